@@ -1,0 +1,1 @@
+"""The Mitsuba plugin `diffraction_grating`. Everything in this folder needs Mitsuba."""

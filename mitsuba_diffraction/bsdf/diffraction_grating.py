@@ -1,0 +1,245 @@
+"""The class behind `<bsdf type="diffraction_grating">`."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .geometry import Geometry
+from .line_spectrum import LineSpectrum
+from .reflectance import reflectance_from
+from .surface import spectrum_from
+from .tables import BELOW_ONE
+
+SHADOWING = ("v_cavity", "none")
+
+
+VISIBLE_FROM = 360.0  # nm, the shortest wavelength that Mitsuba samples
+DEFENSIVE = 0.02  # the share of samples that follow the cosine, for lobes that the sampler's averages miss
+
+MANUAL = """A diffraction grating, given by the spectrum of its phase.
+
+Parameters (XML or dictionary):
+    filename (string): a saved spectrum (.exr) or a recipe (.toml).
+    spectrum (GratingSpectrum): the same from Python, in load_dict.
+    profile (string): a grating by formula instead of a file, with the parameters of the function of that name in
+        `mitsuba_diffraction.gratings`, all lengths in µm, and coherence_length and tolerance as in `precompute`.
+    int_ior, ext_ior (float or string): a dielectric, as in Mitsuba's `dielectric` (1.5 against air).
+    material (string): a conductor instead, as in Mitsuba's `conductor`; "none" is the perfect mirror, R = 1.
+    fresnel (string): "exact" or "schlick".
+    orientation (float or texture): degrees from the tangent dp_du to the pattern's x axis (0).
+    height_scale (float): scales the heights (1).
+    shadowing (string): "v_cavity" or "none".
+    base (BSDF): what lies under a dielectric surface (pigment); it receives (1 − R_i)(1 − R_o) of the light.
+
+The BRDF is R · K · G · S(q; κ)/λ²: R the power reflectance at the half vector, K and G as in `geometry.py`, S as in
+`line_spectrum.py`, with q = −(ω_i + ω_o)/λ along the pattern's axes and κ = 2π (cos θ_i + cos θ_o)/λ.
+"""
+
+
+def define() -> type:
+    """The plugin's class for the variant in force: its base class belongs to that variant."""
+
+    class DiffractionGrating(mi.BSDF):
+        __doc__ = MANUAL
+
+        def __init__(self, props: mi.Properties) -> None:
+            mi.BSDF.__init__(self, props)
+            self.spectrum = spectrum_from(props)
+            self.reflectance = reflectance_from(props)
+            self.orientation = props.get_texture("orientation", 0.0)
+            self.height_scale = mi.Float(props.get("height_scale", 1.0))
+            self.shadowing = props.get("shadowing", "v_cavity")
+            if self.shadowing not in SHADOWING:
+                raise ValueError(f"shadowing: got {self.shadowing!r}, wanted one of {', '.join(SHADOWING)}")
+            self.lines = LineSpectrum(self.spectrum)
+            self.base = _base(props)
+            if self.base is not None and not self.reflectance.transparent:
+                raise ValueError("base: got a BSDF below a conductor or a perfect mirror, which let no light through")
+            self._update()
+            flags = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.Anisotropic | mi.BSDFFlags.FrontSide
+            if self.orientation.is_spatially_varying():
+                flags = flags | mi.BSDFFlags.SpatiallyVarying
+            self.m_components = [flags]
+            self.m_flags = flags
+
+        def _update(self) -> None:
+            """What depends on parameters that can change."""
+            scale = np.max(self.height_scale)
+            largest = VISIBLE_FROM / self.spectrum.wavelengths[0]
+            if not 0 <= scale <= largest * (1 + 1e-6):
+                raise ValueError(
+                    f"height_scale: got {scale}, wanted 0 to {largest:.4g}: the spectrum was built for "
+                    f"wavelengths from {self.spectrum.wavelengths[0]:g} nm; for larger heights build it from "
+                    f"{VISIBLE_FROM:g} nm divided by the scale"
+                )
+            dr.make_opaque(self.height_scale)
+
+        def traverse(self, callback: mi.TraversalCallback) -> None:
+            callback.put("orientation", self.orientation, mi.ParamFlags.Differentiable)
+            callback.put("height_scale", self.height_scale, mi.ParamFlags.Differentiable)
+            self.reflectance.traverse(callback)
+            if self.base is not None:
+                callback.put("base", self.base, mi.ParamFlags.Differentiable)
+
+        def parameters_changed(self, keys: list[str] = ()) -> None:
+            if not keys or "height_scale" in keys:
+                self._update()
+
+        def _frame(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
+            """Sine and cosine of the angle from the tangent to the pattern's x axis."""
+            return dr.sincos(dr.deg2rad(self.orientation.eval_1(si, active)))
+
+        def _grating(
+            self, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool
+        ) -> tuple[mi.UnpolarizedSpectrum, mi.Float]:
+            """f cos θ_o of the grating, and the density of its own samples, for directions above the surface."""
+            geometry = Geometry(si.wi, wo)
+            sin, cos = self._frame(si, active)
+            u, v = cos * geometry.u + sin * geometry.v, cos * geometry.v - sin * geometry.u
+            value, density = mi.UnpolarizedSpectrum(0.0), mi.Float(0.0)
+            channels = len(value)
+            for channel in range(channels):
+                wavelength = si.wavelengths[channel] * 1e-3  # µm
+                scaled = dr.two_pi / wavelength * self.height_scale
+                weights = self.lines.sampler.weights(geometry.cos_i, dr.detach(scaled))
+                power, share = self.lines.evaluate(
+                    u / wavelength, v / wavelength, -geometry.w * scaled, weights, active & self._covers(wavelength)
+                )
+                value[channel] = power / dr.square(wavelength)
+                density += share / dr.square(wavelength)
+            value *= self.reflectance(si, geometry.cos_half(), active) * geometry.factor(self.shadowing == "v_cavity")
+            # The mean over the wavelengths: any of them may have chosen the direction.
+            density = DEFENSIVE * dr.inv_pi + (1 - DEFENSIVE) * density / channels
+            return value, density * geometry.cos_o
+
+        def _covers(self, wavelength: mi.Float) -> mi.Bool:
+            """The spectrum says nothing outside of its wavelengths (µm): there the grating is black."""
+            shortest, longest = self.spectrum.wavelengths
+            return (wavelength >= shortest * 1e-3 * (1 - 1e-6)) & (wavelength <= longest * 1e-3 * (1 + 1e-6))
+
+        def _transmitted(self, si: mi.SurfaceInteraction3f, cos_o: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
+            """(1 − R_i)(1 − R_o): what the surface lets through to the base and back."""
+            r_i = self.reflectance(si, mi.Frame3f.cos_theta(si.wi), active)
+            return (1 - r_i) * (1 - self.reflectance(si, cos_o, active))
+
+        def eval_pdf(
+            self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
+        ) -> tuple[mi.Spectrum, mi.Float]:
+            cos_i, cos_o = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(wo)
+            active = active & (cos_i > 0) & (cos_o > 0)
+            share = self._grating_share(ctx)
+            value, pdf = mi.Spectrum(0.0), mi.Float(0.0)
+            if share == 0:
+                return value, pdf
+            grating, density = self._grating(si, wo, active)
+            value, pdf = value + mi.depolarizer(grating), pdf + share * density
+            if share < 1:
+                below, density = self.base.eval_pdf(ctx, si, wo, active)
+                value, pdf = (
+                    value + _attenuated(self._transmitted(si, cos_o, active), below),
+                    pdf + (1 - share) * density,
+                )
+            return dr.select(active, value, 0), dr.select(active, pdf, 0)
+
+        def eval(
+            self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
+        ) -> mi.Spectrum:
+            return self.eval_pdf(ctx, si, wo, active)[0]
+
+        def pdf(
+            self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
+        ) -> mi.Float:
+            return self.eval_pdf(ctx, si, wo, active)[1]
+
+        def sample(
+            self,
+            ctx: mi.BSDFContext,
+            si: mi.SurfaceInteraction3f,
+            sample1: mi.Float,
+            sample2: mi.Point2f,
+            active: mi.Bool = True,
+        ) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
+            cos_i = mi.Frame3f.cos_theta(si.wi)
+            active = active & (cos_i > 0)
+            share = self._grating_share(ctx)
+            if share == 0:
+                return dr.zeros(mi.BSDFSample3f), mi.Spectrum(0.0)
+            below = active & (sample1 >= share)
+            bs = dr.zeros(mi.BSDFSample3f)
+            bs.wo = self._draw(si, sample1 / share, sample2, active & (sample1 < share))
+            if share < 1:
+                base_sample, _ = self.base.sample(ctx, si, (sample1 - share) / (1 - share), sample2, below)
+                bs.wo = dr.select(below, base_sample.wo, bs.wo)
+            value, bs.pdf = self.eval_pdf(ctx, si, bs.wo, active)
+            bs.eta = 1.0
+            bs.sampled_type = mi.UInt32(+mi.BSDFFlags.GlossyReflection)
+            bs.sampled_component = mi.UInt32(0)
+            valid = active & (bs.pdf > 0)
+            return bs, dr.select(valid, value / dr.select(valid, bs.pdf, 1), 0)
+
+        def _grating_share(self, ctx: mi.BSDFContext) -> float:
+            """The share of samples that the grating gets; the base gets the rest."""
+            if not ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0):
+                return 0.0
+            return 1.0 if self.base is None else 0.5
+
+        def _draw(self, si: mi.SurfaceInteraction3f, u: mi.Float, v: mi.Point2f, active: mi.Bool) -> mi.Vector3f:
+            """A direction for one of the wavelengths; below the horizon (z = 0) where its order is evanescent."""
+            diffuse = u < DEFENSIVE
+            u = (u - DEFENSIVE) / (1 - DEFENSIVE)
+            channels = len(mi.UnpolarizedSpectrum(0.0))
+            chosen = dr.clip(mi.UInt32(dr.maximum(u, 0) * channels), 0, channels - 1)
+            rest = dr.clip(u * channels - mi.Float(chosen), 0, BELOW_ONE)
+            wavelength = si.wavelengths[0] * 1e-3
+            for channel in range(1, channels):
+                wavelength = dr.select(chosen == channel, si.wavelengths[channel] * 1e-3, wavelength)
+            wavelength = dr.detach(wavelength)
+            scaled = dr.two_pi / wavelength * dr.detach(self.height_scale)
+            q_x, q_y = self.lines.sample(mi.Frame3f.cos_theta(si.wi), scaled, rest, v, active & (u >= 0))
+            sin, cos = (dr.detach(x) for x in self._frame(si, active))
+            x = -wavelength * (cos * q_x - sin * q_y) - si.wi.x
+            y = -wavelength * (sin * q_x + cos * q_y) - si.wi.y
+            z = dr.safe_sqrt(1 - dr.square(x) - dr.square(y))
+            return dr.select(diffuse, mi.warp.square_to_cosine_hemisphere(v), mi.Vector3f(x, y, z))
+
+        def to_string(self) -> str:
+            x, y = self.spectrum.orders.tile_size
+            lines = [
+                f"spectrum = {self.spectrum.source}",
+                f"tile = {x:.4g} x {y:.4g} um",
+                f"coherence_length = {self.spectrum.coherence_length:g} um",
+                f"representation = {self.spectrum.representation}, {self.spectrum.megabytes:.3g} MB",
+                f"reflectance = {self.reflectance}",
+                f"orientation = {self.orientation}",
+                f"height_scale = {self.height_scale}",
+                f"shadowing = {self.shadowing}",
+            ]
+            return "DiffractionGrating[\n" + "".join(f"  {line},\n" for line in lines) + "]"
+
+    return DiffractionGrating
+
+
+def _base(props: mi.Properties) -> mi.BSDF | None:
+    """The nested BSDF, if there is one.
+
+    Raises:
+        ValueError: if it is not a BSDF that reflects over the whole hemisphere.
+    """
+    if "base" not in props:
+        return None
+    base = props["base"]
+    if not isinstance(base, mi.BSDF):
+        raise ValueError(f"base: got {base!r}, wanted a BSDF")
+    smooth = mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.GlossyReflection
+    if base.flags() & ~int(smooth) & int(mi.BSDFFlags.All):
+        raise ValueError(
+            "base: got a BSDF with a delta or a transmitted part, wanted diffuse or glossy reflection only"
+        )
+    return base
+
+
+def _attenuated(factor: mi.UnpolarizedSpectrum, value: mi.Spectrum) -> mi.Spectrum:
+    """`value` (a Mueller matrix in polarised variants) times `factor`."""
+    return mi.mueller.absorber(factor) @ value if mi.is_polarized else factor * value

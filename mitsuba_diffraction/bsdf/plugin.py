@@ -1,0 +1,64 @@
+"""Registers `diffraction_grating` with Mitsuba, for every variant, now and after each mi.set_variant.
+
+Mitsuba discovers this module through the entry point group `mitsuba` (from 3.10 on) and reloads it at each change of
+variant; importing `mitsuba_diffraction` does the same on every version.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+
+import mitsuba as mi
+
+from .. import llvm
+from ..variants import is_spectral
+from . import diffraction_grating
+from .surface import hand_over
+
+NAME = "diffraction_grating"
+
+
+def register(variant: str) -> None:
+    """Make the plugin known to `variant`, or, where it cannot work, a stand-in that says why."""
+    reason = None
+    if not is_spectral(variant):
+        reason = (
+            f"{NAME} needs the wavelength of light, which the variant {variant} does not have: use a spectral variant, "
+            "such as llvm_ad_spectral, cuda_ad_spectral or scalar_spectral"
+        )
+    elif variant.startswith("llvm"):
+        reason = llvm.problem()
+    mi.register_bsdf(NAME, _refusal(reason) if reason else diffraction_grating.define())
+
+
+def _refusal(reason: str) -> Callable[[mi.Properties], mi.BSDF]:
+    def refuse(props: mi.Properties) -> mi.BSDF:
+        raise RuntimeError(reason)
+
+    return refuse
+
+
+def _accept_spectra() -> None:
+    """Let mi.load_dict take a GratingSpectrum as a value, which Mitsuba's own function refuses."""
+    original = mi.load_dict
+
+    @functools.wraps(original)
+    def load_dict(dict: dict, *args: object, **kwargs: object) -> object:
+        return original(hand_over(dict), *args, **kwargs)
+
+    mi.load_dict = load_dict
+
+
+def _on_variant_change(old: str | None, new: str | None) -> None:
+    if new is not None:
+        register(new)
+
+
+# A reload must not do this twice.
+if not getattr(mi, "_mitsuba_diffraction_registered", False):
+    mi.detail.add_variant_callback(_on_variant_change)
+    _accept_spectra()
+    mi._mitsuba_diffraction_registered = True
+if mi.variant() is not None:
+    register(mi.variant())

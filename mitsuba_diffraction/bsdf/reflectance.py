@@ -1,0 +1,108 @@
+"""R(λ, ω_i·h): the power reflectance of the material at the half vector."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+MODELS = ("exact", "schlick")
+
+
+def reflectance_from(props: mi.Properties) -> PerfectMirror | Dielectric | Conductor:
+    """The material that the parameters `int_ior`, `ext_ior`, `material` and `fresnel` name.
+
+    Raises:
+        ValueError: if they contradict each other or name something unknown.
+    """
+    model = props.get("fresnel", "exact")
+    if model not in MODELS:
+        raise ValueError(f"fresnel: got {model!r}, wanted one of {', '.join(MODELS)}")
+    if "material" not in props:
+        return Dielectric(props.get("int_ior", 1.5), props.get("ext_ior", "air"), model)
+    if "int_ior" in props or "ext_ior" in props:
+        raise ValueError("material: a conductor or a perfect mirror takes no int_ior or ext_ior; give one or the other")
+    material = props["material"]
+    return PerfectMirror() if material == "none" else Conductor(material, model)
+
+
+class PerfectMirror:
+    """R = 1."""
+
+    transparent = False
+
+    def __call__(self, si: mi.SurfaceInteraction3f, cos_half: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
+        return mi.UnpolarizedSpectrum(1.0)
+
+    def traverse(self, callback: mi.TraversalCallback) -> None:
+        pass
+
+    def __repr__(self) -> str:
+        return "none (R = 1)"
+
+
+class Dielectric:
+    """A dielectric of relative index η, seen from outside; no absorption, no dispersion (as Mitsuba's `dielectric`)."""
+
+    transparent = True
+
+    def __init__(self, int_ior: float | str, ext_ior: float | str, model: str) -> None:
+        # Mitsuba's own plugin knows the presets' names.
+        interface = mi.load_dict({"type": "dielectric", "int_ior": int_ior, "ext_ior": ext_ior})
+        self.eta = mi.Float(mi.traverse(interface)["eta"])
+        self.model = model
+        dr.make_opaque(self.eta)
+
+    def __call__(self, si: mi.SurfaceInteraction3f, cos_half: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
+        if self.model == "exact":
+            return mi.UnpolarizedSpectrum(mi.fresnel(cos_half, self.eta)[0])
+        return mi.UnpolarizedSpectrum(_schlick(dr.square((self.eta - 1) / (self.eta + 1)), cos_half))
+
+    def traverse(self, callback: mi.TraversalCallback) -> None:
+        callback.put("eta", self.eta, mi.ParamFlags.Differentiable)
+
+    def __repr__(self) -> str:
+        return f"dielectric, eta = {self.eta}, {self.model}"
+
+
+class Conductor:
+    """A metal of complex index η − ik, by the names of Mitsuba's `conductor`."""
+
+    transparent = False
+
+    def __init__(self, material: str, model: str) -> None:
+        metal = mi.traverse(mi.load_dict({"type": "conductor", "material": material}))
+        self.eta, self.k = (self._spectrum(metal, name) for name in ("eta", "k"))
+        self.material = material
+        self.model = model
+
+    @staticmethod
+    def _spectrum(metal: mi.SceneParameters, name: str) -> mi.Texture:
+        wavelengths, values = metal[f"{name}.wavelengths"], metal[f"{name}.values"]
+        return mi.load_dict({"type": "irregular", "wavelengths": _text(wavelengths), "values": _text(values)})
+
+    def __call__(self, si: mi.SurfaceInteraction3f, cos_half: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
+        eta, k = self.eta.eval(si, active), self.k.eval(si, active)
+        if self.model == "exact":
+            result = mi.UnpolarizedSpectrum(0.0)
+            for channel in range(len(result)):
+                result[channel] = mi.fresnel_conductor(cos_half, mi.Complex2f(eta[channel], k[channel]))
+            return result
+        normal = (dr.square(eta - 1) + dr.square(k)) / (dr.square(eta + 1) + dr.square(k))
+        return _schlick(normal, cos_half)
+
+    def traverse(self, callback: mi.TraversalCallback) -> None:
+        callback.put("eta", self.eta, mi.ParamFlags.Differentiable)
+        callback.put("k", self.k, mi.ParamFlags.Differentiable)
+
+    def __repr__(self) -> str:
+        return f"conductor, {self.material}, {self.model}"
+
+
+def _schlick(normal: mi.UnpolarizedSpectrum, cos_half: mi.Float) -> mi.UnpolarizedSpectrum:
+    """R₀ + (1 − R₀)(1 − cos)⁵ (Schlick 1994); R₀ is a power already and is not squared."""
+    away = 1 - cos_half
+    return normal + (1 - normal) * dr.square(dr.square(away)) * away
+
+
+def _text(values: mi.Float) -> str:
+    return ", ".join(repr(float(v)) for v in values)

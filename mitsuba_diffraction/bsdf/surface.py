@@ -1,0 +1,76 @@
+"""Which surface a scene names: a saved spectrum, a recipe, a profile by formula, or a spectrum from Python."""
+
+from __future__ import annotations
+
+import inspect
+import weakref
+from pathlib import Path
+
+import mitsuba as mi
+
+from ..gratings import PROFILES
+from ..recipe import Recipe
+from ..spectrum import GratingSpectrum
+
+_PREFIX = "handed over: "
+_handed_over: weakref.WeakValueDictionary[str, GratingSpectrum] = weakref.WeakValueDictionary()
+
+
+def spectrum_from(props: mi.Properties) -> GratingSpectrum:
+    """The spectrum that the parameters `filename`, `spectrum`, or `profile` with its own parameters name.
+
+    Raises:
+        ValueError: unless exactly one of them is given, or if what it names cannot be had.
+    """
+    given = [name for name in ("filename", "spectrum", "profile") if name in props]
+    if len(given) != 1:
+        raise ValueError(
+            f"surface: got {' and '.join(given) or 'nothing'}, wanted one of filename (a saved spectrum or a recipe), "
+            f"profile ({', '.join(PROFILES)}) or, from Python, spectrum"
+        )
+    if given == ["spectrum"]:
+        return _taken_over(props["spectrum"])
+    if given == ["filename"]:
+        return _from_file(Path(str(mi.file_resolver().resolve(props["filename"]))))
+    name = props["profile"]
+    if name not in PROFILES:
+        raise ValueError(f"profile: got {name!r}, wanted one of {', '.join(PROFILES)}")
+    known = inspect.signature(PROFILES[name]).parameters
+    surface = {"profile": name, **{key: props[key] for key in known if key in props}}
+    settings = {key: props[key] for key in ("coherence_length", "tolerance") if key in props}
+    return Recipe(surface, settings).cached()
+
+
+def _from_file(path: Path) -> GratingSpectrum:
+    suffix = path.suffix.lower()
+    if suffix == ".toml":
+        return Recipe.load(path).cached()
+    if suffix == ".exr":
+        return GratingSpectrum.load(path)
+    raise ValueError(
+        f"filename: got {path}, wanted a saved spectrum (.exr) or a recipe (.toml); "
+        "a scan is turned into a spectrum by `mitsuba-diffraction precompute`, or named by a recipe"
+    )
+
+
+def _taken_over(handle: str) -> GratingSpectrum:
+    spectrum = _handed_over.get(handle)
+    if spectrum is None:
+        raise ValueError(
+            f"spectrum: got {handle!r}, wanted a GratingSpectrum in Python's load_dict; XML takes a filename"
+        )
+    return spectrum
+
+
+def hand_over(value: object) -> object:
+    """A scene dictionary in which every GratingSpectrum is replaced by a handle.
+
+    Mitsuba's load_dict accepts only types bound in C++, so an object of ours travels by name.
+    """
+    if isinstance(value, GratingSpectrum):
+        handle = f"{_PREFIX}{id(value)}"
+        _handed_over[handle] = value
+        return handle
+    if isinstance(value, dict):
+        return {key: hand_over(item) for key, item in value.items()}
+    return value

@@ -1,0 +1,31 @@
+"""The Gaussian lobe that a finite coherence length gives to every order."""
+
+from __future__ import annotations
+
+import numpy as np
+
+# The sun's disc is 0.53° wide: its light is coherent over about 65 µm.
+SUN_COHERENCE_LENGTH = 65.0
+
+
+def lobe_width(coherence_length: float) -> float:
+    """σ_q in cycles/µm for the coherence length L_c in µm.
+
+    The window is Gaussian in amplitude, a(x) = exp(−|x|²/2σ_s²) with σ_s = L_c/4; the power of its transform is a
+    Gaussian of standard deviation σ_q = 1/(2√2 π σ_s).
+
+    Raises:
+        ValueError: if the coherence length is not positive and finite.
+    """
+    if not (np.isfinite(coherence_length) and coherence_length > 0):
+        raise ValueError(f"coherence_length: got {coherence_length!r}, wanted a positive number of µm")
+    return 1 / (2 * np.sqrt(2) * np.pi * (coherence_length / 4))
+
+
+def lobe_reach(share: float) -> float:
+    """The radius ρ, in standard deviations, at which a lobe is cut off; what is inside is scaled up to the whole.
+
+    A two-dimensional Gaussian has e^{−ρ²/2} outside of the radius ρ. Cutting it off and scaling the rest changes the
+    lobe by twice that in the L1 norm, which is to be `share`.
+    """
+    return float(np.sqrt(-2 * np.log(share / 2)))

@@ -1,0 +1,187 @@
+"""A recipe: which surface, and how its spectrum is built, in a TOML file.
+
+[surface]                        # a profile by formula …
+profile = "blazed"               # a name of gratings.PROFILES, its parameters beside it
+period = 2.5                     # µm
+depth = 0.25                     # µm
+
+[surface]                        # … or a scan
+scan = "skin.png"                # relative to the recipe
+pixel_size = 0.0586              # µm, one number or [x, y]
+height_range = 0.375             # µm, for integer images
+
+[spectrum]                       # every line may be left out
+extent = "tile"
+coherence_length = 65.0          # µm
+wavelengths = [360.0, 830.0]     # nm
+representation = "auto"
+tolerance = 1e-3
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import platformdirs
+
+from .gratings import PROFILES
+from .heightfield import HeightField
+from .precompute import precompute
+from .readers import read_height_field
+from .spectrum import GratingSpectrum
+from .spectrum.file import FORMAT_VERSION
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+_SCAN_KEYS = frozenset({"scan", "pixel_size", "height_range"})
+_SPECTRUM_KEYS = frozenset({"extent", "coherence_length", "wavelengths", "representation", "tolerance"})
+# Raised when the same input gives other numbers than before, so that the cache is not read.
+_BUILD_VERSION = 1
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """A surface and the way to its spectrum.
+
+    Attributes:
+        surface: a profile's name and parameters, or a scan with its scale; see the head of this file.
+        spectrum: arguments of `precompute`.
+        folder: where relative file names start.
+
+    Raises:
+        ValueError: if something is missing, unknown or contradictory.
+    """
+
+    surface: Mapping[str, Any]
+    spectrum: Mapping[str, Any] = field(default_factory=dict)
+    folder: Path = Path()
+
+    def __post_init__(self) -> None:
+        if ("profile" in self.surface) == ("scan" in self.surface):
+            raise ValueError(f"[surface]: got {_names(self.surface)}, wanted either a profile or a scan")
+        if "profile" in self.surface and self.surface["profile"] not in tuple(PROFILES):
+            raise ValueError(f"profile: got {self.surface['profile']!r}, wanted one of {', '.join(PROFILES)}")
+        if "scan" in self.surface:
+            _refuse_unknown("[surface]", self.surface, _SCAN_KEYS)
+            if not isinstance(self.surface["scan"], str):
+                raise ValueError(f"scan: got {self.surface['scan']!r}, wanted a file name")
+        _refuse_unknown("[spectrum]", self.spectrum, _SPECTRUM_KEYS)
+        for name, value in [*self.surface.items(), *self.spectrum.items()]:
+            if not (_is_plain(value) or (isinstance(value, list | tuple) and all(_is_plain(v) for v in value))):
+                raise ValueError(f"{name}: got {value!r}, wanted a number, a text, or a list of them")
+        for name in ("tolerance", "coherence_length"):
+            if name in self.spectrum and not _is_number(self.spectrum[name]):
+                raise ValueError(f"{name}: got {self.spectrum[name]!r}, wanted a number")
+        if "wavelengths" in self.spectrum and not isinstance(self.spectrum["wavelengths"], list | tuple):
+            raise ValueError(f"wavelengths: got {self.spectrum['wavelengths']!r}, wanted [shortest, longest] in nm")
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Recipe:
+        """Read a recipe.
+
+        Raises:
+            FileNotFoundError: if there is no such file.
+            ValueError: if it is not TOML, or not a recipe.
+        """
+        path = Path(path)
+        try:
+            with open(path, "rb") as file:
+                content = tomllib.load(file)
+        except FileNotFoundError:
+            raise FileNotFoundError(f"{path}: no such file") from None
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise ValueError(f"{path}: not a TOML file ({error})") from None
+        try:
+            _refuse_unknown("recipe", content, frozenset({"surface", "spectrum"}))
+            surface, spectrum = content.get("surface", {}), content.get("spectrum", {})
+            if not (isinstance(surface, dict) and isinstance(spectrum, dict)):
+                raise ValueError("wanted the tables [surface] and [spectrum]")
+            return cls(surface, spectrum, path.parent)
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from None
+
+    def height_field(self) -> HeightField:
+        """The surface."""
+        parameters = dict(self.surface)
+        if "scan" in parameters:
+            pixel_size = parameters.pop("pixel_size", None)
+            if isinstance(pixel_size, list):
+                pixel_size = tuple(pixel_size)
+            return read_height_field(
+                self.folder / parameters.pop("scan"), pixel_size=pixel_size, height_range=parameters.get("height_range")
+            )
+        name = parameters.pop("profile")
+        try:
+            return PROFILES[name](**parameters)
+        except TypeError as error:
+            raise ValueError(f"profile {name!r}: {error}") from None
+
+    def build(self, progress: Callable[[int, int], None] | None = None) -> GratingSpectrum:
+        """The spectrum, computed."""
+        arguments = dict(self.spectrum)
+        if "wavelengths" in arguments:
+            arguments["wavelengths"] = tuple(arguments["wavelengths"])
+        return precompute(self.height_field(), progress=progress, **arguments)
+
+    def digest(self) -> str:
+        """SHA-256 of everything that the spectrum depends on: the recipe's words and the scan's bytes."""
+        content = hashlib.sha256(f"{FORMAT_VERSION}.{_BUILD_VERSION}".encode())
+        surface = dict(self.surface)
+        if "scan" in surface:
+            scan = self.folder / surface.pop("scan")
+            try:
+                content.update(scan.read_bytes())
+            except FileNotFoundError:
+                raise FileNotFoundError(f"{scan}: no such file") from None
+            content.update(scan.suffix.lower().encode())
+        content.update(json.dumps([surface, dict(self.spectrum)], sort_keys=True).encode())
+        return content.hexdigest()
+
+    def cached(self, progress: Callable[[int, int], None] | None = None) -> GratingSpectrum:
+        """The spectrum from the cache, or built and put there.
+
+        The cache is a folder of spectra named by `digest`: $MITSUBA_DIFFRACTION_CACHE, or the user's cache folder.
+        """
+        path = cache_folder() / f"{self.digest()}.exr"
+        if path.is_file():
+            try:
+                return GratingSpectrum.load(path)
+            except ValueError:
+                path.unlink()  # damaged from outside; built anew below
+        spectrum = self.build(progress)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        spectrum.save(path)
+        return spectrum
+
+
+def cache_folder() -> Path:
+    """Where spectra of recipes are kept."""
+    named = os.environ.get("MITSUBA_DIFFRACTION_CACHE")
+    return Path(named) if named else platformdirs.user_cache_path("mitsuba_diffraction")
+
+
+def _refuse_unknown(where: str, table: Mapping[str, Any], known: frozenset[str]) -> None:
+    if unknown := sorted(set(table) - known):
+        raise ValueError(f"{where}: got the unknown name {', '.join(unknown)}, wanted among {', '.join(sorted(known))}")
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _is_plain(value: object) -> bool:
+    return isinstance(value, int | float | str)
+
+
+def _names(table: Mapping[str, Any]) -> str:
+    return ", ".join(sorted(table)) or "nothing"

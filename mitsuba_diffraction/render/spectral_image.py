@@ -1,0 +1,135 @@
+"""A spectral picture in memory, and its OpenEXR file."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..color import spectrum_to_linear_sRGB
+from ..files import whole_file
+
+_LAYOUT_VERSION = "1.0"
+# Radiance per unit of the channels' names, that is per nm: the layout's authors and pbrt-v4 leave the nm⁻¹ out, and
+# colour-science integrates the channels over wavelength.
+_UNITS = "W.m^-2.sr^-1"
+_CHANNEL = re.compile(r"S0\.(\d+(?:,\d+)?)nm")
+_MAGIC = b"\x76\x2f\x31\x01"
+# Header entries that are OpenEXR's or the layout's and not ours to give back.
+_RESERVED = frozenset(
+    (
+        *("channels", "chunkCount", "compression", "dataWindow", "displayWindow", "lineOrder", "name"),
+        *("pixelAspectRatio", "screenWindowCenter", "screenWindowWidth", "tiles", "type", "version", "view"),
+        *("spectralLayoutVersion", "emissiveUnits"),
+    )
+)
+
+
+@dataclass(frozen=True, eq=False)
+class SpectralImage:
+    """Spectral radiance per pixel.
+
+    Attributes:
+        wavelengths: (n,) float64, nm, ascending.
+        radiance: (height, width, n) float32, W m⁻² sr⁻¹ nm⁻¹; row 0 is the top.
+        attributes: what else is known, by name: text, integers (32 bits in the file) or floats (float32 in the file).
+
+    Raises:
+        ValueError: if the shapes disagree, the wavelengths do not ascend, or an attribute has another type or a name
+            that the file format uses.
+    """
+
+    wavelengths: NDArray[np.float64]
+    radiance: NDArray[np.float32]
+    attributes: Mapping[str, str | int | float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        wavelengths = np.array(self.wavelengths, dtype=np.float64)
+        radiance = np.array(self.radiance, dtype=np.float32, order="C")
+        if wavelengths.ndim != 1 or wavelengths.size == 0 or not np.all(np.diff(wavelengths, prepend=0.0) > 0):
+            raise ValueError(f"wavelengths: got {self.wavelengths!r}, wanted (n,) positive and ascending, nm")
+        if radiance.ndim != 3 or radiance.size == 0 or radiance.shape[2] != wavelengths.size:
+            raise ValueError(
+                f"radiance: got shape {radiance.shape}, wanted (height, width, {wavelengths.size}), none of them zero"
+            )
+        for name, value in self.attributes.items():
+            if isinstance(value, int) and not -(2**31) <= value < 2**31:
+                # OpenEXR would cut it off and say nothing.
+                raise ValueError(f"attributes: got {name!r} = {value}, wanted an integer of 32 bits")
+            if name in _RESERVED or not isinstance(value, str | int | float):
+                raise ValueError(
+                    f"attributes: got {name!r} = {value!r}, wanted text or a number, under a name that is not OpenEXR's"
+                )
+        wavelengths.setflags(write=False)
+        radiance.setflags(write=False)
+        object.__setattr__(self, "wavelengths", wavelengths)
+        object.__setattr__(self, "radiance", radiance)
+        object.__setattr__(self, "attributes", dict(self.attributes))
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Writes an OpenEXR file (float32, ZIP) in the spectral layout of Fichet, Pacanowski and Wilkie 2021.
+
+        Channels `S0.405,000000nm` hold the radiance, R, G and B its linear sRGB (scaled as in `color`), so that viewers
+        which know no spectra show the picture.
+
+        Raises:
+            FileNotFoundError: if the folder does not exist.
+        """
+        import OpenEXR
+
+        rgb = spectrum_to_linear_sRGB(self.radiance, self.wavelengths).astype(np.float32)
+        channels = {name: np.ascontiguousarray(rgb[..., i]) for i, name in enumerate("RGB")}
+        for i, wavelength in enumerate(self.wavelengths):
+            number = f"{wavelength:.6f}".replace(".", ",")
+            channels[f"S0.{number}nm"] = np.ascontiguousarray(self.radiance[..., i])
+        header = {
+            **self.attributes,
+            "compression": OpenEXR.ZIP_COMPRESSION,
+            "type": OpenEXR.scanlineimage,
+            "spectralLayoutVersion": _LAYOUT_VERSION,
+            "emissiveUnits": _UNITS,
+        }
+        with whole_file(path) as temporary:
+            OpenEXR.File(header, channels).write(str(temporary))
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> SpectralImage:
+        """Reads what `save` writes.
+
+        Raises:
+            FileNotFoundError: if there is no such file.
+            ValueError: if it is not an OpenEXR file, not in this layout and version, or has no emissive channels in nm.
+        """
+        import OpenEXR
+
+        with Path(path).open("rb") as stream:
+            # OpenEXR would write a line of its own to stderr before it raises.
+            if stream.read(4) != _MAGIC:
+                raise ValueError(f"{os.fspath(path)}: not an OpenEXR file")
+        try:
+            file = OpenEXR.File(os.fspath(path), separate_channels=True)
+            header, channels = file.header(), file.channels()
+        except (RuntimeError, ValueError) as error:
+            raise ValueError(f"{os.fspath(path)}: cannot be read as OpenEXR, is it whole? ({error})") from error
+        for name, wanted in (("spectralLayoutVersion", _LAYOUT_VERSION), ("emissiveUnits", _UNITS)):
+            if header.get(name) != wanted:
+                raise ValueError(f"{os.fspath(path)}: {name} is {header.get(name)!r}, wanted {wanted!r}")
+        found = sorted(
+            (float(match[1].replace(",", ".")), name)
+            for name in channels
+            if (match := _CHANNEL.fullmatch(name)) is not None
+        )
+        if not found:
+            raise ValueError(f"{os.fspath(path)}: no channel like 'S0.405,000000nm'")
+        radiance = np.stack([channels[name].pixels for _, name in found], axis=-1)
+        attributes = {
+            name: value
+            for name, value in header.items()
+            if name not in _RESERVED and isinstance(value, str | int | float)
+        }
+        return cls(np.array([wavelength for wavelength, _ in found]), radiance, attributes)

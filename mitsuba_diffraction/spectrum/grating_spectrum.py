@@ -1,0 +1,168 @@
+"""The precomputed power spectrum S(q; κ) of the phase e^{iκh} of a surface."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..arrays import matching
+from ..coherence import lobe_reach, lobe_width
+from .orders import OrderGrid
+from .series_table import SeriesTable
+from .slice_table import SliceTable
+
+# The part of the tolerance that is spent on the tails of the lobes.
+TAIL_SHARE = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class GratingSpectrum:
+    """S(q; κ) = Σ_m η_m(κ) N(q − m/T; σ_q² I).
+
+    Attributes:
+        table: η_m(κ), in one of the representations.
+        orders: the diffraction orders m that are kept.
+        pixel_size: (x, y) of the height field, µm.
+        height_range: of the height field, µm.
+        coherence_length: L_c in µm; it sets the width σ_q of each order.
+        wavelengths: (shortest, longest) in nm for which the table holds.
+        tolerance: the bound that was asked for.
+        error: what was measured: max over κ of ∫|S_approx − S_exact| dq over the frequencies that light can reach.
+        source: where the heights came from.
+        source_digest: SHA-256 of the height field.
+        extent: "tile": the patch repeats for ever.
+    """
+
+    table: SeriesTable | SliceTable
+    orders: OrderGrid
+    pixel_size: tuple[float, float]
+    height_range: float
+    coherence_length: float
+    wavelengths: tuple[float, float]
+    tolerance: float
+    error: float
+    source: str
+    source_digest: str = field(repr=False)
+    extent: str = "tile"
+
+    def __post_init__(self) -> None:
+        if self.table.shape != self.orders.shape:
+            raise ValueError(f"table: got {self.table.shape} orders, wanted {self.orders.shape}")
+        if self.extent != "tile":
+            raise ValueError(f"extent: got {self.extent!r}, wanted 'tile'")
+        if not all(np.isfinite(p) and p > 0 for p in self.pixel_size):
+            raise ValueError(f"pixel_size: got {self.pixel_size}, wanted two positive lengths in µm")
+        if not (np.isfinite(self.height_range) and self.height_range >= 0):
+            raise ValueError(f"height_range: got {self.height_range}, wanted a length ≥ 0 in µm")
+        if not (0 < self.tolerance < 1 and self.error >= 0 and np.isfinite(self.error)):
+            raise ValueError(f"tolerance, error: got {self.tolerance}, {self.error}, wanted shares of the power")
+        if not (isinstance(self.source, str) and isinstance(self.source_digest, str)):
+            raise ValueError(f"source: got {self.source!r}, {self.source_digest!r}, wanted texts")
+        check_wavelengths(self.wavelengths)
+        lobe_width(self.coherence_length)
+
+    @property
+    def representation(self) -> str:
+        """How the order powers are stored: "taylor" or "slices"."""
+        return self.table.representation
+
+    @property
+    def largest_kappa(self) -> float:
+        """4π/λ_min in rad/µm: normal incidence and exit at the shortest wavelength."""
+        return 4 * np.pi / (self.wavelengths[0] * 1e-3)
+
+    @property
+    def lobe_width(self) -> float:
+        """σ_q in cycles/µm."""
+        return lobe_width(self.coherence_length)
+
+    @property
+    def reach(self) -> float:
+        """How far the lobe of an order is followed, in standard deviations σ_q."""
+        return lobe_reach(TAIL_SHARE * self.tolerance)
+
+    @property
+    def neighbours(self) -> tuple[int, int]:
+        """How many orders along x and y overlap at one q, to the tolerance."""
+        return self.orders.neighbours(self.lobe_width, self.reach)
+
+    @property
+    def megabytes(self) -> float:
+        """Size of the table in memory."""
+        return self.table.nbytes / 1e6
+
+    def order_powers(self, kappa: float) -> NDArray[np.float32]:
+        """η_m(κ) of the orders that are kept, (2 M_y + 1, 2 M_x + 1), in float32 as a renderer computes them.
+
+        Raises:
+            ValueError: if κ (rad/µm) is outside of what the table holds.
+        """
+        return self.table.order_powers(float(self._checked(np.float64(kappa))))
+
+    def evaluate(self, q: ArrayLike, kappa: ArrayLike) -> NDArray[np.float64]:
+        """S(q; κ) from the table.
+
+        Args:
+            q: (..., 2) cycles/µm, along x and y.
+            kappa: (...) rad/µm, 0 ≤ κ ≤ `largest_kappa`.
+
+        Returns:
+            (...) µm².
+
+        Raises:
+            ValueError: if shapes do not match or κ is outside of what the table holds.
+        """
+        q, kappa = matching(q, kappa)
+        self._checked(kappa)
+        sigma = self.lobe_width
+        tile, largest = np.array(self.orders.tile_size), np.array(self.orders.largest)
+        first = np.ceil(np.clip((q - self.reach * sigma) * tile, -largest, largest + 1)).astype(np.int64)
+        result = np.zeros(kappa.shape)
+        count_x, count_y = self.neighbours
+        for step in np.ndindex(count_x, count_y):
+            m = first + step
+            kept = (np.abs(m) <= largest).all(axis=-1)
+            column, row = np.moveaxis(np.where(kept[..., None], m + largest, 0), -1, 0)
+            distance = ((q - m / tile) ** 2).sum(axis=-1)
+            kept &= distance <= (self.reach * sigma) ** 2
+            lobe = np.exp(-distance / (2 * sigma**2)) / (2 * np.pi * sigma**2 * -np.expm1(-(self.reach**2) / 2))
+            result += np.where(kept, lobe * self.table.powers_at(row, column, kappa), 0)
+        return result
+
+    def _checked(self, kappa: NDArray[np.float64]) -> NDArray[np.float64]:
+        if not (np.all(kappa >= 0) and np.all(kappa <= self.largest_kappa * (1 + 1e-6))):
+            raise ValueError(
+                f"kappa: got values from {np.min(kappa):.6g} to {np.max(kappa):.6g} rad/µm, wanted 0 to "
+                f"{self.largest_kappa:.6g} (the spectrum was built for wavelengths from {self.wavelengths[0]:g} nm)"
+            )
+        return kappa
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the spectrum as an OpenEXR file, whole or not at all."""
+        from .file import save
+
+        save(self, path)
+
+    @staticmethod
+    def load(path: str | os.PathLike[str]) -> GratingSpectrum:
+        """Read a spectrum that `save` wrote.
+
+        Raises:
+            ValueError: if the file is not a spectrum, is damaged, or is of a version or representation not known here.
+        """
+        from .file import load
+
+        return load(path)
+
+
+def check_wavelengths(wavelengths: tuple[float, float]) -> None:
+    """Raises ValueError unless `wavelengths` is (shortest, longest) in nm."""
+    try:
+        shortest, longest = (float(w) for w in wavelengths)
+    except (TypeError, ValueError):
+        raise ValueError(f"wavelengths: got {wavelengths!r}, wanted (shortest, longest) in nm") from None
+    if not (np.isfinite([shortest, longest]).all() and 50 <= shortest < longest):
+        raise ValueError(f"wavelengths: got {wavelengths!r}, wanted (shortest, longest) in nm, at least 50 nm")

@@ -1,0 +1,44 @@
+"""What all tests share: a cache of their own, and the measured scans."""
+
+from pathlib import Path
+
+import pytest
+from hypothesis import settings
+
+import mitsuba_diffraction as md
+
+# One example may be the first to import or to compile something.
+settings.register_profile("tests", deadline=None)
+settings.load_profile("tests")
+
+_DATA = Path(__file__).parents[2] / "shared" / "data"
+_HEIGHT_RANGE = {"elaphe": 0.375, "xenopeltis": 0.819}
+"""µm, black to white."""
+
+
+@pytest.fixture(scope="session", autouse=True)
+def cache_folder(tmp_path_factory):
+    """A folder for the spectra of recipes that lasts for this session only."""
+    folder = tmp_path_factory.mktemp("cache")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("MITSUBA_DIFFRACTION_CACHE", str(folder))
+        yield folder
+
+
+@pytest.fixture
+def scan_file():
+    """scan_file(name): the path of a measured scan."""
+
+    def find(name):
+        path = _DATA / f"{name}_afm_100x100.png"
+        if not path.is_file():
+            pytest.skip(f"{path.name} is not part of the repository, and {_DATA} does not hold it")
+        return path
+
+    return find
+
+
+@pytest.fixture
+def scan(scan_file):
+    """scan(name): the height field of a measured scan."""
+    return lambda name: md.read_height_field(scan_file(name), pixel_size=0.0586, height_range=_HEIGHT_RANGE[name])

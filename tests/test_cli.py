@@ -1,0 +1,267 @@
+"""The commands as a person meets them: one line for a mistake, a file for a success, nothing for an interrupt."""
+
+import importlib
+import shlex
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import drjit as dr
+import numpy as np
+import OpenEXR
+import pytest
+
+import mitsuba_diffraction as md
+from mitsuba_diffraction import cli
+
+# The package gives the function of that name.
+PRECOMPUTE = importlib.import_module("mitsuba_diffraction.precompute")
+BLAZE = '[surface]\nprofile = "blazed"\nperiod = 2.5\ndepth = 0.25\nsamples = 64\n'
+SCENE = """<scene version="3.0.0"><default name="spectrum" value="blaze.toml"/><integrator type="path"/>
+<sensor type="perspective"><transform name="to_world"><lookat origin="0,0,4" target="0,0,0" up="0,1,0"/></transform>
+<film type="hdrfilm"><integer name="width" value="16"/><integer name="height" value="16"/></film></sensor>
+<emitter type="constant"/><shape type="sphere"><bsdf type="diffraction_grating">
+<string name="filename" value="$spectrum"/></bsdf></shape></scene>"""
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    """Each test stands in a folder of its own, with a recipe and a scan."""
+    monkeypatch.chdir(tmp_path)
+    Path("blaze.toml").write_text(BLAZE)
+    np.save("scan.npy", np.random.default_rng(1).random((6, 8)) * 0.1)
+    np.save("counts.npy", np.arange(48, dtype=np.uint8).reshape(6, 8))
+    return tmp_path
+
+
+@pytest.fixture
+def command(monkeypatch, capfd):
+    """command(line) or command(*words): (exit code, stdout, stderr) of the command, in this process."""
+
+    def call(*words):
+        arguments = shlex.split(words[0]) if len(words) == 1 else words
+        monkeypatch.setattr(sys, "argv", [cli.NAME, *arguments])
+        # Warnings are shown, as they are to a person, and what shows them is put back afterwards.
+        with warnings.catch_warnings():
+            warnings.simplefilter("default")
+            with pytest.raises(SystemExit) as caught:
+                cli.main()
+        return caught.value.code, *capfd.readouterr()
+
+    return call
+
+
+def files():
+    return {path.name for path in Path().iterdir()}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ("", "command"),
+        ("frobnicate", "frobnicate"),
+        ("precompute", "Missing argument"),
+        ("precompute gone.toml", "gone.toml"),
+        ("precompute gone.npy --pixel-size 0.1", "gone.npy"),
+        ("precompute .", ""),
+        ("precompute blaze.toml --colour red", "--colour"),
+        ("precompute blaze.toml --tolerance fine", "--tolerance"),
+        ("precompute blaze.toml --tolerance 7", "tolerance: got 7"),
+        ("precompute blaze.toml --tolerance nan", "tolerance: got nan"),
+        ("precompute blaze.toml --coherence-length -3", "coherence_length: got -3"),
+        ("precompute blaze.toml --representation wavelets", "representation: got 'wavelets'"),
+        ("precompute blaze.toml --pixel-size 0.1", "--pixel-size"),
+        ("precompute blaze.toml -o out.png", "out.png"),
+        ("precompute blaze.toml -o out", "ends in .exr"),
+        ("precompute blaze.toml -o nowhere/out.exr", "nowhere/out.exr"),
+        ("precompute blaze.toml blaze.toml -o out.exr", "-o: got 2 sources"),
+        ("precompute scan.npy", "pixel_size"),
+        ("precompute scan.npy --pixel-size 0", "pixel_size: got 0"),
+        ("precompute scan.npy --pixel-size 0.05 --height-range 1", "height_range"),
+        ("precompute counts.npy --pixel-size 0.05", "height_range: missing"),
+        ("render", "Missing argument"),
+        ("render gone.xml", "gone.xml"),
+        ("render scene.xml -o out.png", "out.png"),
+        ("render scene.xml -o nowhere/out.exr", "nowhere"),
+        ("render scene.xml -D spectrum", "-D: got 'spectrum', wanted NAME=VALUE"),
+        ("render scene.xml -D =blaze.toml", "-D: got '=blaze.toml'"),
+        ("render scene.xml --spp 0", "--spp"),
+        ("render scene.xml --spp many", "--spp"),
+        ("render scene.xml --width 0", "--width"),
+        ("render scene.xml --seed -1", "--seed"),
+        ("render scene.xml --variant scalar_rgb", "scalar_rgb"),
+        ("render scene.xml --variant scalar_rgbx", "unknown"),
+        ("render scene.xml --variant scalar_spectral --spp 1 -D spectrum=gone.exr", "gone.exr"),
+        ("render scene.xml --variant scalar_spectral --spp 1 -D spectre=blaze.toml", "spectre"),
+    ],
+)
+def test_a_mistake_is_one_line_and_exit_code_2(command, arguments, words):
+    Path("scene.xml").write_text(SCENE)
+    before = files()
+    code, out, err = command(arguments)
+    assert code == 2
+    assert out == ""
+    assert len(err.splitlines()) == 1, err
+    assert err.startswith("mitsuba-diffraction: error: ")
+    assert words in err
+    assert "Traceback" not in err
+    assert files() == before
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[surface",
+        '[surface]\nprofile = "blased"\n',
+        '[surface]\nprofile = ["blazed"]\n',
+        "[surface]\nscan = 3\npixel_size = 0.05\n",
+        BLAZE + '[spectrum]\ntolerance = "fine"\n',
+        BLAZE + "[spectrum]\nwavelengths = 500\n",
+        BLAZE + 'typo = "\\u001b[31m\\n"\n',
+    ],
+)
+def test_a_recipe_that_is_wrong_is_one_line(command, text):
+    Path("wrong.toml").write_text(text)
+    code, out, err = command("precompute", "wrong.toml")
+    assert (code, out) == (2, "")
+    assert len(err.splitlines()) == 1, err
+    assert "\x1b" not in err
+
+
+def test_a_spectrum_cut_short_is_one_line(command):
+    Path("scene.xml").write_text(SCENE)
+    command("precompute", "blaze.toml")
+    content = Path("blaze.exr").read_bytes()
+    Path("blaze.exr").write_bytes(content[: len(content) * 3 // 4])
+    code, out, err = command("render scene.xml --variant scalar_spectral --spp 1 -D spectrum=blaze.exr")
+    assert (code, out) == (2, "")
+    assert len(err.splitlines()) == 1, err
+    assert "blaze.exr" in err
+
+
+def test_precompute_writes_the_file_that_it_names_and_says_its_error(command):
+    code, out, err = command("precompute", "blaze.toml")
+    assert (code, err.strip()) == (0, "")
+    spectrum = md.GratingSpectrum.load("blaze.exr")
+    assert out.startswith("blaze.exr: ")
+    assert len(out.splitlines()) == 1
+    for part in ("blazed grating", "2.5 × 2.5 µm", "27 × 1 orders", "MB", f"error {spectrum.error:.1e}", "0.001"):
+        assert part in out
+
+
+def test_options_go_before_the_recipe(command):
+    Path("blaze.toml").write_text(BLAZE + '[spectrum]\ntolerance = 0.1\nrepresentation = "slices"\n')
+    code, _, _ = command(
+        "precompute blaze.toml -o out.exr --tolerance 0.02 --representation taylor --coherence-length 20"
+    )
+    assert code == 0
+    spectrum = md.GratingSpectrum.load("out.exr")
+    assert (spectrum.tolerance, spectrum.representation, spectrum.coherence_length) == (0.02, "taylor", 20.0)
+
+
+def test_scans_with_their_scale(command):
+    code, _, _ = command("precompute counts.npy --pixel-size 0.05 --height-range 0.5 -o out.exr")
+    assert code == 0
+    spectrum = md.GratingSpectrum.load("out.exr")
+    assert spectrum.height_range == pytest.approx(47 / 255 * 0.5)
+    assert spectrum.pixel_size == (0.05, 0.05)
+    assert spectrum.source == "counts.npy"
+
+
+def test_many_sources_are_named_after_themselves(command):
+    Path("other.toml").write_text(BLAZE)
+    code, out, _ = command("precompute", "blaze.toml", "other.toml")
+    assert code == 0
+    assert [line.split(":")[0] for line in out.splitlines()] == ["blaze.exr", "other.exr"]
+    assert {"blaze.exr", "other.exr"} <= files()
+
+
+@pytest.mark.parametrize("name", ["a[red]b.exr", "a[b]c.exr", "a:smile:.exr", "é ü.exr"])
+def test_the_name_that_is_said_is_the_name_of_the_file(command, name):
+    # Regression: square brackets and words between colons were taken for markup.
+    code, out, _ = command("precompute", "blaze.toml", "-o", name)
+    assert code == 0
+    assert name in files()
+    assert out.startswith(f"{name}: ")
+    code, _, err = command("precompute", name.replace(".exr", ".toml"))
+    assert code == 2
+    assert name.replace(".exr", ".toml") in err
+
+
+def test_a_folder_whose_name_looks_like_markup_is_no_crash(command):
+    Path("dir[").mkdir()
+    code, out, _ = command("precompute", "blaze.toml", "-o", "dir[/x].exr")
+    assert code == 0
+    assert out.startswith("dir[/x].exr: ")
+
+
+def test_a_warning_is_a_line_and_not_a_failure(command):
+    code, out, err = command("precompute scan.npy --pixel-size 0.2 -o out.exr")
+    assert code == 0
+    assert "out.exr" in out
+    told = [line for line in err.splitlines() if line]
+    assert len(told) == 2  # one for each axis
+    assert all(line.startswith("mitsuba-diffraction: warning: pixels of 200 nm along ") for line in told)
+
+
+@pytest.mark.parametrize("place", ["precompute", "save"])
+def test_an_interrupt_leaves_no_file(command, monkeypatch, place):
+    def interrupted(*arguments, **named):
+        raise KeyboardInterrupt
+
+    if place == "precompute":
+        monkeypatch.setattr(PRECOMPUTE, "_slices", interrupted)
+    else:
+        monkeypatch.setattr(OpenEXR.File, "write", interrupted, raising=True)
+    before = files()
+    code, out, err = command("precompute", "blaze.toml")
+    assert (code, out) == (1, "")
+    assert err.strip() == "mitsuba-diffraction: interrupted: nothing was written"
+    assert files() == before
+
+
+@pytest.mark.parametrize("error", [MemoryError(), OSError("disk full"), RuntimeError("no luck")])
+def test_a_failure_is_one_line_and_exit_code_1(command, monkeypatch, error):
+    def fail(*arguments, **named):
+        raise error
+
+    monkeypatch.setattr(PRECOMPUTE, "_slices", fail)
+    code, out, err = command("precompute", "blaze.toml")
+    assert (code, out) == (1, "")
+    assert err.strip() == f"mitsuba-diffraction: error: {str(error) or 'MemoryError'}"
+
+
+def test_help_is_for_asking(command):
+    code, out, _ = command("--help")
+    assert code == 0
+    assert "precompute" in out
+    assert "render" in out
+
+
+def test_render_writes_a_spectral_picture_and_a_preview(command):
+    if not dr.has_backend(dr.JitBackend.LLVM):
+        pytest.skip("Dr.Jit finds no LLVM")
+    Path("scene.xml").write_text(SCENE)
+    code, out, err = command(
+        "render scene.xml -o out.exr --spp 2 --width 8 --variant llvm_ad_spectral -D spectrum=blaze.toml"
+    )
+    assert (code, err.strip()) == (0, "")
+    channels = OpenEXR.File("out.exr", separate_channels=True).channels()
+    assert channels["R"].pixels.shape == (8, 8)
+    assert any(name.startswith("S0.") and name.endswith("nm") for name in channels)
+    assert np.isfinite(channels["G"].pixels).all()
+    assert channels["G"].pixels[4, 4] > 0
+    assert out.startswith("out.exr: 8 × 8 pixels")
+    assert "out.png" in files()
+
+
+def test_the_installed_command_ends_with_its_exit_code(folder):
+    program = Path(sys.executable).with_name("mitsuba-diffraction")
+    start = (
+        [str(program)] if program.is_file() else [sys.executable, "-c", "import mitsuba_diffraction.cli as c; c.main()"]
+    )
+    done = subprocess.run([*start, "precompute", "gone.toml"], cwd=folder, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr == "mitsuba-diffraction: error: gone.toml: no such file\n"

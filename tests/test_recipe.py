@@ -1,0 +1,310 @@
+"""Recipes: what they refuse, what they build, and a cache that is keyed by content."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mitsuba_diffraction as md
+from mitsuba_diffraction import GratingSpectrum, Recipe
+from mitsuba_diffraction import recipe as recipe_module
+
+RECIPES = sorted((Path(__file__).parents[1] / "precompute").glob("*.toml"))
+BLAZE = '[surface]\nprofile = "blazed"\nperiod = 2.5\ndepth = 0.25\n'
+FAST = {"tolerance": 0.01}
+
+
+def write(folder, text, name="recipe.toml"):
+    path = folder / name
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def write_scan(folder, seed=0, name="scan.npy"):
+    heights = np.random.default_rng(seed).random((6, 8)) * 0.1
+    np.save(folder / name, heights)
+    return heights
+
+
+def powers(spectrum):
+    return spectrum.table.powers
+
+
+@pytest.fixture
+def own_cache(tmp_path, monkeypatch):
+    """An empty cache; gives the folder."""
+    folder = tmp_path / "cache" / "of its own"
+    monkeypatch.setenv("MITSUBA_DIFFRACTION_CACHE", str(folder))
+    return folder
+
+
+@pytest.fixture
+def builds(monkeypatch):
+    """The surfaces that were computed, not read from the cache, since the test began."""
+    computed = []
+
+    def spy(height_field, **arguments):
+        computed.append(height_field.digest)
+        return md.precompute(height_field, **arguments)
+
+    monkeypatch.setattr(recipe_module, "precompute", spy)
+    return computed
+
+
+# ---------------------------------------------------------------- what is refused
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "wanted either a profile or a scan"),
+        ("[surface]\n", "wanted either a profile or a scan"),
+        ('[surface]\nprofile = "blazed"\nscan = "a.npy"\n', "wanted either a profile or a scan"),
+        ('[surface]\nprofile = "blased"\n', "'blased'"),
+        ('[surface]\nprofile = ["blazed"]\n', "profile"),
+        ("[surface]\nprofile = 3\n", "profile"),
+        ('[surface]\nscan = "a.npy"\npixelsize = 1\n', "pixelsize"),
+        ('surface = "blazed"\n', r"\[surface\]"),
+        (BLAZE + "[spectrum]\nresolution = 3\n", "resolution"),
+        (BLAZE + "[spectra]\ntolerance = 0.1\n", "spectra"),
+        ("spectrum = 3\n" + BLAZE, r"\[spectrum\]"),
+        ("[surface\n", "not a TOML file"),
+        ("\x00", "not a TOML file"),
+    ],
+)
+def test_recipes_that_are_none_are_refused(tmp_path, text, message):
+    path = write(tmp_path, text)
+    with pytest.raises(ValueError, match=message) as caught:
+        Recipe.load(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_bytes_that_are_no_text_are_refused(tmp_path):
+    (tmp_path / "recipe.toml").write_bytes(b"\xff\xfe[surface]")
+    with pytest.raises(ValueError, match=r"recipe.toml: not a TOML file"):
+        Recipe.load(tmp_path / "recipe.toml")
+
+
+def test_a_recipe_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"nothing\.toml: no such file"):
+        Recipe.load(tmp_path / "nothing.toml")
+    with pytest.raises(OSError, match=tmp_path.name):
+        Recipe.load(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("entry", "name"),
+    [
+        ('tolerance = "fine"', "tolerance"),
+        ("tolerance = 0", "tolerance"),
+        ("tolerance = nan", "tolerance"),
+        ("tolerance = [0.1]", "tolerance"),
+        ('coherence_length = "65"', "coherence_length"),
+        ("coherence_length = -1", "coherence_length"),
+        ("coherence_length = [1, 2]", "coherence_length"),
+        ("wavelengths = 500", "wavelengths"),
+        ("wavelengths = [360]", "wavelengths"),
+        ("wavelengths = [830, 360]", "wavelengths"),
+        ('wavelengths = ["blue", "red"]', "wavelengths"),
+        ('representation = "wavelets"', "representation"),
+        ("representation = 1", "representation"),
+        ('extent = "ribbon"', "extent"),
+        ("extent = 5", "extent"),
+    ],
+)
+def test_values_of_the_spectrum_that_cannot_be_are_refused_by_name(tmp_path, entry, name):
+    path = write(tmp_path, f"{BLAZE}[spectrum]\n{entry}\n")
+    with pytest.raises(ValueError, match=f"{name}: ") as caught:
+        Recipe.load(path).build()
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("entries", "name"),
+    [
+        ("perid = 2.5\ndepth = 0.1", "perid"),
+        ("period = 2.5", "depth"),
+        ('period = "wide"\ndepth = 0.1', "period"),
+        ("period = 2.5\ndepth = -1", "depth"),
+        ("period = 1979-05-27\ndepth = 0.1", "period"),
+        ("period = [2.5]\ndepth = 0.1", "period"),
+    ],
+)
+@pytest.mark.parametrize("way", ["build", "cached"])
+def test_values_of_a_profile_that_cannot_be_are_refused_by_name(tmp_path, entries, name, way):
+    path = write(tmp_path, f'[surface]\nprofile = "blazed"\n{entries}\n')
+    with pytest.raises(ValueError, match=name):
+        getattr(Recipe.load(path), way)()
+
+
+@pytest.mark.parametrize(
+    ("entries", "name"),
+    [
+        ('scan = "scan.npy"', "pixel_size"),
+        ('scan = "scan.npy"\npixel_size = -1', "pixel_size"),
+        ('scan = "scan.npy"\npixel_size = "0.1"', "pixel_size"),
+        ('scan = "scan.npy"\npixel_size = [1, 2, 3]', "pixel_size"),
+        ('scan = "scan.npy"\npixel_size = 0.05\nheight_range = 0.1', "height_range"),
+        ("scan = 3\npixel_size = 0.05", "scan"),
+        ('scan = ["scan.npy"]\npixel_size = 0.05', "scan"),
+    ],
+)
+@pytest.mark.parametrize("way", ["build", "cached"])
+def test_values_of_a_scan_that_cannot_be_are_refused_by_name(tmp_path, own_cache, entries, name, way):
+    write_scan(tmp_path)
+    path = write(tmp_path, f"[surface]\n{entries}\n")
+    with pytest.raises(ValueError, match=name):
+        getattr(Recipe.load(path), way)()
+    assert not own_cache.exists() or not list(own_cache.iterdir())
+
+
+@pytest.mark.parametrize("way", ["build", "cached", "digest"])
+def test_a_scan_that_is_not_there_is_named(tmp_path, way):
+    path = write(tmp_path, '[surface]\nscan = "gone.npy"\npixel_size = 0.05\n')
+    with pytest.raises(FileNotFoundError, match=r"gone\.npy"):
+        getattr(Recipe.load(path), way)()
+
+
+# ---------------------------------------------------------------- what is built
+
+
+def test_a_recipe_builds_what_its_words_say(tmp_path):
+    path = write(
+        tmp_path,
+        BLAZE + 'samples = 64\n[spectrum]\nextent = "tile"\ncoherence_length = 30\nwavelengths = [400, 700.0]\n'
+        'representation = "taylor"\ntolerance = 1e-2\n',
+    )
+    got = Recipe.load(path).build()
+    wanted = md.precompute(
+        md.gratings.blazed(2.5, 0.25, samples=64),
+        coherence_length=30.0,
+        wavelengths=(400.0, 700.0),
+        representation="taylor",
+        tolerance=1e-2,
+    )
+    assert (got.representation, got.wavelengths, got.coherence_length) == ("taylor", (400.0, 700.0), 30.0)
+    assert got.source_digest == wanted.source_digest
+    np.testing.assert_array_equal(got.table.coefficients, wanted.table.coefficients)
+
+
+def test_a_scan_is_relative_to_its_recipe(tmp_path, monkeypatch):
+    (tmp_path / "scans").mkdir()
+    heights = write_scan(tmp_path / "scans")
+    path = write(tmp_path, '[surface]\nscan = "scans/scan.npy"\npixel_size = [0.05, 0.08]\n')
+    monkeypatch.chdir("/")
+    field = Recipe.load(path).height_field()
+    np.testing.assert_array_equal(field.heights, heights)
+    assert field.pixel_size == (0.05, 0.08)
+
+
+def test_a_measured_skin_by_recipe(tmp_path, scan_file, scan):
+    text = f'[surface]\nscan = "{scan_file("elaphe")}"\npixel_size = 0.0586\nheight_range = 0.375\n'
+    assert Recipe.load(write(tmp_path, text)).height_field().digest == scan("elaphe").digest
+
+
+@pytest.mark.parametrize("path", RECIPES, ids=lambda path: path.name)
+def test_the_recipes_of_this_repository_build(path):
+    recipe = Recipe.load(path)
+    spectrum = Recipe(recipe.surface, {**recipe.spectrum, "tolerance": 0.2}, recipe.folder).build()
+    assert spectrum.error <= 0.2
+    assert spectrum.height_range == pytest.approx(recipe.surface["depth"], rel=0.01)
+    assert spectrum.coherence_length == recipe.spectrum.get("coherence_length", 65.0)
+
+
+def test_there_are_recipes_in_this_repository():
+    assert {path.stem for path in RECIPES} >= {"blaze", "elaphe", "xenopeltis"}
+
+
+# ---------------------------------------------------------------- the cache
+
+
+def test_the_cache_is_read_the_second_time(own_cache, builds):
+    recipe = Recipe({"profile": "blazed", "period": 2.5, "depth": 0.25, "samples": 64}, FAST)
+    first, second = recipe.cached(), recipe.cached()
+    assert len(builds) == 1
+    assert [path.name for path in own_cache.iterdir()] == [f"{recipe.digest()}.exr"]
+    np.testing.assert_array_equal(powers(first), powers(second))
+    assert (first.error, first.source, first.orders) == (second.error, second.source, second.orders)
+
+
+@pytest.mark.parametrize(
+    ("surface", "spectrum"),
+    [
+        ({"depth": 0.26}, {}),
+        ({"period": 2.6}, {}),
+        ({"profile": "sinusoidal"}, {}),
+        ({}, {"tolerance": 0.02}),
+        ({}, {"coherence_length": 60.0}),
+        ({}, {"wavelengths": [400, 700]}),
+        ({}, {"representation": "taylor"}),
+    ],
+)
+def test_another_parameter_is_another_spectrum(own_cache, builds, surface, spectrum):
+    base = {"profile": "blazed", "period": 2.5, "depth": 0.25, "samples": 64}
+    one, other = Recipe(base, FAST), Recipe({**base, **surface}, {**FAST, **spectrum})
+    assert one.digest() != other.digest()
+    one.cached()
+    got = other.cached()
+    assert len(builds) == 2
+    wanted = other.build()
+    for name in ("representation", "wavelengths", "coherence_length", "tolerance", "source_digest"):
+        assert getattr(got, name) == getattr(wanted, name)
+
+
+def test_the_cache_knows_a_scan_by_its_bytes(tmp_path, own_cache, builds):
+    text = '[surface]\nscan = "scan.npy"\npixel_size = 0.05\n[spectrum]\ntolerance = 0.01\n'
+    here, there = tmp_path / "here", tmp_path / "there"
+    for folder in (here, there):
+        folder.mkdir()
+        write_scan(folder, seed=0)
+        write(folder, text)
+    first = Recipe.load(here / "recipe.toml").cached()
+    Recipe.load(there / "recipe.toml").cached()
+    assert len(builds) == 1  # the same content in another folder
+    shutil.move(there / "scan.npy", there / "other.npy")
+    write(there, text.replace("scan.npy", "other.npy"))
+    Recipe.load(there / "recipe.toml").cached()
+    assert len(builds) == 1  # … and under another name
+    heights = write_scan(here, seed=1)
+    changed = Recipe.load(here / "recipe.toml").cached()
+    assert len(builds) == 2
+    assert changed.source_digest != first.source_digest
+    assert changed.source_digest == md.HeightField(heights, 0.05).digest
+
+
+@pytest.mark.parametrize("damage", [b"", b"not a picture", None])
+def test_a_damaged_entry_is_built_anew(own_cache, builds, damage):
+    recipe = Recipe({"profile": "blazed", "period": 2.5, "depth": 0.25, "samples": 64}, FAST)
+    whole = recipe.cached()
+    (path,) = own_cache.iterdir()
+    path.write_bytes(path.read_bytes()[:-20] if damage is None else damage)
+    got = recipe.cached()
+    assert len(builds) == 2
+    np.testing.assert_array_equal(powers(got), powers(whole))
+    np.testing.assert_array_equal(powers(GratingSpectrum.load(path)), powers(whole))
+
+
+def test_an_interrupted_build_leaves_nothing(own_cache, monkeypatch):
+    def interrupted(height_field, **arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(recipe_module, "precompute", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        Recipe({"profile": "blazed", "period": 2.5, "depth": 0.25}).cached()
+    assert not own_cache.exists() or not list(own_cache.iterdir())
+
+
+def test_digest_does_not_depend_on_the_order_of_the_words():
+    one = Recipe({"profile": "blazed", "period": 2.5, "depth": 0.25})
+    assert one.digest() == Recipe({"depth": 0.25, "profile": "blazed", "period": 2.5}).digest()
+
+
+def test_the_cache_is_the_users_unless_named(monkeypatch, tmp_path):
+    monkeypatch.delenv("MITSUBA_DIFFRACTION_CACHE")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert "mitsuba_diffraction" in str(recipe_module.cache_folder())
+    monkeypatch.setenv("MITSUBA_DIFFRACTION_CACHE", "elsewhere")
+    assert recipe_module.cache_folder() == Path("elsewhere")

@@ -1,0 +1,266 @@
+import gc
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from PIL import Image
+
+import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a variant is set)
+from mitsuba_diffraction.color import spectrum_to_linear_sRGB
+from mitsuba_diffraction.render import passes, render
+from mitsuba_diffraction.render.scene import channel_wavelengths, load_spectral_scene
+
+GRID = channel_wavelengths()
+CONSTANT = '<emitter type="constant"><spectrum name="radiance" value="1"/></emitter>'
+SPHERE = '<shape type="sphere"><bsdf type="diffuse"/></shape>'
+FILM = """<film type="hdrfilm"><integer name="width" value="$width"/><integer name="height" value="8"/>
+    <rfilter type="box"/></film>"""
+SENSOR = """<sensor type="perspective"><transform name="to_world"><lookat origin="0,0,4" target="0,0,0" up="0,1,0"/>
+    </transform><sampler type="independent"/>{film}</sensor>"""
+
+
+def write_scene(folder, content, film=FILM, sensor=SENSOR):
+    path = folder / "scene.xml"
+    path.write_text(
+        f"""<scene version="3.0.0"><default name="width" value="8"/><integrator type="path"/>
+        {sensor.format(film=film)}{content}</scene>"""
+    )
+    return path
+
+
+def spectrum(name, first, last, values):
+    return f"""<spectrum name="{name}" type="regular"><float name="wavelength_min" value="{first}"/>
+        <float name="wavelength_max" value="{last}"/><string name="values" value="{values}"/></spectrum>"""
+
+
+def use(variant):
+    if variant.startswith("llvm") and not dr.has_backend(dr.JitBackend.LLVM):
+        pytest.skip("Dr.Jit finds no LLVM")
+    mi.set_variant(variant)
+
+
+@pytest.fixture
+def llvm():
+    use("llvm_ad_spectral")
+
+
+@pytest.mark.parametrize(
+    ("variant", "spp", "tolerance"),
+    [("llvm_ad_spectral", 8192, 0.06), ("llvm_ad_spectral_polarized", 4096, 0.09), ("scalar_spectral", 32, 0.6)],
+)
+def test_constant_radiance_of_one_per_nm_is_one_in_every_channel(variant, spp, tolerance, tmp_path):
+    use(variant)
+    image = render(write_scene(tmp_path, CONSTANT), spp=spp)
+    assert image.radiance.shape == (8, 8, GRID.size)
+    np.testing.assert_array_equal(image.wavelengths, GRID)
+    means = image.radiance.mean((0, 1))
+    np.testing.assert_allclose(means, 1, atol=tolerance)
+    np.testing.assert_allclose(means.mean(), 1, atol=tolerance / 6)
+
+
+def test_ramp(llvm, tmp_path):
+    ramp = f'<emitter type="constant">{spectrum("radiance", 360, 830, "0, 4.7")}</emitter>'
+    image = render(write_scene(tmp_path, ramp), spp=8192)
+    means = image.radiance.mean((0, 1))
+    np.testing.assert_allclose(means / ((GRID - 360) / 100), 1, atol=0.06)
+
+
+def test_line_of_a_directional_light_is_in_its_channel(llvm, tmp_path):
+    # A triangle around 505 nm seen through hats of the same width: 2/3, and 1/6 in both neighbours.
+    light = '<emitter type="directional"><vector name="direction" x="0" y="0" z="-1"/>'
+    light += spectrum("irradiance", 500, 510, "0, 1, 0") + "</emitter>"
+    wall = '<shape type="rectangle"><transform name="to_world"><scale value="9"/></transform>'
+    wall += '<bsdf type="diffuse"><spectrum name="reflectance" value="0.5"/></bsdf></shape>'
+    image = render(write_scene(tmp_path, light + wall), spp=4096)
+    means = image.radiance.mean((0, 1)) * np.pi / 0.5
+    at = int(np.argmin(np.abs(GRID - 505)))
+    np.testing.assert_allclose(means[at - 1 : at + 2], [1 / 6, 2 / 3, 1 / 6], rtol=0.08)
+    assert (np.delete(means, [at - 1, at, at + 1]) == 0).all()
+
+
+def test_rgb_is_that_of_mitsubas_own_film(llvm, tmp_path):
+    path = write_scene(tmp_path, SPHERE + '<emitter type="constant"/>')
+    image = render(path, spp=2048)
+    own = np.array(mi.render(mi.load_file(str(path)), spp=2048))
+    np.testing.assert_allclose(
+        spectrum_to_linear_sRGB(image.radiance, GRID).mean((0, 1)), own[..., :3].mean((0, 1)), rtol=0.01
+    )
+
+
+def test_passes(llvm, tmp_path, monkeypatch):
+    path = write_scene(tmp_path, SPHERE + CONSTANT)
+    whole = render(path, spp=512, seed=3)
+    again = render(path, spp=512, seed=3)
+    np.testing.assert_array_equal(whole.radiance, again.radiance)
+    assert (render(path, spp=512, seed=4).radiance != whole.radiance).any()
+    assert whole.attributes == {"scene": "scene.xml", "variant": "llvm_ad_spectral", "spp": 512, "seed": "3"}
+
+    calls, fresh = [], []
+
+    def progress(done, total):
+        calls.append((done, total))
+        fresh.append([kernel["hash"] for kernel in dr.kernel_history((dr.KernelType.JIT,)) if not kernel["cache_hit"]])
+
+    monkeypatch.setattr(passes, "_SAMPLES_PER_PASS", 64 * 150)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        split = render(path, spp=512, seed=3, progress=progress)
+    assert calls == [(128, 512), (256, 512), (384, 512), (512, 512)]
+    assert fresh[1:] == [[], [], []]  # nothing is compiled again
+    # Per channel the two differ by noise only, and the split one is not one pass repeated.
+    np.testing.assert_allclose(split.radiance.mean((0, 1)), whole.radiance.mean((0, 1)), rtol=0.25)
+    np.testing.assert_allclose(split.radiance.mean(), whole.radiance.mean(), rtol=0.01)
+    spread = [np.std(picture.radiance[0, 0]) for picture in (split, whole)]
+    assert spread[0] < 1.4 * spread[1]
+
+
+def test_uneven_passes(llvm, tmp_path, monkeypatch):
+    monkeypatch.setattr(passes, "_SAMPLES_PER_PASS", 64 * 3)
+    calls = []
+    image = render(write_scene(tmp_path, CONSTANT), spp=7, progress=lambda done, total: calls.append(done))
+    assert calls == [2, 4, 7]
+    np.testing.assert_allclose(image.radiance.mean(), 1, atol=0.1)
+    monkeypatch.setattr(passes, "_SAMPLES_PER_PASS", 1)
+    render(write_scene(tmp_path, CONSTANT), spp=2, progress=lambda done, total: calls.append(done))
+    assert calls[3:] == [1, 2]  # never less than one sample per pixel
+
+
+def film_of(path, **sizes):
+    return load_spectral_scene(path, **sizes).sensors()[0].film()
+
+
+def test_size_crop_and_filter(llvm, tmp_path):
+    film = """<film type="hdrfilm"><integer name="width" value="40"/><integer name="height" value="20"/>
+        <integer name="crop_offset_x" value="10"/><integer name="crop_offset_y" value="4"/>
+        <integer name="crop_width" value="20"/><integer name="crop_height" value="8"/>
+        <string name="pixel_format" value="rgba"/><rfilter type="tent"/></film>"""
+    path = write_scene(tmp_path, CONSTANT, film=film)
+    kept = film_of(path)
+    assert (list(kept.size()), list(kept.crop_size()), list(kept.crop_offset())) == ([40, 20], [20, 8], [10, 4])
+    assert "TentFilter" in str(kept)
+    for sizes in ({"width": 20}, {"height": 10}, {"width": 20, "height": 10}):
+        scaled = film_of(path, **sizes)
+        assert list(scaled.size()) == [20, 10]
+        assert (list(scaled.crop_size()), list(scaled.crop_offset())) == ([10, 4], [5, 2])
+    assert list(film_of(path, width=7, height=30).size()) == [7, 30]
+    assert list(film_of(path, width=1).crop_size()) == [1, 1]
+
+
+def test_spectral_film_of_the_scene_is_replaced_too(llvm, tmp_path):
+    band = spectrum("band", 500, 600, "1, 1")
+    film = f'<film type="specfilm"><integer name="width" value="3"/><integer name="height" value="2"/>{band}</film>'
+    image = render(write_scene(tmp_path, CONSTANT, film=film), spp=1)
+    assert image.radiance.shape == (2, 3, GRID.size)
+
+
+def test_sensor_without_film(llvm, tmp_path):
+    assert list(film_of(write_scene(tmp_path, CONSTANT, film=""), width=16).size()) == [16, 12]
+
+
+def test_parameters(llvm, tmp_path):
+    path = write_scene(tmp_path, CONSTANT)
+    assert render(path, spp=1, parameters={"width": "5"}).radiance.shape[1] == 5
+    with pytest.raises(ValueError, match=r"\$nonsense=1") as caught:
+        render(path, spp=1, parameters={"nonsense": "1"})
+    assert "\n" not in str(caught.value)
+
+
+def test_files_are_sought_beside_the_scene(llvm, tmp_path, monkeypatch):
+    folder, elsewhere = tmp_path / "scenes", tmp_path / "elsewhere"
+    folder.mkdir()
+    elsewhere.mkdir()
+    Image.new("RGB", (2, 2), (255, 255, 255)).save(folder / "white.png")
+    texture = '<texture type="bitmap" name="reflectance"><string name="filename" value="white.png"/></texture>'
+    write_scene(folder, f'<shape type="sphere"><bsdf type="diffuse">{texture}</bsdf></shape>{CONSTANT}')
+    monkeypatch.chdir(elsewhere)
+    before = str(mi.file_resolver())
+    load_spectral_scene("../scenes/scene.xml")
+    assert str(mi.file_resolver()) == before
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ('<shape type="nonesuch"/>', "nonesuch"),
+        ('<shape type="sphere"><float name="radiu" value="1"/></shape>', "radiu"),
+        ('<shape type="sphere">', "failed"),
+        ('<integrator type="path"/>', "Only one integrator"),
+        ('<bsdf type="unbuildable"/>', "no such grating"),
+    ],
+)
+def test_wrong_scenes_give_one_line(llvm, tmp_path, content, message):
+    class Unbuildable(mi.BSDF):
+        def __init__(self, props):
+            raise ValueError("no such grating")
+
+    mi.register_bsdf("unbuildable", Unbuildable)
+    with pytest.raises(ValueError, match=message) as caught:
+        render(write_scene(tmp_path, content), spp=1)
+    assert "\n" not in str(caught.value)
+    assert "Traceback" not in str(caught.value)
+
+
+def test_wrong_requests(llvm, tmp_path):
+    path = write_scene(tmp_path, CONSTANT)
+    with pytest.raises(FileNotFoundError, match=r"none\.xml"):
+        render(tmp_path / "none.xml", spp=1)
+    for request in ({"spp": 0}, {"spp": 1, "width": 0}, {"spp": 1, "height": -3}, {"spp": 1, "seed": -1}):
+        with pytest.raises(ValueError, match="wanted"):
+            render(path, **request)
+    with pytest.raises(ValueError, match="no sensor"):
+        render(write_scene(tmp_path, CONSTANT, sensor=""), spp=1)
+    (tmp_path / "shape.xml").write_text('<shape version="3.0.0" type="sphere"/>')
+    with pytest.raises(ValueError, match=r"shape\.xml"):
+        render(tmp_path / "shape.xml", spp=1)
+    mi.set_variant("scalar_rgb")
+    with pytest.raises(ValueError, match="got 'scalar_rgb', wanted a spectral one"):
+        render(path, spp=1)
+
+
+def test_integrators_with_other_channels_are_refused(llvm, tmp_path):
+    path = write_scene(tmp_path, SPHERE + CONSTANT)
+    aov = '<integrator type="aov"><string name="aovs" value="z:depth"/><integrator type="path"/></integrator>'
+    path.write_text(path.read_text().replace('<integrator type="path"/>', aov))
+    with pytest.raises(ValueError, match="wanted radiance alone"):
+        render(path, spp=1)
+
+
+@pytest.mark.parametrize(
+    ("raised", "expected", "message"),
+    [
+        (ZeroDivisionError, RuntimeError, "rendering failed: the order is zero"),
+        (KeyboardInterrupt, KeyboardInterrupt, "the order is zero"),
+    ],
+)
+def test_failing_and_interrupted_renderings(llvm, tmp_path, raised, expected, message):
+    class Failing(mi.BSDF):
+        def __init__(self, props):
+            super().__init__(props)
+            self.m_flags = mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.FrontSide
+            self.m_components = [self.m_flags]
+
+        def sample(self, ctx, si, sample1, sample2, active):
+            raise raised("the order is zero")
+
+        def eval_pdf(self, ctx, si, wo, active):
+            raise raised("the order is zero")
+
+    mi.register_bsdf("failing", Failing)
+    path = write_scene(tmp_path, f'<shape type="sphere"><bsdf type="failing"/></shape>{CONSTANT}')
+    with pytest.raises(expected) as caught:
+        render(path, spp=1)
+    assert str(caught.value) == message
+    assert [file.name for file in tmp_path.iterdir()] == ["scene.xml"]
+    # Dr.Jit calls every BSDF that lives: the exception, which holds the scene, must not outlive this test.
+    del caught
+    gc.collect()
+
+
+def test_interrupt_between_passes(llvm, tmp_path, monkeypatch):
+    monkeypatch.setattr(passes, "_SAMPLES_PER_PASS", 64)
+
+    def interrupt(done, total):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        render(write_scene(tmp_path, CONSTANT), spp=4, progress=interrupt)
