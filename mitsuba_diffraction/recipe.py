@@ -24,6 +24,7 @@ import hashlib
 import json
 import os
 import sys
+import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -47,6 +48,8 @@ _SCAN_KEYS = frozenset({"scan", "pixel_size", "height_range"})
 _SPECTRUM_KEYS = frozenset({"extent", "coherence_length", "wavelengths", "representation", "tolerance"})
 # Raised when the same input gives other numbers than before, so that the cache is not read.
 _BUILD_VERSION = 1
+# Mitsuba constructs plugins on several threads; two that name one recipe must not build it twice.
+_building = threading.Lock()
 
 
 @dataclass(frozen=True)
@@ -152,16 +155,17 @@ class Recipe:
 
         The cache is a folder of spectra named by `digest`: $MITSUBA_DIFFRACTION_CACHE, or the user's cache folder.
         """
-        path = cache_folder() / f"{self.digest()}.exr"
-        if path.is_file():
-            try:
-                return GratingSpectrum.load(path)
-            except ValueError:
-                path.unlink()  # damaged from outside; built anew below
-        spectrum = self.build(progress)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        spectrum.save(path)
-        return spectrum
+        with _building:
+            path = cache_folder() / f"{self.digest()}.exr"
+            if path.is_file():
+                try:
+                    return GratingSpectrum.load(path)
+                except ValueError:
+                    path.unlink()  # damaged from outside; built anew below
+            spectrum = self.build(progress)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            spectrum.save(path)
+            return spectrum
 
 
 def cache_folder() -> Path:
