@@ -63,7 +63,7 @@ def _precompute(
         with _progress(f"spectrum of {source.name}") as progress:
             spectrum = _spectrum(source, pixel_size, height_range, settings, progress)
             spectrum.save(target)
-        x, y = spectrum.orders.tile_size
+        x, y = spectrum.grid.tile_size
         _tell(
             f"{target}: {spectrum.source}; {x:.4g} × {y:.4g} µm, {spectrum.table.shape[1]} × {spectrum.table.shape[0]} "
             f"orders, {spectrum.representation}, {spectrum.megabytes:.3g} MB, error {spectrum.error:.1e} "

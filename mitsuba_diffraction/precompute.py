@@ -71,7 +71,7 @@ def precompute(
     )
     return GratingSpectrum(
         table=table,
-        orders=orders,
+        grid=orders,
         pixel_size=height_field.pixel_size,
         height_range=height_field.height_range,
         coherence_length=float(coherence_length),
@@ -129,8 +129,7 @@ def _measured(
     golden = (np.sqrt(5) - 1) / 2
     held_out = largest_kappa * np.concatenate([[0.0, 1.0], np.sqrt((np.arange(1, count) * golden) % 1)])
     return max(
-        float(np.abs(table.order_powers(kappa) - orders.take(order_powers(height_field, kappa))).sum())
-        for kappa in held_out
+        float(np.abs(table.powers(kappa) - orders.take(order_powers(height_field, kappa))).sum()) for kappa in held_out
     )
 
 

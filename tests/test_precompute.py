@@ -275,9 +275,9 @@ def test_auto_takes_a_representation_that_keeps_the_tolerance():
 
 def test_the_orders_are_those_that_light_reaches():
     spectrum = precompute(md.gratings.blazed(2.5, 0.25))
-    assert spectrum.orders.largest == (13, 0)  # 13/2.5 = 5.2 ≤ 2/0.36 = 5.56 < 14/2.5
+    assert spectrum.grid.largest == (13, 0)  # 13/2.5 = 5.2 ≤ 2/0.36 = 5.56 < 14/2.5
     spectrum = precompute(md.gratings.blazed(2.5, 0.25), wavelengths=(500.0, 600.0))
-    assert spectrum.orders.largest == (10, 0)
+    assert spectrum.grid.largest == (10, 0)
     assert spectrum.largest_kappa == pytest.approx(4 * np.pi / 0.5)
 
 
@@ -288,7 +288,7 @@ def test_pixels_too_coarse_are_told(pixel, axis):
         spectrum = precompute(field)
     assert len(caught) == 1
     assert caught[0].filename == __file__
-    for size, count, largest in zip(field.pixel_size, (7, 6), spectrum.orders.largest, strict=True):
+    for size, count, largest in zip(field.pixel_size, (7, 6), spectrum.grid.largest, strict=True):
         assert largest / (count * size) < 1 / (2 * size)
 
 

@@ -205,7 +205,7 @@ def define() -> type:
             return dr.select(diffuse, mi.warp.square_to_cosine_hemisphere(v), mi.Vector3f(x, y, z))
 
         def to_string(self) -> str:
-            x, y = self.spectrum.orders.tile_size
+            x, y = self.spectrum.grid.tile_size
             lines = [
                 f"spectrum = {self.spectrum.source}",
                 f"tile = {x:.4g} x {y:.4g} um",

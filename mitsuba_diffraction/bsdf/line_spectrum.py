@@ -22,14 +22,14 @@ class LineSpectrum:
     def __init__(self, spectrum: GratingSpectrum) -> None:
         self.power = order_power(spectrum.table)
         self.sampler = OrderSampler(spectrum)
-        self.largest_x, self.largest_y = spectrum.orders.largest
-        self.columns = spectrum.orders.shape[1]
+        self.largest_x, self.largest_y = spectrum.grid.largest
+        self.columns = spectrum.grid.shape[1]
         self.count_x, self.count_y = spectrum.neighbours
         sigma, reach = spectrum.lobe_width, spectrum.reach
         self.lobe_width = opaque(sigma)
         self.inside = opaque(-np.expm1(-(reach**2) / 2))  # the share of the Gaussian within its reach
         self.radius = opaque(reach * sigma)
-        self.tile_x, self.tile_y = (opaque(t) for t in spectrum.orders.tile_size)
+        self.tile_x, self.tile_y = (opaque(t) for t in spectrum.grid.tile_size)
 
     @dr.syntax
     def evaluate(

@@ -28,7 +28,7 @@ class OrderSampler:
 
     def __init__(self, spectrum: GratingSpectrum) -> None:
         self.cell_width = opaque(spectrum.largest_kappa / CELLS)
-        self.rows, self.columns = spectrum.orders.shape
+        self.rows, self.columns = spectrum.grid.shape
         averages = np.stack([_average(spectrum, cell).ravel() for cell in range(CELLS)])
         self.shares = PacketTable(averages.T)
         self.aliases = _PairTable(np.stack([np.stack(alias_table(average), -1) for average in averages]))
@@ -79,7 +79,7 @@ def _average(spectrum: GratingSpectrum, cell: int) -> NDArray[np.float64]:
     # η_m oscillates in κ with the angular frequency of the height range at most.
     points = int(np.ceil(width * spectrum.height_range)) + 2
     nodes = (cell + (np.arange(points) + 0.5) / points) * width
-    total = sum(spectrum.order_powers(kappa).astype(np.float64) for kappa in nodes)
+    total = sum(spectrum.powers(kappa).astype(np.float64) for kappa in nodes)
     return total / total.sum()
 
 

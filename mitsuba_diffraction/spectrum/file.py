@@ -64,7 +64,7 @@ def save(spectrum: GratingSpectrum, path: str | os.PathLike[str]) -> None:
         "extent": spectrum.extent,
         "heightRange": _doubles(spectrum.height_range),
         "pixelSize": _doubles(*spectrum.pixel_size),
-        "tileSize": _doubles(*spectrum.orders.tile_size),
+        "tileSize": _doubles(*spectrum.grid.tile_size),
         "coherenceLength": _doubles(spectrum.coherence_length),
         "wavelengths": _doubles(*spectrum.wavelengths),
         "tolerance": _doubles(spectrum.tolerance),
@@ -121,7 +121,7 @@ def load(path: str | os.PathLike[str]) -> GratingSpectrum:
         rows, columns = table.shape
         return GratingSpectrum(
             table=table,
-            orders=OrderGrid(_pair(header["tileSize"]), ((columns - 1) // 2, (rows - 1) // 2)),
+            grid=OrderGrid(_pair(header["tileSize"]), ((columns - 1) // 2, (rows - 1) // 2)),
             pixel_size=_pair(header["pixelSize"]),
             height_range=height_range,
             coherence_length=_single(header["coherenceLength"]),
@@ -155,7 +155,7 @@ def _series_table(pixels: dict[str, np.ndarray], height_range: float, largest_ka
 
 def _slice_channels(table: SliceTable) -> dict[str, np.ndarray]:
     return {
-        f"eta({interval:03d}.{node})": table.powers[interval, node]
+        f"eta({interval:03d}.{node})": table.values[interval, node]
         for interval in range(table.intervals)
         for node in range(4)
     }

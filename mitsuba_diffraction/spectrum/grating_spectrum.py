@@ -24,7 +24,7 @@ class GratingSpectrum:
 
     Attributes:
         table: η_m(κ), in one of the representations.
-        orders: the diffraction orders m that are kept.
+        grid: the diffraction orders m that are kept.
         pixel_size: (x, y) of the height field, µm.
         height_range: of the height field, µm.
         coherence_length: L_c in µm; it sets the width σ_q of each order.
@@ -37,7 +37,7 @@ class GratingSpectrum:
     """
 
     table: SeriesTable | SliceTable
-    orders: OrderGrid
+    grid: OrderGrid
     pixel_size: tuple[float, float]
     height_range: float
     coherence_length: float
@@ -49,8 +49,8 @@ class GratingSpectrum:
     extent: str = "tile"
 
     def __post_init__(self) -> None:
-        if self.table.shape != self.orders.shape:
-            raise ValueError(f"table: got {self.table.shape} orders, wanted {self.orders.shape}")
+        if self.table.shape != self.grid.shape:
+            raise ValueError(f"table: got {self.table.shape} orders, wanted {self.grid.shape}")
         if self.extent != "tile":
             raise ValueError(f"extent: got {self.extent!r}, wanted 'tile'")
         if not all(np.isfinite(p) and p > 0 for p in self.pixel_size):
@@ -87,20 +87,20 @@ class GratingSpectrum:
     @property
     def neighbours(self) -> tuple[int, int]:
         """How many orders along x and y overlap at one q, to the tolerance."""
-        return self.orders.neighbours(self.lobe_width, self.reach)
+        return self.grid.neighbours(self.lobe_width, self.reach)
 
     @property
     def megabytes(self) -> float:
         """Size of the table in memory."""
         return self.table.nbytes / 1e6
 
-    def order_powers(self, kappa: float) -> NDArray[np.float32]:
+    def powers(self, kappa: float) -> NDArray[np.float32]:
         """η_m(κ) of the orders that are kept, (2 M_y + 1, 2 M_x + 1), in float32 as a renderer computes them.
 
         Raises:
             ValueError: if κ (rad/µm) is outside of what the table holds.
         """
-        return self.table.order_powers(float(self._checked(np.float64(kappa))))
+        return self.table.powers(float(self._checked(np.float64(kappa))))
 
     def evaluate(self, q: ArrayLike, kappa: ArrayLike) -> NDArray[np.float64]:
         """S(q; κ) from the table.
@@ -118,7 +118,7 @@ class GratingSpectrum:
         q, kappa = matching(q, kappa)
         self._checked(kappa)
         sigma = self.lobe_width
-        tile, largest = np.array(self.orders.tile_size), np.array(self.orders.largest)
+        tile, largest = np.array(self.grid.tile_size), np.array(self.grid.largest)
         first = np.ceil(np.clip((q - self.reach * sigma) * tile, -largest, largest + 1)).astype(np.int64)
         result = np.zeros(kappa.shape)
         count_x, count_y = self.neighbours

@@ -53,6 +53,10 @@ class OrderGrid:
         m_x, m_y = self.largest
         return np.arange(-m_x, m_x + 1), np.arange(-m_y, m_y + 1)
 
+    def frequencies(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """q_x of the columns and q_y of the rows, cycles/µm."""
+        return tuple(m / size for m, size in zip(self.axes(), self.tile_size, strict=True))
+
     def take(self, transform: NDArray) -> NDArray:
         """The kept orders out of a discrete Fourier transform of the tile.
 

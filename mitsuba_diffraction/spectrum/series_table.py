@@ -65,7 +65,7 @@ class SeriesTable:
         """Size in memory."""
         return self.coefficients.nbytes
 
-    def order_powers(self, kappa: float) -> NDArray[np.float32]:
+    def powers(self, kappa: float) -> NDArray[np.float32]:
         """η_m(κ) of all orders, (rows, columns), in float32 as a renderer computes them; κ in rad/µm."""
         amplitude = np.zeros(self.shape, np.complex64)
         for weight, term in zip(self.series.weights(kappa).astype(np.complex64), self.coefficients, strict=True):

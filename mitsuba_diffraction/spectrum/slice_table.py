@@ -29,19 +29,19 @@ class SliceTable:
 
     Attributes:
         largest_kappa: κ_max in rad/µm.
-        powers: η_m, float32 (K, 4, rows, columns), on an order grid.
+        values: η_m, float32 (K, 4, rows, columns), on an order grid.
     """
 
     largest_kappa: float
-    powers: NDArray[np.float32] = field(repr=False)
+    values: NDArray[np.float32] = field(repr=False)
 
     representation: ClassVar[str] = "slices"
     floats_per_order: ClassVar[int] = 4
 
     def __post_init__(self) -> None:
-        got = self.powers
+        got = self.values
         if got.ndim != 4 or got.shape[1] != 4 or got.dtype != np.float32 or not np.isfinite(got).all():
-            raise ValueError(f"powers: got {got.dtype} {got.shape}, wanted finite float32 (K, 4, rows, columns)")
+            raise ValueError(f"values: got {got.dtype} {got.shape}, wanted finite float32 (K, 4, rows, columns)")
         got.setflags(write=False)
 
     @classmethod
@@ -65,27 +65,27 @@ class SliceTable:
     @property
     def intervals(self) -> int:
         """K."""
-        return len(self.powers)
+        return len(self.values)
 
     @property
     def shape(self) -> tuple[int, int]:
         """(rows, columns) of the order grid."""
-        return self.powers.shape[2:]
+        return self.values.shape[2:]
 
     @property
     def nbytes(self) -> int:
         """Size in memory."""
-        return self.powers.nbytes
+        return self.values.nbytes
 
     def polynomials(self) -> NDArray[np.float32]:
         """The cubics a₀ + a₁t + a₂t² + a₃t³, 0 ≤ t ≤ 1 on each interval: (rows, columns, K, 4)."""
-        return np.einsum("pn,knyx->yxkp", _TO_POLYNOMIAL, self.powers, optimize=True).astype(np.float32)
+        return np.einsum("pn,knyx->yxkp", _TO_POLYNOMIAL, self.values, optimize=True).astype(np.float32)
 
-    def order_powers(self, kappa: float) -> NDArray[np.float32]:
+    def powers(self, kappa: float) -> NDArray[np.float32]:
         """η_m(κ) of all orders, (rows, columns); κ in rad/µm."""
         interval, t = self._place(np.float64(kappa))
         weights = (t ** np.arange(4) @ _TO_POLYNOMIAL).astype(np.float32)
-        return np.maximum(np.tensordot(weights, self.powers[interval], 1), 0)
+        return np.maximum(np.tensordot(weights, self.values[interval], 1), 0)
 
     def powers_at(
         self, row: NDArray[np.int64], column: NDArray[np.int64], kappa: NDArray[np.float64]
@@ -93,7 +93,7 @@ class SliceTable:
         """η_m(κ) at one order and one κ each; all arguments and the result of one shape (...)."""
         interval, t = self._place(kappa)
         weights = (t[..., None] ** np.arange(4) @ _TO_POLYNOMIAL).astype(np.float32)
-        nodes = np.stack([self.powers[interval, node, row, column] for node in range(4)], axis=-1)
+        nodes = np.stack([self.values[interval, node, row, column] for node in range(4)], axis=-1)
         return np.maximum((weights * nodes).sum(axis=-1), 0)
 
     def _place(self, kappa: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:

@@ -1,0 +1,77 @@
+"""Welch's method: where the windows of an averaged periodogram stand on a scan (Welch 1967).
+
+A scan is a piece of a larger, irregular surface. Its power spectrum is estimated from windowed pieces of it,
+
+    S(q; κ) = (d_x d_y/P) Σ_p |Σ_n a(x_n − x_p) e^{iκh_n} e^{−2πi q·x_n}|² / Σ_n a²            [µm²]
+
+averaged over P places x_p; d is the pixel size. No window reaches over the edge, nothing is wrapped around.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .coherence import lobe_width
+from .heightfield import HeightField
+
+# A window ends at three σ_s to each side, where its amplitude is e^{−9/2}, 1 %.
+_SUPPORT = 6.0
+# Windows that take up three quarters of the scan leave room for three places along each axis, σ_s apart.
+_LARGEST = 0.5
+_FEWEST_PIXELS = 4
+
+
+@dataclass(frozen=True)
+class WindowAxis:
+    """The windows along one axis.
+
+    Attributes:
+        window: a, (W,), sampled at the pixels, Σ a² = 1.
+        starts: first pixel of each place.
+    """
+
+    window: NDArray[np.float64] = field(repr=False)
+    starts: NDArray[np.int64] = field(repr=False)
+
+
+def carried_coherence_length(height_field: HeightField, asked: float) -> float:
+    """The coherence length in µm that a scan can carry: what is asked for, at most half of the scan's shorter side.
+
+    An axis of one pixel sets no limit: along it the surface is uniform.
+
+    Raises:
+        ValueError: if it is under four pixels, too few for a window.
+    """
+    lobe_width(asked)
+    axes = list(zip(height_field.tile_size, height_field.pixel_size, height_field.shape[::-1], strict=True))
+    carried = min([float(asked), *(_LARGEST * size for size, _, count in axes if count > 1)])
+    for _, pixel, count in axes:
+        if count > 1 and carried < _FEWEST_PIXELS * pixel * (1 - 1e-9):
+            raise ValueError(
+                f"coherence_length: got {asked:g} µm, of which the scan of {axes[0][0]:.4g} × {axes[1][0]:.4g} µm "
+                f"carries {carried:.4g}; wanted at least {_FEWEST_PIXELS} pixels ({_FEWEST_PIXELS * pixel:.4g} µm)"
+            )
+    return carried
+
+
+def window_axes(height_field: HeightField, coherence_length: float) -> tuple[WindowAxis | None, WindowAxis | None]:
+    """The windows along x and y for a coherence length (µm) that the scan carries; None for an axis of one pixel.
+
+    a(x) = exp(−x²/2σ_s²) with σ_s = L_c/4, about the middle of its support; places are at most σ_s apart.
+    """
+    sigma = coherence_length / 4
+    return tuple(
+        _axis(count, pixel, sigma) if count > 1 else None
+        for count, pixel in zip(height_field.shape[::-1], height_field.pixel_size, strict=True)
+    )
+
+
+def _axis(count: int, pixel: float, sigma: float) -> WindowAxis:
+    width = min(count, max(_FEWEST_PIXELS, int(np.ceil(_SUPPORT * sigma / pixel))))
+    x = (np.arange(width) - (width - 1) / 2) * pixel
+    window = np.exp(-(x**2) / (2 * sigma**2))
+    places = int(np.ceil((count - width) * pixel / sigma)) + 1
+    return WindowAxis(window / np.linalg.norm(window), np.rint(np.linspace(0, count - width, places)).astype(np.int64))
