@@ -45,6 +45,9 @@ def _precompute(
     ] = None,
     pixel_size: Annotated[float | None, typer.Option(help="of a scan, µm")] = None,
     height_range: Annotated[float | None, typer.Option(help="of a scan, black to white, µm")] = None,
+    fill_missing: Annotated[
+        bool, typer.Option("--fill-missing", help="of a scan, fill pixels without a height from their surroundings")
+    ] = False,
     representation: Annotated[str | None, typer.Option(help=", ".join(REPRESENTATIONS))] = None,
     tolerance: Annotated[float | None, typer.Option(help="error allowed, as a share of the reflected power")] = None,
     coherence_length: Annotated[
@@ -61,7 +64,7 @@ def _precompute(
         if target.suffix.lower() != ".exr":
             raise ValueError(f"-o: got {target}, wanted a file name that ends in .exr")
         with _progress(f"spectrum of {source.name}") as progress:
-            spectrum = _spectrum(source, pixel_size, height_range, settings, progress)
+            spectrum = _spectrum(source, pixel_size, height_range, fill_missing, settings, progress)
             spectrum.save(target)
         x, y = spectrum.grid.tile_size
         _tell(
@@ -75,15 +78,20 @@ def _spectrum(
     source: Path,
     pixel_size: float | None,
     height_range: float | None,
+    fill_missing: bool,
     settings: dict[str, object],
     progress: Callable[[int, int], None],
 ) -> GratingSpectrum:
     if source.suffix.lower() == ".toml":
-        if pixel_size is not None or height_range is not None:
-            raise ValueError(f"--pixel-size and --height-range go with a scan; {source} is a recipe and holds its own")
+        if pixel_size is not None or height_range is not None or fill_missing:
+            raise ValueError(
+                f"--pixel-size, --height-range and --fill-missing go with a scan; the recipe {source} has its own"
+            )
         recipe = Recipe.load(source)
         return Recipe(recipe.surface, {**recipe.spectrum, **settings}, recipe.folder).build(progress)
-    height_field = read_height_field(source, pixel_size=pixel_size, height_range=height_range)
+    height_field = read_height_field(
+        source, pixel_size=pixel_size, height_range=height_range, fill_missing=fill_missing
+    )
     return precompute(height_field, progress=progress, **settings)
 
 

@@ -9,6 +9,8 @@ from numbers import Real
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from . import missing
+
 
 def as_pixel_size(value: float | tuple[float, float]) -> tuple[float, float]:
     """One number or (x, y), in µm, as a pair of positive floats.
@@ -38,41 +40,50 @@ class HeightField:
     Attributes:
         heights: (N_y, N_x) float64, µm; row ↔ +y, column ↔ +x.
         pixel_size: (x, y) in µm; one number stands for square pixels.
-        source: where the heights come from (a file name, a formula), for people to read.
+        source: where the heights come from (a file name, a formula), for people to read; it says how many were filled.
+        filled: how many pixels were missing and are filled.
+
+    Pixels that are missing (NaN, infinite or masked) are refused. With `fill_missing=True` they are filled from
+    their surroundings instead; see `missing.fill_missing`.
 
     Raises:
-        ValueError: if the heights are not a two-dimensional array of finite numbers with at least one pixel,
-            or if the pixel size is not positive.
+        ValueError: if the heights are not a two-dimensional array of finite numbers with at least one pixel (with
+            `fill_missing=True`: one finite number is enough), or if the pixel size is not positive.
     """
 
     heights: NDArray[np.float64]
     pixel_size: tuple[float, float]
     source: str = "array"
+    filled: int = 0
 
-    def __init__(self, heights: ArrayLike, pixel_size: float | tuple[float, float], source: str = "array") -> None:
-        if np.ma.isMaskedArray(heights):
-            heights = heights.astype(np.float64).filled(np.nan)
-        try:
-            if np.iscomplexobj(heights):
-                raise ValueError
-            array = np.array(heights, dtype=np.float64, order="C")
-        except (TypeError, ValueError):
+    def __init__(
+        self,
+        heights: ArrayLike,
+        pixel_size: float | tuple[float, float],
+        source: str = "array",
+        fill_missing: bool = False,
+    ) -> None:
+        if not isinstance(fill_missing, bool | np.bool_):
+            raise ValueError(f"fill_missing: got {fill_missing!r}, wanted True or False")
+        array = np.array(missing.as_heights(heights), order="C")
+        pixel_size = as_pixel_size(pixel_size)
+        places = np.argwhere(~np.isfinite(array))
+        filled = len(places)
+        if filled and not fill_missing:
+            row, column = places[0]
             raise ValueError(
-                f"heights: got {type(heights).__name__}, wanted a two-dimensional array of real heights in µm"
-            ) from None
-        if array.ndim != 2 or array.size == 0:
-            raise ValueError(f"heights: got an array of shape {array.shape}, wanted (rows, columns), at least (1, 1)")
-        missing = np.argwhere(~np.isfinite(array))
-        if len(missing):
-            row, column = missing[0]
-            raise ValueError(
-                f"heights: {len(missing)} of {array.size} pixels are missing or not finite, "
-                f"the first at row {row}, column {column}; wanted finite heights in µm"
+                f"heights: {filled} of {array.size} pixels are missing or not finite, "
+                f"the first at row {row}, column {column}; wanted finite heights in µm "
+                "(fill_missing=True, or --fill-missing, fills them from their surroundings)"
             )
+        if filled:
+            array = missing.fill_missing(array, pixel_size)
+            source = f"{source} ({filled} missing pixel{'s' if filled > 1 else ''} filled)"
         array.setflags(write=False)
         object.__setattr__(self, "heights", array)
-        object.__setattr__(self, "pixel_size", as_pixel_size(pixel_size))
+        object.__setattr__(self, "pixel_size", pixel_size)
         object.__setattr__(self, "source", str(source))
+        object.__setattr__(self, "filled", filled)
 
     @property
     def shape(self) -> tuple[int, int]:

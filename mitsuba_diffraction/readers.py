@@ -35,6 +35,7 @@ def read_height_field(
     path: str | os.PathLike[str],
     pixel_size: float | tuple[float, float] | None = None,
     height_range: float | None = None,
+    fill_missing: bool = False,
 ) -> HeightField:
     """Read a height field.
 
@@ -50,6 +51,8 @@ def read_height_field(
         pixel_size: µm, one number or (x, y). Goes before that of the file; required where the file has none.
         height_range: from the least to the greatest number that the integer type holds (black to white), µm. The
             heights start at zero there.
+        fill_missing: fill the pixels that are NaN or infinite from their surroundings (`missing.fill_missing`), not
+            refuse them. `source` and `filled` of the height field tell how many they were.
 
     Returns:
         The heights, row by row as they stand in the file.
@@ -60,7 +63,7 @@ def read_height_field(
     """
     path = Path(path)
     try:
-        return _read(path, pixel_size, height_range)
+        return _read(path, pixel_size, height_range, fill_missing)
     except FileNotFoundError:
         raise
     # OSError is what Pillow raises for a damaged picture, and the system for what cannot be read (a folder, rights).
@@ -68,7 +71,7 @@ def read_height_field(
         raise ValueError(" ".join(f"{path}: {str(error)[:_SHOWN]}".split())) from error
 
 
-def _read(path: Path, pixel_size: object, height_range: object) -> HeightField:
+def _read(path: Path, pixel_size: object, height_range: object, fill_missing: object) -> HeightField:
     extension = path.suffix.lower()
     if extension not in _FORMATS:
         raise ValueError(f"got the extension {path.suffix!r}, wanted one of {', '.join(_FORMATS)}")
@@ -79,7 +82,7 @@ def _read(path: Path, pixel_size: object, height_range: object) -> HeightField:
     pixel_size = own_pixel_size if pixel_size is None else pixel_size
     if pixel_size is None:
         raise ValueError("pixel_size: the file has none, wanted one number or (x, y) in µm")
-    return HeightField(heights, pixel_size, source=path.name)
+    return HeightField(heights, pixel_size, source=path.name, fill_missing=fill_missing)
 
 
 def _as_micrometres(numbers: NDArray, height_range: object) -> NDArray[np.float64]:

@@ -9,6 +9,7 @@ depth = 0.25                     # µm
 scan = "skin.png"                # relative to the recipe
 pixel_size = 0.0586              # µm, one number or [x, y]
 height_range = 0.375             # µm, for integer images
+fill_missing = true              # pixels without a height are filled from their surroundings; without it, refused
 
 [spectrum]                       # every line may be left out
 extent = "tile"
@@ -44,7 +45,7 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-_SCAN_KEYS = frozenset({"scan", "pixel_size", "height_range"})
+_SCAN_KEYS = frozenset({"scan", "pixel_size", "height_range", "fill_missing"})
 _SPECTRUM_KEYS = frozenset({"extent", "coherence_length", "wavelengths", "representation", "tolerance"})
 # Raised when the same input gives other numbers than before, so that the cache is not read.
 _BUILD_VERSION = 1
@@ -121,7 +122,10 @@ class Recipe:
             if isinstance(pixel_size, list):
                 pixel_size = tuple(pixel_size)
             return read_height_field(
-                self.folder / parameters.pop("scan"), pixel_size=pixel_size, height_range=parameters.get("height_range")
+                self.folder / parameters.pop("scan"),
+                pixel_size=pixel_size,
+                height_range=parameters.get("height_range"),
+                fill_missing=parameters.get("fill_missing", False),
             )
         name = parameters.pop("profile")
         try:

@@ -31,6 +31,9 @@ def folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("blaze.toml").write_text(BLAZE)
     np.save("scan.npy", np.random.default_rng(1).random((6, 8)) * 0.1)
+    holed = np.load("scan.npy")
+    holed[2, 3] = np.nan
+    np.save("holed.npy", holed)
     np.save("counts.npy", np.arange(48, dtype=np.uint8).reshape(6, 8))
     return tmp_path
 
@@ -72,6 +75,9 @@ def files():
         ("precompute blaze.toml --coherence-length -3", "coherence_length: got -3"),
         ("precompute blaze.toml --representation wavelets", "representation: got 'wavelets'"),
         ("precompute blaze.toml --pixel-size 0.1", "--pixel-size"),
+        ("precompute blaze.toml --fill-missing", "--fill-missing go with a scan; the recipe blaze.toml"),
+        ("precompute holed.npy --pixel-size 0.05", "1 of 48 pixels are missing"),
+        ("precompute holed.npy --pixel-size 0.05", "--fill-missing, fills them from their surroundings"),
         ("precompute blaze.toml -o out.png", "out.png"),
         ("precompute blaze.toml -o out", "ends in .exr"),
         ("precompute blaze.toml -o nowhere/out.exr", "nowhere/out.exr"),
@@ -167,6 +173,15 @@ def test_scans_with_their_scale(command):
     assert spectrum.height_range == pytest.approx(47 / 255 * 0.5)
     assert spectrum.pixel_size == (0.05, 0.05)
     assert spectrum.source == "counts.npy"
+
+
+def test_missing_pixels_of_a_scan_are_filled_on_request(command):
+    code, out, _ = command("precompute holed.npy --pixel-size 0.05 --fill-missing -o out.exr")
+    assert code == 0
+    assert "out.exr: holed.npy (1 missing pixel filled); " in out
+    spectrum = md.GratingSpectrum.load("out.exr")
+    assert spectrum.source == "holed.npy (1 missing pixel filled)"
+    assert spectrum.source_digest == md.HeightField(np.load("holed.npy"), 0.05, fill_missing=True).digest
 
 
 def test_many_sources_are_named_after_themselves(command):

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from mitsuba_diffraction import HeightField
+from mitsuba_diffraction.missing import fill_missing
 
 arrays = hnp.arrays(np.float64, hnp.array_shapes(min_dims=2, max_dims=2, max_side=9), elements=st.floats(-5, 5))
 
@@ -41,6 +42,67 @@ def test_masked_pixels_are_refused_and_an_empty_mask_is_not(dtype):
         HeightField(heights, 0.1)
     whole = np.ma.masked_equal(heights.data, 100)
     np.testing.assert_array_equal(HeightField(whole, 0.1).heights, heights.data)
+
+
+def test_the_refusal_says_how_to_ask_for_the_filling():
+    with pytest.raises(ValueError, match=r"\(fill_missing=True, or --fill-missing, fills them"):
+        HeightField([[np.nan, 1]], 0.1)
+
+
+@given(heights=arrays, place=st.data(), bad=st.sampled_from([np.nan, np.inf, -np.inf]))
+def test_missing_pixels_are_filled_on_request_and_counted(heights, place, bad):
+    flat = place.draw(st.sets(st.integers(0, heights.size - 1), max_size=heights.size - 1))
+    heights.ravel()[list(flat)] = bad
+    field = HeightField(heights, (0.1, 0.2), source="scan.npy", fill_missing=True)
+    np.testing.assert_array_equal(field.heights, fill_missing(heights, (0.1, 0.2)))
+    assert not field.heights.flags.writeable
+    assert heights.flags.writeable
+    assert field.filled == len(flat)
+    assert field.digest == HeightField(field.heights, (0.1, 0.2)).digest
+    assert (
+        field.digest
+        == hashlib.sha256(
+            np.array(heights.shape, "<i8").tobytes() + np.array([0.1, 0.2]).tobytes() + field.heights.tobytes()
+        ).hexdigest()
+    )
+
+
+def test_the_fill_knows_the_shape_of_a_pixel():
+    corner = [[np.nan, 1.0], [10.0, 0.0]]
+    # Weights 1/d²: (4·1 + 10)/5 where pixels are twice as long along y.
+    assert HeightField(corner, (0.1, 0.2), fill_missing=True).heights[0, 0] == pytest.approx(14 / 5)
+    assert HeightField(corner, 0.1, fill_missing=True).heights[0, 0] == pytest.approx(11 / 2)
+
+
+@pytest.mark.parametrize(
+    ("heights", "text"),
+    [
+        ([[1, 2, 3]], "source='scan.npy')"),
+        ([[1, np.nan, 3]], "source='scan.npy (1 missing pixel filled)')"),
+        ([[1, np.nan, np.inf]], "source='scan.npy (2 missing pixels filled)')"),
+        (np.ma.masked_equal([[1, 7, 7, 7]], 7), "source='scan.npy (3 missing pixels filled)')"),
+    ],
+)
+def test_the_source_and_repr_tell_how_many_were_filled(heights, text):
+    assert text in repr(HeightField(heights, 0.1, source="scan.npy", fill_missing=True))
+
+
+def test_nothing_is_filled_where_nothing_is_missing():
+    field = HeightField([[1, 2]], 0.1)
+    assert field.filled == 0
+    assert (field.source, field.digest) == ("array", HeightField([[1, 2]], 0.1, fill_missing=True).digest)
+
+
+@pytest.mark.parametrize("heights", [np.full((2, 3), np.nan), np.ma.masked_all((3, 2))])
+def test_there_is_nothing_to_fill_from_where_all_is_missing(heights):
+    with pytest.raises(ValueError, match="all 6 pixels are missing"):
+        HeightField(heights, 0.1, fill_missing=True)
+
+
+@pytest.mark.parametrize("answer", ["no", 1, None])
+def test_the_filling_is_asked_for_with_true_or_false(answer):
+    with pytest.raises(ValueError, match=r"fill_missing: got .* wanted True or False"):
+        HeightField([[1, 2]], 0.1, fill_missing=answer)
 
 
 @pytest.mark.parametrize(

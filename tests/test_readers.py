@@ -110,6 +110,36 @@ def test_the_top_row_of_a_picture_is_the_first_row(tmp_path):
     np.testing.assert_array_equal(read_height_field(tmp_path / "scan.png", 0.1, 1.0).heights[:, 0], [1, 0, 0, 0])
 
 
+# ---------------------------------------------------------------- missing pixels
+
+HOLED = np.array([[0.1, np.nan, 0.3, 0.4], [0.1, 0.2, np.inf, 0.4]])
+"""µm; the two pixels are 0.2 and 0.3 by interpolation."""
+
+
+def write_holed(path):
+    if path.suffix == ".npy":
+        np.save(path, HOLED)
+    elif path.suffix == ".npz":
+        np.savez(path, heights=HOLED)
+    else:
+        Image.fromarray(HOLED.astype(np.float32)).save(path)
+
+
+@pytest.mark.parametrize("name", ["scan.npy", "scan.npz", "scan.tif"])
+def test_missing_pixels_are_filled_on_request(tmp_path, refuse, name):
+    write_holed(tmp_path / name)
+    refuse(name, r"2 of 8 pixels are missing .*row 0, column 1; .*--fill-missing, fills them")
+    field = read_height_field(tmp_path / name, 0.1, fill_missing=True)
+    np.testing.assert_allclose(field.heights, [[0.1, 0.2, 0.3, 0.4]] * 2, rtol=1e-6)
+    assert (field.filled, field.source) == (2, f"{name} (2 missing pixels filled)")
+
+
+def test_a_scan_without_a_height_is_refused_by_name(tmp_path):
+    np.save(tmp_path / "scan.npy", np.full((2, 3), np.nan))
+    with pytest.raises(ValueError, match=r"scan\.npy: heights: all 6 pixels are missing"):
+        read_height_field(tmp_path / "scan.npy", 0.1, fill_missing=True)
+
+
 # ---------------------------------------------------------------- misuse of the arguments
 
 

@@ -147,6 +147,8 @@ def test_values_of_a_profile_that_cannot_be_are_refused_by_name(tmp_path, entrie
         ('scan = "scan.npy"\npixel_size = "0.1"', "pixel_size"),
         ('scan = "scan.npy"\npixel_size = [1, 2, 3]', "pixel_size"),
         ('scan = "scan.npy"\npixel_size = 0.05\nheight_range = 0.1', "height_range"),
+        ('scan = "scan.npy"\npixel_size = 0.05\nfill_missing = "yes"', "fill_missing"),
+        ('scan = "scan.npy"\npixel_size = 0.05\nfill_missing = 1', "fill_missing"),
         ("scan = 3\npixel_size = 0.05", "scan"),
         ('scan = ["scan.npy"]\npixel_size = 0.05', "scan"),
     ],
@@ -197,6 +199,29 @@ def test_a_scan_is_relative_to_its_recipe(tmp_path, monkeypatch):
     field = Recipe.load(path).height_field()
     np.testing.assert_array_equal(field.heights, heights)
     assert field.pixel_size == (0.05, 0.08)
+
+
+def test_a_scan_with_missing_pixels_is_filled_where_the_recipe_says_so(tmp_path, own_cache):
+    heights = write_scan(tmp_path)
+    heights[2, 3:5] = np.nan
+    np.save(tmp_path / "scan.npy", heights)
+    text = '[surface]\nscan = "scan.npy"\npixel_size = [0.05, 0.08]\n'
+    for refusing in (text, text + "fill_missing = false\n"):
+        with pytest.raises(ValueError, match="2 of 48 pixels are missing"):
+            Recipe.load(write(tmp_path, refusing)).cached()
+    recipe = Recipe.load(write(tmp_path, text + "fill_missing = true\n[spectrum]\ntolerance = 0.01\n"))
+    wanted = md.HeightField(heights, (0.05, 0.08), fill_missing=True)
+    recipe.cached()
+    spectrum = recipe.cached()  # read from the file
+    assert len(list(own_cache.iterdir())) == 1
+    assert spectrum.source_digest == wanted.digest
+    assert spectrum.source == "scan.npy (2 missing pixels filled)"
+    assert recipe.height_field().filled == 2
+
+
+def test_a_profile_has_no_missing_pixels(tmp_path):
+    with pytest.raises(ValueError, match="fill_missing"):
+        Recipe.load(write(tmp_path, BLAZE + "fill_missing = true\n")).height_field()
 
 
 def test_a_measured_skin_by_recipe(tmp_path, scan_file, scan):

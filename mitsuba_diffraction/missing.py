@@ -1,0 +1,90 @@
+"""Pixels without a height, as an instrument leaves them: NaN, infinite or masked, and how to fill them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import sparse
+from scipy.sparse.linalg import splu
+
+
+def as_heights(heights: ArrayLike) -> NDArray[np.float64]:
+    """A plane of heights, (N_y, N_x) µm, NaN where the array is masked; no copy where none is needed.
+
+    Raises:
+        ValueError: if it is not a two-dimensional array of real numbers with at least one pixel.
+    """
+    try:
+        if np.iscomplexobj(heights):
+            raise ValueError
+        if np.ma.isMaskedArray(heights):
+            heights = heights.astype(np.float64).filled(np.nan)
+        array = np.asarray(heights, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(
+            f"heights: got {type(heights).__name__}, wanted a two-dimensional array of real heights in µm"
+        ) from None
+    if array.ndim != 2 or array.size == 0:
+        raise ValueError(f"heights: got an array of shape {array.shape}, wanted (rows, columns), at least (1, 1)")
+    return array
+
+
+def fill_missing(heights: ArrayLike, pixel_size: tuple[float, float] = (1.0, 1.0)) -> NDArray[np.float64]:
+    """Missing pixels by harmonic interpolation, the known ones as they are.
+
+    The missing heights minimise ∫|∇h|² between the known ones, so ∇²h = 0 in every hole. At a missing pixel p,
+
+        Σ_n w_n (h_n − h_p) = 0,    w = 1/d_x² along a row, 1/d_y² along a column
+
+    over those of its four neighbours n that lie in the array. At the edge of the array this is the natural boundary,
+    ∂h/∂n = 0: a hole there takes up the slope along the edge and none across it. No height is higher or lower than
+    all known ones.
+
+    Pérez, Gangnet and Blake 2003, "Poisson image editing", ACM Transactions on Graphics 22(3), 313–318: equations
+    1 and 2, and 7 without a guidance field, with neighbourhoods cut at the edge of the picture.
+
+    Args:
+        heights: (N_y, N_x) µm; a pixel is missing where it is NaN, infinite or masked.
+        pixel_size: (d_x, d_y), positive; only their ratio matters.
+
+    Returns:
+        (N_y, N_x) µm, a new array; where nothing is missing, the heights themselves.
+
+    Raises:
+        ValueError: if the heights are not a two-dimensional array of real numbers with at least one pixel, or if all
+            of them are missing.
+    """
+    heights = as_heights(heights)
+    missing = ~np.isfinite(heights)
+    rows, columns = np.nonzero(missing)
+    count = len(rows)
+    if count == 0:
+        return heights
+    if count == heights.size:
+        raise ValueError(f"heights: all {count} pixels are missing, wanted at least one height in µm to fill from")
+    known = heights[~missing]
+    lowest, highest = known.min(), known.max()
+    middle = lowest / 2 + highest / 2  # heights are solved for about it, for the sake of their last digits
+    unknown = np.empty(heights.shape, np.int64)
+    unknown[missing] = np.arange(count)
+    weight_x, weight_y = (np.min(pixel_size) / np.asarray(pixel_size, np.float64)) ** 2
+
+    diagonal, right_side = np.zeros(count), np.zeros(count)
+    links = []
+    for down, right, weight in ((0, -1, weight_x), (0, 1, weight_x), (-1, 0, weight_y), (1, 0, weight_y)):
+        row, column = rows + down, columns + right
+        pixel = np.flatnonzero((row >= 0) & (row < heights.shape[0]) & (column >= 0) & (column < heights.shape[1]))
+        row, column = row[pixel], column[pixel]
+        diagonal[pixel] += weight
+        is_missing = missing[row, column]
+        right_side[pixel[~is_missing]] += weight * (heights[row, column][~is_missing] - middle)
+        links.append((pixel[is_missing], unknown[row, column][is_missing], weight))
+    equation = np.concatenate([np.arange(count), *(pixel for pixel, _, _ in links)])
+    neighbour = np.concatenate([np.arange(count), *(other for _, other, _ in links)])
+    values = np.concatenate([diagonal, *(np.full(len(pixel), -weight) for pixel, _, weight in links)])
+    matrix = sparse.csc_matrix((values, (equation, neighbour)), shape=(count, count))
+    # Symmetric and positive definite (every hole borders on a known pixel), so no pivots need to be looked for.
+    factors = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    filled = heights.copy()
+    filled[missing] = np.clip(factors.solve(right_side) + middle, lowest, highest)
+    return filled
