@@ -50,6 +50,10 @@ def _precompute(
     ] = False,
     representation: Annotated[str | None, typer.Option(help=", ".join(REPRESENTATIONS))] = None,
     tolerance: Annotated[float | None, typer.Option(help="error allowed, as a share of the reflected power")] = None,
+    extent: Annotated[
+        str | None, typer.Option(help="tile (the patch repeats) or sample (a piece of an irregular surface)")
+    ] = None,
+    largest_angle: Annotated[float | None, typer.Option(help="that the scene has, degrees from the normal")] = None,
     coherence_length: Annotated[
         float | None, typer.Option(help=f"µm; {SUN_COHERENCE_LENGTH:g} is that of sunlight")
     ] = None,
@@ -57,7 +61,13 @@ def _precompute(
     """Turn a recipe or a scan into the spectrum of its phase."""
     if output is not None and len(sources) > 1:
         raise ValueError(f"-o: got {len(sources)} sources, wanted one (without -o each is named after its source)")
-    given = {"representation": representation, "tolerance": tolerance, "coherence_length": coherence_length}
+    given = {
+        "extent": extent,
+        "coherence_length": coherence_length,
+        "largest_angle": largest_angle,
+        "representation": representation,
+        "tolerance": tolerance,
+    }
     settings = {name: value for name, value in given.items() if value is not None}
     for source in sources:
         target = output or Path(source.with_suffix(".exr").name)
@@ -66,11 +76,12 @@ def _precompute(
         with _progress(f"spectrum of {source.name}") as progress:
             spectrum = _spectrum(source, pixel_size, height_range, fill_missing, settings, progress)
             spectrum.save(target)
-        x, y = spectrum.grid.tile_size
         _tell(
-            f"{target}: {spectrum.source}; {x:.4g} × {y:.4g} µm, {spectrum.table.shape[1]} × {spectrum.table.shape[0]} "
-            f"orders, {spectrum.representation}, {spectrum.megabytes:.3g} MB, error {spectrum.error:.1e} "
-            f"(asked {spectrum.tolerance:g})"
+            f"{target}: {spectrum.source}; {spectrum.extent}, {spectrum.grid}; coherence length "
+            f"{spectrum.coherence_length:.4g} µm; {spectrum.representation}, {spectrum.megabytes:.3g} MB, "
+            f"error {spectrum.error:.1e} (asked {spectrum.tolerance:g})\n"
+            f"left out, at most: {spectrum.dropped:.1e} of the power in weak frequencies; {spectrum.beyond:.1e} where "
+            "no light reaches or no pixel resolves"
         )
 
 
@@ -139,6 +150,44 @@ def _render(
         f"{target}: {columns} × {rows} pixels, {bins} wavelengths, {spp} samples per pixel, {mi.variant()}, "
         f"{time.perf_counter() - start:.1f} s\n{preview}: preview, exposure {exposure:.4g}"
     )
+
+
+@app.command("benchmark")
+def _benchmark(
+    scan: Annotated[Path | None, typer.Argument(metavar="[SCAN]", help="a scan to measure with")] = None,
+    pixel_size: Annotated[float | None, typer.Option(help="of the scan, µm")] = None,
+    height_range: Annotated[float | None, typer.Option(help="of the scan, black to white, µm")] = None,
+    surface: Annotated[list[str] | None, typer.Option(help="only these of the bundled ones")] = None,
+    tolerance: Annotated[list[float] | None, typer.Option(help="only these")] = None,
+    variant: Annotated[str | None, typer.Option(help="of Mitsuba; the fastest spectral one by default")] = None,
+    json: Annotated[Path | None, typer.Option(help="write the results here, too")] = None,
+    plot: Annotated[Path | None, typer.Option(help="draw error against speed here (.png)")] = None,
+) -> None:
+    """Speed against error of every representation, as ratios to Mitsuba's roughconductor."""
+    import mitsuba as mi
+
+    from .benchmark import bundled_cases, measure, report, run, scan_case
+    from .variants import choose_variant
+
+    cases = bundled_cases()
+    names = [case.name for case in cases]
+    if unknown := set(surface or []) - set(names):
+        raise ValueError(f"--surface: got {', '.join(sorted(unknown))}, wanted among {', '.join(names)}")
+    cases = [case for case in cases if not surface or case.name in surface]
+    if scan is not None:
+        cases.append(scan_case(read_height_field(scan, pixel_size=pixel_size, height_range=height_range)))
+    mi.set_variant(choose_variant(variant))
+    with _progress("speed and error") as progress:
+        results = run(cases, **({"tolerances": tolerance} if tolerance else {}), progress=progress)
+    with _progress("sampling") as progress:
+        sampling = measure(cases, progress=progress)
+    # Wide enough wherever it goes, a file too.
+    wide = Console(highlight=False, width=max(_out.width, 140))
+    wide.print(report.table(results), report.sampling_table(sampling), sep="\n\n")
+    if json is not None:
+        report.save_json(results, sampling, json)
+    if plot is not None:
+        report.save_plot(results, plot)
 
 
 @contextmanager

@@ -2,25 +2,42 @@
 
 from __future__ import annotations
 
+import dataclasses
 import warnings
 from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import NDArray
 
-from .coherence import SUN_COHERENCE_LENGTH, lobe_width
+from .coherence import SUN_COHERENCE_LENGTH, lobe_reach, lobe_width
+from .expansions import chebyshev_nodes, chebyshev_polynomials, chebyshev_transform, nodes_for, position
+from .expansions.chebyshev import ChebyshevSeries
+from .expansions.svd import SvdSeries
 from .expansions.taylor import TaylorSeries
 from .heightfield import HeightField
-from .reference import check_extent, order_powers
+from .reference import check_extent
 from .spectrum import GratingSpectrum
-from .spectrum.grating_spectrum import TAIL_SHARE, check_wavelengths
-from .spectrum.orders import OrderGrid
+from .spectrum.grating_spectrum import TAIL_SHARE, check_angle, check_wavelengths
+from .spectrum.sample import SamplePowers
 from .spectrum.series_table import SeriesTable
-from .spectrum.slice_table import SliceTable
+from .spectrum.slice_table import SliceTable, interpolation
+from .spectrum.tile import TilePowers, inner
+from .welch import carried_coherence_length
 
 VISIBLE = (360.0, 830.0)  # nm, the range that Mitsuba samples
-REPRESENTATIONS = ("auto", TaylorSeries.NAME, SliceTable.representation)
+REPRESENTATIONS = ("auto", TaylorSeries.name, ChebyshevSeries.name, SvdSeries.name, SliceTable.representation)
+
+# Shares of the tolerance.
+_DROP_SHARE = 0.1  # weak frequencies
+_SPLINE_SHARE = 0.4  # of a sample, what lies between the nodes in q
+# What is chosen by the strongest frequencies, and measured at a few κ, is held to this part of what is allowed.
+_MARGIN = 0.7
+_PILOT = 8_000  # frequencies
+_LARGEST_TABLE = 4e9  # bytes
 
 Progress = Callable[[int, int], None]
+Powers = Callable[[float], NDArray[np.float64]]
+Table = SeriesTable | SliceTable
 
 
 def precompute(
@@ -29,6 +46,7 @@ def precompute(
     extent: str = "tile",
     coherence_length: float = SUN_COHERENCE_LENGTH,
     wavelengths: tuple[float, float] = VISIBLE,
+    largest_angle: float = 90.0,
     representation: str = "auto",
     tolerance: float = 1e-3,
     progress: Progress | None = None,
@@ -37,10 +55,13 @@ def precompute(
 
     Args:
         height_field: the surface.
-        extent: "tile": the patch repeats for ever.
+        extent: "tile": the patch repeats for ever; "sample": it is a piece of a larger, irregular surface.
         coherence_length: L_c in µm.
         wavelengths: (shortest, longest) in nm.
-        representation: "taylor" or "slices"; "auto" takes the one that reads the fewest numbers: slices.
+        largest_angle: in degrees from the normal, of incidence and exit, that the scene has; less than 90 keeps fewer
+            frequencies.
+        representation: "taylor", "chebyshev", "svd" or "slices"; "auto" takes the one that reads the fewest numbers:
+            slices.
         tolerance: bound of max over κ of ∫|S_approx(q; κ) − S_exact(q; κ)| dq, a share of the reflected power.
         progress: called with (steps done, steps in all).
 
@@ -48,13 +69,16 @@ def precompute(
         The spectrum; its `error` is what was measured, at values of κ that were not used to build it.
 
     Raises:
-        ValueError: if an argument is out of range, or the tolerance cannot be kept in float32 for so deep a surface.
+        ValueError: if an argument is out of range, or the tolerance cannot be kept: in float32 by a Taylor series for
+            so deep a surface, or within a table of 4 GB.
 
     Warns:
-        UserWarning: if the pixels are too coarse to hold all the frequencies that the shortest wavelength can reach.
+        UserWarning: if the pixels are too coarse to hold all the frequencies that the shortest wavelength can reach, or
+            a sample is too small for the coherence length.
     """
     check_extent(extent)
     check_wavelengths(wavelengths)
+    check_angle(largest_angle)
     lobe_width(coherence_length)
     if representation not in REPRESENTATIONS:
         raise ValueError(f"representation: got {representation!r}, wanted one of {', '.join(REPRESENTATIONS)}")
@@ -62,82 +86,226 @@ def precompute(
         raise ValueError(f"tolerance: got {tolerance!r}, wanted a share of the reflected power from 1e-5 to 1")
     shortest = wavelengths[0] * 1e-3
     largest_kappa = 4 * np.pi / shortest
-    _check_resolution(height_field, shortest)
-    rows, columns = height_field.shape
-    orders = OrderGrid.reachable(height_field.tile_size, (columns, rows), shortest)
-    build = _taylor if representation == TaylorSeries.NAME else _slices
-    table, error = build(
-        height_field, orders, largest_kappa, (1 - TAIL_SHARE) * tolerance, progress or (lambda done, total: None)
-    )
+    reach = 2 * np.sin(np.deg2rad(largest_angle)) / shortest
+    _check_resolution(height_field, reach)
+    carried = float(coherence_length)
+    if extent == "tile":
+        allowed = (1 - TAIL_SHARE) * tolerance
+        radius = lobe_reach(TAIL_SHARE * tolerance) * lobe_width(coherence_length)
+        powers = TilePowers(height_field, reach, radius)
+    else:
+        allowed = tolerance
+        carried = carried_coherence_length(height_field, coherence_length)
+        if carried < coherence_length * (1 - 1e-9):
+            x, y = height_field.tile_size
+            warnings.warn(
+                f"coherence_length: a scan of {x:.4g} × {y:.4g} µm carries {carried:.4g} µm of the "
+                f"{coherence_length:.4g} µm asked for; the lobes are as wide as the scan allows",
+                stacklevel=2,
+            )
+        powers = _splines(height_field, carried, reach, largest_kappa, _SPLINE_SHARE * tolerance)
+    build = _Build(powers, height_field.height_range, largest_kappa, allowed, progress or (lambda done, total: None))
+    table, error = build(SliceTable.representation if representation == "auto" else representation)
     return GratingSpectrum(
         table=table,
-        grid=orders,
+        grid=build.kept,
         pixel_size=height_field.pixel_size,
         height_range=height_field.height_range,
-        coherence_length=float(coherence_length),
+        coherence_length=carried,
         wavelengths=(float(wavelengths[0]), float(wavelengths[1])),
         tolerance=float(tolerance),
-        error=error + TAIL_SHARE * tolerance,
+        error=error + tolerance - allowed,
         source=height_field.source,
         source_digest=height_field.digest,
-        extent=extent,
+        largest_angle=float(largest_angle),
+        dropped=build.dropped,
+        beyond=build.beyond,
     )
 
 
-def _taylor(
-    height_field: HeightField, orders: OrderGrid, largest_kappa: float, tolerance: float, progress: Progress
-) -> tuple[SeriesTable, float]:
-    x = largest_kappa * height_field.half_range
-    refusal = (
-        f"taylor: a surface of height range {height_field.height_range:.3g} µm cannot be kept to {tolerance:.2g} "
-        f"in float32 up to κ = {largest_kappa:.1f} rad/µm: the terms of the series grow to e^{x:.1f} and cancel; "
-        "representation 'slices' keeps it"
-    )
-    # Each term is good to 2^-24 of its size, and their sizes add up to e^x; the bound is generous by 20.
-    if 2.0**-24 * np.exp(min(x, 80.0)) > 20 * tolerance:
-        raise ValueError(refusal)
-    # The other half is left to rounding.
-    series = TaylorSeries.for_tolerance(height_field.half_range, largest_kappa, 0.5 * tolerance)
-    table = SeriesTable.build(series, height_field, orders, progress)
-    error = _measured(table, height_field, orders, largest_kappa)
-    if error > tolerance:
-        raise ValueError(f"{refusal} (measured error {error:.2g})")
-    return table, error
-
-
-def _slices(
-    height_field: HeightField, orders: OrderGrid, largest_kappa: float, tolerance: float, progress: Progress
-) -> tuple[SliceTable, float]:
-    # A cubic on Chebyshev points errs by (RΔκ)⁴/3072 of an oscillation of angular frequency R. Few heights are R apart,
-    # so begin with a quarter of the intervals that this asks for.
-    step = 4 * (3072 * tolerance) ** 0.25
-    intervals = max(1, int(np.ceil(largest_kappa * height_field.height_range / step)))
+def _splines(
+    height_field: HeightField, coherence_length: float, reach: float, largest_kappa: float, allowed: float
+) -> SamplePowers:
+    """A lattice of splines so fine that what lies between its nodes is right to `allowed`."""
+    sigma = lobe_width(coherence_length)
+    spacing = 0.74 * sigma
     while True:
-        table = SliceTable.build(intervals, largest_kappa, height_field, orders, progress)
-        error = _measured(table, height_field, orders, largest_kappa)
-        # What lies between the κ that were measured may be a little worse.
-        if error <= 0.7 * tolerance:
-            return table, error / 0.7
-        intervals = max(intervals + 1, int(intervals * (error / tolerance) ** 0.25))
+        powers = SamplePowers(height_field, coherence_length, spacing, reach)
+        if 16.0 * np.prod(powers.grid.shape, dtype=float) > _LARGEST_TABLE:
+            raise ValueError(
+                f"tolerance: {allowed / _SPLINE_SHARE:.2g} needs {' × '.join(map(str, powers.grid.shape))} frequencies "
+                f"for a coherence length of {coherence_length:.4g} µm, more than a table of 4 GB; "
+                "take a larger tolerance or a shorter coherence length"
+            )
+        error = max(
+            powers.error(powers.grid, powers(kappa).astype(np.float32), kappa)
+            for kappa in (0.0, 0.35 * largest_kappa, largest_kappa)
+        )
+        if error <= allowed:
+            return powers
+        # The error of quadratic splines falls with the third power of the spacing.
+        spacing *= min(0.95, 0.95 * (allowed / error) ** (1 / 3))
 
 
-def _measured(
-    table: SeriesTable | SliceTable, height_field: HeightField, orders: OrderGrid, largest_kappa: float
-) -> float:
-    """max over held-out κ of Σ_m |η_m − exact|: both ends, and others between, at least four to an oscillation."""
-    count = 12 + int(np.ceil(largest_kappa * height_field.height_range))
-    golden = (np.sqrt(5) - 1) / 2
-    held_out = largest_kappa * np.concatenate([[0.0, 1.0], np.sqrt((np.arange(1, count) * golden) % 1)])
-    return max(
-        float(np.abs(table.powers(kappa) - orders.take(order_powers(height_field, kappa))).sum()) for kappa in held_out
-    )
+class _Build:
+    """One way from the exact powers to a table that keeps the tolerance.
+
+    Attributes:
+        kept: the grid without the weak frequencies at its rim.
+        dropped: the largest share of the power outside of it.
+        beyond: the largest share of the power that the whole grid does not reach.
+    """
+
+    def __init__(
+        self,
+        powers: TilePowers | SamplePowers,
+        height_range: float,
+        largest_kappa: float,
+        allowed: float,
+        progress: Progress,
+    ) -> None:
+        self._exact = powers
+        self._range = height_range
+        self._largest_kappa = largest_kappa
+        self._allowed = allowed
+        self._progress = progress
+        self._x = largest_kappa * height_range / 2
+        self._nodes = nodes_for(self._x, 0.01 * allowed)
+        self._survey()
+
+    def _powers(self, kappa: float) -> NDArray[np.float64]:
+        return self._exact(kappa)[inner(self._exact.grid, self.kept)]
+
+    def _survey(self) -> None:
+        """Over the Chebyshev nodes in κ: where the power lies, and a pilot, the strongest frequencies."""
+        kappas = (1 + chebyshev_nodes(self._nodes)) / 2 * self._largest_kappa
+        grid = self._exact.grid
+        rims, missing = ([], []), []
+        for kappa in kappas:
+            power = self._exact(kappa)
+            missing.append(1 - self._exact.reached(power))
+            for axis in (0, 1):
+                rims[axis].append(_rim(np.abs(power).sum(axis=axis)))
+        # Between the nodes more may be missing, or lie at the rim.
+        between = self._between()[1]
+        self.beyond = float(np.clip((between @ missing).max(), 0, 1))
+        largest = []
+        for whole, rim in zip(grid.largest, rims, strict=True):
+            outside = (between @ np.array(rim)).max(axis=0)
+            largest.append(int(np.argmax(outside <= _DROP_SHARE / 2 * self._allowed)) if whole else 0)
+        self.kept = dataclasses.replace(grid, largest=tuple(largest))
+        dropped, total, strongest = [], 0.0, None
+        pilot = np.empty((self._nodes, min(_PILOT, int(np.prod(self.kept.shape)))))
+        for j, kappa in enumerate(kappas):
+            whole = self._exact(kappa)
+            power = whole[inner(grid, self.kept)].ravel()
+            dropped.append(np.abs(whole).sum() - np.abs(power).sum())
+            if strongest is None:
+                strongest = np.sort(np.argpartition(-np.abs(power), pilot.shape[1] - 1)[: pilot.shape[1]])
+            pilot[j] = power[strongest]
+            total += np.abs(power).sum()
+        self.dropped = float(np.clip((between @ dropped).max(), 0, 1))
+        self._pilot = pilot
+        # The others are taken to err as much for their power.
+        self._pilot_share = float(np.abs(pilot).sum() / total)
+
+    def __call__(self, representation: str) -> tuple[Table, float]:
+        """The cheapest table of this representation, and its measured error."""
+        refine = 1.0
+        while True:
+            table = self._build(representation, _MARGIN * self._allowed * refine)
+            error = self._measured(table) / _MARGIN
+            if error <= self._allowed:
+                return table, error
+            if refine < 0.01:
+                raise ValueError(self._refusal(representation, error))
+            refine /= max(2.0, error / self._allowed)
+
+    def _build(self, representation: str, allowed: float) -> Table:
+        if representation == SliceTable.representation:
+            return SliceTable.build(self._intervals(allowed), self._largest_kappa, self._powers, self._progress)
+        if representation == SvdSeries.name:
+            modes = SvdSeries.fit(self._largest_kappa, self._pilot)
+            series = modes.first(self._terms(modes, allowed))
+        else:
+            if representation == TaylorSeries.name and 2.0**-24 * np.exp(min(self._x, 80.0)) > 20 * self._allowed:
+                # Each term is good to 2^-24 of its size, and their sizes add up to e^x; the bound is generous by 20.
+                raise ValueError(self._refusal(representation, None))
+            kind = TaylorSeries if representation == TaylorSeries.name else ChebyshevSeries
+            whole = kind(self._largest_kappa, self._nodes)
+            series = kind(self._largest_kappa, self._terms(whole, allowed))
+        return SeriesTable.build(series, self._nodes, self._powers, self._progress)
+
+    def _refusal(self, representation: str, error: float | None) -> str:
+        if representation == TaylorSeries.name:
+            why = f"the terms of the series grow to e^{self._x:.1f} and cancel; representation 'slices' keeps it"
+        else:
+            why = "rounding does not allow it"
+        measured = f" (measured error {error:.2g})" if error is not None else ""
+        return (
+            f"{representation}: a surface of height range {self._range:.3g} µm cannot be kept to {self._allowed:.2g} "
+            f"in float32 up to κ = {self._largest_kappa:.1f} rad/µm: {why}{measured}"
+        )
+
+    def _between(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Many κ, four to an oscillation, and the pilot's powers there, (κ, n), by Chebyshev interpolation."""
+        kappas = np.linspace(0, self._largest_kappa, 16 + int(np.ceil(4 * self._x)))
+        vander = chebyshev_polynomials(position(kappas, self._largest_kappa), self._nodes)
+        return kappas, vander @ chebyshev_transform(self._nodes)
+
+    def _terms(self, series: TaylorSeries | ChebyshevSeries | SvdSeries, allowed: float) -> int:
+        """The fewest terms with which the pilot is kept at every κ."""
+        allowed *= self._pilot_share
+        kappas, interpolate = self._between()
+        terms = series.projection(self._nodes) @ self._pilot
+        weights = series.weights(kappas)
+        error = np.abs(interpolate @ self._pilot).sum(axis=1)
+        remainder = interpolate @ self._pilot
+        for n in range(series.terms):
+            if error.max() <= allowed:
+                return max(n, 1)
+            remainder -= np.outer(weights[:, n], terms[n])
+            error = np.abs(remainder).sum(axis=1)
+        return series.terms
+
+    def _intervals(self, allowed: float) -> int:
+        """The fewest intervals with which the pilot is kept at every κ."""
+        allowed *= self._pilot_share
+        kappas, interpolate = self._between()
+        exact = interpolate @ self._pilot
+        intervals = 1
+        while True:
+            at = (np.arange(intervals)[:, None] + (1 + chebyshev_nodes(4)) / 2) / intervals * self._largest_kappa
+            vander = chebyshev_polynomials(position(at, self._largest_kappa), self._nodes)
+            values = vander @ chebyshev_transform(self._nodes) @ self._pilot
+            interval, weights = interpolation(kappas, self._largest_kappa, intervals)
+            # One κ after the other: all at once would take more memory than the table.
+            error = max(np.abs(w @ values[k] - e).sum() for k, w, e in zip(interval, weights, exact, strict=True))
+            if error <= allowed:
+                return intervals
+            intervals = max(intervals + 1, int(intervals * min(2.0, 0.95 * (error / allowed) ** 0.25)))
+
+    def _measured(self, table: Table) -> float:
+        """max over held-out κ of the error of S: both ends, and others between, at least four to an oscillation."""
+        count = 12 + int(np.ceil(2 * self._x))
+        golden = (np.sqrt(5) - 1) / 2
+        held_out = self._largest_kappa * np.concatenate([[0.0, 1.0], np.sqrt((np.arange(1, count) * golden) % 1)])
+        return max(self._exact.error(self.kept, table.powers(kappa), kappa) for kappa in held_out)
 
 
-def _check_resolution(height_field: HeightField, shortest: float) -> None:
+def _rim(profile: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The sum of a profile over −M…M outside of each |m|: (M + 1,)."""
+    half = len(profile) // 2
+    folded = profile[half:] + profile[half::-1]
+    folded[0] /= 2
+    return np.concatenate([np.cumsum(folded[::-1])[::-1][1:], [0.0]])
+
+
+def _check_resolution(height_field: HeightField, reach: float) -> None:
     for axis, size, count in zip("xy", height_field.pixel_size, height_field.shape[::-1], strict=True):
-        if count > 1 and size > shortest / 4:
+        if count > 1 and 1 / (2 * size) < reach * (1 - 1e-9):
             warnings.warn(
                 f"pixels of {size * 1e3:.4g} nm along {axis} hold no frequency beyond {1 / (2 * size):.3g} cycles/µm, "
-                f"but light of {shortest * 1e3:.4g} nm reaches {2 / shortest:.3g}: what lies between is missing",
+                f"but light reaches {reach:.3g}: what lies between is missing",
                 stacklevel=3,
             )

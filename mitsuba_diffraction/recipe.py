@@ -15,6 +15,7 @@ fill_missing = true              # pixels without a height are filled from their
 extent = "tile"
 coherence_length = 65.0          # µm
 wavelengths = [360.0, 830.0]     # nm
+largest_angle = 90.0             # degrees from the normal
 representation = "auto"
 tolerance = 1e-3
 """
@@ -46,9 +47,11 @@ else:
     import tomli as tomllib
 
 _SCAN_KEYS = frozenset({"scan", "pixel_size", "height_range", "fill_missing"})
-_SPECTRUM_KEYS = frozenset({"extent", "coherence_length", "wavelengths", "representation", "tolerance"})
+_SPECTRUM_KEYS = frozenset(
+    {"extent", "coherence_length", "wavelengths", "largest_angle", "representation", "tolerance"}
+)
 # Raised when the same input gives other numbers than before, so that the cache is not read.
-_BUILD_VERSION = 1
+_BUILD_VERSION = 2
 # Mitsuba constructs plugins on several threads; two that name one recipe must not build it twice.
 _building = threading.Lock()
 
@@ -83,7 +86,7 @@ class Recipe:
         for name, value in [*self.surface.items(), *self.spectrum.items()]:
             if not (_is_plain(value) or (isinstance(value, list | tuple) and all(_is_plain(v) for v in value))):
                 raise ValueError(f"{name}: got {value!r}, wanted a number, a text, or a list of them")
-        for name in ("tolerance", "coherence_length"):
+        for name in ("tolerance", "coherence_length", "largest_angle"):
             if name in self.spectrum and not _is_number(self.spectrum[name]):
                 raise ValueError(f"{name}: got {self.spectrum[name]!r}, wanted a number")
         if "wavelengths" in self.spectrum and not isinstance(self.spectrum["wavelengths"], list | tuple):

@@ -5,15 +5,22 @@ Everything else in this package is measured against this file.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from numbers import Integral
+
 import numpy as np
 import scipy.fft
 from numpy.typing import ArrayLike, NDArray
 
 from .arrays import matching
 from .coherence import SUN_COHERENCE_LENGTH, lobe_width
+from .finite_tiles import tile_factor
 from .heightfield import HeightField
+from .welch import WindowAxis, carried_coherence_length, window_axes
 
+EXTENTS = ("tile", "sample")
 _FAR = 9.0  # standard deviations; e^{−9²/2} is under 3e-18
+_CHUNK = 2**20  # complex numbers in one intermediate array, 16 MiB
 
 
 def amplitudes(height_field: HeightField, kappa: float) -> NDArray[np.complex128]:
@@ -42,45 +49,196 @@ def power_spectrum(
     extent: str = "tile",
     coherence_length: float = SUN_COHERENCE_LENGTH,
 ) -> NDArray[np.float64]:
-    """S(q; κ) = Σ_m η_m(κ) N(q − m/T; σ_q² I) of a tile that repeats for ever.
+    """S(q; κ), the density over the frequency plane of the power that a patch reflects.
+
+    A "tile" repeats for ever, a line spectrum:
+
+        S(q; κ) = Σ_m η_m(κ) N(q − m/T; σ_q² I),     ∫ S dq = 1.
+
+    A "sample" is a piece of a larger, irregular surface (Welch 1967), averaged over P places x_p of a window a that
+    lies inside of the scan (`welch`):
+
+        S(q; κ) = (d_x d_y/P) Σ_p |Σ_n a(x_n − x_p) e^{iκh_n} e^{−2πi q·x_n}|² / Σ_n a².
+
+    Its integral over the Nyquist rectangle |q_j| ≤ 1/2d_j is one for every κ; d is the pixel size. The window is as
+    wide as the coherence length asks for or the scan allows, whichever is less. Along an axis of one pixel the
+    surface is uniform and S has the factor N(q_j; σ_q²), of the same coherence length.
+
+    Frequencies beyond the Nyquist limit do not exist in the data, and nothing is wrapped into their place. A tile has
+    no orders there, only the flanks of the lobes of its last orders; the spectrum of a sample is zero there.
 
     Args:
-        height_field: the tile.
+        height_field: the patch.
         q: (..., 2) cycles/µm, along x and y.
         kappa: (...) rad/µm.
-        extent: "tile".
+        extent: "tile" or "sample".
         coherence_length: L_c in µm.
 
     Returns:
         (...) µm².
 
     Raises:
-        ValueError: on an unknown extent, a coherence length that is not positive, or shapes that do not match.
+        ValueError: on an unknown extent, a coherence length that is not positive or, for a sample, under four pixels,
+            arguments that are not finite, or shapes that do not match.
     """
     check_extent(extent)
-    sigma = lobe_width(coherence_length)
-    q, kappa = matching(q, kappa)
+    lobe_width(coherence_length)
+    q, kappa = _checked(q, kappa)
+    evaluate = _tile_spectrum if extent == "tile" else _sample_spectrum
+    return evaluate(height_field, q.reshape(-1, 2), kappa.ravel(), coherence_length).reshape(kappa.shape)
+
+
+def finite_tiles_spectrum(
+    height_field: HeightField, q: ArrayLike, kappa: ArrayLike, *, tiles: tuple[int, int]
+) -> NDArray[np.float64]:
+    """S(q; κ) of P × Q tiles side by side and nothing around them, seen without a window (the "PQ" form).
+
+    With A the transform of one tile of N_x × N_y pixels, and D the factor of a row of tiles (`tile_factor`),
+
+        A(q; κ) = Σ_n e^{iκh_n} e^{−2πi q·x_n}
+        S(q; κ) = d_x d_y |A(q; κ)|² D(q_x T_x; P)² D(q_y T_y; Q)² / (N_x N_y P Q).
+
+    A is summed at q itself, which equals the sinc interpolation of the tile's FFT. The surface consists of pixels, so
+    that sum repeats with the period 1/d_j; by Parseval S integrates to one over one such period, the Nyquist rectangle
+    |q_j| ≤ 1/2d_j, what lies beyond being folded into it. Outside of the rectangle S is zero, as for a sample in
+    `power_spectrum`. An axis of one pixel is no exception.
+
+    Args:
+        height_field: the tile.
+        q: (..., 2) cycles/µm, along x and y.
+        kappa: (...) rad/µm.
+        tiles: (P, Q), how many tiles along x and y.
+
+    Returns:
+        (...) µm².
+
+    Raises:
+        ValueError: if `tiles` is not two whole numbers ≥ 1, on arguments that are not finite, or shapes that do not
+            match.
+    """
+    tiles = _checked_tiles(tiles)
+    q, kappa = _checked(q, kappa)
     shape = kappa.shape
     q, kappa = q.reshape(-1, 2), kappa.ravel()
-    result = np.zeros(kappa.shape)
-    rows, columns = height_field.shape
-    tile = height_field.tile_size
-    orders = [np.sort(np.rint(scipy.fft.fftfreq(n) * n).astype(int)) for n in (columns, rows)]
-    for value in np.unique(kappa):
-        eta = scipy.fft.fftshift(order_powers(height_field, value))
-        for index in zip(*np.nonzero(kappa == value), strict=True):
-            lobes, spans = [], []
-            for axis in (0, 1):
-                near = np.abs(q[index][axis] - orders[axis] / tile[axis]) <= _FAR * sigma
-                span = slice(near.argmax(), near.argmax() + near.sum())
-                offset = q[index][axis] - orders[axis][span] / tile[axis]
-                lobes.append(np.exp(-(offset**2) / (2 * sigma**2)) / (np.sqrt(2 * np.pi) * sigma))
-                spans.append(span)
-            result[index] = lobes[1] @ eta[spans[1], spans[0]] @ lobes[0]
+    # One window of constant amplitude over the whole of the tile.
+    axes = tuple(WindowAxis(np.full(n, n**-0.5), np.zeros(1, np.int64)) for n in height_field.shape[::-1])
+    result = _periodograms(height_field, q, kappa, axes)
+    for axis in (0, 1):
+        factor = tile_factor(q[:, axis] * height_field.tile_size[axis], tiles[axis])
+        result *= factor**2 / tiles[axis] * _nyquist_density(q[:, axis], height_field.pixel_size[axis])
     return result.reshape(shape)
 
 
 def check_extent(extent: str) -> None:
     """Raises ValueError unless `extent` names a reading of the patch."""
-    if extent != "tile":
-        raise ValueError(f"extent: got {extent!r}, wanted 'tile'")
+    if extent not in EXTENTS:
+        raise ValueError(f"extent: got {extent!r}, wanted 'tile' or 'sample'")
+
+
+def _tile_spectrum(
+    height_field: HeightField, q: NDArray[np.float64], kappa: NDArray[np.float64], coherence_length: float
+) -> NDArray[np.float64]:
+    """Σ_m η_m(κ) N(q − m/T; σ_q² I) for q (M, 2) and κ (M,): (M,) µm²."""
+    sigma = lobe_width(coherence_length)
+    result = np.zeros(kappa.shape)
+    rows, columns = height_field.shape
+    tile = height_field.tile_size
+    orders = [np.arange(-(n // 2), n // 2 + 1) for n in (columns, rows)]
+    # The Nyquist order of an even number of pixels has no sign: half of its power lies on each side.
+    shares = [np.where(2 * np.abs(m) == n, 0.5, 1.0) for m, n in zip(orders, (columns, rows), strict=True)]
+    for value, indices in _by_kappa(kappa):
+        eta = order_powers(height_field, value)[np.ix_(orders[1] % rows, orders[0] % columns)]
+        eta *= np.outer(shares[1], shares[0])
+        for index in indices:
+            lobes, spans = [], []
+            for axis in (0, 1):
+                near = np.abs(q[index, axis] - orders[axis] / tile[axis]) <= _FAR * sigma
+                span = slice(near.argmax(), near.argmax() + near.sum())
+                lobes.append(_gaussian(q[index, axis] - orders[axis][span] / tile[axis], sigma))
+                spans.append(span)
+            result[index] = lobes[1] @ eta[spans[1], spans[0]] @ lobes[0]
+    return result
+
+
+def _sample_spectrum(
+    height_field: HeightField, q: NDArray[np.float64], kappa: NDArray[np.float64], coherence_length: float
+) -> NDArray[np.float64]:
+    """Welch's estimate of S for q (M, 2) and κ (M,): (M,) µm²."""
+    carried = carried_coherence_length(height_field, coherence_length)
+    windows = window_axes(height_field, carried)
+    uniform = WindowAxis(np.ones(1), np.zeros(1, np.int64))
+    result = _periodograms(height_field, q, kappa, tuple(w or uniform for w in windows))
+    for axis in (0, 1):
+        if windows[axis] is None:
+            result *= _gaussian(q[:, axis], lobe_width(carried))
+        else:
+            result *= _nyquist_density(q[:, axis], height_field.pixel_size[axis])
+    return result
+
+
+def _periodograms(
+    height_field: HeightField,
+    q: NDArray[np.float64],
+    kappa: NDArray[np.float64],
+    axes: tuple[WindowAxis, WindowAxis],
+) -> NDArray[np.float64]:
+    """Mean over the places x_p of |Σ_n a(x_n − x_p) e^{iκh_n} e^{−2πi q·x_n}|² for q (M, 2) and κ (M,): (M,).
+
+    The window is a product, and so is the wave: first the sums over y, for all columns at once, then those over x.
+    """
+    along_x, along_y = axes
+    width, height = len(along_x.window), len(along_y.window)
+    chunk = max(1, _CHUNK // max(height_field.shape))
+    result = np.zeros(kappa.shape)
+    for value, indices in _by_kappa(kappa):
+        phase = np.exp(1j * value * height_field.centred)
+        for part in np.split(indices, range(chunk, len(indices), chunk)):
+            # On a grid of q many share the same q_y.
+            q_y, which = np.unique(q[part, 1], return_inverse=True)
+            # Waves start with the window; where it stands changes the phase of the sum only.
+            wave_x = along_x.window * _waves(q[part, 0], width, height_field.pixel_size[0])
+            wave_y = along_y.window * _waves(q_y, height, height_field.pixel_size[1])
+            for row in along_y.starts:
+                columns = wave_y @ phase[row : row + height]
+                for column in along_x.starts:
+                    amplitude = np.einsum("mx,mx->m", columns[which, column : column + width], wave_x)
+                    result[part] += amplitude.real**2 + amplitude.imag**2
+    return result / (len(along_x.starts) * len(along_y.starts))
+
+
+def _waves(q: NDArray[np.float64], count: int, pixel: float) -> NDArray[np.complex128]:
+    """e^{−2πiqx} at x = 0, d, 2d, …: (M, count) for q (M,)."""
+    return np.exp(-2j * np.pi * np.outer(q, np.arange(count) * pixel))
+
+
+def _nyquist_density(q: NDArray[np.float64], pixel: float) -> NDArray[np.float64]:
+    """d for |q| ≤ 1/2d, else zero: (M,) µm. It integrates to one over q."""
+    # Rounding in the q of the caller must not cut off the limit itself.
+    return np.where(np.abs(q) * 2 * pixel <= 1 + 1e-12, pixel, 0.0)
+
+
+def _gaussian(q: NDArray[np.float64], sigma: float) -> NDArray[np.float64]:
+    """N(q; σ²) along one axis, µm."""
+    return np.exp(-(q**2) / (2 * sigma**2)) / (np.sqrt(2 * np.pi) * sigma)
+
+
+def _by_kappa(kappa: NDArray[np.float64]) -> Iterator[tuple[float, NDArray[np.int64]]]:
+    """Each value in κ (M,) once, with the indices where it stands."""
+    for value in np.unique(kappa):
+        yield value, np.flatnonzero(kappa == value)
+
+
+def _checked(q: ArrayLike, kappa: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """As `matching`, and κ is finite too."""
+    q, kappa = matching(q, kappa)
+    if not np.isfinite(kappa).all():
+        raise ValueError("kappa: got numbers that are not finite, wanted rad/µm")
+    return q, kappa
+
+
+def _checked_tiles(tiles: tuple[int, int]) -> tuple[int, int]:
+    """Two whole numbers ≥ 1, or ValueError."""
+    pair = tuple(tiles) if isinstance(tiles, (tuple, list, np.ndarray)) else ()
+    if len(pair) != 2 or not all(isinstance(n, Integral) and not isinstance(n, bool) and n >= 1 for n in pair):
+        raise ValueError(f"tiles: got {tiles!r}, wanted two whole numbers ≥ 1, along x and y")
+    return int(pair[0]), int(pair[1])

@@ -24,7 +24,7 @@ _LARGEST = 0.5
 _FEWEST_PIXELS = 4
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class WindowAxis:
     """The windows along one axis.
 
@@ -60,7 +60,8 @@ def carried_coherence_length(height_field: HeightField, asked: float) -> float:
 def window_axes(height_field: HeightField, coherence_length: float) -> tuple[WindowAxis | None, WindowAxis | None]:
     """The windows along x and y for a coherence length (µm) that the scan carries; None for an axis of one pixel.
 
-    a(x) = exp(−x²/2σ_s²) with σ_s = L_c/4, about the middle of its support; places are at most σ_s apart.
+    a(x) = exp(−x²/2σ_s²) with σ_s = L_c/4, about the middle of its support, which is 6σ_s rounded up to whole pixels.
+    Places run evenly from one edge of the scan to the other, at most σ_s apart, rounded to whole pixels.
     """
     sigma = coherence_length / 4
     return tuple(
@@ -70,8 +71,13 @@ def window_axes(height_field: HeightField, coherence_length: float) -> tuple[Win
 
 
 def _axis(count: int, pixel: float, sigma: float) -> WindowAxis:
-    width = min(count, max(_FEWEST_PIXELS, int(np.ceil(_SUPPORT * sigma / pixel))))
+    width = min(count, max(_FEWEST_PIXELS, _rounded_up(_SUPPORT * sigma / pixel)))
     x = (np.arange(width) - (width - 1) / 2) * pixel
     window = np.exp(-(x**2) / (2 * sigma**2))
-    places = int(np.ceil((count - width) * pixel / sigma)) + 1
+    places = _rounded_up((count - width) * pixel / sigma) + 1
     return WindowAxis(window / np.linalg.norm(window), np.rint(np.linspace(0, count - width, places)).astype(np.int64))
+
+
+def _rounded_up(value: float) -> int:
+    """The whole number at or above; rounding error above a whole number does not count."""
+    return int(np.ceil(value * (1 - 1e-9)))

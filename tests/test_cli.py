@@ -30,6 +30,8 @@ def folder(tmp_path, monkeypatch):
     """Each test stands in a folder of its own, with a recipe and a scan."""
     monkeypatch.chdir(tmp_path)
     Path("blaze.toml").write_text(BLAZE)
+    Path("deep.toml").write_text(BLAZE.replace("0.25", "5"))
+    np.save("wide.npy", np.random.default_rng(1).random((20, 24)) * 0.1)
     np.save("scan.npy", np.random.default_rng(1).random((6, 8)) * 0.1)
     holed = np.load("scan.npy")
     holed[2, 3] = np.nan
@@ -74,6 +76,11 @@ def files():
         ("precompute blaze.toml --tolerance nan", "tolerance: got nan"),
         ("precompute blaze.toml --coherence-length -3", "coherence_length: got -3"),
         ("precompute blaze.toml --representation wavelets", "representation: got 'wavelets'"),
+        ("precompute blaze.toml --extent ribbon", "extent: got 'ribbon', wanted 'tile' or 'sample'"),
+        ("precompute blaze.toml --largest-angle 91", "largest_angle: got 91"),
+        ("precompute blaze.toml --largest-angle steep", "--largest-angle"),
+        ("precompute deep.toml --representation taylor", "taylor: a surface of height range 4.92 µm"),
+        ("precompute scan.npy --pixel-size 0.05 --extent sample", "wanted at least 4 pixels (0.2 µm)"),
         ("precompute blaze.toml --pixel-size 0.1", "--pixel-size"),
         ("precompute blaze.toml --fill-missing", "--fill-missing go with a scan; the recipe blaze.toml"),
         ("precompute holed.npy --pixel-size 0.05", "1 of 48 pixels are missing"),
@@ -151,9 +158,48 @@ def test_precompute_writes_the_file_that_it_names_and_says_its_error(command):
     assert (code, err.strip()) == (0, "")
     spectrum = md.GratingSpectrum.load("blaze.exr")
     assert out.startswith("blaze.exr: ")
-    assert len(out.splitlines()) == 1
+    assert len(out.splitlines()) == 2
     for part in ("blazed grating", "2.5 × 2.5 µm", "27 × 1 orders", "MB", f"error {spectrum.error:.1e}", "0.001"):
         assert part in out
+    assert "tile, " in out
+    assert "coherence length 65 µm; slices, " in out
+    assert out.splitlines()[1].startswith("left out, at most: 0.0e+00 of the power in weak frequencies; ")
+    # All but the orders up to 13, the last one below 2/λ: summed here.
+    kappa = np.linspace(0, spectrum.largest_kappa, 2000)[:, None]
+    eta = [
+        np.abs(np.exp(1j * kappa * 0.25 * np.arange(64) / 64 - 2j * np.pi * m * np.arange(64) / 64).mean(axis=1)) ** 2
+        for m in range(-13, 14)
+    ]
+    told = float(out.split("frequencies; ")[1].split()[0])
+    assert told == pytest.approx(1 - np.sum(eta, axis=0).min(), rel=0.05)
+    assert f"{spectrum.beyond:.1e} where no light reaches" in out
+
+
+@pytest.mark.parametrize("representation", ["taylor", "chebyshev", "svd", "slices"])
+def test_a_sample_by_options(command, representation):
+    code, out, err = command(
+        "precompute wide.npy --pixel-size 0.09 --extent sample --largest-angle 60 --tolerance 0.02 -o out.exr "
+        f"--representation {representation}"
+    )
+    assert code == 0
+    told = err.splitlines()
+    assert len(told) == 1
+    assert told[0].startswith("mitsuba-diffraction: warning: coherence_length: a scan of 2.16 × 1.8 µm carries 0.9 µm")
+    spectrum = md.GratingSpectrum.load("out.exr")
+    assert (spectrum.extent, spectrum.largest_angle, spectrum.tolerance) == ("sample", 60.0, 0.02)
+    assert spectrum.representation == representation
+    rows, columns = spectrum.grid.shape
+    for part in (f"sample, {columns} × {rows} frequencies", "cycles/µm apart", "coherence length 0.9 µm", "left out"):
+        assert part in out
+    assert f"{spectrum.dropped:.1e} of the power" in out
+    assert f"{spectrum.beyond:.1e} where" in out
+
+
+def test_a_smaller_angle_takes_fewer_orders(command):
+    code, out, _ = command("precompute blaze.toml --largest-angle 29")
+    assert code == 0
+    assert "13 × 1 orders" in out
+    assert md.GratingSpectrum.load("blaze.exr").largest_angle == 29.0
 
 
 def test_options_go_before_the_recipe(command):
@@ -188,7 +234,7 @@ def test_many_sources_are_named_after_themselves(command):
     Path("other.toml").write_text(BLAZE)
     code, out, _ = command("precompute", "blaze.toml", "other.toml")
     assert code == 0
-    assert [line.split(":")[0] for line in out.splitlines()] == ["blaze.exr", "other.exr"]
+    assert [line.split(":")[0] for line in out.splitlines()[::2]] == ["blaze.exr", "other.exr"]
     assert {"blaze.exr", "other.exr"} <= files()
 
 
@@ -226,7 +272,7 @@ def test_an_interrupt_leaves_no_file(command, monkeypatch, place):
         raise KeyboardInterrupt
 
     if place == "precompute":
-        monkeypatch.setattr(PRECOMPUTE, "_slices", interrupted)
+        monkeypatch.setattr(PRECOMPUTE, "_Build", interrupted)
     else:
         monkeypatch.setattr(OpenEXR.File, "write", interrupted, raising=True)
     before = files()
@@ -241,7 +287,7 @@ def test_a_failure_is_one_line_and_exit_code_1(command, monkeypatch, error):
     def fail(*arguments, **named):
         raise error
 
-    monkeypatch.setattr(PRECOMPUTE, "_slices", fail)
+    monkeypatch.setattr(PRECOMPUTE, "_Build", fail)
     code, out, err = command("precompute", "blaze.toml")
     assert (code, out) == (1, "")
     assert err.strip() == f"mitsuba-diffraction: error: {str(error) or 'MemoryError'}"

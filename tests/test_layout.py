@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 PACKAGE = Path(__file__).parents[1] / "mitsuba_diffraction"
-RUN_TIME = {"bsdf", "render", "cli.py", "llvm.py", "variants.py", "__init__.py"}
+RUN_TIME = {"benchmark", "bsdf", "render", "cli.py", "llvm.py", "variants.py", "__init__.py"}
 """What may import Mitsuba; everything else is offline."""
 OFFLINE = sorted(path for path in PACKAGE.rglob("*.py") if path.relative_to(PACKAGE).parts[0] not in RUN_TIME)
 

@@ -111,6 +111,9 @@ def test_a_recipe_that_is_not_there_is_named(tmp_path):
         ('representation = "wavelets"', "representation"),
         ("representation = 1", "representation"),
         ('extent = "ribbon"', "extent"),
+        ('largest_angle = "steep"', "largest_angle"),
+        ("largest_angle = 0", "largest_angle"),
+        ("largest_angle = 91", "largest_angle"),
         ("extent = 5", "extent"),
     ],
 )
@@ -176,19 +179,51 @@ def test_a_recipe_builds_what_its_words_say(tmp_path):
     path = write(
         tmp_path,
         BLAZE + 'samples = 64\n[spectrum]\nextent = "tile"\ncoherence_length = 30\nwavelengths = [400, 700.0]\n'
-        'representation = "taylor"\ntolerance = 1e-2\n',
+        'largest_angle = 60\nrepresentation = "taylor"\ntolerance = 1e-2\n',
     )
     got = Recipe.load(path).build()
     wanted = md.precompute(
         md.gratings.blazed(2.5, 0.25, samples=64),
         coherence_length=30.0,
         wavelengths=(400.0, 700.0),
+        largest_angle=60.0,
         representation="taylor",
         tolerance=1e-2,
     )
+    assert (got.extent, got.largest_angle) == ("tile", 60.0)
     assert (got.representation, got.wavelengths, got.coherence_length) == ("taylor", (400.0, 700.0), 30.0)
     assert got.source_digest == wanted.source_digest
-    np.testing.assert_array_equal(got.table.coefficients, wanted.table.coefficients)
+    np.testing.assert_array_equal(got.table.terms, wanted.table.terms)
+
+
+def test_a_recipe_of_a_sample(tmp_path, own_cache):
+    heights = np.random.default_rng(0).random((20, 24)) * 0.1
+    np.save(tmp_path / "scan.npy", heights)
+    path = write(
+        tmp_path,
+        '[surface]\nscan = "scan.npy"\npixel_size = [0.09, 0.08]\n'
+        '[spectrum]\nextent = "sample"\ncoherence_length = 0.7\ntolerance = 0.02\n',
+    )
+    Recipe.load(path).cached()
+    spectrum = Recipe.load(path).cached()  # read from the file
+    assert len(list(own_cache.iterdir())) == 1
+    field = md.HeightField(heights, (0.09, 0.08))
+    wanted = md.precompute(field, extent="sample", coherence_length=0.7, tolerance=0.02)
+    assert (spectrum.extent, spectrum.coherence_length, spectrum.grid) == ("sample", 0.7, wanted.grid)
+    np.testing.assert_array_equal(powers(spectrum), powers(wanted))
+    tile = write(tmp_path, path.read_text().replace('"sample"', '"tile"'), "tile.toml")
+    assert Recipe.load(tile).digest() != Recipe.load(path).digest()
+
+
+def test_a_recipe_says_what_coherence_its_scan_carries(tmp_path):
+    np.save(tmp_path / "scan.npy", np.zeros((20, 24)))
+    path = write(
+        tmp_path,
+        '[surface]\nscan = "scan.npy"\npixel_size = 0.09\n[spectrum]\nextent = "sample"\ntolerance = 0.02\n',
+    )
+    with pytest.warns(UserWarning, match=r"2.16 × 1.8 µm carries 0.9 µm of the 65 µm asked for"):
+        spectrum = Recipe.load(path).build()
+    assert spectrum.coherence_length == pytest.approx(0.9)
 
 
 def test_a_scan_is_relative_to_its_recipe(tmp_path, monkeypatch):
@@ -264,6 +299,8 @@ def test_the_cache_is_read_the_second_time(own_cache, builds):
         ({}, {"coherence_length": 60.0}),
         ({}, {"wavelengths": [400, 700]}),
         ({}, {"representation": "taylor"}),
+        ({}, {"representation": "svd"}),
+        ({}, {"largest_angle": 50}),
     ],
 )
 def test_another_parameter_is_another_spectrum(own_cache, builds, surface, spectrum):
@@ -274,7 +311,10 @@ def test_another_parameter_is_another_spectrum(own_cache, builds, surface, spect
     got = other.cached()
     assert len(builds) == 2
     wanted = other.build()
-    for name in ("representation", "wavelengths", "coherence_length", "tolerance", "source_digest"):
+    for name in (
+        *("representation", "wavelengths", "coherence_length", "tolerance", "source_digest", "largest_angle"),
+        *("dropped", "beyond", "grid"),
+    ):
         assert getattr(got, name) == getattr(wanted, name)
 
 

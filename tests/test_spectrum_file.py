@@ -2,6 +2,8 @@
 
 import contextlib
 import dataclasses
+import functools
+import json
 import resource
 
 import numpy as np
@@ -9,13 +11,18 @@ import OpenEXR
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.special import jv
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction import GratingSpectrum
 from mitsuba_diffraction.spectrum.slice_table import SliceTable
 
 SHAPES = [(1, 1), (1, 8), (7, 1), (5, 5), (4, 6)]
-NUMBERS = ("height_range", "coherence_length", "wavelengths", "tolerance", "error", "pixel_size")
+KINDS = ["taylor", "chebyshev", "svd", "slices"]
+NUMBERS = (
+    *("height_range", "coherence_length", "wavelengths", "tolerance", "error", "pixel_size"),
+    *("largest_angle", "dropped", "beyond"),
+)
 
 
 def make(representation="slices", shape=(4, 7), depth=0.2, source="by hand", **arguments):
@@ -23,13 +30,25 @@ def make(representation="slices", shape=(4, 7), depth=0.2, source="by hand", **a
     return md.precompute(md.HeightField(heights, (0.07, 0.0585), source), representation=representation, **arguments)
 
 
+def make_sample(representation="slices", shape=(10, 9), depth=0.2, source="by hand", **arguments):
+    # Four pixels of 0.07 µm: the shortest coherence that a scan of any size here carries.
+    arguments = {"extent": "sample", "coherence_length": 0.2801, "tolerance": 0.05, **arguments}
+    return make(representation, shape, depth, source, **arguments)
+
+
+@functools.cache
+def built(extent, kind):
+    return make(kind) if extent == "tile" else make_sample(kind)
+
+
 def table_of(spectrum):
-    return spectrum.table.coefficients if spectrum.representation == "taylor" else spectrum.table.values
+    return spectrum.table.values if spectrum.representation == "slices" else spectrum.table.terms
 
 
-@pytest.fixture(params=["taylor", "slices"])
+@pytest.fixture(params=[("tile", kind) for kind in KINDS] + [("sample", "slices")], ids="-".join)
 def saved(request, tmp_path):
-    spectrum = make(request.param)
+    extent, kind = request.param
+    spectrum = built(extent, kind)
     spectrum.save(tmp_path / "saved.exr")
     return spectrum, tmp_path / "saved.exr"
 
@@ -55,24 +74,7 @@ def rewrite(path, header=(), channels=(), drop=()):
 # ---------------------------------------------------------------- what is in the file
 
 
-@settings(max_examples=25)
-@given(
-    representation=st.sampled_from(["taylor", "slices"]),
-    shape=st.sampled_from(SHAPES),
-    depth=st.sampled_from([0.0, 0.05, 0.3]),
-    coherence_length=st.floats(1.0, 1000.0),
-    shortest=st.floats(360.0, 500.0),
-    source=st.sampled_from(["", "scan.png", "gräben [µm]", "two\nlines", "x" * 400]),
-)
-def test_a_spectrum_comes_back_bit_for_bit(
-    tmp_path_factory, representation, shape, depth, coherence_length, shortest, source
-):
-    path = tmp_path_factory.mktemp("round") / "trip.exr"
-    spectrum = make(
-        representation, shape, depth, source, coherence_length=coherence_length, wavelengths=(shortest, 830)
-    )
-    spectrum.save(path)
-    back = GratingSpectrum.load(path)
+def assert_the_same(back, spectrum):
     for name in (*NUMBERS, "source", "source_digest", "extent", "representation", "grid", "largest_kappa"):
         assert getattr(back, name) == getattr(spectrum, name), name
     assert table_of(back).dtype == table_of(spectrum).dtype
@@ -82,48 +84,112 @@ def test_a_spectrum_comes_back_bit_for_bit(
     np.testing.assert_array_equal(back.powers(25.0), spectrum.powers(25.0))
 
 
-def test_the_header_names_all_that_a_reader_needs(saved):
-    spectrum, path = saved
-    header = OpenEXR.File(str(path), separate_channels=True).header()
+@settings(max_examples=30)
+@given(
+    representation=st.sampled_from(KINDS),
+    shape=st.sampled_from(SHAPES),
+    depth=st.sampled_from([0.0, 0.05, 0.3]),
+    coherence_length=st.floats(1.0, 1000.0),
+    shortest=st.floats(360.0, 500.0),
+    largest_angle=st.sampled_from([90.0, 60, 100 / 3]),
+    source=st.sampled_from(["", "scan.png", "gräben [µm]", "two\nlines", "x" * 400]),
+)
+def test_a_spectrum_comes_back_bit_for_bit(
+    tmp_path_factory, representation, shape, depth, coherence_length, shortest, largest_angle, source
+):
+    path = tmp_path_factory.mktemp("round") / "trip.exr"
+    spectrum = make(
+        representation,
+        shape,
+        depth,
+        source,
+        coherence_length=coherence_length,
+        wavelengths=(shortest, 830),
+        largest_angle=largest_angle,
+    )
+    spectrum.save(path)
+    assert_the_same(GratingSpectrum.load(path), spectrum)
+
+
+@pytest.mark.parametrize("shape", [(1, 9), (10, 1), (10, 9), (1, 1)])
+@pytest.mark.parametrize("representation", KINDS)
+def test_a_sample_comes_back_bit_for_bit(tmp_path, representation, shape):
+    # An axis of one pixel has no end: its limit is infinite, in the file as well.
+    spectrum = make_sample(representation, shape)
+    assert [limit == np.inf for limit in spectrum.grid.limit] == [n == 1 for n in shape[::-1]]
+    spectrum.save(tmp_path / "sample.exr")
+    assert_the_same(GratingSpectrum.load(tmp_path / "sample.exr"), spectrum)
+
+
+@pytest.mark.parametrize("way", ["tile", "sample"])
+def test_the_header_names_all_that_a_reader_needs(tmp_path, way):
+    spectrum = make(largest_angle=80) if way == "tile" else make_sample(largest_angle=80)
+    shape = (4, 7) if way == "tile" else (10, 9)
+    spectrum.save(tmp_path / "saved.exr")
+    header = OpenEXR.File(str(tmp_path / "saved.exr"), separate_channels=True).header()
     numbers = {
         "pixelSize": spectrum.pixel_size,
-        "tileSize": (7 * 0.07, 4 * 0.0585),
-        "coherenceLength": (65.0,),
+        "coherenceLength": (65.0 if way == "tile" else 0.2801,),
         "heightRange": (spectrum.height_range,),
         "wavelengths": (360.0, 830.0),
         "error": (spectrum.error,),
-        "tolerance": (1e-3,),
+        "tolerance": (1e-3 if way == "tile" else 0.05,),
+        "largestAngle": (80.0,),
+        "dropped": (spectrum.dropped,),
+        "beyond": (spectrum.beyond,),
     }
+    if way == "tile":
+        numbers["tileSize"] = (7 * 0.07, 4 * 0.0585)
+    else:
+        numbers["spacing"] = spectrum.grid.spacing
+        numbers["limit"] = (1 / (2 * 0.07), 1 / (2 * 0.0585))
     for name, value in numbers.items():
         assert header[name].dtype == np.float64, name
         assert tuple(header[name]) == value, name
-    assert header["representation"] == spectrum.representation
+    assert (header["representation"], header["extent"]) == (spectrum.representation, way)
     assert header["source"] == "by hand"
-    heights = np.random.default_rng(5).random((4, 7)) * 0.2
+    heights = np.random.default_rng(5).random(shape) * 0.2
     assert header["sourceSha256"] == md.HeightField(heights, (0.07, 0.0585)).digest
     assert isinstance(header["formatVersion"], int)
     assert header["compression"] == OpenEXR.ZIP_COMPRESSION
     assert header["type"] == OpenEXR.scanlineimage
 
 
-def test_channels_are_float32_and_named_after_what_they_hold(saved):
-    spectrum, path = saved
-    file = OpenEXR.File(str(path), separate_channels=True)
+@pytest.mark.parametrize(
+    ("representation", "name"),
+    [("taylor", "B{t^003}"), ("chebyshev", "B{T_003}"), ("svd", "B{mode 001}"), ("slices", "S(000.3)")],
+)
+def test_channels_are_float32_and_named_after_what_they_hold(tmp_path, representation, name):
+    spectrum = make(representation, depth=0.02 if representation == "slices" else 0.2)
+    spectrum.save(tmp_path / "saved.exr")
+    file = OpenEXR.File(str(tmp_path / "saved.exr"), separate_channels=True)
     assert len(file.parts) == 1
     pixels = {name: channel.pixels for name, channel in file.channels().items()}
     assert {values.dtype for values in pixels.values()} == {np.dtype(np.float32)}
-    if spectrum.representation == "taylor":
-        assert len(pixels) == 2 * spectrum.table.series.terms
-        # By the definition of the channel: the mean of the third power of the scaled heights is its order zero.
-        heights = np.random.default_rng(5).random((4, 7)) * 0.2
-        middle, half = (heights.max() + heights.min()) / 2, np.ptp(heights) / 2
-        rows, columns = pixels["F{(h/H)^003}.re"].shape
-        got = pixels["F{(h/H)^003}.re"][rows // 2, columns // 2]
-        assert got == pytest.approx((((heights - middle) / half) ** 3).mean(), abs=1e-7)
-        assert pixels["F{(h/H)^003}.im"][rows // 2, columns // 2] == pytest.approx(0, abs=1e-7)
+    got = pixels[name]
+    middle = got[got.shape[0] // 2, got.shape[1] // 2]
+    heights = np.random.default_rng(5).random((4, 7)) * spectrum.height_range
+    heights *= spectrum.height_range / np.ptp(heights)
+    u = (heights.ravel()[:, None] - heights.ravel()).ravel()
+    centre = spectrum.largest_kappa / 2
+    wave = np.exp(1j * centre * u)
+    # By the definition of each channel, its order zero: the mean over all pairs of pixels.
+    if representation == "taylor":
+        assert len(pixels) == spectrum.table.series.terms
+        assert middle == pytest.approx(((1j * centre * u) ** 3 / 6 * wave).mean().real, rel=1e-3)
+    elif representation == "chebyshev":
+        assert middle == pytest.approx((2 * (-1j) * jv(3, centre * u) * wave).mean().real, rel=1e-3)
+    elif representation == "svd":
+        header = contents(tmp_path / "saved.exr")[0]
+        modes = np.array(json.loads(header["modes"]))
+        np.testing.assert_array_equal(modes, spectrum.table.series.modes)
+        t = -np.cos(np.pi * (np.arange(modes.shape[1]) + 0.5) / modes.shape[1])
+        eta = np.exp(1j * centre * np.outer(1 + t, u)).mean(axis=1).real
+        assert middle == pytest.approx(np.polynomial.chebyshev.chebval(t, modes[1]) @ eta, abs=1e-5)
     else:
-        assert len(pixels) == 4 * spectrum.table.intervals
-        np.testing.assert_array_equal(pixels["eta(001.2)"], spectrum.table.values[1, 2])
+        assert len(pixels) == 4 * spectrum.table.intervals == 4
+        kappa = (1 - np.cos(np.pi * 3.5 / 4)) / 2 * spectrum.largest_kappa
+        assert middle == pytest.approx(np.exp(1j * kappa * u).mean().real, abs=1e-6)
 
 
 def test_more_than_a_thousand_intervals_keep_their_order(tmp_path):
@@ -147,8 +213,9 @@ def refusal(path, kind=ValueError):
 
 
 def test_another_version_is_refused(saved):
-    rewrite(saved[1], {"formatVersion": 2})
-    assert "version 2" in refusal(saved[1])
+    for version in (1, 3):
+        rewrite(saved[1], {"formatVersion": version})
+        assert f"version {version}" in refusal(saved[1])
 
 
 def test_an_unknown_representation_is_refused(saved):
@@ -171,13 +238,24 @@ def test_a_picture_is_refused(tmp_path):
 @pytest.mark.parametrize(
     "name",
     [
-        *("format", "formatVersion", "representation", "extent", "heightRange", "pixelSize", "tileSize"),
+        *("format", "formatVersion", "representation", "extent", "heightRange", "pixelSize", "grid"),
         *("coherenceLength", "wavelengths", "tolerance", "error", "source", "sourceSha256"),
+        *("largestAngle", "dropped", "beyond", "channelCount"),
     ],
 )
 def test_a_missing_entry_of_the_header_is_refused(saved, name):
+    if name == "grid":
+        name = "tileSize" if saved[0].extent == "tile" else "spacing"
     rewrite(saved[1], drop=[name])
     refusal(saved[1])
+
+
+@pytest.mark.parametrize(("make", "kind", "name"), [(make, "svd", "modes"), (make_sample, "slices", "limit")])
+def test_what_only_some_spectra_have_is_not_done_without(tmp_path, make, kind, name):
+    path = tmp_path / "saved.exr"
+    make(kind).save(path)
+    rewrite(path, drop=[name])
+    assert f"'{name}' is missing" in refusal(path)
 
 
 @pytest.mark.parametrize("which", [0, 3, -1])
@@ -206,7 +284,11 @@ def test_half_precision_is_refused(saved):
         ("heightRange", np.array([-1.0])),
         ("pixelSize", np.array([0.0, -1.0])),
         ("pixelSize", np.array([0.1, 0.1, 0.1])),
-        ("tileSize", np.array([np.nan, 1.0])),
+        ("grid", np.array([np.nan, 1.0])),
+        ("largestAngle", np.array([91.0])),
+        ("dropped", np.array([-0.1])),
+        ("beyond", np.array([np.nan])),
+        ("extent", "ribbon"),
         ("coherenceLength", np.array([0.0])),
         ("coherenceLength", "65"),
         ("wavelengths", np.array([360.0])),
@@ -217,6 +299,8 @@ def test_half_precision_is_refused(saved):
     ],
 )
 def test_numbers_that_cannot_be_are_refused(saved, name, value):
+    if name == "grid":
+        name = "tileSize" if saved[0].extent == "tile" else "spacing"
     rewrite(saved[1], {name: value})
     refusal(saved[1])
 

@@ -6,11 +6,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .energy import energy_from
 from .geometry import Geometry
 from .line_spectrum import LineSpectrum
 from .reflectance import reflectance_from
+from .smooth_spectrum import SmoothSpectrum
 from .surface import spectrum_from
-from .tables import BELOW_ONE
+from .tables import BELOW_ONE, opaque
 
 SHADOWING = ("v_cavity", "none")
 
@@ -33,8 +35,9 @@ Parameters (XML or dictionary):
     shadowing (string): "v_cavity" or "none".
     base (BSDF): what lies under a dielectric surface (pigment); it receives (1 − R_i)(1 − R_o) of the light.
 
-The BRDF is R · K · G · S(q; κ)/λ²: R the power reflectance at the half vector, K and G as in `geometry.py`, S as in
-`line_spectrum.py`, with q = −(ω_i + ω_o)/λ along the pattern's axes and κ = 2π (cos θ_i + cos θ_o)/λ.
+The BRDF is R · K · G · S(q; κ)/λ² · E: R the power reflectance at the half vector, K and G as in `geometry.py`, S as in
+`line_spectrum.py`, with q = −(ω_i + ω_o)/λ along the pattern's axes and κ = 2π (cos θ_i + cos θ_o)/λ. E, as in
+`energy.py`, keeps the reflected light to the received; it is one where the rest does so by itself.
 """
 
 
@@ -53,7 +56,9 @@ def define() -> type:
             self.shadowing = props.get("shadowing", "v_cavity")
             if self.shadowing not in SHADOWING:
                 raise ValueError(f"shadowing: got {self.shadowing!r}, wanted one of {', '.join(SHADOWING)}")
-            self.lines = LineSpectrum(self.spectrum)
+            self.scattering = (LineSpectrum if self.spectrum.extent == "tile" else SmoothSpectrum)(self.spectrum)
+            # The spectrum says nothing beyond its largest angle: there the grating is black.
+            self.least_cosine = opaque(np.cos(np.deg2rad(self.spectrum.largest_angle)) * (1 - 1e-6))
             self.base = _base(props)
             if self.base is not None and not self.reflectance.transparent:
                 raise ValueError("base: got a BSDF below a conductor or a perfect mirror, which let no light through")
@@ -75,6 +80,7 @@ def define() -> type:
                     f"{VISIBLE_FROM:g} nm divided by the scale"
                 )
             dr.make_opaque(self.height_scale)
+            self.energy = energy_from(self.spectrum, self.shadowing == "v_cavity", self.height_scale)
 
         def traverse(self, callback: mi.TraversalCallback) -> None:
             callback.put("orientation", self.orientation, mi.ParamFlags.Differentiable)
@@ -97,18 +103,30 @@ def define() -> type:
             """f cos θ_o of the grating, and the density of its own samples, for directions above the surface."""
             geometry = Geometry(si.wi, wo)
             sin, cos = self._frame(si, active)
-            u, v = cos * geometry.u + sin * geometry.v, cos * geometry.v - sin * geometry.u
+            # From here on along the pattern's axes.
+            wi, wo = _turned(si.wi, sin, cos), _turned(wo, sin, cos)
+            u, v = -wi.x - wo.x, -wi.y - wo.y
+            active = active & (dr.minimum(geometry.cos_i, geometry.cos_o) >= self.least_cosine)
             value, density = mi.UnpolarizedSpectrum(0.0), mi.Float(0.0)
             channels = len(value)
             for channel in range(channels):
                 wavelength = si.wavelengths[channel] * 1e-3  # µm
-                scaled = dr.two_pi / wavelength * self.height_scale
-                weights = self.lines.sampler.weights(geometry.cos_i, dr.detach(scaled))
-                power, share = self.lines.evaluate(
-                    u / wavelength, v / wavelength, -geometry.w * scaled, weights, active & self._covers(wavelength)
+                frequency = dr.rcp(wavelength)
+                scaled = dr.two_pi * frequency * self.height_scale
+                power, share = self.scattering.evaluate(
+                    u * frequency,
+                    v * frequency,
+                    -geometry.w * scaled,
+                    dr.detach(wi),
+                    dr.detach(frequency),
+                    dr.detach(scaled),
+                    active & self._covers(wavelength),
                 )
                 value[channel] = power / dr.square(wavelength)
                 density += share / dr.square(wavelength)
+            if self.energy is not None:
+                wavelengths = mi.UnpolarizedSpectrum(si.wavelengths) * 1e-3
+                value = self.energy.conserve(value, wi, wo, wavelengths, active)
             value *= self.reflectance(si, geometry.cos_half(), active) * geometry.factor(self.shadowing == "v_cavity")
             # The mean over the wavelengths: any of them may have chosen the direction.
             density = DEFENSIVE * dr.inv_pi + (1 - DEFENSIVE) * density / channels
@@ -196,19 +214,19 @@ def define() -> type:
             for channel in range(1, channels):
                 wavelength = dr.select(chosen == channel, si.wavelengths[channel] * 1e-3, wavelength)
             wavelength = dr.detach(wavelength)
-            scaled = dr.two_pi / wavelength * dr.detach(self.height_scale)
-            q_x, q_y = self.lines.sample(mi.Frame3f.cos_theta(si.wi), scaled, rest, v, active & (u >= 0))
+            frequency = dr.rcp(wavelength)
+            scaled = dr.two_pi * frequency * dr.detach(self.height_scale)
             sin, cos = (dr.detach(x) for x in self._frame(si, active))
+            q_x, q_y = self.scattering.sample(_turned(si.wi, sin, cos), frequency, scaled, rest, v, active & (u >= 0))
             x = -wavelength * (cos * q_x - sin * q_y) - si.wi.x
             y = -wavelength * (sin * q_x + cos * q_y) - si.wi.y
             z = dr.safe_sqrt(1 - dr.square(x) - dr.square(y))
             return dr.select(diffuse, mi.warp.square_to_cosine_hemisphere(v), mi.Vector3f(x, y, z))
 
         def to_string(self) -> str:
-            x, y = self.spectrum.grid.tile_size
             lines = [
                 f"spectrum = {self.spectrum.source}",
-                f"tile = {x:.4g} x {y:.4g} um",
+                f"{self.spectrum.extent} = {self.spectrum.grid}",
                 f"coherence_length = {self.spectrum.coherence_length:g} um",
                 f"representation = {self.spectrum.representation}, {self.spectrum.megabytes:.3g} MB",
                 f"reflectance = {self.reflectance}",
@@ -219,6 +237,11 @@ def define() -> type:
             return "DiffractionGrating[\n" + "".join(f"  {line},\n" for line in lines) + "]"
 
     return DiffractionGrating
+
+
+def _turned(omega: mi.Vector3f, sin: mi.Float, cos: mi.Float) -> mi.Vector3f:
+    """ω along the pattern's axes."""
+    return mi.Vector3f(cos * omega.x + sin * omega.y, cos * omega.y - sin * omega.x, omega.z)
 
 
 def _base(props: mi.Properties) -> mi.BSDF | None:

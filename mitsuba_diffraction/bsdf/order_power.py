@@ -1,4 +1,4 @@
-"""η_m(κ) at run time, for each way in which a spectrum stores it."""
+"""The power of a node of a spectrum at run time, for each way in which a spectrum stores it."""
 
 from __future__ import annotations
 
@@ -10,60 +10,88 @@ from ..spectrum.series_table import SeriesTable
 from ..spectrum.slice_table import SliceTable
 from .tables import PacketTable, opaque
 
-
-def order_power(table: SeriesTable | SliceTable) -> SeriesPower | SlicePower:
-    """The evaluation that fits the table."""
-    return SlicePower(table) if isinstance(table, SliceTable) else SeriesPower(table)
+# Linear interpolation of g_n(κ) errs by less than this share of its largest value.
+_WEIGHT_ERROR = 1e-5
 
 
-class SeriesPower:
-    """η_m(κ) = |Σ_n (iκH)ⁿ/n! F{(h/H)ⁿ}_m|².
+def order_power(table: SeriesTable | SliceTable, rim: int = 0) -> SeriesPower | SlicePower:
+    """The evaluation that fits the table; `rim` rings of zeros are put around its nodes."""
+    return SlicePower(table, rim) if isinstance(table, SliceTable) else SeriesPower(table, rim)
 
-    One evaluation reads 4·⌈N/2⌉ floats that lie one after the other, two terms to a packet.
+
+class _Power:
+    """What both have in common.
+
+    Attributes:
+        table: packets of four floats; those of nodes beside each other along x lie beside each other.
+        rows: of nodes.
+        columns: of nodes.
     """
 
-    def __init__(self, table: SeriesTable) -> None:
-        terms, rows, columns = table.coefficients.shape
-        self.pairs = (terms + 1) // 2
-        packets = np.zeros((rows, columns, 2 * self.pairs, 2), np.float32)
-        packets[:, :, :terms, 0] = np.moveaxis(table.coefficients.real, 0, -1)
-        packets[:, :, :terms, 1] = np.moveaxis(table.coefficients.imag, 0, -1)
+    def __init__(self, packets: np.ndarray, rim: int) -> None:
+        """Takes (packets per node, rows, columns, 4)."""
+        packets = np.pad(packets, ((0, 0), (rim, rim), (rim, rim), (0, 0))) if rim else packets
+        self.rows, self.columns = packets.shape[1:3]
         self.table = PacketTable(packets)
-        self.half_range = opaque(table.series.half_range)
 
-    @dr.syntax
-    def __call__(self, order: mi.UInt32, kappa: mi.Float, active: mi.Bool) -> mi.Float:
-        """The power of the order with flat index `order` (row-major); κ in rad/µm."""
-        # xⁿ/n! is real for even n, imaginary for odd n; two terms go into one step.
-        x = kappa * self.half_range
-        even, odd = mi.Float(1.0), mi.Float(x)
-        real, imaginary = mi.Float(0.0), mi.Float(0.0)
-        start = order * self.pairs
-        pair = mi.UInt32(0)
-        while pair < self.pairs:
-            term = self.table(start + pair, active)
-            real += even * term[0] - odd * term[3]
-            imaginary += even * term[1] + odd * term[2]
-            n = mi.Float(2 * pair)
-            even *= -dr.square(x) / ((n + 1) * (n + 2))
-            odd *= -dr.square(x) / ((n + 2) * (n + 3))
-            pair += 1
-        return dr.square(real) + dr.square(imaginary)
+    def of(self, node: mi.UInt32, at: list[tuple[mi.UInt32, mi.Vector4f]], active: mi.Bool) -> mi.Float:
+        """c_m of one node (row-major); `at` is what the method `at` gave for κ."""
+        return sum(dr.dot(self.table(offset + node, active), factors) for offset, factors in at)
 
 
-class SlicePower:
-    """η_m(κ) by a cubic in κ. One evaluation reads one packet of four floats."""
+class SlicePower(_Power):
+    """c_m(κ) = a₀ + a₁t + a₂t² + a₃t³ on the interval of κ. A node is one packet of four floats."""
 
-    def __init__(self, table: SliceTable) -> None:
-        self.table = PacketTable(table.polynomials())
+    def __init__(self, table: SliceTable, rim: int) -> None:
+        super().__init__(table.polynomials(), rim)
         self.intervals = table.intervals
         self.per_kappa = opaque(table.intervals / table.largest_kappa)
 
-    def __call__(self, order: mi.UInt32, kappa: mi.Float, active: mi.Bool) -> mi.Float:
-        """The power of the order with flat index `order` (row-major); κ in rad/µm."""
+    def at(self, kappa: mi.Float, active: mi.Bool) -> list[tuple[mi.UInt32, mi.Vector4f]]:
+        """Where the packets of node 0 lie at κ (rad/µm), and the weights of their four floats."""
         x = kappa * self.per_kappa
         interval = dr.minimum(mi.UInt32(x), self.intervals - 1)
         t = x - mi.Float(interval)
-        a = self.table(order * self.intervals + interval, active)
-        # The cubic may dip below zero by its error.
-        return dr.maximum(dr.fma(dr.fma(dr.fma(a[3], t, a[2]), t, a[1]), t, a[0]), 0)
+        return [(interval * (self.rows * self.columns), mi.Vector4f(1, t, dr.square(t), dr.square(t) * t))]
+
+
+class SeriesPower(_Power):
+    """c_m(κ) = Σ_n g_n(κ) B_nm. A node is ⌈N/4⌉ packets of four floats; the g_n come from a small table over κ."""
+
+    def __init__(self, table: SeriesTable, rim: int) -> None:
+        terms, rows, columns = table.terms.shape
+        self.packets = (terms + 3) // 4
+        packets = np.zeros((self.packets, rows, columns, 4), np.float32)
+        for n, term in enumerate(table.terms):
+            packets[n // 4, :, :, n % 4] = term
+        super().__init__(packets, rim)
+        weights = _weights(table)
+        self.steps = len(weights) - 1
+        padded = np.zeros((len(weights), self.packets * 4), np.float32)
+        padded[:, :terms] = weights
+        self.weights = PacketTable(padded.reshape(-1, self.packets, 4))
+        self.per_kappa = opaque(self.steps / table.largest_kappa)
+
+    def at(self, kappa: mi.Float, active: mi.Bool) -> list[tuple[mi.UInt32, mi.Vector4f]]:
+        """Where the packets of node 0 lie at κ (rad/µm), and the weights of their four floats."""
+        x = kappa * self.per_kappa
+        step = dr.minimum(mi.UInt32(x), self.steps - 1)
+        t = x - mi.Float(step)
+        result = []
+        for packet in range(self.packets):
+            low = self.weights(step * self.packets + packet, active)
+            high = self.weights((step + 1) * self.packets + packet, active)
+            result.append((mi.UInt32(packet * self.rows * self.columns), dr.fma(t, high - low, low)))
+        return result
+
+
+def _weights(table: SeriesTable) -> np.ndarray:
+    """g_n at steps in κ so small that straight lines between them serve: (steps + 1, N)."""
+    steps = 64
+    while True:
+        kappas = np.linspace(0, table.largest_kappa, 2 * steps + 1)
+        weights = table.series.weights(kappas)
+        error = np.abs(weights[1::2] - (weights[:-1:2] + weights[2::2]) / 2).max(axis=0)
+        if (error <= _WEIGHT_ERROR * np.abs(weights).max(axis=0)).all() or steps >= 1 << 14:
+            return weights[::2]
+        steps *= 2

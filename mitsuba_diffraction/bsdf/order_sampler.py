@@ -1,16 +1,17 @@
 """Which order a ray takes: the distribution over orders from which the BSDF is sampled.
 
-The best choice for the order m would be its own power η_m(κ_m), but κ_m = k (cos θ_i + cos θ_m) is known only when the
-order is. The κ of all directions lie in k cos θ_i ≤ κ ≤ k (1 + cos θ_i); weighting cos θ_o by 2 cos θ_o, as a diffuse
-surface would, gives the mixture
+P_m = Σ_j w_j A_jm / Σ_j w_j M_j is a mixture over κ (`kappa_cells`), restricted to the rectangle of orders around those
+that propagate: light on other orders goes nowhere, and at grazing incidence most of the mixture would lie there. M_j is
+the sum of A_jm over the rectangle. A one-row grating has the exact interval: with s the direction of incidence,
 
-    P_m = Σ_j w_j A_jm,    A_jm ∝ mean of η_m over the cell κ_j ≤ κ ≤ κ_{j+1},  Σ_m A_jm = 1
-    w_j = e_{j+1}² − e_j²,    e_j = clip(κ_j/k − cos θ_i, 0, 1)
+    |m_x/T_x + s_x/λ| ≤ √(1/λ² − s_y²/λ²)
 
-The averages of a few wide cells serve: where η_m changes fast with κ, P_m must cover its range, not follow it.
+each made wider by the reach of the lobes.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import drjit as dr
 import mitsuba as mi
@@ -18,109 +19,166 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..spectrum import GratingSpectrum
+from .kappa_cells import CELLS, KappaCells, averages, choose
 from .tables import BELOW_ONE, PacketTable, opaque
 
-CELLS = 4  # one packet
+FLOOR = 0.05  # the share of each κ cell that all orders have alike, for those that its average misses
+WHOLE = 2**24  # a float32 holds whole numbers up to here
+LARGEST_TABLE = 2**19  # packets (8 MB); where the sums over rectangles take more, all orders can be drawn
 
 
 class OrderSampler:
-    """Draws orders in O(1) by alias tables (Walker 1977); P_m of a given order reads one packet of four floats."""
+    """Draws orders by two binary searches; P_m of a given order reads one packet of four floats.
+
+    The A_jm are whole numbers of units 2⁻²⁴, so that sums over rectangles are exact: the probability of what is drawn
+    is the probability that is reported.
+    """
 
     def __init__(self, spectrum: GratingSpectrum) -> None:
-        self.cell_width = opaque(spectrum.largest_kappa / CELLS)
+        self.cells = KappaCells(spectrum.largest_kappa)
         self.rows, self.columns = spectrum.grid.shape
-        averages = np.stack([_average(spectrum, cell).ravel() for cell in range(CELLS)])
-        self.shares = PacketTable(averages.T)
-        self.aliases = _PairTable(np.stack([np.stack(alias_table(average), -1) for average in averages]))
+        self.largest_x, self.largest_y = spectrum.grid.largest
+        self.tile_x, self.tile_y = (opaque(t) for t in spectrum.grid.tile_size)
+        self.margin = opaque(spectrum.reach * spectrum.lobe_width)
+        self.restricted = (self.largest_x + 1) ** 2 * (self.rows + 1) <= LARGEST_TABLE
+        units = np.stack([_units(average) for average in averages(spectrum)], axis=-1)
+        self.shares = PacketTable(units)
+        # The sums of A_j over the columns before x, for each row.
+        before_x = np.zeros((self.rows, self.columns + 1, CELLS), np.int64)
+        before_x[:, 1:] = units.cumsum(axis=1)
+        self.before_x = PacketTable(before_x)
+        # The sums of A_j over the rows before y, for each first column and each end of the columns.
+        first, end = np.arange(self.largest_x + 1), np.arange(self.largest_x + 1, self.columns + 1)
+        if not self.restricted:
+            first, end = first[:1], end[-1:]
+        before_y = np.zeros((len(first), len(end), self.rows + 1, CELLS), np.int64)
+        for index, column in enumerate(first):
+            before_y[index, :, 1:] = np.moveaxis((before_x[:, end] - before_x[:, [column]]).cumsum(axis=0), 1, 0)
+        self.before_y = PacketTable(before_y)
 
-    def weights(self, cos_i: mi.Float, kappa_per_cosine: mi.Float) -> mi.Vector4f:
-        """w_j for one wavelength; `kappa_per_cosine` is k in rad/µm, times the scale of the heights."""
-        edges = [
-            dr.clip(cell * self.cell_width / kappa_per_cosine - cos_i, 0, 1) if cell else 0.0 for cell in range(CELLS)
-        ]
-        edges.append(1.0)  # the last cell takes what lies beyond the table
-        return mi.Vector4f(*(dr.square(edges[j + 1]) - dr.square(edges[j]) for j in range(CELLS)))
+    def rectangle(self, wi: mi.Vector3f, frequency: mi.Float) -> tuple[mi.Int32, mi.Int32, mi.Int32, mi.Int32]:
+        """The first row, the end of the rows, the first column, the end of the columns.
+
+        Args:
+            wi: direction of incidence, along the axes of the pattern.
+            frequency: 1/λ in cycles/µm.
+        """
+        if not self.restricted:
+            return mi.Int32(0), mi.Int32(self.rows), mi.Int32(0), mi.Int32(self.columns)
+        s_x, s_y = wi.x * frequency, wi.y * frequency
+        rows = self._interval(s_y, s_x, self.columns, frequency, self.tile_y, self.largest_y)
+        columns = self._interval(s_x, s_y, self.rows, frequency, self.tile_x, self.largest_x)
+        return *rows, *columns
+
+    def _interval(
+        self, along: mi.Float, across: mi.Float, lines: int, frequency: mi.Float, tile: mi.Float, largest: int
+    ) -> tuple[mi.Int32, mi.Int32]:
+        """The orders |m/T + s/λ| ≤ ρ along one axis, of which there are `lines` side by side: first and end."""
+        if largest == 0:
+            return mi.Int32(0), mi.Int32(1)
+        half = frequency
+        if lines == 1:
+            half = dr.safe_sqrt(dr.square(frequency) - dr.square(dr.maximum(dr.abs(across) - self.margin, 0)))
+        half = half + self.margin
+        first = mi.Int32(dr.ceil((-along - half) * tile))
+        last = mi.Int32(dr.floor((half - along) * tile))
+        # The mirror order m = 0 is always among them.
+        return dr.clip(first, -largest, 0) + largest, dr.clip(last, 0, largest) + (largest + 1)
+
+    def weights(self, wi: mi.Vector3f, frequency: mi.Float, kappa_per_cosine: mi.Float, active: mi.Bool) -> mi.Vector4f:
+        """w_j / Σ_j w_j M_j for one wavelength.
+
+        Args:
+            wi: direction of incidence, along the axes of the pattern.
+            frequency: 1/λ in cycles/µm.
+            kappa_per_cosine: 2π/λ in rad/µm, times the scale of the heights.
+            active: mask.
+        """
+        weights = self.cells.weights(wi.z, kappa_per_cosine)
+        bottom, top, left, right = self.rectangle(wi, frequency)
+        total = dr.dot(weights, self._masses(bottom, top, self._start(left, right), active))
+        return weights * dr.rcp(dr.maximum(total, 1))
+
+    def _start(self, left: mi.Int32, right: mi.Int32) -> mi.Int32:
+        """Where the sums over the rows begin in their table."""
+        if not self.restricted:
+            return mi.Int32(0)
+        return (left * (self.largest_x + 1) + right - (self.largest_x + 1)) * (self.rows + 1)
+
+    def _masses(self, bottom: mi.Int32, top: mi.Int32, start: mi.Int32, active: mi.Bool) -> mi.Vector4f:
+        """M_j in units."""
+        masses = self.before_y(mi.UInt32(start + top), active)
+        return masses - self.before_y(mi.UInt32(start + bottom), active) if self.rows > 1 else masses
 
     def share(self, order: mi.UInt32, weights: mi.Vector4f, active: mi.Bool) -> mi.Float:
-        """P_m of the order with flat index `order`."""
+        """P_m of the order with flat index `order`, which is among those of the rectangle."""
         return dr.dot(self.shares(order, active), weights)
 
     def sample(
-        self, cos_i: mi.Float, kappa_per_cosine: mi.Float, u: mi.Float, v: mi.Point2f, active: mi.Bool
-    ) -> tuple[mi.UInt32, mi.Point2f]:
-        """Draw an order for one wavelength.
+        self,
+        wi: mi.Vector3f,
+        frequency: mi.Float,
+        kappa_per_cosine: mi.Float,
+        u: mi.Float,
+        v: mi.Point2f,
+        active: mi.Bool,
+    ) -> tuple[mi.Int32, mi.Int32, mi.Point2f]:
+        """Draw an order for one wavelength; the arguments are those of `weights`.
 
-        Row, column and alias are drawn from different numbers: one alone has too few bits for a large table.
+        κ cell and row come from `u`, the column from `v` where there are several rows.
 
         Returns:
-            Its flat index, and what is left of `v`: two numbers uniform in [0, 1).
+            Its row and column, and what is left of `v`: two numbers uniform in [0, 1).
         """
-        row, u = _pick(u, self.rows)
-        column, x = _pick(v.x, self.columns)
-        kappa = kappa_per_cosine * (cos_i + dr.sqrt(u))
-        cell = dr.minimum(mi.UInt32(kappa / self.cell_width), CELLS - 1)
-        order = row * self.columns + column
-        threshold, alias = self.aliases(cell * (self.rows * self.columns) + order, active)
-        keep = v.y < threshold
-        y = dr.select(keep, v.y, v.y - threshold) / dr.select(keep, threshold, 1 - threshold)
-        return dr.select(keep, order, mi.UInt32(alias)), mi.Point2f(x, dr.clip(y, 0, BELOW_ONE))
+        bottom, top, left, right = self.rectangle(wi, frequency)
+        start = self._start(left, right)
+        masses = self._masses(bottom, top, start, active)
+        cell, u = choose(self.cells.weights(wi.z, kappa_per_cosine) * masses, u)
+
+        def before_y(y: mi.Int32) -> mi.Float:
+            return self.before_y.entry(mi.UInt32(start + y), cell, active)
+
+        def before_x(x: mi.Int32) -> mi.Float:
+            return self.before_x.entry(mi.UInt32(row * (self.columns + 1) + x), cell, active)
+
+        if self.rows == 1:
+            row = mi.Int32(0)
+            column, _ = _search(before_x, left, right, self.columns, u)
+            return row, column, v
+        row, _ = _search(before_y, bottom, top, self.rows, u)
+        column, rest = _search(before_x, left, right, self.columns, v.x)
+        return row, column, mi.Point2f(rest, v.y)
 
 
-def _pick(u: mi.Float, count: int) -> tuple[mi.UInt32, mi.Float]:
-    """One of `count` equal parts, and the place in it."""
-    x = u * count
-    part = dr.minimum(mi.UInt32(x), count - 1)
-    return part, dr.minimum(x - mi.Float(part), BELOW_ONE)
+def _units(average: NDArray[np.float64]) -> NDArray[np.int64]:
+    """A_jm of one κ cell in units of 2⁻²⁴: at least one, no more than 2²⁴ together."""
+    mixed = (1 - FLOOR) * average + FLOOR / average.size
+    return 1 + np.floor(mixed * (WHOLE - average.size)).astype(np.int64)
 
 
-def _average(spectrum: GratingSpectrum, cell: int) -> NDArray[np.float64]:
-    """A_jm of one cell, (rows, columns): the mean of η_m over the cell, scaled to the sum one."""
-    width = spectrum.largest_kappa / CELLS
-    # η_m oscillates in κ with the angular frequency of the height range at most.
-    points = int(np.ceil(width * spectrum.height_range)) + 2
-    nodes = (cell + (np.arange(points) + 0.5) / points) * width
-    total = sum(spectrum.powers(kappa).astype(np.float64) for kappa in nodes)
-    return total / total.sum()
-
-
-def alias_table(probabilities: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Thresholds and aliases for drawing index i with probability p_i: take i uniformly, keep it if u < threshold_i.
-
-    Entries below the mean are filled up by those above, in order; the running sums of what is missing and of what is
-    left over say who fills whom, so that no loop is needed.
+def _search(
+    before: Callable[[mi.Int32], mi.Float], first: mi.Int32, end: mi.Int32, count: int, u: mi.Float
+) -> tuple[mi.Int32, mi.Float]:
+    """The index i with F(i) ≤ F(first) + u (F(end) − F(first)) < F(i + 1), first ≤ i < end.
 
     Args:
-        probabilities: (n,), sum one.
+        before: F, increasing, its values whole numbers.
+        first: where the search begins.
+        end: where it ends.
+        count: end − first at most.
+        u: in [0, 1).
 
     Returns:
-        (n,) thresholds in [0, 1] and (n,) indices.
+        i, and the place between F(i) and F(i + 1), in [0, 1).
     """
-    count = len(probabilities)
-    scaled = np.asarray(probabilities, np.float64) * count
-    threshold, alias = np.ones(count), np.arange(count)
-    light, heavy = np.flatnonzero(scaled < 1), np.flatnonzero(scaled >= 1)
-    if len(light) == 0:
-        return threshold, alias
-    missing, surplus = np.cumsum(1 - scaled[light]), np.cumsum(scaled[heavy] - 1)
-    # A light entry is filled by the first heavy one that has something left when its turn comes.
-    giver = np.minimum(np.searchsorted(surplus, np.concatenate([[0.0], missing[:-1]]), side="right"), len(heavy) - 1)
-    threshold[light], alias[light] = scaled[light], heavy[giver]
-    # A heavy entry that has given more than it had is filled by the next heavy one.
-    last = np.searchsorted(missing, surplus[:-1], side="right")
-    over = last < len(light)
-    threshold[heavy[:-1][over]] = 1 - (missing[last[over]] - surplus[:-1][over])
-    alias[heavy[:-1][over]] = heavy[1:][over]
-    return np.clip(threshold, 0, 1), alias
-
-
-class _PairTable:
-    """A flat table of (threshold, alias); the alias is an integer below 2²⁴, which a float holds exactly."""
-
-    def __init__(self, pairs: NDArray[np.float64]) -> None:
-        flat = np.ascontiguousarray(pairs, np.float32).ravel()
-        self.values = mi.Float(flat) if dr.is_jit_v(mi.Float) else flat
-
-    def __call__(self, index: mi.UInt32, active: mi.Bool) -> mi.Vector2f:
-        if dr.is_jit_v(mi.Float):
-            return dr.gather(mi.Vector2f, self.values, index, active)
-        return mi.Vector2f(*map(float, self.values[2 * index : 2 * index + 2])) if active else mi.Vector2f(0.0)
+    index, low, high = first, before(first), before(end)
+    target = dr.fma(u, high - low, low)
+    # The sum may round up to the end.
+    target = dr.select(target < high, target, low)
+    for bit in reversed(range((count - 1).bit_length())):
+        trial = dr.minimum(index + (1 << bit), end)
+        value = before(trial)
+        further = value <= target
+        index = dr.select(further, trial, index)
+        low, high = dr.select(further, value, low), dr.select(further, high, value)
+    return index, dr.clip((target - low) / dr.maximum(high - low, 1), 0, BELOW_ONE)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
+VISIBLE_FROM, VISIBLE_TO = 360.0, 830.0  # nm, what Mitsuba samples
 MODELS = ("exact", "schlick")
 
 
@@ -77,8 +79,13 @@ class Conductor:
 
     @staticmethod
     def _spectrum(metal: mi.SceneParameters, name: str) -> mi.Texture:
-        wavelengths, values = metal[f"{name}.wavelengths"], metal[f"{name}.values"]
-        return mi.load_dict({"type": "irregular", "wavelengths": _text(wavelengths), "values": _text(values)})
+        # A regular table is read at once; in an irregular one every look-up searches, which took half of all time.
+        nanometres = np.arange(VISIBLE_FROM, VISIBLE_TO + 1)
+        values = np.interp(nanometres, metal[f"{name}.wavelengths"], metal[f"{name}.values"])
+        text = ", ".join(repr(float(value)) for value in values)
+        return mi.load_dict(
+            {"type": "regular", "wavelength_min": VISIBLE_FROM, "wavelength_max": VISIBLE_TO, "values": text}
+        )
 
     def __call__(self, si: mi.SurfaceInteraction3f, cos_half: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
         eta, k = self.eta.eval(si, active), self.k.eval(si, active)
@@ -102,7 +109,3 @@ def _schlick(normal: mi.UnpolarizedSpectrum, cos_half: mi.Float) -> mi.Unpolariz
     """R₀ + (1 − R₀)(1 − cos)⁵ (Schlick 1994); R₀ is a power already and is not squared."""
     away = 1 - cos_half
     return normal + (1 - normal) * dr.square(dr.square(away)) * away
-
-
-def _text(values: mi.Float) -> str:
-    return ", ".join(repr(float(v)) for v in values)

@@ -18,16 +18,27 @@ BELOW_ONE = 1 - 2.0**-24  # the largest float32 under one, in every variant
 
 
 class PacketTable:
-    """A flat table of packets of four floats; one packet is one aligned read of 16 bytes."""
+    """A flat table of packets of two or four floats; one packet is one aligned read of 8 or 16 bytes."""
 
-    def __init__(self, packets: np.ndarray) -> None:
-        """Takes float32 (..., 4)."""
+    def __init__(self, packets: np.ndarray, width: int = 4) -> None:
+        """Takes the packets one after the other, in an array of any shape, and holds them as float32."""
+        self.width = width
+        self.packet = {2: mi.Vector2f, 4: mi.Vector4f}[width]
         flat = np.ascontiguousarray(packets, np.float32).ravel()
         # Scalar variants have no gather.
         self.values = mi.Float(flat) if dr.is_jit_v(mi.Float) else flat
 
-    def __call__(self, index: mi.UInt32, active: mi.Bool) -> mi.Vector4f:
+    def __call__(self, index: mi.UInt32, active: mi.Bool) -> mi.Vector2f | mi.Vector4f:
         """The packets at `index`; zero where not `active`."""
         if dr.is_jit_v(mi.Float):
-            return dr.gather(mi.Vector4f, self.values, index, active)
-        return mi.Vector4f(*map(float, self.values[4 * index : 4 * index + 4])) if active else mi.Vector4f(0.0)
+            return dr.gather(self.packet, self.values, index, active)
+        if not active:
+            return self.packet(0.0)
+        return self.packet(*map(float, self.values[self.width * index : self.width * (index + 1)]))
+
+    def entry(self, index: mi.UInt32, place: mi.UInt32, active: mi.Bool) -> mi.Float:
+        """One float of the packets at `index`; zero where not `active`."""
+        index = self.width * index + place
+        if dr.is_jit_v(mi.Float):
+            return dr.gather(mi.Float, self.values, index, active)
+        return float(self.values[index]) if active else 0.0

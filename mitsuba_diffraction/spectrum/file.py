@@ -1,15 +1,15 @@
-"""A grating spectrum as an OpenEXR file: float32, ZIP, one part, one pixel per diffraction order.
+"""A grating spectrum as an OpenEXR file: float32, ZIP, one part, one pixel per diffraction order or node.
 
-Channels are named after what they hold. "taylor": `F{(h/H)^003}.re` and `.im`, the real and imaginary parts of the
-Fourier coefficients of the third power of the centred, scaled heights. "slices": `eta(012.2)`, the order powers at the
-third Chebyshev point of interval 12 of κ. Rows are orders m_y, columns m_x, from −M to M.
-Numbers in the header are double precision.
+Channels are named after what they hold. Series: `B{t^003}` (taylor), `B{T_003}` (chebyshev), `B{mode 003}` (svd), the
+terms B_n of S = Σ g_n(κ) B_n; "slices": `S(012.2)`, the powers at the third Chebyshev point of interval 12 of κ. Rows
+are orders m_y, columns m_x, from −M to M. Numbers in the header are double precision.
 """
 
 from __future__ import annotations
 
 import contextlib
 import io
+import json
 import os
 import sys
 from collections.abc import Iterator
@@ -18,15 +18,18 @@ from pathlib import Path
 import numpy as np
 import OpenEXR
 
+from ..expansions.chebyshev import ChebyshevSeries
+from ..expansions.svd import SvdSeries
 from ..expansions.taylor import TaylorSeries
 from ..files import whole_file
 from .grating_spectrum import GratingSpectrum
 from .orders import OrderGrid
 from .series_table import SeriesTable
 from .slice_table import SliceTable
+from .spline_grid import SplineGrid
 
 FORMAT = "mitsuba_diffraction grating spectrum"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 
 
 @contextlib.contextmanager
@@ -64,16 +67,22 @@ def save(spectrum: GratingSpectrum, path: str | os.PathLike[str]) -> None:
         "extent": spectrum.extent,
         "heightRange": _doubles(spectrum.height_range),
         "pixelSize": _doubles(*spectrum.pixel_size),
-        "tileSize": _doubles(*spectrum.grid.tile_size),
+        **_grid_header(spectrum.grid),
         "coherenceLength": _doubles(spectrum.coherence_length),
         "wavelengths": _doubles(*spectrum.wavelengths),
         "tolerance": _doubles(spectrum.tolerance),
         "error": _doubles(spectrum.error),
+        "largestAngle": _doubles(spectrum.largest_angle),
+        "dropped": _doubles(spectrum.dropped),
+        "beyond": _doubles(spectrum.beyond),
         "source": spectrum.source,
         "sourceSha256": spectrum.source_digest,
         "units": "lengths in micrometres, wavelengths in nanometres",
     }
-    channels = _CHANNELS[spectrum.representation](spectrum.table)
+    if isinstance(spectrum.table, SeriesTable) and isinstance(spectrum.table.series, SvdSeries):
+        # repr of a float is exact.
+        header["modes"] = json.dumps(spectrum.table.series.modes.tolist())
+    channels = _channels(spectrum.table)
     header["channelCount"] = len(channels)
     with whole_file(path) as temporary:
         OpenEXR.File(header, channels).write(str(temporary))
@@ -104,33 +113,34 @@ def load(path: str | os.PathLike[str]) -> GratingSpectrum:
             f"{path}: got format version {header.get('formatVersion')}, wanted {FORMAT_VERSION}; "
             "build the spectrum again with this version of mitsuba_diffraction"
         )
-    if header.get("representation") not in _TABLES:
+    if header.get("representation") not in _REPRESENTATIONS:
         raise ValueError(
-            f"{path}: got representation {header.get('representation')!r}, wanted one of {', '.join(_TABLES)}"
+            f"{path}: got representation {header.get('representation')!r}, wanted one of {', '.join(_REPRESENTATIONS)}"
         )
     try:
         pixels = {name: channel.pixels for name, channel in channels.items()}
         if halves := [name for name, values in pixels.items() if values.dtype != np.float32]:
             raise ValueError(f"{halves[0]} is not of type float")
-        height_range, wavelengths = _single(header["heightRange"]), _pair(header["wavelengths"])
-        table = _TABLES[header["representation"]](pixels, height_range, 4 * np.pi / (wavelengths[0] * 1e-3))
-        names = _CHANNELS[header["representation"]](table).keys()
+        wavelengths = _pair(header["wavelengths"])
+        table = _table(header, pixels, 4 * np.pi / (wavelengths[0] * 1e-3))
+        names = _channels(table).keys()
         if pixels.keys() != names or len(names) != header["channelCount"]:
             unknown = ", ".join(sorted(pixels.keys() - names)) or "none unknown"
             raise ValueError(f"got {len(pixels)} channels ({unknown}), wanted {header['channelCount']} of known names")
-        rows, columns = table.shape
         return GratingSpectrum(
             table=table,
-            grid=OrderGrid(_pair(header["tileSize"]), ((columns - 1) // 2, (rows - 1) // 2)),
+            grid=_grid(header, table.shape),
             pixel_size=_pair(header["pixelSize"]),
-            height_range=height_range,
+            height_range=_single(header["heightRange"]),
             coherence_length=_single(header["coherenceLength"]),
             wavelengths=wavelengths,
             tolerance=_single(header["tolerance"]),
             error=_single(header["error"]),
             source=header["source"],
             source_digest=header["sourceSha256"],
-            extent=header["extent"],
+            largest_angle=_single(header["largestAngle"]),
+            dropped=_single(header["dropped"]),
+            beyond=_single(header["beyond"]),
         )
     except KeyError as error:
         raise ValueError(f"{path}: a damaged spectrum, {error} is missing") from None
@@ -138,37 +148,45 @@ def load(path: str | os.PathLike[str]) -> GratingSpectrum:
         raise ValueError(f"{path}: a damaged spectrum ({_one_line(error)})") from None
 
 
-def _series_channels(table: SeriesTable) -> dict[str, np.ndarray]:
-    channels = {}
-    for n, term in enumerate(table.coefficients):
-        channels[f"F{{(h/H)^{n:03d}}}.re"] = np.ascontiguousarray(term.real)
-        channels[f"F{{(h/H)^{n:03d}}}.im"] = np.ascontiguousarray(term.imag)
-    return channels
+def _grid_header(grid: OrderGrid | SplineGrid) -> dict[str, np.ndarray]:
+    if isinstance(grid, OrderGrid):
+        return {"tileSize": _doubles(*grid.tile_size)}
+    return {"spacing": _doubles(*grid.spacing), "limit": _doubles(*grid.limit)}
 
 
-def _series_table(pixels: dict[str, np.ndarray], height_range: float, largest_kappa: float) -> SeriesTable:
-    terms = len(pixels) // 2
-    names = [f"F{{(h/H)^{n:03d}}}" for n in range(terms)]
-    coefficients = np.stack([pixels[name + ".re"] + 1j * pixels[name + ".im"] for name in names])
-    return SeriesTable(TaylorSeries(height_range / 2, terms), coefficients.astype(np.complex64))
+def _grid(header: dict, shape: tuple[int, int]) -> OrderGrid | SplineGrid:
+    largest = ((shape[1] - 1) // 2, (shape[0] - 1) // 2)
+    if header["extent"] == "tile":
+        return OrderGrid(_pair(header["tileSize"]), largest)
+    if header["extent"] == "sample":
+        return SplineGrid(_pair(header["spacing"]), largest, _pair(header["limit"]))
+    raise ValueError(f"extent: got {header['extent']!r}, wanted 'tile' or 'sample'")
 
 
-def _slice_channels(table: SliceTable) -> dict[str, np.ndarray]:
-    return {
-        f"eta({interval:03d}.{node})": table.values[interval, node]
-        for interval in range(table.intervals)
-        for node in range(4)
-    }
+_TERM_NAMES = {
+    TaylorSeries.name: "B{{t^{:03d}}}",
+    ChebyshevSeries.name: "B{{T_{:03d}}}",
+    SvdSeries.name: "B{{mode {:03d}}}",
+}
+_REPRESENTATIONS = (*_TERM_NAMES, SliceTable.representation)
 
 
-def _slice_table(pixels: dict[str, np.ndarray], height_range: float, largest_kappa: float) -> SliceTable:
-    intervals = len(pixels) // 4
-    powers = [[pixels[f"eta({interval:03d}.{node})"] for node in range(4)] for interval in range(intervals)]
-    return SliceTable(largest_kappa, np.array(powers, np.float32))
+def _channels(table: SeriesTable | SliceTable) -> dict[str, np.ndarray]:
+    if isinstance(table, SliceTable):
+        return {f"S({k:03d}.{node})": table.values[k, node] for k in range(table.intervals) for node in range(4)}
+    return {_TERM_NAMES[table.representation].format(n): term for n, term in enumerate(table.terms)}
 
 
-_CHANNELS = {TaylorSeries.NAME: _series_channels, SliceTable.representation: _slice_channels}
-_TABLES = {TaylorSeries.NAME: _series_table, SliceTable.representation: _slice_table}
+def _table(header: dict, pixels: dict[str, np.ndarray], largest_kappa: float) -> SeriesTable | SliceTable:
+    kind, count = header["representation"], header["channelCount"]
+    if kind == SliceTable.representation:
+        values = [[pixels[f"S({k:03d}.{node})"] for node in range(4)] for k in range(count // 4)]
+        return SliceTable(largest_kappa, np.array(values, np.float32))
+    if kind == SvdSeries.name:
+        series = SvdSeries(largest_kappa, np.array(json.loads(header["modes"]), np.float64))
+    else:
+        series = (TaylorSeries if kind == TaylorSeries.name else ChebyshevSeries)(largest_kappa, count)
+    return SeriesTable(series, np.stack([pixels[_TERM_NAMES[kind].format(n)] for n in range(count)]))
 
 
 def _single(value: np.ndarray) -> float:

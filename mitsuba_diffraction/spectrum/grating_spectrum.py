@@ -13,6 +13,7 @@ from ..coherence import lobe_reach, lobe_width
 from .orders import OrderGrid
 from .series_table import SeriesTable
 from .slice_table import SliceTable
+from .spline_grid import SplineGrid
 
 # The part of the tolerance that is spent on the tails of the lobes.
 TAIL_SHARE = 0.1
@@ -20,24 +21,27 @@ TAIL_SHARE = 0.1
 
 @dataclass(frozen=True, eq=False)
 class GratingSpectrum:
-    """S(q; κ) = Σ_m η_m(κ) N(q − m/T; σ_q² I).
+    """S(q; κ) of a tile, Σ_m η_m(κ) N(q − m/T; σ_q² I), or of a sample, a sum of B-splines (`SplineGrid`).
 
     Attributes:
-        table: η_m(κ), in one of the representations.
-        grid: the diffraction orders m that are kept.
+        table: η_m(κ), or the coefficients of the splines, in one of the representations.
+        grid: the diffraction orders m, or the nodes, that are kept.
         pixel_size: (x, y) of the height field, µm.
         height_range: of the height field, µm.
-        coherence_length: L_c in µm; it sets the width σ_q of each order.
+        coherence_length: L_c in µm; it sets the width σ_q of each order. Of a sample: what the scan carries.
         wavelengths: (shortest, longest) in nm for which the table holds.
         tolerance: the bound that was asked for.
         error: what was measured: max over κ of ∫|S_approx − S_exact| dq over the frequencies that light can reach.
         source: where the heights came from.
         source_digest: SHA-256 of the height field.
-        extent: "tile": the patch repeats for ever.
+        largest_angle: in degrees from the normal, of both directions, for which the table holds.
+        dropped: the largest share of the power, over κ, in weak frequencies that were not kept; part of `error`.
+        beyond: the largest share of the power, over κ, at frequencies that no pair of directions reaches, or that the
+            pixels do not resolve.
     """
 
     table: SeriesTable | SliceTable
-    grid: OrderGrid
+    grid: OrderGrid | SplineGrid
     pixel_size: tuple[float, float]
     height_range: float
     coherence_length: float
@@ -46,13 +50,13 @@ class GratingSpectrum:
     error: float
     source: str
     source_digest: str = field(repr=False)
-    extent: str = "tile"
+    largest_angle: float = 90.0
+    dropped: float = 0.0
+    beyond: float = 0.0
 
     def __post_init__(self) -> None:
         if self.table.shape != self.grid.shape:
-            raise ValueError(f"table: got {self.table.shape} orders, wanted {self.grid.shape}")
-        if self.extent != "tile":
-            raise ValueError(f"extent: got {self.extent!r}, wanted 'tile'")
+            raise ValueError(f"table: got {self.table.shape} nodes, wanted {self.grid.shape}")
         if not all(np.isfinite(p) and p > 0 for p in self.pixel_size):
             raise ValueError(f"pixel_size: got {self.pixel_size}, wanted two positive lengths in µm")
         if not (np.isfinite(self.height_range) and self.height_range >= 0):
@@ -61,13 +65,21 @@ class GratingSpectrum:
             raise ValueError(f"tolerance, error: got {self.tolerance}, {self.error}, wanted shares of the power")
         if not (isinstance(self.source, str) and isinstance(self.source_digest, str)):
             raise ValueError(f"source: got {self.source!r}, {self.source_digest!r}, wanted texts")
+        if not (0 <= self.dropped <= 1 and 0 <= self.beyond <= 1):
+            raise ValueError(f"dropped, beyond: got {self.dropped}, {self.beyond}, wanted shares of the power")
         check_wavelengths(self.wavelengths)
+        check_angle(self.largest_angle)
         lobe_width(self.coherence_length)
 
     @property
     def representation(self) -> str:
-        """How the order powers are stored: "taylor" or "slices"."""
+        """How the powers are stored: "taylor", "chebyshev", "svd" or "slices"."""
         return self.table.representation
+
+    @property
+    def extent(self) -> str:
+        """ "tile": the patch repeats for ever; "sample": it is a piece of a larger, irregular surface."""
+        return "tile" if isinstance(self.grid, OrderGrid) else "sample"
 
     @property
     def largest_kappa(self) -> float:
@@ -86,8 +98,13 @@ class GratingSpectrum:
 
     @property
     def neighbours(self) -> tuple[int, int]:
-        """How many orders along x and y overlap at one q, to the tolerance."""
-        return self.grid.neighbours(self.lobe_width, self.reach)
+        """How many nodes along x and y hold at one q, to the tolerance."""
+        return self.grid.neighbours(self.lobe_width, self.reach) if self.extent == "tile" else (3, 3)
+
+    @property
+    def floats_per_evaluation(self) -> int:
+        """How many floats of the table one evaluation of S reads."""
+        return self.neighbours[0] * self.neighbours[1] * self.table.floats_per_node
 
     @property
     def megabytes(self) -> float:
@@ -95,7 +112,9 @@ class GratingSpectrum:
         return self.table.nbytes / 1e6
 
     def powers(self, kappa: float) -> NDArray[np.float32]:
-        """η_m(κ) of the orders that are kept, (2 M_y + 1, 2 M_x + 1), in float32 as a renderer computes them.
+        """The share of the reflected power of each node, (2 M_y + 1, 2 M_x + 1), in float32 as a renderer computes it.
+
+        Of a tile, η_m(κ). Shares may be below zero: by the error, and as coefficients of splines.
 
         Raises:
             ValueError: if κ (rad/µm) is outside of what the table holds.
@@ -117,20 +136,12 @@ class GratingSpectrum:
         """
         q, kappa = matching(q, kappa)
         self._checked(kappa)
-        sigma = self.lobe_width
-        tile, largest = np.array(self.grid.tile_size), np.array(self.grid.largest)
-        first = np.ceil(np.clip((q - self.reach * sigma) * tile, -largest, largest + 1)).astype(np.int64)
         result = np.zeros(kappa.shape)
-        count_x, count_y = self.neighbours
-        for step in np.ndindex(count_x, count_y):
-            m = first + step
-            kept = (np.abs(m) <= largest).all(axis=-1)
-            column, row = np.moveaxis(np.where(kept[..., None], m + largest, 0), -1, 0)
-            distance = ((q - m / tile) ** 2).sum(axis=-1)
-            kept &= distance <= (self.reach * sigma) ** 2
-            lobe = np.exp(-distance / (2 * sigma**2)) / (2 * np.pi * sigma**2 * -np.expm1(-(self.reach**2) / 2))
-            result += np.where(kept, lobe * self.table.powers_at(row, column, kappa), 0)
-        return result
+        around = self.grid.around(q, self.lobe_width, self.reach) if self.extent == "tile" else self.grid.around(q)
+        for row, column, weight in around:
+            result += weight * self.table.powers_at(row, column, kappa)
+        # Interpolation may dip below zero by its error.
+        return np.maximum(result, 0)
 
     def _checked(self, kappa: NDArray[np.float64]) -> NDArray[np.float64]:
         if not (np.all(kappa >= 0) and np.all(kappa <= self.largest_kappa * (1 + 1e-6))):
@@ -166,3 +177,9 @@ def check_wavelengths(wavelengths: tuple[float, float]) -> None:
         raise ValueError(f"wavelengths: got {wavelengths!r}, wanted (shortest, longest) in nm") from None
     if not (np.isfinite([shortest, longest]).all() and 50 <= shortest < longest):
         raise ValueError(f"wavelengths: got {wavelengths!r}, wanted (shortest, longest) in nm, at least 50 nm")
+
+
+def check_angle(largest_angle: float) -> None:
+    """Raises ValueError unless `largest_angle` is an angle from the normal in degrees."""
+    if not 0 < largest_angle <= 90:
+        raise ValueError(f"largest_angle: got {largest_angle!r}, wanted degrees from the normal, above 0, at most 90")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,19 +28,16 @@ class OrderGrid:
             raise ValueError(f"largest order: got {self.largest}, wanted two integers ≥ 0")
 
     @classmethod
-    def reachable(
-        cls, tile_size: tuple[float, float], pixels: tuple[int, int], shortest_wavelength: float
-    ) -> OrderGrid:
-        """The orders that some pair of directions reaches: |q| ≤ 2/λ, as far as the pixels resolve them.
+    def reachable(cls, tile_size: tuple[float, float], pixels: tuple[int, int], largest_frequency: float) -> OrderGrid:
+        """The orders up to `largest_frequency` (cycles/µm), as far as the pixels resolve them.
 
         Args:
             tile_size: (T_x, T_y) in µm.
-            pixels: (N_x, N_y); there is nothing at or beyond the Nyquist order N/2.
-            shortest_wavelength: λ_min in µm.
+            pixels: (N_x, N_y); there is nothing beyond the Nyquist order N/2.
+            largest_frequency: the largest |q| that a pair of directions reaches, cycles/µm.
         """
         largest = tuple(
-            min(int(np.floor(2 * t / shortest_wavelength)), (n - 1) // 2)
-            for t, n in zip(tile_size, pixels, strict=True)
+            min(int(np.floor(t * largest_frequency)), n // 2) for t, n in zip(tile_size, pixels, strict=True)
         )
         return cls(tile_size, largest)
 
@@ -47,6 +45,10 @@ class OrderGrid:
     def shape(self) -> tuple[int, int]:
         """(rows, columns) = (2 M_y + 1, 2 M_x + 1); row ↔ m_y, column ↔ m_x, both from −M."""
         return 2 * self.largest[1] + 1, 2 * self.largest[0] + 1
+
+    def __str__(self) -> str:
+        x, y = self.tile_size
+        return f"{x:.4g} × {y:.4g} µm, {self.shape[1]} × {self.shape[0]} orders"
 
     def axes(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """m_x of the columns and m_y of the rows."""
@@ -57,17 +59,39 @@ class OrderGrid:
         """q_x of the columns and q_y of the rows, cycles/µm."""
         return tuple(m / size for m, size in zip(self.axes(), self.tile_size, strict=True))
 
-    def take(self, transform: NDArray) -> NDArray:
-        """The kept orders out of a discrete Fourier transform of the tile.
+    def take(self, powers: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The kept orders out of the powers of all.
 
         Args:
-            transform: (N_y, N_x), in the order of `scipy.fft.fft2`.
+            powers: (N_y, N_x), in the order of `scipy.fft.fft2`.
 
         Returns:
-            (2 M_y + 1, 2 M_x + 1), in the order of `axes`.
+            (2 M_y + 1, 2 M_x + 1), in the order of `axes`. The Nyquist order of an even N has no sign: half of its
+            power goes to each.
         """
         m_x, m_y = self.axes()
-        return transform[np.ix_(m_y % transform.shape[0], m_x % transform.shape[1])]
+        taken = powers[np.ix_(m_y % powers.shape[0], m_x % powers.shape[1])]
+        for lines, m, count in ((taken, m_y, powers.shape[0]), (taken.T, m_x, powers.shape[1])):
+            lines[2 * np.abs(m) == count] *= 0.5
+        return taken
+
+    def around(
+        self, q: NDArray[np.float64], lobe_width: float, reach: float
+    ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]]:
+        """The orders whose lobes hold q (..., 2): row, column and N(q − m/T; σ_q² I), one neighbour at a time.
+
+        The lobe is cut off at `reach`·σ_q and scaled to the integral one; its value is 0 beyond, and beyond the grid.
+        """
+        tile, largest = np.array(self.tile_size), np.array(self.largest)
+        first = np.ceil(np.clip((q - reach * lobe_width) * tile, -largest, largest + 1)).astype(np.int64)
+        peak = 1 / (2 * np.pi * lobe_width**2 * -np.expm1(-(reach**2) / 2))
+        for step in np.ndindex(*self.neighbours(lobe_width, reach)):
+            m = first + step
+            kept = (np.abs(m) <= largest).all(axis=-1)
+            column, row = np.moveaxis(np.where(kept[..., None], m + largest, 0), -1, 0)
+            distance = ((q - m / tile) ** 2).sum(axis=-1)
+            kept &= distance <= (reach * lobe_width) ** 2
+            yield row, column, np.where(kept, peak * np.exp(-distance / (2 * lobe_width**2)), 0)
 
     def neighbours(self, lobe_width: float, reach: float) -> tuple[int, int]:
         """How many orders can lie within ±`reach`·σ_q of one q, along x and y (σ_q in cycles/µm)."""

@@ -1,4 +1,4 @@
-"""The order powers from a series: η_m(κ) = |Σ_n c_n(κ) F{φ_n}_m|²."""
+"""The powers from a series: c_m(κ) = Σ_n g_n(κ) B_nm."""
 
 from __future__ import annotations
 
@@ -6,76 +6,85 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-import scipy.fft
 from numpy.typing import NDArray
 
-from ..expansions.taylor import TaylorSeries
-from ..heightfield import HeightField
-from .orders import OrderGrid
+from ..expansions import Series, chebyshev_nodes
 
 
 @dataclass(frozen=True, eq=False)
 class SeriesTable:
-    """The Fourier coefficients of the terms of a series.
+    """The terms of a series at every node of a grid.
 
     Attributes:
-        series: e^{iκh} = Σ_n c_n(κ) φ_n(h).
-        coefficients: F{φ_n}_m, complex64 (N, rows, columns), on an order grid.
+        series: the g_n(κ).
+        terms: B_nm, float32 (N, rows, columns), on the grid.
     """
 
-    series: TaylorSeries
-    coefficients: NDArray[np.complex64] = field(repr=False)
+    series: Series
+    terms: NDArray[np.float32] = field(repr=False)
 
     def __post_init__(self) -> None:
-        got = self.coefficients
-        if got.ndim != 3 or len(got) != self.series.terms or got.dtype != np.complex64 or not np.isfinite(got).all():
+        got = self.terms
+        if got.ndim != 3 or len(got) != self.series.terms or got.dtype != np.float32 or not np.isfinite(got).all():
             raise ValueError(
-                f"coefficients: got {got.dtype} {got.shape}, wanted finite complex64 (terms, rows, columns)"
+                f"terms: got {got.dtype} {got.shape}, wanted finite float32 ({self.series.terms}, rows, columns)"
             )
         got.setflags(write=False)
 
     @classmethod
     def build(
-        cls, series: TaylorSeries, height_field: HeightField, orders: OrderGrid, progress: Callable[[int, int], None]
+        cls,
+        series: Series,
+        nodes: int,
+        powers: Callable[[float], NDArray[np.float64]],
+        progress: Callable[[int, int], None],
     ) -> SeriesTable:
-        """Transform the terms one after the other, so that little more than the result is held in memory."""
-        coefficients = np.empty((series.terms, *orders.shape), np.complex64)
-        for n, term in enumerate(series.basis(height_field.centred)):
-            coefficients[n] = orders.take(scipy.fft.fft2(term, norm="forward"))
-            progress(n + 1, series.terms)
-        return cls(series, coefficients)
+        """Adds up the terms over `nodes` Chebyshev nodes in κ; little more than the result is held in memory."""
+        projection = series.projection(nodes)
+        # Taylor's terms come out of sums that cancel; those of the others are as large as what is summed.
+        dtype = np.float64 if np.abs(projection).sum(axis=1).max() > 100 else np.float32
+        terms = None
+        for j, t in enumerate(chebyshev_nodes(nodes)):
+            power = powers((1 + t) / 2 * series.largest_kappa).astype(dtype)
+            if terms is None:
+                terms = np.zeros((series.terms, *power.shape), dtype)
+            for term, factor in zip(terms, projection[:, j].astype(dtype), strict=True):
+                term += factor * power
+            progress(j + 1, nodes)
+        return cls(series, terms.astype(np.float32, copy=False))
 
     @property
     def representation(self) -> str:
         """The name of the series."""
-        return self.series.NAME
+        return self.series.name
+
+    @property
+    def largest_kappa(self) -> float:
+        """κ_max in rad/µm."""
+        return self.series.largest_kappa
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(rows, columns) of the order grid."""
-        return self.coefficients.shape[1:]
-
-    @property
-    def floats_per_order(self) -> int:
-        """How many floats the power of one order at one κ reads."""
-        return 2 * self.series.terms
+        """(rows, columns) of the grid."""
+        return self.terms.shape[1:]
 
     @property
     def nbytes(self) -> int:
         """Size in memory."""
-        return self.coefficients.nbytes
+        return self.terms.nbytes
+
+    @property
+    def floats_per_node(self) -> int:
+        """How many floats one node at one κ reads."""
+        return len(self.terms)
 
     def powers(self, kappa: float) -> NDArray[np.float32]:
-        """η_m(κ) of all orders, (rows, columns), in float32 as a renderer computes them; κ in rad/µm."""
-        amplitude = np.zeros(self.shape, np.complex64)
-        for weight, term in zip(self.series.weights(kappa).astype(np.complex64), self.coefficients, strict=True):
-            amplitude += weight * term
-        return amplitude.real**2 + amplitude.imag**2
+        """c_m(κ) of all nodes, (rows, columns), in float32 as a renderer computes them; κ in rad/µm."""
+        return np.tensordot(self.series.weights(kappa).astype(np.float32), self.terms, 1)
 
     def powers_at(
         self, row: NDArray[np.int64], column: NDArray[np.int64], kappa: NDArray[np.float64]
     ) -> NDArray[np.float32]:
-        """η_m(κ) at one order and one κ each; all arguments and the result of one shape (...)."""
-        weights = self.series.weights(kappa).astype(np.complex64)
-        amplitude = np.einsum("...n,n...->...", weights, self.coefficients[:, row, column])
-        return amplitude.real**2 + amplitude.imag**2
+        """c_m(κ) at one node and one κ each; all arguments and the result of one shape (...)."""
+        weights = self.series.weights(kappa).astype(np.float32)
+        return np.einsum("...n,n...->...", weights, self.terms[:, row, column])

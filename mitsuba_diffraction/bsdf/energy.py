@@ -1,0 +1,180 @@
+"""E(ω_i, ω_o, λ) at run time: what keeps the grating from reflecting more light than it receives.
+
+E = min(e(ω_i, λ), e(ω_o, λ)), e as in `spectrum/albedo.py`.
+"""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..spectrum import GratingSpectrum
+from ..spectrum.albedo import EnergyTable, GatheredSpectrum, energy_table
+from .tables import PacketTable, opaque
+
+STEP = 1e-3  # of height_scale, for the derivative of the table
+
+_built: weakref.WeakKeyDictionary[GratingSpectrum, _Tables] = weakref.WeakKeyDictionary()
+
+
+class _Tables:
+    """The tables of one spectrum, for every BSDF that shows it; the last few are kept."""
+
+    KEPT = 8
+
+    def __init__(self, spectrum: GratingSpectrum) -> None:
+        self.gathered = GatheredSpectrum.of(spectrum)
+        self.tables: dict[tuple[bool, float], EnergyTable] = {}
+
+    def __call__(self, shadowing: bool, height_scale: float) -> EnergyTable:
+        key = shadowing, height_scale
+        table = self.tables.get(key)
+        if table is None:
+            table = energy_table(self.gathered, shadowing, height_scale)
+            self.tables = dict([*self.tables.items(), (key, table)][-self.KEPT :])
+        return table
+
+
+def energy_from(spectrum: GratingSpectrum, shadowing: bool, height_scale: mi.Float) -> Energy | None:
+    """The factor for a surface, or None if it is one for all directions and wavelengths.
+
+    The table holds for one value of `height_scale` and is built again when that changes. Where a gradient is tracked
+    through `height_scale`, the entries of the table carry theirs, from a central difference.
+    """
+    tables = _built.get(spectrum)
+    if tables is None:
+        tables = _built[spectrum] = _Tables(spectrum)
+    scale = float(np.max(height_scale))
+    table = tables(shadowing, scale)
+    if not dr.grad_enabled(height_scale):
+        return Energy(table) if table.needed else None
+    lower, upper = max(scale - STEP, 0.0), scale + STEP
+    slope = (tables(shadowing, upper).values - tables(shadowing, lower).values) / (upper - lower)
+    return Energy(table, slope, height_scale - dr.detach(height_scale))
+
+
+@dataclass
+class Place:
+    """Where a direction lies in the table: cells and the place in them, 0 to 1, and c."""
+
+    column: mi.UInt32
+    x: mi.Float
+    row: mi.UInt32
+    y: mi.Float
+    c: mi.Float
+
+
+class Energy:
+    """e(ω, λ) from a table, linear in y, ν and x.
+
+    The four corners of a cell in (ν, x) are packed as bytes into one number, so that a direction and a wavelength cost
+    one read of four bytes, or two where the table has more than one row: reads cost more than the arithmetic. Bytes
+    are rounded down, which leaves e a lower bound.
+    """
+
+    def __init__(self, table: EnergyTable, slope: np.ndarray | None = None, change: mi.Float | None = None) -> None:
+        """`slope` times `change`, which is zero but for its gradient, is added to the table."""
+        self.rows, slices, columns = table.values.shape
+        self.slices, self.columns = slices - 1, columns - 1
+        self.conical = table.conical
+        least = float(table.values.min())
+        # A value that is a whole number of steps stays one, and one stays one.
+        steps = np.floor((_corners(table.values) - least) / (1 - least) * 255 + 1e-3).astype(np.uint32)
+        self.table = _NumberTable(steps @ (np.uint32(1) << np.arange(0, 32, 8, dtype=np.uint32)))
+        self.least, self.step = opaque(least), opaque((1 - least) / 255)
+        self.slope = None if slope is None else PacketTable(_corners(slope))
+        self.change = change
+        first, last = table.frequencies
+        self.first = opaque(first)
+        self.per_frequency = opaque(self.slices / (last - first))
+
+    @dr.syntax
+    def conserve(
+        self,
+        value: mi.UnpolarizedSpectrum,
+        wi: mi.Vector3f,
+        wo: mi.Vector3f,
+        wavelengths: mi.UnpolarizedSpectrum,
+        active: mi.Bool,
+    ) -> mi.UnpolarizedSpectrum:
+        """`value` times E; directions along the pattern's axes, wavelengths in µm.
+
+        Most pairs of directions meet no order and need no E.
+        """
+        if active & (dr.max(value) > 0):
+            value = value * self.factor(wi, wo, wavelengths)
+        return value
+
+    def factor(self, wi: mi.Vector3f, wo: mi.Vector3f, wavelengths: mi.UnpolarizedSpectrum) -> mi.UnpolarizedSpectrum:
+        """E of each wavelength."""
+        there, back = self.place(wi), self.place(wo)
+        result = mi.UnpolarizedSpectrum(1.0)
+        for channel in range(len(result)):
+            frequency = self.per_frequency / wavelengths[channel]
+            result[channel] = dr.minimum(self.bound(there, frequency), self.bound(back, frequency))
+        return result
+
+    def place(self, omega: mi.Vector3f) -> Place:
+        """The place of ω, along the pattern's axes."""
+        z = dr.maximum(omega.z, 0)
+        c = dr.sqrt(dr.square(omega.x) + dr.square(z))
+        column, x = _cell(0.5 * (omega.x / dr.maximum(c + z, 1e-7) + 1) * self.columns, self.columns)
+        row, y = mi.UInt32(0), mi.Float(0)
+        if self.rows > 1:
+            row, y = _cell(0.5 * (omega.y / (1 + c) + 1) * (self.rows - 1), self.rows - 1)
+        return Place(column, x, row, y, c)
+
+    def bound(self, place: Place, frequency: mi.Float) -> mi.Float:
+        """e of the direction at `place`; `frequency` is 1/λ in cells of the table."""
+        nu = place.c * frequency if self.conical else frequency - self.first * self.per_frequency
+        cell, t = _cell(nu, self.slices)
+        index = (place.row * self.slices + cell) * self.columns + place.column
+        steps = self._between(lambda i: _bytes(self.table(i)), index, place, t)
+        e = dr.fma(steps, self.step, self.least)
+        if self.slope is not None:
+            e += self._between(lambda i: self.slope(i, True), index, place, t) * self.change
+        return e
+
+    def _between(
+        self, corners: Callable[[mi.UInt32], mi.Vector4f], index: mi.UInt32, place: Place, t: mi.Float
+    ) -> mi.Float:
+        """Linear between the corners of the cell at `index`."""
+        values = corners(index)
+        if self.rows > 1:
+            values = dr.lerp(values, corners(index + self.slices * self.columns), place.y)
+        return dr.lerp(dr.lerp(values[0], values[1], place.x), dr.lerp(values[2], values[3], place.x), t)
+
+
+class _NumberTable:
+    """A flat table of 32-bit numbers."""
+
+    def __init__(self, numbers: np.ndarray) -> None:
+        flat = np.ascontiguousarray(numbers, np.uint32).ravel()
+        # Scalar variants have no gather.
+        self.values = mi.UInt32(flat) if dr.is_jit_v(mi.Float) else flat
+
+    def __call__(self, index: mi.UInt32) -> mi.UInt32:
+        """The number at `index`."""
+        return dr.gather(mi.UInt32, self.values, index) if dr.is_jit_v(mi.Float) else int(self.values[index])
+
+
+def _bytes(number: mi.UInt32) -> mi.Vector4f:
+    return mi.Vector4f(*(mi.Float(mi.Int32((number >> shift) & 255)) for shift in range(0, 32, 8)))
+
+
+def _corners(values: np.ndarray) -> np.ndarray:
+    """(rows, slices, columns) → (rows, slices − 1, columns − 1, 4): two neighbours in x, and the same at the next ν."""
+    below, above = values[:, :-1], values[:, 1:]
+    return np.stack([below[..., :-1], below[..., 1:], above[..., :-1], above[..., 1:]], -1)
+
+
+def _cell(x: mi.Float, count: int) -> tuple[mi.UInt32, mi.Float]:
+    """The cell of x, 0 ≤ x ≤ count, and the place in it; outside, the nearest."""
+    x = dr.clip(x, 0, count)
+    cell = dr.minimum(mi.UInt32(x), count - 1)
+    return cell, x - mi.Float(cell)

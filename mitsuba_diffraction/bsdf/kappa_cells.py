@@ -1,0 +1,76 @@
+"""The distribution over κ from which the BSDF is sampled: a mixture of a few wide cells.
+
+The best choice of a frequency q would follow S(q; κ), but κ = k (cos θ_i + cos θ_o) is known only when q is. The κ of
+all directions lie in k cos θ_i ≤ κ ≤ k (1 + cos θ_i); weighting cos θ_o by 2 cos θ_o, as a diffuse surface would, gives
+the cell κ_j ≤ κ ≤ κ_{j+1} the weight
+
+    w_j = e_{j+1}² − e_j²,    e_j = clip(κ_j/k − cos θ_i, 0, 1),    Σ_j w_j = 1
+
+The averages of a few wide cells serve: where S changes fast with κ, the mixture must cover its range, not follow it.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from ..spectrum import GratingSpectrum
+from .tables import BELOW_ONE, opaque
+
+CELLS = 4  # one packet
+
+
+class KappaCells:
+    """Equal cells of 0 ≤ κ ≤ `largest_kappa` (rad/µm); the last one takes what lies beyond, too."""
+
+    def __init__(self, largest_kappa: float) -> None:
+        self.width = opaque(largest_kappa / CELLS)
+
+    def weights(self, cos_i: mi.Float, kappa_per_cosine: mi.Float) -> mi.Vector4f:
+        """w_j for one wavelength; `kappa_per_cosine` is k in rad/µm, times the scale of the heights."""
+        step = self.width / kappa_per_cosine
+        inner = [dr.clip(dr.fma(cell, step, -cos_i), 0, 1) for cell in range(1, CELLS)]
+        squares = [0.0, *map(dr.square, inner), 1.0]
+        return mi.Vector4f(*(squares[cell + 1] - squares[cell] for cell in range(CELLS)))
+
+
+def averages(spectrum: GratingSpectrum) -> NDArray[np.float64]:
+    """A_jm, (CELLS, rows, columns): the mean of the powers over each cell, scaled to the sum one."""
+    return np.stack([_average(spectrum, cell) for cell in range(CELLS)])
+
+
+def _average(spectrum: GratingSpectrum, cell: int) -> NDArray[np.float64]:
+    width = spectrum.largest_kappa / CELLS
+    # The powers oscillate in κ with the angular frequency of the height range at most.
+    points = int(np.ceil(width * spectrum.height_range)) + 2
+    nodes = (cell + (np.arange(points) + 0.5) / points) * width
+    total = sum(spectrum.powers(kappa).astype(np.float64) for kappa in nodes)
+    return total / total.sum()
+
+
+def choose(shares: mi.Vector4f, u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
+    """A cell with probability proportional to its share.
+
+    Returns:
+        Its index, and what is left of `u`: a number uniform in [0, 1).
+    """
+    ends = [shares[0]]
+    for cell in range(1, CELLS):
+        ends.append(ends[-1] + shares[cell])
+    x = u * ends[-1]
+    chosen, start, end = mi.UInt32(0), mi.Float(0.0), ends[0]
+    for cell in range(1, CELLS):
+        past = x >= ends[cell - 1]
+        chosen = dr.select(past, mi.UInt32(cell), chosen)
+        start, end = dr.select(past, ends[cell - 1], start), dr.select(past, ends[cell], end)
+    # Where nothing is drawn, in a masked lane, all shares are zero.
+    return chosen, dr.clip((x - start) / dr.maximum(end - start, 1e-30), 0, BELOW_ONE)
+
+
+def pick(u: mi.Float, count: int) -> tuple[mi.UInt32, mi.Float]:
+    """One of `count` equal parts, and the place in it."""
+    x = u * count
+    part = dr.minimum(mi.UInt32(x), count - 1)
+    return part, dr.minimum(x - mi.Float(part), BELOW_ONE)

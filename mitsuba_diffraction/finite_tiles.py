@@ -1,0 +1,68 @@
+"""A finite number of tiles: what their sum does to the transform of one (the "PQ" form)."""
+
+from __future__ import annotations
+
+from numbers import Integral
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+
+def tile_factor(x: ArrayLike, count: int) -> NDArray[np.floating]:
+    """D(x; N) = sin(πNx)/sin(πx): the sum of N unit waves, each x periods after the one before, about their middle.
+
+    N tiles of period T multiply the transform of one tile by D(qT; N), up to a phase. |D| ≤ N, and D² integrates to N
+    over one period. The quotient is 0/0 at whole numbers; with k the whole number nearest to x and r = x − k, which is
+    exact in floating point,
+
+        D(x; N) = (−1)^{k(N−1)} sin(πNr)/sin(πr) → (−1)^{k(N−1)} N   as r → 0.
+
+    The product Nr is kept as two numbers before its own whole part is taken off, so that D is right to a few units in
+    the last place everywhere, next to its zeros too.
+
+    Args:
+        x: (...) numbers; float32 stays float32, everything else becomes float64.
+        count: N, from 1 to 1/ε of the number type (2²³ in float32).
+
+    Returns:
+        (...) in the number type of x.
+
+    Raises:
+        ValueError: if x is not real and finite, or count is not such a whole number.
+    """
+    x = np.asarray(x)
+    if x.dtype.kind not in "fiu":
+        raise ValueError(f"x: got {x.dtype}, wanted real numbers")
+    x = x.astype(np.float32 if x.dtype == np.float32 else np.float64)
+    if not np.isfinite(x).all():
+        raise ValueError("x: got numbers that are not finite")
+    epsilon = np.finfo(x.dtype).eps
+    if isinstance(count, bool) or not isinstance(count, Integral) or not 1 <= count <= 1 / epsilon:
+        raise ValueError(f"count: got {count!r}, wanted a whole number of tiles from 1 to {int(1 / epsilon)}")
+    number, pi = x.dtype.type(count), x.dtype.type(np.pi)
+
+    nearest = np.rint(x)
+    r = x - nearest
+    product, rest = _exact_product(number, r)
+    whole = np.rint(product)
+    fraction = (product - whole) + rest
+    # Here D differs from N by N(πNr)²/6, less than rounding does.
+    at_integer = np.abs(product) < np.sqrt(epsilon) / 4
+    quotient = np.sin(pi * fraction) / np.where(at_integer, x.dtype.type(1), np.sin(pi * r))
+    odd = np.fmod(np.abs(nearest) * x.dtype.type((count - 1) % 2) + np.abs(whole), 2)
+    return np.where(at_integer, number, quotient) * (1 - 2 * odd)
+
+
+def _exact_product(a: np.floating, b: NDArray[np.floating]) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+    """a·b as a rounded product and what rounding took off it (Dekker 1971): their sum is exact."""
+    bits = np.finfo(b.dtype).nmant + 1
+
+    def split(value: NDArray[np.floating]) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+        """Two numbers of half the digits each, whose products do not round."""
+        scaled = value * b.dtype.type(2 ** ((bits + 1) // 2) + 1)
+        high = scaled - (scaled - value)
+        return high, value - high
+
+    product = a * b
+    (a_high, a_low), (b_high, b_low) = split(a), split(b)
+    return product, ((a_high * b_high - product) + a_high * b_low + a_low * b_high) + a_low * b_low

@@ -1,0 +1,141 @@
+"""The spectrum of a piece of a larger, irregular surface, by Welch's method (`welch.py`)."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.fft
+import scipy.ndimage
+from numpy.typing import NDArray
+
+from ..coherence import lobe_width
+from ..heightfield import HeightField
+from ..welch import WindowAxis, window_axes
+from .spline_grid import SplineGrid, spline_integral, spline_weights
+from .tile import inner
+
+# Along an axis on which the surface is uniform the lobe is followed to this many σ_q.
+_UNIFORM_REACH = 6.0
+# Pieces are transformed in batches of about this many numbers.
+_BATCH = 1 << 20
+
+
+class _Lags:
+    """One axis: the lags τ of the autocorrelation, and the frequency lattice that its transform falls on."""
+
+    def __init__(self, axis: WindowAxis | None, pixel: float, coherence_length: float, spacing: float, reach: float):
+        self.axis = axis
+        sigma = lobe_width(coherence_length)
+        if axis is None:
+            pixel, reach = 1 / (4 * _UNIFORM_REACH * sigma), _UNIFORM_REACH * sigma
+            lags = int(np.ceil(6 * coherence_length / 4 * np.sqrt(2) / pixel))
+        else:
+            lags = len(axis.window) - 1
+        # The lattice must resolve the longest lag.
+        self.count = scipy.fft.next_fast_len(max(int(np.ceil(1 / (spacing * pixel))), 2 * lags + 1), real=True)
+        self.spacing = 1 / (self.count * pixel)
+        self.limit = np.inf if axis is None else 1 / (2 * pixel)
+        self.reached = min(reach, self.limit)
+        # Three nodes hold at the last frequency, too. Beyond the Nyquist limit S repeats.
+        self.largest = int(np.rint(self.reached / self.spacing)) + 1
+        self.lags = np.arange(-lags, lags + 1)
+        self.pixel = pixel
+        # The transform of B, and of Σ_k B(x − k) times itself: dividing projects on the splines in the least squares.
+        x = self.lags / self.count
+        self.projection = np.sinc(x) ** 3 * 60 / (33 + 26 * np.cos(2 * np.pi * x) + np.cos(4 * np.pi * x))
+        # Of a uniform axis, the autocorrelation of the window itself.
+        tau = self.lags * pixel
+        self.uniform = np.exp(-(tau**2) / (4 * (coherence_length / 4) ** 2))
+
+
+class SamplePowers:
+    """The B-spline coefficients c_m(κ) of S(q; κ).
+
+    S is band-limited: it is the transform of an autocorrelation that ends at the windows' width. So the coefficients
+    come from one transform of it, and S itself can be had at any other lattice exactly, which measures their error.
+
+    Attributes:
+        grid: all nodes whose splines hold where light reaches and the pixels resolve.
+    """
+
+    def __init__(self, height_field: HeightField, coherence_length: float, spacing: float, reach: float) -> None:
+        """Takes the scan, the coherence length it carries (µm), and the spacing and reach of the nodes (cycles/µm)."""
+        self._phase = height_field.centred
+        self._lags = [
+            _Lags(axis, pixel, coherence_length, spacing, reach)
+            for axis, pixel in zip(window_axes(height_field, coherence_length), height_field.pixel_size, strict=True)
+        ]
+        x, y = self._lags
+        self.grid = SplineGrid((x.spacing, y.spacing), (x.largest, y.largest), (x.limit, y.limit))
+        self._random = np.random.default_rng(0)
+
+    def _autocorrelation(self, kappa: float) -> NDArray[np.complex128]:
+        """ρ(τ) of the windowed phase, averaged over the places: (lags τ_y, lags τ_x ≥ 0); ρ(0) = 1."""
+        (window_x, starts_x), (window_y, starts_y) = (
+            (np.ones(1), np.zeros(1, int)) if lags.axis is None else (lags.axis.window, lags.axis.starts)
+            for lags in self._lags
+        )
+        wave = np.exp(1j * kappa * self._phase)
+        shape = tuple(scipy.fft.next_fast_len(2 * len(w) - 1) for w in (window_y, window_x))
+        pieces = np.lib.stride_tricks.sliding_window_view(wave, (len(window_y), len(window_x)))
+        window = np.outer(window_y, window_x)
+        total = np.zeros(shape)
+        places = [(y, x) for y in starts_y for x in starts_x]
+        step = max(1, _BATCH // (shape[0] * shape[1]))
+        for first in range(0, len(places), step):
+            y, x = np.array(places[first : first + step]).T
+            transform = scipy.fft.fft2(pieces[y, x] * window, shape, overwrite_x=True, workers=2)
+            total += (transform.real**2 + transform.imag**2).sum(axis=0)
+        half = np.conj(scipy.fft.rfft2(total / len(places), norm="forward"))
+        rows = np.arange(-len(window_y) + 1, len(window_y))
+        half = half[rows % shape[0], : len(window_x)]
+        x, y = self._lags
+        # Along a uniform axis the only row, or column, is drawn out by the window's own autocorrelation.
+        if y.axis is None:
+            half = half * y.uniform[:, None]
+        if x.axis is None:
+            half = half * x.uniform[x.lags >= 0]
+        return half
+
+    def _transform(self, half: NDArray[np.complex128]) -> NDArray[np.float64]:
+        """From lags to the nodes of the grid, times the area of a cell: shares of the power."""
+        x, y = self._lags
+        padded = np.zeros((y.count, x.count // 2 + 1), np.complex128)
+        padded[y.lags % y.count, : half.shape[1]] = half
+        full = scipy.fft.hfft2(padded, (y.count, x.count), norm="forward", overwrite_x=True, workers=2)
+        m_x, m_y = (np.arange(-lags.largest, lags.largest + 1) for lags in self._lags)
+        return full[np.ix_(m_y % y.count, m_x % x.count)]
+
+    def __call__(self, kappa: float) -> NDArray[np.float64]:
+        """c_m(κ), (rows, columns), with Σ c = 1 over all frequencies; κ in rad/µm."""
+        x, y = self._lags
+        return self._transform(self._autocorrelation(kappa) * y.projection[:, None] * x.projection[x.lags >= 0])
+
+    def reached(self, powers: NDArray[np.float64]) -> float:
+        """The share of the power where light reaches and the pixels resolve; takes c_m of the grid."""
+        inside = []
+        for axis in self._lags:
+            m, end = np.arange(-axis.largest, axis.largest + 1), axis.reached / axis.spacing
+            inside.append(spline_integral(end - m) - spline_integral(-end - m))
+        return float(inside[1] @ powers @ inside[0])
+
+    def error(self, kept: SplineGrid, powers: NDArray[np.float32], kappa: float) -> float:
+        """∫|S_approx − S_exact| dq where light reaches, by the rule of rectangles on a shifted lattice.
+
+        Args:
+            kept: the smaller grid of the approximation.
+            powers: c_m on it; zero outside.
+            kappa: κ in rad/µm.
+        """
+        shift = self._random.uniform(-0.5, 0.5, 2)
+        ramp = [np.exp(-2j * np.pi * s * lags.lags / lags.count) for s, lags in zip(shift, self._lags, strict=True)]
+        exact = self._transform(self._autocorrelation(kappa) * ramp[1][:, None] * ramp[0][self._lags[0].lags >= 0])
+        weights_x, weights_y = (np.array(spline_weights(s)) for s in shift)
+        approximate = np.zeros(self.grid.shape)
+        approximate[inner(self.grid, kept)] = powers
+        approximate = scipy.ndimage.correlate1d(approximate, weights_x, axis=1, mode="constant")
+        approximate = scipy.ndimage.correlate1d(approximate, weights_y, axis=0, mode="constant")
+        inside_x, inside_y = (
+            np.abs(np.arange(-axis.largest, axis.largest + 1) + s) * axis.spacing <= axis.reached
+            for axis, s in zip(self._lags, shift, strict=True)
+        )
+        return float(inside_y @ np.abs(np.maximum(approximate, 0) - exact) @ inside_x)

@@ -1,0 +1,110 @@
+"""The benchmark: that it measures errors that are there, and reports what it was asked."""
+
+import dataclasses
+import json
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from PIL import Image
+from rich.console import Console
+
+import mitsuba_diffraction as md
+from mitsuba_diffraction import gratings
+from mitsuba_diffraction.benchmark import Case, bundled_cases, measure, report, run, scan_case
+from mitsuba_diffraction.benchmark.accuracy import Exact
+from mitsuba_diffraction.spectrum.slice_table import SliceTable
+
+BLAZE = Case("blaze", gratings.blazed(2.5, 0.25), "tile", 65.0)
+SKIN = Case("skin", gratings.elaphe(8.0, pixel_size=0.08), "sample", 2.0)
+VISIBLE = (360.0, 830.0)
+
+
+@pytest.fixture
+def llvm():
+    if not dr.has_backend(dr.JitBackend.LLVM):
+        pytest.skip("Dr.Jit finds no LLVM")
+    mi.set_variant("llvm_ad_spectral")
+
+
+@pytest.mark.parametrize("case", [BLAZE, SKIN], ids=lambda case: case.name)
+def test_accuracy_is_within_the_tolerance_and_follows_it(case):
+    exact = Exact(case, VISIBLE, kappas=2, points=400)
+    coarse, fine = (exact.accuracy(case.spectrum("slices", tolerance)) for tolerance in (1e-2, 1e-3))
+    assert 0 < fine.l1 <= 1e-3 * 1.1  # a sum over 400 random frequencies
+    assert fine.l1 < coarse.l1 <= 1e-2
+    assert 0 < fine.delta_e[0] <= fine.delta_e[1] < coarse.delta_e[1] < 1
+
+
+@pytest.mark.parametrize("case", [BLAZE, SKIN], ids=lambda case: case.name)
+def test_accuracy_sees_an_error_that_is_put_in(case):
+    exact, spectrum = Exact(case, VISIBLE, kappas=2, points=400), case.spectrum("slices")
+    weaker = SliceTable(spectrum.table.largest_kappa, spectrum.table.values * np.float32(0.8))
+    found = exact.accuracy(dataclasses.replace(spectrum, table=weaker))
+    assert found.peak == pytest.approx(0.2, abs=0.03)
+    assert found.l1 == pytest.approx(0.2, abs=0.02)
+    assert found.delta_e[1] > 1
+
+
+def test_a_run_reports_every_combination(llvm, tmp_path):
+    deep = Case("deep", gratings.sinusoidal(2.5, 2.0), "tile", 65.0)
+    steps = []
+    results = run(
+        [BLAZE, deep],
+        representations=("slices", "taylor"),
+        tolerances=(1e-2,),
+        count=1 << 12,
+        repetitions=1,
+        progress=lambda done, total: steps.append((done, total)),
+    )
+    assert [(r.surface, r.representation) for r in results] == [
+        ("blaze", "slices"), ("blaze", "taylor"), ("deep", "slices"), ("deep", "taylor")
+    ]  # fmt: skip
+    assert steps[-1] == (4, 4)
+    assert "taylor" in results[3].refused
+    for result in results[:3]:
+        assert result.refused is None
+        assert result.floats == (4 if result.representation == "slices" else result.terms)
+        assert min(result.evaluations, result.evaluate_ratio, result.read_ratio, result.sample_ratio) > 0
+        assert result.accuracy.l1 <= 1e-2
+    console = Console(width=200, record=True)
+    console.print(report.table(results))
+    text = console.export_text()
+    assert "refused" in text
+    assert all(len(report.cells(r)) == len(report.cells(results[0])) for r in results)
+
+    report.save_json(results, [], tmp_path / "results.json")
+    written = json.loads((tmp_path / "results.json").read_text(encoding="utf-8"))
+    assert written["speed and error"][0]["accuracy"]["l1"] == results[0].accuracy.l1
+    assert written["speed and error"][3]["terms"] is None
+    report.save_plot(results, tmp_path / "plot.png")
+    with Image.open(tmp_path / "plot.png") as picture:
+        assert picture.width > 600
+        assert np.ptp(np.asarray(picture)) > 100
+
+
+def test_sampling_is_measured(llvm):
+    (found,) = measure([BLAZE], count=1 << 12, size=16, spp=4, repetitions=1)
+    assert min(found.fractions[:4]) >= 0.5
+    assert found.fractions[4] >= 0.25
+    assert 1 < found.largest_weight < 100
+    assert found.variance_ratio > 1
+    assert found.picture_ratio > 0
+    console = Console(width=200, record=True)
+    console.print(report.sampling_table([found]))
+    assert "blaze" in console.export_text()
+
+
+def test_the_bundled_surfaces_are_those_of_the_recipes():
+    cases = {case.name: case for case in bundled_cases()}
+    for name in ("elaphe", "xenopeltis"):
+        recipe = md.Recipe.load(f"precompute/{name}.toml")
+        assert cases[name].coherence_length == recipe.spectrum["coherence_length"]
+        assert cases[name].height_field.digest == recipe.height_field().digest
+
+
+def test_a_scan_is_read_as_a_sample(scan):
+    case = scan_case(scan("elaphe"))
+    assert case.extent == "sample"
+    assert case.coherence_length == pytest.approx(2.93)

@@ -1,0 +1,346 @@
+"""Samples against their density, the density against the sphere, and how much work a sample does."""
+
+import functools
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import mitsuba_diffraction as md
+from mitsuba_diffraction.bsdf.cell_sampler import CellSampler, alias_table
+from mitsuba_diffraction.bsdf.kappa_cells import CELLS
+from mitsuba_diffraction.bsdf.line_spectrum import LineSpectrum
+from mitsuba_diffraction.bsdf.order_sampler import OrderSampler
+
+WAVELENGTHS = (400.0, 500.0, 600.0, 700.0)
+BUNDLED = {
+    "blazed": lambda: md.gratings.blazed(2.5, 0.246),
+    "sinusoidal": lambda: md.gratings.sinusoidal(2.5, 0.25),
+    "lamellar": lambda: md.gratings.lamellar(2.5, 0.25),
+    "crossed": lambda: md.gratings.crossed(2.5, 0.25),
+    "elaphe": lambda: md.gratings.elaphe(32.0, seed=1),
+    "xenopeltis": lambda: md.gratings.xenopeltis(32.0, seed=1),
+}
+SMALL = {
+    **BUNDLED,
+    "elaphe": lambda: md.gratings.elaphe(8.0),
+    "xenopeltis": lambda: md.gratings.xenopeltis(8.0),
+    "column": lambda: md.HeightField(md.gratings.blazed(2.5, 0.246).heights.T, (2.5, 2.5 / 512)),
+}
+RECIPE_COHERENCE = {"elaphe": 26.0, "xenopeltis": 26.0}
+"""µm, as in precompute/*.toml; 65 otherwise."""
+
+
+@functools.cache
+def bundled(name):
+    return md.precompute(BUNDLED[name](), coherence_length=RECIPE_COHERENCE.get(name, 65.0))
+
+
+@functools.cache
+def blurred(name):
+    """With lobes so wide that the bins of a chi² test resolve them."""
+    return md.precompute(SMALL[name](), coherence_length=6.0 if name in RECIPE_COHERENCE else 3.0)
+
+
+def use(variant):
+    if variant.startswith("llvm") and not dr.has_backend(dr.JitBackend.LLVM):
+        pytest.skip("Dr.Jit finds no LLVM")
+    mi.set_variant(variant)
+
+
+@pytest.fixture
+def llvm():
+    use("llvm_ad_spectral")
+
+
+def plugin(of, **parameters):
+    return mi.load_dict({"type": "diffraction_grating", "spectrum": of, "material": "none", **parameters})
+
+
+def direction(theta, phi):
+    """Degrees → a unit vector."""
+    theta, phi = np.deg2rad(theta), np.deg2rad(phi)
+    return [float(x) for x in (np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta))]
+
+
+def interaction(wi, wavelengths, count):
+    si = dr.zeros(mi.SurfaceInteraction3f, count)
+    si.wi = mi.Vector3f(*(dr.full(mi.Float, x, count) for x in wi))
+    si.wavelengths = type(si.wavelengths)(*(dr.full(mi.Float, float(x), count) for x in wavelengths))
+    return si
+
+
+def numbers(count, seed=0):
+    return np.random.default_rng(seed).random((3, count), dtype=np.float32)
+
+
+def sampled(bsdf, wi, wavelengths, count, seed=0):
+    """The sample of Mitsuba, and its weights (4, count) in float64."""
+    u = numbers(count, seed)
+    si = interaction(wi, wavelengths, count)
+    bs, weight = bsdf.sample(mi.BSDFContext(), si, mi.Float(u[0]), mi.Point2f(mi.Float(u[1]), mi.Float(u[2])))
+    return bs, np.array(weight, np.float64)
+
+
+# ---------------------------------------------------------------- the density
+
+ALONE = [(w,) * 4 for w in WAVELENGTHS]
+REDUCED = [
+    ("blazed", 0, 0, WAVELENGTHS),
+    ("blazed", 60, 20, WAVELENGTHS),
+    ("blazed", 80, 110, ALONE[1]),
+    ("column", 60, 20, WAVELENGTHS),
+    ("lamellar", 80, 20, WAVELENGTHS),
+    ("sinusoidal", 30, 70, ALONE[0]),
+    ("crossed", 60, 35, ALONE[2]),
+    ("crossed", 80, 200, WAVELENGTHS),
+    ("elaphe", 30, 20, WAVELENGTHS),
+    ("xenopeltis", 60, 290, WAVELENGTHS),
+    ("xenopeltis", 80, 20, ALONE[3]),
+]
+FULL = [
+    (name, theta, phi, wavelengths)
+    for name in SMALL
+    for theta, phi in ((0, 0), (30, 20), (30, 110), (60, 20), (60, 200), (80, 70), (80, 290))
+    for wavelengths in (WAVELENGTHS, *ALONE)
+]
+CASES = [*REDUCED, *(pytest.param(*case, marks=pytest.mark.slow) for case in FULL if case not in REDUCED)]
+
+
+@pytest.mark.parametrize(("name", "theta", "phi", "wavelengths"), CASES)
+def test_samples_pass_the_chi_square_test(llvm, name, theta, phi, wavelengths):
+    bsdf, wi = plugin(blurred(name)), direction(theta, phi)
+
+    # In the plane of direction cosines, where lobes have one width everywhere: dω = dx dy / cos θ.
+    def sample(points):
+        si = interaction(wi, wavelengths, dr.width(points))
+        bs, _ = bsdf.sample(mi.BSDFContext(), si, points.x, mi.Point2f(points.y, points.z))
+        above = bs.pdf > 0
+        return dr.select(above, mi.Vector2f(bs.wo.x, bs.wo.y), 0), dr.select(above, mi.Float(1), 0)
+
+    def density(p):
+        z = dr.safe_sqrt(1 - dr.squared_norm(p))
+        si = interaction(wi, wavelengths, dr.width(p))
+        pdf = bsdf.pdf(mi.BSDFContext(), si, mi.Vector3f(p.x, p.y, z))
+        return dr.select(z > 0, pdf / z, 0)
+
+    domain = mi.chi2.PlanarDomain()
+    # The density of cells has steps, which the test integrates well only on a fine grid.
+    test = mi.chi2.ChiSquareTest(domain, sample, density, sample_dim=3, sample_count=400_000, res=41, ires=64)
+    # One case in a hundred fails by chance at the level 0.01; there are CASES of them.
+    assert test.run(significance_level=0.01, test_count=len(CASES), quiet=True), test.messages
+
+
+@pytest.mark.parametrize("name", ["blazed", "column", "crossed", "elaphe"])
+def test_density_integrates_to_the_share_of_samples_above_the_horizon(llvm, name):
+    bsdf, wi, count = plugin(blurred(name)), direction(70, 40), 1 << 19
+    bs, _ = sampled(bsdf, wi, WAVELENGTHS, count)
+    above = np.array(bs.pdf) > 0
+    u = numbers(count, seed=1)
+    wo = mi.warp.square_to_uniform_hemisphere(mi.Point2f(mi.Float(u[0]), mi.Float(u[1])))
+    pdf = 2 * np.pi * np.array(bsdf.pdf(mi.BSDFContext(), interaction(wi, WAVELENGTHS, count), wo), np.float64)
+    error = np.hypot(pdf.std(), above.std()) / np.sqrt(count)
+    assert abs(pdf.mean() - above.mean()) < 4 * error
+
+
+@pytest.mark.parametrize("name", ["blazed", "crossed", "xenopeltis"])
+@pytest.mark.parametrize("theta", [0, 60, 85])
+def test_mean_weight_is_the_albedo(llvm, name, theta):
+    bsdf, wi, count = plugin(blurred(name)), direction(theta, 40), 1 << 18
+    _, weight = sampled(bsdf, wi, WAVELENGTHS, count)
+    # The integral by another sampling: uniform in the plane of direction cosines, dω = du dv / cos θ_o.
+    u = np.stack([(np.arange(2048) + 0.5) / 2048] * 2)
+    x, y = (2 * axis.ravel() - 1 for axis in np.meshgrid(*u))
+    z = np.sqrt(np.maximum(1 - x**2 - y**2, 0))
+    inside = z > 0
+    x, y, z = x[inside], y[inside], z[inside]
+    wo = mi.Vector3f(*(mi.Float(axis.astype(np.float32)) for axis in (x, y, z)))
+    value = np.array(bsdf.eval(mi.BSDFContext(), interaction(wi, WAVELENGTHS, len(x)), wo), np.float64)
+    albedo = (value / z).sum(axis=1) * (2 / 2048) ** 2
+    error = weight.std(axis=1) / np.sqrt(count)
+    np.testing.assert_array_less(np.abs(weight.mean(axis=1) - albedo), 4 * error + 2e-3 * albedo)
+
+
+# ---------------------------------------------------------------- the work that a sample does
+
+
+def shifted(u):
+    """Four wavelengths as Mitsuba's path tracer samples them: equally spaced over 360–830 nm, shifted by `u`."""
+    return 360 + 470 * ((u + np.arange(4) / 4) % 1)
+
+
+def effective_fraction(bsdf, theta, phi, draws, count):
+    """E[w]²/E[w²] of the weight w averaged over the wavelengths, averaged over draws of them; and max w / E[w]."""
+    fractions, largest = [], 0.0
+    for draw in range(draws):
+        _, weight = sampled(bsdf, direction(theta, phi), shifted((draw + 0.5) / draws / 4), count, seed=draw)
+        assert np.isfinite(weight).all()
+        assert (weight >= 0).all()
+        w = weight.mean(axis=0)
+        fractions.append(w.mean() ** 2 / (w**2).mean())
+        largest = max(largest, w.max() / w.mean())
+    return np.mean(fractions), largest
+
+
+@pytest.mark.parametrize("phi", [0, 30, *(pytest.param(x, marks=pytest.mark.slow) for x in (60, 90, 180, 210, 300))])
+@pytest.mark.parametrize(
+    ("theta", "least"),
+    [
+        (60, 0.5),
+        (85, 0.25),
+        *(pytest.param(theta, 0.5, marks=pytest.mark.slow) for theta in (0, 15, 30, 45, 75)),
+    ],
+)
+@pytest.mark.parametrize("name", BUNDLED)
+def test_effective_sample_fraction(llvm, name, theta, least, phi):
+    fraction, largest = effective_fraction(plugin(bundled(name)), theta, phi, draws=4, count=1 << 15)
+    assert fraction >= least
+    assert largest < 20
+
+
+@pytest.mark.parametrize("theta", [0, 50, 89, 89.99])
+@pytest.mark.parametrize("name", ["blazed", "crossed", "elaphe"])
+def test_weights_are_finite_and_pdf_is_that_of_the_sample(llvm, name, theta):
+    bsdf, wi, count = plugin(bundled(name)), direction(theta, 30), 1 << 15
+    for wavelengths in ((360.0, 830.0, 360.0, 830.0), (355.0, 835.0, 500.0, 500.0)):
+        bs, weight = sampled(bsdf, wi, wavelengths, count)
+        assert np.isfinite(weight).all()
+        assert (weight >= 0).all()
+        again = np.array(bsdf.pdf(mi.BSDFContext(), interaction(wi, wavelengths, count), bs.wo))
+        pdf = np.array(bs.pdf)
+        assert np.isfinite(pdf).all()
+        some = pdf > 0
+        np.testing.assert_allclose(pdf[some], again[some], rtol=1e-3)
+
+
+def test_height_scale_reaches_the_sampler(llvm):
+    bsdf = plugin(bundled("blazed"), height_scale=0.5)
+    assert effective_fraction(bsdf, 60, 30, draws=4, count=1 << 15)[0] > 0.5
+
+
+# ---------------------------------------------------------------- the samplers
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_alias_table_gives_the_probabilities(seed):
+    rng = np.random.default_rng(seed)
+    p = rng.random(1000) ** [1, 8, 30, 1][seed] * (rng.random(1000) < 0.5)
+    p /= p.sum()
+    threshold, alias = alias_table(p)
+    given = np.bincount(np.arange(1000), threshold, 1000) + np.bincount(alias, 1 - threshold, 1000)
+    np.testing.assert_allclose(given / 1000, p, atol=1e-12)
+
+
+@pytest.mark.parametrize("p", [[1.0], [0.0, 1.0, 0.0], [0.25] * 4, [0.5, 0.0, 0.0, 0.5]])
+def test_alias_table_of_a_few(p):
+    threshold, alias = alias_table(np.array(p))
+    given = np.bincount(np.arange(len(p)), threshold, len(p)) + np.bincount(alias, 1 - threshold, len(p))
+    np.testing.assert_allclose(given / len(p), p, atol=1e-12)
+
+
+def test_cells_are_drawn_with_their_density(llvm):
+    rng, count = np.random.default_rng(1), 1 << 20
+    shares = rng.random((CELLS, 7, 11)) ** 3
+    shares[:, 2, 3] = 0
+    spacing = 0.05, 0.11
+    sampler = CellSampler(shares, spacing, (5, 3), largest_kappa=30.0)
+    weights = sampler.weights(mi.Float(0.4), mi.Float(15.0))
+    u = numbers(count)
+    q_x, q_y = sampler.sample(weights, mi.Float(u[0]), mi.Point2f(mi.Float(u[1]), mi.Float(u[2])), mi.Bool(True))
+    p = np.array(weights).ravel() @ (shares / shares.sum(axis=(1, 2), keepdims=True)).reshape(CELLS, -1)
+    np.testing.assert_allclose(p.sum(), 1, rtol=1e-5)
+
+    # Each cell cut into 2 × 2, so that the place in the cell is tested as well.
+    ends_x, ends_y = (np.arange(-2 * m - 1, 2 * m + 2) / 2 * d for m, d in zip((5, 3), spacing, strict=True))
+    found, _, _ = np.histogram2d(np.array(q_y), np.array(q_x), bins=(ends_y, ends_x))
+    assert found.sum() == count
+    wanted = np.kron(p.reshape(7, 11), np.full((2, 2), 0.25)) * count
+    some = wanted > 0
+    assert found[~some].sum() == 0
+    chi_square, degrees = ((found - wanted)[some] ** 2 / wanted[some]).sum(), some.sum() - 1
+    assert abs(chi_square - degrees) < 4 * np.sqrt(2 * degrees)
+
+    density = np.array(sampler.density(q_x, q_y, weights, mi.Bool(True)))
+    m_x, m_y = (np.rint(np.array(q) / d).astype(int) for q, d in ((q_x, spacing[0]), (q_y, spacing[1])))
+    np.testing.assert_allclose(density, p.reshape(7, 11)[m_y + 3, m_x + 5] / np.prod(spacing), rtol=1e-4)
+    outside = sampler.density(mi.Float(0.31, 0.0), mi.Float(0.0, -0.4), weights, mi.Bool(True))
+    assert (np.array(outside) == 0).all()
+
+
+@pytest.mark.parametrize("name", ["blazed", "column", "crossed"])
+@pytest.mark.parametrize(("theta", "phi"), [(0, 0), (40, 130), (85, 250)])
+def test_orders_are_drawn_with_their_shares_and_only_those_that_propagate(llvm, name, theta, phi):
+    spectrum, count = md.precompute(SMALL[name]()), 1 << 20
+    sampler = OrderSampler(spectrum)
+    wi, frequency = mi.Vector3f(*direction(theta, phi)), mi.Float(1 / 0.5)
+    u = numbers(count)
+    arguments = wi, frequency, dr.two_pi * frequency
+    row, column, _ = sampler.sample(*arguments, mi.Float(u[0]), mi.Point2f(mi.Float(u[1]), mi.Float(u[2])), True)
+    rows, columns = spectrum.grid.shape
+    order = dr.arange(mi.UInt32, rows * columns)
+    weights = sampler.weights(*arguments, mi.Bool(True))
+    share = np.array(sampler.share(order, weights, mi.Bool(True))).reshape(rows, columns)
+    bottom, top, left, right = (int(x[0]) for x in map(mi.Int32, sampler.rectangle(wi, frequency)))
+    inside = np.zeros((rows, columns), bool)
+    inside[bottom:top, left:right] = True
+    np.testing.assert_allclose(share[inside].sum(), 1, rtol=1e-5)
+
+    row, column = (np.array(x) + np.zeros(count, int) for x in (row, column))
+    found = np.bincount(row * columns + column, minlength=rows * columns).reshape(rows, columns)
+    assert found[~inside].sum() == 0
+    wanted = share[inside] * count
+    chi_square, degrees = ((found[inside] - wanted) ** 2 / wanted).sum(), inside.sum() - 1
+    assert abs(chi_square - degrees) < 4 * np.sqrt(2 * degrees)
+
+    # All that propagate are in the rectangle, and of a single row nothing else.
+    m_x, m_y = np.meshgrid(*spectrum.grid.axes())
+    s = np.array(direction(theta, phi))
+    t_x, t_y = (m * 0.5 / tile for m, tile in zip((m_x, m_y), spectrum.grid.tile_size, strict=True))
+    propagates = (t_x + s[0]) ** 2 + (t_y + s[1]) ** 2 < 1
+    assert inside[propagates].all()
+    if name != "crossed":
+        assert inside.sum() <= propagates.sum() + 2
+
+
+def test_many_orders_are_drawn_without_a_rectangle(llvm):
+    spectrum = md.precompute(md.gratings.xenopeltis(16.0))
+    sampler = OrderSampler(spectrum)
+    assert not sampler.restricted
+    wi, frequency = mi.Vector3f(0.6, 0.0, 0.8), mi.Float(2.0)
+    weights = sampler.weights(wi, frequency, dr.two_pi * frequency, mi.Bool(True))
+    order = dr.arange(mi.UInt32, spectrum.grid.shape[0] * spectrum.grid.shape[1])
+    np.testing.assert_allclose(dr.sum(sampler.share(order, weights, mi.Bool(True))), 1, rtol=1e-4)
+
+
+def test_cells_serve_where_orders_overlap(llvm):
+    assert LineSpectrum(bundled("elaphe")).cells is not None
+    assert LineSpectrum(bundled("blazed")).orders is not None
+
+
+# ---------------------------------------------------------------- other variants
+
+
+@pytest.mark.parametrize("variant", ["scalar_spectral", "llvm_ad_spectral_polarized"])
+@pytest.mark.parametrize("name", ["blazed", "crossed", "elaphe"])
+def test_other_variants_draw_the_same(variant, name):
+    count, wi = 40, direction(50, 25)
+    use("llvm_ad_spectral")
+    bs, weight = sampled(plugin(blurred(name)), wi, WAVELENGTHS, count)
+    wanted, wanted_pdf = np.array(bs.wo).T, np.array(bs.pdf)
+    use(variant)
+    bsdf, u = plugin(blurred(name)), numbers(count)
+    for index in range(count):
+        si = interaction(wi, WAVELENGTHS, 1) if mi.is_polarized else dr.zeros(mi.SurfaceInteraction3f)
+        if not mi.is_polarized:
+            si.wi = mi.Vector3f(*wi)
+            si.wavelengths = type(si.wavelengths)(*WAVELENGTHS)
+        one = [float(x) for x in u[:, index]]
+        bs, value = bsdf.sample(mi.BSDFContext(), si, mi.Float(one[0]), mi.Point2f(*one[1:]))
+        value = value[0, 0] if mi.is_polarized else value
+        if wanted_pdf[index] == 0:
+            assert np.array(bs.pdf).item() == 0
+            continue
+        np.testing.assert_allclose(np.array(bs.wo).ravel(), wanted[index], atol=2e-5)
+        np.testing.assert_allclose(np.array(bs.pdf).item(), wanted_pdf[index], rtol=5e-3)
+        np.testing.assert_allclose(np.array(value).ravel(), weight[:, index], rtol=5e-3, atol=1e-4)

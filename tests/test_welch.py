@@ -1,0 +1,94 @@
+"""Where the windows of a sample stand, and how wide the scan lets them be."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mitsuba_diffraction import HeightField
+from mitsuba_diffraction.welch import carried_coherence_length, window_axes
+
+
+def flat(rows, columns, pixel):
+    return HeightField(np.zeros((rows, columns)), pixel)
+
+
+@pytest.mark.parametrize(
+    ("rows", "columns", "pixel", "asked", "wanted"),
+    [
+        (100, 100, 0.0586, 65.0, 2.93),  # half of the scan
+        (100, 60, 0.1, 65.0, 3.0),  # the shorter side, along x
+        (60, 100, 0.1, 65.0, 3.0),  # and along y
+        (100, 100, (0.1, 0.3), 65.0, 5.0),  # in micrometres, not in pixels
+        (100, 100, 0.1, 2.0, 2.0),  # what is asked for, where the scan carries it
+        (1, 100, 0.1, 65.0, 5.0),  # an axis of one pixel sets no limit
+        (100, 1, 0.1, 65.0, 5.0),
+        (1, 1, 0.1, 65.0, 65.0),
+        (8, 8, 0.25, 65.0, 1.0),  # four pixels are just enough
+    ],
+)
+def test_a_scan_carries_half_of_its_shorter_side(rows, columns, pixel, asked, wanted):
+    assert carried_coherence_length(flat(rows, columns, pixel), asked) == pytest.approx(wanted, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("rows", "columns", "asked", "message"),
+    [
+        (100, 7, 65.0, "coherence_length: got 65 µm, of which the scan of 0.7 × 10 µm carries 0.35; wanted at least 4"),
+        (7, 100, 65.0, "carries 0.35"),
+        (100, 100, 0.3, r"got 0.3 µm.* wanted at least 4 pixels \(0.4 µm\)"),
+        (2, 100, 65.0, "carries 0.1"),
+        (1, 1, 0.0, "coherence_length: got 0.0"),
+        (100, 100, np.nan, "coherence_length: got nan"),
+    ],
+)
+def test_too_few_pixels_for_a_window_are_refused(rows, columns, asked, message):
+    with pytest.raises(ValueError, match=message):
+        carried_coherence_length(flat(rows, columns, 0.1), asked)
+
+
+@given(
+    count=st.integers(8, 300),
+    pixel=st.sampled_from([0.0586, 0.1, 0.07, 1 / 3, 0.013, 2.0]),
+    share=st.floats(0.0, 1.0),
+)
+def test_windows_are_gaussian_and_cover_the_scan(count, pixel, share):
+    # From four pixels to half of the scan.
+    coherence_length = (4 + share * (count / 2 - 4)) * pixel
+    sigma = coherence_length / 4 / pixel  # pixels
+    axis, none = window_axes(flat(1, count, (pixel, 1.0)), coherence_length)
+    assert none is None
+    width = len(axis.window)
+    assert 0 <= width - 6 * sigma + 1e-6 <= 1 + 2e-6  # three σ_s to each side, in whole pixels
+    # ln a is the parabola −x²/2σ_s² about the middle, up to its height, and Σ a² = 1.
+    x = np.arange(width) - (width - 1) / 2
+    parabola = np.log(axis.window) + x**2 / (2 * sigma**2)
+    np.testing.assert_allclose(parabola, parabola[0], atol=1e-9)
+    assert (axis.window**2).sum() == pytest.approx(1)
+    # Places run from edge to edge, evenly but for whole pixels, and no two are much more than σ_s apart.
+    assert axis.starts[0] == 0
+    assert axis.starts[-1] == count - width
+    hops = np.diff(axis.starts)
+    assert hops.min() >= 1
+    assert hops.max() - hops.min() <= 2
+    assert hops.max() < sigma * (1 + 1e-6) + 1
+    # No more of them than that takes.
+    assert (len(axis.starts) - 2) * sigma < (count - width) * (1 + 1e-6)
+
+
+@given(count=st.integers(8, 400), pixel=st.sampled_from([0.0586, 0.1, 0.07, 1 / 3, 0.013, 0.3]))
+def test_the_widest_windows_have_three_places(count, pixel):
+    # Whatever rounding makes of sizes that divide evenly.
+    field = flat(count, count, pixel)
+    for axis in window_axes(field, carried_coherence_length(field, 65 * count)):
+        assert len(axis.starts) == 3
+
+
+def test_each_axis_has_windows_of_its_own():
+    along_x, along_y = window_axes(flat(40, 100, (0.1, 0.2)), 4.0)
+    assert len(along_x.window) == 60
+    assert len(along_y.window) == 30
+    assert along_x.starts[-1] == 40
+    assert along_y.starts[-1] == 10
+    assert window_axes(flat(1, 1, 0.1), 4.0) == (None, None)
+    assert window_axes(flat(40, 1, 0.1), 1.0)[0] is None
