@@ -22,8 +22,12 @@ MAKE = {
     "xenopeltis": lambda: md.gratings.xenopeltis(8),
 }
 ONE_ROW = ["flat", "blazed", "deep blazed", "sinusoidal", "deep sinusoidal", "lamellar"]
-EXCESS = 0.02
-"""What an albedo may exceed one by: the table is bounded at its nodes and half-way between them only."""
+EXCESS = 2e-3
+"""What an albedo may exceed one by. 0.0012 was the largest found, for each surface over the 14 of 40,000 random pairs
+of direction and wavelength with the largest e·a. For deep surfaces e·a itself may be 0.015 too large where a jumps,
+between the places from which the table was lowered (`test_table_is_a_tight_bound`)."""
+EXCESS_WITHOUT_SHADOWING = 0.02
+"""Up to 89°; its albedo grows without bound towards the horizon."""
 
 
 @functools.cache
@@ -130,9 +134,16 @@ def test_no_albedo_above_one_for_a_turned_pattern():
     assert there <= 1 + EXCESS
 
 
-@pytest.mark.parametrize("shadowing", ["v_cavity", "none"])
-@pytest.mark.parametrize("name", sorted(MAKE))
+SAMPLED = [("deep blazed", "v_cavity"), ("blazed", "none"), ("crossed", "v_cavity"), ("xenopeltis", "v_cavity")]
+ALL_SAMPLED = [(name, shadowing) for name in sorted(MAKE) for shadowing in ("v_cavity", "none")]
+
+
+@pytest.mark.parametrize(
+    ("name", "shadowing"),
+    [*SAMPLED, *(pytest.param(*case, marks=pytest.mark.slow) for case in ALL_SAMPLED if case not in SAMPLED)],
+)
 def test_no_albedo_above_one_by_samples(name, shadowing):
+    excess = EXCESS if shadowing == "v_cavity" else EXCESS_WITHOUT_SHADOWING
     bsdf, count = plugin(spectrum(name), shadowing=shadowing), 200_000
     rng = np.random.default_rng(5)
     for theta in (0, 20, 40, 60, 75, 85, 89):
@@ -144,7 +155,7 @@ def test_no_albedo_above_one_by_samples(name, shadowing):
         numbers = mi.Float(rng.random(count)), mi.Point2f(rng.random(count), rng.random(count))
         weight = np.array(bsdf.sample(mi.BSDFContext(), si, *numbers)[1])
         noise = weight.std(1) / np.sqrt(count)
-        assert (weight.mean(1) <= 1 + EXCESS + 4 * noise).all(), (theta, np.rad2deg(phi), weight.mean(1))
+        assert (weight.mean(1) <= 1 + excess + 4 * noise).all(), (theta, np.rad2deg(phi), weight.mean(1))
 
 
 @pytest.mark.parametrize("name", ["blazed", "elaphe"])
@@ -211,7 +222,9 @@ def test_flat_surface_is_left_alone_away_from_the_horizon():
     omega = np.stack([np.sin(theta) * 0.6, np.sin(theta) * 0.8, np.cos(theta)], -1)
     for wavelength in (360, 500, 830):
         e = energies(bsdf, omega, wavelength)
-        np.testing.assert_array_equal(e[theta < np.deg2rad(55)], 1)
+        np.testing.assert_array_equal(e[theta < np.deg2rad(50)], 1)
+        # At 54.5° and 830 nm a is one, but the table's row also holds for 360 nm at c = 0.33, where it is 1.0006.
+        assert e[theta < np.deg2rad(55)].min() > 1 - 2e-4
         # K·G is above one within a lobe's width of the horizon: a = 1.003 at 76° and 830 nm, 1.01 at 80°. The table
         # of one row does not tell 500 nm there from 830 nm.
         assert e.min() > 0.985
@@ -303,6 +316,76 @@ def test_table_follows_height_scale_and_carries_its_derivative():
     slope = np.array(dr.grad(e))
     assert np.abs(difference).max() > 0.5
     assert np.corrcoef(slope, difference)[0, 1] > 0.95
+
+
+MEAN_LOSS = {"crossed": 6e-3, "elaphe": 6e-3, "xenopeltis": 6e-3}  # else 2.5e-3
+TIGHT = ["blazed", "crossed"]
+
+
+@pytest.mark.parametrize("name", [*TIGHT, *(pytest.param(n, marks=pytest.mark.slow) for n in MAKE if n not in TIGHT)])
+def test_table_is_a_tight_bound(name):
+    gathered, rng = GatheredSpectrum.of(spectrum(name)), np.random.default_rng(10)
+    bsdf, products, lost = plugin(spectrum(name)), [], []
+    for wavelength in rng.uniform(360, 830, 80):
+        omega = directions_at(*rng.uniform(-1, 1, (2, 250)))
+        a, e = gathered.albedo(omega, wavelength * 1e-3), energies(bsdf, omega, wavelength)
+        products.append(e * a)
+        lost.append((1 - e)[a <= 1])
+    assert np.mean(np.concatenate(products) > 1 + 2e-3) < 2.5e-3
+    assert np.max(products) < 1.05  # 1.015 was measured, in pairs that are rare
+    assert np.concatenate(lost).mean() < MEAN_LOSS.get(name, 2.5e-3)
+
+
+def test_what_the_table_misses_is_measured_and_shown():
+    table = energy_table(GatheredSpectrum.of(spectrum("crossed")))
+    assert -1e-3 < table.excess < 0.02
+    mean, largest = table.loss
+    assert 0 < mean < MEAN_LOSS["crossed"]
+    assert mean < largest < 0.2
+    assert f"e·a at most 1 + {table.excess:.2g}" in str(plugin(spectrum("crossed")))
+
+
+def test_rounding_for_the_renderer_leaves_a_lower_bound():
+    table = energy_table(GatheredSpectrum.of(spectrum("deep blazed")))
+    steps, least, step = table.packed()
+    rounded = least + step * steps
+    assert (rounded <= table.values + 1e-5).all()
+    assert (rounded > table.values - 1.01 * step).all()
+    np.testing.assert_allclose(rounded[table.values == 1], 1, atol=1e-6)
+
+
+def direct_albedo(of, omega, wavelength):
+    """∫ K G S(q; κ) dq of a sample by a sum in float64: each node at 3 × 3 points of its B-spline; λ in µm."""
+    q_x, q_y = (q.ravel() for q in np.meshgrid(*of.grid.frequencies()))
+    row, column = (i.ravel() for i in np.indices(of.grid.shape))
+    total = 0.0
+    # Three points with the B-spline's variance, 1/4.
+    for x, weight_x in ((-1, 1 / 8), (0, 3 / 4), (1, 1 / 8)):
+        for y, weight_y in ((-1, 1 / 8), (0, 3 / 4), (1, 1 / 8)):
+            u = wavelength * (q_x + x * of.grid.spacing[0])
+            v = wavelength * (q_y + y * of.grid.spacing[1])
+            square = 1 - (u + omega[0]) ** 2 - (v + omega[1]) ** 2
+            up = square > 0
+            cos_i, cos_o, u, v = omega[2], np.sqrt(square[up]), u[up], v[up]
+            w = cos_i + cos_o
+            d = (u**2 + v**2 + w**2) / 2
+            geometry = d**2 / (cos_i * cos_o * w**2) * np.minimum(1, 2 * w * np.minimum(cos_i, cos_o) / d)
+            power = of.table.powers_at(row[up], column[up], np.minimum(2 * np.pi * w / wavelength, of.largest_kappa))
+            total += weight_x * weight_y * (geometry * power.astype(np.float64)).sum()
+    return total
+
+
+@pytest.mark.filterwarnings("ignore:pixels of")
+def test_albedo_of_a_sample():
+    skin = md.gratings.xenopeltis(20, pixel_size=20 / 160)
+    of = md.precompute(skin, extent="sample", coherence_length=10, tolerance=1e-2)
+    gathered = GatheredSpectrum.of(of)
+    # Gathered in cells 0.08 to 0.6 cycles/µm wide: above the tolerance only where light grazes, and upwards.
+    for theta, phi, wavelength in ((0, 0, 0.5), (30, 20, 0.4), (60, 100, 0.6), (75, 200, 0.5), (80, 300, 0.7)):
+        sine = np.sin(np.deg2rad(theta))
+        omega = np.array([sine * np.cos(np.deg2rad(phi)), sine * np.sin(np.deg2rad(phi)), np.cos(np.deg2rad(theta))])
+        ratio = gathered.albedo(omega[None], wavelength)[0] / direct_albedo(of, omega, wavelength)
+        assert 1 - of.tolerance < ratio < 1 + (0.03 if theta >= 80 else of.tolerance)
 
 
 @pytest.mark.parametrize("name", ["blazed", "elaphe"])

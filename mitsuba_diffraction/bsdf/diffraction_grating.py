@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import functools
+import operator
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .base import base_from
 from .energy import energy_from
 from .geometry import Geometry
 from .line_spectrum import LineSpectrum
@@ -19,6 +23,7 @@ SHADOWING = ("v_cavity", "none")
 
 VISIBLE_FROM = 360.0  # nm, the shortest wavelength that Mitsuba samples
 DEFENSIVE = 0.02  # the share of samples that follow the cosine, for lobes that the sampler's averages miss
+LEAST_SHARE = 0.1  # of the samples, for the grating and for its base: what each reflects is only estimated
 
 MANUAL = """A diffraction grating, given by the spectrum of its phase.
 
@@ -33,7 +38,13 @@ Parameters (XML or dictionary):
     orientation (float or texture): degrees from the tangent dp_du to the pattern's x axis (0).
     height_scale (float): scales the heights (1).
     shadowing (string): "v_cavity" or "none".
-    base (BSDF): what lies under a dielectric surface (pigment); it receives (1 − R_i)(1 − R_o) of the light.
+    base (BSDF): what lies under a dielectric surface (pigment): any BSDF that reflects and lets nothing through. Its
+        value is multiplied by (1 − R_i)(1 − R_o), R at the angles of ω_i and ω_o to the surface.
+
+The pattern's x axis lies along dp_du, where u grows, laid into the plane across the shading normal n; its y axis is
+n × x whatever dp_dv is. So lengths are true where UVs are stretched or sheared, and mirrored UVs turn the pattern but
+do not mirror it; the back of a `twosided` shows its mirror image. On a mesh without UVs x lies along the first edge of
+each triangle and changes from one to the next: give such a mesh UVs. Where dp_du vanishes Mitsuba picks an axis.
 
 The BRDF is R · K · G · S(q; κ)/λ² · E: R the power reflectance at the half vector, K and G as in `geometry.py`, S as in
 `line_spectrum.py`, with q = −(ω_i + ω_o)/λ along the pattern's axes and κ = 2π (cos θ_i + cos θ_o)/λ. E, as in
@@ -59,15 +70,16 @@ def define() -> type:
             self.scattering = (LineSpectrum if self.spectrum.extent == "tile" else SmoothSpectrum)(self.spectrum)
             # The spectrum says nothing beyond its largest angle: there the grating is black.
             self.least_cosine = opaque(np.cos(np.deg2rad(self.spectrum.largest_angle)) * (1 - 1e-6))
-            self.base = _base(props)
+            self.base = base_from(props)
             if self.base is not None and not self.reflectance.transparent:
                 raise ValueError("base: got a BSDF below a conductor or a perfect mirror, which let no light through")
             self._update()
             flags = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.Anisotropic | mi.BSDFFlags.FrontSide
             if self.orientation.is_spatially_varying():
                 flags = flags | mi.BSDFFlags.SpatiallyVarying
-            self.m_components = [flags]
-            self.m_flags = flags
+            # The grating is component 0, those of the base follow.
+            self.m_components = [+flags, *(self.base.components if self.base is not None else [])]
+            self.m_flags = functools.reduce(operator.or_, self.m_components)
 
         def _update(self) -> None:
             """What depends on parameters that can change."""
@@ -87,11 +99,12 @@ def define() -> type:
             callback.put("height_scale", self.height_scale, mi.ParamFlags.Differentiable)
             self.reflectance.traverse(callback)
             if self.base is not None:
-                callback.put("base", self.base, mi.ParamFlags.Differentiable)
+                callback.put("base", self.base.bsdf, mi.ParamFlags.Differentiable)
 
         def parameters_changed(self, keys: list[str] = ()) -> None:
             if not keys or "height_scale" in keys:
                 self._update()
+            self.reflectance.update()
 
         def _frame(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
             """Sine and cosine of the angle from the tangent to the pattern's x axis."""
@@ -137,28 +150,42 @@ def define() -> type:
             shortest, longest = self.spectrum.wavelengths
             return (wavelength >= shortest * 1e-3 * (1 - 1e-6)) & (wavelength <= longest * 1e-3 * (1 + 1e-6))
 
-        def _transmitted(self, si: mi.SurfaceInteraction3f, cos_o: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
-            """(1 − R_i)(1 − R_o): what the surface lets through to the base and back."""
-            r_i = self.reflectance(si, mi.Frame3f.cos_theta(si.wi), active)
-            return (1 - r_i) * (1 - self.reflectance(si, cos_o, active))
+        def _lobes(self, ctx: mi.BSDFContext) -> tuple[bool, mi.BSDFContext | None]:
+            """Whether `ctx` asks for the grating, and what it asks of the base."""
+            grating = ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0)
+            return grating, None if self.base is None else self.base.context(ctx, before=1)
+
+        def _share(
+            self,
+            si: mi.SurfaceInteraction3f,
+            lobes: tuple[bool, mi.BSDFContext | None],
+            r_i: mi.UnpolarizedSpectrum,
+            active: mi.Bool,
+        ) -> mi.Float:
+            """The share of samples that the grating gets; that of the base is the rest. About as they reflect."""
+            grating, below = lobes
+            if not grating or below is None:
+                return mi.Float(1.0 if grating else 0.0)
+            reflected = dr.mean(r_i)
+            returned = (1 - reflected) * self.base.albedo(si, active)
+            return dr.detach(dr.clip(reflected / (reflected + returned), LEAST_SHARE, 1 - LEAST_SHARE))
 
         def eval_pdf(
             self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
         ) -> tuple[mi.Spectrum, mi.Float]:
             cos_i, cos_o = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(wo)
             active = active & (cos_i > 0) & (cos_o > 0)
-            share = self._grating_share(ctx)
+            lobes = grating, below = self._lobes(ctx)
             value, pdf = mi.Spectrum(0.0), mi.Float(0.0)
-            if share == 0:
-                return value, pdf
-            grating, density = self._grating(si, wo, active)
-            value, pdf = value + mi.depolarizer(grating), pdf + share * density
-            if share < 1:
-                below, density = self.base.eval_pdf(ctx, si, wo, active)
-                value, pdf = (
-                    value + _attenuated(self._transmitted(si, cos_o, active), below),
-                    pdf + (1 - share) * density,
-                )
+            if grating:
+                of_grating, pdf = self._grating(si, wo, active)
+                value = mi.depolarizer(of_grating)
+            if below is not None:
+                r_i, r_o = (self.reflectance(si, cos, active) for cos in (cos_i, cos_o))
+                share = self._share(si, lobes, r_i, active)
+                of_base, density = self.base.bsdf.eval_pdf(below, si, wo, active)
+                value += _attenuated((1 - r_i) * (1 - r_o), of_base)
+                pdf = share * pdf + (1 - share) * density
             return dr.select(active, value, 0), dr.select(active, pdf, 0)
 
         def eval(
@@ -181,27 +208,35 @@ def define() -> type:
         ) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
             cos_i = mi.Frame3f.cos_theta(si.wi)
             active = active & (cos_i > 0)
-            share = self._grating_share(ctx)
-            if share == 0:
-                return dr.zeros(mi.BSDFSample3f), mi.Spectrum(0.0)
-            below = active & (sample1 >= share)
+            lobes = grating, below = self._lobes(ctx)
             bs = dr.zeros(mi.BSDFSample3f)
-            bs.wo = self._draw(si, sample1 / share, sample2, active & (sample1 < share))
-            if share < 1:
-                base_sample, _ = self.base.sample(ctx, si, (sample1 - share) / (1 - share), sample2, below)
-                bs.wo = dr.select(below, base_sample.wo, bs.wo)
-            value, bs.pdf = self.eval_pdf(ctx, si, bs.wo, active)
+            if not grating and below is None:
+                return bs, mi.Spectrum(0.0)
             bs.eta = 1.0
             bs.sampled_type = mi.UInt32(+mi.BSDFFlags.GlossyReflection)
-            bs.sampled_component = mi.UInt32(0)
+            r_i = self.reflectance(si, cos_i, active) if below is not None else None
+            share = self._share(si, lobes, r_i, active)
+            of_base = active & (sample1 >= share)
+            if grating:
+                bs.wo = self._draw(si, sample1 / share, sample2, active & (sample1 < share))
+            if below is not None:
+                rest = dr.minimum((sample1 - share) / (1 - share), BELOW_ONE)
+                drawn, weight = self.base.bsdf.sample(below, si, rest, sample2, of_base)
+                bs.wo = dr.select(of_base, drawn.wo, bs.wo)
+                bs.sampled_type = dr.select(of_base, drawn.sampled_type, bs.sampled_type)
+                bs.sampled_component = dr.select(of_base, drawn.sampled_component + 1, 0)
+            value, bs.pdf = self.eval_pdf(ctx, si, bs.wo, active)
             valid = active & (bs.pdf > 0)
-            return bs, dr.select(valid, value / dr.select(valid, bs.pdf, 1), 0)
-
-        def _grating_share(self, ctx: mi.BSDFContext) -> float:
-            """The share of samples that the grating gets; the base gets the rest."""
-            if not ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0):
-                return 0.0
-            return 1.0 if self.base is None else 0.5
+            # The direction does not follow the parameters, so its density must not either.
+            result = dr.select(valid, value / dr.detach(dr.select(valid, bs.pdf, 1)), 0)
+            if below is not None and self.base.has_delta:
+                mirror = of_base & mi.has_flag(drawn.sampled_type, mi.BSDFFlags.Delta)
+                cos_o = mi.Frame3f.cos_theta(drawn.wo)
+                through = (1 - r_i) * (1 - self.reflectance(si, cos_o, mirror)) / (1 - share)
+                above = cos_o > 0
+                bs.pdf = dr.select(mirror, dr.select(above, (1 - share) * drawn.pdf, 0), bs.pdf)
+                result = dr.select(mirror, dr.select(above, _attenuated(through, weight), 0), result)
+            return bs, result
 
         def _draw(self, si: mi.SurfaceInteraction3f, u: mi.Float, v: mi.Point2f, active: mi.Bool) -> mi.Vector3f:
             """A direction for one of the wavelengths; below the horizon (z = 0) where its order is evanescent."""
@@ -233,6 +268,7 @@ def define() -> type:
                 f"orientation = {self.orientation}",
                 f"height_scale = {self.height_scale}",
                 f"shadowing = {self.shadowing}",
+                f"energy = {self.energy or 'conserved by itself'}",
             ]
             return "DiffractionGrating[\n" + "".join(f"  {line},\n" for line in lines) + "]"
 
@@ -242,25 +278,6 @@ def define() -> type:
 def _turned(omega: mi.Vector3f, sin: mi.Float, cos: mi.Float) -> mi.Vector3f:
     """ω along the pattern's axes."""
     return mi.Vector3f(cos * omega.x + sin * omega.y, cos * omega.y - sin * omega.x, omega.z)
-
-
-def _base(props: mi.Properties) -> mi.BSDF | None:
-    """The nested BSDF, if there is one.
-
-    Raises:
-        ValueError: if it is not a BSDF that reflects over the whole hemisphere.
-    """
-    if "base" not in props:
-        return None
-    base = props["base"]
-    if not isinstance(base, mi.BSDF):
-        raise ValueError(f"base: got {base!r}, wanted a BSDF")
-    smooth = mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.GlossyReflection
-    if base.flags() & ~int(smooth) & int(mi.BSDFFlags.All):
-        raise ValueError(
-            "base: got a BSDF with a delta or a transmitted part, wanted diffuse or glossy reflection only"
-        )
-    return base
 
 
 def _attenuated(factor: mi.UnpolarizedSpectrum, value: mi.Spectrum) -> mi.Spectrum:

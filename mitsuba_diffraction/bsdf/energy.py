@@ -79,19 +79,21 @@ class Energy:
 
     def __init__(self, table: EnergyTable, slope: np.ndarray | None = None, change: mi.Float | None = None) -> None:
         """`slope` times `change`, which is zero but for its gradient, is added to the table."""
+        self.measured = table.excess, *table.loss
         self.rows, slices, columns = table.values.shape
         self.slices, self.columns = slices - 1, columns - 1
         self.conical = table.conical
-        least = float(table.values.min())
-        # A value that is a whole number of steps stays one, and one stays one.
-        steps = np.floor((_corners(table.values) - least) / (1 - least) * 255 + 1e-3).astype(np.uint32)
-        self.table = _NumberTable(steps @ (np.uint32(1) << np.arange(0, 32, 8, dtype=np.uint32)))
-        self.least, self.step = opaque(least), opaque((1 - least) / 255)
+        steps, least, step = table.packed()
+        self.table = _NumberTable(_corners(steps) @ (np.uint32(1) << np.arange(0, 32, 8, dtype=np.uint32)))
+        self.least, self.step = opaque(least), opaque(step)
         self.slope = None if slope is None else PacketTable(_corners(slope))
         self.change = change
         first, last = table.frequencies
         self.first = opaque(first)
         self.per_frequency = opaque(self.slices / (last - first))
+
+    def __str__(self) -> str:
+        return "e·a at most 1 + {:.2g}; where a ≤ 1, 1 − e is {:.2g} in the mean, {:.2g} at most".format(*self.measured)
 
     @dr.syntax
     def conserve(

@@ -35,6 +35,9 @@ class PerfectMirror:
     def __call__(self, si: mi.SurfaceInteraction3f, cos_half: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
         return mi.UnpolarizedSpectrum(1.0)
 
+    def update(self) -> None:
+        pass
+
     def traverse(self, callback: mi.TraversalCallback) -> None:
         pass
 
@@ -52,6 +55,10 @@ class Dielectric:
         interface = mi.load_dict({"type": "dielectric", "int_ior": int_ior, "ext_ior": ext_ior})
         self.eta = mi.Float(mi.traverse(interface)["eta"])
         self.model = model
+        self.update()
+
+    def update(self) -> None:
+        """Keep the index an array: a number from Python would be compiled into the kernels."""
         dr.make_opaque(self.eta)
 
     def __call__(self, si: mi.SurfaceInteraction3f, cos_half: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
@@ -96,6 +103,9 @@ class Conductor:
             return result
         normal = (dr.square(eta - 1) + dr.square(k)) / (dr.square(eta + 1) + dr.square(k))
         return _schlick(normal, cos_half)
+
+    def update(self) -> None:
+        pass
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         callback.put("eta", self.eta, mi.ParamFlags.Differentiable)

@@ -1,0 +1,72 @@
+"""What lies under the surface: a nested BSDF that reflects."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+TRANSMITS = (
+    mi.BSDFFlags.DiffuseTransmission
+    | mi.BSDFFlags.GlossyTransmission
+    | mi.BSDFFlags.DeltaTransmission
+    | mi.BSDFFlags.Null
+)
+REFLECTS = mi.BSDFFlags.DiffuseReflection, mi.BSDFFlags.GlossyReflection, mi.BSDFFlags.DeltaReflection
+
+
+def base_from(props: mi.Properties) -> Base | None:
+    """The nested BSDF that the parameter `base` holds, if there is one.
+
+    Raises:
+        ValueError: if it is not a BSDF that reflects and lets nothing through.
+    """
+    if "base" not in props:
+        return None
+    bsdf = props["base"]
+    if not isinstance(bsdf, mi.BSDF):
+        raise ValueError(f"base: got {bsdf!r}, wanted a BSDF")
+    return Base(bsdf)
+
+
+class Base:
+    """A BSDF whose light passes the surface twice.
+
+    Attributes:
+        bsdf: the BSDF itself.
+        components: the flags of its components, as seen from the front.
+        has_delta: it reflects some light as a mirror does, which `eval` cannot show.
+    """
+
+    def __init__(self, bsdf: mi.BSDF) -> None:
+        flags = bsdf.flags()
+        if flags & +TRANSMITS:
+            raise ValueError(
+                "base: got a BSDF that lets light through (transmission or a mask), wanted one that only reflects"
+            )
+        if not (flags & +mi.BSDFFlags.FrontSide and any(flags & +kind for kind in REFLECTS)):
+            raise ValueError("base: got a BSDF that reflects nothing at its front, wanted one that reflects")
+        self.bsdf = bsdf
+        self.components = [bsdf.flags(i) & ~+mi.BSDFFlags.BackSide for i in range(bsdf.component_count())]
+        self.has_delta = bool(flags & +mi.BSDFFlags.DeltaReflection)
+        self._is_diffuse = bool(flags & +mi.BSDFFlags.DiffuseReflection)
+
+    def context(self, ctx: mi.BSDFContext, before: int) -> mi.BSDFContext | None:
+        """The same request to the nested BSDF, `before` components of others before its own; None if it has no part."""
+        if not any(self._asked(ctx, flags, before + i) for i, flags in enumerate(self.components)):
+            return None
+        inner = mi.BSDFContext(ctx.mode)
+        inner.type_mask = ctx.type_mask
+        inner.component = ctx.component if ctx.component == mi.BSDFContext().component else ctx.component - before
+        return inner
+
+    @staticmethod
+    def _asked(ctx: mi.BSDFContext, flags: int, component: int) -> bool:
+        front = flags & +mi.BSDFFlags.FrontSide
+        return bool(front) and any(flags & +kind and ctx.is_enabled(kind, component) for kind in REFLECTS)
+
+    def albedo(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Float:
+        """About what it reflects, averaged over the wavelengths: only to divide samples by."""
+        if not self._is_diffuse:
+            return mi.Float(1.0)
+        value = mi.unpolarized_spectrum(self.bsdf.eval_diffuse_reflectance(si, active))
+        return dr.clip(dr.mean(value), 0, 1)

@@ -1,0 +1,131 @@
+"""What the tests of the BSDF share: surfaces, directions, interactions."""
+
+import functools
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import mitsuba_diffraction as md
+
+WAVELENGTHS = (400.0, 500.0, 600.0, 700.0)
+PERIOD = 2.5
+
+
+def corner_blaze():
+    """Blazed along x and along y: its light goes to −x −y, so that a mirrored or turned pattern is told apart."""
+    ramp = md.gratings.blazed(PERIOD, 0.2, samples=48)
+    along_x = ramp.heights[0]
+    return md.HeightField(along_x[None, :] + along_x[:, None], PERIOD / 48)
+
+
+SURFACES = {
+    "blazed": lambda: md.gratings.blazed(PERIOD, 0.25),
+    "deep blazed": lambda: md.gratings.blazed(PERIOD, 0.8),
+    "sinusoidal": lambda: md.gratings.sinusoidal(PERIOD, 0.3),
+    "corner": corner_blaze,
+    "elaphe": lambda: md.gratings.elaphe(8),
+}
+
+
+@functools.cache
+def spectrum(name, coherence_length=65.0):
+    return md.precompute(SURFACES[name](), coherence_length=coherence_length)
+
+
+def use(variant):
+    if variant.startswith("llvm") and not dr.has_backend(dr.JitBackend.LLVM):
+        pytest.skip("Dr.Jit finds no LLVM")
+    mi.set_variant(variant)
+
+
+def uniform(value):
+    return {"type": "uniform", "value": value}
+
+
+def grating(name="blazed", coherence_length=65.0, **parameters):
+    """The dictionary of a grating; the perfect mirror unless an index is given."""
+    if "int_ior" not in parameters:
+        parameters.setdefault("material", "none")
+    return {"type": "diffraction_grating", "spectrum": spectrum(name, coherence_length), **parameters}
+
+
+def direction(theta, phi=0.0):
+    """Degrees → a unit vector."""
+    theta, phi = np.deg2rad(theta), np.deg2rad(phi)
+    return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta) + 0 * phi], -1)
+
+
+def towards(wi, orders, wavelength, pitch=1 / PERIOD):
+    """ω_o of the orders (n, 2) at one wavelength (nm); those that are evanescent are left out."""
+    t = -wavelength * 1e-3 * pitch * np.asarray(orders) - wi[:2]
+    t = t[(t**2).sum(-1) < 0.99]
+    return np.concatenate([t, np.sqrt(1 - (t**2).sum(-1, keepdims=True))], -1)
+
+
+def random_directions(rng, count, least=0.05):
+    z, phi = rng.uniform(least, 1, count), rng.uniform(0, 2 * np.pi, count)
+    r = np.sqrt(1 - z**2)
+    return np.stack([r * np.cos(phi), r * np.sin(phi), z], -1)
+
+
+def vectors(omega):
+    """(n, 3) or (3,) → mi.Vector3f."""
+    return mi.Vector3f(*np.atleast_2d(omega).T.astype(np.float32))
+
+
+def interaction(wi, wavelengths=WAVELENGTHS, count=1, uv=None):
+    si = dr.zeros(mi.SurfaceInteraction3f, count)
+    si.wi = vectors(wi)
+    si.wavelengths = type(si.wavelengths)(*map(float, wavelengths))
+    si.sh_frame = mi.Frame3f(mi.Normal3f(0, 0, 1))
+    si.n = mi.Normal3f(0, 0, 1)
+    si.dp_du, si.dp_dv = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
+    if uv is not None:
+        si.uv = mi.Point2f(*np.asarray(uv, np.float32).T)
+    return si
+
+
+def first(value):
+    """(4, n) of a spectrum, or of the first element of a Mueller matrix."""
+    value = np.array(value, np.float64)
+    return value[0, 0] if value.ndim == 4 else value
+
+
+def evaluate(bsdf, wi, wo, ctx=None, **arguments):
+    """f cos θ_o (4, n) and pdf (n,)."""
+    wo = np.atleast_2d(wo)
+    si = interaction(np.broadcast_to(wi, wo.shape), count=len(wo), **arguments)
+    value, pdf = bsdf.eval_pdf(ctx or mi.BSDFContext(), si, vectors(wo))
+    return first(value) + np.zeros((1, len(wo))), np.array(pdf, np.float64) + np.zeros(len(wo))
+
+
+def draw(bsdf, wi, count, ctx=None, seed=1, **arguments):
+    """Samples and their weights (4, n)."""
+    u = np.random.default_rng(seed).random((3, count)).astype(np.float32)
+    si = interaction(np.broadcast_to(wi, (count, 3)), count=count, **arguments)
+    bs, weight = bsdf.sample(ctx or mi.BSDFContext(), si, mi.Float(u[0]), mi.Point2f(u[1], u[2]))
+    return bs, first(weight)
+
+
+def hemisphere(side=512):
+    """Directions above the surface that tile the plane of direction cosines, and the du dv of each."""
+    u = 2 * (np.arange(side) + 0.5) / side - 1
+    x, y = (axis.ravel() for axis in np.meshgrid(u, u))
+    inside = x**2 + y**2 < 1
+    x, y = x[inside], y[inside]
+    return np.stack([x, y, np.sqrt(1 - x**2 - y**2)], -1), (2 / side) ** 2
+
+
+def albedo(bsdf, wi, **arguments):
+    """∫ f cos θ_o dω_o = ∫ f du dv of what `eval` shows, (4,)."""
+    wo, area = hemisphere()
+    return (evaluate(bsdf, wi, wo, **arguments)[0] / wo[:, 2]).sum(1) * area
+
+
+def through(cosine, index=1.5):
+    """1 − R of a dielectric."""
+    t = np.sqrt(1 - (1 - cosine**2) / index**2)
+    s, p = (cosine - index * t) / (cosine + index * t), (index * cosine - t) / (index * cosine + t)
+    return 1 - (s**2 + p**2) / 2
