@@ -15,7 +15,7 @@ from .geometry import Geometry
 from .line_spectrum import LineSpectrum
 from .reflectance import reflectance_from
 from .smooth_spectrum import SmoothSpectrum
-from .surface import spectrum_from
+from .surface import surface_from
 from .tables import BELOW_ONE, opaque
 
 SHADOWING = ("v_cavity", "none")
@@ -60,7 +60,7 @@ def define() -> type:
 
         def __init__(self, props: mi.Properties) -> None:
             mi.BSDF.__init__(self, props)
-            self.spectrum = spectrum_from(props)
+            self.spectrum, self.recipe = surface_from(props)
             self.reflectance = reflectance_from(props)
             self.orientation = props.get_texture("orientation", 0.0)
             self.height_scale = mi.Float(props.get("height_scale", 1.0))
@@ -110,6 +110,10 @@ def define() -> type:
             """Sine and cosine of the angle from the tangent to the pattern's x axis."""
             return dr.sincos(dr.deg2rad(self.orientation.eval_1(si, active)))
 
+        def along_pattern(self, si: mi.SurfaceInteraction3f, omega: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:
+            """A direction of the shading frame, along the pattern's axes."""
+            return _turned(omega, *self._frame(si, active))
+
         def _grating(
             self, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool
         ) -> tuple[mi.UnpolarizedSpectrum, mi.Float]:
@@ -149,6 +153,11 @@ def define() -> type:
             """The spectrum says nothing outside of its wavelengths (µm): there the grating is black."""
             shortest, longest = self.spectrum.wavelengths
             return (wavelength >= shortest * 1e-3 * (1 - 1e-6)) & (wavelength <= longest * 1e-3 * (1 + 1e-6))
+
+        def transmitted(self, si: mi.SurfaceInteraction3f, cos_o: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
+            """(1 − R_i)(1 − R_o): what the surface lets through to the base and back."""
+            r_i, r_o = (self.reflectance(si, cos, active) for cos in (mi.Frame3f.cos_theta(si.wi), cos_o))
+            return (1 - r_i) * (1 - r_o)
 
         def _lobes(self, ctx: mi.BSDFContext) -> tuple[bool, mi.BSDFContext | None]:
             """Whether `ctx` asks for the grating, and what it asks of the base."""

@@ -16,8 +16,11 @@ _PREFIX = "handed over: "
 _handed_over: weakref.WeakValueDictionary[str, GratingSpectrum] = weakref.WeakValueDictionary()
 
 
-def spectrum_from(props: mi.Properties) -> GratingSpectrum:
+def surface_from(props: mi.Properties) -> tuple[GratingSpectrum, Recipe | None]:
     """The spectrum that the parameters `filename`, `spectrum`, or `profile` with its own parameters name.
+
+    Returns:
+        The spectrum, and the recipe behind it. A saved spectrum has none: it does not say which heights it is of.
 
     Raises:
         ValueError: unless exactly one of them is given, or if what it names cannot be had.
@@ -29,7 +32,7 @@ def spectrum_from(props: mi.Properties) -> GratingSpectrum:
             f"profile ({', '.join(PROFILES)}) or, from Python, spectrum"
         )
     if given == ["spectrum"]:
-        return _taken_over(props["spectrum"])
+        return _taken_over(props["spectrum"]), None
     if given == ["filename"]:
         return _from_file(Path(str(mi.file_resolver().resolve(props["filename"]))))
     name = props["profile"]
@@ -38,15 +41,17 @@ def spectrum_from(props: mi.Properties) -> GratingSpectrum:
     known = inspect.signature(PROFILES[name]).parameters
     surface = {"profile": name, **{key: props[key] for key in known if key in props}}
     settings = {key: props[key] for key in ("coherence_length", "tolerance") if key in props}
-    return Recipe(surface, settings).cached()
+    recipe = Recipe(surface, settings)
+    return recipe.cached(), recipe
 
 
-def _from_file(path: Path) -> GratingSpectrum:
+def _from_file(path: Path) -> tuple[GratingSpectrum, Recipe | None]:
     suffix = path.suffix.lower()
     if suffix == ".toml":
-        return Recipe.load(path).cached()
+        recipe = Recipe.load(path)
+        return recipe.cached(), recipe
     if suffix == ".exr":
-        return GratingSpectrum.load(path)
+        return GratingSpectrum.load(path), None
     raise ValueError(
         f"filename: got {path}, wanted a saved spectrum (.exr) or a recipe (.toml); "
         "a scan is turned into a spectrum by `mitsuba-diffraction precompute`, or named by a recipe"

@@ -1,0 +1,211 @@
+"""What every variant of the shader has in common."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from numbers import Integral, Real
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..coherence import SUN_COHERENCE_LENGTH, lobe_width
+from ..heightfield import HeightField
+from .gain import PUBLISHED_R0, Gain, fresnel_ratio
+from .quirks import Quirks
+from .spectral_weights import SpectralWeights
+from .taylor_textures import PUBLISHED_TERMS, TaylorTextures
+from .texture_sum import TextureSum
+from .tristimulus import LONGEST, PUBLISHED_STEP, SHORTEST, rgb_matrix
+
+
+class Shader:
+    """A way to shade a tile: directions → linear RGB.
+
+    Directions are unit vectors along the axes of the tile, z the normal, both away from the surface: ω_i to the light,
+    ω_o to the viewer. An instance belongs to the variant of Mitsuba under which it was made.
+    """
+
+    def __init__(self, height_field: HeightField, quirks: Quirks, shadowing: bool = True) -> None:
+        self.tile_size = height_field.tile_size
+        self.quirks = quirks
+        self.shadowing = shadowing
+
+    def weights(self, r_0: ArrayLike = PUBLISHED_R0, light: ArrayLike | None = None) -> SpectralWeights:
+        """The colour weights for a material and a light, as `SpectralWeights` has them."""
+        return SpectralWeights(self.quirks, self.peak, r_0=r_0, light=light)
+
+    @property
+    def peak(self) -> float:
+        """S(0) of a flat surface, µm², by which a relative radiance was divided."""
+        raise NotImplementedError
+
+    @property
+    def texel_reads(self) -> int:
+        """How many texels of the height field's transforms one shading point reads, at most."""
+        raise NotImplementedError
+
+    def rgb(
+        self,
+        wi: mi.Vector3f,
+        wo: mi.Vector3f,
+        weights: SpectralWeights,
+        active: mi.Bool = True,
+        height_scale: mi.Float = 1.0,
+    ) -> mi.Color3f:
+        """Linear RGB, before gamma.
+
+        Args:
+            wi: ω_i.
+            wo: ω_o.
+            weights: of this shader's `weights`.
+            active: where to shade.
+            height_scale: scales the heights.
+        """
+        raise NotImplementedError
+
+
+class TextureShader(Shader):
+    """A shader that sums Taylor textures, wavelength by wavelength, into XYZ.
+
+    The relative radiance of algorithm 4.3 is
+
+        ρ(λ) = F/F₀ · K G cos θ_i · |P(q; κ)|²,     q = (u, v)/λ,     κ = −2πw/λ,
+
+    |P|² = 1 being that of a flat mirror, and the colour ∫ ρ(λ) S(λ) (x̄, ȳ, z̄) dλ.
+    """
+
+    origin = "corner"
+
+    def __init__(
+        self,
+        height_field: HeightField,
+        quirks: Quirks,
+        *,
+        coherence_length: float = SUN_COHERENCE_LENGTH,
+        terms: int = PUBLISHED_TERMS,
+        step: float = PUBLISHED_STEP,
+        shadowing: bool = True,
+    ) -> None:
+        """Computes the textures.
+
+        Args:
+            height_field: the tile.
+            quirks: which of the published shader's peculiarities to keep.
+            coherence_length: L_c in µm.
+            terms: how many Taylor terms.
+            step: between wavelengths, nm; 400 must be a multiple of it.
+            shadowing: multiply with G.
+
+        Raises:
+            ValueError: if an argument makes no sense.
+        """
+        super().__init__(height_field, quirks, shadowing)
+        lobe_width(coherence_length)  # refuses what is no length
+        steps = (LONGEST - SHORTEST) / step if isinstance(step, Real) and step > 0 else 0
+        if steps < 1 or abs(steps - round(steps)) > 1e-9:
+            raise ValueError(f"step: got {step!r}, wanted a part of the {LONGEST - SHORTEST:g} nm from 380 to 780 nm")
+        self.coherence_length = coherence_length
+        self.step = float(step)
+        self.wavelength_count = round(steps) + 1
+        self.textures = TextureSum(
+            TaylorTextures.of(height_field, terms, heights_from_zero=quirks.heights_from_zero, origin=self.origin)
+        )
+
+    @property
+    def sigma(self) -> float:
+        """σ_f = 1/(2πσ_s) in cycles/µm, σ_s = L_c/4: the window in amplitude, √2 times as wide as in power."""
+        return float(np.sqrt(2) * lobe_width(self.coherence_length))
+
+    @property
+    def peak(self) -> float:
+        return 1 / (float(np.pi) * self.sigma**2)
+
+    def power(self, gain: Gain, wavelength: mi.Float, height_scale: mi.Float, active: mi.Bool) -> mi.Float:
+        """|P(q; κ)|² at a wavelength in µm, one for a flat mirror at q = 0."""
+        raise NotImplementedError
+
+    def relative_radiance(
+        self,
+        wi: mi.Vector3f,
+        wo: mi.Vector3f,
+        wavelength: mi.Float,
+        r_0: mi.Float = PUBLISHED_R0,
+        height_scale: mi.Float = 1.0,
+    ) -> mi.Float:
+        """ρ(λ) at a wavelength in nm (eq. 3.11), with the shadowing."""
+        gain = Gain(wi, wo, self.shadowing, mi.Bool(True))
+        r_0 = PUBLISHED_R0 if self.quirks.fixed_index else r_0
+        power = self.power(gain, mi.Float(wavelength) * 1e-3, mi.Float(height_scale), gain.active)
+        return gain.factor * self.fresnel(mi.Float(r_0), gain) * power
+
+    def fresnel(self, r_0: mi.Float, gain: Gain) -> mi.Float:
+        """F/F₀ or its square."""
+        return fresnel_ratio(r_0, gain.falloff, self.quirks.fresnel_squared)
+
+    def xyz(
+        self,
+        wi: mi.Vector3f,
+        wo: mi.Vector3f,
+        weights: SpectralWeights,
+        active: mi.Bool = True,
+        height_scale: mi.Float = 1.0,
+    ) -> mi.Color3f:
+        """CIE XYZ; arguments as in `rgb`."""
+        gain = Gain(wi, wo, self.shadowing, mi.Bool(active))
+        return gain.factor * self.integral(gain, weights, mi.Float(height_scale))
+
+    def integral(self, gain: Gain, weights: SpectralWeights, height_scale: mi.Float) -> mi.Color3f:
+        """∫ F/F₀ |P|² S (x̄, ȳ, z̄) dλ, here by the trapezoidal rule."""
+        return trapezoid(self, self.power, gain, weights, height_scale, gain.active)
+
+    def rgb(
+        self,
+        wi: mi.Vector3f,
+        wo: mi.Vector3f,
+        weights: SpectralWeights,
+        active: mi.Bool = True,
+        height_scale: mi.Float = 1.0,
+    ) -> mi.Color3f:
+        matrix = rgb_matrix(cie_rgb_matrix=self.quirks.cie_rgb_matrix, d65_twice=self.quirks.d65_twice)
+        xyz = self.xyz(wi, wo, weights, active, height_scale)
+        return mi.Color3f(*(sum(float(row[i]) * xyz[i] for i in range(3)) for row in matrix))
+
+    @property
+    def texels_per_term(self) -> int:
+        """How many texels one Taylor term of one wavelength reads."""
+        raise NotImplementedError
+
+    @property
+    def texel_reads(self) -> int:
+        return self.wavelength_count * self.textures.terms * self.texels_per_term
+
+
+@dr.syntax
+def trapezoid(
+    shader: TextureShader,
+    power: Callable[[Gain, mi.Float, mi.Float, mi.Bool], mi.Float],
+    gain: Gain,
+    weights: SpectralWeights,
+    height_scale: mi.Float,
+    active: mi.Bool,
+) -> mi.Color3f:
+    """Σ_j F/F₀ power(λ_j) S (x̄, ȳ, z̄)(λ_j) Δλ over the shader's wavelengths, half of it at both ends."""
+    result = mi.Color3f(0)
+    index = mi.UInt32(0)
+    while active & (index < shader.wavelength_count):
+        wavelength = SHORTEST + shader.step * mi.Float(index)
+        weight, r_0 = weights(wavelength, active)
+        at_end = (index == 0) | (index == shader.wavelength_count - 1)
+        share = dr.select(at_end, 0.5 * shader.step, shader.step) * shader.fresnel(r_0, gain)
+        result += weight * (share * power(gain, wavelength * 1e-3, height_scale, active))
+        index += 1
+    return result
+
+
+def check_whole(name: str, value: int, least: int) -> int:
+    """`value` as an int ≥ `least`, or ValueError."""
+    if isinstance(value, bool) or not isinstance(value, Integral) or value < least:
+        raise ValueError(f"{name}: got {value!r}, wanted a whole number ≥ {least}")
+    return int(value)

@@ -1,0 +1,127 @@
+"""The shader at given directions, NumPy in and out."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..heightfield import HeightField
+from .base import Shader
+from .flss import FLSS
+from .gem import GEM
+from .nmm import NMM
+from .picture import encode
+from .pq import PQ
+from .quirks import Quirks
+
+VARIANTS = {"flss": FLSS, "nmm": NMM, "pq": PQ, "gem": GEM}
+QUANTITIES = ("encoded", "rgb", "xyz")
+
+
+def shader_for(height_field: HeightField, variant: str, quirks: Quirks, **settings: object) -> Shader:
+    """The shader of that name (`VARIANTS`), under Mitsuba's variant in force.
+
+    Raises:
+        ValueError: on an unknown name, or where Mitsuba has no vectorised variant set.
+    """
+    if variant not in VARIANTS:
+        raise ValueError(f"variant: got {variant!r}, wanted one of {', '.join(VARIANTS)}")
+    if mi.variant() is None or not dr.is_jit_v(mi.Float) or not mi.is_spectral:
+        raise ValueError(f"variant: Mitsuba's is {mi.variant()}, wanted a spectral one such as llvm_ad_spectral")
+    return VARIANTS[variant](height_field, quirks, **settings)
+
+
+def colour(
+    height_field: HeightField,
+    wi: ArrayLike,
+    wo: ArrayLike,
+    *,
+    variant: str = "flss",
+    quirks: Quirks | None = None,
+    quantity: str = "rgb",
+    r_0: ArrayLike = 0.04,
+    light: ArrayLike | None = None,
+    **settings: object,
+) -> NDArray[np.float32]:
+    """The colour that the shader gives a tile.
+
+    Args:
+        height_field: the tile.
+        wi: ω_i, (..., 3) along the axes of the tile.
+        wo: ω_o, likewise; the two broadcast.
+        variant: "flss", "nmm", "pq" or "gem".
+        quirks: as published if none are given.
+        quantity: "xyz" (not for gem), linear "rgb", or "encoded", the numbers of the screen, cut off at 0 and 1.
+        r_0: the power reflectance at normal incidence.
+        light: the light's irradiance per nm at `tristimulus.wavelengths`; D65 with Y = 1 if there is none.
+        settings: further arguments of the shader's class.
+
+    Returns:
+        (..., 3).
+
+    Raises:
+        ValueError: if an argument makes no sense.
+    """
+    if quantity not in QUANTITIES:
+        raise ValueError(f"quantity: got {quantity!r}, wanted one of {', '.join(QUANTITIES)}")
+    quirks = quirks or Quirks.as_published()
+    shader = shader_for(height_field, variant, quirks, **settings)
+    if quantity == "xyz" and variant == "gem":
+        raise ValueError("quantity: gem has no XYZ, only RGB")
+    wi, wo, shape = _directions(wi, wo)
+    weights = shader.weights(r_0, light)
+    result = shader.xyz(wi, wo, weights) if quantity == "xyz" else shader.rgb(wi, wo, weights)
+    if quantity == "encoded":
+        result = dr.minimum(encode(result, quirks.power_gamma), 1)
+    return np.array(result).T.reshape(*shape, 3)
+
+
+def relative_radiance(
+    height_field: HeightField,
+    wi: ArrayLike,
+    wo: ArrayLike,
+    wavelengths: ArrayLike,
+    *,
+    variant: str = "flss",
+    quirks: Quirks | None = None,
+    r_0: float = 0.04,
+    **settings: object,
+) -> NDArray[np.float32]:
+    """ρ(λ), the radiance over that of a flat mirror lit and seen at right angles (eq. 3.11).
+
+    Args:
+        height_field: the tile.
+        wi: ω_i, (..., 3) along the axes of the tile.
+        wo: ω_o, likewise.
+        wavelengths: (...) in nm; all three broadcast.
+        variant: "flss" or "pq"; "nmm" gives what it finds at one of its wavelengths, the same as "flss".
+        quirks: as published if none are given.
+        r_0: the power reflectance at normal incidence.
+        settings: further arguments of the shader's class.
+
+    Returns:
+        (...).
+
+    Raises:
+        ValueError: if an argument makes no sense.
+    """
+    if variant == "gem":
+        raise ValueError("variant: gem has no spectrum, only RGB")
+    shader = shader_for(height_field, variant, quirks or Quirks.as_published(), **settings)
+    wavelengths = np.asarray(wavelengths, np.float32)
+    wi, wo = (np.broadcast_to(omega, (*wavelengths.shape, 3)) if np.ndim(omega) == 1 else omega for omega in (wi, wo))
+    wi, wo, shape = _directions(wi, wo)
+    wavelengths = np.broadcast_to(wavelengths, shape).ravel()
+    return np.array(shader.relative_radiance(wi, wo, mi.Float(wavelengths), r_0)).reshape(shape)
+
+
+def _directions(wi: ArrayLike, wo: ArrayLike) -> tuple[mi.Vector3f, mi.Vector3f, tuple[int, ...]]:
+    """Two arrays (..., 3) of directions as Dr.Jit's, and the shape (...)."""
+    wi, wo = (np.asarray(omega, np.float32) for omega in (wi, wo))
+    if wi.shape[-1:] != (3,) or wo.shape[-1:] != (3,):
+        raise ValueError(f"wi, wo: got shapes {wi.shape} and {wo.shape}, wanted (..., 3)")
+    wi, wo = np.broadcast_arrays(wi, wo)
+    vectors = (mi.Vector3f(np.ascontiguousarray(omega.reshape(-1, 3).T)) for omega in (wi, wo))
+    return *vectors, wi.shape[:-1]

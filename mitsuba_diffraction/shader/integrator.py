@@ -1,0 +1,174 @@
+"""The class behind `<integrator type="diffraction_shader">`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from .base import Shader
+from .evaluate import VARIANTS
+from .lights import Light, lights_of, spectrum_of
+from .picture import Emission, decode, encode
+from .quirks import Quirks
+from .spectral_weights import SpectralWeights
+from .surfaces import Surface, heights_of, surfaces_of
+
+MANUAL = """The real-time shader of structural colour, on the same scene that a path tracer renders.
+
+Parameters (XML or dictionary):
+    variant (string): "flss", "nmm", "pq" or "gem" ("flss").
+    as_published (boolean): with all of the published shader's peculiarities, or with none (true).
+    fresnel_squared, window_pi, … (boolean): one peculiarity on or off, whatever as_published says; `Quirks` lists them.
+    terms (integer): Taylor terms (37); not for gem.
+    interpolation (string): "sinc" or "linear" (sinc); for pq only.
+    spacing (float): the period d in µm, by default that of the strongest wave along x; for gem only.
+    roughness (float): of the highlight, 1/µm (5); for gem only.
+    shadows (boolean): test whether something stands before the light (false, as published).
+    diffuse_weight (float): the share of a BSDF below the grating (0.5; the thesis gives no number).
+
+Surfaces with a `diffraction_grating`, or one inside `twosided`, are shaded with their heights, which must come from a
+recipe or a profile; all other BSDFs as they are. Light comes straight from directional and point lights; other lights,
+the background and reflections between surfaces are left out.
+
+The shader gives RGB. The picture is light of that colour, as a spectrum (`Emission`), so that any film records it; a
+colour that sRGB cannot show has negative radiance at some wavelengths. Corrected, FLSS and NMM are in the scene's units
+and show the direct light of a path tracer with fresnel="schlick", without the BRDF's factor E.
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class _Prepared:
+    """What a scene needs before it is rendered: its lights, and per surface the shader and a table for each light."""
+
+    lights: list[Light]
+    surfaces: list[tuple[Surface, Shader, list[SpectralWeights]]]
+
+
+def define() -> type:
+    """The plugin's class for the variant in force: its base class belongs to that variant."""
+
+    class DiffractionShader(mi.SamplingIntegrator):
+        __doc__ = MANUAL
+
+        def __init__(self, props: mi.Properties) -> None:
+            mi.SamplingIntegrator.__init__(self, props)
+            self.variant = props.get("variant", "flss")
+            if self.variant not in VARIANTS:
+                raise ValueError(f"variant: got {self.variant!r}, wanted one of {', '.join(VARIANTS)}")
+            quirks = Quirks.as_published() if props.get("as_published", True) else Quirks.corrected()
+            self.quirks = replace(quirks, **{name: props[name] for name in Quirks.names() if name in props})
+            self.settings = {name: props[name] for name in _settings(self.variant) if name in props}
+            self.shadows = props.get("shadows", False)
+            self.diffuse_weight = props.get("diffuse_weight", 0.5)
+            if not 0 <= self.diffuse_weight <= 1:
+                raise ValueError(f"diffuse_weight: got {self.diffuse_weight}, wanted 0 to 1")
+            self.emission = Emission()
+            self._shaders: list[tuple[mi.BSDF, Shader]] = []
+            self._prepared: _Prepared | None = None
+
+        def render(self, scene: mi.Scene, *args: object, **kwargs: object) -> mi.TensorXf:
+            # Lights and materials may have changed since the last time.
+            self._prepared = self.prepare(scene)
+            return mi.SamplingIntegrator.render(self, scene, *args, **kwargs)
+
+        def prepare(self, scene: mi.Scene) -> _Prepared:
+            """Reads the lights and the gratings of a scene.
+
+            Raises:
+                ValueError: if the shader cannot show them.
+            """
+            lights = lights_of(scene)
+            surfaces = []
+            for surface in surfaces_of(scene):
+                shader, r_0 = self.shader_of(surface.grating), _normal_reflectance(surface.grating)
+                surfaces.append((surface, shader, [shader.weights(r_0, light.spectrum) for light in lights]))
+            return _Prepared(lights, surfaces)
+
+        def shader_of(self, grating: mi.BSDF) -> Shader:
+            """The shader of a grating; its textures are computed once."""
+            for known, shader in self._shaders:
+                if known is grating:
+                    return shader
+            height_field, coherence_length = heights_of(grating)
+            settings = dict(self.settings, shadowing=grating.shadowing == "v_cavity")
+            if self.variant != "gem":
+                settings["coherence_length"] = coherence_length
+            shader = VARIANTS[self.variant](height_field, self.quirks, **settings)
+            self._shaders.append((grating, shader))
+            return shader
+
+        def sample(
+            self,
+            scene: mi.Scene,
+            sampler: mi.Sampler,
+            ray: mi.RayDifferential3f,
+            medium: mi.Medium | None = None,
+            active: mi.Bool = True,
+        ) -> tuple[mi.Spectrum, mi.Bool, list[mi.Float]]:
+            prepared = self._prepared or self.prepare(scene)
+            si = scene.ray_intersect(ray, active)
+            active = active & si.is_valid()
+            bsdf = si.bsdf(ray)
+            places = [active & surface.holds(bsdf, si.wi) for surface, _, _ in prepared.surfaces]
+            plain = active
+            for surface, _, _ in prepared.surfaces:
+                plain = plain & (surface.is_of(bsdf) ^ True)
+            rgb, radiance = mi.Color3f(0), mi.UnpolarizedSpectrum(0)
+            for index, light in enumerate(prepared.lights):
+                ds, falloff, irradiance = light.sample(si, active)
+                lit = mi.Bool(True)
+                if self.shadows:
+                    lit = scene.ray_test(si.spawn_ray_to(ds.p), active) ^ True
+                direction = si.to_local(ds.d)
+                value = mi.unpolarized_spectrum(bsdf.eval(mi.BSDFContext(), si, direction, plain & lit))
+                radiance += dr.select(plain & lit, value * irradiance, 0)
+                for (surface, shader, weights), here in zip(prepared.surfaces, places, strict=True):
+                    here = here & lit
+                    grating = surface.grating
+                    own = mi.SurfaceInteraction3f(si)
+                    own.wi = mi.Vector3f(si.wi.x, si.wi.y, surface.side * si.wi.z)
+                    wi = mi.Vector3f(direction.x, direction.y, surface.side * direction.z)
+                    colour = shader.rgb(
+                        grating.along_pattern(own, wi, here),
+                        grating.along_pattern(own, own.wi, here),
+                        weights[index],
+                        here,
+                        grating.height_scale,
+                    )
+                    share = mi.Float(1)
+                    if grating.base is not None:
+                        below = mi.unpolarized_spectrum(grating.base.bsdf.eval(mi.BSDFContext(), own, wi, here))
+                        if self.quirks.constant_blend:
+                            share = mi.Float(1 - self.diffuse_weight)
+                            below *= self.diffuse_weight
+                        else:
+                            below *= grating.transmitted(own, mi.Frame3f.cos_theta(wi), here)
+                        radiance += dr.select(here, below * irradiance, 0)
+                    rgb += dr.select(here, share * falloff * colour, 0)
+            if self.quirks.power_gamma:
+                rgb = decode(encode(rgb, True))
+            radiance += self.emission(rgb, ray.wavelengths, active)
+            return mi.depolarizer(radiance), active, []
+
+        def to_string(self) -> str:
+            on = [name for name in Quirks.names() if getattr(self.quirks, name)]
+            return (
+                f"DiffractionShader[\n  variant = {self.variant},\n  quirks = {', '.join(on) or 'none'},\n"
+                f"  shadows = {self.shadows}\n]"
+            )
+
+    return DiffractionShader
+
+
+def _settings(variant: str) -> tuple[str, ...]:
+    """The parameters that a variant of the shader has beyond those of all."""
+    return {"pq": ("terms", "interpolation"), "gem": ("spacing", "roughness")}.get(variant, ("terms",))
+
+
+def _normal_reflectance(grating: mi.BSDF) -> NDArray[np.float64]:
+    """R at normal incidence at `tristimulus.wavelengths`, (401,)."""
+    return spectrum_of(lambda si: grating.reflectance(si, mi.Float(1), mi.Bool(True)))

@@ -1,0 +1,75 @@
+"""The lights that a real-time shader knows: parallel light, and points."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from .tristimulus import wavelengths
+
+
+def spectrum_of(evaluate: Callable[[mi.SurfaceInteraction3f], mi.UnpolarizedSpectrum]) -> NDArray[np.float64]:
+    """What a function of a SurfaceInteraction3f that holds wavelengths gives, at `tristimulus.wavelengths`: (401,)."""
+    nanometres = wavelengths()
+    channels = len(mi.UnpolarizedSpectrum(0))
+    groups = np.resize(nanometres, (-(-nanometres.size // channels), channels)).T.astype(np.float32)
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    if dr.is_jit_v(mi.Float):
+        si.wavelengths = mi.UnpolarizedSpectrum(groups)
+        values = np.broadcast_to(np.array(evaluate(si)), groups.shape)
+    else:
+        columns = []
+        for group in groups.T:
+            si.wavelengths = mi.UnpolarizedSpectrum([float(value) for value in group])
+            columns.append(np.array(evaluate(si)))
+        values = np.stack(columns, axis=1)
+    return np.asarray(values, np.float64).T.ravel()[: nanometres.size]
+
+
+class Light:
+    """A directional or point emitter of a scene.
+
+    Attributes:
+        emitter: Mitsuba's.
+        spectrum: (401,) at `tristimulus.wavelengths`: irradiance across the light per nm, for a point at the
+            distance one.
+    """
+
+    KINDS = ("DirectionalEmitter", "PointLight")
+
+    def __init__(self, emitter: mi.Emitter) -> None:
+        self.emitter = emitter
+        self.at_point = emitter.class_name() == "PointLight"
+        # One unit of length beside a point; parallel light is the same everywhere.
+        place = mi.Point3f(mi.traverse(emitter)["position"]) if self.at_point else mi.Point3f(0)
+
+        def irradiance(si: mi.SurfaceInteraction3f) -> mi.UnpolarizedSpectrum:
+            si.p = place + mi.Vector3f(0, 0, 1)
+            _, value = emitter.sample_direction(si, mi.Point2f(0.5), True)
+            return mi.unpolarized_spectrum(value)
+
+        self.spectrum = spectrum_of(irradiance)
+
+    def sample(
+        self, si: mi.SurfaceInteraction3f, active: mi.Bool
+    ) -> tuple[mi.DirectionSample3f, mi.Float, mi.UnpolarizedSpectrum]:
+        """Where the light is, by what `spectrum` is to be multiplied, and the irradiance at the ray's wavelengths."""
+        ds, value = self.emitter.sample_direction(si, mi.Point2f(0.5), active)
+        falloff = dr.rcp(dr.square(ds.dist)) if self.at_point else mi.Float(1)
+        return ds, falloff, mi.unpolarized_spectrum(value)
+
+
+def lights_of(scene: mi.Scene) -> list[Light]:
+    """The directional and point lights of a scene; others are left out.
+
+    Raises:
+        ValueError: if there is none.
+    """
+    found = [Light(emitter) for emitter in scene.emitters() if emitter.class_name() in Light.KINDS]
+    if not found:
+        raise ValueError("diffraction_shader: the scene has no directional or point light, and it knows no other")
+    return found

@@ -1,0 +1,43 @@
+"""From the shader's linear RGB to what a screen shows, and on to light that a film can record."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..bsdf.tables import PacketTable
+from .tristimulus import EMISSION, primary_spectra
+
+
+def encode(rgb: mi.Color3f, power_gamma: bool) -> mi.Color3f:
+    """Linear RGB to the numbers of a screen: the power 1/2.2, or sRGB's transfer function (IEC 61966-2-1)."""
+    rgb = dr.maximum(rgb, 0)
+    if power_gamma:
+        return dr.power(rgb, 1 / 2.2)
+    return dr.select(rgb <= 0.0031308, 12.92 * rgb, 1.055 * dr.power(rgb, 1 / 2.4) - 0.055)
+
+
+def decode(encoded: mi.Color3f) -> mi.Color3f:
+    """The light, linear sRGB, that an sRGB screen gives for the numbers."""
+    return dr.select(encoded <= 0.04045, encoded / 12.92, dr.power((encoded + 0.055) / 1.055, 2.4))
+
+
+class Emission:
+    """Light of a given linear sRGB, as a spectrum: Σ_c RGB_c b_c(λ), b_c as in `tristimulus.primary_spectra`."""
+
+    def __init__(self) -> None:
+        spectra = primary_spectra()
+        self.table = PacketTable(np.concatenate([spectra, np.zeros((len(spectra), 1))], axis=1))
+
+    def __call__(self, rgb: mi.Color3f, wavelengths: mi.UnpolarizedSpectrum, active: mi.Bool) -> mi.UnpolarizedSpectrum:
+        """Per nm, at the wavelengths of a ray, in nm."""
+        result = mi.UnpolarizedSpectrum(0)
+        last = EMISSION.size - 1
+        for channel in range(len(result)):
+            place = dr.clip((wavelengths[channel] - float(EMISSION[0])) / float(EMISSION[1] - EMISSION[0]), 0, last)
+            index = mi.UInt32(dr.minimum(place, last - 1))
+            below, above = self.table(index, active), self.table(index + 1, active)
+            b = below + (place - mi.Float(index)) * (above - below)
+            result[channel] = rgb.x * b.x + rgb.y * b.y + rgb.z * b.z
+        return result

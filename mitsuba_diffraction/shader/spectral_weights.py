@@ -1,0 +1,62 @@
+"""Colour weights at run time: what the light of one wavelength adds to XYZ."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..bsdf.tables import PacketTable
+from .gain import PUBLISHED_R0
+from .quirks import Quirks
+from .tristimulus import FLAT, LONGEST, SHORTEST, d65_weights, light_weights, matching_functions, wavelengths
+
+
+class SpectralWeights:
+    """A table of (X, Y, Z, R₀) with one entry per nm, read with linear interpolation (algorithm 4.3, line 5)."""
+
+    def __init__(
+        self,
+        quirks: Quirks,
+        peak: float,
+        *,
+        r_0: ArrayLike = PUBLISHED_R0,
+        light: ArrayLike | None = None,
+    ) -> None:
+        """Builds the table.
+
+        With the light's spectrum E(λ), an irradiance per nm, and a relative radiance ρ(λ) the colour is
+        ∫ ρ E (x̄, ȳ, z̄) dλ / ∫ȳ dλ. A radiance instead of a relative one has the factor R₀ S(0)/λ², S(0) being the
+        density of a flat surface at q = 0.
+
+        Args:
+            quirks: `fixed_index`, `d65_light` and `relative` decide.
+            peak: S(0) of a flat surface, µm².
+            r_0: the power reflectance at normal incidence, one number or (401,) at `tristimulus.wavelengths`.
+            light: the spectrum of the light, (401,); D65 with Y = 1 if there is none.
+        """
+        weights = d65_weights() if light is None else light_weights(light)
+        self.luminance = 1.0 if light is None else _luminance(light)
+        if quirks.d65_light:
+            weights = d65_weights() * self.luminance
+        r_0 = PUBLISHED_R0 if quirks.fixed_index else r_0
+        r_0 = np.broadcast_to(np.asarray(r_0, np.float64), wavelengths().shape)
+        if not quirks.relative:
+            weights = weights * (r_0 * peak / (wavelengths() * 1e-3) ** 2)[:, None]
+        self.table = PacketTable(np.concatenate([weights, r_0[:, None]], axis=1))
+
+    def __call__(self, wavelength: mi.Float, active: mi.Bool) -> tuple[mi.Color3f, mi.Float]:
+        """(X, Y, Z) per nm, and R₀, at a wavelength in nm; zero outside of 380 to 780 nm."""
+        active = active & (wavelength >= SHORTEST - 1e-3) & (wavelength <= LONGEST + 1e-3)
+        place = dr.clip(wavelength - SHORTEST, 0, LONGEST - SHORTEST)
+        index = mi.UInt32(dr.minimum(place, LONGEST - SHORTEST - 1))
+        below, above = self.table(index, active), self.table(index + 1, active)
+        value = below + (place - mi.Float(index)) * (above - below)
+        return mi.Color3f(value.x, value.y, value.z), value.w
+
+
+def _luminance(light: ArrayLike) -> float:
+    """∫ E ȳ dλ / ∫ ȳ dλ."""
+    values: NDArray[np.float64] = np.asarray(light, np.float64) * matching_functions()[:, 1]
+    return float(np.trapezoid(values) / FLAT)

@@ -1,0 +1,91 @@
+"""The shader's colour: what one nanometre of light adds to XYZ, the way to RGB, and from RGB back to a spectrum."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import lsq_linear
+
+SHORTEST, LONGEST, PUBLISHED_STEP = 380.0, 780.0, 5.0  # nm: 81 wavelengths
+
+CIE_RGB = np.array([[0.41847, -0.15866, -0.082835], [-0.091169, 0.25243, 0.015708], [0.00092090, -0.0025498, 0.17860]])
+"""XYZ → CIE RGB of 1931 (Smith and Guild 1931), eq. 4.9 of the thesis. The rows add up to 0.177."""
+
+FLAT = 106.857
+"""∫ȳ dλ in nm: a flat spectrum of one has Y = 1, as everywhere in this project (`color`)."""
+
+
+def wavelengths() -> NDArray[np.float64]:
+    """The nodes of the tables below, one per nm: (401,), nm."""
+    return np.arange(SHORTEST, LONGEST + 0.5)
+
+
+@lru_cache(maxsize=1)
+def matching_functions() -> NDArray[np.float64]:
+    """x̄, ȳ, z̄ of the CIE 1931 2° observer at `wavelengths`: (401, 3)."""
+    import colour
+
+    cmfs = colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"]
+    return np.stack([np.interp(wavelengths(), cmfs.wavelengths, column) for column in cmfs.values.T], axis=1)
+
+
+@lru_cache(maxsize=1)
+def d65_weights() -> NDArray[np.float64]:
+    """S(λ) (x̄, ȳ, z̄) of the illuminant D65 (CIE 15:2018), (401, 3) per nm: ∫ gives its white point, Y = 1.
+
+    The integral is the shader's own, a trapezoid of 5 nm.
+    """
+    import colour
+
+    d65 = colour.SDS_ILLUMINANTS["D65"]
+    weights = np.interp(wavelengths(), d65.wavelengths, d65.values)[:, None] * matching_functions()
+    return weights / np.trapezoid(weights[:: int(PUBLISHED_STEP), 1], dx=PUBLISHED_STEP)
+
+
+def light_weights(spectrum: ArrayLike) -> NDArray[np.float64]:
+    """S(λ) (x̄, ȳ, z̄)/∫ȳ dλ of a light with the spectrum S at `wavelengths`, (401,) per nm: (401, 3) per nm."""
+    return np.asarray(spectrum, np.float64)[:, None] * matching_functions() / FLAT
+
+
+def d65_white() -> NDArray[np.float64]:
+    """XYZ of D65 by the shader's own integral, Y = 1: (3,)."""
+    return np.trapezoid(d65_weights()[:: int(PUBLISHED_STEP)], dx=PUBLISHED_STEP, axis=0)
+
+
+def rgb_matrix(*, cie_rgb_matrix: bool, d65_twice: bool) -> NDArray[np.float64]:
+    """(3, 3): XYZ → linear RGB, M or, eq. 4.10, M diag(D65). M is CIE RGB or sRGB (IEC 61966-2-1)."""
+    import colour
+
+    matrix = CIE_RGB if cie_rgb_matrix else colour.RGB_COLOURSPACES["sRGB"].matrix_XYZ_to_RGB
+    return matrix * d65_white() if d65_twice else np.array(matrix)
+
+
+EMISSION = np.arange(360.0, 830.0 + 0.5, 5.0)
+"""The nodes of `primary_spectra`, nm."""
+
+
+@lru_cache(maxsize=1)
+def primary_spectra() -> NDArray[np.float64]:
+    """Spectra b_c(λ) of the primaries of sRGB at `EMISSION`, linear in between: (95, 3).
+
+    Light with the spectrum Σ_c RGB_c b_c(λ) has the colour RGB. b_c is the spectrum of least power among those that
+    are nowhere negative; as smooth as that, it costs a renderer that draws wavelengths the least noise.
+    """
+    import colour
+
+    fine = np.arange(EMISSION[0], EMISSION[-1] + 0.5)
+    cmfs = colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"]
+    matching = np.stack([np.interp(fine, cmfs.wavelengths, column) for column in cmfs.values.T]) / FLAT
+    hats = np.maximum(0.0, 1 - np.abs(fine[:, None] - EMISSION) / (EMISSION[1] - EMISSION[0]))
+    to_xyz = matching @ hats
+    primaries = colour.RGB_COLOURSPACES["sRGB"].matrix_RGB_to_XYZ
+    system = np.concatenate([1e4 * to_xyz, 1e-2 * np.eye(EMISSION.size)])
+    rest = np.zeros(EMISSION.size)
+    spectra = [lsq_linear(system, np.concatenate([1e4 * target, rest]), bounds=(0, np.inf)).x for target in primaries.T]
+    result = np.stack(spectra, axis=1)
+    # The compromise with least power is off by a little.
+    result = result @ np.linalg.solve(to_xyz @ result, primaries)
+    result.setflags(write=False)
+    return result
