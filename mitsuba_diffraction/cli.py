@@ -178,14 +178,14 @@ def _benchmark(
         cases.append(scan_case(read_height_field(scan, pixel_size=pixel_size, height_range=height_range)))
     mi.set_variant(choose_variant(variant))
     with _progress("speed and error") as progress:
-        results = run(cases, **({"tolerances": tolerance} if tolerance else {}), progress=progress)
+        results, shaders = run(cases, **({"tolerances": tolerance} if tolerance else {}), progress=progress)
     with _progress("sampling") as progress:
         sampling = measure(cases, progress=progress)
     # Wide enough wherever it goes, a file too.
     wide = Console(highlight=False, width=max(_out.width, 140))
-    wide.print(report.table(results), report.sampling_table(sampling), sep="\n\n")
+    wide.print(report.table(results), report.shader_table(shaders), report.sampling_table(sampling), sep="\n\n")
     if json is not None:
-        report.save_json(results, sampling, json)
+        report.save_json(results, shaders, sampling, json)
     if plot is not None:
         report.save_plot(results, plot)
 

@@ -50,7 +50,7 @@ def test_accuracy_sees_an_error_that_is_put_in(case):
 def test_a_run_reports_every_combination(llvm, tmp_path):
     deep = Case("deep", gratings.sinusoidal(2.5, 2.0), "tile", 65.0)
     steps = []
-    results = run(
+    results, shaders = run(
         [BLAZE, deep],
         representations=("slices", "taylor"),
         tolerances=(1e-2,),
@@ -74,7 +74,15 @@ def test_a_run_reports_every_combination(llvm, tmp_path):
     assert "refused" in text
     assert all(len(report.cells(r)) == len(report.cells(results[0])) for r in results)
 
-    report.save_json(results, [], tmp_path / "results.json")
+    published, corrected = shaders[0], shaders[1]
+    assert (published.surface, published.variant, published.as_published) == ("blaze", "flss", True)
+    assert published.texel_reads > 20_000
+    # Without its quirks the shader shows this model's colours, but for its 5 nm steps and the patches' 10 nm.
+    assert corrected.delta_e[0] < published.delta_e[0]
+    assert corrected.delta_e[0] < 1
+    console.print(report.shader_table(shaders))
+    assert "flss, as published" in console.export_text()
+    report.save_json(results, shaders, [], tmp_path / "results.json")
     written = json.loads((tmp_path / "results.json").read_text(encoding="utf-8"))
     assert written["speed and error"][0]["accuracy"]["l1"] == results[0].accuracy.l1
     assert written["speed and error"][3]["terms"] is None

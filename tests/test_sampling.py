@@ -26,6 +26,7 @@ SMALL = {
     **BUNDLED,
     "elaphe": lambda: md.gratings.elaphe(8.0),
     "xenopeltis": lambda: md.gratings.xenopeltis(8.0),
+    "sample": lambda: md.gratings.xenopeltis(8.0),
     "column": lambda: md.HeightField(md.gratings.blazed(2.5, 0.246).heights.T, (2.5, 2.5 / 512)),
 }
 RECIPE_COHERENCE = {"elaphe": 26.0, "xenopeltis": 26.0}
@@ -40,6 +41,8 @@ def bundled(name):
 @functools.cache
 def blurred(name):
     """With lobes so wide that the bins of a chi² test resolve them."""
+    if name == "sample":
+        return md.precompute(SMALL[name](), extent="sample", coherence_length=4.0)
     return md.precompute(SMALL[name](), coherence_length=6.0 if name in RECIPE_COHERENCE else 3.0)
 
 
@@ -98,6 +101,9 @@ REDUCED = [
     ("elaphe", 30, 20, WAVELENGTHS),
     ("xenopeltis", 60, 290, WAVELENGTHS),
     ("xenopeltis", 80, 20, ALONE[3]),
+    ("sample", 0, 0, WAVELENGTHS),
+    ("sample", 60, 20, ALONE[1]),
+    ("sample", 80, 200, WAVELENGTHS),
 ]
 FULL = [
     (name, theta, phi, wavelengths)
@@ -110,7 +116,18 @@ CASES = [*REDUCED, *(pytest.param(*case, marks=pytest.mark.slow) for case in FUL
 
 @pytest.mark.parametrize(("name", "theta", "phi", "wavelengths"), CASES)
 def test_samples_pass_the_chi_square_test(llvm, name, theta, phi, wavelengths):
-    bsdf, wi = plugin(blurred(name)), direction(theta, phi)
+    check_chi_square(blurred(name), theta, phi, wavelengths)
+
+
+@pytest.mark.parametrize("theta", [0, 60])
+@pytest.mark.parametrize("extent", ["tile", "sample"])
+@pytest.mark.parametrize("name", ["elaphe", "xenopeltis"])
+def test_samples_of_a_real_scan_pass_the_chi_square_test(llvm, scan, name, extent, theta):
+    check_chi_square(md.precompute(scan(name), extent=extent, coherence_length=2.9), theta, 20, WAVELENGTHS)
+
+
+def check_chi_square(spectrum, theta, phi, wavelengths):
+    bsdf, wi = plugin(spectrum), direction(theta, phi)
 
     # In the plane of direction cosines, where lobes have one width everywhere: dω = dx dy / cos θ.
     def sample(points):
@@ -132,7 +149,7 @@ def test_samples_pass_the_chi_square_test(llvm, name, theta, phi, wavelengths):
     assert test.run(significance_level=0.01, test_count=len(CASES), quiet=True), test.messages
 
 
-@pytest.mark.parametrize("name", ["blazed", "column", "crossed", "elaphe"])
+@pytest.mark.parametrize("name", ["blazed", "column", "crossed", "elaphe", "sample"])
 def test_density_integrates_to_the_share_of_samples_above_the_horizon(llvm, name):
     bsdf, wi, count = plugin(blurred(name)), direction(70, 40), 1 << 19
     bs, _ = sampled(bsdf, wi, WAVELENGTHS, count)
@@ -144,7 +161,7 @@ def test_density_integrates_to_the_share_of_samples_above_the_horizon(llvm, name
     assert abs(pdf.mean() - above.mean()) < 4 * error
 
 
-@pytest.mark.parametrize("name", ["blazed", "crossed", "xenopeltis"])
+@pytest.mark.parametrize("name", ["blazed", "crossed", "xenopeltis", "sample"])
 @pytest.mark.parametrize("theta", [0, 60, 85])
 def test_mean_weight_is_the_albedo(llvm, name, theta):
     bsdf, wi, count = plugin(blurred(name)), direction(theta, 40), 1 << 18

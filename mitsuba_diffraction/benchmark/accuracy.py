@@ -53,6 +53,8 @@ class Exact:
     def accuracy(self, spectrum: GratingSpectrum) -> Accuracy:
         """The errors of a spectrum of the same case."""
         l1 = peak = 0.0
+        # What lies beyond the reach of the lobes is not drawn.
+        tail = np.exp(-(spectrum.reach**2) / 2) if spectrum.extent == "tile" else 0.0
         random = np.random.default_rng(2)
         for kappa in self._kappas:
             shares = spectrum.powers(kappa)
@@ -61,7 +63,7 @@ class Exact:
             # q are drawn from S/∫S itself, as far as it is not negative anywhere.
             drawn = approximate > 0
             error = np.abs(approximate - self._power(q, kappa))[drawn] / approximate[drawn]
-            l1 = max(l1, float(error.mean() * shares.sum(dtype=np.float64)) + spectrum.dropped)
+            l1 = max(l1, float(error.mean() * shares.sum(dtype=np.float64)) + spectrum.dropped + tail)
             peaks = _peaks(spectrum, shares)
             exact = self._power(peaks, kappa)
             strong = exact > 0.01 * exact.max()
@@ -70,23 +72,40 @@ class Exact:
         return Accuracy(l1, peak, self._delta_e(self._factor * spectrum.evaluate(self._q, self._kappa)))
 
     def _delta_e(self, spectra: NDArray[np.float64]) -> tuple[float, float]:
+        return delta_e(self.xyz(), self._xyz(spectra))
+
+    def xyz(self) -> NDArray[np.float64]:
+        """XYZ (12, 3) of the patches' S/λ² under the light; without K, G and R, which patches do not share."""
+        return self._xyz(self._spectra)
+
+    def _xyz(self, spectra: NDArray[np.float64]) -> NDArray[np.float64]:
         import colour
 
         from ..color import spectrum_to_XYZ
 
         light = colour.SDS_ILLUMINANTS[_LIGHT]
-        light = np.interp(self._wavelengths, light.wavelengths, light.values)
-        exact = spectrum_to_XYZ(self._spectra * light, self._wavelengths)
-        # Exposed so that the brightest patch is a light grey.
-        scale = 0.5 / exact[:, 1].max()
-        white = spectrum_to_XYZ(light, self._wavelengths)
-        white = white / white[1]
-        xy = colour.XYZ_to_xy(white)
-        labs = [
-            colour.XYZ_to_Lab(xyz * scale, xy) for xyz in (exact, spectrum_to_XYZ(spectra * light, self._wavelengths))
-        ]
-        difference = colour.delta_E(*labs, method="CIE 2000")
-        return float(difference.mean()), float(difference.max())
+        return spectrum_to_XYZ(
+            spectra * np.interp(self._wavelengths, light.wavelengths, light.values), self._wavelengths
+        )
+
+
+def delta_e(exact: NDArray[np.float64], approximate: NDArray[np.float64]) -> tuple[float, float]:
+    """(mean, largest) CIEDE2000 of XYZ (n, 3), both exposed so that the brightest exact patch is a light grey."""
+    import colour
+
+    white = colour.CCS_ILLUMINANTS["CIE 1931 2 Degree Standard Observer"][_LIGHT]
+    labs = [colour.XYZ_to_Lab(xyz * 0.5 / exact[:, 1].max(), white) for xyz in (exact, approximate)]
+    difference = colour.delta_E(*labs, method="CIE 2000")
+    return float(difference.mean()), float(difference.max())
+
+
+def patch_directions() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """ω_i and ω_o of the patches, (12, 3) each."""
+    wi, wo = np.zeros((2, 12, 3))
+    for plane, patches in enumerate((slice(0, 6), slice(6, 12))):
+        wi[patches, plane], wo[patches, plane] = np.sin(_INCIDENCE), np.sin(_EXITS)
+        wi[patches, 2], wo[patches, 2] = np.cos(_INCIDENCE), np.cos(_EXITS)
+    return wi, wo
 
 
 def _patches(
@@ -111,7 +130,11 @@ def _drawn(
     places = (np.arange(count) + random.random(count)) / count * total[-1]
     row, column = np.unravel_index(np.minimum(np.searchsorted(total, places), total.size - 1), shares.shape)
     if spectrum.extent == "tile":
-        offset = random.normal(0, spectrum.lobe_width, (count, 2))
+        # The lobes end at their reach.
+        inside = -np.expm1(-(spectrum.reach**2) / 2)
+        radius = spectrum.lobe_width * np.sqrt(-2 * np.log1p(-inside * random.random(count)))
+        angle = 2 * np.pi * random.random(count)
+        offset = radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     else:
         # A quadratic B-spline is the density of the sum of three uniform numbers.
         offset = random.uniform(-0.5, 0.5, (3, count, 2)).sum(axis=0) * spectrum.grid.spacing

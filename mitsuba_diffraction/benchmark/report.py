@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from rich.table import Table
 
 from ..files import whole_file
+from .approximation import Approximation
 from .run import Result
 from .sampling import ANGLES, Sampling
 
@@ -63,6 +64,23 @@ def sampling_table(sampling: Sequence[Sampling]) -> Table:
     return _table((*columns, "variance of\ncosine sampling", "picture\ntime"), 1, rows)
 
 
+def shader_table(shaders: Sequence[Approximation]) -> Table:
+    """The real-time shaders, for a terminal."""
+    columns = ("surface", "shader", "texel reads", "speed\nratio", "ΔE00\nmean", "ΔE00\nmax")
+    rows = [
+        [
+            s.surface,
+            s.variant + (", as published" if s.as_published else ", corrected"),
+            str(s.texel_reads),
+            f"{s.evaluate_ratio:.1e}",
+            f"{s.delta_e[0]:.2f}",
+            f"{s.delta_e[1]:.1f}",
+        ]
+        for s in shaders
+    ]
+    return _table(columns, 2, rows)
+
+
 def _table(columns: Sequence[str], texts: int, rows: Sequence[Sequence[str]]) -> Table:
     """Of which the first `texts` columns hold texts, the others numbers."""
     shown = Table(box=None, pad_edge=False)
@@ -73,10 +91,16 @@ def _table(columns: Sequence[str], texts: int, rows: Sequence[Sequence[str]]) ->
     return shown
 
 
-def save_json(results: Sequence[Result], sampling: Sequence[Sampling], path: str | os.PathLike[str]) -> None:
-    """Write both, whole or not at all."""
+def save_json(
+    results: Sequence[Result],
+    shaders: Sequence[Approximation],
+    sampling: Sequence[Sampling],
+    path: str | os.PathLike[str],
+) -> None:
+    """Write all, whole or not at all."""
     content = {
         "speed and error": [dataclasses.asdict(result) for result in results],
+        "real-time shader": [dataclasses.asdict(s) for s in shaders],
         "sampling": [dataclasses.asdict(s) for s in sampling],
     }
     with whole_file(path) as temporary:

@@ -13,6 +13,7 @@ from ..precompute import VISIBLE
 from ..spectrum import GratingSpectrum
 from ..spectrum.slice_table import SliceTable
 from .accuracy import Accuracy, Exact
+from .approximation import Approximation, approximations
 from .cases import Case
 from .speed import Rays, rates
 
@@ -65,7 +66,7 @@ def run(
     count: int = 1 << 19,
     repetitions: int = 5,
     progress: Callable[[int, int], None] = lambda done, total: None,
-) -> list[Result]:
+) -> tuple[list[Result], list[Approximation]]:
     """Measure under the variant in force.
 
     Args:
@@ -77,20 +78,22 @@ def run(
         progress: called with (steps done, steps in all).
 
     Returns:
-        A result for every combination, in order.
+        A result for every combination, in order; and the real-time shaders on the tiles.
     """
     cases = list(cases)
-    results, total = [], len(cases) * len(tolerances) * len(representations)
+    results, shaders, total = [], [], len(cases) * len(tolerances) * len(representations)
     rays = Rays(count)
     for case in cases:
         exact = Exact(case, VISIBLE)
+        if case.extent == "tile":
+            shaders += approximations(case, exact)
         for tolerance in tolerances:
             spectra: dict[str, tuple[GratingSpectrum, float] | str] = {}
             for representation in representations:
                 spectra[representation] = _built(case, representation, tolerance)
                 progress(len(results) + len(spectra), total)
             results += _measured(case, tolerance, spectra, exact, rays, repetitions)
-    return results
+    return results, shaders
 
 
 def _built(case: Case, representation: str, tolerance: float) -> tuple[GratingSpectrum, float] | str:
