@@ -18,7 +18,7 @@ from .cases import Case
 from .speed import Rays, rates
 
 REPRESENTATIONS = ("slices", "svd", "chebyshev", "taylor")
-TOLERANCES = (3e-2, 1e-2, 1e-3)
+TOLERANCES = (1e-2, 1e-3)
 
 
 @dataclass(frozen=True)
