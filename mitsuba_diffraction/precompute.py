@@ -60,8 +60,8 @@ def precompute(
         wavelengths: (shortest, longest) in nm.
         largest_angle: in degrees from the normal, of incidence and exit, that the scene has; less than 90 keeps fewer
             frequencies.
-        representation: "taylor", "chebyshev", "svd" or "slices"; "auto" takes the one that reads the fewest numbers:
-            slices.
+        representation: "taylor", "chebyshev", "svd" or "slices"; "auto" takes the one that reads the fewest
+            packets of four numbers: slices.
         tolerance: bound of max over κ of ∫|S_approx(q; κ) − S_exact(q; κ)| dq, a share of the reflected power.
         progress: called with (steps done, steps in all).
 
