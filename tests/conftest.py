@@ -1,11 +1,15 @@
-"""What all tests share: a cache of their own, and the measured scans."""
+"""What all tests share: a cache of their own, the measured scans, and the command."""
 
+import shlex
+import sys
+import warnings
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
 
 import mitsuba_diffraction as md
+from mitsuba_diffraction import cli
 
 # One example may be the first to import or to compile something.
 settings.register_profile("tests", deadline=None)
@@ -42,3 +46,20 @@ def scan_file():
 def scan(scan_file):
     """scan(name): the height field of a measured scan."""
     return lambda name: md.read_height_field(scan_file(name), pixel_size=0.0586, height_range=_HEIGHT_RANGE[name])
+
+
+@pytest.fixture
+def command(monkeypatch, capfd):
+    """command(line) or command(*words): (exit code, stdout, stderr) of the command, in this process."""
+
+    def call(*words):
+        arguments = shlex.split(words[0]) if len(words) == 1 else words
+        monkeypatch.setattr(sys, "argv", [cli.NAME, *arguments])
+        # Warnings are shown, as they are to a person, and what shows them is put back afterwards.
+        with warnings.catch_warnings():
+            warnings.simplefilter("default")
+            with pytest.raises(SystemExit) as caught:
+                cli.main()
+        return caught.value.code, *capfd.readouterr()
+
+    return call

@@ -1,10 +1,8 @@
 """The commands as a person meets them: one line for a mistake, a file for a success, nothing for an interrupt."""
 
 import importlib
-import shlex
 import subprocess
 import sys
-import warnings
 from pathlib import Path
 
 import drjit as dr
@@ -13,7 +11,6 @@ import OpenEXR
 import pytest
 
 import mitsuba_diffraction as md
-from mitsuba_diffraction import cli
 
 # The package gives the function of that name.
 PRECOMPUTE = importlib.import_module("mitsuba_diffraction.precompute")
@@ -38,23 +35,6 @@ def folder(tmp_path, monkeypatch):
     np.save("holed.npy", holed)
     np.save("counts.npy", np.arange(48, dtype=np.uint8).reshape(6, 8))
     return tmp_path
-
-
-@pytest.fixture
-def command(monkeypatch, capfd):
-    """command(line) or command(*words): (exit code, stdout, stderr) of the command, in this process."""
-
-    def call(*words):
-        arguments = shlex.split(words[0]) if len(words) == 1 else words
-        monkeypatch.setattr(sys, "argv", [cli.NAME, *arguments])
-        # Warnings are shown, as they are to a person, and what shows them is put back afterwards.
-        with warnings.catch_warnings():
-            warnings.simplefilter("default")
-            with pytest.raises(SystemExit) as caught:
-                cli.main()
-        return caught.value.code, *capfd.readouterr()
-
-    return call
 
 
 def files():

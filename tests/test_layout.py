@@ -8,7 +8,10 @@ from pathlib import Path
 import pytest
 
 PACKAGE = Path(__file__).parents[1] / "mitsuba_diffraction"
-RUN_TIME = {"benchmark", "bsdf", "render", "shader", "cli.py", "llvm.py", "plugin.py", "variants.py", "__init__.py"}
+RUN_TIME = {
+    *("benchmark", "bsdf", "cli", "comparison", "evaluation", "render", "shader", "validation"),
+    *("llvm.py", "plugin.py", "variants.py", "__init__.py"),
+}
 """What may import Mitsuba; everything else is offline."""
 OFFLINE_SHADER = {"shader/quirks.py", "shader/taylor_textures.py", "shader/tristimulus.py"}
 OFFLINE = sorted(

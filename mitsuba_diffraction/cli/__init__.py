@@ -1,0 +1,50 @@
+"""The commands, thin: they read arguments, call the package, and say what came of it. One file a command.
+
+Exit codes: 0 done; 1 the work failed or was interrupted; 2 the request was wrong.
+"""
+
+from __future__ import annotations
+
+import sys
+import warnings
+
+import typer
+
+from .benchmark import benchmark
+from .console import NAME, say
+from .precompute import precompute
+from .render import render
+
+# Click's, or that of the copy of Click which newer versions of Typer carry.
+_UsageError = typer.BadParameter.__base__
+
+app = typer.Typer(add_completion=False, no_args_is_help=False, help="Diffraction gratings for Mitsuba 3.")
+for _command in (precompute, render, benchmark):
+    app.command()(_command)
+
+
+@app.callback()
+def _commands() -> None:
+    """Diffraction gratings for Mitsuba 3."""
+
+
+def main() -> None:
+    """Entry point of the command `mitsuba-diffraction`."""
+    warnings.showwarning = lambda message, *args, **kwargs: say("warning", message)
+    try:
+        code = app(prog_name=NAME, standalone_mode=False) or 0
+        if code == 130:  # newer versions of Typer turn Ctrl-C into this code
+            raise KeyboardInterrupt
+    except _UsageError as error:
+        say("error", f"{error.format_message()} (try {NAME} --help)")
+        code = 2
+    except (ValueError, FileNotFoundError, IsADirectoryError, NotADirectoryError) as error:
+        say("error", error)
+        code = 2
+    except (KeyboardInterrupt, typer.Abort):
+        say("interrupted", "nothing was written")
+        code = 1
+    except (RuntimeError, OSError, MemoryError) as error:
+        say("error", str(error) or type(error).__name__)
+        code = 1
+    sys.exit(code)

@@ -1,0 +1,85 @@
+"""`mitsuba-diffraction precompute`: from a recipe or a scan to a spectrum file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ..coherence import SUN_COHERENCE_LENGTH
+from ..precompute import REPRESENTATIONS
+from ..precompute import precompute as build
+from ..readers import read_height_field
+from ..recipe import Recipe
+from ..spectrum import GratingSpectrum
+from .console import progress_bar, tell
+
+
+def precompute(
+    sources: Annotated[list[Path], typer.Argument(metavar="RECIPE|SCAN...", help="recipes (.toml), or scans")],
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="the spectrum (.exr); beside you by default")
+    ] = None,
+    pixel_size: Annotated[float | None, typer.Option(help="of a scan, µm")] = None,
+    height_range: Annotated[float | None, typer.Option(help="of a scan, black to white, µm")] = None,
+    fill_missing: Annotated[
+        bool, typer.Option("--fill-missing", help="of a scan, fill pixels without a height from their surroundings")
+    ] = False,
+    representation: Annotated[str | None, typer.Option(help=", ".join(REPRESENTATIONS))] = None,
+    tolerance: Annotated[float | None, typer.Option(help="error allowed, as a share of the reflected power")] = None,
+    extent: Annotated[
+        str | None, typer.Option(help="tile (the patch repeats) or sample (a piece of an irregular surface)")
+    ] = None,
+    largest_angle: Annotated[float | None, typer.Option(help="that the scene has, degrees from the normal")] = None,
+    coherence_length: Annotated[
+        float | None, typer.Option(help=f"µm; {SUN_COHERENCE_LENGTH:g} is that of sunlight")
+    ] = None,
+) -> None:
+    """Turn a recipe or a scan into the spectrum of its phase."""
+    if output is not None and len(sources) > 1:
+        raise ValueError(f"-o: got {len(sources)} sources, wanted one (without -o each is named after its source)")
+    given = {
+        "extent": extent,
+        "coherence_length": coherence_length,
+        "largest_angle": largest_angle,
+        "representation": representation,
+        "tolerance": tolerance,
+    }
+    settings = {name: value for name, value in given.items() if value is not None}
+    for source in sources:
+        target = output or Path(source.with_suffix(".exr").name)
+        if target.suffix.lower() != ".exr":
+            raise ValueError(f"-o: got {target}, wanted a file name that ends in .exr")
+        with progress_bar(f"spectrum of {source.name}") as progress:
+            spectrum = _spectrum(source, pixel_size, height_range, fill_missing, settings, progress)
+            spectrum.save(target)
+        tell(
+            f"{target}: {spectrum.source}; {spectrum.extent}, {spectrum.grid}; coherence length "
+            f"{spectrum.coherence_length:.4g} µm; {spectrum.representation}, {spectrum.megabytes:.3g} MB, "
+            f"error {spectrum.error:.1e} (asked {spectrum.tolerance:g})\n"
+            f"left out, at most: {spectrum.dropped:.1e} of the power in weak frequencies; {spectrum.beyond:.1e} where "
+            "no light reaches or no pixel resolves"
+        )
+
+
+def _spectrum(
+    source: Path,
+    pixel_size: float | None,
+    height_range: float | None,
+    fill_missing: bool,
+    settings: dict[str, object],
+    progress: Callable[[int, int], None],
+) -> GratingSpectrum:
+    if source.suffix.lower() == ".toml":
+        if pixel_size is not None or height_range is not None or fill_missing:
+            raise ValueError(
+                f"--pixel-size, --height-range and --fill-missing go with a scan; the recipe {source} has its own"
+            )
+        recipe = Recipe.load(source)
+        return Recipe(recipe.surface, {**recipe.spectrum, **settings}, recipe.folder).build(progress)
+    height_field = read_height_field(
+        source, pixel_size=pixel_size, height_range=height_range, fill_missing=fill_missing
+    )
+    return build(height_field, progress=progress, **settings)
