@@ -9,6 +9,7 @@ import pytest
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction.bsdf.cell_sampler import CellSampler, alias_table
+from mitsuba_diffraction.bsdf.incidence import Incidence
 from mitsuba_diffraction.bsdf.kappa_cells import CELLS
 from mitsuba_diffraction.bsdf.line_spectrum import LineSpectrum
 from mitsuba_diffraction.bsdf.order_sampler import OrderSampler
@@ -262,7 +263,7 @@ def test_cells_are_drawn_with_their_density(llvm):
     shares[:, 2, 3] = 0
     spacing = 0.05, 0.11
     sampler = CellSampler(shares, spacing, (5, 3), largest_kappa=30.0)
-    weights = sampler.weights(mi.Float(0.4), mi.Float(15.0))
+    weights = sampler.weights(Incidence(mi.Vector3f(0.6, 0.64, 0.48), mi.Float(2.4), mi.Float(15.0)))
     u = numbers(count)
     q_x, q_y = sampler.sample(weights, mi.Float(u[0]), mi.Point2f(mi.Float(u[1]), mi.Float(u[2])), mi.Bool(True))
     p = np.array(weights).ravel() @ (shares / shares.sum(axis=(1, 2), keepdims=True)).reshape(CELLS, -1)
@@ -290,15 +291,14 @@ def test_cells_are_drawn_with_their_density(llvm):
 def test_orders_are_drawn_with_their_shares_and_only_those_that_propagate(llvm, name, theta, phi):
     spectrum, count = md.precompute(SMALL[name]()), 1 << 20
     sampler = OrderSampler(spectrum)
-    wi, frequency = mi.Vector3f(*direction(theta, phi)), mi.Float(1 / 0.5)
+    incidence = Incidence.of(mi.Vector3f(*direction(theta, phi)), mi.Float(1 / 0.5), 1.0)
     u = numbers(count)
-    arguments = wi, frequency, dr.two_pi * frequency
-    row, column, _ = sampler.sample(*arguments, mi.Float(u[0]), mi.Point2f(mi.Float(u[1]), mi.Float(u[2])), True)
+    row, column, _ = sampler.sample(incidence, mi.Float(u[0]), mi.Point2f(mi.Float(u[1]), mi.Float(u[2])), True)
     rows, columns = spectrum.grid.shape
     order = dr.arange(mi.UInt32, rows * columns)
-    weights = sampler.weights(*arguments, mi.Bool(True))
+    weights = sampler.weights(incidence, mi.Bool(True))
     share = np.array(sampler.share(order, weights, mi.Bool(True))).reshape(rows, columns)
-    bottom, top, left, right = (int(x[0]) for x in map(mi.Int32, sampler.rectangle(wi, frequency)))
+    bottom, top, left, right = (int(x[0]) for x in map(mi.Int32, sampler.rectangle(incidence)))
     inside = np.zeros((rows, columns), bool)
     inside[bottom:top, left:right] = True
     np.testing.assert_allclose(share[inside].sum(), 1, rtol=1e-5)
@@ -324,8 +324,8 @@ def test_many_orders_are_drawn_without_a_rectangle(llvm):
     spectrum = md.precompute(md.gratings.xenopeltis(16.0))
     sampler = OrderSampler(spectrum)
     assert not sampler.restricted
-    wi, frequency = mi.Vector3f(0.6, 0.0, 0.8), mi.Float(2.0)
-    weights = sampler.weights(wi, frequency, dr.two_pi * frequency, mi.Bool(True))
+    incidence = Incidence.of(mi.Vector3f(0.6, 0.0, 0.8), mi.Float(2.0), 1.0)
+    weights = sampler.weights(incidence, mi.Bool(True))
     order = dr.arange(mi.UInt32, spectrum.grid.shape[0] * spectrum.grid.shape[1])
     np.testing.assert_allclose(dr.sum(sampler.share(order, weights, mi.Bool(True))), 1, rtol=1e-4)
 

@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from .incidence import Incidence
 from .kappa_cells import KappaCells, choose, pick
 from .tables import BELOW_ONE, PacketTable, opaque
 
@@ -38,9 +39,9 @@ class CellSampler:
         self.densities = PacketTable(flat.T / (spacing[0] * spacing[1]))
         self.aliases = PacketTable(np.stack([np.stack(alias_table(share), -1) for share in flat]), width=2)
 
-    def weights(self, cos_i: mi.Float, kappa_per_cosine: mi.Float) -> mi.Vector4f:
-        """w_j for one wavelength; `kappa_per_cosine` is k in rad/µm, times the scale of the heights."""
-        return self.cells.weights(cos_i, kappa_per_cosine)
+    def weights(self, incidence: Incidence) -> mi.Vector4f:
+        """w_j for one wavelength."""
+        return self.cells.weights(incidence)
 
     def density(self, q_x: mi.Float, q_y: mi.Float, weights: mi.Vector4f, active: mi.Bool) -> mi.Float:
         """p(q) in µm², q in cycles/µm."""

@@ -12,6 +12,7 @@ import numpy as np
 from .base import base_from
 from .energy import energy_from
 from .geometry import Geometry
+from .incidence import Incidence
 from .line_spectrum import LineSpectrum
 from .reflectance import reflectance_from
 from .smooth_spectrum import SmoothSpectrum
@@ -130,14 +131,11 @@ def define() -> type:
             for channel in range(channels):
                 wavelength = si.wavelengths[channel] * 1e-3  # µm
                 frequency = dr.rcp(wavelength)
-                scaled = dr.two_pi * frequency * self.height_scale
                 power, share = self.scattering.evaluate(
                     u * frequency,
                     v * frequency,
-                    -geometry.w * scaled,
-                    dr.detach(wi),
-                    dr.detach(frequency),
-                    dr.detach(scaled),
+                    -geometry.w * dr.two_pi * frequency * self.height_scale,
+                    Incidence.of(wi, frequency, self.height_scale),
                     active & self._covers(wavelength),
                 )
                 value[channel] = power / dr.square(wavelength)
@@ -259,10 +257,9 @@ def define() -> type:
             for channel in range(1, channels):
                 wavelength = dr.select(chosen == channel, si.wavelengths[channel] * 1e-3, wavelength)
             wavelength = dr.detach(wavelength)
-            frequency = dr.rcp(wavelength)
-            scaled = dr.two_pi * frequency * dr.detach(self.height_scale)
             sin, cos = (dr.detach(x) for x in self._frame(si, active))
-            q_x, q_y = self.scattering.sample(_turned(si.wi, sin, cos), frequency, scaled, rest, v, active & (u >= 0))
+            incidence = Incidence.of(_turned(si.wi, sin, cos), dr.rcp(wavelength), self.height_scale)
+            q_x, q_y = self.scattering.sample(incidence, rest, v, active & (u >= 0))
             x = -wavelength * (cos * q_x - sin * q_y) - si.wi.x
             y = -wavelength * (sin * q_x + cos * q_y) - si.wi.y
             z = dr.safe_sqrt(1 - dr.square(x) - dr.square(y))

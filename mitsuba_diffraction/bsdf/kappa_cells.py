@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..spectrum import GratingSpectrum
+from .incidence import Incidence
 from .tables import BELOW_ONE, opaque
 
 CELLS = 4  # one packet
@@ -28,9 +29,9 @@ class KappaCells:
     def __init__(self, largest_kappa: float) -> None:
         self.width = opaque(largest_kappa / CELLS)
 
-    def weights(self, cos_i: mi.Float, kappa_per_cosine: mi.Float) -> mi.Vector4f:
-        """w_j for one wavelength; `kappa_per_cosine` is k in rad/µm, times the scale of the heights."""
-        step = self.width / kappa_per_cosine
+    def weights(self, incidence: Incidence) -> mi.Vector4f:
+        """w_j for one wavelength."""
+        cos_i, step = incidence.wi.z, self.width / incidence.kappa_per_cosine
         inner = [dr.clip(dr.fma(cell, step, -cos_i), 0, 1) for cell in range(1, CELLS)]
         squares = [0.0, *map(dr.square, inner), 1.0]
         return mi.Vector4f(*(squares[cell + 1] - squares[cell] for cell in range(CELLS)))

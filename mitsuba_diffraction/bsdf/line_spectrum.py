@@ -10,6 +10,7 @@ import scipy.special
 
 from ..spectrum import GratingSpectrum
 from .cell_sampler import CellSampler
+from .incidence import Incidence
 from .kappa_cells import averages
 from .order_power import order_power
 from .order_sampler import OrderSampler
@@ -48,9 +49,7 @@ class LineSpectrum:
         q_x: mi.Float,
         q_y: mi.Float,
         kappa: mi.Float,
-        wi: mi.Vector3f,
-        frequency: mi.Float,
-        kappa_per_cosine: mi.Float,
+        incidence: Incidence,
         active: mi.Bool,
     ) -> tuple[mi.Float, mi.Float]:
         """S(q; κ) and the density of q, both in µm², for one wavelength.
@@ -59,19 +58,16 @@ class LineSpectrum:
             q_x: cycles/µm.
             q_y: cycles/µm.
             kappa: rad/µm.
-            wi: direction of incidence, along the axes of the pattern.
-            frequency: 1/λ in cycles/µm.
-            kappa_per_cosine: 2π/λ in rad/µm, times the scale of the heights.
+            incidence: the wavelength and where it comes from.
             active: mask.
         """
         first_x = dr.maximum(mi.Int32(dr.ceil((q_x - self.radius) * self.tile_x)), -self.largest_x)
         first_y = dr.maximum(mi.Int32(dr.ceil((q_y - self.radius) * self.tile_y)), -self.largest_y)
         near = active & (first_x <= self.largest_x) & (self._square_x(first_x, q_x) <= self.farthest)
         near &= (first_y <= self.largest_y) & (self._square_y(first_y, q_y) <= self.farthest)
-        incidence = wi, frequency, kappa_per_cosine
         power, density = self._where_near(first_x, first_y, q_x, q_y, kappa, incidence, near)
         if self.cells is not None:
-            weights = self.cells.weights(wi.z, kappa_per_cosine)
+            weights = self.cells.weights(incidence)
             density = self.cells.density(q_x, q_y, weights, active)
         # Interpolation may dip below zero by its error.
         return dr.maximum(power, 0), density
@@ -92,7 +88,7 @@ class LineSpectrum:
         q_x: mi.Float,
         q_y: mi.Float,
         kappa: mi.Float,
-        incidence: tuple[mi.Vector3f, mi.Float, mi.Float],
+        incidence: Incidence,
         active: mi.Bool,
     ) -> tuple[mi.Float, mi.Float]:
         """Σ_m η_m(κ) N(q − m/T; σ_q² I) over the neighbours, and the same with P_m.
@@ -112,12 +108,12 @@ class LineSpectrum:
         q_x: mi.Float,
         q_y: mi.Float,
         kappa: mi.Float,
-        incidence: tuple[mi.Vector3f, mi.Float, mi.Float],
+        incidence: Incidence,
         active: mi.Bool,
     ) -> tuple[mi.Float, mi.Float]:
         """The sums, row by row."""
         at = self.power.at(kappa, active)
-        weights = mi.Vector4f(0.0) if self.orders is None else self.orders.weights(*incidence, active)
+        weights = mi.Vector4f(0.0) if self.orders is None else self.orders.weights(incidence, active)
         columns = [first_x + step for step in range(self.count_x)]
         squares = [self._square_x(m_x, q_x) for m_x in columns]
         # exp(−|q − m/T|²/2σ_q²) is a product: one factor for each column, one for each row.
@@ -173,17 +169,15 @@ class LineSpectrum:
 
     def sample(
         self,
-        wi: mi.Vector3f,
-        frequency: mi.Float,
-        kappa_per_cosine: mi.Float,
+        incidence: Incidence,
         u: mi.Float,
         v: mi.Point2f,
         active: mi.Bool,
     ) -> tuple[mi.Float, mi.Float]:
-        """Draw q in cycles/µm, for one wavelength; the first arguments are those of `evaluate`."""
+        """Draw q in cycles/µm, for one wavelength; `incidence` as in `evaluate`."""
         if self.cells is not None:
-            return self.cells.sample(self.cells.weights(wi.z, kappa_per_cosine), u, v, active)
-        row, column, v = self.orders.sample(wi, frequency, kappa_per_cosine, u, v, active)
+            return self.cells.sample(self.cells.weights(incidence), u, v, active)
+        row, column, v = self.orders.sample(incidence, u, v, active)
         radius = self.lobe_width * dr.sqrt(-2 * dr.log(1 - v.x * self.inside))
         sin, cos = dr.sincos(dr.two_pi * v.y)
         m_x, m_y = mi.Float(column) - self.largest_x, mi.Float(row) - self.largest_y

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..spectrum import GratingSpectrum
+from .incidence import Incidence
 from .kappa_cells import CELLS, KappaCells, averages, choose
 from .tables import BELOW_ONE, PacketTable, opaque
 
@@ -56,16 +57,12 @@ class OrderSampler:
             before_y[index, :, 1:] = np.moveaxis((before_x[:, end] - before_x[:, [column]]).cumsum(axis=0), 1, 0)
         self.before_y = PacketTable(before_y)
 
-    def rectangle(self, wi: mi.Vector3f, frequency: mi.Float) -> tuple[mi.Int32, mi.Int32, mi.Int32, mi.Int32]:
-        """The first row, the end of the rows, the first column, the end of the columns.
-
-        Args:
-            wi: direction of incidence, along the axes of the pattern.
-            frequency: 1/λ in cycles/µm.
-        """
+    def rectangle(self, incidence: Incidence) -> tuple[mi.Int32, mi.Int32, mi.Int32, mi.Int32]:
+        """The first row, the end of the rows, the first column, the end of the columns."""
         if not self.restricted:
             return mi.Int32(0), mi.Int32(self.rows), mi.Int32(0), mi.Int32(self.columns)
-        s_x, s_y = wi.x * frequency, wi.y * frequency
+        frequency = incidence.frequency
+        s_x, s_y = incidence.wi.x * frequency, incidence.wi.y * frequency
         rows = self._interval(s_y, s_x, self.columns, frequency, self.tile_y, self.largest_y)
         columns = self._interval(s_x, s_y, self.rows, frequency, self.tile_x, self.largest_x)
         return *rows, *columns
@@ -85,17 +82,15 @@ class OrderSampler:
         # The mirror order m = 0 is always among them.
         return dr.clip(first, -largest, 0) + largest, dr.clip(last, 0, largest) + (largest + 1)
 
-    def weights(self, wi: mi.Vector3f, frequency: mi.Float, kappa_per_cosine: mi.Float, active: mi.Bool) -> mi.Vector4f:
+    def weights(self, incidence: Incidence, active: mi.Bool) -> mi.Vector4f:
         """w_j / Σ_j w_j M_j for one wavelength.
 
         Args:
-            wi: direction of incidence, along the axes of the pattern.
-            frequency: 1/λ in cycles/µm.
-            kappa_per_cosine: 2π/λ in rad/µm, times the scale of the heights.
+            incidence: the wavelength and where it comes from.
             active: mask.
         """
-        weights = self.cells.weights(wi.z, kappa_per_cosine)
-        bottom, top, left, right = self.rectangle(wi, frequency)
+        weights = self.cells.weights(incidence)
+        bottom, top, left, right = self.rectangle(incidence)
         total = dr.dot(weights, self._masses(bottom, top, self._start(left, right), active))
         return weights * dr.rcp(dr.maximum(total, 1))
 
@@ -116,9 +111,7 @@ class OrderSampler:
 
     def sample(
         self,
-        wi: mi.Vector3f,
-        frequency: mi.Float,
-        kappa_per_cosine: mi.Float,
+        incidence: Incidence,
         u: mi.Float,
         v: mi.Point2f,
         active: mi.Bool,
@@ -130,10 +123,10 @@ class OrderSampler:
         Returns:
             Its row and column, and what is left of `v`: two numbers uniform in [0, 1).
         """
-        bottom, top, left, right = self.rectangle(wi, frequency)
+        bottom, top, left, right = self.rectangle(incidence)
         start = self._start(left, right)
         masses = self._masses(bottom, top, start, active)
-        cell, u = choose(self.cells.weights(wi.z, kappa_per_cosine) * masses, u)
+        cell, u = choose(self.cells.weights(incidence) * masses, u)
 
         def before_y(y: mi.Int32) -> mi.Float:
             return self.before_y.entry(mi.UInt32(start + y), cell, active)

@@ -10,6 +10,7 @@ import scipy.ndimage
 from ..spectrum import GratingSpectrum
 from ..spectrum.spline_grid import spline_weights
 from .cell_sampler import CellSampler
+from .incidence import Incidence
 from .kappa_cells import averages
 from .order_power import order_power
 from .tables import opaque
@@ -41,9 +42,7 @@ class SmoothSpectrum:
         q_x: mi.Float,
         q_y: mi.Float,
         kappa: mi.Float,
-        wi: mi.Vector3f,
-        frequency: mi.Float,
-        kappa_per_cosine: mi.Float,
+        incidence: Incidence,
         active: mi.Bool,
     ) -> tuple[mi.Float, mi.Float]:
         """S(q; κ) and the density of q, both in µm², for one wavelength.
@@ -52,9 +51,7 @@ class SmoothSpectrum:
             q_x: cycles/µm.
             q_y: cycles/µm.
             kappa: rad/µm.
-            wi: direction of incidence, along the axes of the pattern.
-            frequency: 1/λ in cycles/µm.
-            kappa_per_cosine: 2π/λ in rad/µm, times the scale of the heights.
+            incidence: the wavelength and where it comes from.
             active: mask.
         """
         x, y = q_x / self.spacing_x, q_y / self.spacing_y
@@ -73,17 +70,15 @@ class SmoothSpectrum:
             power += dr.dot(packet, factors)
         # Interpolation may dip below zero by its error.
         power = dr.maximum(power, 0) / (self.spacing_x * self.spacing_y)
-        weights = self.cells.weights(wi.z, kappa_per_cosine)
+        weights = self.cells.weights(incidence)
         return dr.select(inside, power, 0), self.cells.density(q_x, q_y, weights, active)
 
     def sample(
         self,
-        wi: mi.Vector3f,
-        frequency: mi.Float,
-        kappa_per_cosine: mi.Float,
+        incidence: Incidence,
         u: mi.Float,
         v: mi.Point2f,
         active: mi.Bool,
     ) -> tuple[mi.Float, mi.Float]:
-        """Draw q in cycles/µm, for one wavelength; the first arguments are those of `evaluate`."""
-        return self.cells.sample(self.cells.weights(wi.z, kappa_per_cosine), u, v, active)
+        """Draw q in cycles/µm, for one wavelength; `incidence` as in `evaluate`."""
+        return self.cells.sample(self.cells.weights(incidence), u, v, active)
