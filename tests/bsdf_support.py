@@ -46,9 +46,19 @@ def uniform(value):
 
 def grating(name="blazed", coherence_length=65.0, **parameters):
     """The dictionary of a grating; the perfect mirror unless an index is given."""
+    return of_spectrum(spectrum(name, coherence_length), **parameters)
+
+
+def of_spectrum(spectrum, **parameters):
+    """The dictionary of a grating with a given spectrum."""
     if "int_ior" not in parameters:
         parameters.setdefault("material", "none")
-    return {"type": "diffraction_grating", "spectrum": spectrum(name, coherence_length), **parameters}
+    return {"type": "diffraction_grating", "spectrum": spectrum, **parameters}
+
+
+def plugin(spectrum, **parameters):
+    """The BSDF with a given spectrum."""
+    return mi.load_dict(of_spectrum(spectrum, **parameters))
 
 
 def direction(theta, phi=0.0):

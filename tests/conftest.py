@@ -6,6 +6,7 @@ import warnings
 from pathlib import Path
 
 import pytest
+from bsdf_support import use
 from hypothesis import settings
 
 import mitsuba_diffraction as md
@@ -63,3 +64,9 @@ def command(monkeypatch, capfd):
         return caught.value.code, *capfd.readouterr()
 
     return call
+
+
+@pytest.fixture
+def llvm():
+    """The variant that most tests are for."""
+    use("llvm_ad_spectral")

@@ -60,9 +60,7 @@ def alone(name="blazed", coherence_length=3.0):
     return mi.load_dict(grating(name, coherence_length, int_ior=1.5, ext_ior=1.0))
 
 
-@pytest.fixture(autouse=True)
-def llvm():
-    use("llvm_ad_spectral")
+pytestmark = pytest.mark.usefixtures("llvm")
 
 
 @pytest.mark.parametrize("name", sorted(SMOOTH))

@@ -3,8 +3,6 @@
 import dataclasses
 import json
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 import pytest
 from PIL import Image
@@ -19,13 +17,6 @@ from mitsuba_diffraction.spectrum.slice_table import SliceTable
 BLAZE = Case("blaze", gratings.blazed(2.5, 0.25), "tile", 65.0)
 SKIN = Case("skin", gratings.elaphe(8.0, pixel_size=0.08), "sample", 2.0)
 VISIBLE = (360.0, 830.0)
-
-
-@pytest.fixture
-def llvm():
-    if not dr.has_backend(dr.JitBackend.LLVM):
-        pytest.skip("Dr.Jit finds no LLVM")
-    mi.set_variant("llvm_ad_spectral")
 
 
 @pytest.mark.parametrize("case", [BLAZE, SKIN], ids=lambda case: case.name)

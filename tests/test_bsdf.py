@@ -6,11 +6,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from bsdf_support import WAVELENGTHS, direction, plugin, random_directions, use
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction.coherence import lobe_width
 
-WAVELENGTHS = np.array([400.0, 500.0, 600.0, 700.0])
 MAKE = {
     "flat": lambda: md.HeightField(np.zeros((1, 4)), 0.05),
     "blazed": lambda: md.gratings.blazed(2.5, 0.25),
@@ -32,34 +32,11 @@ def spectrum(name, coherence_length=65.0, representation="auto"):
     return md.precompute(surface(name), coherence_length=coherence_length, representation=representation)
 
 
-def use(variant):
-    if variant.startswith("llvm") and not dr.has_backend(dr.JitBackend.LLVM):
-        pytest.skip("Dr.Jit finds no LLVM")
-    mi.set_variant(variant)
-
-
-@pytest.fixture
-def llvm():
-    use("llvm_ad_spectral")
-
-
-def plugin(of, **parameters):
-    if "int_ior" not in parameters:
-        parameters.setdefault("material", "none")
-    return mi.load_dict({"type": "diffraction_grating", "spectrum": of, **parameters})
-
-
 def raw_plugin(of):
     """The plugin without E, which tests/test_energy.py examines."""
     bsdf = plugin(of)
     bsdf.energy = None
     return bsdf
-
-
-def direction(theta, phi=0.0):
-    """Degrees → a unit vector."""
-    theta, phi = np.deg2rad(theta), np.deg2rad(phi)
-    return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta) + 0 * phi], -1)
 
 
 def towards(wi, q, wavelength):
@@ -102,12 +79,6 @@ def expected(height_field, wi, wo, wavelengths=WAVELENGTHS, coherence_length=65.
     kappa = 2 * np.pi * (wi + wo)[:, None, 2] / um
     s = md.reference.power_spectrum(height_field, q, kappa, coherence_length=coherence_length)
     return (k_g(wi, wo) * wo[:, 2])[:, None] * s / um**2
-
-
-def random_directions(rng, count, least=0.0):
-    z, phi = rng.uniform(least, 1, count), rng.uniform(0, 2 * np.pi, count)
-    r = np.sqrt(1 - z**2)
-    return np.stack([r * np.cos(phi), r * np.sin(phi), z], -1)
 
 
 def test_flat_surface_gives_a_gaussian_about_the_mirror_direction(llvm):

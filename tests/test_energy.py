@@ -6,6 +6,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from bsdf_support import plugin as conserving_plugin
+from bsdf_support import use
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction.spectrum.albedo import SLACK, GatheredSpectrum, directions_at, energy_table
@@ -35,20 +37,12 @@ def spectrum(name, coherence_length=65.0):
     return md.precompute(MAKE[name](), coherence_length=coherence_length)
 
 
-@pytest.fixture(autouse=True)
-def llvm():
-    use("llvm_ad_spectral")
-
-
-def use(variant):
-    if variant.startswith("llvm") and not dr.has_backend(dr.JitBackend.LLVM):
-        pytest.skip("Dr.Jit finds no LLVM")
-    mi.set_variant(variant)
+pytestmark = pytest.mark.usefixtures("llvm")
 
 
 def plugin(of, conserving=True, **parameters):
     """The plugin with R = 1; without `conserving`, the raw formula."""
-    bsdf = mi.load_dict({"type": "diffraction_grating", "spectrum": of, "material": "none", **parameters})
+    bsdf = conserving_plugin(of, **parameters)
     if not conserving:
         bsdf.energy = None
     return bsdf

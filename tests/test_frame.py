@@ -4,16 +4,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from bsdf_support import PERIOD, WAVELENGTHS, corner_blaze, grating, use
+from bsdf_support import PERIOD, WAVELENGTHS, corner_blaze, grating
 
 DOWN = (0.0, 0.0, -1.0)
 SQUARE = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], float)
 S = np.sqrt(0.5)
 
 
-@pytest.fixture(autouse=True)
-def llvm():
-    use("llvm_ad_spectral")
+pytestmark = pytest.mark.usefixtures("llvm")
 
 
 def scale(*factors):

@@ -4,7 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from bsdf_support import direction, grating, hemisphere, interaction, towards, uniform, use, vectors
+from bsdf_support import direction, grating, hemisphere, interaction, towards, uniform, vectors
 
 from mitsuba_diffraction.bsdf import diffraction_grating, energy
 
@@ -12,9 +12,7 @@ ORDERS = [(a, 0) for a in range(-3, 4)]
 WI = direction(20, 30)
 
 
-@pytest.fixture(autouse=True)
-def llvm():
-    use("llvm_ad_spectral")
+pytestmark = pytest.mark.usefixtures("llvm")
 
 
 def bitmap(values):

@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from bsdf_support import WAVELENGTHS, direction, plugin, use
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction.bsdf.cell_sampler import CellSampler, alias_table
@@ -14,7 +15,6 @@ from mitsuba_diffraction.bsdf.kappa_cells import CELLS
 from mitsuba_diffraction.bsdf.line_spectrum import LineSpectrum
 from mitsuba_diffraction.bsdf.order_sampler import OrderSampler
 
-WAVELENGTHS = (400.0, 500.0, 600.0, 700.0)
 BUNDLED = {
     "blazed": lambda: md.gratings.blazed(2.5, 0.246),
     "sinusoidal": lambda: md.gratings.sinusoidal(2.5, 0.25),
@@ -45,27 +45,6 @@ def blurred(name):
     if name == "sample":
         return md.precompute(SMALL[name](), extent="sample", coherence_length=4.0)
     return md.precompute(SMALL[name](), coherence_length=6.0 if name in RECIPE_COHERENCE else 3.0)
-
-
-def use(variant):
-    if variant.startswith("llvm") and not dr.has_backend(dr.JitBackend.LLVM):
-        pytest.skip("Dr.Jit finds no LLVM")
-    mi.set_variant(variant)
-
-
-@pytest.fixture
-def llvm():
-    use("llvm_ad_spectral")
-
-
-def plugin(of, **parameters):
-    return mi.load_dict({"type": "diffraction_grating", "spectrum": of, "material": "none", **parameters})
-
-
-def direction(theta, phi):
-    """Degrees → a unit vector."""
-    theta, phi = np.deg2rad(theta), np.deg2rad(phi)
-    return [float(x) for x in (np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta))]
 
 
 def interaction(wi, wavelengths, count):
@@ -291,7 +270,7 @@ def test_cells_are_drawn_with_their_density(llvm):
 def test_orders_are_drawn_with_their_shares_and_only_those_that_propagate(llvm, name, theta, phi):
     spectrum, count = md.precompute(SMALL[name]()), 1 << 20
     sampler = OrderSampler(spectrum)
-    incidence = Incidence.of(mi.Vector3f(*direction(theta, phi)), mi.Float(1 / 0.5), 1.0)
+    incidence = Incidence.of(mi.Vector3f(direction(theta, phi).tolist()), mi.Float(1 / 0.5), 1.0)
     u = numbers(count)
     row, column, _ = sampler.sample(incidence, mi.Float(u[0]), mi.Point2f(mi.Float(u[1]), mi.Float(u[2])), True)
     rows, columns = spectrum.grid.shape

@@ -24,11 +24,7 @@ FLAT = md.HeightField(np.zeros((1, 4)), 0.625)
 ROUGH = md.HeightField(np.random.default_rng(1).normal(0, 0.03, (8, 16)), 0.1)
 
 
-@pytest.fixture(autouse=True)
-def llvm():
-    if not dr.has_backend(dr.JitBackend.LLVM):
-        pytest.skip("Dr.Jit finds no LLVM")
-    mi.set_variant("llvm_ad_spectral")
+pytestmark = pytest.mark.usefixtures("llvm")
 
 
 def only(name):

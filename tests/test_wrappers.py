@@ -13,7 +13,6 @@ from bsdf_support import (
     interaction,
     random_directions,
     uniform,
-    use,
     vectors,
 )
 
@@ -21,9 +20,7 @@ DIFFUSE = {"type": "diffuse", "reflectance": uniform(0.5)}
 TILT = np.array([0.25, -0.15, 1.0]) / np.linalg.norm([0.25, -0.15, 1.0])
 
 
-@pytest.fixture(autouse=True)
-def llvm():
-    use("llvm_ad_spectral")
+pytestmark = pytest.mark.usefixtures("llvm")
 
 
 def bitmap(values, **parameters):
