@@ -107,3 +107,16 @@ def test_a_scan_is_read_as_a_sample(scan):
     case = scan_case(scan("elaphe"))
     assert case.extent == "sample"
     assert case.coherence_length == pytest.approx(2.93)
+
+
+@pytest.mark.slow
+def test_the_command_writes_its_results_and_its_plot(command, llvm, tmp_path):
+    options = f"--surface blazed --tolerance 0.01 --json {tmp_path}/out.json --plot {tmp_path}/out.png"
+    code, out, error = command(f"benchmark {options}")
+    assert (code, error.strip()) == (0, "")
+    assert "slices" in out
+    assert json.loads((tmp_path / "out.json").read_text())
+    assert (tmp_path / "out.png").stat().st_size > 10_000
+    code, _, error = command("benchmark --surface glass")
+    assert code == 2
+    assert "--surface: got glass, wanted among blazed" in error

@@ -1,0 +1,116 @@
+"""Every block of code in the manual and the README runs, in a folder like that of the repository."""
+
+import logging
+import re
+import shlex
+import shutil
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from mkdocs.commands.build import build
+from mkdocs.config import load_config
+from PIL import Image
+
+import mitsuba_diffraction as md
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+BLOCK = re.compile(r"^(?P<indent> *)```(?P<language>\w+)\n(?P<body>.*?)^ *```$", re.DOTALL | re.MULTILINE)
+REDUCED = {
+    "render": "--width 16 --spp 1",
+    "precompute": "--tolerance 0.05",
+    "compare": "--width 16 --spp 1",
+}
+"""Options that make a command quick; they stand last, and the last one counts."""
+SHELL = {"text"}
+"""What is shown and not run: the output of a command."""
+BY_OTHER_MEANS = (
+    *("python3 -m venv", "python -m pytest", "pip install", "jupyter ", "mkdocs "),
+    "mitsuba-diffraction benchmark",
+)
+"""Commands that CI, test_notebooks, test_the_manual_is_built and test_benchmark run."""
+
+
+def blocks(page):
+    for match in BLOCK.finditer(page.read_text(encoding="utf-8")):
+        indent = match["indent"]
+        lines = match["body"].splitlines()
+        yield match["language"], "\n".join(line.removeprefix(indent) for line in lines)
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """Recipes and scenes as in the repository, and the scan that the pages speak of."""
+    for name in ("precompute", "scenes", "docs"):
+        shutil.copytree(ROOT / name, tmp_path / name)
+    monkeypatch.chdir(tmp_path)
+    heights = md.gratings.xenopeltis(4.0, pixel_size=0.05).heights
+    grey = np.round(65535 * (heights - heights.min()) / np.ptp(heights)).astype(np.uint16)
+    Image.fromarray(grey).save("scan.png")
+    Image.fromarray(grey).save("skin.png")
+    return tmp_path
+
+
+def run_shell(text, command):
+    for line in text.replace("\\\n", " ").splitlines():
+        line = line.partition(" #")[0].strip()
+        if not line or line.startswith(BY_OTHER_MEANS):
+            continue
+        name, *words = shlex.split(line)
+        assert name == "mitsuba-diffraction", line
+        code, _, error = command(*words, *REDUCED.get(words[0], "").split())
+        assert code == 0, f"{line}: {error}"
+
+
+def run_toml(text):
+    Path("block.toml").write_text(text)
+    recipe = md.Recipe.load("block.toml")
+    assert recipe.height_field().heights.size
+
+
+def run_xml(text):
+    Path("block.xml").write_text(f'<scene version="3.0.0">{text}</scene>')
+    mi.load_file("block.xml")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_the_code_of_a_page_runs(page, folder, command, llvm):
+    names = {}
+    for language, text in blocks(page):
+        if language == "python":
+            exec(compile(text, page.name, "exec"), names)
+        elif language == "sh":
+            run_shell(text, command)
+        elif language == "toml":
+            run_toml(text)
+        elif language == "xml":
+            run_xml(text)
+        else:
+            assert language in SHELL, f"{page.name}: a block of {language!r}, which nothing runs"
+
+
+def test_a_block_that_is_wrong_is_found(folder, command, llvm):
+    with pytest.raises(AssertionError):
+        run_shell("mitsuba-diffraction precompute gone.toml", command)
+    with pytest.raises(RuntimeError):
+        run_xml('<bsdf type="diffraction_grating"><string name="profile" value="blaze"/></bsdf>')
+    with pytest.raises(ValueError, match="unknown name"):
+        run_toml("[surfaces]")
+
+
+def test_the_files_that_the_readme_names_are_there():
+    named = re.findall(r"(?:scenes|docs|precompute|notebooks)/[\w./]+\.(?:xml|png|toml|ipynb|md)", PAGES[0].read_text())
+    assert len(named) >= 5
+    for name in named:
+        assert (ROOT / name).is_file(), name
+
+
+def test_the_manual_is_built_without_warnings(tmp_path, caplog):
+    with caplog.at_level(logging.WARNING):
+        build(load_config(str(ROOT / "mkdocs.yml"), site_dir=str(tmp_path / "site")))
+    assert not [record for record in caplog.records if record.levelno >= logging.WARNING]
+    for page in PAGES[1:]:
+        place = "" if page.stem == "index" else page.stem
+        assert (tmp_path / "site" / place / "index.html").is_file()
