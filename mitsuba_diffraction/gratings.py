@@ -129,12 +129,12 @@ def elaphe(
     scatter from finger to finger as in the AFM scans of such skins. The shape was drawn after a 5.9 µm AFM scan of
     the LANE lab, Geneva.
 
-    The patch has no seams, so it holds whole numbers of fingers and rows: size_y / period rounded. `source` tells the
-    mean period that results; a size_y that is a multiple of the period keeps it exactly.
+    The patch has no seams, so it holds whole numbers of fingers and rows. size_y is rounded to whole periods, so that
+    the period is kept; the pitch of the rows fills size_x.
 
     Args:
-        size: extent of the patch, µm, one number or (x, y).
-        pixel_size: wanted pixel, µm; adjusted so that a whole number of pixels fills the size.
+        size: wanted extent of the patch, µm, one number or (x, y).
+        pixel_size: wanted pixel, µm; adjusted so that a whole number of pixels fills the patch.
         depth: lowest to highest point, µm.
         period: mean distance from finger to finger along y, µm.
         seed: of the random numbers; the same seed gives the same skin.
@@ -148,7 +148,7 @@ def elaphe(
     """
     _check_profile(period, depth)
     rng = _generator(seed)
-    canvas = _Canvas(size, pixel_size, pitch=(2.93 * period, period))
+    canvas = _Canvas(size, pixel_size, pitch=(2.93 * period, period), axis=1)
     row_pitch, pitch = canvas.pitch
 
     # The lattice of crotches: it drifts slowly, rows shift against each other, and every crotch has its own place.
@@ -188,12 +188,12 @@ def xenopeltis(
     20 degrees and now and then fork or end. Fingers stand 0.36 periods apart along y, with small deep pits between
     them, and here and there two are joined. The shape was drawn after a 5.9 µm AFM scan of the LANE lab, Geneva.
 
-    The patch has no seams, so it holds whole numbers of rows and fingers: size_x / period rounded. `source` tells the
-    mean period that results; a size_x that is a multiple of the period keeps it exactly.
+    The patch has no seams, so it holds whole numbers of rows and fingers. size_x is rounded to whole periods, so that
+    the period is kept; the pitch of the fingers fills size_y.
 
     Args:
-        size: extent of the patch, µm, one number or (x, y).
-        pixel_size: wanted pixel, µm; adjusted so that a whole number of pixels fills the size.
+        size: wanted extent of the patch, µm, one number or (x, y).
+        pixel_size: wanted pixel, µm; adjusted so that a whole number of pixels fills the patch.
         depth: lowest to highest point, µm.
         period: mean distance from row to row along x, µm.
         seed: of the random numbers; the same seed gives the same skin.
@@ -207,7 +207,7 @@ def xenopeltis(
     """
     _check_profile(period, depth)
     rng = _generator(seed)
-    canvas = _Canvas(size, pixel_size, pitch=(period, 0.36 * period))
+    canvas = _Canvas(size, pixel_size, pitch=(period, 0.36 * period), axis=0)
     row_pitch, pitch = canvas.pitch
 
     meander = 0.11 * row_pitch * canvas.noise(rng, 6.0, 1.3)
@@ -289,13 +289,15 @@ class _Canvas:
     """A periodic patch on which small shapes are drawn; what leaves it on one side comes back on the other.
 
     Attributes:
-        size: (x, y) µm.
+        size: (x, y) µm, along the diffracting axis rounded to a whole number of pitches.
         count: whole numbers of pitches along x and y.
         pitch: (x, y) µm, the mean distances that fill the size.
         heights: (N_y, N_x) µm.
     """
 
-    def __init__(self, size: float | tuple[float, float], pixel_size: float, pitch: tuple[float, float]) -> None:
+    def __init__(
+        self, size: float | tuple[float, float], pixel_size: float, pitch: tuple[float, float], axis: int
+    ) -> None:
         try:
             self.size = as_pixel_size(size)
         except ValueError:
@@ -307,9 +309,11 @@ class _Canvas:
             )
         if pixel_size > min(pitch) / 4:
             raise ValueError(f"pixel_size: got {pixel_size!r} µm, wanted at most {min(pitch) / 4:.4g} µm")
-        self.count = tuple(round(s / p) for s, p in zip(self.size, pitch, strict=True))
-        self.pitch = tuple(s / n for s, n in zip(self.size, self.count, strict=True))
         columns, rows = (round(s / pixel_size) for s in self.size)
+        self.count = tuple(round(s / p) for s, p in zip(self.size, pitch, strict=True))
+        # The period is what is seen: along its axis the size gives way, not the pitch.
+        self.size = tuple(pitch[i] * self.count[i] if i == axis else self.size[i] for i in (0, 1))
+        self.pitch = tuple(s / n for s, n in zip(self.size, self.count, strict=True))
         self.pixel = (self.size[0] / columns, self.size[1] / rows)
         self.heights = np.zeros((rows, columns))
 

@@ -51,7 +51,7 @@ _SPECTRUM_KEYS = frozenset(
     {"extent", "coherence_length", "wavelengths", "largest_angle", "representation", "tolerance"}
 )
 # Raised when the same input gives other numbers than before, so that the cache is not read.
-_BUILD_VERSION = 2
+_BUILD_VERSION = 3
 # Mitsuba constructs plugins on several threads; two that name one recipe must not build it twice.
 _building = threading.Lock()
 

@@ -27,7 +27,7 @@ SMALL = {
     **BUNDLED,
     "elaphe": lambda: md.gratings.elaphe(8.0),
     "xenopeltis": lambda: md.gratings.xenopeltis(8.0),
-    "sample": lambda: md.gratings.xenopeltis(8.0),
+    "sample": lambda: md.gratings.xenopeltis((9.0, 8.0)),
     "column": lambda: md.HeightField(md.gratings.blazed(2.5, 0.246).heights.T, (2.5, 2.5 / 512)),
 }
 RECIPE_COHERENCE = {"elaphe": 26.0, "xenopeltis": 26.0}

@@ -1,0 +1,92 @@
+"""The notebooks run, and are committed with what they showed.
+
+A code cell may carry the metadata "reduced", Python source that the test runs in its place: the same with less work.
+"""
+
+import base64
+import copy
+import os
+from pathlib import Path
+
+import nbformat
+import pytest
+from nbclient import NotebookClient
+
+FOLDER = Path(__file__).parents[1] / "notebooks"
+NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
+LARGEST = 500_000
+"""Bytes of a notebook in the repository."""
+
+
+def code_cells(notebook):
+    return [cell for cell in notebook.cells if cell.cell_type == "code"]
+
+
+def outputs(notebook):
+    return [output for cell in code_cells(notebook) for output in cell.outputs]
+
+
+def pictures(notebook):
+    """The PNG files that a notebook shows."""
+    return [base64.b64decode(out.data["image/png"]) for out in outputs(notebook) if "image/png" in out.get("data", {})]
+
+
+def errors(notebook):
+    return [out for out in outputs(notebook) if out.output_type == "error" or out.get("name") == "stderr"]
+
+
+def reduced(notebook):
+    """A copy without outputs, with the reduced sources in place."""
+    notebook = copy.deepcopy(notebook)
+    for cell in code_cells(notebook):
+        cell.source = cell.metadata.get("reduced", cell.source)
+        cell.outputs = []
+    return notebook
+
+
+def executed(notebook):
+    """Run in the folder of the notebooks, in a kernel of this Python."""
+    client = NotebookClient(notebook, timeout=300, kernel_name="python3", resources={"metadata": {"path": str(FOLDER)}})
+    return client.execute()
+
+
+def test_there_are_notebooks():
+    assert {path.stem for path in NOTEBOOKS} >= {"02_brdf_and_grating_equation", "04_speed_against_error"}
+
+
+@pytest.fixture(params=NOTEBOOKS, ids=lambda path: path.stem)
+def path(request):
+    return request.param
+
+
+def test_a_notebook_is_committed_with_what_it_showed(path):
+    notebook = nbformat.read(path, as_version=4)
+    nbformat.validate(notebook)
+    assert os.path.getsize(path) < LARGEST
+    assert all(cell.execution_count for cell in code_cells(notebook)), "some cells were not run"
+    assert not errors(notebook)
+    assert any(picture.startswith(b"\x89PNG") for picture in pictures(notebook))
+
+
+def test_no_notebook_names_a_folder_of_somebodys_machine(path):
+    text = path.read_text(encoding="utf-8")
+    for folder in ("/home/", "/tmp/", "/work/", "/Users/", "C:\\\\"):
+        assert folder not in text, folder
+
+
+def test_a_notebook_runs(path):
+    notebook = executed(reduced(nbformat.read(path, as_version=4)))
+    assert not [out for out in outputs(notebook) if out.output_type == "error"]
+    assert pictures(notebook)
+
+
+def test_an_error_in_a_cell_is_noticed():
+    notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell("1 / 0")])
+    with pytest.raises(Exception, match="ZeroDivisionError"):
+        executed(notebook)
+
+
+def test_the_reduced_source_of_a_cell_is_run_instead():
+    cell = nbformat.v4.new_code_cell("1 / 0", metadata={"reduced": "print(6 * 7)"})
+    [output] = outputs(executed(reduced(nbformat.v4.new_notebook(cells=[cell]))))
+    assert output.text.strip() == "42"
