@@ -40,15 +40,17 @@ class HeightField:
     Attributes:
         heights: (N_y, N_x) float64, µm; row ↔ +y, column ↔ +x.
         pixel_size: (x, y) in µm; one number stands for square pixels.
-        source: where the heights come from (a file name, a formula), for people to read; it says how many were filled.
-        filled: how many pixels were missing and are filled.
+        source: where the heights come from (a file name, a formula) and what was done to them, for people to read.
+        filled: how many of the pixels given were missing and are filled.
 
     Pixels that are missing (NaN, infinite or masked) are refused. With `fill_missing=True` they are filled from
-    their surroundings instead; see `missing.fill_missing`.
+    their surroundings instead; see `missing.fill_missing`. With `keep_missing=True` they stay, as NaN, for the steps of
+    `prepare`; such a height field has no height range, so no spectrum.
 
     Raises:
         ValueError: if the heights are not a two-dimensional array of finite numbers with at least one pixel (with
-            `fill_missing=True`: one finite number is enough), or if the pixel size is not positive.
+            `fill_missing=True` or `keep_missing=True`: one finite number is enough), or if the pixel size is not
+            positive.
     """
 
     heights: NDArray[np.float64]
@@ -62,23 +64,24 @@ class HeightField:
         pixel_size: float | tuple[float, float],
         source: str = "array",
         fill_missing: bool = False,
+        keep_missing: bool = False,
     ) -> None:
-        if not isinstance(fill_missing, bool | np.bool_):
-            raise ValueError(f"fill_missing: got {fill_missing!r}, wanted True or False")
+        for name, value in (("fill_missing", fill_missing), ("keep_missing", keep_missing)):
+            if not isinstance(value, bool | np.bool_):
+                raise ValueError(f"{name}: got {value!r}, wanted True or False")
         array = np.array(missing.as_heights(heights), order="C")
         pixel_size = as_pixel_size(pixel_size)
-        places = np.argwhere(~np.isfinite(array))
-        filled = len(places)
-        if filled and not fill_missing:
-            row, column = places[0]
-            raise ValueError(
-                f"heights: {filled} of {array.size} pixels are missing or not finite, "
-                f"the first at row {row}, column {column}; wanted finite heights in µm "
-                "(fill_missing=True, or --fill-missing, fills them from their surroundings)"
-            )
+        gaps = ~np.isfinite(array)
+        filled = int(gaps.sum()) if fill_missing else 0
         if filled:
             array = missing.fill_missing(array, pixel_size)
             source = f"{source} ({filled} missing pixel{'s' if filled > 1 else ''} filled)"
+        elif keep_missing:
+            if gaps.all():
+                raise ValueError(f"heights: all {gaps.size} pixels are missing, wanted at least one height in µm")
+            array[gaps] = np.nan
+        elif gaps.any():
+            raise ValueError(_refusal(gaps))
         array.setflags(write=False)
         object.__setattr__(self, "heights", array)
         object.__setattr__(self, "pixel_size", pixel_size)
@@ -97,9 +100,23 @@ class HeightField:
         return columns * self.pixel_size[0], rows * self.pixel_size[1]
 
     @property
+    def gaps(self) -> NDArray[np.bool_]:
+        """Where pixels are missing, (N_y, N_x)."""
+        return np.isnan(self.heights)
+
+    @property
     def height_range(self) -> float:
-        """Highest minus lowest point, µm."""
+        """Highest minus lowest point, µm.
+
+        Raises:
+            ValueError: if pixels are missing.
+        """
+        self._refuse_gaps()
         return float(np.ptp(self.heights))
+
+    def _refuse_gaps(self) -> None:
+        if (gaps := self.gaps).any():
+            raise ValueError(_refusal(gaps))
 
     @property
     def half_range(self) -> float:
@@ -108,7 +125,12 @@ class HeightField:
 
     @property
     def centred(self) -> NDArray[np.float64]:
-        """Heights about the middle of their range, (N_y, N_x) µm. A common offset changes the phase of e^{iκh} only."""
+        """Heights about the middle of their range, (N_y, N_x) µm. A common offset changes the phase of e^{iκh} only.
+
+        Raises:
+            ValueError: if pixels are missing.
+        """
+        self._refuse_gaps()
         return self.heights - (self.heights.min() + self.heights.max()) / 2
 
     @property
@@ -122,7 +144,18 @@ class HeightField:
     def __repr__(self) -> str:
         rows, columns = self.shape
         x, y = self.tile_size
+        height_range = np.nanmax(self.heights) - np.nanmin(self.heights)
+        gaps = f"{count} missing, " if (count := int(self.gaps.sum())) else ""
         return (
-            f"HeightField({columns} × {rows} pixels, {x:.4g} × {y:.4g} µm, "
-            f"height range {self.height_range:.4g} µm, source={self.source!r})"
+            f"HeightField({columns} × {rows} pixels, {gaps}{x:.4g} × {y:.4g} µm, "
+            f"height range {height_range:.4g} µm, source={self.source!r})"
         )
+
+
+def _refusal(gaps: NDArray[np.bool_]) -> str:
+    row, column = np.argwhere(gaps)[0]
+    return (
+        f"heights: {gaps.sum()} of {gaps.size} pixels are missing or not finite, "
+        f"the first at row {row}, column {column}; wanted finite heights in µm "
+        "(fill_missing=True, or --fill-missing, fills them from their surroundings)"
+    )

@@ -6,9 +6,20 @@ period = 2.5                     # µm
 depth = 0.25                     # µm
 
 [surface]                        # … or a scan
-scan = "skin.png"                # relative to the recipe
-pixel_size = 0.0586              # µm, one number or [x, y]
+scan = "skin.png"                # relative to the recipe; formats: readers.read_height_field
+pixel_size = 0.0586              # µm, one number or [x, y]; where the file has none, or to overrule it
 height_range = 0.375             # µm, for integer images
+channel = "Height"               # a name or a number, of a file with several; without it, the one of heights
+unit = "nm"                      # of a file that names none; ["um", "nm"]: along the surface, and of the heights
+prepare = [                      # steps of prepare.py, done in this order
+    "level_plane",               # or "level_quadratic"
+    "align_lines",               # bring the rows to one level
+    { despike = 5.0 },           # spikes beyond so many standard deviations of the noise
+    "fill_missing",              # here; or, with fill_missing = true, after the last step
+    { trim_edges = 0.5 },        # µm off each edge
+    { rotate = -3.0 },           # degrees from +x towards +y
+    { crop_periods = "xy" },     # to whole periods along "x", "y" or both
+]
 fill_missing = true              # pixels without a height are filled from their surroundings; without it, refused
 
 [spectrum]                       # every line may be left out
@@ -37,6 +48,7 @@ import platformdirs
 from .gratings import PROFILES
 from .heightfield import HeightField
 from .precompute import precompute
+from .prepare import apply_steps, check_steps
 from .readers import read_height_field
 from .spectrum import GratingSpectrum
 from .spectrum.file import FORMAT_VERSION
@@ -46,7 +58,7 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-_SCAN_KEYS = frozenset({"scan", "pixel_size", "height_range", "fill_missing"})
+_SCAN_KEYS = frozenset({"scan", "pixel_size", "height_range", "fill_missing", "channel", "unit", "prepare"})
 _SPECTRUM_KEYS = frozenset(
     {"extent", "coherence_length", "wavelengths", "largest_angle", "representation", "tolerance"}
 )
@@ -82,8 +94,11 @@ class Recipe:
             _refuse_unknown("[surface]", self.surface, _SCAN_KEYS)
             if not isinstance(self.surface["scan"], str):
                 raise ValueError(f"scan: got {self.surface['scan']!r}, wanted a file name")
+            check_steps(self.surface.get("prepare", []))
         _refuse_unknown("[spectrum]", self.spectrum, _SPECTRUM_KEYS)
         for name, value in [*self.surface.items(), *self.spectrum.items()]:
+            if name == "prepare" and "scan" in self.surface:
+                continue  # checked above
             if not (_is_plain(value) or (isinstance(value, list | tuple) and all(_is_plain(v) for v in value))):
                 raise ValueError(f"{name}: got {value!r}, wanted a number, a text, or a list of them")
         for name in ("tolerance", "coherence_length", "largest_angle"):
@@ -121,20 +136,27 @@ class Recipe:
         """The surface."""
         parameters = dict(self.surface)
         if "scan" in parameters:
-            pixel_size = parameters.pop("pixel_size", None)
-            if isinstance(pixel_size, list):
-                pixel_size = tuple(pixel_size)
-            return read_height_field(
-                self.folder / parameters.pop("scan"),
-                pixel_size=pixel_size,
-                height_range=parameters.get("height_range"),
-                fill_missing=parameters.get("fill_missing", False),
-            )
+            return self._prepared_scan(parameters)
         name = parameters.pop("profile")
         try:
             return PROFILES[name](**parameters)
         except TypeError as error:
             raise ValueError(f"profile {name!r}: {error}") from None
+
+    def _prepared_scan(self, parameters: dict[str, Any]) -> HeightField:
+        path = self.folder / parameters.pop("scan")
+        steps, fill = parameters.pop("prepare", []), parameters.pop("fill_missing", False)
+        for name in ("pixel_size", "unit"):
+            if isinstance(parameters.get(name), list):
+                parameters[name] = tuple(parameters[name])
+        if not steps:
+            return read_height_field(path, fill_missing=fill, **parameters)
+        scan = read_height_field(path, keep_missing=True, **parameters)
+        try:
+            ready = apply_steps(scan, steps)
+            return HeightField(ready.heights, ready.pixel_size, ready.source, fill_missing=fill)
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from None
 
     def build(self, progress: Callable[[int, int], None] | None = None) -> GratingSpectrum:
         """The spectrum, computed."""

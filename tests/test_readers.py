@@ -1,8 +1,10 @@
-"""Files to height fields: round trips of every format, and every misuse told in one line."""
+"""Files to height fields: round trips of every format of the core, and every misuse told in one line."""
 
 import struct
+import time
 import zlib
 
+import gwyfile
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -21,9 +23,9 @@ GREY = np.array([[0, 51, 255], [102, 7, 30]], dtype=np.uint8)
 def refuse(tmp_path):
     """Check that a file is refused in one line that names it and holds the text given."""
 
-    def check(name, text, pixel_size=0.1, height_range=None):
+    def check(name, text, pixel_size=0.1, height_range=None, **more):
         with pytest.raises(ValueError, match=text) as caught:
-            read_height_field(tmp_path / name, pixel_size, height_range)
+            read_height_field(tmp_path / name, pixel_size, height_range, **more)
         assert name in str(caught.value)
         assert "\n" not in str(caught.value)
 
@@ -288,7 +290,7 @@ def test_a_picture_that_unpacks_to_too_much_is_refused(tmp_path, refuse, monkeyp
 
 def test_an_archive_that_unpacks_to_too_much_is_refused(tmp_path, refuse, monkeypatch):
     np.savez_compressed(tmp_path / "scan.npz", heights=np.zeros((100, 100)))
-    monkeypatch.setattr("mitsuba_diffraction.readers._MOST_BYTES", 1000)
+    monkeypatch.setattr("mitsuba_diffraction.readers.arrays.MOST_BYTES", 1000)
     refuse("scan.npz", "wanted at most 1000")
 
 
@@ -314,3 +316,326 @@ def test_precision_is_never_lost_in_silence(tmp_path, refuse):
     refuse("int32.tif", "mode 'I'", height_range=1.0)
     Image.fromarray(GREY.astype(np.uint16)).save(tmp_path / "inverse.tif", tiffinfo={262: 0})
     refuse("inverse.tif", "black at zero", height_range=1.0)
+
+
+# ---------------------------------------------------------------- Gwyddion: written by another program's library
+
+
+def gwy_field(heights=HEIGHTS, xy="m", z="m", **more):
+    size = {"xreal": 3e-6, "yreal": 4e-6} | more
+    return gwyfile.objects.GwyDataField(np.asarray(heights) * 1e-6, si_unit_xy=xy, si_unit_z=z, **size)
+
+
+def write_gwy(path, channels):
+    """A file with these channels: number → (title, data field)."""
+    container = gwyfile.objects.GwyContainer()
+    container["/filename"] = str(path)
+    container["/0/mask"] = gwy_field(np.ones_like(HEIGHTS))
+    for number, (title, field) in channels.items():
+        container[f"/{number}/data/title"] = title
+        container[f"/{number}/data"] = field
+        container[f"/{number}/data/visible"] = True
+    container.tofile(str(path))
+
+
+def component(name, kind, value):
+    return name.encode() + b"\0" + kind.encode() + value
+
+
+def gwy_bytes(inside, name=b"GwyContainer"):
+    return b"GWYP" + name + b"\0" + struct.pack("<I", len(inside)) + inside
+
+
+def test_gwy_brings_its_scale_and_the_top_row_is_the_first(tmp_path):
+    write_gwy(tmp_path / "scan.gwy", {0: ("Height (measured)", gwy_field())})
+    field = read_height_field(tmp_path / "scan.gwy")
+    np.testing.assert_allclose(field.heights, HEIGHTS, rtol=1e-14)
+    assert field.pixel_size == pytest.approx((1.0, 2.0))
+    assert field.source == "scan.gwy, Height (measured)"
+    assert read_height_field(tmp_path / "scan.gwy", pixel_size=0.5).pixel_size == (0.5, 0.5)
+
+
+@pytest.mark.parametrize(("unit", "scale"), [("m", 1.0), ("um", 1e-6), ("µm", 1e-6), ("nm", 1e-9), ("Å", 1e-10)])
+def test_gwy_units(tmp_path, unit, scale):
+    write_gwy(tmp_path / "scan.gwy", {3: ("Z", gwy_field(z=unit))})
+    np.testing.assert_allclose(read_height_field(tmp_path / "scan.gwy").heights, HEIGHTS * scale, rtol=1e-12)
+
+
+def test_the_channel_is_chosen_or_named(tmp_path, refuse):
+    other = gwy_field(HEIGHTS * 2)
+    channels = {0: ("Phase", gwy_field(z="deg")), 1: ("Amplitude", other), 2: ("ZSensor", gwy_field())}
+    write_gwy(tmp_path / "scan.gwy", channels)
+    assert read_height_field(tmp_path / "scan.gwy").source == "scan.gwy, ZSensor"
+    for name in ("Amplitude", "amplitude", "ampl", 1, "1"):
+        np.testing.assert_allclose(read_height_field(tmp_path / "scan.gwy", channel=name).heights, HEIGHTS * 2)
+    refuse("scan.gwy", "0 'Phase' holds no lengths", channel="Phase")
+    refuse(
+        "scan.gwy", "channel: got 'Friction', wanted one of 0 'Phase', 1 'Amplitude', 2 'ZSensor'", channel="Friction"
+    )
+    refuse("scan.gwy", "wanted one of 0 'Phase', 1 'Amplitude'", channel="a")
+    refuse("scan.gwy", "channel: got True", channel=True)
+    write_gwy(tmp_path / "scan.gwy", {0: ("One", other), 1: ("Two", other)})
+    refuse("scan.gwy", r"channel: which of 0 'One', 1 'Two'\?")
+    write_gwy(tmp_path / "scan.gwy", {0: ("Phase", gwy_field(z="deg"))})
+    refuse("scan.gwy", "wanted a channel of heights in a unit of length, got 0 'Phase'")
+    np.save(tmp_path / "scan.npy", HEIGHTS)
+    refuse("scan.npy", "channel: got 'Height' for .npy, which holds one only", channel="Height")
+
+
+def test_a_unit_that_is_missing_is_asked_for(tmp_path, refuse):
+    write_gwy(tmp_path / "scan.gwy", {0: ("Height", gwy_field(HEIGHTS * 1e6, xy=None, z=None, xreal=3.0, yreal=4.0))})
+    refuse("scan.gwy", "unit: the file names none for the heights")
+    field = read_height_field(tmp_path / "scan.gwy", unit=("um", "nm"))
+    np.testing.assert_allclose(field.heights, HEIGHTS * 1e-3, rtol=1e-12)
+    assert field.pixel_size == pytest.approx((1.0, 2.0))
+    for wrong in ("V", ("m",), ("m", "m", "m"), 3):
+        refuse("scan.gwy", "unit: ", unit=wrong)
+    np.save(tmp_path / "scan.npy", HEIGHTS)
+    refuse("scan.npy", "unit: got 'nm' for .npy", unit="nm")
+
+
+DOUBLES = struct.pack("<I", 6) + np.zeros(6).tobytes()
+GOOD = (
+    component("xres", "i", struct.pack("<i", 3))
+    + component("yres", "i", struct.pack("<i", 2))
+    + component("xreal", "d", struct.pack("<d", 1))
+    + component("yreal", "d", struct.pack("<d", 1))
+    + component("data", "D", DOUBLES)
+)
+
+
+def in_field(inside):
+    return gwy_bytes(component("/0/data", "o", b"GwyDataField\0" + struct.pack("<I", len(inside)) + inside))
+
+
+@pytest.mark.parametrize(
+    ("content", "text"),
+    [
+        (b"GWYQ" + bytes(30), "not a Gwyddion file"),
+        (b"GWYO" + bytes(30), "not a Gwyddion file"),
+        (b"GWYPGwyContainer", "text without an end"),
+        (gwy_bytes(b"")[:-1], "truncated"),
+        (gwy_bytes(b"", b"GwyGraph"), "wanted a GwyContainer"),
+        (gwy_bytes(b""), "got none"),
+        (gwy_bytes(component("a", "S", struct.pack("<I", 2**31 - 1) + b"x\0")), "text without an end"),
+        (gwy_bytes(component("a", "O", struct.pack("<I", 2**31 - 1))), "text without an end"),
+        (gwy_bytes(component("a", "D", struct.pack("<I", 2**32 - 1))), "truncated"),
+        (gwy_bytes(component("a", "C", struct.pack("<I", 2**32 - 1))), "truncated"),
+        (gwy_bytes(component("a", "z", b"")), "unknown type 'z'"),
+        (gwy_bytes(component("a", "o", b"B\0" + struct.pack("<I", 99))), "truncated"),
+        (gwy_bytes(b"\xff\xfe\0ix"), "decode"),
+        (in_field(GOOD.replace(b"xres\0i\x03", b"xres\0i\x04")), "4 × 2 pixels with 6 heights"),
+        (in_field(GOOD.replace(b"xres\0i\x03\0\0\0", b"xres\0i\xff\xff\xff\xff")), "data field of -1 × 2"),
+        (in_field(GOOD.replace(struct.pack("<d", 1), struct.pack("<d", np.nan))), "size"),
+        (in_field(b""), "data field of None"),
+    ],
+)
+def test_gwy_files_that_lie_are_refused_at_once(tmp_path, refuse, content, text):
+    (tmp_path / "scan.gwy").write_bytes(content)
+    start = time.perf_counter()
+    refuse("scan.gwy", text, unit="m")
+    assert time.perf_counter() - start < 5
+
+
+def test_gwy_of_great_depth_or_many_parts_is_no_trouble(tmp_path, refuse):
+    deep = b""
+    for _ in range(5000):
+        deep = component("b", "o", b"A\0" + struct.pack("<I", len(deep)) + deep)
+    many = b"".join(component(str(k), "i", bytes(4)) for k in range(100_000))
+    (tmp_path / "scan.gwy").write_bytes(
+        gwy_bytes(component("a", "o", b"A\0" + struct.pack("<I", len(deep)) + deep) + many)
+    )
+    start = time.perf_counter()
+    refuse("scan.gwy", "got none")
+    assert time.perf_counter() - start < 5
+
+
+# ---------------------------------------------------------------- Gwyddion's simple field
+
+GSF = "Gwyddion Simple Field 1.0\nXRes = 3\nYRes = 2\nXReal = 3e-6\nYReal = 4e-6\nXYUnits = m\nZUnits = m\nTitle = Z\n"
+
+
+def write_gsf(path, header=GSF, heights=HEIGHTS * 1e-6):
+    text = header.encode()
+    path.write_bytes(text + bytes(4 - len(text) % 4) + np.asarray(heights, "<f4").tobytes())
+
+
+@pytest.mark.parametrize("padding", range(4))
+def test_gsf_is_read_at_every_padding(tmp_path, padding):
+    write_gsf(tmp_path / "scan.gsf", GSF + f"Comment = {'x' * padding}\n")
+    field = read_height_field(tmp_path / "scan.gsf")
+    np.testing.assert_allclose(field.heights, HEIGHTS, rtol=1e-6)
+    assert field.pixel_size == pytest.approx((1.0, 2.0))
+    assert field.source == "scan.gsf, Z"
+
+
+def test_gsf_without_a_scale_asks_for_it(tmp_path, refuse):
+    write_gsf(tmp_path / "scan.gsf", "Gwyddion Simple Field 1.0\nXRes = 3\nYRes = 2\n", HEIGHTS * 1e3)
+    refuse("scan.gsf", "unit: the file names none for its heights")
+    refuse("scan.gsf", "pixel_size: the file has none", pixel_size=None, unit="nm")
+    field = read_height_field(tmp_path / "scan.gsf", 0.1, unit="nm")
+    np.testing.assert_allclose(field.heights, HEIGHTS, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "text"),
+    [
+        ("1.0", "2.0", "not a Gwyddion Simple Field"),
+        ("XRes = 3", "XRes = 4", "bytes, wanted"),
+        ("XRes = 3", "XRes = 999999999", "wanted at most"),
+        ("XRes = 3", "XRes = -3", "XRes: got -3"),
+        ("XRes = 3\n", "", "XRes: got none"),
+        ("XReal = 3e-6", "XReal = wide", "XReal: got wide"),
+        ("XReal = 3e-6", "XReal = -1", "XReal: got -1"),
+        ("ZUnits = m", "ZUnits = V", "ZUnits: got the unit 'V'"),
+        ("Title = Z", "Title", "wanted 'name = value'"),
+    ],
+)
+def test_gsf_headers_that_lie_are_refused(tmp_path, refuse, old, new, text):
+    write_gsf(tmp_path / "scan.gsf", GSF.replace(old, new))
+    refuse("scan.gsf", text)
+
+
+# ---------------------------------------------------------------- text
+
+
+def points(heights=HEIGHTS, d_x=0.1, d_y=0.2, order=None, digits=8):
+    y, x = np.mgrid[: heights.shape[0], : heights.shape[1]]
+    table = np.stack([5 + x.ravel() * d_x, -3 + y.ravel() * d_y, heights.ravel()], axis=1)
+    table = table if order is None else table[order]
+    return "\n".join(" ".join(f"{value:.{digits}g}" for value in line) for line in table) + "\n"
+
+
+@pytest.mark.parametrize("delimiter", [" ", "\t", ", ", ";"])
+def test_points_in_any_order(tmp_path, delimiter):
+    text = "# made by hand\n" + points(order=[4, 2, 0, 1, 5, 3]).replace(" ", delimiter)
+    (tmp_path / "scan.xyz").write_text(text)
+    field = read_height_field(tmp_path / "scan.xyz", unit="um")
+    np.testing.assert_allclose(field.heights, HEIGHTS)
+    assert field.pixel_size == pytest.approx((0.1, 0.2))
+    # Along the surface in micrometres, the heights in nanometres.
+    np.testing.assert_allclose(read_height_field(tmp_path / "scan.xyz", unit=("um", "nm")).heights, HEIGHTS * 1e-3)
+
+
+def test_points_with_rounded_places(tmp_path):
+    heights = np.random.default_rng(0).random((40, 50))
+    (tmp_path / "scan.xyz").write_text(points(heights, 0.0123, 0.0234, digits=4))
+    field = read_height_field(tmp_path / "scan.xyz", unit="um")
+    np.testing.assert_allclose(field.heights, heights, rtol=1e-3)
+    assert field.pixel_size == pytest.approx((0.0123, 0.0234), rel=1e-3)
+
+
+def test_points_that_are_not_there_are_missing(tmp_path, refuse):
+    (tmp_path / "scan.xyz").write_text(points(order=[0, 2, 3, 4, 5]))
+    refuse("scan.xyz", "1 of 6 pixels are missing or not finite, the first at row 0, column 1", unit="um")
+    assert read_height_field(tmp_path / "scan.xyz", unit="um", keep_missing=True).gaps.sum() == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("1 2\n3 4\n", "got 2 numbers in a line, wanted three"),
+        ("0 0 1\n0 1\n", "not a table of numbers"),
+        ("0 0 1\nNo Data\n", "not a table of numbers"),
+        ("# nothing\n", "holds no numbers"),
+        ("0 0 1\n0 0 2\n1 0 1\n1 1 1", "two points at one place"),
+        ("0 0 1\n1 0 2\n1.4 1 1\n3 1 1", "regular grid"),
+        ("0 nan 1\n1 0 2\n", "without x or y"),
+        (" ".join(map(str, [0, 0, 1])) + "\n100 100 1\n1 1 1\n2 2 1\n", "wanted a regular grid"),
+        ("0 0 1\0", "zero bytes"),
+        ("0 0 1,5\n", "table of numbers|numbers in a line"),
+    ],
+)
+def test_points_that_are_no_grid_are_refused(tmp_path, refuse, text, message):
+    (tmp_path / "scan.xyz").write_text(text)
+    refuse("scan.xyz", message, unit="um")
+
+
+def test_points_need_a_unit_and_a_line_a_pixel_size(tmp_path, refuse):
+    (tmp_path / "scan.xyz").write_text(points())
+    refuse("scan.xyz", "unit: .xyz names none")
+    (tmp_path / "scan.xyz").write_text(points(HEIGHTS[:1]))
+    refuse("scan.xyz", "pixel_size: the file has none", pixel_size=None, unit="um")
+    assert read_height_field(tmp_path / "scan.xyz", (0.1, 1.0), unit="um").shape == (1, 3)
+
+
+MATRIX = "\n".join("\t".join(str(h * 1e-6) for h in row) for row in HEIGHTS)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "latin-1"])
+def test_a_table_as_gwyddion_exports_it(tmp_path, encoding):
+    header = "# Channel: Height (forward)\n# Width: 0.300 µm\n# Height: 400 nm\n# Value units: m\n"
+    (tmp_path / "scan.asc").write_bytes((header + MATRIX).encode(encoding))
+    field = read_height_field(tmp_path / "scan.asc")
+    np.testing.assert_allclose(field.heights, HEIGHTS)
+    assert field.pixel_size == pytest.approx((0.1, 0.2))
+    assert field.source == "scan.asc, Height (forward)"
+
+
+def test_a_bare_table_asks_for_its_scale(tmp_path, refuse):
+    (tmp_path / "scan.asc").write_text(MATRIX)
+    refuse("scan.asc", "unit: the file names none")
+    refuse("scan.asc", "pixel_size: the file has none", pixel_size=None, unit="m")
+    np.testing.assert_allclose(read_height_field(tmp_path / "scan.asc", 0.1, unit="m").heights, HEIGHTS)
+
+
+def test_a_table_that_may_be_points_is_refused(tmp_path, refuse):
+    (tmp_path / "scan.asc").write_text(points())
+    refuse("scan.asc", "wanted the extension .xyz", unit="um")
+
+
+ESRI = "ncols 3\nnrows 2\nxllcorner 10\nyllcorner 20\ncellsize 0.1\nNODATA_value -9999\n"
+
+
+def test_an_esri_grid_comes_from_the_top_down(tmp_path, refuse):
+    (tmp_path / "scan.asc").write_text(ESRI + "1 2 3\n4 -9999 6\n")
+    field = read_height_field(tmp_path / "scan.asc", unit=("um", "nm"), keep_missing=True)
+    np.testing.assert_allclose(field.heights, np.array([[4, np.nan, 6], [1, 2, 3]]) * 1e-3)
+    assert field.pixel_size == pytest.approx((0.1, 0.1))
+    refuse("scan.asc", "unit: an ESRI grid names none")
+    (tmp_path / "scan.asc").write_text(ESRI + "1 2 3\n")
+    refuse("scan.asc", "got 1 lines of 3, wanted 2 of 3", unit="um")
+    (tmp_path / "scan.asc").write_text("ncols 3\nnrows\n1 2 3\n")
+    refuse("scan.asc", "the header: got the line 'nrows'", unit="um")
+    (tmp_path / "scan.asc").write_text("ncols 3\nnrows 1\n1 2 3\n")
+    refuse("scan.asc", "wanted ncols, nrows and cellsize", unit="um")
+
+
+# ---------------------------------------------------------------- damaged files of these formats
+
+
+def write_each(path):
+    if path.suffix == ".gwy":
+        write_gwy(path, {0: ("Height", gwy_field())})
+    elif path.suffix == ".gsf":
+        write_gsf(path)
+    elif path.suffix == ".xyz":
+        path.write_text(points())
+    else:
+        path.write_text(ESRI + "1 2 3\n4 5 6\n")
+
+
+@pytest.mark.parametrize("name", ["scan.gwy", "scan.gsf"])
+def test_every_cut_of_a_binary_file_is_refused(tmp_path, refuse, name):
+    write_each(tmp_path / name)
+    whole = (tmp_path / name).read_bytes()
+    for length in range(len(whole)):
+        (tmp_path / name).write_bytes(whole[:length])
+        refuse(name, name, unit="m")
+
+
+@settings(max_examples=200, deadline=None)
+@given(name=st.sampled_from(["scan.gwy", "scan.gsf", "scan.xyz", "scan.asc"]), data=st.data())
+def test_changed_bytes_give_heights_or_one_line(tmp_path_factory, name, data):
+    path = tmp_path_factory.mktemp("changed") / name
+    write_each(path)
+    content = bytearray(path.read_bytes())
+    for _ in range(data.draw(st.integers(1, 4))):
+        content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+    path.write_bytes(content)
+    try:
+        message = ""
+        assert np.isfinite(read_height_field(path, 0.1, unit="um").heights).all()
+    except ValueError as error:
+        message = str(error)
+    assert not message or (name in message and "\n" not in message)

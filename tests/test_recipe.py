@@ -65,6 +65,10 @@ def builds(monkeypatch):
         ('[surface]\nprofile = ["blazed"]\n', "profile"),
         ("[surface]\nprofile = 3\n", "profile"),
         ('[surface]\nscan = "a.npy"\npixelsize = 1\n', "pixelsize"),
+        ('[surface]\nscan = "a.npy"\nprepare = "level_plane"\n', "prepare: got 'level_plane', wanted a list of steps"),
+        ('[surface]\nscan = "a.npy"\nprepare = ["level"]\n', "prepare: got 'level', wanted one of level_plane"),
+        ('[surface]\nscan = "a.npy"\nprepare = [{ rotate = "x" }]\n', "prepare: rotate: got 'x', wanted a number"),
+        (BLAZE + "prepare = [{ rotate = 1 }]\n", "prepare: got"),
         ('surface = "blazed"\n', r"\[surface\]"),
         (BLAZE + "[spectrum]\nresolution = 3\n", "resolution"),
         (BLAZE + "[spectra]\ntolerance = 0.1\n", "spectra"),
@@ -373,3 +377,101 @@ def test_the_cache_is_the_users_unless_named(monkeypatch, tmp_path):
     assert "mitsuba_diffraction" in str(recipe_module.cache_folder())
     monkeypatch.setenv("MITSUBA_DIFFRACTION_CACHE", "elsewhere")
     assert recipe_module.cache_folder() == Path("elsewhere")
+
+
+# ---------------------------------------------------------------- scans made ready
+
+
+def tilted(folder):
+    """A grating of 0.6 µm with a tilt, jumps between its lines and a hole; as scan.npy."""
+    generator = np.random.default_rng(0)
+    x = np.mgrid[:40, :70][1] * 0.05
+    heights = 0.05 * np.cos(2 * np.pi * x / 0.613) + 0.2 * x + 0.02 * generator.standard_normal((40, 1))
+    heights[10, 20] = np.nan
+    np.save(folder / "scan.npy", heights)
+
+
+PREPARED = """[surface]
+scan = "scan.npy"
+pixel_size = 0.05
+prepare = ["level_plane", "align_lines", "fill_missing", { trim_edges = 0.1 }, { crop_periods = "x" }]
+"""
+
+
+def test_a_scan_is_made_ready_and_the_spectrum_says_how(tmp_path):
+    tilted(tmp_path)
+    recipe = Recipe.load(write(tmp_path, PREPARED + "[spectrum]\ntolerance = 0.01\n"))
+    spectrum = recipe.build()
+    spectrum.save(tmp_path / "out.exr")
+    source = GratingSpectrum.load(tmp_path / "out.exr").source
+    assert source == recipe.height_field().source
+    told = [part.split(":")[0] for part in source.split("; ")]
+    assert told[:5] == ["scan.npy", "level_plane", "align_lines", "fill_missing", "trim_edges"]
+    assert "level_plane: tilt 11" in source  # atan 0.2, but for the waves that the patch cuts
+    assert "fill_missing: 1 of 2800 pixels" in source
+    assert "crop_periods: 5 × 613" in source
+    assert spectrum.grid.tile_size[0] == pytest.approx(5 * 0.613, rel=2e-3)
+
+
+def test_missing_pixels_wait_for_the_last_step(tmp_path):
+    tilted(tmp_path)
+    text = '[surface]\nscan = "scan.npy"\npixel_size = 0.05\nprepare = ["level_plane"]\n'
+    with pytest.raises(ValueError, match=r"scan\.npy: heights: 1 of 2800 pixels are missing"):
+        Recipe.load(write(tmp_path, text)).height_field()
+    field = Recipe.load(write(tmp_path, text + "fill_missing = true\n")).height_field()
+    assert field.filled == 1
+    assert field.source.endswith("(1 missing pixel filled)")
+    with pytest.raises(ValueError, match=r"scan\.npy: trim_edges: got 9 µm"):
+        Recipe.load(write(tmp_path, text.replace('"level_plane"', "{ trim_edges = 9 }"))).height_field()
+
+
+def test_the_cache_knows_the_steps_and_their_order(tmp_path):
+    tilted(tmp_path)
+    texts = [
+        PREPARED,
+        PREPARED.replace("0.1", "0.2"),
+        PREPARED.replace('"level_plane", "align_lines"', '"align_lines", "level_plane"'),
+    ]
+    assert len({Recipe.load(write(tmp_path, text)).digest() for text in texts}) == 3
+
+
+def test_unit_and_channel_of_a_recipe(tmp_path):
+    (tmp_path / "scan.xyz").write_text("0 0 1\n1 0 2\n0 1 3\n1 1 4\n")
+    text = '[surface]\nscan = "scan.xyz"\nunit = ["um", "nm"]\npixel_size = [0.5, 1]\n'
+    field = Recipe.load(write(tmp_path, text)).height_field()
+    np.testing.assert_allclose(field.heights, [[1e-3, 2e-3], [3e-3, 4e-3]])
+    assert field.pixel_size == (0.5, 1.0)
+    with pytest.raises(ValueError, match=r"channel: got 'Z' for \.xyz"):
+        Recipe.load(write(tmp_path, text + 'channel = "Z"\n')).height_field()
+
+
+def test_the_command_takes_the_same_of_a_scan(tmp_path, command, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    tilted(tmp_path)
+    steps = "--prepare level_plane --prepare fill_missing --prepare trim_edges=0.1 --prepare crop_periods=x"
+    code, out, err = command(f"precompute scan.npy --pixel-size 0.05 --tolerance 0.01 {steps}")
+    assert code == 0, err
+    source = GratingSpectrum.load("scan.exr").source
+    assert out.startswith(f"scan.exr: {source}; tile, ")
+    assert [part.split(":")[0] for part in source.split("; ")][1:] == [
+        "level_plane",
+        "fill_missing",
+        "trim_edges",
+        "crop_periods",
+    ]
+    (tmp_path / "scan.xyz").write_text("0 0 1\n1 0 2\n0 1 3\n1 1 4\n")
+    code, out, err = command("precompute scan.xyz --unit um --unit nm -o points.exr --tolerance 0.01")
+    assert code == 0, err
+    assert GratingSpectrum.load("points.exr").height_range == pytest.approx(3e-3)
+    for arguments, words in (
+        ("scan.npy --channel Height", "channel: got 'Height' for .npy"),
+        ("scan.xyz --unit V", "unit: got the unit 'V'"),
+        ("scan.npy --prepare rotate=left", "prepare: rotate: got 'left', wanted a number"),
+        (
+            "recipe.toml --unit nm --prepare despike",
+            "--unit, --prepare go with a scan; the recipe recipe.toml has its own",
+        ),
+    ):
+        code, out, err = command(f"precompute {arguments}")
+        assert (code, out, len(err.splitlines())) == (2, "", 1)
+        assert words in err

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
@@ -10,10 +9,8 @@ import typer
 
 from ..coherence import SUN_COHERENCE_LENGTH
 from ..precompute import REPRESENTATIONS
-from ..precompute import precompute as build
-from ..readers import read_height_field
+from ..prepare import STEP_NAMES, step_of
 from ..recipe import Recipe
-from ..spectrum import GratingSpectrum
 from .console import progress_bar, tell
 
 
@@ -27,6 +24,15 @@ def precompute(
     fill_missing: Annotated[
         bool, typer.Option("--fill-missing", help="of a scan, fill pixels without a height from their surroundings")
     ] = False,
+    channel: Annotated[str | None, typer.Option(help="of a scan with several, a name or a number")] = None,
+    unit: Annotated[
+        list[str] | None,
+        typer.Option(help="of a scan whose file names none; given twice: along the surface, and of the heights"),
+    ] = None,
+    prepare: Annotated[
+        list[str] | None,
+        typer.Option(help=f"of a scan, a step, done in the order given: {', '.join(STEP_NAMES)}; NAME=ARGUMENT"),
+    ] = None,
     representation: Annotated[str | None, typer.Option(help=", ".join(REPRESENTATIONS))] = None,
     tolerance: Annotated[float | None, typer.Option(help="error allowed, as a share of the reflected power")] = None,
     extent: Annotated[
@@ -48,12 +54,21 @@ def precompute(
         "tolerance": tolerance,
     }
     settings = {name: value for name, value in given.items() if value is not None}
+    of_scan = {
+        "pixel_size": pixel_size,
+        "height_range": height_range,
+        "fill_missing": fill_missing or None,
+        "channel": channel,
+        "unit": unit[0] if unit and len(unit) == 1 else unit or None,
+        "prepare": [step_of(text) for text in prepare] if prepare else None,
+    }
+    of_scan = {name: value for name, value in of_scan.items() if value is not None}
     for source in sources:
         target = output or Path(source.with_suffix(".exr").name)
         if target.suffix.lower() != ".exr":
             raise ValueError(f"-o: got {target}, wanted a file name that ends in .exr")
         with progress_bar(f"spectrum of {source.name}") as progress:
-            spectrum = _spectrum(source, pixel_size, height_range, fill_missing, settings, progress)
+            spectrum = _recipe(source, of_scan, settings).build(progress)
             spectrum.save(target)
         tell(
             f"{target}: {spectrum.source}; {spectrum.extent}, {spectrum.grid}; coherence length "
@@ -64,22 +79,11 @@ def precompute(
         )
 
 
-def _spectrum(
-    source: Path,
-    pixel_size: float | None,
-    height_range: float | None,
-    fill_missing: bool,
-    settings: dict[str, object],
-    progress: Callable[[int, int], None],
-) -> GratingSpectrum:
-    if source.suffix.lower() == ".toml":
-        if pixel_size is not None or height_range is not None or fill_missing:
-            raise ValueError(
-                f"--pixel-size, --height-range and --fill-missing go with a scan; the recipe {source} has its own"
-            )
-        recipe = Recipe.load(source)
-        return Recipe(recipe.surface, {**recipe.spectrum, **settings}, recipe.folder).build(progress)
-    height_field = read_height_field(
-        source, pixel_size=pixel_size, height_range=height_range, fill_missing=fill_missing
-    )
-    return build(height_field, progress=progress, **settings)
+def _recipe(source: Path, of_scan: dict[str, object], settings: dict[str, object]) -> Recipe:
+    if source.suffix.lower() != ".toml":
+        return Recipe({"scan": source.name, **of_scan}, settings, source.parent)
+    if of_scan:
+        names = ", ".join(f"--{name.replace('_', '-')}" for name in of_scan)
+        raise ValueError(f"{names} go with a scan; the recipe {source} has its own")
+    recipe = Recipe.load(source)
+    return Recipe(recipe.surface, {**recipe.spectrum, **settings}, recipe.folder)

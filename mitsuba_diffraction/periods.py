@@ -1,0 +1,397 @@
+"""Periods and directions of a height field, with their uncertainties, found from its power spectrum."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from .heightfield import HeightField
+from .missing import fill_missing
+
+_FEWEST = 2.0
+"""Waves that a patch must hold along its diagonal of frequencies for their length to be told."""
+
+_LEAST_ANGLE = 15.0
+"""Degrees between two waves; closer ones are one period that wanders, or its harmonics."""
+
+_FALSE_ALARM = 1e-4
+"""Chance that noise alone shows a period."""
+
+_RING = 24
+"""Fewest frequencies that the background is the lower quartile of."""
+
+_LEAST_STRENGTH = 1e-3
+"""Share of the variance that a wave must hold: an instrument hums, too."""
+
+_MOST_MAXIMA = 200
+"""Local maxima that are looked at."""
+
+_LOBE = 3
+"""Bins about a peak where its own light falls: the window spreads a wave over two, a wandering one over more."""
+
+
+@dataclass(frozen=True)
+class Period:
+    """One period of a height field, with standard uncertainties (one standard deviation).
+
+    Attributes:
+        period: µm, across the lines.
+        direction: degrees of the wave vector from +x towards +y, in (−90, 90].
+        period_uncertainty: µm.
+        direction_uncertainty: degrees.
+        strength: share of the variance of the levelled heights in this one wave; its harmonics are not counted.
+    """
+
+    period: float
+    direction: float
+    period_uncertainty: float
+    direction_uncertainty: float
+    strength: float
+
+
+def find_periods(height_field: HeightField, count: int = 2) -> tuple[Period, ...]:
+    """The strongest periods of a height field.
+
+    A wave is taken where the power of the levelled and windowed (Hann) heights stands so far above the background that
+    noise about a background known exactly would rise there once in ten thousand height fields (with the background as
+    it is told here, white noise did in one of 300). The background is told by the greatest of three lower quartiles:
+    over the frequencies of about the same length, and along the row and the column of the frequency, for the streaks of
+    a scan. If a wave of two or three times the period stands out too, or is stronger, it is the period, and the first
+    wave its harmonic.
+
+    The waves are then fitted together, by weighted least squares for their complex amplitudes c and, by Gauss–Newton
+    steps, their frequencies q, beside a surface of second order:
+
+        h(x) ≈ p(x) + Re Σ_k c_k e^{2πi q_k·x},    weights: the window
+
+    With n(q) the power density of the residual about q, the covariance of the estimate is (XᴴWX)⁻¹ XᴴW²X (XᴴWX)⁻¹ n,
+    X the derivatives of the model; for one wave in white noise and without a window this is the bound of Cramér and
+    Rao (Rife and Boorstyn 1974, "Single-tone parameter estimation from discrete-time observations", IEEE Transactions
+    on Information Theory 20(5), 591–598, equation 22), var q = 6 n/(π² |c|² T²) along a side of length T.
+
+    A wave that wanders over the patch, as the fingers of a skin do, is less certain than noise makes it. Fitted to the
+    halves of a line, or the quarters of a patch, q would scatter by noise so that their mean has four times that
+    covariance (each of two halves has eight times, each of four quarters sixteen times). What their mean has beyond
+    that is added.
+
+    Args:
+        height_field: missing pixels are filled first. It needs no levelling.
+        count: how many periods at most.
+
+    Returns:
+        Strongest first, at least 15° between the directions; empty where nothing stands out (noise, a flat surface).
+
+    Raises:
+        ValueError: if count is not a positive integer.
+    """
+    if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
+        raise ValueError(f"count: got {count!r}, wanted a positive integer")
+    heights = fill_missing(height_field.heights, height_field.pixel_size)
+    spectrum = _Spectrum(heights, height_field.pixel_size)
+    if not spectrum.scale > 1e-13 * np.abs(heights).max():  # level but for rounding
+        return ()
+    waves = spectrum.peaks(int(count))
+    if not waves:
+        return ()
+    return spectrum.fit(waves)
+
+
+class _Spectrum:
+    """The power spectrum of heights that are levelled to second order, under a Hann window."""
+
+    def __init__(self, heights: NDArray[np.float64], pixel_size: tuple[float, float]) -> None:
+        rows, columns = heights.shape
+        self._size = np.array([columns * pixel_size[0], rows * pixel_size[1]])
+        self._x = (np.arange(columns) - (columns - 1) / 2) * pixel_size[0]
+        self._y = (np.arange(rows) - (rows - 1) / 2) * pixel_size[1]
+        self._heights = heights - heights.mean()
+        flat = (np.ones(columns), np.ones(rows))
+        self._levelled = self._heights - _LeastSquares(_polynomials(self._x, self._y, 2), flat).fit(self._heights)
+        self.scale = float(self._levelled.std())
+        weight = np.outer(_hann(rows), _hann(columns))
+        self._power = np.abs(np.fft.fft2(weight * self._levelled)) ** 2
+        self._q = (np.fft.fftfreq(columns, pixel_size[0]), np.fft.fftfreq(rows, pixel_size[1]))
+
+    # ------------------------------------------------------------ detection
+
+    def peaks(self, count: int) -> list[NDArray[np.float64]]:
+        """The frequencies of the bins at the strongest peaks that stand out, cycles/µm; none collinear."""
+        found: list[NDArray[np.float64]] = []
+        for row, column in self._candidates:
+            q = self._frequency(row, column)
+            if any(_angle(q, other) < _LEAST_ANGLE for other in found):
+                continue
+            q = self._fundamental(q)
+            if any(_angle(q, other) < _LEAST_ANGLE for other in found):
+                continue
+            found.append(q)
+            if len(found) == count:
+                break
+        return found
+
+    def _frequency(self, row: int, column: int) -> NDArray[np.float64]:
+        return np.array([self._q[0][column], self._q[1][row]])
+
+    @cached_property
+    def _usable(self) -> NDArray[np.bool_]:
+        """One of q and −q, where the patch holds enough waves."""
+        q_x, q_y = np.meshgrid(*self._q)
+        waves = np.hypot(q_x * self._size[0], q_y * self._size[1])
+        return ((q_x > 0) | ((q_x == 0) & (q_y > 0))) & (waves >= _FEWEST - 1e-9)
+
+    @cached_property
+    def _maxima(self) -> list[tuple[int, int]]:
+        """Rows and columns of the local maxima of the power, strongest first."""
+        maximum = self._usable & (self._power == ndimage.maximum_filter(self._power, 3, mode="wrap"))
+        places = np.argwhere(maximum)[np.argsort(-self._power[maximum], kind="stable")][:_MOST_MAXIMA]
+        return [(int(row), int(column)) for row, column in places]
+
+    @cached_property
+    def _candidates(self) -> list[tuple[int, int]]:
+        """The local maxima that stand out of the background."""
+        power, usable = self._power, self._usable
+        if not usable.any():
+            return []
+        # Of noise, a power is distributed as an exponential about its mean, which is the quartile over ln 4/3.
+        level = np.log(usable.sum() / _FALSE_ALARM) / np.log(4 / 3)
+        background = self._rings(usable, np.hypot(*np.meshgrid(*self._q)))
+        return [p for p in self._maxima if power[p] > level * max(background[p], self._streak(*p))]
+
+    def _rings(self, usable: NDArray[np.bool_], length: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The lower quartile of the power over frequencies of about the same length, by power laws between rings."""
+        lengths, powers = length[usable], self._power[usable]
+        order = np.argsort(lengths, kind="stable")
+        rings = max(1, len(order) // _RING)
+        # Rings as wide as a bin, or wider, so that each holds enough frequencies.
+        label = np.floor(lengths * self._size.max()).astype(int)[order]
+        label = np.minimum(label - label[0], np.arange(len(order)) * rings // len(order))
+        label = np.searchsorted(np.unique(label), label)
+        counts = np.bincount(label)
+        middle = np.exp(np.bincount(label, np.log(lengths[order])) / counts)
+        quartiles = np.maximum(_quartiles(powers[order], counts), 1e-300)
+        background = np.full(self._power.shape, np.inf)
+        background[usable] = _power_law(lengths, middle, quartiles)
+        return background
+
+    def _streak(self, row: int, column: int) -> float:
+        """The greater quartile of the power along the row and along the column of a frequency, beside its own lobe."""
+        quartiles = [0.0]
+        for line, place in ((self._power[row], column), (self._power[:, column], row)):
+            reach = min(12, (len(line) - 1) // 2)
+            if reach > _LOBE + 3:
+                away = np.r_[-reach:-_LOBE, _LOBE + 1 : reach + 1]
+                quartiles.append(float(np.quantile(line[(place + away) % len(line)], 0.25)))
+        return max(quartiles)
+
+    def _fundamental(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The longest wave, as strong as q or standing out, that has q as its third or second harmonic, else q."""
+        column, row = (np.rint(q * self._size).astype(int)).tolist()
+        power = self._power[row, column]
+        for order in (3, 2):
+            for row, column in self._maxima:
+                other = self._frequency(row, column)
+                if self._power[row, column] < power and (row, column) not in self._candidates:
+                    continue
+                for signed in (other, -other):
+                    # A harmonic is known to half a bin, so its fundamental is nearer than one.
+                    if (np.abs((signed - q / order) * self._size) <= 1).all():
+                        return signed
+        return q
+
+    # ------------------------------------------------------------ fit
+
+    def fit(self, waves: list[NDArray[np.float64]]) -> tuple[Period, ...]:
+        """The waves by least squares, from the frequencies of their bins."""
+        whole = _Waves(self._heights, self._x, self._y, degree=2)
+        q = whole.frequencies(np.array(waves))
+        amplitude, noise, variance = whole.amplitudes(q)
+        strength = np.abs(amplitude) ** 2 / 2 / variance
+        found = []
+        for k in range(len(q)):
+            spread = noise[k] + self._wander(q[k], 4 * noise[k])
+            found.append(_period(q[k], spread, float(min(strength[k], 1.0))))
+        found = [period for period in found if period.strength >= _LEAST_STRENGTH]
+        return tuple(sorted(found, key=lambda period: -period.strength))
+
+    def _wander(self, q: NDArray[np.float64], expected: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The covariance of the mean frequency of the halves or quarters of the patch, beyond that of noise."""
+        if np.hypot(*(q * self._size)) < 2 * _FEWEST:
+            return np.zeros((2, 2))
+        rows, columns = (_halves(count) for count in self._heights.shape)
+        found = np.array(
+            [
+                _Waves(self._levelled[r, c], self._x[c], self._y[r], degree=0).frequencies(q[None], 1e-3)[0]
+                for r in rows
+                for c in columns
+            ]
+        )
+        if len(found) == 1:
+            return np.zeros((2, 2))
+        scatter = (found - found.mean(axis=0)).T @ (found - found.mean(axis=0)) / len(found) / (len(found) - 1)
+        values, axes = np.linalg.eigh(scatter - expected)
+        return axes @ np.diag(np.maximum(values, 0)) @ axes.T
+
+
+class _Waves:
+    """The model p(x) + Re Σ_k c_k e^{2πi q_k·x} of some heights, under their own Hann window."""
+
+    def __init__(self, heights: NDArray[np.float64], x: NDArray, y: NDArray, degree: int) -> None:
+        self._heights = heights
+        self._x, self._y = x - x.mean(), y - y.mean()
+        self._size = np.array([_length(x), _length(y)])
+        self._window = (_hann(len(x)), _hann(len(y)))
+        self._polynomials = _polynomials(self._x, self._y, degree)
+
+    def frequencies(self, q: NDArray[np.float64], bins: float = 1e-7) -> NDArray[np.float64]:
+        """The q that fit best, (k, 2), from these, until a step is less than `bins`."""
+        for _ in range(20):
+            amplitude, slope = self._amplitudes(self._model(q).solve(self._heights))
+            # c e^{2πi(q + δ)·x} ≈ (c + 2πi c δ·x) e^{2πi q·x}; where there is no wave at all, c = 0, q stays.
+            step = np.real(slope * np.conj(2j * np.pi * amplitude[:, None]))
+            step /= np.maximum(np.abs(2 * np.pi * amplitude[:, None]) ** 2, 1e-300)
+            step = np.clip(step, -0.5 / self._size, 0.5 / self._size)
+            q = q + step
+            if (np.abs(step * self._size) < bins).all():
+                break
+        return q
+
+    def amplitudes(self, q: NDArray[np.float64]) -> tuple[NDArray, NDArray[np.float64], float]:
+        """c, (k,), the covariance of each q under the noise about it, (k, 2, 2), and the variance of h − p."""
+        model = self._model(q)
+        coefficients = model.solve(self._heights)
+        amplitude, _ = self._amplitudes(coefficients)
+        density = self._density(self._heights - model.evaluate(coefficients), q)
+        covariance = model.covariance()
+        spread = []
+        for k, c in enumerate(amplitude):
+            # δ = Re(slope/(2πi c)): a real linear function of the coefficients of xe and ye.
+            place = len(self._polynomials) + 6 * k
+            gradient = np.zeros((2, len(covariance)), complex)
+            for axis in range(2):
+                gradient[axis, place + 1 + axis] = 1 / (4j * np.pi * c)
+                gradient[axis, place + 4 + axis] = np.conj(1 / (4j * np.pi * c))
+            spread.append(np.real(gradient @ covariance @ gradient.conj().T) * density[k])
+        surface = np.where(np.arange(len(coefficients)) < len(self._polynomials), coefficients, 0)
+        return amplitude, np.array(spread), float((self._heights - model.evaluate(surface)).var())
+
+    def _model(self, q: NDArray[np.float64]) -> _LeastSquares:
+        """The polynomials, and of each wave e, xe, ye with e = e^{2πi q·x}/2, and their conjugates."""
+        basis = list(self._polynomials)
+        for wave in q:
+            x, y = np.exp(2j * np.pi * wave[0] * self._x), np.exp(2j * np.pi * wave[1] * self._y)
+            waves = [(x / 2, y), (self._x * x / 2, y), (x / 2, self._y * y)]
+            basis += waves + [(u.conj(), v.conj()) for u, v in waves]
+        return _LeastSquares(basis, self._window)
+
+    def _amplitudes(self, coefficients: NDArray) -> tuple[NDArray, NDArray]:
+        """c, (k,), and the coefficients of xe and ye, (k, 2)."""
+        table = coefficients[len(self._polynomials) :].reshape(-1, 6)
+        return table[:, 0], table[:, 1:3]
+
+    def _density(self, residual: NDArray[np.float64], q: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The variance per pixel of the white noise that has the power density of the residual about each q, (k,)."""
+        weight = np.outer(self._window[1], self._window[0])
+        power = np.abs(np.fft.fft2(weight * residual)) ** 2 / np.sum(weight**2)
+        rows, columns = residual.shape
+        bins_x, bins_y = np.meshgrid(np.fft.fftfreq(columns) * columns, np.fft.fftfreq(rows) * rows)
+        densities = []
+        for wave in q * self._size:
+            away = np.hypot(bins_x - wave[0], bins_y - wave[1])
+            near = away <= _LOBE
+            # The fit took away what looks like the wave, nearest to it: the greater of two means.
+            densities.append(max(power[near].mean(), power[near & (away > 1)].mean()))
+        return np.array(densities)
+
+
+class _LeastSquares:
+    """Weighted least squares in functions that are products f(x) g(y), weights u(x) v(y): all sums are products too."""
+
+    def __init__(self, basis: list[tuple[NDArray, NDArray]], window: tuple[NDArray, NDArray]) -> None:
+        self._along_x = np.array([f for f, _ in basis])
+        self._along_y = np.array([g for _, g in basis])
+        self._window = window
+        self._inverse = np.linalg.pinv(self._gram(1), rcond=1e-13, hermitian=True)
+
+    def _gram(self, power: int) -> NDArray:
+        u, v = (w**power for w in self._window)
+        return ((self._along_x.conj() * u) @ self._along_x.T) * ((self._along_y.conj() * v) @ self._along_y.T)
+
+    def solve(self, heights: NDArray[np.float64]) -> NDArray:
+        """The coefficients."""
+        u, v = self._window
+        sums = np.einsum("ky,ky->k", self._along_y.conj() * v, (self._along_x.conj() * u) @ heights.T)
+        return self._inverse @ sums
+
+    def evaluate(self, coefficients: NDArray) -> NDArray[np.float64]:
+        """The model, (N_y, N_x)."""
+        return np.real((self._along_y.T * coefficients) @ self._along_x)
+
+    def fit(self, heights: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The model of these heights."""
+        return self.evaluate(self.solve(heights))
+
+    def covariance(self) -> NDArray:
+        """Of the coefficients, under white noise of variance one."""
+        return self._inverse @ self._gram(2) @ self._inverse
+
+
+def _period(q: NDArray[np.float64], spread: NDArray[np.float64], strength: float) -> Period:
+    """From a frequency in cycles/µm and its covariance."""
+    length = float(np.hypot(*q))
+    along, across = q / length, np.array([-q[1], q[0]]) / length
+    direction = float(np.degrees(np.arctan2(q[1], q[0])))
+    direction = float(direction - 180 * np.ceil((direction - 90) / 180 - 1e-12))  # (−90, 90], not −90 by rounding
+    return Period(
+        period=1 / length,
+        direction=direction,
+        period_uncertainty=float(np.sqrt(along @ spread @ along)) / length**2,
+        direction_uncertainty=float(np.degrees(np.sqrt(across @ spread @ across) / length)),
+        strength=strength,
+    )
+
+
+def _polynomials(x: NDArray, y: NDArray, degree: int) -> list[tuple[NDArray, NDArray]]:
+    """1, x, y, x², xy, y² … as functions of x and of y to multiply; without those that too few points would tell."""
+    x, y = (v / max(np.abs(v).max(), 1e-300) for v in (x, y))
+    powers = [(i, j) for i in range(degree + 1) for j in range(degree + 1 - i) if i < len(x) and j < len(y)]
+    return [(x**i, y**j) for i, j in powers]
+
+
+def _halves(count: int) -> list[slice]:
+    return [slice(0, count // 2), slice(count - count // 2, count)] if count >= 16 else [slice(0, count)]
+
+
+def _length(places: NDArray[np.float64]) -> float:
+    """Of a row of pixels, from their middles; any length for one pixel, which has no frequency."""
+    return float(len(places) * (places[1] - places[0])) if len(places) > 1 else 1.0
+
+
+def _hann(count: int) -> NDArray[np.float64]:
+    """Hann's window between, not at, its zeros; one where there is one pixel."""
+    return np.sin(np.pi * (np.arange(count) + 0.5) / count) ** 2
+
+
+def _quartiles(values: NDArray[np.float64], counts: NDArray[np.intp]) -> NDArray[np.float64]:
+    """The lower quartile of each run of values, of these lengths."""
+    label = np.repeat(np.arange(len(counts)), counts)
+    ordered = values[np.lexsort((values, label))]
+    return ordered[np.cumsum(counts) - counts + (counts - 1) // 4]
+
+
+def _power_law(x: NDArray, points: NDArray, values: NDArray) -> NDArray[np.float64]:
+    """Interpolation that is linear in the logarithms; before the first point it goes on as it begins."""
+    x, points, values = np.log(x), np.log(points), np.log(values)
+    if len(points) > 1:
+        slope = min((values[1] - values[0]) / (points[1] - points[0]), 0.0)
+        points = np.concatenate([[x.min() - 1], points])
+        values = np.concatenate([[values[0] + slope * (points[0] - points[1])], values])
+    return np.exp(np.interp(x, points, values))
+
+
+def _angle(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
+    """Between two waves, of which either may be turned round; degrees in [0, 90]."""
+    return float(np.degrees(np.arctan2(abs(one[0] * other[1] - one[1] * other[0]), abs(one @ other))))

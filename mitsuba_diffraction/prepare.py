@@ -1,0 +1,388 @@
+"""A scan made ready: levelling, line alignment, spikes, missing pixels, rotation, cropping.
+
+Each step takes a height field and gives a new one whose `source` tells, after those before it, what the step did.
+Missing pixels (NaN) stay missing until `fill_missing`; the other steps work on the pixels that are there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from numbers import Real
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.interpolate import RectBivariateSpline, make_interp_spline
+
+from . import missing
+from .heightfield import HeightField
+from .periods import Period, find_periods
+
+_SIDE = 5
+"""Side of the square about a pixel that the pixel is held against, pixels."""
+
+_STANDARD = 1.4826
+"""Standard deviation of normal errors over the median of their moduli."""
+
+_MISFIT = 0.05
+"""Of a second wave at the seam, in periods."""
+
+_LEAST_STRENGTH = 0.1
+"""Of a second wave, in parts of the strongest's; a weaker one sets no length."""
+
+Step = str | Mapping[str, object]
+"""The name of a step, or {name: argument}."""
+
+
+def level_plane(height_field: HeightField) -> HeightField:
+    """Subtract the plane that fits best (least squares over the pixels that are there): the tilt of the sample."""
+    return _level(height_field, 1)
+
+
+def level_quadratic(height_field: HeightField) -> HeightField:
+    """Subtract the surface of second order that fits best: the tilt, and the bow of a tube scanner."""
+    return _level(height_field, 2)
+
+
+def _level(height_field: HeightField, degree: int) -> HeightField:
+    heights = height_field.heights
+    rows, columns = heights.shape
+    x, y = ((np.arange(n) - (n - 1) / 2) / max((n - 1) / 2, 1) for n in (columns, rows))  # [−1, 1]
+    # One row has no slope along y, and two have no bow.
+    powers = [(i, j) for i in range(degree + 1) for j in range(degree + 1 - i) if i < columns and j < rows]
+    there = ~height_field.gaps
+    middle = heights[there].mean()
+    terms = np.array([(y[:, None] ** j * x**i)[there] for i, j in powers])
+    coefficients = np.linalg.lstsq(terms @ terms.T, terms @ (heights[there] - middle), rcond=1e-12)[0]
+    surface = sum(c * y[:, None] ** j * x**i for c, (i, j) in zip(coefficients, powers, strict=True))
+    found = dict(zip(powers, coefficients, strict=True))
+    half = [max((n - 1) / 2, 1) * size for n, size in zip((columns, rows), height_field.pixel_size, strict=True)]
+    tilts = [np.degrees(np.arctan(found.get(p, 0.0) / h)) for p, h in zip([(1, 0), (0, 1)], half, strict=True)]
+    told = f"tilt {tilts[0]:.3g}° along x, {tilts[1]:.3g}° along y"
+    if degree == 2:
+        told += f", bow {found.get((2, 0), 0.0) * 1e3:.3g} nm along x, {found.get((0, 2), 0.0) * 1e3:.3g} nm along y"
+    name = "level_plane" if degree == 1 else "level_quadratic"
+    return _after(height_field, heights - middle - surface, f"{name}: {told}")
+
+
+def align_lines(height_field: HeightField) -> HeightField:
+    """Bring the lines of a scan (rows) to one level.
+
+    The offset of a row to the one before is the median of their differences, which a feature across few columns does
+    not move. A straight trend of the offsets is a tilt, and stays (`level_plane` takes it). Heights that whole rows
+    share go with the jumps: not for a grating whose lines run along x.
+    """
+    heights = height_field.heights
+    lines = np.flatnonzero(~height_field.gaps.all(axis=1))
+    offsets = np.zeros(len(lines))
+    before = heights[lines[0]]
+    for k, line in enumerate(lines[1:], 1):
+        difference = heights[line] - before
+        shared = difference[~np.isnan(difference)]
+        offsets[k] = offsets[k - 1] + (np.median(shared) if len(shared) else 0.0)
+        # Where the line has no pixel, the line before it stands in.
+        before = np.where(np.isnan(heights[line]), before + offsets[k] - offsets[k - 1], heights[line])
+    # The median of an oblique, lopsided profile's slope is not zero: over the lines that adds up to a tilt.
+    offsets -= np.polyval(np.polyfit(lines, offsets, 1 if len(lines) > 1 else 0), lines)
+    aligned = heights.copy()
+    aligned[lines] -= offsets[:, None]
+    told = f"offsets {offsets.std() * 1e3:.3g} nm rms, {np.abs(offsets).max() * 1e3:.3g} nm at most"
+    return _after(height_field, aligned, f"align_lines: {told}")
+
+
+def despike(height_field: HeightField, threshold: float = 5.0) -> HeightField:
+    """Replace pixels that stand out of their surroundings.
+
+    Of the 25 pixels of the square about a pixel, the five highest and the five lowest may be spikes, or a streak along
+    a line. A pixel is one where it rises above, or falls below, all others by more than `threshold` standard deviations
+    σ of the noise, and by more than twice the range of the others: in a groove, between even slopes, it lies at most
+    once their range below. It is filled from its surroundings as a missing pixel is. A ridge one pixel wide on an even
+    ground goes, too.
+
+    σ is that of Immerkær 1996, "Fast noise variance estimation", Computer Vision and Image Understanding 64(2),
+    300–302: of the second differences along x of those along y, which a smooth surface hardly has; with the median of
+    their moduli for their mean, which spikes do not raise.
+
+    Raises:
+        ValueError: if the threshold is not positive.
+    """
+    _check_positive("despike", threshold, "a number of standard deviations")
+    gaps = height_field.gaps
+    whole = missing.fill_missing(height_field.heights, height_field.pixel_size)
+    # Beyond its edges the surface goes on with its slope; at the very corner a spike cannot be told from that.
+    inside = slice(_SIDE // 2, -(_SIDE // 2))
+    padded = np.pad(whole, _SIDE // 2, mode="reflect", reflect_type="odd")
+    lowest, highest = (ndimage.rank_filter(padded, rank, _SIDE)[inside, inside] for rank in (_SIDE, -_SIDE - 1))
+    sigma = _noise(whole)
+    excess = np.maximum(whole - highest, lowest - whole)
+    spikes = ~gaps & (excess > threshold * sigma) & (excess > 2 * (highest - lowest))
+    cleaned = height_field.heights
+    if spikes.any():
+        cleaned = missing.fill_missing(np.where(spikes, np.nan, whole), height_field.pixel_size)
+        cleaned = np.where(gaps, np.nan, np.where(spikes, cleaned, height_field.heights))
+    told = f"{spikes.sum()} of {spikes.size} pixels beyond {threshold:g} × {sigma * 1e3:.3g} nm"
+    return _after(height_field, cleaned, f"despike: {told}")
+
+
+def _noise(heights: NDArray[np.float64]) -> float:
+    """The standard deviation of white noise on a smooth surface, µm."""
+    differences = heights
+    for dimension, count in enumerate(heights.shape):
+        if count > 2:
+            differences = np.diff(differences, 2, axis=dimension) / np.sqrt(6)  # 1² + 2² + 1²
+    return float(_STANDARD * np.median(np.abs(differences))) if differences is not heights else 0.0
+
+
+def fill_missing(height_field: HeightField) -> HeightField:
+    """Fill missing pixels from their surroundings (`missing.fill_missing`)."""
+    filled = missing.fill_missing(height_field.heights, height_field.pixel_size)
+    return _after(height_field, filled, f"fill_missing: {height_field.gaps.sum()} of {filled.size} pixels")
+
+
+def trim_edges(height_field: HeightField, width: float) -> HeightField:
+    """Cut off `width` µm at each edge, where the tip turns round; whole pixels, at least that much.
+
+    Raises:
+        ValueError: if the width is not positive, or nothing would be left.
+    """
+    _check_positive("trim_edges", width, "a width in µm")
+    rows, columns = height_field.shape
+    cuts = [
+        int(np.ceil(width / size - 1e-9)) if n > 1 else 0  # a profile has no edge along its one pixel
+        for n, size in zip((columns, rows), height_field.pixel_size, strict=True)
+    ]
+    if 2 * cuts[0] >= columns or 2 * cuts[1] >= rows:
+        x, y = height_field.tile_size
+        raise ValueError(f"trim_edges: got {width:g} µm at each edge of {x:.4g} × {y:.4g} µm: nothing would be left")
+    inside = height_field.heights[cuts[1] : rows - cuts[1], cuts[0] : columns - cuts[0]]
+    _check_any("trim_edges", inside)
+    return _after(height_field, inside, f"trim_edges: {cuts[0]} columns and {cuts[1]} rows at each edge")
+
+
+def rotate(height_field: HeightField, degrees: float) -> HeightField:
+    """Turn the surface from +x towards +y, about the middle of the patch.
+
+    The heights between pixels are those of cubic splines; by multiples of 90° the pixels themselves are turned. Of the
+    turned patch the greatest rectangle along x and y is kept, so that no height is made up. A pixel is missing where
+    one of the four about its place is.
+
+    Raises:
+        ValueError: if the angle is not a finite number, or no pixel fits into the turned patch.
+    """
+    if not _is_number(degrees):
+        raise ValueError(f"rotate: got {degrees!r}, wanted an angle in degrees")
+    quarters = degrees / 90
+    if quarters == np.rint(quarters):
+        turns = int(np.rint(quarters)) % 4
+        # rot90 turns from +x (columns) towards −y (rows): row ↔ +y here.
+        size = height_field.pixel_size[:: -1 if turns % 2 else 1]
+        return _after(height_field, np.rot90(height_field.heights, -turns), f"rotate: {degrees:g}°", size)
+    rows, columns = height_field.shape
+    d_x, d_y = height_field.pixel_size
+    cos, sin = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    # Between the middles of the outermost pixels.
+    width, height = _largest_rectangle((columns - 1) * d_x, (rows - 1) * d_y, abs(cos), abs(sin))
+    count = [int(np.floor(length / d + 1e-9)) + 1 for length, d in ((width, d_x), (height, d_y))]
+    if min(count) < 2:
+        raise ValueError(f"rotate: no pixels fit into {columns} × {rows} pixels turned by {degrees:g}°")
+    x, y = ((np.arange(n) - (n - 1) / 2) * d for n, d in zip(count, (d_x, d_y), strict=True))
+    x, y = np.meshgrid(x, y)
+    places = np.array([(cos * y - sin * x) / d_y + (rows - 1) / 2, (cos * x + sin * y) / d_x + (columns - 1) / 2])
+    whole = missing.fill_missing(height_field.heights, height_field.pixel_size)
+    # Not ndimage's splines, which are level at the edge of the patch and so bend there.
+    degree = [min(3, n - 1) for n in (rows, columns)]
+    spline = RectBivariateSpline(np.arange(rows), np.arange(columns), whole, kx=degree[0], ky=degree[1])
+    turned = spline.ev(*places)
+    gaps = ndimage.map_coordinates(height_field.gaps.astype(float), places, order=1, mode="nearest") > 1e-9
+    turned[gaps] = np.nan
+    _check_any("rotate", turned)
+    return _after(height_field, turned, f"rotate: {degrees:g}°, {count[0]} × {count[1]} of {columns} × {rows} pixels")
+
+
+def _largest_rectangle(width: float, height: float, cos: float, sin: float) -> tuple[float, float]:
+    """Sides along x and y of the greatest rectangle inside a turned one, cos and sin those of the angle, both > 0.
+
+    With all four corners on the turned rectangle, W = w cos + h sin and H = w sin + h cos give w and h. Where it is
+    long and narrow, two corners on its long sides bind alone, and wh is greatest at W₁ = w sin = h cos, half of the
+    short side S = w sin + h cos (or with cos and sin exchanged).
+    """
+    short = min(width, height)
+    if short <= 2 * sin * cos * max(width, height) or abs(cos - sin) < 1e-12:
+        return (short / 2 / sin, short / 2 / cos) if width >= height else (short / 2 / cos, short / 2 / sin)
+    determinant = cos**2 - sin**2
+    return (width * cos - height * sin) / determinant, (height * cos - width * sin) / determinant
+
+
+def crop_periods(height_field: HeightField, axes: str = "xy") -> HeightField:
+    """Crop to a whole number of periods, so that the patch repeats without a seam.
+
+    The periods are those of `find_periods`, at most two. Along an axis the strongest wave that has a period there sets
+    the length, and of the whole numbers of its period that leave at least half of the patch the one is taken that is
+    nearest to whole numbers of the other's, or the greatest. A period is no whole number of pixels: what is left over,
+    up to half a pixel, would be a seam, and a comb of false orders to light. The heights are therefore resampled, by
+    cubic splines, on as many pixels as are nearest, each longer or shorter by that share.
+
+    Args:
+        axes: "x", "y" or "xy".
+
+    Raises:
+        ValueError: if pixels are missing, no period is found, or less than one fits into the patch.
+    """
+    if axes not in ("x", "y", "xy"):
+        raise ValueError(f"crop_periods: got {axes!r}, wanted 'x', 'y' or 'xy'")
+    if height_field.gaps.any():
+        raise ValueError(f"crop_periods: {height_field.gaps.sum()} pixels are missing, wanted fill_missing before it")
+    found = find_periods(height_field)
+    waves = [wave for wave in found if wave.strength >= _LEAST_STRENGTH * found[0].strength]
+    if not waves:
+        raise ValueError("crop_periods: no period stands out of the spectrum of the heights")
+    told = []
+    heights, sizes = height_field.heights, list(height_field.pixel_size)
+    for axis in axes:
+        k = "xy".index(axis)
+        heights, sizes[k], what = _crop(heights, 1 - k, sizes[k], waves, axis)
+        told.append(what)
+    if all("no period" in what for what in told):
+        raise ValueError(f"crop_periods: {'; '.join(told)}")
+    return _after(height_field, heights, f"crop_periods: {', '.join(told)}", (sizes[0], sizes[1]))
+
+
+def _crop(
+    heights: NDArray[np.float64], dimension: int, size: float, waves: Sequence[Period], axis: str
+) -> tuple[NDArray[np.float64], float, str]:
+    """Along one axis: the heights, their pixel size, and what was done."""
+    count = heights.shape[dimension]
+    q, uncertainty = (np.array(v) for v in zip(*(_component(wave, axis) for wave in waves), strict=True))
+    across = np.flatnonzero(q * count * size >= 1 - 1e-9)
+    if count == 1 or len(across) == 0:
+        return heights, size, f"no period along {axis}"
+    first = across[0]
+    most = int(np.floor(q[first] * count * size + 1e-6))
+    numbers = np.arange(most, most // 2 - 1 if most > 1 else 0, -1)
+    lengths = np.maximum(numbers, 1) / q[first]
+    misfits = np.abs(q[:, None] * lengths - np.rint(q[:, None] * lengths))
+    worst = misfits.max(axis=0)
+    best = int(np.argmax(worst <= _MISFIT)) if (worst <= _MISFIT).any() else int(np.argmin(worst))
+    length, misfit = lengths[best], np.delete(misfits[:, best], first)
+    exact = length / size
+    new = int(np.rint(exact))
+    start = (count - exact) / 2
+    if abs(exact - new) < 1e-3 or new < 4:
+        cut = slice((count - new) // 2, (count - new) // 2 + new)
+        heights = heights[:, cut] if dimension == 1 else heights[cut]
+        how = f"{new} of {count} pixels"
+    else:
+        spline = make_interp_spline(np.arange(count), heights, k=3, axis=dimension)
+        heights = spline(start - 0.5 + (np.arange(new) + 0.5) * exact / new)
+        how = f"{exact:.2f} of {count} pixels, resampled to {new}"
+        size = length / new
+    told = f"{max(numbers[best], 1)} × {1e3 / q[first]:.4g} nm along {axis} ({how}, "
+    told += f"known to {length * uncertainty[first]:.2g} periods"
+    told += f", the other wave is {misfit.max():.2g} periods off)" if len(misfit) else ")"
+    return heights, size, told
+
+
+def _component(wave: Period, axis: str) -> tuple[float, float]:
+    """|q| along an axis in cycles/µm, and its standard uncertainty."""
+    angle = np.radians(wave.direction)
+    along, across = (np.cos(angle), np.sin(angle)) if axis == "x" else (np.sin(angle), np.cos(angle))
+    spread = (
+        along * wave.period_uncertainty / wave.period**2,
+        across * np.radians(wave.direction_uncertainty) / wave.period,
+    )
+    return abs(float(along)) / wave.period, float(np.hypot(*spread))
+
+
+# ---------------------------------------------------------------- recipes
+
+_STEPS: dict[str, tuple[Callable[..., HeightField], type | None, bool]] = {
+    "level_plane": (level_plane, None, False),
+    "level_quadratic": (level_quadratic, None, False),
+    "align_lines": (align_lines, None, False),
+    "despike": (despike, float, False),
+    "fill_missing": (fill_missing, None, False),
+    "rotate": (rotate, float, True),
+    "crop_periods": (crop_periods, str, False),
+    "trim_edges": (trim_edges, float, True),
+}
+"""Name → function, type of its argument (None: it has none), and whether it must be given."""
+
+
+STEP_NAMES = tuple(_STEPS)
+
+
+def check_steps(steps: object) -> None:
+    """Check a list of steps, each a name or {name: argument}, before there is a height field.
+
+    Raises:
+        ValueError: if a name or an argument is wrong.
+    """
+    if not isinstance(steps, list | tuple):
+        raise ValueError(f"prepare: got {steps!r}, wanted a list of steps")
+    for step in steps:
+        name, argument = _parts(step)
+        _, kind, required = _STEPS[name]
+        if argument is None:
+            if required:
+                raise ValueError(f"prepare: {name}: missing its argument, wanted {{ {name} = … }}")
+        elif kind is None:
+            raise ValueError(f"prepare: {name}: got {argument!r}, wanted no argument")
+        elif kind is float and not _is_number(argument):
+            raise ValueError(f"prepare: {name}: got {argument!r}, wanted a number")
+        elif kind is str and argument not in ("x", "y", "xy"):
+            raise ValueError(f"prepare: {name}: got {argument!r}, wanted 'x', 'y' or 'xy'")
+
+
+def apply_steps(height_field: HeightField, steps: Sequence[Step]) -> HeightField:
+    """The height field after all steps, in their order.
+
+    Raises:
+        ValueError: if a step is wrong or cannot be done.
+    """
+    check_steps(steps)
+    for step in steps:
+        name, argument = _parts(step)
+        function = _STEPS[name][0]
+        height_field = function(height_field) if argument is None else function(height_field, argument)
+    return height_field
+
+
+def step_of(text: str) -> Step:
+    """A step as it is typed: `level_plane`, `despike=4`, `crop_periods=x`."""
+    name, equals, argument = text.partition("=")
+    if not equals:
+        return name
+    try:
+        return {name: float(argument)}
+    except ValueError:
+        return {name: argument}
+
+
+def _parts(step: object) -> tuple[str, object]:
+    name, argument = step, None
+    if isinstance(step, Mapping) and len(step) == 1:
+        ((name, argument),) = step.items()
+    if not (isinstance(name, str) and name in _STEPS):
+        raise ValueError(f"prepare: got {step!r}, wanted one of {', '.join(_STEPS)}")
+    return name, argument
+
+
+def _after(
+    height_field: HeightField, heights: NDArray, told: str, pixel_size: tuple[float, float] | None = None
+) -> HeightField:
+    source = f"{height_field.source}; {told}"
+    return HeightField(heights, pixel_size or height_field.pixel_size, source, keep_missing=True)
+
+
+def _check_positive(name: str, value: object, wanted: str) -> None:
+    if not (_is_number(value) and value > 0):
+        raise ValueError(f"{name}: got {value!r}, wanted {wanted}, positive")
+
+
+def _check_any(name: str, heights: NDArray[np.float64]) -> None:
+    if np.isnan(heights).all():
+        raise ValueError(f"{name}: all pixels that are left are missing")
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool) and bool(np.isfinite(value))

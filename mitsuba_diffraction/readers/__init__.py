@@ -1,0 +1,144 @@
+"""Height fields from files: arrays, pictures, Gwyddion, text, and instruments' own formats.
+
+Row 0 of a file is row 0 of `heights`, so the top row of a picture lies at the lowest y (row ↔ +y, column ↔ +x), as
+Mitsuba lays a bitmap on a surface. That holds for every format that stores a picture, whichever way its lines were
+scanned; where a text gives y itself (.xyz, ESRI grids), its y is kept.
+"""
+
+from __future__ import annotations
+
+import os
+from numbers import Real
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..heightfield import HeightField
+from . import arrays, gwyddion, instruments, pictures, simple_field, text
+from .scan import Scan
+
+__all__ = ["read_height_field"]
+
+_SHOWN = 300
+"""Longest text of an error, characters, that is passed on: a header gone bad is quoted whole by some libraries."""
+
+_WITHOUT_UNIT = {
+    ".npy": arrays.read_npy,
+    ".npz": arrays.read_npz,
+    ".png": pictures.read,
+    ".tif": pictures.read,
+    ".tiff": pictures.read,
+}
+"""Extension → reader of formats whose heights are µm, or are scaled by `height_range`."""
+
+_WITH_UNIT = {".gsf": simple_field.read, ".xyz": text.read_points, ".asc": text.read_table}
+"""Extension → reader of formats of one channel whose heights have a unit."""
+
+_EXTENSIONS = (*_WITHOUT_UNIT, ".gwy", *_WITH_UNIT)
+
+
+def read_height_field(
+    path: str | os.PathLike[str],
+    pixel_size: float | tuple[float, float] | None = None,
+    height_range: float | None = None,
+    fill_missing: bool = False,
+    *,
+    channel: str | int | None = None,
+    unit: str | tuple[str, str] | None = None,
+    keep_missing: bool = False,
+) -> HeightField:
+    """Read a height field.
+
+    | format | numbers | what has to be given |
+    |---|---|---|
+    | .npy | floats are µm; integers run over the full range of their type | pixel_size; integers: height_range |
+    | .npz | array `heights`, as .npy, and optionally `pixel_size` in µm, one number or (x, y) | as .npy |
+    | .png, .tif, .tiff | 8 or 16 bit grey; colour is accepted where it is grey and opaque | pixel_size, height_range |
+    | .tif, .tiff | 32 bit float, µm | pixel_size |
+    | .gwy, .gsf | Gwyddion's own, and its simple field | unit where the file has none |
+    | .xyz | points x y z on a regular grid | unit |
+    | .asc | a table of heights, as Gwyddion exports it or an ESRI grid | unit and pixel_size where it has none |
+    | .spm, .000, .nid, .ibw, .sdf, .x3p, … | instruments' own, with the extra `instruments` | |
+
+    Args:
+        path: the file; its extension names the format.
+        pixel_size: µm, one number or (x, y). Goes before that of the file; required where the file has none.
+        height_range: from the least to the greatest number that the integer type holds (black to white), µm. The
+            heights start at zero there. For integers only.
+        fill_missing: fill the pixels that are NaN or infinite from their surroundings (`missing.fill_missing`), not
+            refuse them. `source` and `filled` of the height field tell how many they were.
+        channel: of a file with several (.gwy and instruments'), a name or a number. None takes the one that holds
+            lengths, or the first of those that is called height or topography; `source` tells which.
+        unit: of lengths, "nm", for formats that have units and a file that names none; two, ("um", "nm"), where
+            those along the surface and of the heights differ.
+        keep_missing: leave missing pixels as they are, NaN, for the steps of `prepare`.
+
+    Returns:
+        The heights in µm, row by row as they stand in the picture.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if the file or the arguments are wrong; one line that names the file.
+    """
+    path = Path(path)
+    try:
+        scan = _read(path, channel, unit)
+        heights = _as_micrometres(scan.numbers, height_range)
+        pixel_size = scan.pixel_size if pixel_size is None else pixel_size
+        if pixel_size is None:
+            raise ValueError("pixel_size: the file has none, wanted one number or (x, y) in µm")
+        source = f"{path.name}, {scan.channel}" if scan.channel else path.name
+        return HeightField(heights, pixel_size, source, fill_missing=fill_missing, keep_missing=keep_missing)
+    except FileNotFoundError:
+        raise
+    # OSError is what Pillow raises for a damaged picture, and the system for what cannot be read (a folder, rights).
+    except (ValueError, OSError, MemoryError) as error:
+        raise ValueError(" ".join(f"{path}: {str(error)[:_SHOWN]}".split())) from error
+
+
+def _read(path: Path, channel: str | int | None, unit: str | tuple[str, str] | None) -> Scan:
+    extension = path.suffix.lower()
+    instrument = instruments.format_of(extension) is not None
+    if extension not in _EXTENSIONS and not instrument:
+        raise ValueError(
+            f"got the extension {path.suffix!r}, wanted one of {', '.join(_EXTENSIONS)}, or an instrument's: "
+            f"{instruments.NAMES}"
+        )
+    if path.stat().st_size == 0:
+        raise ValueError("the file is empty")
+    if channel is not None and not (instrument or extension == ".gwy"):
+        raise ValueError(f"channel: got {channel!r} for {extension}, which holds one only")
+    if unit is not None and extension in _WITHOUT_UNIT:
+        raise ValueError(f"unit: got {unit!r} for {extension}, whose lengths are µm")
+    if instrument:
+        return instruments.read(path, unit, channel)
+    if extension == ".gwy":
+        return gwyddion.read(path, unit, channel)
+    if extension in _WITH_UNIT:
+        return _WITH_UNIT[extension](path, unit)
+    return _WITHOUT_UNIT[extension](path)
+
+
+def _as_micrometres(numbers: NDArray, height_range: object) -> NDArray[np.float64]:
+    """Integers scaled by the full range of their type, floats as they are; (N_y, N_x) µm."""
+    if numbers.dtype.kind not in "iuf":
+        raise ValueError(f"got numbers of type {numbers.dtype}, wanted real floats in µm or integers")
+    if numbers.ndim != 2 or numbers.size == 0:
+        raise ValueError(f"got an array of shape {numbers.shape}, wanted (rows, columns), at least (1, 1)")
+    if numbers.dtype.kind == "f":
+        if height_range is not None:
+            raise ValueError(
+                f"height_range: got {height_range!r} for {numbers.dtype} heights, wanted none: they are in µm"
+            )
+        return numbers.astype(np.float64)
+    if height_range is None:
+        raise ValueError(
+            f"height_range: missing for {numbers.dtype} heights, wanted the height in µm from black to white"
+        )
+    if isinstance(height_range, bool) or not isinstance(height_range, Real):
+        raise ValueError(f"height_range: got {height_range!r}, wanted a number in µm")
+    if not (np.isfinite(height_range) and height_range > 0):
+        raise ValueError(f"height_range: got {height_range!r}, wanted a positive number in µm")
+    scale = np.iinfo(numbers.dtype)
+    return (numbers.astype(np.float64) - scale.min) / (float(scale.max) - scale.min) * float(height_range)

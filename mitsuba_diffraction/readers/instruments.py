@@ -1,0 +1,117 @@
+"""Instruments' own formats, through SurfaceTopography (an optional extra).
+
+A format is read by the reader that its extension names: the library's guessing would also try formats of general use.
+"""
+
+from __future__ import annotations
+
+import re
+import warnings
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+from . import units
+from .scan import MOST_BYTES, Channel, Scan, choose
+
+EXTRA = "pip install 'mitsuba_diffraction[instruments]'"
+
+_FORMATS = {
+    ".al3d": "al3d",
+    ".bcr": "bcr",
+    ".bcrf": "bcr",
+    ".ezd": "ezd",
+    ".frt": "frt",
+    ".ibw": "ibw",
+    ".jpk": "jpk",
+    ".lext": "lext",
+    ".mdt": "mdt",
+    ".mi": "mi",
+    ".mnt": "mnt",
+    ".nid": "ezd",
+    ".nms": "nms",
+    ".opd": "opd",
+    ".opdx": "opdx",
+    ".os3d": "os3d",
+    ".plu": "plu",
+    ".plux": "plux",
+    ".sdf": "sdf",
+    ".spm": "di",
+    ".sur": "sur",
+    ".tmd": "tmd",
+    ".vk4": "vk",
+    ".vk6": "vk",
+    ".vk7": "vk",
+    ".x3p": "x3p",
+    ".zon": "zon",
+}
+"""Extension → SurfaceTopography's name of the format; Nanoscope's numbers (.000, .001, …) besides."""
+
+NAMES = (
+    "Nanoscope .spm .000, Nanosurf .nid .ezd, Igor .ibw, JPK .jpk, NT-MDT .mdt, ISO 25178-71 .sdf, X3P .x3p, "
+    "Digital Surf .sur, Wyko .opd, Keyence .vk4, Sensofar .plu and others"
+)
+
+
+def format_of(extension: str) -> str | None:
+    """SurfaceTopography's name of the format of a file with this extension (lower case), if it is an instrument's."""
+    return "di" if re.fullmatch(r"\.\d{3}", extension) else _FORMATS.get(extension)
+
+
+def read(path: Path, unit: str | tuple[str, str] | None, channel: str | int | None) -> Scan:
+    """One channel of an instrument's file; the top row of its picture is row 0.
+
+    Raises:
+        ValueError: if SurfaceTopography is not installed, does not understand the file, or finds no such channel.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the library's remarks on what else is not installed, and on metadata
+        try:
+            from SurfaceTopography.IO import lookup_reader_by_format
+        except ImportError as error:
+            raise ValueError(f"an instrument's own format: wanted SurfaceTopography, {EXTRA} ({error})") from None
+        _refuse_bomb(path)
+        try:
+            reader = lookup_reader_by_format[format_of(path.suffix.lower())](str(path))
+            found = list(reader.channels)
+        # Readers of binary files raise whatever a wrong byte leads them to.
+        except Exception as error:
+            raise ValueError(f"not a file of this instrument, or a damaged one ({_told(error)})") from None
+        chosen = choose(
+            [Channel(c.index, c.name, c.dim == 2 and c.data_kind.value == "height") for c in found], channel
+        )
+        source = found[[c.index for c in found].index(chosen.number)]
+        if 8 * int(np.prod(source.nb_grid_pts, dtype=object)) > MOST_BYTES:
+            raise ValueError(f"got {source.nb_grid_pts} pixels, wanted at most {MOST_BYTES} bytes")
+        given = units.pair(unit)
+        own = source.unit is not None
+        if not own and not given[0]:
+            raise ValueError(f"unit: the file names none, wanted one of {units.UNITS}")
+        try:
+            topography = source.topography() if own else source.topography(unit=given[0])
+            heights = np.ma.asarray(topography.heights(), np.float64).T
+            size = topography.physical_sizes
+        except Exception as error:
+            raise ValueError(f"a damaged file ({_told(error)})") from None
+    along, high = (source.unit, source.unit) if own else given
+    rows, columns = heights.shape
+    scale = units.micrometres(along, "the file")
+    pixel_size = (size[0] * scale / columns, size[1] * scale / rows) if size is not None else None
+    return Scan(heights * units.micrometres(high, "the file"), pixel_size, chosen.name)
+
+
+def _refuse_bomb(path: Path) -> None:
+    """Several formats are archives, which the library unpacks into memory."""
+    if zipfile.is_zipfile(path):
+        try:
+            with zipfile.ZipFile(path) as archive:
+                unpacked = sum(member.file_size for member in archive.infolist())
+        except (zipfile.BadZipFile, ValueError, NotImplementedError) as error:
+            raise ValueError(f"a damaged archive ({error})") from None
+        if unpacked > MOST_BYTES:
+            raise ValueError(f"an archive of {unpacked} bytes, wanted at most {MOST_BYTES}")
+
+
+def _told(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__

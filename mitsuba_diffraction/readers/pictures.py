@@ -1,0 +1,63 @@
+"""Grey pictures (.png, .tif) whose numbers are heights."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, UnidentifiedImageError
+
+from .scan import DAMAGED, Scan
+
+
+def read(path: Path) -> Scan:
+    """The one channel of a picture."""
+    with warnings.catch_warnings():
+        # What Pillow only warns of (pictures that unpack to a great size, damaged metadata) is an error here.
+        warnings.simplefilter("error", Image.DecompressionBombWarning)
+        warnings.simplefilter("error", UserWarning)
+        try:
+            with Image.open(path, formats=("PNG", "TIFF")) as picture:
+                pages = getattr(picture, "n_frames", 1)
+                if pages != 1:
+                    raise ValueError(f"got {pages} pages or frames, wanted one")
+                return Scan(_numbers_of(picture))
+        except UnidentifiedImageError:
+            raise ValueError("not a PNG or TIFF picture that can be read") from None
+        except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
+            raise ValueError(f"too large ({error})") from None
+        except DAMAGED as error:
+            raise ValueError(f"a damaged picture ({type(error).__name__}: {error})") from None
+
+
+def _numbers_of(picture: Image.Image) -> NDArray:
+    """The one channel of a grey picture in its own precision: uint8, uint16 or float32."""
+    mode = picture.mode
+    # How the numbers are packed in the file; Pillow forgets it when it loads them.
+    packing = str(picture.tile[0][3]) if picture.tile else ""
+    white_is_zero = picture.format == "TIFF" and picture.tag_v2.get(262) == 0
+    sixteen = mode.startswith("I;16") and "I;16" in packing and not white_is_zero
+    # Older Pillow opens a PNG of 16 bit as 32 bit integers.
+    sixteen = sixteen or (mode == "I" and picture.format == "PNG")
+    channels = mode in ("RGB", "RGBA", "LA") and ";16" not in packing
+    if not (mode in ("L", "F") or sixteen or channels) or "transparency" in picture.info:
+        raise ValueError(
+            f"got a picture of Pillow mode {mode!r} ({packing}), wanted opaque grey of 8 or 16 bit, black at zero, "
+            "or (TIFF) 32 bit float"
+        )
+    pixels = np.asarray(picture)
+    if channels:
+        return _grey(pixels, mode)
+    return pixels.astype(np.uint16) if sixteen else pixels
+
+
+def _grey(pixels: NDArray, mode: str) -> NDArray:
+    """The one channel of a picture whose colours are equal and whose alpha is opaque."""
+    if mode.endswith("A") and not (pixels[..., -1] == 255).all():
+        raise ValueError("got a picture with transparent pixels, wanted an opaque grey one")
+    colours = pixels[..., : len(mode.removesuffix("A"))]
+    if not (colours == colours[..., :1]).all():
+        raise ValueError("got a colour picture, wanted a grey one")
+    return colours[..., 0]

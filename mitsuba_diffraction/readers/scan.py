@@ -1,0 +1,84 @@
+"""What a reader takes from a file, and how one of several channels is chosen."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from numpy.typing import NDArray
+
+MOST_BYTES = 2**31
+"""Largest array that is taken from a file."""
+
+DAMAGED = (SyntaxError, TypeError, KeyError, EOFError, IndexError, OverflowError, struct.error, UserWarning)
+"""What Pillow and NumPy raise, besides OSError and ValueError, when the bytes of a file are wrong."""
+
+_HEIGHT_NAMES = ("height", "topograph", "z-axis", "zsensor", "z sensor")
+"""What instruments call the channel of the heights."""
+
+
+@dataclass(frozen=True)
+class Scan:
+    """The numbers of a file.
+
+    Attributes:
+        numbers: (N_y, N_x); floats are µm, NaN or masked where missing; integers run over the range of their type.
+        pixel_size: µm, one number or (x, y); None where the file has none.
+        channel: the name of the channel, where a file may have several.
+    """
+
+    numbers: NDArray
+    pixel_size: float | tuple[float, float] | None = None
+    channel: str = ""
+
+
+@dataclass(frozen=True)
+class Channel:
+    """A channel of a file: its number there, its name, and whether it holds lengths."""
+
+    number: int
+    name: str
+    is_length: bool
+
+    def __str__(self) -> str:
+        return f"{self.number} {self.name!r}"
+
+
+def choose(channels: Sequence[Channel], wanted: str | int | None) -> Channel:
+    """The channel that is named, or that holds the heights.
+
+    Args:
+        wanted: the number of a channel, its name, or a part of it that only one channel has (capitals do not count).
+            None takes the only channel of lengths, or the first of those that are called heights.
+
+    Raises:
+        ValueError: if there is no such channel, if several answer to the name, or if it holds no lengths; the channels
+            are listed.
+    """
+    if wanted is None:
+        lengths = [channel for channel in channels if channel.is_length]
+        named = [c for c in lengths if any(name in c.name.lower() for name in _HEIGHT_NAMES)]
+        if not lengths:
+            raise ValueError(f"wanted a channel of heights in a unit of length, got {_listed(channels)}")
+        if not named and len(lengths) > 1:
+            raise ValueError(f"channel: which of {_listed(lengths)}?")
+        return (named or lengths)[0]
+    if isinstance(wanted, int) and not isinstance(wanted, bool):
+        found = [channel for channel in channels if channel.number == wanted]
+    elif isinstance(wanted, str):
+        found = [channel for channel in channels if channel.name.lower() == wanted.lower()]
+        found = found or [channel for channel in channels if wanted.lower() in channel.name.lower()]
+        if not found and wanted.isdecimal():
+            found = [channel for channel in channels if channel.number == int(wanted)]
+    else:
+        raise ValueError(f"channel: got {wanted!r}, wanted a name or a number")
+    if len(found) != 1:
+        raise ValueError(f"channel: got {wanted!r}, wanted one of {_listed(found or channels)}")
+    if not found[0].is_length:
+        raise ValueError(f"channel: {found[0]} holds no lengths")
+    return found[0]
+
+
+def _listed(channels: Sequence[Channel]) -> str:
+    return ", ".join(map(str, channels)) or "none"

@@ -1,0 +1,190 @@
+"""Heights as text: points x y z (.xyz), and a table of heights with or without a header (.asc).
+
+.xyz: three numbers a line, in any order of the points, on a regular grid along x and y; a place of the grid without a
+point is a missing pixel. Lines that begin with # are comments. Row 0 has the least y.
+
+.asc: a table of heights, the top row of the picture first, with one of these headers:
+
+    # Channel: Height                 as Gwyddion exports it; the lines may come in any order, others are passed over
+    # Width: 5.000 µm
+    # Height: 5.000 µm
+    # Value units: m
+
+    ncols 512                         an ESRI grid; a square cell; its rows come from the highest y down
+    nrows 512
+    xllcorner 0
+    yllcorner 0
+    cellsize 0.05
+    NODATA_value -9999
+
+or with no header, where pixel size and unit are given by the user.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import warnings
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import units
+from .scan import MOST_BYTES, Scan
+
+_OFF_GRID = 0.1
+"""How far a coordinate may lie from its place, in pixels: text is rounded."""
+
+_FEWEST_POINTS = 0.25
+"""Share of the places of a grid that must have a point; less is not a grid."""
+
+_GWYDDION = re.compile(r"#\s*(Channel|Width|Height|Value units):\s*(.+?)\s*$")
+_LENGTH = re.compile(r"([-+.\deE]+)\s*(\S+)$")
+_ESRI = ("ncols", "nrows", "xllcorner", "yllcorner", "xllcenter", "yllcenter", "cellsize", "nodata_value")
+
+
+def read_points(path: Path, unit: str | tuple[str, str] | None) -> Scan:
+    """Points x y z on a regular grid.
+
+    Raises:
+        ValueError: if there are not three numbers a line, if no unit is given, or if they are not on a grid.
+    """
+    points = _table(_text(path))
+    if points.shape[1] != 3:
+        raise ValueError(f"got {points.shape[1]} numbers in a line, wanted three: x y z")
+    along, high = units.pair(unit)
+    if not along:
+        raise ValueError(f"unit: .xyz names none, wanted one of {units.UNITS} (two: along the surface, of the heights)")
+    if not np.isfinite(points[:, :2]).all():
+        raise ValueError("got a point without x or y")
+    (column, columns, d_x), (row, rows, d_y) = (_grid(points[:, axis], name) for axis, name in enumerate("xy"))
+    if columns * rows * _FEWEST_POINTS > len(points):
+        raise ValueError(f"{len(points)} points on a grid of {columns} × {rows}: wanted a regular grid along x and y")
+    place = row * columns + column
+    if len(np.unique(place)) != len(place):
+        raise ValueError("two points at one place: wanted a regular grid along x and y")
+    heights = np.full(rows * columns, np.nan)
+    heights[place] = points[:, 2]
+    scale = units.micrometres(along, "unit")
+    pixel_size = (d_x * scale, d_y * scale) if d_x and d_y else None  # a single line tells one of them only
+    return Scan(heights.reshape(rows, columns) * units.micrometres(high, "unit"), pixel_size)
+
+
+def read_table(path: Path, unit: str | tuple[str, str] | None) -> Scan:
+    """A table of heights.
+
+    Raises:
+        ValueError: if it is no table, if it may be points, or if its unit is not known.
+    """
+    text = _text(path)
+    if text.lstrip()[:5].lower() == "ncols":
+        return _esri(text, unit)
+    header = dict(match.groups() for line in text.splitlines() if (match := _GWYDDION.match(line)))
+    heights = _table(text)
+    rows, columns = heights.shape
+    if not header and columns == 3 and _may_be_points(heights):
+        raise ValueError("three numbers a line that may be points x y z: wanted the extension .xyz for points")
+    along, high = units.pair(unit)
+    high = header.get("Value units", high)
+    if not high:
+        raise ValueError(f"unit: the file names none, wanted one of {units.UNITS}")
+    pixel_size = None
+    if "Width" in header and "Height" in header:
+        pixel_size = (_length(header["Width"], along) / columns, _length(header["Height"], along) / rows)
+    return Scan(heights * units.micrometres(high, "Value units"), pixel_size, header.get("Channel", ""))
+
+
+def _esri(text: str, unit: str | tuple[str, str] | None) -> Scan:
+    lines = text.lstrip().splitlines()
+    header: dict[str, float] = {}
+    for line in lines:
+        words = line.split()
+        if not words or words[0].lower() not in _ESRI:
+            break
+        try:
+            header[words[0].lower()] = float(words[1])
+        except (IndexError, ValueError):
+            raise ValueError(f"the header: got the line {line[:60]!r}, wanted a name and a number") from None
+    if not {"ncols", "nrows", "cellsize"} <= header.keys():
+        raise ValueError(f"the header of an ESRI grid: got {', '.join(header)}, wanted ncols, nrows and cellsize")
+    along, high = units.pair(unit)
+    if not along:
+        raise ValueError(
+            f"unit: an ESRI grid names none, wanted one of {units.UNITS} (two: along the surface, of the heights)"
+        )
+    heights = _table("\n".join(lines[len(header) :]))
+    if heights.shape != (header["nrows"], header["ncols"]):
+        raise ValueError(
+            f"got {heights.shape[0]} lines of {heights.shape[1]}, wanted {header['nrows']:g} of {header['ncols']:g}"
+        )
+    if "nodata_value" in header:
+        heights = np.where(heights == header["nodata_value"], np.nan, heights)
+    cell = header["cellsize"] * units.micrometres(along, "unit")
+    return Scan(heights[::-1] * units.micrometres(high, "unit"), cell)
+
+
+def _text(path: Path) -> str:
+    if path.stat().st_size > MOST_BYTES:
+        raise ValueError(f"got {path.stat().st_size} bytes, wanted at most {MOST_BYTES}")
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError:
+        text = path.read_text(encoding="latin-1")  # µ as Windows writes it
+    if "\0" in text:
+        raise ValueError("not a text: it holds zero bytes")
+    return text
+
+
+def _table(text: str) -> NDArray[np.float64]:
+    """Numbers in lines of equal length, between white space, commas or semicolons."""
+    first = next((line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")), "")
+    if not first:
+        raise ValueError("the file holds no numbers")
+    delimiter = next((mark for mark in (";", ",") if mark in first), None)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            return np.loadtxt(io.StringIO(text), dtype=np.float64, comments="#", delimiter=delimiter, ndmin=2)
+    except (ValueError, UserWarning) as error:
+        raise ValueError(f"not a table of numbers ({error})") from None
+
+
+def _grid(places: NDArray[np.float64], axis: str) -> tuple[NDArray[np.int64], int, float]:
+    """The index of each coordinate on the regular grid that they lie on, its length, and its spacing (0 for one)."""
+    values = np.unique(places)
+    if values[-1] == values[0]:
+        return np.zeros(len(places), np.int64), 1, 0.0
+    gaps = np.diff(values)
+    # What is nearer than a tenth of the widest gap is one place, rounded in different ways.
+    starts = np.concatenate([[0], np.flatnonzero(gaps > _OFF_GRID * gaps.max()) + 1])
+    middles = np.add.reduceat(values, starts) / np.diff(np.append(starts, len(values)))
+    # Step by step, so that rounding does not add up; where a column has no point, a step is two.
+    steps = np.diff(middles)
+    index = np.concatenate([[0], np.cumsum(np.rint(steps / np.median(steps)))])
+    if not (np.diff(index) > 0).all():
+        raise ValueError(f"{axis} is not on a regular grid: wanted a grid along x and y")
+    spacing, origin = np.polyfit(index, middles, 1)
+    index = np.rint((places - origin) / spacing)
+    off = np.abs(places - origin - index * spacing).max() / spacing
+    if not off <= _OFF_GRID:
+        raise ValueError(f"{axis} lies up to {off:.2f} of a pixel off a regular grid: wanted a grid along x and y")
+    return index.astype(np.int64), int(index.max()) + 1, float(spacing)
+
+
+def _may_be_points(table: NDArray[np.float64]) -> bool:
+    try:
+        (_, columns, _), (_, rows, _) = (_grid(table[:, axis], "x") for axis in range(2))
+    except (ValueError, OverflowError):
+        return False
+    return columns * rows == len(table) > 1
+
+
+def _length(text: str, unit: str) -> float:
+    """A length with its unit, or without it in the user's, in µm."""
+    match = _LENGTH.match(text)
+    try:
+        value, unit = (float(match[1]), match[2]) if match else (float(text), unit)
+    except ValueError:
+        raise ValueError(f"the header: got the length {text[:60]!r}, wanted a number and a unit") from None
+    return value * units.micrometres(unit, "the header")

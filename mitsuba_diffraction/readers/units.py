@@ -1,0 +1,51 @@
+"""Units of length as instruments write them, in µm."""
+
+from __future__ import annotations
+
+_MICROMETRES = {
+    "m": 1e6,
+    "cm": 1e4,
+    "mm": 1e3,
+    "um": 1.0,
+    "µm": 1.0,  # micro sign
+    "μm": 1.0,  # Greek mu
+    "micron": 1.0,
+    "nm": 1e-3,
+    "Å": 1e-4,
+    "\N{ANGSTROM SIGN}": 1e-4,
+    "Angstrom": 1e-4,
+    "pm": 1e-6,
+}
+UNITS = "m, cm, mm, um, nm, Å, pm"
+
+
+def is_length(unit: str) -> bool:
+    """Whether this is a unit of length."""
+    return unit.strip() in _MICROMETRES
+
+
+def micrometres(unit: str, what: str) -> float:
+    """One of `unit` in µm.
+
+    Raises:
+        ValueError: if it is no unit of length.
+    """
+    if not (isinstance(unit, str) and is_length(unit)):
+        raise ValueError(f"{what}: got the unit {unit!r}, wanted a length ({UNITS})")
+    return _MICROMETRES[unit.strip()]
+
+
+def pair(unit: str | tuple[str, str] | None) -> tuple[str, str]:
+    """The units along the surface and of the heights, as the user gives them; empty where none is given.
+
+    Raises:
+        ValueError: if it is neither a unit of length nor two of them.
+    """
+    if unit is None:
+        return "", ""
+    units = (unit, unit) if isinstance(unit, str) else unit
+    if not (isinstance(units, tuple | list) and len(units) == 2):
+        raise ValueError(f"unit: got {unit!r}, wanted a unit of length, or two: along the surface and of the heights")
+    for one in units:
+        micrometres(one, "unit")
+    return units[0], units[1]
