@@ -5,8 +5,9 @@ from __future__ import annotations
 import os
 import secrets
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import BinaryIO
 
 
 @contextmanager
@@ -36,7 +37,63 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     temporary = target.with_name(f".{target.stem}-{secrets.token_hex(4)}{target.suffix}")
     try:
         yield temporary
+        _sync(temporary, os.O_RDWR)
         os.replace(temporary, target)
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
+
+
+@contextmanager
+def durable_file(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
+    """Gives a stream whose content becomes `path` when the block ends well, and outlives a power cut from then on.
+
+    For large files that one process writes again and again. The temporary file `.NAME.partial` beside `path` has one
+    name: what a killed process left is written over by the next, and does not fill the disk.
+
+    Raises:
+        OSError: if it cannot be written (no space, no permission, no folder); `path` stays as it was.
+    """
+    target = Path(os.path.realpath(path))
+    temporary = target.with_name(f".{target.name}.partial")
+    try:
+        with temporary.open("wb") as stream:
+            yield stream
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.replace(temporary, target)
+    except BaseException:
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        raise
+    if hasattr(os, "O_DIRECTORY"):  # the rename itself; not every system can
+        _sync(target.parent, os.O_DIRECTORY)
+
+
+def _sync(path: Path, flags: int) -> None:
+    """Waits until a file or a folder is on the disk."""
+    opened = os.open(path, flags)
+    try:
+        os.fsync(opened)
+    finally:
+        os.close(opened)
+
+
+def refuse_unwritable(path: str | os.PathLike[str]) -> None:
+    """Raises if no file can be made where `path` shall be: better before hours of work than after them.
+
+    Raises:
+        ValueError: with the reason.
+    """
+    try:
+        with whole_file(path) as temporary:
+            temporary.touch()
+            raise _Writable
+    except _Writable:
+        pass
+    except OSError as error:
+        raise ValueError(f"cannot write {os.fspath(path)!r}: {error.strerror or error}") from None
+
+
+class _Writable(Exception):
+    """Nothing stands in the way; the temporary file goes."""

@@ -9,7 +9,8 @@ from PIL import Image
 import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a variant is set)
 from mitsuba_diffraction.color import spectrum_to_linear_sRGB
 from mitsuba_diffraction.render import passes, render
-from mitsuba_diffraction.render.scene import channel_wavelengths, load_spectral_scene
+from mitsuba_diffraction.render.film import trace_pass
+from mitsuba_diffraction.render.scene import channel_wavelengths, channel_weights, load_spectral_scene
 
 GRID = channel_wavelengths()
 CONSTANT = '<emitter type="constant"><spectrum name="radiance" value="1"/></emitter>'
@@ -94,19 +95,22 @@ def test_passes(llvm, tmp_path, monkeypatch):
     again = render(path, spp=512, seed=3)
     np.testing.assert_array_equal(whole.radiance, again.radiance)
     assert (render(path, spp=512, seed=4).radiance != whole.radiance).any()
-    assert whole.attributes == {"scene": "scene.xml", "variant": "llvm_ad_spectral", "spp": 512, "seed": "3"}
+    digest = whole.attributes["digest"]
+    assert whole.attributes == {
+        **{"scene": "scene.xml", "variant": "llvm_ad_spectral", "spp": 512, "seed": "3", "digest": digest}
+    }
 
     calls, fresh = [], []
 
-    def progress(done, total):
+    def progress(done, total, error):
         calls.append((done, total))
         fresh.append([kernel["hash"] for kernel in dr.kernel_history((dr.KernelType.JIT,)) if not kernel["cache_hit"]])
 
     monkeypatch.setattr(passes, "_SAMPLES_PER_PASS", 64 * 150)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         split = render(path, spp=512, seed=3, progress=progress)
-    assert calls == [(128, 512), (256, 512), (384, 512), (512, 512)]
-    assert fresh[1:] == [[], [], []]  # nothing is compiled again
+    assert calls == [(0, 512), (128, 512), (256, 512), (384, 512), (512, 512)]
+    assert fresh[2:] == [[], [], []]  # nothing is compiled again
     # Per channel the two differ by noise only, and the split one is not one pass repeated.
     np.testing.assert_allclose(split.radiance.mean((0, 1)), whole.radiance.mean((0, 1)), rtol=0.25)
     np.testing.assert_allclose(split.radiance.mean(), whole.radiance.mean(), rtol=0.01)
@@ -115,14 +119,91 @@ def test_passes(llvm, tmp_path, monkeypatch):
 
 
 def test_uneven_passes(llvm, tmp_path, monkeypatch):
-    monkeypatch.setattr(passes, "_SAMPLES_PER_PASS", 64 * 3)
+    monkeypatch.setattr(passes, "_SAMPLES_PER_PASS", 1)  # a large picture, so to say: four samples per pixel
     calls = []
-    image = render(write_scene(tmp_path, CONSTANT), spp=7, progress=lambda done, total: calls.append(done))
-    assert calls == [2, 4, 7]
+    path = write_scene(tmp_path, CONSTANT)
+    image = render(path, spp=11, progress=lambda done, total, error: calls.append(done))
+    assert calls == [0, 3, 7, 11]
     np.testing.assert_allclose(image.radiance.mean(), 1, atol=0.1)
-    monkeypatch.setattr(passes, "_SAMPLES_PER_PASS", 1)
-    render(write_scene(tmp_path, CONSTANT), spp=2, progress=lambda done, total: calls.append(done))
-    assert calls[3:] == [1, 2]  # never less than one sample per pixel
+    render(path, spp=2, until_error=0.001, progress=lambda done, total, error: calls.append(done))
+    assert calls[4:] == [0, 1, 2]  # never less than one sample per pixel
+
+
+def test_samplers_that_round_up_are_counted(llvm, tmp_path, monkeypatch):
+    monkeypatch.setattr(passes, "_SAMPLES_PER_PASS", 64 * 6)
+    path = write_scene(tmp_path, CONSTANT)
+    path.write_text(path.read_text().replace("independent", "stratified"))
+    calls = []
+    image = render(path, spp=12, progress=lambda done, total, error: calls.append((done, total)))
+    assert calls == [(0, 18), (9, 18), (18, 18)]
+    assert image.attributes["spp"] == 18
+
+
+BORDERED = """<film type="hdrfilm"><integer name="width" value="24"/><integer name="height" value="20"/>
+    <integer name="crop_offset_x" value="3"/><integer name="crop_offset_y" value="7"/>
+    <integer name="crop_width" value="13"/><integer name="crop_height" value="9"/>
+    <boolean name="sample_border" value="{border}"/><rfilter type="{rfilter}"/></film>"""
+
+
+@pytest.mark.parametrize(
+    ("rfilter", "border", "variant"),
+    [
+        ("box", "false", "llvm_ad_spectral"),
+        ("tent", "true", "llvm_ad_spectral"),
+        pytest.param("tent", "false", "llvm_ad_spectral_polarized", marks=pytest.mark.slow),
+        pytest.param("gaussian", "false", "llvm_ad_spectral", marks=pytest.mark.slow),
+        pytest.param("gaussian", "true", "llvm_ad_spectral", marks=pytest.mark.slow),
+        pytest.param("lanczos", "true", "llvm_ad_spectral", marks=pytest.mark.slow),
+    ],
+)
+def test_a_pass_is_that_of_mitsubas_own_film(rfilter, border, variant, tmp_path):
+    use(variant)
+    film = BORDERED.format(rfilter=rfilter, border=border)
+    scene = load_spectral_scene(write_scene(tmp_path, SPHERE + '<emitter type="constant"/>', film=film))
+    sums = trace_pass(scene, 5, 11)
+    own = np.array(mi.render(scene, spp=5, seed=11)) / channel_weights()
+    ratio = sums[..., :-1] / sums[..., -1:]
+    np.testing.assert_allclose(ratio, own, rtol=0, atol=2e-5 * own.max())
+
+
+LENS = """<sensor type="thinlens"><float name="aperture_radius" value="0.3"/><float name="focus_distance" value="3"/>
+    <float name="shutter_open" value="0"/><float name="shutter_close" value="1"/><transform name="to_world">
+    <lookat origin="0,0,4" target="0,0,0" up="0,1,0"/></transform><sampler type="independent"/>{film}</sensor>"""
+
+
+@pytest.mark.slow
+def test_a_lens_and_a_shutter_take_their_random_numbers(llvm, tmp_path):
+    scene = load_spectral_scene(write_scene(tmp_path, SPHERE + '<emitter type="constant"/>', sensor=LENS))
+    sums = trace_pass(scene, 5, 11)
+    own = np.array(mi.render(scene, spp=5, seed=11)) / channel_weights()
+    np.testing.assert_allclose(sums[..., :-1] / sums[..., -1:], own, rtol=0, atol=2e-5 * own.max())
+
+
+@pytest.fixture
+def threads():
+    before = dr.thread_count()
+    yield dr.set_thread_count
+    dr.set_thread_count(before)
+
+
+@pytest.mark.parametrize("rfilter", ["box", "gaussian"])
+def test_equal_seeds_give_equal_bits_on_any_number_of_threads(llvm, threads, tmp_path, rfilter):
+    # 997 samples of one pixel are split among threads, and 64 pixels lie under one another's filters.
+    film = FILM.replace("box", rfilter)
+    scene = load_spectral_scene(write_scene(tmp_path, SPHERE + CONSTANT, film=film))
+    pictures = []
+    for count in (1, 2, 2, 5):
+        threads(count)
+        pictures.append(trace_pass(scene, 997, 3))
+    assert all((picture == pictures[0]).all() for picture in pictures[1:])
+
+
+@pytest.mark.slow
+def test_integrators_that_do_not_trace_ray_by_ray(llvm, tmp_path):
+    path = write_scene(tmp_path, SPHERE + CONSTANT)
+    expected = render(path, spp=256).radiance.mean()
+    path.write_text(path.read_text().replace('"path"', '"prb"'))
+    np.testing.assert_allclose(render(path, spp=256).radiance.mean(), expected, rtol=0.1)
 
 
 def film_of(path, **sizes):
@@ -259,7 +340,7 @@ def test_failing_and_interrupted_renderings(llvm, tmp_path, raised, expected, me
 def test_interrupt_between_passes(llvm, tmp_path, monkeypatch):
     monkeypatch.setattr(passes, "_SAMPLES_PER_PASS", 64)
 
-    def interrupt(done, total):
+    def interrupt(done, total, error):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):

@@ -1,20 +1,23 @@
-"""`mitsuba-diffraction render`: from a scene to a spectral picture."""
+"""`mitsuba-diffraction render`: from a scene to a spectral picture, or to one for each place of the camera."""
 
 from __future__ import annotations
 
+import math
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from .console import progress_bar, tell
+from .console import err, say, tell
 
 
 def render(
     scene: Annotated[Path, typer.Argument(metavar="SCENE.xml")],
     output: Annotated[Path | None, typer.Option("-o", "--output", help="the spectral picture (.exr)")] = None,
-    spp: Annotated[int, typer.Option(min=1, help="samples per pixel")] = 64,
+    spp: Annotated[int, typer.Option(min=1, help="samples per pixel; with --until-error the most of them")] = 64,
     width: Annotated[int | None, typer.Option(min=1, help="pixels; the scene's own by default")] = None,
     height: Annotated[int | None, typer.Option(min=1, help="pixels; the scene's own by default")] = None,
     variant: Annotated[str | None, typer.Option(help="of Mitsuba; the fastest spectral one by default")] = None,
@@ -22,12 +25,27 @@ def render(
     define: Annotated[
         list[str] | None, typer.Option("-D", metavar="NAME=VALUE", help="a parameter of the scene")
     ] = None,
+    until_error: Annotated[
+        float | None, typer.Option(metavar="ERROR", help="stop when luminance is as sure as this, such as 0.01")
+    ] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="go on where a run of the same command ended")] = False,
+    checkpoint: Annotated[float, typer.Option(min=0, metavar="SECONDS", help="between two checkpoints")] = 60,
+    dask: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="spread the passes over a Dask cluster (tcp://HOST:PORT)")
+    ] = None,
+    frames: Annotated[int | None, typer.Option(min=2, metavar="N", help="pictures of an orbit")] = None,
+    orbit: Annotated[bool, typer.Option("--orbit", help="the camera goes round the scene once")] = False,
 ) -> None:
     """Path-trace a scene into a spectral picture (.exr) and a preview (.png) beside it."""
     import mitsuba as mi
 
-    from ..color import save_preview
-    from ..render import render as trace
+    from ..files import refuse_unwritable
+    from ..render.checkpoint import checkpoint_path
+    from ..render.passes import Interrupted, trace_here
+    from ..render.passes import render as trace
+    from ..render.spectral_image import SpectralImage
+    from ..render.turntable import frame_path, save_animation, save_frame_preview
+    from ..render.turntable import orbit as motions_of_orbit
     from ..variants import choose_variant
 
     target = output or Path(scene.with_suffix(".exr").name)
@@ -35,6 +53,8 @@ def render(
         raise ValueError(f"-o: got {target}, wanted a file name that ends in .exr")
     if not target.parent.is_dir():
         raise ValueError(f"-o: got {target}, but the folder {target.parent} is not there")
+    if (frames is not None) != orbit:
+        raise ValueError("--frames N and --orbit go together")
     parameters = {}
     for item in define or []:
         name, equals, value = item.partition("=")
@@ -42,15 +62,103 @@ def render(
             raise ValueError(f"-D: got {item!r}, wanted NAME=VALUE")
         # A file named on the command line is relative to where the command is given.
         parameters[name] = str(Path(value).resolve()) if Path(value).is_file() else value
+    targets = [target] if frames is None else [frame_path(target, frame, frames) for frame in range(frames)]
+    for path in targets:
+        refuse_unwritable(path)
+        if checkpoint_path(path).exists() and not resume:
+            raise ValueError(
+                f"{checkpoint_path(path)} is of an unfinished rendering: --resume goes on from it; "
+                "remove it to begin anew"
+            )
     mi.set_variant(choose_variant(variant))
-    start = time.perf_counter()
-    with progress_bar(scene.name) as progress:
-        image = trace(scene, spp=spp, width=width, height=height, seed=seed, parameters=parameters, progress=progress)
-    image.save(target)
-    preview = target.with_suffix(".png")
-    exposure = save_preview(image, preview)
-    rows, columns, bins = image.radiance.shape
-    tell(
-        f"{target}: {columns} × {rows} pixels, {bins} wavelengths, {spp} samples per pixel, {mi.variant()}, "
-        f"{time.perf_counter() - start:.1f} s\n{preview}: preview, exposure {exposure:.4g}"
+    tracer = trace_here
+    if dask is not None:
+        from ..render.cluster import trace_on
+
+        tracer = trace_on(dask)
+    motions = [None] if frames is None else motions_of_orbit(scene, frames, parameters)
+
+    exposure = None
+    for number, (path, motion) in enumerate(zip(targets, motions, strict=True)):
+        start = time.perf_counter()
+        waiting = checkpoint_path(path)
+        label = scene.name if frames is None else f"{scene.name} {number + 1}/{frames}"
+        earlier = SpectralImage.load(path) if resume and path.is_file() and not waiting.exists() else None
+        interrupted = False
+        try:
+            with _progress_bar(label) as progress:
+                image = trace(
+                    scene,
+                    spp=spp,
+                    width=width,
+                    height=height,
+                    seed=seed,
+                    parameters=parameters,
+                    motion=motion,
+                    until_error=until_error,
+                    checkpoint=waiting,
+                    seconds=checkpoint,
+                    finished=earlier,
+                    tracer=tracer,
+                    progress=progress,
+                )
+        except Interrupted as error:
+            image, interrupted = error.image, True
+        except KeyboardInterrupt:
+            if not waiting.exists():
+                raise
+            say("interrupted", f"{waiting} holds what there is; the same command with --resume goes on from it")
+            raise typer.Exit(1) from None
+        preview = path.with_suffix(".png")
+        try:
+            if image is not earlier:
+                image.save(path)
+            exposure = save_frame_preview(image, preview, exposure)
+        except (OSError, RuntimeError) as error:
+            kept = f"; {waiting} is whole, and --resume goes on from it" if waiting.exists() else ""
+            raise RuntimeError(f"{path} or its preview cannot be written ({error}){kept}") from error
+        if interrupted:
+            spp = image.attributes["spp"]
+            say("interrupted", f"{path} holds {spp} samples per pixel; the same command with --resume goes on")
+            raise typer.Exit(1)
+        waiting.unlink(missing_ok=True)
+        rows, columns, bins = image.radiance.shape
+        done = f"{image.attributes['spp']} samples per pixel"
+        if "error" in image.attributes:
+            done += f", error {image.attributes['error']:.2g}"
+        tell(
+            f"{path}: {columns} × {rows} pixels, {bins} wavelengths, {done}, {mi.variant()}, "
+            f"{time.perf_counter() - start:.1f} s\n{preview}: preview, exposure {exposure:.4g}"
+        )
+    if frames is not None:
+        animation = target.with_suffix(".webp")
+        save_animation([path.with_suffix(".png") for path in targets], animation)
+        tell(f"{animation}: animated preview, {frames} frames")
+
+
+@contextmanager
+def _progress_bar(label: str) -> Iterator[Callable[[int, int, float], None]]:
+    """Samples per pixel done and expected, the error so far, the time taken and the time left."""
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
     )
+
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn())
+    with Progress(
+        *(*columns, TextColumn("spp{task.fields[noise]}"), TimeElapsedColumn(), TimeRemainingColumn()),
+        console=err,
+        transient=True,
+        disable=not err.is_terminal,
+        speed_estimate_period=600,  # passes of a large picture take longer than the usual half minute
+    ) as bars:
+        task = bars.add_task(label, total=None, noise="")
+
+        def show(done: int, total: int, error: float) -> None:
+            bars.update(task, completed=done, total=total, noise="" if math.isnan(error) else f", error {error:.2g}")
+
+        yield show

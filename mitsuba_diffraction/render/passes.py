@@ -2,18 +2,108 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
-from collections.abc import Callable, Mapping
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, contextmanager
+from dataclasses import asdict, dataclass
+from importlib import metadata
+from itertools import pairwise
 from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
-from .scene import channel_wavelengths, channel_weights, load_spectral_scene, root_cause
+from .accumulation import Accumulation
+from .checkpoint import load_checkpoint, save_checkpoint
+from .film import samples_drawn, trace_pass
+from .scene import channel_wavelengths, load_spectral_scene, scene_digest
 from .spectral_image import SpectralImage
 
-# Two million take some seconds on two cores, so that progress shows and an interrupt is heard.
+# Two million take some seconds on two cores, so that progress shows and an interrupt is heard. A large picture gets
+# eight samples per pixel nevertheless: adding a pass to the sum takes one core as long as a third of a sample.
 _SAMPLES_PER_PASS = 2**21
+_LEAST_SAMPLES_PER_PIXEL = 8
+# Where the noise decides when to stop, it is estimated from the passes: from four on, and of sixteen at least.
+_PASSES_TO_JUDGE = 4
+_LEAST_PASSES_TO_CONVERGE = 16
+# Of the time at most a twentieth goes into checkpoints, however large they are.
+_CHECKPOINT_SHARE = 20
+
+
+@dataclass(frozen=True)
+class Job:
+    """All that decides the bits of a picture, apart from the processor. Processes pass it to each other.
+
+    Attributes:
+        scene: absolute path of the XML file.
+        width, height, parameters, motion: as for `load_spectral_scene`.
+        variant: of Mitsuba.
+        seed: of the random numbers.
+        samples: samples per pixel of each pass.
+        until_error: as for `render`.
+        content: of the scene and the files that it names (`scene_digest`).
+        versions: of the packages that trace.
+    """
+
+    scene: str
+    width: int | None
+    height: int | None
+    parameters: tuple[tuple[str, str], ...]
+    motion: tuple[float, ...] | None
+    variant: str
+    seed: int
+    samples: tuple[int, ...]
+    until_error: float | None
+    content: str
+    versions: tuple[str, ...]
+
+    def digest(self) -> str:
+        """SHA-256 of everything but the place of the scene."""
+        told = {name: value for name, value in asdict(self).items() if name != "scene"}
+        return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
+
+    def load(self) -> mi.Scene:
+        """The scene; errors are those of `load_spectral_scene`."""
+        return load_spectral_scene(
+            self.scene, width=self.width, height=self.height, parameters=dict(self.parameters), motion=self.motion
+        )
+
+    def pass_seed(self, index: int) -> int:
+        """A 32-bit seed for one pass, independent of those of its neighbours and of other `seed`s."""
+        return int(np.random.SeedSequence((self.seed, index)).generate_state(1)[0])
+
+
+# Gives the passes `first`, `first` + 1, … of a job, one after the other; see `trace_here`.
+Tracer = Callable[[Job, "mi.Scene", int], Iterator[NDArray[np.float32]]]
+
+
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C between two passes.
+
+    Attributes:
+        image: the picture from the passes so far.
+    """
+
+    def __init__(self, image: SpectralImage) -> None:
+        super().__init__(f"after {image.attributes['spp']} samples per pixel")
+        self.image = image
+
+
+def trace_here(job: Job, scene: mi.Scene, first: int) -> Iterator[NDArray[np.float32]]:
+    """The passes of a job from `first` on, traced in this process; see `trace_pass`."""
+    for index in range(first, len(job.samples)):
+        yield trace_pass(scene, job.samples[index], job.pass_seed(index))
+
+
+def versions() -> tuple[str, ...]:
+    """Of the packages that decide what a pass gives."""
+    return tuple(f"{name} {metadata.version(name)}" for name in ("mitsuba", "drjit", "mitsuba_diffraction"))
 
 
 def render(
@@ -24,58 +114,153 @@ def render(
     height: int | None = None,
     seed: int = 0,
     parameters: Mapping[str, str] | None = None,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    motion: tuple[float, ...] | None = None,
+    until_error: float | None = None,
+    checkpoint: str | os.PathLike[str] | None = None,
+    seconds: float = 60.0,
+    finished: SpectralImage | None = None,
+    tracer: Tracer = trace_here,
+    progress: Callable[[int, int, float], None] = lambda done, total, error: None,
 ) -> SpectralImage:
     """Renders the first sensor of a scene with its own integrator, spectrally, under the current variant.
 
-    The samples are split into passes of about two million with independent seeds, accumulated in float64. The same
-    seed gives the same picture.
+    The samples are split into passes with independent seeds. Passes are added in float64 in the order of their number,
+    wherever and whenever they were traced: the same seed gives the same bits (within the limits of `trace_pass`),
+    interrupted or not, on one machine or on several.
 
     Args:
         scene_path: an XML scene; its film may be of any kind (see `load_spectral_scene`).
-        spp: samples per pixel, four wavelengths each.
+        spp: samples per pixel, four wavelengths each; the scene's sampler may round it up.
         width: pixels, if the film's size shall not hold.
         height: likewise.
         seed: of the random numbers, not negative.
         parameters: values for the scene's `$name` parameters.
-        progress: called with (done, total) samples per pixel after each pass.
+        motion: of the camera, as for `load_spectral_scene`.
+        until_error: stop as soon as the picture's relative error (`Accumulation.error`) is not above this; spp is then
+            the most that is taken.
+        checkpoint: the file where the sums are kept every so often. If it is there, rendering goes on from it. It stays
+            when the picture is done: who has saved the picture removes it.
+        seconds: between two checkpoints, or twenty times as long as one takes to write, if that is longer.
+        finished: a picture of an earlier run; it is given back if it is what was asked for, and nothing is traced.
+        tracer: who traces the passes; this process by default, see `cluster.trace_on`.
+        progress: called with the samples per pixel done, those to be done (with `until_error`, as many as the noise so
+            far lets expect), and the error so far (not a number before four passes), at the start and after each pass.
 
     Returns:
-        The picture; radiance per nm at `channel_wavelengths()`.
+        The picture; radiance per nm at `channel_wavelengths()`. Its attributes name the scene, the variant, the samples
+        per pixel, the seed, the error (if there were four passes), and the digest of the request that it fulfils.
 
     Raises:
         FileNotFoundError: if there is no such scene.
-        ValueError: if the request is wrong, as for `load_spectral_scene`, or spp or seed is out of range.
+        ValueError: if the request is wrong, as for `load_spectral_scene`, a number is out of range, or the checkpoint
+            is not one of this rendering.
         RuntimeError: if rendering failed, with the cause in one line.
-        KeyboardInterrupt: as it comes; nothing has been written.
+        OSError: if a checkpoint cannot be written; the last one is still whole.
+        Interrupted: on the first Ctrl-C, at the end of the pass, with the picture so far and the checkpoint written.
+        KeyboardInterrupt: on the second Ctrl-C, at once, or if there is no pass yet.
     """
     if spp < 1:
         raise ValueError(f"spp: got {spp}, wanted a positive number of samples per pixel")
     if seed < 0:
         raise ValueError(f"seed: got {seed}, wanted an integer that is not negative")
-    scene = load_spectral_scene(scene_path, width=width, height=height, parameters=parameters)
-    wavelengths = channel_wavelengths()
-    columns, rows = scene.sensors()[0].film().crop_size()
-    total = np.zeros((rows, columns, wavelengths.size))
-    done = 0
-    passes = min(spp, -(-spp * rows * columns // _SAMPLES_PER_PASS))
-    for index in range(passes):
-        samples = spp * (index + 1) // passes - done
-        total += samples * _render_pass(scene, samples, _pass_seed(seed, index))
-        done += samples
-        progress(done, spp)
-    attributes = {"scene": Path(scene_path).name, "variant": mi.variant(), "spp": spp, "seed": str(seed)}
-    return SpectralImage(wavelengths, total / (spp * channel_weights()), attributes)
+    if until_error is not None and not 0 < until_error < 1:
+        raise ValueError(f"until_error: got {until_error}, wanted a relative error between 0 and 1, such as 0.01")
+    where = {"width": width, "height": height, "parameters": dict(parameters or {}), "motion": motion}
+    scene = load_spectral_scene(scene_path, **where)
+    columns, rows = (int(size) for size in scene.sensors()[0].film().crop_size())
+    job = Job(
+        scene=str(Path(scene_path).resolve()),
+        width=width,
+        height=height,
+        parameters=tuple(sorted(where["parameters"].items())),
+        motion=motion,
+        variant=mi.variant(),
+        seed=seed,
+        samples=_split(scene, spp, rows * columns, until_error),
+        until_error=until_error,
+        content=scene_digest(scene_path, parameters),
+        versions=versions(),
+    )
+    if finished is not None and finished.attributes.get("digest") == job.digest():
+        return finished
+
+    total = sum(job.samples)
+    sums = None if checkpoint is None else load_checkpoint(checkpoint, job.digest())
+    saved = 0 if sums is None else sums.samples
+    if sums is None:
+        sums = Accumulation.empty(rows, columns, channel_wavelengths())
+    ends = sums.passes == len(job.samples) or _converged(sums, until_error)
+    progress(sums.samples, _expected(sums, total, until_error), sums.error())
+    last, wait = time.monotonic(), seconds
+    with _deferred_interrupt() as interrupted, closing(tracer(job, scene, sums.passes)) as traced:
+        while not (ends or interrupted()):
+            sums.add(next(traced), job.samples[sums.passes])
+            ends = sums.passes == len(job.samples) or _converged(sums, until_error)
+            progress(sums.samples, _expected(sums, total, until_error), sums.error())
+            due = interrupted() or time.monotonic() - last >= wait
+            if checkpoint is not None and due and not ends:
+                last = time.monotonic()
+                _save(checkpoint, job, sums, saved)
+                saved = sums.samples
+                wait = max(seconds, _CHECKPOINT_SHARE * (time.monotonic() - last))
+    if not sums.passes:
+        raise KeyboardInterrupt
+    attributes = {"scene": Path(scene_path).name, "variant": job.variant, "spp": sums.samples, "seed": str(seed)}
+    if sums.passes >= _PASSES_TO_JUDGE:
+        attributes["error"] = sums.error()
+    if not ends:
+        raise Interrupted(SpectralImage(sums.wavelengths, sums.radiance(), attributes))
+    return SpectralImage(sums.wavelengths, sums.radiance(), {**attributes, "digest": job.digest()})
 
 
-def _pass_seed(seed: int, index: int) -> int:
-    """A 32-bit seed for one pass, independent of those of its neighbours and of other `seed`s."""
-    return int(np.random.SeedSequence((seed, index)).generate_state(1)[0])
+def _split(scene: mi.Scene, spp: int, pixels: int, until_error: float | None) -> tuple[int, ...]:
+    """Samples per pixel of each pass. Nothing but the request decides, so that an interrupt changes no pass."""
+    passes = -(-spp * pixels // max(_SAMPLES_PER_PASS, _LEAST_SAMPLES_PER_PIXEL * pixels))
+    if until_error is not None:
+        passes = max(passes, _LEAST_PASSES_TO_CONVERGE)
+    passes = min(passes, spp)
+    ends = [spp * index // passes for index in range(passes + 1)]
+    return tuple(samples_drawn(scene, end - start) for start, end in pairwise(ends))
 
 
-def _render_pass(scene: mi.Scene, spp: int, seed: int) -> np.ndarray:
-    """One pass, (height, width, n) float32."""
+def _converged(sums: Accumulation, until_error: float | None) -> bool:
+    return until_error is not None and sums.passes >= _PASSES_TO_JUDGE and sums.error() <= until_error
+
+
+def _expected(sums: Accumulation, total: int, until_error: float | None) -> int:
+    """Samples per pixel at the end: the error falls with the root of their number."""
+    if until_error is None or sums.passes < _PASSES_TO_JUDGE or not np.isfinite(sums.error()):
+        return total
+    return min(total, max(sums.samples, round(sums.samples * (sums.error() / until_error) ** 2)))
+
+
+def _save(checkpoint: str | os.PathLike[str], job: Job, sums: Accumulation, saved: int) -> None:
     try:
-        return np.array(mi.render(scene, spp=spp, seed=seed))
-    except Exception as error:
-        raise RuntimeError(f"rendering failed: {root_cause(error)}") from error
+        save_checkpoint(checkpoint, job.digest(), sums)
+    except OSError as error:
+        left = f"the last one, of {saved} samples per pixel, is whole" if saved else "there is none yet"
+        raise OSError(f"{os.fspath(checkpoint)}: cannot be written ({error.strerror or error}); {left}") from error
+
+
+@contextmanager
+def _deferred_interrupt() -> Iterator[Callable[[], bool]]:
+    """Gives what tells whether there was a Ctrl-C; a second one interrupts at once.
+
+    An exception between two statements would leave the sums and their count in disagreement. Python hears signals in
+    the main thread alone.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield lambda: False
+        return
+    before = signal.getsignal(signal.SIGINT)
+    asked = threading.Event()
+
+    def note(number: int, frame: object) -> None:
+        asked.set()
+        signal.signal(signal.SIGINT, before)
+
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield asked.is_set
+    finally:
+        signal.signal(signal.SIGINT, before)

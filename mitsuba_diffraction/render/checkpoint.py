@@ -1,0 +1,63 @@
+"""The file in which an unfinished rendering waits.
+
+It is NumPy's `.npz`, not compressed (noise does not shrink): the fields of `Accumulation`, and `digest`, that of the
+request (`passes.Job`). The zip format's checksums tell a damaged file. It takes 8 bytes per pixel and channel, 690 MB
+for 1280 × 720 pixels; while one is written, the one before is there as well.
+"""
+
+from __future__ import annotations
+
+import os
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+from ..files import durable_file
+from .accumulation import Accumulation
+
+
+def checkpoint_path(picture: Path) -> Path:
+    """Where the checkpoint of a picture lies: beside it."""
+    return picture.with_name(f"{picture.name}.checkpoint")
+
+
+def save_checkpoint(path: str | os.PathLike[str], digest: str, sums: Accumulation) -> None:
+    """Writes a checkpoint. At any moment, be it of a kill or a power cut, `path` is the old one or the new one.
+
+    Raises:
+        OSError: if it cannot be written; the old one stays.
+    """
+    with durable_file(path) as stream:
+        np.savez(stream, digest=digest, **vars(sums))
+
+
+def load_checkpoint(path: str | os.PathLike[str], digest: str) -> Accumulation | None:
+    """Reads a checkpoint.
+
+    Args:
+        path: where it lies.
+        digest: of the request.
+
+    Returns:
+        The sums, or None if there is no such file.
+
+    Raises:
+        ValueError: if it is damaged, not a checkpoint, or one of another request.
+    """
+    try:
+        with open(path, "rb") as stream, np.load(stream) as content:
+            found = content["digest"].item()
+            if found == digest:
+                names = [name for name in content.files if name != "digest"]
+                read = {name: content[name] for name in names}
+                read = {name: value if value.ndim else value.item() for name, value in read.items()}
+                return Accumulation(**read)
+    except FileNotFoundError:
+        return None
+    except (ValueError, KeyError, TypeError, EOFError, AttributeError, zipfile.BadZipFile) as error:
+        raise ValueError(f"{os.fspath(path)}: not a checkpoint, or a damaged one ({error})") from None
+    raise ValueError(
+        f"{os.fspath(path)}: of another rendering: the scene or a file that it names, an option, or a version is not "
+        "what it was; give what was given then, or remove the file to begin anew"
+    )

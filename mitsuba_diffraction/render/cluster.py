@@ -1,0 +1,103 @@
+"""Passes on other machines: a Dask cluster that exists already (the extra `cluster`).
+
+Each pass is a task. A worker loads the scene once, for as long as passes of one rendering come in, and traces one pass
+at a time with as many threads as it was started with. Results are taken in the order of the passes, whichever comes
+first, so that the sum has the same bits as on one machine; twice as many passes as there were workers at the start are
+under way, and no more wait anywhere. If a worker is lost, Dask gives its passes to the others.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections import deque
+from collections.abc import Iterator
+from concurrent import futures
+from contextlib import suppress
+from functools import lru_cache
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from .film import trace_pass
+from .passes import Job, Tracer, versions
+from .scene import scene_digest
+
+# Dr.Jit's threads share one pass; two at a time would only take the memory of two.
+_one_pass = threading.Lock()
+_SECONDS_TO_CONNECT = 30
+
+
+def trace_on(address: str) -> Tracer:
+    """Who traces the passes of `render` on the workers of a Dask cluster.
+
+    All workers need this package in the same version, the same kind of processor for equal bits, and the scene and its
+    files under the same path, as on a shared disk.
+
+    Args:
+        address: of the scheduler, such as `tcp://10.0.0.1:8786`.
+
+    Raises:
+        RuntimeError: if `distributed` is not installed; later, while rendering: if the scheduler or workers are not
+            there or no longer there, differ in versions, find other files, or a pass fails, with the cause in one line.
+    """
+    try:
+        import distributed
+    except ImportError:
+        raise RuntimeError(
+            "a Dask cluster needs the package distributed: pip install 'mitsuba_diffraction[cluster]'"
+        ) from None
+
+    def trace(job: Job, scene: mi.Scene, first: int) -> Iterator[NDArray[np.float32]]:
+        try:
+            client = distributed.Client(address, timeout=_SECONDS_TO_CONNECT, set_as_default=False)
+        except (OSError, ValueError) as error:
+            raise RuntimeError(f"no Dask scheduler at {address}: {error}") from error
+        with client:
+            waiting: deque[distributed.Future] = deque()
+            try:
+                client.wait_for_workers(1, timeout=_SECONDS_TO_CONNECT)
+                ahead = 2 * len(client.nthreads())
+                for index in range(first, len(job.samples)):
+                    while len(waiting) < ahead and index + len(waiting) < len(job.samples):
+                        task = client.submit(_trace_there, job, index + len(waiting), pure=False)
+                        waiting.append(task)
+                    traced = waiting[0].result()
+                    waiting.popleft()
+                    yield traced
+                    del traced
+            except (distributed.TimeoutError, TimeoutError):
+                raise RuntimeError(f"the Dask scheduler at {address} has no workers") from None
+            except (asyncio.CancelledError, futures.CancelledError):
+                raise RuntimeError(f"the Dask scheduler at {address} is gone") from None
+            except distributed.KilledWorker as error:
+                raise RuntimeError(f"workers of {address} end while they trace: {error}") from None
+            finally:
+                with suppress(distributed.TimeoutError, TimeoutError, OSError):
+                    client.cancel(list(waiting), force=True)
+
+    return trace
+
+
+def _trace_there(job: Job, index: int) -> NDArray[np.float32]:
+    """One pass, on a worker."""
+    import distributed
+
+    if versions() != job.versions:
+        raise RuntimeError(f"a worker has {', '.join(versions())}; wanted {', '.join(job.versions)}")
+    with _one_pass:
+        mi.set_variant(job.variant)
+        threads = distributed.get_worker().state.nthreads
+        if dr.thread_count() != threads:
+            dr.set_thread_count(threads)
+        return trace_pass(_scene(job), job.samples[index], job.pass_seed(index))
+
+
+@lru_cache(maxsize=1)
+def _scene(job: Job) -> mi.Scene:
+    scene = job.load()
+    if scene_digest(job.scene, dict(job.parameters)) != job.content:
+        raise RuntimeError(f"{job.scene}: a worker finds another scene there, or other files that it names")
+    return scene

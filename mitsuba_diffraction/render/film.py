@@ -1,0 +1,177 @@
+"""One pass: trace samples and filter them onto pixels, so that equal seeds give equal bits.
+
+Mitsuba adds the samples to its film from several threads with atomic additions. Floating-point sums depend on their
+order, so that a picture traced twice differs in its last bits as soon as two threads meet in one pixel: with every
+filter wider than a pixel, and with the box filter where the samples of one pixel are split among threads. Here the
+samples are kept, and each pixel collects its own in a fixed order: the result depends neither on threads nor on luck.
+
+It is also faster. Four wavelengths touch eight of the hat-shaped channels at most, and only those are added to, where a
+`specfilm` adds all 93 for each sample and each pixel under the filter: two million samples of `scenes/blaze.xml` take
+one core 0.6 s where Mitsuba's film takes 1.5 s, and with a Gaussian filter 3.0 s instead of 3.7 s.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from .scene import channel_wavelengths, channel_weights, root_cause
+
+
+def trace_pass(scene: mi.Scene, spp: int, seed: int) -> NDArray[np.float32]:
+    """Traces the first sensor once and gives the sums from which radiance follows.
+
+    With the filter f, the continuous position p_s of the sample s, its radiance L_s(λ) at four wavelengths λ_sj
+    (divided by their density) and the hats t_i of unit area around the channels' wavelengths, a pixel at c holds
+
+        Σ_s f(c − p_s) ¼ Σ_j L_s(λ_sj) t_i(λ_sj)    in channel i,    and last    Σ_s f(c − p_s);
+
+    their ratio is radiance per nm. Sums of passes add up, and their ratio does not depend on how they were split.
+
+    The bits depend on the seed, the scene, the versions of Mitsuba and Dr.Jit and the kind of processor, not on the
+    number of threads. Scalar variants and Mitsuba's differentiable integrators (`prb`, ...) trace with Mitsuba's own
+    film, and their last bits are not certain.
+
+    Args:
+        scene: as `load_spectral_scene` gives it.
+        spp: samples per pixel; the scene's sampler may take more (`samples_drawn`).
+        seed: 32 bits.
+
+    Returns:
+        (height, width, n + 1) float32.
+
+    Raises:
+        RuntimeError: if tracing failed, with the cause in one line.
+    """
+    integrator = scene.integrator()
+    try:
+        if (
+            mi.variant().startswith("scalar")
+            or not isinstance(integrator, mi.SamplingIntegrator)
+            or isinstance(integrator, mi.CppADIntegrator)
+        ):
+            return _trace_with_mitsubas_film(scene, spp, seed)
+        return _trace(scene, integrator, spp, seed)
+    except Exception as error:
+        raise RuntimeError(f"rendering failed: {root_cause(error)}") from error
+
+
+def samples_drawn(scene: mi.Scene, spp: int) -> int:
+    """How many samples per pixel the scene's sampler takes if asked for `spp`: some round up, to a square or a power of
+    two."""
+    sampler = scene.sensors()[0].sampler().clone()
+    sampler.set_sample_count(spp)
+    return sampler.sample_count()
+
+
+def _trace_with_mitsubas_film(scene: mi.Scene, spp: int, seed: int) -> NDArray[np.float32]:
+    picture = np.array(mi.render(scene, spp=spp, seed=seed)) / channel_weights().astype(np.float32)
+    drawn = np.float32(samples_drawn(scene, spp))
+    return np.concatenate([picture * drawn, np.full((*picture.shape[:2], 1), drawn)], axis=-1)
+
+
+def _trace(scene: mi.Scene, integrator: mi.SamplingIntegrator, spp: int, seed: int) -> NDArray[np.float32]:
+    sensor = scene.sensors()[0]
+    film = sensor.film()
+    columns, rows = (int(size) for size in film.crop_size())
+    rfilter = film.rfilter()
+    border = rfilter.border_size() if film.sample_border() else 0
+    traced_columns, traced_rows = columns + 2 * border, rows + 2 * border
+
+    sampler = sensor.sampler().clone()
+    sampler.set_sample_count(spp)
+    spp = sampler.sample_count()
+    sampler.set_samples_per_wavefront(spp)
+    size = traced_columns * traced_rows * spp
+    sampler.seed(seed, size)
+
+    # Opaque, so that passes of other sizes run the same kernels.
+    count, stride = dr.opaque(mi.UInt32, spp), dr.opaque(mi.UInt32, traced_columns)
+    pixel = dr.arange(mi.UInt32, size) // count
+    row = pixel // stride
+    corner = mi.Vector2f(mi.Vector2i(pixel - row * stride, row)) - border
+    position = corner + sampler.next_2d()
+    aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
+    time = mi.Float(sensor.shutter_open())
+    if sensor.shutter_open_time() > 0:
+        time += sampler.next_1d() * sensor.shutter_open_time()
+    ray, weight = sensor.sample_ray_differential(
+        time, sampler.next_1d(), position / mi.ScalarVector2f(columns, rows), aperture
+    )
+    ray.scale_differential(spp**-0.5)
+    traced, _, _ = integrator.sample(scene, sampler, ray, sensor.get_medium())
+    # The weight holds the response of the film, by whose density wavelengths are drawn.
+    seen = dr.zeros(mi.SurfaceInteraction3f)
+    seen.wavelengths = ray.wavelengths
+    response = film.sensor_response_function().eval(seen)
+    radiance = mi.unpolarized_spectrum(weight * traced) * dr.select(response > 0, dr.rcp(response), 0)
+
+    centres = channel_wavelengths()
+    step = float(centres[1] - centres[0])
+    channel = (ray.wavelengths - float(centres[0])) / step
+    value = radiance / (len(radiance) * step)
+    dr.eval(position, channel, value)
+    sums = _collect(rfilter, position, channel, value, (rows, columns), border, count, centres.size)
+    return np.array(sums).reshape(rows, columns, centres.size + 1)
+
+
+@dr.syntax
+def _collect(rfilter, position, channel, value, size, border, count, channels):
+    """Adds to each pixel the samples under its filter, row by row; one lane does it all for one pixel."""
+    rows, columns = size
+    reach = int(np.ceil(rfilter.radius() - 0.5))
+    box = rfilter.is_box_filter()
+    width = 2 * reach + 1
+    pixel = dr.arange(mi.UInt32, rows * columns)
+    across = dr.opaque(mi.UInt32, columns)
+    y = mi.Int32(pixel // across)
+    x = mi.Int32(pixel) - y * mi.Int32(across)
+    base = pixel * (channels + 1)
+    sums = dr.zeros(mi.Float, rows * columns * (channels + 1))
+    stride = mi.Int32(across) + 2 * border
+    last_x, last_y = mi.Int32(across) + border, dr.opaque(mi.Int32, rows + border)
+
+    weight = dr.zeros(mi.Float, rows * columns)
+    tap = mi.UInt32(0)
+    while tap < width * width:
+        source_y = y + mi.Int32(tap // width) - reach
+        source_x = x + mi.Int32(tap % width) - reach
+        inside = (source_x >= -border) & (source_y >= -border) & (source_x < last_x) & (source_y < last_y)
+        first = mi.UInt32((source_y + border) * stride + source_x + border) * count
+        index = mi.UInt32(0)
+        while index < count:
+            at = first + index
+            share = mi.Float(1)
+            if dr.hint(not box, mode="scalar"):
+                away_x = mi.Float(x) + 0.5 - dr.gather(mi.Float, position.x, at, inside)
+                away_y = mi.Float(y) + 0.5 - dr.gather(mi.Float, position.y, at, inside)
+                share = rfilter.eval(away_x, inside) * rfilter.eval(away_y, inside)
+            for i in range(len(channel)):
+                where = dr.gather(mi.Float, channel[i], at, inside)
+                what = dr.gather(mi.Float, value[i], at, inside) * share
+                lower = dr.floor(where)
+                upper_share = where - lower
+                k = mi.Int32(lower)
+                dr.scatter_reduce(
+                    dr.ReduceOp.Add,
+                    sums,
+                    what * (1 - upper_share),
+                    base + mi.UInt32(k),
+                    inside & (k >= 0) & (k < channels),
+                    dr.ReduceMode.NoConflicts,
+                )
+                dr.scatter_reduce(
+                    dr.ReduceOp.Add,
+                    sums,
+                    what * upper_share,
+                    base + mi.UInt32(k + 1),
+                    inside & (k >= -1) & (k < channels - 1),
+                    dr.ReduceMode.NoConflicts,
+                )
+            weight += dr.select(inside, share, 0)
+            index += 1
+        tap += 1
+    dr.scatter(sums, weight, base + channels)
+    return sums
