@@ -82,10 +82,30 @@ def spectrum_to_linear_sRGB(radiance: ArrayLike, wavelengths: ArrayLike) -> NDAr
 
     Arguments and errors are those of `spectrum_to_XYZ`.
     """
+    return XYZ_to_linear_sRGB(spectrum_to_XYZ(radiance, wavelengths))
+
+
+def XYZ_to_linear_sRGB(XYZ: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Linear sRGB of XYZ, (..., 3) each; negative parts outside the gamut."""
     import colour
 
-    XYZ = spectrum_to_XYZ(radiance, wavelengths)
     return XYZ @ colour.RGB_COLOURSPACES["sRGB"].matrix_XYZ_to_RGB.T
+
+
+def delta_E(XYZ_1: ArrayLike, XYZ_2: ArrayLike) -> NDArray[np.float64]:
+    """The colour difference CIEDE2000 (CIE 142, ISO/CIE 11664-6) to an eye that takes D65 with Y = 1 for white.
+
+    Args:
+        XYZ_1: (..., 3).
+        XYZ_2: likewise.
+
+    Returns:
+        (...).
+    """
+    import colour
+
+    white = colour.CCS_ILLUMINANTS[_OBSERVER]["D65"]
+    return colour.delta_E(*(colour.XYZ_to_Lab(np.asarray(XYZ), white) for XYZ in (XYZ_1, XYZ_2)), method="CIE 2000")
 
 
 def into_gamut(rgb: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -161,14 +181,15 @@ def auto_exposure(rgb: NDArray[np.floating]) -> float:
     return float(1 / np.percentile(lit, 97))
 
 
-def save_preview(image: SpectralImage, path: str | os.PathLike[str]) -> float:
+def save_preview(image: SpectralImage, path: str | os.PathLike[str], exposure: float | None = None) -> float:
     """Writes an 8-bit sRGB picture of a spectral image, in the format that the ending of `path` names.
 
-    Spectra → linear sRGB → `into_gamut` → × exposure (`auto_exposure`) → `roll_off` → sRGB's transfer function.
+    Spectra → linear sRGB → `into_gamut` → × exposure → `roll_off` → sRGB's transfer function.
 
     Args:
         image: the spectral image.
         path: where to write, such as `picture.png`.
+        exposure: the factor for linear sRGB; by default `auto_exposure`.
 
     Returns:
         The exposure: the factor by which linear sRGB was multiplied.
@@ -176,13 +197,19 @@ def save_preview(image: SpectralImage, path: str | os.PathLike[str]) -> float:
     Raises:
         ValueError: if Pillow knows no format of that ending.
     """
-    import colour
     from PIL import Image
 
     rgb = into_gamut(spectrum_to_linear_sRGB(image.radiance, image.wavelengths))
-    exposure = auto_exposure(rgb)
-    shown = colour.cctf_encoding(roll_off(rgb * exposure), function="sRGB")
-    pixels = np.round(255 * np.clip(shown, 0.0, 1.0)).astype(np.uint8)
+    if exposure is None:
+        exposure = auto_exposure(rgb)
     with whole_file(path) as temporary:
-        Image.fromarray(pixels).save(temporary)
+        Image.fromarray(on_screen(rgb * exposure)).save(temporary)
     return exposure
+
+
+def on_screen(rgb: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """Exposed linear sRGB without negative parts → `roll_off` → sRGB's transfer function, in 8 bits."""
+    import colour
+
+    shown = colour.cctf_encoding(roll_off(rgb), function="sRGB")
+    return np.round(255 * np.clip(shown, 0.0, 1.0)).astype(np.uint8)

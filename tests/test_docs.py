@@ -21,7 +21,7 @@ BLOCK = re.compile(r"^(?P<indent> *)```(?P<language>\w+)\n(?P<body>.*?)^ *```$",
 REDUCED = {
     "render": "--width 16 --spp 1",
     "precompute": "--tolerance 0.05",
-    "compare": "--width 16 --spp 1",
+    "compare": "--width 16 --spp 1 --no-shares",
 }
 """Options that make a command quick; they stand last, and the last one counts."""
 SHELL = {"text"}

@@ -11,6 +11,7 @@ from typing import Annotated
 
 import typer
 
+from .arguments import scene_parameters
 from .console import err, say, tell
 
 
@@ -39,12 +40,13 @@ def render(
     """Path-trace a scene into a spectral picture (.exr) and a preview (.png) beside it."""
     import mitsuba as mi
 
+    from ..color import save_preview
     from ..files import refuse_unwritable
     from ..render.checkpoint import checkpoint_path
     from ..render.passes import Interrupted, trace_here
     from ..render.passes import render as trace
     from ..render.spectral_image import SpectralImage
-    from ..render.turntable import frame_path, save_animation, save_frame_preview
+    from ..render.turntable import frame_path, save_animation
     from ..render.turntable import orbit as motions_of_orbit
     from ..variants import choose_variant
 
@@ -55,13 +57,7 @@ def render(
         raise ValueError(f"-o: got {target}, but the folder {target.parent} is not there")
     if (frames is not None) != orbit:
         raise ValueError("--frames N and --orbit go together")
-    parameters = {}
-    for item in define or []:
-        name, equals, value = item.partition("=")
-        if not (name and equals):
-            raise ValueError(f"-D: got {item!r}, wanted NAME=VALUE")
-        # A file named on the command line is relative to where the command is given.
-        parameters[name] = str(Path(value).resolve()) if Path(value).is_file() else value
+    parameters = scene_parameters(define)
     targets = [target] if frames is None else [frame_path(target, frame, frames) for frame in range(frames)]
     for path in targets:
         refuse_unwritable(path)
@@ -113,7 +109,7 @@ def render(
         try:
             if image is not earlier:
                 image.save(path)
-            exposure = save_frame_preview(image, preview, exposure)
+            exposure = save_preview(image, preview, exposure)
         except (OSError, RuntimeError) as error:
             kept = f"; {waiting} is whole, and --resume goes on from it" if waiting.exists() else ""
             raise RuntimeError(f"{path} or its preview cannot be written ({error}){kept}") from error

@@ -13,10 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ..color import auto_exposure, into_gamut, roll_off, spectrum_to_linear_sRGB
 from ..files import whole_file
 from .scene import load_spectral_scene
-from .spectral_image import SpectralImage
 
 _FRAMES_PER_SECOND = 12
 
@@ -86,20 +84,6 @@ def frame_path(picture: Path, frame: int, frames: int) -> Path:
     """`picture.exr` → `picture_007.exr`."""
     digits = max(3, len(str(frames - 1)))
     return picture.with_name(f"{picture.stem}_{frame:0{digits}d}{picture.suffix}")
-
-
-def save_frame_preview(image: SpectralImage, path: str | os.PathLike[str], exposure: float | None) -> float:
-    """Writes an 8-bit sRGB picture as `color.save_preview` does, with the exposure given; returns the exposure."""
-    import colour
-    from PIL import Image
-
-    rgb = into_gamut(spectrum_to_linear_sRGB(image.radiance, image.wavelengths))
-    if exposure is None:
-        exposure = auto_exposure(rgb)
-    shown = colour.cctf_encoding(roll_off(rgb * exposure), function="sRGB")
-    with whole_file(path) as temporary:
-        Image.fromarray(np.round(255 * np.clip(shown, 0.0, 1.0)).astype(np.uint8)).save(temporary)
-    return exposure
 
 
 def save_animation(previews: Iterable[Path], path: str | os.PathLike[str]) -> None:

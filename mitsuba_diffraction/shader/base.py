@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from numbers import Integral, Real
+from typing import ClassVar
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..bsdf.tables import opaque
 from ..coherence import SUN_COHERENCE_LENGTH, lobe_width
 from ..heightfield import HeightField
 from .gain import PUBLISHED_R0, Gain, fresnel_ratio
@@ -25,12 +28,23 @@ class Shader:
 
     Directions are unit vectors along the axes of the tile, z the normal, both away from the surface: ω_i to the light,
     ω_o to the viewer. An instance belongs to the variant of Mitsuba under which it was made.
+
+    Attributes:
+        own_quirks: the names of the quirks that change something in this shader.
     """
+
+    own_quirks: ClassVar[tuple[str, ...]]
 
     def __init__(self, height_field: HeightField, quirks: Quirks, shadowing: bool = True) -> None:
         self.tile_size = height_field.tile_size
         self.quirks = quirks
         self.shadowing = shadowing
+
+    def with_quirks(self, quirks: Quirks) -> Shader:
+        """The same shader with other quirks; the two share their tables."""
+        other = copy.copy(self)
+        other.quirks = quirks
+        return other
 
     def weights(self, r_0: ArrayLike = PUBLISHED_R0, light: ArrayLike | None = None) -> SpectralWeights:
         """The colour weights for a material and a light, as `SpectralWeights` has them."""
@@ -76,6 +90,10 @@ class TextureShader(Shader):
     |P|² = 1 being that of a flat mirror, and the colour ∫ ρ(λ) S(λ) (x̄, ȳ, z̄) dλ.
     """
 
+    own_quirks = (
+        *("fresnel_squared", "fixed_index", "floor_anchor", "heights_from_zero"),
+        *("d65_light", "relative", "d65_twice", "cie_rgb_matrix"),
+    )
     origin = "corner"
 
     def __init__(
@@ -109,9 +127,25 @@ class TextureShader(Shader):
         self.coherence_length = coherence_length
         self.step = float(step)
         self.wavelength_count = round(steps) + 1
-        self.textures = TextureSum(
-            TaylorTextures.of(height_field, terms, heights_from_zero=quirks.heights_from_zero, origin=self.origin)
-        )
+        self._height_field, self._terms = height_field, terms
+        self._textures: dict[bool, TextureSum] = {}
+        self._bind()
+
+    def with_quirks(self, quirks: Quirks) -> TextureShader:
+        other = super().with_quirks(quirks)
+        other._bind()
+        return other
+
+    def _bind(self) -> None:
+        """What the quirks decide before shading."""
+        from_zero = self.quirks.heights_from_zero
+        if from_zero not in self._textures:
+            self._textures[from_zero] = TextureSum(
+                TaylorTextures.of(self._height_field, self._terms, heights_from_zero=from_zero, origin=self.origin)
+            )
+        self.textures = self._textures[from_zero]
+        matrix = rgb_matrix(cie_rgb_matrix=self.quirks.cie_rgb_matrix, d65_twice=self.quirks.d65_twice)
+        self.matrix = [[opaque(float(entry)) for entry in row] for row in matrix]
 
     @property
     def sigma(self) -> float:
@@ -168,9 +202,8 @@ class TextureShader(Shader):
         active: mi.Bool = True,
         height_scale: mi.Float = 1.0,
     ) -> mi.Color3f:
-        matrix = rgb_matrix(cie_rgb_matrix=self.quirks.cie_rgb_matrix, d65_twice=self.quirks.d65_twice)
         xyz = self.xyz(wi, wo, weights, active, height_scale)
-        return mi.Color3f(*(sum(float(row[i]) * xyz[i] for i in range(3)) for row in matrix))
+        return mi.Color3f(*(sum(row[i] * xyz[i] for i in range(3)) for row in self.matrix))
 
     @property
     def texels_per_term(self) -> int:

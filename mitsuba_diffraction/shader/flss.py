@@ -26,9 +26,16 @@ class FLSS(TextureShader):
     tile is much smaller. With T > L_c neighbours overlap, and the complex sum is one place x₀ instead of the average.
     """
 
+    own_quirks = (*TextureShader.own_quirks, "window_pi", "complex_window_sum")
+
     @property
     def texels_per_term(self) -> int:
         return (2 * REACH + 1) ** 2
+
+    @property
+    def left_out(self) -> float:
+        """e^{−(3/2)²/(σ_f T)²}, T the longer side: the most of a line's power that the neighbourhood leaves out."""
+        return float(np.exp(-((1.5 / (self.sigma * max(self.tile_size))) ** 2)))
 
     def power(self, gain: Gain, wavelength: mi.Float, height_scale: mi.Float, active: mi.Bool) -> mi.Float:
         x, y = self.position(gain, wavelength)

@@ -31,6 +31,8 @@ class GEM(Shader):
         roughness: r in 1/µm.
     """
 
+    own_quirks = ("infrared_rainbow",)
+
     def __init__(
         self,
         height_field: HeightField,

@@ -41,7 +41,7 @@ and show the direct light of a path tracer with fresnel="schlick", without the B
 
 
 @dataclass(frozen=True, eq=False)
-class _Prepared:
+class Prepared:
     """What a scene needs before it is rendered: its lights, and per surface the shader and a table for each light."""
 
     lights: list[Light]
@@ -68,15 +68,20 @@ def define() -> type:
                 raise ValueError(f"diffuse_weight: got {self.diffuse_weight}, wanted 0 to 1")
             self.emission = Emission()
             self._shaders: list[tuple[mi.BSDF, Shader]] = []
-            self._prepared: _Prepared | None = None
+            self.prepared: Prepared | None = None
 
         def render(self, scene: mi.Scene, *args: object, **kwargs: object) -> mi.TensorXf:
             # Lights and materials may have changed since the last time.
-            self._prepared = self.prepare(scene)
+            self.prepare(scene)
             return mi.SamplingIntegrator.render(self, scene, *args, **kwargs)
 
-        def prepare(self, scene: mi.Scene) -> _Prepared:
-            """Reads the lights and the gratings of a scene.
+        def take(self, quirks: Quirks) -> None:
+            """Has other quirks from the next `prepare` on; textures that are there are kept."""
+            self.quirks = quirks
+            self._shaders = [(grating, shader.with_quirks(quirks)) for grating, shader in self._shaders]
+
+        def prepare(self, scene: mi.Scene) -> Prepared:
+            """Reads the lights and the gratings of a scene, for all that follows.
 
             Raises:
                 ValueError: if the shader cannot show them.
@@ -86,7 +91,8 @@ def define() -> type:
             for surface in surfaces_of(scene):
                 shader, r_0 = self.shader_of(surface.grating), _normal_reflectance(surface.grating)
                 surfaces.append((surface, shader, [shader.weights(r_0, light.spectrum) for light in lights]))
-            return _Prepared(lights, surfaces)
+            self.prepared = Prepared(lights, surfaces)
+            return self.prepared
 
         def shader_of(self, grating: mi.BSDF) -> Shader:
             """The shader of a grating; its textures are computed once."""
@@ -109,7 +115,20 @@ def define() -> type:
             medium: mi.Medium | None = None,
             active: mi.Bool = True,
         ) -> tuple[mi.Spectrum, mi.Bool, list[mi.Float]]:
-            prepared = self._prepared or self.prepare(scene)
+            rgb, radiance, active = self.shade(scene, ray, active)
+            radiance += self.emission(rgb, ray.wavelengths, active)
+            return mi.depolarizer(radiance), active, []
+
+        def shade(
+            self, scene: mi.Scene, ray: mi.RayDifferential3f, active: mi.Bool = True
+        ) -> tuple[mi.Color3f, mi.UnpolarizedSpectrum, mi.Bool]:
+            """What a ray sees.
+
+            Returns:
+                The gratings' light as the shader has it, linear sRGB; that of all other BSDFs, per nm at the ray's
+                wavelengths; and whether something was hit.
+            """
+            prepared = self.prepared or self.prepare(scene)
             si = scene.ray_intersect(ray, active)
             active = active & si.is_valid()
             bsdf = si.bsdf(ray)
@@ -151,8 +170,7 @@ def define() -> type:
                     rgb += dr.select(here, share * falloff * colour, 0)
             if self.quirks.power_gamma:
                 rgb = decode(encode(rgb, True))
-            radiance += self.emission(rgb, ray.wavelengths, active)
-            return mi.depolarizer(radiance), active, []
+            return dr.select(active, rgb, 0), radiance, active
 
         def to_string(self) -> str:
             on = [name for name in Quirks.names() if getattr(self.quirks, name)]

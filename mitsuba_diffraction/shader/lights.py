@@ -71,5 +71,8 @@ def lights_of(scene: mi.Scene) -> list[Light]:
     """
     found = [Light(emitter) for emitter in scene.emitters() if emitter.class_name() in Light.KINDS]
     if not found:
-        raise ValueError("diffraction_shader: the scene has no directional or point light, and it knows no other")
+        raise ValueError(
+            "diffraction_shader: the scene has no directional or point light, and it knows no other; in place of a "
+            "sun's disc give it a directional light"
+        )
     return found

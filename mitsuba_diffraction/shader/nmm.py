@@ -34,6 +34,8 @@ class NMM(FLSS):
     where λ_n²/|u| = d · dλ/dn is the Jacobian that the thesis leaves out, so that violet is too strong.
     """
 
+    own_quirks = (*FLSS.own_quirks, "no_jacobian")
+
     @property
     def texel_reads(self) -> int:
         """At |u| = 2, the most that there is."""

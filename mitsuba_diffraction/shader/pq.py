@@ -32,6 +32,7 @@ class PQ(TextureShader):
     exist. The thesis sums n = 0 … N, that is N + 1 tiles (eq. 3.33).
     """
 
+    own_quirks = (*TextureShader.own_quirks, "wrong_product")
     origin = "centre"
 
     def __init__(

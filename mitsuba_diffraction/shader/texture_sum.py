@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..bsdf.tables import PacketTable
+from ..bsdf.tables import PacketTable, opaque
 from .taylor_textures import TaylorTextures
 
 
@@ -18,7 +18,7 @@ class TextureSum:
     def __init__(self, textures: TaylorTextures) -> None:
         self.columns, self.rows = textures.orders
         self.terms = textures.terms
-        self.height = textures.height
+        self.height = opaque(textures.height)
         self.table = PacketTable(np.stack([textures.texels.real, textures.texels.imag], axis=-1), width=2)
 
     def amplitude(

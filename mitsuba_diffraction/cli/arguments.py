@@ -1,0 +1,22 @@
+"""Arguments that several commands take."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+
+def scene_parameters(define: Sequence[str] | None) -> dict[str, str]:
+    """The scene's parameters from the -D NAME=VALUE of a command line.
+
+    Raises:
+        ValueError: if one is not of that form.
+    """
+    parameters = {}
+    for item in define or []:
+        name, equals, value = item.partition("=")
+        if not (name and equals):
+            raise ValueError(f"-D: got {item!r}, wanted NAME=VALUE")
+        # A file named on the command line is relative to where the command is given.
+        parameters[name] = str(Path(value).resolve()) if Path(value).is_file() else value
+    return parameters

@@ -1,0 +1,106 @@
+"""How much of the difference each peculiarity of the published shader makes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from .difference import difference, noise, white_luminance
+from .pictures import Pictures, Progress, silent
+
+
+@dataclass(frozen=True)
+class QuirkShare:
+    """One quirk against one reference; both numbers are differences of mean CIEDE2000.
+
+    Attributes:
+        drop: of the published shader, when this quirk alone is corrected.
+        rise: of the corrected shader, when this quirk alone is put in.
+    """
+
+    drop: float
+    rise: float
+
+
+@dataclass(frozen=True)
+class AgainstReference:
+    """The quirks against one reference.
+
+    Attributes:
+        published: mean CIEDE2000 of the shader as published.
+        corrected: of the shader without quirks.
+        noise: of the reference; None if it has one sample per pixel.
+        shares: by the name of the quirk.
+    """
+
+    published: float
+    corrected: float
+    noise: float | None
+    shares: dict[str, QuirkShare]
+
+    def share(self, name: str) -> float:
+        """The share of a quirk in the difference of the published shader: (drop + rise)/2 over `published`."""
+        return (self.shares[name].drop + self.shares[name].rise) / 2 / self.published
+
+
+@dataclass(frozen=True)
+class QuirkShares:
+    """Shares of all quirks.
+
+    `drop` is what a quirk makes beside all others, `rise` what it makes alone; a share takes the mean of both. Shares
+    do not add up to one, and may be negative: two quirks may cancel each other, or one may hide behind another.
+
+    Attributes:
+        size: (width, height) of the pictures.
+        samples: per pixel of the path tracer, and shading points of the shader.
+        path_traced: against the path tracer's picture.
+        same_light: against the project's model under the light that the shader knows.
+    """
+
+    size: tuple[int, int]
+    samples: tuple[int, int]
+    path_traced: AgainstReference
+    same_light: AgainstReference
+
+
+def quirk_shares(pictures: Pictures, samples: int, shading_points: int, progress: Progress = silent) -> QuirkShares:
+    """Renders the shader with every single quirk corrected, and with every single quirk put in.
+
+    Args:
+        pictures: of a small size.
+        samples: per pixel of the references.
+        shading_points: per pixel of the shader.
+        progress: called with (pictures done, pictures in all).
+    """
+    names = pictures.quirks
+    done, total = 2, 2 * len(names) + 4
+    references = [pictures.path_traced(samples)]
+    progress(1, total)
+    references.append(pictures.same_light(samples))
+    progress(2, total)
+    white = white_luminance(references[0].xyz, pictures.surface)
+
+    def distances(quirks: tuple[str, ...]) -> list[float]:
+        """To both references."""
+        nonlocal done
+        xyz = pictures.shaded(quirks, shading_points, samples).xyz
+        done += 1
+        progress(done, total)
+        return [difference(reference.xyz, xyz, pictures.surface, white).mean for reference in references]
+
+    published, corrected = distances(names), distances(())
+    without = {name: distances(tuple(other for other in names if other != name)) for name in names}
+    alone = {name: distances((name,)) for name in names}
+    results = [
+        AgainstReference(
+            published=published[index],
+            corrected=corrected[index],
+            noise=noise(reference.halves, pictures.surface, white),
+            shares={
+                name: QuirkShare(published[index] - without[name][index], alone[name][index] - corrected[index])
+                for name in names
+            },
+        )
+        for index, reference in enumerate(references)
+    ]
+    rows, columns = pictures.surface.shape
+    return QuirkShares((columns, rows), (samples, shading_points), *results)
