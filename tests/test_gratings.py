@@ -198,14 +198,14 @@ def test_a_skin_resembles_the_scan(name, period):
 # ---------------------------------------------------------------- misuse
 
 
-@pytest.mark.parametrize("name", sorted(PROFILES))
+@pytest.mark.parametrize("name", sorted(set(PROFILES) - {"ruled"}))
 @pytest.mark.parametrize("period", [0, -1.0, np.nan, np.inf, "2"])
 def test_a_period_must_be_positive(name, period):
     with pytest.raises(ValueError, match=r"period: got .* wanted a positive number"):
         PROFILES[name](period=period, depth=0.1)
 
 
-@pytest.mark.parametrize("name", sorted(PROFILES))
+@pytest.mark.parametrize("name", sorted(set(PROFILES) - {"ruled"}))
 @pytest.mark.parametrize("depth", [-0.1, np.nan, None])
 def test_a_depth_must_not_be_negative(name, depth):
     with pytest.raises(ValueError, match=r"depth: got .* zero or more"):

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import mitsuba as mi
 
-from ..gratings import PROFILES
+from ..gratings import COHERENCE_LENGTHS, PROFILES
 from ..recipe import Recipe
 from ..spectrum import GratingSpectrum
 
@@ -40,7 +40,8 @@ def surface_from(props: mi.Properties) -> tuple[GratingSpectrum, Recipe | None]:
         raise ValueError(f"profile: got {name!r}, wanted one of {', '.join(PROFILES)}")
     known = inspect.signature(PROFILES[name]).parameters
     surface = {"profile": name, **{key: props[key] for key in known if key in props}}
-    settings = {key: props[key] for key in ("coherence_length", "tolerance") if key in props}
+    settings = {"coherence_length": COHERENCE_LENGTHS[name]} if name in COHERENCE_LENGTHS else {}
+    settings |= {key: props[key] for key in ("coherence_length", "tolerance") if key in props}
     recipe = Recipe(surface, settings)
     return recipe.cached(), recipe
 

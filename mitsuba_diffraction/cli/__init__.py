@@ -13,6 +13,7 @@ import typer
 from .benchmark import benchmark
 from .compare import compare
 from .console import NAME, say
+from .inspect import inspect
 from .precompute import precompute
 from .render import render
 
@@ -20,7 +21,7 @@ from .render import render
 _UsageError = typer.BadParameter.__base__
 
 app = typer.Typer(add_completion=False, no_args_is_help=False, help="Diffraction gratings for Mitsuba 3.")
-for _command in (precompute, render, compare, benchmark):
+for _command in (inspect, precompute, render, compare, benchmark):
     app.command()(_command)
 
 

@@ -9,9 +9,8 @@ import typer
 
 from ..coherence import SUN_COHERENCE_LENGTH
 from ..precompute import REPRESENTATIONS
-from ..prepare import STEP_NAMES, step_of
-from ..recipe import Recipe
 from .console import progress_bar, tell
+from .scan import Channel, FillMissing, HeightRange, PixelSize, Prepare, Unit, options_of_scan, recipe_of
 
 
 def precompute(
@@ -19,20 +18,12 @@ def precompute(
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="the spectrum (.exr); beside you by default")
     ] = None,
-    pixel_size: Annotated[float | None, typer.Option(help="of a scan, µm")] = None,
-    height_range: Annotated[float | None, typer.Option(help="of a scan, black to white, µm")] = None,
-    fill_missing: Annotated[
-        bool, typer.Option("--fill-missing", help="of a scan, fill pixels without a height from their surroundings")
-    ] = False,
-    channel: Annotated[str | None, typer.Option(help="of a scan with several, a name or a number")] = None,
-    unit: Annotated[
-        list[str] | None,
-        typer.Option(help="of a scan whose file names none; given twice: along the surface, and of the heights"),
-    ] = None,
-    prepare: Annotated[
-        list[str] | None,
-        typer.Option(help=f"of a scan, a step, done in the order given: {', '.join(STEP_NAMES)}; NAME=ARGUMENT"),
-    ] = None,
+    pixel_size: PixelSize = None,
+    height_range: HeightRange = None,
+    fill_missing: FillMissing = False,
+    channel: Channel = None,
+    unit: Unit = None,
+    prepare: Prepare = None,
     representation: Annotated[str | None, typer.Option(help=", ".join(REPRESENTATIONS))] = None,
     tolerance: Annotated[float | None, typer.Option(help="error allowed, as a share of the reflected power")] = None,
     extent: Annotated[
@@ -54,21 +45,13 @@ def precompute(
         "tolerance": tolerance,
     }
     settings = {name: value for name, value in given.items() if value is not None}
-    of_scan = {
-        "pixel_size": pixel_size,
-        "height_range": height_range,
-        "fill_missing": fill_missing or None,
-        "channel": channel,
-        "unit": unit[0] if unit and len(unit) == 1 else unit or None,
-        "prepare": [step_of(text) for text in prepare] if prepare else None,
-    }
-    of_scan = {name: value for name, value in of_scan.items() if value is not None}
+    of_scan = options_of_scan(pixel_size, height_range, fill_missing, channel, unit, prepare)
     for source in sources:
         target = output or Path(source.with_suffix(".exr").name)
         if target.suffix.lower() != ".exr":
             raise ValueError(f"-o: got {target}, wanted a file name that ends in .exr")
         with progress_bar(f"spectrum of {source.name}") as progress:
-            spectrum = _recipe(source, of_scan, settings).build(progress)
+            spectrum = recipe_of(source, of_scan, settings).build(progress)
             spectrum.save(target)
         tell(
             f"{target}: {spectrum.source}; {spectrum.extent}, {spectrum.grid}; coherence length "
@@ -77,13 +60,3 @@ def precompute(
             f"left out, at most: {spectrum.dropped:.1e} of the power in weak frequencies; {spectrum.beyond:.1e} where "
             "no light reaches or no pixel resolves"
         )
-
-
-def _recipe(source: Path, of_scan: dict[str, object], settings: dict[str, object]) -> Recipe:
-    if source.suffix.lower() != ".toml":
-        return Recipe({"scan": source.name, **of_scan}, settings, source.parent)
-    if of_scan:
-        names = ", ".join(f"--{name.replace('_', '-')}" for name in of_scan)
-        raise ValueError(f"{names} go with a scan; the recipe {source} has its own")
-    recipe = Recipe.load(source)
-    return Recipe(recipe.surface, {**recipe.spectrum, **settings}, recipe.folder)

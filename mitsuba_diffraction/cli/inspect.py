@@ -1,0 +1,181 @@
+"""`mitsuba-diffraction inspect`: what a scan holds, what it will look like, and how far that can be trusted."""
+
+from __future__ import annotations
+
+import json as json_format
+import math
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from ..coherence import SUN_COHERENCE_LENGTH, lobe_width
+from ..files import whole_file
+from ..inspection import Inspection, save_picture
+from ..inspection import inspect as look
+from ..inspection.picture import with_uncertainty
+from ..inspection.uncertainty import GREEN
+from .console import out, progress_bar, tell
+from .scan import Channel, FillMissing, HeightRange, PixelSize, Prepare, Unit, options_of_scan, recipe_of
+
+
+def inspect(
+    source: Annotated[Path, typer.Argument(metavar="SCAN|RECIPE", help="a scan, or a recipe (.toml)")],
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", help="the picture (.png, .pdf, .svg); NAME_inspect.png beside you by default"),
+    ] = None,
+    pixel_size: PixelSize = None,
+    height_range: HeightRange = None,
+    fill_missing: FillMissing = False,
+    channel: Channel = None,
+    unit: Unit = None,
+    prepare: Prepare = None,
+    json: Annotated[Path | None, typer.Option(help="write the numbers here, too")] = None,
+) -> None:
+    """Statistics, periods and predicted colours of a surface, and how far they can be trusted; a picture."""
+    picture = output or Path(f"{source.stem}_inspect.png")
+    for option, path in (("-o", picture), ("--json", json)):
+        if path is not None and not path.parent.is_dir():
+            raise ValueError(f"{option}: got {path}, but the folder {path.parent} is not there")
+    if picture.suffix.lower() not in (".png", ".pdf", ".svg"):
+        raise ValueError(f"-o: got {picture}, wanted a file name that ends in .png, .pdf or .svg")
+    of_scan = options_of_scan(pixel_size, height_range, fill_missing, channel, unit, prepare)
+    recipe = recipe_of(source, of_scan, {})
+    height_field = recipe.height_field()
+    with progress_bar(f"spectra of {source.name}") as progress:
+        inspection = look(
+            height_field,
+            extent=recipe.spectrum.get("extent", "tile" if source.suffix.lower() == ".toml" else "sample"),
+            coherence_length=recipe.spectrum.get("coherence_length", SUN_COHERENCE_LENGTH),
+            measured="scan" in recipe.surface,
+            progress=progress,
+        )
+    save_picture(inspection, picture, title=source.stem if source.suffix == ".toml" else source.name)
+    if json is not None:
+        with whole_file(json) as temporary:
+            temporary.write_text(json_format.dumps(inspection.as_json(), indent=2) + "\n", encoding="utf-8")
+    # Wide enough wherever it goes, a file too.
+    wide = Console(highlight=False, width=max(out.width, 130))
+    wide.print(_table(inspection))
+    if inspection.changes:
+        wide.print()
+        wide.print(_changes_table(inspection))
+        wide.print()
+    for concern in inspection.concerns:
+        tell(f"! {concern}")
+    tell(f"{picture}: height map, spectrum and predicted colours" + (f"\n{json}: the numbers" if json else ""))
+
+
+def _table(inspection: Inspection) -> Table:
+    table = Table(box=None, show_header=False, pad_edge=False)
+    table.add_column(style="bold", no_wrap=True)
+    table.add_column()
+    for name, value in [*_surface(inspection), *_light(inspection)]:
+        table.add_row(name, value)
+    return table
+
+
+def _surface(inspection: Inspection) -> list[tuple[str, str]]:
+    field, numbers = inspection.height_field, inspection.statistics
+    rows, columns = field.shape
+    kind = "one tile, repeats" if inspection.extent == "tile" else "a piece of a larger surface"
+    levels = f"{numbers.levels} different heights"
+    if 1 < numbers.levels <= 256:
+        levels += f", {numbers.step * 1e3:.3g} nm apart"
+    return [
+        ("surface", _escaped(f"{field.source} ({kind})")),
+        ("size", f"{field.tile_size[0]:.4g} × {field.tile_size[1]:.4g} µm, {columns} × {rows} pixels"),
+        ("pixel size", f"{field.pixel_size[0] * 1e3:.4g} × {field.pixel_size[1] * 1e3:.4g} nm"),
+        ("missing", f"{field.filled} pixels, filled" if field.filled else "none"),
+        ("heights", f"{_nm(field.height_range)} from lowest to highest; {levels}"),
+        *(
+            [("tilt", f"{round(numbers.tilt, 3):g}°, {round(numbers.tilt_height * 1e3, 1):g} nm from corner to corner")]
+            if inspection.extent == "sample"
+            else []
+        ),
+        ("roughness", f"Sa {_nm(numbers.Sa)}, Sq {_nm(numbers.Sq)}, Sz {_nm(numbers.Sz)}"),
+        ("slopes", f"Sdq {numbers.Sdq:.3g} (r.m.s.); one pixel in a hundred above {numbers.steepest:.3g}°"),
+    ]
+
+
+def _light(inspection: Inspection) -> list[tuple[str, str]]:
+    lines = []
+    for number, period in enumerate(inspection.periods):
+        where = f"{with_uncertainty(period.direction, period.direction_uncertainty)}° from x"
+        lines.append(
+            (
+                "period" if number == 0 else "another period",
+                f"{with_uncertainty(period.period, period.period_uncertainty)} µm along {where}; "
+                f"{period.strength:.1%} of the variance",
+            )
+        )
+    if not inspection.periods:
+        lines.append(("period", "none stands out"))
+    else:
+        angles = []
+        for order in range(1, 4):
+            sine = order * GREEN / inspection.periods[0].period
+            if sine < 1:
+                angles.append(f"{math.degrees(math.asin(sine)):.1f}°")
+        where = ", ".join(angles) or "no angle: the period is shorter than the wavelength"
+        lines.append(("550 nm goes to", f"{where} (orders 1, 2, … at normal incidence)" if angles else where))
+    lobe = math.degrees(GREEN * lobe_width(inspection.coherence_length))
+    length = f"{inspection.coherence_length:.3g} µm"
+    if inspection.extent == "sample":
+        length += f" (the scan carries {inspection.carried:.3g} of sunlight's {SUN_COHERENCE_LENGTH:g})"
+    lines.append(("coherence length", f"{length}: at 550 nm an order is ±{lobe:.2g}° wide (1 σ)"))
+    lines.append(("scalar theory", _scalar(inspection)))
+    return lines
+
+
+def _scalar(inspection: Inspection) -> str:
+    errors = inspection.scalar_error
+    if not errors:
+        return "not told without a period"
+    told = [nm for nm, error in errors.items() if np.isfinite(error)]
+    if not told:
+        return "does not hold: the period is under a wavelength, or the surface deeper than two"
+    text = f"within {' / '.join(f'{errors[nm]:.1%}' for nm in told)} of rigorous calculation at "
+    text += f"{' / '.join(map(str, told))} nm"
+    beyond = [f"{nm} nm" for nm in errors if nm not in told]
+    text += f"; beyond all that was calculated at {', '.join(beyond)}" if beyond else ""
+    worst = max(errors[nm] for nm in told)
+    return text + ("; right directions, powers only roughly" if worst > 0.1 else "")
+
+
+def _changes_table(inspection: Inspection) -> Table:
+    before = inspection.changes[0].before
+    table = Table(box=None, pad_edge=False)
+    table.add_column("5 % more or less of", no_wrap=True)
+    table.add_column("period", justify="right")
+    for order, share in before.items():
+        table.add_column(f"light in orders ±{order}, {share:.3g}", justify="right")
+        table.add_column("their colour", justify="right")
+    for change in inspection.changes:
+        name = f"{change.what} {change.by:+.0%}"
+        if np.isfinite(change.tip_radius):
+            kind = "blunter" if change.tip_radius > 0 else "sharper"
+            name += f" (tip {kind} by {abs(change.tip_radius) * 1e3:.0f} nm)"
+        cells = [f"{change.period:+.1%}"]
+        for order, share in before.items():
+            cells += [
+                f"{change.after[order] / share - 1:+.1%}" if share > 0 else "",
+                f"ΔE00 {change.colour[order]:.1f}",
+            ]
+        table.add_row(name, *cells)
+    return table
+
+
+def _nm(length: float) -> str:
+    return f"{length * 1e3:.3g} nm" if length < 1 else f"{length:.4g} µm"
+
+
+def _escaped(text: str) -> str:
+    """No markup in file names."""
+    from rich.markup import escape
+
+    return escape(text)

@@ -1,0 +1,88 @@
+"""A periodic patch on which small shapes are drawn."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import erf
+
+from ..heightfield import HeightField, as_pixel_size
+from .checks import check_positive
+
+Array = NDArray[np.float64]
+
+
+class Canvas:
+    """A periodic patch on which small shapes are drawn; what leaves it on one side comes back on the other.
+
+    Attributes:
+        size: (x, y) µm, along the diffracting axis rounded to a whole number of pitches.
+        count: whole numbers of pitches along x and y.
+        pitch: (x, y) µm, the mean distances that fill the size.
+        heights: (N_y, N_x) µm.
+    """
+
+    def __init__(
+        self, size: float | tuple[float, float], pixel_size: float, pitch: tuple[float, float], axis: int
+    ) -> None:
+        try:
+            self.size = as_pixel_size(size)
+        except ValueError:
+            raise ValueError(f"size: got {size!r}, wanted a positive number or (x, y) in µm") from None
+        check_positive("pixel_size", pixel_size)
+        if self.size[0] < 2 * pitch[0] or self.size[1] < 4 * pitch[1]:
+            raise ValueError(
+                f"size: got {size!r} µm, wanted at least 2 rows × 4 fingers, {2 * pitch[0]:.4g} × {4 * pitch[1]:.4g} µm"
+            )
+        if pixel_size > min(pitch) / 4:
+            raise ValueError(f"pixel_size: got {pixel_size!r} µm, wanted at most {min(pitch) / 4:.4g} µm")
+        columns, rows = (round(s / pixel_size) for s in self.size)
+        self.count = tuple(round(s / p) for s, p in zip(self.size, pitch, strict=True))
+        # The period is what is seen: along its axis the size gives way, not the pitch.
+        self.size = tuple(pitch[i] * self.count[i] if i == axis else self.size[i] for i in (0, 1))
+        self.pitch = tuple(s / n for s, n in zip(self.size, self.count, strict=True))
+        self.pixel = (self.size[0] / columns, self.size[1] / rows)
+        self.heights = np.zeros((rows, columns))
+
+    def places(self, axis: int) -> Array:
+        """Centres of the pitches along x (0) or y (1), µm."""
+        return (np.arange(self.count[axis]) + 0.5) * self.pitch[axis]
+
+    def window(self, x: tuple[float, float], y: tuple[float, float]) -> tuple[tuple[Array, Array], Array, Array]:
+        """Pixels of the box x[0]…x[1], y[0]…y[1] µm.
+
+        Returns:
+            index: of the pixels in `heights`, wrapped round.
+            X, Y: centres of the pixels, (1, n_x) and (n_y, 1), µm, not wrapped.
+        """
+        columns, rows = (
+            np.arange(int(np.floor(a / p)), min(int(np.ceil(b / p)), int(np.floor(a / p)) + n))
+            for (a, b), p, n in zip((x, y), self.pixel, self.heights.shape[::-1], strict=True)
+        )
+        index = np.ix_(rows % self.heights.shape[0], columns % self.heights.shape[1])
+        return index, (columns[None, :] + 0.5) * self.pixel[0], (rows[:, None] + 0.5) * self.pixel[1]
+
+    def noise(self, rng: np.random.Generator, length_x: float, length_y: float) -> Array:
+        """Periodic Gaussian noise, mean 0, standard deviation 1, correlation exp(−x²/4 length_x² − …), (N_y, N_x)."""
+        rows, columns = self.heights.shape
+        q_x = np.fft.rfftfreq(columns, self.pixel[0])
+        q_y = np.fft.fftfreq(rows, self.pixel[1])[:, None]
+        filter_ = np.exp(-2 * np.pi**2 * ((q_x * length_x) ** 2 + (q_y * length_y) ** 2))
+        filter_[0, 0] = 0
+        field = np.fft.irfft2(np.fft.rfft2(rng.standard_normal((rows, columns))) * filter_, s=(rows, columns))
+        return field / field.std()
+
+    def at(self, field: Array, x: float, y: float) -> float:
+        """Value of a field at a place, µm, wrapped round."""
+        rows, columns = field.shape
+        return field[int(y / self.pixel[1]) % rows, int(x / self.pixel[0]) % columns]
+
+    def height_field(self, rng: np.random.Generator, depth: float, source: str) -> HeightField:
+        """What was drawn, scaled to `depth`, from a random origin: two seeds do not share a lattice."""
+        heights = np.roll(self.heights - self.heights.min(), rng.integers(self.heights.shape), axis=(0, 1))
+        return HeightField(heights / heights.max() * depth, self.pixel, source)
+
+
+def smooth_step(x: Array, width: float) -> Array:
+    """Smooth step from 0 to 1 at x = 0."""
+    return (1 + erf(x / width)) / 2

@@ -1,0 +1,26 @@
+"""What all profiles ask of their arguments."""
+
+from __future__ import annotations
+
+from numbers import Integral, Real
+
+import numpy as np
+
+
+def check_positive(name: str, value: float) -> None:
+    if not (isinstance(value, Real) and np.isfinite(value) and value > 0):
+        raise ValueError(f"{name}: got {value!r}, wanted a positive number in µm")
+
+
+def check_profile(period: float, depth: float, samples: int = 2) -> None:
+    check_positive("period", period)
+    if not (isinstance(depth, Real) and np.isfinite(depth) and depth >= 0):
+        raise ValueError(f"depth: got {depth!r}, wanted a number in µm, zero or more")
+    if not (isinstance(samples, Integral) and samples >= 2):
+        raise ValueError(f"samples: got {samples!r}, wanted a whole number of at least 2")
+
+
+def generator(seed: int) -> np.random.Generator:
+    if not (isinstance(seed, Integral) and seed >= 0):
+        raise ValueError(f"seed: got {seed!r}, wanted a whole number, zero or more")
+    return np.random.default_rng(int(seed))

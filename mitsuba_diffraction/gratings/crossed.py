@@ -1,0 +1,35 @@
+"""Crossed grating: two sinusoids at right angles."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..heightfield import HeightField
+from .checks import check_positive, check_profile
+from .line_profile import phase
+
+
+def crossed(period: float, depth: float, *, period_y: float | None = None, samples: int = 128) -> HeightField:
+    """Sum of a sinusoid along x and one along y, so that the orders are products |F_m|² = |F_{m_x}|² |F_{m_y}|².
+
+    Args:
+        period: wavelength along x, µm.
+        depth: from the valleys to the peaks of *each* sinusoid, µm; the sum spans twice that.
+        period_y: wavelength along y, µm; that along x if left out.
+        samples: pixels per period in either direction.
+
+    Returns:
+        One period in each direction, (samples, samples).
+
+    Raises:
+        ValueError: if a period is not positive, the depth negative, or samples below two.
+    """
+    check_profile(period, depth, samples)
+    period_y = period if period_y is None else period_y
+    check_positive("period_y", period_y)
+    wave = depth / 2 * np.sin(2 * np.pi * phase(samples))
+    return HeightField(
+        wave[:, None] + wave,
+        (period / samples, period_y / samples),
+        f"crossed grating, periods {period:g} × {period_y:g} µm, depth {depth:g} µm each",
+    )

@@ -1,0 +1,191 @@
+"""Everything there is to know about a surface before it is rendered."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ..coherence import SUN_COHERENCE_LENGTH, lobe_width
+from ..heightfield import HeightField
+from ..periods import Period, find_periods
+from ..precompute import VISIBLE, precompute
+from ..reference import check_extent
+from ..scalar_theory import expected_error
+from ..spectrum import GratingSpectrum
+from ..welch import carried_coherence_length
+from .colours import LONGEST_COHERENCE
+from .concerns import concerns
+from .statistics import Statistics, statistics
+from .uncertainty import SHARE, Change, changes
+
+SCALAR_AT = (450, 550, 650)
+"""nm."""
+
+_TOLERANCE = 0.02
+_FEW_PIXELS = 256
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """A surface in numbers.
+
+    Attributes:
+        height_field: the surface.
+        extent: "tile" or "sample".
+        statistics: heights, slopes, tilt.
+        periods: strongest first; none where nothing stands out.
+        carried: the coherence length that a scan carries, µm, at most that of sunlight; of a tile, any.
+        coherence_length: what is asked for, as far as it is carried, µm.
+        scalar_error: nm → expected error of scalar theory as a share of the reflected power; NaN where rigorous
+            results do not reach; empty without a period.
+        changes: what ±5 % of height scale, pixel size and tip broadening do; empty without a period.
+        concerns: what stands in the way of a right picture.
+        spectrum: of at most `LONGEST_COHERENCE`, for predicted colours.
+        shown: the height field, a small tile repeated until it shows how it goes on.
+    """
+
+    height_field: HeightField
+    extent: str
+    statistics: Statistics
+    periods: tuple[Period, ...]
+    carried: float
+    coherence_length: float
+    scalar_error: Mapping[int, float]
+    changes: tuple[Change, ...]
+    concerns: tuple[str, ...]
+    spectrum: GratingSpectrum = field(repr=False)
+    shown: HeightField = field(repr=False)
+
+    @property
+    def direction(self) -> float:
+        """Of the plane in which colours are shown: that of the main period, else x; degrees."""
+        return self.periods[0].direction if self.periods else 0.0
+
+    def as_json(self) -> dict[str, object]:
+        """All numbers under their names, lengths in µm; what is not a number is null."""
+        rows, columns = self.height_field.shape
+        return _plain(
+            {
+                "source": self.height_field.source,
+                "extent": self.extent,
+                "pixels": [columns, rows],
+                "pixel_size": self.height_field.pixel_size,
+                "size": self.height_field.tile_size,
+                "filled": self.height_field.filled,
+                "statistics": dataclasses.asdict(self.statistics),
+                "periods": [dataclasses.asdict(period) for period in self.periods],
+                "carried_coherence_length": self.carried,
+                "coherence_length": self.coherence_length,
+                "scalar_error": self.scalar_error,
+                "changes": [dataclasses.asdict(change) for change in self.changes],
+                "concerns": self.concerns,
+            }
+        )
+
+
+def inspect(
+    height_field: HeightField,
+    *,
+    extent: str = "sample",
+    coherence_length: float = SUN_COHERENCE_LENGTH,
+    measured: bool = True,
+    progress: Callable[[int, int], None] | None = None,
+) -> Inspection:
+    """Look at a surface.
+
+    Args:
+        height_field: the surface.
+        extent: "sample": a piece of a larger, irregular surface; "tile": it repeats.
+        coherence_length: that is wanted, µm.
+        measured: whether it is a scan; only of scans one asks for tilt and steps of the heights.
+        progress: called with (steps done, steps in all).
+
+    Raises:
+        ValueError: on an unknown extent, a coherence length that is not positive, or a sample of too few pixels.
+    """
+    check_extent(extent)
+    lobe_width(coherence_length)
+    sun = SUN_COHERENCE_LENGTH
+    carried = carried_coherence_length(height_field, sun) if extent == "sample" else max(sun, coherence_length)
+    used = min(float(coherence_length), carried)
+    step = iter(range(1, 5))
+    report = progress or (lambda done, total: None)
+
+    def build(surface: HeightField) -> GratingSpectrum:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # of pixels and coherence `concerns` tells in its own words
+            spectrum = precompute(
+                surface,
+                extent=extent,
+                coherence_length=min(used, LONGEST_COHERENCE),
+                # Heights may be scaled up by the share that is tried.
+                wavelengths=(VISIBLE[0] / (1 + SHARE), VISIBLE[1]),
+                tolerance=_TOLERANCE,
+            )
+        report(next(step), 4)
+        return spectrum
+
+    numbers = statistics(height_field, extent=extent)
+
+    def as_it_goes_on(surface: HeightField) -> HeightField:
+        return _repeated(surface) if extent == "tile" else surface
+
+    def find(surface: HeightField) -> tuple[Period, ...]:
+        whole = as_it_goes_on(surface)
+        found = find_periods(whole)
+        return found if whole is surface else tuple(_on_lattice(period, surface) for period in found)
+
+    periods = find(height_field)
+    spectrum = build(height_field)
+    # The sinusoid of the same roughness stands for the surface.
+    depth = 2 * math.sqrt(2) * numbers.Sq
+    result = Inspection(
+        height_field=height_field,
+        extent=extent,
+        statistics=numbers,
+        periods=periods,
+        carried=carried,
+        coherence_length=used,
+        scalar_error={nm: expected_error(periods[0].period, depth, nm * 1e-3) for nm in SCALAR_AT} if periods else {},
+        changes=changes(height_field, spectrum, periods[0], extent=extent, build=build, find=find) if periods else (),
+        concerns=concerns(height_field, numbers, used, measured=measured),
+        spectrum=spectrum,
+        shown=as_it_goes_on(height_field),
+    )
+    report(4, 4)
+    return result
+
+
+def _repeated(height_field: HeightField) -> HeightField:
+    """A tile of few pixels, eight times along each axis: its period shows only where it is repeated."""
+    if min(height_field.shape) >= _FEW_PIXELS:
+        return height_field
+    return HeightField(np.tile(height_field.heights, (8, 8)), height_field.pixel_size, height_field.source)
+
+
+def _on_lattice(period: Period, tile: HeightField) -> Period:
+    """A period of a tile that repeats is one of its orders: exactly known."""
+    along = np.deg2rad(period.direction)
+    order = np.rint(np.array([np.cos(along), np.sin(along)]) / period.period * tile.tile_size)
+    if not order.any():
+        return period
+    q = order / tile.tile_size
+    direction = float(np.degrees(np.arctan2(q[1], q[0])))
+    direction = direction - 180 * np.sign(direction) if not -90 < direction <= 90 else direction
+    return Period(float(1 / np.hypot(*q)), direction, 0.0, 0.0, period.strength)
+
+
+def _plain(value: object) -> object:
+    """As JSON has it: dictionaries with texts for keys, lists, finite numbers or None."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

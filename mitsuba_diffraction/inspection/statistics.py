@@ -1,0 +1,83 @@
+"""The numbers by which surfaces are compared: ISO 25178-2 height and slope parameters, tilt, steps of the heights."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..heightfield import HeightField
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """A height field in numbers. Sa, Sq, Sz and Sdq are about the reference plane (ISO 25178-2, without filters).
+
+    Attributes:
+        Sa: arithmetical mean height, mean |h|, µm.
+        Sq: root mean square height, µm.
+        Sz: maximum height, highest to lowest, µm.
+        Sdq: root mean square slope (gradient between neighbouring pixels), a number.
+        steepest: slope, in degrees, that one pixel in a hundred exceeds.
+        tilt: of the reference plane, degrees from level.
+        tilt_height: height difference of the reference plane from corner to corner of the patch, µm.
+        levels: how many different heights there are.
+        step: smallest difference between two of them, µm; 0 where all are equal.
+    """
+
+    Sa: float
+    Sq: float
+    Sz: float
+    Sdq: float
+    steepest: float
+    tilt: float
+    tilt_height: float
+    levels: int
+    step: float
+
+
+def statistics(height_field: HeightField, *, extent: str = "sample") -> Statistics:
+    """The numbers of a height field, about `reference_plane`."""
+    heights = height_field.heights
+    plane, slopes = reference_plane(height_field, extent)
+    level = heights - plane
+    gradients = [
+        np.gradient(level, pixel, axis=axis) if level.shape[axis] > 1 else np.zeros_like(level)
+        for axis, pixel in ((1, height_field.pixel_size[0]), (0, height_field.pixel_size[1]))
+    ]
+    slope = np.hypot(*gradients)
+    values = np.unique(heights)
+    # What arithmetic makes of equal numbers is no difference.
+    steps = np.diff(values)
+    steps = steps[steps > 1e-9 * max(np.abs(values).max(), 1e-300)]
+    return Statistics(
+        Sa=float(np.abs(level).mean()),
+        Sq=float(np.sqrt(np.mean(level**2))),
+        Sz=float(np.ptp(level)),
+        Sdq=float(np.sqrt(np.mean(slope**2))),
+        steepest=float(np.degrees(np.arctan(np.quantile(slope, 0.99)))),
+        tilt=float(np.degrees(np.arctan(np.hypot(*slopes)))),
+        tilt_height=float(np.ptp(plane)),
+        levels=len(steps) + 1,
+        step=float(steps.min()) if len(steps) else 0.0,
+    )
+
+
+def reference_plane(height_field: HeightField, extent: str) -> tuple[Array, tuple[float, float]]:
+    """The plane from which heights are told, (N_y, N_x) µm, and its slopes along x and y.
+
+    Of a sample, the plane that fits best (least squares). A tile repeats, so that it is level on the whole.
+    """
+    rows, columns = height_field.shape
+    if extent == "tile":
+        return np.full((rows, columns), height_field.heights.mean()), (0.0, 0.0)
+    # On a full grid the three unknowns do not mix.
+    x = (np.arange(columns) - (columns - 1) / 2) * height_field.pixel_size[0]
+    y = (np.arange(rows) - (rows - 1) / 2) * height_field.pixel_size[1]
+    mean = height_field.heights.mean()
+    slope_x = float(height_field.heights.mean(axis=0) @ x / max(x @ x, 1e-300))
+    slope_y = float(height_field.heights.mean(axis=1) @ y / max(y @ y, 1e-300))
+    return mean + slope_x * x + slope_y * y[:, None], (slope_x, slope_y)

@@ -1,0 +1,189 @@
+"""Where scalar theory holds: its efficiencies in closed form, and how far they are from rigorous ones.
+
+A surface is taken for a perfect mirror bent by h, every facet of which reflects like a plane: right as long as the
+surface changes little over a wavelength. The stored results of coupled-wave analysis (`validation/rigorous_reference`)
+say how right, over period/λ and depth/λ.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import RegularGridInterpolator
+from scipy.special import jv
+
+from .heightfield import HeightField
+
+Array = NDArray[np.float64]
+OrderPowers = Callable[[NDArray[np.int64], Array], Array]
+"""(m, κ), broadcast against each other → η_m(κ)."""
+
+STORED = Path(__file__).parent / "data" / "rigorous.json"
+
+
+def fresnel(cosine: ArrayLike, index: complex) -> tuple[Array, Array]:
+    """Power reflectances (R_s, R_p) of a plane of index n + ik in air, at the cosine of the angle of incidence."""
+    cosine = np.asarray(cosine, np.float64)
+    root = np.sqrt(complex(index) ** 2 - (1 - cosine**2))
+    s = (cosine - root) / (cosine + root)
+    p = (index**2 * cosine - root) / (index**2 * cosine + root)
+    return np.abs(s) ** 2, np.abs(p) ** 2
+
+
+def sinusoid_powers(depth: float) -> OrderPowers:
+    """η_m = J_m(κ · depth / 2)² of a sinusoid, depth from valley to peak in µm."""
+    return lambda m, kappa: jv(m, kappa * depth / 2) ** 2
+
+
+def profile_powers(height_field: HeightField) -> OrderPowers:
+    """η_m of a profile of one row, by one sum over its pixels for each pair (m, κ)."""
+    if height_field.shape[0] != 1:
+        raise ValueError(f"height_field: got {height_field.shape[0]} rows, wanted a profile of one")
+    heights, count = height_field.centred[0], height_field.shape[1]
+
+    def powers(m: NDArray[np.int64], kappa: Array) -> Array:
+        m, kappa = np.broadcast_arrays(m, kappa)
+        waves = np.exp(1j * (kappa[..., None] * heights - 2 * np.pi * m[..., None] * np.arange(count) / count))
+        return np.where(2 * np.abs(m) < count, np.abs(waves.mean(axis=-1)) ** 2, 0.0)
+
+    return powers
+
+
+@dataclass(frozen=True)
+class Orders:
+    """What a grating reflects, order by order.
+
+    Attributes:
+        m: the orders that propagate, (n,).
+        s, p: share of the incident power in each, polarised across the plane of incidence and in it, (n,).
+    """
+
+    m: NDArray[np.int64]
+    s: Array
+    p: Array
+
+    @property
+    def unpolarised(self) -> Array:
+        """The mean of s and p."""
+        return (self.s + self.p) / 2
+
+
+def scalar_orders(powers: OrderPowers, period: float, wavelength: float, angle: float, index: complex) -> Orders:
+    """R K G E η_m(κ_m), what the BSDF reflects into each order, in float64 and for lobes of no width.
+
+    The light comes from −x in the plane across the grooves. The BRDF R K G S(q; κ)/λ² E (`bsdf/`) times cos θ_o,
+    integrated over the lobe of an order, leaves these factors at the direction of the order, du dv = λ² dq.
+
+    Args:
+        powers: of the profile.
+        period, wavelength: µm.
+        angle: of incidence, degrees.
+        index: n + ik of what is below.
+    """
+    pitch = wavelength / period
+    sine = -np.sin(np.deg2rad(angle))
+    m, sines, factor, cos_half = _mirror_orders(powers, pitch, wavelength, np.array([sine]))
+    kept = factor[0] > -1
+    m, sines, factor, cos_half = m[kept], sines[0, kept], factor[0, kept], cos_half[0, kept]
+    albedo = np.maximum(factor.sum(), _albedo(powers, pitch, wavelength, sines))
+    reflected = factor / np.maximum(1, albedo)
+    s, p = fresnel(cos_half, index)
+    return Orders(m, s * reflected, p * reflected)
+
+
+def _mirror_orders(
+    powers: OrderPowers, pitch: float, wavelength: float, sines: Array
+) -> tuple[NDArray[np.int64], Array, Array, Array]:
+    """For ω_i,x (d,): m (n,), and (d, n) each ω_o,x, K G η_m for R = 1 (−1 where evanescent), and ω_i·h."""
+    m = np.arange(-int(2 / pitch) - 1, int(2 / pitch) + 2)
+    sine_i = sines[:, None]
+    sine_o = -m * pitch - sine_i
+    there = np.abs(sine_o) < 1
+    cos_i = np.sqrt(1 - sine_i**2)
+    cos_o = np.sqrt(np.where(there, 1 - sine_o**2, 1))
+    w = cos_i + cos_o
+    d = 1 + sine_i * np.where(there, sine_o, 0) + cos_i * cos_o
+    k_g = d**2 / (cos_i * cos_o * w**2) * np.minimum(1, 2 * w * np.minimum(cos_i, cos_o) / d)
+    factor = np.where(there, k_g * powers(m, 2 * np.pi * w / wavelength), -1)
+    return m, sine_o, factor, np.sqrt(d / 2)
+
+
+def _albedo(powers: OrderPowers, pitch: float, wavelength: float, sines: Array) -> Array:
+    """a(ω) of a perfect mirror for light from ω_x, (d,)."""
+    factor = _mirror_orders(powers, pitch, wavelength, sines)[2]
+    return np.maximum(factor, 0).sum(axis=1)
+
+
+@functools.cache
+def stored() -> dict[str, Any]:
+    """The stored rigorous results, as `validation/rigorous_reference` wrote them."""
+    return json.loads(STORED.read_text(encoding="utf-8"))
+
+
+def difference(scalar: ArrayLike, rigorous: ArrayLike) -> float:
+    """L1 difference of efficiencies, as a share of the rigorously reflected power: Σ|Δη_m| / Σ η_m."""
+    scalar, rigorous = np.asarray(scalar), np.asarray(rigorous)
+    return float(np.abs(scalar - rigorous).sum() / rigorous.sum())
+
+
+@functools.cache
+def error_map() -> tuple[Array, Array, Array, Array]:
+    """How wrong scalar theory is about sinusoids of n = 1.5 in unpolarised light.
+
+    Returns:
+        period/λ (n,), depth/λ (k,), angles of incidence in degrees (a,), and (n, k, a) the difference of all orders.
+    """
+    found: dict[tuple[float, float, float], float] = {}
+    index = complex(stored()["map index"])
+    for point in stored()["map"]:
+        period, depth, angle = point["period"], point["depth"], point["angle"]
+        orders = scalar_orders(sinusoid_powers(depth), period, 1.0, angle, index)
+        if [int(orders.m[0]), int(orders.m[-1])] != point["orders"]:
+            raise ValueError(f"{STORED.name}: orders {point['orders']} at {period} λ, wanted {orders.m[[0, -1]]}")
+        found[period, depth, angle] = difference(orders.unpolarised, point["unpolarised"])
+    periods, depths, angles = (np.array(sorted(set(values))) for values in zip(*found, strict=True))
+    errors = np.array([[[found[p, d, a] for a in angles] for d in depths] for p in periods])
+    return periods, depths, angles, errors
+
+
+@functools.cache
+def _interpolated() -> RegularGridInterpolator:
+    periods, depths, _, errors = error_map()
+    return RegularGridInterpolator((np.log(periods), np.log(depths)), np.log(errors.max(axis=2)))
+
+
+def expected_error(period: float, depth: float, wavelength: float) -> float:
+    """How wrong scalar theory is expected to be about a surface at incidence up to 20°.
+
+    The larger of the stored differences at 0° and 20°, interpolated linearly between the logarithms. It was found for
+    sinusoids of n = 1.5. Another surface is told by its main period and by the depth of the sinusoid of the same
+    roughness, 2√2 times the rms height; edges add to the error.
+
+    Args:
+        period, depth, wavelength: µm, depth from valleys to peaks.
+
+    Returns:
+        Σ|Δη_m| as a share of the reflected power. Above the largest period stored (20 λ), and below the smallest depth
+        (λ/20), the value there, which is above the true one. NaN below a period of λ or above a depth of 2 λ, where
+        there is no stored result: scalar theory says nothing useful there.
+
+    Raises:
+        ValueError: unless period and wavelength are positive and the depth is not negative.
+    """
+    for name, value in (("period", period), ("wavelength", wavelength)):
+        if not (np.isfinite(value) and value > 0):
+            raise ValueError(f"{name}: got {value!r}, wanted a positive number in µm")
+    if not (np.isfinite(depth) and depth >= 0):
+        raise ValueError(f"depth: got {depth!r}, wanted a number in µm, zero or more")
+    periods, depths, _, _ = error_map()
+    if period < periods[0] * wavelength or depth > depths[-1] * wavelength:
+        return float("nan")
+    place = np.minimum(period / wavelength, periods[-1]), np.maximum(depth / wavelength, depths[0])
+    return float(np.exp(_interpolated()(np.log(place))).item())
