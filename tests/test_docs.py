@@ -1,11 +1,13 @@
 """Every block of code in the manual and the README runs, in a folder like that of the repository."""
 
+import importlib.util
 import logging
 import re
 import shlex
 import shutil
 from pathlib import Path
 
+import gwyfile
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -24,8 +26,8 @@ REDUCED = {
     "compare": "--width 16 --spp 1 --no-shares",
 }
 """Options that make a command quick; they stand last, and the last one counts."""
-SHELL = {"text"}
-"""What is shown and not run: the output of a command."""
+SHOWN = {"text", "bash"}
+"""What is shown and not run: output, and what needs several machines (tests/test_cluster.py)."""
 BY_OTHER_MEANS = (
     *("python3 -m venv", "python -m pytest", "pip install", "jupyter ", "mkdocs "),
     "mitsuba-diffraction benchmark",
@@ -50,24 +52,50 @@ def folder(tmp_path, monkeypatch):
     grey = np.round(65535 * (heights - heights.min()) / np.ptp(heights)).astype(np.uint16)
     Image.fromarray(grey).save("scan.png")
     Image.fromarray(grey).save("skin.png")
+    save_holed_gwyddion("skin.gwy", 1e-6 * heights)
+    (package,) = importlib.util.find_spec("NSFopen").submodule_search_locations
+    shutil.copy(Path(package) / "example" / "Plane_Removal" / "grid.nid", "grid.nid")
     return tmp_path
 
 
-def run_shell(text, command):
+def save_holed_gwyddion(path, heights):
+    """Heights in m, tilted and with a hole, as Gwyddion saves them."""
+    rows, columns = heights.shape
+    heights = heights + 1e-9 * np.arange(columns)
+    heights[rows // 2, columns // 2 : columns // 2 + 3] = np.nan
+    size = {"xreal": 24e-6, "yreal": 24e-6 * rows / columns, "si_unit_xy": "m", "si_unit_z": "m"}
+    container = gwyfile.objects.GwyContainer()
+    container["/0/data"] = gwyfile.objects.GwyDataField(heights, **size)
+    container["/0/data/title"] = "Height"
+    container.tofile(path)
+
+
+def run_shell(text, command, wanted=0):
     for line in text.replace("\\\n", " ").splitlines():
-        line = line.partition(" #")[0].strip()
-        if not line or line.startswith(BY_OTHER_MEANS):
+        words = shlex.split(line, comments=True)
+        if not words or line.startswith(BY_OTHER_MEANS):
             continue
-        name, *words = shlex.split(line)
+        name, *words = words
         assert name == "mitsuba-diffraction", line
-        code, _, error = command(*words, *REDUCED.get(words[0], "").split())
-        assert code == 0, f"{line}: {error}"
+        options = REDUCED.get(words[0], "").split() + ["--frames", "2"] * ("--orbit" in words)
+        code, _, error = command(*words, *options)
+        assert code == wanted, f"{line}: {error}"
+
+
+def run_console(text, command):
+    """A command after $ and what it printed, which may be an error."""
+    for part in text.split("$ ")[1:]:
+        line, _, output = part.partition("\n")
+        run_shell(line, command, 2 if "error: " in output else 0)
 
 
 def run_toml(text):
     Path("block.toml").write_text(text)
     recipe = md.Recipe.load("block.toml")
     assert recipe.height_field().heights.size
+    if "scan" in recipe.surface:
+        # The pages call a recipe as its scan.
+        shutil.copy("block.toml", Path(recipe.surface["scan"]).with_suffix(".toml"))
 
 
 def run_xml(text):
@@ -83,12 +111,14 @@ def test_the_code_of_a_page_runs(page, folder, command, llvm):
             exec(compile(text, page.name, "exec"), names)
         elif language == "sh":
             run_shell(text, command)
+        elif language == "console":
+            run_console(text, command)
         elif language == "toml":
             run_toml(text)
         elif language == "xml":
             run_xml(text)
         else:
-            assert language in SHELL, f"{page.name}: a block of {language!r}, which nothing runs"
+            assert language in SHOWN, f"{page.name}: a block of {language!r}, which nothing runs"
 
 
 def test_a_block_that_is_wrong_is_found(folder, command, llvm):
