@@ -27,6 +27,9 @@ OrderPowers = Callable[[NDArray[np.int64], Array], Array]
 
 STORED = Path(__file__).parent / "data" / "rigorous.json"
 
+TRUSTED = 0.1
+"""A surface of which scalar theory is expected to get more than this wrong lies outside of its range."""
+
 
 def fresnel(cosine: ArrayLike, index: complex) -> tuple[Array, Array]:
     """Power reflectances (R_s, R_p) of a plane of index n + ik in air, at the cosine of the angle of incidence."""
@@ -83,7 +86,8 @@ def scalar_orders(powers: OrderPowers, period: float, wavelength: float, angle: 
 
     Args:
         powers: of the profile.
-        period, wavelength: µm.
+        period: µm.
+        wavelength: µm.
         angle: of incidence, degrees.
         index: n + ik of what is below.
     """
@@ -167,7 +171,9 @@ def expected_error(period: float, depth: float, wavelength: float) -> float:
     roughness, 2√2 times the rms height; edges add to the error.
 
     Args:
-        period, depth, wavelength: µm, depth from valleys to peaks.
+        period: µm.
+        depth: from valleys to peaks, µm.
+        wavelength: µm.
 
     Returns:
         Σ|Δη_m| as a share of the reflected power. Above the largest period stored (20 λ), and below the smallest depth

@@ -30,9 +30,10 @@ SHOWN = {"text", "bash"}
 """What is shown and not run: output, and what needs several machines (tests/test_cluster.py)."""
 BY_OTHER_MEANS = (
     *("python3 -m venv", "python -m pytest", "pip install", "jupyter ", "mkdocs "),
-    "mitsuba-diffraction benchmark",
+    *("mitsuba-diffraction benchmark", "mitsuba-diffraction validate"),
+    "python -m mitsuba_diffraction.validation.rigorous_reference",
 )
-"""Commands that CI, test_notebooks, test_the_manual_is_built and test_benchmark run."""
+"""Commands that CI, test_notebooks, test_the_manual_is_built, test_benchmark and test_validation run."""
 
 
 def blocks(page):

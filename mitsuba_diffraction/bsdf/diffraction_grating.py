@@ -14,6 +14,7 @@ from .energy import energy_from
 from .geometry import Geometry
 from .incidence import Incidence
 from .line_spectrum import LineSpectrum
+from .polarisation import reflected
 from .reflectance import reflectance_from
 from .smooth_spectrum import SmoothSpectrum
 from .surface import surface_from
@@ -51,6 +52,9 @@ The BRDF is R · K · G · S(q; κ)/λ² · E: R the power reflectance at the ha
 `line_spectrum.py` (of a tile) or `smooth_spectrum.py` (of a sample), with q = −(ω_i + ω_o)/λ along the pattern's axes
 and κ = 2π (cos θ_i + cos θ_o)/λ. E, as in `energy.py`, keeps the reflected light to the received; it is one where the
 rest does so by itself. Without shadowing K diverges near the horizon, and E bounds it less well there.
+
+In polarised variants light is split into s and p as by a plane across the half vector; a perfect mirror and Schlick's
+formula leave it unpolarised.
 """
 
 
@@ -148,6 +152,18 @@ def define() -> type:
             density = DEFENSIVE * dr.inv_pi + (1 - DEFENSIVE) * density / channels
             return value, density * geometry.cos_o
 
+        def _mueller(
+            self,
+            value: mi.UnpolarizedSpectrum,
+            ctx: mi.BSDFContext,
+            si: mi.SurfaceInteraction3f,
+            wo: mi.Vector3f,
+            active: mi.Bool,
+        ) -> mi.Spectrum:
+            """`value` as light that is split into s and p where the variant and the material know them."""
+            index = self.reflectance.index(si, active) if mi.is_polarized else None
+            return mi.depolarizer(value) if index is None else reflected(value, index, si.wi, wo, ctx.mode)
+
         def _covers(self, wavelength: mi.Float) -> mi.Bool:
             """The spectrum says nothing outside of its wavelengths (µm): there the grating is black."""
             shortest, longest = self.spectrum.wavelengths
@@ -187,7 +203,7 @@ def define() -> type:
             value, pdf = mi.Spectrum(0.0), mi.Float(0.0)
             if grating:
                 of_grating, pdf = self._grating(si, wo, active)
-                value = mi.depolarizer(of_grating)
+                value = self._mueller(of_grating, ctx, si, wo, active)
             if below is not None:
                 r_i, r_o = (self.reflectance(si, cos, active) for cos in (cos_i, cos_o))
                 share = self._share(si, lobes, r_i, active)

@@ -35,6 +35,9 @@ class PerfectMirror:
     def __call__(self, si: mi.SurfaceInteraction3f, cos_half: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
         return mi.UnpolarizedSpectrum(1.0)
 
+    def index(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> None:
+        """It has none."""
+
     def update(self) -> None:
         pass
 
@@ -65,6 +68,10 @@ class Dielectric:
         if self.model == "exact":
             return mi.UnpolarizedSpectrum(mi.fresnel(cos_half, self.eta)[0])
         return mi.UnpolarizedSpectrum(_schlick(dr.square((self.eta - 1) / (self.eta + 1)), cos_half))
+
+    def index(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> list[mi.Complex2f] | None:
+        """n + ik of every wavelength; Schlick's formula knows no polarisation."""
+        return None if self.model == "schlick" else [mi.Complex2f(self.eta, 0)] * len(mi.UnpolarizedSpectrum(0.0))
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         callback.put("eta", self.eta, mi.ParamFlags.Differentiable)
@@ -103,6 +110,13 @@ class Conductor:
             return result
         normal = (dr.square(eta - 1) + dr.square(k)) / (dr.square(eta + 1) + dr.square(k))
         return _schlick(normal, cos_half)
+
+    def index(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> list[mi.Complex2f] | None:
+        """n + ik of every wavelength; Schlick's formula knows no polarisation."""
+        if self.model == "schlick":
+            return None
+        eta, k = self.eta.eval(si, active), self.k.eval(si, active)
+        return [mi.Complex2f(eta[channel], k[channel]) for channel in range(len(eta))]
 
     def update(self) -> None:
         pass

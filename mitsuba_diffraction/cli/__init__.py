@@ -16,12 +16,13 @@ from .console import NAME, say
 from .inspect import inspect
 from .precompute import precompute
 from .render import render
+from .validate import validate
 
 # Click's, or that of the copy of Click which newer versions of Typer carry.
 _UsageError = typer.BadParameter.__base__
 
 app = typer.Typer(add_completion=False, no_args_is_help=False, help="Diffraction gratings for Mitsuba 3.")
-for _command in (inspect, precompute, render, compare, benchmark):
+for _command in (inspect, precompute, render, compare, validate, benchmark):
     app.command()(_command)
 
 

@@ -18,6 +18,7 @@ from ..inspection import Inspection, save_picture
 from ..inspection import inspect as look
 from ..inspection.picture import with_uncertainty
 from ..inspection.uncertainty import GREEN
+from ..scalar_theory import TRUSTED
 from .console import out, progress_bar, tell
 from .scan import Channel, FillMissing, HeightRange, PixelSize, Prepare, Unit, options_of_scan, recipe_of
 
@@ -144,7 +145,7 @@ def _scalar(inspection: Inspection) -> str:
     beyond = [f"{nm} nm" for nm in errors if nm not in told]
     text += f"; beyond all that was calculated at {', '.join(beyond)}" if beyond else ""
     worst = max(errors[nm] for nm in told)
-    return text + ("; right directions, powers only roughly" if worst > 0.1 else "")
+    return text + ("; right directions, powers only roughly" if worst > TRUSTED else "")
 
 
 def _changes_table(inspection: Inspection) -> Table:

@@ -1,0 +1,232 @@
+"""The checks of `mitsuba-diffraction validate`, one test each, and whether they can fail."""
+
+import json
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import mitsuba_diffraction as md
+from mitsuba_diffraction import scalar_theory
+from mitsuba_diffraction.validation import Check, Finding, analytic, checks, conservation, product, report, rigorous
+from mitsuba_diffraction.validation.surface import main_period, surface_checks
+
+CHECKS = checks()
+
+
+pytestmark = pytest.mark.usefixtures("llvm")
+
+
+@pytest.mark.parametrize(
+    "check",
+    [pytest.param(c, marks=pytest.mark.slow) if c.slow else c for c in CHECKS],
+    ids=lambda check: f"{check.group}: {check.name}",
+)
+def test_check(check):
+    finding = check.run()
+    assert finding.ok, finding
+
+
+def test_names_are_told_apart():
+    assert len({(check.group, check.name) for check in CHECKS}) == len(CHECKS)
+
+
+def test_a_finding_is_within_its_bound_or_not():
+    assert Finding(1, 1.05, 0.05, 0.1).ok
+    assert not Finding(1, 1.2, 0.2, 0.1).ok
+    assert not Finding(1, np.nan, np.nan, 0.1).ok
+    assert Finding(1, 2, 1, None).ok
+    worst = Finding.worst([1.0, 2.0, 3.0], [1.1, 2.5, 3.0], 0.1)
+    assert (worst.expected, worst.found, worst.difference) == (2.0, 2.5, 0.5)
+    assert not worst.ok
+    assert not Finding.worst([1.0, 2.0], [1.0, np.nan], 0.1).ok
+
+
+def test_checks_see_a_wrong_product(monkeypatch):
+    """A BSDF of which heights are 2 % too low misses what it must."""
+    right = product.bsdf
+
+    def wrong(spectrum, conserve=True, **parameters):
+        return right(spectrum, conserve, height_scale=0.98, **parameters)
+
+    monkeypatch.setattr(product, "bsdf", wrong)
+    by_name = {check.name: check for check in analytic.CHECKS}
+    assert not by_name["sinusoid: orders J_m²(κ depth/2)"].run().ok
+    assert not by_name["blaze: orders sinc²(m − κ depth/2π)"].run().ok
+    assert by_name["grating equation, planar incidence"].run().ok
+
+
+def test_checks_see_a_wrong_period(monkeypatch):
+    right = md.gratings.sinusoidal
+    monkeypatch.setattr(analytic.gratings, "sinusoidal", lambda period, depth, **more: right(1.001 * period, depth))
+    assert not analytic.CHECKS[0].run().ok
+
+
+# ---------------------------------------------------------------- scalar theory and its range
+
+
+def test_scalar_orders_are_those_of_the_sinusoid():
+    """In a plane mirror's limit, and J_m² by two ways."""
+    sampled = scalar_theory.profile_powers(md.gratings.sinusoidal(2.5, 0.25))
+    exact = scalar_theory.sinusoid_powers(0.25)
+    found, expected = (scalar_theory.scalar_orders(powers, 2.5, 0.5, 20.0, 1.5) for powers in (sampled, exact))
+    np.testing.assert_array_equal(found.m, expected.m)
+    np.testing.assert_allclose(found.unpolarised, expected.unpolarised, atol=1e-12)
+    flat = scalar_theory.scalar_orders(scalar_theory.sinusoid_powers(0.0), 2.5, 0.5, 40.0, 1.5)
+    (mirror,) = np.flatnonzero(flat.s > 1e-12)
+    assert flat.m[mirror] == 0
+    s, p = scalar_theory.fresnel(np.cos(np.deg2rad(40)), 1.5)
+    assert (flat.s[mirror], flat.p[mirror]) == pytest.approx((s, p))
+
+
+def test_fresnel_is_mitsubas():
+    mi.set_variant("scalar_rgb")
+    for cosine in (0.05, 0.3, 0.9):
+        assert np.mean(scalar_theory.fresnel(cosine, 1.5)) == pytest.approx(mi.fresnel(cosine, 1.5)[0], rel=1e-5)
+        metal = mi.fresnel_conductor(cosine, mi.Complex2f(0.96, 6.69))
+        assert np.mean(scalar_theory.fresnel(cosine, 0.96 + 6.69j)) == pytest.approx(metal, rel=1e-5)
+
+
+def test_expected_error_is_that_of_the_stored_results():
+    periods, depths, angles, errors = scalar_theory.error_map()
+    assert errors.shape == (len(periods), len(depths), len(angles))
+    for i, j in ((2, 3), (5, 1), (8, 6)):
+        expected = errors[i, j].max()
+        assert scalar_theory.expected_error(periods[i] * 0.6, depths[j] * 0.6, 0.6) == pytest.approx(expected)
+    # Between nodes, between their values.
+    between = scalar_theory.expected_error(np.sqrt(periods[4] * periods[5]), depths[2], 1.0)
+    assert between == pytest.approx(np.sqrt(errors[4, 2].max() * errors[5, 2].max()))
+
+
+def test_expected_error_tells_where_it_holds():
+    good = scalar_theory.expected_error(10.0, 0.05, 0.55)
+    bad = scalar_theory.expected_error(0.8, 0.4, 0.55)
+    assert good < 0.02 < 0.1 < bad
+    assert np.isnan(scalar_theory.expected_error(0.4, 0.1, 0.55))  # period under λ
+    assert np.isnan(scalar_theory.expected_error(5.0, 1.2, 0.55))  # deeper than 2 λ
+    assert scalar_theory.expected_error(100.0, 0.1, 0.55) == scalar_theory.expected_error(20.3 * 0.55, 0.1, 0.55)
+    assert scalar_theory.expected_error(5.0, 0.0, 0.55) == scalar_theory.expected_error(5.0, 0.0275, 0.55)
+    for wrong in ((0.0, 0.1, 0.5), (1.0, -0.1, 0.5), (1.0, 0.1, np.nan)):
+        with pytest.raises(ValueError, match="wanted"):
+            scalar_theory.expected_error(*wrong)
+
+
+def test_stored_results_conserve_energy_and_are_converged():
+    content = scalar_theory.stored()
+    for result in [*content["cases"], *content["map"]]:
+        if result["lost"] is not None:
+            assert result["lost"] < 1e-5
+            assert result["change"] < 0.03, result
+    metals = [case for case in content["cases"] if case["material"] != "dielectric"]
+    assert metals
+    assert all(case["lost"] is None for case in metals)
+
+
+@pytest.mark.slow
+def test_stored_results_are_made_again():
+    pytest.importorskip("meent", reason="the extra 'rigorous' is not installed")
+    from mitsuba_diffraction.validation.coupled_waves import converged
+
+    case = next(c for c in rigorous.cases() if c.profile == "blazed" and c.period == 2.5 and c.wavelength == 0.65)
+    found = converged("blazed", case.period, case.depth, case.wavelength, case.angle, case.index, tolerance=3e-3)
+    np.testing.assert_array_equal(found.orders, case.orders)
+    assert scalar_theory.difference(found.te, case.te) < 1e-4
+    assert scalar_theory.difference(found.tm, case.tm) < 1e-4
+
+
+def test_coupled_waves_send_a_blaze_to_the_side_of_its_facets():
+    """And reflect from a plane as Fresnel says, dielectric and metal."""
+    pytest.importorskip("meent", reason="the extra 'rigorous' is not installed")
+    from mitsuba_diffraction.validation.coupled_waves import solve
+
+    # Facets rise along +x: light along the normal goes to −x, into q > 0.
+    orders, efficiencies, total = solve("blazed", 2.5, 0.25, 0.5, 0.0, 1.5 + 0j, 12, 12)
+    assert orders[np.argmax(efficiencies.mean(axis=0))] == 1
+    assert total == pytest.approx([1, 1], abs=1e-6)
+    for index in (1.5 + 0j, 0.96 + 6.69j):
+        orders, efficiencies, _ = solve("sinusoidal", 1.0, 1e-6, 0.5, 50.0, index, 8, 1)
+        mirror = efficiencies[:, orders == 0][:, 0]
+        np.testing.assert_allclose(mirror, scalar_theory.fresnel(np.cos(np.deg2rad(50)), index), rtol=1e-4)
+
+
+# ---------------------------------------------------------------- one surface, and the command
+
+
+def test_checks_of_a_surface():
+    blaze = md.gratings.blazed(2.5, 0.1)
+    results = {c.name: c.run() for c in surface_checks(blaze, md.precompute(blaze))}
+    assert all(finding.ok for finding in results.values()), results
+    assert results["range of scalar theory"].found > 0
+
+
+def test_a_surface_that_is_not_the_spectrums_is_told():
+    blaze, other = md.gratings.blazed(2.5, 0.25), md.gratings.blazed(2.5, 0.24)
+    spectrum = md.precompute(blaze)
+    assert conservation.against_reference(blaze, spectrum).ok
+    assert not conservation.against_reference(other, spectrum).ok
+
+
+def test_the_period_of_a_surface_is_seen():
+    # The fingers of the synthetic skin, and its rows, are 1.144 µm apart in a patch of whole numbers of them.
+    spectrum = md.precompute(md.gratings.elaphe((20.0, 1.144 * 14), seed=1), coherence_length=13.0, tolerance=1e-2)
+    assert main_period(spectrum) == pytest.approx(1.144, rel=0.05)
+    assert main_period(md.precompute(md.gratings.blazed(2.5, 0.1))) == pytest.approx(2.5)
+    assert np.isnan(main_period(md.precompute(md.HeightField(np.zeros((1, 4)), 0.05))))
+
+
+def test_a_surface_outside_of_the_range_is_missed(command, tmp_path):
+    recipe = tmp_path / "narrow.toml"
+    recipe.write_text('[surface]\nprofile = "sinusoidal"\nperiod = 0.8\ndepth = 0.4\n')
+    code, out, error = command("validate", str(recipe), "--json", str(tmp_path / "a.json"))
+    assert code == 1
+    assert "range of scalar theory" in error
+    assert "MISSED" in out
+    assert any(not result["ok"] for result in json.loads((tmp_path / "a.json").read_text(encoding="utf-8")))
+
+
+def test_the_command_prints_and_writes(command, tmp_path, monkeypatch):
+    few = (
+        Check("one", "good", lambda: Finding(1.0, 1.01, 0.01, 0.1, "a | b"), "theory"),
+        Check("two", "shown", lambda: Finding(1.0, 2.0, 1.0, None), "theory"),
+    )
+    monkeypatch.setattr("mitsuba_diffraction.validation.checks", lambda: few)
+    code, out, _ = command("validate", "--markdown", str(tmp_path / "a.md"), "--json", str(tmp_path / "a.json"))
+    assert code == 0
+    assert "1 of 1 within their bounds; 1 only shown" in out
+    assert "| one | good | 1 | 1.01 | 0.01 | 0.1 | ok | a \\| b | theory |" in (tmp_path / "a.md").read_text("utf-8")
+    assert [r["name"] for r in json.loads((tmp_path / "a.json").read_text("utf-8"))] == ["good", "shown"]
+    bad = Check("one", "bad", lambda: Finding(1.0, 2.0, 1.0, 0.1), "theory")
+    monkeypatch.setattr("mitsuba_diffraction.validation.checks", lambda: (*few, bad))
+    code, out, error = command("validate")
+    assert code == 1
+    assert "bad" in error
+
+
+def test_wrong_requests_are_refused(command, tmp_path):
+    code, _, error = command("validate", "--pixel-size", "0.1")
+    assert (code, error.count("\n")) == (2, 1)
+    assert "go with a scan" in error
+    assert command("validate", str(tmp_path / "nothing.toml"))[0] == 2
+    code, _, error = command("validate", "--variant", "scalar_spectral")
+    assert (code, error.count("\n")) == (2, 1)
+    assert "wanted llvm_" in error
+
+
+def test_figures_are_drawn(command, tmp_path, monkeypatch):
+    called = []
+    monkeypatch.setattr("mitsuba_diffraction.validation.checks", lambda: ())
+    monkeypatch.setattr("mitsuba_diffraction.evaluation.save_figures", lambda folder, progress: called.append(folder))
+    assert command("validate", "--figures", str(tmp_path / "figures"))[0] == 0
+    assert called == [tmp_path / "figures"]
+
+
+def test_results_are_plain_json(tmp_path):
+    result = Check("a", "b", lambda: Finding(0.0, float("nan"), float("inf"), 0.1), "c").result()
+    report.save_json([result], tmp_path / "a.json")
+    assert json.loads((tmp_path / "a.json").read_text("utf-8"))[0]["found"] is None
+
+
+def test_the_stored_results_are_part_of_the_package():
+    from importlib import resources
+
+    assert resources.files("mitsuba_diffraction").joinpath("data/rigorous.json").is_file()
