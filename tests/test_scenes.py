@@ -1,5 +1,8 @@
-"""The scenes that come with the package render."""
+"""The scenes that come with the package render, and their models are what they say."""
 
+import re
+import shutil
+import sys
 from pathlib import Path
 
 import drjit as dr
@@ -10,11 +13,18 @@ import pytest
 import mitsuba_diffraction as md
 from mitsuba_diffraction.render import render
 
-SCENES = Path(__file__).parents[1] / "scenes"
+ROOT = Path(__file__).parents[1]
+SCENES = ROOT / "scenes"
+sys.path.insert(0, str(SCENES))
+
+import disc  # noqa: E402
+import foil  # noqa: E402
+import ground  # noqa: E402
+import snake  # noqa: E402
 
 
-def check(image, size):
-    assert image.radiance.shape[:2] == (size, size)
+def check(image, width, height):
+    assert image.radiance.shape[:2] == (height, width)
     assert np.isfinite(image.radiance).all()
     assert image.radiance.mean() > 0
 
@@ -28,15 +38,218 @@ def llvm():
 
 @pytest.mark.parametrize("name", ["blaze", "elaphe", "xenopeltis"])
 def test_scene_renders(llvm, name):
-    check(render(SCENES / f"{name}.xml", spp=4, width=16, height=16), 16)
+    check(render(SCENES / f"{name}.xml", spp=4, width=16, height=16), 16, 16)
 
 
 def test_scene_of_a_scan_renders(llvm, tmp_path):
     path = tmp_path / "spectrum.exr"
     md.precompute(md.gratings.elaphe(8)).save(path)
-    check(render(SCENES / "scan.xml", spp=4, width=16, height=16, parameters={"spectrum": str(path)}), 16)
+    check(render(SCENES / "scan.xml", spp=4, width=16, height=16, parameters={"spectrum": str(path)}), 16, 16)
 
 
 def test_blaze_renders_in_the_scalar_variant():
     mi.set_variant("scalar_spectral")
-    check(render(SCENES / "blaze.xml", spp=1, width=4, height=4), 4)
+    check(render(SCENES / "blaze.xml", spp=1, width=4, height=4), 4, 4)
+
+
+# ---------------------------------------------------------------- scenes with models
+
+
+@pytest.fixture(scope="module")
+def small_scenes(tmp_path_factory):
+    """The folder of scenes beside that of recipes, with models of few texels."""
+    root = tmp_path_factory.mktemp("root")
+    scenes = root / "scenes"
+    shutil.copytree(SCENES, scenes, ignore=shutil.ignore_patterns("models", "__pycache__"))
+    shutil.copytree(ROOT / "precompute", root / "precompute")
+    models = scenes / "models"
+    models.mkdir()
+    snake.make(models, columns=640)
+    disc.make(models, count=64)
+    foil.make(models, count=60)
+    ground.make(models, size=256)
+    return scenes
+
+
+PICTURES = [
+    ("snake", {"skin": "xenopeltis", "light": "sun"}),
+    ("compact_disc", {"light": "desk_lamp"}),
+    pytest.param("foil", {"light": "lamp"}, marks=pytest.mark.slow),
+    pytest.param("snake", {"skin": "elaphe", "light": "lamp"}, marks=pytest.mark.slow),
+    pytest.param("compact_disc", {"light": "sun"}, marks=pytest.mark.slow),
+    pytest.param("foil", {"light": "sun"}, marks=pytest.mark.slow),
+]
+
+
+@pytest.mark.parametrize(("name", "parameters"), PICTURES)
+def test_scene_with_models_renders(llvm, small_scenes, name, parameters):
+    check(render(small_scenes / f"{name}.xml", spp=4, width=32, parameters=parameters), 32, 18)
+
+
+def test_missing_models_are_named(llvm, tmp_path, command):
+    for part in ("foil.xml", "lights/sun.xml"):
+        (tmp_path / part).parent.mkdir(exist_ok=True)
+        shutil.copy(SCENES / part, tmp_path / part)
+    code, _, error = command("render", str(tmp_path / "foil.xml"), "-o", str(tmp_path / "x.exr"))
+    assert code == 2
+    assert re.search(r"models/\w+\.(ply|png|exr)", error)
+    assert error.count("\n") == 1
+
+
+def hit(small_scenes, name, origins, directions):
+    """Where rays meet a mesh: Mitsuba's interaction, in the scalar variant one by one."""
+    mi.set_variant("scalar_spectral")
+    scene = mi.load_dict({"type": "scene", "m": {"type": "ply", "filename": str(small_scenes / "models" / name)}})
+    found = [scene.ray_intersect(mi.Ray3f(o, d)) for o, d in zip(origins, directions, strict=True)]
+    assert all(si.is_valid() for si in found)
+    return found
+
+
+# ---------------------------------------------------------------- the snake
+
+
+def test_snake_lies_on_the_ground_and_not_in_itself():
+    nodes = snake.centre_line()
+    s = np.linspace(0, snake.LENGTH, len(nodes))
+    width, height = snake.half_axes(s)
+    assert (nodes[:, 2] - height).min() > -0.05
+    # It does lie: a good part touches the ground.
+    assert np.mean(nodes[:, 2] - height < 0.1) > 0.2
+    distance = np.linalg.norm(nodes[:, None] - nodes, axis=-1)
+    apart = width[:, None] + width
+    far = np.abs(s[:, None] - s) > 2.5 * apart
+    assert (apart - distance)[far].max() < 0.05
+    # A coil turns by more than two turns in all.
+    tangent = np.diff(nodes[:, :2], axis=0)
+    turned = np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0]))
+    assert abs(turned[-1] - turned[0]) > 4 * np.pi
+
+
+def test_snake_tapers():
+    s = np.linspace(0, snake.LENGTH, 400)
+    width, height = snake.half_axes(s)
+    assert width.max() == pytest.approx(1.04 * snake.RADIUS, rel=0.03)
+    assert width[0] < 0.05
+    assert width[-1] < 0.1 * snake.RADIUS
+    assert np.all(np.diff(width[s < 0.4 * snake.LENGTH]) > 0)
+    assert np.all((width >= 0.9 * height) & (height >= 0.3 * width))
+
+
+def test_snake_has_coordinates_along_the_body(small_scenes):
+    nodes = snake.centre_line()
+    # From above onto the top coil and the outer one, away from tail and head.
+    places = [60, 120, 200, 230]
+    for index, si in zip(
+        places,
+        hit(small_scenes, "snake.ply", [nodes[i] + [0, 0, 1.2 * snake.RADIUS] for i in places], [[0, 0, -1]] * 4),
+        strict=True,
+    ):
+        tangent = nodes[index + 1] - nodes[index - 1]
+        tangent /= np.linalg.norm(tangent)
+        along, around = (np.array(v) / np.linalg.norm(v) for v in (si.dp_du, si.dp_dv))
+        assert along @ tangent > 0.97
+        assert abs(si.uv[1] - 0.5) < 0.06
+        normal = np.array(si.sh_frame.n)
+        assert normal[2] > 0.85
+        assert np.cross(along, around) @ normal > 0.95
+
+
+@pytest.fixture(scope="module")
+def scales():
+    sweep = snake.Sweep.along(2000)
+    return {name: snake.texels(sweep, skin, 1280) for name, skin in snake.SKINS.items()}
+
+
+@pytest.mark.parametrize("name", sorted(snake.SKINS))
+def test_snake_wears_scales(scales, name):
+    skin, texels = snake.SKINS[name], scales[name]
+    body = (texels.s[0] > 40) & (texels.s[0] < 100)
+    # Every texel belongs to a scale: nothing shows between them.
+    assert texels.edge[:, body].max() <= 1
+    assert np.mean(texels.edge[:, body] < 0.8) > 0.4
+    column = texels.number[:, np.flatnonzero(body)[0]]
+    rows = 1 + np.count_nonzero(np.diff(column))
+    assert 0.6 * skin.rows < rows < 1.2 * skin.rows
+    # The back's scales rise towards their tips, and both sides of the back are alike.
+    assert np.abs(texels.slope_v[:, body].mean()) < 0.02
+    normals = 2 * snake.normals_from_slopes(texels.slope_u, texels.slope_v) - 1
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=-1), 1, rtol=1e-5)
+    assert np.rad2deg(np.arccos(normals[..., 2].min())) < 60
+
+
+def test_microstructure_turns_from_scale_to_scale(scales):
+    texels = scales["xenopeltis"]
+    turn = snake.per_scale(texels, 3)
+    first = np.unique(texels.number, return_index=True)[1]
+    values = turn.ravel()[first]
+    assert values.size > 1000
+    assert values.std() == pytest.approx(1, rel=0.1)
+    for number in texels.number.ravel()[first][::300]:
+        assert np.ptp(turn[texels.number == number]) == 0
+
+
+def test_snakes_have_their_colours(scales):
+    for name, texels in scales.items():
+        colour = snake.pigment(name, texels)
+        back, belly = colour[np.abs(texels.v[:, 0] - 0.5) < 0.1], colour[texels.v[:, 0] < 0.05]
+        assert back.mean((0, 1)).sum() < belly.mean((0, 1)).sum()
+        if name == "elaphe":
+            assert back[..., 0].mean() > 2 * back[..., 2].mean()
+        else:
+            assert back.mean() < 0.25
+
+
+def test_models_are_the_same_each_time(tmp_path):
+    files = []
+    for folder in (tmp_path / "a", tmp_path / "b"):
+        folder.mkdir()
+        snake.centre_line.cache_clear()
+        snake.make(folder, columns=160)
+        files.append({path.name: path.read_bytes() for path in folder.iterdir()})
+    assert files[0] == files[1]
+    assert len(files[0]) == 8
+
+
+# ---------------------------------------------------------------- disc and foil
+
+
+def test_tracks_run_round_the_disc(small_scenes):
+    angles = np.linspace(0.1, 6.2, 9)
+    places = 4.0 * np.stack([np.cos(angles), np.sin(angles), 0 * angles], -1)
+    for place, si in zip(
+        places, hit(small_scenes, "disc_metal.ply", places + np.array([0, 0, 1]), [[0, 0, -1]] * 9), strict=True
+    ):
+        outwards = np.array(si.dp_du) / np.linalg.norm(si.dp_du)
+        # Corners of a circle of 64 are 5.6° apart.
+        assert outwards @ (place / 4) > np.cos(np.deg2rad(6))
+        assert si.n[2] > 0.99
+    mi.set_variant("scalar_spectral")
+    scene = mi.load_dict(
+        {"type": "scene", "m": {"type": "ply", "filename": str(small_scenes / "models" / "disc_metal.ply")}}
+    )
+    for radius in (1.0, 2.2, 5.95):
+        assert not scene.ray_intersect(mi.Ray3f([radius, 0.01, 1], [0, 0, -1])).is_valid()
+
+
+def test_foil_keeps_its_size():
+    places, _, _ = foil.sheet(200)
+    # Crumpling and curling bend the sheet, but stretch it little.
+    length = np.linalg.norm(np.diff(places, axis=1), axis=-1).sum(1)
+    assert np.all(np.abs(length / foil.WIDTH - 1) < 0.03)
+    assert places[..., 2].min() == 0
+    assert places[..., 2].max() > 2
+
+
+def test_foil_is_embossed_with_shards():
+    turn = foil.shards(np.random.default_rng(6), 300)
+    values, counts = np.unique(turn, return_counts=True)
+    assert 0.9 * foil.SHARDS < values.size <= foil.SHARDS
+    assert values.min() >= 0
+    assert values.max() <= 180
+    assert counts.max() < 0.02 * turn.size
+
+
+def test_ground_may_be_repeated():
+    colour, _ = ground.stone(np.random.default_rng(1), 128)
+    inside = np.abs(np.diff(colour, axis=1)).mean()
+    assert np.abs(colour[:, 0] - colour[:, -1]).mean() < 2 * inside

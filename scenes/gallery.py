@@ -1,0 +1,236 @@
+"""Makes the pictures of the gallery anew, small, and fails if one differs from its reference by more than noise.
+
+    python scenes/gallery.py                 # every picture
+    python scenes/gallery.py foil_sun        # some
+    python scenes/gallery.py --write         # new references, after a change that is meant
+    python scenes/gallery.py --compress      # brings the pictures in docs/gallery under 500 kB
+
+The commands are those of the gallery in README.md and scenes/README.md: first what makes the models, where these are
+not there yet, then each `mitsuba-diffraction render … -o docs/gallery/NAME.exr`, at 160 × 90 pixels and 8 samples.
+
+What is compared: linear sRGB c is mapped to c/(c + m), m the mean of the reference, so that single bright paths count
+little, and averaged over squares of 10 and of 30 pixels and over the picture. The reference holds mean and standard
+deviation s of each average over n renderings with seeds of their own; that of a new picture differs from the mean by
+t = Δ/(s √(1 + 1/n)), with s no less than its root mean square over all squares of that size. A picture has changed if
+its largest |t| is less probable than 0.001 (Student's t with n − 1 degrees of freedom, corrected for the number of
+averages after Šidák 1967).
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import re
+import shlex
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+from scipy import stats
+
+from mitsuba_diffraction.cli import app
+from mitsuba_diffraction.color import into_gamut, spectrum_to_linear_sRGB
+from mitsuba_diffraction.files import whole_file
+from mitsuba_diffraction.render import SpectralImage
+
+ROOT = Path(__file__).parents[1]
+REFERENCES = Path(__file__).with_name("gallery.npz")
+SIZE, SAMPLES, SQUARES = (160, 90), 8, (10, 30)
+SEEDS = 12  # of the references
+SIGNIFICANCE = 1e-3
+LARGEST_FILE = 500_000  # bytes
+
+Array = NDArray[np.float64]
+
+
+def commands(pages: Sequence[Path]) -> tuple[list[list[str]], dict[str, list[str]]]:
+    """What the pages tell to run: the commands that make models, and by picture those that render it.
+
+    Raises:
+        ValueError: if two commands disagree about one picture.
+    """
+    models: list[list[str]] = []
+    renderings: dict[str, list[str]] = {}
+    for page in pages:
+        text = page.read_text(encoding="utf-8")
+        for script in re.findall(r"python (scenes/\w+\.py)(?=\s|`)", text):
+            words = [sys.executable, script]
+            if words not in models and Path(script).stem != Path(__file__).stem:
+                models.append(words)
+        for line in re.findall(r"mitsuba-diffraction (render scenes/[^`|\n]*? -o docs/gallery/\w+\.exr)", text):
+            words = shlex.split(line)
+            name = Path(words[words.index("-o") + 1]).stem
+            if renderings.setdefault(name, words) != words:
+                raise ValueError(f"{page.name}: got another command for {name}, wanted one for each picture")
+    return models, renderings
+
+
+def small(words: Sequence[str], seed: int, target: Path) -> list[str]:
+    """The same command, but of reduced size, with a seed, into `target`."""
+    words = [words[0], str(ROOT / words[1]), *words[2:]]
+    for option in ("-o", "--spp", "--width", "--height", "--seed"):
+        if option in words:
+            place = words.index(option)
+            del words[place : place + 2]
+    size = ["--width", str(SIZE[0]), "--height", str(SIZE[1]), "--spp", str(SAMPLES)]
+    return [*words, *size, "--seed", str(seed), "-o", str(target)]
+
+
+def rendered(words: Sequence[str], seed: int) -> Array:
+    """The linear sRGB of a command's picture, reduced, (height, width, 3).
+
+    Raises:
+        ValueError: if the command does, for a scene that is wrong for example.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        target = Path(folder) / "picture.exr"
+        # In this process, so that kernels are compiled and models read by Dr.Jit's and Mitsuba's own caches once.
+        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+            app(small(words, seed, target), standalone_mode=False)
+        image = SpectralImage.load(target)
+    return into_gamut(spectrum_to_linear_sRGB(image.radiance, image.wavelengths))
+
+
+@dataclass(frozen=True)
+class Reference:
+    """What pictures of one command look like.
+
+    Attributes:
+        level: m, the mean of the pictures.
+        mean, deviation: of the averages, (k,).
+        count: n, how many pictures.
+    """
+
+    level: float
+    mean: Array
+    deviation: Array
+    count: int
+
+    @classmethod
+    def of(cls, pictures: Sequence[Array]) -> Reference:
+        """The reference that pictures with different seeds make."""
+        level = float(np.mean(pictures))
+        values = np.array([averages(picture, level) for picture in pictures])
+        return cls(level, values.mean(0), values.std(0, ddof=1), len(pictures))
+
+    def probability(self, picture: Array) -> float:
+        """That noise alone makes a picture differ so much."""
+        # A few pictures may miss the rare bright paths of a square: s is at least as large as it is on the whole.
+        scale = scales(picture.shape)
+        usual = np.sqrt(np.bincount(scale, self.deviation**2) / np.bincount(scale))[scale]
+        # Where next to nothing is random, a 2000th would not be seen.
+        deviation = np.maximum(np.maximum(self.deviation, usual), 1 / 2000) * np.sqrt(1 + 1 / self.count)
+        t = (averages(picture, self.level) - self.mean) / deviation
+        least = 2 * stats.t.sf(np.abs(t).max(), self.count - 1)
+        return float(-np.expm1(t.size * np.log1p(-least)))
+
+
+def averages(picture: Array, level: float) -> Array:
+    """Means of c/(c + m) over squares and over the picture, (k,)."""
+    mapped = picture / (picture + level)
+    parts = [mapped.mean((0, 1))]
+    for side in SQUARES:
+        rows, columns = (n // side for n in picture.shape[:2])
+        whole = mapped[: rows * side, : columns * side].reshape(rows, side, columns, side, 3)
+        parts.append(whole.mean((1, 3)).ravel())
+    return np.concatenate(parts)
+
+
+def scales(shape: tuple[int, ...]) -> NDArray[np.int64]:
+    """Which of the averages of a picture are over squares of one size, (k,): 0 the picture, 1 and on `SQUARES`."""
+    counts = [1, *((shape[0] // side) * (shape[1] // side) for side in SQUARES)]
+    return np.repeat(np.arange(len(counts)), 3 * np.array(counts))
+
+
+def load(path: Path) -> dict[str, Reference]:
+    """The references in a file, by picture."""
+    with np.load(path) as file:
+        names = sorted({key.split(".")[0] for key in file})
+        return {
+            name: Reference(
+                float(file[f"{name}.level"]),
+                file[f"{name}.mean"],
+                file[f"{name}.deviation"],
+                int(file[f"{name}.count"]),
+            )
+            for name in names
+        }
+
+
+def save(references: Mapping[str, Reference], path: Path) -> None:
+    """Writes references, in single precision."""
+    arrays = {}
+    for name, reference in sorted(references.items()):
+        arrays[f"{name}.level"], arrays[f"{name}.count"] = np.float64(reference.level), np.int64(reference.count)
+        arrays[f"{name}.mean"] = reference.mean.astype(np.float32)
+        arrays[f"{name}.deviation"] = reference.deviation.astype(np.float32)
+    with whole_file(path) as temporary:
+        np.savez_compressed(temporary, **arrays)
+
+
+def compress(path: Path) -> int:
+    """Gives a picture of 500 kB or more a palette that brings it below; the number of its colours, 0 for a small one.
+
+    Raises:
+        ValueError: if 32 colours are too many.
+    """
+    if path.stat().st_size < LARGEST_FILE:
+        return 0
+    with Image.open(path) as picture:
+        picture = picture.convert("RGB")
+    for colours in (256, 192, 128, 96, 64, 48, 32):
+        stream = io.BytesIO()
+        picture.quantize(colours).save(stream, "PNG", optimize=True)
+        if stream.tell() < LARGEST_FILE:
+            with whole_file(path) as temporary:
+                temporary.write_bytes(stream.getvalue())
+            return colours
+    raise ValueError(f"{path}: got more than {LARGEST_FILE // 1000} kB with 32 colours, wanted less noise")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs the check; the exit code."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("names", nargs="*", metavar="NAME", help="pictures; all by default")
+    parser.add_argument("--write", action="store_true", help="make new references")
+    parser.add_argument("--compress", action="store_true", help="bring the pictures in docs/gallery under 500 kB")
+    options = parser.parse_args(arguments)
+    if options.compress:
+        for path in sorted((ROOT / "docs" / "gallery").glob("*.png")):
+            colours = compress(path)
+            print(f"{path.name}: {path.stat().st_size // 1000} kB, {f'{colours} colours' if colours else 'as it was'}")
+        return 0
+    models, renderings = commands([ROOT / "README.md", ROOT / "scenes" / "README.md"])
+    if unknown := set(options.names) - set(renderings):
+        parser.error(f"got {', '.join(sorted(unknown))}, wanted names among {', '.join(renderings)}")
+    if not (ROOT / "scenes" / "models").is_dir():
+        for words in models:
+            subprocess.run(words, cwd=ROOT, check=True)
+    references = load(REFERENCES) if REFERENCES.is_file() else {}
+    changed = 0
+    for name in options.names or renderings:
+        words = renderings[name]
+        if options.write:
+            references[name] = Reference.of([rendered(words, 100 + seed) for seed in range(SEEDS)])
+            save(references, REFERENCES)
+            print(f"{name}: reference of {SEEDS} pictures", flush=True)
+        elif name not in references:
+            changed += 1
+            print(f"{name}: no reference; --write makes one", flush=True)
+        else:
+            probability = references[name].probability(rendered(words, 0))
+            same = probability >= SIGNIFICANCE
+            changed += not same
+            print(f"{name}: {'unchanged' if same else 'CHANGED'}, p = {probability:.2g}", flush=True)
+    return int(changed > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

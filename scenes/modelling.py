@@ -1,0 +1,118 @@
+"""What the models of the scenes share: meshes and textures, written where the scenes look for them.
+
+Lengths are cm. A patch (u, v) → place becomes a mesh with normals and UVs; u and v must turn so that ∂u × ∂v points
+outwards. The meshes are swept or deformed sheets, so that everything follows from arrays of places.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from mitsuba_diffraction.files import whole_file
+
+Array = NDArray[np.float64]
+
+MODELS = Path(__file__).parent / "models"
+
+
+def command(make: Callable[[Path], None]) -> None:
+    """Makes the files of one scene and says which and how long it took."""
+    MODELS.mkdir(exist_ok=True)
+    start = time.perf_counter()
+    make(MODELS)
+    print(f"{Path(sys.argv[0]).stem}: written to {MODELS}, {time.perf_counter() - start:.1f} s")
+
+
+def write_sheets(path: Path, sheets: Sequence[tuple[Array, Array, Array]]) -> None:
+    """Writes sheets as one mesh (.ply) with normals and UVs: two triangles for each cell.
+
+    Args:
+        path: where to write.
+        sheets: (places, u, v) each, of shapes (n_v, n_u, 3), (n_u,) and (n_v,). Where the first and the last row or
+            column lie in one place the surface is closed there.
+    """
+    vertices, normals, uvs, faces, count = [], [], [], [], 0
+    for places, u, v in sheets:
+        rows, columns = places.shape[:2]
+        normal = np.cross(_difference(places, 1), _difference(places, 0))
+        length = np.linalg.norm(normal, axis=-1, keepdims=True)
+        normals.append(np.divide(normal, length, out=np.zeros_like(normal), where=length > 0).reshape(-1, 3))
+        vertices.append(places.reshape(-1, 3))
+        uvs.append(np.stack(np.meshgrid(u, v), -1).reshape(-1, 2))
+        corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel() + count
+        faces += [corner, corner + 1, corner + columns + 1, corner, corner + columns + 1, corner + columns]
+        count += rows * columns
+    triangles = [np.stack(faces[i : i + 3], -1) for i in range(0, len(faces), 3)]
+    mi.set_variant("scalar_rgb")
+    number = sum(len(part) for part in triangles)
+    mesh = mi.Mesh(path.stem, count, number, has_vertex_normals=True, has_vertex_texcoords=True)
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = np.concatenate(vertices).ravel()
+    parameters["vertex_normals"] = np.concatenate(normals).ravel()
+    parameters["vertex_texcoords"] = np.concatenate(uvs).ravel()
+    parameters["faces"] = np.concatenate(triangles).ravel()
+    parameters.update()
+    with whole_file(path) as temporary:
+        mesh.write_ply(str(temporary))
+
+
+def _difference(places: Array, axis: int) -> Array:
+    """Central differences; across the seam where the first and the last place are the same."""
+    first, last = places.take(0, axis), places.take(-1, axis)
+    if np.allclose(first, last):
+        inner = places.take(range(places.shape[axis] - 1), axis)
+        difference = np.roll(inner, -1, axis) - np.roll(inner, 1, axis)
+        return np.concatenate([difference, difference.take([0], axis)], axis)
+    return np.gradient(places, axis=axis)
+
+
+def write_colours(path: Path, srgb: Array) -> None:
+    """Writes a texture of colours (.png): sRGB in [0, 1], (rows, columns, 3); row 0 lies at v = 1, as Mitsuba reads."""
+    with whole_file(path) as temporary:
+        Image.fromarray(np.round(255 * np.clip(srgb, 0, 1)).astype(np.uint8)[::-1]).save(temporary)
+
+
+def write_numbers(path: Path, values: Array) -> None:
+    """Writes a texture of numbers (.exr, half): (rows, columns) or (rows, columns, 3); row 0 lies at v = 1.
+
+    Eight bits would not do for normals: their steps of half a degree are as wide as the lobes of a grating.
+    """
+    with whole_file(path) as temporary:
+        mi.Bitmap(np.ascontiguousarray(values[::-1]).astype(np.float16)).write(str(temporary))
+
+
+def normals_from_slopes(slope_u: Array, slope_v: Array) -> Array:
+    """The texture of a normal map: (n + 1)/2 with n ∝ (−∂h/∂u, −∂h/∂v, 1), slopes per length along u and v."""
+    normal = np.stack([-slope_u, -slope_v, np.ones_like(slope_u)], -1)
+    return (normal / np.linalg.norm(normal, axis=-1, keepdims=True) + 1) / 2
+
+
+def noise(rng: np.random.Generator, shape: tuple[int, int], exponent: float, largest: float = 1.0) -> Array:
+    """Periodic noise of mean 0 and standard deviation 1 whose amplitude falls as q^−exponent beyond q = 1/largest.
+
+    Args:
+        rng: of the random numbers.
+        shape: (rows, columns).
+        exponent: 1 is cloudy, 2 smooth.
+        largest: the length above which nothing varies more, as a share of the sheet's width.
+    """
+    rows, columns = shape
+    q = np.hypot(np.fft.fftfreq(rows)[:, None] * columns, np.fft.rfftfreq(columns) * columns)
+    amplitude = np.maximum(q, 1 / largest) ** -exponent
+    amplitude[0, 0] = 0
+    field = np.fft.irfft2(np.fft.rfft2(rng.standard_normal(shape)) * amplitude, s=shape)
+    return field / field.std()
+
+
+def smooth_step(x: Array, start: float, end: float) -> Array:
+    """0 before `start`, 1 after `end` (which may be the smaller), smooth between (Hermite)."""
+    t = np.clip((x - start) / (end - start), 0, 1)
+    return t * t * (3 - 2 * t)
