@@ -30,10 +30,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import colour
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
-from scipy import stats
+from scipy import cluster, stats
 
 from mitsuba_diffraction.cli import app
 from mitsuba_diffraction.color import into_gamut, spectrum_to_linear_sRGB
@@ -187,12 +188,29 @@ def compress(path: Path) -> int:
         picture = picture.convert("RGB")
     for colours in (256, 192, 128, 96, 64, 48, 32):
         stream = io.BytesIO()
-        picture.quantize(colours).save(stream, "PNG", optimize=True)
+        reduced = picture.quantize(palette=palette(picture, colours), dither=Image.Dither.FLOYDSTEINBERG)
+        reduced.save(stream, "PNG", optimize=True)
         if stream.tell() < LARGEST_FILE:
             with whole_file(path) as temporary:
                 temporary.write_bytes(stream.getvalue())
             return colours
     raise ValueError(f"{path}: got more than {LARGEST_FILE // 1000} kB with 32 colours, wanted less noise")
+
+
+def palette(picture: Image.Image, colours: int) -> Image.Image:
+    """The colours of a picture by k-means in Oklab.
+
+    A colour counts by the 0.4th power of its pixels: what is seen of a grating are few pixels of rare colours.
+    """
+    found, counts = np.unique(np.asarray(picture).reshape(-1, 3) // 4, axis=0, return_counts=True)
+    weights = counts**0.4
+    drawn = found[np.random.default_rng(0).choice(len(found), 50_000, p=weights / weights.sum())]
+    places = colour.XYZ_to_Oklab(colour.sRGB_to_XYZ((4 * drawn + 2) / 255))
+    centres, _ = cluster.vq.kmeans2(places, colours, minit="++", rng=0)
+    rgb = np.clip(colour.XYZ_to_sRGB(colour.Oklab_to_XYZ(centres)), 0, 1)
+    result = Image.new("P", (1, 1))
+    result.putpalette(np.round(255 * rgb).astype(np.uint8).ravel().tolist())
+    return result
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -31,9 +31,9 @@ SHOWN = {"text", "bash"}
 BY_OTHER_MEANS = (
     *("python3 -m venv", "python -m pytest", "pip install", "jupyter ", "mkdocs "),
     *("mitsuba-diffraction benchmark", "mitsuba-diffraction validate"),
-    "python -m mitsuba_diffraction.validation.rigorous_reference",
+    *("python -m mitsuba_diffraction.validation.rigorous_reference", "python scenes/"),
 )
-"""Commands that CI, test_notebooks, test_the_manual_is_built, test_benchmark and test_validation run."""
+"""Commands that CI runs, and the tests of notebooks, the manual, the benchmark, the validation and the gallery."""
 
 
 def blocks(page):
