@@ -108,6 +108,21 @@ def delta_E(XYZ_1: ArrayLike, XYZ_2: ArrayLike) -> NDArray[np.float64]:
     return colour.delta_E(*(colour.XYZ_to_Lab(np.asarray(XYZ), white) for XYZ in (XYZ_1, XYZ_2)), method="CIE 2000")
 
 
+def daylight(wavelengths: ArrayLike) -> NDArray[np.float64]:
+    """The illuminant D65 (CIE 15:2018) relative to its value at 560 nm, linear between the values of its table.
+
+    Args:
+        wavelengths: (n,), nm.
+
+    Returns:
+        (n,).
+    """
+    import colour
+
+    table = colour.SDS_ILLUMINANTS["D65"]
+    return np.interp(wavelengths, table.wavelengths, table.values) / 100
+
+
 def into_gamut(rgb: NDArray[np.floating]) -> NDArray[np.float64]:
     """Mixes colours that sRGB cannot show with the grey of the same luminance, until no part is negative.
 

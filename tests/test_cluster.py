@@ -111,6 +111,16 @@ def test_failures_of_a_worker_are_one_line(threads_of_this_process, monkeypatch,
     code, out, err = command(line)
     assert (code, out) == (1, "")
     assert err.splitlines()[-1] == "mitsuba-diffraction: error: rendering failed: no luck"
+
+    def miss(job):
+        raise FileNotFoundError("scene.xml: no such file")
+
+    with monkeypatch.context() as only_here:
+        only_here.setattr(passes.Job, "load", miss)
+        cluster._scene.cache_clear()
+        code, out, err = command(line)
+    assert (code, out) == (1, "")
+    assert err.splitlines()[-1].endswith("error: a worker cannot load the scene: scene.xml: no such file")
     monkeypatch.setattr(cluster, "scene_digest", lambda *arguments: "another")
     cluster._scene.cache_clear()
     code, out, err = command(line)

@@ -3,7 +3,6 @@
 import csv
 import functools
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -34,13 +33,6 @@ BLAZE = SURFACES["blaze"]
 COARSE = wavelengths(40.0)
 SKINS = {"elaphe": (1, 1.144), "xenopeltis": (0, 1.552)}
 """Diffracting axis, period in µm."""
-
-
-@pytest.fixture
-def llvm():
-    if not dr.has_backend(dr.JitBackend.LLVM):
-        pytest.skip("Dr.Jit finds no LLVM")
-    mi.set_variant("llvm_ad_spectral")
 
 
 @functools.cache

@@ -4,6 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from bsdf_support import use
 from PIL import Image
 
 import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a variant is set)
@@ -33,17 +34,6 @@ def write_scene(folder, content, film=FILM, sensor=SENSOR):
 def spectrum(name, first, last, values):
     return f"""<spectrum name="{name}" type="regular"><float name="wavelength_min" value="{first}"/>
         <float name="wavelength_max" value="{last}"/><string name="values" value="{values}"/></spectrum>"""
-
-
-def use(variant):
-    if variant.startswith("llvm") and not dr.has_backend(dr.JitBackend.LLVM):
-        pytest.skip("Dr.Jit finds no LLVM")
-    mi.set_variant(variant)
-
-
-@pytest.fixture
-def llvm():
-    use("llvm_ad_spectral")
 
 
 @pytest.mark.parametrize(
@@ -119,7 +109,8 @@ def test_passes(llvm, tmp_path, monkeypatch):
 
 
 def test_uneven_passes(llvm, tmp_path, monkeypatch):
-    monkeypatch.setattr(passes, "_SAMPLES_PER_PASS", 1)  # a large picture, so to say: four samples per pixel
+    monkeypatch.setattr(passes, "_SAMPLES_PER_PASS", 1)  # a large picture, so to say
+    monkeypatch.setattr(passes, "_LEAST_SAMPLES_PER_PIXEL", 4)
     calls = []
     path = write_scene(tmp_path, CONSTANT)
     image = render(path, spp=11, progress=lambda done, total, error: calls.append(done))

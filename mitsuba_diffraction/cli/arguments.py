@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -18,5 +19,5 @@ def scene_parameters(define: Sequence[str] | None) -> dict[str, str]:
         if not (name and equals):
             raise ValueError(f"-D: got {item!r}, wanted NAME=VALUE")
         # A file named on the command line is relative to where the command is given.
-        parameters[name] = str(Path(value).resolve()) if Path(value).is_file() else value
+        parameters[name] = str(Path(value).resolve()) if os.path.isfile(value) else value
     return parameters

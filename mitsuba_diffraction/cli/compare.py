@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from ..files import whole_file
+from ..files import refuse_unwritable, whole_file
 from .arguments import scene_parameters
 from .console import out, progress_bar, tell
 
@@ -46,6 +46,14 @@ def compare(
         raise ValueError(f"-o: got {prefix}, but the folder {prefix.parent} is not there")
     if json is not None and not json.parent.is_dir():
         raise ValueError(f"--json: got {json}, but the folder {json.parent} is not there")
+    images = {
+        f"{prefix}-path.exr": "path_traced",
+        f"{prefix}-published.exr": "published",
+        f"{prefix}-corrected.exr": "corrected",
+    }
+    written = [*images, f"{prefix}.png", *([str(json)] if json is not None else [])]
+    for target in written:
+        refuse_unwritable(target)
     parameters = scene_parameters(define)
     mi.set_variant(choose_variant(variant))
     start = time.perf_counter()
@@ -61,11 +69,6 @@ def compare(
         shares=shares,
         progress=progress_bar,
     )
-    images = {
-        f"{prefix}-path.exr": "path_traced",
-        f"{prefix}-published.exr": "published",
-        f"{prefix}-corrected.exr": "corrected",
-    }
     with ExitStack() as files:  # all of them or none
         for target, picture in images.items():
             found.pictures[picture].image.save(files.enter_context(whole_file(target)))
@@ -78,5 +81,4 @@ def compare(
     if found.shares is not None:
         wide.print("", report.quirk_table(found), sep="\n")
     tell("\n" + "\n".join(report.notes(found)))
-    written = [*images, f"{prefix}.png", *([str(json)] if json is not None else [])]
     tell(f"{', '.join(written)}: {found.variant}, {time.perf_counter() - start:.1f} s")

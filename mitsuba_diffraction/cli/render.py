@@ -59,8 +59,12 @@ def render(
         raise ValueError("--frames N and --orbit go together")
     parameters = scene_parameters(define)
     targets = [target] if frames is None else [frame_path(target, frame, frames) for frame in range(frames)]
+    animation = target.with_suffix(".webp")
+    if frames is not None:
+        refuse_unwritable(animation)
     for path in targets:
         refuse_unwritable(path)
+        refuse_unwritable(path.with_suffix(".png"))
         if checkpoint_path(path).exists() and not resume:
             raise ValueError(
                 f"{checkpoint_path(path)} is of an unfinished rendering: --resume goes on from it; "
@@ -101,9 +105,13 @@ def render(
         except Interrupted as error:
             image, interrupted = error.image, True
         except KeyboardInterrupt:
-            if not waiting.exists():
+            if waiting.exists():
+                kept = f"{waiting} holds what there is"
+            elif number:
+                kept = f"{number} of {frames} pictures are whole"
+            else:
                 raise
-            say("interrupted", f"{waiting} holds what there is; the same command with --resume goes on from it")
+            say("interrupted", f"{kept}; the same command with --resume goes on from it")
             raise typer.Exit(1) from None
         preview = path.with_suffix(".png")
         try:
@@ -122,12 +130,13 @@ def render(
         done = f"{image.attributes['spp']} samples per pixel"
         if "error" in image.attributes:
             done += f", error {image.attributes['error']:.2g}"
+            if until_error is not None and image.attributes["error"] > until_error:
+                done += f" (not {until_error:g}: more --spp may take it there)"
         tell(
             f"{path}: {columns} × {rows} pixels, {bins} wavelengths, {done}, {mi.variant()}, "
             f"{time.perf_counter() - start:.1f} s\n{preview}: preview, exposure {exposure:.4g}"
         )
     if frames is not None:
-        animation = target.with_suffix(".webp")
         save_animation([path.with_suffix(".png") for path in targets], animation)
         tell(f"{animation}: animated preview, {frames} frames")
 

@@ -14,7 +14,10 @@ from numpy.typing import NDArray
 
 from ..color import spectrum_to_XYZ
 from ..render import SpectralImage
-from ..render.scene import channel_wavelengths, channel_weights, load_spectral_scene, root_cause
+from ..render.accumulation import Accumulation, ratio
+from ..render.film import collect, pass_seed, trace_pass
+from ..render.passes import split
+from ..render.scene import channel_wavelengths, load_spectral_scene
 from ..shader.base import Shader
 from ..shader.evaluate import VARIANTS
 from ..shader.flss import FLSS
@@ -27,7 +30,6 @@ Progress = Callable[[int, int], None]
 NO_SHADOWS = "no_shadows"
 
 # Per dispatch, so that progress shows: some seconds of work on two cores.
-_PATHS = 2**20
 _SHADING_POINTS = 2**16
 
 
@@ -104,7 +106,7 @@ class Pictures:
         if hasattr(self.scene.integrator(), "quirks"):
             raise ValueError(f"{scene_path}: its integrator is the shader itself, wanted a path tracer (type='path')")
         self.seed = seed
-        self._others: dict[tuple[bool, bool, int], tuple[SpectralImage, int, float, NDArray[np.float64] | None]] = {}
+        self._others: dict[tuple[bool, bool, int], Picture] = {}
         self._shader = mi.load_dict({"type": "diffraction_shader", "variant": shader})
         # Refuses a scene that the shader cannot show.
         prepared = self._shader.prepare(self.scene)
@@ -147,11 +149,11 @@ class Pictures:
 
     def path_traced(self, samples: int, progress: Progress = silent) -> Picture:
         """By the scene's own integrator."""
-        return Picture(*self._traced(self.scene.integrator(), samples, progress))
+        return self._traced(self.scene.integrator(), samples, progress)
 
     def same_light(self, samples: int, progress: Progress = silent) -> Picture:
         """By the scene's BSDFs, with the light alone that the shader knows; see `integrators.same_light`."""
-        return Picture(*self._traced(same_light(self.scene), samples, progress))
+        return self._traced(same_light(self.scene), samples, progress)
 
     def shaded(self, quirks: Collection[str], samples: int, others: int, progress: Progress = silent) -> Picture:
         """By the shader: what its integrator converges to, with far fewer samples.
@@ -172,74 +174,64 @@ class Pictures:
         known = ("constant_blend" in quirks, self._shader.shadows, others)
         if known not in self._others:
             self._others[known] = self._traced(without_gratings(self._shader), others, silent, halves=False)
-        rest, _, rest_seconds, _ = self._others[known]
+        rest = self._others[known]
         rgb, seconds = self._colours(samples, progress)
-        radiance = rest.radiance + rgb @ _channel_spectra().T
-        return Picture(SpectralImage(rest.wavelengths, radiance), samples, seconds + rest_seconds)
+        radiance = rest.image.radiance + rgb @ _channel_spectra().T
+        return Picture(SpectralImage(rest.image.wavelengths, radiance), samples, seconds + rest.seconds)
 
-    def _traced(
-        self, integrator: mi.Integrator, samples: int, progress: Progress, halves: bool = True
-    ) -> tuple[SpectralImage, int, float, NDArray[np.float64] | None]:
-        """What `Picture` takes."""
+    def _traced(self, integrator: mi.Integrator, samples: int, progress: Progress, halves: bool = True) -> Picture:
         rows, columns = self.surface.shape
-        self._render(integrator, 1, self.seed)  # compiles the kernels
-        wavelengths, weights = channel_wavelengths(), channel_weights()
-        total = np.zeros((rows, columns, wavelengths.size))
-        sums, counts = np.zeros((2, rows, columns, 3)), [0, 0]
-        passes = min(samples, max(1 + halves, -(-samples * rows * columns // _PATHS)))
-        done = 0
+        passes = split(self.scene, samples, 2 if halves else 1)
+        trace_pass(self.scene, 1, self.seed, integrator)  # compiles the kernels
+        sums = Accumulation.empty(rows, columns, channel_wavelengths())
+        pair = np.zeros((2, rows, columns, 4))  # sums of XYZ and of the filter, of every other pass
         begin = time.perf_counter()
-        for index in range(passes):
-            some = samples * (index + 1) // passes - done
-            seed = np.random.SeedSequence((self.seed, index)).generate_state(1)[0]
-            radiance = some * self._render(integrator, some, int(seed)) / weights
-            total += radiance
-            sums[index % 2] += spectrum_to_XYZ(radiance, wavelengths)
-            counts[index % 2] += some
-            done += some
-            progress(done, samples)
+        for index, some in enumerate(passes):
+            traced = trace_pass(self.scene, some, pass_seed(self.seed, index), integrator)
+            sums.add(traced, some)
+            pair[index % 2, ..., :3] += spectrum_to_XYZ(traced[..., :-1], sums.wavelengths)
+            pair[index % 2, ..., 3] += traced[..., -1]
+            progress(sums.samples, sum(passes))
         seconds = time.perf_counter() - begin
-        pair = sums / np.reshape(counts, (2, 1, 1, 1)) if halves and all(counts) else None
-        return SpectralImage(wavelengths, total / samples), samples, seconds, pair
-
-    def _render(self, integrator: mi.Integrator, spp: int, seed: int) -> NDArray[np.float32]:
-        try:
-            return np.array(mi.render(self.scene, integrator=integrator, spp=spp, seed=seed))
-        except Exception as error:
-            raise RuntimeError(f"rendering failed: {root_cause(error)}") from error
+        image = SpectralImage(sums.wavelengths, sums.radiance())
+        in_halves = ratio(pair[..., :3], pair[..., 3:]) if halves and len(passes) > 1 else None
+        return Picture(image, sums.samples, seconds, in_halves)
 
     def _colours(self, samples: int, progress: Progress) -> tuple[NDArray[np.float64], float]:
         """Linear sRGB of the gratings, (height, width, 3), and seconds."""
         rows, columns = self.surface.shape
-        film = self.scene.sensors()[0].film()
-        block = mi.ImageBlock(film.crop_size(), [0, 0], 4, film.rfilter(), border=False)
         per_dispatch = max(1, _SHADING_POINTS // samples)
         firsts = range(0, rows * columns, per_dispatch)
-        # One pixel compiles the kernels.
-        self._shade(mi.ImageBlock(film.crop_size(), [0, 0], 4, film.rfilter(), border=False), 0, 1, samples)
+        self._shade(0, 1, samples)  # one pixel compiles the kernels
         begin = time.perf_counter()
+        points = []
         for index, first in enumerate(firsts):
-            self._shade(block, first, min(per_dispatch, rows * columns - first), samples)
+            points.append(self._shade(first, min(per_dispatch, rows * columns - first), samples))
             progress(index + 1, len(firsts))
-        values = np.array(block.tensor(), np.float64)
+        x, y, *rgb = (mi.Float(column) for column in np.concatenate(points, axis=1))
+        channels = [dr.opaque(mi.Float, channel, shape=len(x)) for channel in range(3)]
+        rfilter = self.scene.sensors()[0].film().rfilter()
+        count = dr.opaque(mi.UInt32, len(x) // (rows * columns))
+        sums = collect(rfilter, mi.Point2f(x, y), channels, rgb, (rows, columns), 0, count, 3)
+        values = np.array(sums, np.float64).reshape(rows, columns, 4)
         return values[..., :3] / values[..., 3:], time.perf_counter() - begin
 
-    def _shade(self, block: mi.ImageBlock, first: int, count: int, samples: int) -> None:
-        """Adds `count` pixels, from `first` on, to a block."""
-        sensor, columns = self.scene.sensors()[0], block.size()[0]
+    def _shade(self, first: int, count: int, samples: int) -> NDArray[np.float32]:
+        """Shading points of `count` pixels, from `first` on: (5, n), position in the picture and linear sRGB."""
+        sensor = self.scene.sensors()[0]
+        columns, rows = (int(size) for size in sensor.film().crop_size())
         sampler = mi.load_dict({"type": "multijitter", "sample_count": samples})
         samples = sampler.sample_count()  # the next product of two like numbers
         sampler.set_samples_per_wavefront(samples)
-        seed = np.random.SeedSequence((self.seed, first)).generate_state(1)[0]
-        sampler.seed(int(seed), count * samples)
+        sampler.seed(pass_seed(self.seed, first), count * samples)
         pixel = dr.opaque(mi.UInt32, first) + dr.arange(mi.UInt32, count * samples) // samples
         position = mi.Point2f(mi.Float(pixel % columns), mi.Float(pixel // columns)) + sampler.next_2d()
         # Time and aperture; a shader needs no wavelengths.
-        ray, _ = sensor.sample_ray(sampler.next_1d(), 0.5, position / mi.Vector2f(block.size()), sampler.next_2d())
+        size = mi.Vector2f(columns, rows)
+        ray, _ = sensor.sample_ray(sampler.next_1d(), 0.5, position / size, sampler.next_2d())
         rgb, _, _ = self._shader.shade(self.scene, mi.RayDifferential3f(ray))
-        block.put(position, [rgb.x, rgb.y, rgb.z, mi.Float(1)])
-        dr.eval(block.tensor())
-        dr.sync_thread()
+        dr.eval(position, rgb)
+        return np.concatenate([np.array(position), np.array(rgb)])
 
 
 def _channel_spectra() -> NDArray[np.float64]:

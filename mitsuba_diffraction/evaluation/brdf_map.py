@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..color import auto_exposure, into_gamut, roll_off, spectrum_to_linear_sRGB
+from ..color import auto_exposure, daylight, into_gamut, on_screen, spectrum_to_linear_sRGB
 from ..shader.evaluate import VARIANTS, colour
 from ..shader.quirks import Quirks
 from .model import relative_reflectance
@@ -48,11 +48,7 @@ class BRDFMap:
     @property
     def picture(self) -> Array:
         """sRGB (side, side, 3) from 0 to 1; 0.5 grey outside."""
-        import colour as colour_science
-
-        shown = roll_off(into_gamut(self.rgb) * self.exposure)
-        encoded = np.clip(colour_science.cctf_encoding(shown, function="sRGB"), 0, 1)
-        return np.where(np.isnan(self.rgb), 0.5, encoded)
+        return np.where(np.isnan(self.rgb), 0.5, on_screen(into_gamut(self.rgb) * self.exposure) / 255)
 
     def places_of_orders(self, nanometres: Array, orders: Array) -> tuple[Array, Array]:
         """Where the grating equation with the published period puts the orders, in the map's x and y.
@@ -130,12 +126,9 @@ def _linear_rgb(surface: Surface, method: str, wi: Array, wo: Array, quirks: Qui
     if method != MODEL:
         settings = {} if method == "gem" else {"coherence_length": surface.coherence_length}
         return colour(surface.height_field, wi, wo, variant=method, quirks=quirks, **settings)
-    import colour as colour_science
-
     nanometres = wavelengths()
-    light = colour_science.SDS_ILLUMINANTS["D65"]
     values = relative_reflectance(surface.spectrum, wi, wo, nanometres)
-    return spectrum_to_linear_sRGB(values.T * np.interp(nanometres, light.wavelengths, light.values) / 100, nanometres)
+    return spectrum_to_linear_sRGB(values.T * daylight(nanometres), nanometres)
 
 
 def _direction(theta: float | Array, phi: float | Array, degrees: bool = True) -> Array:

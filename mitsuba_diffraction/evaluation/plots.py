@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..color import daylight, into_gamut, on_screen, spectrum_to_linear_sRGB
 from .brdf_map import BRDFMap
 from .slits import Slits, analytic_intensity, tiled_intensity
 from .surfaces import Surface
-from .viewing_angle import MODEL, PeriodFit, ReflectanceMap, fit_period, grating_equation, peak_angles
+from .viewing_angle import MODEL, PeriodFit, ReflectanceMap, fit_period, grating_equation, peak_angles, wavelengths
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -182,29 +183,20 @@ def plot_slits(counts: Sequence[int] = (1, 2, 3, 7), wavelength: float = 500.0) 
 
 def plot_slit_patterns(counts: Sequence[int] = (1, 7), wavelength: float = 500.0) -> Figure:
     """What the screen behind N slits looks like in light of one wavelength, and in daylight (figure 5.6)."""
-    import colour
-
-    from ..color import into_gamut, roll_off, spectrum_to_linear_sRGB
-    from .viewing_angle import wavelengths
-
     drawn = figure(7, 1.35 * len(counts) + 0.6)
     axes = drawn.subplots(2 * len(counts), 1, sharex=True)
     place, nanometres = np.linspace(-25e3, 25e3, 1501), wavelengths()
-    d65 = colour.SDS_ILLUMINANTS["D65"]
-    daylight = np.interp(nanometres, d65.wavelengths, d65.values) / 100
     # Light in one wavelength: all of a step of 5 nm, made as bright as daylight.
     line = np.where(nanometres == wavelength, 1.0, 0.0)
+    lights = ((line, f"{wavelength:g} nm"), (daylight(nanometres), "daylight"))
     for index, count in enumerate(counts):
         slits = Slits(count)
         intensity = tiled_intensity(slits, slits.sine(place)[:, None], nanometres, samples=100)
-        for panel, light, name in zip(
-            axes[2 * index : 2 * index + 2], (line, daylight), (f"{wavelength:g} nm", "daylight"), strict=True
-        ):
+        for panel, (light, name) in zip(axes[2 * index : 2 * index + 2], lights, strict=True):
             rgb = into_gamut(spectrum_to_linear_sRGB(intensity * light, nanometres))
             # The middle at the white of the screen; the square root lifts the faint outer orders.
             peak = rgb.max(axis=-1, keepdims=True) / rgb.max()
-            shown = roll_off(rgb / rgb.max() / np.sqrt(np.maximum(peak, 1e-9)))
-            pixels = np.clip(colour.cctf_encoding(shown, function="sRGB"), 0, 1)
+            pixels = on_screen(rgb / rgb.max() / np.sqrt(np.maximum(peak, 1e-9)))
             panel.imshow(pixels[None], aspect="auto", extent=(-25, 25, 0, 1))
             panel.set_yticks([])
             panel.set_ylabel(f"N = {count}\n{name}", rotation=0, ha="right", va="center", size=9)

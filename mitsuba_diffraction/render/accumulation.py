@@ -48,7 +48,7 @@ class Accumulation:
         # einsum adds in one order; a matrix product may share the work among threads.
         weights = spectrum_to_XYZ(np.eye(self.wavelengths.size), self.wavelengths)[:, 1].astype(np.float32)
         luminance = np.einsum("yxi,i->yx", traced[..., :-1], weights).astype(np.float64)
-        luminance = _ratio(luminance, traced[..., -1])
+        luminance = ratio(luminance, traced[..., -1])
         self.sums += traced
         self.luminance += samples * luminance
         self.squares += samples * luminance**2
@@ -58,7 +58,7 @@ class Accumulation:
     def radiance(self) -> NDArray[np.float32]:
         """(height, width, n) float32, W m⁻² sr⁻¹ nm⁻¹."""
         # Row by row: the sums of a large picture are not doubled in memory.
-        return np.stack([_ratio(row[:, :-1], row[:, -1:]).astype(np.float32) for row in self.sums])
+        return np.stack([ratio(row[:, :-1], row[:, -1:]).astype(np.float32) for row in self.sums])
 
     def error(self) -> float:
         """The relative error that nine in ten lit pixels do not exceed.
@@ -83,6 +83,6 @@ class Accumulation:
         return float(np.percentile(np.sqrt(variance * self.samples) / luminance, 90))
 
 
-def _ratio(sums: NDArray, weights: NDArray) -> NDArray:
+def ratio(sums: NDArray, weights: NDArray) -> NDArray:
     """sums/weights, zero where no sample lies under the filter."""
     return np.divide(sums, weights, out=np.zeros_like(sums), where=weights != 0)

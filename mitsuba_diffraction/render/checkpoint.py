@@ -8,8 +8,9 @@ for 1280 × 720 pixels; while one is written, the one before is there as well.
 from __future__ import annotations
 
 import os
-import zipfile
+from dataclasses import fields
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -45,18 +46,18 @@ def load_checkpoint(path: str | os.PathLike[str], digest: str) -> Accumulation |
     Raises:
         ValueError: if it is damaged, not a checkpoint, or one of another request.
     """
-    try:
-        with open(path, "rb") as stream, np.load(stream) as content:
-            found = content["digest"].item()
-            if found == digest:
-                names = [name for name in content.files if name != "digest"]
-                read = {name: content[name] for name in names}
-                read = {name: value if value.ndim else value.item() for name, value in read.items()}
-                return Accumulation(**read)
-    except FileNotFoundError:
+    if not os.path.exists(path):
         return None
-    except (ValueError, KeyError, TypeError, EOFError, AttributeError, zipfile.BadZipFile) as error:
-        raise ValueError(f"{os.fspath(path)}: not a checkpoint, or a damaged one ({error})") from None
+    with open(path, "rb") as stream:
+        try:
+            with np.load(stream) as content:
+                found = content["digest"].item()
+                if found == digest:
+                    read = {name: content[name] for name in (field.name for field in fields(Accumulation))}
+                    return Accumulation(**{name: value if value.ndim else value.item() for name, value in read.items()})
+        # What NumPy and zipfile raise, wherever the damage is.
+        except (ValueError, KeyError, TypeError, EOFError, AttributeError, RuntimeError, OSError, BadZipFile) as error:
+            raise ValueError(f"{os.fspath(path)}: not a checkpoint, or a damaged one ({error})") from None
     raise ValueError(
         f"{os.fspath(path)}: of another rendering: the scene or a file that it names, an option, or a version is not "
         "what it was; give what was given then, or remove the file to begin anew"

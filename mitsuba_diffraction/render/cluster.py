@@ -21,7 +21,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from .film import trace_pass
+from .film import pass_seed, trace_pass
 from .passes import Job, Tracer, versions
 from .scene import scene_digest
 
@@ -74,6 +74,8 @@ def trace_on(address: str) -> Tracer:
                 raise RuntimeError(f"the Dask scheduler at {address} is gone") from None
             except distributed.KilledWorker as error:
                 raise RuntimeError(f"workers of {address} end while they trace: {error}") from None
+            except ImportError as error:
+                raise RuntimeError(f"a worker of {address} lacks a package: {error}") from None
             finally:
                 with suppress(distributed.TimeoutError, TimeoutError, OSError):
                     client.cancel(list(waiting), force=True)
@@ -92,12 +94,16 @@ def _trace_there(job: Job, index: int) -> NDArray[np.float32]:
         threads = distributed.get_worker().state.nthreads
         if dr.thread_count() != threads:
             dr.set_thread_count(threads)
-        return trace_pass(_scene(job), job.samples[index], job.pass_seed(index))
+        return trace_pass(_scene(job), job.samples[index], pass_seed(job.seed, index))
 
 
 @lru_cache(maxsize=1)
 def _scene(job: Job) -> mi.Scene:
-    scene = job.load()
-    if scene_digest(job.scene, dict(job.parameters)) != job.content:
+    try:
+        scene = job.load()
+        content = scene_digest(job.scene, dict(job.parameters))
+    except (ValueError, OSError) as error:
+        raise RuntimeError(f"a worker cannot load the scene: {error}") from None
+    if content != job.content:
         raise RuntimeError(f"{job.scene}: a worker finds another scene there, or other files that it names")
     return scene

@@ -20,7 +20,12 @@ from numpy.typing import NDArray
 from .scene import channel_wavelengths, channel_weights, root_cause
 
 
-def trace_pass(scene: mi.Scene, spp: int, seed: int) -> NDArray[np.float32]:
+def pass_seed(seed: int, index: int) -> int:
+    """A 32-bit seed for one pass, independent of those of its neighbours and of other `seed`s."""
+    return int(np.random.SeedSequence((seed, index)).generate_state(1)[0])
+
+
+def trace_pass(scene: mi.Scene, spp: int, seed: int, integrator: mi.Integrator | None = None) -> NDArray[np.float32]:
     """Traces the first sensor once and gives the sums from which radiance follows.
 
     With the filter f, the continuous position p_s of the sample s, its radiance L_s(λ) at four wavelengths λ_sj
@@ -38,6 +43,7 @@ def trace_pass(scene: mi.Scene, spp: int, seed: int) -> NDArray[np.float32]:
         scene: as `load_spectral_scene` gives it.
         spp: samples per pixel; the scene's sampler may take more (`samples_drawn`).
         seed: 32 bits.
+        integrator: in place of the scene's own.
 
     Returns:
         (height, width, n + 1) float32.
@@ -45,14 +51,14 @@ def trace_pass(scene: mi.Scene, spp: int, seed: int) -> NDArray[np.float32]:
     Raises:
         RuntimeError: if tracing failed, with the cause in one line.
     """
-    integrator = scene.integrator()
+    integrator = scene.integrator() if integrator is None else integrator
     try:
         if (
             mi.variant().startswith("scalar")
             or not isinstance(integrator, mi.SamplingIntegrator)
             or isinstance(integrator, mi.CppADIntegrator)
         ):
-            return _trace_with_mitsubas_film(scene, spp, seed)
+            return _trace_with_mitsubas_film(scene, integrator, spp, seed)
         return _trace(scene, integrator, spp, seed)
     except Exception as error:
         raise RuntimeError(f"rendering failed: {root_cause(error)}") from error
@@ -66,8 +72,9 @@ def samples_drawn(scene: mi.Scene, spp: int) -> int:
     return sampler.sample_count()
 
 
-def _trace_with_mitsubas_film(scene: mi.Scene, spp: int, seed: int) -> NDArray[np.float32]:
-    picture = np.array(mi.render(scene, spp=spp, seed=seed)) / channel_weights().astype(np.float32)
+def _trace_with_mitsubas_film(scene: mi.Scene, integrator: mi.Integrator, spp: int, seed: int) -> NDArray[np.float32]:
+    recorded = np.array(mi.render(scene, integrator=integrator, spp=spp, seed=seed))
+    picture = recorded / channel_weights().astype(np.float32)
     drawn = np.float32(samples_drawn(scene, spp))
     return np.concatenate([picture * drawn, np.full((*picture.shape[:2], 1), drawn)], axis=-1)
 
@@ -113,13 +120,17 @@ def _trace(scene: mi.Scene, integrator: mi.SamplingIntegrator, spp: int, seed: i
     channel = (ray.wavelengths - float(centres[0])) / step
     value = radiance / (len(radiance) * step)
     dr.eval(position, channel, value)
-    sums = _collect(rfilter, position, channel, value, (rows, columns), border, count, centres.size)
+    sums = collect(rfilter, position, channel, value, (rows, columns), border, count, centres.size)
     return np.array(sums).reshape(rows, columns, centres.size + 1)
 
 
 @dr.syntax
-def _collect(rfilter, position, channel, value, size, border, count, channels):
-    """Adds to each pixel the samples under its filter, row by row; one lane does it all for one pixel."""
+def collect(rfilter, position, channel, value, size, border, count, channels):
+    """Adds to each pixel the samples under its filter, row by row; one lane does it all for one pixel.
+
+    Lists `channel` and `value`: at a channel between two whole numbers, these share the value. The samples of a pixel
+    stand together. The result holds, pixel by pixel, the channels and last the sum of the filter.
+    """
     rows, columns = size
     reach = int(np.ceil(rfilter.radius() - 0.5))
     box = rfilter.is_box_filter()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 import signal
 import threading
@@ -21,7 +22,7 @@ from numpy.typing import NDArray
 
 from .accumulation import Accumulation
 from .checkpoint import load_checkpoint, save_checkpoint
-from .film import samples_drawn, trace_pass
+from .film import pass_seed, samples_drawn, trace_pass
 from .scene import channel_wavelengths, load_spectral_scene, scene_digest
 from .spectral_image import SpectralImage
 
@@ -74,10 +75,6 @@ class Job:
             self.scene, width=self.width, height=self.height, parameters=dict(self.parameters), motion=self.motion
         )
 
-    def pass_seed(self, index: int) -> int:
-        """A 32-bit seed for one pass, independent of those of its neighbours and of other `seed`s."""
-        return int(np.random.SeedSequence((self.seed, index)).generate_state(1)[0])
-
 
 # Gives the passes `first`, `first` + 1, … of a job, one after the other; see `trace_here`.
 Tracer = Callable[[Job, "mi.Scene", int], Iterator[NDArray[np.float32]]]
@@ -98,7 +95,7 @@ class Interrupted(KeyboardInterrupt):
 def trace_here(job: Job, scene: mi.Scene, first: int) -> Iterator[NDArray[np.float32]]:
     """The passes of a job from `first` on, traced in this process; see `trace_pass`."""
     for index in range(first, len(job.samples)):
-        yield trace_pass(scene, job.samples[index], job.pass_seed(index))
+        yield trace_pass(scene, job.samples[index], pass_seed(job.seed, index))
 
 
 def versions() -> tuple[str, ...]:
@@ -176,7 +173,7 @@ def render(
         motion=motion,
         variant=mi.variant(),
         seed=seed,
-        samples=_split(scene, spp, rows * columns, until_error),
+        samples=split(scene, spp, 1 if until_error is None else _LEAST_PASSES_TO_CONVERGE),
         until_error=until_error,
         content=scene_digest(scene_path, parameters),
         versions=versions(),
@@ -184,19 +181,16 @@ def render(
     if finished is not None and finished.attributes.get("digest") == job.digest():
         return finished
 
-    total = sum(job.samples)
     sums = None if checkpoint is None else load_checkpoint(checkpoint, job.digest())
     saved = 0 if sums is None else sums.samples
     if sums is None:
         sums = Accumulation.empty(rows, columns, channel_wavelengths())
-    ends = sums.passes == len(job.samples) or _converged(sums, until_error)
-    progress(sums.samples, _expected(sums, total, until_error), sums.error())
+    ends = _judge(sums, job, progress)
     last, wait = time.monotonic(), seconds
     with _deferred_interrupt() as interrupted, closing(tracer(job, scene, sums.passes)) as traced:
         while not (ends or interrupted()):
             sums.add(next(traced), job.samples[sums.passes])
-            ends = sums.passes == len(job.samples) or _converged(sums, until_error)
-            progress(sums.samples, _expected(sums, total, until_error), sums.error())
+            ends = _judge(sums, job, progress)
             due = interrupted() or time.monotonic() - last >= wait
             if checkpoint is not None and due and not ends:
                 last = time.monotonic()
@@ -213,25 +207,27 @@ def render(
     return SpectralImage(sums.wavelengths, sums.radiance(), {**attributes, "digest": job.digest()})
 
 
-def _split(scene: mi.Scene, spp: int, pixels: int, until_error: float | None) -> tuple[int, ...]:
-    """Samples per pixel of each pass. Nothing but the request decides, so that an interrupt changes no pass."""
+def split(scene: mi.Scene, spp: int, least: int = 1) -> tuple[int, ...]:
+    """Samples per pixel of each pass of a picture; `least` passes or more, as far as there are samples for them.
+
+    Nothing but the request decides, so that an interrupt changes no pass.
+    """
+    pixels = math.prod(scene.sensors()[0].film().crop_size())
     passes = -(-spp * pixels // max(_SAMPLES_PER_PASS, _LEAST_SAMPLES_PER_PIXEL * pixels))
-    if until_error is not None:
-        passes = max(passes, _LEAST_PASSES_TO_CONVERGE)
-    passes = min(passes, spp)
+    passes = min(max(passes, least), spp)
     ends = [spp * index // passes for index in range(passes + 1)]
     return tuple(samples_drawn(scene, end - start) for start, end in pairwise(ends))
 
 
-def _converged(sums: Accumulation, until_error: float | None) -> bool:
-    return until_error is not None and sums.passes >= _PASSES_TO_JUDGE and sums.error() <= until_error
-
-
-def _expected(sums: Accumulation, total: int, until_error: float | None) -> int:
-    """Samples per pixel at the end: the error falls with the root of their number."""
-    if until_error is None or sums.passes < _PASSES_TO_JUDGE or not np.isfinite(sums.error()):
-        return total
-    return min(total, max(sums.samples, round(sums.samples * (sums.error() / until_error) ** 2)))
+def _judge(sums: Accumulation, job: Job, progress: Callable[[int, int, float], None]) -> bool:
+    """Tells the progress, and gives whether the picture is done."""
+    error = sums.error() if sums.passes >= _PASSES_TO_JUDGE else math.nan
+    expected = total = sum(job.samples)
+    if job.until_error is not None and not math.isnan(error):
+        # The error falls with the root of the samples.
+        expected = min(total, max(sums.samples, round(sums.samples * (error / job.until_error) ** 2)))
+    progress(sums.samples, expected, error)
+    return sums.passes == len(job.samples) or (job.until_error is not None and error <= job.until_error)
 
 
 def _save(checkpoint: str | os.PathLike[str], job: Job, sums: Accumulation, saved: int) -> None:
@@ -247,12 +243,12 @@ def _deferred_interrupt() -> Iterator[Callable[[], bool]]:
     """Gives what tells whether there was a Ctrl-C; a second one interrupts at once.
 
     An exception between two statements would leave the sums and their count in disagreement. Python hears signals in
-    the main thread alone.
+    the main thread alone; where Ctrl-C is ignored, as in what a script starts in the background, it stays ignored.
     """
-    if threading.current_thread() is not threading.main_thread():
+    before = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or before in (signal.SIG_IGN, None):
         yield lambda: False
         return
-    before = signal.getsignal(signal.SIGINT)
     asked = threading.Event()
 
     def note(number: int, frame: object) -> None:

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
+import drjit as dr
 import mitsuba as mi
 import mitsuba.parser
 import numpy as np
@@ -116,7 +117,7 @@ def scene_digest(path: str | os.PathLike[str], parameters: Mapping[str, str] | N
             for name, value in node.props.items():
                 named = Path(str(mi.file_resolver().resolve(value))) if name == "filename" else None
                 if named is None or not named.is_file():
-                    content.update(f"{name}={value}\n".encode())
+                    content.update(f"{name}={_in_full(value)}\n".encode())
                 elif named.suffix == ".toml":
                     content.update(Recipe.load(named).digest().encode())
                 else:
@@ -124,6 +125,15 @@ def scene_digest(path: str | os.PathLike[str], parameters: Mapping[str, str] | N
                         while block := stream.read(2**24):
                             content.update(block)
     return content.hexdigest()
+
+
+def _in_full(value: object) -> str:
+    """A property as text that tells its value: Mitsuba's own counts the samples of a spectrum, and rounds."""
+    if dr.is_array_v(value):
+        return str(list(value))
+    if hasattr(value, "wavelengths"):
+        return f"{list(value.wavelengths)} {list(value.values)}"
+    return str(np.array(value.matrix).tolist() if hasattr(value, "matrix") else value)
 
 
 @contextmanager

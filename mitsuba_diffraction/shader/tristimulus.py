@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import lsq_linear
 
+from ..color import daylight
+
 SHORTEST, LONGEST, PUBLISHED_STEP = 380.0, 780.0, 5.0  # nm: 81 wavelengths
 
 CIE_RGB = np.array([[0.41847, -0.15866, -0.082835], [-0.091169, 0.25243, 0.015708], [0.00092090, -0.0025498, 0.17860]])
@@ -37,10 +39,7 @@ def d65_weights() -> NDArray[np.float64]:
 
     The integral is the shader's own, a trapezoid of 5 nm.
     """
-    import colour
-
-    d65 = colour.SDS_ILLUMINANTS["D65"]
-    weights = np.interp(wavelengths(), d65.wavelengths, d65.values)[:, None] * matching_functions()
+    weights = daylight(wavelengths())[:, None] * matching_functions()
     return weights / np.trapezoid(weights[:: int(PUBLISHED_STEP), 1], dx=PUBLISHED_STEP)
 
 
