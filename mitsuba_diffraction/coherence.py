@@ -7,6 +7,9 @@ import numpy as np
 # The sun's disc is 0.53° wide: its light is coherent over about 65 µm.
 SUN_COHERENCE_LENGTH = 65.0
 
+# A nanometre to a metre: beyond, lobes have no width or no end in floats.
+SHORTEST, LONGEST = 1e-3, 1e6
+
 
 def lobe_width(coherence_length: float) -> float:
     """σ_q in cycles/µm for the coherence length L_c in µm.
@@ -15,10 +18,12 @@ def lobe_width(coherence_length: float) -> float:
     Gaussian of standard deviation σ_q = 1/(2√2 π σ_s).
 
     Raises:
-        ValueError: if the coherence length is not positive and finite.
+        ValueError: if the coherence length is not 1 nm to 1 m.
     """
-    if not (np.isfinite(coherence_length) and coherence_length > 0):
-        raise ValueError(f"coherence_length: got {coherence_length!r}, wanted a positive number of µm")
+    if not SHORTEST <= coherence_length <= LONGEST:
+        raise ValueError(
+            f"coherence_length: got {coherence_length!r}, wanted a positive number of µm, {SHORTEST:g} to {LONGEST:g}"
+        )
     return 1 / (2 * np.sqrt(2) * np.pi * (coherence_length / 4))
 
 

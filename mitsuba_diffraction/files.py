@@ -92,7 +92,7 @@ def refuse_unwritable(path: str | os.PathLike[str]) -> None:
     except _Writable:
         pass
     except OSError as error:
-        raise ValueError(f"cannot write {os.fspath(path)!r}: {error.strerror or error}") from None
+        raise ValueError(f"cannot write {os.fspath(path)!r}: {error.strerror}" if error.strerror else error) from None
 
 
 class _Writable(Exception):

@@ -18,16 +18,13 @@ def as_pixel_size(value: float | tuple[float, float]) -> tuple[float, float]:
     Raises:
         ValueError: if the value is neither, or not positive and finite.
     """
-    if isinstance(value, Real):
-        pair = (float(value), float(value))
-    else:
-        try:
-            if isinstance(value, str):
-                raise TypeError
-            x, y = value
-            pair = (float(x), float(y))
-        except (TypeError, ValueError):
-            raise ValueError(f"pixel_size: got {value!r}, wanted one number or (x, y) in µm") from None
+    try:
+        if isinstance(value, str | bool):
+            raise TypeError
+        x, y = (value, value) if isinstance(value, Real) else value
+        pair = (float(x), float(y))
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"pixel_size: got {value!r}, wanted one number or (x, y) in µm") from None
     if not all(np.isfinite(p) and p > 0 for p in pair):
         raise ValueError(f"pixel_size: got {value!r}, wanted positive numbers in µm")
     return pair

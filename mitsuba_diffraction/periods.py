@@ -27,6 +27,9 @@ _RING = 24
 _LEAST_STRENGTH = 1e-3
 """Share of the variance that a wave must hold: an instrument hums, too."""
 
+_ROUNDING = 1e-20
+"""Of the greatest power; a wave of `_LEAST_STRENGTH` is far above, what rounding of the transform leaves far below."""
+
 _MOST_MAXIMA = 200
 """Local maxima that are looked at."""
 
@@ -51,6 +54,22 @@ class Period:
     period_uncertainty: float
     direction_uncertainty: float
     strength: float
+
+    @classmethod
+    def of(cls, q: NDArray[np.float64], spread: NDArray[np.float64], strength: float) -> Period:
+        """From a frequency (2,) in cycles/µm and its covariance (2, 2)."""
+        length = float(np.hypot(*q))
+        along, across = q / length, np.array([-q[1], q[0]]) / length
+        direction = float(np.degrees(np.arctan2(q[1], q[0])))
+        # (−90, 90]; what is −90 but for rounding is 90.
+        direction = min(float(direction - 180 * np.ceil((direction - 90) / 180 - 1e-12)), 90.0)
+        return cls(
+            period=1 / length,
+            direction=direction,
+            period_uncertainty=float(np.sqrt(along @ spread @ along)) / length**2,
+            direction_uncertainty=float(np.degrees(np.sqrt(across @ spread @ across) / length)),
+            strength=strength,
+        )
 
 
 def find_periods(height_field: HeightField, count: int = 2) -> tuple[Period, ...]:
@@ -159,7 +178,9 @@ class _Spectrum:
         # Of noise, a power is distributed as an exponential about its mean, which is the quartile over ln 4/3.
         level = np.log(usable.sum() / _FALSE_ALARM) / np.log(4 / 3)
         background = self._rings(usable, np.hypot(*np.meshgrid(*self._q)))
-        return [p for p in self._maxima if power[p] > level * max(background[p], self._streak(*p))]
+        # About a wave without noise there is nothing but rounding.
+        least = _ROUNDING * power[usable].max()
+        return [p for p in self._maxima if power[p] > max(least, level * max(background[p], self._streak(*p)))]
 
     def _rings(self, usable: NDArray[np.bool_], length: NDArray[np.float64]) -> NDArray[np.float64]:
         """The lower quartile of the power over frequencies of about the same length, by power laws between rings."""
@@ -213,7 +234,7 @@ class _Spectrum:
         found = []
         for k in range(len(q)):
             spread = noise[k] + self._wander(q[k], 4 * noise[k])
-            found.append(_period(q[k], spread, float(min(strength[k], 1.0))))
+            found.append(Period.of(q[k], spread, float(min(strength[k], 1.0))))
         found = [period for period in found if period.strength >= _LEAST_STRENGTH]
         return tuple(sorted(found, key=lambda period: -period.strength))
 
@@ -337,21 +358,6 @@ class _LeastSquares:
     def covariance(self) -> NDArray:
         """Of the coefficients, under white noise of variance one."""
         return self._inverse @ self._gram(2) @ self._inverse
-
-
-def _period(q: NDArray[np.float64], spread: NDArray[np.float64], strength: float) -> Period:
-    """From a frequency in cycles/µm and its covariance."""
-    length = float(np.hypot(*q))
-    along, across = q / length, np.array([-q[1], q[0]]) / length
-    direction = float(np.degrees(np.arctan2(q[1], q[0])))
-    direction = float(direction - 180 * np.ceil((direction - 90) / 180 - 1e-12))  # (−90, 90], not −90 by rounding
-    return Period(
-        period=1 / length,
-        direction=direction,
-        period_uncertainty=float(np.sqrt(along @ spread @ along)) / length**2,
-        direction_uncertainty=float(np.degrees(np.sqrt(across @ spread @ across) / length)),
-        strength=strength,
-    )
 
 
 def _polynomials(x: NDArray, y: NDArray, degree: int) -> list[tuple[NDArray, NDArray]]:

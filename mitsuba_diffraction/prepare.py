@@ -6,6 +6,7 @@ Missing pixels (NaN) stay missing until `fill_missing`; the other steps work on 
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from numbers import Real
 
@@ -148,7 +149,7 @@ def trim_edges(height_field: HeightField, width: float) -> HeightField:
     _check_positive("trim_edges", width, "a width in µm")
     rows, columns = height_field.shape
     cuts = [
-        int(np.ceil(width / size - 1e-9)) if n > 1 else 0  # a profile has no edge along its one pixel
+        int(np.ceil(min(width / size, n) - 1e-9)) if n > 1 else 0  # a profile has no edge along its one pixel
         for n, size in zip((columns, rows), height_field.pixel_size, strict=True)
     ]
     if 2 * cuts[0] >= columns or 2 * cuts[1] >= rows:
@@ -385,4 +386,5 @@ def _check_any(name: str, heights: NDArray[np.float64]) -> None:
 
 
 def _is_number(value: object) -> bool:
-    return isinstance(value, Real) and not isinstance(value, bool) and bool(np.isfinite(value))
+    # Whole numbers may be too great for a float.
+    return isinstance(value, Real) and not isinstance(value, bool) and bool(abs(value) <= sys.float_info.max)

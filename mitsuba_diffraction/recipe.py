@@ -99,6 +99,8 @@ class Recipe:
         for name, value in [*self.surface.items(), *self.spectrum.items()]:
             if name == "prepare" and "scan" in self.surface:
                 continue  # checked above
+            if isinstance(value, bool) and name != "fill_missing":
+                raise ValueError(f"{name}: got {value!r}, wanted a number or a text")
             if not (_is_plain(value) or (isinstance(value, list | tuple) and all(_is_plain(v) for v in value))):
                 raise ValueError(f"{name}: got {value!r}, wanted a number, a text, or a list of them")
         for name in ("tolerance", "coherence_length", "largest_angle"):
@@ -121,7 +123,8 @@ class Recipe:
                 content = tomllib.load(file)
         except FileNotFoundError:
             raise FileNotFoundError(f"{path}: no such file") from None
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        # Of the parser and of the text; a number of too many digits; brackets in brackets in brackets.
+        except (ValueError, RecursionError) as error:
             raise ValueError(f"{path}: not a TOML file ({error})") from None
         try:
             _refuse_unknown("recipe", content, frozenset({"surface", "spectrum"}))
@@ -213,7 +216,8 @@ def _is_number(value: object) -> bool:
 
 
 def _is_plain(value: object) -> bool:
-    return isinstance(value, int | float | str)
+    # TOML's integers have 64 bits; Python reads greater ones, too, which no float holds.
+    return isinstance(value, float | str) or (isinstance(value, int) and -(2**63) <= value < 2**63)
 
 
 def _names(table: Mapping[str, Any]) -> str:

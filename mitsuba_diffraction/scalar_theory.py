@@ -40,6 +40,21 @@ def fresnel(cosine: ArrayLike, index: complex) -> tuple[Array, Array]:
     return np.abs(s) ** 2, np.abs(p) ** 2
 
 
+def geometry(cos_i: ArrayLike, cos_o: ArrayLike, cos_between: ArrayLike) -> Array:
+    """K G: Stam's geometry and the shadowing of V-cavities, from the cosines of θ_i, θ_o and ω_i·ω_o.
+
+    K = (1 + ω_i·ω_o)²/(cos θ_i cos θ_o w²), w = cos θ_i + cos θ_o (Stam 1999), and G = min(1, 2(n·h)(n·ω)/(ω_o·h)) for
+    both directions (Torrance and Sparrow 1967), where 2(n·h)(n·ω)/(ω_o·h) = 2w cos θ/(1 + ω_i·ω_o).
+    """
+    w, d = np.add(cos_i, cos_o), np.add(1, cos_between)
+    return d**2 / (cos_i * cos_o * w**2) * np.minimum(1, 2 * w * np.minimum(cos_i, cos_o) / d)
+
+
+def equivalent_depth(rms_height: float) -> float:
+    """Depth, from valley to peak, of the sinusoid that is as rough: 2√2 times the rms height (any unit)."""
+    return 2 * np.sqrt(2) * rms_height
+
+
 def sinusoid_powers(depth: float) -> OrderPowers:
     """η_m = J_m(κ · depth / 2)² of a sinusoid, depth from valley to peak in µm."""
     return lambda m, kappa: jv(m, kappa * depth / 2) ** 2
@@ -112,11 +127,10 @@ def _mirror_orders(
     there = np.abs(sine_o) < 1
     cos_i = np.sqrt(1 - sine_i**2)
     cos_o = np.sqrt(np.where(there, 1 - sine_o**2, 1))
-    w = cos_i + cos_o
-    d = 1 + sine_i * np.where(there, sine_o, 0) + cos_i * cos_o
-    k_g = d**2 / (cos_i * cos_o * w**2) * np.minimum(1, 2 * w * np.minimum(cos_i, cos_o) / d)
-    factor = np.where(there, k_g * powers(m, 2 * np.pi * w / wavelength), -1)
-    return m, sine_o, factor, np.sqrt(d / 2)
+    cos_between = sine_i * np.where(there, sine_o, 0) + cos_i * cos_o
+    kappa = 2 * np.pi * (cos_i + cos_o) / wavelength
+    factor = np.where(there, geometry(cos_i, cos_o, cos_between) * powers(m, kappa), -1)
+    return m, sine_o, factor, np.sqrt((1 + cos_between) / 2)
 
 
 def _albedo(powers: OrderPowers, pitch: float, wavelength: float, sines: Array) -> Array:
@@ -167,8 +181,7 @@ def expected_error(period: float, depth: float, wavelength: float) -> float:
     """How wrong scalar theory is expected to be about a surface at incidence up to 20°.
 
     The larger of the stored differences at 0° and 20°, interpolated linearly between the logarithms. It was found for
-    sinusoids of n = 1.5. Another surface is told by its main period and by the depth of the sinusoid of the same
-    roughness, 2√2 times the rms height; edges add to the error.
+    sinusoids of n = 1.5. Another surface is told by its main period and its `equivalent_depth`; edges add to the error.
 
     Args:
         period: µm.

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.special import jv
-from test_bsdf import evaluate, k_g, llvm, random_directions, raw_plugin, towards  # noqa: F401
+from test_bsdf import evaluate, k_g, random_directions, raw_plugin, towards
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction.coherence import lobe_width

@@ -15,11 +15,12 @@ import mitsuba_diffraction as md
 from mitsuba_diffraction.bsdf.geometry import Geometry
 from mitsuba_diffraction.color import into_gamut, spectrum_to_linear_sRGB, spectrum_to_XYZ
 from mitsuba_diffraction.inspection import inspect, save_picture
-from mitsuba_diffraction.inspection.colours import WAVELENGTHS, _geometry, daylight, order_angle, order_share, radiance
+from mitsuba_diffraction.inspection.colours import WAVELENGTHS, daylight, order_angle, order_share, radiance
 from mitsuba_diffraction.inspection.concerns import concerns
 from mitsuba_diffraction.inspection.picture import with_uncertainty
 from mitsuba_diffraction.inspection.statistics import statistics
 from mitsuba_diffraction.inspection.tip import broadened, scanned
+from mitsuba_diffraction.scalar_theory import geometry
 
 ROOT = Path(__file__).parents[1]
 PERIOD, DEPTH = 2.0, 0.2
@@ -108,7 +109,8 @@ def test_radiance_is_that_of_the_bsdf(theta_i, theta_o):
     assert share.max() <= 1 + 1e-3
     assert share.min() > 0.94
     factor = Geometry(si.wi, towards(theta_o)).factor(True) / cos_o
-    assert _geometry(np.deg2rad(theta_i), np.deg2rad(theta_o)) == pytest.approx(factor, rel=1e-5)
+    between = np.cos(np.deg2rad(theta_i + theta_o))
+    assert geometry(np.cos(np.deg2rad(theta_i)), cos_o, between) == pytest.approx(factor, rel=1e-5)
 
 
 def test_colours_go_where_the_grating_equation_sends_them():
@@ -332,6 +334,7 @@ def test_an_uncertainty_has_two_digits(value, uncertainty, text):
 def folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     np.save("waves.npy", waves(count=4, pixel=0.08).heights)
+    Image.fromarray(np.zeros((4, 4), np.uint8)).save("grey.png")
     Path("foil.toml").write_text('[surface]\nprofile = "foil"\nsamples = 32\n')
     return tmp_path
 
@@ -352,7 +355,9 @@ def test_inspect_tells_and_draws(folder, command):
     assert "\x1b" not in out
     assert "pixel size +5%" in out
     assert json.loads(Path("numbers.json").read_text())["carried_coherence_length"] == pytest.approx(4.0)
-    assert {path.name for path in folder.iterdir()} == {"waves.npy", "foil.toml", "numbers.json", "waves_inspect.png"}
+    assert {path.name for path in folder.iterdir()} == {
+        *("waves.npy", "grey.png", "foil.toml", "numbers.json", "waves_inspect.png")
+    }
 
 
 def test_inspect_takes_a_recipe(folder, command):
@@ -374,6 +379,7 @@ def test_inspect_takes_a_recipe(folder, command):
         ("inspect waves.npy --pixel-size 0.08 -o nowhere/picture.png", "nowhere"),
         ("inspect waves.npy --pixel-size 0.08 --json nowhere/n.json", "--json: got nowhere/n.json"),
         ("inspect foil.toml --pixel-size 0.1", "go with a scan"),
+        ("inspect grey.png --pixel-size 0.1 -o ./grey.png", "which is what is inspected"),
     ],
 )
 def test_a_mistake_is_one_line_and_exit_code_2(folder, command, arguments, words):

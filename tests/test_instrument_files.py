@@ -5,6 +5,7 @@ import struct
 import sys
 import warnings
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -198,6 +199,18 @@ def test_an_archive_that_unpacks_to_too_much_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(instruments, "MOST_BYTES", 1000)
     with pytest.raises(ValueError, match="an archive of 100000 bytes, wanted at most 1000"):
         read_height_field(tmp_path / "scan.x3p")
+
+
+@needs_the_extra
+def test_a_channel_without_a_name_is_listed(tmp_path, monkeypatch):
+    from SurfaceTopography.IO import lookup_reader_by_format
+
+    line = SimpleNamespace(index=0, name=None, dim=1, data_kind=SimpleNamespace(value="height"))
+    monkeypatch.setitem(lookup_reader_by_format, "sur", lambda path: SimpleNamespace(channels=[line]))
+    (tmp_path / "line.sur").write_bytes(b"anything")
+    for channel in (None, "height"):
+        with pytest.raises(ValueError, match=r"0 'untitled'"):
+            read_height_field(tmp_path / "line.sur", channel=channel)
 
 
 def test_without_the_extra_it_is_named(tmp_path, monkeypatch):

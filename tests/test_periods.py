@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
 import mitsuba_diffraction as md
@@ -52,6 +52,9 @@ shapes = st.tuples(st.integers(40, 70), st.integers(40, 70))
     tilt=st.floats(-1, 1),
     bow=st.floats(-0.1, 0.1),
 )
+# Rounding as a second wave, and a direction of 90° and a little.
+@example(shape=(45, 40), period=0.5, direction=90.0, phase=0.0, tilt=0.0, bow=0.0)
+@example(shape=(43, 40), period=1.0, direction=90.0, phase=0.0, tilt=0.0, bow=0.0)
 def test_a_sinusoid_on_a_bowed_plane_is_exact(shape, period, direction, phase, tilt, bow):
     assume(resolved(shape, period, direction))
     x, y = places(shape)

@@ -82,3 +82,8 @@ def test_without_an_index_light_leaves_unpolarised(polarised, parameters):
 def test_straight_back(polarised):
     wi = np.array([[0.0], [0.0], [1.0]])
     assert np.isfinite(matrices(grating(int_ior=1.5), wi, wi)).all()
+
+
+def test_indices_that_match_reflect_nothing(polarised):
+    m = matrices(grating(int_ior=1.0, ext_ior=1.0), *directions(20))
+    assert (m == 0).all()

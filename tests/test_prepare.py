@@ -330,7 +330,7 @@ def test_edges_are_trimmed_by_at_least_their_width():
     np.testing.assert_array_equal(after.heights, field.heights[2:-2, 4:-4])
     profile = prepare.trim_edges(HeightField(field.heights[:1], PIXEL), 0.16)
     np.testing.assert_array_equal(profile.heights, field.heights[:1, 4:-4])
-    for width in (0.8, -1.0, 0.0):
+    for width in (0.8, 1e308, -1.0, 0.0):
         with pytest.raises(ValueError, match="trim_edges: got"):
             prepare.trim_edges(field, width)
 

@@ -329,7 +329,8 @@ def gwy_field(heights=HEIGHTS, xy="m", z="m", **more):
 def write_gwy(path, channels):
     """A file with these channels: number → (title, data field)."""
     container = gwyfile.objects.GwyContainer()
-    container["/filename"] = str(path)
+    # Not the whole path: how long it is would differ between the examples of a property.
+    container["/filename"] = path.name
     container["/0/mask"] = gwy_field(np.ones_like(HEIGHTS))
     for number, (title, field) in channels.items():
         container[f"/{number}/data/title"] = title
@@ -572,6 +573,19 @@ def test_a_table_as_gwyddion_exports_it(tmp_path, encoding):
     assert field.source == "scan.asc, Height (forward)"
 
 
+def test_lengths_of_a_header_without_a_unit_are_in_the_users(tmp_path):
+    (tmp_path / "scan.asc").write_text("# Width: 50\n# Height: 2.50\n1 2 3 4 5\n")
+    assert read_height_field(tmp_path / "scan.asc", unit="nm").pixel_size == pytest.approx((0.01, 0.0025))
+
+
+@pytest.mark.parametrize("width", ["a" + " " * 200_000 + "b", "1" * 200_000 + " x y"])
+def test_a_header_line_of_any_length_is_read_at_once(tmp_path, refuse, width):
+    (tmp_path / "scan.asc").write_text(f"# Width: {width}\n# Height: 1 m\n1 2\n")
+    start = time.perf_counter()
+    refuse("scan.asc", "the header: got", unit="m")
+    assert time.perf_counter() - start < 5
+
+
 def test_a_bare_table_asks_for_its_scale(tmp_path, refuse):
     (tmp_path / "scan.asc").write_text(MATRIX)
     refuse("scan.asc", "unit: the file names none")
@@ -599,6 +613,29 @@ def test_an_esri_grid_comes_from_the_top_down(tmp_path, refuse):
     refuse("scan.asc", "the header: got the line 'nrows'", unit="um")
     (tmp_path / "scan.asc").write_text("ncols 3\nnrows 1\n1 2 3\n")
     refuse("scan.asc", "wanted ncols, nrows and cellsize", unit="um")
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("scan.xyz", "1e308 0 1\n-1e308 0 2\n", "x goes from -1e\\+308 to 1e\\+308"),
+        ("scan.xyz", "0 0 1e308\n1 0 1\n", "1 of 2 pixels are missing or not finite"),
+        ("scan.asc", "# Value units: m\n1e308 2\n", "1 of 2 pixels are missing or not finite"),
+        ("scan.asc", "1e308 0 1\n-1e308 0 2\n0 0 1\n", "2 of 9 pixels are missing or not finite"),
+        ("scan.asc", "0 inf 1\n1 nan 2\n", "2 of 6 pixels are missing or not finite"),
+    ],
+)
+def test_numbers_beyond_those_of_a_float_are_refused_in_one_line(tmp_path, refuse, name, text, message):
+    (tmp_path / name).write_text(text)
+    refuse(name, message, unit="m")
+
+
+def test_signalling_numbers_are_missing_pixels(tmp_path, refuse):
+    """A bit pattern that complains when it is turned into a double."""
+    write_gsf(tmp_path / "scan.gsf")
+    content = (tmp_path / "scan.gsf").read_bytes()
+    (tmp_path / "scan.gsf").write_bytes(content[:-4] + b"\x01\x00\x80\x7f")
+    refuse("scan.gsf", "1 of 6 pixels are missing or not finite")
 
 
 # ---------------------------------------------------------------- damaged files of these formats

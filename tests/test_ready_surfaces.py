@@ -194,6 +194,34 @@ def test_a_disc_that_cannot_be_is_refused(arguments, message):
         compact_disc(**arguments)
 
 
+@pytest.mark.parametrize(
+    ("name", "arguments"),
+    [
+        ("blazed", {"samples": 10**10}),
+        ("crossed", {"period": 1.0, "depth": 0.1, "samples": 10**5}),
+        ("foil", {"samples": 10**5}),
+        ("compact_disc", {"length": 1e7}),
+        ("compact_disc", {"tracks": 10**9}),
+        ("compact_disc", {"length": 1e308}),
+        ("elaphe", {"size": 1e5}),
+        ("xenopeltis", {"size": 1e308}),
+        ("morpho_ridges", {"pixel_size": 1e-6}),
+    ],
+)
+def test_a_patch_too_large_is_refused_before_memory_is_asked_for_it(name, arguments):
+    with pytest.raises(ValueError, match="pixels, wanted at most"):
+        PROFILES[name](**arguments)
+
+
+def test_a_disc_of_one_long_track_takes_no_more_memory_than_its_heights():
+    field = compact_disc(tracks=1, length=5000.0)
+    assert field.shape == (80_000, 26)
+    # Pits at both ends of the patch, as in its middle.
+    share = field.heights.mean(axis=1)
+    assert share[:8000].mean() == pytest.approx(share.mean(), rel=0.2)
+    assert share[-8000:].mean() == pytest.approx(share.mean(), rel=0.2)
+
+
 # ---------------------------------------------------------------- ridges
 
 

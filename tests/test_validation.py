@@ -9,7 +9,7 @@ import pytest
 import mitsuba_diffraction as md
 from mitsuba_diffraction import scalar_theory
 from mitsuba_diffraction.validation import Check, Finding, analytic, checks, conservation, product, report, rigorous
-from mitsuba_diffraction.validation.surface import main_period, surface_checks
+from mitsuba_diffraction.validation.surface import main_period, scalar_range, surface_checks
 
 CHECKS = checks()
 
@@ -166,6 +166,26 @@ def test_a_surface_that_is_not_the_spectrums_is_told():
     assert not conservation.against_reference(other, spectrum).ok
 
 
+def test_a_product_that_is_not_a_number_misses_its_bounds(monkeypatch):
+    blaze = md.gratings.blazed(2.5, 0.25)
+    spectrum = md.precompute(blaze)
+    monkeypatch.setattr(conservation, "_drawn", lambda bsdf, wi, *rest: (wi, np.full(len(wi), np.nan)))
+    assert not conservation.energy(spectrum).ok
+    monkeypatch.setattr(type(spectrum), "evaluate", lambda self, q, kappa: np.full(len(q), np.nan))
+    assert not conservation.against_reference(blaze, spectrum).ok
+
+
+def test_a_tilt_is_no_roughness():
+    x = (np.arange(100) + 0.5) * 0.08
+    waves = np.tile(0.05 * np.cos(2 * np.pi * x / 2.0), (100, 1))
+    spectrum = md.precompute(md.HeightField(waves, 0.08), extent="sample", coherence_length=4.0, tolerance=1e-2)
+    level, tilted = (
+        scalar_range(md.HeightField(waves + slope * x[:, None], 0.08), spectrum).found for slope in (0.0, 0.1)
+    )
+    assert tilted == pytest.approx(level)
+    assert level == pytest.approx(scalar_theory.expected_error(main_period(spectrum), 0.1, 0.55), rel=0.02)
+
+
 def test_the_period_of_a_surface_is_seen():
     # The fingers of the synthetic skin, and its rows, are 1.144 µm apart in a patch of whole numbers of them.
     spectrum = md.precompute(md.gratings.elaphe((20.0, 1.144 * 14), seed=1), coherence_length=13.0, tolerance=1e-2)
@@ -207,9 +227,36 @@ def test_wrong_requests_are_refused(command, tmp_path):
     assert (code, error.count("\n")) == (2, 1)
     assert "go with a scan" in error
     assert command("validate", str(tmp_path / "nothing.toml"))[0] == 2
+    code, _, error = command("validate", "--extent", "tile")
+    assert code == 2
+    assert "--extent: got no surface" in error
+    for option in ("--json", "--markdown"):
+        code, _, error = command("validate", option, str(tmp_path / "nowhere" / "results"))
+        assert (code, error.count("\n"), error.count("cannot write")) == (2, 1, 1)
     code, _, error = command("validate", "--variant", "scalar_spectral")
     assert (code, error.count("\n")) == (2, 1)
     assert "wanted llvm_" in error
+
+
+def test_a_scan_is_validated_with_the_options_that_other_commands_take(command, tmp_path, monkeypatch):
+    heights = np.random.default_rng(1).random((20, 24)) * 0.1
+    heights[3, 4] = np.nan
+    np.save(tmp_path / "scan.npy", heights)
+    seen = []
+
+    def checks_of(height_field, spectrum):
+        seen.append((height_field.filled, spectrum.extent))
+        return ()
+
+    monkeypatch.setattr("mitsuba_diffraction.validation.surface.surface_checks", checks_of)
+    line = ("validate", str(tmp_path / "scan.npy"), "--pixel-size", "0.2", "--fill-missing")
+    for extent in ("sample", "tile"):
+        code, _, error = command(*line, *(("--extent", extent) if extent == "tile" else ()))
+        assert code == 0, error
+    assert seen == [(1, "sample"), (1, "tile")]
+    code, _, error = command("validate", str(tmp_path / "scan.npy"), "--pixel-size", "0.2")
+    assert code == 2
+    assert "--fill-missing" in error
 
 
 def test_figures_are_drawn(command, tmp_path, monkeypatch):

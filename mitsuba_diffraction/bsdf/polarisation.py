@@ -28,12 +28,14 @@ def reflected(
     half = dr.normalize(wi + wo)
     cos_half = dr.dot(wi, half)
     planes = [mi.mueller.specular_reflection(cos_half, eta) for eta in index]
+    # Where nothing is reflected (indices that match) `value` is zero, and so is every entry.
+    brightness = [dr.select(plane[0, 0] > 0, plane[0, 0], 1) for plane in planes]
     matrix = mi.Spectrum(0.0)
     for row in range(4):
         for column in range(4):
             entry = mi.UnpolarizedSpectrum(0.0)
             for channel, plane in enumerate(planes):
-                entry[channel] = value[channel] * plane[row, column] / plane[0, 0]
+                entry[channel] = value[channel] * plane[row, column] / brightness[channel]
             matrix[row, column] = entry
     # The s axes lie across the plane of reflection; for light that returns to its source any axis across it will do.
     axes = [dr.cross(half, -source), dr.cross(half, exit_)]

@@ -42,6 +42,8 @@ def inspect(
     for option, path in (("-o", picture), ("--json", json)):
         if path is not None and not path.parent.is_dir():
             raise ValueError(f"{option}: got {path}, but the folder {path.parent} is not there")
+        if path is not None and path.resolve() == source.resolve():
+            raise ValueError(f"{option}: got {path}, which is what is inspected")
     if picture.suffix.lower() not in (".png", ".pdf", ".svg"):
         raise ValueError(f"-o: got {picture}, wanted a file name that ends in .png, .pdf or .svg")
     of_scan = options_of_scan(pixel_size, height_range, fill_missing, channel, unit, prepare)

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from ..coherence import SUN_COHERENCE_LENGTH
+from ..files import refuse_unwritable
 from ..precompute import REPRESENTATIONS
 from .console import progress_bar, tell
 from .scan import Channel, FillMissing, HeightRange, PixelSize, Prepare, Unit, options_of_scan, recipe_of
@@ -46,10 +47,14 @@ def precompute(
     }
     settings = {name: value for name, value in given.items() if value is not None}
     of_scan = options_of_scan(pixel_size, height_range, fill_missing, channel, unit, prepare)
-    for source in sources:
-        target = output or Path(source.with_suffix(".exr").name)
+    targets = [output or Path(source.with_suffix(".exr").name) for source in sources]
+    for number, target in enumerate(targets):
         if target.suffix.lower() != ".exr":
             raise ValueError(f"-o: got {target}, wanted a file name that ends in .exr")
+        if target in targets[:number]:
+            raise ValueError(f"got two sources whose spectrum would be {target}, wanted different names")
+        refuse_unwritable(target)
+    for source, target in zip(sources, targets, strict=True):
         with progress_bar(f"spectrum of {source.name}") as progress:
             spectrum = recipe_of(source, of_scan, settings).build(progress)
             spectrum.save(target)

@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from ..precompute import precompute
-from ..readers import read_height_field
-from ..recipe import Recipe
+from ..files import refuse_unwritable
 from .console import out, progress_bar, tell
+from .scan import Channel, FillMissing, HeightRange, PixelSize, Prepare, Unit, options_of_scan, recipe_of
 
 if TYPE_CHECKING:
     from ..validation import Check
@@ -21,9 +20,15 @@ def validate(
     surface: Annotated[
         Path | None, typer.Argument(metavar="[SURFACE]", help="a recipe (.toml) or a scan: check this surface instead")
     ] = None,
-    pixel_size: Annotated[float | None, typer.Option(help="of a scan, µm")] = None,
-    height_range: Annotated[float | None, typer.Option(help="of a scan, black to white, µm")] = None,
-    extent: Annotated[str, typer.Option(help="of a scan: sample or tile")] = "sample",
+    pixel_size: PixelSize = None,
+    height_range: HeightRange = None,
+    fill_missing: FillMissing = False,
+    channel: Channel = None,
+    unit: Unit = None,
+    prepare: Prepare = None,
+    extent: Annotated[
+        str | None, typer.Option(help="sample (of a scan, unless told otherwise) or tile; goes before a recipe's own")
+    ] = None,
     variant: Annotated[str | None, typer.Option(help="of Mitsuba; the fastest spectral one by default")] = None,
     json: Annotated[Path | None, typer.Option(help="write the results here, too")] = None,
     markdown: Annotated[Path | None, typer.Option(help="write a table with notes and sources here (.md)")] = None,
@@ -35,13 +40,19 @@ def validate(
     from ..validation import checks, report
     from ..variants import choose_variant
 
-    if surface is None and (pixel_size is not None or height_range is not None):
-        raise ValueError("--pixel-size and --height-range go with a scan")
+    of_scan = options_of_scan(pixel_size, height_range, fill_missing, channel, unit, prepare)
+    settings = {} if extent is None else {"extent": extent}
+    if surface is None and (of_scan or settings):
+        names = ", ".join(f"--{name.replace('_', '-')}" for name in {**of_scan, **settings})
+        raise ValueError(f"{names}: got no surface; they go with a scan, --extent with a recipe, too")
+    for path in (json, markdown):
+        if path is not None:
+            refuse_unwritable(path)
     chosen = choose_variant(variant)
     if chosen.startswith("scalar"):
         raise ValueError(f"--variant: got {chosen}, wanted llvm_… or cuda_…: the checks take millions of directions")
     mi.set_variant(chosen)
-    these = checks() if surface is None else _of_surface(surface, pixel_size, height_range, extent)
+    these = checks() if surface is None else _of_surface(surface, of_scan, settings)
     results = []
     with progress_bar("validation") as progress:
         for check in these:
@@ -64,14 +75,11 @@ def validate(
         raise RuntimeError(f"{len(missed)} of {promised} checks missed: {'; '.join(missed)}")
 
 
-def _of_surface(path: Path, pixel_size: float | None, height_range: float | None, extent: str) -> tuple[Check, ...]:
+def _of_surface(path: Path, of_scan: dict[str, object], settings: dict[str, object]) -> tuple[Check, ...]:
     from ..validation.surface import surface_checks
 
-    if path.suffix.lower() == ".toml":
-        if pixel_size is not None or height_range is not None:
-            raise ValueError(f"--pixel-size and --height-range go with a scan; the recipe {path} has its own")
-        recipe = Recipe.load(path)
-        return surface_checks(recipe.height_field(), recipe.cached())
-    height_field = read_height_field(path, pixel_size=pixel_size, height_range=height_range)
+    if path.suffix.lower() != ".toml":
+        settings = {"extent": "sample", **settings}
+    recipe = recipe_of(path, of_scan, settings)
     with progress_bar(f"spectrum of {path.name}") as progress:
-        return surface_checks(height_field, precompute(height_field, extent=extent, progress=progress))
+        return surface_checks(recipe.height_field(), recipe.cached(progress))

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.special import erf
 
 from ..heightfield import HeightField, as_pixel_size
-from .checks import check_positive
+from .checks import check_pixels, check_positive
 
 Array = NDArray[np.float64]
 
@@ -36,6 +36,7 @@ class Canvas:
             )
         if pixel_size > min(pitch) / 4:
             raise ValueError(f"pixel_size: got {pixel_size!r} µm, wanted at most {min(pitch) / 4:.4g} µm")
+        check_pixels(*(s / pixel_size for s in self.size))
         columns, rows = (round(s / pixel_size) for s in self.size)
         self.count = tuple(round(s / p) for s, p in zip(self.size, pitch, strict=True))
         # The period is what is seen: along its axis the size gives way, not the pitch.

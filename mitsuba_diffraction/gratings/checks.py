@@ -6,6 +6,15 @@ from numbers import Integral, Real
 
 import numpy as np
 
+MOST_PIXELS = 2**26
+"""Of a profile: half a gigabyte of heights."""
+
+
+def check_pixels(columns: float, rows: float) -> None:
+    """Refuses a patch before memory is asked for it."""
+    if not columns * rows <= MOST_PIXELS:
+        raise ValueError(f"got a patch of {columns:.4g} × {rows:.4g} pixels, wanted at most {MOST_PIXELS} in all")
+
 
 def check_positive(name: str, value: float) -> None:
     if not (isinstance(value, Real) and np.isfinite(value) and value > 0):
@@ -18,6 +27,7 @@ def check_profile(period: float, depth: float, samples: int = 2) -> None:
         raise ValueError(f"depth: got {depth!r}, wanted a number in µm, zero or more")
     if not (isinstance(samples, Integral) and samples >= 2):
         raise ValueError(f"samples: got {samples!r}, wanted a whole number of at least 2")
+    check_pixels(samples, 1)
 
 
 def generator(seed: int) -> np.random.Generator:

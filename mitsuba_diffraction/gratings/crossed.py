@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..heightfield import HeightField
-from .checks import check_positive, check_profile
+from .checks import check_pixels, check_positive, check_profile
 from .line_profile import phase
 
 
@@ -25,6 +25,7 @@ def crossed(period: float, depth: float, *, period_y: float | None = None, sampl
         ValueError: if a period is not positive, the depth negative, or samples below two.
     """
     check_profile(period, depth, samples)
+    check_pixels(samples, samples)
     period_y = period if period_y is None else period_y
     check_positive("period_y", period_y)
     wave = depth / 2 * np.sin(2 * np.pi * phase(samples))

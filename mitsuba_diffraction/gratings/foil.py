@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..heightfield import HeightField
-from .checks import check_profile
+from .checks import check_pixels, check_profile
 
 
 def foil(period: float = 1.0, depth: float = 0.15, *, directions: int = 2, samples: int = 64) -> HeightField:
@@ -41,6 +41,7 @@ def foil(period: float = 1.0, depth: float = 0.15, *, directions: int = 2, sampl
         size = np.array([2.0, 2 / np.sqrt(3)])
         # The lowest points lie at a third of the period along x and half of the tile along y.
         pixels = (6 * round(samples / 3), 2 * round(samples / np.sqrt(3)))
+    check_pixels(*pixels)
     x, y = (np.arange(n) / n * s for n, s in zip(pixels, size, strict=True))
     waves = np.zeros((len(y), len(x)))
     for j in range(directions):

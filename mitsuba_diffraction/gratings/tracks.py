@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from numbers import Integral
+from numbers import Integral, Real
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..heightfield import HeightField
-from .checks import check_positive, check_profile, generator
+from .checks import check_pixels, check_positive, check_profile, generator
 
 # The horizontal extent of a pit's sloping wall, µm: pits are moulded with walls of about 45 to 60 degrees.
 _WALL = 0.1
@@ -48,7 +48,7 @@ def draw_tracks(
         ("pixel_size", pixel_size),
     ):
         check_positive(label, value)
-    if not (isinstance(index, float | int) and np.isfinite(index) and index >= 1):
+    if not (isinstance(index, Real) and np.isfinite(index) and index >= 1):
         raise ValueError(f"index: got {index!r}, wanted a refractive index of at least 1")
     if not (isinstance(tracks, Integral) and tracks >= 1):
         raise ValueError(f"tracks: got {tracks!r}, wanted a whole number of at least 1")
@@ -62,6 +62,7 @@ def draw_tracks(
         raise ValueError(f"length: got {length!r} µm, wanted at least four of the longest pits, {4 * longest:.4g}")
     if pixel_size > width / 2:
         raise ValueError(f"pixel_size: got {pixel_size!r} µm, wanted at most half of a pit's width, {width / 2:.4g}")
+    check_pixels(tracks * period / pixel_size, length / pixel_size)
     rng = generator(seed)
     bits = round(length / channel_bit)
     size = (tracks * period, bits * channel_bit)
@@ -74,9 +75,11 @@ def draw_tracks(
     for number in range(tracks):
         starts, ends = _pits(rng, bits, runs)
         # The axis of a pit, its round ends left off; the distance of each row from the nearest axis, round the torus.
-        centre, half = (starts + ends) / 2 * channel_bit, (ends - starts) / 2 * channel_bit - width / 2
-        distance = (y[:, None] - centre + size[1] / 2) % size[1] - size[1] / 2
-        along = np.maximum(np.abs(distance) - half, 0).min(axis=1)
+        first, last = starts * channel_bit + width / 2, ends * channel_bit - width / 2
+        place = (y - first[0]) % size[1] + first[0]
+        before = np.searchsorted(first, place, side="right") - 1
+        following = np.append(first[1:], first[0] + size[1])[before]
+        along = np.maximum(np.minimum(place - last[before], following - place), 0)
         mine = track == number
         radius = np.hypot(along[:, None], across[mine])
         heights[:, mine] = np.clip(0.5 + (width / 2 - radius) / _WALL, 0, 1)

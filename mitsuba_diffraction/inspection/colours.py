@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..color import spectrum_to_XYZ
+from ..scalar_theory import geometry
 from ..spectrum import GratingSpectrum
 
 Array = NDArray[np.float64]
@@ -68,18 +69,9 @@ def radiance(
     along = np.deg2rad(direction)
     vector = lateral_scale * q[..., None] * np.array([np.cos(along), np.sin(along)])
     density = lateral_scale**2 * spectrum.evaluate(vector, height_scale * kappa)
-    return daylight() * _geometry(theta_i, theta_o)[..., None] * density / wavelengths**2 * cos_i
-
-
-def _geometry(theta_i: Array, theta_o: Array) -> Array:
-    """K · G in the plane of incidence: Stam's geometry and the shadowing of V-cavities."""
-    cos_i, cos_o = np.cos(theta_i), np.cos(theta_o)
-    # 1 + ω_i·ω_o, with the light at −θ_i.
-    one_plus = 1 + np.cos(theta_i + theta_o)
-    K = one_plus**2 / (cos_i * cos_o * (cos_i + cos_o) ** 2)
-    n_h = (cos_i + cos_o) / np.sqrt(2 * one_plus)
-    o_h = np.sqrt(one_plus / 2)
-    return K * np.minimum(1, np.minimum(2 * n_h * cos_o / o_h, 2 * n_h * cos_i / o_h))
+    # The light comes from −θ_i.
+    k_g = geometry(cos_i, cos_o, np.cos(theta_i + theta_o)[..., None])
+    return daylight() * k_g * density / wavelengths**2 * cos_i
 
 
 def order_angle(order: int, period: float, wavelength: float) -> float | None:

@@ -6,7 +6,7 @@ import numpy as np
 
 from ..coherence import lobe_width
 from ..heightfield import HeightField
-from .statistics import Statistics
+from .statistics import Statistics, hann
 
 _COARSE = 0.1  # µm; model: pixels that resolve the shortest wavelength
 _BLUE, _GREEN = 0.45, 0.55  # µm
@@ -73,8 +73,7 @@ def concerns(
 def _share_at_limit(height_field: HeightField) -> float:
     """The share of the phase's power at 450 nm and normal incidence beyond 0.8 of the Nyquist limit."""
     phase = np.exp(1j * 4 * np.pi / _BLUE * height_field.centred)
-    windows = [np.hanning(n + 2)[1:-1] if n > 1 else np.ones(1) for n in phase.shape]
-    power = np.abs(np.fft.fft2(phase * np.outer(*windows))) ** 2
+    power = np.abs(np.fft.fft2(phase * hann(phase.shape))) ** 2
     outside = np.zeros(power.shape, bool)
     for axis, count in enumerate(power.shape):
         if count > 1:

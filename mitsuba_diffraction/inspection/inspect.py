@@ -15,7 +15,7 @@ from ..heightfield import HeightField
 from ..periods import Period, find_periods
 from ..precompute import VISIBLE, precompute
 from ..reference import check_extent
-from ..scalar_theory import expected_error
+from ..scalar_theory import equivalent_depth, expected_error
 from ..spectrum import GratingSpectrum
 from ..welch import carried_coherence_length
 from .colours import LONGEST_COHERENCE
@@ -142,8 +142,7 @@ def inspect(
 
     periods = find(height_field)
     spectrum = build(height_field)
-    # The sinusoid of the same roughness stands for the surface.
-    depth = 2 * math.sqrt(2) * numbers.Sq
+    depth = equivalent_depth(numbers.Sq)
     result = Inspection(
         height_field=height_field,
         extent=extent,
@@ -174,10 +173,7 @@ def _on_lattice(period: Period, tile: HeightField) -> Period:
     order = np.rint(np.array([np.cos(along), np.sin(along)]) / period.period * tile.tile_size)
     if not order.any():
         return period
-    q = order / tile.tile_size
-    direction = float(np.degrees(np.arctan2(q[1], q[0])))
-    direction = direction - 180 * np.sign(direction) if not -90 < direction <= 90 else direction
-    return Period(float(1 / np.hypot(*q)), direction, 0.0, 0.0, period.strength)
+    return Period.of(order / tile.tile_size, np.zeros((2, 2)), period.strength)
 
 
 def _plain(value: object) -> object:

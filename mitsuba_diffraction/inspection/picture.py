@@ -15,7 +15,7 @@ from ..files import whole_file
 from ..heightfield import HeightField
 from .colours import WAVELENGTHS, radiance
 from .inspect import Inspection
-from .statistics import reference_plane
+from .statistics import hann, reference_plane
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -163,8 +163,7 @@ def _spectrum(axes: Axes, inspection: Inspection) -> None:
 def _height_spectrum(field: HeightField, extent: str) -> tuple[Array, Array, Array]:
     """q_x, q_y in ascending order and the power of the levelled, Hann-windowed heights, at most about 1000² points."""
     level = field.heights - reference_plane(field, extent)[0]
-    windows = [np.hanning(n + 2)[1:-1] if n > 1 else np.ones(1) for n in level.shape]
-    power = np.fft.fftshift(np.abs(np.fft.fft2(level * np.outer(*windows))) ** 2)
+    power = np.fft.fftshift(np.abs(np.fft.fft2(level * hann(level.shape))) ** 2)
     q_y, q_x = (np.fft.fftshift(np.fft.fftfreq(n, p)) for n, p in zip(level.shape, field.pixel_size[::-1], strict=True))
     keep_x, keep_y = np.abs(q_x) <= _HIGHEST_FREQUENCY * 1.01, np.abs(q_y) <= _HIGHEST_FREQUENCY * 1.01
     return q_x[keep_x], q_y[keep_y], power[np.ix_(keep_y, keep_x)]

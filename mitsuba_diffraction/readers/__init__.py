@@ -83,8 +83,10 @@ def read_height_field(
     """
     path = Path(path)
     try:
-        scan = _read(path, channel, unit)
-        heights = _as_micrometres(scan.numbers, height_range)
+        # What is too great for a float becomes infinite, a missing pixel or no length, and is refused as such.
+        with np.errstate(over="ignore", invalid="ignore"):
+            scan = _read(path, channel, unit)
+            heights = _as_micrometres(scan.numbers, height_range)
         pixel_size = scan.pixel_size if pixel_size is None else pixel_size
         if pixel_size is None:
             raise ValueError("pixel_size: the file has none, wanted one number or (x, y) in µm")

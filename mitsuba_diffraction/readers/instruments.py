@@ -79,7 +79,8 @@ def read(path: Path, unit: str | tuple[str, str] | None, channel: str | int | No
         except Exception as error:
             raise ValueError(f"not a file of this instrument, or a damaged one ({_told(error)})") from None
         chosen = choose(
-            [Channel(c.index, c.name, c.dim == 2 and c.data_kind.value == "height") for c in found], channel
+            [Channel(c.index, c.name or "untitled", c.dim == 2 and c.data_kind.value == "height") for c in found],
+            channel,
         )
         source = found[[c.index for c in found].index(chosen.number)]
         if 8 * int(np.prod(source.nb_grid_pts, dtype=object)) > MOST_BYTES:

@@ -39,8 +39,8 @@ _OFF_GRID = 0.1
 _FEWEST_POINTS = 0.25
 """Share of the places of a grid that must have a point; less is not a grid."""
 
-_GWYDDION = re.compile(r"#\s*(Channel|Width|Height|Value units):\s*(.+?)\s*$")
-_LENGTH = re.compile(r"([-+.\deE]+)\s*(\S+)$")
+_GWYDDION = re.compile(r"#\s*(Channel|Width|Height|Value units):(.*)")
+_LENGTH = re.compile(r"([-+.\deE]*)(.*)")
 _ESRI = ("ncols", "nrows", "xllcorner", "yllcorner", "xllcenter", "yllcenter", "cellsize", "nodata_value")
 
 
@@ -80,7 +80,8 @@ def read_table(path: Path, unit: str | tuple[str, str] | None) -> Scan:
     text = _text(path)
     if text.lstrip()[:5].lower() == "ncols":
         return _esri(text, unit)
-    header = dict(match.groups() for line in text.splitlines() if (match := _GWYDDION.match(line)))
+    matches = (_GWYDDION.match(line) for line in text.splitlines())
+    header = {match[1]: match[2].strip() for match in matches if match and match[2].strip()}
     heights = _table(text)
     rows, columns = heights.shape
     if not header and columns == 3 and _may_be_points(heights):
@@ -156,6 +157,8 @@ def _grid(places: NDArray[np.float64], axis: str) -> tuple[NDArray[np.int64], in
     if values[-1] == values[0]:
         return np.zeros(len(places), np.int64), 1, 0.0
     gaps = np.diff(values)
+    if not np.isfinite(gaps).all():
+        raise ValueError(f"{axis} goes from {values[0]:g} to {values[-1]:g}: wanted a grid along x and y")
     # What is nearer than a tenth of the widest gap is one place, rounded in different ways.
     starts = np.concatenate([[0], np.flatnonzero(gaps > _OFF_GRID * gaps.max()) + 1])
     middles = np.add.reduceat(values, starts) / np.diff(np.append(starts, len(values)))
@@ -182,9 +185,9 @@ def _may_be_points(table: NDArray[np.float64]) -> bool:
 
 def _length(text: str, unit: str) -> float:
     """A length with its unit, or without it in the user's, in µm."""
-    match = _LENGTH.match(text)
+    number, own = _LENGTH.match(text).groups()
     try:
-        value, unit = (float(match[1]), match[2]) if match else (float(text), unit)
+        value = float(number)
     except ValueError:
         raise ValueError(f"the header: got the length {text[:60]!r}, wanted a number and a unit") from None
-    return value * units.micrometres(unit, "the header")
+    return value * units.micrometres(own.strip() or unit, "the header")

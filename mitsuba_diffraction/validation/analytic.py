@@ -16,6 +16,7 @@ from ..coherence import lobe_width
 from ..heightfield import HeightField
 from . import product
 from .checks import Check, Finding
+from .conservation import parseval
 
 Array = NDArray[np.float64]
 
@@ -130,12 +131,8 @@ def _flat() -> Finding:
     return Finding.worst(expected, found, BOUND, "share of the peak")
 
 
-def _parseval(height_field: HeightField, **settings: object) -> Finding:
-    """Σ over all frequencies that the spectrum holds, and what it says it left out."""
-    spectrum = product.spectrum_of(height_field, **settings)
-    kappas = np.linspace(0.2, 1, 9) * spectrum.largest_kappa
-    found = [spectrum.powers(kappa).sum(dtype=np.float64) for kappa in kappas]
-    return Finding.worst(1.0, found, spectrum.tolerance + spectrum.beyond + spectrum.dropped, "Σ_m η_m, nine κ")
+def _parseval(height_field: HeightField) -> Finding:
+    return parseval(product.spectrum_of(height_field))
 
 
 def _product() -> Finding:

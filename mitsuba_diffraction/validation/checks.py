@@ -46,7 +46,7 @@ class Check:
     """One line of the table, and one test.
 
     Attributes:
-        group: "analytic", "statistical", "rigorous", "literature" or "surface".
+        group: "analytic", "literature", "statistical", "energy", "rigorous" or "surface".
         name: what is checked, in words.
         run: finds out, under the variant of Mitsuba in force.
         source: where the expected value comes from.

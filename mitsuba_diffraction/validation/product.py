@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..heightfield import HeightField
 from ..precompute import precompute
+from ..scalar_theory import geometry
 from ..spectrum import GratingSpectrum
 
 Array = NDArray[np.float64]
@@ -74,9 +75,7 @@ def towards(wi: Array, q: ArrayLike, wavelength: ArrayLike) -> Array:
 
 def factor(wi: Array, wo: Array) -> Array:
     """K G of directions (..., 3), in float64."""
-    cos_i, cos_o = wi[..., 2], wo[..., 2]
-    w, d = cos_i + cos_o, 1 + (wi * wo).sum(-1)
-    return d**2 / (cos_i * cos_o * w**2) * np.minimum(1, 2 * w * np.minimum(cos_i, cos_o) / d)
+    return geometry(wi[..., 2], wo[..., 2], (wi * wo).sum(-1))
 
 
 def lobe_power(of: mi.BSDF, spectrum: GratingSpectrum, wi: Array, q: ArrayLike, wavelength: float) -> Array:

@@ -11,7 +11,7 @@ import numpy as np
 from .. import gratings
 from ..files import whole_file
 from ..heightfield import HeightField
-from ..scalar_theory import error_map, expected_error
+from ..scalar_theory import equivalent_depth, error_map, expected_error
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -21,25 +21,21 @@ _VISIBLE = (0.4, 0.7)  # µm
 _LABELS = {
     "blaze": (0, (7, 2), "left"),
     "Elaphe": (1, (-7, -6), "right"),
-    "Xenopeltis": (0, (8, 11), "right"),
-    "compact disc": (0, (7, -10), "left"),
+    "Xenopeltis": (1, (7, -10), "left"),
+    "compact disc": (0, (0, 10), "right"),
 }
 _LEVELS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5)
 
 
-def equivalent_depth(height_field: HeightField) -> float:
-    """Depth of the sinusoid of the same roughness, 2√2 times the rms height, µm."""
-    return 2 * np.sqrt(2) * float(np.std(height_field.heights))
-
-
 def known_surfaces() -> dict[str, tuple[float, float]]:
     """Name → (period, depth of the sinusoid of the same roughness), µm."""
-    return {
-        "blaze": (2.5, equivalent_depth(gratings.blazed(2.5, 0.246))),
-        "Elaphe": (1.144, equivalent_depth(gratings.elaphe(16, seed=1))),
-        "Xenopeltis": (1.552, equivalent_depth(gratings.xenopeltis(16, seed=1))),
-        "compact disc": (1.6, 0.12),
+    surfaces: dict[str, tuple[float, HeightField]] = {
+        "blaze": (2.5, gratings.blazed(2.5, 0.246)),
+        "Elaphe": (1.144, gratings.elaphe(16, seed=1)),
+        "Xenopeltis": (1.552, gratings.xenopeltis(16, seed=1)),
+        "compact disc": (1.6, gratings.compact_disc()),
     }
+    return {name: (period, equivalent_depth(field.heights.std())) for name, (period, field) in surfaces.items()}
 
 
 def draw_map() -> Figure:

@@ -7,11 +7,11 @@ import functools
 import numpy as np
 
 from ..heightfield import HeightField
-from ..scalar_theory import TRUSTED, expected_error
+from ..inspection.statistics import statistics
+from ..scalar_theory import TRUSTED, equivalent_depth, expected_error
 from ..spectrum import GratingSpectrum
 from .checks import Check, Finding
-from .conservation import against_reference, energy, reciprocity
-from .scalar_range import equivalent_depth
+from .conservation import against_reference, energy, parseval, reciprocity
 
 _WAVELENGTH = 0.55  # µm, the middle of the visible range
 
@@ -37,13 +37,6 @@ def surface_checks(height_field: HeightField, spectrum: GratingSpectrum) -> tupl
     )
 
 
-def parseval(spectrum: GratingSpectrum) -> Finding:
-    """Σ over all frequencies that the spectrum holds; what it says it left out is allowed for."""
-    kappas = np.linspace(0.2, 1, 9) * spectrum.largest_kappa
-    found = [spectrum.powers(kappa).sum(dtype=np.float64) for kappa in kappas]
-    return Finding.worst(1.0, found, spectrum.tolerance + spectrum.beyond + spectrum.dropped, "nine κ")
-
-
 def main_period(spectrum: GratingSpectrum) -> float:
     """1/|q| of the strongest light beside the mirror's own, in µm; NaN if there is none.
 
@@ -59,7 +52,9 @@ def main_period(spectrum: GratingSpectrum) -> float:
 
 def scalar_range(height_field: HeightField, spectrum: GratingSpectrum) -> Finding:
     """What scalar theory is expected to get wrong about a sinusoid of the same period and roughness."""
-    period, depth = main_period(spectrum), equivalent_depth(height_field)
+    period = main_period(spectrum)
+    # About the mean plane of a sample: a tilt turns the light and is no roughness.
+    depth = equivalent_depth(statistics(height_field, extent=spectrum.extent).Sq)
     if np.isnan(period):
         return Finding(0.0, 0.0, 0.0, TRUSTED, "no light beside the mirror's own")
     found = expected_error(period, depth, _WAVELENGTH)
