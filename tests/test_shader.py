@@ -1,5 +1,6 @@
 """The published shader against float64, against this project's model, and one peculiarity after the other."""
 
+import signal
 from dataclasses import replace
 
 import drjit as dr
@@ -625,3 +626,22 @@ def test_variants_without_wavelengths_are_refused():
         mi.load_dict({"type": "diffraction_shader"})
     with pytest.raises(ValueError, match="wanted a spectral one"):
         colour(BLAZE, unit(0.1), unit(0.1))
+
+
+def test_a_picture_follows_its_light_and_leaves_ctrl_c_alone():
+    light = {"type": "directional", "direction": [0, 0, -1], "irradiance": {"type": "uniform", "value": 1.0}}
+    built = scene({"type": "diffraction_shader"}, light=light)
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        before = np.array(mi.render(built, spp=1, seed=1))
+        parameters = mi.traverse(built)
+        (name,) = (name for name in parameters if name.endswith("irradiance.value"))
+        parameters[name] = 2 * parameters[name]
+        parameters.update()
+        after = np.array(mi.render(built, spp=1, seed=1))
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+    finally:
+        signal.signal(signal.SIGINT, handler)
+    assert before.max() > 0
+    assert after.sum() > 1.1 * before.sum()

@@ -70,11 +70,6 @@ def define() -> type:
             self._shaders: list[tuple[mi.BSDF, Shader]] = []
             self.prepared: Prepared | None = None
 
-        def render(self, scene: mi.Scene, *args: object, **kwargs: object) -> mi.TensorXf:
-            # Lights and materials may have changed since the last time.
-            self.prepare(scene)
-            return mi.SamplingIntegrator.render(self, scene, *args, **kwargs)
-
         def take(self, quirks: Quirks) -> None:
             """Has other quirks from the next `prepare` on; textures that are there are kept."""
             self.quirks = quirks
@@ -115,6 +110,10 @@ def define() -> type:
             medium: mi.Medium | None = None,
             active: mi.Bool = True,
         ) -> tuple[mi.Spectrum, mi.Bool, list[mi.Float]]:
+            # Called once a picture where numbers are arrays: lights and materials may have changed since the last one. (An
+            # override of `render` that calls Mitsuba's would leave Mitsuba's handler of Ctrl-C in force for ever.)
+            if dr.is_jit_v(mi.Float):
+                self.prepare(scene)
             rgb, radiance, active = self.shade(scene, ray, active)
             radiance += self.emission(rgb, ray.wavelengths, active)
             return mi.depolarizer(radiance), active, []
