@@ -34,6 +34,7 @@ tolerance = 1e-3
 from __future__ import annotations
 
 import hashlib
+import inspect
 import json
 import os
 import sys
@@ -144,7 +145,10 @@ class Recipe:
         try:
             return PROFILES[name](**parameters)
         except TypeError as error:
-            raise ValueError(f"profile {name!r}: {error}") from None
+            known = inspect.signature(PROFILES[name]).parameters
+            unknown = sorted(set(parameters) - set(known))
+            wrong = f"got the unknown name {', '.join(unknown)}, wanted among {', '.join(known)}" if unknown else error
+            raise ValueError(f"profile {name!r}: {wrong}") from None
 
     def _prepared_scan(self, parameters: dict[str, Any]) -> HeightField:
         path = self.folder / parameters.pop("scan")

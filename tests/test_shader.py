@@ -635,7 +635,8 @@ def test_a_picture_follows_its_light_and_leaves_ctrl_c_alone():
     try:
         before = np.array(mi.render(built, spp=1, seed=1))
         parameters = mi.traverse(built)
-        (name,) = (name for name in parameters if name.endswith("irradiance.value"))
+        names = list(parameters.keys())
+        (name,) = (name for name in names if name.endswith("irradiance.value"))
         parameters[name] = 2 * parameters[name]
         parameters.update()
         after = np.array(mi.render(built, spp=1, seed=1))

@@ -42,7 +42,8 @@ def main() -> None:
         say("error", f"{error.format_message()} (try {NAME} --help)")
         code = 2
     except (ValueError, FileNotFoundError, IsADirectoryError, NotADirectoryError) as error:
-        say("error", error)
+        named = isinstance(error, OSError) and error.filename and error.strerror
+        say("error", f"{error.filename}: {error.strerror.lower()}" if named else error)
         code = 2
     except (KeyboardInterrupt, typer.Abort):
         say("interrupted", "nothing was written")

@@ -8,7 +8,7 @@ from ..coherence import lobe_width
 from ..heightfield import HeightField
 from .statistics import Statistics, hann
 
-_COARSE = 0.1  # µm; model: pixels that resolve the shortest wavelength
+_COARSE = 0.09  # µm: a quarter of the shortest wavelength, as light of grazing incidence and exit wants
 _BLUE, _GREEN = 0.45, 0.55  # µm
 _LIMIT_SHARE = 0.02  # of the power beyond four fifths of the Nyquist limit
 _STEP_SHARE = 1e-3  # of the light that steps of the heights scatter
@@ -33,7 +33,7 @@ def concerns(
     if coarsest > _COARSE:
         found.append(
             f"Pixels of {coarsest * 1e3:.0f} nm are too coarse for light: orders beyond {1 / (2 * coarsest):.2g} "
-            "cycles/µm are missing. Scan again with pixels of at most 100 nm."
+            "cycles/µm are missing. Scan again with pixels of at most 90 nm."
         )
     if not measured:
         return tuple(found)

@@ -27,7 +27,7 @@ SCALAR_AT = (450, 550, 650)
 """nm."""
 
 _TOLERANCE = 0.02
-_FEW_PIXELS = 256
+_PIXELS = 1536
 
 
 @dataclass(frozen=True)
@@ -161,10 +161,9 @@ def inspect(
 
 
 def _repeated(height_field: HeightField) -> HeightField:
-    """A tile of few pixels, eight times along each axis: its period shows only where it is repeated."""
-    if min(height_field.shape) >= _FEW_PIXELS:
-        return height_field
-    return HeightField(np.tile(height_field.heights, (8, 8)), height_field.pixel_size, height_field.source)
+    """A tile, as often along each axis as few pixels allow: its period shows only where it is repeated."""
+    times = [min(8, max(1, _PIXELS // count)) for count in height_field.shape]
+    return HeightField(np.tile(height_field.heights, times), height_field.pixel_size, height_field.source)
 
 
 def _on_lattice(period: Period, tile: HeightField) -> Period:

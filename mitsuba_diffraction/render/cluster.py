@@ -52,6 +52,7 @@ def trace_on(address: str) -> Tracer:
 
     def trace(job: Job, scene: mi.Scene, first: int) -> Iterator[NDArray[np.float32]]:
         try:
+            distributed.comm.parse_address(address, strict=True)
             client = distributed.Client(address, timeout=_SECONDS_TO_CONNECT, set_as_default=False)
         except (OSError, ValueError) as error:
             raise RuntimeError(f"no Dask scheduler at {address}: {error}") from error

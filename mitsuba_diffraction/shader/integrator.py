@@ -110,8 +110,8 @@ def define() -> type:
             medium: mi.Medium | None = None,
             active: mi.Bool = True,
         ) -> tuple[mi.Spectrum, mi.Bool, list[mi.Float]]:
-            # Called once a picture where numbers are arrays: lights and materials may have changed since the last one. (An
-            # override of `render` that calls Mitsuba's would leave Mitsuba's handler of Ctrl-C in force for ever.)
+            # Where numbers are arrays this runs once a picture: lights and materials may have changed since the last.
+            # (An override of `render` that calls Mitsuba's would leave Mitsuba's handler of Ctrl-C in force for ever.)
             if dr.is_jit_v(mi.Float):
                 self.prepare(scene)
             rgb, radiance, active = self.shade(scene, ray, active)
