@@ -441,3 +441,12 @@ def test_the_page_on_own_gratings_holds(tmp_path, monkeypatch):
     assert bsdf.spectrum.source == "round ridges, 1.3 µm"
     for name in re.findall(r"\]\(([\w.]+\.png)\)", text):
         assert (ROOT / "docs" / name).is_file()
+
+
+@pytest.mark.parametrize("periods", [1, 2, 4, 9])
+def test_the_period_of_a_tile_is_found_whatever_it_holds(periods):
+    x = (np.arange(96) + 0.5) / 96 * periods
+    tile = md.HeightField(0.05 * np.sin(2 * np.pi * x) + np.zeros((80, 1)), 1.3 * periods / 96)
+    (found, *_) = inspect(tile, extent="tile").periods
+    assert found.period == pytest.approx(1.3, rel=1e-6)
+    assert found.direction == pytest.approx(0, abs=1e-6)

@@ -27,7 +27,8 @@ SCALAR_AT = (450, 550, 650)
 """nm."""
 
 _TOLERANCE = 0.02
-_PIXELS = 1536
+_MOST_TIMES = 8
+_MOST_PIXELS = 2**22
 
 
 @dataclass(frozen=True)
@@ -132,13 +133,8 @@ def inspect(
 
     numbers = statistics(height_field, extent=extent)
 
-    def as_it_goes_on(surface: HeightField) -> HeightField:
-        return _repeated(surface) if extent == "tile" else surface
-
     def find(surface: HeightField) -> tuple[Period, ...]:
-        whole = as_it_goes_on(surface)
-        found = find_periods(whole)
-        return found if whole is surface else tuple(_on_lattice(period, surface) for period in found)
+        return _periods_of_tile(surface) if extent == "tile" else find_periods(surface)
 
     periods = find(height_field)
     spectrum = build(height_field)
@@ -154,16 +150,25 @@ def inspect(
         changes=changes(height_field, spectrum, periods[0], extent=extent, build=build, find=find) if periods else (),
         concerns=concerns(height_field, numbers, used, measured=measured),
         spectrum=spectrum,
-        shown=as_it_goes_on(height_field),
+        shown=_repeated(height_field, _MOST_TIMES) if extent == "tile" else height_field,
     )
     report(4, 4)
     return result
 
 
-def _repeated(height_field: HeightField) -> HeightField:
-    """A tile, as often along each axis as few pixels allow: its period shows only where it is repeated."""
-    times = [min(8, max(1, _PIXELS // count)) for count in height_field.shape]
-    return HeightField(np.tile(height_field.heights, times), height_field.pixel_size, height_field.source)
+def _repeated(tile: HeightField, times: int) -> HeightField:
+    """A tile so many times along each axis, or fewer times where that would be many pixels."""
+    while tile.heights.size * times**2 > _MOST_PIXELS and times > 1:
+        times //= 2
+    return HeightField(np.tile(tile.heights, (times, times)), tile.pixel_size, tile.source)
+
+
+def _periods_of_tile(tile: HeightField) -> tuple[Period, ...]:
+    """A wave stands out of a patch with several of its periods; the tile is repeated until there are enough."""
+    for times in (1, 2, 4, _MOST_TIMES):
+        if found := find_periods(_repeated(tile, times)):
+            return tuple(_on_lattice(period, tile) for period in found)
+    return ()
 
 
 def _on_lattice(period: Period, tile: HeightField) -> Period:
