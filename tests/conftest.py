@@ -1,6 +1,7 @@
 """What all tests share: a cache of their own, the measured scans, and the command."""
 
 import shlex
+import signal
 import sys
 import warnings
 from pathlib import Path
@@ -28,6 +29,14 @@ def cache_folder(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("MITSUBA_DIFFRACTION_CACHE", str(folder))
         yield folder
+
+
+@pytest.fixture(scope="session", autouse=True)
+def ctrl_c():
+    """Ctrl-C interrupts; what a script starts in the background ignores it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 @pytest.fixture
