@@ -419,7 +419,8 @@ def small_disk(tmp_path):
     subprocess.run(["umount", place], check=True)
 
 
-def test_a_disk_that_the_picture_fills_is_one_line(command, small_disk):
+def test_a_disk_that_the_picture_fills_is_one_line(command, small_disk, monkeypatch):
+    monkeypatch.setattr(passes, "_CHECKPOINT_SHARE", 0)  # after each pass, however long a checkpoint takes
     # A checkpoint is 200 kB, two of them do not fit; a larger picture does not fit at all.
     code, out, err = command(f"{LINE} -o disk/out.exr --checkpoint 0")
     assert (code, out) == (1, "")
