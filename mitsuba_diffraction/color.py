@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .files import whole_file
+from .outputs import png_text
 
 if TYPE_CHECKING:
     from .render.spectral_image import SpectralImage
@@ -218,7 +219,7 @@ def save_preview(image: SpectralImage, path: str | os.PathLike[str], exposure: f
     if exposure is None:
         exposure = auto_exposure(rgb)
     with whole_file(path) as temporary:
-        Image.fromarray(on_screen(rgb * exposure)).save(temporary)
+        Image.fromarray(on_screen(rgb * exposure)).save(temporary, pnginfo=png_text(path))
     return exposure
 
 

@@ -39,19 +39,23 @@ import json
 import os
 import sys
 import threading
+import warnings
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import platformdirs
 
+from .files import refuse_special
 from .gratings import PROFILES
 from .heightfield import HeightField
 from .precompute import precompute
 from .prepare import apply_steps, check_steps
 from .readers import read_height_field
 from .spectrum import GratingSpectrum
+from .spectrum import file as spectrum_file
 from .spectrum.file import FORMAT_VERSION
 
 if sys.version_info >= (3, 11):
@@ -67,6 +71,10 @@ _SPECTRUM_KEYS = frozenset(
 _BUILD_VERSION = 3
 # Mitsuba constructs plugins on several threads; two that name one recipe must not build it twice.
 _building = threading.Lock()
+
+
+class CacheWarning(UserWarning):
+    """Spectra cannot be kept in the cache: they are built anew each time."""
 
 
 @dataclass(frozen=True)
@@ -119,6 +127,7 @@ class Recipe:
             ValueError: if it is not TOML, or not a recipe.
         """
         path = Path(path)
+        refuse_special(path)
         try:
             with open(path, "rb") as file:
                 content = tomllib.load(file)
@@ -178,6 +187,7 @@ class Recipe:
         surface = dict(self.surface)
         if "scan" in surface:
             scan = self.folder / surface.pop("scan")
+            refuse_special(scan)
             try:
                 content.update(scan.read_bytes())
             except FileNotFoundError:
@@ -189,18 +199,28 @@ class Recipe:
     def cached(self, progress: Callable[[int, int], None] | None = None) -> GratingSpectrum:
         """The spectrum from the cache, or built and put there.
 
-        The cache is a folder of spectra named by `digest`: $MITSUBA_DIFFRACTION_CACHE, or the user's cache folder.
+        The cache is a folder of spectra named by `digest`: $MITSUBA_DIFFRACTION_CACHE, or the user's cache folder. An
+        entry that is damaged, or of another recipe, is replaced.
+
+        Warns:
+            CacheWarning: if the spectrum cannot be kept.
         """
         with _building:
-            path = cache_folder() / f"{self.digest()}.exr"
-            if path.is_file():
-                try:
-                    return GratingSpectrum.load(path)
-                except ValueError:
-                    path.unlink()  # damaged from outside; built anew below
+            digest = self.digest()
+            path = cache_folder() / f"{digest}.exr"
+            with suppress(ValueError, OSError):
+                return spectrum_file.load(path, recipe=digest)
             spectrum = self.build(progress)
-            path.parent.mkdir(parents=True, exist_ok=True)
-            spectrum.save(path)
+            try:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                spectrum_file.save(spectrum, path, recipe=digest)
+            except (ValueError, OSError, RuntimeError) as error:  # RuntimeError is what OpenEXR raises on a full disk
+                reason = getattr(error, "strerror", None) or error
+                warnings.warn(
+                    f"the cache {path.parent} cannot be written to ({reason}); spectra are built anew each time",
+                    CacheWarning,
+                    stacklevel=1,
+                )
             return spectrum
 
 

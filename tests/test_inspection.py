@@ -379,7 +379,7 @@ def test_inspect_takes_a_recipe(folder, command):
         ("inspect waves.npy --pixel-size 0.08 -o nowhere/picture.png", "nowhere"),
         ("inspect waves.npy --pixel-size 0.08 --json nowhere/n.json", "--json: got nowhere/n.json"),
         ("inspect foil.toml --pixel-size 0.1", "go with a scan"),
-        ("inspect grey.png --pixel-size 0.1 -o ./grey.png", "which is what is inspected"),
+        ("inspect grey.png --pixel-size 0.1 -o ./grey.png", "which is read"),
     ],
 )
 def test_a_mistake_is_one_line_and_exit_code_2(folder, command, arguments, words):

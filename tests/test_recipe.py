@@ -486,6 +486,6 @@ def test_the_command_takes_the_same_of_a_scan(tmp_path, command, monkeypatch):
             "--unit, --prepare go with a scan; the recipe recipe.toml has its own",
         ),
     ):
-        code, out, err = command(f"precompute {arguments}")
+        code, out, err = command(f"precompute {arguments} --overwrite")
         assert (code, out, len(err.splitlines())) == (2, "", 1)
         assert words in err

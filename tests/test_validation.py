@@ -201,7 +201,7 @@ def test_a_surface_outside_of_the_range_is_missed(command, tmp_path):
     assert code == 1
     assert "range of scalar theory" in error
     assert "MISSED" in out
-    assert any(not result["ok"] for result in json.loads((tmp_path / "a.json").read_text(encoding="utf-8")))
+    assert any(not result["ok"] for result in json.loads((tmp_path / "a.json").read_text(encoding="utf-8"))["checks"])
 
 
 def test_the_command_prints_and_writes(command, tmp_path, monkeypatch):
@@ -214,7 +214,7 @@ def test_the_command_prints_and_writes(command, tmp_path, monkeypatch):
     assert code == 0
     assert "1 of 1 within their bounds; 1 only shown" in out
     assert "| one | good | 1 | 1.01 | 0.01 | 0.1 | ok | a \\| b | theory |" in (tmp_path / "a.md").read_text("utf-8")
-    assert [r["name"] for r in json.loads((tmp_path / "a.json").read_text("utf-8"))] == ["good", "shown"]
+    assert [r["name"] for r in json.loads((tmp_path / "a.json").read_text("utf-8"))["checks"]] == ["good", "shown"]
     bad = Check("one", "bad", lambda: Finding(1.0, 2.0, 1.0, 0.1), "theory")
     monkeypatch.setattr("mitsuba_diffraction.validation.checks", lambda: (*few, bad))
     code, out, error = command("validate")
@@ -232,7 +232,7 @@ def test_wrong_requests_are_refused(command, tmp_path):
     assert "--extent: got no surface" in error
     for option in ("--json", "--markdown"):
         code, _, error = command("validate", option, str(tmp_path / "nowhere" / "results"))
-        assert (code, error.count("\n"), error.count("cannot write")) == (2, 1, 1)
+        assert (code, error.count("\n"), error.count("nowhere is not there")) == (2, 1, 1)
     code, _, error = command("validate", "--variant", "scalar_spectral")
     assert (code, error.count("\n")) == (2, 1)
     assert "wanted llvm_" in error
@@ -270,7 +270,7 @@ def test_figures_are_drawn(command, tmp_path, monkeypatch):
 def test_results_are_plain_json(tmp_path):
     result = Check("a", "b", lambda: Finding(0.0, float("nan"), float("inf"), 0.1), "c").result()
     report.save_json([result], tmp_path / "a.json")
-    assert json.loads((tmp_path / "a.json").read_text("utf-8"))[0]["found"] is None
+    assert json.loads((tmp_path / "a.json").read_text("utf-8"))["checks"][0]["found"] is None
 
 
 def test_the_stored_results_are_part_of_the_package():

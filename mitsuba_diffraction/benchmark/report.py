@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import os
 from collections.abc import Sequence
 
 from rich.table import Table
 
 from ..files import whole_file
+from ..outputs import metadata
+from ..outputs import save_json as write_json
 from .approximation import Approximation
 from .run import Result
 from .sampling import ANGLES, Sampling
@@ -103,8 +104,7 @@ def save_json(
         "real-time shader": [dataclasses.asdict(s) for s in shaders],
         "sampling": [dataclasses.asdict(s) for s in sampling],
     }
-    with whole_file(path) as temporary:
-        temporary.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    write_json(content, path)
 
 
 def save_plot(results: Sequence[Result], path: str | os.PathLike[str]) -> None:
@@ -137,4 +137,4 @@ def save_plot(results: Sequence[Result], path: str | os.PathLike[str]) -> None:
     handles, labels = axes.flat[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), frameon=False)
     with whole_file(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=130)
+        figure.savefig(temporary, format="png", dpi=130, metadata=metadata(path))

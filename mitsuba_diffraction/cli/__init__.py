@@ -5,6 +5,7 @@ Exit codes: 0 done; 1 the work failed or was interrupted; 2 the request was wron
 
 from __future__ import annotations
 
+import io
 import sys
 import warnings
 
@@ -33,6 +34,9 @@ def _commands() -> None:
 
 def main() -> None:
     """Entry point of the command `mitsuba-diffraction`."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # file names need not be UTF-8, nor every terminal
+            stream.reconfigure(errors="backslashreplace")
     warnings.showwarning = lambda message, *args, **kwargs: say("warning", message)
     try:
         code = app(prog_name=NAME, standalone_mode=False) or 0

@@ -9,10 +9,13 @@ import typer
 from rich.console import Console
 
 from ..readers import read_height_field
+from .arguments import Overwrite, claim
 from .console import out, progress_bar
+from .inputs import files_read
 
 
 def benchmark(
+    context: typer.Context,
     scan: Annotated[Path | None, typer.Argument(metavar="[SCAN]", help="a scan to measure with")] = None,
     pixel_size: Annotated[float | None, typer.Option(help="of the scan, µm")] = None,
     height_range: Annotated[float | None, typer.Option(help="of the scan, black to white, µm")] = None,
@@ -21,6 +24,7 @@ def benchmark(
     variant: Annotated[str | None, typer.Option(help="of Mitsuba; the fastest spectral one by default")] = None,
     json: Annotated[Path | None, typer.Option(help="write the results here, too")] = None,
     plot: Annotated[Path | None, typer.Option(help="draw error against speed here (.png)")] = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Speed against error of every representation, as ratios to Mitsuba's roughconductor."""
     import mitsuba as mi
@@ -28,6 +32,8 @@ def benchmark(
     from ..benchmark import bundled_cases, measure, report, run, scan_case
     from ..variants import choose_variant
 
+    writes = [(option, path) for option, path in (("--json", json), ("--plot", plot)) if path is not None]
+    claim(context, [] if scan is None else files_read(scan), writes)
     cases = bundled_cases()
     names = [case.name for case in cases]
     if unknown := set(surface or []) - set(names):

@@ -10,12 +10,18 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from ..files import refuse_unwritable, whole_file
-from .arguments import scene_parameters
+from ..files import whole_file
+from ..outputs import free_name
+from .arguments import Overwrite, claim, scene_parameters
 from .console import out, progress_bar, tell
+from .inputs import files_read
+
+_PICTURES = {"-path.exr": "path_traced", "-published.exr": "published", "-corrected.exr": "corrected"}
+"""Ending → which picture."""
 
 
 def compare(
+    context: typer.Context,
     scene: Annotated[Path, typer.Argument(metavar="SCENE.xml")],
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="what the names of the files begin with, or a folder")
@@ -32,6 +38,7 @@ def compare(
     define: Annotated[
         list[str] | None, typer.Option("-D", metavar="NAME=VALUE", help="a parameter of the scene")
     ] = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Render a scene with the path tracer and with the real-time shader, and show and measure the difference."""
     import mitsuba as mi
@@ -40,21 +47,18 @@ def compare(
     from ..comparison import report
     from ..variants import choose_variant
 
-    name = f"{scene.stem}-{shader}"
-    prefix = Path(name) if output is None else output / name if output.is_dir() else output
-    if not prefix.parent.is_dir():
-        raise ValueError(f"-o: got {prefix}, but the folder {prefix.parent} is not there")
-    if json is not None and not json.parent.is_dir():
-        raise ValueError(f"--json: got {json}, but the folder {json.parent} is not there")
-    images = {
-        f"{prefix}-path.exr": "path_traced",
-        f"{prefix}-published.exr": "published",
-        f"{prefix}-corrected.exr": "corrected",
-    }
-    written = [*images, f"{prefix}.png", *([str(json)] if json is not None else [])]
-    for target in written:
-        refuse_unwritable(target)
     parameters = scene_parameters(define)
+    reads = files_read(scene, parameters)
+    prefix = output
+    if output is None or output.is_dir():
+        folder = output or Path()
+        prefix = folder / free_name(
+            f"{scene.stem}-{shader}", lambda stem: [folder / f"{stem}{end}" for end in (*_PICTURES, ".png")], reads
+        )
+    images = {f"{prefix}{end}": picture for end, picture in _PICTURES.items()}
+    written = [("-o", Path(target)) for target in (*images, f"{prefix}.png")]
+    written += [("--json", json)] if json is not None else []
+    claim(context, reads, written)
     mi.set_variant(choose_variant(variant))
     start = time.perf_counter()
     found = run(
@@ -81,4 +85,4 @@ def compare(
     if found.shares is not None:
         wide.print("", report.quirk_table(found), sep="\n")
     tell("\n" + "\n".join(report.notes(found)))
-    tell(f"{', '.join(written)}: {found.variant}, {time.perf_counter() - start:.1f} s")
+    tell(f"{', '.join(str(target) for _, target in written)}: {found.variant}, {time.perf_counter() - start:.1f} s")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json as json_format
 import math
 from pathlib import Path
 from typing import Annotated
@@ -13,17 +12,20 @@ from rich.console import Console
 from rich.table import Table
 
 from ..coherence import SUN_COHERENCE_LENGTH, lobe_width
-from ..files import whole_file
 from ..inspection import Inspection, save_picture
 from ..inspection import inspect as look
 from ..inspection.picture import with_uncertainty
 from ..inspection.uncertainty import GREEN
+from ..outputs import free_name, save_json
 from ..scalar_theory import TRUSTED
+from .arguments import Overwrite, claim
 from .console import out, progress_bar, tell
+from .inputs import files_read
 from .scan import Channel, FillMissing, HeightRange, PixelSize, Prepare, Unit, options_of_scan, recipe_of
 
 
 def inspect(
+    context: typer.Context,
     source: Annotated[Path, typer.Argument(metavar="SCAN|RECIPE", help="a scan, or a recipe (.toml)")],
     output: Annotated[
         Path | None,
@@ -36,16 +38,15 @@ def inspect(
     unit: Unit = None,
     prepare: Prepare = None,
     json: Annotated[Path | None, typer.Option(help="write the numbers here, too")] = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Statistics, periods and predicted colours of a surface, and how far they can be trusted; a picture."""
-    picture = output or Path(f"{source.stem}_inspect.png")
-    for option, path in (("-o", picture), ("--json", json)):
-        if path is not None and not path.parent.is_dir():
-            raise ValueError(f"{option}: got {path}, but the folder {path.parent} is not there")
-        if path is not None and path.resolve() == source.resolve():
-            raise ValueError(f"{option}: got {path}, which is what is inspected")
+    reads = files_read(source)
+    by_default = free_name(f"{source.stem}_inspect", lambda stem: [Path(f"{stem}.png")], reads)
+    picture = output or Path(f"{by_default}.png")
     if picture.suffix.lower() not in (".png", ".pdf", ".svg"):
         raise ValueError(f"-o: got {picture}, wanted a file name that ends in .png, .pdf or .svg")
+    claim(context, reads, [("-o", picture), *([("--json", json)] if json else [])])
     of_scan = options_of_scan(pixel_size, height_range, fill_missing, channel, unit, prepare)
     recipe = recipe_of(source, of_scan, {})
     height_field = recipe.height_field()
@@ -59,8 +60,7 @@ def inspect(
         )
     save_picture(inspection, picture, title=source.stem if source.suffix == ".toml" else source.name)
     if json is not None:
-        with whole_file(json) as temporary:
-            temporary.write_text(json_format.dumps(inspection.as_json(), indent=2) + "\n", encoding="utf-8")
+        save_json(inspection.as_json(), json)
     # Wide enough wherever it goes, a file too.
     wide = Console(highlight=False, width=max(out.width, 130))
     wide.print(_table(inspection))

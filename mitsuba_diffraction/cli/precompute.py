@@ -8,13 +8,15 @@ from typing import Annotated
 import typer
 
 from ..coherence import SUN_COHERENCE_LENGTH
-from ..files import refuse_unwritable
 from ..precompute import REPRESENTATIONS
+from .arguments import Overwrite, claim
 from .console import progress_bar, tell
+from .inputs import files_read
 from .scan import Channel, FillMissing, HeightRange, PixelSize, Prepare, Unit, options_of_scan, recipe_of
 
 
 def precompute(
+    context: typer.Context,
     sources: Annotated[list[Path], typer.Argument(metavar="RECIPE|SCAN...", help="recipes (.toml), or scans")],
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="the spectrum (.exr); beside you by default")
@@ -34,6 +36,7 @@ def precompute(
     coherence_length: Annotated[
         float | None, typer.Option(help=f"µm; {SUN_COHERENCE_LENGTH:g} is that of sunlight")
     ] = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Turn a recipe or a scan into the spectrum of its phase."""
     if output is not None and len(sources) > 1:
@@ -48,12 +51,11 @@ def precompute(
     settings = {name: value for name, value in given.items() if value is not None}
     of_scan = options_of_scan(pixel_size, height_range, fill_missing, channel, unit, prepare)
     targets = [output or Path(source.with_suffix(".exr").name) for source in sources]
-    for number, target in enumerate(targets):
+    for target in targets:
         if target.suffix.lower() != ".exr":
             raise ValueError(f"-o: got {target}, wanted a file name that ends in .exr")
-        if target in targets[:number]:
-            raise ValueError(f"got two sources whose spectrum would be {target}, wanted different names")
-        refuse_unwritable(target)
+    reads = [file for source in sources for file in files_read(source)]
+    claim(context, reads, [("-o" if output else f"spectrum of {s}", t) for s, t in zip(sources, targets, strict=True)])
     for source, target in zip(sources, targets, strict=True):
         with progress_bar(f"spectrum of {source.name}") as progress:
             spectrum = recipe_of(source, of_scan, settings).build(progress)

@@ -11,11 +11,14 @@ from typing import Annotated
 
 import typer
 
-from .arguments import scene_parameters
+from ..outputs import free_name
+from .arguments import Overwrite, claim, scene_parameters
 from .console import err, say, tell
+from .inputs import files_read
 
 
 def render(
+    context: typer.Context,
     scene: Annotated[Path, typer.Argument(metavar="SCENE.xml")],
     output: Annotated[Path | None, typer.Option("-o", "--output", help="the spectral picture (.exr)")] = None,
     spp: Annotated[int, typer.Option(min=1, help="samples per pixel; with --until-error the most of them")] = 64,
@@ -36,12 +39,12 @@ def render(
     ] = None,
     frames: Annotated[int | None, typer.Option(min=2, metavar="N", help="pictures of an orbit")] = None,
     orbit: Annotated[bool, typer.Option("--orbit", help="the camera goes round the scene once")] = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """Path-trace a scene into a spectral picture (.exr) and a preview (.png) beside it."""
     import mitsuba as mi
 
     from ..color import save_preview
-    from ..files import refuse_unwritable
     from ..render.checkpoint import checkpoint_path
     from ..render.passes import Interrupted, trace_here
     from ..render.passes import render as trace
@@ -50,21 +53,24 @@ def render(
     from ..render.turntable import orbit as motions_of_orbit
     from ..variants import choose_variant
 
-    target = output or Path(scene.with_suffix(".exr").name)
-    if target.suffix.lower() != ".exr":
-        raise ValueError(f"-o: got {target}, wanted a file name that ends in .exr")
-    if not target.parent.is_dir():
-        raise ValueError(f"-o: got {target}, but the folder {target.parent} is not there")
+    if output is not None and output.suffix.lower() != ".exr":
+        raise ValueError(f"-o: got {output}, wanted a file name that ends in .exr")
     if (frames is not None) != orbit:
         raise ValueError("--frames N and --orbit go together")
     parameters = scene_parameters(define)
-    targets = [target] if frames is None else [frame_path(target, frame, frames) for frame in range(frames)]
-    animation = target.with_suffix(".webp")
-    if frames is not None:
-        refuse_unwritable(animation)
+    reads = files_read(scene, parameters)
+
+    def pictures(target: Path) -> list[Path]:
+        return [target] if frames is None else [frame_path(target, frame, frames) for frame in range(frames)]
+
+    def written(target: Path) -> list[Path]:
+        previews = [path.with_suffix(".png") for path in pictures(target)]
+        return [*pictures(target), *previews, *([] if frames is None else [target.with_suffix(".webp")])]
+
+    target = output or Path(free_name(scene.stem, lambda stem: written(Path(f"{stem}.exr")), reads) + ".exr")
+    targets, animation = pictures(target), target.with_suffix(".webp")
+    claim(context, reads, [("-o", path) for path in written(target)], map(checkpoint_path, targets))
     for path in targets:
-        refuse_unwritable(path)
-        refuse_unwritable(path.with_suffix(".png"))
         if checkpoint_path(path).exists() and not resume:
             raise ValueError(
                 f"{checkpoint_path(path)} is of an unfinished rendering: --resume goes on from it; "

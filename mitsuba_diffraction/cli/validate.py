@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from ..files import refuse_unwritable
+from .arguments import Overwrite, claim
 from .console import out, progress_bar, tell
+from .inputs import files_read
 from .scan import Channel, FillMissing, HeightRange, PixelSize, Prepare, Unit, options_of_scan, recipe_of
 
 if TYPE_CHECKING:
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 
 
 def validate(
+    context: typer.Context,
     surface: Annotated[
         Path | None, typer.Argument(metavar="[SURFACE]", help="a recipe (.toml) or a scan: check this surface instead")
     ] = None,
@@ -33,6 +35,7 @@ def validate(
     json: Annotated[Path | None, typer.Option(help="write the results here, too")] = None,
     markdown: Annotated[Path | None, typer.Option(help="write a table with notes and sources here (.md)")] = None,
     figures: Annotated[Path | None, typer.Option(metavar="DIR", help="draw the evaluation's figures here")] = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Check against closed forms and rigorous results, or check one surface; fails if a bound is missed."""
     import mitsuba as mi
@@ -45,9 +48,13 @@ def validate(
     if surface is None and (of_scan or settings):
         names = ", ".join(f"--{name.replace('_', '-')}" for name in {**of_scan, **settings})
         raise ValueError(f"{names}: got no surface; they go with a scan, --extent with a recipe, too")
-    for path in (json, markdown):
-        if path is not None:
-            refuse_unwritable(path)
+    writes = [(option, path) for option, path in (("--json", json), ("--markdown", markdown)) if path is not None]
+    if figures is not None:
+        from ..evaluation import figure_names, save_figures
+
+        figures.mkdir(parents=True, exist_ok=True)
+        writes += [("--figures", figures / name) for name in figure_names()]
+    claim(context, [] if surface is None else files_read(surface), writes)
     chosen = choose_variant(variant)
     if chosen.startswith("scalar"):
         raise ValueError(f"--variant: got {chosen}, wanted llvm_… or cuda_…: the checks take millions of directions")
@@ -67,8 +74,6 @@ def validate(
     if markdown is not None:
         report.save_markdown(results, markdown)
     if figures is not None:
-        from ..evaluation import save_figures
-
         with progress_bar("figures") as progress:
             save_figures(figures, progress=progress)
     if missed:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -13,6 +12,8 @@ from rich.table import Table
 
 from ..color import XYZ_to_linear_sRGB, into_gamut, on_screen
 from ..files import whole_file
+from ..outputs import metadata
+from ..outputs import save_json as write_json
 from .difference import Difference
 from .quirk_shares import AgainstReference
 from .run import Comparison
@@ -193,8 +194,7 @@ def as_dict(comparison: Comparison) -> dict[str, object]:
 
 def save_json(comparison: Comparison, path: str | os.PathLike[str]) -> None:
     """Writes `as_dict`, whole or not at all."""
-    with whole_file(path) as temporary:
-        temporary.write_text(json.dumps(as_dict(comparison), indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    write_json(as_dict(comparison), path)
 
 
 def shown(comparison: Comparison, name: str) -> NDArray[np.uint8]:
@@ -259,4 +259,4 @@ def _bars(panel: Axes, against: AgainstReference) -> None:
 def save_figure(comparison: Comparison, path: str | os.PathLike[str], dpi: float = 150) -> None:
     """Writes `figure` as PNG, whole or not at all."""
     with whole_file(path) as temporary:
-        figure(comparison).savefig(temporary, format="png", dpi=dpi)
+        figure(comparison).savefig(temporary, format="png", dpi=dpi, metadata=metadata(path))

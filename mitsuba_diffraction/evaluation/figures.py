@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..files import whole_file
+from ..outputs import made_for, png_text
+from ..outputs import save_markdown as write_markdown
 from ..shader.quirks import Quirks
 from . import plots
 from .brdf_map import MAP_METHODS, PROJECTIONS, brdf_map
@@ -76,6 +78,14 @@ def period_rows(surface: Surface, maps: Iterable[ReflectanceMap], step: float = 
             )  # fmt: skip
             rows.append(Row(surface, found.method, False, fit_period(corrected)))
     return rows
+
+
+def figure_names(surfaces: Iterable[str] | None = None) -> list[str]:
+    """The files that `save_figures` writes."""
+    wanted = chosen(surfaces)
+    of_surfaces = [f"{kind}_{name}.png" for name in wanted for kind in ("viewing_angle", "brdf")]
+    cut_patch = ["patch_length.png"] if CUT in wanted else []
+    return [*of_surfaces, *cut_patch, "slits.png", "slit_patterns.png", "periods.md", "periods.csv"]
 
 
 def save_figures(
@@ -171,16 +181,18 @@ def _cells(row: Row) -> tuple[str, ...]:
 def save_markdown(rows: Iterable[Row], path: str | os.PathLike[str]) -> None:
     """The table of fitted periods in Markdown, whole or not at all."""
     lines = [_HEAD, ("---", "---", *["---:"] * (len(_HEAD) - 2)), *map(_cells, rows)]
-    with whole_file(path) as temporary:
-        temporary.write_text("".join(f"| {' | '.join(cells)} |\n" for cells in lines), encoding="utf-8")
+    write_markdown("".join(f"| {' | '.join(cells)} |\n" for cells in lines), path)
 
 
 def save_csv(rows: Iterable[Row], path: str | os.PathLike[str]) -> None:
-    """The table of fitted periods as comma-separated values, whole or not at all."""
+    """The table of fitted periods as comma-separated values, whole or not at all; a comment may follow."""
+    request = made_for(path)
     with whole_file(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
         csv.writer(file).writerows([_HEAD, *map(_cells, rows)])
+        if request is not None:
+            file.write(f"# {request}\n")
 
 
 def _save(drawn: Figure, path: Path) -> None:
     with whole_file(path) as temporary:
-        temporary.write_bytes(plots.png(drawn))
+        temporary.write_bytes(plots.png(drawn, pnginfo=png_text(path)))

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.cm import ScalarMappable
     from matplotlib.figure import Figure
+    from PIL.PngImagePlugin import PngInfo
 
 TITLES = {MODEL: "this model", "flss": "FLSS", "nmm": "NMM", "pq": "PQ", "gem": "GEM"}
 _PEAK, _EQUATION = "#d62728", "#1f77b4"
@@ -31,7 +32,7 @@ def figure(width: float, height: float) -> Figure:
     return Figure(figsize=(width, height), layout="constrained")
 
 
-def png(drawn: Figure, dpi: float = 110) -> bytes:
+def png(drawn: Figure, dpi: float = 110, pnginfo: PngInfo | None = None) -> bytes:
     """A figure as a PNG of 256 colours and their mixtures, half the size of one of all colours."""
     from PIL import Image
 
@@ -42,7 +43,7 @@ def png(drawn: Figure, dpi: float = 110) -> bytes:
         palette = picture.quantize(256, kmeans=2)
         # Pillow mixes colours only for a palette that it is given.
         mixed = picture.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG)
-        mixed.save(reduced, format="png", optimize=True)
+        mixed.save(reduced, format="png", optimize=True, pnginfo=pnginfo)
     return reduced.getvalue()
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ..color import auto_exposure, into_gamut, roll_off, spectrum_to_linear_sRGB
 from ..files import whole_file
 from ..heightfield import HeightField
+from ..outputs import metadata
 from .colours import WAVELENGTHS, radiance
 from .inspect import Inspection
 from .statistics import hann, reference_plane
@@ -64,7 +65,7 @@ def save_picture(inspection: Inspection, path: str | os.PathLike[str], *, title:
     _facts(figure.add_subplot(right), inspection)
     _colours([figure.add_subplot(row) for row in lower], inspection)
     with whole_file(path) as temporary:
-        figure.savefig(temporary)
+        figure.savefig(temporary, metadata=metadata(path))
 
 
 def _short(text: str, length: int) -> str:

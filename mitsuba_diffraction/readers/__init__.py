@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ..files import refuse_special
 from ..heightfield import HeightField
 from . import arrays, gwyddion, instruments, pictures, simple_field, text
 from .scan import Scan
@@ -82,6 +83,7 @@ def read_height_field(
         ValueError: if the file or the arguments are wrong; one line that names the file.
     """
     path = Path(path)
+    refuse_special(path)
     try:
         # What is too great for a float becomes infinite, a missing pixel or no length, and is refused as such.
         with np.errstate(over="ignore", invalid="ignore"):

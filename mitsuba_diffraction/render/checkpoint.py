@@ -1,8 +1,8 @@
 """The file in which an unfinished rendering waits.
 
 It is NumPy's `.npz`, not compressed (noise does not shrink): the fields of `Accumulation`, and `digest`, that of the
-request (`passes.Job`). The zip format's checksums tell a damaged file. It takes 8 bytes per pixel and channel, 690 MB
-for 1280 × 720 pixels; while one is written, the one before is there as well.
+request (`passes.Job`). The comment of the zip archive is the SHA-256 of the file (`files.seal`). It takes 8 bytes per
+pixel and channel, 690 MB for 1280 × 720 pixels; while one is written, the one before is there as well.
 """
 
 from __future__ import annotations
@@ -10,11 +10,11 @@ from __future__ import annotations
 import os
 from dataclasses import fields
 from pathlib import Path
-from zipfile import BadZipFile
+from zipfile import BadZipFile, ZipFile
 
 import numpy as np
 
-from ..files import durable_file
+from ..files import UNSEALED, is_intact, seal, whole_file
 from .accumulation import Accumulation
 
 
@@ -29,8 +29,12 @@ def save_checkpoint(path: str | os.PathLike[str], digest: str, sums: Accumulatio
     Raises:
         OSError: if it cannot be written; the old one stays.
     """
-    with durable_file(path) as stream:
-        np.savez(stream, digest=digest, **vars(sums))
+    with whole_file(path) as temporary:
+        with open(temporary, "wb") as stream:
+            np.savez(stream, digest=digest, **vars(sums))
+        with ZipFile(temporary, "a") as archive:
+            archive.comment = UNSEALED.encode()
+        seal(temporary)
 
 
 def load_checkpoint(path: str | os.PathLike[str], digest: str) -> Accumulation | None:
@@ -50,6 +54,8 @@ def load_checkpoint(path: str | os.PathLike[str], digest: str) -> Accumulation |
         return None
     with open(path, "rb") as stream:
         try:
+            if not is_intact(path):
+                raise ValueError("its bytes are not those that were written")
             with np.load(stream) as content:
                 found = content["digest"].item()
                 if found == digest:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ..color import spectrum_to_linear_sRGB
 from ..files import whole_file
+from ..outputs import made_for
 
 _LAYOUT_VERSION = "1.0"
 # Radiance per unit of the channels' names, that is per nm: the layout's authors and pbrt-v4 leave the nm⁻¹ out, and
@@ -25,7 +26,7 @@ _RESERVED = frozenset(
     (
         *("channels", "chunkCount", "compression", "dataWindow", "displayWindow", "lineOrder", "name"),
         *("pixelAspectRatio", "screenWindowCenter", "screenWindowWidth", "tiles", "type", "version", "view"),
-        *("spectralLayoutVersion", "emissiveUnits"),
+        *("spectralLayoutVersion", "emissiveUnits", "madeFor"),
     )
 )
 
@@ -94,6 +95,8 @@ class SpectralImage:
             "spectralLayoutVersion": _LAYOUT_VERSION,
             "emissiveUnits": _UNITS,
         }
+        if (request := made_for(path)) is not None:
+            header["madeFor"] = request
         with whole_file(path) as temporary:
             OpenEXR.File(header, channels).write(str(temporary))
 

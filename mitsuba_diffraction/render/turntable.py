@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ..files import whole_file
+from ..outputs import made_for
 from .scene import load_spectral_scene
 
 _FRAMES_PER_SECOND = 12
@@ -91,7 +92,14 @@ def save_animation(previews: Iterable[Path], path: str | os.PathLike[str]) -> No
     from PIL import Image
 
     first, *others = (Image.open(preview).convert("RGB") for preview in previews)
+    request = made_for(path)
     with whole_file(path) as temporary:
         first.save(
-            temporary, save_all=True, append_images=others, duration=1000 // _FRAMES_PER_SECOND, loop=0, quality=85
+            temporary,
+            save_all=True,
+            append_images=others,
+            duration=1000 // _FRAMES_PER_SECOND,
+            loop=0,
+            quality=85,
+            xmp=b"" if request is None else request.encode(),
         )

@@ -2,7 +2,8 @@
 
 Channels are named after what they hold. Series: `B{t^003}` (taylor), `B{T_003}` (chebyshev), `B{mode 003}` (svd), the
 terms B_n of S = Σ g_n(κ) B_n; "slices": `S(012.2)`, the powers at the third Chebyshev point of interval 12 of κ. Rows
-are orders m_y, columns m_x, from −M to M. Numbers in the header are double precision.
+are orders m_y, columns m_x, from −M to M. Numbers in the header are double precision. `contentSha256` covers every
+byte of the file, so that a damaged one is known as such.
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ import OpenEXR
 from ..expansions.chebyshev import ChebyshevSeries
 from ..expansions.svd import SvdSeries
 from ..expansions.taylor import TaylorSeries
-from ..files import whole_file
+from ..files import UNSEALED, is_intact, seal, whole_file
+from ..outputs import made_for
 from .grating_spectrum import GratingSpectrum
 from .orders import OrderGrid
 from .series_table import SeriesTable
@@ -29,7 +31,7 @@ from .slice_table import SliceTable
 from .spline_grid import SplineGrid
 
 FORMAT = "mitsuba_diffraction grating spectrum"
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 
 
 @contextlib.contextmanager
@@ -52,8 +54,8 @@ def _doubles(*values: float) -> np.ndarray:
     return np.array(values, np.float64)
 
 
-def save(spectrum: GratingSpectrum, path: str | os.PathLike[str]) -> None:
-    """Write `spectrum` to `path`, whole or not at all.
+def save(spectrum: GratingSpectrum, path: str | os.PathLike[str], recipe: str = "") -> None:
+    """Write `spectrum` to `path`, whole or not at all; `recipe` is the digest of that from which it was built.
 
     Raises:
         OSError: if the file cannot be written.
@@ -78,7 +80,11 @@ def save(spectrum: GratingSpectrum, path: str | os.PathLike[str]) -> None:
         "source": spectrum.source,
         "sourceSha256": spectrum.source_digest,
         "units": "lengths in micrometres, wavelengths in nanometres",
+        "recipeSha256": recipe,
+        "contentSha256": UNSEALED,
     }
+    if (request := made_for(path)) is not None:
+        header["madeFor"] = request
     if isinstance(spectrum.table, SeriesTable) and isinstance(spectrum.table.series, SvdSeries):
         # repr of a float is exact.
         header["modes"] = json.dumps(spectrum.table.series.modes.tolist())
@@ -86,19 +92,25 @@ def save(spectrum: GratingSpectrum, path: str | os.PathLike[str]) -> None:
     header["channelCount"] = len(channels)
     with whole_file(path) as temporary:
         OpenEXR.File(header, channels).write(str(temporary))
+        seal(temporary)
 
 
-def load(path: str | os.PathLike[str]) -> GratingSpectrum:
+def load(path: str | os.PathLike[str], recipe: str | None = None) -> GratingSpectrum:
     """Read a spectrum that `save` wrote.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if it is not a spectrum, is damaged, or is of a version or representation not known here.
+        ValueError: if it is not a spectrum, is damaged (be it by a single bit), is of a version or representation not
+            known here, or was not built from that recipe.
     """
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
     try:
+        intact = is_intact(path)
+        if intact is False:
+            # Before OpenEXR sees it: a size that is wrong could take all memory.
+            raise ValueError("damaged: its bytes are not those that were written")
         with _silence():
             file = OpenEXR.File(str(path), separate_channels=True)
             header, channels = file.header(), file.channels()
@@ -113,6 +125,10 @@ def load(path: str | os.PathLike[str]) -> GratingSpectrum:
             f"{path}: got format version {header.get('formatVersion')}, wanted {FORMAT_VERSION}; "
             "build the spectrum again with this version of mitsuba_diffraction"
         )
+    if not intact:
+        raise ValueError(f"{path}: a damaged spectrum (its SHA-256 is missing)")
+    if recipe not in (None, header.get("recipeSha256")):
+        raise ValueError(f"{path}: a spectrum of another recipe")
     if header.get("representation") not in _REPRESENTATIONS:
         raise ValueError(
             f"{path}: got representation {header.get('representation')!r}, wanted one of {', '.join(_REPRESENTATIONS)}"

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from rich.table import Table
 from rich.text import Text
 
-from ..files import whole_file
+from .. import outputs
 
 COLUMNS = ("check", "expected", "found", "difference", "bound", "")
 
@@ -57,8 +55,7 @@ def markdown(results: Sequence[dict[str, Any]]) -> str:
 
 
 def save_markdown(results: Sequence[dict[str, Any]], path: str | os.PathLike[str]) -> None:
-    with whole_file(path) as temporary:
-        Path(temporary).write_text(markdown(results), encoding="utf-8")
+    outputs.save_markdown(markdown(results), path)
 
 
 def save_json(results: Sequence[dict[str, Any]], path: str | os.PathLike[str]) -> None:
@@ -67,5 +64,4 @@ def save_json(results: Sequence[dict[str, Any]], path: str | os.PathLike[str]) -
         {name: None if isinstance(value, float) and not math.isfinite(value) else value for name, value in r.items()}
         for r in results
     ]
-    with whole_file(path) as temporary:
-        Path(temporary).write_text(json.dumps(plain, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    outputs.save_json({"checks": plain}, path)

@@ -1,0 +1,158 @@
+"""What a command may write: never over what it reads, nor over what was not made for the same request.
+
+A command tells once what it reads and writes (`claimed`). What it then writes carries a digest of the request
+(`made_for`), by which the next run of the same command knows its own files. Writers put it where their format keeps
+text: OpenEXR's header, PNG's text chunks, metadata of PDF, SVG and WebP, an entry of JSON, a comment in Markdown.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from .files import final_path, refuse_unwritable, whole_file
+
+if TYPE_CHECKING:
+    from PIL.PngImagePlugin import PngInfo
+
+_MEGABYTE = 2**20
+# Of the command that runs: real path of a file that it writes → the text that the file carries.
+_claims: dict[Path, str] = {}
+
+
+@contextmanager
+def claimed(
+    request: Mapping[str, object],
+    reads: Iterable[str | os.PathLike[str]],
+    writes: Iterable[tuple[str, str | os.PathLike[str]]],
+    *,
+    scratch: Iterable[str | os.PathLike[str]] = (),
+    overwrite: bool = False,
+) -> Iterator[None]:
+    """Refuses files that must not be written over, before the work; what is written inside the block is then marked.
+
+    Args:
+        request: all that decides what is written, by name. Names of files stand for their place relative to the file
+            that is written, so that a folder may move.
+        reads: files that are read.
+        writes: (option, file) of each file that is written.
+        scratch: files that are written on the way, and know by themselves what they belong to.
+        overwrite: allow to replace what was made for another request. What is read is never replaced.
+
+    Raises:
+        ValueError: if a file to be written is read, or named twice, or was not made for this request; or if it cannot
+            be written at all.
+    """
+    writes = [(option, os.fspath(path)) for option, path in writes]
+    taken = {identity: os.fspath(path) for path in reads for identity in _identities(path)}
+    planned: dict[object, str] = {}
+    for option, path in [*writes, *(("checkpoint", os.fspath(path)) for path in scratch)]:
+        identities = _identities(path)
+        for read in (taken[identity] for identity in identities & taken.keys()):
+            by = "" if os.path.abspath(path) == os.path.abspath(read) else f" as {read}"
+            raise ValueError(f"{option}: got {path}, which is read{by} and would be lost; wanted another name")
+        identities.add(os.path.realpath(path).casefold())  # two names that differ in case may become one file
+        for other in (planned[identity] for identity in identities & planned.keys()):
+            raise ValueError(f"{option}: {path} would be written twice, for {other} too; wanted another name")
+        planned.update(dict.fromkeys(identities, option))
+    marks = {}
+    for option, path in writes:
+        if not Path(path).parent.is_dir():
+            raise ValueError(f"{option}: got {path}, but the folder {Path(path).parent} is not there")
+        refuse_unwritable(path)
+        real = final_path(path)
+        marks[real] = _mark(option, request, real.parent)
+        if os.path.exists(path) and not overwrite and not _carries(real, marks[real]):
+            raise ValueError(
+                f"{option}: {path} is there, and this command with these options did not make it; "
+                "--overwrite replaces it, another name keeps it"
+            )
+    before = dict(_claims)
+    _claims.update(marks)
+    try:
+        yield
+    finally:
+        _claims.clear()
+        _claims.update(before)
+
+
+def made_for(path: str | os.PathLike[str]) -> str | None:
+    """The text that a file has to carry, ASCII; None unless a command has claimed it."""
+    return _claims.get(final_path(path))
+
+
+def metadata(path: str | os.PathLike[str]) -> dict[str, str]:
+    """The same for Matplotlib's `savefig`, under a name that PNG, PDF and SVG share."""
+    request = made_for(path)
+    return {} if request is None else {"Keywords": request}
+
+
+def png_text(path: str | os.PathLike[str]) -> PngInfo:
+    """The same for Pillow's `save`."""
+    from PIL.PngImagePlugin import PngInfo
+
+    text = PngInfo()
+    for name, value in metadata(path).items():
+        text.add_text(name, value)
+    return text
+
+
+def save_json(content: Mapping[str, object], path: str | os.PathLike[str]) -> None:
+    """Writes a JSON file, whole or not at all."""
+    request = made_for(path)
+    marked = dict(content) if request is None else {**content, "made for": request}
+    with whole_file(path) as temporary:
+        temporary.write_text(json.dumps(marked, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def save_markdown(text: str, path: str | os.PathLike[str]) -> None:
+    """Writes a Markdown file, whole or not at all."""
+    request = made_for(path)
+    with whole_file(path) as temporary:
+        temporary.write_text(text if request is None else f"{text}\n<!-- {request} -->\n", encoding="utf-8")
+
+
+def free_name(stem: str, files_of: Callable[[str], Iterable[Path]], reads: Iterable[str | os.PathLike[str]]) -> str:
+    """The first of `stem`, `stem`_2, `stem`_3, … of whose files (`files_of`) none is read: for names by default."""
+    taken = {identity for path in reads for identity in _identities(path)}
+    names = (stem if number == 1 else f"{stem}_{number}" for number in itertools.count(1))
+    return next(name for name in names if not any(taken & _identities(path) for path in files_of(name)))
+
+
+def _identities(path: str | os.PathLike[str]) -> set[object]:
+    """Whatever tells that two names mean one file: links are followed, hard ones too."""
+    found: set[object] = {os.path.realpath(path)}
+    if os.path.exists(path):
+        status = os.stat(path)
+        found.add((status.st_dev, status.st_ino))
+    return found
+
+
+def _mark(option: str, request: Mapping[str, object], folder: Path) -> str:
+    told = json.dumps([option, _relative(request, folder)], sort_keys=True, default=str)
+    return f"mitsuba_diffraction request {hashlib.sha256(told.encode('utf-8', 'surrogateescape')).hexdigest()}"
+
+
+def _relative(value: object, folder: Path) -> object:
+    if isinstance(value, Mapping):
+        return {name: _relative(item, folder) for name, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_relative(item, folder) for item in value]
+    if isinstance(value, str | Path) and os.path.exists(value):
+        return Path(os.path.relpath(os.path.realpath(value), folder)).as_posix()
+    return value
+
+
+def _carries(path: Path, mark: str) -> bool:
+    """Whether a file carries a text; formats keep it near the beginning or the end."""
+    with open(path, "rb") as stream:
+        if mark.encode() in stream.read(_MEGABYTE):
+            return True
+        stream.seek(max(0, stream.seek(0, os.SEEK_END) - _MEGABYTE))
+        return mark.encode() in stream.read()

@@ -1,0 +1,307 @@
+"""No command writes over what it reads, nor over what another command made; and what a kill leaves is cleared."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import mitsuba_diffraction as md
+from mitsuba_diffraction import outputs
+from mitsuba_diffraction.cli.inputs import files_read
+from mitsuba_diffraction.files import is_intact, refuse_unwritable, seal, whole_file
+from mitsuba_diffraction.outputs import claimed, made_for
+
+BLAZE = '[surface]\nprofile = "blazed"\nperiod = 2.5\ndepth = 0.25\nsamples = 64\n[spectrum]\ntolerance = 0.02\n'
+SCAN = '[surface]\nscan = "scan.png"\npixel_size = 0.05\nheight_range = 0.3\n[spectrum]\ntolerance = 0.02\n'
+SCENE = """<scene version="3.0.0"><default name="spectrum" value="u.exr"/><default name="light" value="sky"/>
+<integrator type="path"/><sensor type="perspective"><transform name="to_world">
+<lookat origin="0,0,4" target="0,0,0" up="0,1,0"/></transform><film type="hdrfilm">
+<integer name="width" value="4"/><integer name="height" value="4"/></film></sensor>
+<include filename="lights/$light.xml"/><shape type="sphere"><bsdf type="diffraction_grating">
+<string name="filename" value="$spectrum"/><bsdf type="diffuse" name="base"><texture type="bitmap" name="reflectance">
+<string name='filename' value='tex.png'/></texture></bsdf></bsdf></shape></scene>"""
+SKY = """<scene version="3.0.0"><emitter type="constant">
+<spectrum name="radiance" filename="sky.spd"/></emitter></scene>"""
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    """A scene in a folder of its own that names a spectrum, a texture, an included light and its table."""
+    monkeypatch.chdir(tmp_path)
+    Path("lights").mkdir()
+    Path("u.xml").write_text(SCENE)
+    Path("lights/sky.xml").write_text(SKY)
+    Path("sky.spd").write_text("400 1\n700 1\n")
+    Path("blaze.toml").write_text(BLAZE)
+    Path("scan.toml").write_text(SCAN)
+    pixels = np.random.default_rng(0).integers(0, 255, (8, 8), dtype=np.uint8)
+    for name in ("scan.png", "tex.png"):
+        Image.fromarray(pixels).save(name)
+    md.precompute(md.gratings.blazed(2.5, 0.25, samples=64), tolerance=0.02).save("u.exr")
+    return tmp_path
+
+
+def contents():
+    return {path: path.read_bytes() for path in Path().rglob("*") if path.is_file()}
+
+
+def refused(command, line, name):
+    """The command is refused in one line that names the file, and no file changes."""
+    before = contents()
+    code, out, err = command(line)
+    assert (code, out) == (2, "")
+    assert len(err.splitlines()) == 1, err
+    assert name in err
+    assert contents() == before
+    return err
+
+
+RENDER = "render u.xml --spp 1 --width 2 --variant scalar_spectral"
+
+
+# --- what is read ---
+
+
+def test_a_scene_reads_what_it_names():
+    named = {os.path.normpath(path) for path in files_read("u.xml")}
+    assert named == {"u.xml", "u.exr", "tex.png", "lights/sky.xml", "sky.spd"}
+    named = {os.path.normpath(path) for path in files_read("u.xml", {"spectrum": "scan.toml"})}
+    assert named == {"u.xml", "scan.toml", "scan.png", "tex.png", "lights/sky.xml", "sky.spd"}
+
+
+@pytest.mark.parametrize(
+    ("line", "name"),
+    [
+        (f"{RENDER} -o u.exr", "u.exr"),
+        (f"{RENDER} -o tex.exr", "tex.png"),  # the preview
+        (f"{RENDER} -o hard.exr", "u.exr"),
+        (f"{RENDER} -o soft.exr", "u.exr"),
+        (f"{RENDER} -o there/u.exr", "u.exr"),
+        (f"{RENDER} -o lights/../u.exr", "u.exr"),
+        (f"{RENDER} -D spectrum=scan.toml -o scan.exr", "scan.png"),
+        (f"{RENDER} -D spectrum=u_001.exr -o u.exr --frames 2 --orbit", "u_001.exr"),
+        ("compare u.xml --json lights/sky.xml -o a", "lights/sky.xml"),
+        ("compare u.xml --json sky.spd -o a", "sky.spd"),
+        ("precompute scan.toml -o scan.EXR", ""),
+        ("inspect scan.toml -o scan.png", "scan.png"),
+        ("inspect scan.toml --json scan.toml", "scan.toml"),
+        ("validate scan.toml --json scan.toml", "scan.toml"),
+        ("validate scan.toml --markdown scan.png", "scan.png"),
+        ("benchmark scan.png --pixel-size 0.05 --height-range 0.3 --plot scan.png", "scan.png"),
+    ],
+)
+def test_what_is_read_is_not_written_over(command, line, name):
+    # Regression: the README's own way put the picture over the spectrum, and the preview over the scan.
+    os.link("u.exr", "hard.exr")
+    Path("soft.exr").symlink_to("u.exr")
+    Path("there").symlink_to(".")
+    Path("u_001.exr").write_bytes(Path("u.exr").read_bytes())
+    if not name:
+        os.link("scan.png", "scan.EXR")
+    assert "is read" in refused(command, f"{line} --overwrite", name)
+
+
+def test_names_by_default_keep_clear_of_what_is_read(command):
+    before = contents()
+    line = RENDER.replace("u.xml", "u.xml -D spectrum=u.exr")
+    for _ in range(2):  # the second time over its own files
+        code, out, _ = command(line)
+        assert code == 0
+        assert out.startswith("u_2.exr: ")
+    after = contents()
+    assert {path: after[path] for path in before} == before
+    assert {str(path) for path in after.keys() - before.keys()} == {"u_2.exr", "u_2.png"}
+
+
+# --- one over another ---
+
+
+@pytest.mark.parametrize(
+    ("line", "name"),
+    [
+        ("inspect scan.toml -o q.png --json q.png", "q.png"),
+        ("inspect scan.toml -o q.png --json Q.png", "Q.png"),
+        ("validate scan.toml --json r --markdown ./r", "r"),
+        ("benchmark --json b.png --plot b.png", "b.png"),
+        ("compare u.xml -o c --json c.png", "c.png"),
+        ("compare u.xml -o c --json c-path.exr", "c-path.exr"),
+        ("precompute blaze.toml lights/../blaze.toml", "blaze.exr"),
+    ],
+)
+def test_one_output_is_not_written_over_another(command, line, name):
+    assert "twice" in refused(command, f"{line} --overwrite", name)
+
+
+# --- what is there ---
+
+
+@pytest.mark.parametrize(
+    ("line", "other", "name"),
+    [
+        ("precompute blaze.toml -o a.exr", "--tolerance 0.05", "a.exr"),
+        ("inspect blaze.toml -o a.png --json a.json", "--pixel-size 1", "a.png"),
+        (f"{RENDER} -o a.exr", "--seed 1", "a.exr"),
+    ],
+)
+def test_a_command_knows_what_it_made(command, line, other, name):
+    assert command(line)[0] == 0
+    assert command(line)[0] == 0
+    assert "--overwrite" in refused(command, f"{line} {other}", name)
+    Path(name).write_text("a year's work")
+    refused(command, line, name)
+    assert command(f"{line} --overwrite")[0] == 0
+    assert command(line)[0] == 0
+
+
+def test_a_preview_of_another_is_not_replaced(command):
+    Path("a.png").write_text("a year's work")
+    refused(command, f"{RENDER} -o a.exr", "a.png")
+
+
+def test_a_folder_may_move(command):
+    Path("here").mkdir()
+    Path("blaze.toml").rename("here/blaze.toml")
+    assert command("precompute here/blaze.toml -o here/a.exr")[0] == 0
+    Path("here").rename("there")
+    assert command("precompute there/blaze.toml -o there/a.exr")[0] == 0
+
+
+@pytest.mark.parametrize("name", ["a.json", "a.md", "a.png", "a.pdf", "a.svg", "a.webp", "a.exr", "spectrum.exr"])
+def test_every_format_carries_its_request(name):
+    def write():
+        if name == "a.json":
+            outputs.save_json({"a": 1}, name)
+        elif name == "a.md":
+            outputs.save_markdown("# a\n", name)
+        elif name == "a.webp":
+            from mitsuba_diffraction.render.turntable import save_animation
+
+            save_animation([Path("tex.png"), Path("scan.png")], name)
+        elif name == "a.exr":
+            from mitsuba_diffraction.render import SpectralImage
+
+            SpectralImage([500.0], np.zeros((2, 2, 1), np.float32)).save(name)
+        elif name == "spectrum.exr":
+            md.GratingSpectrum.load("u.exr").save(name)
+        else:
+            from matplotlib.figure import Figure
+
+            Figure(figsize=(1, 1)).savefig(name, metadata=outputs.metadata(name))
+
+    for seed in (1, 1):
+        with claimed({"seed": seed}, [], [("-o", name)]):
+            assert made_for(name)
+            write()
+    with pytest.raises(ValueError, match="--overwrite"), claimed({"seed": 2}, [], [("-o", name)]):
+        pass
+    with claimed({"seed": 2}, [], [("-o", name)], overwrite=True):
+        write()
+    assert made_for(name) is None
+    if name.endswith("json"):
+        assert json.loads(Path(name).read_text())["a"] == 1
+
+
+# --- several at once, and kills ---
+
+WRITER = """import sys, time
+from mitsuba_diffraction.files import whole_file
+with whole_file("target.bin") as temporary:
+    for _ in range(50):
+        temporary.write_bytes(sys.argv[1].encode() * 100_000)
+    print("ready", flush=True)
+    time.sleep(float(sys.argv[2]))"""
+
+
+def write_elsewhere(letter, seconds):
+    process = subprocess.Popen([sys.executable, "-c", WRITER, letter, str(seconds)], stdout=subprocess.PIPE)
+    process.stdout.readline()
+    return process
+
+
+def temporaries():
+    return [path for path in Path().iterdir() if path.name.startswith(".target-")]
+
+
+def test_processes_that_write_one_file_do_not_meet():
+    writers = [write_elsewhere(letter, 0.5) for letter in "ab"]
+    assert len(temporaries()) == 2
+    with whole_file("target.bin") as temporary:  # it leaves those alone that are being written
+        temporary.write_bytes(b"c")
+    assert Path("target.bin").read_bytes() == b"c"
+    assert [writer.wait() for writer in writers] == [0, 0]
+    assert set(Path("target.bin").read_bytes()) in ({ord("a")}, {ord("b")})
+    assert not temporaries()
+    for writer in writers:
+        writer.stdout.close()
+
+
+def test_what_a_kill_leaves_is_cleared_by_the_next():
+    process = write_elsewhere("a", 60)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    process.stdout.close()
+    Path(".target-of-mine.bin").write_text("mine")
+    assert len(temporaries()) == 2
+    refuse_unwritable("target.bin")
+    assert [path.name for path in temporaries()] == [".target-of-mine.bin"]
+
+
+def test_a_temporary_path_may_be_handed_on():
+    with whole_file("a.txt") as outer, whole_file(outer) as inner:
+        assert inner == outer
+        inner.write_text("a")
+    assert Path("a.txt").read_text() == "a"
+
+
+def test_a_seal_covers_every_byte():
+    with pytest.raises(ValueError, match="no place"):
+        seal("scan.png")
+    assert is_intact("scan.png") is None
+    assert is_intact("u.exr")
+    with Path("u.exr").open("ab") as stream:
+        stream.write(b"\0")
+    assert is_intact("u.exr") is False
+
+
+# --- files that are none, and names that are no text ---
+
+
+@pytest.mark.parametrize("line", ["precompute NAME.npy --pixel-size 1", "inspect NAME.npy", "precompute NAME.toml"])
+@pytest.mark.parametrize("kind", ["pipe", "device"])
+def test_pipes_and_devices_are_refused(command, line, kind):
+    # Regression: the command waited for ever, or filled the memory.
+    for name in ("a.npy", "a.toml"):
+        if kind == "pipe":
+            os.mkfifo(name)
+        else:
+            Path(name).symlink_to("/dev/zero")
+    start = time.monotonic()
+    code, _, err = command(line.replace("NAME", "a"))
+    assert (code, len(err.splitlines())) == (2, 1)
+    assert "a pipe or a device" in err
+    assert time.monotonic() - start < 60
+
+
+def test_a_recipe_whose_scan_is_a_pipe_is_refused():
+    os.mkfifo("pipe.png")
+    Path("scan.toml").write_text(SCAN.replace("scan.png", "pipe.png"))
+    with pytest.raises(ValueError, match="a pipe or a device"):
+        md.Recipe.load("scan.toml").cached()
+
+
+@pytest.mark.parametrize(
+    "words", [("precompute", "\udcff.npy"), ("render", "u.xml", "-o", "\udcff.exr"), ("render", "u.xml", "-Da=\udcff")]
+)
+def test_names_that_are_not_utf8_are_one_line(command, words):
+    np.save(os.fsencode("\udcff.npy"), np.zeros((8, 8)))
+    code, out, err = command(*words)
+    assert (code, out) == (2, "")
+    assert len(err.splitlines()) == 1
+    assert "UTF-8" in err
