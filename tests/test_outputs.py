@@ -5,7 +5,7 @@ import os
 import signal
 import subprocess
 import sys
-import time
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -187,7 +187,7 @@ def test_every_format_carries_its_request(name):
         elif name == "a.exr":
             from mitsuba_diffraction.render import SpectralImage
 
-            SpectralImage([500.0], np.zeros((2, 2, 1), np.float32)).save(name)
+            SpectralImage([500.0, 600.0], np.zeros((2, 2, 2), np.float32)).save(name)
         elif name == "spectrum.exr":
             md.GratingSpectrum.load("u.exr").save(name)
         else:
@@ -210,19 +210,22 @@ def test_every_format_carries_its_request(name):
 
 # --- several at once, and kills ---
 
-WRITER = """import sys, time
+WRITER = """import sys
 from mitsuba_diffraction.files import whole_file
 with whole_file("target.bin") as temporary:
     for _ in range(50):
         temporary.write_bytes(sys.argv[1].encode() * 100_000)
     print("ready", flush=True)
-    time.sleep(float(sys.argv[2]))"""
+    sys.stdin.readline()"""
 
 
-def write_elsewhere(letter, seconds):
-    process = subprocess.Popen([sys.executable, "-c", WRITER, letter, str(seconds)], stdout=subprocess.PIPE)
-    process.stdout.readline()
-    return process
+@contextmanager
+def write_elsewhere(letter):
+    """A process that has written a temporary file, and waits for an end of line."""
+    words = [sys.executable, "-c", WRITER, letter]
+    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        process.stdout.readline()
+        yield process
 
 
 def temporaries():
@@ -230,23 +233,21 @@ def temporaries():
 
 
 def test_processes_that_write_one_file_do_not_meet():
-    writers = [write_elsewhere(letter, 0.5) for letter in "ab"]
-    assert len(temporaries()) == 2
-    with whole_file("target.bin") as temporary:  # it leaves those alone that are being written
-        temporary.write_bytes(b"c")
-    assert Path("target.bin").read_bytes() == b"c"
-    assert [writer.wait() for writer in writers] == [0, 0]
-    assert set(Path("target.bin").read_bytes()) in ({ord("a")}, {ord("b")})
+    with write_elsewhere("a") as a, write_elsewhere("b") as b:
+        assert len(temporaries()) == 2
+        with whole_file("target.bin") as temporary:  # it leaves those alone that are being written
+            temporary.write_bytes(b"c")
+        assert Path("target.bin").read_bytes() == b"c"
+        for writer, letter in ((a, b"a"), (b, b"b")):
+            writer.communicate("\n")
+            assert writer.returncode == 0
+            assert Path("target.bin").read_bytes() == letter * 100_000
     assert not temporaries()
-    for writer in writers:
-        writer.stdout.close()
 
 
 def test_what_a_kill_leaves_is_cleared_by_the_next():
-    process = write_elsewhere("a", 60)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
-    process.stdout.close()
+    with write_elsewhere("a") as process:
+        process.send_signal(signal.SIGKILL)
     Path(".target-of-mine.bin").write_text("mine")
     assert len(temporaries()) == 2
     refuse_unwritable("target.bin")
@@ -282,11 +283,9 @@ def test_pipes_and_devices_are_refused(command, line, kind):
             os.mkfifo(name)
         else:
             Path(name).symlink_to("/dev/zero")
-    start = time.monotonic()
     code, _, err = command(line.replace("NAME", "a"))
     assert (code, len(err.splitlines())) == (2, 1)
     assert "a pipe or a device" in err
-    assert time.monotonic() - start < 60
 
 
 def test_a_recipe_whose_scan_is_a_pipe_is_refused():
@@ -300,7 +299,7 @@ def test_a_recipe_whose_scan_is_a_pipe_is_refused():
     "words", [("precompute", "\udcff.npy"), ("render", "u.xml", "-o", "\udcff.exr"), ("render", "u.xml", "-Da=\udcff")]
 )
 def test_names_that_are_not_utf8_are_one_line(command, words):
-    np.save(os.fsencode("\udcff.npy"), np.zeros((8, 8)))
+    Path("\udcff.npy").write_bytes(b"")
     code, out, err = command(*words)
     assert (code, out) == (2, "")
     assert len(err.splitlines()) == 1

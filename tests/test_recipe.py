@@ -1,6 +1,7 @@
 """Recipes: what they refuse, what they build, and a cache that is keyed by content."""
 
 import shutil
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -489,3 +490,55 @@ def test_the_command_takes_the_same_of_a_scan(tmp_path, command, monkeypatch):
         code, out, err = command(f"precompute {arguments} --overwrite")
         assert (code, out, len(err.splitlines())) == (2, "", 1)
         assert words in err
+
+
+# ---------------------------------------------------------------- a cache that is damaged, or cannot be used
+
+
+@pytest.mark.parametrize("damage", ["folder", "dangling link", "folder is a file", "folder is a dangling link"])
+def test_without_a_cache_there_is_a_warning(own_cache, builds, damage):
+    # Regression: the render was refused.
+    recipe = Recipe({"profile": "blazed", "period": 2.5, "depth": 0.25, "samples": 64}, FAST)
+    entry = own_cache / f"{recipe.digest()}.exr"
+    own_cache.parent.mkdir()
+    if damage == "folder is a file":
+        own_cache.write_text("")
+    elif damage == "folder is a dangling link":
+        own_cache.symlink_to("nowhere")
+    else:
+        own_cache.mkdir()
+        if damage == "folder":
+            entry.mkdir()
+        else:
+            entry.symlink_to("nowhere/spectrum.exr")
+    for _ in range(2):
+        with pytest.warns(recipe_module.CacheWarning) as told:
+            spectrum = recipe.cached()
+        assert len(told) == 1
+    assert spectrum.source_digest == recipe.height_field().digest
+    assert len(builds) == 2
+
+
+def test_one_warning_for_many_surfaces(own_cache):
+    own_cache.parent.mkdir()
+    own_cache.write_text("")
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("default")
+        for period in (2.5, 2.6, 2.7):
+            Recipe({"profile": "blazed", "period": period, "depth": 0.25, "samples": 64}, FAST).cached()
+    assert len(told) == 1
+
+
+def test_a_spectrum_of_another_surface_under_a_name_of_the_cache_is_not_used(own_cache, builds):
+    one, other = (
+        Recipe({"profile": "blazed", "period": period, "depth": 0.25, "samples": 64}, FAST) for period in (2.5, 2.6)
+    )
+    one.cached()
+    entry = own_cache / f"{one.digest()}.exr"
+    shutil.copy(entry, own_cache / f"{other.digest()}.exr")
+    assert other.cached().source_digest == other.height_field().digest
+    assert len(builds) == 2
+    other.build().save(entry)  # one that precompute wrote names no recipe
+    assert one.cached().source_digest == one.height_field().digest
+    one.cached()
+    assert len(builds) == 4

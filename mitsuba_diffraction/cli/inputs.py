@@ -51,7 +51,8 @@ def files_read(path: str | os.PathLike[str], parameters: Mapping[str, str] | Non
             for element in _DEFAULT.findall(text):
                 attributes = {name: html.unescape(a or b) for name, a, b in _ATTRIBUTE.findall(element)}
                 defaults.setdefault(attributes.get("name", ""), attributes.get("value", ""))
-            values = {_put_in(html.unescape(a or b), {**defaults, **given}) for a, b in _VALUE.findall(text)} - {""}
+            rest = _DEFAULT.sub("", text)  # a default that is used comes in by its name
+            values = {_put_in(html.unescape(a or b), {**defaults, **given}) for a, b in _VALUE.findall(rest)} - {""}
             places = list(dict.fromkeys([*folders, file.parent]))
             folders += [place / value for value in values for place in places if os.path.isdir(place / value)]
             waiting += [place / value for value in values for place in [*folders, file.parent]]
