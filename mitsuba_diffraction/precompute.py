@@ -82,8 +82,7 @@ def precompute(
     lobe_width(coherence_length)
     if representation not in REPRESENTATIONS:
         raise ValueError(f"representation: got {representation!r}, wanted one of {', '.join(REPRESENTATIONS)}")
-    if not 1e-5 <= tolerance < 1:
-        raise ValueError(f"tolerance: got {tolerance!r}, wanted a share of the reflected power from 1e-5 to 1")
+    check_tolerance(tolerance)
     shortest = wavelengths[0] * 1e-3
     largest_kappa = 4 * np.pi / shortest
     reach = 2 * np.sin(np.deg2rad(largest_angle)) / shortest
@@ -121,6 +120,12 @@ def precompute(
         dropped=build.dropped,
         beyond=build.beyond,
     )
+
+
+def check_tolerance(tolerance: float) -> None:
+    """Raises ValueError unless `tolerance` is a share of the power that float32 can keep."""
+    if not 1e-5 <= tolerance < 1:
+        raise ValueError(f"tolerance: got {tolerance!r}, wanted a share of the reflected power from 1e-5 to 1")
 
 
 def _splines(
@@ -273,11 +278,12 @@ class _Build:
         allowed *= self._pilot_share
         kappas, interpolate = self._between()
         exact = interpolate @ self._pilot
+        coefficients = chebyshev_transform(self._nodes) @ self._pilot
         intervals = 1
         while True:
             at = (np.arange(intervals)[:, None] + (1 + chebyshev_nodes(4)) / 2) / intervals * self._largest_kappa
-            vander = chebyshev_polynomials(position(at, self._largest_kappa), self._nodes)
-            values = vander @ chebyshev_transform(self._nodes) @ self._pilot
+            vander = chebyshev_polynomials(position(at.ravel(), self._largest_kappa), self._nodes)
+            values = (vander @ coefficients).reshape(*at.shape, -1)
             interval, weights = interpolation(kappas, self._largest_kappa, intervals)
             # One κ after the other: all at once would take more memory than the table.
             error = max(np.abs(w @ values[k] - e).sum() for k, w, e in zip(interval, weights, exact, strict=True))

@@ -147,7 +147,10 @@ class Recipe:
         except TypeError as error:
             known = inspect.signature(PROFILES[name]).parameters
             unknown = sorted(set(parameters) - set(known))
-            wrong = f"got the unknown name {', '.join(unknown)}, wanted among {', '.join(known)}" if unknown else error
+            # The text alone: a local name of the exception would tie it and all its frames into a cycle.
+            wrong = (
+                f"got the unknown name {', '.join(unknown)}, wanted among {', '.join(known)}" if unknown else str(error)
+            )
             raise ValueError(f"profile {name!r}: {wrong}") from None
 
     def _prepared_scan(self, parameters: dict[str, Any]) -> HeightField:

@@ -11,6 +11,7 @@ import OpenEXR
 import pytest
 
 import mitsuba_diffraction as md
+from mitsuba_diffraction.cli.arguments import scene_parameters
 
 # The package gives the function of that name.
 PRECOMPUTE = importlib.import_module("mitsuba_diffraction.precompute")
@@ -313,3 +314,19 @@ def test_precompute_refuses_where_it_cannot_write_before_the_work(command, monke
     monkeypatch.setattr("mitsuba_diffraction.recipe.precompute", lambda *_, **__: pytest.fail("it went to work"))
     code, _, err = command("precompute blaze.toml -o nowhere/out.exr")
     assert (code, err.count("cannot write 'nowhere/out.exr'")) == (2, 1)
+
+
+@pytest.mark.parametrize(
+    ("value", "is_file"), [("blazed", False), ("0.25", False), ("./blazed", True), ("a.exr", True)]
+)
+def test_a_value_of_a_parameter_is_a_file_only_if_it_looks_like_one(folder, value, is_file):
+    for name in ("blazed", "0.25", "a.exr"):
+        Path(name).touch()
+    wanted = str((folder / value).resolve()) if is_file else value
+    assert scene_parameters([f"p={value}"]) == {"p": wanted}
+
+
+def test_benchmark_refuses_a_tolerance_before_it_measures(command):
+    code, out, err = command("benchmark --tolerance -1")
+    assert (code, out) == (2, "")
+    assert "tolerance: got -1.0, wanted a share" in err

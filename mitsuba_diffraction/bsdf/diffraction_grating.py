@@ -65,10 +65,11 @@ def define() -> type:
         __doc__ = MANUAL
 
         def __init__(self, props: mi.Properties) -> None:
-            mi.BSDF.__init__(self, props)
+            # Mitsuba registers an object when its base class is initialised, and Dr.Jit then calls it in every scene as
+            # long as anything holds it, be it a traceback: all that may fail comes first.
             self.spectrum, self.recipe = surface_from(props)
             self.reflectance = reflectance_from(props)
-            self.orientation = props.get_texture("orientation", 0.0)
+            self.orientation = _orientation(props)
             self.height_scale = mi.Float(props.get("height_scale", 1.0))
             self.shadowing = props.get("shadowing", "v_cavity")
             if self.shadowing not in SHADOWING:
@@ -80,6 +81,7 @@ def define() -> type:
             if self.base is not None and not self.reflectance.transparent:
                 raise ValueError("base: got a BSDF below a conductor or a perfect mirror, which let no light through")
             self._update()
+            mi.BSDF.__init__(self, props)
             flags = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.Anisotropic | mi.BSDFFlags.FrontSide
             if self.orientation.is_spatially_varying():
                 flags = flags | mi.BSDFFlags.SpatiallyVarying
@@ -296,6 +298,13 @@ def define() -> type:
             return "DiffractionGrating[\n" + "".join(f"  {line},\n" for line in lines) + "]"
 
     return DiffractionGrating
+
+
+def _orientation(props: mi.Properties) -> mi.Texture:
+    angle = props.get("orientation", 0.0)
+    if isinstance(angle, float) and not np.isfinite(angle):
+        raise ValueError(f"orientation: got {angle}, wanted degrees or a texture")
+    return props.get_texture("orientation", 0.0)
 
 
 def _turned(omega: mi.Vector3f, sin: mi.Float, cos: mi.Float) -> mi.Vector3f:
