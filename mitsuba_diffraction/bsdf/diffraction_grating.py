@@ -33,7 +33,8 @@ Parameters (XML or dictionary):
     filename (string): a saved spectrum (.exr) or a recipe (.toml).
     spectrum (GratingSpectrum): the same from Python, in load_dict.
     profile (string): a grating by formula instead of a file, with the parameters of the function of that name in
-        `mitsuba_diffraction.gratings`, all lengths in µm, and coherence_length and tolerance as in `precompute`.
+        `mitsuba_diffraction.gratings`, all lengths in µm, and coherence_length, tolerance and largest_height_range as
+        in `precompute`.
     int_ior, ext_ior (float or string): a dielectric, as in Mitsuba's `dielectric` (1.5 against air).
     material (string): a conductor instead, as in Mitsuba's `conductor`; "none" is the perfect mirror, R = 1.
     fresnel (string): "exact" or "schlick".

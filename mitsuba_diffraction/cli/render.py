@@ -34,7 +34,7 @@ def render(
     dask: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="spread the passes over a Dask cluster (tcp://HOST:PORT)")
     ] = None,
-    frames: Annotated[int | None, typer.Option(min=2, metavar="N", help="pictures of an orbit")] = None,
+    frames: Annotated[int | None, typer.Option(min=2, max=3600, metavar="N", help="pictures of an orbit")] = None,
     orbit: Annotated[bool, typer.Option("--orbit", help="the camera goes round the scene once")] = False,
 ) -> None:
     """Path-trace a scene into a spectral picture (.exr) and a preview (.png) beside it."""
