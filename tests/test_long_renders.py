@@ -328,7 +328,7 @@ LINE = "render scene.xml -o out.exr --spp 6 --variant llvm_ad_spectral"
 def test_the_command_is_interrupted_and_goes_on(command, monkeypatch):
     press_ctrl_c(monkeypatch, 2)
     code, out, err = command(LINE)
-    assert (code, out) == (1, "")
+    assert (code, out) == (130, "")
     expected = (
         "mitsuba-diffraction: interrupted: out.exr holds 2 samples per pixel; the same command with --resume goes on"
     )
@@ -378,7 +378,7 @@ def test_an_interrupt_before_the_first_pass_writes_nothing(command, monkeypatch)
 
     monkeypatch.setattr(passes, "load_spectral_scene", interrupted)
     code, out, err = command(LINE)
-    assert (code, out) == (1, "")
+    assert (code, out) == (130, "")
     assert err.strip() == "mitsuba-diffraction: interrupted: nothing was written"
     assert files() == {"scene.xml"}
 
@@ -512,7 +512,7 @@ def test_a_turntable_writes_frames_and_an_animation_and_resumes(command, monkeyp
     line = f"{LINE} --frames 3 --orbit --spp 2"
     press_ctrl_c(monkeypatch, 3)
     code, _, err = command(line)
-    assert code == 1
+    assert code == 130
     assert "out_001.exr holds 1 samples per pixel; the same command with --resume goes on" in err
     assert "out_001.exr.checkpoint" in files()
     first = Path("out_000.exr").stat().st_mtime_ns
@@ -544,7 +544,7 @@ def test_a_second_ctrl_c_in_a_turntable_says_what_is_there(command, monkeypatch)
 
     monkeypatch.setattr(passes, "trace_pass", trace_pass)
     code, _, err = command(f"{LINE} --frames 3 --orbit --spp 2")
-    assert code == 1
+    assert code == 130
     assert "interrupted: 1 of 3 pictures are whole; the same command with --resume goes on from it" in err
     assert files() == {"scene.xml", "out_000.exr", "out_000.png"}
 

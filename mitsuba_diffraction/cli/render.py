@@ -12,7 +12,7 @@ from typing import Annotated
 import typer
 
 from .arguments import scene_parameters
-from .console import err, say, tell
+from .console import Stopped, err, tell
 
 
 def render(
@@ -111,8 +111,7 @@ def render(
                 kept = f"{number} of {frames} pictures are whole"
             else:
                 raise
-            say("interrupted", f"{kept}; the same command with --resume goes on from it")
-            raise typer.Exit(1) from None
+            raise Stopped(f"{kept}; the same command with --resume goes on from it") from None
         preview = path.with_suffix(".png")
         try:
             if image is not earlier:
@@ -123,8 +122,7 @@ def render(
             raise RuntimeError(f"{path} or its preview cannot be written ({error}){kept}") from error
         if interrupted:
             spp = image.attributes["spp"]
-            say("interrupted", f"{path} holds {spp} samples per pixel; the same command with --resume goes on")
-            raise typer.Exit(1)
+            raise Stopped(f"{path} holds {spp} samples per pixel; the same command with --resume goes on")
         waiting.unlink(missing_ok=True)
         rows, columns, bins = image.radiance.shape
         done = f"{image.attributes['spp']} samples per pixel"
