@@ -34,6 +34,7 @@ _SPLINE_SHARE = 0.4  # of a sample, what lies between the nodes in q
 _MARGIN = 0.7
 _PILOT = 8_000  # frequencies
 _LARGEST_TABLE = 4e9  # bytes
+_MOST_NEIGHBOURS = 1000  # orders in one evaluation of S
 
 Progress = Callable[[int, int], None]
 Powers = Callable[[float], NDArray[np.float64]]
@@ -49,6 +50,7 @@ def precompute(
     largest_angle: float = 90.0,
     representation: str = "auto",
     tolerance: float = 1e-3,
+    largest_height_range: float = 20.0,
     progress: Progress | None = None,
 ) -> GratingSpectrum:
     """The spectrum of the phase e^{iκh}, its error at most `tolerance`.
@@ -63,14 +65,17 @@ def precompute(
         representation: "taylor", "chebyshev", "svd" or "slices"; "auto" takes the one that reads the fewest
             packets of four numbers: slices.
         tolerance: bound of max over κ of ∫|S_approx(q; κ) − S_exact(q; κ)| dq, a share of the reflected power.
+        largest_height_range: in µm; a deeper surface is refused, as one whose heights are in nm. Time and memory grow
+            with the height range.
         progress: called with (steps done, steps in all).
 
     Returns:
         The spectrum; its `error` is what was measured, at values of κ that were not used to build it.
 
     Raises:
-        ValueError: if an argument is out of range, or the tolerance cannot be kept: in float32 by a Taylor series for
-            so deep a surface, or within a table of 4 GB.
+        ValueError: if an argument is out of range, the surface is deeper than `largest_height_range`, the lobes of a
+            thousand orders of a tile overlap, or the tolerance cannot be kept: in float32 by a Taylor series for so
+            deep a surface, or within a table of 4 GB.
 
     Warns:
         UserWarning: if the pixels are too coarse to hold all the frequencies that the shortest wavelength can reach, or
@@ -82,8 +87,14 @@ def precompute(
     lobe_width(coherence_length)
     if representation not in REPRESENTATIONS:
         raise ValueError(f"representation: got {representation!r}, wanted one of {', '.join(REPRESENTATIONS)}")
-    if not 1e-5 <= tolerance < 1:
-        raise ValueError(f"tolerance: got {tolerance!r}, wanted a share of the reflected power from 1e-5 to 1")
+    check_tolerance(tolerance)
+    if not largest_height_range > 0:
+        raise ValueError(f"largest_height_range: got {largest_height_range!r}, wanted a positive number of µm")
+    if height_field.height_range > largest_height_range:
+        raise ValueError(
+            f"heights: got a range of {height_field.height_range:.4g} µm, wanted at most {largest_height_range:g}: are "
+            "these nanometres? If the surface is so deep, raise largest_height_range"
+        )
     shortest = wavelengths[0] * 1e-3
     largest_kappa = 4 * np.pi / shortest
     reach = 2 * np.sin(np.deg2rad(largest_angle)) / shortest
@@ -93,6 +104,7 @@ def precompute(
         allowed = (1 - TAIL_SHARE) * tolerance
         radius = lobe_reach(TAIL_SHARE * tolerance) * lobe_width(coherence_length)
         powers = TilePowers(height_field, reach, radius)
+        _check_overlap(powers.grid.neighbours(1, radius), coherence_length)
     else:
         allowed = tolerance
         carried = carried_coherence_length(height_field, coherence_length)
@@ -123,6 +135,12 @@ def precompute(
     )
 
 
+def check_tolerance(tolerance: float) -> None:
+    """Raises ValueError unless `tolerance` is a share of the power that float32 can keep."""
+    if not 1e-5 <= tolerance < 1:
+        raise ValueError(f"tolerance: got {tolerance!r}, wanted a share of the reflected power from 1e-5 to 1")
+
+
 def _splines(
     height_field: HeightField, coherence_length: float, reach: float, largest_kappa: float, allowed: float
 ) -> SamplePowers:
@@ -131,12 +149,7 @@ def _splines(
     spacing = 0.74 * sigma
     while True:
         powers = SamplePowers(height_field, coherence_length, spacing, reach)
-        if 16.0 * np.prod(powers.grid.shape, dtype=float) > _LARGEST_TABLE:
-            raise ValueError(
-                f"tolerance: {allowed / _SPLINE_SHARE:.2g} needs {' × '.join(map(str, powers.grid.shape))} frequencies "
-                f"for a coherence length of {coherence_length:.4g} µm, more than a table of 4 GB; "
-                "take a larger tolerance or a shorter coherence length"
-            )
+        _check_size(powers.grid.shape, 4)
         error = max(
             powers.error(powers.grid, powers(kappa).astype(np.float32), kappa)
             for kappa in (0.0, 0.35 * largest_kappa, largest_kappa)
@@ -223,7 +236,9 @@ class _Build:
 
     def _build(self, representation: str, allowed: float) -> Table:
         if representation == SliceTable.representation:
-            return SliceTable.build(self._intervals(allowed), self._largest_kappa, self._powers, self._progress)
+            intervals = self._intervals(allowed)
+            _check_size(self.kept.shape, intervals * SliceTable.floats_per_node)
+            return SliceTable.build(intervals, self._largest_kappa, self._powers, self._progress)
         if representation == SvdSeries.name:
             modes = SvdSeries.fit(self._largest_kappa, self._pilot)
             series = modes.first(self._terms(modes, allowed))
@@ -234,6 +249,7 @@ class _Build:
             kind = TaylorSeries if representation == TaylorSeries.name else ChebyshevSeries
             whole = kind(self._largest_kappa, self._nodes)
             series = kind(self._largest_kappa, self._terms(whole, allowed))
+        _check_size(self.kept.shape, series.terms)
         return SeriesTable.build(series, self._nodes, self._powers, self._progress)
 
     def _refusal(self, representation: str, error: float | None) -> str:
@@ -273,11 +289,12 @@ class _Build:
         allowed *= self._pilot_share
         kappas, interpolate = self._between()
         exact = interpolate @ self._pilot
+        coefficients = chebyshev_transform(self._nodes) @ self._pilot
         intervals = 1
         while True:
             at = (np.arange(intervals)[:, None] + (1 + chebyshev_nodes(4)) / 2) / intervals * self._largest_kappa
-            vander = chebyshev_polynomials(position(at, self._largest_kappa), self._nodes)
-            values = vander @ chebyshev_transform(self._nodes) @ self._pilot
+            vander = chebyshev_polynomials(position(at.ravel(), self._largest_kappa), self._nodes)
+            values = (vander @ coefficients).reshape(*at.shape, -1)
             interval, weights = interpolation(kappas, self._largest_kappa, intervals)
             # One κ after the other: all at once would take more memory than the table.
             error = max(np.abs(w @ values[k] - e).sum() for k, w, e in zip(interval, weights, exact, strict=True))
@@ -299,6 +316,25 @@ def _rim(profile: NDArray[np.float64]) -> NDArray[np.float64]:
     folded = profile[half:] + profile[half::-1]
     folded[0] /= 2
     return np.concatenate([np.cumsum(folded[::-1])[::-1][1:], [0.0]])
+
+
+def _check_size(shape: tuple[int, int], floats: int) -> None:
+    """Refuses a table of so many floats a node before memory is asked for it."""
+    if 4.0 * np.prod(shape, dtype=float) * floats > _LARGEST_TABLE:
+        raise ValueError(
+            f"tolerance: needs {' × '.join(map(str, shape))} frequencies of {floats} numbers, more than a table of "
+            "4 GB; take a larger tolerance, a smaller patch or, of a sample, a shorter coherence length"
+        )
+
+
+def _check_overlap(neighbours: tuple[int, int], coherence_length: float) -> None:
+    """Refuses a tile of which one evaluation would sum thousands of orders."""
+    if neighbours[0] * neighbours[1] > _MOST_NEIGHBOURS:
+        raise ValueError(
+            f"coherence_length: at {coherence_length:.4g} µm the lobes of {neighbours[0]} × {neighbours[1]} orders of "
+            f"this tile overlap, wanted at most {_MOST_NEIGHBOURS}; take extent 'sample' or a longer "
+            "coherence length"
+        )
 
 
 def _check_resolution(height_field: HeightField, reach: float) -> None:

@@ -29,6 +29,7 @@ wavelengths = [360.0, 830.0]     # nm
 largest_angle = 90.0             # degrees from the normal
 representation = "auto"
 tolerance = 1e-3
+largest_height_range = 20.0      # µm; deeper surfaces are refused
 """
 
 from __future__ import annotations
@@ -65,7 +66,10 @@ else:
 
 _SCAN_KEYS = frozenset({"scan", "pixel_size", "height_range", "fill_missing", "channel", "unit", "prepare"})
 _SPECTRUM_KEYS = frozenset(
-    {"extent", "coherence_length", "wavelengths", "largest_angle", "representation", "tolerance"}
+    {
+        *("extent", "coherence_length", "wavelengths", "largest_angle", "representation", "tolerance"),
+        "largest_height_range",
+    }
 )
 # Raised when the same input gives other numbers than before, so that the cache is not read.
 _BUILD_VERSION = 3
@@ -112,7 +116,7 @@ class Recipe:
                 raise ValueError(f"{name}: got {value!r}, wanted a number or a text")
             if not (_is_plain(value) or (isinstance(value, list | tuple) and all(_is_plain(v) for v in value))):
                 raise ValueError(f"{name}: got {value!r}, wanted a number, a text, or a list of them")
-        for name in ("tolerance", "coherence_length", "largest_angle"):
+        for name in ("tolerance", "coherence_length", "largest_angle", "largest_height_range"):
             if name in self.spectrum and not _is_number(self.spectrum[name]):
                 raise ValueError(f"{name}: got {self.spectrum[name]!r}, wanted a number")
         if "wavelengths" in self.spectrum and not isinstance(self.spectrum["wavelengths"], list | tuple):
@@ -156,7 +160,10 @@ class Recipe:
         except TypeError as error:
             known = inspect.signature(PROFILES[name]).parameters
             unknown = sorted(set(parameters) - set(known))
-            wrong = f"got the unknown name {', '.join(unknown)}, wanted among {', '.join(known)}" if unknown else error
+            # The text alone: a local name of the exception would tie it and all its frames into a cycle.
+            wrong = (
+                f"got the unknown name {', '.join(unknown)}, wanted among {', '.join(known)}" if unknown else str(error)
+            )
             raise ValueError(f"profile {name!r}: {wrong}") from None
 
     def _prepared_scan(self, parameters: dict[str, Any]) -> HeightField:

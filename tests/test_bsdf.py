@@ -257,11 +257,46 @@ def test_variant_without_wavelengths_is_refused():
         ({"height_scale": -0.5}, "height_scale"),
         ({"material": "Al", "base": {"type": "diffuse"}}, "base"),
         ({"material": "none", "base": {"type": "diffuse"}}, "base"),
+        ({"int_ior": 0.0}, "int_ior: got 0"),
+        ({"int_ior": np.nan}, "int_ior: got nan"),
+        ({"ext_ior": np.inf}, "ext_ior: got inf"),
+        ({"orientation": np.nan}, "orientation: got nan"),
     ],
 )
 def test_mistakes_are_refused(llvm, parameters, text):
     with pytest.raises((RuntimeError, ValueError), match=text):
         mi.load_dict({"type": "diffraction_grating", "spectrum": spectrum("blazed"), **parameters})
+
+
+@pytest.mark.parametrize(
+    ("kind", "parameters"),
+    [
+        ("diffraction_grating", {"profile": "sinusoidal", "depth": 0.2}),
+        ("diffraction_grating", {"profile": "blazed", "period": 2.5, "depth": 0.25, "height_scale": -1.0}),
+        ("diffraction_grating", {"profile": "blazed", "period": 2.5, "depth": 0.25, "shadowing": "smith"}),
+        ("diffraction_shader", {"variant": "phong"}),
+    ],
+)
+def test_a_refused_plugin_disturbs_no_other(llvm, kind, parameters):
+    """Dr.Jit calls whatever is registered, also a half-built object that a traceback keeps alive."""
+    grating = {"type": "diffraction_grating", "profile": "blazed", "period": 2.5, "depth": 0.25}
+    film = {"type": "specfilm", "width": 8, "height": 8, "green": {"type": "regular", "wavelength_min": 500.0}}
+    film["green"].update(wavelength_max=600.0, values="1, 1")
+    view = mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0])
+    scene = {
+        "type": "scene",
+        "integrator": {"type": "path"},
+        "sensor": {"type": "perspective", "to_world": view, "film": film},
+        "light": {"type": "constant"},
+        "grating": {"type": "sphere", "bsdf": grating},
+        "other": {"type": "rectangle", "bsdf": {"type": "diffuse"}},
+    }
+    kept = []  # as a notebook does with the last error
+    for seed in range(2):
+        with pytest.raises((RuntimeError, ValueError)) as caught:
+            mi.load_dict({"type": kind, **parameters})
+        kept.append(caught)
+        mi.render(mi.load_dict(scene), spp=1, seed=seed).numpy()
 
 
 def test_unknown_profile_is_refused(llvm):

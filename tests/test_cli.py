@@ -1,16 +1,21 @@
 """The commands as a person meets them: one line for a mistake, a file for a success, nothing for an interrupt."""
 
 import importlib
+import os
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 import OpenEXR
 import pytest
 
 import mitsuba_diffraction as md
+from mitsuba_diffraction.cli.arguments import scene_parameters
 
 # The package gives the function of that name.
 PRECOMPUTE = importlib.import_module("mitsuba_diffraction.precompute")
@@ -258,7 +263,7 @@ def test_an_interrupt_leaves_no_file(command, monkeypatch, place):
         monkeypatch.setattr(OpenEXR.File, "write", interrupted, raising=True)
     before = files()
     code, out, err = command("precompute", "blaze.toml")
-    assert (code, out) == (1, "")
+    assert (code, out) == (130, "")
     assert err.strip() == "mitsuba-diffraction: interrupted: nothing was written"
     assert files() == before
 
@@ -313,3 +318,60 @@ def test_precompute_refuses_where_it_cannot_write_before_the_work(command, monke
     monkeypatch.setattr("mitsuba_diffraction.recipe.precompute", lambda *_, **__: pytest.fail("it went to work"))
     code, _, err = command("precompute blaze.toml -o nowhere/out.exr")
     assert (code, err.count("got nowhere/out.exr, but the folder nowhere is not there")) == (2, 1)
+
+
+@pytest.mark.parametrize(
+    ("value", "is_file"), [("blazed", False), ("0.25", False), ("./blazed", True), ("a.exr", True)]
+)
+def test_a_value_of_a_parameter_is_a_file_only_if_it_looks_like_one(folder, value, is_file):
+    for name in ("blazed", "0.25", "a.exr"):
+        Path(name).touch()
+    wanted = str((folder / value).resolve()) if is_file else value
+    assert scene_parameters([f"p={value}"]) == {"p": wanted}
+
+
+def test_benchmark_refuses_a_tolerance_before_it_measures(command):
+    code, out, err = command("benchmark --tolerance -1")
+    assert (code, out) == (2, "")
+    assert "tolerance: got -1.0, wanted a share" in err
+
+
+def test_an_interrupt_inside_a_plugin_is_no_error_of_the_scene(command):
+    """Mitsuba makes a RuntimeError of whatever a constructor raises."""
+
+    mi.set_variant("scalar_spectral")
+
+    class Pressing(mi.BSDF):
+        def __init__(self, props):
+            mi.BSDF.__init__(self, props)
+            try:
+                signal.raise_signal(signal.SIGINT)
+            except KeyboardInterrupt:
+                raise ValueError("no such grating") from None
+
+    mi.register_bsdf("pressing", Pressing)
+    Path("scene.xml").write_text(SCENE.replace("diffraction_grating", "pressing"))
+    before = signal.getsignal(signal.SIGINT)
+    code, out, err = command("render scene.xml --variant scalar_spectral --spp 1")
+    assert (code, out) == (130, "")
+    assert err.strip() == "mitsuba-diffraction: interrupted: nothing was written"
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seconds", [0.5, 1.0, 2.0, 3.0, 4.0, 6.0])
+def test_an_interrupt_at_any_time_is_one_line(seconds):
+    Path("scene.xml").write_text(SCENE)
+    start = "import signal as s; s.signal(s.SIGINT, s.default_int_handler)"
+    run = f"{start}; from mitsuba_diffraction_command import main; main()"
+    arguments = ["render", "scene.xml", "--spp", "100000000"]
+    environment = {**os.environ, "PYTHONPATH": str(Path(md.__file__).parents[1])}
+    running = subprocess.Popen(
+        [sys.executable, "-c", run, *arguments], stdout=-1, stderr=-1, text=True, env=environment
+    )
+    time.sleep(seconds)
+    running.send_signal(signal.SIGINT)
+    out, err = running.communicate()
+    assert (running.returncode, out) == (130, "")
+    assert len(err.splitlines()) == 1
+    assert err.startswith("mitsuba-diffraction: interrupted: ")

@@ -256,3 +256,8 @@ def test_a_flat_surface_takes_one_term(kind):
     spectrum = md.precompute(md.HeightField(np.zeros((4, 6)), 0.05), representation=kind, tolerance=1e-5)
     assert spectrum.table.series.terms == 1
     assert spectrum.powers(20.0).max() == pytest.approx(1, abs=2e-7)
+
+
+def test_the_nodes_of_very_deep_surfaces_are_finite():
+    # Beyond x = 1400 the bound exceeds every float before it falls.
+    assert 0.5 * 3000 < nodes_for(3000.0, 1e-5) < 1.5 * 3000

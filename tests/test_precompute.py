@@ -604,13 +604,42 @@ def test_a_flat_sample_shows_the_window_alone():
         np.testing.assert_allclose(spectrum.evaluate(q, kappa), wanted, atol=0.012 * wanted.max())
 
 
-def test_too_large_a_table_is_refused(monkeypatch):
-    monkeypatch.setattr(importlib.import_module("mitsuba_diffraction.precompute"), "_LARGEST_TABLE", 2e4)
+@pytest.mark.parametrize("extent", ["tile", "sample"])
+@pytest.mark.parametrize("representation", ["svd", "slices"])
+def test_too_large_a_table_is_refused(monkeypatch, extent, representation):
+    monkeypatch.setattr(importlib.import_module("mitsuba_diffraction.precompute"), "_LARGEST_TABLE", 2e3)
     field, coherence_length = SAMPLES["odd"]
     with pytest.raises(
-        ValueError, match=r"tolerance: 0.001 needs .*more than a table of .*larger tolerance or a short"
+        ValueError, match=r"tolerance: needs .*more than a table of .*larger tolerance, a smaller patch"
     ):
-        precompute(field, extent="sample", coherence_length=coherence_length)
+        precompute(field, extent=extent, coherence_length=coherence_length, representation=representation)
+
+
+@pytest.mark.parametrize("extent", ["tile", "sample"])
+def test_heights_in_nanometres_are_refused_before_any_work(extent):
+    field = HeightField(np.random.default_rng(0).random((64, 64)) * 300, 0.1)
+    with pytest.raises(ValueError, match=r"heights: got a range of 29\d.* µm, wanted at most 20: are these nanometres"):
+        precompute(field, extent=extent)
+
+
+def test_the_largest_height_range_can_be_raised():
+    field = HeightField([[0.0, 0.0, 21.0, 21.0]], 0.08)
+    with pytest.raises(ValueError, match="raise largest_height_range"):
+        precompute(field)
+    # Half of the light has the phase κ·90 µm.
+    spectrum = precompute(field, largest_height_range=22.0)
+    for kappa in (3.0, 21.0):
+        assert spectrum.powers(kappa)[0, 1] == pytest.approx(np.cos(10.5 * kappa) ** 2, abs=1e-3)
+    for limit in (0.0, np.nan):
+        with pytest.raises(ValueError, match="largest_height_range: got"):
+            precompute(field, largest_height_range=limit)
+
+
+def test_a_tile_of_which_thousands_of_orders_overlap_is_refused():
+    heights = np.random.default_rng(0).random((300, 156)) * 0.3
+    with pytest.raises(ValueError, match=r"1 µm the lobes of \d+ × \d+ orders of this tile overlap.* extent 'sample'"):
+        precompute(HeightField(heights, 0.09), coherence_length=1.0)
+    precompute(HeightField(heights[:20, :20], 0.09), coherence_length=1.0)
 
 
 # ---------------------------------------------------------------- memory

@@ -98,6 +98,12 @@ def test_float_tiff_is_in_micrometres(tmp_path):
     np.testing.assert_array_equal(field.heights, HEIGHTS.astype(np.float32))
 
 
+@pytest.mark.parametrize("dtype", [np.int32, np.uint32, np.int64, np.uint64])
+def test_counts_that_are_flat_beside_the_range_of_their_type_are_refused(tmp_path, refuse, dtype):
+    np.save(tmp_path / "scan.npy", GREY.astype(dtype))
+    refuse("scan.npy", f"got {np.dtype(dtype)} heights from 0 to 255, flat", height_range=0.5)
+
+
 @pytest.mark.parametrize("dtype", [np.uint8, np.int16, np.int32, np.uint64])
 def test_integers_run_over_the_range_of_their_type(tmp_path, dtype):
     scale = np.iinfo(dtype)

@@ -279,6 +279,9 @@ def test_wrong_requests(llvm, tmp_path):
     for request in ({"spp": 0}, {"spp": 1, "width": 0}, {"spp": 1, "height": -3}, {"spp": 1, "seed": -1}):
         with pytest.raises(ValueError, match="wanted"):
             render(path, **request)
+    for request in ({"spp": 10**12}, {"spp": 1, "width": 10**8}):
+        with pytest.raises(ValueError, match="wanted at most"):
+            render(path, **request)
     with pytest.raises(ValueError, match="no sensor"):
         render(write_scene(tmp_path, CONSTANT, sensor=""), spp=1)
     (tmp_path / "shape.xml").write_text('<shape version="3.0.0" type="sphere"/>')

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ..precompute import VISIBLE
+from ..precompute import VISIBLE, check_tolerance
 from ..spectrum import GratingSpectrum
 from ..spectrum.slice_table import SliceTable
 from .accuracy import Accuracy, Exact
@@ -79,7 +79,12 @@ def run(
 
     Returns:
         A result for every combination, in order; and the real-time shaders on the tiles.
+
+    Raises:
+        ValueError: if a tolerance is out of range.
     """
+    for tolerance in tolerances:
+        check_tolerance(tolerance)
     cases = list(cases)
     results, shaders, total = [], [], len(cases) * len(tolerances) * len(representations)
     rays = Rays(count)

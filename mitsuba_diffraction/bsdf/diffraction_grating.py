@@ -33,7 +33,8 @@ Parameters (XML or dictionary):
     filename (string): a saved spectrum (.exr) or a recipe (.toml).
     spectrum (GratingSpectrum): the same from Python, in load_dict.
     profile (string): a grating by formula instead of a file, with the parameters of the function of that name in
-        `mitsuba_diffraction.gratings`, all lengths in µm, and coherence_length and tolerance as in `precompute`.
+        `mitsuba_diffraction.gratings`, all lengths in µm, and coherence_length, tolerance and largest_height_range as
+        in `precompute`.
     int_ior, ext_ior (float or string): a dielectric, as in Mitsuba's `dielectric` (1.5 against air).
     material (string): a conductor instead, as in Mitsuba's `conductor`; "none" is the perfect mirror, R = 1.
     fresnel (string): "exact" or "schlick".
@@ -65,10 +66,11 @@ def define() -> type:
         __doc__ = MANUAL
 
         def __init__(self, props: mi.Properties) -> None:
-            mi.BSDF.__init__(self, props)
+            # Mitsuba registers an object when its base class is initialised, and Dr.Jit then calls it in every scene as
+            # long as anything holds it, be it a traceback: all that may fail comes first.
             self.spectrum, self.recipe = surface_from(props)
             self.reflectance = reflectance_from(props)
-            self.orientation = props.get_texture("orientation", 0.0)
+            self.orientation = _orientation(props)
             self.height_scale = mi.Float(props.get("height_scale", 1.0))
             self.shadowing = props.get("shadowing", "v_cavity")
             if self.shadowing not in SHADOWING:
@@ -80,6 +82,7 @@ def define() -> type:
             if self.base is not None and not self.reflectance.transparent:
                 raise ValueError("base: got a BSDF below a conductor or a perfect mirror, which let no light through")
             self._update()
+            mi.BSDF.__init__(self, props)
             flags = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.Anisotropic | mi.BSDFFlags.FrontSide
             if self.orientation.is_spatially_varying():
                 flags = flags | mi.BSDFFlags.SpatiallyVarying
@@ -296,6 +299,13 @@ def define() -> type:
             return "DiffractionGrating[\n" + "".join(f"  {line},\n" for line in lines) + "]"
 
     return DiffractionGrating
+
+
+def _orientation(props: mi.Properties) -> mi.Texture:
+    angle = props.get("orientation", 0.0)
+    if isinstance(angle, float) and not np.isfinite(angle):
+        raise ValueError(f"orientation: got {angle}, wanted degrees or a texture")
+    return props.get_texture("orientation", 0.0)
 
 
 def _turned(omega: mi.Vector3f, sin: mi.Float, cos: mi.Float) -> mi.Vector3f:

@@ -54,6 +54,9 @@ class Dielectric:
     transparent = True
 
     def __init__(self, int_ior: float | str, ext_ior: float | str, model: str) -> None:
+        for name, index in (("int_ior", int_ior), ("ext_ior", ext_ior)):
+            if isinstance(index, int | float) and not 0 < index < np.inf:
+                raise ValueError(f"{name}: got {index}, wanted a positive index of refraction, or a name such as 'bk7'")
         # Mitsuba's own plugin knows the presets' names.
         interface = mi.load_dict({"type": "dielectric", "int_ior": int_ior, "ext_ior": ext_ior})
         self.eta = mi.Float(mi.traverse(interface)["eta"])

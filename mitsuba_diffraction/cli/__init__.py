@@ -1,11 +1,12 @@
 """The commands, thin: they read arguments, call the package, and say what came of it. One file a command.
 
-Exit codes: 0 done; 1 the work failed or was interrupted; 2 the request was wrong.
+Exit codes: 0 done; 1 the work failed; 2 the request was wrong; 130 interrupted.
 """
 
 from __future__ import annotations
 
 import io
+import signal
 import sys
 import warnings
 
@@ -13,7 +14,7 @@ import typer
 
 from .benchmark import benchmark
 from .compare import compare
-from .console import NAME, say
+from .console import NAME, Stopped, say
 from .inspect import inspect
 from .precompute import precompute
 from .render import render
@@ -32,27 +33,51 @@ def _commands() -> None:
     """Diffraction gratings for Mitsuba 3."""
 
 
+class _CtrlC:
+    """Raises KeyboardInterrupt, and remembers it: Mitsuba turns what is raised in a plugin into errors of the scene."""
+
+    pressed = False
+
+    def __call__(self, number: int, frame: object) -> None:
+        self.pressed = True
+        raise KeyboardInterrupt
+
+
 def main() -> None:
-    """Entry point of the command `mitsuba-diffraction`."""
+    """What the command `mitsuba-diffraction` does."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # file names need not be UTF-8, nor every terminal
             stream.reconfigure(errors="backslashreplace")
     warnings.showwarning = lambda message, *args, **kwargs: say("warning", message)
+    ctrl_c, before = _CtrlC(), signal.getsignal(signal.SIGINT)
+    # Where Ctrl-C is ignored, as in what a script starts in the background, it stays ignored.
+    if before is not signal.SIG_IGN:
+        signal.signal(signal.SIGINT, ctrl_c)
     try:
         code = app(prog_name=NAME, standalone_mode=False) or 0
         if code == 130:  # newer versions of Typer turn Ctrl-C into this code
             raise KeyboardInterrupt
-    except _UsageError as error:
+    except (Exception, KeyboardInterrupt) as error:
+        lost = ctrl_c.pressed and not isinstance(error, Stopped)
+        code = _tell(KeyboardInterrupt() if lost else error)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    sys.exit(code)
+
+
+def _tell(error: BaseException) -> int:
+    """Says in one line what went wrong; the exit code."""
+    if isinstance(error, Stopped | KeyboardInterrupt | typer.Abort):
+        say("interrupted", error if isinstance(error, Stopped) else "nothing was written")
+        return 130
+    if isinstance(error, _UsageError):
         say("error", f"{error.format_message()} (try {NAME} --help)")
-        code = 2
-    except (ValueError, FileNotFoundError, IsADirectoryError, NotADirectoryError) as error:
+        return 2
+    if isinstance(error, ValueError | FileNotFoundError | IsADirectoryError | NotADirectoryError):
         named = isinstance(error, OSError) and error.filename and error.strerror
         say("error", f"{error.filename}: {error.strerror.lower()}" if named else error)
-        code = 2
-    except (KeyboardInterrupt, typer.Abort):
-        say("interrupted", "nothing was written")
-        code = 1
-    except (RuntimeError, OSError, MemoryError) as error:
+        return 2
+    if isinstance(error, RuntimeError | OSError | MemoryError):
         say("error", str(error) or type(error).__name__)
-        code = 1
-    sys.exit(code)
+        return 1
+    raise error

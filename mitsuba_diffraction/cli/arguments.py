@@ -24,8 +24,10 @@ def scene_parameters(define: Sequence[str] | None) -> dict[str, str]:
         if not (name and equals):
             raise ValueError(f"-D: got {item!r}, wanted NAME=VALUE")
         _refuse_other_than_utf8(item)
-        # A file named on the command line is relative to where the command is given.
-        parameters[name] = str(Path(value).resolve()) if os.path.isfile(value) else value
+        # A file named on the command line is relative to where the command is given. A bare word or number is no file,
+        # whatever lies there under that name.
+        named = os.path.isfile(value) and (os.path.dirname(value) or Path(value).suffix[1:2].isalpha())
+        parameters[name] = str(Path(value).resolve()) if named else value
     return parameters
 
 

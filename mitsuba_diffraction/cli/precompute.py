@@ -33,6 +33,7 @@ def precompute(
         str | None, typer.Option(help="tile (the patch repeats) or sample (a piece of an irregular surface)")
     ] = None,
     largest_angle: Annotated[float | None, typer.Option(help="that the scene has, degrees from the normal")] = None,
+    largest_height_range: Annotated[float | None, typer.Option(help="µm; a deeper surface is refused")] = None,
     coherence_length: Annotated[
         float | None, typer.Option(help=f"µm; {SUN_COHERENCE_LENGTH:g} is that of sunlight")
     ] = None,
@@ -45,6 +46,7 @@ def precompute(
         "extent": extent,
         "coherence_length": coherence_length,
         "largest_angle": largest_angle,
+        "largest_height_range": largest_height_range,
         "representation": representation,
         "tolerance": tolerance,
     }

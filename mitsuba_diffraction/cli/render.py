@@ -13,7 +13,7 @@ import typer
 
 from ..outputs import free_name
 from .arguments import Overwrite, claim, scene_parameters
-from .console import err, say, tell
+from .console import Stopped, err, tell
 from .inputs import files_read
 
 
@@ -37,7 +37,7 @@ def render(
     dask: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="spread the passes over a Dask cluster (tcp://HOST:PORT)")
     ] = None,
-    frames: Annotated[int | None, typer.Option(min=2, metavar="N", help="pictures of an orbit")] = None,
+    frames: Annotated[int | None, typer.Option(min=2, max=3600, metavar="N", help="pictures of an orbit")] = None,
     orbit: Annotated[bool, typer.Option("--orbit", help="the camera goes round the scene once")] = False,
     overwrite: Overwrite = False,
 ) -> None:
@@ -117,8 +117,7 @@ def render(
                 kept = f"{number} of {frames} pictures are whole"
             else:
                 raise
-            say("interrupted", f"{kept}; the same command with --resume goes on from it")
-            raise typer.Exit(1) from None
+            raise Stopped(f"{kept}; the same command with --resume goes on from it") from None
         preview = path.with_suffix(".png")
         try:
             if image is not earlier:
@@ -129,8 +128,7 @@ def render(
             raise RuntimeError(f"{path} or its preview cannot be written ({error}){kept}") from error
         if interrupted:
             spp = image.attributes["spp"]
-            say("interrupted", f"{path} holds {spp} samples per pixel; the same command with --resume goes on")
-            raise typer.Exit(1)
+            raise Stopped(f"{path} holds {spp} samples per pixel; the same command with --resume goes on")
         waiting.unlink(missing_ok=True)
         rows, columns, bins = image.radiance.shape
         done = f"{image.attributes['spp']} samples per pixel"

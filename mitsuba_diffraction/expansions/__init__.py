@@ -70,8 +70,11 @@ def nodes_for(x: float, tolerance: float) -> int:
 
     Jacobi–Anger: the coefficient of T_n is 2 iⁿ J_n(x), and |J_n(x)| ≤ (x/2)ⁿ/n!.
     """
-    count, bound = 1, 4.0
-    while bound > tolerance or count < x / 2:
-        bound *= x / (2 * count)
+    if x == 0:
+        return 1
+    # In logarithms: the bound itself grows to e^{x/2} before it falls, which no float holds beyond x = 1400.
+    count, bound = 1, np.log(4 / tolerance)
+    while bound > 0 or count < x / 2:
+        bound += np.log(x / (2 * count))
         count += 1
     return count

@@ -145,4 +145,10 @@ def _as_micrometres(numbers: NDArray, height_range: object) -> NDArray[np.float6
     if not (np.isfinite(height_range) and height_range > 0):
         raise ValueError(f"height_range: got {height_range!r}, wanted a positive number in µm")
     scale = np.iinfo(numbers.dtype)
+    least, greatest = int(numbers.min()), int(numbers.max())
+    if numbers.dtype.itemsize > 2 and 0 < (greatest - least) * 2**16 < scale.max - scale.min:
+        raise ValueError(
+            f"height_range: got {numbers.dtype} heights from {least} to {greatest}, flat beside the range of their "
+            "type; wanted floats in µm, or a type that they fill, such as uint16"
+        )
     return (numbers.astype(np.float64) - scale.min) / (float(scale.max) - scale.min) * float(height_range)

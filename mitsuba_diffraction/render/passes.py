@@ -33,6 +33,8 @@ _LEAST_SAMPLES_PER_PIXEL = 8
 # Where the noise decides when to stop, it is estimated from the passes: from four on, and of sixteen at least.
 _PASSES_TO_JUDGE = 4
 _LEAST_PASSES_TO_CONVERGE = 16
+# Of seconds each: weeks.
+_MOST_PASSES = 10**6
 # Of the time at most a twentieth goes into checkpoints, however large they are.
 _CHECKPOINT_SHARE = 20
 
@@ -214,6 +216,8 @@ def split(scene: mi.Scene, spp: int, least: int = 1) -> tuple[int, ...]:
     """
     pixels = math.prod(scene.sensors()[0].film().crop_size())
     passes = -(-spp * pixels // max(_SAMPLES_PER_PASS, _LEAST_SAMPLES_PER_PIXEL * pixels))
+    if passes > _MOST_PASSES:
+        raise ValueError(f"spp: got {spp}, wanted at most {_MOST_PASSES * spp // passes:.2g} for so large a picture")
     passes = min(max(passes, least), spp)
     ends = [spp * index // passes for index in range(passes + 1)]
     return tuple(samples_drawn(scene, end - start) for start, end in pairwise(ends))

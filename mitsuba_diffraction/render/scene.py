@@ -25,6 +25,7 @@ from ..recipe import Recipe
 _RANGE = (360.0, 830.0)
 _STEP = 5.0
 
+_MOST_PIXELS = 2**25  # above 7680 × 4320; the sums of one have 750 bytes
 _DEFAULT_SIZE = (768, 576)  # that of Mitsuba's films
 
 
@@ -209,6 +210,10 @@ def _spectral_film(
         start = min(round(offset * new / was), new - 1)
         end = min(max(round((offset + size) * new / was), start + 1), new)
         film[f"crop_offset_{axis}"], film[f"crop_{extent}"] = start, end - start
+    if film["crop_width"] * film["crop_height"] > _MOST_PIXELS:
+        raise ValueError(
+            f"film: got {film['crop_width']} × {film['crop_height']} pixels, wanted at most {_MOST_PIXELS} in all"
+        )
     if "sample_border" in old:
         film["sample_border"] = old["sample_border"]
     for name, index in _children(old).items():

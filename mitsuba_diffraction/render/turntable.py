@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
@@ -18,6 +16,7 @@ from ..outputs import made_for
 from .scene import load_spectral_scene
 
 _FRAMES_PER_SECOND = 12
+MOST_FRAMES = 3600  # a tenth of a degree apart, five minutes
 
 
 def orbit(
@@ -25,9 +24,8 @@ def orbit(
 ) -> list[tuple[float, ...]]:
     """The motions that take the first camera once round the scene, anticlockwise seen from above.
 
-    Frame k turns it by 360° k/`frames` about the axis through the target of its `lookat` along that one's `up`. A
-    camera without a `lookat` turns about the middle of the scene's bounding box, along the coordinate axis that is
-    nearest to the camera's own up.
+    Frame k turns it by 360° k/`frames` about the coordinate axis nearest to the camera's up, through the point on its
+    line of sight that is nearest to the middle of the scene's bounding box.
 
     Args:
         scene_path: the scene.
@@ -38,47 +36,31 @@ def orbit(
         One affine map of the world for each frame, as `load_spectral_scene` takes it; the first is the identity.
 
     Raises:
-        ValueError: if there are fewer than two frames, or as for `load_spectral_scene`.
+        ValueError: if there are fewer than two frames or more than 3600, or as for `load_spectral_scene`.
         FileNotFoundError: if there is no such scene.
     """
-    if frames < 2:
-        raise ValueError(f"frames: got {frames}, wanted two or more")
+    if not 2 <= frames <= MOST_FRAMES:
+        raise ValueError(f"frames: got {frames}, wanted 2 to {MOST_FRAMES}")
     scene = load_spectral_scene(scene_path, width=1, height=1, parameters=parameters)
-    centre, up = _look_at(scene_path, parameters or {}) or _middle(scene)
+    centre, up = _view(scene)
     motions = []
     for k in range(frames):
         motion = np.eye(4)
-        motion[:3, :3] = Rotation.from_rotvec(2 * np.pi * k / frames * up / np.linalg.norm(up)).as_matrix()
+        motion[:3, :3] = Rotation.from_rotvec(2 * np.pi * k / frames * up).as_matrix()
         motion[:3, 3] = centre - motion[:3, :3] @ centre
         motions.append(tuple(motion.ravel().tolist()))
     return motions
 
 
-def _look_at(
-    scene_path: str | os.PathLike[str], parameters: Mapping[str, str]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-    """Target and up of the first sensor's `lookat` if the XML has one: Mitsuba keeps its matrix alone."""
-    root = ElementTree.parse(scene_path).getroot()
-    known = {element.get("name"): element.get("value") for element in root.iter("default")} | dict(parameters)
-
-    def vector(text: str) -> NDArray[np.float64]:
-        for name in sorted(known, key=len, reverse=True):
-            text = text.replace(f"${name}", known[name])
-        return np.array([float(number) for number in re.split(r"[\s,]+", text.strip())])
-
-    sensor = root.find("sensor")
-    found = None if sensor is None else sensor.find("transform[@name='to_world']/lookat")
-    if found is None or len(sensor.find("transform[@name='to_world']")) > 1:
-        return None
-    return vector(found.get("target")), vector(found.get("up", "0, 1, 0"))
-
-
-def _middle(scene: mi.Scene) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    own_up = np.ravel(np.array(scene.sensors()[0].world_transform().matrix)).reshape(4, 4)[:3, 1]
+def _view(scene: mi.Scene) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """What the first camera looks at, and the coordinate axis nearest to its up."""
+    to_world = np.array(scene.sensors()[0].world_transform().matrix, np.float64).reshape(4, 4)
+    origin, forward, own_up = to_world[:3, 3], to_world[:3, 2] / np.linalg.norm(to_world[:3, 2]), to_world[:3, 1]
+    middle = np.ravel(np.array(scene.bbox().center(), np.float64))
     axis = int(np.argmax(np.abs(own_up)))
     up = np.zeros(3)
     up[axis] = np.sign(own_up[axis])
-    return np.ravel(np.array(scene.bbox().center())).astype(np.float64), up
+    return origin + forward * (forward @ (middle - origin)), up
 
 
 def frame_path(picture: Path, frame: int, frames: int) -> Path:

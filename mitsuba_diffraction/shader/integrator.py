@@ -55,7 +55,7 @@ def define() -> type:
         __doc__ = MANUAL
 
         def __init__(self, props: mi.Properties) -> None:
-            mi.SamplingIntegrator.__init__(self, props)
+            # As in `DiffractionGrating`: what may fail comes before Mitsuba registers the object.
             self.variant = props.get("variant", "flss")
             if self.variant not in VARIANTS:
                 raise ValueError(f"variant: got {self.variant!r}, wanted one of {', '.join(VARIANTS)}")
@@ -67,6 +67,7 @@ def define() -> type:
             if not 0 <= self.diffuse_weight <= 1:
                 raise ValueError(f"diffuse_weight: got {self.diffuse_weight}, wanted 0 to 1")
             self.emission = Emission()
+            mi.SamplingIntegrator.__init__(self, props)
             self._shaders: list[tuple[mi.BSDF, Shader]] = []
             self.prepared: Prepared | None = None
 
