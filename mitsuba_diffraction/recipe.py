@@ -39,6 +39,7 @@ import json
 import os
 import sys
 import threading
+import weakref
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -64,9 +65,11 @@ _SPECTRUM_KEYS = frozenset(
     {"extent", "coherence_length", "wavelengths", "largest_angle", "representation", "tolerance"}
 )
 # Raised when the same input gives other numbers than before, so that the cache is not read.
-_BUILD_VERSION = 3
+_BUILD_VERSION = 4
 # Mitsuba constructs plugins on several threads; two that name one recipe must not build it twice.
 _building = threading.Lock()
+# Spectra in use, by the digest of their recipe: a scene with many instances reads the file once.
+_in_use: weakref.WeakValueDictionary[str, GratingSpectrum] = weakref.WeakValueDictionary()
 
 
 @dataclass(frozen=True)
@@ -192,16 +195,22 @@ class Recipe:
         The cache is a folder of spectra named by `digest`: $MITSUBA_DIFFRACTION_CACHE, or the user's cache folder.
         """
         with _building:
-            path = cache_folder() / f"{self.digest()}.exr"
-            if path.is_file():
-                try:
-                    return GratingSpectrum.load(path)
-                except ValueError:
-                    path.unlink()  # damaged from outside; built anew below
-            spectrum = self.build(progress)
-            path.parent.mkdir(parents=True, exist_ok=True)
-            spectrum.save(path)
+            digest = self.digest()
+            spectrum = _in_use.get(digest)
+            if spectrum is None:
+                spectrum = _in_use[digest] = self._from_cache(cache_folder() / f"{digest}.exr", progress)
             return spectrum
+
+    def _from_cache(self, path: Path, progress: Callable[[int, int], None] | None) -> GratingSpectrum:
+        if path.is_file():
+            try:
+                return GratingSpectrum.load(path)
+            except ValueError:
+                path.unlink()  # damaged from outside; built anew below
+        spectrum = self.build(progress)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        spectrum.save(path)
+        return spectrum
 
 
 def cache_folder() -> Path:

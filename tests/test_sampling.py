@@ -198,8 +198,8 @@ def shifted(u):
 def effective_fraction(bsdf, theta, phi, draws, count):
     """E[w]²/E[w²] of the weight w averaged over the wavelengths, averaged over draws of them; and max w / E[w]."""
     fractions, largest = [], 0.0
-    for draw in range(draws):
-        _, weight = sampled(bsdf, direction(theta, phi), shifted((draw + 0.5) / draws / 4), count, seed=draw)
+    for seed in range(draws):
+        _, weight = sampled(bsdf, direction(theta, phi), shifted((seed + 0.5) / draws / 4), count, seed=seed)
         assert np.isfinite(weight).all()
         assert (weight >= 0).all()
         w = weight.mean(axis=0)

@@ -9,19 +9,15 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..spectrum.energy_table import SHADOWING
 from .base import base_from
-from .energy import energy_from
 from .geometry import Geometry
 from .incidence import Incidence
-from .line_spectrum import LineSpectrum
 from .polarisation import reflected
 from .reflectance import reflectance_from
-from .smooth_spectrum import SmoothSpectrum
+from .shared import SharedTables
 from .surface import surface_from
 from .tables import BELOW_ONE, opaque
-
-SHADOWING = ("v_cavity", "none")
-
 
 VISIBLE_FROM = 360.0  # nm, the shortest wavelength that Mitsuba samples
 DEFENSIVE = 0.02  # the share of samples that follow the cosine, for lobes that the sampler's averages miss
@@ -73,7 +69,8 @@ def define() -> type:
             self.shadowing = props.get("shadowing", "v_cavity")
             if self.shadowing not in SHADOWING:
                 raise ValueError(f"shadowing: got {self.shadowing!r}, wanted one of {', '.join(SHADOWING)}")
-            self.scattering = (LineSpectrum if self.spectrum.extent == "tile" else SmoothSpectrum)(self.spectrum)
+            self._tables = SharedTables.of(self.spectrum)
+            self.scattering = self._tables.scattering
             # The spectrum says nothing beyond its largest angle: there the grating is black.
             self.least_cosine = opaque(np.cos(np.deg2rad(self.spectrum.largest_angle)) * (1 - 1e-6))
             self.base = base_from(props)
@@ -98,7 +95,7 @@ def define() -> type:
                     f"{VISIBLE_FROM:g} nm divided by the scale"
                 )
             dr.make_opaque(self.height_scale)
-            self.energy = energy_from(self.spectrum, self.shadowing == "v_cavity", self.height_scale)
+            self.energy = self._tables.energy(self.shadowing, self.height_scale)
 
         def traverse(self, callback: mi.TraversalCallback) -> None:
             callback.put("orientation", self.orientation, mi.ParamFlags.Differentiable)

@@ -2,7 +2,8 @@
 
 Channels are named after what they hold. Series: `B{t^003}` (taylor), `B{T_003}` (chebyshev), `B{mode 003}` (svd), the
 terms B_n of S = Σ g_n(κ) B_n; "slices": `S(012.2)`, the powers at the third Chebyshev point of interval 12 of κ. Rows
-are orders m_y, columns m_x, from −M to M. Numbers in the header are double precision.
+are orders m_y, columns m_x, from −M to M. Numbers in the header are double precision. `energy` is JSON: the tables of
+`energy_table.py`, by the kind of shadowing.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from ..expansions.chebyshev import ChebyshevSeries
 from ..expansions.svd import SvdSeries
 from ..expansions.taylor import TaylorSeries
 from ..files import whole_file
+from .energy_table import SHADOWING, EnergyTable
 from .grating_spectrum import GratingSpectrum
 from .orders import OrderGrid
 from .series_table import SeriesTable
@@ -29,7 +31,7 @@ from .slice_table import SliceTable
 from .spline_grid import SplineGrid
 
 FORMAT = "mitsuba_diffraction grating spectrum"
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 
 
 @contextlib.contextmanager
@@ -82,6 +84,7 @@ def save(spectrum: GratingSpectrum, path: str | os.PathLike[str]) -> None:
     if isinstance(spectrum.table, SeriesTable) and isinstance(spectrum.table.series, SvdSeries):
         # repr of a float is exact.
         header["modes"] = json.dumps(spectrum.table.series.modes.tolist())
+    header["energy"] = json.dumps({kind: spectrum.energy_table(kind).as_plain() for kind in SHADOWING})
     channels = _channels(spectrum.table)
     header["channelCount"] = len(channels)
     with whole_file(path) as temporary:
@@ -141,10 +144,11 @@ def load(path: str | os.PathLike[str]) -> GratingSpectrum:
             largest_angle=_single(header["largestAngle"]),
             dropped=_single(header["dropped"]),
             beyond=_single(header["beyond"]),
+            energy={kind: EnergyTable.from_plain(t) for kind, t in json.loads(header["energy"]).items()},
         )
     except KeyError as error:
         raise ValueError(f"{path}: a damaged spectrum, {error} is missing") from None
-    except (TypeError, ValueError, IndexError) as error:
+    except (TypeError, ValueError, IndexError, AttributeError, OverflowError, MemoryError) as error:
         raise ValueError(f"{path}: a damaged spectrum ({_one_line(error)})") from None
 
 
