@@ -41,6 +41,7 @@ import os
 import sys
 import threading
 import warnings
+import weakref
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -72,9 +73,11 @@ _SPECTRUM_KEYS = frozenset(
     }
 )
 # Raised when the same input gives other numbers than before, so that the cache is not read.
-_BUILD_VERSION = 3
+_BUILD_VERSION = 4
 # Mitsuba constructs plugins on several threads; two that name one recipe must not build it twice.
 _building = threading.Lock()
+# Spectra in use, by the digest of their recipe: a scene with many instances reads the file once.
+_in_use: weakref.WeakValueDictionary[str, GratingSpectrum] = weakref.WeakValueDictionary()
 
 
 class CacheWarning(UserWarning):
@@ -214,21 +217,27 @@ class Recipe:
         """
         with _building:
             digest = self.digest()
-            path = cache_folder() / f"{digest}.exr"
-            with suppress(ValueError, OSError):
-                return spectrum_file.load(path, recipe=digest)
-            spectrum = self.build(progress)
-            try:
-                path.parent.mkdir(parents=True, exist_ok=True)
-                spectrum_file.save(spectrum, path, recipe=digest)
-            except (ValueError, OSError, RuntimeError) as error:  # RuntimeError is what OpenEXR raises on a full disk
-                reason = getattr(error, "strerror", None) or error
-                warnings.warn(
-                    f"the cache {path.parent} cannot be written to ({reason}); spectra are built anew each time",
-                    CacheWarning,
-                    stacklevel=1,
-                )
+            spectrum = _in_use.get(digest)
+            if spectrum is None:
+                spectrum = _in_use[digest] = self._from_cache(digest, progress)
             return spectrum
+
+    def _from_cache(self, digest: str, progress: Callable[[int, int], None] | None) -> GratingSpectrum:
+        path = cache_folder() / f"{digest}.exr"
+        with suppress(ValueError, OSError):
+            return spectrum_file.load(path, recipe=digest)
+        spectrum = self.build(progress)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            spectrum_file.save(spectrum, path, recipe=digest)
+        except (ValueError, OSError, RuntimeError) as error:  # RuntimeError is what OpenEXR raises on a full disk
+            reason = getattr(error, "strerror", None) or error
+            warnings.warn(
+                f"the cache {path.parent} cannot be written to ({reason}); spectra are built anew each time",
+                CacheWarning,
+                stacklevel=1,
+            )
+        return spectrum
 
 
 def cache_folder() -> Path:

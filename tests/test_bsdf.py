@@ -235,7 +235,7 @@ def test_samples_pass_the_chi_square_test(llvm, name, theta):
         return bsdf.pdf(mi.BSDFContext(), interaction(np.broadcast_to(wi, (count, 3)), count=count), wo)
 
     test = mi.chi2.ChiSquareTest(
-        mi.chi2.SphericalDomain(), sample, density, sample_dim=3, sample_count=400_000, res=41, ires=16
+        mi.chi2.SphericalDomain(), sample, density, sample_dim=3, sample_count=400_000, res=41, ires=64
     )
     assert test.run(), test.messages
 

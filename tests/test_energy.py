@@ -1,6 +1,9 @@
 """No surface reflects more than it receives, and none is darkened that does not."""
 
 import functools
+import gc
+import json
+import weakref
 
 import drjit as dr
 import mitsuba as mi
@@ -10,7 +13,8 @@ from bsdf_support import plugin as conserving_plugin
 from bsdf_support import use
 
 import mitsuba_diffraction as md
-from mitsuba_diffraction.spectrum.albedo import SLACK, GatheredSpectrum, directions_at, energy_table
+from mitsuba_diffraction.spectrum.albedo import SLACK, GatheredSpectrum
+from mitsuba_diffraction.spectrum.energy_table import EnergyTable, directions_at
 
 MAKE = {
     "flat": lambda: md.HeightField(np.zeros((1, 4)), 0.05),
@@ -331,7 +335,7 @@ def test_table_is_a_tight_bound(name):
 
 
 def test_what_the_table_misses_is_measured_and_shown():
-    table = energy_table(GatheredSpectrum.of(spectrum("crossed")))
+    table = spectrum("crossed").energy_table()
     assert -1e-3 < table.excess < 0.02
     mean, largest = table.loss
     assert 0 < mean < MEAN_LOSS["crossed"]
@@ -340,7 +344,7 @@ def test_what_the_table_misses_is_measured_and_shown():
 
 
 def test_rounding_for_the_renderer_leaves_a_lower_bound():
-    table = energy_table(GatheredSpectrum.of(spectrum("deep blazed")))
+    table = spectrum("deep blazed").energy_table()
     steps, least, step = table.packed()
     rounded = least + step * steps
     assert (rounded <= table.values + 1e-5).all()
@@ -384,8 +388,60 @@ def test_albedo_of_a_sample():
 
 @pytest.mark.parametrize("name", ["blazed", "elaphe"])
 def test_table_is_small(name):
-    table = energy_table(GatheredSpectrum.of(spectrum(name)))
+    table = spectrum(name).energy_table()
     assert table.values.nbytes < 1e6
     assert 0 < table.values.min() < 1
     assert table.values.max() == 1
     assert SLACK < 1e-3
+
+
+@pytest.mark.parametrize("shadowing", ["v_cavity", "none"])
+def test_numpy_and_the_renderer_read_one_table(shadowing):
+    of, rng = spectrum("deep blazed"), np.random.default_rng(11)
+    omega, table = random_directions(rng, 500), of.energy_table(shadowing)
+    for wavelength in (380, 500, 800):
+        found = energies(plugin(of, shadowing=shadowing), omega, wavelength)
+        np.testing.assert_allclose(found, table.at(omega, wavelength * 1e-3), atol=1e-4)
+
+
+def test_the_table_is_stored_with_the_spectrum(tmp_path, monkeypatch):
+    of = spectrum("deep blazed")
+    of.save(tmp_path / "s.exr")
+    monkeypatch.setattr(GatheredSpectrum, "of", lambda _: pytest.fail("gathered"))
+    loaded = md.GratingSpectrum.load(tmp_path / "s.exr")
+    assert loaded.digest == of.digest
+    for shadowing in ("v_cavity", "none"):
+        there, here = loaded.energy_table(shadowing), of.energy_table(shadowing)
+        np.testing.assert_array_equal(there.values, here.values)
+        assert (there.excess, there.loss, there.frequencies) == (here.excess, here.loss, here.frequencies)
+    bsdf = mi.load_dict({"type": "diffraction_grating", "filename": str(tmp_path / "s.exr")})
+    assert str(bsdf.energy) == str(plugin(of).energy)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"values": "AAAA"}, {"shape": [1, 1 << 20, 1 << 20]}, {"shape": [2, 2]}, {"frequencies": [1, 0]}, {"loss": 3}],
+)
+def test_a_damaged_table_is_refused(wrong):
+    plain = json.loads(json.dumps(spectrum("blazed").energy_table().as_plain()))
+    EnergyTable.from_plain(plain)
+    with pytest.raises((ValueError, TypeError)):
+        EnergyTable.from_plain({**plain, **wrong})
+
+
+def test_instances_of_one_surface_share_their_tables(tmp_path):
+    of = spectrum("blazed")
+    of.save(tmp_path / "s.exr")
+    one, other = (mi.load_dict({"type": "diffraction_grating", "filename": str(tmp_path / "s.exr")}) for _ in range(2))
+    assert one.scattering is other.scattering is plugin(of).scattering
+    assert one.energy is other.energy
+    profile = {"type": "diffraction_grating", "profile": "blazed", "period": 2.5, "depth": 0.123}
+    many = mi.load_dict({"type": "scene", **{f"s{i}": {"type": "sphere", "bsdf": {**profile}} for i in range(20)}})
+    bsdfs = [shape.bsdf() for shape in many.shapes()]
+    assert len({id(bsdf.scattering) for bsdf in bsdfs}) == 1
+    # Nothing is kept once no BSDF uses it.
+    last = weakref.ref(bsdfs[0].scattering)
+    del many, bsdfs
+    gc.collect()
+    gc.collect()
+    assert last() is None

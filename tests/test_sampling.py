@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from bsdf_support import WAVELENGTHS, direction, plugin, use
+from bsdf_support import WAVELENGTHS, albedo, direction, draw, hemisphere, plugin, use
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction.bsdf.cell_sampler import CellSampler, alias_table
@@ -159,6 +159,34 @@ def test_mean_weight_is_the_albedo(llvm, name, theta):
     np.testing.assert_array_less(np.abs(weight.mean(axis=1) - albedo), 4 * error + 2e-3 * albedo)
 
 
+@pytest.mark.parametrize("longest", [700.0, 600.0, 390.0])
+def test_wavelengths_that_are_not_covered_take_no_part_in_the_sampling(llvm, longest):
+    heights = md.gratings.sinusoidal(2.5, 0.25)
+    bsdf = plugin(md.precompute(heights, wavelengths=(360.0, longest), coherence_length=3.0))
+    wi, wavelengths = direction(20, 40), (450.0, 550.0, 650.0, 750.0)
+    bs, weight = draw(bsdf, wi, 1 << 18, wavelengths=wavelengths)
+    wanted = albedo(bsdf, wi, wavelengths=wavelengths)
+    assert (wanted[np.array(wavelengths) > longest] == 0).all()
+    error = weight.std(1) / np.sqrt(weight.shape[1])
+    np.testing.assert_array_less(np.abs(weight.mean(1) - wanted), 4 * error + 2e-3 * wanted + 1e-9)
+    # The density is that of the samples.
+    wo, area = hemisphere()
+    si = interaction(wi, wavelengths, len(wo))
+    pdf = np.array(bsdf.pdf(mi.BSDFContext(), si, mi.Vector3f(*wo.T.astype(np.float32))), np.float64)
+    drawn = (np.array(bs.pdf) > 0).mean()
+    assert abs((pdf / wo[:, 2]).sum() * area - drawn) < 5e-3
+
+
+def test_beyond_the_largest_angle_only_the_base_reflects(llvm):
+    of = md.precompute(md.gratings.sinusoidal(2.5, 0.25), largest_angle=60.0, coherence_length=3.0)
+    bsdf = plugin(of, int_ior=1.5, base={"type": "diffuse"})
+    for theta in (40, 70):
+        _, weight = draw(bsdf, direction(theta, 20), 1 << 18)
+        wanted = albedo(bsdf, direction(theta, 20))
+        error = weight.std(1) / np.sqrt(weight.shape[1])
+        np.testing.assert_array_less(np.abs(weight.mean(1) - wanted), 4 * error + 2e-3 * wanted)
+
+
 # ---------------------------------------------------------------- the work that a sample does
 
 
@@ -170,8 +198,8 @@ def shifted(u):
 def effective_fraction(bsdf, theta, phi, draws, count):
     """E[w]²/E[w²] of the weight w averaged over the wavelengths, averaged over draws of them; and max w / E[w]."""
     fractions, largest = [], 0.0
-    for draw in range(draws):
-        _, weight = sampled(bsdf, direction(theta, phi), shifted((draw + 0.5) / draws / 4), count, seed=draw)
+    for seed in range(draws):
+        _, weight = sampled(bsdf, direction(theta, phi), shifted((seed + 0.5) / draws / 4), count, seed=seed)
         assert np.isfinite(weight).all()
         assert (weight >= 0).all()
         w = weight.mean(axis=0)

@@ -9,19 +9,15 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..spectrum.energy_table import SHADOWING
 from .base import base_from
-from .energy import energy_from
 from .geometry import Geometry
 from .incidence import Incidence
-from .line_spectrum import LineSpectrum
 from .polarisation import reflected
 from .reflectance import reflectance_from
-from .smooth_spectrum import SmoothSpectrum
+from .shared import SharedTables
 from .surface import surface_from
 from .tables import BELOW_ONE, opaque
-
-SHADOWING = ("v_cavity", "none")
-
 
 VISIBLE_FROM = 360.0  # nm, the shortest wavelength that Mitsuba samples
 DEFENSIVE = 0.02  # the share of samples that follow the cosine, for lobes that the sampler's averages miss
@@ -75,7 +71,8 @@ def define() -> type:
             self.shadowing = props.get("shadowing", "v_cavity")
             if self.shadowing not in SHADOWING:
                 raise ValueError(f"shadowing: got {self.shadowing!r}, wanted one of {', '.join(SHADOWING)}")
-            self.scattering = (LineSpectrum if self.spectrum.extent == "tile" else SmoothSpectrum)(self.spectrum)
+            self._tables = SharedTables.of(self.spectrum)
+            self.scattering = self._tables.scattering
             # The spectrum says nothing beyond its largest angle: there the grating is black.
             self.least_cosine = opaque(np.cos(np.deg2rad(self.spectrum.largest_angle)) * (1 - 1e-6))
             self.base = base_from(props)
@@ -101,7 +98,7 @@ def define() -> type:
                     f"{VISIBLE_FROM:g} nm divided by the scale"
                 )
             dr.make_opaque(self.height_scale)
-            self.energy = energy_from(self.spectrum, self.shadowing == "v_cavity", self.height_scale)
+            self.energy = self._tables.energy(self.shadowing, self.height_scale)
 
         def traverse(self, callback: mi.TraversalCallback) -> None:
             callback.put("orientation", self.orientation, mi.ParamFlags.Differentiable)
@@ -132,10 +129,11 @@ def define() -> type:
             # From here on along the pattern's axes.
             wi, wo = _turned(si.wi, sin, cos), _turned(wo, sin, cos)
             u, v = -wi.x - wo.x, -wi.y - wo.y
-            active = active & (dr.minimum(geometry.cos_i, geometry.cos_o) >= self.least_cosine)
+            # Directions beyond the largest angle are black, but they are drawn: they have a density.
+            within = dr.minimum(geometry.cos_i, geometry.cos_o) >= self.least_cosine
             value, density = mi.UnpolarizedSpectrum(0.0), mi.Float(0.0)
-            channels = len(value)
-            for channel in range(channels):
+            covered, count = self._covered(si)
+            for channel in range(len(value)):
                 wavelength = si.wavelengths[channel] * 1e-3  # µm
                 frequency = dr.rcp(wavelength)
                 power, share = self.scattering.evaluate(
@@ -143,16 +141,17 @@ def define() -> type:
                     v * frequency,
                     -geometry.w * dr.two_pi * frequency * self.height_scale,
                     Incidence.of(wi, frequency, self.height_scale),
-                    active & self._covers(wavelength),
+                    active & covered[channel],
                 )
-                value[channel] = power / dr.square(wavelength)
+                value[channel] = dr.select(within, power / dr.square(wavelength), 0)
                 density += share / dr.square(wavelength)
             if self.energy is not None:
                 wavelengths = mi.UnpolarizedSpectrum(si.wavelengths) * 1e-3
                 value = self.energy.conserve(value, wi, wo, wavelengths, active)
             value *= self.reflectance(si, geometry.cos_half(), active) * geometry.factor(self.shadowing == "v_cavity")
-            # The mean over the wavelengths: any of them may have chosen the direction.
-            density = DEFENSIVE * dr.inv_pi + (1 - DEFENSIVE) * density / channels
+            # The mean over the covered wavelengths: any of them may have chosen the direction.
+            diffuse = _diffuse_share(count)
+            density = diffuse * dr.inv_pi + (1 - diffuse) * density / dr.maximum(count, 1)
             return value, density * geometry.cos_o
 
         def _mueller(
@@ -167,10 +166,11 @@ def define() -> type:
             index = self.reflectance.index(si, active) if mi.is_polarized else None
             return mi.depolarizer(value) if index is None else reflected(value, index, si.wi, wo, ctx.mode)
 
-        def _covers(self, wavelength: mi.Float) -> mi.Bool:
-            """The spectrum says nothing outside of its wavelengths (µm): there the grating is black."""
-            shortest, longest = self.spectrum.wavelengths
-            return (wavelength >= shortest * 1e-3 * (1 - 1e-6)) & (wavelength <= longest * 1e-3 * (1 + 1e-6))
+        def _covered(self, si: mi.SurfaceInteraction3f) -> tuple[list[mi.Bool], mi.Float]:
+            """Which of the wavelengths the spectrum covers, and how many: at the others the grating is black."""
+            shortest, longest = (w * (1 + d) for w, d in zip(self.spectrum.wavelengths, (-1e-6, 1e-6), strict=True))
+            covered = [(wavelength >= shortest) & (wavelength <= longest) for wavelength in si.wavelengths]
+            return covered, sum(dr.select(c, mi.Float(1), 0) for c in covered)
 
         def transmitted(self, si: mi.SurfaceInteraction3f, cos_o: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
             """(1 − R_i)(1 − R_o): what the surface lets through to the base and back."""
@@ -267,18 +267,21 @@ def define() -> type:
 
         def _draw(self, si: mi.SurfaceInteraction3f, u: mi.Float, v: mi.Point2f, active: mi.Bool) -> mi.Vector3f:
             """A direction for one of the wavelengths; below the horizon (z = 0) where its order is evanescent."""
-            diffuse = u < DEFENSIVE
-            u = (u - DEFENSIVE) / (1 - DEFENSIVE)
-            channels = len(mi.UnpolarizedSpectrum(0.0))
-            chosen = dr.clip(mi.UInt32(dr.maximum(u, 0) * channels), 0, channels - 1)
-            rest = dr.clip(u * channels - mi.Float(chosen), 0, BELOW_ONE)
-            wavelength = si.wavelengths[0] * 1e-3
-            for channel in range(1, channels):
-                wavelength = dr.select(chosen == channel, si.wavelengths[channel] * 1e-3, wavelength)
-            wavelength = dr.detach(wavelength)
+            covered, count = self._covered(si)
+            share = _diffuse_share(count)
+            diffuse = u < share
+            u = (u - share) / dr.maximum(1 - share, DEFENSIVE)
+            # Only wavelengths that the spectrum covers draw directions.
+            chosen = dr.clip(dr.floor(u * count), 0, dr.maximum(count - 1, 0))
+            rest = dr.clip(u * count - chosen, 0, BELOW_ONE)
+            wavelength, before = mi.Float(si.wavelengths[0]), mi.Float(0.0)
+            for channel, use in enumerate(covered):
+                wavelength = dr.select(use & (before == chosen), si.wavelengths[channel], wavelength)
+                before += dr.select(use, 1, 0)
+            wavelength = dr.detach(wavelength) * 1e-3
             sin, cos = (dr.detach(x) for x in self._frame(si, active))
             incidence = Incidence.of(_turned(si.wi, sin, cos), dr.rcp(wavelength), self.height_scale)
-            q_x, q_y = self.scattering.sample(incidence, rest, v, active & (u >= 0))
+            q_x, q_y = self.scattering.sample(incidence, rest, v, active & ~diffuse)
             x = -wavelength * (cos * q_x - sin * q_y) - si.wi.x
             y = -wavelength * (sin * q_x + cos * q_y) - si.wi.y
             z = dr.safe_sqrt(1 - dr.square(x) - dr.square(y))
@@ -306,6 +309,11 @@ def _orientation(props: mi.Properties) -> mi.Texture:
     if isinstance(angle, float) and not np.isfinite(angle):
         raise ValueError(f"orientation: got {angle}, wanted degrees or a texture")
     return props.get_texture("orientation", 0.0)
+
+
+def _diffuse_share(covered: mi.Float) -> mi.Float:
+    """The share of samples that follow the cosine: all of them where no wavelength is covered."""
+    return dr.select(covered > 0, mi.Float(DEFENSIVE), 1)
 
 
 def _turned(omega: mi.Vector3f, sin: mi.Float, cos: mi.Float) -> mi.Vector3f:

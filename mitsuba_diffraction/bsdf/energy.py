@@ -1,11 +1,10 @@
 """E(ω_i, ω_o, λ) at run time: what keeps the grating from reflecting more light than it receives.
 
-E = min(e(ω_i, λ), e(ω_o, λ)), e as in `spectrum/albedo.py`.
+E = min(e(ω_i, λ), e(ω_o, λ)), e as in `spectrum/energy_table.py`.
 """
 
 from __future__ import annotations
 
-import weakref
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -13,64 +12,24 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..spectrum import GratingSpectrum
-from ..spectrum.albedo import EnergyTable, GatheredSpectrum, energy_table
+from ..spectrum.energy_table import HORIZON, EnergyTable
 from .tables import PacketTable, opaque
-
-STEP = 1e-3  # of height_scale, for the derivative of the table
-
-_built: weakref.WeakKeyDictionary[GratingSpectrum, _Tables] = weakref.WeakKeyDictionary()
-
-
-class _Tables:
-    """The tables of one spectrum, for every BSDF that shows it; the last few are kept."""
-
-    KEPT = 8
-
-    def __init__(self, spectrum: GratingSpectrum) -> None:
-        self.gathered = GatheredSpectrum.of(spectrum)
-        self.tables: dict[tuple[bool, float], EnergyTable] = {}
-
-    def __call__(self, shadowing: bool, height_scale: float) -> EnergyTable:
-        key = shadowing, height_scale
-        table = self.tables.get(key)
-        if table is None:
-            table = energy_table(self.gathered, shadowing, height_scale)
-            self.tables = dict([*self.tables.items(), (key, table)][-self.KEPT :])
-        return table
-
-
-def energy_from(spectrum: GratingSpectrum, shadowing: bool, height_scale: mi.Float) -> Energy | None:
-    """The factor for a surface, or None if it is one for all directions and wavelengths.
-
-    The table holds for one value of `height_scale` and is built again when that changes. Where a gradient is tracked
-    through `height_scale`, the entries of the table carry theirs, from a central difference.
-    """
-    tables = _built.get(spectrum)
-    if tables is None:
-        tables = _built[spectrum] = _Tables(spectrum)
-    scale = float(np.max(height_scale))
-    table = tables(shadowing, scale)
-    if not dr.grad_enabled(height_scale):
-        return Energy(table) if table.needed else None
-    lower, upper = max(scale - STEP, 0.0), scale + STEP
-    slope = (tables(shadowing, upper).values - tables(shadowing, lower).values) / (upper - lower)
-    return Energy(table, slope, height_scale - dr.detach(height_scale))
 
 
 @dataclass
 class Place:
-    """Where a direction lies in the table: cells and the place in them, 0 to 1, and c."""
+    """Where a direction lies in the table: cells and the place in them, 0 to 1, c and cos θ."""
 
     column: mi.UInt32
     x: mi.Float
     row: mi.UInt32
     y: mi.Float
     c: mi.Float
+    z: mi.Float
 
 
 class Energy:
-    """e(ω, λ) from a table, linear in y, ν and x.
+    """e(ω, λ) from a table, linear in y, ν and s.
 
     The four corners of a cell in (ν, x) are packed as bytes into one number, so that a direction and a wavelength cost
     one read of four bytes, or two where the table has more than one row: reads cost more than the arithmetic. Bytes
@@ -82,7 +41,7 @@ class Energy:
         self.measured = table.excess, *table.loss
         self.rows, slices, columns = table.values.shape
         self.slices, self.columns = slices - 1, columns - 1
-        self.conical = table.conical
+        self.conical, self.shadowing = table.conical, table.shadowing
         steps, least, step = table.packed()
         self.table = _NumberTable(_corners(steps) @ (np.uint32(1) << np.arange(0, 32, 8, dtype=np.uint32)))
         self.least, self.step = opaque(least), opaque(step)
@@ -125,11 +84,14 @@ class Energy:
         """The place of ω, along the pattern's axes."""
         z = dr.maximum(omega.z, 0)
         c = dr.sqrt(dr.square(omega.x) + dr.square(z))
-        column, x = _cell(0.5 * (omega.x / dr.maximum(c + z, 1e-7) + 1) * self.columns, self.columns)
+        tangent = omega.x / dr.maximum(c + z, 1e-7)
+        rest = dr.maximum(1 - dr.abs(tangent), 0)
+        s = dr.copysign(1 - 0.5 * (dr.sqrt(rest) + rest), tangent)
+        column, x = _cell(0.5 * (s + 1) * self.columns, self.columns)
         row, y = mi.UInt32(0), mi.Float(0)
         if self.rows > 1:
             row, y = _cell(0.5 * (omega.y / (1 + c) + 1) * (self.rows - 1), self.rows - 1)
-        return Place(column, x, row, y, c)
+        return Place(column, x, row, y, c, z)
 
     def bound(self, place: Place, frequency: mi.Float) -> mi.Float:
         """e of the direction at `place`; `frequency` is 1/λ in cells of the table."""
@@ -140,6 +102,8 @@ class Energy:
         e = dr.fma(steps, self.step, self.least)
         if self.slope is not None:
             e += self._between(lambda i: self.slope(i, True), index, place, t) * self.change
+        if self.shadowing == "none":
+            e *= dr.minimum(1, place.z / HORIZON)
         return e
 
     def _between(

@@ -1,44 +1,40 @@
-"""How much light a perfect mirror with this spectrum would reflect, and the factor that keeps it to what it receives.
+"""How much light a perfect mirror with this spectrum would reflect, and the table of what bounds it by one.
 
 With R = 1 the BRDF K·G·S(q; κ)/λ² has the albedo
 
     a(ω_i, λ) = ∫ K G S(q; κ) dq    over the q whose ω_o is above the surface (du dv = cos θ_o dω_o = λ² dq)
 
-which exceeds one for some directions. The BSDF multiplies by
-
-    E = min(e(ω_i, λ), e(ω_o, λ)),    e = min(1, (1 + SLACK)/a)
-
-which is reciprocal, one where neither direction reflects more than it receives, and keeps every albedo to 1 + SLACK,
-because E ≤ e(ω_i). An `EnergyTable` holds e, bounded from below: a node starts with e there, then e is computed at
-random places in the cells, and where the table is above it the corners of the cell are lowered. What is left is
-measured at other random places, `EnergyTable.excess`; the albedo itself exceeds one by less, because light that makes
-a high usually leaves near the horizon, where e(ω_o) is low.
+`energy_table` computes e = min(1, (1 + SLACK)/a) (`energy_table.py`), bounded from below: a node starts with e there,
+then e is computed at random places in the cells, and where the table is above it the corners of the cell are lowered.
+What is left is measured at other places, `EnergyTable.excess`; the albedo itself exceeds one by less, because light
+that makes a high usually leaves near the horizon, where e(ω_o) is low.
 
 a is summed over cells in which the spectrum is gathered: the lobe of the mirror direction, which meets the horizon
-together with ω, is integrated; other cells are boxes that the horizon may cut.
-
-Directions are stored in angles about the pattern's y axis: with c = √(1 − ω_y²), the cosine of the latitude,
-
-    x = ω_x/(c + ω_z) = tan(longitude/2),    y = ω_y/(1 + c) = tan(latitude/2),    both in [−1, 1]
-
-so that directions near the horizon are as finely divided as others. The third coordinate is ν = 1/λ.
-A grating of one row keeps ω_o,y = −ω_i,y. Then K and G depend on the longitudes alone, and λ enters everywhere as λ/c:
-a is a function of x and ν = c/λ, and the table has one row in y.
+together with ω, is integrated; the others are boxes, each represented by Gauss points in cos θ_o, on which K, G and κ
+depend and which changes fast where the horizon cuts a box.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.polynomial.chebyshev import chebvander
+import scipy.sparse
+from numpy.polynomial.legendre import leggauss
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
+from scipy.integrate import cumulative_trapezoid
+from scipy.interpolate import CubicSpline
+from scipy.special import ndtr
 
+from .energy_table import EnergyTable, between, directions_at
 from .grating_spectrum import GratingSpectrum
+from .spline_grid import spline_integral
 
 SLACK = 5e-4
 """What an albedo may exceed one by: half the error of a spectrum at its usual tolerance."""
@@ -47,38 +43,62 @@ SLACK = 5e-4
 CONICAL_SHAPE = (1, 193, 193)
 GENERAL_SHAPE = (33, 17, 33)
 ROUNDS = 4  # how often the table is lowered
-CONICAL_PLACES, GENERAL_PLACES = 3, 2  # from how many places in each cell
-CONICAL_WAVELENGTHS = 4  # how many of the λ that share one ν = c/λ a node is computed for
-VARIED = 0.02  # after the first round only cells are looked at that were lowered, or about which e varies by as much
+CONICAL_PLACES, GENERAL_PLACES = 2, 1  # from how many places in each cell
+CONICAL_WAVELENGTHS = 2  # how many of the λ that share one ν = c/λ a node is computed for
+VARIED = 0.03  # after the first round only cells are looked at that were lowered, or about which e varies by as much
+LIKELY = 0.8  # the albedo at neighbouring nodes from which a cell is looked at
 CHECKED = 10_000  # places at which the table is measured
 
 # The gathered spectrum: lengths in cycles/µm.
 NARROW = 0.01  # λσ_q of lobes so narrow that ω_o,y = −ω_i,y holds
-FINE, COARSE = 0.15, 0.6  # widths of the cells of q in which nodes are gathered; weak ones in the wider
-WEAK = 2e-3  # the power under which a cell is weak
-STRONG, THIRD = 2e-2, 1.3  # the power from which a lobe is told by three boxes; their width, in σ_q
-CHUNK = 1 << 16  # pairs (direction, q) that are computed at once, so that they stay in the cache
+FINE = 0.08  # width of the cells of q in which nodes are gathered
+WIDE = 0.16  # width in ω_o,t of the cells in which weak ones are gathered further
+STEP = 1.25  # from one gathering to the next, in λ
+KEPT = 150  # the strongest cells, which are not gathered further
+STRONG, THIRD = 2e-2, 1.3  # the power from which a lobe is represented by three boxes; their width, in σ_q
+SPLINE_STEP, LINEAR_STEP = 0.4, 0.1  # in radians of the fastest oscillation over κ
+GAUSS = ((1 + leggauss(2)[0]) / 2).tolist(), (leggauss(2)[1] / 2).tolist()
+FAR = 4  # half-widths of a box in cos² from the horizon, from where one point represents it
+CHUNK = 1 << 17  # pairs (direction, q) that are computed at once, so that they stay in the cache
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """S(q; κ) gathered in few cells of the frequency plane, for a range of wavelengths.
+
+    Attributes:
+        longest: wavelength in µm.
+        q: float32 (n, 2), cycles/µm, the centres of power.
+        widths: float32 (n, 2), cycles/µm: the power of each cell is spread over a box.
+        shifts: float32 (n,), cycles/µm, how far towards the horizon the box is from the centre.
+        powers: p_j, float32 (n, K), at K equidistant κ from 0 to the largest; linear between them.
+    """
+
+    longest: float
+    q: NDArray[np.float32]
+    widths: NDArray[np.float32]
+    shifts: NDArray[np.float32]
+    powers: NDArray[np.float32]
+
+    @functools.cached_property
+    def integrals(self) -> NDArray[np.float32]:
+        """∫p_j dκ from 0, in steps of κ, float32 (n, K)."""
+        return cumulative_trapezoid(self.powers, initial=0, axis=1).astype(np.float32)
 
 
 @dataclass(frozen=True, eq=False)
 class GatheredSpectrum:
-    """S(q; κ) gathered in few cells of the frequency plane.
+    """S(q; κ) gathered in few cells, whose widths are about the same in ω_o,t for every wavelength.
 
     Attributes:
-        q: float32 (n, 2), cycles/µm, the centres of power.
-        widths: float32 (n,), cycles/µm: the power of each cell is spread over a box, which matters at the horizon.
-        shifts: float32 (n,), cycles/µm, how far towards the horizon the box is from the centre.
-        powers: p_j, float32 (n, K), at K equidistant κ from 0 to `largest_kappa`; linear between them.
+        cells: for ranges of wavelengths that ascend.
         largest_kappa: rad/µm.
         wavelengths: (shortest, longest) in nm.
         conical: ω_o,y = −ω_i,y.
         mirror: the first cell is the lobe of the mirror direction, a Gaussian, and q = 0.
     """
 
-    q: NDArray[np.float32] = field(repr=False)
-    widths: NDArray[np.float32] = field(repr=False)
-    shifts: NDArray[np.float32] = field(repr=False)
-    powers: NDArray[np.float32] = field(repr=False)
+    cells: tuple[Cells, ...] = field(repr=False)
     largest_kappa: float
     wavelengths: tuple[float, float]
     conical: bool
@@ -87,58 +107,79 @@ class GatheredSpectrum:
     @classmethod
     def of(cls, spectrum: GratingSpectrum) -> GatheredSpectrum:
         """Gather the nodes of `spectrum` in the cells of a grid, each cell at its centre of power."""
-        q_x, q_y = spectrum.grid.frequencies()
-        sigma = spectrum.lobe_width
-        conical = spectrum.extent == "tile" and len(q_y) == 1 and sigma * spectrum.wavelengths[1] * 1e-3 <= NARROW
-        # A cell holds the whole lobe: of a tile it comes with its order, of a sample to four σ_q.
-        narrow = sigma <= FINE / (3 if spectrum.extent == "tile" else 8)
-        fine = FINE / 8 if conical else FINE if narrow else FINE / 2
-        # Wide lobes are gathered point by point; the nodes of a sample hold them already.
-        spread = sigma if spectrum.extent == "tile" and not narrow else 0.0
-        x, y = _cells(q_x, spread, fine), _cells(q_y, spread, fine)
+        sigma, sample = spectrum.lobe_width, spectrum.extent == "sample"
+        conical = not sample and spectrum.grid.shape[0] == 1 and sigma * spectrum.wavelengths[1] * 1e-3 <= NARROW
+        # A cell holds the whole lobe of a node, or the parts of it that lie in the cell.
+        narrow = sigma <= FINE / (8 if sample else 3)
+        fine = FINE / 4 if conical else FINE
+        # Light reaches no further than |q| = 2/λ.
+        reach = 2e3 / spectrum.wavelengths[0] + fine
+        limits = np.minimum(spectrum.grid.limit if sample else np.inf, 2 * (reach,))
+        lobes = (
+            [None, None]
+            if narrow
+            else [(spline_integral, d) for d in spectrum.grid.spacing]
+            if sample
+            else 2 * [(ndtr, sigma)]
+        )
+        x, y = (
+            _shares(q, lobe, fine, limit)
+            for q, lobe, limit in zip(spectrum.grid.frequencies(), lobes, limits, strict=True)
+        )
 
-        # p_j(κ) is band-limited by the height range R: Chebyshev nodes enough for e^{iκR}.
+        # p_j(κ) is band-limited by the height range R: first κ for a cubic spline, from there equidistant κ so near
+        # that straight lines serve. Sums by sparse matrices: those of BLAS depend on the number of cores.
         largest, radians = spectrum.largest_kappa, spectrum.largest_kappa * spectrum.height_range
-        count = int(np.ceil(radians / 2)) + 12
-        nodes = np.cos(np.pi * (np.arange(count) + 0.5) / count)
-        gathered = np.empty((count, y[0].shape[1], x[0].shape[1]), np.float32)
-        total = np.zeros(spectrum.grid.shape, np.float32)
-        for index, node in enumerate(nodes):
-            powers = spectrum.powers((1 + node) / 2 * largest)
-            gathered[index] = y[0].T @ powers @ x[0]
+        kappas = np.linspace(0, largest, int(np.ceil(radians / SPLINE_STEP)) + 8)
+        gathered = np.empty((len(kappas), y[0].shape[1], x[0].shape[1]), np.float32)
+        total = np.zeros(spectrum.grid.shape, np.float64)
+        for index, kappa in enumerate(kappas):
+            powers = spectrum.powers(kappa).astype(np.float64)
+            gathered[index] = _product(y[0], powers, x[0])
             total += powers
-        moments = {(i, j): y[j].T @ total @ x[i] for i, j in ((0, 0), (1, 0), (0, 1), (2, 0), (0, 2))}
-        present = moments[0, 0] > count * 1e-9
-        weight = moments[0, 0][present]
-        q = np.stack([moments[1, 0][present], moments[0, 1][present]], -1) / weight[:, None]
-        square = (moments[2, 0] + moments[0, 2])[present] / weight
-
-        # From the nodes to equidistant κ, 0.15 rad of the fastest oscillation apart.
-        equidistant = np.linspace(-1, 1, int(np.ceil(radians / 0.15)) + 2)
-        weights = 2 / count * chebvander(nodes, count - 1)
-        weights[:, 0] /= 2
-        powers = np.maximum(chebvander(equidistant, count - 1) @ weights.T @ gathered[:, present], 0).T
-        q, square, powers = _merged(q, square, powers, COARSE / 8 if conical else COARSE)
-        own = max(spectrum.grid.spacing) / 2 if spectrum.extent == "sample" else sigma if narrow else fine / np.sqrt(12)
-        sigmas = np.sqrt(np.maximum((square - (q**2).sum(-1)) / 2, 0) + own**2)
+        moments = [_product(y[j], total, x[i]) for i, j in ((0, 0), (1, 0), (0, 1), (2, 0), (0, 2))]
+        present = moments[0] > len(kappas) * 1e-9
+        weight, *others = (moment[present][:, None] for moment in moments)
+        q, square = np.hstack(others[:2]) / weight, np.hstack(others[2:]) / weight
+        gathered = gathered[:, present].T
+        equidistant = np.linspace(0, largest, int(np.ceil(radians / LINEAR_STEP)) + 2)
+        # The lobes that lie in the cells as a whole.
+        own = (np.array(spectrum.grid.spacing) / 2 if sample else sigma) if narrow else 0.0
         mirror = np.abs(q).max(-1) <= fine / 2
-        order = np.argsort(~mirror, kind="stable")
-        q[mirror] = 0
-        q, sigmas, powers = q[order], sigmas[order], powers[order]
         has_mirror = bool(narrow and mirror.any())
-        # What strong lobes do at the horizon is told by three boxes, that of the others by one of the same deviation.
-        strong = (powers.max(-1) >= STRONG) & ~(has_mirror & mirror[order])
-        parts = [(q[~strong], np.sqrt(12) * sigmas[~strong], 0 * sigmas[~strong], powers[~strong])]
-        for offset, weight in zip(*_lobe(3, THIRD), strict=True):
-            parts.append((q[strong], THIRD * sigmas[strong], offset * sigmas[strong], weight * powers[strong]))
-        cells = (np.ascontiguousarray(np.concatenate(x), np.float32) for x in zip(*parts, strict=True))
-        return cls(*cells, largest, spectrum.wavelengths, conical, has_mirror)
+
+        def cells(shortest: float, longest: float, width: float) -> Cells:
+            near = np.hypot(*q.T) < 2 / shortest + width
+            parts = (q[near], square[near], gathered[near])
+            centres, squares, powers = _merged(*parts, width, ~mirror[near] if has_mirror else None)
+            powers = np.maximum(CubicSpline(kappas, powers, axis=1)(equidistant), 0)
+            sigmas = np.sqrt(np.maximum(squares - centres**2, 0) + own**2)
+            at_mirror = np.abs(centres).max(-1) <= fine / 2
+            order = np.argsort(~at_mirror, kind="stable")
+            if has_mirror:
+                centres[at_mirror] = 0
+            centres, sigmas, powers = centres[order], sigmas[order], powers[order]
+            strong = (powers.max(-1) >= STRONG) & ~(has_mirror & at_mirror[order])
+            # At the horizon strong lobes are represented by three boxes, others by one of the same deviation.
+            parts = [(centres[~strong], np.sqrt(12) * sigmas[~strong], 0 * sigmas[~strong, 0], powers[~strong])]
+            for offset, share in zip(*_lobe(3, THIRD), strict=True):
+                s = sigmas[strong]
+                parts.append((centres[strong], THIRD * s, offset * s.mean(-1), share * powers[strong]))
+            return Cells(
+                longest, *(np.ascontiguousarray(np.concatenate(p), np.float32) for p in zip(*parts, strict=True))
+            )
+
+        shortest, longest = (w * 1e-3 for w in spectrum.wavelengths)
+        count = 1 if conical else int(np.ceil(np.log(longest / shortest) / np.log(STEP)))
+        ends = shortest * (longest / shortest) ** (np.arange(count + 1) / count)
+        levels = tuple(cells(start, end, WIDE / end) for start, end in itertools.pairwise(ends.tolist()))
+        return cls(levels, largest, spectrum.wavelengths, conical, has_mirror)
 
     def albedo(
         self,
         directions: NDArray[np.float64],
         wavelengths: ArrayLike,
-        shadowing: bool = True,
+        shadowing: str = "v_cavity",
         height_scale: float = 1.0,
     ) -> NDArray[np.float32]:
         """a(ω, λ).
@@ -146,127 +187,125 @@ class GatheredSpectrum:
         Args:
             directions: ω, (n, 3) unit vectors above the surface, along the pattern's axes.
             wavelengths: λ in µm, (n,) or one for all; 4π · `height_scale`/λ at most `largest_kappa`.
-            shadowing: G is the V-cavity's, else 1.
+            shadowing: G is that of a "v_cavity", or 1 ("none").
             height_scale: times the heights.
 
         Returns:
             (n,).
         """
         wavelengths = np.broadcast_to(wavelengths, len(directions))
-        # Neighbours of one length reach about the same q.
-        order = np.argsort(wavelengths, kind="stable")
         result = np.empty(len(directions), np.float32)
 
-        def compute(some: NDArray[np.int64]) -> None:
-            result[some] = self._albedo(directions[some], wavelengths[some], shadowing, height_scale)
+        def compute(level: Cells, some: NDArray[np.int64]) -> None:
+            result[some] = self._albedo(level, directions[some], wavelengths[some], shadowing, height_scale)
 
-        parts = np.array_split(order, 1 + len(order) * len(self.q) // CHUNK)
+        # Neighbours of one wavelength and one latitude reach about the same q.
+        order = np.lexsort((directions[:, 0], directions[:, 1], wavelengths))
+        level = np.searchsorted([cells.longest * (1 + 1e-6) for cells in self.cells[:-1]], wavelengths[order])
+        parts = []
+        for index, cells in enumerate(self.cells):
+            some = order[level == index]
+            parts += [
+                (cells, part) for part in np.array_split(some, 1 + len(some) * len(cells.q) // CHUNK) if len(part)
+            ]
         with ThreadPoolExecutor() as threads:
-            list(threads.map(compute, [part for part in parts if len(part)]))
+            list(threads.map(compute, *zip(*parts, strict=True)))
         return result
 
     def _albedo(
-        self, directions: NDArray[np.float64], wavelengths: NDArray[np.float64], shadowing: bool, height_scale: float
+        self,
+        cells: Cells,
+        directions: NDArray[np.float64],
+        wavelengths: NDArray[np.float64],
+        shadowing: str,
+        height_scale: float,
     ) -> NDArray[np.float32]:
         """`albedo` of a few directions at once."""
         s_x, s_y, cos_i = directions.astype(np.float32).T[:, :, None]
-        wavelengths = wavelengths.astype(np.float32)[:, None]
-        # Light reaches no further than |q| = 2/λ.
-        reached = np.flatnonzero((self.q**2).sum(-1) * wavelengths.min() ** 2 < 4)
-        u, v = wavelengths * self.q[reached, 0], wavelengths * self.q[reached, 1]
-        width, shift = wavelengths * self.widths[reached], wavelengths * self.shifts[reached]
-        # The part of each cell above the horizon, and its mean cosine.
-        above, cos_o = _above(1 - (u + s_x) ** 2 - (v + s_y) ** 2 - 2 * shift, width)
         cos_i = np.maximum(cos_i, 1e-4)
-        factor = above * _geometry(u**2 + v**2, cos_i, cos_o, shadowing)
+        # What some of them send above the horizon.
+        middle = directions[:, :2].mean(0)
+        spread = np.hypot(*(directions[:, :2] - middle).T).max()
+        margin = np.hypot(*cells.widths.T) / 2 + np.abs(cells.shifts)
+        least, most = wavelengths.min(), wavelengths.max()
+        distance = np.hypot(*((least + most) / 2 * cells.q + middle).T)
+        reach = 1 + spread + most * margin + (most - least) / 2 * np.hypot(*cells.q.T)
+        reached = np.flatnonzero(distance < reach + 0.01)
+        if self.mirror and (len(reached) == 0 or reached[0] != 0):
+            reached = np.concatenate([[0], reached])
+        wavelengths = wavelengths.astype(np.float32)[:, None]
+        q_x, q_y = cells.q[reached].T
+        widths, shifts = cells.widths[reached], cells.shifts[reached]
+        outer = (wavelengths * q_x + s_x) ** 2 + (wavelengths * q_y + s_y) ** 2
+        # Pairs (direction, cell) of which some part is above the horizon.
+        above = outer < (1 + most.astype(np.float32) * (np.hypot(*widths.T) / 2 + np.abs(shifts))) ** 2
         if self.mirror:
-            factor[:, 0] = _mirror_lobe(cos_i[:, 0], width[:, 0] / np.sqrt(12), shadowing)
-        w = cos_i + cos_o
-        # p_j(κ), κ = 2π w/λ.
-        count = self.powers.shape[1]
-        per_cosine = np.float32(2 * np.pi * height_scale * (count - 1) / self.largest_kappa) / wavelengths
-        place = np.minimum(per_cosine * w, count - 1)
-        cell = np.minimum(place.astype(np.int32), count - 2)
-        place -= cell
-        cell += (reached * count).astype(np.int32)
-        flat = self.powers.ravel()
-        below = flat[cell]
-        power = below + place * (flat[cell + 1] - below)
-        return (factor * power).sum(-1)
+            above[:, 0] = True
+        i, j = np.nonzero(above)
+        lengths, cos_i = wavelengths[i, 0], cos_i[i, 0]
+        box = [lengths * x for x in (q_x[j], q_y[j], widths[j, 0], widths[j, 1], shifts[j])]
+        pair, cos_o, half, share, factor = _points(s_x[i, 0], s_y[i, 0], cos_i, *box, shadowing)
+        if self.mirror:
+            at = np.flatnonzero(j[pair] == 0)
+            factor[at] = share[at] * _mirror_lobe(
+                cos_i[pair[at]], box[2][pair[at]] / np.float32(np.sqrt(12)), shadowing
+            )
+        # The mean of p_j(κ), κ = 2π w/λ, over the part of the box.
+        count = cells.powers.shape[1]
+        per_cosine = np.float32(2 * np.pi * height_scale * (count - 1) / self.largest_kappa) / lengths[pair]
+        place, half = per_cosine * (cos_i[pair] + cos_o), np.maximum(per_cosine * half, 1)
+        low, high = np.clip(place - half, 0, count - 1), np.clip(place + half, 0, count - 1)
+        flat, first = cells.integrals.ravel(), (reached * count).astype(np.int32)[j[pair]]
+        power = (_linear(flat, first, high, count) - _linear(flat, first, low, count)) / np.maximum(high - low, 0.5)
+        return np.bincount(i[pair], factor * power, len(directions))
 
 
-@dataclass(frozen=True, eq=False)
-class EnergyTable:
-    """Lower bounds of e at nodes, linear between them in y, ν and x.
-
-    Attributes:
-        values: float32 (N_y, N_ν, N_x); y and x from −1 to 1, ν as in `frequencies`.
-        frequencies: (smallest, largest) ν in 1/µm.
-        conical: ν = c/λ and N_y = 1; else ν = 1/λ.
-        excess: the largest e·a − 1 found, over random places that the table was not made from, with the rounding of
-            `packed`.
-        loss: (mean, largest) 1 − e over those of them with a ≤ 1: light that is lost to the table's resolution.
-    """
-
-    values: NDArray[np.float32] = field(repr=False)
-    frequencies: tuple[float, float]
-    conical: bool
-    excess: float = 0.0
-    loss: tuple[float, float] = (0.0, 0.0)
-
-    @property
-    def needed(self) -> bool:
-        """Some direction would reflect more than it receives."""
-        return bool((self.values < 1).any())
-
-    def packed(self) -> tuple[NDArray[np.uint8], float, float]:
-        """Bytes b and numbers (least, step) with `values` ≥ least + step · b, as the renderer holds them."""
-        least = float(self.values.min())
-        step = (1 - least) / 255 or 1.0
-        # A value that is a whole number of steps stays one, and one stays one.
-        return np.floor((self.values - least) / step + 1e-3).astype(np.uint8), least, step
-
-
-def energy_table(spectrum: GatheredSpectrum, shadowing: bool = True, height_scale: float = 1.0) -> EnergyTable:
+def energy_table(spectrum: GatheredSpectrum, shadowing: str = "v_cavity", height_scale: float = 1.0) -> EnergyTable:
     """e, bounded from below, and how well.
 
     Args:
         spectrum: gathered.
-        shadowing: G is the V-cavity's, else 1. Then a grows without bound towards the horizon, faster than the table
-            can follow: of 42,000 pairs for each surface e·a was 1.7 at most (blaze 0.8 µm deep), the albedo of the
-            pairs with the largest e·a 1.02 up to 89.5° and 1.05 beyond.
+        shadowing: "v_cavity" or "none".
         height_scale: times the heights.
     """
     shape, count = (CONICAL_SHAPE, CONICAL_PLACES) if spectrum.conical else (GENERAL_SHAPE, GENERAL_PLACES)
     cells = tuple(max(n - 1, 1) for n in shape)
     shortest, longest = (w * 1e-3 for w in spectrum.wavelengths)
     frequencies = (0.0 if spectrum.conical else 1 / longest, 1 / shortest)
+    table = EnergyTable(np.ones(shape, np.float32), frequencies, spectrum.conical, shadowing)
 
     def bound(places: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """a and e at places (row, slice, column), (n, 3); of a table of one row 0 ≤ row ≤ 1 chooses λ."""
-        y, t, x = places.T / np.array(cells)[:, None]
+        """a times what the table's value is multiplied by, and the largest value; places (row, slice, column), (n, 3).
+
+        Of a table of one row 0 ≤ row ≤ 1 chooses λ.
+        """
+        y, t, s = places.T / np.array(cells)[:, None]
         nu = np.maximum(frequencies[0] + (frequencies[1] - frequencies[0]) * t, 1e-3)
-        x, y, wavelengths = 2 * x - 1, 2 * y - 1, 1 / nu
+        s, y, wavelengths = 2 * s - 1, 2 * y - 1, 1 / nu
         if spectrum.conical:
             # ν = c/λ is one number, but the lobes are λσ_q wide: any λ that has this ν.
             # The widest and the narrowest lobes, and some between.
             share = np.clip(0.5 + y, 0, 1)
             wavelengths = shortest + (np.minimum(longest, wavelengths) - shortest) * share
             y = np.sqrt(np.maximum(1 - wavelengths * nu, 0) / (1 + wavelengths * nu))
-        a = spectrum.albedo(directions_at(x, y), wavelengths, shadowing, height_scale)
-        return a, np.minimum(1, (1 + SLACK) / a)
+        directions = directions_at(s, y)
+        directions[:, 2] = np.maximum(directions[:, 2], 1e-4)
+        a = spectrum.albedo(directions, wavelengths, shadowing, height_scale) * table.horizon(directions[:, 2])
+        return a, np.minimum(1, (1 + SLACK) / np.maximum(a, 1e-6)).astype(np.float32)
 
     nodes = np.indices(shape).reshape(3, -1).T
     rows = np.linspace(0, 1, CONICAL_WAVELENGTHS) if spectrum.conical else [0.0]
-    values = np.min([bound(nodes + np.array([row, 0, 0]))[1] for row in rows], axis=0).reshape(shape)
+    at_nodes = [bound(nodes + np.array([row, 0, 0])) for row in rows]
+    values = np.min([e for _, e in at_nodes], axis=0).reshape(shape)
+    largest = np.max([a for a, _ in at_nodes], axis=0).reshape(shape)
 
     # The same places for every height scale, so that their tables can be subtracted.
     rng = np.random.default_rng(0)
-    doubtful = np.ones(cells, bool)
+    doubtful = (ndimage.maximum_filter(largest, 3) > LIKELY)[tuple(slice(n) for n in cells)]
     for _ in range(ROUNDS):
         inside = rng.random((count, *cells, 3), np.float32)[:, doubtful]
         first = np.argwhere(doubtful)
-        above = np.max([_between(values, first + r) - bound(first + r)[1] for r in inside], axis=0)
+        above = np.max([between(values, first + r) - bound(first + r)[1] for r in inside], axis=0)
         drop = np.zeros(shape, np.float32)
         drop[tuple(first.T)] = np.maximum(above, 0)
         # A node is a corner of the cells before and after it.
@@ -275,55 +314,85 @@ def energy_table(spectrum: GatheredSpectrum, shadowing: bool = True, height_scal
         varied = ndimage.maximum_filter(values, 3) - ndimage.minimum_filter(values, 3) > VARIED
         doubtful = (ndimage.maximum_filter(drop > 0, 3) | varied)[tuple(slice(n) for n in cells)]
 
-    table = EnergyTable(np.ascontiguousarray(values, np.float32), frequencies, spectrum.conical)
+    table = dataclasses.replace(table, values=np.ascontiguousarray(values, np.float32))
     steps, least, step = table.packed()
-    places = rng.random((CHECKED, 3))
-    # Every other one nearer to the horizon, x = ±1.
-    places[::2, 2] = 0.5 * (1 + np.sin(np.pi * (places[::2, 2] - 0.5)))
-    places *= cells
-    e, a = _between(least + step * steps.astype(np.float32), places), bound(places)[0]
+    places = rng.random((CHECKED, 3)) * cells
+    e, a = between(least + step * steps.astype(np.float32), places), bound(places)[0]
     lost = (1 - e)[a <= 1]
     loss = (float(lost.mean()), float(lost.max())) if len(lost) else (0.0, 0.0)
     return dataclasses.replace(table, excess=float((e * a).max() - 1), loss=loss)
 
 
-def _between(values: NDArray[np.float32], places: NDArray[np.float64]) -> NDArray[np.float32]:
-    """The table at places (row, slice, column), (n, 3), linear between nodes; beyond, the nearest."""
-    return ndimage.map_coordinates(values, places.T, order=1, mode="nearest")
+def _linear(
+    flat: NDArray[np.float32], first: NDArray[np.int32], place: NDArray[np.float32], count: int
+) -> NDArray[np.float32]:
+    """Rows of `count` numbers, one after the other in `flat`, at `place` in the rows that begin at `first`."""
+    cell = np.minimum(place.astype(np.int32), count - 2)
+    place = place - cell
+    cell += first
+    below = flat[cell]
+    return below + place * (flat[cell + 1] - below)
 
 
-def directions_at(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The unit vectors (..., 3) of the coordinates x and y, which broadcast."""
-    x, y = np.broadcast_arrays(x, y)
-    c = (1 - y**2) / (1 + y**2)
-    return np.stack([c * 2 * x / (1 + x**2), 2 * y / (1 + y**2), c * (1 - x**2) / (1 + x**2)], -1)
+def _points(
+    s_x: NDArray[np.float32],
+    s_y: NDArray[np.float32],
+    cos_i: NDArray[np.float32],
+    u: NDArray[np.float32],
+    v: NDArray[np.float32],
+    width_x: NDArray[np.float32],
+    width_y: NDArray[np.float32],
+    shift: NDArray[np.float32],
+    shadowing: str,
+) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """∫ K G over boxes in ω_o,t as sums over few cos θ_o: one, or two of Gauss and Legendre near the horizon.
 
-
-def _above(square: NDArray[np.float32], width: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """The part of a cell above the horizon, and the mean cosine there.
+    cos² θ_o is taken to be spread evenly over a box, and what is below the horizon is cut off.
 
     Args:
-        square: 1 − |ω_o,t|² of its centre.
-        width: of the cell, in ω_o,t.
+        s_x: of ω_i, (n,).
+        s_y: of ω_i.
+        cos_i: cos θ_i.
+        u: of the centre of the box.
+        v: of the centre.
+        width_x: of the box.
+        width_y: of the box.
+        shift: of the box, outwards.
+        shadowing: as in `GatheredSpectrum.albedo`.
+
+    Returns:
+        The index of the box, cos θ_o, half the part of cos θ_o and the share of the box that it represents, and the
+        summand: each (points,).
     """
-    # The mean of the cosines at both edges is, near the horizon, the harmonic mean over the part: K has 1/cos θ_o.
-    inner, outer = np.maximum(square + width, 1e-8), np.maximum(square - width, 0)
-    return np.clip(square / (2 * width) + 0.5, 0, 1), np.minimum(0.5 * (np.sqrt(inner) + np.sqrt(outer)), 1)
-
-
-def _geometry(
-    tangent: NDArray[np.float32], cos_i: NDArray[np.float32], cos_o: NDArray[np.float32], shadowing: bool
-) -> NDArray[np.float32]:
-    """K·G, for u² + v² = `tangent`."""
+    o_x, o_y = u + s_x, v + s_y  # −ω_o,t
+    outer = o_x**2 + o_y**2
+    square_x, square_y = width_x**2, width_y**2
+    # The deviation along the radius is that of the box.
+    half = np.sqrt(square_x * o_x**2 + square_y * o_y**2 + (square_x + square_y) ** 2 / 64)
+    middle = 1 - outer - 2 * shift - (square_x + square_y) / 12
+    far = middle > FAR * half
+    whole, cut = np.flatnonzero(far), np.flatnonzero(~far & (middle > -half))
+    cosine = np.sqrt(middle[whole])
+    lowest = np.sqrt(np.maximum(middle - half, 0)[cut])
+    span = np.sqrt(np.minimum((middle + half)[cut], 1)) - np.minimum(lowest, 1)
+    pair = np.concatenate([whole, cut, cut])
+    cos_o = np.minimum(np.concatenate([cosine, *(lowest + x * span for x in GAUSS[0])]), 1)
+    part = np.concatenate([half[whole] / (2 * cosine), *(w / 2 * span for w in GAUSS[1])])
+    share = np.concatenate([np.ones_like(cosine), *(np.full_like(span, w) for w in GAUSS[1])])
+    measure = np.concatenate([1 / cosine, *(w * span / half[cut] for w in GAUSS[1])])
+    # Nearer to the horizon, or farther from it, along the radius.
+    u, v, outer, cos_i = u[pair], v[pair], outer[pair], cos_i[pair]
+    stretch = np.sqrt(1 - cos_o**2) / np.sqrt(np.maximum(outer, (square_x + square_y)[pair] / 32)) - 1
+    tangent = u**2 + v**2 + stretch * (2 * (o_x[pair] * u + o_y[pair] * v) + stretch * outer)
     w = cos_i + cos_o
-    d = 0.5 * (tangent + w**2)  # 1 + ω_i·ω_o
-    factor = d**2 / (cos_i * cos_o * w**2)
-    if shadowing:
-        factor *= np.minimum(1, 2 * w * np.minimum(cos_i, cos_o) / d)
-    return factor
+    d = 0.5 * (np.maximum(tangent, 0) + w**2)  # 1 + ω_i·ω_o
+    factor = d**2 / (cos_i * w**2)  # K·cos θ_o
+    if shadowing == "v_cavity":
+        factor = np.minimum(factor, 2 * np.minimum(1, cos_o / cos_i) * d / w)
+    return pair, cos_o, part, share, measure * factor
 
 
-def _mirror_lobe(cos_i: NDArray[np.float32], width: NDArray[np.float32], shadowing: bool) -> NDArray[np.float32]:
+def _mirror_lobe(cos_i: NDArray[np.float32], width: NDArray[np.float32], shadowing: str) -> NDArray[np.float32]:
     """∫ K G over the lobe of the mirror direction, a Gaussian of the standard deviation `width` in ω_o,t; (n,).
 
     From a table, linear in √cos θ_i and the width.
@@ -335,7 +404,7 @@ def _mirror_lobe(cos_i: NDArray[np.float32], width: NDArray[np.float32], shadowi
 
 @functools.cache
 def _mirror_table(
-    shadowing: bool,
+    shadowing: str,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """The table of `_mirror_lobe`: widths (n,), cosines (m,), and the integrals (n, m)."""
     widths = np.geomspace(2e-4, 0.05, 24, dtype=np.float32)
@@ -343,34 +412,51 @@ def _mirror_table(
     offsets, weights = _lobe(29, 0.25)
     table = np.zeros((len(widths), len(cosines)), np.float32)
     sine = np.sqrt(1 - cosines**2)
+    sine, cosine, width = (np.ravel(x) for x in np.broadcast_arrays(sine, cosines, widths[:, None]))
     for i, j in np.ndindex(len(offsets), (len(offsets) + 1) // 2):
-        u, v = widths[:, None] * offsets[i], widths[:, None] * offsets[j]
-        above, cos_o = _above(1 - (u - sine) ** 2 - v**2, 0.25 * widths[:, None])
+        u, v, box = np.float32(offsets[i]) * width, np.float32(offsets[j]) * width, np.float32(0.25) * width
+        pair, *_, factor = _points(-sine, 0 * sine, cosine, u, v, box, box, 0 * box, shadowing)
         twice = 1 if offsets[j] == 0 else 2
-        table += twice * weights[i] * weights[j] * above * _geometry(u**2 + v**2, cosines, cos_o, shadowing)
+        share = np.bincount(pair, factor, len(sine)).reshape(table.shape)
+        table += (twice * weights[i] * weights[j] * share).astype(np.float32)
     return widths, cosines, table
 
 
-def _cells(q: NDArray[np.float64], sigma: float, width: float) -> NDArray[np.float32]:
+def _shares(
+    q: NDArray[np.float64],
+    lobe: tuple[Callable[[NDArray[np.float64]], NDArray[np.float64]], float] | None,
+    width: float,
+    limit: float,
+) -> list[scipy.sparse.csr_array]:
     """How nodes along one axis, each with its lobe, fall into cells.
 
     Args:
         q: (n,) cycles/µm.
-        sigma: σ_q in cycles/µm.
+        lobe: its integral from −∞, and its width in cycles/µm; without it, a lobe lies in a cell as a whole.
         width: of a cell, cycles/µm.
+        limit: |q| beyond which there is nothing.
 
     Returns:
-        The share of each node in each cell, the same times q, and times q²: (3, n, cells).
+        The share of each node in each cell, the same times q, and times q²: each (n, cells).
     """
-    offsets, weights = _lobe(7, 0.85) if sigma else (np.zeros(1), np.ones(1))
-    points = q[:, None] + sigma * offsets
-    cells = np.round(points / width).astype(np.int64)
-    first = cells.min()
-    result = np.zeros((3, len(q), cells.max() - first + 1), np.float32)
-    row = np.broadcast_to(np.arange(len(q))[:, None], cells.shape)
-    for power, moment in enumerate(result):
-        np.add.at(moment, (row, cells - first), weights * points**power)
-    return result
+    if lobe is None:
+        cells = np.round(q / width).astype(np.int64)
+        cells -= cells.min()
+        row, shape = np.arange(len(q)), (len(q), cells.max() + 1)
+        return [scipy.sparse.csr_array((q**power, (row, cells)), shape) for power in range(3)]
+    integral, scale = lobe
+    first, last = (int(np.round(end / width)) for end in (q.min() - 4 * scale, q.max() + 4 * scale))
+    edges = np.clip((np.arange(first, last + 2) - 0.5) * width, -limit, limit)
+    shares = np.diff(integral((edges - q[:, None]) / scale), axis=1)
+    shares[shares < 1e-7] = 0
+    centres, extents = (edges[1:] + edges[:-1]) / 2, np.diff(edges)
+    moments = (1, centres, centres**2 + extents**2 / 12)
+    return [scipy.sparse.csr_array(shares * moment) for moment in moments]
+
+
+def _product(y: scipy.sparse.csr_array, powers: NDArray[np.float64], x: scipy.sparse.csr_array) -> NDArray[np.float64]:
+    """Σ over the nodes, y (rows, n) and x (columns, m): (n, m)."""
+    return (x.T @ (y.T @ powers).T).T
 
 
 def _lobe(count: int, spacing: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -381,31 +467,38 @@ def _lobe(count: int, spacing: float) -> tuple[NDArray[np.float64], NDArray[np.f
 
 
 def _merged(
-    q: NDArray[np.float64], square: NDArray[np.float64], powers: NDArray[np.float64], width: float
+    q: NDArray[np.float64],
+    square: NDArray[np.float64],
+    powers: NDArray[np.float64],
+    width: float,
+    mergeable: NDArray[np.bool_] | None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Gather weak cells in wider ones, each at its centre of power.
 
     Args:
         q: (n, 2) cycles/µm.
-        square: the mean of |q|² in each cell, (n,).
+        square: the means of q_x² and q_y² in each cell, (n, 2).
         powers: (n, K).
         width: of the wider cells, cycles/µm.
+        mergeable: which cells may be, (n,).
 
     Returns:
         The same for fewer cells.
     """
-    weak = powers.max(-1) < WEAK
+    strength = powers.max(-1)
+    weak = np.ones(len(q), bool)
+    weak[np.argsort(-strength, kind="stable")[:KEPT]] = False
+    if mergeable is not None:
+        weak &= mergeable
     if not weak.any():
-        return q, square, powers
+        return q.copy(), square, powers
     _, cell = np.unique(np.round(q[weak] / width), axis=0, return_inverse=True)
     cell = cell.ravel()
-    merged = np.zeros((cell.max() + 1, powers.shape[1]))
-    np.add.at(merged, cell, powers[weak])
-    weight = powers[weak].sum(-1)
-    total = np.bincount(cell, weight)
-    x, y, both = (np.bincount(cell, weight * m) / total for m in (*q[weak].T, square[weak]))
+    gather = scipy.sparse.csr_array((np.ones(len(cell)), (cell, np.arange(len(cell)))))
+    weight = np.maximum(powers[weak].sum(-1, dtype=np.float64), 1e-30)[:, None]
+    total = gather @ weight
     return (
-        np.concatenate([q[~weak], np.stack([x, y], -1)]),
-        np.concatenate([square[~weak], both]),
-        np.concatenate([powers[~weak], merged]),
+        np.concatenate([q[~weak], gather @ (weight * q[weak]) / total]),
+        np.concatenate([square[~weak], gather @ (weight * square[weak]) / total]),
+        np.concatenate([powers[~weak], gather @ powers[weak]]),
     )

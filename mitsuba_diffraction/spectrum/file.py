@@ -2,8 +2,9 @@
 
 Channels are named after what they hold. Series: `B{t^003}` (taylor), `B{T_003}` (chebyshev), `B{mode 003}` (svd), the
 terms B_n of S = Σ g_n(κ) B_n; "slices": `S(012.2)`, the powers at the third Chebyshev point of interval 12 of κ. Rows
-are orders m_y, columns m_x, from −M to M. Numbers in the header are double precision. `contentSha256` covers every
-byte of the file, so that a damaged one is known as such.
+are orders m_y, columns m_x, from −M to M. Numbers in the header are double precision. `energy` is JSON: the tables of
+`energy_table.py`, by the kind of shadowing. `contentSha256` covers every byte of the file, so that a damaged one is
+known as such.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from ..expansions.svd import SvdSeries
 from ..expansions.taylor import TaylorSeries
 from ..files import UNSEALED, is_intact, seal, whole_file
 from ..outputs import made_for
+from .energy_table import SHADOWING, EnergyTable
 from .grating_spectrum import GratingSpectrum
 from .orders import OrderGrid
 from .series_table import SeriesTable
@@ -88,6 +90,7 @@ def save(spectrum: GratingSpectrum, path: str | os.PathLike[str], recipe: str = 
     if isinstance(spectrum.table, SeriesTable) and isinstance(spectrum.table.series, SvdSeries):
         # repr of a float is exact.
         header["modes"] = json.dumps(spectrum.table.series.modes.tolist())
+    header["energy"] = json.dumps({kind: spectrum.energy_table(kind).as_plain() for kind in SHADOWING})
     channels = _channels(spectrum.table)
     header["channelCount"] = len(channels)
     with whole_file(path) as temporary:
@@ -157,10 +160,11 @@ def load(path: str | os.PathLike[str], recipe: str | None = None) -> GratingSpec
             largest_angle=_single(header["largestAngle"]),
             dropped=_single(header["dropped"]),
             beyond=_single(header["beyond"]),
+            energy={kind: EnergyTable.from_plain(t) for kind, t in json.loads(header["energy"]).items()},
         )
     except KeyError as error:
         raise ValueError(f"{path}: a damaged spectrum, {error} is missing") from None
-    except (TypeError, ValueError, IndexError) as error:
+    except (TypeError, ValueError, IndexError, AttributeError, OverflowError, MemoryError) as error:
         raise ValueError(f"{path}: a damaged spectrum ({_one_line(error)})") from None
 
 

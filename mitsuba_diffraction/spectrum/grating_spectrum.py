@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
-from dataclasses import dataclass, field
+import threading
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import matching
 from ..coherence import lobe_reach, lobe_width
+from .energy_table import EnergyTable
 from .orders import OrderGrid
 from .series_table import SeriesTable
 from .slice_table import SliceTable
@@ -17,6 +22,8 @@ from .spline_grid import SplineGrid
 
 # The part of the tolerance that is spent on the tails of the lobes.
 TAIL_SHARE = 0.1
+
+_computing = threading.Lock()
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +45,7 @@ class GratingSpectrum:
         dropped: the largest share of the power, over κ, in weak frequencies that were not kept; part of `error`.
         beyond: the largest share of the power, over κ, at frequencies that no pair of directions reaches, or that the
             pixels do not resolve.
+        energy: the tables that bound the albedo, by the kind of shadowing; `energy_table` computes what is missing.
     """
 
     table: SeriesTable | SliceTable
@@ -53,6 +61,7 @@ class GratingSpectrum:
     largest_angle: float = 90.0
     dropped: float = 0.0
     beyond: float = 0.0
+    energy: Mapping[str, EnergyTable] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         if self.table.shape != self.grid.shape:
@@ -67,6 +76,8 @@ class GratingSpectrum:
             raise ValueError(f"source: got {self.source!r}, {self.source_digest!r}, wanted texts")
         if not (0 <= self.dropped <= 1 and 0 <= self.beyond <= 1):
             raise ValueError(f"dropped, beyond: got {self.dropped}, {self.beyond}, wanted shares of the power")
+        if not all(key == getattr(table, "shadowing", None) for key, table in self.energy.items()):
+            raise ValueError(f"energy: got {', '.join(map(str, self.energy))}, wanted energy tables by their shadowing")
         check_wavelengths(self.wavelengths)
         check_angle(self.largest_angle)
         lobe_width(self.coherence_length)
@@ -150,6 +161,34 @@ class GratingSpectrum:
                 f"{self.largest_kappa:.6g} (the spectrum was built for wavelengths from {self.wavelengths[0]:g} nm)"
             )
         return kappa
+
+    def energy_table(self, shadowing: str = "v_cavity") -> EnergyTable:
+        """What bounds the albedo by one, for these heights; computed at the first call unless it came with the file.
+
+        Raises:
+            ValueError: unless `shadowing` is "v_cavity" or "none".
+        """
+        from .albedo import GatheredSpectrum, energy_table
+
+        with _computing:
+            if shadowing not in self._energy:
+                self._energy[shadowing] = energy_table(GatheredSpectrum.of(self), shadowing)
+            return self._energy[shadowing]
+
+    @cached_property
+    def _energy(self) -> dict[str, EnergyTable]:
+        return dict(self.energy)
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 of what a renderer needs of it: spectra that have one show the same."""
+        content = hashlib.sha256()
+        for f in fields(self):
+            if f.name not in ("table", "energy", "source", "source_digest"):
+                content.update(f"{f.name}={getattr(self, f.name)!r};".encode())
+        for array in self.table.content():
+            content.update(array)
+        return content.hexdigest()
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the spectrum as an OpenEXR file, whole or not at all."""

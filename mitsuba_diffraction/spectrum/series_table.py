@@ -68,6 +68,11 @@ class SeriesTable:
         """(rows, columns) of the grid."""
         return self.terms.shape[1:]
 
+    def content(self) -> list[NDArray]:
+        """All that tells it from others, C-contiguous."""
+        weights = self.series.weights(np.linspace(0, self.largest_kappa, 2 * self.series.terms + 2))
+        return [np.frombuffer(self.representation.encode(), np.uint8), weights, np.ascontiguousarray(self.terms)]
+
     @property
     def nbytes(self) -> int:
         """Size in memory."""
@@ -80,7 +85,8 @@ class SeriesTable:
 
     def powers(self, kappa: float) -> NDArray[np.float32]:
         """c_m(κ) of all nodes, (rows, columns), in float32 as a renderer computes them; κ in rad/µm."""
-        return np.tensordot(self.series.weights(kappa).astype(np.float32), self.terms, 1)
+        # The last bits of BLAS depend on the number of cores.
+        return np.einsum("n,nyx->yx", self.series.weights(kappa).astype(np.float32), self.terms)
 
     def powers_at(
         self, row: NDArray[np.int64], column: NDArray[np.int64], kappa: NDArray[np.float64]

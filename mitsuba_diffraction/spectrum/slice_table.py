@@ -70,6 +70,10 @@ class SliceTable:
         """(rows, columns) of the grid."""
         return self.values.shape[2:]
 
+    def content(self) -> list[NDArray]:
+        """All that tells it from others, C-contiguous."""
+        return [np.ascontiguousarray(self.values)]
+
     @property
     def nbytes(self) -> int:
         """Size in memory."""
@@ -85,7 +89,8 @@ class SliceTable:
     def powers(self, kappa: float) -> NDArray[np.float32]:
         """c_m(κ) of all nodes, (rows, columns), in float32 as a renderer computes them; κ in rad/µm."""
         interval, weights = interpolation(kappa, self.largest_kappa, self.intervals)
-        return np.tensordot(weights.astype(np.float32), self.values[interval], 1)
+        # The last bits of BLAS depend on the number of cores.
+        return np.einsum("n,nyx->yx", weights.astype(np.float32), self.values[interval])
 
     def powers_at(
         self, row: NDArray[np.int64], column: NDArray[np.int64], kappa: NDArray[np.float64]
