@@ -7,11 +7,21 @@ from typing import Annotated
 
 import typer
 
-from ..coherence import SUN_COHERENCE_LENGTH
 from ..files import refuse_unwritable
 from ..precompute import REPRESENTATIONS
 from .console import progress_bar, tell
-from .scan import Channel, FillMissing, HeightRange, PixelSize, Prepare, Unit, options_of_scan, recipe_of
+from .scan import (
+    Channel,
+    CoherenceLength,
+    Extent,
+    FillMissing,
+    HeightRange,
+    PixelSize,
+    Prepare,
+    Unit,
+    options_of_scan,
+    recipe_of,
+)
 
 
 def precompute(
@@ -27,13 +37,9 @@ def precompute(
     prepare: Prepare = None,
     representation: Annotated[str | None, typer.Option(help=", ".join(REPRESENTATIONS))] = None,
     tolerance: Annotated[float | None, typer.Option(help="error allowed, as a share of the reflected power")] = None,
-    extent: Annotated[
-        str | None, typer.Option(help="tile (the patch repeats) or sample (a piece of an irregular surface)")
-    ] = None,
+    extent: Extent = None,
     largest_angle: Annotated[float | None, typer.Option(help="that the scene has, degrees from the normal")] = None,
-    coherence_length: Annotated[
-        float | None, typer.Option(help=f"µm; {SUN_COHERENCE_LENGTH:g} is that of sunlight")
-    ] = None,
+    coherence_length: CoherenceLength = None,
 ) -> None:
     """Turn a recipe or a scan into the spectrum of its phase."""
     if output is not None and len(sources) > 1:
