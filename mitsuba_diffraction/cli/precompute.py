@@ -9,6 +9,8 @@ import typer
 
 from ..files import refuse_unwritable
 from ..precompute import REPRESENTATIONS
+from ..recipe import Recipe
+from ..seam import seam_matters, seam_steps
 from .console import progress_bar, tell
 from .scan import (
     Channel,
@@ -60,7 +62,8 @@ def precompute(
         if target in targets[:number]:
             raise ValueError(f"got two sources whose spectrum would be {target}, wanted different names")
         refuse_unwritable(target)
-    for source, target in zip(sources, targets, strict=True):
+    seams = [_seam(source, recipe_of(source, of_scan, settings)) for source in sources]
+    for source, target, seam in zip(sources, targets, seams, strict=True):
         with progress_bar(f"spectrum of {source.name}") as progress:
             spectrum = recipe_of(source, of_scan, settings).build(progress)
             spectrum.save(target)
@@ -69,5 +72,26 @@ def precompute(
             f"{spectrum.coherence_length:.4g} µm; {spectrum.representation}, {spectrum.megabytes:.3g} MB, "
             f"error {spectrum.error:.1e} (asked {spectrum.tolerance:g})\n"
             f"left out, at most: {spectrum.dropped:.1e} of the power in weak frequencies; {spectrum.beyond:.1e} where "
-            "no light reaches or no pixel resolves"
+            f"no light reaches or no pixel resolves{seam}"
         )
+
+
+def _seam(source: Path, recipe: Recipe) -> str:
+    """A line on the seam of a bare scan that nobody says repeats.
+
+    Raises:
+        ValueError: if the seam would show.
+    """
+    if source.suffix.lower() == ".toml" or "extent" in recipe.spectrum:
+        return ""
+    steps = seam_steps(recipe.height_field())
+    told = " and ".join(
+        f"{across * 1e3:.3g} nm along {axis} ({inside * 1e3:.3g} inside)" for axis, (across, inside) in steps.items()
+    )
+    if seam_matters(steps):
+        raise ValueError(
+            f"--extent: got none, and {source} does not repeat without a seam: r.m.s. steps of {told}; wanted "
+            "--extent sample (a piece of an irregular surface), --extent tile (it repeats, seam and all), or "
+            "--prepare crop_periods (a grating, cropped to whole periods)"
+        )
+    return f"\nrepeats as a tile; r.m.s. steps at the seam {told}" if told else ""

@@ -103,6 +103,32 @@ def load_spectral_scene(
     return scene
 
 
+def named_sample_count(path: str | os.PathLike[str], parameters: Mapping[str, str] | None = None) -> int | None:
+    """The sample_count that a scene names for the sampler of its first sensor; None if it names none.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if the scene is wrong.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file")
+    with _files_beside(path):
+        try:
+            config = mi.parser.ParserConfig(mi.variant())
+            state = mi.parser.parse_file(config, str(path.resolve()), **(parameters or {}))
+        except Exception as error:
+            raise ValueError(f"{path}: {root_cause(error)}") from error
+    for node in state.nodes:
+        if node.type == mi.ObjectType.Sensor:
+            for child in _children(node.props).values():
+                props = state.nodes[child].props
+                if state.nodes[child].type == mi.ObjectType.Sampler and "sample_count" in props:
+                    return int(props["sample_count"])
+            return None
+    return None
+
+
 def scene_digest(path: str | os.PathLike[str], parameters: Mapping[str, str] | None = None) -> str:
     """SHA-256 of what a scene that loads is made of: its XML with the parameters put in, and the files that it names.
 
