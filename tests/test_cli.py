@@ -12,6 +12,7 @@ import OpenEXR
 import pytest
 
 import mitsuba_diffraction as md
+from mitsuba_diffraction.cli.console import log_lines
 from mitsuba_diffraction.render.spectral_image import SpectralImage
 
 # The package gives the function of that name.
@@ -73,6 +74,8 @@ def files():
         ("precompute blaze.toml blaze.toml -o out.exr", "-o: got 2 sources"),
         ("precompute scan.npy scan.toml --pixel-size 0.05", "got two sources whose spectrum would be scan.exr"),
         ("precompute scan.npy", "pixel_size"),
+        ("precompute counts.npy", "pixel_size, height_range: both missing"),
+        ("render scene.xml -D a=1 -D a=2", "-D a: got it twice"),
         ("precompute scan.npy --pixel-size 0", "pixel_size: got 0"),
         ("precompute scan.npy --pixel-size 0.05 --height-range 1", "height_range"),
         ("precompute counts.npy --pixel-size 0.05", "height_range: missing"),
@@ -229,6 +232,27 @@ def test_a_bare_scan_with_a_seam_wants_an_extent(command):
     code, out, _ = command("precompute whole.npy --pixel-size 0.05 --tolerance 0.01")
     assert code == 0
     assert "repeats as a tile; r.m.s. steps at the seam" in out
+
+
+def test_the_version_is_said(command):
+    code, out, err = command("--version")
+    assert (code, err) == (0, "")
+    assert re.fullmatch(r"mitsuba-diffraction [\d.]+\S*, Mitsuba 3\.\S+\n", out)
+
+
+def test_help_says_the_defaults(command):
+    for words in (("precompute", "auto by default"), ("precompute", "0.001 by default"), ("render", "or 64")):
+        code, out, _ = command(words[0], "--help")
+        assert code == 0
+        assert words[1] in " ".join(re.sub(r"[│|]", " ", out).split())
+
+
+def test_work_without_a_terminal_says_lines(capfd):
+    show = log_lines("scene.xml", seconds=0)
+    show(3, 7)
+    assert re.fullmatch(r"mitsuba-diffraction: scene.xml: 3 of 7, 0 s\n", capfd.readouterr().err)
+    log_lines("scene.xml")(3, 7)  # short work says nothing
+    assert capfd.readouterr().err == ""
 
 
 def test_many_sources_are_named_after_themselves(command):

@@ -82,6 +82,7 @@ def run(
     """
     cases = list(cases)
     results, shaders, total = [], [], len(cases) * len(tolerances) * len(representations)
+    progress(0, total)
     rays = Rays(count)
     for case in cases:
         exact = Exact(case, VISIBLE)

@@ -37,10 +37,14 @@ def precompute(
     channel: Channel = None,
     unit: Unit = None,
     prepare: Prepare = None,
-    representation: Annotated[str | None, typer.Option(help=", ".join(REPRESENTATIONS))] = None,
-    tolerance: Annotated[float | None, typer.Option(help="error allowed, as a share of the reflected power")] = None,
+    representation: Annotated[str | None, typer.Option(help=f"{', '.join(REPRESENTATIONS)}; auto by default")] = None,
+    tolerance: Annotated[
+        float | None, typer.Option(help="error allowed, as a share of the reflected power; 0.001 by default")
+    ] = None,
     extent: Extent = None,
-    largest_angle: Annotated[float | None, typer.Option(help="that the scene has, degrees from the normal")] = None,
+    largest_angle: Annotated[
+        float | None, typer.Option(help="that the scene has, degrees from the normal; 90 by default")
+    ] = None,
     coherence_length: CoherenceLength = None,
 ) -> None:
     """Turn a recipe or a scan into the spectrum of its phase."""

@@ -12,7 +12,7 @@ from typing import Annotated
 import typer
 
 from .arguments import scene_parameters
-from .console import err, say, tell
+from .console import err, log_lines, say, tell
 
 
 def render(
@@ -157,6 +157,10 @@ def render(
 @contextmanager
 def _progress_bar(label: str) -> Iterator[Callable[[int, int, float], None]]:
     """Samples per pixel done and expected, the error so far, the time taken and the time left."""
+    if not err.is_terminal:
+        lines = log_lines(label)
+        yield lambda done, total, error: lines(done, total)
+        return
     from rich.progress import (
         BarColumn,
         MofNCompleteColumn,
@@ -171,7 +175,6 @@ def _progress_bar(label: str) -> Iterator[Callable[[int, int, float], None]]:
         *(*columns, TextColumn("spp{task.fields[noise]}"), TimeElapsedColumn(), TimeRemainingColumn()),
         console=err,
         transient=True,
-        disable=not err.is_terminal,
         speed_estimate_period=600,  # passes of a large picture take longer than the usual half minute
     ) as bars:
         task = bars.add_task(label, total=None, noise="")

@@ -26,10 +26,13 @@ Prepare = Annotated[
     typer.Option(help=f"of a scan, a step, done in the order given: {', '.join(STEP_NAMES)}; NAME=ARGUMENT"),
 ]
 Extent = Annotated[
-    str | None, typer.Option(help="tile (the patch repeats) or sample (a piece of an irregular surface)")
+    str | None,
+    typer.Option(
+        help="tile (the patch repeats) or sample (a piece of an irregular surface); a recipe's own by default"
+    ),
 ]
 CoherenceLength = Annotated[
-    float | None, typer.Option(help=f"µm; that of sunlight, {SUN_COHERENCE_LENGTH:g}, by default")
+    float | None, typer.Option(help=f"µm; a recipe's own by default, else that of sunlight, {SUN_COHERENCE_LENGTH:g}")
 ]
 
 
