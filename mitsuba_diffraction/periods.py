@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from .bands import Band, fit_band
 from .heightfield import HeightField
 from .missing import fill_missing
 
@@ -39,14 +40,17 @@ _LOBE = 3
 
 @dataclass(frozen=True)
 class Period:
-    """One period of a height field, with standard uncertainties (one standard deviation).
+    """One period of a height field, or the centre of a band of periods, with standard uncertainties (one deviation).
 
     Attributes:
         period: µm, across the lines.
         direction: degrees of the wave vector from +x towards +y, in (−90, 90].
         period_uncertainty: µm.
         direction_uncertainty: degrees.
-        strength: share of the variance of the levelled heights in this one wave; its harmonics are not counted.
+        strength: share of the variance of the levelled heights in this one wave, whose harmonics are not counted, or
+            in the whole band.
+        width: standard deviation of the periods of a band about its centre, µm; 0 for a single period.
+        direction_width: likewise of their directions, degrees.
     """
 
     period: float
@@ -54,21 +58,34 @@ class Period:
     period_uncertainty: float
     direction_uncertainty: float
     strength: float
+    width: float = 0.0
+    direction_width: float = 0.0
 
     @classmethod
     def of(cls, q: NDArray[np.float64], spread: NDArray[np.float64], strength: float) -> Period:
         """From a frequency (2,) in cycles/µm and its covariance (2, 2)."""
         length = float(np.hypot(*q))
         along, across = q / length, np.array([-q[1], q[0]]) / length
-        direction = float(np.degrees(np.arctan2(q[1], q[0])))
-        # (−90, 90]; what is −90 but for rounding is 90.
-        direction = min(float(direction - 180 * np.ceil((direction - 90) / 180 - 1e-12)), 90.0)
         return cls(
             period=1 / length,
-            direction=direction,
+            direction=_as_direction(np.arctan2(q[1], q[0])),
             period_uncertainty=float(np.sqrt(along @ spread @ along)) / length**2,
             direction_uncertainty=float(np.degrees(np.sqrt(across @ spread @ across) / length)),
             strength=strength,
+        )
+
+    @classmethod
+    def of_band(cls, band: Band, spread: NDArray[np.float64]) -> Period:
+        """From a band and the covariance (2, 2) of its centre (ρ₀, φ₀)."""
+        length, phi = band.centre
+        return cls(
+            period=float(1 / length),
+            direction=_as_direction(phi),
+            period_uncertainty=float(np.sqrt(spread[0, 0]) / length**2),
+            direction_uncertainty=float(np.degrees(np.sqrt(spread[1, 1]))),
+            strength=band.share,
+            width=float(band.width[0] / length**2),
+            direction_width=float(np.degrees(band.width[1])),
         )
 
 
@@ -97,12 +114,16 @@ def find_periods(height_field: HeightField, count: int = 2) -> tuple[Period, ...
     covariance (each of two halves has eight times, each of four quarters sixteen times). What their mean has beyond
     that is added.
 
+    A peak that is broader than a bin of the spectrum is no wave but a band of periods: its centre, width and share are
+    fitted to all bins (`bands`), and the scatter of the centre over the quarters of the patch is added in the same way.
+
     Args:
         height_field: missing pixels are filled first. It needs no levelling.
         count: how many periods at most.
 
     Returns:
-        Strongest first, at least 15° between the directions; empty where nothing stands out (noise, a flat surface).
+        Single periods, strongest first, then bands, strongest first; at least 15° between the directions. Empty where
+        nothing stands out (noise, a flat surface).
 
     Raises:
         ValueError: if count is not a positive integer.
@@ -113,10 +134,9 @@ def find_periods(height_field: HeightField, count: int = 2) -> tuple[Period, ...
     spectrum = _Spectrum(heights, height_field.pixel_size)
     if not spectrum.scale > 1e-13 * np.abs(heights).max():  # level but for rounding
         return ()
-    waves = spectrum.peaks(int(count))
-    if not waves:
-        return ()
-    return spectrum.fit(waves)
+    waves, bands = spectrum.peaks(int(count))
+    found = [*spectrum.fit(waves), *(spectrum.band(band) for band in bands)]
+    return tuple(sorted(found, key=lambda period: (period.width > 0, -period.strength)))
 
 
 class _Spectrum:
@@ -124,6 +144,7 @@ class _Spectrum:
 
     def __init__(self, heights: NDArray[np.float64], pixel_size: tuple[float, float]) -> None:
         rows, columns = heights.shape
+        self._pixel_size = pixel_size
         self._size = np.array([columns * pixel_size[0], rows * pixel_size[1]])
         self._x = (np.arange(columns) - (columns - 1) / 2) * pixel_size[0]
         self._y = (np.arange(rows) - (rows - 1) / 2) * pixel_size[1]
@@ -137,20 +158,36 @@ class _Spectrum:
 
     # ------------------------------------------------------------ detection
 
-    def peaks(self, count: int) -> list[NDArray[np.float64]]:
-        """The frequencies of the bins at the strongest peaks that stand out, cycles/µm; none collinear."""
-        found: list[NDArray[np.float64]] = []
+    def peaks(self, count: int) -> tuple[list[NDArray[np.float64]], list[Band]]:
+        """The frequencies, cycles/µm, of the bins at the strongest peaks that stand out, and bands; none collinear."""
+        waves: list[NDArray[np.float64]] = []
+        bands: list[Band] = []
+
+        def known(q: NDArray[np.float64]) -> bool:
+            others = [*waves, *(band.centre[0] * _unit(band.centre[1]) for band in bands)]
+            return any(_angle(q, other) < _LEAST_ANGLE for other in others) or any(band.holds(q) for band in bands)
+
         for row, column in self._candidates:
             q = self._frequency(row, column)
-            if any(_angle(q, other) < _LEAST_ANGLE for other in found):
+            if known(q):
                 continue
-            q = self._fundamental(q)
-            if any(_angle(q, other) < _LEAST_ANGLE for other in found):
-                continue
-            found.append(q)
-            if len(found) == count:
+            band = None if self._alone(q) else fit_band(self._power, self._rings, self._q, self._size, q)
+            if band is not None and not band.sharp:
+                bands.append(band)
+            elif not known(q := self._fundamental(q)):
+                waves.append(q)
+            if len(waves) + len(bands) == count:
                 break
-        return found
+        return waves, bands
+
+    def _alone(self, q: NDArray[np.float64]) -> bool:
+        """Whether a peak's own lobe holds nearly all the power within half an octave and 45° of it."""
+        q_x, q_y = np.meshgrid(*self._q)
+        octaves = np.abs(np.log2(np.maximum(np.hypot(q_x, q_y), 1e-300) / np.hypot(*q)))
+        along, across = q_x * q[0] + q_y * q[1], q_y * q[0] - q_x * q[1]
+        lobe = np.hypot((q_x - q[0]) * self._size[0], (q_y - q[1]) * self._size[1]) <= 2
+        about = (octaves < 0.5) & (np.abs(across) < along) | lobe
+        return bool(self._power[lobe].sum() > 0.8 * self._power[about].sum())
 
     def _frequency(self, row: int, column: int) -> NDArray[np.float64]:
         return np.array([self._q[0][column], self._q[1][row]])
@@ -177,13 +214,15 @@ class _Spectrum:
             return []
         # Of noise, a power is distributed as an exponential about its mean, which is the quartile over ln 4/3.
         level = np.log(usable.sum() / _FALSE_ALARM) / np.log(4 / 3)
-        background = self._rings(usable, np.hypot(*np.meshgrid(*self._q)))
+        background = self._rings
         # About a wave without noise there is nothing but rounding.
         least = _ROUNDING * power[usable].max()
         return [p for p in self._maxima if power[p] > max(least, level * max(background[p], self._streak(*p)))]
 
-    def _rings(self, usable: NDArray[np.bool_], length: NDArray[np.float64]) -> NDArray[np.float64]:
+    @cached_property
+    def _rings(self) -> NDArray[np.float64]:
         """The lower quartile of the power over frequencies of about the same length, by power laws between rings."""
+        usable, length = self._usable, np.hypot(*np.meshgrid(*self._q))
         lengths, powers = length[usable], self._power[usable]
         order = np.argsort(lengths, kind="stable")
         rings = max(1, len(order) // _RING)
@@ -225,18 +264,37 @@ class _Spectrum:
 
     # ------------------------------------------------------------ fit
 
-    def fit(self, waves: list[NDArray[np.float64]]) -> tuple[Period, ...]:
+    def fit(self, waves: list[NDArray[np.float64]]) -> list[Period]:
         """The waves by least squares, from the frequencies of their bins."""
         whole = _Waves(self._heights, self._x, self._y, degree=2)
-        q = whole.frequencies(np.array(waves))
+        while waves:
+            q = whole.frequencies(np.array(waves))
+            # What goes further from its peak is no wave: half of one fits a single bump of the patch.
+            near = (np.abs((q - waves) * self._size) <= 1).all(axis=1)
+            if near.all():
+                break
+            waves = [wave for wave, kept in zip(waves, near, strict=True) if kept]
+        if not waves:
+            return []
         amplitude, noise, variance = whole.amplitudes(q)
         strength = np.abs(amplitude) ** 2 / 2 / variance
         found = []
         for k in range(len(q)):
             spread = noise[k] + self._wander(q[k], 4 * noise[k])
             found.append(Period.of(q[k], spread, float(min(strength[k], 1.0))))
-        found = [period for period in found if period.strength >= _LEAST_STRENGTH]
-        return tuple(sorted(found, key=lambda period: -period.strength))
+        return [period for period in found if period.strength >= _LEAST_STRENGTH]
+
+    def band(self, band: Band) -> Period:
+        """The period of a band, its uncertainty with that of the mean of the quarters' centres beyond noise."""
+        found, expected = [], []
+        for r in _halves(self._heights.shape[0]):
+            for c in _halves(self._heights.shape[1]):
+                part = _Spectrum(self._heights[r, c], self._pixel_size)
+                at = band.centre[0] * _unit(band.centre[1])
+                quarter = fit_band(part._power, part._rings, part._q, part._size, at)
+                found.append(quarter.centre)
+                expected.append(quarter.covariance)
+        return Period.of_band(band, band.covariance + _beyond(np.array(found), np.mean(expected, axis=0) / len(found)))
 
     def _wander(self, q: NDArray[np.float64], expected: NDArray[np.float64]) -> NDArray[np.float64]:
         """The covariance of the mean frequency of the halves or quarters of the patch, beyond that of noise."""
@@ -250,11 +308,7 @@ class _Spectrum:
                 for c in columns
             ]
         )
-        if len(found) == 1:
-            return np.zeros((2, 2))
-        scatter = (found - found.mean(axis=0)).T @ (found - found.mean(axis=0)) / len(found) / (len(found) - 1)
-        values, axes = np.linalg.eigh(scatter - expected)
-        return axes @ np.diag(np.maximum(values, 0)) @ axes.T
+        return _beyond(found, expected)
 
 
 class _Waves:
@@ -358,6 +412,25 @@ class _LeastSquares:
     def covariance(self) -> NDArray:
         """Of the coefficients, under white noise of variance one."""
         return self._inverse @ self._gram(2) @ self._inverse
+
+
+def _beyond(found: NDArray[np.float64], expected: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The covariance of the mean of estimates (n, 2) by their scatter, beyond that which is expected of noise."""
+    if len(found) == 1:
+        return np.zeros((2, 2))
+    scatter = (found - found.mean(axis=0)).T @ (found - found.mean(axis=0)) / len(found) / (len(found) - 1)
+    values, axes = np.linalg.eigh(scatter - expected)
+    return axes @ np.diag(np.maximum(values, 0)) @ axes.T
+
+
+def _unit(phi: float) -> NDArray[np.float64]:
+    return np.array([np.cos(phi), np.sin(phi)])
+
+
+def _as_direction(phi: float) -> float:
+    """Degrees in (−90, 90]; what is −90 but for rounding is 90."""
+    degrees = float(np.degrees(phi))
+    return min(float(degrees - 180 * np.ceil((degrees - 90) / 180 - 1e-12)), 90.0)
 
 
 def _polynomials(x: NDArray, y: NDArray, degree: int) -> list[tuple[NDArray, NDArray]]:

@@ -233,7 +233,7 @@ def crop_periods(height_field: HeightField, axes: str = "xy") -> HeightField:
         raise ValueError(f"crop_periods: got {axes!r}, wanted 'x', 'y' or 'xy'")
     if height_field.gaps.any():
         raise ValueError(f"crop_periods: {height_field.gaps.sum()} pixels are missing, wanted fill_missing before it")
-    found = find_periods(height_field)
+    found = [period for period in find_periods(height_field) if not period.width]
     waves = [wave for wave in found if wave.strength >= _LEAST_STRENGTH * found[0].strength]
     if not waves:
         raise ValueError("crop_periods: no period stands out of the spectrum of the heights")

@@ -53,6 +53,14 @@ def scan_file():
 
 
 @pytest.fixture
+def scan_folder():
+    """Where the measured scans lie."""
+    if not _DATA.is_dir():
+        pytest.skip(f"{_DATA} is not there")
+    return _DATA
+
+
+@pytest.fixture
 def scan(scan_file):
     """scan(name): the height field of a measured scan."""
     return lambda name: md.read_height_field(scan_file(name), pixel_size=0.0586, height_range=_HEIGHT_RANGE[name])

@@ -2,6 +2,7 @@
 
 import importlib
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -16,6 +17,8 @@ import pytest
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction.cli.arguments import scene_parameters
+from mitsuba_diffraction.cli.console import log_lines
+from mitsuba_diffraction.render.spectral_image import SpectralImage
 
 # The package gives the function of that name.
 PRECOMPUTE = importlib.import_module("mitsuba_diffraction.precompute")
@@ -76,6 +79,8 @@ def files():
         ("precompute blaze.toml blaze.toml -o out.exr", "-o: got 2 sources"),
         ("precompute scan.npy scan.toml", "scan.exr would be written twice"),
         ("precompute scan.npy", "pixel_size"),
+        ("precompute counts.npy", "pixel_size, height_range: both missing"),
+        ("render scene.xml -D a=1 -D a=2", "-D a: got it twice"),
         ("precompute scan.npy --pixel-size 0", "pixel_size: got 0"),
         ("precompute scan.npy --pixel-size 0.05 --height-range 1", "height_range"),
         ("precompute counts.npy --pixel-size 0.05", "height_range: missing"),
@@ -199,7 +204,7 @@ def test_options_go_before_the_recipe(command):
 
 
 def test_scans_with_their_scale(command):
-    code, _, _ = command("precompute counts.npy --pixel-size 0.05 --height-range 0.5 -o out.exr")
+    code, _, _ = command("precompute counts.npy --extent tile --pixel-size 0.05 --height-range 0.5 -o out.exr")
     assert code == 0
     spectrum = md.GratingSpectrum.load("out.exr")
     assert spectrum.height_range == pytest.approx(47 / 255 * 0.5)
@@ -208,12 +213,51 @@ def test_scans_with_their_scale(command):
 
 
 def test_missing_pixels_of_a_scan_are_filled_on_request(command):
-    code, out, _ = command("precompute holed.npy --pixel-size 0.05 --fill-missing -o out.exr")
+    code, out, _ = command("precompute holed.npy --extent tile --pixel-size 0.05 --fill-missing -o out.exr")
     assert code == 0
     assert "out.exr: holed.npy (1 missing pixel filled); " in out
     spectrum = md.GratingSpectrum.load("out.exr")
     assert spectrum.source == "holed.npy (1 missing pixel filled)"
     assert spectrum.source_digest == md.HeightField(np.load("holed.npy"), 0.05, fill_missing=True).digest
+
+
+def test_a_bare_scan_with_a_seam_wants_an_extent(command):
+    x = np.arange(48) * 0.05
+    np.save("whole.npy", 0.1 * np.sin(2 * np.pi * x / 0.8) + np.zeros((8, 1)))
+    np.save("broken.npy", 0.1 * np.sin(2 * np.pi * x / 0.9) + np.zeros((8, 1)))
+    before = files()
+    code, out, err = command("precompute broken.npy --pixel-size 0.05 --tolerance 0.01")
+    assert (code, out, files()) == (2, "", before)
+    assert len(err.splitlines()) == 1
+    assert re.search(r"r.m.s. steps of 64.3 nm along x \(\d\d.\d inside\) and 0 nm along y", err)
+    for words in ("--extent sample", "--extent tile", "crop_periods"):
+        assert words in err
+    code, out, _ = command("precompute broken.npy --pixel-size 0.05 --tolerance 0.01 --extent tile")
+    assert (code, "seam" in out) == (0, False)
+    code, out, _ = command("precompute whole.npy --pixel-size 0.05 --tolerance 0.01")
+    assert code == 0
+    assert "repeats as a tile; r.m.s. steps at the seam" in out
+
+
+def test_the_version_is_said(command):
+    code, out, err = command("--version")
+    assert (code, err) == (0, "")
+    assert re.fullmatch(r"mitsuba-diffraction [\d.]+\S*, Mitsuba 3\.\S+\n", out)
+
+
+def test_help_says_the_defaults(command):
+    for words in (("precompute", "auto by default"), ("precompute", "0.001 by default"), ("render", "or 64")):
+        code, out, _ = command(words[0], "--help")
+        assert code == 0
+        assert words[1] in " ".join(re.sub(r"[│|]", " ", out).split())
+
+
+def test_work_without_a_terminal_says_lines(capfd):
+    show = log_lines("scene.xml", seconds=0)
+    show(3, 7)
+    assert re.fullmatch(r"mitsuba-diffraction: scene.xml: 3 of 7, 0 s\n", capfd.readouterr().err)
+    log_lines("scene.xml")(3, 7)  # short work says nothing
+    assert capfd.readouterr().err == ""
 
 
 def test_many_sources_are_named_after_themselves(command):
@@ -244,7 +288,7 @@ def test_a_folder_whose_name_looks_like_markup_is_no_crash(command):
 
 
 def test_a_warning_is_a_line_and_not_a_failure(command):
-    code, out, err = command("precompute scan.npy --pixel-size 0.2 -o out.exr")
+    code, out, err = command("precompute scan.npy --extent tile --pixel-size 0.2 -o out.exr")
     assert code == 0
     assert "out.exr" in out
     told = [line for line in err.splitlines() if line]
@@ -284,6 +328,24 @@ def test_help_is_for_asking(command):
     assert code == 0
     assert "precompute" in out
     assert "render" in out
+
+
+def test_the_samples_of_a_scene_are_taken_and_a_file_may_be_half(command):
+    line = "render sampled.xml -o out.exr --width 8 --variant llvm_ad_spectral -D spectrum=blaze.toml"
+    sampler = '<sampler type="independent"><integer name="sample_count" value="3"/></sampler></sensor>'
+    Path("sampled.xml").write_text(SCENE.replace("</sensor>", sampler))
+    code, out, err = command(line)
+    assert code == 0, err
+    whole, size = SpectralImage.load("out.exr"), Path("out.exr").stat().st_size
+    assert whole.attributes["spp"] == 3
+    assert f" s, {size / 1e6:.3g} MB\n" in out
+    Path("out.exr").unlink()
+    code, _, err = command(f"{line} --half")
+    assert code == 0, err
+    assert Path("out.exr").stat().st_size < 0.7 * size
+    half = SpectralImage.load("out.exr").radiance
+    np.testing.assert_allclose(half, whole.radiance, rtol=2.0**-11, atol=3e-8)
+    assert (half != whole.radiance).any()
 
 
 def test_render_writes_a_spectral_picture_and_a_preview(command):

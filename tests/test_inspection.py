@@ -17,10 +17,10 @@ from mitsuba_diffraction.color import into_gamut, spectrum_to_linear_sRGB, spect
 from mitsuba_diffraction.inspection import inspect, save_picture
 from mitsuba_diffraction.inspection.colours import WAVELENGTHS, daylight, order_angle, order_share, radiance
 from mitsuba_diffraction.inspection.concerns import concerns
-from mitsuba_diffraction.inspection.picture import with_uncertainty
+from mitsuba_diffraction.inspection.picture import _piece, with_uncertainty
 from mitsuba_diffraction.inspection.statistics import statistics
 from mitsuba_diffraction.inspection.tip import broadened, scanned
-from mitsuba_diffraction.scalar_theory import geometry
+from mitsuba_diffraction.scalar_theory import equivalent_depth, expected_error, geometry
 
 ROOT = Path(__file__).parents[1]
 PERIOD, DEPTH = 2.0, 0.2
@@ -358,6 +358,49 @@ def test_inspect_tells_and_draws(folder, command):
     assert {path.name for path in folder.iterdir()} == {
         *("waves.npy", "grey.png", "foil.toml", "numbers.json", "waves_inspect.png")
     }
+
+
+def test_one_period_of_a_profile(folder, command):
+    np.save("ridges.npy", 0.1 * np.abs(np.sin(np.pi * np.arange(256) / 256))[None])
+    code, out, err = command("inspect ridges.npy --pixel-size 0.005078125")
+    assert (code, err) == (0, "")
+    assert "none stands out (if the patch is one period of a grating: --extent tile)" in out
+    code, out, err = command("inspect ridges.npy --pixel-size 0.005078125 --extent tile")
+    assert (code, err) == (0, "")
+    assert "period            1.3 µm along 0°" in out
+    tips = re.findall(r"tip broadening.*?\)\s+(\S+)", out)
+    assert tips == ["+0.0%", "+0.0%"]
+    for panel in (slice(80, 420), slice(820, 1270)):  # the surface, its spectrum
+        pixels = np.asarray(Image.open("ridges_inspect.png").convert("L"))[200:630, panel].astype(int)
+        assert (np.ptp(pixels, axis=0) > 0).any()
+        assert pixels.std() > 20
+
+
+def test_options_of_precompute(folder, command):
+    heights = np.load("waves.npy")
+    np.save("waves.npy", heights + 0.01 * np.arange(100))
+    code, out, _ = command("inspect waves.npy --pixel-size 0.08")
+    assert "Level it" in out
+    code, out, err = command("inspect waves.npy --pixel-size 0.08 --plane --coherence-length 3 --extent sample")
+    assert (code, err) == (0, "")
+    assert "Level it" not in out
+    assert "coherence length  3 µm" in out
+
+
+def test_scalar_theory_is_judged_at_every_period():
+    x = (np.arange(150) + 0.5) * 0.08
+    crossed = 0.04 * np.sin(2 * np.pi * x / 3) + 0.02 * np.sin(2 * np.pi * x / 0.8)[:, None]
+    both = inspect(md.HeightField(crossed, 0.08))
+    assert [round(period.period, 2) for period in both.periods] == [3.0, 0.8]
+    depth = equivalent_depth(both.statistics.Sq)
+    assert both.scalar_error[550] == pytest.approx(expected_error(both.periods[1].period, depth, 0.55))
+    assert both.scalar_error[550] > 2 * expected_error(3.0, depth, 0.55)
+
+
+def test_the_slide_of_a_large_tile_shows_a_dozen_periods():
+    tile = md.HeightField(np.tile(md.gratings.sinusoidal(PERIOD, DEPTH, samples=16).heights, (32, 8)), PERIOD / 16)
+    piece = _piece(inspect(tile, extent="tile", coherence_length=5.0))
+    assert piece.tile_size == pytest.approx((24.0, 24.0))
 
 
 def test_inspect_takes_a_recipe(folder, command):

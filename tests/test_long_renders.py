@@ -352,7 +352,7 @@ def test_the_command_is_interrupted_and_goes_on(command, monkeypatch):
 
     code, out, err = command(f"{LINE} --resume")
     assert (code, err) == (0, "")
-    assert "6 samples per pixel, error" in out
+    assert "6 samples per pixel, relative error of luminance" in out
     assert files() == {"scene.xml", "out.exr", "out.png"}
     picture = SpectralImage.load("out.exr")
     np.testing.assert_array_equal(picture.radiance, render("scene.xml", spp=6).radiance)
@@ -372,7 +372,7 @@ def test_the_command_stops_at_an_error_and_says_if_it_is_not_reached(command):
     assert "(not " not in out
     code, out, err = command(f"{LINE} --spp 8 --until-error 0.001 --overwrite")
     assert (code, err) == (0, "")
-    assert "8 samples per pixel, error 0." in out
+    assert "8 samples per pixel, relative error of luminance 0." in out
     assert "(not 0.001: more --spp" in out
 
 
@@ -524,7 +524,7 @@ def test_a_turntable_writes_frames_and_an_animation_and_resumes(command, monkeyp
     expected = {f"out_{number:03d}.{kind}" for number in range(3) for kind in ("exr", "png")}
     assert files() == {"scene.xml", "out.webp", *expected}
     assert Path("out_000.exr").stat().st_mtime_ns == first
-    assert len({line.split("exposure ")[1] for line in out.splitlines() if "exposure" in line}) == 1
+    assert len({line.split("radiance times ")[1] for line in out.splitlines() if "exposure" in line}) == 1
     for number, motion in enumerate(orbit("scene.xml", 3)):
         picture = SpectralImage.load(f"out_{number:03d}.exr")
         np.testing.assert_array_equal(picture.radiance, render("scene.xml", spp=2, motion=motion).radiance)

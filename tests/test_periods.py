@@ -219,3 +219,53 @@ def test_a_period_is_plain_numbers():
     (found,) = find_periods(HeightField(wave((40, 40), 0.5, 10), PIXEL))
     assert isinstance(found, Period)
     assert {type(value) for value in vars(found).values()} == {float}
+
+
+# ---------------------------------------------------------------- bands
+
+
+def fingers(seed, width=0.2, shape=(160, 160), pixel=0.06):
+    """Noise with a Gaussian band about 1.8 cycles/µm along x (σ: `width` along ρ, 8° in φ) on a white floor."""
+    q_x, q_y = np.meshgrid(np.fft.fftfreq(shape[1], pixel), np.fft.fftfreq(shape[0], pixel))
+    rho, phi = np.hypot(q_x, q_y), np.arctan2(q_y, np.abs(q_x)) * np.sign(q_x + 1e-9)
+    power = np.exp(-(((rho - 1.8) / width) ** 2) / 2 - (phi / np.radians(8)) ** 2 / 2) + 1e-4
+    white = np.fft.fft2(np.random.default_rng(seed).standard_normal(shape))
+    return HeightField(np.fft.ifft2(white * np.sqrt(power)).real, pixel)
+
+
+def test_a_band_is_told_by_its_centre_and_not_by_its_strongest_bin():
+    errors = []
+    for seed in range(8):
+        (band,) = find_periods(fingers(seed), 1)
+        assert band.width * 1.8**2 == pytest.approx(0.2, rel=0.25)
+        assert band.direction_width == pytest.approx(8, rel=0.25)
+        assert band.strength > 0.8
+        errors.append((1 / band.period - 1.8) / (band.period_uncertainty * 1.8**2))
+        errors.append(band.direction / band.direction_uncertainty)
+    assert np.abs(errors).max() < 3.5
+    assert 0.4 < np.sqrt(np.mean(np.square(errors))) < 1.6
+
+
+def test_crops_confirm_the_uncertainty_of_the_fingers(scan_folder):
+    heights = np.load(scan_folder / "xenopeltis_afm_20um.npz")["heights"].astype(float)
+    whole = HeightField(heights, 20 / 370, fill_missing=True)
+    rows, band = find_periods(whole)
+    assert (rows.period, rows.direction) == pytest.approx((1.550, -89.6), rel=1e-3)
+    assert rows.period_uncertainty == pytest.approx(0.023, abs=0.001)
+    assert rows.width == 0
+    assert band.period == pytest.approx(0.56, abs=0.005)
+    assert band.strength == pytest.approx(1 / 3, abs=0.05)
+    errors = []
+    for i, j in ((0, 0), (0, 93), (93, 93)):
+        crop = HeightField(whole.heights[i : i + 277, j : j + 277], whole.pixel_size)
+        (part,) = [period for period in find_periods(crop) if period.width]
+        errors.append((part.period - band.period) / np.hypot(part.period_uncertainty, band.period_uncertainty))
+    assert np.abs(errors).max() < 2.5
+    # An uncertainty that is much too great would agree with everything.
+    assert np.sqrt(np.mean(np.square(errors))) > 0.2
+
+
+def test_half_a_wave_is_no_period():
+    # |sin| over one period is exactly half a wave of twice the period.
+    ridge = np.abs(np.sin(np.pi * np.arange(256) / 256))[None]
+    assert find_periods(HeightField(0.1 * ridge, (1.3 / 256, 1.3))) == ()

@@ -464,7 +464,7 @@ def test_the_command_takes_the_same_of_a_scan(tmp_path, command, monkeypatch):
     monkeypatch.chdir(tmp_path)
     tilted(tmp_path)
     steps = "--prepare level_plane --prepare fill_missing --prepare trim_edges=0.1 --prepare crop_periods=x"
-    code, out, err = command(f"precompute scan.npy --pixel-size 0.05 --tolerance 0.01 {steps}")
+    code, out, err = command(f"precompute scan.npy --pixel-size 0.05 --tolerance 0.01 --extent tile {steps}")
     assert code == 0, err
     source = GratingSpectrum.load("scan.exr").source
     assert out.startswith(f"scan.exr: {source}; tile, ")
@@ -475,7 +475,7 @@ def test_the_command_takes_the_same_of_a_scan(tmp_path, command, monkeypatch):
         "crop_periods",
     ]
     (tmp_path / "scan.xyz").write_text("0 0 1\n1 0 2\n0 1 3\n1 1 4\n")
-    code, out, err = command("precompute scan.xyz --unit um --unit nm -o points.exr --tolerance 0.01")
+    code, out, err = command("precompute scan.xyz --unit um --unit nm --extent tile -o points.exr --tolerance 0.01")
     assert code == 0, err
     assert GratingSpectrum.load("points.exr").height_range == pytest.approx(3e-3)
     for arguments, words in (

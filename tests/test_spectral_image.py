@@ -168,3 +168,10 @@ def test_whole_file_follows_links(tmp_path):
         temporary.write_text("new")
     assert (tmp_path / "link.txt").is_symlink()
     assert (tmp_path / "target.txt").read_text() == "new"
+
+
+def test_half_precision_refuses_what_it_cannot_hold(tmp_path):
+    image = SpectralImage([500.0, 505.0], np.full((1, 1, 2), 7e4))
+    with pytest.raises(ValueError, match=r"half: got radiances up to .*float32"):
+        image.save(tmp_path / "a.exr", half=True)
+    assert list(tmp_path.iterdir()) == []

@@ -87,6 +87,7 @@ def run(
         check_tolerance(tolerance)
     cases = list(cases)
     results, shaders, total = [], [], len(cases) * len(tolerances) * len(representations)
+    progress(0, total)
     rays = Rays(count)
     for case in cases:
         exact = Exact(case, VISIBLE)

@@ -18,8 +18,13 @@ def base_from(props: mi.Properties) -> Base | None:
     """The nested BSDF that the parameter `base` holds, if there is one.
 
     Raises:
-        ValueError: if it is not a BSDF that reflects and lets nothing through.
+        ValueError: if it is not a BSDF that reflects and lets nothing through, or has another name.
     """
+    others = [name for name, value in props.objects() if name != "base" and isinstance(value, mi.BSDF)]
+    if others:
+        raise ValueError(
+            'base: got a nested BSDF without this name, wanted <bsdf name="base" …> (in load_dict, the key "base")'
+        )
     if "base" not in props:
         return None
     bsdf = props["base"]

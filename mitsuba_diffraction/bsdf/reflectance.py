@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -89,6 +91,7 @@ class Conductor:
     transparent = False
 
     def __init__(self, material: str, model: str) -> None:
+        _refuse_unknown_material(material)
         metal = mi.traverse(mi.load_dict({"type": "conductor", "material": material}))
         self.eta, self.k = (self._spectrum(metal, name) for name in ("eta", "k"))
         self.material = material
@@ -130,6 +133,19 @@ class Conductor:
 
     def __repr__(self) -> str:
         return f"conductor, {self.material}, {self.model}"
+
+
+def _refuse_unknown_material(material: str) -> None:
+    """Mitsuba would say which file is missing; the files are the list of the names."""
+    tables = Path(str(mi.file_resolver().resolve("data/ior/Al.eta.spd"))).parent.glob("*.eta.spd")
+    names = ["none", *sorted(path.name.removesuffix(".eta.spd") for path in tables)]
+    if len(names) > 1 and material not in names:
+        close = [name for name in names if name.lower().startswith(str(material)[:2].lower())]
+        raise ValueError(
+            f"material: got {material!r}, "
+            + (f"did you mean {' or '.join(close)}? " if close else "")
+            + f"wanted one of {', '.join(names)}"
+        )
 
 
 def _schlick(normal: mi.UnpolarizedSpectrum, cos_half: mi.Float) -> mi.UnpolarizedSpectrum:

@@ -48,6 +48,11 @@ def surface_from(props: mi.Properties) -> tuple[GratingSpectrum, Recipe | None]:
 
 def _from_file(path: Path) -> tuple[GratingSpectrum, Recipe | None]:
     suffix = path.suffix.lower()
+    if suffix in (".toml", ".exr") and not path.is_file():
+        # What is not found stays relative; the folder of a scene is searched first.
+        folder = Path(str(mi.file_resolver()[0])) / path.parent
+        there = sorted(other.name for other in folder.glob("*") if other.suffix.lower() in (".exr", ".toml"))
+        raise FileNotFoundError(f"{path}: no such file; {folder} holds {', '.join(there) or 'no spectrum'}")
     if suffix == ".toml":
         recipe = Recipe.load(path)
         return recipe.cached(), recipe

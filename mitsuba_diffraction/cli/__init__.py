@@ -9,12 +9,14 @@ import io
 import signal
 import sys
 import warnings
+from importlib import metadata
+from typing import Annotated
 
 import typer
 
 from .benchmark import benchmark
 from .compare import compare
-from .console import NAME, Stopped, say
+from .console import NAME, Stopped, say, tell
 from .inspect import inspect
 from .precompute import precompute
 from .render import render
@@ -28,8 +30,16 @@ for _command in (inspect, precompute, render, compare, validate, benchmark):
     app.command()(_command)
 
 
+def _say_version(wanted: bool) -> None:
+    if wanted:
+        tell(f"{NAME} {metadata.version('mitsuba_diffraction')}, Mitsuba {metadata.version('mitsuba')}")
+        raise typer.Exit
+
+
 @app.callback()
-def _commands() -> None:
+def _commands(
+    version: Annotated[bool, typer.Option("--version", callback=_say_version, is_eager=True)] = False,
+) -> None:
     """Diffraction gratings for Mitsuba 3."""
 
 

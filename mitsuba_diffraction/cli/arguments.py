@@ -16,7 +16,7 @@ def scene_parameters(define: Sequence[str] | None) -> dict[str, str]:
     """The scene's parameters from the -D NAME=VALUE of a command line.
 
     Raises:
-        ValueError: if one is not of that form, or not UTF-8.
+        ValueError: if one is not of that form, not UTF-8, or given twice.
     """
     parameters = {}
     for item in define or []:
@@ -24,6 +24,8 @@ def scene_parameters(define: Sequence[str] | None) -> dict[str, str]:
         if not (name and equals):
             raise ValueError(f"-D: got {item!r}, wanted NAME=VALUE")
         _refuse_other_than_utf8(item)
+        if name in parameters:
+            raise ValueError(f"-D {name}: got it twice, wanted one value")
         # A file named on the command line is relative to where the command is given. A bare word or number is no file,
         # whatever lies there under that name.
         named = os.path.isfile(value) and (os.path.dirname(value) or Path(value).suffix[1:2].isalpha())

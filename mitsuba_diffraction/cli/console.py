@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -18,10 +19,26 @@ class Stopped(Exception):
     """Ctrl-C where something is kept; the text says what."""
 
 
+def log_lines(label: str, seconds: float = 30.0) -> Callable[[int, int], None]:
+    """Progress where there is no terminal: a line on stderr every so many seconds, none for short work."""
+    start = last = time.monotonic()
+
+    def show(done: int, total: int) -> None:
+        nonlocal last
+        if (now := time.monotonic()) - last >= seconds:
+            last = now
+            say(label, f"{done} of {total}, {now - start:.0f} s")
+
+    return show
+
+
 @contextmanager
 def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
+    if not err.is_terminal:
+        yield log_lines(label)
+        return
     columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, TimeRemainingColumn(), console=err, transient=True, disable=not err.is_terminal) as bars:
+    with Progress(*columns, TimeRemainingColumn(), console=err, transient=True) as bars:
         task = bars.add_task(label, total=None)
         yield lambda done, total: bars.update(task, completed=done, total=total)
 

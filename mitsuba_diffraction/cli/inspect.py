@@ -21,7 +21,18 @@ from ..scalar_theory import TRUSTED
 from .arguments import Overwrite, claim
 from .console import out, progress_bar, tell
 from .inputs import files_read
-from .scan import Channel, FillMissing, HeightRange, PixelSize, Prepare, Unit, options_of_scan, recipe_of
+from .scan import (
+    Channel,
+    CoherenceLength,
+    Extent,
+    FillMissing,
+    HeightRange,
+    PixelSize,
+    Prepare,
+    Unit,
+    options_of_scan,
+    recipe_of,
+)
 
 
 def inspect(
@@ -36,7 +47,10 @@ def inspect(
     fill_missing: FillMissing = False,
     channel: Channel = None,
     unit: Unit = None,
+    plane: Annotated[bool, typer.Option("--plane", help="level the scan first, as --prepare level_plane")] = False,
     prepare: Prepare = None,
+    extent: Extent = None,
+    coherence_length: CoherenceLength = None,
     json: Annotated[Path | None, typer.Option(help="write the numbers here, too")] = None,
     overwrite: Overwrite = False,
 ) -> None:
@@ -47,8 +61,11 @@ def inspect(
     if picture.suffix.lower() not in (".png", ".pdf", ".svg"):
         raise ValueError(f"-o: got {picture}, wanted a file name that ends in .png, .pdf or .svg")
     claim(context, reads, [("-o", picture), *([("--json", json)] if json else [])])
-    of_scan = options_of_scan(pixel_size, height_range, fill_missing, channel, unit, prepare)
-    recipe = recipe_of(source, of_scan, {})
+    of_scan = options_of_scan(
+        pixel_size, height_range, fill_missing, channel, unit, [*["level_plane"] * plane, *(prepare or [])]
+    )
+    settings = {"extent": extent, "coherence_length": coherence_length}
+    recipe = recipe_of(source, of_scan, {name: value for name, value in settings.items() if value is not None})
     height_field = recipe.height_field()
     with progress_bar(f"spectra of {source.name}") as progress:
         inspection = look(
@@ -109,15 +126,15 @@ def _light(inspection: Inspection) -> list[tuple[str, str]]:
     lines = []
     for number, period in enumerate(inspection.periods):
         where = f"{with_uncertainty(period.direction, period.direction_uncertainty)}° from x"
-        lines.append(
-            (
-                "period" if number == 0 else "another period",
-                f"{with_uncertainty(period.period, period.period_uncertainty)} µm along {where}; "
-                f"{period.strength:.1%} of the variance",
-            )
-        )
+        name = "period" if number == 0 else "another period"
+        what = f"{with_uncertainty(period.period, period.period_uncertainty)} µm along {where}; "
+        if period.width:
+            name = "band of periods"
+            what += f"± {period.width:.2g} µm and ± {period.direction_width:.2g}° wide (1 σ), "
+        lines.append((name, f"{what}{period.strength:.1%} of the variance"))
     if not inspection.periods:
-        lines.append(("period", "none stands out"))
+        one = " (if the patch is one period of a grating: --extent tile)" if inspection.extent == "sample" else ""
+        lines.append(("period", f"none stands out{one}"))
     else:
         angles = []
         for order in range(1, 4):
@@ -146,6 +163,7 @@ def _scalar(inspection: Inspection) -> str:
     text += f"{' / '.join(map(str, told))} nm"
     beyond = [f"{nm} nm" for nm in errors if nm not in told]
     text += f"; beyond all that was calculated at {', '.join(beyond)}" if beyond else ""
+    text += " (the worst of all periods)" if len(inspection.periods) > 1 else ""
     worst = max(errors[nm] for nm in told)
     return text + ("; right directions, powers only roughly" if worst > TRUSTED else "")
 

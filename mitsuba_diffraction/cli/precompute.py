@@ -7,12 +7,24 @@ from typing import Annotated
 
 import typer
 
-from ..coherence import SUN_COHERENCE_LENGTH
 from ..precompute import REPRESENTATIONS
+from ..recipe import Recipe
+from ..seam import seam_matters, seam_steps
 from .arguments import Overwrite, claim
 from .console import progress_bar, tell
 from .inputs import files_read
-from .scan import Channel, FillMissing, HeightRange, PixelSize, Prepare, Unit, options_of_scan, recipe_of
+from .scan import (
+    Channel,
+    CoherenceLength,
+    Extent,
+    FillMissing,
+    HeightRange,
+    PixelSize,
+    Prepare,
+    Unit,
+    options_of_scan,
+    recipe_of,
+)
 
 
 def precompute(
@@ -27,16 +39,16 @@ def precompute(
     channel: Channel = None,
     unit: Unit = None,
     prepare: Prepare = None,
-    representation: Annotated[str | None, typer.Option(help=", ".join(REPRESENTATIONS))] = None,
-    tolerance: Annotated[float | None, typer.Option(help="error allowed, as a share of the reflected power")] = None,
-    extent: Annotated[
-        str | None, typer.Option(help="tile (the patch repeats) or sample (a piece of an irregular surface)")
+    representation: Annotated[str | None, typer.Option(help=f"{', '.join(REPRESENTATIONS)}; auto by default")] = None,
+    tolerance: Annotated[
+        float | None, typer.Option(help="error allowed, as a share of the reflected power; 0.001 by default")
     ] = None,
-    largest_angle: Annotated[float | None, typer.Option(help="that the scene has, degrees from the normal")] = None,
+    extent: Extent = None,
+    largest_angle: Annotated[
+        float | None, typer.Option(help="that the scene has, degrees from the normal; 90 by default")
+    ] = None,
+    coherence_length: CoherenceLength = None,
     largest_height_range: Annotated[float | None, typer.Option(help="µm; a deeper surface is refused")] = None,
-    coherence_length: Annotated[
-        float | None, typer.Option(help=f"µm; {SUN_COHERENCE_LENGTH:g} is that of sunlight")
-    ] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Turn a recipe or a scan into the spectrum of its phase."""
@@ -58,7 +70,8 @@ def precompute(
             raise ValueError(f"-o: got {target}, wanted a file name that ends in .exr")
     reads = [file for source in sources for file in files_read(source)]
     claim(context, reads, [("-o" if output else f"spectrum of {s}", t) for s, t in zip(sources, targets, strict=True)])
-    for source, target in zip(sources, targets, strict=True):
+    seams = [_seam(source, recipe_of(source, of_scan, settings)) for source in sources]
+    for source, target, seam in zip(sources, targets, seams, strict=True):
         with progress_bar(f"spectrum of {source.name}") as progress:
             spectrum = recipe_of(source, of_scan, settings).build(progress)
             spectrum.save(target)
@@ -67,5 +80,26 @@ def precompute(
             f"{spectrum.coherence_length:.4g} µm; {spectrum.representation}, {spectrum.megabytes:.3g} MB, "
             f"error {spectrum.error:.1e} (asked {spectrum.tolerance:g})\n"
             f"left out, at most: {spectrum.dropped:.1e} of the power in weak frequencies; {spectrum.beyond:.1e} where "
-            "no light reaches or no pixel resolves"
+            f"no light reaches or no pixel resolves{seam}"
         )
+
+
+def _seam(source: Path, recipe: Recipe) -> str:
+    """A line on the seam of a bare scan that nobody says repeats.
+
+    Raises:
+        ValueError: if the seam would show.
+    """
+    if source.suffix.lower() == ".toml" or "extent" in recipe.spectrum:
+        return ""
+    steps = seam_steps(recipe.height_field())
+    told = " and ".join(
+        f"{across * 1e3:.3g} nm along {axis} ({inside * 1e3:.3g} inside)" for axis, (across, inside) in steps.items()
+    )
+    if seam_matters(steps):
+        raise ValueError(
+            f"--extent: got none, and {source} does not repeat without a seam: r.m.s. steps of {told}; wanted "
+            "--extent sample (a piece of an irregular surface), --extent tile (it repeats, seam and all), or "
+            "--prepare crop_periods (a grating, cropped to whole periods)"
+        )
+    return f"\nrepeats as a tile; r.m.s. steps at the seam {told}" if told else ""

@@ -13,7 +13,7 @@ import typer
 
 from ..outputs import free_name
 from .arguments import Overwrite, claim, scene_parameters
-from .console import Stopped, err, tell
+from .console import Stopped, err, log_lines, tell
 from .inputs import files_read
 
 
@@ -21,7 +21,13 @@ def render(
     context: typer.Context,
     scene: Annotated[Path, typer.Argument(metavar="SCENE.xml")],
     output: Annotated[Path | None, typer.Option("-o", "--output", help="the spectral picture (.exr)")] = None,
-    spp: Annotated[int, typer.Option(min=1, help="samples per pixel; with --until-error the most of them")] = 64,
+    spp: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            help="samples per pixel, with --until-error the most; by default the scene's sample_count, or 64",
+        ),
+    ] = None,
     width: Annotated[int | None, typer.Option(min=1, help="pixels; the scene's own by default")] = None,
     height: Annotated[int | None, typer.Option(min=1, help="pixels; the scene's own by default")] = None,
     variant: Annotated[str | None, typer.Option(help="of Mitsuba; the fastest spectral one by default")] = None,
@@ -34,6 +40,9 @@ def render(
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="go on where a run of the same command ended")] = False,
     checkpoint: Annotated[float, typer.Option(min=0, metavar="SECONDS", help="between two checkpoints")] = 60,
+    half: Annotated[
+        bool, typer.Option("--half", help="write float16: half of the size, radiance rounded by up to 0.05 %")
+    ] = False,
     dask: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="spread the passes over a Dask cluster (tcp://HOST:PORT)")
     ] = None,
@@ -48,6 +57,7 @@ def render(
     from ..render.checkpoint import checkpoint_path
     from ..render.passes import Interrupted, trace_here
     from ..render.passes import render as trace
+    from ..render.scene import named_sample_count
     from ..render.spectral_image import SpectralImage
     from ..render.turntable import frame_path, save_animation
     from ..render.turntable import orbit as motions_of_orbit
@@ -77,6 +87,8 @@ def render(
                 "remove it to begin anew"
             )
     mi.set_variant(choose_variant(variant))
+    if spp is None:
+        spp = named_sample_count(scene, parameters) or 64
     tracer = trace_here
     if dask is not None:
         from ..render.cluster import trace_on
@@ -121,7 +133,7 @@ def render(
         preview = path.with_suffix(".png")
         try:
             if image is not earlier:
-                image.save(path)
+                image.save(path, half=half)
             exposure = save_preview(image, preview, exposure)
         except (OSError, RuntimeError) as error:
             kept = f"; {waiting} is whole, and --resume goes on from it" if waiting.exists() else ""
@@ -133,12 +145,13 @@ def render(
         rows, columns, bins = image.radiance.shape
         done = f"{image.attributes['spp']} samples per pixel"
         if "error" in image.attributes:
-            done += f", error {image.attributes['error']:.2g}"
+            done += f", relative error of luminance {image.attributes['error']:.2g} in nine of ten pixels"
             if until_error is not None and image.attributes["error"] > until_error:
                 done += f" (not {until_error:g}: more --spp may take it there)"
         tell(
             f"{path}: {columns} × {rows} pixels, {bins} wavelengths, {done}, {mi.variant()}, "
-            f"{time.perf_counter() - start:.1f} s\n{preview}: preview, exposure {exposure:.4g}"
+            f"{time.perf_counter() - start:.1f} s, {path.stat().st_size / 1e6:.3g} MB\n"
+            f"{preview}: preview, radiance times {exposure:.4g} (exposure)"
         )
     if frames is not None:
         save_animation([path.with_suffix(".png") for path in targets], animation)
@@ -148,6 +161,10 @@ def render(
 @contextmanager
 def _progress_bar(label: str) -> Iterator[Callable[[int, int, float], None]]:
     """Samples per pixel done and expected, the error so far, the time taken and the time left."""
+    if not err.is_terminal:
+        lines = log_lines(label)
+        yield lambda done, total, error: lines(done, total)
+        return
     from rich.progress import (
         BarColumn,
         MofNCompleteColumn,
@@ -162,7 +179,6 @@ def _progress_bar(label: str) -> Iterator[Callable[[int, int, float], None]]:
         *(*columns, TextColumn("spp{task.fields[noise]}"), TimeElapsedColumn(), TimeRemainingColumn()),
         console=err,
         transient=True,
-        disable=not err.is_terminal,
         speed_estimate_period=600,  # passes of a large picture take longer than the usual half minute
     ) as bars:
         task = bars.add_task(label, total=None, noise="")

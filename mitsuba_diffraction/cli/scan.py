@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from ..coherence import SUN_COHERENCE_LENGTH
 from ..prepare import STEP_NAMES, step_of
 from ..recipe import Recipe
 
@@ -23,6 +24,15 @@ Unit = Annotated[
 Prepare = Annotated[
     list[str] | None,
     typer.Option(help=f"of a scan, a step, done in the order given: {', '.join(STEP_NAMES)}; NAME=ARGUMENT"),
+]
+Extent = Annotated[
+    str | None,
+    typer.Option(
+        help="tile (the patch repeats) or sample (a piece of an irregular surface); a recipe's own by default"
+    ),
+]
+CoherenceLength = Annotated[
+    float | None, typer.Option(help=f"µm; a recipe's own by default, else that of sunlight, {SUN_COHERENCE_LENGTH:g}")
 ]
 
 

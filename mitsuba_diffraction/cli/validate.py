@@ -68,7 +68,10 @@ def validate(
     Console(highlight=False, width=max(out.width, 120)).print(report.table(results))
     missed = [result["name"] for result in results if not result["ok"]]
     promised = sum(result["bound"] is not None for result in results)
-    tell(f"{promised - len(missed)} of {promised} within their bounds; {len(results) - promised} only shown")
+    tell(
+        f"{promised - len(missed)} of {promised} within their bounds; {len(results) - promised} only shown. "
+        "Differences are absolute, |found − expected|, unless the name of a check says otherwise"
+    )
     if json is not None:
         report.save_json(results, json)
     if markdown is not None:

@@ -39,15 +39,15 @@ class Inspection:
         height_field: the surface.
         extent: "tile" or "sample".
         statistics: heights, slopes, tilt.
-        periods: strongest first; none where nothing stands out.
+        periods: as of `find_periods`: single ones, then bands; none where nothing stands out.
         carried: the coherence length that a scan carries, µm, at most that of sunlight; of a tile, any.
         coherence_length: what is asked for, as far as it is carried, µm.
-        scalar_error: nm → expected error of scalar theory as a share of the reflected power; NaN where rigorous
-            results do not reach; empty without a period.
+        scalar_error: nm → expected error of scalar theory as a share of the reflected power, the greatest of all
+            periods; NaN where rigorous results do not reach for one of them; empty without a period.
         changes: what ±5 % of height scale, pixel size and tip broadening do; empty without a period.
         concerns: what stands in the way of a right picture.
         spectrum: of at most `LONGEST_COHERENCE`, for predicted colours.
-        shown: the height field, a small tile repeated until it shows how it goes on.
+        shown: the height field, a small tile repeated until it shows how it goes on, a profile as wide as it is long.
     """
 
     height_field: HeightField
@@ -146,11 +146,14 @@ def inspect(
         periods=periods,
         carried=carried,
         coherence_length=used,
-        scalar_error={nm: expected_error(periods[0].period, depth, nm * 1e-3) for nm in SCALAR_AT} if periods else {},
+        scalar_error={
+            nm: float(np.max([expected_error(period.period, depth, nm * 1e-3) for period in periods]))
+            for nm in (SCALAR_AT if periods else ())
+        },
         changes=changes(height_field, spectrum, periods[0], extent=extent, build=build, find=find) if periods else (),
         concerns=concerns(height_field, numbers, used, measured=measured),
         spectrum=spectrum,
-        shown=_repeated(height_field, _MOST_TIMES) if extent == "tile" else height_field,
+        shown=_widened(_repeated(height_field, _MOST_TIMES) if extent == "tile" else height_field),
     )
     report(4, 4)
     return result
@@ -163,9 +166,21 @@ def _repeated(tile: HeightField, times: int) -> HeightField:
     return HeightField(np.tile(tile.heights, (times, times)), tile.pixel_size, tile.source)
 
 
+def _widened(field: HeightField) -> HeightField:
+    """A profile, which is uniform along its axis of one pixel, as a square."""
+    for axis in (0, 1):
+        if field.shape[axis] == 1 < field.shape[1 - axis]:
+            count = min(field.shape[1 - axis], 256)
+            sizes = list(field.pixel_size)
+            sizes[1 - axis] = field.tile_size[axis] / count
+            return HeightField(np.repeat(field.heights, count, axis), (sizes[0], sizes[1]), field.source)
+    return field
+
+
 def _periods_of_tile(tile: HeightField) -> tuple[Period, ...]:
     """A wave stands out of a patch with several of its periods; the tile is repeated until there are enough."""
-    for times in (1, 2, 4, _MOST_TIMES):
+    # Of one period of a profile, harmonics stand out before the period does.
+    for times in (_MOST_TIMES,) if 1 in tile.shape else (1, 2, 4, _MOST_TIMES):
         if found := find_periods(_repeated(tile, times)):
             return tuple(_on_lattice(period, tile) for period in found)
     return ()
@@ -173,6 +188,8 @@ def _periods_of_tile(tile: HeightField) -> tuple[Period, ...]:
 
 def _on_lattice(period: Period, tile: HeightField) -> Period:
     """A period of a tile that repeats is one of its orders: exactly known."""
+    if period.width:
+        return period
     along = np.deg2rad(period.direction)
     order = np.rint(np.array([np.cos(along), np.sin(along)]) / period.period * tile.tile_size)
     if not order.any():

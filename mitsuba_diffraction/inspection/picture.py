@@ -60,7 +60,7 @@ def save_picture(inspection: Inspection, path: str | os.PathLike[str], *, title:
         for start, end in ((0.04, 0.27), (0.43, 0.665), (0.705, 0.985))
     )
     lower = figure.add_gridspec(len(INCIDENCES), 1, top=0.285, bottom=0.085, hspace=0.16, left=0.115, right=0.985)
-    _height_map(figure.add_subplot(left), inspection.shown, inspection.extent)
+    _height_map(figure.add_subplot(left), _piece(inspection), inspection.extent)
     _spectrum(figure.add_subplot(middle), inspection)
     _facts(figure.add_subplot(right), inspection)
     _colours([figure.add_subplot(row) for row in lower], inspection)
@@ -111,6 +111,17 @@ def _height_map(axes: Axes, field: HeightField, extent: str) -> None:
     axes.text(size_x * 0.05, y - size_y * 0.04, f"{length:g} µm", color="white", fontsize=11, va="bottom", bbox=box)
 
 
+def _piece(inspection: Inspection) -> HeightField:
+    """Of a surface that repeats, as much as shows its periods: a dozen of the shortest, but four of the longest."""
+    field = inspection.shown
+    if inspection.extent == "sample" or not inspection.periods:
+        return field
+    lengths = [period.period for period in inspection.periods]
+    side = max(12 * min(lengths), 4 * max(lengths))
+    columns, rows = (max(1, round(side / pixel)) for pixel in field.pixel_size)
+    return HeightField(field.heights[:rows, :columns], field.pixel_size, field.source)
+
+
 def _square_cut(field: HeightField) -> HeightField:
     """A piece of a long patch that is at most twice as long as wide."""
     rows, columns = field.shape
@@ -150,7 +161,7 @@ def _spectrum(axes: Axes, inspection: Inspection) -> None:
         # Outwards, but for the rim.
         side = (-1 if x < -0.02 * limit else 1) * (-1 if abs(x) > 0.6 * limit else 1)
         axes.annotate(
-            f"{period.period:.3g} µm",
+            f"{period.period:.3g} µm" + (", band" if period.width else ""),
             (x, y),
             xytext=(side * 10, 10 if y <= 0 else -20),
             textcoords="offset points",
@@ -183,7 +194,7 @@ def _facts(axes: Axes, inspection: Inspection) -> None:
     for number, period in enumerate(inspection.periods):
         lines.append(
             (
-                "period" if number == 0 else "second period",
+                "band of periods" if period.width else "period" if number == 0 else "second period",
                 with_uncertainty(period.period, period.period_uncertainty) + " µm",
             )
         )

@@ -88,6 +88,12 @@ def read_height_field(
         # What is too great for a float becomes infinite, a missing pixel or no length, and is refused as such.
         with np.errstate(over="ignore", invalid="ignore"):
             scan = _read(path, channel, unit)
+            integers = scan.numbers.dtype.kind in "iu"
+            if pixel_size is None and scan.pixel_size is None and height_range is None and integers:
+                raise ValueError(
+                    f"pixel_size, height_range: both missing for {scan.numbers.dtype} heights, wanted one number or "
+                    "(x, y) in µm, and the height in µm from black to white"
+                )
             heights = _as_micrometres(scan.numbers, height_range)
         pixel_size = scan.pixel_size if pixel_size is None else pixel_size
         if pixel_size is None:

@@ -59,5 +59,8 @@ def _grey(pixels: NDArray, mode: str) -> NDArray:
         raise ValueError("got a picture with transparent pixels, wanted an opaque grey one")
     colours = pixels[..., : len(mode.removesuffix("A"))]
     if not (colours == colours[..., :1]).all():
-        raise ValueError("got a colour picture, wanted a grey one")
+        raise ValueError(
+            "got a colour picture, wanted a grey one: colours of a map are no heights; export the data itself (.gwy, "
+            ".gsf, a .tif of 32 bit) or choose a grey palette"
+        )
     return colours[..., 0]

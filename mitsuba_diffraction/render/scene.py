@@ -96,12 +96,38 @@ def load_spectral_scene(
             mi.parser.transform_all(config, state)
             scene = mi.parser.instantiate(config, state)
         except Exception as error:
-            raise ValueError(f"{path}: {root_cause(error)}") from error
+            raise ValueError(f"{path}: {root_cause(error)}{_what_there_is(path, str(error))}") from error
     if not isinstance(scene, mi.Scene):
         raise ValueError(f"{path}: the file holds a {type(scene).__name__}, wanted a scene")
     if scene.integrator().aov_names():
         raise ValueError(f"{path}: the integrator gives {scene.integrator().aov_names()}, wanted radiance alone")
     return scene
+
+
+def named_sample_count(path: str | os.PathLike[str], parameters: Mapping[str, str] | None = None) -> int | None:
+    """The sample_count that a scene names for the sampler of its first sensor; None if it names none.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if the scene is wrong.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file")
+    with _files_beside(path):
+        try:
+            config = mi.parser.ParserConfig(mi.variant())
+            state = mi.parser.parse_file(config, str(path.resolve()), **(parameters or {}))
+        except Exception as error:
+            raise ValueError(f"{path}: {root_cause(error)}{_what_there_is(path, str(error))}") from error
+    for node in state.nodes:
+        if node.type == mi.ObjectType.Sensor:
+            for child in _children(node.props).values():
+                props = state.nodes[child].props
+                if state.nodes[child].type == mi.ObjectType.Sampler and "sample_count" in props:
+                    return int(props["sample_count"])
+            return None
+    return None
 
 
 def scene_digest(path: str | os.PathLike[str], parameters: Mapping[str, str] | None = None) -> str:
@@ -226,6 +252,19 @@ def _spectral_film(
         # The parser refuses names with a dot, so that channels are numbered; films keep the order of names.
         film[f"channel_{number:03d}"] = _add(state, mi.ObjectType.Texture, hat)
     return film
+
+
+def _what_there_is(scene: Path, error: str) -> str:
+    """After an include that is missing, those that are there; after an unknown parameter, those that a scene has."""
+    if (missing := re.search(r'included file "(.+?)" not found', error)) is not None:
+        folder = scene.resolve().parent / Path(missing[1]).parent
+        there = sorted(path.stem for path in folder.glob("*.xml"))
+        return f"; {Path(missing[1]).parent} holds {', '.join(there) or 'none'}"
+    if "unused parameters" in error:
+        text = scene.read_text(encoding="utf-8", errors="replace")
+        known = sorted({*re.findall(r"\$(\w+)", text), *re.findall(r'<default\s+name="(\w+)"', text)})
+        return f"; the scene's parameters are {', '.join(known) or 'none'}"
+    return ""
 
 
 def root_cause(error: BaseException) -> str:

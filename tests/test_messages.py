@@ -1,0 +1,41 @@
+"""What a wrong scene is told: not only what is missing, but what there is."""
+
+import mitsuba as mi
+import pytest
+
+from mitsuba_diffraction.render.scene import load_spectral_scene
+
+SCENE = """<scene version="3.0.0"><default name="light" value="sun"/><include filename="lights/$light.xml"/>
+<sensor type="perspective"/><shape type="sphere">%s</shape></scene>"""
+GRATING = '<bsdf type="diffraction_grating">%s</bsdf>'
+BLAZED = '<string name="profile" value="blazed"/><float name="period" value="2.5"/><float name="depth" value="0.25"/>'
+
+
+@pytest.mark.parametrize(
+    ("body", "parameters", "words"),
+    [
+        ("", {"light": "moon"}, "lights holds lamp, sun"),
+        ("", {"lamp": "moon"}, "the scene's parameters are light"),
+        (GRATING % '<string name="filename" value="gone.exr"/>', {}, r"gone.exr: no such file; .* holds skin.exr"),
+        (
+            GRATING % (BLAZED + '<string name="material" value="Alu"/>'),
+            {},
+            r"'Alu', did you mean Al or .*of none, ",
+        ),
+        (GRATING % (BLAZED + '<bsdf type="diffuse"/>'), {}, 'wanted <bsdf name="base"'),
+    ],
+)
+def test_what_there_is_is_said(body, parameters, words, tmp_path, llvm):
+    (tmp_path / "lights").mkdir()
+    for name in ("sun", "lamp"):
+        (tmp_path / "lights" / f"{name}.xml").write_text('<scene version="3.0.0"><emitter type="constant"/></scene>')
+    (tmp_path / "skin.exr").touch()
+    (tmp_path / "scene.xml").write_text(SCENE % body)
+    with pytest.raises(ValueError, match=words):
+        load_spectral_scene(tmp_path / "scene.xml", parameters=parameters)
+
+
+def test_every_material_of_mitsuba_is_known(llvm):
+    for material in ("Al", "Au", "none", "Cr", "a-C", "TiO2_palik"):
+        mi.load_dict({"type": "diffraction_grating", "profile": "blazed", "period": 2.5, "depth": 0.25,
+                      "tolerance": 0.05, "coherence_length": 5.0, "material": material})  # fmt: skip
