@@ -1,27 +1,41 @@
 """Diffraction gratings for Mitsuba 3.
 
 Importing this package registers the BSDF `diffraction_grating` and the integrator `diffraction_shader` for every
-spectral variant of Mitsuba, and sees to it that Dr.Jit finds an LLVM that works.
+spectral variant of Mitsuba, once Mitsuba is imported. Everything that needs no renderer works without it.
 """
 
-from . import llvm
+from __future__ import annotations
 
-llvm.ensure()
+import importlib
 
-from . import gratings, reference  # noqa: E402 (LLVM must be settled before anything imports Dr.Jit)
-from . import plugin as _plugin  # noqa: E402, F401 (registers on import)
-from .heightfield import HeightField  # noqa: E402
-from .precompute import precompute  # noqa: E402
-from .readers import read_height_field  # noqa: E402
-from .recipe import Recipe  # noqa: E402
-from .spectrum import GratingSpectrum  # noqa: E402
+from .registration import register as _register
 
-__all__ = [
-    "GratingSpectrum",
-    "HeightField",
-    "Recipe",
-    "gratings",
-    "precompute",
-    "read_height_field",
-    "reference",
-]
+_HOME = {
+    "GratingSpectrum": "spectrum",
+    "HeightField": "heightfield",
+    "Recipe": "recipe",
+    "precompute": "precompute",
+    "read_height_field": "readers",
+}
+_MODULES = ("gratings", "reference")
+
+__all__ = [*_HOME, *_MODULES]
+
+
+def __getattr__(name: str) -> object:
+    """The public names, imported when they are asked for (PEP 562)."""
+    if name in _HOME:
+        value = getattr(importlib.import_module(f".{_HOME[name]}", __name__), name)
+    elif name in _MODULES:
+        value = importlib.import_module(f".{name}", __name__)
+    else:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
+
+_register()

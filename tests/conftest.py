@@ -7,11 +7,12 @@ import warnings
 from pathlib import Path
 
 import pytest
-from bsdf_support import use
 from hypothesis import settings
 
-import mitsuba_diffraction as md
+import mitsuba_diffraction as md  # before Dr.Jit, so that it has an LLVM that works
 from mitsuba_diffraction import cli
+
+from bsdf_support import use  # isort: skip
 
 # One example may be the first to import or to compile something.
 settings.register_profile("tests", deadline=None)

@@ -1,77 +1,83 @@
-"""The package below the file of a spectrum does without Mitsuba; arrows run one way."""
+"""Imports run one way, and nothing offline imports Mitsuba or Dr.Jit."""
 
 import ast
+import graphlib
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-PACKAGE = Path(__file__).parents[1] / "mitsuba_diffraction"
-RUN_TIME = {
-    *("benchmark", "bsdf", "cli", "comparison", "evaluation", "render", "shader", "validation"),
-    *("llvm.py", "plugin.py", "variants.py", "__init__.py"),
-}
-"""What may import Mitsuba; everything else is offline."""
-OFFLINE_SHADER = {"shader/quirks.py", "shader/taylor_textures.py", "shader/tristimulus.py"}
-OFFLINE = sorted(
-    path
+import mitsuba_diffraction
+
+PACKAGE = Path(mitsuba_diffraction.__file__).parent
+MODULES = {
+    ".".join(["mitsuba_diffraction", *path.relative_to(PACKAGE).with_suffix("").parts]).removesuffix(".__init__"): path
     for path in PACKAGE.rglob("*.py")
-    if path.relative_to(PACKAGE).parts[0] not in RUN_TIME or path.relative_to(PACKAGE).as_posix() in OFFLINE_SHADER
-)
+}
 
 
-def absolute(node, path):
-    """The modules that an import statement in the file `path` names, e.g. mitsuba_diffraction.files."""
-    if isinstance(node, ast.Import):
-        return [alias.name for alias in node.names]
-    if not isinstance(node, ast.ImportFrom):
-        return []
-    if not node.level:
-        return [node.module]
-    parents = ["mitsuba_diffraction", *path.relative_to(PACKAGE).parts[:-1]]
-    base = parents[: len(parents) - node.level + 1]
-    if node.module:
-        return [".".join([*base, node.module])]
-    return [".".join([*base, alias.name]) for alias in node.names]
+def imports(module):
+    """The modules of the package that a module imports, at its head or inside a function."""
+    path = MODULES[module]
+    package = module if path.name == "__init__.py" else module.rpartition(".")[0]
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom):
+            base = package.rsplit(".", node.level - 1)[0] if node.level else ""
+            source = ".".join(filter(None, [base, node.module]))
+            for alias in node.names:
+                found = f"{source}.{alias.name}" if f"{source}.{alias.name}" in MODULES else source
+                if found in MODULES:
+                    yield found
 
 
-def imports(path):
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    for block in ast.walk(tree):
-        # What only a type checker imports does not count.
-        if isinstance(block, ast.If) and ast.unparse(block.test) == "TYPE_CHECKING":
-            block.body = []
-    return [name for node in ast.walk(tree) for name in absolute(node, path)]
+def in_a_fresh_process(program):
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.split()
 
 
-@pytest.mark.parametrize("path", OFFLINE, ids=lambda path: str(path.relative_to(PACKAGE)))
-def test_offline_modules_import_neither_mitsuba_nor_what_does(path):
-    for name in imports(path):
-        top, *rest = name.split(".")
-        assert top not in {"mitsuba", "drjit"}, name
-        if top == "mitsuba_diffraction":
-            assert rest, f"{name}: the package itself registers plugins"
-            assert not {rest[0], f"{rest[0]}.py"} & RUN_TIME, name
+def test_no_module_imports_itself_by_way_of_others():
+    graph = {module: set(imports(module)) - {module} for module in MODULES}
+    assert sum(map(len, graph.values())) > 200
+    graphlib.TopologicalSorter(graph).prepare()
 
 
-def test_there_are_offline_modules():
-    names = {str(path.relative_to(PACKAGE)) for path in OFFLINE}
-    assert names >= {"heightfield.py", "reference.py", "precompute.py", "recipe.py", "expansions/taylor.py"}
-    assert names >= {"spectrum/file.py", "spectrum/grating_spectrum.py", *OFFLINE_SHADER}
-
-
-def test_a_spectrum_is_built_where_there_is_no_mitsuba():
-    # The package without its __init__, which registers the plugins.
+def test_what_is_offline_does_not_import_mitsuba(tmp_path):
     program = f"""
-import sys, types
-sys.modules["mitsuba"] = sys.modules["drjit"] = None
-package = types.ModuleType("mitsuba_diffraction")
-package.__path__ = [{str(PACKAGE)!r}]
-sys.modules["mitsuba_diffraction"] = package
-from mitsuba_diffraction.recipe import Recipe
-spectrum = Recipe({{"profile": "blazed", "period": 2.5, "depth": 0.25, "samples": 64}}).build()
-print(f"{{spectrum.error < 1e-3}}")
+import sys
+import mitsuba_diffraction as md
+loaded = {{"mitsuba", "drjit", "numpy"}} & set(sys.modules)
+assert not loaded, loaded
+field = md.gratings.blazed(period=2.5, depth=0.25, samples=64)
+md.precompute(field).save({str(tmp_path / "blazed.exr")!r})
+md.reference.power_spectrum(field, [0.4, 0.0], 20.0)
+np = sys.modules["numpy"]
+np.save({str(tmp_path / "scan.npy")!r}, np.random.default_rng(0).random((40, 40)))
+from mitsuba_diffraction.cli import main
+sys.argv = ["", "inspect", {str(tmp_path / "scan.npy")!r}, "--pixel-size", "0.1", "-o", {str(tmp_path / "s.png")!r}]
+try:
+    main()
+except SystemExit as exit:
+    assert not exit.code, exit.code
+print(*({{"mitsuba", "drjit"}} & set(sys.modules)))
 """
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
-    assert done.stdout.strip() == "True", done.stderr
+    words = in_a_fresh_process(program)
+    assert not {"mitsuba", "drjit"} & set(words)
+    assert (tmp_path / "blazed.exr").is_file()
+    assert (tmp_path / "s.png").is_file()
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        ("import mitsuba_diffraction", "import mitsuba", "mitsuba.set_variant('scalar_spectral')"),
+        ("import mitsuba", "import mitsuba_diffraction", "mitsuba.set_variant('scalar_spectral')"),
+        ("import mitsuba", "mitsuba.set_variant('scalar_spectral')", "import mitsuba_diffraction"),
+    ],
+    ids=["first", "between", "last"],
+)
+def test_plugins_are_registered_whenever_the_package_is_imported(lines):
+    grating = "{'type': 'diffraction_grating', 'profile': 'blazed', 'period': 2.5, 'depth': 0.25}"
+    printed = in_a_fresh_process("\n".join([*lines, f"print(type(mitsuba.load_dict({grating})).__name__)"]))
+    assert printed == ["DiffractionGrating"]

@@ -1,0 +1,44 @@
+"""Registers the plugins as soon as Mitsuba is imported, and imports it no sooner.
+
+Precomputation, inspection and the readers do without Mitsuba, which takes longer to import than they take to run.
+"""
+
+from __future__ import annotations
+
+import importlib.abc
+import importlib.util
+import sys
+from collections.abc import Sequence
+from importlib.machinery import ModuleSpec
+from types import ModuleType
+
+from . import llvm
+
+
+def register() -> None:
+    """Register now if Mitsuba is imported, else when it is."""
+    if "mitsuba" in sys.modules:
+        from . import plugin  # noqa: F401  (registers when it is imported)
+    elif not any(isinstance(finder, _MitsubaFinder) for finder in sys.meta_path):
+        sys.meta_path.insert(0, _MitsubaFinder())
+
+
+class _MitsubaFinder(importlib.abc.MetaPathFinder):
+    """Finds LLVM before Dr.Jit is imported, and registers the plugins after Mitsuba is."""
+
+    def find_spec(self, name: str, path: Sequence[str] | None, target: ModuleType | None = None) -> ModuleSpec | None:
+        if name in ("drjit", "mitsuba") and "drjit" not in sys.modules:
+            llvm.choose()
+        if name != "mitsuba":
+            return None
+        sys.meta_path.remove(self)
+        if (spec := importlib.util.find_spec(name)) is None or spec.loader is None:
+            return None
+        execute = spec.loader.exec_module
+
+        def execute_and_register(module: ModuleType) -> None:
+            execute(module)
+            from . import plugin  # noqa: F401
+
+        spec.loader.exec_module = execute_and_register
+        return spec
