@@ -12,8 +12,6 @@ from collections.abc import Sequence
 from importlib.machinery import ModuleSpec
 from types import ModuleType
 
-from . import llvm
-
 
 def register() -> None:
     """Register now if Mitsuba is imported, else when it is."""
@@ -28,6 +26,8 @@ class _MitsubaFinder(importlib.abc.MetaPathFinder):
 
     def find_spec(self, name: str, path: Sequence[str] | None, target: ModuleType | None = None) -> ModuleSpec | None:
         if name in ("drjit", "mitsuba") and "drjit" not in sys.modules:
+            from . import llvm
+
             llvm.choose()
         if name != "mitsuba":
             return None

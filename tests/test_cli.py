@@ -425,7 +425,7 @@ def test_an_interrupt_inside_a_plugin_is_no_error_of_the_scene(command):
 def test_an_interrupt_at_any_time_is_one_line(seconds):
     Path("scene.xml").write_text(SCENE)
     start = "import signal as s; s.signal(s.SIGINT, s.default_int_handler)"
-    run = f"{start}; from mitsuba_diffraction_command import main; main()"
+    run = f"{start}; from mitsuba_diffraction.__main__ import main; main()"
     arguments = ["render", "scene.xml", "--spp", "100000000"]
     environment = {**os.environ, "PYTHONPATH": str(Path(md.__file__).parents[1])}
     running = subprocess.Popen(

@@ -10,7 +10,7 @@ def main() -> None:
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         # An exception inside an extension module that is being imported becomes another one, or a crash.
         signal.signal(signal.SIGINT, _stop)
-    from mitsuba_diffraction.cli import main
+    from .cli import main
 
     main()
 
@@ -18,3 +18,7 @@ def main() -> None:
 def _stop(number: int, frame: object) -> None:
     os.write(2, b"mitsuba-diffraction: interrupted: nothing was written\n")
     os._exit(130)
+
+
+if __name__ == "__main__":
+    main()
