@@ -12,18 +12,13 @@ that use it, when they are called.
 
 from __future__ import annotations
 
-import os
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .files import whole_file
-from .outputs import png_text
-
 if TYPE_CHECKING:
-    from .render.spectral_image import SpectralImage
+    pass
 
 _OBSERVER = "CIE 1931 2 Degree Standard Observer"
 
@@ -195,32 +190,6 @@ def auto_exposure(rgb: NDArray[np.floating]) -> float:
         return 1.0
     lit = peak[peak > 1e-3 * np.percentile(peak, 99)]
     return float(1 / np.percentile(lit, 97))
-
-
-def save_preview(image: SpectralImage, path: str | os.PathLike[str], exposure: float | None = None) -> float:
-    """Writes an 8-bit sRGB picture of a spectral image, in the format that the ending of `path` names.
-
-    Spectra → linear sRGB → `into_gamut` → × exposure → `roll_off` → sRGB's transfer function.
-
-    Args:
-        image: the spectral image.
-        path: where to write, such as `picture.png`.
-        exposure: the factor for linear sRGB; by default `auto_exposure`.
-
-    Returns:
-        The exposure: the factor by which linear sRGB was multiplied.
-
-    Raises:
-        ValueError: if Pillow knows no format of that ending.
-    """
-    from PIL import Image
-
-    rgb = into_gamut(spectrum_to_linear_sRGB(image.radiance, image.wavelengths))
-    if exposure is None:
-        exposure = auto_exposure(rgb)
-    with whole_file(path) as temporary:
-        Image.fromarray(on_screen(rgb * exposure)).save(temporary, pnginfo=png_text(path))
-    return exposure
 
 
 def on_screen(rgb: NDArray[np.floating]) -> NDArray[np.uint8]:

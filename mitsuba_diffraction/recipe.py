@@ -57,7 +57,6 @@ from .precompute import precompute
 from .prepare import apply_steps, check_steps
 from .readers import read_height_field
 from .spectrum import GratingSpectrum
-from .spectrum import file as spectrum_file
 from .spectrum.file import FORMAT_VERSION
 
 if sys.version_info >= (3, 11):
@@ -225,11 +224,11 @@ class Recipe:
     def _from_cache(self, digest: str, progress: Callable[[int, int], None] | None) -> GratingSpectrum:
         path = cache_folder() / f"{digest}.exr"
         with suppress(ValueError, OSError):
-            return spectrum_file.load(path, recipe=digest)
+            return GratingSpectrum.load(path, recipe=digest)
         spectrum = self.build(progress)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            spectrum_file.save(spectrum, path, recipe=digest)
+            spectrum.save(path, recipe=digest)
         except (ValueError, OSError, RuntimeError) as error:  # RuntimeError is what OpenEXR raises on a full disk
             reason = getattr(error, "strerror", None) or error
             warnings.warn(

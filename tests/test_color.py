@@ -7,10 +7,10 @@ from mitsuba_diffraction.color import (
     auto_exposure,
     into_gamut,
     roll_off,
-    save_preview,
     spectrum_to_linear_sRGB,
     spectrum_to_XYZ,
 )
+from mitsuba_diffraction.render.preview import save_preview
 from mitsuba_diffraction.render.spectral_image import SpectralImage
 
 GRID = np.arange(365.0, 830.0, 5.0)

@@ -53,10 +53,10 @@ def render(
     """Path-trace a scene into a spectral picture (.exr) and a preview (.png) beside it."""
     import mitsuba as mi
 
-    from ..color import save_preview
     from ..render.checkpoint import checkpoint_path
     from ..render.passes import Interrupted, trace_here
     from ..render.passes import render as trace
+    from ..render.preview import save_preview
     from ..render.scene import named_sample_count
     from ..render.spectral_image import SpectralImage
     from ..render.turntable import frame_path, save_animation

@@ -22,6 +22,7 @@ import itertools
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.sparse
@@ -33,8 +34,10 @@ from scipy.interpolate import CubicSpline
 from scipy.special import ndtr
 
 from .energy_table import EnergyTable, between, directions_at
-from .grating_spectrum import GratingSpectrum
 from .spline_grid import spline_integral
+
+if TYPE_CHECKING:
+    from .grating_spectrum import GratingSpectrum
 
 SLACK = 5e-4
 """What an albedo may exceed one by: half the error of a spectrum at its usual tolerance."""

@@ -14,8 +14,9 @@ import io
 import json
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 import OpenEXR
@@ -26,12 +27,15 @@ from ..expansions.taylor import TaylorSeries
 from ..files import UNSEALED, is_intact, seal, whole_file
 from ..outputs import made_for
 from .energy_table import SHADOWING, EnergyTable
-from .grating_spectrum import GratingSpectrum
 from .orders import OrderGrid
 from .series_table import SeriesTable
 from .slice_table import SliceTable
 from .spline_grid import SplineGrid
 
+if TYPE_CHECKING:
+    from .grating_spectrum import GratingSpectrum
+
+Spectrum = TypeVar("Spectrum")
 FORMAT = "mitsuba_diffraction grating spectrum"
 FORMAT_VERSION = 3
 
@@ -98,14 +102,8 @@ def save(spectrum: GratingSpectrum, path: str | os.PathLike[str], recipe: str = 
         seal(temporary)
 
 
-def load(path: str | os.PathLike[str], recipe: str | None = None) -> GratingSpectrum:
-    """Read a spectrum that `save` wrote.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if it is not a spectrum, is damaged (be it by a single bit), is of a version or representation not
-            known here, or was not built from that recipe.
-    """
+def load(path: str | os.PathLike[str], construct: Callable[..., Spectrum], recipe: str | None = None) -> Spectrum:
+    """Hand what `save` wrote to the constructor of a `GratingSpectrum`; errors as in `GratingSpectrum.load`."""
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
@@ -146,7 +144,7 @@ def load(path: str | os.PathLike[str], recipe: str | None = None) -> GratingSpec
         if pixels.keys() != names or len(names) != header["channelCount"]:
             unknown = ", ".join(sorted(pixels.keys() - names)) or "none unknown"
             raise ValueError(f"got {len(pixels)} channels ({unknown}), wanted {header['channelCount']} of known names")
-        return GratingSpectrum(
+        return construct(
             table=table,
             grid=_grid(header, table.shape),
             pixel_size=_pair(header["pixelSize"]),

@@ -14,7 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import matching
 from ..coherence import lobe_reach, lobe_width
+from .albedo import GatheredSpectrum, energy_table
 from .energy_table import EnergyTable
+from .file import load, save
 from .orders import OrderGrid
 from .series_table import SeriesTable
 from .slice_table import SliceTable
@@ -168,8 +170,6 @@ class GratingSpectrum:
         Raises:
             ValueError: unless `shadowing` is "v_cavity" or "none".
         """
-        from .albedo import GatheredSpectrum, energy_table
-
         with _computing:
             if shadowing not in self._energy:
                 self._energy[shadowing] = energy_table(GatheredSpectrum.of(self), shadowing)
@@ -190,22 +190,24 @@ class GratingSpectrum:
             content.update(array)
         return content.hexdigest()
 
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the spectrum as an OpenEXR file, whole or not at all."""
-        from .file import save
+    def save(self, path: str | os.PathLike[str], recipe: str = "") -> None:
+        """Write the spectrum as an OpenEXR file, whole or not at all; `recipe` is the digest of its `Recipe`.
 
-        save(self, path)
+        Raises:
+            OSError: if the file cannot be written.
+        """
+        save(self, path, recipe)
 
-    @staticmethod
-    def load(path: str | os.PathLike[str]) -> GratingSpectrum:
+    @classmethod
+    def load(cls, path: str | os.PathLike[str], recipe: str | None = None) -> GratingSpectrum:
         """Read a spectrum that `save` wrote.
 
         Raises:
-            ValueError: if the file is not a spectrum, is damaged, or is of a version or representation not known here.
+            FileNotFoundError: if there is no such file.
+            ValueError: if it is not a spectrum, is damaged (be it by a single bit), is of a version or representation
+                not known here, or was not built from that recipe.
         """
-        from .file import load
-
-        return load(path)
+        return load(path, cls, recipe)
 
 
 def check_wavelengths(wavelengths: tuple[float, float]) -> None:

@@ -1,0 +1,36 @@
+"""The 8-bit picture beside a spectral image."""
+
+from __future__ import annotations
+
+import os
+
+from ..color import auto_exposure, into_gamut, on_screen, spectrum_to_linear_sRGB
+from ..files import whole_file
+from ..outputs import png_text
+from .spectral_image import SpectralImage
+
+
+def save_preview(image: SpectralImage, path: str | os.PathLike[str], exposure: float | None = None) -> float:
+    """Writes an 8-bit sRGB picture of a spectral image, in the format that the ending of `path` names.
+
+    Spectra → linear sRGB → `into_gamut` → × exposure → `roll_off` → sRGB's transfer function.
+
+    Args:
+        image: the spectral image.
+        path: where to write, such as `picture.png`.
+        exposure: the factor for linear sRGB; by default `auto_exposure`.
+
+    Returns:
+        The exposure: the factor by which linear sRGB was multiplied.
+
+    Raises:
+        ValueError: if Pillow knows no format of that ending.
+    """
+    from PIL import Image
+
+    rgb = into_gamut(spectrum_to_linear_sRGB(image.radiance, image.wavelengths))
+    if exposure is None:
+        exposure = auto_exposure(rgb)
+    with whole_file(path) as temporary:
+        Image.fromarray(on_screen(rgb * exposure)).save(temporary, pnginfo=png_text(path))
+    return exposure
