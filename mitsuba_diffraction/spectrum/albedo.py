@@ -108,7 +108,7 @@ class GatheredSpectrum:
     def of(cls, spectrum: GratingSpectrum) -> GatheredSpectrum:
         """Gather the nodes of `spectrum` in the cells of a grid, each cell at its centre of power."""
         sigma, sample = spectrum.lobe_width, spectrum.extent == "sample"
-        conical = not sample and spectrum.grid.shape[0] == 1 and sigma * spectrum.wavelengths[1] * 1e-3 <= NARROW
+        conical = bool(not sample and spectrum.grid.shape[0] == 1 and sigma * spectrum.wavelengths[1] * 1e-3 <= NARROW)
         # A cell holds the whole lobe of a node, or the parts of it that lie in the cell.
         narrow = sigma <= FINE / (8 if sample else 3)
         fine = FINE / 4 if conical else FINE
