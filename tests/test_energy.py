@@ -445,3 +445,37 @@ def test_instances_of_one_surface_share_their_tables(tmp_path):
     gc.collect()
     gc.collect()
     assert last() is None
+
+
+def hemisphere_albedo(of, omega, wavelength, table=None, rings=40, spokes=48):
+    """∫ K G S E/λ² cos θ_o dω_o of lobes wider than the rule, from the spectrum's own `evaluate`; λ in µm."""
+    x, weight = np.polynomial.legendre.leggauss(rings)
+    # cos θ_o = t³: fine near the horizon.
+    cos, weight = ((x + 1) / 2) ** 3, 3 * ((x + 1) / 2) ** 2 * weight / 2
+    phi, sine = 2 * np.pi * (np.arange(spokes) + 0.5) / spokes, np.sqrt(1 - cos**2)
+    wo = np.stack([np.outer(sine, np.cos(phi)), np.outer(sine, np.sin(phi)), np.outer(cos, 0 * phi + 1)], -1)
+    wo, u = wo.reshape(-1, 3), -wo.reshape(-1, 3) - omega
+    w, d = -u[:, 2], (u**2).sum(-1) / 2
+    factor = d / w * np.minimum(d / (w * omega[2]), 2 * np.minimum(1, wo[:, 2] / omega[2]))
+    s = of.evaluate(u[:, :2] / wavelength, np.minimum(2 * np.pi * w / wavelength, of.largest_kappa))
+    if table is not None:
+        s = s * np.minimum(table.at(omega[None], wavelength)[0], table.at(wo, wavelength))
+    return (np.repeat(weight, spokes) * 2 * np.pi / spokes * factor * s).sum() / wavelength**2
+
+
+@pytest.mark.filterwarnings("ignore:pixels of", "ignore:coherence_length")
+@pytest.mark.parametrize(
+    ("side", "pixel", "coherence_length"), [(0.6, 0.05, 0.28), pytest.param(1.2, 0.1, 0.4, marks=pytest.mark.slow)]
+)
+def test_no_albedo_above_one_for_rough_scans_with_wide_lobes(side, pixel, coherence_length):
+    count = round(side / pixel)
+    heights = md.HeightField(np.random.default_rng(0).random((count, count)), pixel)
+    of = md.precompute(heights, extent="sample", coherence_length=coherence_length, tolerance=1e-2)
+    raw, bounded = [], []
+    for theta, phi, wavelength in ((87, 40, 0.4), (89, 300, 0.5), (89.5, 10, 0.6)):
+        sine = np.sin(np.deg2rad(theta))
+        omega = np.array([sine * np.cos(np.deg2rad(phi)), sine * np.sin(np.deg2rad(phi)), np.cos(np.deg2rad(theta))])
+        raw.append(hemisphere_albedo(of, omega, wavelength))
+        bounded.append(hemisphere_albedo(of, omega, wavelength, of.energy_table()))
+    assert max(raw) > 1.4
+    assert max(bounded) <= 1 + EXCESS

@@ -48,7 +48,7 @@ each triangle and changes from one to the next: give such a mesh UVs. Where dp_d
 The BRDF is R · K · G · S(q; κ)/λ² · E: R the power reflectance at the half vector, K and G as in `geometry.py`, S as in
 `line_spectrum.py` (of a tile) or `smooth_spectrum.py` (of a sample), with q = −(ω_i + ω_o)/λ along the pattern's axes
 and κ = 2π (cos θ_i + cos θ_o)/λ. E, as in `energy.py`, keeps the reflected light to the received; it is one where the
-rest does so by itself. Without shadowing K diverges near the horizon, and E bounds it less well there.
+rest does so by itself. Without shadowing K diverges as 1/cos θ near the horizon: from 85° on E then falls with cos θ.
 
 In polarised variants light is split into s and p as by a plane across the half vector; a perfect mirror and Schlick's
 formula leave it unpolarised.

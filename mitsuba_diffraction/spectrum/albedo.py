@@ -111,7 +111,7 @@ class GatheredSpectrum:
     def of(cls, spectrum: GratingSpectrum) -> GatheredSpectrum:
         """Gather the nodes of `spectrum` in the cells of a grid, each cell at its centre of power."""
         sigma, sample = spectrum.lobe_width, spectrum.extent == "sample"
-        conical = not sample and spectrum.grid.shape[0] == 1 and sigma * spectrum.wavelengths[1] * 1e-3 <= NARROW
+        conical = bool(not sample and spectrum.grid.shape[0] == 1 and sigma * spectrum.wavelengths[1] * 1e-3 <= NARROW)
         # A cell holds the whole lobe of a node, or the parts of it that lie in the cell.
         narrow = sigma <= FINE / (8 if sample else 3)
         fine = FINE / 4 if conical else FINE
@@ -391,8 +391,25 @@ def _points(
     d = 0.5 * (np.maximum(tangent, 0) + w**2)  # 1 + ω_i·ω_o
     factor = d**2 / (cos_i * w**2)  # K·cos θ_o
     if shadowing == "v_cavity":
-        factor = np.minimum(factor, 2 * np.minimum(1, cos_o / cos_i) * d / w)
+        # G's part changes as fast as cos θ_i: its mean over the part of the box.
+        shadowed = np.minimum(1, cos_o / cos_i) / w
+        shadowed[len(whole) :] = _mean_shadowed(
+            np.concatenate([lowest, lowest + span / 2]), np.tile(span / 2, 2), cos_i[len(whole) :]
+        )
+        factor = np.minimum(factor, 2 * d * shadowed)
     return pair, cos_o, part, share, measure * factor
+
+
+def _mean_shadowed(
+    lowest: NDArray[np.float32], span: NDArray[np.float32], cos_i: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """The mean of min(1, c/cos θ_i)/(cos θ_i + c) over lowest ≤ c ≤ lowest + span."""
+    middle = (lowest + span / 2) / cos_i
+    ends = [np.asarray(x / cos_i, np.float64) for x in (lowest, lowest + span)]
+    below, above = (np.where(x < 1, x - np.log1p(x), 1 - 2 * np.log(2) + np.log1p(x)) for x in ends)
+    narrow = span < 1e-3 * (lowest + cos_i)
+    mean = (above - below) / np.where(narrow, 1, span)
+    return np.where(narrow, np.minimum(1, middle) / (cos_i * (1 + middle)), mean).astype(np.float32)
 
 
 def _mirror_lobe(cos_i: NDArray[np.float32], width: NDArray[np.float32], shadowing: str) -> NDArray[np.float32]:
