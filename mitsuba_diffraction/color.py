@@ -17,9 +17,6 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-if TYPE_CHECKING:
-    pass
-
 _OBSERVER = "CIE 1931 2 Degree Standard Observer"
 
 
