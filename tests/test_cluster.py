@@ -3,6 +3,7 @@
 import contextlib
 import os
 import signal
+import socket
 import time
 from pathlib import Path
 
@@ -142,6 +143,15 @@ def test_a_scheduler_that_is_not_there(command, monkeypatch):
         code, out, err = command(f"{line} {local.scheduler_address}")
         assert (code, out) == (1, "")
         assert err.splitlines()[-1].endswith("has no workers")
+
+
+def test_a_port_that_is_silent_is_no_scheduler(command, monkeypatch):
+    monkeypatch.setattr(cluster, "_SECONDS_TO_CONNECT", 0.5)
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
+        code, out, err = command(f"render scene.xml --spp 9 --variant llvm_ad_spectral --dask {address}")
+    assert (code, out) == (1, "")
+    assert err.strip() == f"mitsuba-diffraction: error: no Dask scheduler at {address}: it does not answer"
 
 
 @pytest.mark.slow

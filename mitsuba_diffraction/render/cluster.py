@@ -53,9 +53,10 @@ def trace_on(address: str) -> Tracer:
     def trace(job: Job, scene: mi.Scene, first: int) -> Iterator[NDArray[np.float32]]:
         try:
             distributed.comm.parse_address(address, strict=True)
+            asyncio.run(_greet(address))
             client = distributed.Client(address, timeout=_SECONDS_TO_CONNECT, set_as_default=False)
-        except (OSError, ValueError) as error:
-            raise RuntimeError(f"no Dask scheduler at {address}: {error}") from error
+        except (OSError, ValueError, TimeoutError, asyncio.TimeoutError) as error:
+            raise RuntimeError(f"no Dask scheduler at {address}: {str(error) or 'it does not answer'}") from error
         with client:
             waiting: deque[distributed.Future] = deque()
             try:
@@ -82,6 +83,14 @@ def trace_on(address: str) -> Tracer:
                     client.cancel(list(waiting), force=True)
 
     return trace
+
+
+async def _greet(address: str) -> None:
+    """Shakes hands with a scheduler; a client would wait for minutes for a port that accepts and then is silent."""
+    import distributed
+
+    comm = await asyncio.wait_for(distributed.comm.connect(address), _SECONDS_TO_CONNECT)
+    await comm.close()
 
 
 def _trace_there(job: Job, index: int) -> NDArray[np.float32]:
