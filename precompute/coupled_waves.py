@@ -17,7 +17,7 @@ from scipy.linalg import toeplitz
 Array = NDArray[np.float64]
 
 # Without any loss the sign of the root of an eigenvalue is up to rounding, and a wave may be taken for its reflection:
-# with many layers several per cent of the energy are then lost. This index of absorption moves the efficiencies by 1e-7.
+# with many layers several per cent of the energy are lost. This index of absorption moves the efficiencies by 1e-7.
 _LOSS = 1e-8
 # A metal is a slab that lets 1e-9 through: of meent's substrates only those without loss conserve energy in TM.
 _SLAB = 10.0  # −ln of the amplitude

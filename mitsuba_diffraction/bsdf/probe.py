@@ -93,7 +93,10 @@ def evaluate_pdf(
     count, channels = wavelengths.shape[-1], _channels()
     groups = np.resize(np.arange(count), (-(-count // channels), channels))
     wavelengths = np.broadcast_to(wavelengths, (*shape, count))[..., groups].reshape(-1, channels)
-    wi, wo = (np.repeat(np.broadcast_to(omega, (*shape, 3)).reshape(-1, 3), len(groups), axis=0) for omega in (wi, wo))
+    wi, wo, uv = (
+        np.repeat(np.broadcast_to(values, (*shape, size)).reshape(-1, size), len(groups), axis=0)
+        for values, size in ((wi, 3), (wo, 3), (uv, 2))
+    )
     context = context or mi.BSDFContext()
     if dr.is_jit_v(mi.Float):
         value, pdf = bsdf.eval_pdf(context, interaction(wi, wavelengths, uv), vectors(wo))

@@ -168,8 +168,12 @@ def _mark_orders(panel: Axes, found: BRDFMap) -> None:
 
 
 PERIOD_COLUMNS = (
-    *("surface", "method", "period / nm", "variance / nm²"),
-    *("thesis: period / nm", "thesis: variance / nm²"),
+    "surface",
+    "method",
+    "period / nm",
+    "variance / nm²",
+    "thesis: period / nm",
+    "thesis: variance / nm²",
 )
 
 
@@ -177,7 +181,7 @@ def period_rows(surface: PublishedSurface, maps: Iterable[ReflectanceMap], step:
     """The fits under `PERIOD_COLUMNS`: of maps that are there, the shader as published, and of the shader corrected.
 
     Args:
-        surface: what to look at.
+        surface: what the maps are of.
         maps: as `reflectance_map` gives them.
         step: between wavelengths of what is still to be evaluated, nm.
     """

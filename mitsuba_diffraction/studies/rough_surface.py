@@ -9,8 +9,8 @@ the specular and the diffuse component, both convolved with the Gaussian lobe of
 density of slopes remains: Beckmann's microfacets.
 
 One realisation differs from the mean. With length A of the profile, the mean field over all of it has the variance
-V/A in its real part, V the terms of even n at q = 0, so that the specular share e^{−g} has the
-standard deviation 2 e^{−g/2} √(V/A); a band of width B holds A·B independent speckles and has 1/√(A·B). Bounds are three such standard deviations.
+V/A in its real part, V the terms of even n at q = 0, so that the specular share e^{−g} has the standard deviation
+2 e^{−g/2} √(V/A); a band of width B holds A·B independent speckles and has 1/√(A·B). Bounds are three of these.
 """
 
 from __future__ import annotations

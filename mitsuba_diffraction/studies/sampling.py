@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from ..bsdf import probe
 from ..wavelengths import VISIBLE
@@ -16,7 +17,7 @@ from .speed import seconds
 
 ANGLES = (0.0, 30.0, 60.0, 75.0, 85.0)
 _AZIMUTHS = (0.0, 30.0, 60.0, 90.0)
-_WAVELENGTHS = 4  # draws of the four wavelengths of a ray
+_DRAWS = 4  # of the four wavelengths of a ray
 
 COLUMNS = {
     "surface": "{.surface}",
@@ -69,7 +70,7 @@ def measure(
     for case in cases:
         grating = {"type": "diffraction_grating", "spectrum": case.spectrum()}
         mirror = mi.load_dict({**grating, "material": "none"})
-        drawn = np.array([[_fraction(mirror, angle, phi, count) for phi in _AZIMUTHS] for angle in ANGLES])
+        fractions, largest = zip(*(_fraction(mirror, angle, count) for angle in ANGLES), strict=True)
         pictures = {
             "grating": _sphere({**grating, "material": "Al"}, size),
             "rough": _sphere({"type": "roughconductor", "material": "Al"}, size),
@@ -79,8 +80,8 @@ def measure(
         results.append(
             Sampling(
                 surface=case.name,
-                fractions=tuple(drawn[..., 0].min(axis=1).tolist()),
-                largest_weight=float(drawn[..., 1].max()),
+                fractions=fractions,
+                largest_weight=max(largest),
                 variance_ratio=min(_against_cosine(mirror, angle, count, repetitions) for angle in ANGLES),
                 picture_ratio=taken["grating"] / taken["rough"],
             )
@@ -89,21 +90,24 @@ def measure(
     return results
 
 
-def _wavelengths(shift: float) -> np.ndarray:
-    """Equally spaced, shifted together, as Mitsuba's path tracer takes them: (4,) nm."""
+def _wavelengths(shift: ArrayLike) -> NDArray[np.float64]:
+    """Equally spaced, shifted together, as Mitsuba's path tracer takes them: (..., 4) nm of shifts (..., 1)."""
     return VISIBLE[0] + (VISIBLE[1] - VISIBLE[0]) * (shift + np.arange(4)) / 4
 
 
-def _fraction(bsdf: mi.BSDF, angle: float, azimuth: float, count: int) -> tuple[float, float]:
-    """E[w]²/E[w²] and the largest w, the weight averaged over the four wavelengths; mean over draws of wavelengths."""
-    wi = np.broadcast_to(probe.direction(angle, azimuth), (count, 3))
-    fractions, largest = [], 0.0
-    for draw in range(_WAVELENGTHS):
-        _, weights, _ = probe.sample(bsdf, wi, _wavelengths((draw + 0.5) / _WAVELENGTHS), seed=draw)
-        weight = weights.mean(axis=1)
-        fractions.append(weight.mean() ** 2 / (weight**2).mean())
-        largest = max(largest, float(weight.max()))
-    return float(np.mean(fractions)), largest
+def _fraction(bsdf: mi.BSDF, angle: float, count: int) -> tuple[float, float]:
+    """E[w]²/E[w²], the least over azimuths, and the largest w; the weight w is averaged over the four wavelengths.
+
+    The mean over draws of wavelengths.
+    """
+    drawn = _wavelengths((np.arange(_DRAWS)[:, None] + 0.5) / _DRAWS)
+    shape = len(_AZIMUTHS), _DRAWS, count
+    wi = np.broadcast_to(probe.direction(angle, np.array(_AZIMUTHS))[:, None, None], (*shape, 3))
+    wavelengths = np.broadcast_to(drawn[:, None], (*shape, 4))
+    _, weights, _ = probe.sample(bsdf, wi.reshape(-1, 3), wavelengths.reshape(-1, 4))
+    weight = weights.mean(axis=1).reshape(shape)
+    fractions = (weight.mean(axis=-1) ** 2 / (weight**2).mean(axis=-1)).mean(axis=-1)
+    return float(fractions.min()), float(weight.max())
 
 
 def _against_cosine(bsdf: mi.BSDF, angle: float, count: int, repetitions: int) -> float:
