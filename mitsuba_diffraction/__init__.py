@@ -12,12 +12,12 @@ from .registration import register as _register
 
 _HOME = {
     "GratingSpectrum": "spectrum",
-    "HeightField": "heightfield",
+    "HeightField": "surface.heightfield",
     "Recipe": "recipe",
-    "precompute": "precompute",
-    "read_height_field": "readers",
+    "precompute": "spectrum.build",
+    "read_height_field": "surface.readers",
 }
-_MODULES = ("gratings", "reference")
+_MODULES = {"gratings": "surface.gratings", "reference": "reference"}
 
 __all__ = [*_HOME, *_MODULES]
 
@@ -27,7 +27,7 @@ def __getattr__(name: str) -> object:
     if name in _HOME:
         value = getattr(importlib.import_module(f".{_HOME[name]}", __name__), name)
     elif name in _MODULES:
-        value = importlib.import_module(f".{name}", __name__)
+        value = importlib.import_module(f".{_MODULES[name]}", __name__)
     else:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     globals()[name] = value

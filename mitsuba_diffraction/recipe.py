@@ -11,7 +11,7 @@ pixel_size = 0.0586              # µm, one number or [x, y]; where the file has
 height_range = 0.375             # µm, for integer images
 channel = "Height"               # a name or a number, of a file with several; without it, the one of heights
 unit = "nm"                      # of a file that names none; ["um", "nm"]: along the surface, and of the heights
-prepare = [                      # steps of prepare.py, done in this order
+prepare = [                      # steps of surface/prepare.py, done in this order
     "level_plane",               # or "level_quadratic"
     "align_lines",               # bring the rows to one level
     { despike = 5.0 },           # spikes beyond so many standard deviations of the noise
@@ -51,13 +51,13 @@ from typing import Any
 import platformdirs
 
 from .files import refuse_special
-from .gratings import PROFILES
-from .heightfield import HeightField
-from .precompute import precompute
-from .prepare import apply_steps, check_steps
-from .readers import read_height_field
 from .spectrum import GratingSpectrum
+from .spectrum.build import precompute
 from .spectrum.file import FORMAT_VERSION
+from .surface.gratings import PROFILES
+from .surface.heightfield import HeightField
+from .surface.prepare import apply_steps, check_steps
+from .surface.readers import read_height_field
 
 if sys.version_info >= (3, 11):
     import tomllib

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from .arrays import matching
 from .coherence import SUN_COHERENCE_LENGTH, lobe_width
 from .finite_tiles import tile_factor
-from .heightfield import HeightField
+from .surface.heightfield import HeightField
 from .welch import WindowAxis, carried_coherence_length, window_axes
 
 EXTENTS = ("tile", "sample")

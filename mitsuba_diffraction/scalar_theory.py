@@ -20,7 +20,7 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.special import jv
 
 from .geometry import k_g
-from .heightfield import HeightField
+from .surface.heightfield import HeightField
 
 Array = NDArray[np.float64]
 OrderPowers = Callable[[NDArray[np.int64], Array], Array]

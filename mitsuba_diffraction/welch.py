@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .coherence import lobe_width
-from .heightfield import HeightField
+from .surface.heightfield import HeightField
 
 # A window ends at three σ_s to each side, where its amplitude is e^{−9/2}, 1 %.
 _SUPPORT = 6.0

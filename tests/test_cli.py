@@ -21,7 +21,7 @@ from mitsuba_diffraction.cli.console import log_lines
 from mitsuba_diffraction.render.spectral_image import SpectralImage
 
 # The package gives the function of that name.
-PRECOMPUTE = importlib.import_module("mitsuba_diffraction.precompute")
+PRECOMPUTE = importlib.import_module("mitsuba_diffraction.spectrum.build")
 BLAZE = '[surface]\nprofile = "blazed"\nperiod = 2.5\ndepth = 0.25\nsamples = 64\n'
 SCENE = """<scene version="3.0.0"><default name="spectrum" value="blaze.toml"/><integrator type="path"/>
 <sensor type="perspective"><transform name="to_world"><lookat origin="0,0,4" target="0,0,0" up="0,1,0"/></transform>

@@ -3,13 +3,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mitsuba_diffraction.color import (
-    auto_exposure,
-    into_gamut,
-    roll_off,
-    spectrum_to_linear_sRGB,
-    spectrum_to_XYZ,
-)
+from mitsuba_diffraction.color import auto_exposure, into_gamut, roll_off, spectrum_to_linear_sRGB, spectrum_to_XYZ
 from mitsuba_diffraction.render.preview import save_preview
 from mitsuba_diffraction.render.spectral_image import SpectralImage
 

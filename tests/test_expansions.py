@@ -9,10 +9,15 @@ from hypothesis import strategies as st
 from scipy.special import jv
 
 import mitsuba_diffraction as md
-from mitsuba_diffraction.expansions import chebyshev_nodes, chebyshev_polynomials, chebyshev_transform, nodes_for
-from mitsuba_diffraction.expansions.chebyshev import ChebyshevSeries
-from mitsuba_diffraction.expansions.svd import SvdSeries
-from mitsuba_diffraction.expansions.taylor import TaylorSeries
+from mitsuba_diffraction.spectrum.expansions import (
+    chebyshev_nodes,
+    chebyshev_polynomials,
+    chebyshev_transform,
+    nodes_for,
+)
+from mitsuba_diffraction.spectrum.expansions.chebyshev import ChebyshevSeries
+from mitsuba_diffraction.spectrum.expansions.svd import SvdSeries
+from mitsuba_diffraction.spectrum.expansions.taylor import TaylorSeries
 from mitsuba_diffraction.spectrum.series_table import SeriesTable
 from mitsuba_diffraction.spectrum.slice_table import SliceTable
 

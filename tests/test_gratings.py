@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from PIL import Image
 from scipy.special import jv
 
-from mitsuba_diffraction.gratings import PROFILES, blazed, crossed, elaphe, lamellar, sinusoidal, xenopeltis
+from mitsuba_diffraction.surface.gratings import PROFILES, blazed, crossed, elaphe, lamellar, sinusoidal, xenopeltis
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 PERIOD = 2.5

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from mitsuba_diffraction import HeightField
-from mitsuba_diffraction.missing import fill_missing
+from mitsuba_diffraction.surface.missing import fill_missing
 
 arrays = hnp.arrays(np.float64, hnp.array_shapes(min_dims=2, max_dims=2, max_side=9), elements=st.floats(-5, 5))
 

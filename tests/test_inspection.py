@@ -14,13 +14,13 @@ from scipy.special import jv
 import mitsuba_diffraction as md
 from mitsuba_diffraction.bsdf.geometry import Geometry
 from mitsuba_diffraction.color import into_gamut, spectrum_to_linear_sRGB, spectrum_to_XYZ
-from mitsuba_diffraction.inspection import inspect, save_picture
-from mitsuba_diffraction.inspection.colours import WAVELENGTHS, daylight, order_angle, order_share, radiance
-from mitsuba_diffraction.inspection.concerns import concerns
-from mitsuba_diffraction.inspection.picture import _piece, with_uncertainty
-from mitsuba_diffraction.inspection.statistics import statistics
-from mitsuba_diffraction.inspection.tip import broadened, scanned
 from mitsuba_diffraction.scalar_theory import equivalent_depth, expected_error, geometry
+from mitsuba_diffraction.studies.inspection import inspect, save_picture
+from mitsuba_diffraction.studies.inspection.colours import WAVELENGTHS, daylight, order_angle, order_share, radiance
+from mitsuba_diffraction.studies.inspection.concerns import concerns
+from mitsuba_diffraction.studies.inspection.picture import _piece, with_uncertainty
+from mitsuba_diffraction.studies.inspection.statistics import statistics
+from mitsuba_diffraction.studies.inspection.tip import broadened, scanned
 
 ROOT = Path(__file__).parents[1]
 PERIOD, DEPTH = 2.0, 0.2

@@ -10,10 +10,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from mitsuba_diffraction import prepare
-from mitsuba_diffraction.heightfield import HeightField
-from mitsuba_diffraction.periods import find_periods
-from mitsuba_diffraction.readers import instruments, read_height_field
+from mitsuba_diffraction.surface import prepare
+from mitsuba_diffraction.surface.heightfield import HeightField
+from mitsuba_diffraction.surface.periods import find_periods
+from mitsuba_diffraction.surface.readers import instruments, read_height_field
 
 needs_the_extra = pytest.mark.skipif(
     importlib.util.find_spec("SurfaceTopography") is None, reason=f"SurfaceTopography is missing: {instruments.EXTRA}"

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from mitsuba_diffraction.missing import fill_missing
+from mitsuba_diffraction.surface.missing import fill_missing
 
 Y, X = np.mgrid[:20, :30].astype(float)
 HARMONIC = {

@@ -6,8 +6,8 @@ from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
 import mitsuba_diffraction as md
-from mitsuba_diffraction.heightfield import HeightField
-from mitsuba_diffraction.periods import Period, find_periods
+from mitsuba_diffraction.surface.heightfield import HeightField
+from mitsuba_diffraction.surface.periods import Period, find_periods
 
 PIXEL = (0.05, 0.07)
 """µm, (x, y)"""

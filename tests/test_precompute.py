@@ -607,7 +607,7 @@ def test_a_flat_sample_shows_the_window_alone():
 @pytest.mark.parametrize("extent", ["tile", "sample"])
 @pytest.mark.parametrize("representation", ["svd", "slices"])
 def test_too_large_a_table_is_refused(monkeypatch, extent, representation):
-    monkeypatch.setattr(importlib.import_module("mitsuba_diffraction.precompute"), "_LARGEST_TABLE", 2e3)
+    monkeypatch.setattr(importlib.import_module("mitsuba_diffraction.spectrum.build"), "_LARGEST_TABLE", 2e3)
     field, coherence_length = SAMPLES["odd"]
     with pytest.raises(
         ValueError, match=r"tolerance: needs .*more than a table of .*larger tolerance, a smaller patch"

@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
 import mitsuba_diffraction as md
-from mitsuba_diffraction import prepare
-from mitsuba_diffraction.heightfield import HeightField
-from mitsuba_diffraction.periods import find_periods
+from mitsuba_diffraction.surface import prepare
+from mitsuba_diffraction.surface.heightfield import HeightField
+from mitsuba_diffraction.surface.periods import find_periods
 
 PIXEL = (0.05, 0.08)
 """µm, (x, y)"""

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 from PIL import Image
 
-from mitsuba_diffraction.readers import read_height_field
+from mitsuba_diffraction.surface.readers import read_height_field
 
 HEIGHTS = np.array([[0.0, 0.1, 0.25], [0.3, 0.2, 0.05]])
 """µm"""
@@ -296,7 +296,7 @@ def test_a_picture_that_unpacks_to_too_much_is_refused(tmp_path, refuse, monkeyp
 
 def test_an_archive_that_unpacks_to_too_much_is_refused(tmp_path, refuse, monkeypatch):
     np.savez_compressed(tmp_path / "scan.npz", heights=np.zeros((100, 100)))
-    monkeypatch.setattr("mitsuba_diffraction.readers.arrays.MOST_BYTES", 1000)
+    monkeypatch.setattr("mitsuba_diffraction.surface.readers.arrays.MOST_BYTES", 1000)
     refuse("scan.npz", "wanted at most 1000")
 
 

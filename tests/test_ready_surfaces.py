@@ -10,8 +10,16 @@ from scipy.special import jv
 
 from mitsuba_diffraction import Recipe
 from mitsuba_diffraction.coherence import lobe_width
-from mitsuba_diffraction.gratings import COHERENCE_LENGTHS, PROFILES, compact_disc, dvd, foil, morpho_ridges, ruled
-from mitsuba_diffraction.gratings.tracks import EIGHT_TO_FOURTEEN
+from mitsuba_diffraction.surface.gratings import (
+    COHERENCE_LENGTHS,
+    PROFILES,
+    compact_disc,
+    dvd,
+    foil,
+    morpho_ridges,
+    ruled,
+)
+from mitsuba_diffraction.surface.gratings.tracks import EIGHT_TO_FOURTEEN
 
 RECIPES = Path(__file__).parents[1] / "precompute"
 DISCS = {"compact_disc": (compact_disc, 1.6, 0.833, 3.054), "dvd": (dvd, 0.74, 0.400, 1.866)}

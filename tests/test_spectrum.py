@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction.coherence import lobe_reach
-from mitsuba_diffraction.expansions import nodes_for
-from mitsuba_diffraction.expansions.chebyshev import ChebyshevSeries
-from mitsuba_diffraction.expansions.svd import SvdSeries
-from mitsuba_diffraction.expansions.taylor import TaylorSeries
+from mitsuba_diffraction.spectrum.expansions import nodes_for
+from mitsuba_diffraction.spectrum.expansions.chebyshev import ChebyshevSeries
+from mitsuba_diffraction.spectrum.expansions.svd import SvdSeries
+from mitsuba_diffraction.spectrum.expansions.taylor import TaylorSeries
 from mitsuba_diffraction.spectrum.orders import OrderGrid
 from mitsuba_diffraction.spectrum.series_table import SeriesTable
 from mitsuba_diffraction.spectrum.slice_table import SliceTable

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import mitsuba as mi
 
-from ..gratings import COHERENCE_LENGTHS, PROFILES
 from ..recipe import Recipe
 from ..spectrum import GratingSpectrum
+from ..surface.gratings import COHERENCE_LENGTHS, PROFILES
 
 _PREFIX = "handed over: "
 _handed_over: weakref.WeakValueDictionary[str, GratingSpectrum] = weakref.WeakValueDictionary()

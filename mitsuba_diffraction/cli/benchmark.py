@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from ..readers import read_height_field
+from ..surface.readers import read_height_field
 from .arguments import Overwrite, claim
 from .console import out, progress_bar
 from .inputs import files_read

@@ -12,12 +12,12 @@ from rich.console import Console
 from rich.table import Table
 
 from ..coherence import SUN_COHERENCE_LENGTH, lobe_width
-from ..inspection import Inspection, save_picture
-from ..inspection import inspect as look
-from ..inspection.picture import with_uncertainty
-from ..inspection.uncertainty import GREEN
 from ..outputs import free_name, save_json
 from ..scalar_theory import TRUSTED
+from ..studies.inspection import Inspection, save_picture
+from ..studies.inspection import inspect as look
+from ..studies.inspection.picture import with_uncertainty
+from ..studies.inspection.uncertainty import GREEN
 from .arguments import Overwrite, claim
 from .console import out, progress_bar, tell
 from .inputs import files_read

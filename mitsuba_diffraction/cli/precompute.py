@@ -7,9 +7,9 @@ from typing import Annotated
 
 import typer
 
-from ..precompute import REPRESENTATIONS
 from ..recipe import Recipe
-from ..seam import seam_matters, seam_steps
+from ..spectrum.build import REPRESENTATIONS
+from ..surface.seam import seam_matters, seam_steps
 from .arguments import Overwrite, claim
 from .console import progress_bar, tell
 from .inputs import files_read

@@ -8,8 +8,8 @@ from typing import Annotated
 import typer
 
 from ..coherence import SUN_COHERENCE_LENGTH
-from ..prepare import STEP_NAMES, step_of
 from ..recipe import Recipe
+from ..surface.prepare import STEP_NAMES, step_of
 
 PixelSize = Annotated[float | None, typer.Option(help="of a scan, µm")]
 HeightRange = Annotated[float | None, typer.Option(help="of a scan, black to white, µm")]

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from ..bsdf.tables import opaque
 from ..coherence import SUN_COHERENCE_LENGTH, lobe_width
-from ..heightfield import HeightField
+from ..surface.heightfield import HeightField
 from .gain import PUBLISHED_R0, Gain, fresnel_ratio
 from .quirks import Quirks
 from .spectral_weights import SpectralWeights

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..heightfield import HeightField
+from ..surface.heightfield import HeightField
 from .base import Shader
 from .flss import FLSS
 from .gem import GEM

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import scipy.fft
 
-from ..heightfield import HeightField
+from ..surface.heightfield import HeightField
 from .base import Shader
 from .quirks import Quirks
 from .spectral_weights import SpectralWeights

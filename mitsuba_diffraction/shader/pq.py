@@ -7,7 +7,7 @@ from collections.abc import Callable
 import drjit as dr
 import mitsuba as mi
 
-from ..heightfield import HeightField
+from ..surface.heightfield import HeightField
 from .base import TextureShader, check_whole
 from .gain import Gain
 from .quirks import Quirks

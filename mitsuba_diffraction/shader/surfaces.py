@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..coherence import SUN_COHERENCE_LENGTH
-from ..heightfield import HeightField
+from ..surface.heightfield import HeightField
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-from ..heightfield import HeightField
+from ..surface.heightfield import HeightField
 
 PUBLISHED_TERMS = 37  # 81 wavelengths × 37 terms × 9 texels are the 27,000 reads of the published shader
 

@@ -21,12 +21,12 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 import OpenEXR
 
-from ..expansions.chebyshev import ChebyshevSeries
-from ..expansions.svd import SvdSeries
-from ..expansions.taylor import TaylorSeries
 from ..files import UNSEALED, is_intact, seal, whole_file
 from ..outputs import made_for
 from .energy_table import SHADOWING, EnergyTable
+from .expansions.chebyshev import ChebyshevSeries
+from .expansions.svd import SvdSeries
+from .expansions.taylor import TaylorSeries
 from .orders import OrderGrid
 from .series_table import SeriesTable
 from .slice_table import SliceTable

@@ -8,7 +8,7 @@ import scipy.ndimage
 from numpy.typing import NDArray
 
 from ..coherence import lobe_width
-from ..heightfield import HeightField
+from ..surface.heightfield import HeightField
 from ..welch import WindowAxis, window_axes
 from .spline_grid import SplineGrid, spline_integral, spline_weights
 from .tile import inner

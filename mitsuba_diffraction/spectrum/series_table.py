@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from ..expansions import Series, chebyshev_nodes
+from .expansions import Series, chebyshev_nodes
 
 
 @dataclass(frozen=True, eq=False)

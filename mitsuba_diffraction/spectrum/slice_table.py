@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..expansions import chebyshev_nodes
+from .expansions import chebyshev_nodes
 
 # Chebyshev points of the first kind on [0, 1]: no cubic through four samples is nearer to a smooth function.
 NODES = (1 + chebyshev_nodes(4)) / 2

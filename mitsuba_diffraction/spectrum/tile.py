@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy.fft
 from numpy.typing import NDArray
 
-from ..heightfield import HeightField
-from ..reference import order_powers
+from ..surface.heightfield import HeightField
 from .orders import OrderGrid
 
 
@@ -26,7 +26,7 @@ class TilePowers:
 
     def __call__(self, kappa: float) -> NDArray[np.float64]:
         """η_m(κ), (rows, columns); κ in rad/µm."""
-        return self.grid.take(order_powers(self._height_field, kappa))
+        return self.grid.take(_powers(self._height_field, kappa))
 
     def reached(self, powers: NDArray[np.float64]) -> float:
         """The share of the power in orders that lie where light reaches; takes η_m of the grid."""
@@ -43,6 +43,12 @@ class TilePowers:
         exact = self(kappa)
         inside = exact[inner(self.grid, kept)]
         return float(exact.sum() - inside.sum() + np.abs(np.maximum(powers, 0) - inside).sum())
+
+
+def _powers(height_field: HeightField, kappa: float) -> NDArray[np.float64]:
+    """η_m(κ) = |F_m|² of all orders, (N_y, N_x), as in `scipy.fft.fftfreq`."""
+    transform = scipy.fft.fft2(np.exp(1j * kappa * height_field.centred), norm="forward", overwrite_x=True)
+    return transform.real**2 + transform.imag**2
 
 
 def inner(grid: OrderGrid, kept: OrderGrid) -> tuple[slice, slice]:

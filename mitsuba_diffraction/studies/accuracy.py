@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from ..bsdf.probe import direction
 from ..color import daylight, delta_E, spectrum_to_XYZ
-from ..heightfield import HeightField
 from ..reference import power_spectrum
 from ..spectrum import GratingSpectrum
+from ..surface.heightfield import HeightField
 from .cases import Case
 from .record import Record
 

@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import jv
 
-from .. import gratings
 from ..bsdf.probe import direction
 from ..coherence import lobe_width
 from ..geometry import k_g_between
-from ..heightfield import HeightField
+from ..surface import gratings
+from ..surface.heightfield import HeightField
 from .conservation import parseval
 from .lobes import brdf, density, grating, order_powers, orders_above, spectrum_of, towards
 from .record import Check, Record

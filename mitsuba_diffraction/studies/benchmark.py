@@ -12,8 +12,8 @@ import mitsuba as mi
 
 from ..files import whole_file
 from ..outputs import metadata
-from ..precompute import check_tolerance
 from ..spectrum import GratingSpectrum
+from ..spectrum.build import check_tolerance
 from ..spectrum.slice_table import SliceTable
 from ..wavelengths import VISIBLE
 from . import report, sampling, shader_speed

@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 
 from ..bsdf.probe import direction
 from ..coherence import lobe_width
-from ..heightfield import HeightField
 from ..spectrum import GratingSpectrum
+from ..surface.heightfield import HeightField
 from .analytic import compare_orders
 from .lobes import density, grating, spectrum_of, towards
 from .record import Check, Record

@@ -5,11 +5,11 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass
 
-from .. import gratings
 from ..coherence import SUN_COHERENCE_LENGTH
-from ..heightfield import HeightField
-from ..precompute import precompute
 from ..spectrum import GratingSpectrum
+from ..spectrum.build import precompute
+from ..surface import gratings
+from ..surface.heightfield import HeightField
 from ..welch import carried_coherence_length
 
 

@@ -6,13 +6,13 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ..heightfield import HeightField
-from ..inspection.statistics import statistics
-from ..periods import find_periods
 from ..scalar_theory import TRUSTED, equivalent_depth, expected_error
 from ..spectrum import GratingSpectrum
+from ..surface.heightfield import HeightField
+from ..surface.periods import find_periods
 from . import analytic, bumps, conservation, coupled_waves, rough_surface, viewing_angle
 from .accuracy import against_reference
+from .inspection.statistics import statistics
 from .record import GROUPS, Check, Record
 
 _WAVELENGTH = 0.55  # µm, the middle of the visible range

@@ -9,10 +9,10 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import gratings
 from ..bsdf import probe
-from ..heightfield import HeightField
 from ..spectrum import GratingSpectrum
+from ..surface import gratings
+from ..surface.heightfield import HeightField
 from .lobes import brdf, grating, spectrum_of
 from .record import Check, Record
 

@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import gratings
 from ..bsdf.probe import direction
-from ..heightfield import HeightField
 from ..scalar_theory import Orders, difference, error_map, expected_error, profile_powers, scalar_orders, stored
+from ..surface import gratings
+from ..surface.heightfield import HeightField
 from .lobes import grating, lobe_powers, spectrum_of
 from .record import Check, Record
 

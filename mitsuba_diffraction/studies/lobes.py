@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..bsdf import probe
 from ..geometry import k_g_between
-from ..heightfield import HeightField
-from ..precompute import precompute
 from ..spectrum import GratingSpectrum
+from ..spectrum.build import precompute
+from ..surface.heightfield import HeightField
 
 Array = NDArray[np.float64]
 

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..coherence import SUN_COHERENCE_LENGTH
-from ..heightfield import HeightField
 from ..recipe import Recipe
 from ..spectrum import GratingSpectrum
+from ..surface.heightfield import HeightField
 
 
 @dataclass(frozen=True, eq=False)

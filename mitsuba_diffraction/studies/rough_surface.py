@@ -25,8 +25,8 @@ from scipy.special import gammaln, ndtr
 
 from ..bsdf.probe import direction
 from ..coherence import lobe_width
-from ..heightfield import HeightField
 from ..spectrum import GratingSpectrum
+from ..surface.heightfield import HeightField
 from .lobes import brdf, density, grating, spectrum_of, towards
 from .record import Check, Record
 

@@ -9,20 +9,20 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from .coherence import SUN_COHERENCE_LENGTH, lobe_reach, lobe_width
+from ..coherence import SUN_COHERENCE_LENGTH, lobe_reach, lobe_width
+from ..reference import check_extent
+from ..surface.heightfield import HeightField
+from ..welch import carried_coherence_length
+from . import GratingSpectrum
 from .expansions import chebyshev_nodes, chebyshev_polynomials, chebyshev_transform, nodes_for, position
 from .expansions.chebyshev import ChebyshevSeries
 from .expansions.svd import SvdSeries
 from .expansions.taylor import TaylorSeries
-from .heightfield import HeightField
-from .reference import check_extent
-from .spectrum import GratingSpectrum
-from .spectrum.grating_spectrum import TAIL_SHARE, check_angle, check_wavelengths
-from .spectrum.sample import SamplePowers
-from .spectrum.series_table import SeriesTable
-from .spectrum.slice_table import SliceTable, interpolation
-from .spectrum.tile import TilePowers, inner
-from .welch import carried_coherence_length
+from .grating_spectrum import TAIL_SHARE, check_angle, check_wavelengths
+from .sample import SamplePowers
+from .series_table import SeriesTable
+from .slice_table import SliceTable, interpolation
+from .tile import TilePowers, inner
 
 VISIBLE = (360.0, 830.0)  # nm, the range that Mitsuba samples
 REPRESENTATIONS = ("auto", TaylorSeries.name, ChebyshevSeries.name, SvdSeries.name, SliceTable.representation)

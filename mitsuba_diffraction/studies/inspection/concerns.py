@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..coherence import lobe_width
-from ..heightfield import HeightField
+from ...coherence import lobe_width
+from ...surface.heightfield import HeightField
 from .statistics import Statistics, hann
 
 _COARSE = 0.09  # µm: a quarter of the shortest wavelength, as light of grazing incidence and exit wants

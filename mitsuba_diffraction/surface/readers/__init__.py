@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..files import refuse_special
+from ...files import refuse_special
 from ..heightfield import HeightField
 from . import arrays, gwyddion, instruments, pictures, simple_field, text
 from .scan import Scan

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..heightfield import HeightField
+from ...surface.heightfield import HeightField
 
 Array = NDArray[np.float64]
 

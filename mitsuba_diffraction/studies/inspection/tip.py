@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import grey_dilation, grey_erosion
 
-from ..heightfield import HeightField
+from ...surface.heightfield import HeightField
 
 _HALVINGS = 12
 

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ..color import auto_exposure, into_gamut, roll_off, spectrum_to_linear_sRGB
-from ..files import whole_file
-from ..heightfield import HeightField
-from ..outputs import metadata
+from ...color import auto_exposure, into_gamut, roll_off, spectrum_to_linear_sRGB
+from ...files import whole_file
+from ...outputs import metadata
+from ...surface.heightfield import HeightField
 from .colours import WAVELENGTHS, radiance
 from .inspect import Inspection
 from .statistics import hann, reference_plane

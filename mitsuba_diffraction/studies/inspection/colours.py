@@ -15,9 +15,9 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..color import spectrum_to_XYZ
-from ..scalar_theory import geometry
-from ..spectrum import GratingSpectrum
+from ...color import spectrum_to_XYZ
+from ...scalar_theory import geometry
+from ...spectrum import GratingSpectrum
 
 Array = NDArray[np.float64]
 

@@ -10,14 +10,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..coherence import SUN_COHERENCE_LENGTH, lobe_width
-from ..heightfield import HeightField
-from ..periods import Period, find_periods
-from ..precompute import VISIBLE, precompute
-from ..reference import check_extent
-from ..scalar_theory import equivalent_depth, expected_error
-from ..spectrum import GratingSpectrum
-from ..welch import carried_coherence_length
+from ...coherence import SUN_COHERENCE_LENGTH, lobe_width
+from ...reference import check_extent
+from ...scalar_theory import equivalent_depth, expected_error
+from ...spectrum import GratingSpectrum
+from ...spectrum.build import VISIBLE, precompute
+from ...surface.heightfield import HeightField
+from ...surface.periods import Period, find_periods
+from ...welch import carried_coherence_length
 from .colours import LONGEST_COHERENCE
 from .concerns import concerns
 from .statistics import Statistics, statistics

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..color import spectrum_to_XYZ
-from ..heightfield import HeightField
-from ..periods import Period
-from ..spectrum import GratingSpectrum
+from ...color import spectrum_to_XYZ
+from ...spectrum import GratingSpectrum
+from ...surface.heightfield import HeightField
+from ...surface.periods import Period
 from .colours import WAVELENGTHS, order_angle, order_share, radiance
 from .tip import broadened
 
