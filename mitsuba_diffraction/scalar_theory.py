@@ -1,8 +1,8 @@
 """Where scalar theory holds: its efficiencies in closed form, and how far they are from rigorous ones.
 
 A surface is taken for a perfect mirror bent by h, every facet of which reflects like a plane: right as long as the
-surface changes little over a wavelength. The stored results of coupled-wave analysis (`validation/rigorous_reference`)
-say how right, over period/λ and depth/λ.
+surface changes little over a wavelength. Stored results of coupled-wave analysis, made by
+`precompute/rigorous_reference.py`, say how right, over period/λ and depth/λ.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import RegularGridInterpolator
 from scipy.special import jv
 
+from .geometry import k_g
 from .heightfield import HeightField
 
 Array = NDArray[np.float64]
@@ -41,13 +42,8 @@ def fresnel(cosine: ArrayLike, index: complex) -> tuple[Array, Array]:
 
 
 def geometry(cos_i: ArrayLike, cos_o: ArrayLike, cos_between: ArrayLike) -> Array:
-    """K G: Stam's geometry and the shadowing of V-cavities, from the cosines of θ_i, θ_o and ω_i·ω_o.
-
-    K = (1 + ω_i·ω_o)²/(cos θ_i cos θ_o w²), w = cos θ_i + cos θ_o (Stam 1999), and G = min(1, 2(n·h)(n·ω)/(ω_o·h)) for
-    both directions (Torrance and Sparrow 1967), where 2(n·h)(n·ω)/(ω_o·h) = 2w cos θ/(1 + ω_i·ω_o).
-    """
-    w, d = np.add(cos_i, cos_o), np.add(1, cos_between)
-    return d**2 / (cos_i * cos_o * w**2) * np.minimum(1, 2 * w * np.minimum(cos_i, cos_o) / d)
+    """K G, from the cosines of θ_i, θ_o and ω_i·ω_o; see `geometry.k_g`."""
+    return k_g(cos_i, cos_o, np.add(1, cos_between))
 
 
 def equivalent_depth(rms_height: float) -> float:
@@ -141,7 +137,7 @@ def _albedo(powers: OrderPowers, pitch: float, wavelength: float, sines: Array) 
 
 @functools.cache
 def stored() -> dict[str, Any]:
-    """The stored rigorous results, as `validation/rigorous_reference` wrote them."""
+    """The stored rigorous results, as `precompute/rigorous_reference.py` wrote them."""
     return json.loads(STORED.read_text(encoding="utf-8"))
 
 

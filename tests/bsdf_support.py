@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 import mitsuba_diffraction as md
+from mitsuba_diffraction.bsdf import probe
 
+direction, vectors = probe.direction, probe.vectors
 WAVELENGTHS = (400.0, 500.0, 600.0, 700.0)
 PERIOD = 2.5
 
@@ -61,12 +63,6 @@ def plugin(spectrum, **parameters):
     return mi.load_dict(of_spectrum(spectrum, **parameters))
 
 
-def direction(theta, phi=0.0):
-    """Degrees → a unit vector."""
-    theta, phi = np.deg2rad(theta), np.deg2rad(phi)
-    return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta) + 0 * phi], -1)
-
-
 def towards(wi, orders, wavelength, pitch=1 / PERIOD):
     """ω_o of the orders (n, 2) at one wavelength (nm); those that are evanescent are left out."""
     t = -wavelength * 1e-3 * pitch * np.asarray(orders) - wi[:2]
@@ -80,43 +76,20 @@ def random_directions(rng, count, least=0.05):
     return np.stack([r * np.cos(phi), r * np.sin(phi), z], -1)
 
 
-def vectors(omega):
-    """(n, 3) or (3,) → mi.Vector3f."""
-    return mi.Vector3f(*np.atleast_2d(omega).T.astype(np.float32))
+def interaction(wi, wavelengths=WAVELENGTHS, count=1, uv=(0.0, 0.0)):
+    return probe.interaction(np.broadcast_to(wi, (count, 3)), wavelengths, uv)
 
 
-def interaction(wi, wavelengths=WAVELENGTHS, count=1, uv=None):
-    si = dr.zeros(mi.SurfaceInteraction3f, count)
-    si.wi = vectors(wi)
-    si.wavelengths = type(si.wavelengths)(*map(float, wavelengths))
-    si.sh_frame = mi.Frame3f(mi.Normal3f(0, 0, 1))
-    si.n = mi.Normal3f(0, 0, 1)
-    si.dp_du, si.dp_dv = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
-    if uv is not None:
-        si.uv = mi.Point2f(*np.asarray(uv, np.float32).T)
-    return si
-
-
-def first(value):
-    """(4, n) of a spectrum, or of the first element of a Mueller matrix."""
-    value = np.array(value, np.float64)
-    return value[0, 0] if value.ndim == 4 else value
-
-
-def evaluate(bsdf, wi, wo, ctx=None, **arguments):
+def evaluate(bsdf, wi, wo, ctx=None, wavelengths=WAVELENGTHS, uv=(0.0, 0.0)):
     """f cos θ_o (4, n) and pdf (n,)."""
-    wo = np.atleast_2d(wo)
-    si = interaction(np.broadcast_to(wi, wo.shape), count=len(wo), **arguments)
-    value, pdf = bsdf.eval_pdf(ctx or mi.BSDFContext(), si, vectors(wo))
-    return first(value) + np.zeros((1, len(wo))), np.array(pdf, np.float64) + np.zeros(len(wo))
+    value, pdf = probe.evaluate_pdf(bsdf, wi, np.atleast_2d(wo), wavelengths, ctx, uv)
+    return value.T, pdf[:, 0]
 
 
-def draw(bsdf, wi, count, ctx=None, seed=1, **arguments):
+def draw(bsdf, wi, count, ctx=None, seed=1, uv=(0.0, 0.0)):
     """Samples and their weights (4, n)."""
-    u = np.random.default_rng(seed).random((3, count)).astype(np.float32)
-    si = interaction(np.broadcast_to(wi, (count, 3)), count=count, **arguments)
-    bs, weight = bsdf.sample(ctx or mi.BSDFContext(), si, mi.Float(u[0]), mi.Point2f(u[1], u[2]))
-    return bs, first(weight)
+    _, weights, bs = probe.sample(bsdf, np.broadcast_to(wi, (count, 3)), WAVELENGTHS, seed, ctx, uv)
+    return bs, weights.T
 
 
 def hemisphere(side=512):

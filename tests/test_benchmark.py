@@ -10,13 +10,15 @@ from rich.console import Console
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction import gratings
-from mitsuba_diffraction.benchmark import Case, bundled_cases, measure, report, run, scan_case
-from mitsuba_diffraction.benchmark.accuracy import Exact
 from mitsuba_diffraction.spectrum.slice_table import SliceTable
+from mitsuba_diffraction.studies import benchmark
+from mitsuba_diffraction.studies.accuracy import Exact
+from mitsuba_diffraction.studies.cases import Case, bundled_cases, scan_case
+from mitsuba_diffraction.studies.sampling import measure
+from mitsuba_diffraction.wavelengths import VISIBLE
 
 BLAZE = Case("blaze", gratings.blazed(2.5, 0.25), "tile", 65.0)
 SKIN = Case("skin", gratings.elaphe(8.0, pixel_size=0.08), "sample", 2.0)
-VISIBLE = (360.0, 830.0)
 
 
 @pytest.mark.parametrize("case", [BLAZE, SKIN], ids=lambda case: case.name)
@@ -41,11 +43,12 @@ def test_accuracy_sees_an_error_that_is_put_in(case):
 def test_a_run_reports_every_combination(llvm, tmp_path):
     deep = Case("deep", gratings.sinusoidal(2.5, 2.0), "tile", 65.0)
     steps = []
-    results, shaders = run(
+    results, shaders = benchmark.run(
         [BLAZE, deep],
         representations=("slices", "taylor"),
         tolerances=(1e-2,),
         count=1 << 12,
+        shading_points=1 << 8,
         repetitions=1,
         progress=lambda done, total: steps.append((done, total)),
     )
@@ -60,10 +63,11 @@ def test_a_run_reports_every_combination(llvm, tmp_path):
         assert min(result.evaluations, result.evaluate_ratio, result.read_ratio, result.sample_ratio) > 0
         assert result.accuracy.l1 <= 1e-2
     console = Console(width=200, record=True)
-    console.print(report.table(results))
+    console.print(*benchmark.tables(results, shaders, []))
     text = console.export_text()
     assert "refused" in text
-    assert all(len(report.cells(r)) == len(report.cells(results[0])) for r in results)
+    assert "flss, as published" in text
+    assert {len(benchmark.cells(r)) for r in results} == {len(benchmark.COLUMNS)}
 
     published, corrected = shaders[0], shaders[1]
     assert (published.surface, published.variant, published.as_published) == ("blaze", "flss", True)
@@ -71,13 +75,11 @@ def test_a_run_reports_every_combination(llvm, tmp_path):
     # Without its quirks the shader shows this model's colours, but for its 5 nm steps and the patches' 10 nm.
     assert corrected.delta_e[0] < published.delta_e[0]
     assert corrected.delta_e[0] < 1
-    console.print(report.shader_table(shaders))
-    assert "flss, as published" in console.export_text()
-    report.save_json(results, shaders, [], tmp_path / "results.json")
+    benchmark.save_json(results, shaders, [], tmp_path / "results.json")
     written = json.loads((tmp_path / "results.json").read_text(encoding="utf-8"))
     assert written["speed and error"][0]["accuracy"]["l1"] == results[0].accuracy.l1
     assert written["speed and error"][3]["terms"] is None
-    report.save_plot(results, tmp_path / "plot.png")
+    benchmark.save_plot(results, tmp_path / "plot.png")
     with Image.open(tmp_path / "plot.png") as picture:
         assert picture.width > 600
         assert np.ptp(np.asarray(picture)) > 100
@@ -91,7 +93,7 @@ def test_sampling_is_measured(llvm):
     assert found.variance_ratio > 1
     assert found.picture_ratio > 0
     console = Console(width=200, record=True)
-    console.print(report.sampling_table([found]))
+    console.print(*benchmark.tables([], [], [found]))
     assert "blaze" in console.export_text()
 
 

@@ -11,13 +11,13 @@ from PIL import Image
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction.color import delta_E, spectrum_to_XYZ
-from mitsuba_diffraction.comparison import compare, report
-from mitsuba_diffraction.comparison.difference import difference, noise, white_luminance
-from mitsuba_diffraction.comparison.pictures import NO_SHADOWS, Pictures
-from mitsuba_diffraction.comparison.quirk_shares import quirk_shares
 from mitsuba_diffraction.render.scene import channel_wavelengths, channel_weights
 from mitsuba_diffraction.shader.evaluate import VARIANTS
 from mitsuba_diffraction.shader.quirks import Quirks
+from mitsuba_diffraction.studies.shader_comparison import compare, summary
+from mitsuba_diffraction.studies.shader_comparison.difference import difference, noise, white_luminance
+from mitsuba_diffraction.studies.shader_comparison.pictures import NO_SHADOWS, Pictures
+from mitsuba_diffraction.studies.shader_comparison.quirk_shares import quirk_shares
 
 # A sphere above a plate, with a pigment; broad lobes, so that small pictures resolve them.
 GRATING = """<bsdf type="diffraction_grating"><string name="profile" value="{profile}"/>
@@ -311,13 +311,13 @@ def test_the_same_seed_gives_the_same_numbers(llvm, folder):
     found = [compare("scene.xml", "gem", spp=16, seed=1, shares=False) for _ in range(2)]
     for first, second in zip(*(one.pictures.values() for one in found), strict=True):
         np.testing.assert_array_equal(first.image.radiance, second.image.radiance)
-    numbers = [report.as_dict(one) for one in found]
+    numbers = [summary.as_dict(one) for one in found]
     assert numbers[0]["shares"] is None
     for one in numbers:
         del one["pictures"]  # seconds
     assert numbers[0] == numbers[1]
     # Without the shares, too, there is a figure.
-    report.save_figure(found[0], "figure.png", dpi=40)
+    summary.save_figure(found[0], "figure.png", dpi=40)
     with Image.open("figure.png") as picture:
         assert picture.width > 400
 
@@ -360,7 +360,7 @@ def test_all_files_or_none(command, monkeypatch, llvm, folder, error):
     def fail(*args, **kwargs):
         raise error
 
-    monkeypatch.setattr(report, "save_figure", fail)
+    monkeypatch.setattr(summary, "save_figure", fail)
     code, out, err = command("compare scene.xml --shader gem --spp 1 --width 4 --no-shares")
     assert (code, out) == (1, "")
     assert len(err.splitlines()) == 1

@@ -31,7 +31,7 @@ SHOWN = {"text", "bash"}
 BY_OTHER_MEANS = (
     *("python3 -m venv", "python -m pytest", "pip install", "jupyter ", "mkdocs "),
     *("mitsuba-diffraction benchmark", "mitsuba-diffraction validate"),
-    *("python -m mitsuba_diffraction.validation.rigorous_reference", "python scenes/"),
+    *("python precompute/rigorous_reference.py", "python scenes/"),
 )
 """Commands that CI runs, and the tests of notebooks, the manual, the benchmark, the validation and the gallery."""
 

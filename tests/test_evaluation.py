@@ -11,23 +11,21 @@ from hypothesis import strategies as st
 from PIL import Image
 
 import mitsuba_diffraction as md
-from mitsuba_diffraction.evaluation import save_figures
-from mitsuba_diffraction.evaluation.brdf_map import MAP_METHODS, PROJECTIONS, brdf_map
-from mitsuba_diffraction.evaluation.model import relative_reflectance
-from mitsuba_diffraction.evaluation.patch_length import cut, fit_cut_patch, period_of_heights
-from mitsuba_diffraction.evaluation.slits import Slits, analytic_intensity, tiled_intensity
-from mitsuba_diffraction.evaluation.surfaces import SURFACES, Surface, chosen
-from mitsuba_diffraction.evaluation.viewing_angle import (
+from mitsuba_diffraction.shader.quirks import Quirks
+from mitsuba_diffraction.studies.brdf_map import MAP_METHODS, PROJECTIONS, brdf_map
+from mitsuba_diffraction.studies.figures import save_figures
+from mitsuba_diffraction.studies.published_surfaces import SURFACES, PublishedSurface
+from mitsuba_diffraction.studies.viewing_angle import (
     METHODS,
     ReflectanceMap,
     fit_period,
     grating_equation,
     peak_angles,
     reflectance_map,
+    relative_reflectance,
     viewing_angles,
     wavelengths,
 )
-from mitsuba_diffraction.shader.quirks import Quirks
 
 BLAZE = SURFACES["blaze"]
 COARSE = wavelengths(40.0)
@@ -39,7 +37,7 @@ SKINS = {"elaphe": (1, 1.144), "xenopeltis": (0, 1.552)}
 def small_skin(name):
     axis, period = SKINS[name]
     surface = {"profile": name, "size": 12.0, "pixel_size": 0.085, "seed": 1}
-    return Surface(name, md.Recipe(surface, {"coherence_length": 10.0}), axis, period, (1e3 * period, 0.0))
+    return PublishedSurface(name, md.Recipe(surface, {"coherence_length": 10.0}), axis, period, (1e3 * period, 0.0))
 
 
 # ---------------------------------------------------------------- the model at directions
@@ -48,7 +46,7 @@ def small_skin(name):
 def test_a_flat_mirror_has_the_relative_reflectance_one(llvm):
     flat = md.precompute(md.HeightField(np.zeros((8, 8)), 0.05))
     found = relative_reflectance(flat, [0, 0, 1], [[0, 0, 1]], COARSE)
-    assert found.shape == (COARSE.size, 1)
+    assert found.shape == (1, COARSE.size)
     np.testing.assert_allclose(found, 1, atol=2e-3)  # what cutting off the lobes and the bytes of E leave
 
 
@@ -81,8 +79,8 @@ def fresnel(cosine, index=1.5):
 def test_the_number_of_wavelengths_need_not_be_a_multiple_of_four(llvm):
     wi, wo = BLAZE.direction(75.0), BLAZE.direction([-55.0, -50.0, -45.0])
     together = relative_reflectance(BLAZE.spectrum, wi, wo, COARSE[:7])
-    for nanometres, row in zip(COARSE, together, strict=False):
-        np.testing.assert_allclose(relative_reflectance(BLAZE.spectrum, wi, wo, [nanometres])[0], row, rtol=1e-5)
+    for nanometres, row in zip(COARSE, together.T, strict=False):
+        np.testing.assert_allclose(relative_reflectance(BLAZE.spectrum, wi, wo, [nanometres])[:, 0], row, rtol=1e-5)
 
 
 def test_directions_below_the_surface_are_dark(llvm):
@@ -194,39 +192,6 @@ def test_nmm_sees_only_the_orders_of_the_tile(llvm, incidence):
     np.testing.assert_array_equal(np.isnan(found.angles), np.isnan(found.reflectance))
 
 
-WAVES = Surface("waves", md.Recipe({"profile": "sinusoidal", "period": 1.144, "depth": 0.2}), 0, 1.144, (1144.0, 0.0))
-
-
-def cut_waves(periods):
-    """A patch of sinusoids 1.144 µm apart, `periods` of them."""
-    wave = md.gratings.sinusoidal(1.144, 0.2, samples=20).heights
-    columns = round(20 * periods)
-    return md.HeightField(np.tile(wave, (columns, 10))[:, :columns], 1.144 / 20)
-
-
-@pytest.mark.parametrize(("periods", "order"), [(6.0, 6), (5.6, 6), (6.35, 6), (6.65, 7)])
-def test_pq_on_a_cut_patch_fits_the_patch_and_not_the_surface(llvm, periods, order):
-    fit = fit_cut_patch(WAVES, cut_waves(periods), "pq", step=100.0)
-    assert fit.mean == pytest.approx(1144 * periods / order, rel=2e-3)
-
-
-def test_the_model_on_a_cut_patch_fits_the_surface(llvm):
-    fit = fit_cut_patch(WAVES, cut_waves(5.6), "model", step=100.0)
-    assert fit.mean == pytest.approx(1144, rel=0.02)
-
-
-@pytest.mark.slow
-def test_the_model_on_a_cut_patch_of_skin_fits_the_heights(llvm):
-    skin = small_skin("elaphe")
-    patch = cut(skin, 7.5)
-    fit = fit_cut_patch(skin, patch, "model", step=100.0)
-    assert fit.mean == pytest.approx(1e3 * period_of_heights(skin, patch), rel=0.02)
-
-
-def test_period_of_heights_is_that_of_a_sinusoid():
-    assert period_of_heights(WAVES, cut_waves(7.5)) == pytest.approx(1.144, rel=5e-3)
-
-
 # ---------------------------------------------------------------- maps of directions
 
 
@@ -263,30 +228,6 @@ def test_a_map_is_a_picture_of_the_hemisphere(llvm, method):
     assert found.exposure > 0
 
 
-# ---------------------------------------------------------------- slits
-
-
-@pytest.mark.parametrize("count", [1, 2, 7])
-def test_slits_agree_with_a_sum_of_wavelets(count):
-    slits = Slits(count)
-    sine = slits.sine(np.linspace(-12e3, 12e3, 301))
-    # Huygens' wavelets from 400 points of each slit.
-    inside = ((np.arange(400) + 0.5) / 400 - 0.5) * slits.width
-    places = (np.arange(count)[:, None] * slits.separation + inside).ravel()
-    direct = np.abs(np.exp(-2j * np.pi * sine[:, None] / 0.5 * places).mean(axis=1)) ** 2
-    np.testing.assert_allclose(analytic_intensity(slits, sine, 500.0), direct, atol=2e-5)
-    np.testing.assert_allclose(tiled_intensity(slits, sine, 500.0), direct, atol=2e-5)
-
-
-def test_slits_at_and_between_the_orders():
-    slits = Slits(7)
-    order = 0.5 / slits.separation
-    for intensity in (analytic_intensity, tiled_intensity):
-        at = intensity(slits, np.array([0, 1, 2]) * order, 500.0)
-        np.testing.assert_allclose(at, np.sinc(np.array([0, 1, 2]) * slits.width / slits.separation) ** 2, rtol=1e-3)
-        np.testing.assert_allclose(intensity(slits, np.arange(1, 7) / 7 * order, 500.0), 0, atol=1e-12)
-
-
 # ---------------------------------------------------------------- figures
 
 
@@ -296,8 +237,8 @@ def test_figures_and_the_table_are_written(llvm, tmp_path):
     files = save_figures(
         folder, surfaces=["blaze"], step=50.0, side=24, progress=lambda done, total: steps.append((done, total))
     )
-    assert steps == [(1, 3), (2, 3), (3, 3)]
-    names = {"viewing_angle_blaze.png", "brdf_blaze.png", "slits.png", "slit_patterns.png", "periods.md", "periods.csv"}
+    assert steps == [(1, 2), (2, 2)]
+    names = {"viewing_angle_blaze.png", "brdf_blaze.png", "periods.md", "periods.csv"}
     assert {path.name for path in files} == {path.name for path in folder.iterdir()} == names
     for path in folder.glob("*.png"):
         with Image.open(path) as picture:
@@ -316,31 +257,24 @@ def test_figures_and_the_table_are_written(llvm, tmp_path):
     assert f"| {' | '.join(rows[0])} |" == table[2]
 
 
-@pytest.mark.slow
-def test_figures_of_a_skin_hold_the_cut_patches(llvm, tmp_path):
-    files = save_figures(tmp_path, surfaces=["elaphe"], step=50.0, side=24, patch_lengths=(6.25, 6.5, 6.75))
-    assert (tmp_path / "patch_length.png") in files
-    assert (tmp_path / "patch_length.png").stat().st_size > 10_000
-
-
 # ---------------------------------------------------------------- misuse
 
 
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: chosen(["blaze", "python"]), "surfaces: got 'python', wanted among blaze, elaphe, xenopeltis"),
+        (
+            lambda: save_figures("nowhere", surfaces=["blaze", "python"]),
+            "surfaces: got 'python', wanted among blaze, elaphe, xenopeltis",
+        ),
         (lambda: reflectance_map(BLAZE, "gem"), "method: got 'gem', wanted one of model, flss, nmm, pq"),
         (lambda: reflectance_map(BLAZE, incidence=90.0), r"incidence: got 90\.0, wanted degrees"),
         (lambda: brdf_map(BLAZE, "none"), "method: got 'none'"),
         (lambda: brdf_map(BLAZE, projection="fisheye"), "projection: got 'fisheye'"),
         (lambda: brdf_map(BLAZE, incidence=(95.0, 0.0)), r"incidence: got \(95\.0, 0\.0\)"),
         (lambda: relative_reflectance(BLAZE.spectrum, [0, 0, 1], [[0, 1]], [500.0]), "wi, wo, wavelengths: got shapes"),
-        (lambda: cut(small_skin("elaphe"), 40.0), r"length: got 40\.0 µm"),
-        (lambda: Slits(0), "count: got 0"),
-        (lambda: Slits(2, width=200.0), r"width, separation, distance: got 200\.0"),
-        (lambda: Surface("x", BLAZE.recipe, 2, 1.0, (0, 0)), "axis: got 2"),
-        (lambda: Surface("x", BLAZE.recipe, 0, 0.0, (0, 0)), r"period: got 0\.0"),
+        (lambda: PublishedSurface("x", BLAZE.recipe, 2, 1.0, (0, 0)), "axis: got 2"),
+        (lambda: PublishedSurface("x", BLAZE.recipe, 0, 0.0, (0, 0)), r"period: got 0\.0"),
     ],
 )
 def test_misuse_is_refused(llvm, call, message):

@@ -25,7 +25,9 @@ def benchmark(
     """Speed against error of every representation, as ratios to Mitsuba's roughconductor."""
     import mitsuba as mi
 
-    from ..benchmark import bundled_cases, measure, report, run, scan_case
+    from ..studies.benchmark import run, save_json, save_plot, tables
+    from ..studies.cases import bundled_cases, scan_case
+    from ..studies.sampling import measure
     from ..variants import choose_variant
 
     cases = bundled_cases()
@@ -42,8 +44,8 @@ def benchmark(
         sampling = measure(cases, progress=progress)
     # Wide enough wherever it goes, a file too.
     wide = Console(highlight=False, width=max(out.width, 140))
-    wide.print(report.table(results), report.shader_table(shaders), report.sampling_table(sampling), sep="\n\n")
+    wide.print(*tables(results, shaders, sampling), sep="\n\n")
     if json is not None:
-        report.save_json(results, shaders, sampling, json)
+        save_json(results, shaders, sampling, json)
     if plot is not None:
-        report.save_plot(results, plot)
+        save_plot(results, plot)

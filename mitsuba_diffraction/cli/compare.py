@@ -36,8 +36,8 @@ def compare(
     """Render a scene with the path tracer and with the real-time shader, and show and measure the difference."""
     import mitsuba as mi
 
-    from ..comparison import compare as run
-    from ..comparison import report
+    from ..studies.shader_comparison import compare as run
+    from ..studies.shader_comparison import summary
     from ..variants import choose_variant
 
     name = f"{scene.stem}-{shader}"
@@ -72,13 +72,13 @@ def compare(
     with ExitStack() as files:  # all of them or none
         for target, picture in images.items():
             found.pictures[picture].image.save(files.enter_context(whole_file(target)))
-        report.save_figure(found, files.enter_context(whole_file(f"{prefix}.png")))
+        summary.save_figure(found, files.enter_context(whole_file(f"{prefix}.png")))
         if json is not None:
-            report.save_json(found, files.enter_context(whole_file(json)))
+            summary.save_json(found, files.enter_context(whole_file(json)))
     # Wide enough wherever it goes, a file too.
     wide = Console(highlight=False, width=max(out.width, 120))
-    wide.print(report.picture_table(found))
+    wide.print(summary.picture_table(found))
     if found.shares is not None:
-        wide.print("", report.quirk_table(found), sep="\n")
-    tell("\n" + "\n".join(report.notes(found)))
+        wide.print("", summary.quirk_table(found), sep="\n")
+    tell("\n" + "\n".join(summary.notes(found)))
     tell(f"{', '.join(written)}: {found.variant}, {time.perf_counter() - start:.1f} s")

@@ -13,7 +13,7 @@ from .console import out, progress_bar, tell
 from .scan import Channel, FillMissing, HeightRange, PixelSize, Prepare, Unit, options_of_scan, recipe_of
 
 if TYPE_CHECKING:
-    from ..validation import Check
+    from ..studies.record import Check
 
 
 def validate(
@@ -37,7 +37,8 @@ def validate(
     """Check against closed forms and rigorous results, or check one surface; fails if a bound is missed."""
     import mitsuba as mi
 
-    from ..validation import checks, report
+    from ..studies import report
+    from ..studies.checks import checks
     from ..variants import choose_variant
 
     of_scan = options_of_scan(pixel_size, height_range, fill_missing, channel, unit, prepare)
@@ -56,18 +57,18 @@ def validate(
     results = []
     with progress_bar("validation") as progress:
         for check in these:
-            results.append(check.result())
+            results.append(check.run())
             progress(len(results), len(these))
-    Console(highlight=False, width=max(out.width, 120)).print(report.table(results))
-    missed = [result["name"] for result in results if not result["ok"]]
-    promised = sum(result["bound"] is not None for result in results)
+    Console(highlight=False, width=max(out.width, 120)).print(report.record_table(results))
+    missed = [result.name for result in results if not result.ok]
+    promised = sum(result.bound is not None for result in results)
     tell(f"{promised - len(missed)} of {promised} within their bounds; {len(results) - promised} only shown")
     if json is not None:
-        report.save_json(results, json)
+        report.save_json(report.record_dicts(results), json)
     if markdown is not None:
-        report.save_markdown(results, markdown)
+        report.save_text(report.record_markdown(results), markdown)
     if figures is not None:
-        from ..evaluation import save_figures
+        from ..studies.figures import save_figures
 
         with progress_bar("figures") as progress:
             save_figures(figures, progress=progress)
@@ -76,7 +77,7 @@ def validate(
 
 
 def _of_surface(path: Path, of_scan: dict[str, object], settings: dict[str, object]) -> tuple[Check, ...]:
-    from ..validation.surface import surface_checks
+    from ..studies.checks import surface_checks
 
     if path.suffix.lower() != ".toml":
         settings = {"extent": "sample", **settings}

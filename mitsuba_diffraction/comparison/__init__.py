@@ -1,5 +1,0 @@
-"""The path tracer with this project's BSDF against the real-time shader, on one scene."""
-
-from .run import Comparison, compare
-
-__all__ = ["Comparison", "compare"]

@@ -1,5 +1,0 @@
-"""The evaluation of the thesis of 2014 (chapter 5), for the real-time shader and for this project's model."""
-
-from .figures import save_figures
-
-__all__ = ["save_figures"]

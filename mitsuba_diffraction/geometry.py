@@ -1,0 +1,30 @@
+"""K G in NumPy: Stam's geometry factor and the shadowing of V-cavities. `bsdf/geometry.py` is the same in Dr.Jit."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+
+def k_g(cos_i: ArrayLike, cos_o: ArrayLike, d: ArrayLike, shadowing: bool = True) -> NDArray[np.floating]:
+    """K G of pairs of directions; shapes broadcast, float32 stays float32.
+
+    With D = 1 + ω_i·ω_o and w = cos θ_i + cos θ_o,
+
+        K = D²/(cos θ_i cos θ_o w²)    (Stam 1999),
+        G = min(1, 2w cos θ_i/D, 2w cos θ_o/D)    (Torrance and Sparrow 1967).
+
+    Args:
+        cos_i, cos_o: cos θ_i and cos θ_o, positive.
+        d: D. Near grazing incidence take it from (|ω_i,t + ω_o,t|² + w²)/2, which does not cancel.
+        shadowing: without it, K alone.
+    """
+    w = np.add(cos_i, cos_o)
+    k = np.square(d) / (cos_i * cos_o * w**2)
+    return k * np.minimum(1, 2 * w * np.minimum(cos_i, cos_o) / d) if shadowing else k
+
+
+def k_g_between(wi: ArrayLike, wo: ArrayLike, shadowing: bool = True) -> NDArray[np.float64]:
+    """K G of unit vectors (..., 3) above the surface, which broadcast."""
+    wi, wo = np.asarray(wi, np.float64), np.asarray(wo, np.float64)
+    return k_g(wi[..., 2], wo[..., 2], ((wi + wo) ** 2).sum(axis=-1) / 2, shadowing)

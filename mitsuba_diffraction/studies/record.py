@@ -1,0 +1,91 @@
+"""What a check or a measurement found."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+GROUPS = ("analytic", "literature", "statistical", "energy", "rigorous", "surface")
+
+
+@dataclass(frozen=True)
+class Record:
+    """A number that was measured on the product, beside the number that was expected.
+
+    Attributes:
+        measured, expected: of many numbers, those that differ most.
+        bound: on the error; None where nothing is promised.
+        relative: whether the error is relative to `expected`.
+        note: what else a reader needs.
+        group: one of `GROUPS`.
+        name: what was measured, in words.
+        source: where `expected` comes from.
+    """
+
+    measured: float
+    expected: float
+    bound: float | None
+    relative: bool = False
+    note: str = ""
+    group: str = ""
+    name: str = ""
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        for name in ("measured", "expected"):
+            object.__setattr__(self, name, float(getattr(self, name)))
+        if self.bound is not None:
+            object.__setattr__(self, "bound", float(self.bound))
+
+    @classmethod
+    def worst(
+        cls,
+        expected: ArrayLike,
+        measured: ArrayLike,
+        bound: ArrayLike | None,
+        note: str = "",
+        *,
+        relative: bool = False,
+    ) -> Record:
+        """Of many numbers those with the largest error, as a multiple of its bound; NaN is the largest."""
+        limits = 1.0 if bound is None else bound
+        expected, measured, limits = (np.ravel(x) for x in np.broadcast_arrays(expected, measured, limits))
+        error = np.abs(measured - expected) / (np.abs(expected) if relative else 1) / limits
+        place = int(np.argmax(np.where(np.isnan(error), np.inf, error)))
+        return cls(measured[place], expected[place], None if bound is None else limits[place], relative, note)
+
+    @property
+    def error(self) -> float:
+        """|measured − expected|, over |expected| if relative."""
+        error = abs(self.measured - self.expected)
+        return error / abs(self.expected) if self.relative else error
+
+    @property
+    def ok(self) -> bool:
+        """Within the bound; an error that is not a number is not."""
+        return self.bound is None or self.error <= self.bound
+
+
+@dataclass(frozen=True)
+class Check:
+    """How a record comes about: one line of the table, and one test.
+
+    Attributes:
+        group, name, source: as of `Record`.
+        measure: measures under Mitsuba's variant in force; its record lacks these three.
+        slow: takes more than three seconds.
+    """
+
+    group: str
+    name: str
+    measure: Callable[[], Record]
+    source: str
+    slow: bool = False
+
+    def run(self) -> Record:
+        """The record."""
+        return dataclasses.replace(self.measure(), group=self.group, name=self.name, source=self.source)

@@ -1,0 +1,91 @@
+"""How far one picture is from another: exposure, CIEDE2000, luminance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...color import XYZ_to_linear_sRGB, auto_exposure, delta_E, into_gamut
+
+
+@dataclass(frozen=True, eq=False)
+class Difference:
+    """Of a picture to a reference.
+
+    Attributes:
+        exposure: the factor by which the picture was multiplied, so that both have the same mean luminance.
+        delta_e: (height, width) CIEDE2000, NaN where nothing is compared.
+        luminance_error: Σ|Y − Y_ref| / Σ Y_ref, as shown.
+    """
+
+    exposure: float
+    delta_e: NDArray[np.float64]
+    luminance_error: float
+
+    @property
+    def mean(self) -> float:
+        """The mean CIEDE2000."""
+        return float(np.nanmean(self.delta_e))
+
+    @property
+    def percentile_95(self) -> float:
+        """What 95 % of the pixels stay below."""
+        return float(np.nanpercentile(self.delta_e, 95))
+
+    @property
+    def largest(self) -> float:
+        """The largest CIEDE2000."""
+        return float(np.nanmax(self.delta_e))
+
+
+def as_shown(xyz: NDArray[np.float64]) -> NDArray[np.float64]:
+    """What is brighter than white, Y > 1, keeps its chromaticity and gets Y = 1: CIEDE2000 knows nothing beyond."""
+    return xyz / np.maximum(xyz[..., 1:2], 1)
+
+
+def white_luminance(xyz: NDArray[np.float64], where: NDArray[np.bool_]) -> float:
+    """The luminance that a preview of the picture shows as white (`auto_exposure` of the pixels that count)."""
+    return 1 / auto_exposure(into_gamut(XYZ_to_linear_sRGB(xyz[where])))
+
+
+def difference(
+    reference: NDArray[np.float64], xyz: NDArray[np.float64], where: NDArray[np.bool_], white: float
+) -> Difference:
+    """Compares two pictures.
+
+    Args:
+        reference: XYZ, (height, width, 3).
+        xyz: of the other picture, likewise.
+        where: (height, width), the pixels that count.
+        white: the luminance of the reference that is shown as white.
+
+    Raises:
+        ValueError: if nothing counts, or one picture is black there.
+    """
+    sums = [float(picture[where][:, 1].sum()) for picture in (reference, xyz)]
+    if not min(sums) > 0:
+        raise ValueError(f"luminance: got sums {sums[0]:.3g} and {sums[1]:.3g} of two pictures, wanted positive ones")
+    exposure = sums[0] / sums[1]
+    first, second = as_shown(reference[where] / white), as_shown(xyz[where] * (exposure / white))
+    delta_e = np.full(where.shape, np.nan)
+    delta_e[where] = delta_E(first, second)
+    error = np.abs(second[:, 1] - first[:, 1]).sum() / first[:, 1].sum()
+    return Difference(exposure, delta_e, float(error))
+
+
+def noise(halves: NDArray[np.float64] | None, where: NDArray[np.bool_], white: float) -> float | None:
+    """The mean CIEDE2000 of a picture to itself without noise, estimated as half of that between its two halves.
+
+    The variance of the mean of two halves is a quarter of that of their difference.
+
+    Args:
+        halves: of `Picture`.
+        where: (height, width), the pixels that count.
+        white: the luminance that is shown as white.
+    """
+    if halves is None:
+        return None
+    first, second = (as_shown(half[where] / white) for half in halves)
+    return float(delta_E(first, second).mean()) / 2
