@@ -1,7 +1,7 @@
 """Diffraction gratings for Mitsuba 3.
 
-Importing this package registers the BSDF `diffraction_grating` and the integrator `diffraction_shader` for every
-spectral variant of Mitsuba, and sees to it that Dr.Jit finds an LLVM that works.
+Importing this package registers the BSDF `diffraction_grating` and the integrators `diffraction_path` and
+`diffraction_shader` for every spectral variant of Mitsuba, and sees to it that Dr.Jit finds an LLVM that works.
 """
 
 from . import llvm

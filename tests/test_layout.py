@@ -9,7 +9,7 @@ import pytest
 
 PACKAGE = Path(__file__).parents[1] / "mitsuba_diffraction"
 RUN_TIME = {
-    *("benchmark", "bsdf", "cli", "comparison", "evaluation", "render", "shader", "validation"),
+    *("benchmark", "bsdf", "cli", "comparison", "evaluation", "integrator", "render", "shader", "validation"),
     *("llvm.py", "plugin.py", "variants.py", "__init__.py"),
 }
 """What may import Mitsuba; everything else is offline."""
