@@ -4,34 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 
 from .gratings import Gratings
 from .ratio import ratio
+from .splats import SplatBuffer, Splats
 
 _PATHS_AT_ONCE = 2**20  # some 150 MB
 _CANDIDATES = 4
 # For each sample of the film: they cost about as much, and there must be time for both.
 _PATHS_PER_SAMPLE = 0.25
-
-
-@dataclass(frozen=True, eq=False)
-class Splats:
-    """Contributions to the film, n of them.
-
-    Attributes:
-        position: pixels from the corner of the crop window.
-        wavelengths: four, drawn by the sensor, nm.
-        value: Σ value δ(x − position) over all splats has the expectation L(x), x in pixels, in the form in which the
-            sensor gives radiance to the film: divided by the density of the wavelengths and times the film's response.
-    """
-
-    position: mi.Point2f
-    wavelengths: mi.Spectrum
-    value: mi.Spectrum
 
 
 class LightPaths:
@@ -53,7 +37,8 @@ class LightPaths:
 
     def __init__(self, scene: mi.Scene, sensor: mi.Sensor, gratings: Gratings, max_depth: int, rr_depth: int) -> None:
         self.scene, self.sensor, self.gratings = scene, sensor, gratings
-        self.max_depth = 2**31 if max_depth < 0 else max_depth
+        # Opaque, so that all depths run the same kernel.
+        self.max_depth = dr.opaque(mi.UInt32, max_depth % 2**32)
         self.pixels = math.prod(map(int, sensor.film().crop_size()))
         self.rr_depth = dr.opaque(mi.UInt32, rr_depth)
 
@@ -64,45 +49,48 @@ class LightPaths:
     def splats(self, seed: int, count: int) -> Iterator[Splats]:
         """Traces `count` paths. What comes, and in which order, depends on the seed and the count alone."""
         step = _PATHS_AT_ONCE if dr.is_jit_v(mi.Float) else 1
+        capacity = min(step, count)
         for first in range(0, count, step):
-            lanes = dr.arange(mi.UInt32, min(step, count - first)) if dr.is_jit_v(mi.Float) else 0
-            rng = mi.PCG32()
-            # Other numbers than the sampler draws from the same seed.
-            numbers = mi.sample_tea_32(lanes + dr.opaque(mi.UInt32, first), dr.opaque(mi.UInt32, seed ^ 0x9E3779B9))
-            rng.seed(*map(mi.UInt64, numbers))
-            yield from self._trace(rng, self.pixels / count)
+            buffer = SplatBuffer(capacity)
+            self._trace(seed, first, min(step, count - first), self.pixels / count, buffer)
+            if buffer.count() > capacity:
+                # Once more, with the same random numbers.
+                capacity = buffer.count()
+                buffer = SplatBuffer(capacity)
+                self._trace(seed, first, min(step, count - first), self.pixels / count, buffer)
+            yield from buffer.content()
 
-    def _trace(self, rng: mi.PCG32, scale: float) -> Iterator[Splats]:
+    @dr.syntax
+    def _trace(self, seed: int, first: int, count: int, scale: float, buffer: SplatBuffer) -> None:
+        """Traces the paths from the number `first` on, and leaves in `buffer` what they give to the sensor."""
+        path = dr.arange(mi.UInt32, count) if dr.is_jit_v(mi.Float) else 0
+        path += dr.opaque(mi.UInt32, first)
+        rng = mi.PCG32()
+        # Other numbers than the sampler draws from the same seed.
+        state, sequence = mi.sample_tea_32(path, dr.opaque(mi.UInt32, seed ^ 0x9E3779B9))
+        rng.seed(mi.UInt64(state), mi.UInt64(sequence))
         ray, power, active = self._start(rng)
         power *= dr.opaque(mi.Float, scale)
+        si = self.scene.ray_intersect(ray, active)
+        depth = mi.UInt32(2)
+        active &= si.is_valid()
         throughput, eta, met = mi.Spectrum(1), mi.Float(1), mi.Bool(False)
-        for depth in range(2, self.max_depth):
-            # Each vertex is a kernel of its own, for the paths that are left.
-            state = _those(active, ray, power, throughput, eta, met, rng)
-            if state is None:
-                return
-            ray, power, throughput, eta, met, rng = state
-            dr.make_opaque(ray, power, throughput, eta, met, rng)
-            si = self.scene.ray_intersect(ray)
-            active = si.is_valid()
-            if not dr.is_jit_v(mi.Float) and not active:
-                return
+        while active:
             bsdf = si.bsdf(ray)
-            met = met | (self.gratings.hold(si, active) ^ True)
+            met |= self.gratings.hold(si, active) ^ True
             position, value, reached = self._connect(si, bsdf, _next_2d(rng), active & met)
-            value *= power * throughput
+            buffer.add(Splats(position, ray.wavelengths, value * power * throughput), path, depth, reached)
             ray, weight, widening, _ = self._scatter(si, bsdf, rng, active)
             throughput *= weight
             eta *= widening
-            active &= dr.any(throughput != 0)
-            gambles = dr.opaque(mi.UInt32, depth + 1) >= self.rr_depth
+            depth += 1
+            gambles = depth >= self.rr_depth
             survival = dr.minimum(dr.max(throughput) * dr.square(eta), 0.95)
+            active &= dr.any(throughput != 0) & (depth < self.max_depth)
             active &= (gambles ^ True) | (_next_1d(rng) < survival)
             throughput *= dr.select(gambles, ratio(1, survival), 1)
-            dr.eval(position, value, reached, ray, power, throughput, eta, met, rng, active)
-            found = _those(reached, position, si.wavelengths, value)
-            if found is not None:
-                yield Splats(*found)
+            si = self.scene.ray_intersect(ray, active)
+            active &= si.is_valid()
 
     @dr.syntax
     def _start(self, rng: mi.PCG32) -> tuple[mi.Ray3f, mi.Spectrum, mi.Bool]:
@@ -183,15 +171,6 @@ def _from(si: mi.SurfaceInteraction3f, wi: mi.Vector3f) -> mi.SurfaceInteraction
     seen = mi.SurfaceInteraction3f(si)
     seen.wi = wi
     return seen
-
-
-def _those(active: mi.Bool, *values: object) -> tuple | None:
-    """The lanes that are active, in their order; None if there are none."""
-    if not dr.is_jit_v(mi.Float):
-        return values if active else None
-    dr.eval(active, values)  # all at once: what is gathered from must be there
-    index = dr.compress(active)
-    return tuple(dr.gather(type(value), value, index) for value in values) if len(index) else None
 
 
 def _next_1d(rng: mi.PCG32) -> mi.Float:

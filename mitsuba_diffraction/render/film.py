@@ -19,7 +19,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..integrator.light_paths import Splats
+from ..integrator.splats import Splats
 from .scene import channel_wavelengths, channel_weights, root_cause
 
 
