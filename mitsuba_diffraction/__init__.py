@@ -1,7 +1,8 @@
 """Diffraction gratings for Mitsuba 3.
 
-Importing this package registers the BSDF `diffraction_grating` and the integrator `diffraction_shader` for every
-spectral variant of Mitsuba, once Mitsuba is imported. Everything that needs no renderer works without it.
+Importing this package registers the BSDF `diffraction_grating` and the integrators `diffraction_path` and
+`diffraction_shader` for every spectral variant of Mitsuba, once Mitsuba is imported. Everything that needs no renderer
+works without it.
 """
 
 from __future__ import annotations

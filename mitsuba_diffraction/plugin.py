@@ -14,12 +14,14 @@ import mitsuba as mi
 from . import llvm
 from .bsdf import diffraction_grating
 from .bsdf.surface import hand_over
+from .integrator import diffraction_path
 from .shader import integrator
 from .variants import is_spectral
 
 # Name, the function of Mitsuba's that registers it, and what gives its class for the variant in force.
 PLUGINS = (
     ("diffraction_grating", "register_bsdf", diffraction_grating.define),
+    ("diffraction_path", "register_integrator", diffraction_path.define),
     ("diffraction_shader", "register_integrator", integrator.define),
 )
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from ..bsdf.nesting import contains_grating, is_grating, nested
 from ..coherence import SUN_COHERENCE_LENGTH
 from ..surface.heightfield import HeightField
 
@@ -50,11 +51,11 @@ def surfaces_of(scene: mi.Scene) -> list[Surface]:
         if is_grating(bsdf):
             found.append(Surface(bsdf, bsdf, 1))
             continue
-        parts = _children(bsdf)
+        parts = nested(bsdf)
         if bsdf.class_name() == "TwoSidedBRDF":
             sides = ((parts[0], 1), (parts[-1], -1))
             found += [Surface(bsdf, part, side) for part, side in sides if is_grating(part)]
-        elif any(map(_contains_grating, parts)):
+        elif any(map(contains_grating, parts)):
             raise ValueError(
                 f"diffraction_shader: a diffraction_grating stands inside {bsdf.class_name()}, wanted on a shape or "
                 "inside twosided"
@@ -75,27 +76,3 @@ def heights_of(grating: mi.BSDF) -> tuple[HeightField, float]:
         )
     recipe = grating.recipe
     return recipe.height_field(), float(recipe.spectrum.get("coherence_length", SUN_COHERENCE_LENGTH))
-
-
-def is_grating(bsdf: mi.BSDF) -> bool:
-    """Whether a BSDF is of the class behind `diffraction_grating`."""
-    return hasattr(bsdf, "spectrum") and hasattr(bsdf, "recipe")
-
-
-def _contains_grating(bsdf: mi.BSDF) -> bool:
-    return is_grating(bsdf) or any(map(_contains_grating, _children(bsdf)))
-
-
-def _children(bsdf: mi.BSDF) -> list[mi.BSDF]:
-    class Children(mi.TraversalCallback):
-        def __init__(self) -> None:
-            mi.TraversalCallback.__init__(self)
-            self.found: list[mi.BSDF] = []
-
-        def put(self, name: str, value: object, *rest: object) -> None:
-            if isinstance(value, mi.BSDF):
-                self.found.append(value)
-
-    callback = Children()
-    bsdf.traverse(callback)
-    return callback.found
