@@ -8,7 +8,7 @@ from . import llvm
 
 llvm.ensure()
 
-from . import gratings, reference  # noqa: E402 (LLVM must be settled before anything imports Dr.Jit)
+from . import gratings, reference, rigorous  # noqa: E402 (LLVM must be settled before anything imports Dr.Jit)
 from . import plugin as _plugin  # noqa: E402, F401 (registers on import)
 from .heightfield import HeightField  # noqa: E402
 from .precompute import precompute  # noqa: E402
@@ -24,4 +24,5 @@ __all__ = [
     "precompute",
     "read_height_field",
     "reference",
+    "rigorous",
 ]
