@@ -141,13 +141,46 @@ def half_space(grating: Grating, alpha: Real, gamma2: complex, upwards: bool) ->
 
 
 @dataclass(frozen=True, eq=False)
+class Light:
+    """A plane wave from above, of unit amplitude, and what is above.
+
+    Attributes:
+        alpha: α_m of all harmonics, (n,); that of the light is in the middle.
+        square: γ² above.
+        beta: β of the light, positive; it travels downwards.
+        above: the outgoing fields above.
+        psi: ψ of the light along the curve, (n, 1).
+        rise: −iG of the light less Yψ, (n, 1).
+    """
+
+    alpha: Real
+    square: float
+    beta: float
+    above: HalfSpace
+    psi: Complex
+    rise: Complex
+
+
+def light_from(grating: Grating, alpha_0: float, square: float) -> Light:
+    """The light whose wave vector has x component α_0, with γ² = k² − k_y² (times period / 2π, and its square)."""
+    alpha = alpha_0 + grating.n
+    above = half_space(grating, alpha, square, True)
+    beta = float(np.sqrt(square - alpha_0**2))
+    psi, flux = grating.rayleigh(alpha, np.array([0]), np.array([-beta]))
+    return Light(alpha, square, beta, above, psi, flux - above.admittance @ psi)
+
+
+@dataclass(frozen=True, eq=False)
 class Scattered:
     """What became of light from above.
 
+    A wave that travels along k̂ is polarised as (ê, k̂ × ê), ê the direction of ŷ − (ŷ·k̂)k̂: "y" light, whose electric
+    field lies along the grooves as far as it can, comes before its orthogonal.
+
     Attributes:
         orders: n of the reflected orders, whose α is α_0 + n, (p,).
-        reflected: (p, 2, 2), [order, polarisation of the order, of the incident light], s before p, so scaled that |·|²
-            is a share of the incident power.
+        reflected: (p, 2, 2), [order, polarisation of the order, of the incident light], so scaled that |·|² is a share
+            of the incident power.
         transmitted: the same of the orders that propagate below, (r, 2, 2).
     """
 
@@ -156,51 +189,27 @@ class Scattered:
     transmitted: Complex
 
 
-def scatter(grating: Grating, alpha_0: float, k_y: float, k_0: float, indices: tuple[float, complex]) -> Scattered:
-    """Light comes from above.
-
-    Args:
-        grating: the surface and its harmonics.
-        alpha_0, k_y, k_0: x and y of its wave vector, and the wave number in vacuum, times period / 2π.
-        indices: n above, and n + ik below.
-    """
-    alpha = alpha_0 + grating.n
-    n_1, n_2 = indices[0], (indices[1].real if np.imag(indices[1]) == 0 else indices[1])
-    square_1, square_2 = (k_0 * n_1) ** 2 - k_y**2, (k_0 * n_2) ** 2 - k_y**2
-    above, below = half_space(grating, alpha, square_1, True), half_space(grating, alpha, square_2, False)
-    beta_0 = np.sqrt(square_1 - alpha_0**2)
-    incident, flux = grating.rayleigh(alpha, np.array([0]), np.array([-beta_0]))
-    # ψ_E and ψ_H on the surface, from E_t and H_t, which are continuous. Above, −iG = Yψ + rise.
+def scatter(grating: Grating, light: Light, k_y: float, index: complex) -> Scattered:
+    """Solve for light of this k_y (times period / 2π) in air above a medium of the index n + ik."""
+    k_0 = np.sqrt(light.square + k_y**2)
+    square = k_0**2 * (index.real**2 if index.imag == 0 else index**2) - k_y**2
+    above, below = light.above, half_space(grating, light.alpha, square, False)
+    # ψ_E and ψ_H on the curve, from E_t and H_t, which are continuous. Above, −iG = Yψ + rise.
     #   k_y α ψ_E (1/γ₁² − 1/γ₂²) − k_0 (Y₁/γ₁² − Y₂/γ₂²) ψ_H = k_0/γ₁² rise_H
-    #   k_y α ψ_H (1/γ₁² − 1/γ₂²) + k_0 (n₁² Y₁/γ₁² − n₂² Y₂/γ₂²) ψ_E = −k_0 n₁²/γ₁² rise_E
-    rise = flux - above.admittance @ incident
-    coupling = np.diag(k_y * alpha * (1 / square_1 - 1 / square_2))
-    upper, lower = k_0 / square_1 * above.admittance, k_0 / square_2 * below.admittance
-    matrix = np.block([[coupling, lower - upper], [n_1**2 * upper - n_2**2 * lower, coupling]])
-    zero = np.zeros_like(rise)
-    right = k_0 / square_1 * np.block([[zero, rise], [-(n_1**2) * rise, zero]])
+    #   k_y α ψ_H (1/γ₁² − 1/γ₂²) + k_0 (Y₁/γ₁² − n² Y₂/γ₂²) ψ_E = −k_0/γ₁² rise_E
+    coupling = np.diag(k_y * light.alpha * (1 / light.square - 1 / square))
+    upper, lower = k_0 / light.square * above.admittance, k_0 / square * below.admittance
+    matrix = np.block([[coupling, lower - upper], [upper - index**2 * lower, coupling]])
+    zero = np.zeros_like(light.rise)
+    right = k_0 / light.square * np.block([[zero, light.rise], [-light.rise, zero]])
     # [ψ_E or ψ_H, harmonic, light in E_y or in H_y].
-    total = np.linalg.solve(matrix, right).reshape(2, len(alpha), 2)
-    scattered = total - np.stack([np.hstack([incident, zero]), np.hstack([zero, incident])])
-    light = _polarisations(np.array([alpha_0]), k_y, np.array([-beta_0]), n_1)[0]
-
-    def amplitudes(side: HalfSpace, fields: Complex, sign: int, index: float) -> Complex:
-        waves = np.stack([side.amplitudes(field) for field in fields], axis=1)
-        frames = _polarisations(alpha_0 + side.orders, k_y, sign * side.beta, index)
-        return np.sqrt(side.beta / beta_0)[:, None, None] * np.linalg.solve(frames, waves @ light)
-
-    transmitted = amplitudes(below, total, -1, n_2) if len(below.orders) else np.empty((0, 2, 2), complex)
-    return Scattered(above.orders, amplitudes(above, scattered, 1, n_1), transmitted)
-
-
-def _polarisations(alpha: Real, k_y: float, beta: Real, index: float) -> Complex:
-    """(n, 2, 2): E_y and H_y (rows) of waves (α, k_y, β) of unit amplitude, s and p (columns).
-
-    ŝ = ẑ × k̂ / |ẑ × k̂|, or ŷ along z; p̂ = k̂ × ŝ; H = n k̂ × E.
-    """
-    across = np.hypot(alpha, k_y)
-    normal = across < 1e-12
-    cos, sin = np.where(normal, [[1.0], [0.0]], np.divide([alpha, np.full_like(alpha, k_y)], across + normal))
-    # k̂ = (sin θ cos φ, sin θ sin φ, cos θ), ŝ = (−sin φ, cos φ, 0), p̂_y = −cos θ sin φ.
-    p_y = -beta / np.hypot(across, beta) * sin
-    return np.array([[cos, p_y], [index * p_y, -index * cos]]).transpose(2, 0, 1).astype(complex)
+    total = np.linalg.solve(matrix, right).reshape(2, -1, 2)
+    scattered = total - np.stack([np.hstack([light.psi, zero]), np.hstack([zero, light.psi])])
+    # Of unit waves, E_y = γ/k and H_y = −n γ/k.
+    up = np.stack([above.amplitudes(field) for field in scattered], axis=1) * [[1, -1], [-1, 1]]
+    reflected = np.sqrt(above.beta / light.beta)[:, None, None] * up
+    down = np.zeros((len(below.orders), 2, 2), complex)
+    if len(below.orders):
+        down = np.stack([below.amplitudes(field) for field in total], axis=1) * [[1, -1], [-1, 1]]
+        down *= np.sqrt(below.beta / light.beta * light.square / square)[:, None, None] * [[index.real], [1]]
+    return Scattered(above.orders, reflected, down)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..heightfield import HeightField
-from .coordinate_transformation import Grating, scatter
+from .coordinate_transformation import Grating, light_from, scatter
 from .curve import curve_of
 from .materials import refractive_index
 
@@ -110,9 +110,26 @@ def efficiencies(
 def _solve(height_field: HeightField, omega: Real, wavelength: float, index: complex, harmonics: int) -> Efficiencies:
     k_0 = height_field.tile_size[0] / wavelength
     grating = Grating(curve_of(height_field), harmonics)
-    # Orders count along the change of k_x here, and along q = −(ω_i + ω_o)/λ outside: m = −n.
-    solved = scatter(grating, -omega[0] * k_0, -omega[1] * k_0, k_0, (1.0, index))
+    alpha, k_y = -omega[:2] * k_0
+    solved = scatter(grating, light_from(grating, alpha, k_0**2 - k_y**2), k_y, index)
+    light = _frames(np.array([[alpha, k_y, -k_0 * omega[2]]]) / k_0)
+    alphas = alpha + solved.orders
+    heights = np.sqrt(k_0**2 - k_y**2 - alphas**2)
+    orders = _frames(np.stack([alphas, np.full_like(alphas, k_y), heights], axis=1) / k_0)
+    amplitudes = orders.transpose(0, 2, 1) @ solved.reflected @ light
     transmitted = np.full(2, np.nan)
     if index.imag == 0:
-        transmitted = (np.abs(solved.transmitted) ** 2).sum(axis=(0, 1))
-    return Efficiencies(-solved.orders[::-1], solved.reflected[::-1], transmitted, harmonics, float("nan"))
+        transmitted = (np.abs(solved.transmitted @ light) ** 2).sum(axis=(0, 1))
+    # Orders count along the change of k_x there, and along q = −(ω_i + ω_o)/λ here.
+    return Efficiencies(-solved.orders[::-1], amplitudes[::-1], transmitted, harmonics, float("nan"))
+
+
+def _frames(k: Real) -> Real:
+    """(n, 2, 2): ŝ and p̂ (columns) of waves along k (n, 3) in terms of ê and k̂ × ê (rows), as in `Scattered`."""
+    across = np.hypot(k[:, 0], k[:, 1])
+    s = np.stack([-k[:, 1], k[:, 0], np.zeros(len(k))], axis=1)
+    s = np.where(across[:, None] < 1e-12, [0.0, 1.0, 0.0], s / np.maximum(across, 1e-12)[:, None])
+    # ê·ŝ = s_y/√(1 − k_y²), and (k̂ × ê)·ŝ = −ê·(k̂ × ŝ) = −ê·p̂.
+    scale = np.sqrt(np.maximum(1 - k[:, 1] ** 2, 1e-30))
+    cos, sin = s[:, 1] / scale, np.cross(k, s)[:, 1] / scale
+    return np.array([[cos, sin], [-sin, cos]]).transpose(2, 0, 1)
