@@ -9,6 +9,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
+import platformdirs
+
 
 @contextmanager
 def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
@@ -97,3 +99,9 @@ def refuse_unwritable(path: str | os.PathLike[str]) -> None:
 
 class _Writable(Exception):
     """Nothing stands in the way; the temporary file goes."""
+
+
+def cache_folder() -> Path:
+    """Where what took long to build is kept: $MITSUBA_DIFFRACTION_CACHE, or the user's cache folder."""
+    named = os.environ.get("MITSUBA_DIFFRACTION_CACHE")
+    return Path(named) if named else platformdirs.user_cache_path("mitsuba_diffraction")

@@ -44,8 +44,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import platformdirs
-
+from .files import cache_folder
 from .gratings import PROFILES
 from .heightfield import HeightField
 from .precompute import precompute
@@ -202,12 +201,6 @@ class Recipe:
             path.parent.mkdir(parents=True, exist_ok=True)
             spectrum.save(path)
             return spectrum
-
-
-def cache_folder() -> Path:
-    """Where spectra of recipes are kept."""
-    named = os.environ.get("MITSUBA_DIFFRACTION_CACHE")
-    return Path(named) if named else platformdirs.user_cache_path("mitsuba_diffraction")
 
 
 def _refuse_unknown(where: str, table: Mapping[str, Any], known: frozenset[str]) -> None:

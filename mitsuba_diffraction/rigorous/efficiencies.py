@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..heightfield import HeightField
+from .blas import one_thread
 from .coordinate_transformation import Grating, light_from, scatter
 from .curve import curve_of
 from .materials import refractive_index
@@ -109,9 +110,10 @@ def efficiencies(
 
 def _solve(height_field: HeightField, omega: Real, wavelength: float, index: complex, harmonics: int) -> Efficiencies:
     k_0 = height_field.tile_size[0] / wavelength
-    grating = Grating(curve_of(height_field), harmonics)
     alpha, k_y = -omega[:2] * k_0
-    solved = scatter(grating, light_from(grating, alpha, k_0**2 - k_y**2), k_y, index)
+    with one_thread():
+        grating = Grating(curve_of(height_field), harmonics)
+        solved = scatter(grating, light_from(grating, alpha, k_0**2 - k_y**2), k_y, index)
     light = _frames(np.array([[alpha, k_y, -k_0 * omega[2]]]) / k_0)
     alphas = alpha + solved.orders
     heights = np.sqrt(k_0**2 - k_y**2 - alphas**2)

@@ -33,7 +33,7 @@ FORMAT_VERSION = 2
 
 
 @contextlib.contextmanager
-def _silence() -> Iterator[None]:
+def silence() -> Iterator[None]:
     """Keep the library from giving its own account of a broken file, from Python and from C, before it raises."""
     sys.stderr.flush()
     kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
@@ -99,7 +99,7 @@ def load(path: str | os.PathLike[str]) -> GratingSpectrum:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
     try:
-        with _silence():
+        with silence():
             file = OpenEXR.File(str(path), separate_channels=True)
             header, channels = file.header(), file.channels()
     except Exception as error:
