@@ -18,7 +18,7 @@ _HOME = {
     "precompute": "spectrum.build",
     "read_height_field": "surface.readers",
 }
-_MODULES = {"gratings": "surface.gratings", "reference": "reference"}
+_MODULES = {"gratings": "surface.gratings", "reference": "reference", "rigorous": "rigorous"}
 
 __all__ = [*_HOME, *_MODULES]
 

@@ -11,6 +11,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
+import platformdirs
+
 try:
     import fcntl
 except ImportError:  # Windows, where nothing tells whether a temporary file is still being written
@@ -123,6 +125,12 @@ def refuse_unwritable(path: str | os.PathLike[str]) -> None:
 
 class _Writable(Exception):
     """Nothing stands in the way; the temporary file goes."""
+
+
+def cache_folder() -> Path:
+    """Where what took long to build is kept: $MITSUBA_DIFFRACTION_CACHE, or the user's cache folder."""
+    named = os.environ.get("MITSUBA_DIFFRACTION_CACHE")
+    return Path(named) if named else platformdirs.user_cache_path("mitsuba_diffraction")
 
 
 def refuse_special(path: str | os.PathLike[str]) -> None:

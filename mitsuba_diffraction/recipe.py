@@ -48,9 +48,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import platformdirs
-
-from .files import refuse_special
+from .files import cache_folder, refuse_special
 from .spectrum import GratingSpectrum
 from .spectrum.build import precompute
 from .spectrum.file import FORMAT_VERSION
@@ -237,12 +235,6 @@ class Recipe:
                 stacklevel=1,
             )
         return spectrum
-
-
-def cache_folder() -> Path:
-    """Where spectra of recipes are kept."""
-    named = os.environ.get("MITSUBA_DIFFRACTION_CACHE")
-    return Path(named) if named else platformdirs.user_cache_path("mitsuba_diffraction")
 
 
 def _refuse_unknown(where: str, table: Mapping[str, Any], known: frozenset[str]) -> None:
