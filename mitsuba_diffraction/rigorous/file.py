@@ -7,13 +7,21 @@ at the left. Numbers in the header are double precision.
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 import OpenEXR
 
 from ..files import whole_file
-from .spectrum import Axes, RigorousSpectrum
+from ..spectrum.file import silence
+from .axes import Axes
+
+if TYPE_CHECKING:
+    from .spectrum import RigorousSpectrum
+
+Spectrum = TypeVar("Spectrum")
 
 FORMAT = "mitsuba_diffraction rigorous spectrum"
 FORMAT_VERSION = 1
@@ -56,15 +64,13 @@ def save(spectrum: RigorousSpectrum, path: str | os.PathLike[str]) -> None:
         OpenEXR.File(header, {_channel(k): plane for k, plane in enumerate(sheet)}).write(str(temporary))
 
 
-def load(path: str | os.PathLike[str]) -> RigorousSpectrum:
-    """Read a spectrum that `save` wrote.
+def load(path: str | os.PathLike[str], construct: Callable[..., Spectrum]) -> Spectrum:
+    """Hand what `save` wrote to the constructor of a `RigorousSpectrum`.
 
     Raises:
         FileNotFoundError: if there is no such file.
         ValueError: if it is not a rigorous spectrum, is damaged, or is of a version not known here.
     """
-    from ..spectrum.file import silence
-
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
@@ -90,7 +96,7 @@ def load(path: str | os.PathLike[str]) -> RigorousSpectrum:
             side = axes.side(m)
             squares.append(sheet[:, top : top + side, :side].reshape(axes.planes, side**2))
             top += side
-        return RigorousSpectrum(
+        return construct(
             axes=axes,
             values=np.ascontiguousarray(np.concatenate(squares, axis=1)),
             int_ior=complex(*(float(x) for x in header["intIor"])),
