@@ -11,6 +11,7 @@ from typing import Annotated
 
 import typer
 
+from ..errors import RequestError
 from ..outputs import free_name
 from .arguments import Overwrite, claim, scene_parameters
 from .console import Stopped, err, log_lines, tell
@@ -64,9 +65,9 @@ def render(
     from ..variants import choose_variant
 
     if output is not None and output.suffix.lower() != ".exr":
-        raise ValueError(f"-o: got {output}, wanted a file name that ends in .exr")
+        raise RequestError(f"-o: got {output}, wanted a file name that ends in .exr")
     if (frames is not None) != orbit:
-        raise ValueError("--frames N and --orbit go together")
+        raise RequestError("--frames N and --orbit go together")
     parameters = scene_parameters(define)
     reads = files_read(scene, parameters)
 
@@ -82,7 +83,7 @@ def render(
     claim(context, reads, [("-o", path) for path in written(target)], map(checkpoint_path, targets))
     for path in targets:
         if checkpoint_path(path).exists() and not resume:
-            raise ValueError(
+            raise RequestError(
                 f"{checkpoint_path(path)} is of an unfinished rendering: --resume goes on from it; "
                 "remove it to begin anew"
             )

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..coherence import SUN_COHERENCE_LENGTH, lobe_reach, lobe_width
+from ..errors import RequestError
 from ..reference import check_extent
 from ..surface.heightfield import HeightField
 from ..welch import carried_coherence_length
@@ -86,12 +87,12 @@ def precompute(
     check_angle(largest_angle)
     lobe_width(coherence_length)
     if representation not in REPRESENTATIONS:
-        raise ValueError(f"representation: got {representation!r}, wanted one of {', '.join(REPRESENTATIONS)}")
+        raise RequestError(f"representation: got {representation!r}, wanted one of {', '.join(REPRESENTATIONS)}")
     check_tolerance(tolerance)
     if not largest_height_range > 0:
-        raise ValueError(f"largest_height_range: got {largest_height_range!r}, wanted a positive number of µm")
+        raise RequestError(f"largest_height_range: got {largest_height_range!r}, wanted a positive number of µm")
     if height_field.height_range > largest_height_range:
-        raise ValueError(
+        raise RequestError(
             f"heights: got a range of {height_field.height_range:.4g} µm, wanted at most {largest_height_range:g}: are "
             "these nanometres? If the surface is so deep, raise largest_height_range"
         )
@@ -138,7 +139,7 @@ def precompute(
 def check_tolerance(tolerance: float) -> None:
     """Raises ValueError unless `tolerance` is a share of the power that float32 can keep."""
     if not 1e-5 <= tolerance < 1:
-        raise ValueError(f"tolerance: got {tolerance!r}, wanted a share of the reflected power from 1e-5 to 1")
+        raise RequestError(f"tolerance: got {tolerance!r}, wanted a share of the reflected power from 1e-5 to 1")
 
 
 def _splines(
@@ -231,7 +232,7 @@ class _Build:
             if error <= self._allowed:
                 return table, error
             if refine < 0.01:
-                raise ValueError(self._refusal(representation, error))
+                raise RequestError(self._refusal(representation, error))
             refine /= max(2.0, error / self._allowed)
 
     def _build(self, representation: str, allowed: float) -> Table:
@@ -245,7 +246,7 @@ class _Build:
         else:
             if representation == TaylorSeries.name and 2.0**-24 * np.exp(min(self._x, 80.0)) > 20 * self._allowed:
                 # Each term is good to 2^-24 of its size, and their sizes add up to e^x; the bound is generous by 20.
-                raise ValueError(self._refusal(representation, None))
+                raise RequestError(self._refusal(representation, None))
             kind = TaylorSeries if representation == TaylorSeries.name else ChebyshevSeries
             whole = kind(self._largest_kappa, self._nodes)
             series = kind(self._largest_kappa, self._terms(whole, allowed))
@@ -321,7 +322,7 @@ def _rim(profile: NDArray[np.float64]) -> NDArray[np.float64]:
 def _check_size(shape: tuple[int, int], floats: int) -> None:
     """Refuses a table of so many floats a node before memory is asked for it."""
     if 4.0 * np.prod(shape, dtype=float) * floats > _LARGEST_TABLE:
-        raise ValueError(
+        raise RequestError(
             f"tolerance: needs {' × '.join(map(str, shape))} frequencies of {floats} numbers, more than a table of "
             "4 GB; take a larger tolerance, a smaller patch or, of a sample, a shorter coherence length"
         )
@@ -330,7 +331,7 @@ def _check_size(shape: tuple[int, int], floats: int) -> None:
 def _check_overlap(neighbours: tuple[int, int], coherence_length: float) -> None:
     """Refuses a tile of which one evaluation would sum thousands of orders."""
     if neighbours[0] * neighbours[1] > _MOST_NEIGHBOURS:
-        raise ValueError(
+        raise RequestError(
             f"coherence_length: at {coherence_length:.4g} µm the lobes of {neighbours[0]} × {neighbours[1]} orders of "
             f"this tile overlap, wanted at most {_MOST_NEIGHBOURS}; take extent 'sample' or a longer "
             "coherence length"
