@@ -11,6 +11,7 @@ import numpy as np
 
 from ..errors import RequestError
 from ..spectrum.energy_table import SHADOWING
+from ..wavelengths import VISIBLE
 from .base import base_from
 from .geometry import Geometry
 from .incidence import Incidence
@@ -20,7 +21,6 @@ from .shared import SharedTables
 from .surface import surface_from
 from .tables import BELOW_ONE, opaque
 
-VISIBLE_FROM = 360.0  # nm, the shortest wavelength that Mitsuba samples
 DEFENSIVE = 0.02  # the share of samples that follow the cosine, for lobes that the sampler's averages miss
 LEAST_SHARE = 0.1  # of the samples, for the grating and for its base: what each reflects is only estimated
 
@@ -94,12 +94,12 @@ def define() -> type:
         def _update(self) -> None:
             """What depends on parameters that can change."""
             scale = np.max(self.height_scale)
-            largest = VISIBLE_FROM / self.spectrum.wavelengths[0]
+            largest = VISIBLE[0] / self.spectrum.wavelengths[0]
             if not 0 <= scale <= largest * (1 + 1e-6):
                 raise RequestError(
                     f"height_scale: got {scale}, wanted 0 to {largest:.4g}: the spectrum was built for "
                     f"wavelengths from {self.spectrum.wavelengths[0]:g} nm; for larger heights build it from "
-                    f"{VISIBLE_FROM:g} nm divided by the scale"
+                    f"{VISIBLE[0]:g} nm divided by the scale"
                 )
             dr.make_opaque(self.height_scale)
             self.energy = self._tables.energy(self.shadowing, self.height_scale)

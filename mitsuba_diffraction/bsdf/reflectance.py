@@ -9,8 +9,8 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import RequestError
+from ..wavelengths import VISIBLE
 
-VISIBLE_FROM, VISIBLE_TO = 360.0, 830.0  # nm, what Mitsuba samples
 MODELS = ("exact", "schlick")
 
 
@@ -106,11 +106,11 @@ class Conductor:
     @staticmethod
     def _spectrum(metal: mi.SceneParameters, name: str) -> mi.Texture:
         # A regular table is read at once; in an irregular one every look-up searches, which took half of all time.
-        nanometres = np.arange(VISIBLE_FROM, VISIBLE_TO + 1)
+        nanometres = np.arange(VISIBLE[0], VISIBLE[1] + 1)
         values = np.interp(nanometres, metal[f"{name}.wavelengths"], metal[f"{name}.values"])
         text = ", ".join(repr(float(value)) for value in values)
         return mi.load_dict(
-            {"type": "regular", "wavelength_min": VISIBLE_FROM, "wavelength_max": VISIBLE_TO, "values": text}
+            {"type": "regular", "wavelength_min": VISIBLE[0], "wavelength_max": VISIBLE[1], "values": text}
         )
 
     def __call__(self, si: mi.SurfaceInteraction3f, cos_half: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:

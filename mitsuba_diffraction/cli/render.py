@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import math
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -14,7 +11,7 @@ import typer
 from ..errors import RequestError
 from ..outputs import free_name
 from .arguments import Overwrite, claim, scene_parameters
-from .console import Stopped, err, log_lines, tell
+from .console import Stopped, progress_bar, tell
 from .inputs import files_read
 
 
@@ -105,7 +102,7 @@ def render(
         earlier = SpectralImage.load(path) if resume and path.is_file() and not waiting.exists() else None
         interrupted = False
         try:
-            with _progress_bar(label) as progress:
+            with progress_bar(label, "spp") as progress:
                 image = trace(
                     scene,
                     spp=spp,
@@ -157,34 +154,3 @@ def render(
     if frames is not None:
         save_animation([path.with_suffix(".png") for path in targets], animation)
         tell(f"{animation}: animated preview, {frames} frames")
-
-
-@contextmanager
-def _progress_bar(label: str) -> Iterator[Callable[[int, int, float], None]]:
-    """Samples per pixel done and expected, the error so far, the time taken and the time left."""
-    if not err.is_terminal:
-        lines = log_lines(label)
-        yield lambda done, total, error: lines(done, total)
-        return
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-
-    columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn())
-    with Progress(
-        *(*columns, TextColumn("spp{task.fields[noise]}"), TimeElapsedColumn(), TimeRemainingColumn()),
-        console=err,
-        transient=True,
-        speed_estimate_period=600,  # passes of a large picture take longer than the usual half minute
-    ) as bars:
-        task = bars.add_task(label, total=None, noise="")
-
-        def show(done: int, total: int, error: float) -> None:
-            bars.update(task, completed=done, total=total, noise="" if math.isnan(error) else f", error {error:.2g}")
-
-        yield show

@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 
 from ..errors import Bug, RequestError, is_bug
 from ..recipe import Recipe
+from ..wavelengths import VISIBLE
 
-# The range in which Mitsuba's spectra are defined, and the distance of the channels, nm.
+# The distance of the channels, nm.
 #
 # Why 5 nm: colours differ from the exact ones by ΔE₂₀₀₀ ≤ 0.05 for lines 5 nm wide and by 0.6 for the worst laser line
 # (10 nm: 1.3 and 3.2; 23.5 nm: 90), and a grating's orders, 5–20 nm wide at a coherence length of 65 µm, are resolved.
 # Time does not depend on it, memory does: `film` adds a sample to eight channels at most.
-_RANGE = (360.0, 830.0)
 _STEP = 5.0
 
 _MOST_PIXELS = 2**25  # above 7680 × 4320; the sums of one have 750 bytes
@@ -36,7 +36,7 @@ _INNER_TRACEBACK = re.compile(r"Traceback \(most recent call last\):\n(?:\s+.*\n
 
 def channel_wavelengths() -> NDArray[np.float64]:
     """The centres of the film's channels, (n,), nm: the hats around them lie whole inside the range."""
-    return np.arange(_RANGE[0] + _STEP, _RANGE[1] - _STEP / 2, _STEP)
+    return np.arange(VISIBLE[0] + _STEP, VISIBLE[1] - _STEP / 2, _STEP)
 
 
 def channel_weights() -> NDArray[np.float64]:

@@ -13,6 +13,7 @@ from ..coherence import SUN_COHERENCE_LENGTH, lobe_reach, lobe_width
 from ..errors import RequestError
 from ..reference import check_extent
 from ..surface.heightfield import HeightField
+from ..wavelengths import VISIBLE
 from ..welch import carried_coherence_length
 from . import GratingSpectrum
 from .expansions import chebyshev_nodes, chebyshev_polynomials, chebyshev_transform, nodes_for, position
@@ -25,7 +26,6 @@ from .series_table import SeriesTable
 from .slice_table import SliceTable, interpolation
 from .tile import TilePowers, inner
 
-VISIBLE = (360.0, 830.0)  # nm, the range that Mitsuba samples
 REPRESENTATIONS = ("auto", TaylorSeries.name, ChebyshevSeries.name, SvdSeries.name, SliceTable.representation)
 
 # Shares of the tolerance.
