@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from .errors import RequestError
+
 # The sun's disc is 0.53° wide: its light is coherent over about 65 µm.
 SUN_COHERENCE_LENGTH = 65.0
 
@@ -21,7 +23,7 @@ def lobe_width(coherence_length: float) -> float:
         ValueError: if the coherence length is not 1 nm to 1 m.
     """
     if not SHORTEST <= coherence_length <= LONGEST:
-        raise ValueError(
+        raise RequestError(
             f"coherence_length: got {coherence_length!r}, wanted a positive number of µm, {SHORTEST:g} to {LONGEST:g}"
         )
     return 1 / (2 * np.sqrt(2) * np.pi * (coherence_length / 4))

@@ -13,6 +13,8 @@ from typing import BinaryIO
 
 import platformdirs
 
+from .errors import RequestError
+
 try:
     import fcntl
 except ImportError:  # Windows, where nothing tells whether a temporary file is still being written
@@ -55,7 +57,7 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     if not target.parent.is_dir():
         raise FileNotFoundError(f"cannot write {os.fspath(path)!r}: its folder does not exist")
     if target.exists() and not target.is_file():
-        raise ValueError(f"cannot write {os.fspath(path)!r}: it is there and is not an ordinary file")
+        raise RequestError(f"cannot write {os.fspath(path)!r}: it is there and is not an ordinary file")
     _remove_what_a_kill_left(target)
     temporary, opened = _locked_temporary(target)
     _being_written[str(temporary)] = target
@@ -120,7 +122,7 @@ def refuse_unwritable(path: str | os.PathLike[str]) -> None:
     except _Writable:
         pass
     except OSError as error:
-        raise ValueError(f"cannot write {os.fspath(path)!r}: {error.strerror}" if error.strerror else error) from None
+        raise RequestError(f"cannot write {os.fspath(path)!r}: {error.strerror}" if error.strerror else error) from None
 
 
 class _Writable(Exception):
@@ -140,7 +142,7 @@ def refuse_special(path: str | os.PathLike[str]) -> None:
         ValueError: if so.
     """
     if os.path.exists(path) and not (os.path.isfile(path) or os.path.isdir(path)):
-        raise ValueError(f"{os.fspath(path)}: a pipe or a device, wanted an ordinary file")
+        raise RequestError(f"{os.fspath(path)}: a pipe or a device, wanted an ordinary file")
 
 
 # --- a digest inside the file itself ---
@@ -161,7 +163,7 @@ def seal(path: str | os.PathLike[str]) -> None:
     with open(path, "r+b") as stream:
         place = _place_of_digest(stream)
         if place is None:
-            raise ValueError(f"{os.fspath(path)}: has no place for its digest")
+            raise RequestError(f"{os.fspath(path)}: has no place for its digest")
         digest = _digest(stream, place)
         stream.seek(place)
         stream.write(digest)

@@ -7,6 +7,8 @@ from numbers import Integral
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .errors import RequestError
+
 
 def tile_factor(x: ArrayLike, count: int) -> NDArray[np.floating]:
     """D(x; N) = sin(πNx)/sin(πx): the sum of N unit waves, each x periods after the one before, about their middle.
@@ -32,13 +34,13 @@ def tile_factor(x: ArrayLike, count: int) -> NDArray[np.floating]:
     """
     x = np.asarray(x)
     if x.dtype.kind not in "fiu":
-        raise ValueError(f"x: got {x.dtype}, wanted real numbers")
+        raise RequestError(f"x: got {x.dtype}, wanted real numbers")
     x = x.astype(np.float32 if x.dtype == np.float32 else np.float64)
     if not np.isfinite(x).all():
-        raise ValueError("x: got numbers that are not finite")
+        raise RequestError("x: got numbers that are not finite")
     epsilon = np.finfo(x.dtype).eps
     if isinstance(count, bool) or not isinstance(count, Integral) or not 1 <= count <= 1 / epsilon:
-        raise ValueError(f"count: got {count!r}, wanted a whole number of tiles from 1 to {int(1 / epsilon)}")
+        raise RequestError(f"count: got {count!r}, wanted a whole number of tiles from 1 to {int(1 / epsilon)}")
     number, pi = x.dtype.type(count), x.dtype.type(np.pi)
 
     nearest = np.rint(x)

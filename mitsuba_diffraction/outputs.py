@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from .errors import RequestError
 from .files import final_path, refuse_unwritable, whole_file
 
 if TYPE_CHECKING:
@@ -56,20 +57,20 @@ def claimed(
         identities = _identities(path)
         for read in (taken[identity] for identity in identities & taken.keys()):
             by = "" if os.path.abspath(path) == os.path.abspath(read) else f" as {read}"
-            raise ValueError(f"{option}: got {path}, which is read{by} and would be lost; wanted another name")
+            raise RequestError(f"{option}: got {path}, which is read{by} and would be lost; wanted another name")
         identities.add(os.path.realpath(path).casefold())  # two names that differ in case may become one file
         for other in (planned[identity] for identity in identities & planned.keys()):
-            raise ValueError(f"{option}: {path} would be written twice, for {other} too; wanted another name")
+            raise RequestError(f"{option}: {path} would be written twice, for {other} too; wanted another name")
         planned.update(dict.fromkeys(identities, option))
     marks = {}
     for option, path in writes:
         if not Path(path).parent.is_dir():
-            raise ValueError(f"{option}: got {path}, but the folder {Path(path).parent} is not there")
+            raise RequestError(f"{option}: got {path}, but the folder {Path(path).parent} is not there")
         refuse_unwritable(path)
         real = final_path(path)
         marks[real] = _mark(option, request, real.parent)
         if os.path.exists(path) and not overwrite and not _carries(real, marks[real]):
-            raise ValueError(
+            raise RequestError(
                 f"{option}: {path} is there, and this command with these options did not make it; "
                 "--overwrite replaces it, another name keeps it"
             )

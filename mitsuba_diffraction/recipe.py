@@ -48,6 +48,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from .errors import RequestError
 from .files import cache_folder, refuse_special
 from .spectrum import GratingSpectrum
 from .spectrum.build import precompute
@@ -100,27 +101,27 @@ class Recipe:
 
     def __post_init__(self) -> None:
         if ("profile" in self.surface) == ("scan" in self.surface):
-            raise ValueError(f"[surface]: got {_names(self.surface)}, wanted either a profile or a scan")
+            raise RequestError(f"[surface]: got {_names(self.surface)}, wanted either a profile or a scan")
         if "profile" in self.surface and self.surface["profile"] not in tuple(PROFILES):
-            raise ValueError(f"profile: got {self.surface['profile']!r}, wanted one of {', '.join(PROFILES)}")
+            raise RequestError(f"profile: got {self.surface['profile']!r}, wanted one of {', '.join(PROFILES)}")
         if "scan" in self.surface:
             _refuse_unknown("[surface]", self.surface, _SCAN_KEYS)
             if not isinstance(self.surface["scan"], str):
-                raise ValueError(f"scan: got {self.surface['scan']!r}, wanted a file name")
+                raise RequestError(f"scan: got {self.surface['scan']!r}, wanted a file name")
             check_steps(self.surface.get("prepare", []))
         _refuse_unknown("[spectrum]", self.spectrum, _SPECTRUM_KEYS)
         for name, value in [*self.surface.items(), *self.spectrum.items()]:
             if name == "prepare" and "scan" in self.surface:
                 continue  # checked above
             if isinstance(value, bool) and name != "fill_missing":
-                raise ValueError(f"{name}: got {value!r}, wanted a number or a text")
+                raise RequestError(f"{name}: got {value!r}, wanted a number or a text")
             if not (_is_plain(value) or (isinstance(value, list | tuple) and all(_is_plain(v) for v in value))):
-                raise ValueError(f"{name}: got {value!r}, wanted a number, a text, or a list of them")
+                raise RequestError(f"{name}: got {value!r}, wanted a number, a text, or a list of them")
         for name in ("tolerance", "coherence_length", "largest_angle", "largest_height_range"):
             if name in self.spectrum and not _is_number(self.spectrum[name]):
-                raise ValueError(f"{name}: got {self.spectrum[name]!r}, wanted a number")
+                raise RequestError(f"{name}: got {self.spectrum[name]!r}, wanted a number")
         if "wavelengths" in self.spectrum and not isinstance(self.spectrum["wavelengths"], list | tuple):
-            raise ValueError(f"wavelengths: got {self.spectrum['wavelengths']!r}, wanted [shortest, longest] in nm")
+            raise RequestError(f"wavelengths: got {self.spectrum['wavelengths']!r}, wanted [shortest, longest] in nm")
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Recipe:
@@ -139,15 +140,15 @@ class Recipe:
             raise FileNotFoundError(f"{path}: no such file") from None
         # Of the parser and of the text; a number of too many digits; brackets in brackets in brackets.
         except (ValueError, RecursionError) as error:
-            raise ValueError(f"{path}: not a TOML file ({error})") from None
+            raise RequestError(f"{path}: not a TOML file ({error})") from None
         try:
             _refuse_unknown("recipe", content, frozenset({"surface", "spectrum"}))
             surface, spectrum = content.get("surface", {}), content.get("spectrum", {})
             if not (isinstance(surface, dict) and isinstance(spectrum, dict)):
-                raise ValueError("wanted the tables [surface] and [spectrum]")
+                raise RequestError("wanted the tables [surface] and [spectrum]")
             return cls(surface, spectrum, path.parent)
-        except ValueError as error:
-            raise ValueError(f"{path}: {error}") from None
+        except RequestError as error:
+            raise RequestError(f"{path}: {error}") from None
 
     def height_field(self) -> HeightField:
         """The surface."""
@@ -155,16 +156,13 @@ class Recipe:
         if "scan" in parameters:
             return self._prepared_scan(parameters)
         name = parameters.pop("profile")
+        signature = inspect.signature(PROFILES[name])
+        _refuse_unknown(f"profile {name!r}", parameters, frozenset(signature.parameters))
         try:
-            return PROFILES[name](**parameters)
+            signature.bind(**parameters)
         except TypeError as error:
-            known = inspect.signature(PROFILES[name]).parameters
-            unknown = sorted(set(parameters) - set(known))
-            # The text alone: a local name of the exception would tie it and all its frames into a cycle.
-            wrong = (
-                f"got the unknown name {', '.join(unknown)}, wanted among {', '.join(known)}" if unknown else str(error)
-            )
-            raise ValueError(f"profile {name!r}: {wrong}") from None
+            raise RequestError(f"profile {name!r}: {error}") from None
+        return PROFILES[name](**parameters)
 
     def _prepared_scan(self, parameters: dict[str, Any]) -> HeightField:
         path = self.folder / parameters.pop("scan")
@@ -178,8 +176,8 @@ class Recipe:
         try:
             ready = apply_steps(scan, steps)
             return HeightField(ready.heights, ready.pixel_size, ready.source, fill_missing=fill)
-        except ValueError as error:
-            raise ValueError(f"{path}: {error}") from None
+        except RequestError as error:
+            raise RequestError(f"{path}: {error}") from None
 
     def build(self, progress: Callable[[int, int], None] | None = None) -> GratingSpectrum:
         """The spectrum, computed."""
@@ -221,13 +219,13 @@ class Recipe:
 
     def _from_cache(self, digest: str, progress: Callable[[int, int], None] | None) -> GratingSpectrum:
         path = cache_folder() / f"{digest}.exr"
-        with suppress(ValueError, OSError):
+        with suppress(RequestError, OSError):
             return GratingSpectrum.load(path, recipe=digest)
         spectrum = self.build(progress)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             spectrum.save(path, recipe=digest)
-        except (ValueError, OSError, RuntimeError) as error:  # RuntimeError is what OpenEXR raises on a full disk
+        except (RequestError, OSError, RuntimeError) as error:  # RuntimeError is what OpenEXR raises on a full disk
             reason = getattr(error, "strerror", None) or error
             warnings.warn(
                 f"the cache {path.parent} cannot be written to ({reason}); spectra are built anew each time",
@@ -239,7 +237,9 @@ class Recipe:
 
 def _refuse_unknown(where: str, table: Mapping[str, Any], known: frozenset[str]) -> None:
     if unknown := sorted(set(table) - known):
-        raise ValueError(f"{where}: got the unknown name {', '.join(unknown)}, wanted among {', '.join(sorted(known))}")
+        raise RequestError(
+            f"{where}: got the unknown name {', '.join(unknown)}, wanted among {', '.join(sorted(known))}"
+        )
 
 
 def _is_number(value: object) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from . import llvm
+from .errors import RequestError
 
 
 def is_spectral(name: str) -> bool:
@@ -46,7 +47,7 @@ def choose_variant(requested: str | None = None) -> str:
         import mitsuba as mi
 
         reason = "is not spectral" if requested in mi.variants() else "is unknown"
-        raise ValueError(f"variant {requested!r} {reason}; use one of {', '.join(available)}")
+        raise RequestError(f"variant {requested!r} {reason}; use one of {', '.join(available)}")
     if requested.startswith("cuda") and not dr.has_backend(dr.JitBackend.CUDA):
         raise RuntimeError(f"variant {requested!r} needs an NVIDIA GPU with a recent driver, and Dr.Jit found none")
     if requested.startswith("llvm") and (message := llvm.problem()):

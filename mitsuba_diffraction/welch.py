@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .coherence import lobe_width
+from .errors import RequestError
 from .surface.heightfield import HeightField
 
 # A window ends at three σ_s to each side, where its amplitude is e^{−9/2}, 1 %.
@@ -50,7 +51,7 @@ def carried_coherence_length(height_field: HeightField, asked: float) -> float:
     carried = min([float(asked), *(_LARGEST * size for size, _, count in axes if count > 1)])
     for _, pixel, count in axes:
         if count > 1 and carried < _FEWEST_PIXELS * pixel * (1 - 1e-9):
-            raise ValueError(
+            raise RequestError(
                 f"coherence_length: got {asked:g} µm, of which the scan of {axes[0][0]:.4g} × {axes[1][0]:.4g} µm "
                 f"carries {carried:.4g}; wanted at least {_FEWEST_PIXELS} pixels ({_FEWEST_PIXELS * pixel:.4g} µm)"
             )

@@ -8,12 +8,14 @@ from __future__ import annotations
 import io
 import signal
 import sys
+import traceback
 import warnings
 from importlib import metadata
 from typing import Annotated
 
 import typer
 
+from ..errors import Bug, RequestError, is_bug
 from .benchmark import benchmark
 from .compare import compare
 from .console import NAME, Stopped, say, tell
@@ -38,9 +40,12 @@ def _say_version(wanted: bool) -> None:
 
 @app.callback()
 def _commands(
+    context: typer.Context,
     version: Annotated[bool, typer.Option("--version", callback=_say_version, is_eager=True)] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="show where an error was raised")] = False,
 ) -> None:
     """Diffraction gratings for Mitsuba 3."""
+    context.obj["debug"] = debug
 
 
 class _CtrlC:
@@ -59,35 +64,40 @@ def main() -> None:
         if isinstance(stream, io.TextIOWrapper):  # file names need not be UTF-8, nor every terminal
             stream.reconfigure(errors="backslashreplace")
     warnings.showwarning = lambda message, *args, **kwargs: say("warning", message)
+    options: dict[str, bool] = {}
     ctrl_c, before = _CtrlC(), signal.getsignal(signal.SIGINT)
     # Where Ctrl-C is ignored, as in what a script starts in the background, it stays ignored.
     if before is not signal.SIG_IGN:
         signal.signal(signal.SIGINT, ctrl_c)
     try:
-        code = app(prog_name=NAME, standalone_mode=False) or 0
+        code = app(prog_name=NAME, standalone_mode=False, obj=options) or 0
         if code == 130:  # newer versions of Typer turn Ctrl-C into this code
             raise KeyboardInterrupt
     except (Exception, KeyboardInterrupt) as error:
         lost = ctrl_c.pressed and not isinstance(error, Stopped)
-        code = _tell(KeyboardInterrupt() if lost else error)
+        code = _tell(KeyboardInterrupt() if lost else error, **options)
     finally:
         signal.signal(signal.SIGINT, before)
     sys.exit(code)
 
 
-def _tell(error: BaseException) -> int:
-    """Says in one line what went wrong; the exit code."""
+def _tell(error: BaseException, debug: bool = False) -> int:
+    """Says in one line what went wrong, after the traceback if `debug`; the exit code."""
     if isinstance(error, Stopped | KeyboardInterrupt | typer.Abort):
         say("interrupted", error if isinstance(error, Stopped) else "nothing was written")
         return 130
     if isinstance(error, _UsageError):
         say("error", f"{error.format_message()} (try {NAME} --help)")
         return 2
-    if isinstance(error, ValueError | FileNotFoundError | IsADirectoryError | NotADirectoryError):
+    if debug:
+        traceback.print_exception(error)
+    if isinstance(error, RequestError | FileNotFoundError | IsADirectoryError | NotADirectoryError):
         named = isinstance(error, OSError) and error.filename and error.strerror
         say("error", f"{error.filename}: {error.strerror.lower()}" if named else error)
         return 2
-    if isinstance(error, RuntimeError | OSError | MemoryError):
+    if is_bug(type(error)):
+        text = error if isinstance(error, Bug) else f"{type(error).__name__}: {error}"
+        say("error", f"this is a bug in mitsuba_diffraction ({text}); {NAME} --debug … shows where")
+    else:
         say("error", str(error) or type(error).__name__)
-        return 1
-    raise error
+    return 1

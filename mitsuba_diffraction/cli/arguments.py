@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from ..errors import RequestError
 from ..outputs import claimed
 
 
@@ -22,10 +23,10 @@ def scene_parameters(define: Sequence[str] | None) -> dict[str, str]:
     for item in define or []:
         name, equals, value = item.partition("=")
         if not (name and equals):
-            raise ValueError(f"-D: got {item!r}, wanted NAME=VALUE")
+            raise RequestError(f"-D: got {item!r}, wanted NAME=VALUE")
         _refuse_other_than_utf8(item)
         if name in parameters:
-            raise ValueError(f"-D {name}: got it twice, wanted one value")
+            raise RequestError(f"-D {name}: got it twice, wanted one value")
         # A file named on the command line is relative to where the command is given. A bare word or number is no file,
         # whatever lies there under that name.
         named = os.path.isfile(value) and (os.path.dirname(value) or Path(value).suffix[1:2].isalpha())
@@ -78,4 +79,4 @@ def _refuse_other_than_utf8(text: str) -> None:
     try:
         text.encode()
     except UnicodeEncodeError:
-        raise ValueError(f"{text}: wanted names of files and folders in UTF-8") from None
+        raise RequestError(f"{text}: wanted names of files and folders in UTF-8") from None

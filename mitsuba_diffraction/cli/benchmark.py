@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from ..errors import RequestError
 from ..surface.readers import read_height_field
 from .arguments import Overwrite, claim
 from .console import out, progress_bar
@@ -39,7 +40,7 @@ def benchmark(
     cases = bundled_cases()
     names = [case.name for case in cases]
     if unknown := set(surface or []) - set(names):
-        raise ValueError(f"--surface: got {', '.join(sorted(unknown))}, wanted among {', '.join(names)}")
+        raise RequestError(f"--surface: got {', '.join(sorted(unknown))}, wanted among {', '.join(names)}")
     cases = [case for case in cases if not surface or case.name in surface]
     if scan is not None:
         cases.append(scan_case(read_height_field(scan, pixel_size=pixel_size, height_range=height_range)))

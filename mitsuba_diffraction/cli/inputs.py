@@ -8,6 +8,7 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 
+from ..errors import RequestError
 from ..recipe import Recipe
 
 _VALUE = re.compile(r"""=\s*(?:"([^"]*)"|'([^']*)')""")
@@ -42,7 +43,7 @@ def files_read(path: str | os.PathLike[str], parameters: Mapping[str, str] | Non
         if file.suffix.lower() == ".toml":
             try:
                 recipe = Recipe.load(file)
-            except (ValueError, OSError):
+            except (RequestError, OSError):
                 continue  # said by the command itself
             if "scan" in recipe.surface:
                 waiting.append(recipe.folder / recipe.surface["scan"])

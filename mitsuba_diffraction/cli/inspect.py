@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from ..coherence import SUN_COHERENCE_LENGTH, lobe_width
+from ..errors import RequestError
 from ..outputs import free_name, save_json
 from ..scalar_theory import TRUSTED
 from ..studies.inspection import Inspection, save_picture
@@ -59,7 +60,7 @@ def inspect(
     by_default = free_name(f"{source.stem}_inspect", lambda stem: [Path(f"{stem}.png")], reads)
     picture = output or Path(f"{by_default}.png")
     if picture.suffix.lower() not in (".png", ".pdf", ".svg"):
-        raise ValueError(f"-o: got {picture}, wanted a file name that ends in .png, .pdf or .svg")
+        raise RequestError(f"-o: got {picture}, wanted a file name that ends in .png, .pdf or .svg")
     claim(context, reads, [("-o", picture), *([("--json", json)] if json else [])])
     of_scan = options_of_scan(
         pixel_size, height_range, fill_missing, channel, unit, [*["level_plane"] * plane, *(prepare or [])]

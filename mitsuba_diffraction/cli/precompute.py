@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from ..errors import RequestError
 from ..recipe import Recipe
 from ..spectrum.build import REPRESENTATIONS
 from ..surface.seam import seam_matters, seam_steps
@@ -53,7 +54,7 @@ def precompute(
 ) -> None:
     """Turn a recipe or a scan into the spectrum of its phase."""
     if output is not None and len(sources) > 1:
-        raise ValueError(f"-o: got {len(sources)} sources, wanted one (without -o each is named after its source)")
+        raise RequestError(f"-o: got {len(sources)} sources, wanted one (without -o each is named after its source)")
     given = {
         "extent": extent,
         "coherence_length": coherence_length,
@@ -64,10 +65,10 @@ def precompute(
     }
     settings = {name: value for name, value in given.items() if value is not None}
     of_scan = options_of_scan(pixel_size, height_range, fill_missing, channel, unit, prepare)
-    targets = [output or Path(source.with_suffix(".exr").name) for source in sources]
+    targets = [output or Path(source.name or "spectrum").with_suffix(".exr") for source in sources]
     for target in targets:
         if target.suffix.lower() != ".exr":
-            raise ValueError(f"-o: got {target}, wanted a file name that ends in .exr")
+            raise RequestError(f"-o: got {target}, wanted a file name that ends in .exr")
     reads = [file for source in sources for file in files_read(source)]
     claim(context, reads, [("-o" if output else f"spectrum of {s}", t) for s, t in zip(sources, targets, strict=True)])
     seams = [_seam(source, recipe_of(source, of_scan, settings)) for source in sources]
@@ -97,7 +98,7 @@ def _seam(source: Path, recipe: Recipe) -> str:
         f"{across * 1e3:.3g} nm along {axis} ({inside * 1e3:.3g} inside)" for axis, (across, inside) in steps.items()
     )
     if seam_matters(steps):
-        raise ValueError(
+        raise RequestError(
             f"--extent: got none, and {source} does not repeat without a seam: r.m.s. steps of {told}; wanted "
             "--extent sample (a piece of an irregular surface), --extent tile (it repeats, seam and all), or "
             "--prepare crop_periods (a grating, cropped to whole periods)"

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import math
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from ..errors import RequestError
 from ..outputs import free_name
 from .arguments import Overwrite, claim, scene_parameters
-from .console import Stopped, err, log_lines, tell
+from .console import Stopped, progress_bar, tell
 from .inputs import files_read
 
 
@@ -64,9 +62,9 @@ def render(
     from ..variants import choose_variant
 
     if output is not None and output.suffix.lower() != ".exr":
-        raise ValueError(f"-o: got {output}, wanted a file name that ends in .exr")
+        raise RequestError(f"-o: got {output}, wanted a file name that ends in .exr")
     if (frames is not None) != orbit:
-        raise ValueError("--frames N and --orbit go together")
+        raise RequestError("--frames N and --orbit go together")
     parameters = scene_parameters(define)
     reads = files_read(scene, parameters)
 
@@ -82,7 +80,7 @@ def render(
     claim(context, reads, [("-o", path) for path in written(target)], map(checkpoint_path, targets))
     for path in targets:
         if checkpoint_path(path).exists() and not resume:
-            raise ValueError(
+            raise RequestError(
                 f"{checkpoint_path(path)} is of an unfinished rendering: --resume goes on from it; "
                 "remove it to begin anew"
             )
@@ -104,7 +102,7 @@ def render(
         earlier = SpectralImage.load(path) if resume and path.is_file() and not waiting.exists() else None
         interrupted = False
         try:
-            with _progress_bar(label) as progress:
+            with progress_bar(label, "spp") as progress:
                 image = trace(
                     scene,
                     spp=spp,
@@ -156,34 +154,3 @@ def render(
     if frames is not None:
         save_animation([path.with_suffix(".png") for path in targets], animation)
         tell(f"{animation}: animated preview, {frames} frames")
-
-
-@contextmanager
-def _progress_bar(label: str) -> Iterator[Callable[[int, int, float], None]]:
-    """Samples per pixel done and expected, the error so far, the time taken and the time left."""
-    if not err.is_terminal:
-        lines = log_lines(label)
-        yield lambda done, total, error: lines(done, total)
-        return
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-
-    columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn())
-    with Progress(
-        *(*columns, TextColumn("spp{task.fields[noise]}"), TimeElapsedColumn(), TimeRemainingColumn()),
-        console=err,
-        transient=True,
-        speed_estimate_period=600,  # passes of a large picture take longer than the usual half minute
-    ) as bars:
-        task = bars.add_task(label, total=None, noise="")
-
-        def show(done: int, total: int, error: float) -> None:
-            bars.update(task, completed=done, total=total, noise="" if math.isnan(error) else f", error {error:.2g}")
-
-        yield show

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from ..coherence import SUN_COHERENCE_LENGTH
+from ..errors import RequestError
 from ..recipe import Recipe
 from ..surface.prepare import STEP_NAMES, step_of
 
@@ -66,6 +67,6 @@ def recipe_of(source: Path, of_scan: dict[str, object], settings: dict[str, obje
         return Recipe({"scan": source.name, **of_scan}, settings, source.parent)
     if of_scan:
         names = ", ".join(f"--{name.replace('_', '-')}" for name in of_scan)
-        raise ValueError(f"{names} go with a scan; the recipe {source} has its own")
+        raise RequestError(f"{names} go with a scan; the recipe {source} has its own")
     recipe = Recipe.load(source)
     return Recipe(recipe.surface, {**recipe.spectrum, **settings}, recipe.folder)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
+from ..errors import RequestError
 from ..outputs import save_markdown
 from .arguments import Overwrite, claim
 from .console import out, progress_bar, tell
@@ -49,7 +50,7 @@ def validate(
     settings = {} if extent is None else {"extent": extent}
     if surface is None and (of_scan or settings):
         names = ", ".join(f"--{name.replace('_', '-')}" for name in {**of_scan, **settings})
-        raise ValueError(f"{names}: got no surface; they go with a scan, --extent with a recipe, too")
+        raise RequestError(f"{names}: got no surface; they go with a scan, --extent with a recipe, too")
     writes = [(option, path) for option, path in (("--json", json), ("--markdown", markdown)) if path is not None]
     if figures is not None:
         from ..studies.figures import figure_names, save_figures
@@ -59,7 +60,7 @@ def validate(
     claim(context, [] if surface is None else files_read(surface), writes)
     chosen = choose_variant(variant)
     if chosen.startswith("scalar"):
-        raise ValueError(f"--variant: got {chosen}, wanted llvm_… or cuda_…: the checks take millions of directions")
+        raise RequestError(f"--variant: got {chosen}, wanted llvm_… or cuda_…: the checks take millions of directions")
     mi.set_variant(chosen)
     these = checks() if surface is None else _of_surface(surface, of_scan, settings)
     results = []

@@ -5,6 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from ..errors import RequestError
 from . import eye_paths
 from .gratings import Gratings
 from .light_paths import LightPaths
@@ -54,7 +55,7 @@ def define() -> type:
             mi.SamplingIntegrator.__init__(self, props)
             self.max_depth, self.rr_depth = props.get("max_depth", -1), props.get("rr_depth", 5)
             if props.get("hide_emitters", False):
-                raise ValueError("hide_emitters: got true, wanted false: diffraction_path shows all lights")
+                raise RequestError("hide_emitters: got true, wanted false: diffraction_path shows all lights")
             self.path = mi.load_dict({"type": "path", "max_depth": self.max_depth, "rr_depth": self.rr_depth})
 
         def parts(self, scene: mi.Scene, sensor: mi.Sensor) -> tuple[mi.SamplingIntegrator, LightPaths | None]:
@@ -70,7 +71,7 @@ def define() -> type:
                 return self.path, None
             film = sensor.film()
             if film.sample_border() and film.rfilter().border_size() > 0:
-                raise ValueError(
+                raise RequestError(
                     "sample_border: got true, wanted false: points beyond the film's edge cannot be connected to it"
                 )
             light = LightPaths(scene, sensor, gratings, self.max_depth, self.rr_depth)

@@ -14,6 +14,7 @@ from zipfile import BadZipFile, ZipFile
 
 import numpy as np
 
+from ..errors import RequestError
 from ..files import UNSEALED, is_intact, seal, whole_file
 from .accumulation import Accumulation
 
@@ -55,7 +56,7 @@ def load_checkpoint(path: str | os.PathLike[str], digest: str) -> Accumulation |
     with open(path, "rb") as stream:
         try:
             if not is_intact(path):
-                raise ValueError("its bytes are not those that were written")
+                raise RequestError("its bytes are not those that were written")
             with np.load(stream) as content:
                 found = content["digest"].item()
                 if found == digest:
@@ -63,8 +64,8 @@ def load_checkpoint(path: str | os.PathLike[str], digest: str) -> Accumulation |
                     return Accumulation(**{name: value if value.ndim else value.item() for name, value in read.items()})
         # What NumPy and zipfile raise, wherever the damage is.
         except (ValueError, KeyError, TypeError, EOFError, AttributeError, RuntimeError, OSError, BadZipFile) as error:
-            raise ValueError(f"{os.fspath(path)}: not a checkpoint, or a damaged one ({error})") from None
-    raise ValueError(
+            raise RequestError(f"{os.fspath(path)}: not a checkpoint, or a damaged one ({error})") from None
+    raise RequestError(
         f"{os.fspath(path)}: of another rendering: the scene or a file that it names, an option, or a version is not "
         "what it was; give what was given then, or remove the file to begin anew"
     )

@@ -21,6 +21,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import RequestError
 from .film import pass_seed, trace_pass
 from .passes import Job, Tracer, versions
 from .scene import scene_digest
@@ -112,7 +113,7 @@ def _scene(job: Job) -> mi.Scene:
     try:
         scene = job.load()
         content = scene_digest(job.scene, dict(job.parameters))
-    except (ValueError, OSError) as error:
+    except (RequestError, OSError) as error:
         raise RuntimeError(f"a worker cannot load the scene: {error}") from None
     if content != job.content:
         raise RuntimeError(f"{job.scene}: a worker finds another scene there, or other files that it names")

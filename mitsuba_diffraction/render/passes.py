@@ -20,6 +20,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import RequestError
 from .accumulation import Accumulation
 from .checkpoint import load_checkpoint, save_checkpoint
 from .film import pass_seed, samples_drawn, trace_pass
@@ -159,11 +160,11 @@ def render(
         KeyboardInterrupt: on the second Ctrl-C, at once, or if there is no pass yet.
     """
     if spp < 1:
-        raise ValueError(f"spp: got {spp}, wanted a positive number of samples per pixel")
+        raise RequestError(f"spp: got {spp}, wanted a positive number of samples per pixel")
     if seed < 0:
-        raise ValueError(f"seed: got {seed}, wanted an integer that is not negative")
+        raise RequestError(f"seed: got {seed}, wanted an integer that is not negative")
     if until_error is not None and not 0 < until_error < 1:
-        raise ValueError(f"until_error: got {until_error}, wanted a relative error between 0 and 1, such as 0.01")
+        raise RequestError(f"until_error: got {until_error}, wanted a relative error between 0 and 1, such as 0.01")
     where = {"width": width, "height": height, "parameters": dict(parameters or {}), "motion": motion}
     scene = load_spectral_scene(scene_path, **where)
     columns, rows = (int(size) for size in scene.sensors()[0].film().crop_size())
@@ -217,7 +218,7 @@ def split(scene: mi.Scene, spp: int, least: int = 1) -> tuple[int, ...]:
     pixels = math.prod(scene.sensors()[0].film().crop_size())
     passes = -(-spp * pixels // max(_SAMPLES_PER_PASS, _LEAST_SAMPLES_PER_PIXEL * pixels))
     if passes > _MOST_PASSES:
-        raise ValueError(f"spp: got {spp}, wanted at most {_MOST_PASSES * spp // passes:.2g} for so large a picture")
+        raise RequestError(f"spp: got {spp}, wanted at most {_MOST_PASSES * spp // passes:.2g} for so large a picture")
     passes = min(max(passes, least), spp)
     ends = [spp * index // passes for index in range(passes + 1)]
     return tuple(samples_drawn(scene, end - start) for start, end in pairwise(ends))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import builtins
 import hashlib
 import os
 import re
@@ -15,23 +16,27 @@ import mitsuba.parser
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import Bug, RequestError, is_bug
 from ..recipe import Recipe
+from ..wavelengths import VISIBLE
 
-# The range in which Mitsuba's spectra are defined, and the distance of the channels, nm.
+# The distance of the channels, nm.
 #
 # Why 5 nm: colours differ from the exact ones by ΔE₂₀₀₀ ≤ 0.05 for lines 5 nm wide and by 0.6 for the worst laser line
 # (10 nm: 1.3 and 3.2; 23.5 nm: 90), and a grating's orders, 5–20 nm wide at a coherence length of 65 µm, are resolved.
 # Time does not depend on it, memory does: `film` adds a sample to eight channels at most.
-_RANGE = (360.0, 830.0)
 _STEP = 5.0
 
 _MOST_PIXELS = 2**25  # above 7680 × 4320; the sums of one have 750 bytes
 _DEFAULT_SIZE = (768, 576)  # that of Mitsuba's films
 
+# An exception in a Python plugin comes as text: lines that are indented, then its class and its message.
+_INNER_TRACEBACK = re.compile(r"Traceback \(most recent call last\):\n(?:\s+.*\n)*(?:\w+\.)*(\w+)(?:: )?")
+
 
 def channel_wavelengths() -> NDArray[np.float64]:
     """The centres of the film's channels, (n,), nm: the hats around them lie whole inside the range."""
-    return np.arange(_RANGE[0] + _STEP, _RANGE[1] - _STEP / 2, _STEP)
+    return np.arange(VISIBLE[0] + _STEP, VISIBLE[1] - _STEP / 2, _STEP)
 
 
 def channel_weights() -> NDArray[np.float64]:
@@ -78,10 +83,10 @@ def load_spectral_scene(
     """
     variant = mi.variant()
     if variant is None or "spectral" not in variant:
-        raise ValueError(f"variant: got {variant!r}, wanted a spectral one, such as 'llvm_ad_spectral'")
+        raise RequestError(f"variant: got {variant!r}, wanted a spectral one, such as 'llvm_ad_spectral'")
     for name, size in (("width", width), ("height", height)):
         if size is not None and size < 1:
-            raise ValueError(f"{name}: got {size}, wanted a positive number of pixels")
+            raise RequestError(f"{name}: got {size}, wanted a positive number of pixels")
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
@@ -96,11 +101,11 @@ def load_spectral_scene(
             mi.parser.transform_all(config, state)
             scene = mi.parser.instantiate(config, state)
         except Exception as error:
-            raise ValueError(f"{path}: {root_cause(error)}{_what_there_is(path, str(error))}") from error
+            raise RequestError(f"{path}: {root_cause(error)}{_what_there_is(path, str(error))}") from error
     if not isinstance(scene, mi.Scene):
-        raise ValueError(f"{path}: the file holds a {type(scene).__name__}, wanted a scene")
+        raise RequestError(f"{path}: the file holds a {type(scene).__name__}, wanted a scene")
     if scene.integrator().aov_names():
-        raise ValueError(f"{path}: the integrator gives {scene.integrator().aov_names()}, wanted radiance alone")
+        raise RequestError(f"{path}: the integrator gives {scene.integrator().aov_names()}, wanted radiance alone")
     return scene
 
 
@@ -119,7 +124,7 @@ def named_sample_count(path: str | os.PathLike[str], parameters: Mapping[str, st
             config = mi.parser.ParserConfig(mi.variant())
             state = mi.parser.parse_file(config, str(path.resolve()), **(parameters or {}))
         except Exception as error:
-            raise ValueError(f"{path}: {root_cause(error)}{_what_there_is(path, str(error))}") from error
+            raise RequestError(f"{path}: {root_cause(error)}{_what_there_is(path, str(error))}") from error
     for node in state.nodes:
         if node.type == mi.ObjectType.Sensor:
             for child in _children(node.props).values():
@@ -189,7 +194,7 @@ def _replace_films(state: mi.parser.ParserState, width: int | None, height: int 
     """Puts spectral films in the place of all films, and one into sensors that have none."""
     kinds = [node.type for node in state.nodes]
     if mi.ObjectType.Sensor not in kinds:
-        raise ValueError("the scene has no sensor")
+        raise RequestError("the scene has no sensor")
     for index, kind in enumerate(kinds):
         # Each film adds nodes, and the list may then move in memory, so that what was taken from it is no longer valid:
         # properties are read as a copy, and written through a fresh look-up.
@@ -215,11 +220,18 @@ def _add(state: mi.parser.ParserState, kind: mi.ObjectType, props: mi.Properties
     return mi.Properties.ResolvedReference(len(state.nodes) - 1)
 
 
+def _whole(film: mi.Properties, name: str, default: int) -> int:
+    value = film.get(name, default)
+    if not isinstance(value, int):
+        raise RequestError(f"film: {name} is {value!r}, wanted a whole number of pixels")
+    return value
+
+
 def _spectral_film(
     state: mi.parser.ParserState, old: mi.Properties, width: int | None, height: int | None
 ) -> mi.Properties:
     """The properties of a spectral film that looks through the same window as `old`."""
-    old_size = tuple(int(old.get(name, size)) for name, size in zip(("width", "height"), _DEFAULT_SIZE, strict=True))
+    old_size = tuple(_whole(old, name, size) for name, size in zip(("width", "height"), _DEFAULT_SIZE, strict=True))
     if width is None:
         width = old_size[0] if height is None else max(1, round(height * old_size[0] / old_size[1]))
     if height is None:
@@ -231,13 +243,13 @@ def _spectral_film(
     film["component_format"] = "float32"
     for axis, new, was in (("x", width, old_size[0]), ("y", height, old_size[1])):
         extent = "width" if axis == "x" else "height"
-        offset = int(old.get(f"crop_offset_{axis}", 0))
-        size = int(old.get(f"crop_{extent}", was - offset))
+        offset = _whole(old, f"crop_offset_{axis}", 0)
+        size = _whole(old, f"crop_{extent}", was - offset)
         start = min(round(offset * new / was), new - 1)
         end = min(max(round((offset + size) * new / was), start + 1), new)
         film[f"crop_offset_{axis}"], film[f"crop_{extent}"] = start, end - start
     if film["crop_width"] * film["crop_height"] > _MOST_PIXELS:
-        raise ValueError(
+        raise RequestError(
             f"film: got {film['crop_width']} × {film['crop_height']} pixels, wanted at most {_MOST_PIXELS} in all"
         )
     if "sample_border" in old:
@@ -275,12 +287,17 @@ def root_cause(error: BaseException) -> str:
 
     Raises:
         KeyboardInterrupt: if that is the cause: a wish of the user is no failure.
+        Bug: if the cause is a mistake of the code.
     """
     while error.__cause__ is not None:
         error = error.__cause__
     if isinstance(error, KeyboardInterrupt):
         raise error
-    text = re.sub(r"\[\w+\.(cpp|h):\d+\]", "", str(error))
-    # An exception in a Python plugin comes with its traceback inside the text: lines that are indented, before its own.
-    text = re.sub(r"Traceback \(most recent call last\):\n(\s+.*\n)*", "", text)
-    return " ".join(text.split()) or type(error).__name__
+    kind, text = type(error), re.sub(r"\[\w+\.(cpp|h):\d+\]", "", str(error))
+    if (match := _INNER_TRACEBACK.search(text)) is not None:
+        kind = {"RequestError": RequestError}.get(match[1]) or getattr(builtins, match[1], Exception)
+        text = text[: match.start()] + text[match.end() :]
+    text = " ".join(text.split()) or kind.__name__
+    if is_bug(kind):
+        raise Bug(f"{kind.__name__}: {text}") from error
+    return text

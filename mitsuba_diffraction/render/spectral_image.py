@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..color import spectrum_to_linear_sRGB
+from ..errors import RequestError
 from ..files import whole_file
 from ..outputs import made_for
 
@@ -53,17 +54,17 @@ class SpectralImage:
         wavelengths = np.array(self.wavelengths, dtype=np.float64)
         radiance = np.array(self.radiance, dtype=np.float32, order="C")
         if wavelengths.ndim != 1 or wavelengths.size == 0 or not np.all(np.diff(wavelengths, prepend=0.0) > 0):
-            raise ValueError(f"wavelengths: got {self.wavelengths!r}, wanted (n,) positive and ascending, nm")
+            raise RequestError(f"wavelengths: got {self.wavelengths!r}, wanted (n,) positive and ascending, nm")
         if radiance.ndim != 3 or radiance.size == 0 or radiance.shape[2] != wavelengths.size:
-            raise ValueError(
+            raise RequestError(
                 f"radiance: got shape {radiance.shape}, wanted (height, width, {wavelengths.size}), none of them zero"
             )
         for name, value in self.attributes.items():
             if isinstance(value, int) and not -(2**31) <= value < 2**31:
                 # OpenEXR would cut it off and say nothing.
-                raise ValueError(f"attributes: got {name!r} = {value}, wanted an integer of 32 bits")
+                raise RequestError(f"attributes: got {name!r} = {value}, wanted an integer of 32 bits")
             if name in _RESERVED or not isinstance(value, str | int | float):
-                raise ValueError(
+                raise RequestError(
                     f"attributes: got {name!r} = {value!r}, wanted text or a number, under a name that is not OpenEXR's"
                 )
         wavelengths.setflags(write=False)
@@ -93,7 +94,7 @@ class SpectralImage:
         rgb = spectrum_to_linear_sRGB(self.radiance, self.wavelengths).astype(np.float32)
         largest = max(float(np.abs(self.radiance).max()), float(np.abs(rgb).max()))
         if half and largest > float(np.finfo(np.float16).max):
-            raise ValueError(f"half: got radiances up to {largest:.4g}, wanted at most 65504; float32 holds them")
+            raise RequestError(f"half: got radiances up to {largest:.4g}, wanted at most 65504; float32 holds them")
         channels = {name: np.ascontiguousarray(rgb[..., i], kind) for i, name in enumerate("RGB")}
         for i, wavelength in enumerate(self.wavelengths):
             number = f"{wavelength:.6f}".replace(".", ",")
@@ -123,22 +124,22 @@ class SpectralImage:
         with Path(path).open("rb") as stream:
             # OpenEXR would write a line of its own to stderr before it raises.
             if stream.read(4) != _MAGIC:
-                raise ValueError(f"{os.fspath(path)}: not an OpenEXR file")
+                raise RequestError(f"{os.fspath(path)}: not an OpenEXR file")
         try:
             file = OpenEXR.File(os.fspath(path), separate_channels=True)
             header, channels = file.header(), file.channels()
         except (RuntimeError, ValueError) as error:
-            raise ValueError(f"{os.fspath(path)}: cannot be read as OpenEXR, is it whole? ({error})") from error
+            raise RequestError(f"{os.fspath(path)}: cannot be read as OpenEXR, is it whole? ({error})") from error
         for name, wanted in (("spectralLayoutVersion", _LAYOUT_VERSION), ("emissiveUnits", _UNITS)):
             if header.get(name) != wanted:
-                raise ValueError(f"{os.fspath(path)}: {name} is {header.get(name)!r}, wanted {wanted!r}")
+                raise RequestError(f"{os.fspath(path)}: {name} is {header.get(name)!r}, wanted {wanted!r}")
         found = sorted(
             (float(match[1].replace(",", ".")), name)
             for name in channels
             if (match := _CHANNEL.fullmatch(name)) is not None
         )
         if not found:
-            raise ValueError(f"{os.fspath(path)}: no channel like 'S0.405,000000nm'")
+            raise RequestError(f"{os.fspath(path)}: no channel like 'S0.405,000000nm'")
         radiance = np.stack([channels[name].pixels for _, name in found], axis=-1)
         attributes = {
             name: value

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from ..errors import RequestError
 from ..files import whole_file
 from ..outputs import made_for
 from .scene import load_spectral_scene
@@ -40,7 +41,7 @@ def orbit(
         FileNotFoundError: if there is no such scene.
     """
     if not 2 <= frames <= MOST_FRAMES:
-        raise ValueError(f"frames: got {frames}, wanted 2 to {MOST_FRAMES}")
+        raise RequestError(f"frames: got {frames}, wanted 2 to {MOST_FRAMES}")
     scene = load_spectral_scene(scene_path, width=1, height=1, parameters=parameters)
     centre, up = _view(scene)
     motions = []

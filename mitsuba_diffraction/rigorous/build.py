@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..coherence import SUN_COHERENCE_LENGTH, lobe_width
+from ..errors import RequestError
 from ..files import whole_file
 from ..surface.heightfield import HeightField
 from .axes import Axes
@@ -73,7 +74,7 @@ def build_spectrum(
         UserWarning: if the finest table errs by more than `tolerance`; its `error` says by how much.
     """
     if not 1e-4 <= tolerance < 1:
-        raise ValueError(f"tolerance: got {tolerance!r}, wanted a share of the reflected light from 1e-4 to 1")
+        raise RequestError(f"tolerance: got {tolerance!r}, wanted a share of the reflected light from 1e-4 to 1")
     lobe_width(coherence_length)
     with one_thread():
         surface = _Surface(height_field, (wavelengths[0] * 1e-3, wavelengths[1] * 1e-3), int_ior, material, tolerance)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import RequestError
 from ..surface.heightfield import HeightField
 
 Real = NDArray[np.float64]
@@ -59,7 +60,7 @@ def curve_of(height_field: HeightField) -> Curve:
     """
     rows = height_field.centred
     if np.ptp(rows, axis=0).max() > 0:
-        raise ValueError(
+        raise RequestError(
             f"height field: got {len(rows)} rows that differ, wanted a surface that does not change along y; "
             "rigorous theory is offered for such only"
         )

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..errors import RequestError
 from ..surface.heightfield import HeightField
 from .blas import one_thread
 from .coordinate_transformation import Grating, light_from, scatter
@@ -85,19 +86,19 @@ def efficiencies(
         ValueError: if an argument is out of range.
     """
     if not (np.isfinite(wavelength) and 0.01 <= wavelength <= 100):
-        raise ValueError(f"wavelength: got {wavelength!r}, wanted µm, from 0.01 to 100")
+        raise RequestError(f"wavelength: got {wavelength!r}, wanted µm, from 0.01 to 100")
     index = refractive_index(wavelength, int_ior=int_ior, material=material)
     omega = np.asarray(direction, np.float64)
     length = np.linalg.norm(omega)
     if omega.shape != (3,) or not (np.isfinite(length) and length > 0 and omega[2] > 0):
-        raise ValueError(f"direction: got {direction!r}, wanted three numbers, to the light, the third positive")
+        raise RequestError(f"direction: got {direction!r}, wanted three numbers, to the light, the third positive")
     omega = omega / length
     if harmonics is not None:
         if not 1 <= harmonics <= 500:
-            raise ValueError(f"harmonics: got {harmonics!r}, wanted a number from 1 to 500")
+            raise RequestError(f"harmonics: got {harmonics!r}, wanted a number from 1 to 500")
         return _solve(height_field, omega, wavelength, index, harmonics)
     if not 0 < tolerance < 1:
-        raise ValueError(f"tolerance: got {tolerance!r}, wanted a share of the reflected light between 0 and 1")
+        raise RequestError(f"tolerance: got {tolerance!r}, wanted a share of the reflected light between 0 and 1")
     count = int(np.ceil(height_field.tile_size[0] / wavelength)) + 6
     found = _solve(height_field, omega, wavelength, index, count)
     while True:

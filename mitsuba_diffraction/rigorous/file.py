@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 import OpenEXR
 
+from ..errors import RequestError
 from ..files import whole_file
 from ..spectrum.file import silence
 from .axes import Axes
@@ -79,11 +80,11 @@ def load(path: str | os.PathLike[str], construct: Callable[..., Spectrum]) -> Sp
             file = OpenEXR.File(str(path), separate_channels=True)
             header, channels = file.header(), file.channels()
     except Exception as error:
-        raise ValueError(f"{path}: not a readable OpenEXR file ({' '.join(str(error).split())})") from None
+        raise RequestError(f"{path}: not a readable OpenEXR file ({' '.join(str(error).split())})") from None
     if header.get("format") != FORMAT:
-        raise ValueError(f"{path}: got an OpenEXR file of another kind, wanted a rigorous spectrum")
+        raise RequestError(f"{path}: got an OpenEXR file of another kind, wanted a rigorous spectrum")
     if header.get("formatVersion") != FORMAT_VERSION:
-        raise ValueError(
+        raise RequestError(
             f"{path}: got format version {header.get('formatVersion')}, wanted {FORMAT_VERSION}; "
             "build the spectrum again with this version of mitsuba_diffraction"
         )
@@ -105,9 +106,9 @@ def load(path: str | os.PathLike[str], construct: Callable[..., Spectrum]) -> Sp
             **{name: header[_camel(name)] for name in _TEXTS},
         )
     except KeyError as error:
-        raise ValueError(f"{path}: a damaged spectrum, {error} is missing") from None
+        raise RequestError(f"{path}: a damaged spectrum, {error} is missing") from None
     except (TypeError, ValueError, IndexError) as error:
-        raise ValueError(f"{path}: a damaged spectrum ({' '.join(str(error).split())})") from None
+        raise RequestError(f"{path}: a damaged spectrum ({' '.join(str(error).split())})") from None
 
 
 def _square(axes: Axes, values: np.ndarray, m: int) -> np.ndarray:

@@ -8,7 +8,8 @@ from numbers import Complex
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import NDArrayfrom ..errors import RequestError
+
 
 
 def refractive_index(wavelength: float, *, int_ior: complex | None = None, material: str | None = None) -> complex:
@@ -24,11 +25,11 @@ def refractive_index(wavelength: float, *, int_ior: complex | None = None, mater
         ValueError: if not exactly one of `int_ior` and `material` is given, or it is unknown or out of range.
     """
     if (int_ior is None) == (material is None):
-        raise ValueError(f"int_ior, material: got {int_ior!r}, {material!r}, wanted one of the two")
+        raise RequestError(f"int_ior, material: got {int_ior!r}, {material!r}, wanted one of the two")
     if material is None:
         number = complex(int_ior) if isinstance(int_ior, Complex) and not isinstance(int_ior, bool) else complex("nan")
         if not (0.01 <= abs(number) <= 100 and number.real >= 0 and number.imag >= 0):
-            raise ValueError(f"int_ior: got {int_ior!r}, wanted a refractive index, a number or n + ik with k ≥ 0")
+            raise RequestError(f"int_ior: got {int_ior!r}, wanted a refractive index, a number or n + ik with k ≥ 0")
         return number
     wavelengths, n, k = _table(material)
     return complex(np.interp(wavelength, wavelengths, n), np.interp(wavelength, wavelengths, k))
@@ -40,6 +41,6 @@ def _table(material: str) -> tuple[NDArray[np.float64], ...]:
     folder = Path(str(metadata.distribution("mitsuba").locate_file("mitsuba/data/ior")))
     known = sorted(path.name.removesuffix(".eta.spd") for path in folder.glob("*.eta.spd"))
     if material not in known:
-        raise ValueError(f"material: got {material!r}, wanted one of {', '.join(known) or 'none: no tables found'}")
+        raise RequestError(f"material: got {material!r}, wanted one of {', '.join(known) or 'none: no tables found'}")
     (nm, n), (nm_k, k) = (np.loadtxt(folder / f"{material}.{part}.spd").T for part in ("eta", "k"))
     return nm * 1e-3, n, np.interp(nm, nm_k, k)

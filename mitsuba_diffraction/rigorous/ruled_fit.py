@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
+from ..errors import RequestError
 from ..scalar_theory import profile_powers, scalar_orders
 from ..surface.heightfield import HeightField
 from .efficiencies import efficiencies
@@ -97,7 +98,7 @@ def measured(name: str) -> tuple[Real, Real]:
         ValueError: if there is no such grating.
     """
     if name not in LINES_PER_MM:
-        raise ValueError(f"grating: got {name!r}, wanted one of {', '.join(LINES_PER_MM)}")
+        raise RequestError(f"grating: got {name!r}, wanted one of {', '.join(LINES_PER_MM)}")
     nanometres, found = np.loadtxt(DATA / f"{name}.csv", delimiter=",", skiprows=2, unpack=True)
     return nanometres * 1e-3, found
 

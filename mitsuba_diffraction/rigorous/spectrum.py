@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..coherence import lobe_width
+from ..errors import RequestError
 from .axes import Axes, split
 from .file import load, save
 
@@ -51,7 +52,7 @@ class RigorousSpectrum:
     def __post_init__(self) -> None:
         wanted = self.axes.planes, self.axes.nodes
         if self.values.shape != wanted or self.values.dtype != np.float32:
-            raise ValueError(f"values: got {self.values.shape} of {self.values.dtype}, wanted {wanted} of float32")
+            raise RequestError(f"values: got {self.values.shape} of {self.values.dtype}, wanted {wanted} of float32")
         lobe_width(self.coherence_length)
 
     @property

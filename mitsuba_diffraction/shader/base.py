@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from ..bsdf.tables import opaque
 from ..coherence import SUN_COHERENCE_LENGTH, lobe_width
+from ..errors import RequestError
 from ..surface.heightfield import HeightField
 from .gain import PUBLISHED_R0, Gain, fresnel_ratio
 from .quirks import Quirks
@@ -123,7 +124,7 @@ class TextureShader(Shader):
         lobe_width(coherence_length)  # refuses what is no length
         steps = (LONGEST - SHORTEST) / step if isinstance(step, Real) and step > 0 else 0
         if steps < 1 or abs(steps - round(steps)) > 1e-9:
-            raise ValueError(f"step: got {step!r}, wanted a part of the {LONGEST - SHORTEST:g} nm from 380 to 780 nm")
+            raise RequestError(f"step: got {step!r}, wanted a part of the {LONGEST - SHORTEST:g} nm from 380 to 780 nm")
         self.coherence_length = coherence_length
         self.step = float(step)
         self.wavelength_count = round(steps) + 1
@@ -240,5 +241,5 @@ def trapezoid(
 def check_whole(name: str, value: int, least: int) -> int:
     """`value` as an int ≥ `least`, or ValueError."""
     if isinstance(value, bool) or not isinstance(value, Integral) or value < least:
-        raise ValueError(f"{name}: got {value!r}, wanted a whole number ≥ {least}")
+        raise RequestError(f"{name}: got {value!r}, wanted a whole number ≥ {least}")
     return int(value)

@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..errors import RequestError
 from ..surface.heightfield import HeightField
 from .base import Shader
 from .flss import FLSS
@@ -27,9 +28,9 @@ def shader_for(height_field: HeightField, variant: str, quirks: Quirks, **settin
         ValueError: on an unknown name, or where Mitsuba has no vectorised variant set.
     """
     if variant not in VARIANTS:
-        raise ValueError(f"variant: got {variant!r}, wanted one of {', '.join(VARIANTS)}")
+        raise RequestError(f"variant: got {variant!r}, wanted one of {', '.join(VARIANTS)}")
     if mi.variant() is None or not dr.is_jit_v(mi.Float) or not mi.is_spectral:
-        raise ValueError(f"variant: Mitsuba's is {mi.variant()}, wanted a spectral one such as llvm_ad_spectral")
+        raise RequestError(f"variant: Mitsuba's is {mi.variant()}, wanted a spectral one such as llvm_ad_spectral")
     return VARIANTS[variant](height_field, quirks, **settings)
 
 
@@ -65,11 +66,11 @@ def colour(
         ValueError: if an argument makes no sense.
     """
     if quantity not in QUANTITIES:
-        raise ValueError(f"quantity: got {quantity!r}, wanted one of {', '.join(QUANTITIES)}")
+        raise RequestError(f"quantity: got {quantity!r}, wanted one of {', '.join(QUANTITIES)}")
     quirks = quirks or Quirks.as_published()
     shader = shader_for(height_field, variant, quirks, **settings)
     if quantity == "xyz" and variant == "gem":
-        raise ValueError("quantity: gem has no XYZ, only RGB")
+        raise RequestError("quantity: gem has no XYZ, only RGB")
     wi, wo, shape = _directions(wi, wo)
     weights = shader.weights(r_0, light)
     result = shader.xyz(wi, wo, weights) if quantity == "xyz" else shader.rgb(wi, wo, weights)
@@ -108,7 +109,7 @@ def relative_radiance(
         ValueError: if an argument makes no sense.
     """
     if variant == "gem":
-        raise ValueError("variant: gem has no spectrum, only RGB")
+        raise RequestError("variant: gem has no spectrum, only RGB")
     shader = shader_for(height_field, variant, quirks or Quirks.as_published(), **settings)
     wavelengths = np.asarray(wavelengths, np.float32)
     wi, wo = (np.broadcast_to(omega, (*wavelengths.shape, 3)) if np.ndim(omega) == 1 else omega for omega in (wi, wo))
@@ -121,7 +122,7 @@ def _directions(wi: ArrayLike, wo: ArrayLike) -> tuple[mi.Vector3f, mi.Vector3f,
     """Two arrays (..., 3) of directions as Dr.Jit's, and the shape (...)."""
     wi, wo = (np.asarray(omega, np.float32) for omega in (wi, wo))
     if wi.shape[-1:] != (3,) or wo.shape[-1:] != (3,):
-        raise ValueError(f"wi, wo: got shapes {wi.shape} and {wo.shape}, wanted (..., 3)")
+        raise RequestError(f"wi, wo: got shapes {wi.shape} and {wo.shape}, wanted (..., 3)")
     wi, wo = np.broadcast_arrays(wi, wo)
     vectors = (mi.Vector3f(np.ascontiguousarray(omega.reshape(-1, 3).T)) for omega in (wi, wo))
     return *vectors, wi.shape[:-1]

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from numbers import Real
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import scipy.fft
 
+from ..errors import RequestError
 from ..surface.heightfield import HeightField
 from .base import Shader
 from .quirks import Quirks
@@ -44,10 +47,10 @@ class GEM(Shader):
     ) -> None:
         """Takes d, by default the period of the strongest wave of the heights along x."""
         super().__init__(height_field, quirks, shadowing)
-        self.spacing = strongest_period(height_field) if spacing is None else float(spacing)
-        self.roughness = float(roughness)
-        if not (self.spacing > 0 and self.roughness > 0):
-            raise ValueError(f"spacing, roughness: got {spacing!r}, {roughness!r}, wanted positive numbers")
+        self.spacing = strongest_period(height_field) if spacing is None else spacing
+        self.roughness = roughness
+        if not all(isinstance(number, Real) and number > 0 for number in (self.spacing, self.roughness)):
+            raise RequestError(f"spacing, roughness: got {spacing!r}, {roughness!r}, wanted positive numbers")
 
     @property
     def peak(self) -> float:

@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import RequestError
 from .base import Shader
 from .evaluate import VARIANTS
 from .lights import Light, lights_of, spectrum_of
@@ -58,14 +59,14 @@ def define() -> type:
             # As in `DiffractionGrating`: what may fail comes before Mitsuba registers the object.
             self.variant = props.get("variant", "flss")
             if self.variant not in VARIANTS:
-                raise ValueError(f"variant: got {self.variant!r}, wanted one of {', '.join(VARIANTS)}")
+                raise RequestError(f"variant: got {self.variant!r}, wanted one of {', '.join(VARIANTS)}")
             quirks = Quirks.as_published() if props.get("as_published", True) else Quirks.corrected()
             self.quirks = replace(quirks, **{name: props[name] for name in Quirks.names() if name in props})
             self.settings = {name: props[name] for name in _settings(self.variant) if name in props}
             self.shadows = props.get("shadows", False)
             self.diffuse_weight = props.get("diffuse_weight", 0.5)
-            if not 0 <= self.diffuse_weight <= 1:
-                raise ValueError(f"diffuse_weight: got {self.diffuse_weight}, wanted 0 to 1")
+            if not (isinstance(self.diffuse_weight, int | float) and 0 <= self.diffuse_weight <= 1):
+                raise RequestError(f"diffuse_weight: got {self.diffuse_weight!r}, wanted 0 to 1")
             self.emission = Emission()
             mi.SamplingIntegrator.__init__(self, props)
             self._shaders: list[tuple[mi.BSDF, Shader]] = []

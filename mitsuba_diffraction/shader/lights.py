@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import RequestError
 from .tristimulus import wavelengths
 
 
@@ -71,7 +72,7 @@ def lights_of(scene: mi.Scene) -> list[Light]:
     """
     found = [Light(emitter) for emitter in scene.emitters() if emitter.class_name() in Light.KINDS]
     if not found:
-        raise ValueError(
+        raise RequestError(
             "diffraction_shader: the scene has no directional or point light, and it knows no other; in place of a "
             "sun's disc give it a directional light"
         )

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import drjit as dr
 import mitsuba as mi
 
+from ..errors import RequestError
 from ..surface.heightfield import HeightField
 from .base import TextureShader, check_whole
 from .gain import Gain
@@ -54,12 +55,12 @@ class PQ(TextureShader):
         """
         super().__init__(height_field, quirks, **settings)
         if interpolation not in INTERPOLATIONS:
-            raise ValueError(f"interpolation: got {interpolation!r}, wanted one of {', '.join(INTERPOLATIONS)}")
+            raise RequestError(f"interpolation: got {interpolation!r}, wanted one of {', '.join(INTERPOLATIONS)}")
         if tiles is None:
             tiles = tuple(max(1, round(self.coherence_length / size)) for size in self.tile_size)
         self.tiles = tuple(check_whole("tiles", count, 1) for count in tiles)
         if len(self.tiles) != 2:
-            raise ValueError(f"tiles: got {tiles!r}, wanted two whole numbers ≥ 1, along x and y")
+            raise RequestError(f"tiles: got {tiles!r}, wanted two whole numbers ≥ 1, along x and y")
         self.interpolation = interpolation
         self.reach = check_whole("reach", reach, 1)
 

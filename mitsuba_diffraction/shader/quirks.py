@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
+from ..errors import RequestError
+
 
 @dataclass(frozen=True)
 class Quirks:
@@ -49,7 +51,7 @@ class Quirks:
     def __post_init__(self) -> None:
         for field in fields(self):
             if not isinstance(getattr(self, field.name), bool):
-                raise ValueError(f"{field.name}: got {getattr(self, field.name)!r}, wanted True or False")
+                raise RequestError(f"{field.name}: got {getattr(self, field.name)!r}, wanted True or False")
 
     @classmethod
     def names(cls) -> tuple[str, ...]:

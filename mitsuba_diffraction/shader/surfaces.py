@@ -9,6 +9,7 @@ import mitsuba as mi
 
 from ..bsdf.nesting import contains_grating, is_grating, nested
 from ..coherence import SUN_COHERENCE_LENGTH
+from ..errors import RequestError
 from ..surface.heightfield import HeightField
 
 
@@ -56,7 +57,7 @@ def surfaces_of(scene: mi.Scene) -> list[Surface]:
             sides = ((parts[0], 1), (parts[-1], -1))
             found += [Surface(bsdf, part, side) for part, side in sides if is_grating(part)]
         elif any(map(contains_grating, parts)):
-            raise ValueError(
+            raise RequestError(
                 f"diffraction_shader: a diffraction_grating stands inside {bsdf.class_name()}, wanted on a shape or "
                 "inside twosided"
             )
@@ -70,7 +71,7 @@ def heights_of(grating: mi.BSDF) -> tuple[HeightField, float]:
         ValueError: if it was built from a saved spectrum, which does not hold heights.
     """
     if grating.recipe is None:
-        raise ValueError(
+        raise RequestError(
             "diffraction_shader: it needs heights, and a saved spectrum does not hold them; give the grating a "
             "recipe (filename=….toml) or a profile"
         )

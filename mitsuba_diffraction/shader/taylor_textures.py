@@ -8,6 +8,7 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
+from ..errors import RequestError
 from ..surface.heightfield import HeightField
 
 PUBLISHED_TERMS = 37  # 81 wavelengths × 37 terms × 9 texels are the 27,000 reads of the published shader
@@ -55,9 +56,9 @@ class TaylorTextures:
             ValueError: if there are no terms, or the origin is unknown.
         """
         if isinstance(terms, bool) or not isinstance(terms, int) or terms < 1:
-            raise ValueError(f"terms: got {terms!r}, wanted a whole number ≥ 1")
+            raise RequestError(f"terms: got {terms!r}, wanted a whole number ≥ 1")
         if origin not in ORIGINS:
-            raise ValueError(f"origin: got {origin!r}, wanted one of {', '.join(ORIGINS)}")
+            raise RequestError(f"origin: got {origin!r}, wanted one of {', '.join(ORIGINS)}")
         heights = height_field.heights - height_field.heights.min() if heights_from_zero else height_field.centred
         height = height_field.height_range if heights_from_zero else height_field.half_range
         t = heights / (height or 1.0)

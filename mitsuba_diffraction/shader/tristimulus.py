@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import lsq_linear
 
 from ..color import daylight
+from ..wavelengths import VISIBLE
 
 SHORTEST, LONGEST, PUBLISHED_STEP = 380.0, 780.0, 5.0  # nm: 81 wavelengths
 
@@ -61,7 +62,7 @@ def rgb_matrix(*, cie_rgb_matrix: bool, d65_twice: bool) -> NDArray[np.float64]:
     return matrix * d65_white() if d65_twice else np.array(matrix)
 
 
-EMISSION = np.arange(360.0, 830.0 + 0.5, 5.0)
+EMISSION = np.arange(VISIBLE[0], VISIBLE[1] + 0.5, 5.0)
 """The nodes of `primary_spectra`, nm."""
 
 
