@@ -1,8 +1,8 @@
 """Diffraction gratings for Mitsuba 3.
 
 Importing this package registers the BSDF `diffraction_grating` and the integrators `diffraction_path` and
-`diffraction_shader` for every spectral variant of Mitsuba, once Mitsuba is imported. Everything that needs no renderer
-works without it.
+`diffraction_shader` for all spectral variants as soon as Mitsuba is imported. Everything up to the spectrum file works
+without importing Mitsuba.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ __all__ = [*_HOME, *_MODULES]
 
 
 def __getattr__(name: str) -> object:
-    """The public names, imported when they are asked for (PEP 562)."""
+    """Public names, imported on first use (PEP 562)."""
     if name in _HOME:
         value = getattr(importlib.import_module(f".{_HOME[name]}", __name__), name)
     elif name in _MODULES:

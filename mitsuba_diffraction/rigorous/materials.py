@@ -8,8 +8,9 @@ from numbers import Complex
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArrayfrom ..errors import RequestError
+from numpy.typing import NDArray
 
+from ..errors import RequestError
 
 
 def refractive_index(wavelength: float, *, int_ior: complex | None = None, material: str | None = None) -> complex:

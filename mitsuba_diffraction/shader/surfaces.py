@@ -1,4 +1,4 @@
-"""The gratings of a scene, with the heights that the shader needs."""
+"""The gratings of a scene and their height fields."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from ..surface.heightfield import HeightField
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """One side of a BSDF of the scene that is a grating.
+    """One side of a grating in a scene.
 
     Attributes:
-        bsdf: as shapes hold it, the grating or a `twosided` around it.
+        bsdf: the BSDF of the shape, the grating or a `twosided` around it.
         grating: the `diffraction_grating`.
         side: 1 for the front, −1 for the back.
     """
@@ -28,7 +28,7 @@ class Surface:
     side: int
 
     def is_of(self, bsdf: mi.BSDF) -> mi.Bool:
-        """Whether a point of the scene has the BSDF of this surface."""
+        """Whether a point has the BSDF of this surface."""
         return bsdf == mi.BSDFPtr(self.bsdf) if dr.is_jit_v(mi.Float) else mi.Bool(bsdf is self.bsdf)
 
     def holds(self, bsdf: mi.BSDF, wo: mi.Vector3f) -> mi.Bool:
@@ -40,7 +40,7 @@ def surfaces_of(scene: mi.Scene) -> list[Surface]:
     """All gratings of a scene.
 
     Raises:
-        ValueError: if a grating stands inside another BSDF than `twosided`.
+        ValueError: if a grating is nested in a BSDF other than `twosided`.
     """
     found: list[Surface] = []
     seen: list[mi.BSDF] = []
@@ -68,7 +68,7 @@ def heights_of(grating: mi.BSDF) -> tuple[HeightField, float]:
     """The height field of a grating, and its coherence length in µm.
 
     Raises:
-        ValueError: if it was built from a saved spectrum, which does not hold heights.
+        ValueError: if it was loaded from a spectrum file, which does not contain heights.
     """
     if grating.recipe is None:
         raise RequestError(
