@@ -544,9 +544,7 @@ def test_one_warning_for_many_surfaces(own_cache):
 
 
 def test_a_spectrum_of_another_surface_under_a_name_of_the_cache_is_not_used(own_cache, builds):
-    one, other = (
-        Recipe({**BLAZED, "period": period}, FAST) for period in (2.5, 2.6)
-    )
+    one, other = (Recipe({**BLAZED, "period": period}, FAST) for period in (2.5, 2.6))
     one.cached()
     entry = own_cache / f"{one.digest()}.exr"
     shutil.copy(entry, own_cache / f"{other.digest()}.exr")
