@@ -17,6 +17,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .errors import RequestError
+
 _OBSERVER = "CIE 1931 2 Degree Standard Observer"
 
 
@@ -28,7 +30,7 @@ def _xyz_matrix(wavelengths: tuple[float, ...]) -> NDArray[np.float64]:
     centres = np.asarray(wavelengths)
     steps = np.diff(centres)
     if centres.size < 2 or steps[0] < 1 or np.ptp(steps) > 1e-3 * steps[0]:
-        raise ValueError(
+        raise RequestError(
             f"wavelengths: got {centres.size} from {centres[0]:g} to {centres[-1]:g} nm, "
             "wanted two or more, ascending in equal steps of at least 1 nm"
         )
@@ -64,7 +66,7 @@ def spectrum_to_XYZ(radiance: ArrayLike, wavelengths: ArrayLike) -> NDArray[np.f
     radiance = np.asarray(radiance)
     wavelengths = np.asarray(wavelengths, dtype=np.float64)
     if wavelengths.ndim != 1 or radiance.ndim == 0 or radiance.shape[-1] != wavelengths.size:
-        raise ValueError(
+        raise RequestError(
             f"radiance: got shape {radiance.shape}, wanted (..., n) for wavelengths of shape {wavelengths.shape}"
         )
     return radiance @ _xyz_matrix(tuple(wavelengths.tolist()))

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from .arrays import matching
 from .coherence import SUN_COHERENCE_LENGTH, lobe_width
+from .errors import RequestError
 from .finite_tiles import tile_factor
 from .surface.heightfield import HeightField
 from .welch import WindowAxis, carried_coherence_length, window_axes
@@ -132,7 +133,7 @@ def finite_tiles_spectrum(
 def check_extent(extent: str) -> None:
     """Raises ValueError unless `extent` names a reading of the patch."""
     if extent not in EXTENTS:
-        raise ValueError(f"extent: got {extent!r}, wanted 'tile' or 'sample'")
+        raise RequestError(f"extent: got {extent!r}, wanted 'tile' or 'sample'")
 
 
 def _tile_spectrum(
@@ -232,7 +233,7 @@ def _checked(q: ArrayLike, kappa: ArrayLike) -> tuple[NDArray[np.float64], NDArr
     """As `matching`, and κ is finite too."""
     q, kappa = matching(q, kappa)
     if not np.isfinite(kappa).all():
-        raise ValueError("kappa: got numbers that are not finite, wanted rad/µm")
+        raise RequestError("kappa: got numbers that are not finite, wanted rad/µm")
     return q, kappa
 
 
@@ -240,5 +241,5 @@ def _checked_tiles(tiles: tuple[int, int]) -> tuple[int, int]:
     """Two whole numbers ≥ 1, or ValueError."""
     pair = tuple(tiles) if isinstance(tiles, (tuple, list, np.ndarray)) else ()
     if len(pair) != 2 or not all(isinstance(n, Integral) and not isinstance(n, bool) and n >= 1 for n in pair):
-        raise ValueError(f"tiles: got {tiles!r}, wanted two whole numbers ≥ 1, along x and y")
+        raise RequestError(f"tiles: got {tiles!r}, wanted two whole numbers ≥ 1, along x and y")
     return int(pair[0]), int(pair[1])

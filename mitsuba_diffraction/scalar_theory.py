@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import RegularGridInterpolator
 from scipy.special import jv
 
+from .errors import RequestError
 from .geometry import k_g
 from .surface.heightfield import HeightField
 
@@ -59,7 +60,7 @@ def sinusoid_powers(depth: float) -> OrderPowers:
 def profile_powers(height_field: HeightField) -> OrderPowers:
     """η_m of a profile of one row, by one sum over its pixels for each pair (m, κ)."""
     if height_field.shape[0] != 1:
-        raise ValueError(f"height_field: got {height_field.shape[0]} rows, wanted a profile of one")
+        raise RequestError(f"height_field: got {height_field.shape[0]} rows, wanted a profile of one")
     heights, count = height_field.centred[0], height_field.shape[1]
 
     def powers(m: NDArray[np.int64], kappa: Array) -> Array:
@@ -160,7 +161,7 @@ def error_map() -> tuple[Array, Array, Array, Array]:
         period, depth, angle = point["period"], point["depth"], point["angle"]
         orders = scalar_orders(sinusoid_powers(depth), period, 1.0, angle, index)
         if [int(orders.m[0]), int(orders.m[-1])] != point["orders"]:
-            raise ValueError(f"{STORED.name}: orders {point['orders']} at {period} λ, wanted {orders.m[[0, -1]]}")
+            raise RequestError(f"{STORED.name}: orders {point['orders']} at {period} λ, wanted {orders.m[[0, -1]]}")
         found[period, depth, angle] = difference(orders.unpolarised, point["unpolarised"])
     periods, depths, angles = (np.array(sorted(set(values))) for values in zip(*found, strict=True))
     errors = np.array([[[found[p, d, a] for a in angles] for d in depths] for p in periods])
@@ -194,9 +195,9 @@ def expected_error(period: float, depth: float, wavelength: float) -> float:
     """
     for name, value in (("period", period), ("wavelength", wavelength)):
         if not (np.isfinite(value) and value > 0):
-            raise ValueError(f"{name}: got {value!r}, wanted a positive number in µm")
+            raise RequestError(f"{name}: got {value!r}, wanted a positive number in µm")
     if not (np.isfinite(depth) and depth >= 0):
-        raise ValueError(f"depth: got {depth!r}, wanted a number in µm, zero or more")
+        raise RequestError(f"depth: got {depth!r}, wanted a number in µm, zero or more")
     periods, depths, _, _ = error_map()
     if period < periods[0] * wavelength or depth > depths[-1] * wavelength:
         return float("nan")

@@ -154,7 +154,7 @@ def test_precompute_writes_the_file_that_it_names_and_says_its_error(command):
         assert part in out
     assert "tile, " in out
     assert "coherence length 65 µm; slices, " in out
-    assert out.splitlines()[1].startswith("left out, at most: 0.0e+00 of the power in weak frequencies; ")
+    assert out.splitlines()[1].startswith("truncated, at most: 0.0e+00 of the power at weak frequencies; ")
     # All but the orders up to 13, the last one below 2/λ: summed here.
     kappa = np.linspace(0, spectrum.largest_kappa, 2000)[:, None]
     eta = [
@@ -180,7 +180,7 @@ def test_a_sample_by_options(command, representation):
     assert (spectrum.extent, spectrum.largest_angle, spectrum.tolerance) == ("sample", 60.0, 0.02)
     assert spectrum.representation == representation
     rows, columns = spectrum.grid.shape
-    for part in (f"sample, {columns} × {rows} frequencies", "cycles/µm apart", "coherence length 0.9 µm", "left out"):
+    for part in (f"sample, {columns} × {rows} frequencies", "cycles/µm apart", "coherence length 0.9 µm", "truncated"):
         assert part in out
     assert f"{spectrum.dropped:.1e} of the power" in out
     assert f"{spectrum.beyond:.1e} where" in out
@@ -236,7 +236,7 @@ def test_a_bare_scan_with_a_seam_wants_an_extent(command):
     assert (code, "seam" in out) == (0, False)
     code, out, _ = command("precompute whole.npy --pixel-size 0.05 --tolerance 0.01")
     assert code == 0
-    assert "repeats as a tile; r.m.s. steps at the seam" in out
+    assert "repeated as a tile; r.m.s. steps at the seam" in out
 
 
 def test_the_version_is_said(command):
@@ -321,6 +321,55 @@ def test_a_failure_is_one_line_and_exit_code_1(command, monkeypatch, error):
     code, out, err = command("precompute", "blaze.toml")
     assert (code, out) == (1, "")
     assert err.strip() == f"mitsuba-diffraction: error: {str(error) or 'MemoryError'}"
+
+
+BROADCAST = "operands could not be broadcast together with shapes (2,) (3,) "
+BUG = "mitsuba-diffraction: error: this is a bug in mitsuba_diffraction ("
+
+
+def broadcast(*arguments, **named):
+    """A mistake as code makes it, with NumPy's own exception, a ValueError."""
+    return np.zeros(2) + np.zeros(3)
+
+
+def test_a_mistake_of_the_code_is_told_as_such(command, monkeypatch):
+    monkeypatch.setattr(PRECOMPUTE, "_Build", broadcast)
+    code, out, err = command("precompute", "blaze.toml")
+    assert (code, out) == (1, "")
+    assert err == f"{BUG}ValueError: {BROADCAST}); mitsuba-diffraction --debug … shows where\n"
+    code, out, err = command("--debug precompute blaze.toml")
+    assert (code, out) == (1, "")
+    assert err.startswith("Traceback")
+    assert "in broadcast" in err
+    assert BUG in err
+
+
+def test_a_mistake_of_the_code_inside_a_plugin_is_none_of_the_scene(command, monkeypatch):
+    Path("scene.xml").write_text(SCENE)
+    monkeypatch.setattr("mitsuba_diffraction.bsdf.diffraction_grating.reflectance_from", broadcast)
+    code, out, err = command("render scene.xml --variant scalar_spectral --spp 1 -o out.exr")
+    assert (code, out) == (1, "")
+    assert len(err.splitlines()) == 1, err
+    assert err.startswith(f"{BUG}ValueError: ")
+    assert BROADCAST.strip() in err
+    code, out, err = command("--debug render scene.xml --variant scalar_spectral --spp 1 -o out.exr")
+    assert code == 1
+    assert "in broadcast" in err
+
+
+def test_a_mistake_of_the_code_while_it_renders_is_told_as_such(command, monkeypatch):
+    Path("scene.xml").write_text(SCENE)
+    monkeypatch.setattr("mitsuba_diffraction.render.film._trace_with_mitsubas_film", broadcast)
+    code, out, err = command("render scene.xml --variant scalar_spectral --spp 1 -o out.exr")
+    assert (code, out) == (1, "")
+    assert err.startswith(f"{BUG}ValueError: ")
+
+
+def test_debug_shows_where_a_request_is_refused(command):
+    code, _, err = command("--debug precompute blaze.toml --tolerance 7")
+    assert code == 2
+    assert err.startswith("Traceback")
+    assert err.splitlines()[-1].startswith("mitsuba-diffraction: error: tolerance: got 7")
 
 
 def test_help_is_for_asking(command):

@@ -23,6 +23,8 @@ BLAZED = '<string name="profile" value="blazed"/><float name="period" value="2.5
             r"'Alu', did you mean Al or .*of none, ",
         ),
         (GRATING % (BLAZED + '<bsdf type="diffuse"/>'), {}, 'wanted <bsdf name="base"'),
+        (GRATING % (BLAZED + '<string name="height_scale" value="a"/>'), {}, "height_scale: got 'a', wanted a number"),
+        (GRATING % '<float name="filename" value="1"/>', {}, r"filename: got 1.0, wanted a saved spectrum"),
     ],
 )
 def test_what_there_is_is_said(body, parameters, words, tmp_path, llvm):

@@ -5,6 +5,8 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from ..errors import RequestError
+
 TRANSMITS = (
     mi.BSDFFlags.DiffuseTransmission
     | mi.BSDFFlags.GlossyTransmission
@@ -22,14 +24,14 @@ def base_from(props: mi.Properties) -> Base | None:
     """
     others = [name for name, value in props.objects() if name != "base" and isinstance(value, mi.BSDF)]
     if others:
-        raise ValueError(
+        raise RequestError(
             'base: got a nested BSDF without this name, wanted <bsdf name="base" …> (in load_dict, the key "base")'
         )
     if "base" not in props:
         return None
     bsdf = props["base"]
     if not isinstance(bsdf, mi.BSDF):
-        raise ValueError(f"base: got {bsdf!r}, wanted a BSDF")
+        raise RequestError(f"base: got {bsdf!r}, wanted a BSDF")
     return Base(bsdf)
 
 
@@ -45,11 +47,11 @@ class Base:
     def __init__(self, bsdf: mi.BSDF) -> None:
         flags = bsdf.flags()
         if flags & +TRANSMITS:
-            raise ValueError(
+            raise RequestError(
                 "base: got a BSDF that lets light through (transmission or a mask), wanted one that only reflects"
             )
         if not (flags & +mi.BSDFFlags.FrontSide and any(flags & +kind for kind in REFLECTS)):
-            raise ValueError("base: got a BSDF that reflects nothing at its front, wanted one that reflects")
+            raise RequestError("base: got a BSDF that reflects nothing at its front, wanted one that reflects")
         self.bsdf = bsdf
         self.components = [bsdf.flags(i) & ~+mi.BSDFFlags.BackSide for i in range(bsdf.component_count())]
         self.has_delta = bool(flags & +mi.BSDFFlags.DeltaReflection)

@@ -9,7 +9,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..errors import RequestError
 from ..spectrum.energy_table import SHADOWING
+from ..wavelengths import VISIBLE
 from .base import base_from
 from .geometry import Geometry
 from .incidence import Incidence
@@ -19,7 +21,6 @@ from .shared import SharedTables
 from .surface import surface_from
 from .tables import BELOW_ONE, opaque
 
-VISIBLE_FROM = 360.0  # nm, the shortest wavelength that Mitsuba samples
 DEFENSIVE = 0.02  # the share of samples that follow the cosine, for lobes that the sampler's averages miss
 LEAST_SHARE = 0.1  # of the samples, for the grating and for its base: what each reflects is only estimated
 
@@ -67,17 +68,20 @@ def define() -> type:
             self.spectrum, self.recipe = surface_from(props)
             self.reflectance = reflectance_from(props)
             self.orientation = _orientation(props)
-            self.height_scale = mi.Float(props.get("height_scale", 1.0))
+            height_scale = props.get("height_scale", 1.0)
+            if not isinstance(height_scale, int | float):
+                raise RequestError(f"height_scale: got {height_scale!r}, wanted a number")
+            self.height_scale = mi.Float(height_scale)
             self.shadowing = props.get("shadowing", "v_cavity")
             if self.shadowing not in SHADOWING:
-                raise ValueError(f"shadowing: got {self.shadowing!r}, wanted one of {', '.join(SHADOWING)}")
+                raise RequestError(f"shadowing: got {self.shadowing!r}, wanted one of {', '.join(SHADOWING)}")
             self._tables = SharedTables.of(self.spectrum)
             self.scattering = self._tables.scattering
             # The spectrum says nothing beyond its largest angle: there the grating is black.
             self.least_cosine = opaque(np.cos(np.deg2rad(self.spectrum.largest_angle)) * (1 - 1e-6))
             self.base = base_from(props)
             if self.base is not None and not self.reflectance.transparent:
-                raise ValueError("base: got a BSDF below a conductor or a perfect mirror, which let no light through")
+                raise RequestError("base: got a BSDF below a conductor or a perfect mirror, which let no light through")
             self._update()
             mi.BSDF.__init__(self, props)
             flags = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.Anisotropic | mi.BSDFFlags.FrontSide
@@ -90,12 +94,12 @@ def define() -> type:
         def _update(self) -> None:
             """What depends on parameters that can change."""
             scale = np.max(self.height_scale)
-            largest = VISIBLE_FROM / self.spectrum.wavelengths[0]
+            largest = VISIBLE[0] / self.spectrum.wavelengths[0]
             if not 0 <= scale <= largest * (1 + 1e-6):
-                raise ValueError(
+                raise RequestError(
                     f"height_scale: got {scale}, wanted 0 to {largest:.4g}: the spectrum was built for "
                     f"wavelengths from {self.spectrum.wavelengths[0]:g} nm; for larger heights build it from "
-                    f"{VISIBLE_FROM:g} nm divided by the scale"
+                    f"{VISIBLE[0]:g} nm divided by the scale"
                 )
             dr.make_opaque(self.height_scale)
             self.energy = self._tables.energy(self.shadowing, self.height_scale)
@@ -307,7 +311,7 @@ def define() -> type:
 def _orientation(props: mi.Properties) -> mi.Texture:
     angle = props.get("orientation", 0.0)
     if isinstance(angle, float) and not np.isfinite(angle):
-        raise ValueError(f"orientation: got {angle}, wanted degrees or a texture")
+        raise RequestError(f"orientation: got {angle}, wanted degrees or a texture")
     return props.get_texture("orientation", 0.0)
 
 

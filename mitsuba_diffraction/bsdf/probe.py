@@ -7,6 +7,8 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..errors import RequestError
+
 Array = NDArray[np.float64]
 
 
@@ -83,12 +85,12 @@ def evaluate_pdf(
     """
     wi, wo, wavelengths = (np.asarray(values, np.float64) for values in (wi, wo, wavelengths))
     if wi.shape[-1:] != (3,) or wo.shape[-1:] != (3,) or wavelengths.ndim == 0:
-        raise ValueError(
+        raise RequestError(
             f"wi, wo, wavelengths: got shapes {wi.shape}, {wo.shape}, {wavelengths.shape}, "
             "wanted (..., 3), (..., 3), (..., c)"
         )
     if not mi.variant() or not mi.is_spectral:
-        raise ValueError(f"variant: Mitsuba's is {mi.variant()}, wanted a spectral one such as llvm_ad_spectral")
+        raise RequestError(f"variant: Mitsuba's is {mi.variant()}, wanted a spectral one such as llvm_ad_spectral")
     shape = np.broadcast_shapes(wi.shape[:-1], wo.shape[:-1], wavelengths.shape[:-1])
     count, channels = wavelengths.shape[-1], _channels()
     groups = np.resize(np.arange(count), (-(-count // channels), channels))

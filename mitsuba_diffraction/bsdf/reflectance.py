@@ -8,7 +8,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-VISIBLE_FROM, VISIBLE_TO = 360.0, 830.0  # nm, what Mitsuba samples
+from ..errors import RequestError
+from ..wavelengths import VISIBLE
+
 MODELS = ("exact", "schlick")
 
 
@@ -20,11 +22,13 @@ def reflectance_from(props: mi.Properties) -> PerfectMirror | Dielectric | Condu
     """
     model = props.get("fresnel", "exact")
     if model not in MODELS:
-        raise ValueError(f"fresnel: got {model!r}, wanted one of {', '.join(MODELS)}")
+        raise RequestError(f"fresnel: got {model!r}, wanted one of {', '.join(MODELS)}")
     if "material" not in props:
         return Dielectric(props.get("int_ior", 1.5), props.get("ext_ior", "air"), model)
     if "int_ior" in props or "ext_ior" in props:
-        raise ValueError("material: a conductor or a perfect mirror takes no int_ior or ext_ior; give one or the other")
+        raise RequestError(
+            "material: a conductor or a perfect mirror takes no int_ior or ext_ior; give one or the other"
+        )
     material = props["material"]
     return PerfectMirror() if material == "none" else Conductor(material, model)
 
@@ -58,7 +62,9 @@ class Dielectric:
     def __init__(self, int_ior: float | str, ext_ior: float | str, model: str) -> None:
         for name, index in (("int_ior", int_ior), ("ext_ior", ext_ior)):
             if isinstance(index, int | float) and not 0 < index < np.inf:
-                raise ValueError(f"{name}: got {index}, wanted a positive index of refraction, or a name such as 'bk7'")
+                raise RequestError(
+                    f"{name}: got {index}, wanted a positive index of refraction, or a name such as 'bk7'"
+                )
         # Mitsuba's own plugin knows the presets' names.
         interface = mi.load_dict({"type": "dielectric", "int_ior": int_ior, "ext_ior": ext_ior})
         self.eta = mi.Float(mi.traverse(interface)["eta"])
@@ -100,11 +106,11 @@ class Conductor:
     @staticmethod
     def _spectrum(metal: mi.SceneParameters, name: str) -> mi.Texture:
         # A regular table is read at once; in an irregular one every look-up searches, which took half of all time.
-        nanometres = np.arange(VISIBLE_FROM, VISIBLE_TO + 1)
+        nanometres = np.arange(VISIBLE[0], VISIBLE[1] + 1)
         values = np.interp(nanometres, metal[f"{name}.wavelengths"], metal[f"{name}.values"])
         text = ", ".join(repr(float(value)) for value in values)
         return mi.load_dict(
-            {"type": "regular", "wavelength_min": VISIBLE_FROM, "wavelength_max": VISIBLE_TO, "values": text}
+            {"type": "regular", "wavelength_min": VISIBLE[0], "wavelength_max": VISIBLE[1], "values": text}
         )
 
     def __call__(self, si: mi.SurfaceInteraction3f, cos_half: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
@@ -141,7 +147,7 @@ def _refuse_unknown_material(material: str) -> None:
     names = ["none", *sorted(path.name.removesuffix(".eta.spd") for path in tables)]
     if len(names) > 1 and material not in names:
         close = [name for name in names if name.lower().startswith(str(material)[:2].lower())]
-        raise ValueError(
+        raise RequestError(
             f"material: got {material!r}, "
             + (f"did you mean {' or '.join(close)}? " if close else "")
             + f"wanted one of {', '.join(names)}"

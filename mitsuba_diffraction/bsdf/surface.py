@@ -8,6 +8,7 @@ from pathlib import Path
 
 import mitsuba as mi
 
+from ..errors import RequestError
 from ..recipe import Recipe
 from ..spectrum import GratingSpectrum
 from ..surface.gratings import COHERENCE_LENGTHS, PROFILES
@@ -27,17 +28,17 @@ def surface_from(props: mi.Properties) -> tuple[GratingSpectrum, Recipe | None]:
     """
     given = [name for name in ("filename", "spectrum", "profile") if name in props]
     if len(given) != 1:
-        raise ValueError(
+        raise RequestError(
             f"surface: got {' and '.join(given) or 'nothing'}, wanted one of filename (a saved spectrum or a recipe), "
             f"profile ({', '.join(PROFILES)}) or, from Python, spectrum"
         )
     if given == ["spectrum"]:
         return _taken_over(props["spectrum"]), None
     if given == ["filename"]:
-        return _from_file(Path(str(mi.file_resolver().resolve(props["filename"]))))
+        return _from_file(Path(str(mi.file_resolver().resolve(str(props["filename"])))))
     name = props["profile"]
     if name not in PROFILES:
-        raise ValueError(f"profile: got {name!r}, wanted one of {', '.join(PROFILES)}")
+        raise RequestError(f"profile: got {name!r}, wanted one of {', '.join(PROFILES)}")
     known = inspect.signature(PROFILES[name]).parameters
     surface = {"profile": name, **{key: props[key] for key in known if key in props}}
     settings = {"coherence_length": COHERENCE_LENGTHS[name]} if name in COHERENCE_LENGTHS else {}
@@ -58,7 +59,7 @@ def _from_file(path: Path) -> tuple[GratingSpectrum, Recipe | None]:
         return recipe.cached(), recipe
     if suffix == ".exr":
         return GratingSpectrum.load(path), None
-    raise ValueError(
+    raise RequestError(
         f"filename: got {path}, wanted a saved spectrum (.exr) or a recipe (.toml); "
         "a scan is turned into a spectrum by `mitsuba-diffraction precompute`, or named by a recipe"
     )
@@ -67,7 +68,7 @@ def _from_file(path: Path) -> tuple[GratingSpectrum, Recipe | None]:
 def _taken_over(handle: str) -> GratingSpectrum:
     spectrum = _handed_over.get(handle)
     if spectrum is None:
-        raise ValueError(
+        raise RequestError(
             f"spectrum: got {handle!r}, wanted a GratingSpectrum in Python's load_dict; XML takes a filename"
         )
     return spectrum

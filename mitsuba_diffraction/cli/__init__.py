@@ -1,4 +1,4 @@
-"""The commands, thin: they read arguments, call the package, and say what came of it. One file a command.
+"""The command line: one file per command, which parses arguments, calls the package and prints the result.
 
 Exit codes: 0 done; 1 the work failed; 2 the request was wrong; 130 interrupted.
 """
@@ -8,12 +8,14 @@ from __future__ import annotations
 import io
 import signal
 import sys
+import traceback
 import warnings
 from importlib import metadata
 from typing import Annotated
 
 import typer
 
+from ..errors import Bug, RequestError, is_bug
 from .benchmark import benchmark
 from .compare import compare
 from .console import NAME, Stopped, say, tell
@@ -38,13 +40,16 @@ def _say_version(wanted: bool) -> None:
 
 @app.callback()
 def _commands(
+    context: typer.Context,
     version: Annotated[bool, typer.Option("--version", callback=_say_version, is_eager=True)] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="show where an error was raised")] = False,
 ) -> None:
     """Diffraction gratings for Mitsuba 3."""
+    context.obj["debug"] = debug
 
 
 class _CtrlC:
-    """Raises KeyboardInterrupt, and remembers it: Mitsuba turns what is raised in a plugin into errors of the scene."""
+    """Raises KeyboardInterrupt and records it: Mitsuba converts exceptions raised in a plugin into scene errors."""
 
     pressed = False
 
@@ -54,40 +59,45 @@ class _CtrlC:
 
 
 def main() -> None:
-    """What the command `mitsuba-diffraction` does."""
+    """Entry point of `mitsuba-diffraction`."""
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):  # file names need not be UTF-8, nor every terminal
+        if isinstance(stream, io.TextIOWrapper):  # neither file names nor terminals need be UTF-8
             stream.reconfigure(errors="backslashreplace")
     warnings.showwarning = lambda message, *args, **kwargs: say("warning", message)
+    options: dict[str, bool] = {}
     ctrl_c, before = _CtrlC(), signal.getsignal(signal.SIGINT)
-    # Where Ctrl-C is ignored, as in what a script starts in the background, it stays ignored.
+    # Ctrl-C stays ignored where it is, as in background jobs of a script.
     if before is not signal.SIG_IGN:
         signal.signal(signal.SIGINT, ctrl_c)
     try:
-        code = app(prog_name=NAME, standalone_mode=False) or 0
-        if code == 130:  # newer versions of Typer turn Ctrl-C into this code
+        code = app(prog_name=NAME, standalone_mode=False, obj=options) or 0
+        if code == 130:  # newer versions of Typer return this code on Ctrl-C
             raise KeyboardInterrupt
     except (Exception, KeyboardInterrupt) as error:
         lost = ctrl_c.pressed and not isinstance(error, Stopped)
-        code = _tell(KeyboardInterrupt() if lost else error)
+        code = _tell(KeyboardInterrupt() if lost else error, **options)
     finally:
         signal.signal(signal.SIGINT, before)
     sys.exit(code)
 
 
-def _tell(error: BaseException) -> int:
-    """Says in one line what went wrong; the exit code."""
+def _tell(error: BaseException, debug: bool = False) -> int:
+    """Reports an error on one line, after the traceback if `debug`, and returns the exit code."""
     if isinstance(error, Stopped | KeyboardInterrupt | typer.Abort):
         say("interrupted", error if isinstance(error, Stopped) else "nothing was written")
         return 130
     if isinstance(error, _UsageError):
         say("error", f"{error.format_message()} (try {NAME} --help)")
         return 2
-    if isinstance(error, ValueError | FileNotFoundError | IsADirectoryError | NotADirectoryError):
+    if debug:
+        traceback.print_exception(error)
+    if isinstance(error, RequestError | FileNotFoundError | IsADirectoryError | NotADirectoryError):
         named = isinstance(error, OSError) and error.filename and error.strerror
         say("error", f"{error.filename}: {error.strerror.lower()}" if named else error)
         return 2
-    if isinstance(error, RuntimeError | OSError | MemoryError):
+    if is_bug(type(error)):
+        text = error if isinstance(error, Bug) else f"{type(error).__name__}: {error}"
+        say("error", f"this is a bug in mitsuba_diffraction ({text}); {NAME} --debug … shows where")
+    else:
         say("error", str(error) or type(error).__name__)
-        return 1
-    raise error
+    return 1

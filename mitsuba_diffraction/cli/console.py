@@ -1,7 +1,8 @@
-"""What all commands share: the two streams, the progress bar, and how a line is said."""
+"""The console: output streams, progress bar, messages."""
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -16,14 +17,14 @@ err = Console(stderr=True, highlight=False, soft_wrap=True)
 
 
 class Stopped(Exception):
-    """Ctrl-C where something is kept; the text says what."""
+    """Ctrl-C after something has been saved; the text says what."""
 
 
-def log_lines(label: str, seconds: float = 30.0) -> Callable[[int, int], None]:
-    """Progress where there is no terminal: a line on stderr every so many seconds, none for short work."""
+def log_lines(label: str, seconds: float = 30.0) -> Callable[..., None]:
+    """Progress without a terminal: a line on stderr at this interval, none for short tasks."""
     start = last = time.monotonic()
 
-    def show(done: int, total: int) -> None:
+    def show(done: int, total: int, error: float = math.nan) -> None:
         nonlocal last
         if (now := time.monotonic()) - last >= seconds:
             last = now
@@ -33,18 +34,32 @@ def log_lines(label: str, seconds: float = 30.0) -> Callable[[int, int], None]:
 
 
 @contextmanager
-def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
+def progress_bar(label: str, unit: str = "") -> Iterator[Callable[..., None]]:
+    """What shows how much is done: called with that, the total, and the relative error so far where there is one."""
     if not err.is_terminal:
         yield log_lines(label)
         return
-    columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, TimeRemainingColumn(), console=err, transient=True) as bars:
-        task = bars.add_task(label, total=None)
-        yield lambda done, total: bars.update(task, completed=done, total=total)
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[after]}"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    # Passes of a large picture take longer than the usual half minute.
+    with Progress(*columns, console=err, transient=True, speed_estimate_period=600) as bars:
+        task = bars.add_task(label, total=None, after=unit)
+
+        def show(done: int, total: int, error: float = math.nan) -> None:
+            after = unit if math.isnan(error) else f"{unit}, error {error:.2g}"
+            bars.update(task, completed=done, total=total, after=after)
+
+        yield show
 
 
 def tell(text: str) -> None:
-    # File names are no markup.
+    # File names are not markup.
     out.print(text, markup=False, emoji=False)
 
 

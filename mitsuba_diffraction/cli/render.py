@@ -1,56 +1,54 @@
-"""`mitsuba-diffraction render`: from a scene to a spectral picture, or to one for each place of the camera."""
+"""`mitsuba-diffraction render`: a spectral picture of a scene, or one per camera position of an orbit."""
 
 from __future__ import annotations
 
-import math
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from ..errors import RequestError
 from ..outputs import free_name
 from .arguments import Overwrite, claim, scene_parameters
-from .console import Stopped, err, log_lines, tell
+from .console import Stopped, progress_bar, tell
 from .inputs import files_read
 
 
 def render(
     context: typer.Context,
     scene: Annotated[Path, typer.Argument(metavar="SCENE.xml")],
-    output: Annotated[Path | None, typer.Option("-o", "--output", help="the spectral picture (.exr)")] = None,
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="spectral picture (.exr)")] = None,
     spp: Annotated[
         int | None,
         typer.Option(
             min=1,
-            help="samples per pixel, with --until-error the most; by default the scene's sample_count, or 64",
+            help="samples per pixel, the maximum with --until-error; default: sample_count of the scene, or 64",
         ),
     ] = None,
-    width: Annotated[int | None, typer.Option(min=1, help="pixels; the scene's own by default")] = None,
-    height: Annotated[int | None, typer.Option(min=1, help="pixels; the scene's own by default")] = None,
-    variant: Annotated[str | None, typer.Option(help="of Mitsuba; the fastest spectral one by default")] = None,
+    width: Annotated[int | None, typer.Option(min=1, help="pixels; default: that of the scene")] = None,
+    height: Annotated[int | None, typer.Option(min=1, help="pixels; default: that of the scene")] = None,
+    variant: Annotated[str | None, typer.Option(help="Mitsuba variant; default: the fastest spectral one")] = None,
     seed: Annotated[int, typer.Option(min=0)] = 0,
     define: Annotated[
-        list[str] | None, typer.Option("-D", metavar="NAME=VALUE", help="a parameter of the scene")
+        list[str] | None, typer.Option("-D", metavar="NAME=VALUE", help="set a parameter of the scene")
     ] = None,
     until_error: Annotated[
-        float | None, typer.Option(metavar="ERROR", help="stop when luminance is as sure as this, such as 0.01")
+        float | None, typer.Option(metavar="ERROR", help="stop at this relative standard error of luminance, e.g. 0.01")
     ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="go on where a run of the same command ended")] = False,
-    checkpoint: Annotated[float, typer.Option(min=0, metavar="SECONDS", help="between two checkpoints")] = 60,
+    resume: Annotated[bool, typer.Option("--resume", help="resume an interrupted run of the same command")] = False,
+    checkpoint: Annotated[float, typer.Option(min=0, metavar="SECONDS", help="interval between checkpoints")] = 60,
     half: Annotated[
-        bool, typer.Option("--half", help="write float16: half of the size, radiance rounded by up to 0.05 %")
+        bool, typer.Option("--half", help="write float16: half the size, radiance rounded by up to 0.05 %")
     ] = False,
     dask: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="spread the passes over a Dask cluster (tcp://HOST:PORT)")
+        str | None, typer.Option(metavar="ADDRESS", help="distribute the passes over a Dask cluster (tcp://HOST:PORT)")
     ] = None,
-    frames: Annotated[int | None, typer.Option(min=2, max=3600, metavar="N", help="pictures of an orbit")] = None,
-    orbit: Annotated[bool, typer.Option("--orbit", help="the camera goes round the scene once")] = False,
+    frames: Annotated[int | None, typer.Option(min=2, max=3600, metavar="N", help="frames of an orbit")] = None,
+    orbit: Annotated[bool, typer.Option("--orbit", help="orbit the scene once")] = False,
     overwrite: Overwrite = False,
 ) -> None:
-    """Path-trace a scene into a spectral picture (.exr) and a preview (.png) beside it."""
+    """Path-trace a scene into a spectral picture (.exr) with a preview (.png)."""
     import mitsuba as mi
 
     from ..render.checkpoint import checkpoint_path
@@ -64,9 +62,9 @@ def render(
     from ..variants import choose_variant
 
     if output is not None and output.suffix.lower() != ".exr":
-        raise ValueError(f"-o: got {output}, wanted a file name that ends in .exr")
+        raise RequestError(f"-o: got {output}, wanted a file name that ends in .exr")
     if (frames is not None) != orbit:
-        raise ValueError("--frames N and --orbit go together")
+        raise RequestError("--frames N and --orbit go together")
     parameters = scene_parameters(define)
     reads = files_read(scene, parameters)
 
@@ -82,7 +80,7 @@ def render(
     claim(context, reads, [("-o", path) for path in written(target)], map(checkpoint_path, targets))
     for path in targets:
         if checkpoint_path(path).exists() and not resume:
-            raise ValueError(
+            raise RequestError(
                 f"{checkpoint_path(path)} is of an unfinished rendering: --resume goes on from it; "
                 "remove it to begin anew"
             )
@@ -104,7 +102,7 @@ def render(
         earlier = SpectralImage.load(path) if resume and path.is_file() and not waiting.exists() else None
         interrupted = False
         try:
-            with _progress_bar(label) as progress:
+            with progress_bar(label, "spp") as progress:
                 image = trace(
                     scene,
                     spp=spp,
@@ -156,34 +154,3 @@ def render(
     if frames is not None:
         save_animation([path.with_suffix(".png") for path in targets], animation)
         tell(f"{animation}: animated preview, {frames} frames")
-
-
-@contextmanager
-def _progress_bar(label: str) -> Iterator[Callable[[int, int, float], None]]:
-    """Samples per pixel done and expected, the error so far, the time taken and the time left."""
-    if not err.is_terminal:
-        lines = log_lines(label)
-        yield lambda done, total, error: lines(done, total)
-        return
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-
-    columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn())
-    with Progress(
-        *(*columns, TextColumn("spp{task.fields[noise]}"), TimeElapsedColumn(), TimeRemainingColumn()),
-        console=err,
-        transient=True,
-        speed_estimate_period=600,  # passes of a large picture take longer than the usual half minute
-    ) as bars:
-        task = bars.add_task(label, total=None, noise="")
-
-        def show(done: int, total: int, error: float) -> None:
-            bars.update(task, completed=done, total=total, noise="" if math.isnan(error) else f", error {error:.2g}")
-
-        yield show

@@ -1,4 +1,4 @@
-"""The shader at given directions, NumPy in and out."""
+"""Evaluates the shader for NumPy arrays of directions."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..errors import RequestError
 from ..surface.heightfield import HeightField
 from .base import Shader
 from .flss import FLSS
@@ -21,15 +22,15 @@ QUANTITIES = ("encoded", "rgb", "xyz")
 
 
 def shader_for(height_field: HeightField, variant: str, quirks: Quirks, **settings: object) -> Shader:
-    """The shader of that name (`VARIANTS`), under Mitsuba's variant in force.
+    """The shader of a given name (`VARIANTS`) in the current Mitsuba variant.
 
     Raises:
-        ValueError: on an unknown name, or where Mitsuba has no vectorised variant set.
+        ValueError: if the name is unknown, or no vectorised Mitsuba variant is set.
     """
     if variant not in VARIANTS:
-        raise ValueError(f"variant: got {variant!r}, wanted one of {', '.join(VARIANTS)}")
+        raise RequestError(f"variant: got {variant!r}, wanted one of {', '.join(VARIANTS)}")
     if mi.variant() is None or not dr.is_jit_v(mi.Float) or not mi.is_spectral:
-        raise ValueError(f"variant: Mitsuba's is {mi.variant()}, wanted a spectral one such as llvm_ad_spectral")
+        raise RequestError(f"variant: Mitsuba's is {mi.variant()}, wanted a spectral one such as llvm_ad_spectral")
     return VARIANTS[variant](height_field, quirks, **settings)
 
 
@@ -45,31 +46,31 @@ def colour(
     light: ArrayLike | None = None,
     **settings: object,
 ) -> NDArray[np.float32]:
-    """The colour that the shader gives a tile.
+    """The colour of a tile as computed by the shader.
 
     Args:
         height_field: the tile.
-        wi: ω_i, (..., 3) along the axes of the tile.
-        wo: ω_o, likewise; the two broadcast.
+        wi: ω_i, (..., 3) in the frame of the tile.
+        wo: ω_o, likewise; shapes broadcast.
         variant: "flss", "nmm", "pq" or "gem".
-        quirks: as published if none are given.
-        quantity: "xyz" (not for gem), linear "rgb", or "encoded", the numbers of the screen, cut off at 0 and 1.
-        r_0: the power reflectance at normal incidence.
-        light: the light's irradiance per nm at `tristimulus.wavelengths`; D65 with Y = 1 if there is none.
-        settings: further arguments of the shader's class.
+        quirks: default: as published.
+        quantity: "xyz" (not for gem), linear "rgb", or "encoded", display values clamped to [0, 1].
+        r_0: power reflectance at normal incidence.
+        light: irradiance per nm at `tristimulus.wavelengths`; default: D65 with Y = 1.
+        settings: further arguments of the shader class.
 
     Returns:
         (..., 3).
 
     Raises:
-        ValueError: if an argument makes no sense.
+        ValueError: if an argument is invalid.
     """
     if quantity not in QUANTITIES:
-        raise ValueError(f"quantity: got {quantity!r}, wanted one of {', '.join(QUANTITIES)}")
+        raise RequestError(f"quantity: got {quantity!r}, wanted one of {', '.join(QUANTITIES)}")
     quirks = quirks or Quirks.as_published()
     shader = shader_for(height_field, variant, quirks, **settings)
     if quantity == "xyz" and variant == "gem":
-        raise ValueError("quantity: gem has no XYZ, only RGB")
+        raise RequestError("quantity: gem has no XYZ, only RGB")
     wi, wo, shape = _directions(wi, wo)
     weights = shader.weights(r_0, light)
     result = shader.xyz(wi, wo, weights) if quantity == "xyz" else shader.rgb(wi, wo, weights)
@@ -89,26 +90,26 @@ def relative_radiance(
     r_0: float = 0.04,
     **settings: object,
 ) -> NDArray[np.float32]:
-    """ρ(λ), the radiance over that of a flat mirror lit and seen at right angles (eq. 3.11).
+    """ρ(λ), the radiance relative to that of a flat mirror at normal incidence (eq. 3.11).
 
     Args:
         height_field: the tile.
-        wi: ω_i, (..., 3) along the axes of the tile.
+        wi: ω_i, (..., 3) in the frame of the tile.
         wo: ω_o, likewise.
         wavelengths: (...) in nm; all three broadcast.
-        variant: "flss" or "pq"; "nmm" gives what it finds at one of its wavelengths, the same as "flss".
-        quirks: as published if none are given.
-        r_0: the power reflectance at normal incidence.
-        settings: further arguments of the shader's class.
+        variant: "flss" or "pq"; "nmm" is evaluated as at one of its own wavelengths, which equals "flss".
+        quirks: default: as published.
+        r_0: power reflectance at normal incidence.
+        settings: further arguments of the shader class.
 
     Returns:
         (...).
 
     Raises:
-        ValueError: if an argument makes no sense.
+        ValueError: if an argument is invalid.
     """
     if variant == "gem":
-        raise ValueError("variant: gem has no spectrum, only RGB")
+        raise RequestError("variant: gem has no spectrum, only RGB")
     shader = shader_for(height_field, variant, quirks or Quirks.as_published(), **settings)
     wavelengths = np.asarray(wavelengths, np.float32)
     wi, wo = (np.broadcast_to(omega, (*wavelengths.shape, 3)) if np.ndim(omega) == 1 else omega for omega in (wi, wo))
@@ -118,10 +119,10 @@ def relative_radiance(
 
 
 def _directions(wi: ArrayLike, wo: ArrayLike) -> tuple[mi.Vector3f, mi.Vector3f, tuple[int, ...]]:
-    """Two arrays (..., 3) of directions as Dr.Jit's, and the shape (...)."""
+    """Two arrays (..., 3) of directions as Dr.Jit arrays, and the shape (...)."""
     wi, wo = (np.asarray(omega, np.float32) for omega in (wi, wo))
     if wi.shape[-1:] != (3,) or wo.shape[-1:] != (3,):
-        raise ValueError(f"wi, wo: got shapes {wi.shape} and {wo.shape}, wanted (..., 3)")
+        raise RequestError(f"wi, wo: got shapes {wi.shape} and {wo.shape}, wanted (..., 3)")
     wi, wo = np.broadcast_arrays(wi, wo)
     vectors = (mi.Vector3f(np.ascontiguousarray(omega.reshape(-1, 3).T)) for omega in (wi, wo))
     return *vectors, wi.shape[:-1]

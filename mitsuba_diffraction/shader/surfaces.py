@@ -1,4 +1,4 @@
-"""The gratings of a scene, with the heights that the shader needs."""
+"""The gratings of a scene and their height fields."""
 
 from __future__ import annotations
 
@@ -7,16 +7,18 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from ..bsdf.nesting import contains_grating, is_grating, nested
 from ..coherence import SUN_COHERENCE_LENGTH
+from ..errors import RequestError
 from ..surface.heightfield import HeightField
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """One side of a BSDF of the scene that is a grating.
+    """One side of a grating in a scene.
 
     Attributes:
-        bsdf: as shapes hold it, the grating or a `twosided` around it.
+        bsdf: the BSDF of the shape, the grating or a `twosided` around it.
         grating: the `diffraction_grating`.
         side: 1 for the front, −1 for the back.
     """
@@ -26,7 +28,7 @@ class Surface:
     side: int
 
     def is_of(self, bsdf: mi.BSDF) -> mi.Bool:
-        """Whether a point of the scene has the BSDF of this surface."""
+        """Whether a point has the BSDF of this surface."""
         return bsdf == mi.BSDFPtr(self.bsdf) if dr.is_jit_v(mi.Float) else mi.Bool(bsdf is self.bsdf)
 
     def holds(self, bsdf: mi.BSDF, wo: mi.Vector3f) -> mi.Bool:
@@ -38,7 +40,7 @@ def surfaces_of(scene: mi.Scene) -> list[Surface]:
     """All gratings of a scene.
 
     Raises:
-        ValueError: if a grating stands inside another BSDF than `twosided`.
+        ValueError: if a grating is nested in a BSDF other than `twosided`.
     """
     found: list[Surface] = []
     seen: list[mi.BSDF] = []
@@ -50,12 +52,12 @@ def surfaces_of(scene: mi.Scene) -> list[Surface]:
         if is_grating(bsdf):
             found.append(Surface(bsdf, bsdf, 1))
             continue
-        parts = _children(bsdf)
+        parts = nested(bsdf)
         if bsdf.class_name() == "TwoSidedBRDF":
             sides = ((parts[0], 1), (parts[-1], -1))
             found += [Surface(bsdf, part, side) for part, side in sides if is_grating(part)]
-        elif any(map(_contains_grating, parts)):
-            raise ValueError(
+        elif any(map(contains_grating, parts)):
+            raise RequestError(
                 f"diffraction_shader: a diffraction_grating stands inside {bsdf.class_name()}, wanted on a shape or "
                 "inside twosided"
             )
@@ -66,36 +68,12 @@ def heights_of(grating: mi.BSDF) -> tuple[HeightField, float]:
     """The height field of a grating, and its coherence length in µm.
 
     Raises:
-        ValueError: if it was built from a saved spectrum, which does not hold heights.
+        ValueError: if it was loaded from a spectrum file, which does not contain heights.
     """
     if grating.recipe is None:
-        raise ValueError(
+        raise RequestError(
             "diffraction_shader: it needs heights, and a saved spectrum does not hold them; give the grating a "
             "recipe (filename=….toml) or a profile"
         )
     recipe = grating.recipe
     return recipe.height_field(), float(recipe.spectrum.get("coherence_length", SUN_COHERENCE_LENGTH))
-
-
-def is_grating(bsdf: mi.BSDF) -> bool:
-    """Whether a BSDF is of the class behind `diffraction_grating`."""
-    return hasattr(bsdf, "spectrum") and hasattr(bsdf, "recipe")
-
-
-def _contains_grating(bsdf: mi.BSDF) -> bool:
-    return is_grating(bsdf) or any(map(_contains_grating, _children(bsdf)))
-
-
-def _children(bsdf: mi.BSDF) -> list[mi.BSDF]:
-    class Children(mi.TraversalCallback):
-        def __init__(self) -> None:
-            mi.TraversalCallback.__init__(self)
-            self.found: list[mi.BSDF] = []
-
-        def put(self, name: str, value: object, *rest: object) -> None:
-            if isinstance(value, mi.BSDF):
-                self.found.append(value)
-
-    callback = Children()
-    bsdf.traverse(callback)
-    return callback.found

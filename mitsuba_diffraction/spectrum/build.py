@@ -10,8 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..coherence import SUN_COHERENCE_LENGTH, lobe_reach, lobe_width
+from ..errors import RequestError
+from ..files import cache_folder
 from ..reference import check_extent
+from ..rigorous.build import build_spectrum
+from ..rigorous.spectrum import RigorousSpectrum
 from ..surface.heightfield import HeightField
+from ..wavelengths import VISIBLE
 from ..welch import carried_coherence_length
 from . import GratingSpectrum
 from .expansions import chebyshev_nodes, chebyshev_polynomials, chebyshev_transform, nodes_for, position
@@ -24,7 +29,6 @@ from .series_table import SeriesTable
 from .slice_table import SliceTable, interpolation
 from .tile import TilePowers, inner
 
-VISIBLE = (360.0, 830.0)  # nm, the range that Mitsuba samples
 REPRESENTATIONS = ("auto", TaylorSeries.name, ChebyshevSeries.name, SvdSeries.name, SliceTable.representation)
 
 # Shares of the tolerance.
@@ -49,11 +53,14 @@ def precompute(
     wavelengths: tuple[float, float] = VISIBLE,
     largest_angle: float = 90.0,
     representation: str = "auto",
-    tolerance: float = 1e-3,
+    tolerance: float | None = None,
     largest_height_range: float = 20.0,
     progress: Progress | None = None,
-) -> GratingSpectrum:
-    """The spectrum of the phase e^{iκh}, its error at most `tolerance`.
+    theory: str = "scalar",
+    int_ior: complex | None = None,
+    material: str | None = None,
+) -> GratingSpectrum | RigorousSpectrum:
+    """The spectrum of the phase e^{iκh}, or the table of rigorous efficiencies, its error at most `tolerance`.
 
     Args:
         height_field: the surface.
@@ -64,10 +71,14 @@ def precompute(
             frequencies.
         representation: "taylor", "chebyshev", "svd" or "slices"; "auto" takes the one that reads the fewest
             packets of four numbers: slices.
-        tolerance: bound of max over κ of ∫|S_approx(q; κ) − S_exact(q; κ)| dq, a share of the reflected power.
+        tolerance: bound of max over κ of ∫|S_approx(q; κ) − S_exact(q; κ)| dq, a share of the reflected power; 1e-3
+            unless told otherwise. Of rigorous theory: see `rigorous.build.build_spectrum`, 1e-2.
         largest_height_range: in µm; a deeper surface is refused, as one whose heights are in nm. Time and memory grow
             with the height range.
         progress: called with (steps done, steps in all).
+        theory: "scalar", or "rigorous": Maxwell's equations, for a tile of one row and one material only. An
+            interrupted build goes on from what it left in the cache folder.
+        int_ior, material: of rigorous theory, index of refraction of a dielectric, or a conductor by Mitsuba's name.
 
     Returns:
         The spectrum; its `error` is what was measured, at values of κ that were not used to build it.
@@ -83,15 +94,36 @@ def precompute(
     """
     check_extent(extent)
     check_wavelengths(wavelengths)
+    if theory not in ("scalar", "rigorous"):
+        raise RequestError(f"theory: got {theory!r}, wanted scalar or rigorous")
+    if theory == "rigorous":
+        if (extent, largest_angle, representation) != ("tile", 90.0, "auto"):
+            raise RequestError(
+                f"theory: got rigorous with extent {extent!r}, largest_angle {largest_angle!r} and representation "
+                f"{representation!r}; it has its own table of a tile, for all directions"
+            )
+        return build_spectrum(
+            height_field,
+            int_ior=int_ior,
+            material=material,
+            coherence_length=coherence_length,
+            wavelengths=wavelengths,
+            tolerance=1e-2 if tolerance is None else tolerance,
+            progress=progress,
+            checkpoints=cache_folder(),
+        )
+    if int_ior is not None or material is not None:
+        raise RequestError("int_ior, material: the spectrum of scalar theory is that of every material; wanted neither")
+    tolerance = 1e-3 if tolerance is None else tolerance
     check_angle(largest_angle)
     lobe_width(coherence_length)
     if representation not in REPRESENTATIONS:
-        raise ValueError(f"representation: got {representation!r}, wanted one of {', '.join(REPRESENTATIONS)}")
+        raise RequestError(f"representation: got {representation!r}, wanted one of {', '.join(REPRESENTATIONS)}")
     check_tolerance(tolerance)
     if not largest_height_range > 0:
-        raise ValueError(f"largest_height_range: got {largest_height_range!r}, wanted a positive number of µm")
+        raise RequestError(f"largest_height_range: got {largest_height_range!r}, wanted a positive number of µm")
     if height_field.height_range > largest_height_range:
-        raise ValueError(
+        raise RequestError(
             f"heights: got a range of {height_field.height_range:.4g} µm, wanted at most {largest_height_range:g}: are "
             "these nanometres? If the surface is so deep, raise largest_height_range"
         )
@@ -138,7 +170,7 @@ def precompute(
 def check_tolerance(tolerance: float) -> None:
     """Raises ValueError unless `tolerance` is a share of the power that float32 can keep."""
     if not 1e-5 <= tolerance < 1:
-        raise ValueError(f"tolerance: got {tolerance!r}, wanted a share of the reflected power from 1e-5 to 1")
+        raise RequestError(f"tolerance: got {tolerance!r}, wanted a share of the reflected power from 1e-5 to 1")
 
 
 def _splines(
@@ -231,7 +263,7 @@ class _Build:
             if error <= self._allowed:
                 return table, error
             if refine < 0.01:
-                raise ValueError(self._refusal(representation, error))
+                raise RequestError(self._refusal(representation, error))
             refine /= max(2.0, error / self._allowed)
 
     def _build(self, representation: str, allowed: float) -> Table:
@@ -245,7 +277,7 @@ class _Build:
         else:
             if representation == TaylorSeries.name and 2.0**-24 * np.exp(min(self._x, 80.0)) > 20 * self._allowed:
                 # Each term is good to 2^-24 of its size, and their sizes add up to e^x; the bound is generous by 20.
-                raise ValueError(self._refusal(representation, None))
+                raise RequestError(self._refusal(representation, None))
             kind = TaylorSeries if representation == TaylorSeries.name else ChebyshevSeries
             whole = kind(self._largest_kappa, self._nodes)
             series = kind(self._largest_kappa, self._terms(whole, allowed))
@@ -321,7 +353,7 @@ def _rim(profile: NDArray[np.float64]) -> NDArray[np.float64]:
 def _check_size(shape: tuple[int, int], floats: int) -> None:
     """Refuses a table of so many floats a node before memory is asked for it."""
     if 4.0 * np.prod(shape, dtype=float) * floats > _LARGEST_TABLE:
-        raise ValueError(
+        raise RequestError(
             f"tolerance: needs {' × '.join(map(str, shape))} frequencies of {floats} numbers, more than a table of "
             "4 GB; take a larger tolerance, a smaller patch or, of a sample, a shorter coherence length"
         )
@@ -330,7 +362,7 @@ def _check_size(shape: tuple[int, int], floats: int) -> None:
 def _check_overlap(neighbours: tuple[int, int], coherence_length: float) -> None:
     """Refuses a tile of which one evaluation would sum thousands of orders."""
     if neighbours[0] * neighbours[1] > _MOST_NEIGHBOURS:
-        raise ValueError(
+        raise RequestError(
             f"coherence_length: at {coherence_length:.4g} µm the lobes of {neighbours[0]} × {neighbours[1]} orders of "
             f"this tile overlap, wanted at most {_MOST_NEIGHBOURS}; take extent 'sample' or a longer "
             "coherence length"

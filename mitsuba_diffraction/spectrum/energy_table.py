@@ -34,6 +34,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
+from ..errors import RequestError
+
 HORIZON = float(np.cos(np.deg2rad(85)))
 """cos θ below which e falls with cos θ where there is no shadowing."""
 
@@ -63,11 +65,11 @@ class EnergyTable:
     def __post_init__(self) -> None:
         v = self.values
         if v.ndim != 3 or v.dtype != np.float32 or min(v.shape[1:]) < 2 or not ((v >= 0) & (v <= 1)).all():
-            raise ValueError(f"energy table: got {v.dtype} {v.shape}, wanted float32 from 0 to 1 with three axes")
+            raise RequestError(f"energy table: got {v.dtype} {v.shape}, wanted float32 from 0 to 1 with three axes")
         if not 0 <= self.frequencies[0] < self.frequencies[1] < np.inf:
-            raise ValueError(f"energy table: got frequencies {self.frequencies}, wanted two that increase")
+            raise RequestError(f"energy table: got frequencies {self.frequencies}, wanted two that increase")
         if self.shadowing not in SHADOWING:
-            raise ValueError(f"shadowing: got {self.shadowing!r}, wanted one of {', '.join(SHADOWING)}")
+            raise RequestError(f"shadowing: got {self.shadowing!r}, wanted one of {', '.join(SHADOWING)}")
         v.setflags(write=False)
 
     @property
@@ -120,9 +122,9 @@ class EnergyTable:
             # No more than there should be: a damaged file may hold a long row of zeros.
             content = zlib.decompressobj().decompress(base64.b64decode(plain["values"]), size + 1)
         except (zlib.error, binascii.Error) as error:
-            raise ValueError(f"energy table: {error}") from None
+            raise RequestError(f"energy table: {error}") from None
         if not 0 < size < 1 << 26 or len(content) != size:
-            raise ValueError(f"energy table: got {len(content)} bytes, wanted {size}")
+            raise RequestError(f"energy table: got {len(content)} bytes, wanted {size}")
         rest["values"] = np.frombuffer(content, "<f4").astype(np.float32).reshape(shape)
         return cls(**rest)
 

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 import OpenEXR
 
+from ..errors import RequestError
 from ..files import UNSEALED, is_intact, seal, whole_file
 from ..outputs import made_for
 from .energy_table import SHADOWING, EnergyTable
@@ -41,7 +42,7 @@ FORMAT_VERSION = 3
 
 
 @contextlib.contextmanager
-def _silence() -> Iterator[None]:
+def silence() -> Iterator[None]:
     """Keep the library from giving its own account of a broken file, from Python and from C, before it raises."""
     sys.stderr.flush()
     kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
@@ -111,39 +112,41 @@ def load(path: str | os.PathLike[str], construct: Callable[..., Spectrum], recip
         intact = is_intact(path)
         if intact is False:
             # Before OpenEXR sees it: a size that is wrong could take all memory.
-            raise ValueError("damaged: its bytes are not those that were written")
-        with _silence():
+            raise RequestError("damaged: its bytes are not those that were written")
+        with silence():
             file = OpenEXR.File(str(path), separate_channels=True)
             header, channels = file.header(), file.channels()
     except Exception as error:
-        raise ValueError(f"{path}: not a readable OpenEXR file ({_one_line(error)})") from None
+        raise RequestError(f"{path}: not a readable OpenEXR file ({_one_line(error)})") from None
     if header.get("format") != FORMAT:
-        raise ValueError(
+        raise RequestError(
             f"{path}: an OpenEXR file, but not a grating spectrum, which mitsuba-diffraction precompute writes"
         )
     if header.get("formatVersion") != FORMAT_VERSION:
-        raise ValueError(
+        raise RequestError(
             f"{path}: got format version {header.get('formatVersion')}, wanted {FORMAT_VERSION}; "
             "build the spectrum again with this version of mitsuba_diffraction"
         )
     if not intact:
-        raise ValueError(f"{path}: a damaged spectrum (its SHA-256 is missing)")
+        raise RequestError(f"{path}: a damaged spectrum (its SHA-256 is missing)")
     if recipe not in (None, header.get("recipeSha256")):
-        raise ValueError(f"{path}: a spectrum of another recipe")
+        raise RequestError(f"{path}: a spectrum of another recipe")
     if header.get("representation") not in _REPRESENTATIONS:
-        raise ValueError(
+        raise RequestError(
             f"{path}: got representation {header.get('representation')!r}, wanted one of {', '.join(_REPRESENTATIONS)}"
         )
     try:
         pixels = {name: channel.pixels for name, channel in channels.items()}
         if halves := [name for name, values in pixels.items() if values.dtype != np.float32]:
-            raise ValueError(f"{halves[0]} is not of type float")
+            raise RequestError(f"{halves[0]} is not of type float")
         wavelengths = _pair(header["wavelengths"])
         table = _table(header, pixels, 4 * np.pi / (wavelengths[0] * 1e-3))
         names = _channels(table).keys()
         if pixels.keys() != names or len(names) != header["channelCount"]:
             unknown = ", ".join(sorted(pixels.keys() - names)) or "none unknown"
-            raise ValueError(f"got {len(pixels)} channels ({unknown}), wanted {header['channelCount']} of known names")
+            raise RequestError(
+                f"got {len(pixels)} channels ({unknown}), wanted {header['channelCount']} of known names"
+            )
         return construct(
             table=table,
             grid=_grid(header, table.shape),
@@ -161,9 +164,9 @@ def load(path: str | os.PathLike[str], construct: Callable[..., Spectrum], recip
             energy={kind: EnergyTable.from_plain(t) for kind, t in json.loads(header["energy"]).items()},
         )
     except KeyError as error:
-        raise ValueError(f"{path}: a damaged spectrum, {error} is missing") from None
+        raise RequestError(f"{path}: a damaged spectrum, {error} is missing") from None
     except (TypeError, ValueError, IndexError, AttributeError, OverflowError, MemoryError) as error:
-        raise ValueError(f"{path}: a damaged spectrum ({_one_line(error)})") from None
+        raise RequestError(f"{path}: a damaged spectrum ({_one_line(error)})") from None
 
 
 def _grid_header(grid: OrderGrid | SplineGrid) -> dict[str, np.ndarray]:
@@ -178,7 +181,7 @@ def _grid(header: dict, shape: tuple[int, int]) -> OrderGrid | SplineGrid:
         return OrderGrid(_pair(header["tileSize"]), largest)
     if header["extent"] == "sample":
         return SplineGrid(_pair(header["spacing"]), largest, _pair(header["limit"]))
-    raise ValueError(f"extent: got {header['extent']!r}, wanted 'tile' or 'sample'")
+    raise RequestError(f"extent: got {header['extent']!r}, wanted 'tile' or 'sample'")
 
 
 _TERM_NAMES = {
@@ -209,7 +212,7 @@ def _table(header: dict, pixels: dict[str, np.ndarray], largest_kappa: float) ->
 
 def _single(value: np.ndarray) -> float:
     if not isinstance(value, np.ndarray) or value.shape != (1,):
-        raise ValueError(f"got {value!r}, wanted one double")
+        raise RequestError(f"got {value!r}, wanted one double")
     return float(value[0])
 
 

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import matching
 from ..coherence import lobe_reach, lobe_width
+from ..errors import RequestError
 from .albedo import GatheredSpectrum, energy_table
 from .energy_table import EnergyTable
 from .file import load, save
@@ -67,19 +68,21 @@ class GratingSpectrum:
 
     def __post_init__(self) -> None:
         if self.table.shape != self.grid.shape:
-            raise ValueError(f"table: got {self.table.shape} nodes, wanted {self.grid.shape}")
+            raise RequestError(f"table: got {self.table.shape} nodes, wanted {self.grid.shape}")
         if not all(np.isfinite(p) and p > 0 for p in self.pixel_size):
-            raise ValueError(f"pixel_size: got {self.pixel_size}, wanted two positive lengths in µm")
+            raise RequestError(f"pixel_size: got {self.pixel_size}, wanted two positive lengths in µm")
         if not (np.isfinite(self.height_range) and self.height_range >= 0):
-            raise ValueError(f"height_range: got {self.height_range}, wanted a length ≥ 0 in µm")
+            raise RequestError(f"height_range: got {self.height_range}, wanted a length ≥ 0 in µm")
         if not (0 < self.tolerance < 1 and self.error >= 0 and np.isfinite(self.error)):
-            raise ValueError(f"tolerance, error: got {self.tolerance}, {self.error}, wanted shares of the power")
+            raise RequestError(f"tolerance, error: got {self.tolerance}, {self.error}, wanted shares of the power")
         if not (isinstance(self.source, str) and isinstance(self.source_digest, str)):
-            raise ValueError(f"source: got {self.source!r}, {self.source_digest!r}, wanted texts")
+            raise RequestError(f"source: got {self.source!r}, {self.source_digest!r}, wanted texts")
         if not (0 <= self.dropped <= 1 and 0 <= self.beyond <= 1):
-            raise ValueError(f"dropped, beyond: got {self.dropped}, {self.beyond}, wanted shares of the power")
+            raise RequestError(f"dropped, beyond: got {self.dropped}, {self.beyond}, wanted shares of the power")
         if not all(key == getattr(table, "shadowing", None) for key, table in self.energy.items()):
-            raise ValueError(f"energy: got {', '.join(map(str, self.energy))}, wanted energy tables by their shadowing")
+            raise RequestError(
+                f"energy: got {', '.join(map(str, self.energy))}, wanted energy tables by their shadowing"
+            )
         check_wavelengths(self.wavelengths)
         check_angle(self.largest_angle)
         lobe_width(self.coherence_length)
@@ -158,7 +161,7 @@ class GratingSpectrum:
 
     def _checked(self, kappa: NDArray[np.float64]) -> NDArray[np.float64]:
         if not (np.all(kappa >= 0) and np.all(kappa <= self.largest_kappa * (1 + 1e-6))):
-            raise ValueError(
+            raise RequestError(
                 f"kappa: got values from {np.min(kappa):.6g} to {np.max(kappa):.6g} rad/µm, wanted 0 to "
                 f"{self.largest_kappa:.6g} (the spectrum was built for wavelengths from {self.wavelengths[0]:g} nm)"
             )
@@ -215,12 +218,12 @@ def check_wavelengths(wavelengths: tuple[float, float]) -> None:
     try:
         shortest, longest = (float(w) for w in wavelengths)
     except (TypeError, ValueError):
-        raise ValueError(f"wavelengths: got {wavelengths!r}, wanted (shortest, longest) in nm") from None
+        raise RequestError(f"wavelengths: got {wavelengths!r}, wanted (shortest, longest) in nm") from None
     if not (np.isfinite([shortest, longest]).all() and 50 <= shortest < longest):
-        raise ValueError(f"wavelengths: got {wavelengths!r}, wanted (shortest, longest) in nm, at least 50 nm")
+        raise RequestError(f"wavelengths: got {wavelengths!r}, wanted (shortest, longest) in nm, at least 50 nm")
 
 
 def check_angle(largest_angle: float) -> None:
     """Raises ValueError unless `largest_angle` is an angle from the normal in degrees."""
     if not 0 < largest_angle <= 90:
-        raise ValueError(f"largest_angle: got {largest_angle!r}, wanted degrees from the normal, above 0, at most 90")
+        raise RequestError(f"largest_angle: got {largest_angle!r}, wanted degrees from the normal, above 0, at most 90")

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import RequestError
+
 
 @dataclass(frozen=True)
 class OrderGrid:
@@ -23,9 +25,9 @@ class OrderGrid:
 
     def __post_init__(self) -> None:
         if not all(np.isfinite(t) and t > 0 for t in self.tile_size):
-            raise ValueError(f"tile_size: got {self.tile_size}, wanted two positive lengths in µm")
+            raise RequestError(f"tile_size: got {self.tile_size}, wanted two positive lengths in µm")
         if not all(m >= 0 for m in self.largest):
-            raise ValueError(f"largest order: got {self.largest}, wanted two integers ≥ 0")
+            raise RequestError(f"largest order: got {self.largest}, wanted two integers ≥ 0")
 
     @classmethod
     def reachable(cls, tile_size: tuple[float, float], pixels: tuple[int, int], largest_frequency: float) -> OrderGrid:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import RequestError
 from .expansions import Series, chebyshev_nodes
 
 
@@ -26,7 +27,7 @@ class SeriesTable:
     def __post_init__(self) -> None:
         got = self.terms
         if got.ndim != 3 or len(got) != self.series.terms or got.dtype != np.float32 or not np.isfinite(got).all():
-            raise ValueError(
+            raise RequestError(
                 f"terms: got {got.dtype} {got.shape}, wanted finite float32 ({self.series.terms}, rows, columns)"
             )
         got.setflags(write=False)

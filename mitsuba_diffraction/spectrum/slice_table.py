@@ -9,6 +9,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..errors import RequestError
 from .expansions import chebyshev_nodes
 
 # Chebyshev points of the first kind on [0, 1]: no cubic through four samples is nearer to a smooth function.
@@ -39,7 +40,7 @@ class SliceTable:
     def __post_init__(self) -> None:
         got = self.values
         if got.ndim != 4 or got.shape[1] != 4 or got.dtype != np.float32 or not np.isfinite(got).all():
-            raise ValueError(f"values: got {got.dtype} {got.shape}, wanted finite float32 (K, 4, rows, columns)")
+            raise RequestError(f"values: got {got.dtype} {got.shape}, wanted finite float32 (K, 4, rows, columns)")
         got.setflags(write=False)
 
     @classmethod

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import RequestError
+
 
 @dataclass(frozen=True)
 class SplineGrid:
@@ -28,11 +30,11 @@ class SplineGrid:
 
     def __post_init__(self) -> None:
         if not all(np.isfinite(d) and d > 0 for d in self.spacing):
-            raise ValueError(f"spacing: got {self.spacing}, wanted two positive numbers in cycles/µm")
+            raise RequestError(f"spacing: got {self.spacing}, wanted two positive numbers in cycles/µm")
         if not all(m >= 0 for m in self.largest):
-            raise ValueError(f"largest node: got {self.largest}, wanted two integers ≥ 0")
+            raise RequestError(f"largest node: got {self.largest}, wanted two integers ≥ 0")
         if not all(limit > 0 for limit in self.limit):
-            raise ValueError(f"limit: got {self.limit}, wanted two positive numbers in cycles/µm")
+            raise RequestError(f"limit: got {self.limit}, wanted two positive numbers in cycles/µm")
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import mitsuba as mi
 
+from ..errors import RequestError
 from ..files import whole_file
 from ..outputs import metadata
 from ..spectrum import GratingSpectrum
@@ -132,7 +133,7 @@ def run(
                 try:
                     spectrum = case.spectrum(representation, tolerance)
                     built[representation] = spectrum, time.perf_counter() - start
-                except ValueError as error:
+                except RequestError as error:
                     refused[representation] = str(error)
                 progress(len(results) + len(built) + len(refused), total)
             measured = _measured(built, exact, rays, repetitions)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from ..bsdf.probe import direction
 from ..color import auto_exposure, daylight, into_gamut, on_screen, spectrum_to_linear_sRGB
+from ..errors import RequestError
 from ..shader.evaluate import VARIANTS, colour
 from ..shader.quirks import Quirks
 from .published_surfaces import PublishedSurface
@@ -98,12 +99,12 @@ def brdf_map(
         ValueError: if an argument makes no sense, or Mitsuba has no vectorised spectral variant set.
     """
     if method not in MAP_METHODS:
-        raise ValueError(f"method: got {method!r}, wanted one of {', '.join(MAP_METHODS)}")
+        raise RequestError(f"method: got {method!r}, wanted one of {', '.join(MAP_METHODS)}")
     if projection not in PROJECTIONS:
-        raise ValueError(f"projection: got {projection!r}, wanted one of {', '.join(PROJECTIONS)}")
+        raise RequestError(f"projection: got {projection!r}, wanted one of {', '.join(PROJECTIONS)}")
     wi = direction(*incidence)
     if not wi[2] > 0:
-        raise ValueError(f"incidence: got {incidence!r}, wanted an angle from the normal below 90 degrees first")
+        raise RequestError(f"incidence: got {incidence!r}, wanted an angle from the normal below 90 degrees first")
     axis = (np.arange(side) + 0.5) / side * 2 - 1
     if projection == "hemisphere":
         x = y = 90 * axis

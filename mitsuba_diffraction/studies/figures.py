@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..errors import RequestError
 from ..files import whole_file
 from ..outputs import made_for, png_text, save_markdown
 from ..shader.quirks import Quirks
@@ -242,7 +243,7 @@ def save_figures(
     """
     surfaces = list(surfaces)
     if unknown := [name for name in surfaces if name not in SURFACES]:
-        raise ValueError(f"surfaces: got {', '.join(map(repr, unknown))}, wanted among {', '.join(SURFACES)}")
+        raise RequestError(f"surfaces: got {', '.join(map(repr, unknown))}, wanted among {', '.join(SURFACES)}")
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     files: list[Path] = []

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..coherence import SUN_COHERENCE_LENGTH
+from ..errors import RequestError
 from ..recipe import Recipe
 from ..spectrum import GratingSpectrum
 from ..surface.heightfield import HeightField
@@ -37,9 +38,9 @@ class PublishedSurface:
 
     def __post_init__(self) -> None:
         if self.axis not in (0, 1):
-            raise ValueError(f"axis: got {self.axis!r}, wanted 0 for x or 1 for y")
+            raise RequestError(f"axis: got {self.axis!r}, wanted 0 for x or 1 for y")
         if not self.period > 0:
-            raise ValueError(f"period: got {self.period!r}, wanted a positive number in µm")
+            raise RequestError(f"period: got {self.period!r}, wanted a positive number in µm")
 
     @cached_property
     def height_field(self) -> HeightField:

@@ -11,7 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..bsdf.probe import vectors
+from ..bsdf.probe import interaction, vectors
 from ..spectrum import GratingSpectrum
 from ..wavelengths import VISIBLE
 
@@ -24,9 +24,8 @@ class Rays:
     def __init__(self, count: int, seed: int = 0) -> None:
         random = np.random.default_rng(seed)
         self.count = count
-        self.si = dr.zeros(mi.SurfaceInteraction3f, count)
-        self.si.wi, self.wo = (vectors(_directions(random, count)) for _ in range(2))
-        self.si.wavelengths = mi.UnpolarizedSpectrum(*(mi.Float(random.uniform(*VISIBLE, count)) for _ in range(4)))
+        wi, wo = (_directions(random, count) for _ in range(2))
+        self.si, self.wo = interaction(wi, random.uniform(*VISIBLE, (4, count)).T), vectors(wo)
         self.sample1 = mi.Float(random.random(count))
         self.sample2 = mi.Point2f(mi.Float(random.random(count)), mi.Float(random.random(count)))
         dr.eval(self.si, self.wo, self.sample1, self.sample2)

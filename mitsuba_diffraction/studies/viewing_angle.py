@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..bsdf import probe
+from ..errors import RequestError
 from ..shader.evaluate import relative_radiance
 from ..shader.quirks import Quirks
 from ..spectrum import GratingSpectrum
@@ -59,7 +60,7 @@ def relative_reflectance(spectrum: GratingSpectrum, wi: ArrayLike, wo: ArrayLike
         ValueError: if shapes do not match, or Mitsuba has no vectorised spectral variant set.
     """
     if mi.variant() is None or not dr.is_jit_v(mi.Float) or not mi.is_spectral:
-        raise ValueError(f"variant: Mitsuba's is {mi.variant()}, wanted a spectral one such as llvm_ad_spectral")
+        raise RequestError(f"variant: Mitsuba's is {mi.variant()}, wanted a spectral one such as llvm_ad_spectral")
     bsdf = mi.load_dict({"type": "diffraction_grating", "spectrum": spectrum, "int_ior": _INDEX})
     wi, wo, wavelengths = (np.asarray(values, np.float64) for values in (wi, wo, wavelengths))
     value = probe.evaluate(bsdf, wi, wo, wavelengths)
@@ -105,7 +106,7 @@ class ReflectanceMap:
     def __post_init__(self) -> None:
         shape = (self.wavelengths.size, self.angles.shape[-1])
         if self.reflectance.shape != shape or self.angles.shape not in (shape, shape[1:]):
-            raise ValueError(
+            raise RequestError(
                 f"reflectance, angles: got shapes {self.reflectance.shape} and {self.angles.shape}, wanted {shape}"
             )
 
@@ -149,9 +150,9 @@ def reflectance_map(
         ValueError: if an argument makes no sense, or Mitsuba has no vectorised spectral variant set.
     """
     if method not in METHODS:
-        raise ValueError(f"method: got {method!r}, wanted one of {', '.join(METHODS)}")
+        raise RequestError(f"method: got {method!r}, wanted one of {', '.join(METHODS)}")
     if not 0 <= incidence < 90:
-        raise ValueError(f"incidence: got {incidence!r}, wanted degrees from the normal, 0 or more, below 90")
+        raise RequestError(f"incidence: got {incidence!r}, wanted degrees from the normal, 0 or more, below 90")
     nanometres = np.arange(380.0, 782.5, 5.0) if wavelengths is None else np.asarray(wavelengths, np.float64)
     wi = surface.direction(incidence)
     if method == "nmm":
@@ -254,7 +255,7 @@ def fit_period(found: ReflectanceMap) -> PeriodFit:
     angles = peak_angles(found)
     if np.isnan(angles).any():
         dark = found.wavelengths[np.isnan(angles)]
-        raise ValueError(f"reflectance: got none outside of the specular peak at {dark[0]:g} nm, wanted a peak")
+        raise RequestError(f"reflectance: got none outside of the specular peak at {dark[0]:g} nm, wanted a peak")
     periods = found.wavelengths / (np.sin(np.deg2rad(found.incidence)) + np.sin(np.deg2rad(angles)))
     return PeriodFit(float(periods.mean()), float(periods.var()))
 

@@ -9,6 +9,7 @@ from numbers import Real
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..errors import RequestError
 from . import missing
 
 
@@ -24,9 +25,9 @@ def as_pixel_size(value: float | tuple[float, float]) -> tuple[float, float]:
         x, y = (value, value) if isinstance(value, Real) else value
         pair = (float(x), float(y))
     except (TypeError, ValueError, OverflowError):
-        raise ValueError(f"pixel_size: got {value!r}, wanted one number or (x, y) in µm") from None
+        raise RequestError(f"pixel_size: got {value!r}, wanted one number or (x, y) in µm") from None
     if not all(np.isfinite(p) and p > 0 for p in pair):
-        raise ValueError(f"pixel_size: got {value!r}, wanted positive numbers in µm")
+        raise RequestError(f"pixel_size: got {value!r}, wanted positive numbers in µm")
     return pair
 
 
@@ -65,7 +66,7 @@ class HeightField:
     ) -> None:
         for name, value in (("fill_missing", fill_missing), ("keep_missing", keep_missing)):
             if not isinstance(value, bool | np.bool_):
-                raise ValueError(f"{name}: got {value!r}, wanted True or False")
+                raise RequestError(f"{name}: got {value!r}, wanted True or False")
         array = np.array(missing.as_heights(heights), order="C")
         pixel_size = as_pixel_size(pixel_size)
         gaps = ~np.isfinite(array)
@@ -75,10 +76,10 @@ class HeightField:
             source = f"{source} ({filled} missing pixel{'s' if filled > 1 else ''} filled)"
         elif keep_missing:
             if gaps.all():
-                raise ValueError(f"heights: all {gaps.size} pixels are missing, wanted at least one height in µm")
+                raise RequestError(f"heights: all {gaps.size} pixels are missing, wanted at least one height in µm")
             array[gaps] = np.nan
         elif gaps.any():
-            raise ValueError(_refusal(gaps))
+            raise RequestError(_refusal(gaps))
         array.setflags(write=False)
         object.__setattr__(self, "heights", array)
         object.__setattr__(self, "pixel_size", pixel_size)
@@ -113,7 +114,7 @@ class HeightField:
 
     def _refuse_gaps(self) -> None:
         if (gaps := self.gaps).any():
-            raise ValueError(_refusal(gaps))
+            raise RequestError(_refusal(gaps))
 
     @property
     def half_range(self) -> float:

@@ -7,6 +7,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
+from ..errors import RequestError
+
 
 def as_heights(heights: ArrayLike) -> NDArray[np.float64]:
     """A plane of heights, (N_y, N_x) µm, NaN where the array is masked; no copy where none is needed.
@@ -16,16 +18,16 @@ def as_heights(heights: ArrayLike) -> NDArray[np.float64]:
     """
     try:
         if np.iscomplexobj(heights):
-            raise ValueError
+            raise RequestError
         if np.ma.isMaskedArray(heights):
             heights = heights.astype(np.float64).filled(np.nan)
         array = np.asarray(heights, dtype=np.float64)
     except (TypeError, ValueError):
-        raise ValueError(
+        raise RequestError(
             f"heights: got {type(heights).__name__}, wanted a two-dimensional array of real heights in µm"
         ) from None
     if array.ndim != 2 or array.size == 0:
-        raise ValueError(f"heights: got an array of shape {array.shape}, wanted (rows, columns), at least (1, 1)")
+        raise RequestError(f"heights: got an array of shape {array.shape}, wanted (rows, columns), at least (1, 1)")
     return array
 
 
@@ -61,7 +63,7 @@ def fill_missing(heights: ArrayLike, pixel_size: tuple[float, float] = (1.0, 1.0
     if count == 0:
         return heights
     if count == heights.size:
-        raise ValueError(f"heights: all {count} pixels are missing, wanted at least one height in µm to fill from")
+        raise RequestError(f"heights: all {count} pixels are missing, wanted at least one height in µm to fill from")
     known = heights[~missing]
     lowest, highest = known.min(), known.max()
     middle = lowest / 2 + highest / 2  # heights are solved for about it, for the sake of their last digits

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from ..errors import RequestError
 from .bands import Band, fit_band
 from .heightfield import HeightField
 from .missing import fill_missing
@@ -129,7 +130,7 @@ def find_periods(height_field: HeightField, count: int = 2) -> tuple[Period, ...
         ValueError: if count is not a positive integer.
     """
     if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
-        raise ValueError(f"count: got {count!r}, wanted a positive integer")
+        raise RequestError(f"count: got {count!r}, wanted a positive integer")
     heights = fill_missing(height_field.heights, height_field.pixel_size)
     spectrum = _Spectrum(heights, height_field.pixel_size)
     if not spectrum.scale > 1e-13 * np.abs(heights).max():  # level but for rounding

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.interpolate import RectBivariateSpline, make_interp_spline
 
+from ..errors import RequestError
 from . import missing
 from .heightfield import HeightField
 from .periods import Period, find_periods
@@ -154,7 +155,7 @@ def trim_edges(height_field: HeightField, width: float) -> HeightField:
     ]
     if 2 * cuts[0] >= columns or 2 * cuts[1] >= rows:
         x, y = height_field.tile_size
-        raise ValueError(f"trim_edges: got {width:g} µm at each edge of {x:.4g} × {y:.4g} µm: nothing would be left")
+        raise RequestError(f"trim_edges: got {width:g} µm at each edge of {x:.4g} × {y:.4g} µm: nothing would be left")
     inside = height_field.heights[cuts[1] : rows - cuts[1], cuts[0] : columns - cuts[0]]
     _check_any("trim_edges", inside)
     return _after(height_field, inside, f"trim_edges: {cuts[0]} columns and {cuts[1]} rows at each edge")
@@ -171,7 +172,7 @@ def rotate(height_field: HeightField, degrees: float) -> HeightField:
         ValueError: if the angle is not a finite number, or no pixel fits into the turned patch.
     """
     if not _is_number(degrees):
-        raise ValueError(f"rotate: got {degrees!r}, wanted an angle in degrees")
+        raise RequestError(f"rotate: got {degrees!r}, wanted an angle in degrees")
     quarters = degrees / 90
     if quarters == np.rint(quarters):
         turns = int(np.rint(quarters)) % 4
@@ -185,7 +186,7 @@ def rotate(height_field: HeightField, degrees: float) -> HeightField:
     width, height = _largest_rectangle((columns - 1) * d_x, (rows - 1) * d_y, abs(cos), abs(sin))
     count = [int(np.floor(length / d + 1e-9)) + 1 for length, d in ((width, d_x), (height, d_y))]
     if min(count) < 2:
-        raise ValueError(f"rotate: no pixels fit into {columns} × {rows} pixels turned by {degrees:g}°")
+        raise RequestError(f"rotate: no pixels fit into {columns} × {rows} pixels turned by {degrees:g}°")
     x, y = ((np.arange(n) - (n - 1) / 2) * d for n, d in zip(count, (d_x, d_y), strict=True))
     x, y = np.meshgrid(x, y)
     places = np.array([(cos * y - sin * x) / d_y + (rows - 1) / 2, (cos * x + sin * y) / d_x + (columns - 1) / 2])
@@ -230,13 +231,13 @@ def crop_periods(height_field: HeightField, axes: str = "xy") -> HeightField:
         ValueError: if pixels are missing, no period is found, or less than one fits into the patch.
     """
     if axes not in ("x", "y", "xy"):
-        raise ValueError(f"crop_periods: got {axes!r}, wanted 'x', 'y' or 'xy'")
+        raise RequestError(f"crop_periods: got {axes!r}, wanted 'x', 'y' or 'xy'")
     if height_field.gaps.any():
-        raise ValueError(f"crop_periods: {height_field.gaps.sum()} pixels are missing, wanted fill_missing before it")
+        raise RequestError(f"crop_periods: {height_field.gaps.sum()} pixels are missing, wanted fill_missing before it")
     found = [period for period in find_periods(height_field) if not period.width]
     waves = [wave for wave in found if wave.strength >= _LEAST_STRENGTH * found[0].strength]
     if not waves:
-        raise ValueError("crop_periods: no period stands out of the spectrum of the heights")
+        raise RequestError("crop_periods: no period stands out of the spectrum of the heights")
     told = []
     heights, sizes = height_field.heights, list(height_field.pixel_size)
     for axis in axes:
@@ -244,7 +245,7 @@ def crop_periods(height_field: HeightField, axes: str = "xy") -> HeightField:
         heights, sizes[k], what = _crop(heights, 1 - k, sizes[k], waves, axis)
         told.append(what)
     if all("no period" in what for what in told):
-        raise ValueError(f"crop_periods: {'; '.join(told)}")
+        raise RequestError(f"crop_periods: {'; '.join(told)}")
     return _after(height_field, heights, f"crop_periods: {', '.join(told)}", (sizes[0], sizes[1]))
 
 
@@ -319,19 +320,19 @@ def check_steps(steps: object) -> None:
         ValueError: if a name or an argument is wrong.
     """
     if not isinstance(steps, list | tuple):
-        raise ValueError(f"prepare: got {steps!r}, wanted a list of steps")
+        raise RequestError(f"prepare: got {steps!r}, wanted a list of steps")
     for step in steps:
         name, argument = _parts(step)
         _, kind, required = _STEPS[name]
         if argument is None:
             if required:
-                raise ValueError(f"prepare: {name}: missing its argument, wanted {{ {name} = … }}")
+                raise RequestError(f"prepare: {name}: missing its argument, wanted {{ {name} = … }}")
         elif kind is None:
-            raise ValueError(f"prepare: {name}: got {argument!r}, wanted no argument")
+            raise RequestError(f"prepare: {name}: got {argument!r}, wanted no argument")
         elif kind is float and not _is_number(argument):
-            raise ValueError(f"prepare: {name}: got {argument!r}, wanted a number")
+            raise RequestError(f"prepare: {name}: got {argument!r}, wanted a number")
         elif kind is str and argument not in ("x", "y", "xy"):
-            raise ValueError(f"prepare: {name}: got {argument!r}, wanted 'x', 'y' or 'xy'")
+            raise RequestError(f"prepare: {name}: got {argument!r}, wanted 'x', 'y' or 'xy'")
 
 
 def apply_steps(height_field: HeightField, steps: Sequence[Step]) -> HeightField:
@@ -364,7 +365,7 @@ def _parts(step: object) -> tuple[str, object]:
     if isinstance(step, Mapping) and len(step) == 1:
         ((name, argument),) = step.items()
     if not (isinstance(name, str) and name in _STEPS):
-        raise ValueError(f"prepare: got {step!r}, wanted one of {', '.join(_STEPS)}")
+        raise RequestError(f"prepare: got {step!r}, wanted one of {', '.join(_STEPS)}")
     return name, argument
 
 
@@ -377,12 +378,12 @@ def _after(
 
 def _check_positive(name: str, value: object, wanted: str) -> None:
     if not (_is_number(value) and value > 0):
-        raise ValueError(f"{name}: got {value!r}, wanted {wanted}, positive")
+        raise RequestError(f"{name}: got {value!r}, wanted {wanted}, positive")
 
 
 def _check_any(name: str, heights: NDArray[np.float64]) -> None:
     if np.isnan(heights).all():
-        raise ValueError(f"{name}: all pixels that are left are missing")
+        raise RequestError(f"{name}: all pixels that are left are missing")
 
 
 def _is_number(value: object) -> bool:

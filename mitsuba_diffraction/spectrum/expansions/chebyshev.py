@@ -8,6 +8,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ...errors import RequestError
 from . import chebyshev_polynomials, chebyshev_transform, position
 
 
@@ -30,7 +31,7 @@ class ChebyshevSeries:
 
     def __post_init__(self) -> None:
         if self.terms < 1:
-            raise ValueError(f"terms: got {self.terms}, wanted at least 1")
+            raise RequestError(f"terms: got {self.terms}, wanted at least 1")
 
     def weights(self, kappa: ArrayLike) -> NDArray[np.float64]:
         """T_n(t) for κ (...) in rad/µm: (..., N)."""

@@ -8,6 +8,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ...errors import RequestError
 from . import chebyshev_nodes, chebyshev_polynomials, chebyshev_transform, position
 
 
@@ -27,7 +28,7 @@ class SvdSeries:
 
     def __post_init__(self) -> None:
         if self.modes.ndim != 2 or 0 in self.modes.shape or not np.isfinite(self.modes).all():
-            raise ValueError(f"modes: got {self.modes.shape}, wanted finite numbers, (terms, degrees)")
+            raise RequestError(f"modes: got {self.modes.shape}, wanted finite numbers, (terms, degrees)")
         self.modes.setflags(write=False)
 
     @classmethod
@@ -66,5 +67,5 @@ class SvdSeries:
             ValueError: if the nodes are not those of the fit.
         """
         if nodes != self.modes.shape[1]:
-            raise ValueError(f"nodes: got {nodes}, wanted the {self.modes.shape[1]} of the fit")
+            raise RequestError(f"nodes: got {nodes}, wanted the {self.modes.shape[1]} of the fit")
         return self.modes @ chebyshev_polynomials(chebyshev_nodes(nodes), nodes).T

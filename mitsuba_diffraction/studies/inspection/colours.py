@@ -18,10 +18,11 @@ from numpy.typing import ArrayLike, NDArray
 from ...color import spectrum_to_XYZ
 from ...scalar_theory import geometry
 from ...spectrum import GratingSpectrum
+from ...wavelengths import VISIBLE
 
 Array = NDArray[np.float64]
 
-WAVELENGTHS = np.arange(360.0, 831.0, 2.0)
+WAVELENGTHS = np.arange(VISIBLE[0], VISIBLE[1] + 1, 2.0)
 """nm; fine enough for the lobes of `LONGEST_COHERENCE`."""
 
 LONGEST_COHERENCE = 20.0

@@ -14,9 +14,10 @@ from ...coherence import SUN_COHERENCE_LENGTH, lobe_width
 from ...reference import check_extent
 from ...scalar_theory import equivalent_depth, expected_error
 from ...spectrum import GratingSpectrum
-from ...spectrum.build import VISIBLE, precompute
+from ...spectrum.build import precompute
 from ...surface.heightfield import HeightField
 from ...surface.periods import Period, find_periods
+from ...wavelengths import VISIBLE
 from ...welch import carried_coherence_length
 from .colours import LONGEST_COHERENCE
 from .concerns import concerns

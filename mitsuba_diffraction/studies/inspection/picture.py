@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...color import auto_exposure, into_gamut, roll_off, spectrum_to_linear_sRGB
+from ...errors import RequestError
 from ...files import whole_file
 from ...outputs import metadata
 from ...surface.heightfield import HeightField
@@ -49,7 +50,7 @@ def save_picture(inspection: Inspection, path: str | os.PathLike[str], *, title:
     figure = Figure(figsize=(12.8, 7.2), dpi=150)
     kinds = FigureCanvasAgg(figure).get_supported_filetypes()
     if Path(path).suffix.lower().removeprefix(".") not in kinds:
-        raise ValueError(f"picture: got {os.fspath(path)!r}, wanted a file name that ends in .png, .pdf or .svg")
+        raise RequestError(f"picture: got {os.fspath(path)!r}, wanted a file name that ends in .png, .pdf or .svg")
     source = inspection.height_field.source
     figure.text(0.04, 0.95, _short(title or source, 80), fontsize=17, weight="bold", va="center")
     below = [_headline(inspection)] if title in (None, source) else [_short(source, 150), _headline(inspection)]

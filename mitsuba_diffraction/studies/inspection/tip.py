@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import grey_dilation, grey_erosion
 
+from ...errors import RequestError
 from ...surface.heightfield import HeightField
 
 _HALVINGS = 12
@@ -49,7 +50,7 @@ def broadened(height_field: HeightField, share: float, *, extent: str = "sample"
     """
     heights = height_field.heights
     if height_field.height_range < 1e-12:
-        raise ValueError("height_field: got a flat surface, wanted one with ridges")
+        raise RequestError("height_field: got a flat surface, wanted one with ridges")
     high_part = heights > heights.mean()
     level = (heights[high_part].mean() + heights[~high_part].mean()) / 2
     above = np.mean(heights > level)
@@ -64,7 +65,7 @@ def broadened(height_field: HeightField, share: float, *, extent: str = "sample"
     while not reached(sign * high):
         low, high = high, 2 * high
         if high > largest:
-            raise ValueError("height_field: no tip broadens its ridges that much")
+            raise RequestError("height_field: no tip broadens its ridges that much")
     for _ in range(_HALVINGS):
         middle_radius = (low + high) / 2
         if reached(sign * middle_radius):

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...color import spectrum_to_XYZ
+from ...errors import RequestError
 from ...spectrum import GratingSpectrum
 from ...surface.heightfield import HeightField
 from ...surface.periods import Period
@@ -102,7 +103,7 @@ def changes(
     for by in (SHARE, -SHARE):
         try:
             other, radius = broadened(height_field, by, extent=extent)
-        except ValueError:
+        except RequestError:
             continue  # steps from one pixel to the next: no tip is that sharp
         found.append(change("tip broadening", by, _View(build(other), _same_period(find(other), main)), radius))
     return tuple(found)

@@ -12,6 +12,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ...errors import RequestError
 from .difference import Difference, difference, noise, white_luminance
 from .pictures import Picture, Pictures, Progress, silent
 from .quirk_shares import QuirkShares, quirk_shares
@@ -102,7 +103,7 @@ def compare(
     """
     for name, count in (("spp", spp), ("shading_points", shading_points), ("shares_side", shares_side)):
         if count < 1:
-            raise ValueError(f"{name}: got {count}, wanted a positive number")
+            raise RequestError(f"{name}: got {count}, wanted a positive number")
     of = Pictures(scene_path, shader, width=width, height=height, seed=seed, parameters=parameters)
     pictures = {}
     with progress("path tracer") as bar:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...color import XYZ_to_linear_sRGB, auto_exposure, delta_E, into_gamut
+from ...errors import RequestError
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +67,7 @@ def difference(
     """
     sums = [float(picture[where][:, 1].sum()) for picture in (reference, xyz)]
     if not min(sums) > 0:
-        raise ValueError(f"luminance: got sums {sums[0]:.3g} and {sums[1]:.3g} of two pictures, wanted positive ones")
+        raise RequestError(f"luminance: got sums {sums[0]:.3g} and {sums[1]:.3g} of two pictures, wanted positive ones")
     exposure = sums[0] / sums[1]
     first, second = as_shown(reference[where] / white), as_shown(xyz[where] * (exposure / white))
     delta_e = np.full(where.shape, np.nan)

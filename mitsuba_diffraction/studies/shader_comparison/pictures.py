@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...color import spectrum_to_XYZ
+from ...errors import RequestError
 from ...render import SpectralImage
 from ...render.accumulation import Accumulation, ratio
 from ...render.film import collect, pass_seed, trace_pass
@@ -98,28 +99,28 @@ class Pictures:
             ValueError: if the request is wrong, or the shader cannot show the scene.
         """
         if shader not in VARIANTS:
-            raise ValueError(f"shader: got {shader!r}, wanted one of {', '.join(VARIANTS)}")
+            raise RequestError(f"shader: got {shader!r}, wanted one of {', '.join(VARIANTS)}")
         if seed < 0:
-            raise ValueError(f"seed: got {seed}, wanted an integer that is not negative")
+            raise RequestError(f"seed: got {seed}, wanted an integer that is not negative")
         if not dr.is_jit_v(mi.Float):
-            raise ValueError(f"variant: got {mi.variant()!r}, wanted a vectorised one, such as 'llvm_ad_spectral'")
+            raise RequestError(f"variant: got {mi.variant()!r}, wanted a vectorised one, such as 'llvm_ad_spectral'")
         self.scene = load_spectral_scene(scene_path, width=width, height=height, parameters=parameters)
         if hasattr(self.scene.integrator(), "quirks"):
-            raise ValueError(f"{scene_path}: its integrator is the shader itself, wanted a path tracer (type='path')")
+            raise RequestError(f"{scene_path}: its integrator is the shader itself, wanted a path tracer (type='path')")
         self.seed = seed
         self._others: dict[tuple[bool, bool, int], Picture] = {}
         self._shader = mi.load_dict({"type": "diffraction_shader", "variant": shader})
         # Refuses a scene that the shader cannot show.
         prepared = self._shader.prepare(self.scene)
         if not prepared.surfaces:
-            raise ValueError(f"{scene_path}: no shape has a diffraction_grating, there is nothing to compare")
+            raise RequestError(f"{scene_path}: no shape has a diffraction_grating, there is nothing to compare")
         self.shaders: list[Shader] = [shader for _, shader, _ in prepared.surfaces]
         self.spectra = [surface.grating.spectrum for surface, _, _ in prepared.surfaces]
         self.has_base = any(surface.grating.base is not None for surface, _, _ in prepared.surfaces)
         self.film_size = tuple(int(size) for size in self.scene.sensors()[0].film().size())
         self.surface = _shows_surfaces(self.scene)
         if not self.surface.any():
-            raise ValueError(f"{scene_path}: no pixel shows a surface, there is nothing to compare")
+            raise RequestError(f"{scene_path}: no pixel shows a surface, there is nothing to compare")
 
     @property
     def quirks(self) -> tuple[str, ...]:

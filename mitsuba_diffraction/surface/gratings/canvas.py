@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
+from ...errors import RequestError
 from ..heightfield import HeightField, as_pixel_size
 from .checks import check_pixels, check_positive
 
@@ -27,15 +28,15 @@ class Canvas:
     ) -> None:
         try:
             self.size = as_pixel_size(size)
-        except ValueError:
-            raise ValueError(f"size: got {size!r}, wanted a positive number or (x, y) in µm") from None
+        except RequestError:
+            raise RequestError(f"size: got {size!r}, wanted a positive number or (x, y) in µm") from None
         check_positive("pixel_size", pixel_size)
         if self.size[0] < 2 * pitch[0] or self.size[1] < 4 * pitch[1]:
-            raise ValueError(
+            raise RequestError(
                 f"size: got {size!r} µm, wanted at least 2 rows × 4 fingers, {2 * pitch[0]:.4g} × {4 * pitch[1]:.4g} µm"
             )
         if pixel_size > min(pitch) / 4:
-            raise ValueError(f"pixel_size: got {pixel_size!r} µm, wanted at most {min(pitch) / 4:.4g} µm")
+            raise RequestError(f"pixel_size: got {pixel_size!r} µm, wanted at most {min(pitch) / 4:.4g} µm")
         check_pixels(*(s / pixel_size for s in self.size))
         columns, rows = (round(s / pixel_size) for s in self.size)
         self.count = tuple(round(s / p) for s, p in zip(self.size, pitch, strict=True))

@@ -6,6 +6,8 @@ from numbers import Integral, Real
 
 import numpy as np
 
+from ...errors import RequestError
+
 MOST_PIXELS = 2**26
 """Of a profile: half a gigabyte of heights."""
 
@@ -13,24 +15,24 @@ MOST_PIXELS = 2**26
 def check_pixels(columns: float, rows: float) -> None:
     """Refuses a patch before memory is asked for it."""
     if not columns * rows <= MOST_PIXELS:
-        raise ValueError(f"got a patch of {columns:.4g} × {rows:.4g} pixels, wanted at most {MOST_PIXELS} in all")
+        raise RequestError(f"got a patch of {columns:.4g} × {rows:.4g} pixels, wanted at most {MOST_PIXELS} in all")
 
 
 def check_positive(name: str, value: float) -> None:
     if not (isinstance(value, Real) and np.isfinite(value) and value > 0):
-        raise ValueError(f"{name}: got {value!r}, wanted a positive number in µm")
+        raise RequestError(f"{name}: got {value!r}, wanted a positive number in µm")
 
 
 def check_profile(period: float, depth: float, samples: int = 2) -> None:
     check_positive("period", period)
     if not (isinstance(depth, Real) and np.isfinite(depth) and depth >= 0):
-        raise ValueError(f"depth: got {depth!r}, wanted a number in µm, zero or more")
+        raise RequestError(f"depth: got {depth!r}, wanted a number in µm, zero or more")
     if not (isinstance(samples, Integral) and samples >= 2):
-        raise ValueError(f"samples: got {samples!r}, wanted a whole number of at least 2")
+        raise RequestError(f"samples: got {samples!r}, wanted a whole number of at least 2")
     check_pixels(samples, 1)
 
 
 def generator(seed: int) -> np.random.Generator:
     if not (isinstance(seed, Integral) and seed >= 0):
-        raise ValueError(f"seed: got {seed!r}, wanted a whole number, zero or more")
+        raise RequestError(f"seed: got {seed!r}, wanted a whole number, zero or more")
     return np.random.default_rng(int(seed))

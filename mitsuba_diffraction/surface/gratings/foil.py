@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ...errors import RequestError
 from ..heightfield import HeightField
 from .checks import check_pixels, check_profile
 
@@ -31,9 +32,9 @@ def foil(period: float = 1.0, depth: float = 0.15, *, directions: int = 2, sampl
     """
     check_profile(period, depth, samples)
     if samples % 2:
-        raise ValueError(f"samples: got {samples}, wanted an even number, so that the lowest point is on a pixel")
+        raise RequestError(f"samples: got {samples}, wanted an even number, so that the lowest point is on a pixel")
     if directions not in (2, 3):
-        raise ValueError(f"directions: got {directions!r}, wanted 2 (crossed) or 3 (hexagonal)")
+        raise RequestError(f"directions: got {directions!r}, wanted 2 (crossed) or 3 (hexagonal)")
     # In units of the period. The highest and the lowest point are on pixels.
     if directions == 2:
         size, pixels = np.array([1.0, 1.0]), (samples, samples)

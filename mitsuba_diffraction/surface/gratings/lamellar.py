@@ -6,6 +6,7 @@ from numbers import Real
 
 import numpy as np
 
+from ...errors import RequestError
 from ..heightfield import HeightField
 from .checks import check_profile
 from .line_profile import one_row
@@ -29,10 +30,10 @@ def lamellar(period: float, depth: float, *, duty: float = 0.5, samples: int = 5
     """
     check_profile(period, depth, samples)
     if not (isinstance(duty, Real) and 0 < duty < 1):
-        raise ValueError(f"duty: got {duty!r}, wanted a fraction above 0 and below 1")
+        raise RequestError(f"duty: got {duty!r}, wanted a fraction above 0 and below 1")
     high = round(duty * samples)
     if not 0 < high < samples:
-        raise ValueError(f"duty: got {duty!r} with {samples} samples, wanted ridge and groove at least a pixel wide")
+        raise RequestError(f"duty: got {duty!r} with {samples} samples, wanted ridge and groove at least a pixel wide")
     heights = np.where(np.arange(samples) < high, depth, 0.0)
     return one_row(
         heights, period, f"lamellar grating, period {period:g} µm, depth {depth:g} µm, duty {high / samples:g}"

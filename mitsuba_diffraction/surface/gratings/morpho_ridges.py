@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ...errors import RequestError
 from ..heightfield import HeightField
 from .canvas import Canvas, smooth_step
 from .checks import check_positive, check_profile, generator
@@ -44,7 +45,7 @@ def morpho_ridges(
     check_profile(period, depth)
     check_positive("width", width)
     if width >= period:
-        raise ValueError(f"width: got {width!r} µm, wanted less than the period, {period:g}")
+        raise RequestError(f"width: got {width!r} µm, wanted less than the period, {period:g}")
     rng = generator(seed)
     canvas = Canvas(size, pixel_size, pitch=(period, period), axis=0)
     # Every ridge has a height of its own and rises and falls along it, where one lamella ends and the next begins.

@@ -6,6 +6,7 @@ from numbers import Real
 
 import numpy as np
 
+from ...errors import RequestError
 from ..heightfield import HeightField
 from .blazed import blazed
 
@@ -38,11 +39,11 @@ def ruled(lines_per_mm: float = 600.0, *, blaze_wavelength: float = 500.0, sampl
         ("blaze_wavelength", blaze_wavelength, "nm"),
     ):
         if not (isinstance(value, Real) and np.isfinite(value) and value > 0):
-            raise ValueError(f"{name}: got {value!r}, wanted a positive number of {unit}")
+            raise RequestError(f"{name}: got {value!r}, wanted a positive number of {unit}")
     period = 1000 / lines_per_mm
     sine = blaze_wavelength * 1e-3 / (2 * period)
     if sine >= 1:
-        raise ValueError(
+        raise RequestError(
             f"blaze_wavelength: got {blaze_wavelength:g} nm, wanted less than twice the period, {2000 * period:.4g} nm"
         )
     angle = np.arcsin(sine)

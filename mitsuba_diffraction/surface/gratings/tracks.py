@@ -8,6 +8,7 @@ from numbers import Integral, Real
 import numpy as np
 from numpy.typing import NDArray
 
+from ...errors import RequestError
 from ..heightfield import HeightField
 from .checks import check_pixels, check_positive, check_profile, generator
 
@@ -49,19 +50,19 @@ def draw_tracks(
     ):
         check_positive(label, value)
     if not (isinstance(index, Real) and np.isfinite(index) and index >= 1):
-        raise ValueError(f"index: got {index!r}, wanted a refractive index of at least 1")
+        raise RequestError(f"index: got {index!r}, wanted a refractive index of at least 1")
     if not (isinstance(tracks, Integral) and tracks >= 1):
-        raise ValueError(f"tracks: got {tracks!r}, wanted a whole number of at least 1")
+        raise RequestError(f"tracks: got {tracks!r}, wanted a whole number of at least 1")
     shortest, longest = min(runs) * channel_bit, max(runs) * channel_bit
     if not _WALL <= width <= min(shortest, period - _WALL):
-        raise ValueError(
+        raise RequestError(
             f"width: got {width!r} µm, wanted {_WALL:g} to {min(shortest, period - _WALL):.4g} (the shortest pit, and "
             "the land between tracks)"
         )
     if length < 4 * longest:
-        raise ValueError(f"length: got {length!r} µm, wanted at least four of the longest pits, {4 * longest:.4g}")
+        raise RequestError(f"length: got {length!r} µm, wanted at least four of the longest pits, {4 * longest:.4g}")
     if pixel_size > width / 2:
-        raise ValueError(f"pixel_size: got {pixel_size!r} µm, wanted at most half of a pit's width, {width / 2:.4g}")
+        raise RequestError(f"pixel_size: got {pixel_size!r} µm, wanted at most half of a pit's width, {width / 2:.4g}")
     check_pixels(tracks * period / pixel_size, length / pixel_size)
     rng = generator(seed)
     bits = round(length / channel_bit)

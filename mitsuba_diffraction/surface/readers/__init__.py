@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ...errors import RequestError
 from ...files import refuse_special
 from ..heightfield import HeightField
 from . import arrays, gwyddion, instruments, pictures, simple_field, text
@@ -90,37 +91,38 @@ def read_height_field(
             scan = _read(path, channel, unit)
             integers = scan.numbers.dtype.kind in "iu"
             if pixel_size is None and scan.pixel_size is None and height_range is None and integers:
-                raise ValueError(
+                raise RequestError(
                     f"pixel_size, height_range: both missing for {scan.numbers.dtype} heights, wanted one number or "
                     "(x, y) in µm, and the height in µm from black to white"
                 )
             heights = _as_micrometres(scan.numbers, height_range)
         pixel_size = scan.pixel_size if pixel_size is None else pixel_size
         if pixel_size is None:
-            raise ValueError("pixel_size: the file has none, wanted one number or (x, y) in µm")
+            raise RequestError("pixel_size: the file has none, wanted one number or (x, y) in µm")
         source = f"{path.name}, {scan.channel}" if scan.channel else path.name
         return HeightField(heights, pixel_size, source, fill_missing=fill_missing, keep_missing=keep_missing)
     except FileNotFoundError:
         raise
-    # OSError is what Pillow raises for a damaged picture, and the system for what cannot be read (a folder, rights).
-    except (ValueError, OSError, MemoryError) as error:
-        raise ValueError(" ".join(f"{path}: {str(error)[:_SHOWN]}".split())) from error
+    # OSError is what Pillow raises for a damaged picture, and the system for what cannot be read (a folder, rights);
+    # UnicodeDecodeError what a damaged text does.
+    except (RequestError, UnicodeDecodeError, OSError, MemoryError) as error:
+        raise RequestError(" ".join(f"{path}: {str(error)[:_SHOWN]}".split())) from error
 
 
 def _read(path: Path, channel: str | int | None, unit: str | tuple[str, str] | None) -> Scan:
     extension = path.suffix.lower()
     instrument = instruments.format_of(extension) is not None
     if extension not in _EXTENSIONS and not instrument:
-        raise ValueError(
+        raise RequestError(
             f"got the extension {path.suffix!r}, wanted one of {', '.join(_EXTENSIONS)}, or an instrument's: "
             f"{instruments.NAMES}"
         )
     if path.stat().st_size == 0:
-        raise ValueError("the file is empty")
+        raise RequestError("the file is empty")
     if channel is not None and not (instrument or extension == ".gwy"):
-        raise ValueError(f"channel: got {channel!r} for {extension}, which holds one only")
+        raise RequestError(f"channel: got {channel!r} for {extension}, which holds one only")
     if unit is not None and extension in _WITHOUT_UNIT:
-        raise ValueError(f"unit: got {unit!r} for {extension}, whose lengths are µm")
+        raise RequestError(f"unit: got {unit!r} for {extension}, whose lengths are µm")
     if instrument:
         return instruments.read(path, unit, channel)
     if extension == ".gwy":
@@ -133,27 +135,27 @@ def _read(path: Path, channel: str | int | None, unit: str | tuple[str, str] | N
 def _as_micrometres(numbers: NDArray, height_range: object) -> NDArray[np.float64]:
     """Integers scaled by the full range of their type, floats as they are; (N_y, N_x) µm."""
     if numbers.dtype.kind not in "iuf":
-        raise ValueError(f"got numbers of type {numbers.dtype}, wanted real floats in µm or integers")
+        raise RequestError(f"got numbers of type {numbers.dtype}, wanted real floats in µm or integers")
     if numbers.ndim != 2 or numbers.size == 0:
-        raise ValueError(f"got an array of shape {numbers.shape}, wanted (rows, columns), at least (1, 1)")
+        raise RequestError(f"got an array of shape {numbers.shape}, wanted (rows, columns), at least (1, 1)")
     if numbers.dtype.kind == "f":
         if height_range is not None:
-            raise ValueError(
+            raise RequestError(
                 f"height_range: got {height_range!r} for {numbers.dtype} heights, wanted none: they are in µm"
             )
         return numbers.astype(np.float64)
     if height_range is None:
-        raise ValueError(
+        raise RequestError(
             f"height_range: missing for {numbers.dtype} heights, wanted the height in µm from black to white"
         )
     if isinstance(height_range, bool) or not isinstance(height_range, Real):
-        raise ValueError(f"height_range: got {height_range!r}, wanted a number in µm")
+        raise RequestError(f"height_range: got {height_range!r}, wanted a number in µm")
     if not (np.isfinite(height_range) and height_range > 0):
-        raise ValueError(f"height_range: got {height_range!r}, wanted a positive number in µm")
+        raise RequestError(f"height_range: got {height_range!r}, wanted a positive number in µm")
     scale = np.iinfo(numbers.dtype)
     least, greatest = int(numbers.min()), int(numbers.max())
     if numbers.dtype.itemsize > 2 and 0 < (greatest - least) * 2**16 < scale.max - scale.min:
-        raise ValueError(
+        raise RequestError(
             f"height_range: got {numbers.dtype} heights from {least} to {greatest}, flat beside the range of their "
             "type; wanted floats in µm, or a type that they fill, such as uint16"
         )

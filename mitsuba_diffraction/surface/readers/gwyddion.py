@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ...errors import RequestError
 from . import units
 from .scan import MOST_BYTES, Channel, Scan, choose
 
@@ -32,13 +33,13 @@ def read(path: Path, unit: str | tuple[str, str] | None, channel: str | int | No
         ValueError: if it is no such file, not whole, or has no such channel.
     """
     if path.stat().st_size > MOST_BYTES:
-        raise ValueError(f"got {path.stat().st_size} bytes, wanted at most {MOST_BYTES}")
+        raise RequestError(f"got {path.stat().st_size} bytes, wanted at most {MOST_BYTES}")
     data = path.read_bytes()
     if data[:4] != b"GWYP":
-        raise ValueError("not a Gwyddion file, which begins with 'GWYP'")
+        raise RequestError("not a Gwyddion file, which begins with 'GWYP'")
     name, inside = _Bytes(data, 4, len(data)).object()
     if name != "GwyContainer":
-        raise ValueError(f"got a {name!r}, wanted a GwyContainer")
+        raise RequestError(f"got a {name!r}, wanted a GwyContainer")
     fields: dict[int, dict[str, object]] = {}
     titles: dict[int, str] = {}
     for name, value in inside.components():
@@ -56,7 +57,7 @@ def read(path: Path, unit: str | tuple[str, str] | None, channel: str | int | No
     high = high or given[1]
     for what, one in (("heights", high), ("width", along)):
         if not one:
-            raise ValueError(f"unit: the file names none for the {what}, wanted one of {units.UNITS}")
+            raise RequestError(f"unit: the file names none for the {what}, wanted one of {units.UNITS}")
     heights, size = _heights(fields[chosen.number])
     scale = units.micrometres(along, "the width")
     rows, columns = heights.shape
@@ -68,13 +69,13 @@ def _heights(field: dict[str, object]) -> tuple[NDArray[np.float64], tuple[float
     """The array of a data field, and its width and height, in its own units."""
     columns, rows, values = field.get("xres"), field.get("yres"), field.get("data")
     if not (isinstance(columns, int) and isinstance(rows, int) and columns > 0 and rows > 0):
-        raise ValueError(f"a data field of {columns!r} × {rows!r} pixels")
+        raise RequestError(f"a data field of {columns!r} × {rows!r} pixels")
     if not isinstance(values, np.ndarray) or len(values) != rows * columns:
         count = len(values) if isinstance(values, np.ndarray) else 0
-        raise ValueError(f"a data field of {columns} × {rows} pixels with {count} heights")
+        raise RequestError(f"a data field of {columns} × {rows} pixels with {count} heights")
     size = field.get("xreal", 1.0), field.get("yreal", 1.0)  # the format's defaults
     if not all(isinstance(s, float) and np.isfinite(s) and s > 0 for s in size):
-        raise ValueError(f"a data field of the size {size}, wanted positive lengths")
+        raise RequestError(f"a data field of the size {size}, wanted positive lengths")
     return values.astype(np.float64).reshape(rows, columns), size
 
 
@@ -84,7 +85,7 @@ def _unit(field: dict[str, object], name: str) -> str:
         return ""
     text = dict(value[1].components()).get("unitstr", "") if isinstance(value, tuple) else None
     if not isinstance(text, str):
-        raise ValueError(f"a damaged unit, {name}")
+        raise RequestError(f"a damaged unit, {name}")
     return text
 
 
@@ -115,7 +116,7 @@ class _Bytes:
         if kind in _NUMBERS:
             return self._number(_NUMBERS[kind])
         if kind not in "SOCIQD":
-            raise ValueError(f"a component of the unknown type {kind!r}")
+            raise RequestError(f"a component of the unknown type {kind!r}")
         count = self._number("<I")
         if kind in _ARRAYS:
             start = self._skip(count * _ARRAYS[kind])
@@ -129,7 +130,7 @@ class _Bytes:
         """The place of the next bytes, which are passed over."""
         start = self._place
         if count > self._end - start:
-            raise ValueError("the file ends, or a part of it, before what it announces: truncated or damaged")
+            raise RequestError("the file ends, or a part of it, before what it announces: truncated or damaged")
         self._place += count
         return start
 
@@ -140,6 +141,6 @@ class _Bytes:
         end = self._end if longest is None else min(self._end, self._place + longest)
         zero = self._data.find(b"\0", self._place, end)
         if zero < 0:
-            raise ValueError("a text without an end: truncated or damaged")
+            raise RequestError("a text without an end: truncated or damaged")
         start = self._skip(zero + 1 - self._place)
         return self._data[start:zero].decode("utf-8")

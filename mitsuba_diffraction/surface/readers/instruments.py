@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ...errors import RequestError
 from . import units
 from .scan import MOST_BYTES, Channel, Scan, choose
 
@@ -70,31 +71,31 @@ def read(path: Path, unit: str | tuple[str, str] | None, channel: str | int | No
         try:
             from SurfaceTopography.IO import lookup_reader_by_format
         except ImportError as error:
-            raise ValueError(f"an instrument's own format: wanted SurfaceTopography, {EXTRA} ({error})") from None
+            raise RequestError(f"an instrument's own format: wanted SurfaceTopography, {EXTRA} ({error})") from None
         _refuse_bomb(path)
         try:
             reader = lookup_reader_by_format[format_of(path.suffix.lower())](str(path))
             found = list(reader.channels)
         # Readers of binary files raise whatever a wrong byte leads them to.
         except Exception as error:
-            raise ValueError(f"not a file of this instrument, or a damaged one ({_told(error)})") from None
+            raise RequestError(f"not a file of this instrument, or a damaged one ({_told(error)})") from None
         chosen = choose(
             [Channel(c.index, c.name or "untitled", c.dim == 2 and c.data_kind.value == "height") for c in found],
             channel,
         )
         source = found[[c.index for c in found].index(chosen.number)]
         if 8 * int(np.prod(source.nb_grid_pts, dtype=object)) > MOST_BYTES:
-            raise ValueError(f"got {source.nb_grid_pts} pixels, wanted at most {MOST_BYTES} bytes")
+            raise RequestError(f"got {source.nb_grid_pts} pixels, wanted at most {MOST_BYTES} bytes")
         given = units.pair(unit)
         own = source.unit is not None
         if not own and not given[0]:
-            raise ValueError(f"unit: the file names none, wanted one of {units.UNITS}")
+            raise RequestError(f"unit: the file names none, wanted one of {units.UNITS}")
         try:
             topography = source.topography() if own else source.topography(unit=given[0])
             heights = np.ma.asarray(topography.heights(), np.float64).T
             size = topography.physical_sizes
         except Exception as error:
-            raise ValueError(f"a damaged file ({_told(error)})") from None
+            raise RequestError(f"a damaged file ({_told(error)})") from None
     along, high = (source.unit, source.unit) if own else given
     rows, columns = heights.shape
     scale = units.micrometres(along, "the file")
@@ -109,9 +110,9 @@ def _refuse_bomb(path: Path) -> None:
             with zipfile.ZipFile(path) as archive:
                 unpacked = sum(member.file_size for member in archive.infolist())
         except (zipfile.BadZipFile, ValueError, NotImplementedError) as error:
-            raise ValueError(f"a damaged archive ({error})") from None
+            raise RequestError(f"a damaged archive ({error})") from None
         if unpacked > MOST_BYTES:
-            raise ValueError(f"an archive of {unpacked} bytes, wanted at most {MOST_BYTES}")
+            raise RequestError(f"an archive of {unpacked} bytes, wanted at most {MOST_BYTES}")
 
 
 def _told(error: Exception) -> str:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
+from ...errors import RequestError
 from .scan import DAMAGED, Scan
 
 
@@ -22,14 +23,16 @@ def read(path: Path) -> Scan:
             with Image.open(path, formats=("PNG", "TIFF")) as picture:
                 pages = getattr(picture, "n_frames", 1)
                 if pages != 1:
-                    raise ValueError(f"got {pages} pages or frames, wanted one")
+                    raise RequestError(f"got {pages} pages or frames, wanted one")
                 return Scan(_numbers_of(picture))
         except UnidentifiedImageError:
-            raise ValueError("not a PNG or TIFF picture that can be read") from None
+            raise RequestError("not a PNG or TIFF picture that can be read") from None
         except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
-            raise ValueError(f"too large ({error})") from None
-        except DAMAGED as error:
-            raise ValueError(f"a damaged picture ({type(error).__name__}: {error})") from None
+            raise RequestError(f"too large ({error})") from None
+        except RequestError:
+            raise
+        except (*DAMAGED, ValueError) as error:
+            raise RequestError(f"a damaged picture ({type(error).__name__}: {error})") from None
 
 
 def _numbers_of(picture: Image.Image) -> NDArray:
@@ -43,7 +46,7 @@ def _numbers_of(picture: Image.Image) -> NDArray:
     sixteen = sixteen or (mode == "I" and picture.format == "PNG")
     channels = mode in ("RGB", "RGBA", "LA") and ";16" not in packing
     if not (mode in ("L", "F") or sixteen or channels) or "transparency" in picture.info:
-        raise ValueError(
+        raise RequestError(
             f"got a picture of Pillow mode {mode!r} ({packing}), wanted opaque grey of 8 or 16 bit, black at zero, "
             "or (TIFF) 32 bit float"
         )
@@ -56,10 +59,10 @@ def _numbers_of(picture: Image.Image) -> NDArray:
 def _grey(pixels: NDArray, mode: str) -> NDArray:
     """The one channel of a picture whose colours are equal and whose alpha is opaque."""
     if mode.endswith("A") and not (pixels[..., -1] == 255).all():
-        raise ValueError("got a picture with transparent pixels, wanted an opaque grey one")
+        raise RequestError("got a picture with transparent pixels, wanted an opaque grey one")
     colours = pixels[..., : len(mode.removesuffix("A"))]
     if not (colours == colours[..., :1]).all():
-        raise ValueError(
+        raise RequestError(
             "got a colour picture, wanted a grey one: colours of a map are no heights; export the data itself (.gwy, "
             ".gsf, a .tif of 32 bit) or choose a grey palette"
         )

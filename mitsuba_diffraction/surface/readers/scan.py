@@ -8,6 +8,8 @@ from dataclasses import dataclass
 
 from numpy.typing import NDArray
 
+from ...errors import RequestError
+
 MOST_BYTES = 2**31
 """Largest array that is taken from a file."""
 
@@ -60,9 +62,9 @@ def choose(channels: Sequence[Channel], wanted: str | int | None) -> Channel:
         lengths = [channel for channel in channels if channel.is_length]
         named = [c for c in lengths if any(name in c.name.lower() for name in _HEIGHT_NAMES)]
         if not lengths:
-            raise ValueError(f"wanted a channel of heights in a unit of length, got {_listed(channels)}")
+            raise RequestError(f"wanted a channel of heights in a unit of length, got {_listed(channels)}")
         if not named and len(lengths) > 1:
-            raise ValueError(f"channel: which of {_listed(lengths)}?")
+            raise RequestError(f"channel: which of {_listed(lengths)}?")
         return (named or lengths)[0]
     if isinstance(wanted, int) and not isinstance(wanted, bool):
         found = [channel for channel in channels if channel.number == wanted]
@@ -72,11 +74,11 @@ def choose(channels: Sequence[Channel], wanted: str | int | None) -> Channel:
         if not found and wanted.isdecimal():
             found = [channel for channel in channels if channel.number == int(wanted)]
     else:
-        raise ValueError(f"channel: got {wanted!r}, wanted a name or a number")
+        raise RequestError(f"channel: got {wanted!r}, wanted a name or a number")
     if len(found) != 1:
-        raise ValueError(f"channel: got {wanted!r}, wanted one of {_listed(found or channels)}")
+        raise RequestError(f"channel: got {wanted!r}, wanted one of {_listed(found or channels)}")
     if not found[0].is_length:
-        raise ValueError(f"channel: {found[0]} holds no lengths")
+        raise RequestError(f"channel: {found[0]} holds no lengths")
     return found[0]
 
 

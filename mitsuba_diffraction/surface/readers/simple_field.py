@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ...errors import RequestError
 from . import units
 from .scan import MOST_BYTES, Scan
 
@@ -25,30 +26,30 @@ def read(path: Path, unit: str | tuple[str, str] | None) -> Scan:
     with path.open("rb") as file:
         head = file.read(_LONGEST_HEADER)
         if not head.startswith(_MAGIC):
-            raise ValueError("not a Gwyddion Simple Field, which begins with 'Gwyddion Simple Field 1.0'")
+            raise RequestError("not a Gwyddion Simple Field, which begins with 'Gwyddion Simple Field 1.0'")
         end = head.find(b"\0")
         if end < 0:
-            raise ValueError("the header does not end: a truncated file")
+            raise RequestError("the header does not end: a truncated file")
         fields = _fields(head[len(_MAGIC) : end])
         columns, rows = (_count(fields, name) for name in ("XRes", "YRes"))
         if 4 * rows * columns > MOST_BYTES:
-            raise ValueError(f"got {columns} × {rows} pixels, wanted at most {MOST_BYTES} bytes")
+            raise RequestError(f"got {columns} × {rows} pixels, wanted at most {MOST_BYTES} bytes")
         start = end + 4 - end % 4
         size = path.stat().st_size
         if size != start + 4 * rows * columns:
-            raise ValueError(f"got {size} bytes, wanted {start + 4 * rows * columns} for {columns} × {rows} pixels")
+            raise RequestError(f"got {size} bytes, wanted {start + 4 * rows * columns} for {columns} × {rows} pixels")
         file.seek(start)
         numbers = np.frombuffer(file.read(4 * rows * columns), "<f4").reshape(rows, columns)
     along, high = (
         fields.get(name, "") or given for name, given in zip(("XYUnits", "ZUnits"), units.pair(unit), strict=True)
     )
     if not high:
-        raise ValueError(f"unit: the file names none for its heights, wanted one of {units.UNITS}")
+        raise RequestError(f"unit: the file names none for its heights, wanted one of {units.UNITS}")
     heights = numbers.astype(np.float64) * units.micrometres(high, "ZUnits")
     if not ("XReal" in fields and "YReal" in fields):
         return Scan(heights, None, fields.get("Title", ""))
     if not along:
-        raise ValueError(f"unit: the file names none along the surface, wanted one of {units.UNITS}")
+        raise RequestError(f"unit: the file names none along the surface, wanted one of {units.UNITS}")
     scale = units.micrometres(along, "XYUnits")
     pixel_size = (_length(fields, "XReal") * scale / columns, _length(fields, "YReal") * scale / rows)
     return Scan(heights, pixel_size, fields.get("Title", ""))
@@ -59,7 +60,7 @@ def _fields(header: bytes) -> dict[str, str]:
     for line in header.decode("utf-8").splitlines():
         name, equals, value = line.partition("=")
         if not equals:
-            raise ValueError(f"the header: got the line {line[:60]!r}, wanted 'name = value'")
+            raise RequestError(f"the header: got the line {line[:60]!r}, wanted 'name = value'")
         fields[name.strip()] = value.strip()
     return fields
 
@@ -67,7 +68,7 @@ def _fields(header: bytes) -> dict[str, str]:
 def _count(fields: dict[str, str], name: str) -> int:
     text = fields.get(name, "none")
     if not (text.isascii() and text.isdecimal() and len(text) < 10 and int(text) > 0):
-        raise ValueError(f"{name}: got {text}, wanted a number of pixels")
+        raise RequestError(f"{name}: got {text}, wanted a number of pixels")
     return int(text)
 
 
@@ -77,5 +78,5 @@ def _length(fields: dict[str, str], name: str) -> float:
     except ValueError:
         value = np.nan
     if not (np.isfinite(value) and value > 0):
-        raise ValueError(f"{name}: got {fields[name]}, wanted a positive length")
+        raise RequestError(f"{name}: got {fields[name]}, wanted a positive length")
     return value

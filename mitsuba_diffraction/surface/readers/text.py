@@ -30,6 +30,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ...errors import RequestError
 from . import units
 from .scan import MOST_BYTES, Scan
 
@@ -52,18 +53,20 @@ def read_points(path: Path, unit: str | tuple[str, str] | None) -> Scan:
     """
     points = _table(_text(path))
     if points.shape[1] != 3:
-        raise ValueError(f"got {points.shape[1]} numbers in a line, wanted three: x y z")
+        raise RequestError(f"got {points.shape[1]} numbers in a line, wanted three: x y z")
     along, high = units.pair(unit)
     if not along:
-        raise ValueError(f"unit: .xyz names none, wanted one of {units.UNITS} (two: along the surface, of the heights)")
+        raise RequestError(
+            f"unit: .xyz names none, wanted one of {units.UNITS} (two: along the surface, of the heights)"
+        )
     if not np.isfinite(points[:, :2]).all():
-        raise ValueError("got a point without x or y")
+        raise RequestError("got a point without x or y")
     (column, columns, d_x), (row, rows, d_y) = (_grid(points[:, axis], name) for axis, name in enumerate("xy"))
     if columns * rows * _FEWEST_POINTS > len(points):
-        raise ValueError(f"{len(points)} points on a grid of {columns} × {rows}: wanted a regular grid along x and y")
+        raise RequestError(f"{len(points)} points on a grid of {columns} × {rows}: wanted a regular grid along x and y")
     place = row * columns + column
     if len(np.unique(place)) != len(place):
-        raise ValueError("two points at one place: wanted a regular grid along x and y")
+        raise RequestError("two points at one place: wanted a regular grid along x and y")
     heights = np.full(rows * columns, np.nan)
     heights[place] = points[:, 2]
     scale = units.micrometres(along, "unit")
@@ -85,11 +88,11 @@ def read_table(path: Path, unit: str | tuple[str, str] | None) -> Scan:
     heights = _table(text)
     rows, columns = heights.shape
     if not header and columns == 3 and _may_be_points(heights):
-        raise ValueError("three numbers a line that may be points x y z: wanted the extension .xyz for points")
+        raise RequestError("three numbers a line that may be points x y z: wanted the extension .xyz for points")
     along, high = units.pair(unit)
     high = header.get("Value units", high)
     if not high:
-        raise ValueError(f"unit: the file names none, wanted one of {units.UNITS}")
+        raise RequestError(f"unit: the file names none, wanted one of {units.UNITS}")
     pixel_size = None
     if "Width" in header and "Height" in header:
         pixel_size = (_length(header["Width"], along) / columns, _length(header["Height"], along) / rows)
@@ -106,17 +109,17 @@ def _esri(text: str, unit: str | tuple[str, str] | None) -> Scan:
         try:
             header[words[0].lower()] = float(words[1])
         except (IndexError, ValueError):
-            raise ValueError(f"the header: got the line {line[:60]!r}, wanted a name and a number") from None
+            raise RequestError(f"the header: got the line {line[:60]!r}, wanted a name and a number") from None
     if not {"ncols", "nrows", "cellsize"} <= header.keys():
-        raise ValueError(f"the header of an ESRI grid: got {', '.join(header)}, wanted ncols, nrows and cellsize")
+        raise RequestError(f"the header of an ESRI grid: got {', '.join(header)}, wanted ncols, nrows and cellsize")
     along, high = units.pair(unit)
     if not along:
-        raise ValueError(
+        raise RequestError(
             f"unit: an ESRI grid names none, wanted one of {units.UNITS} (two: along the surface, of the heights)"
         )
     heights = _table("\n".join(lines[len(header) :]))
     if heights.shape != (header["nrows"], header["ncols"]):
-        raise ValueError(
+        raise RequestError(
             f"got {heights.shape[0]} lines of {heights.shape[1]}, wanted {header['nrows']:g} of {header['ncols']:g}"
         )
     if "nodata_value" in header:
@@ -127,13 +130,13 @@ def _esri(text: str, unit: str | tuple[str, str] | None) -> Scan:
 
 def _text(path: Path) -> str:
     if path.stat().st_size > MOST_BYTES:
-        raise ValueError(f"got {path.stat().st_size} bytes, wanted at most {MOST_BYTES}")
+        raise RequestError(f"got {path.stat().st_size} bytes, wanted at most {MOST_BYTES}")
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError:
         text = path.read_text(encoding="latin-1")  # µ as Windows writes it
     if "\0" in text:
-        raise ValueError("not a text: it holds zero bytes")
+        raise RequestError("not a text: it holds zero bytes")
     return text
 
 
@@ -141,14 +144,14 @@ def _table(text: str) -> NDArray[np.float64]:
     """Numbers in lines of equal length, between white space, commas or semicolons."""
     first = next((line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")), "")
     if not first:
-        raise ValueError("the file holds no numbers")
+        raise RequestError("the file holds no numbers")
     delimiter = next((mark for mark in (";", ",") if mark in first), None)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             return np.loadtxt(io.StringIO(text), dtype=np.float64, comments="#", delimiter=delimiter, ndmin=2)
     except (ValueError, UserWarning) as error:
-        raise ValueError(f"not a table of numbers ({error})") from None
+        raise RequestError(f"not a table of numbers ({error})") from None
 
 
 def _grid(places: NDArray[np.float64], axis: str) -> tuple[NDArray[np.int64], int, float]:
@@ -158,7 +161,7 @@ def _grid(places: NDArray[np.float64], axis: str) -> tuple[NDArray[np.int64], in
         return np.zeros(len(places), np.int64), 1, 0.0
     gaps = np.diff(values)
     if not np.isfinite(gaps).all():
-        raise ValueError(f"{axis} goes from {values[0]:g} to {values[-1]:g}: wanted a grid along x and y")
+        raise RequestError(f"{axis} goes from {values[0]:g} to {values[-1]:g}: wanted a grid along x and y")
     # What is nearer than a tenth of the widest gap is one place, rounded in different ways.
     starts = np.concatenate([[0], np.flatnonzero(gaps > _OFF_GRID * gaps.max()) + 1])
     middles = np.add.reduceat(values, starts) / np.diff(np.append(starts, len(values)))
@@ -166,12 +169,12 @@ def _grid(places: NDArray[np.float64], axis: str) -> tuple[NDArray[np.int64], in
     steps = np.diff(middles)
     index = np.concatenate([[0], np.cumsum(np.rint(steps / np.median(steps)))])
     if not (np.diff(index) > 0).all():
-        raise ValueError(f"{axis} is not on a regular grid: wanted a grid along x and y")
+        raise RequestError(f"{axis} is not on a regular grid: wanted a grid along x and y")
     spacing, origin = np.polyfit(index, middles, 1)
     index = np.rint((places - origin) / spacing)
     off = np.abs(places - origin - index * spacing).max() / spacing
     if not off <= _OFF_GRID:
-        raise ValueError(f"{axis} lies up to {off:.2f} of a pixel off a regular grid: wanted a grid along x and y")
+        raise RequestError(f"{axis} lies up to {off:.2f} of a pixel off a regular grid: wanted a grid along x and y")
     return index.astype(np.int64), int(index.max()) + 1, float(spacing)
 
 
@@ -189,5 +192,5 @@ def _length(text: str, unit: str) -> float:
     try:
         value = float(number)
     except ValueError:
-        raise ValueError(f"the header: got the length {text[:60]!r}, wanted a number and a unit") from None
+        raise RequestError(f"the header: got the length {text[:60]!r}, wanted a number and a unit") from None
     return value * units.micrometres(own.strip() or unit, "the header")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from ...errors import RequestError
+
 _MICROMETRES = {
     "m": 1e6,
     "cm": 1e4,
@@ -31,7 +33,7 @@ def micrometres(unit: str, what: str) -> float:
         ValueError: if it is no unit of length.
     """
     if not (isinstance(unit, str) and is_length(unit)):
-        raise ValueError(f"{what}: got the unit {unit!r}, wanted a length ({UNITS})")
+        raise RequestError(f"{what}: got the unit {unit!r}, wanted a length ({UNITS})")
     return _MICROMETRES[unit.strip()]
 
 
@@ -45,7 +47,7 @@ def pair(unit: str | tuple[str, str] | None) -> tuple[str, str]:
         return "", ""
     units = (unit, unit) if isinstance(unit, str) else unit
     if not (isinstance(units, tuple | list) and len(units) == 2):
-        raise ValueError(f"unit: got {unit!r}, wanted a unit of length, or two: along the surface and of the heights")
+        raise RequestError(f"unit: got {unit!r}, wanted a unit of length, or two: along the surface and of the heights")
     for one in units:
         micrometres(one, "unit")
     return units[0], units[1]
