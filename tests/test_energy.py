@@ -46,10 +46,7 @@ pytestmark = pytest.mark.usefixtures("llvm")
 
 def plugin(of, conserving=True, **parameters):
     """The plugin with R = 1; without `conserving`, the raw formula."""
-    bsdf = conserving_plugin(of, **parameters)
-    if not conserving:
-        bsdf.energy = None
-    return bsdf
+    return conserving_plugin(of, conserve_energy=conserving, **parameters)
 
 
 def random_directions(rng, count):

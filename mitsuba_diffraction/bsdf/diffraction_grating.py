@@ -9,8 +9,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..coherence import SUN_COHERENCE_LENGTH
 from ..errors import RequestError
+from ..manual import Parameter, listed
 from ..spectrum.energy_table import SHADOWING
+from ..surface.heightfield import HeightField
 from ..wavelengths import VISIBLE
 from .base import base_from
 from .geometry import Geometry
@@ -24,22 +27,38 @@ from .tables import BELOW_ONE, opaque
 DEFENSIVE = 0.02  # the share of samples that follow the cosine, for lobes that the sampler's averages miss
 LEAST_SHARE = 0.1  # of the samples, for the grating and for its base: what each reflects is only estimated
 
-MANUAL = """A diffraction grating, given by the spectrum of its phase.
+PARAMETERS = (
+    Parameter("filename", "string", "a saved spectrum (.exr) or a recipe (.toml)"),
+    Parameter("spectrum", "GratingSpectrum", "the same from Python, in load_dict"),
+    Parameter(
+        "profile",
+        "string",
+        "a grating by formula instead of a file, with the parameters of the function of that name in "
+        "`mitsuba_diffraction.gratings`, all lengths in µm, and coherence_length, tolerance and largest_height_range "
+        "as in `precompute`",
+    ),
+    Parameter("int_ior, ext_ior", "float or string", "a dielectric, as in Mitsuba's `dielectric`", "1.5, air"),
+    Parameter(
+        "material", "string", 'a conductor instead, as in Mitsuba\'s `conductor`; "none" is the perfect mirror, R = 1'
+    ),
+    Parameter("fresnel", "string", "exact, or Schlick's approximation schlick", "exact"),
+    Parameter("orientation", "float or texture", "degrees from the tangent dp_du to the pattern's x axis", "0"),
+    Parameter("height_scale", "float", "scales the heights", "1"),
+    Parameter("shadowing", "string", "v_cavity or none", "v_cavity"),
+    Parameter("conserve_energy", "boolean", "false leaves out E, to compare with closed forms", "true"),
+    Parameter(
+        "base",
+        "BSDF",
+        "what lies under a dielectric surface (pigment): any BSDF that reflects and lets nothing through. Its value "
+        "is multiplied by (1 − R_i)(1 − R_o), R at the angles of ω_i and ω_o to the surface",
+        "none",
+    ),
+)
+
+MANUAL = f"""A diffraction grating, given by the spectrum of its phase.
 
 Parameters (XML or dictionary):
-    filename (string): a saved spectrum (.exr) or a recipe (.toml).
-    spectrum (GratingSpectrum): the same from Python, in load_dict.
-    profile (string): a grating by formula instead of a file, with the parameters of the function of that name in
-        `mitsuba_diffraction.gratings`, all lengths in µm, and coherence_length, tolerance and largest_height_range as
-        in `precompute`.
-    int_ior, ext_ior (float or string): a dielectric, as in Mitsuba's `dielectric` (1.5 against air).
-    material (string): a conductor instead, as in Mitsuba's `conductor`; "none" is the perfect mirror, R = 1.
-    fresnel (string): "exact" or "schlick".
-    orientation (float or texture): degrees from the tangent dp_du to the pattern's x axis (0).
-    height_scale (float): scales the heights (1).
-    shadowing (string): "v_cavity" or "none".
-    base (BSDF): what lies under a dielectric surface (pigment): any BSDF that reflects and lets nothing through. Its
-        value is multiplied by (1 − R_i)(1 − R_o), R at the angles of ω_i and ω_o to the surface.
+{listed(PARAMETERS)}
 
 The pattern's x axis lies along dp_du, where u grows, laid into the plane across the shading normal n; its y axis is
 n × x whatever dp_dv is. So lengths are true where UVs are stretched or sheared, and mirrored UVs turn the pattern but
@@ -65,7 +84,7 @@ def define() -> type:
         def __init__(self, props: mi.Properties) -> None:
             # Mitsuba registers an object when its base class is initialised, and Dr.Jit then calls it in every scene as
             # long as anything holds it, be it a traceback: all that may fail comes first.
-            self.spectrum, self.recipe = surface_from(props)
+            self.spectrum, self._recipe = surface_from(props)
             self.reflectance = reflectance_from(props)
             self.orientation = _orientation(props)
             height_scale = props.get("height_scale", 1.0)
@@ -75,6 +94,9 @@ def define() -> type:
             self.shadowing = props.get("shadowing", "v_cavity")
             if self.shadowing not in SHADOWING:
                 raise RequestError(f"shadowing: got {self.shadowing!r}, wanted one of {', '.join(SHADOWING)}")
+            self.conserve_energy = props.get("conserve_energy", True)
+            if not isinstance(self.conserve_energy, bool):
+                raise RequestError(f"conserve_energy: got {self.conserve_energy!r}, wanted true or false")
             self._tables = SharedTables.of(self.spectrum)
             self.scattering = self._tables.scattering
             # The spectrum says nothing beyond its largest angle: there the grating is black.
@@ -102,7 +124,7 @@ def define() -> type:
                     f"{VISIBLE[0]:g} nm divided by the scale"
                 )
             dr.make_opaque(self.height_scale)
-            self.energy = self._tables.energy(self.shadowing, self.height_scale)
+            self.energy = self._tables.energy(self.shadowing, self.height_scale) if self.conserve_energy else None
 
         def traverse(self, callback: mi.TraversalCallback) -> None:
             callback.put("orientation", self.orientation, mi.ParamFlags.Differentiable)
@@ -119,10 +141,6 @@ def define() -> type:
         def _frame(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
             """Sine and cosine of the angle from the tangent to the pattern's x axis."""
             return dr.sincos(dr.deg2rad(self.orientation.eval_1(si, active)))
-
-        def along_pattern(self, si: mi.SurfaceInteraction3f, omega: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:
-            """A direction of the shading frame, along the pattern's axes."""
-            return _turned(omega, *self._frame(si, active))
 
         def _grating(
             self, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool
@@ -175,11 +193,6 @@ def define() -> type:
             shortest, longest = (w * (1 + d) for w, d in zip(self.spectrum.wavelengths, (-1e-6, 1e-6), strict=True))
             covered = [(wavelength >= shortest) & (wavelength <= longest) for wavelength in si.wavelengths]
             return covered, sum(dr.select(c, mi.Float(1), 0) for c in covered)
-
-        def transmitted(self, si: mi.SurfaceInteraction3f, cos_o: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
-            """(1 − R_i)(1 − R_o): what the surface lets through to the base and back."""
-            r_i, r_o = (self.reflectance(si, cos, active) for cos in (mi.Frame3f.cos_theta(si.wi), cos_o))
-            return (1 - r_i) * (1 - r_o)
 
         def _lobes(self, ctx: mi.BSDFContext) -> tuple[bool, mi.BSDFContext | None]:
             """Whether `ctx` asks for the grating, and what it asks of the base."""
@@ -291,6 +304,31 @@ def define() -> type:
             z = dr.safe_sqrt(1 - dr.square(x) - dr.square(y))
             return dr.select(diffuse, mi.warp.square_to_cosine_hemisphere(v), mi.Vector3f(x, y, z))
 
+        # What the real-time shader asks of a grating: `shader.surfaces.ShadedGrating`.
+
+        def heights(self) -> tuple[HeightField, float]:
+            """The height field and its coherence length in µm.
+
+            Raises:
+                ValueError: for a saved spectrum, which does not hold heights.
+            """
+            if self._recipe is None:
+                raise RequestError(
+                    "diffraction_shader: it needs heights, and a saved spectrum does not hold them; give the grating a "
+                    "recipe (filename=….toml) or a profile"
+                )
+            coherence_length = self._recipe.spectrum.get("coherence_length", SUN_COHERENCE_LENGTH)
+            return self._recipe.height_field(), float(coherence_length)
+
+        def along_pattern(self, si: mi.SurfaceInteraction3f, omega: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:
+            """A direction of the shading frame, along the pattern's axes."""
+            return _turned(omega, *self._frame(si, active))
+
+        def transmitted(self, si: mi.SurfaceInteraction3f, cos_o: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
+            """(1 − R_i)(1 − R_o): what the surface lets through to the base and back."""
+            r_i, r_o = (self.reflectance(si, cos, active) for cos in (mi.Frame3f.cos_theta(si.wi), cos_o))
+            return (1 - r_i) * (1 - r_o)
+
         def to_string(self) -> str:
             lines = [
                 f"spectrum = {self.spectrum.source}",
@@ -301,7 +339,7 @@ def define() -> type:
                 f"orientation = {self.orientation}",
                 f"height_scale = {self.height_scale}",
                 f"shadowing = {self.shadowing}",
-                f"energy = {self.energy or 'conserved by itself'}",
+                f"energy = {self.energy or ('conserved by itself' if self.conserve_energy else 'not conserved')}",
             ]
             return "DiffractionGrating[\n" + "".join(f"  {line},\n" for line in lines) + "]"
 
