@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from numbers import Integral, Real
+from numbers import Integral
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,6 @@ def draw_tracks(
     depth: float,
     width: float,
     channel_bit: float,
-    index: float,
     tracks: int,
     length: float,
     pixel_size: float,
@@ -49,8 +48,6 @@ def draw_tracks(
         ("pixel_size", pixel_size),
     ):
         check_positive(label, value)
-    if not (isinstance(index, Real) and np.isfinite(index) and index >= 1):
-        raise RequestError(f"index: got {index!r}, wanted a refractive index of at least 1")
     if not (isinstance(tracks, Integral) and tracks >= 1):
         raise RequestError(f"tracks: got {tracks!r}, wanted a whole number of at least 1")
     shortest, longest = min(runs) * channel_bit, max(runs) * channel_bit
@@ -85,10 +82,10 @@ def draw_tracks(
         radius = np.hypot(along[:, None], across[mine])
         heights[:, mine] = np.clip(0.5 + (width / 2 - radius) / _WALL, 0, 1)
     return HeightField(
-        heights * index * depth,
+        heights * depth,
         (size[0] / columns, size[1] / rows),
         f"{name}, {tracks} tracks of {period:g} µm along x, pits {width:g} µm wide and {depth:g} µm deep seen through "
-        f"n = {index:g}, seed {seed}",
+        f"seed {seed}",
     )
 
 
