@@ -1,4 +1,4 @@
-"""Periods and directions of a height field, with their uncertainties, found from its power spectrum."""
+"""Periods and directions of a height field, and their uncertainties, from its power spectrum."""
 
 from __future__ import annotations
 
@@ -14,43 +14,43 @@ from .heightfield import HeightField
 from .missing import fill_missing
 
 _FEWEST = 2.0
-"""Waves that a patch must hold along its diagonal of frequencies for their length to be told."""
+"""Fewest periods across a patch that determine their length."""
 
 _LEAST_ANGLE = 15.0
-"""Degrees between two waves; closer ones are one period that wanders, or its harmonics."""
+"""Least angle between two waves, degrees; closer ones are one drifting period, or its harmonics."""
 
 _FALSE_ALARM = 1e-4
-"""Chance that noise alone shows a period."""
+"""Probability of a false detection in noise."""
 
 _RING = 24
-"""Fewest frequencies that the background is the lower quartile of."""
+"""Fewest frequencies from which the lower quartile, i.e. the background, is estimated."""
 
 _LEAST_STRENGTH = 1e-3
-"""Share of the variance that a wave must hold: an instrument hums, too."""
+"""Least fraction of the variance of a wave, to exclude hum of the instrument."""
 
 _ROUNDING = 1e-20
-"""Of the greatest power; a wave of `_LEAST_STRENGTH` is far above, what rounding of the transform leaves far below."""
+"""Relative to the largest power: far below a wave of `_LEAST_STRENGTH`, far above rounding errors."""
 
 _MOST_MAXIMA = 200
-"""Local maxima that are looked at."""
+"""Local maxima considered."""
 
 _LOBE = 3
-"""Bins about a peak where its own light falls: the window spreads a wave over two, a wandering one over more."""
+"""Half width of a peak in bins: two owing to the window, more if the period drifts."""
 
 
 @dataclass(frozen=True)
 class Period:
-    """One period of a height field, or the centre of a band of periods, with standard uncertainties (one deviation).
+    """A period of a height field, or the centre of a band of periods, with standard uncertainties.
 
     Attributes:
-        period: µm, across the lines.
+        period: µm, perpendicular to the lines.
         direction: degrees of the wave vector from +x towards +y, in (−90, 90].
         period_uncertainty: µm.
         direction_uncertainty: degrees.
-        strength: share of the variance of the levelled heights in this one wave, whose harmonics are not counted, or
-            in the whole band.
+        strength: fraction of the variance of the levelled heights in this wave, without harmonics, or in the whole
+            band.
         width: standard deviation of the periods of a band about its centre, µm; 0 for a single period.
-        direction_width: likewise of their directions, degrees.
+        direction_width: the same for their directions, degrees.
     """
 
     period: float
@@ -92,38 +92,37 @@ class Period:
 def find_periods(height_field: HeightField, count: int = 2) -> tuple[Period, ...]:
     """The strongest periods of a height field.
 
-    A wave is taken where the power of the levelled and windowed (Hann) heights stands so far above the background that
-    noise about a background known exactly would rise there once in ten thousand height fields (with the background as
-    it is told here, white noise did in one of 300). The background is told by the greatest of three lower quartiles:
-    over the frequencies of about the same length, and along the row and the column of the frequency, for the streaks of
-    a scan. If a wave of two or three times the period stands out too, or is stronger, it is the period, and the first
-    wave its harmonic.
+    A wave is detected where the power of the levelled and windowed (Hann) heights exceeds the background by a factor
+    that noise on an exactly known background would exceed in one of ten thousand height fields (with the background
+    estimated as here, white noise did in one of 300). The background is estimated by the largest of three lower
+    quartiles: over frequencies of similar magnitude, and along the row and the column of the frequency, because of the
+    streaks of a scan. If a wave of two or three times the period is also significant, or stronger, it is the period,
+    and the first wave its harmonic.
 
-    The waves are then fitted together, by weighted least squares for their complex amplitudes c and, by Gauss–Newton
-    steps, their frequencies q, beside a surface of second order:
+    The waves are then fitted jointly, together with a quadratic surface p: by weighted least squares for their complex
+    amplitudes c, and by Gauss–Newton steps for their frequencies q,
 
         h(x) ≈ p(x) + Re Σ_k c_k e^{2πi q_k·x},    weights: the window
 
-    With n(q) the power density of the residual about q, the covariance of the estimate is (XᴴWX)⁻¹ XᴴW²X (XᴴWX)⁻¹ n,
-    X the derivatives of the model; for one wave in white noise and without a window this is the bound of Cramér and
-    Rao (Rife and Boorstyn 1974, "Single-tone parameter estimation from discrete-time observations", IEEE Transactions
+    With n(q) the power density of the residual around q and X the derivatives of the model, the covariance of the
+    estimate is (XᴴWX)⁻¹ XᴴW²X (XᴴWX)⁻¹ n; for one wave in white noise without a window this is the Cramér–Rao bound
+    (Rife and Boorstyn 1974, "Single-tone parameter estimation from discrete-time observations", IEEE Transactions
     on Information Theory 20(5), 591–598, equation 22), var q = 6 n/(π² |c|² T²) along a side of length T.
 
-    A wave that wanders over the patch, as the fingers of a skin do, is less certain than noise makes it. Fitted to the
-    halves of a line, or the quarters of a patch, q would scatter by noise so that their mean has four times that
-    covariance (each of two halves has eight times, each of four quarters sixteen times). What their mean has beyond
-    that is added.
+    If a period drifts over the patch, like the fingers of a skin, its uncertainty is larger. Fits to the halves of a
+    line, or to the quarters of a patch, scatter owing to noise such that their mean has four times that covariance
+    (eight times for each of two halves, sixteen times for each of four quarters). The excess over that is added.
 
-    A peak that is broader than a bin of the spectrum is no wave but a band of periods: its centre, width and share are
-    fitted to all bins (`bands`), and the scatter of the centre over the quarters of the patch is added in the same way.
+    A peak broader than a bin of the spectrum is a band of periods: its centre, width and strength are fitted to all
+    bins (`bands`), and the scatter of the centre over the quarters of the patch is added in the same way.
 
     Args:
-        height_field: missing pixels are filled first. It needs no levelling.
-        count: how many periods at most.
+        height_field: need not be levelled; missing pixels are filled first.
+        count: largest number of periods.
 
     Returns:
-        Single periods, strongest first, then bands, strongest first; at least 15° between the directions. Empty where
-        nothing stands out (noise, a flat surface).
+        Single periods, strongest first, then bands, strongest first, with directions at least 15° apart. Empty if none
+        is significant (noise, a flat surface).
 
     Raises:
         ValueError: if count is not a positive integer.
@@ -132,7 +131,7 @@ def find_periods(height_field: HeightField, count: int = 2) -> tuple[Period, ...
         raise ValueError(f"count: got {count!r}, wanted a positive integer")
     heights = fill_missing(height_field.heights, height_field.pixel_size)
     spectrum = _Spectrum(heights, height_field.pixel_size)
-    if not spectrum.scale > 1e-13 * np.abs(heights).max():  # level but for rounding
+    if not spectrum.scale > 1e-13 * np.abs(heights).max():  # flat up to rounding
         return ()
     waves, bands = spectrum.peaks(int(count))
     found = [*spectrum.fit(waves), *(spectrum.band(band) for band in bands)]
@@ -140,7 +139,7 @@ def find_periods(height_field: HeightField, count: int = 2) -> tuple[Period, ...
 
 
 class _Spectrum:
-    """The power spectrum of heights that are levelled to second order, under a Hann window."""
+    """The power spectrum of heights levelled to second order, under a Hann window."""
 
     def __init__(self, heights: NDArray[np.float64], pixel_size: tuple[float, float]) -> None:
         rows, columns = heights.shape

@@ -24,12 +24,12 @@ def dvd(
     pixel_size: float = 0.0625,
     seed: int = 0,
 ) -> HeightField:
-    """The reflecting layer of a DVD, as light sees it through the polycarbonate.
+    """The reflecting layer of a DVD, as seen through the polycarbonate.
 
     As `compact_disc`, with the numbers of ECMA-267 (one layer): a track pitch of 0.74 µm, channel bits of 133.3 nm,
     pits and lands of 3 to 11 of them and 14 in sync codes, so 0.40 to 1.87 µm, read at 650 nm (λ/4n = 0.105 µm). The
-    pits' width is usual, not prescribed. What `compact_disc` says of optical depths holds here, too. The period is
-    about a wavelength: the directions of the orders are right, their powers only roughly.
+    width of the pits is typical, not specified. Heights are optical depths, as for `compact_disc`. As the period is
+    about a wavelength, the directions of the orders are exact, but their efficiencies approximate.
 
     Args, Returns, Raises: those of `compact_disc`.
     """
