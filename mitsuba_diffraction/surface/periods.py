@@ -180,7 +180,7 @@ class _Spectrum:
         return waves, bands
 
     def _alone(self, q: NDArray[np.float64]) -> bool:
-        """Whether a peak's own lobe holds nearly all the power within half an octave and 45° of it."""
+        """Whether the lobe of a peak holds nearly all power within half an octave and 45°."""
         q_x, q_y = np.meshgrid(*self._q)
         octaves = np.abs(np.log2(np.maximum(np.hypot(q_x, q_y), 1e-300) / np.hypot(*q)))
         along, across = q_x * q[0] + q_y * q[1], q_y * q[0] - q_x * q[1]
@@ -193,7 +193,7 @@ class _Spectrum:
 
     @cached_property
     def _usable(self) -> NDArray[np.bool_]:
-        """One of q and −q, where the patch holds enough waves."""
+        """Mask: one of q and −q, if the patch holds enough periods."""
         q_x, q_y = np.meshgrid(*self._q)
         waves = np.hypot(q_x * self._size[0], q_y * self._size[1])
         return ((q_x > 0) | ((q_x == 0) & (q_y > 0))) & (waves >= _FEWEST - 1e-9)
@@ -207,25 +207,25 @@ class _Spectrum:
 
     @cached_property
     def _candidates(self) -> list[tuple[int, int]]:
-        """The local maxima that stand out of the background."""
+        """The local maxima significantly above the background."""
         power, usable = self._power, self._usable
         if not usable.any():
             return []
-        # Of noise, a power is distributed as an exponential about its mean, which is the quartile over ln 4/3.
+        # The power of noise is exponentially distributed; its mean is the lower quartile divided by ln 4/3.
         level = np.log(usable.sum() / _FALSE_ALARM) / np.log(4 / 3)
         background = self._rings
-        # About a wave without noise there is nothing but rounding.
+        # Around a noise-free wave there are only rounding errors.
         least = _ROUNDING * power[usable].max()
         return [p for p in self._maxima if power[p] > max(least, level * max(background[p], self._streak(*p)))]
 
     @cached_property
     def _rings(self) -> NDArray[np.float64]:
-        """The lower quartile of the power over frequencies of about the same length, by power laws between rings."""
+        """The lower quartile of the power over frequencies of similar magnitude, by power laws between rings."""
         usable, length = self._usable, np.hypot(*np.meshgrid(*self._q))
         lengths, powers = length[usable], self._power[usable]
         order = np.argsort(lengths, kind="stable")
         rings = max(1, len(order) // _RING)
-        # Rings as wide as a bin, or wider, so that each holds enough frequencies.
+        # Rings at least one bin wide, with enough frequencies in each.
         label = np.floor(lengths * self._size.max()).astype(int)[order]
         label = np.minimum(label - label[0], np.arange(len(order)) * rings // len(order))
         label = np.searchsorted(np.unique(label), label)
@@ -237,7 +237,7 @@ class _Spectrum:
         return background
 
     def _streak(self, row: int, column: int) -> float:
-        """The greater quartile of the power along the row and along the column of a frequency, beside its own lobe."""
+        """The larger of the lower quartiles along the row and the column of a frequency, excluding its lobe."""
         quartiles = [0.0]
         for line, place in ((self._power[row], column), (self._power[:, column], row)):
             reach = min(12, (len(line) - 1) // 2)
@@ -247,7 +247,7 @@ class _Spectrum:
         return max(quartiles)
 
     def _fundamental(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The longest wave, as strong as q or standing out, that has q as its third or second harmonic, else q."""
+        """The longest wave of which q is the third or second harmonic, if significant or as strong as q; else q."""
         column, row = (np.rint(q * self._size).astype(int)).tolist()
         power = self._power[row, column]
         for order in (3, 2):
@@ -256,7 +256,7 @@ class _Spectrum:
                 if self._power[row, column] < power and (row, column) not in self._candidates:
                     continue
                 for signed in (other, -other):
-                    # A harmonic is known to half a bin, so its fundamental is nearer than one.
+                    # A harmonic is known to half a bin, its fundamental to less than one.
                     if (np.abs((signed - q / order) * self._size) <= 1).all():
                         return signed
         return q
@@ -264,11 +264,11 @@ class _Spectrum:
     # ------------------------------------------------------------ fit
 
     def fit(self, waves: list[NDArray[np.float64]]) -> list[Period]:
-        """The waves by least squares, from the frequencies of their bins."""
+        """The waves by least squares, starting from the frequencies of their bins."""
         whole = _Waves(self._heights, self._x, self._y, degree=2)
         while waves:
             q = whole.frequencies(np.array(waves))
-            # What goes further from its peak is no wave: half of one fits a single bump of the patch.
+            # If it moves further from its peak, it is not a wave: half a period also fits a single bump.
             near = (np.abs((q - waves) * self._size) <= 1).all(axis=1)
             if near.all():
                 break
@@ -284,7 +284,7 @@ class _Spectrum:
         return [period for period in found if period.strength >= _LEAST_STRENGTH]
 
     def band(self, band: Band) -> Period:
-        """The period of a band, its uncertainty with that of the mean of the quarters' centres beyond noise."""
+        """The period of a band; its uncertainty includes the excess scatter of the quarters."""
         found, expected = [], []
         for r in _halves(self._heights.shape[0]):
             for c in _halves(self._heights.shape[1]):
@@ -296,7 +296,7 @@ class _Spectrum:
         return Period.of_band(band, band.covariance + _beyond(np.array(found), np.mean(expected, axis=0) / len(found)))
 
     def _wander(self, q: NDArray[np.float64], expected: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The covariance of the mean frequency of the halves or quarters of the patch, beyond that of noise."""
+        """The covariance of the mean frequency of the halves or quarters of the patch, in excess of noise."""
         if np.hypot(*(q * self._size)) < 2 * _FEWEST:
             return np.zeros((2, 2))
         rows, columns = (_halves(count) for count in self._heights.shape)
@@ -311,7 +311,7 @@ class _Spectrum:
 
 
 class _Waves:
-    """The model p(x) + Re Σ_k c_k e^{2πi q_k·x} of some heights, under their own Hann window."""
+    """The model p(x) + Re Σ_k c_k e^{2πi q_k·x} of heights under a Hann window."""
 
     def __init__(self, heights: NDArray[np.float64], x: NDArray, y: NDArray, degree: int) -> None:
         self._heights = heights
@@ -321,10 +321,10 @@ class _Waves:
         self._polynomials = _polynomials(self._x, self._y, degree)
 
     def frequencies(self, q: NDArray[np.float64], bins: float = 1e-7) -> NDArray[np.float64]:
-        """The q that fit best, (k, 2), from these, until a step is less than `bins`."""
+        """The best q, (k, 2), from these starting points, until a step is less than `bins`."""
         for _ in range(20):
             amplitude, slope = self._amplitudes(self._model(q).solve(self._heights))
-            # c e^{2πi(q + δ)·x} ≈ (c + 2πi c δ·x) e^{2πi q·x}; where there is no wave at all, c = 0, q stays.
+            # c e^{2πi(q + δ)·x} ≈ (c + 2πi c δ·x) e^{2πi q·x}; without a wave, c = 0, q is unchanged.
             step = np.real(slope * np.conj(2j * np.pi * amplitude[:, None]))
             step /= np.maximum(np.abs(2 * np.pi * amplitude[:, None]) ** 2, 1e-300)
             step = np.clip(step, -0.5 / self._size, 0.5 / self._size)
@@ -334,7 +334,7 @@ class _Waves:
         return q
 
     def amplitudes(self, q: NDArray[np.float64]) -> tuple[NDArray, NDArray[np.float64], float]:
-        """c, (k,), the covariance of each q under the noise about it, (k, 2, 2), and the variance of h − p."""
+        """c, (k,), the covariance of each q given the noise around it, (k, 2, 2), and the variance of h − p."""
         model = self._model(q)
         coefficients = model.solve(self._heights)
         amplitude, _ = self._amplitudes(coefficients)
@@ -353,7 +353,7 @@ class _Waves:
         return amplitude, np.array(spread), float((self._heights - model.evaluate(surface)).var())
 
     def _model(self, q: NDArray[np.float64]) -> _LeastSquares:
-        """The polynomials, and of each wave e, xe, ye with e = e^{2πi q·x}/2, and their conjugates."""
+        """The polynomials, and for each wave e, xe, ye with e = e^{2πi q·x}/2, and their conjugates."""
         basis = list(self._polynomials)
         for wave in q:
             x, y = np.exp(2j * np.pi * wave[0] * self._x), np.exp(2j * np.pi * wave[1] * self._y)
@@ -367,7 +367,7 @@ class _Waves:
         return table[:, 0], table[:, 1:3]
 
     def _density(self, residual: NDArray[np.float64], q: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The variance per pixel of the white noise that has the power density of the residual about each q, (k,)."""
+        """The variance per pixel of white noise with the power density of the residual around each q, (k,)."""
         weight = np.outer(self._window[1], self._window[0])
         power = np.abs(np.fft.fft2(weight * residual)) ** 2 / np.sum(weight**2)
         rows, columns = residual.shape
@@ -376,13 +376,13 @@ class _Waves:
         for wave in q * self._size:
             away = np.hypot(bins_x - wave[0], bins_y - wave[1])
             near = away <= _LOBE
-            # The fit took away what looks like the wave, nearest to it: the greater of two means.
+            # The fit reduces the residual close to the wave: the larger of two means.
             densities.append(max(power[near].mean(), power[near & (away > 1)].mean()))
         return np.array(densities)
 
 
 class _LeastSquares:
-    """Weighted least squares in functions that are products f(x) g(y), weights u(x) v(y): all sums are products too."""
+    """Weighted least squares with separable functions f(x) g(y) and weights u(x) v(y): all sums are separable."""
 
     def __init__(self, basis: list[tuple[NDArray, NDArray]], window: tuple[NDArray, NDArray]) -> None:
         self._along_x = np.array([f for f, _ in basis])
@@ -405,16 +405,16 @@ class _LeastSquares:
         return np.real((self._along_y.T * coefficients) @ self._along_x)
 
     def fit(self, heights: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The model of these heights."""
+        """The model of the heights."""
         return self.evaluate(self.solve(heights))
 
     def covariance(self) -> NDArray:
-        """Of the coefficients, under white noise of variance one."""
+        """Covariance of the coefficients for white noise of variance one."""
         return self._inverse @ self._gram(2) @ self._inverse
 
 
 def _beyond(found: NDArray[np.float64], expected: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The covariance of the mean of estimates (n, 2) by their scatter, beyond that which is expected of noise."""
+    """The covariance of the mean of estimates (n, 2) from their scatter, in excess of that expected from noise."""
     if len(found) == 1:
         return np.zeros((2, 2))
     scatter = (found - found.mean(axis=0)).T @ (found - found.mean(axis=0)) / len(found) / (len(found) - 1)
@@ -427,13 +427,13 @@ def _unit(phi: float) -> NDArray[np.float64]:
 
 
 def _as_direction(phi: float) -> float:
-    """Degrees in (−90, 90]; what is −90 but for rounding is 90."""
+    """Degrees in (−90, 90]; −90 up to rounding becomes 90."""
     degrees = float(np.degrees(phi))
     return min(float(degrees - 180 * np.ceil((degrees - 90) / 180 - 1e-12)), 90.0)
 
 
 def _polynomials(x: NDArray, y: NDArray, degree: int) -> list[tuple[NDArray, NDArray]]:
-    """1, x, y, x², xy, y² … as functions of x and of y to multiply; without those that too few points would tell."""
+    """1, x, y, x², xy, y² … as pairs of factors in x and y, as far as the points determine them."""
     x, y = (v / max(np.abs(v).max(), 1e-300) for v in (x, y))
     powers = [(i, j) for i in range(degree + 1) for j in range(degree + 1 - i) if i < len(x) and j < len(y)]
     return [(x**i, y**j) for i, j in powers]
@@ -444,24 +444,24 @@ def _halves(count: int) -> list[slice]:
 
 
 def _length(places: NDArray[np.float64]) -> float:
-    """Of a row of pixels, from their middles; any length for one pixel, which has no frequency."""
+    """Length of a row of pixels from their positions; arbitrary for one pixel, which has no frequency."""
     return float(len(places) * (places[1] - places[0])) if len(places) > 1 else 1.0
 
 
 def _hann(count: int) -> NDArray[np.float64]:
-    """Hann's window between, not at, its zeros; one where there is one pixel."""
+    """Hann window without its zeros; one for a single pixel."""
     return np.sin(np.pi * (np.arange(count) + 0.5) / count) ** 2
 
 
 def _quartiles(values: NDArray[np.float64], counts: NDArray[np.intp]) -> NDArray[np.float64]:
-    """The lower quartile of each run of values, of these lengths."""
+    """The lower quartile of consecutive runs of values of these lengths."""
     label = np.repeat(np.arange(len(counts)), counts)
     ordered = values[np.lexsort((values, label))]
     return ordered[np.cumsum(counts) - counts + (counts - 1) // 4]
 
 
 def _power_law(x: NDArray, points: NDArray, values: NDArray) -> NDArray[np.float64]:
-    """Interpolation that is linear in the logarithms; before the first point it goes on as it begins."""
+    """Linear interpolation of the logarithms, extrapolated before the first point."""
     x, points, values = np.log(x), np.log(points), np.log(values)
     if len(points) > 1:
         slope = min((values[1] - values[0]) / (points[1] - points[0]), 0.0)
@@ -471,5 +471,5 @@ def _power_law(x: NDArray, points: NDArray, values: NDArray) -> NDArray[np.float
 
 
 def _angle(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
-    """Between two waves, of which either may be turned round; degrees in [0, 90]."""
+    """Angle between two waves irrespective of their sign, degrees in [0, 90]."""
     return float(np.degrees(np.arctan2(abs(one[0] * other[1] - one[1] * other[0]), abs(one @ other))))

@@ -1,4 +1,4 @@
-"""What all profiles ask of their arguments."""
+"""Checks of the arguments of all profiles."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from numbers import Integral, Real
 import numpy as np
 
 MOST_PIXELS = 2**26
-"""Of a profile: half a gigabyte of heights."""
+"""Largest profile: half a gigabyte of heights."""
 
 
 def check_pixels(columns: float, rows: float) -> None:
-    """Refuses a patch before memory is asked for it."""
+    """Refuses a patch before its memory is allocated."""
     if not columns * rows <= MOST_PIXELS:
         raise ValueError(f"got a patch of {columns:.4g} × {rows:.4g} pixels, wanted at most {MOST_PIXELS} in all")
 

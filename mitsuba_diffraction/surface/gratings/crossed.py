@@ -1,4 +1,4 @@
-"""Crossed grating: two sinusoids at right angles."""
+"""Crossed grating: two perpendicular sinusoids."""
 
 from __future__ import annotations
 

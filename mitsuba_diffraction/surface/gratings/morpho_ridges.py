@@ -47,7 +47,7 @@ def morpho_ridges(
         raise ValueError(f"width: got {width!r} µm, wanted less than the period, {period:g}")
     rng = generator(seed)
     canvas = Canvas(size, pixel_size, pitch=(period, period), axis=0)
-    # Every ridge has a height of its own and rises and falls along it, where one lamella ends and the next begins.
+    # The height differs between ridges and varies along each, where one lamella ends and the next begins.
     uneven = canvas.noise(rng, 0.0, 1.0)
     x = (np.arange(canvas.heights.shape[1]) + 0.5) * canvas.pixel[0]
     for centre, offset in zip(canvas.places(0), rng.normal(0, 0.15, canvas.count[0]), strict=True):
