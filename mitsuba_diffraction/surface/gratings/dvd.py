@@ -27,8 +27,8 @@ def dvd(
 
     As `compact_disc`, with the numbers of ECMA-267 (one layer): a track pitch of 0.74 µm, channel bits of 133.3 nm,
     pits and lands of 3 to 11 of them and 14 in sync codes, so 0.40 to 1.87 µm, read at 650 nm (λ/4n = 0.105 µm). The
-    pits' width is usual, not prescribed. What `compact_disc` says of the layer holds here, too. The period is
-    about a wavelength: the directions of the orders are right, their powers only roughly.
+    width of the pits is typical, not specified. What `compact_disc` says of the layer holds here, too. As the period is
+    about a wavelength, the directions of the orders are exact, but their efficiencies approximate.
 
     Args, Returns, Raises: those of `compact_disc`.
     """
