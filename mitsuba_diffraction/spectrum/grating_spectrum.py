@@ -17,6 +17,7 @@ from ..coherence import lobe_reach, lobe_width
 from .albedo import GatheredSpectrum, energy_table
 from .energy_table import EnergyTable
 from .file import load, save
+from .furnace import conserving
 from .orders import OrderGrid
 from .series_table import SeriesTable
 from .slice_table import SliceTable
@@ -172,7 +173,7 @@ class GratingSpectrum:
         """
         with _computing:
             if shadowing not in self._energy:
-                self._energy[shadowing] = energy_table(GatheredSpectrum.of(self), shadowing)
+                self._energy[shadowing] = conserving(self, energy_table(GatheredSpectrum.of(self), shadowing))
             return self._energy[shadowing]
 
     @cached_property
