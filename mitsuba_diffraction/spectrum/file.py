@@ -24,7 +24,7 @@ import OpenEXR
 from ..errors import RequestError
 from ..files import UNSEALED, is_intact, seal, whole_file
 from ..outputs import made_for
-from .energy_table import SHADOWING, EnergyTable
+from .energy_table import EnergyTable
 from .expansions.chebyshev import ChebyshevSeries
 from .expansions.svd import SvdSeries
 from .expansions.taylor import TaylorSeries
@@ -95,7 +95,8 @@ def save(spectrum: GratingSpectrum, path: str | os.PathLike[str], recipe: str = 
     if isinstance(spectrum.table, SeriesTable) and isinstance(spectrum.table.series, SvdSeries):
         # repr of a float is exact.
         header["modes"] = json.dumps(spectrum.table.series.modes.tolist())
-    header["energy"] = json.dumps({kind: spectrum.energy_table(kind).as_plain() for kind in SHADOWING})
+    # Scenes seldom ask for the other kind.
+    header["energy"] = json.dumps({"v_cavity": spectrum.energy_table("v_cavity").as_plain()})
     channels = _channels(spectrum.table)
     header["channelCount"] = len(channels)
     with whole_file(path) as temporary:

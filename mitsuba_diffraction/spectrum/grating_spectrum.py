@@ -18,6 +18,7 @@ from ..errors import RequestError
 from .albedo import GatheredSpectrum, energy_table
 from .energy_table import EnergyTable
 from .file import load, save
+from .furnace import conserving
 from .orders import OrderGrid
 from .series_table import SeriesTable
 from .slice_table import SliceTable
@@ -175,7 +176,7 @@ class GratingSpectrum:
         """
         with _computing:
             if shadowing not in self._energy:
-                self._energy[shadowing] = energy_table(GatheredSpectrum.of(self), shadowing)
+                self._energy[shadowing] = conserving(self, energy_table(GatheredSpectrum.of(self), shadowing))
             return self._energy[shadowing]
 
     @cached_property
