@@ -1,13 +1,13 @@
-"""Spectra to colours: spectral radiance → CIE XYZ → linear sRGB → a picture for the screen.
+"""Spectra to colours: spectral radiance → CIE XYZ → linear sRGB → display.
 
 Observer: CIE 1931, 2°. Primaries and white point (D65) of sRGB (IEC 61966-2-1). All tables come from colour-science.
 
 Scale: XYZ is divided by the Y of a flat spectrum of one, ∫ȳ dλ = 106.857 nm, so that a constant 1 W m⁻² sr⁻¹ nm⁻¹ has
-luminance 1. This is also what Mitsuba's own RGB film does. There is no chromatic adaptation: a flat spectrum looks
-slightly pink beside D65.
+luminance 1, as in Mitsuba's RGB film. There is no chromatic adaptation: a flat spectrum is slightly pink relative to
+D65.
 
-colour-science takes about a second to import, longer than a small rendering; therefore it is imported by the functions
-that use it, when they are called.
+colour-science is imported inside the functions that use it, because the import takes about a second, longer than a
+small rendering.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _OBSERVER = "CIE 1931 2 Degree Standard Observer"
 
 @lru_cache(maxsize=8)
 def _xyz_matrix(wavelengths: tuple[float, ...]) -> NDArray[np.float64]:
-    """The matrix m of `spectrum_to_XYZ`, (n, 3); see there."""
+    """The matrix m of `spectrum_to_XYZ`, (n, 3)."""
     import colour
 
     centres = np.asarray(wavelengths)
@@ -49,9 +49,9 @@ def spectrum_to_XYZ(radiance: ArrayLike, wavelengths: ArrayLike) -> NDArray[np.f
     """CIE 1931 XYZ of spectra.
 
     A channel i of a spectral image is L_i = ∫ L(λ) t_i(λ) dλ with a hat t_i of unit area around λ_i. Colour is
-    X = ∫ L(λ) x̄(λ) dλ. If x̄ = Σ_i m_i t_i, then X = Σ_i m_i L_i for every spectrum, be it smooth or a single line; so
-    m is the least-squares fit of the matching function by the hats. With steps of 5 nm the fit misses x̄, ȳ and z̄ by
-    0.002, 0.002 and 0.01 at most. (Taking x̄(λ_i) Δλ for m_i instead makes ten times the error for narrow lines.)
+    X = ∫ L(λ) x̄(λ) dλ. If x̄ = Σ_i m_i t_i, then X = Σ_i m_i L_i for any spectrum, smooth or a single line; m is
+    therefore the least-squares fit of the matching function by the hats. At a spacing of 5 nm the largest residuals of
+    x̄, ȳ and z̄ are 0.002, 0.002 and 0.01. (With m_i = x̄(λ_i) Δλ, the error for narrow lines is ten times larger.)
 
     Args:
         radiance: (..., n), W m⁻² sr⁻¹ nm⁻¹.
@@ -61,7 +61,7 @@ def spectrum_to_XYZ(radiance: ArrayLike, wavelengths: ArrayLike) -> NDArray[np.f
         (..., 3); Y = 1 for a constant spectrum of one.
 
     Raises:
-        ValueError: if the wavelengths are not such a grid, or the shapes disagree.
+        ValueError: if the wavelengths are not equally spaced, or the shapes do not match.
     """
     radiance = np.asarray(radiance)
     wavelengths = np.asarray(wavelengths, dtype=np.float64)
@@ -73,7 +73,7 @@ def spectrum_to_XYZ(radiance: ArrayLike, wavelengths: ArrayLike) -> NDArray[np.f
 
 
 def spectrum_to_linear_sRGB(radiance: ArrayLike, wavelengths: ArrayLike) -> NDArray[np.float64]:
-    """Linear sRGB of spectra: (..., n) → (..., 3). Colours outside the gamut have negative parts.
+    """Linear sRGB of spectra: (..., n) → (..., 3). Colours outside the gamut have negative components.
 
     Arguments and errors are those of `spectrum_to_XYZ`.
     """
@@ -81,14 +81,14 @@ def spectrum_to_linear_sRGB(radiance: ArrayLike, wavelengths: ArrayLike) -> NDAr
 
 
 def XYZ_to_linear_sRGB(XYZ: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Linear sRGB of XYZ, (..., 3) each; negative parts outside the gamut."""
+    """Linear sRGB of XYZ, (..., 3) each; negative components outside the gamut."""
     import colour
 
     return XYZ @ colour.RGB_COLOURSPACES["sRGB"].matrix_XYZ_to_RGB.T
 
 
 def delta_E(XYZ_1: ArrayLike, XYZ_2: ArrayLike) -> NDArray[np.float64]:
-    """The colour difference CIEDE2000 (CIE 142, ISO/CIE 11664-6) to an eye that takes D65 with Y = 1 for white.
+    """The colour difference CIEDE2000 (CIE 142, ISO/CIE 11664-6) relative to D65 with Y = 1.
 
     Args:
         XYZ_1: (..., 3).
@@ -104,7 +104,7 @@ def delta_E(XYZ_1: ArrayLike, XYZ_2: ArrayLike) -> NDArray[np.float64]:
 
 
 def daylight(wavelengths: ArrayLike) -> NDArray[np.float64]:
-    """The illuminant D65 (CIE 15:2018) relative to its value at 560 nm, linear between the values of its table.
+    """The illuminant D65 (CIE 15:2018) relative to its value at 560 nm, linearly interpolated.
 
     Args:
         wavelengths: (n,), nm.
@@ -119,12 +119,11 @@ def daylight(wavelengths: ArrayLike) -> NDArray[np.float64]:
 
 
 def into_gamut(rgb: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Mixes colours that sRGB cannot show with the grey of the same luminance, until no part is negative.
+    """Desaturates colours outside the sRGB gamut towards the grey of equal luminance, until no component is negative.
 
-    c' = Y + t (c − Y), with the largest t ≤ 1 for which min(c') ≥ 0. Luminance is kept exactly and hue nearly (lines of
-    one dominant wavelength are straight in XYZ). Cutting each channel off at zero would instead brighten every spectral
-    colour, most of all cyan and violet. Where the luminance itself is not positive, or a value is not a number, the
-    result is black.
+    c' = Y + t (c − Y), with the largest t ≤ 1 for which min(c') ≥ 0. Luminance is preserved, and so is the dominant
+    wavelength. Clamping each channel at zero would instead brighten spectral colours, above all cyan and violet. The
+    result is black where the luminance is not positive or a value is NaN.
 
     Args:
         rgb: (..., 3), linear sRGB.
@@ -144,16 +143,15 @@ def into_gamut(rgb: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 _SHOULDER_START = 0.8
-_WHITENING = 0.15  # how fast: with this, a pixel ten times too bright is mixed to 58 %
+_WHITENING = 0.15  # a pixel ten times too bright is desaturated by 58 %
 
 
 def roll_off(rgb: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Compresses highlights into [0, 1] without turning their hue.
+    """Compresses highlights into [0, 1] without a shift of hue.
 
-    The brightest channel p of a pixel stays as it is up to 0.8 and then follows 1 − d²/(p + d − 0.8), d = 0.2, which
-    is smooth and reaches 1 at infinity; the other channels are scaled alike. What was very bright is then mixed towards
-    white, as film and eyes do. This is the Khronos PBR Neutral tone mapper (Khronos Group, 2024) without its toe, which
-    belongs to dielectric surfaces.
+    The brightest channel p of a pixel is unchanged up to 0.8 and beyond follows 1 − d²/(p + d − 0.8), d = 0.2, which is
+    smooth and tends to 1; the other channels are scaled equally. Very bright pixels are then desaturated. This is the
+    Khronos PBR Neutral tone mapper (Khronos Group, 2024) without its toe, which applies to dielectric surfaces.
 
     Args:
         rgb: (..., 3), linear sRGB, not negative.
@@ -171,11 +169,11 @@ def roll_off(rgb: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def auto_exposure(rgb: NDArray[np.floating]) -> float:
-    """The factor that makes a picture neither dark nor burnt.
+    """Automatic exposure.
 
-    It brings the 97th percentile of the brightest channel, over the lit pixels, to one. A lit pixel is one above a
-    thousandth of the 99th percentile, so that neither a black background nor a few pixels of a lamp or of noise decide.
-    The brightest channel is taken rather than luminance, which is small for saturated blue and red.
+    Scales the 97th percentile of the brightest channel over the lit pixels to one. A pixel is lit if it exceeds a
+    thousandth of the 99th percentile, which makes the result robust against a black background, visible lamps and
+    fireflies. The brightest channel is used because the luminance of saturated blue and red is small.
 
     Args:
         rgb: (..., 3), linear sRGB, not negative.
@@ -192,7 +190,7 @@ def auto_exposure(rgb: NDArray[np.floating]) -> float:
 
 
 def on_screen(rgb: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """Exposed linear sRGB without negative parts → `roll_off` → sRGB's transfer function, in 8 bits."""
+    """Exposed, non-negative linear sRGB → `roll_off` → transfer function of sRGB, 8 bits."""
     import colour
 
     shown = colour.cctf_encoding(roll_off(rgb), function="sRGB")

@@ -71,8 +71,7 @@ def claimed(
         marks[real] = _mark(option, request, real.parent)
         if os.path.exists(path) and not overwrite and not _carries(real, marks[real]):
             raise RequestError(
-                f"{option}: {path} is there, and this command with these options did not make it; "
-                "--overwrite replaces it, another name keeps it"
+                f"{option}: {path} exists and was not made by this command with these options; --overwrite replaces it"
             )
     before = dict(_claims)
     _claims.update(marks)

@@ -28,7 +28,7 @@ coherence_length = 65.0          # µm
 wavelengths = [360.0, 830.0]     # nm
 largest_angle = 90.0             # degrees from the normal
 representation = "auto"
-tolerance = 1e-3
+tolerance = 1e-3                 # of a sample by default a tenth of its standard error, 1e-3 to 1e-2
 largest_height_range = 20.0      # µm; deeper surfaces are refused
 """
 
@@ -71,7 +71,7 @@ _SPECTRUM_KEYS = frozenset(
     }
 )
 # Incremented when the same input gives a different result, to invalidate the cache.
-_BUILD_VERSION = 4
+_BUILD_VERSION = 5
 # Mitsuba constructs plugins in parallel; two with the same recipe must not both compute its spectrum.
 _building = threading.Lock()
 # Spectra in use, by the digest of their recipe: many BSDFs of one recipe read its file once.

@@ -1,6 +1,6 @@
-"""The power spectrum of the phase in float64, by direct evaluation: slow, exact, no tables.
+"""Reference: the power spectrum of the phase by direct summation in float64, without tables.
 
-Everything else in this package is measured against this file.
+All other evaluations are measured against it.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def amplitudes(height_field: HeightField, kappa: float) -> NDArray[np.complex128
 
 
 def order_powers(height_field: HeightField, kappa: float) -> NDArray[np.float64]:
-    """η_m(κ) = |F_m|²: the share of the reflected power in each order; shape and order as `amplitudes`."""
+    """η_m(κ) = |F_m|²: the fraction of the reflected power in each order; layout as `amplitudes`."""
     return np.abs(amplitudes(height_field, kappa)) ** 2
 
 
@@ -50,23 +50,23 @@ def power_spectrum(
     extent: str = "tile",
     coherence_length: float = SUN_COHERENCE_LENGTH,
 ) -> NDArray[np.float64]:
-    """S(q; κ), the density over the frequency plane of the power that a patch reflects.
+    """S(q; κ), the power reflected by a patch per unit area of the frequency plane.
 
-    A "tile" repeats for ever, a line spectrum:
+    A "tile" is periodic and has a line spectrum:
 
         S(q; κ) = Σ_m η_m(κ) N(q − m/T; σ_q² I),     ∫ S dq = 1.
 
-    A "sample" is a piece of a larger, irregular surface (Welch 1967), averaged over P places x_p of a window a that
-    lies inside of the scan (`welch`):
+    A "sample" of a larger, irregular surface is averaged over P positions x_p of a window a inside the scan (Welch
+    1967, see `welch`):
 
         S(q; κ) = (d_x d_y/P) Σ_p |Σ_n a(x_n − x_p) e^{iκh_n} e^{−2πi q·x_n}|² / Σ_n a².
 
-    Its integral over the Nyquist rectangle |q_j| ≤ 1/2d_j is one for every κ; d is the pixel size. The window is as
-    wide as the coherence length asks for or the scan allows, whichever is less. Along an axis of one pixel the
-    surface is uniform and S has the factor N(q_j; σ_q²), of the same coherence length.
+    Its integral over the Nyquist rectangle |q_j| ≤ 1/2d_j is one for every κ; d is the pixel size. The width of the
+    window is given by the coherence length, limited by the size of the scan. Along an axis of one pixel the surface is
+    uniform, and S has the factor N(q_j; σ_q²) of the same coherence length.
 
-    Frequencies beyond the Nyquist limit do not exist in the data, and nothing is wrapped into their place. A tile has
-    no orders there, only the flanks of the lobes of its last orders; the spectrum of a sample is zero there.
+    The spectrum is not continued periodically beyond the Nyquist limit: a tile has no orders there, only the tails of
+    its last orders, and the spectrum of a sample is zero.
 
     Args:
         height_field: the patch.
@@ -79,8 +79,8 @@ def power_spectrum(
         (...) µm².
 
     Raises:
-        ValueError: on an unknown extent, a coherence length that is not positive or, for a sample, under four pixels,
-            arguments that are not finite, or shapes that do not match.
+        ValueError: if the extent is unknown, the coherence length is not positive or, for a sample, below four pixels,
+            an argument is not finite, or the shapes do not match.
     """
     check_extent(extent)
     lobe_width(coherence_length)
@@ -92,36 +92,35 @@ def power_spectrum(
 def finite_tiles_spectrum(
     height_field: HeightField, q: ArrayLike, kappa: ArrayLike, *, tiles: tuple[int, int]
 ) -> NDArray[np.float64]:
-    """S(q; κ) of P × Q tiles side by side and nothing around them, seen without a window (the "PQ" form).
+    """S(q; κ) of P × Q tiles without a window (the "PQ" form).
 
     With A the transform of one tile of N_x × N_y pixels, and D the factor of a row of tiles (`tile_factor`),
 
         A(q; κ) = Σ_n e^{iκh_n} e^{−2πi q·x_n}
         S(q; κ) = d_x d_y |A(q; κ)|² D(q_x T_x; P)² D(q_y T_y; Q)² / (N_x N_y P Q).
 
-    A is summed at q itself, which equals the sinc interpolation of the tile's FFT. The surface consists of pixels, so
-    that sum repeats with the period 1/d_j; by Parseval S integrates to one over one such period, the Nyquist rectangle
-    |q_j| ≤ 1/2d_j, what lies beyond being folded into it. Outside of the rectangle S is zero, as for a sample in
-    `power_spectrum`. An axis of one pixel is no exception.
+    A is summed directly at q, which equals the sinc interpolation of the FFT of the tile. It has the period 1/d_j; by
+    Parseval's theorem S integrates to one over one such period, the Nyquist rectangle |q_j| ≤ 1/2d_j, into which higher
+    frequencies are aliased. Outside the rectangle S is zero, as for a sample in `power_spectrum`, also along an axis of
+    one pixel.
 
     Args:
         height_field: the tile.
         q: (..., 2) cycles/µm, along x and y.
         kappa: (...) rad/µm.
-        tiles: (P, Q), how many tiles along x and y.
+        tiles: (P, Q), numbers of tiles along x and y.
 
     Returns:
         (...) µm².
 
     Raises:
-        ValueError: if `tiles` is not two whole numbers ≥ 1, on arguments that are not finite, or shapes that do not
-            match.
+        ValueError: if `tiles` is not two integers ≥ 1, an argument is not finite, or the shapes do not match.
     """
     tiles = _checked_tiles(tiles)
     q, kappa = _checked(q, kappa)
     shape = kappa.shape
     q, kappa = q.reshape(-1, 2), kappa.ravel()
-    # One window of constant amplitude over the whole of the tile.
+    # A single uniform window over the whole tile.
     axes = tuple(WindowAxis(np.full(n, n**-0.5), np.zeros(1, np.int64)) for n in height_field.shape[::-1])
     result = _periodograms(height_field, q, kappa, axes)
     for axis in (0, 1):
@@ -131,7 +130,7 @@ def finite_tiles_spectrum(
 
 
 def check_extent(extent: str) -> None:
-    """Raises ValueError unless `extent` names a reading of the patch."""
+    """Raises ValueError unless `extent` is known."""
     if extent not in EXTENTS:
         raise RequestError(f"extent: got {extent!r}, wanted 'tile' or 'sample'")
 
@@ -145,7 +144,7 @@ def _tile_spectrum(
     rows, columns = height_field.shape
     tile = height_field.tile_size
     orders = [np.arange(-(n // 2), n // 2 + 1) for n in (columns, rows)]
-    # The Nyquist order of an even number of pixels has no sign: half of its power lies on each side.
+    # The Nyquist order of an even number of pixels is split evenly between both signs.
     shares = [np.where(2 * np.abs(m) == n, 0.5, 1.0) for m, n in zip(orders, (columns, rows), strict=True)]
     for value, indices in _by_kappa(kappa):
         eta = order_powers(height_field, value)[np.ix_(orders[1] % rows, orders[0] % columns)]
@@ -185,7 +184,7 @@ def _periodograms(
 ) -> NDArray[np.float64]:
     """Mean over the places x_p of |Σ_n a(x_n − x_p) e^{iκh_n} e^{−2πi q·x_n}|² for q (M, 2) and κ (M,): (M,).
 
-    The window is a product, and so is the wave: first the sums over y, for all columns at once, then those over x.
+    Window and wave are separable: first the sums over y, for all columns at once, then those over x.
     """
     along_x, along_y = axes
     width, height = len(along_x.window), len(along_y.window)
@@ -194,9 +193,9 @@ def _periodograms(
     for value, indices in _by_kappa(kappa):
         phase = np.exp(1j * value * height_field.centred)
         for part in np.split(indices, range(chunk, len(indices), chunk)):
-            # On a grid of q many share the same q_y.
+            # On a grid, many q share the same q_y.
             q_y, which = np.unique(q[part, 1], return_inverse=True)
-            # Waves start with the window; where it stands changes the phase of the sum only.
+            # Waves start at the window, whose position only affects the phase of the sum.
             wave_x = along_x.window * _waves(q[part, 0], width, height_field.pixel_size[0])
             wave_y = along_y.window * _waves(q_y, height, height_field.pixel_size[1])
             for row in along_y.starts:
@@ -213,8 +212,8 @@ def _waves(q: NDArray[np.float64], count: int, pixel: float) -> NDArray[np.compl
 
 
 def _nyquist_density(q: NDArray[np.float64], pixel: float) -> NDArray[np.float64]:
-    """d for |q| ≤ 1/2d, else zero: (M,) µm. It integrates to one over q."""
-    # Rounding in the q of the caller must not cut off the limit itself.
+    """d for |q| ≤ 1/2d, else zero: (M,) µm; integrates to one."""
+    # Tolerates rounding of q at the limit itself.
     return np.where(np.abs(q) * 2 * pixel <= 1 + 1e-12, pixel, 0.0)
 
 
@@ -224,13 +223,13 @@ def _gaussian(q: NDArray[np.float64], sigma: float) -> NDArray[np.float64]:
 
 
 def _by_kappa(kappa: NDArray[np.float64]) -> Iterator[tuple[float, NDArray[np.int64]]]:
-    """Each value in κ (M,) once, with the indices where it stands."""
+    """Each distinct value in κ (M,), with its indices."""
     for value in np.unique(kappa):
         yield value, np.flatnonzero(kappa == value)
 
 
 def _checked(q: ArrayLike, kappa: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """As `matching`, and κ is finite too."""
+    """As `matching`, and checks that κ is finite."""
     q, kappa = matching(q, kappa)
     if not np.isfinite(kappa).all():
         raise RequestError("kappa: got numbers that are not finite, wanted rad/µm")
@@ -238,7 +237,7 @@ def _checked(q: ArrayLike, kappa: ArrayLike) -> tuple[NDArray[np.float64], NDArr
 
 
 def _checked_tiles(tiles: tuple[int, int]) -> tuple[int, int]:
-    """Two whole numbers ≥ 1, or ValueError."""
+    """Two integers ≥ 1, or ValueError."""
     pair = tuple(tiles) if isinstance(tiles, (tuple, list, np.ndarray)) else ()
     if len(pair) != 2 or not all(isinstance(n, Integral) and not isinstance(n, bool) and n >= 1 for n in pair):
         raise RequestError(f"tiles: got {tiles!r}, wanted two whole numbers ≥ 1, along x and y")

@@ -1,8 +1,8 @@
-"""Where scalar theory holds: its efficiencies in closed form, and how far they are from rigorous ones.
+"""The range of scalar theory: its efficiencies in closed form, and their deviation from rigorous ones.
 
-A surface is taken for a perfect mirror bent by h, every facet of which reflects like a plane: right as long as the
-surface changes little over a wavelength. Stored results of coupled-wave analysis, made by
-`precompute/rigorous_reference.py`, say how right, over period/λ and depth/λ.
+Scalar theory treats each facet of the surface as a plane mirror (tangent-plane approximation), which holds if the
+surface varies slowly on the scale of a wavelength. Stored results of rigorous coupled-wave analysis, made by
+`precompute/rigorous_reference.py`, quantify the error as a function of period/λ and depth/λ.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ OrderPowers = Callable[[NDArray[np.int64], Array], Array]
 STORED = Path(__file__).parent / "data" / "rigorous.json"
 
 TRUSTED = 0.1
-"""A surface of which scalar theory is expected to get more than this wrong lies outside of its range."""
+"""Expected error above which a surface is considered outside the range of scalar theory."""
 
 
 def fresnel(cosine: ArrayLike, index: complex) -> tuple[Array, Array]:
-    """Power reflectances (R_s, R_p) of a plane of index n + ik in air, at the cosine of the angle of incidence."""
+    """Power reflectances (R_s, R_p) of a plane of index n + ik in air, for the cosine of the angle of incidence."""
     cosine = np.asarray(cosine, np.float64)
     root = np.sqrt(complex(index) ** 2 - (1 - cosine**2))
     s = (cosine - root) / (cosine + root)
@@ -43,22 +43,22 @@ def fresnel(cosine: ArrayLike, index: complex) -> tuple[Array, Array]:
 
 
 def geometry(cos_i: ArrayLike, cos_o: ArrayLike, cos_between: ArrayLike) -> Array:
-    """K G, from the cosines of θ_i, θ_o and ω_i·ω_o; see `geometry.k_g`."""
+    """K G from cos θ_i, cos θ_o and ω_i·ω_o; see `geometry.k_g`."""
     return k_g(cos_i, cos_o, np.add(1, cos_between))
 
 
 def equivalent_depth(rms_height: float) -> float:
-    """Depth, from valley to peak, of the sinusoid that is as rough: 2√2 times the rms height (any unit)."""
+    """Peak-to-valley depth of the sinusoid of equal roughness: 2√2 times the r.m.s. height (any unit)."""
     return 2 * np.sqrt(2) * rms_height
 
 
 def sinusoid_powers(depth: float) -> OrderPowers:
-    """η_m = J_m(κ · depth / 2)² of a sinusoid, depth from valley to peak in µm."""
+    """η_m = J_m(κ · depth / 2)² of a sinusoid; peak-to-valley depth in µm."""
     return lambda m, kappa: jv(m, kappa * depth / 2) ** 2
 
 
 def profile_powers(height_field: HeightField) -> OrderPowers:
-    """η_m of a profile of one row, by one sum over its pixels for each pair (m, κ)."""
+    """η_m of a profile of one row, by direct summation for each pair (m, κ)."""
     if height_field.shape[0] != 1:
         raise RequestError(f"height_field: got {height_field.shape[0]} rows, wanted a profile of one")
     heights, count = height_field.centred[0], height_field.shape[1]
@@ -73,11 +73,12 @@ def profile_powers(height_field: HeightField) -> OrderPowers:
 
 @dataclass(frozen=True)
 class Orders:
-    """What a grating reflects, order by order.
+    """Efficiencies of the propagating orders of a grating.
 
     Attributes:
-        m: the orders that propagate, (n,).
-        s, p: share of the incident power in each, polarised across the plane of incidence and in it, (n,).
+        m: the orders, (n,).
+        s, p: fraction of the incident power in each, polarised perpendicular and parallel to the plane of incidence,
+            (n,).
     """
 
     m: NDArray[np.int64]
@@ -91,17 +92,18 @@ class Orders:
 
 
 def scalar_orders(powers: OrderPowers, period: float, wavelength: float, angle: float, index: complex) -> Orders:
-    """R K G E η_m(κ_m), what the BSDF reflects into each order, in float64 and for lobes of no width.
+    """R K G E η_m(κ_m), the efficiencies of the BSDF in float64 in the limit of narrow lobes.
 
-    The light comes from −x in the plane across the grooves. The BRDF R K G S(q; κ)/λ² E (`bsdf/`) times cos θ_o,
-    integrated over the lobe of an order, leaves these factors at the direction of the order, du dv = λ² dq.
+    Light is incident from −x in the plane perpendicular to the grooves. Integrating the BRDF R K G S(q; κ)/λ² E
+    (`bsdf/`) times cos θ_o over the lobe of an order, with du dv = λ² dq, gives these factors at the direction of the
+    order.
 
     Args:
         powers: of the profile.
         period: µm.
         wavelength: µm.
         angle: of incidence, degrees.
-        index: n + ik of what is below.
+        index: n + ik of the material.
     """
     pitch = wavelength / period
     sine = -np.sin(np.deg2rad(angle))
@@ -143,17 +145,17 @@ def stored() -> dict[str, Any]:
 
 
 def difference(scalar: ArrayLike, rigorous: ArrayLike) -> float:
-    """L1 difference of efficiencies, as a share of the rigorously reflected power: Σ|Δη_m| / Σ η_m."""
+    """L1 difference of efficiencies relative to the rigorously reflected power: Σ|Δη_m| / Σ η_m."""
     scalar, rigorous = np.asarray(scalar), np.asarray(rigorous)
     return float(np.abs(scalar - rigorous).sum() / rigorous.sum())
 
 
 @functools.cache
 def error_map() -> tuple[Array, Array, Array, Array]:
-    """How wrong scalar theory is about sinusoids of n = 1.5 in unpolarised light.
+    """Error of scalar theory for sinusoids of n = 1.5 in unpolarised light.
 
     Returns:
-        period/λ (n,), depth/λ (k,), angles of incidence in degrees (a,), and (n, k, a) the difference of all orders.
+        period/λ (n,), depth/λ (k,), angles of incidence in degrees (a,), and the error, (n, k, a).
     """
     found: dict[tuple[float, float, float], float] = {}
     index = complex(stored()["map index"])
@@ -175,20 +177,20 @@ def _interpolated() -> RegularGridInterpolator:
 
 
 def expected_error(period: float, depth: float, wavelength: float) -> float:
-    """How wrong scalar theory is expected to be about a surface at incidence up to 20°.
+    """Expected error of scalar theory for a surface at incidence up to 20°.
 
-    The larger of the stored differences at 0° and 20°, interpolated linearly between the logarithms. It was found for
-    sinusoids of n = 1.5. Another surface is told by its main period and its `equivalent_depth`; edges add to the error.
+    The larger of the stored errors at 0° and 20°, interpolated linearly in the logarithms. They are for sinusoids of
+    n = 1.5. Other surfaces are represented by their main period and their `equivalent_depth`; edges increase the error.
 
     Args:
         period: µm.
-        depth: from valleys to peaks, µm.
+        depth: peak to valley, µm.
         wavelength: µm.
 
     Returns:
-        Σ|Δη_m| as a share of the reflected power. Above the largest period stored (20 λ), and below the smallest depth
-        (λ/20), the value there, which is above the true one. NaN below a period of λ or above a depth of 2 λ, where
-        there is no stored result: scalar theory says nothing useful there.
+        Σ|Δη_m| relative to the reflected power. Above the largest stored period (20 λ) and below the smallest depth
+        (λ/20), the value at the boundary, an upper bound. NaN for periods below λ or depths above 2 λ, which are not
+        stored and beyond scalar theory.
 
     Raises:
         ValueError: unless period and wavelength are positive and the depth is not negative.

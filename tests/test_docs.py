@@ -166,6 +166,22 @@ def test_a_block_that_is_wrong_is_found(folder, command, llvm, capfd):
         run_toml("[surfaces]")
 
 
+def test_the_manual_lists_the_parameters_of_the_plugins(llvm):
+    from mitsuba_diffraction.bsdf import diffraction_grating
+    from mitsuba_diffraction.shader import integrator
+
+    text, listed, head = (ROOT / "docs" / "plugin.md").read_text().replace("`", ""), set(), []
+    for line in text.splitlines():
+        cells = [cell.strip() for cell in line.strip("| ").split(" | ")] if line.startswith("| ") else []
+        if cells[:1] == ["parameter"]:
+            head = cells
+        elif cells:
+            row = dict(zip(head, cells, strict=False))
+            listed.add((row["parameter"], row["type"], row.get("default", "").strip("| ")))
+    known = (*diffraction_grating.PARAMETERS, *integrator.PARAMETERS)
+    assert listed == {(parameter.name, parameter.type, parameter.default) for parameter in known}
+
+
 def test_the_files_that_the_readme_names_are_there():
     named = re.findall(r"(?:scenes|docs|precompute|notebooks)/[\w./]+\.(?:xml|png|toml|ipynb|md)", PAGES[0].read_text())
     assert len(named) >= 5

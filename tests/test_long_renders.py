@@ -334,7 +334,7 @@ def test_the_command_is_interrupted_and_goes_on(command, monkeypatch):
     code, out, err = command(LINE)
     assert (code, out) == (130, "")
     expected = (
-        "mitsuba-diffraction: interrupted: out.exr holds 2 samples per pixel; the same command with --resume goes on"
+        "mitsuba-diffraction: interrupted: out.exr holds 2 samples per pixel; the same command with --resume continues"
     )
     assert err.strip() == expected
     assert files() == {"scene.xml", "out.exr", "out.png", "out.exr.checkpoint"}
@@ -343,7 +343,7 @@ def test_the_command_is_interrupted_and_goes_on(command, monkeypatch):
     code, out, err = command(LINE)
     assert (code, out) == (2, "")
     assert err.startswith(
-        "mitsuba-diffraction: error: out.exr.checkpoint is of an unfinished rendering: --resume goes on"
+        "mitsuba-diffraction: error: out.exr.checkpoint is of an unfinished rendering: --resume continues"
     )
     code, out, err = command(f"{LINE} --resume --seed 3 --overwrite")
     assert (code, out) == (2, "")
@@ -516,7 +516,7 @@ def test_a_turntable_writes_frames_and_an_animation_and_resumes(command, monkeyp
     press_ctrl_c(monkeypatch, 3)
     code, _, err = command(line)
     assert code == 130
-    assert "out_001.exr holds 1 samples per pixel; the same command with --resume goes on" in err
+    assert "out_001.exr holds 1 samples per pixel; the same command with --resume continues" in err
     assert "out_001.exr.checkpoint" in files()
     first = Path("out_000.exr").stat().st_mtime_ns
     code, out, err = command(f"{line} --resume")
@@ -548,7 +548,7 @@ def test_a_second_ctrl_c_in_a_turntable_says_what_is_there(command, monkeypatch)
     monkeypatch.setattr(passes, "trace_pass", trace_pass)
     code, _, err = command(f"{LINE} --frames 3 --orbit --spp 2")
     assert code == 130
-    assert "interrupted: 1 of 3 pictures are whole; the same command with --resume goes on from it" in err
+    assert "interrupted: 1 of 3 pictures are complete; the same command with --resume continues" in err
     assert files() == {"scene.xml", "out_000.exr", "out_000.png"}
 
 

@@ -12,6 +12,7 @@ import pytest
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction.render import render
+from mitsuba_diffraction.render.scene import load_spectral_scene
 
 ROOT = Path(__file__).parents[1]
 SCENES = ROOT / "scenes"
@@ -253,3 +254,39 @@ def test_ground_may_be_repeated():
     colour, _ = ground.stone(np.random.default_rng(1), 128)
     inside = np.abs(np.diff(colour, axis=1)).mean()
     assert np.abs(colour[:, 0] - colour[:, -1]).mean() < 2 * inside
+
+
+# ---------------------------------------------------------------- the spectrometer
+
+
+@pytest.mark.parametrize(
+    ("lines", "parameters"),
+    [
+        ((404.66, 435.83, 546.07), {}),
+        pytest.param(
+            *((589.3,), {"lines": "587.99:0, 588.99:2, 589.29:1.9, 589.59:1, 590.59:0"}),
+            marks=pytest.mark.slow,
+        ),
+    ],
+    ids=["mercury", "sodium"],
+)
+def test_lines_are_where_the_grating_equation_has_them(llvm, lines, parameters):
+    path, size = SCENES / "spectrometer.xml", (160, 90)
+    parameters = {"room": "1e-12", **parameters}
+    image = render(path, spp=32, width=size[0], height=size[1], parameters=parameters)
+    built = load_spectral_scene(path, width=size[0], height=size[1], parameters=parameters)
+    pixel = dr.arange(mi.UInt32, size[0] * size[1])
+    at = mi.Point2f(pixel % size[0], pixel // size[0]) + 0.5
+    ray, _ = built.sensors()[0].sample_ray(0, 0.5, at / mi.Point2f(size), mi.Point2f(0.5))
+    si = built.ray_intersect(ray)
+    x, y = (np.array(axis).reshape(size[::-1]) for axis in (si.p.x, si.p.y))
+    on_screen = np.abs(y - 50) < 1e-3
+    period = 1e6 / 1200  # nm
+    for line in lines:
+        in_line = np.abs(image.wavelengths - line) < 5
+        light = np.where(on_screen, image.radiance[..., in_line].sum(-1), 0)
+        expected = 50 * np.tan(np.arcsin(line / period - 0.5))
+        light[np.abs(x - expected) > 1.5] = 0  # what the screen and the table scatter
+        mean = (x * light).sum() / light.sum()
+        measured = period * (np.sin(np.arctan(mean / 50)) + 0.5)
+        assert measured == pytest.approx(line, rel=0.005), line

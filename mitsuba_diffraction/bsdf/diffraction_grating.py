@@ -9,13 +9,17 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..coherence import SUN_COHERENCE_LENGTH
 from ..errors import RequestError
+from ..manual import Parameter, listed
 from ..spectrum.energy_table import SHADOWING
+from ..surface.heightfield import HeightField
 from ..wavelengths import VISIBLE
 from .base import base_from
+from .coat import coat_from
 from .geometry import Geometry
 from .incidence import Incidence
-from .polarisation import reflected
+from .polarisation import reflected, through_layer
 from .reflectance import reflectance_from
 from .shared import SharedTables
 from .surface import surface_from
@@ -24,22 +28,41 @@ from .tables import BELOW_ONE, opaque
 DEFENSIVE = 0.02  # the share of samples that follow the cosine, for lobes that the sampler's averages miss
 LEAST_SHARE = 0.1  # of the samples, for the grating and for its base: what each reflects is only estimated
 
-MANUAL = """A diffraction grating, given by the spectrum of its phase.
+PARAMETERS = (
+    Parameter("filename", "string", "a saved spectrum (.exr) or a recipe (.toml)"),
+    Parameter("spectrum", "GratingSpectrum", "the same from Python, in load_dict"),
+    Parameter(
+        "profile",
+        "string",
+        "a grating by formula instead of a file, with the parameters of the function of that name in "
+        "`mitsuba_diffraction.gratings`, all lengths in µm, and coherence_length, tolerance and largest_height_range "
+        "as in `precompute`",
+    ),
+    Parameter("int_ior, ext_ior", "float or string", "a dielectric, as in Mitsuba's `dielectric`", "1.5, air"),
+    Parameter(
+        "material", "string", 'a conductor instead, as in Mitsuba\'s `conductor`; "none" is the perfect mirror, R = 1'
+    ),
+    Parameter("fresnel", "string", "exact, or Schlick's approximation schlick", "exact"),
+    Parameter("orientation", "float or texture", "degrees from the tangent dp_du to the pattern's x axis", "0"),
+    Parameter("height_scale", "float", "scales the heights", "1"),
+    Parameter("shadowing", "string", "v_cavity or none", "v_cavity"),
+    Parameter("conserve_energy", "boolean", "false leaves out E, to compare with closed forms", "true"),
+    Parameter("coat_ior", "float or string", "index of a clear plane layer over the grating, as for int_ior", "none"),
+    Parameter("coat_absorption", "float", "of the layer, 1/µm", "0"),
+    Parameter("coat_thickness", "float", "of the layer, µm; it matters only with coat_absorption", "0"),
+    Parameter(
+        "base",
+        "BSDF",
+        "what lies under a dielectric surface (pigment): any BSDF that reflects and lets nothing through. Its value "
+        "is multiplied by (1 − R_i)(1 − R_o), R at the angles of ω_i and ω_o to the surface",
+        "none",
+    ),
+)
+
+MANUAL = f"""A diffraction grating, given by the spectrum of its phase.
 
 Parameters (XML or dictionary):
-    filename (string): a saved spectrum (.exr) or a recipe (.toml).
-    spectrum (GratingSpectrum): the same from Python, in load_dict.
-    profile (string): a grating by formula instead of a file, with the parameters of the function of that name in
-        `mitsuba_diffraction.gratings`, all lengths in µm, and coherence_length, tolerance and largest_height_range as
-        in `precompute`.
-    int_ior, ext_ior (float or string): a dielectric, as in Mitsuba's `dielectric` (1.5 against air).
-    material (string): a conductor instead, as in Mitsuba's `conductor`; "none" is the perfect mirror, R = 1.
-    fresnel (string): "exact" or "schlick".
-    orientation (float or texture): degrees from the tangent dp_du to the pattern's x axis (0).
-    height_scale (float): scales the heights (1).
-    shadowing (string): "v_cavity" or "none".
-    base (BSDF): what lies under a dielectric surface (pigment): any BSDF that reflects and lets nothing through. Its
-        value is multiplied by (1 − R_i)(1 − R_o), R at the angles of ω_i and ω_o to the surface.
+{listed(PARAMETERS)}
 
 The pattern's x axis lies along dp_du, where u grows, laid into the plane across the shading normal n; its y axis is
 n × x whatever dp_dv is. So lengths are true where UVs are stretched or sheared, and mirrored UVs turn the pattern but
@@ -50,6 +73,10 @@ The BRDF is R · K · G · S(q; κ)/λ² · E: R the power reflectance at the ha
 `line_spectrum.py` (of a tile) or `smooth_spectrum.py` (of a sample), with q = −(ω_i + ω_o)/λ along the pattern's axes
 and κ = 2π (cos θ_i + cos θ_o)/λ. E, as in `energy.py`, keeps the reflected light to the received; it is one where the
 rest does so by itself. Without shadowing K diverges as 1/cos θ near the horizon: from 85° on E then falls with cos θ.
+
+Under a coat (`coat.py`) all this holds inside of it, where wavelengths are shorter and directions steeper; the front
+face of the coat is a mirror. A saved spectrum must cover the shorter wavelengths; one built from a recipe or a profile
+does.
 
 In polarised variants light is split into s and p as by a plane across the half vector; a perfect mirror and Schlick's
 formula leave it unpolarised.
@@ -65,8 +92,9 @@ def define() -> type:
         def __init__(self, props: mi.Properties) -> None:
             # Mitsuba registers an object when its base class is initialised, and Dr.Jit then calls it in every scene as
             # long as anything holds it, be it a traceback: all that may fail comes first.
-            self.spectrum, self.recipe = surface_from(props)
-            self.reflectance = reflectance_from(props)
+            self.coat = coat_from(props)
+            self.spectrum, self._recipe = surface_from(props, self.coat)
+            self.reflectance = reflectance_from(props, self.coat)
             self.orientation = _orientation(props)
             height_scale = props.get("height_scale", 1.0)
             if not isinstance(height_scale, int | float):
@@ -75,6 +103,9 @@ def define() -> type:
             self.shadowing = props.get("shadowing", "v_cavity")
             if self.shadowing not in SHADOWING:
                 raise RequestError(f"shadowing: got {self.shadowing!r}, wanted one of {', '.join(SHADOWING)}")
+            self.conserve_energy = props.get("conserve_energy", True)
+            if not isinstance(self.conserve_energy, bool):
+                raise RequestError(f"conserve_energy: got {self.conserve_energy!r}, wanted true or false")
             self._tables = SharedTables.of(self.spectrum)
             self.scattering = self._tables.scattering
             # The spectrum says nothing beyond its largest angle: there the grating is black.
@@ -87,22 +118,32 @@ def define() -> type:
             flags = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.Anisotropic | mi.BSDFFlags.FrontSide
             if self.orientation.is_spatially_varying():
                 flags = flags | mi.BSDFFlags.SpatiallyVarying
-            # The grating is component 0, those of the base follow.
+            # The grating is component 0; those of the base follow, and the front face of the coat.
             self.m_components = [+flags, *(self.base.components if self.base is not None else [])]
+            self.front = len(self.m_components)
+            if self.coat is not None:
+                self.m_components.append(mi.BSDFFlags.DeltaReflection | mi.BSDFFlags.FrontSide)
             self.m_flags = functools.reduce(operator.or_, self.m_components)
 
         def _update(self) -> None:
             """What depends on parameters that can change."""
             scale = np.max(self.height_scale)
-            largest = VISIBLE[0] / self.spectrum.wavelengths[0]
+            shortest = VISIBLE[0] / (1 if self.coat is None else self.coat.relative)
+            largest = shortest / self.spectrum.wavelengths[0]
+            if self.coat is not None and largest < 1 - 1e-6:
+                raise RequestError(
+                    f"coat_ior: got {self.coat.index:g}, and a spectrum for wavelengths from "
+                    f"{self.spectrum.wavelengths[0]:g} nm; inside the coat they are shorter: build it from "
+                    f"{shortest:.4g} nm"
+                )
             if not 0 <= scale <= largest * (1 + 1e-6):
                 raise RequestError(
                     f"height_scale: got {scale}, wanted 0 to {largest:.4g}: the spectrum was built for "
                     f"wavelengths from {self.spectrum.wavelengths[0]:g} nm; for larger heights build it from "
-                    f"{VISIBLE[0]:g} nm divided by the scale"
+                    f"{shortest:.4g} nm divided by the scale"
                 )
             dr.make_opaque(self.height_scale)
-            self.energy = self._tables.energy(self.shadowing, self.height_scale)
+            self.energy = self._tables.energy(self.shadowing, self.height_scale) if self.conserve_energy else None
 
         def traverse(self, callback: mi.TraversalCallback) -> None:
             callback.put("orientation", self.orientation, mi.ParamFlags.Differentiable)
@@ -120,19 +161,19 @@ def define() -> type:
             """Sine and cosine of the angle from the tangent to the pattern's x axis."""
             return dr.sincos(dr.deg2rad(self.orientation.eval_1(si, active)))
 
-        def along_pattern(self, si: mi.SurfaceInteraction3f, omega: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:
-            """A direction of the shading frame, along the pattern's axes."""
-            return _turned(omega, *self._frame(si, active))
-
         def _grating(
             self, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool
         ) -> tuple[mi.UnpolarizedSpectrum, mi.Float]:
             """f cos θ_o of the grating, and the density of its own samples, for directions above the surface."""
-            geometry = Geometry(si.wi, wo)
             sin, cos = self._frame(si, active)
             # From here on along the pattern's axes.
-            wi, wo = _turned(si.wi, sin, cos), _turned(wo, sin, cos)
+            wi, wo, outside = _turned(si.wi, sin, cos), _turned(wo, sin, cos), mi.Frame3f.cos_theta(wo)
             u, v = -wi.x - wo.x, -wi.y - wo.y
+            towards = wi
+            if self.coat is not None:
+                wi, wo = self.coat.refracted(wi), self.coat.refracted(wo)
+            index = 1.0 if self.coat is None else self.coat.eta
+            geometry = Geometry(wi, wo)
             # Directions beyond the largest angle are black, but they are drawn: they have a density.
             within = dr.minimum(geometry.cos_i, geometry.cos_o) >= self.least_cosine
             value, density = mi.UnpolarizedSpectrum(0.0), mi.Float(0.0)
@@ -143,20 +184,23 @@ def define() -> type:
                 power, share = self.scattering.evaluate(
                     u * frequency,
                     v * frequency,
-                    -geometry.w * dr.two_pi * frequency * self.height_scale,
-                    Incidence.of(wi, frequency, self.height_scale),
+                    -geometry.w * dr.two_pi * index * frequency * self.height_scale,
+                    Incidence.of(towards, frequency, self.height_scale, self.coat),
                     active & covered[channel],
                 )
                 value[channel] = dr.select(within, power / dr.square(wavelength), 0)
                 density += share / dr.square(wavelength)
             if self.energy is not None:
-                wavelengths = mi.UnpolarizedSpectrum(si.wavelengths) * 1e-3
+                wavelengths = mi.UnpolarizedSpectrum(si.wavelengths) * (1e-3 / index)
                 value = self.energy.conserve(value, wi, wo, wavelengths, active)
             value *= self.reflectance(si, geometry.cos_half(), active) * geometry.factor(self.shadowing == "v_cavity")
             # The mean over the covered wavelengths: any of them may have chosen the direction.
             diffuse = _diffuse_share(count)
             density = diffuse * dr.inv_pi + (1 - diffuse) * density / dr.maximum(count, 1)
-            return value, density * geometry.cos_o
+            if self.coat is not None:
+                # The solid angle inside the coat is smaller: cos θ'_o dω'_o = cos θ_o dω_o/n².
+                value *= outside / geometry.cos_o
+            return value, density * outside
 
         def _mueller(
             self,
@@ -168,18 +212,42 @@ def define() -> type:
         ) -> mi.Spectrum:
             """`value` as light that is split into s and p where the variant and the material know them."""
             index = self.reflectance.index(si, active) if mi.is_polarized else None
+            if self.coat is not None:
+                return self._through_coat(value, index, ctx, si, wo)
             return mi.depolarizer(value) if index is None else reflected(value, index, si.wi, wo, ctx.mode)
+
+        def _through_coat(
+            self,
+            value: mi.UnpolarizedSpectrum,
+            index: list[mi.Complex2f] | None,
+            ctx: mi.BSDFContext,
+            si: mi.SurfaceInteraction3f,
+            wo: mi.Vector3f,
+        ) -> mi.Spectrum:
+            """`value` after both passes through the coat, T_i T_o."""
+            inside = [self.coat.refracted(omega) for omega in (si.wi, wo)]
+            if mi.is_polarized:
+                value *= self.coat.absorption(inside[0].z) * self.coat.absorption(inside[1].z)
+                return through_layer(value, index, self.coat.eta, (si.wi, wo), inside, ctx.mode)
+            for omega, refracted in zip((si.wi, wo), inside, strict=True):
+                value *= self.coat.transmittance(omega.z, refracted.z)
+            return value
 
         def _covered(self, si: mi.SurfaceInteraction3f) -> tuple[list[mi.Bool], mi.Float]:
             """Which of the wavelengths the spectrum covers, and how many: at the others the grating is black."""
-            shortest, longest = (w * (1 + d) for w, d in zip(self.spectrum.wavelengths, (-1e-6, 1e-6), strict=True))
+            index = 1 if self.coat is None else self.coat.relative
+            shortest, longest = (
+                w * index * d for w, d in zip(self.spectrum.wavelengths, (1 - 1e-6, 1 + 1e-6), strict=True)
+            )
             covered = [(wavelength >= shortest) & (wavelength <= longest) for wavelength in si.wavelengths]
             return covered, sum(dr.select(c, mi.Float(1), 0) for c in covered)
 
-        def transmitted(self, si: mi.SurfaceInteraction3f, cos_o: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
-            """(1 − R_i)(1 − R_o): what the surface lets through to the base and back."""
-            r_i, r_o = (self.reflectance(si, cos, active) for cos in (mi.Frame3f.cos_theta(si.wi), cos_o))
-            return (1 - r_i) * (1 - r_o)
+        def _entering(self, si: mi.SurfaceInteraction3f, cos: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
+            """1 − R, times T of the coat, at the cosine of an angle outside."""
+            if self.coat is None:
+                return 1 - self.reflectance(si, cos, active)
+            inside = self.coat.cos_inside(cos)
+            return self.coat.transmittance(cos, inside) * (1 - self.reflectance(si, inside, active))
 
         def _lobes(self, ctx: mi.BSDFContext) -> tuple[bool, mi.BSDFContext | None]:
             """Whether `ctx` asks for the grating, and what it asks of the base."""
@@ -190,16 +258,36 @@ def define() -> type:
             self,
             si: mi.SurfaceInteraction3f,
             lobes: tuple[bool, mi.BSDFContext | None],
-            r_i: mi.UnpolarizedSpectrum,
+            entering: mi.UnpolarizedSpectrum,
             active: mi.Bool,
         ) -> mi.Float:
             """The share of samples that the grating gets; that of the base is the rest. About as they reflect."""
             grating, below = lobes
             if not grating or below is None:
                 return mi.Float(1.0 if grating else 0.0)
-            reflected = dr.mean(r_i)
-            returned = (1 - reflected) * self.base.albedo(si, active)
+            entered = dr.mean(entering)
+            reflected = 1 - entered
+            returned = entered * self.base.albedo(si, active)
             return dr.detach(dr.clip(reflected / (reflected + returned), LEAST_SHARE, 1 - LEAST_SHARE))
+
+        def _front_share(
+            self,
+            ctx: mi.BSDFContext,
+            si: mi.SurfaceInteraction3f,
+            lobes: tuple[bool, mi.BSDFContext | None],
+            active: mi.Bool,
+        ) -> mi.Float:
+            """The share of samples that the coat's front face gets, about as it reflects beside all below."""
+            if self.coat is None or not ctx.is_enabled(mi.BSDFFlags.DeltaReflection, self.front):
+                return mi.Float(0.0)
+            grating, below = lobes
+            if not grating and below is None:
+                return mi.Float(1.0)
+            cos = mi.Frame3f.cos_theta(si.wi)
+            reflected = self.reflectance(si, self.coat.cos_inside(cos), active)
+            if below is not None:
+                reflected += (1 - reflected) * self.base.albedo(si, active)
+            return self.coat.share(cos, dr.mean(reflected))
 
         def eval_pdf(
             self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
@@ -212,11 +300,12 @@ def define() -> type:
                 of_grating, pdf = self._grating(si, wo, active)
                 value = self._mueller(of_grating, ctx, si, wo, active)
             if below is not None:
-                r_i, r_o = (self.reflectance(si, cos, active) for cos in (cos_i, cos_o))
-                share = self._share(si, lobes, r_i, active)
+                entering = self._entering(si, cos_i, active)
+                share = self._share(si, lobes, entering, active)
                 of_base, density = self.base.bsdf.eval_pdf(below, si, wo, active)
-                value += _attenuated((1 - r_i) * (1 - r_o), of_base)
+                value += _attenuated(entering * self._entering(si, cos_o, active), of_base)
                 pdf = share * pdf + (1 - share) * density
+            pdf *= 1 - self._front_share(ctx, si, lobes, active)
             return dr.select(active, value, 0), dr.select(active, pdf, 0)
 
         def eval(
@@ -241,12 +330,49 @@ def define() -> type:
             active = active & (cos_i > 0)
             lobes = grating, below = self._lobes(ctx)
             bs = dr.zeros(mi.BSDFSample3f)
-            if not grating and below is None:
+            front_share = self._front_share(ctx, si, lobes, active)
+            of_front = active & (sample1 < front_share)
+            if grating or below is not None:
+                rest = dr.minimum((sample1 - front_share) / (1 - front_share), BELOW_ONE)
+                bs, result = self._sample_below(ctx, si, lobes, 1 - front_share, rest, sample2, active & ~of_front)
+            elif self.coat is not None and ctx.is_enabled(mi.BSDFFlags.DeltaReflection, self.front):
+                result = mi.Spectrum(0.0)
+            else:
                 return bs, mi.Spectrum(0.0)
             bs.eta = 1.0
+            if self.coat is not None:
+                bs.wo = dr.select(of_front, mi.reflect(si.wi), bs.wo)
+                bs.pdf = dr.select(of_front, front_share, bs.pdf)
+                bs.sampled_type = dr.select(of_front, mi.UInt32(+mi.BSDFFlags.DeltaReflection), bs.sampled_type)
+                bs.sampled_component = dr.select(of_front, self.front, bs.sampled_component)
+                mirrored = self._front(si, ctx, active) / dr.select(of_front, front_share, 1)
+                result = dr.select(of_front, mirrored, result)
+            return bs, result
+
+        def _front(self, si: mi.SurfaceInteraction3f, ctx: mi.BSDFContext, active: mi.Bool) -> mi.Spectrum:
+            """F of the coat's front face."""
+            value = mi.UnpolarizedSpectrum(self.coat.reflectance(mi.Frame3f.cos_theta(si.wi)))
+            if not mi.is_polarized:
+                return value
+            return reflected(value, self.coat.indices(), si.wi, mi.reflect(si.wi), ctx.mode)
+
+        def _sample_below(
+            self,
+            ctx: mi.BSDFContext,
+            si: mi.SurfaceInteraction3f,
+            lobes: tuple[bool, mi.BSDFContext | None],
+            part: mi.Float,
+            sample1: mi.Float,
+            sample2: mi.Point2f,
+            active: mi.Bool,
+        ) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
+            """A sample of the grating or its base, which get `part` of all samples."""
+            grating, below = lobes
+            cos_i = mi.Frame3f.cos_theta(si.wi)
+            bs = dr.zeros(mi.BSDFSample3f)
             bs.sampled_type = mi.UInt32(+mi.BSDFFlags.GlossyReflection)
-            r_i = self.reflectance(si, cos_i, active) if below is not None else None
-            share = self._share(si, lobes, r_i, active)
+            entering = self._entering(si, cos_i, active) if below is not None else None
+            share = self._share(si, lobes, entering, active)
             of_base = active & (sample1 >= share)
             if grating:
                 bs.wo = self._draw(si, sample1 / share, sample2, active & (sample1 < share))
@@ -263,9 +389,10 @@ def define() -> type:
             if below is not None and self.base.has_delta:
                 mirror = of_base & mi.has_flag(drawn.sampled_type, mi.BSDFFlags.Delta)
                 cos_o = mi.Frame3f.cos_theta(drawn.wo)
-                through = (1 - r_i) * (1 - self.reflectance(si, cos_o, mirror)) / (1 - share)
+                own = part * (1 - share)
+                through = entering * self._entering(si, cos_o, mirror) / own
                 above = cos_o > 0
-                bs.pdf = dr.select(mirror, dr.select(above, (1 - share) * drawn.pdf, 0), bs.pdf)
+                bs.pdf = dr.select(mirror, dr.select(above, own * drawn.pdf, 0), bs.pdf)
                 result = dr.select(mirror, dr.select(above, _attenuated(through, weight), 0), result)
             return bs, result
 
@@ -284,12 +411,36 @@ def define() -> type:
                 before += dr.select(use, 1, 0)
             wavelength = dr.detach(wavelength) * 1e-3
             sin, cos = (dr.detach(x) for x in self._frame(si, active))
-            incidence = Incidence.of(_turned(si.wi, sin, cos), dr.rcp(wavelength), self.height_scale)
+            incidence = Incidence.of(_turned(si.wi, sin, cos), dr.rcp(wavelength), self.height_scale, self.coat)
             q_x, q_y = self.scattering.sample(incidence, rest, v, active & ~diffuse)
             x = -wavelength * (cos * q_x - sin * q_y) - si.wi.x
             y = -wavelength * (sin * q_x + cos * q_y) - si.wi.y
             z = dr.safe_sqrt(1 - dr.square(x) - dr.square(y))
             return dr.select(diffuse, mi.warp.square_to_cosine_hemisphere(v), mi.Vector3f(x, y, z))
+
+        # What the real-time shader asks of a grating: `shader.surfaces.ShadedGrating`.
+
+        def heights(self) -> tuple[HeightField, float]:
+            """The height field and its coherence length in µm.
+
+            Raises:
+                ValueError: for a saved spectrum, which does not hold heights.
+            """
+            if self._recipe is None:
+                raise RequestError(
+                    "diffraction_shader: it needs heights, and a saved spectrum does not hold them; give the grating a "
+                    "recipe (filename=….toml) or a profile"
+                )
+            coherence_length = self._recipe.spectrum.get("coherence_length", SUN_COHERENCE_LENGTH)
+            return self._recipe.height_field(), float(coherence_length)
+
+        def along_pattern(self, si: mi.SurfaceInteraction3f, omega: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:
+            """A direction of the shading frame, along the pattern's axes."""
+            return _turned(omega, *self._frame(si, active))
+
+        def transmitted(self, si: mi.SurfaceInteraction3f, cos_o: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
+            """(1 − R_i)(1 − R_o): what the surface, and its coat, let through to the base and back."""
+            return self._entering(si, mi.Frame3f.cos_theta(si.wi), active) * self._entering(si, cos_o, active)
 
         def to_string(self) -> str:
             lines = [
@@ -298,10 +449,11 @@ def define() -> type:
                 f"coherence_length = {self.spectrum.coherence_length:g} um",
                 f"representation = {self.spectrum.representation}, {self.spectrum.megabytes:.3g} MB",
                 f"reflectance = {self.reflectance}",
+                *([] if self.coat is None else [f"coat = {self.coat}"]),
                 f"orientation = {self.orientation}",
                 f"height_scale = {self.height_scale}",
                 f"shadowing = {self.shadowing}",
-                f"energy = {self.energy or 'conserved by itself'}",
+                f"energy = {self.energy or ('conserved by itself' if self.conserve_energy else 'not conserved')}",
             ]
             return "DiffractionGrating[\n" + "".join(f"  {line},\n" for line in lines) + "]"
 

@@ -52,7 +52,8 @@ class Energy:
         self.per_frequency = opaque(self.slices / (last - first))
 
     def __str__(self) -> str:
-        return "e·a at most 1 + {:.2g}; where a ≤ 1, 1 − e is {:.2g} in the mean, {:.2g} at most".format(*self.measured)
+        text = "albedo at most 1 + {:.2g}; where a ≤ 1, 1 − e is {:.2g} in the mean, {:.2g} at most"
+        return text.format(*self.measured)
 
     @dr.syntax
     def conserve(

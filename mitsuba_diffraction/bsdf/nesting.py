@@ -7,7 +7,7 @@ import mitsuba as mi
 
 def is_grating(bsdf: mi.BSDF) -> bool:
     """Whether a BSDF is of the class behind `diffraction_grating`."""
-    return hasattr(bsdf, "spectrum") and hasattr(bsdf, "recipe")
+    return hasattr(bsdf, "spectrum") and hasattr(bsdf, "along_pattern")
 
 
 def contains_grating(bsdf: mi.BSDF) -> bool:

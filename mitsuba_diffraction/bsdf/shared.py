@@ -12,6 +12,7 @@ import numpy as np
 from ..spectrum import GratingSpectrum
 from ..spectrum.albedo import GatheredSpectrum, energy_table
 from ..spectrum.energy_table import EnergyTable
+from ..spectrum.furnace import conserving
 from .energy import Energy
 from .line_spectrum import LineSpectrum
 from .smooth_spectrum import SmoothSpectrum
@@ -59,10 +60,15 @@ class SharedTables:
         key = shadowing, height_scale
         with self._lock:
             if key not in self._tables:
-                if self._gathered is None:
-                    self._gathered = GatheredSpectrum.of(self._spectrum)
-                self._keep(self._tables, key, energy_table(self._gathered, shadowing, height_scale))
+                table = conserving(self._spectrum, self._gathered_table(shadowing, height_scale), height_scale)
+                self._keep(self._tables, key, table)
             return self._tables[key]
+
+    def _gathered_table(self, shadowing: str, height_scale: float) -> EnergyTable:
+        with self._lock:
+            if self._gathered is None:
+                self._gathered = GatheredSpectrum.of(self._spectrum)
+            return energy_table(self._gathered, shadowing, height_scale)
 
     def energy(self, shadowing: str, height_scale: mi.Float) -> Energy | None:
         """The factor E, or None if it is one for all directions and wavelengths.
@@ -74,7 +80,7 @@ class SharedTables:
         table = self.energy_table(shadowing, scale)
         if dr.grad_enabled(height_scale):
             lower, upper = max(scale - STEP, 0.0), scale + STEP
-            above, below = (self.energy_table(shadowing, s).values for s in (upper, lower))
+            above, below = (self._gathered_table(shadowing, s).values for s in (upper, lower))
             return Energy(table, (above - below) / (upper - lower), height_scale - dr.detach(height_scale))
         if not table.needed:
             return None

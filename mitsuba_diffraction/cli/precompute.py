@@ -76,10 +76,11 @@ def precompute(
         with progress_bar(f"spectrum of {source.name}") as progress:
             spectrum = recipe_of(source, of_scan, settings).build(progress)
             spectrum.save(target)
+        scatter = f", standard error of one scan {spectrum.standard_error:.2g}" if spectrum.extent == "sample" else ""
         tell(
             f"{target}: {spectrum.source}; {spectrum.extent}, {spectrum.grid}; coherence length "
             f"{spectrum.coherence_length:.4g} µm; {spectrum.representation}, {spectrum.megabytes:.3g} MB, "
-            f"error {spectrum.error:.1e} (tolerance {spectrum.tolerance:g})\n"
+            f"error {spectrum.error:.1e} (tolerance {spectrum.tolerance:.3g}){scatter}\n"
             f"truncated, at most: {spectrum.dropped:.1e} of the power at weak frequencies; {spectrum.beyond:.1e} at "
             f"frequencies that no direction reaches or no pixel resolves{seam}"
         )

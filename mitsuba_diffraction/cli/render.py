@@ -81,8 +81,7 @@ def render(
     for path in targets:
         if checkpoint_path(path).exists() and not resume:
             raise RequestError(
-                f"{checkpoint_path(path)} is of an unfinished rendering: --resume goes on from it; "
-                "remove it to begin anew"
+                f"{checkpoint_path(path)} is of an unfinished rendering: --resume continues it; remove it to start over"
             )
     mi.set_variant(choose_variant(variant))
     if spp is None:
@@ -122,30 +121,30 @@ def render(
             image, interrupted = error.image, True
         except KeyboardInterrupt:
             if waiting.exists():
-                kept = f"{waiting} holds what there is"
+                kept = f"{waiting} holds the samples so far"
             elif number:
-                kept = f"{number} of {frames} pictures are whole"
+                kept = f"{number} of {frames} pictures are complete"
             else:
                 raise
-            raise Stopped(f"{kept}; the same command with --resume goes on from it") from None
+            raise Stopped(f"{kept}; the same command with --resume continues") from None
         preview = path.with_suffix(".png")
         try:
             if image is not earlier:
                 image.save(path, half=half)
             exposure = save_preview(image, preview, exposure)
         except (OSError, RuntimeError) as error:
-            kept = f"; {waiting} is whole, and --resume goes on from it" if waiting.exists() else ""
+            kept = f"; {waiting} is kept, and --resume continues from it" if waiting.exists() else ""
             raise RuntimeError(f"{path} or its preview cannot be written ({error}){kept}") from error
         if interrupted:
             spp = image.attributes["spp"]
-            raise Stopped(f"{path} holds {spp} samples per pixel; the same command with --resume goes on")
+            raise Stopped(f"{path} holds {spp} samples per pixel; the same command with --resume continues")
         waiting.unlink(missing_ok=True)
         rows, columns, bins = image.radiance.shape
         done = f"{image.attributes['spp']} samples per pixel"
         if "error" in image.attributes:
-            done += f", relative error of luminance {image.attributes['error']:.2g} in nine of ten pixels"
+            done += f", relative error of luminance at most {image.attributes['error']:.2g} in 90 % of the pixels"
             if until_error is not None and image.attributes["error"] > until_error:
-                done += f" (not {until_error:g}: more --spp may take it there)"
+                done += f" (above {until_error:g}: increase --spp)"
         tell(
             f"{path}: {columns} × {rows} pixels, {bins} wavelengths, {done}, {mi.variant()}, "
             f"{time.perf_counter() - start:.1f} s, {path.stat().st_size / 1e6:.3g} MB\n"

@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..bsdf.probe import vectors
 from ..errors import RequestError
 from ..surface.heightfield import HeightField
 from .base import Shader
@@ -124,5 +125,4 @@ def _directions(wi: ArrayLike, wo: ArrayLike) -> tuple[mi.Vector3f, mi.Vector3f,
     if wi.shape[-1:] != (3,) or wo.shape[-1:] != (3,):
         raise RequestError(f"wi, wo: got shapes {wi.shape} and {wo.shape}, wanted (..., 3)")
     wi, wo = np.broadcast_arrays(wi, wo)
-    vectors = (mi.Vector3f(np.ascontiguousarray(omega.reshape(-1, 3).T)) for omega in (wi, wo))
-    return *vectors, wi.shape[:-1]
+    return vectors(wi.reshape(-1, 3)), vectors(wo.reshape(-1, 3)), wi.shape[:-1]

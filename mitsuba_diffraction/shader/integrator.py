@@ -10,26 +10,35 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RequestError
+from ..manual import Parameter, listed
 from .base import Shader
 from .evaluate import VARIANTS
 from .lights import Light, lights_of, spectrum_of
 from .picture import Emission, decode, encode
 from .quirks import Quirks
 from .spectral_weights import SpectralWeights
-from .surfaces import Surface, heights_of, surfaces_of
+from .surfaces import ShadedGrating, Surface, surfaces_of
 
-MANUAL = """The real-time shader of structural colour, on the same scene that a path tracer renders.
+PARAMETERS = (
+    Parameter("variant", "string", "flss, nmm, pq or gem", "flss"),
+    Parameter("as_published", "boolean", "with all of the published shader's peculiarities, or with none", "true"),
+    Parameter(
+        "fresnel_squared, window_pi, …",
+        "boolean",
+        "one peculiarity on or off, whatever as_published says; `Quirks` lists them",
+    ),
+    Parameter("terms", "integer", "Taylor terms; not for gem", "37"),
+    Parameter("interpolation", "string", "sinc or linear; for pq only", "sinc"),
+    Parameter("spacing", "float", "the period d in µm, by default that of the strongest wave along x; for gem only"),
+    Parameter("roughness", "float", "of the highlight, 1/µm; for gem only", "5"),
+    Parameter("shadows", "boolean", "test whether something stands before the light", "false"),
+    Parameter("diffuse_weight", "float", "the share of a BSDF below the grating; the thesis gives no number", "0.5"),
+)
+
+MANUAL = f"""The real-time shader of structural colour, on the same scene that a path tracer renders.
 
 Parameters (XML or dictionary):
-    variant (string): "flss", "nmm", "pq" or "gem" ("flss").
-    as_published (boolean): with all of the published shader's peculiarities, or with none (true).
-    fresnel_squared, window_pi, … (boolean): one peculiarity on or off, whatever as_published says; `Quirks` lists them.
-    terms (integer): Taylor terms (37); not for gem.
-    interpolation (string): "sinc" or "linear" (sinc); for pq only.
-    spacing (float): the period d in µm, by default that of the strongest wave along x; for gem only.
-    roughness (float): of the highlight, 1/µm (5); for gem only.
-    shadows (boolean): test whether something stands before the light (false, as published).
-    diffuse_weight (float): the share of a BSDF below the grating (0.5; the thesis gives no number).
+{listed(PARAMETERS)}
 
 Surfaces with a `diffraction_grating`, or one inside `twosided`, are shaded with their heights, which must come from a
 recipe or a profile; all other BSDFs as they are. Light comes straight from directional and point lights; other lights,
@@ -69,7 +78,7 @@ def define() -> type:
                 raise RequestError(f"diffuse_weight: got {self.diffuse_weight!r}, wanted 0 to 1")
             self.emission = Emission()
             mi.SamplingIntegrator.__init__(self, props)
-            self._shaders: list[tuple[mi.BSDF, Shader]] = []
+            self._shaders: list[tuple[ShadedGrating, Shader]] = []
             self.prepared: Prepared | None = None
 
         def take(self, quirks: Quirks) -> None:
@@ -91,12 +100,12 @@ def define() -> type:
             self.prepared = Prepared(lights, surfaces)
             return self.prepared
 
-        def shader_of(self, grating: mi.BSDF) -> Shader:
+        def shader_of(self, grating: ShadedGrating) -> Shader:
             """The shader of a grating; its textures are computed once."""
             for known, shader in self._shaders:
                 if known is grating:
                     return shader
-            height_field, coherence_length = heights_of(grating)
+            height_field, coherence_length = grating.heights()
             settings = dict(self.settings, shadowing=grating.shadowing == "v_cavity")
             if self.variant != "gem":
                 settings["coherence_length"] = coherence_length
@@ -188,6 +197,6 @@ def _settings(variant: str) -> tuple[str, ...]:
     return {"pq": ("terms", "interpolation"), "gem": ("spacing", "roughness")}.get(variant, ("terms",))
 
 
-def _normal_reflectance(grating: mi.BSDF) -> NDArray[np.float64]:
+def _normal_reflectance(grating: ShadedGrating) -> NDArray[np.float64]:
     """R at normal incidence at `tristimulus.wavelengths`, (401,)."""
     return spectrum_of(lambda si: grating.reflectance(si, mi.Float(1), mi.Bool(True)))

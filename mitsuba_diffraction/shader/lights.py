@@ -9,26 +9,20 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..bsdf.probe import interaction
 from ..errors import RequestError
 from .tristimulus import wavelengths
 
 
 def spectrum_of(evaluate: Callable[[mi.SurfaceInteraction3f], mi.UnpolarizedSpectrum]) -> NDArray[np.float64]:
     """A spectral function of a SurfaceInteraction3f, evaluated at `tristimulus.wavelengths`: (401,)."""
-    nanometres = wavelengths()
-    channels = len(mi.UnpolarizedSpectrum(0))
-    groups = np.resize(nanometres, (-(-nanometres.size // channels), channels)).T.astype(np.float32)
-    si = dr.zeros(mi.SurfaceInteraction3f)
-    if dr.is_jit_v(mi.Float):
-        si.wavelengths = mi.UnpolarizedSpectrum(groups)
-        values = np.broadcast_to(np.array(evaluate(si)), groups.shape)
-    else:
-        columns = []
-        for group in groups.T:
-            si.wavelengths = mi.UnpolarizedSpectrum([float(value) for value in group])
-            columns.append(np.array(evaluate(si)))
-        values = np.stack(columns, axis=1)
-    return np.asarray(values, np.float64).T.ravel()[: nanometres.size]
+    nanometres, channels = wavelengths(), len(mi.UnpolarizedSpectrum(0))
+    groups = np.resize(nanometres, (-(-nanometres.size // channels), channels))
+    found = []
+    for group in [groups] if dr.is_jit_v(mi.Float) else groups[:, None]:
+        values = np.array(evaluate(interaction((0, 0, 1), group)), np.float64).reshape(channels, -1)
+        found.append(np.broadcast_to(values, (channels, len(group))))
+    return np.concatenate(found, axis=1).T.ravel()[: nanometres.size]
 
 
 class Light:

@@ -2,15 +2,43 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import drjit as dr
 import mitsuba as mi
 
-from ..bsdf.nesting import contains_grating, is_grating, nested
-from ..coherence import SUN_COHERENCE_LENGTH
+from ..bsdf.base import Base
+from ..bsdf.nesting import contains_grating, nested
 from ..errors import RequestError
 from ..surface.heightfield import HeightField
+
+
+@runtime_checkable
+class ShadedGrating(Protocol):
+    """What the shader asks of a BSDF to shade it as a grating.
+
+    Attributes:
+        height_scale: scales the heights.
+        shadowing: "v_cavity" or "none".
+        base: what lies under the surface.
+        reflectance: R(si, cos θ, active) at the angle to the microfacet.
+    """
+
+    height_scale: mi.Float
+    shadowing: str
+    base: Base | None
+    reflectance: Callable[[mi.SurfaceInteraction3f, mi.Float, mi.Bool], mi.UnpolarizedSpectrum]
+
+    def heights(self) -> tuple[HeightField, float]:
+        """The height field and its coherence length in µm; ValueError where they are not known."""
+
+    def along_pattern(self, si: mi.SurfaceInteraction3f, omega: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:
+        """A direction of the shading frame, along the pattern's axes."""
+
+    def transmitted(self, si: mi.SurfaceInteraction3f, cos_o: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
+        """(1 − R_i)(1 − R_o): what the surface lets through to the base and back."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +52,7 @@ class Surface:
     """
 
     bsdf: mi.BSDF
-    grating: mi.BSDF
+    grating: ShadedGrating
     side: int
 
     def is_of(self, bsdf: mi.BSDF) -> mi.Bool:
@@ -49,31 +77,16 @@ def surfaces_of(scene: mi.Scene) -> list[Surface]:
         if bsdf is None or any(bsdf is other for other in seen):
             continue
         seen.append(bsdf)
-        if is_grating(bsdf):
+        if isinstance(bsdf, ShadedGrating):
             found.append(Surface(bsdf, bsdf, 1))
             continue
         parts = nested(bsdf)
         if bsdf.class_name() == "TwoSidedBRDF":
             sides = ((parts[0], 1), (parts[-1], -1))
-            found += [Surface(bsdf, part, side) for part, side in sides if is_grating(part)]
+            found += [Surface(bsdf, part, side) for part, side in sides if isinstance(part, ShadedGrating)]
         elif any(map(contains_grating, parts)):
             raise RequestError(
                 f"diffraction_shader: a diffraction_grating stands inside {bsdf.class_name()}, wanted on a shape or "
                 "inside twosided"
             )
     return found
-
-
-def heights_of(grating: mi.BSDF) -> tuple[HeightField, float]:
-    """The height field of a grating, and its coherence length in µm.
-
-    Raises:
-        ValueError: if it was loaded from a spectrum file, which does not contain heights.
-    """
-    if grating.recipe is None:
-        raise RequestError(
-            "diffraction_shader: it needs heights, and a saved spectrum does not hold them; give the grating a "
-            "recipe (filename=….toml) or a profile"
-        )
-    recipe = grating.recipe
-    return recipe.height_field(), float(recipe.spectrum.get("coherence_length", SUN_COHERENCE_LENGTH))

@@ -4,10 +4,9 @@ With R = 1 the BRDF K·G·S(q; κ)/λ² has the albedo
 
     a(ω_i, λ) = ∫ K G S(q; κ) dq    over the q whose ω_o is above the surface (du dv = cos θ_o dω_o = λ² dq)
 
-`energy_table` computes e = min(1, (1 + SLACK)/a) (`energy_table.py`), bounded from below: a node starts with e there,
-then e is computed at random places in the cells, and where the table is above it the corners of the cell are lowered.
-What is left is measured at other places, `EnergyTable.excess`; the albedo itself exceeds one by less, because light
-that makes a high usually leaves near the horizon, where e(ω_o) is low.
+`energy_table` computes e = min(1, (1 + SLACK)/a) (`energy_table.py`): a node starts with e there, then e is computed
+at a random place in each cell, and where the table is above it the corners of the cell are lowered. What remains above
+one is found and lowered by `furnace.py`.
 
 a is summed over cells in which the spectrum is gathered: the lobe of the mirror direction, which meets the horizon
 together with ω, is integrated; the others are boxes, each represented by Gauss points in cos θ_o, on which K, G and κ
@@ -45,17 +44,15 @@ SLACK = 5e-4
 # The table: nodes in (y, ν, x).
 CONICAL_SHAPE = (1, 193, 193)
 GENERAL_SHAPE = (33, 17, 33)
-ROUNDS = 4  # how often the table is lowered
-CONICAL_PLACES, GENERAL_PLACES = 2, 1  # from how many places in each cell
 CONICAL_WAVELENGTHS = 2  # how many of the λ that share one ν = c/λ a node is computed for
-VARIED = 0.03  # after the first round only cells are looked at that were lowered, or about which e varies by as much
+ROUNDS = 6  # how often the table is lowered
+MUCH = 0.05  # from which the cells about are looked at again
 LIKELY = 0.8  # the albedo at neighbouring nodes from which a cell is looked at
-CHECKED = 10_000  # places at which the table is measured
 
 # The gathered spectrum: lengths in cycles/µm.
 NARROW = 0.01  # λσ_q of lobes so narrow that ω_o,y = −ω_i,y holds
 FINE = 0.08  # width of the cells of q in which nodes are gathered
-WIDE = 0.16  # width in ω_o,t of the cells in which weak ones are gathered further
+WIDE = 0.2  # width in ω_o,t of the cells in which weak ones are gathered further
 STEP = 1.25  # from one gathering to the next, in λ
 KEPT = 150  # the strongest cells, which are not gathered further
 STRONG, THIRD = 2e-2, 1.3  # the power from which a lobe is represented by three boxes; their width, in σ_q
@@ -264,14 +261,14 @@ class GatheredSpectrum:
 
 
 def energy_table(spectrum: GatheredSpectrum, shadowing: str = "v_cavity", height_scale: float = 1.0) -> EnergyTable:
-    """e, bounded from below, and how well.
+    """e, to be lowered where the spectrum itself asks for it (`furnace.py`).
 
     Args:
         spectrum: gathered.
         shadowing: "v_cavity" or "none".
         height_scale: times the heights.
     """
-    shape, count = (CONICAL_SHAPE, CONICAL_PLACES) if spectrum.conical else (GENERAL_SHAPE, GENERAL_PLACES)
+    shape = CONICAL_SHAPE if spectrum.conical else GENERAL_SHAPE
     cells = tuple(max(n - 1, 1) for n in shape)
     shortest, longest = (w * 1e-3 for w in spectrum.wavelengths)
     frequencies = (0.0 if spectrum.conical else 1 / longest, 1 / shortest)
@@ -306,24 +303,14 @@ def energy_table(spectrum: GatheredSpectrum, shadowing: str = "v_cavity", height
     rng = np.random.default_rng(0)
     doubtful = (ndimage.maximum_filter(largest, 3) > LIKELY)[tuple(slice(n) for n in cells)]
     for _ in range(ROUNDS):
-        inside = rng.random((count, *cells, 3), np.float32)[:, doubtful]
-        first = np.argwhere(doubtful)
-        above = np.max([between(values, first + r) - bound(first + r)[1] for r in inside], axis=0)
+        inside, first = rng.random((*cells, 3), np.float32)[doubtful], np.argwhere(doubtful)
         drop = np.zeros(shape, np.float32)
-        drop[tuple(first.T)] = np.maximum(above, 0)
+        drop[tuple(first.T)] = np.maximum(between(values, first + inside) - bound(first + inside)[1], 0)
         # A node is a corner of the cells before and after it.
         values = np.maximum(values - ndimage.maximum_filter(drop, [min(n, 2) for n in shape], mode="constant"), 0)
-        # Next time only cells that had to be lowered, or about which e varies.
-        varied = ndimage.maximum_filter(values, 3) - ndimage.minimum_filter(values, 3) > VARIED
-        doubtful = (ndimage.maximum_filter(drop > 0, 3) | varied)[tuple(slice(n) for n in cells)]
-
-    table = dataclasses.replace(table, values=np.ascontiguousarray(values, np.float32))
-    steps, least, step = table.packed()
-    places = rng.random((CHECKED, 3)) * cells
-    e, a = between(least + step * steps.astype(np.float32), places), bound(places)[0]
-    lost = (1 - e)[a <= 1]
-    loss = (float(lost.mean()), float(lost.max())) if len(lost) else (0.0, 0.0)
-    return dataclasses.replace(table, excess=float((e * a).max() - 1), loss=loss)
+        # Next time only about cells that had to be lowered much.
+        doubtful = (ndimage.maximum_filter(drop, 3) > MUCH)[tuple(slice(n) for n in cells)]
+    return dataclasses.replace(table, values=np.ascontiguousarray(values, np.float32))
 
 
 def _linear(
@@ -429,12 +416,12 @@ def _mirror_table(
     """The table of `_mirror_lobe`: widths (n,), cosines (m,), and the integrals (n, m)."""
     widths = np.geomspace(2e-4, 0.05, 24, dtype=np.float32)
     cosines = np.maximum(np.linspace(0, 1, 97, dtype=np.float32) ** 2, 1e-4)
-    offsets, weights = _lobe(29, 0.25)
+    offsets, weights = _lobe(15, 0.5)
     table = np.zeros((len(widths), len(cosines)), np.float32)
     sine = np.sqrt(1 - cosines**2)
     sine, cosine, width = (np.ravel(x) for x in np.broadcast_arrays(sine, cosines, widths[:, None]))
     for i, j in np.ndindex(len(offsets), (len(offsets) + 1) // 2):
-        u, v, box = np.float32(offsets[i]) * width, np.float32(offsets[j]) * width, np.float32(0.25) * width
+        u, v, box = np.float32(offsets[i]) * width, np.float32(offsets[j]) * width, np.float32(0.5) * width
         pair, *_, factor = _points(-sine, 0 * sine, cosine, u, v, box, box, 0 * box, shadowing)
         twice = 1 if offsets[j] == 0 else 2
         share = np.bincount(pair, factor, len(sine)).reshape(table.shape)

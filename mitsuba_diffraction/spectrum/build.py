@@ -27,6 +27,7 @@ from .grating_spectrum import TAIL_SHARE, check_angle, check_wavelengths
 from .sample import SamplePowers
 from .series_table import SeriesTable
 from .slice_table import SliceTable, interpolation
+from .standard_error import standard_error
 from .tile import TilePowers, inner
 
 REPRESENTATIONS = ("auto", TaylorSeries.name, ChebyshevSeries.name, SvdSeries.name, SliceTable.representation)
@@ -38,6 +39,10 @@ _SPLINE_SHARE = 0.4  # of a sample, what lies between the nodes in q
 _MARGIN = 0.7
 _PILOT = 8_000  # frequencies
 _LARGEST_TABLE = 4e9  # bytes
+# Where none is asked for: the tolerances that measurements and pictures need, and in between, of a sample, a share of
+# its standard error. A table exact to 1e-3 of what is known to 25 % is waste.
+_FINEST, _COARSEST = 1e-3, 1e-2
+_SCATTER_SHARE = 0.1
 _MOST_NEIGHBOURS = 1000  # orders in one evaluation of S
 
 Progress = Callable[[int, int], None]
@@ -71,8 +76,9 @@ def precompute(
             frequencies.
         representation: "taylor", "chebyshev", "svd" or "slices"; "auto" takes the one that reads the fewest
             packets of four numbers: slices.
-        tolerance: bound of max over κ of ∫|S_approx(q; κ) − S_exact(q; κ)| dq, a share of the reflected power; 1e-3
-            unless told otherwise. Of rigorous theory: see `rigorous.build.build_spectrum`, 1e-2.
+        tolerance: bound of max over κ of ∫|S_approx(q; κ) − S_exact(q; κ)| dq, a share of the reflected power; by
+            default 1e-3, and of a sample a tenth of its `standard_error`, at least 1e-3 and at most 1e-2. Of rigorous
+            theory: see `rigorous.build.build_spectrum`, 1e-2.
         largest_height_range: in µm; a deeper surface is refused, as one whose heights are in nm. Time and memory grow
             with the height range.
         progress: called with (steps done, steps in all).
@@ -114,12 +120,12 @@ def precompute(
         )
     if int_ior is not None or material is not None:
         raise RequestError("int_ior, material: the spectrum of scalar theory is that of every material; wanted neither")
-    tolerance = 1e-3 if tolerance is None else tolerance
+    if tolerance is not None:
+        check_tolerance(tolerance)
     check_angle(largest_angle)
     lobe_width(coherence_length)
     if representation not in REPRESENTATIONS:
         raise RequestError(f"representation: got {representation!r}, wanted one of {', '.join(REPRESENTATIONS)}")
-    check_tolerance(tolerance)
     if not largest_height_range > 0:
         raise RequestError(f"largest_height_range: got {largest_height_range!r}, wanted a positive number of µm")
     if height_field.height_range > largest_height_range:
@@ -131,15 +137,19 @@ def precompute(
     largest_kappa = 4 * np.pi / shortest
     reach = 2 * np.sin(np.deg2rad(largest_angle)) / shortest
     _check_resolution(height_field, reach)
-    carried = float(coherence_length)
+    carried, scatter = float(coherence_length), None
     if extent == "tile":
+        tolerance = _FINEST if tolerance is None else tolerance
         allowed = (1 - TAIL_SHARE) * tolerance
         radius = lobe_reach(TAIL_SHARE * tolerance) * lobe_width(coherence_length)
         powers = TilePowers(height_field, reach, radius)
         _check_overlap(powers.grid.neighbours(1, radius), coherence_length)
     else:
-        allowed = tolerance
         carried = carried_coherence_length(height_field, coherence_length)
+        scatter = standard_error(height_field, coherence_length=carried, largest_kappa=largest_kappa, reach=reach)
+        if tolerance is None:
+            tolerance = float(np.clip(_SCATTER_SHARE * scatter, _FINEST, _COARSEST))
+        allowed = tolerance
         if carried < coherence_length * (1 - 1e-9):
             x, y = height_field.tile_size
             warnings.warn(
@@ -164,6 +174,7 @@ def precompute(
         largest_angle=float(largest_angle),
         dropped=build.dropped,
         beyond=build.beyond,
+        scatter=scatter,
     )
 
 

@@ -51,7 +51,8 @@ class EnergyTable:
         frequencies: (smallest, largest) ν in 1/µm.
         conical: ν = c/λ and N_y = 1; else ν = 1/λ.
         shadowing: "v_cavity" or "none".
-        excess: the largest e·a − 1 found, over places that the table was not made from, with the rounding of `packed`.
+        excess: the largest A − 1 found (`furnace.py`), over places that the table was not made from; A is the albedo
+            with E, the rounding of `packed` included.
         loss: (mean, largest) 1 − e over those of them with a ≤ 1: light that is lost to the table's resolution.
     """
 

@@ -24,7 +24,7 @@ import OpenEXR
 from ..errors import RequestError
 from ..files import UNSEALED, is_intact, seal, whole_file
 from ..outputs import made_for
-from .energy_table import SHADOWING, EnergyTable
+from .energy_table import EnergyTable
 from .expansions.chebyshev import ChebyshevSeries
 from .expansions.svd import SvdSeries
 from .expansions.taylor import TaylorSeries
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 Spectrum = TypeVar("Spectrum")
 FORMAT = "mitsuba_diffraction grating spectrum"
-FORMAT_VERSION = 3
+FORMAT_VERSION = 4
 
 
 @contextlib.contextmanager
@@ -84,6 +84,7 @@ def save(spectrum: GratingSpectrum, path: str | os.PathLike[str], recipe: str = 
         "largestAngle": _doubles(spectrum.largest_angle),
         "dropped": _doubles(spectrum.dropped),
         "beyond": _doubles(spectrum.beyond),
+        **({"standardError": _doubles(spectrum.standard_error)} if spectrum.extent == "sample" else {}),
         "source": spectrum.source,
         "sourceSha256": spectrum.source_digest,
         "units": "lengths in micrometres, wavelengths in nanometres",
@@ -95,7 +96,8 @@ def save(spectrum: GratingSpectrum, path: str | os.PathLike[str], recipe: str = 
     if isinstance(spectrum.table, SeriesTable) and isinstance(spectrum.table.series, SvdSeries):
         # repr of a float is exact.
         header["modes"] = json.dumps(spectrum.table.series.modes.tolist())
-    header["energy"] = json.dumps({kind: spectrum.energy_table(kind).as_plain() for kind in SHADOWING})
+    # Scenes seldom ask for the other kind.
+    header["energy"] = json.dumps({"v_cavity": spectrum.energy_table("v_cavity").as_plain()})
     channels = _channels(spectrum.table)
     header["channelCount"] = len(channels)
     with whole_file(path) as temporary:
@@ -161,6 +163,7 @@ def load(path: str | os.PathLike[str], construct: Callable[..., Spectrum], recip
             largest_angle=_single(header["largestAngle"]),
             dropped=_single(header["dropped"]),
             beyond=_single(header["beyond"]),
+            scatter=_single(header["standardError"]) if header["extent"] == "sample" else None,
             energy={kind: EnergyTable.from_plain(t) for kind, t in json.loads(header["energy"]).items()},
         )
     except KeyError as error:

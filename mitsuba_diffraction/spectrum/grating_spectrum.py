@@ -18,6 +18,7 @@ from ..errors import RequestError
 from .albedo import GatheredSpectrum, energy_table
 from .energy_table import EnergyTable
 from .file import load, save
+from .furnace import conserving
 from .orders import OrderGrid
 from .series_table import SeriesTable
 from .slice_table import SliceTable
@@ -48,6 +49,7 @@ class GratingSpectrum:
         dropped: the largest share of the power, over κ, in weak frequencies that were not kept; part of `error`.
         beyond: the largest share of the power, over κ, at frequencies that no pair of directions reaches, or that the
             pixels do not resolve.
+        scatter: of a sample, its `standard_error`; None of a tile.
         energy: the tables that bound the albedo, by the kind of shadowing; `energy_table` computes what is missing.
     """
 
@@ -64,6 +66,7 @@ class GratingSpectrum:
     largest_angle: float = 90.0
     dropped: float = 0.0
     beyond: float = 0.0
+    scatter: float | None = None
     energy: Mapping[str, EnergyTable] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
@@ -79,6 +82,8 @@ class GratingSpectrum:
             raise RequestError(f"source: got {self.source!r}, {self.source_digest!r}, wanted texts")
         if not (0 <= self.dropped <= 1 and 0 <= self.beyond <= 1):
             raise RequestError(f"dropped, beyond: got {self.dropped}, {self.beyond}, wanted shares of the power")
+        if (self.scatter is not None) != (self.extent == "sample") or not 0 <= (self.scatter or 0.0) < np.inf:
+            raise RequestError(f"scatter: got {self.scatter} of a {self.extent}, wanted a number ≥ 0 of a sample only")
         if not all(key == getattr(table, "shadowing", None) for key, table in self.energy.items()):
             raise RequestError(
                 f"energy: got {', '.join(map(str, self.energy))}, wanted energy tables by their shadowing"
@@ -96,6 +101,21 @@ class GratingSpectrum:
     def extent(self) -> str:
         """ "tile": the patch repeats for ever; "sample": it is a piece of a larger, irregular surface."""
         return "tile" if isinstance(self.grid, OrderGrid) else "sample"
+
+    @property
+    def standard_error(self) -> float:
+        """∫ of the standard error of Welch's estimate over q, at the worst κ: of one scan about the mean of many.
+
+        A share of the reflected power, comparable to `error`; see `standard_error.standard_error`.
+
+        Raises:
+            RequestError: of a tile.
+        """
+        if self.scatter is None:
+            raise RequestError(
+                "standard_error: got a tile, wanted a sample: a patch that repeats for ever is known exactly"
+            )
+        return self.scatter
 
     @property
     def largest_kappa(self) -> float:
@@ -175,7 +195,7 @@ class GratingSpectrum:
         """
         with _computing:
             if shadowing not in self._energy:
-                self._energy[shadowing] = energy_table(GatheredSpectrum.of(self), shadowing)
+                self._energy[shadowing] = conserving(self, energy_table(GatheredSpectrum.of(self), shadowing))
             return self._energy[shadowing]
 
     @cached_property

@@ -32,10 +32,9 @@ def grating(spectrum: GratingSpectrum, conserve: bool = True, **parameters: Any)
     """
     if not {"int_ior", "material"} & set(parameters):
         parameters["material"] = "none"
-    plugin = mi.load_dict({"type": "diffraction_grating", "spectrum": spectrum, **parameters})
-    if not conserve:
-        plugin.energy = None
-    return plugin
+    return mi.load_dict(
+        {"type": "diffraction_grating", "spectrum": spectrum, "conserve_energy": conserve, **parameters}
+    )
 
 
 @functools.lru_cache(maxsize=32)

@@ -1,15 +1,14 @@
-"""A band of periods: a broad peak of the power spectrum, such as that of fingers side by side without a lattice.
+"""Bands of periods: broad peaks of the power spectrum, such as that of fingers without long-range order.
 
-Its mean power over wave vectors q = ρ (cos φ, sin φ) is taken as a Gaussian beside the background B:
+The expected power at the wave vector q = ρ (cos φ, sin φ) is modelled as a Gaussian above the background B:
 
     P(q) = A exp(−(ρ − ρ₀)²/2σ_ρ² − (φ − φ₀)²/2σ_φ²) + b B(q)
 
-A single bin of the spectrum of noise is distributed as an exponential about P, so that the strongest bin of a band is
-chance and says little about its centre. All six parameters are therefore fitted to all bins about the peak by maximum
-likelihood, the minimum of Σ ln P + I/P over their powers I (Whittle 1953, "Estimation and information in stationary
-time series", Arkiv för Matematik 2, 423–434). The covariance is the inverse of Fisher's information
-Σ ∂ln P/∂θ_i ∂ln P/∂θ_j, times 35/18 for each axis: under a Hann window the powers of neighbouring bins are correlated,
-by 4/9 and 1/36.
+The power I of a single bin is exponentially distributed with mean P, so that the strongest bin of a band is a poor
+estimate of its centre. All six parameters are therefore fitted to the bins around the peak by maximum likelihood,
+minimising Σ ln P + I/P (Whittle 1953, "Estimation and information in stationary time series", Arkiv för Matematik 2,
+423–434). The covariance is the inverse of the Fisher information Σ ∂ln P/∂θ_i ∂ln P/∂θ_j, times 35/18 for each axis, as
+the powers of neighbouring bins under a Hann window are correlated by 4/9 and 1/36.
 """
 
 from __future__ import annotations
@@ -27,13 +26,13 @@ _LOBE = 1 / 3
 """Variance of the power of a single wave under a Hann window, bins²: its three bins hold 1/6, 2/3 and 1/6."""
 
 _FALSE_ALARM = 1e-4
-"""Chance that a bin of a band without a single period is taken for one."""
+"""Probability that a bin of a band is mistaken for a single period."""
 
 _NARROW = 1.25
-"""Bins; a narrower peak is a single period that wanders."""
+"""Bins; a narrower peak is a single period that drifts."""
 
 _REACH, _SECTOR = 1.6, np.pi / 4
-"""What is fitted: frequencies up to this factor from the peak, and radians from its direction."""
+"""Range of the fit: frequencies up to this factor from the peak, and radians from its direction."""
 
 _SHIFT = 1.3
 """Factor by which the centre may differ from the peak; the width is at most a quarter of it."""
@@ -45,10 +44,10 @@ class Band:
 
     Attributes:
         centre: (ρ₀, φ₀), cycles/µm and radians.
-        width: (σ_ρ, σ_φ), without what the window adds.
+        width: (σ_ρ, σ_φ), corrected for the window.
         covariance: of the centre, (2, 2).
         share: of the power of the spectrum.
-        sharp: whether it is as narrow as a single period, or no band whose centre is known to half of its width.
+        sharp: whether it is as narrow as a single period, or its centre is uncertain by more than half of its width.
     """
 
     centre: Array
@@ -68,10 +67,10 @@ def fit_band(power: Array, background: Array, q: tuple[Array, Array], size: Arra
 
     Args:
         power: |FFT|² of the heights under a Hann window, (N_y, N_x).
-        background: B, (N_y, N_x); infinite at one or both of q and −q where it is not known.
+        background: B, (N_y, N_x); infinite at one or both of q and −q where it is unknown.
         q: frequencies along x, (N_x,), and along y, (N_y,), cycles/µm.
         size: of the patch along x and y, µm.
-        peak: (2,) where to look, cycles/µm.
+        peak: (2,) starting point, cycles/µm.
     """
     q_x, q_y = np.meshgrid(*q)
     rho_0, phi_0 = np.hypot(*peak), np.arctan2(peak[1], peak[0])

@@ -1,4 +1,4 @@
-"""A height field: the surface as it was measured or designed."""
+"""Height fields."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ class HeightField:
 
     Attributes:
         heights: (N_y, N_x) float64, µm; row ↔ +y, column ↔ +x.
-        pixel_size: (x, y) in µm; one number stands for square pixels.
-        source: where the heights come from (a file name, a formula) and what was done to them, for people to read.
-        filled: how many of the pixels given were missing and are filled.
+        pixel_size: (x, y) in µm; one number for square pixels.
+        source: origin of the heights (a file name, a formula) and processing steps, as text.
+        filled: number of missing pixels that were filled.
 
-    Pixels that are missing (NaN, infinite or masked) are refused. With `fill_missing=True` they are filled from
-    their surroundings instead; see `missing.fill_missing`. With `keep_missing=True` they stay, as NaN, for the steps of
-    `prepare`; such a height field has no height range, so no spectrum.
+    Missing pixels (NaN, infinite or masked) are refused. `fill_missing=True` interpolates them instead; see
+    `missing.fill_missing`. `keep_missing=True` keeps them as NaN for the steps of `prepare`; such a height field has
+    neither a height range nor a spectrum.
 
     Raises:
         ValueError: if the heights are not a two-dimensional array of finite numbers with at least one pixel (with
@@ -93,13 +93,13 @@ class HeightField:
 
     @property
     def tile_size(self) -> tuple[float, float]:
-        """(T_x, T_y) in µm: the period of the surface if the patch repeats for ever."""
+        """(T_x, T_y) in µm: the period of the surface if the patch is repeated."""
         rows, columns = self.shape
         return columns * self.pixel_size[0], rows * self.pixel_size[1]
 
     @property
     def gaps(self) -> NDArray[np.bool_]:
-        """Where pixels are missing, (N_y, N_x)."""
+        """Mask of missing pixels, (N_y, N_x)."""
         return np.isnan(self.heights)
 
     @property
@@ -123,7 +123,7 @@ class HeightField:
 
     @property
     def centred(self) -> NDArray[np.float64]:
-        """Heights about the middle of their range, (N_y, N_x) µm. A common offset changes the phase of e^{iκh} only.
+        """Heights relative to the centre of their range, (N_y, N_x) µm. An offset only changes the phase of e^{iκh}.
 
         Raises:
             ValueError: if pixels are missing.

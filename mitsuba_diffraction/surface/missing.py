@@ -1,4 +1,4 @@
-"""Pixels without a height, as an instrument leaves them: NaN, infinite or masked, and how to fill them."""
+"""Missing pixels: NaN, infinite or masked."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from ..errors import RequestError
 
 
 def as_heights(heights: ArrayLike) -> NDArray[np.float64]:
-    """A plane of heights, (N_y, N_x) µm, NaN where the array is masked; no copy where none is needed.
+    """Heights as an array, (N_y, N_x) µm, NaN where masked; copied only if necessary.
 
     Raises:
         ValueError: if it is not a two-dimensional array of real numbers with at least one pixel.
@@ -32,25 +32,24 @@ def as_heights(heights: ArrayLike) -> NDArray[np.float64]:
 
 
 def fill_missing(heights: ArrayLike, pixel_size: tuple[float, float] = (1.0, 1.0)) -> NDArray[np.float64]:
-    """Missing pixels by harmonic interpolation, the known ones as they are.
+    """Fill missing pixels by harmonic interpolation.
 
-    The missing heights minimise ∫|∇h|² between the known ones, so ∇²h = 0 in every hole. At a missing pixel p,
+    The missing heights minimise ∫|∇h|² subject to the known ones, so that ∇²h = 0 in every hole. At a missing pixel p,
 
         Σ_n w_n (h_n − h_p) = 0,    w = 1/d_x² along a row, 1/d_y² along a column
 
-    over those of its four neighbours n that lie in the array. At the edge of the array this is the natural boundary,
-    ∂h/∂n = 0: a hole there takes up the slope along the edge and none across it. No height is higher or lower than
-    all known ones.
+    over those of its four neighbours n that lie inside the array. At the edge of the array this implies the natural
+    boundary condition ∂h/∂n = 0. Filled heights lie within the range of the known ones.
 
     Pérez, Gangnet and Blake 2003, "Poisson image editing", ACM Transactions on Graphics 22(3), 313–318: equations
-    1 and 2, and 7 without a guidance field, with neighbourhoods cut at the edge of the picture.
+    1 and 2, and 7 without a guidance field, with neighbourhoods truncated at the edge of the array.
 
     Args:
         heights: (N_y, N_x) µm; a pixel is missing where it is NaN, infinite or masked.
         pixel_size: (d_x, d_y), positive; only their ratio matters.
 
     Returns:
-        (N_y, N_x) µm, a new array; where nothing is missing, the heights themselves.
+        (N_y, N_x) µm, a new array, or the input if nothing is missing.
 
     Raises:
         ValueError: if the heights are not a two-dimensional array of real numbers with at least one pixel, or if all
@@ -66,7 +65,7 @@ def fill_missing(heights: ArrayLike, pixel_size: tuple[float, float] = (1.0, 1.0
         raise RequestError(f"heights: all {count} pixels are missing, wanted at least one height in µm to fill from")
     known = heights[~missing]
     lowest, highest = known.min(), known.max()
-    middle = lowest / 2 + highest / 2  # heights are solved for about it, for the sake of their last digits
+    middle = lowest / 2 + highest / 2  # solved relative to it, to preserve digits
     unknown = np.empty(heights.shape, np.int64)
     unknown[missing] = np.arange(count)
     weight_x, weight_y = (np.min(pixel_size) / np.asarray(pixel_size, np.float64)) ** 2
@@ -85,7 +84,7 @@ def fill_missing(heights: ArrayLike, pixel_size: tuple[float, float] = (1.0, 1.0
     neighbour = np.concatenate([np.arange(count), *(other for _, other, _ in links)])
     values = np.concatenate([diagonal, *(np.full(len(pixel), -weight) for pixel, _, weight in links)])
     matrix = sparse.csc_matrix((values, (equation, neighbour)), shape=(count, count))
-    # Symmetric and positive definite (every hole borders on a known pixel), so no pivots need to be looked for.
+    # Symmetric and positive definite (every hole borders on a known pixel): no pivoting needed.
     factors = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
     filled = heights.copy()
     filled[missing] = np.clip(factors.solve(right_side) + middle, lowest, highest)

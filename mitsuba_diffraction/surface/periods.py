@@ -1,4 +1,4 @@
-"""Periods and directions of a height field, with their uncertainties, found from its power spectrum."""
+"""Periods and directions of a height field, and their uncertainties, from its power spectrum."""
 
 from __future__ import annotations
 
@@ -15,43 +15,43 @@ from .heightfield import HeightField
 from .missing import fill_missing
 
 _FEWEST = 2.0
-"""Waves that a patch must hold along its diagonal of frequencies for their length to be told."""
+"""Fewest periods across a patch that determine their length."""
 
 _LEAST_ANGLE = 15.0
-"""Degrees between two waves; closer ones are one period that wanders, or its harmonics."""
+"""Least angle between two waves, degrees; closer ones are one drifting period, or its harmonics."""
 
 _FALSE_ALARM = 1e-4
-"""Chance that noise alone shows a period."""
+"""Probability of a false detection in noise."""
 
 _RING = 24
-"""Fewest frequencies that the background is the lower quartile of."""
+"""Fewest frequencies from which the lower quartile, i.e. the background, is estimated."""
 
 _LEAST_STRENGTH = 1e-3
-"""Share of the variance that a wave must hold: an instrument hums, too."""
+"""Least fraction of the variance of a wave, to exclude hum of the instrument."""
 
 _ROUNDING = 1e-20
-"""Of the greatest power; a wave of `_LEAST_STRENGTH` is far above, what rounding of the transform leaves far below."""
+"""Relative to the largest power: far below a wave of `_LEAST_STRENGTH`, far above rounding errors."""
 
 _MOST_MAXIMA = 200
-"""Local maxima that are looked at."""
+"""Local maxima considered."""
 
 _LOBE = 3
-"""Bins about a peak where its own light falls: the window spreads a wave over two, a wandering one over more."""
+"""Half width of a peak in bins: two owing to the window, more if the period drifts."""
 
 
 @dataclass(frozen=True)
 class Period:
-    """One period of a height field, or the centre of a band of periods, with standard uncertainties (one deviation).
+    """A period of a height field, or the centre of a band of periods, with standard uncertainties.
 
     Attributes:
-        period: µm, across the lines.
+        period: µm, perpendicular to the lines.
         direction: degrees of the wave vector from +x towards +y, in (−90, 90].
         period_uncertainty: µm.
         direction_uncertainty: degrees.
-        strength: share of the variance of the levelled heights in this one wave, whose harmonics are not counted, or
-            in the whole band.
+        strength: fraction of the variance of the levelled heights in this wave, without harmonics, or in the whole
+            band.
         width: standard deviation of the periods of a band about its centre, µm; 0 for a single period.
-        direction_width: likewise of their directions, degrees.
+        direction_width: the same for their directions, degrees.
     """
 
     period: float
@@ -93,38 +93,37 @@ class Period:
 def find_periods(height_field: HeightField, count: int = 2) -> tuple[Period, ...]:
     """The strongest periods of a height field.
 
-    A wave is taken where the power of the levelled and windowed (Hann) heights stands so far above the background that
-    noise about a background known exactly would rise there once in ten thousand height fields (with the background as
-    it is told here, white noise did in one of 300). The background is told by the greatest of three lower quartiles:
-    over the frequencies of about the same length, and along the row and the column of the frequency, for the streaks of
-    a scan. If a wave of two or three times the period stands out too, or is stronger, it is the period, and the first
-    wave its harmonic.
+    A wave is detected where the power of the levelled and windowed (Hann) heights exceeds the background by a factor
+    that noise on an exactly known background would exceed in one of ten thousand height fields (with the background
+    estimated as here, white noise did in one of 300). The background is estimated by the largest of three lower
+    quartiles: over frequencies of similar magnitude, and along the row and the column of the frequency, because of the
+    streaks of a scan. If a wave of two or three times the period is also significant, or stronger, it is the period,
+    and the first wave its harmonic.
 
-    The waves are then fitted together, by weighted least squares for their complex amplitudes c and, by Gauss–Newton
-    steps, their frequencies q, beside a surface of second order:
+    The waves are then fitted jointly, together with a quadratic surface p: by weighted least squares for their complex
+    amplitudes c, and by Gauss–Newton steps for their frequencies q,
 
         h(x) ≈ p(x) + Re Σ_k c_k e^{2πi q_k·x},    weights: the window
 
-    With n(q) the power density of the residual about q, the covariance of the estimate is (XᴴWX)⁻¹ XᴴW²X (XᴴWX)⁻¹ n,
-    X the derivatives of the model; for one wave in white noise and without a window this is the bound of Cramér and
-    Rao (Rife and Boorstyn 1974, "Single-tone parameter estimation from discrete-time observations", IEEE Transactions
+    With n(q) the power density of the residual around q and X the derivatives of the model, the covariance of the
+    estimate is (XᴴWX)⁻¹ XᴴW²X (XᴴWX)⁻¹ n; for one wave in white noise without a window this is the Cramér–Rao bound
+    (Rife and Boorstyn 1974, "Single-tone parameter estimation from discrete-time observations", IEEE Transactions
     on Information Theory 20(5), 591–598, equation 22), var q = 6 n/(π² |c|² T²) along a side of length T.
 
-    A wave that wanders over the patch, as the fingers of a skin do, is less certain than noise makes it. Fitted to the
-    halves of a line, or the quarters of a patch, q would scatter by noise so that their mean has four times that
-    covariance (each of two halves has eight times, each of four quarters sixteen times). What their mean has beyond
-    that is added.
+    If a period drifts over the patch, like the fingers of a skin, its uncertainty is larger. Fits to the halves of a
+    line, or to the quarters of a patch, scatter owing to noise such that their mean has four times that covariance
+    (eight times for each of two halves, sixteen times for each of four quarters). The excess over that is added.
 
-    A peak that is broader than a bin of the spectrum is no wave but a band of periods: its centre, width and share are
-    fitted to all bins (`bands`), and the scatter of the centre over the quarters of the patch is added in the same way.
+    A peak broader than a bin of the spectrum is a band of periods: its centre, width and strength are fitted to all
+    bins (`bands`), and the scatter of the centre over the quarters of the patch is added in the same way.
 
     Args:
-        height_field: missing pixels are filled first. It needs no levelling.
-        count: how many periods at most.
+        height_field: need not be levelled; missing pixels are filled first.
+        count: largest number of periods.
 
     Returns:
-        Single periods, strongest first, then bands, strongest first; at least 15° between the directions. Empty where
-        nothing stands out (noise, a flat surface).
+        Single periods, strongest first, then bands, strongest first, with directions at least 15° apart. Empty if none
+        is significant (noise, a flat surface).
 
     Raises:
         ValueError: if count is not a positive integer.
@@ -133,7 +132,7 @@ def find_periods(height_field: HeightField, count: int = 2) -> tuple[Period, ...
         raise RequestError(f"count: got {count!r}, wanted a positive integer")
     heights = fill_missing(height_field.heights, height_field.pixel_size)
     spectrum = _Spectrum(heights, height_field.pixel_size)
-    if not spectrum.scale > 1e-13 * np.abs(heights).max():  # level but for rounding
+    if not spectrum.scale > 1e-13 * np.abs(heights).max():  # flat up to rounding
         return ()
     waves, bands = spectrum.peaks(int(count))
     found = [*spectrum.fit(waves), *(spectrum.band(band) for band in bands)]
@@ -141,7 +140,7 @@ def find_periods(height_field: HeightField, count: int = 2) -> tuple[Period, ...
 
 
 class _Spectrum:
-    """The power spectrum of heights that are levelled to second order, under a Hann window."""
+    """The power spectrum of heights levelled to second order, under a Hann window."""
 
     def __init__(self, heights: NDArray[np.float64], pixel_size: tuple[float, float]) -> None:
         rows, columns = heights.shape
@@ -182,7 +181,7 @@ class _Spectrum:
         return waves, bands
 
     def _alone(self, q: NDArray[np.float64]) -> bool:
-        """Whether a peak's own lobe holds nearly all the power within half an octave and 45° of it."""
+        """Whether the lobe of a peak holds nearly all power within half an octave and 45°."""
         q_x, q_y = np.meshgrid(*self._q)
         octaves = np.abs(np.log2(np.maximum(np.hypot(q_x, q_y), 1e-300) / np.hypot(*q)))
         along, across = q_x * q[0] + q_y * q[1], q_y * q[0] - q_x * q[1]
@@ -195,7 +194,7 @@ class _Spectrum:
 
     @cached_property
     def _usable(self) -> NDArray[np.bool_]:
-        """One of q and −q, where the patch holds enough waves."""
+        """Mask: one of q and −q, if the patch holds enough periods."""
         q_x, q_y = np.meshgrid(*self._q)
         waves = np.hypot(q_x * self._size[0], q_y * self._size[1])
         return ((q_x > 0) | ((q_x == 0) & (q_y > 0))) & (waves >= _FEWEST - 1e-9)
@@ -209,25 +208,25 @@ class _Spectrum:
 
     @cached_property
     def _candidates(self) -> list[tuple[int, int]]:
-        """The local maxima that stand out of the background."""
+        """The local maxima significantly above the background."""
         power, usable = self._power, self._usable
         if not usable.any():
             return []
-        # Of noise, a power is distributed as an exponential about its mean, which is the quartile over ln 4/3.
+        # The power of noise is exponentially distributed; its mean is the lower quartile divided by ln 4/3.
         level = np.log(usable.sum() / _FALSE_ALARM) / np.log(4 / 3)
         background = self._rings
-        # About a wave without noise there is nothing but rounding.
+        # Around a noise-free wave there are only rounding errors.
         least = _ROUNDING * power[usable].max()
         return [p for p in self._maxima if power[p] > max(least, level * max(background[p], self._streak(*p)))]
 
     @cached_property
     def _rings(self) -> NDArray[np.float64]:
-        """The lower quartile of the power over frequencies of about the same length, by power laws between rings."""
+        """The lower quartile of the power over frequencies of similar magnitude, by power laws between rings."""
         usable, length = self._usable, np.hypot(*np.meshgrid(*self._q))
         lengths, powers = length[usable], self._power[usable]
         order = np.argsort(lengths, kind="stable")
         rings = max(1, len(order) // _RING)
-        # Rings as wide as a bin, or wider, so that each holds enough frequencies.
+        # Rings at least one bin wide, with enough frequencies in each.
         label = np.floor(lengths * self._size.max()).astype(int)[order]
         label = np.minimum(label - label[0], np.arange(len(order)) * rings // len(order))
         label = np.searchsorted(np.unique(label), label)
@@ -239,7 +238,7 @@ class _Spectrum:
         return background
 
     def _streak(self, row: int, column: int) -> float:
-        """The greater quartile of the power along the row and along the column of a frequency, beside its own lobe."""
+        """The larger of the lower quartiles along the row and the column of a frequency, excluding its lobe."""
         quartiles = [0.0]
         for line, place in ((self._power[row], column), (self._power[:, column], row)):
             reach = min(12, (len(line) - 1) // 2)
@@ -249,7 +248,7 @@ class _Spectrum:
         return max(quartiles)
 
     def _fundamental(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The longest wave, as strong as q or standing out, that has q as its third or second harmonic, else q."""
+        """The longest wave of which q is the third or second harmonic, if significant or as strong as q; else q."""
         column, row = (np.rint(q * self._size).astype(int)).tolist()
         power = self._power[row, column]
         for order in (3, 2):
@@ -258,7 +257,7 @@ class _Spectrum:
                 if self._power[row, column] < power and (row, column) not in self._candidates:
                     continue
                 for signed in (other, -other):
-                    # A harmonic is known to half a bin, so its fundamental is nearer than one.
+                    # A harmonic is known to half a bin, its fundamental to less than one.
                     if (np.abs((signed - q / order) * self._size) <= 1).all():
                         return signed
         return q
@@ -266,11 +265,11 @@ class _Spectrum:
     # ------------------------------------------------------------ fit
 
     def fit(self, waves: list[NDArray[np.float64]]) -> list[Period]:
-        """The waves by least squares, from the frequencies of their bins."""
+        """The waves by least squares, starting from the frequencies of their bins."""
         whole = _Waves(self._heights, self._x, self._y, degree=2)
         while waves:
             q = whole.frequencies(np.array(waves))
-            # What goes further from its peak is no wave: half of one fits a single bump of the patch.
+            # If it moves further from its peak, it is not a wave: half a period also fits a single bump.
             near = (np.abs((q - waves) * self._size) <= 1).all(axis=1)
             if near.all():
                 break
@@ -286,7 +285,7 @@ class _Spectrum:
         return [period for period in found if period.strength >= _LEAST_STRENGTH]
 
     def band(self, band: Band) -> Period:
-        """The period of a band, its uncertainty with that of the mean of the quarters' centres beyond noise."""
+        """The period of a band; its uncertainty includes the excess scatter of the quarters."""
         found, expected = [], []
         for r in _halves(self._heights.shape[0]):
             for c in _halves(self._heights.shape[1]):
@@ -298,7 +297,7 @@ class _Spectrum:
         return Period.of_band(band, band.covariance + _beyond(np.array(found), np.mean(expected, axis=0) / len(found)))
 
     def _wander(self, q: NDArray[np.float64], expected: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The covariance of the mean frequency of the halves or quarters of the patch, beyond that of noise."""
+        """The covariance of the mean frequency of the halves or quarters of the patch, in excess of noise."""
         if np.hypot(*(q * self._size)) < 2 * _FEWEST:
             return np.zeros((2, 2))
         rows, columns = (_halves(count) for count in self._heights.shape)
@@ -313,7 +312,7 @@ class _Spectrum:
 
 
 class _Waves:
-    """The model p(x) + Re Σ_k c_k e^{2πi q_k·x} of some heights, under their own Hann window."""
+    """The model p(x) + Re Σ_k c_k e^{2πi q_k·x} of heights under a Hann window."""
 
     def __init__(self, heights: NDArray[np.float64], x: NDArray, y: NDArray, degree: int) -> None:
         self._heights = heights
@@ -323,10 +322,10 @@ class _Waves:
         self._polynomials = _polynomials(self._x, self._y, degree)
 
     def frequencies(self, q: NDArray[np.float64], bins: float = 1e-7) -> NDArray[np.float64]:
-        """The q that fit best, (k, 2), from these, until a step is less than `bins`."""
+        """The best q, (k, 2), from these starting points, until a step is less than `bins`."""
         for _ in range(20):
             amplitude, slope = self._amplitudes(self._model(q).solve(self._heights))
-            # c e^{2πi(q + δ)·x} ≈ (c + 2πi c δ·x) e^{2πi q·x}; where there is no wave at all, c = 0, q stays.
+            # c e^{2πi(q + δ)·x} ≈ (c + 2πi c δ·x) e^{2πi q·x}; without a wave, c = 0, q is unchanged.
             step = np.real(slope * np.conj(2j * np.pi * amplitude[:, None]))
             step /= np.maximum(np.abs(2 * np.pi * amplitude[:, None]) ** 2, 1e-300)
             step = np.clip(step, -0.5 / self._size, 0.5 / self._size)
@@ -336,7 +335,7 @@ class _Waves:
         return q
 
     def amplitudes(self, q: NDArray[np.float64]) -> tuple[NDArray, NDArray[np.float64], float]:
-        """c, (k,), the covariance of each q under the noise about it, (k, 2, 2), and the variance of h − p."""
+        """c, (k,), the covariance of each q given the noise around it, (k, 2, 2), and the variance of h − p."""
         model = self._model(q)
         coefficients = model.solve(self._heights)
         amplitude, _ = self._amplitudes(coefficients)
@@ -355,7 +354,7 @@ class _Waves:
         return amplitude, np.array(spread), float((self._heights - model.evaluate(surface)).var())
 
     def _model(self, q: NDArray[np.float64]) -> _LeastSquares:
-        """The polynomials, and of each wave e, xe, ye with e = e^{2πi q·x}/2, and their conjugates."""
+        """The polynomials, and for each wave e, xe, ye with e = e^{2πi q·x}/2, and their conjugates."""
         basis = list(self._polynomials)
         for wave in q:
             x, y = np.exp(2j * np.pi * wave[0] * self._x), np.exp(2j * np.pi * wave[1] * self._y)
@@ -369,7 +368,7 @@ class _Waves:
         return table[:, 0], table[:, 1:3]
 
     def _density(self, residual: NDArray[np.float64], q: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The variance per pixel of the white noise that has the power density of the residual about each q, (k,)."""
+        """The variance per pixel of white noise with the power density of the residual around each q, (k,)."""
         weight = np.outer(self._window[1], self._window[0])
         power = np.abs(np.fft.fft2(weight * residual)) ** 2 / np.sum(weight**2)
         rows, columns = residual.shape
@@ -378,13 +377,13 @@ class _Waves:
         for wave in q * self._size:
             away = np.hypot(bins_x - wave[0], bins_y - wave[1])
             near = away <= _LOBE
-            # The fit took away what looks like the wave, nearest to it: the greater of two means.
+            # The fit reduces the residual close to the wave: the larger of two means.
             densities.append(max(power[near].mean(), power[near & (away > 1)].mean()))
         return np.array(densities)
 
 
 class _LeastSquares:
-    """Weighted least squares in functions that are products f(x) g(y), weights u(x) v(y): all sums are products too."""
+    """Weighted least squares with separable functions f(x) g(y) and weights u(x) v(y): all sums are separable."""
 
     def __init__(self, basis: list[tuple[NDArray, NDArray]], window: tuple[NDArray, NDArray]) -> None:
         self._along_x = np.array([f for f, _ in basis])
@@ -407,16 +406,16 @@ class _LeastSquares:
         return np.real((self._along_y.T * coefficients) @ self._along_x)
 
     def fit(self, heights: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The model of these heights."""
+        """The model of the heights."""
         return self.evaluate(self.solve(heights))
 
     def covariance(self) -> NDArray:
-        """Of the coefficients, under white noise of variance one."""
+        """Covariance of the coefficients for white noise of variance one."""
         return self._inverse @ self._gram(2) @ self._inverse
 
 
 def _beyond(found: NDArray[np.float64], expected: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The covariance of the mean of estimates (n, 2) by their scatter, beyond that which is expected of noise."""
+    """The covariance of the mean of estimates (n, 2) from their scatter, in excess of that expected from noise."""
     if len(found) == 1:
         return np.zeros((2, 2))
     scatter = (found - found.mean(axis=0)).T @ (found - found.mean(axis=0)) / len(found) / (len(found) - 1)
@@ -429,13 +428,13 @@ def _unit(phi: float) -> NDArray[np.float64]:
 
 
 def _as_direction(phi: float) -> float:
-    """Degrees in (−90, 90]; what is −90 but for rounding is 90."""
+    """Degrees in (−90, 90]; −90 up to rounding becomes 90."""
     degrees = float(np.degrees(phi))
     return min(float(degrees - 180 * np.ceil((degrees - 90) / 180 - 1e-12)), 90.0)
 
 
 def _polynomials(x: NDArray, y: NDArray, degree: int) -> list[tuple[NDArray, NDArray]]:
-    """1, x, y, x², xy, y² … as functions of x and of y to multiply; without those that too few points would tell."""
+    """1, x, y, x², xy, y² … as pairs of factors in x and y, as far as the points determine them."""
     x, y = (v / max(np.abs(v).max(), 1e-300) for v in (x, y))
     powers = [(i, j) for i in range(degree + 1) for j in range(degree + 1 - i) if i < len(x) and j < len(y)]
     return [(x**i, y**j) for i, j in powers]
@@ -446,24 +445,24 @@ def _halves(count: int) -> list[slice]:
 
 
 def _length(places: NDArray[np.float64]) -> float:
-    """Of a row of pixels, from their middles; any length for one pixel, which has no frequency."""
+    """Length of a row of pixels from their positions; arbitrary for one pixel, which has no frequency."""
     return float(len(places) * (places[1] - places[0])) if len(places) > 1 else 1.0
 
 
 def _hann(count: int) -> NDArray[np.float64]:
-    """Hann's window between, not at, its zeros; one where there is one pixel."""
+    """Hann window without its zeros; one for a single pixel."""
     return np.sin(np.pi * (np.arange(count) + 0.5) / count) ** 2
 
 
 def _quartiles(values: NDArray[np.float64], counts: NDArray[np.intp]) -> NDArray[np.float64]:
-    """The lower quartile of each run of values, of these lengths."""
+    """The lower quartile of consecutive runs of values of these lengths."""
     label = np.repeat(np.arange(len(counts)), counts)
     ordered = values[np.lexsort((values, label))]
     return ordered[np.cumsum(counts) - counts + (counts - 1) // 4]
 
 
 def _power_law(x: NDArray, points: NDArray, values: NDArray) -> NDArray[np.float64]:
-    """Interpolation that is linear in the logarithms; before the first point it goes on as it begins."""
+    """Linear interpolation of the logarithms, extrapolated before the first point."""
     x, points, values = np.log(x), np.log(points), np.log(values)
     if len(points) > 1:
         slope = min((values[1] - values[0]) / (points[1] - points[0]), 0.0)
@@ -473,5 +472,5 @@ def _power_law(x: NDArray, points: NDArray, values: NDArray) -> NDArray[np.float
 
 
 def _angle(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
-    """Between two waves, of which either may be turned round; degrees in [0, 90]."""
+    """Angle between two waves irrespective of their sign, degrees in [0, 90]."""
     return float(np.degrees(np.arctan2(abs(one[0] * other[1] - one[1] * other[0]), abs(one @ other))))

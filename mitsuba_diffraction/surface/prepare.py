@@ -1,7 +1,7 @@
-"""A scan made ready: levelling, line alignment, spikes, missing pixels, rotation, cropping.
+"""Preparation of scans: levelling, line alignment, despiking, missing pixels, rotation, cropping.
 
-Each step takes a height field and gives a new one whose `source` tells, after those before it, what the step did.
-Missing pixels (NaN) stay missing until `fill_missing`; the other steps work on the pixels that are there.
+Each step takes a height field and returns a new one, whose `source` records the result of the step. Missing pixels
+(NaN) remain missing until `fill_missing`; the other steps ignore them.
 """
 
 from __future__ import annotations
@@ -21,28 +21,28 @@ from .heightfield import HeightField
 from .periods import Period, find_periods
 
 _SIDE = 5
-"""Side of the square about a pixel that the pixel is held against, pixels."""
+"""Side of the neighbourhood of a pixel, pixels."""
 
 _STANDARD = 1.4826
-"""Standard deviation of normal errors over the median of their moduli."""
+"""Standard deviation of a normal distribution over its median absolute deviation."""
 
 _MISFIT = 0.05
-"""Of a second wave at the seam, in periods."""
+"""Largest misfit of a second wave at the seam, in periods."""
 
 _LEAST_STRENGTH = 0.1
-"""Of a second wave, in parts of the strongest's; a weaker one sets no length."""
+"""Least strength of a second wave relative to the strongest; a weaker one is ignored."""
 
 Step = str | Mapping[str, object]
 """The name of a step, or {name: argument}."""
 
 
 def level_plane(height_field: HeightField) -> HeightField:
-    """Subtract the plane that fits best (least squares over the pixels that are there): the tilt of the sample."""
+    """Subtract the least-squares plane: the tilt of the sample. Missing pixels are ignored."""
     return _level(height_field, 1)
 
 
 def level_quadratic(height_field: HeightField) -> HeightField:
-    """Subtract the surface of second order that fits best: the tilt, and the bow of a tube scanner."""
+    """Subtract the least-squares quadratic: tilt, and the bow of a tube scanner."""
     return _level(height_field, 2)
 
 
@@ -50,7 +50,7 @@ def _level(height_field: HeightField, degree: int) -> HeightField:
     heights = height_field.heights
     rows, columns = heights.shape
     x, y = ((np.arange(n) - (n - 1) / 2) / max((n - 1) / 2, 1) for n in (columns, rows))  # [−1, 1]
-    # One row has no slope along y, and two have no bow.
+    # A single row has no slope along y, and two rows have no bow.
     powers = [(i, j) for i in range(degree + 1) for j in range(degree + 1 - i) if i < columns and j < rows]
     there = ~height_field.gaps
     middle = heights[there].mean()
@@ -68,11 +68,11 @@ def _level(height_field: HeightField, degree: int) -> HeightField:
 
 
 def align_lines(height_field: HeightField) -> HeightField:
-    """Bring the lines of a scan (rows) to one level.
+    """Remove the offsets between the lines (rows) of a scan.
 
-    The offset of a row to the one before is the median of their differences, which a feature across few columns does
-    not move. A straight trend of the offsets is a tilt, and stays (`level_plane` takes it). Heights that whole rows
-    share go with the jumps: not for a grating whose lines run along x.
+    The offset between adjacent rows is the median of their differences, which is robust against features across few
+    columns. A linear trend of the offsets is a tilt and is kept (see `level_plane`). Structure shared by whole rows is
+    removed as well: not for gratings whose lines run along x.
     """
     heights = height_field.heights
     lines = np.flatnonzero(~height_field.gaps.all(axis=1))
@@ -82,9 +82,9 @@ def align_lines(height_field: HeightField) -> HeightField:
         difference = heights[line] - before
         shared = difference[~np.isnan(difference)]
         offsets[k] = offsets[k - 1] + (np.median(shared) if len(shared) else 0.0)
-        # Where the line has no pixel, the line before it stands in.
+        # Missing pixels are replaced by those of the line before.
         before = np.where(np.isnan(heights[line]), before + offsets[k] - offsets[k - 1], heights[line])
-    # The median of an oblique, lopsided profile's slope is not zero: over the lines that adds up to a tilt.
+    # The median slope of an oblique asymmetric profile is not zero, which accumulates to a tilt over the lines.
     offsets -= np.polyval(np.polyfit(lines, offsets, 1 if len(lines) > 1 else 0), lines)
     aligned = heights.copy()
     aligned[lines] -= offsets[:, None]
@@ -93,17 +93,17 @@ def align_lines(height_field: HeightField) -> HeightField:
 
 
 def despike(height_field: HeightField, threshold: float = 5.0) -> HeightField:
-    """Replace pixels that stand out of their surroundings.
+    """Replace outliers.
 
-    Of the 25 pixels of the square about a pixel, the five highest and the five lowest may be spikes, or a streak along
-    a line. A pixel is one where it rises above, or falls below, all others by more than `threshold` standard deviations
-    σ of the noise, and by more than twice the range of the others: in a groove, between even slopes, it lies at most
-    once their range below. It is filled from its surroundings as a missing pixel is. A ridge one pixel wide on an even
-    ground goes, too.
+    Of the 5 × 5 neighbourhood of a pixel, the five highest and the five lowest pixels may be outliers, e.g. a streak
+    along a line. The pixel is an outlier if it is above, or below, all others by more than `threshold` standard
+    deviations σ of the noise and by more than twice their range; at the bottom of a groove with straight walls, it is
+    below them by at most their range. Outliers are filled like missing pixels. A ridge one pixel wide on flat ground is
+    also removed.
 
-    σ is that of Immerkær 1996, "Fast noise variance estimation", Computer Vision and Image Understanding 64(2),
-    300–302: of the second differences along x of those along y, which a smooth surface hardly has; with the median of
-    their moduli for their mean, which spikes do not raise.
+    σ is estimated after Immerkær 1996, "Fast noise variance estimation", Computer Vision and Image Understanding 64(2),
+    300–302, from the mixed second differences along x and y, which nearly vanish for a smooth surface, with the median
+    of their moduli in place of the mean for robustness.
 
     Raises:
         ValueError: if the threshold is not positive.
@@ -111,7 +111,7 @@ def despike(height_field: HeightField, threshold: float = 5.0) -> HeightField:
     _check_positive("despike", threshold, "a number of standard deviations")
     gaps = height_field.gaps
     whole = missing.fill_missing(height_field.heights, height_field.pixel_size)
-    # Beyond its edges the surface goes on with its slope; at the very corner a spike cannot be told from that.
+    # The surface is extended with its slope beyond the edges; a spike at the very corner is not detected.
     inside = slice(_SIDE // 2, -(_SIDE // 2))
     padded = np.pad(whole, _SIDE // 2, mode="reflect", reflect_type="odd")
     lowest, highest = (ndimage.rank_filter(padded, rank, _SIDE)[inside, inside] for rank in (_SIDE, -_SIDE - 1))
@@ -127,7 +127,7 @@ def despike(height_field: HeightField, threshold: float = 5.0) -> HeightField:
 
 
 def _noise(heights: NDArray[np.float64]) -> float:
-    """The standard deviation of white noise on a smooth surface, µm."""
+    """Standard deviation of white noise on a smooth surface, µm."""
     differences = heights
     for dimension, count in enumerate(heights.shape):
         if count > 2:
@@ -136,13 +136,13 @@ def _noise(heights: NDArray[np.float64]) -> float:
 
 
 def fill_missing(height_field: HeightField) -> HeightField:
-    """Fill missing pixels from their surroundings (`missing.fill_missing`)."""
+    """Fill missing pixels by harmonic interpolation (`missing.fill_missing`)."""
     filled = missing.fill_missing(height_field.heights, height_field.pixel_size)
     return _after(height_field, filled, f"fill_missing: {height_field.gaps.sum()} of {filled.size} pixels")
 
 
 def trim_edges(height_field: HeightField, width: float) -> HeightField:
-    """Cut off `width` µm at each edge, where the tip turns round; whole pixels, at least that much.
+    """Cut off at least `width` µm at each edge, where the tip turns round, in whole pixels.
 
     Raises:
         ValueError: if the width is not positive, or nothing would be left.
@@ -150,7 +150,7 @@ def trim_edges(height_field: HeightField, width: float) -> HeightField:
     _check_positive("trim_edges", width, "a width in µm")
     rows, columns = height_field.shape
     cuts = [
-        int(np.ceil(min(width / size, n) - 1e-9)) if n > 1 else 0  # a profile has no edge along its one pixel
+        int(np.ceil(min(width / size, n) - 1e-9)) if n > 1 else 0  # a profile has no edges along its single pixel
         for n, size in zip((columns, rows), height_field.pixel_size, strict=True)
     ]
     if 2 * cuts[0] >= columns or 2 * cuts[1] >= rows:
@@ -162,27 +162,27 @@ def trim_edges(height_field: HeightField, width: float) -> HeightField:
 
 
 def rotate(height_field: HeightField, degrees: float) -> HeightField:
-    """Turn the surface from +x towards +y, about the middle of the patch.
+    """Rotate the surface from +x towards +y about the centre of the patch.
 
-    The heights between pixels are those of cubic splines; by multiples of 90° the pixels themselves are turned. Of the
-    turned patch the greatest rectangle along x and y is kept, so that no height is made up. A pixel is missing where
-    one of the four about its place is.
+    Heights are interpolated by cubic splines; multiples of 90° rotate the pixels themselves. The largest axis-aligned
+    rectangle inside the rotated patch is kept, so that nothing is extrapolated. A pixel is missing if one of the four
+    around its position is.
 
     Raises:
-        ValueError: if the angle is not a finite number, or no pixel fits into the turned patch.
+        ValueError: if the angle is not a finite number, or no pixel fits into the rotated patch.
     """
     if not _is_number(degrees):
         raise RequestError(f"rotate: got {degrees!r}, wanted an angle in degrees")
     quarters = degrees / 90
     if quarters == np.rint(quarters):
         turns = int(np.rint(quarters)) % 4
-        # rot90 turns from +x (columns) towards −y (rows): row ↔ +y here.
+        # rot90 rotates from +x (columns) towards −y (rows), but rows run along +y here.
         size = height_field.pixel_size[:: -1 if turns % 2 else 1]
         return _after(height_field, np.rot90(height_field.heights, -turns), f"rotate: {degrees:g}°", size)
     rows, columns = height_field.shape
     d_x, d_y = height_field.pixel_size
     cos, sin = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-    # Between the middles of the outermost pixels.
+    # Between the centres of the outermost pixels.
     width, height = _largest_rectangle((columns - 1) * d_x, (rows - 1) * d_y, abs(cos), abs(sin))
     count = [int(np.floor(length / d + 1e-9)) + 1 for length, d in ((width, d_x), (height, d_y))]
     if min(count) < 2:
@@ -191,7 +191,7 @@ def rotate(height_field: HeightField, degrees: float) -> HeightField:
     x, y = np.meshgrid(x, y)
     places = np.array([(cos * y - sin * x) / d_y + (rows - 1) / 2, (cos * x + sin * y) / d_x + (columns - 1) / 2])
     whole = missing.fill_missing(height_field.heights, height_field.pixel_size)
-    # Not ndimage's splines, which are level at the edge of the patch and so bend there.
+    # Not ndimage's splines, whose slope vanishes at the edges.
     degree = [min(3, n - 1) for n in (rows, columns)]
     spline = RectBivariateSpline(np.arange(rows), np.arange(columns), whole, kx=degree[0], ky=degree[1])
     turned = spline.ev(*places)
@@ -202,10 +202,10 @@ def rotate(height_field: HeightField, degrees: float) -> HeightField:
 
 
 def _largest_rectangle(width: float, height: float, cos: float, sin: float) -> tuple[float, float]:
-    """Sides along x and y of the greatest rectangle inside a turned one, cos and sin those of the angle, both > 0.
+    """Sides along x and y of the largest rectangle inside a rotated one, for an angle with cos, sin > 0.
 
-    With all four corners on the turned rectangle, W = w cos + h sin and H = w sin + h cos give w and h. Where it is
-    long and narrow, two corners on its long sides bind alone, and wh is greatest at W₁ = w sin = h cos, half of the
+    If all four corners lie on the rotated rectangle, W = w cos + h sin and H = w sin + h cos give w and h. For a long
+    and narrow rectangle only two corners on its long sides are active, and wh is largest at w sin = h cos, half of the
     short side S = w sin + h cos (or with cos and sin exchanged).
     """
     short = min(width, height)
@@ -216,13 +216,13 @@ def _largest_rectangle(width: float, height: float, cos: float, sin: float) -> t
 
 
 def crop_periods(height_field: HeightField, axes: str = "xy") -> HeightField:
-    """Crop to a whole number of periods, so that the patch repeats without a seam.
+    """Crop to a whole number of periods, so that the patch tiles without a seam.
 
-    The periods are those of `find_periods`, at most two. Along an axis the strongest wave that has a period there sets
-    the length, and of the whole numbers of its period that leave at least half of the patch the one is taken that is
-    nearest to whole numbers of the other's, or the greatest. A period is no whole number of pixels: what is left over,
-    up to half a pixel, would be a seam, and a comb of false orders to light. The heights are therefore resampled, by
-    cubic splines, on as many pixels as are nearest, each longer or shorter by that share.
+    The periods are those of `find_periods`, at most two. Along each axis the strongest wave with a period along it sets
+    the length: of the multiples of its period that keep at least half of the patch, the one closest to a multiple of
+    the other period, or else the largest. As the length is not a whole number of pixels, a remainder of up to half a
+    pixel would be a seam, which diffracts into spurious orders. The heights are therefore resampled by cubic splines to
+    the nearest number of pixels.
 
     Args:
         axes: "x", "y" or "xy".
@@ -252,7 +252,7 @@ def crop_periods(height_field: HeightField, axes: str = "xy") -> HeightField:
 def _crop(
     heights: NDArray[np.float64], dimension: int, size: float, waves: Sequence[Period], axis: str
 ) -> tuple[NDArray[np.float64], float, str]:
-    """Along one axis: the heights, their pixel size, and what was done."""
+    """Along one axis: the heights, their pixel size, and a description."""
     count = heights.shape[dimension]
     q, uncertainty = (np.array(v) for v in zip(*(_component(wave, axis) for wave in waves), strict=True))
     across = np.flatnonzero(q * count * size >= 1 - 1e-9)
@@ -307,14 +307,14 @@ _STEPS: dict[str, tuple[Callable[..., HeightField], type | None, bool]] = {
     "crop_periods": (crop_periods, str, False),
     "trim_edges": (trim_edges, float, True),
 }
-"""Name → function, type of its argument (None: it has none), and whether it must be given."""
+"""Name → function, type of its argument (None: no argument), and whether it is required."""
 
 
 STEP_NAMES = tuple(_STEPS)
 
 
 def check_steps(steps: object) -> None:
-    """Check a list of steps, each a name or {name: argument}, before there is a height field.
+    """Check a list of steps, each a name or {name: argument}, without a height field.
 
     Raises:
         ValueError: if a name or an argument is wrong.
@@ -336,10 +336,10 @@ def check_steps(steps: object) -> None:
 
 
 def apply_steps(height_field: HeightField, steps: Sequence[Step]) -> HeightField:
-    """The height field after all steps, in their order.
+    """The height field after all steps, in order.
 
     Raises:
-        ValueError: if a step is wrong or cannot be done.
+        ValueError: if a step is invalid or cannot be applied.
     """
     check_steps(steps)
     for step in steps:
@@ -350,7 +350,7 @@ def apply_steps(height_field: HeightField, steps: Sequence[Step]) -> HeightField
 
 
 def step_of(text: str) -> Step:
-    """A step as it is typed: `level_plane`, `despike=4`, `crop_periods=x`."""
+    """A step given on the command line: `level_plane`, `despike=4`, `crop_periods=x`."""
     name, equals, argument = text.partition("=")
     if not equals:
         return name

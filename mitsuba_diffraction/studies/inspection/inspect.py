@@ -15,6 +15,7 @@ from ...reference import check_extent
 from ...scalar_theory import equivalent_depth, expected_error
 from ...spectrum import GratingSpectrum
 from ...spectrum.build import precompute
+from ...spectrum.standard_error import standard_error
 from ...surface.heightfield import HeightField
 from ...surface.periods import Period, find_periods
 from ...wavelengths import VISIBLE
@@ -43,6 +44,7 @@ class Inspection:
         periods: as of `find_periods`: single ones, then bands; none where nothing stands out.
         carried: the coherence length that a scan carries, µm, at most that of sunlight; of a tile, any.
         coherence_length: what is asked for, as far as it is carried, µm.
+        standard_error: of a sample's spectrum at that coherence length, a share of the reflected power; None of a tile.
         scalar_error: nm → expected error of scalar theory as a share of the reflected power, the greatest of all
             periods; NaN where rigorous results do not reach for one of them; empty without a period.
         changes: what ±5 % of height scale, pixel size and tip broadening do; empty without a period.
@@ -57,6 +59,7 @@ class Inspection:
     periods: tuple[Period, ...]
     carried: float
     coherence_length: float
+    standard_error: float | None
     scalar_error: Mapping[int, float]
     changes: tuple[Change, ...]
     concerns: tuple[str, ...]
@@ -83,6 +86,7 @@ class Inspection:
                 "periods": [dataclasses.asdict(period) for period in self.periods],
                 "carried_coherence_length": self.carried,
                 "coherence_length": self.coherence_length,
+                "standard_error": self.standard_error,
                 "scalar_error": self.scalar_error,
                 "changes": [dataclasses.asdict(change) for change in self.changes],
                 "concerns": self.concerns,
@@ -133,6 +137,7 @@ def inspect(
         return spectrum
 
     numbers = statistics(height_field, extent=extent)
+    shortest = VISIBLE[0] * 1e-3
 
     def find(surface: HeightField) -> tuple[Period, ...]:
         return _periods_of_tile(surface) if extent == "tile" else find_periods(surface)
@@ -147,6 +152,11 @@ def inspect(
         periods=periods,
         carried=carried,
         coherence_length=used,
+        standard_error=standard_error(
+            height_field, coherence_length=used, largest_kappa=4 * np.pi / shortest, reach=2 / shortest
+        )
+        if extent == "sample"
+        else None,
         scalar_error={
             nm: float(np.max([expected_error(period.period, depth, nm * 1e-3) for period in periods]))
             for nm in (SCALAR_AT if periods else ())

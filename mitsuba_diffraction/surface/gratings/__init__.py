@@ -1,8 +1,8 @@
-"""Height fields by formula: classical gratings, technical surfaces, and synthetic stand-ins for natural ones.
+"""Analytic height fields: classical gratings, technical surfaces, and synthetic replicas of natural ones.
 
-Every profile is one exact period of a surface that repeats for ever: a tile (extent "tile" of the spectrum). Lengths
-are in µm. One surface, one file; a new one is added to `PROFILES`, and scenes and recipes know its name. Called without
-parameters, a profile that has values for all of them is a ready surface.
+Every profile is exactly one period of a periodic surface (extent "tile" of the spectrum). Lengths are in µm. Each has
+its own file and an entry in `PROFILES`, the names used in scenes and recipes. Profiles with defaults for all parameters
+are ready-made surfaces.
 """
 
 from __future__ import annotations
@@ -35,16 +35,15 @@ PROFILES: dict[str, Callable[..., HeightField]] = {
     "xenopeltis": xenopeltis,
     "morpho_ridges": morpho_ridges,
 }
-"""Name of a profile, as recipes and scenes write it → the function that makes it."""
+"""Name in recipes and scenes → function."""
 
 COHERENCE_LENGTHS: dict[str, float] = dict.fromkeys(
     ("compact_disc", "dvd", "elaphe", "xenopeltis", "morpho_ridges"), 26.0
 )
-"""Name of a profile that is drawn at random → coherence length in µm that suits the tile of its default size,
-about 32 µm.
+"""Name of a random profile → coherence length in µm suitable for its default tile of about 32 µm.
 
-A patch that repeats has a comb of orders, 1/32 µm apart; light coherent over less than the patch blurs them into the
-smooth haze of an irregular surface.
+The periodic patch has a comb of orders spaced by 1/32 cycles/µm; a coherence length below the size of the patch blurs
+them into the smooth haze of an irregular surface.
 """
 
 __all__ = ["COHERENCE_LENGTHS", "PROFILES", *PROFILES]

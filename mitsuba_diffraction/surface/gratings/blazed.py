@@ -10,11 +10,11 @@ from .line_profile import one_row, phase
 def blazed(period: float = 2.5, depth: float = 0.246, *, samples: int = 512) -> HeightField:
     """Sawtooth h = depth · x / period, rising along +x.
 
-    At normal incidence its facets mirror the light towards −x: into ω_o = −λq with q = m / period, m = 2 depth / λ.
+    At normal incidence its facets reflect light towards −x: into ω_o = −λq with q = m / period, m = 2 depth / λ.
 
     Args:
-        period: length of a tooth along x, µm.
-        depth: height of a tooth, µm.
+        period: along x, µm.
+        depth: µm.
         samples: pixels per period.
 
     Returns:

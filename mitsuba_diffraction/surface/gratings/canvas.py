@@ -1,4 +1,4 @@
-"""A periodic patch on which small shapes are drawn."""
+"""A periodic patch for drawing small shapes."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ Array = NDArray[np.float64]
 
 
 class Canvas:
-    """A periodic patch on which small shapes are drawn; what leaves it on one side comes back on the other.
+    """A periodic patch for drawing small shapes, which wrap around at its edges.
 
     Attributes:
         size: (x, y) µm, along the diffracting axis rounded to a whole number of pitches.
-        count: whole numbers of pitches along x and y.
-        pitch: (x, y) µm, the mean distances that fill the size.
+        count: numbers of pitches along x and y.
+        pitch: (x, y) µm, mean spacings, which divide the size.
         heights: (N_y, N_x) µm.
     """
 
@@ -40,7 +40,7 @@ class Canvas:
         check_pixels(*(s / pixel_size for s in self.size))
         columns, rows = (round(s / pixel_size) for s in self.size)
         self.count = tuple(round(s / p) for s, p in zip(self.size, pitch, strict=True))
-        # The period is what is seen: along its axis the size gives way, not the pitch.
+        # The period is preserved: along its axis the size is adjusted, not the pitch.
         self.size = tuple(pitch[i] * self.count[i] if i == axis else self.size[i] for i in (0, 1))
         self.pitch = tuple(s / n for s, n in zip(self.size, self.count, strict=True))
         self.pixel = (self.size[0] / columns, self.size[1] / rows)
@@ -54,7 +54,7 @@ class Canvas:
         """Pixels of the box x[0]…x[1], y[0]…y[1] µm.
 
         Returns:
-            index: of the pixels in `heights`, wrapped round.
+            index: of the pixels in `heights`, wrapped.
             X, Y: centres of the pixels, (1, n_x) and (n_y, 1), µm, not wrapped.
         """
         columns, rows = (
@@ -75,12 +75,12 @@ class Canvas:
         return field / field.std()
 
     def at(self, field: Array, x: float, y: float) -> float:
-        """Value of a field at a place, µm, wrapped round."""
+        """Value of a field at a position, µm, wrapped."""
         rows, columns = field.shape
         return field[int(y / self.pixel[1]) % rows, int(x / self.pixel[0]) % columns]
 
     def height_field(self, rng: np.random.Generator, depth: float, source: str) -> HeightField:
-        """What was drawn, scaled to `depth`, from a random origin: two seeds do not share a lattice."""
+        """The drawing, scaled to `depth` and shifted by a random offset, as seeds must not share a lattice."""
         heights = np.roll(self.heights - self.heights.min(), rng.integers(self.heights.shape), axis=(0, 1))
         return HeightField(heights / heights.max() * depth, self.pixel, source)
 

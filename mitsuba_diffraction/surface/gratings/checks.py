@@ -1,4 +1,4 @@
-"""What all profiles ask of their arguments."""
+"""Checks of the arguments of all profiles."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import numpy as np
 from ...errors import RequestError
 
 MOST_PIXELS = 2**26
-"""Of a profile: half a gigabyte of heights."""
+"""Largest profile: half a gigabyte of heights."""
 
 
 def check_pixels(columns: float, rows: float) -> None:
-    """Refuses a patch before memory is asked for it."""
+    """Refuses a patch before its memory is allocated."""
     if not columns * rows <= MOST_PIXELS:
         raise RequestError(f"got a patch of {columns:.4g} × {rows:.4g} pixels, wanted at most {MOST_PIXELS} in all")
 

@@ -1,4 +1,4 @@
-"""Crossed grating: two sinusoids at right angles."""
+"""Crossed grating: two perpendicular sinusoids."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ def crossed(period: float, depth: float, *, period_y: float | None = None, sampl
 
     Args:
         period: wavelength along x, µm.
-        depth: from the valleys to the peaks of *each* sinusoid, µm; the sum spans twice that.
-        period_y: wavelength along y, µm; that along x if left out.
+        depth: peak to valley of *each* sinusoid, µm; their sum spans twice that.
+        period_y: wavelength along y, µm; default: that along x.
         samples: pixels per period in either direction.
 
     Returns:

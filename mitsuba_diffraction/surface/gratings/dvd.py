@@ -18,18 +18,17 @@ def dvd(
     *,
     width: float = 0.32,
     channel_bit: float = 0.1333,
-    index: float = 1.55,
     tracks: int = 43,
     length: float = 32.0,
-    pixel_size: float = 0.0625,
+    pixel_size: float = 0.05,
     seed: int = 0,
 ) -> HeightField:
-    """The reflecting layer of a DVD, as light sees it through the polycarbonate.
+    """The metal of a DVD.
 
     As `compact_disc`, with the numbers of ECMA-267 (one layer): a track pitch of 0.74 µm, channel bits of 133.3 nm,
     pits and lands of 3 to 11 of them and 14 in sync codes, so 0.40 to 1.87 µm, read at 650 nm (λ/4n = 0.105 µm). The
-    pits' width is usual, not prescribed. What `compact_disc` says of optical depths holds here, too. The period is
-    about a wavelength: the directions of the orders are right, their powers only roughly.
+    width of the pits is typical, not specified. What `compact_disc` says of the layer holds here, too. As the period is
+    about a wavelength, the directions of the orders are exact, but their efficiencies approximate.
 
     Args, Returns, Raises: those of `compact_disc`.
     """
@@ -38,7 +37,6 @@ def dvd(
         depth=depth,
         width=width,
         channel_bit=channel_bit,
-        index=index,
         tracks=tracks,
         length=length,
         pixel_size=pixel_size,

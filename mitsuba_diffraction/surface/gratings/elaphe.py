@@ -1,4 +1,4 @@
-"""Synthetic stand-in for the shed skin of Elaphe guttata."""
+"""Synthetic replica of the shed skin of Elaphe guttata."""
 
 from __future__ import annotations
 
@@ -17,23 +17,21 @@ def elaphe(
     period: float = 1.144,
     seed: int = 0,
 ) -> HeightField:
-    """Synthetic stand-in for the shed skin of *Elaphe guttata*, not a measurement.
+    """Synthetic replica of the shed skin of *Elaphe guttata*, not a measurement.
 
-    Fingers along x that taper towards +x, side by side along **y**: the diffracting direction is y. Between two
-    fingers a groove starts as a deep narrow crotch and widens up to the fingers' tips, where the next row of fingers
-    begins, 2.93 periods further on. Granules sit on top of the fingers. Positions, lengths, widths, heights and tilts
-    scatter from finger to finger as in the AFM scans of such skins. The shape was drawn after a 5.9 µm AFM scan of
-    the LANE lab, Geneva.
+    Fingers along x that taper towards +x, side by side along **y**, the diffracting direction. Between two fingers a
+    groove starts as a deep narrow crotch and widens up to the tips of the fingers, where the next row begins, 2.93
+    periods further on. Granules sit on top of the fingers. Positions, lengths, widths, heights and tilts vary from
+    finger to finger as in AFM scans of such skins. The shape is modelled on a 5.9 µm AFM scan of the LANE lab, Geneva.
 
-    The patch has no seams, so it holds whole numbers of fingers and rows. size_y is rounded to whole periods, so that
-    the period is kept; the pitch of the rows fills size_x.
+    The patch tiles seamlessly: size_y is rounded to whole periods, and the pitch of the rows is adjusted to size_x.
 
     Args:
-        size: wanted extent of the patch, µm, one number or (x, y).
-        pixel_size: wanted pixel, µm; adjusted so that a whole number of pixels fills the patch.
+        size: approximate size of the patch, µm, one number or (x, y).
+        pixel_size: µm, adjusted to a whole number of pixels per patch.
         depth: lowest to highest point, µm.
         period: mean distance from finger to finger along y, µm.
-        seed: of the random numbers; the same seed gives the same skin.
+        seed: random seed.
 
     Returns:
         The patch, (round(size_y / pixel_size), round(size_x / pixel_size)).

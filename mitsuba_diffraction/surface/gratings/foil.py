@@ -10,12 +10,12 @@ from .checks import check_pixels, check_profile
 
 
 def foil(period: float = 1.0, depth: float = 0.15, *, directions: int = 2, samples: int = 64) -> HeightField:
-    """Equal sinusoids that cross each other, as interference patterns are exposed one after the other.
+    """Crossed sinusoids of equal amplitude, as from successive interference exposures.
 
         h(x) = a Σ_j cos(2π k_j·x),    k_j = (cos α_j, sin α_j) / period
 
-    Two directions stand at α = 0° and 90°, a square lattice: depth = 4a. Three stand at 0°, 60° and 120°, a hexagonal
-    one: depth = 9a/2. Each wave alone would have the orders J_m(κa)².
+    Two directions, α = 0° and 90°, give a square lattice with depth = 4a; three, 0°, 60° and 120°, a hexagonal one with
+    depth = 9a/2. Each wave alone has the orders J_m(κa)².
 
     Args:
         period: of each wave, µm.

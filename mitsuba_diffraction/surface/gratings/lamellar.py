@@ -13,12 +13,12 @@ from .line_profile import one_row
 
 
 def lamellar(period: float, depth: float, *, duty: float = 0.5, samples: int = 512) -> HeightField:
-    """Binary grating: the first part of the period stands at `depth`, the rest at zero.
+    """Binary grating: the first part of the period is at `depth`, the rest at zero.
 
     Args:
-        period: distance from ridge to ridge along x, µm.
+        period: along x, µm.
         depth: height of the ridges, µm.
-        duty: fraction of the period that is high; rounded to whole pixels.
+        duty: width of the ridges relative to the period, rounded to whole pixels.
         samples: pixels per period.
 
     Returns:

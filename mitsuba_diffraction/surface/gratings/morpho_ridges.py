@@ -19,24 +19,24 @@ def morpho_ridges(
     pixel_size: float = 0.0625,
     seed: int = 0,
 ) -> HeightField:
-    """Parallel ridges along y, of unequal heights: the grating of a Morpho's scale, **not its blue**.
+    """Parallel ridges along y of unequal heights: the grating of a Morpho scale, **not its blue**.
 
-    The blue comes from a stack of lamellae within each ridge, an interference filter that a height field cannot hold;
-    what this surface shows is only how the ridges spread light across them. Their tops are uneven, which weakens the
-    orders of the grating and spreads the rest (Kinoshita, Yoshioka & Kawagoe 2002, Proc. R. Soc. B 269, 1417–1421: a
-    regular stack on irregular ridges, about 0.7 µm apart and 0.3 µm wide). A drawing after that description, neither
-    measured nor of real depth (about 2 µm, where scalar theory ends). For a blue butterfly, give it a blue mirror.
+    The blue is due to a stack of lamellae within each ridge, an interference filter that a height field cannot
+    represent; this surface only models the scattering perpendicular to the ridges. Their uneven heights weaken the
+    orders of the grating and scatter the rest (Kinoshita, Yoshioka & Kawagoe 2002, Proc. R. Soc. B 269, 1417–1421: a
+    regular stack on irregular ridges, about 0.7 µm apart and 0.3 µm wide). Modelled on that description, neither
+    measured nor of the real depth (about 2 µm, beyond scalar theory). For a blue butterfly, use a blue mirror.
 
     Args:
-        period: mean distance from ridge to ridge along x, µm.
+        period: mean spacing of the ridges along x, µm.
         depth: lowest to highest point, µm.
         width: of the ridges, µm.
         size: extent of the patch, µm, one number or (x, y); size_x is rounded to whole periods.
-        pixel_size: wanted pixel, µm; adjusted so that a whole number of pixels fills the patch.
-        seed: of the random numbers.
+        pixel_size: µm, adjusted to a whole number of pixels per patch.
+        seed: random seed.
 
     Returns:
-        The patch, which repeats without seams.
+        The patch, which tiles seamlessly.
 
     Raises:
         ValueError: if a length is not positive, the depth negative, the ridges wider than the period, the seed not a
@@ -48,7 +48,7 @@ def morpho_ridges(
         raise RequestError(f"width: got {width!r} µm, wanted less than the period, {period:g}")
     rng = generator(seed)
     canvas = Canvas(size, pixel_size, pitch=(period, period), axis=0)
-    # Every ridge has a height of its own and rises and falls along it, where one lamella ends and the next begins.
+    # The height differs between ridges and varies along each, where one lamella ends and the next begins.
     uneven = canvas.noise(rng, 0.0, 1.0)
     x = (np.arange(canvas.heights.shape[1]) + 0.5) * canvas.pixel[0]
     for centre, offset in zip(canvas.places(0), rng.normal(0, 0.15, canvas.count[0]), strict=True):

@@ -1,4 +1,4 @@
-"""Ruled grating, as catalogues name it: lines per millimetre and blaze wavelength."""
+"""Ruled grating, specified by lines per millimetre and blaze wavelength as in catalogues."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from .blazed import blazed
 
 
 def ruled(lines_per_mm: float = 600.0, *, blaze_wavelength: float = 500.0, samples: int = 512) -> HeightField:
-    """Blazed grating of so many lines per millimetre, its facets tilted for one wavelength.
+    """Blazed grating with given lines per millimetre and blaze wavelength.
 
-    A grating's blaze wavelength λ_B is that of the first order in Littrow's mounting, where light returns along the
-    facet's normal, at the blaze angle θ_B (Palmer 2020, Diffraction Grating Handbook, chapters 2 and 9). With the
+    The blaze wavelength λ_B is that of the first order in Littrow mounting, where light returns along the normal of the
+    facets, at the blaze angle θ_B (Palmer 2020, Diffraction Grating Handbook, chapters 2 and 9). With the
     period d and the depth D of a groove,
 
         λ_B = 2 d sin θ_B,    D = d tan θ_B.
 
-    In that mounting κD = 2π exactly, so that scalar theory puts all of the power into the first order.
+    In that mounting κD = 2π, so that scalar theory diffracts all power into the first order.
 
     Args:
         lines_per_mm: grooves per millimetre; the period is 1000 / lines_per_mm in µm.

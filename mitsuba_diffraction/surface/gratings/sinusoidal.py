@@ -13,8 +13,8 @@ def sinusoidal(period: float, depth: float, *, samples: int = 512) -> HeightFiel
     """Sinusoid h = (depth / 2) · sin(2π x / period), so |F_m|² = J_m(κ · depth / 2)².
 
     Args:
-        period: wavelength of the surface along x, µm.
-        depth: from the valleys to the peaks, µm.
+        period: along x, µm.
+        depth: peak to valley, µm.
         samples: pixels per period.
 
     Returns:

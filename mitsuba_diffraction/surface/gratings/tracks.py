@@ -1,9 +1,9 @@
-"""The tracks of an optical disc: parallel rows of pits, their lengths those of a modulated bit stream."""
+"""The tracks of an optical disc: parallel rows of pits with the run lengths of a modulated bit stream."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from numbers import Integral, Real
+from numbers import Integral
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,11 +12,11 @@ from ...errors import RequestError
 from ..heightfield import HeightField
 from .checks import check_pixels, check_positive, check_profile, generator
 
-# The horizontal extent of a pit's sloping wall, µm: pits are moulded with walls of about 45 to 60 degrees.
+# Horizontal width of the walls of a pit, µm, which slope by about 45 to 60 degrees.
 _WALL = 0.1
 
 # Runs of at least 3 and at most 11 channel bits: the constraint (d, k) = (2, 10), whose capacity is C = 0.5418 bits.
-# The sequences that carry most information have runs of n bits with the probability 2^{−Cn} (Immink 2004, Codes for
+# In sequences of maximum entropy, runs of n bits have the probability 2^{−Cn} (Immink 2004, Codes for
 # Mass Data Storage Systems, chapter 4).
 EIGHT_TO_FOURTEEN = {n: 2 ** (-0.5418 * n) for n in range(3, 12)}
 
@@ -27,7 +27,6 @@ def draw_tracks(
     depth: float,
     width: float,
     channel_bit: float,
-    index: float,
     tracks: int,
     length: float,
     pixel_size: float,
@@ -38,7 +37,7 @@ def draw_tracks(
     """A periodic patch of tracks along y, side by side along x; arguments as in `compact_disc`.
 
     Args:
-        runs: length of a pit or a land in channel bits → its probability.
+        runs: run length in channel bits → probability.
         name: of the disc.
     """
     check_profile(period, depth)
@@ -49,8 +48,6 @@ def draw_tracks(
         ("pixel_size", pixel_size),
     ):
         check_positive(label, value)
-    if not (isinstance(index, Real) and np.isfinite(index) and index >= 1):
-        raise RequestError(f"index: got {index!r}, wanted a refractive index of at least 1")
     if not (isinstance(tracks, Integral) and tracks >= 1):
         raise RequestError(f"tracks: got {tracks!r}, wanted a whole number of at least 1")
     shortest, longest = min(runs) * channel_bit, max(runs) * channel_bit
@@ -85,10 +82,10 @@ def draw_tracks(
         radius = np.hypot(along[:, None], across[mine])
         heights[:, mine] = np.clip(0.5 + (width / 2 - radius) / _WALL, 0, 1)
     return HeightField(
-        heights * index * depth,
+        heights * depth,
         (size[0] / columns, size[1] / rows),
         f"{name}, {tracks} tracks of {period:g} µm along x, pits {width:g} µm wide and {depth:g} µm deep seen through "
-        f"n = {index:g}, seed {seed}",
+        f"seed {seed}",
     )
 
 
@@ -101,7 +98,7 @@ def _pits(
     while True:
         drawn = rng.choice(lengths, size=bits // min(runs) + 1, p=probability)
         ends = np.cumsum(drawn)
-        # A closed track is a whole number of bits, and as many lands as pits.
+        # A closed track has a whole number of bits, and equal numbers of pits and lands.
         last = np.searchsorted(ends, bits)
         if ends[last] == bits and last % 2 == 1:
             break

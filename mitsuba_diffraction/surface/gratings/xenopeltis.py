@@ -1,4 +1,4 @@
-"""Synthetic stand-in for the shed skin of Xenopeltis unicolor."""
+"""Synthetic replica of the shed skin of Xenopeltis unicolor."""
 
 from __future__ import annotations
 
@@ -20,22 +20,21 @@ def xenopeltis(
     period: float = 1.552,
     seed: int = 0,
 ) -> HeightField:
-    """Synthetic stand-in for the shed skin of *Xenopeltis unicolor*, not a measurement.
+    """Synthetic replica of the shed skin of *Xenopeltis unicolor*, not a measurement.
 
-    Rows of short round fingers: the fingers point along +x and rise towards their tips, like roof tiles; a row runs
-    along y, the next follows one period further along **x**, which is the diffracting direction. Rows meander by 10 to
-    20 degrees and now and then fork or end. Fingers stand 0.36 periods apart along y, with small deep pits between
-    them, and here and there two are joined. The shape was drawn after a 5.9 µm AFM scan of the LANE lab, Geneva.
+    Rows of short round fingers, which point along +x and rise towards their tips like roof tiles. Rows run along y, one
+    period apart along **x**, the diffracting direction; they meander by 10 to 20 degrees and occasionally fork or end.
+    Fingers are 0.36 periods apart along y, with small deep pits between them; some are joined. The shape is modelled on
+    a 5.9 µm AFM scan of the LANE lab, Geneva.
 
-    The patch has no seams, so it holds whole numbers of rows and fingers. size_x is rounded to whole periods, so that
-    the period is kept; the pitch of the fingers fills size_y.
+    The patch tiles seamlessly: size_x is rounded to whole periods, and the pitch of the fingers is adjusted to size_y.
 
     Args:
-        size: wanted extent of the patch, µm, one number or (x, y).
-        pixel_size: wanted pixel, µm; adjusted so that a whole number of pixels fills the patch.
+        size: approximate size of the patch, µm, one number or (x, y).
+        pixel_size: µm, adjusted to a whole number of pixels per patch.
         depth: lowest to highest point, µm.
         period: mean distance from row to row along x, µm.
-        seed: of the random numbers; the same seed gives the same skin.
+        seed: random seed.
 
     Returns:
         The patch, (round(size_y / pixel_size), round(size_x / pixel_size)).

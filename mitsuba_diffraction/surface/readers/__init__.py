@@ -1,8 +1,8 @@
-"""Height fields from files: arrays, pictures, Gwyddion, text, and instruments' own formats.
+"""Height fields from files: arrays, images, Gwyddion, text, and instrument formats.
 
-Row 0 of a file is row 0 of `heights`, so the top row of a picture lies at the lowest y (row ↔ +y, column ↔ +x), as
-Mitsuba lays a bitmap on a surface. That holds for every format that stores a picture, whichever way its lines were
-scanned; where a text gives y itself (.xyz, ESRI grids), its y is kept.
+Row 0 of a file is row 0 of `heights`, so that the top row of an image is at the lowest y (row ↔ +y, column ↔ +x), as
+for a bitmap in Mitsuba. This holds for every format that stores an image, whatever its scan direction; formats with
+explicit y (.xyz, ESRI grids) keep theirs.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from .scan import Scan
 __all__ = ["read_height_field"]
 
 _SHOWN = 300
-"""Longest text of an error, characters, that is passed on: a header gone bad is quoted whole by some libraries."""
+"""Longest error text of a library to quote, characters: some quote a damaged header in full."""
 
 _WITHOUT_UNIT = {
     ".npy": arrays.read_npy,
@@ -32,10 +32,10 @@ _WITHOUT_UNIT = {
     ".tif": pictures.read,
     ".tiff": pictures.read,
 }
-"""Extension → reader of formats whose heights are µm, or are scaled by `height_range`."""
+"""Extension → reader of formats with heights in µm, or scaled by `height_range`."""
 
 _WITH_UNIT = {".gsf": simple_field.read, ".xyz": text.read_points, ".asc": text.read_table}
-"""Extension → reader of formats of one channel whose heights have a unit."""
+"""Extension → reader of single-channel formats with a unit."""
 
 _EXTENSIONS = (*_WITHOUT_UNIT, ".gwy", *_WITH_UNIT)
 
@@ -52,41 +52,40 @@ def read_height_field(
 ) -> HeightField:
     """Read a height field.
 
-    | format | numbers | what has to be given |
+    | format | contents | required arguments |
     |---|---|---|
     | .npy | floats are µm; integers run over the full range of their type | pixel_size; integers: height_range |
     | .npz | array `heights`, as .npy, and optionally `pixel_size` in µm, one number or (x, y) | as .npy |
-    | .png, .tif, .tiff | 8 or 16 bit grey; colour is accepted where it is grey and opaque | pixel_size, height_range |
+    | .png, .tif, .tiff | 8 or 16 bit grey; colour if grey and opaque | pixel_size, height_range |
     | .tif, .tiff | 32 bit float, µm | pixel_size |
-    | .gwy, .gsf | Gwyddion's own, and its simple field | unit where the file has none |
+    | .gwy, .gsf | Gwyddion, Gwyddion Simple Field | unit, if the file has none |
     | .xyz | points x y z on a regular grid | unit |
-    | .asc | a table of heights, as Gwyddion exports it or an ESRI grid | unit and pixel_size where it has none |
-    | .spm, .000, .nid, .ibw, .sdf, .x3p, … | instruments' own, with the extra `instruments` | |
+    | .asc | table of heights exported by Gwyddion, or ESRI grid | unit and pixel_size, if it has none |
+    | .spm, .000, .nid, .ibw, .sdf, .x3p, … | instrument formats, with the extra `instruments` | |
 
     Args:
-        path: the file; its extension names the format.
-        pixel_size: µm, one number or (x, y). Goes before that of the file; required where the file has none.
-        height_range: from the least to the greatest number that the integer type holds (black to white), µm. The
-            heights start at zero there. For integers only.
-        fill_missing: fill the pixels that are NaN or infinite from their surroundings (`missing.fill_missing`), not
-            refuse them. `source` and `filled` of the height field tell how many they were.
-        channel: of a file with several (.gwy and instruments'), a name or a number. None takes the one that holds
-            lengths, or the first of those that is called height or topography; `source` tells which.
-        unit: of lengths, "nm", for formats that have units and a file that names none; two, ("um", "nm"), where
-            those along the surface and of the heights differ.
-        keep_missing: leave missing pixels as they are, NaN, for the steps of `prepare`.
+        path: the file; its extension determines the format.
+        pixel_size: µm, one number or (x, y). Overrides that of the file; required if the file has none.
+        height_range: height of the full range of the integer type (black to white), µm; heights start at zero.
+            For integers only.
+        fill_missing: interpolate NaN or infinite pixels (`missing.fill_missing`) instead of refusing them. `source` and
+            `filled` of the height field report their number.
+        channel: of a file with several (.gwy and instrument formats), by name or number. None selects the one that
+            holds lengths, or the first of those named height or topography; `source` reports which.
+        unit: of lengths, e.g. "nm", for a file without one; ("um", "nm") if lateral lengths and heights differ.
+        keep_missing: keep missing pixels as NaN, for the steps of `prepare`.
 
     Returns:
-        The heights in µm, row by row as they stand in the picture.
+        The heights in µm, row by row as in the image.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if the file or the arguments are wrong; one line that names the file.
+        ValueError: if the file or the arguments are invalid; one line that names the file.
     """
     path = Path(path)
     refuse_special(path)
     try:
-        # What is too great for a float becomes infinite, a missing pixel or no length, and is refused as such.
+        # Numbers that overflow become infinite, and are refused as missing pixels or invalid lengths.
         with np.errstate(over="ignore", invalid="ignore"):
             scan = _read(path, channel, unit)
             integers = scan.numbers.dtype.kind in "iu"
@@ -103,8 +102,8 @@ def read_height_field(
         return HeightField(heights, pixel_size, source, fill_missing=fill_missing, keep_missing=keep_missing)
     except FileNotFoundError:
         raise
-    # OSError is what Pillow raises for a damaged picture, and the system for what cannot be read (a folder, rights);
-    # UnicodeDecodeError what a damaged text does.
+    # Pillow raises OSError for a damaged image, the system for unreadable paths (a folder, permissions);
+    # UnicodeDecodeError comes from a damaged text.
     except (RequestError, UnicodeDecodeError, OSError, MemoryError) as error:
         raise RequestError(" ".join(f"{path}: {str(error)[:_SHOWN]}".split())) from error
 
@@ -133,7 +132,7 @@ def _read(path: Path, channel: str | int | None, unit: str | tuple[str, str] | N
 
 
 def _as_micrometres(numbers: NDArray, height_range: object) -> NDArray[np.float64]:
-    """Integers scaled by the full range of their type, floats as they are; (N_y, N_x) µm."""
+    """Integers scaled by the full range of their type, floats unchanged; (N_y, N_x) µm."""
     if numbers.dtype.kind not in "iuf":
         raise RequestError(f"got numbers of type {numbers.dtype}, wanted real floats in µm or integers")
     if numbers.ndim != 2 or numbers.size == 0:

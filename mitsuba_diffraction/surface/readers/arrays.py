@@ -1,4 +1,4 @@
-"""NumPy's arrays (.npy, .npz); pickles are never opened."""
+"""NumPy arrays (.npy, .npz); pickles are never loaded."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def read_npy(path: Path) -> Scan:
 
 
 def read_npz(path: Path) -> Scan:
-    """The array `heights` of an archive, and its `pixel_size` where it has one."""
+    """The array `heights` of an archive, and its `pixel_size`, if any."""
     try:
         with zipfile.ZipFile(path) as archive:
             unpacked = max((member.file_size for member in archive.infolist()), default=0)
@@ -52,7 +52,7 @@ def read_npz(path: Path) -> Scan:
 
 
 def _load_array(file: BinaryIO) -> NDArray:
-    """An array in NumPy's format, without pickles."""
+    """An array in NumPy's format; pickles are refused."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", UserWarning)

@@ -3,7 +3,7 @@
 The format: Gwyddion user guide, "Gwyddion native file format",
 http://gwyddion.net/documentation/user-guide-en/gwyfile-format.html. An object is its name, a zero byte, the number of
 bytes that follow (uint32) and its components; a component is its name, a zero byte, a letter for its type, and its
-value. All numbers are little-endian. Every size is checked against the bytes that are there before it is used.
+value. All numbers are little-endian. Every size is checked against the remaining bytes before it is used.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ _LONGEST_NAME = 4096
 
 
 def read(path: Path, unit: str | tuple[str, str] | None, channel: str | int | None) -> Scan:
-    """One data field; the top row of its picture is row 0. Masks, which mark what their user chose, are not read.
+    """One data field; the top row of its image is row 0. Masks are ignored.
 
     Raises:
-        ValueError: if it is no such file, not whole, or has no such channel.
+        ValueError: if it is not a Gwyddion file, is truncated, or has no such channel.
     """
     if path.stat().st_size > MOST_BYTES:
         raise RequestError(f"got {path.stat().st_size} bytes, wanted at most {MOST_BYTES}")
@@ -66,14 +66,14 @@ def read(path: Path, unit: str | tuple[str, str] | None, channel: str | int | No
 
 
 def _heights(field: dict[str, object]) -> tuple[NDArray[np.float64], tuple[float, float]]:
-    """The array of a data field, and its width and height, in its own units."""
+    """The array of a data field, and its width and height, in the units of the file."""
     columns, rows, values = field.get("xres"), field.get("yres"), field.get("data")
     if not (isinstance(columns, int) and isinstance(rows, int) and columns > 0 and rows > 0):
         raise RequestError(f"a data field of {columns!r} × {rows!r} pixels")
     if not isinstance(values, np.ndarray) or len(values) != rows * columns:
         count = len(values) if isinstance(values, np.ndarray) else 0
         raise RequestError(f"a data field of {columns} × {rows} pixels with {count} heights")
-    size = field.get("xreal", 1.0), field.get("yreal", 1.0)  # the format's defaults
+    size = field.get("xreal", 1.0), field.get("yreal", 1.0)  # defaults of the format
     if not all(isinstance(s, float) and np.isfinite(s) and s > 0 for s in size):
         raise RequestError(f"a data field of the size {size}, wanted positive lengths")
     return values.astype(np.float64).reshape(rows, columns), size

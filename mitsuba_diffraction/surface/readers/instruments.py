@@ -1,6 +1,6 @@
-"""Instruments' own formats, through SurfaceTopography (an optional extra).
+"""Instrument formats, read by SurfaceTopography (an optional extra).
 
-A format is read by the reader that its extension names: the library's guessing would also try formats of general use.
+The extension determines the reader: the library would otherwise also try general-purpose formats.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _FORMATS = {
     ".x3p": "x3p",
     ".zon": "zon",
 }
-"""Extension → SurfaceTopography's name of the format; Nanoscope's numbers (.000, .001, …) besides."""
+"""Extension → SurfaceTopography's name of the format, in addition to Nanoscope's numbers (.000, .001, …)."""
 
 NAMES = (
     "Nanoscope .spm .000, Nanosurf .nid .ezd, Igor .ibw, JPK .jpk, NT-MDT .mdt, ISO 25178-71 .sdf, X3P .x3p, "
@@ -56,18 +56,18 @@ NAMES = (
 
 
 def format_of(extension: str) -> str | None:
-    """SurfaceTopography's name of the format of a file with this extension (lower case), if it is an instrument's."""
+    """SurfaceTopography's name of the format for this extension (lower case), if it is an instrument format."""
     return "di" if re.fullmatch(r"\.\d{3}", extension) else _FORMATS.get(extension)
 
 
 def read(path: Path, unit: str | tuple[str, str] | None, channel: str | int | None) -> Scan:
-    """One channel of an instrument's file; the top row of its picture is row 0.
+    """One channel of an instrument file; the top row of its image is row 0.
 
     Raises:
-        ValueError: if SurfaceTopography is not installed, does not understand the file, or finds no such channel.
+        ValueError: if SurfaceTopography is not installed, cannot read the file, or finds no such channel.
     """
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the library's remarks on what else is not installed, and on metadata
+        warnings.simplefilter("ignore")  # of the library, on optional dependencies and metadata
         try:
             from SurfaceTopography.IO import lookup_reader_by_format
         except ImportError as error:
@@ -76,7 +76,7 @@ def read(path: Path, unit: str | tuple[str, str] | None, channel: str | int | No
         try:
             reader = lookup_reader_by_format[format_of(path.suffix.lower())](str(path))
             found = list(reader.channels)
-        # Readers of binary files raise whatever a wrong byte leads them to.
+        # Readers of binary files raise arbitrary exceptions for damaged files.
         except Exception as error:
             raise RequestError(f"not a file of this instrument, or a damaged one ({_told(error)})") from None
         chosen = choose(
@@ -104,7 +104,7 @@ def read(path: Path, unit: str | tuple[str, str] | None, channel: str | int | No
 
 
 def _refuse_bomb(path: Path) -> None:
-    """Several formats are archives, which the library unpacks into memory."""
+    """Checks archives, which the library unpacks into memory."""
     if zipfile.is_zipfile(path):
         try:
             with zipfile.ZipFile(path) as archive:

@@ -1,4 +1,4 @@
-"""Grey pictures (.png, .tif) whose numbers are heights."""
+"""Greyscale images (.png, .tif) of heights."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from .scan import DAMAGED, Scan
 
 
 def read(path: Path) -> Scan:
-    """The one channel of a picture."""
+    """The channel of an image."""
     with warnings.catch_warnings():
-        # What Pillow only warns of (pictures that unpack to a great size, damaged metadata) is an error here.
+        # Warnings of Pillow (decompression bombs, damaged metadata) are errors here.
         warnings.simplefilter("error", Image.DecompressionBombWarning)
         warnings.simplefilter("error", UserWarning)
         try:
@@ -36,13 +36,13 @@ def read(path: Path) -> Scan:
 
 
 def _numbers_of(picture: Image.Image) -> NDArray:
-    """The one channel of a grey picture in its own precision: uint8, uint16 or float32."""
+    """The channel of a greyscale image in its own precision: uint8, uint16 or float32."""
     mode = picture.mode
-    # How the numbers are packed in the file; Pillow forgets it when it loads them.
+    # The pixel format of the file, which Pillow discards on loading.
     packing = str(picture.tile[0][3]) if picture.tile else ""
     white_is_zero = picture.format == "TIFF" and picture.tag_v2.get(262) == 0
     sixteen = mode.startswith("I;16") and "I;16" in packing and not white_is_zero
-    # Older Pillow opens a PNG of 16 bit as 32 bit integers.
+    # Older versions of Pillow open 16 bit PNG files as 32 bit integers.
     sixteen = sixteen or (mode == "I" and picture.format == "PNG")
     channels = mode in ("RGB", "RGBA", "LA") and ";16" not in packing
     if not (mode in ("L", "F") or sixteen or channels) or "transparency" in picture.info:
@@ -57,7 +57,7 @@ def _numbers_of(picture: Image.Image) -> NDArray:
 
 
 def _grey(pixels: NDArray, mode: str) -> NDArray:
-    """The one channel of a picture whose colours are equal and whose alpha is opaque."""
+    """The common channel of a colour image that is grey and opaque."""
     if mode.endswith("A") and not (pixels[..., -1] == 255).all():
         raise RequestError("got a picture with transparent pixels, wanted an opaque grey one")
     colours = pixels[..., : len(mode.removesuffix("A"))]

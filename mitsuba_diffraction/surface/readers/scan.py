@@ -1,4 +1,4 @@
-"""What a reader takes from a file, and how one of several channels is chosen."""
+"""The contents of a scan file, and the choice among several channels."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from numpy.typing import NDArray
 from ...errors import RequestError
 
 MOST_BYTES = 2**31
-"""Largest array that is taken from a file."""
+"""Largest array read from a file."""
 
 DAMAGED = (SyntaxError, TypeError, KeyError, EOFError, IndexError, OverflowError, struct.error, UserWarning)
-"""What Pillow and NumPy raise, besides OSError and ValueError, when the bytes of a file are wrong."""
+"""Raised by Pillow and NumPy for damaged files, in addition to OSError and ValueError."""
 
 _HEIGHT_NAMES = ("height", "topograph", "z-axis", "zsensor", "z sensor")
-"""What instruments call the channel of the heights."""
+"""Names of the height channel in instrument files."""
 
 
 @dataclass(frozen=True)
 class Scan:
-    """The numbers of a file.
+    """The contents of a file.
 
     Attributes:
-        numbers: (N_y, N_x); floats are µm, NaN or masked where missing; integers run over the range of their type.
-        pixel_size: µm, one number or (x, y); None where the file has none.
-        channel: the name of the channel, where a file may have several.
+        numbers: (N_y, N_x); floats are µm, NaN or masked where missing; integers use the full range of their type.
+        pixel_size: µm, one number or (x, y); None if the file has none.
+        channel: the name of the channel, in formats with several.
     """
 
     numbers: NDArray
@@ -37,7 +37,7 @@ class Scan:
 
 @dataclass(frozen=True)
 class Channel:
-    """A channel of a file: its number there, its name, and whether it holds lengths."""
+    """A channel of a file: its number, its name, and whether it holds lengths."""
 
     number: int
     name: str
@@ -48,15 +48,15 @@ class Channel:
 
 
 def choose(channels: Sequence[Channel], wanted: str | int | None) -> Channel:
-    """The channel that is named, or that holds the heights.
+    """The named channel, or that of the heights.
 
     Args:
-        wanted: the number of a channel, its name, or a part of it that only one channel has (capitals do not count).
-            None takes the only channel of lengths, or the first of those that are called heights.
+        wanted: number, name or unique part of a name (case-insensitive). None selects the only channel of lengths, or
+            the first of those named as heights.
 
     Raises:
-        ValueError: if there is no such channel, if several answer to the name, or if it holds no lengths; the channels
-            are listed.
+        ValueError: if there is no such channel, the name is ambiguous, or it does not hold lengths; lists the
+            channels.
     """
     if wanted is None:
         lengths = [channel for channel in channels if channel.is_length]

@@ -18,10 +18,10 @@ _LONGEST_HEADER = 2**20
 
 
 def read(path: Path, unit: str | tuple[str, str] | None) -> Scan:
-    """The one field of a file; the top row of its picture is row 0.
+    """The field of a file; the top row of its image is row 0.
 
     Raises:
-        ValueError: if it is no such file, or not whole.
+        ValueError: if it is not in this format, or truncated.
     """
     with path.open("rb") as file:
         head = file.read(_LONGEST_HEADER)

@@ -1,23 +1,23 @@
 """Heights as text: points x y z (.xyz), and a table of heights with or without a header (.asc).
 
-.xyz: three numbers a line, in any order of the points, on a regular grid along x and y; a place of the grid without a
-point is a missing pixel. Lines that begin with # are comments. Row 0 has the least y.
+.xyz: three numbers per line, points in any order, on a regular grid along x and y; a grid position without a point is a
+missing pixel. Lines that begin with # are comments. Row 0 has the smallest y.
 
-.asc: a table of heights, the top row of the picture first, with one of these headers:
+.asc: a table of heights, starting with the top row of the image, with one of these headers:
 
-    # Channel: Height                 as Gwyddion exports it; the lines may come in any order, others are passed over
+    # Channel: Height                 exported by Gwyddion; lines in any order, others are ignored
     # Width: 5.000 µm
     # Height: 5.000 µm
     # Value units: m
 
-    ncols 512                         an ESRI grid; a square cell; its rows come from the highest y down
+    ncols 512                         an ESRI grid of square cells; rows start at the largest y
     nrows 512
     xllcorner 0
     yllcorner 0
     cellsize 0.05
     NODATA_value -9999
 
-or with no header, where pixel size and unit are given by the user.
+or without a header, if pixel size and unit are given as arguments.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ from . import units
 from .scan import MOST_BYTES, Scan
 
 _OFF_GRID = 0.1
-"""How far a coordinate may lie from its place, in pixels: text is rounded."""
+"""Largest deviation of a coordinate from the grid, in pixels, owing to rounding in text."""
 
 _FEWEST_POINTS = 0.25
-"""Share of the places of a grid that must have a point; less is not a grid."""
+"""Least fraction of grid positions with a point."""
 
 _GWYDDION = re.compile(r"#\s*(Channel|Width|Height|Value units):(.*)")
 _LENGTH = re.compile(r"([-+.\deE]*)(.*)")
@@ -49,7 +49,7 @@ def read_points(path: Path, unit: str | tuple[str, str] | None) -> Scan:
     """Points x y z on a regular grid.
 
     Raises:
-        ValueError: if there are not three numbers a line, if no unit is given, or if they are not on a grid.
+        ValueError: if a line does not have three numbers, no unit is given, or the points are not on a grid.
     """
     points = _table(_text(path))
     if points.shape[1] != 3:
@@ -70,7 +70,7 @@ def read_points(path: Path, unit: str | tuple[str, str] | None) -> Scan:
     heights = np.full(rows * columns, np.nan)
     heights[place] = points[:, 2]
     scale = units.micrometres(along, "unit")
-    pixel_size = (d_x * scale, d_y * scale) if d_x and d_y else None  # a single line tells one of them only
+    pixel_size = (d_x * scale, d_y * scale) if d_x and d_y else None  # a single line determines only one of them
     return Scan(heights.reshape(rows, columns) * units.micrometres(high, "unit"), pixel_size)
 
 
@@ -78,7 +78,7 @@ def read_table(path: Path, unit: str | tuple[str, str] | None) -> Scan:
     """A table of heights.
 
     Raises:
-        ValueError: if it is no table, if it may be points, or if its unit is not known.
+        ValueError: if it is not a table, could be a list of points, or has no known unit.
     """
     text = _text(path)
     if text.lstrip()[:5].lower() == "ncols":
@@ -134,14 +134,14 @@ def _text(path: Path) -> str:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError:
-        text = path.read_text(encoding="latin-1")  # µ as Windows writes it
+        text = path.read_text(encoding="latin-1")  # µ as encoded by Windows
     if "\0" in text:
         raise RequestError("not a text: it holds zero bytes")
     return text
 
 
 def _table(text: str) -> NDArray[np.float64]:
-    """Numbers in lines of equal length, between white space, commas or semicolons."""
+    """Numbers in lines of equal length, separated by white space, commas or semicolons."""
     first = next((line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")), "")
     if not first:
         raise RequestError("the file holds no numbers")
@@ -155,17 +155,17 @@ def _table(text: str) -> NDArray[np.float64]:
 
 
 def _grid(places: NDArray[np.float64], axis: str) -> tuple[NDArray[np.int64], int, float]:
-    """The index of each coordinate on the regular grid that they lie on, its length, and its spacing (0 for one)."""
+    """The index of each coordinate on its regular grid, the length of the grid, and its spacing (0 for one point)."""
     values = np.unique(places)
     if values[-1] == values[0]:
         return np.zeros(len(places), np.int64), 1, 0.0
     gaps = np.diff(values)
     if not np.isfinite(gaps).all():
         raise RequestError(f"{axis} goes from {values[0]:g} to {values[-1]:g}: wanted a grid along x and y")
-    # What is nearer than a tenth of the widest gap is one place, rounded in different ways.
+    # Coordinates closer than a tenth of the widest gap are equal up to rounding.
     starts = np.concatenate([[0], np.flatnonzero(gaps > _OFF_GRID * gaps.max()) + 1])
     middles = np.add.reduceat(values, starts) / np.diff(np.append(starts, len(values)))
-    # Step by step, so that rounding does not add up; where a column has no point, a step is two.
+    # Step by step, to avoid accumulating rounding errors; across a column without points a step is two.
     steps = np.diff(middles)
     index = np.concatenate([[0], np.cumsum(np.rint(steps / np.median(steps)))])
     if not (np.diff(index) > 0).all():
@@ -187,7 +187,7 @@ def _may_be_points(table: NDArray[np.float64]) -> bool:
 
 
 def _length(text: str, unit: str) -> float:
-    """A length with its unit, or without it in the user's, in µm."""
+    """A length in µm, in its own unit or else in the given one."""
     number, own = _LENGTH.match(text).groups()
     try:
         value = float(number)

@@ -1,4 +1,4 @@
-"""Units of length as instruments write them, in µm."""
+"""Units of length in instrument files, in µm."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def micrometres(unit: str, what: str) -> float:
     """One of `unit` in µm.
 
     Raises:
-        ValueError: if it is no unit of length.
+        ValueError: if it is not a unit of length.
     """
     if not (isinstance(unit, str) and is_length(unit)):
         raise RequestError(f"{what}: got the unit {unit!r}, wanted a length ({UNITS})")
@@ -38,10 +38,10 @@ def micrometres(unit: str, what: str) -> float:
 
 
 def pair(unit: str | tuple[str, str] | None) -> tuple[str, str]:
-    """The units along the surface and of the heights, as the user gives them; empty where none is given.
+    """The given units of lateral lengths and heights; empty if none.
 
     Raises:
-        ValueError: if it is neither a unit of length nor two of them.
+        ValueError: if it is neither one unit of length nor two.
     """
     if unit is None:
         return "", ""
