@@ -390,7 +390,8 @@ def test_the_samples_of_a_scene_are_taken_and_a_file_may_be_half(command):
     whole, size = SpectralImage.load("out.exr"), Path("out.exr").stat().st_size
     assert whole.attributes["spp"] == 3
     assert f" s, {size / 1e6:.3g} MB\n" in out
-    Path("out.exr").unlink()
+    for name in ("out.exr", "out.png"):
+        Path(name).unlink()
     code, _, err = command(f"{line} --half")
     assert code == 0, err
     assert Path("out.exr").stat().st_size < 0.7 * size

@@ -369,11 +369,11 @@ def test_the_command_stops_at_an_error_and_says_if_it_is_not_reached(command):
     picture = SpectralImage.load("out.exr")
     assert picture.attributes["spp"] < 4096
     assert picture.attributes["error"] <= 0.2
-    assert "(not " not in out
+    assert "increase --spp" not in out
     code, out, err = command(f"{LINE} --spp 8 --until-error 0.001 --overwrite")
     assert (code, err) == (0, "")
-    assert "8 samples per pixel, relative error of luminance 0." in out
-    assert "(not 0.001: more --spp" in out
+    assert "8 samples per pixel, relative error of luminance at most 0." in out
+    assert "(above 0.001: increase --spp)" in out
 
 
 def test_an_interrupt_before_the_first_pass_writes_nothing(command, monkeypatch):
