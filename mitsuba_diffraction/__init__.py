@@ -1,7 +1,8 @@
 """Diffraction gratings for Mitsuba 3.
 
-Importing this package registers the BSDF `diffraction_grating` and the integrator `diffraction_shader` for every
-spectral variant of Mitsuba, once Mitsuba is imported. Everything that needs no renderer works without it.
+Importing this package registers the BSDF `diffraction_grating` and the integrators `diffraction_path` and
+`diffraction_shader` for all spectral variants as soon as Mitsuba is imported. Everything up to the spectrum file works
+without importing Mitsuba.
 """
 
 from __future__ import annotations
@@ -17,13 +18,13 @@ _HOME = {
     "precompute": "spectrum.build",
     "read_height_field": "surface.readers",
 }
-_MODULES = {"gratings": "surface.gratings", "reference": "reference"}
+_MODULES = {"gratings": "surface.gratings", "reference": "reference", "rigorous": "rigorous"}
 
 __all__ = [*_HOME, *_MODULES]
 
 
 def __getattr__(name: str) -> object:
-    """The public names, imported when they are asked for (PEP 562)."""
+    """Public names, imported on first use (PEP 562)."""
     if name in _HOME:
         value = getattr(importlib.import_module(f".{_HOME[name]}", __name__), name)
     elif name in _MODULES:

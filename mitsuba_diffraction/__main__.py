@@ -1,4 +1,4 @@
-"""Entry point of the command `mitsuba-diffraction`: ends on Ctrl-C also while the package is imported."""
+"""Entry point of `mitsuba-diffraction`; handles Ctrl-C during imports as well."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import signal
 
 def main() -> None:
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        # An exception inside an extension module that is being imported becomes another one, or a crash.
+        # An exception raised while an extension module is being imported is converted, or crashes.
         signal.signal(signal.SIGINT, _stop)
     from .cli import main
 

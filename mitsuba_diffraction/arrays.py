@@ -1,4 +1,4 @@
-"""Shapes of the arguments that all evaluations share."""
+"""Shapes of the arguments shared by all evaluations."""
 
 from __future__ import annotations
 

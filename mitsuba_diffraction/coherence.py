@@ -1,4 +1,4 @@
-"""The Gaussian lobe that a finite coherence length gives to every order."""
+"""The Gaussian lobe of an order due to a finite coherence length."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import numpy as np
 
 from .errors import RequestError
 
-# The sun's disc is 0.53° wide: its light is coherent over about 65 µm.
+# Angular diameter 0.53°.
 SUN_COHERENCE_LENGTH = 65.0
 
-# A nanometre to a metre: beyond, lobes have no width or no end in floats.
+# 1 nm to 1 m, beyond which the lobes under- or overflow in floating point.
 SHORTEST, LONGEST = 1e-3, 1e6
 
 
@@ -30,9 +30,9 @@ def lobe_width(coherence_length: float) -> float:
 
 
 def lobe_reach(share: float) -> float:
-    """The radius ρ, in standard deviations, at which a lobe is cut off; what is inside is scaled up to the whole.
+    """The truncation radius ρ of a lobe, in standard deviations; the truncated lobe is renormalised.
 
-    A two-dimensional Gaussian has e^{−ρ²/2} outside of the radius ρ. Cutting it off and scaling the rest changes the
-    lobe by twice that in the L1 norm, which is to be `share`.
+    A two-dimensional Gaussian has the fraction e^{−ρ²/2} outside the radius ρ. Truncation and renormalisation change it
+    by twice that in the L1 norm, which is set equal to `share`.
     """
     return float(np.sqrt(-2 * np.log(share / 2)))

@@ -1,4 +1,4 @@
-"""Output files that are whole or not there, and that tell whether they still are what was written."""
+"""Atomic writing of files, and digests that detect damage."""
 
 from __future__ import annotations
 
@@ -11,45 +11,47 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
+import platformdirs
+
 from .errors import RequestError
 
 try:
     import fcntl
-except ImportError:  # Windows, where nothing tells whether a temporary file is still being written
+except ImportError:  # Windows, where a temporary file in use cannot be recognised
     fcntl = None
 
-# Temporary path → what it becomes.
+# Temporary path → final path.
 _being_written: dict[str, Path] = {}
 
 
 def final_path(path: str | os.PathLike[str]) -> Path:
-    """The real path of a file; of a temporary one that `whole_file` gave, what it becomes."""
+    """The real path of a file; the final path of a temporary file from `whole_file`."""
     real = os.path.realpath(path)
     return _being_written.get(real, Path(real))
 
 
 @contextmanager
 def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Gives a temporary path beside `path` and renames it onto `path` when the block ends well.
+    """Yields a temporary path next to `path` and renames it to `path` if the block succeeds.
 
-    A reader therefore sees the old file or the new one, never half of one, whatever else writes the same file, and from
-    the end of the block on the new one outlives a power cut. If the block raises (KeyboardInterrupt included) the
-    temporary file is removed and `path` stays as it was. The temporary name ends like `path`, because writers choose
-    the format by the ending. It is locked while it is written; unlocked ones, left by a kill, are removed here.
+    A reader sees either the old or the new file, whichever process writes it, and after the block the new file is on
+    disk (fsync). If the block raises, including KeyboardInterrupt, the temporary file is removed and `path` is left
+    unchanged. The temporary name has the suffix of `path`, by which writers choose the format. It is locked while it
+    is being written; unlocked ones, left by a killed process, are removed here.
 
     Args:
-        path: where the finished file shall be; a symbolic link is followed.
+        path: the final path; symbolic links are followed.
 
     Yields:
-        The path to write to, in the same folder (a rename across file systems would be a copy, and not whole).
+        The path to write to, in the same folder: a rename across file systems is not atomic.
 
     Raises:
         FileNotFoundError: if the folder does not exist.
-        ValueError: if `path` is there and is not an ordinary file.
-        OSError: if it cannot be written (no space, no permission); `path` stays as it was.
+        ValueError: if `path` exists and is not an ordinary file.
+        OSError: if it cannot be written (no space, no permission); `path` is left unchanged.
     """
     target = Path(os.path.realpath(path))
-    if str(target) in _being_written:  # a writer that was given a temporary path
+    if str(target) in _being_written:  # a writer called with a temporary path
         yield target
         return
     if not target.parent.is_dir():
@@ -75,7 +77,7 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
         del _being_written[str(temporary)]
         if fcntl is not None:
             os.close(opened)
-    if hasattr(os, "O_DIRECTORY"):  # the rename itself; not every system can
+    if hasattr(os, "O_DIRECTORY"):  # makes the rename itself durable, where supported
         folder = os.open(target.parent, os.O_DIRECTORY)
         try:
             os.fsync(folder)
@@ -84,15 +86,15 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def _locked_temporary(target: Path) -> tuple[Path, int]:
-    """A new file beside `target`, and the descriptor that holds its lock."""
+    """A new file next to `target`, and the descriptor that holds its lock."""
     while True:
-        # Not tempfile.mkstemp: its files are private to their owner, and would stay so after the rename.
+        # Not tempfile.mkstemp, whose files are readable by their owner only, also after the rename.
         temporary = target.with_name(f".{target.stem}-{secrets.token_hex(8)}{target.suffix}")
         opened = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
         if fcntl is not None:
             with suppress(OSError):  # a file system without locks
                 fcntl.flock(opened, fcntl.LOCK_EX)
-        if temporary.exists():  # another process has not taken it for a dead one's before it was locked
+        if temporary.exists():  # not removed as a leftover by another process before it was locked
             return temporary, opened
         os.close(opened)
 
@@ -103,13 +105,13 @@ def _remove_what_a_kill_left(target: Path) -> None:
     ours = re.compile(re.escape(f".{target.stem}-") + "[0-9a-f]{16}" + re.escape(target.suffix))
     with suppress(OSError), os.scandir(target.parent) as entries:
         for left in [Path(entry.path) for entry in entries if ours.fullmatch(entry.name)]:
-            with suppress(OSError), left.open("rb") as stream:  # locked, gone meanwhile, or of another user
+            with suppress(OSError), left.open("rb") as stream:  # locked, already gone, or of another user
                 fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 left.unlink()
 
 
 def refuse_unwritable(path: str | os.PathLike[str]) -> None:
-    """Raises if no file can be made where `path` shall be: better before hours of work than after them.
+    """Raises if `path` cannot be written, to be called before long computations.
 
     Raises:
         ValueError: with the reason.
@@ -124,11 +126,17 @@ def refuse_unwritable(path: str | os.PathLike[str]) -> None:
 
 
 class _Writable(Exception):
-    """Nothing stands in the way; the temporary file goes."""
+    """`path` can be written; discards the temporary file."""
+
+
+def cache_folder() -> Path:
+    """Where what took long to build is kept: $MITSUBA_DIFFRACTION_CACHE, or the user's cache folder."""
+    named = os.environ.get("MITSUBA_DIFFRACTION_CACHE")
+    return Path(named) if named else platformdirs.user_cache_path("mitsuba_diffraction")
 
 
 def refuse_special(path: str | os.PathLike[str]) -> None:
-    """Raises if `path` is a pipe or a device, which may have no end.
+    """Raises if `path` is a pipe or a device, which may be endless.
 
     Raises:
         ValueError: if so.
@@ -142,15 +150,15 @@ def refuse_special(path: str | os.PathLike[str]) -> None:
 _BEFORE_DIGEST = "SHA-256 of this file with zeros for it: "
 _ZEROS = 64 * "0"
 UNSEALED = _BEFORE_DIGEST + _ZEROS
-"""Text that has to stand in the first or last megabyte of a file for `seal`."""
+"""Placeholder for the digest, in the first or last megabyte of the file; see `seal`."""
 _MEGABYTE = 2**20
 
 
 def seal(path: str | os.PathLike[str]) -> None:
-    """Puts the SHA-256 of a file into the place that `UNSEALED` (or an earlier digest) keeps in it.
+    """Replaces the placeholder `UNSEALED`, or an earlier digest, by the SHA-256 of the file.
 
     Raises:
-        ValueError: if it has no such place.
+        ValueError: if the file has no placeholder.
     """
     with open(path, "r+b") as stream:
         place = _place_of_digest(stream)
@@ -162,7 +170,7 @@ def seal(path: str | os.PathLike[str]) -> None:
 
 
 def is_intact(path: str | os.PathLike[str]) -> bool | None:
-    """Whether every bit of a sealed file is what was written; None if it is not sealed."""
+    """Whether a sealed file is unchanged; None if it is not sealed."""
     with open(path, "rb") as stream:
         place = _place_of_digest(stream)
         if place is None:

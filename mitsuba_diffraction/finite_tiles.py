@@ -1,4 +1,4 @@
-"""A finite number of tiles: what their sum does to the transform of one (the "PQ" form)."""
+"""A finite number of tiles: the factor that multiplies the transform of one (the "PQ" form)."""
 
 from __future__ import annotations
 
@@ -11,26 +11,26 @@ from .errors import RequestError
 
 
 def tile_factor(x: ArrayLike, count: int) -> NDArray[np.floating]:
-    """D(x; N) = sin(πNx)/sin(πx): the sum of N unit waves, each x periods after the one before, about their middle.
+    """D(x; N) = sin(πNx)/sin(πx): the sum of N unit phasors, successively shifted by x periods, about their centre.
 
     N tiles of period T multiply the transform of one tile by D(qT; N), up to a phase. |D| ≤ N, and D² integrates to N
-    over one period. The quotient is 0/0 at whole numbers; with k the whole number nearest to x and r = x − k, which is
-    exact in floating point,
+    over one period. The quotient is 0/0 at integers; with k the integer nearest to x and r = x − k, exact in floating
+    point,
 
         D(x; N) = (−1)^{k(N−1)} sin(πNr)/sin(πr) → (−1)^{k(N−1)} N   as r → 0.
 
-    The product Nr is kept as two numbers before its own whole part is taken off, so that D is right to a few units in
-    the last place everywhere, next to its zeros too.
+    The product Nr is represented by two numbers before its integer part is removed, which makes D accurate to a few
+    units in the last place everywhere, also near its zeros.
 
     Args:
-        x: (...) numbers; float32 stays float32, everything else becomes float64.
-        count: N, from 1 to 1/ε of the number type (2²³ in float32).
+        x: (...) real; float32 is preserved, all other types become float64.
+        count: N, from 1 to 1/ε of the floating-point type (2²³ in float32).
 
     Returns:
-        (...) in the number type of x.
+        (...) in the type of x.
 
     Raises:
-        ValueError: if x is not real and finite, or count is not such a whole number.
+        ValueError: if x is not real and finite, or count is not an integer in this range.
     """
     x = np.asarray(x)
     if x.dtype.kind not in "fiu":
@@ -48,7 +48,7 @@ def tile_factor(x: ArrayLike, count: int) -> NDArray[np.floating]:
     product, rest = _exact_product(number, r)
     whole = np.rint(product)
     fraction = (product - whole) + rest
-    # Here D differs from N by N(πNr)²/6, less than rounding does.
+    # Here D differs from N by N(πNr)²/6, less than the rounding error.
     at_integer = np.abs(product) < np.sqrt(epsilon) / 4
     quotient = np.sin(pi * fraction) / np.where(at_integer, x.dtype.type(1), np.sin(pi * r))
     odd = np.fmod(np.abs(nearest) * x.dtype.type((count - 1) % 2) + np.abs(whole), 2)
@@ -56,11 +56,11 @@ def tile_factor(x: ArrayLike, count: int) -> NDArray[np.floating]:
 
 
 def _exact_product(a: np.floating, b: NDArray[np.floating]) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-    """a·b as a rounded product and what rounding took off it (Dekker 1971): their sum is exact."""
+    """a·b as the rounded product and its rounding error, whose sum is exact (Dekker 1971)."""
     bits = np.finfo(b.dtype).nmant + 1
 
     def split(value: NDArray[np.floating]) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-        """Two numbers of half the digits each, whose products do not round."""
+        """Two numbers of half the digits each, whose products are exact."""
         scaled = value * b.dtype.type(2 ** ((bits + 1) // 2) + 1)
         high = scaled - (scaled - value)
         return high, value - high

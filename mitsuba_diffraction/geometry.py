@@ -1,4 +1,4 @@
-"""K G in NumPy: Stam's geometry factor and the shadowing of V-cavities. `bsdf/geometry.py` is the same in Dr.Jit."""
+"""K G in NumPy: Stam's geometry factor and V-cavity shadowing. `bsdf/geometry.py` is the same in Dr.Jit."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 
 def k_g(cos_i: ArrayLike, cos_o: ArrayLike, d: ArrayLike, shadowing: bool = True) -> NDArray[np.floating]:
-    """K G of pairs of directions; shapes broadcast, float32 stays float32.
+    """K G of pairs of directions; shapes broadcast, float32 is preserved.
 
     With D = 1 + ω_i·ω_o and w = cos θ_i + cos θ_o,
 
@@ -16,8 +16,8 @@ def k_g(cos_i: ArrayLike, cos_o: ArrayLike, d: ArrayLike, shadowing: bool = True
 
     Args:
         cos_i, cos_o: cos θ_i and cos θ_o, positive.
-        d: D. Near grazing incidence take it from (|ω_i,t + ω_o,t|² + w²)/2, which does not cancel.
-        shadowing: without it, K alone.
+        d: D. Near grazing incidence compute it as (|ω_i,t + ω_o,t|² + w²)/2, which avoids cancellation.
+        shadowing: if false, K alone.
     """
     w = np.add(cos_i, cos_o)
     k = np.square(d) / (cos_i * cos_o * w**2)
@@ -25,6 +25,6 @@ def k_g(cos_i: ArrayLike, cos_o: ArrayLike, d: ArrayLike, shadowing: bool = True
 
 
 def k_g_between(wi: ArrayLike, wo: ArrayLike, shadowing: bool = True) -> NDArray[np.float64]:
-    """K G of unit vectors (..., 3) above the surface, which broadcast."""
+    """K G of unit vectors (..., 3) in the upper hemisphere; shapes broadcast."""
     wi, wo = np.asarray(wi, np.float64), np.asarray(wo, np.float64)
     return k_g(wi[..., 2], wo[..., 2], ((wi + wo) ** 2).sum(axis=-1) / 2, shadowing)

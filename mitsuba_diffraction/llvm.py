@@ -1,9 +1,9 @@
 """A usable LLVM for Dr.Jit's CPU backend.
 
-Dr.Jit loads libLLVM once, when it is imported: the library that ``DRJIT_LIBLLVM_PATH`` names, else the newest of the
-system. That one may be missing or too old, and Dr.Jit does not say so: with LLVM 15 and 16 the first kernel that holds
-``dr.maximum`` or ``dr.clip`` aborts the process. :func:`choose` therefore names the library of the wheel
-``karellen-llvm-core`` unless the variable already names a usable one; it must run before Dr.Jit is imported.
+Dr.Jit loads libLLVM once, when it is imported: the library in ``DRJIT_LIBLLVM_PATH``, or else the newest of the system.
+That may be missing or too old, without an error: with LLVM 15 and 16 the first kernel with ``dr.maximum`` or
+``dr.clip`` aborts the process. :func:`choose` therefore selects the library of the wheel ``karellen-llvm-core`` unless
+the variable already points to a suitable one; it must run before Dr.Jit is imported.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ from importlib import metadata
 from pathlib import Path
 
 MINIMUM_VERSION = (17, 0, 0)
-"""Oldest LLVM that compiles every kernel: 15 and 16 stop at ``fmaximum``, Dr.Jit itself refuses 14."""
+"""Oldest LLVM that compiles every kernel: 15 and 16 abort at ``fmaximum``, Dr.Jit itself refuses 14."""
 
 _PATH_VARIABLE = "DRJIT_LIBLLVM_PATH"
 _WHEEL = "karellen-llvm-core"
-# The wheel's libLLVM finds these through symbolic links that are only made at the next start of the interpreter, and
-# never in a read-only environment. Loaded beforehand, in this order, they are found by their names instead.
+# The wheel's libLLVM finds these through symbolic links that are only created at the next start of the interpreter, and
+# never in a read-only environment. Loading them first, in this order, lets it find them by name.
 _RUNTIME_LIBRARIES = ("libunwind.so.1", "libc++abi.so.1", "libc++.so.1")
 
 
 def choose() -> None:
-    """Points ``DRJIT_LIBLLVM_PATH`` to the wheel's library, unless it names a usable one. Needs Dr.Jit unimported."""
+    """Points ``DRJIT_LIBLLVM_PATH`` to the wheel's library unless it names a suitable one. Call before Dr.Jit loads."""
     given = os.environ.get(_PATH_VARIABLE)
     if given and _usable(_library_version(given)):
         return
@@ -38,7 +38,7 @@ def choose() -> None:
 
 
 def problem() -> str | None:
-    """Returns None if Dr.Jit has a usable LLVM, else one line that says what is wrong and what to do."""
+    """None if Dr.Jit has a suitable LLVM, otherwise one line with the problem and its remedy."""
     import drjit as dr
 
     version = tuple(dr.detail.llvm_version()) if dr.has_backend(dr.JitBackend.LLVM) else None
@@ -47,9 +47,9 @@ def problem() -> str | None:
     found = f"found {'.'.join(map(str, version))}" if version else "none found"
     advice = f"install LLVM {MINIMUM_VERSION[0]} or later, or set {_PATH_VARIABLE} to its libLLVM"
     if _wheel_library():
-        advice = "import mitsuba_diffraction before mitsuba and drjit, which load LLVM once and for all"
+        advice = "import mitsuba_diffraction before mitsuba and drjit, which load LLVM only once"
     elif platform.system() == "Linux" and platform.machine() == "x86_64":
-        advice = f"`pip install {_WHEEL}` (without --target, which leaves the library out), or {advice}"
+        advice = f"`pip install {_WHEEL}` (without --target, which omits the library), or {advice}"
     return f"Dr.Jit's CPU backend needs LLVM {MINIMUM_VERSION[0]} or later ({found}): {advice}"
 
 
@@ -65,7 +65,7 @@ def _load(path: str | Path) -> ctypes.CDLL | None:
 
 
 def _library_version(path: str | Path) -> tuple[int, ...] | None:
-    """Version of the libLLVM at ``path``, or None where it does not load or is older than LLVM 16."""
+    """Version of the libLLVM at ``path``, or None if it does not load or is older than LLVM 16."""
     library = _load(path)
     if library is None or not hasattr(library, "LLVMGetVersion"):
         return None
@@ -75,7 +75,7 @@ def _library_version(path: str | Path) -> tuple[int, ...] | None:
 
 
 def _wheel_library() -> str | None:
-    """Path of a libLLVM that the wheel has installed and that loads, or None."""
+    """Path of the wheel's libLLVM if it loads, or None."""
     for distribution in metadata.distributions(name=_WHEEL):
         files = [
             Path(file.locate()).resolve()

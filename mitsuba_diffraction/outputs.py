@@ -1,8 +1,8 @@
-"""What a command may write: never over what it reads, nor over what was not made for the same request.
+"""Protection of files: a command overwrites neither its inputs nor files that were made for another request.
 
-A command tells once what it reads and writes (`claimed`). What it then writes carries a digest of the request
-(`made_for`), by which the next run of the same command knows its own files. Writers put it where their format keeps
-text: OpenEXR's header, PNG's text chunks, metadata of PDF, SVG and WebP, an entry of JSON, a comment in Markdown.
+A command declares the files it reads and writes (`claimed`). Every output carries a digest of the request (`made_for`),
+by which a later run of the same command recognises its own files. It is stored in the header of OpenEXR, text chunks of
+PNG, metadata of PDF, SVG and WebP, an entry of JSON, or a comment in Markdown.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from PIL.PngImagePlugin import PngInfo
 
 _MEGABYTE = 2**20
-# Of the command that runs: real path of a file that it writes → the text that the file carries.
+# Of the running command: real path of an output → the text that it has to carry.
 _claims: dict[Path, str] = {}
 
 
@@ -36,19 +36,19 @@ def claimed(
     scratch: Iterable[str | os.PathLike[str]] = (),
     overwrite: bool = False,
 ) -> Iterator[None]:
-    """Refuses files that must not be written over, before the work; what is written inside the block is then marked.
+    """Refuses to overwrite protected files before any work is done, and marks the files written inside the block.
 
     Args:
-        request: all that decides what is written, by name. Names of files stand for their place relative to the file
-            that is written, so that a folder may move.
-        reads: files that are read.
-        writes: (option, file) of each file that is written.
-        scratch: files that are written on the way, and know by themselves what they belong to.
-        overwrite: allow to replace what was made for another request. What is read is never replaced.
+        request: everything that determines the output, by name. File names are stored relative to the output, so that
+            a folder may be moved.
+        reads: input files.
+        writes: (option, file) of each output.
+        scratch: intermediate files, which identify their request themselves.
+        overwrite: replace outputs of other requests. Inputs are never replaced.
 
     Raises:
-        ValueError: if a file to be written is read, or named twice, or was not made for this request; or if it cannot
-            be written at all.
+        ValueError: if an output is also an input, is named twice, exists and was not made for this request, or cannot
+            be written.
     """
     writes = [(option, os.fspath(path)) for option, path in writes]
     taken = {identity: os.fspath(path) for path in reads for identity in _identities(path)}
@@ -58,7 +58,7 @@ def claimed(
         for read in (taken[identity] for identity in identities & taken.keys()):
             by = "" if os.path.abspath(path) == os.path.abspath(read) else f" as {read}"
             raise RequestError(f"{option}: got {path}, which is read{by} and would be lost; wanted another name")
-        identities.add(os.path.realpath(path).casefold())  # two names that differ in case may become one file
+        identities.add(os.path.realpath(path).casefold())  # names that differ in case only may be the same file
         for other in (planned[identity] for identity in identities & planned.keys()):
             raise RequestError(f"{option}: {path} would be written twice, for {other} too; wanted another name")
         planned.update(dict.fromkeys(identities, option))
@@ -84,18 +84,18 @@ def claimed(
 
 
 def made_for(path: str | os.PathLike[str]) -> str | None:
-    """The text that a file has to carry, ASCII; None unless a command has claimed it."""
+    """The mark of an output, ASCII; None if no command has claimed it."""
     return _claims.get(final_path(path))
 
 
 def metadata(path: str | os.PathLike[str]) -> dict[str, str]:
-    """The same for Matplotlib's `savefig`, under a name that PNG, PDF and SVG share."""
+    """The mark as metadata for Matplotlib's `savefig`, under a key common to PNG, PDF and SVG."""
     request = made_for(path)
     return {} if request is None else {"Keywords": request}
 
 
 def png_text(path: str | os.PathLike[str]) -> PngInfo:
-    """The same for Pillow's `save`."""
+    """The mark as text chunks for Pillow's `save`."""
     from PIL.PngImagePlugin import PngInfo
 
     text = PngInfo()
@@ -105,7 +105,7 @@ def png_text(path: str | os.PathLike[str]) -> PngInfo:
 
 
 def save_json(content: Mapping[str, object], path: str | os.PathLike[str]) -> None:
-    """Writes a JSON file, whole or not at all."""
+    """Writes a JSON file atomically."""
     request = made_for(path)
     marked = dict(content) if request is None else {**content, "made for": request}
     with whole_file(path) as temporary:
@@ -113,21 +113,21 @@ def save_json(content: Mapping[str, object], path: str | os.PathLike[str]) -> No
 
 
 def save_markdown(text: str, path: str | os.PathLike[str]) -> None:
-    """Writes a Markdown file, whole or not at all."""
+    """Writes a Markdown file atomically."""
     request = made_for(path)
     with whole_file(path) as temporary:
         temporary.write_text(text if request is None else f"{text}\n<!-- {request} -->\n", encoding="utf-8")
 
 
 def free_name(stem: str, files_of: Callable[[str], Iterable[Path]], reads: Iterable[str | os.PathLike[str]]) -> str:
-    """The first of `stem`, `stem`_2, `stem`_3, … of whose files (`files_of`) none is read: for names by default."""
+    """A default name: the first of `stem`, `stem`_2, … none of whose files (`files_of`) is an input."""
     taken = {identity for path in reads for identity in _identities(path)}
     names = (stem if number == 1 else f"{stem}_{number}" for number in itertools.count(1))
     return next(name for name in names if not any(taken & _identities(path) for path in files_of(name)))
 
 
 def _identities(path: str | os.PathLike[str]) -> set[object]:
-    """Whatever tells that two names mean one file: links are followed, hard ones too."""
+    """Identifies a file independently of its name: resolves symbolic and hard links."""
     found: set[object] = {os.path.realpath(path)}
     if os.path.exists(path):
         status = os.stat(path)
@@ -151,7 +151,7 @@ def _relative(value: object, folder: Path) -> object:
 
 
 def _carries(path: Path, mark: str) -> bool:
-    """Whether a file carries a text; formats keep it near the beginning or the end."""
+    """Whether a file carries the mark; all formats store it near the beginning or the end."""
     with open(path, "rb") as stream:
         if mark.encode() in stream.read(_MEGABYTE):
             return True

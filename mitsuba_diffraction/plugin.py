@@ -1,7 +1,7 @@
 """Registers the plugins with Mitsuba, for every variant, now and after each mi.set_variant.
 
-Mitsuba discovers this module through the entry point group `mitsuba` (from 3.10 on) and reloads it at each change of
-variant; importing `mitsuba_diffraction` does the same on every version.
+Mitsuba 3.10 and later discover this module through the entry point group `mitsuba` and reload it on each change of
+variant; importing `mitsuba_diffraction` has the same effect in all versions.
 """
 
 from __future__ import annotations
@@ -14,18 +14,20 @@ import mitsuba as mi
 from . import llvm
 from .bsdf import diffraction_grating
 from .bsdf.surface import hand_over
+from .integrator import diffraction_path
 from .shader import integrator
 from .variants import is_spectral
 
-# Name, the function of Mitsuba's that registers it, and what gives its class for the variant in force.
+# Name, registration function of Mitsuba, and a function that defines the class for the current variant.
 PLUGINS = (
     ("diffraction_grating", "register_bsdf", diffraction_grating.define),
+    ("diffraction_path", "register_integrator", diffraction_path.define),
     ("diffraction_shader", "register_integrator", integrator.define),
 )
 
 
 def register(variant: str) -> None:
-    """Make the plugins known to `variant`, or, where they cannot work, stand-ins that say why."""
+    """Register the plugins for `variant`, or stand-ins that raise the reason why they cannot work."""
     for name, function, define in PLUGINS:
         reason = None
         if not is_spectral(variant):
@@ -46,7 +48,7 @@ def _refusal(reason: str) -> Callable[[mi.Properties], mi.Object]:
 
 
 def _accept_spectra() -> None:
-    """Let mi.load_dict take a GratingSpectrum as a value, which Mitsuba's own function refuses."""
+    """Make mi.load_dict accept a GratingSpectrum as a value, which Mitsuba refuses."""
     original = mi.load_dict
 
     @functools.wraps(original)
@@ -61,7 +63,7 @@ def _on_variant_change(old: str | None, new: str | None) -> None:
         register(new)
 
 
-# A reload must not do this twice.
+# Only once, also after a reload.
 if not getattr(mi, "_mitsuba_diffraction_registered", False):
     mi.detail.add_variant_callback(_on_variant_change)
     _accept_spectra()

@@ -1,28 +1,28 @@
-"""A recipe: which surface, and how its spectrum is built, in a TOML file.
+"""A recipe: a surface and the parameters of its spectrum, in a TOML file.
 
-[surface]                        # a profile by formula …
-profile = "blazed"               # a name of gratings.PROFILES, its parameters beside it
+[surface]                        # an analytic profile …
+profile = "blazed"               # a name in gratings.PROFILES, followed by its parameters
 period = 2.5                     # µm
 depth = 0.25                     # µm
 
 [surface]                        # … or a scan
 scan = "skin.png"                # relative to the recipe; formats: readers.read_height_field
-pixel_size = 0.0586              # µm, one number or [x, y]; where the file has none, or to overrule it
+pixel_size = 0.0586              # µm, one number or [x, y]; if the file has none, or to override it
 height_range = 0.375             # µm, for integer images
-channel = "Height"               # a name or a number, of a file with several; without it, the one of heights
-unit = "nm"                      # of a file that names none; ["um", "nm"]: along the surface, and of the heights
-prepare = [                      # steps of surface/prepare.py, done in this order
+channel = "Height"               # name or number, in a file with several; default: that of the heights
+unit = "nm"                      # of a file without one; ["um", "nm"]: lateral, and of the heights
+prepare = [                      # steps of surface/prepare.py, in this order
     "level_plane",               # or "level_quadratic"
-    "align_lines",               # bring the rows to one level
-    { despike = 5.0 },           # spikes beyond so many standard deviations of the noise
-    "fill_missing",              # here; or, with fill_missing = true, after the last step
+    "align_lines",               # remove offsets between rows
+    { despike = 5.0 },           # remove outliers beyond this many standard deviations of the noise
+    "fill_missing",              # here, or with fill_missing = true after the last step
     { trim_edges = 0.5 },        # µm off each edge
     { rotate = -3.0 },           # degrees from +x towards +y
     { crop_periods = "xy" },     # to whole periods along "x", "y" or both
 ]
-fill_missing = true              # pixels without a height are filled from their surroundings; without it, refused
+fill_missing = true              # interpolate missing pixels; default: refuse them
 
-[spectrum]                       # every line may be left out
+[spectrum]                       # all optional
 extent = "tile"
 coherence_length = 65.0          # µm
 wavelengths = [360.0, 830.0]     # nm
@@ -48,10 +48,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import platformdirs
-
 from .errors import RequestError
-from .files import refuse_special
+from .files import cache_folder, refuse_special
 from .spectrum import GratingSpectrum
 from .spectrum.build import precompute
 from .spectrum.file import FORMAT_VERSION
@@ -72,26 +70,26 @@ _SPECTRUM_KEYS = frozenset(
         "largest_height_range",
     }
 )
-# Raised when the same input gives other numbers than before, so that the cache is not read.
+# Incremented when the same input gives a different result, to invalidate the cache.
 _BUILD_VERSION = 4
-# Mitsuba constructs plugins on several threads; two that name one recipe must not build it twice.
+# Mitsuba constructs plugins in parallel; two with the same recipe must not both compute its spectrum.
 _building = threading.Lock()
-# Spectra in use, by the digest of their recipe: a scene with many instances reads the file once.
+# Spectra in use, by the digest of their recipe: many BSDFs of one recipe read its file once.
 _in_use: weakref.WeakValueDictionary[str, GratingSpectrum] = weakref.WeakValueDictionary()
 
 
 class CacheWarning(UserWarning):
-    """Spectra cannot be kept in the cache: they are built anew each time."""
+    """Spectra cannot be cached and are recomputed each time."""
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """A surface and the way to its spectrum.
+    """A surface and the parameters of its spectrum.
 
     Attributes:
-        surface: a profile's name and parameters, or a scan with its scale; see the head of this file.
+        surface: name and parameters of a profile, or a scan with its scale; see the docstring of this module.
         spectrum: arguments of `precompute`.
-        folder: where relative file names start.
+        folder: base of relative file names.
 
     Raises:
         ValueError: if something is missing, unknown or contradictory.
@@ -140,7 +138,7 @@ class Recipe:
                 content = tomllib.load(file)
         except FileNotFoundError:
             raise FileNotFoundError(f"{path}: no such file") from None
-        # Of the parser and of the text; a number of too many digits; brackets in brackets in brackets.
+        # Syntax or encoding errors; numbers of too many digits; deeply nested brackets.
         except (ValueError, RecursionError) as error:
             raise RequestError(f"{path}: not a TOML file ({error})") from None
         try:
@@ -182,14 +180,14 @@ class Recipe:
             raise RequestError(f"{path}: {error}") from None
 
     def build(self, progress: Callable[[int, int], None] | None = None) -> GratingSpectrum:
-        """The spectrum, computed."""
+        """Compute the spectrum."""
         arguments = dict(self.spectrum)
         if "wavelengths" in arguments:
             arguments["wavelengths"] = tuple(arguments["wavelengths"])
         return precompute(self.height_field(), progress=progress, **arguments)
 
     def digest(self) -> str:
-        """SHA-256 of everything that the spectrum depends on: the recipe's words and the scan's bytes."""
+        """SHA-256 of everything that determines the spectrum: the recipe and the contents of the scan."""
         content = hashlib.sha256(f"{FORMAT_VERSION}.{_BUILD_VERSION}".encode())
         surface = dict(self.surface)
         if "scan" in surface:
@@ -204,13 +202,13 @@ class Recipe:
         return content.hexdigest()
 
     def cached(self, progress: Callable[[int, int], None] | None = None) -> GratingSpectrum:
-        """The spectrum from the cache, or built and put there.
+        """The spectrum from the cache, or computed and cached.
 
-        The cache is a folder of spectra named by `digest`: $MITSUBA_DIFFRACTION_CACHE, or the user's cache folder. An
-        entry that is damaged, or of another recipe, is replaced.
+        The cache is a folder of spectra named by `digest`: $MITSUBA_DIFFRACTION_CACHE, or the user's cache folder. A
+        damaged entry, or one of another recipe, is replaced.
 
         Warns:
-            CacheWarning: if the spectrum cannot be kept.
+            CacheWarning: if the spectrum cannot be cached.
         """
         with _building:
             digest = self.digest()
@@ -230,17 +228,11 @@ class Recipe:
         except (RequestError, OSError, RuntimeError) as error:  # RuntimeError is what OpenEXR raises on a full disk
             reason = getattr(error, "strerror", None) or error
             warnings.warn(
-                f"the cache {path.parent} cannot be written to ({reason}); spectra are built anew each time",
+                f"the cache {path.parent} cannot be written to ({reason}); spectra are recomputed each time",
                 CacheWarning,
                 stacklevel=1,
             )
         return spectrum
-
-
-def cache_folder() -> Path:
-    """Where spectra of recipes are kept."""
-    named = os.environ.get("MITSUBA_DIFFRACTION_CACHE")
-    return Path(named) if named else platformdirs.user_cache_path("mitsuba_diffraction")
 
 
 def _refuse_unknown(where: str, table: Mapping[str, Any], known: frozenset[str]) -> None:
@@ -255,7 +247,7 @@ def _is_number(value: object) -> bool:
 
 
 def _is_plain(value: object) -> bool:
-    # TOML's integers have 64 bits; Python reads greater ones, too, which no float holds.
+    # TOML integers have 64 bits; Python also parses larger ones, which overflow a float.
     return isinstance(value, float | str) or (isinstance(value, int) and -(2**63) <= value < 2**63)
 
 

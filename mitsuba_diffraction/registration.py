@@ -1,6 +1,6 @@
-"""Registers the plugins as soon as Mitsuba is imported, and imports it no sooner.
+"""Registers the plugins as soon as Mitsuba is imported, without importing it.
 
-Precomputation, inspection and the readers do without Mitsuba, which takes longer to import than they take to run.
+Precomputation, inspection and the readers do not need Mitsuba, which takes longer to import than they take to run.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from types import ModuleType
 
 
 def register() -> None:
-    """Register now if Mitsuba is imported, else when it is."""
+    """Register the plugins now if Mitsuba has been imported, otherwise when it is."""
     if "mitsuba" in sys.modules:
-        from . import plugin  # noqa: F401  (registers when it is imported)
+        from . import plugin  # noqa: F401  (registers on import)
     elif not any(isinstance(finder, _MitsubaFinder) for finder in sys.meta_path):
         sys.meta_path.insert(0, _MitsubaFinder())
 
 
 class _MitsubaFinder(importlib.abc.MetaPathFinder):
-    """Finds LLVM before Dr.Jit is imported, and registers the plugins after Mitsuba is."""
+    """Selects LLVM before Dr.Jit is imported and registers the plugins after Mitsuba has been imported."""
 
     def find_spec(self, name: str, path: Sequence[str] | None, target: ModuleType | None = None) -> ModuleSpec | None:
         if name in ("drjit", "mitsuba") and "drjit" not in sys.modules:

@@ -1,4 +1,4 @@
-"""Which of Mitsuba's variants to render with: diffraction colours need a spectral one."""
+"""The Mitsuba variant to render with: diffraction needs a spectral one."""
 
 from __future__ import annotations
 
@@ -12,22 +12,21 @@ def is_spectral(name: str) -> bool:
 
 
 def spectral_variants() -> list[str]:
-    """The spectral variants of the Mitsuba that is installed."""
+    """The spectral variants of the installed Mitsuba."""
     import mitsuba as mi
 
     return [name for name in mi.variants() if is_spectral(name)]
 
 
 def choose_variant(requested: str | None = None) -> str:
-    """Returns the variant to render with: the one requested if it can run here, else the fastest that can.
+    """The variant to render with: the requested one, or the fastest that runs on this machine.
 
     Args:
-        requested: Name of a spectral variant, or None for ``cuda_ad_spectral`` where there is a GPU and
-            ``llvm_ad_spectral`` where not.
+        requested: a spectral variant, or None for ``cuda_ad_spectral`` with a GPU and ``llvm_ad_spectral`` without.
 
     Raises:
-        ValueError: ``requested`` is not the name of a spectral variant.
-        RuntimeError: The variant cannot run on this machine; the message says what to install.
+        ValueError: ``requested`` is not a spectral variant.
+        RuntimeError: the variant cannot run on this machine; the message names what to install.
     """
     import drjit as dr
 

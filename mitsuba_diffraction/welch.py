@@ -1,10 +1,10 @@
-"""Welch's method: where the windows of an averaged periodogram stand on a scan (Welch 1967).
+"""Welch's method: the windows of an averaged periodogram on a scan (Welch 1967).
 
-A scan is a piece of a larger, irregular surface. Its power spectrum is estimated from windowed pieces of it,
+A scan is a sample of a larger, irregular surface. Its power spectrum is estimated from windowed segments,
 
     S(q; κ) = (d_x d_y/P) Σ_p |Σ_n a(x_n − x_p) e^{iκh_n} e^{−2πi q·x_n}|² / Σ_n a²            [µm²]
 
-averaged over P places x_p; d is the pixel size. No window reaches over the edge, nothing is wrapped around.
+averaged over P positions x_p; d is the pixel size. No window extends beyond the edge or wraps around.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from .coherence import lobe_width
 from .errors import RequestError
 from .surface.heightfield import HeightField
 
-# A window ends at three σ_s to each side, where its amplitude is e^{−9/2}, 1 %.
+# Windows are truncated at ±3 σ_s, where their amplitude is e^{−9/2}, 1 %.
 _SUPPORT = 6.0
-# Windows that take up three quarters of the scan leave room for three places along each axis, σ_s apart.
+# Windows of three quarters of the scan leave room for three positions along each axis, σ_s apart.
 _LARGEST = 0.5
 _FEWEST_PIXELS = 4
 
@@ -31,7 +31,7 @@ class WindowAxis:
 
     Attributes:
         window: a, (W,), sampled at the pixels, Σ a² = 1.
-        starts: first pixel of each place.
+        starts: first pixel of each position.
     """
 
     window: NDArray[np.float64] = field(repr=False)
@@ -39,12 +39,12 @@ class WindowAxis:
 
 
 def carried_coherence_length(height_field: HeightField, asked: float) -> float:
-    """The coherence length in µm that a scan can carry: what is asked for, at most half of the scan's shorter side.
+    """The coherence length in µm that a scan supports: `asked`, but at most half of its shorter side.
 
-    An axis of one pixel sets no limit: along it the surface is uniform.
+    An axis of one pixel imposes no limit: the surface is uniform along it.
 
     Raises:
-        ValueError: if it is under four pixels, too few for a window.
+        ValueError: if it is below four pixels, too short for a window.
     """
     lobe_width(asked)
     axes = list(zip(height_field.tile_size, height_field.pixel_size, height_field.shape[::-1], strict=True))
@@ -59,10 +59,10 @@ def carried_coherence_length(height_field: HeightField, asked: float) -> float:
 
 
 def window_axes(height_field: HeightField, coherence_length: float) -> tuple[WindowAxis | None, WindowAxis | None]:
-    """The windows along x and y for a coherence length (µm) that the scan carries; None for an axis of one pixel.
+    """The windows along x and y for a coherence length (µm) that the scan supports; None for an axis of one pixel.
 
-    a(x) = exp(−x²/2σ_s²) with σ_s = L_c/4, about the middle of its support, which is 6σ_s rounded up to whole pixels.
-    Places run evenly from one edge of the scan to the other, at most σ_s apart, rounded to whole pixels.
+    a(x) = exp(−x²/2σ_s²) with σ_s = L_c/4, about the centre of its support, 6σ_s rounded up to whole pixels. The
+    positions are evenly spaced from edge to edge of the scan, at most σ_s apart, rounded to whole pixels.
     """
     sigma = coherence_length / 4
     return tuple(
@@ -80,5 +80,5 @@ def _axis(count: int, pixel: float, sigma: float) -> WindowAxis:
 
 
 def _rounded_up(value: float) -> int:
-    """The whole number at or above; rounding error above a whole number does not count."""
+    """The ceiling, tolerant of rounding errors just above an integer."""
     return int(np.ceil(value * (1 - 1e-9)))

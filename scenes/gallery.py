@@ -1,19 +1,19 @@
-"""Makes the pictures of the gallery anew, small, and fails if one differs from its reference by more than noise.
+"""Renders the gallery at low resolution and fails if a picture differs from its reference by more than noise.
 
     python scenes/gallery.py                 # every picture
     python scenes/gallery.py foil_sun        # some
-    python scenes/gallery.py --write         # new references, after a change that is meant
-    python scenes/gallery.py --compress      # brings the pictures in docs/gallery under 500 kB
+    python scenes/gallery.py --write         # new references, after an intended change
+    python scenes/gallery.py --compress      # reduces the pictures in docs/gallery to less than 500 kB each
 
-The commands are those of the gallery in README.md and scenes/README.md: first what makes the models, where these are
-not there yet, then each `mitsuba-diffraction render … -o docs/gallery/NAME.exr`, at 160 × 90 pixels and 8 samples.
+The commands are those of docs/gallery.md: first the scripts that generate the models, if there are none yet, then each
+`mitsuba-diffraction render … -o docs/gallery/NAME.exr`, at 160 × 90 pixels and 8 samples per pixel.
 
-What is compared: linear sRGB c is mapped to c/(c + m), m the mean of the reference, so that single bright paths count
-little, and averaged over squares of 10 and of 30 pixels and over the picture. The reference holds mean and standard
-deviation s of each average over n renderings with seeds of their own; that of a new picture differs from the mean by
+Linear sRGB c is mapped to c/(c + m), where m is the mean of the reference, to limit the weight of fireflies, and
+averaged over squares of 10 and of 30 pixels and over the picture. The reference holds the mean and the standard
+deviation s of each average over n renderings with independent seeds. An average of a new picture that deviates by Δ has
 t = Δ/(s √(1 + 1/n)), with s no less than its root mean square over all squares of that size. A picture has changed if
-its largest |t| is less probable than 0.001 (Student's t with n − 1 degrees of freedom, corrected for the number of
-averages after Šidák 1967).
+the probability of its largest |t| is below 0.001 (Student's t with n − 1 degrees of freedom, Šidák's correction (1967)
+for the number of averages).
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ Array = NDArray[np.float64]
 
 
 def commands(pages: Sequence[Path]) -> tuple[list[list[str]], dict[str, list[str]]]:
-    """What the pages tell to run: the commands that make models, and by picture those that render it.
+    """The commands on the pages: those that generate models, and by picture those that render it.
 
     Raises:
         ValueError: if two commands disagree about one picture.
@@ -74,7 +74,7 @@ def commands(pages: Sequence[Path]) -> tuple[list[list[str]], dict[str, list[str
 
 
 def small(words: Sequence[str], seed: int, target: Path) -> list[str]:
-    """The same command, but of reduced size, with a seed, into `target`."""
+    """The same command at low resolution, with a given seed, writing to `target`."""
     words = [words[0], str(ROOT / words[1]), *words[2:]]
     for option in ("-o", "--spp", "--width", "--height", "--seed"):
         if option in words:
@@ -218,14 +218,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("names", nargs="*", metavar="NAME", help="pictures; all by default")
     parser.add_argument("--write", action="store_true", help="make new references")
-    parser.add_argument("--compress", action="store_true", help="bring the pictures in docs/gallery under 500 kB")
+    parser.add_argument("--compress", action="store_true", help="compress the pictures in docs/gallery")
     options = parser.parse_args(arguments)
     if options.compress:
         for path in sorted((ROOT / "docs" / "gallery").glob("*.png")):
             colours = compress(path)
             print(f"{path.name}: {path.stat().st_size // 1000} kB, {f'{colours} colours' if colours else 'as it was'}")
         return 0
-    models, renderings = commands([ROOT / "README.md", ROOT / "scenes" / "README.md"])
+    models, renderings = commands([ROOT / "docs" / "gallery.md"])
     if unknown := set(options.names) - set(renderings):
         parser.error(f"got {', '.join(sorted(unknown))}, wanted names among {', '.join(renderings)}")
     if not (ROOT / "scenes" / "models").is_dir():

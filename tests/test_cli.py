@@ -154,7 +154,7 @@ def test_precompute_writes_the_file_that_it_names_and_says_its_error(command):
         assert part in out
     assert "tile, " in out
     assert "coherence length 65 µm; slices, " in out
-    assert out.splitlines()[1].startswith("left out, at most: 0.0e+00 of the power in weak frequencies; ")
+    assert out.splitlines()[1].startswith("truncated, at most: 0.0e+00 of the power at weak frequencies; ")
     # All but the orders up to 13, the last one below 2/λ: summed here.
     kappa = np.linspace(0, spectrum.largest_kappa, 2000)[:, None]
     eta = [
@@ -180,7 +180,7 @@ def test_a_sample_by_options(command, representation):
     assert (spectrum.extent, spectrum.largest_angle, spectrum.tolerance) == ("sample", 60.0, 0.02)
     assert spectrum.representation == representation
     rows, columns = spectrum.grid.shape
-    for part in (f"sample, {columns} × {rows} frequencies", "cycles/µm apart", "coherence length 0.9 µm", "left out"):
+    for part in (f"sample, {columns} × {rows} frequencies", "cycles/µm apart", "coherence length 0.9 µm", "truncated"):
         assert part in out
     assert f"{spectrum.dropped:.1e} of the power" in out
     assert f"{spectrum.beyond:.1e} where" in out
@@ -236,7 +236,7 @@ def test_a_bare_scan_with_a_seam_wants_an_extent(command):
     assert (code, "seam" in out) == (0, False)
     code, out, _ = command("precompute whole.npy --pixel-size 0.05 --tolerance 0.01")
     assert code == 0
-    assert "repeats as a tile; r.m.s. steps at the seam" in out
+    assert "repeated as a tile; r.m.s. steps at the seam" in out
 
 
 def test_the_version_is_said(command):

@@ -138,7 +138,7 @@ def run_xml(text):
 def test_the_code_of_a_page_runs(page, folder, command, llvm, capfd):
     names = {}
     parts = list(blocks(page))
-    for (language, text), (following, shown) in zip(parts, [*parts[1:], ("", "")], strict=True):
+    for (language, text), (following, shown) in zip(parts, [*parts, ("", "")][1:], strict=True):
         if language == "python":
             run_python(text, names, shown if following == "text" else None, capfd)
         elif language == "sh":

@@ -12,7 +12,7 @@ sys.path.insert(0, str(ROOT / "scenes"))
 
 import gallery  # noqa: E402
 
-PAGES = [ROOT / "README.md", ROOT / "scenes" / "README.md"]
+PAGES = [ROOT / "docs" / "gallery.md"]
 
 
 def scene(seed, factor=1.0, spoilt=None):

@@ -347,7 +347,7 @@ def test_inspect_tells_and_draws(folder, command):
         "80 × 80 nm",
         "Sq 70.7 nm",
         "2.00",
-        "the scan carries 4 of sunlight's 65",
+        "largest for this scan: 4; sunlight: 65",
         "of rigorous",
         "ΔE00",
     ):
@@ -364,7 +364,7 @@ def test_one_period_of_a_profile(folder, command):
     np.save("ridges.npy", 0.1 * np.abs(np.sin(np.pi * np.arange(256) / 256))[None])
     code, out, err = command("inspect ridges.npy --pixel-size 0.005078125")
     assert (code, err) == (0, "")
-    assert "none stands out (if the patch is one period of a grating: --extent tile)" in out
+    assert "none stands out (for a single period of a grating: --extent tile)" in out
     code, out, err = command("inspect ridges.npy --pixel-size 0.005078125 --extent tile")
     assert (code, err) == (0, "")
     assert "period            1.3 µm along 0°" in out
@@ -406,7 +406,7 @@ def test_the_slide_of_a_large_tile_shows_a_dozen_periods():
 def test_inspect_takes_a_recipe(folder, command):
     code, out, err = command("inspect foil.toml -o slide.pdf")
     assert (code, err) == (0, "")
-    assert "one tile, repeats" in out
+    assert "periodic tile" in out
     assert "another period" in out
     assert Path("slide.pdf").read_bytes().startswith(b"%PDF")
 

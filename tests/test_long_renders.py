@@ -408,7 +408,7 @@ def test_a_full_disk_is_one_line_and_leaves_the_last_checkpoint(command, monkeyp
     command(line)
     code, out, err = limited(f"{line} --resume")
     assert (code, out) == (1, "")
-    assert err.strip().endswith("(File too large); the last one, of 2 samples per pixel, is whole")
+    assert err.strip().endswith("(File too large); the last one, of 2 samples per pixel, is kept")
     assert samples_in("out.exr.checkpoint") == 2
     assert command(f"{line} --resume")[0] == 0
     np.testing.assert_array_equal(SpectralImage.load("out.exr").radiance, render("scene.xml", spp=6).radiance)

@@ -245,7 +245,7 @@ def test_the_command_prints_and_writes(command, tmp_path, monkeypatch):
     monkeypatch.setattr("mitsuba_diffraction.studies.checks.checks", lambda: few)
     code, out, _ = command("validate", "--markdown", str(tmp_path / "a.md"), "--json", str(tmp_path / "a.json"))
     assert code == 0
-    assert "1 of 1 within their bounds; 1 only shown" in out
+    assert "1 of 1 within their bounds; 1 reported without one" in out
     assert "| one | good | 1 | 1.01 | 0.01 | 0.1 | ok | a \\| b | theory |" in (tmp_path / "a.md").read_text("utf-8")
     assert [r["name"] for r in json.loads((tmp_path / "a.json").read_text("utf-8"))["checks"]] == ["good", "shown"]
     bad = Check("one", "bad", lambda: Record(2.0, 1.0, 0.1), "theory")

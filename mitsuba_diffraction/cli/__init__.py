@@ -1,4 +1,4 @@
-"""The commands, thin: they read arguments, call the package, and say what came of it. One file a command.
+"""The command line: one file per command, which parses arguments, calls the package and prints the result.
 
 Exit codes: 0 done; 1 the work failed; 2 the request was wrong; 130 interrupted.
 """
@@ -49,7 +49,7 @@ def _commands(
 
 
 class _CtrlC:
-    """Raises KeyboardInterrupt, and remembers it: Mitsuba turns what is raised in a plugin into errors of the scene."""
+    """Raises KeyboardInterrupt and records it: Mitsuba converts exceptions raised in a plugin into scene errors."""
 
     pressed = False
 
@@ -59,19 +59,19 @@ class _CtrlC:
 
 
 def main() -> None:
-    """What the command `mitsuba-diffraction` does."""
+    """Entry point of `mitsuba-diffraction`."""
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):  # file names need not be UTF-8, nor every terminal
+        if isinstance(stream, io.TextIOWrapper):  # neither file names nor terminals need be UTF-8
             stream.reconfigure(errors="backslashreplace")
     warnings.showwarning = lambda message, *args, **kwargs: say("warning", message)
     options: dict[str, bool] = {}
     ctrl_c, before = _CtrlC(), signal.getsignal(signal.SIGINT)
-    # Where Ctrl-C is ignored, as in what a script starts in the background, it stays ignored.
+    # Ctrl-C stays ignored where it is, as in background jobs of a script.
     if before is not signal.SIG_IGN:
         signal.signal(signal.SIGINT, ctrl_c)
     try:
         code = app(prog_name=NAME, standalone_mode=False, obj=options) or 0
-        if code == 130:  # newer versions of Typer turn Ctrl-C into this code
+        if code == 130:  # newer versions of Typer return this code on Ctrl-C
             raise KeyboardInterrupt
     except (Exception, KeyboardInterrupt) as error:
         lost = ctrl_c.pressed and not isinstance(error, Stopped)
@@ -82,7 +82,7 @@ def main() -> None:
 
 
 def _tell(error: BaseException, debug: bool = False) -> int:
-    """Says in one line what went wrong, after the traceback if `debug`; the exit code."""
+    """Reports an error on one line, after the traceback if `debug`, and returns the exit code."""
     if isinstance(error, Stopped | KeyboardInterrupt | typer.Abort):
         say("interrupted", error if isinstance(error, Stopped) else "nothing was written")
         return 130

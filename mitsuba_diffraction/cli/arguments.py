@@ -1,4 +1,4 @@
-"""Arguments that several commands take."""
+"""Arguments shared by several commands."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from ..outputs import claimed
 
 
 def scene_parameters(define: Sequence[str] | None) -> dict[str, str]:
-    """The scene's parameters from the -D NAME=VALUE of a command line.
+    """Scene parameters from the options -D NAME=VALUE.
 
     Raises:
-        ValueError: if one is not of that form, not UTF-8, or given twice.
+        ValueError: if one is not of this form, not UTF-8, or given twice.
     """
     parameters = {}
     for item in define or []:
@@ -27,17 +27,15 @@ def scene_parameters(define: Sequence[str] | None) -> dict[str, str]:
         _refuse_other_than_utf8(item)
         if name in parameters:
             raise RequestError(f"-D {name}: got it twice, wanted one value")
-        # A file named on the command line is relative to where the command is given. A bare word or number is no file,
-        # whatever lies there under that name.
+        # File names on the command line are relative to the current folder. A bare word or number is not a file name,
+        # even if a file of that name exists.
         named = os.path.isfile(value) and (os.path.dirname(value) or Path(value).suffix[1:2].isalpha())
         parameters[name] = str(Path(value).resolve()) if named else value
     return parameters
 
 
-Overwrite = Annotated[
-    bool, typer.Option("--overwrite", help="replace files that were made otherwise; never those that are read")
-]
-# They decide where and how, not what is written.
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="replace existing files, but never inputs")]
+# Options that affect where and how files are written, but not their content.
 _NOT_OF_THE_REQUEST = frozenset(
     {"output", "json", "plot", "markdown", "figures", "overwrite", "resume", "checkpoint", "dask"}
 )
@@ -49,10 +47,10 @@ def claim(
     writes: Iterable[tuple[str, Path]],
     scratch: Iterable[Path] = (),
 ) -> None:
-    """`outputs.claimed` until the command ends; its request is what the command line says, but for defaults.
+    """`outputs.claimed` for the duration of the command; the request is the command line without defaults.
 
     Raises:
-        ValueError: as `outputs.claimed`, or if a file name is not UTF-8, which neither OpenEXR nor Mitsuba can take.
+        ValueError: as `outputs.claimed`, or if a file name is not UTF-8, which OpenEXR and Mitsuba require.
     """
     reads, writes, scratch = list(reads), list(writes), list(scratch)
     for path in [*reads, *(path for _, path in writes)]:

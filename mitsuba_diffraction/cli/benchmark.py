@@ -17,17 +17,17 @@ from .inputs import files_read
 
 def benchmark(
     context: typer.Context,
-    scan: Annotated[Path | None, typer.Argument(metavar="[SCAN]", help="a scan to measure with")] = None,
-    pixel_size: Annotated[float | None, typer.Option(help="of the scan, µm")] = None,
-    height_range: Annotated[float | None, typer.Option(help="of the scan, black to white, µm")] = None,
-    surface: Annotated[list[str] | None, typer.Option(help="only these of the bundled ones")] = None,
-    tolerance: Annotated[list[float] | None, typer.Option(help="only these")] = None,
-    variant: Annotated[str | None, typer.Option(help="of Mitsuba; the fastest spectral one by default")] = None,
-    json: Annotated[Path | None, typer.Option(help="write the results here, too")] = None,
-    plot: Annotated[Path | None, typer.Option(help="draw error against speed here (.png)")] = None,
+    scan: Annotated[Path | None, typer.Argument(metavar="[SCAN]", help="a scan to include")] = None,
+    pixel_size: Annotated[float | None, typer.Option(help="pixel size of the scan, µm")] = None,
+    height_range: Annotated[float | None, typer.Option(help="heights from black to white, µm")] = None,
+    surface: Annotated[list[str] | None, typer.Option(help="only these of the built-in surfaces")] = None,
+    tolerance: Annotated[list[float] | None, typer.Option(help="only these tolerances")] = None,
+    variant: Annotated[str | None, typer.Option(help="Mitsuba variant; default: the fastest spectral one")] = None,
+    json: Annotated[Path | None, typer.Option(help="save the results (.json)")] = None,
+    plot: Annotated[Path | None, typer.Option(help="plot error against speed (.png)")] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Speed against error of every representation, as ratios to Mitsuba's roughconductor."""
+    """Measure error and speed of every representation, relative to Mitsuba's roughconductor."""
     import mitsuba as mi
 
     from ..studies.benchmark import run, save_json, save_plot, tables
@@ -49,7 +49,7 @@ def benchmark(
         results, shaders = run(cases, **({"tolerances": tolerance} if tolerance else {}), progress=progress)
     with progress_bar("sampling") as progress:
         sampling = measure(cases, progress=progress)
-    # Wide enough wherever it goes, a file too.
+    # Wide enough in any terminal, and in a file.
     wide = Console(highlight=False, width=max(out.width, 140))
     wide.print(*tables(results, shaders, sampling), sep="\n\n")
     if json is not None:

@@ -17,30 +17,30 @@ from .console import out, progress_bar, tell
 from .inputs import files_read
 
 _PICTURES = {"-path.exr": "path_traced", "-published.exr": "published", "-corrected.exr": "corrected"}
-"""Ending → which picture."""
+"""Suffix → picture."""
 
 
 def compare(
     context: typer.Context,
     scene: Annotated[Path, typer.Argument(metavar="SCENE.xml")],
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="what the names of the files begin with, or a folder")
+        Path | None, typer.Option("-o", "--output", help="prefix of the output files, or a folder")
     ] = None,
     shader: Annotated[str, typer.Option(help="flss, nmm, pq or gem")] = "flss",
     spp: Annotated[int, typer.Option(min=1, help="samples per pixel of the path tracer")] = 64,
-    shading_points: Annotated[int, typer.Option(min=1, help="per pixel of the shader, each with its spectrum")] = 4,
-    width: Annotated[int | None, typer.Option(min=1, help="pixels; the scene's own by default")] = None,
-    height: Annotated[int | None, typer.Option(min=1, help="pixels; the scene's own by default")] = None,
-    shares: Annotated[bool, typer.Option(help="measure what each quirk of the shader makes")] = True,
-    variant: Annotated[str | None, typer.Option(help="of Mitsuba; the fastest spectral one by default")] = None,
+    shading_points: Annotated[int, typer.Option(min=1, help="shading points per pixel of the shader")] = 4,
+    width: Annotated[int | None, typer.Option(min=1, help="pixels; default: that of the scene")] = None,
+    height: Annotated[int | None, typer.Option(min=1, help="pixels; default: that of the scene")] = None,
+    shares: Annotated[bool, typer.Option(help="measure the cost of each quirk of the shader")] = True,
+    variant: Annotated[str | None, typer.Option(help="Mitsuba variant; default: the fastest spectral one")] = None,
     seed: Annotated[int, typer.Option(min=0)] = 0,
-    json: Annotated[Path | None, typer.Option(help="write the numbers here, too")] = None,
+    json: Annotated[Path | None, typer.Option(help="save the numbers (.json)")] = None,
     define: Annotated[
-        list[str] | None, typer.Option("-D", metavar="NAME=VALUE", help="a parameter of the scene")
+        list[str] | None, typer.Option("-D", metavar="NAME=VALUE", help="set a parameter of the scene")
     ] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Render a scene with the path tracer and with the real-time shader, and show and measure the difference."""
+    """Compare renderings of a scene by the path tracer and the real-time shader."""
     import mitsuba as mi
 
     from ..studies.shader_comparison import compare as run
@@ -79,7 +79,7 @@ def compare(
         summary.save_figure(found, files.enter_context(whole_file(f"{prefix}.png")))
         if json is not None:
             summary.save_json(found, files.enter_context(whole_file(json)))
-    # Wide enough wherever it goes, a file too.
+    # Wide enough in any terminal, and in a file.
     wide = Console(highlight=False, width=max(out.width, 120))
     wide.print(summary.picture_table(found))
     if found.shares is not None:

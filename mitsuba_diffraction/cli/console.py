@@ -1,4 +1,4 @@
-"""What all commands share: the two streams, the progress bar, and how a line is said."""
+"""The console: output streams, progress bar, messages."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ err = Console(stderr=True, highlight=False, soft_wrap=True)
 
 
 class Stopped(Exception):
-    """Ctrl-C where something is kept; the text says what."""
+    """Ctrl-C after something has been saved; the text says what."""
 
 
 def log_lines(label: str, seconds: float = 30.0) -> Callable[..., None]:
-    """Progress where there is no terminal: a line on stderr every so many seconds, none for short work."""
+    """Progress without a terminal: a line on stderr at this interval, none for short tasks."""
     start = last = time.monotonic()
 
     def show(done: int, total: int, error: float = math.nan) -> None:
@@ -59,7 +59,7 @@ def progress_bar(label: str, unit: str = "") -> Iterator[Callable[..., None]]:
 
 
 def tell(text: str) -> None:
-    # File names are no markup.
+    # File names are not markup.
     out.print(text, markup=False, emoji=False)
 
 

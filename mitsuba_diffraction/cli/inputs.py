@@ -1,4 +1,4 @@
-"""Which files a command reads: what scenes and recipes name."""
+"""The files that a command reads: those referenced by scenes and recipes."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ _ATTRIBUTE = re.compile(r"""(\w+)\s*=\s*(?:"([^"]*)"|'([^']*)')""")
 
 
 def files_read(path: str | os.PathLike[str], parameters: Mapping[str, str] | None = None) -> set[Path]:
-    """A scene, recipe or scan, and all files that it may read: rather too many than too few.
+    """A scene, recipe or scan, and all files that it may read. Errs on the side of too many.
 
-    Every attribute in an XML file that is the name of a file counts, whatever its element, with the parameters put in;
-    included scenes and recipes are followed. Names are looked for where Mitsuba does: beside the scene, beside the
-    file that names them, in the current folder, and in folders that the XML names. Nothing is refused here.
+    Every XML attribute that names an existing file counts, whatever its element, after substitution of the parameters;
+    included scenes and recipes are followed. Names are resolved as in Mitsuba: relative to the scene, to the file that
+    references them, to the current folder, and to folders named in the XML. Nothing is refused here.
 
     Args:
         path: the scene, recipe or scan.
         parameters: values for the scene's `$name` parameters.
 
     Returns:
-        The files that are there.
+        The files that exist.
     """
     given = dict(parameters or {})
     defaults: dict[str, str] = {}
@@ -44,7 +44,7 @@ def files_read(path: str | os.PathLike[str], parameters: Mapping[str, str] | Non
             try:
                 recipe = Recipe.load(file)
             except (RequestError, OSError):
-                continue  # said by the command itself
+                continue  # reported by the command itself
             if "scan" in recipe.surface:
                 waiting.append(recipe.folder / recipe.surface["scan"])
         elif file.suffix.lower() == ".xml":
@@ -52,7 +52,7 @@ def files_read(path: str | os.PathLike[str], parameters: Mapping[str, str] | Non
             for element in _DEFAULT.findall(text):
                 attributes = {name: html.unescape(a or b) for name, a, b in _ATTRIBUTE.findall(element)}
                 defaults.setdefault(attributes.get("name", ""), attributes.get("value", ""))
-            rest = _DEFAULT.sub("", text)  # a default that is used comes in by its name
+            rest = _DEFAULT.sub("", text)  # a default counts where its name is used
             values = {_put_in(html.unescape(a or b), {**defaults, **given}) for a, b in _VALUE.findall(rest)} - {""}
             places = list(dict.fromkeys([*folders, file.parent]))
             folders += [place / value for value in values for place in places if os.path.isdir(place / value)]
@@ -61,7 +61,7 @@ def files_read(path: str | os.PathLike[str], parameters: Mapping[str, str] | Non
 
 
 def _put_in(text: str, parameters: Mapping[str, str]) -> str:
-    for _ in range(8):  # a value may name another parameter
+    for _ in range(8):  # a value may refer to another parameter
         if "$" not in text:
             break
         for name in sorted(parameters, key=len, reverse=True):

@@ -1,4 +1,4 @@
-"""`mitsuba-diffraction inspect`: what a scan holds, what it will look like, and how far that can be trusted."""
+"""`mitsuba-diffraction inspect`: statistics, predicted colours and reliability of a surface."""
 
 from __future__ import annotations
 
@@ -41,21 +41,21 @@ def inspect(
     source: Annotated[Path, typer.Argument(metavar="SCAN|RECIPE", help="a scan, or a recipe (.toml)")],
     output: Annotated[
         Path | None,
-        typer.Option("-o", "--output", help="the picture (.png, .pdf, .svg); NAME_inspect.png beside you by default"),
+        typer.Option("-o", "--output", help="figure (.png, .pdf, .svg); default: NAME_inspect.png here"),
     ] = None,
     pixel_size: PixelSize = None,
     height_range: HeightRange = None,
     fill_missing: FillMissing = False,
     channel: Channel = None,
     unit: Unit = None,
-    plane: Annotated[bool, typer.Option("--plane", help="level the scan first, as --prepare level_plane")] = False,
+    plane: Annotated[bool, typer.Option("--plane", help="level the scan first: --prepare level_plane")] = False,
     prepare: Prepare = None,
     extent: Extent = None,
     coherence_length: CoherenceLength = None,
-    json: Annotated[Path | None, typer.Option(help="write the numbers here, too")] = None,
+    json: Annotated[Path | None, typer.Option(help="save the numbers (.json)")] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Statistics, periods and predicted colours of a surface, and how far they can be trusted; a picture."""
+    """Report and plot the statistics, periods and predicted colours of a surface, and their reliability."""
     reads = files_read(source)
     by_default = free_name(f"{source.stem}_inspect", lambda stem: [Path(f"{stem}.png")], reads)
     picture = output or Path(f"{by_default}.png")
@@ -79,7 +79,7 @@ def inspect(
     save_picture(inspection, picture, title=source.stem if source.suffix == ".toml" else source.name)
     if json is not None:
         save_json(inspection.as_json(), json)
-    # Wide enough wherever it goes, a file too.
+    # Wide enough in any terminal, and in a file.
     wide = Console(highlight=False, width=max(out.width, 130))
     wide.print(_table(inspection))
     if inspection.changes:
@@ -103,7 +103,7 @@ def _table(inspection: Inspection) -> Table:
 def _surface(inspection: Inspection) -> list[tuple[str, str]]:
     field, numbers = inspection.height_field, inspection.statistics
     rows, columns = field.shape
-    kind = "one tile, repeats" if inspection.extent == "tile" else "a piece of a larger surface"
+    kind = "periodic tile" if inspection.extent == "tile" else "sample of a larger surface"
     levels = f"{numbers.levels} different heights"
     if 1 < numbers.levels <= 256:
         levels += f", {numbers.step * 1e3:.3g} nm apart"
@@ -119,7 +119,7 @@ def _surface(inspection: Inspection) -> list[tuple[str, str]]:
             else []
         ),
         ("roughness", f"Sa {_nm(numbers.Sa)}, Sq {_nm(numbers.Sq)}, Sz {_nm(numbers.Sz)}"),
-        ("slopes", f"Sdq {numbers.Sdq:.3g} (r.m.s.); one pixel in a hundred above {numbers.steepest:.3g}°"),
+        ("slopes", f"Sdq {numbers.Sdq:.3g} (r.m.s.); 1 % of the pixels above {numbers.steepest:.3g}°"),
     ]
 
 
@@ -134,7 +134,7 @@ def _light(inspection: Inspection) -> list[tuple[str, str]]:
             what += f"± {period.width:.2g} µm and ± {period.direction_width:.2g}° wide (1 σ), "
         lines.append((name, f"{what}{period.strength:.1%} of the variance"))
     if not inspection.periods:
-        one = " (if the patch is one period of a grating: --extent tile)" if inspection.extent == "sample" else ""
+        one = " (for a single period of a grating: --extent tile)" if inspection.extent == "sample" else ""
         lines.append(("period", f"none stands out{one}"))
     else:
         angles = []
@@ -147,7 +147,7 @@ def _light(inspection: Inspection) -> list[tuple[str, str]]:
     lobe = math.degrees(GREEN * lobe_width(inspection.coherence_length))
     length = f"{inspection.coherence_length:.3g} µm"
     if inspection.extent == "sample":
-        length += f" (the scan carries {inspection.carried:.3g} of sunlight's {SUN_COHERENCE_LENGTH:g})"
+        length += f" (largest for this scan: {inspection.carried:.3g}; sunlight: {SUN_COHERENCE_LENGTH:g})"
     lines.append(("coherence length", f"{length}: at 550 nm an order is ±{lobe:.2g}° wide (1 σ)"))
     lines.append(("scalar theory", _scalar(inspection)))
     return lines
@@ -156,17 +156,17 @@ def _light(inspection: Inspection) -> list[tuple[str, str]]:
 def _scalar(inspection: Inspection) -> str:
     errors = inspection.scalar_error
     if not errors:
-        return "not told without a period"
+        return "unknown without a period"
     told = [nm for nm, error in errors.items() if np.isfinite(error)]
     if not told:
-        return "does not hold: the period is under a wavelength, or the surface deeper than two"
-    text = f"within {' / '.join(f'{errors[nm]:.1%}' for nm in told)} of rigorous calculation at "
+        return "invalid: period below one wavelength, or depth above two"
+    text = f"within {' / '.join(f'{errors[nm]:.1%}' for nm in told)} of rigorous theory at "
     text += f"{' / '.join(map(str, told))} nm"
     beyond = [f"{nm} nm" for nm in errors if nm not in told]
-    text += f"; beyond all that was calculated at {', '.join(beyond)}" if beyond else ""
-    text += " (the worst of all periods)" if len(inspection.periods) > 1 else ""
+    text += f"; outside the stored range at {', '.join(beyond)}" if beyond else ""
+    text += " (for the worst period)" if len(inspection.periods) > 1 else ""
     worst = max(errors[nm] for nm in told)
-    return text + ("; right directions, powers only roughly" if worst > TRUSTED else "")
+    return text + ("; exact directions, approximate efficiencies" if worst > TRUSTED else "")
 
 
 def _changes_table(inspection: Inspection) -> Table:
@@ -175,7 +175,7 @@ def _changes_table(inspection: Inspection) -> Table:
     table.add_column("5 % more or less of", no_wrap=True)
     table.add_column("period", justify="right")
     for order, share in before.items():
-        table.add_column(f"light in orders ±{order}, {share:.3g}", justify="right")
+        table.add_column(f"power in orders ±{order}, {share:.3g}", justify="right")
         table.add_column("their colour", justify="right")
     for change in inspection.changes:
         name = f"{change.what} {change.by:+.0%}"

@@ -1,4 +1,4 @@
-"""`mitsuba-diffraction precompute`: from a recipe or a scan to a spectrum file."""
+"""`mitsuba-diffraction precompute`: a spectrum file from a recipe or a scan."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def precompute(
     context: typer.Context,
     sources: Annotated[list[Path], typer.Argument(metavar="RECIPE|SCAN...", help="recipes (.toml), or scans")],
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="the spectrum (.exr); beside you by default")
+        Path | None, typer.Option("-o", "--output", help="spectrum file (.exr); in the current folder by default")
     ] = None,
     pixel_size: PixelSize = None,
     height_range: HeightRange = None,
@@ -40,19 +40,19 @@ def precompute(
     channel: Channel = None,
     unit: Unit = None,
     prepare: Prepare = None,
-    representation: Annotated[str | None, typer.Option(help=f"{', '.join(REPRESENTATIONS)}; auto by default")] = None,
+    representation: Annotated[str | None, typer.Option(help=f"{', '.join(REPRESENTATIONS)}; default: auto")] = None,
     tolerance: Annotated[
-        float | None, typer.Option(help="error allowed, as a share of the reflected power; 0.001 by default")
+        float | None, typer.Option(help="largest error, as a fraction of the reflected power; default: 0.001")
     ] = None,
     extent: Extent = None,
     largest_angle: Annotated[
-        float | None, typer.Option(help="that the scene has, degrees from the normal; 90 by default")
+        float | None, typer.Option(help="largest angle of incidence or exit in the scene, degrees; default: 90")
     ] = None,
     coherence_length: CoherenceLength = None,
-    largest_height_range: Annotated[float | None, typer.Option(help="µm; a deeper surface is refused")] = None,
+    largest_height_range: Annotated[float | None, typer.Option(help="refuse deeper surfaces, µm; default: 20")] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Turn a recipe or a scan into the spectrum of its phase."""
+    """Compute the power spectrum of the phase from recipes or scans."""
     if output is not None and len(sources) > 1:
         raise RequestError(f"-o: got {len(sources)} sources, wanted one (without -o each is named after its source)")
     given = {
@@ -79,17 +79,17 @@ def precompute(
         tell(
             f"{target}: {spectrum.source}; {spectrum.extent}, {spectrum.grid}; coherence length "
             f"{spectrum.coherence_length:.4g} µm; {spectrum.representation}, {spectrum.megabytes:.3g} MB, "
-            f"error {spectrum.error:.1e} (asked {spectrum.tolerance:g})\n"
-            f"left out, at most: {spectrum.dropped:.1e} of the power in weak frequencies; {spectrum.beyond:.1e} where "
-            f"no light reaches or no pixel resolves{seam}"
+            f"error {spectrum.error:.1e} (tolerance {spectrum.tolerance:g})\n"
+            f"truncated, at most: {spectrum.dropped:.1e} of the power at weak frequencies; {spectrum.beyond:.1e} at "
+            f"frequencies that no direction reaches or no pixel resolves{seam}"
         )
 
 
 def _seam(source: Path, recipe: Recipe) -> str:
-    """A line on the seam of a bare scan that nobody says repeats.
+    """A line on the seam of a scan for which no extent is given.
 
     Raises:
-        ValueError: if the seam would show.
+        ValueError: if the seam would be visible.
     """
     if source.suffix.lower() == ".toml" or "extent" in recipe.spectrum:
         return ""
@@ -99,8 +99,8 @@ def _seam(source: Path, recipe: Recipe) -> str:
     )
     if seam_matters(steps):
         raise RequestError(
-            f"--extent: got none, and {source} does not repeat without a seam: r.m.s. steps of {told}; wanted "
-            "--extent sample (a piece of an irregular surface), --extent tile (it repeats, seam and all), or "
+            f"--extent: got none, and {source} does not tile without a seam: r.m.s. steps of {told}; wanted "
+            "--extent sample (a sample of an irregular surface), --extent tile (periodic, in spite of the seam), or "
             "--prepare crop_periods (a grating, cropped to whole periods)"
         )
-    return f"\nrepeats as a tile; r.m.s. steps at the seam {told}" if told else ""
+    return f"\nrepeated as a tile; r.m.s. steps at the seam {told}" if told else ""

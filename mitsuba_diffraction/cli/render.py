@@ -1,4 +1,4 @@
-"""`mitsuba-diffraction render`: from a scene to a spectral picture, or to one for each place of the camera."""
+"""`mitsuba-diffraction render`: a spectral picture of a scene, or one per camera position of an orbit."""
 
 from __future__ import annotations
 
@@ -18,37 +18,37 @@ from .inputs import files_read
 def render(
     context: typer.Context,
     scene: Annotated[Path, typer.Argument(metavar="SCENE.xml")],
-    output: Annotated[Path | None, typer.Option("-o", "--output", help="the spectral picture (.exr)")] = None,
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="spectral picture (.exr)")] = None,
     spp: Annotated[
         int | None,
         typer.Option(
             min=1,
-            help="samples per pixel, with --until-error the most; by default the scene's sample_count, or 64",
+            help="samples per pixel, the maximum with --until-error; default: sample_count of the scene, or 64",
         ),
     ] = None,
-    width: Annotated[int | None, typer.Option(min=1, help="pixels; the scene's own by default")] = None,
-    height: Annotated[int | None, typer.Option(min=1, help="pixels; the scene's own by default")] = None,
-    variant: Annotated[str | None, typer.Option(help="of Mitsuba; the fastest spectral one by default")] = None,
+    width: Annotated[int | None, typer.Option(min=1, help="pixels; default: that of the scene")] = None,
+    height: Annotated[int | None, typer.Option(min=1, help="pixels; default: that of the scene")] = None,
+    variant: Annotated[str | None, typer.Option(help="Mitsuba variant; default: the fastest spectral one")] = None,
     seed: Annotated[int, typer.Option(min=0)] = 0,
     define: Annotated[
-        list[str] | None, typer.Option("-D", metavar="NAME=VALUE", help="a parameter of the scene")
+        list[str] | None, typer.Option("-D", metavar="NAME=VALUE", help="set a parameter of the scene")
     ] = None,
     until_error: Annotated[
-        float | None, typer.Option(metavar="ERROR", help="stop when luminance is as sure as this, such as 0.01")
+        float | None, typer.Option(metavar="ERROR", help="stop at this relative standard error of luminance, e.g. 0.01")
     ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="go on where a run of the same command ended")] = False,
-    checkpoint: Annotated[float, typer.Option(min=0, metavar="SECONDS", help="between two checkpoints")] = 60,
+    resume: Annotated[bool, typer.Option("--resume", help="resume an interrupted run of the same command")] = False,
+    checkpoint: Annotated[float, typer.Option(min=0, metavar="SECONDS", help="interval between checkpoints")] = 60,
     half: Annotated[
-        bool, typer.Option("--half", help="write float16: half of the size, radiance rounded by up to 0.05 %")
+        bool, typer.Option("--half", help="write float16: half the size, radiance rounded by up to 0.05 %")
     ] = False,
     dask: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="spread the passes over a Dask cluster (tcp://HOST:PORT)")
+        str | None, typer.Option(metavar="ADDRESS", help="distribute the passes over a Dask cluster (tcp://HOST:PORT)")
     ] = None,
-    frames: Annotated[int | None, typer.Option(min=2, max=3600, metavar="N", help="pictures of an orbit")] = None,
-    orbit: Annotated[bool, typer.Option("--orbit", help="the camera goes round the scene once")] = False,
+    frames: Annotated[int | None, typer.Option(min=2, max=3600, metavar="N", help="frames of an orbit")] = None,
+    orbit: Annotated[bool, typer.Option("--orbit", help="orbit the scene once")] = False,
     overwrite: Overwrite = False,
 ) -> None:
-    """Path-trace a scene into a spectral picture (.exr) and a preview (.png) beside it."""
+    """Path-trace a scene into a spectral picture (.exr) with a preview (.png)."""
     import mitsuba as mi
 
     from ..render.checkpoint import checkpoint_path

@@ -1,4 +1,4 @@
-"""How commands take a scan or a recipe: the options that a scan needs, and the recipe that they amount to."""
+"""Scans and recipes on the command line: the options of a scan, and the recipe equivalent to them."""
 
 from __future__ import annotations
 
@@ -12,28 +12,24 @@ from ..errors import RequestError
 from ..recipe import Recipe
 from ..surface.prepare import STEP_NAMES, step_of
 
-PixelSize = Annotated[float | None, typer.Option(help="of a scan, µm")]
-HeightRange = Annotated[float | None, typer.Option(help="of a scan, black to white, µm")]
-FillMissing = Annotated[
-    bool, typer.Option("--fill-missing", help="of a scan, fill pixels without a height from their surroundings")
-]
-Channel = Annotated[str | None, typer.Option(help="of a scan with several, a name or a number")]
+PixelSize = Annotated[float | None, typer.Option(help="pixel size of the scan, µm")]
+HeightRange = Annotated[float | None, typer.Option(help="heights from black to white, µm")]
+FillMissing = Annotated[bool, typer.Option("--fill-missing", help="interpolate missing pixels of the scan")]
+Channel = Annotated[str | None, typer.Option(help="channel of the scan, by name or number")]
 Unit = Annotated[
     list[str] | None,
-    typer.Option(help="of a scan whose file names none; given twice: along the surface, and of the heights"),
+    typer.Option(help="unit of a scan without one; given twice: lateral, then of the heights"),
 ]
 Prepare = Annotated[
     list[str] | None,
-    typer.Option(help=f"of a scan, a step, done in the order given: {', '.join(STEP_NAMES)}; NAME=ARGUMENT"),
+    typer.Option(help=f"apply a step to the scan, in the order given: {', '.join(STEP_NAMES)}; NAME=ARGUMENT"),
 ]
 Extent = Annotated[
     str | None,
-    typer.Option(
-        help="tile (the patch repeats) or sample (a piece of an irregular surface); a recipe's own by default"
-    ),
+    typer.Option(help="tile (periodic) or sample (of an irregular surface); default: that of the recipe"),
 ]
 CoherenceLength = Annotated[
-    float | None, typer.Option(help=f"µm; a recipe's own by default, else that of sunlight, {SUN_COHERENCE_LENGTH:g}")
+    float | None, typer.Option(help=f"µm; default: that of the recipe, or of sunlight, {SUN_COHERENCE_LENGTH:g}")
 ]
 
 
@@ -45,7 +41,7 @@ def options_of_scan(
     unit: list[str] | None,
     prepare: list[str] | None,
 ) -> dict[str, object]:
-    """What was given, under the names that recipes have for it."""
+    """The options given, under their names in recipes."""
     given = {
         "pixel_size": pixel_size,
         "height_range": height_range,
@@ -58,7 +54,7 @@ def options_of_scan(
 
 
 def recipe_of(source: Path, of_scan: dict[str, object], settings: dict[str, object]) -> Recipe:
-    """The recipe that a file is, or that a scan and its options make; `settings` of the spectrum go before its own.
+    """The recipe in a file, or the one equivalent to a scan and its options; `settings` override its spectrum.
 
     Raises:
         ValueError: if options of a scan are given for a recipe, or something in either is wrong.

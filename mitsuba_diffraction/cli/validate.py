@@ -1,4 +1,4 @@
-"""`mitsuba-diffraction validate`: what is known, against what is computed."""
+"""`mitsuba-diffraction validate`: the BSDF against closed forms and rigorous results."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 def validate(
     context: typer.Context,
     surface: Annotated[
-        Path | None, typer.Argument(metavar="[SURFACE]", help="a recipe (.toml) or a scan: check this surface instead")
+        Path | None, typer.Argument(metavar="[SURFACE]", help="check this recipe (.toml) or scan instead")
     ] = None,
     pixel_size: PixelSize = None,
     height_range: HeightRange = None,
@@ -31,15 +31,15 @@ def validate(
     unit: Unit = None,
     prepare: Prepare = None,
     extent: Annotated[
-        str | None, typer.Option(help="sample (of a scan, unless told otherwise) or tile; goes before a recipe's own")
+        str | None, typer.Option(help="tile or sample; default: that of the recipe, sample for a scan")
     ] = None,
-    variant: Annotated[str | None, typer.Option(help="of Mitsuba; the fastest spectral one by default")] = None,
-    json: Annotated[Path | None, typer.Option(help="write the results here, too")] = None,
-    markdown: Annotated[Path | None, typer.Option(help="write a table with notes and sources here (.md)")] = None,
-    figures: Annotated[Path | None, typer.Option(metavar="DIR", help="draw the evaluation's figures here")] = None,
+    variant: Annotated[str | None, typer.Option(help="Mitsuba variant; default: the fastest spectral one")] = None,
+    json: Annotated[Path | None, typer.Option(help="save the results (.json)")] = None,
+    markdown: Annotated[Path | None, typer.Option(help="save a table with notes and sources (.md)")] = None,
+    figures: Annotated[Path | None, typer.Option(metavar="DIR", help="save the figures of the evaluation here")] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Check against closed forms and rigorous results, or check one surface; fails if a bound is missed."""
+    """Validate against closed forms and rigorous results, or validate one surface. Fails if a bound is exceeded."""
     import mitsuba as mi
 
     from ..studies import report
@@ -72,8 +72,8 @@ def validate(
     missed = [result.name for result in results if not result.ok]
     promised = sum(result.bound is not None for result in results)
     tell(
-        f"{promised - len(missed)} of {promised} within their bounds; {len(results) - promised} only shown. "
-        "Differences are absolute, |found − expected|, unless the name of a check says otherwise"
+        f"{promised - len(missed)} of {promised} within their bounds; {len(results) - promised} reported without one. "
+        "Differences are absolute, |found − expected|, unless stated otherwise"
     )
     if json is not None:
         report.save_json({"checks": report.record_dicts(results)}, json)

@@ -1,4 +1,4 @@
-"""The sum of the passes, and how sure it is."""
+"""The sum of the passes and its standard error."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from ..color import spectrum_to_XYZ
 
 @dataclass(eq=False)
 class Accumulation:
-    """Sums over passes p = 1 … P, of n_p samples per pixel each.
+    """Sums over passes p = 1 … P of n_p samples per pixel each.
 
-    y_p is a pixel's luminance Y in the pass p alone. Floating-point sums depend on their order: passes must come in
-    the order of their number.
+    y_p is the luminance Y of a pixel in pass p alone. Floating-point sums depend on their order: passes must be added
+    in the order of their indices.
 
     Attributes:
         wavelengths: (n,) float64, nm.
-        sums: (height, width, n + 1) float64, Σ_p of what `trace_pass` gives.
+        sums: (height, width, n + 1) float64, Σ_p of the results of `trace_pass`.
         luminance: (height, width) float64, Σ_p n_p y_p.
         squares: (height, width) float64, Σ_p n_p y_p².
         passes: P.
@@ -35,7 +35,7 @@ class Accumulation:
 
     @classmethod
     def empty(cls, rows: int, columns: int, wavelengths: NDArray[np.float64]) -> Accumulation:
-        """No pass yet."""
+        """Zero passes."""
         return cls(
             wavelengths,
             np.zeros((rows, columns, wavelengths.size + 1)),
@@ -44,8 +44,8 @@ class Accumulation:
         )
 
     def add(self, traced: NDArray[np.float32], samples: int) -> None:
-        """Adds what `trace_pass` gave for that many samples per pixel."""
-        # einsum adds in one order; a matrix product may share the work among threads.
+        """Adds the result of `trace_pass` with that many samples per pixel."""
+        # einsum adds in a fixed order; a matrix product may be multithreaded.
         weights = spectrum_to_XYZ(np.eye(self.wavelengths.size), self.wavelengths)[:, 1].astype(np.float32)
         luminance = np.einsum("yxi,i->yx", traced[..., :-1], weights).astype(np.float64)
         luminance = ratio(luminance, traced[..., -1])
@@ -57,23 +57,23 @@ class Accumulation:
 
     def radiance(self) -> NDArray[np.float32]:
         """(height, width, n) float32, W m⁻² sr⁻¹ nm⁻¹."""
-        # Row by row: the sums of a large picture are not doubled in memory.
+        # Row by row, to avoid a second copy of the sums of a large picture.
         return np.stack([ratio(row[:, :-1], row[:, -1:]).astype(np.float32) for row in self.sums])
 
     def error(self) -> float:
-        """The relative error that nine in ten lit pixels do not exceed.
+        """The 90th percentile of the relative standard error of luminance over all non-black pixels.
 
-        A sample's luminance has the variance σ², and y_p has σ²/n_p. An unbiased estimate of σ² from passes is
+        With σ² the variance of the luminance of a sample, y_p has the variance σ²/n_p. An unbiased estimate of σ² is
 
             s² = (Σ_p n_p y_p² − (Σ_p n_p y_p)²/N) / (P − 1),
 
-        a pixel's relative error is its standard error over its luminance, (s/√N) / (Σ_p n_p y_p/N), and the picture's
-        is the 90th percentile over the pixels that are not black. The mean square over all pixels would be no measure
-        where a lamp is seen by way of two gratings: a few very bright samples then make all of it, and it does not fall
-        for hours. With few passes the percentile is rather too large, as s² scatters.
+        and the relative error of a pixel is (s/√N) / (Σ_p n_p y_p/N). The mean square over all pixels is not useful
+        where
+        a lamp is seen by way of two gratings: it is dominated by fireflies and does not fall for hours. With few
+        passes the percentile is biased upwards by the variance of s².
 
         Returns:
-            The error; not a number before two passes, or for a black picture.
+            The error; NaN before two passes, or for a black picture.
         """
         lit = self.luminance > 0
         if self.passes < 2 or not lit.any():
@@ -84,5 +84,5 @@ class Accumulation:
 
 
 def ratio(sums: NDArray, weights: NDArray) -> NDArray:
-    """sums/weights, zero where no sample lies under the filter."""
+    """sums/weights, zero where the filter covers no sample."""
     return np.divide(sums, weights, out=np.zeros_like(sums), where=weights != 0)

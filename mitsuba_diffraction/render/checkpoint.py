@@ -1,8 +1,8 @@
-"""The file in which an unfinished rendering waits.
+"""Checkpoints of unfinished renderings.
 
-It is NumPy's `.npz`, not compressed (noise does not shrink): the fields of `Accumulation`, and `digest`, that of the
-request (`passes.Job`). The comment of the zip archive is the SHA-256 of the file (`files.seal`). It takes 8 bytes per
-pixel and channel, 690 MB for 1280 × 720 pixels; while one is written, the one before is there as well.
+A checkpoint is an uncompressed `.npz` file (noise does not compress) with the fields of `Accumulation` and the `digest`
+of the request (`passes.Job`). The comment of the archive is the SHA-256 of the file (`files.seal`). It takes 8 bytes
+per pixel and channel, 690 MB for 1280 × 720 pixels, and twice that while it is being replaced.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from .accumulation import Accumulation
 
 
 def checkpoint_path(picture: Path) -> Path:
-    """Where the checkpoint of a picture lies: beside it."""
+    """The path of the checkpoint of a picture, next to it."""
     return picture.with_name(f"{picture.name}.checkpoint")
 
 
 def save_checkpoint(path: str | os.PathLike[str], digest: str, sums: Accumulation) -> None:
-    """Writes a checkpoint. At any moment, be it of a kill or a power cut, `path` is the old one or the new one.
+    """Writes a checkpoint atomically: after a kill or a power cut, `path` is either the old or the new one.
 
     Raises:
-        OSError: if it cannot be written; the old one stays.
+        OSError: if it cannot be written; the old one is kept.
     """
     with whole_file(path) as temporary:
         with open(temporary, "wb") as stream:
@@ -42,7 +42,7 @@ def load_checkpoint(path: str | os.PathLike[str], digest: str) -> Accumulation |
     """Reads a checkpoint.
 
     Args:
-        path: where it lies.
+        path: the file.
         digest: of the request.
 
     Returns:
@@ -56,16 +56,16 @@ def load_checkpoint(path: str | os.PathLike[str], digest: str) -> Accumulation |
     with open(path, "rb") as stream:
         try:
             if not is_intact(path):
-                raise RequestError("its bytes are not those that were written")
+                raise RequestError("its contents do not match its digest")
             with np.load(stream) as content:
                 found = content["digest"].item()
                 if found == digest:
                     read = {name: content[name] for name in (field.name for field in fields(Accumulation))}
                     return Accumulation(**{name: value if value.ndim else value.item() for name, value in read.items()})
-        # What NumPy and zipfile raise, wherever the damage is.
+        # Raised by NumPy and zipfile for damaged files.
         except (ValueError, KeyError, TypeError, EOFError, AttributeError, RuntimeError, OSError, BadZipFile) as error:
             raise RequestError(f"{os.fspath(path)}: not a checkpoint, or a damaged one ({error})") from None
     raise RequestError(
-        f"{os.fspath(path)}: of another rendering: the scene or a file that it names, an option, or a version is not "
-        "what it was; give what was given then, or remove the file to begin anew"
+        f"{os.fspath(path)}: of another rendering: the scene or a file that it references, an option or a version has "
+        "changed; repeat the original command, or remove the file to start over"
     )

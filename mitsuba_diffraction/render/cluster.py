@@ -1,9 +1,8 @@
-"""Passes on other machines: a Dask cluster that exists already (the extra `cluster`).
+"""Rendering on an existing Dask cluster (the extra `cluster`).
 
-Each pass is a task. A worker loads the scene once, for as long as passes of one rendering come in, and traces one pass
-at a time with as many threads as it was started with. Results are taken in the order of the passes, whichever comes
-first, so that the sum has the same bits as on one machine; twice as many passes as there were workers at the start are
-under way, and no more wait anywhere. If a worker is lost, Dask gives its passes to the others.
+Each pass is a task. A worker loads the scene once per rendering and traces one pass at a time with all of its threads.
+Results are added in the order of the passes, so that the sum is identical, bit for bit, to that of a single machine. At
+most two passes per initial worker are in flight. Dask reassigns the passes of a lost worker.
 """
 
 from __future__ import annotations
@@ -26,23 +25,23 @@ from .film import pass_seed, trace_pass
 from .passes import Job, Tracer, versions
 from .scene import scene_digest
 
-# Dr.Jit's threads share one pass; two at a time would only take the memory of two.
+# A pass uses all threads of Dr.Jit; two at a time would only need more memory.
 _one_pass = threading.Lock()
 _SECONDS_TO_CONNECT = 30
 
 
 def trace_on(address: str) -> Tracer:
-    """Who traces the passes of `render` on the workers of a Dask cluster.
+    """A tracer for `render` that uses the workers of a Dask cluster.
 
-    All workers need this package in the same version, the same kind of processor for equal bits, and the scene and its
-    files under the same path, as on a shared disk.
+    All workers need the same versions, the scene and its files under the same path (a shared disk) and, for identical
+    bits, the same kind of processor.
 
     Args:
         address: of the scheduler, such as `tcp://10.0.0.1:8786`.
 
     Raises:
-        RuntimeError: if `distributed` is not installed; later, while rendering: if the scheduler or workers are not
-            there or no longer there, differ in versions, find other files, or a pass fails, with the cause in one line.
+        RuntimeError: if `distributed` is not installed; while rendering, if the scheduler or the workers are
+            unreachable or lost, have other versions or files, or a pass fails, with the cause on one line.
     """
     try:
         import distributed
@@ -76,7 +75,7 @@ def trace_on(address: str) -> Tracer:
             except (asyncio.CancelledError, futures.CancelledError):
                 raise RuntimeError(f"the Dask scheduler at {address} is gone") from None
             except distributed.KilledWorker as error:
-                raise RuntimeError(f"workers of {address} end while they trace: {error}") from None
+                raise RuntimeError(f"workers of {address} die while tracing: {error}") from None
             except ImportError as error:
                 raise RuntimeError(f"a worker of {address} lacks a package: {error}") from None
             finally:
@@ -87,7 +86,7 @@ def trace_on(address: str) -> Tracer:
 
 
 async def _greet(address: str) -> None:
-    """Shakes hands with a scheduler; a client would wait for minutes for a port that accepts and then is silent."""
+    """Shakes hands with a scheduler; a client would wait for minutes on a port that accepts but stays silent."""
     import distributed
 
     comm = await asyncio.wait_for(distributed.comm.connect(address), _SECONDS_TO_CONNECT)
@@ -116,5 +115,5 @@ def _scene(job: Job) -> mi.Scene:
     except (RequestError, OSError) as error:
         raise RuntimeError(f"a worker cannot load the scene: {error}") from None
     if content != job.content:
-        raise RuntimeError(f"{job.scene}: a worker finds another scene there, or other files that it names")
+        raise RuntimeError(f"{job.scene}: a worker finds another scene there, or other files that it references")
     return scene

@@ -1,55 +1,58 @@
-"""One pass: trace samples and filter them onto pixels, so that equal seeds give equal bits.
+"""One rendering pass with deterministic filtering: equal seeds give equal bits.
 
-Mitsuba adds the samples to its film from several threads with atomic additions. Floating-point sums depend on their
-order, so that a picture traced twice differs in its last bits as soon as two threads meet in one pixel: with every
-filter wider than a pixel, and with the box filter where the samples of one pixel are split among threads. Here the
-samples are kept, and each pixel collects its own in a fixed order: the result depends neither on threads nor on luck.
+Mitsuba accumulates samples in its film from several threads with atomic additions. As floating-point sums depend on
+their order, the result is not reproducible when several threads contribute to a pixel: with any filter wider than a
+pixel, and with the box filter if the samples of a pixel are split among threads. Here the samples are stored, and each
+pixel gathers its own in a fixed order, independent of the number of threads.
 
-It is also faster. Four wavelengths touch eight of the hat-shaped channels at most, and only those are added to, where a
-`specfilm` adds all 93 for each sample and each pixel under the filter: two million samples of `scenes/blaze.xml` take
-one core 0.6 s where Mitsuba's film takes 1.5 s, and with a Gaussian filter 3.0 s instead of 3.7 s.
+This is also faster. Four wavelengths contribute to at most eight of the hat-shaped channels, whereas a `specfilm` adds
+to all 93 for each sample and each pixel under the filter: two million samples of `scenes/blaze.xml` take one core
+0.6 s instead of 1.5 s with Mitsuba's film, and 3.0 s instead of 3.7 s with a Gaussian filter.
 """
 
 from __future__ import annotations
+
+from collections.abc import Iterable
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..integrator.splats import Splats
 from .scene import channel_wavelengths, channel_weights, root_cause
 
 
 def pass_seed(seed: int, index: int) -> int:
-    """A 32-bit seed for one pass, independent of those of its neighbours and of other `seed`s."""
+    """A 32-bit seed for one pass, independent of those of other passes and other `seed`s."""
     return int(np.random.SeedSequence((seed, index)).generate_state(1)[0])
 
 
 def trace_pass(scene: mi.Scene, spp: int, seed: int, integrator: mi.Integrator | None = None) -> NDArray[np.float32]:
-    """Traces the first sensor once and gives the sums from which radiance follows.
+    """Traces the first sensor once and returns the sums that determine radiance.
 
-    With the filter f, the continuous position p_s of the sample s, its radiance L_s(λ) at four wavelengths λ_sj
-    (divided by their density) and the hats t_i of unit area around the channels' wavelengths, a pixel at c holds
+    With the filter f, the position p_s of sample s on the film, its radiance L_s(λ) at four wavelengths λ_sj (divided
+    by their density) and the hats t_i of unit area around the wavelengths of the channels, a pixel at c holds
 
-        Σ_s f(c − p_s) ¼ Σ_j L_s(λ_sj) t_i(λ_sj)    in channel i,    and last    Σ_s f(c − p_s);
+        Σ_s f(c − p_s) ¼ Σ_j L_s(λ_sj) t_i(λ_sj)    in channel i,    and finally    Σ_s f(c − p_s);
 
-    their ratio is radiance per nm. Sums of passes add up, and their ratio does not depend on how they were split.
+    their ratio is radiance per nm. The sums of passes are additive.
 
-    The bits depend on the seed, the scene, the versions of Mitsuba and Dr.Jit and the kind of processor, not on the
-    number of threads. Scalar variants and Mitsuba's differentiable integrators (`prb`, ...) trace with Mitsuba's own
-    film, and their last bits are not certain.
+    The result is determined, bit for bit, by the seed, the scene, the versions of Mitsuba and Dr.Jit and the kind of
+    processor, not by the number of threads. Scalar variants and Mitsuba's differentiable integrators (`prb`, ...) use
+    Mitsuba's film and are not reproducible in the last bits.
 
     Args:
-        scene: as `load_spectral_scene` gives it.
+        scene: from `load_spectral_scene`.
         spp: samples per pixel; the scene's sampler may take more (`samples_drawn`).
         seed: 32 bits.
-        integrator: in place of the scene's own.
+        integrator: replaces that of the scene.
 
     Returns:
         (height, width, n + 1) float32.
 
     Raises:
-        RuntimeError: if tracing failed, with the cause in one line.
+        RuntimeError: if tracing failed, with the cause on one line.
     """
     integrator = scene.integrator() if integrator is None else integrator
     try:
@@ -65,8 +68,7 @@ def trace_pass(scene: mi.Scene, spp: int, seed: int, integrator: mi.Integrator |
 
 
 def samples_drawn(scene: mi.Scene, spp: int) -> int:
-    """How many samples per pixel the scene's sampler takes if asked for `spp`: some round up, to a square or a power of
-    two."""
+    """Samples per pixel that the scene's sampler takes for `spp`; some round up to a square or a power of two."""
     sampler = scene.sensors()[0].sampler().clone()
     sampler.set_sample_count(spp)
     return sampler.sample_count()
@@ -85,6 +87,9 @@ def _trace(scene: mi.Scene, integrator: mi.SamplingIntegrator, spp: int, seed: i
     columns, rows = (int(size) for size in film.crop_size())
     rfilter = film.rfilter()
     border = rfilter.border_size() if film.sample_border() else 0
+    light = None
+    if hasattr(integrator, "parts"):
+        integrator, light = integrator.parts(scene, sensor)
     traced_columns, traced_rows = columns + 2 * border, rows + 2 * border
 
     sampler = sensor.sampler().clone()
@@ -94,7 +99,7 @@ def _trace(scene: mi.Scene, integrator: mi.SamplingIntegrator, spp: int, seed: i
     size = traced_columns * traced_rows * spp
     sampler.seed(seed, size)
 
-    # Opaque, so that passes of other sizes run the same kernels.
+    # Opaque, so that passes of different sizes share their kernels.
     count, stride = dr.opaque(mi.UInt32, spp), dr.opaque(mi.UInt32, traced_columns)
     pixel = dr.arange(mi.UInt32, size) // count
     row = pixel // stride
@@ -109,29 +114,69 @@ def _trace(scene: mi.Scene, integrator: mi.SamplingIntegrator, spp: int, seed: i
     )
     ray.scale_differential(spp**-0.5)
     traced, _, _ = integrator.sample(scene, sampler, ray, sensor.get_medium())
-    # The weight holds the response of the film, by whose density wavelengths are drawn.
-    seen = dr.zeros(mi.SurfaceInteraction3f)
-    seen.wavelengths = ray.wavelengths
-    response = film.sensor_response_function().eval(seen)
-    radiance = mi.unpolarized_spectrum(weight * traced) * dr.select(response > 0, dr.rcp(response), 0)
+    channel, value = _on_channels(film, ray.wavelengths, weight * traced)
+    dr.eval(position, channel, value)
 
+    def of_pixel(index: mi.UInt32, active: mi.Bool) -> tuple[mi.UInt32, mi.UInt32]:
+        return index * count, index * count + count
+
+    sums = np.array(collect(rfilter, position, channel, value, (rows, columns), border, of_pixel))
+    sums = sums.reshape(rows, columns, -1)
+    if light is not None:
+        _add_light(sums, film, light.splats(seed, light.count(spp)), spp)
+    return sums
+
+
+def _on_channels(film: mi.Film, wavelengths: mi.Spectrum, value: mi.Spectrum) -> tuple[list[mi.Float], list[mi.Float]]:
+    """Where the wavelengths lie among the channels, and what they add there; `value` as the sensor gives it."""
+    # It holds the response of the film, by whose density wavelengths are drawn.
+    seen = dr.zeros(mi.SurfaceInteraction3f)
+    seen.wavelengths = wavelengths
+    response = film.sensor_response_function().eval(seen)
+    radiance = mi.unpolarized_spectrum(value) * dr.select(response > 0, dr.rcp(response), 0)
     centres = channel_wavelengths()
     step = float(centres[1] - centres[0])
-    channel = (ray.wavelengths - float(centres[0])) / step
-    value = radiance / (len(radiance) * step)
-    dr.eval(position, channel, value)
-    sums = collect(rfilter, position, channel, value, (rows, columns), border, count, centres.size)
-    return np.array(sums).reshape(rows, columns, centres.size + 1)
+    return list((wavelengths - float(centres[0])) / step), list(radiance / (len(radiance) * step))
+
+
+def _add_light(sums: NDArray[np.float32], film: mi.Film, found: Iterable[Splats], spp: int) -> None:
+    """Adds what came by way of paths from the light, which have no weight of their own.
+
+    They are sorted by pixel, those of a pixel in the order in which they were traced.
+    """
+    rows, columns, _ = sums.shape
+    parts = []
+    for splats in found:
+        channel, value = _on_channels(film, splats.wavelengths, splats.value * dr.opaque(mi.Float, spp))
+        dr.eval(channel, value)
+        parts.append([np.array(column) for column in (*splats.position, *channel, *value)])
+    if not parts:
+        return
+    x, y, *rest = (np.concatenate(column) for column in zip(*parts, strict=True))
+    pixel = np.clip(y.astype(np.int64), 0, rows - 1) * columns + np.clip(x.astype(np.int64), 0, columns - 1)
+    order = np.argsort(pixel, kind="stable")
+    x, y, *rest = (mi.Float(column[order]) for column in (x, y, *rest))
+    starts = mi.UInt32(np.concatenate([[0], np.bincount(pixel, minlength=rows * columns).cumsum()]))
+
+    def of_pixel(index: mi.UInt32, active: mi.Bool) -> tuple[mi.UInt32, mi.UInt32]:
+        return dr.gather(mi.UInt32, starts, index, active), dr.gather(mi.UInt32, starts, index + 1, active)
+
+    half = len(rest) // 2
+    added = np.array(collect(film.rfilter(), mi.Point2f(x, y), rest[:half], rest[half:], (rows, columns), 0, of_pixel))
+    sums[..., :-1] += added.reshape(sums.shape)[..., :-1]
 
 
 @dr.syntax
-def collect(rfilter, position, channel, value, size, border, count, channels):
-    """Adds to each pixel the samples under its filter, row by row; one lane does it all for one pixel.
+def collect(rfilter, position, channel, value, size, border, samples):
+    """Gathers the samples under the filter of each pixel, row by row, in one lane per pixel.
 
-    Lists `channel` and `value`: at a channel between two whole numbers, these share the value. The samples of a pixel
-    stand together. The result holds, pixel by pixel, the channels and last the sum of the filter.
+    `channel` and `value` are lists; a fractional channel splits the value linearly between its two neighbours. The
+    result holds the channels and then the filter sum of each pixel.
+
+    The samples of a pixel are contiguous: `samples` takes the index of a pixel, counting the border of the film, and a
+    mask, and returns the first sample and the one after the last.
     """
-    rows, columns = size
+    (rows, columns), channels = size, len(channel_wavelengths())
     reach = int(np.ceil(rfilter.radius() - 0.5))
     box = rfilter.is_box_filter()
     width = 2 * reach + 1
@@ -150,10 +195,8 @@ def collect(rfilter, position, channel, value, size, border, count, channels):
         source_y = y + mi.Int32(tap // width) - reach
         source_x = x + mi.Int32(tap % width) - reach
         inside = (source_x >= -border) & (source_y >= -border) & (source_x < last_x) & (source_y < last_y)
-        first = mi.UInt32((source_y + border) * stride + source_x + border) * count
-        index = mi.UInt32(0)
-        while index < count:
-            at = first + index
+        at, end = samples(mi.UInt32((source_y + border) * stride + source_x + border), inside)
+        while at < end:
             share = mi.Float(1)
             if dr.hint(not box, mode="scalar"):
                 away_x = mi.Float(x) + 0.5 - dr.gather(mi.Float, position.x, at, inside)
@@ -182,7 +225,7 @@ def collect(rfilter, position, channel, value, size, border, count, channels):
                     dr.ReduceMode.NoConflicts,
                 )
             weight += dr.select(inside, share, 0)
-            index += 1
+            at += 1
         tap += 1
     dr.scatter(sums, weight, base + channels)
     return sums

@@ -27,32 +27,32 @@ from .film import pass_seed, samples_drawn, trace_pass
 from .scene import channel_wavelengths, load_spectral_scene, scene_digest
 from .spectral_image import SpectralImage
 
-# Two million take some seconds on two cores, so that progress shows and an interrupt is heard. A large picture gets
-# eight samples per pixel nevertheless: adding a pass to the sum takes one core as long as a third of a sample.
+# Two million samples take some seconds on two cores, which keeps progress and interrupts responsive. Large pictures
+# take at least eight samples per pixel, as adding a pass to the sum takes one core as long as a third of a sample.
 _SAMPLES_PER_PASS = 2**21
 _LEAST_SAMPLES_PER_PIXEL = 8
-# Where the noise decides when to stop, it is estimated from the passes: from four on, and of sixteen at least.
+# The stopping criterion estimates the noise from four passes on, and needs at least sixteen in all.
 _PASSES_TO_JUDGE = 4
 _LEAST_PASSES_TO_CONVERGE = 16
-# Of seconds each: weeks.
+# Of some seconds each: weeks.
 _MOST_PASSES = 10**6
-# Of the time at most a twentieth goes into checkpoints, however large they are.
+# At most a twentieth of the time is spent on checkpoints.
 _CHECKPOINT_SHARE = 20
 
 
 @dataclass(frozen=True)
 class Job:
-    """All that decides the bits of a picture, apart from the processor. Processes pass it to each other.
+    """Everything that determines the bits of a picture, except for the processor. Sent to workers.
 
     Attributes:
         scene: absolute path of the XML file.
-        width, height, parameters, motion: as for `load_spectral_scene`.
-        variant: of Mitsuba.
-        seed: of the random numbers.
+        width, height, parameters, motion: see `load_spectral_scene`.
+        variant: Mitsuba variant.
+        seed: random seed.
         samples: samples per pixel of each pass.
-        until_error: as for `render`.
-        content: of the scene and the files that it names (`scene_digest`).
-        versions: of the packages that trace.
+        until_error: see `render`.
+        content: digest of the scene and the files it references (`scene_digest`).
+        versions: of the packages involved.
     """
 
     scene: str
@@ -68,18 +68,18 @@ class Job:
     versions: tuple[str, ...]
 
     def digest(self) -> str:
-        """SHA-256 of everything but the place of the scene."""
+        """SHA-256 of everything but the path of the scene."""
         told = {name: value for name, value in asdict(self).items() if name != "scene"}
         return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
 
     def load(self) -> mi.Scene:
-        """The scene; errors are those of `load_spectral_scene`."""
+        """The scene; raises as `load_spectral_scene`."""
         return load_spectral_scene(
             self.scene, width=self.width, height=self.height, parameters=dict(self.parameters), motion=self.motion
         )
 
 
-# Gives the passes `first`, `first` + 1, … of a job, one after the other; see `trace_here`.
+# Yields the passes `first`, `first` + 1, … of a job in order; see `trace_here`.
 Tracer = Callable[[Job, "mi.Scene", int], Iterator[NDArray[np.float32]]]
 
 
@@ -87,7 +87,7 @@ class Interrupted(KeyboardInterrupt):
     """Ctrl-C between two passes.
 
     Attributes:
-        image: the picture from the passes so far.
+        image: the picture from the passes completed.
     """
 
     def __init__(self, image: SpectralImage) -> None:
@@ -102,7 +102,7 @@ def trace_here(job: Job, scene: mi.Scene, first: int) -> Iterator[NDArray[np.flo
 
 
 def versions() -> tuple[str, ...]:
-    """Of the packages that decide what a pass gives."""
+    """Versions of the packages that determine the result of a pass."""
     return tuple(f"{name} {metadata.version(name)}" for name in ("mitsuba", "drjit", "mitsuba_diffraction"))
 
 
@@ -122,42 +122,41 @@ def render(
     tracer: Tracer = trace_here,
     progress: Callable[[int, int, float], None] = lambda done, total, error: None,
 ) -> SpectralImage:
-    """Renders the first sensor of a scene with its own integrator, spectrally, under the current variant.
+    """Renders the first sensor of a scene spectrally, with its own integrator, in the current variant.
 
-    The samples are split into passes with independent seeds. Passes are added in float64 in the order of their number,
-    wherever and whenever they were traced: the same seed gives the same bits (within the limits of `trace_pass`),
+    The samples are split into passes with independent seeds, which are added in float64 in the order of their indices.
+    The same seed therefore gives the same bits (within the limits of `trace_pass`), whether the rendering was
     interrupted or not, on one machine or on several.
 
     Args:
         scene_path: an XML scene; its film may be of any kind (see `load_spectral_scene`).
         spp: samples per pixel, four wavelengths each; the scene's sampler may round it up.
-        width: pixels, if the film's size shall not hold.
+        width: in pixels; default: that of the film.
         height: likewise.
-        seed: of the random numbers, not negative.
+        seed: random seed, not negative.
         parameters: values for the scene's `$name` parameters.
-        motion: of the camera, as for `load_spectral_scene`.
-        until_error: stop as soon as the picture's relative error (`Accumulation.error`) is not above this; spp is then
-            the most that is taken.
-        checkpoint: the file where the sums are kept every so often. If it is there, rendering goes on from it. It stays
-            when the picture is done: who has saved the picture removes it.
-        seconds: between two checkpoints, or twenty times as long as one takes to write, if that is longer.
-        finished: a picture of an earlier run; it is given back if it is what was asked for, and nothing is traced.
-        tracer: who traces the passes; this process by default, see `cluster.trace_on`.
-        progress: called with the samples per pixel done, those to be done (with `until_error`, as many as the noise so
-            far lets expect), and the error so far (not a number before four passes), at the start and after each pass.
+        motion: of the camera, see `load_spectral_scene`.
+        until_error: stop when the relative error of the picture (`Accumulation.error`) is at most this; spp is then the
+            maximum.
+        checkpoint: file in which the sums are saved periodically. If it exists, rendering resumes from it. The caller
+            removes it after saving the picture.
+        seconds: interval between checkpoints, or twenty times as long as writing one takes, if that is longer.
+        finished: a picture of an earlier run, returned without rendering if it satisfies this request.
+        tracer: traces the passes; default: this process, see also `cluster.trace_on`.
+        progress: called at the start and after each pass with the samples per pixel done, in total (with `until_error`,
+            extrapolated from the current error), and the current error (NaN before four passes).
 
     Returns:
-        The picture; radiance per nm at `channel_wavelengths()`. Its attributes name the scene, the variant, the samples
-        per pixel, the seed, the error (if there were four passes), and the digest of the request that it fulfils.
+        The picture; radiance per nm at `channel_wavelengths()`. Its attributes are the scene, the variant, the samples
+        per pixel, the seed, the error (from four passes on) and the digest of the request.
 
     Raises:
         FileNotFoundError: if there is no such scene.
-        ValueError: if the request is wrong, as for `load_spectral_scene`, a number is out of range, or the checkpoint
-            is not one of this rendering.
-        RuntimeError: if rendering failed, with the cause in one line.
-        OSError: if a checkpoint cannot be written; the last one is still whole.
-        Interrupted: on the first Ctrl-C, at the end of the pass, with the picture so far and the checkpoint written.
-        KeyboardInterrupt: on the second Ctrl-C, at once, or if there is no pass yet.
+        ValueError: as `load_spectral_scene`, or if a number is out of range or the checkpoint is of another rendering.
+        RuntimeError: if rendering failed, with the cause on one line.
+        OSError: if a checkpoint cannot be written; the previous one is kept.
+        Interrupted: at the end of the current pass on the first Ctrl-C, with the picture so far, after a checkpoint.
+        KeyboardInterrupt: at once on the second Ctrl-C, or if no pass has been completed.
     """
     if spp < 1:
         raise RequestError(f"spp: got {spp}, wanted a positive number of samples per pixel")
@@ -211,9 +210,9 @@ def render(
 
 
 def split(scene: mi.Scene, spp: int, least: int = 1) -> tuple[int, ...]:
-    """Samples per pixel of each pass of a picture; `least` passes or more, as far as there are samples for them.
+    """Samples per pixel of each pass; at least `least` passes, if there are enough samples.
 
-    Nothing but the request decides, so that an interrupt changes no pass.
+    Determined by the request alone, so that an interruption does not change the passes.
     """
     pixels = math.prod(scene.sensors()[0].film().crop_size())
     passes = -(-spp * pixels // max(_SAMPLES_PER_PASS, _LEAST_SAMPLES_PER_PIXEL * pixels))
@@ -225,11 +224,11 @@ def split(scene: mi.Scene, spp: int, least: int = 1) -> tuple[int, ...]:
 
 
 def _judge(sums: Accumulation, job: Job, progress: Callable[[int, int, float], None]) -> bool:
-    """Tells the progress, and gives whether the picture is done."""
+    """Reports progress and returns whether the picture is complete."""
     error = sums.error() if sums.passes >= _PASSES_TO_JUDGE else math.nan
     expected = total = sum(job.samples)
     if job.until_error is not None and not math.isnan(error):
-        # The error falls with the root of the samples.
+        # The error falls with the square root of the number of samples.
         expected = min(total, max(sums.samples, round(sums.samples * (error / job.until_error) ** 2)))
     progress(sums.samples, expected, error)
     return sums.passes == len(job.samples) or (job.until_error is not None and error <= job.until_error)
@@ -239,16 +238,16 @@ def _save(checkpoint: str | os.PathLike[str], job: Job, sums: Accumulation, save
     try:
         save_checkpoint(checkpoint, job.digest(), sums)
     except OSError as error:
-        left = f"the last one, of {saved} samples per pixel, is whole" if saved else "there is none yet"
+        left = f"the last one, of {saved} samples per pixel, is kept" if saved else "there is none yet"
         raise OSError(f"{os.fspath(checkpoint)}: cannot be written ({error.strerror or error}); {left}") from error
 
 
 @contextmanager
 def _deferred_interrupt() -> Iterator[Callable[[], bool]]:
-    """Gives what tells whether there was a Ctrl-C; a second one interrupts at once.
+    """Yields a function that returns whether Ctrl-C was pressed; a second one interrupts at once.
 
-    An exception between two statements would leave the sums and their count in disagreement. Python hears signals in
-    the main thread alone; where Ctrl-C is ignored, as in what a script starts in the background, it stays ignored.
+    An exception between two statements could make the sums inconsistent with their count. Python handles signals in the
+    main thread only. Ctrl-C stays ignored where it is, as in background jobs of a script.
     """
     before = signal.getsignal(signal.SIGINT)
     if threading.current_thread() is not threading.main_thread() or before in (signal.SIG_IGN, None):

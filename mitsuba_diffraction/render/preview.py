@@ -1,4 +1,4 @@
-"""The 8-bit picture beside a spectral image."""
+"""8-bit previews of spectral images."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from .spectral_image import SpectralImage
 
 
 def save_preview(image: SpectralImage, path: str | os.PathLike[str], exposure: float | None = None) -> float:
-    """Writes an 8-bit sRGB picture of a spectral image, in the format that the ending of `path` names.
+    """Writes an 8-bit sRGB preview of a spectral image, in the format given by the suffix of `path`.
 
     Spectra → linear sRGB → `into_gamut` → × exposure → `roll_off` → sRGB's transfer function.
 
     Args:
         image: the spectral image.
-        path: where to write, such as `picture.png`.
+        path: the file, such as `picture.png`.
         exposure: the factor for linear sRGB; by default `auto_exposure`.
 
     Returns:
-        The exposure: the factor by which linear sRGB was multiplied.
+        The exposure.
 
     Raises:
-        ValueError: if Pillow knows no format of that ending.
+        ValueError: if Pillow does not support the suffix.
     """
     from PIL import Image
 

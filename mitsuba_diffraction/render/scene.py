@@ -1,4 +1,4 @@
-"""Load an ordinary Mitsuba scene and give its sensor a film that records spectra."""
+"""Loads a Mitsuba scene with a spectral film."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from ..errors import Bug, RequestError, is_bug
 from ..recipe import Recipe
 from ..wavelengths import VISIBLE
 
-# The distance of the channels, nm.
+# The spacing of the channels, nm.
 #
-# Why 5 nm: colours differ from the exact ones by ΔE₂₀₀₀ ≤ 0.05 for lines 5 nm wide and by 0.6 for the worst laser line
-# (10 nm: 1.3 and 3.2; 23.5 nm: 90), and a grating's orders, 5–20 nm wide at a coherence length of 65 µm, are resolved.
-# Time does not depend on it, memory does: `film` adds a sample to eight channels at most.
+# With 5 nm, colours differ from the exact ones by ΔE₂₀₀₀ ≤ 0.05 for lines 5 nm wide and by 0.6 for the worst laser line
+# (10 nm: 1.3 and 3.2; 23.5 nm: 90), and the orders of a grating, 5–20 nm wide at a coherence length of 65 µm, are
+# resolved. The spacing affects memory but not time, as `film` adds a sample to at most eight channels.
 _STEP = 5.0
 
-_MOST_PIXELS = 2**25  # above 7680 × 4320; the sums of one have 750 bytes
+_MOST_PIXELS = 2**25  # above 7680 × 4320; sums take 750 bytes per pixel
 _DEFAULT_SIZE = (768, 576)  # that of Mitsuba's films
 
 # An exception in a Python plugin comes as text: lines that are indented, then its class and its message.
@@ -35,18 +35,17 @@ _INNER_TRACEBACK = re.compile(r"Traceback \(most recent call last\):\n(?:\s+.*\n
 
 
 def channel_wavelengths() -> NDArray[np.float64]:
-    """The centres of the film's channels, (n,), nm: the hats around them lie whole inside the range."""
+    """Centres of the channels of the film, (n,), nm; their hats lie inside the range of Mitsuba's spectra."""
     return np.arange(VISIBLE[0] + _STEP, VISIBLE[1] - _STEP / 2, _STEP)
 
 
 def channel_weights() -> NDArray[np.float64]:
-    """How large each channel is on the film, (n,): what it records must be divided by this to give radiance.
+    """Area of the response of each channel, (n,); the recorded value divided by it is radiance.
 
-    Mitsuba draws wavelengths in proportion to the sum of a film's responses. Unit hats would spend half of the samples
-    where the eye sees next to nothing; these weights follow the density that Mitsuba's RGB film draws from,
-    sech²(0.0072 (λ − 538 nm)) (Radziszewski, Boryczko and Alda 2009), which takes a quarter off the colour noise, as
-    1.8 times the samples would. They are kept above one quarter, so that no channel becomes more than twice as noisy as
-    the best one.
+    Mitsuba samples wavelengths in proportion to the sum of the responses of the film. Hats of unit area would spend
+    half of the samples where the eye is insensitive; these weights follow the density of Mitsuba's RGB film,
+    sech²(0.0072 (λ − 538 nm)) (Radziszewski, Boryczko and Alda 2009), which reduces colour noise by a quarter, like 1.8
+    times the samples. The lower bound of one quarter limits the noise of a channel to twice that of the best one.
     """
     return np.maximum(np.cosh(0.0072 * (channel_wavelengths() - 538)) ** -2, 0.25)
 
@@ -59,19 +58,20 @@ def load_spectral_scene(
     parameters: Mapping[str, str] | None = None,
     motion: tuple[float, ...] | None = None,
 ) -> mi.Scene:
-    """Loads an XML scene under the current variant, with a spectral film in place of its own.
+    """Loads an XML scene in the current variant and replaces its film by a spectral one.
 
     The film becomes a `specfilm` of float32 whose channels are hat functions at `channel_wavelengths()` with areas of
-    `channel_weights()`: divided by these, each channel is spectral radiance per nm, averaged over the hat. Size, crop
-    and reconstruction filter stay the scene's. File names in the scene are relative to its folder.
+    `channel_weights()`: divided by these, a channel is spectral radiance per nm, averaged over the hat. Size, crop and
+    reconstruction filter are those of the scene. File names in the scene are relative to its folder.
 
     Args:
         path: the scene.
-        width: pixels of the whole film; the crop window is scaled with it. If only one of the two sizes is given, the
-            other follows from the film's aspect.
+        width: of the full film in pixels; the crop window is scaled with it. If only one of width and height is given,
+            the aspect ratio is preserved.
         height: likewise.
         parameters: values for the scene's `$name` parameters (`-Dname=value` of Mitsuba's command line).
-        motion: moves the first sensor: an affine map of the world, 16 numbers row by row, applied after its `to_world`.
+        motion: of the first sensor: an affine map of world space, 16 numbers in row-major order, applied after its
+            `to_world`.
 
     Returns:
         The scene.
@@ -110,7 +110,7 @@ def load_spectral_scene(
 
 
 def named_sample_count(path: str | os.PathLike[str], parameters: Mapping[str, str] | None = None) -> int | None:
-    """The sample_count that a scene names for the sampler of its first sensor; None if it names none.
+    """The sample_count of the sampler of the first sensor in a scene, None if unspecified.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -136,9 +136,9 @@ def named_sample_count(path: str | os.PathLike[str], parameters: Mapping[str, st
 
 
 def scene_digest(path: str | os.PathLike[str], parameters: Mapping[str, str] | None = None) -> str:
-    """SHA-256 of what a scene that loads is made of: its XML with the parameters put in, and the files that it names.
+    """SHA-256 of a valid scene: its XML after substitution of the parameters, and the files it references.
 
-    Files are told by their content, not by their place; a recipe stands for the scan that it names.
+    Files enter by content, not by path; a recipe includes the scan it references.
     """
     path = Path(path)
     content = hashlib.sha256(path.read_bytes())
@@ -160,7 +160,7 @@ def scene_digest(path: str | os.PathLike[str], parameters: Mapping[str, str] | N
 
 
 def _in_full(value: object) -> str:
-    """A property as text that tells its value: Mitsuba's own counts the samples of a spectrum, and rounds."""
+    """A property as text without loss; Mitsuba's own abbreviates spectra and rounds."""
     if dr.is_array_v(value):
         return str(list(value))
     if hasattr(value, "wavelengths"):
@@ -170,7 +170,7 @@ def _in_full(value: object) -> str:
 
 @contextmanager
 def _files_beside(scene: Path) -> Iterator[None]:
-    """Lets Mitsuba look for files in the folder of a scene first."""
+    """Makes Mitsuba search the folder of a scene first."""
     resolver = mi.file_resolver()
     beside_scene = mi.FileResolver(resolver)
     beside_scene.prepend(str(scene.resolve().parent))
@@ -191,13 +191,13 @@ def _move_first_sensor(state: mi.parser.ParserState, motion: tuple[float, ...]) 
 
 
 def _replace_films(state: mi.parser.ParserState, width: int | None, height: int | None) -> None:
-    """Puts spectral films in the place of all films, and one into sensors that have none."""
+    """Replaces all films by spectral ones, and adds one to sensors without a film."""
     kinds = [node.type for node in state.nodes]
     if mi.ObjectType.Sensor not in kinds:
         raise RequestError("the scene has no sensor")
     for index, kind in enumerate(kinds):
-        # Each film adds nodes, and the list may then move in memory, so that what was taken from it is no longer valid:
-        # properties are read as a copy, and written through a fresh look-up.
+        # Each film adds nodes, which may reallocate the list and invalidate references into it: properties are read as
+        # a copy and written by index.
         props = mi.Properties(state.nodes[index].props)
         if kind == mi.ObjectType.Film:
             state.nodes[index].props = _spectral_film(state, props, width, height)
@@ -207,12 +207,12 @@ def _replace_films(state: mi.parser.ParserState, width: int | None, height: int 
 
 
 def _children(props: mi.Properties) -> dict[str, int]:
-    """Name → index in the parser's list of the nodes that stand inside one."""
+    """Name → index in the parser's list of the children of a node."""
     return {name: value.index() for name, value in props.items() if isinstance(value, mi.Properties.ResolvedReference)}
 
 
 def _add(state: mi.parser.ParserState, kind: mi.ObjectType, props: mi.Properties) -> mi.Properties.ResolvedReference:
-    """Appends a node and gives the reference that a parent needs."""
+    """Appends a node and returns a reference to it for its parent."""
     node = mi.parser.SceneNode()
     node.type = kind
     node.props = props
@@ -230,7 +230,7 @@ def _whole(film: mi.Properties, name: str, default: int) -> int:
 def _spectral_film(
     state: mi.parser.ParserState, old: mi.Properties, width: int | None, height: int | None
 ) -> mi.Properties:
-    """The properties of a spectral film that looks through the same window as `old`."""
+    """The properties of a spectral film with the crop window of `old`."""
     old_size = tuple(_whole(old, name, size) for name, size in zip(("width", "height"), _DEFAULT_SIZE, strict=True))
     if width is None:
         width = old_size[0] if height is None else max(1, round(height * old_size[0] / old_size[1]))
@@ -261,13 +261,13 @@ def _spectral_film(
         hat = mi.Properties("regular")
         hat["wavelength_min"], hat["wavelength_max"] = float(centre - _STEP), float(centre + _STEP)
         hat["values"] = f"0, {weight / _STEP:.17g}, 0"
-        # The parser refuses names with a dot, so that channels are numbered; films keep the order of names.
+        # Channels are numbered, as the parser refuses names with a dot; films keep the order of names.
         film[f"channel_{number:03d}"] = _add(state, mi.ObjectType.Texture, hat)
     return film
 
 
 def _what_there_is(scene: Path, error: str) -> str:
-    """After an include that is missing, those that are there; after an unknown parameter, those that a scene has."""
+    """For a missing include, the available ones; for an unknown parameter, those of the scene."""
     if (missing := re.search(r'included file "(.+?)" not found', error)) is not None:
         folder = scene.resolve().parent / Path(missing[1]).parent
         there = sorted(path.stem for path in folder.glob("*.xml"))
@@ -280,13 +280,13 @@ def _what_there_is(scene: Path, error: str) -> str:
 
 
 def root_cause(error: BaseException) -> str:
-    """What went wrong inside Mitsuba: the text at the bottom of the chain of exceptions, as one line.
+    """The message at the end of the chain of exceptions of Mitsuba, as one line.
 
-    Mitsuba says "Error while ..." and keeps what matters in `__cause__`; its messages span lines and begin with the
-    place in its C++ sources.
+    Mitsuba raises "Error while ..." with the actual error as `__cause__`; its messages span several lines and begin
+    with the location in its C++ sources.
 
     Raises:
-        KeyboardInterrupt: if that is the cause: a wish of the user is no failure.
+        KeyboardInterrupt: if that is the cause.
         Bug: if the cause is a mistake of the code.
     """
     while error.__cause__ is not None:

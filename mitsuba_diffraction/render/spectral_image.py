@@ -1,4 +1,4 @@
-"""A spectral picture in memory, and its OpenEXR file."""
+"""Spectral images and their OpenEXR files."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from ..files import whole_file
 from ..outputs import made_for
 
 _LAYOUT_VERSION = "1.0"
-# Radiance per unit of the channels' names, that is per nm: the layout's authors and pbrt-v4 leave the nm⁻¹ out, and
+# Radiance per nm, the unit in the channel names: the authors of the layout and pbrt-v4 omit the nm⁻¹, and
 # colour-science integrates the channels over wavelength.
 _UNITS = "W.m^-2.sr^-1"
 _CHANNEL = re.compile(r"S0\.(\d+(?:,\d+)?)nm")
 _MAGIC = b"\x76\x2f\x31\x01"
-# Header entries that are OpenEXR's or the layout's and not ours to give back.
+# Header entries of OpenEXR and of the layout, which are not attributes.
 _RESERVED = frozenset(
     (
         *("channels", "chunkCount", "compression", "dataWindow", "displayWindow", "lineOrder", "name"),
@@ -39,11 +39,11 @@ class SpectralImage:
     Attributes:
         wavelengths: (n,) float64, nm, ascending.
         radiance: (height, width, n) float32, W m⁻² sr⁻¹ nm⁻¹; row 0 is the top.
-        attributes: what else is known, by name: text, integers (32 bits in the file) or floats (float32 in the file).
+        attributes: metadata by name: text, integers (32 bits in the file) or floats (float32 in the file).
 
     Raises:
-        ValueError: if the shapes disagree, the wavelengths do not ascend, or an attribute has another type or a name
-            that the file format uses.
+        ValueError: if the shapes disagree, the wavelengths do not ascend, or an attribute has another type or a
+            reserved name.
     """
 
     wavelengths: NDArray[np.float64]
@@ -61,7 +61,7 @@ class SpectralImage:
             )
         for name, value in self.attributes.items():
             if isinstance(value, int) and not -(2**31) <= value < 2**31:
-                # OpenEXR would cut it off and say nothing.
+                # OpenEXR would truncate it silently.
                 raise RequestError(f"attributes: got {name!r} = {value}, wanted an integer of 32 bits")
             if name in _RESERVED or not isinstance(value, str | int | float):
                 raise RequestError(
@@ -76,17 +76,17 @@ class SpectralImage:
     def save(self, path: str | os.PathLike[str], *, half: bool = False) -> None:
         """Writes an OpenEXR file (ZIP) in the spectral layout of Fichet, Pacanowski and Wilkie 2021.
 
-        Channels `S0.405,000000nm` hold the radiance, R, G and B its linear sRGB (scaled as in `color`), so that viewers
-        which know no spectra show the picture.
+        Channels `S0.405,000000nm` hold the radiance; R, G and B are linear sRGB (scaled as in `color`) for ordinary
+        viewers.
 
         Args:
             path: the file.
-            half: float16 instead of float32: about half of the size or less. Radiance from 6.1e-5 to 65504 is then
-                rounded by at most 2⁻¹¹ (0.05 %), less than that by at most 3e-8.
+            half: write float16 instead of float32, in about half the size or less. Radiance from 6.1e-5 to 65504 is
+                then rounded by at most 2⁻¹¹ (0.05 %), smaller radiance by at most 3e-8.
 
         Raises:
             FileNotFoundError: if the folder does not exist.
-            ValueError: if a radiance is too great for float16.
+            ValueError: if a radiance exceeds the range of float16.
         """
         import OpenEXR
 
@@ -113,7 +113,7 @@ class SpectralImage:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> SpectralImage:
-        """Reads what `save` writes.
+        """Reads a file written by `save`.
 
         Raises:
             FileNotFoundError: if there is no such file.
@@ -122,7 +122,7 @@ class SpectralImage:
         import OpenEXR
 
         with Path(path).open("rb") as stream:
-            # OpenEXR would write a line of its own to stderr before it raises.
+            # OpenEXR would print to stderr before raising.
             if stream.read(4) != _MAGIC:
                 raise RequestError(f"{os.fspath(path)}: not an OpenEXR file")
         try:

@@ -1,4 +1,4 @@
-"""A camera that goes round the scene, and the animation of its pictures."""
+"""Turntable animations: a camera that orbits the scene."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ MOST_FRAMES = 3600  # a tenth of a degree apart, five minutes
 def orbit(
     scene_path: str | os.PathLike[str], frames: int, parameters: Mapping[str, str] | None = None
 ) -> list[tuple[float, ...]]:
-    """The motions that take the first camera once round the scene, anticlockwise seen from above.
+    """The motions of the first camera for one orbit, counterclockwise as seen from above.
 
-    Frame k turns it by 360° k/`frames` about the coordinate axis nearest to the camera's up, through the point on its
-    line of sight that is nearest to the middle of the scene's bounding box.
+    Frame k rotates it by 360° k/`frames` about the coordinate axis closest to its up vector, through the point on its
+    line of sight that is closest to the centre of the scene's bounding box.
 
     Args:
         scene_path: the scene.
-        frames: how many, two or more.
+        frames: number of frames, at least two.
         parameters: values for the scene's `$name` parameters.
 
     Returns:
-        One affine map of the world for each frame, as `load_spectral_scene` takes it; the first is the identity.
+        One affine map of world space per frame, for `load_spectral_scene`; the first is the identity.
 
     Raises:
         ValueError: if there are fewer than two frames or more than 3600, or as for `load_spectral_scene`.
@@ -54,7 +54,7 @@ def orbit(
 
 
 def _view(scene: mi.Scene) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """What the first camera looks at, and the coordinate axis nearest to its up."""
+    """The point the first camera looks at, and the coordinate axis closest to its up vector."""
     to_world = np.array(scene.sensors()[0].world_transform().matrix, np.float64).reshape(4, 4)
     origin, forward, own_up = to_world[:3, 3], to_world[:3, 2] / np.linalg.norm(to_world[:3, 2]), to_world[:3, 1]
     middle = np.ravel(np.array(scene.bbox().center(), np.float64))
@@ -71,7 +71,7 @@ def frame_path(picture: Path, frame: int, frames: int) -> Path:
 
 
 def save_animation(previews: Iterable[Path], path: str | os.PathLike[str]) -> None:
-    """Joins pictures of one size into an animated WebP that repeats for ever, twelve pictures a second."""
+    """Joins pictures of equal size into a looping animated WebP at twelve frames per second."""
     from PIL import Image
 
     first, *others = (Image.open(preview).convert("RGB") for preview in previews)

@@ -1,5 +1,5 @@
-"""The real-time shader of structural colour, as it was published, beside this project's model.
+"""The published real-time shader of structural colour, for comparison with this project's model.
 
-Chapters 3 and 4 of the thesis of 2014 that this project starts from. `quirks`, `taylor_textures` and `tristimulus`
-only precompute and need no Mitsuba; the rest does.
+Chapters 3 and 4 of the thesis of 2014 from which this project started. `quirks`, `taylor_textures` and `tristimulus`
+do not need Mitsuba.
 """

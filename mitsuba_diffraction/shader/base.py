@@ -1,4 +1,4 @@
-"""What every variant of the shader has in common."""
+"""Base classes of the variants of the shader."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from .tristimulus import LONGEST, PUBLISHED_STEP, SHORTEST, rgb_matrix
 
 
 class Shader:
-    """A way to shade a tile: directions → linear RGB.
+    """Shades a tile: directions → linear RGB.
 
-    Directions are unit vectors along the axes of the tile, z the normal, both away from the surface: ω_i to the light,
-    ω_o to the viewer. An instance belongs to the variant of Mitsuba under which it was made.
+    Directions are unit vectors in the frame of the tile, z being the normal, and point away from the surface: ω_i to
+    the light, ω_o to the viewer. An instance is bound to the Mitsuba variant in which it was made.
 
     Attributes:
-        own_quirks: the names of the quirks that change something in this shader.
+        own_quirks: names of the quirks that affect this shader.
     """
 
     own_quirks: ClassVar[tuple[str, ...]]
@@ -42,23 +42,23 @@ class Shader:
         self.shadowing = shadowing
 
     def with_quirks(self, quirks: Quirks) -> Shader:
-        """The same shader with other quirks; the two share their tables."""
+        """The same shader with other quirks; tables are shared."""
         other = copy.copy(self)
         other.quirks = quirks
         return other
 
     def weights(self, r_0: ArrayLike = PUBLISHED_R0, light: ArrayLike | None = None) -> SpectralWeights:
-        """The colour weights for a material and a light, as `SpectralWeights` has them."""
+        """The `SpectralWeights` of a material and a light."""
         return SpectralWeights(self.quirks, self.peak, r_0=r_0, light=light)
 
     @property
     def peak(self) -> float:
-        """S(0) of a flat surface, µm², by which a relative radiance was divided."""
+        """S(0) of a flat surface, µm², the normalisation of the relative radiance."""
         raise NotImplementedError
 
     @property
     def texel_reads(self) -> int:
-        """How many texels of the height field's transforms one shading point reads, at most."""
+        """The largest number of texels read for one shading point."""
         raise NotImplementedError
 
     def rgb(
@@ -74,8 +74,8 @@ class Shader:
         Args:
             wi: ω_i.
             wo: ω_o.
-            weights: of this shader's `weights`.
-            active: where to shade.
+            weights: from `weights`.
+            active: mask.
             height_scale: scales the heights.
         """
         raise NotImplementedError
@@ -88,7 +88,7 @@ class TextureShader(Shader):
 
         ρ(λ) = F/F₀ · K G cos θ_i · |P(q; κ)|²,     q = (u, v)/λ,     κ = −2πw/λ,
 
-    |P|² = 1 being that of a flat mirror, and the colour ∫ ρ(λ) S(λ) (x̄, ȳ, z̄) dλ.
+    with |P|² = 1 for a flat mirror, and the colour is ∫ ρ(λ) S(λ) (x̄, ȳ, z̄) dλ.
     """
 
     own_quirks = (
@@ -111,17 +111,17 @@ class TextureShader(Shader):
 
         Args:
             height_field: the tile.
-            quirks: which of the published shader's peculiarities to keep.
+            quirks: the quirks of the published shader to keep.
             coherence_length: L_c in µm.
-            terms: how many Taylor terms.
-            step: between wavelengths, nm; 400 must be a multiple of it.
-            shadowing: multiply with G.
+            terms: number of Taylor terms.
+            step: wavelength spacing, nm, a divisor of 400.
+            shadowing: include G.
 
         Raises:
-            ValueError: if an argument makes no sense.
+            ValueError: if an argument is invalid.
         """
         super().__init__(height_field, quirks, shadowing)
-        lobe_width(coherence_length)  # refuses what is no length
+        lobe_width(coherence_length)  # raises unless it is a valid length
         steps = (LONGEST - SHORTEST) / step if isinstance(step, Real) and step > 0 else 0
         if steps < 1 or abs(steps - round(steps)) > 1e-9:
             raise RequestError(f"step: got {step!r}, wanted a part of the {LONGEST - SHORTEST:g} nm from 380 to 780 nm")
@@ -138,7 +138,7 @@ class TextureShader(Shader):
         return other
 
     def _bind(self) -> None:
-        """What the quirks decide before shading."""
+        """Sets up what depends on the quirks."""
         from_zero = self.quirks.heights_from_zero
         if from_zero not in self._textures:
             self._textures[from_zero] = TextureSum(
@@ -150,7 +150,7 @@ class TextureShader(Shader):
 
     @property
     def sigma(self) -> float:
-        """σ_f = 1/(2πσ_s) in cycles/µm, σ_s = L_c/4: the window in amplitude, √2 times as wide as in power."""
+        """σ_f = 1/(2πσ_s) in cycles/µm, σ_s = L_c/4, of the window in amplitude, √2 times as wide as in power."""
         return float(np.sqrt(2) * lobe_width(self.coherence_length))
 
     @property
@@ -169,7 +169,7 @@ class TextureShader(Shader):
         r_0: mi.Float = PUBLISHED_R0,
         height_scale: mi.Float = 1.0,
     ) -> mi.Float:
-        """ρ(λ) at a wavelength in nm (eq. 3.11), with the shadowing."""
+        """ρ(λ) at a wavelength in nm (eq. 3.11), including shadowing."""
         gain = Gain(wi, wo, self.shadowing, mi.Bool(True))
         r_0 = PUBLISHED_R0 if self.quirks.fixed_index else r_0
         power = self.power(gain, mi.Float(wavelength) * 1e-3, mi.Float(height_scale), gain.active)
@@ -192,7 +192,7 @@ class TextureShader(Shader):
         return gain.factor * self.integral(gain, weights, mi.Float(height_scale))
 
     def integral(self, gain: Gain, weights: SpectralWeights, height_scale: mi.Float) -> mi.Color3f:
-        """∫ F/F₀ |P|² S (x̄, ȳ, z̄) dλ, here by the trapezoidal rule."""
+        """∫ F/F₀ |P|² S (x̄, ȳ, z̄) dλ by the trapezoidal rule."""
         return trapezoid(self, self.power, gain, weights, height_scale, gain.active)
 
     def rgb(
@@ -208,7 +208,7 @@ class TextureShader(Shader):
 
     @property
     def texels_per_term(self) -> int:
-        """How many texels one Taylor term of one wavelength reads."""
+        """Texels read per Taylor term and wavelength."""
         raise NotImplementedError
 
     @property
@@ -225,7 +225,7 @@ def trapezoid(
     height_scale: mi.Float,
     active: mi.Bool,
 ) -> mi.Color3f:
-    """Σ_j F/F₀ power(λ_j) S (x̄, ȳ, z̄)(λ_j) Δλ over the shader's wavelengths, half of it at both ends."""
+    """Σ_j F/F₀ power(λ_j) S (x̄, ȳ, z̄)(λ_j) Δλ over the wavelengths of the shader, with half weight at both ends."""
     result = mi.Color3f(0)
     index = mi.UInt32(0)
     while active & (index < shader.wavelength_count):

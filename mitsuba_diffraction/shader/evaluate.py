@@ -1,4 +1,4 @@
-"""The shader at given directions, NumPy in and out."""
+"""Evaluates the shader for NumPy arrays of directions."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ QUANTITIES = ("encoded", "rgb", "xyz")
 
 
 def shader_for(height_field: HeightField, variant: str, quirks: Quirks, **settings: object) -> Shader:
-    """The shader of that name (`VARIANTS`), under Mitsuba's variant in force.
+    """The shader of a given name (`VARIANTS`) in the current Mitsuba variant.
 
     Raises:
-        ValueError: on an unknown name, or where Mitsuba has no vectorised variant set.
+        ValueError: if the name is unknown, or no vectorised Mitsuba variant is set.
     """
     if variant not in VARIANTS:
         raise RequestError(f"variant: got {variant!r}, wanted one of {', '.join(VARIANTS)}")
@@ -47,24 +47,24 @@ def colour(
     light: ArrayLike | None = None,
     **settings: object,
 ) -> NDArray[np.float32]:
-    """The colour that the shader gives a tile.
+    """The colour of a tile as computed by the shader.
 
     Args:
         height_field: the tile.
-        wi: ω_i, (..., 3) along the axes of the tile.
-        wo: ω_o, likewise; the two broadcast.
+        wi: ω_i, (..., 3) in the frame of the tile.
+        wo: ω_o, likewise; shapes broadcast.
         variant: "flss", "nmm", "pq" or "gem".
-        quirks: as published if none are given.
-        quantity: "xyz" (not for gem), linear "rgb", or "encoded", the numbers of the screen, cut off at 0 and 1.
-        r_0: the power reflectance at normal incidence.
-        light: the light's irradiance per nm at `tristimulus.wavelengths`; D65 with Y = 1 if there is none.
-        settings: further arguments of the shader's class.
+        quirks: default: as published.
+        quantity: "xyz" (not for gem), linear "rgb", or "encoded", display values clamped to [0, 1].
+        r_0: power reflectance at normal incidence.
+        light: irradiance per nm at `tristimulus.wavelengths`; default: D65 with Y = 1.
+        settings: further arguments of the shader class.
 
     Returns:
         (..., 3).
 
     Raises:
-        ValueError: if an argument makes no sense.
+        ValueError: if an argument is invalid.
     """
     if quantity not in QUANTITIES:
         raise RequestError(f"quantity: got {quantity!r}, wanted one of {', '.join(QUANTITIES)}")
@@ -91,23 +91,23 @@ def relative_radiance(
     r_0: float = 0.04,
     **settings: object,
 ) -> NDArray[np.float32]:
-    """ρ(λ), the radiance over that of a flat mirror lit and seen at right angles (eq. 3.11).
+    """ρ(λ), the radiance relative to that of a flat mirror at normal incidence (eq. 3.11).
 
     Args:
         height_field: the tile.
-        wi: ω_i, (..., 3) along the axes of the tile.
+        wi: ω_i, (..., 3) in the frame of the tile.
         wo: ω_o, likewise.
         wavelengths: (...) in nm; all three broadcast.
-        variant: "flss" or "pq"; "nmm" gives what it finds at one of its wavelengths, the same as "flss".
-        quirks: as published if none are given.
-        r_0: the power reflectance at normal incidence.
-        settings: further arguments of the shader's class.
+        variant: "flss" or "pq"; "nmm" is evaluated as at one of its own wavelengths, which equals "flss".
+        quirks: default: as published.
+        r_0: power reflectance at normal incidence.
+        settings: further arguments of the shader class.
 
     Returns:
         (...).
 
     Raises:
-        ValueError: if an argument makes no sense.
+        ValueError: if an argument is invalid.
     """
     if variant == "gem":
         raise RequestError("variant: gem has no spectrum, only RGB")
@@ -120,7 +120,7 @@ def relative_radiance(
 
 
 def _directions(wi: ArrayLike, wo: ArrayLike) -> tuple[mi.Vector3f, mi.Vector3f, tuple[int, ...]]:
-    """Two arrays (..., 3) of directions as Dr.Jit's, and the shape (...)."""
+    """Two arrays (..., 3) of directions as Dr.Jit arrays, and the shape (...)."""
     wi, wo = (np.asarray(omega, np.float32) for omega in (wi, wo))
     if wi.shape[-1:] != (3,) or wo.shape[-1:] != (3,):
         raise RequestError(f"wi, wo: got shapes {wi.shape} and {wo.shape}, wanted (..., 3)")

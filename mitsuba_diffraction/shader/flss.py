@@ -1,4 +1,4 @@
-"""FLSS: full wavelength sampling."""
+"""FLSS: full lambda space sampling."""
 
 from __future__ import annotations
 
@@ -11,19 +11,20 @@ import numpy as np
 from .base import TextureShader
 from .gain import Gain
 
-REACH = 1  # texels to each side: a neighbourhood of 3 × 3
+REACH = 1  # texels on each side: a neighbourhood of 3 × 3
 
 
 class FLSS(TextureShader):
     """Full lambda space sampling (thesis of 2014, algorithm 4.3, after Stam 1999, "Diffraction Shaders").
 
-    81 wavelengths, 380 to 780 nm. At each the transform of the tile is looked up at the texel position c = (u T_x,
-    v T_y)/λ (eq. 4.6) in the texels around it, weighted with a Gaussian window in amplitude (eq. 3.29, 3.30):
+    Samples 81 wavelengths, 380 to 780 nm. For each, the texels of the transform of the tile around the position
+    c = (u T_x, v T_y)/λ (eq. 4.6) are weighted with a Gaussian window in amplitude (eq. 3.29, 3.30):
 
         P = Σ_m φ(m/T − q) F_m(κ),     φ(x) = e^{−|x|²/2σ_f²},     σ_f = 1/(2πσ_s),     σ_s = L_c/4.
 
-    What the neighbourhood leaves out is at most about e^{−(3/2)²/(σ_f T)²} of a line: 0.4 % if T = L_c, nothing if the
-    tile is much smaller. With T > L_c neighbours overlap, and the complex sum is one place x₀ instead of the average.
+    The neighbourhood truncates at most about e^{−(3/2)²/(σ_f T)²} of a line: 0.4 % for T = L_c, and a negligible part
+    for much smaller tiles. For T > L_c orders overlap, and the complex sum represents a single point x₀ rather than the
+    average.
     """
 
     own_quirks = (*TextureShader.own_quirks, "window_pi", "complex_window_sum")
@@ -34,7 +35,7 @@ class FLSS(TextureShader):
 
     @property
     def left_out(self) -> float:
-        """e^{−(3/2)²/(σ_f T)²}, T the longer side: the most of a line's power that the neighbourhood leaves out."""
+        """e^{−(3/2)²/(σ_f T)²} with the longer side T: bound of the truncated fraction of the power of a line."""
         return float(np.exp(-((1.5 / (self.sigma * max(self.tile_size))) ** 2)))
 
     def power(self, gain: Gain, wavelength: mi.Float, height_scale: mi.Float, active: mi.Bool) -> mi.Float:
@@ -42,13 +43,13 @@ class FLSS(TextureShader):
         return self.windowed(gain, x, y, wavelength, height_scale, self.window(x, y), active)
 
     def position(self, gain: Gain, wavelength: mi.Float) -> tuple[mi.Float, mi.Float]:
-        """c, in texels from frequency zero."""
+        """c, in texels relative to frequency zero."""
         return gain.u * self.tile_size[0] / wavelength, gain.v * self.tile_size[1] / wavelength
 
     def window(
         self, x: mi.Float, y: mi.Float, stretch_x: mi.Float = 1.0, stretch_y: mi.Float = 1.0
     ) -> Callable[[mi.Int32, mi.Int32], mi.Float]:
-        """φ of the texels m, distances along x and y multiplied by what is given."""
+        """φ of the texels m, with distances along x and y scaled by the given factors."""
         height = float(np.pi) if self.quirks.window_pi else 1.0
         scale = 1 / (float(np.sqrt(2)) * self.sigma)
 
@@ -72,7 +73,7 @@ class FLSS(TextureShader):
     ) -> mi.Float:
         """|Σ φ F|² or Σ φ² |F|² around the position (x, y)."""
         anchor = dr.floor if self.quirks.floor_anchor else dr.round
-        # Far outside of the texture nothing is read; the limit keeps the conversion in range.
+        # Far outside the texture nothing is read; clamping keeps the conversion in range.
         first = tuple(mi.Int32(dr.clip(anchor(c), -1e6, 1e6)) - reach for c in (x, y))
         kappa = -dr.two_pi * gain.w / wavelength * height_scale
         size = (2 * reach + 1, 2 * reach + 1)

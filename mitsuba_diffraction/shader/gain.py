@@ -1,4 +1,4 @@
-"""What the shader multiplies the power of the phase with: Fresnel, Stam's geometry, V-cavity shadowing (eq. 3.10)."""
+"""The gain factor of the shader: Fresnel, Stam's geometry factor, V-cavity shadowing (eq. 3.10)."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ def fresnel_ratio(r_0: mi.Float, falloff: mi.Float, squared: bool) -> mi.Float:
 
 
 class Gain:
-    """C(ω_i, ω_o) without F and with the shadowing: what is the same for all wavelengths.
+    """C(ω_i, ω_o) without F and with shadowing: the factors independent of wavelength.
 
-    Relative to a flat mirror that is lit and seen at right angles,
+    Relative to a flat mirror at normal incidence,
 
         C = F(ω_i·h)/F(1) · (1 + ω_i·ω_o)²/((cos θ_i + cos θ_o)² cos θ_o),
 
@@ -34,12 +34,12 @@ class Gain:
 
     Attributes:
         falloff: `schlick_falloff`.
-        factor: K G cos θ_i; zero below the surface.
-        active: both directions are above the surface.
+        factor: K G cos θ_i; zero below the horizon.
+        active: both directions are in the upper hemisphere.
     """
 
     def __init__(self, wi: mi.Vector3f, wo: mi.Vector3f, shadowing: bool, active: mi.Bool) -> None:
-        # With the directions exchanged, K G cos θ_o is K G cos θ_i: K and G are symmetric.
+        # K and G are symmetric: exchanging the directions turns K G cos θ_o into K G cos θ_i.
         geometry = Geometry(wo, wi)
         self.active = active & geometry.reflects()
         self.falloff = schlick_falloff(geometry.cos_half())

@@ -1,4 +1,4 @@
-"""GEM: a rainbow per order, no height field."""
+"""GEM: a rainbow per order, independent of the height field."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from .quirks import Quirks
 from .spectral_weights import SpectralWeights
 
 ORDERS = 7
-_RAINBOW = (0.75, 0.5, 0.25)  # where red, green and blue are strongest
+_RAINBOW = (0.75, 0.5, 0.25)  # peaks of red, green and blue
 
 
 class GEM(Shader):
     """The shader of GPU Gems 1, chapter 8, "Simulating Diffraction" (Stam, in Fernando 2004).
 
-    A regular lattice of period d along x sends into a direction the wavelengths λ_n = d |u|/n. Each of the first seven
-    orders adds a rainbow of three parabolas, a highlight stands for order zero:
+    A lattice of period d along x diffracts the wavelengths λ_n = d |u|/n into a direction. Each of the first seven
+    orders adds a rainbow of three parabolas; order zero is a highlight:
 
         c = Σ_{n=1}^{7} max(0, 1 − 16 (y_n − y_c)²) + e^{−(r d u/w)²},     y_c = 3/4, 1/2, 1/4 for red, green, blue,
 
-    with y = 2λ − 1 (λ in µm), which puts 0.5 to 1 µm on the rainbow. Nothing depends on the shape of the surface.
+    with y = 2λ − 1 (λ in µm), which maps 0.5 to 1 µm to the rainbow. The profile of the surface is ignored.
 
     Attributes:
         spacing: d in µm.
@@ -45,7 +45,7 @@ class GEM(Shader):
         roughness: float = 5.0,
         shadowing: bool = True,
     ) -> None:
-        """Takes d, by default the period of the strongest wave of the heights along x."""
+        """The default of d is the period of the strongest component of the heights along x."""
         super().__init__(height_field, quirks, shadowing)
         self.spacing = strongest_period(height_field) if spacing is None else spacing
         self.roughness = roughness
@@ -54,7 +54,7 @@ class GEM(Shader):
 
     @property
     def peak(self) -> float:
-        """There is no radiance to be relative to: the shader gives colours."""
+        """Unused: the shader computes colours, not a relative radiance."""
         return 1.0
 
     @property
@@ -81,7 +81,7 @@ class GEM(Shader):
 
 
 def strongest_period(height_field: HeightField) -> float:
-    """The period along x, in µm, of the wave with the largest share of the heights' power; the tile's if flat."""
+    """The period along x, in µm, of the strongest Fourier component of the heights; that of the tile if flat."""
     power = np.abs(scipy.fft.rfft(height_field.centred - height_field.centred.mean(), axis=1)) ** 2
     orders = power.sum(axis=0)[1:]
     if orders.size == 0 or orders.max() == 0:

@@ -1,4 +1,4 @@
-"""The class behind `<integrator type="diffraction_shader">`."""
+"""The integrator `diffraction_shader`."""
 
 from __future__ import annotations
 
@@ -52,20 +52,20 @@ and show the direct light of a path tracer with fresnel="schlick", without the B
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """What a scene needs before it is rendered: its lights, and per surface the shader and a table for each light."""
+    """The lights of a scene and, for each surface, its shader with one table per light."""
 
     lights: list[Light]
     surfaces: list[tuple[Surface, Shader, list[SpectralWeights]]]
 
 
 def define() -> type:
-    """The plugin's class for the variant in force: its base class belongs to that variant."""
+    """The plugin class for the current variant, to which its base class belongs."""
 
     class DiffractionShader(mi.SamplingIntegrator):
         __doc__ = MANUAL
 
         def __init__(self, props: mi.Properties) -> None:
-            # As in `DiffractionGrating`: what may fail comes before Mitsuba registers the object.
+            # As in `DiffractionGrating`: anything that may fail precedes the registration of the object by Mitsuba.
             self.variant = props.get("variant", "flss")
             if self.variant not in VARIANTS:
                 raise RequestError(f"variant: got {self.variant!r}, wanted one of {', '.join(VARIANTS)}")
@@ -82,15 +82,15 @@ def define() -> type:
             self.prepared: Prepared | None = None
 
         def take(self, quirks: Quirks) -> None:
-            """Has other quirks from the next `prepare` on; textures that are there are kept."""
+            """Sets the quirks for the next `prepare`; existing textures are kept."""
             self.quirks = quirks
             self._shaders = [(grating, shader.with_quirks(quirks)) for grating, shader in self._shaders]
 
         def prepare(self, scene: mi.Scene) -> Prepared:
-            """Reads the lights and the gratings of a scene, for all that follows.
+            """Reads the lights and the gratings of a scene.
 
             Raises:
-                ValueError: if the shader cannot show them.
+                ValueError: if the shader does not support them.
             """
             lights = lights_of(scene)
             surfaces = []
@@ -121,8 +121,8 @@ def define() -> type:
             medium: mi.Medium | None = None,
             active: mi.Bool = True,
         ) -> tuple[mi.Spectrum, mi.Bool, list[mi.Float]]:
-            # Where numbers are arrays this runs once a picture: lights and materials may have changed since the last.
-            # (An override of `render` that calls Mitsuba's would leave Mitsuba's handler of Ctrl-C in force for ever.)
+            # In vectorised variants this runs once per picture: lights and materials may have changed since the last.
+            # (Overriding `render` and calling that of Mitsuba would leave its Ctrl-C handler installed.)
             if dr.is_jit_v(mi.Float):
                 self.prepare(scene)
             rgb, radiance, active = self.shade(scene, ray, active)
@@ -132,11 +132,11 @@ def define() -> type:
         def shade(
             self, scene: mi.Scene, ray: mi.RayDifferential3f, active: mi.Bool = True
         ) -> tuple[mi.Color3f, mi.UnpolarizedSpectrum, mi.Bool]:
-            """What a ray sees.
+            """Shades the surface hit by a ray.
 
             Returns:
-                The gratings' light as the shader has it, linear sRGB; that of all other BSDFs, per nm at the ray's
-                wavelengths; and whether something was hit.
+                Linear sRGB of gratings from the shader; radiance of all other BSDFs, per nm at the wavelengths of the
+                ray; and whether a surface was hit.
             """
             prepared = self.prepared or self.prepare(scene)
             si = scene.ray_intersect(ray, active)
@@ -193,7 +193,7 @@ def define() -> type:
 
 
 def _settings(variant: str) -> tuple[str, ...]:
-    """The parameters that a variant of the shader has beyond those of all."""
+    """The parameters specific to a variant of the shader."""
     return {"pq": ("terms", "interpolation"), "gem": ("spacing", "roughness")}.get(variant, ("terms",))
 
 

@@ -1,4 +1,4 @@
-"""The lights that a real-time shader knows: parallel light, and points."""
+"""The lights supported by a real-time shader: directional and point lights."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .tristimulus import wavelengths
 
 
 def spectrum_of(evaluate: Callable[[mi.SurfaceInteraction3f], mi.UnpolarizedSpectrum]) -> NDArray[np.float64]:
-    """What a function of a SurfaceInteraction3f that holds wavelengths gives, at `tristimulus.wavelengths`: (401,)."""
+    """A spectral function of a SurfaceInteraction3f, evaluated at `tristimulus.wavelengths`: (401,)."""
     nanometres, channels = wavelengths(), len(mi.UnpolarizedSpectrum(0))
     groups = np.resize(nanometres, (-(-nanometres.size // channels), channels))
     found = []
@@ -29,9 +29,8 @@ class Light:
     """A directional or point emitter of a scene.
 
     Attributes:
-        emitter: Mitsuba's.
-        spectrum: (401,) at `tristimulus.wavelengths`: irradiance across the light per nm, for a point at the
-            distance one.
+        emitter: the Mitsuba emitter.
+        spectrum: (401,) at `tristimulus.wavelengths`: normal irradiance per nm, for point lights at distance one.
     """
 
     KINDS = ("DirectionalEmitter", "PointLight")
@@ -39,7 +38,7 @@ class Light:
     def __init__(self, emitter: mi.Emitter) -> None:
         self.emitter = emitter
         self.at_point = emitter.class_name() == "PointLight"
-        # One unit of length beside a point; parallel light is the same everywhere.
+        # At distance one from a point light; directional light is uniform.
         place = mi.Point3f(mi.traverse(emitter)["position"]) if self.at_point else mi.Point3f(0)
 
         def irradiance(si: mi.SurfaceInteraction3f) -> mi.UnpolarizedSpectrum:
@@ -52,14 +51,14 @@ class Light:
     def sample(
         self, si: mi.SurfaceInteraction3f, active: mi.Bool
     ) -> tuple[mi.DirectionSample3f, mi.Float, mi.UnpolarizedSpectrum]:
-        """Where the light is, by what `spectrum` is to be multiplied, and the irradiance at the ray's wavelengths."""
+        """Direction of the light, the factor of `spectrum`, and the irradiance at the wavelengths of the ray."""
         ds, value = self.emitter.sample_direction(si, mi.Point2f(0.5), active)
         falloff = dr.rcp(dr.square(ds.dist)) if self.at_point else mi.Float(1)
         return ds, falloff, mi.unpolarized_spectrum(value)
 
 
 def lights_of(scene: mi.Scene) -> list[Light]:
-    """The directional and point lights of a scene; others are left out.
+    """The directional and point lights of a scene; others are ignored.
 
     Raises:
         ValueError: if there is none.

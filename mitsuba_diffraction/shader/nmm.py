@@ -1,4 +1,4 @@
-"""NMM: only the wavelengths that a grating sends this way."""
+"""NMM: only the wavelengths that satisfy the grating equation."""
 
 from __future__ import annotations
 
@@ -14,31 +14,31 @@ from .gain import Gain
 from .spectral_weights import SpectralWeights
 from .tristimulus import LONGEST, SHORTEST
 
-_FAR = 4.0  # σ_f; e^{−4²} of a line's power is 1e-7
+_FAR = 4.0  # σ_f, at which the power of a line has fallen to e^{−4²} = 1e-7
 
 
 class NMM(FLSS):
     """The (N_min, N_max) approach (thesis of 2014, section 4.5).
 
-    A grating of period d sends only the wavelengths λ_n = d u/n into a direction, n = N_min … N_max with
-    N_min = d u/λ_max and N_max = d u/λ_min. The thesis lists them along u and along v and does not say how the two are
-    joined; here n counts along the axis with the larger |d_j u_j|, d the period of the tile, and the window sees the
-    orders of the other axis. Order zero, (u, v) = (0, 0), holds every wavelength: it is summed as in FLSS, the texel
-    of order zero alone.
+    A grating of period d diffracts only the wavelengths λ_n = d u/n into a direction, n = N_min … N_max with
+    N_min = d u/λ_max and N_max = d u/λ_min. The thesis enumerates them along u and along v without specifying how to
+    combine the two; here n runs along the axis with the larger |d_j u_j|, where d is the period of the tile, and the
+    window covers the orders of the other axis. Order zero, (u, v) = (0, 0), contains all wavelengths: it is summed as
+    in FLSS, with the texel of order zero only.
 
-    Corrected, each wavelength stands for the area of its line. Along λ the window's power is a Gaussian in
-    s = 1/λ about the point s* next to the order, at the distance p:
+    When corrected, each wavelength represents the area of its line. Along λ the power of the window is a Gaussian in
+    s = 1/λ about the point s* closest to the order, at the distance p:
 
         ∫ φ² dλ = e^{−p²/σ_f²} √π σ_f λ_n²/|(u, v)|,
 
-    where λ_n²/|u| = d · dλ/dn is the Jacobian that the thesis leaves out, so that violet is too strong.
+    where λ_n²/|u| = d · dλ/dn is the Jacobian that the thesis omits, which makes violet too strong.
     """
 
     own_quirks = (*FLSS.own_quirks, "no_jacobian")
 
     @property
     def texel_reads(self) -> int:
-        """At |u| = 2, the most that there is."""
+        """At |u| = 2, the maximum."""
         longest = max(self.tile_size)
         most = np.floor(2e3 * longest / SHORTEST) - np.ceil(2e3 * longest / LONGEST) + 1
         return round(self.textures.terms * (self.wavelength_count + most * self.texels_per_term))
@@ -54,14 +54,14 @@ class NMM(FLSS):
         last = mi.Int32(dr.floor(path / SHORTEST))
 
         def share(n: mi.Int32) -> tuple[mi.Float, mi.Float]:
-            """λ_n in nm, and |P|² times the width in nm that it stands for."""
+            """λ_n in nm, and |P|² times the width in nm that it represents."""
             wavelength = path / mi.Float(n)
             x, y = self.position(gain, wavelength * 1e-3)
             if self.quirks.no_jacobian:
                 window, width = self.window(x, y), mi.Float(self.step)
             else:
-                # p is the distance at right angles to (u, v). Other orders of the main axis have wavelengths of their
-                # own and must not be counted twice.
+                # p is the distance perpendicular to (u, v). Other orders of the main axis have their own wavelengths
+                # and must not be counted twice.
                 window = self._own_line(x, y, along_x, dr.abs(dr.select(along_x, gain.u, gain.v)) / slope)
                 width = float(np.sqrt(np.pi)) * self.sigma * dr.square(wavelength) * 1e-3 / slope
             power = self.windowed(gain, x, y, wavelength * 1e-3, height_scale, window, gain.active, REACH)
@@ -72,7 +72,7 @@ class NMM(FLSS):
     def _own_line(
         self, x: mi.Float, y: mi.Float, along_x: mi.Bool, tilt: mi.Float
     ) -> Callable[[mi.Int32, mi.Int32], mi.Float]:
-        """φ with p for the distance, for the texels whose order along the main axis is the nearest."""
+        """φ at the distance p, for the texels whose order along the main axis is the closest."""
         phi = self.window(x, y, dr.select(along_x, 0, tilt), dr.select(along_x, tilt, 0))
         main = dr.round(dr.select(along_x, x, y))
 

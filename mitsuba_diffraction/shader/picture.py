@@ -1,4 +1,4 @@
-"""From the shader's linear RGB to what a screen shows, and on to light that a film can record."""
+"""Display encoding of the linear RGB of the shader, and spectra that represent the displayed colour."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from .tristimulus import EMISSION, primary_spectra
 
 
 def encode(rgb: mi.Color3f, power_gamma: bool) -> mi.Color3f:
-    """Linear RGB to the numbers of a screen: the power 1/2.2, or sRGB's transfer function (IEC 61966-2-1)."""
+    """Linear RGB to display values: a power of 1/2.2, or the transfer function of sRGB (IEC 61966-2-1)."""
     rgb = dr.maximum(rgb, 0)
     if power_gamma:
         return dr.power(rgb, 1 / 2.2)
@@ -19,12 +19,12 @@ def encode(rgb: mi.Color3f, power_gamma: bool) -> mi.Color3f:
 
 
 def decode(encoded: mi.Color3f) -> mi.Color3f:
-    """The light, linear sRGB, that an sRGB screen gives for the numbers."""
+    """The linear sRGB that an sRGB display emits for these values."""
     return dr.select(encoded <= 0.04045, encoded / 12.92, dr.power((encoded + 0.055) / 1.055, 2.4))
 
 
 class Emission:
-    """Light of a given linear sRGB, as a spectrum: Σ_c RGB_c b_c(λ), b_c as in `tristimulus.primary_spectra`."""
+    """A spectrum of given linear sRGB: Σ_c RGB_c b_c(λ), with b_c from `tristimulus.primary_spectra`."""
 
     def __init__(self) -> None:
         spectra = primary_spectra()

@@ -20,17 +20,17 @@ INTERPOLATIONS = ("sinc", "linear")
 class PQ(TextureShader):
     """The PQ factors (thesis of 2014, sections 3.2.1 and 3.2.2, algorithm 4.5; "P" and "Q" are tiles along x and y).
 
-    The surface is P × Q tiles and nothing around them. With A the transform of one tile, over its number of pixels,
+    The surface consists of P × Q tiles only. With A the transform of one tile, divided by its number of pixels,
 
         |P(q; κ)|² = |A(q; κ)|² · |Σ_{n<P} e^{−2πi n q_x T_x}|² |Σ_{n<Q} e^{−2πi n q_y T_y}|²/(PQ)²,
 
-    one for a flat mirror. A between the texels comes from interpolation: linear (2 × 2 texels), or with the kernel
+    one for a flat mirror. A is interpolated between texels: linearly (2 × 2 texels), or with the kernel
 
         D(t/N; N)/N = sin(πt)/(N sin(πt/N)),     t = q_j T_j − m_j,
 
-    of a tile of N pixels, which over all texels is exact and is sinc(t) for large N. The published neighbourhood is
-    3 × 3. x = 0 is the middle of the tile, so that the kernel has no phase. Frequencies beyond the Nyquist limit do not
-    exist. The thesis sums n = 0 … N, that is N + 1 tiles (eq. 3.33).
+    of a tile of N pixels, which is exact if summed over all texels and tends to sinc(t) for large N. The published
+    neighbourhood is 3 × 3. The origin is the centre of the tile, so that the kernel is real. Frequencies beyond the
+    Nyquist limit are zero. The thesis sums n = 0 … N, i.e. N + 1 tiles (eq. 3.33).
     """
 
     own_quirks = (*TextureShader.own_quirks, "wrong_product")
@@ -49,9 +49,9 @@ class PQ(TextureShader):
         """As TextureShader, and:
 
         Args:
-            tiles: (P, Q); by default as many as the coherence length covers.
+            tiles: (P, Q); default: as many as the coherence length covers.
             interpolation: "sinc" or "linear".
-            reach: of the sinc kernel, texels to each side.
+            reach: of the sinc kernel, in texels on each side.
         """
         super().__init__(height_field, quirks, **settings)
         if interpolation not in INTERPOLATIONS:
@@ -88,7 +88,7 @@ class PQ(TextureShader):
         return dr.select(active, tile * tiling_power(x, y, self.tiles, self.quirks.wrong_product), 0)
 
     def _kernel(self, x: mi.Float, y: mi.Float) -> Callable[[mi.Int32, mi.Int32], mi.Float]:
-        """What the texel m contributes at the position (x, y)."""
+        """The weight of texel m at the position (x, y)."""
         counts = self.textures.columns, self.textures.rows
 
         def linear(m_x: mi.Int32, m_y: mi.Int32) -> mi.Float:

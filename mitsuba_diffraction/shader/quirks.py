@@ -1,4 +1,4 @@
-"""What the published shader does otherwise than the physics asks for, each a switch of its own."""
+"""The quirks of the published shader: deviations from the physics, each of which can be toggled."""
 
 from __future__ import annotations
 
@@ -9,27 +9,27 @@ from ..errors import RequestError
 
 @dataclass(frozen=True)
 class Quirks:
-    """Each attribute is true "as published" and false "corrected"; equations are those of the thesis of 2014.
+    """True means "as published", false "corrected"; equations are those of the thesis of 2014.
 
     Attributes:
-        fresnel_squared: F² with Schlick's F, which is a power already (eq. 3.4, 3.10); corrected: F.
-        fixed_index: F is that of an index of 1.5 whatever the material is; corrected: R at normal incidence is given.
-        window_pi: the Gaussian window has the height π (eq. 3.30); corrected: 1, so that a flat mirror gives one.
-        complex_window_sum: |Σ φ F|², the average ⟨·⟩ over places is dropped; corrected: Σ φ² |F|².
-        floor_anchor: the neighbourhood is centred at ⌊·⌋ of the position among the texels (algorithm 4.3, lines 12 and
-            13); corrected: at the nearest texel.
-        heights_from_zero: the heights run from 0 to their range (algorithm 4.1); corrected: about the middle, which
-            needs half of the Taylor terms and loses fewer digits.
-        no_jacobian: NMM adds up its wavelengths without dλ/dn; corrected: each stands for the area of its line.
-        wrong_product: PQ's imaginary part of a product is p₁p₂ + q₁q₂ (eq. 3.48); corrected: p₁q₂ + q₁p₂.
-        d65_light: the light is D65, whatever the scene says; corrected: the spectrum of the light.
-        relative: the radiance is relative to a flat mirror, which drops R₀ S(0)/λ² (eq. 3.7); corrected: radiance.
-        d65_twice: XYZ, weighted with D65 already, is multiplied by D65's white point (eq. 4.10); corrected: once.
-        cie_rgb_matrix: XYZ becomes CIE RGB and is shown as if it were sRGB (eq. 4.9); corrected: sRGB.
-        power_gamma: the picture is encoded with a power of 1/2.2; corrected: with sRGB's transfer function.
-        constant_blend: a surface below is blended in with a constant weight (algorithm 4.4, whose test |F| > 1 no
-            reflectance meets); corrected: it gets what the surface lets through, (1 − R_i)(1 − R_o).
-        infrared_rainbow: GEM's rainbow spans 0.5 to 1 µm; corrected: 0.38 to 0.78 µm.
+        fresnel_squared: F² with Schlick's F, which is already a power reflectance (eq. 3.4, 3.10); corrected: F.
+        fixed_index: F is that of an index of 1.5 for any material; corrected: R at normal incidence of the material.
+        window_pi: the Gaussian window has the height π (eq. 3.30); corrected: 1, which gives one for a flat mirror.
+        complex_window_sum: |Σ φ F|² without the spatial average ⟨·⟩; corrected: Σ φ² |F|².
+        floor_anchor: the neighbourhood is centred at ⌊·⌋ of the texel position (algorithm 4.3, lines 12 and 13);
+            corrected: at the nearest texel.
+        heights_from_zero: heights are measured from the lowest point (algorithm 4.1); corrected: from the centre of
+            their range, which halves the number of Taylor terms and the loss of digits.
+        no_jacobian: NMM sums its wavelengths without dλ/dn; corrected: each represents the area of its line.
+        wrong_product: the imaginary part of a product in PQ is p₁p₂ + q₁q₂ (eq. 3.48); corrected: p₁q₂ + q₁p₂.
+        d65_light: the light is D65; corrected: the spectrum of the light in the scene.
+        relative: radiance is relative to a flat mirror, which omits R₀ S(0)/λ² (eq. 3.7); corrected: radiance.
+        d65_twice: XYZ, already weighted by D65, is multiplied by the white point of D65 (eq. 4.10); corrected: once.
+        cie_rgb_matrix: XYZ is converted to CIE RGB but displayed as sRGB (eq. 4.9); corrected: sRGB.
+        power_gamma: the picture is encoded with a power of 1/2.2; corrected: the transfer function of sRGB.
+        constant_blend: the layer below is blended with a constant weight (algorithm 4.4, whose test |F| > 1 is never
+            true); corrected: weighted by the transmittance (1 − R_i)(1 − R_o).
+        infrared_rainbow: the rainbow of GEM spans 0.5 to 1 µm; corrected: 0.38 to 0.78 µm.
     """
 
     fresnel_squared: bool
@@ -55,7 +55,7 @@ class Quirks:
 
     @classmethod
     def names(cls) -> tuple[str, ...]:
-        """The names of the switches."""
+        """The names of all quirks."""
         return tuple(field.name for field in fields(cls))
 
     @classmethod

@@ -1,4 +1,4 @@
-"""Colour weights at run time: what the light of one wavelength adds to XYZ."""
+"""Colour weights at run time: the contribution of each wavelength to XYZ."""
 
 from __future__ import annotations
 
@@ -26,15 +26,14 @@ class SpectralWeights:
     ) -> None:
         """Builds the table.
 
-        With the light's spectrum E(λ), an irradiance per nm, and a relative radiance ρ(λ) the colour is
-        ∫ ρ E (x̄, ȳ, z̄) dλ / ∫ȳ dλ. A radiance instead of a relative one has the factor R₀ S(0)/λ², S(0) being the
-        density of a flat surface at q = 0.
+        For the irradiance E(λ) per nm and the relative radiance ρ(λ), the colour is ∫ ρ E (x̄, ȳ, z̄) dλ / ∫ȳ dλ.
+        Absolute radiance has the additional factor R₀ S(0)/λ², where S(0) is the density of a flat surface at q = 0.
 
         Args:
-            quirks: `fixed_index`, `d65_light` and `relative` decide.
+            quirks: `fixed_index`, `d65_light` and `relative` apply.
             peak: S(0) of a flat surface, µm².
-            r_0: the power reflectance at normal incidence, one number or (401,) at `tristimulus.wavelengths`.
-            light: the spectrum of the light, (401,); D65 with Y = 1 if there is none.
+            r_0: power reflectance at normal incidence, one number or (401,) at `tristimulus.wavelengths`.
+            light: spectrum of the light, (401,); default: D65 with Y = 1.
         """
         weights = d65_weights() if light is None else light_weights(light)
         self.luminance = 1.0 if light is None else _luminance(light)
@@ -47,7 +46,7 @@ class SpectralWeights:
         self.table = PacketTable(np.concatenate([weights, r_0[:, None]], axis=1))
 
     def __call__(self, wavelength: mi.Float, active: mi.Bool) -> tuple[mi.Color3f, mi.Float]:
-        """(X, Y, Z) per nm, and R₀, at a wavelength in nm; zero outside of 380 to 780 nm."""
+        """(X, Y, Z) per nm, and R₀, at a wavelength in nm; zero outside 380 to 780 nm."""
         active = active & (wavelength >= SHORTEST - 1e-3) & (wavelength <= LONGEST + 1e-3)
         place = dr.clip(wavelength - SHORTEST, 0, LONGEST - SHORTEST)
         index = mi.UInt32(dr.minimum(place, LONGEST - SHORTEST - 1))

@@ -1,4 +1,4 @@
-"""The gratings of a scene, with the heights that the shader needs."""
+"""The gratings of a scene and their height fields."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..bsdf.base import Base
+from ..bsdf.nesting import contains_grating, nested
 from ..errors import RequestError
 from ..surface.heightfield import HeightField
 
@@ -42,10 +43,10 @@ class ShadedGrating(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """One side of a BSDF of the scene that is a grating.
+    """One side of a grating in a scene.
 
     Attributes:
-        bsdf: as shapes hold it, the grating or a `twosided` around it.
+        bsdf: the BSDF of the shape, the grating or a `twosided` around it.
         grating: the `diffraction_grating` itself.
         side: 1 for the front, −1 for the back.
     """
@@ -55,7 +56,7 @@ class Surface:
     side: int
 
     def is_of(self, bsdf: mi.BSDF) -> mi.Bool:
-        """Whether a point of the scene has the BSDF of this surface."""
+        """Whether a point has the BSDF of this surface."""
         return bsdf == mi.BSDFPtr(self.bsdf) if dr.is_jit_v(mi.Float) else mi.Bool(bsdf is self.bsdf)
 
     def holds(self, bsdf: mi.BSDF, wo: mi.Vector3f) -> mi.Bool:
@@ -67,7 +68,7 @@ def surfaces_of(scene: mi.Scene) -> list[Surface]:
     """All gratings of a scene.
 
     Raises:
-        ValueError: if a grating stands inside another BSDF than `twosided`.
+        ValueError: if a grating is nested in a BSDF other than `twosided`.
     """
     found: list[Surface] = []
     seen: list[mi.BSDF] = []
@@ -79,32 +80,13 @@ def surfaces_of(scene: mi.Scene) -> list[Surface]:
         if isinstance(bsdf, ShadedGrating):
             found.append(Surface(bsdf, bsdf, 1))
             continue
-        parts = _children(bsdf)
+        parts = nested(bsdf)
         if bsdf.class_name() == "TwoSidedBRDF":
             sides = ((parts[0], 1), (parts[-1], -1))
             found += [Surface(bsdf, part, side) for part, side in sides if isinstance(part, ShadedGrating)]
-        elif any(map(_contains_grating, parts)):
+        elif any(map(contains_grating, parts)):
             raise RequestError(
                 f"diffraction_shader: a diffraction_grating stands inside {bsdf.class_name()}, wanted on a shape or "
                 "inside twosided"
             )
     return found
-
-
-def _contains_grating(bsdf: mi.BSDF) -> bool:
-    return isinstance(bsdf, ShadedGrating) or any(map(_contains_grating, _children(bsdf)))
-
-
-def _children(bsdf: mi.BSDF) -> list[mi.BSDF]:
-    class Children(mi.TraversalCallback):
-        def __init__(self) -> None:
-            mi.TraversalCallback.__init__(self)
-            self.found: list[mi.BSDF] = []
-
-        def put(self, name: str, value: object, *rest: object) -> None:
-            if isinstance(value, mi.BSDF):
-                self.found.append(value)
-
-    callback = Children()
-    bsdf.traverse(callback)
-    return callback.found

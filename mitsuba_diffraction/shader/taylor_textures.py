@@ -1,4 +1,4 @@
-"""The Fourier transforms of the powers of a height field, which the shader keeps as textures (algorithm 4.1)."""
+"""The Fourier transforms of the powers of a height field, stored as textures (algorithm 4.1)."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ class TaylorTextures:
 
         F_m(κ) = Σ_n (iκH)ⁿ/n! · F{tⁿ}(m),     n < N.
 
-    |t| ≤ 1 keeps every texel within one. The thesis transforms e^{ikwh}, kw = −κ, with the other sign in the exponent,
+    |t| ≤ 1 bounds the texels by one. The thesis transforms e^{ikwh}, kw = −κ, with the opposite sign in the exponent,
     which gives the complex conjugate of F_m and the same power.
 
     Attributes:
-        texels: (N_y, N_x, N) complex64; frequency zero stands at (N_y // 2, N_x // 2) (eq. 4.3).
+        texels: (N_y, N_x, N) complex64; frequency zero is at (N_y // 2, N_x // 2) (eq. 4.3).
         height: H in µm.
         tile_size: (T_x, T_y) in µm.
     """
@@ -48,12 +48,12 @@ class TaylorTextures:
 
         Args:
             height_field: the tile.
-            terms: N; what they leave out is at most (κH)^N/N!.
-            heights_from_zero: measure heights from the lowest point, H the whole range, instead of from the middle.
-            origin: where x = 0 is, the first pixel or the middle of the tile. It turns the phases of F_m.
+            terms: N; the truncation error is at most (κH)^N/N!.
+            heights_from_zero: measure heights from the lowest point (H is the full range) instead of the centre.
+            origin: x = 0 at the first pixel or at the centre of the tile, which affects the phase of F_m.
 
         Raises:
-            ValueError: if there are no terms, or the origin is unknown.
+            ValueError: if there are no terms or the origin is unknown.
         """
         if isinstance(terms, bool) or not isinstance(terms, int) or terms < 1:
             raise RequestError(f"terms: got {terms!r}, wanted a whole number ≥ 1")
@@ -80,5 +80,5 @@ class TaylorTextures:
 
     @property
     def orders(self) -> tuple[int, int]:
-        """(N_x, N_y), the number of texels along x and y."""
+        """(N_x, N_y), the numbers of texels along x and y."""
         return self.texels.shape[1], self.texels.shape[0]

@@ -1,4 +1,4 @@
-"""The innermost loops of the shader: Taylor terms of one texel, and weighted sums over texels."""
+"""The inner loops of the shader: Taylor series of a texel, and weighted sums over texels."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .taylor_textures import TaylorTextures
 
 
 class TextureSum:
-    """Reads of Taylor textures; every term of every texel is one read of a complex number."""
+    """Sums over Taylor textures; each term of each texel is one read of a complex number."""
 
     def __init__(self, textures: TaylorTextures) -> None:
         self.columns, self.rows = textures.orders
@@ -24,7 +24,7 @@ class TextureSum:
     def amplitude(
         self, m_x: mi.Int32, m_y: mi.Int32, kappa: mi.Float, active: mi.Bool
     ) -> tuple[mi.Float, mi.Float, mi.Bool]:
-        """Real and imaginary part of F_m(κ) = Σ_n (iκH)ⁿ/n! F{tⁿ}(m), and whether the data hold that order."""
+        """Real and imaginary part of F_m(κ) = Σ_n (iκH)ⁿ/n! F{tⁿ}(m), and whether the order lies in the texture."""
         column, row = m_x + self.columns // 2, m_y + self.rows // 2
         held = active & (column >= 0) & (column < self.columns) & (row >= 0) & (row < self.rows)
         first = mi.UInt32(dr.select(held, (row * self.columns + column) * self.terms, 0))
@@ -43,10 +43,10 @@ class TextureSum:
 
         Args:
             first: the texel of lowest order along x and y.
-            size: how many texels along x and y.
+            size: numbers of texels along x and y.
             kappa: κ in rad/µm.
             weight: φ of the orders (m_x, m_y).
-            active: where to sum.
+            active: mask.
         """
         return _rectangle(self, mi.Int32(first[0]), mi.Int32(first[1]), size[0], size[1], kappa, weight, active)
 

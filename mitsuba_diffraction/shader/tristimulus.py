@@ -1,4 +1,4 @@
-"""The shader's colour: what one nanometre of light adds to XYZ, the way to RGB, and from RGB back to a spectrum."""
+"""Colour in the shader: spectral weights for XYZ, conversion to RGB, and spectra of RGB colours."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from ..wavelengths import VISIBLE
 SHORTEST, LONGEST, PUBLISHED_STEP = 380.0, 780.0, 5.0  # nm: 81 wavelengths
 
 CIE_RGB = np.array([[0.41847, -0.15866, -0.082835], [-0.091169, 0.25243, 0.015708], [0.00092090, -0.0025498, 0.17860]])
-"""XYZ → CIE RGB of 1931 (Smith and Guild 1931), eq. 4.9 of the thesis. The rows add up to 0.177."""
+"""XYZ → CIE RGB of 1931 (Smith and Guild 1931), eq. 4.9 of the thesis. Rows sum to 0.177."""
 
 FLAT = 106.857
-"""∫ȳ dλ in nm: a flat spectrum of one has Y = 1, as everywhere in this project (`color`)."""
+"""∫ȳ dλ in nm: a constant spectrum of one has Y = 1, as in `color`."""
 
 
 def wavelengths() -> NDArray[np.float64]:
-    """The nodes of the tables below, one per nm: (401,), nm."""
+    """The nodes of the tables below, 1 nm apart: (401,), nm."""
     return np.arange(SHORTEST, LONGEST + 0.5)
 
 
@@ -36,9 +36,9 @@ def matching_functions() -> NDArray[np.float64]:
 
 @lru_cache(maxsize=1)
 def d65_weights() -> NDArray[np.float64]:
-    """S(λ) (x̄, ȳ, z̄) of the illuminant D65 (CIE 15:2018), (401, 3) per nm: ∫ gives its white point, Y = 1.
+    """S(λ) (x̄, ȳ, z̄) of the illuminant D65 (CIE 15:2018), (401, 3) per nm.
 
-    The integral is the shader's own, a trapezoid of 5 nm.
+    Normalised to Y = 1 for the integral of the shader, the trapezoidal rule at 5 nm.
     """
     weights = daylight(wavelengths())[:, None] * matching_functions()
     return weights / np.trapezoid(weights[:: int(PUBLISHED_STEP), 1], dx=PUBLISHED_STEP)
@@ -50,7 +50,7 @@ def light_weights(spectrum: ArrayLike) -> NDArray[np.float64]:
 
 
 def d65_white() -> NDArray[np.float64]:
-    """XYZ of D65 by the shader's own integral, Y = 1: (3,)."""
+    """XYZ of D65 by the integral of the shader, Y = 1: (3,)."""
     return np.trapezoid(d65_weights()[:: int(PUBLISHED_STEP)], dx=PUBLISHED_STEP, axis=0)
 
 
@@ -68,10 +68,10 @@ EMISSION = np.arange(VISIBLE[0], VISIBLE[1] + 0.5, 5.0)
 
 @lru_cache(maxsize=1)
 def primary_spectra() -> NDArray[np.float64]:
-    """Spectra b_c(λ) of the primaries of sRGB at `EMISSION`, linear in between: (95, 3).
+    """Spectra b_c(λ) of the sRGB primaries at `EMISSION`, piecewise linear: (95, 3).
 
-    Light with the spectrum Σ_c RGB_c b_c(λ) has the colour RGB. b_c is the spectrum of least power among those that
-    are nowhere negative; as smooth as that, it costs a renderer that draws wavelengths the least noise.
+    The spectrum Σ_c RGB_c b_c(λ) has the colour RGB. b_c is the non-negative spectrum of least power, whose smoothness
+    keeps the noise of wavelength sampling low.
     """
     import colour
 
@@ -85,7 +85,7 @@ def primary_spectra() -> NDArray[np.float64]:
     rest = np.zeros(EMISSION.size)
     spectra = [lsq_linear(system, np.concatenate([1e4 * target, rest]), bounds=(0, np.inf)).x for target in primaries.T]
     result = np.stack(spectra, axis=1)
-    # The compromise with least power is off by a little.
+    # Removes the small colour error due to the least-power term.
     result = result @ np.linalg.solve(to_xyz @ result, primaries)
     result.setflags(write=False)
     return result

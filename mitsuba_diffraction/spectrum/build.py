@@ -11,7 +11,10 @@ from numpy.typing import NDArray
 
 from ..coherence import SUN_COHERENCE_LENGTH, lobe_reach, lobe_width
 from ..errors import RequestError
+from ..files import cache_folder
 from ..reference import check_extent
+from ..rigorous.build import build_spectrum
+from ..rigorous.spectrum import RigorousSpectrum
 from ..surface.heightfield import HeightField
 from ..wavelengths import VISIBLE
 from ..welch import carried_coherence_length
@@ -50,11 +53,14 @@ def precompute(
     wavelengths: tuple[float, float] = VISIBLE,
     largest_angle: float = 90.0,
     representation: str = "auto",
-    tolerance: float = 1e-3,
+    tolerance: float | None = None,
     largest_height_range: float = 20.0,
     progress: Progress | None = None,
-) -> GratingSpectrum:
-    """The spectrum of the phase e^{iκh}, its error at most `tolerance`.
+    theory: str = "scalar",
+    int_ior: complex | None = None,
+    material: str | None = None,
+) -> GratingSpectrum | RigorousSpectrum:
+    """The spectrum of the phase e^{iκh}, or the table of rigorous efficiencies, its error at most `tolerance`.
 
     Args:
         height_field: the surface.
@@ -65,10 +71,14 @@ def precompute(
             frequencies.
         representation: "taylor", "chebyshev", "svd" or "slices"; "auto" takes the one that reads the fewest
             packets of four numbers: slices.
-        tolerance: bound of max over κ of ∫|S_approx(q; κ) − S_exact(q; κ)| dq, a share of the reflected power.
+        tolerance: bound of max over κ of ∫|S_approx(q; κ) − S_exact(q; κ)| dq, a share of the reflected power; 1e-3
+            unless told otherwise. Of rigorous theory: see `rigorous.build.build_spectrum`, 1e-2.
         largest_height_range: in µm; a deeper surface is refused, as one whose heights are in nm. Time and memory grow
             with the height range.
         progress: called with (steps done, steps in all).
+        theory: "scalar", or "rigorous": Maxwell's equations, for a tile of one row and one material only. An
+            interrupted build goes on from what it left in the cache folder.
+        int_ior, material: of rigorous theory, index of refraction of a dielectric, or a conductor by Mitsuba's name.
 
     Returns:
         The spectrum; its `error` is what was measured, at values of κ that were not used to build it.
@@ -84,6 +94,27 @@ def precompute(
     """
     check_extent(extent)
     check_wavelengths(wavelengths)
+    if theory not in ("scalar", "rigorous"):
+        raise RequestError(f"theory: got {theory!r}, wanted scalar or rigorous")
+    if theory == "rigorous":
+        if (extent, largest_angle, representation) != ("tile", 90.0, "auto"):
+            raise RequestError(
+                f"theory: got rigorous with extent {extent!r}, largest_angle {largest_angle!r} and representation "
+                f"{representation!r}; it has its own table of a tile, for all directions"
+            )
+        return build_spectrum(
+            height_field,
+            int_ior=int_ior,
+            material=material,
+            coherence_length=coherence_length,
+            wavelengths=wavelengths,
+            tolerance=1e-2 if tolerance is None else tolerance,
+            progress=progress,
+            checkpoints=cache_folder(),
+        )
+    if int_ior is not None or material is not None:
+        raise RequestError("int_ior, material: the spectrum of scalar theory is that of every material; wanted neither")
+    tolerance = 1e-3 if tolerance is None else tolerance
     check_angle(largest_angle)
     lobe_width(coherence_length)
     if representation not in REPRESENTATIONS:

@@ -42,7 +42,7 @@ FORMAT_VERSION = 3
 
 
 @contextlib.contextmanager
-def _silence() -> Iterator[None]:
+def silence() -> Iterator[None]:
     """Keep the library from giving its own account of a broken file, from Python and from C, before it raises."""
     sys.stderr.flush()
     kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
@@ -113,7 +113,7 @@ def load(path: str | os.PathLike[str], construct: Callable[..., Spectrum], recip
         if intact is False:
             # Before OpenEXR sees it: a size that is wrong could take all memory.
             raise RequestError("damaged: its bytes are not those that were written")
-        with _silence():
+        with silence():
             file = OpenEXR.File(str(path), separate_channels=True)
             header, channels = file.header(), file.channels()
     except Exception as error:

@@ -1,0 +1,1 @@
+"""The Mitsuba plugin `diffraction_path`. Everything in this folder needs Mitsuba."""

@@ -1,0 +1,140 @@
+"""The class behind `<integrator type="diffraction_path">`."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from ..errors import RequestError
+from . import eye_paths
+from .gratings import Gratings
+from .light_paths import LightPaths
+
+MANUAL = """A path tracer that also finds the light that gratings throw onto other surfaces.
+
+Parameters (XML or dictionary):
+    max_depth, rr_depth (integer): as in `path` (−1, 5).
+
+The picture converges to that of `path` with the same parameters. A path tracer meets a small or distant light by way of
+a grating only by chance, so that what gratings throw onto a wall is white specks. Those paths are traced from the light
+here, and all others from the eye.
+
+With L a light, G a vertex on a surface whose BSDF is or holds a `diffraction_grating` (whichever component of it
+scatters: both sides of `twosided`, all of a blend, the base), X a vertex on any other surface, and E the eye, the paths
+
+    L G⁺ X (G | X)* E
+
+are traced from the light if the vertex next to E scatters otherwise than as a perfect mirror or refraction does. So
+
+    L G E, L G G E              from the eye: gratings alone, seen directly
+    L G X E, L G G X E          from the light: what they throw onto a wall
+    L G X X E, L G X G E        from the light: that wall lights another one, or is seen in a grating
+    L G M X E                   from the light, M a mirror or a pane of glass
+    L G X M E                   from the eye: that wall seen in a mirror, which cannot be connected to the eye
+    L X G X E, L M G X E        from the eye: light that met another surface before the grating
+
+Points on gratings are drawn by area, a light is drawn from there, one of four such pairs is taken in proportion to what
+it receives, and the path goes on by `sample` of the BSDFs, with the correction for shading normals; each vertex after
+the first X is connected to the sensor. There is one path from the light for four samples of the film. As in `path`, a
+light without extent is not seen in a mirror: it is left out where the grating next to it scatters by a delta component.
+
+Without a grating, with max_depth below 3, in polarised variants, and for sensors that points cannot be connected to
+(all but `perspective` and `thinlens`), this is `path`. Instances and curves count as X. Where Mitsuba asks for single
+rays, as inside of `aov`, all paths are traced from the eye.
+"""
+
+
+def define() -> type:
+    """The plugin's class for the variant in force: its base class belongs to that variant."""
+    eye_class = eye_paths.define()
+
+    class DiffractionPath(mi.SamplingIntegrator):
+        __doc__ = MANUAL
+
+        def __init__(self, props: mi.Properties) -> None:
+            mi.SamplingIntegrator.__init__(self, props)
+            self.max_depth, self.rr_depth = props.get("max_depth", -1), props.get("rr_depth", 5)
+            if props.get("hide_emitters", False):
+                raise RequestError("hide_emitters: got true, wanted false: diffraction_path shows all lights")
+            self.path = mi.load_dict({"type": "path", "max_depth": self.max_depth, "rr_depth": self.rr_depth})
+
+        def parts(self, scene: mi.Scene, sensor: mi.Sensor) -> tuple[mi.SamplingIntegrator, LightPaths | None]:
+            """What traces from the eye, and what traces from the light; None where there are no such paths.
+
+            Raises:
+                ValueError: if the film takes samples beyond its edge.
+            """
+            if 0 <= self.max_depth < 3 or mi.is_polarized or not _connects(sensor):
+                return self.path, None
+            gratings = Gratings(scene)
+            if not gratings.shapes or not scene.emitters():
+                return self.path, None
+            film = sensor.film()
+            if film.sample_border() and film.rfilter().border_size() > 0:
+                raise RequestError(
+                    "sample_border: got true, wanted false: points beyond the film's edge cannot be connected to it"
+                )
+            light = LightPaths(scene, sensor, gratings, self.max_depth, self.rr_depth)
+            return eye_class(gratings, self.max_depth, self.rr_depth), light
+
+        def sample(
+            self,
+            scene: mi.Scene,
+            sampler: mi.Sampler,
+            ray: mi.RayDifferential3f,
+            medium: mi.Medium | None = None,
+            active: mi.Bool = True,
+        ) -> tuple[mi.Spectrum, mi.Bool, list[mi.Float]]:
+            # Along one ray, with no film at hand, all light is traced from the eye.
+            return self.path.sample(scene, sampler, ray, medium, active)
+
+        def render(
+            self,
+            scene: mi.Scene,
+            sensor: mi.Sensor | int = 0,
+            seed: int = 0,
+            spp: int = 0,
+            develop: bool = True,
+            evaluate: bool = True,
+        ) -> mi.TensorXf:
+            if isinstance(sensor, int):
+                sensor = scene.sensors()[sensor]
+            eye, light = self.parts(scene, sensor)
+            if light is None:
+                return eye.render(scene, sensor, seed, spp, develop, evaluate)
+            eye.render(scene, sensor, seed, spp, False, evaluate)
+            film = sensor.film()
+            # Scaled by the samples that the film is divided by.
+            spp = sensor.sampler().sample_count()
+            block = film.create_block()
+            corner = mi.Vector2f(film.crop_offset())
+            for splats in light.splats(seed, light.count(spp)):
+                put(film, block, splats.position + corner, splats.wavelengths, splats.value * spp)
+            film.put_block(block)
+            return film.develop() if develop else mi.TensorXf()
+
+        def to_string(self) -> str:
+            return f"DiffractionPath[\n  max_depth = {self.max_depth},\n  rr_depth = {self.rr_depth}\n]"
+
+    return DiffractionPath
+
+
+def put(
+    film: mi.Film, block: mi.ImageBlock, position: mi.Point2f, wavelengths: mi.Spectrum, value: mi.Spectrum
+) -> None:
+    """Adds to a block without adding to its weight."""
+    if mi.has_flag(film.flags(), mi.FilmFlags.Special):
+        block.put(position, film.prepare_sample(value, wavelengths, block.channel_count(), 0.0, 0.0))
+    else:
+        block.put(position, wavelengths, value, 0.0, 0.0)
+
+
+def _connects(sensor: mi.Sensor) -> bool:
+    """Whether points of the scene can be connected to a sensor: to `perspective` and `thinlens`."""
+    try:
+        sensor.sample_direction(dr.zeros(mi.SurfaceInteraction3f), mi.Point2f(0.5))
+    except RuntimeError as error:
+        if "not implemented" not in str(error):
+            raise
+        return False
+    return True

@@ -1,0 +1,325 @@
+"""From a height field to the table of its rigorous efficiencies, with a measured error."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import warnings
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..coherence import SUN_COHERENCE_LENGTH, lobe_width
+from ..errors import RequestError
+from ..files import whole_file
+from ..surface.heightfield import HeightField
+from .axes import Axes
+from .blas import one_thread
+from .coordinate_transformation import Grating, light_from, scatter
+from .curve import curve_of
+from .efficiencies import efficiencies
+from .materials import refractive_index
+from .spectrum import RigorousSpectrum
+
+Real = NDArray[np.float64]
+Progress = Callable[[int, int], None]
+
+# Steps to a unit that are solved, one after the other until the error is kept.
+_SOLVED = (8, 16, 32)
+# Steps to a unit that are stored, to each that is solved, by cubic polynomials: linear look-ups need more nodes.
+_STORED = 2
+PLANES = 17
+# Wavelengths that are solved, by the least g λ / T (the cosine of the cone angle) of these: metals in light along the
+# grooves show narrow lines that move with the wavelength.
+_CONES = ((0.45, 17), (0.7, 9), (1.0, 5))
+# An order at exactly grazing exit has no Rayleigh wave.
+_OFF = 1e-8
+_NEAR = 0.02
+_CHECKS = 200
+# Light at which the harmonics are chosen: near the normal, and oblique from both sides.
+_HARD = ((0.1, 0, 1), (0.8, 0.3, 0.5), (-0.8, 0.3, 0.5))
+_BUILD_VERSION = 1
+
+
+def build_spectrum(
+    height_field: HeightField,
+    *,
+    int_ior: complex | None = None,
+    material: str | None = None,
+    coherence_length: float = SUN_COHERENCE_LENGTH,
+    wavelengths: tuple[float, float] = (360.0, 830.0),
+    tolerance: float = 1e-2,
+    progress: Progress | None = None,
+    checkpoints: Path | None = None,
+) -> RigorousSpectrum:
+    """The table of a surface of one row.
+
+    Args:
+        height_field: the surface; rows that differ are refused.
+        int_ior: index of refraction of a dielectric, or n + ik.
+        material: or a conductor by Mitsuba's name.
+        coherence_length: L_c in µm.
+        wavelengths: (shortest, longest) in nm.
+        tolerance: bound of `RigorousSpectrum.error`, the mean of Σ|Δη_m| / Σ η_m over directions and wavelengths.
+        progress: called with (steps done, steps in all).
+        checkpoints: a folder for what is done so far; an interrupted build goes on from there.
+
+    Raises:
+        ValueError: if an argument is out of range.
+
+    Warns:
+        UserWarning: if the finest table errs by more than `tolerance`; its `error` says by how much.
+    """
+    if not 1e-4 <= tolerance < 1:
+        raise RequestError(f"tolerance: got {tolerance!r}, wanted a share of the reflected light from 1e-4 to 1")
+    lobe_width(coherence_length)
+    with one_thread():
+        surface = _Surface(height_field, (wavelengths[0] * 1e-3, wavelengths[1] * 1e-3), int_ior, material, tolerance)
+        checks = surface.checks()
+        for solved in _SOLVED:
+            axes = Axes(surface.period, surface.wavelengths, _STORED * solved, PLANES)
+            values = _Table(surface, axes, solved).values(progress or (lambda done, total: None), checkpoints)
+            spectrum = RigorousSpectrum(
+                axes=axes,
+                values=values,
+                material=material or "",
+                int_ior=0 if int_ior is None else complex(int_ior),
+                coherence_length=float(coherence_length),
+                tolerance=float(tolerance),
+                harmonics=surface.harmonics,
+                source=height_field.source,
+                source_digest=height_field.digest,
+                **_errors(axes, values, checks),
+            )
+            if spectrum.error <= tolerance:
+                return spectrum
+    warnings.warn(
+        f"rigorous table: got a mean error of {spectrum.error:.2g} with {_SOLVED[-1]} steps to a unit, wanted at most "
+        f"{tolerance:.2g}",
+        stacklevel=2,
+    )
+    return spectrum
+
+
+class _Surface:
+    """A surface and its material, ready to be solved.
+
+    Attributes:
+        harmonics: N, enough for a tenth of the tolerance at the shortest wavelength.
+    """
+
+    def __init__(
+        self,
+        height_field: HeightField,
+        wavelengths: tuple[float, float],
+        int_ior: complex | None,
+        material: str | None,
+        tolerance: float,
+    ) -> None:
+        self.period = height_field.tile_size[0]
+        self.wavelengths = wavelengths
+        self.index = lambda wavelength: refractive_index(wavelength, int_ior=int_ior, material=material)
+        curve = curve_of(height_field)
+        self.harmonics = max(self._harmonics(height_field, d, tolerance / 10) for d in _HARD)
+        self.grating = Grating(curve, self.harmonics)
+        # What the table is compared with is solved with more.
+        self.finer = Grating(curve, int(1.4 * self.harmonics))
+        self.digest = hashlib.sha256(
+            repr((height_field.digest, wavelengths, int_ior, material, self.harmonics, _BUILD_VERSION)).encode()
+        ).hexdigest()
+
+    def _harmonics(self, height_field: HeightField, direction: tuple[float, ...], tolerance: float) -> int:
+        """The fewest harmonics that are right to the tolerance, at the shortest wavelength."""
+        wavelength = self.wavelengths[0]
+        material = {"int_ior": self.index(wavelength)}
+        exact = efficiencies(height_field, direction, wavelength, tolerance=tolerance / 2, **material)
+        count = int(np.ceil(self.period / wavelength)) + 4
+        while count < exact.harmonics:
+            found = efficiencies(height_field, direction, wavelength, harmonics=count, **material)
+            if np.abs(found.unpolarised - exact.unpolarised).sum() <= tolerance * exact.unpolarised.sum():
+                break
+            count = int(np.ceil(1.1 * count))
+        return count
+
+    def solve(
+        self, alpha: float, g: float, wavelengths: Iterable[float], grating: Grating | None = None
+    ) -> tuple[NDArray[np.int64], Real]:
+        """m of the orders, and η of unpolarised light, (wavelengths, orders), for k_x = α and g (times period/2π)."""
+        grating = grating or self.grating
+        light = light_from(grating, alpha, g**2)
+        found = []
+        for wavelength in wavelengths:
+            k_y = np.sqrt(max((self.period / wavelength) ** 2 - g**2, 0))
+            solved = scatter(grating, light, k_y, self.index(wavelength))
+            found.append((np.abs(solved.reflected) ** 2).sum(axis=(1, 2)) / 2)
+        return -solved.orders, np.array(found)
+
+    def checks(self) -> list[tuple[float, float, float, NDArray[np.int64], Real]]:
+        """α, g, λ, m and η_m at random places: directions uniform over the hemisphere, wavelengths over their range."""
+        rng = np.random.default_rng(0)
+        checks = []
+        for cosine, turn, share in rng.random((_CHECKS, 3)):
+            wavelength = self.wavelengths[0] + share * (self.wavelengths[1] - self.wavelengths[0])
+            k = np.sqrt(1 - cosine**2) * self.period / wavelength
+            alpha, k_y = k * np.cos(2 * np.pi * turn), k * np.sin(2 * np.pi * turn)
+            g = np.sqrt((self.period / wavelength) ** 2 - k_y**2)
+            m, eta = self.solve(alpha, g, [wavelength], self.finer)
+            checks.append((alpha, g, wavelength, m, eta[0]))
+        return checks
+
+
+def _errors(axes: Axes, values: NDArray[np.float32], checks: list) -> dict[str, float]:
+    """`error`, `worst` and `worst_near` of a table."""
+    table = RigorousSpectrum(axes, values, "", 1, SUN_COHERENCE_LENGTH, 0.1, 0, 0, 0, 0, "", "")
+    error, near = [], []
+    for alpha, g, wavelength, m, eta in checks:
+        found = table.evaluate(m, alpha - m / 2, g, wavelength)
+        error.append(np.abs(found - eta).sum() / eta.sum())
+        near.append(min(abs(x - round(x)) for x in (g + alpha, g - alpha)) < _NEAR)
+    error, near = np.array(error), np.array(near)
+    return {
+        "error": float(error.mean()),
+        "worst": float(error[~near].max(initial=0)),
+        "worst_near": float(error[near].max(initial=0)),
+    }
+
+
+class _Table:
+    """A lattice of light to be solved, and the way from there to the nodes of `Axes`.
+
+    Light from (p, r) = (g + α, g − α) has order m at P = p − max(m, 0), R = r + min(m, 0): whole units away, so that
+    one lattice serves all orders.
+    """
+
+    def __init__(self, surface: _Surface, axes: Axes, steps: int) -> None:
+        self.surface, self.axes, self.steps = surface, axes, steps
+        self.lattice = Axes(axes.period, axes.wavelengths, steps, axes.planes)
+        count = self.lattice.side(0)
+        nodes = self.lattice.nodes_at(count)
+        self.p = np.where(np.arange(count) % steps, nodes, nodes + _OFF)
+
+    def values(self, progress: Progress, checkpoints: Path | None) -> NDArray[np.float32]:
+        """(K, nodes), as `RigorousSpectrum` has them."""
+        rows = _Checkpoint(checkpoints, f"{self.surface.digest}-{self.steps}")
+        left = [row for row in range(1, len(self.p)) if row not in rows.done]
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            try:
+                for row, solved in zip(left, pool.map(self._row, left), strict=True):
+                    rows.add(row, solved)
+                    progress(len(rows.done), len(self.p) - 1)
+            except BaseException:
+                pool.shutdown(cancel_futures=True)
+                rows.write()
+                raise
+        values = self._stored(rows.done)
+        rows.remove()
+        return values
+
+    def _row(self, row: int) -> NDArray[np.float32]:
+        """η of all light with this p: (r, orders −M … M, K); NaN where an order does not propagate."""
+        largest, planes = self.axes.largest, self.axes.planes
+        found = np.full((len(self.p), 2 * largest + 1, planes), np.nan, np.float32)
+        # The units that the table reaches, whole, for polynomials across them.
+        unit = (row - 1) // self.steps
+        reached = range(1, min(len(self.p), (self.lattice.units(0) - unit) * self.steps + 1))
+        for column in reached:
+            p, r = self.p[row], self.p[column]
+            g = (p + r) / 2
+            first, last = self.axes.range(g)
+            count = 1
+            if last > first:
+                cone = g * self.axes.wavelengths[0] / self.axes.period
+                count = next((count for limit, count in _CONES if cone < limit), _CONES[-1][1])
+            at, weights = _chebyshev(count, planes)
+            m, eta = self.surface.solve((p - r) / 2, g, first + at * (last - first))
+            kept = np.abs(m) <= largest
+            found[column, m[kept] + largest] = (weights @ eta[:, kept]).T
+        return found
+
+    def _stored(self, rows: dict[int, NDArray[np.float32]]) -> NDArray[np.float32]:
+        """What was solved, the mean of light and reversed light, at the nodes that are stored."""
+        axes, steps, largest = self.axes, self.steps, self.axes.largest
+        values = np.zeros((axes.planes, axes.nodes), np.float32)
+        for m in range(-largest, largest + 1):
+            side, solved = axes.side(m), self.lattice.side(m)
+            eta = np.full((solved, solved, axes.planes), np.nan)
+            for row, found in rows.items():
+                p = row - max(m, 0) * steps
+                # A node at the end of two units was solved just inside the one where the order travels.
+                if 0 < p < solved:
+                    part = found[-min(m, 0) * steps :, m + largest][:solved]
+                    eta[p, 1 : len(part)] = part[1:]
+            # At grazing exit or incidence all is mirrored.
+            eta[0], eta[:, 0] = float(m == 0), float(m == 0)
+            reversed_ = eta.transpose(1, 0, 2)
+            both = np.where(np.isnan(eta), reversed_, np.where(np.isnan(reversed_), eta, (eta + reversed_) / 2))
+            both = np.nan_to_num(both)  # units that light does not reach
+            refine = _cubic(axes.units(m), steps, axes.steps)
+            block = np.einsum("ai,bj,ijk->kab", refine, refine, both, optimize=True)
+            values[:, axes.offset(m) : axes.offset(m) + side**2] = block.reshape(axes.planes, -1)
+        return values
+
+
+def _chebyshev(count: int, planes: int) -> tuple[Real, Real]:
+    """Chebyshev–Lobatto points in 0 … 1, (count,), and the weights (planes, count) of their values at equal steps."""
+    if count == 1:
+        return np.zeros(1), np.ones((planes, 1))
+    at = (1 - np.cos(np.pi * np.arange(count) / (count - 1))) / 2
+    return at, _lagrange(np.linspace(0, 1, planes), at)
+
+
+def _lagrange(x: Real, nodes: Real) -> Real:
+    """(x, nodes): weights of values at the nodes in the polynomial through them."""
+    ratio = np.ones((len(x), len(nodes)))
+    for j, node in enumerate(nodes):
+        others = np.delete(nodes, j)
+        ratio[:, j] = np.prod((x[:, None] - others) / (node - others), axis=1)
+    return ratio
+
+
+def _cubic(units: int, steps: int, finer: int) -> Real:
+    """(finer nodes, nodes): cubic interpolation between nodes, of each unit by its own."""
+    matrix = np.zeros((units * finer + 1, units * steps + 1))
+    for unit in range(units):
+        for fine in range(finer + 1):
+            x = fine * steps / finer
+            low = int(np.clip(np.floor(x) - 1, 0, steps - 3))
+            row = matrix[unit * finer + fine]
+            row[:] = 0
+            row[unit * steps + low : unit * steps + low + 4] = _lagrange(np.array([x]), np.arange(low, low + 4.0))[0]
+    return matrix
+
+
+class _Checkpoint:
+    """Rows that are done, in memory and, now and then, in a file of that name."""
+
+    def __init__(self, folder: Path | None, name: str) -> None:
+        self.path = folder / f"rigorous-{name}.npz" if folder else None
+        self.done: dict[int, NDArray[np.float32]] = {}
+        self._unwritten = 0
+        if self.path and self.path.is_file():
+            try:
+                with np.load(self.path) as file:
+                    self.done = {int(row): file[row] for row in file.files}
+            except (OSError, ValueError, EOFError, KeyError):
+                self.path.unlink(missing_ok=True)
+
+    def add(self, row: int, values: NDArray[np.float32]) -> None:
+        self.done[row] = values
+        self._unwritten += 1
+        if self._unwritten >= 8:
+            self.write()
+
+    def write(self) -> None:
+        if self.path:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            with whole_file(self.path) as temporary, open(temporary, "wb") as file:
+                np.savez(file, **{str(row): values for row, values in self.done.items()})
+        self._unwritten = 0
+
+    def remove(self) -> None:
+        if self.path:
+            self.path.unlink(missing_ok=True)

@@ -1,0 +1,47 @@
+"""Refractive indices n + ik, as Mitsuba's `conductor` has them."""
+
+from __future__ import annotations
+
+import functools
+from importlib import metadata
+from numbers import Complex
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import RequestError
+
+
+def refractive_index(wavelength: float, *, int_ior: complex | None = None, material: str | None = None) -> complex:
+    """n + ik of what lies below a surface.
+
+    Args:
+        wavelength: µm, in vacuum.
+        int_ior: of a dielectric, or n + ik.
+        material: a conductor by Mitsuba's name ("Al", "Au", …): the tables that come with Mitsuba, linear between their
+            wavelengths and constant beyond them, are read without loading it.
+
+    Raises:
+        ValueError: if not exactly one of `int_ior` and `material` is given, or it is unknown or out of range.
+    """
+    if (int_ior is None) == (material is None):
+        raise RequestError(f"int_ior, material: got {int_ior!r}, {material!r}, wanted one of the two")
+    if material is None:
+        number = complex(int_ior) if isinstance(int_ior, Complex) and not isinstance(int_ior, bool) else complex("nan")
+        if not (0.01 <= abs(number) <= 100 and number.real >= 0 and number.imag >= 0):
+            raise RequestError(f"int_ior: got {int_ior!r}, wanted a refractive index, a number or n + ik with k ≥ 0")
+        return number
+    wavelengths, n, k = _table(material)
+    return complex(np.interp(wavelength, wavelengths, n), np.interp(wavelength, wavelengths, k))
+
+
+@functools.cache
+def _table(material: str) -> tuple[NDArray[np.float64], ...]:
+    """Wavelengths in µm, n and k there."""
+    folder = Path(str(metadata.distribution("mitsuba").locate_file("mitsuba/data/ior")))
+    known = sorted(path.name.removesuffix(".eta.spd") for path in folder.glob("*.eta.spd"))
+    if material not in known:
+        raise RequestError(f"material: got {material!r}, wanted one of {', '.join(known) or 'none: no tables found'}")
+    (nm, n), (nm_k, k) = (np.loadtxt(folder / f"{material}.{part}.spd").T for part in ("eta", "k"))
+    return nm * 1e-3, n, np.interp(nm, nm_k, k)

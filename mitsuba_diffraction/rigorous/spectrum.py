@@ -1,0 +1,123 @@
+"""Rigorous efficiencies of a grating as a table over direction and wavelength."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..coherence import lobe_width
+from ..errors import RequestError
+from .axes import Axes, split
+from .file import load, save
+
+Real = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class RigorousSpectrum:
+    """η_m of unpolarised light, over `Axes`, and what else a BSDF needs: f = Σ_m η_m N(q − m/T; σ_q² I) / λ².
+
+    Attributes:
+        axes: what the table stands over.
+        values: (K, nodes) float32, η at the nodes of `axes`; of order m, side² values from offset(m), [P, R].
+        material: a conductor by Mitsuba's name, or "" for a dielectric.
+        int_ior: n + ik if there is no material.
+        coherence_length: L_c in µm; it sets the width σ_q of each order.
+        tolerance: what was asked for.
+        error: what was measured at directions (uniform over the hemisphere) and wavelengths that were not used to build
+            the table: the mean of Σ|Δη_m| / Σ η_m.
+        worst: the largest of these, away from the lines where an order passes off (P or R within 0.02 of an integer).
+        worst_near: the largest of these near such a line.
+        harmonics: N of the solver.
+        source: where the heights came from.
+        source_digest: SHA-256 of the height field.
+    """
+
+    axes: Axes
+    values: NDArray[np.float32]
+    material: str
+    int_ior: complex
+    coherence_length: float
+    tolerance: float
+    error: float
+    worst: float
+    worst_near: float
+    harmonics: int
+    source: str
+    source_digest: str = field(repr=False)
+
+    def __post_init__(self) -> None:
+        wanted = self.axes.planes, self.axes.nodes
+        if self.values.shape != wanted or self.values.dtype != np.float32:
+            raise RequestError(f"values: got {self.values.shape} of {self.values.dtype}, wanted {wanted} of float32")
+        lobe_width(self.coherence_length)
+
+    @property
+    def megabytes(self) -> float:
+        """Size of the table in memory."""
+        return self.values.nbytes / 1e6
+
+    @property
+    def lobe_width(self) -> float:
+        """σ_q in cycles/µm."""
+        return lobe_width(self.coherence_length)
+
+    def evaluate(self, m: ArrayLike, c: ArrayLike, g: ArrayLike, wavelength: ArrayLike) -> Real:
+        """η_m from the table, linear between its nodes.
+
+        Args:
+            m: orders, broadcast against the others.
+            c, g: as in `Axes`.
+            wavelength: µm.
+
+        Returns:
+            η_m; 0 for an order that does not propagate, or that is beyond the wavelengths of the table.
+        """
+        m, c, g, wavelength = np.broadcast_arrays(np.asarray(m, np.int64), c, g, wavelength)
+        axes, half = self.axes, np.abs(m) / 2
+        p, r = g + c - half, g - c - half
+        there = (p > 0) & (r > 0) & (p + r + 2 * half <= axes.reach * (1 + 1e-9))
+        p, r, order = (np.where(there, v, 0) for v in (p, r, m))
+        known = np.arange(-axes.largest, axes.largest + 1)
+        side = np.array([axes.side(k) for k in known])[order + axes.largest]
+        offset = np.array([axes.offset(k) for k in known])[order + axes.largest]
+        first, last = axes.range(g)
+        z = np.clip((wavelength - first) / np.maximum(last - first, 1e-9), 0, 1) * (axes.planes - 1)
+        result = np.zeros(m.shape)
+        places = [split(axes.position(p), side), split(axes.position(r), side), split(z, axes.planes)]
+        for corner in np.ndindex(2, 2, 2):
+            (i, j, k), weights = zip(
+                *((low + up, f if up else 1 - f) for (low, f), up in zip(places, corner, strict=True)), strict=True
+            )
+            result += np.prod(weights, axis=0) * self.values[k, offset + i * side + j]
+        return np.where(there, result, 0)
+
+    def efficiencies(self, direction: ArrayLike, wavelength: float) -> tuple[NDArray[np.int64], Real]:
+        """The orders that propagate, ascending, and η_m of unpolarised light, as `rigorous.efficiencies` has them.
+
+        Args:
+            direction: ω_i, (3,), to the light.
+            wavelength: µm.
+        """
+        omega = np.asarray(direction, np.float64) / np.linalg.norm(direction)
+        alpha, k_y = -omega[:2] * self.axes.period / wavelength
+        g = np.sqrt((self.axes.period / wavelength) ** 2 - k_y**2)
+        m = np.arange(-self.axes.largest, self.axes.largest + 1)
+        m = m[np.abs(alpha - m) < g]
+        return m, self.evaluate(m, alpha - m / 2, g, wavelength)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the spectrum as an OpenEXR file, whole or not at all."""
+        save(self, path)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> RigorousSpectrum:
+        """Read a spectrum that `save` wrote.
+
+        Raises:
+            ValueError: if the file is not a rigorous spectrum, or is damaged.
+        """
+        return load(path, cls)

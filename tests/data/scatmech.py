@@ -1,0 +1,46 @@
+"""Makes scatmech.json: efficiencies by NIST's coupled-wave solver, `python tests/data/scatmech.py > scatmech.json`.
+
+Needs pySCATMECH 0.1.10, which is compiled when it is installed; a few minutes. Incidence is conical, 35° from the
+normal and turned by 50°; the wavelength is 0.55 µm, the period 1 µm, the depth 0.2 µm.
+"""
+
+import json
+import os
+import sys
+
+import numpy as np
+
+PROFILES = {
+    "sinusoidal": ("Sinusoidal_Relief_Grating", {"amplitude": 0.2, "option": 0, "base": 0, "nlevels": 150}),
+    "triangular": ("Triangular_Grating", {"amplitude": 0.2, "aspect": 0.8, "nlevels": 150}),
+    "lamellar": ("Single_Line_Grating", {"height": 0.2, "topwidth": 0.4, "bottomwidth": 0.4, "nlevels": 1}),
+}
+CASES = (("sinusoidal", 1.5, 0, 25), ("triangular", 1.5, 0, 25), ("lamellar", 1.5, 0, 60), ("lamellar", 0.8, 6, 150))
+
+
+def case(profile, n, k, harmonics):
+    from pySCATMECH.rcw import RCW_Model
+
+    grating, shape = PROFILES[profile]
+    index = f"({n},{k})"
+    model = RCW_Model(grating=grating)
+    parameters = {"lambda": 0.55, "thetai": 35, "rotation": 50, "order": harmonics, "type": 0}
+    parameters |= {"grating.period": 1, "grating.medium_i": "(1,0)", "grating.medium_t": index}
+    parameters |= {"grating.material": index} | {f"grating.{name}": value for name, value in shape.items()}
+    for name, value in parameters.items():
+        model.setParameters({name: str(value)})
+    found = {}
+    for m in range(-3, 4):
+        efficiency = np.array(model.DiffractionEfficiency(m))[0, 0]
+        if efficiency > 0:
+            found[m] = float(f"{efficiency:.6g}")
+    return {"profile": profile, "index": [n, k], "harmonics": harmonics, "unpolarised": found}
+
+
+if __name__ == "__main__":
+    out, silent = os.dup(1), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(silent, 1), os.dup2(silent, 2)  # it tells of every layer
+    results = [case(*arguments) for arguments in CASES]
+    sys.stdout.flush()
+    os.dup2(out, 1)
+    print(json.dumps(results, indent=1))

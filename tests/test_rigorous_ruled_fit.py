@@ -1,0 +1,47 @@
+"""Ruled gratings as their maker measured them."""
+
+import numpy as np
+import pytest
+
+from mitsuba_diffraction import rigorous
+from mitsuba_diffraction.rigorous import ruled_fit
+
+
+def test_the_profile_has_its_facets_at_right_angles():
+    profile = ruled_fit.right_angled(2.0, 20.0, samples=2000).heights[0]
+    slopes = np.diff(profile) / 1e-3
+    assert slopes[0] == pytest.approx(np.tan(np.deg2rad(20)))
+    assert slopes[0] * slopes[-1] == pytest.approx(-1)
+
+
+@pytest.mark.parametrize("wavelength", [0.4, 0.5, 0.6, 0.7, 0.8])
+def test_aluminium_is_that_of_the_table(wavelength):
+    model, table = ruled_fit.aluminium(wavelength), rigorous.refractive_index(wavelength, material="Al")
+    assert abs(model - table) < 0.05 * abs(table)
+
+
+def test_every_grating_has_its_measurements():
+    for name in ruled_fit.LINES_PER_MM:
+        wavelengths, found = ruled_fit.measured(name)
+        assert len(wavelengths) > 25
+        assert 0.3 < wavelengths[0] < wavelengths[-1] < 1.2
+        assert 0.7 < found.max() < 0.9
+    with pytest.raises(ValueError, match="grating: got 'R1200', wanted one of R150"):
+        ruled_fit.measured("R1200")
+
+
+def test_efficiencies_bend_where_an_order_passes_off():
+    # Orders −1 and 2 in Littrow: at λ/d = 2/3.
+    period = 1000 / 831
+    ratios = np.arange(0.6, 0.74, 0.01)
+    curve = [ruled_fit.littrow(period, 21.0, ratio * period, rigorous=True) for ratio in ratios]
+    kink = ratios[1 + np.argmax(np.abs(np.diff(curve, 2)))]
+    assert abs(kink - 2 / 3) < 0.015
+
+
+@pytest.mark.slow
+def test_rigorous_theory_fits_what_was_measured_where_scalar_theory_does_not():
+    exact, scalar = (ruled_fit.fit("R831", theory) for theory in (True, False))
+    assert exact.rms < 0.02
+    assert scalar.rms > 0.06
+    assert 19 < exact.facet_angle < 23

@@ -1,0 +1,112 @@
+"""The table of rigorous efficiencies against the solver."""
+
+import numpy as np
+import pytest
+
+import mitsuba_diffraction as md
+from mitsuba_diffraction import gratings, rigorous
+from mitsuba_diffraction.rigorous.axes import Axes
+from mitsuba_diffraction.rigorous.build import build_spectrum
+from mitsuba_diffraction.rigorous.spectrum import RigorousSpectrum
+
+SURFACE = gratings.blazed(0.3, 0.05, samples=64)
+REQUEST = {"int_ior": 1.5, "wavelengths": (400.0, 500.0), "tolerance": 0.2, "coherence_length": 40.0}
+
+
+@pytest.fixture(scope="module")
+def spectrum(cache_folder):
+    return build_spectrum(SURFACE, **REQUEST)
+
+
+def hemisphere(count, seed):
+    rng = np.random.default_rng(seed)
+    z, turn = rng.random((2, count))
+    return np.stack([np.sqrt(1 - z**2) * f(2 * np.pi * turn) for f in (np.cos, np.sin)] + [z], axis=-1)
+
+
+def test_the_axes_are_symmetric_and_whole_where_orders_pass_off():
+    axes = Axes(0.9, (0.36, 0.83), 8, 5)
+    assert axes.largest == 4
+    np.testing.assert_allclose(axes.position(axes.nodes_at(17)), np.arange(17), atol=1e-6)
+    assert axes.offset(-4) == 0
+    assert axes.nodes == sum((int(np.ceil(5 - abs(m))) * 8 + 1) ** 2 for m in range(-4, 5))
+
+
+def test_the_table_has_the_efficiencies_of_the_solver(spectrum):
+    errors = []
+    for omega, wavelength in zip(hemisphere(25, 1), np.linspace(0.401, 0.499, 25), strict=True):
+        exact = rigorous.efficiencies(SURFACE, omega, wavelength, int_ior=1.5)
+        m, eta = spectrum.efficiencies(omega, wavelength)
+        np.testing.assert_array_equal(m, exact.orders)
+        errors.append(np.abs(eta - exact.unpolarised).sum() / exact.unpolarised.sum())
+    assert np.mean(errors) < 1.5 * spectrum.error
+    assert spectrum.error <= 0.2
+
+
+def test_the_table_is_reciprocal(spectrum):
+    c, g = np.random.default_rng(2).random((2, 100)) * [[0.3], [0.75]]
+    for m in (-1, 0, 1):
+        there, back = (spectrum.evaluate(m, sign * c, g, 0.45) for sign in (1, -1))
+        np.testing.assert_allclose(there, back, atol=1e-6)
+
+
+def test_grazing_light_is_mirrored(spectrum):
+    m, eta = spectrum.efficiencies((1 - 1e-9, 0, 1e-6), 0.45)
+    assert eta[list(m).index(0)] == pytest.approx(1, abs=1e-3)
+    assert eta.sum() <= 1 + 1e-3
+
+
+def test_a_spectrum_survives_its_file(spectrum, tmp_path):
+    spectrum.save(tmp_path / "table.exr")
+    loaded = RigorousSpectrum.load(tmp_path / "table.exr")
+    np.testing.assert_array_equal(loaded.values, spectrum.values)
+    for name in ("axes", "material", "int_ior", "coherence_length", "error", "harmonics", "source", "source_digest"):
+        assert getattr(loaded, name) == getattr(spectrum, name)
+
+
+def test_a_scalar_spectrum_is_refused(spectrum, tmp_path):
+    md.precompute(SURFACE, tolerance=0.01).save(tmp_path / "scalar.exr")
+    with pytest.raises(ValueError, match="wanted a rigorous spectrum"):
+        RigorousSpectrum.load(tmp_path / "scalar.exr")
+    spectrum.save(tmp_path / "rigorous.exr")
+    with pytest.raises(ValueError, match="not a grating spectrum"):
+        md.GratingSpectrum.load(tmp_path / "rigorous.exr")
+
+
+def test_an_interrupted_build_goes_on(tmp_path):
+    class Enough(Exception):
+        pass
+
+    def stop(done, total):
+        if done == 5:
+            raise Enough
+
+    small = gratings.sinusoidal(0.15, 0.03, samples=32)
+    with pytest.raises(Enough):
+        build_spectrum(small, **REQUEST, progress=stop, checkpoints=tmp_path)
+    assert list(tmp_path.iterdir())
+    steps = []
+    again = build_spectrum(
+        small, **REQUEST, progress=lambda done, total: steps.append((done, total)), checkpoints=tmp_path
+    )
+    assert steps[0][0] > 5
+    assert steps[-1][0] == steps[-1][1]
+    np.testing.assert_array_equal(again.values, build_spectrum(small, **REQUEST).values)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"tolerance": 0}, "tolerance: got 0"),
+        ({"extent": "sample"}, "got rigorous with extent 'sample'"),
+        ({"int_ior": None}, "wanted one of the two"),
+        ({"theory": "exact"}, "theory: got 'exact'"),
+        ({"theory": "scalar"}, "wanted neither"),
+        ({"height_field": gratings.crossed(2.0, 0.2, samples=8)}, "rows that differ"),
+    ],
+)
+def test_what_is_out_of_range_is_refused(change, message):
+    arguments = {"height_field": SURFACE, "theory": "rigorous", "int_ior": 1.5} | change
+    with pytest.raises(ValueError, match=message):
+        md.precompute(**arguments)
