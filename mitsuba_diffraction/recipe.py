@@ -226,7 +226,8 @@ class Recipe:
             path.parent.mkdir(parents=True, exist_ok=True)
             spectrum.save(path, recipe=digest)
         except (RequestError, OSError, RuntimeError) as error:  # RuntimeError is what OpenEXR raises on a full disk
-            reason = getattr(error, "strerror", None) or error
+            # A text: the exception would tie this frame, and the spectrum in it, into a cycle.
+            reason = getattr(error, "strerror", None) or str(error)
             warnings.warn(
                 f"the cache {path.parent} cannot be written to ({reason}); spectra are recomputed each time",
                 CacheWarning,

@@ -22,7 +22,7 @@ from mitsuba_diffraction.variants import choose_variant
 
 HERE = Path(__file__).parent
 DISCS = {"compact_disc", "dvd"}
-SKINS = {"elaphe", "xenopeltis", "morpho_ridges"}
+SKINS = {"elaphe", "elaphe_afm", "xenopeltis", "xenopeltis_afm", "morpho_ridges"}
 METAL = '<string name="material" value="Al"/>'
 SKIN = """<float name="int_ior" value="1.5"/>
     <bsdf type="diffuse" name="base"><rgb name="reflectance" value="0.02, 0.014, 0.01"/></bsdf>"""

@@ -18,7 +18,7 @@ from bsdf_support import use  # isort: skip
 settings.register_profile("tests", deadline=None)
 settings.load_profile("tests")
 
-_DATA = Path(__file__).parents[2] / "shared" / "data"
+MEASURED = Path(__file__).parents[1] / "precompute" / "measured"
 _HEIGHT_RANGE = {"elaphe": 0.375, "xenopeltis": 0.819}
 """µm, black to white."""
 
@@ -43,28 +43,19 @@ def ctrl_c():
 @pytest.fixture
 def scan_file():
     """scan_file(name): the path of a measured scan."""
-
-    def find(name):
-        path = _DATA / f"{name}_afm_100x100.png"
-        if not path.is_file():
-            pytest.skip(f"{path.name} is not part of the repository, and {_DATA} does not hold it")
-        return path
-
-    return find
-
-
-@pytest.fixture
-def scan_folder():
-    """Where the measured scans lie."""
-    if not _DATA.is_dir():
-        pytest.skip(f"{_DATA} is not there")
-    return _DATA
+    return lambda name: MEASURED / f"{name}_afm_100x100.png"
 
 
 @pytest.fixture
 def scan(scan_file):
     """scan(name): the height field of a measured scan."""
     return lambda name: md.read_height_field(scan_file(name), pixel_size=0.0586, height_range=_HEIGHT_RANGE[name])
+
+
+@pytest.fixture(scope="session")
+def panel():
+    """20 µm of Xenopeltis, its missing pixels filled."""
+    return md.read_height_field(MEASURED / "xenopeltis_afm_20um.npz", pixel_size=20 / 370, fill_missing=True)
 
 
 @pytest.fixture

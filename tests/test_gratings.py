@@ -1,7 +1,5 @@
 """Profiles by formula against the analytic orders; synthetic skins against the statistics they promise."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -11,7 +9,6 @@ from scipy.special import jv
 
 from mitsuba_diffraction.surface.gratings import PROFILES, blazed, crossed, elaphe, lamellar, sinusoidal, xenopeltis
 
-DATA = Path(__file__).parents[2] / "shared" / "data"
 PERIOD = 2.5
 """µm"""
 ORDERS = np.arange(-int(PERIOD * 2 / 0.36), int(PERIOD * 2 / 0.36) + 1)
@@ -179,12 +176,9 @@ def standardised(heights, pixel_size):
 
 
 @pytest.mark.parametrize(("name", "period"), [("elaphe", 1.0), ("xenopeltis", 1.40)])
-def test_a_skin_resembles_the_scan(name, period):
-    scan = DATA / f"{name}_afm_100x100.png"
-    if not scan.exists():
-        pytest.skip("needs the AFM patches of ../shared/data")
+def test_a_skin_resembles_the_scan(name, period, scan_file):
     make, _, _, depth = SKINS[name]
-    measured = np.asarray(Image.open(scan).convert("L")) / 255 * depth
+    measured = np.asarray(Image.open(scan_file(name)).convert("L")) / 255 * depth
     synthetic = make(300 * 0.0586, pixel_size=0.0586, period=period).heights
     assert synthetic.std() == pytest.approx(measured.std(), rel=0.3)
     skewness, kurtosis, slope_x, slope_y = standardised(synthetic, 0.0586)

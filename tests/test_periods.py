@@ -246,9 +246,8 @@ def test_a_band_is_told_by_its_centre_and_not_by_its_strongest_bin():
     assert 0.4 < np.sqrt(np.mean(np.square(errors))) < 1.6
 
 
-def test_crops_confirm_the_uncertainty_of_the_fingers(scan_folder):
-    heights = np.load(scan_folder / "xenopeltis_afm_20um.npz")["heights"].astype(float)
-    whole = HeightField(heights, 20 / 370, fill_missing=True)
+def test_crops_confirm_the_uncertainty_of_the_fingers(panel):
+    whole = panel
     rows, band = find_periods(whole)
     assert (rows.period, rows.direction) == pytest.approx((1.550, -89.6), rel=1e-3)
     assert rows.period_uncertainty == pytest.approx(0.023, abs=0.001)

@@ -16,9 +16,10 @@ from ..spectrum.energy_table import SHADOWING
 from ..surface.heightfield import HeightField
 from ..wavelengths import VISIBLE
 from .base import base_from
+from .coat import coat_from
 from .geometry import Geometry
 from .incidence import Incidence
-from .polarisation import reflected
+from .polarisation import reflected, through_layer
 from .reflectance import reflectance_from
 from .shared import SharedTables
 from .surface import surface_from
@@ -46,6 +47,9 @@ PARAMETERS = (
     Parameter("height_scale", "float", "scales the heights", "1"),
     Parameter("shadowing", "string", "v_cavity or none", "v_cavity"),
     Parameter("conserve_energy", "boolean", "false leaves out E, to compare with closed forms", "true"),
+    Parameter("coat_ior", "float or string", "index of a clear plane layer over the grating, as for int_ior", "none"),
+    Parameter("coat_absorption", "float", "of the layer, 1/µm", "0"),
+    Parameter("coat_thickness", "float", "of the layer, µm; it matters only with coat_absorption", "0"),
     Parameter(
         "base",
         "BSDF",
@@ -70,6 +74,10 @@ The BRDF is R · K · G · S(q; κ)/λ² · E: R the power reflectance at the ha
 and κ = 2π (cos θ_i + cos θ_o)/λ. E, as in `energy.py`, bounds the albedo by one; it is one where the albedo is
 below one without it. Without shadowing K diverges as 1/cos θ near the horizon: from 85° on E then falls with cos θ.
 
+Under a coat (`coat.py`) all this holds inside of it, where wavelengths are shorter and directions steeper; the front
+face of the coat is a mirror. A saved spectrum must cover the shorter wavelengths; one built from a recipe or a profile
+does.
+
 In polarised variants light is split into s and p as by a plane across the half vector; a perfect mirror and Schlick's
 formula leave it unpolarised.
 """
@@ -84,8 +92,9 @@ def define() -> type:
         def __init__(self, props: mi.Properties) -> None:
             # Mitsuba registers an object when its base class is initialised, and Dr.Jit then calls it in every scene as
             # long as anything holds it, be it a traceback: all that may fail comes first.
-            self.spectrum, self._recipe = surface_from(props)
-            self.reflectance = reflectance_from(props)
+            self.coat = coat_from(props)
+            self.spectrum, self._recipe = surface_from(props, self.coat)
+            self.reflectance = reflectance_from(props, self.coat)
             self.orientation = _orientation(props)
             height_scale = props.get("height_scale", 1.0)
             if not isinstance(height_scale, int | float):
@@ -109,19 +118,29 @@ def define() -> type:
             flags = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.Anisotropic | mi.BSDFFlags.FrontSide
             if self.orientation.is_spatially_varying():
                 flags = flags | mi.BSDFFlags.SpatiallyVarying
-            # The grating is component 0, those of the base follow.
+            # The grating is component 0; those of the base follow, and the front face of the coat.
             self.m_components = [+flags, *(self.base.components if self.base is not None else [])]
+            self.front = len(self.m_components)
+            if self.coat is not None:
+                self.m_components.append(mi.BSDFFlags.DeltaReflection | mi.BSDFFlags.FrontSide)
             self.m_flags = functools.reduce(operator.or_, self.m_components)
 
         def _update(self) -> None:
             """What depends on parameters that can change."""
             scale = np.max(self.height_scale)
-            largest = VISIBLE[0] / self.spectrum.wavelengths[0]
+            shortest = VISIBLE[0] / (1 if self.coat is None else self.coat.relative)
+            largest = shortest / self.spectrum.wavelengths[0]
+            if self.coat is not None and largest < 1 - 1e-6:
+                raise RequestError(
+                    f"coat_ior: got {self.coat.index:g}, and a spectrum for wavelengths from "
+                    f"{self.spectrum.wavelengths[0]:g} nm; inside the coat they are shorter: build it from "
+                    f"{shortest:.4g} nm"
+                )
             if not 0 <= scale <= largest * (1 + 1e-6):
                 raise RequestError(
                     f"height_scale: got {scale}, wanted 0 to {largest:.4g}: the spectrum was built for "
                     f"wavelengths from {self.spectrum.wavelengths[0]:g} nm; for larger heights build it from "
-                    f"{VISIBLE[0]:g} nm divided by the scale"
+                    f"{shortest:.4g} nm divided by the scale"
                 )
             dr.make_opaque(self.height_scale)
             self.energy = self._tables.energy(self.shadowing, self.height_scale) if self.conserve_energy else None
@@ -146,11 +165,15 @@ def define() -> type:
             self, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool
         ) -> tuple[mi.UnpolarizedSpectrum, mi.Float]:
             """f cos θ_o of the grating, and the density of its own samples, for directions above the surface."""
-            geometry = Geometry(si.wi, wo)
             sin, cos = self._frame(si, active)
             # From here on along the pattern's axes.
-            wi, wo = _turned(si.wi, sin, cos), _turned(wo, sin, cos)
+            wi, wo, outside = _turned(si.wi, sin, cos), _turned(wo, sin, cos), mi.Frame3f.cos_theta(wo)
             u, v = -wi.x - wo.x, -wi.y - wo.y
+            towards = wi
+            if self.coat is not None:
+                wi, wo = self.coat.refracted(wi), self.coat.refracted(wo)
+            index = 1.0 if self.coat is None else self.coat.eta
+            geometry = Geometry(wi, wo)
             # Directions beyond the largest angle are black, but they are drawn: they have a density.
             within = dr.minimum(geometry.cos_i, geometry.cos_o) >= self.least_cosine
             value, density = mi.UnpolarizedSpectrum(0.0), mi.Float(0.0)
@@ -161,20 +184,23 @@ def define() -> type:
                 power, share = self.scattering.evaluate(
                     u * frequency,
                     v * frequency,
-                    -geometry.w * dr.two_pi * frequency * self.height_scale,
-                    Incidence.of(wi, frequency, self.height_scale),
+                    -geometry.w * dr.two_pi * index * frequency * self.height_scale,
+                    Incidence.of(towards, frequency, self.height_scale, self.coat),
                     active & covered[channel],
                 )
                 value[channel] = dr.select(within, power / dr.square(wavelength), 0)
                 density += share / dr.square(wavelength)
             if self.energy is not None:
-                wavelengths = mi.UnpolarizedSpectrum(si.wavelengths) * 1e-3
+                wavelengths = mi.UnpolarizedSpectrum(si.wavelengths) * (1e-3 / index)
                 value = self.energy.conserve(value, wi, wo, wavelengths, active)
             value *= self.reflectance(si, geometry.cos_half(), active) * geometry.factor(self.shadowing == "v_cavity")
             # The mean over the covered wavelengths: any of them may have chosen the direction.
             diffuse = _diffuse_share(count)
             density = diffuse * dr.inv_pi + (1 - diffuse) * density / dr.maximum(count, 1)
-            return value, density * geometry.cos_o
+            if self.coat is not None:
+                # The solid angle inside the coat is smaller: cos θ'_o dω'_o = cos θ_o dω_o/n².
+                value *= outside / geometry.cos_o
+            return value, density * outside
 
         def _mueller(
             self,
@@ -186,13 +212,42 @@ def define() -> type:
         ) -> mi.Spectrum:
             """`value` as light that is split into s and p where the variant and the material know them."""
             index = self.reflectance.index(si, active) if mi.is_polarized else None
+            if self.coat is not None:
+                return self._through_coat(value, index, ctx, si, wo)
             return mi.depolarizer(value) if index is None else reflected(value, index, si.wi, wo, ctx.mode)
+
+        def _through_coat(
+            self,
+            value: mi.UnpolarizedSpectrum,
+            index: list[mi.Complex2f] | None,
+            ctx: mi.BSDFContext,
+            si: mi.SurfaceInteraction3f,
+            wo: mi.Vector3f,
+        ) -> mi.Spectrum:
+            """`value` after both passes through the coat, T_i T_o."""
+            inside = [self.coat.refracted(omega) for omega in (si.wi, wo)]
+            if mi.is_polarized:
+                value *= self.coat.absorption(inside[0].z) * self.coat.absorption(inside[1].z)
+                return through_layer(value, index, self.coat.eta, (si.wi, wo), inside, ctx.mode)
+            for omega, refracted in zip((si.wi, wo), inside, strict=True):
+                value *= self.coat.transmittance(omega.z, refracted.z)
+            return value
 
         def _covered(self, si: mi.SurfaceInteraction3f) -> tuple[list[mi.Bool], mi.Float]:
             """Which of the wavelengths the spectrum covers, and how many: at the others the grating is black."""
-            shortest, longest = (w * (1 + d) for w, d in zip(self.spectrum.wavelengths, (-1e-6, 1e-6), strict=True))
+            index = 1 if self.coat is None else self.coat.relative
+            shortest, longest = (
+                w * index * d for w, d in zip(self.spectrum.wavelengths, (1 - 1e-6, 1 + 1e-6), strict=True)
+            )
             covered = [(wavelength >= shortest) & (wavelength <= longest) for wavelength in si.wavelengths]
             return covered, sum(dr.select(c, mi.Float(1), 0) for c in covered)
+
+        def _entering(self, si: mi.SurfaceInteraction3f, cos: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
+            """1 − R, times T of the coat, at the cosine of an angle outside."""
+            if self.coat is None:
+                return 1 - self.reflectance(si, cos, active)
+            inside = self.coat.cos_inside(cos)
+            return self.coat.transmittance(cos, inside) * (1 - self.reflectance(si, inside, active))
 
         def _lobes(self, ctx: mi.BSDFContext) -> tuple[bool, mi.BSDFContext | None]:
             """Whether `ctx` asks for the grating, and what it asks of the base."""
@@ -203,16 +258,36 @@ def define() -> type:
             self,
             si: mi.SurfaceInteraction3f,
             lobes: tuple[bool, mi.BSDFContext | None],
-            r_i: mi.UnpolarizedSpectrum,
+            entering: mi.UnpolarizedSpectrum,
             active: mi.Bool,
         ) -> mi.Float:
             """The share of samples that the grating gets; that of the base is the rest. About as they reflect."""
             grating, below = lobes
             if not grating or below is None:
                 return mi.Float(1.0 if grating else 0.0)
-            reflected = dr.mean(r_i)
-            returned = (1 - reflected) * self.base.albedo(si, active)
+            entered = dr.mean(entering)
+            reflected = 1 - entered
+            returned = entered * self.base.albedo(si, active)
             return dr.detach(dr.clip(reflected / (reflected + returned), LEAST_SHARE, 1 - LEAST_SHARE))
+
+        def _front_share(
+            self,
+            ctx: mi.BSDFContext,
+            si: mi.SurfaceInteraction3f,
+            lobes: tuple[bool, mi.BSDFContext | None],
+            active: mi.Bool,
+        ) -> mi.Float:
+            """The share of samples that the coat's front face gets, about as it reflects beside all below."""
+            if self.coat is None or not ctx.is_enabled(mi.BSDFFlags.DeltaReflection, self.front):
+                return mi.Float(0.0)
+            grating, below = lobes
+            if not grating and below is None:
+                return mi.Float(1.0)
+            cos = mi.Frame3f.cos_theta(si.wi)
+            reflected = self.reflectance(si, self.coat.cos_inside(cos), active)
+            if below is not None:
+                reflected += (1 - reflected) * self.base.albedo(si, active)
+            return self.coat.share(cos, dr.mean(reflected))
 
         def eval_pdf(
             self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
@@ -225,11 +300,12 @@ def define() -> type:
                 of_grating, pdf = self._grating(si, wo, active)
                 value = self._mueller(of_grating, ctx, si, wo, active)
             if below is not None:
-                r_i, r_o = (self.reflectance(si, cos, active) for cos in (cos_i, cos_o))
-                share = self._share(si, lobes, r_i, active)
+                entering = self._entering(si, cos_i, active)
+                share = self._share(si, lobes, entering, active)
                 of_base, density = self.base.bsdf.eval_pdf(below, si, wo, active)
-                value += _attenuated((1 - r_i) * (1 - r_o), of_base)
+                value += _attenuated(entering * self._entering(si, cos_o, active), of_base)
                 pdf = share * pdf + (1 - share) * density
+            pdf *= 1 - self._front_share(ctx, si, lobes, active)
             return dr.select(active, value, 0), dr.select(active, pdf, 0)
 
         def eval(
@@ -254,12 +330,49 @@ def define() -> type:
             active = active & (cos_i > 0)
             lobes = grating, below = self._lobes(ctx)
             bs = dr.zeros(mi.BSDFSample3f)
-            if not grating and below is None:
+            front_share = self._front_share(ctx, si, lobes, active)
+            of_front = active & (sample1 < front_share)
+            if grating or below is not None:
+                rest = dr.minimum((sample1 - front_share) / (1 - front_share), BELOW_ONE)
+                bs, result = self._sample_below(ctx, si, lobes, 1 - front_share, rest, sample2, active & ~of_front)
+            elif self.coat is not None and ctx.is_enabled(mi.BSDFFlags.DeltaReflection, self.front):
+                result = mi.Spectrum(0.0)
+            else:
                 return bs, mi.Spectrum(0.0)
             bs.eta = 1.0
+            if self.coat is not None:
+                bs.wo = dr.select(of_front, mi.reflect(si.wi), bs.wo)
+                bs.pdf = dr.select(of_front, front_share, bs.pdf)
+                bs.sampled_type = dr.select(of_front, mi.UInt32(+mi.BSDFFlags.DeltaReflection), bs.sampled_type)
+                bs.sampled_component = dr.select(of_front, self.front, bs.sampled_component)
+                mirrored = self._front(si, ctx, active) / dr.select(of_front, front_share, 1)
+                result = dr.select(of_front, mirrored, result)
+            return bs, result
+
+        def _front(self, si: mi.SurfaceInteraction3f, ctx: mi.BSDFContext, active: mi.Bool) -> mi.Spectrum:
+            """F of the coat's front face."""
+            value = mi.UnpolarizedSpectrum(self.coat.reflectance(mi.Frame3f.cos_theta(si.wi)))
+            if not mi.is_polarized:
+                return value
+            return reflected(value, self.coat.indices(), si.wi, mi.reflect(si.wi), ctx.mode)
+
+        def _sample_below(
+            self,
+            ctx: mi.BSDFContext,
+            si: mi.SurfaceInteraction3f,
+            lobes: tuple[bool, mi.BSDFContext | None],
+            part: mi.Float,
+            sample1: mi.Float,
+            sample2: mi.Point2f,
+            active: mi.Bool,
+        ) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
+            """A sample of the grating or its base, which get `part` of all samples."""
+            grating, below = lobes
+            cos_i = mi.Frame3f.cos_theta(si.wi)
+            bs = dr.zeros(mi.BSDFSample3f)
             bs.sampled_type = mi.UInt32(+mi.BSDFFlags.GlossyReflection)
-            r_i = self.reflectance(si, cos_i, active) if below is not None else None
-            share = self._share(si, lobes, r_i, active)
+            entering = self._entering(si, cos_i, active) if below is not None else None
+            share = self._share(si, lobes, entering, active)
             of_base = active & (sample1 >= share)
             if grating:
                 bs.wo = self._draw(si, sample1 / share, sample2, active & (sample1 < share))
@@ -276,9 +389,10 @@ def define() -> type:
             if below is not None and self.base.has_delta:
                 mirror = of_base & mi.has_flag(drawn.sampled_type, mi.BSDFFlags.Delta)
                 cos_o = mi.Frame3f.cos_theta(drawn.wo)
-                through = (1 - r_i) * (1 - self.reflectance(si, cos_o, mirror)) / (1 - share)
+                own = part * (1 - share)
+                through = entering * self._entering(si, cos_o, mirror) / own
                 above = cos_o > 0
-                bs.pdf = dr.select(mirror, dr.select(above, (1 - share) * drawn.pdf, 0), bs.pdf)
+                bs.pdf = dr.select(mirror, dr.select(above, own * drawn.pdf, 0), bs.pdf)
                 result = dr.select(mirror, dr.select(above, _attenuated(through, weight), 0), result)
             return bs, result
 
@@ -297,7 +411,7 @@ def define() -> type:
                 before += dr.select(use, 1, 0)
             wavelength = dr.detach(wavelength) * 1e-3
             sin, cos = (dr.detach(x) for x in self._frame(si, active))
-            incidence = Incidence.of(_turned(si.wi, sin, cos), dr.rcp(wavelength), self.height_scale)
+            incidence = Incidence.of(_turned(si.wi, sin, cos), dr.rcp(wavelength), self.height_scale, self.coat)
             q_x, q_y = self.scattering.sample(incidence, rest, v, active & ~diffuse)
             x = -wavelength * (cos * q_x - sin * q_y) - si.wi.x
             y = -wavelength * (sin * q_x + cos * q_y) - si.wi.y
@@ -325,9 +439,8 @@ def define() -> type:
             return _turned(omega, *self._frame(si, active))
 
         def transmitted(self, si: mi.SurfaceInteraction3f, cos_o: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
-            """(1 − R_i)(1 − R_o): what the surface lets through to the base and back."""
-            r_i, r_o = (self.reflectance(si, cos, active) for cos in (mi.Frame3f.cos_theta(si.wi), cos_o))
-            return (1 - r_i) * (1 - r_o)
+            """(1 − R_i)(1 − R_o): what the surface, and its coat, let through to the base and back."""
+            return self._entering(si, mi.Frame3f.cos_theta(si.wi), active) * self._entering(si, cos_o, active)
 
         def to_string(self) -> str:
             lines = [
@@ -336,6 +449,7 @@ def define() -> type:
                 f"coherence_length = {self.spectrum.coherence_length:g} um",
                 f"representation = {self.spectrum.representation}, {self.spectrum.megabytes:.3g} MB",
                 f"reflectance = {self.reflectance}",
+                *([] if self.coat is None else [f"coat = {self.coat}"]),
                 f"orientation = {self.orientation}",
                 f"height_scale = {self.height_scale}",
                 f"shadowing = {self.shadowing}",

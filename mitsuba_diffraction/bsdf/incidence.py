@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from .coat import Coat
+
 
 # Not frozen: Dr.Jit rebuilds what enters a branch field by field.
 @dataclass(eq=False)
@@ -16,15 +18,26 @@ class Incidence:
     Attributes:
         wi: ω_i along the axes of the pattern.
         frequency: 1/λ in cycles/µm.
-        kappa_per_cosine: 2π/λ in rad/µm, times the scale of the heights.
+        least_kappa: κ of light that leaves along the horizon, rad/µm.
+        kappa_span: by how much κ is larger for light that leaves along the normal, rad/µm.
     """
 
     wi: mi.Vector3f
     frequency: mi.Float
-    kappa_per_cosine: mi.Float
+    least_kappa: mi.Float
+    kappa_span: mi.Float
 
     @classmethod
-    def of(cls, wi: mi.Vector3f, frequency: mi.Float, height_scale: mi.Float) -> Incidence:
-        """Without gradients: directions are drawn, and what is drawn does not follow the parameters."""
+    def of(cls, wi: mi.Vector3f, frequency: mi.Float, height_scale: mi.Float, coat: Coat | None) -> Incidence:
+        """κ = 2π (cos θ_i + cos θ_o)/λ times the scale of the heights; under a coat, with what holds inside of it.
+
+        Without gradients: directions are drawn, and what is drawn does not follow the parameters.
+        """
         kappa_per_cosine = dr.two_pi * frequency * height_scale
-        return cls(*(dr.detach(value) for value in (wi, frequency, kappa_per_cosine)))
+        least, span = kappa_per_cosine * wi.z, kappa_per_cosine
+        if coat is not None:
+            critical = dr.sqrt(1 - dr.rcp(dr.square(coat.eta)))
+            kappa_per_cosine *= coat.relative
+            least = kappa_per_cosine * (coat.refracted(wi).z + critical)
+            span = kappa_per_cosine * (1 - critical)
+        return cls(*(dr.detach(value) for value in (wi, frequency, least, span)))

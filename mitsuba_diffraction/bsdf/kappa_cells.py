@@ -31,8 +31,8 @@ class KappaCells:
 
     def weights(self, incidence: Incidence) -> mi.Vector4f:
         """w_j for one wavelength."""
-        cos_i, step = incidence.wi.z, self.width / incidence.kappa_per_cosine
-        inner = [dr.clip(dr.fma(cell, step, -cos_i), 0, 1) for cell in range(1, CELLS)]
+        first, step = incidence.least_kappa / incidence.kappa_span, self.width / incidence.kappa_span
+        inner = [dr.clip(dr.fma(cell, step, -first), 0, 1) for cell in range(1, CELLS)]
         squares = [0.0, *map(dr.square, inner), 1.0]
         return mi.Vector4f(*(squares[cell + 1] - squares[cell] for cell in range(CELLS)))
 

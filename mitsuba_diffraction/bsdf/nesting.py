@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from ..spectrum import GratingSpectrum
-
 
 def is_grating(bsdf: mi.BSDF) -> bool:
     """Whether a BSDF is of the class behind `diffraction_grating`."""
-    return isinstance(getattr(bsdf, "spectrum", None), GratingSpectrum)
+    return hasattr(bsdf, "spectrum") and hasattr(bsdf, "along_pattern")
 
 
 def contains_grating(bsdf: mi.BSDF) -> bool:

@@ -10,12 +10,13 @@ import numpy as np
 
 from ..errors import RequestError
 from ..wavelengths import VISIBLE
+from .coat import Coat
 
 MODELS = ("exact", "schlick")
 
 
-def reflectance_from(props: mi.Properties) -> PerfectMirror | Dielectric | Conductor:
-    """The material that the parameters `int_ior`, `ext_ior`, `material` and `fresnel` name.
+def reflectance_from(props: mi.Properties, coat: Coat | None) -> PerfectMirror | Dielectric | Conductor:
+    """The material that the parameters `int_ior`, `ext_ior`, `material` and `fresnel` name, seen from inside a coat.
 
     Raises:
         ValueError: if they contradict each other or name something unknown.
@@ -24,13 +25,14 @@ def reflectance_from(props: mi.Properties) -> PerfectMirror | Dielectric | Condu
     if model not in MODELS:
         raise RequestError(f"fresnel: got {model!r}, wanted one of {', '.join(MODELS)}")
     if "material" not in props:
-        return Dielectric(props.get("int_ior", 1.5), props.get("ext_ior", "air"), model)
-    if "int_ior" in props or "ext_ior" in props:
+        outside = props.get("ext_ior", "air")
+        return Dielectric(props.get("int_ior", 1.5), outside if coat is None else coat.index, model)
+    if "int_ior" in props or ("ext_ior" in props and coat is None):
         raise RequestError(
             "material: a conductor or a perfect mirror takes no int_ior or ext_ior; give one or the other"
         )
     material = props["material"]
-    return PerfectMirror() if material == "none" else Conductor(material, model)
+    return PerfectMirror() if material == "none" else Conductor(material, model, 1.0 if coat is None else coat.index)
 
 
 class PerfectMirror:
@@ -92,22 +94,22 @@ class Dielectric:
 
 
 class Conductor:
-    """A metal of complex index η − ik, by the names of Mitsuba's `conductor`."""
+    """A metal of complex index η − ik, by the names of Mitsuba's `conductor`; under a coat, relative to its index."""
 
     transparent = False
 
-    def __init__(self, material: str, model: str) -> None:
+    def __init__(self, material: str, model: str, outside: float) -> None:
         _refuse_unknown_material(material)
         metal = mi.traverse(mi.load_dict({"type": "conductor", "material": material}))
-        self.eta, self.k = (self._spectrum(metal, name) for name in ("eta", "k"))
+        self.eta, self.k = (self._spectrum(metal, name, outside) for name in ("eta", "k"))
         self.material = material
         self.model = model
 
     @staticmethod
-    def _spectrum(metal: mi.SceneParameters, name: str) -> mi.Texture:
+    def _spectrum(metal: mi.SceneParameters, name: str, outside: float) -> mi.Texture:
         # A regular table is read at once; in an irregular one every look-up searches, which took half of all time.
         nanometres = np.arange(VISIBLE[0], VISIBLE[1] + 1)
-        values = np.interp(nanometres, metal[f"{name}.wavelengths"], metal[f"{name}.values"])
+        values = np.interp(nanometres, metal[f"{name}.wavelengths"], metal[f"{name}.values"]) / outside
         text = ", ".join(repr(float(value)) for value in values)
         return mi.load_dict(
             {"type": "regular", "wavelength_min": VISIBLE[0], "wavelength_max": VISIBLE[1], "values": text}

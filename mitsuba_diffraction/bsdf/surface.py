@@ -12,13 +12,17 @@ from ..errors import RequestError
 from ..recipe import Recipe
 from ..spectrum import GratingSpectrum
 from ..surface.gratings import COHERENCE_LENGTHS, PROFILES
+from ..wavelengths import VISIBLE
+from .coat import Coat
 
 _PREFIX = "handed over: "
 _handed_over: weakref.WeakValueDictionary[str, GratingSpectrum] = weakref.WeakValueDictionary()
 
 
-def surface_from(props: mi.Properties) -> tuple[GratingSpectrum, Recipe | None]:
+def surface_from(props: mi.Properties, coat: Coat | None) -> tuple[GratingSpectrum, Recipe | None]:
     """The spectrum that the parameters `filename`, `spectrum`, or `profile` with its own parameters name.
+
+    Wavelengths are shorter inside a coat: what is built here is built for λ/n.
 
     Returns:
         The spectrum, and the recipe behind it. A saved spectrum has none: it does not say which heights it is of.
@@ -35,7 +39,7 @@ def surface_from(props: mi.Properties) -> tuple[GratingSpectrum, Recipe | None]:
     if given == ["spectrum"]:
         return _taken_over(props["spectrum"]), None
     if given == ["filename"]:
-        return _from_file(Path(str(mi.file_resolver().resolve(str(props["filename"])))))
+        return _from_file(Path(str(mi.file_resolver().resolve(str(props["filename"])))), coat)
     name = props["profile"]
     if name not in PROFILES:
         raise RequestError(f"profile: got {name!r}, wanted one of {', '.join(PROFILES)}")
@@ -43,11 +47,19 @@ def surface_from(props: mi.Properties) -> tuple[GratingSpectrum, Recipe | None]:
     surface = {"profile": name, **{key: props[key] for key in known if key in props}}
     settings = {"coherence_length": COHERENCE_LENGTHS[name]} if name in COHERENCE_LENGTHS else {}
     settings |= {key: props[key] for key in ("coherence_length", "tolerance", "largest_height_range") if key in props}
-    recipe = Recipe(surface, settings)
+    recipe = _inside(coat, Recipe(surface, settings))
     return recipe.cached(), recipe
 
 
-def _from_file(path: Path) -> tuple[GratingSpectrum, Recipe | None]:
+def _inside(coat: Coat | None, recipe: Recipe) -> Recipe:
+    """The recipe for the wavelengths that there are inside a coat."""
+    if coat is None or "wavelengths" in recipe.spectrum:
+        return recipe
+    wavelengths = [nanometres / coat.relative for nanometres in VISIBLE]
+    return Recipe(recipe.surface, {**recipe.spectrum, "wavelengths": wavelengths}, recipe.folder)
+
+
+def _from_file(path: Path, coat: Coat | None) -> tuple[GratingSpectrum, Recipe | None]:
     suffix = path.suffix.lower()
     if suffix in (".toml", ".exr") and not path.is_file():
         # What is not found stays relative; the folder of a scene is searched first.
@@ -55,7 +67,7 @@ def _from_file(path: Path) -> tuple[GratingSpectrum, Recipe | None]:
         there = sorted(other.name for other in folder.glob("*") if other.suffix.lower() in (".exr", ".toml"))
         raise FileNotFoundError(f"{path}: no such file; {folder} holds {', '.join(there) or 'no spectrum'}")
     if suffix == ".toml":
-        recipe = Recipe.load(path)
+        recipe = _inside(coat, Recipe.load(path))
         return recipe.cached(), recipe
     if suffix == ".exr":
         return GratingSpectrum.load(path), None

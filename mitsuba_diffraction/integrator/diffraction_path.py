@@ -6,14 +6,20 @@ import drjit as dr
 import mitsuba as mi
 
 from ..errors import RequestError
+from ..manual import Parameter, listed
 from . import eye_paths
 from .gratings import Gratings
 from .light_paths import LightPaths
 
-MANUAL = """A path tracer that also finds the light that gratings throw onto other surfaces.
+PARAMETERS = (
+    Parameter("max_depth", "integer", "as in `path`: 2 is direct light, 3 a rainbow on a wall; −1 is no limit", "−1"),
+    Parameter("rr_depth", "integer", "as in `path`: from here on, Russian roulette", "5"),
+)
+
+MANUAL = f"""A path tracer that also finds the light that gratings throw onto other surfaces.
 
 Parameters (XML or dictionary):
-    max_depth, rr_depth (integer): as in `path` (−1, 5).
+{listed(PARAMETERS)}
 
 The picture converges to that of `path` with the same parameters. A path tracer meets a small or distant light by way of
 a grating only by chance, so that what gratings throw onto a wall is white specks. Those paths are traced from the light
@@ -22,21 +28,21 @@ here, and all others from the eye.
 With L a light, G a vertex on a surface whose BSDF is or holds a `diffraction_grating` (whichever component of it
 scatters: both sides of `twosided`, all of a blend, the base), X a vertex on any other surface, and E the eye, the paths
 
-    L G⁺ X (G | X)* E
+    L G⁺ X E    and    L G⁺ X (G | X)* X E
 
 are traced from the light if the vertex next to E scatters otherwise than as a perfect mirror or refraction does. So
 
-    L G E, L G G E              from the eye: gratings alone, seen directly
+    L G E, L G G E              from the eye: gratings alone
     L G X E, L G G X E          from the light: what they throw onto a wall
-    L G X X E, L G X G E        from the light: that wall lights another one, or is seen in a grating
-    L G M X E                   from the light, M a mirror or a pane of glass
-    L G X M E                   from the eye: that wall seen in a mirror, which cannot be connected to the eye
+    L G X X E, L G M X E        from the light: that wall lights another one; M is a mirror or a pane of glass
+    L G X G E, L G X M E        from the eye: that wall seen in a grating or a mirror
     L X G X E, L M G X E        from the eye: light that met another surface before the grating
 
+What is seen in a grating is left to the eye, as the lobes of a grating reach a pinhole as seldom as a mirror does.
 Points on gratings are drawn by area, a light is drawn from there, one of four such pairs is taken in proportion to what
-it receives, and the path goes on by `sample` of the BSDFs, with the correction for shading normals; each vertex after
-the first X is connected to the sensor. There is one path from the light for four samples of the film. As in `path`, a
-light without extent is not seen in a mirror: it is left out where the grating next to it scatters by a delta component.
+it receives, and the path goes on by `sample` of the BSDFs, with the correction for shading normals; each X is connected
+to the sensor. There is one path from the light for eight samples of the film. As in `path`, a light without extent is
+not seen in a mirror: it is left out where the grating next to it scatters by a delta component.
 
 Without a grating, with max_depth below 3, in polarised variants, and for sensors that points cannot be connected to
 (all but `perspective` and `thinlens`), this is `path`. Instances and curves count as X. Where Mitsuba asks for single

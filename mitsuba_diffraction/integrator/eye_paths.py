@@ -39,7 +39,7 @@ def define() -> type:
             throughput, eta = mi.Spectrum(1.0), mi.Float(1.0)
             depth = mi.UInt32(1)
             active = seen & (depth < self.max_depth)
-            # Of the vertices so far: whether one is no grating, and whether the first one scattered as a mirror does.
+            # Whether a vertex so far is no grating, and whether the first one is one or scattered as a mirror does.
             met, mirrored = mi.Bool(False), mi.Bool(False)
             while active:
                 bsdf = si.bsdf(ray)
@@ -62,7 +62,7 @@ def define() -> type:
                 throughput *= weight
                 eta *= bs.eta
                 delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-                mirrored |= (depth == 1) & delta
+                mirrored |= (depth == 1) & (delta | on_grating)
                 met |= on_grating ^ True
                 active &= dr.any(throughput != 0)
                 ray = si.spawn_ray(si.to_world(bs.wo))

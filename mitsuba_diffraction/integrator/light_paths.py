@@ -15,11 +15,11 @@ from .splats import SplatBuffer, Splats
 _PATHS_AT_ONCE = 2**20  # some 150 MB
 _CANDIDATES = 4
 # For each sample of the film: they cost about as much, and there must be time for both.
-_PATHS_PER_SAMPLE = 0.25
+_PATHS_PER_SAMPLE = 0.125
 
 
 class LightPaths:
-    """Traces L G⁺ X (G | X)* E (see `diffraction_path`) from the grating next to the light, and connects to the sensor.
+    """Traces L G⁺ X ((G | X)* X)? E (see `diffraction_path`) from the first grating on, and connects to the sensor.
 
     With y₁ on a grating, drawn with density p(y₁), and a light in the direction ω₁ drawn with density p(ω₁), a path
     carries the power
@@ -74,11 +74,11 @@ class LightPaths:
         si = self.scene.ray_intersect(ray, active)
         depth = mi.UInt32(2)
         active &= si.is_valid()
-        throughput, eta, met = mi.Spectrum(1), mi.Float(1), mi.Bool(False)
+        throughput, eta = mi.Spectrum(1), mi.Float(1)
         while active:
             bsdf = si.bsdf(ray)
-            met |= self.gratings.hold(si, active) ^ True
-            position, value, reached = self._connect(si, bsdf, _next_2d(rng), active & met)
+            plain = active & (self.gratings.hold(si, active) ^ True)
+            position, value, reached = self._connect(si, bsdf, _next_2d(rng), plain)
             buffer.add(Splats(position, ray.wavelengths, value * power * throughput), path, depth, reached)
             ray, weight, widening, _ = self._scatter(si, bsdf, rng, active)
             throughput *= weight

@@ -12,7 +12,7 @@ to all 93 for each sample and each pixel under the filter: two million samples o
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import drjit as dr
 import mitsuba as mi
@@ -21,6 +21,9 @@ from numpy.typing import NDArray
 
 from ..integrator.splats import Splats
 from .scene import channel_wavelengths, channel_weights, root_cause
+
+# A pixel, row by row, and a mask → the first of its samples, which stand together, and the one after the last.
+Samples = Callable[["mi.UInt32", "mi.Bool"], tuple["mi.UInt32", "mi.UInt32"]]
 
 
 def pass_seed(seed: int, index: int) -> int:
@@ -114,13 +117,10 @@ def _trace(scene: mi.Scene, integrator: mi.SamplingIntegrator, spp: int, seed: i
     )
     ray.scale_differential(spp**-0.5)
     traced, _, _ = integrator.sample(scene, sampler, ray, sensor.get_medium())
+    channels = channel_wavelengths().size
     channel, value = _on_channels(film, ray.wavelengths, weight * traced)
     dr.eval(position, channel, value)
-
-    def of_pixel(index: mi.UInt32, active: mi.Bool) -> tuple[mi.UInt32, mi.UInt32]:
-        return index * count, index * count + count
-
-    sums = np.array(collect(rfilter, position, channel, value, (rows, columns), border, of_pixel))
+    sums = np.array(collect(rfilter, position, channel, value, (rows, columns), border, evenly(count), channels))
     sums = sums.reshape(rows, columns, -1)
     if light is not None:
         _add_light(sums, film, light.splats(seed, light.count(spp)), spp)
@@ -144,7 +144,7 @@ def _add_light(sums: NDArray[np.float32], film: mi.Film, found: Iterable[Splats]
 
     They are sorted by pixel, those of a pixel in the order in which they were traced.
     """
-    rows, columns, _ = sums.shape
+    rows, columns, channels = sums.shape
     parts = []
     for splats in found:
         channel, value = _on_channels(film, splats.wavelengths, splats.value * dr.opaque(mi.Float, spp))
@@ -162,21 +162,24 @@ def _add_light(sums: NDArray[np.float32], film: mi.Film, found: Iterable[Splats]
         return dr.gather(mi.UInt32, starts, index, active), dr.gather(mi.UInt32, starts, index + 1, active)
 
     half = len(rest) // 2
-    added = np.array(collect(film.rfilter(), mi.Point2f(x, y), rest[:half], rest[half:], (rows, columns), 0, of_pixel))
-    sums[..., :-1] += added.reshape(sums.shape)[..., :-1]
+    position, channel, value = mi.Point2f(x, y), rest[:half], rest[half:]
+    added = collect(film.rfilter(), position, channel, value, (rows, columns), 0, of_pixel, channels - 1)
+    sums[..., :-1] += np.array(added).reshape(sums.shape)[..., :-1]
+
+
+def evenly(count: mi.UInt32) -> Samples:
+    """The samples of each pixel, if all have as many."""
+    return lambda pixel, active: (pixel * count, pixel * count + count)
 
 
 @dr.syntax
-def collect(rfilter, position, channel, value, size, border, samples):
+def collect(rfilter, position, channel, value, size, border, samples, channels):
     """Gathers the samples under the filter of each pixel, row by row, in one lane per pixel.
 
     `channel` and `value` are lists; a fractional channel splits the value linearly between its two neighbours. The
-    result holds the channels and then the filter sum of each pixel.
-
-    The samples of a pixel are contiguous: `samples` takes the index of a pixel, counting the border of the film, and a
-    mask, and returns the first sample and the one after the last.
+    result holds as many channels as asked for and then the filter sum of each pixel. Samples also lie in the `border`.
     """
-    (rows, columns), channels = size, len(channel_wavelengths())
+    rows, columns = size
     reach = int(np.ceil(rfilter.radius() - 0.5))
     box = rfilter.is_box_filter()
     width = 2 * reach + 1

@@ -47,7 +47,7 @@ class Surface:
 
     Attributes:
         bsdf: the BSDF of the shape, the grating or a `twosided` around it.
-        grating: the `diffraction_grating` itself.
+        grating: the `diffraction_grating`.
         side: 1 for the front, −1 for the back.
     """
 

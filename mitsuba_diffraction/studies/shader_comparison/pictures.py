@@ -16,7 +16,7 @@ from ...color import spectrum_to_XYZ
 from ...errors import RequestError
 from ...render import SpectralImage
 from ...render.accumulation import Accumulation, ratio
-from ...render.film import collect, pass_seed, trace_pass
+from ...render.film import collect, evenly, pass_seed, trace_pass
 from ...render.passes import split
 from ...render.scene import channel_wavelengths, load_spectral_scene
 from ...shader.base import Shader
@@ -213,7 +213,7 @@ class Pictures:
         channels = [dr.opaque(mi.Float, channel, shape=len(x)) for channel in range(3)]
         rfilter = self.scene.sensors()[0].film().rfilter()
         count = dr.opaque(mi.UInt32, len(x) // (rows * columns))
-        sums = collect(rfilter, mi.Point2f(x, y), channels, rgb, (rows, columns), 0, count, 3)
+        sums = collect(rfilter, mi.Point2f(x, y), channels, rgb, (rows, columns), 0, evenly(count), 3)
         values = np.array(sums, np.float64).reshape(rows, columns, 4)
         return values[..., :3] / values[..., 3:], time.perf_counter() - begin
 

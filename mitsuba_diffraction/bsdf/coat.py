@@ -1,0 +1,97 @@
+"""A clear plane layer over the grating: polycarbonate over a disc's metal, lacquer over foil.
+
+A plane layer of index n keeps tangential components, so that q = −(ω_i + ω_o)/λ along the surface is what it is
+without the layer. Inside, sin θ' = sin θ/n and the wavelength is λ/n, hence κ' = 2πn (cos θ'_i + cos θ'_o)/λ and
+
+    f = T_i T_o R' K' G' E' S(q; κ')/λ²,    T = (1 − F(θ)) e^{−σd/cos θ'}
+
+with F the power reflectance of the layer's front face, R' relative to n, primes for quantities inside, absorption σ and
+thickness d. Light that the grating sends beyond the critical angle, and what the front face returns to the grating, is
+lost; the front face itself reflects F as a mirror.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..errors import RequestError
+from .tables import opaque
+
+
+def coat_from(props: mi.Properties) -> Coat | None:
+    """The layer that the parameters `coat_ior`, `coat_absorption` and `coat_thickness` describe, if there is one.
+
+    Raises:
+        ValueError: if its index is below one or below that of the outside, or a parameter makes no sense.
+    """
+    absorption, thickness = props.get("coat_absorption", 0.0), props.get("coat_thickness", 0.0)
+    if "coat_ior" not in props:
+        if "coat_absorption" in props or "coat_thickness" in props:
+            raise RequestError("coat_absorption, coat_thickness: got a layer without coat_ior, wanted its index, too")
+        return None
+    for name, value in (("coat_absorption", absorption), ("coat_thickness", thickness)):
+        if not 0 <= value < np.inf:
+            raise RequestError(f"{name}: got {value}, wanted a number ≥ 0")
+    return Coat(props["coat_ior"], props.get("ext_ior", "air"), absorption * thickness)
+
+
+def absolute_index(name: str, index: float | str) -> float:
+    """An index of refraction, given by a number or by a preset's name as in Mitsuba's `dielectric`."""
+    if isinstance(index, int | float) and not 0 < index < np.inf:
+        raise RequestError(f"{name}: got {index}, wanted a positive index of refraction, or a name such as 'bk7'")
+    interface = mi.load_dict({"type": "dielectric", "int_ior": index, "ext_ior": 1.0})
+    return float(np.ravel(mi.traverse(interface)["eta"])[0])
+
+
+class Coat:
+    """The layer.
+
+    Attributes:
+        index: n, absolute.
+        relative, eta: n relative to the outside, as a number and as an array.
+        depth: σd, the optical depth at normal incidence.
+    """
+
+    def __init__(self, index: float | str, outside: float | str, depth: float) -> None:
+        self.index = absolute_index("coat_ior", index)
+        outer = absolute_index("ext_ior", outside)
+        if not (self.index >= 1 and self.index >= outer):
+            raise RequestError(f"coat_ior: got {self.index:g}, wanted at least one and that of the outside, {outer:g}")
+        self.relative = self.index / outer
+        self.eta, self.depth = opaque(self.relative), opaque(depth)
+        self.absorbs = depth > 0
+
+    def refracted(self, omega: mi.Vector3f) -> mi.Vector3f:
+        """The direction inside, away from the grating, of light that is outside in the direction ω."""
+        x, y = omega.x / self.eta, omega.y / self.eta
+        return mi.Vector3f(x, y, dr.safe_sqrt(1 - dr.square(x) - dr.square(y)))
+
+    def cos_inside(self, cos: mi.Float) -> mi.Float:
+        """cos θ' for the cosine of an angle outside."""
+        return dr.safe_sqrt(1 - (1 - dr.square(cos)) / dr.square(self.eta))
+
+    def indices(self) -> list[mi.Complex2f]:
+        """The relative index, for every wavelength."""
+        return [mi.Complex2f(self.eta, 0)] * len(mi.UnpolarizedSpectrum(0.0))
+
+    def reflectance(self, cos: mi.Float) -> mi.Float:
+        """F at the cosine of an angle outside."""
+        return mi.fresnel(cos, self.eta)[0]
+
+    def absorption(self, cos_inside: mi.Float) -> mi.Float:
+        """e^{−σd/cos θ'}."""
+        return dr.exp(-self.depth / cos_inside) if self.absorbs else mi.Float(1.0)
+
+    def transmittance(self, cos: mi.Float, cos_inside: mi.Float) -> mi.Float:
+        """T."""
+        return (1 - self.reflectance(cos)) * self.absorption(cos_inside)
+
+    def share(self, cos: mi.Float, below: mi.Float) -> mi.Float:
+        """The share of samples that the front face gets, where what is below reflects `below`."""
+        front = self.reflectance(cos)
+        return dr.detach(dr.clip(front / (front + dr.square(1 - front) * below), 0, 1))
+
+    def __repr__(self) -> str:
+        return f"n = {self.index:g}" + (f", optical depth {self.depth}" if self.absorbs else "")
