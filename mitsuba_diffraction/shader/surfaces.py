@@ -65,7 +65,7 @@ def surfaces_of(scene: mi.Scene) -> list[Surface]:
 
 
 def heights_of(grating: mi.BSDF) -> tuple[HeightField, float]:
-    """The height field of a grating, and its coherence length in µm.
+    """The height field of a grating, of several patches the first, and its coherence length in µm.
 
     Raises:
         ValueError: if it was loaded from a spectrum file, which does not contain heights.
