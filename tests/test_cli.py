@@ -165,7 +165,7 @@ def test_precompute_writes_the_file_that_it_names_and_says_its_error(command):
     ]
     told = float(out.split("frequencies; ")[1].split()[0])
     assert told == pytest.approx(1 - np.sum(eta, axis=0).min(), rel=0.05)
-    assert f"{spectrum.beyond:.1e} where no light reaches" in out
+    assert f"{spectrum.beyond:.1e} at frequencies that no direction reaches" in out
 
 
 @pytest.mark.parametrize("representation", ["taylor", "chebyshev", "svd", "slices"])
@@ -185,7 +185,7 @@ def test_a_sample_by_options(command, representation):
     for part in (f"sample, {columns} × {rows} frequencies", "cycles/µm apart", "coherence length 0.9 µm", "truncated"):
         assert part in out
     assert f"{spectrum.dropped:.1e} of the power" in out
-    assert f"{spectrum.beyond:.1e} where" in out
+    assert f"{spectrum.beyond:.1e} at frequencies that" in out
 
 
 def test_a_smaller_angle_takes_fewer_orders(command):

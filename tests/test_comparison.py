@@ -343,7 +343,7 @@ def test_the_same_seed_gives_the_same_numbers(llvm, folder):
 )
 def test_a_mistake_is_one_line_and_exit_code_2(command, llvm, folder, arguments, of, words):
     write(Path("scene.xml"), **of)
-    md.precompute(md.gratings.blazed(2.5, 0.25, samples=64)).save("blaze.exr")
+    md.precompute(md.gratings.blazed(2.5, 0.25, samples=64), coherence_length=20).save("blaze.exr")
     before = names()
     code, out, err = command(f"compare {arguments}")
     assert (code, out) == (2, "")

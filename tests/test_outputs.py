@@ -1,5 +1,6 @@
 """No command writes over what it reads, nor over what another command made; and what a kill leaves is cleared."""
 
+import functools
 import json
 import os
 import signal
@@ -18,7 +19,15 @@ from mitsuba_diffraction.cli.inputs import files_read
 from mitsuba_diffraction.files import is_intact, refuse_unwritable, seal, whole_file
 from mitsuba_diffraction.outputs import claimed, made_for
 
-BLAZE = '[surface]\nprofile = "blazed"\nperiod = 2.5\ndepth = 0.25\nsamples = 64\n[spectrum]\ntolerance = 0.02\n'
+BLAZE = """[surface]
+profile = "blazed"
+period = 2.5
+depth = 0.25
+samples = 64
+[spectrum]
+tolerance = 0.02
+coherence_length = 20
+"""
 SCAN = '[surface]\nscan = "scan.png"\npixel_size = 0.05\nheight_range = 0.3\n[spectrum]\ntolerance = 0.02\n'
 SCENE = """<scene version="3.0.0"><default name="spectrum" value="u.exr"/><default name="light" value="sky"/>
 <integrator type="path"/><sensor type="perspective"><transform name="to_world">
@@ -29,6 +38,12 @@ SCENE = """<scene version="3.0.0"><default name="spectrum" value="u.exr"/><defau
 <string name='filename' value='tex.png'/></texture></bsdf></bsdf></shape></scene>"""
 SKY = """<scene version="3.0.0"><emitter type="constant">
 <spectrum name="radiance" filename="sky.spd"/></emitter></scene>"""
+
+
+@functools.cache
+def spectrum():
+    """Lobes so wide that the energy table is a small one; computed once."""
+    return md.precompute(md.gratings.blazed(2.5, 0.25, samples=64), tolerance=0.02, coherence_length=20)
 
 
 @pytest.fixture(autouse=True)
@@ -44,7 +59,7 @@ def folder(tmp_path, monkeypatch):
     pixels = np.random.default_rng(0).integers(0, 255, (8, 8), dtype=np.uint8)
     for name in ("scan.png", "tex.png"):
         Image.fromarray(pixels).save(name)
-    md.precompute(md.gratings.blazed(2.5, 0.25, samples=64), tolerance=0.02).save("u.exr")
+    spectrum().save("u.exr")
     return tmp_path
 
 
