@@ -4,6 +4,7 @@
 profile = "blazed"               # a name in gratings.PROFILES, followed by its parameters
 period = 2.5                     # µm
 depth = 0.25                     # µm
+patches = 16                     # of a profile with a seed: the mean over so many seeds, from `seed` on
 
 [surface]                        # … or a scan
 scan = "skin.png"                # relative to the recipe; formats: readers.read_height_field
@@ -53,7 +54,7 @@ from .files import cache_folder, refuse_special
 from .spectrum import GratingSpectrum
 from .spectrum.build import precompute
 from .spectrum.file import FORMAT_VERSION
-from .surface.gratings import PROFILES
+from .surface.gratings import PATCHES, PROFILES
 from .surface.heightfield import HeightField
 from .surface.prepare import apply_steps, check_steps
 from .surface.readers import read_height_field
@@ -104,6 +105,14 @@ class Recipe:
             raise RequestError(f"[surface]: got {_names(self.surface)}, wanted either a profile or a scan")
         if "profile" in self.surface and self.surface["profile"] not in tuple(PROFILES):
             raise RequestError(f"profile: got {self.surface['profile']!r}, wanted one of {', '.join(PROFILES)}")
+        if "profile" in self.surface and "patches" in self.surface:
+            patches = self.surface["patches"]
+            if isinstance(patches, bool) or not isinstance(patches, int) or patches < 1:
+                raise RequestError(f"patches: got {patches!r}, wanted a whole number of at least 1")
+            if not self._has_seed:
+                raise RequestError(
+                    f"patches: got {patches!r} of the profile {self.surface['profile']!r}, wanted a profile with a seed"
+                )
         if "scan" in self.surface:
             _refuse_unknown("[surface]", self.surface, _SCAN_KEYS)
             if not isinstance(self.surface["scan"], str):
@@ -150,12 +159,40 @@ class Recipe:
         except RequestError as error:
             raise RequestError(f"{path}: {error}") from None
 
+    @property
+    def _has_seed(self) -> bool:
+        return "seed" in inspect.signature(PROFILES[self.surface["profile"]]).parameters
+
+    @property
+    def patches(self) -> int:
+        """Over how many seeds the spectrum is averaged: one of a sample, and of what is not drawn at random."""
+        if "patches" in self.surface:
+            return int(self.surface["patches"])
+        return PATCHES.get(self.surface.get("profile", ""), 1) if self.spectrum.get("extent", "tile") == "tile" else 1
+
+    def of_one_patch(self) -> Recipe:
+        """The recipe without the mean over seeds: its spectrum is that of `height_field`."""
+        if self.patches == 1:
+            return self
+        return Recipe({**self.surface, "patches": 1}, self.spectrum, self.folder)
+
+    def height_fields(self) -> tuple[HeightField, ...]:
+        """The patches: seed, seed + 1, …; one where nothing is drawn at random."""
+        if self.patches == 1:
+            return (self.height_field(),)
+        parameters = {name: value for name, value in self.surface.items() if name != "patches"}
+        seed = parameters.pop("seed", 0)
+        first = self.height_field()  # which refuses a wrong seed
+        others = [Recipe({**parameters, "patches": 1, "seed": seed + k}).height_field() for k in range(1, self.patches)]
+        return (first, *others)
+
     def height_field(self) -> HeightField:
-        """The surface."""
+        """The surface; of several patches, the first."""
         parameters = dict(self.surface)
         if "scan" in parameters:
             return self._prepared_scan(parameters)
         name = parameters.pop("profile")
+        parameters.pop("patches", None)
         signature = inspect.signature(PROFILES[name])
         _refuse_unknown(f"profile {name!r}", parameters, frozenset(signature.parameters))
         try:
@@ -184,7 +221,7 @@ class Recipe:
         arguments = dict(self.spectrum)
         if "wavelengths" in arguments:
             arguments["wavelengths"] = tuple(arguments["wavelengths"])
-        return precompute(self.height_field(), progress=progress, **arguments)
+        return precompute(self.height_fields(), progress=progress, **arguments)
 
     def digest(self) -> str:
         """SHA-256 of everything that determines the spectrum: the recipe and the contents of the scan."""
@@ -198,7 +235,7 @@ class Recipe:
             except FileNotFoundError:
                 raise FileNotFoundError(f"{scan}: no such file") from None
             content.update(scan.suffix.lower().encode())
-        content.update(json.dumps([surface, dict(self.spectrum)], sort_keys=True).encode())
+        content.update(json.dumps([surface, self.patches, dict(self.spectrum)], sort_keys=True).encode())
         return content.hexdigest()
 
     def cached(self, progress: Callable[[int, int], None] | None = None) -> GratingSpectrum:

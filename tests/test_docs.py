@@ -168,6 +168,7 @@ def test_a_block_that_is_wrong_is_found(folder, command, llvm, capfd):
 
 def test_the_manual_lists_the_parameters_of_the_plugins(llvm):
     from mitsuba_diffraction.bsdf import diffraction_grating
+    from mitsuba_diffraction.integrator import diffraction_path
     from mitsuba_diffraction.shader import integrator
 
     text, listed, head = (ROOT / "docs" / "plugin.md").read_text().replace("`", ""), set(), []
@@ -178,7 +179,7 @@ def test_the_manual_lists_the_parameters_of_the_plugins(llvm):
         elif cells:
             row = dict(zip(head, cells, strict=False))
             listed.add((row["parameter"], row["type"], row.get("default", "").strip("| ")))
-    known = (*diffraction_grating.PARAMETERS, *integrator.PARAMETERS)
+    known = (*diffraction_grating.PARAMETERS, *integrator.PARAMETERS, *diffraction_path.PARAMETERS)
     assert listed == {(parameter.name, parameter.type, parameter.default) for parameter in known}
 
 

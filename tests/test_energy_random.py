@@ -12,7 +12,7 @@ from mitsuba_diffraction.spectrum.spline_grid import spline_integral
 
 MOST = 1.002
 SEEDS = range(1000, 1030)
-"""Of the slow study; any others serve, 500 take two hours of one core."""
+"""Of the slow study; any others serve."""
 
 
 def random_surface(seed):

@@ -12,6 +12,7 @@ from mitsuba_diffraction import Recipe
 from mitsuba_diffraction.coherence import lobe_width
 from mitsuba_diffraction.surface.gratings import (
     COHERENCE_LENGTHS,
+    PATCHES,
     PROFILES,
     compact_disc,
     dvd,
@@ -259,8 +260,10 @@ def test_the_comb_of_a_drawn_tile_is_blurred(name):
 
 
 @pytest.mark.parametrize("name", sorted(COHERENCE_LENGTHS))
-def test_a_recipe_and_a_scene_agree_on_the_coherence_length(name):
-    assert Recipe.load(RECIPES / f"{name}.toml").spectrum["coherence_length"] == COHERENCE_LENGTHS[name]
+def test_a_recipe_and_a_scene_agree_on_coherence_length_and_patches(name):
+    recipe = Recipe.load(RECIPES / f"{name}.toml")
+    assert recipe.spectrum["coherence_length"] == COHERENCE_LENGTHS[name]
+    assert recipe.surface["patches"] == PATCHES[name]
 
 
 # ---------------------------------------------------------------- recipes, and by name in a scene

@@ -79,6 +79,7 @@ PICTURES = [
     pytest.param("snake", {"skin": "elaphe", "light": "lamp"}, marks=pytest.mark.slow),
     pytest.param("compact_disc", {"light": "sun"}, marks=pytest.mark.slow),
     pytest.param("foil", {"light": "sun"}, marks=pytest.mark.slow),
+    pytest.param("rainbow", {}, marks=pytest.mark.slow),
 ]
 
 

@@ -64,15 +64,15 @@ MANUAL = f"""A diffraction grating, given by the spectrum of its phase.
 Parameters (XML or dictionary):
 {listed(PARAMETERS)}
 
-The pattern's x axis lies along dp_du, where u grows, laid into the plane across the shading normal n; its y axis is
-n × x whatever dp_dv is. So lengths are true where UVs are stretched or sheared, and mirrored UVs turn the pattern but
-do not mirror it; the back of a `twosided` shows its mirror image. On a mesh without UVs x lies along the first edge of
-each triangle and changes from one to the next: give such a mesh UVs. Where dp_du vanishes Mitsuba picks an axis.
+The x axis of the pattern is dp_du projected onto the plane perpendicular to the shading normal n; the y axis is n × x,
+independent of dp_dv. The pattern therefore keeps its physical scale under stretched or sheared UVs, and mirrored UVs
+rotate it without reflecting it; the back of a `twosided` shows its mirror image. On a mesh without UVs x follows the
+first edge of each triangle and is discontinuous: such a mesh needs UVs. Where dp_du vanishes Mitsuba picks an axis.
 
 The BRDF is R · K · G · S(q; κ)/λ² · E: R the power reflectance at the half vector, K and G as in `geometry.py`, S as in
 `line_spectrum.py` (of a tile) or `smooth_spectrum.py` (of a sample), with q = −(ω_i + ω_o)/λ along the pattern's axes
-and κ = 2π (cos θ_i + cos θ_o)/λ. E, as in `energy.py`, keeps the reflected light to the received; it is one where the
-rest does so by itself. Without shadowing K diverges as 1/cos θ near the horizon: from 85° on E then falls with cos θ.
+and κ = 2π (cos θ_i + cos θ_o)/λ. E, as in `energy.py`, bounds the albedo by one; it is one where the albedo is
+below one without it. Without shadowing K diverges as 1/cos θ near the horizon: from 85° on E then falls with cos θ.
 
 Under a coat (`coat.py`) all this holds inside of it, where wavelengths are shorter and directions steeper; the front
 face of the coat is a mirror. A saved spectrum must cover the shorter wavelengths; one built from a recipe or a profile

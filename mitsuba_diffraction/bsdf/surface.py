@@ -44,7 +44,7 @@ def surface_from(props: mi.Properties, coat: Coat | None) -> tuple[GratingSpectr
     if name not in PROFILES:
         raise RequestError(f"profile: got {name!r}, wanted one of {', '.join(PROFILES)}")
     known = inspect.signature(PROFILES[name]).parameters
-    surface = {"profile": name, **{key: props[key] for key in known if key in props}}
+    surface = {"profile": name, **{key: props[key] for key in (*known, "patches") if key in props}}
     settings = {"coherence_length": COHERENCE_LENGTHS[name]} if name in COHERENCE_LENGTHS else {}
     settings |= {key: props[key] for key in ("coherence_length", "tolerance", "largest_height_range") if key in props}
     recipe = _inside(coat, Recipe(surface, settings))

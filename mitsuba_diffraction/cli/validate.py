@@ -91,6 +91,6 @@ def _of_surface(path: Path, of_scan: dict[str, object], settings: dict[str, obje
 
     if path.suffix.lower() != ".toml":
         settings = {"extent": "sample", **settings}
-    recipe = recipe_of(path, of_scan, settings)
+    recipe = recipe_of(path, of_scan, settings).of_one_patch()
     with progress_bar(f"spectrum of {path.name}") as progress:
         return surface_checks(recipe.height_field(), recipe.cached(progress))

@@ -6,14 +6,20 @@ import drjit as dr
 import mitsuba as mi
 
 from ..errors import RequestError
+from ..manual import Parameter, listed
 from . import eye_paths
 from .gratings import Gratings
 from .light_paths import LightPaths
 
-MANUAL = """A path tracer that also finds the light that gratings throw onto other surfaces.
+PARAMETERS = (
+    Parameter("max_depth", "integer", "as in `path`: 2 is direct light, 3 a rainbow on a wall; −1 is no limit", "−1"),
+    Parameter("rr_depth", "integer", "as in `path`: from here on, Russian roulette", "5"),
+)
+
+MANUAL = f"""A path tracer that also finds the light that gratings throw onto other surfaces.
 
 Parameters (XML or dictionary):
-    max_depth, rr_depth (integer): as in `path` (−1, 5).
+{listed(PARAMETERS)}
 
 The picture converges to that of `path` with the same parameters. A path tracer meets a small or distant light by way of
 a grating only by chance, so that what gratings throw onto a wall is white specks. Those paths are traced from the light

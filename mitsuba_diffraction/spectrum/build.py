@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,7 @@ from .expansions.chebyshev import ChebyshevSeries
 from .expansions.svd import SvdSeries
 from .expansions.taylor import TaylorSeries
 from .grating_spectrum import TAIL_SHARE, check_angle, check_wavelengths
+from .patches import MeanPowers, check_patches
 from .sample import SamplePowers
 from .series_table import SeriesTable
 from .slice_table import SliceTable, interpolation
@@ -51,7 +53,7 @@ Table = SeriesTable | SliceTable
 
 
 def precompute(
-    height_field: HeightField,
+    height_field: HeightField | Sequence[HeightField],
     *,
     extent: str = "tile",
     coherence_length: float = SUN_COHERENCE_LENGTH,
@@ -68,7 +70,8 @@ def precompute(
     """The spectrum of the phase e^{iκh}, or the table of rigorous efficiencies, its error at most `tolerance`.
 
     Args:
-        height_field: the surface.
+        height_field: the surface; or several patches of one size that repeat (extent "tile"), drawn from one kind of
+            irregular surface: the spectrum is the mean of theirs.
         extent: "tile": the patch repeats for ever; "sample": it is a piece of a larger, irregular surface.
         coherence_length: L_c in µm.
         wavelengths: (shortest, longest) in nm.
@@ -99,6 +102,10 @@ def precompute(
             a sample is too small for the coherence length.
     """
     check_extent(extent)
+    patches = (height_field,) if isinstance(height_field, HeightField) else tuple(height_field)
+    check_patches(patches, extent)
+    height_field = patches[0]
+    height_range = max(patch.height_range for patch in patches)
     check_wavelengths(wavelengths)
     if theory not in ("scalar", "rigorous"):
         raise RequestError(f"theory: got {theory!r}, wanted scalar or rigorous")
@@ -128,9 +135,9 @@ def precompute(
         raise RequestError(f"representation: got {representation!r}, wanted one of {', '.join(REPRESENTATIONS)}")
     if not largest_height_range > 0:
         raise RequestError(f"largest_height_range: got {largest_height_range!r}, wanted a positive number of µm")
-    if height_field.height_range > largest_height_range:
+    if height_range > largest_height_range:
         raise RequestError(
-            f"heights: got a range of {height_field.height_range:.4g} µm, wanted at most {largest_height_range:g}: are "
+            f"heights: got a range of {height_range:.4g} µm, wanted at most {largest_height_range:g}: are "
             "these nanometres? If the surface is so deep, raise largest_height_range"
         )
     shortest = wavelengths[0] * 1e-3
@@ -144,6 +151,8 @@ def precompute(
         radius = lobe_reach(TAIL_SHARE * tolerance) * lobe_width(coherence_length)
         powers = TilePowers(height_field, reach, radius)
         _check_overlap(powers.grid.neighbours(1, radius), coherence_length)
+        if len(patches) > 1:
+            powers = MeanPowers(patches, reach, radius, largest_kappa, allowed)
     else:
         carried = carried_coherence_length(height_field, coherence_length)
         scatter = standard_error(height_field, coherence_length=carried, largest_kappa=largest_kappa, reach=reach)
@@ -158,24 +167,33 @@ def precompute(
                 stacklevel=2,
             )
         powers = _splines(height_field, carried, reach, largest_kappa, _SPLINE_SHARE * tolerance)
-    build = _Build(powers, height_field.height_range, largest_kappa, allowed, progress or (lambda done, total: None))
+    build = _Build(powers, height_range, largest_kappa, allowed, progress or (lambda done, total: None))
     table, error = build(SliceTable.representation if representation == "auto" else representation)
     return GratingSpectrum(
         table=table,
         grid=build.kept,
         pixel_size=height_field.pixel_size,
-        height_range=height_field.height_range,
+        height_range=height_range,
         coherence_length=carried,
         wavelengths=(float(wavelengths[0]), float(wavelengths[1])),
         tolerance=float(tolerance),
         error=error + tolerance - allowed,
-        source=height_field.source,
-        source_digest=height_field.digest,
+        source=height_field.source
+        if len(patches) == 1
+        else f"mean of {len(patches)} patches: {height_field.source}, …",
+        source_digest=_digest(patches),
+        patches=len(patches),
         largest_angle=float(largest_angle),
         dropped=build.dropped,
         beyond=build.beyond,
         scatter=scatter,
     )
+
+
+def _digest(patches: Sequence[HeightField]) -> str:
+    """SHA-256 of the height field, or of those of all patches."""
+    digests = [patch.digest for patch in patches]
+    return digests[0] if len(digests) == 1 else hashlib.sha256("".join(digests).encode()).hexdigest()
 
 
 def check_tolerance(tolerance: float) -> None:

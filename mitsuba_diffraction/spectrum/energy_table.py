@@ -3,10 +3,10 @@
 With R = 1 the BRDF K·G·S(q; κ)/λ² has an albedo a(ω_i, λ) (`albedo.py`) that exceeds one for some directions. The BSDF
 multiplies by
 
-    E = min(e(ω_i, λ), e(ω_o, λ)),    e ≤ min(1, 1/a)
+    E = min(e(ω_i, λ), e(ω_o, λ)),    e ≤ 1, about 1/a where a > 1
 
-which is reciprocal, one where neither direction reflects more than it receives, and bounds every albedo by one,
-because E ≤ e(ω_i).
+which is reciprocal, and one where neither direction reflects more than it receives. Where e ≤ 1/a, E ≤ e(ω_i) bounds
+the albedo by one; where a varies too fast for the table, `furnace.py` lowers e until the albedo with E is bounded.
 
 Directions are stored in angles about the pattern's y axis: with c = √(1 − ω_y²), the cosine of the latitude,
 

@@ -84,6 +84,7 @@ def save(spectrum: GratingSpectrum, path: str | os.PathLike[str], recipe: str = 
         "largestAngle": _doubles(spectrum.largest_angle),
         "dropped": _doubles(spectrum.dropped),
         "beyond": _doubles(spectrum.beyond),
+        "patches": spectrum.patches,
         **({"standardError": _doubles(spectrum.standard_error)} if spectrum.extent == "sample" else {}),
         "source": spectrum.source,
         "sourceSha256": spectrum.source_digest,
@@ -163,6 +164,7 @@ def load(path: str | os.PathLike[str], construct: Callable[..., Spectrum], recip
             largest_angle=_single(header["largestAngle"]),
             dropped=_single(header["dropped"]),
             beyond=_single(header["beyond"]),
+            patches=header["patches"],
             scatter=_single(header["standardError"]) if header["extent"] == "sample" else None,
             energy={kind: EnergyTable.from_plain(t) for kind, t in json.loads(header["energy"]).items()},
         )

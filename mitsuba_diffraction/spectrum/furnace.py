@@ -244,7 +244,7 @@ def conserving(spectrum: GratingSpectrum, table: EnergyTable, height_scale: floa
         # that is too little, the same bound for a neighbourhood that widens.
         corners = np.ones_like(values)
         if attempt:
-            corners[values < 1] = max(1 / total.max(), 1 - LITTLE)
+            corners[values < 1 - SLACK] = max(1 / total.max(), 1 - LITTLE)
         for step in itertools.product(range(-attempt, 2 + attempt), repeat=3):
             node = tuple(np.clip(cell + step, 0, shape - 1).T)
             if min(step) >= 0 and max(step) <= 1:

@@ -49,6 +49,7 @@ class GratingSpectrum:
         dropped: the largest share of the power, over κ, in weak frequencies that were not kept; part of `error`.
         beyond: the largest share of the power, over κ, at frequencies that no pair of directions reaches, or that the
             pixels do not resolve.
+        patches: of how many draws of an irregular surface it is the mean.
         scatter: of a sample, its `standard_error`; None of a tile.
         energy: the tables that bound the albedo, by the kind of shadowing; `energy_table` computes what is missing.
     """
@@ -66,6 +67,7 @@ class GratingSpectrum:
     largest_angle: float = 90.0
     dropped: float = 0.0
     beyond: float = 0.0
+    patches: int = 1
     scatter: float | None = None
     energy: Mapping[str, EnergyTable] = field(default_factory=dict, repr=False)
 
@@ -82,6 +84,8 @@ class GratingSpectrum:
             raise RequestError(f"source: got {self.source!r}, {self.source_digest!r}, wanted texts")
         if not (0 <= self.dropped <= 1 and 0 <= self.beyond <= 1):
             raise RequestError(f"dropped, beyond: got {self.dropped}, {self.beyond}, wanted shares of the power")
+        if not (isinstance(self.patches, int) and self.patches >= 1):
+            raise RequestError(f"patches: got {self.patches!r}, wanted a whole number of at least 1")
         if (self.scatter is not None) != (self.extent == "sample") or not 0 <= (self.scatter or 0.0) < np.inf:
             raise RequestError(f"scatter: got {self.scatter} of a {self.extent}, wanted a number ≥ 0 of a sample only")
         if not all(key == getattr(table, "shadowing", None) for key, table in self.energy.items()):

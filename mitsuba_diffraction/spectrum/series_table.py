@@ -72,7 +72,11 @@ class SeriesTable:
     def content(self) -> list[NDArray]:
         """All that tells it from others, C-contiguous."""
         weights = self.series.weights(np.linspace(0, self.largest_kappa, 2 * self.series.terms + 2))
-        return [np.frombuffer(self.representation.encode(), np.uint8), weights, np.ascontiguousarray(self.terms)]
+        return [
+            np.frombuffer(self.representation.encode(), np.uint8),
+            np.ascontiguousarray(weights),
+            np.ascontiguousarray(self.terms),
+        ]
 
     @property
     def nbytes(self) -> int:

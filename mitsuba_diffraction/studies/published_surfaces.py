@@ -72,7 +72,9 @@ class PublishedSurface:
 
 def _skin(profile: str, depth: float) -> Recipe:
     """As in precompute/elaphe.toml and xenopeltis.toml."""
-    return Recipe({"profile": profile, "size": 32.0, "depth": depth, "seed": 1}, {"coherence_length": 26.0})
+    return Recipe(
+        {"profile": profile, "size": 32.0, "depth": depth, "seed": 1, "patches": 1}, {"coherence_length": 26.0}
+    )
 
 
 SURFACES = {
