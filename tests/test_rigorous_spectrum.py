@@ -5,8 +5,9 @@ import pytest
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction import gratings, rigorous
+from mitsuba_diffraction.rigorous.axes import Axes
 from mitsuba_diffraction.rigorous.build import build_spectrum
-from mitsuba_diffraction.rigorous.spectrum import Axes, RigorousSpectrum
+from mitsuba_diffraction.rigorous.spectrum import RigorousSpectrum
 
 SURFACE = gratings.blazed(0.3, 0.05, samples=64)
 REQUEST = {"int_ior": 1.5, "wavelengths": (400.0, 500.0), "tolerance": 0.2, "coherence_length": 40.0}

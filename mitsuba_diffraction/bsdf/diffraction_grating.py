@@ -9,12 +9,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..rigorous.spectrum import RigorousSpectrum
 from ..spectrum.energy_table import SHADOWING
 from .base import base_from
 from .geometry import Geometry
 from .incidence import Incidence
 from .polarisation import reflected
 from .reflectance import reflectance_from
+from .rigorous_parameters import check_parameters
 from .shared import SharedTables
 from .surface import surface_from
 from .tables import BELOW_ONE, opaque
@@ -27,10 +29,13 @@ MANUAL = """A diffraction grating, given by the spectrum of its phase.
 
 Parameters (XML or dictionary):
     filename (string): a saved spectrum (.exr) or a recipe (.toml).
-    spectrum (GratingSpectrum): the same from Python, in load_dict.
+    spectrum (GratingSpectrum or RigorousSpectrum): the same from Python, in load_dict.
     profile (string): a grating by formula instead of a file, with the parameters of the function of that name in
         `mitsuba_diffraction.gratings`, all lengths in µm, and coherence_length, tolerance and largest_height_range as
         in `precompute`.
+    theory (string): of a profile, "scalar" or "rigorous": Maxwell's equations, for the material that is given, of
+        gratings of one row. Files and spectra say by themselves which they are. Rigorous efficiencies leave no room for
+        height_scale, shadowing, fresnel and base, and are those of unpolarised light.
     int_ior, ext_ior (float or string): a dielectric, as in Mitsuba's `dielectric` (1.5 against air).
     material (string): a conductor instead, as in Mitsuba's `conductor`; "none" is the perfect mirror, R = 1.
     fresnel (string): "exact" or "schlick".
@@ -49,6 +54,7 @@ The BRDF is R · K · G · S(q; κ)/λ² · E: R the power reflectance at the ha
 `line_spectrum.py` (of a tile) or `smooth_spectrum.py` (of a sample), with q = −(ω_i + ω_o)/λ along the pattern's axes
 and κ = 2π (cos θ_i + cos θ_o)/λ. E, as in `energy.py`, keeps the reflected light to the received; it is one where the
 rest does so by itself. Without shadowing K diverges as 1/cos θ near the horizon: from 85° on E then falls with cos θ.
+Of rigorous theory the BRDF is Σ_m η_m N(q − m/T; σ_q² I)/λ², as in `rigorous_orders.py`: R, K, G and E are in η_m.
 
 In polarised variants light is split into s and p as by a plane across the half vector; a perfect mirror and Schlick's
 formula leave it unpolarised.
@@ -65,7 +71,8 @@ def define() -> type:
             # Mitsuba registers an object when its base class is initialised, and Dr.Jit then calls it in every scene as
             # long as anything holds it, be it a traceback: all that may fail comes first.
             self.spectrum, self.recipe = surface_from(props)
-            self.reflectance = reflectance_from(props)
+            self.rigorous = isinstance(self.spectrum, RigorousSpectrum)
+            self.reflectance = check_parameters(props, self.spectrum) if self.rigorous else reflectance_from(props)
             self.orientation = _orientation(props)
             self.height_scale = mi.Float(props.get("height_scale", 1.0))
             self.shadowing = props.get("shadowing", "v_cavity")
@@ -89,6 +96,9 @@ def define() -> type:
 
         def _update(self) -> None:
             """What depends on parameters that can change."""
+            if self.rigorous:
+                self.energy = None
+                return
             scale = np.max(self.height_scale)
             largest = VISIBLE_FROM / self.spectrum.wavelengths[0]
             if not 0 <= scale <= largest * (1 + 1e-6):
@@ -102,7 +112,8 @@ def define() -> type:
 
         def traverse(self, callback: mi.TraversalCallback) -> None:
             callback.put("orientation", self.orientation, mi.ParamFlags.Differentiable)
-            callback.put("height_scale", self.height_scale, mi.ParamFlags.Differentiable)
+            if not self.rigorous:
+                callback.put("height_scale", self.height_scale, mi.ParamFlags.Differentiable)
             self.reflectance.traverse(callback)
             if self.base is not None:
                 callback.put("base", self.base.bsdf, mi.ParamFlags.Differentiable)
@@ -136,19 +147,26 @@ def define() -> type:
             for channel in range(len(value)):
                 wavelength = si.wavelengths[channel] * 1e-3  # µm
                 frequency = dr.rcp(wavelength)
-                power, share = self.scattering.evaluate(
-                    u * frequency,
-                    v * frequency,
-                    -geometry.w * dr.two_pi * frequency * self.height_scale,
-                    Incidence.of(wi, frequency, self.height_scale),
-                    active & covered[channel],
-                )
+                if self.rigorous:
+                    power, share = self.scattering.evaluate(wi, wo, frequency, active & covered[channel])
+                else:
+                    power, share = self.scattering.evaluate(
+                        u * frequency,
+                        v * frequency,
+                        -geometry.w * dr.two_pi * frequency * self.height_scale,
+                        Incidence.of(wi, frequency, self.height_scale),
+                        active & covered[channel],
+                    )
                 value[channel] = dr.select(within, power / dr.square(wavelength), 0)
                 density += share / dr.square(wavelength)
             if self.energy is not None:
                 wavelengths = mi.UnpolarizedSpectrum(si.wavelengths) * 1e-3
                 value = self.energy.conserve(value, wi, wo, wavelengths, active)
-            value *= self.reflectance(si, geometry.cos_half(), active) * geometry.factor(self.shadowing == "v_cavity")
+            if self.rigorous:
+                value *= geometry.cos_o
+            else:
+                value *= self.reflectance(si, geometry.cos_half(), active)
+                value *= geometry.factor(self.shadowing == "v_cavity")
             # The mean over the covered wavelengths: any of them may have chosen the direction.
             diffuse = _diffuse_share(count)
             density = diffuse * dr.inv_pi + (1 - diffuse) * density / dr.maximum(count, 1)
@@ -299,6 +317,8 @@ def define() -> type:
                 f"shadowing = {self.shadowing}",
                 f"energy = {self.energy or 'conserved by itself'}",
             ]
+            if self.rigorous:
+                del lines[-3:]
             return "DiffractionGrating[\n" + "".join(f"  {line},\n" for line in lines) + "]"
 
     return DiffractionGrating

@@ -8,6 +8,8 @@ from typing import Annotated
 import typer
 
 from ..recipe import Recipe
+from ..rigorous.spectrum import RigorousSpectrum
+from ..spectrum import GratingSpectrum
 from ..spectrum.build import REPRESENTATIONS
 from ..surface.seam import seam_matters, seam_steps
 from .arguments import Overwrite, claim
@@ -77,11 +79,23 @@ def precompute(
             spectrum.save(target)
         tell(
             f"{target}: {spectrum.source}; {spectrum.extent}, {spectrum.grid}; coherence length "
-            f"{spectrum.coherence_length:.4g} µm; {spectrum.representation}, {spectrum.megabytes:.3g} MB, "
-            f"error {spectrum.error:.1e} (asked {spectrum.tolerance:g})\n"
-            f"left out, at most: {spectrum.dropped:.1e} of the power in weak frequencies; {spectrum.beyond:.1e} where "
-            f"no light reaches or no pixel resolves{seam}"
+            f"{spectrum.coherence_length:.4g} µm; {_table(spectrum)}{seam}"
         )
+
+
+def _table(spectrum: GratingSpectrum | RigorousSpectrum) -> str:
+    size, asked = f"{spectrum.megabytes:.3g} MB", f"(asked {spectrum.tolerance:g})"
+    if isinstance(spectrum, RigorousSpectrum):
+        return (
+            f"rigorous, {spectrum.material_name}, {size}, mean error {spectrum.error:.1e} {asked}\n"
+            f"at most {spectrum.worst:.1e} of the reflected light, {spectrum.worst_near:.1e} beside an order that "
+            "passes off"
+        )
+    return (
+        f"{spectrum.representation}, {size}, error {spectrum.error:.1e} {asked}\n"
+        f"left out, at most: {spectrum.dropped:.1e} of the power in weak frequencies; {spectrum.beyond:.1e} where no "
+        "light reaches or no pixel resolves"
+    )
 
 
 def _seam(source: Path, recipe: Recipe) -> str:

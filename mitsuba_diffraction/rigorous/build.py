@@ -15,12 +15,13 @@ from numpy.typing import NDArray
 from ..coherence import SUN_COHERENCE_LENGTH, lobe_width
 from ..files import whole_file
 from ..surface.heightfield import HeightField
+from .axes import Axes
 from .blas import one_thread
 from .coordinate_transformation import Grating, light_from, scatter
 from .curve import curve_of
 from .efficiencies import efficiencies
 from .materials import refractive_index
-from .spectrum import Axes, RigorousSpectrum
+from .spectrum import RigorousSpectrum
 
 Real = NDArray[np.float64]
 Progress = Callable[[int, int], None]

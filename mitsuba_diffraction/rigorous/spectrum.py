@@ -2,92 +2,20 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..coherence import lobe_width
+from ..coherence import lobe_reach, lobe_width
+from ..spectrum.orders import OrderGrid
+from .axes import Axes
+from .file import load, save
 
 Real = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Axes:
-    """The coordinates of the table: such that η is smooth in them, and the same for light and for reversed light.
-
-    With ν = T/λ, directions enter by three numbers, symmetric under exchange of ω_i and ω_o but for the sign of c:
-
-        k_y = (ω_o,y − ω_i,y) ν / 2,    g = √(ν² − k_y²),    c = (ω_o,x − ω_i,x) ν / 2.
-
-    In units of 2π/T, g is the wave number across the grooves; light of order m comes in with k_x = c + m/2 and leaves
-    with c − m/2. Order n of the same light passes off where |c + m/2 − n| = g, which is where
-
-        P = g + c − |m|/2    or    R = g − c − |m|/2
-
-    is an integer. Both are above zero if order m propagates; reversed light exchanges them, and η_m(P, R) = η_m(R, P)
-    by reciprocity. Beside such a line η goes as a square root, so that along P and R the nodes lie at
-
-        P = i + sin²(π f / 2 s),    f = 0 … s,    X = i s + f,
-
-    s steps to each unit: η is smooth in X from one whole P to the next. The third coordinate is the wavelength, from
-    the shortest to the longest that g admits (k_y² ≥ 0):
-
-        λ = λ₀ + (λ₁ − λ₀) Z / (K − 1),    λ₀ = min(λ_min, T/g),    λ₁ = min(λ_max, T/g).
-
-    Attributes:
-        period: T in µm.
-        wavelengths: (shortest, longest) in µm.
-        steps: s.
-        planes: K.
-    """
-
-    period: float
-    wavelengths: tuple[float, float]
-    steps: int
-    planes: int
-
-    @property
-    def reach(self) -> float:
-        """2 ν of the shortest wavelength: P + R + |m| is below."""
-        return 2 * self.period / self.wavelengths[0]
-
-    @property
-    def largest(self) -> int:
-        """M, the largest order that any pair of directions reaches."""
-        return int(np.ceil(self.reach)) - 1
-
-    def units(self, m: int) -> int:
-        """How many units P and R of order m cover."""
-        return int(np.ceil(self.reach - abs(m)))
-
-    def side(self, m: int) -> int:
-        """Nodes of order m along P, and along R."""
-        return self.units(m) * self.steps + 1
-
-    def offset(self, m: int) -> int:
-        """Where the nodes of order m start in a plane: [P, R] of order −M first."""
-        return sum(self.side(k) ** 2 for k in range(-self.largest, m))
-
-    @property
-    def nodes(self) -> int:
-        """In a plane."""
-        return self.offset(self.largest + 1)
-
-    def nodes_at(self, count: int) -> Real:
-        """P at X = 0 … count − 1."""
-        i, f = np.divmod(np.arange(count), self.steps)
-        return i + np.sin(np.pi / 2 * f / self.steps) ** 2
-
-    def position(self, p: Real) -> Real:
-        """X of P ≥ 0."""
-        i = np.floor(p)
-        return self.steps * (i + 2 / np.pi * np.arcsin(np.sqrt(p - i)))
-
-    def range(self, g: Real) -> tuple[Real, Real]:
-        """λ₀ and λ₁ at g, µm."""
-        return tuple(np.minimum(w, self.period / np.maximum(g, 1e-12)) for w in self.wavelengths)
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,6 +57,30 @@ class RigorousSpectrum:
             raise ValueError(f"values: got {self.values.shape} of {self.values.dtype}, wanted {wanted} of float32")
         lobe_width(self.coherence_length)
 
+    # As a `GratingSpectrum` has them.
+    extent = "tile"
+    representation = "rigorous"
+    largest_angle = 90.0
+
+    @property
+    def wavelengths(self) -> tuple[float, float]:
+        """(shortest, longest) in nm."""
+        shortest, longest = (1e3 * w for w in self.axes.wavelengths)
+        return shortest, longest
+
+    @property
+    def grid(self) -> OrderGrid:
+        """The orders m that any pair of directions reaches."""
+        return OrderGrid((self.axes.period, self.axes.period), (self.axes.largest, 0))
+
+    @property
+    def material_name(self) -> str:
+        """As recipes and scenes give it."""
+        if self.material:
+            return f"material {self.material}"
+        index = self.int_ior.real if np.imag(self.int_ior) == 0 else self.int_ior
+        return f"int_ior {index:.6g}"
+
     @property
     def megabytes(self) -> float:
         """Size of the table in memory."""
@@ -138,6 +90,17 @@ class RigorousSpectrum:
     def lobe_width(self) -> float:
         """σ_q in cycles/µm."""
         return lobe_width(self.coherence_length)
+
+    @property
+    def reach(self) -> float:
+        """How far the lobe of an order is followed, in standard deviations σ_q: a tenth of the tolerance is beyond."""
+        return lobe_reach(0.1 * self.tolerance)
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 of what a renderer needs of it: spectra that have one show the same."""
+        told = repr((self.axes, self.material, self.int_ior, self.coherence_length, self.tolerance))
+        return hashlib.sha256(told.encode() + self.values.tobytes()).hexdigest()
 
     def evaluate(self, m: ArrayLike, c: ArrayLike, g: ArrayLike, wavelength: ArrayLike) -> Real:
         """η_m from the table, linear between its nodes.
@@ -183,22 +146,23 @@ class RigorousSpectrum:
         m = m[np.abs(alpha - m) < g]
         return m, self.evaluate(m, alpha - m / 2, g, wavelength)
 
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the spectrum as an OpenEXR file, whole or not at all."""
-        from .file import save
+    def save(self, path: str | os.PathLike[str], recipe: str = "") -> None:
+        """Write the spectrum as an OpenEXR file, whole or not at all; `recipe` is the digest of its `Recipe`.
 
-        save(self, path)
+        Raises:
+            OSError: if the file cannot be written.
+        """
+        save(self, path, recipe)
 
-    @staticmethod
-    def load(path: str | os.PathLike[str]) -> RigorousSpectrum:
+    @classmethod
+    def load(cls, path: str | os.PathLike[str], recipe: str | None = None) -> RigorousSpectrum:
         """Read a spectrum that `save` wrote.
 
         Raises:
-            ValueError: if the file is not a rigorous spectrum, or is damaged.
+            FileNotFoundError: if there is no such file.
+            ValueError: if the file is not a rigorous spectrum, is damaged, or was not built from that recipe.
         """
-        from .file import load
-
-        return load(path)
+        return load(path, cls, recipe)
 
 
 def _split(x: Real, count: NDArray[np.int64] | int) -> tuple[NDArray[np.int64], Real]:

@@ -28,6 +28,7 @@ from .slice_table import SliceTable, interpolation
 from .tile import TilePowers, inner
 
 VISIBLE = (360.0, 830.0)  # nm, the range that Mitsuba samples
+THEORIES = ("scalar", "rigorous")
 REPRESENTATIONS = ("auto", TaylorSeries.name, ChebyshevSeries.name, SvdSeries.name, SliceTable.representation)
 
 # Shares of the tolerance.
@@ -93,8 +94,8 @@ def precompute(
     """
     check_extent(extent)
     check_wavelengths(wavelengths)
-    if theory not in ("scalar", "rigorous"):
-        raise ValueError(f"theory: got {theory!r}, wanted scalar or rigorous")
+    if theory not in THEORIES:
+        raise ValueError(f"theory: got {theory!r}, wanted one of {', '.join(THEORIES)}")
     if theory == "rigorous":
         if (extent, largest_angle, representation) != ("tile", 90.0, "auto"):
             raise ValueError(

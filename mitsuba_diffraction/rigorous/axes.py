@@ -1,0 +1,87 @@
+"""The coordinates of the table of rigorous efficiencies."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Real = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Axes:
+    """The coordinates of the table: such that η is smooth in them, and the same for light and for reversed light.
+
+    With ν = T/λ, directions enter by three numbers, symmetric under exchange of ω_i and ω_o but for the sign of c:
+
+        k_y = (ω_o,y − ω_i,y) ν / 2,    g = √(ν² − k_y²),    c = (ω_o,x − ω_i,x) ν / 2.
+
+    In units of 2π/T, g is the wave number across the grooves; light of order m comes in with k_x = c + m/2 and leaves
+    with c − m/2. Order n of the same light passes off where |c + m/2 − n| = g, which is where
+
+        P = g + c − |m|/2    or    R = g − c − |m|/2
+
+    is an integer. Both are above zero if order m propagates; reversed light exchanges them, and η_m(P, R) = η_m(R, P)
+    by reciprocity. Beside such a line η goes as a square root, so that along P and R the nodes lie at
+
+        P = i + sin²(π f / 2 s),    f = 0 … s,    X = i s + f,
+
+    s steps to each unit: η is smooth in X from one whole P to the next. The third coordinate is the wavelength, from
+    the shortest to the longest that g admits (k_y² ≥ 0):
+
+        λ = λ₀ + (λ₁ − λ₀) Z / (K − 1),    λ₀ = min(λ_min, T/g),    λ₁ = min(λ_max, T/g).
+
+    Attributes:
+        period: T in µm.
+        wavelengths: (shortest, longest) in µm.
+        steps: s.
+        planes: K.
+    """
+
+    period: float
+    wavelengths: tuple[float, float]
+    steps: int
+    planes: int
+
+    @property
+    def reach(self) -> float:
+        """2 ν of the shortest wavelength: P + R + |m| is below."""
+        return 2 * self.period / self.wavelengths[0]
+
+    @property
+    def largest(self) -> int:
+        """M, the largest order that any pair of directions reaches."""
+        return int(np.ceil(self.reach)) - 1
+
+    def units(self, m: int) -> int:
+        """How many units P and R of order m cover."""
+        return int(np.ceil(self.reach - abs(m)))
+
+    def side(self, m: int) -> int:
+        """Nodes of order m along P, and along R."""
+        return self.units(m) * self.steps + 1
+
+    def offset(self, m: int) -> int:
+        """Where the nodes of order m start in a plane: [P, R] of order −M first."""
+        return sum(self.side(k) ** 2 for k in range(-self.largest, m))
+
+    @property
+    def nodes(self) -> int:
+        """In a plane."""
+        return self.offset(self.largest + 1)
+
+    def nodes_at(self, count: int) -> Real:
+        """P at X = 0 … count − 1."""
+        i, f = np.divmod(np.arange(count), self.steps)
+        return i + np.sin(np.pi / 2 * f / self.steps) ** 2
+
+    def position(self, p: Real) -> Real:
+        """X of P ≥ 0."""
+        i = np.floor(p)
+        return self.steps * (i + 2 / np.pi * np.arcsin(np.sqrt(p - i)))
+
+    def range(self, g: Real) -> tuple[Real, Real]:
+        """λ₀ and λ₁ at g, µm."""
+        return tuple(np.minimum(w, self.period / np.maximum(g, 1e-12)) for w in self.wavelengths)
