@@ -31,6 +31,9 @@ largest_angle = 90.0             # degrees from the normal
 representation = "auto"
 tolerance = 1e-3                 # of a sample by default a tenth of its standard error, 1e-3 to 1e-2
 largest_height_range = 20.0      # µm; deeper surfaces are refused
+theory = "scalar"                # or "rigorous", of one row and of one material:
+material = "Al"                  # a conductor by Mitsuba's name,
+int_ior = 1.5                    # or an index of refraction
 """
 
 from __future__ import annotations
@@ -51,9 +54,11 @@ from typing import Any
 
 from .errors import RequestError
 from .files import cache_folder, refuse_special
+from .rigorous.spectrum import RigorousSpectrum
 from .spectrum import GratingSpectrum
 from .spectrum.build import precompute
 from .spectrum.file import FORMAT_VERSION
+from .spectrum.load import load_spectrum
 from .surface.gratings import PATCHES, PROFILES
 from .surface.heightfield import HeightField
 from .surface.prepare import apply_steps, check_steps
@@ -64,11 +69,13 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
+Spectrum = GratingSpectrum | RigorousSpectrum
+
 _SCAN_KEYS = frozenset({"scan", "pixel_size", "height_range", "fill_missing", "channel", "unit", "prepare"})
 _SPECTRUM_KEYS = frozenset(
     {
         *("extent", "coherence_length", "wavelengths", "largest_angle", "representation", "tolerance"),
-        "largest_height_range",
+        *("largest_height_range", "theory", "material", "int_ior"),
     }
 )
 # Incremented when the same input gives a different result, to invalidate the cache.
@@ -76,7 +83,7 @@ _BUILD_VERSION = 5
 # Mitsuba constructs plugins in parallel; two with the same recipe must not both compute its spectrum.
 _building = threading.Lock()
 # Spectra in use, by the digest of their recipe: many BSDFs of one recipe read its file once.
-_in_use: weakref.WeakValueDictionary[str, GratingSpectrum] = weakref.WeakValueDictionary()
+_in_use: weakref.WeakValueDictionary[str, Spectrum] = weakref.WeakValueDictionary()
 
 
 class CacheWarning(UserWarning):
@@ -126,7 +133,7 @@ class Recipe:
                 raise RequestError(f"{name}: got {value!r}, wanted a number or a text")
             if not (_is_plain(value) or (isinstance(value, list | tuple) and all(_is_plain(v) for v in value))):
                 raise RequestError(f"{name}: got {value!r}, wanted a number, a text, or a list of them")
-        for name in ("tolerance", "coherence_length", "largest_angle", "largest_height_range"):
+        for name in ("tolerance", "coherence_length", "largest_angle", "largest_height_range", "int_ior"):
             if name in self.spectrum and not _is_number(self.spectrum[name]):
                 raise RequestError(f"{name}: got {self.spectrum[name]!r}, wanted a number")
         if "wavelengths" in self.spectrum and not isinstance(self.spectrum["wavelengths"], list | tuple):
@@ -216,7 +223,7 @@ class Recipe:
         except RequestError as error:
             raise RequestError(f"{path}: {error}") from None
 
-    def build(self, progress: Callable[[int, int], None] | None = None) -> GratingSpectrum:
+    def build(self, progress: Callable[[int, int], None] | None = None) -> Spectrum:
         """Compute the spectrum."""
         arguments = dict(self.spectrum)
         if "wavelengths" in arguments:
@@ -238,7 +245,7 @@ class Recipe:
         content.update(json.dumps([surface, self.patches, dict(self.spectrum)], sort_keys=True).encode())
         return content.hexdigest()
 
-    def cached(self, progress: Callable[[int, int], None] | None = None) -> GratingSpectrum:
+    def cached(self, progress: Callable[[int, int], None] | None = None) -> Spectrum:
         """The spectrum from the cache, or computed and cached.
 
         The cache is a folder of spectra named by `digest`: $MITSUBA_DIFFRACTION_CACHE, or the user's cache folder. A
@@ -254,10 +261,10 @@ class Recipe:
                 spectrum = _in_use[digest] = self._from_cache(digest, progress)
             return spectrum
 
-    def _from_cache(self, digest: str, progress: Callable[[int, int], None] | None) -> GratingSpectrum:
+    def _from_cache(self, digest: str, progress: Callable[[int, int], None] | None) -> Spectrum:
         path = cache_folder() / f"{digest}.exr"
         with suppress(RequestError, OSError):
-            return GratingSpectrum.load(path, recipe=digest)
+            return load_spectrum(path, recipe=digest)
         spectrum = self.build(progress)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)

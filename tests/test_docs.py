@@ -174,9 +174,11 @@ def test_the_manual_lists_the_parameters_of_the_plugins(llvm):
     text, listed, head = (ROOT / "docs" / "plugin.md").read_text().replace("`", ""), set(), []
     for line in text.splitlines():
         cells = [cell.strip() for cell in line.strip("| ").split(" | ")] if line.startswith("| ") else []
+        if not line.startswith("|"):
+            head = []
         if cells[:1] == ["parameter"]:
             head = cells
-        elif cells:
+        elif cells and head:
             row = dict(zip(head, cells, strict=False))
             listed.add((row["parameter"], row["type"], row.get("default", "").strip("| ")))
     known = (*diffraction_grating.PARAMETERS, *integrator.PARAMETERS, *diffraction_path.PARAMETERS)

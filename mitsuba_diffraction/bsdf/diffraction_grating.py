@@ -12,6 +12,7 @@ import numpy as np
 from ..coherence import SUN_COHERENCE_LENGTH
 from ..errors import RequestError
 from ..manual import Parameter, listed
+from ..rigorous.spectrum import RigorousSpectrum
 from ..spectrum.energy_table import SHADOWING
 from ..surface.heightfield import HeightField
 from ..wavelengths import VISIBLE
@@ -21,6 +22,7 @@ from .geometry import Geometry
 from .incidence import Incidence
 from .polarisation import reflected, through_layer
 from .reflectance import reflectance_from
+from .rigorous_parameters import check_parameters
 from .shared import SharedTables
 from .surface import surface_from
 from .tables import BELOW_ONE, opaque
@@ -30,13 +32,21 @@ LEAST_SHARE = 0.1  # of the samples, for the grating and for its base: what each
 
 PARAMETERS = (
     Parameter("filename", "string", "a saved spectrum (.exr) or a recipe (.toml)"),
-    Parameter("spectrum", "GratingSpectrum", "the same from Python, in load_dict"),
+    Parameter("spectrum", "GratingSpectrum or RigorousSpectrum", "the same from Python, in load_dict"),
     Parameter(
         "profile",
         "string",
         "a grating by formula instead of a file, with the parameters of the function of that name in "
         "`mitsuba_diffraction.gratings`, all lengths in µm, and coherence_length, tolerance and largest_height_range "
         "as in `precompute`",
+    ),
+    Parameter(
+        "theory",
+        "string",
+        "of a profile: scalar, or rigorous, Maxwell's equations for the material that is given and for gratings of one "
+        "row; files and spectra say which they are. Rigorous efficiencies are those of unpolarised light and exclude "
+        "height_scale, shadowing, fresnel, coat_ior and base",
+        "scalar",
     ),
     Parameter("int_ior, ext_ior", "float or string", "a dielectric, as in Mitsuba's `dielectric`", "1.5, air"),
     Parameter(
@@ -74,6 +84,8 @@ The BRDF is R · K · G · S(q; κ)/λ² · E: R the power reflectance at the ha
 and κ = 2π (cos θ_i + cos θ_o)/λ. E, as in `energy.py`, bounds the albedo by one; it is one where the albedo is
 below one without it. Without shadowing K diverges as 1/cos θ near the horizon: from 85° on E then falls with cos θ.
 
+Of rigorous theory the BRDF is Σ_m η_m N(q − m/T; σ_q² I)/λ², as in `rigorous_orders.py`: R, K, G and E are in η_m.
+
 Under a coat (`coat.py`) all this holds inside of it, where wavelengths are shorter and directions steeper; the front
 face of the coat is a mirror. A saved spectrum must cover the shorter wavelengths; one built from a recipe or a profile
 does.
@@ -94,7 +106,10 @@ def define() -> type:
             # long as anything holds it, be it a traceback: all that may fail comes first.
             self.coat = coat_from(props)
             self.spectrum, self._recipe = surface_from(props, self.coat)
-            self.reflectance = reflectance_from(props, self.coat)
+            self.rigorous = isinstance(self.spectrum, RigorousSpectrum)
+            self.reflectance = (
+                check_parameters(props, self.spectrum) if self.rigorous else reflectance_from(props, self.coat)
+            )
             self.orientation = _orientation(props)
             height_scale = props.get("height_scale", 1.0)
             if not isinstance(height_scale, int | float):
@@ -127,6 +142,9 @@ def define() -> type:
 
         def _update(self) -> None:
             """What depends on parameters that can change."""
+            if self.rigorous:
+                self.energy = None
+                return
             scale = np.max(self.height_scale)
             shortest = VISIBLE[0] / (1 if self.coat is None else self.coat.relative)
             largest = shortest / self.spectrum.wavelengths[0]
@@ -147,7 +165,8 @@ def define() -> type:
 
         def traverse(self, callback: mi.TraversalCallback) -> None:
             callback.put("orientation", self.orientation, mi.ParamFlags.Differentiable)
-            callback.put("height_scale", self.height_scale, mi.ParamFlags.Differentiable)
+            if not self.rigorous:
+                callback.put("height_scale", self.height_scale, mi.ParamFlags.Differentiable)
             self.reflectance.traverse(callback)
             if self.base is not None:
                 callback.put("base", self.base.bsdf, mi.ParamFlags.Differentiable)
@@ -181,19 +200,26 @@ def define() -> type:
             for channel in range(len(value)):
                 wavelength = si.wavelengths[channel] * 1e-3  # µm
                 frequency = dr.rcp(wavelength)
-                power, share = self.scattering.evaluate(
-                    u * frequency,
-                    v * frequency,
-                    -geometry.w * dr.two_pi * index * frequency * self.height_scale,
-                    Incidence.of(towards, frequency, self.height_scale, self.coat),
-                    active & covered[channel],
-                )
+                if self.rigorous:
+                    power, share = self.scattering.evaluate(wi, wo, frequency, active & covered[channel])
+                else:
+                    power, share = self.scattering.evaluate(
+                        u * frequency,
+                        v * frequency,
+                        -geometry.w * dr.two_pi * index * frequency * self.height_scale,
+                        Incidence.of(towards, frequency, self.height_scale, self.coat),
+                        active & covered[channel],
+                    )
                 value[channel] = dr.select(within, power / dr.square(wavelength), 0)
                 density += share / dr.square(wavelength)
             if self.energy is not None:
                 wavelengths = mi.UnpolarizedSpectrum(si.wavelengths) * (1e-3 / index)
                 value = self.energy.conserve(value, wi, wo, wavelengths, active)
-            value *= self.reflectance(si, geometry.cos_half(), active) * geometry.factor(self.shadowing == "v_cavity")
+            if self.rigorous:
+                value *= geometry.cos_o
+            else:
+                value *= self.reflectance(si, geometry.cos_half(), active)
+                value *= geometry.factor(self.shadowing == "v_cavity")
             # The mean over the covered wavelengths: any of them may have chosen the direction.
             diffuse = _diffuse_share(count)
             density = diffuse * dr.inv_pi + (1 - diffuse) * density / dr.maximum(count, 1)
@@ -455,6 +481,8 @@ def define() -> type:
                 f"shadowing = {self.shadowing}",
                 f"energy = {self.energy or ('conserved by itself' if self.conserve_energy else 'not conserved')}",
             ]
+            if self.rigorous:
+                del lines[-3:]
             return "DiffractionGrating[\n" + "".join(f"  {line},\n" for line in lines) + "]"
 
     return DiffractionGrating

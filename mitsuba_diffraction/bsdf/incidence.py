@@ -28,7 +28,7 @@ class Incidence:
     kappa_span: mi.Float
 
     @classmethod
-    def of(cls, wi: mi.Vector3f, frequency: mi.Float, height_scale: mi.Float, coat: Coat | None) -> Incidence:
+    def of(cls, wi: mi.Vector3f, frequency: mi.Float, height_scale: mi.Float, coat: Coat | None = None) -> Incidence:
         """κ = 2π (cos θ_i + cos θ_o)/λ times the scale of the heights; under a coat, with what holds inside of it.
 
         Without gradients: directions are drawn, and what is drawn does not follow the parameters.

@@ -136,10 +136,10 @@ class OrderSampler:
 
         if self.rows == 1:
             row = mi.Int32(0)
-            column, _ = _search(before_x, left, right, self.columns, u)
+            column, _ = search(before_x, left, right, self.columns, u)
             return row, column, v
-        row, _ = _search(before_y, bottom, top, self.rows, u)
-        column, rest = _search(before_x, left, right, self.columns, v.x)
+        row, _ = search(before_y, bottom, top, self.rows, u)
+        column, rest = search(before_x, left, right, self.columns, v.x)
         return row, column, mi.Point2f(rest, v.y)
 
 
@@ -149,7 +149,7 @@ def _units(average: NDArray[np.float64]) -> NDArray[np.int64]:
     return 1 + np.floor(mixed * (WHOLE - average.size)).astype(np.int64)
 
 
-def _search(
+def search(
     before: Callable[[mi.Int32], mi.Float], first: mi.Int32, end: mi.Int32, count: int, u: mi.Float
 ) -> tuple[mi.Int32, mi.Float]:
     """The index i with F(i) ≤ F(first) + u (F(end) − F(first)) < F(i + 1), first ≤ i < end.

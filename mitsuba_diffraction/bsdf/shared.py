@@ -9,12 +9,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..rigorous.spectrum import RigorousSpectrum
 from ..spectrum import GratingSpectrum
 from ..spectrum.albedo import GatheredSpectrum, energy_table
 from ..spectrum.energy_table import EnergyTable
 from ..spectrum.furnace import conserving
 from .energy import Energy
 from .line_spectrum import LineSpectrum
+from .rigorous_orders import RigorousOrders
 from .smooth_spectrum import SmoothSpectrum
 
 STEP = 1e-3  # of height_scale, for the derivative of the energy table
@@ -32,8 +34,11 @@ class SharedTables:
 
     KEPT = 8  # energy tables of other heights
 
-    def __init__(self, spectrum: GratingSpectrum) -> None:
-        self.scattering = (LineSpectrum if spectrum.extent == "tile" else SmoothSpectrum)(spectrum)
+    def __init__(self, spectrum: GratingSpectrum | RigorousSpectrum) -> None:
+        if isinstance(spectrum, RigorousSpectrum):
+            self.scattering = RigorousOrders(spectrum)
+        else:
+            self.scattering = (LineSpectrum if spectrum.extent == "tile" else SmoothSpectrum)(spectrum)
         self._spectrum = spectrum
         self._gathered: GatheredSpectrum | None = None
         self._tables: dict[tuple[str, float], EnergyTable] = {}
@@ -41,7 +46,7 @@ class SharedTables:
         self._lock = threading.RLock()
 
     @classmethod
-    def of(cls, spectrum: GratingSpectrum) -> SharedTables:
+    def of(cls, spectrum: GratingSpectrum | RigorousSpectrum) -> SharedTables:
         """Those of an equal spectrum, while some BSDF has them; else new ones.
 
         Mitsuba constructs plugins on several threads: one of them makes the tables, the others wait.

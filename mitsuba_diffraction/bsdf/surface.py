@@ -10,16 +10,22 @@ import mitsuba as mi
 
 from ..errors import RequestError
 from ..recipe import Recipe
+from ..rigorous.spectrum import RigorousSpectrum
 from ..spectrum import GratingSpectrum
+from ..spectrum.build import THEORIES
+from ..spectrum.load import load_spectrum
 from ..surface.gratings import COHERENCE_LENGTHS, PROFILES
 from ..wavelengths import VISIBLE
 from .coat import Coat
+from .rigorous_parameters import material_from
+
+Spectrum = GratingSpectrum | RigorousSpectrum
 
 _PREFIX = "handed over: "
-_handed_over: weakref.WeakValueDictionary[str, GratingSpectrum] = weakref.WeakValueDictionary()
+_handed_over: weakref.WeakValueDictionary[str, Spectrum] = weakref.WeakValueDictionary()
 
 
-def surface_from(props: mi.Properties, coat: Coat | None) -> tuple[GratingSpectrum, Recipe | None]:
+def surface_from(props: mi.Properties, coat: Coat | None) -> tuple[Spectrum, Recipe | None]:
     """The spectrum that the parameters `filename`, `spectrum`, or `profile` with its own parameters name.
 
     Wavelengths are shorter inside a coat: what is built here is built for λ/n.
@@ -31,15 +37,23 @@ def surface_from(props: mi.Properties, coat: Coat | None) -> tuple[GratingSpectr
         ValueError: unless exactly one of them is given, or if what it names cannot be had.
     """
     given = [name for name in ("filename", "spectrum", "profile") if name in props]
+    theory = props.get("theory", "scalar")
+    if theory not in THEORIES:
+        raise ValueError(f"theory: got {theory!r}, wanted one of {', '.join(THEORIES)}")
     if len(given) != 1:
         raise RequestError(
             f"surface: got {' and '.join(given) or 'nothing'}, wanted one of filename (a saved spectrum or a recipe), "
             f"profile ({', '.join(PROFILES)}) or, from Python, spectrum"
         )
-    if given == ["spectrum"]:
-        return _taken_over(props["spectrum"]), None
-    if given == ["filename"]:
-        return _from_file(Path(str(mi.file_resolver().resolve(str(props["filename"])))), coat)
+    if given != ["profile"]:
+        if given == ["spectrum"]:
+            spectrum, recipe = _taken_over(props["spectrum"]), None
+        else:
+            spectrum, recipe = _from_file(Path(str(mi.file_resolver().resolve(str(props["filename"])))), coat)
+        found = "rigorous" if isinstance(spectrum, RigorousSpectrum) else "scalar"
+        if props.get("theory", found) != found:
+            raise RequestError(f"theory: got {theory!r} with a spectrum of {found} theory, wanted one built for it")
+        return spectrum, recipe
     name = props["profile"]
     if name not in PROFILES:
         raise RequestError(f"profile: got {name!r}, wanted one of {', '.join(PROFILES)}")
@@ -47,6 +61,8 @@ def surface_from(props: mi.Properties, coat: Coat | None) -> tuple[GratingSpectr
     surface = {"profile": name, **{key: props[key] for key in (*known, "patches") if key in props}}
     settings = {"coherence_length": COHERENCE_LENGTHS[name]} if name in COHERENCE_LENGTHS else {}
     settings |= {key: props[key] for key in ("coherence_length", "tolerance", "largest_height_range") if key in props}
+    if theory == "rigorous":
+        settings |= {"theory": theory, **material_from(props)}
     recipe = _inside(coat, Recipe(surface, settings))
     return recipe.cached(), recipe
 
@@ -59,7 +75,7 @@ def _inside(coat: Coat | None, recipe: Recipe) -> Recipe:
     return Recipe(recipe.surface, {**recipe.spectrum, "wavelengths": wavelengths}, recipe.folder)
 
 
-def _from_file(path: Path, coat: Coat | None) -> tuple[GratingSpectrum, Recipe | None]:
+def _from_file(path: Path, coat: Coat | None) -> tuple[Spectrum, Recipe | None]:
     suffix = path.suffix.lower()
     if suffix in (".toml", ".exr") and not path.is_file():
         # What is not found stays relative; the folder of a scene is searched first.
@@ -70,14 +86,14 @@ def _from_file(path: Path, coat: Coat | None) -> tuple[GratingSpectrum, Recipe |
         recipe = _inside(coat, Recipe.load(path))
         return recipe.cached(), recipe
     if suffix == ".exr":
-        return GratingSpectrum.load(path), None
+        return load_spectrum(path), None
     raise RequestError(
         f"filename: got {path}, wanted a saved spectrum (.exr) or a recipe (.toml); "
         "a scan is turned into a spectrum by `mitsuba-diffraction precompute`, or named by a recipe"
     )
 
 
-def _taken_over(handle: str) -> GratingSpectrum:
+def _taken_over(handle: str) -> Spectrum:
     spectrum = _handed_over.get(handle)
     if spectrum is None:
         raise RequestError(
@@ -87,11 +103,11 @@ def _taken_over(handle: str) -> GratingSpectrum:
 
 
 def hand_over(value: object) -> object:
-    """A scene dictionary in which every GratingSpectrum is replaced by a handle.
+    """A scene dictionary in which every spectrum is replaced by a handle.
 
     Mitsuba's load_dict accepts only types bound in C++, so an object of ours travels by name.
     """
-    if isinstance(value, GratingSpectrum):
+    if isinstance(value, Spectrum):
         handle = f"{_PREFIX}{id(value)}"
         _handed_over[handle] = value
         return handle

@@ -9,6 +9,8 @@ import typer
 
 from ..errors import RequestError
 from ..recipe import Recipe
+from ..rigorous.spectrum import RigorousSpectrum
+from ..spectrum import GratingSpectrum
 from ..spectrum.build import REPRESENTATIONS
 from ..surface.seam import seam_matters, seam_steps
 from .arguments import Overwrite, claim
@@ -76,14 +78,26 @@ def precompute(
         with progress_bar(f"spectrum of {source.name}") as progress:
             spectrum = recipe_of(source, of_scan, settings).build(progress)
             spectrum.save(target)
-        scatter = f", standard error of one scan {spectrum.standard_error:.2g}" if spectrum.extent == "sample" else ""
         tell(
             f"{target}: {spectrum.source}; {spectrum.extent}, {spectrum.grid}; coherence length "
-            f"{spectrum.coherence_length:.4g} µm; {spectrum.representation}, {spectrum.megabytes:.3g} MB, "
-            f"error {spectrum.error:.1e} (tolerance {spectrum.tolerance:.3g}){scatter}\n"
-            f"truncated, at most: {spectrum.dropped:.1e} of the power at weak frequencies; {spectrum.beyond:.1e} at "
-            f"frequencies that no direction reaches or no pixel resolves{seam}"
+            f"{spectrum.coherence_length:.4g} µm; {_table(spectrum)}{seam}"
         )
+
+
+def _table(spectrum: GratingSpectrum | RigorousSpectrum) -> str:
+    size, asked = f"{spectrum.megabytes:.3g} MB", f"(tolerance {spectrum.tolerance:.3g})"
+    if isinstance(spectrum, RigorousSpectrum):
+        return (
+            f"rigorous, {spectrum.material_name}, {size}, mean error {spectrum.error:.1e} {asked}\n"
+            f"worst error {spectrum.worst:.1e} of the reflected light, {spectrum.worst_near:.1e} beside an order that "
+            "passes off"
+        )
+    scatter = f", standard error of one scan {spectrum.standard_error:.2g}" if spectrum.extent == "sample" else ""
+    return (
+        f"{spectrum.representation}, {size}, error {spectrum.error:.1e} {asked}{scatter}\n"
+        f"truncated, at most: {spectrum.dropped:.1e} of the power at weak frequencies; {spectrum.beyond:.1e} at "
+        "frequencies that no direction reaches or no pixel resolves"
+    )
 
 
 def _seam(source: Path, recipe: Recipe) -> str:

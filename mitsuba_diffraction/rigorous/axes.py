@@ -1,4 +1,4 @@
-"""Where the nodes of a table of rigorous efficiencies lie."""
+"""The coordinates of the table of rigorous efficiencies."""
 
 from __future__ import annotations
 
@@ -85,9 +85,3 @@ class Axes:
     def range(self, g: Real) -> tuple[Real, Real]:
         """λ₀ and λ₁ at g, µm."""
         return tuple(np.minimum(w, self.period / np.maximum(g, 1e-12)) for w in self.wavelengths)
-
-
-def split(x: Real, count: NDArray[np.int64] | int) -> tuple[NDArray[np.int64], Real]:
-    """The node below x, at most the last but one, and how far x is beyond it."""
-    low = np.clip(np.floor(x).astype(np.int64), 0, np.maximum(np.asarray(count) - 2, 0))
-    return low, x - low

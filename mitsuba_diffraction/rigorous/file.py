@@ -12,18 +12,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
-import OpenEXR
 
 from ..errors import RequestError
-from ..files import whole_file
-from ..spectrum.file import silence
+from ..spectrum.exr import doubles, one_line, read, write
 from .axes import Axes
 
 if TYPE_CHECKING:
     from .spectrum import RigorousSpectrum
 
 Spectrum = TypeVar("Spectrum")
-
 FORMAT = "mitsuba_diffraction rigorous spectrum"
 FORMAT_VERSION = 1
 
@@ -31,8 +28,8 @@ _NUMBERS = ("coherence_length", "tolerance", "error", "worst", "worst_near")
 _TEXTS = ("material", "source", "source_digest")
 
 
-def save(spectrum: RigorousSpectrum, path: str | os.PathLike[str]) -> None:
-    """Write `spectrum` to `path`, whole or not at all.
+def save(spectrum: RigorousSpectrum, path: str | os.PathLike[str], recipe: str = "") -> None:
+    """Write `spectrum` to `path`, whole or not at all; `recipe` is the digest of that from which it was built.
 
     Raises:
         OSError: if the file cannot be written.
@@ -47,47 +44,23 @@ def save(spectrum: RigorousSpectrum, path: str | os.PathLike[str]) -> None:
         top += side
     index = complex(spectrum.int_ior)
     header = {
-        "type": OpenEXR.scanlineimage,
-        "compression": OpenEXR.ZIP_COMPRESSION,
-        "format": FORMAT,
-        "formatVersion": FORMAT_VERSION,
-        "period": np.array([axes.period]),
-        "wavelengths": np.array(axes.wavelengths),
+        "period": doubles(axes.period),
+        "wavelengths": doubles(*axes.wavelengths),
         "steps": axes.steps,
         "planes": axes.planes,
         "harmonics": spectrum.harmonics,
-        "intIor": np.array([index.real, index.imag]),
-        **{_camel(name): np.array([getattr(spectrum, name)]) for name in _NUMBERS},
+        "intIor": doubles(index.real, index.imag),
+        **{_camel(name): doubles(getattr(spectrum, name)) for name in _NUMBERS},
         **{_camel(name): getattr(spectrum, name) for name in _TEXTS},
         "units": "lengths and wavelengths in micrometres",
     }
-    with whole_file(path) as temporary:
-        OpenEXR.File(header, {_channel(k): plane for k, plane in enumerate(sheet)}).write(str(temporary))
+    write(path, FORMAT, FORMAT_VERSION, header, {_channel(k): plane for k, plane in enumerate(sheet)}, recipe)
 
 
-def load(path: str | os.PathLike[str], construct: Callable[..., Spectrum]) -> Spectrum:
-    """Hand what `save` wrote to the constructor of a `RigorousSpectrum`.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if it is not a rigorous spectrum, is damaged, or is of a version not known here.
-    """
+def load(path: str | os.PathLike[str], construct: Callable[..., Spectrum], recipe: str | None = None) -> Spectrum:
+    """Hand what `save` wrote to the constructor of a `RigorousSpectrum`; errors as in `RigorousSpectrum.load`."""
     path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
-    try:
-        with silence():
-            file = OpenEXR.File(str(path), separate_channels=True)
-            header, channels = file.header(), file.channels()
-    except Exception as error:
-        raise RequestError(f"{path}: not a readable OpenEXR file ({' '.join(str(error).split())})") from None
-    if header.get("format") != FORMAT:
-        raise RequestError(f"{path}: got an OpenEXR file of another kind, wanted a rigorous spectrum")
-    if header.get("formatVersion") != FORMAT_VERSION:
-        raise RequestError(
-            f"{path}: got format version {header.get('formatVersion')}, wanted {FORMAT_VERSION}; "
-            "build the spectrum again with this version of mitsuba_diffraction"
-        )
+    header, channels = read(path, FORMAT, FORMAT_VERSION, recipe)
     try:
         (period,), wavelengths = header["period"], tuple(float(x) for x in header["wavelengths"])
         axes = Axes(float(period), wavelengths, header["steps"], header["planes"])
@@ -108,7 +81,7 @@ def load(path: str | os.PathLike[str], construct: Callable[..., Spectrum]) -> Sp
     except KeyError as error:
         raise RequestError(f"{path}: a damaged spectrum, {error} is missing") from None
     except (TypeError, ValueError, IndexError) as error:
-        raise RequestError(f"{path}: a damaged spectrum ({' '.join(str(error).split())})") from None
+        raise RequestError(f"{path}: a damaged spectrum ({one_line(error)})") from None
 
 
 def _square(axes: Axes, values: np.ndarray, m: int) -> np.ndarray:

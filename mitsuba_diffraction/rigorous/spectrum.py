@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..coherence import lobe_width
+from ..coherence import lobe_reach, lobe_width
 from ..errors import RequestError
-from .axes import Axes, split
+from ..spectrum.orders import OrderGrid
+from .axes import Axes
 from .file import load, save
 
 Real = NDArray[np.float64]
@@ -55,6 +58,30 @@ class RigorousSpectrum:
             raise RequestError(f"values: got {self.values.shape} of {self.values.dtype}, wanted {wanted} of float32")
         lobe_width(self.coherence_length)
 
+    # As a `GratingSpectrum` has them.
+    extent = "tile"
+    representation = "rigorous"
+    largest_angle = 90.0
+
+    @property
+    def wavelengths(self) -> tuple[float, float]:
+        """(shortest, longest) in nm."""
+        shortest, longest = (1e3 * w for w in self.axes.wavelengths)
+        return shortest, longest
+
+    @property
+    def grid(self) -> OrderGrid:
+        """The orders m that any pair of directions reaches."""
+        return OrderGrid((self.axes.period, self.axes.period), (self.axes.largest, 0))
+
+    @property
+    def material_name(self) -> str:
+        """As recipes and scenes give it."""
+        if self.material:
+            return f"material {self.material}"
+        index = self.int_ior.real if np.imag(self.int_ior) == 0 else self.int_ior
+        return f"int_ior {index:.6g}"
+
     @property
     def megabytes(self) -> float:
         """Size of the table in memory."""
@@ -64,6 +91,17 @@ class RigorousSpectrum:
     def lobe_width(self) -> float:
         """σ_q in cycles/µm."""
         return lobe_width(self.coherence_length)
+
+    @property
+    def reach(self) -> float:
+        """How far the lobe of an order is followed, in standard deviations σ_q: a tenth of the tolerance is beyond."""
+        return lobe_reach(0.1 * self.tolerance)
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 of what a renderer needs of it: spectra that have one show the same."""
+        told = repr((self.axes, self.material, self.int_ior, self.coherence_length, self.tolerance))
+        return hashlib.sha256(told.encode() + self.values.tobytes()).hexdigest()
 
     def evaluate(self, m: ArrayLike, c: ArrayLike, g: ArrayLike, wavelength: ArrayLike) -> Real:
         """η_m from the table, linear between its nodes.
@@ -87,7 +125,7 @@ class RigorousSpectrum:
         first, last = axes.range(g)
         z = np.clip((wavelength - first) / np.maximum(last - first, 1e-9), 0, 1) * (axes.planes - 1)
         result = np.zeros(m.shape)
-        places = [split(axes.position(p), side), split(axes.position(r), side), split(z, axes.planes)]
+        places = [_split(axes.position(p), side), _split(axes.position(r), side), _split(z, axes.planes)]
         for corner in np.ndindex(2, 2, 2):
             (i, j, k), weights = zip(
                 *((low + up, f if up else 1 - f) for (low, f), up in zip(places, corner, strict=True)), strict=True
@@ -109,15 +147,26 @@ class RigorousSpectrum:
         m = m[np.abs(alpha - m) < g]
         return m, self.evaluate(m, alpha - m / 2, g, wavelength)
 
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the spectrum as an OpenEXR file, whole or not at all."""
-        save(self, path)
+    def save(self, path: str | os.PathLike[str], recipe: str = "") -> None:
+        """Write the spectrum as an OpenEXR file, whole or not at all; `recipe` is the digest of its `Recipe`.
+
+        Raises:
+            OSError: if the file cannot be written.
+        """
+        save(self, path, recipe)
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> RigorousSpectrum:
+    def load(cls, path: str | os.PathLike[str], recipe: str | None = None) -> RigorousSpectrum:
         """Read a spectrum that `save` wrote.
 
         Raises:
-            ValueError: if the file is not a rigorous spectrum, or is damaged.
+            FileNotFoundError: if there is no such file.
+            ValueError: if the file is not a rigorous spectrum, is damaged, or was not built from that recipe.
         """
-        return load(path, cls)
+        return load(path, cls, recipe)
+
+
+def _split(x: Real, count: NDArray[np.int64] | int) -> tuple[NDArray[np.int64], Real]:
+    """The node below x, at most the last but one, and how far x is beyond it."""
+    low = np.clip(np.floor(x).astype(np.int64), 0, np.maximum(np.asarray(count) - 2, 0))
+    return low, x - low

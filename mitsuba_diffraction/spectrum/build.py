@@ -32,6 +32,7 @@ from .slice_table import SliceTable, interpolation
 from .standard_error import standard_error
 from .tile import TilePowers, inner
 
+THEORIES = ("scalar", "rigorous")
 REPRESENTATIONS = ("auto", TaylorSeries.name, ChebyshevSeries.name, SvdSeries.name, SliceTable.representation)
 
 # Shares of the tolerance.
@@ -107,8 +108,8 @@ def precompute(
     height_field = patches[0]
     height_range = max(patch.height_range for patch in patches)
     check_wavelengths(wavelengths)
-    if theory not in ("scalar", "rigorous"):
-        raise RequestError(f"theory: got {theory!r}, wanted scalar or rigorous")
+    if theory not in THEORIES:
+        raise RequestError(f"theory: got {theory!r}, wanted one of {', '.join(THEORIES)}")
     if theory == "rigorous":
         if (extent, largest_angle, representation) != ("tile", 90.0, "auto"):
             raise RequestError(

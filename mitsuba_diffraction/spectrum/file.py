@@ -9,25 +9,20 @@ known as such.
 
 from __future__ import annotations
 
-import contextlib
-import io
 import json
 import os
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
-import OpenEXR
 
 from ..errors import RequestError
-from ..files import UNSEALED, is_intact, seal, whole_file
-from ..outputs import made_for
 from .energy_table import EnergyTable
 from .expansions.chebyshev import ChebyshevSeries
 from .expansions.svd import SvdSeries
 from .expansions.taylor import TaylorSeries
+from .exr import doubles, one_line, read, write
 from .orders import OrderGrid
 from .series_table import SeriesTable
 from .slice_table import SliceTable
@@ -41,26 +36,6 @@ FORMAT = "mitsuba_diffraction grating spectrum"
 FORMAT_VERSION = 4
 
 
-@contextlib.contextmanager
-def silence() -> Iterator[None]:
-    """Keep the library from giving its own account of a broken file, from Python and from C, before it raises."""
-    sys.stderr.flush()
-    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
-    try:
-        os.dup2(nowhere, 2)
-        with contextlib.redirect_stdout(io.StringIO()):
-            yield
-    finally:
-        os.dup2(kept, 2)
-        os.close(kept)
-        os.close(nowhere)
-
-
-def _doubles(*values: float) -> np.ndarray:
-    # A Python float would be written in single precision.
-    return np.array(values, np.float64)
-
-
 def save(spectrum: GratingSpectrum, path: str | os.PathLike[str], recipe: str = "") -> None:
     """Write `spectrum` to `path`, whole or not at all; `recipe` is the digest of that from which it was built.
 
@@ -68,32 +43,24 @@ def save(spectrum: GratingSpectrum, path: str | os.PathLike[str], recipe: str = 
         OSError: if the file cannot be written.
     """
     header = {
-        "type": OpenEXR.scanlineimage,
-        "compression": OpenEXR.ZIP_COMPRESSION,
-        "format": FORMAT,
-        "formatVersion": FORMAT_VERSION,
         "representation": spectrum.representation,
         "extent": spectrum.extent,
-        "heightRange": _doubles(spectrum.height_range),
-        "pixelSize": _doubles(*spectrum.pixel_size),
+        "heightRange": doubles(spectrum.height_range),
+        "pixelSize": doubles(*spectrum.pixel_size),
         **_grid_header(spectrum.grid),
-        "coherenceLength": _doubles(spectrum.coherence_length),
-        "wavelengths": _doubles(*spectrum.wavelengths),
-        "tolerance": _doubles(spectrum.tolerance),
-        "error": _doubles(spectrum.error),
-        "largestAngle": _doubles(spectrum.largest_angle),
-        "dropped": _doubles(spectrum.dropped),
-        "beyond": _doubles(spectrum.beyond),
+        "coherenceLength": doubles(spectrum.coherence_length),
+        "wavelengths": doubles(*spectrum.wavelengths),
+        "tolerance": doubles(spectrum.tolerance),
+        "error": doubles(spectrum.error),
+        "largestAngle": doubles(spectrum.largest_angle),
+        "dropped": doubles(spectrum.dropped),
+        "beyond": doubles(spectrum.beyond),
         "patches": spectrum.patches,
-        **({"standardError": _doubles(spectrum.standard_error)} if spectrum.extent == "sample" else {}),
+        **({"standardError": doubles(spectrum.standard_error)} if spectrum.extent == "sample" else {}),
         "source": spectrum.source,
         "sourceSha256": spectrum.source_digest,
         "units": "lengths in micrometres, wavelengths in nanometres",
-        "recipeSha256": recipe,
-        "contentSha256": UNSEALED,
     }
-    if (request := made_for(path)) is not None:
-        header["madeFor"] = request
     if isinstance(spectrum.table, SeriesTable) and isinstance(spectrum.table.series, SvdSeries):
         # repr of a float is exact.
         header["modes"] = json.dumps(spectrum.table.series.modes.tolist())
@@ -101,39 +68,13 @@ def save(spectrum: GratingSpectrum, path: str | os.PathLike[str], recipe: str = 
     header["energy"] = json.dumps({"v_cavity": spectrum.energy_table("v_cavity").as_plain()})
     channels = _channels(spectrum.table)
     header["channelCount"] = len(channels)
-    with whole_file(path) as temporary:
-        OpenEXR.File(header, channels).write(str(temporary))
-        seal(temporary)
+    write(path, FORMAT, FORMAT_VERSION, header, channels, recipe)
 
 
 def load(path: str | os.PathLike[str], construct: Callable[..., Spectrum], recipe: str | None = None) -> Spectrum:
     """Hand what `save` wrote to the constructor of a `GratingSpectrum`; errors as in `GratingSpectrum.load`."""
     path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
-    try:
-        intact = is_intact(path)
-        if intact is False:
-            # Before OpenEXR sees it: a size that is wrong could take all memory.
-            raise RequestError("damaged: its bytes are not those that were written")
-        with silence():
-            file = OpenEXR.File(str(path), separate_channels=True)
-            header, channels = file.header(), file.channels()
-    except Exception as error:
-        raise RequestError(f"{path}: not a readable OpenEXR file ({_one_line(error)})") from None
-    if header.get("format") != FORMAT:
-        raise RequestError(
-            f"{path}: an OpenEXR file, but not a grating spectrum, which mitsuba-diffraction precompute writes"
-        )
-    if header.get("formatVersion") != FORMAT_VERSION:
-        raise RequestError(
-            f"{path}: got format version {header.get('formatVersion')}, wanted {FORMAT_VERSION}; "
-            "build the spectrum again with this version of mitsuba_diffraction"
-        )
-    if not intact:
-        raise RequestError(f"{path}: a damaged spectrum (its SHA-256 is missing)")
-    if recipe not in (None, header.get("recipeSha256")):
-        raise RequestError(f"{path}: a spectrum of another recipe")
+    header, channels = read(path, FORMAT, FORMAT_VERSION, recipe)
     if header.get("representation") not in _REPRESENTATIONS:
         raise RequestError(
             f"{path}: got representation {header.get('representation')!r}, wanted one of {', '.join(_REPRESENTATIONS)}"
@@ -171,13 +112,13 @@ def load(path: str | os.PathLike[str], construct: Callable[..., Spectrum], recip
     except KeyError as error:
         raise RequestError(f"{path}: a damaged spectrum, {error} is missing") from None
     except (TypeError, ValueError, IndexError, AttributeError, OverflowError, MemoryError) as error:
-        raise RequestError(f"{path}: a damaged spectrum ({_one_line(error)})") from None
+        raise RequestError(f"{path}: a damaged spectrum ({one_line(error)})") from None
 
 
 def _grid_header(grid: OrderGrid | SplineGrid) -> dict[str, np.ndarray]:
     if isinstance(grid, OrderGrid):
-        return {"tileSize": _doubles(*grid.tile_size)}
-    return {"spacing": _doubles(*grid.spacing), "limit": _doubles(*grid.limit)}
+        return {"tileSize": doubles(*grid.tile_size)}
+    return {"spacing": doubles(*grid.spacing), "limit": doubles(*grid.limit)}
 
 
 def _grid(header: dict, shape: tuple[int, int]) -> OrderGrid | SplineGrid:
@@ -224,7 +165,3 @@ def _single(value: np.ndarray) -> float:
 def _pair(value: np.ndarray) -> tuple[float, float]:
     x, y = (float(v) for v in value)
     return x, y
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())

@@ -1,0 +1,221 @@
+"""Rigorous orders at run time: the table of efficiencies, and an order drawn by its efficiency."""
+
+from __future__ import annotations
+
+import math
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from ..rigorous.axes import Axes
+from ..rigorous.spectrum import RigorousSpectrum
+from .incidence import Incidence
+from .order_sampler import WHOLE, search
+from .tables import PacketTable, opaque
+
+CELLS = 8  # of the sampler to each unit of P and R
+PLANES = 4  # of its cells over the wavelengths
+FLOOR = 0.05  # the share that all orders of a cell have alike, for those that vary within it
+
+
+class RigorousOrders:
+    """Σ_m η_m N(q − m/T; σ_q² I), and the density Σ_m P_m N(q − m/T; σ_q² I) from which q is drawn.
+
+    η_m is that of the pair (ω_i, ω_o), in the coordinates of `Axes`: symmetric under exchange. N is cut off at `reach`
+    standard deviations and scaled up. P_m follows η_m of light from ω_i, averaged over cells of
+
+        p = g + α = P + max(m, 0),    r = g − α = R − min(m, 0),    α = −ω_i,x ν,    g = ν √(1 − ω_i,y²),
+
+    and of the wavelength: in p and r the orders of one direction share one cell.
+    """
+
+    def __init__(self, spectrum: RigorousSpectrum) -> None:
+        axes = spectrum.axes
+        self.axes = axes
+        self.count = int(2 * spectrum.reach * spectrum.lobe_width * axes.period) + 1  # lobes that overlap
+        self.table = PacketTable(_packets(spectrum))
+        self.layout = PacketTable(_layout(axes), width=2)
+        self.cells = math.gcd(CELLS, axes.steps)
+        units = _units(_shares(spectrum, self.cells))
+        self.sampler_planes = units.shape[0]
+        self.cells_across = units.shape[1]
+        before = np.zeros((*units.shape[:3], units.shape[3] + 1))
+        before[..., 1:] = units.cumsum(axis=-1)
+        self.orders = PacketTable(np.stack([before, np.append(units, 0 * units[..., :1], axis=-1)], axis=-1), width=2)
+        sigma, reach = spectrum.lobe_width, spectrum.reach
+        inside = -np.expm1(-(reach**2) / 2)  # the share of the Gaussian within its reach
+        self.lobe_width, self.inside = opaque(sigma), opaque(inside)
+        self.peak, self.falloff = opaque(1 / (2 * np.pi * sigma**2 * inside)), opaque(-0.5 / sigma**2)
+        self.radius, self.farthest = opaque(reach * sigma), opaque((reach * sigma) ** 2)
+        self.period, self.pitch = opaque(axes.period), opaque(1 / axes.period)
+        self.shortest, self.longest = (opaque(w) for w in axes.wavelengths)
+
+    @dr.syntax
+    def evaluate(
+        self, wi: mi.Vector3f, wo: mi.Vector3f, frequency: mi.Float, active: mi.Bool
+    ) -> tuple[mi.Float, mi.Float]:
+        """Σ_m η_m N and the density of q, both in µm², for one wavelength.
+
+        Args:
+            wi, wo: ω_i and ω_o along the pattern's axes.
+            frequency: 1/λ in cycles/µm.
+            active: mask.
+        """
+        q_x, q_y = -(wi.x + wo.x) * frequency, -(wi.y + wo.y) * frequency
+        first = mi.Int32(dr.ceil((q_x - self.radius) * self.period))
+        near = active & (mi.Float(first) * self.pitch - q_x <= self.radius) & (dr.abs(q_y) <= self.radius)
+        power, density = mi.Float(0.0), mi.Float(0.0)
+        # Most directions lie between the orders: they jump over all that reads tables.
+        if near:
+            nu = self.period * frequency
+            k_y, c = 0.5 * nu * (wo.y - wi.y), 0.5 * nu * (wo.x - wi.x)
+            g = dr.sqrt(dr.maximum(dr.square(nu) - dr.square(k_y), 0))
+            z = self._z(g, frequency)
+            cell = self._cell(Incidence.of(wi, frequency, mi.Float(1)))
+            for step in range(self.count):
+                m = first + step
+                square = self._square(m, q_x, q_y)
+                there = near & (square <= self.farthest) & (dr.abs(m) <= self.axes.largest)
+                lobe = dr.select(there, self.peak * dr.exp(self.falloff * square), 0)
+                power += lobe * self._efficiency(m, c, g, z, there)
+                density += lobe * self.orders(mi.UInt32(dr.select(there, cell + m, 0)), there).y
+        return power, density / WHOLE
+
+    def sample(self, incidence: Incidence, u: mi.Float, v: mi.Point2f, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
+        """Draw q in cycles/µm, for one wavelength: the order from `u`, its place in the lobe from `v`."""
+        middle = self._cell(incidence)
+        largest = self.axes.largest
+
+        def before(m: mi.Int32) -> mi.Float:
+            return self.orders(mi.UInt32(middle + m), active).x
+
+        m, _ = search(before, mi.Int32(-largest), mi.Int32(largest + 1), 2 * largest + 1, u)
+        radius = self.lobe_width * dr.sqrt(-2 * dr.log(1 - v.x * self.inside))
+        sin, cos = dr.sincos(dr.two_pi * v.y)
+        return mi.Float(m) * self.pitch + radius * cos, radius * sin
+
+    def _square(self, m: mi.Int32, q_x: mi.Float, q_y: mi.Float) -> mi.Float:
+        """|q − m/T|²."""
+        return dr.square(dr.fma(-self.pitch, mi.Float(m), q_x)) + dr.square(q_y)
+
+    def _z(self, g: mi.Float, frequency: mi.Float) -> mi.Float:
+        """Z / (K − 1), from 0 to 1."""
+        most = self.period / dr.maximum(g, 1e-6)
+        first, last = dr.minimum(self.shortest, most), dr.minimum(self.longest, most)
+        return dr.clip((dr.rcp(frequency) - first) / dr.maximum(last - first, 1e-6), 0, 1)
+
+    def _position(self, p: mi.Float) -> mi.Float:
+        """X / s of P ≥ 0."""
+        whole = dr.floor(p)
+        # Above zero, where the root has a derivative.
+        return whole + 2 * dr.inv_pi * dr.asin(dr.sqrt(dr.maximum(p - whole, 1e-12)))
+
+    def _efficiency(self, m: mi.Int32, c: mi.Float, g: mi.Float, z: mi.Float, active: mi.Bool) -> mi.Float:
+        """η_m(P, R, Z), linear between the nodes; 0 for an order that does not propagate."""
+        half = 0.5 * mi.Float(dr.abs(m))
+        p, r = g + c - half, g - c - half
+        active = active & (p > 0) & (r > 0)
+        layout = self.layout(mi.UInt32(dr.select(active, m + self.axes.largest, 0)), active)
+        side = mi.UInt32(layout.y)
+        i, f = _split(self._position(dr.select(active, p, 0)) * self.axes.steps, side)
+        j, h = _split(self._position(dr.select(active, r, 0)) * self.axes.steps, side)
+        k, w = _split(z * (self.axes.planes - 1), mi.UInt32(self.axes.planes))
+        node, planes = mi.UInt32(layout.x) + i * side + j, self.axes.planes - 1
+        low, high = (self.table(at * planes + k, active) for at in (node, node + side))
+        corners = dr.lerp(low, high, f)
+        found = dr.lerp(dr.lerp(corners.x, corners.y, w), dr.lerp(corners.z, corners.w, w), h)
+        # Between the nodes that were solved the table may dip below zero by its error.
+        return dr.select(active, dr.maximum(found, 0), 0)
+
+    def _cell(self, incidence: Incidence) -> mi.Int32:
+        """Where order 0 of the sampler's cell stands in its table."""
+        nu, wi = self.period * incidence.frequency, incidence.wi
+        g = nu * dr.safe_sqrt(1 - dr.square(wi.y))
+        p, r = (
+            dr.clip(mi.Int32(self.cells * self._position(dr.maximum(x, 0))), 0, self.cells_across - 1)
+            for x in (g - nu * wi.x, g + nu * wi.x)
+        )
+        z = dr.clip(mi.Int32(self._z(g, incidence.frequency) * self.sampler_planes), 0, self.sampler_planes - 1)
+        width = 2 * self.axes.largest + 2
+        return ((z * self.cells_across + p) * self.cells_across + r) * width + self.axes.largest
+
+
+def _split(x: mi.Float, count: mi.UInt32) -> tuple[mi.UInt32, mi.Float]:
+    """The node below x, at most the last but one, and how far x is beyond it."""
+    low = dr.minimum(mi.UInt32(x), count - 2)
+    return low, x - mi.Float(low)
+
+
+def _squares(spectrum: RigorousSpectrum, m: int) -> NDArray[np.float32]:
+    """η_m at the nodes, (K, P, R)."""
+    side, start = spectrum.axes.side(m), spectrum.axes.offset(m)
+    return spectrum.values[:, start : start + side**2].reshape(-1, side, side)
+
+
+def _orders(axes: Axes) -> range:
+    return range(-axes.largest, axes.largest + 1)
+
+
+def _layout(axes: Axes) -> NDArray[np.float64]:
+    """Where order m starts in a plane, and its side: (orders, 2)."""
+    return np.array([(axes.offset(m), axes.side(m)) for m in _orders(axes)], np.float64)
+
+
+def _packets(spectrum: RigorousSpectrum) -> NDArray[np.float32]:
+    """η_m at (j, k), (j, k + 1), (j + 1, k), (j + 1, k + 1), for each node (i, j) and each k but the last."""
+    packets = np.empty((spectrum.axes.nodes, spectrum.axes.planes - 1, 4), np.float32)
+    for m in _orders(spectrum.axes):
+        square = np.moveaxis(_squares(spectrum, m), 0, -1)
+        side, start = square.shape[0], spectrum.axes.offset(m)
+        ahead = np.append(square[:, 1:], square[:, -1:], axis=1)
+        corners = [square[..., :-1], square[..., 1:], ahead[..., :-1], ahead[..., 1:]]
+        packets[start : start + side**2] = np.stack(corners, axis=-1).reshape(side**2, -1, 4)
+    return packets
+
+
+def _shares(spectrum: RigorousSpectrum, cells: int) -> NDArray[np.float64]:
+    """η_m averaged over the sampler's cells, (Z, p, r, orders); `cells` of them to each unit.
+
+    An order that is evanescent by less than the reach of its lobe has half of what it has where it begins to propagate.
+    """
+    axes = spectrum.axes
+    planes = math.gcd(PLANES, axes.planes - 1)
+    margin = spectrum.reach * spectrum.lobe_width * axes.period
+    whole = axes.units(0) * cells
+    ends = -np.arange(whole)  # of the cells below P = 0
+    ends = ends // cells + np.sin(np.pi / 2 * (ends % cells) / cells) ** 2
+    beyond = int((ends > -margin).sum())
+    shares = np.zeros((planes, whole, whole, 2 * axes.largest + 1))
+    for column, m in enumerate(_orders(axes)):
+        units = axes.units(m) * cells
+        average = _averaged(_averaged(_averaged(_squares(spectrum, m), 0, planes), 1, units), 2, units)
+        padded = np.pad(average, [(0, 0), (beyond, 0), (beyond, 0)], mode="edge")
+        padded[:, :beyond] *= 0.5
+        padded[:, :, :beyond] *= 0.5
+        start = [max(m, 0) * cells - beyond, max(-m, 0) * cells - beyond]
+        from_ = [max(s, 0) for s in start]
+        to = [s + beyond + units for s in start]
+        shares[:, from_[0] : to[0], from_[1] : to[1], column] = padded[:, from_[0] - start[0] :, from_[1] - start[1] :]
+    return shares
+
+
+def _averaged(values: NDArray, axis: int, cells: int) -> NDArray[np.float64]:
+    """The mean over each of so many cells along one axis, of what is linear between the nodes."""
+    values = np.moveaxis(np.asarray(values, np.float64), axis, 0)
+    middle = (values[1:] + values[:-1]) / 2
+    return np.moveaxis(middle.reshape(cells, -1, *middle.shape[1:]).mean(axis=1), 0, axis)
+
+
+def _units(shares: NDArray[np.float64]) -> NDArray[np.int64]:
+    """P_m of every cell in units of 2⁻²⁴, 2²⁴ together, so that sums in float32 are exact."""
+    mirror = shares.shape[-1] // 2
+    shares = np.maximum(shares, 0)  # interpolation may dip below
+    possible = shares > 0
+    possible[..., mirror] = True  # order 0 propagates always
+    shares = shares / np.maximum(shares.sum(axis=-1, keepdims=True), 1e-30)
+    shares = (1 - FLOOR) * shares + FLOOR * possible / possible.sum(axis=-1, keepdims=True)
+    units = np.floor(shares * WHOLE).astype(np.int64)
+    units[..., mirror] += WHOLE - units.sum(axis=-1)
+    return units

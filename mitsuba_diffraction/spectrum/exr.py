@@ -1,0 +1,106 @@
+"""OpenEXR files of spectra: float32, ZIP, one part, sealed by the digest of their content."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import sys
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenEXR
+
+from ..errors import RequestError
+from ..files import UNSEALED, is_intact, seal, whole_file
+from ..outputs import made_for
+
+
+@contextlib.contextmanager
+def silence() -> Iterator[None]:
+    """Keep the library from giving its own account of a broken file, from Python and from C, before it raises."""
+    sys.stderr.flush()
+    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 2)
+        with contextlib.redirect_stdout(io.StringIO()):
+            yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
+
+
+def doubles(*values: float) -> np.ndarray:
+    """Numbers for a header: a Python float would be written in single precision."""
+    return np.array(values, np.float64)
+
+
+def write(
+    path: str | os.PathLike[str],
+    kind: str,
+    version: int,
+    header: Mapping[str, Any],
+    channels: Mapping[str, np.ndarray],
+    recipe: str,
+) -> None:
+    """Write a spectrum of the format `kind`, whole or not at all; `recipe` is the digest of that of which it was built.
+
+    Raises:
+        OSError: if the file cannot be written.
+    """
+    header = {
+        "type": OpenEXR.scanlineimage,
+        "compression": OpenEXR.ZIP_COMPRESSION,
+        "format": kind,
+        "formatVersion": version,
+        **header,
+        "recipeSha256": recipe,
+        "contentSha256": UNSEALED,
+    }
+    if (request := made_for(path)) is not None:
+        header["madeFor"] = request
+    with whole_file(path) as temporary:
+        OpenEXR.File(header, dict(channels)).write(str(temporary))
+        seal(temporary)
+
+
+def read(path: Path, kind: str, version: int, recipe: str | None) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Header and channels of what `write` wrote.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is not of this format and version, is damaged, or, if `recipe` is given, of another recipe.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file")
+    try:
+        intact = is_intact(path)
+        if intact is False:
+            # Before OpenEXR sees it: a size that is wrong could take all memory.
+            raise RequestError("damaged: its bytes are not those that were written")
+        with silence():
+            file = OpenEXR.File(str(path), separate_channels=True)
+            header, channels = file.header(), file.channels()
+    except Exception as error:
+        raise RequestError(f"{path}: not a readable OpenEXR file ({one_line(error)})") from None
+    if header.get("format") != kind:
+        name = kind.removeprefix("mitsuba_diffraction ")
+        raise RequestError(f"{path}: an OpenEXR file, but not a {name}, which mitsuba-diffraction precompute writes")
+    if header.get("formatVersion") != version:
+        raise RequestError(
+            f"{path}: got format version {header.get('formatVersion')}, wanted {version}; "
+            "build the spectrum again with this version of mitsuba_diffraction"
+        )
+    if not intact:
+        raise RequestError(f"{path}: a damaged spectrum (its SHA-256 is missing)")
+    if recipe not in (None, header.get("recipeSha256")):
+        raise RequestError(f"{path}: a spectrum of another recipe")
+    return header, channels
+
+
+def one_line(error: Exception) -> str:
+    """What an exception says."""
+    return " ".join(str(error).split())

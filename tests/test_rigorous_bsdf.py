@@ -1,0 +1,212 @@
+"""The BSDF of rigorous efficiencies: against its table in float64, and against the solver."""
+
+import dataclasses
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from bsdf_support import direction, evaluate, interaction, random_directions, use
+
+import mitsuba_diffraction as md
+from mitsuba_diffraction.bsdf import probe
+from mitsuba_diffraction.rigorous.axes import Axes
+from mitsuba_diffraction.rigorous.spectrum import RigorousSpectrum
+
+SURFACE = {"profile": "blazed", "period": 0.3, "depth": 0.05, "samples": 64}
+SETTINGS = {"theory": "rigorous", "int_ior": 1.5, "wavelengths": [400.0, 500.0], "tolerance": 0.2}
+WAVELENGTHS = (405.0, 440.0, 470.0, 498.0)
+
+
+@pytest.fixture(scope="module")
+def recipe_file(tmp_path_factory):
+    """A recipe of a grating of 0.3 µm; at its wavelengths it has the orders −1, 0 and 1."""
+    path = tmp_path_factory.mktemp("rigorous") / "fine.toml"
+    tables = {"surface": SURFACE, "spectrum": SETTINGS}
+    lines = [f"[{name}]\n" + "".join(f"{k} = {v!r}\n" for k, v in table.items()) for name, table in tables.items()]
+    path.write_text("".join(lines), encoding="utf-8")
+    return path
+
+
+@pytest.fixture(scope="module")
+def solved(recipe_file):
+    return md.Recipe.load(recipe_file).cached()
+
+
+def made_up(coherence_length=65.0):
+    """A table of η that no solver knows, symmetric in P and R, of a grating with many orders; Σ η_m < 1."""
+    axes = Axes(1.7, (0.36, 0.83), 8, 5)
+    values = np.empty((axes.planes, axes.nodes), np.float32)
+    for m in range(-axes.largest, axes.largest + 1):
+        side, start = axes.side(m), axes.offset(m)
+        x = np.sin(0.2 * np.arange(side) + m) ** 2
+        square = (1 + np.add.outer(x, x)) * np.linspace(1, 2, axes.planes)[:, None, None] / (60 + 5 * m)
+        values[:, start : start + side**2] = square.reshape(axes.planes, -1)
+    return RigorousSpectrum(axes, values, "Al", 0j, coherence_length, 0.01, 0, 0, 0, 1, "made up", "")
+
+
+@pytest.fixture(scope="module", params=["solved", "made up", "made up, wide lobes"])
+def spectrum(request):
+    if request.param == "solved":
+        return request.getfixturevalue("solved")
+    return made_up(3.0 if "wide" in request.param else 65.0)
+
+
+def plugin(spectrum, **parameters):
+    return mi.load_dict({"type": "diffraction_grating", "spectrum": spectrum, **parameters})
+
+
+def expected(spectrum, wi, wo, wavelength):
+    """f = Σ_m η_m N(q − m/T; σ_q² I)/λ² in float64; wi, wo (n, 3), λ in µm."""
+    axes, sigma = spectrum.axes, spectrum.lobe_width
+    nu = axes.period / wavelength
+    k_y, c = ((wo - wi)[:, i] * nu / 2 for i in (1, 0))
+    g, q = np.sqrt(nu**2 - k_y**2), -(wi + wo)[:, :2] / wavelength
+    f = np.zeros(len(wi))
+    for m in range(-axes.largest, axes.largest + 1):
+        square = ((q - [m / axes.period, 0]) ** 2).sum(1)
+        lobe = np.exp(-square / (2 * sigma**2)) / (2 * np.pi * sigma**2 * -np.expm1(-(spectrum.reach**2) / 2))
+        lobe = np.where(square <= (spectrum.reach * sigma) ** 2, lobe, 0)
+        f += np.maximum(spectrum.evaluate(m, c, g, wavelength), 0) * lobe
+    return f / wavelength**2
+
+
+def pairs(spectrum, wavelength, count=400):
+    """Pairs of directions in the lobes of propagating orders."""
+    rng = np.random.default_rng(7)
+    wi = random_directions(rng, count)
+    m = rng.integers(-spectrum.axes.largest, spectrum.axes.largest + 1, count)
+    q = np.stack([m / spectrum.axes.period, 0 * m], axis=-1) + spectrum.lobe_width * rng.normal(size=(count, 2))
+    t = -wavelength * q - wi[:, :2]
+    there = (t**2).sum(1) < 0.99
+    wi, t = wi[there], t[there]
+    return wi, np.concatenate([t, np.sqrt(1 - (t**2).sum(1, keepdims=True))], axis=1)
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_spectral", "scalar_spectral"])
+def test_f_is_the_sum_over_the_orders(variant, spectrum):
+    use(variant)
+    wi, wo = pairs(spectrum, 0.47, 400 if variant.startswith("llvm") else 40)
+    value, _ = probe.evaluate_pdf(plugin(spectrum), wi, wo, (470.0,) * 4)
+    wanted = expected(spectrum, wi, wo, 0.47) * wo[:, 2]
+    assert wanted.max() > 0
+    np.testing.assert_allclose(value[:, 0], wanted, rtol=5e-3, atol=1e-3 * wanted.max())
+
+
+def test_exchange_of_the_directions_changes_nothing(llvm, spectrum):
+    wi, wo = pairs(spectrum, 0.47)
+    there, back = (
+        probe.evaluate_pdf(plugin(spectrum), a, b, (470.0,) * 4)[0][:, 0] / b[:, 2] for a, b in ((wi, wo), (wo, wi))
+    )
+    assert there.max() > 0
+    np.testing.assert_allclose(there, back, rtol=1e-4, atol=1e-6 * there.max())
+
+
+@pytest.mark.parametrize("theta", [0, 40, 75, 88])
+def test_samples_carry_the_efficiencies_evenly(llvm, spectrum, theta):
+    wi = direction(theta, 30)
+    for wavelength in (405.0, 470.0):
+        _, weights, _ = probe.sample(plugin(spectrum), np.broadcast_to(wi, (100_000, 3)), (wavelength,) * 4, 1)
+        weights = weights[:, 0]
+        albedo = weights.mean()
+        _, eta = spectrum.efficiencies(wi, wavelength * 1e-3)
+        # Wide lobes reach beyond the horizon: what is drawn there is lost.
+        if spectrum.coherence_length > 10 and theta <= 75:
+            assert albedo == pytest.approx(np.maximum(eta, 0).sum(), rel=0.03)
+            assert albedo**2 / (weights**2).mean() >= 0.7
+        assert albedo <= 1 + 1e-3
+
+
+@pytest.mark.parametrize("theta", [0, 40, 75])
+def test_samples_pass_the_chi_square_test(llvm, solved, theta):
+    wide = dataclasses.replace(solved, coherence_length=3.0)
+    for spectrum, wavelengths in ((wide, WAVELENGTHS), (made_up(3.0), (400.0, 500.0, 600.0, 700.0))):
+        bsdf, wi = plugin(spectrum, orientation=20.0), direction(theta, 20)
+
+        def sample(points, bsdf=bsdf, wi=wi, wavelengths=wavelengths):
+            si = interaction(wi, wavelengths, dr.width(points))
+            bs, _ = bsdf.sample(mi.BSDFContext(), si, points.x, mi.Point2f(points.y, points.z))
+            return bs.wo, dr.select(bs.pdf > 0, mi.Float(1), 0)
+
+        def density(wo, bsdf=bsdf, wi=wi, wavelengths=wavelengths):
+            return bsdf.pdf(mi.BSDFContext(), interaction(wi, wavelengths, dr.width(wo)), wo)
+
+        test = mi.chi2.ChiSquareTest(
+            mi.chi2.SphericalDomain(), sample, density, sample_dim=3, sample_count=200_000, res=41, ires=64
+        )
+        assert test.run(), test.messages
+
+
+def test_the_albedo_is_that_of_the_solver(llvm, solved):
+    """By samples, of directions and wavelengths that are not nodes."""
+    for theta, phi, wavelength in ((10, 20, 412.0), (50, 70, 450.0), (70, 0, 490.0)):
+        wi = direction(theta, phi)
+        _, weights, _ = probe.sample(plugin(solved), np.broadcast_to(wi, (40_000, 3)), (wavelength,) * 4, 2)
+        exact = md.rigorous.efficiencies(md.gratings.blazed(0.3, 0.05, samples=64), wi, wavelength * 1e-3, int_ior=1.5)
+        assert weights[:, 0].mean() == pytest.approx(exact.unpolarised.sum(), rel=0.05)
+
+
+def test_files_recipes_and_profiles_give_the_same(llvm, solved, recipe_file, tmp_path):
+    saved = tmp_path / "fine.exr"
+    solved.save(saved)
+    wi, wo = direction(30, 10), -direction(30, 10) * [1, 1, -1]
+    found = [
+        evaluate(mi.load_dict({"type": "diffraction_grating", **surface}), wi, wo, wavelengths=WAVELENGTHS)[0]
+        for surface in ({"spectrum": solved}, {"filename": str(saved)}, {"filename": str(recipe_file), "int_ior": 1.5})
+    ]
+    assert found[0].min() > 0
+    for other in found[1:]:
+        np.testing.assert_array_equal(other, found[0])
+
+
+@pytest.mark.parametrize(
+    ("parameters", "text"),
+    [
+        ({"height_scale": 0.5}, "height_scale: got 0.5, wanted none with theory=rigorous: build the spectrum"),
+        ({"shadowing": "none"}, "shadowing: got 'none', wanted none with theory=rigorous"),
+        ({"fresnel": "exact"}, "fresnel: got 'exact', wanted none with theory=rigorous"),
+        ({"base": {"type": "diffuse"}}, "base: got a BSDF, wanted none with theory=rigorous"),
+        ({"material": "Al"}, "got material Al, but the rigorous spectrum is of int_ior 1.5"),
+        ({"int_ior": 1.6}, "got int_ior 1.59956, but the rigorous spectrum is of int_ior 1.5"),
+        ({"material": "none"}, "material: got 'none', wanted a real one for theory=rigorous"),
+        ({"theory": "scalar"}, "theory: got 'scalar' with a spectrum of rigorous theory"),
+        ({"theory": "vector"}, "theory: got 'vector', wanted one of scalar, rigorous"),
+    ],
+)
+def test_what_only_scalar_theory_has_is_refused(llvm, solved, parameters, text):
+    with pytest.raises(RuntimeError, match=text):
+        plugin(solved, **parameters)
+
+
+def test_surfaces_of_several_rows_are_refused(llvm):
+    with pytest.raises(RuntimeError, match="rows that differ, wanted a surface that does not change along y"):
+        mi.load_dict({"type": "diffraction_grating", "profile": "foil", "theory": "rigorous", "material": "Al"})
+
+
+def test_polarised_variants_are_refused(solved):
+    use("llvm_ad_spectral_polarized")
+    with pytest.raises(RuntimeError, match="theory: got rigorous in the variant llvm_ad_spectral_polarized, wanted"):
+        plugin(solved)
+
+
+def test_precompute_writes_a_recipes_rigorous_spectrum(command, tmp_path):
+    recipe, target = tmp_path / "moth_eye.toml", tmp_path / "moth_eye.exr"
+    recipe.write_text(
+        '[surface]\nprofile = "sinusoidal"\nperiod = 0.19\ndepth = 0.05\nsamples = 32\n'
+        '[spectrum]\ntheory = "rigorous"\nint_ior = 1.5\nwavelengths = [400, 500]\ntolerance = 0.5\n',
+        encoding="utf-8",
+    )
+    code, out, _ = command("precompute", str(recipe), "-o", str(target))
+    assert code == 0
+    assert "rigorous, int_ior 1.5" in out
+    assert RigorousSpectrum.load(target).material_name == "int_ior 1.5"
+    # Another command does not write over it.
+    recipe.write_text(recipe.read_text().replace("0.05", "0.06"), encoding="utf-8")
+    code, _, err = command("precompute", str(recipe), "-o", str(target), "--tolerance", "0.4")
+    assert code == 2
+    assert "--overwrite" in err
+    content = bytearray(target.read_bytes())
+    content[-200] ^= 1
+    target.write_bytes(content)
+    with pytest.raises(ValueError, match="its bytes are not those that were written"):
+        RigorousSpectrum.load(target)
