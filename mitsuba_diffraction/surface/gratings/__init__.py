@@ -47,7 +47,7 @@ A patch that repeats has a comb of orders, 1/32 µm apart; light coherent over l
 smooth haze of an irregular surface.
 """
 
-PATCHES: dict[str, int] = {"compact_disc": 48, "dvd": 48, "elaphe": 8, "xenopeltis": 16, "morpho_ridges": 8}
+PATCHES: dict[str, int] = {"compact_disc": 48, "dvd": 48, "elaphe": 16, "xenopeltis": 16, "morpho_ridges": 16}
 """Name of a profile that is drawn at random → over how many seeds its spectrum is averaged by default.
 
 At 550 nm and normal incidence ∫|ΔS| dq to the mean of as many other seeds as one likes is then below 0.08; of discs it
