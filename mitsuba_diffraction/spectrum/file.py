@@ -64,8 +64,9 @@ def save(spectrum: GratingSpectrum, path: str | os.PathLike[str], recipe: str = 
     if isinstance(spectrum.table, SeriesTable) and isinstance(spectrum.table.series, SvdSeries):
         # repr of a float is exact.
         header["modes"] = json.dumps(spectrum.table.series.modes.tolist())
-    # Scenes seldom ask for the other kind.
-    header["energy"] = json.dumps({"v_cavity": spectrum.energy_table("v_cavity").as_plain()})
+    # Scenes seldom ask for another kind of shadowing: of the others, those that are there.
+    kinds = dict.fromkeys(["v_cavity", *spectrum.energy])
+    header["energy"] = json.dumps({kind: spectrum.energy_table(kind).as_plain() for kind in kinds})
     channels = _channels(spectrum.table)
     header["channelCount"] = len(channels)
     write(path, FORMAT, FORMAT_VERSION, header, channels, recipe)

@@ -46,7 +46,7 @@ The periodic patch has a comb of orders spaced by 1/32 cycles/µm; a coherence l
 them into the smooth haze of an irregular surface.
 """
 
-PATCHES: dict[str, int] = {"compact_disc": 48, "dvd": 48, "elaphe": 8, "xenopeltis": 16, "morpho_ridges": 8}
+PATCHES: dict[str, int] = {"compact_disc": 48, "dvd": 48, "elaphe": 16, "xenopeltis": 16, "morpho_ridges": 16}
 """Name of a profile that is drawn at random → over how many seeds its spectrum is averaged by default.
 
 At 550 nm and normal incidence ∫|ΔS| dq to the mean of as many other seeds as one likes is then below 0.08; of discs it
