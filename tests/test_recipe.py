@@ -53,7 +53,7 @@ def builds(monkeypatch):
     computed = []
 
     def spy(height_field, **arguments):
-        computed.append(height_field.digest)
+        computed.append(height_field[0].digest)
         return md.precompute(height_field, **arguments)
 
     monkeypatch.setattr(recipe_module, "precompute", spy)
