@@ -1,6 +1,7 @@
 """The BSDF of rigorous efficiencies: against its table in float64, and against the solver."""
 
 import dataclasses
+from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
@@ -181,6 +182,14 @@ def test_what_only_scalar_theory_has_is_refused(llvm, solved, parameters, text):
 def test_surfaces_of_several_rows_are_refused(llvm):
     with pytest.raises(RuntimeError, match="rows that differ, wanted a surface that does not change along y"):
         mi.load_dict({"type": "diffraction_grating", "profile": "foil", "theory": "rigorous", "material": "Al"})
+
+
+def test_the_rigorous_recipes_are_of_one_row():
+    found = sorted((Path(__file__).parents[1] / "precompute" / "rigorous").glob("*.toml"))
+    assert len(found) == 3
+    for recipe in map(md.Recipe.load, found):
+        assert recipe.height_field().shape[0] == 1
+        assert recipe.spectrum["theory"] == "rigorous"
 
 
 def test_polarised_variants_are_refused(solved):

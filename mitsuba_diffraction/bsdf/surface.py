@@ -96,9 +96,7 @@ def _from_file(path: Path, coat: Coat | None) -> tuple[Spectrum, Recipe | None]:
 def _taken_over(handle: str) -> Spectrum:
     spectrum = _handed_over.get(handle)
     if spectrum is None:
-        raise RequestError(
-            f"spectrum: got {handle!r}, wanted a GratingSpectrum in Python's load_dict; XML takes a filename"
-        )
+        raise RequestError(f"spectrum: got {handle!r}, wanted a spectrum in Python's load_dict; XML takes a filename")
     return spectrum
 
 
