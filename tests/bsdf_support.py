@@ -86,9 +86,9 @@ def evaluate(bsdf, wi, wo, ctx=None, wavelengths=WAVELENGTHS, uv=(0.0, 0.0)):
     return value.T, pdf[:, 0]
 
 
-def draw(bsdf, wi, count, ctx=None, seed=1, uv=(0.0, 0.0)):
+def draw(bsdf, wi, count, ctx=None, seed=1, uv=(0.0, 0.0), wavelengths=WAVELENGTHS):
     """Samples and their weights (4, n)."""
-    _, weights, bs = probe.sample(bsdf, np.broadcast_to(wi, (count, 3)), WAVELENGTHS, seed, ctx, uv)
+    _, weights, bs = probe.sample(bsdf, np.broadcast_to(wi, (count, 3)), wavelengths, seed, ctx, uv)
     return bs, weights.T
 
 

@@ -9,6 +9,7 @@ from PIL import Image
 
 import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a variant is set)
 from mitsuba_diffraction.color import spectrum_to_linear_sRGB
+from mitsuba_diffraction.errors import Bug, RequestError
 from mitsuba_diffraction.render import passes, render
 from mitsuba_diffraction.render.film import trace_pass
 from mitsuba_diffraction.render.scene import channel_wavelengths, channel_weights, load_spectral_scene
@@ -263,7 +264,7 @@ def test_files_are_sought_beside_the_scene(llvm, tmp_path, monkeypatch):
 def test_wrong_scenes_give_one_line(llvm, tmp_path, content, message):
     class Unbuildable(mi.BSDF):
         def __init__(self, props):
-            raise ValueError("no such grating")
+            raise RequestError("no such grating")
 
     mi.register_bsdf("unbuildable", Unbuildable)
     with pytest.raises(ValueError, match=message) as caught:
@@ -303,7 +304,8 @@ def test_integrators_with_other_channels_are_refused(llvm, tmp_path):
 @pytest.mark.parametrize(
     ("raised", "expected", "message"),
     [
-        (ZeroDivisionError, RuntimeError, "rendering failed: the order is zero"),
+        (RuntimeError, RuntimeError, "rendering failed: the order is zero"),
+        (ZeroDivisionError, Bug, "ZeroDivisionError: the order is zero"),
         (KeyboardInterrupt, KeyboardInterrupt, "the order is zero"),
     ],
 )

@@ -270,7 +270,7 @@ def test_cells_are_drawn_with_their_density(llvm):
     shares[:, 2, 3] = 0
     spacing = 0.05, 0.11
     sampler = CellSampler(shares, spacing, (5, 3), largest_kappa=30.0)
-    weights = sampler.weights(Incidence(mi.Vector3f(0.6, 0.64, 0.48), mi.Float(2.4), mi.Float(15.0)))
+    weights = sampler.weights(Incidence(mi.Vector3f(0.6, 0.64, 0.48), mi.Float(2.4), mi.Float(7.2), mi.Float(15.0)))
     u = numbers(count)
     q_x, q_y = sampler.sample(weights, mi.Float(u[0]), mi.Point2f(mi.Float(u[1]), mi.Float(u[2])), mi.Bool(True))
     p = np.array(weights).ravel() @ (shares / shares.sum(axis=(1, 2), keepdims=True)).reshape(CELLS, -1)

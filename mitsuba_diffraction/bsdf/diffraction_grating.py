@@ -360,7 +360,9 @@ def define() -> type:
             of_front = active & (sample1 < front_share)
             if grating or below is not None:
                 rest = dr.minimum((sample1 - front_share) / (1 - front_share), BELOW_ONE)
-                bs, result = self._sample_below(ctx, si, lobes, 1 - front_share, rest, sample2, active & ~of_front)
+                bs, result = self._sample_below(
+                    ctx, si, lobes, 1 - front_share, rest, sample2, active & (sample1 >= front_share)
+                )
             elif self.coat is not None and ctx.is_enabled(mi.BSDFFlags.DeltaReflection, self.front):
                 result = mi.Spectrum(0.0)
             else:

@@ -75,6 +75,6 @@ def nodes_for(x: float, tolerance: float) -> int:
     # In logarithms: the bound itself grows to e^{x/2} before it falls, which no float holds beyond x = 1400.
     count, bound = 1, np.log(4 / tolerance)
     while bound > 0 or count < x / 2:
-        bound += np.log(x / (2 * count))
+        bound += np.log(x) - np.log(2 * count)
         count += 1
     return count
