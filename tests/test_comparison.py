@@ -361,6 +361,6 @@ def test_all_files_or_none(command, monkeypatch, llvm, folder, error):
 
     monkeypatch.setattr(summary, "save_figure", fail)
     code, out, err = command("compare scene.xml --shader gem --spp 1 --width 4 --no-shares")
-    assert (code, out) == (1, "")
+    assert (code, out) == (130 if isinstance(error, KeyboardInterrupt) else 1, "")
     assert len(err.splitlines()) == 1
     assert names() == {"scene.xml"}

@@ -365,7 +365,7 @@ def test_one_period_of_a_profile(folder, command):
     code, out, err = command("inspect ridges.npy --pixel-size 0.005078125")
     assert (code, err) == (0, "")
     assert "none stands out (for a single period of a grating: --extent tile)" in out
-    code, out, err = command("inspect ridges.npy --pixel-size 0.005078125 --extent tile")
+    code, out, err = command("inspect ridges.npy --pixel-size 0.005078125 --extent tile --overwrite")
     assert (code, err) == (0, "")
     assert "period            1.3 µm along 0°" in out
     tips = re.findall(r"tip broadening.*?\)\s+(\S+)", out)
@@ -381,7 +381,9 @@ def test_options_of_precompute(folder, command):
     np.save("waves.npy", heights + 0.01 * np.arange(100))
     code, out, _ = command("inspect waves.npy --pixel-size 0.08")
     assert "Level it" in out
-    code, out, err = command("inspect waves.npy --pixel-size 0.08 --plane --coherence-length 3 --extent sample")
+    code, out, err = command(
+        "inspect waves.npy --pixel-size 0.08 --plane --coherence-length 3 --extent sample --overwrite"
+    )
     assert (code, err) == (0, "")
     assert "Level it" not in out
     assert "coherence length  3 µm" in out
@@ -466,24 +468,6 @@ def test_the_notebook_runs_and_says_what_it_shows(monkeypatch, capsys, whole):
     assert sum("image/png" in output.get("data", {}) for cell in cells for output in cell["outputs"]) == 2
     # Colours, not greys.
     assert np.ptp(names["picture"], axis=2).max() > 0.1 * names["picture"].max()
-
-
-def test_the_page_on_own_gratings_holds(tmp_path, monkeypatch):
-    text = (ROOT / "docs" / "own_grating.md").read_text(encoding="utf-8")
-    blocks = dict(re.findall(r"```(toml|xml|python)\n(.*?)```", text, re.DOTALL))
-    monkeypatch.chdir(tmp_path)
-    exec(blocks["python"], {})
-    assert md.GratingSpectrum.load("ridges.exr").error <= 1e-3
-    Image.fromarray((waves(count=3, pixel=0.0586).heights * 1000 + 128).astype(np.uint8)).save("scan.png")
-    Path("scan.toml").write_text(blocks["toml"])
-    assert md.Recipe.load("scan.toml").height_field().tile_size[0] == pytest.approx(6.0, abs=0.06)
-    mi.set_variant("scalar_spectral")
-    bsdf = mi.load_string(
-        blocks["xml"].replace("<bsdf ", '<bsdf version="3.0.0" ').replace("scan.exr", str(tmp_path / "ridges.exr"))
-    )
-    assert bsdf.spectrum.source == "round ridges, 1.3 µm"
-    for name in re.findall(r"\]\(([\w.]+\.png)\)", text):
-        assert (ROOT / "docs" / name).is_file()
 
 
 @pytest.mark.parametrize("periods", [1, 2, 4, 9])

@@ -223,7 +223,7 @@ def test_a_patch_too_large_is_refused_before_memory_is_asked_for_it(name, argume
 
 def test_a_disc_of_one_long_track_takes_no_more_memory_than_its_heights():
     field = compact_disc(tracks=1, length=5000.0)
-    assert field.shape == (80_000, 26)
+    assert field.shape == (100_000, 32)
     # Pits at both ends of the patch, as in its middle.
     share = field.heights.mean(axis=1)
     assert share[:8000].mean() == pytest.approx(share.mean(), rel=0.2)

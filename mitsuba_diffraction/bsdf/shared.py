@@ -65,11 +65,11 @@ class SharedTables:
         key = shadowing, height_scale
         with self._lock:
             if key not in self._tables:
-                table = conserving(self._spectrum, self._gathered_table(shadowing, height_scale), height_scale)
+                table = conserving(self._spectrum, self.gathered_table(shadowing, height_scale), height_scale)
                 self._keep(self._tables, key, table)
             return self._tables[key]
 
-    def _gathered_table(self, shadowing: str, height_scale: float) -> EnergyTable:
+    def gathered_table(self, shadowing: str, height_scale: float) -> EnergyTable:
         with self._lock:
             if self._gathered is None:
                 self._gathered = GatheredSpectrum.of(self._spectrum)
@@ -85,7 +85,7 @@ class SharedTables:
         table = self.energy_table(shadowing, scale)
         if dr.grad_enabled(height_scale):
             lower, upper = max(scale - STEP, 0.0), scale + STEP
-            above, below = (self._gathered_table(shadowing, s).values for s in (upper, lower))
+            above, below = (self.gathered_table(shadowing, s).values for s in (upper, lower))
             return Energy(table, (above - below) / (upper - lower), height_scale - dr.detach(height_scale))
         if not table.needed:
             return None
