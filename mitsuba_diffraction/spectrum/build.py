@@ -88,7 +88,8 @@ def precompute(
         progress: called with (steps done, steps in all).
         theory: "scalar", or "rigorous": Maxwell's equations, for a tile of one row and one material only. An
             interrupted build goes on from what it left in the cache folder.
-        int_ior, material: of rigorous theory, index of refraction of a dielectric, or a conductor by Mitsuba's name.
+        int_ior: of rigorous theory, index of refraction of a dielectric.
+        material: of rigorous theory, a conductor by the name that Mitsuba has for it.
 
     Returns:
         The spectrum; its `error` is what was measured, at values of κ that were not used to build it.
