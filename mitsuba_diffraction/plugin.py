@@ -58,14 +58,8 @@ def _accept_spectra() -> None:
     mi.load_dict = load_dict
 
 
-def _on_variant_change(old: str | None, new: str | None) -> None:
-    if new is not None:
-        register(new)
-
-
-# Only once, also after a reload.
+# A reload must not do this twice.
 if not getattr(mi, "_mitsuba_diffraction_registered", False):
-    mi.detail.add_variant_callback(_on_variant_change)
     _accept_spectra()
     mi._mitsuba_diffraction_registered = True
 if mi.variant() is not None:

@@ -14,11 +14,28 @@ from types import ModuleType
 
 
 def register() -> None:
-    """Register the plugins now if Mitsuba has been imported, otherwise when it is."""
-    if "mitsuba" in sys.modules:
-        from . import plugin  # noqa: F401  (registers on import)
+    """Register for the variant that Mitsuba has, and for those that it will have; now, or when it is imported."""
+    if (mitsuba := sys.modules.get("mitsuba")) is not None:
+        _watch(mitsuba)
     elif not any(isinstance(finder, _MitsubaFinder) for finder in sys.meta_path):
         sys.meta_path.insert(0, _MitsubaFinder())
+
+
+def _watch(mitsuba: ModuleType) -> None:
+    mitsuba.detail.add_variant_callback(_on_variant_change)
+    if mitsuba.variant() is not None:
+        from . import plugin  # noqa: F401  (registers when it is imported)
+
+
+def _on_variant_change(old: str | None, new: str | None) -> None:
+    # No sooner: whoever imports Mitsuba may be a module that the plugins need.
+    if new is None:
+        return
+    loaded = f"{__package__}.plugin" in sys.modules
+    from . import plugin
+
+    if loaded:
+        plugin.register(new)
 
 
 class _MitsubaFinder(importlib.abc.MetaPathFinder):
@@ -38,7 +55,7 @@ class _MitsubaFinder(importlib.abc.MetaPathFinder):
 
         def execute_and_register(module: ModuleType) -> None:
             execute(module)
-            from . import plugin  # noqa: F401
+            _watch(sys.modules["mitsuba"])
 
         spec.loader.exec_module = execute_and_register
         return spec

@@ -46,7 +46,7 @@ def reduced(notebook):
 
 def executed(notebook):
     """Run in the folder of the notebooks, in a kernel of this Python."""
-    client = NotebookClient(notebook, timeout=300, kernel_name="python3", resources={"metadata": {"path": str(FOLDER)}})
+    client = NotebookClient(notebook, timeout=900, kernel_name="python3", resources={"metadata": {"path": str(FOLDER)}})
     return client.execute()
 
 
