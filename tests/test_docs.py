@@ -24,14 +24,13 @@ REDUCED = {
     "render": {"--width": "16", "--spp": "1"},
     "precompute": {"--tolerance": "0.05"},
     "compare": {"--width": "16", "--spp": "1", "--no-shares": None},
-    "convergence": {"--width": "8", "--spp": "1", "--reference-spp": "2", "--tolerance": "0.1"},
 }
 """Options that make a command quick, instead of those that it has."""
 SHOWN = {"text", "bash"}
 """What is shown and not run: output, and what needs several machines (tests/test_cluster.py)."""
 BY_OTHER_MEANS = (
     *("python3 -m venv", "python -m pytest", "pip install", "jupyter ", "mkdocs "),
-    *("mitsuba-diffraction benchmark", "mitsuba-diffraction validate"),
+    *("mitsuba-diffraction benchmark", "mitsuba-diffraction convergence", "mitsuba-diffraction validate"),
     *("python precompute/rigorous_reference.py", "python scenes/"),
 )
 """Commands that CI runs, and the tests of notebooks, the manual, the benchmark, the validation and the gallery."""
