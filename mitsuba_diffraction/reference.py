@@ -21,7 +21,7 @@ from .welch import WindowAxis, carried_coherence_length, window_axes
 
 EXTENTS = ("tile", "sample")
 _FAR = 9.0  # standard deviations; e^{−9²/2} is under 3e-18
-_CHUNK = 2**20  # complex numbers in one intermediate array, 16 MiB
+CHUNK = 2**20  # complex numbers in one intermediate array, 16 MiB
 
 
 def amplitudes(height_field: HeightField, kappa: float) -> NDArray[np.complex128]:
@@ -188,7 +188,7 @@ def _periodograms(
     """
     along_x, along_y = axes
     width, height = len(along_x.window), len(along_y.window)
-    chunk = max(1, _CHUNK // max(height_field.shape))
+    chunk = max(1, CHUNK // max(height_field.shape))
     result = np.zeros(kappa.shape)
     for value, indices in _by_kappa(kappa):
         phase = np.exp(1j * value * height_field.centred)

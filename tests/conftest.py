@@ -1,5 +1,6 @@
 """What all tests share: a cache of their own, the measured scans, and the command."""
 
+import os
 import shlex
 import signal
 import sys
@@ -13,6 +14,7 @@ import mitsuba_diffraction as md  # before Dr.Jit, so that it has an LLVM that w
 from mitsuba_diffraction import cli
 
 from bsdf_support import use  # isort: skip
+from mitsuba_diffraction.render import passes  # isort: skip
 
 # One example may be the first to import or to compile something.
 settings.register_profile("tests", deadline=None)
@@ -25,8 +27,10 @@ _HEIGHT_RANGE = {"elaphe": 0.375, "xenopeltis": 0.819}
 
 @pytest.fixture(scope="session", autouse=True)
 def cache_folder(tmp_path_factory):
-    """A folder for the spectra of recipes that lasts for this session only."""
-    folder = tmp_path_factory.mktemp("cache")
+    """A folder for the spectra of recipes that lasts for this session only, the same for all its processes."""
+    session = tmp_path_factory.getbasetemp()
+    folder = (session.parent if "PYTEST_XDIST_WORKER" in os.environ else session) / "cache"
+    folder.mkdir(exist_ok=True)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("MITSUBA_DIFFRACTION_CACHE", str(folder))
         yield folder
@@ -38,6 +42,17 @@ def ctrl_c():
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
+
+
+@pytest.fixture
+def small_passes(llvm, monkeypatch):
+    """small_passes(side): passes take one sample per pixel of a square picture."""
+
+    def take(side):
+        monkeypatch.setattr(passes, "SAMPLES_PER_PASS", side**2)
+        monkeypatch.setattr(passes, "LEAST_SAMPLES_PER_PIXEL", 1)
+
+    return take
 
 
 @pytest.fixture

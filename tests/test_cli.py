@@ -1,6 +1,5 @@
 """The commands as a person meets them: one line for a mistake, a file for a success, nothing for an interrupt."""
 
-import importlib
 import os
 import re
 import signal
@@ -20,8 +19,6 @@ from mitsuba_diffraction.cli.arguments import scene_parameters
 from mitsuba_diffraction.cli.console import log_lines
 from mitsuba_diffraction.render.spectral_image import SpectralImage
 
-# The package gives the function of that name.
-PRECOMPUTE = importlib.import_module("mitsuba_diffraction.spectrum.build")
 BLAZE = '[surface]\nprofile = "blazed"\nperiod = 2.5\ndepth = 0.25\nsamples = 64\n'
 # Lobes so wide that the energy table is a small one.
 QUICK = BLAZE + "[spectrum]\ncoherence_length = 20\n"
@@ -304,7 +301,7 @@ def test_an_interrupt_leaves_no_file(command, monkeypatch, place):
         raise KeyboardInterrupt
 
     if place == "precompute":
-        monkeypatch.setattr(PRECOMPUTE, "_Build", interrupted)
+        monkeypatch.setattr("mitsuba_diffraction.recipe.precompute", interrupted)
     else:
         monkeypatch.setattr(OpenEXR.File, "write", interrupted, raising=True)
     before = files()
@@ -319,7 +316,7 @@ def test_a_failure_is_one_line_and_exit_code_1(command, monkeypatch, error):
     def fail(*arguments, **named):
         raise error
 
-    monkeypatch.setattr(PRECOMPUTE, "_Build", fail)
+    monkeypatch.setattr("mitsuba_diffraction.recipe.precompute", fail)
     code, out, err = command("precompute", "blaze.toml")
     assert (code, out) == (1, "")
     assert err.strip() == f"mitsuba-diffraction: error: {str(error) or 'MemoryError'}"
@@ -335,7 +332,7 @@ def broadcast(*arguments, **named):
 
 
 def test_a_mistake_of_the_code_is_told_as_such(command, monkeypatch):
-    monkeypatch.setattr(PRECOMPUTE, "_Build", broadcast)
+    monkeypatch.setattr("mitsuba_diffraction.recipe.precompute", broadcast)
     code, out, err = command("precompute", "blaze.toml")
     assert (code, out) == (1, "")
     assert err == f"{BUG}ValueError: {BROADCAST}); mitsuba-diffraction --debug … shows where\n"
@@ -361,7 +358,7 @@ def test_a_mistake_of_the_code_inside_a_plugin_is_none_of_the_scene(command, mon
 
 def test_a_mistake_of_the_code_while_it_renders_is_told_as_such(command, monkeypatch):
     Path("scene.xml").write_text(SCENE)
-    monkeypatch.setattr("mitsuba_diffraction.render.film._trace_with_mitsubas_film", broadcast)
+    monkeypatch.setattr("mitsuba_diffraction.render.film.trace_with_mitsubas_film", broadcast)
     code, out, err = command("render scene.xml --variant scalar_spectral --spp 1 -o out.exr")
     assert (code, out) == (1, "")
     assert err.startswith(f"{BUG}ValueError: ")

@@ -8,7 +8,6 @@ import time
 from pathlib import Path
 
 import drjit as dr
-import mitsuba as mi
 import numpy as np
 import pytest
 
@@ -30,18 +29,14 @@ SCENE = f"""<scene version="3.0.0"><integrator type="path"/>
 
 
 @pytest.fixture(autouse=True)
-def folder(tmp_path, monkeypatch):
+def folder(tmp_path, monkeypatch, small_passes):
     """Each test stands in a folder of its own, with a scene; passes take one sample per pixel."""
-    if not dr.has_backend(dr.JitBackend.LLVM):
-        pytest.skip("Dr.Jit finds no LLVM")
-    mi.set_variant("llvm_ad_spectral")
+    small_passes(SIZE)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(passes, "_SAMPLES_PER_PASS", SIZE**2)
-    monkeypatch.setattr(passes, "_LEAST_SAMPLES_PER_PIXEL", 1)
     Path("scene.xml").write_text(SCENE)
     threads = dr.thread_count()
     yield tmp_path
-    cluster._scene.cache_clear()
+    cluster.scene_of.cache_clear()
     dr.set_thread_count(threads)
 
 
@@ -103,7 +98,7 @@ def test_results_that_come_out_of_order_are_added_in_order(threads_of_this_proce
     in_order = ended.copy()
     ended.clear()
     monkeypatch.setattr(cluster, "trace_pass", invented)
-    monkeypatch.setattr(cluster, "_one_pass", contextlib.nullcontext())
+    monkeypatch.setattr(cluster, "one_pass", contextlib.nullcontext())
     there = render("scene.xml", spp=16, tracer=trace_on(threads_of_this_process))
     assert sorted(ended) == sorted(in_order)
     assert ended != in_order
@@ -126,12 +121,12 @@ def test_failures_of_a_worker_are_one_line(threads_of_this_process, monkeypatch,
 
     with monkeypatch.context() as only_here:
         only_here.setattr(passes.Job, "load", miss)
-        cluster._scene.cache_clear()
+        cluster.scene_of.cache_clear()
         code, out, err = command(line)
     assert (code, out) == (1, "")
     assert err.splitlines()[-1].endswith("error: a worker cannot load the scene: scene.xml: no such file")
     monkeypatch.setattr(cluster, "scene_digest", lambda *arguments: "another")
-    cluster._scene.cache_clear()
+    cluster.scene_of.cache_clear()
     code, out, err = command(line)
     assert (code, out) == (1, "")
     assert "scene.xml: a worker finds another scene there" in err.splitlines()[-1]
@@ -141,7 +136,7 @@ def test_failures_of_a_worker_are_one_line(threads_of_this_process, monkeypatch,
 
 
 def test_a_scheduler_that_is_not_there(command, monkeypatch):
-    monkeypatch.setattr(cluster, "_SECONDS_TO_CONNECT", 0.5)
+    monkeypatch.setattr(cluster, "SECONDS_TO_CONNECT", 0.5)
     line = "render scene.xml --spp 9 --variant llvm_ad_spectral --dask"
     for address in ("tcp://127.0.0.1:1", "nonsense://x"):
         code, out, err = command(f"{line} {address}")
@@ -154,7 +149,7 @@ def test_a_scheduler_that_is_not_there(command, monkeypatch):
 
 
 def test_a_port_that_is_silent_is_no_scheduler(command, monkeypatch):
-    monkeypatch.setattr(cluster, "_SECONDS_TO_CONNECT", 0.5)
+    monkeypatch.setattr(cluster, "SECONDS_TO_CONNECT", 0.5)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
         code, out, err = command(f"render scene.xml --spp 9 --variant llvm_ad_spectral --dask {address}")

@@ -18,7 +18,7 @@ from mitsuba_diffraction.scalar_theory import equivalent_depth, expected_error, 
 from mitsuba_diffraction.studies.inspection import inspect, save_picture
 from mitsuba_diffraction.studies.inspection.colours import WAVELENGTHS, daylight, order_angle, order_share, radiance
 from mitsuba_diffraction.studies.inspection.concerns import concerns
-from mitsuba_diffraction.studies.inspection.picture import _piece, with_uncertainty
+from mitsuba_diffraction.studies.inspection.picture import piece_shown, with_uncertainty
 from mitsuba_diffraction.studies.inspection.statistics import statistics
 from mitsuba_diffraction.studies.inspection.tip import broadened, scanned
 
@@ -401,7 +401,7 @@ def test_scalar_theory_is_judged_at_every_period():
 
 def test_the_slide_of_a_large_tile_shows_a_dozen_periods():
     tile = md.HeightField(np.tile(md.gratings.sinusoidal(PERIOD, DEPTH, samples=16).heights, (32, 8)), PERIOD / 16)
-    piece = _piece(inspect(tile, extent="tile", coherence_length=5.0))
+    piece = piece_shown(inspect(tile, extent="tile", coherence_length=5.0))
     assert piece.tile_size == pytest.approx((24.0, 24.0))
 
 

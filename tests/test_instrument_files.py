@@ -180,7 +180,7 @@ def test_a_header_that_lies_is_refused_in_one_line(nid, tmp_path, old, new):
 
 
 @needs_the_extra
-@pytest.mark.parametrize("extension", [*instruments._FORMATS, ".000", ".123"])
+@pytest.mark.parametrize("extension", [*instruments.FORMATS, ".000", ".123"])
 def test_every_format_refuses_what_is_none(tmp_path, extension):
     path = tmp_path / f"scan{extension}"
     for content in (b"", b"no scan at all\n" * 20, bytes(range(256)) * 8, b"PK\x05\x06" + bytes(18)):

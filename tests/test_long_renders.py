@@ -8,8 +8,6 @@ import sys
 import time
 from pathlib import Path
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 import pytest
 from PIL import Image
@@ -33,19 +31,15 @@ SCENE = f"""<scene version="3.0.0"><default name="red" value="0.5"/><integrator 
 <bsdf type="diffuse"><rgb name="reflectance" value="$red, 0.2, 0.1"/></bsdf></shape></scene>"""
 # The command with passes of one sample per pixel, so that a small picture has many.
 SMALL_PASSES = f"""import mitsuba_diffraction.cli, mitsuba_diffraction.render.passes as passes
-passes._SAMPLES_PER_PASS, passes._LEAST_SAMPLES_PER_PIXEL = {SIZE**2}, 1
+passes.SAMPLES_PER_PASS, passes.LEAST_SAMPLES_PER_PIXEL = {SIZE**2}, 1
 mitsuba_diffraction.cli.main()"""
 
 
 @pytest.fixture(autouse=True)
-def folder(tmp_path, monkeypatch):
+def folder(tmp_path, monkeypatch, small_passes):
     """Each test stands in a folder of its own, with a scene; passes take one sample per pixel."""
-    if not dr.has_backend(dr.JitBackend.LLVM):
-        pytest.skip("Dr.Jit finds no LLVM")
-    mi.set_variant("llvm_ad_spectral")
+    small_passes(SIZE)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(passes, "_SAMPLES_PER_PASS", SIZE**2)
-    monkeypatch.setattr(passes, "_LEAST_SAMPLES_PER_PIXEL", 1)
     Path("scene.xml").write_text(SCENE.replace("RFILTER", "tent"))
     return tmp_path
 
@@ -191,7 +185,7 @@ def test_checkpoints_are_written_every_so_often(monkeypatch):
     clock = iter(np.arange(0, 1000, 4.0))  # each look at the clock is four seconds after the one before
     monkeypatch.setattr(passes.time, "monotonic", lambda: next(clock))
     written = []
-    monkeypatch.setattr(passes, "_save", lambda checkpoint, job, sums, saved: written.append(sums.samples))
+    monkeypatch.setattr(passes, "save_checkpoint", lambda checkpoint, digest, sums: written.append(sums.samples))
     render("scene.xml", spp=60, checkpoint="c", seconds=10)
     # After three looks; then twenty times the four seconds that one took to write, counted from its beginning.
     assert written == [3, 22, 41]
@@ -427,7 +421,7 @@ def small_disk(tmp_path):
 
 
 def test_a_disk_that_the_picture_fills_is_one_line(command, small_disk, monkeypatch):
-    monkeypatch.setattr(passes, "_CHECKPOINT_SHARE", 0)  # after each pass, however long a checkpoint takes
+    monkeypatch.setattr(passes, "CHECKPOINT_SHARE", 0)  # after each pass, however long a checkpoint takes
     # A checkpoint is 200 kB, two of them do not fit; a larger picture does not fit at all.
     code, out, err = command(f"{LINE} -o disk/out.exr --checkpoint 0")
     assert (code, out) == (1, "")

@@ -288,7 +288,7 @@ def test_a_smooth_surface_is_turned_about_its_middle(degrees, shape):
 @given(width=st.floats(1, 30), height=st.floats(1, 30), degrees=st.floats(0.1, 89.9))
 def test_the_rectangle_fits_and_none_of_its_shape_is_greater(width, height, degrees):
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-    w, h = prepare._largest_rectangle(width, height, c, s)
+    w, h = prepare.largest_rectangle(width, height, c, s)
 
     def fits(w, h):
         return w * c + h * s <= width * (1 + 1e-9) and w * s + h * c <= height * (1 + 1e-9)

@@ -431,7 +431,7 @@ def test_how_many_at_a_time_does_not_matter(largest, monkeypatch):
     q[1] = q[0]  # the same places again
     kappa = np.array([4.0, 20.0, 4.0])
     wanted = [[power_spectrum(field, q[i, j], kappa[j], extent="sample") for j in range(3)] for i in range(5)]
-    monkeypatch.setattr("mitsuba_diffraction.reference._CHUNK", largest)
+    monkeypatch.setattr("mitsuba_diffraction.reference.CHUNK", largest)
     np.testing.assert_allclose(power_spectrum(field, q, kappa, extent="sample"), wanted, rtol=1e-10)
 
 

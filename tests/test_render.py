@@ -97,7 +97,7 @@ def test_passes(llvm, tmp_path, monkeypatch):
         calls.append((done, total))
         fresh.append([kernel["hash"] for kernel in dr.kernel_history((dr.KernelType.JIT,)) if not kernel["cache_hit"]])
 
-    monkeypatch.setattr(passes, "_SAMPLES_PER_PASS", 64 * 150)
+    monkeypatch.setattr(passes, "SAMPLES_PER_PASS", 64 * 150)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         split = render(path, spp=512, seed=3, progress=progress)
     assert calls == [(0, 512), (128, 512), (256, 512), (384, 512), (512, 512)]
@@ -110,8 +110,8 @@ def test_passes(llvm, tmp_path, monkeypatch):
 
 
 def test_uneven_passes(llvm, tmp_path, monkeypatch):
-    monkeypatch.setattr(passes, "_SAMPLES_PER_PASS", 1)  # a large picture, so to say
-    monkeypatch.setattr(passes, "_LEAST_SAMPLES_PER_PIXEL", 4)
+    monkeypatch.setattr(passes, "SAMPLES_PER_PASS", 1)  # a large picture, so to say
+    monkeypatch.setattr(passes, "LEAST_SAMPLES_PER_PIXEL", 4)
     calls = []
     path = write_scene(tmp_path, CONSTANT)
     image = render(path, spp=11, progress=lambda done, total, error: calls.append(done))
@@ -122,7 +122,7 @@ def test_uneven_passes(llvm, tmp_path, monkeypatch):
 
 
 def test_samplers_that_round_up_are_counted(llvm, tmp_path, monkeypatch):
-    monkeypatch.setattr(passes, "_SAMPLES_PER_PASS", 64 * 6)
+    monkeypatch.setattr(passes, "SAMPLES_PER_PASS", 64 * 6)
     path = write_scene(tmp_path, CONSTANT)
     path.write_text(path.read_text().replace("independent", "stratified"))
     calls = []
@@ -334,7 +334,7 @@ def test_failing_and_interrupted_renderings(llvm, tmp_path, raised, expected, me
 
 
 def test_interrupt_between_passes(llvm, tmp_path, monkeypatch):
-    monkeypatch.setattr(passes, "_SAMPLES_PER_PASS", 64)
+    monkeypatch.setattr(passes, "SAMPLES_PER_PASS", 64)
 
     def interrupt(done, total, error):
         raise KeyboardInterrupt

@@ -26,8 +26,8 @@ from .passes import Job, Tracer, versions
 from .scene import scene_digest
 
 # A pass uses all threads of Dr.Jit; two at a time would only need more memory.
-_one_pass = threading.Lock()
-_SECONDS_TO_CONNECT = 30
+one_pass = threading.Lock()
+SECONDS_TO_CONNECT = 30
 
 
 def trace_on(address: str) -> Tracer:
@@ -54,13 +54,13 @@ def trace_on(address: str) -> Tracer:
         try:
             distributed.comm.parse_address(address, strict=True)
             asyncio.run(_greet(address))
-            client = distributed.Client(address, timeout=_SECONDS_TO_CONNECT, set_as_default=False)
+            client = distributed.Client(address, timeout=SECONDS_TO_CONNECT, set_as_default=False)
         except (OSError, ValueError, TimeoutError, asyncio.TimeoutError) as error:
             raise RuntimeError(f"no Dask scheduler at {address}: {str(error) or 'it does not answer'}") from error
         with client:
             waiting: deque[distributed.Future] = deque()
             try:
-                client.wait_for_workers(1, timeout=_SECONDS_TO_CONNECT)
+                client.wait_for_workers(1, timeout=SECONDS_TO_CONNECT)
                 ahead = 2 * len(client.nthreads())
                 for index in range(first, len(job.samples)):
                     while len(waiting) < ahead and index + len(waiting) < len(job.samples):
@@ -89,7 +89,7 @@ async def _greet(address: str) -> None:
     """Shakes hands with a scheduler; a client would wait for minutes on a port that accepts but stays silent."""
     import distributed
 
-    comm = await asyncio.wait_for(distributed.comm.connect(address), _SECONDS_TO_CONNECT)
+    comm = await asyncio.wait_for(distributed.comm.connect(address), SECONDS_TO_CONNECT)
     await comm.close()
 
 
@@ -99,16 +99,16 @@ def _trace_there(job: Job, index: int) -> NDArray[np.float32]:
 
     if versions() != job.versions:
         raise RuntimeError(f"a worker has {', '.join(versions())}; wanted {', '.join(job.versions)}")
-    with _one_pass:
+    with one_pass:
         mi.set_variant(job.variant)
         threads = distributed.get_worker().state.nthreads
         if dr.thread_count() != threads:
             dr.set_thread_count(threads)
-        return trace_pass(_scene(job), job.samples[index], pass_seed(job.seed, index))
+        return trace_pass(scene_of(job), job.samples[index], pass_seed(job.seed, index))
 
 
 @lru_cache(maxsize=1)
-def _scene(job: Job) -> mi.Scene:
+def scene_of(job: Job) -> mi.Scene:
     try:
         scene = job.load()
         content = scene_digest(job.scene, dict(job.parameters))

@@ -64,7 +64,7 @@ def trace_pass(scene: mi.Scene, spp: int, seed: int, integrator: mi.Integrator |
             or not isinstance(integrator, mi.SamplingIntegrator)
             or isinstance(integrator, mi.CppADIntegrator)
         ):
-            return _trace_with_mitsubas_film(scene, integrator, spp, seed)
+            return trace_with_mitsubas_film(scene, integrator, spp, seed)
         return _trace(scene, integrator, spp, seed)
     except Exception as error:
         raise RuntimeError(f"rendering failed: {root_cause(error)}") from error
@@ -77,7 +77,7 @@ def samples_drawn(scene: mi.Scene, spp: int) -> int:
     return sampler.sample_count()
 
 
-def _trace_with_mitsubas_film(scene: mi.Scene, integrator: mi.Integrator, spp: int, seed: int) -> NDArray[np.float32]:
+def trace_with_mitsubas_film(scene: mi.Scene, integrator: mi.Integrator, spp: int, seed: int) -> NDArray[np.float32]:
     recorded = np.array(mi.render(scene, integrator=integrator, spp=spp, seed=seed))
     picture = recorded / channel_weights().astype(np.float32)
     drawn = np.float32(samples_drawn(scene, spp))

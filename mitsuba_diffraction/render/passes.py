@@ -29,15 +29,15 @@ from .spectral_image import SpectralImage
 
 # Two million samples take some seconds on two cores, which keeps progress and interrupts responsive. Large pictures
 # take at least eight samples per pixel, as adding a pass to the sum takes one core as long as a third of a sample.
-_SAMPLES_PER_PASS = 2**21
-_LEAST_SAMPLES_PER_PIXEL = 8
+SAMPLES_PER_PASS = 2**21
+LEAST_SAMPLES_PER_PIXEL = 8
 # The stopping criterion estimates the noise from four passes on, and needs at least sixteen in all.
 _PASSES_TO_JUDGE = 4
 _LEAST_PASSES_TO_CONVERGE = 16
 # Of some seconds each: weeks.
 _MOST_PASSES = 10**6
 # At most a twentieth of the time is spent on checkpoints.
-_CHECKPOINT_SHARE = 20
+CHECKPOINT_SHARE = 20
 
 
 @dataclass(frozen=True)
@@ -198,7 +198,7 @@ def render(
                 last = time.monotonic()
                 _save(checkpoint, job, sums, saved)
                 saved = sums.samples
-                wait = max(seconds, _CHECKPOINT_SHARE * (time.monotonic() - last))
+                wait = max(seconds, CHECKPOINT_SHARE * (time.monotonic() - last))
     if not sums.passes:
         raise KeyboardInterrupt
     attributes = {"scene": Path(scene_path).name, "variant": job.variant, "spp": sums.samples, "seed": str(seed)}
@@ -215,7 +215,7 @@ def split(scene: mi.Scene, spp: int, least: int = 1) -> tuple[int, ...]:
     Determined by the request alone, so that an interruption does not change the passes.
     """
     pixels = math.prod(scene.sensors()[0].film().crop_size())
-    passes = -(-spp * pixels // max(_SAMPLES_PER_PASS, _LEAST_SAMPLES_PER_PIXEL * pixels))
+    passes = -(-spp * pixels // max(SAMPLES_PER_PASS, LEAST_SAMPLES_PER_PIXEL * pixels))
     if passes > _MOST_PASSES:
         raise RequestError(f"spp: got {spp}, wanted at most {_MOST_PASSES * spp // passes:.2g} for so large a picture")
     passes = min(max(passes, least), spp)

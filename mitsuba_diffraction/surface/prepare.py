@@ -183,7 +183,7 @@ def rotate(height_field: HeightField, degrees: float) -> HeightField:
     d_x, d_y = height_field.pixel_size
     cos, sin = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     # Between the centres of the outermost pixels.
-    width, height = _largest_rectangle((columns - 1) * d_x, (rows - 1) * d_y, abs(cos), abs(sin))
+    width, height = largest_rectangle((columns - 1) * d_x, (rows - 1) * d_y, abs(cos), abs(sin))
     count = [int(np.floor(length / d + 1e-9)) + 1 for length, d in ((width, d_x), (height, d_y))]
     if min(count) < 2:
         raise RequestError(f"rotate: no pixels fit into {columns} × {rows} pixels turned by {degrees:g}°")
@@ -201,7 +201,7 @@ def rotate(height_field: HeightField, degrees: float) -> HeightField:
     return _after(height_field, turned, f"rotate: {degrees:g}°, {count[0]} × {count[1]} of {columns} × {rows} pixels")
 
 
-def _largest_rectangle(width: float, height: float, cos: float, sin: float) -> tuple[float, float]:
+def largest_rectangle(width: float, height: float, cos: float, sin: float) -> tuple[float, float]:
     """Sides along x and y of the largest rectangle inside a rotated one, for an angle with cos, sin > 0.
 
     If all four corners lie on the rotated rectangle, W = w cos + h sin and H = w sin + h cos give w and h. For a long

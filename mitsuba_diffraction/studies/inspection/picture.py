@@ -61,7 +61,7 @@ def save_picture(inspection: Inspection, path: str | os.PathLike[str], *, title:
         for start, end in ((0.04, 0.27), (0.43, 0.665), (0.705, 0.985))
     )
     lower = figure.add_gridspec(len(INCIDENCES), 1, top=0.285, bottom=0.085, hspace=0.16, left=0.115, right=0.985)
-    _height_map(figure.add_subplot(left), _piece(inspection), inspection.extent)
+    _height_map(figure.add_subplot(left), piece_shown(inspection), inspection.extent)
     _spectrum(figure.add_subplot(middle), inspection)
     _facts(figure.add_subplot(right), inspection)
     _colours([figure.add_subplot(row) for row in lower], inspection)
@@ -112,7 +112,7 @@ def _height_map(axes: Axes, field: HeightField, extent: str) -> None:
     axes.text(size_x * 0.05, y - size_y * 0.04, f"{length:g} µm", color="white", fontsize=11, va="bottom", bbox=box)
 
 
-def _piece(inspection: Inspection) -> HeightField:
+def piece_shown(inspection: Inspection) -> HeightField:
     """Of a surface that repeats, as much as shows its periods: a dozen of the shortest, but four of the longest."""
     field = inspection.shown
     if inspection.extent == "sample" or not inspection.periods:

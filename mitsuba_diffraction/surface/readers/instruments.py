@@ -18,7 +18,7 @@ from .scan import MOST_BYTES, Channel, Scan, choose
 
 EXTRA = "pip install 'mitsuba_diffraction[instruments]'"
 
-_FORMATS = {
+FORMATS = {
     ".al3d": "al3d",
     ".bcr": "bcr",
     ".bcrf": "bcr",
@@ -57,7 +57,7 @@ NAMES = (
 
 def format_of(extension: str) -> str | None:
     """SurfaceTopography's name of the format for this extension (lower case), if it is an instrument format."""
-    return "di" if re.fullmatch(r"\.\d{3}", extension) else _FORMATS.get(extension)
+    return "di" if re.fullmatch(r"\.\d{3}", extension) else FORMATS.get(extension)
 
 
 def read(path: Path, unit: str | tuple[str, str] | None, channel: str | int | None) -> Scan:
