@@ -9,14 +9,13 @@ import numpy as np
 from ..scalar_theory import TRUSTED, equivalent_depth, expected_error
 from ..spectrum import GratingSpectrum
 from ..surface.heightfield import HeightField
-from ..surface.periods import find_periods
+from ..surface.periods import find_periods, find_periods_of_tile
 from . import analytic, bumps, conservation, coupled_waves, rough_surface, viewing_angle
 from .accuracy import against_reference
 from .inspection.statistics import statistics
 from .record import GROUPS, Check, Record
 
 _WAVELENGTH = 0.55  # µm, the middle of the visible range
-_LARGEST = 1 << 21  # pixels of a repeated tile
 
 
 def checks() -> tuple[Check, ...]:
@@ -46,23 +45,9 @@ def surface_checks(height_field: HeightField, spectrum: GratingSpectrum) -> tupl
 
 
 def main_period(height_field: HeightField, extent: str) -> float:
-    """The strongest period in µm; NaN if there is none.
-
-    A wave stands out of several of its periods: a tile is repeated until there are enough. It is then an order of the
-    tile.
-    """
-    if extent == "sample":
-        found = find_periods(height_field, 1)
-        return found[0].period if found else float("nan")
-    for times in (1, 2, 4, 16):
-        if height_field.heights.size * times**2 > _LARGEST:
-            break
-        repeated = np.tile(height_field.heights, (times, times))
-        for found in find_periods(HeightField(repeated, height_field.pixel_size), 1):
-            along = np.array([np.cos(np.deg2rad(found.direction)), np.sin(np.deg2rad(found.direction))])
-            order = np.rint(along / found.period * height_field.tile_size)
-            return float(1 / np.hypot(*(order / height_field.tile_size))) if order.any() else found.period
-    return float("nan")
+    """The strongest period in µm; NaN if there is none."""
+    found = find_periods_of_tile(height_field, 1) if extent == "tile" else find_periods(height_field, 1)
+    return found[0].period if found else float("nan")
 
 
 def scalar_range(height_field: HeightField, extent: str) -> Record:

@@ -38,6 +38,9 @@ _MOST_MAXIMA = 200
 _LOBE = 3
 """Half width of a peak in bins: two owing to the window, more if the period drifts."""
 
+_MOST_TIMES = 8  # that a tile is repeated along each axis
+_MOST_PIXELS = 2**22
+
 
 @dataclass(frozen=True)
 class Period:
@@ -412,6 +415,36 @@ class _LeastSquares:
     def covariance(self) -> NDArray:
         """Covariance of the coefficients for white noise of variance one."""
         return self._inverse @ self._gram(2) @ self._inverse
+
+
+def find_periods_of_tile(tile: HeightField, count: int = 2) -> tuple[Period, ...]:
+    """The strongest periods of a height field that repeats: orders of its lattice; see `find_periods`.
+
+    A wave stands out of a patch with several of its periods; the tile is repeated until there are enough.
+    """
+    # Of one period of a profile, harmonics stand out before the period does.
+    for times in (_MOST_TIMES,) if 1 in tile.shape else (1, 2, 4, _MOST_TIMES):
+        if found := find_periods(repeated(tile, times), count):
+            return tuple(_on_lattice(period, tile) for period in found)
+    return ()
+
+
+def _on_lattice(period: Period, tile: HeightField) -> Period:
+    """A period of a tile that repeats is one of its orders: exactly known."""
+    if period.width:
+        return period
+    along = np.deg2rad(period.direction)
+    order = np.rint(np.array([np.cos(along), np.sin(along)]) / period.period * tile.tile_size)
+    if not order.any():
+        return period
+    return Period.of(order / tile.tile_size, np.zeros((2, 2)), period.strength)
+
+
+def repeated(tile: HeightField, times: int) -> HeightField:
+    """A tile so many times along each axis, or fewer times where that would be many pixels."""
+    while tile.heights.size * times**2 > _MOST_PIXELS and times > 1:
+        times //= 2
+    return HeightField(np.tile(tile.heights, (times, times)), tile.pixel_size, tile.source)
 
 
 def _beyond(found: NDArray[np.float64], expected: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -17,7 +17,7 @@ from ...spectrum import GratingSpectrum
 from ...spectrum.build import precompute
 from ...spectrum.standard_error import standard_error
 from ...surface.heightfield import HeightField
-from ...surface.periods import Period, find_periods
+from ...surface.periods import Period, find_periods, find_periods_of_tile, repeated
 from ...wavelengths import VISIBLE
 from ...welch import carried_coherence_length
 from .colours import LONGEST_COHERENCE
@@ -30,7 +30,6 @@ SCALAR_AT = (450, 550, 650)
 
 _TOLERANCE = 0.02
 _MOST_TIMES = 8
-_MOST_PIXELS = 2**22
 
 
 @dataclass(frozen=True)
@@ -140,7 +139,7 @@ def inspect(
     shortest = VISIBLE[0] * 1e-3
 
     def find(surface: HeightField) -> tuple[Period, ...]:
-        return _periods_of_tile(surface) if extent == "tile" else find_periods(surface)
+        return find_periods_of_tile(surface) if extent == "tile" else find_periods(surface)
 
     periods = find(height_field)
     spectrum = build(height_field)
@@ -164,17 +163,10 @@ def inspect(
         changes=changes(height_field, spectrum, periods[0], extent=extent, build=build, find=find) if periods else (),
         concerns=concerns(height_field, numbers, used, measured=measured),
         spectrum=spectrum,
-        shown=_widened(_repeated(height_field, _MOST_TIMES) if extent == "tile" else height_field),
+        shown=_widened(repeated(height_field, _MOST_TIMES) if extent == "tile" else height_field),
     )
     report(4, 4)
     return result
-
-
-def _repeated(tile: HeightField, times: int) -> HeightField:
-    """A tile so many times along each axis, or fewer times where that would be many pixels."""
-    while tile.heights.size * times**2 > _MOST_PIXELS and times > 1:
-        times //= 2
-    return HeightField(np.tile(tile.heights, (times, times)), tile.pixel_size, tile.source)
 
 
 def _widened(field: HeightField) -> HeightField:
@@ -186,26 +178,6 @@ def _widened(field: HeightField) -> HeightField:
             sizes[1 - axis] = field.tile_size[axis] / count
             return HeightField(np.repeat(field.heights, count, axis), (sizes[0], sizes[1]), field.source)
     return field
-
-
-def _periods_of_tile(tile: HeightField) -> tuple[Period, ...]:
-    """A wave stands out of a patch with several of its periods; the tile is repeated until there are enough."""
-    # Of one period of a profile, harmonics stand out before the period does.
-    for times in (_MOST_TIMES,) if 1 in tile.shape else (1, 2, 4, _MOST_TIMES):
-        if found := find_periods(_repeated(tile, times)):
-            return tuple(_on_lattice(period, tile) for period in found)
-    return ()
-
-
-def _on_lattice(period: Period, tile: HeightField) -> Period:
-    """A period of a tile that repeats is one of its orders: exactly known."""
-    if period.width:
-        return period
-    along = np.deg2rad(period.direction)
-    order = np.rint(np.array([np.cos(along), np.sin(along)]) / period.period * tile.tile_size)
-    if not order.any():
-        return period
-    return Period.of(order / tile.tile_size, np.zeros((2, 2)), period.strength)
 
 
 def _plain(value: object) -> object:
