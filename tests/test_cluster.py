@@ -4,6 +4,8 @@ import contextlib
 import os
 import signal
 import socket
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -169,6 +171,36 @@ def test_a_scheduler_that_goes_leaves_the_checkpoint():
         render("scene.xml", spp=60, checkpoint="c", seconds=0, tracer=trace_on(local.scheduler_address), progress=close)
     whole = render("scene.xml", spp=60, checkpoint="c")
     np.testing.assert_array_equal(whole.radiance, render("scene.xml", spp=60).radiance)
+
+
+@pytest.mark.slow
+def test_a_killed_scheduler_is_one_line():
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"tcp://127.0.0.1:{free.getsockname()[1]}"
+    scheduler = ["scheduler", "--host", "127.0.0.1", "--port", address.rpartition(":")[2], "--no-dashboard"]
+    dask = [
+        subprocess.Popen([sys.executable, "-m", "dask", *words], stderr=subprocess.DEVNULL)
+        for words in (scheduler, ["worker", address, "--no-dashboard", "--no-nanny", "--death-timeout", "20"])
+    ]
+    line = f"render scene.xml -o out.exr --spp 100000 --checkpoint 0 --variant llvm_ad_spectral --dask {address}"
+    try:
+        command = [sys.executable, "-m", "mitsuba_diffraction", *line.split()]
+        rendering = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+        until = time.monotonic() + 120
+        while not Path("out.exr.checkpoint").exists():
+            assert rendering.poll() is None, rendering.stderr.read()
+            assert time.monotonic() < until
+            time.sleep(0.1)
+        dask[0].kill()
+        _, err = rendering.communicate(timeout=120)
+    finally:
+        for process in dask:
+            process.kill()
+            process.wait()
+    assert rendering.returncode == 1
+    lines = [text for text in err.splitlines() if " of 100" not in text]
+    assert lines == [f"mitsuba-diffraction: error: the Dask scheduler at {address} is gone"]
 
 
 @pytest.mark.slow

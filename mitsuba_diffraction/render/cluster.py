@@ -8,11 +8,12 @@ most two passes per initial worker are in flight. Dask reassigns the passes of a
 from __future__ import annotations
 
 import asyncio
+import logging
 import threading
 from collections import deque
 from collections.abc import Iterator
 from concurrent import futures
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from functools import lru_cache
 
 import drjit as dr
@@ -57,7 +58,7 @@ def trace_on(address: str) -> Tracer:
             client = distributed.Client(address, timeout=SECONDS_TO_CONNECT, set_as_default=False)
         except (OSError, ValueError, TimeoutError, asyncio.TimeoutError) as error:
             raise RuntimeError(f"no Dask scheduler at {address}: {str(error) or 'it does not answer'}") from error
-        with client:
+        with _errors_are_told_here(), client:
             waiting: deque[distributed.Future] = deque()
             try:
                 client.wait_for_workers(1, timeout=SECONDS_TO_CONNECT)
@@ -83,6 +84,18 @@ def trace_on(address: str) -> Tracer:
                     client.cancel(list(waiting), force=True)
 
     return trace
+
+
+@contextmanager
+def _errors_are_told_here() -> Iterator[None]:
+    """Dask's client logs what it raises, with its traceback."""
+    logger = logging.getLogger("distributed.client")
+    before = logger.level
+    logger.setLevel(logging.CRITICAL + 1)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
 
 
 async def _greet(address: str) -> None:
