@@ -198,6 +198,29 @@ def test_polarised_variants_are_refused(solved):
         plugin(solved)
 
 
+def test_the_log_says_once_where_scalar_theory_fails(llvm, capfd):
+    fine = {"type": "diffraction_grating", "profile": "sinusoidal", "period": 0.71, "depth": 0.3, "samples": 64}
+    for _ in range(2):
+        mi.load_dict({**fine, "material": "Al"})
+    mi.load_dict({**fine, "period": 3.0, "depth": 0.05, "material": "Al"})
+    said = "".join(capfd.readouterr())
+    assert said.count("scalar theory is expected to err by") == 1
+    assert "theory=rigorous has it right" in said
+
+
+def test_precompute_says_where_scalar_theory_fails(command, tmp_path):
+    recipe = tmp_path / "fine.toml"
+    recipe.write_text('[surface]\nprofile = "sinusoidal"\nperiod = 0.71\ndepth = 0.3\nsamples = 64\n')
+    code, out, _ = command("precompute", str(recipe), "-o", str(tmp_path / "fine.exr"))
+    assert code == 0
+    assert "! scalar theory is expected to err by" in out
+
+
+def test_a_period_too_long_for_the_table_is_refused():
+    with pytest.raises(ValueError, match=r"period: got 20 µm, wanted at most 3\.6 µm with theory=rigorous, 10 times"):
+        md.precompute(md.gratings.sinusoidal(20.0, 0.1), theory="rigorous", material="Al")
+
+
 def test_precompute_writes_a_recipes_rigorous_spectrum(command, tmp_path):
     recipe, target = tmp_path / "moth_eye.toml", tmp_path / "moth_eye.exr"
     recipe.write_text(

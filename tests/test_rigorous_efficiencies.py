@@ -149,6 +149,13 @@ def test_what_is_reported_as_the_error_is_the_error(surface, index, goal):
         assert difference(one, other) <= goal
 
 
+def test_all_orders_of_a_coarse_grating_are_found():
+    """Beside the horizon the last order is farther away than the period has wavelengths."""
+    found = rigorous.efficiencies(gratings.sinusoidal(13.7, 0.05, samples=256), light(60), 1.0, int_ior=1.5)
+    sine = np.sin(np.deg2rad(60))
+    np.testing.assert_array_equal(found.orders, np.arange(np.ceil(-13.7 * (1 - sine)), np.floor(13.7 * (1 + sine)) + 1))
+
+
 def test_where_harmonics_run_out_the_error_tells():
     found = rigorous.efficiencies(gratings.sinusoidal(0.5, 4.0), CONICAL, 0.55, material="Ag", tolerance=1e-9)
     assert found.harmonics == 80

@@ -24,7 +24,7 @@ from .polarisation import reflected, through_layer
 from .reflectance import reflectance_from
 from .rigorous_parameters import check_parameters
 from .shared import SharedTables
-from .surface import surface_from
+from .surface import surface_from, warn_of_range
 from .tables import BELOW_ONE, opaque
 
 DEFENSIVE = 0.02  # the share of samples that follow the cosine, for lobes that the sampler's averages miss
@@ -107,6 +107,8 @@ def define() -> type:
             self.coat = coat_from(props)
             self.spectrum, self._recipe = surface_from(props, self.coat)
             self.rigorous = isinstance(self.spectrum, RigorousSpectrum)
+            if self._recipe is not None and not self.rigorous:
+                warn_of_range(self._recipe)
             self.reflectance = (
                 check_parameters(props, self.spectrum) if self.rigorous else reflectance_from(props, self.coat)
             )

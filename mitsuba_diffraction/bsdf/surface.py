@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import json
 import weakref
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import mitsuba as mi
 from ..errors import RequestError
 from ..recipe import Recipe
 from ..rigorous.spectrum import RigorousSpectrum
+from ..scalar_theory import range_warning
 from ..spectrum import GratingSpectrum
 from ..spectrum.build import THEORIES
 from ..spectrum.load import load_spectrum
@@ -22,6 +24,7 @@ from .rigorous_parameters import material_from
 Spectrum = GratingSpectrum | RigorousSpectrum
 
 _PREFIX = "handed over: "
+_told: set[str] = set()  # surfaces whose range was looked up
 _handed_over: weakref.WeakValueDictionary[str, Spectrum] = weakref.WeakValueDictionary()
 
 
@@ -65,6 +68,16 @@ def surface_from(props: mi.Properties, coat: Coat | None) -> tuple[Spectrum, Rec
         settings |= {"theory": theory, **material_from(props)}
     recipe = _inside(coat, Recipe(surface, settings))
     return recipe.cached(), recipe
+
+
+def warn_of_range(recipe: Recipe) -> None:
+    """Mitsuba's log says once for each surface if scalar theory is not to be trusted there."""
+    told = json.dumps(dict(recipe.surface), sort_keys=True, default=str)
+    if told in _told:
+        return
+    _told.add(told)
+    if beyond := range_warning(recipe.height_field()):
+        mi.Log(mi.LogLevel.Warn, f"diffraction_grating, {recipe.height_field().source}: {beyond}")
 
 
 def _inside(coat: Coat | None, recipe: Recipe) -> Recipe:

@@ -10,6 +10,7 @@ import typer
 from ..errors import RequestError
 from ..recipe import Recipe
 from ..rigorous.spectrum import RigorousSpectrum
+from ..scalar_theory import range_warning
 from ..spectrum import GratingSpectrum
 from ..spectrum.build import REPRESENTATIONS
 from ..surface.seam import seam_matters, seam_steps
@@ -76,12 +77,15 @@ def precompute(
     seams = [_seam(source, recipe_of(source, of_scan, settings)) for source in sources]
     for source, target, seam in zip(sources, targets, seams, strict=True):
         with progress_bar(f"spectrum of {source.name}") as progress:
-            spectrum = recipe_of(source, of_scan, settings).build(progress)
+            recipe = recipe_of(source, of_scan, settings)
+            spectrum = recipe.build(progress)
             spectrum.save(target)
         tell(
             f"{target}: {spectrum.source}; {spectrum.extent}, {spectrum.grid}; coherence length "
             f"{spectrum.coherence_length:.4g} µm; {_table(spectrum)}{seam}"
         )
+        if isinstance(spectrum, GratingSpectrum) and (beyond := range_warning(recipe.height_field())):
+            tell(f"! {beyond}")
 
 
 def _table(spectrum: GratingSpectrum | RigorousSpectrum) -> str:

@@ -9,6 +9,9 @@ from numpy.typing import NDArray
 
 Real = NDArray[np.float64]
 
+LARGEST_PERIOD = 10.0
+"""In units of the shortest wavelength: the table grows with the cube of the period, the time to build it faster."""
+
 
 @dataclass(frozen=True)
 class Axes:

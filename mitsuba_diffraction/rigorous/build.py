@@ -16,7 +16,7 @@ from ..coherence import SUN_COHERENCE_LENGTH, lobe_width
 from ..errors import RequestError
 from ..files import whole_file
 from ..surface.heightfield import HeightField
-from .axes import Axes
+from .axes import LARGEST_PERIOD, Axes
 from .blas import one_thread
 from .coordinate_transformation import Grating, light_from, scatter
 from .curve import curve_of
@@ -68,7 +68,7 @@ def build_spectrum(
         checkpoints: a folder for what is done so far; an interrupted build goes on from there.
 
     Raises:
-        ValueError: if an argument is out of range.
+        ValueError: if an argument is out of range, or the period is above ten of the shortest wavelength.
 
     Warns:
         UserWarning: if the finest table errs by more than `tolerance`; its `error` says by how much.
@@ -76,6 +76,12 @@ def build_spectrum(
     if not 1e-4 <= tolerance < 1:
         raise RequestError(f"tolerance: got {tolerance!r}, wanted a share of the reflected light from 1e-4 to 1")
     lobe_width(coherence_length)
+    period, longest = height_field.tile_size[0], LARGEST_PERIOD * wavelengths[0] * 1e-3
+    if period > longest:
+        raise RequestError(
+            f"period: got {period:.4g} µm, wanted at most {longest:.4g} µm with theory=rigorous, "
+            f"{LARGEST_PERIOD:g} times the shortest wavelength; use theory=scalar"
+        )
     with one_thread():
         surface = _Surface(height_field, (wavelengths[0] * 1e-3, wavelengths[1] * 1e-3), int_ior, material, tolerance)
         checks = surface.checks()
@@ -136,7 +142,8 @@ class _Surface:
         wavelength = self.wavelengths[0]
         material = {"int_ior": self.index(wavelength)}
         exact = efficiencies(height_field, direction, wavelength, tolerance=tolerance / 2, **material)
-        count = int(np.ceil(self.period / wavelength)) + 4
+        # At grazing incidence there are orders up to 2 T/λ.
+        count = int(np.ceil(2 * self.period / wavelength))
         while count < exact.harmonics:
             found = efficiencies(height_field, direction, wavelength, harmonics=count, **material)
             if np.abs(found.unpolarised - exact.unpolarised).sum() <= tolerance * exact.unpolarised.sum():
