@@ -350,12 +350,12 @@ def test_a_mistake_of_the_code_is_told_as_such(command, monkeypatch):
 def test_a_mistake_of_the_code_inside_a_plugin_is_none_of_the_scene(command, monkeypatch):
     Path("scene.xml").write_text(SCENE)
     monkeypatch.setattr("mitsuba_diffraction.bsdf.diffraction_grating.reflectance_from", broadcast)
-    code, out, err = command("render scene.xml --variant scalar_spectral --spp 1 -o out.exr")
+    code, _, err = command("render scene.xml --variant scalar_spectral --spp 1 -o out.exr")
     assert code == 1
     assert len(err.splitlines()) == 1, err
     assert err.startswith(f"{BUG}ValueError: ")
     assert BROADCAST.strip() in err
-    code, out, err = command("--debug render scene.xml --variant scalar_spectral --spp 1 -o out.exr")
+    code, _, err = command("--debug render scene.xml --variant scalar_spectral --spp 1 -o out.exr")
     assert code == 1
     assert "in broadcast" in err
 
