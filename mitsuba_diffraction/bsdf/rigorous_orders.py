@@ -37,6 +37,8 @@ class RigorousOrders:
         self.count = int(2 * spectrum.reach * spectrum.lobe_width * axes.period) + 1  # lobes that overlap
         self.table = PacketTable(_packets(spectrum))
         self.layout = PacketTable(_layout(axes), width=2)
+        if mi.is_polarized:
+            self.matrices = PacketTable(np.moveaxis(spectrum.mueller, 0, 1))
         self.cells = math.gcd(CELLS, axes.steps)
         units = _units(_shares(spectrum, self.cells))
         self.sampler_planes = units.shape[0]
@@ -83,6 +85,57 @@ class RigorousOrders:
                 density += lobe * self.orders(mi.UInt32(dr.select(there, cell + m, 0)), there).y
         return power, density / WHOLE
 
+    def mueller(
+        self, source: mi.Vector3f, exit_: mi.Vector3f, frequency: mi.Float, active: mi.Bool
+    ) -> list[list[mi.Float]]:
+        """M_ij / M_00 of light from `source`, from all orders whose lobes reach the pair; the identity where none does.
+
+        Args:
+            source, exit_: along the pattern's axes.
+            frequency: 1/λ in cycles/µm.
+            active: mask.
+        """
+        q_x, q_y = -(source.x + exit_.x) * frequency, -(source.y + exit_.y) * frequency
+        first = mi.Int32(dr.ceil((q_x - self.radius) * self.period))
+        nu = self.period * frequency
+        k_y, c = 0.5 * nu * (exit_.y - source.y), 0.5 * nu * (exit_.x - source.x)
+        g = dr.sqrt(dr.maximum(dr.square(nu) - dr.square(k_y), 0))
+        z = self._z(g, frequency)
+        rows = [mi.Vector4f(0.0) for _ in range(4)]
+        for step in range(self.count):
+            m = first + step
+            square = self._square(m, q_x, q_y)
+            there = active & (square <= self.farthest) & (dr.abs(m) <= self.axes.largest)
+            lobe = dr.select(there, dr.exp(self.falloff * square), 0)
+            for row, found in enumerate(self._matrix(m, c, g, z, there)):
+                rows[row] += lobe * found
+        bright = rows[0].x > 0
+        # Light of the opposite k_y is mirrored: `mueller.MIRRORED`.
+        mirrored = dr.select(k_y < 0, mi.Float(-1), mi.Float(1))
+        scale = dr.rcp(dr.select(bright, rows[0].x, mi.Float(1)))
+        return [
+            [
+                dr.select(bright, rows[i][j] * scale * (mirrored if (i < 2) != (j < 2) else 1), mi.Float(i == j))
+                for j in range(4)
+            ]
+            for i in range(4)
+        ]
+
+    def _matrix(self, m: mi.Int32, c: mi.Float, g: mi.Float, z: mi.Float, active: mi.Bool) -> list[mi.Vector4f]:
+        """The rows of M of order m, linear between the nodes."""
+        active, start, side, places = self._place(m, c, g, active)
+        places = [*places, _split(z * (self.axes.planes - 1), mi.UInt32(self.axes.planes))]
+        rows = [mi.Vector4f(0.0) for _ in range(4)]
+        for i, j, k in np.ndindex(2, 2, 2):
+            node = start + (places[0][0] + i) * side + places[1][0] + j
+            weight = mi.Float(1)
+            for (_, share), up in zip(places, (i, j, k), strict=True):
+                weight *= share if up else 1 - share
+            for row in range(4):
+                packet = self.matrices(((node * self.axes.planes) + places[2][0] + k) * 4 + row, active)
+                rows[row] += weight * packet
+        return rows
+
     def sample(self, incidence: Incidence, u: mi.Float, v: mi.Point2f, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
         """Draw q in cycles/µm, for one wavelength: the order from `u`, its place in the lobe from `v`."""
         middle = self._cell(incidence)
@@ -114,20 +167,26 @@ class RigorousOrders:
 
     def _efficiency(self, m: mi.Int32, c: mi.Float, g: mi.Float, z: mi.Float, active: mi.Bool) -> mi.Float:
         """η_m(P, R, Z), linear between the nodes; 0 for an order that does not propagate."""
-        half = 0.5 * mi.Float(dr.abs(m))
-        p, r = g + c - half, g - c - half
-        active = active & (p > 0) & (r > 0)
-        layout = self.layout(mi.UInt32(dr.select(active, m + self.axes.largest, 0)), active)
-        side = mi.UInt32(layout.y)
-        i, f = _split(self._position(dr.select(active, p, 0)) * self.axes.steps, side)
-        j, h = _split(self._position(dr.select(active, r, 0)) * self.axes.steps, side)
+        active, start, side, ((i, f), (j, h)) = self._place(m, c, g, active)
         k, w = _split(z * (self.axes.planes - 1), mi.UInt32(self.axes.planes))
-        node, planes = mi.UInt32(layout.x) + i * side + j, self.axes.planes - 1
+        node, planes = start + i * side + j, self.axes.planes - 1
         low, high = (self.table(at * planes + k, active) for at in (node, node + side))
         corners = dr.lerp(low, high, f)
         found = dr.lerp(dr.lerp(corners.x, corners.y, w), dr.lerp(corners.z, corners.w, w), h)
         # Between the nodes that were solved the table may dip below zero by its error.
         return dr.select(active, dr.maximum(found, 0), 0)
+
+    def _place(
+        self, m: mi.Int32, c: mi.Float, g: mi.Float, active: mi.Bool
+    ) -> tuple[mi.Bool, mi.UInt32, mi.UInt32, list[tuple[mi.UInt32, mi.Float]]]:
+        """Whether order m propagates, where its nodes start, their side, the nodes along P and R and the rest."""
+        half = 0.5 * mi.Float(dr.abs(m))
+        p, r = g + c - half, g - c - half
+        active = active & (p > 0) & (r > 0)
+        layout = self.layout(mi.UInt32(dr.select(active, m + self.axes.largest, 0)), active)
+        side = mi.UInt32(layout.y)
+        places = [_split(self._position(dr.select(active, x, 0)) * self.axes.steps, side) for x in (p, r)]
+        return active, mi.UInt32(layout.x), side, places
 
     def _cell(self, incidence: Incidence) -> mi.Int32:
         """Where order 0 of the sampler's cell stands in its table."""

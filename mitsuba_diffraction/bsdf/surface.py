@@ -19,7 +19,7 @@ from ..spectrum.load import load_spectrum
 from ..surface.gratings import COHERENCE_LENGTHS, PROFILES
 from ..wavelengths import VISIBLE
 from .coat import Coat
-from .rigorous_parameters import material_from
+from .rigorous_parameters import settings_from, settings_of_medium
 
 Spectrum = GratingSpectrum | RigorousSpectrum
 
@@ -65,7 +65,7 @@ def surface_from(props: mi.Properties, coat: Coat | None) -> tuple[Spectrum, Rec
     settings = {"coherence_length": COHERENCE_LENGTHS[name]} if name in COHERENCE_LENGTHS else {}
     settings |= {key: props[key] for key in ("coherence_length", "tolerance", "largest_height_range") if key in props}
     if theory == "rigorous":
-        settings |= {"theory": theory, **material_from(props)}
+        settings |= {"theory": theory, **settings_from(props, coat)}
     recipe = _inside(coat, Recipe(surface, settings))
     return recipe.cached(), recipe
 
@@ -81,11 +81,13 @@ def warn_of_range(recipe: Recipe) -> None:
 
 
 def _inside(coat: Coat | None, recipe: Recipe) -> Recipe:
-    """The recipe for the wavelengths that there are inside a coat."""
-    if coat is None or "wavelengths" in recipe.spectrum:
-        return recipe
-    wavelengths = [nanometres / coat.relative for nanometres in VISIBLE]
-    return Recipe(recipe.surface, {**recipe.spectrum, "wavelengths": wavelengths}, recipe.folder)
+    """The recipe for the wavelengths that there are inside a coat, and, of rigorous theory, for the variant."""
+    inside = {}
+    if coat is not None and "wavelengths" not in recipe.spectrum:
+        inside["wavelengths"] = [nanometres / coat.relative for nanometres in VISIBLE]
+    if recipe.spectrum.get("theory") == "rigorous":
+        inside |= settings_of_medium(coat)
+    return Recipe(recipe.surface, {**recipe.spectrum, **inside}, recipe.folder) if inside else recipe
 
 
 def _from_file(path: Path, coat: Coat | None) -> tuple[Spectrum, Recipe | None]:
