@@ -206,10 +206,18 @@ def test_surfaces_of_several_rows_are_refused(llvm):
 
 def test_the_rigorous_recipes_are_of_one_row():
     found = sorted((Path(__file__).parents[1] / "precompute" / "rigorous").glob("*.toml"))
-    assert len(found) == 3
+    assert len(found) == 4
     for recipe in map(md.Recipe.load, found):
         assert recipe.height_field().shape[0] == 1
         assert recipe.spectrum["theory"] == "rigorous"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["dvd_grooves", "foil_one_direction", "ruled_1200", "ruled_600"])
+def test_a_rigorous_recipe_keeps_its_tolerance(name):
+    """Minutes each; the last one a quarter of an hour."""
+    spectrum = md.Recipe.load(Path(__file__).parents[1] / "precompute" / "rigorous" / f"{name}.toml").build()
+    assert spectrum.error <= spectrum.tolerance == 1e-2
 
 
 # ---------------------------------------------------------------- polarised light
