@@ -1,7 +1,8 @@
 """A compact disc, as meshes for compact_disc.xml: `python scenes/disc.py`.
 
 Rings of the dimensions of IEC 60908: hole 15 mm, metal from 46 to 117 mm, disc 120 mm across and 1.2 mm thick. u grows
-from the middle outwards and v round it, so that tracks, which run round the disc, lie along v. Lengths are cm.
+from the middle outwards and v round it, so that tracks, which run round the disc, lie along v. The clear rings have the
+UVs of the table below. Lengths are cm.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from modelling import Array, command, write_sheets
 
 THICKNESS = 0.12
 HOLE, METAL, RIM, EDGE = 0.75, 2.3, 5.85, 6.0
+TABLE_TURN, TABLE_HALF_SIDE = np.deg2rad(68), 400  # as in compact_disc.xml and rainbow.xml
 
 
 def ring(inner: tuple[float, float], outer: tuple[float, float], count: int) -> tuple[Array, Array, Array]:
@@ -22,6 +24,13 @@ def ring(inner: tuple[float, float], outer: tuple[float, float], count: int) -> 
     phi = 2 * np.pi * v[:, None]
     places = np.stack([radius * np.cos(phi), radius * np.sin(phi), height + 0 * phi], -1)
     return places, u, v
+
+
+def uv_of_table(places: Array) -> Array:
+    """UVs (n, 2) of the table below places (n, 3)."""
+    cosine, sine = np.cos(TABLE_TURN), np.sin(TABLE_TURN)
+    x, y = places[:, 0], places[:, 1]
+    return (np.stack([cosine * x + sine * y, cosine * y - sine * x], -1) / TABLE_HALF_SIDE + 1) / 2
 
 
 def make(folder: Path, count: int = 1024) -> None:
@@ -40,7 +49,7 @@ def make(folder: Path, count: int = 1024) -> None:
         ring((EDGE, top - 0.02), (EDGE, 0.0), count),
         ring((HOLE, 0.0), (HOLE, top), count),
     ]
-    write_sheets(folder / "disc_clear.ply", clear)
+    write_sheets(folder / "disc_clear.ply", clear, uv_of_table)
 
 
 if __name__ == "__main__":

@@ -31,13 +31,16 @@ def command(make: Callable[[Path], None]) -> None:
     print(f"{Path(sys.argv[0]).stem}: written to {MODELS}, {time.perf_counter() - start:.1f} s")
 
 
-def write_sheets(path: Path, sheets: Sequence[tuple[Array, Array, Array]]) -> None:
+def write_sheets(
+    path: Path, sheets: Sequence[tuple[Array, Array, Array]], uv: Callable[[Array], Array] | None = None
+) -> None:
     """Writes sheets as one mesh (.ply) with normals and UVs: two triangles for each cell.
 
     Args:
         path: where to write.
         sheets: (places, u, v) each, of shapes (n_v, n_u, 3), (n_u,) and (n_v,). Where the first and the last row or
             column lie in one place the surface is closed there.
+        uv: UVs (n, 2) of places (n, 3), instead of u and v.
     """
     vertices, normals, uvs, faces, count = [], [], [], [], 0
     for places, u, v in sheets:
@@ -46,7 +49,7 @@ def write_sheets(path: Path, sheets: Sequence[tuple[Array, Array, Array]]) -> No
         length = np.linalg.norm(normal, axis=-1, keepdims=True)
         normals.append(np.divide(normal, length, out=np.zeros_like(normal), where=length > 0).reshape(-1, 3))
         vertices.append(places.reshape(-1, 3))
-        uvs.append(np.stack(np.meshgrid(u, v), -1).reshape(-1, 2))
+        uvs.append(np.stack(np.meshgrid(u, v), -1).reshape(-1, 2) if uv is None else uv(vertices[-1]))
         corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel() + count
         faces += [corner, corner + 1, corner + columns + 1, corner, corner + columns + 1, corner + columns]
         count += rows * columns

@@ -62,7 +62,15 @@ def two_processes():
         yield local
 
 
-def test_a_cluster_gives_the_bits_of_one_machine(threads_of_this_process, command):
+def with_light_from_gratings(scene):
+    """The same on a floor in the sun, by the integrator that finds what the grating throws onto it."""
+    sun = '<emitter type="directional"><vector name="direction" x="0" y="1" z="-1"/></emitter>'
+    return scene.replace('"path"', '"diffraction_path"').replace("</scene>", f'{sun}<shape type="rectangle"/></scene>')
+
+
+@pytest.mark.parametrize("scene", [SCENE, with_light_from_gratings(SCENE)], ids=["path", "diffraction_path"])
+def test_a_cluster_gives_the_bits_of_one_machine(scene, threads_of_this_process, command):
+    Path("scene.xml").write_text(scene)
     line = f"render scene.xml -o out.exr --spp 9 --variant llvm_ad_spectral --dask {threads_of_this_process}"
     code, _, err = command(line)
     assert (code, err) == (0, "")

@@ -21,16 +21,16 @@ ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 BLOCK = re.compile(r"^(?P<indent> *)```(?P<language>\w+)\n(?P<body>.*?)^ *```$", re.DOTALL | re.MULTILINE)
 REDUCED = {
-    "render": "--width 16 --spp 1",
-    "precompute": "--tolerance 0.05",
-    "compare": "--width 16 --spp 1 --no-shares",
+    "render": {"--width": "16", "--spp": "1"},
+    "precompute": {"--tolerance": "0.05"},
+    "compare": {"--width": "16", "--spp": "1", "--no-shares": None},
 }
-"""Options that make a command quick; they stand last, and the last one counts."""
+"""Options that make a command quick, instead of those that it has."""
 SHOWN = {"text", "bash"}
 """What is shown and not run: output, and what needs several machines (tests/test_cluster.py)."""
 BY_OTHER_MEANS = (
     *("python3 -m venv", "python -m pytest", "pip install", "jupyter ", "mkdocs "),
-    *("mitsuba-diffraction benchmark", "mitsuba-diffraction validate"),
+    *("mitsuba-diffraction benchmark", "mitsuba-diffraction convergence", "mitsuba-diffraction validate"),
     *("python precompute/rigorous_reference.py", "python scenes/"),
 )
 """Commands that CI runs, and the tests of notebooks, the manual, the benchmark, the validation and the gallery."""
@@ -102,13 +102,24 @@ def run_shell(text, command, wanted=0, reduced=True):
             continue
         name, *words = words
         assert name == "mitsuba-diffraction", line
-        options = REDUCED.get(words[0], "").split() * (reduced and "--width 64" not in line) + ["--frames", "2"] * (
-            "--orbit" in words
-        )
-        code, said, error = command(*words, *options)
+        options = dict(REDUCED.get(words[0], {}) if reduced and "--width 64" not in line else {})
+        if "--orbit" in words:
+            options["--frames"] = "2"
+        code, said, error = command(*with_options(words, options))
         assert code == wanted, f"{line}: {error}"
         said = said or error
     return said
+
+
+def with_options(words, options):
+    """A command with other values of options, (name → value, None of a flag)."""
+    kept, rest = [], iter(words)
+    for word in rest:
+        if word not in options:
+            kept.append(word)
+        elif options[word] is not None:
+            next(rest)
+    return kept + [word for option in options.items() for word in option if word is not None]
 
 
 def run_console(text, command):

@@ -37,9 +37,10 @@ PARAMETERS = (
         "profile",
         "string",
         "a grating by formula instead of a file, with the parameters of the function of that name in "
-        "`mitsuba_diffraction.gratings`, all lengths in µm, and coherence_length, tolerance and largest_height_range "
-        "as in `precompute`",
+        "`mitsuba_diffraction.gratings`, all lengths in µm, and coherence_length and largest_height_range as in "
+        "`precompute`",
     ),
+    Parameter("tolerance", "float", "of a profile or instead of that of a recipe, as in `precompute`"),
     Parameter(
         "theory",
         "string",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import inspect
 import json
 import weakref
@@ -52,7 +53,9 @@ def surface_from(props: mi.Properties, coat: Coat | None) -> tuple[Spectrum, Rec
         if given == ["spectrum"]:
             spectrum, recipe = _taken_over(props["spectrum"]), None
         else:
-            spectrum, recipe = _from_file(Path(str(mi.file_resolver().resolve(str(props["filename"])))), coat)
+            spectrum, recipe = _from_file(
+                Path(str(mi.file_resolver().resolve(str(props["filename"])))), coat, props.get("tolerance")
+            )
         found = "rigorous" if isinstance(spectrum, RigorousSpectrum) else "scalar"
         if props.get("theory", found) != found:
             raise RequestError(f"theory: got {theory!r} with a spectrum of {found} theory, wanted one built for it")
@@ -90,7 +93,7 @@ def _inside(coat: Coat | None, recipe: Recipe) -> Recipe:
     return Recipe(recipe.surface, {**recipe.spectrum, **inside}, recipe.folder) if inside else recipe
 
 
-def _from_file(path: Path, coat: Coat | None) -> tuple[Spectrum, Recipe | None]:
+def _from_file(path: Path, coat: Coat | None, tolerance: float | None) -> tuple[Spectrum, Recipe | None]:
     suffix = path.suffix.lower()
     if suffix in (".toml", ".exr") and not path.is_file():
         # What is not found stays relative; the folder of a scene is searched first.
@@ -99,8 +102,12 @@ def _from_file(path: Path, coat: Coat | None) -> tuple[Spectrum, Recipe | None]:
         raise FileNotFoundError(f"{path}: no such file; {folder} holds {', '.join(there) or 'no spectrum'}")
     if suffix == ".toml":
         recipe = _inside(coat, Recipe.load(path))
+        if tolerance is not None:
+            recipe = dataclasses.replace(recipe, spectrum={**recipe.spectrum, "tolerance": tolerance})
         return recipe.cached(), recipe
     if suffix == ".exr":
+        if tolerance is not None:
+            raise RequestError(f"tolerance: got {tolerance} with {path}, wanted it when the spectrum is computed")
         return load_spectrum(path), None
     raise RequestError(
         f"filename: got {path}, wanted a saved spectrum (.exr) or a recipe (.toml); "

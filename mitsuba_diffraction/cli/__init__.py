@@ -14,11 +14,13 @@ from importlib import metadata
 from typing import Annotated
 
 import typer
+from typer.core import TyperCommand
 
 from ..errors import Bug, RequestError, is_bug
 from .benchmark import benchmark
 from .compare import compare
 from .console import NAME, Stopped, say, tell
+from .convergence import convergence
 from .inspect import inspect
 from .precompute import precompute
 from .render import render
@@ -27,9 +29,21 @@ from .validate import validate
 # Click's, or that of the copy of Click which newer versions of Typer carry.
 _UsageError = typer.BadParameter.__base__
 
+
+class _Command(TyperCommand):
+    """Refuses an option that is given twice; of a list of values it may be."""
+
+    def parse_args(self, context: typer.Context, arguments: list[str]) -> list[str]:
+        _, _, order = self.make_parser(context).parse_args(list(arguments))
+        for parameter in order:
+            if order.count(parameter) > 1 and not parameter.multiple and parameter.param_type_name == "option":
+                raise RequestError(f"{parameter.opts[-1]}: got it twice, wanted one value")
+        return super().parse_args(context, arguments)
+
+
 app = typer.Typer(add_completion=False, no_args_is_help=False, help="Diffraction gratings for Mitsuba 3.")
-for _command in (inspect, precompute, render, compare, validate, benchmark):
-    app.command()(_command)
+for _command in (inspect, precompute, render, compare, convergence, validate, benchmark):
+    app.command(cls=_Command)(_command)
 
 
 def _say_version(wanted: bool) -> None:

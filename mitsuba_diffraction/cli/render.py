@@ -41,6 +41,9 @@ def render(
     half: Annotated[
         bool, typer.Option("--half", help="write float16: half the size, radiance rounded by up to 0.05 %")
     ] = False,
+    denoise: Annotated[
+        bool, typer.Option("--denoise", help="denoise the preview, but not the spectral picture (extra: denoise)")
+    ] = False,
     dask: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="distribute the passes over a Dask cluster (tcp://HOST:PORT)")
     ] = None,
@@ -55,7 +58,7 @@ def render(
     from ..render.passes import Interrupted, trace_here
     from ..render.passes import render as trace
     from ..render.preview import save_preview
-    from ..render.scene import named_sample_count
+    from ..render.scene import load_spectral_scene, named_sample_count
     from ..render.spectral_image import SpectralImage
     from ..render.turntable import frame_path, save_animation
     from ..render.turntable import orbit as motions_of_orbit
@@ -93,22 +96,25 @@ def render(
         tracer = trace_on(dask)
     motions = [None] if frames is None else motions_of_orbit(scene, frames, parameters)
 
+    where = {"width": width, "height": height, "parameters": parameters}
     exposure = None
     for number, (path, motion) in enumerate(zip(targets, motions, strict=True)):
         start = time.perf_counter()
         waiting = checkpoint_path(path)
         label = scene.name if frames is None else f"{scene.name} {number + 1}/{frames}"
         earlier = SpectralImage.load(path) if resume and path.is_file() and not waiting.exists() else None
-        interrupted = False
+        guides, interrupted = None, False
+        if denoise:
+            from ..render.denoise import guides as guides_of
+
+            guides = guides_of(load_spectral_scene(scene, **where, motion=motion))
         try:
             with progress_bar(label, "spp") as progress:
                 image = trace(
                     scene,
                     spp=spp,
-                    width=width,
-                    height=height,
+                    **where,
                     seed=seed,
-                    parameters=parameters,
                     motion=motion,
                     until_error=until_error,
                     checkpoint=waiting,
@@ -131,7 +137,7 @@ def render(
         try:
             if image is not earlier:
                 image.save(path, half=half)
-            exposure = save_preview(image, preview, exposure)
+            exposure = save_preview(image, preview, exposure, guides)
         except (OSError, RuntimeError) as error:
             kept = f"; {waiting} is kept, and --resume continues from it" if waiting.exists() else ""
             raise RuntimeError(f"{path} or its preview cannot be written ({error}){kept}") from error

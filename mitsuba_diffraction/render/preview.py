@@ -3,22 +3,29 @@
 from __future__ import annotations
 
 import os
+from typing import TYPE_CHECKING
 
-from ..color import auto_exposure, into_gamut, on_screen, spectrum_to_linear_sRGB
+from ..color import XYZ_to_linear_sRGB, auto_exposure, into_gamut, on_screen, spectrum_to_XYZ
 from ..files import whole_file
 from ..outputs import png_text
 from .spectral_image import SpectralImage
 
+if TYPE_CHECKING:
+    from .denoise import Guides
 
-def save_preview(image: SpectralImage, path: str | os.PathLike[str], exposure: float | None = None) -> float:
+
+def save_preview(
+    image: SpectralImage, path: str | os.PathLike[str], exposure: float | None = None, guides: Guides | None = None
+) -> float:
     """Writes an 8-bit sRGB preview of a spectral image, in the format given by the suffix of `path`.
 
-    Spectra → linear sRGB → `into_gamut` → × exposure → `roll_off` → sRGB's transfer function.
+    Spectra → XYZ → linear sRGB → `into_gamut` → × exposure → `roll_off` → sRGB's transfer function.
 
     Args:
         image: the spectral image.
         path: the file, such as `picture.png`.
         exposure: the factor for linear sRGB; by default `auto_exposure`.
+        guides: of the same pixels (`denoise.guides`), to denoise the preview.
 
     Returns:
         The exposure.
@@ -28,7 +35,12 @@ def save_preview(image: SpectralImage, path: str | os.PathLike[str], exposure: f
     """
     from PIL import Image
 
-    rgb = into_gamut(spectrum_to_linear_sRGB(image.radiance, image.wavelengths))
+    XYZ = spectrum_to_XYZ(image.radiance, image.wavelengths)
+    if guides is not None:
+        from .denoise import denoised
+
+        XYZ = denoised(XYZ, guides)
+    rgb = into_gamut(XYZ_to_linear_sRGB(XYZ))
     if exposure is None:
         exposure = auto_exposure(rgb)
     with whole_file(path) as temporary:

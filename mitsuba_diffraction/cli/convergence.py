@@ -1,0 +1,63 @@
+"""`mitsuba-diffraction convergence`: the error of a picture against its time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from .arguments import Overwrite, claim, scene_parameters
+from .console import out, progress_bar, tell
+from .inputs import files_read
+
+
+def convergence(
+    context: typer.Context,
+    scene: Annotated[Path, typer.Argument(metavar="SCENE.xml")],
+    plot: Annotated[Path, typer.Option("-o", "--output", help="plot of error against time (.png)")],
+    tolerance: Annotated[list[float] | None, typer.Option(help="of the spectra; default: 0.1, 0.01 and 0.001")] = None,
+    spp: Annotated[list[int] | None, typer.Option(min=1, help="samples per pixel; default: 1, 4, … 256")] = None,
+    reference_spp: Annotated[int, typer.Option(min=2, help="samples per pixel of the reference")] = 2048,
+    width: Annotated[int, typer.Option(min=1, help="pixels")] = 128,
+    variant: Annotated[str | None, typer.Option(help="Mitsuba variant; default: the fastest spectral one")] = None,
+    json: Annotated[Path | None, typer.Option(help="save the numbers (.json)")] = None,
+    define: Annotated[
+        list[str] | None, typer.Option("-D", metavar="NAME=VALUE", help="set a parameter of the scene")
+    ] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Measure the error of a picture against time, by the path tracer and by the real-time shaders.
+
+    The scene needs a parameter `tolerance` of its gratings.
+    """
+    import mitsuba as mi
+
+    from ..studies import report
+    from ..studies.shader_comparison import convergence as study
+    from ..variants import choose_variant
+
+    parameters = scene_parameters(define)
+    written = [("-o", plot), *([("--json", json)] if json is not None else [])]
+    claim(context, files_read(scene, parameters), written)
+    mi.set_variant(choose_variant(variant))
+    found = study.convergence(
+        scene,
+        tolerances=sorted(tolerance or study.TOLERANCES, reverse=True),
+        samples=sorted(spp or study.SAMPLES),
+        reference_samples=reference_spp,
+        width=width,
+        parameters=parameters,
+        progress=progress_bar,
+    )
+    study.save_plot(found, plot)
+    if json is not None:
+        report.save_json(found, json)
+    wide = Console(highlight=False, width=max(out.width, 100))
+    wide.print(report.table(study.COLUMNS, study.rows(found)))
+    for name, curve in found.curves().items():
+        if not curve[0].traced:
+            when = [f"{found.overtaken(name, error):.2g} s" for error in ("delta_e", "relative_mse")]
+            tell(f"{name}: overtaken after {when[0]} (ΔE00) and {when[1]} (relative MSE)")
+    tell(f"the reference owes ΔE00 {found.noise:.2f} to noise")

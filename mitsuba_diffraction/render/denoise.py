@@ -1,0 +1,105 @@
+"""Denoised previews, by Intel Open Image Denoise on the CPU. Spectral pictures are never denoised.
+
+The denoiser expects noise that is independent from pixel to pixel. The reconstruction filter h of a film correlates it,
+with the autocorrelation r = h ⋆ h and hence the power spectrum R(f) = Σ_n r(n) e^{2πi n f}. The picture is therefore
+divided by √R in the frequency domain, denoised, and multiplied by √R again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from ..errors import RequestError
+
+_SAMPLES = 16  # per pixel, of the guides
+_RGB = (610.0, 550.0, 465.0)  # nm, at which the albedo is evaluated
+_STEPS = 100  # of the integral of the autocorrelation, per pixel
+_SMALLEST = 0.1  # √R, of filters that remove a frequency altogether
+
+
+@dataclass(frozen=True, eq=False)
+class Guides:
+    """What the denoiser knows of a scene beside its picture, for the first sensor.
+
+    Attributes:
+        albedo: float32 (rows, columns, 3), 0 to 1: of diffuse surfaces seen first, else one.
+        normals: float32 (rows, columns, 3): shading normals in world space; zero for the background.
+        response: √R of the reconstruction filter at the frequencies of a discrete cosine transform, (rows, columns, 1).
+    """
+
+    albedo: NDArray[np.float32]
+    normals: NDArray[np.float32]
+    response: NDArray[np.float64]
+
+
+def guides(scene: mi.Scene) -> Guides:
+    """The guides of a scene.
+
+    Raises:
+        ValueError: if the variant is a scalar one, or pyoidn is not installed.
+    """
+    if not dr.is_jit_v(mi.Float):
+        raise RequestError(f"--denoise: got the variant {mi.variant()}, wanted a vectorised one")
+    try:
+        import pyoidn  # noqa: F401
+    except ModuleNotFoundError:
+        raise RequestError("--denoise: pyoidn is not installed; pip install 'mitsuba_diffraction[denoise]'") from None
+    sensor = scene.sensors()[0]
+    columns, rows = (int(size) for size in sensor.film().crop_size())
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(0, rows * columns * _SAMPLES)
+    pixel = dr.arange(mi.UInt32, rows * columns * _SAMPLES) // _SAMPLES
+    position = (mi.Point2f(pixel % columns, pixel // columns) + sampler.next_2d()) / mi.Point2f(columns, rows)
+    ray, _ = sensor.sample_ray(0.0, sampler.next_1d(), position, sampler.next_2d())
+    ray.wavelengths = type(ray.wavelengths)(*_RGB, _RGB[1])
+    hit = scene.ray_intersect(ray)
+    bsdf = hit.bsdf(ray)
+    diffuse = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Diffuse)
+    albedo = mi.unpolarized_spectrum(bsdf.eval_diffuse_reflectance(hit, diffuse))
+    albedo = dr.select(diffuse, dr.clip(albedo, 0, 1), 1)
+
+    def mean(*channels: mi.Float) -> NDArray[np.float32]:
+        values = [np.array(x).reshape(rows, columns, _SAMPLES).mean(-1) for x in channels]
+        return np.stack(values, -1).astype(np.float32)
+
+    normal = dr.select(hit.is_valid(), hit.sh_frame.n, 0)
+    response = np.multiply.outer(*(_response(sensor.film().rfilter(), size) for size in (rows, columns)))
+    return Guides(mean(*(albedo[i] for i in range(3))), mean(normal.x, normal.y, normal.z), response[..., None])
+
+
+def _response(kernel: mi.ReconstructionFilter, size: int) -> NDArray[np.float64]:
+    """√R at the frequencies of a discrete cosine transform of `size` numbers, one at f = 0; (size,)."""
+    shifts = np.arange(int(np.ceil(2 * kernel.radius())) + 1)
+    x = np.arange(-kernel.radius(), kernel.radius(), 1 / _STEPS) + 0.5 / _STEPS
+    h = np.array(kernel.eval(mi.Float(x)))
+    autocorrelation = np.array([h @ np.interp(x + shift, x, h, 0, 0) for shift in shifts])
+    autocorrelation[1:] *= 2
+    power = np.cos(np.pi * np.arange(size)[:, None] / size * shifts) @ autocorrelation
+    return np.sqrt(np.maximum(power / power[0], _SMALLEST**2))
+
+
+def denoised(XYZ: NDArray[np.floating], guide: Guides) -> NDArray[np.float64]:
+    """A picture without its noise.
+
+    Args:
+        XYZ: (rows, columns, 3), of any scale.
+        guide: of the same pixels.
+
+    Returns:
+        XYZ, likewise.
+    """
+    import colour
+    import pyoidn
+
+    # ACES primaries enclose the visible colours: no channel is negative but for noise.
+    space = colour.RGB_COLOURSPACES["ACES2065-1"]
+    white = fft.idctn(fft.dctn(XYZ @ space.matrix_XYZ_to_RGB.T, axes=(0, 1)) / guide.response, axes=(0, 1))
+    rgb = pyoidn.denoise(np.ascontiguousarray(white, np.float32), albedo=guide.albedo, normal=guide.normals, hdr=True)
+    rgb = fft.idctn(fft.dctn(rgb.astype(np.float64), axes=(0, 1)) * guide.response, axes=(0, 1))
+    return rgb @ space.matrix_RGB_to_XYZ.T

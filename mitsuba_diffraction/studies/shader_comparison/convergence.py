@@ -1,0 +1,216 @@
+"""The error of a picture against the time that it took: the path tracer and the real-time shaders.
+
+All pictures of a scene are compared with one reference: the path tracer's, with many samples and a table a third as
+coarse as the finest. Noise and the tolerance of the spectrum tend to zero; the shaders stop at their bias.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...errors import RequestError
+from ...files import whole_file
+from ...outputs import metadata
+from ..report import cells
+from .comparison import no_progress
+from .difference import difference, noise, white_luminance
+from .pictures import Picture, Pictures, Progress
+
+TOLERANCES = (1e-1, 1e-2, 1e-3)
+SAMPLES = (1, 4, 16, 64, 256)
+REFERENCE_SAMPLES = 2048
+SHADERS = ("flss", "nmm", "pq")
+SHADING_POINTS = (1, 4, 16)
+OTHERS = 4  # samples of what is no grating, per shading point
+
+COLUMNS = {
+    "picture": "{.name}",
+    "samples": "{.samples}",
+    "seconds": "{.seconds:.3g}",
+    "ΔE00": "{.delta_e:.2f}",
+    "relative MSE": "{.relative_mse:.1e}",
+}
+
+
+@dataclass(frozen=True)
+class Point:
+    """A picture.
+
+    Attributes:
+        name: "tolerance 0.01" of the path tracer, or "flss, corrected".
+        traced: by the path tracer.
+        samples: per pixel; shading points of a shader.
+        seconds: of rendering, without loading and compiling.
+        delta_e: mean CIEDE2000 to the reference.
+        relative_mse: Σ (Y − Y_ref)²/Σ Y_ref² over the pixels that show surfaces, at the same mean luminance.
+    """
+
+    name: str
+    traced: bool
+    samples: int
+    seconds: float
+    delta_e: float
+    relative_mse: float
+
+
+@dataclass(frozen=True)
+class Convergence:
+    """The pictures of one scene.
+
+    Attributes:
+        scene: file name and parameters.
+        size: (width, height) in pixels.
+        noise: mean CIEDE2000 that the reference owes to noise.
+        points: in the order of measurement.
+    """
+
+    scene: str
+    size: tuple[int, int]
+    noise: float
+    points: tuple[Point, ...]
+
+    def curves(self) -> dict[str, list[Point]]:
+        """Points by name."""
+        names = dict.fromkeys(point.name for point in self.points)
+        return {name: [point for point in self.points if point.name == name] for name in names}
+
+    def overtaken(self, name: str, error: str) -> float:
+        """When the path tracer's error falls below the least of a shader.
+
+        Args:
+            name: of the shader's curve.
+            error: "delta_e" or "relative_mse".
+
+        Returns:
+            Seconds, interpolated in logarithms along the fastest curve; the time of the fastest picture if that is
+            already better, NaN if none is.
+        """
+        bias = min(getattr(point, error) for point in self.curves()[name])
+        times = []
+        for curve in self.curves().values():
+            if not curve[0].traced:
+                continue
+            seconds, errors = (np.log([getattr(point, key) for point in curve]) for key in ("seconds", error))
+            below = np.flatnonzero(errors < np.log(bias))
+            if len(below):
+                last = below[0]
+                span = slice(max(last - 1, 0), last + 1)
+                times.append(np.exp(np.interp(-np.log(bias), -errors[span], seconds[span])))
+        return float(min(times, default=np.nan))
+
+
+def convergence(
+    scene_path: str | os.PathLike[str],
+    *,
+    tolerances: Sequence[float] = TOLERANCES,
+    samples: Sequence[int] = SAMPLES,
+    reference_samples: int = REFERENCE_SAMPLES,
+    shaders: Sequence[str] = SHADERS,
+    shading_points: Sequence[int] = SHADING_POINTS,
+    width: int | None = None,
+    parameters: Mapping[str, str] | None = None,
+    progress: Callable[[str], AbstractContextManager[Progress]] = no_progress,
+) -> Convergence:
+    """Renders a scene in many ways, under the variant in force.
+
+    Args:
+        scene_path: an XML scene with a parameter `tolerance` of its gratings, whose integrator is a path tracer, with a
+            directional or point light.
+        tolerances: of the spectra.
+        samples: per pixel of the path tracer, ascending.
+        reference_samples: per pixel of the reference.
+        shaders: names.
+        shading_points: per pixel of the shaders, ascending.
+        width: pixels, if the film's size shall not hold.
+        parameters: further values for the scene's `$name` parameters.
+        progress: progress(label) is a context whose value is called with (done, total).
+
+    Raises:
+        FileNotFoundError: if there is no such scene.
+        ValueError: if the request is wrong, or a shader cannot show the scene.
+    """
+    if not min(tolerances) > 0:
+        raise RequestError(f"tolerance: got {min(tolerances)}, wanted a positive number")
+
+    def pictures(tolerance: float, shader: str = SHADERS[0], seed: int = 0) -> Pictures:
+        chosen = {**(parameters or {}), "tolerance": f"{tolerance:g}"}
+        return Pictures(scene_path, shader, width=width, seed=seed, parameters=chosen)
+
+    finest = min(tolerances)
+    of = pictures(finest / 3, seed=1)
+    with progress("reference") as bar:
+        reference = of.path_traced(reference_samples, bar)
+    white = white_luminance(reference.xyz, of.surface)
+    points = []
+
+    def add(name: str, traced: bool, picture: Picture) -> None:
+        delta_e = difference(reference.xyz, picture.xyz, of.surface, white)
+        wanted, found = reference.xyz[of.surface][:, 1], delta_e.exposure * picture.xyz[of.surface][:, 1]
+        mse = float(((found - wanted) ** 2).sum() / (wanted**2).sum())
+        points.append(Point(name, traced, picture.samples, picture.seconds, delta_e.mean, mse))
+
+    for tolerance in tolerances:
+        traced = pictures(tolerance)
+        with progress(f"tolerance {tolerance:g}") as bar:
+            for number, count in enumerate(samples, 1):
+                add(f"tolerance {tolerance:g}", True, traced.path_traced(count))
+                bar(number, len(samples))
+    for shader in shaders:
+        shaded = pictures(finest, shader)
+        for name, quirks in (("as published", shaded.quirks), ("corrected", ())):
+            with progress(f"{shader}, {name}") as bar:
+                for number, count in enumerate(shading_points, 1):
+                    add(f"{shader}, {name}", False, shaded.shaded(quirks, count, OTHERS * count))
+                    bar(number, len(shading_points))
+    scene = " ".join(
+        [os.path.basename(scene_path), *(f"-D {key}={value}" for key, value in (parameters or {}).items())]
+    )
+    rows, columns = of.surface.shape
+    return Convergence(scene, (columns, rows), noise(reference.halves, of.surface, white), tuple(points))
+
+
+def rows(found: Convergence) -> list[list[str]]:
+    """The points under `COLUMNS`."""
+    return [cells(COLUMNS, point) for point in found.points]
+
+
+def save_plot(found: Convergence, path: str | os.PathLike[str]) -> None:
+    """Draws both errors against time: down is more accurate, left is faster."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9.5, 4.6), layout="constrained")
+    panels = figure.subplots(1, 2)
+    for panel, error, label in zip(
+        panels, ("delta_e", "relative_mse"), ("mean ΔE00", "relative mean square error"), strict=True
+    ):
+        colours = iter(("#1b6ca8", "#3fa0d9", "#8fcdf2", "#bfe3f7"))
+        shaders = dict(zip(SHADERS, ("#c0392b", "#d98c1f", "#6b8e23"), strict=True))
+        for name, curve in found.curves().items():
+            seconds, errors = ([getattr(point, key) for point in curve] for key in ("seconds", error))
+            if curve[0].traced:
+                panel.loglog(seconds, errors, "o-", color=next(colours), markersize=4, label=f"path tracer, {name}")
+                continue
+            colour, published = shaders[name.split(",")[0]], name.endswith("published")
+            panel.loglog(
+                seconds, errors, "s--" if published else "D:", color=colour, markersize=5, linewidth=1,
+                markerfacecolor=colour if published else "white", label=name,
+            )  # fmt: skip
+            when = found.overtaken(name, error)
+            if np.isfinite(when):
+                panel.plot(when, min(errors), "x", color=colour, markersize=7, markeredgewidth=1.8)
+        panel.set_xlabel("seconds")
+        panel.set_ylabel(label)
+        panel.grid(alpha=0.25, which="both")
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize="small")
+    width, height = found.size
+    figure.suptitle(
+        f"{found.scene}, {width} × {height} pixels; × where the path tracer overtakes a shader", fontsize=10
+    )
+    with whole_file(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=130, metadata=metadata(path))
