@@ -75,7 +75,7 @@ _SCAN_KEYS = frozenset({"scan", "pixel_size", "height_range", "fill_missing", "c
 _SPECTRUM_KEYS = frozenset(
     {
         *("extent", "coherence_length", "wavelengths", "largest_angle", "representation", "tolerance"),
-        *("largest_height_range", "theory", "material", "int_ior"),
+        *("largest_height_range", "theory", "material", "int_ior", "ext_ior", "polarised"),
     }
 )
 # Incremented when the same input gives a different result, to invalidate the cache.
@@ -129,11 +129,11 @@ class Recipe:
         for name, value in [*self.surface.items(), *self.spectrum.items()]:
             if name == "prepare" and "scan" in self.surface:
                 continue  # checked above
-            if isinstance(value, bool) and name != "fill_missing":
+            if isinstance(value, bool) and name not in ("fill_missing", "polarised"):
                 raise RequestError(f"{name}: got {value!r}, wanted a number or a text")
             if not (_is_plain(value) or (isinstance(value, list | tuple) and all(_is_plain(v) for v in value))):
                 raise RequestError(f"{name}: got {value!r}, wanted a number, a text, or a list of them")
-        for name in ("tolerance", "coherence_length", "largest_angle", "largest_height_range", "int_ior"):
+        for name in ("tolerance", "coherence_length", "largest_angle", "largest_height_range", "int_ior", "ext_ior"):
             if name in self.spectrum and not _is_number(self.spectrum[name]):
                 raise RequestError(f"{name}: got {self.spectrum[name]!r}, wanted a number")
         if "wavelengths" in self.spectrum and not isinstance(self.spectrum["wavelengths"], list | tuple):

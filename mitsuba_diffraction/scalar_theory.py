@@ -1,15 +1,16 @@
 """The range of scalar theory: its efficiencies in closed form, and their deviation from rigorous ones.
 
 Scalar theory treats each facet of the surface as a plane mirror (tangent-plane approximation), which holds if the
-surface varies slowly on the scale of a wavelength. Stored results of rigorous coupled-wave analysis, made by
-`precompute/rigorous_reference.py`, quantify the error as a function of period/λ and depth/λ.
+surface varies slowly on the scale of a wavelength. Stored rigorous results quantify the error: a map over
+period/λ and depth/λ by the solver of `rigorous` (`precompute/scalar_theory_map.py`), and single gratings, which also
+check that map, by coupled-wave analysis (`precompute/rigorous_reference.py`).
 """
 
 from __future__ import annotations
 
 import functools
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,13 +22,17 @@ from scipy.special import jv
 
 from .errors import RequestError
 from .geometry import k_g
+from .rigorous.axes import LARGEST_PERIOD
+from .rigorous.curve import is_profile
 from .surface.heightfield import HeightField
+from .wavelengths import VISIBLE
 
 Array = NDArray[np.float64]
 OrderPowers = Callable[[NDArray[np.int64], Array], Array]
 """(m, κ), broadcast against each other → η_m(κ)."""
 
 STORED = Path(__file__).parent / "data" / "rigorous.json"
+MAP = STORED.with_name("scalar_error.json")
 
 TRUSTED = 0.1
 """Expected error above which a surface is considered outside the range of scalar theory."""
@@ -91,10 +96,12 @@ class Orders:
         return (self.s + self.p) / 2
 
 
-def scalar_orders(powers: OrderPowers, period: float, wavelength: float, angle: float, index: complex) -> Orders:
+def scalar_orders(
+    powers: OrderPowers, period: float, wavelength: float, angle: float, index: complex, turn: float = 0.0
+) -> Orders:
     """R K G E η_m(κ_m), the efficiencies of the BSDF in float64 in the limit of narrow lobes.
 
-    Light is incident from −x in the plane perpendicular to the grooves. Integrating the BRDF R K G S(q; κ)/λ² E
+    Integrating the BRDF R K G S(q; κ)/λ² E
     (`bsdf/`) times cos θ_o over the lobe of an order, with du dv = λ² dq, gives these factors at the direction of the
     order.
 
@@ -102,39 +109,45 @@ def scalar_orders(powers: OrderPowers, period: float, wavelength: float, angle: 
         powers: of the profile.
         period: µm.
         wavelength: µm.
-        angle: of incidence, degrees.
+        angle: of incidence, degrees; the light comes from −x.
         index: n + ik of the material.
+        turn: of the plane of incidence, degrees; 0: it is perpendicular to the grooves, 90: parallel (conical).
     """
     pitch = wavelength / period
     sine = -np.sin(np.deg2rad(angle))
-    m, sines, factor, cos_half = _mirror_orders(powers, pitch, wavelength, np.array([sine]))
+    along, across = sine * np.cos(np.deg2rad(turn)), sine * np.sin(np.deg2rad(turn))
+    m, sines, factor, cos_half = _mirror_orders(powers, pitch, wavelength, np.array([along]), across)
     kept = factor[0] > -1
     m, sines, factor, cos_half = m[kept], sines[0, kept], factor[0, kept], cos_half[0, kept]
-    albedo = np.maximum(factor.sum(), _albedo(powers, pitch, wavelength, sines))
+    albedo = np.maximum(factor.sum(), _albedo(powers, pitch, wavelength, sines, across))
     reflected = factor / np.maximum(1, albedo)
     s, p = fresnel(cos_half, index)
     return Orders(m, s * reflected, p * reflected)
 
 
 def _mirror_orders(
-    powers: OrderPowers, pitch: float, wavelength: float, sines: Array
+    powers: OrderPowers, pitch: float, wavelength: float, sines: Array, across: float
 ) -> tuple[NDArray[np.int64], Array, Array, Array]:
-    """For ω_i,x (d,): m (n,), and (d, n) each ω_o,x, K G η_m for R = 1 (−1 where evanescent), and ω_i·h."""
+    """For ω_i,x (d,) and one ω_i,y = −ω_o,y.
+
+    m (n,), and (d, n) each ω_o,x, K G η_m for R = 1 (−1 where evanescent), and ω_i·h.
+    """
     m = np.arange(-int(2 / pitch) - 1, int(2 / pitch) + 2)
     sine_i = sines[:, None]
     sine_o = -m * pitch - sine_i
-    there = np.abs(sine_o) < 1
-    cos_i = np.sqrt(1 - sine_i**2)
-    cos_o = np.sqrt(np.where(there, 1 - sine_o**2, 1))
-    cos_between = sine_i * np.where(there, sine_o, 0) + cos_i * cos_o
+    most = 1 - across**2
+    there = sine_o**2 < most
+    cos_i = np.sqrt(most - sine_i**2)
+    cos_o = np.sqrt(np.where(there, most - sine_o**2, 1))
+    cos_between = sine_i * np.where(there, sine_o, 0) - across**2 + cos_i * cos_o
     kappa = 2 * np.pi * (cos_i + cos_o) / wavelength
     factor = np.where(there, geometry(cos_i, cos_o, cos_between) * powers(m, kappa), -1)
     return m, sine_o, factor, np.sqrt((1 + cos_between) / 2)
 
 
-def _albedo(powers: OrderPowers, pitch: float, wavelength: float, sines: Array) -> Array:
-    """a(ω) of a perfect mirror for light from ω_x, (d,)."""
-    factor = _mirror_orders(powers, pitch, wavelength, sines)[2]
+def _albedo(powers: OrderPowers, pitch: float, wavelength: float, sines: Array, across: float) -> Array:
+    """a(ω) of a perfect mirror for light from ω_x, (d,), and ω_y."""
+    factor = _mirror_orders(powers, pitch, wavelength, sines, across)[2]
     return np.maximum(factor, 0).sum(axis=1)
 
 
@@ -151,41 +164,54 @@ def difference(scalar: ArrayLike, rigorous: ArrayLike) -> float:
 
 
 @functools.cache
-def error_map() -> tuple[Array, Array, Array, Array]:
-    """Error of scalar theory for sinusoids of n = 1.5 in unpolarised light.
+def error_map(material: str = "dielectric") -> tuple[Array, Array, Array, Array]:
+    """Error of scalar theory for sinusoids in unpolarised light, as `precompute/scalar_theory_map.py` wrote it.
+
+    Args:
+        material: "dielectric", n = 1.5, or "Al", aluminium at 550 nm.
 
     Returns:
-        period/λ (n,), depth/λ (k,), angles of incidence in degrees (a,), and the error, (n, k, a).
+        period/λ (n,), depth/λ (k,), directions (a, 2) in degrees, of incidence and of the plane of incidence from that
+        perpendicular to the grooves, and the error, (n, k, a).
     """
-    found: dict[tuple[float, float, float], float] = {}
-    index = complex(stored()["map index"])
-    for point in stored()["map"]:
-        period, depth, angle = point["period"], point["depth"], point["angle"]
-        orders = scalar_orders(sinusoid_powers(depth), period, 1.0, angle, index)
-        if [int(orders.m[0]), int(orders.m[-1])] != point["orders"]:
-            raise RequestError(f"{STORED.name}: orders {point['orders']} at {period} λ, wanted {orders.m[[0, -1]]}")
-        found[period, depth, angle] = difference(orders.unpolarised, point["unpolarised"])
-    periods, depths, angles = (np.array(sorted(set(values))) for values in zip(*found, strict=True))
-    errors = np.array([[[found[p, d, a] for a in angles] for d in depths] for p in periods])
-    return periods, depths, angles, errors
+    content = json.loads(MAP.read_text(encoding="utf-8"))
+    if material not in content["error"]:
+        raise RequestError(f"material: got {material!r}, wanted one of {', '.join(content['error'])}")
+    periods, depths, directions = (np.array(content[name], float) for name in ("periods", "depths", "directions"))
+    errors = np.reshape(content["error"][material], (len(directions), len(depths), len(periods)))
+    return periods, depths, directions, errors.transpose(2, 1, 0)
 
 
 @functools.cache
-def _interpolated() -> RegularGridInterpolator:
-    periods, depths, _, errors = error_map()
-    return RegularGridInterpolator((np.log(periods), np.log(depths)), np.log(errors.max(axis=2)))
+def _interpolated(material: str, largest_angle: float, mean: bool) -> RegularGridInterpolator:
+    periods, depths, directions, errors = error_map(material)
+    those = errors[..., directions[:, 0] <= largest_angle]
+    error = those.mean(axis=2) if mean else those.max(axis=2)
+    return RegularGridInterpolator((np.log(periods), np.log(depths)), np.log(np.maximum(error, 1e-6)))
 
 
-def expected_error(period: float, depth: float, wavelength: float) -> float:
-    """Expected error of scalar theory for a surface at incidence up to 20°.
+def expected_error(
+    period: float,
+    depth: float,
+    wavelength: float,
+    *,
+    material: str = "dielectric",
+    largest_angle: float = 20.0,
+    mean: bool = False,
+) -> float:
+    """Expected error of scalar theory for a surface at incidence up to some angle.
 
-    The larger of the stored errors at 0° and 20°, interpolated linearly in the logarithms. They are for sinusoids of
-    n = 1.5. Other surfaces are represented by their main period and their `equivalent_depth`; edges increase the error.
+    The largest of the stored errors at 0°, 20°, 40° and 60° up to `largest_angle`, at 40° and 60° conical incidence
+    among them, interpolated linearly in the logarithms. They are for sinusoids. Other surfaces are represented by their
+    main period and their `equivalent_depth`; edges increase the error.
 
     Args:
         period: µm.
         depth: peak to valley, µm.
         wavelength: µm.
+        material: "dielectric", n = 1.5, or "Al".
+        largest_angle: degrees.
+        mean: of these errors instead of the largest.
 
     Returns:
         Σ|Δη_m| relative to the reflected power. Above the largest stored period (20 λ) and below the smallest depth
@@ -193,15 +219,67 @@ def expected_error(period: float, depth: float, wavelength: float) -> float:
         stored and beyond scalar theory.
 
     Raises:
-        ValueError: unless period and wavelength are positive and the depth is not negative.
+        ValueError: unless period and wavelength are positive and the depth is not negative, or for another material.
     """
     for name, value in (("period", period), ("wavelength", wavelength)):
         if not (np.isfinite(value) and value > 0):
             raise RequestError(f"{name}: got {value!r}, wanted a positive number in µm")
     if not (np.isfinite(depth) and depth >= 0):
         raise RequestError(f"depth: got {depth!r}, wanted a number in µm, zero or more")
-    periods, depths, _, _ = error_map()
+    if not largest_angle >= 0:
+        raise RequestError(f"largest_angle: got {largest_angle!r}, wanted degrees, zero or more")
+    periods, depths, _, _ = error_map(material)
     if period < periods[0] * wavelength or depth > depths[-1] * wavelength:
         return float("nan")
     place = np.minimum(period / wavelength, periods[-1]), np.maximum(depth / wavelength, depths[0])
-    return float(np.exp(_interpolated()(np.log(place))).item())
+    return float(np.exp(_interpolated(material, float(largest_angle), mean)(np.log(place))).item())
+
+
+def strongest_period(height_field: HeightField) -> float:
+    """The period of the strongest wave in a patch that repeats, µm; NaN of a plane."""
+    power = np.abs(np.fft.rfft2(height_field.centred)) ** 2
+    power[0, 0] = 0
+    if not power.max() > 1e-20 * height_field.heights.size**2:
+        return float("nan")
+    row, column = np.unravel_index(np.argmax(power), power.shape)
+    rows = len(power)
+    width, length = height_field.tile_size
+    return float(1 / np.hypot(column / width, (row - rows * (2 * row > rows)) / length))
+
+
+def range_warning(height_field: HeightField, periods: Sequence[float] | None = None) -> str:
+    """A sentence if scalar theory is expected to err by more than `TRUSTED`, or does not hold; "" if not.
+
+    Where rigorous theory can take its place, half of that is enough. What counts is the mean error over the stored
+    directions, of a dielectric or of aluminium, for blue, green or red light, the largest.
+
+    Args:
+        height_field: the surface.
+        periods: that stand out, µm, the worst of which counts; by default that of the strongest wave.
+    """
+    periods = [strongest_period(height_field)] if periods is None else periods
+    depth = equivalent_depth(float(height_field.centred.std()))
+    worst, period = max(((_mean_error(each, depth), each) for each in periods if np.isfinite(each)), default=(0.0, 0.0))
+    longest = LARGEST_PERIOD * VISIBLE[0] * 1e-3
+    rigorous = is_profile(height_field) and height_field.tile_size[0] <= longest
+    if worst <= (TRUSTED / 2 if rigorous else TRUSTED):
+        return ""
+    place = f"(period {period:.3g} µm, depth {depth:.2g} µm)"
+    error = f"is expected to err by {worst:.0%} of the reflected light" if np.isfinite(worst) else "does not hold"
+    if rigorous:
+        remedy = "theory=rigorous has it right"
+    elif is_profile(height_field):
+        remedy = f"rigorous theory is offered for tiles of up to {longest:.2g} µm along x"
+    else:
+        remedy = "no rigorous theory is offered for a surface that varies along y"
+    return f"scalar theory {error} here {place}; {remedy}"
+
+
+def _mean_error(period: float, depth: float) -> float:
+    """For `range_warning`; infinite where the map does not reach at any of the wavelengths."""
+    errors = [
+        expected_error(period, depth, wavelength, material=material, largest_angle=90.0, mean=True)
+        for material in ("dielectric", "Al")
+        for wavelength in (0.45, 0.55, 0.65)
+    ]
+    return float(np.nanmax(errors)) if np.isfinite(errors).any() else float("inf")

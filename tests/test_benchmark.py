@@ -11,10 +11,11 @@ from rich.console import Console
 import mitsuba_diffraction as md
 from mitsuba_diffraction import gratings
 from mitsuba_diffraction.spectrum.slice_table import SliceTable
-from mitsuba_diffraction.studies import benchmark
+from mitsuba_diffraction.studies import benchmark, report
 from mitsuba_diffraction.studies.accuracy import Exact
 from mitsuba_diffraction.studies.cases import Case, bundled_cases, scan_case
 from mitsuba_diffraction.studies.sampling import measure
+from mitsuba_diffraction.studies.theories import COLUMNS, compare_theories
 from mitsuba_diffraction.wavelengths import VISIBLE
 
 BLAZE = Case("blaze", gratings.blazed(2.5, 0.25), "tile", 65.0)
@@ -95,6 +96,18 @@ def test_sampling_is_measured(llvm):
     console = Console(width=200, record=True)
     console.print(*benchmark.tables([], [], [found]))
     assert "blaze" in console.export_text()
+
+
+def test_theories_are_compared_on_one_grating(llvm):
+    """A grating of 0.3 µm, on a table as coarse as it may be: rigorous theory is right, scalar theory is not."""
+    fine = gratings.sinusoidal(0.3, 0.1, samples=64)
+    scalar, rigorous = compare_theories(fine, tolerance=0.5, count=1 << 10, repetitions=1)
+    assert (scalar.theory, rigorous.theory) == ("scalar", "rigorous")
+    assert rigorous.error < 0.05 < 0.2 < scalar.error
+    assert rigorous.worst >= rigorous.error
+    for cost in (scalar, rigorous):
+        assert min(cost.build_seconds, cost.megabytes, cost.evaluate_ratio, cost.lobe_ratio, cost.sample_ratio) > 0
+    assert report.cells(COLUMNS, rigorous)[0] == "rigorous"
 
 
 def test_the_bundled_surfaces_are_those_of_the_recipes():

@@ -148,7 +148,8 @@ def test_precompute_writes_the_file_that_it_names_and_says_its_error(command):
     assert (code, err.strip()) == (0, "")
     spectrum = md.GratingSpectrum.load("blaze.exr")
     assert out.startswith("blaze.exr: ")
-    assert len(out.splitlines()) == 2
+    assert len(out.splitlines()) == 3
+    assert out.splitlines()[2].startswith("! scalar theory is expected to err by 6% ")
     for part in ("blazed grating", "2.5 × 2.5 µm", "27 × 1 orders", "MB", f"error {spectrum.error:.1e}", "0.001"):
         assert part in out
     assert "tile, " in out
@@ -263,7 +264,7 @@ def test_many_sources_are_named_after_themselves(command):
     Path("other.toml").write_text(QUICK)
     code, out, _ = command("precompute", "blaze.toml", "other.toml")
     assert code == 0
-    assert [line.split(":")[0] for line in out.splitlines()[::2]] == ["blaze.exr", "other.exr"]
+    assert [line.split(":")[0] for line in out.splitlines() if ".exr: " in line] == ["blaze.exr", "other.exr"]
     assert {"blaze.exr", "other.exr"} <= files()
 
 
@@ -346,12 +347,12 @@ def test_a_mistake_of_the_code_is_told_as_such(command, monkeypatch):
 def test_a_mistake_of_the_code_inside_a_plugin_is_none_of_the_scene(command, monkeypatch):
     Path("scene.xml").write_text(SCENE)
     monkeypatch.setattr("mitsuba_diffraction.bsdf.diffraction_grating.reflectance_from", broadcast)
-    code, out, err = command("render scene.xml --variant scalar_spectral --spp 1 -o out.exr")
-    assert (code, out) == (1, "")
+    code, _, err = command("render scene.xml --variant scalar_spectral --spp 1 -o out.exr")
+    assert code == 1
     assert len(err.splitlines()) == 1, err
     assert err.startswith(f"{BUG}ValueError: ")
     assert BROADCAST.strip() in err
-    code, out, err = command("--debug render scene.xml --variant scalar_spectral --spp 1 -o out.exr")
+    code, _, err = command("--debug render scene.xml --variant scalar_spectral --spp 1 -o out.exr")
     assert code == 1
     assert "in broadcast" in err
 

@@ -257,6 +257,13 @@ def test_what_stands_in_the_way_is_said(field, words):
     assert any(words in sentence for sentence in said), said
 
 
+def test_a_grating_too_fine_for_scalar_theory_is_a_concern():
+    fine = md.gratings.sinusoidal(0.8, 0.3)
+    (said,) = concerns(fine, statistics(fine), 65.0, measured=False, periods=[0.8])
+    assert said.startswith("Scalar theory is expected to err by ")
+    assert said.endswith("; theory=rigorous has it right.")
+
+
 def test_a_good_scan_raises_no_concern():
     assert about(waves()) == ()
     assert about(md.gratings.lamellar(2.5, 0.2), measured=False) == ()

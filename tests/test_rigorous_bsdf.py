@@ -12,11 +12,17 @@ from bsdf_support import direction, evaluate, interaction, random_directions, us
 import mitsuba_diffraction as md
 from mitsuba_diffraction.bsdf import probe
 from mitsuba_diffraction.rigorous.axes import Axes
+from mitsuba_diffraction.rigorous.mueller import mueller
 from mitsuba_diffraction.rigorous.spectrum import RigorousSpectrum
+from mitsuba_diffraction.scalar_theory import fresnel
 
 SURFACE = {"profile": "blazed", "period": 0.3, "depth": 0.05, "samples": 64}
-SETTINGS = {"theory": "rigorous", "int_ior": 1.5, "wavelengths": [400.0, 500.0], "tolerance": 0.2}
+SETTINGS = {"theory": "rigorous", "int_ior": 1.5, "wavelengths": [400.0, 500.0], "tolerance": 0.03, "polarised": True}
 WAVELENGTHS = (405.0, 440.0, 470.0, 498.0)
+
+
+def toml(value):
+    return "true" if value is True else repr(value)
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +30,10 @@ def recipe_file(tmp_path_factory):
     """A recipe of a grating of 0.3 µm; at its wavelengths it has the orders −1, 0 and 1."""
     path = tmp_path_factory.mktemp("rigorous") / "fine.toml"
     tables = {"surface": SURFACE, "spectrum": SETTINGS}
-    lines = [f"[{name}]\n" + "".join(f"{k} = {v!r}\n" for k, v in table.items()) for name, table in tables.items()]
+    lines = [
+        f"[{name}]\n" + "".join(f"{k} = {str(v).lower() if v is True else repr(v)}\n" for k, v in table.items())
+        for name, table in tables.items()
+    ]
     path.write_text("".join(lines), encoding="utf-8")
     return path
 
@@ -147,6 +156,17 @@ def test_the_albedo_is_that_of_the_solver(llvm, solved):
         assert weights[:, 0].mean() == pytest.approx(exact.unpolarised.sum(), rel=0.05)
 
 
+def test_a_profile_by_formula_is_built_in_the_scene(llvm):
+    """A table of a few nodes, as coarse as it may be."""
+    fine = {"type": "diffraction_grating", "profile": "sinusoidal", "period": 0.2, "depth": 0.05, "samples": 32}
+    bsdf = mi.load_dict({**fine, "theory": "rigorous", "int_ior": 1.5, "ext_ior": 1.0, "tolerance": 0.9})
+    wi = direction(30, 20)
+    _, weights, _ = probe.sample(bsdf, np.broadcast_to(wi, (20_000, 3)), (600.0,) * 4, 3)
+    exact = md.rigorous.efficiencies(md.gratings.sinusoidal(0.2, 0.05, samples=32), wi, 0.6, int_ior=1.5)
+    assert weights[:, 0].mean() == pytest.approx(exact.unpolarised.sum(), rel=0.1)
+    assert "rigorous" in str(bsdf)
+
+
 def test_files_recipes_and_profiles_give_the_same(llvm, solved, recipe_file, tmp_path):
     saved = tmp_path / "fine.exr"
     solved.save(saved)
@@ -186,16 +206,226 @@ def test_surfaces_of_several_rows_are_refused(llvm):
 
 def test_the_rigorous_recipes_are_of_one_row():
     found = sorted((Path(__file__).parents[1] / "precompute" / "rigorous").glob("*.toml"))
-    assert len(found) == 3
+    assert len(found) == 4
     for recipe in map(md.Recipe.load, found):
         assert recipe.height_field().shape[0] == 1
         assert recipe.spectrum["theory"] == "rigorous"
 
 
-def test_polarised_variants_are_refused(solved):
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["dvd_grooves", "foil_one_direction", "ruled_1200", "ruled_600"])
+def test_a_rigorous_recipe_keeps_its_tolerance(name):
+    """Minutes each; the last one a quarter of an hour."""
+    spectrum = md.Recipe.load(Path(__file__).parents[1] / "precompute" / "rigorous" / f"{name}.toml").build()
+    assert spectrum.error <= spectrum.tolerance == 1e-2
+
+
+# ---------------------------------------------------------------- polarised light
+
+
+def vector(v):
+    return mi.Vector3f(*map(float, v))
+
+
+def entries(matrix):
+    """Of the first wavelength, (4, 4)."""
+    return np.array([[np.ravel(matrix[i, j][0])[0] for j in range(4)] for i in range(4)])
+
+
+def mueller_of(bsdf, source, exit_, wavelength):
+    """The Mueller matrix, (4, 4), for light from `source` to `exit_`, in nm."""
+    return entries(bsdf.eval(mi.BSDFContext(), interaction(exit_, (wavelength,) * 4, 1), vector(source)))
+
+
+def between_stokes_axes(matrix, source, exit_):
+    """A matrix between waves in (ŝ, k̂ × ŝ), ŝ = ẑ × k̂, as one between Mitsuba's axes."""
+    full = mi.Spectrum(0.0)
+    for i, j in np.ndindex(4, 4):
+        full[i, j] = mi.UnpolarizedSpectrum(float(matrix[i, j]))
+    axes = [vector(np.cross([0, 0, 1], k) / np.linalg.norm(k[:2])) for k in (-source, exit_)]
+    came, leaves = vector(-source), vector(exit_)
+    return entries(
+        mi.mueller.rotate_mueller_basis(
+            full, came, axes[0], mi.mueller.stokes_basis(came), leaves, axes[1], mi.mueller.stokes_basis(leaves)
+        )
+    )
+
+
+def test_mueller_matrices_of_a_plane_are_mitsubas():
+    """The signs of circular polarisation, too."""
+    use("scalar_spectral_polarized")
+    cosine, index = 0.6, 0.8 + 6j
+    omega = np.sqrt(1 - cosine**2), 0, cosine
+    found = md.rigorous.efficiencies(md.gratings.sinusoidal(0.3, 0.0, samples=64), omega, 0.45, int_ior=index)
+    wanted = mi.mueller.specular_reflection(cosine, mi.Complex2f(index.real, index.imag))
+    wanted = [[float(np.ravel(wanted[i, j])[0]) for j in range(4)] for i in range(4)]
+    np.testing.assert_allclose(mueller(found.amplitudes[found.orders == 0][0]), wanted, atol=1e-5)
+
+
+def test_polarised_light_is_split_as_the_solver_has_it(solved):
+    """Conical incidence from all sides, of a pattern that is turned."""
     use("llvm_ad_spectral_polarized")
-    with pytest.raises(RuntimeError, match="theory: got rigorous in the variant llvm_ad_spectral_polarized, wanted"):
-        plugin(solved)
+    surface, bsdf = md.gratings.blazed(0.3, 0.05, samples=64), plugin(solved, orientation=25.0)
+    sin, cos = np.sin(np.deg2rad(25)), np.cos(np.deg2rad(25))
+    turn = np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])
+    differences = []
+    for theta, phi in ((20, 10), (35, 100), (50, 200), (60, 310), (40, 65)):
+        wi = direction(theta, phi)
+        exact = md.rigorous.efficiencies(surface, turn @ wi, 0.45, int_ior=1.5)
+        for m, amplitudes in zip(exact.orders, exact.amplitudes, strict=True):
+            xy = np.array([-m * 0.45 / 0.3, 0]) - (turn @ wi)[:2]
+            wo = turn.T @ [*xy, np.sqrt(1 - xy @ xy)]
+            wanted = between_stokes_axes(mueller(amplitudes), wi, wo)
+            found = mueller_of(bsdf, wi, wo, 450.0)
+            share = exact.unpolarised[exact.orders == m][0] / exact.unpolarised.sum()
+            found, wanted = found / found[0, 0], wanted / wanted[0, 0]
+            differences.append(share * np.abs(found - wanted).max())
+    assert max(differences) < 0.06
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_spectral_polarized", "scalar_spectral_polarized"])
+def test_unpolarised_light_is_that_of_variants_without_polarisation(variant, solved):
+    wi, wo = (omega[:6] for omega in pairs(solved, 0.47, 60))
+    use("llvm_ad_spectral")
+    wanted = probe.evaluate_pdf(plugin(solved), wi, wo, (470.0,) * 4)[0][:, 0]
+    use(variant)
+    bsdf = plugin(solved)
+    # `evaluate_pdf` has the cosine of the light's direction, ω_o of the BSDF.
+    matrices = np.array([mueller_of(bsdf, b, a, 470.0) for a, b in zip(wi, wo, strict=True)])
+    np.testing.assert_allclose(matrices[:, 0, 0], wanted, rtol=1e-4, atol=1e-4 * wanted.max())
+    # No light is more than polarised.
+    for kind in (1, 2, 3):
+        for sign in (-1, 1):
+            out = matrices[:, :, 0] + sign * matrices[:, :, kind]
+            assert (np.linalg.norm(out[:, 1:], axis=1) <= (1 + 2 * solved.polarisation_error) * out[:, 0]).all()
+
+
+def test_a_table_of_unpolarised_light_is_refused_in_polarised_variants():
+    use("llvm_ad_spectral_polarized")
+    with pytest.raises(RuntimeError, match="wanted one that was built with polarised=True"):
+        plugin(made_up())
+
+
+# ---------------------------------------------------------------- under a coat
+
+
+@pytest.fixture(scope="module")
+def coated():
+    """The spectrum of a grating of 0.3 µm in aluminium under a coat of index 1.5, for 405 to 495 nm outside."""
+    return md.precompute(
+        md.gratings.blazed(0.3, 0.05, samples=64),
+        theory="rigorous",
+        material="Al",
+        ext_ior=1.5,
+        wavelengths=(270.0, 330.0),
+        tolerance=0.2,
+        polarised=True,
+    )
+
+
+def under_coat(coated):
+    return plugin(coated, coat_ior=1.5, ext_ior=1.0)
+
+
+def passed(theta, phi, wavelength):
+    """F, and what leaves a grating under a coat of 1.5: Σ_m T_i T_o η_m by the solver; wavelength in µm."""
+    wi = direction(theta, phi)
+    inside = np.array([*wi[:2] / 1.5, np.sqrt(1 - (wi[:2] @ wi[:2]) / 2.25)])
+    index = md.rigorous.refractive_index(wavelength, material="Al") / 1.5
+    surface = md.gratings.blazed(0.3, 0.05, samples=64)
+    exact = md.rigorous.efficiencies(surface, inside, wavelength / 1.5, int_ior=index)
+    xy = -np.stack([exact.orders * wavelength / 0.3 + wi[0], np.full(len(exact.orders), wi[1])], axis=1)
+    square = (xy**2).sum(axis=1)
+    leaves = square < 1
+    front, back = (np.mean(fresnel(cosine, 1.5), axis=0) for cosine in (wi[2], np.sqrt(1 - square[leaves])))
+    return front, ((1 - front) * (1 - back) * exact.unpolarised[leaves]).sum()
+
+
+@pytest.mark.parametrize(("theta", "phi", "wavelength"), [(10, 20, 0.412), (50, 70, 0.45), (65, 0, 0.48)])
+def test_a_coat_lets_through_what_the_solver_sends_out(llvm, coated, theta, phi, wavelength):
+    wi = np.broadcast_to(direction(theta, phi), (40_000, 3))
+    front, below = passed(theta, phi, wavelength)
+    _, weights, _ = probe.sample(under_coat(coated), wi, (wavelength * 1e3,) * 4, 2)
+    assert weights[:, 0].mean() == pytest.approx(front + below, rel=0.03)
+    assert weights[:, 0].mean() < 1
+
+
+def test_a_grating_under_a_coat_is_reciprocal(llvm, coated):
+    rng = np.random.default_rng(3)
+    wi = random_directions(rng, 300)
+    t = -0.45 * coated.lobe_width * rng.normal(size=(300, 2)) - wi[:, :2]
+    inside = (t**2).sum(1) < 0.99
+    wi, t = wi[inside], t[inside]
+    wo = np.concatenate([t, np.sqrt(1 - (t**2).sum(1, keepdims=True))], axis=1)
+    there, back = (
+        probe.evaluate_pdf(under_coat(coated), a, b, (450.0,) * 4)[0][:, 0] / b[:, 2] for a, b in ((wi, wo), (wo, wi))
+    )
+    assert there.max() > 0
+    np.testing.assert_allclose(there, back, rtol=2e-4, atol=1e-5 * there.max())
+
+
+def test_polarised_light_passes_a_coat(coated):
+    """Unpolarised light leaves polarised by both faces and by the grating."""
+    use("llvm_ad_spectral_polarized")
+    wi = direction(50, 70)
+    wo = wi * [-1, -1, 1]
+    found = mueller_of(under_coat(coated), wo, wi, 450.0)
+    assert 0.02 < np.linalg.norm(found[1:, 0]) / found[0, 0] < 1
+    # Without polarisation the mean transmittance of each face is taken, not that of s and of p.
+    use("llvm_ad_spectral")
+    plain = probe.evaluate_pdf(under_coat(coated), wi[None], wo[None], (450.0,) * 4)[0][0, 0]
+    assert found[0, 0] == pytest.approx(plain, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "text"),
+    [
+        ({}, "coat_ior: got none, but the rigorous spectrum is of a grating below a medium of index 1.5"),
+        ({"coat_ior": 1.6, "ext_ior": 1.0}, r"coat_ior: got 1\.6, but .* build it with ext_ior=1\.6"),
+    ],
+)
+def test_a_spectrum_for_another_coat_is_refused(llvm, coated, parameters, text):
+    with pytest.raises(RuntimeError, match=text):
+        plugin(coated, **parameters)
+
+
+def test_a_grating_is_built_for_the_coat_and_the_variant_of_the_scene(monkeypatch):
+    """What is asked for; the table would take minutes."""
+    use("llvm_ad_spectral_polarized")
+    asked = []
+    monkeypatch.setattr(md.Recipe, "cached", lambda recipe: asked.append(dict(recipe.spectrum)) or made_up())
+    scene = {"type": "diffraction_grating", "profile": "sinusoidal", "period": 0.3, "depth": 0.05, "theory": "rigorous"}
+    for material in ({"material": "Al"}, {"int_ior": 1.8}):
+        with pytest.raises(RuntimeError, match="polarised=True"):
+            mi.load_dict({**scene, "coat_ior": 1.5, "ext_ior": 1.0, **material})
+    assert [settings.pop("wavelengths") for settings in asked] == [[240.0, pytest.approx(830 / 1.5)]] * 2
+    assert asked == [
+        {"theory": "rigorous", "material": "Al", "ext_ior": 1.5, "polarised": True},
+        {"theory": "rigorous", "int_ior": 1.8, "ext_ior": 1.5, "polarised": True},
+    ]
+
+
+def test_the_log_says_once_where_scalar_theory_fails(llvm, capfd):
+    fine = {"type": "diffraction_grating", "profile": "sinusoidal", "period": 0.71, "depth": 0.3, "samples": 64}
+    for _ in range(2):
+        mi.load_dict({**fine, "material": "Al"})
+    mi.load_dict({**fine, "period": 3.0, "depth": 0.05, "material": "Al"})
+    said = "".join(capfd.readouterr())
+    assert said.count("scalar theory is expected to err by") == 1
+    assert "theory=rigorous has it right" in said
+
+
+def test_precompute_says_where_scalar_theory_fails(command, tmp_path):
+    recipe = tmp_path / "fine.toml"
+    recipe.write_text('[surface]\nprofile = "sinusoidal"\nperiod = 0.71\ndepth = 0.3\nsamples = 64\n')
+    code, out, _ = command("precompute", str(recipe), "-o", str(tmp_path / "fine.exr"))
+    assert code == 0
+    assert "! scalar theory is expected to err by" in out
+
+
+def test_a_period_too_long_for_the_table_is_refused():
+    with pytest.raises(ValueError, match=r"period: got 20 µm, wanted at most 3\.6 µm with theory=rigorous, 10 times"):
+        md.precompute(md.gratings.sinusoidal(20.0, 0.1), theory="rigorous", material="Al")
 
 
 def test_precompute_writes_a_recipes_rigorous_spectrum(command, tmp_path):
@@ -209,6 +439,18 @@ def test_precompute_writes_a_recipes_rigorous_spectrum(command, tmp_path):
     assert code == 0
     assert "rigorous, int_ior 1.5" in out
     assert RigorousSpectrum.load(target).material_name == "int_ior 1.5"
+    assert "Mueller matrices, mean " not in out
+    # Options stand in for the recipe's.
+    scalar = tmp_path / "scalar.toml"
+    scalar.write_text('[surface]\nprofile = "sinusoidal"\nperiod = 0.19\ndepth = 0.05\nsamples = 32\n')
+    options = ("--theory", "rigorous", "--material", "Al", "--ext-ior", "1.5", "--polarised", "--tolerance", "0.9")
+    code, out, _ = command("precompute", str(scalar), "-o", str(tmp_path / "metal.exr"), *options)
+    assert code == 0
+    assert "rigorous, material Al below ext_ior 1.5" in out
+    assert "Mueller matrices, mean " in out
+    code, _, err = command("precompute", str(scalar), "-o", str(tmp_path / "gone.exr"), "--theory", "vector")
+    assert (code, len(err.splitlines())) == (2, 1)
+    assert "theory: got 'vector', wanted one of scalar, rigorous" in err
     # Another command does not write over it.
     recipe.write_text(recipe.read_text().replace("0.05", "0.06"), encoding="utf-8")
     code, _, err = command("precompute", str(recipe), "-o", str(target), "--tolerance", "0.4")

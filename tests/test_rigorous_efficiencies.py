@@ -149,6 +149,20 @@ def test_what_is_reported_as_the_error_is_the_error(surface, index, goal):
         assert difference(one, other) <= goal
 
 
+def test_light_of_a_denser_medium_is_conserved():
+    """Under a coat the grating may be less dense than what is above: some orders are reflected totally."""
+    found = rigorous.efficiencies(asymmetric(0.5, 0.1, 0.7), CONICAL, 0.3, int_ior=1.3 / 1.58)
+    assert found.s.sum() + found.transmitted[0] == pytest.approx(1, abs=1e-6)
+    assert found.p.sum() + found.transmitted[1] == pytest.approx(1, abs=1e-6)
+
+
+def test_all_orders_of_a_coarse_grating_are_found():
+    """Beside the horizon the last order is farther away than the period has wavelengths."""
+    found = rigorous.efficiencies(gratings.sinusoidal(13.7, 0.05, samples=256), light(60), 1.0, int_ior=1.5)
+    sine = np.sin(np.deg2rad(60))
+    np.testing.assert_array_equal(found.orders, np.arange(np.ceil(-13.7 * (1 - sine)), np.floor(13.7 * (1 + sine)) + 1))
+
+
 def test_where_harmonics_run_out_the_error_tells():
     found = rigorous.efficiencies(gratings.sinusoidal(0.5, 4.0), CONICAL, 0.55, material="Ag", tolerance=1e-9)
     assert found.harmonics == 80

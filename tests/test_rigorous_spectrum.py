@@ -102,7 +102,7 @@ def test_an_interrupted_build_goes_on(tmp_path):
         ({"extent": "sample"}, "got rigorous with extent 'sample'"),
         ({"int_ior": None}, "wanted one of the two"),
         ({"theory": "exact"}, "theory: got 'exact'"),
-        ({"theory": "scalar"}, "wanted neither"),
+        ({"theory": "scalar"}, "wanted none of them"),
         ({"height_field": gratings.crossed(2.0, 0.2, samples=8)}, "rows that differ"),
     ],
 )

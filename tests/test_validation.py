@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import mitsuba_diffraction as md
-from mitsuba_diffraction import scalar_theory
+from mitsuba_diffraction import rigorous, scalar_theory
 from mitsuba_diffraction.studies import analytic, conservation, coupled_waves, report
 from mitsuba_diffraction.studies.accuracy import against_reference
 from mitsuba_diffraction.studies.checks import checks, main_period, scalar_range, surface_checks
@@ -91,14 +91,50 @@ def test_fresnel_is_mitsubas():
 
 
 def test_expected_error_is_that_of_the_stored_results():
-    periods, depths, angles, errors = scalar_theory.error_map()
-    assert errors.shape == (len(periods), len(depths), len(angles))
+    periods, depths, directions, all_errors = scalar_theory.error_map()
+    assert all_errors.shape == (len(periods), len(depths), len(directions))
+    errors = all_errors[..., directions[:, 0] <= 20]
     for i, j in ((2, 3), (5, 1), (8, 6)):
         expected = errors[i, j].max()
         assert scalar_theory.expected_error(periods[i] * 0.6, depths[j] * 0.6, 0.6) == pytest.approx(expected)
     # Between nodes, between their values.
     between = scalar_theory.expected_error(np.sqrt(periods[4] * periods[5]), depths[2], 1.0)
     assert between == pytest.approx(np.sqrt(errors[4, 2].max() * errors[5, 2].max()))
+    oblique = scalar_theory.expected_error(periods[5], depths[4], 1.0, largest_angle=60.0)
+    assert oblique == pytest.approx(all_errors[5, 4].max())
+    assert oblique > errors[5, 4].max()
+    mean = scalar_theory.expected_error(periods[5], depths[4], 1.0, largest_angle=60.0, mean=True)
+    assert mean == pytest.approx(all_errors[5, 4].mean())
+
+
+@pytest.mark.parametrize("material", ["dielectric", "Al"])
+def test_the_map_is_that_of_the_solver(material):
+    """Places of the map, conical ones among them, solved with another sampling of the sinusoid."""
+    periods, depths, directions, errors = scalar_theory.error_map(material)
+    index = 1.5 if material == "dielectric" else rigorous.refractive_index(0.55, material="Al")
+    for i, j, k in ((1, 1, 2), (3, 3, 5), (4, 2, 7), (2, 4, 0)):
+        period, depth, (angle, turn) = periods[i], depths[j], directions[k]
+        theta, phi = np.deg2rad([angle, 180 + turn])
+        light = np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)
+        surface = md.gratings.sinusoidal(period, depth, samples=300)
+        exact = rigorous.efficiencies(surface, light, 1.0, int_ior=index)
+        powers = scalar_theory.profile_powers(surface)
+        scalar = scalar_theory.scalar_orders(powers, period, 1.0, angle, index, turn)
+        np.testing.assert_array_equal(scalar.m, exact.orders)
+        found = scalar_theory.difference(scalar.unpolarised, exact.unpolarised)
+        assert found == pytest.approx(errors[i, j, k], rel=0.03, abs=0.003)
+
+
+def test_who_goes_beyond_scalar_theory_is_told():
+    blaze = scalar_theory.range_warning(md.gratings.ruled(1200))
+    assert "expected to err by 3" in blaze
+    assert blaze.endswith("(period 0.833 µm, depth 0.21 µm); theory=rigorous has it right")
+    crossed = scalar_theory.range_warning(md.gratings.foil(0.8, 0.5))
+    assert crossed.endswith("no rigorous theory is offered for a surface that varies along y")
+    assert scalar_theory.range_warning(md.gratings.sinusoidal(0.3, 0.1)).startswith("scalar theory does not hold here")
+    assert scalar_theory.range_warning(md.gratings.sinusoidal(4.0, 1.5)).endswith("for tiles of up to 3.6 µm along x")
+    for good in (md.gratings.sinusoidal(3.0, 0.05), md.gratings.compact_disc(), md.HeightField(np.zeros((1, 8)), 0.1)):
+        assert scalar_theory.range_warning(good) == ""
 
 
 def test_expected_error_tells_where_it_holds():

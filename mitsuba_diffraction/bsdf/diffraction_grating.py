@@ -20,11 +20,11 @@ from .base import base_from
 from .coat import coat_from
 from .geometry import Geometry
 from .incidence import Incidence
-from .polarisation import reflected, through_layer
+from .polarisation import Split, of_orders, of_plane, reflected, through_layer, unpolarised
 from .reflectance import reflectance_from
 from .rigorous_parameters import check_parameters
 from .shared import SharedTables
-from .surface import surface_from
+from .surface import surface_from, warn_of_range
 from .tables import BELOW_ONE, opaque
 
 DEFENSIVE = 0.02  # the share of samples that follow the cosine, for lobes that the sampler's averages miss
@@ -45,8 +45,8 @@ PARAMETERS = (
         "theory",
         "string",
         "of a profile: scalar, or rigorous, Maxwell's equations for the material that is given and for gratings of one "
-        "row; files and spectra say which they are. Rigorous efficiencies are those of unpolarised light and exclude "
-        "height_scale, shadowing, fresnel, coat_ior and base",
+        "row; files and spectra say which they are. Rigorous efficiencies exclude height_scale, shadowing, fresnel and "
+        "base",
         "scalar",
     ),
     Parameter("int_ior, ext_ior", "float or string", "a dielectric, as in Mitsuba's `dielectric`", "1.5, air"),
@@ -91,8 +91,8 @@ Under a coat (`coat.py`) all this holds inside of it, where wavelengths are shor
 face of the coat is a mirror. A saved spectrum must cover the shorter wavelengths; one built from a recipe or a profile
 does.
 
-In polarised variants light is split into s and p as by a plane across the half vector; a perfect mirror and Schlick's
-formula leave it unpolarised.
+In polarised variants light is split into s and p as by a plane across the half vector, by rigorous theory as Maxwell's
+equations have it; a perfect mirror and Schlick's formula leave it unpolarised.
 """
 
 
@@ -108,8 +108,12 @@ def define() -> type:
             self.coat = coat_from(props)
             self.spectrum, self._recipe = surface_from(props, self.coat)
             self.rigorous = isinstance(self.spectrum, RigorousSpectrum)
+            if self._recipe is not None and not self.rigorous:
+                warn_of_range(self._recipe)
             self.reflectance = (
-                check_parameters(props, self.spectrum) if self.rigorous else reflectance_from(props, self.coat)
+                check_parameters(props, self.spectrum, self.coat)
+                if self.rigorous
+                else reflectance_from(props, self.coat)
             )
             self.orientation = _orientation(props)
             height_scale = props.get("height_scale", 1.0)
@@ -146,7 +150,6 @@ def define() -> type:
             if self.rigorous:
                 self.energy = None
                 return
-            scale = np.max(self.height_scale)
             shortest = VISIBLE[0] / (1 if self.coat is None else self.coat.relative)
             largest = shortest / self.spectrum.wavelengths[0]
             if self.coat is not None and largest < 1 - 1e-6:
@@ -155,6 +158,7 @@ def define() -> type:
                     f"{self.spectrum.wavelengths[0]:g} nm; inside the coat they are shorter: build it from "
                     f"{shortest:.4g} nm"
                 )
+            scale = np.max(self.height_scale)
             if not 0 <= scale <= largest * (1 + 1e-6):
                 raise RequestError(
                     f"height_scale: got {scale}, wanted 0 to {largest:.4g}: the spectrum was built for "
@@ -202,7 +206,7 @@ def define() -> type:
                 wavelength = si.wavelengths[channel] * 1e-3  # µm
                 frequency = dr.rcp(wavelength)
                 if self.rigorous:
-                    power, share = self.scattering.evaluate(wi, wo, frequency, active & covered[channel])
+                    power, share = self.scattering.evaluate(wi, wo, index * frequency, active & covered[channel])
                 else:
                     power, share = self.scattering.evaluate(
                         u * frequency,
@@ -237,28 +241,34 @@ def define() -> type:
             wo: mi.Vector3f,
             active: mi.Bool,
         ) -> mi.Spectrum:
-            """`value` as light that is split into s and p where the variant and the material know them."""
-            index = self.reflectance.index(si, active) if mi.is_polarized else None
-            if self.coat is not None:
-                return self._through_coat(value, index, ctx, si, wo)
-            return mi.depolarizer(value) if index is None else reflected(value, index, si.wi, wo, ctx.mode)
+            """`value` as light that is split into s and p where the variant and the material know them.
 
-        def _through_coat(
-            self,
-            value: mi.UnpolarizedSpectrum,
-            index: list[mi.Complex2f] | None,
-            ctx: mi.BSDFContext,
-            si: mi.SurfaceInteraction3f,
-            wo: mi.Vector3f,
-        ) -> mi.Spectrum:
-            """`value` after both passes through the coat, T_i T_o."""
-            inside = [self.coat.refracted(omega) for omega in (si.wi, wo)]
+            Under a coat, after both passes through it, T_i T_o.
+            """
+            directions = si.wi, wo
+            if self.coat is None:
+                return reflected(self._split(value, si, active), *directions, ctx.mode) if mi.is_polarized else value
+            inside = [self.coat.refracted(omega) for omega in directions]
             if mi.is_polarized:
                 value *= self.coat.absorption(inside[0].z) * self.coat.absorption(inside[1].z)
-                return through_layer(value, index, self.coat.eta, (si.wi, wo), inside, ctx.mode)
-            for omega, refracted in zip((si.wi, wo), inside, strict=True):
+                return through_layer(self._split(value, si, active), self.coat.eta, directions, inside, ctx.mode)
+            for omega, refracted in zip(directions, inside, strict=True):
                 value *= self.coat.transmittance(omega.z, refracted.z)
             return value
+
+        def _split(self, value: mi.UnpolarizedSpectrum, si: mi.SurfaceInteraction3f, active: mi.Bool) -> Split:
+            """How the grating splits `value` into s and p."""
+            if not self.rigorous:
+                index = self.reflectance.index(si, active)
+                return unpolarised(value) if index is None else of_plane(value, index)
+            sin, cos = self._frame(si, active)
+            relative = 1e3 if self.coat is None else 1e3 * self.coat.relative
+
+            def entries(channel: int, source: mi.Vector3f, exit_: mi.Vector3f) -> list[list[mi.Float]]:
+                frequency = relative / si.wavelengths[channel]
+                return self.scattering.mueller(_turned(source, sin, cos), _turned(exit_, sin, cos), frequency, active)
+
+            return of_orders(value, entries, mi.Vector3f(-sin, cos, 0))
 
         def _covered(self, si: mi.SurfaceInteraction3f) -> tuple[list[mi.Bool], mi.Float]:
             """Which of the wavelengths the spectrum covers, and how many: at the others the grating is black."""
@@ -383,7 +393,7 @@ def define() -> type:
             value = mi.UnpolarizedSpectrum(self.coat.reflectance(mi.Frame3f.cos_theta(si.wi)))
             if not mi.is_polarized:
                 return value
-            return reflected(value, self.coat.indices(), si.wi, mi.reflect(si.wi), ctx.mode)
+            return reflected(of_plane(value, self.coat.indices()), si.wi, mi.reflect(si.wi), ctx.mode)
 
         def _sample_below(
             self,
@@ -440,7 +450,12 @@ def define() -> type:
                 before += dr.select(use, 1, 0)
             wavelength = dr.detach(wavelength) * 1e-3
             sin, cos = (dr.detach(x) for x in self._frame(si, active))
-            incidence = Incidence.of(_turned(si.wi, sin, cos), dr.rcp(wavelength), self.height_scale, self.coat)
+            towards, frequency = _turned(si.wi, sin, cos), dr.rcp(wavelength)
+            if self.rigorous and self.coat is not None:
+                # Inside, as its tables are.
+                incidence = Incidence.of(self.coat.refracted(towards), frequency * self.coat.relative, mi.Float(1))
+            else:
+                incidence = Incidence.of(towards, frequency, self.height_scale, self.coat)
             q_x, q_y = self.scattering.sample(incidence, rest, v, active & ~diffuse)
             x = -wavelength * (cos * q_x - sin * q_y) - si.wi.x
             y = -wavelength * (sin * q_x + cos * q_y) - si.wi.y

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import json
 import weakref
 from pathlib import Path
 
@@ -12,17 +13,19 @@ import mitsuba as mi
 from ..errors import RequestError
 from ..recipe import Recipe
 from ..rigorous.spectrum import RigorousSpectrum
+from ..scalar_theory import range_warning
 from ..spectrum import GratingSpectrum
 from ..spectrum.build import THEORIES
 from ..spectrum.load import load_spectrum
 from ..surface.gratings import COHERENCE_LENGTHS, PROFILES
 from ..wavelengths import VISIBLE
 from .coat import Coat
-from .rigorous_parameters import material_from
+from .rigorous_parameters import settings_from, settings_of_medium
 
 Spectrum = GratingSpectrum | RigorousSpectrum
 
 _PREFIX = "handed over: "
+_told: set[str] = set()  # surfaces whose range was looked up
 _handed_over: weakref.WeakValueDictionary[str, Spectrum] = weakref.WeakValueDictionary()
 
 
@@ -65,17 +68,29 @@ def surface_from(props: mi.Properties, coat: Coat | None) -> tuple[Spectrum, Rec
     settings = {"coherence_length": COHERENCE_LENGTHS[name]} if name in COHERENCE_LENGTHS else {}
     settings |= {key: props[key] for key in ("coherence_length", "tolerance", "largest_height_range") if key in props}
     if theory == "rigorous":
-        settings |= {"theory": theory, **material_from(props)}
+        settings |= {"theory": theory, **settings_from(props, coat)}
     recipe = _inside(coat, Recipe(surface, settings))
     return recipe.cached(), recipe
 
 
+def warn_of_range(recipe: Recipe) -> None:
+    """Mitsuba's log says once for each surface if scalar theory is not to be trusted there."""
+    told = json.dumps(dict(recipe.surface), sort_keys=True, default=str)
+    if told in _told:
+        return
+    _told.add(told)
+    if beyond := range_warning(recipe.height_field()):
+        mi.Log(mi.LogLevel.Warn, f"diffraction_grating, {recipe.height_field().source}: {beyond}")
+
+
 def _inside(coat: Coat | None, recipe: Recipe) -> Recipe:
-    """The recipe for the wavelengths that there are inside a coat."""
-    if coat is None or "wavelengths" in recipe.spectrum:
-        return recipe
-    wavelengths = [nanometres / coat.relative for nanometres in VISIBLE]
-    return Recipe(recipe.surface, {**recipe.spectrum, "wavelengths": wavelengths}, recipe.folder)
+    """The recipe for the wavelengths that there are inside a coat, and, of rigorous theory, for the variant."""
+    inside = {}
+    if coat is not None and "wavelengths" not in recipe.spectrum:
+        inside["wavelengths"] = [nanometres / coat.relative for nanometres in VISIBLE]
+    if recipe.spectrum.get("theory") == "rigorous":
+        inside |= settings_of_medium(coat)
+    return Recipe(recipe.surface, {**recipe.spectrum, **inside}, recipe.folder) if inside else recipe
 
 
 def _from_file(path: Path, coat: Coat | None, tolerance: float | None) -> tuple[Spectrum, Recipe | None]:

@@ -23,6 +23,9 @@ def benchmark(
     surface: Annotated[list[str] | None, typer.Option(help="only these of the built-in surfaces")] = None,
     tolerance: Annotated[list[float] | None, typer.Option(help="only these tolerances")] = None,
     variant: Annotated[str | None, typer.Option(help="Mitsuba variant; default: the fastest spectral one")] = None,
+    rigorous: Annotated[
+        bool, typer.Option("--rigorous", help="compare the theories on 1200 lines/mm in aluminium instead; minutes")
+    ] = False,
     json: Annotated[Path | None, typer.Option(help="save the results (.json)")] = None,
     plot: Annotated[Path | None, typer.Option(help="plot error against speed (.png)")] = None,
     overwrite: Overwrite = False,
@@ -30,9 +33,12 @@ def benchmark(
     """Measure error and speed of every representation, relative to Mitsuba's roughconductor."""
     import mitsuba as mi
 
+    from ..studies import report
     from ..studies.benchmark import run, save_json, save_plot, tables
     from ..studies.cases import bundled_cases, scan_case
     from ..studies.sampling import measure
+    from ..studies.theories import COLUMNS, compare_theories
+    from ..surface.gratings import ruled
     from ..variants import choose_variant
 
     writes = [(option, path) for option, path in (("--json", json), ("--plot", plot)) if path is not None]
@@ -45,12 +51,23 @@ def benchmark(
     if scan is not None:
         cases.append(scan_case(read_height_field(scan, pixel_size=pixel_size, height_range=height_range)))
     mi.set_variant(choose_variant(variant))
+    # Wide enough in any terminal, and in a file.
+    wide = Console(highlight=False, width=max(out.width, 140))
+    if rigorous:
+        if scan is not None or surface or tolerance or plot is not None:
+            raise RequestError(
+                "--rigorous: got other surfaces, tolerances or a plot, too; it has one grating of its own"
+            )
+        with progress_bar("rigorous efficiencies") as progress:
+            costs = compare_theories(ruled(1200), progress=progress)
+        wide.print(report.table(COLUMNS, (report.cells(COLUMNS, cost) for cost in costs)))
+        if json is not None:
+            report.save_json({"theories": costs}, json)
+        return
     with progress_bar("speed and error") as progress:
         results, shaders = run(cases, **({"tolerances": tolerance} if tolerance else {}), progress=progress)
     with progress_bar("sampling") as progress:
         sampling = measure(cases, progress=progress)
-    # Wide enough in any terminal, and in a file.
-    wide = Console(highlight=False, width=max(out.width, 140))
     wide.print(*tables(results, shaders, sampling), sep="\n\n")
     if json is not None:
         save_json(results, shaders, sampling, json)

@@ -10,8 +10,9 @@ import typer
 from ..errors import RequestError
 from ..recipe import Recipe
 from ..rigorous.spectrum import RigorousSpectrum
+from ..scalar_theory import range_warning
 from ..spectrum import GratingSpectrum
-from ..spectrum.build import REPRESENTATIONS
+from ..spectrum.build import REPRESENTATIONS, THEORIES
 from ..surface.seam import seam_matters, seam_steps
 from .arguments import Overwrite, claim
 from .console import progress_bar, tell
@@ -44,8 +45,17 @@ def precompute(
     prepare: Prepare = None,
     representation: Annotated[str | None, typer.Option(help=f"{', '.join(REPRESENTATIONS)}; default: auto")] = None,
     tolerance: Annotated[
-        float | None, typer.Option(help="largest error, as a fraction of the reflected power; default: 0.001")
+        float | None,
+        typer.Option(help="largest error, a fraction of the reflected power; default: 0.001, rigorous 0.01"),
     ] = None,
+    theory: Annotated[
+        str | None,
+        typer.Option(help=f"{', '.join(THEORIES)} (for profiles of one row); default: scalar"),
+    ] = None,
+    material: Annotated[str | None, typer.Option(help="of rigorous theory: a conductor, as Mitsuba names it")] = None,
+    int_ior: Annotated[float | None, typer.Option(help="of rigorous theory: the index of a dielectric")] = None,
+    ext_ior: Annotated[float | None, typer.Option(help="of rigorous theory: the index of a coat; default: 1")] = None,
+    polarised: Annotated[bool, typer.Option("--polarised", help="of rigorous theory: with Mueller matrices")] = False,
     extent: Extent = None,
     largest_angle: Annotated[
         float | None, typer.Option(help="largest angle of incidence or exit in the scene, degrees; default: 90")
@@ -64,6 +74,11 @@ def precompute(
         "largest_height_range": largest_height_range,
         "representation": representation,
         "tolerance": tolerance,
+        "theory": theory,
+        "material": material,
+        "int_ior": int_ior,
+        "ext_ior": ext_ior,
+        "polarised": polarised or None,
     }
     settings = {name: value for name, value in given.items() if value is not None}
     of_scan = options_of_scan(pixel_size, height_range, fill_missing, channel, unit, prepare)
@@ -76,12 +91,15 @@ def precompute(
     seams = [_seam(source, recipe_of(source, of_scan, settings)) for source in sources]
     for source, target, seam in zip(sources, targets, seams, strict=True):
         with progress_bar(f"spectrum of {source.name}") as progress:
-            spectrum = recipe_of(source, of_scan, settings).build(progress)
+            recipe = recipe_of(source, of_scan, settings)
+            spectrum = recipe.build(progress)
             spectrum.save(target)
         tell(
             f"{target}: {spectrum.source}; {spectrum.extent}, {spectrum.grid}; coherence length "
             f"{spectrum.coherence_length:.4g} µm; {_table(spectrum)}{seam}"
         )
+        if isinstance(spectrum, GratingSpectrum) and (beyond := range_warning(recipe.height_field())):
+            tell(f"! {beyond}")
 
 
 def _table(spectrum: GratingSpectrum | RigorousSpectrum) -> str:
@@ -91,6 +109,7 @@ def _table(spectrum: GratingSpectrum | RigorousSpectrum) -> str:
             f"rigorous, {spectrum.material_name}, {size}, mean error {spectrum.error:.1e} {asked}\n"
             f"worst error {spectrum.worst:.1e} of the reflected light, {spectrum.worst_near:.1e} beside an order that "
             "passes off"
+            + ("" if spectrum.mueller is None else f"; Mueller matrices, mean {spectrum.polarisation_error:.1e}")
         )
     scatter = f", standard error of one scan {spectrum.standard_error:.2g}" if spectrum.extent == "sample" else ""
     return (

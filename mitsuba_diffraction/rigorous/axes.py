@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 Real = NDArray[np.float64]
+
+LARGEST_PERIOD = 10.0
+"""In units of the shortest wavelength: the table grows with the cube of the period, the time to build it faster."""
+
+STORED = 2
+"""Steps to a unit to each that is solved, by cubic polynomials: linear look-ups need more nodes."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +51,11 @@ class Axes:
     wavelengths: tuple[float, float]
     steps: int
     planes: int
+
+    @property
+    def solved(self) -> Axes:
+        """The coarser nodes at which η was solved."""
+        return dataclasses.replace(self, steps=self.steps // STORED)
 
     @property
     def reach(self) -> float:

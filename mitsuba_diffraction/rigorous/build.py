@@ -16,12 +16,13 @@ from ..coherence import SUN_COHERENCE_LENGTH, lobe_width
 from ..errors import RequestError
 from ..files import whole_file
 from ..surface.heightfield import HeightField
-from .axes import Axes
+from .axes import LARGEST_PERIOD, STORED, Axes
 from .blas import one_thread
 from .coordinate_transformation import Grating, light_from, scatter
 from .curve import curve_of
 from .efficiencies import efficiencies
 from .materials import refractive_index
+from .mueller import REVERSED, mueller
 from .spectrum import RigorousSpectrum
 
 Real = NDArray[np.float64]
@@ -29,8 +30,6 @@ Progress = Callable[[int, int], None]
 
 # Steps to a unit that are solved, one after the other until the error is kept.
 _SOLVED = (8, 16, 32)
-# Steps to a unit that are stored, to each that is solved, by cubic polynomials: linear look-ups need more nodes.
-_STORED = 2
 PLANES = 17
 # Wavelengths that are solved, by the least g λ / T (the cosine of the cone angle) of these: metals in light along the
 # grooves show narrow lines that move with the wavelength.
@@ -41,7 +40,9 @@ _NEAR = 0.02
 _CHECKS = 200
 # Light at which the harmonics are chosen: near the normal, and oblique from both sides.
 _HARD = ((0.1, 0, 1), (0.8, 0.3, 0.5), (-0.8, 0.3, 0.5))
-_BUILD_VERSION = 1
+_BUILD_VERSION = 2
+MATRICES = 3.0
+"""Bound of `polarisation_error`, in tolerances: matrices vary faster than η."""
 
 
 def build_spectrum(
@@ -49,6 +50,8 @@ def build_spectrum(
     *,
     int_ior: complex | None = None,
     material: str | None = None,
+    ext_ior: float = 1.0,
+    polarised: bool = False,
     coherence_length: float = SUN_COHERENCE_LENGTH,
     wavelengths: tuple[float, float] = (360.0, 830.0),
     tolerance: float = 1e-2,
@@ -61,14 +64,17 @@ def build_spectrum(
         height_field: the surface; rows that differ are refused.
         int_ior: index of refraction of a dielectric, or n + ik.
         material: or a conductor by Mitsuba's name.
+        ext_ior: index of refraction of the medium above, relative to air: that of a coat.
+        polarised: whether the table holds the Mueller matrices of the orders, too; it is seventeen times as large.
         coherence_length: L_c in µm.
-        wavelengths: (shortest, longest) in nm.
-        tolerance: bound of `RigorousSpectrum.error`, the mean of Σ|Δη_m| / Σ η_m over directions and wavelengths.
+        wavelengths: (shortest, longest) in nm, in the medium above.
+        tolerance: bound of `RigorousSpectrum.error`, the mean of Σ|Δη_m| / Σ η_m over directions and wavelengths, and
+            of a third of `polarisation_error`.
         progress: called with (steps done, steps in all).
         checkpoints: a folder for what is done so far; an interrupted build goes on from there.
 
     Raises:
-        ValueError: if an argument is out of range.
+        ValueError: if an argument is out of range, or the period is above ten of the shortest wavelength.
 
     Warns:
         UserWarning: if the finest table errs by more than `tolerance`; its `error` says by how much.
@@ -76,25 +82,45 @@ def build_spectrum(
     if not 1e-4 <= tolerance < 1:
         raise RequestError(f"tolerance: got {tolerance!r}, wanted a share of the reflected light from 1e-4 to 1")
     lobe_width(coherence_length)
+    if not (isinstance(ext_ior, int | float) and 1 <= ext_ior <= 10):
+        raise RequestError(f"ext_ior: got {ext_ior!r}, wanted the index of the medium above, from 1 to 10")
+    if not isinstance(polarised, bool):
+        raise RequestError(f"polarised: got {polarised!r}, wanted True or False")
+    period, longest = height_field.tile_size[0], LARGEST_PERIOD * wavelengths[0] * 1e-3
+    if period > longest:
+        raise RequestError(
+            f"period: got {period:.4g} µm, wanted at most {longest:.4g} µm with theory=rigorous, "
+            f"{LARGEST_PERIOD:g} times the shortest wavelength; use theory=scalar"
+        )
     with one_thread():
-        surface = _Surface(height_field, (wavelengths[0] * 1e-3, wavelengths[1] * 1e-3), int_ior, material, tolerance)
+        surface = _Surface(
+            height_field,
+            (wavelengths[0] * 1e-3, wavelengths[1] * 1e-3),
+            lambda wavelength: refractive_index(wavelength * ext_ior, int_ior=int_ior, material=material) / ext_ior,
+            tolerance,
+            repr((int_ior, material, ext_ior, polarised)),
+        )
         checks = surface.checks()
         for solved in _SOLVED:
-            axes = Axes(surface.period, surface.wavelengths, _STORED * solved, PLANES)
-            values = _Table(surface, axes, solved).values(progress or (lambda done, total: None), checkpoints)
+            axes = Axes(surface.period, surface.wavelengths, STORED * solved, PLANES)
+            table = _Table(surface, axes, solved, polarised)
+            values, mueller = table.values(progress or (lambda done, total: None), checkpoints)
             spectrum = RigorousSpectrum(
                 axes=axes,
                 values=values,
                 material=material or "",
-                int_ior=0 if int_ior is None else complex(int_ior),
+                int_ior=complex(int_ior or 0),
+                ext_ior=float(ext_ior),
+                mueller=mueller,
                 coherence_length=float(coherence_length),
                 tolerance=float(tolerance),
                 harmonics=surface.harmonics,
                 source=height_field.source,
                 source_digest=height_field.digest,
-                **_errors(axes, values, checks),
+                **_errors(axes, values, mueller, checks),
             )
-            if spectrum.error <= tolerance:
+            # NaN: there are no matrices.
+            if spectrum.error <= tolerance and not spectrum.polarisation_error > MATRICES * tolerance:
                 return spectrum
     warnings.warn(
         f"rigorous table: got a mean error of {spectrum.error:.2g} with {_SOLVED[-1]} steps to a unit, wanted at most "
@@ -115,20 +141,20 @@ class _Surface:
         self,
         height_field: HeightField,
         wavelengths: tuple[float, float],
-        int_ior: complex | None,
-        material: str | None,
+        index: Callable[[float], complex],
         tolerance: float,
+        named: str,
     ) -> None:
         self.period = height_field.tile_size[0]
         self.wavelengths = wavelengths
-        self.index = lambda wavelength: refractive_index(wavelength, int_ior=int_ior, material=material)
+        self.index = index
         curve = curve_of(height_field)
         self.harmonics = max(self._harmonics(height_field, d, tolerance / 10) for d in _HARD)
         self.grating = Grating(curve, self.harmonics)
         # What the table is compared with is solved with more.
         self.finer = Grating(curve, int(1.4 * self.harmonics))
         self.digest = hashlib.sha256(
-            repr((height_field.digest, wavelengths, int_ior, material, self.harmonics, _BUILD_VERSION)).encode()
+            repr((height_field.digest, wavelengths, named, self.harmonics, _BUILD_VERSION)).encode()
         ).hexdigest()
 
     def _harmonics(self, height_field: HeightField, direction: tuple[float, ...], tolerance: float) -> int:
@@ -136,7 +162,8 @@ class _Surface:
         wavelength = self.wavelengths[0]
         material = {"int_ior": self.index(wavelength)}
         exact = efficiencies(height_field, direction, wavelength, tolerance=tolerance / 2, **material)
-        count = int(np.ceil(self.period / wavelength)) + 4
+        # At grazing incidence there are orders up to 2 T/λ.
+        count = int(np.ceil(2 * self.period / wavelength))
         while count < exact.harmonics:
             found = efficiencies(height_field, direction, wavelength, harmonics=count, **material)
             if np.abs(found.unpolarised - exact.unpolarised).sum() <= tolerance * exact.unpolarised.sum():
@@ -147,18 +174,21 @@ class _Surface:
     def solve(
         self, alpha: float, g: float, wavelengths: Iterable[float], grating: Grating | None = None
     ) -> tuple[NDArray[np.int64], Real]:
-        """m of the orders, and η of unpolarised light, (wavelengths, orders), for k_x = α and g (times period/2π)."""
+        """m of the orders, and M_ij, (wavelengths, orders, 4, 4), for k_x = α and g (times period/2π).
+
+        M_00 is η of unpolarised light.
+        """
         grating = grating or self.grating
         light = light_from(grating, alpha, g**2)
         found = []
         for wavelength in wavelengths:
             k_y = np.sqrt(max((self.period / wavelength) ** 2 - g**2, 0))
             solved = scatter(grating, light, k_y, self.index(wavelength))
-            found.append((np.abs(solved.reflected) ** 2).sum(axis=(1, 2)) / 2)
+            found.append(mueller(solved.reflected))
         return -solved.orders, np.array(found)
 
     def checks(self) -> list[tuple[float, float, float, NDArray[np.int64], Real]]:
-        """α, g, λ, m and η_m at random places: directions uniform over the hemisphere, wavelengths over their range."""
+        """α, g, λ, m and M_ij at random places, directions uniform over the hemisphere, wavelengths over the range."""
         rng = np.random.default_rng(0)
         checks = []
         for cosine, turn, share in rng.random((_CHECKS, 3)):
@@ -166,17 +196,23 @@ class _Surface:
             k = np.sqrt(1 - cosine**2) * self.period / wavelength
             alpha, k_y = k * np.cos(2 * np.pi * turn), k * np.sin(2 * np.pi * turn)
             g = np.sqrt((self.period / wavelength) ** 2 - k_y**2)
-            m, eta = self.solve(alpha, g, [wavelength], self.finer)
-            checks.append((alpha, g, wavelength, m, eta[0]))
+            m, matrices = self.solve(alpha, g, [wavelength], self.finer)
+            checks.append((alpha, g, wavelength, m, matrices[0]))
         return checks
 
 
-def _errors(axes: Axes, values: NDArray[np.float32], checks: list) -> dict[str, float]:
-    """`error`, `worst` and `worst_near` of a table."""
-    table = RigorousSpectrum(axes, values, "", 1, SUN_COHERENCE_LENGTH, 0.1, 0, 0, 0, 0, "", "")
-    error, near = [], []
-    for alpha, g, wavelength, m, eta in checks:
+def _errors(
+    axes: Axes, values: NDArray[np.float32], mueller: NDArray[np.float32] | None, checks: list
+) -> dict[str, float]:
+    """`error`, `worst`, `worst_near` and `polarisation_error` of a table."""
+    table = RigorousSpectrum(axes, values, "", 1, SUN_COHERENCE_LENGTH, 0.1, 0, 0, 0, 0, "", "", mueller=mueller)
+    error, near, split = [], [], []
+    for alpha, g, wavelength, m, matrices in checks:
+        eta = matrices[:, 0, 0]
         found = table.evaluate(m, alpha - m / 2, g, wavelength)
+        if mueller is not None:
+            ours = table.evaluate_mueller(m, alpha - m / 2, g, wavelength)
+            split.append(np.abs(ours - matrices).max(axis=(1, 2)).sum() / eta.sum())
         error.append(np.abs(found - eta).sum() / eta.sum())
         near.append(min(abs(x - round(x)) for x in (g + alpha, g - alpha)) < _NEAR)
     error, near = np.array(error), np.array(near)
@@ -184,6 +220,7 @@ def _errors(axes: Axes, values: NDArray[np.float32], checks: list) -> dict[str, 
         "error": float(error.mean()),
         "worst": float(error[~near].max(initial=0)),
         "worst_near": float(error[near].max(initial=0)),
+        "polarisation_error": float(np.mean(split)) if split else float("nan"),
     }
 
 
@@ -194,15 +231,18 @@ class _Table:
     one lattice serves all orders.
     """
 
-    def __init__(self, surface: _Surface, axes: Axes, steps: int) -> None:
+    def __init__(self, surface: _Surface, axes: Axes, steps: int, polarised: bool) -> None:
         self.surface, self.axes, self.steps = surface, axes, steps
-        self.lattice = Axes(axes.period, axes.wavelengths, steps, axes.planes)
+        self.entries = 4 if polarised else 1  # rows and columns of the matrices that are kept
+        self.lattice = axes.solved
         count = self.lattice.side(0)
         nodes = self.lattice.nodes_at(count)
         self.p = np.where(np.arange(count) % steps, nodes, nodes + _OFF)
 
-    def values(self, progress: Progress, checkpoints: Path | None) -> NDArray[np.float32]:
-        """(K, nodes), as `RigorousSpectrum` has them."""
+    def values(
+        self, progress: Progress, checkpoints: Path | None
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+        """`values` and `mueller` of `RigorousSpectrum`."""
         rows = _Checkpoint(checkpoints, f"{self.surface.digest}-{self.steps}")
         left = [row for row in range(1, len(self.p)) if row not in rows.done]
         with ThreadPoolExecutor(os.cpu_count()) as pool:
@@ -219,9 +259,9 @@ class _Table:
         return values
 
     def _row(self, row: int) -> NDArray[np.float32]:
-        """η of all light with this p: (r, orders −M … M, K); NaN where an order does not propagate."""
-        largest, planes = self.axes.largest, self.axes.planes
-        found = np.full((len(self.p), 2 * largest + 1, planes), np.nan, np.float32)
+        """M of all light with this p: (r, orders −M … M, K, i, j); NaN where an order does not propagate."""
+        largest, planes, entries = self.axes.largest, self.axes.planes, self.entries
+        found = np.full((len(self.p), 2 * largest + 1, planes, entries, entries), np.nan, np.float32)
         # The units that the table reaches, whole, for polynomials across them.
         unit = (row - 1) // self.steps
         reached = range(1, min(len(self.p), (self.lattice.units(0) - unit) * self.steps + 1))
@@ -234,33 +274,36 @@ class _Table:
                 cone = g * self.axes.wavelengths[0] / self.axes.period
                 count = next((count for limit, count in _CONES if cone < limit), _CONES[-1][1])
             at, weights = _chebyshev(count, planes)
-            m, eta = self.surface.solve((p - r) / 2, g, first + at * (last - first))
+            m, solved = self.surface.solve((p - r) / 2, g, first + at * (last - first))
             kept = np.abs(m) <= largest
-            found[column, m[kept] + largest] = (weights @ eta[:, kept]).T
+            matrices = solved[:, kept, :entries, :entries]
+            found[column, m[kept] + largest] = np.einsum("kw,wm...->mk...", weights, matrices)
         return found
 
-    def _stored(self, rows: dict[int, NDArray[np.float32]]) -> NDArray[np.float32]:
+    def _stored(self, rows: dict[int, NDArray[np.float32]]) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
         """What was solved, the mean of light and reversed light, at the nodes that are stored."""
-        axes, steps, largest = self.axes, self.steps, self.axes.largest
-        values = np.zeros((axes.planes, axes.nodes), np.float32)
+        axes, steps, largest, entries = self.axes, self.steps, self.axes.largest, self.entries
+        matrices = np.zeros((axes.planes, axes.nodes, entries, entries), np.float32)
+        signs = np.outer(REVERSED, REVERSED)[:entries, :entries]
         for m in range(-largest, largest + 1):
             side, solved = axes.side(m), self.lattice.side(m)
-            eta = np.full((solved, solved, axes.planes), np.nan)
-            for row, found in rows.items():
+            found = np.full((solved, solved, axes.planes, entries, entries), np.nan)
+            for row, of_row in rows.items():
                 p = row - max(m, 0) * steps
                 # A node at the end of two units was solved just inside the one where the order travels.
                 if 0 < p < solved:
-                    part = found[-min(m, 0) * steps :, m + largest][:solved]
-                    eta[p, 1 : len(part)] = part[1:]
+                    part = of_row[-min(m, 0) * steps :, m + largest][:solved]
+                    found[p, 1 : len(part)] = part[1:]
             # At grazing exit or incidence all is mirrored.
-            eta[0], eta[:, 0] = float(m == 0), float(m == 0)
-            reversed_ = eta.transpose(1, 0, 2)
-            both = np.where(np.isnan(eta), reversed_, np.where(np.isnan(reversed_), eta, (eta + reversed_) / 2))
+            found[0], found[:, 0] = (float(m == 0) * np.eye(entries),) * 2
+            reversed_ = signs * found.transpose(1, 0, 2, 4, 3)
+            both = np.where(np.isnan(found), reversed_, np.where(np.isnan(reversed_), found, (found + reversed_) / 2))
             both = np.nan_to_num(both)  # units that light does not reach
             refine = _cubic(axes.units(m), steps, axes.steps)
-            block = np.einsum("ai,bj,ijk->kab", refine, refine, both, optimize=True)
-            values[:, axes.offset(m) : axes.offset(m) + side**2] = block.reshape(axes.planes, -1)
-        return values
+            block = np.einsum("ai,bj,ijkxy->kabxy", refine, refine, both, optimize=True)
+            start = axes.offset(m)
+            matrices[:, start : start + side**2] = block.reshape(axes.planes, -1, entries, entries)
+        return np.ascontiguousarray(matrices[..., 0, 0]), matrices if entries == 4 else None
 
 
 def _chebyshev(count: int, planes: int) -> tuple[Real, Real]:

@@ -48,6 +48,11 @@ class Curve:
         return tuple((c[1:] + c[:-1]) / 2 for c in (self.x, self.z))
 
 
+def is_profile(height_field: HeightField) -> bool:
+    """Whether the heights do not change along y."""
+    return bool(np.ptp(height_field.heights, axis=0).max() == 0)
+
+
 def curve_of(height_field: HeightField) -> Curve:
     """The curve of a surface of one row: straight lines from pixel to pixel, round the end of the tile.
 
@@ -59,7 +64,7 @@ def curve_of(height_field: HeightField) -> Curve:
         ValueError: if the rows of the height field differ.
     """
     rows = height_field.centred
-    if np.ptp(rows, axis=0).max() > 0:
+    if not is_profile(height_field):
         raise RequestError(
             f"height field: got {len(rows)} rows that differ, wanted a surface that does not change along y; "
             "rigorous theory is offered for such only"

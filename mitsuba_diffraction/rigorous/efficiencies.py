@@ -79,8 +79,9 @@ def efficiencies(
         int_ior: index of refraction of a dielectric, or n + ik.
         material: or a conductor by Mitsuba's name, "Al".
         tolerance: harmonics are raised until the efficiencies change by less than this share of the reflected light (of
-            s and of p light), or their number reaches 80; `Efficiencies.error` says what was reached.
-        harmonics: N, to take this number as it is.
+            s and of p light), or their number reaches 80 and twice the orders; `Efficiencies.error` says what was
+            reached.
+        harmonics: N, to take this number as it is; at least the largest |m| that propagates.
 
     Raises:
         ValueError: if an argument is out of range.
@@ -93,19 +94,22 @@ def efficiencies(
     if omega.shape != (3,) or not (np.isfinite(length) and length > 0 and omega[2] > 0):
         raise RequestError(f"direction: got {direction!r}, wanted three numbers, to the light, the third positive")
     omega = omega / length
+    # Every order that propagates is among the harmonics.
+    fewest = int(np.ceil(height_field.tile_size[0] / wavelength * (1 + abs(omega[0]))))
     if harmonics is not None:
-        if not 1 <= harmonics <= 500:
-            raise RequestError(f"harmonics: got {harmonics!r}, wanted a number from 1 to 500")
+        if not fewest <= harmonics <= 500:
+            raise RequestError(f"harmonics: got {harmonics!r}, wanted a number from {fewest} to 500")
         return _solve(height_field, omega, wavelength, index, harmonics)
     if not 0 < tolerance < 1:
         raise RequestError(f"tolerance: got {tolerance!r}, wanted a share of the reflected light between 0 and 1")
-    count = int(np.ceil(height_field.tile_size[0] / wavelength)) + 6
+    count = fewest + 6
+    most = max(MOST_HARMONICS, 2 * fewest)
     found = _solve(height_field, omega, wavelength, index, count)
     while True:
-        count = min(int(np.ceil(1.25 * count)) + 1, MOST_HARMONICS)
+        count = min(int(np.ceil(1.25 * count)) + 1, most)
         before, found = found, _solve(height_field, omega, wavelength, index, count)
         error = max(np.abs(a - b).sum() / b.sum() for a, b in ((before.s, found.s), (before.p, found.p)))
-        if error <= tolerance or count == MOST_HARMONICS:
+        if error <= tolerance or count == most:
             return Efficiencies(found.orders, found.amplitudes, found.transmitted, count, float(error))
 
 

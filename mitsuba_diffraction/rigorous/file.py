@@ -1,7 +1,8 @@
 """A rigorous spectrum as an OpenEXR file: float32, ZIP, one part.
 
 Channel `eta(07)` holds plane 7 of the table (`Axes`): the squares [P, R] of the orders −M … M from top to bottom, each
-at the left. Numbers in the header are double precision.
+at the left; below them, if the table is polarised, the Mueller matrices of this plane, one after the other. Numbers in
+the header are double precision.
 """
 
 from __future__ import annotations
@@ -22,9 +23,9 @@ if TYPE_CHECKING:
 
 Spectrum = TypeVar("Spectrum")
 FORMAT = "mitsuba_diffraction rigorous spectrum"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 
-_NUMBERS = ("coherence_length", "tolerance", "error", "worst", "worst_near")
+_NUMBERS = ("ext_ior", "coherence_length", "tolerance", "error", "worst", "worst_near", "polarisation_error")
 _TEXTS = ("material", "source", "source_digest")
 
 
@@ -36,7 +37,11 @@ def save(spectrum: RigorousSpectrum, path: str | os.PathLike[str], recipe: str =
     """
     axes = spectrum.axes
     orders = range(-axes.largest, axes.largest + 1)
-    sheet = np.zeros((axes.planes, sum(axes.side(m) for m in orders), axes.side(0)), np.float32)
+    height, width = sum(axes.side(m) for m in orders), axes.side(0)
+    matrices = np.zeros((axes.planes, 0)) if spectrum.mueller is None else spectrum.mueller.reshape(axes.planes, -1)
+    more = -(-matrices.shape[1] // width)
+    sheet = np.zeros((axes.planes, height + more, width), np.float32)
+    sheet[:, height:].reshape(axes.planes, -1)[:, : matrices.shape[1]] = matrices
     top = 0
     for m in orders:
         side = axes.side(m)
@@ -49,6 +54,7 @@ def save(spectrum: RigorousSpectrum, path: str | os.PathLike[str], recipe: str =
         "steps": axes.steps,
         "planes": axes.planes,
         "harmonics": spectrum.harmonics,
+        "polarised": int(spectrum.mueller is not None),
         "intIor": doubles(index.real, index.imag),
         **{_camel(name): doubles(getattr(spectrum, name)) for name in _NUMBERS},
         **{_camel(name): getattr(spectrum, name) for name in _TEXTS},
@@ -70,8 +76,13 @@ def load(path: str | os.PathLike[str], construct: Callable[..., Spectrum], recip
             side = axes.side(m)
             squares.append(sheet[:, top : top + side, :side].reshape(axes.planes, side**2))
             top += side
+        mueller = None
+        if header["polarised"]:
+            flat = sheet[:, top:].reshape(axes.planes, -1)[:, : 16 * axes.nodes]
+            mueller = np.ascontiguousarray(flat.reshape(axes.planes, axes.nodes, 4, 4))
         return construct(
             axes=axes,
+            mueller=mueller,
             values=np.ascontiguousarray(np.concatenate(squares, axis=1)),
             int_ior=complex(*(float(x) for x in header["intIor"])),
             harmonics=header["harmonics"],

@@ -6,6 +6,8 @@ apex of 90°, aluminium; the mount is Littrow, the light unpolarised, the order 
 
 from __future__ import annotations
 
+import functools
+import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,6 +23,7 @@ from .efficiencies import efficiencies
 Real = NDArray[np.float64]
 
 DATA = Path(__file__).parents[1] / "data" / "gratings"
+FITS = DATA / "fits.json"
 LINES_PER_MM = {"R150": 150.0, "R400": 400.0, "B600": 600.0, "R831": 831.0}
 
 # Rakić et al. 1998, table 2: f, Γ and ω of the intraband term and of four interband terms; ħω_p. eV.
@@ -103,6 +106,18 @@ def measured(name: str) -> tuple[Real, Real]:
     return nanometres * 1e-3, found
 
 
+def littrow_curve(name: str, facet_angle: float, wavelengths: Real, rigorous: bool) -> Real:
+    """η₁ of a grating of `LINES_PER_MM` at wavelengths in µm, (n,), as `littrow` has it."""
+    period = 1000 / LINES_PER_MM[name]
+    return np.array([littrow(period, facet_angle, wavelength, rigorous) for wavelength in wavelengths])
+
+
+@functools.cache
+def stored_angles() -> dict[str, dict[str, float]]:
+    """Grating → "scalar" or "rigorous" → facet angle in degrees that `fit` found, by `precompute/ruled_fits.py`."""
+    return json.loads(FITS.read_text(encoding="utf-8"))["facet angles"]
+
+
 def fit(name: str, rigorous: bool) -> Fit:
     """The facet angle that fits a measured grating best in the mean square, by rigorous or by scalar theory.
 
@@ -115,7 +130,7 @@ def fit(name: str, rigorous: bool) -> Fit:
     period = 1000 / LINES_PER_MM[name]
 
     def difference(angle: float) -> tuple[Real, float]:
-        found = np.array([littrow(period, angle, wavelength, rigorous) for wavelength in wavelengths])
+        found = littrow_curve(name, angle, wavelengths, rigorous)
         return found, float(np.sqrt(((found - wanted) ** 2).mean()))
 
     blaze = np.rad2deg(np.arcsin(wavelengths[np.argmax(wanted)] / (2 * period)))

@@ -37,6 +37,10 @@ class RigorousSpectrum:
         harmonics: N of the solver.
         source: where the heights came from.
         source_digest: SHA-256 of the height field.
+        ext_ior: index of the medium above relative to air; wavelengths are those in this medium.
+        mueller: (K, nodes, 4, 4) float32, the Mueller matrices of the orders for k_y ≥ 0, between
+            waves in (ê, k̂ × ê), ê the direction of ŷ − (ŷ·k̂)k̂; or None.
+        polarisation_error: of `mueller`, as `error`: the mean of Σ_m max_ij |ΔM_ij| / Σ η_m; NaN if there is none.
     """
 
     axes: Axes
@@ -51,11 +55,18 @@ class RigorousSpectrum:
     harmonics: int
     source: str
     source_digest: str = field(repr=False)
+    ext_ior: float = 1.0
+    mueller: NDArray[np.float32] | None = field(default=None, repr=False)
+    polarisation_error: float = float("nan")
 
     def __post_init__(self) -> None:
         wanted = self.axes.planes, self.axes.nodes
         if self.values.shape != wanted or self.values.dtype != np.float32:
             raise RequestError(f"values: got {self.values.shape} of {self.values.dtype}, wanted {wanted} of float32")
+        if self.mueller is not None:
+            wanted = self.axes.planes, self.axes.nodes, 4, 4
+            if self.mueller.shape != wanted or self.mueller.dtype != np.float32:
+                raise RequestError(f"mueller: got {self.mueller.shape}, wanted {wanted} of float32")
         lobe_width(self.coherence_length)
 
     # As a `GratingSpectrum` has them.
@@ -77,15 +88,16 @@ class RigorousSpectrum:
     @property
     def material_name(self) -> str:
         """As recipes and scenes give it."""
+        medium = "" if self.ext_ior == 1 else f" below ext_ior {self.ext_ior:.6g}"
         if self.material:
-            return f"material {self.material}"
+            return f"material {self.material}{medium}"
         index = self.int_ior.real if np.imag(self.int_ior) == 0 else self.int_ior
-        return f"int_ior {index:.6g}"
+        return f"int_ior {index:.6g}{medium}"
 
     @property
     def megabytes(self) -> float:
         """Size of the table in memory."""
-        return self.values.nbytes / 1e6
+        return (self.values.nbytes + (0 if self.mueller is None else self.mueller.nbytes)) / 1e6
 
     @property
     def lobe_width(self) -> float:
@@ -100,8 +112,9 @@ class RigorousSpectrum:
     @cached_property
     def digest(self) -> str:
         """SHA-256 of what a renderer needs of it: spectra that have one show the same."""
-        told = repr((self.axes, self.material, self.int_ior, self.coherence_length, self.tolerance))
-        return hashlib.sha256(told.encode() + self.values.tobytes()).hexdigest()
+        told = repr((self.axes, self.material, self.int_ior, self.coherence_length, self.tolerance, self.ext_ior))
+        matrices = b"" if self.mueller is None else self.mueller.tobytes()
+        return hashlib.sha256(told.encode() + self.values.tobytes() + matrices).hexdigest()
 
     def evaluate(self, m: ArrayLike, c: ArrayLike, g: ArrayLike, wavelength: ArrayLike) -> Real:
         """η_m from the table, linear between its nodes.
@@ -114,6 +127,22 @@ class RigorousSpectrum:
         Returns:
             η_m; 0 for an order that does not propagate, or that is beyond the wavelengths of the table.
         """
+        return self._interpolated(self.values, m, c, g, wavelength)
+
+    def evaluate_mueller(self, m: ArrayLike, c: ArrayLike, g: ArrayLike, wavelength: ArrayLike) -> Real:
+        """M_ij of light with k_y ≥ 0, (…, 4, 4), as `evaluate` has η_m.
+
+        Raises:
+            ValueError: if the table has none.
+        """
+        if self.mueller is None:
+            raise RequestError("mueller: got a table of unpolarised light, wanted one built with polarised=True")
+        return self._interpolated(self.mueller, m, c, g, wavelength)
+
+    def _interpolated(
+        self, table: NDArray[np.float32], m: ArrayLike, c: ArrayLike, g: ArrayLike, wavelength: ArrayLike
+    ) -> Real:
+        """What stands at the nodes, (K, nodes, …), linear between them."""
         m, c, g, wavelength = np.broadcast_arrays(np.asarray(m, np.int64), c, g, wavelength)
         axes, half = self.axes, np.abs(m) / 2
         p, r = g + c - half, g - c - half
@@ -124,14 +153,15 @@ class RigorousSpectrum:
         offset = np.array([axes.offset(k) for k in known])[order + axes.largest]
         first, last = axes.range(g)
         z = np.clip((wavelength - first) / np.maximum(last - first, 1e-9), 0, 1) * (axes.planes - 1)
-        result = np.zeros(m.shape)
+        result = np.zeros((*m.shape, *table.shape[2:]))
+        wide = (..., *[None] * (table.ndim - 2))
         places = [_split(axes.position(p), side), _split(axes.position(r), side), _split(z, axes.planes)]
         for corner in np.ndindex(2, 2, 2):
             (i, j, k), weights = zip(
                 *((low + up, f if up else 1 - f) for (low, f), up in zip(places, corner, strict=True)), strict=True
             )
-            result += np.prod(weights, axis=0) * self.values[k, offset + i * side + j]
-        return np.where(there, result, 0)
+            result += np.prod(weights, axis=0)[wide] * table[k, offset + i * side + j]
+        return np.where(there[wide], result, 0)
 
     def efficiencies(self, direction: ArrayLike, wavelength: float) -> tuple[NDArray[np.int64], Real]:
         """The orders that propagate, ascending, and η_m of unpolarised light, as `rigorous.efficiencies` has them.

@@ -67,6 +67,8 @@ def precompute(
     theory: str = "scalar",
     int_ior: complex | None = None,
     material: str | None = None,
+    ext_ior: float = 1.0,
+    polarised: bool = False,
 ) -> GratingSpectrum | RigorousSpectrum:
     """The spectrum of the phase e^{iκh}, or the table of rigorous efficiencies, its error at most `tolerance`.
 
@@ -90,6 +92,8 @@ def precompute(
             interrupted build goes on from what it left in the cache folder.
         int_ior: of rigorous theory, index of refraction of a dielectric.
         material: of rigorous theory, a conductor by the name that Mitsuba has for it.
+        ext_ior: of rigorous theory, index of the medium above, for a grating under a coat; wavelengths are those there.
+        polarised: of rigorous theory, whether polarised variants can use the table.
 
     Returns:
         The spectrum; its `error` is what was measured, at values of κ that were not used to build it.
@@ -121,14 +125,19 @@ def precompute(
             height_field,
             int_ior=int_ior,
             material=material,
+            ext_ior=ext_ior,
+            polarised=polarised,
             coherence_length=coherence_length,
             wavelengths=wavelengths,
             tolerance=1e-2 if tolerance is None else tolerance,
             progress=progress,
             checkpoints=cache_folder(),
         )
-    if int_ior is not None or material is not None:
-        raise RequestError("int_ior, material: the spectrum of scalar theory is that of every material; wanted neither")
+    if int_ior is not None or material is not None or ext_ior != 1 or polarised:
+        raise RequestError(
+            "int_ior, material, ext_ior, polarised: the spectrum of scalar theory is that of every material; wanted "
+            "none of them"
+        )
     if tolerance is not None:
         check_tolerance(tolerance)
     check_angle(largest_angle)

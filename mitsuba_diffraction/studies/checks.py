@@ -10,7 +10,7 @@ from ..scalar_theory import TRUSTED, equivalent_depth, expected_error
 from ..spectrum import GratingSpectrum
 from ..surface.heightfield import HeightField
 from ..surface.periods import find_periods, find_periods_of_tile
-from . import analytic, bumps, conservation, coupled_waves, rough_surface, viewing_angle
+from . import analytic, bumps, conservation, coupled_waves, measured_gratings, rough_surface, viewing_angle
 from .accuracy import against_reference
 from .inspection.statistics import statistics
 from .record import GROUPS, Check, Record
@@ -20,7 +20,7 @@ _WAVELENGTH = 0.55  # µm, the middle of the visible range
 
 def checks() -> tuple[Check, ...]:
     """What `mitsuba-diffraction validate` runs, group by group."""
-    modules = (analytic, bumps, viewing_angle, rough_surface, conservation, coupled_waves)
+    modules = (analytic, bumps, viewing_angle, measured_gratings, rough_surface, conservation, coupled_waves)
     every = [check for module in modules for check in module.CHECKS]
     return tuple(sorted(every, key=lambda check: GROUPS.index(check.group)))
 

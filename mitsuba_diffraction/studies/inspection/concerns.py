@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from ...coherence import lobe_width
+from ...scalar_theory import range_warning
 from ...surface.heightfield import HeightField
 from .statistics import Statistics, hann
 
@@ -17,7 +20,12 @@ _STEEP = 45.0  # degrees: light is reflected twice
 
 
 def concerns(
-    height_field: HeightField, numbers: Statistics, coherence_length: float, *, measured: bool
+    height_field: HeightField,
+    numbers: Statistics,
+    coherence_length: float,
+    *,
+    measured: bool,
+    periods: Sequence[float] = (),
 ) -> tuple[str, ...]:
     """Sentences, none if all is well.
 
@@ -26,6 +34,7 @@ def concerns(
         numbers: its statistics.
         coherence_length: of the light, as far as the surface carries it, µm.
         measured: whether it is a scan; a formula has neither tilt nor steps of its own.
+        periods: that stand out, µm.
     """
     found = []
     axes = zip(height_field.pixel_size, height_field.shape[::-1], strict=True)
@@ -35,6 +44,8 @@ def concerns(
             f"Pixels of {coarsest * 1e3:.0f} nm are too coarse for light: orders beyond {1 / (2 * coarsest):.2g} "
             "cycles/µm are missing. Scan again with pixels of at most 90 nm."
         )
+    if beyond := range_warning(height_field, periods):
+        found.append(f"{beyond[0].upper()}{beyond[1:]}.")
     if not measured:
         return tuple(found)
     # A slope s turns all light by 2s, q by 2s/λ; less than a lobe is not seen, but a degree is too much in any case.

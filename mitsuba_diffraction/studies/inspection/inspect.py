@@ -161,7 +161,9 @@ def inspect(
             for nm in (SCALAR_AT if periods else ())
         },
         changes=changes(height_field, spectrum, periods[0], extent=extent, build=build, find=find) if periods else (),
-        concerns=concerns(height_field, numbers, used, measured=measured),
+        concerns=concerns(
+            height_field, numbers, used, measured=measured, periods=[period.period for period in periods]
+        ),
         spectrum=spectrum,
         shown=_widened(repeated(height_field, _MOST_TIMES) if extent == "tile" else height_field),
     )

@@ -1,0 +1,30 @@
+"""Fits the facet angles of the measured gratings: `python precompute/ruled_fits.py [OUT.json]`; a minute on one core.
+
+`studies/measured_gratings.py` reads what it writes.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+from rich.progress import track
+
+from mitsuba_diffraction.files import whole_file
+from mitsuba_diffraction.rigorous.ruled_fit import FITS, LINES_PER_MM, fit
+
+
+def make(path: Path) -> None:
+    """Fit each grating by both theories and write the angles, whole or not at all."""
+    angles = {
+        name: {theory: round(fit(name, theory == "rigorous").facet_angle, 2) for theory in ("scalar", "rigorous")}
+        for name in track(LINES_PER_MM, "facet angles")
+    }
+    content = {"made by": "python precompute/ruled_fits.py", "unit": "degrees", "facet angles": angles}
+    with whole_file(path) as temporary:
+        Path(temporary).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    make(Path(sys.argv[1]) if len(sys.argv) > 1 else FITS)
