@@ -1,4 +1,7 @@
-"""The albedo of a perfect mirror with random surfaces, by quasi-Monte Carlo from the stored spectrum."""
+"""The albedo of a perfect mirror with random surfaces, by a sum over the nodes of the stored spectrum."""
+
+import functools
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -7,12 +10,16 @@ from scipy.stats import qmc
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction.geometry import k_g
-from mitsuba_diffraction.spectrum.furnace import Furnace, random_places
-from mitsuba_diffraction.spectrum.spline_grid import spline_integral
+from mitsuba_diffraction.spectrum.furnace import ALLOWED, Furnace, random_places
+from mitsuba_diffraction.spectrum.spline_grid import SplineGrid, spline_integral
 
 MOST = 1.002
-SEEDS = range(1000, 1030)
-"""Of the slow study; any others serve."""
+SEEDS = range(5000, 5040)
+"""Of the slow study, four minutes; any others serve. 5000 to 5499 were run once."""
+PIXELS = 64
+"""Along a side, at most: with more, most of the time is spent on the spectrum."""
+OFFSETS = np.linspace(-1.5, 1.5, 4001)
+INTEGRAL = spline_integral(OFFSETS)
 
 
 def random_surface(seed):
@@ -23,7 +30,7 @@ def random_surface(seed):
     rng = np.random.default_rng(seed)
     side = np.exp(rng.uniform(np.log(0.5), np.log(30)))
     height = rng.uniform(0, 10) if rng.random() < 0.7 else 10 ** rng.uniform(-1.5, 1)
-    pixel = max(rng.uniform(0.04, 0.28), side / 110)
+    pixel = max(rng.uniform(0.04, 0.28), side / PIXELS)
     count = max(int(side / pixel), 4)
     shape = (count, max(int(count * rng.uniform(0.5, 1)), 4)) if rng.random() < 0.8 else (1, count)
     h = rng.random(shape)
@@ -36,59 +43,109 @@ def random_surface(seed):
     return md.HeightField(h, pixel), {"extent": extent, "coherence_length": coherence_length}, rng
 
 
-def albedo(of, wi, wavelength, count, seed=0):
-    """∫ K G S min(e(ω_i), e(ω_o)) dq and its standard error; λ in µm. A node by its mean power, a q in its lobe."""
-    k, table = 2 * np.pi / wavelength, of.energy_table()
-    kappas = np.minimum(k * (wi[2] + (np.arange(24) + 0.5) / 24), of.largest_kappa)
-    powers = sum(np.abs(of.powers(kappa).astype(np.float64)) for kappa in kappas)
-    powers += powers.sum() * 1e-2 / powers.size
-    q_x, q_y = of.grid.frequencies()
-    sample = of.extent == "sample"
-    radius = 2.4 * max(of.grid.spacing) if sample else 1.5 * of.reach * of.lobe_width
-    out = np.hypot(wavelength * q_x + wi[0], wavelength * q_y[:, None] + wi[1])
-    powers = np.where(out < np.sqrt(1 + (radius * wavelength) ** 2) + radius * wavelength, powers, 0).ravel()
-    cumulative, results = np.cumsum(powers) / powers.sum(), []
-    for repetition in range(4):
-        x = qmc.Sobol(3, seed=10 * seed + repetition).random(count // 4)
-        node = np.minimum(np.searchsorted(cumulative, x[:, 0], side="right"), powers.size - 1)
-        row, column = np.divmod(node, len(q_x))
-        if sample:
-            t = np.linspace(-1.5, 1.5, 4001)
-            offset = np.stack([np.interp(x[:, i + 1], spline_integral(t), t) * of.grid.spacing[i] for i in (0, 1)], -1)
-        else:
-            r = of.lobe_width * np.sqrt(-2 * np.log(1 + x[:, 1] * np.expm1(-(of.reach**2) / 2)))
-            offset = r[:, None] * np.stack([np.cos(2 * np.pi * x[:, 2]), np.sin(2 * np.pi * x[:, 2])], -1)
-        q = np.stack([q_x[column], q_y[row]], -1) + offset
-        t = -wavelength * q - wi[:2]
-        square = 1 - (t**2).sum(-1)
-        above = square > 0
-        if sample:
-            above &= (np.abs(q) <= np.array(of.grid.limit)).all(-1)
-        cos_o = np.sqrt(np.where(above, square, 1))
-        w = wi[2] + cos_o
-        d = ((wavelength * q) ** 2).sum(-1) / 2 + w**2 / 2
-        s = of.table.powers_at(row, column, np.minimum(k * w, of.largest_kappa)).astype(np.float64)
-        wo = np.concatenate([t, cos_o[:, None]], -1)
-        e = np.minimum(table.at(wi[None], wavelength)[0], table.at(wo, wavelength))
-        value = k_g(wi[2], cos_o, d) * s * e * powers.sum() / powers[node]
-        results.append(np.where(above, value, 0).mean())
-    return np.mean(results), np.std(results) / np.sqrt(3)
-
-
-def largest_albedo(seed, count=24):
-    """The largest over random directions and wavelengths, less twice its error; None for a surface that is refused."""
+@functools.lru_cache(2)
+def spectrum_of(seed):
+    """Of a random surface; skips the test if it is refused."""
     heights, request, rng = random_surface(seed)
     try:
-        of = md.precompute(heights, tolerance=1e-2, **request)
-    except ValueError:
-        return None
+        return md.precompute(heights, tolerance=1e-2, **request), rng
+    except ValueError as refusal:
+        pytest.skip(str(refusal))
+
+
+def albedo(of, table, wi, wavelength, points, rng):
+    """∫ K G S min(e(ω_i), e(ω_o)) dq and its standard error; λ in µm.
+
+    The sum over all nodes, each with `points` in its lobe, four times: drawn from the lobe or, if it reaches near the
+    horizon, even in the azimuth of ω_o and in log(cos θ_i + cos θ_o).
+    """
+    q_x, q_y = (q.ravel() for q in np.meshgrid(*of.grid.frequencies()))
+    row, column = (i.ravel() for i in np.indices(of.grid.shape))
+    splines = isinstance(of.grid, SplineGrid)
+    radius = wavelength * (1.5 * np.hypot(*of.grid.spacing) if splines else of.reach * of.lobe_width)
+    distance = np.hypot(wi[0] + wavelength * q_x, wi[1] + wavelength * q_y)
+    lit = distance < 1 + radius
+    q_x, q_y, row, column, distance = (a[lit, None] for a in (q_x, q_y, row, column, distance))
+    azimuth = np.arctan2(wi[1] + wavelength * q_y, wi[0] + wavelength * q_x)
+    opening = np.where(distance > radius, np.arcsin(np.minimum(radius / np.maximum(distance, 1e-12), 1)), np.pi)
+    low = wi[2] + np.sqrt(1 - np.minimum(distance + radius, 1) ** 2)
+    ratio = np.log((wi[2] + np.sqrt(1 - np.maximum(distance - radius, 0) ** 2)) / low)
+    near = distance + radius > 0.9
+    results = []
+    for _ in range(4):
+        x, y = np.moveaxis((qmc.Sobol(2, scramble=False).random(points) + rng.random((len(q_x), 1, 2))) % 1, -1, 0)
+        cos = low * np.exp(ratio * x) - wi[2]
+        sine, phi = np.sqrt(np.maximum(1 - cos**2, 0)), azimuth + opening * (2 * y - 1)
+        u, v = sine * np.cos(phi) - wi[0], sine * np.sin(phi) - wi[1]
+        share = 2 * opening * ratio * (cos + wi[2]) * cos / wavelength**2
+        if splines:
+            for q, middle, spacing in ((u, q_x, of.grid.spacing[0]), (v, q_y, of.grid.spacing[1])):
+                share = share * b_spline((q / wavelength - middle) / spacing) / spacing
+            drawn = [np.interp(t, INTEGRAL, OFFSETS) * d for t, d in zip((x, y), of.grid.spacing, strict=True)]
+        else:
+            square = ((u / wavelength - q_x) ** 2 + (v / wavelength - q_y) ** 2) / of.lobe_width**2
+            cut = -np.expm1(-(of.reach**2) / 2)
+            share *= np.exp(-square / 2) / (2 * np.pi * of.lobe_width**2 * cut) * (square < of.reach**2)
+            r = of.lobe_width * np.sqrt(-2 * np.log1p(-x * cut))
+            drawn = [r * np.cos(2 * np.pi * y), r * np.sin(2 * np.pi * y)]
+        u, v = np.where(near, u, wavelength * (q_x + drawn[0])), np.where(near, v, wavelength * (q_y + drawn[1]))
+        share = np.where(near, share, 1)
+        square = 1 - (u + wi[0]) ** 2 - (v + wi[1]) ** 2
+        kept = (square > 0) & (share > 0)
+        if splines:
+            kept &= (np.abs(u) <= wavelength * of.grid.limit[0]) & (np.abs(v) <= wavelength * of.grid.limit[1])
+        node, _ = np.nonzero(kept)
+        u, v, cos_o = u[kept], v[kept], np.sqrt(square[kept])
+        w, out = wi[2] + cos_o, np.stack([-u - wi[0], -v - wi[1], cos_o], -1)
+        kappa = np.minimum(2 * np.pi * w / wavelength, of.largest_kappa)
+        s = of.table.powers_at(row[node, 0], column[node, 0], kappa).astype(np.float64)
+        e = np.minimum(table.at(wi[None], wavelength), table.at(out, wavelength))
+        factor = k_g(wi[2], cos_o, (u**2 + v**2 + w**2) / 2, table.shadowing == "v_cavity")
+        results.append((share[kept] * factor * s * e).sum() / points)
+    return np.mean(results), np.std(results, ddof=1) / 2
+
+
+def b_spline(t):
+    """The centred quadratic one."""
+    t = np.abs(t)
+    return np.where(t < 0.5, 0.75 - t**2, 0.5 * np.maximum(1.5 - t, 0) ** 2)
+
+
+@dataclass
+class Worst:
+    """The largest albedo found: its estimate and standard error, and where."""
+
+    albedo: float
+    error: float
+    wi: np.ndarray
+    wavelength: float
+
+    def __str__(self):
+        theta, phi = np.rad2deg([np.arccos(self.wi[2]), np.arctan2(self.wi[1], self.wi[0])])
+        return f"{self.albedo:.5f} ± {self.error:.5f} at {theta:.2f}°, {phi:.0f}°, {1e3 * self.wavelength:.0f} nm"
+
+
+def worst_albedo(of, table, rng, directions, wavelengths, pairs=1 << 14):
+    """The largest at these places: the three largest by few points, again by more where they seem to exceed one."""
+    nodes = np.prod(of.grid.shape)
+    few = int(2 ** np.clip(np.round(np.log2(pairs / nodes)), 1, 8))
+    found = np.array([albedo(of, table, *place, few, rng) for place in zip(directions, wavelengths, strict=True)])
+    results = []
+    for i in np.argsort(-found.sum(-1))[:3]:
+        (mean, error), points = found[i], few
+        while mean + 2 * error > 1.001 and error > 2e-4 and points * nodes < 1 << 21:
+            points *= 4
+            mean, error = albedo(of, table, directions[i], wavelengths[i], points, rng)
+        results.append(Worst(mean, error, directions[i], wavelengths[i]))
+    return max(results, key=lambda worst: worst.albedo)
+
+
+def anywhere(rng, count):
+    """Directions to 89.9°, half of them beyond 70°, and λ in µm."""
     theta = np.deg2rad(rng.uniform(np.where(rng.random(count) < 0.5, 0, 70), 89.9))
-    phi, wavelengths = rng.uniform(0, 2 * np.pi, count), rng.uniform(0.36, 0.83, count)
+    phi = rng.uniform(0, 2 * np.pi, count)
     omega = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1)
-    found = [albedo(of, *pair, 1 << 13) for pair in zip(omega, wavelengths, strict=True)]
-    worst = np.argmax([mean - 2 * error for mean, error in found])
-    mean, error = albedo(of, omega[worst], wavelengths[worst], 1 << 16, seed=3)
-    return mean - 2 * error
+    return omega, rng.uniform(0.36, 0.83, count)
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
@@ -97,24 +154,60 @@ def largest_albedo(seed, count=24):
     [
         pytest.param(3, id="tile of 4 × 4 pixels, 8 µm deep"),  # 1.078 where e came from the gathered spectrum alone
         pytest.param(103, id="tile of 7 pixels, 1.8 µm deep"),
-        pytest.param(6, id="tile of 34 pixels, 3.7 µm deep", marks=pytest.mark.slow),
-        pytest.param(102, id="wide lobes, 8.2 µm deep", marks=pytest.mark.slow),
-        pytest.param(107, id="rough scan, 5 µm deep", marks=pytest.mark.slow),
+        pytest.param(2025, id="grating of 64 pixels, 8 µm deep", marks=pytest.mark.slow),
         *(pytest.param(seed, marks=pytest.mark.slow) for seed in SEEDS),
     ],
 )
 def test_no_albedo_above_one(seed):
-    found = largest_albedo(seed)
-    if found is None:
-        pytest.skip("refused by precompute")
-    assert found <= MOST
+    of, rng = spectrum_of(seed)
+    found = worst_albedo(of, of.energy_table(), rng, *anywhere(rng, 48))
+    assert found.albedo - 2 * found.error <= MOST, str(found)
+
+
+def rough(shape, pixel, depth):
+    h = np.random.default_rng(1).random(shape)
+    return md.HeightField((h - h.min()) / np.ptp(h) * depth, pixel)
+
+
+def scan(side, pixel, coherence_length=65.0):
+    count = round(side / pixel)
+    return md.precompute(
+        rough((count, count), pixel, 1.0), extent="sample", coherence_length=coherence_length, tolerance=1e-2
+    )
+
+
+# What made the spectrum, the kind of shadowing and angles of incidence.
+HARD = {
+    "scan of 0.6 µm": (lambda: scan(0.6, 0.05, 0.28), "v_cavity", (85, 89)),
+    "scan of 1.2 µm": (lambda: scan(1.2, 0.1, 0.4), "v_cavity", (87, 89.5)),
+    "scan of 4.8 µm": (lambda: scan(4.8, 0.1), "v_cavity", (70, 75, 80, 85, 89)),
+    "scan of 9.6 µm": (lambda: scan(9.6, 0.1), "v_cavity", (70, 75, 80, 85, 89)),
+    "tile of 56 × 108": (lambda: md.precompute(rough((56, 108), 0.276, 6.3), tolerance=1e-2), "v_cavity", (10, 50, 85)),
+    "blazed": (lambda: md.precompute(md.gratings.blazed(2.5, 0.25)), "none", (85, 87, 89, 89.9)),
+    "crossed": (lambda: md.precompute(md.gratings.crossed(2.0, 0.1, samples=32)), "none", (85, 87, 89, 89.9)),
+    "scan of 4.8 µm, no shadowing": (lambda: scan(4.8, 0.1), "none", (70, 85, 87, 89, 89.9)),
+}
+QUICK = ("scan of 0.6 µm", "blazed")
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+@pytest.mark.parametrize("name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in HARD])
+def test_the_reported_excess_holds(name):
+    make, shadowing, angles = HARD[name]
+    of, rng = make(), np.random.default_rng(7)
+    table = of.energy_table(shadowing)
+    assert table.excess <= ALLOWED
+    theta, phi = np.deg2rad(np.repeat(angles, 12)), rng.uniform(0, 2 * np.pi, 12 * len(angles))
+    omega = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1)
+    found = worst_albedo(of, table, rng, omega, rng.uniform(0.36, 0.83, len(theta)))
+    assert found.albedo - 2 * found.error <= 1 + max(table.excess, ALLOWED), str(found)
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_the_albedo_that_the_table_was_lowered_by():
-    heights, request, rng = random_surface(103)
-    of = md.precompute(heights, tolerance=1e-2, **request)
+    of, rng = spectrum_of(103)
+    table = of.energy_table()
     omega, wavelengths = random_places(rng, 8, of.wavelengths)
-    got = Furnace(of).albedo(omega, wavelengths, of.energy_table(), 4096, rng)[0]
-    wanted = [albedo(of, *pair, 1 << 14)[0] for pair in zip(omega, wavelengths, strict=True)]
+    got = Furnace(of).albedo(omega, wavelengths, table, 4096, rng)[0]
+    wanted = [albedo(of, table, *pair, 256, rng)[0] for pair in zip(omega, wavelengths, strict=True)]
     np.testing.assert_allclose(got, wanted, rtol=5e-3)

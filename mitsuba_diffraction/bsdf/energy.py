@@ -104,7 +104,7 @@ class Energy:
         if self.slope is not None:
             e += self._between(lambda i: self.slope(i, True), index, place, t) * self.change
         if self.shadowing == "none":
-            e *= dr.minimum(1, place.z / HORIZON)
+            e *= dr.square(dr.minimum(1, place.z / HORIZON))
         return e
 
     def _between(

@@ -45,16 +45,17 @@ SLACK = 5e-4
 CONICAL_SHAPE = (1, 193, 193)
 GENERAL_SHAPE = (33, 17, 33)
 CONICAL_WAVELENGTHS = 2  # how many of the λ that share one ν = c/λ a node is computed for
-ROUNDS = 6  # how often the table is lowered
+ROUNDS = 12  # how often the table is lowered, at most
+DEEP, PAIRS = 30, 1e7  # the largest κ times the height range in radians; pairs (place, cell of q)
 MUCH = 0.05  # from which the cells about are looked at again
 LIKELY = 0.8  # the albedo at neighbouring nodes from which a cell is looked at
 
 # The gathered spectrum: lengths in cycles/µm.
 NARROW = 0.01  # λσ_q of lobes so narrow that ω_o,y = −ω_i,y holds
 FINE = 0.08  # width of the cells of q in which nodes are gathered
-WIDE = 0.2  # width in ω_o,t of the cells in which weak ones are gathered further
+WIDE = 0.3  # width in ω_o,t of the cells in which weak ones are gathered further
 STEP = 1.25  # from one gathering to the next, in λ
-KEPT = 150  # the strongest cells, which are not gathered further
+KEPT = 60  # the strongest cells, which are not gathered further
 STRONG, THIRD = 2e-2, 1.3  # the power from which a lobe is represented by three boxes; their width, in σ_q
 SPLINE_STEP, LINEAR_STEP = 0.4, 0.1  # in radians of the fastest oscillation over κ
 GAUSS = ((1 + leggauss(2)[0]) / 2).tolist(), (leggauss(2)[1] / 2).tolist()
@@ -301,15 +302,21 @@ def energy_table(spectrum: GatheredSpectrum, shadowing: str = "v_cavity", height
 
     # The same places for every height scale, so that their tables can be subtracted.
     rng = np.random.default_rng(0)
-    doubtful = (ndimage.maximum_filter(largest, 3) > LIKELY)[tuple(slice(n) for n in cells)]
-    for _ in range(ROUNDS):
+    # Of few orders of a deep surface a has peaks between nodes where it is small: places in all cells, as many as are
+    # cheap.
+    pairs = np.prod(cells) * np.mean([len(level.q) for level in spectrum.cells])
+    thorough = int(min(PAIRS / pairs, ROUNDS)) if spectrum.cells[0].powers.shape[1] * LINEAR_STEP > DEEP else 0
+    likely = (ndimage.maximum_filter(largest, 3) > LIKELY)[tuple(slice(n) for n in cells)]
+    doubtful = np.ones_like(likely) if thorough else likely
+    for index in range(ROUNDS):
         inside, first = rng.random((*cells, 3), np.float32)[doubtful], np.argwhere(doubtful)
         drop = np.zeros(shape, np.float32)
         drop[tuple(first.T)] = np.maximum(between(values, first + inside) - bound(first + inside)[1], 0)
         # A node is a corner of the cells before and after it.
         values = np.maximum(values - ndimage.maximum_filter(drop, [min(n, 2) for n in shape], mode="constant"), 0)
         # Next time only about cells that had to be lowered much.
-        doubtful = (ndimage.maximum_filter(drop, 3) > MUCH)[tuple(slice(n) for n in cells)]
+        if index + 1 >= thorough:
+            doubtful = (ndimage.maximum_filter(drop, 3) > MUCH)[tuple(slice(n) for n in cells)]
     return dataclasses.replace(table, values=np.ascontiguousarray(values, np.float32))
 
 

@@ -17,8 +17,8 @@ Near the horizon, |x| = 1, albedos change fastest: the nodes are equidistant in 
 A grating of one row keeps ω_o,y = −ω_i,y. Then K and G depend on the longitudes alone, and λ enters everywhere as λ/c:
 a is a function of x and ν = c/λ, and the table has one row in y.
 
-Without shadowing a grows as 1/cos θ towards the horizon, which no table follows: there e is the table's value times
-min(1, cos θ/cos 85°).
+Without shadowing a grows as 1/cos² θ towards the horizon, which no table follows: there e is the table's value times
+min(1, cos θ/cos 85°)².
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from scipy import ndimage
 from ..errors import RequestError
 
 HORIZON = float(np.cos(np.deg2rad(85)))
-"""cos θ below which e falls with cos θ where there is no shadowing."""
+"""cos θ below which e falls with cos² θ where there is no shadowing."""
 
 SHADOWING = ("v_cavity", "none")
 
@@ -51,8 +51,9 @@ class EnergyTable:
         frequencies: (smallest, largest) ν in 1/µm.
         conical: ν = c/λ and N_y = 1; else ν = 1/λ.
         shadowing: "v_cavity" or "none".
-        excess: the largest A − 1 found (`furnace.py`), over places that the table was not made from; A is the albedo
-            with E, the rounding of `packed` included.
+        excess: an upper confidence bound of 95 % of A − 1 at the places where it was found largest (`furnace.py`): 48
+            of 1024 random directions, to 89.9°, and wavelengths, or of 4096 of a deep surface; none of them made or
+            lowered the table. A is the albedo with E, the rounding of `packed` included.
         loss: (mean, largest) 1 − e over those of them with a ≤ 1: light that is lost to the table's resolution.
     """
 
@@ -103,7 +104,7 @@ class EnergyTable:
 
     def horizon(self, cosines: NDArray[np.float64]) -> NDArray[np.float64]:
         """What the table's value is multiplied by, for cos θ (n,)."""
-        return np.minimum(1, cosines / HORIZON) if self.shadowing == "none" else np.ones_like(cosines)
+        return np.minimum(1, cosines / HORIZON) ** 2 if self.shadowing == "none" else np.ones_like(cosines)
 
     def as_plain(self) -> dict[str, Any]:
         """As numbers and texts, for JSON."""

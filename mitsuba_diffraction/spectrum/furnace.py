@@ -7,7 +7,7 @@ With R = 1 the BSDF reflects
 `albedo.py` makes the table from a gathered spectrum, at as many places as a table has cells. Here A is integrated at
 fewer places, but from the powers of the spectrum, by quasi-Monte Carlo with importance sampling: nodes by their power
 about κ and K G, then a q in the lobe. Where A exceeds one the nodes of the table are lowered, until a set of places
-that lowered nothing shows none; it is what `EnergyTable.excess` reports.
+shows none.
 """
 
 from __future__ import annotations
@@ -15,31 +15,86 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 from scipy.stats import qmc
 
 from ..geometry import k_g
-from .albedo import SLACK
+from .albedo import DEEP, SLACK
 from .energy_table import EnergyTable
-from .spline_grid import spline_integral
+from .spline_grid import SplineGrid, spline_integral
 
 if TYPE_CHECKING:
     from .grating_spectrum import GratingSpectrum
 
-BLOCKS = 48  # blocks of nodes along one axis, at most
+BLOCKS = 20  # blocks of nodes along one axis, at most
 BINS = 12  # of κ, for which the power of each block is kept
 FLOOR = 0.25  # the share of the power over all κ in the density: powers oscillate within a bin
-CHUNK = 1 << 16  # points that are computed at once, so that they stay in the cache
+NEAR = 3  # cos θ_o in cos θ_i below which K G changes faster than a lobe
+CHUNK = 1 << 15  # points that are computed at once, so that they stay in the cache
 
-PLACES = 1024  # directions and wavelengths of one round
-POINTS = 256  # by which A is estimated at each
-CANDIDATES, REPETITIONS, MORE_POINTS = 32, 4, 512  # the largest are computed again, less twice their noise
+# One set of places: how many, of shallow surfaces and of deep ones, and the points by which A is estimated; then the
+# same where it is largest.
+PLACES, PLACES_DEEP = 1024, 4096
+SCREENED = ((PLACES_DEEP, 64), (256, 256))
+# The largest again, as long as a bound is too wide to decide, unless there are more such places: then it costs less to
+# lower the whole table a little.
+BOUNDED = ((48, 512), (48, 2048), (12, 8192))
+REPETITIONS = 4
+CONFIDENCE = 2.353 / REPETITIONS**0.5  # one-sided 95 %: Student's t with REPETITIONS − 1 degrees of freedom
+ALLOWED = 1e-3  # what an upper confidence bound of A may exceed one by
+LITTLE = 0.02  # the same, without more than the nodes about it being lowered anew
+MANY, MUCH = 12, 0.1  # places where A exceeds that, or what it exceeds one by, from which on the whole table is
+WIDEST = 2  # cells about a place
 ROUNDS = 10
-LITTLE = 0.02  # what an albedo may exceed one by without more than the nodes about it being lowered anew
 STEEPEST = 89.9  # degrees
+
+
+class _Gaussian:
+    """The lobe of an order, cut off at `reach` standard deviations."""
+
+    def __init__(self, sigma: float, reach: float) -> None:
+        self._sigma, self._cut = sigma, np.expm1(-(reach**2) / 2)
+        self.radius = reach * sigma
+
+    def drawn(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Points of the lobe, in cycles/µm, for numbers from 0 to 1."""
+        r, phi = self._sigma * np.sqrt(-2 * np.log1p(x * self._cut)), 2 * np.pi * y
+        return r * np.cos(phi), r * np.sin(phi)
+
+    def density(self, q_x: NDArray[np.float64], q_y: NDArray[np.float64]) -> NDArray[np.float64]:
+        """µm², of integral one."""
+        square = q_x**2 + q_y**2
+        peak = -1 / (2 * np.pi * self._sigma**2 * self._cut)
+        return np.where(square < self.radius**2, peak * np.exp(-square / (2 * self._sigma**2)), 0)
+
+
+class _Spline:
+    """The B-spline of a node."""
+
+    def __init__(self, spacing: tuple[float, float]) -> None:
+        self._spacing = spacing
+        self._offsets = np.linspace(-1.5, 1.5, 1025)
+        self._integral = spline_integral(self._offsets)
+        self.radius = 1.5 * float(np.hypot(*spacing))
+
+    def drawn(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """As of `_Gaussian`."""
+        return tuple(
+            np.interp(t, self._integral, self._offsets) * d for t, d in zip((x, y), self._spacing, strict=True)
+        )
+
+    def density(self, q_x: NDArray[np.float64], q_y: NDArray[np.float64]) -> NDArray[np.float64]:
+        """As of `_Gaussian`."""
+        product = 1 / (self._spacing[0] * self._spacing[1])
+        for q, spacing in zip((q_x, q_y), self._spacing, strict=True):
+            t = np.abs(q) / spacing
+            product = product * np.where(t < 0.5, 0.75 - t**2, 0.5 * np.maximum(1.5 - t, 0) ** 2)
+        return product
 
 
 class Furnace:
@@ -48,14 +103,9 @@ class Furnace:
     def __init__(self, spectrum: GratingSpectrum) -> None:
         self._spectrum = spectrum
         grid = spectrum.grid
-        self._sample = spectrum.extent == "sample"
-        if self._sample:
-            self._limit = np.array(grid.limit)
-            offsets = np.linspace(-1.5, 1.5, 1025)
-            self._spline = spline_integral(offsets), offsets
-            self._lobe = 1.5 * float(np.hypot(*grid.spacing))
-        else:
-            self._lobe = spectrum.reach * spectrum.lobe_width
+        spline = isinstance(grid, SplineGrid)
+        self._lobe = _Spline(grid.spacing) if spline else _Gaussian(spectrum.lobe_width, spectrum.reach)
+        self._limit = grid.limit if spline else (np.inf, np.inf)
 
         # Nodes, block after block.
         blocks, frequencies = [], grid.frequencies()
@@ -92,7 +142,7 @@ class Furnace:
         ]
         x, y = (np.array(e) for e in edges)
         self._centre = np.stack(np.meshgrid(x.mean(-1), y.mean(-1)), -1).reshape(-1, 2)
-        self._radius = np.hypot(*np.meshgrid(np.ptp(x, axis=1) / 2, np.ptp(y, axis=1) / 2)).ravel() + self._lobe
+        self._radius = np.hypot(*np.meshgrid(np.ptp(x, axis=1) / 2, np.ptp(y, axis=1) / 2)).ravel() + self._lobe.radius
 
     def albedo(
         self,
@@ -126,6 +176,31 @@ class Furnace:
 
         with ThreadPoolExecutor() as threads:
             return tuple(np.concatenate(list(threads.map(compute, parts)), axis=1))
+
+    def bounded(
+        self,
+        directions: NDArray[np.float64],
+        wavelengths: NDArray[np.float64],
+        table: EnergyTable,
+        rng: np.random.Generator,
+        height_scale: float = 1.0,
+    ) -> NDArray[np.float64]:
+        """As `albedo`, (3, n), but of A an upper confidence bound of 95 %, so close that it tells if A is allowed."""
+        result, unsure = np.empty((3, len(directions))), np.arange(len(directions))
+        for most, points in BOUNDED:
+            if len(unsure) > most:
+                break
+            places = directions[unsure], wavelengths[unsure]
+            found = np.array([self.albedo(*places, table, points, rng, height_scale) for _ in range(REPETITIONS)])
+            mean, deviation = found.mean(0), CONFIDENCE * found[:, 0].std(0, ddof=1)
+            result[:, unsure] = mean
+            result[0, unsure] += deviation
+            if (mean[0] - deviation > 1 + ALLOWED).any():
+                break
+            unsure = unsure[mean[0] + deviation > 1 + ALLOWED]
+            if not len(unsure):
+                break
+        return result
 
     def _albedo(
         self,
@@ -163,31 +238,33 @@ class Furnace:
         node = np.clip(node, self._first[block], self._first[block + 1] - 1)
         weight = self._block_mass[block] / np.maximum(chosen * self._mass[node], 1e-300)
 
+        i, node, weight = np.repeat(np.arange(count), points), node.ravel(), weight.ravel() / points
+        first, second = x[..., 1].ravel(), x[..., 2].ravel()
         row, column = self._row[node], self._column[node]
-        q_x, q_y = self._q_x[column], self._q_y[row]
-        if self._sample:
-            q_x = q_x + np.interp(x[..., 1], *self._spline) * spectrum.grid.spacing[0]
-            q_y = q_y + np.interp(x[..., 2], *self._spline) * spectrum.grid.spacing[1]
-        else:
-            r = spectrum.lobe_width * np.sqrt(-2 * np.log1p(x[..., 1] * np.expm1(-(spectrum.reach**2) / 2)))
-            q_x, q_y = q_x + r * np.cos(2 * np.pi * x[..., 2]), q_y + r * np.sin(2 * np.pi * x[..., 2])
-        u, v = wavelengths[:, None] * q_x, wavelengths[:, None] * q_y
-        o_x, o_y = u + directions[:, :1], v + directions[:, 1:2]
-        square = 1 - o_x**2 - o_y**2
-        above = square > 0
-        if self._sample:
-            above &= (np.abs(q_x) <= self._limit[0]) & (np.abs(q_y) <= self._limit[1])
-        i, j = np.nonzero(above)
-        cos_i, cos_o = cos_i[i], np.sqrt(square[i, j])
+        middle = np.stack([self._q_x[column], self._q_y[row]])
+        q = middle + self._lobe.drawn(first, second)
+        # Where light grazes, K G changes faster than a lobe: of the lobes there a second point, drawn by cos θ_o.
+        near, horizon = _Horizon.of(directions[i], wavelengths[i], middle, self._lobe)
+        more = horizon.drawn(first[near], second[near])
+        shares = horizon.share(q[:, near]), horizon.share(more)
+        more_weight = weight[near] * shares[1]
+        weight[near] *= shares[0]
+        q, weight = np.concatenate([q, more], 1), np.concatenate([weight, more_weight])
+        i, row, column = (np.concatenate([a, a[near]]) for a in (i, row, column))
+
+        u, v = wavelengths[i] * q
+        square = 1 - (u + directions[i, 0]) ** 2 - (v + directions[i, 1]) ** 2
+        lit = (square > 0) & (weight > 0) & (np.abs(q[0]) <= self._limit[0]) & (np.abs(q[1]) <= self._limit[1])
+        i, row, column, weight, u, v = (a[lit] for a in (i, row, column, weight, u, v))
+        cos_i, cos_o = cos_i[i], np.sqrt(square[lit])
         w = cos_i + cos_o
-        d = (u[i, j] ** 2 + v[i, j] ** 2 + w**2) / 2
+        d = (u**2 + v**2 + w**2) / 2
         kappa = np.minimum(per_cosine[i] * w, spectrum.largest_kappa)
-        value = weight[i, j] / points * k_g(cos_i, cos_o, d, shadowing)
-        value *= spectrum.table.powers_at(row[i, j], column[i, j], kappa)
+        value = weight * k_g(cos_i, cos_o, d, shadowing) * spectrum.table.powers_at(row, column, kappa)
         raw = np.bincount(i, value, count)
         if not table.needed:
             return np.stack([raw, raw, raw])
-        out = np.stack([-o_x[i, j], -o_y[i, j], cos_o], -1)
+        out = np.stack([-directions[i, 0] - u, -directions[i, 1] - v, cos_o], -1)
         there, back = table.at(directions, wavelengths)[i], table.at(out, wavelengths[i])
         return np.stack(
             [
@@ -198,11 +275,77 @@ class Furnace:
         )
 
 
+@dataclass(frozen=True)
+class _Horizon:
+    """Points q of lobes that reach near the horizon, even in the azimuth of ω_o and in log(cos θ_i + cos θ_o).
+
+    −ω_o,t = ω_i,t + λq has the azimuth φ, and du dv = cos θ_o dcos θ_o dφ. With N the density of a lobe and h that of
+    these points, points of either have the share N/(N + h), the balance heuristic (Veach and Guibas 1995).
+    """
+
+    wavelengths: NDArray[np.float64]
+    tangent: NDArray[np.float64]  # of ω_i, (2, n)
+    cos_i: NDArray[np.float64]
+    middle: NDArray[np.float64]  # q of the node, (2, n)
+    azimuth: NDArray[np.float64]
+    opening: NDArray[np.float64]  # |φ − azimuth| at most
+    lowest: NDArray[np.float64]  # cos θ_o
+    highest: NDArray[np.float64]
+    lobe: _Gaussian | _Spline
+
+    @classmethod
+    def of(
+        cls,
+        directions: NDArray[np.float64],
+        wavelengths: NDArray[np.float64],
+        middle: NDArray[np.float64],
+        lobe: _Gaussian | _Spline,
+    ) -> tuple[NDArray[np.int64], _Horizon]:
+        """Which lobes these are, and their points."""
+        x, y = directions[:, :2].T + wavelengths * middle
+        distance, radius = np.hypot(x, y), wavelengths * lobe.radius
+        near = np.flatnonzero(
+            (distance + radius > np.sqrt(1 - np.minimum(NEAR * directions[:, 2], 0.5) ** 2)) & (distance - radius < 1)
+        )
+        distance, radius = distance[near], radius[near]
+        inner, outer = np.maximum(distance - radius, 0), np.minimum(distance + radius, 1)
+        return near, cls(
+            wavelengths=wavelengths[near],
+            tangent=directions[near, :2].T,
+            cos_i=directions[near, 2],
+            middle=middle[:, near],
+            azimuth=np.arctan2(y, x)[near],
+            opening=np.where(distance > radius, np.arcsin(np.minimum(radius / np.maximum(distance, 1e-9), 1)), np.pi),
+            lowest=np.sqrt(1 - outer**2),
+            highest=np.sqrt(1 - inner**2),
+            lobe=lobe,
+        )
+
+    def drawn(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+        """q, (2, n), for numbers from 0 to 1."""
+        low = self.lowest + self.cos_i
+        cos_o = low * ((self.highest + self.cos_i) / low) ** x - self.cos_i
+        sine, phi = np.sqrt(np.maximum(1 - cos_o**2, 0)), self.azimuth + self.opening * (2 * y - 1)
+        return (sine * np.array([np.cos(phi), np.sin(phi)]) - self.tangent) / self.wavelengths
+
+    def share(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
+        """N/(N + h) at q, (2, n)."""
+        x, y = self.tangent + self.wavelengths * q
+        cos_o = np.sqrt(np.maximum(1 - x**2 - y**2, 1e-14))
+        c, s = np.cos(self.azimuth), np.sin(self.azimuth)
+        inside = np.abs(np.arctan2(c * y - s * x, c * x + s * y)) <= self.opening
+        inside &= (cos_o >= self.lowest) & (cos_o <= self.highest)
+        n = self.lobe.density(*(q - self.middle)) / self.wavelengths**2
+        logarithm = np.log((self.highest + self.cos_i) / (self.lowest + self.cos_i))
+        h = 1 / (2 * self.opening * logarithm * (cos_o + self.cos_i) * cos_o)
+        return n / np.maximum(n + np.where(inside, h, 0), 1e-300)
+
+
 def random_places(
     rng: np.random.Generator, count: int, wavelengths: tuple[float, float]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Directions (n, 3), half of them uniform in the polar angle and half beyond 70°, and λ in µm (n,)."""
-    least = np.where(rng.random(count) < 0.5, 0, 70)
+    """Directions (n, 3), half of them uniform in the polar angle, a quarter beyond 70° and beyond 85°; λ in µm (n,)."""
+    least = np.choose(rng.integers(4, size=count), (0, 0, 70, 85))
     theta = np.deg2rad(rng.uniform(least, STEEPEST))
     phi = rng.uniform(0, 2 * np.pi, count)
     directions = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1)
@@ -212,45 +355,78 @@ def random_places(
 def conserving(spectrum: GratingSpectrum, table: EnergyTable, height_scale: float = 1.0) -> EnergyTable:
     """The table, lowered where the albedo exceeds one, with the excess and the loss that were measured.
 
+    Each set of places lowers the table, or ends the search and tells the excess and the loss.
+
     Args:
         spectrum: what the table was made for.
         table: e.
         height_scale: times the heights.
     """
     furnace, rng = Furnace(spectrum), np.random.default_rng(1)
-    shape = np.array(table.values.shape)
+    places = PLACES_DEEP if spectrum.largest_kappa * spectrum.height_range > DEEP else PLACES
     for attempt in range(ROUNDS):
-        directions, wavelengths = random_places(rng, PLACES, spectrum.wavelengths)
-        total, _, raw = furnace.albedo(directions, wavelengths, table, POINTS, rng, height_scale)
-        lost = (1 - table.at(directions, wavelengths))[raw <= 1]
-        first = np.argsort(-total, kind="stable")[:CANDIDATES]
+        directions, wavelengths = random_places(rng, places, spectrum.wavelengths)
+        total, lost = np.zeros(len(directions)), None
+        for count, points in SCREENED:
+            first = _largest(total, count)
+            directions, wavelengths = directions[first], wavelengths[first]
+            total, _, raw = furnace.albedo(directions, wavelengths, table, points, rng, height_scale)
+            if lost is None:
+                lost = (1 - table.at(directions, wavelengths))[raw <= 1]
+        first = _largest(total, BOUNDED[0][0])
         directions, wavelengths = directions[first], wavelengths[first]
-        repeated = np.array(
-            [furnace.albedo(directions, wavelengths, table, MORE_POINTS, rng, height_scale) for _ in range(REPETITIONS)]
-        )
-        total, local, raw = repeated.mean(0)
-        total = total - 2 * repeated[:, 0].std(0) / np.sqrt(REPETITIONS - 1)
-        excess, over = float(total.max() - 1), total > 1 + SLACK
+        albedo, local, raw = furnace.bounded(directions, wavelengths, table, rng, height_scale)
+        over = albedo > 1 + ALLOWED
         if not over.any() or attempt == ROUNDS - 1:
             break
-        total, local, raw = total[over], local[over], raw[over]
-        e = table.at(directions[over], wavelengths[over])
-        # A is concave in e(ω_i) and so below its tangent; and e = 1/a always suffices.
-        factor = np.maximum(1 - (total - 1) / np.maximum(local, 1e-9), 1 / np.maximum(raw * e, 1e-9))
-        factor = np.minimum(factor, 1).astype(np.float32)
-        values = table.values.copy()
-        cell = np.floor(table.places(directions[over], wavelengths[over])).astype(np.int64)
-        # The corners of the cell. Where more is wrong than a few cells: all that is below one, by a little, and where
-        # that is too little, the same bound for a neighbourhood that widens.
-        corners = np.ones_like(values)
-        if attempt:
-            corners[values < 1 - SLACK] = max(1 / total.max(), 1 - LITTLE)
-        for step in itertools.product(range(-attempt, 2 + attempt), repeat=3):
-            node = tuple(np.clip(cell + step, 0, shape - 1).T)
-            if min(step) >= 0 and max(step) <= 1:
-                np.minimum.at(corners, node, factor)
-            elif attempt:
-                np.minimum.at(values, node, np.where(total > 1 + LITTLE, factor * e, 1).astype(np.float32))
-        table = dataclasses.replace(table, values=values * corners)
+        table = _lowered(
+            table, directions[over], wavelengths[over], albedo[over], local[over], raw[over], min(attempt + 1, WIDEST)
+        )
     loss = (float(lost.mean()), float(lost.max())) if len(lost) else (0.0, 0.0)
-    return dataclasses.replace(table, excess=excess, loss=loss)
+    return dataclasses.replace(table, excess=float(albedo.max() - 1), loss=loss)
+
+
+def _largest(values: NDArray[np.float64], count: int) -> NDArray[np.int64]:
+    return np.argsort(-values, kind="stable")[:count]
+
+
+def _lowered(
+    table: EnergyTable,
+    directions: NDArray[np.float64],
+    wavelengths: NDArray[np.float64],
+    albedo: NDArray[np.float64],
+    local: NDArray[np.float64],
+    raw: NDArray[np.float64],
+    width: int,
+) -> EnergyTable:
+    """The table, lower at places where the albedo exceeds one.
+
+    Args:
+        table: e.
+        directions: of the places, (n, 3).
+        wavelengths: λ in µm, (n,).
+        albedo: A, (n,).
+        local: the part of it where e(ω_i) < e(ω_o).
+        raw: the albedo without e.
+        width: the cells about those of the places that are lowered, too.
+    """
+    e, shape = table.at(directions, wavelengths), np.array(table.values.shape)
+    # A is concave in e(ω_i) and so below its tangent; and e = 1/a always suffices.
+    factor = np.maximum(1 - (albedo - 1) / np.maximum(local, 1e-9), 1 / np.maximum(raw * e, 1e-9))
+    factor = np.minimum(factor, 1).astype(np.float32)
+    about = np.where(albedo > 1 + LITTLE, factor * e / table.horizon(directions[:, 2]), 1).astype(np.float32)
+    values = table.values.copy()
+    if (albedo > 1 + LITTLE).sum() > MANY or albedo.max() > 1 + MUCH:
+        # The albedo changes within a cell: each node halfway to the least about it.
+        values = (values + ndimage.minimum_filter(values, 3, mode="nearest")) / 2
+    cell = np.floor(table.places(directions, wavelengths)).astype(np.int64)
+    # All that is below one, by a little; the corners of the cell, by the factor; the nodes about, to the same bound.
+    corners = np.ones_like(values)
+    corners[values < 1 - SLACK] = max(1 / albedo.max(), 1 - LITTLE)
+    for step in itertools.product(range(-width, 2 + width), repeat=3):
+        node = tuple(np.clip(cell + step, 0, shape - 1).T)
+        if min(step) >= 0 and max(step) <= 1:
+            np.minimum.at(corners, node, factor)
+        else:
+            np.minimum.at(values, node, about)
+    return dataclasses.replace(table, values=values * corners)
