@@ -155,7 +155,7 @@ def search(
     """The index i with F(i) ≤ F(first) + u (F(end) − F(first)) < F(i + 1), first ≤ i < end.
 
     Args:
-        before: F, increasing, its values whole numbers.
+        before: F, which does not fall.
         first: where the search begins.
         end: where it ends.
         count: end − first at most.
@@ -174,4 +174,4 @@ def search(
         further = value <= target
         index = dr.select(further, trial, index)
         low, high = dr.select(further, value, low), dr.select(further, high, value)
-    return index, dr.clip((target - low) / dr.maximum(high - low, 1), 0, BELOW_ONE)
+    return index, dr.clip((target - low) / dr.maximum(high - low, 1e-30), 0, BELOW_ONE)

@@ -19,11 +19,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtri
 from scipy.stats import qmc
 
 from ..geometry import k_g
 from .albedo import SLACK
 from .energy_table import EnergyTable
+from .orders import OrderGrid
 from .spline_grid import spline_integral
 
 if TYPE_CHECKING:
@@ -48,14 +50,16 @@ class Furnace:
     def __init__(self, spectrum: GratingSpectrum) -> None:
         self._spectrum = spectrum
         grid = spectrum.grid
-        self._sample = spectrum.extent == "sample"
-        if self._sample:
+        self._lines = isinstance(grid, OrderGrid)
+        if self._lines:
+            self._inside = [lobe.inside for lobe in spectrum.lobes]
+            # Beyond six σ_q there is nothing.
+            self._lobe = float(np.hypot(*(min(lobe.half_width, 6 * spectrum.lobe_width) for lobe in spectrum.lobes)))
+        else:
             self._limit = np.array(grid.limit)
             offsets = np.linspace(-1.5, 1.5, 1025)
             self._spline = spline_integral(offsets), offsets
             self._lobe = 1.5 * float(np.hypot(*grid.spacing))
-        else:
-            self._lobe = spectrum.reach * spectrum.lobe_width
 
         # Nodes, block after block.
         blocks, frequencies = [], grid.frequencies()
@@ -165,17 +169,19 @@ class Furnace:
 
         row, column = self._row[node], self._column[node]
         q_x, q_y = self._q_x[column], self._q_y[row]
-        if self._sample:
+        if self._lines:
+            q_x, q_y = (
+                q + spectrum.lobe_width * ndtri(0.5 + inside * (np.clip(x[..., i], 1e-9, 1 - 1e-9) - 0.5))
+                for i, (q, inside) in enumerate(zip((q_x, q_y), self._inside, strict=True), start=1)
+            )
+        else:
             q_x = q_x + np.interp(x[..., 1], *self._spline) * spectrum.grid.spacing[0]
             q_y = q_y + np.interp(x[..., 2], *self._spline) * spectrum.grid.spacing[1]
-        else:
-            r = spectrum.lobe_width * np.sqrt(-2 * np.log1p(x[..., 1] * np.expm1(-(spectrum.reach**2) / 2)))
-            q_x, q_y = q_x + r * np.cos(2 * np.pi * x[..., 2]), q_y + r * np.sin(2 * np.pi * x[..., 2])
         u, v = wavelengths[:, None] * q_x, wavelengths[:, None] * q_y
         o_x, o_y = u + directions[:, :1], v + directions[:, 1:2]
         square = 1 - o_x**2 - o_y**2
         above = square > 0
-        if self._sample:
+        if not self._lines:
             above &= (np.abs(q_x) <= self._limit[0]) & (np.abs(q_y) <= self._limit[1])
         i, j = np.nonzero(above)
         cos_i, cos_o = cos_i[i], np.sqrt(square[i, j])
