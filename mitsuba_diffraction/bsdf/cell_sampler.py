@@ -16,8 +16,8 @@ from ..spectrum.spline_grid import spline_integral
 from .horizon import HorizonBins
 from .incidence import Incidence
 from .kappa_cells import CELLS, KappaCells, averages, choose
-from .order_sampler import search
-from .tables import PacketTable, ShareTable, opaque
+from .order_sampler import locate, target_between
+from .tables import FloatTable, PacketTable, ShareTable, opaque
 
 # The widest cells: in σ_q, to follow the lobes, and in cycles/µm, to follow the horizon.
 WIDEST, FINE = 2.0, 0.04
@@ -55,8 +55,8 @@ class CellSampler:
         blocks = shares.reshape(self.rows // self.edge_y, self.edge_y, self.columns // self.edge_x, self.edge_x, CELLS)
         blocks = blocks.swapaxes(1, 2).reshape(*blocks.shape[:3:2], -1, CELLS)
         self.blocks_y, self.blocks_x, self.in_block, _ = blocks.shape
-        before_cell, before_x = _sums_before(blocks), _sums_before(blocks.sum(axis=2))
-        self.before_cell, self.before_x = PacketTable(before_cell), PacketTable(before_x)
+        before_x = _sums_before(blocks.sum(axis=2))
+        self.before_cell, self.before_x = _SumTable(_sums_before(blocks)), _SumTable(before_x)
 
         edge = (np.arange(self.blocks_y + 1) * self.edge_y - largest[1] - 0.5) * spacing[1]
         ends = self.horizon.columns(edge[:-1], edge[1:])
@@ -66,7 +66,7 @@ class CellSampler:
         row = np.arange(self.blocks_y)
         # As they are read: differences of float32.
         before_y = _sums_before(np.float64(before_x[row, end]) - before_x[row, first])
-        self.before_y = PacketTable(before_y)
+        self.before_y = _SumTable(before_y)
         self.masses = PacketTable(before_y[:, -1])
         self.ends = PacketTable(np.stack([first, end], axis=-1), width=2)
 
@@ -88,21 +88,49 @@ class CellSampler:
         masses = self.masses(chosen_bin, active)
         kappa_cell, u = choose(self.cells.weights(incidence) * masses, u)
 
-        def searched(
-            table: PacketTable, line: mi.UInt32, first: mi.Int32, end: mi.Int32, count: int, u: mi.Float
-        ) -> tuple[mi.Int32, mi.Float]:
-            start = line * (count + 1)
-            return search(lambda i: table.entry(start + mi.UInt32(i), kappa_cell, active), first, end, count, u)
-
         zero = mi.Int32(0)
-        row, u = searched(self.before_y, chosen_bin, zero, mi.Int32(self.blocks_y), self.blocks_y, u)
+        row, u = self.before_y.search(chosen_bin, kappa_cell, zero, mi.Int32(self.blocks_y), u, active)
         ends = mi.Vector2i(self.ends(chosen_bin * self.blocks_y + mi.UInt32(row), active))
-        column, x = searched(self.before_x, mi.UInt32(row), ends.x, ends.y, self.blocks_x, v.x)
+        column, x = self.before_x.search(mi.UInt32(row), kappa_cell, ends.x, ends.y, v.x, active)
         block = mi.UInt32(row * self.blocks_x + column)
-        cell, _ = searched(self.before_cell, block, zero, mi.Int32(self.in_block), self.in_block, u)
+        cell, _ = self.before_cell.search(block, kappa_cell, zero, mi.Int32(self.in_block), u, active)
         m_x = mi.Float(column * self.edge_x + cell % self.edge_x - self.largest_x)
         m_y = mi.Float(row * self.edge_y + cell // self.edge_x - self.largest_y)
         return (m_x + x - 0.5) * self.spacing_x, (m_y + v.y - 0.5) * self.spacing_y
+
+
+class _SumTable:
+    """Sums F before each of n numbers, for lines of them and for each κ cell.
+
+    Binary searches take two steps, in every sixteenth sum and in those between: few lines of the cache.
+    """
+
+    GROUP = 16
+
+    def __init__(self, sums: NDArray[np.float32]) -> None:
+        """Takes F (..., n + 1, κ cells)."""
+        sums = sums.swapaxes(-1, -2)
+        self.count = sums.shape[-1] - 1
+        self.groups = -(-self.count // self.GROUP)
+        self.fine, self.coarse = FloatTable(sums), FloatTable(sums[..., : self.count : self.GROUP])
+
+    def search(
+        self, line: mi.UInt32, kappa_cell: mi.UInt32, first: mi.Int32, end: mi.Int32, u: mi.Float, active: mi.Bool
+    ) -> tuple[mi.Int32, mi.Float]:
+        """As `order_sampler.search`, of one line and κ cell."""
+        line = line * CELLS + kappa_cell
+
+        def fine(i: mi.Int32) -> mi.Float:
+            return self.fine(line * (self.count + 1) + mi.UInt32(i), active)
+
+        def coarse(i: mi.Int32) -> mi.Float:
+            return self.coarse(line * self.groups + mi.UInt32(i), active)
+
+        target = target_between(fine(first), fine(end), u)
+        if self.groups > 1:
+            group, _ = locate(coarse, mi.Int32(0), mi.Int32(self.groups - 1), self.groups, target)
+            first, end = dr.maximum(first, self.GROUP * group), dr.minimum(end, self.GROUP * (group + 1))
+        return locate(fine, first, end, min(self.GROUP, self.count), target)
 
 
 @dataclass(frozen=True, eq=False)

@@ -54,11 +54,10 @@ class LineSpectrum:
         """
         along_x, along_y = self.axes
         m_x, m_y = along_x.first(q_x), along_y.first(q_y)
-        lobes_x, lobes_y = along_x.lobes(m_x, q_x), along_y.lobes(m_y, q_y)
         if self.apart:
-            power, density = self._apart(m_x, m_y, lobes_x, lobes_y, kappa, incidence, active)
+            power, density = self._apart(m_x, m_y, q_x, q_y, kappa, incidence, active)
         else:
-            power = self._power(m_x, m_y, lobes_x, lobes_y, kappa, active)
+            power = self._power(m_x, m_y, along_x.lobes(m_x, q_x), along_y.lobes(m_y, q_y), kappa, active)
             density = self.cells.density(q_x, q_y, incidence, active)
         # Interpolation may dip below zero by its error.
         return dr.select(active, dr.maximum(power, 0), 0), density
@@ -82,8 +81,8 @@ class LineSpectrum:
         self,
         m_x: mi.Int32,
         m_y: mi.Int32,
-        lobes_x: list[mi.Float],
-        lobes_y: list[mi.Float],
+        q_x: mi.Float,
+        q_y: mi.Float,
         kappa: mi.Float,
         incidence: Incidence,
         active: mi.Bool,
@@ -92,14 +91,13 @@ class LineSpectrum:
 
         Most directions lie between the orders of a grating: they jump over all that reads tables.
         """
-        lobe = lobes_x[0] * lobes_y[0]
-        near = active & (lobe > 0)
-        near &= (dr.abs(m_x) <= self.axes[0].largest) & (dr.abs(m_y) <= self.axes[1].largest)
+        near = active & self.axes[0].holds(m_x, q_x) & self.axes[1].holds(m_y, q_y)
         power, density = mi.Float(0.0), mi.Float(0.0)
         if near:
+            lobes_x, lobes_y = self.axes[0].lobes(m_x, q_x), self.axes[1].lobes(m_y, q_y)
             power = self._power(m_x, m_y, lobes_x, lobes_y, kappa, near)
             order = mi.UInt32((m_y + self.axes[1].largest) * self.columns + m_x + self.axes[0].largest)
-            density = lobe * self.orders.share(order, self.orders.weights(incidence, near), near)
+            density = lobes_x[0] * lobes_y[0] * self.orders.share(order, self.orders.weights(incidence, near), near)
         return power, density
 
     def sample(
@@ -135,6 +133,11 @@ class _Axis:
     def first(self, q: mi.Float) -> mi.Int32:
         """The first of the `count` orders that hold at q (cycles/µm)."""
         return mi.Int32(-self.largest) if self.all else mi.Int32(dr.ceil(q * self.size - 0.5 * self.count))
+
+    def holds(self, m: mi.Int32, q: mi.Float) -> mi.Bool:
+        """Whether there is an order m, and q lies in its lobe."""
+        offset = dr.fma(-self.pitch, mi.Float(m), q)
+        return (dr.abs(m) <= self.largest) & (dr.abs(offset) <= self.half_width)
 
     def lobes(self, first: mi.Int32, q: mi.Float) -> list[mi.Float]:
         """N(q − m/T; σ_q²) of each of these orders, µm; zero beyond the half width."""

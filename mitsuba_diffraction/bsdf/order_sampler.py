@@ -164,10 +164,21 @@ def search(
     Returns:
         i, and the place between F(i) and F(i + 1), in [0, 1).
     """
-    index, low, high = first, before(first), before(end)
+    return locate(before, first, end, count, target_between(before(first), before(end), u))
+
+
+def target_between(low: mi.Float, high: mi.Float, u: mi.Float) -> mi.Float:
+    """low + u (high − low), less than high."""
     target = dr.fma(u, high - low, low)
     # The sum may round up to the end.
-    target = dr.select(target < high, target, low)
+    return dr.select(target < high, target, low)
+
+
+def locate(
+    before: Callable[[mi.Int32], mi.Float], first: mi.Int32, end: mi.Int32, count: int, target: mi.Float
+) -> tuple[mi.Int32, mi.Float]:
+    """`search` for F(i) ≤ `target` < F(i + 1)."""
+    index, low, high = first, before(first), before(end)
     for bit in reversed(range((count - 1).bit_length())):
         trial = dr.minimum(index + (1 << bit), end)
         value = before(trial)

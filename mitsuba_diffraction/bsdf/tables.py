@@ -19,6 +19,22 @@ def opaque(value: float) -> mi.Float:
 BELOW_ONE = 1 - 2.0**-24  # the largest float32 under one, in every variant
 
 
+class FloatTable:
+    """A flat table of floats."""
+
+    def __init__(self, numbers: np.ndarray) -> None:
+        """Takes an array of any shape."""
+        flat = np.ascontiguousarray(numbers, np.float32).ravel()
+        # Scalar variants have no gather.
+        self.values = mi.Float(flat) if dr.is_jit_v(mi.Float) else flat
+
+    def __call__(self, index: mi.UInt32, active: mi.Bool) -> mi.Float:
+        """The floats at `index`; zero where not `active`."""
+        if dr.is_jit_v(mi.Float):
+            return dr.gather(mi.Float, self.values, index, active)
+        return float(self.values[index]) if active else 0.0
+
+
 class PacketTable:
     """A flat table of packets of two or four floats; one packet is one aligned read of 8 or 16 bytes."""
 
@@ -28,7 +44,7 @@ class PacketTable:
         """Takes the packets one after the other, in an array of any shape, and holds them as float32."""
         self.width = width
         self.packet = {2: mi.Vector2f, 4: mi.Vector4f}[width]
-        flat = np.ascontiguousarray(packets, np.float32).ravel()
+        flat = _aligned(np.ravel(packets))
         # Scalar variants have no gather.
         self.values = mi.Float(flat) if dr.is_jit_v(mi.Float) else flat
 
@@ -50,6 +66,19 @@ class PacketTable:
         if dr.is_jit_v(mi.Float):
             return dr.gather(mi.Float, self.values, index, active)
         return float(self.values[index]) if active else 0.0
+
+
+def _aligned(values: np.ndarray) -> np.ndarray:
+    """`values` as float32 at an address that is a multiple of 64 bytes.
+
+    Dr.Jit uses the memory of NumPy's arrays as it is, and reads a packet at once only where it is aligned so: else the
+    kernel would be slower, and another one from one allocation to the next.
+    """
+    memory = np.empty(4 * values.size + 64, np.uint8)
+    start = -memory.ctypes.data % 64
+    result = memory[start : start + 4 * values.size].view(np.float32)
+    result[:] = values
+    return result
 
 
 class HalfTable:

@@ -43,6 +43,7 @@ _SPLINE_SHARE = 0.4  # what lies between the nodes in q
 _MARGIN = 0.7
 _WIDEST_SPACING = 0.74  # lattice of splines, in σ_q
 _PILOT = 8_000  # frequencies
+_SMALL = 2_000  # nodes of one κ that the nearest cache holds as they are: unpacking would take longer than reading
 _LARGEST_TABLE = 4e9  # bytes
 # Where none is asked for: the tolerances that measurements and pictures need, and in between, of a sample, a share of
 # its standard error. A table exact to 1e-3 of what is known to 25 % is waste.
@@ -349,7 +350,8 @@ class _Build:
 
     def __call__(self, representation: str) -> tuple[Table, float]:
         """The cheapest table of this representation, and its measured error."""
-        storages = _STORAGES if representation == SliceTable.representation else _STORAGES[-1:]
+        packs = representation == SliceTable.representation and np.prod(self.kept.shape) > _SMALL
+        storages = _STORAGES if packs else _STORAGES[-1:]
         for storage in storages:
             refine, refusal = storage.interpolation, None
             while self._allowed >= storage.least:
