@@ -29,8 +29,8 @@ class LineSpectrum:
             _Axis(lobe, size, largest, sigma)
             for lobe, size, largest in zip(spectrum.lobes, grid.tile_size, grid.largest, strict=True)
         )
-        self.power = order_power(spectrum.table, tuple(axis.rim for axis in self.axes))
         self.apart = all(axis.count == 1 for axis in self.axes)
+        self.power = order_power(spectrum.table, tuple(axis.rim for axis in self.axes), windows=not self.apart)
         self.cells = None if self.apart else CellSampler(spectrum)
         self.orders = OrderSampler(spectrum) if self.apart else None
         self.columns = grid.shape[1]

@@ -16,22 +16,54 @@ from .tables import HalfTable, PacketTable, SharedExponentTable, opaque
 _WEIGHT_ERROR = 1e-5
 
 
-def order_power(table: SeriesTable | SliceTable, rim: tuple[int, int] = (0, 0)) -> SeriesPower | SlicePower:
-    """The evaluation that fits the table; (x, y) `rim` nodes of zero are put on each side."""
-    return SlicePower(table, rim) if isinstance(table, SliceTable) else SeriesPower(table, rim)
+# Nodes lie in squares of 4 × 4, so that those of a window lie in few lines of the cache: one word each, in one to four.
+_SQUARE = 4
+
+
+def order_power(
+    table: SeriesTable | SliceTable, rim: tuple[int, int] = (0, 0), windows: bool = True
+) -> SeriesPower | SlicePower:
+    """The evaluation that fits the table.
+
+    Args:
+        table: of a spectrum.
+        rim: nodes of zero that are put on each side, (x, y).
+        windows: whether several nodes are read at a time.
+    """
+    return (SlicePower if isinstance(table, SliceTable) else SeriesPower)(table, rim, _SQUARE if windows else 1)
 
 
 class _Power:
     """What both have in common.
 
     Attributes:
-        table: packets of four numbers; those of nodes beside each other along x lie beside each other.
+        table: packets of numbers, square after square of nodes.
         rows: of nodes, with the rim.
         columns: of nodes, with the rim.
+        square: nodes along the side of a square.
+        nodes: those of all squares.
     """
 
-    def __init__(self, table: PacketTable | HalfTable | SharedExponentTable, rows: int, columns: int) -> None:
-        self.table, self.rows, self.columns = table, rows, columns
+    def __init__(self, rows: int, columns: int, square: int) -> None:
+        self.rows, self.columns, self.square = rows, columns, square
+        self.row = -(-columns // square) * square**2  # nodes of a row of squares
+        self.nodes = -(-rows // square) * self.row
+
+    def _arranged(self, packets: np.ndarray) -> np.ndarray:
+        """(..., rows, columns) → (..., nodes)."""
+        square, (rows, columns) = self.square, packets.shape[-2:]
+        pad = [(0, 0)] * (packets.ndim - 2) + [(0, -rows % square), (0, -columns % square)]
+        padded = np.pad(packets, pad)
+        rows, columns = (n // square for n in padded.shape[-2:])
+        squares = padded.reshape(*packets.shape[:-2], rows, square, columns, square)
+        return squares.swapaxes(-2, -3).reshape(*packets.shape[:-2], -1)
+
+    def _places(self, first: mi.Int32, count: int, before: int, beside: int) -> list[mi.UInt32]:
+        """What each of `count` rows or columns adds to the index: `before` for a square, `beside` for a node in it."""
+        places = [mi.UInt32(first + step) for step in range(count)]
+        if self.square == 1:
+            return [place * before for place in places]
+        return [place // self.square * before + place % self.square * beside for place in places]
 
     def window(
         self,
@@ -54,15 +86,16 @@ class _Power:
         """
         row = dr.clip(row, 0, self.rows - len(weights_y))
         column = dr.clip(column, 0, self.columns - len(weights_x))
-        first = mi.UInt32(row * self.columns + column)
+        rows = self._places(row, len(weights_y), self.row, self.square)
+        columns = self._places(column, len(weights_x), self.square**2, 1)
         weights_x = [weight * self.unit for weight in weights_x]
         total = mi.Float(0.0)
         for offset, factors in at:
             packet = type(factors)(0.0)
-            for j, weight in enumerate(weights_y):
-                line, node = type(factors)(0.0), offset + first + j * self.columns
-                for i, w in enumerate(weights_x):
-                    line = self.table.add(line, w, node + i, active)
+            for weight, r in zip(weights_y, rows, strict=True):
+                line = type(factors)(0.0)
+                for w, c in zip(weights_x, columns, strict=True):
+                    line = self.table.add(line, w, offset + r + c, active)
                 packet = dr.fma(weight, line, packet)
             total += dr.dot(packet, factors)
         return total
@@ -71,8 +104,10 @@ class _Power:
 class SlicePower(_Power):
     """c_m(κ) = Σ_p a_p t^p, −1 ≤ t ≤ 1 on the interval of κ. A node is one packet of one, two or four words."""
 
-    def __init__(self, table: SliceTable, rim: tuple[int, int]) -> None:
+    def __init__(self, table: SliceTable, rim: tuple[int, int], square: int) -> None:
         values = _rimmed(table.values, rim)
+        super().__init__(*values.shape[2:], square)
+        values = self._arranged(values)
         words = table.words_per_node if dr.is_jit_v(mi.Float) else 4
         scale = 1.0
         if words == 1:
@@ -82,10 +117,9 @@ class SlicePower(_Power):
             scale = HALF_SCALE
             packets = HalfTable(np.moveaxis(values, 1, -1) * np.float32(scale))
         else:
-            padded = np.pad(values, ((0, 0), (0, 4 - table.terms), (0, 0), (0, 0)))
+            padded = np.pad(values, ((0, 0), (0, 4 - table.terms), (0, 0)))
             packets = PacketTable(np.moveaxis(padded, 1, -1))
-        super().__init__(packets, *values.shape[2:])
-        self.unit = packets.unit / scale
+        self.table, self.unit = packets, packets.unit / scale
         self.packet = mi.Vector3f if words == 1 else mi.Vector4f
         self.intervals = table.intervals
         self.per_kappa = opaque(table.intervals / table.largest_kappa)
@@ -96,7 +130,7 @@ class SlicePower(_Power):
         interval = dr.minimum(mi.UInt32(x), self.intervals - 1)
         t = 2 * (x - mi.Float(interval)) - 1
         factors = [1, t, dr.square(t), dr.square(t) * t]
-        return [(interval * (self.rows * self.columns), self.packet(factors[: len(self.packet(0))]))]
+        return [(interval * self.nodes, self.packet(factors[: len(self.packet(0))]))]
 
 
 class SeriesPower(_Power):
@@ -104,13 +138,14 @@ class SeriesPower(_Power):
 
     unit = 1.0
 
-    def __init__(self, table: SeriesTable, rim: tuple[int, int]) -> None:
+    def __init__(self, table: SeriesTable, rim: tuple[int, int], square: int) -> None:
         terms, rows, columns = table.terms.shape
         self.packets = (terms + 3) // 4
         packets = np.zeros((self.packets, 4, rows, columns), np.float32)
         packets.reshape(-1, rows, columns)[:terms] = table.terms
         packets = _rimmed(packets, rim)
-        super().__init__(PacketTable(np.moveaxis(packets, 1, -1)), *packets.shape[2:])
+        super().__init__(*packets.shape[2:], square)
+        self.table = PacketTable(np.moveaxis(self._arranged(packets), 1, -1))
         weights = _weights(table)
         self.steps = len(weights) - 1
         padded = np.zeros((len(weights), self.packets * 4), np.float32)
@@ -127,7 +162,7 @@ class SeriesPower(_Power):
         for packet in range(self.packets):
             low = self.weights(step * self.packets + packet, active)
             high = self.weights((step + 1) * self.packets + packet, active)
-            result.append((mi.UInt32(packet * self.rows * self.columns), dr.fma(t, high - low, low)))
+            result.append((mi.UInt32(packet * self.nodes), dr.fma(t, high - low, low)))
         return result
 
 

@@ -44,7 +44,7 @@ class PacketTable:
         """Takes the packets one after the other, in an array of any shape, and holds them as float32."""
         self.width = width
         self.packet = {2: mi.Vector2f, 4: mi.Vector4f}[width]
-        flat = _aligned(np.ravel(packets))
+        flat = _aligned(np.asarray(packets, np.float32).ravel())
         # Scalar variants have no gather.
         self.values = mi.Float(flat) if dr.is_jit_v(mi.Float) else flat
 
@@ -69,14 +69,14 @@ class PacketTable:
 
 
 def _aligned(values: np.ndarray) -> np.ndarray:
-    """`values` as float32 at an address that is a multiple of 64 bytes.
+    """Flat float32 or uint32 at an address that is a multiple of 64 bytes.
 
     Dr.Jit uses the memory of NumPy's arrays as it is, and reads a packet at once only where it is aligned so: else the
     kernel would be slower, and another one from one allocation to the next.
     """
     memory = np.empty(4 * values.size + 64, np.uint8)
     start = -memory.ctypes.data % 64
-    result = memory[start : start + 4 * values.size].view(np.float32)
+    result = memory[start : start + 4 * values.size].view(values.dtype)
     result[:] = values
     return result
 
@@ -93,7 +93,7 @@ class HalfTable:
 
     def __init__(self, packets: np.ndarray) -> None:
         """Takes numbers of half precision in packets of four, in an array of any shape."""
-        self.words = mi.UInt32(np.ascontiguousarray(packets, np.float16).view(np.uint32).ravel())
+        self.words = mi.UInt32(_aligned(np.ascontiguousarray(packets, np.float16).view(np.uint32).ravel()))
 
     def add(self, packet: mi.Vector4f, weight: mi.Float, index: mi.UInt32, active: mi.Bool) -> mi.Vector4f:
         """`packet` + `weight` times what is at `index`."""
@@ -117,7 +117,7 @@ class SharedExponentTable:
         """Takes m (..., 3) and e (...), the numbers being m 2^e."""
         m = mantissas.astype(np.int64) & 511
         words = (m[..., 0] << 23) | (m[..., 1] << 14) | (m[..., 2] << 5) | (exponents - LEAST_EXPONENT + 1)
-        self.words = mi.UInt32(words.astype(np.uint32).ravel())
+        self.words = mi.UInt32(_aligned(words.astype(np.uint32).ravel()))
 
     def add(self, packet: mi.Vector3f, weight: mi.Float, index: mi.UInt32, active: mi.Bool) -> mi.Vector3f:
         """`packet` + `weight` times what is at `index`."""
