@@ -18,8 +18,7 @@ RIM = 3  # rings of zeros, so many as are read in a row
 class SmoothSpectrum:
     """S(q; κ) = Σ_m c_m(κ) B(q/Δ − m)/(Δ_x Δ_y) (`SplineGrid`), and the density from which q is drawn.
 
-    One evaluation reads three by three nodes, three of them side by side in memory, and one packet for the density:
-    with slices 9 × 4 + 4 floats.
+    One evaluation reads three by three nodes and one packet for the density.
     """
 
     def __init__(self, spectrum: GratingSpectrum) -> None:

@@ -36,7 +36,7 @@ class FloatTable:
 
 
 class PacketTable:
-    """A flat table of packets of two or four floats; one packet is one aligned read of 8 or 16 bytes."""
+    """A flat table of packets of two or four floats; one packet is one read of 8 or 16 bytes."""
 
     unit = 1.0
 
