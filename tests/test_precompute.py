@@ -638,6 +638,18 @@ def test_too_large_a_table_is_refused(monkeypatch, extent, representation):
         precompute(field, extent=extent, coherence_length=coherence_length, representation=representation)
 
 
+def test_a_table_too_large_in_one_storage_takes_the_next(monkeypatch):
+    field = md.gratings.xenopeltis(8.0)
+    first = precompute(field, tolerance=1e-2).table
+    assert first.words_per_node == 1
+    module = importlib.import_module("mitsuba_diffraction.spectrum.build")
+    # Six intervals of three terms are refused, three of four terms are not.
+    monkeypatch.setattr(module, "_LARGEST_TABLE", 4 * first.values.size - 1)
+    spectrum = precompute(field, tolerance=1e-2)
+    assert spectrum.table.words_per_node == 2
+    assert spectrum.error <= 1e-2
+
+
 @pytest.mark.parametrize("extent", ["tile", "sample"])
 def test_heights_in_nanometres_are_refused_before_any_work(extent):
     field = HeightField(np.random.default_rng(0).random((64, 64)) * 300, 0.1)

@@ -212,7 +212,7 @@ def effective_fraction(bsdf, theta, phi, draws, count):
     ("theta", "least"),
     [
         (60, 0.5),
-        (85, 0.25),
+        (85, 0.4),
         *(pytest.param(theta, 0.5, marks=pytest.mark.slow) for theta in (0, 15, 30, 45, 75)),
     ],
 )

@@ -24,7 +24,7 @@ class FloatTable:
 
     def __init__(self, numbers: np.ndarray) -> None:
         """Takes an array of any shape."""
-        flat = np.ascontiguousarray(numbers, np.float32).ravel()
+        flat = _aligned(np.asarray(numbers, np.float32).ravel())
         # Scalar variants have no gather.
         self.values = mi.Float(flat) if dr.is_jit_v(mi.Float) else flat
 
@@ -35,18 +35,16 @@ class FloatTable:
         return float(self.values[index]) if active else 0.0
 
 
-class PacketTable:
+class PacketTable(FloatTable):
     """A flat table of packets of two or four floats; one packet is one read of 8 or 16 bytes."""
 
     unit = 1.0
 
     def __init__(self, packets: np.ndarray, width: int = 4) -> None:
         """Takes the packets one after the other, in an array of any shape, and holds them as float32."""
+        super().__init__(packets)
         self.width = width
         self.packet = {2: mi.Vector2f, 4: mi.Vector4f}[width]
-        flat = _aligned(np.asarray(packets, np.float32).ravel())
-        # Scalar variants have no gather.
-        self.values = mi.Float(flat) if dr.is_jit_v(mi.Float) else flat
 
     def __call__(self, index: mi.UInt32, active: mi.Bool) -> mi.Vector2f | mi.Vector4f:
         """The packets at `index`; zero where not `active`."""
@@ -62,10 +60,7 @@ class PacketTable:
 
     def entry(self, index: mi.UInt32, place: mi.UInt32, active: mi.Bool) -> mi.Float:
         """One float of the packets at `index`; zero where not `active`."""
-        index = self.width * index + place
-        if dr.is_jit_v(mi.Float):
-            return dr.gather(mi.Float, self.values, index, active)
-        return float(self.values[index]) if active else 0.0
+        return super().__call__(self.width * index + place, active)
 
 
 def _aligned(values: np.ndarray) -> np.ndarray:
