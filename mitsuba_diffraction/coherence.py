@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy.special
 
 from .errors import RequestError
 
@@ -30,9 +31,10 @@ def lobe_width(coherence_length: float) -> float:
 
 
 def lobe_reach(share: float) -> float:
-    """The truncation radius ρ of a lobe, in standard deviations; the truncated lobe is renormalised.
+    """Half the side ρ of the square at which a lobe is truncated, in standard deviations; the rest is renormalised.
 
-    A two-dimensional Gaussian has the fraction e^{−ρ²/2} outside the radius ρ. Truncation and renormalisation change it
-    by twice that in the L1 norm, which is set equal to `share`.
+    A two-dimensional Gaussian has the fraction 1 − erf(ρ/√2)² outside that square. Truncation and renormalisation
+    change it by twice that in the L1 norm, which is set equal to `share`.
     """
-    return float(np.sqrt(-2 * np.log(share / 2)))
+    # 1 − √(1 − s/2) without cancellation.
+    return float(-scipy.special.ndtri(-np.expm1(0.5 * np.log1p(-share / 2)) / 2))

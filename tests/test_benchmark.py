@@ -60,7 +60,7 @@ def test_a_run_reports_every_combination(llvm, tmp_path):
     assert "taylor" in results[3].refused
     for result in results[:3]:
         assert result.refused is None
-        assert result.floats == (4 if result.representation == "slices" else result.terms)
+        assert result.words == (4 if result.representation == "slices" else -(-result.terms // 4) * 4)
         assert min(result.evaluations, result.evaluate_ratio, result.read_ratio, result.sample_ratio) > 0
         assert result.accuracy.l1 <= 1e-2
     console = Console(width=200, record=True)

@@ -261,7 +261,7 @@ def test_what_is_read_for_a_point(llvm, tmp_path):
     pictures = Pictures(write(tmp_path / "scene.xml", base=""), "flss", width=4)
     assert pictures.shader_reads == 81 * 37 * 9
     spectrum = pictures.spectra[0]
-    assert pictures.model_reads == 4 * spectrum.floats_per_evaluation / 4  # slices: a packet a node, four wavelengths
+    assert pictures.model_reads == 4 * np.prod(spectrum.neighbours)  # slices: a packet a node, four wavelengths
     assert "constant_blend" not in pictures.quirks
 
 

@@ -160,15 +160,16 @@ def test_nodes_resolve_the_wave_to_the_tolerance(x, tolerance):
     assert np.abs(got - np.exp(1j * x * T)).max() <= tolerance + 1e-12
 
 
+@pytest.mark.parametrize(("terms", "divisor"), [(3, 192), (4, 3072)])
 @given(height=st.floats(-5, 5), intervals=st.integers(1, 400), phase=st.floats(0, 2 * np.pi), share=st.floats(0.0, 1.0))
 @settings(max_examples=50)
-def test_cubics_between_chebyshev_points_keep_their_bound(height, intervals, phase, share):
+def test_polynomials_through_chebyshev_points_keep_their_bound(terms, divisor, height, intervals, phase, share):
     table = SliceTable.build(
-        intervals, LARGEST_KAPPA, lambda kappa: np.cos(kappa * height + phase).reshape(1, 1), ignore
+        intervals, terms, LARGEST_KAPPA, lambda kappa: np.cos(kappa * height + phase).reshape(1, 1), ignore
     )
     kappas = LARGEST_KAPPA * (np.arange(0, intervals, max(1, intervals // 20)) + share) / intervals
     got = np.array([table.powers(kappa)[0, 0] for kappa in kappas])
-    bound = (height * LARGEST_KAPPA / intervals) ** 4 / 3072
+    bound = (abs(height) * LARGEST_KAPPA / intervals) ** terms / divisor
     assert np.abs(got - np.cos(kappas * height + phase)).max() <= bound + 3e-6  # float32
 
 

@@ -8,6 +8,7 @@ from bsdf_support import use
 from PIL import Image
 
 import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a variant is set)
+from mitsuba_diffraction.bsdf.tables import PacketTable
 from mitsuba_diffraction.color import spectrum_to_linear_sRGB
 from mitsuba_diffraction.errors import Bug, RequestError
 from mitsuba_diffraction.render import passes, render
@@ -107,6 +108,41 @@ def test_passes(llvm, tmp_path, monkeypatch):
     np.testing.assert_allclose(split.radiance.mean(), whole.radiance.mean(), rtol=0.01)
     spread = [np.std(picture.radiance[0, 0]) for picture in (split, whole)]
     assert spread[0] < 1.4 * spread[1]
+
+
+def test_rendering_a_scene_again_compiles_nothing(llvm, tmp_path):
+    blaze = """<bsdf type="diffraction_grating"><string name="profile" value="blazed"/>
+        <float name="period" value="2.5"/><float name="depth" value="0.25"/></bsdf>"""
+    path = write_scene(tmp_path, f'<shape type="sphere">{blaze}</shape>' + CONSTANT)
+    fresh = []
+    for seed in range(5):
+        dr.kernel_history_clear()
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            render(path, spp=4, seed=seed)
+            history = dr.kernel_history((dr.KernelType.JIT,))
+        fresh.append(sum(not kernel["cache_hit"] for kernel in history))
+        assert len(history) > 0
+    assert fresh[1:] == [0, 0, 0, 0]
+
+
+@pytest.mark.parametrize("offset", [4, 16, 32])
+def test_kernels_do_not_depend_on_where_numpy_puts_a_table(llvm, offset):
+    # Regression: Dr.Jit read packets out of NumPy's own memory, each number alone where that was not aligned.
+    memory = np.zeros(64 * 17, np.uint8)
+    start = (offset - memory.ctypes.data) % 64
+    packets = memory[start : start + 64 * 16].view(np.float32).reshape(-1, 4)
+    assert packets.ctypes.data % 64 == offset
+    index = mi.UInt32([3, 1, 2])
+    dr.make_opaque(index)
+    hashes = set()
+    for table in (PacketTable(packets), PacketTable(packets.copy())):
+        dr.kernel_history_clear()
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.eval(table(index, mi.Bool(True)))
+            (kernel,) = dr.kernel_history((dr.KernelType.JIT,))
+        hashes.add(kernel["hash"])
+        assert "gather_4xf32" in kernel["ir"].getvalue()  # a packet at once
+    assert len(hashes) == 1
 
 
 def test_uneven_passes(llvm, tmp_path, monkeypatch):

@@ -15,7 +15,7 @@ from mitsuba_diffraction.spectrum.expansions.svd import SvdSeries
 from mitsuba_diffraction.spectrum.expansions.taylor import TaylorSeries
 from mitsuba_diffraction.spectrum.orders import OrderGrid
 from mitsuba_diffraction.spectrum.series_table import SeriesTable
-from mitsuba_diffraction.spectrum.slice_table import SliceTable
+from mitsuba_diffraction.spectrum.slice_table import SliceTable, halved, packed
 from mitsuba_diffraction.spectrum.spline_grid import SplineGrid, spline_integral
 
 LARGEST_KAPPA = 4 * np.pi / 0.36
@@ -78,12 +78,35 @@ def test_grids_that_cannot_be_are_refused(arguments):
 
 @given(share=st.floats(1e-7, 0.5))
 def test_the_share_that_lobe_reach_names_is_the_one_that_the_cut_moves(share):
-    # In polar coordinates: outside of ρ there is e^{−ρ²/2}; cut off, and added again by scaling what is inside.
+    # One axis by the trapezoidal rule; cut off outside of the square, and added again by scaling what is inside.
     rho = lobe_reach(share)
-    radius = np.linspace(rho, rho + 12, 20001)
-    outside = np.trapezoid(radius * np.exp(-(radius**2) / 2), radius)
-    assert 2 * outside <= share * (1 + 1e-6)
-    assert 2 * outside >= 0.2 * share
+    x = np.linspace(-rho, rho, 40001)
+    inside = np.trapezoid(np.exp(-(x**2) / 2), x) / np.sqrt(2 * np.pi)
+    assert 2 * (1 - inside**2) == pytest.approx(share, rel=1e-3, abs=1e-9)
+
+
+@pytest.mark.parametrize("coherence_length", [1.0, 5.0, 20.0, 65.0])
+@pytest.mark.parametrize("tolerance", [1e-2, 1e-3])
+def test_lobes_that_end_keep_their_power_and_what_lies_outside_keeps_the_tolerance(coherence_length, tolerance):
+    spectrum = md.precompute(random_surface(0.1, (40, 50)), coherence_length=coherence_length, tolerance=tolerance)
+    grid = OrderGrid(spectrum.pixel_size, (30, 40))  # many orders, whatever the grid of the spectrum is
+    grid = OrderGrid((4.0, 3.2), grid.largest)
+    sigma, reach = spectrum.lobe_width, spectrum.reach
+    for axis, lobe in enumerate(grid.lobes(sigma, reach)):
+        q = np.zeros((20001, 2))
+        end = min(lobe.half_width, 9 * sigma) * 1.5
+        q[:, axis] = np.linspace(-end, end, len(q))
+        held = np.zeros(len(q))
+        count = np.zeros(len(q), int)
+        for row, column, weight in grid.around(q, sigma, reach):
+            of_mirror = (row == grid.largest[1]) & (column == grid.largest[0])
+            held += np.where(of_mirror, weight, 0)
+            count += weight > 0
+        other = grid.lobes(sigma, reach)[1 - axis]
+        across = 1 / (np.sqrt(2 * np.pi) * sigma * other.inside)
+        assert np.trapezoid(held, q[:, axis]) / across == pytest.approx(1, abs=1e-3)
+        exact = np.exp(-(q[:, axis] ** 2) / (2 * sigma**2)) / (np.sqrt(2 * np.pi) * sigma)
+        assert np.trapezoid(np.abs(held / across - exact), q[:, axis]) <= 0.4 * tolerance + 1e-3 * tolerance + 1e-5
 
 
 # ---------------------------------------------------------------- splines
@@ -166,7 +189,7 @@ def powers_of(field):
 def build(kind, field):
     powers = powers_of(field)
     if kind == "slices":
-        return SliceTable.build(40, LARGEST_KAPPA, powers, ignore)
+        return SliceTable.build(40, 4, LARGEST_KAPPA, powers, ignore)
     nodes = nodes_for(LARGEST_KAPPA * field.half_range, 1e-7)
     if kind == "svd":
         kappas = (1 - np.cos(np.pi * (np.arange(nodes) + 0.5) / nodes)) / 2 * LARGEST_KAPPA
@@ -204,17 +227,38 @@ def test_tables_cannot_be_written(kind):
         numbers[...] = 0
     assert table.nbytes == numbers.nbytes
     assert table.shape == (5, 7)
-    assert table.floats_per_node == (4 if kind == "slices" else len(numbers))
+    assert table.words_per_node == (4 if kind == "slices" else 4 * ((len(numbers) + 3) // 4))
 
 
-def test_slices_are_exact_at_their_nodes_and_cubic_between():
-    # η = κ³ on one interval is its own interpolation.
-    nodes = LARGEST_KAPPA * (0.5 - 0.5 * np.cos(np.pi * (np.arange(4) + 0.5) / 4))
-    powers = ((nodes / LARGEST_KAPPA) ** 3).astype(np.float32).reshape(1, 4, 1, 1)
-    table = SliceTable(LARGEST_KAPPA, powers)
-    for share in (0.0, 0.1, 0.5, 1.0):
-        assert table.powers(share * LARGEST_KAPPA)[0, 0] == pytest.approx(share**3, abs=1e-6)
-    np.testing.assert_allclose(table.polynomials(), [[[[0, 0, 0, 1]]]], atol=1e-5)
+@pytest.mark.parametrize("terms", [3, 4])
+def test_slices_interpolate_polynomials_of_their_degree_exactly(terms):
+    def powers(kappa):
+        return np.array([[(kappa / LARGEST_KAPPA) ** (terms - 1), 0.5]])
+
+    table = SliceTable.build(3, terms, LARGEST_KAPPA, powers, ignore)
+    assert (table.terms, table.intervals, table.shape) == (terms, 3, (1, 2))
+    for share in (0.0, 0.1, 1 / 3, 0.5, 0.9, 1.0):
+        np.testing.assert_allclose(table.powers(share * LARGEST_KAPPA), powers(share * LARGEST_KAPPA), atol=1e-6)
+
+
+@given(seed=st.integers(0, 2**32 - 1), decades=st.integers(0, 12))
+def test_rounded_numbers_are_as_near_as_their_bits_allow(seed, decades):
+    values = np.random.default_rng(seed).normal(size=(2, 3, 4, 5)).astype(np.float32) * np.float32(10.0**-decades)
+    values[0, :, 0, 0] = 0
+    largest = np.abs(values).max(axis=1, keepdims=True)
+    error = np.abs(packed(values) - values)
+    # Half a unit; with 255 or less in it, a unit is at most 1/127 of the largest, but no less than 2⁻³⁶.
+    assert (error <= np.maximum(largest / 254, 2.0**-37)).all()
+    error = np.abs(halved(values) - values)
+    assert (error <= np.maximum(np.abs(values) * 2.0**-11, 2.0**-28)).all()
+    for rounded in (packed, halved):
+        np.testing.assert_array_equal(rounded(rounded(values)), rounded(values))
+
+
+def test_numbers_that_are_too_large_do_not_become_others():
+    values = np.full((1, 3, 1, 1), 5.0, np.float32)
+    assert not np.isfinite(packed(values)).any()
+    assert not np.isfinite(halved(values)).any()
 
 
 @pytest.mark.parametrize("representation", KINDS)
@@ -247,7 +291,7 @@ def test_series_tables_check_their_numbers(terms):
     "powers",
     [
         np.zeros((4, 3, 3), np.float32),
-        np.zeros((2, 3, 3, 3), np.float32),
+        np.zeros((2, 5, 3, 3), np.float32),
         np.zeros((2, 4, 3, 3)),
         np.full((1, 4, 1, 1), np.inf, np.float32),
     ],

@@ -2,99 +2,172 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr
 
+from ..spectrum import GratingSpectrum
+from ..spectrum.orders import OrderGrid
+from ..spectrum.spline_grid import spline_integral
+from .horizon import HorizonBins
 from .incidence import Incidence
-from .kappa_cells import KappaCells, choose, pick
-from .tables import BELOW_ONE, PacketTable, opaque
+from .kappa_cells import CELLS, KappaCells, averages, choose
+from .order_sampler import locate, target_between
+from .tables import FloatTable, PacketTable, ShareTable, opaque
+
+# The widest cells: in σ_q, to follow the lobes, and in cycles/µm, to follow the horizon.
+WIDEST, FINE = 2.0, 0.04
+BLOCK = 0.05  # cycles/µm: cells are taken together in blocks of about this width
+LOBE = 4.0  # σ_q: how far the lobes of orders are followed
 
 
 class CellSampler:
     """The density p(q) = P_m/(Δ_x Δ_y) on the cell m, |q_x − m_x Δ_x| ≤ Δ_x/2 and |q_y − m_y Δ_y| ≤ Δ_y/2.
 
-    P_m = Σ_j w_j A_jm, a mixture over κ (`kappa_cells`). A cell is drawn in O(1) by alias tables (Walker 1977); the
-    density at a given q reads one packet of four floats.
+    P_m = Σ_j w_j A_jm / Σ_j w_j M_j, a mixture over κ (`kappa_cells`), restricted to a region that holds all that
+    propagates (`horizon`); M_j is the sum of A_jm over it. A region is made of blocks of cells, an interval of them in
+    each row. A cell is drawn by binary searches: the row of blocks, the block, the cell in it. The density at a given q
+    reads one word for the cell and one packet for M_j.
     """
 
-    def __init__(
-        self, shares: NDArray[np.float64], spacing: tuple[float, float], largest: tuple[int, int], largest_kappa: float
-    ) -> None:
-        """Build the tables.
-
-        Args:
-            shares: A_jm, (κ cells, 2 M_y + 1, 2 M_x + 1), nonnegative; each κ cell is scaled to the sum one.
-            spacing: (Δ_x, Δ_y) in cycles/µm.
-            largest: (M_x, M_y), |m_x| ≤ M_x, |m_y| ≤ M_y.
-            largest_kappa: where the κ cells end, rad/µm.
-        """
-        shares = shares / shares.sum(axis=(1, 2), keepdims=True)
-        self.cells = KappaCells(largest_kappa)
-        self.rows, self.columns = shares.shape[1:]
-        self.largest_x, self.largest_y = largest
+    def __init__(self, spectrum: GratingSpectrum) -> None:
+        along_x, along_y = (_CellAxis.of(spectrum, axis) for axis in (0, 1))
+        shares = np.moveaxis(along_y.shares @ averages(spectrum) @ along_x.shares.T, 0, -1)
+        # Coefficients of splines may be below zero.
+        shares = np.maximum(shares, 0)
+        spacing, largest = (along_x.spacing, along_y.spacing), (along_x.largest, along_y.largest)
+        self.cells, self.horizon = KappaCells(spectrum.largest_kappa), HorizonBins(spectrum.wavelengths)
         self.spacing_x, self.spacing_y = (opaque(s) for s in spacing)
-        flat = shares.reshape(len(shares), -1)
-        self.densities = PacketTable(flat.T / (spacing[0] * spacing[1]))
-        self.aliases = PacketTable(np.stack([np.stack(alias_table(share), -1) for share in flat]), width=2)
+        self.per_q_x, self.per_q_y = (opaque(1 / s) for s in spacing)
+        self.edge_x, self.edge_y = (
+            int(np.clip(round(BLOCK / s), 1, count)) for s, count in zip(spacing, shares.shape[1::-1], strict=True)
+        )
+        pad = ((0, -shares.shape[0] % self.edge_y), (0, -shares.shape[1] % self.edge_x), (0, 0))
+        self.shares = ShareTable(np.pad(shares, pad))
+        shares = np.float64(self.shares.values)
+        self.rows, self.columns = shares.shape[:2]
+        self.largest_x, self.largest_y = largest
+        self.area = opaque(spacing[0] * spacing[1])
+        blocks = shares.reshape(self.rows // self.edge_y, self.edge_y, self.columns // self.edge_x, self.edge_x, CELLS)
+        blocks = blocks.swapaxes(1, 2).reshape(*blocks.shape[:3:2], -1, CELLS)
+        self.blocks_y, self.blocks_x, self.in_block, _ = blocks.shape
+        before_x = _sums_before(blocks.sum(axis=2))
+        self.before_cell, self.before_x = _SumTable(_sums_before(blocks)), _SumTable(before_x)
 
-    def weights(self, incidence: Incidence) -> mi.Vector4f:
-        """w_j for one wavelength."""
-        return self.cells.weights(incidence)
+        edge = (np.arange(self.blocks_y + 1) * self.edge_y - largest[1] - 0.5) * spacing[1]
+        ends = self.horizon.columns(edge[:-1], edge[1:])
+        ends = ends / (spacing[0] * self.edge_x) + (largest[0] + 0.5) / self.edge_x
+        first = np.clip(np.floor(ends[..., 0]), 0, self.blocks_x).astype(np.int64)
+        end = np.maximum(np.clip(np.ceil(ends[..., 1]), 0, self.blocks_x).astype(np.int64), first)
+        row = np.arange(self.blocks_y)
+        # As they are read: differences of float32.
+        before_y = _sums_before(np.float64(before_x[row, end]) - before_x[row, first])
+        self.before_y = _SumTable(before_y)
+        self.masses = PacketTable(before_y[:, -1])
+        self.ends = PacketTable(np.stack([first, end], axis=-1), width=2)
 
-    def density(self, q_x: mi.Float, q_y: mi.Float, weights: mi.Vector4f, active: mi.Bool) -> mi.Float:
-        """p(q) in µm², q in cycles/µm."""
-        m_x = mi.Int32(dr.floor(q_x / self.spacing_x + 0.5))
-        m_y = mi.Int32(dr.floor(q_y / self.spacing_y + 0.5))
+    def density(self, q_x: mi.Float, q_y: mi.Float, incidence: Incidence, active: mi.Bool) -> mi.Float:
+        """p(q) in µm², q in cycles/µm, for one wavelength; of a q that propagates."""
+        m_x, m_y = mi.Int32(dr.round(q_x * self.per_q_x)), mi.Int32(dr.round(q_y * self.per_q_y))
         active = active & (dr.abs(m_x) <= self.largest_x) & (dr.abs(m_y) <= self.largest_y)
-        cell = (m_y + self.largest_y) * self.columns + m_x + self.largest_x
-        return dr.dot(self.densities(mi.UInt32(dr.select(active, cell, 0)), active), weights)
+        cell = mi.UInt32((m_y + self.largest_y) * self.columns + m_x + self.largest_x)
+        weights = self.cells.weights(incidence)
+        total = self.area * dr.dot(weights, self.masses(self.horizon.bin(incidence), active))
+        return dr.dot(self.shares(cell, active), weights) * dr.rcp(dr.maximum(total, 1e-20))
 
-    def sample(self, weights: mi.Vector4f, u: mi.Float, v: mi.Point2f, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
+    def sample(self, incidence: Incidence, u: mi.Float, v: mi.Point2f, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
         """Draw q in cycles/µm, for one wavelength.
 
-        κ cell and row, column, and alias are drawn from different numbers: one alone has too few bits.
+        κ cell, row of blocks and cell come from `u`, the block and q_x from `v.x`: one number alone has too few bits.
         """
-        chosen, u = choose(weights, u)
-        row, _ = pick(u, self.rows)
-        column, x = pick(v.x, self.columns)
-        cell = row * self.columns + column
-        threshold, alias = self.aliases(chosen * (self.rows * self.columns) + cell, active)
-        keep = v.y < threshold
-        # What is left of v.y after the choice is uniform again.
-        y = dr.select(keep, v.y, v.y - threshold) / dr.select(keep, threshold, 1 - threshold)
-        cell = dr.select(keep, cell, mi.UInt32(alias))
-        m_x = mi.Float(cell % self.columns) - self.largest_x
-        m_y = mi.Float(cell // self.columns) - self.largest_y
-        return (m_x + x - 0.5) * self.spacing_x, (m_y + dr.clip(y, 0, BELOW_ONE) - 0.5) * self.spacing_y
+        chosen_bin = self.horizon.bin(incidence)
+        masses = self.masses(chosen_bin, active)
+        kappa_cell, u = choose(self.cells.weights(incidence) * masses, u)
+
+        zero = mi.Int32(0)
+        row, u = self.before_y.search(chosen_bin, kappa_cell, zero, mi.Int32(self.blocks_y), u, active)
+        ends = mi.Vector2i(self.ends(chosen_bin * self.blocks_y + mi.UInt32(row), active))
+        column, x = self.before_x.search(mi.UInt32(row), kappa_cell, ends.x, ends.y, v.x, active)
+        block = mi.UInt32(row * self.blocks_x + column)
+        cell, _ = self.before_cell.search(block, kappa_cell, zero, mi.Int32(self.in_block), u, active)
+        m_x = mi.Float(column * self.edge_x + cell % self.edge_x - self.largest_x)
+        m_y = mi.Float(row * self.edge_y + cell // self.edge_x - self.largest_y)
+        return (m_x + x - 0.5) * self.spacing_x, (m_y + v.y - 0.5) * self.spacing_y
 
 
-def alias_table(probabilities: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Thresholds and aliases for drawing index i with probability p_i: take i uniformly, keep it if u < threshold_i.
+class _SumTable:
+    """Sums F before each of n numbers, for lines of them and for each κ cell.
 
-    Entries below the mean are filled up by those above, in order; the running sums of what is missing and of what is
-    left over say who fills whom, so that no loop is needed.
-
-    Args:
-        probabilities: (n,), sum one.
-
-    Returns:
-        (n,) thresholds in [0, 1] and (n,) indices.
+    Binary searches take two steps, in every sixteenth sum and in those between: few lines of the cache.
     """
-    count = len(probabilities)
-    scaled = np.asarray(probabilities, np.float64) * count
-    threshold, alias = np.ones(count), np.arange(count)
-    light, heavy = np.flatnonzero(scaled < 1), np.flatnonzero(scaled >= 1)
-    if len(light) == 0:
-        return threshold, alias
-    missing, surplus = np.cumsum(1 - scaled[light]), np.cumsum(scaled[heavy] - 1)
-    # A light entry is filled by the first heavy one that has something left when its turn comes.
-    giver = np.minimum(np.searchsorted(surplus, np.concatenate([[0.0], missing[:-1]]), side="right"), len(heavy) - 1)
-    threshold[light], alias[light] = scaled[light], heavy[giver]
-    # A heavy entry that has given more than it had is filled by the next heavy one.
-    last = np.searchsorted(missing, surplus[:-1], side="left")
-    over = last < len(light)
-    threshold[heavy[:-1][over]] = 1 - (missing[last[over]] - surplus[:-1][over])
-    alias[heavy[:-1][over]] = heavy[1:][over]
-    return np.clip(threshold, 0, 1), alias
+
+    GROUP = 16
+
+    def __init__(self, sums: NDArray[np.float32]) -> None:
+        """Takes F (..., n + 1, κ cells)."""
+        sums = sums.swapaxes(-1, -2)
+        self.count = sums.shape[-1] - 1
+        self.groups = -(-self.count // self.GROUP)
+        self.fine, self.coarse = FloatTable(sums), FloatTable(sums[..., : self.count : self.GROUP])
+
+    def search(
+        self, line: mi.UInt32, kappa_cell: mi.UInt32, first: mi.Int32, end: mi.Int32, u: mi.Float, active: mi.Bool
+    ) -> tuple[mi.Int32, mi.Float]:
+        """As `order_sampler.search`, of one line and κ cell."""
+        line = line * CELLS + kappa_cell
+
+        def fine(i: mi.Int32) -> mi.Float:
+            return self.fine(line * (self.count + 1) + mi.UInt32(i), active)
+
+        def coarse(i: mi.Int32) -> mi.Float:
+            return self.coarse(line * self.groups + mi.UInt32(i), active)
+
+        target = target_between(fine(first), fine(end), u)
+        if self.groups > 1:
+            group, _ = locate(coarse, mi.Int32(0), mi.Int32(self.groups - 1), self.groups, target)
+            first, end = dr.maximum(first, self.GROUP * group), dr.minimum(end, self.GROUP * (group + 1))
+        return locate(fine, first, end, min(self.GROUP, self.count), target)
+
+
+@dataclass(frozen=True, eq=False)
+class _CellAxis:
+    """The cells along one axis.
+
+    Attributes:
+        spacing: Δ in cycles/µm, a whole part of the spacing of the nodes.
+        largest: M, |m| ≤ M.
+        shares: (2 M + 1, nodes), the integral of the lobe or spline of each node over each cell.
+    """
+
+    spacing: float
+    largest: int
+    shares: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, spectrum: GratingSpectrum, axis: int) -> _CellAxis:
+        """Along x (0) or y (1)."""
+        grid, sigma = spectrum.grid, spectrum.lobe_width
+        nodes = grid.frequencies()[axis]
+        if isinstance(grid, OrderGrid):
+            between, side = 1 / grid.tile_size[axis], min(spectrum.lobes[axis].half_width, LOBE * sigma)
+        else:
+            between, side = grid.spacing[axis], 1.5 * grid.spacing[axis]
+        spacing = between / np.ceil(between / min(WIDEST * sigma, FINE))
+        largest = int(np.ceil((nodes[-1] + side) / spacing - 0.5))
+        ends = (np.arange(-largest, largest + 2) - 0.5) * spacing
+        if isinstance(grid, OrderGrid):
+            below = ndtr((ends[:, None] - nodes) / sigma)
+        else:
+            below = spline_integral((ends[:, None] - nodes) / between)
+        return cls(spacing, largest, np.diff(below, axis=0))
+
+
+def _sums_before(shares: NDArray[np.float64]) -> NDArray[np.float32]:
+    """(..., n, κ cells) → (..., n + 1, κ cells): the sums of those before each, as they are read."""
+    result = np.zeros((*shares.shape[:-2], shares.shape[-2] + 1, shares.shape[-1]), np.float32)
+    result[..., 1:, :] = shares.cumsum(axis=-2)
+    return result

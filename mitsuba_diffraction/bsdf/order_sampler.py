@@ -155,7 +155,7 @@ def search(
     """The index i with F(i) ≤ F(first) + u (F(end) − F(first)) < F(i + 1), first ≤ i < end.
 
     Args:
-        before: F, increasing, its values whole numbers.
+        before: F, which does not fall.
         first: where the search begins.
         end: where it ends.
         count: end − first at most.
@@ -164,14 +164,25 @@ def search(
     Returns:
         i, and the place between F(i) and F(i + 1), in [0, 1).
     """
-    index, low, high = first, before(first), before(end)
+    return locate(before, first, end, count, target_between(before(first), before(end), u))
+
+
+def target_between(low: mi.Float, high: mi.Float, u: mi.Float) -> mi.Float:
+    """low + u (high − low), less than high."""
     target = dr.fma(u, high - low, low)
     # The sum may round up to the end.
-    target = dr.select(target < high, target, low)
+    return dr.select(target < high, target, low)
+
+
+def locate(
+    before: Callable[[mi.Int32], mi.Float], first: mi.Int32, end: mi.Int32, count: int, target: mi.Float
+) -> tuple[mi.Int32, mi.Float]:
+    """`search` for F(i) ≤ `target` < F(i + 1)."""
+    index, low, high = first, before(first), before(end)
     for bit in reversed(range((count - 1).bit_length())):
         trial = dr.minimum(index + (1 << bit), end)
         value = before(trial)
         further = value <= target
         index = dr.select(further, trial, index)
         low, high = dr.select(further, value, low), dr.select(further, high, value)
-    return index, dr.clip((target - low) / dr.maximum(high - low, 1), 0, BELOW_ONE)
+    return index, dr.clip((target - low) / dr.maximum(high - low, 1e-30), 0, BELOW_ONE)

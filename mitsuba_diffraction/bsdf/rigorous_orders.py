@@ -27,7 +27,7 @@ class RigorousOrders:
     """Σ_m η_m N(q − m/T; σ_q² I), and the density Σ_m P_m N(q − m/T; σ_q² I) from which q is drawn.
 
     η_m is that of the pair (ω_i, ω_o), in the coordinates of `Axes`: symmetric under exchange. N is cut off at `reach`
-    standard deviations and scaled up. P_m follows η_m of light from ω_i, averaged over cells of
+    standard deviations along each axis and scaled up. P_m follows η_m of light from ω_i, averaged over cells of
 
         p = g + α = P + max(m, 0),    r = g − α = R − min(m, 0),    α = −ω_i,x ν,    g = ν √(1 − ω_i,y²),
 
@@ -49,10 +49,10 @@ class RigorousOrders:
         before[..., 1:] = units.cumsum(axis=-1)
         self.orders = PacketTable(np.stack([before, np.append(units, 0 * units[..., :1], axis=-1)], axis=-1), width=2)
         sigma, reach = spectrum.lobe_width, spectrum.reach
-        inside = -np.expm1(-(reach**2) / 2)  # the share of the Gaussian within its reach
-        self.lobe_width, self.inside = opaque(sigma), opaque(inside)
-        self.peak, self.falloff = opaque(1 / (2 * np.pi * sigma**2 * inside)), opaque(-0.5 / sigma**2)
-        self.radius, self.farthest = opaque(reach * sigma), opaque((reach * sigma) ** 2)
+        inside = math.erf(reach / math.sqrt(2))  # the share of the Gaussian within its reach, along one axis
+        self.deviation, self.inside = opaque(np.sqrt(2) * sigma), opaque(inside)
+        self.peak, self.falloff = opaque(1 / (2 * np.pi * (sigma * inside) ** 2)), opaque(-0.5 / sigma**2)
+        self.half_width = opaque(reach * sigma)
         self.period, self.pitch = opaque(axes.period), opaque(1 / axes.period)
         self.shortest, self.longest = (opaque(w) for w in axes.wavelengths)
 
@@ -68,8 +68,8 @@ class RigorousOrders:
             active: mask.
         """
         q_x, q_y = -(wi.x + wo.x) * frequency, -(wi.y + wo.y) * frequency
-        first = mi.Int32(dr.ceil((q_x - self.radius) * self.period))
-        near = active & (mi.Float(first) * self.pitch - q_x <= self.radius) & (dr.abs(q_y) <= self.radius)
+        first = mi.Int32(dr.ceil((q_x - self.half_width) * self.period))
+        near = active & (mi.Float(first) * self.pitch - q_x <= self.half_width) & (dr.abs(q_y) <= self.half_width)
         power, density = mi.Float(0.0), mi.Float(0.0)
         # Most directions lie between the orders: they jump over all that reads tables.
         if near:
@@ -80,8 +80,9 @@ class RigorousOrders:
             cell = self._cell(Incidence.of(wi, frequency, mi.Float(1)))
             for step in range(self.count):
                 m = first + step
-                square = self._square(m, q_x, q_y)
-                there = near & (square <= self.farthest) & (dr.abs(m) <= self.axes.largest)
+                offset = dr.fma(-self.pitch, mi.Float(m), q_x)
+                there = near & (dr.abs(offset) <= self.half_width) & (dr.abs(m) <= self.axes.largest)
+                square = dr.square(offset) + dr.square(q_y)
                 lobe = dr.select(there, self.peak * dr.exp(self.falloff * square), 0)
                 power += lobe * self._efficiency(m, c, g, z, there)
                 density += lobe * self.orders(mi.UInt32(dr.select(there, cell + m, 0)), there).y
@@ -147,13 +148,8 @@ class RigorousOrders:
             return self.orders(mi.UInt32(middle + m), active).x
 
         m, _ = search(before, mi.Int32(-largest), mi.Int32(largest + 1), 2 * largest + 1, u)
-        radius = self.lobe_width * dr.sqrt(-2 * dr.log(1 - v.x * self.inside))
-        sin, cos = dr.sincos(dr.two_pi * v.y)
-        return mi.Float(m) * self.pitch + radius * cos, radius * sin
-
-    def _square(self, m: mi.Int32, q_x: mi.Float, q_y: mi.Float) -> mi.Float:
-        """|q − m/T|²."""
-        return dr.square(dr.fma(-self.pitch, mi.Float(m), q_x)) + dr.square(q_y)
+        x, y = (self.deviation * dr.erfinv(self.inside * (2 * number - 1)) for number in v)
+        return dr.fma(self.pitch, mi.Float(m), x), y
 
     def _z(self, g: mi.Float, frequency: mi.Float) -> mi.Float:
         """Z / (K − 1), from 0 to 1."""

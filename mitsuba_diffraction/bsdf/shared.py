@@ -14,6 +14,7 @@ from ..spectrum import GratingSpectrum
 from ..spectrum.albedo import GatheredSpectrum, energy_table
 from ..spectrum.energy_table import EnergyTable
 from ..spectrum.furnace import conserving
+from ..spectrum.orders import OrderGrid
 from .energy import Energy
 from .line_spectrum import LineSpectrum
 from .rigorous_orders import RigorousOrders
@@ -38,7 +39,7 @@ class SharedTables:
         if isinstance(spectrum, RigorousSpectrum):
             self.scattering = RigorousOrders(spectrum)
         else:
-            self.scattering = (LineSpectrum if spectrum.extent == "tile" else SmoothSpectrum)(spectrum)
+            self.scattering = (LineSpectrum if isinstance(spectrum.grid, OrderGrid) else SmoothSpectrum)(spectrum)
         self._spectrum = spectrum
         self._gathered: GatheredSpectrum | None = None
         self._tables: dict[tuple[str, float], EnergyTable] = {}

@@ -4,38 +4,31 @@ from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
-import scipy.ndimage
 
 from ..spectrum import GratingSpectrum
 from ..spectrum.spline_grid import spline_weights
 from .cell_sampler import CellSampler
 from .incidence import Incidence
-from .kappa_cells import averages
 from .order_power import order_power
 from .tables import opaque
 
-RIM = 2  # rings of zeros: the splines of the last nodes reach 3/2 Δ, and there three nodes are read
+RIM = 3  # rings of zeros, so many as are read in a row
 
 
 class SmoothSpectrum:
     """S(q; κ) = Σ_m c_m(κ) B(q/Δ − m)/(Δ_x Δ_y) (`SplineGrid`), and the density from which q is drawn.
 
-    One evaluation reads three by three nodes, three of them side by side in memory, and one packet for the density:
-    with slices 9 × 4 + 4 floats.
+    One evaluation reads three by three nodes and one packet for the density.
     """
 
     def __init__(self, spectrum: GratingSpectrum) -> None:
         grid = spectrum.grid
-        self.power = order_power(spectrum.table, RIM)
+        self.power = order_power(spectrum.table, (RIM, RIM))
         self.largest_x, self.largest_y = grid.largest
-        self.spacing_x, self.spacing_y = (opaque(d) for d in grid.spacing)
+        self.per_q_x, self.per_q_y = (opaque(1 / d) for d in grid.spacing)
+        self.per_area = opaque(1 / (grid.spacing[0] * grid.spacing[1]))
         self.limit_x, self.limit_y = (opaque(limit) for limit in grid.limit)
-        shares = averages(spectrum)
-        for axis in (1, 2):
-            # The integral of a B-spline over a cell: 1/6, 2/3, 1/6.
-            shares = scipy.ndimage.correlate1d(shares, np.array([1, 4, 1]) / 6, axis=axis, mode="constant")
-        self.cells = CellSampler(np.maximum(shares, 0), grid.spacing, grid.largest, spectrum.largest_kappa)
+        self.cells = CellSampler(spectrum)
 
     def evaluate(
         self,
@@ -54,24 +47,20 @@ class SmoothSpectrum:
             incidence: the wavelength and where it comes from.
             active: mask.
         """
-        x, y = q_x / self.spacing_x, q_y / self.spacing_y
+        x, y = q_x * self.per_q_x, q_y * self.per_q_y
         m_x, m_y = mi.Int32(dr.round(x)), mi.Int32(dr.round(y))
-        weights_x, weights_y = spline_weights(x - mi.Float(m_x)), spline_weights(y - mi.Float(m_y))
-        inside = active & (dr.abs(m_x) <= self.largest_x + 1) & (dr.abs(m_y) <= self.largest_y + 1)
-        inside &= (dr.abs(q_x) <= self.limit_x) & (dr.abs(q_y) <= self.limit_y)
-        row, column = m_y - 1 + self.largest_y + RIM, m_x - 1 + self.largest_x + RIM
-        first = mi.UInt32(dr.select(inside, row * self.power.columns + column, 0))
-        power = mi.Float(0.0)
-        for offset, factors in self.power.at(kappa, inside):
-            packet = mi.Vector4f(0.0)
-            for j in range(3):
-                node = offset + first + j * self.power.columns
-                packet += weights_y[j] * sum(weights_x[i] * self.power.table(node + i, inside) for i in range(3))
-            power += dr.dot(packet, factors)
+        power = self.power.window(
+            m_y + (self.largest_y + RIM - 1),
+            m_x + (self.largest_x + RIM - 1),
+            spline_weights(x - mi.Float(m_x)),
+            spline_weights(y - mi.Float(m_y)),
+            self.power.at(kappa, active),
+            active,
+        )
+        inside = active & (dr.abs(q_x) <= self.limit_x) & (dr.abs(q_y) <= self.limit_y)
         # Interpolation may dip below zero by its error.
-        power = dr.maximum(power, 0) / (self.spacing_x * self.spacing_y)
-        weights = self.cells.weights(incidence)
-        return dr.select(inside, power, 0), self.cells.density(q_x, q_y, weights, active)
+        power = dr.maximum(power, 0) * self.per_area
+        return dr.select(inside, power, 0), self.cells.density(q_x, q_y, incidence, active)
 
     def sample(
         self,
@@ -81,4 +70,4 @@ class SmoothSpectrum:
         active: mi.Bool,
     ) -> tuple[mi.Float, mi.Float]:
         """Draw q in cycles/µm, for one wavelength; `incidence` as in `evaluate`."""
-        return self.cells.sample(self.cells.weights(incidence), u, v, active)
+        return self.cells.sample(incidence, u, v, active)

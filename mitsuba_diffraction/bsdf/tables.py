@@ -6,6 +6,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..spectrum.slice_table import LEAST_EXPONENT
+
 
 def opaque(value: float) -> mi.Float:
     """A number held as an array, not as a literal, so that one kernel serves every surface."""
@@ -17,18 +19,37 @@ def opaque(value: float) -> mi.Float:
 BELOW_ONE = 1 - 2.0**-24  # the largest float32 under one, in every variant
 
 
-class PacketTable:
-    """A flat table of packets of two or four numbers; one packet is one aligned read of 8 or 16 bytes."""
+class FloatTable:
+    """A flat table of floats."""
+
+    def __init__(self, numbers: np.ndarray) -> None:
+        """Takes an array of any shape."""
+        flat = _aligned(np.asarray(numbers, np.float32).ravel())
+        # Scalar variants have no gather.
+        self.values = mi.Float(flat) if dr.is_jit_v(mi.Float) else flat
+
+    def __call__(self, index: mi.UInt32, active: mi.Bool) -> mi.Float:
+        """The floats at `index`; zero where not `active`."""
+        if dr.is_jit_v(mi.Float):
+            return dr.gather(mi.Float, self.values, index, active)
+        return float(self.values[index]) if active else 0.0
+
+
+class PacketTable(FloatTable):
+    """A flat table of packets of two or four numbers; one packet is one read of 8 or 16 bytes."""
+
+    unit = 1.0
 
     def __init__(self, packets: np.ndarray, width: int = 4) -> None:
-        """Takes the packets one after the other, of any shape; uint32 stays so, all else becomes float32."""
+        """Takes the packets one after the other, of any shape; uint32 in fours stays so, all else becomes float32."""
         self.width = width
-        whole = packets.dtype == np.uint32
-        self.number, one = (int, mi.UInt32) if whole else (float, mi.Float)
-        self.packet = mi.Vector4u if whole else {2: mi.Vector2f, 4: mi.Vector4f}[width]
-        flat = np.ascontiguousarray(packets, np.uint32 if whole else np.float32).ravel()
-        # Scalar variants have no gather.
-        self.values = one(flat) if dr.is_jit_v(mi.Float) else flat
+        if packets.dtype == np.uint32:
+            flat = _aligned(packets.ravel())
+            self.values = mi.UInt32(flat) if dr.is_jit_v(mi.Float) else flat
+            self.packet = mi.Vector4u
+        else:
+            super().__init__(packets)
+            self.packet = {2: mi.Vector2f, 4: mi.Vector4f}[width]
 
     def __call__(self, index: mi.UInt32, active: mi.Bool) -> mi.Vector2f | mi.Vector4f | mi.Vector4u:
         """The packets at `index`; zero where not `active`."""
@@ -36,11 +57,103 @@ class PacketTable:
             return dr.gather(self.packet, self.values, index, active)
         if not active:
             return self.packet(0)
-        return self.packet(*map(self.number, self.values[self.width * index : self.width * (index + 1)]))
+        return self.packet(*self.values[self.width * index : self.width * (index + 1)].tolist())
+
+    def add(self, packet: mi.Vector4f, weight: mi.Float, index: mi.UInt32, active: mi.Bool) -> mi.Vector4f:
+        """`packet` + `weight` times what is at `index`."""
+        return dr.fma(weight, self(index, active), packet)
 
     def entry(self, index: mi.UInt32, place: mi.UInt32, active: mi.Bool) -> mi.Float:
         """One float of the packets at `index`; zero where not `active`."""
-        index = self.width * index + place
+        return super().__call__(self.width * index + place, active)
+
+
+def _aligned(values: np.ndarray) -> np.ndarray:
+    """Flat float32 or uint32 at an address that is a multiple of 64 bytes.
+
+    Dr.Jit uses the memory of NumPy's arrays as it is, and reads a packet at once only where it is aligned so: else the
+    kernel would be slower, and another one from one allocation to the next.
+    """
+    memory = np.empty(4 * values.size + 64, np.uint8)
+    start = -memory.ctypes.data % 64
+    result = memory[start : start + 4 * values.size].view(values.dtype)
+    result[:] = values
+    return result
+
+
+class HalfTable:
+    """A flat table of packets of four numbers in half precision, two in a word of 32 bits; not in scalar variants.
+
+    A read costs two gathers of a word. Whole packets would have to be transposed: measured, that takes longer than the
+    memory. The bits of a half, moved to where a float32 has them, are its number times `1/unit`; what is read is left
+    so, for the caller to multiply sums by `unit`.
+    """
+
+    unit = 2.0**112  # the exponents of the two formats are 15 and 127 for the same number
+
+    def __init__(self, packets: np.ndarray) -> None:
+        """Takes numbers of half precision in packets of four, in an array of any shape."""
+        self.words = mi.UInt32(_aligned(np.ascontiguousarray(packets, np.float16).view(np.uint32).ravel()))
+
+    def add(self, packet: mi.Vector4f, weight: mi.Float, index: mi.UInt32, active: mi.Bool) -> mi.Vector4f:
+        """`packet` + `weight` times what is at `index`."""
+        numbers = []
+        for half in (0, 1):
+            word = dr.gather(mi.UInt32, self.words, 2 * index + half, active)
+            numbers.append(dr.reinterpret_array(mi.Float, ((word & 0x7FFF) << 13) | ((word & 0x8000) << 16)))
+            numbers.append(dr.reinterpret_array(mi.Float, ((word & 0x7FFF0000) >> 3) | (word & 0x80000000)))
+        return dr.fma(weight, mi.Vector4f(numbers), packet)
+
+
+class SharedExponentTable:
+    """A flat table of packets of three numbers in a word of 32 bits: nine bits for each and five for one exponent.
+
+    As the pixels of RGB9E5 pictures, but with signs. What is read is left times `1/unit`. Not in scalar variants.
+    """
+
+    unit = 2.0 ** (126 + LEAST_EXPONENT)  # the exponent 1 is 2⁻¹²⁶ in a float32
+
+    def __init__(self, mantissas: np.ndarray, exponents: np.ndarray) -> None:
+        """Takes m (..., 3) and e (...), the numbers being m 2^e."""
+        m = mantissas.astype(np.int64) & 511
+        words = (m[..., 0] << 23) | (m[..., 1] << 14) | (m[..., 2] << 5) | (exponents - LEAST_EXPONENT + 1)
+        self.words = mi.UInt32(_aligned(words.astype(np.uint32).ravel()))
+
+    def add(self, packet: mi.Vector3f, weight: mi.Float, index: mi.UInt32, active: mi.Bool) -> mi.Vector3f:
+        """`packet` + `weight` times what is at `index`."""
+        word = dr.gather(mi.UInt32, self.words, index, active)
+        signed = mi.Int32(word)
+        numbers = mi.Vector3f(mi.Float(signed >> 23), mi.Float((signed << 9) >> 23), mi.Float((signed << 18) >> 23))
+        return dr.fma(weight * dr.reinterpret_array(mi.Float, (word & 31) << 23), numbers, packet)
+
+
+class ShareTable:
+    """A flat table of packets of four nonnegative numbers in a word of 32 bits: six bits for each and one exponent.
+
+    Numbers are rounded up, so that none becomes zero: exact enough for a density from which samples are drawn.
+
+    Attributes:
+        values: what is read, float32 (..., 4).
+    """
+
+    def __init__(self, packets: np.ndarray) -> None:
+        """Takes packets (..., 4)."""
+        exponents = np.frexp(packets.max(axis=-1).astype(np.float32) / np.float32(63))[1]
+        # Smaller ones are zero: nothing in a float32.
+        exponents = np.maximum(exponents, -100)
+        mantissas = np.ceil(np.ldexp(packets, -exponents[..., None])) * (packets > 1e-30)
+        self.values = np.ldexp(mantissas, exponents[..., None]).astype(np.float32)
         if dr.is_jit_v(mi.Float):
-            return dr.gather(mi.Float, self.values, index, active)
-        return float(self.values[index]) if active else 0.0
+            m = mantissas.astype(np.int64)
+            words = (m[..., 0] << 26) | (m[..., 1] << 20) | (m[..., 2] << 14) | (m[..., 3] << 8) | (exponents + 127)
+            self.words = mi.UInt32(words.astype(np.uint32).ravel())
+        else:
+            self.words = PacketTable(self.values)
+
+    def __call__(self, index: mi.UInt32, active: mi.Bool) -> mi.Vector4f:
+        """The packets at `index`; zero where not `active`."""
+        if not dr.is_jit_v(mi.Float):
+            return self.words(index, active)
+        word = dr.gather(mi.UInt32, self.words, index, active)
+        exponent = dr.reinterpret_array(mi.Float, (word & 255) << 23)
+        return exponent * mi.Vector4f(*(mi.Float((word >> shift) & 63) for shift in (26, 20, 14, 8)))

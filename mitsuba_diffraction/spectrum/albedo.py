@@ -33,6 +33,7 @@ from scipy.interpolate import CubicSpline
 from scipy.special import ndtr
 
 from .energy_table import EnergyTable, between, directions_at
+from .orders import OrderGrid
 from .spline_grid import spline_integral
 
 if TYPE_CHECKING:
@@ -108,20 +109,20 @@ class GatheredSpectrum:
     @classmethod
     def of(cls, spectrum: GratingSpectrum) -> GatheredSpectrum:
         """Gather the nodes of `spectrum` in the cells of a grid, each cell at its centre of power."""
-        sigma, sample = spectrum.lobe_width, spectrum.extent == "sample"
-        conical = bool(not sample and spectrum.grid.shape[0] == 1 and sigma * spectrum.wavelengths[1] * 1e-3 <= NARROW)
+        sigma, lines = spectrum.lobe_width, isinstance(spectrum.grid, OrderGrid)
+        conical = bool(lines and spectrum.grid.shape[0] == 1 and sigma * spectrum.wavelengths[1] * 1e-3 <= NARROW)
         # A cell holds the whole lobe of a node, or the parts of it that lie in the cell.
-        narrow = sigma <= FINE / (8 if sample else 3)
+        narrow = sigma <= FINE / (3 if lines else 8)
         fine = FINE / 4 if conical else FINE
         # Light reaches no further than |q| = 2/λ.
         reach = 2e3 / spectrum.wavelengths[0] + fine
-        limits = np.minimum(spectrum.grid.limit if sample else np.inf, 2 * (reach,))
+        limits = np.minimum(np.inf if lines else spectrum.grid.limit, 2 * (reach,))
         lobes = (
             [None, None]
             if narrow
-            else [(spline_integral, d) for d in spectrum.grid.spacing]
-            if sample
             else 2 * [(ndtr, sigma)]
+            if lines
+            else [(spline_integral, d) for d in spectrum.grid.spacing]
         )
         x, y = (
             _shares(q, lobe, fine, limit)
@@ -145,7 +146,7 @@ class GatheredSpectrum:
         gathered = gathered[:, present].T
         equidistant = np.linspace(0, largest, int(np.ceil(radians / LINEAR_STEP)) + 2)
         # The lobes that lie in the cells as a whole.
-        own = (np.array(spectrum.grid.spacing) / 2 if sample else sigma) if narrow else 0.0
+        own = (sigma if lines else np.array(spectrum.grid.spacing) / 2) if narrow else 0.0
         mirror = np.abs(q).max(-1) <= fine / 2
         has_mirror = bool(narrow and mirror.any())
 

@@ -25,31 +25,34 @@ from .expansions.chebyshev import ChebyshevSeries
 from .expansions.svd import SvdSeries
 from .expansions.taylor import TaylorSeries
 from .grating_spectrum import TAIL_SHARE, check_angle, check_wavelengths
+from .orders import LobeAxis, inner
 from .patches import MeanPowers, check_patches
 from .sample import SamplePowers
 from .series_table import SeriesTable
-from .slice_table import SliceTable, interpolation
+from .slice_table import SliceTable, halved, packed, place, to_polynomial
 from .standard_error import standard_error
-from .tile import TilePowers, inner
+from .tile import TilePowers, TileSplines
 
 THEORIES = ("scalar", "rigorous")
 REPRESENTATIONS = ("auto", TaylorSeries.name, ChebyshevSeries.name, SvdSeries.name, SliceTable.representation)
 
 # Shares of the tolerance.
 _DROP_SHARE = 0.1  # weak frequencies
-_SPLINE_SHARE = 0.4  # of a sample, what lies between the nodes in q
+_SPLINE_SHARE = 0.4  # what lies between the nodes in q
 # What is chosen by the strongest frequencies, and measured at a few κ, is held to this part of what is allowed.
 _MARGIN = 0.7
+_WIDEST_SPACING = 0.74  # lattice of splines, in σ_q
 _PILOT = 8_000  # frequencies
+_SMALL = 2_000  # nodes of one κ that the nearest cache holds as they are: unpacking would take longer than reading
 _LARGEST_TABLE = 4e9  # bytes
 # Where none is asked for: the tolerances that measurements and pictures need, and in between, of a sample, a share of
 # its standard error. A table exact to 1e-3 of what is known to 25 % is waste.
 _FINEST, _COARSEST = 1e-3, 1e-2
 _SCATTER_SHARE = 0.1
-_MOST_NEIGHBOURS = 1000  # orders in one evaluation of S
 
 Progress = Callable[[int, int], None]
 Powers = Callable[[float], NDArray[np.float64]]
+Splines = SamplePowers | TileSplines
 Table = SeriesTable | SliceTable
 
 
@@ -80,8 +83,7 @@ def precompute(
         wavelengths: (shortest, longest) in nm.
         largest_angle: in degrees from the normal, of incidence and exit, that the scene has; less than 90 keeps fewer
             frequencies.
-        representation: "taylor", "chebyshev", "svd" or "slices"; "auto" takes the one that reads the fewest
-            packets of four numbers: slices.
+        representation: "taylor", "chebyshev", "svd" or "slices"; "auto" is "slices", than which none reads fewer bytes.
         tolerance: bound of max over κ of ∫|S_approx(q; κ) − S_exact(q; κ)| dq, a share of the reflected power; by
             default 1e-3, and of a sample a tenth of its `standard_error`, at least 1e-3 and at most 1e-2. Of rigorous
             theory: see `rigorous.build.build_spectrum`, 1e-2.
@@ -99,9 +101,8 @@ def precompute(
         The spectrum; its `error` is what was measured, at values of κ that were not used to build it.
 
     Raises:
-        ValueError: if an argument is out of range, the surface is deeper than `largest_height_range`, the lobes of a
-            thousand orders of a tile overlap, or the tolerance cannot be kept: in float32 by a Taylor series for so
-            deep a surface, or within a table of 4 GB.
+        ValueError: if an argument is out of range, the surface is deeper than `largest_height_range`, or the tolerance
+            cannot be kept: in float32 by a Taylor series for so deep a surface, or within a table of 4 GB.
 
     Warns:
         UserWarning: if the pixels are too coarse to hold all the frequencies that the shortest wavelength can reach, or
@@ -155,15 +156,18 @@ def precompute(
     largest_kappa = 4 * np.pi / shortest
     reach = 2 * np.sin(np.deg2rad(largest_angle)) / shortest
     _check_resolution(height_field, reach)
-    carried, scatter = float(coherence_length), None
+    carried, scatter, tail = float(coherence_length), None, 0.0
     if extent == "tile":
-        tolerance = _FINEST if tolerance is None else tolerance
-        allowed = (1 - TAIL_SHARE) * tolerance
-        radius = lobe_reach(TAIL_SHARE * tolerance) * lobe_width(coherence_length)
-        powers = TilePowers(height_field, reach, radius)
-        _check_overlap(powers.grid.neighbours(1, radius), coherence_length)
+        allowed = tolerance = _FINEST if tolerance is None else tolerance
+        sigma, rho = lobe_width(carried), lobe_reach(TAIL_SHARE * tolerance)
+        orders = TilePowers(height_field, reach, rho * sigma)
         if len(patches) > 1:
-            powers = MeanPowers(patches, reach, radius, largest_kappa, allowed)
+            orders = MeanPowers(patches, reach, rho * sigma, largest_kappa, (1 - TAIL_SHARE) * tolerance)
+        lobes = orders.grid.lobes(sigma, rho)
+        powers = _tile_splines(orders, lobes, sigma, reach, largest_kappa, tolerance)
+        if powers is None:
+            powers, tail = orders, 2 * (1 - lobes[0].inside * lobes[1].inside)
+            allowed -= tail
     else:
         carried = carried_coherence_length(height_field, coherence_length)
         scatter = standard_error(height_field, coherence_length=carried, largest_kappa=largest_kappa, reach=reach)
@@ -177,18 +181,24 @@ def precompute(
                 f"{coherence_length:.4g} µm asked for; the lobes are as wide as the scan allows",
                 stacklevel=2,
             )
-        powers = _splines(height_field, carried, reach, largest_kappa, _SPLINE_SHARE * tolerance)
+        powers = _refined(
+            lambda spacing: SamplePowers(height_field, carried, spacing, reach),
+            lobe_width(carried),
+            largest_kappa,
+            tolerance,
+        )
     build = _Build(powers, height_range, largest_kappa, allowed, progress or (lambda done, total: None))
     table, error = build(SliceTable.representation if representation == "auto" else representation)
     return GratingSpectrum(
         table=table,
         grid=build.kept,
+        extent=extent,
         pixel_size=height_field.pixel_size,
         height_range=height_range,
         coherence_length=carried,
         wavelengths=(float(wavelengths[0]), float(wavelengths[1])),
         tolerance=float(tolerance),
-        error=error + tolerance - allowed,
+        error=error + tail,
         source=height_field.source
         if len(patches) == 1
         else f"mean of {len(patches)} patches: {height_field.source}, …",
@@ -213,14 +223,40 @@ def check_tolerance(tolerance: float) -> None:
         raise RequestError(f"tolerance: got {tolerance!r}, wanted a share of the reflected power from 1e-5 to 1")
 
 
-def _splines(
-    height_field: HeightField, coherence_length: float, reach: float, largest_kappa: float, allowed: float
-) -> SamplePowers:
-    """A lattice of splines so fine that what lies between its nodes is right to `allowed`."""
-    sigma = lobe_width(coherence_length)
-    spacing = 0.74 * sigma
+def _tile_splines(
+    orders: TilePowers,
+    lobes: tuple[LobeAxis, LobeAxis],
+    sigma: float,
+    reach: float,
+    largest_kappa: float,
+    tolerance: float,
+) -> TileSplines | None:
+    """A tile's lattice of splines, if it is read faster than its orders."""
+    cost = _cost(lobes[0].count * lobes[1].count, orders.grid.shape)
+    # As coarse as a lattice can be, to begin with.
+    if _cost(9, TileSplines(orders, sigma, _WIDEST_SPACING * sigma, reach).grid.shape) >= cost:
+        return None
+    try:
+        splines = _refined(lambda spacing: TileSplines(orders, sigma, spacing, reach), sigma, largest_kappa, tolerance)
+    except _TooLargeError:
+        return None
+    return splines if _cost(9, splines.grid.shape) < cost else None
+
+
+def _cost(packets: int, shape: tuple[int, int]) -> float:
+    """What an evaluation takes that reads so many packets of a table of (rows, columns) nodes, in reads of a small one.
+
+    Measured on a CPU: reads take the same time while the nodes of one κ, at 8 bytes, fill less than 1 MB, beyond it
+    longer with the square root.
+    """
+    return packets * max(1.0, shape[0] * shape[1] * 8e-6) ** 0.5
+
+
+def _refined(lattice: Callable[[float], Splines], sigma: float, largest_kappa: float, tolerance: float) -> Splines:
+    """The coarsest lattice, a function of its spacing, that keeps its share of the tolerance between its nodes."""
+    allowed, spacing = _SPLINE_SHARE * tolerance, _WIDEST_SPACING * sigma
     while True:
-        powers = SamplePowers(height_field, coherence_length, spacing, reach)
+        powers = lattice(spacing)
         _check_size(powers.grid.shape, 4)
         error = max(
             powers.error(powers.grid, powers(kappa).astype(np.float32), kappa)
@@ -230,6 +266,33 @@ def _splines(
             return powers
         # The error of quadratic splines falls with the third power of the spacing.
         spacing *= min(0.95, 0.95 * (allowed / error) ** (1 / 3))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Storage:
+    """How slices are stored.
+
+    Attributes:
+        terms: of the polynomial in κ.
+        rounded: the values as they are read.
+        least: what is allowed from which on rounding may leave enough.
+        interpolation: the share of it that interpolation gets at first.
+        finest: the share below which finer intervals are given up.
+    """
+
+    terms: int
+    rounded: Callable[[NDArray[np.float32]], NDArray[np.float32]]
+    least: float
+    interpolation: float
+    finest: float
+
+
+# From the fastest to the most exact.
+_STORAGES = (
+    _Storage(3, packed, 2.0**-9, 0.7, 0.3),
+    _Storage(4, halved, 2.0**-11, 0.8, 0.3),
+    _Storage(4, lambda values: values, 0.0, 1.0, 0.01),
+)
 
 
 class _Build:
@@ -243,7 +306,7 @@ class _Build:
 
     def __init__(
         self,
-        powers: TilePowers | SamplePowers,
+        powers: TilePowers | Splines,
         height_range: float,
         largest_kappa: float,
         allowed: float,
@@ -296,21 +359,33 @@ class _Build:
 
     def __call__(self, representation: str) -> tuple[Table, float]:
         """The cheapest table of this representation, and its measured error."""
-        refine = 1.0
-        while True:
-            table = self._build(representation, _MARGIN * self._allowed * refine)
-            error = self._measured(table) / _MARGIN
-            if error <= self._allowed:
-                return table, error
-            if refine < 0.01:
-                raise RequestError(self._refusal(representation, error))
-            refine /= max(2.0, error / self._allowed)
+        packs = representation == SliceTable.representation and np.prod(self.kept.shape) > _SMALL
+        storages = _STORAGES if packs else _STORAGES[-1:]
+        for storage in storages:
+            refine, refusal = storage.interpolation, None
+            while self._allowed >= storage.least:
+                try:
+                    table = self._build(representation, storage, _MARGIN * self._allowed * refine)
+                except _TooLargeError as error:
+                    # Another storage may need fewer intervals.
+                    refusal = error
+                    break
+                error = self._measured(table) / _MARGIN
+                if error <= self._allowed:
+                    return table, error
+                if refine < storage.finest:
+                    break
+                refine /= max(2.0, error / self._allowed)
+        raise refusal or RequestError(self._refusal(representation, error))
 
-    def _build(self, representation: str, allowed: float) -> Table:
+    def _build(self, representation: str, storage: _Storage, allowed: float) -> Table:
         if representation == SliceTable.representation:
-            intervals = self._intervals(allowed)
-            _check_size(self.kept.shape, intervals * SliceTable.floats_per_node)
-            return SliceTable.build(intervals, self._largest_kappa, self._powers, self._progress)
+            intervals = self._intervals(allowed, storage.terms)
+            _check_size(self.kept.shape, intervals * storage.terms)
+            table = SliceTable.build(intervals, storage.terms, self._largest_kappa, self._powers, self._progress)
+            # What is measured is what is stored.
+            rounded = storage.rounded(table.values)
+            return dataclasses.replace(table, values=rounded) if np.isfinite(rounded).all() else table
         if representation == SvdSeries.name:
             modes = SvdSeries.fit(self._largest_kappa, self._pilot)
             series = modes.first(self._terms(modes, allowed))
@@ -356,7 +431,7 @@ class _Build:
             error = np.abs(remainder).sum(axis=1)
         return series.terms
 
-    def _intervals(self, allowed: float) -> int:
+    def _intervals(self, allowed: float, terms: int) -> int:
         """The fewest intervals with which the pilot is kept at every κ."""
         allowed *= self._pilot_share
         kappas, interpolate = self._between()
@@ -364,15 +439,16 @@ class _Build:
         coefficients = chebyshev_transform(self._nodes) @ self._pilot
         intervals = 1
         while True:
-            at = (np.arange(intervals)[:, None] + (1 + chebyshev_nodes(4)) / 2) / intervals * self._largest_kappa
+            at = (np.arange(intervals)[:, None] + (1 + chebyshev_nodes(terms)) / 2) / intervals * self._largest_kappa
             vander = chebyshev_polynomials(position(at.ravel(), self._largest_kappa), self._nodes)
             values = (vander @ coefficients).reshape(*at.shape, -1)
-            interval, weights = interpolation(kappas, self._largest_kappa, intervals)
+            interval, t = place(kappas, self._largest_kappa, intervals)
+            weights = t[:, None] ** np.arange(terms) @ to_polynomial(terms)
             # One κ after the other: all at once would take more memory than the table.
             error = max(np.abs(w @ values[k] - e).sum() for k, w, e in zip(interval, weights, exact, strict=True))
             if error <= allowed:
                 return intervals
-            intervals = max(intervals + 1, int(intervals * min(2.0, 0.95 * (error / allowed) ** 0.25)))
+            intervals = max(intervals + 1, int(intervals * min(2.0, 0.95 * (error / allowed) ** (1 / terms))))
 
     def _measured(self, table: Table) -> float:
         """max over held-out κ of the error of S: both ends, and others between, at least four to an oscillation."""
@@ -390,22 +466,16 @@ def _rim(profile: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.concatenate([np.cumsum(folded[::-1])[::-1][1:], [0.0]])
 
 
+class _TooLargeError(RequestError):
+    """A table would need too much memory."""
+
+
 def _check_size(shape: tuple[int, int], floats: int) -> None:
     """Refuses a table of so many floats a node before memory is asked for it."""
     if 4.0 * np.prod(shape, dtype=float) * floats > _LARGEST_TABLE:
-        raise RequestError(
+        raise _TooLargeError(
             f"tolerance: needs {' × '.join(map(str, shape))} frequencies of {floats} numbers, more than a table of "
             "4 GB; take a larger tolerance, a smaller patch or, of a sample, a shorter coherence length"
-        )
-
-
-def _check_overlap(neighbours: tuple[int, int], coherence_length: float) -> None:
-    """Refuses a tile of which one evaluation would sum thousands of orders."""
-    if neighbours[0] * neighbours[1] > _MOST_NEIGHBOURS:
-        raise RequestError(
-            f"coherence_length: at {coherence_length:.4g} µm the lobes of {neighbours[0]} × {neighbours[1]} orders of "
-            f"this tile overlap, wanted at most {_MOST_NEIGHBOURS}; take extent 'sample' or a longer "
-            "coherence length"
         )
 
 

@@ -1,7 +1,7 @@
 """A grating spectrum as an OpenEXR file: float32, ZIP, one part, one pixel per diffraction order or node.
 
 Channels are named after what they hold. Series: `B{t^003}` (taylor), `B{T_003}` (chebyshev), `B{mode 003}` (svd), the
-terms B_n of S = Σ g_n(κ) B_n; "slices": `S(012.2)`, the powers at the third Chebyshev point of interval 12 of κ. Rows
+terms B_n of S = Σ g_n(κ) B_n; "slices": `S(012.2)`, the coefficient of t² on interval 12 of κ. Rows
 are orders m_y, columns m_x, from −M to M. Numbers in the header are double precision. `energy` is JSON: the tables of
 `energy_table.py`, by the kind of shadowing. `contentSha256` covers every byte of the file, so that a damaged one is
 known as such.
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 Spectrum = TypeVar("Spectrum")
 FORMAT = "mitsuba_diffraction grating spectrum"
-FORMAT_VERSION = 4
+FORMAT_VERSION = 5
 
 
 def save(spectrum: GratingSpectrum, path: str | os.PathLike[str], recipe: str = "") -> None:
@@ -95,6 +95,7 @@ def load(path: str | os.PathLike[str], construct: Callable[..., Spectrum], recip
         return construct(
             table=table,
             grid=_grid(header, table.shape),
+            extent=header["extent"],
             pixel_size=_pair(header["pixelSize"]),
             height_range=_single(header["heightRange"]),
             coherence_length=_single(header["coherenceLength"]),
@@ -124,11 +125,9 @@ def _grid_header(grid: OrderGrid | SplineGrid) -> dict[str, np.ndarray]:
 
 def _grid(header: dict, shape: tuple[int, int]) -> OrderGrid | SplineGrid:
     largest = ((shape[1] - 1) // 2, (shape[0] - 1) // 2)
-    if header["extent"] == "tile":
+    if "tileSize" in header:
         return OrderGrid(_pair(header["tileSize"]), largest)
-    if header["extent"] == "sample":
-        return SplineGrid(_pair(header["spacing"]), largest, _pair(header["limit"]))
-    raise RequestError(f"extent: got {header['extent']!r}, wanted 'tile' or 'sample'")
+    return SplineGrid(_pair(header["spacing"]), largest, _pair(header["limit"]))
 
 
 _TERM_NAMES = {
@@ -141,14 +140,15 @@ _REPRESENTATIONS = (*_TERM_NAMES, SliceTable.representation)
 
 def _channels(table: SeriesTable | SliceTable) -> dict[str, np.ndarray]:
     if isinstance(table, SliceTable):
-        return {f"S({k:03d}.{node})": table.values[k, node] for k in range(table.intervals) for node in range(4)}
+        return {f"S({k:03d}.{p})": table.values[k, p] for k, p in np.ndindex(table.intervals, table.terms)}
     return {_TERM_NAMES[table.representation].format(n): term for n, term in enumerate(table.terms)}
 
 
 def _table(header: dict, pixels: dict[str, np.ndarray], largest_kappa: float) -> SeriesTable | SliceTable:
     kind, count = header["representation"], header["channelCount"]
     if kind == SliceTable.representation:
-        values = [[pixels[f"S({k:03d}.{node})"] for node in range(4)] for k in range(count // 4)]
+        terms = 4 if "S(000.3)" in pixels else 3
+        values = [[pixels[f"S({k:03d}.{p})"] for p in range(terms)] for k in range(count // terms)]
         return SliceTable(largest_kappa, np.array(values, np.float32))
     if kind == SvdSeries.name:
         series = SvdSeries(largest_kappa, np.array(json.loads(header["modes"]), np.float64))

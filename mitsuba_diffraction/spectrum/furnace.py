@@ -21,11 +21,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.special import ndtri
 from scipy.stats import qmc
 
 from ..geometry import k_g
 from .albedo import DEEP, SLACK
 from .energy_table import EnergyTable
+from .orders import LobeAxis
 from .spline_grid import SplineGrid, spline_integral
 
 if TYPE_CHECKING:
@@ -55,22 +57,26 @@ STEEPEST = 89.9  # degrees
 
 
 class _Gaussian:
-    """The lobe of an order, cut off at `reach` standard deviations."""
+    """The lobe of an order, truncated along each axis."""
 
-    def __init__(self, sigma: float, reach: float) -> None:
-        self._sigma, self._cut = sigma, np.expm1(-(reach**2) / 2)
-        self.radius = reach * sigma
+    def __init__(self, sigma: float, lobes: tuple[LobeAxis, LobeAxis]) -> None:
+        self._sigma, self._lobes = sigma, lobes
+        # Beyond six σ_q there is nothing.
+        self.radius = float(np.hypot(*(min(lobe.half_width, 6 * sigma) for lobe in lobes)))
 
     def drawn(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Points of the lobe, in cycles/µm, for numbers from 0 to 1."""
-        r, phi = self._sigma * np.sqrt(-2 * np.log1p(x * self._cut)), 2 * np.pi * y
-        return r * np.cos(phi), r * np.sin(phi)
+        return tuple(
+            self._sigma * ndtri(0.5 + lobe.inside * (np.clip(t, 1e-9, 1 - 1e-9) - 0.5))
+            for t, lobe in zip((x, y), self._lobes, strict=True)
+        )
 
     def density(self, q_x: NDArray[np.float64], q_y: NDArray[np.float64]) -> NDArray[np.float64]:
         """µm², of integral one."""
-        square = q_x**2 + q_y**2
-        peak = -1 / (2 * np.pi * self._sigma**2 * self._cut)
-        return np.where(square < self.radius**2, peak * np.exp(-square / (2 * self._sigma**2)), 0)
+        product = np.exp(-(q_x**2 + q_y**2) / (2 * self._sigma**2)) / (2 * np.pi * self._sigma**2)
+        for q, lobe in zip((q_x, q_y), self._lobes, strict=True):
+            product = product * np.where(np.abs(q) < lobe.half_width, 1 / lobe.inside, 0)
+        return product
 
 
 class _Spline:
@@ -104,7 +110,7 @@ class Furnace:
         self._spectrum = spectrum
         grid = spectrum.grid
         spline = isinstance(grid, SplineGrid)
-        self._lobe = _Spline(grid.spacing) if spline else _Gaussian(spectrum.lobe_width, spectrum.reach)
+        self._lobe = _Spline(grid.spacing) if spline else _Gaussian(spectrum.lobe_width, spectrum.lobes)
         self._limit = grid.limit if spline else (np.inf, np.inf)
 
         # Nodes, block after block.

@@ -19,24 +19,25 @@ from .albedo import GatheredSpectrum, energy_table
 from .energy_table import EnergyTable
 from .file import load, save
 from .furnace import conserving
-from .orders import OrderGrid
+from .orders import LobeAxis, OrderGrid
 from .series_table import SeriesTable
 from .slice_table import SliceTable
 from .spline_grid import SplineGrid
 
 # The part of the tolerance that is spent on the tails of the lobes.
-TAIL_SHARE = 0.1
+TAIL_SHARE = 0.4
 
 _computing = threading.Lock()
 
 
 @dataclass(frozen=True, eq=False)
 class GratingSpectrum:
-    """S(q; κ) of a tile, Σ_m η_m(κ) N(q − m/T; σ_q² I), or of a sample, a sum of B-splines (`SplineGrid`).
+    """S(q; κ): Σ_m η_m(κ) N(q − m/T; σ_q² I) of a tile, or, of a sample and where many lobes overlap, B-splines.
 
     Attributes:
         table: η_m(κ), or the coefficients of the splines, in one of the representations.
         grid: the diffraction orders m, or the nodes, that are kept.
+        extent: "tile": the patch repeats for ever; "sample": it is a piece of a larger, irregular surface.
         pixel_size: (x, y) of the height field, µm.
         height_range: of the height field, µm.
         coherence_length: L_c in µm; it sets the width σ_q of each order. Of a sample: what the scan carries.
@@ -56,6 +57,7 @@ class GratingSpectrum:
 
     table: SeriesTable | SliceTable
     grid: OrderGrid | SplineGrid
+    extent: str
     pixel_size: tuple[float, float]
     height_range: float
     coherence_length: float
@@ -72,6 +74,8 @@ class GratingSpectrum:
     energy: Mapping[str, EnergyTable] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
+        if self.extent not in ("tile", "sample"):
+            raise RequestError(f"extent: got {self.extent!r}, wanted 'tile' or 'sample'")
         if self.table.shape != self.grid.shape:
             raise RequestError(f"table: got {self.table.shape} nodes, wanted {self.grid.shape}")
         if not all(np.isfinite(p) and p > 0 for p in self.pixel_size):
@@ -102,11 +106,6 @@ class GratingSpectrum:
         return self.table.representation
 
     @property
-    def extent(self) -> str:
-        """ "tile": the patch repeats for ever; "sample": it is a piece of a larger, irregular surface."""
-        return "tile" if isinstance(self.grid, OrderGrid) else "sample"
-
-    @property
     def standard_error(self) -> float:
         """∫ of the standard error of Welch's estimate over q, at the worst κ: of one scan about the mean of many.
 
@@ -133,18 +132,23 @@ class GratingSpectrum:
 
     @property
     def reach(self) -> float:
-        """How far the lobe of an order is followed, in standard deviations σ_q."""
+        """How far the lobe of an order is followed along each axis at least, in standard deviations σ_q."""
         return lobe_reach(TAIL_SHARE * self.tolerance)
+
+    @property
+    def lobes(self) -> tuple[LobeAxis, LobeAxis]:
+        """Where the lobes of the orders end along x and y; of a grid of orders only."""
+        return self.grid.lobes(self.lobe_width, self.reach)
 
     @property
     def neighbours(self) -> tuple[int, int]:
         """How many nodes along x and y hold at one q, to the tolerance."""
-        return self.grid.neighbours(self.lobe_width, self.reach) if self.extent == "tile" else (3, 3)
+        return tuple(lobe.count for lobe in self.lobes) if isinstance(self.grid, OrderGrid) else (3, 3)
 
     @property
-    def floats_per_evaluation(self) -> int:
-        """How many floats of the table one evaluation of S reads."""
-        return self.neighbours[0] * self.neighbours[1] * self.table.floats_per_node
+    def words_per_evaluation(self) -> int:
+        """How many words of 32 bits of the table one evaluation of S reads."""
+        return self.neighbours[0] * self.neighbours[1] * self.table.words_per_node
 
     @property
     def megabytes(self) -> float:
@@ -154,7 +158,7 @@ class GratingSpectrum:
     def powers(self, kappa: float) -> NDArray[np.float32]:
         """The share of the reflected power of each node, (2 M_y + 1, 2 M_x + 1), in float32 as a renderer computes it.
 
-        Of a tile, η_m(κ). Shares may be below zero: by the error, and as coefficients of splines.
+        Of orders, η_m(κ). Shares may be below zero: by the error, and as coefficients of splines.
 
         Raises:
             ValueError: if κ (rad/µm) is outside of what the table holds.
@@ -177,7 +181,8 @@ class GratingSpectrum:
         q, kappa = matching(q, kappa)
         self._checked(kappa)
         result = np.zeros(kappa.shape)
-        around = self.grid.around(q, self.lobe_width, self.reach) if self.extent == "tile" else self.grid.around(q)
+        lines = isinstance(self.grid, OrderGrid)
+        around = self.grid.around(q, self.lobe_width, self.reach) if lines else self.grid.around(q)
         for row, column, weight in around:
             result += weight * self.table.powers_at(row, column, kappa)
         # Interpolation may dip below zero by its error.

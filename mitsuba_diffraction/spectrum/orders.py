@@ -4,11 +4,31 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy.special
 from numpy.typing import NDArray
 
 from ..errors import RequestError
+
+if TYPE_CHECKING:
+    from .spline_grid import SplineGrid
+
+
+@dataclass(frozen=True)
+class LobeAxis:
+    """How the lobe of an order is truncated along one axis.
+
+    Attributes:
+        count: how many orders hold at one q.
+        half_width: |q − m/T| up to which the order m holds, cycles/µm; infinite where all orders hold everywhere.
+        inside: the share of the Gaussian within `half_width`, by which it is divided.
+    """
+
+    count: int
+    half_width: float
+    inside: float
 
 
 @dataclass(frozen=True)
@@ -82,22 +102,39 @@ class OrderGrid:
     ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]]:
         """The orders whose lobes hold q (..., 2): row, column and N(q − m/T; σ_q² I), one neighbour at a time.
 
-        The lobe is cut off at `reach`·σ_q and scaled to the integral one; its value is 0 beyond, and beyond the grid.
+        The lobe is cut off as `lobes` says and scaled to the integral one; it is 0 beyond, and beyond the grid.
         """
-        tile, largest = np.array(self.tile_size), np.array(self.largest)
-        first = np.ceil(np.clip((q - reach * lobe_width) * tile, -largest, largest + 1)).astype(np.int64)
-        peak = 1 / (2 * np.pi * lobe_width**2 * -np.expm1(-(reach**2) / 2))
-        for step in np.ndindex(*self.neighbours(lobe_width, reach)):
+        tile, largest, lobes = np.array(self.tile_size), np.array(self.largest), self.lobes(lobe_width, reach)
+        count = np.array([lobe.count for lobe in lobes])
+        half_width = np.array([lobe.half_width for lobe in lobes])
+        start = np.where(np.isinf(half_width), -largest, q * tile - count / 2)
+        first = np.ceil(np.clip(start, -largest - count, largest + 1)).astype(np.int64)
+        peak = 1 / (2 * np.pi * lobe_width**2 * lobes[0].inside * lobes[1].inside)
+        for step in np.ndindex(*count):
             m = first + step
-            kept = (np.abs(m) <= largest).all(axis=-1)
+            offset = q - m / tile
+            kept = ((np.abs(m) <= largest) & (np.abs(offset) <= half_width)).all(axis=-1)
             column, row = np.moveaxis(np.where(kept[..., None], m + largest, 0), -1, 0)
-            distance = ((q - m / tile) ** 2).sum(axis=-1)
-            kept &= distance <= (reach * lobe_width) ** 2
-            yield row, column, np.where(kept, peak * np.exp(-distance / (2 * lobe_width**2)), 0)
+            yield row, column, np.where(kept, peak * np.exp(-(offset**2).sum(axis=-1) / (2 * lobe_width**2)), 0)
 
-    def neighbours(self, lobe_width: float, reach: float) -> tuple[int, int]:
-        """How many orders can lie within ±`reach`·σ_q of one q, along x and y (σ_q in cycles/µm)."""
-        return tuple(
-            int(min(np.floor(2 * reach * lobe_width * t) + 1, 2 * m + 1))
-            for t, m in zip(self.tile_size, self.largest, strict=True)
-        )
+    def lobes(self, lobe_width: float, reach: float) -> tuple[LobeAxis, LobeAxis]:
+        """Where lobes of the width σ_q (cycles/µm) end along x and y: at `reach`·σ_q or further.
+
+        Orders that stand apart end there. Where several hold at one q, it is always the same number of them, the
+        nearest: each ends at so many half spacings. Where more would hold than there are, none ends.
+        """
+        result = []
+        for size, largest in zip(self.tile_size, self.largest, strict=True):
+            # Rounding in the width must not add an order.
+            count = max(1, int(np.ceil(2 * reach * lobe_width * size * (1 - 1e-9))))
+            half_width = count / (2 * size) if count > 1 else reach * lobe_width
+            if count > 2 * largest + 1:
+                count, half_width = 2 * largest + 1, np.inf
+            inside = float(scipy.special.erf(half_width / (np.sqrt(2) * lobe_width)))
+            result.append(LobeAxis(count, half_width, inside))
+        return tuple(result)
+
+
+def inner(grid: OrderGrid | SplineGrid, kept: OrderGrid | SplineGrid) -> tuple[slice, slice]:
+    """Where the nodes of `kept` lie among those of the larger `grid`."""
+    return tuple(slice(m - n, m + n + 1) for m, n in zip(grid.largest[::-1], kept.largest[::-1], strict=True))

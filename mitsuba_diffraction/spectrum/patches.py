@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from ..errors import RequestError
 from ..surface.heightfield import HeightField
 from .expansions import chebyshev_nodes, chebyshev_polynomials, chebyshev_transform, nodes_for, position
-from .orders import OrderGrid
 from .tile import TilePowers
 
 # Where the interpolation in κ is compared with direct sums, parts of the largest κ.
@@ -51,7 +50,7 @@ class MeanPowers(TilePowers):
                 checked[j] += one(share * largest_kappa)
         flat = total.reshape(self._nodes, -1) / len(height_fields)
         self._coefficients = chebyshev_transform(self._nodes) @ flat
-        self._interpolation_error = max(
+        self.own_error = max(
             float(np.abs(self(share * largest_kappa) - direct / len(height_fields)).sum())
             for share, direct in zip(_CHECKED, checked, strict=True)
         )
@@ -60,10 +59,6 @@ class MeanPowers(TilePowers):
         """The mean of η_m(κ), (rows, columns); κ in rad/µm."""
         values = chebyshev_polynomials(position(np.array([kappa]), self._largest_kappa), self._nodes)
         return (values @ self._coefficients).reshape(self.grid.shape)
-
-    def error(self, kept: OrderGrid, powers: NDArray[np.float32], kappa: float) -> float:
-        """As `TilePowers.error`, and what the interpolation in κ changes."""
-        return super().error(kept, powers, kappa) + self._interpolation_error
 
 
 def _powers(heights: NDArray[np.float32], kappa: float) -> NDArray[np.float32]:

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import scipy.fft
-import scipy.ndimage
 from numpy.typing import NDArray
 
 from ..coherence import lobe_width
 from ..surface.heightfield import HeightField
 from ..welch import WindowAxis, window_axes
-from .spline_grid import SplineGrid, spline_integral, spline_weights
-from .tile import inner
+from .spline_grid import SplineGrid
 
 # Along an axis on which the surface is uniform the lobe is followed to this many σ_q.
 _UNIFORM_REACH = 6.0
@@ -66,6 +64,7 @@ class SamplePowers:
         ]
         x, y = self._lags
         self.grid = SplineGrid((x.spacing, y.spacing), (x.largest, y.largest), (x.limit, y.limit))
+        self._reached = x.reached, y.reached
         self._random = np.random.default_rng(0)
 
     def _autocorrelation(self, kappa: float) -> NDArray[np.complex128]:
@@ -112,11 +111,7 @@ class SamplePowers:
 
     def reached(self, powers: NDArray[np.float64]) -> float:
         """The share of the power where light reaches and the pixels resolve; takes c_m of the grid."""
-        inside = []
-        for axis in self._lags:
-            m, end = np.arange(-axis.largest, axis.largest + 1), axis.reached / axis.spacing
-            inside.append(spline_integral(end - m) - spline_integral(-end - m))
-        return float(inside[1] @ powers @ inside[0])
+        return self.grid.within(powers, self._reached)
 
     def error(self, kept: SplineGrid, powers: NDArray[np.float32], kappa: float) -> float:
         """∫|S_approx − S_exact| dq where light reaches, by the rule of rectangles on a shifted lattice.
@@ -129,13 +124,4 @@ class SamplePowers:
         shift = self._random.uniform(-0.5, 0.5, 2)
         ramp = [np.exp(-2j * np.pi * s * lags.lags / lags.count) for s, lags in zip(shift, self._lags, strict=True)]
         exact = self._transform(self._autocorrelation(kappa) * ramp[1][:, None] * ramp[0][self._lags[0].lags >= 0])
-        weights_x, weights_y = (np.array(spline_weights(s)) for s in shift)
-        approximate = np.zeros(self.grid.shape)
-        approximate[inner(self.grid, kept)] = powers
-        approximate = scipy.ndimage.correlate1d(approximate, weights_x, axis=1, mode="constant")
-        approximate = scipy.ndimage.correlate1d(approximate, weights_y, axis=0, mode="constant")
-        inside_x, inside_y = (
-            np.abs(np.arange(-axis.largest, axis.largest + 1) + s) * axis.spacing <= axis.reached
-            for axis, s in zip(self._lags, shift, strict=True)
-        )
-        return float(inside_y @ np.abs(np.maximum(approximate, 0) - exact) @ inside_x)
+        return self.grid.error(kept, powers, exact, shift, self._reached)

@@ -84,9 +84,9 @@ class SeriesTable:
         return self.terms.nbytes
 
     @property
-    def floats_per_node(self) -> int:
-        """How many floats one node at one κ reads."""
-        return len(self.terms)
+    def words_per_node(self) -> int:
+        """Words of 32 bits that a renderer reads of a node at one κ: packets of four."""
+        return 4 * -(-len(self.terms) // 4)
 
     def powers(self, kappa: float) -> NDArray[np.float32]:
         """c_m(κ) of all nodes, (rows, columns), in float32 as a renderer computes them; κ in rad/µm."""

@@ -1,4 +1,4 @@
-"""The frequencies of an irregular surface: a lattice of quadratic B-splines, for a spectrum without sharp lines."""
+"""A lattice of quadratic B-splines, for a spectrum without sharp lines."""
 
 from __future__ import annotations
 
@@ -6,9 +6,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.ndimage
 from numpy.typing import NDArray
 
 from ..errors import RequestError
+from .orders import inner
 
 
 @dataclass(frozen=True)
@@ -64,6 +66,42 @@ class SplineGrid:
             kept = inside & (np.abs(m) <= self.largest).all(axis=-1)
             column, row = np.moveaxis(np.where(kept[..., None], m + self.largest, 0), -1, 0)
             yield row, column, np.where(kept, weights[i][..., 0] * weights[j][..., 1] / area, 0)
+
+    def within(self, coefficients: NDArray[np.float64], reached: tuple[float, float]) -> float:
+        """∫ Σ c B B/(Δ_x Δ_y) over |q_x| and |q_y| up to `reached` (cycles/µm)."""
+        inside = []
+        for largest, spacing, end in zip(self.largest, self.spacing, reached, strict=True):
+            m = np.arange(-largest, largest + 1)
+            inside.append(spline_integral(end / spacing - m) - spline_integral(-end / spacing - m))
+        return float(inside[1] @ coefficients @ inside[0])
+
+    def error(
+        self,
+        kept: SplineGrid,
+        coefficients: NDArray[np.float32],
+        exact: NDArray[np.float64],
+        shift: NDArray[np.float64],
+        reached: tuple[float, float],
+    ) -> float:
+        """∫|S_approx − S_exact| dq up to `reached`, by the rule of rectangles on the lattice shifted by `shift` Δ.
+
+        Args:
+            kept: the smaller grid of the approximation.
+            coefficients: c_m on it; zero outside.
+            exact: S Δ_x Δ_y on the shifted lattice, of the shape of this grid.
+            shift: (x, y), each within ±½.
+            reached: (x, y) in cycles/µm.
+        """
+        weights_x, weights_y = (np.array(spline_weights(s)) for s in shift)
+        approximate = np.zeros(self.shape)
+        approximate[inner(self, kept)] = coefficients
+        approximate = scipy.ndimage.correlate1d(approximate, weights_x, axis=1, mode="constant")
+        approximate = scipy.ndimage.correlate1d(approximate, weights_y, axis=0, mode="constant")
+        inside_x, inside_y = (
+            np.abs(np.arange(-largest, largest + 1) + s) * spacing <= end
+            for largest, spacing, s, end in zip(self.largest, self.spacing, shift, reached, strict=True)
+        )
+        return float(inside_y @ np.abs(np.maximum(approximate, 0) - exact) @ inside_x)
 
 
 def spline_weights(t: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import scipy.fft
+import scipy.linalg
 from numpy.typing import NDArray
 
 from ..surface.heightfield import HeightField
-from .orders import OrderGrid
+from .orders import OrderGrid, inner
+from .spline_grid import SplineGrid
 
 
 class TilePowers:
@@ -15,7 +17,10 @@ class TilePowers:
 
     Attributes:
         grid: the orders of which a lobe, or a part of it, lies where light reaches.
+        own_error: Σ_m |Δη_m|, the largest error of these powers themselves.
     """
+
+    own_error: float = 0.0
 
     def __init__(self, height_field: HeightField, reach: float, lobe_radius: float) -> None:
         """Takes the tile, the largest |q| that light reaches and the radius of a lobe, both in cycles/µm."""
@@ -42,7 +47,7 @@ class TilePowers:
         """
         exact = self(kappa)
         inside = exact[inner(self.grid, kept)]
-        return float(exact.sum() - inside.sum() + np.abs(np.maximum(powers, 0) - inside).sum())
+        return float(exact.sum() - inside.sum() + np.abs(np.maximum(powers, 0) - inside).sum()) + self.own_error
 
 
 def _powers(height_field: HeightField, kappa: float) -> NDArray[np.float64]:
@@ -51,6 +56,62 @@ def _powers(height_field: HeightField, kappa: float) -> NDArray[np.float64]:
     return transform.real**2 + transform.imag**2
 
 
-def inner(grid: OrderGrid, kept: OrderGrid) -> tuple[slice, slice]:
-    """Where the nodes of `kept` lie among those of the larger `grid`."""
-    return tuple(slice(m - n, m + n + 1) for m, n in zip(grid.largest[::-1], kept.largest[::-1], strict=True))
+class TileSplines:
+    """The B-spline coefficients c_m(κ) of S(q; κ) of a tile whose lobes overlap so that it has no sharp lines.
+
+    S is a sum of products, and so is its projection on the splines in the least squares: c = A_y η A_xᵀ, where a column
+    of A projects the lobe of one order.
+
+    Attributes:
+        grid: all nodes whose splines hold where light reaches.
+    """
+
+    # Nodes beyond the grid, so that what lies there is not projected on its last ones.
+    _MARGIN = 12
+
+    def __init__(self, powers: TilePowers, lobe_width: float, spacing: float, reach: float) -> None:
+        """Takes η_m(κ), σ_q, and the largest spacing and reach of the nodes, all in cycles/µm."""
+        self._powers, self._sigma, self._spacing = powers, lobe_width, spacing
+        self._orders = powers.grid.frequencies()
+        # Beyond six σ_q of the last order there is nothing.
+        self._reached = tuple(min(reach, q[-1] + 6 * lobe_width) for q in self._orders)
+        largest = tuple(int(np.rint(end / spacing)) + 1 for end in self._reached)
+        self.grid = SplineGrid((spacing, spacing), largest, (np.inf, np.inf))
+        self._projection = [self._projected(m, q) for m, q in zip(largest, self._orders, strict=True)]
+        self._random = np.random.default_rng(0)
+
+    def _projected(self, largest: int, orders: NDArray[np.float64]) -> NDArray[np.float64]:
+        """A, (nodes, orders), along one axis."""
+        nodes = np.arange(-largest - self._MARGIN, largest + self._MARGIN + 1)
+        x, weights = np.polynomial.legendre.leggauss(8)
+        # B is a parabola on each of three pieces.
+        x = np.concatenate([piece + x / 2 for piece in (-1, 0, 1)])
+        weights = np.tile(weights / 2, 3) * np.where(np.abs(x) <= 0.5, 0.75 - x**2, 0.5 * (1.5 - np.abs(x)) ** 2)
+        moments = sum(w * self._lobes(nodes + t, orders) for t, w in zip(x, weights, strict=True))
+        # ∫B(x)B(x − k), k = 2, 1, 0.
+        gram = np.repeat(np.array([[1], [26], [66]]) / 120, len(nodes), axis=1)
+        return scipy.linalg.solveh_banded(gram, moments)[self._MARGIN : -self._MARGIN]
+
+    def _lobes(self, places: NDArray[np.float64], orders: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Δ N(q − m/T; σ_q²) at q = Δ · `places`, (places, orders)."""
+        offset = (places[:, None] * self._spacing - orders) / self._sigma
+        return self._spacing / (np.sqrt(2 * np.pi) * self._sigma) * np.exp(-(offset**2) / 2)
+
+    def __call__(self, kappa: float) -> NDArray[np.float64]:
+        """c_m(κ), (rows, columns), with Σ c = 1 over all frequencies; κ in rad/µm."""
+        along_x, along_y = self._projection
+        return along_y @ self._powers(kappa) @ along_x.T
+
+    def reached(self, powers: NDArray[np.float64]) -> float:
+        """The share of the power where light reaches; takes c_m of the grid."""
+        return self.grid.within(powers, self._reached)
+
+    def error(self, kept: SplineGrid, powers: NDArray[np.float32], kappa: float) -> float:
+        """∫|S_approx − S_exact| dq where light reaches; arguments as of `TilePowers.error`."""
+        shift = self._random.uniform(-0.5, 0.5, 2)
+        along_x, along_y = (
+            self._lobes(np.arange(-largest, largest + 1) + s, orders)
+            for largest, s, orders in zip(self.grid.largest, shift, self._orders, strict=True)
+        )
+        exact = along_y @ self._powers(kappa) @ along_x.T
+        return self.grid.error(kept, powers, exact, shift, self._reached) + self._powers.own_error

@@ -5,12 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.special
 from numpy.typing import NDArray
 
 from ..bsdf.probe import direction
 from ..color import daylight, delta_E, spectrum_to_XYZ
 from ..reference import power_spectrum
 from ..spectrum import GratingSpectrum
+from ..spectrum.orders import OrderGrid
 from ..surface.heightfield import HeightField
 from .cases import Case
 from .record import Record
@@ -47,14 +49,15 @@ def l1_error(
     shares = spectrum.powers(kappa)
     q = _drawn(spectrum, np.maximum(shares, 0), count, random)
     reached = 2 * np.sin(np.deg2rad(spectrum.largest_angle)) / (spectrum.wavelengths[0] * 1e-3)
-    margin = spectrum.reach * spectrum.lobe_width if spectrum.extent == "tile" else 0.0
+    lines = isinstance(spectrum.grid, OrderGrid)
+    margin = spectrum.reach * spectrum.lobe_width if lines else 0.0
     q = q[np.hypot(*q.T) < reached - margin]
     approximate = spectrum.evaluate(q, kappa)
     # q are drawn from S/∫S itself, as far as it is not negative; what is not a number stays.
     drawn = ~(approximate <= 0)
     error = np.abs(approximate - _exact(spectrum, height_field, q, kappa))[drawn] / approximate[drawn]
     # What lies beyond the reach of the lobes is not drawn.
-    tail = np.exp(-(spectrum.reach**2) / 2) if spectrum.extent == "tile" else 0.0
+    tail = 1 - np.prod([lobe.inside for lobe in spectrum.lobes]) if lines else 0.0
     return float(error.sum() / count * shares.sum(dtype=np.float64) + spectrum.dropped + tail)
 
 
@@ -82,12 +85,10 @@ def _drawn(
     # Evenly spread numbers in random order: less noise than independent ones.
     places = (np.arange(count) + random.random(count)) / count * total[-1]
     row, column = np.unravel_index(np.minimum(np.searchsorted(total, places), total.size - 1), shares.shape)
-    if spectrum.extent == "tile":
-        # The lobes end at their reach.
-        inside = -np.expm1(-(spectrum.reach**2) / 2)
-        radius = spectrum.lobe_width * np.sqrt(-2 * np.log1p(-inside * random.random(count)))
-        angle = 2 * np.pi * random.random(count)
-        offset = radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    if isinstance(spectrum.grid, OrderGrid):
+        # The lobes end at their half widths.
+        inside = np.array([lobe.inside for lobe in spectrum.lobes])
+        offset = spectrum.lobe_width * scipy.special.ndtri(0.5 + inside * (random.random((count, 2)) - 0.5))
     else:
         # A quadratic B-spline is the density of the sum of three uniform numbers.
         offset = random.uniform(-0.5, 0.5, (3, count, 2)).sum(axis=0) * spectrum.grid.spacing

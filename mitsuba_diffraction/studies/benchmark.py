@@ -22,7 +22,7 @@ from .accuracy import Accuracy, Exact
 from .cases import Case
 from .sampling import Sampling
 from .shader_speed import ShaderSpeed, shader_speeds
-from .speed import Rays, packets, seconds
+from .speed import Rays, blank, seconds
 
 REPRESENTATIONS = ("slices", "svd", "chebyshev", "taylor")
 TOLERANCES = (1e-2, 1e-3)
@@ -32,7 +32,7 @@ COLUMNS = {
     "represen-\ntation": "{.representation}",
     "toler-\nance": "{.tolerance:g}",
     "terms": "{.terms}",
-    "floats\nread": "{.floats}",
+    "words\nread": "{.words}",
     "MB": "{.megabytes:.3g}",
     "build\ns": "{.build_seconds:.2g}",
     "L1\nerror": "{.accuracy.l1:.1e}",
@@ -57,11 +57,11 @@ class Result:
         tolerance: what was asked for.
         refused: why there is no such spectrum; then the rest is None.
         terms: of the series, or intervals of the slices.
-        floats: that one evaluation of S reads from the table.
+        words: of 32 bits that one evaluation of S reads from the table.
         megabytes: of the table.
         build_seconds: of `precompute`.
         evaluations: of eval_pdf per second, four wavelengths each.
-        read_ratio: of bare reading of the same floats, which bounds any evaluation, to eval_pdf of roughconductor (Al).
+        read_ratio: of bare reading of the same words, which bounds any evaluation, to eval_pdf of roughconductor (Al).
         evaluate_ratio: to eval_pdf of roughconductor (Al) in the same run.
         sample_ratio: of sample to that of roughconductor (Al) in the same run.
         accuracy: against the float64 reference.
@@ -73,7 +73,7 @@ class Result:
     tolerance: float
     refused: str | None = None
     terms: int | None = None
-    floats: int | None = None
+    words: int | None = None
     megabytes: float | None = None
     build_seconds: float | None = None
     evaluations: float | None = None
@@ -151,7 +151,7 @@ def _measured(
     work = {}
     for name, (spectrum, _) in built.items():
         bsdfs[name] = mi.load_dict({"type": "diffraction_grating", "spectrum": spectrum, "material": "Al"})
-        work[name, "read"] = functools.partial(rays.read, spectrum, packets(spectrum))
+        work[name, "read"] = functools.partial(rays.read, spectrum, blank(spectrum))
     for name, bsdf in bsdfs.items():
         work[name, "evaluate"] = functools.partial(rays.evaluate, bsdf)
         work[name, "sample"] = functools.partial(rays.sample, bsdf)
@@ -159,7 +159,7 @@ def _measured(
     return {
         name: {
             "terms": table.intervals if isinstance(table := spectrum.table, SliceTable) else table.series.terms,
-            "floats": spectrum.floats_per_evaluation,
+            "words": spectrum.words_per_evaluation,
             "megabytes": spectrum.megabytes,
             "build_seconds": build_seconds,
             "evaluations": rays.count / taken[name, "evaluate"],

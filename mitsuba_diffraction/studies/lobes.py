@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 
 TOLERANCE = 1e-5
 """Of the spectra: an analytic check to 1e-4 is to see the model, not its tables."""
-_RADII, _ANGLES = 16, 16
+_POINTS = 16
 
 
 def grating(spectrum: GratingSpectrum, conserve: bool = True, **parameters: Any) -> mi.BSDF:
@@ -67,7 +67,7 @@ def density(bsdf: mi.BSDF, wi: Array, wo: Array, wavelength: float) -> Array:
 def lobe_powers(bsdf: mi.BSDF, spectrum: GratingSpectrum, wi: Array, q: ArrayLike, wavelength: float) -> Array:
     """The share of the incident power that is reflected into the lobes about q: ∫ f cos θ_o dω_o = λ² ∫ f dq.
 
-    Gauss–Legendre points along the radius, equal angles around; a lobe ends at the reach of the spectrum.
+    By Gauss–Legendre quadrature over the square at which a lobe ends.
 
     Args:
         bsdf: of the spectrum.
@@ -79,13 +79,11 @@ def lobe_powers(bsdf: mi.BSDF, spectrum: GratingSpectrum, wi: Array, q: ArrayLik
     Returns:
         (n,).
     """
-    x, weights = np.polynomial.legendre.leggauss(_RADII)
+    x, weights = np.polynomial.legendre.leggauss(_POINTS)
     reach = spectrum.reach * spectrum.lobe_width
-    radius = (x + 1) / 2 * reach
-    angle = 2 * np.pi * (np.arange(_ANGLES) + 0.5) / _ANGLES
-    area = np.repeat(weights * reach / 2 * radius * 2 * np.pi / _ANGLES, _ANGLES)
-    offset = (radius[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], -1)).reshape(-1, 2)
+    offset = reach * np.stack(np.meshgrid(x, x), axis=-1).reshape(-1, 2)
     points = np.asarray(q, np.float64)[:, None, :] + offset
+    area = reach**2 * np.outer(weights, weights).ravel()
     return brdf(bsdf, wi, towards(wi, points, wavelength), wavelength) @ area * wavelength**2
 
 

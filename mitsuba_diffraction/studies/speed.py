@@ -39,12 +39,12 @@ class Rays:
         sample, weight = bsdf.sample(mi.BSDFContext(), self.si, self.sample1, self.sample2)
         dr.eval(sample.wo, sample.pdf, weight)
 
-    def read(self, spectrum: GratingSpectrum, table: mi.Float) -> None:
-        """What no evaluation can do without: the packets of four floats about each q, gathered and added up.
+    def read(self, spectrum: GratingSpectrum, table: mi.UInt32) -> None:
+        """What no evaluation can do without: the words about each q, gathered and added up.
 
         Args:
-            spectrum: says which nodes and how many packets.
-            table: of `packets(spectrum)`.
+            spectrum: says which nodes and how many words.
+            table: of `blank(spectrum)`.
         """
         q_x, q_y = spectrum.grid.frequencies()
         largest_x, largest_y = spectrum.grid.largest
@@ -52,6 +52,8 @@ class Rays:
         dr.make_opaque(spacing_x, spacing_y)
         rows, columns = spectrum.grid.shape
         count_x, count_y = spectrum.neighbours
+        words = spectrum.table.words_per_node
+        packet, packets = (mi.UInt32, words) if words < 4 else (mi.Vector4u, words // 4)
         wi = self.si.wi
         result = mi.UnpolarizedSpectrum(0.0)
         for channel in range(len(result)):
@@ -60,12 +62,12 @@ class Rays:
             m_y = mi.Int32(dr.round((wi.y + self.wo.y) / (wavelength * spacing_y)))
             inside = (dr.abs(m_x) <= largest_x) & (dr.abs(m_y) <= largest_y)
             node = mi.UInt32(dr.select(inside, (m_y + largest_y) * columns + m_x + largest_x, 0))
-            total = mi.Vector4f(0.0)
-            for packet in range(packets_per_node(spectrum)):
-                for i, j in np.ndindex(count_y, count_x):
-                    near = dr.minimum(node + i * columns + j, rows * columns - 1)
-                    total += dr.gather(mi.Vector4f, table, near + packet * (rows * columns), inside)
-            result[channel] = dr.sum(total)
+            total = packet(0)
+            for i, j in np.ndindex(count_y, count_x):
+                near = dr.minimum(node + i * columns + j, rows * columns - 1)
+                for part in range(packets):
+                    total += dr.gather(packet, table, packets * near + part, inside)
+            result[channel] = mi.Float(dr.sum(total))
         dr.eval(result)
 
 
@@ -75,16 +77,11 @@ def _directions(random: np.random.Generator, count: int) -> np.ndarray:
     return np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], axis=-1)
 
 
-def packets_per_node(spectrum: GratingSpectrum) -> int:
-    """Packets of four floats."""
-    return -(-spectrum.table.floats_per_node // 4)
-
-
-def packets(spectrum: GratingSpectrum) -> mi.Float:
-    """Zeros as many as the table of a spectrum holds at run time."""
-    floats = dr.zeros(mi.Float, 4 * spectrum.grid.shape[0] * spectrum.grid.shape[1] * packets_per_node(spectrum))
-    dr.make_opaque(floats)
-    return floats
+def blank(spectrum: GratingSpectrum) -> mi.UInt32:
+    """Zeros as many as the words of one κ that the table of a spectrum holds at run time."""
+    words = dr.zeros(mi.UInt32, int(np.prod(spectrum.grid.shape)) * spectrum.table.words_per_node)
+    dr.make_opaque(words)
+    return words
 
 
 def seconds(work: Mapping[Name, Callable[[], None]], repetitions: int) -> dict[Name, float]:

@@ -24,7 +24,6 @@ from ...shader.evaluate import VARIANTS
 from ...shader.flss import FLSS
 from ...shader.quirks import Quirks
 from ...shader.tristimulus import EMISSION, primary_spectra
-from ..speed import packets_per_node
 from .integrators import same_light, without_gratings
 
 Progress = Callable[[int, int], None]
@@ -136,11 +135,9 @@ class Pictures:
 
     @property
     def model_reads(self) -> int:
-        """How many packets of four numbers one BRDF value of the project's model reads for the wavelengths of a ray."""
-        wavelengths = len(mi.UnpolarizedSpectrum(0))
-        return wavelengths * max(
-            spectrum.neighbours[0] * spectrum.neighbours[1] * packets_per_node(spectrum) for spectrum in self.spectra
-        )
+        """How many packets of at most 16 bytes one BRDF value of the model reads for the wavelengths of a ray."""
+        packets = [np.prod(s.neighbours) * -(-s.table.words_per_node // 4) for s in self.spectra]
+        return len(mi.UnpolarizedSpectrum(0)) * int(max(packets))
 
     @property
     def left_out(self) -> float | None:
