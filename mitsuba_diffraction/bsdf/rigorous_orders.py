@@ -99,7 +99,7 @@ class RigorousOrders:
             active: mask.
         """
         q_x, q_y = -(source.x + exit_.x) * frequency, -(source.y + exit_.y) * frequency
-        first = mi.Int32(dr.ceil((q_x - self.radius) * self.period))
+        first = mi.Int32(dr.ceil((q_x - self.half_width) * self.period))
         nu = self.period * frequency
         k_y, c = 0.5 * nu * (exit_.y - source.y), 0.5 * nu * (exit_.x - source.x)
         g = dr.sqrt(dr.maximum(dr.square(nu) - dr.square(k_y), 0))
@@ -107,9 +107,10 @@ class RigorousOrders:
         rows = [mi.Vector4f(0.0) for _ in range(4)]
         for step in range(self.count):
             m = first + step
-            square = self._square(m, q_x, q_y)
-            there = active & (square <= self.farthest) & (dr.abs(m) <= self.axes.largest)
-            lobe = dr.select(there, dr.exp(self.falloff * square), 0)
+            offset = dr.fma(-self.pitch, mi.Float(m), q_x)
+            there = active & (dr.abs(offset) <= self.half_width) & (dr.abs(q_y) <= self.half_width)
+            there &= dr.abs(m) <= self.axes.largest
+            lobe = dr.select(there, dr.exp(self.falloff * (dr.square(offset) + dr.square(q_y))), 0)
             for row, found in enumerate(self._matrix(m, c, g, z, there)):
                 rows[row] += lobe * found
         bright = rows[0].x > 0
