@@ -38,7 +38,7 @@ CHUNK = 1 << 16  # points that are computed at once, so that they stay in the ca
 
 PLACES = 1024  # directions and wavelengths of one round
 POINTS = 256  # by which A is estimated at each
-CANDIDATES, REPETITIONS, MORE_POINTS = 96, 4, 512  # the largest are computed again, less twice their noise
+CANDIDATES, REPETITIONS, MORE_POINTS = 32, 4, 512  # the largest are computed again, less twice their noise
 ROUNDS = 10
 LITTLE = 0.02  # what an albedo may exceed one by without more than the nodes about it being lowered anew
 STEEPEST = 89.9  # degrees
