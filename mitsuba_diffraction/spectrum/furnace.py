@@ -27,7 +27,7 @@ from scipy.stats import qmc
 from ..geometry import k_g
 from .albedo import DEEP, SLACK
 from .energy_table import EnergyTable
-from .orders import LobeAxis
+from .orders import LobeAxis, OrderGrid
 from .spline_grid import SplineGrid, spline_integral
 
 if TYPE_CHECKING:
@@ -54,6 +54,7 @@ MANY, MUCH = 12, 0.1  # places where A exceeds that, or what it exceeds one by, 
 WIDEST = 2  # cells about a place
 ROUNDS = 10
 STEEPEST = 89.9  # degrees
+GRAZING = 3e-3  # the least cos θ_o of places where an order emerges
 
 
 class _Gaussian:
@@ -149,6 +150,12 @@ class Furnace:
         x, y = (np.array(e) for e in edges)
         self._centre = np.stack(np.meshgrid(x.mean(-1), y.mean(-1)), -1).reshape(-1, 2)
         self._radius = np.hypot(*np.meshgrid(np.ptp(x, axis=1) / 2, np.ptp(y, axis=1) / 2)).ravel() + self._lobe.radius
+
+    def drawn_nodes(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+        """The frequencies (n, 2) of nodes drawn by their power over all κ, cycles/µm."""
+        node = np.searchsorted(self._cumulative, rng.random(count) * self._cumulative[-1], side="right") - 1
+        node = np.minimum(node, len(self._row) - 1)
+        return np.stack([self._q_x[self._column[node]], self._q_y[self._row[node]]], -1)
 
     def albedo(
         self,
@@ -358,6 +365,25 @@ def random_places(
     return directions, rng.uniform(*wavelengths, count) * 1e-3
 
 
+def _emerging(
+    furnace: Furnace, rng: np.random.Generator, directions: NDArray[np.float64], wavelengths: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Directions for which an order leaves near the horizon (a Rayleigh line), where an albedo peaks within a degree.
+
+    An order drawn by its power leaves at an azimuth and a log(cos θ_o) that are evenly distributed. Where no direction
+    sends it there, the given ones stay: (n, 3).
+    """
+    q = furnace.drawn_nodes(rng, len(directions))
+    cosine, phi = np.exp(rng.uniform(np.log(GRAZING), np.log(0.5), len(q))), rng.uniform(0, 2 * np.pi, len(q))
+    out = np.sqrt(1 - cosine**2)[:, None] * np.stack([np.cos(phi), np.sin(phi)], -1)
+    tangential = -wavelengths[:, None] * q - out
+    square = (tangential**2).sum(-1)
+    there = square < np.sin(np.deg2rad(STEEPEST)) ** 2
+    found = directions.copy()
+    found[there] = np.concatenate([tangential[there], np.sqrt(1 - square[there])[:, None]], -1)
+    return found
+
+
 def conserving(spectrum: GratingSpectrum, table: EnergyTable, height_scale: float = 1.0) -> EnergyTable:
     """The table, lowered where the albedo exceeds one, with the excess and the loss that were measured.
 
@@ -372,13 +398,17 @@ def conserving(spectrum: GratingSpectrum, table: EnergyTable, height_scale: floa
     places = PLACES_DEEP if spectrum.largest_kappa * spectrum.height_range > DEEP else PLACES
     for attempt in range(ROUNDS):
         directions, wavelengths = random_places(rng, places, spectrum.wavelengths)
+        anywhere = np.ones(places, bool)
+        if isinstance(spectrum.grid, OrderGrid):
+            anywhere[places // 2 :] = False
+            directions[~anywhere] = _emerging(furnace, rng, directions[~anywhere], wavelengths[~anywhere])
         total, lost = np.zeros(len(directions)), None
         for count, points in SCREENED:
             first = _largest(total, count)
             directions, wavelengths = directions[first], wavelengths[first]
             total, _, raw = furnace.albedo(directions, wavelengths, table, points, rng, height_scale)
             if lost is None:
-                lost = (1 - table.at(directions, wavelengths))[raw <= 1]
+                lost = (1 - table.at(directions, wavelengths))[(raw <= 1) & anywhere[first]]
         first = _largest(total, BOUNDED[0][0])
         directions, wavelengths = directions[first], wavelengths[first]
         albedo, local, raw = furnace.bounded(directions, wavelengths, table, rng, height_scale)
