@@ -34,6 +34,8 @@ class LineSpectrum:
         self.cells = None if self.apart else CellSampler(spectrum)
         self.orders = OrderSampler(spectrum) if self.apart else None
         self.columns = grid.shape[1]
+        self.deviation = opaque(sigma)
+        self.inside = opaque(spectrum.lobes[0].inside * spectrum.lobes[1].inside)
 
     def evaluate(
         self,
@@ -97,7 +99,8 @@ class LineSpectrum:
             lobes_x, lobes_y = self.axes[0].lobes(m_x, q_x), self.axes[1].lobes(m_y, q_y)
             power = self._power(m_x, m_y, lobes_x, lobes_y, kappa, near)
             order = mi.UInt32((m_y + self.axes[1].largest) * self.columns + m_x + self.axes[0].largest)
-            density = lobes_x[0] * lobes_y[0] * self.orders.share(order, self.orders.weights(incidence, near), near)
+            density = self.inside * lobes_x[0] * lobes_y[0]
+            density *= self.orders.share(order, self.orders.weights(incidence, near), near)
         return power, density
 
     def sample(
@@ -111,7 +114,10 @@ class LineSpectrum:
         if self.cells is not None:
             return self.cells.sample(incidence, u, v, active)
         row, column, v = self.orders.sample(incidence, u, v, active)
-        return self.axes[0].draw(column, v.x), self.axes[1].draw(row, v.y)
+        # A Gaussian as a whole: where it was truncated there is nothing, and the density knows.
+        radius = self.deviation * dr.sqrt(-2 * dr.log(1 - v.x))
+        sin, cos = dr.sincos(dr.two_pi * v.y)
+        return self.axes[0].place(column, radius * cos), self.axes[1].place(row, radius * sin)
 
 
 class _Axis:
@@ -123,12 +129,11 @@ class _Axis:
         # A window that lies beyond the grid reads zeros only.
         self.rim = 0 if self.all else self.count
         self.size, self.pitch = opaque(size), opaque(1 / size)
-        self.half_width, self.inside = opaque(min(lobe.half_width, 1e30)), opaque(lobe.inside)
+        self.half_width = opaque(min(lobe.half_width, 1e30))
         self.falloff = opaque(-0.5 / sigma**2)
         self.peak = opaque(1 / (np.sqrt(2 * np.pi) * sigma * lobe.inside))
         self.slope = opaque(1 / (size * sigma**2))
         self.steps = [opaque(np.exp(-0.5 * (k / (size * sigma)) ** 2)) for k in range(1, 0 if self.all else self.count)]
-        self.deviation = opaque(np.sqrt(2) * sigma)
 
     def first(self, q: mi.Float) -> mi.Int32:
         """The first of the `count` orders that hold at q (cycles/µm)."""
@@ -155,7 +160,6 @@ class _Axis:
             lobes.append(lobe * step)
         return lobes
 
-    def draw(self, node: mi.Int32, u: mi.Float) -> mi.Float:
-        """A q in the lobe of the order at a row or column, cycles/µm."""
-        offset = self.deviation * dr.erfinv(self.inside * (2 * u - 1))
+    def place(self, node: mi.Int32, offset: mi.Float) -> mi.Float:
+        """The q that is off the order at a row or column by so much, cycles/µm."""
         return dr.fma(self.pitch, mi.Float(node) - self.largest, offset)
