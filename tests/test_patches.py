@@ -32,8 +32,10 @@ def test_the_patches_are_those_of_the_seeds_in_turn(recipe):
     assert recipe.height_field().digest == wanted[0]
 
 
-def test_the_spectrum_is_the_mean_of_theirs(recipe, spectrum):
+def test_the_spectrum_is_the_mean_of_theirs(recipe):
     fields = recipe.height_fields()
+    # Lobes so narrow that the orders are not gathered on a lattice.
+    spectrum = Recipe(recipe.surface, {"coherence_length": 60}).build()
     m_x, m_y = spectrum.grid.axes()
     for kappa in np.array([0.0, 0.21, 0.47, 0.83, 1.0]) * spectrum.largest_kappa:
         wanted = np.mean([order_powers(field, kappa)[np.ix_(m_y, m_x)] for field in fields], axis=0)

@@ -300,7 +300,7 @@ class _Build:
 
     Attributes:
         kept: the grid without the weak frequencies at its rim.
-        dropped: the largest share of the power outside of it.
+        dropped: the largest share of the power outside of it, at most.
         beyond: the largest share of the power that the whole grid does not reach.
     """
 
@@ -316,7 +316,7 @@ class _Build:
         self._range = height_range
         self._largest_kappa = largest_kappa
         self._allowed = allowed
-        self._progress = progress
+        self._progress, self._done = progress, 0
         self._x = largest_kappa * height_range / 2
         self._nodes = nodes_for(self._x, 0.01 * allowed)
         self._survey()
@@ -327,35 +327,41 @@ class _Build:
     def _survey(self) -> None:
         """Over the Chebyshev nodes in κ: where the power lies, and a pilot, the strongest frequencies."""
         kappas = (1 + chebyshev_nodes(self._nodes)) / 2 * self._largest_kappa
-        grid = self._exact.grid
-        rims, missing = ([], []), []
-        for kappa in kappas:
+        grid, report = self._exact.grid, self._phase(0.0, 0.3)
+        rims, missing, total, strongest = ([], []), [], 0.0, None
+        pilot = np.empty((self._nodes, min(_PILOT, int(np.prod(grid.shape)))))
+        for j, kappa in enumerate(kappas):
             power = self._exact(kappa)
             missing.append(1 - self._exact.reached(power))
+            size = np.abs(power)
+            total += size.sum()
             for axis in (0, 1):
-                rims[axis].append(_rim(np.abs(power).sum(axis=axis)))
+                rims[axis].append(_rim(size.sum(axis=axis)))
+            if strongest is None:
+                strongest = np.sort(np.argpartition(-size, pilot.shape[1] - 1, axis=None)[: pilot.shape[1]])
+            pilot[j] = power.ravel()[strongest]
+            report(j + 1, self._nodes)
         # Between the nodes more may be missing, or lie at the rim.
         between = self._between()[1]
         self.beyond = float(np.clip((between @ missing).max(), 0, 1))
-        largest = []
+        largest, self.dropped = [], 0.0
         for whole, rim in zip(grid.largest, rims, strict=True):
             outside = (between @ np.array(rim)).max(axis=0)
             largest.append(int(np.argmax(outside <= _DROP_SHARE / 2 * self._allowed)) if whole else 0)
+            self.dropped += float(np.clip(outside[largest[-1]], 0, 1))
         self.kept = dataclasses.replace(grid, largest=tuple(largest))
-        dropped, total, strongest = [], 0.0, None
-        pilot = np.empty((self._nodes, min(_PILOT, int(np.prod(self.kept.shape)))))
-        for j, kappa in enumerate(kappas):
-            whole = self._exact(kappa)
-            power = whole[inner(grid, self.kept)].ravel()
-            dropped.append(np.abs(whole).sum() - np.abs(power).sum())
-            if strongest is None:
-                strongest = np.sort(np.argpartition(-np.abs(power), pilot.shape[1] - 1)[: pilot.shape[1]])
-            pilot[j] = power[strongest]
-            total += np.abs(power).sum()
-        self.dropped = float(np.clip((between @ dropped).max(), 0, 1))
         self._pilot = pilot
         # The others are taken to err as much for their power.
         self._pilot_share = float(np.abs(pilot).sum() / total)
+
+    def _phase(self, begin: float, end: float) -> Progress:
+        """Reports a part of the whole, in per cent; what is done again does not count back."""
+
+        def report(done: int, total: int) -> None:
+            self._done = max(self._done, round(100 * (begin + (end - begin) * done / total)))
+            self._progress(self._done, 100)
+
+        return report
 
     def __call__(self, representation: str) -> tuple[Table, float]:
         """The cheapest table of this representation, and its measured error."""
@@ -382,7 +388,7 @@ class _Build:
         if representation == SliceTable.representation:
             intervals = self._intervals(allowed, storage.terms)
             _check_size(self.kept.shape, intervals * storage.terms)
-            table = SliceTable.build(intervals, storage.terms, self._largest_kappa, self._powers, self._progress)
+            table = SliceTable.build(intervals, storage.terms, self._largest_kappa, self._powers, self._phase(0.3, 0.8))
             # What is measured is what is stored.
             rounded = storage.rounded(table.values)
             return dataclasses.replace(table, values=rounded) if np.isfinite(rounded).all() else table
@@ -397,7 +403,7 @@ class _Build:
             whole = kind(self._largest_kappa, self._nodes)
             series = kind(self._largest_kappa, self._terms(whole, allowed))
         _check_size(self.kept.shape, series.terms)
-        return SeriesTable.build(series, self._nodes, self._powers, self._progress)
+        return SeriesTable.build(series, self._nodes, self._powers, self._phase(0.3, 0.8))
 
     def _refusal(self, representation: str, error: float | None) -> str:
         if representation == TaylorSeries.name:
@@ -455,7 +461,11 @@ class _Build:
         count = 12 + int(np.ceil(2 * self._x))
         golden = (np.sqrt(5) - 1) / 2
         held_out = self._largest_kappa * np.concatenate([[0.0, 1.0], np.sqrt((np.arange(1, count) * golden) % 1)])
-        return max(self._exact.error(self.kept, table.powers(kappa), kappa) for kappa in held_out)
+        worst, report = 0.0, self._phase(0.8, 1.0)
+        for number, kappa in enumerate(held_out, 1):
+            worst = max(worst, self._exact.error(self.kept, table.powers(kappa), kappa))
+            report(number, len(held_out))
+        return worst
 
 
 def _rim(profile: NDArray[np.float64]) -> NDArray[np.float64]:
