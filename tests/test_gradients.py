@@ -287,7 +287,7 @@ def test_changes_rebuild_only_what_depends_on_them(monkeypatch):
     bsdf = mi.load_dict(grating("deep blazed", int_ior=1.5, base={"type": "diffuse", "reflectance": uniform(0.3)}))
     parameters = mi.traverse(bsdf)
     tables = Count(monkeypatch, shared, "energy_table")
-    lines = Count(monkeypatch, shared, "LineSpectrum")
+    lines = Count(monkeypatch, shared, "OrderSpectrum")
     scattering, table = bsdf.scattering, bsdf.energy
     for key, value in (("orientation.value", 20.0), ("eta", 1.4), ("base.reflectance.value", 0.1)):
         assert key in parameters

@@ -11,8 +11,8 @@ from bsdf_support import WAVELENGTHS, albedo, direction, draw, hemisphere, plugi
 import mitsuba_diffraction as md
 from mitsuba_diffraction.bsdf.cell_sampler import CellSampler
 from mitsuba_diffraction.bsdf.incidence import Incidence
-from mitsuba_diffraction.bsdf.line_spectrum import LineSpectrum
 from mitsuba_diffraction.bsdf.order_sampler import OrderSampler
+from mitsuba_diffraction.bsdf.order_spectrum import OrderSpectrum
 
 BUNDLED = {
     "blazed": lambda: md.gratings.blazed(2.5, 0.246),
@@ -330,8 +330,8 @@ def test_many_orders_are_drawn_without_a_rectangle(llvm):
 
 
 def test_cells_serve_where_orders_overlap(llvm):
-    assert LineSpectrum(bundled("elaphe")).cells is not None
-    assert LineSpectrum(bundled("blazed")).orders is not None
+    assert OrderSpectrum(bundled("elaphe")).cells is not None
+    assert OrderSpectrum(bundled("blazed")).orders is not None
 
 
 # ---------------------------------------------------------------- other variants

@@ -81,7 +81,7 @@ rotate it without reflecting it; the back of a `twosided` shows its mirror image
 first edge of each triangle and is discontinuous: such a mesh needs UVs. Where dp_du vanishes Mitsuba picks an axis.
 
 The BRDF is R · K · G · S(q; κ)/λ² · E: R the power reflectance at the half vector, K and G as in `geometry.py`, S as in
-`line_spectrum.py` (of a tile) or `smooth_spectrum.py` (of a sample), with q = −(ω_i + ω_o)/λ along the pattern's axes
+`order_spectrum.py` (orders) or `spline_spectrum.py` (a lattice), with q = −(ω_i + ω_o)/λ along the pattern's axes
 and κ = 2π (cos θ_i + cos θ_o)/λ. E, as in `energy.py`, bounds the albedo by one; it is one where the albedo is
 below one without it. Without shadowing K diverges as 1/cos θ near the horizon: from 85° on E then falls with cos θ.
 

@@ -16,9 +16,9 @@ from ..spectrum.energy_table import EnergyTable
 from ..spectrum.furnace import conserving
 from ..spectrum.orders import OrderGrid
 from .energy import Energy
-from .line_spectrum import LineSpectrum
+from .order_spectrum import OrderSpectrum
 from .rigorous_orders import RigorousOrders
-from .smooth_spectrum import SmoothSpectrum
+from .spline_spectrum import SplineSpectrum
 
 STEP = 1e-3  # of height_scale, for the derivative of the energy table
 
@@ -39,7 +39,7 @@ class SharedTables:
         if isinstance(spectrum, RigorousSpectrum):
             self.scattering = RigorousOrders(spectrum)
         else:
-            self.scattering = (LineSpectrum if isinstance(spectrum.grid, OrderGrid) else SmoothSpectrum)(spectrum)
+            self.scattering = (OrderSpectrum if isinstance(spectrum.grid, OrderGrid) else SplineSpectrum)(spectrum)
         self._spectrum = spectrum
         self._gathered: GatheredSpectrum | None = None
         self._tables: dict[tuple[str, float], EnergyTable] = {}

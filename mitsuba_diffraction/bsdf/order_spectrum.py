@@ -15,7 +15,7 @@ from .order_sampler import OrderSampler
 from .tables import opaque
 
 
-class LineSpectrum:
+class OrderSpectrum:
     """S(q; κ) = Σ_m η_m(κ) N(q − m/T; σ_q² I), and the density from which q is drawn.
 
     N ends as `OrderGrid.lobes` says. Orders that stand apart need one of them, so that one evaluation reads

@@ -1,4 +1,4 @@
-"""S(q; κ) of a sample at run time: a lattice of quadratic B-splines, without sharp lines."""
+"""S(q; κ) on a lattice of quadratic B-splines at run time: of a sample, and of a tile whose orders overlap."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .tables import opaque
 RIM = 3  # rings of zeros, so many as are read in a row
 
 
-class SmoothSpectrum:
+class SplineSpectrum:
     """S(q; κ) = Σ_m c_m(κ) B(q/Δ − m)/(Δ_x Δ_y) (`SplineGrid`), and the density from which q is drawn.
 
     One evaluation reads three by three nodes and one packet for the density.
