@@ -125,9 +125,11 @@ def test_derivative_by_height_includes_the_energy_factor(at):
         dr.backward(dr.sum(f * mi.Float(total.weights.astype(np.float32))))
         return dr.grad(x)[0]
 
-    np.testing.assert_allclose(slope(1.0), wanted, rtol=0.01)
+    # The derivatives of S and of E may cancel to a hundredth and less; float32 keeps 1e-4 of each.
+    without = slope(0.0)
+    np.testing.assert_allclose(slope(1.0), wanted, rtol=0.01, atol=1e-4 * abs(without))
     # Without the derivative of E it would be another number.
-    assert abs(slope(0.0) - wanted) > 0.05 * abs(wanted)
+    assert abs(without - wanted) > 0.05 * abs(wanted)
 
 
 @pytest.mark.parametrize("key", ["eta.values", "k.values"])

@@ -83,7 +83,7 @@ first edge of each triangle and is discontinuous: such a mesh needs UVs. Where d
 The BRDF is R · K · G · S(q; κ)/λ² · E: R the power reflectance at the half vector, K and G as in `geometry.py`, S as in
 `order_spectrum.py` (orders) or `spline_spectrum.py` (a lattice), with q = −(ω_i + ω_o)/λ along the pattern's axes
 and κ = 2π (cos θ_i + cos θ_o)/λ. E, as in `energy.py`, bounds the albedo by one; it is one where the albedo is
-below one without it. Without shadowing K diverges as 1/cos θ near the horizon: from 85° on E then falls with cos θ.
+below one without it. Without shadowing K diverges as 1/cos θ near the horizon: from 85° on E then falls with cos² θ.
 
 Of rigorous theory the BRDF is Σ_m η_m N(q − m/T; σ_q² I)/λ², as in `rigorous_orders.py`: R, K, G and E are in η_m.
 
