@@ -54,7 +54,6 @@ MANY, MUCH = 12, 0.1  # places where A exceeds that, or what it exceeds one by, 
 WIDEST = 2  # cells about a place
 ROUNDS = 10
 STEEPEST = 89.9  # degrees
-FEW, LEAST_POINTS = 128, 4  # nodes that are all summed, each by so many points at least
 GRAZING = 3e-3  # the least cos θ_o of places where an order emerges
 
 
@@ -216,35 +215,18 @@ class Furnace:
                 break
         return result
 
-    def _all(
+    def _albedo(
         self,
         directions: NDArray[np.float64],
         wavelengths: NDArray[np.float64],
-        per_cosine: NDArray[np.float64],
-        shadowing: bool,
+        table: EnergyTable,
         x: NDArray[np.float64],
-    ) -> tuple[NDArray, ...]:
-        """As `_drawn`, but the nodes in turn: an albedo of few orders has peaks that a draw among them would hide."""
-        points = max(LEAST_POINTS, x.shape[1] // len(self._row))
-        tangent = directions[:, None, :2] + wavelengths[:, None, None] * np.stack(
-            [self._q_x[self._column], self._q_y[self._row]], -1
-        )
-        i, node = np.nonzero(1 + wavelengths[:, None] * self._lobe.radius > np.hypot(*tangent.T).T)
-        places = x[i, :points]
-        i, node = np.repeat(i, points), np.repeat(node, points)
-        return i, node, np.full(len(i), 1 / points), places[..., 1].ravel(), places[..., 2].ravel()
-
-    def _drawn(
-        self,
-        directions: NDArray[np.float64],
-        wavelengths: NDArray[np.float64],
-        per_cosine: NDArray[np.float64],
-        shadowing: bool,
-        x: NDArray[np.float64],
-    ) -> tuple[NDArray, ...]:
-        """Nodes drawn by what they reflect: the number of the place, the node, its weight, and two numbers 0 to 1."""
+        height_scale: float,
+    ) -> NDArray[np.float64]:
         count, points = x.shape[:2]
+        spectrum, shadowing = self._spectrum, table.shadowing == "v_cavity"
         cos_i = directions[:, 2]
+        per_cosine = 2 * np.pi * height_scale / wavelengths
 
         # The blocks: by their power at κ, times K G cos θ_o at their middle.
         out = wavelengths[:, None, None] * self._centre + directions[:, None, :2]
@@ -252,7 +234,7 @@ class Furnace:
         radius = wavelengths[:, None] * self._radius
         cos_o = np.sqrt(np.maximum(1 - square, 0.25 * np.minimum(radius, 1)))
         d = (((out - directions[:, None, :2]) ** 2).sum(-1) + (cos_i[:, None] + cos_o) ** 2) / 2
-        bins = per_cosine[:, None] * (cos_i[:, None] + cos_o) / self._spectrum.largest_kappa * BINS
+        bins = per_cosine[:, None] * (cos_i[:, None] + cos_o) / spectrum.largest_kappa * BINS
         density = self._density[np.minimum(bins.astype(np.int64), BINS - 1), np.arange(len(self._first) - 1)]
         density *= np.where(square < (1 + radius) ** 2, k_g(cos_i[:, None], cos_o, d, shadowing), 0)
         cumulative = np.cumsum(density, axis=-1)
@@ -269,24 +251,8 @@ class Furnace:
         node = np.clip(node, self._first[block], self._first[block + 1] - 1)
         weight = self._block_mass[block] / np.maximum(chosen * self._mass[node], 1e-300)
 
-        place = np.repeat(np.arange(count), points)
-        return place, node.ravel(), weight.ravel() / points, x[..., 1].ravel(), x[..., 2].ravel()
-
-    def _albedo(
-        self,
-        directions: NDArray[np.float64],
-        wavelengths: NDArray[np.float64],
-        table: EnergyTable,
-        x: NDArray[np.float64],
-        height_scale: float,
-    ) -> NDArray[np.float64]:
-        count = len(x)
-        spectrum, shadowing = self._spectrum, table.shadowing == "v_cavity"
-        cos_i = directions[:, 2]
-        per_cosine = 2 * np.pi * height_scale / wavelengths
-
-        drawn = self._all if len(self._row) <= FEW else self._drawn
-        i, node, weight, first, second = drawn(directions, wavelengths, per_cosine, shadowing, x)
+        i, node, weight = np.repeat(np.arange(count), points), node.ravel(), weight.ravel() / points
+        first, second = x[..., 1].ravel(), x[..., 2].ravel()
         row, column = self._row[node], self._column[node]
         middle = np.stack([self._q_x[column], self._q_y[row]])
         q = middle + self._lobe.drawn(first, second)
