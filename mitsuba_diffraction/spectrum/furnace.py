@@ -43,6 +43,8 @@ CHUNK = 1 << 15  # points that are computed at once, so that they stay in the ca
 # same where it is largest.
 PLACES, PLACES_DEEP = 1024, 4096
 SCREENED = ((PLACES_DEEP, 64), (256, 256))
+# Then places about the largest, normally distributed by so many radians, as peaks are narrow.
+CLIMBERS, CHILDREN, CLIMBED = 48, 6, (0.03, 0.01)
 # The largest again, as long as a bound is too wide to decide, unless there are more such places: then it costs less to
 # lower the whole table a little.
 BOUNDED = ((48, 512), (48, 2048), (12, 8192))
@@ -409,6 +411,13 @@ def conserving(spectrum: GratingSpectrum, table: EnergyTable, height_scale: floa
             total, _, raw = furnace.albedo(directions, wavelengths, table, points, rng, height_scale)
             if lost is None:
                 lost = (1 - table.at(directions, wavelengths))[(raw <= 1) & anywhere[first]]
+        for spread in CLIMBED:
+            first = _largest(total, CLIMBERS)
+            directions, wavelengths, total = directions[first], wavelengths[first], total[first]
+            near = _about(rng, directions, wavelengths, spectrum.wavelengths, spread)
+            risen = furnace.albedo(*near, table, SCREENED[-1][1], rng, height_scale)[0]
+            directions, wavelengths = np.concatenate([directions, near[0]]), np.concatenate([wavelengths, near[1]])
+            total = np.concatenate([total, risen])
         first = _largest(total, BOUNDED[0][0])
         directions, wavelengths = directions[first], wavelengths[first]
         albedo, local, raw = furnace.bounded(directions, wavelengths, table, rng, height_scale)
@@ -420,6 +429,22 @@ def conserving(spectrum: GratingSpectrum, table: EnergyTable, height_scale: floa
         )
     loss = (float(lost.mean()), float(lost.max())) if len(lost) else (0.0, 0.0)
     return dataclasses.replace(table, excess=float(albedo.max() - 1), loss=loss)
+
+
+def _about(
+    rng: np.random.Generator,
+    directions: NDArray[np.float64],
+    wavelengths: NDArray[np.float64],
+    limits: tuple[float, float],
+    spread: float,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Places about others, CHILDREN of each: ω (n, 3) and λ (n,), normally distributed by `spread` radians and λ."""
+    directions, wavelengths = (np.repeat(x, CHILDREN, axis=0) for x in (directions, wavelengths))
+    near = directions + spread * rng.standard_normal(directions.shape)
+    near[:, 2] = np.maximum(near[:, 2], np.cos(np.deg2rad(STEEPEST)))
+    near /= np.linalg.norm(near, axis=-1, keepdims=True)
+    wavelengths = wavelengths * (1 + spread * rng.standard_normal(len(wavelengths)))
+    return near, np.clip(wavelengths, limits[0] * 1e-3, limits[1] * 1e-3)
 
 
 def _largest(values: NDArray[np.float64], count: int) -> NDArray[np.int64]:
