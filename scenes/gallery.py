@@ -96,7 +96,7 @@ def rendered(words: Sequence[str], seed: int) -> Array:
         target = Path(folder) / "picture.exr"
         # In this process, so that kernels are compiled and models read by Dr.Jit's and Mitsuba's own caches once.
         with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
-            app(small(words, seed, target), standalone_mode=False)
+            app(small(words, seed, target), standalone_mode=False, obj={})
         image = SpectralImage.load(target)
     return into_gamut(spectrum_to_linear_sRGB(image.radiance, image.wavelengths))
 
