@@ -25,6 +25,16 @@ _HEIGHT_RANGE = {"elaphe": 0.375, "xenopeltis": 0.819}
 """µm, black to white."""
 
 
+@pytest.hookimpl(tryfirst=True)  # before -m selects
+def pytest_collection_modifyitems(items):
+    """Marks what slow.txt lists as slow: what takes more than a second of a core (`--durations 0`), of each test with
+    many parameters all but the fastest."""
+    listed = set(Path(__file__).with_name("slow.txt").read_text(encoding="utf-8").splitlines())
+    for item in items:
+        if item.nodeid.removeprefix("tests/") in listed:
+            item.add_marker(pytest.mark.slow)
+
+
 @pytest.fixture(scope="session", autouse=True)
 def cache_folder(tmp_path_factory):
     """A folder for the spectra of recipes that lasts for this session only, the same for all its processes."""
