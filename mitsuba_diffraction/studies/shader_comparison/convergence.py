@@ -18,7 +18,7 @@ from ...files import whole_file
 from ...outputs import metadata
 from ..report import cells
 from .comparison import no_progress
-from .difference import difference, noise, white_luminance
+from .difference import as_shown, difference, noise, white_luminance
 from .pictures import Picture, Pictures, Progress
 
 TOLERANCES = (1e-1, 1e-2, 1e-3)
@@ -47,7 +47,8 @@ class Point:
         samples: per pixel; shading points of a shader.
         seconds: of rendering, without loading and compiling.
         delta_e: mean CIEDE2000 to the reference.
-        relative_mse: Σ (Y − Y_ref)²/Σ Y_ref² over the pixels that show surfaces, at the same mean luminance.
+        relative_mse: Σ (Y − Y_ref)²/Σ Y_ref² over the pixels that show surfaces, at the same mean luminance; Y is at most
+            white, as few pixels that are far brighter would tell of themselves only.
     """
 
     name: str
@@ -150,7 +151,8 @@ def convergence(
 
     def add(name: str, traced: bool, picture: Picture) -> None:
         delta_e = difference(reference.xyz, picture.xyz, of.surface, white)
-        wanted, found = reference.xyz[of.surface][:, 1], delta_e.exposure * picture.xyz[of.surface][:, 1]
+        wanted = as_shown(reference.xyz[of.surface] / white)[:, 1]
+        found = as_shown(picture.xyz[of.surface] * (delta_e.exposure / white))[:, 1]
         mse = float(((found - wanted) ** 2).sum() / (wanted**2).sum())
         points.append(Point(name, traced, picture.samples, picture.seconds, delta_e.mean, mse))
 
