@@ -15,7 +15,7 @@ from mitsuba_diffraction.spectrum.spline_grid import SplineGrid, spline_integral
 
 MOST = 1.002
 SEEDS = range(5000, 5040)
-"""Of the slow study, four minutes; any others serve. 5000 to 5499 were run once."""
+"""Of the slow study, four minutes; any others serve."""
 PIXELS = 64
 """Along a side, at most: with more, most of the time is spent on the spectrum."""
 OFFSETS = np.linspace(-1.5, 1.5, 4001)
@@ -155,7 +155,13 @@ def anywhere(rng, count):
         pytest.param(3, id="tile of 4 × 4 pixels, 8 µm deep"),  # 1.078 where e came from the gathered spectrum alone
         pytest.param(103, id="tile of 7 pixels, 1.8 µm deep"),
         pytest.param(2025, id="grating of 64 pixels, 8 µm deep", marks=pytest.mark.slow),
-        *(pytest.param(seed, marks=pytest.mark.slow) for seed in SEEDS),
+        # 1.046 where one set of places that found nothing ended the search.
+        pytest.param(5382, id="grating of 18 pixels, 3 µm deep", marks=pytest.mark.slow),
+        # 1.021 where the search did not go on about the largest albedos found.
+        pytest.param(5031, id="grating of 36 pixels, 3 µm deep", marks=pytest.mark.slow),
+        # 1.008 where no places were looked at where an order emerges.
+        pytest.param(5216, id="tile of 7 × 4 pixels, 0.6 µm deep", marks=pytest.mark.slow),
+        *(pytest.param(seed, marks=pytest.mark.slow) for seed in SEEDS if seed != 5031),
     ],
 )
 def test_no_albedo_above_one(seed):

@@ -52,9 +52,9 @@ class EnergyTable:
         conical: ν = c/λ and N_y = 1; else ν = 1/λ.
         shadowing: "v_cavity" or "none".
         excess: an upper confidence bound of 95 % of A − 1 at the places where it was found largest (`furnace.py`): 48
-            of 1024 random directions, to 89.9°, and wavelengths, or of 4096 of a deep surface, and of places about the
-            largest of these; none of them made or lowered the table. Half of those of a tile lie where an order
-            emerges. A is the albedo with E, the rounding of `packed` included.
+            of 1024 random directions, to 89.9°, and wavelengths, or three times of 4096 of a deep surface, and of
+            places about the largest of these; none of them made or lowered the table. Half of those of a tile lie where
+            an order emerges. A is the albedo with E, the rounding of `packed` included.
         loss: (mean, largest) 1 − e over those of them with a ≤ 1: light that is lost to the table's resolution.
     """
 

@@ -54,7 +54,8 @@ ALLOWED = 1e-3  # what an upper confidence bound of A may exceed one by
 LITTLE = 0.02  # the same, without more than the nodes about it being lowered anew
 MANY, MUCH = 12, 0.1  # places where A exceeds that, or what it exceeds one by, from which on the whole table is
 WIDEST = 2  # cells about a place
-ROUNDS = 10
+ROUNDS = 16
+PASSED_DEEP = 3  # sets of places one after the other that find nothing in a deep surface: one might by luck
 STEEPEST = 89.9  # degrees
 GRAZING = 3e-3  # the least cos θ_o of places where an order emerges
 
@@ -389,7 +390,7 @@ def _emerging(
 def conserving(spectrum: GratingSpectrum, table: EnergyTable, height_scale: float = 1.0) -> EnergyTable:
     """The table, lowered where the albedo exceeds one, with the excess and the loss that were measured.
 
-    Each set of places lowers the table, or ends the search and tells the excess and the loss.
+    Each set of places lowers the table, or tells the excess and the loss; the last ones lower nothing.
 
     Args:
         spectrum: what the table was made for.
@@ -397,7 +398,9 @@ def conserving(spectrum: GratingSpectrum, table: EnergyTable, height_scale: floa
         height_scale: times the heights.
     """
     furnace, rng = Furnace(spectrum), np.random.default_rng(1)
-    places = PLACES_DEEP if spectrum.largest_kappa * spectrum.height_range > DEEP else PLACES
+    deep = spectrum.largest_kappa * spectrum.height_range > DEEP
+    places, enough = (PLACES_DEEP, PASSED_DEEP) if deep else (PLACES, 1)
+    passed, excess = 0, 0.0
     for attempt in range(ROUNDS):
         directions, wavelengths = random_places(rng, places, spectrum.wavelengths)
         anywhere = np.ones(places, bool)
@@ -422,13 +425,17 @@ def conserving(spectrum: GratingSpectrum, table: EnergyTable, height_scale: floa
         directions, wavelengths = directions[first], wavelengths[first]
         albedo, local, raw = furnace.bounded(directions, wavelengths, table, rng, height_scale)
         over = albedo > 1 + ALLOWED
-        if not over.any() or attempt == ROUNDS - 1:
+        excess = albedo.max() - 1 if over.any() or not passed else max(excess, albedo.max() - 1)
+        passed = 0 if over.any() else passed + 1
+        if passed == enough or attempt == ROUNDS - 1:
             break
+        if passed:
+            continue
         table = _lowered(
             table, directions[over], wavelengths[over], albedo[over], local[over], raw[over], min(attempt + 1, WIDEST)
         )
     loss = (float(lost.mean()), float(lost.max())) if len(lost) else (0.0, 0.0)
-    return dataclasses.replace(table, excess=float(albedo.max() - 1), loss=loss)
+    return dataclasses.replace(table, excess=float(excess), loss=loss)
 
 
 def _about(

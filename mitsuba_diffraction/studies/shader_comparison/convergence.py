@@ -47,8 +47,8 @@ class Point:
         samples: per pixel; shading points of a shader.
         seconds: of rendering, without loading and compiling.
         delta_e: mean CIEDE2000 to the reference.
-        relative_mse: Σ (Y − Y_ref)²/Σ Y_ref² over the pixels that show surfaces, at the same mean luminance; Y is at most
-            white, as few pixels that are far brighter would tell of themselves only.
+        relative_mse: Σ (Y − Y_ref)²/Σ Y_ref² over the pixels that show surfaces, at the same mean luminance; Y is at
+            most white, as few pixels that are far brighter would tell of themselves only.
     """
 
     name: str
