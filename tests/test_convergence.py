@@ -70,7 +70,8 @@ def test_the_command_writes_a_plot_and_numbers(command, llvm, tmp_path, monkeypa
     line = "convergence scene.xml -o plot.png --json numbers.json --width 8 --spp 1 --spp 2 --reference-spp 4"
     code, out, err = command(f"{line} --tolerance 0.1 --variant llvm_ad_spectral")
     assert (code, err) == (0, "")
-    assert "pq, corrected: overtaken after" in out
+    assert "pq, corrected: " in out
+    assert "overtaken" in out
     points = json.loads(Path("numbers.json").read_text())["points"]
     assert [point["name"] for point in points[:3]] == ["tolerance 0.1", "tolerance 0.1", "flss, as published"]
     with Image.open("plot.png") as picture:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated
 
@@ -58,6 +59,7 @@ def convergence(
     wide.print(report.table(study.COLUMNS, study.rows(found)))
     for name, curve in found.curves().items():
         if not curve[0].traced:
-            when = [f"{found.overtaken(name, error):.2g} s" for error in ("delta_e", "relative_mse")]
-            tell(f"{name}: overtaken after {when[0]} (ΔE00) and {when[1]} (relative MSE)")
+            times = [found.overtaken(name, error) for error in ("delta_e", "relative_mse")]
+            when = ["not overtaken" if math.isnan(time) else f"overtaken after {time:.2g} s" for time in times]
+            tell(f"{name}: {when[0]} (ΔE00), {when[1]} (relative MSE)")
     tell(f"the reference owes ΔE00 {found.noise:.2f} to noise")
