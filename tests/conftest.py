@@ -27,8 +27,8 @@ _HEIGHT_RANGE = {"elaphe": 0.375, "xenopeltis": 0.819}
 
 @pytest.hookimpl(tryfirst=True)  # before -m selects
 def pytest_collection_modifyitems(items):
-    """Marks what slow.txt lists as slow: what takes more than a second of a core (`--durations 0`), of each test with
-    many parameters all but the fastest."""
+    """Marks what slow.txt lists as slow: by `--durations 0` what takes more than a second of a core, and of tests with
+    many parameters all but some."""
     listed = set(Path(__file__).with_name("slow.txt").read_text(encoding="utf-8").splitlines())
     for item in items:
         if item.nodeid.removeprefix("tests/") in listed:
