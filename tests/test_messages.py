@@ -1,8 +1,12 @@
 """What a wrong scene is told: not only what is missing, but what there is."""
 
+import ast
+from pathlib import Path
+
 import mitsuba as mi
 import pytest
 
+import mitsuba_diffraction
 from mitsuba_diffraction.render.scene import load_spectral_scene
 
 SCENE = """<scene version="3.0.0"><default name="light" value="sun"/><include filename="lights/$light.xml"/>
@@ -25,6 +29,13 @@ BLAZED = '<string name="profile" value="blazed"/><float name="period" value="2.5
         (GRATING % (BLAZED + '<bsdf type="diffuse"/>'), {}, 'wanted <bsdf name="base"'),
         (GRATING % (BLAZED + '<string name="height_scale" value="a"/>'), {}, "height_scale: got 'a', wanted a number"),
         (GRATING % '<float name="filename" value="1"/>', {}, r"filename: got 1.0, wanted a saved spectrum"),
+        (GRATING % '<string name="filename" value="$skin"/>', {}, r"undefined parameter: \$skin; set it by -D skin=…"),
+        (GRATING % (BLAZED + '<string name="theory" value="exact"/>'), {}, "theory: got 'exact', wanted one of scalar"),
+        (
+            GRATING % '<string name="filename" value="skin.exr"/><float name="tolerance" value="0.1"/>',
+            {},
+            "tolerance: got 0.1.* with .*skin.exr, wanted it when the spectrum is computed",
+        ),
     ],
 )
 def test_what_there_is_is_said(body, parameters, words, tmp_path, llvm):
@@ -35,6 +46,22 @@ def test_what_there_is_is_said(body, parameters, words, tmp_path, llvm):
     (tmp_path / "scene.xml").write_text(SCENE % body)
     with pytest.raises(ValueError, match=words):
         load_spectral_scene(tmp_path / "scene.xml", parameters=parameters)
+
+
+def test_wrong_requests_have_a_class_of_their_own():
+    """A plain ValueError is told as a bug."""
+    for path in Path(mitsuba_diffraction.__file__).parent.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call):
+                assert ast.unparse(node.exc.func) != "ValueError", f"{path.name}:{node.lineno}"
+
+
+def test_a_scene_sets_the_tolerance_of_a_recipe(tmp_path, llvm):
+    recipe = tmp_path / "blaze.toml"
+    recipe.write_text('[surface]\nprofile = "blazed"\nperiod = 2.5\ndepth = 0.25\n[spectrum]\ncoherence_length = 5.0\n')
+    grating = {"type": "diffraction_grating", "filename": str(recipe), "material": "Al"}
+    assert mi.load_dict(grating).spectrum.tolerance == 1e-3
+    assert mi.load_dict({**grating, "tolerance": 0.05}).spectrum.tolerance == pytest.approx(0.05)
 
 
 def test_every_material_of_mitsuba_is_known(llvm):

@@ -43,7 +43,7 @@ def surface_from(props: mi.Properties, coat: Coat | None) -> tuple[Spectrum, Rec
     given = [name for name in ("filename", "spectrum", "profile") if name in props]
     theory = props.get("theory", "scalar")
     if theory not in THEORIES:
-        raise ValueError(f"theory: got {theory!r}, wanted one of {', '.join(THEORIES)}")
+        raise RequestError(f"theory: got {theory!r}, wanted one of {', '.join(THEORIES)}")
     if len(given) != 1:
         raise RequestError(
             f"surface: got {' and '.join(given) or 'nothing'}, wanted one of filename (a saved spectrum or a recipe), "

@@ -272,6 +272,8 @@ def _what_there_is(scene: Path, error: str) -> str:
         folder = scene.resolve().parent / Path(missing[1]).parent
         there = sorted(path.stem for path in folder.glob("*.xml"))
         return f"; {Path(missing[1]).parent} holds {', '.join(there) or 'none'}"
+    if (missing := re.search(r"undefined parameter: \$(\w+)", error)) is not None:
+        return f"; set it by -D {missing[1]}=…"
     if "unused parameters" in error:
         text = scene.read_text(encoding="utf-8", errors="replace")
         known = sorted({*re.findall(r"\$(\w+)", text), *re.findall(r'<default\s+name="(\w+)"', text)})
