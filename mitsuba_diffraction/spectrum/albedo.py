@@ -47,7 +47,7 @@ CONICAL_SHAPE = (1, 193, 193)
 GENERAL_SHAPE = (33, 17, 33)
 CONICAL_WAVELENGTHS = 2  # how many of the λ that share one ν = c/λ a node is computed for
 ROUNDS = 12  # how often the table is lowered, at most
-DEEP, PAIRS = 30, 1e7  # the largest κ times the height range in radians; pairs (place, cell of q)
+DEEP, PAIRS = 30, 1.5e7  # the largest κ times the height range in radians; pairs (place, cell of q)
 MUCH = 0.05  # from which the cells about are looked at again
 LIKELY = 0.8  # the albedo at neighbouring nodes from which a cell is looked at
 
@@ -303,12 +303,13 @@ def energy_table(spectrum: GatheredSpectrum, shadowing: str = "v_cavity", height
 
     # The same places for every height scale, so that their tables can be subtracted.
     rng = np.random.default_rng(0)
-    # Of few orders of a deep surface a has peaks between nodes where it is small: places in all cells, as many as are
-    # cheap.
-    pairs = np.prod(cells) * np.mean([len(level.q) for level in spectrum.cells])
-    thorough = int(min(PAIRS / pairs, ROUNDS)) if spectrum.cells[0].powers.shape[1] * LINEAR_STEP > DEEP else 0
+    # a has peaks between nodes, where an order emerges; of few orders of a deep surface even between nodes where it is
+    # small. Places in all those cells, as many as are cheap.
     likely = (ndimage.maximum_filter(largest, 3) > LIKELY)[tuple(slice(n) for n in cells)]
-    doubtful = np.ones_like(likely) if thorough else likely
+    deep = spectrum.cells[0].powers.shape[1] * LINEAR_STEP > DEEP
+    most = PAIRS / np.mean([len(level.q) for level in spectrum.cells])
+    doubtful = np.ones_like(likely) if deep and likely.size <= most else likely
+    thorough = int(min(most / max(doubtful.sum(), 1), ROUNDS))
     for index in range(ROUNDS):
         inside, first = rng.random((*cells, 3), np.float32)[doubtful], np.argwhere(doubtful)
         drop = np.zeros(shape, np.float32)
