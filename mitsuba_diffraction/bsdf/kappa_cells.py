@@ -68,10 +68,3 @@ def choose(shares: mi.Vector4f, u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
         start, end = dr.select(past, ends[cell - 1], start), dr.select(past, ends[cell], end)
     # Where nothing is drawn, in a masked lane, all shares are zero.
     return chosen, dr.clip((x - start) / dr.maximum(end - start, 1e-30), 0, BELOW_ONE)
-
-
-def pick(u: mi.Float, count: int) -> tuple[mi.UInt32, mi.Float]:
-    """One of `count` equal parts, and the place in it."""
-    x = u * count
-    part = dr.minimum(mi.UInt32(x), count - 1)
-    return part, dr.minimum(x - mi.Float(part), BELOW_ONE)

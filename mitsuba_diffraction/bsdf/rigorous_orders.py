@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..rigorous.axes import Axes
+from ..rigorous.mueller import MIRRORED
 from ..rigorous.spectrum import RigorousSpectrum
 from .incidence import Incidence
 from .order_sampler import WHOLE, search
@@ -114,12 +115,11 @@ class RigorousOrders:
             for row, found in enumerate(self._matrix(m, c, g, z, there)):
                 rows[row] += lobe * found
         bright = rows[0].x > 0
-        # Light of the opposite k_y is mirrored: `mueller.MIRRORED`.
-        mirrored = dr.select(k_y < 0, mi.Float(-1), mi.Float(1))
+        mirrored, changed = dr.select(k_y < 0, mi.Float(-1), mi.Float(1)), np.not_equal.outer(MIRRORED, MIRRORED)
         scale = dr.rcp(dr.select(bright, rows[0].x, mi.Float(1)))
         return [
             [
-                dr.select(bright, rows[i][j] * scale * (mirrored if (i < 2) != (j < 2) else 1), mi.Float(i == j))
+                dr.select(bright, rows[i][j] * scale * (mirrored if changed[i, j] else 1), mi.Float(i == j))
                 for j in range(4)
             ]
             for i in range(4)

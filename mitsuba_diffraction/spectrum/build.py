@@ -51,7 +51,6 @@ _FINEST, _COARSEST = 1e-3, 1e-2
 _SCATTER_SHARE = 0.1
 
 Progress = Callable[[int, int], None]
-Powers = Callable[[float], NDArray[np.float64]]
 Splines = SamplePowers | TileSplines
 Table = SeriesTable | SliceTable
 
