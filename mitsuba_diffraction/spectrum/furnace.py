@@ -28,7 +28,7 @@ from ..geometry import k_g
 from .albedo import DEEP, SLACK
 from .energy_table import EnergyTable
 from .orders import LobeAxis, OrderGrid
-from .spline_grid import SplineGrid, spline_integral
+from .spline_grid import SplineGrid, spline, spline_integral
 
 if TYPE_CHECKING:
     from .grating_spectrum import GratingSpectrum
@@ -102,8 +102,7 @@ class _Spline:
         """As of `_Gaussian`."""
         product = 1 / (self._spacing[0] * self._spacing[1])
         for q, spacing in zip((q_x, q_y), self._spacing, strict=True):
-            t = np.abs(q) / spacing
-            product = product * np.where(t < 0.5, 0.75 - t**2, 0.5 * np.maximum(1.5 - t, 0) ** 2)
+            product = product * spline(q / spacing)
         return product
 
 
@@ -113,9 +112,9 @@ class Furnace:
     def __init__(self, spectrum: GratingSpectrum) -> None:
         self._spectrum = spectrum
         grid = spectrum.grid
-        spline = isinstance(grid, SplineGrid)
-        self._lobe = _Spline(grid.spacing) if spline else _Gaussian(spectrum.lobe_width, spectrum.lobes)
-        self._limit = grid.limit if spline else (np.inf, np.inf)
+        of_splines = isinstance(grid, SplineGrid)
+        self._lobe = _Spline(grid.spacing) if of_splines else _Gaussian(spectrum.lobe_width, spectrum.lobes)
+        self._limit = grid.limit if of_splines else (np.inf, np.inf)
 
         # Nodes, block after block.
         blocks, frequencies = [], grid.frequencies()

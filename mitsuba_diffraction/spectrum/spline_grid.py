@@ -104,6 +104,12 @@ class SplineGrid:
         return float(inside_y @ np.abs(np.maximum(approximate, 0) - exact) @ inside_x)
 
 
+def spline(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """B(x)."""
+    x = np.abs(x)
+    return np.where(x <= 0.5, 0.75 - x**2, 0.5 * np.maximum(1.5 - x, 0) ** 2)
+
+
 def spline_weights(t: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """B(t + 1), B(t), B(t − 1) for |t| ≤ ½: the weights of the nodes before, at and after the nearest."""
     return 0.5 * (0.5 - t) ** 2, 0.75 - t**2, 0.5 * (0.5 + t) ** 2

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ..surface.heightfield import HeightField
 from .orders import OrderGrid, inner
-from .spline_grid import SplineGrid
+from .spline_grid import SplineGrid, spline
 
 
 class TilePowers:
@@ -86,7 +86,7 @@ class TileSplines:
         x, weights = np.polynomial.legendre.leggauss(8)
         # B is a parabola on each of three pieces.
         x = np.concatenate([piece + x / 2 for piece in (-1, 0, 1)])
-        weights = np.tile(weights / 2, 3) * np.where(np.abs(x) <= 0.5, 0.75 - x**2, 0.5 * (1.5 - np.abs(x)) ** 2)
+        weights = np.tile(weights / 2, 3) * spline(x)
         moments = sum(w * self._lobes(nodes + t, orders) for t, w in zip(x, weights, strict=True))
         # ∫B(x)B(x − k), k = 2, 1, 0.
         gram = np.repeat(np.array([[1], [26], [66]]) / 120, len(nodes), axis=1)
