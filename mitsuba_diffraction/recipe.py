@@ -54,11 +54,9 @@ from typing import Any
 
 from .errors import RequestError
 from .files import cache_folder, refuse_special
-from .rigorous.spectrum import RigorousSpectrum
-from .spectrum import GratingSpectrum
 from .spectrum.build import precompute
 from .spectrum.file import FORMAT_VERSION
-from .spectrum.load import load_spectrum
+from .spectrum.load import Spectrum, load_spectrum
 from .surface.gratings import PATCHES, PROFILES
 from .surface.heightfield import HeightField
 from .surface.prepare import apply_steps, check_steps
@@ -68,8 +66,6 @@ if sys.version_info >= (3, 11):
     import tomllib
 else:
     import tomli as tomllib
-
-Spectrum = GratingSpectrum | RigorousSpectrum
 
 _SCAN_KEYS = frozenset({"scan", "pixel_size", "height_range", "fill_missing", "channel", "unit", "prepare"})
 _SPECTRUM_KEYS = frozenset(

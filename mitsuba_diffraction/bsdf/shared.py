@@ -10,10 +10,10 @@ import mitsuba as mi
 import numpy as np
 
 from ..rigorous.spectrum import RigorousSpectrum
-from ..spectrum import GratingSpectrum
 from ..spectrum.albedo import GatheredSpectrum, energy_table
 from ..spectrum.energy_table import EnergyTable
 from ..spectrum.furnace import conserving
+from ..spectrum.load import Spectrum
 from ..spectrum.orders import OrderGrid
 from .energy import Energy
 from .order_spectrum import OrderSpectrum
@@ -35,7 +35,7 @@ class SharedTables:
 
     KEPT = 8  # energy tables of other heights
 
-    def __init__(self, spectrum: GratingSpectrum | RigorousSpectrum) -> None:
+    def __init__(self, spectrum: Spectrum) -> None:
         if isinstance(spectrum, RigorousSpectrum):
             self.scattering = RigorousOrders(spectrum)
         else:
@@ -47,7 +47,7 @@ class SharedTables:
         self._lock = threading.RLock()
 
     @classmethod
-    def of(cls, spectrum: GratingSpectrum | RigorousSpectrum) -> SharedTables:
+    def of(cls, spectrum: Spectrum) -> SharedTables:
         """Those of an equal spectrum, while some BSDF has them; else new ones.
 
         Mitsuba constructs plugins on several threads: one of them makes the tables, the others wait.

@@ -14,15 +14,12 @@ from ..errors import RequestError
 from ..recipe import Recipe
 from ..rigorous.spectrum import RigorousSpectrum
 from ..scalar_theory import range_warning
-from ..spectrum import GratingSpectrum
 from ..spectrum.build import THEORIES
-from ..spectrum.load import load_spectrum
+from ..spectrum.load import Spectrum, load_spectrum
 from ..surface.gratings import COHERENCE_LENGTHS, PROFILES
 from ..wavelengths import VISIBLE
 from .coat import Coat
 from .rigorous_parameters import settings_from, settings_of_medium
-
-Spectrum = GratingSpectrum | RigorousSpectrum
 
 _PREFIX = "handed over: "
 _told: set[str] = set()  # surfaces whose range was looked up

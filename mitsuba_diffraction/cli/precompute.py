@@ -13,6 +13,7 @@ from ..rigorous.spectrum import RigorousSpectrum
 from ..scalar_theory import range_warning
 from ..spectrum import GratingSpectrum
 from ..spectrum.build import REPRESENTATIONS, THEORIES
+from ..spectrum.load import Spectrum
 from ..surface.seam import seam_matters, seam_steps
 from .arguments import Overwrite, claim
 from .console import progress_bar, tell
@@ -102,7 +103,7 @@ def precompute(
             tell(f"! {beyond}")
 
 
-def _table(spectrum: GratingSpectrum | RigorousSpectrum) -> str:
+def _table(spectrum: Spectrum) -> str:
     size, asked = f"{spectrum.megabytes:.3g} MB", f"(tolerance {spectrum.tolerance:.3g})"
     if isinstance(spectrum, RigorousSpectrum):
         return (

@@ -15,7 +15,6 @@ from ..errors import RequestError
 from ..files import cache_folder
 from ..reference import check_extent
 from ..rigorous.build import build_spectrum
-from ..rigorous.spectrum import RigorousSpectrum
 from ..surface.heightfield import HeightField
 from ..wavelengths import VISIBLE
 from ..welch import carried_coherence_length
@@ -25,6 +24,7 @@ from .expansions.chebyshev import ChebyshevSeries
 from .expansions.svd import SvdSeries
 from .expansions.taylor import TaylorSeries
 from .grating_spectrum import TAIL_SHARE, check_angle, check_wavelengths
+from .load import Spectrum
 from .orders import LobeAxis, inner
 from .patches import MeanPowers, check_patches
 from .sample import SamplePowers
@@ -71,7 +71,7 @@ def precompute(
     material: str | None = None,
     ext_ior: float = 1.0,
     polarised: bool = False,
-) -> GratingSpectrum | RigorousSpectrum:
+) -> Spectrum:
     """The spectrum of the phase e^{iκh}, or the table of rigorous efficiencies, its error at most `tolerance`.
 
     Args:

@@ -8,10 +8,12 @@ from ..rigorous import file as rigorous_file
 from ..rigorous.spectrum import RigorousSpectrum
 from .grating_spectrum import GratingSpectrum
 
+Spectrum = GratingSpectrum | RigorousSpectrum
+
 _HEADER = 2**16  # bytes, in which the format is told
 
 
-def load_spectrum(path: str | os.PathLike[str], recipe: str | None = None) -> GratingSpectrum | RigorousSpectrum:
+def load_spectrum(path: str | os.PathLike[str], recipe: str | None = None) -> Spectrum:
     """Read a spectrum that `save` wrote.
 
     Args:

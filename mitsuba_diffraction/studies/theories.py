@@ -14,8 +14,8 @@ import numpy as np
 from ..rigorous import efficiencies, refractive_index
 from ..rigorous.spectrum import RigorousSpectrum
 from ..scalar_theory import difference, profile_powers, scalar_orders
-from ..spectrum import GratingSpectrum
 from ..spectrum.build import precompute
+from ..spectrum.load import Spectrum
 from ..surface.heightfield import HeightField
 from .speed import Rays, seconds
 
@@ -112,9 +112,7 @@ def _errors(height_field: HeightField, material: str, table: RigorousSpectrum) -
     return errors
 
 
-def _seconds(
-    spectra: dict[str, GratingSpectrum | RigorousSpectrum], material: str, count: int, repetitions: int
-) -> dict[tuple[str, str], float]:
+def _seconds(spectra: dict[str, Spectrum], material: str, count: int, repetitions: int) -> dict[tuple[str, str], float]:
     bsdfs = {"rough": mi.load_dict({"type": "roughconductor", "material": "Al"})}
     for theory, spectrum in spectra.items():
         bsdfs[theory] = mi.load_dict({"type": "diffraction_grating", "spectrum": spectrum, "material": material})
