@@ -34,7 +34,9 @@ def scene_parameters(define: Sequence[str] | None) -> dict[str, str]:
     return parameters
 
 
+Define = Annotated[list[str] | None, typer.Option("-D", metavar="NAME=VALUE", help="set a parameter of the scene")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="replace existing files, but never inputs")]
+Variant = Annotated[str | None, typer.Option(help="Mitsuba variant; default: the fastest spectral one")]
 # Options that affect where and how files are written, but not their content.
 _NOT_OF_THE_REQUEST = frozenset(
     {"output", "json", "plot", "markdown", "figures", "overwrite", "resume", "checkpoint", "dask"}

@@ -10,7 +10,7 @@ from rich.console import Console
 
 from ..errors import RequestError
 from ..surface.readers import read_height_field
-from .arguments import Overwrite, claim
+from .arguments import Overwrite, Variant, claim
 from .console import out, progress_bar
 from .inputs import files_read
 
@@ -22,7 +22,7 @@ def benchmark(
     height_range: Annotated[float | None, typer.Option(help="heights from black to white, µm")] = None,
     surface: Annotated[list[str] | None, typer.Option(help="only these of the built-in surfaces")] = None,
     tolerance: Annotated[list[float] | None, typer.Option(help="only these tolerances")] = None,
-    variant: Annotated[str | None, typer.Option(help="Mitsuba variant; default: the fastest spectral one")] = None,
+    variant: Variant = None,
     rigorous: Annotated[
         bool, typer.Option("--rigorous", help="compare the theories on 1200 lines/mm in aluminium instead; minutes")
     ] = False,

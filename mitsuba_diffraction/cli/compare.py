@@ -12,7 +12,7 @@ from rich.console import Console
 
 from ..files import whole_file
 from ..outputs import free_name
-from .arguments import Overwrite, claim, scene_parameters
+from .arguments import Define, Overwrite, Variant, claim, scene_parameters
 from .console import out, progress_bar, tell
 from .inputs import files_read
 
@@ -32,12 +32,10 @@ def compare(
     width: Annotated[int | None, typer.Option(min=1, help="pixels; default: that of the scene")] = None,
     height: Annotated[int | None, typer.Option(min=1, help="pixels; default: that of the scene")] = None,
     shares: Annotated[bool, typer.Option(help="measure the cost of each quirk of the shader")] = True,
-    variant: Annotated[str | None, typer.Option(help="Mitsuba variant; default: the fastest spectral one")] = None,
+    variant: Variant = None,
     seed: Annotated[int, typer.Option(min=0)] = 0,
     json: Annotated[Path | None, typer.Option(help="save the numbers (.json)")] = None,
-    define: Annotated[
-        list[str] | None, typer.Option("-D", metavar="NAME=VALUE", help="set a parameter of the scene")
-    ] = None,
+    define: Define = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Compare renderings of a scene by the path tracer and the real-time shader."""

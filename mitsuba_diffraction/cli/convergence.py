@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from .arguments import Overwrite, claim, scene_parameters
+from .arguments import Define, Overwrite, Variant, claim, scene_parameters
 from .console import out, progress_bar, tell
 from .inputs import files_read
 
@@ -22,11 +22,9 @@ def convergence(
     spp: Annotated[list[int] | None, typer.Option(min=1, help="samples per pixel; default: 1, 4, … 256")] = None,
     reference_spp: Annotated[int, typer.Option(min=2, help="samples per pixel of the reference")] = 2048,
     width: Annotated[int, typer.Option(min=1, help="pixels")] = 128,
-    variant: Annotated[str | None, typer.Option(help="Mitsuba variant; default: the fastest spectral one")] = None,
+    variant: Variant = None,
     json: Annotated[Path | None, typer.Option(help="save the numbers (.json)")] = None,
-    define: Annotated[
-        list[str] | None, typer.Option("-D", metavar="NAME=VALUE", help="set a parameter of the scene")
-    ] = None,
+    define: Define = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Measure the error of a picture against time, by the path tracer and by the real-time shaders.

@@ -10,7 +10,7 @@ import typer
 
 from ..errors import RequestError
 from ..outputs import free_name
-from .arguments import Overwrite, claim, scene_parameters
+from .arguments import Define, Overwrite, Variant, claim, scene_parameters
 from .console import Stopped, progress_bar, tell
 from .inputs import files_read
 
@@ -28,11 +28,9 @@ def render(
     ] = None,
     width: Annotated[int | None, typer.Option(min=1, help="pixels; default: that of the scene")] = None,
     height: Annotated[int | None, typer.Option(min=1, help="pixels; default: that of the scene")] = None,
-    variant: Annotated[str | None, typer.Option(help="Mitsuba variant; default: the fastest spectral one")] = None,
+    variant: Variant = None,
     seed: Annotated[int, typer.Option(min=0)] = 0,
-    define: Annotated[
-        list[str] | None, typer.Option("-D", metavar="NAME=VALUE", help="set a parameter of the scene")
-    ] = None,
+    define: Define = None,
     until_error: Annotated[
         float | None, typer.Option(metavar="ERROR", help="stop at this relative standard error of luminance, e.g. 0.01")
     ] = None,

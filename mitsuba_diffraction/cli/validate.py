@@ -10,7 +10,7 @@ from rich.console import Console
 
 from ..errors import RequestError
 from ..outputs import save_markdown
-from .arguments import Overwrite, claim
+from .arguments import Overwrite, Variant, claim
 from .console import out, progress_bar, tell
 from .inputs import files_read
 from .scan import Channel, FillMissing, HeightRange, PixelSize, Prepare, Unit, options_of_scan, recipe_of
@@ -33,7 +33,7 @@ def validate(
     extent: Annotated[
         str | None, typer.Option(help="tile or sample; default: that of the recipe, sample for a scan")
     ] = None,
-    variant: Annotated[str | None, typer.Option(help="Mitsuba variant; default: the fastest spectral one")] = None,
+    variant: Variant = None,
     json: Annotated[Path | None, typer.Option(help="save the results (.json)")] = None,
     markdown: Annotated[Path | None, typer.Option(help="save a table with notes and sources (.md)")] = None,
     figures: Annotated[Path | None, typer.Option(metavar="DIR", help="save the figures of the evaluation here")] = None,
