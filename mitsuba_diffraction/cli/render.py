@@ -53,6 +53,7 @@ def render(
     import mitsuba as mi
 
     from ..render.checkpoint import checkpoint_path
+    from ..render.denoise import guides as guides_of
     from ..render.passes import Interrupted, trace_here
     from ..render.passes import render as trace
     from ..render.preview import save_preview
@@ -103,8 +104,6 @@ def render(
         earlier = SpectralImage.load(path) if resume and path.is_file() and not waiting.exists() else None
         guides, interrupted = None, False
         if denoise:
-            from ..render.denoise import guides as guides_of
-
             guides = guides_of(load_spectral_scene(scene, **where, motion=motion))
         try:
             with progress_bar(label, "spp") as progress:
