@@ -175,6 +175,7 @@ def test_what_is_no_bsdf_is_refused():
         over(uniform(0.5))
 
 
+@pytest.mark.slow
 def test_flags_and_components_are_those_of_both():
     flags = mi.BSDFFlags
     for name, base in (*SMOOTH.items(), *MIRRORS.items()):

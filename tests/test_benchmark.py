@@ -41,6 +41,7 @@ def test_accuracy_sees_an_error_that_is_put_in(case):
     assert found.delta_e[1] > 1
 
 
+@pytest.mark.slow
 def test_a_run_reports_every_combination(llvm, tmp_path):
     deep = Case("deep", gratings.sinusoidal(2.5, 2.0), "tile", 65.0)
     steps = []
@@ -86,6 +87,7 @@ def test_a_run_reports_every_combination(llvm, tmp_path):
         assert np.ptp(np.asarray(picture)) > 100
 
 
+@pytest.mark.slow
 def test_sampling_is_measured(llvm):
     (found,) = measure([BLAZE], count=1 << 12, size=16, spp=4, repetitions=1)
     assert min(found.fractions[:4]) >= 0.5
@@ -98,6 +100,7 @@ def test_sampling_is_measured(llvm):
     assert "blaze" in console.export_text()
 
 
+@pytest.mark.slow
 def test_theories_are_compared_on_one_grating(llvm):
     """A grating of 0.3 µm, on a table as coarse as it may be: rigorous theory is right, scalar theory is not."""
     fine = gratings.sinusoidal(0.3, 0.1, samples=64)
@@ -110,6 +113,7 @@ def test_theories_are_compared_on_one_grating(llvm):
     assert report.cells(COLUMNS, rigorous)[0] == "rigorous"
 
 
+@pytest.mark.slow
 def test_the_bundled_surfaces_are_those_of_the_recipes():
     cases = {case.name: case for case in bundled_cases()}
     for name in ("elaphe", "xenopeltis"):

@@ -148,6 +148,7 @@ def test_orientation_turns_the_pattern(llvm):
     np.testing.assert_allclose(value, wanted, rtol=1e-3, atol=1e-4 * wanted.max())
 
 
+@pytest.mark.slow
 def test_reciprocity(llvm):
     bsdf = plugin(spectrum("crossed", 3.0), int_ior=1.5)
     rng = np.random.default_rng(2)

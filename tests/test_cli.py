@@ -442,6 +442,7 @@ def test_a_value_of_a_parameter_is_a_file_only_if_it_looks_like_one(folder, valu
     assert scene_parameters([f"p={value}"]) == {"p": wanted}
 
 
+@pytest.mark.slow
 def test_benchmark_refuses_a_tolerance_before_it_measures(command):
     code, out, err = command("benchmark --tolerance -1")
     assert (code, out) == (2, "")

@@ -63,6 +63,7 @@ def test_orders_have_the_powers_of_the_closed_form_inside(llvm, theta):
     assert checked >= 3
 
 
+@pytest.mark.slow
 def test_a_coat_of_air_is_none(llvm):
     rng = np.random.default_rng(0)
     wi, wo = random_directions(rng, 200), random_directions(rng, 200)

@@ -156,7 +156,8 @@ def test_other_quirks_for_a_shader_that_is_there(kind):
 # --- Pictures ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("rfilter", ["gaussian", pytest.param("box", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("rfilter", ["gaussian", "box"])
 def test_the_shader_is_what_its_integrator_converges_to(llvm, tmp_path, rfilter):
     pictures = Pictures(write(tmp_path / "scene.xml", rfilter=rfilter), "gem")
     for quirks in (("power_gamma", "constant_blend", "infrared_rainbow", NO_SHADOWS), ()):
@@ -170,6 +171,7 @@ def test_the_shader_is_what_its_integrator_converges_to(llvm, tmp_path, rfilter)
         assert found.seconds > 0
 
 
+@pytest.mark.slow
 def test_the_same_light_is_direct_light(llvm, tmp_path):
     pictures = Pictures(write(tmp_path / "scene.xml"), "gem")
     found = pictures.same_light(1024)
@@ -231,6 +233,7 @@ def test_a_crop_window_is_compared_alone(llvm, tmp_path):
     assert np.abs(pair[0] - pair[1]).sum() < 0.05 * pair[1].sum()
 
 
+@pytest.mark.slow
 def test_a_share_is_what_it_says(llvm, tmp_path):
     pictures = Pictures(write(tmp_path / "scene.xml", SUN + SKY), "gem", width=8)
     names = ("constant_blend", "infrared_rainbow", "power_gamma", NO_SHADOWS)
@@ -278,6 +281,7 @@ def names():
     return {path.name for path in Path().iterdir()}
 
 
+@pytest.mark.slow
 def test_compare_writes_pictures_numbers_and_a_figure(command, llvm, folder):
     write(Path("scene.xml"), SUN + SKY)
     code, out, err = command(
@@ -305,6 +309,7 @@ def test_compare_writes_pictures_numbers_and_a_figure(command, llvm, folder):
         assert np.ptp(np.asarray(picture.convert("L"))) > 100
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_numbers(llvm, folder):
     write(Path("scene.xml"), rfilter="gaussian")
     found = [compare("scene.xml", "gem", spp=16, seed=1, shares=False) for _ in range(2)]

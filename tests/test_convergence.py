@@ -64,6 +64,7 @@ def test_noise_falls_with_time_and_a_coarse_table_stops(llvm, tmp_path):
     assert published > corrected > curves["tolerance 0.001"][1].delta_e
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_plot_and_numbers(command, llvm, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write(Path("scene.xml"), SUN, WITH_TOLERANCE)

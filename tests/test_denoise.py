@@ -23,6 +23,7 @@ SCENE = """<scene version="3.0.0"><integrator type="direct"/>
 <float name="coherence_length" value="6"/></bsdf></shape></scene>"""
 
 
+@pytest.mark.slow
 def test_guides_are_of_what_is_seen_first(llvm):
     look = mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0])
     film = {"type": "hdrfilm", "width": 30, "height": 20, "rfilter": {"type": "box"}}
@@ -73,6 +74,7 @@ def test_the_noise_of_any_reconstruction_filter_goes(rfilter, llvm):
     assert (clean - 1).std() < 0.2 * (noisy - 1).std()
 
 
+@pytest.mark.slow
 def test_the_preview_loses_its_noise_and_the_spectral_picture_stays(command, tmp_path, monkeypatch):
     use("llvm_ad_spectral")
     monkeypatch.chdir(tmp_path)

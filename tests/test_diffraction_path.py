@@ -131,11 +131,13 @@ def test_converges_to_what_path_converges_to(build, depth, spp, llvm):
     assert_agree(build(), depth, spp, rr_depth=3)
 
 
+@pytest.mark.slow
 def test_converges_in_a_scalar_variant():
     use("scalar_spectral")
     assert_agree(scene(plate=plate(blaze()), sun=SUN, film={"width": 4, "height": 4}), 3, 16)
 
 
+@pytest.mark.slow
 def test_what_a_grating_throws_onto_a_wall_is_far_less_noisy(llvm):
     narrow = blaze(26.0, material="Al")
     built = scene(plate=plate(narrow, 0.5), sun=SUN)
@@ -205,6 +207,7 @@ SCENE = """<scene version="3.0.0">
 </scene>"""
 
 
+@pytest.mark.slow
 def test_passes_have_the_same_bits_whatever_the_threads_and_agree_with_mitsubas_film(llvm, tmp_path):
     path = tmp_path / "scene.xml"
     path.write_text(SCENE)
@@ -224,6 +227,7 @@ def test_passes_have_the_same_bits_whatever_the_threads_and_agree_with_mitsubas_
     np.testing.assert_allclose(own, theirs, rtol=0.1)
 
 
+@pytest.mark.slow
 def test_ctrl_c_is_left_alone(llvm):
     built = scene(plate=plate(blaze()), sun=SUN)
     handler = signal.signal(signal.SIGINT, signal.default_int_handler)

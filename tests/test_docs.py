@@ -203,6 +203,7 @@ def test_the_files_that_the_readme_names_are_there():
         assert (ROOT / name).is_file(), name
 
 
+@pytest.mark.slow
 def test_the_manual_is_built_without_warnings(tmp_path, caplog):
     with caplog.at_level(logging.WARNING):
         build(load_config(str(ROOT / "mkdocs.yml"), site_dir=str(tmp_path / "site")))

@@ -107,6 +107,7 @@ def test_no_albedo_above_one_for_scaled_heights(height_scale):
     assert furnace("deep blazed", np.random.default_rng(2), 15, height_scale=height_scale) <= 1 + EXCESS
 
 
+@pytest.mark.slow
 def test_largest_height_scale():
     of = md.precompute(MAKE["blazed"](), wavelengths=(250.0, 830.0))
     bsdf = plugin(of, height_scale=1.44)
@@ -114,6 +115,7 @@ def test_largest_height_scale():
         assert albedo(bsdf, of, wi, wavelength) <= 1 + EXCESS
 
 
+@pytest.mark.slow
 def test_no_albedo_above_one_without_shadowing():
     # Its albedo is hundreds near the horizon; what the table leaves there is larger.
     assert furnace("blazed", np.random.default_rng(4), 15, shadowing="none") <= 1 + 0.1
@@ -264,6 +266,7 @@ def test_other_variants_give_the_same_values(variant):
         np.testing.assert_allclose(np.array(got).ravel()[0], value, rtol=1e-3, atol=1e-4 * wanted.max())
 
 
+@pytest.mark.slow
 def test_table_follows_height_scale_and_carries_its_derivative():
     bsdf, rng = plugin(spectrum("deep blazed"), height_scale=0.6), np.random.default_rng(9)
     omega = random_directions(rng, 300)
@@ -348,6 +351,7 @@ def direct_albedo(of, omega, wavelength):
     return total
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:pixels of")
 def test_albedo_of_a_sample():
     skin = md.gratings.xenopeltis(20, pixel_size=20 / 160)
@@ -406,6 +410,7 @@ def test_a_damaged_table_is_refused(wrong):
         EnergyTable.from_plain({**plain, **wrong})
 
 
+@pytest.mark.slow
 def test_instances_of_one_surface_share_their_tables(tmp_path):
     of = spectrum("blazed")
     of.save(tmp_path / "s.exr")
@@ -440,10 +445,9 @@ def hemisphere_albedo(of, omega, wavelength, table=None, rings=40, spokes=48):
     return (np.repeat(weight, spokes) * 2 * np.pi / spokes * factor * s).sum() / wavelength**2
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:pixels of", "ignore:coherence_length")
-@pytest.mark.parametrize(
-    ("side", "pixel", "coherence_length"), [(0.6, 0.05, 0.28), pytest.param(1.2, 0.1, 0.4, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize(("side", "pixel", "coherence_length"), [(0.6, 0.05, 0.28), (1.2, 0.1, 0.4)])
 def test_no_albedo_above_one_for_rough_scans_with_wide_lobes(side, pixel, coherence_length):
     count = round(side / pixel)
     heights = md.HeightField(np.random.default_rng(0).random((count, count)), pixel)

@@ -153,6 +153,7 @@ def test_any_other_angle_gives_the_same_period(llvm):
     assert fit.mean == pytest.approx(2500, rel=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SKINS)
 def test_the_period_of_a_small_skin_is_fitted_within_a_hundredth(llvm, name):
     found = reflectance_map(small_skin(name), wavelengths=COARSE, angles=viewing_angles(0.25))
@@ -231,6 +232,7 @@ def test_a_map_is_a_picture_of_the_hemisphere(llvm, method):
 # ---------------------------------------------------------------- figures
 
 
+@pytest.mark.slow
 def test_figures_and_the_table_are_written(llvm, tmp_path):
     steps = []
     folder = tmp_path / "new" / "figures"

@@ -185,6 +185,7 @@ def test_poles_of_a_sphere_are_finite():
     assert value.max() > 0
 
 
+@pytest.mark.slow
 def test_back_of_a_twosided_surface_is_the_mirror_image():
     def twosided(nested):
         return {"type": "twosided", "nested": nested}

@@ -83,6 +83,7 @@ def test_pictures_are_small_enough():
         assert path.stat().st_size < 500_000, path.name
 
 
+@pytest.mark.slow
 def test_pictures_are_compressed(tmp_path):
     path = tmp_path / "noise.png"
     rng = np.random.default_rng(0)

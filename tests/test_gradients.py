@@ -104,6 +104,7 @@ def energy_near(of, at, height_scale):
     return energy.Energy(tables.energy_table("v_cavity", at), there - here, mi.Float(1.0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("at", [0.6, 0.8])
 def test_derivative_by_height_includes_the_energy_factor(at):
     total = Total("height_scale", name="deep blazed")
@@ -165,6 +166,7 @@ def test_derivative_by_a_texture_of_orientations():
         np.testing.assert_allclose(found[tuple(place)], wanted, rtol=0.01, atol=2e-3 * scale)
 
 
+@pytest.mark.slow
 def test_derivatives_are_finite_where_orders_vanish_and_at_the_horizon():
     bsdf = mi.load_dict(grating("deep blazed", int_ior=1.5, base={"type": "diffuse"}))
     parameters = mi.traverse(bsdf)
@@ -240,9 +242,8 @@ def scene(**parameters):
     )
 
 
-@pytest.mark.parametrize(
-    ("key", "at", "step"), [("eta", 1.5, 0.05), pytest.param("height_scale", 0.7, 0.05, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("key", "at", "step"), [("eta", 1.5, 0.05), ("height_scale", 0.7, 0.05)])
 def test_derivative_of_a_rendering(key, at, step):
     world = scene(name="sinusoidal", int_ior=1.5, base={"type": "diffuse", "reflectance": uniform(0.2)})
     parameters = mi.traverse(world)

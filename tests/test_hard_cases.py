@@ -128,6 +128,7 @@ def test_at_q_zero_and_small_kappa_every_surface_is_a_mirror(name, representatio
         assert exact == pytest.approx(1 / (2 * np.pi * lobe_width(coherence_length) ** 2), rel=1e-9)
 
 
+@pytest.mark.slow
 @settings(max_examples=25)
 @given(
     depth=st.sampled_from([0.0, 1e-9, 0.05, 0.3, 2.0, 5.0]),

@@ -278,6 +278,7 @@ def sample():
     return inspect(waves(count=4, pixel=0.08, noise=0.001))
 
 
+@pytest.mark.slow
 def test_a_sample_is_told_in_numbers(sample):
     (period, *_) = sample.periods
     assert period.period == pytest.approx(PERIOD, abs=4 * period.period_uncertainty + 0.01)
@@ -347,6 +348,7 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
+@pytest.mark.slow
 def test_inspect_tells_and_draws(folder, command):
     code, out, err = command("inspect waves.npy --pixel-size 0.08 --json numbers.json")
     assert (code, err) == (0, "")
@@ -368,6 +370,7 @@ def test_inspect_tells_and_draws(folder, command):
     }
 
 
+@pytest.mark.slow
 def test_one_period_of_a_profile(folder, command):
     np.save("ridges.npy", 0.1 * np.abs(np.sin(np.pi * np.arange(256) / 256))[None])
     code, out, err = command("inspect ridges.npy --pixel-size 0.005078125")
@@ -384,6 +387,7 @@ def test_one_period_of_a_profile(folder, command):
         assert pixels.std() > 20
 
 
+@pytest.mark.slow
 def test_options_of_precompute(folder, command):
     heights = np.load("waves.npy")
     np.save("waves.npy", heights + 0.01 * np.arange(100))
@@ -397,6 +401,7 @@ def test_options_of_precompute(folder, command):
     assert "coherence length  3 µm" in out
 
 
+@pytest.mark.slow
 def test_scalar_theory_is_judged_at_every_period():
     x = (np.arange(150) + 0.5) * 0.08
     crossed = 0.04 * np.sin(2 * np.pi * x / 3) + 0.02 * np.sin(2 * np.pi * x / 0.8)[:, None]
@@ -407,12 +412,14 @@ def test_scalar_theory_is_judged_at_every_period():
     assert both.scalar_error[550] > 2 * expected_error(3.0, depth, 0.55)
 
 
+@pytest.mark.slow
 def test_the_slide_of_a_large_tile_shows_a_dozen_periods():
     tile = md.HeightField(np.tile(md.gratings.sinusoidal(PERIOD, DEPTH, samples=16).heights, (32, 8)), PERIOD / 16)
     piece = piece_shown(inspect(tile, extent="tile", coherence_length=5.0))
     assert piece.tile_size == pytest.approx((24.0, 24.0))
 
 
+@pytest.mark.slow
 def test_inspect_takes_a_recipe(folder, command):
     code, out, err = command("inspect foil.toml -o slide.pdf")
     assert (code, err) == (0, "")
@@ -444,6 +451,7 @@ def test_a_mistake_is_one_line_and_exit_code_2(folder, command, arguments, words
     assert sorted(folder.iterdir()) == before
 
 
+@pytest.mark.slow
 def test_the_measured_skins(scan):
     seen = inspect(scan("elaphe"))
     assert seen.periods[0].period == pytest.approx(1.0, abs=0.05)
@@ -454,7 +462,8 @@ def test_the_measured_skins(scan):
 # ---------------------------------------------------------------- what people read
 
 
-@pytest.mark.parametrize("whole", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("whole", [False, True])
 def test_the_notebook_runs_and_says_what_it_shows(monkeypatch, capsys, whole):
     if not dr.has_backend(dr.JitBackend.LLVM):
         pytest.skip("Dr.Jit finds no LLVM")

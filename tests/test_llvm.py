@@ -57,11 +57,13 @@ def test_takes_the_place_of_an_old_llvm(major: int) -> None:
     assert "is not an LLVM 17 or later" in process.stderr
 
 
+@pytest.mark.slow
 @needs_wheel
 def test_takes_the_place_of_a_missing_llvm() -> None:
     run(IMPORT, USE, library="/nonexistent")
 
 
+@pytest.mark.slow
 @needs_wheel
 def test_without_the_user_doing_anything() -> None:
     assert not run(IMPORT, USE).stderr
@@ -83,6 +85,7 @@ def test_an_old_llvm_that_was_there_first_is_told_before_a_kernel_aborts(first: 
     assert "import mitsuba_diffraction before mitsuba" in line
 
 
+@pytest.mark.slow
 @needs_wheel
 def test_a_usable_llvm_of_the_user_stays(tmp_path: Path) -> None:
     (tmp_path / "lib").symlink_to(WHEEL.parent)
@@ -91,6 +94,7 @@ def test_a_usable_llvm_of_the_user_stays(tmp_path: Path) -> None:
     assert process.stdout.strip() == str(library)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not any(file.name.startswith("libc++.so.1") for file in WHEEL_FILES), reason="no such wheel")
 def test_wheel_whose_links_are_not_made_yet(tmp_path: Path) -> None:
     """As right after pip, in the interpreter that runs on, or in an environment that is read-only."""

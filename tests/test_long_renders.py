@@ -102,6 +102,7 @@ def test_error_is_the_scatter_of_whole_pictures():
     assert sums.error() == pytest.approx(expected, rel=0.05)
 
 
+@pytest.mark.slow
 def test_black_pictures_have_no_error_and_end(folder):
     text = SCENE.replace("RFILTER", "box")
     Path("scene.xml").write_text(text[: text.index('<emitter type="constant"')] + "</scene>")
@@ -110,6 +111,7 @@ def test_black_pictures_have_no_error_and_end(folder):
     assert not image.radiance.any()
 
 
+@pytest.mark.slow
 def test_until_error_stops_where_the_noise_is_as_wanted():
     calls = []
     image = render("scene.xml", spp=4096, until_error=0.05, progress=lambda *call: calls.append(call))
@@ -142,6 +144,7 @@ def test_errors_out_of_range_are_refused(error):
 # --- checkpoints ---
 
 
+@pytest.mark.slow
 def test_ctrl_c_gives_what_there_is_and_resuming_gives_the_same_bits():
     whole = render("scene.xml", spp=7)
     with pytest.raises(Interrupted) as caught:
@@ -181,6 +184,7 @@ def test_ctrl_c_stays_ignored_where_it_was():
         signal.signal(signal.SIGINT, before)
 
 
+@pytest.mark.slow
 def test_checkpoints_are_written_every_so_often(monkeypatch):
     clock = iter(np.arange(0, 1000, 4.0))  # each look at the clock is four seconds after the one before
     monkeypatch.setattr(passes.time, "monotonic", lambda: next(clock))
@@ -282,9 +286,10 @@ def test_damaged_checkpoints_are_refused(damage):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kills", "rfilter"),
-    [(2, "box"), pytest.param(10, "box", marks=pytest.mark.slow), pytest.param(10, "gaussian", marks=pytest.mark.slow)],
+    [(2, "box"), (10, "box"), (10, "gaussian")],
 )
 def test_killed_renderings_go_on_and_give_the_same_bits(command, kills, rfilter):
     Path("scene.xml").write_text(SCENE.replace("RFILTER", rfilter))
@@ -324,6 +329,7 @@ RENDER = "render scene.xml --variant llvm_ad_spectral"
 LINE = f"{RENDER} -o out.exr --spp 6"
 
 
+@pytest.mark.slow
 def test_the_command_is_interrupted_and_goes_on(command, monkeypatch):
     press_ctrl_c(monkeypatch, 2)
     code, out, err = command(LINE)
@@ -382,6 +388,7 @@ def test_an_interrupt_before_the_first_pass_writes_nothing(command, monkeypatch)
     assert files() == {"scene.xml"}
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_one_line_and_leaves_the_last_checkpoint(command, monkeypatch):
     def limited(line):
         # Not even the superuser writes more than this; a disk that is full raises another number.

@@ -64,6 +64,7 @@ def test_a_scene_sets_the_tolerance_of_a_recipe(tmp_path, llvm):
     assert mi.load_dict({**grating, "tolerance": 0.05}).spectrum.tolerance == pytest.approx(0.05)
 
 
+@pytest.mark.slow
 def test_every_material_of_mitsuba_is_known(llvm):
     for material in ("Al", "Au", "none", "Cr", "a-C", "TiO2_palik"):
         mi.load_dict({"type": "diffraction_grating", "profile": "blazed", "period": 2.5, "depth": 0.25,

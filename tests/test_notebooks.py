@@ -74,6 +74,7 @@ def test_no_notebook_names_a_folder_of_somebodys_machine(path):
         assert folder not in text, folder
 
 
+@pytest.mark.slow
 def test_a_notebook_runs(path):
     notebook = executed(reduced(nbformat.read(path, as_version=4)))
     assert not [out for out in outputs(notebook) if out.output_type == "error"]

@@ -52,6 +52,7 @@ def test_between_the_orders_too(recipe, spectrum):
     np.testing.assert_allclose(spectrum.evaluate(q, kappa), wanted, atol=2e-3 * wanted.max())
 
 
+@pytest.mark.slow
 def test_a_saved_spectrum_says_how_many(spectrum, tmp_path):
     spectrum.save(tmp_path / "mean.exr")
     again = GratingSpectrum.load(tmp_path / "mean.exr")
@@ -94,6 +95,7 @@ def test_patches_repeat_and_are_of_one_size(recipe):
         md.precompute([])
 
 
+@pytest.mark.slow
 def test_a_scene_names_them(llvm):
     surface = {"type": "diffraction_grating", **{**SURFACE, "coherence_length": 5.6, "patches": 2}}
     assert mi.load_dict(surface).spectrum.patches == 2

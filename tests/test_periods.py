@@ -246,6 +246,7 @@ def test_a_band_is_told_by_its_centre_and_not_by_its_strongest_bin():
     assert 0.4 < np.sqrt(np.mean(np.square(errors))) < 1.6
 
 
+@pytest.mark.slow
 def test_crops_confirm_the_uncertainty_of_the_fingers(panel):
     whole = panel
     rows, band = find_periods(whole)

@@ -56,6 +56,7 @@ def test_metal_as_rough_conductor(polarised, mode):
         )
 
 
+@pytest.mark.slow
 def test_light_reflected_at_brewsters_angle_is_s_light(polarised):
     angle = np.arctan(1.5)
     wi = np.array([[np.sin(angle)], [0], [np.cos(angle)]])
@@ -64,6 +65,7 @@ def test_light_reflected_at_brewsters_angle_is_s_light(polarised):
     np.testing.assert_allclose(np.hypot(m[1, 0], m[2, 0]) / m[0, 0], 1, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_unpolarised_light_is_as_bright_as_in_the_other_variants(polarised):
     wi, wo = directions(50)
     brightness = matrices(grating(int_ior=1.5), wi, wo)[0, 0]
@@ -79,11 +81,13 @@ def test_without_an_index_light_leaves_unpolarised(polarised, parameters):
     assert (m == 0).all()
 
 
+@pytest.mark.slow
 def test_straight_back(polarised):
     wi = np.array([[0.0], [0.0], [1.0]])
     assert np.isfinite(matrices(grating(int_ior=1.5), wi, wi)).all()
 
 
+@pytest.mark.slow
 def test_indices_that_match_reflect_nothing(polarised):
     m = matrices(grating(int_ior=1.0, ext_ior=1.0), *directions(20))
     assert (m == 0).all()

@@ -670,6 +670,7 @@ def test_the_largest_height_range_can_be_raised():
             precompute(field, largest_height_range=limit)
 
 
+@pytest.mark.slow
 def test_a_tile_of_which_thousands_of_orders_overlap_is_read_from_a_lattice():
     field = HeightField(np.random.default_rng(0).random((300, 156)) * 0.3, 0.09)
     spectrum = precompute(field, coherence_length=1.0)

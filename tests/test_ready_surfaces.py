@@ -319,6 +319,7 @@ def test_gratings_are_ready_without_any_number(name):
     assert bsdf.spectrum.source == PROFILES[name]().source
 
 
+@pytest.mark.slow
 def test_the_tracks_of_a_disc_run_round_it():
     if not dr.has_backend(dr.JitBackend.LLVM):
         pytest.skip("Dr.Jit finds no LLVM")

@@ -220,6 +220,7 @@ def test_a_recipe_builds_what_its_words_say(tmp_path):
     np.testing.assert_array_equal(got.table.terms, wanted.table.terms)
 
 
+@pytest.mark.slow
 def test_a_recipe_of_a_sample(tmp_path, own_cache):
     heights = np.random.default_rng(0).random((20, 24)) * 0.1
     np.save(tmp_path / "scan.npy", heights)
@@ -351,6 +352,7 @@ def test_another_parameter_is_another_spectrum(own_cache, builds, surface, spect
         assert getattr(got, name) == getattr(wanted, name)
 
 
+@pytest.mark.slow
 def test_the_cache_knows_a_scan_by_its_bytes(tmp_path, own_cache, builds):
     text = '[surface]\nscan = "scan.npy"\npixel_size = 0.05\n[spectrum]\ntolerance = 0.01\n'
     here, there = tmp_path / "here", tmp_path / "there"
@@ -474,6 +476,7 @@ def test_unit_and_channel_of_a_recipe(tmp_path):
         Recipe.load(write(tmp_path, text + 'channel = "Z"\n')).height_field()
 
 
+@pytest.mark.slow
 def test_the_command_takes_the_same_of_a_scan(tmp_path, command, monkeypatch):
     monkeypatch.chdir(tmp_path)
     tilted(tmp_path)
@@ -543,6 +546,7 @@ def test_one_warning_for_many_surfaces(own_cache):
     assert len(told) == 1
 
 
+@pytest.mark.slow
 def test_a_spectrum_of_another_surface_under_a_name_of_the_cache_is_not_used(own_cache, builds):
     one, other = (Recipe({**BLAZED, "period": period}, FAST) for period in (2.5, 2.6))
     one.cached()

@@ -52,6 +52,7 @@ def test_constant_radiance_of_one_per_nm_is_one_in_every_channel(variant, spp, t
     np.testing.assert_allclose(means.mean(), 1, atol=tolerance / 6)
 
 
+@pytest.mark.slow
 def test_ramp(llvm, tmp_path):
     ramp = f'<emitter type="constant">{spectrum("radiance", 360, 830, "0, 4.7")}</emitter>'
     image = render(write_scene(tmp_path, ramp), spp=8192)
@@ -59,6 +60,7 @@ def test_ramp(llvm, tmp_path):
     np.testing.assert_allclose(means / ((GRID - 360) / 100), 1, atol=0.06)
 
 
+@pytest.mark.slow
 def test_line_of_a_directional_light_is_in_its_channel(llvm, tmp_path):
     # A triangle around 505 nm seen through hats of the same width: 2/3, and 1/6 in both neighbours.
     light = '<emitter type="directional"><vector name="direction" x="0" y="0" z="-1"/>'
@@ -72,6 +74,7 @@ def test_line_of_a_directional_light_is_in_its_channel(llvm, tmp_path):
     assert (np.delete(means, [at - 1, at, at + 1]) == 0).all()
 
 
+@pytest.mark.slow
 def test_rgb_is_that_of_mitsubas_own_film(llvm, tmp_path):
     path = write_scene(tmp_path, SPHERE + '<emitter type="constant"/>')
     image = render(path, spp=2048)
@@ -81,6 +84,7 @@ def test_rgb_is_that_of_mitsubas_own_film(llvm, tmp_path):
     )
 
 
+@pytest.mark.slow
 def test_passes(llvm, tmp_path, monkeypatch):
     path = write_scene(tmp_path, SPHERE + CONSTANT)
     whole = render(path, spp=512, seed=3)
@@ -110,6 +114,7 @@ def test_passes(llvm, tmp_path, monkeypatch):
     assert spread[0] < 1.4 * spread[1]
 
 
+@pytest.mark.slow
 def test_rendering_a_scene_again_compiles_nothing(llvm, tmp_path):
     blaze = """<bsdf type="diffraction_grating"><string name="profile" value="blazed"/>
         <float name="period" value="2.5"/><float name="depth" value="0.25"/></bsdf>"""
@@ -157,6 +162,7 @@ def test_uneven_passes(llvm, tmp_path, monkeypatch):
     assert calls[4:] == [0, 1, 2]  # never less than one sample per pixel
 
 
+@pytest.mark.slow
 def test_samplers_that_round_up_are_counted(llvm, tmp_path, monkeypatch):
     monkeypatch.setattr(passes, "SAMPLES_PER_PASS", 64 * 6)
     path = write_scene(tmp_path, CONSTANT)
@@ -173,15 +179,16 @@ BORDERED = """<film type="hdrfilm"><integer name="width" value="24"/><integer na
     <boolean name="sample_border" value="{border}"/><rfilter type="{rfilter}"/></film>"""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("rfilter", "border", "variant"),
     [
         ("box", "false", "llvm_ad_spectral"),
         ("tent", "true", "llvm_ad_spectral"),
-        pytest.param("tent", "false", "llvm_ad_spectral_polarized", marks=pytest.mark.slow),
-        pytest.param("gaussian", "false", "llvm_ad_spectral", marks=pytest.mark.slow),
-        pytest.param("gaussian", "true", "llvm_ad_spectral", marks=pytest.mark.slow),
-        pytest.param("lanczos", "true", "llvm_ad_spectral", marks=pytest.mark.slow),
+        ("tent", "false", "llvm_ad_spectral_polarized"),
+        ("gaussian", "false", "llvm_ad_spectral"),
+        ("gaussian", "true", "llvm_ad_spectral"),
+        ("lanczos", "true", "llvm_ad_spectral"),
     ],
 )
 def test_a_pass_is_that_of_mitsubas_own_film(rfilter, border, variant, tmp_path):
@@ -255,6 +262,7 @@ def test_size_crop_and_filter(llvm, tmp_path):
     assert list(film_of(path, width=1).crop_size()) == [1, 1]
 
 
+@pytest.mark.slow
 def test_spectral_film_of_the_scene_is_replaced_too(llvm, tmp_path):
     band = spectrum("band", 500, 600, "1, 1")
     film = f'<film type="specfilm"><integer name="width" value="3"/><integer name="height" value="2"/>{band}</film>'
@@ -266,6 +274,7 @@ def test_sensor_without_film(llvm, tmp_path):
     assert list(film_of(write_scene(tmp_path, CONSTANT, film=""), width=16).size()) == [16, 12]
 
 
+@pytest.mark.slow
 def test_parameters(llvm, tmp_path):
     path = write_scene(tmp_path, CONSTANT)
     assert render(path, spp=1, parameters={"width": "5"}).radiance.shape[1] == 5

@@ -262,6 +262,7 @@ def test_mueller_matrices_of_a_plane_are_mitsubas():
     np.testing.assert_allclose(mueller(found.amplitudes[found.orders == 0][0]), wanted, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_polarised_light_is_split_as_the_solver_has_it(solved):
     """Conical incidence from all sides, of a pattern that is turned."""
     use("llvm_ad_spectral_polarized")
@@ -405,6 +406,7 @@ def test_a_grating_is_built_for_the_coat_and_the_variant_of_the_scene(monkeypatc
     ]
 
 
+@pytest.mark.slow
 def test_the_log_says_once_where_scalar_theory_fails(llvm, capfd):
     fine = {"type": "diffraction_grating", "profile": "sinusoidal", "period": 0.71, "depth": 0.3, "samples": 64}
     for _ in range(2):
@@ -428,6 +430,7 @@ def test_a_period_too_long_for_the_table_is_refused():
         md.precompute(md.gratings.sinusoidal(20.0, 0.1), theory="rigorous", material="Al")
 
 
+@pytest.mark.slow
 def test_precompute_writes_a_recipes_rigorous_spectrum(command, tmp_path):
     recipe, target = tmp_path / "moth_eye.toml", tmp_path / "moth_eye.exr"
     recipe.write_text(

@@ -51,6 +51,7 @@ def test_the_stored_angles_fit_best(theory):
     assert best < min(others)
 
 
+@pytest.mark.slow
 def test_measured_gratings_are_drawn_with_both_theories(llvm):
     from mitsuba_diffraction.studies import measured_gratings
 

@@ -32,6 +32,7 @@ def test_the_axes_are_symmetric_and_whole_where_orders_pass_off():
     assert axes.nodes == sum((int(np.ceil(5 - abs(m))) * 8 + 1) ** 2 for m in range(-4, 5))
 
 
+@pytest.mark.slow
 def test_the_table_has_the_efficiencies_of_the_solver(spectrum):
     errors = []
     for omega, wavelength in zip(hemisphere(25, 1), np.linspace(0.401, 0.499, 25), strict=True):
@@ -73,6 +74,7 @@ def test_a_scalar_spectrum_is_refused(spectrum, tmp_path):
         md.GratingSpectrum.load(tmp_path / "rigorous.exr")
 
 
+@pytest.mark.slow
 def test_an_interrupted_build_goes_on(tmp_path):
     class Enough(Exception):
         pass

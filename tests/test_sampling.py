@@ -176,6 +176,7 @@ def test_wavelengths_that_are_not_covered_take_no_part_in_the_sampling(llvm, lon
     assert abs((pdf / wo[:, 2]).sum() * area - drawn) < 5e-3
 
 
+@pytest.mark.slow
 def test_beyond_the_largest_angle_only_the_base_reflects(llvm):
     of = md.precompute(md.gratings.sinusoidal(2.5, 0.25), largest_angle=60.0, coherence_length=3.0)
     bsdf = plugin(of, int_ior=1.5, base={"type": "diffuse"})
@@ -319,6 +320,7 @@ def test_orders_are_drawn_with_their_shares_and_only_those_that_propagate(llvm, 
         assert inside.sum() <= propagates.sum() + 2
 
 
+@pytest.mark.slow
 def test_many_orders_are_drawn_without_a_rectangle(llvm):
     spectrum = md.precompute(md.gratings.xenopeltis(16.0))
     sampler = OrderSampler(spectrum)

@@ -42,6 +42,7 @@ def test_scene_renders(llvm, name):
     check(render(SCENES / f"{name}.xml", spp=4, width=16, height=16), 16, 16)
 
 
+@pytest.mark.slow
 def test_scene_of_a_scan_renders(llvm, tmp_path):
     path = tmp_path / "spectrum.exr"
     md.precompute(md.gratings.elaphe(8)).save(path)
@@ -75,14 +76,15 @@ def small_scenes(tmp_path_factory):
 PICTURES = [
     ("snake", {"skin": "xenopeltis", "light": "sun"}),
     ("compact_disc", {"light": "desk_lamp"}),
-    pytest.param("foil", {"light": "lamp"}, marks=pytest.mark.slow),
-    pytest.param("snake", {"skin": "elaphe", "light": "lamp"}, marks=pytest.mark.slow),
-    pytest.param("compact_disc", {"light": "sun"}, marks=pytest.mark.slow),
-    pytest.param("foil", {"light": "sun"}, marks=pytest.mark.slow),
-    pytest.param("rainbow", {}, marks=pytest.mark.slow),
+    ("foil", {"light": "lamp"}),
+    ("snake", {"skin": "elaphe", "light": "lamp"}),
+    ("compact_disc", {"light": "sun"}),
+    ("foil", {"light": "sun"}),
+    ("rainbow", {}),
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "parameters"), PICTURES)
 def test_scene_with_models_renders(llvm, small_scenes, name, parameters):
     check(render(small_scenes / f"{name}.xml", spp=4, width=32, parameters=parameters), 32, 18)
@@ -201,6 +203,7 @@ def test_snakes_have_their_colours(scales):
             assert back.mean() < 0.25
 
 
+@pytest.mark.slow
 def test_models_are_the_same_each_time(tmp_path):
     files = []
     for folder in (tmp_path / "a", tmp_path / "b"):
@@ -260,14 +263,12 @@ def test_ground_may_be_repeated():
 # ---------------------------------------------------------------- the spectrometer
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("lines", "parameters"),
     [
         ((404.66, 435.83, 546.07), {}),
-        pytest.param(
-            *((589.3,), {"lines": "587.99:0, 588.99:2, 589.29:1.9, 589.59:1, 590.59:0"}),
-            marks=pytest.mark.slow,
-        ),
+        ((589.3,), {"lines": "587.99:0, 588.99:2, 589.29:1.9, 589.59:1, 590.59:0"}),
     ],
     ids=["mercury", "sodium"],
 )

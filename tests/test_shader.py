@@ -507,6 +507,7 @@ def test_bright_pixels_are_where_the_grating_equation_says(variant, as_published
     assert u[(row * (np.abs(u) > 0.1)).argmax()] == pytest.approx(0.55, abs=0.08)
 
 
+@pytest.mark.slow
 def test_the_corrected_integrator_shows_what_the_path_tracer_does():
     # A rougher lobe, so that 16 × 16 pixels resolve it.
     base = {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.4}}
@@ -519,6 +520,7 @@ def test_the_corrected_integrator_shows_what_the_path_tracer_does():
             assert np.abs(image - expected).sum() < 0.06 * expected.sum()
 
 
+@pytest.mark.slow
 def test_each_quirk_of_the_scene_is_a_parameter():
     published = picture(shader(terms=16), 4)
     for name in ("window_pi", "d65_twice", "cie_rgb_matrix", "relative", "power_gamma"):
@@ -526,6 +528,7 @@ def test_each_quirk_of_the_scene_is_a_parameter():
         assert np.abs(changed - published).max() > 0.003 * published.max(), name
 
 
+@pytest.mark.slow
 def test_what_lies_below_gets_what_the_surface_lets_through():
     bsdf = dict(GRATING, depth=0.0, base={"type": "diffuse", "reflectance": {"type": "uniform", "value": 1.0}})
     side = (slice(None), slice(0, 4))  # far from the mirror direction

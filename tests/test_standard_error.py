@@ -118,6 +118,7 @@ def test_a_tile_has_none():
         spectrum.standard_error  # noqa: B018
 
 
+@pytest.mark.slow
 def test_the_command_prints_it_and_the_file_keeps_it(rough, tmp_path, command, monkeypatch):
     monkeypatch.chdir(tmp_path)
     recipe = Path("noise.toml")

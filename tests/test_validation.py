@@ -53,6 +53,7 @@ def test_a_record_is_within_its_bound_or_not():
     assert Record.worst([10.0, 1.0], [12.0, 1.3], 1.0, relative=True).error == pytest.approx(0.3)
 
 
+@pytest.mark.slow
 def test_checks_see_heights_that_are_wrong():
     """2 % too low."""
     assert not analytic.compare_orders(md.gratings.sinusoidal(2.5, 0.98 * 0.3), analytic.sinusoid_orders).ok
@@ -61,6 +62,7 @@ def test_checks_see_heights_that_are_wrong():
     assert analytic.compare_directions(low_blaze, 25, 0).ok
 
 
+@pytest.mark.slow
 def test_checks_see_a_wrong_period():
     assert not analytic.compare_directions(md.gratings.sinusoidal(1.001 * 2.5, 0.3), 25, 0).ok
 
@@ -168,6 +170,7 @@ def solver(monkeypatch, name="coupled_waves"):
     return importlib.import_module(name)
 
 
+@pytest.mark.slow
 def test_the_maker_of_the_stored_results_runs(monkeypatch, tmp_path):
     maker = solver(monkeypatch, "rigorous_reference")
     jobs = maker.all_jobs()
@@ -211,6 +214,7 @@ def test_coupled_waves_send_a_blaze_to_the_side_of_its_facets(monkeypatch):
 # ---------------------------------------------------------------- one surface, and the command
 
 
+@pytest.mark.slow
 def test_checks_of_a_surface():
     blaze = md.gratings.blazed(2.5, 0.1)
     results = {c.name: c.run() for c in surface_checks(blaze, md.precompute(blaze))}
@@ -263,6 +267,7 @@ def test_the_period_of_a_surface_is_seen():
     assert np.isnan(main_period(md.HeightField(np.zeros((1, 4)), 0.05), "tile"))
 
 
+@pytest.mark.slow
 def test_a_surface_outside_of_the_range_is_missed(command, tmp_path):
     recipe = tmp_path / "narrow.toml"
     recipe.write_text('[surface]\nprofile = "sinusoidal"\nperiod = 0.8\ndepth = 0.4\n')
@@ -307,6 +312,7 @@ def test_wrong_requests_are_refused(command, tmp_path):
     assert "wanted llvm_" in error
 
 
+@pytest.mark.slow
 def test_a_scan_is_validated_with_the_options_that_other_commands_take(command, tmp_path, monkeypatch):
     heights = np.random.default_rng(1).random((20, 24)) * 0.1
     heights[3, 4] = np.nan

@@ -111,6 +111,7 @@ def test_samples_carry_the_albedo(name):
     assert albedo.min() > 0.2
 
 
+@pytest.mark.slow
 def test_back_of_twosided_is_that_of_the_front_with_z_turned():
     bsdf, rng = mi.load_dict(WRAPPERS["twosided"]()), np.random.default_rng(2)
     wi, wo = random_directions(rng, 300), random_directions(rng, 300)
@@ -123,6 +124,7 @@ def test_back_of_twosided_is_that_of_the_front_with_z_turned():
     assert weight.mean() > 0.5
 
 
+@pytest.mark.slow
 def test_twosided_takes_another_grating_for_its_back():
     bsdf = mi.load_dict({"type": "twosided", "front": wide(), "back": wide(orientation=90.0)})
     wi, wo = direction(20, 10), random_directions(np.random.default_rng(3), 100)
@@ -132,6 +134,7 @@ def test_twosided_takes_another_grating_for_its_back():
         np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_blend_by_a_texture():
     weights = bitmap([[[0.1], [0.8]], [[0.1], [0.8]]])
     bsdf = mi.load_dict({"type": "blendbsdf", "weight": weights, "first": wide(), "second": DIFFUSE})
@@ -209,6 +212,7 @@ def test_picture_has_no_nan(name):
     assert image.mean() > 0.1
 
 
+@pytest.mark.slow
 def test_wrappers_stand_inside_each_other():
     inner = {**WRAPPERS["normalmap"](), "nested": grating("elaphe", 26.0, int_ior=1.5, base=DIFFUSE)}
     bsdf = mi.load_dict({"type": "twosided", "nested": {"type": "mask", "opacity": 1.0, "nested": inner}}["nested"])
