@@ -5,8 +5,10 @@ import shlex
 import signal
 import sys
 import warnings
+from collections import defaultdict
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import settings
 
@@ -27,12 +29,15 @@ _HEIGHT_RANGE = {"elaphe": 0.375, "xenopeltis": 0.819}
 
 @pytest.hookimpl(tryfirst=True)  # before -m selects
 def pytest_collection_modifyitems(items):
-    """Marks what slow.txt lists as slow: by `--durations 0` what takes more than a second of a core, and of tests with
-    many parameters all but some."""
-    listed = set(Path(__file__).with_name("slow.txt").read_text(encoding="utf-8").splitlines())
+    """Of a test marked `few(n)`, n of the cases that are not slow stay so, evenly spaced; the others are slow."""
+    cases = defaultdict(list)
     for item in items:
-        if item.nodeid.removeprefix("tests/") in listed:
-            item.add_marker(pytest.mark.slow)
+        if (few := item.get_closest_marker("few")) and not item.get_closest_marker("slow"):
+            cases[few.args[0], item.function].append(item)
+    for (count, _), those in cases.items():
+        kept = np.linspace(0, len(those) - 1, count).round()
+        for case in set(range(len(those))) - set(kept):
+            those[case].add_marker(pytest.mark.slow)
 
 
 @pytest.fixture(scope="session", autouse=True)

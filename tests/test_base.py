@@ -63,6 +63,7 @@ def alone(name="blazed", coherence_length=3.0):
 pytestmark = pytest.mark.usefixtures("llvm")
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("name", sorted(SMOOTH))
 def test_value_is_the_grating_and_what_it_lets_through(name):
     rng = np.random.default_rng(3)
@@ -75,10 +76,8 @@ def test_value_is_the_grating_and_what_it_lets_through(name):
     np.testing.assert_allclose(evaluate(over(SMOOTH[name]()), wi, wo, uv=uv)[0], wanted, rtol=2e-4, atol=1e-6)
 
 
-QUICK = "bitmap", "roughplastic", "blendbsdf"
-
-
-@pytest.mark.parametrize("name", [x if x in QUICK else pytest.param(x, marks=pytest.mark.slow) for x in sorted(SMOOTH)])
+@pytest.mark.few(1)
+@pytest.mark.parametrize("name", sorted(SMOOTH))
 def test_weight_is_value_over_density_and_its_mean_the_albedo(name):
     bsdf, wi, count, uv = over(SMOOTH[name]()), direction(40, 30), 1 << 17, (0.3, 0.4)
     bs, weight = draw(bsdf, wi, count, uv=[uv])
@@ -131,6 +130,7 @@ def test_samples_pass_the_chi_square_test(base, theta):
     assert test.run(significance_level=0.01, test_count=9, quiet=True), test.messages
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", sorted(MIRRORS))
 def test_mirror_lobes_pass_the_surface_twice(name):
     wi, count = direction(50, 70), 1 << 16
@@ -249,6 +249,7 @@ def test_texture_steers_the_samples():
     assert max(shares) > 2 * min(shares)
 
 
+@pytest.mark.few(12)
 @pytest.mark.parametrize("theta", [0, 70, 89, *(pytest.param(x, marks=pytest.mark.slow) for x in (30, 45, 80, 85))])
 @pytest.mark.parametrize("base", [{"type": "diffuse", "reflectance": uniform(1.0)}, {"type": "conductor"}])
 @pytest.mark.parametrize("name", ["blazed", "deep blazed", "elaphe"])
@@ -277,6 +278,7 @@ def values_and_samples(base, wi):
     return value.T, pdf, np.array(bs.wo).T, np.array(bs.pdf), weight.T, component
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("base", OTHERS)
 def test_polarised_variants_give_the_same(base):
     wi = direction(40, 30)

@@ -22,6 +22,7 @@ BLAZE = Case("blaze", gratings.blazed(2.5, 0.25), "tile", 65.0)
 SKIN = Case("skin", gratings.elaphe(8.0, pixel_size=0.08), "sample", 2.0)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("case", [BLAZE, SKIN], ids=lambda case: case.name)
 def test_accuracy_is_within_the_tolerance_and_follows_it(case):
     exact = Exact(case, VISIBLE, kappas=2, points=400)
@@ -31,6 +32,7 @@ def test_accuracy_is_within_the_tolerance_and_follows_it(case):
     assert 0 < fine.delta_e[0] <= fine.delta_e[1] < coarse.delta_e[1] < 1
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("case", [BLAZE, SKIN], ids=lambda case: case.name)
 def test_accuracy_sees_an_error_that_is_put_in(case):
     exact, spectrum = Exact(case, VISIBLE, kappas=2, points=400), case.spectrum("slices")

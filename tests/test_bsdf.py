@@ -90,6 +90,7 @@ def test_flat_surface_gives_a_gaussian_about_the_mirror_direction(llvm):
         np.testing.assert_allclose(value[:, 1] / wo[:, 2], wanted, rtol=2e-3)
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("name", ["blazed", "sinusoidal"])
 @pytest.mark.parametrize(("theta", "phi"), [(0, 0), (30, 0), (45, 70)])
 def test_orders_have_their_power_and_nothing_lies_between(llvm, name, theta, phi):
@@ -163,6 +164,7 @@ def test_reciprocity(llvm):
     np.testing.assert_allclose(there, back, rtol=1e-4, atol=1e-6 * there.max())
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("representation", ["taylor", "slices"])
 @pytest.mark.parametrize("name", sorted(MAKE))
 def test_any_directions_give_finite_values(llvm, name, representation):

@@ -166,6 +166,7 @@ def test_precompute_writes_the_file_that_it_names_and_says_its_error(command):
     assert f"{spectrum.beyond:.1e} at frequencies that no direction reaches" in out
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("representation", ["taylor", "chebyshev", "svd", "slices"])
 def test_a_sample_by_options(command, representation):
     code, out, err = command(
@@ -268,6 +269,7 @@ def test_many_sources_are_named_after_themselves(command):
     assert {"blaze.exr", "other.exr"} <= files()
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("name", ["a[red]b.exr", "a[b]c.exr", "a:smile:.exr", "é ü.exr"])
 def test_the_name_that_is_said_is_the_name_of_the_file(command, name):
     # Regression: square brackets and words between colons were taken for markup.

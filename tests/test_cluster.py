@@ -65,6 +65,7 @@ def with_light_from_gratings(scene):
     return scene.replace('"path"', '"diffraction_path"').replace("</scene>", f'{sun}<shape type="rectangle"/></scene>')
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("scene", [SCENE, with_light_from_gratings(SCENE)], ids=["path", "diffraction_path"])
 def test_a_cluster_gives_the_bits_of_one_machine(scene, threads_of_this_process, command):
     Path("scene.xml").write_text(scene)

@@ -35,6 +35,7 @@ def transmittance(cosine):
     return 1 - np.mean(fresnel(cosine, RELATIVE), axis=0)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("theta", [0.0, 25.0, 50.0])
 def test_orders_have_the_powers_of_the_closed_form_inside(llvm, theta):
     wavelength, wi = 0.5, direction(theta)

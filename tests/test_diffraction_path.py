@@ -149,6 +149,7 @@ def test_what_a_grating_throws_onto_a_wall_is_far_less_noisy(llvm):
     assert at_wall["path"] > 50 * at_wall["diffraction_path"]
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(("bsdf", "depth"), [(blaze, 1), (blaze, 2), (lambda: diffuse(0.5), 5)])
 def test_without_such_light_it_is_path(bsdf, depth, llvm):
     built = scene(plate=plate(bsdf()), sun=SUN, sky=SKY)

@@ -145,6 +145,7 @@ def run_xml(text):
     mi.load_file("block.xml")
 
 
+@pytest.mark.few(8)
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_the_code_of_a_page_runs(page, folder, command, llvm, capfd):
     names = {}

@@ -97,11 +97,13 @@ def furnace(name, rng, count, **parameters):
     return max(albedo(bsdf, of, wi, wavelength) for wi, wavelength in pairs)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", ONE_ROW)
 def test_no_albedo_above_one_by_quadrature(name):
     assert furnace(name, np.random.default_rng(1), 20) <= 1 + EXCESS
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("height_scale", [0.3, 0.7])
 def test_no_albedo_above_one_for_scaled_heights(height_scale):
     assert furnace("deep blazed", np.random.default_rng(2), 15, height_scale=height_scale) <= 1 + EXCESS
@@ -134,6 +136,7 @@ SAMPLED = [("deep blazed", "v_cavity"), ("blazed", "none"), ("crossed", "v_cavit
 ALL_SAMPLED = [(name, shadowing) for name in sorted(MAKE) for shadowing in ("v_cavity", "none")]
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("name", "shadowing"),
     [*SAMPLED, *(pytest.param(*case, marks=pytest.mark.slow) for case in ALL_SAMPLED if case not in SAMPLED)],
@@ -154,6 +157,7 @@ def test_no_albedo_above_one_by_samples(name, shadowing):
         assert (weight.mean(1) <= 1 + excess + 4 * noise).all(), (theta, np.rad2deg(phi), weight.mean(1))
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", ["blazed", "elaphe"])
 def test_a_lit_sphere_is_nowhere_brighter_than_its_surroundings(name):
     scene = mi.load_dict(
@@ -184,6 +188,7 @@ def test_a_lit_sphere_is_nowhere_brighter_than_its_surroundings(name):
     assert image[8, 8] > 0.3 * corner
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", ["blazed", "crossed"])
 def test_untouched_where_neither_direction_reflects_too_much(name):
     of, rng = spectrum(name), np.random.default_rng(6)
@@ -226,6 +231,7 @@ def test_flat_surface_is_left_alone_away_from_the_horizon():
         assert e.min() > 0.984
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", ["deep blazed", "crossed"])
 def test_reciprocity(name):
     bsdf, rng = plugin(spectrum(name, 10.0)), np.random.default_rng(8)
@@ -296,6 +302,7 @@ MEAN_LOSS = {"crossed": 6e-3, "elaphe": 6e-3, "xenopeltis": 6e-3}  # else 2.5e-3
 TIGHT = ["blazed", "crossed"]
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", [*TIGHT, *(pytest.param(n, marks=pytest.mark.slow) for n in MAKE if n not in TIGHT)])
 def test_table_is_a_tight_bound(name):
     of, rng = spectrum(name), np.random.default_rng(10)
@@ -368,6 +375,7 @@ def test_albedo_of_a_sample():
     assert (found < upper * wanted).all()
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", ["blazed", "elaphe"])
 def test_table_is_small(name):
     table = spectrum(name).energy_table()

@@ -148,20 +148,21 @@ def anywhere(rng, count):
     return omega, rng.uniform(0.36, 0.83, count)
 
 
+@pytest.mark.few(1)
 @pytest.mark.filterwarnings("ignore::UserWarning")
 @pytest.mark.parametrize(
     "seed",
     [
         pytest.param(3, id="tile of 4 × 4 pixels, 8 µm deep"),  # 1.078 where e came from the gathered spectrum alone
         pytest.param(103, id="tile of 7 pixels, 1.8 µm deep"),
-        pytest.param(2025, id="grating of 64 pixels, 8 µm deep", marks=pytest.mark.slow),
+        pytest.param(2025, id="grating of 64 pixels, 8 µm deep"),
         # 1.046 where one set of places that found nothing ended the search.
-        pytest.param(5382, id="grating of 18 pixels, 3 µm deep", marks=pytest.mark.slow),
+        pytest.param(5382, id="grating of 18 pixels, 3 µm deep"),
         # 1.021 where the search did not go on about the largest albedos found.
-        pytest.param(5031, id="grating of 36 pixels, 3 µm deep", marks=pytest.mark.slow),
+        pytest.param(5031, id="grating of 36 pixels, 3 µm deep"),
         # 1.008 where no places were looked at where an order emerges.
-        pytest.param(5216, id="tile of 7 × 4 pixels, 0.6 µm deep", marks=pytest.mark.slow),
-        *(pytest.param(seed, marks=pytest.mark.slow) for seed in SEEDS if seed != 5031),
+        pytest.param(5216, id="tile of 7 × 4 pixels, 0.6 µm deep"),
+        *(seed for seed in SEEDS if seed != 5031),
     ],
 )
 def test_no_albedo_above_one(seed):
@@ -193,11 +194,11 @@ HARD = {
     "crossed": (lambda: md.precompute(md.gratings.crossed(2.0, 0.1, samples=32)), "none", (85, 87, 89, 89.9)),
     "scan of 4.8 µm, no shadowing": (lambda: scan(4.8, 0.1), "none", (70, 85, 87, 89, 89.9)),
 }
-QUICK = ("scan of 0.6 µm", "blazed")
 
 
+@pytest.mark.few(1)
 @pytest.mark.filterwarnings("ignore::UserWarning")
-@pytest.mark.parametrize("name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in HARD])
+@pytest.mark.parametrize("name", HARD)
 def test_the_reported_excess_holds(name):
     make, shadowing, angles = HARD[name]
     of, rng = make(), np.random.default_rng(7)

@@ -50,6 +50,7 @@ def test_a_flat_mirror_has_the_relative_reflectance_one(llvm):
     np.testing.assert_allclose(found, 1, atol=2e-3)  # what cutting off the lobes and the bytes of E leave
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("order", [-1, 0, 1])
 def test_orders_of_a_shallow_blaze_are_the_analytic_ones(llvm, order):
     # So shallow that energy is conserved of itself (E = 1).
@@ -196,6 +197,7 @@ def test_nmm_sees_only_the_orders_of_the_tile(llvm, incidence):
 # ---------------------------------------------------------------- maps of directions
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("projection", PROJECTIONS)
 def test_an_order_is_where_the_map_says(llvm, projection):
     found = brdf_map(BLAZE.coherent_over(6.5), projection=projection, side=120, incidence=(30.0, 20.0))

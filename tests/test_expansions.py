@@ -160,6 +160,7 @@ def test_nodes_resolve_the_wave_to_the_tolerance(x, tolerance):
     assert np.abs(got - np.exp(1j * x * T)).max() <= tolerance + 1e-12
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(("terms", "divisor"), [(3, 192), (4, 3072)])
 @given(height=st.floats(-5, 5), intervals=st.integers(1, 400), phase=st.floats(0, 2 * np.pi), share=st.floats(0.0, 1.0))
 @settings(max_examples=50)
@@ -239,6 +240,7 @@ def terms_of(kinds, field, extent):
     ]
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("depth", [0.15, 0.3, 0.5])
 @pytest.mark.parametrize(
     ("make", "extent"),

@@ -134,6 +134,7 @@ def test_a_seed_names_one_skin(name):
     assert abs(np.corrcoef(first.ravel(), other.ravel())[0, 1]) < 0.5
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("name", sorted(SKINS))
 @pytest.mark.parametrize("seed", [0, 7])
 def test_mean_period_of_a_skin_is_that_asked_for(name, seed):

@@ -101,6 +101,7 @@ def case(name):
     return {**SHALLOW, **FIVE_MICROMETRES}[name]
 
 
+@pytest.mark.few(27)
 @pytest.mark.parametrize(("name", "representation"), CASES)
 def test_hard_surfaces_are_right_to_the_tolerance(name, representation):
     field, extent, coherence_length = case(name)
@@ -114,6 +115,7 @@ def test_hard_surfaces_are_right_to_the_tolerance(name, representation):
         assert power > 5e-3  # there is something to compare
 
 
+@pytest.mark.few(36)
 @pytest.mark.parametrize("name", SHALLOW)
 @pytest.mark.parametrize("representation", ["svd", "slices", *SLOW])
 def test_at_q_zero_and_small_kappa_every_surface_is_a_mirror(name, representation):
@@ -205,6 +207,7 @@ RENDERED = [
 ]
 
 
+@pytest.mark.few(8)
 @pytest.mark.parametrize(("name", "representation"), RENDERED)
 @pytest.mark.usefixtures("llvm")
 def test_hard_surfaces_are_rendered_right(name, representation):
@@ -226,6 +229,7 @@ def test_hard_surfaces_are_rendered_right(name, representation):
     np.testing.assert_allclose(got, exact, atol=(1.5e-3 + digits) * peak)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("representation", KINDS)
 @pytest.mark.usefixtures("llvm")
 def test_a_sample_is_rendered_right_to_its_rim_and_black_beyond(representation):
@@ -253,6 +257,7 @@ def test_a_sample_is_rendered_right_to_its_rim_and_black_beyond(representation):
         np.testing.assert_allclose(got, spectrum.evaluate(q, kappa), atol=1e-5 * peak)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("extent", ["tile", "sample"])
 @pytest.mark.usefixtures("llvm")
 def test_the_ends_of_the_wavelengths_are_right_and_beyond_them_it_is_black(extent):

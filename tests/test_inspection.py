@@ -86,6 +86,7 @@ def test_a_flat_surface_mirrors_daylight():
     assert XYZ[0, 2] / XYZ[0, 0] > XYZ_flat[0, 2] / XYZ_flat[0, 0]
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(("theta_i", "theta_o"), [(0.0, 16.0), (20.0, 45.0), (60.0, 20.0), (30.0, -10.0), (70.0, 72.0)])
 def test_radiance_is_that_of_the_bsdf(theta_i, theta_o):
     mi.set_variant("scalar_spectral")
@@ -124,6 +125,7 @@ def test_colours_go_where_the_grating_equation_sends_them():
     assert order_angle(4, PERIOD, 0.55) is None
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("order", [1, 2])
 @pytest.mark.parametrize("extent", ["tile", "sample"])
 def test_orders_hold_what_bessel_says(order, extent):
@@ -487,6 +489,7 @@ def test_the_notebook_runs_and_says_what_it_shows(monkeypatch, capsys, whole):
     assert np.ptp(names["picture"], axis=2).max() > 0.1 * names["picture"].max()
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("periods", [1, 2, 4, 9])
 def test_the_period_of_a_tile_is_found_whatever_it_holds(periods):
     x = (np.arange(96) + 0.5) / 96 * periods

@@ -72,6 +72,7 @@ print(*({{"mitsuba", "drjit"}} & set(sys.modules)))
     assert (tmp_path / "s.png").is_file()
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     "lines",
     [

@@ -50,6 +50,7 @@ def run(*lines: str, library: str | None = None, python_path: Path | None = None
     return process
 
 
+@pytest.mark.few(1)
 @needs_wheel
 @pytest.mark.parametrize("major", [14, 15])
 def test_takes_the_place_of_an_old_llvm(major: int) -> None:
@@ -69,6 +70,7 @@ def test_without_the_user_doing_anything() -> None:
     assert not run(IMPORT, USE).stderr
 
 
+@pytest.mark.few(1)
 @needs_wheel
 @pytest.mark.parametrize("first", ["import drjit", "import mitsuba"])
 def test_an_old_llvm_that_was_there_first_is_told_before_a_kernel_aborts(first: str) -> None:
@@ -116,6 +118,7 @@ def test_wheel_whose_links_are_not_made_yet(tmp_path: Path) -> None:
     assert process.stdout.strip() == str(folder / WHEEL.name)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("first", ["", "import mitsuba"])
 def test_no_llvm_at_all(first: str) -> None:
     process = run(

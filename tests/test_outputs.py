@@ -157,6 +157,7 @@ def test_one_output_is_not_written_over_another(command, line, name):
 # --- what is there ---
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("line", "other", "name"),
     [

@@ -162,6 +162,7 @@ def test_a_grating_on_a_part_of_the_patch():
     assert find_periods(HeightField(np.zeros((64, 64)), PIXEL)) == ()
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(("name", "directions"), [("elaphe", (90, 0)), ("xenopeltis", (0, 90))])
 def test_the_rows_of_a_synthetic_skin(name, directions):
     # Its fingers wander, and the uncertainty says so.

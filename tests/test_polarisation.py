@@ -39,6 +39,7 @@ def matrices(bsdf, wi, wo, mode=None):
     return np.array(bsdf.eval(ctx, si, mi.Vector3f(wo.astype(np.float32))), np.float64)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("mode", ["Radiance", "Importance"])
 def test_metal_as_rough_conductor(polarised, mode):
     mode = getattr(mi.TransportMode, mode)
@@ -73,6 +74,7 @@ def test_unpolarised_light_is_as_bright_as_in_the_other_variants(polarised):
     np.testing.assert_allclose(brightness, matrices(grating(int_ior=1.5), wi, wo), rtol=1e-4, atol=1e-6)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("parameters", [{"material": "none"}, {"int_ior": 1.5, "fresnel": "schlick"}])
 def test_without_an_index_light_leaves_unpolarised(polarised, parameters):
     m = matrices(grating(**parameters), *directions(20))

@@ -108,6 +108,7 @@ def test_taylor_keeps_any_tolerance_on_a_shallow_surface(field, tolerance, seed)
     assert worst_error(spectrum, field, random_kappas(seed)) <= tolerance
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("tolerance", TOLERANCES[:2])
 @pytest.mark.parametrize(
     ("name", "representation"),
@@ -120,6 +121,7 @@ def test_measured_skins_keep_the_tolerance(scan, name, representation, tolerance
     assert worst_error(spectrum, field, random_kappas(6, 4)) <= tolerance
 
 
+@pytest.mark.few(6)
 @pytest.mark.parametrize(
     ("field", "tolerance"),
     [
@@ -139,6 +141,7 @@ def test_the_error_that_is_told_is_that_of_every_kappa(field, tolerance, represe
     assert worst <= spectrum.error <= tolerance
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("representation", KINDS)
 @pytest.mark.parametrize("tolerance", TOLERANCES)
 def test_the_error_that_is_told_is_no_more_than_what_is_there(representation, tolerance):
@@ -176,6 +179,7 @@ def overlapping_error(field, spectrum, kappa, coherence_length):
     return np.abs(spectrum.evaluate(q, kappa) - exact)[reached].sum() * step**2
 
 
+@pytest.mark.few(44)
 @pytest.mark.parametrize("tolerance", [1e-2, 1e-4])
 @pytest.mark.parametrize("representation", KINDS)
 @pytest.mark.parametrize(
@@ -202,6 +206,7 @@ def error_where_light_reaches(spectrum, field, kappa, reach, coherence_length):
     return np.abs(along_x - lobes @ eta[0]).sum() * step
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("tolerance", [1e-2, 1e-3])
 @pytest.mark.parametrize(
     ("period", "coherence_length", "largest_angle"),
@@ -434,6 +439,7 @@ def test_what_lies_beyond_is_told(field, arguments):
     assert spectrum.beyond == pytest.approx(worst, rel=0.02, abs=1e-9)
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("tolerance", TOLERANCES)
 @pytest.mark.parametrize(
     "field",
@@ -528,6 +534,7 @@ SAMPLES = {
 }
 
 
+@pytest.mark.few(56)
 @EACH
 @pytest.mark.parametrize("tolerance", [3e-2, 1e-3])
 @pytest.mark.parametrize("name", SAMPLES)

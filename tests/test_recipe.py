@@ -289,6 +289,7 @@ def test_a_measured_skin_by_recipe(tmp_path, scan_file, scan):
     assert Recipe.load(write(tmp_path, text)).height_field().digest == scan("elaphe").digest
 
 
+@pytest.mark.few(6)
 @pytest.mark.parametrize("path", RECIPES, ids=lambda path: path.name)
 def test_the_recipes_of_this_repository_build(path):
     recipe = Recipe.load(path)
@@ -324,6 +325,7 @@ def test_a_spectrum_in_use_is_neither_built_nor_read_again(own_cache, builds):
     assert len(builds) == 1
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("surface", "spectrum"),
     [
@@ -374,6 +376,7 @@ def test_the_cache_knows_a_scan_by_its_bytes(tmp_path, own_cache, builds):
     assert changed.source_digest == md.HeightField(heights, 0.05).digest
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("damage", [b"", b"not a picture", None])
 def test_a_damaged_entry_is_built_anew(own_cache, builds, damage):
     recipe = Recipe(BLAZED, FAST)
@@ -512,6 +515,7 @@ def test_the_command_takes_the_same_of_a_scan(tmp_path, command, monkeypatch):
 # ---------------------------------------------------------------- a cache that is damaged, or cannot be used
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("damage", ["folder", "dangling link", "folder is a file", "folder is a dangling link"])
 def test_without_a_cache_there_is_a_warning(own_cache, builds, damage):
     # Regression: the render was refused.

@@ -180,6 +180,7 @@ def test_sunlight_gives_lobes_of_a_fifth_of_a_degree():
     assert lobe_width(65.0) == pytest.approx(0.0069, abs=5e-5)
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("shape", [(1, 1), (5, 4), (1, 6), (7, 1)])
 @pytest.mark.parametrize("kappa", [0.0, 12.0, 34.9])
 def test_the_spectrum_integrates_to_one(shape, kappa):

@@ -93,6 +93,7 @@ def pairs(spectrum, wavelength, count=400):
     return wi, np.concatenate([t, np.sqrt(1 - (t**2).sum(1, keepdims=True))], axis=1)
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("variant", ["llvm_ad_spectral", "scalar_spectral"])
 def test_f_is_the_sum_over_the_orders(variant, spectrum):
     use(variant)
@@ -342,6 +343,7 @@ def passed(theta, phi, wavelength):
     return front, ((1 - front) * (1 - back) * exact.unpolarised[leaves]).sum()
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(("theta", "phi", "wavelength"), [(10, 20, 0.412), (50, 70, 0.45), (65, 0, 0.48)])
 def test_a_coat_lets_through_what_the_solver_sends_out(llvm, coated, theta, phi, wavelength):
     wi = np.broadcast_to(direction(theta, phi), (40_000, 3))

@@ -96,6 +96,7 @@ def test_a_dielectric_as_deep_as_its_period_conserves_energy():
     np.testing.assert_allclose(np.add([found.s.sum(), found.p.sum()], found.transmitted), 1, atol=1e-6)
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("profile", SURFACES)
 @pytest.mark.parametrize("index", [1.5, 0.9 + 6j])
 def test_reversed_light_goes_the_same_way_back(profile, index):
@@ -128,6 +129,7 @@ def test_a_sawtooth_blazes_to_the_side_that_scalar_theory_blazes_to():
     assert found.unpolarised.max() > 0.7
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("surface", "index", "goal"),
     [

@@ -93,11 +93,13 @@ FULL = [
 CASES = [*REDUCED, *(pytest.param(*case, marks=pytest.mark.slow) for case in FULL if case not in REDUCED)]
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(("name", "theta", "phi", "wavelengths"), CASES)
 def test_samples_pass_the_chi_square_test(llvm, name, theta, phi, wavelengths):
     check_chi_square(blurred(name), theta, phi, wavelengths)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("theta", [0, 60])
 @pytest.mark.parametrize("extent", ["tile", "sample"])
 @pytest.mark.parametrize("name", ["elaphe", "xenopeltis"])
@@ -128,6 +130,7 @@ def check_chi_square(spectrum, theta, phi, wavelengths):
     assert test.run(significance_level=0.01, test_count=len(CASES), quiet=True), test.messages
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("name", ["blazed", "column", "crossed", "elaphe", "sample"])
 def test_density_integrates_to_the_share_of_samples_above_the_horizon(llvm, name):
     bsdf, wi, count = plugin(blurred(name)), direction(70, 40), 1 << 19
@@ -140,6 +143,7 @@ def test_density_integrates_to_the_share_of_samples_above_the_horizon(llvm, name
     assert abs(pdf.mean() - above.mean()) < 4 * error
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("name", ["blazed", "crossed", "xenopeltis", "sample"])
 @pytest.mark.parametrize("theta", [0, 60, 85])
 def test_mean_weight_is_the_albedo(llvm, name, theta):
@@ -158,6 +162,7 @@ def test_mean_weight_is_the_albedo(llvm, name, theta):
     np.testing.assert_array_less(np.abs(weight.mean(axis=1) - albedo), 4 * error + 2e-3 * albedo)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("longest", [700.0, 600.0, 390.0])
 def test_wavelengths_that_are_not_covered_take_no_part_in_the_sampling(llvm, longest):
     heights = md.gratings.sinusoidal(2.5, 0.25)
@@ -208,6 +213,7 @@ def effective_fraction(bsdf, theta, phi, draws, count):
     return np.mean(fractions), largest
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("phi", [0, 30, *(pytest.param(x, marks=pytest.mark.slow) for x in (60, 90, 180, 210, 300))])
 @pytest.mark.parametrize(
     ("theta", "least"),
@@ -224,6 +230,7 @@ def test_effective_sample_fraction(llvm, name, theta, least, phi):
     assert largest < 20
 
 
+@pytest.mark.few(6)
 @pytest.mark.parametrize("theta", [0, 50, 89, 89.99])
 @pytest.mark.parametrize("name", ["blazed", "crossed", "elaphe"])
 def test_weights_are_finite_and_pdf_is_that_of_the_sample(llvm, name, theta):
@@ -247,6 +254,7 @@ def test_height_scale_reaches_the_sampler(llvm):
 # ---------------------------------------------------------------- the samplers
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("name", ["column", "sample", "elaphe"])
 @pytest.mark.parametrize(("theta", "phi"), [(0, 0), (40, 130), (85, 250)])
 def test_cells_are_drawn_with_their_density_and_few_that_do_not_propagate(llvm, name, theta, phi):
@@ -339,6 +347,7 @@ def test_cells_serve_where_orders_overlap(llvm):
 # ---------------------------------------------------------------- other variants
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("variant", ["scalar_spectral", "llvm_ad_spectral_polarized"])
 @pytest.mark.parametrize("name", ["blazed", "crossed", "elaphe"])
 def test_other_variants_draw_the_same(variant, name):

@@ -37,6 +37,7 @@ def llvm():
     mi.set_variant("llvm_ad_spectral")
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", ["blaze", "elaphe", "xenopeltis"])
 def test_scene_renders(llvm, name):
     check(render(SCENES / f"{name}.xml", spp=4, width=16, height=16), 16, 16)

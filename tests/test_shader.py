@@ -197,6 +197,7 @@ def test_tile_factor_is_that_of_the_reference():
         )
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("tiles", [(1, 1), (5, 1), (26, 3)])
 @pytest.mark.parametrize("surface", [BLAZE, ROUGH], ids=["blaze", "rough"])
 def test_pq_of_n_tiles_is_the_transform_of_their_surface(surface, tiles):

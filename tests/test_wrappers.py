@@ -78,6 +78,7 @@ def expected(name, wi, wo):
 UV = [(0.5, 0.5)]
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", sorted(WRAPPERS))
 def test_value_is_that_of_the_grating_inside(name):
     rng = np.random.default_rng(1)
@@ -91,6 +92,7 @@ def test_value_is_that_of_the_grating_inside(name):
         assert np.abs(evaluate(mi.load_dict(wide()), wi, wo)[0] - wanted).max() > 0.05 * wanted.max()
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", sorted(WRAPPERS))
 def test_samples_carry_the_albedo(name):
     bsdf, wi, count = mi.load_dict(WRAPPERS[name]()), direction(25, 40), 1 << 17
@@ -155,6 +157,7 @@ TURNS = {
 }
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", sorted(TURNS))
 def test_texture_turns_the_pattern(name):
     texture, angles = TURNS[name]
@@ -205,6 +208,7 @@ def picture(bsdf, integrator="path"):
     return np.array(mi.render(scene, spp=16))
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", sorted(WRAPPERS))
 def test_picture_has_no_nan(name):
     image = picture(WRAPPERS[name]())
