@@ -161,10 +161,11 @@ CHECKS = (
             f"roughness: specular share e^{{−κ²σ²}}, {name}",
             functools.partial(_coherent, wavelength, angle),
             "Beckmann 1963",
+            slow=True,
         )
         for name, wavelength, angle in (("weak", 0.82, 33.0), ("medium", 0.8, 0.0), ("strong", 0.5, 0.0))
     ),
-    Check("statistical", "roughness: diffuse component in bands", _diffuse_bands, "Beckmann's series"),
+    Check("statistical", "roughness: diffuse component in bands", _diffuse_bands, "Beckmann's series", slow=True),
     *(
         Check(
             "statistical",
