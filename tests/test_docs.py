@@ -19,6 +19,8 @@ import mitsuba_diffraction as md
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+SLOW = {"compare", "long_renders", "own_grating", "own_scan", "plugin", "reading_exr", "tolerance"}
+"""Pages whose code takes long."""
 BLOCK = re.compile(r"^(?P<indent> *)```(?P<language>\w+)\n(?P<body>.*?)^ *```$", re.DOTALL | re.MULTILINE)
 REDUCED = {
     "render": {"--width": "16", "--spp": "1"},
@@ -145,8 +147,11 @@ def run_xml(text):
     mi.load_file("block.xml")
 
 
-@pytest.mark.few(8)
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+@pytest.mark.parametrize(
+    "page",
+    [pytest.param(page, marks=pytest.mark.slow if page.stem in SLOW else ()) for page in PAGES],
+    ids=[page.stem for page in PAGES],
+)
 def test_the_code_of_a_page_runs(page, folder, command, llvm, capfd):
     names = {}
     parts = list(blocks(page))

@@ -185,12 +185,12 @@ def scan(side, pixel, coherence_length=65.0):
 
 # What made the spectrum, the kind of shadowing and angles of incidence.
 HARD = {
+    "blazed": (lambda: md.precompute(md.gratings.blazed(2.5, 0.25)), "none", (85, 87, 89, 89.9)),
     "scan of 0.6 µm": (lambda: scan(0.6, 0.05, 0.28), "v_cavity", (85, 89)),
     "scan of 1.2 µm": (lambda: scan(1.2, 0.1, 0.4), "v_cavity", (87, 89.5)),
     "scan of 4.8 µm": (lambda: scan(4.8, 0.1), "v_cavity", (70, 75, 80, 85, 89)),
     "scan of 9.6 µm": (lambda: scan(9.6, 0.1), "v_cavity", (70, 75, 80, 85, 89)),
     "tile of 56 × 108": (lambda: md.precompute(rough((56, 108), 0.276, 6.3), tolerance=1e-2), "v_cavity", (10, 50, 85)),
-    "blazed": (lambda: md.precompute(md.gratings.blazed(2.5, 0.25)), "none", (85, 87, 89, 89.9)),
     "crossed": (lambda: md.precompute(md.gratings.crossed(2.0, 0.1, samples=32)), "none", (85, 87, 89, 89.9)),
     "scan of 4.8 µm, no shadowing": (lambda: scan(4.8, 0.1), "none", (70, 85, 87, 89, 89.9)),
 }

@@ -185,7 +185,10 @@ def test_derivatives_are_finite_where_orders_vanish_and_at_the_horizon():
         assert np.isfinite(np.array(dr.grad(value))).all()
 
 
-@pytest.mark.parametrize(("key", "at"), [("height_scale", 0.8), ("eta", 1.5), ("orientation.value", 10.0)])
+@pytest.mark.parametrize(
+    ("key", "at"),
+    [pytest.param("height_scale", 0.8, marks=pytest.mark.slow), ("eta", 1.5), ("orientation.value", 10.0)],
+)
 def test_weights_of_samples_carry_the_derivative_of_the_value(key, at):
     """The direction stays where it was drawn, so its density must not be differentiated."""
     base = {"type": "diffuse", "reflectance": uniform(0.5)}
@@ -321,7 +324,9 @@ def compiled(action):
     return len(history), sum(not entry["cache_hit"] for entry in history)
 
 
-@pytest.mark.parametrize("key", ["height_scale", "eta", "orientation.value", "base.reflectance.value"])
+@pytest.mark.parametrize(
+    "key", [pytest.param("height_scale", marks=pytest.mark.slow), "eta", "orientation.value", "base.reflectance.value"]
+)
 def test_changed_numbers_compile_nothing(key):
     bsdf = mi.load_dict(grating("deep blazed", int_ior=1.5, base={"type": "diffuse", "reflectance": uniform(0.3)}))
     parameters = mi.traverse(bsdf)

@@ -14,6 +14,7 @@ from nbclient import NotebookClient
 
 FOLDER = Path(__file__).parents[1] / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
+QUICK = "05_can_i_trust_the_picture"
 LARGEST = 500_000
 """Bytes of a notebook in the repository."""
 
@@ -74,7 +75,10 @@ def test_no_notebook_names_a_folder_of_somebodys_machine(path):
         assert folder not in text, folder
 
 
-@pytest.mark.slow
+@pytest.mark.parametrize(
+    "path",
+    [pytest.param(p, id=p.stem, marks=() if p.stem == QUICK else pytest.mark.slow) for p in NOTEBOOKS],
+)
 def test_a_notebook_runs(path):
     notebook = executed(reduced(nbformat.read(path, as_version=4)))
     assert not [out for out in outputs(notebook) if out.output_type == "error"]

@@ -278,7 +278,6 @@ def test_the_period_of_a_surface_is_seen():
     assert np.isnan(main_period(md.HeightField(np.zeros((1, 4)), 0.05), "tile"))
 
 
-@pytest.mark.slow
 def test_a_surface_outside_of_the_range_is_missed(command, tmp_path):
     recipe = tmp_path / "narrow.toml"
     recipe.write_text('[surface]\nprofile = "sinusoidal"\nperiod = 0.8\ndepth = 0.4\n')
