@@ -11,6 +11,7 @@ import mitsuba_diffraction as md
 from mitsuba_diffraction import GratingSpectrum, Recipe
 from mitsuba_diffraction import recipe as recipe_module
 
+SLOW = {"compact_disc", "dvd", "elaphe", "morpho_ridges", "xenopeltis", "xenopeltis_afm"}
 RECIPES = sorted((Path(__file__).parents[1] / "precompute").glob("*.toml"))
 BLAZE = '[surface]\nprofile = "blazed"\nperiod = 2.5\ndepth = 0.25\n'
 FAST = {"tolerance": 0.01, "coherence_length": 20.0}
@@ -289,8 +290,9 @@ def test_a_measured_skin_by_recipe(tmp_path, scan_file, scan):
     assert Recipe.load(write(tmp_path, text)).height_field().digest == scan("elaphe").digest
 
 
-@pytest.mark.few(6)
-@pytest.mark.parametrize("path", RECIPES, ids=lambda path: path.name)
+@pytest.mark.parametrize(
+    "path", [pytest.param(p, id=p.name, marks=pytest.mark.slow if p.stem in SLOW else ()) for p in RECIPES]
+)
 def test_the_recipes_of_this_repository_build(path):
     recipe = Recipe.load(path)
     spectrum = Recipe(recipe.surface, {**recipe.spectrum, "tolerance": 0.2}, recipe.folder).of_one_patch().build()

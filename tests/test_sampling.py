@@ -14,6 +14,7 @@ from mitsuba_diffraction.bsdf.incidence import Incidence
 from mitsuba_diffraction.bsdf.order_sampler import OrderSampler
 from mitsuba_diffraction.bsdf.order_spectrum import OrderSpectrum
 
+SKINS = "elaphe", "xenopeltis"  # slow to build
 BUNDLED = {
     "blazed": lambda: md.gratings.blazed(2.5, 0.246),
     "sinusoidal": lambda: md.gratings.sinusoidal(2.5, 0.25),
@@ -223,16 +224,16 @@ def effective_fraction(bsdf, theta, phi, draws, count):
         *(pytest.param(theta, 0.5, marks=pytest.mark.slow) for theta in (0, 15, 30, 45, 75)),
     ],
 )
-@pytest.mark.parametrize("name", BUNDLED)
+@pytest.mark.parametrize("name", [pytest.param(x, marks=pytest.mark.slow if x in SKINS else ()) for x in BUNDLED])
 def test_effective_sample_fraction(llvm, name, theta, least, phi):
     fraction, largest = effective_fraction(plugin(bundled(name)), theta, phi, draws=4, count=1 << 15)
     assert fraction >= least
     assert largest < 20
 
 
-@pytest.mark.few(6)
+@pytest.mark.few(4)
 @pytest.mark.parametrize("theta", [0, 50, 89, 89.99])
-@pytest.mark.parametrize("name", ["blazed", "crossed", "elaphe"])
+@pytest.mark.parametrize("name", ["blazed", "crossed", pytest.param("elaphe", marks=pytest.mark.slow)])
 def test_weights_are_finite_and_pdf_is_that_of_the_sample(llvm, name, theta):
     bsdf, wi, count = plugin(bundled(name)), direction(theta, 30), 1 << 15
     for wavelengths in ((360.0, 830.0, 360.0, 830.0), (355.0, 835.0, 500.0, 500.0)):
@@ -347,9 +348,9 @@ def test_cells_serve_where_orders_overlap(llvm):
 # ---------------------------------------------------------------- other variants
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("variant", ["scalar_spectral", "llvm_ad_spectral_polarized"])
-@pytest.mark.parametrize("name", ["blazed", "crossed", "elaphe"])
+@pytest.mark.parametrize("name", ["blazed", "crossed", pytest.param("elaphe", marks=pytest.mark.slow)])
 def test_other_variants_draw_the_same(variant, name):
     count, wi = 40, direction(50, 25)
     use("llvm_ad_spectral")

@@ -226,7 +226,7 @@ def _of_profile(profile: str) -> tuple[Check, ...]:
         return functools.partial(_dielectric, profile, choose)
 
     return (
-        _check(f"{profile}, n = 1.5, depth ≤ λ/2{short}, {near}", dielectric(lambda case: case.in_range)),
+        _check(f"{profile}, n = 1.5, depth ≤ λ/2{short}, {near}", dielectric(lambda case: case.in_range), slow=True),
         _check(
             f"{profile}, n = 1.5, {near}, outside of that",
             dielectric(lambda case: not case.in_range and case.angle <= LARGEST_ANGLE),
