@@ -71,7 +71,7 @@ NUMBERS = {
 }
 
 
-@pytest.mark.few(5)
+@pytest.mark.few(4)
 @pytest.mark.parametrize("mode", ["forward", "backward"])
 @pytest.mark.parametrize("case", sorted(NUMBERS))
 def test_derivative_by_a_number(case, mode):

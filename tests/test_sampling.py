@@ -131,7 +131,7 @@ def check_chi_square(spectrum, theta, phi, wavelengths):
     assert test.run(significance_level=0.01, test_count=len(CASES), quiet=True), test.messages
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("name", ["blazed", "column", "crossed", "elaphe", "sample"])
 def test_density_integrates_to_the_share_of_samples_above_the_horizon(llvm, name):
     bsdf, wi, count = plugin(blurred(name)), direction(70, 40), 1 << 19
@@ -214,7 +214,7 @@ def effective_fraction(bsdf, theta, phi, draws, count):
     return np.mean(fractions), largest
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("phi", [0, 30, *(pytest.param(x, marks=pytest.mark.slow) for x in (60, 90, 180, 210, 300))])
 @pytest.mark.parametrize(
     ("theta", "least"),
