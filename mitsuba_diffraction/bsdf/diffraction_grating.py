@@ -186,9 +186,12 @@ def define() -> type:
             return dr.sincos(dr.deg2rad(self.orientation.eval_1(si, active)))
 
         def _grating(
-            self, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool
+            self, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool, drawn: bool
         ) -> tuple[mi.UnpolarizedSpectrum, mi.Float]:
-            """f cos θ_o of the grating, and the density of its own samples, for directions above the surface."""
+            """f cos θ_o of the grating, and the density of its own samples, for directions above the surface.
+
+            `drawn` tells that the directions are samples, so that nearly all of them meet an order.
+            """
             sin, cos = self._frame(si, active)
             # From here on along the pattern's axes.
             wi, wo, outside = _turned(si.wi, sin, cos), _turned(wo, sin, cos), mi.Frame3f.cos_theta(wo)
@@ -206,7 +209,7 @@ def define() -> type:
                 wavelength = si.wavelengths[channel] * 1e-3  # µm
                 frequency = dr.rcp(wavelength)
                 if self.rigorous:
-                    power, share = self.scattering.evaluate(wi, wo, index * frequency, active & covered[channel])
+                    power, share = self.scattering.evaluate(wi, wo, index * frequency, active & covered[channel], drawn)
                 else:
                     power, share = self.scattering.evaluate(
                         u * frequency,
@@ -214,17 +217,14 @@ def define() -> type:
                         -geometry.w * dr.two_pi * index * frequency * self.height_scale,
                         Incidence.of(towards, frequency, self.height_scale, self.coat),
                         active & covered[channel],
+                        drawn,
                     )
                 value[channel] = dr.select(within, power / dr.square(wavelength), 0)
                 density += share / dr.square(wavelength)
-            if self.energy is not None:
-                wavelengths = mi.UnpolarizedSpectrum(si.wavelengths) * (1e-3 / index)
-                value = self.energy.conserve(value, wi, wo, wavelengths, active)
-            if self.rigorous:
-                value *= geometry.cos_o
-            else:
-                value *= self.reflectance(si, geometry.cos_half(), active)
-                value *= geometry.factor(self.shadowing == "v_cavity")
+            wavelengths = mi.UnpolarizedSpectrum(si.wavelengths) * (1e-3 / index)
+            # Most pairs of directions meet no order of a grating: unless drawn, they jump over what follows.
+            lit = active & (dr.max(value) > 0) if self.scattering.apart and not drawn else True
+            value = self._reflected(value, si, wi, wo, geometry, wavelengths, active, lit)
             # The mean over the covered wavelengths: any of them may have chosen the direction.
             diffuse = _diffuse_share(count)
             density = diffuse * dr.inv_pi + (1 - diffuse) * density / dr.maximum(count, 1)
@@ -232,6 +232,29 @@ def define() -> type:
                 # The solid angle inside the coat is smaller: cos θ'_o dω'_o = cos θ_o dω_o/n².
                 value *= outside / geometry.cos_o
             return value, density * outside
+
+        @dr.syntax
+        def _reflected(
+            self,
+            value: mi.UnpolarizedSpectrum,
+            si: mi.SurfaceInteraction3f,
+            wi: mi.Vector3f,
+            wo: mi.Vector3f,
+            geometry: Geometry,
+            wavelengths: mi.UnpolarizedSpectrum,
+            active: mi.Bool,
+            lit: mi.Bool | bool,
+        ) -> mi.UnpolarizedSpectrum:
+            """`value`, which is zero where not `lit`, times E R K G cos θ_o; λ in µm, inside a coat."""
+            if lit:
+                if self.energy is not None:
+                    value = value * self.energy.factor(wi, wo, wavelengths)
+                if self.rigorous:
+                    value = value * geometry.cos_o
+                else:
+                    value = value * self.reflectance(si, geometry.cos_half(), active)
+                    value = value * geometry.factor(self.shadowing == "v_cavity")
+            return value
 
         def _mueller(
             self,
@@ -329,12 +352,17 @@ def define() -> type:
         def eval_pdf(
             self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
         ) -> tuple[mi.Spectrum, mi.Float]:
+            return self._eval_pdf(ctx, si, wo, active, drawn=False)
+
+        def _eval_pdf(
+            self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool, *, drawn: bool
+        ) -> tuple[mi.Spectrum, mi.Float]:
             cos_i, cos_o = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(wo)
             active = active & (cos_i > 0) & (cos_o > 0)
             lobes = grating, below = self._lobes(ctx)
             value, pdf = mi.Spectrum(0.0), mi.Float(0.0)
             if grating:
-                of_grating, pdf = self._grating(si, wo, active)
+                of_grating, pdf = self._grating(si, wo, active, drawn)
                 value = self._mueller(of_grating, ctx, si, wo, active)
             if below is not None:
                 entering = self._entering(si, cos_i, active)
@@ -421,7 +449,7 @@ def define() -> type:
                 bs.wo = dr.select(of_base, drawn.wo, bs.wo)
                 bs.sampled_type = dr.select(of_base, drawn.sampled_type, bs.sampled_type)
                 bs.sampled_component = dr.select(of_base, drawn.sampled_component + 1, 0)
-            value, bs.pdf = self.eval_pdf(ctx, si, bs.wo, active)
+            value, bs.pdf = self._eval_pdf(ctx, si, bs.wo, active, drawn=True)
             valid = active & (bs.pdf > 0)
             # The direction does not follow the parameters, so its density must not either.
             result = dr.select(valid, value / dr.detach(dr.select(valid, bs.pdf, 1)), 0)

@@ -55,23 +55,6 @@ class Energy:
         text = "albedo at most 1 + {:.2g}; where a ≤ 1, 1 − e is {:.2g} in the mean, {:.2g} at most"
         return text.format(*self.measured)
 
-    @dr.syntax
-    def conserve(
-        self,
-        value: mi.UnpolarizedSpectrum,
-        wi: mi.Vector3f,
-        wo: mi.Vector3f,
-        wavelengths: mi.UnpolarizedSpectrum,
-        active: mi.Bool,
-    ) -> mi.UnpolarizedSpectrum:
-        """`value` times E; directions along the pattern's axes, wavelengths in µm.
-
-        Most pairs of directions meet no order and need no E.
-        """
-        if active & (dr.max(value) > 0):
-            value = value * self.factor(wi, wo, wavelengths)
-        return value
-
     def factor(self, wi: mi.Vector3f, wo: mi.Vector3f, wavelengths: mi.UnpolarizedSpectrum) -> mi.UnpolarizedSpectrum:
         """E of each wavelength."""
         there, back = self.place(wi), self.place(wo)

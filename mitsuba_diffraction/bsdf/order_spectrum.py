@@ -44,6 +44,7 @@ class OrderSpectrum:
         kappa: mi.Float,
         incidence: Incidence,
         active: mi.Bool,
+        drawn: bool,
     ) -> tuple[mi.Float, mi.Float]:
         """S(q; κ) and the density of q, both in µm², for one wavelength.
 
@@ -53,11 +54,12 @@ class OrderSpectrum:
             kappa: rad/µm.
             incidence: the wavelength and where it comes from.
             active: mask.
+            drawn: whether the direction is a sample, so that an order meets it.
         """
         along_x, along_y = self.axes
         m_x, m_y = along_x.first(q_x), along_y.first(q_y)
         if self.apart:
-            power, density = self._apart(m_x, m_y, q_x, q_y, kappa, incidence, active)
+            power, density = self._apart(m_x, m_y, q_x, q_y, kappa, incidence, active, drawn)
         else:
             power = self._power(m_x, m_y, along_x.lobes(m_x, q_x), along_y.lobes(m_y, q_y), kappa, active)
             density = self.cells.density(q_x, q_y, incidence, active)
@@ -88,14 +90,15 @@ class OrderSpectrum:
         kappa: mi.Float,
         incidence: Incidence,
         active: mi.Bool,
+        drawn: bool,
     ) -> tuple[mi.Float, mi.Float]:
         """`_power` of the one order that may hold at q, and the density.
 
-        Most directions lie between the orders of a grating: they jump over all that reads tables.
+        Most directions lie between the orders of a grating: unless drawn, they jump over all that reads tables.
         """
         near = active & self.axes[0].holds(m_x, q_x) & self.axes[1].holds(m_y, q_y)
-        power, density = mi.Float(0.0), mi.Float(0.0)
-        if near:
+        power, density, needed = mi.Float(0.0), mi.Float(0.0), drawn or near
+        if needed:
             lobes_x, lobes_y = self.axes[0].lobes(m_x, q_x), self.axes[1].lobes(m_y, q_y)
             power = self._power(m_x, m_y, lobes_x, lobes_y, kappa, near)
             order = mi.UInt32((m_y + self.axes[1].largest) * self.columns + m_x + self.axes[0].largest)

@@ -35,6 +35,8 @@ class RigorousOrders:
     and of the wavelength: in p and r the orders of one direction share one cell.
     """
 
+    apart = True
+
     def __init__(self, spectrum: RigorousSpectrum) -> None:
         axes = spectrum.axes
         self.axes = axes
@@ -59,7 +61,7 @@ class RigorousOrders:
 
     @dr.syntax
     def evaluate(
-        self, wi: mi.Vector3f, wo: mi.Vector3f, frequency: mi.Float, active: mi.Bool
+        self, wi: mi.Vector3f, wo: mi.Vector3f, frequency: mi.Float, active: mi.Bool, drawn: bool
     ) -> tuple[mi.Float, mi.Float]:
         """Σ_m η_m N and the density of q, both in µm², for one wavelength.
 
@@ -67,13 +69,14 @@ class RigorousOrders:
             wi, wo: ω_i and ω_o along the pattern's axes.
             frequency: 1/λ in cycles/µm.
             active: mask.
+            drawn: whether ω_o is a sample, so that an order meets it.
         """
         q_x, q_y = -(wi.x + wo.x) * frequency, -(wi.y + wo.y) * frequency
         first = mi.Int32(dr.ceil((q_x - self.half_width) * self.period))
         near = active & (mi.Float(first) * self.pitch - q_x <= self.half_width) & (dr.abs(q_y) <= self.half_width)
-        power, density = mi.Float(0.0), mi.Float(0.0)
-        # Most directions lie between the orders: they jump over all that reads tables.
-        if near:
+        power, density, needed = mi.Float(0.0), mi.Float(0.0), drawn or near
+        # Most directions lie between the orders: unless drawn, they jump over all that reads tables.
+        if needed:
             nu = self.period * frequency
             k_y, c = 0.5 * nu * (wo.y - wi.y), 0.5 * nu * (wo.x - wi.x)
             g = dr.sqrt(dr.maximum(dr.square(nu) - dr.square(k_y), 0))

@@ -21,6 +21,8 @@ class SplineSpectrum:
     One evaluation reads three by three nodes and one packet for the density.
     """
 
+    apart = False
+
     def __init__(self, spectrum: GratingSpectrum) -> None:
         grid = spectrum.grid
         self.power = order_power(spectrum.table, (RIM, RIM))
@@ -37,6 +39,7 @@ class SplineSpectrum:
         kappa: mi.Float,
         incidence: Incidence,
         active: mi.Bool,
+        drawn: bool,
     ) -> tuple[mi.Float, mi.Float]:
         """S(q; κ) and the density of q, both in µm², for one wavelength.
 
@@ -46,6 +49,7 @@ class SplineSpectrum:
             kappa: rad/µm.
             incidence: the wavelength and where it comes from.
             active: mask.
+            drawn: as of `OrderSpectrum`; here all directions cost the same.
         """
         x, y = q_x * self.per_q_x, q_y * self.per_q_y
         m_x, m_y = mi.Int32(dr.round(x)), mi.Int32(dr.round(y))
