@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 
+import drjit as dr
 import mitsuba as mi
 
 from . import llvm
@@ -62,5 +63,8 @@ def _accept_spectra() -> None:
 if not getattr(mi, "_mitsuba_diffraction_registered", False):
     _accept_spectra()
     mi._mitsuba_diffraction_registered = True
+    # With one thread, on a machine of one core, Mitsuba 3.9.1 waits for ever where it reads or writes an EXR picture.
+    if dr.thread_count() < 2:
+        dr.set_thread_count(2)
 if mi.variant() is not None:
     register(mi.variant())

@@ -1,7 +1,9 @@
 """The scenes that come with the package render, and their models are what they say."""
 
+import os
 import re
 import shutil
+import subprocess
 import sys
 from pathlib import Path
 
@@ -53,6 +55,22 @@ def test_scene_of_a_scan_renders(llvm, tmp_path):
 def test_blaze_renders_in_the_scalar_variant():
     mi.set_variant("scalar_spectral")
     check(render(SCENES / "blaze.xml", spp=1, width=4, height=4), 4, 4)
+
+
+ON_ONE_CORE = """
+import os
+os.sched_setaffinity(0, list(os.sched_getaffinity(0))[:1])
+import mitsuba_diffraction
+import mitsuba as mi
+mi.set_variant("llvm_ad_spectral")
+mi.Bitmap(mi.Bitmap.PixelFormat.Y, mi.Struct.Type.Float16, [4, 2]).write("texture.exr")
+mi.load_dict({"type": "bitmap", "filename": "texture.exr"})
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="the system cannot confine a process to one core")
+def test_a_picture_is_a_texture_on_one_core(llvm, tmp_path):
+    subprocess.run([sys.executable, "-c", ON_ONE_CORE], cwd=tmp_path, check=True, timeout=60)
 
 
 # ---------------------------------------------------------------- scenes with models
