@@ -185,6 +185,7 @@ def define() -> type:
             """Sine and cosine of the angle from the tangent to the pattern's x axis."""
             return dr.sincos(dr.deg2rad(self.orientation.eval_1(si, active)))
 
+        @dr.syntax
         def _grating(
             self, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool, drawn: bool
         ) -> tuple[mi.UnpolarizedSpectrum, mi.Float]:
@@ -195,8 +196,41 @@ def define() -> type:
             sin, cos = self._frame(si, active)
             # From here on along the pattern's axes.
             wi, wo, outside = _turned(si.wi, sin, cos), _turned(wo, sin, cos), mi.Frame3f.cos_theta(wo)
-            u, v = -wi.x - wo.x, -wi.y - wo.y
-            towards = wi
+            covered, count = self._covered(si)
+            value, density = mi.UnpolarizedSpectrum(0.0), mi.Float(0.0)
+            # Most directions lie between the orders of a grating at all wavelengths: unless drawn, they jump over what
+            # follows.
+            jumps = self.scattering.apart and not drawn
+            needed = active & self._meets(si, -wi.x - wo.x, -wi.y - wo.y) if jumps else True
+            # What has no derivative is bound here: Dr.Jit carries all other state through the branch.
+            scattered, height_scale = functools.partial(self._scattered, si, covered, active, drawn), self.height_scale
+            if needed:
+                value, density = scattered(wi, wo, height_scale)
+            # The mean over the covered wavelengths: any of them may have chosen the direction.
+            diffuse = _diffuse_share(count)
+            density = diffuse * dr.inv_pi + (1 - diffuse) * density / dr.maximum(count, 1)
+            return value, density * outside
+
+        def _meets(self, si: mi.SurfaceInteraction3f, u: mi.Float, v: mi.Float) -> mi.Bool:
+            """Whether the lobe of an order holds (u, v) = λq at any wavelength."""
+            result = mi.Bool(False)
+            for wavelength in si.wavelengths:
+                frequency = 1e3 / wavelength
+                result |= self.scattering.meets(u * frequency, v * frequency)
+            return result
+
+        def _scattered(
+            self,
+            si: mi.SurfaceInteraction3f,
+            covered: list[mi.Bool],
+            active: mi.Bool,
+            drawn: bool,
+            wi: mi.Vector3f,
+            wo: mi.Vector3f,
+            height_scale: mi.Float,
+        ) -> tuple[mi.UnpolarizedSpectrum, mi.Float]:
+            """f cos θ_o, and the sum over the wavelengths of the densities; directions along the pattern's axes."""
+            u, v, towards, outside = -wi.x - wo.x, -wi.y - wo.y, wi, wo.z
             if self.coat is not None:
                 wi, wo = self.coat.refracted(wi), self.coat.refracted(wo)
             index = 1.0 if self.coat is None else self.coat.eta
@@ -204,7 +238,6 @@ def define() -> type:
             # Directions beyond the largest angle are black, but they are drawn: they have a density.
             within = dr.minimum(geometry.cos_i, geometry.cos_o) >= self.least_cosine
             value, density = mi.UnpolarizedSpectrum(0.0), mi.Float(0.0)
-            covered, count = self._covered(si)
             for channel in range(len(value)):
                 wavelength = si.wavelengths[channel] * 1e-3  # µm
                 frequency = dr.rcp(wavelength)
@@ -214,47 +247,24 @@ def define() -> type:
                     power, share = self.scattering.evaluate(
                         u * frequency,
                         v * frequency,
-                        -geometry.w * dr.two_pi * index * frequency * self.height_scale,
-                        Incidence.of(towards, frequency, self.height_scale, self.coat),
+                        -geometry.w * dr.two_pi * index * frequency * height_scale,
+                        Incidence.of(towards, frequency, height_scale, self.coat),
                         active & covered[channel],
                         drawn,
                     )
                 value[channel] = dr.select(within, power / dr.square(wavelength), 0)
                 density += share / dr.square(wavelength)
-            wavelengths = mi.UnpolarizedSpectrum(si.wavelengths) * (1e-3 / index)
-            # Most pairs of directions meet no order of a grating: unless drawn, they jump over what follows.
-            lit = active & (dr.max(value) > 0) if self.scattering.apart and not drawn else True
-            value = self._reflected(value, si, wi, wo, geometry, wavelengths, active, lit)
-            # The mean over the covered wavelengths: any of them may have chosen the direction.
-            diffuse = _diffuse_share(count)
-            density = diffuse * dr.inv_pi + (1 - diffuse) * density / dr.maximum(count, 1)
+            if self.rigorous:
+                value *= geometry.cos_o
+            else:
+                if self.energy is not None:
+                    value *= self.energy.factor(wi, wo, mi.UnpolarizedSpectrum(si.wavelengths) * (1e-3 / index))
+                value *= self.reflectance(si, geometry.cos_half(), active)
+                value *= geometry.factor(self.shadowing == "v_cavity")
             if self.coat is not None:
                 # The solid angle inside the coat is smaller: cos θ'_o dω'_o = cos θ_o dω_o/n².
                 value *= outside / geometry.cos_o
-            return value, density * outside
-
-        @dr.syntax
-        def _reflected(
-            self,
-            value: mi.UnpolarizedSpectrum,
-            si: mi.SurfaceInteraction3f,
-            wi: mi.Vector3f,
-            wo: mi.Vector3f,
-            geometry: Geometry,
-            wavelengths: mi.UnpolarizedSpectrum,
-            active: mi.Bool,
-            lit: mi.Bool | bool,
-        ) -> mi.UnpolarizedSpectrum:
-            """`value`, which is zero where not `lit`, times E R K G cos θ_o; λ in µm, inside a coat."""
-            if lit:
-                if self.energy is not None:
-                    value = value * self.energy.factor(wi, wo, wavelengths)
-                if self.rigorous:
-                    value = value * geometry.cos_o
-                else:
-                    value = value * self.reflectance(si, geometry.cos_half(), active)
-                    value = value * geometry.factor(self.shadowing == "v_cavity")
-            return value
+            return value, density
 
         def _mueller(
             self,

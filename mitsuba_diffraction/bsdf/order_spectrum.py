@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -36,6 +38,11 @@ class OrderSpectrum:
         self.columns = grid.shape[1]
         self.deviation = opaque(sigma)
         self.inside = opaque(spectrum.lobes[0].inside * spectrum.lobes[1].inside)
+
+    def meets(self, q_x: mi.Float, q_y: mi.Float) -> mi.Bool:
+        """Whether q lies in the lobe of an order, where they stand apart; q in cycles/µm."""
+        along_x, along_y = self.axes
+        return along_x.holds(along_x.first(q_x), q_x) & along_y.holds(along_y.first(q_y), q_y)
 
     def evaluate(
         self,
@@ -96,14 +103,30 @@ class OrderSpectrum:
 
         Most directions lie between the orders of a grating: unless drawn, they jump over all that reads tables.
         """
-        near = active & self.axes[0].holds(m_x, q_x) & self.axes[1].holds(m_y, q_y)
+        near = active & self.meets(q_x, q_y)
         power, density, needed = mi.Float(0.0), mi.Float(0.0), drawn or near
+        # What has no derivative is bound here: Dr.Jit carries all other state through the branch.
+        read = functools.partial(self._read, m_x, m_y, incidence, near)
         if needed:
-            lobes_x, lobes_y = self.axes[0].lobes(m_x, q_x), self.axes[1].lobes(m_y, q_y)
-            power = self._power(m_x, m_y, lobes_x, lobes_y, kappa, near)
-            order = mi.UInt32((m_y + self.axes[1].largest) * self.columns + m_x + self.axes[0].largest)
-            density = self.inside * lobes_x[0] * lobes_y[0]
-            density *= self.orders.share(order, self.orders.weights(incidence, near), near)
+            power, density = read(q_x, q_y, kappa)
+        return power, density
+
+    def _read(
+        self,
+        m_x: mi.Int32,
+        m_y: mi.Int32,
+        incidence: Incidence,
+        near: mi.Bool,
+        q_x: mi.Float,
+        q_y: mi.Float,
+        kappa: mi.Float,
+    ) -> tuple[mi.Float, mi.Float]:
+        """As `_apart`, where `near`; else zero."""
+        lobes_x, lobes_y = self.axes[0].lobes(m_x, q_x), self.axes[1].lobes(m_y, q_y)
+        power = self._power(m_x, m_y, lobes_x, lobes_y, kappa, near)
+        order = mi.UInt32((m_y + self.axes[1].largest) * self.columns + m_x + self.axes[0].largest)
+        density = self.inside * lobes_x[0] * lobes_y[0]
+        density *= self.orders.share(order, self.orders.weights(incidence, near), near)
         return power, density
 
     def sample(

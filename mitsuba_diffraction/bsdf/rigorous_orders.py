@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 
 import drjit as dr
@@ -59,6 +60,14 @@ class RigorousOrders:
         self.period, self.pitch = opaque(axes.period), opaque(1 / axes.period)
         self.shortest, self.longest = (opaque(w) for w in axes.wavelengths)
 
+    def meets(self, q_x: mi.Float, q_y: mi.Float) -> mi.Bool:
+        """Whether q lies in the lobe of an order; q in cycles/µm."""
+        return (mi.Float(self._first(q_x)) * self.pitch - q_x <= self.half_width) & (dr.abs(q_y) <= self.half_width)
+
+    def _first(self, q_x: mi.Float) -> mi.Int32:
+        """The first order whose lobe may hold q_x."""
+        return mi.Int32(dr.ceil((q_x - self.half_width) * self.period))
+
     @dr.syntax
     def evaluate(
         self, wi: mi.Vector3f, wo: mi.Vector3f, frequency: mi.Float, active: mi.Bool, drawn: bool
@@ -71,25 +80,33 @@ class RigorousOrders:
             active: mask.
             drawn: whether ω_o is a sample, so that an order meets it.
         """
-        q_x, q_y = -(wi.x + wo.x) * frequency, -(wi.y + wo.y) * frequency
-        first = mi.Int32(dr.ceil((q_x - self.half_width) * self.period))
-        near = active & (mi.Float(first) * self.pitch - q_x <= self.half_width) & (dr.abs(q_y) <= self.half_width)
+        near = active & self.meets(-(wi.x + wo.x) * frequency, -(wi.y + wo.y) * frequency)
         power, density, needed = mi.Float(0.0), mi.Float(0.0), drawn or near
         # Most directions lie between the orders: unless drawn, they jump over all that reads tables.
+        # What has no derivative is bound here: Dr.Jit carries all other state through the branch.
+        read = functools.partial(self._read, frequency, near)
         if needed:
-            nu = self.period * frequency
-            k_y, c = 0.5 * nu * (wo.y - wi.y), 0.5 * nu * (wo.x - wi.x)
-            g = dr.sqrt(dr.maximum(dr.square(nu) - dr.square(k_y), 0))
-            z = self._z(g, frequency)
-            cell = self._cell(Incidence.of(wi, frequency, mi.Float(1)))
-            for step in range(self.count):
-                m = first + step
-                offset = dr.fma(-self.pitch, mi.Float(m), q_x)
-                there = near & (dr.abs(offset) <= self.half_width) & (dr.abs(m) <= self.axes.largest)
-                square = dr.square(offset) + dr.square(q_y)
-                lobe = dr.select(there, self.peak * dr.exp(self.falloff * square), 0)
-                power += lobe * self._efficiency(m, c, g, z, there)
-                density += lobe * self.orders(mi.UInt32(dr.select(there, cell + m, 0)), there).y
+            power, density = read(wi, wo)
+        return power, density
+
+    def _read(self, frequency: mi.Float, near: mi.Bool, wi: mi.Vector3f, wo: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
+        """As `evaluate`, where `near`; else zero."""
+        q_x, q_y = -(wi.x + wo.x) * frequency, -(wi.y + wo.y) * frequency
+        nu = self.period * frequency
+        k_y, c = 0.5 * nu * (wo.y - wi.y), 0.5 * nu * (wo.x - wi.x)
+        g = dr.sqrt(dr.maximum(dr.square(nu) - dr.square(k_y), 0))
+        z = self._z(g, frequency)
+        cell = self._cell(Incidence.of(wi, frequency, mi.Float(1)))
+        first = self._first(q_x)
+        power, density = mi.Float(0.0), mi.Float(0.0)
+        for step in range(self.count):
+            m = first + step
+            offset = dr.fma(-self.pitch, mi.Float(m), q_x)
+            there = near & (dr.abs(offset) <= self.half_width) & (dr.abs(m) <= self.axes.largest)
+            square = dr.square(offset) + dr.square(q_y)
+            lobe = dr.select(there, self.peak * dr.exp(self.falloff * square), 0)
+            power += lobe * self._efficiency(m, c, g, z, there)
+            density += lobe * self.orders(mi.UInt32(dr.select(there, cell + m, 0)), there).y
         return power, density / WHOLE
 
     def mueller(
