@@ -358,17 +358,20 @@ def test_other_variants_draw_the_same(variant, name):
     wanted, wanted_pdf = np.array(bs.wo).T, np.array(bs.pdf)
     use(variant)
     bsdf, u = plugin(blurred(name)), numbers(count)
-    for index in range(count):
-        si = interaction(wi, WAVELENGTHS, 1) if mi.is_polarized else dr.zeros(mi.SurfaceInteraction3f)
-        if not mi.is_polarized:
+    # In a scalar variant one after the other.
+    for part in [np.arange(count)] if dr.is_jit_v(mi.Float) else np.arange(count)[:, None]:
+        one = [x[part] if dr.is_jit_v(mi.Float) else float(x[part[0]]) for x in u]
+        if dr.is_jit_v(mi.Float):
+            si = interaction(wi, WAVELENGTHS, len(part))
+        else:
+            si = dr.zeros(mi.SurfaceInteraction3f)
             si.wi = mi.Vector3f(*wi)
             si.wavelengths = type(si.wavelengths)(*WAVELENGTHS)
-        one = [float(x) for x in u[:, index]]
         bs, value = bsdf.sample(mi.BSDFContext(), si, mi.Float(one[0]), mi.Point2f(*one[1:]))
         value = value[0, 0] if mi.is_polarized else value
-        if wanted_pdf[index] == 0:
-            assert np.array(bs.pdf).item() == 0
-            continue
-        np.testing.assert_allclose(np.array(bs.wo).ravel(), wanted[index], atol=2e-5)
-        np.testing.assert_allclose(np.array(bs.pdf).item(), wanted_pdf[index], rtol=5e-3)
-        np.testing.assert_allclose(np.array(value).ravel(), weight[:, index], rtol=5e-3, atol=1e-4)
+        drawn = wanted_pdf[part] > 0
+        np.testing.assert_allclose(np.array(bs.pdf).reshape(-1), wanted_pdf[part], rtol=5e-3)
+        np.testing.assert_allclose(np.array(bs.wo).reshape(3, -1).T[drawn], wanted[part][drawn], atol=2e-5)
+        np.testing.assert_allclose(
+            np.array(value).reshape(4, -1)[:, drawn], weight[:, part][:, drawn], rtol=5e-3, atol=1e-4
+        )
