@@ -487,6 +487,8 @@ def test_an_interrupt_at_any_time_is_one_line(seconds):
     time.sleep(seconds)
     running.send_signal(signal.SIGINT)
     out, err = running.communicate()
-    assert (running.returncode, out) == (130, "")
+    assert running.returncode == 130
+    # Mitsuba's log goes there, of a grating too fine for scalar theory.
+    assert all("scalar theory" in line for line in out.replace("\x1b[0m", "").splitlines() if line)
     assert len(err.splitlines()) == 1
     assert err.startswith("mitsuba-diffraction: interrupted: ")
