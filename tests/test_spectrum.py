@@ -25,6 +25,10 @@ def ignore(done, total):
     pass
 
 
+def as_it_is(values):
+    return values
+
+
 # ---------------------------------------------------------------- orders
 
 
@@ -189,7 +193,7 @@ def powers_of(field):
 def build(kind, field):
     powers = powers_of(field)
     if kind == "slices":
-        return SliceTable.build(40, 4, LARGEST_KAPPA, powers, ignore)
+        return SliceTable.build(40, 4, LARGEST_KAPPA, powers, as_it_is, ignore)
     nodes = nodes_for(LARGEST_KAPPA * field.half_range, 1e-7)
     if kind == "svd":
         kappas = (1 - np.cos(np.pi * (np.arange(nodes) + 0.5) / nodes)) / 2 * LARGEST_KAPPA
@@ -235,7 +239,7 @@ def test_slices_interpolate_polynomials_of_their_degree_exactly(terms):
     def powers(kappa):
         return np.array([[(kappa / LARGEST_KAPPA) ** (terms - 1), 0.5]])
 
-    table = SliceTable.build(3, terms, LARGEST_KAPPA, powers, ignore)
+    table = SliceTable.build(3, terms, LARGEST_KAPPA, powers, as_it_is, ignore)
     assert (table.terms, table.intervals, table.shape) == (terms, 3, (1, 2))
     for share in (0.0, 0.1, 1 / 3, 0.5, 0.9, 1.0):
         np.testing.assert_allclose(table.powers(share * LARGEST_KAPPA), powers(share * LARGEST_KAPPA), atol=1e-6)
@@ -257,6 +261,19 @@ def test_rounded_numbers_are_as_near_as_their_bits_allow(seed, decades):
     # No finite error for numbers that are too large: such a table is not taken.
     values[1, 2, 3, 4] = 5
     assert np.isinf(packed(values)[1, :, 3, 4]).all()
+
+
+@pytest.mark.parametrize(("terms", "rounded"), [(3, packed), (4, halved)])
+def test_slices_are_stored_rounded_but_where_they_are_too_large(terms, rounded):
+    def powers(kappa):
+        return np.array([[0.1 if kappa < LARGEST_KAPPA / 2 else 10.1]])
+
+    table = SliceTable.build(2, terms, LARGEST_KAPPA, powers, rounded, ignore)
+    np.testing.assert_array_equal(table.values[:1], rounded(table.values[:1]))
+    assert table.powers(0.0) != np.float32(0.1)
+    assert table.powers(0.0) == pytest.approx(0.1, rel=4e-3)
+    assert table.powers(LARGEST_KAPPA) == np.float32(10.1)
+    assert table.words_per_node == 4
 
 
 def test_numbers_that_are_too_large_do_not_become_others():

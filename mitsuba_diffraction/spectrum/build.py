@@ -387,10 +387,10 @@ class _Build:
         if representation == SliceTable.representation:
             intervals = self._intervals(allowed, storage.terms)
             _check_size(self.kept.shape, intervals * storage.terms)
-            table = SliceTable.build(intervals, storage.terms, self._largest_kappa, self._powers, self._phase(0.3, 0.8))
             # What is measured is what is stored.
-            rounded = storage.rounded(table.values)
-            return dataclasses.replace(table, values=rounded) if np.isfinite(rounded).all() else table
+            return SliceTable.build(
+                intervals, storage.terms, self._largest_kappa, self._powers, storage.rounded, self._phase(0.3, 0.8)
+            )
         if representation == SvdSeries.name:
             modes = SvdSeries.fit(self._largest_kappa, self._pilot)
             series = modes.first(self._terms(modes, allowed))

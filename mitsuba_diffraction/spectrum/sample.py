@@ -14,7 +14,7 @@ from .spline_grid import SplineGrid
 # Along an axis on which the surface is uniform the lobe is followed to this many σ_q.
 _UNIFORM_REACH = 6.0
 # Pieces are transformed in batches of about this many numbers.
-_BATCH = 1 << 20
+_BATCH = 1 << 17
 
 
 class _Lags:

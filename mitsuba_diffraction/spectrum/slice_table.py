@@ -46,9 +46,20 @@ class SliceTable:
         terms: int,
         largest_kappa: float,
         powers: Callable[[float], NDArray[np.float64]],
+        rounded: Callable[[NDArray[np.float32]], NDArray[np.float32]],
         progress: Callable[[int, int], None],
     ) -> SliceTable:
-        """Takes the powers at one κ after the other, so that little more than the result is held in memory."""
+        """Takes the powers at one κ after the other, so that little more than the result is held in memory.
+
+        Args:
+            intervals: K.
+            terms: how many a_p.
+            largest_kappa: κ_max in rad/µm.
+            powers: c_m at one κ.
+            rounded: values (K, terms, ...) as they are read, `packed` or `halved`; an interval stays as it is where
+                they are too large for it.
+            progress: called with what is done and what there is to do.
+        """
         values, nodes, polynomial = None, chebyshev_nodes(terms), to_polynomial(terms)
         for interval, node in np.ndindex(intervals, terms):
             power = powers((interval + (1 + nodes[node]) / 2) / intervals * largest_kappa)
@@ -56,6 +67,8 @@ class SliceTable:
                 values = np.zeros((intervals, terms, *power.shape), np.float32)
             for coefficient, factor in zip(values[interval], polynomial[:, node], strict=True):
                 coefficient += factor * power
+            if node == terms - 1 and np.isfinite(stored := rounded(values[interval, None])).all():
+                values[interval] = stored[0]
             progress(interval * terms + node + 1, intervals * terms)
         return cls(largest_kappa, values)
 
@@ -81,10 +94,10 @@ class SliceTable:
     @cached_property
     def words_per_node(self) -> int:
         """Words of 32 bits that a renderer reads of a node at one κ: 1 if `packed`, 2 if `halved`, else 4."""
-        if self.terms == 3 and np.array_equal(packed(self.values), self.values):
-            return 1
-        if self.terms == 4 and np.array_equal(halved(self.values), self.values):
-            return 2
+        for terms, words, rounded in ((3, 1, packed), (4, 2, halved)):
+            # One interval after the other: all at once would take several times the memory of the table.
+            if self.terms == terms and all(np.array_equal(rounded(v), v) for v in self.values[:, None]):
+                return words
         return 4
 
     @property
