@@ -80,6 +80,12 @@ def interaction(wi, wavelengths=WAVELENGTHS, count=1, uv=(0.0, 0.0)):
     return probe.interaction(np.broadcast_to(wi, (count, 3)), wavelengths, uv)
 
 
+def array(value):
+    """NumPy's array of a value of Dr.Jit: computed first, since a kernel that also arranges it is compiled per size."""
+    dr.eval(value)
+    return np.array(value, np.float64)
+
+
 def evaluate(bsdf, wi, wo, ctx=None, wavelengths=WAVELENGTHS, uv=(0.0, 0.0)):
     """f cos θ_o (4, n) and pdf (n,)."""
     value, pdf = probe.evaluate_pdf(bsdf, wi, np.atleast_2d(wo), wavelengths, ctx, uv)
@@ -90,6 +96,27 @@ def draw(bsdf, wi, count, ctx=None, seed=1, uv=(0.0, 0.0), wavelengths=WAVELENGT
     """Samples and their weights (4, n)."""
     _, weights, bs = probe.sample(bsdf, np.broadcast_to(wi, (count, 3)), wavelengths, seed, ctx, uv)
     return bs, weights.T
+
+
+def check_chi_square(bsdf, wi, wavelengths=WAVELENGTHS, cases=9):
+    """Mitsuba's chi² test of what is drawn, without mirrors, against the density; `cases` share the level of 0.01."""
+
+    # In the plane of direction cosines, where lobes have one width everywhere: dω = dx dy / cos θ.
+    def sample(points):
+        si = interaction(wi, wavelengths, dr.width(points))
+        bs, _ = bsdf.sample(mi.BSDFContext(), si, points.x, mi.Point2f(points.y, points.z))
+        keep = (bs.pdf > 0) & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        return dr.select(keep, mi.Vector2f(bs.wo.x, bs.wo.y), 0), dr.select(keep, mi.Float(1), 0)
+
+    def density(p):
+        z = dr.safe_sqrt(1 - dr.squared_norm(p))
+        pdf = bsdf.pdf(mi.BSDFContext(), interaction(wi, wavelengths, dr.width(p)), mi.Vector3f(p.x, p.y, z))
+        return dr.select(z > 0, pdf / z, 0)
+
+    domain = mi.chi2.PlanarDomain()
+    # The density of cells has steps, which the test integrates well only on a fine grid.
+    test = mi.chi2.ChiSquareTest(domain, sample, density, sample_dim=3, sample_count=400_000, res=41, ires=64)
+    assert test.run(significance_level=0.01, test_count=cases, quiet=True), test.messages
 
 
 def hemisphere(side=512):

@@ -1,6 +1,7 @@
 """What all tests share: a cache of their own, the measured scans, and the command."""
 
 import os
+import pickle
 import shlex
 import signal
 import sys
@@ -14,6 +15,9 @@ from hypothesis import settings
 
 import mitsuba_diffraction as md  # before Dr.Jit, so that it has an LLVM that works
 from mitsuba_diffraction import cli
+from mitsuba_diffraction.files import whole_file
+from mitsuba_diffraction.spectrum.energy_table import SHADOWING
+from mitsuba_diffraction.spectrum.grating_spectrum import GratingSpectrum
 
 from bsdf_support import use  # isort: skip
 from mitsuba_diffraction.render import passes  # isort: skip
@@ -49,6 +53,28 @@ def cache_folder(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("MITSUBA_DIFFRACTION_CACHE", str(folder))
         yield folder
+
+
+@pytest.fixture(scope="session", autouse=True)
+def energy_tables(cache_folder):
+    """The energy table of equal spectra is computed once in this session, whichever process asks first."""
+    compute, tables = GratingSpectrum.energy_table, {}
+
+    def energy_table(spectrum, shadowing="v_cavity"):
+        if shadowing in spectrum.energy or shadowing not in SHADOWING:
+            return compute(spectrum, shadowing)
+        path = cache_folder / f"{spectrum.digest}-{shadowing}.pickle"
+        if path not in tables and path.is_file():
+            tables[path] = pickle.loads(path.read_bytes())
+        if path not in tables:
+            tables[path] = compute(spectrum, shadowing)
+            with whole_file(path) as temporary:
+                temporary.write_bytes(pickle.dumps(tables[path]))
+        return tables[path]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(GratingSpectrum, "energy_table", energy_table)
+        yield
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -7,6 +7,8 @@ import pytest
 from bsdf_support import (
     WAVELENGTHS,
     albedo,
+    array,
+    check_chi_square,
     direction,
     draw,
     evaluate,
@@ -111,23 +113,7 @@ def test_weight_is_value_over_density_and_its_mean_the_albedo(name):
     ],
 )
 def test_samples_pass_the_chi_square_test(base, theta):
-    bsdf, wi = over({**SMOOTH, **MIRRORS}[base]()), direction(theta, 20)
-
-    # In the plane of direction cosines, where lobes have one width everywhere: dω = dx dy / cos θ.
-    def sample(points):
-        si = interaction(wi, count=dr.width(points))
-        bs, _ = bsdf.sample(mi.BSDFContext(), si, points.x, mi.Point2f(points.y, points.z))
-        keep = (bs.pdf > 0) & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-        return dr.select(keep, mi.Vector2f(bs.wo.x, bs.wo.y), 0), dr.select(keep, mi.Float(1), 0)
-
-    def density(p):
-        z = dr.safe_sqrt(1 - dr.squared_norm(p))
-        pdf = bsdf.pdf(mi.BSDFContext(), interaction(wi, count=dr.width(p)), mi.Vector3f(p.x, p.y, z))
-        return dr.select(z > 0, pdf / z, 0)
-
-    domain = mi.chi2.PlanarDomain()
-    test = mi.chi2.ChiSquareTest(domain, sample, density, sample_dim=3, sample_count=400_000, res=41, ires=64)
-    assert test.run(significance_level=0.01, test_count=9, quiet=True), test.messages
+    check_chi_square(over({**SMOOTH, **MIRRORS}[base]()), direction(theta, 20))
 
 
 @pytest.mark.few(1)
@@ -290,14 +276,14 @@ def test_polarised_variants_give_the_same(base):
     wo = some_directions(wi)
     si = interaction(np.tile(wi, (len(wo), 1)), count=len(wo))
     value, of_grating = (
-        np.array(bsdf.eval(mi.BSDFContext(), si, vectors(wo))).reshape(16, -1)
-        for bsdf in (over_or_alone(base), alone())
+        array(bsdf.eval(mi.BSDFContext(), si, vectors(wo))).reshape(16, -1) for bsdf in (over_or_alone(base), alone())
     )
     assert np.abs(of_grating[1:]).max() > 0
     np.testing.assert_array_equal(value[1:], of_grating[1:])
     u = np.random.default_rng(1).random((3, 16)).astype(np.float32)
     si = interaction(np.tile(wi, (16, 1)), count=16)
     bs, weight = over_or_alone(base).sample(mi.BSDFContext(), si, mi.Float(u[0]), mi.Point2f(u[1], u[2]))
+    dr.eval(bs, weight)
     if base == "conductor":
         of_mirror = np.array(bs.sampled_component) == 1
         assert np.abs(np.array(weight).reshape(16, 4, 16)[1:][..., of_mirror]).max() > 0.1

@@ -1,10 +1,9 @@
 """A clear layer over the grating, against Fresnel's formulas and closed forms inside the layer."""
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from bsdf_support import direction, interaction, random_directions, use, vectors
+from bsdf_support import array, check_chi_square, direction, interaction, random_directions, use, vectors
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction.bsdf import probe
@@ -104,25 +103,7 @@ def test_the_front_face_reflects_as_fresnel_says_and_no_light_is_gained(llvm, th
 
 @pytest.mark.parametrize("theta", [0, 60])
 def test_samples_pass_the_chi_square_test(llvm, theta):
-    bsdf, wi = coated(), direction(theta, 20)
-    context = mi.BSDFContext()
-    context.type_mask = +mi.BSDFFlags.GlossyReflection
-
-    def sample(points):
-        count = dr.width(points)
-        bs, _ = bsdf.sample(context, interaction(wi, count=count), points.x, mi.Point2f(points.y, points.z))
-        valid = bs.pdf > 0
-        return dr.select(valid, mi.Point2f(bs.wo.x, bs.wo.y), 0), dr.select(valid, mi.Float(1), 0)
-
-    def density(place):
-        z = dr.safe_sqrt(1 - dr.squared_norm(place))
-        wo = mi.Vector3f(place.x, place.y, z)
-        pdf = bsdf.pdf(context, interaction(wi, count=dr.width(wo)), wo)
-        return dr.select(z > 1e-3, pdf / dr.maximum(z, 1e-3), 0)
-
-    domain = mi.chi2.PlanarDomain()
-    test = mi.chi2.ChiSquareTest(domain, sample, density, sample_dim=3, sample_count=200_000, res=41, ires=64)
-    assert test.run(quiet=True), test.messages
+    check_chi_square(coated(), direction(theta, 20))
 
 
 def test_an_absorbing_layer_attenuates_both_passes(llvm):
@@ -162,7 +143,7 @@ def test_light_that_enters_along_s_passes_as_s():
     wo = wi * [-1, 1, 1]
     bsdf = coated(material="none", coherence_length=65.0)
     si = interaction(wi)
-    matrix = np.array(bsdf.eval(mi.BSDFContext(), si, vectors(wo)))[..., 0, 0]
+    matrix = array(bsdf.eval(mi.BSDFContext(), si, vectors(wo)))[..., 0, 0]
     s, p = 1 - np.array(fresnel(wi[2], RELATIVE)).ravel()
     # The stokes basis of either direction lies along s or p: both passes leave (s² + p²)/2 and ±(s² − p²)/2.
     assert abs(matrix[0, 1] / matrix[0, 0]) == pytest.approx(abs(s - p) / (s + p), rel=0.02)

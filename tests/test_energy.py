@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from bsdf_support import direction, use
+from bsdf_support import array, direction, use
 from bsdf_support import plugin as conserving_plugin
 
 import mitsuba_diffraction as md
@@ -63,7 +63,7 @@ def evaluate(bsdf, wi, wo, wavelengths):
     si = dr.zeros(mi.SurfaceInteraction3f, count)
     si.wi = mi.Vector3f(*np.broadcast_to(wi, wo.shape).T.astype(np.float32))
     si.wavelengths = type(si.wavelengths)(mi.Float(np.broadcast_to(wavelengths, count).astype(np.float32)))
-    return np.array(bsdf.eval(mi.BSDFContext(), si, mi.Vector3f(*wo.T.astype(np.float32))))[0]
+    return array(bsdf.eval(mi.BSDFContext(), si, mi.Vector3f(*wo.T.astype(np.float32))))[0]
 
 
 def near_orders(of, wi, wavelength, half=10, spacing=0.32, turn=0.0):
@@ -152,7 +152,7 @@ def test_no_albedo_above_one_by_samples(name, shadowing):
         si.wi = mi.Vector3f(*map(float, wi))
         si.wavelengths = type(si.wavelengths)(380, 480, 580, 780)
         numbers = mi.Float(rng.random(count)), mi.Point2f(rng.random(count), rng.random(count))
-        weight = np.array(bsdf.sample(mi.BSDFContext(), si, *numbers)[1])
+        weight = array(bsdf.sample(mi.BSDFContext(), si, *numbers)[1])
         noise = weight.std(1) / np.sqrt(count)
         assert (weight.mean(1) <= 1 + excess + 4 * noise).all(), (theta, np.rad2deg(phi), weight.mean(1))
 

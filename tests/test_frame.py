@@ -4,7 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from bsdf_support import PERIOD, WAVELENGTHS, corner_blaze, grating
+from bsdf_support import PERIOD, WAVELENGTHS, array, corner_blaze, evaluate, grating, vectors
 
 DOWN = (0.0, 0.0, -1.0)
 SQUARE = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], float)
@@ -54,12 +54,7 @@ def hit(shape, origin, towards, bsdf):
 
 def world(si, bsdf, omega):
     """f cos θ_o at 500 nm for directions (n, 3) in the world."""
-    omega = np.asarray(omega, float)
-    result = []
-    for o in omega:
-        wo = si.to_local(mi.Vector3f(*map(float, o)))
-        result.append(np.array(bsdf.eval(mi.BSDFContext(), si, wo))[1].item())
-    return np.array(result)
+    return array(bsdf.eval(mi.BSDFContext(), si, si.to_local(vectors(omega))))[1]
 
 
 def orders(mirror, x, y, n):
@@ -83,12 +78,8 @@ def check(shape, origin, towards, n, x, y, orientation=0.0, wrap=lambda nested: 
     mirror = d - 2 * n * (n @ d)
     found = world(si, bsdf, orders(mirror, x, y, n))
     # The plain grating on a table of its own.
-    local = dr.zeros(mi.SurfaceInteraction3f)
-    local.wi = mi.Vector3f(*(float(-d @ v) for v in (x, y, n)))
-    local.wavelengths = si.wavelengths
-    e = np.eye(3)
-    flat = orders(np.array([mirror @ x, mirror @ y, mirror @ n]), e[0], e[1], e[2])
-    wanted = [np.array(plain.eval(mi.BSDFContext(), local, mi.Vector3f(*map(float, o))))[1].item() for o in flat]
+    axes = np.stack([x, y, n])
+    wanted = evaluate(plain, -axes @ d, orders(axes @ mirror, *np.eye(3)))[0][1]
     assert wanted[0] > 5 * max(wanted[1:])
     np.testing.assert_allclose(found, wanted, rtol=0.02, atol=1e-3 * wanted[0])
 

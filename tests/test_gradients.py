@@ -4,7 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from bsdf_support import direction, grating, hemisphere, interaction, towards, uniform, vectors
+from bsdf_support import array, direction, grating, hemisphere, interaction, towards, uniform, vectors
 
 from mitsuba_diffraction.bsdf import energy, shared
 
@@ -49,7 +49,7 @@ class Total:
         self.parameters[self.key] = value
         self.parameters.update()
         f = self.bsdf.eval(mi.BSDFContext(), self.si, vectors(self.wo))
-        return np.array(f, np.float64)[1] @ self.weights
+        return array(f)[1] @ self.weights
 
 
 def difference(total, at, step):
@@ -212,6 +212,7 @@ def test_weights_of_samples_carry_the_derivative_of_the_value(key, at):
     parameters[key] = mi.Float(at)
     parameters.update()
     bs, _ = bsdf.sample(ctx, si, *numbers)
+    dr.eval(bs)
     wo, pdf = dr.detach(bs.wo), np.array(bs.pdf)
     found = slope(lambda: bsdf.sample(ctx, si, *numbers)[1]) * pdf
     wanted = slope(lambda: bsdf.eval(ctx, si, wo))

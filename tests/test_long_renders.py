@@ -1,5 +1,6 @@
 """Renderings that take long: noise that tells when to stop, kills, Ctrl-C, full disks, and the turntable."""
 
+import itertools
 import os
 import resource
 import signal
@@ -58,11 +59,10 @@ def stop_after(count):
 
 def press_ctrl_c(monkeypatch, count):
     """Lets the command be interrupted in its pass number `count`."""
-    original, calls = passes.trace_pass, []
+    original, number = passes.trace_pass, itertools.count(1)
 
     def trace_pass(*arguments):
-        calls.append(arguments)
-        if len(calls) == count:
+        if next(number) == count:
             signal.raise_signal(signal.SIGINT)
         return original(*arguments)
 
@@ -539,11 +539,10 @@ def test_a_turntable_writes_frames_and_an_animation_and_resumes(command, monkeyp
 
 
 def test_a_second_ctrl_c_in_a_turntable_says_what_is_there(command, monkeypatch):
-    original, calls = passes.trace_pass, []
+    original, number = passes.trace_pass, itertools.count(1)
 
     def trace_pass(*arguments):
-        calls.append(arguments)
-        if len(calls) == 3:
+        if next(number) == 3:
             raise KeyboardInterrupt
         return original(*arguments)
 

@@ -4,7 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from bsdf_support import use
+from bsdf_support import array, use
 
 import mitsuba_diffraction as md
 
@@ -36,7 +36,7 @@ def matrices(bsdf, wi, wo, mode=None):
     si.wavelengths = type(si.wavelengths)(*WAVELENGTHS)
     si.sh_frame = mi.Frame3f(mi.Normal3f(0, 0, 1))
     ctx = mi.BSDFContext(mode or mi.TransportMode.Radiance)
-    return np.array(bsdf.eval(ctx, si, mi.Vector3f(wo.astype(np.float32))), np.float64)
+    return array(bsdf.eval(ctx, si, mi.Vector3f(wo.astype(np.float32))))
 
 
 @pytest.mark.few(1)

@@ -7,7 +7,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from bsdf_support import direction, evaluate, interaction, random_directions, use
+from bsdf_support import check_chi_square, direction, evaluate, interaction, random_directions, use
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction.bsdf import probe
@@ -131,21 +131,16 @@ def test_samples_carry_the_efficiencies_evenly(llvm, spectrum, theta):
 @pytest.mark.parametrize("theta", [0, 40, 75])
 def test_samples_pass_the_chi_square_test(llvm, solved, theta):
     wide = dataclasses.replace(solved, coherence_length=3.0)
-    for spectrum, wavelengths in ((wide, WAVELENGTHS), (made_up(3.0), (400.0, 500.0, 600.0, 700.0))):
-        bsdf, wi = plugin(spectrum, orientation=20.0), direction(theta, 20)
+    check_chi_square(plugin(wide, orientation=20.0), direction(theta, 20), WAVELENGTHS)
+    check_chi_square(plugin(made_up(3.0), orientation=20.0), direction(theta, 20))
 
-        def sample(points, bsdf=bsdf, wi=wi, wavelengths=wavelengths):
-            si = interaction(wi, wavelengths, dr.width(points))
-            bs, _ = bsdf.sample(mi.BSDFContext(), si, points.x, mi.Point2f(points.y, points.z))
-            return bs.wo, dr.select(bs.pdf > 0, mi.Float(1), 0)
 
-        def density(wo, bsdf=bsdf, wi=wi, wavelengths=wavelengths):
-            return bsdf.pdf(mi.BSDFContext(), interaction(wi, wavelengths, dr.width(wo)), wo)
-
-        test = mi.chi2.ChiSquareTest(
-            mi.chi2.SphericalDomain(), sample, density, sample_dim=3, sample_count=200_000, res=41, ires=64
-        )
-        assert test.run(), test.messages
+@pytest.mark.few(1)
+@pytest.mark.parametrize("theta", [40, 0, 75])
+def test_polarised_samples_pass_the_chi_square_test(solved, theta):
+    use("llvm_ad_spectral_polarized")
+    wide = dataclasses.replace(solved, coherence_length=3.0)
+    check_chi_square(plugin(wide, orientation=20.0), direction(theta, 20), WAVELENGTHS)
 
 
 def test_the_albedo_is_that_of_the_solver(llvm, solved):
@@ -230,6 +225,7 @@ def vector(v):
 
 def entries(matrix):
     """Of the first wavelength, (4, 4)."""
+    dr.eval(matrix)  # in one kernel
     return np.array([[np.ravel(matrix[i, j][0])[0] for j in range(4)] for i in range(4)])
 
 
@@ -351,6 +347,13 @@ def test_a_coat_lets_through_what_the_solver_sends_out(llvm, coated, theta, phi,
     _, weights, _ = probe.sample(under_coat(coated), wi, (wavelength * 1e3,) * 4, 2)
     assert weights[:, 0].mean() == pytest.approx(front + below, rel=0.03)
     assert weights[:, 0].mean() < 1
+
+
+@pytest.mark.few(1)
+@pytest.mark.parametrize("theta", [40, 0, 75])
+def test_samples_under_a_coat_pass_the_chi_square_test(llvm, coated, theta):
+    wide = dataclasses.replace(coated, coherence_length=3.0)
+    check_chi_square(under_coat(wide), direction(theta, 20), (410.0, 440.0, 470.0, 490.0))
 
 
 def test_a_grating_under_a_coat_is_reciprocal(llvm, coated):

@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from bsdf_support import WAVELENGTHS, albedo, direction, draw, hemisphere, plugin, use
+from bsdf_support import WAVELENGTHS, albedo, array, check_chi_square, direction, draw, hemisphere, plugin, use
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction.bsdf.cell_sampler import CellSampler
@@ -63,6 +63,7 @@ def sampled(bsdf, wi, wavelengths, count, seed=0):
     u = numbers(count, seed)
     si = interaction(wi, wavelengths, count)
     bs, weight = bsdf.sample(mi.BSDFContext(), si, mi.Float(u[0]), mi.Point2f(mi.Float(u[1]), mi.Float(u[2])))
+    dr.eval(bs, weight)
     return bs, np.array(weight, np.float64)
 
 
@@ -97,7 +98,7 @@ CASES = [*REDUCED, *(pytest.param(*case, marks=pytest.mark.slow) for case in FUL
 @pytest.mark.few(2)
 @pytest.mark.parametrize(("name", "theta", "phi", "wavelengths"), CASES)
 def test_samples_pass_the_chi_square_test(llvm, name, theta, phi, wavelengths):
-    check_chi_square(blurred(name), theta, phi, wavelengths)
+    check_chi_square(plugin(blurred(name)), direction(theta, phi), wavelengths, len(CASES))
 
 
 @pytest.mark.few(1)
@@ -105,30 +106,8 @@ def test_samples_pass_the_chi_square_test(llvm, name, theta, phi, wavelengths):
 @pytest.mark.parametrize("extent", ["tile", "sample"])
 @pytest.mark.parametrize("name", ["elaphe", "xenopeltis"])
 def test_samples_of_a_real_scan_pass_the_chi_square_test(llvm, scan, name, extent, theta):
-    check_chi_square(md.precompute(scan(name), extent=extent, coherence_length=2.9), theta, 20, WAVELENGTHS)
-
-
-def check_chi_square(spectrum, theta, phi, wavelengths):
-    bsdf, wi = plugin(spectrum), direction(theta, phi)
-
-    # In the plane of direction cosines, where lobes have one width everywhere: dω = dx dy / cos θ.
-    def sample(points):
-        si = interaction(wi, wavelengths, dr.width(points))
-        bs, _ = bsdf.sample(mi.BSDFContext(), si, points.x, mi.Point2f(points.y, points.z))
-        above = bs.pdf > 0
-        return dr.select(above, mi.Vector2f(bs.wo.x, bs.wo.y), 0), dr.select(above, mi.Float(1), 0)
-
-    def density(p):
-        z = dr.safe_sqrt(1 - dr.squared_norm(p))
-        si = interaction(wi, wavelengths, dr.width(p))
-        pdf = bsdf.pdf(mi.BSDFContext(), si, mi.Vector3f(p.x, p.y, z))
-        return dr.select(z > 0, pdf / z, 0)
-
-    domain = mi.chi2.PlanarDomain()
-    # The density of cells has steps, which the test integrates well only on a fine grid.
-    test = mi.chi2.ChiSquareTest(domain, sample, density, sample_dim=3, sample_count=400_000, res=41, ires=64)
-    # One case in a hundred fails by chance at the level 0.01; there are CASES of them.
-    assert test.run(significance_level=0.01, test_count=len(CASES), quiet=True), test.messages
+    spectrum = md.precompute(scan(name), extent=extent, coherence_length=2.9)
+    check_chi_square(plugin(spectrum), direction(theta, 20), cases=len(CASES))
 
 
 @pytest.mark.few(2)
@@ -157,7 +136,7 @@ def test_mean_weight_is_the_albedo(llvm, name, theta):
     inside = z > 0
     x, y, z = x[inside], y[inside], z[inside]
     wo = mi.Vector3f(*(mi.Float(axis.astype(np.float32)) for axis in (x, y, z)))
-    value = np.array(bsdf.eval(mi.BSDFContext(), interaction(wi, WAVELENGTHS, len(x)), wo), np.float64)
+    value = array(bsdf.eval(mi.BSDFContext(), interaction(wi, WAVELENGTHS, len(x)), wo))
     albedo = (value / z).sum(axis=1) * (2 / 2048) ** 2
     error = weight.std(axis=1) / np.sqrt(count)
     np.testing.assert_array_less(np.abs(weight.mean(axis=1) - albedo), 4 * error + 2e-3 * albedo)
@@ -264,9 +243,9 @@ def test_cells_are_drawn_with_their_density_and_few_that_do_not_propagate(llvm, 
     s = direction(theta, phi)
     incidence = Incidence.of(mi.Vector3f(s.tolist()), mi.Float(1 / wavelength), mi.Float(1.0), None)
     u = numbers(count)
-    q = [
-        np.array(x) for x in sampler.sample(incidence, mi.Float(u[0]), mi.Point2f(mi.Float(u[1]), mi.Float(u[2])), True)
-    ]
+    q = sampler.sample(incidence, mi.Float(u[0]), mi.Point2f(mi.Float(u[1]), mi.Float(u[2])), True)
+    dr.eval(q)
+    q = [np.array(x) for x in q]
     spacing = [float(np.array(x).item()) for x in (sampler.spacing_x, sampler.spacing_y)]
 
     # The density at the middles of all cells; those outside of the region are told by no q that propagates.
@@ -303,6 +282,7 @@ def test_orders_are_drawn_with_their_shares_and_only_those_that_propagate(llvm, 
     incidence = Incidence.of(mi.Vector3f(direction(theta, phi).tolist()), mi.Float(1 / 0.5), mi.Float(1.0), None)
     u = numbers(count)
     row, column, _ = sampler.sample(incidence, mi.Float(u[0]), mi.Point2f(mi.Float(u[1]), mi.Float(u[2])), True)
+    dr.eval(row, column)
     rows, columns = spectrum.grid.shape
     order = dr.arange(mi.UInt32, rows * columns)
     weights = sampler.weights(incidence, mi.Bool(True))

@@ -102,6 +102,7 @@ def evaluate_pdf(
     context = context or mi.BSDFContext()
     if dr.is_jit_v(mi.Float):
         value, pdf = bsdf.eval_pdf(context, interaction(wi, wavelengths, uv), vectors(wo))
+        dr.eval(value, pdf)  # in one kernel, whatever their number
         value, pdf = _spectrum(value, len(wo)), np.array(pdf, np.float64)
     else:
         found = [
@@ -144,6 +145,7 @@ def sample(
     found, weight = bsdf.sample(
         context or mi.BSDFContext(), interaction(wi, wavelengths, uv), mi.Float(u[0]), mi.Point2f(u[1:])
     )
+    dr.eval(found, weight)  # in one kernel, whatever their number
     return np.array(found.wo, np.float64).T, _spectrum(weight, len(wi)), found
 
 

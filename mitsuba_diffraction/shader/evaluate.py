@@ -77,6 +77,7 @@ def colour(
     result = shader.xyz(wi, wo, weights) if quantity == "xyz" else shader.rgb(wi, wo, weights)
     if quantity == "encoded":
         result = dr.minimum(encode(result, quirks.power_gamma), 1)
+    dr.eval(result)  # what arranges it is compiled for its size
     return np.array(result).T.reshape(*shape, 3)
 
 
