@@ -232,14 +232,18 @@ def _tile_splines(
 ) -> TileSplines | None:
     """A tile's lattice of splines, if it is read faster than its orders."""
     cost = _cost(lobes[0].count * lobes[1].count, orders.grid.shape)
-    # As coarse as a lattice can be, to begin with.
-    if _cost(9, TileSplines(orders, sigma, _WIDEST_SPACING * sigma, reach).grid.shape) >= cost:
-        return None
+
+    def lattice(spacing: float) -> TileSplines:
+        splines = TileSplines(orders, sigma, spacing, reach)
+        # A finer one would be read slower still.
+        if _cost(9, splines.grid.shape) >= cost:
+            raise _TooLargeError(f"{splines.grid}: read no faster than the orders")
+        return splines
+
     try:
-        splines = _refined(lambda spacing: TileSplines(orders, sigma, spacing, reach), sigma, largest_kappa, tolerance)
+        return _refined(lattice, sigma, largest_kappa, tolerance)
     except _TooLargeError:
         return None
-    return splines if _cost(9, splines.grid.shape) < cost else None
 
 
 def _cost(packets: int, shape: tuple[int, int]) -> float:
@@ -476,7 +480,7 @@ def _rim(profile: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 class _TooLargeError(RequestError):
-    """A table would need too much memory."""
+    """A table would need too much memory, or a lattice take longer to read than the orders."""
 
 
 def _check_size(shape: tuple[int, int], floats: int) -> None:

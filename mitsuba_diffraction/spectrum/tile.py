@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 import scipy.fft
 import scipy.linalg
@@ -77,8 +79,12 @@ class TileSplines:
         self._reached = tuple(min(reach, q[-1] + 6 * lobe_width) for q in self._orders)
         largest = tuple(int(np.rint(end / spacing)) + 1 for end in self._reached)
         self.grid = SplineGrid((spacing, spacing), largest, (np.inf, np.inf))
-        self._projection = [self._projected(m, q) for m, q in zip(largest, self._orders, strict=True)]
         self._random = np.random.default_rng(0)
+
+    @cached_property
+    def _projection(self) -> list[NDArray[np.float64]]:
+        """A_x and A_y, once coefficients are asked for."""
+        return [self._projected(m, q) for m, q in zip(self.grid.largest, self._orders, strict=True)]
 
     def _projected(self, largest: int, orders: NDArray[np.float64]) -> NDArray[np.float64]:
         """A, (nodes, orders), along one axis."""
