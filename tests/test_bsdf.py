@@ -32,9 +32,9 @@ def spectrum(name, coherence_length=65.0, representation="auto"):
     return md.precompute(surface(name), coherence_length=coherence_length, representation=representation)
 
 
-def raw_plugin(of):
+def raw_plugin(of, **parameters):
     """The plugin without E, which tests/test_energy.py examines."""
-    return plugin(of, conserve_energy=False)
+    return plugin(of, conserve_energy=False, **parameters)
 
 
 def towards(wi, q, wavelength):
@@ -81,7 +81,7 @@ def expected(height_field, wi, wo, wavelengths=WAVELENGTHS, coherence_length=65.
 
 
 def test_flat_surface_gives_a_gaussian_about_the_mirror_direction(llvm):
-    bsdf, wi = plugin(spectrum("flat")), direction(40, 25)
+    bsdf, wi = raw_plugin(spectrum("flat")), direction(40, 25)
     sigma = lobe_width(65.0)
     peak = 1 / (0.5**2 * 2 * np.pi * sigma**2)
     for offset in (0, 1, 2):
@@ -112,7 +112,7 @@ def test_blaze_goes_to_the_side_that_its_facets_mirror(llvm):
     wi = direction(0)
     wo = towards(wi, np.array([[0.4, 0], [-0.4, 0]]), 500)
     assert wo[0, 0] < 0
-    minus_x, plus_x = evaluate(plugin(spectrum("blazed")), wi, wo)[0][:, 1]
+    minus_x, plus_x = evaluate(raw_plugin(spectrum("blazed")), wi, wo)[0][:, 1]
     assert minus_x > 10 * max(plus_x, 1e-9)
 
 
@@ -120,16 +120,16 @@ def test_dielectric_is_fresnel_at_the_half_vector(llvm):
     wi = direction(50, 20)
     wo = towards(wi, np.array([[m / 2.5, 0] for m in (-1, 0, 1, 2)]), 500)
     wo = wo[np.isfinite(wo[:, 2])]
-    mirror = evaluate(plugin(spectrum("blazed")), wi, wo)[0][:, 1]
+    mirror = evaluate(raw_plugin(spectrum("blazed")), wi, wo)[0][:, 1]
     assert (mirror > 0).all()
     c = np.sqrt((1 + wo @ wi) / 2)
     t = np.sqrt(1 - (1 - c**2) / 1.5**2)
     exact = (((c - 1.5 * t) / (c + 1.5 * t)) ** 2 + ((1.5 * c - t) / (1.5 * c + t)) ** 2) / 2
     for model, wanted in (("exact", exact), ("schlick", 0.04 + 0.96 * (1 - c) ** 5)):
-        value = evaluate(plugin(spectrum("blazed"), int_ior=1.5, ext_ior=1.0, fresnel=model), wi, wo)[0][:, 1]
+        value = evaluate(raw_plugin(spectrum("blazed"), int_ior=1.5, ext_ior=1.0, fresnel=model), wi, wo)[0][:, 1]
         np.testing.assert_allclose(value / mirror, wanted, rtol=1e-4)
     for model in ("exact", "schlick"):
-        ratio = evaluate(plugin(spectrum("blazed"), material="Al", fresnel=model), wi, wo)[0][:, 1] / mirror
+        ratio = evaluate(raw_plugin(spectrum("blazed"), material="Al", fresnel=model), wi, wo)[0][:, 1] / mirror
         assert (ratio > 0.8).all()
         assert (ratio < 1).all()
 
@@ -137,22 +137,22 @@ def test_dielectric_is_fresnel_at_the_half_vector(llvm):
 def test_orientation_turns_the_pattern(llvm):
     wi = direction(0)
     wo = towards(wi, np.array([[0.4, 0], [0, 0.4]]), 500)
-    along_x, along_y = evaluate(plugin(spectrum("blazed"), orientation=90.0), wi, wo)[0][:, 1]
+    along_x, along_y = evaluate(raw_plugin(spectrum("blazed"), orientation=90.0), wi, wo)[0][:, 1]
     assert along_x == 0
-    np.testing.assert_allclose(along_y, evaluate(plugin(spectrum("blazed")), wi, wo)[0][0, 1], rtol=1e-4)
+    np.testing.assert_allclose(along_y, evaluate(raw_plugin(spectrum("blazed")), wi, wo)[0][0, 1], rtol=1e-4)
 
     c, s = np.cos(np.deg2rad(30)), np.sin(np.deg2rad(30))
     back = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
     rng = np.random.default_rng(1)
     wi, wo = random_directions(rng, 500, 0.1), random_directions(rng, 500, 0.1)
-    turned, straight = plugin(spectrum("blazed", 3.0), orientation=30.0), plugin(spectrum("blazed", 3.0))
+    turned, straight = raw_plugin(spectrum("blazed", 3.0), orientation=30.0), raw_plugin(spectrum("blazed", 3.0))
     value, wanted = evaluate(turned, wi, wo)[0], evaluate(straight, wi @ back.T, wo @ back.T)[0]
     np.testing.assert_allclose(value, wanted, rtol=1e-3, atol=1e-4 * wanted.max())
 
 
 @pytest.mark.slow
 def test_reciprocity(llvm):
-    bsdf = plugin(spectrum("crossed", 3.0), int_ior=1.5)
+    bsdf = raw_plugin(spectrum("crossed", 3.0), int_ior=1.5)
     rng = np.random.default_rng(2)
     wi = random_directions(rng, 2000, 0.1)
     q = rng.integers(-2, 3, (2000, 2)) / 2.0 + rng.normal(0, 0.1, (2000, 2))
@@ -225,7 +225,7 @@ def test_samples_follow_their_density_and_carry_the_albedo(llvm, theta):
 @pytest.mark.parametrize("theta", [0, 30, 60])
 @pytest.mark.parametrize("name", ["blazed", "crossed"])
 def test_samples_pass_the_chi_square_test(llvm, name, theta):
-    check_chi_square(plugin(spectrum(name, 3.0)), direction(theta, 20))
+    check_chi_square(raw_plugin(spectrum(name, 3.0)), direction(theta, 20))
 
 
 def test_variant_without_wavelengths_is_refused():

@@ -58,7 +58,7 @@ def test_wrong_requests_have_a_class_of_their_own():
 
 def test_a_scene_sets_the_tolerance_of_a_recipe(tmp_path, llvm):
     recipe = tmp_path / "blaze.toml"
-    recipe.write_text('[surface]\nprofile = "blazed"\nperiod = 2.5\ndepth = 0.25\n[spectrum]\ncoherence_length = 5.0\n')
+    recipe.write_text('[surface]\nprofile = "blazed"\nperiod = 2.5\ndepth = 0.25\n')
     grating = {"type": "diffraction_grating", "filename": str(recipe), "material": "Al"}
     assert mi.load_dict(grating).spectrum.tolerance == 1e-3
     assert mi.load_dict({**grating, "tolerance": 0.05}).spectrum.tolerance == pytest.approx(0.05)

@@ -19,7 +19,7 @@ def polarised():
 def grating(**parameters):
     # Lobes as wide as the facets': light everywhere.
     spectrum = md.precompute(md.gratings.sinusoidal(2.5, 0.3), coherence_length=2.0)
-    return mi.load_dict({"type": "diffraction_grating", "spectrum": spectrum, **parameters})
+    return mi.load_dict({"type": "diffraction_grating", "spectrum": spectrum, "conserve_energy": False, **parameters})
 
 
 def directions(count=200):
