@@ -83,6 +83,6 @@ print(*({{"mitsuba", "drjit"}} & set(sys.modules)))
     ids=["first", "between", "last"],
 )
 def test_plugins_are_registered_whenever_the_package_is_imported(lines):
-    grating = "{'type': 'diffraction_grating', 'profile': 'blazed', 'period': 2.5, 'depth': 0.05}"
+    grating = "{'type': 'diffraction_grating', 'profile': 'blazed', 'period': 2.5, 'depth': 0.05, 'tolerance': 0.05}"
     printed = in_a_fresh_process("\n".join([*lines, f"print(type(mitsuba.load_dict({grating})).__name__)"]))
     assert printed == ["DiffractionGrating"]
