@@ -477,7 +477,8 @@ def define() -> type:
             """A direction for one of the wavelengths; below the horizon (z = 0) where its order is evanescent."""
             covered, count = self._covered(si)
             share = _diffuse_share(count)
-            diffuse = u < share
+            # In scalar variants these are Python's, for which ~ is no negation.
+            diffuse, diffracted = u < share, u >= share
             u = (u - share) / dr.maximum(1 - share, DEFENSIVE)
             # Only wavelengths that the spectrum covers draw directions.
             chosen = dr.clip(dr.floor(u * count), 0, dr.maximum(count - 1, 0))
@@ -494,7 +495,7 @@ def define() -> type:
                 incidence = Incidence.of(self.coat.refracted(towards), frequency * self.coat.relative, mi.Float(1))
             else:
                 incidence = Incidence.of(towards, frequency, self.height_scale, self.coat)
-            q_x, q_y = self.scattering.sample(incidence, rest, v, active & ~diffuse)
+            q_x, q_y = self.scattering.sample(incidence, rest, v, active & diffracted)
             x = -wavelength * (cos * q_x - sin * q_y) - si.wi.x
             y = -wavelength * (sin * q_x + cos * q_y) - si.wi.y
             z = dr.safe_sqrt(1 - dr.square(x) - dr.square(y))
