@@ -43,7 +43,7 @@ def folder(tmp_path, monkeypatch, small_passes):
 
 
 def start(**options):
-    return distributed.LocalCluster(dashboard_address=None, threads_per_worker=1, **options)
+    return distributed.LocalCluster(dashboard_address=":0", threads_per_worker=1, **options)
 
 
 @pytest.fixture
