@@ -113,7 +113,7 @@ def test_weight_is_value_over_density_and_its_mean_the_albedo(name):
     ],
 )
 def test_samples_pass_the_chi_square_test(base, theta):
-    check_chi_square(over({**SMOOTH, **MIRRORS}[base]()), direction(theta, 20))
+    check_chi_square(over({**SMOOTH, **MIRRORS}[base]()), direction(theta, 20), cases=9)
 
 
 @pytest.mark.few(1)

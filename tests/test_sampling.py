@@ -98,7 +98,7 @@ CASES = [*REDUCED, *(pytest.param(*case, marks=pytest.mark.slow) for case in FUL
 @pytest.mark.few(2)
 @pytest.mark.parametrize(("name", "theta", "phi", "wavelengths"), CASES)
 def test_samples_pass_the_chi_square_test(llvm, name, theta, phi, wavelengths):
-    check_chi_square(plugin(blurred(name), conserve_energy=False), direction(theta, phi), wavelengths, len(CASES))
+    check_chi_square(plugin(blurred(name), conserve_energy=False), direction(theta, phi), wavelengths, cases=len(CASES))
 
 
 @pytest.mark.few(1)
