@@ -10,7 +10,7 @@ import pytest
 import mitsuba_diffraction as md
 from mitsuba_diffraction.bsdf import probe
 
-direction, vectors = probe.direction, probe.vectors
+array, direction, vectors = probe.array, probe.direction, probe.vectors
 WAVELENGTHS = (400.0, 500.0, 600.0, 700.0)
 PERIOD = 2.5
 
@@ -78,12 +78,6 @@ def random_directions(rng, count, least=0.05):
 
 def interaction(wi, wavelengths=WAVELENGTHS, count=1, uv=(0.0, 0.0)):
     return probe.interaction(np.broadcast_to(wi, (count, 3)), wavelengths, uv)
-
-
-def array(value):
-    """NumPy's array of a value of Dr.Jit: computed first, since a kernel that also arranges it is compiled per size."""
-    dr.eval(value)
-    return np.array(value, np.float64)
 
 
 def evaluate(bsdf, wi, wo, ctx=None, wavelengths=WAVELENGTHS, uv=(0.0, 0.0)):

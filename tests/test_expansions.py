@@ -32,10 +32,6 @@ def ignore(done, total):
     pass
 
 
-def as_it_is(values):
-    return values
-
-
 def at_nodes(count):
     return CENTRE * (1 + chebyshev_nodes(count))
 
@@ -170,7 +166,7 @@ def test_nodes_resolve_the_wave_to_the_tolerance(x, tolerance):
 @settings(max_examples=50)
 def test_polynomials_through_chebyshev_points_keep_their_bound(terms, divisor, height, intervals, phase, share):
     table = SliceTable.build(
-        intervals, terms, LARGEST_KAPPA, lambda kappa: np.cos(kappa * height + phase).reshape(1, 1), as_it_is, ignore
+        intervals, terms, LARGEST_KAPPA, lambda kappa: np.cos(kappa * height + phase).reshape(1, 1), lambda v: v, ignore
     )
     kappas = LARGEST_KAPPA * (np.arange(0, intervals, max(1, intervals // 20)) + share) / intervals
     got = np.array([table.powers(kappa)[0, 0] for kappa in kappas])

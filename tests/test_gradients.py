@@ -49,7 +49,7 @@ class Total:
         self.parameters[self.key] = value
         self.parameters.update()
         f = self.bsdf.eval(mi.BSDFContext(), self.si, vectors(self.wo))
-        return array(f)[1] @ self.weights
+        return array(f, np.float64)[1] @ self.weights
 
 
 def difference(total, at, step):

@@ -36,7 +36,7 @@ def matrices(bsdf, wi, wo, mode=None):
     si.wavelengths = type(si.wavelengths)(*WAVELENGTHS)
     si.sh_frame = mi.Frame3f(mi.Normal3f(0, 0, 1))
     ctx = mi.BSDFContext(mode or mi.TransportMode.Radiance)
-    return array(bsdf.eval(ctx, si, mi.Vector3f(wo.astype(np.float32))))
+    return array(bsdf.eval(ctx, si, mi.Vector3f(wo.astype(np.float32))), np.float64)
 
 
 @pytest.mark.few(1)

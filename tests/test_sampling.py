@@ -136,7 +136,7 @@ def test_mean_weight_is_the_albedo(llvm, name, theta):
     inside = z > 0
     x, y, z = x[inside], y[inside], z[inside]
     wo = mi.Vector3f(*(mi.Float(axis.astype(np.float32)) for axis in (x, y, z)))
-    value = array(bsdf.eval(mi.BSDFContext(), interaction(wi, WAVELENGTHS, len(x)), wo))
+    value = array(bsdf.eval(mi.BSDFContext(), interaction(wi, WAVELENGTHS, len(x)), wo), np.float64)
     albedo = (value / z).sum(axis=1) * (2 / 2048) ** 2
     error = weight.std(axis=1) / np.sqrt(count)
     np.testing.assert_array_less(np.abs(weight.mean(axis=1) - albedo), 4 * error + 2e-3 * albedo)

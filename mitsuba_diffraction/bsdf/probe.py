@@ -39,6 +39,15 @@ def vectors(omega: ArrayLike) -> mi.Vector3f:
     return _components(mi.Vector3f, omega)
 
 
+def array(value: object, dtype: type | None = None) -> NDArray:
+    """NumPy's array of a value of Dr.Jit, (components, n).
+
+    It is computed first: a kernel that also arranges the components would be compiled for every n.
+    """
+    dr.eval(value)
+    return np.array(value, dtype)
+
+
 def interaction(wi: ArrayLike, wavelengths: ArrayLike, uv: ArrayLike = (0.0, 0.0)) -> mi.SurfaceInteraction3f:
     """Points of the plane z = 0, its tangents along x and y.
 
@@ -102,8 +111,8 @@ def evaluate_pdf(
     context = context or mi.BSDFContext()
     if dr.is_jit_v(mi.Float):
         value, pdf = bsdf.eval_pdf(context, interaction(wi, wavelengths, uv), vectors(wo))
-        dr.eval(value, pdf)  # in one kernel, whatever their number
-        value, pdf = _spectrum(value, len(wo)), np.array(pdf, np.float64)
+        dr.eval(value, pdf)  # in one kernel
+        value, pdf = _spectrum(value, len(wo)), array(pdf, np.float64)
     else:
         found = [
             bsdf.eval_pdf(context, interaction(one, nanometres, place), vectors(other))
@@ -145,8 +154,8 @@ def sample(
     found, weight = bsdf.sample(
         context or mi.BSDFContext(), interaction(wi, wavelengths, uv), mi.Float(u[0]), mi.Point2f(u[1:])
     )
-    dr.eval(found, weight)  # in one kernel, whatever their number
-    return np.array(found.wo, np.float64).T, _spectrum(weight, len(wi)), found
+    dr.eval(found, weight)  # in one kernel
+    return array(found.wo, np.float64).T, _spectrum(weight, len(wi)), found
 
 
 def _components(kind: type, values: ArrayLike) -> object:
@@ -162,5 +171,5 @@ def _channels() -> int:
 
 def _spectrum(value: mi.Spectrum, count: int) -> Array:
     """Of Mitsuba's spectrum, or of the first element of a Mueller matrix: (count, c)."""
-    found = np.array(mi.unpolarized_spectrum(value), np.float64).reshape(_channels(), -1)
+    found = array(mi.unpolarized_spectrum(value), np.float64).reshape(_channels(), -1)
     return np.broadcast_to(found, (len(found), count)).T

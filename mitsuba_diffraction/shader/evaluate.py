@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..bsdf.probe import vectors
+from ..bsdf.probe import array, vectors
 from ..errors import RequestError
 from ..surface.heightfield import HeightField
 from .base import Shader
@@ -77,8 +77,7 @@ def colour(
     result = shader.xyz(wi, wo, weights) if quantity == "xyz" else shader.rgb(wi, wo, weights)
     if quantity == "encoded":
         result = dr.minimum(encode(result, quirks.power_gamma), 1)
-    dr.eval(result)  # what arranges it is compiled for its size
-    return np.array(result).T.reshape(*shape, 3)
+    return array(result).T.reshape(*shape, 3)
 
 
 def relative_radiance(

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bsdf.probe import interaction
+from ..bsdf.probe import array, interaction
 from ..errors import RequestError
 from .tristimulus import wavelengths
 
@@ -20,9 +20,7 @@ def spectrum_of(evaluate: Callable[[mi.SurfaceInteraction3f], mi.UnpolarizedSpec
     groups = np.resize(nanometres, (-(-nanometres.size // channels), channels))
     found = []
     for group in [groups] if dr.is_jit_v(mi.Float) else groups[:, None]:
-        values = evaluate(interaction((0, 0, 1), group))
-        dr.eval(values)  # what arranges it is compiled for its size
-        values = np.array(values, np.float64).reshape(channels, -1)
+        values = array(evaluate(interaction((0, 0, 1), group)), np.float64).reshape(channels, -1)
         found.append(np.broadcast_to(values, (channels, len(group))))
     return np.concatenate(found, axis=1).T.ravel()[: nanometres.size]
 
