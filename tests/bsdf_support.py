@@ -10,7 +10,7 @@ import pytest
 import mitsuba_diffraction as md
 from mitsuba_diffraction.bsdf import probe
 
-array, direction, vectors = probe.array, probe.direction, probe.vectors
+array, direction, floats, vectors = probe.array, probe.direction, probe.floats, probe.vectors
 WAVELENGTHS = (400.0, 500.0, 600.0, 700.0)
 PERIOD = 2.5
 

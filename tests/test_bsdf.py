@@ -6,9 +6,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from bsdf_support import WAVELENGTHS, check_chi_square, direction, plugin, random_directions, use
+from bsdf_support import WAVELENGTHS, check_chi_square, direction, floats, interaction, plugin, random_directions, use
 
 import mitsuba_diffraction as md
+from mitsuba_diffraction.bsdf.probe import evaluate_pdf
 from mitsuba_diffraction.coherence import lobe_width
 
 MAKE = {
@@ -44,22 +45,10 @@ def towards(wi, q, wavelength):
         return np.concatenate([t, np.sqrt(1 - (t**2).sum(-1, keepdims=True))], -1)
 
 
-def interaction(wi, wavelengths=WAVELENGTHS, count=1):
-    si = dr.zeros(mi.SurfaceInteraction3f, count)
-    si.wi = mi.Vector3f(*np.atleast_2d(wi).T.astype(np.float32))
-    w = np.asarray(wavelengths, np.float32)
-    si.wavelengths = type(si.wavelengths)(*(w.tolist() if w.ndim == 1 else w.T))
-    return si
-
-
 def evaluate(bsdf, wi, wo, wavelengths=WAVELENGTHS):
     """f cos θ_o (n, 4) and pdf (n,) in an LLVM variant."""
-    wo = np.atleast_2d(wo)
-    wi = np.broadcast_to(wi, wo.shape)
-    si = interaction(wi, wavelengths, len(wo))
-    value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, mi.Vector3f(*wo.T.astype(np.float32)))
-    dr.eval(value, pdf)
-    return np.array(value).reshape(-1, len(wo)).T, np.array(pdf)
+    value, pdf = evaluate_pdf(bsdf, wi, np.atleast_2d(wo), wavelengths)
+    return value, pdf[:, 0]
 
 
 def k_g(wi, wo):
@@ -210,7 +199,7 @@ def test_samples_follow_their_density_and_carry_the_albedo(llvm, theta):
     rng = np.random.default_rng(4)
     si = interaction(np.broadcast_to(wi, (count, 3)), count=count)
     bs, weight = bsdf.sample(
-        mi.BSDFContext(), si, mi.Float(rng.random(count)), mi.Point2f(rng.random(count), rng.random(count))
+        mi.BSDFContext(), si, floats(rng.random(count)), mi.Point2f(*map(floats, rng.random((2, count))))
     )
     dr.eval(bs, weight)
     again = np.array(bsdf.pdf(mi.BSDFContext(), si, bs.wo))

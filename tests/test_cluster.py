@@ -82,7 +82,9 @@ def test_a_cluster_gives_the_bits_of_one_machine(scene, threads_of_this_process,
 
     with pytest.raises(Interrupted):
         render("scene.xml", spp=9, checkpoint="c", tracer=trace_on(threads_of_this_process), progress=ctrl_c)
-    resumed = render("scene.xml", spp=9, checkpoint="c")
+    # A worker may be at a pass that nobody waits for; Dr.Jit cannot trace two at once in one process.
+    with cluster.one_pass:
+        resumed = render("scene.xml", spp=9, checkpoint="c")
     np.testing.assert_array_equal(resumed.radiance, here.radiance)
 
 

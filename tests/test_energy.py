@@ -9,10 +9,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from bsdf_support import array, direction, use
+from bsdf_support import array, direction, floats, interaction, use, vectors
 from bsdf_support import plugin as conserving_plugin
 
 import mitsuba_diffraction as md
+from mitsuba_diffraction.bsdf import probe
 from mitsuba_diffraction.spectrum.albedo import SLACK, GatheredSpectrum
 from mitsuba_diffraction.spectrum.energy_table import EnergyTable, directions_at
 from mitsuba_diffraction.spectrum.furnace import ALLOWED, Furnace, random_places
@@ -59,11 +60,7 @@ def random_directions(rng, count):
 
 def evaluate(bsdf, wi, wo, wavelengths):
     """f cos θ_o, (n,); directions (n, 3) or (3,), wavelengths (nm) (n,) or a number."""
-    count = len(wo)
-    si = dr.zeros(mi.SurfaceInteraction3f, count)
-    si.wi = mi.Vector3f(*np.broadcast_to(wi, wo.shape).T.astype(np.float32))
-    si.wavelengths = type(si.wavelengths)(mi.Float(np.broadcast_to(wavelengths, count).astype(np.float32)))
-    return array(bsdf.eval(mi.BSDFContext(), si, mi.Vector3f(*wo.T.astype(np.float32))))[0]
+    return probe.evaluate(bsdf, wi, wo, np.broadcast_to(wavelengths, len(wo))[:, None])[:, 0]
 
 
 def near_orders(of, wi, wavelength, half=10, spacing=0.32, turn=0.0):
@@ -148,10 +145,8 @@ def test_no_albedo_above_one_by_samples(name, shadowing):
     for theta in (0, 20, 40, 60, 75, 85, 89):
         phi = rng.uniform(0, 2 * np.pi)
         wi = np.array([np.sin(np.deg2rad(theta)) * x for x in (np.cos(phi), np.sin(phi))] + [np.cos(np.deg2rad(theta))])
-        si = dr.zeros(mi.SurfaceInteraction3f, count)
-        si.wi = mi.Vector3f(*map(float, wi))
-        si.wavelengths = type(si.wavelengths)(380, 480, 580, 780)
-        numbers = mi.Float(rng.random(count)), mi.Point2f(rng.random(count), rng.random(count))
+        si = interaction(wi, (380, 480, 580, 780), count)
+        numbers = floats(rng.random(count)), mi.Point2f(*map(floats, rng.random((2, count))))
         weight = array(bsdf.sample(mi.BSDFContext(), si, *numbers)[1])
         noise = weight.std(1) / np.sqrt(count)
         assert (weight.mean(1) <= 1 + excess + 4 * noise).all(), (theta, np.rad2deg(phi), weight.mean(1))
@@ -214,8 +209,8 @@ def test_untouched_where_neither_direction_reflects_too_much(name):
 def energies(bsdf, omega, wavelength):
     """e of the table, (n,)."""
     energy = bsdf.energy
-    place = energy.place(mi.Vector3f(*omega.T.astype(np.float32)))
-    return np.array(energy.bound(place, energy.per_frequency / mi.Float(np.full(len(omega), wavelength * 1e-3))))
+    place = energy.place(vectors(omega))
+    return np.array(energy.bound(place, energy.per_frequency / floats(wavelength * 1e-3)))
 
 
 def test_flat_surface_is_left_alone_away_from_the_horizon():
@@ -290,7 +285,7 @@ def test_table_follows_height_scale_and_carries_its_derivative():
     parameters["height_scale"] = scale
     parameters.update()
     energy = bsdf.energy
-    place = energy.place(mi.Vector3f(*omega.T.astype(np.float32)))
+    place = energy.place(vectors(omega))
     e = energy.bound(place, energy.per_frequency / mi.Float(np.full(300, 0.5)))
     dr.forward(scale)
     slope = np.array(dr.grad(e))

@@ -4,7 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from bsdf_support import array, direction, grating, hemisphere, interaction, towards, uniform, vectors
+from bsdf_support import array, direction, floats, grating, hemisphere, interaction, towards, uniform, vectors
 
 from mitsuba_diffraction.bsdf import energy, shared
 
@@ -42,11 +42,11 @@ class Total:
         self.parameters[self.key] = value
         self.parameters.update()
         f = self.bsdf.eval(mi.BSDFContext(), self.si, vectors(self.wo))
-        return dr.sum(f[1] * mi.Float(self.weights.astype(np.float32)))
+        return dr.sum(f[1] * floats(self.weights))
 
     def number(self, value):
         """In float64, for differences."""
-        self.parameters[self.key] = value
+        self.parameters[self.key] = floats(value) if np.isscalar(value) else value
         self.parameters.update()
         f = self.bsdf.eval(mi.BSDFContext(), self.si, vectors(self.wo))
         return array(f, np.float64)[1] @ self.weights
@@ -124,7 +124,7 @@ def test_derivative_by_height_includes_the_energy_factor(at):
         total.parameters.update()
         total.bsdf.energy.change *= change_of_table
         f = total.bsdf.eval(mi.BSDFContext(), total.si, vectors(total.wo))[1]
-        dr.backward(dr.sum(f * mi.Float(total.weights.astype(np.float32))))
+        dr.backward(dr.sum(f * floats(total.weights)))
         return dr.grad(x)[0]
 
     # The derivatives of S and of E may cancel to a hundredth and less; float32 keeps 1e-4 of each.
@@ -208,7 +208,7 @@ def test_weights_of_samples_carry_the_derivative_of_the_value(key, at):
         return np.array(dr.grad(value), np.float64)
 
     ctx = mi.BSDFContext()
-    numbers = mi.Float(u[0]), mi.Point2f(u[1], u[2])
+    numbers = floats(u[0]), mi.Point2f(*map(floats, u[1:]))
     parameters[key] = mi.Float(at)
     parameters.update()
     bs, _ = bsdf.sample(ctx, si, *numbers)

@@ -4,7 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from bsdf_support import array, use
+from bsdf_support import array, use, vectors
 
 import mitsuba_diffraction as md
 
@@ -32,11 +32,11 @@ def directions(count=200):
 def matrices(bsdf, wi, wo, mode=None):
     """(4, 4, wavelengths, n)"""
     si = dr.zeros(mi.SurfaceInteraction3f, wi.shape[1])
-    si.wi = mi.Vector3f(wi.astype(np.float32))
+    si.wi = vectors(wi.T)
     si.wavelengths = type(si.wavelengths)(*WAVELENGTHS)
     si.sh_frame = mi.Frame3f(mi.Normal3f(0, 0, 1))
     ctx = mi.BSDFContext(mode or mi.TransportMode.Radiance)
-    return array(bsdf.eval(ctx, si, mi.Vector3f(wo.astype(np.float32))), np.float64)
+    return array(bsdf.eval(ctx, si, vectors(wo.T)), np.float64)
 
 
 @pytest.mark.few(1)

@@ -3,7 +3,7 @@
 import mitsuba as mi
 import numpy as np
 import pytest
-from bsdf_support import random_directions, use
+from bsdf_support import floats, random_directions, use, vectors
 
 from mitsuba_diffraction.bsdf import probe
 from mitsuba_diffraction.bsdf.geometry import Geometry
@@ -21,11 +21,11 @@ def test_values_are_those_of_single_calls(variant):
     value, pdf = probe.evaluate_pdf(bsdf, wi, DIRECTIONS, WAVELENGTHS)
     assert (value.shape, pdf.shape) == ((5, 6), (5, 2))
     si = mi.SurfaceInteraction3f()
-    si.wi, si.sh_frame = mi.Vector3f(wi.tolist()), mi.Frame3f(mi.Normal3f(0, 0, 1))
+    si.wi, si.sh_frame = vectors(wi), mi.Frame3f(mi.Normal3f(0, 0, 1))
     for row, density, wo in zip(value, pdf, DIRECTIONS, strict=True):
         for found, nanometres in zip(row, WAVELENGTHS, strict=True):
-            si.wavelengths = mi.UnpolarizedSpectrum(float(nanometres))
-            one, its_pdf = bsdf.eval_pdf(mi.BSDFContext(), si, mi.Vector3f(wo.tolist()))
+            si.wavelengths = mi.UnpolarizedSpectrum(floats(nanometres))
+            one, its_pdf = bsdf.eval_pdf(mi.BSDFContext(), si, vectors(wo))
             assert found == pytest.approx(np.array(mi.unpolarized_spectrum(one)).ravel()[0], rel=1e-5)
             np.testing.assert_allclose(density, np.array(its_pdf).item(), rtol=1e-5)
     assert np.ptp(value) > 0.1 * value.max()

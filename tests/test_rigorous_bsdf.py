@@ -7,7 +7,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from bsdf_support import check_chi_square, direction, evaluate, interaction, random_directions, use
+from bsdf_support import check_chi_square, direction, evaluate, interaction, random_directions, use, vectors
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction.bsdf import probe
@@ -219,10 +219,6 @@ def test_a_rigorous_recipe_keeps_its_tolerance(name):
 # ---------------------------------------------------------------- polarised light
 
 
-def vector(v):
-    return mi.Vector3f(*map(float, v))
-
-
 def entries(matrix):
     """Of the first wavelength, (4, 4)."""
     dr.eval(matrix)  # in one kernel
@@ -231,7 +227,7 @@ def entries(matrix):
 
 def mueller_of(bsdf, source, exit_, wavelength):
     """The Mueller matrix, (4, 4), for light from `source` to `exit_`, in nm."""
-    return entries(bsdf.eval(mi.BSDFContext(), interaction(exit_, (wavelength,) * 4, 1), vector(source)))
+    return entries(bsdf.eval(mi.BSDFContext(), interaction(exit_, (wavelength,) * 4, 1), vectors(source)))
 
 
 def between_stokes_axes(matrix, source, exit_):
@@ -239,8 +235,8 @@ def between_stokes_axes(matrix, source, exit_):
     full = mi.Spectrum(0.0)
     for i, j in np.ndindex(4, 4):
         full[i, j] = mi.UnpolarizedSpectrum(float(matrix[i, j]))
-    axes = [vector(np.cross([0, 0, 1], k) / np.linalg.norm(k[:2])) for k in (-source, exit_)]
-    came, leaves = vector(-source), vector(exit_)
+    axes = [vectors(np.cross([0, 0, 1], k) / np.linalg.norm(k[:2])) for k in (-source, exit_)]
+    came, leaves = vectors(-source), vectors(exit_)
     return entries(
         mi.mueller.rotate_mueller_basis(
             full, came, axes[0], mi.mueller.stokes_basis(came), leaves, axes[1], mi.mueller.stokes_basis(leaves)

@@ -6,7 +6,20 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from bsdf_support import WAVELENGTHS, albedo, array, check_chi_square, direction, draw, hemisphere, plugin, use
+from bsdf_support import (
+    WAVELENGTHS,
+    albedo,
+    array,
+    check_chi_square,
+    direction,
+    draw,
+    floats,
+    hemisphere,
+    interaction,
+    plugin,
+    use,
+    vectors,
+)
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction.bsdf.cell_sampler import CellSampler
@@ -47,22 +60,19 @@ def blurred(name):
     return md.precompute(SMALL[name](), coherence_length=6.0 if name in RECIPE_COHERENCE else 3.0)
 
 
-def interaction(wi, wavelengths, count):
-    si = dr.zeros(mi.SurfaceInteraction3f, count)
-    si.wi = mi.Vector3f(*(dr.full(mi.Float, x, count) for x in wi))
-    si.wavelengths = type(si.wavelengths)(*(dr.full(mi.Float, float(x), count) for x in wavelengths))
-    return si
-
-
 def numbers(count, seed=0):
     return np.random.default_rng(seed).random((3, count), dtype=np.float32)
 
 
+def points(u):
+    """(3, count) as `sample` takes them."""
+    first, *second = map(floats, u)
+    return first, mi.Point2f(*second)
+
+
 def sampled(bsdf, wi, wavelengths, count, seed=0):
     """The sample of Mitsuba, and its weights (4, count) in float64."""
-    u = numbers(count, seed)
-    si = interaction(wi, wavelengths, count)
-    bs, weight = bsdf.sample(mi.BSDFContext(), si, mi.Float(u[0]), mi.Point2f(mi.Float(u[1]), mi.Float(u[2])))
+    bs, weight = bsdf.sample(mi.BSDFContext(), interaction(wi, wavelengths, count), *points(numbers(count, seed)))
     dr.eval(bs, weight)
     return bs, np.array(weight, np.float64)
 
@@ -116,8 +126,7 @@ def test_density_integrates_to_the_share_of_samples_above_the_horizon(llvm, name
     bsdf, wi, count = plugin(blurred(name), conserve_energy=False), direction(70, 40), 1 << 19
     bs, _ = sampled(bsdf, wi, WAVELENGTHS, count)
     above = np.array(bs.pdf) > 0
-    u = numbers(count, seed=1)
-    wo = mi.warp.square_to_uniform_hemisphere(mi.Point2f(mi.Float(u[0]), mi.Float(u[1])))
+    wo = mi.warp.square_to_uniform_hemisphere(points(numbers(count, seed=1))[1])
     pdf = 2 * np.pi * np.array(bsdf.pdf(mi.BSDFContext(), interaction(wi, WAVELENGTHS, count), wo), np.float64)
     error = np.hypot(pdf.std(), above.std()) / np.sqrt(count)
     assert abs(pdf.mean() - above.mean()) < 4 * error
@@ -135,7 +144,7 @@ def test_mean_weight_is_the_albedo(llvm, name, theta):
     z = np.sqrt(np.maximum(1 - x**2 - y**2, 0))
     inside = z > 0
     x, y, z = x[inside], y[inside], z[inside]
-    wo = mi.Vector3f(*(mi.Float(axis.astype(np.float32)) for axis in (x, y, z)))
+    wo = vectors(np.stack([x, y, z], axis=-1))
     value = array(bsdf.eval(mi.BSDFContext(), interaction(wi, WAVELENGTHS, len(x)), wo), np.float64)
     albedo = (value / z).sum(axis=1) * (2 / 2048) ** 2
     error = weight.std(axis=1) / np.sqrt(count)
@@ -156,7 +165,7 @@ def test_wavelengths_that_are_not_covered_take_no_part_in_the_sampling(llvm, lon
     # The density is that of the samples.
     wo, area = hemisphere()
     si = interaction(wi, wavelengths, len(wo))
-    pdf = np.array(bsdf.pdf(mi.BSDFContext(), si, mi.Vector3f(*wo.T.astype(np.float32))), np.float64)
+    pdf = np.array(bsdf.pdf(mi.BSDFContext(), si, vectors(wo)), np.float64)
     drawn = (np.array(bs.pdf) > 0).mean()
     assert abs((pdf / wo[:, 2]).sum() * area - drawn) < 5e-3
 
@@ -241,9 +250,8 @@ def test_cells_are_drawn_with_their_density_and_few_that_do_not_propagate(llvm, 
     spectrum, count, wavelength = blurred(name), 1 << 20, 0.5
     sampler = CellSampler(spectrum)
     s = direction(theta, phi)
-    incidence = Incidence.of(mi.Vector3f(s.tolist()), mi.Float(1 / wavelength), mi.Float(1.0), None)
-    u = numbers(count)
-    q = sampler.sample(incidence, mi.Float(u[0]), mi.Point2f(mi.Float(u[1]), mi.Float(u[2])), True)
+    incidence = Incidence.of(vectors(s), floats(1 / wavelength), mi.Float(1.0), None)
+    q = sampler.sample(incidence, *points(numbers(count)), True)
     dr.eval(q)
     q = [np.array(x) for x in q]
     spacing = [float(np.array(x).item()) for x in (sampler.spacing_x, sampler.spacing_y)]
@@ -251,7 +259,7 @@ def test_cells_are_drawn_with_their_density_and_few_that_do_not_propagate(llvm, 
     # The density at the middles of all cells; those outside of the region are told by no q that propagates.
     middles = [np.arange(-m, m + 1) * d for m, d in zip((sampler.largest_x, sampler.largest_y), spacing, strict=True)]
     x, y = (axis.ravel() for axis in np.meshgrid(*middles))
-    density = np.array(sampler.density(mi.Float(x), mi.Float(y), incidence, mi.Bool(True)), np.float64)
+    density = np.array(sampler.density(floats(x), floats(y), incidence, mi.Bool(True)), np.float64)
     corners = [
         np.hypot(wavelength * (x + a * spacing[0]) + s[0], wavelength * (y + b * spacing[1]) + s[1])
         for a in (-0.5, 0, 0.5)
@@ -279,9 +287,8 @@ def test_cells_are_drawn_with_their_density_and_few_that_do_not_propagate(llvm, 
 def test_orders_are_drawn_with_their_shares_and_only_those_that_propagate(llvm, name, theta, phi):
     spectrum, count = md.precompute(SMALL[name]()), 1 << 20
     sampler = OrderSampler(spectrum)
-    incidence = Incidence.of(mi.Vector3f(direction(theta, phi).tolist()), mi.Float(1 / 0.5), mi.Float(1.0), None)
-    u = numbers(count)
-    row, column, _ = sampler.sample(incidence, mi.Float(u[0]), mi.Point2f(mi.Float(u[1]), mi.Float(u[2])), True)
+    incidence = Incidence.of(vectors(direction(theta, phi)), floats(1 / 0.5), mi.Float(1.0), None)
+    row, column, _ = sampler.sample(incidence, *points(numbers(count)), True)
     dr.eval(row, column)
     rows, columns = spectrum.grid.shape
     order = dr.arange(mi.UInt32, rows * columns)
@@ -314,7 +321,7 @@ def test_many_orders_are_drawn_without_a_rectangle(llvm):
     spectrum = md.precompute(md.gratings.xenopeltis(16.0))
     sampler = OrderSampler(spectrum)
     assert not sampler.restricted
-    incidence = Incidence.of(mi.Vector3f(0.6, 0.0, 0.8), mi.Float(2.0), mi.Float(1.0), None)
+    incidence = Incidence.of(vectors((0.6, 0.0, 0.8)), floats(2.0), mi.Float(1.0), None)
     weights = sampler.weights(incidence, mi.Bool(True))
     order = dr.arange(mi.UInt32, spectrum.grid.shape[0] * spectrum.grid.shape[1])
     np.testing.assert_allclose(dr.sum(sampler.share(order, weights, mi.Bool(True))), 1, rtol=1e-4)
@@ -340,14 +347,8 @@ def test_other_variants_draw_the_same(variant, name):
     bsdf, u = plugin(blurred(name), conserve_energy=False), numbers(count)
     # In a scalar variant one after the other.
     for part in [np.arange(count)] if dr.is_jit_v(mi.Float) else np.arange(count)[:, None]:
-        one = [x[part] if dr.is_jit_v(mi.Float) else float(x[part[0]]) for x in u]
-        if dr.is_jit_v(mi.Float):
-            si = interaction(wi, WAVELENGTHS, len(part))
-        else:
-            si = dr.zeros(mi.SurfaceInteraction3f)
-            si.wi = mi.Vector3f(*wi)
-            si.wavelengths = type(si.wavelengths)(*WAVELENGTHS)
-        bs, value = bsdf.sample(mi.BSDFContext(), si, mi.Float(one[0]), mi.Point2f(*one[1:]))
+        si = interaction(wi, WAVELENGTHS, len(part))
+        bs, value = bsdf.sample(mi.BSDFContext(), si, *points(u[:, part]))
         value = value[0, 0] if mi.is_polarized else value
         drawn = wanted_pdf[part] > 0
         np.testing.assert_allclose(np.array(bs.pdf).reshape(-1), wanted_pdf[part], rtol=5e-3)

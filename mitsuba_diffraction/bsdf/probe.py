@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import RequestError
+from .tables import aligned
 
 Array = NDArray[np.float64]
 
@@ -37,6 +38,19 @@ def towards(wi: Array, q: ArrayLike, wavelength: ArrayLike) -> Array:
 def vectors(omega: ArrayLike) -> mi.Vector3f:
     """(n, 3) or (3,) → Mitsuba's; n = 1 in scalar variants."""
     return _components(mi.Vector3f, omega)
+
+
+def floats(values: ArrayLike) -> mi.Float:
+    """(n,) or a number → Mitsuba's; n = 1 in scalar variants.
+
+    A copy that is neither a literal nor where NumPy happens to have it: the same kernel serves the next one.
+    """
+    values = np.atleast_1d(np.asarray(values, np.float32))
+    if not dr.is_jit_v(mi.Float):
+        return float(values[0])
+    result = mi.Float(aligned(values))
+    dr.make_opaque(result)
+    return result
 
 
 def array(value: object, dtype: type | None = None) -> NDArray:
@@ -152,7 +166,7 @@ def sample(
     """
     u = np.random.default_rng(seed).random((3, len(wi))).astype(np.float32)
     found, weight = bsdf.sample(
-        context or mi.BSDFContext(), interaction(wi, wavelengths, uv), mi.Float(u[0]), mi.Point2f(u[1:])
+        context or mi.BSDFContext(), interaction(wi, wavelengths, uv), floats(u[0]), mi.Point2f(*map(floats, u[1:]))
     )
     dr.eval(found, weight)  # in one kernel
     return array(found.wo, np.float64).T, _spectrum(weight, len(wi)), found
@@ -160,8 +174,7 @@ def sample(
 
 def _components(kind: type, values: ArrayLike) -> object:
     """An array of Mitsuba's from (n, k) or (k,)."""
-    values = np.atleast_2d(np.asarray(values, np.float32))
-    return kind(*(values.T if dr.is_jit_v(mi.Float) else map(float, values[0])))
+    return kind(*map(floats, np.atleast_2d(values).T))
 
 
 def _channels() -> int:

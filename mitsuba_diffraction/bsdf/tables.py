@@ -24,7 +24,7 @@ class FloatTable:
 
     def __init__(self, numbers: np.ndarray) -> None:
         """Takes an array of any shape."""
-        flat = _aligned(np.asarray(numbers, np.float32).ravel())
+        flat = aligned(np.asarray(numbers, np.float32).ravel())
         # Scalar variants have no gather.
         self.values = mi.Float(flat) if dr.is_jit_v(mi.Float) else flat
 
@@ -44,7 +44,7 @@ class PacketTable(FloatTable):
         """Takes the packets one after the other, of any shape; uint32 in fours stays so, all else becomes float32."""
         self.width = width
         if packets.dtype == np.uint32:
-            flat = _aligned(packets.ravel())
+            flat = aligned(packets.ravel())
             self.values = mi.UInt32(flat) if dr.is_jit_v(mi.Float) else flat
             self.packet = mi.Vector4u
         else:
@@ -68,7 +68,7 @@ class PacketTable(FloatTable):
         return super().__call__(self.width * index + place, active)
 
 
-def _aligned(values: np.ndarray) -> np.ndarray:
+def aligned(values: np.ndarray) -> np.ndarray:
     """Flat float32 or uint32 at an address that is a multiple of 64 bytes.
 
     Dr.Jit uses the memory of NumPy's arrays as it is, and reads a packet at once only where it is aligned so: else the
@@ -93,7 +93,7 @@ class HalfTable:
 
     def __init__(self, packets: np.ndarray) -> None:
         """Takes numbers of half precision in packets of four, in an array of any shape."""
-        self.words = mi.UInt32(_aligned(np.ascontiguousarray(packets, np.float16).view(np.uint32).ravel()))
+        self.words = mi.UInt32(aligned(np.ascontiguousarray(packets, np.float16).view(np.uint32).ravel()))
 
     def add(self, packet: mi.Vector4f, weight: mi.Float, index: mi.UInt32, active: mi.Bool) -> mi.Vector4f:
         """`packet` + `weight` times what is at `index`."""
@@ -117,7 +117,7 @@ class SharedExponentTable:
         """Takes m (..., 3) and e (...), the numbers being m 2^e."""
         m = mantissas.astype(np.int64) & 511
         words = (m[..., 0] << 23) | (m[..., 1] << 14) | (m[..., 2] << 5) | (exponents - LEAST_EXPONENT + 1)
-        self.words = mi.UInt32(_aligned(words.astype(np.uint32).ravel()))
+        self.words = mi.UInt32(aligned(words.astype(np.uint32).ravel()))
 
     def add(self, packet: mi.Vector3f, weight: mi.Float, index: mi.UInt32, active: mi.Bool) -> mi.Vector3f:
         """`packet` + `weight` times what is at `index`."""
