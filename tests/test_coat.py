@@ -89,7 +89,7 @@ def test_reciprocal(llvm, material):
 @pytest.mark.parametrize("turned", [0, 70])
 def test_the_front_face_reflects_as_fresnel_says_and_no_light_is_gained(llvm, theta, turned):
     wi = np.broadcast_to(direction(theta, turned), (100_000, 3))
-    bsdf = coated(coherence_length=65.0)
+    bsdf = coated()
     wo, weight, bs = probe.sample(bsdf, wi, [550] * 4)
     mirrored = np.array(mi.has_flag(bs.sampled_type, mi.BSDFFlags.DeltaReflection)) & (np.array(bs.pdf) > 0)
     np.testing.assert_allclose(wo[mirrored], np.broadcast_to(wi[0] * [-1, -1, 1], (mirrored.sum(), 3)), atol=1e-6)
@@ -143,7 +143,7 @@ def test_light_that_enters_along_s_passes_as_s():
     use("llvm_ad_spectral_polarized")
     wi = direction(56.0)
     wo = wi * [-1, 1, 1]
-    bsdf = coated(material="none", coherence_length=65.0)
+    bsdf = coated(material="none")
     si = interaction(wi)
     matrix = array(bsdf.eval(mi.BSDFContext(), si, vectors(wo)))[..., 0, 0]
     s, p = 1 - np.array(fresnel(wi[2], RELATIVE)).ravel()

@@ -20,7 +20,7 @@ SCENE = """<scene version="3.0.0"><integrator type="direct"/>
 <bsdf type="diffuse"><rgb name="reflectance" value="0.8, 0.3, 0.1"/></bsdf></shape>
 <shape type="sphere"><point name="center" x="0" y="0" z="1"/><bsdf type="diffraction_grating">
 <string name="profile" value="blazed"/><float name="period" value="2.5"/><float name="depth" value="0.25"/>
-<float name="coherence_length" value="6"/></bsdf></shape></scene>"""
+<float name="coherence_length" value="5"/><integer name="samples" value="64"/></bsdf></shape></scene>"""
 
 
 @pytest.mark.slow

@@ -17,8 +17,8 @@ SKY = {"type": "constant", "radiance": uniform(0.05)}
 
 
 def blaze(coherence_length=1.5, **parameters):
-    """A grating, by default with lobes so wide that `path` converges as well."""
-    return grating("blazed", coherence_length, **parameters)
+    """A grating, by default with lobes so wide that `path` converges as well; without E, for speed."""
+    return grating("blazed", coherence_length, conserve_energy=False, **parameters)
 
 
 def at(*place):
