@@ -46,8 +46,11 @@ SLACK = 5e-4
 CONICAL_SHAPE = (1, 193, 193)
 GENERAL_SHAPE = (33, 17, 33)
 CONICAL_WAVELENGTHS = 2  # how many of the λ that share one ν = c/λ a node is computed for
-ROUNDS = 12  # how often the table is lowered, at most
-DEEP, PAIRS = 30, 1.5e7  # the largest κ times the height range in radians; pairs (place, cell of q)
+ROUNDS = 6  # how often the table is lowered, at most
+DEEP, PAIRS = 30, 7.5e6  # the largest κ times the height range in radians; pairs (place, cell of q)
+# From one round to the next, so that the places of few rounds cover a cell evenly (Roberts 2018: powers of the root of
+# x⁴ = x + 1).
+STRIDE = np.array([0.8191725, 0.6710436, 0.5497005], np.float32)
 MUCH = 0.05  # from which the cells about are looked at again
 LIKELY = 0.8  # the albedo at neighbouring nodes from which a cell is looked at
 
@@ -302,7 +305,7 @@ def energy_table(spectrum: GatheredSpectrum, shadowing: str = "v_cavity", height
     largest = np.max([a for a, _ in at_nodes], axis=0).reshape(shape)
 
     # The same places for every height scale, so that their tables can be subtracted.
-    rng = np.random.default_rng(0)
+    start = np.random.default_rng(0).random((*cells, 3), np.float32)
     # a has peaks between nodes, where an order emerges; of few orders of a deep surface even between nodes where it is
     # small. Places in all those cells, as many as are cheap.
     likely = (ndimage.maximum_filter(largest, 3) > LIKELY)[tuple(slice(n) for n in cells)]
@@ -311,7 +314,7 @@ def energy_table(spectrum: GatheredSpectrum, shadowing: str = "v_cavity", height
     doubtful = np.ones_like(likely) if deep and likely.size <= most else likely
     thorough = int(min(most / max(doubtful.sum(), 1), ROUNDS))
     for index in range(ROUNDS):
-        inside, first = rng.random((*cells, 3), np.float32)[doubtful], np.argwhere(doubtful)
+        inside, first = ((start + index * STRIDE) % 1)[doubtful], np.argwhere(doubtful)
         drop = np.zeros(shape, np.float32)
         drop[tuple(first.T)] = np.maximum(between(values, first + inside) - bound(first + inside)[1], 0)
         # A node is a corner of the cells before and after it.
