@@ -359,6 +359,7 @@ def test_a_mistake_is_one_line_and_exit_code_2(command, llvm, folder, arguments,
     assert names() == before
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError("disk full")])
 def test_all_files_or_none(command, monkeypatch, llvm, folder, error):
     write(Path("scene.xml"))
