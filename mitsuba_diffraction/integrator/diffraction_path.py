@@ -13,7 +13,7 @@ from .light_paths import LightPaths
 
 PARAMETERS = (
     Parameter("max_depth", "integer", "as in `path`: 2 is direct light, 3 a rainbow on a wall; −1 is no limit", "−1"),
-    Parameter("rr_depth", "integer", "as in `path`: from here on, Russian roulette", "5"),
+    Parameter("rr_depth", "integer", "as in `path`: depth at which Russian roulette begins", "5"),
 )
 
 MANUAL = f"""A path tracer that also finds the light that gratings throw onto other surfaces.

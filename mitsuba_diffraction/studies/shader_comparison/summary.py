@@ -94,7 +94,8 @@ def notes(comparison: Comparison) -> list[str]:
     if comparison.left_out is not None:
         lines.append(
             "limit: corrected, the shader converges to this model in the same light; its 3 × 3 texels leave out at "
-            f"most {100 * comparison.left_out:.2g} % of a line, the less the more the coherence length exceeds the tile"
+            f"most {100 * comparison.left_out:.2g} % of a line, and less the longer "
+            "the coherence length is relative to the tile"
         )
     if (shares := comparison.shares) is not None:
         lines.append(
