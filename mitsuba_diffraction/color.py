@@ -30,9 +30,9 @@ def _xyz_matrix(wavelengths: tuple[float, ...]) -> NDArray[np.float64]:
     centres = np.asarray(wavelengths)
     steps = np.diff(centres)
     if centres.size < 2 or steps[0] < 1 or np.ptp(steps) > 1e-3 * steps[0]:
+        ends = f" from {centres[0]:g} to {centres[-1]:g} nm" if centres.size else ""
         raise RequestError(
-            f"wavelengths: got {centres.size} from {centres[0]:g} to {centres[-1]:g} nm, "
-            "wanted two or more, ascending in equal steps of at least 1 nm"
+            f"wavelengths: got {centres.size}{ends}, wanted two or more, ascending in equal steps of at least 1 nm"
         )
     step = float(np.mean(steps))
     cmfs = colour.MSDS_CMFS[_OBSERVER]
@@ -123,7 +123,7 @@ def into_gamut(rgb: NDArray[np.floating]) -> NDArray[np.float64]:
 
     c' = Y + t (c − Y), with the largest t ≤ 1 for which min(c') ≥ 0. Luminance is preserved, and so is the dominant
     wavelength. Clamping each channel at zero would instead brighten spectral colours, above all cyan and violet. The
-    result is black where the luminance is not positive or a value is NaN.
+    result is black where the luminance is not positive or a value is not finite.
 
     Args:
         rgb: (..., 3), linear sRGB.
@@ -133,7 +133,8 @@ def into_gamut(rgb: NDArray[np.floating]) -> NDArray[np.float64]:
     """
     import colour
 
-    rgb = np.nan_to_num(np.asarray(rgb, dtype=np.float64), nan=0.0, posinf=0.0, neginf=0.0)
+    rgb = np.asarray(rgb, dtype=np.float64)
+    rgb = np.where(np.isfinite(rgb).all(axis=-1, keepdims=True), rgb, 0.0)
     luminance = rgb @ colour.RGB_COLOURSPACES["sRGB"].matrix_RGB_to_XYZ[1]
     luminance = np.maximum(luminance, 0.0)[..., None]
     lowest = np.minimum(rgb.min(axis=-1, keepdims=True), 0.0)

@@ -12,6 +12,6 @@ class Bug(Exception):
 
 
 def is_bug(kind: type[BaseException]) -> bool:
-    """Whether such an exception tells neither a wrong request nor work that failed through no fault of the code."""
+    """Whether an exception of this class is a mistake of the code: neither a wrong request nor a failure around it."""
     foreseen = RequestError, RuntimeError, OSError, MemoryError, ImportError
     return not issubclass(kind, foreseen) or issubclass(kind, NotImplementedError | RecursionError)

@@ -17,7 +17,7 @@ from .coherence import SUN_COHERENCE_LENGTH, lobe_width
 from .errors import RequestError
 from .finite_tiles import tile_factor
 from .surface.heightfield import HeightField
-from .welch import WindowAxis, carried_coherence_length, window_axes
+from .welch import UNIFORM, WindowAxis, carried_coherence_length, window_axes
 
 EXTENTS = ("tile", "sample")
 _FAR = 9.0  # standard deviations; e^{−9²/2} is under 3e-18
@@ -166,8 +166,7 @@ def _sample_spectrum(
     """Welch's estimate of S for q (M, 2) and κ (M,): (M,) µm²."""
     carried = carried_coherence_length(height_field, coherence_length)
     windows = window_axes(height_field, carried)
-    uniform = WindowAxis(np.ones(1), np.zeros(1, np.int64))
-    result = _periodograms(height_field, q, kappa, tuple(w or uniform for w in windows))
+    result = _periodograms(height_field, q, kappa, tuple(w or UNIFORM for w in windows))
     for axis in (0, 1):
         if windows[axis] is None:
             result *= _gaussian(q[:, axis], lobe_width(carried))

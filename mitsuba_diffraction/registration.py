@@ -39,22 +39,33 @@ def _on_variant_change(old: str | None, new: str | None) -> None:
 
 
 class _MitsubaFinder(importlib.abc.MetaPathFinder):
-    """Selects LLVM before Dr.Jit is imported and registers the plugins after Mitsuba has been imported."""
+    """Selects LLVM before Dr.Jit is imported and registers the plugins after Mitsuba has been imported.
+
+    It stays until then: `importlib.util.find_spec` asks without importing.
+    """
+
+    _asking = False
 
     def find_spec(self, name: str, path: Sequence[str] | None, target: ModuleType | None = None) -> ModuleSpec | None:
         if name in ("drjit", "mitsuba") and "drjit" not in sys.modules:
             from . import llvm
 
             llvm.choose()
-        if name != "mitsuba":
+        if name != "mitsuba" or self._asking:
             return None
-        sys.meta_path.remove(self)
-        if (spec := importlib.util.find_spec(name)) is None or spec.loader is None:
+        self._asking = True
+        try:
+            spec = importlib.util.find_spec(name)
+        finally:
+            self._asking = False
+        if spec is None or spec.loader is None:
             return None
         execute = spec.loader.exec_module
 
         def execute_and_register(module: ModuleType) -> None:
             execute(module)
+            if self in sys.meta_path:
+                sys.meta_path.remove(self)
             _watch(sys.modules["mitsuba"])
 
         spec.loader.exec_module = execute_and_register

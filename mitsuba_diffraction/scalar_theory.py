@@ -101,9 +101,8 @@ def scalar_orders(
 ) -> Orders:
     """R K G E η_m(κ_m), the efficiencies of the BSDF in float64 in the limit of narrow lobes.
 
-    Integrating the BRDF R K G S(q; κ)/λ² E
-    (`bsdf/`) times cos θ_o over the lobe of an order, with du dv = λ² dq, gives these factors at the direction of the
-    order.
+    Integrating the BRDF R K G S(q; κ)/λ² E (`bsdf/`) times cos θ_o over the lobe of an order, with du dv = λ² dq, gives
+    these factors at the direction of the order.
 
     Args:
         powers: of the profile.

@@ -38,6 +38,10 @@ class WindowAxis:
     starts: NDArray[np.int64] = field(repr=False)
 
 
+UNIFORM = WindowAxis(np.ones(1), np.zeros(1, np.int64))
+"""The window along an axis of one pixel."""
+
+
 def carried_coherence_length(height_field: HeightField, asked: float) -> float:
     """The coherence length in µm that a scan supports: `asked`, but at most half of its shorter side.
 

@@ -91,7 +91,7 @@ def small_passes(llvm, monkeypatch):
 
     def take(side):
         monkeypatch.setattr(passes, "SAMPLES_PER_PASS", side**2)
-        monkeypatch.setattr(passes, "LEAST_SAMPLES_PER_PIXEL", 1)
+        monkeypatch.setattr(passes, "SAMPLES_PER_PIXEL_OF_LARGE_PICTURES", 1)
 
     return take
 

@@ -11,6 +11,7 @@ from mitsuba_diffraction.geometry import k_g
 from mitsuba_diffraction.scalar_theory import fresnel
 
 INDEX = 1.55
+GRATING = {"type": "diffraction_grating", "coherence_length": 3.0}
 AIR = 1.000277
 RELATIVE = INDEX / AIR
 
@@ -134,6 +135,23 @@ def test_scalar_and_polarised_variants_agree():
     np.testing.assert_allclose(found[1], found[0], rtol=1e-3)
     # Off the normal s and p pass the front face unequally: a little more or less passes twice.
     np.testing.assert_allclose(found[2], found[0], rtol=1e-2)
+
+
+def test_a_scalar_variant_divides_by_no_zero():
+    """From behind, along the horizon, and where drawn directions are evanescent even inside."""
+    use("scalar_spectral")
+    thin = {"profile": "crossed", "period": 2.0, "depth": 0.3, "material": "none", "coat_ior": 1.05}
+    thin |= {"coat_absorption": 0.1, "coat_thickness": 1.0}
+    rng = np.random.default_rng(0)
+    for bsdf, wi in (
+        (coated(), (0.95, 0, -0.3)),
+        (coated(), (1.0, 0, 0)),
+        (mi.load_dict(GRATING | thin), (0.6, 0, 0.8)),
+    ):
+        si = interaction(np.array(wi) / np.linalg.norm(wi))
+        for first, *second in rng.random((100, 3)).tolist():
+            bs, weight = bsdf.sample(mi.BSDFContext(), si, first, mi.Point2f(*second))
+            assert np.isfinite([bs.pdf, *np.ravel(weight)]).all()
 
 
 def test_light_that_enters_along_s_passes_as_s():

@@ -54,7 +54,7 @@ def test_pictures_are_converted_pixel_by_pixel():
     np.testing.assert_allclose(rgb[2, 1], spectrum_to_linear_sRGB(spectra[2, 1], GRID))
 
 
-@pytest.mark.parametrize("grid", [[500.0], [500.0, 510.0, 530.0], [510.0, 500.0], [500.0, 500.5]])
+@pytest.mark.parametrize("grid", [[], [500.0], [500.0, 510.0, 530.0], [510.0, 500.0], [500.0, 500.5]])
 def test_other_grids_are_refused(grid):
     with pytest.raises(ValueError, match="equal steps"):
         spectrum_to_XYZ(np.ones(len(grid)), grid)
@@ -77,9 +77,7 @@ def test_into_gamut_keeps_luminance_and_what_is_inside():
 
 @pytest.mark.parametrize("bad", [(np.nan, 1, 1), (-1, -2, -3), (0, 0, 0), (np.inf, -np.inf, 0)])
 def test_into_gamut_shows_what_is_no_color_as_black(bad):
-    assert np.isfinite(into_gamut(np.array([bad]))).all()
-    if bad[0] < 1:
-        assert (into_gamut(np.array([bad])) == 0).all()
+    assert (into_gamut(np.array([bad])) == 0).all()
 
 
 def test_roll_off():

@@ -72,15 +72,21 @@ print(*({{"mitsuba", "drjit"}} & set(sys.modules)))
     assert (tmp_path / "s.png").is_file()
 
 
-@pytest.mark.few(1)
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     "lines",
     [
         ("import mitsuba_diffraction", "import mitsuba", "mitsuba.set_variant('scalar_spectral')"),
         ("import mitsuba", "import mitsuba_diffraction", "mitsuba.set_variant('scalar_spectral')"),
         ("import mitsuba", "mitsuba.set_variant('scalar_spectral')", "import mitsuba_diffraction"),
+        (
+            "import importlib.util, mitsuba_diffraction",
+            "importlib.util.find_spec('mitsuba')",
+            "import mitsuba",
+            "mitsuba.set_variant('scalar_spectral')",
+        ),
     ],
-    ids=["first", "between", "last"],
+    ids=["first", "between", "last", "after it was looked for"],
 )
 def test_plugins_are_registered_whenever_the_package_is_imported(lines):
     grating = "{'type': 'diffraction_grating', 'profile': 'blazed', 'period': 2.5, 'depth': 0.05, 'tolerance': 0.05}"

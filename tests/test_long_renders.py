@@ -32,7 +32,7 @@ SCENE = f"""<scene version="3.0.0"><default name="red" value="0.5"/><integrator 
 <bsdf type="diffuse"><rgb name="reflectance" value="$red, 0.2, 0.1"/></bsdf></shape></scene>"""
 # The command with passes of one sample per pixel, so that a small picture has many.
 SMALL_PASSES = f"""import mitsuba_diffraction.cli, mitsuba_diffraction.render.passes as passes
-passes.SAMPLES_PER_PASS, passes.LEAST_SAMPLES_PER_PIXEL = {SIZE**2}, 1
+passes.SAMPLES_PER_PASS, passes.SAMPLES_PER_PIXEL_OF_LARGE_PICTURES = {SIZE**2}, 1
 mitsuba_diffraction.cli.main()"""
 
 

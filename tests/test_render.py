@@ -152,7 +152,7 @@ def test_kernels_do_not_depend_on_where_numpy_puts_a_table(llvm, offset):
 
 def test_uneven_passes(llvm, tmp_path, monkeypatch):
     monkeypatch.setattr(passes, "SAMPLES_PER_PASS", 1)  # a large picture, so to say
-    monkeypatch.setattr(passes, "LEAST_SAMPLES_PER_PIXEL", 4)
+    monkeypatch.setattr(passes, "SAMPLES_PER_PIXEL_OF_LARGE_PICTURES", 4)
     calls = []
     path = write_scene(tmp_path, CONSTANT)
     image = render(path, spp=11, progress=lambda done, total, error: calls.append(done))

@@ -97,6 +97,24 @@ def test_an_interrupted_build_goes_on(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_a_checkpoint_is_no_reason_to_fail(tmp_path):
+    """In a folder that cannot be written to, and where a checkpoint is damaged."""
+    small = gratings.sinusoidal(0.15, 0.03, samples=32)
+    wanted = build_spectrum(small, **REQUEST, checkpoints=tmp_path / "good").values
+    (tmp_path / "file").write_text("")
+    np.testing.assert_array_equal(build_spectrum(small, **REQUEST, checkpoints=tmp_path / "file" / "x").values, wanted)
+
+    def leave(done, total):
+        if done == 3:
+            raise InterruptedError
+
+    with pytest.raises(InterruptedError):
+        build_spectrum(small, **REQUEST, progress=leave, checkpoints=tmp_path)
+    (checkpoint,) = tmp_path.glob("rigorous-*.npz")
+    checkpoint.write_bytes(checkpoint.read_bytes()[:100])
+    np.testing.assert_array_equal(build_spectrum(small, **REQUEST, checkpoints=tmp_path).values, wanted)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -106,6 +124,8 @@ def test_an_interrupted_build_goes_on(tmp_path):
         ({"theory": "exact"}, "theory: got 'exact'"),
         ({"theory": "scalar"}, "wanted none of them"),
         ({"height_field": gratings.crossed(2.0, 0.2, samples=8)}, "rows that differ"),
+        ({"height_field": [SURFACE, SURFACE]}, "patches: got 2 with theory 'rigorous', wanted one"),
+        ({"largest_height_range": 0.04}, r"heights: got a range of 0\.049\d* µm, wanted at most 0\.04"),
     ],
 )
 def test_what_is_out_of_range_is_refused(change, message):

@@ -22,6 +22,7 @@ from bsdf_support import (
 )
 
 import mitsuba_diffraction as md
+from mitsuba_diffraction.bsdf import probe
 from mitsuba_diffraction.bsdf.cell_sampler import CellSampler
 from mitsuba_diffraction.bsdf.incidence import Incidence
 from mitsuba_diffraction.bsdf.order_sampler import OrderSampler
@@ -169,6 +170,21 @@ def test_wavelengths_that_are_not_covered_take_no_part_in_the_sampling(llvm, lon
     pdf = np.array(bsdf.pdf(mi.BSDFContext(), si, vectors(wo)), np.float64)
     drawn = (np.array(bs.pdf) > 0).mean()
     assert abs((pdf / wo[:, 2]).sum() * area - drawn) < 5e-3
+
+
+def test_a_spectrum_need_not_begin_at_the_shortest_wavelength(llvm):
+    # Regression: height_scale = 1 was refused.
+    spectrum = md.precompute(md.gratings.sinusoidal(2.5, 0.25), wavelengths=(400.0, 700.0), coherence_length=3.0)
+    bsdf, whole = (
+        plugin(s, conserve_energy=False)
+        for s in (spectrum, md.precompute(md.gratings.sinusoidal(2.5, 0.25), coherence_length=3.0))
+    )
+    wi, wo = direction(20, 40), direction([10, 25, 60], 220)
+    found, wanted = (probe.evaluate(b, wi, wo, [380.0, 401.0, 550.0, 699.0]) for b in (bsdf, whole))
+    assert (found[:, 0] == 0).all()
+    np.testing.assert_allclose(found[:, 1:], wanted[:, 1:], rtol=0.02, atol=1e-3 * wanted.max())
+    with pytest.raises(RuntimeError, match=r"height_scale: got 1\.1, wanted 0 to 1"):
+        plugin(spectrum, height_scale=1.1)
 
 
 @pytest.mark.slow

@@ -3,7 +3,10 @@
 import dataclasses
 import functools
 import json
+import os
 import resource
+import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import OpenEXR
@@ -342,6 +345,16 @@ def test_a_file_cut_short_is_refused_without_noise(saved, capfd):
         refusal(saved[1], change=f"only {len(content[:left])} of {len(content)} bytes were left")
     # The message is all that a person sees: the library's own lines would stand above it.
     assert capfd.readouterr() == ("", "")
+
+
+def test_files_are_read_on_several_threads(saved, capfd):
+    # Regression: two at a time left the streams of the process redirected for good.
+    streams = sys.stdout, sys.stderr
+    with ThreadPoolExecutor(4) as threads:
+        list(threads.map(lambda _: GratingSpectrum.load(saved[1]), range(40)))
+    assert (sys.stdout, sys.stderr) == streams
+    os.write(2, b"told")
+    assert capfd.readouterr() == ("", "told")
 
 
 def test_any_bit_that_flips_is_refused(saved):

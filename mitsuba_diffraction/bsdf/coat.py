@@ -82,7 +82,7 @@ class Coat:
 
     def absorption(self, cos_inside: mi.Float) -> mi.Float:
         """e^{−σd/cos θ'}."""
-        return dr.exp(-self.depth / cos_inside) if self.absorbs else mi.Float(1.0)
+        return dr.exp(-self.depth / dr.maximum(cos_inside, 1e-7)) if self.absorbs else mi.Float(1.0)
 
     def transmittance(self, cos: mi.Float, cos_inside: mi.Float) -> mi.Float:
         """T."""

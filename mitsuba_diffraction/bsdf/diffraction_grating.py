@@ -91,8 +91,8 @@ Under a coat (`coat.py`) all this holds inside of it, where wavelengths are shor
 face of the coat is a mirror. A saved spectrum must cover the shorter wavelengths; one built from a recipe or a profile
 does.
 
-In polarised variants light is split into s and p as by a plane across the half vector, by rigorous theory as Maxwell's
-equations have it; a perfect mirror and Schlick's formula leave it unpolarised.
+In polarised variants scalar theory reflects s and p light as a plane perpendicular to the half vector does; rigorous
+theory uses the Mueller matrices of the orders. A perfect mirror and Schlick's formula depolarise.
 """
 
 
@@ -158,10 +158,12 @@ def define() -> type:
                     f"{self.spectrum.wavelengths[0]:g} nm; inside the coat they are shorter: build it from "
                     f"{shortest:.4g} nm"
                 )
+            # At wavelengths that the spectrum does not cover the grating is black, and κ is less at the others.
+            largest = max(largest, 1.0)
             scale = np.max(self.height_scale)
             if not 0 <= scale <= largest * (1 + 1e-6):
                 raise RequestError(
-                    f"height_scale: got {scale}, wanted 0 to {largest:.4g}: the spectrum was built for "
+                    f"height_scale: got {scale:.6g}, wanted 0 to {largest:.4g}: the spectrum was built for "
                     f"wavelengths from {self.spectrum.wavelengths[0]:g} nm; for larger heights build it from "
                     f"{shortest:.4g} nm divided by the scale"
                 )
@@ -263,7 +265,7 @@ def define() -> type:
                 value *= geometry.factor(self.shadowing == "v_cavity")
             if self.coat is not None:
                 # The solid angle inside the coat is smaller: cos θ'_o dω'_o = cos θ_o dω_o/n².
-                value *= outside / geometry.cos_o
+                value *= outside / dr.maximum(geometry.cos_o, 1e-7)
             return value, density
 
         def _mueller(
@@ -408,7 +410,9 @@ def define() -> type:
             front_share = self._front_share(ctx, si, lobes, active)
             of_front = active & (sample1 < front_share)
             if grating or below is not None:
-                rest = dr.minimum((sample1 - front_share) / (1 - front_share), BELOW_ONE)
+                # From behind and along the horizon the front reflects all; Python's numbers cannot be divided by zero.
+                below_front = dr.select(front_share < 1, 1 - front_share, 1)
+                rest = dr.minimum((sample1 - front_share) / below_front, BELOW_ONE)
                 bs, result = self._sample_below(
                     ctx, si, lobes, 1 - front_share, rest, sample2, active & (sample1 >= front_share)
                 )
@@ -422,11 +426,11 @@ def define() -> type:
                 bs.pdf = dr.select(of_front, front_share, bs.pdf)
                 bs.sampled_type = dr.select(of_front, mi.UInt32(+mi.BSDFFlags.DeltaReflection), bs.sampled_type)
                 bs.sampled_component = dr.select(of_front, self.front, bs.sampled_component)
-                mirrored = self._front(si, ctx, active) / dr.select(of_front, front_share, 1)
+                mirrored = self._front(si, ctx) / dr.select(of_front, front_share, 1)
                 result = dr.select(of_front, mirrored, result)
             return bs, result
 
-        def _front(self, si: mi.SurfaceInteraction3f, ctx: mi.BSDFContext, active: mi.Bool) -> mi.Spectrum:
+        def _front(self, si: mi.SurfaceInteraction3f, ctx: mi.BSDFContext) -> mi.Spectrum:
             """F of the coat's front face."""
             value = mi.UnpolarizedSpectrum(self.coat.reflectance(mi.Frame3f.cos_theta(si.wi)))
             if not mi.is_polarized:

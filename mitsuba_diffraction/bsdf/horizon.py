@@ -50,7 +50,7 @@ class HorizonBins:
         largest = self._first + (self._last - self._first) * np.arange(1, FREQUENCIES + 1)[:, None] / FREQUENCIES
         largest, low, high = (np.asarray(x, np.float32) for x in (largest, low, high))
         result = np.empty((FREQUENCIES, COSINES, AZIMUTHS, len(low), 2))
-        # Of a border told by points, each disc is to hold those of its neighbours' halves.
+        # The border is represented by points: each disc is enlarged to cover those up to half a step away.
         square = (1 + _STEP / 2 + _BEYOND) ** 2
         for cosine, azimuth in np.ndindex(COSINES, AZIMUTHS):
             s_x, s_y = (s[:, None, None].astype(np.float32) for s in _border(cosine, azimuth))

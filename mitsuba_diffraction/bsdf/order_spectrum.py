@@ -162,7 +162,7 @@ class _Axis:
         self.steps = [opaque(np.exp(-0.5 * (k / (size * sigma)) ** 2)) for k in range(1, 0 if self.all else self.count)]
 
     def first(self, q: mi.Float) -> mi.Int32:
-        """The first of the `count` orders that hold at q (cycles/µm)."""
+        """The first of the `count` orders that contribute at q (cycles/µm)."""
         return mi.Int32(-self.largest) if self.all else mi.Int32(dr.ceil(q * self.size - 0.5 * self.count))
 
     def holds(self, m: mi.Int32, q: mi.Float) -> mi.Bool:

@@ -57,7 +57,7 @@ def through_layer(
 
 
 def unpolarised(value: mi.UnpolarizedSpectrum) -> Split:
-    """A grating that leaves light unpolarised."""
+    """A grating that depolarises light."""
     return lambda *_: mi.depolarizer(value)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..errors import RequestError
 from ..wavelengths import VISIBLE
-from .coat import Coat
+from .coat import Coat, absolute_index
 
 MODELS = ("exact", "schlick")
 
@@ -62,14 +62,7 @@ class Dielectric:
     transparent = True
 
     def __init__(self, int_ior: float | str, ext_ior: float | str, model: str) -> None:
-        for name, index in (("int_ior", int_ior), ("ext_ior", ext_ior)):
-            if isinstance(index, int | float) and not 0 < index < np.inf:
-                raise RequestError(
-                    f"{name}: got {index}, wanted a positive index of refraction, or a name such as 'bk7'"
-                )
-        # Mitsuba's own plugin knows the presets' names.
-        interface = mi.load_dict({"type": "dielectric", "int_ior": int_ior, "ext_ior": ext_ior})
-        self.eta = mi.Float(mi.traverse(interface)["eta"])
+        self.eta = mi.Float(absolute_index("int_ior", int_ior) / absolute_index("ext_ior", ext_ior))
         self.model = model
         self.update()
 
@@ -94,7 +87,7 @@ class Dielectric:
 
 
 class Conductor:
-    """A metal of complex index η − ik, by the names of Mitsuba's `conductor`; under a coat, relative to its index."""
+    """A metal of complex index η + ik, by the names of Mitsuba's `conductor`; under a coat, relative to its index."""
 
     transparent = False
 

@@ -10,7 +10,6 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..rigorous.axes import Axes
 from ..rigorous.mueller import MIRRORED
 from ..rigorous.spectrum import RigorousSpectrum
 from .incidence import Incidence
@@ -89,13 +88,16 @@ class RigorousOrders:
             power, density = read(wi, wo)
         return power, density
 
-    def _read(self, frequency: mi.Float, near: mi.Bool, wi: mi.Vector3f, wo: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
-        """As `evaluate`, where `near`; else zero."""
-        q_x, q_y = -(wi.x + wo.x) * frequency, -(wi.y + wo.y) * frequency
+    def _coordinates(self, wi: mi.Vector3f, wo: mi.Vector3f, frequency: mi.Float) -> tuple[mi.Float, ...]:
+        """q_x, q_y in cycles/µm, and k_y, c, g and the third coordinate of `Axes`."""
         nu = self.period * frequency
         k_y, c = 0.5 * nu * (wo.y - wi.y), 0.5 * nu * (wo.x - wi.x)
         g = dr.sqrt(dr.maximum(dr.square(nu) - dr.square(k_y), 0))
-        z = self._z(g, frequency)
+        return -(wi.x + wo.x) * frequency, -(wi.y + wo.y) * frequency, k_y, c, g, self._z(g, frequency)
+
+    def _read(self, frequency: mi.Float, near: mi.Bool, wi: mi.Vector3f, wo: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
+        """As `evaluate`, where `near`; else zero."""
+        q_x, q_y, _, c, g, z = self._coordinates(wi, wo, frequency)
         cell = self._cell(Incidence.of(wi, frequency, mi.Float(1)))
         first = self._first(q_x)
         power, density = mi.Float(0.0), mi.Float(0.0)
@@ -119,12 +121,8 @@ class RigorousOrders:
             frequency: 1/λ in cycles/µm.
             active: mask.
         """
-        q_x, q_y = -(source.x + exit_.x) * frequency, -(source.y + exit_.y) * frequency
-        first = mi.Int32(dr.ceil((q_x - self.half_width) * self.period))
-        nu = self.period * frequency
-        k_y, c = 0.5 * nu * (exit_.y - source.y), 0.5 * nu * (exit_.x - source.x)
-        g = dr.sqrt(dr.maximum(dr.square(nu) - dr.square(k_y), 0))
-        z = self._z(g, frequency)
+        q_x, q_y, k_y, c, g, z = self._coordinates(source, exit_, frequency)
+        first = self._first(q_x)
         rows = [mi.Vector4f(0.0) for _ in range(4)]
         for step in range(self.count):
             m = first + step
@@ -247,16 +245,6 @@ def _split(x: mi.Float, count: mi.UInt32) -> tuple[mi.UInt32, mi.Float]:
     return low, x - mi.Float(low)
 
 
-def _squares(spectrum: RigorousSpectrum, m: int) -> NDArray[np.float32]:
-    """η_m at the nodes, (K, P, R)."""
-    side, start = spectrum.axes.side(m), spectrum.axes.offset(m)
-    return spectrum.values[:, start : start + side**2].reshape(-1, side, side)
-
-
-def _orders(axes: Axes) -> range:
-    return range(-axes.largest, axes.largest + 1)
-
-
 def _packets(spectrum: RigorousSpectrum) -> NDArray[np.uint32]:
     """η_m at the eight nodes about each cell, in steps of 1/65535: (nodes, K − 1, 4).
 
@@ -265,8 +253,8 @@ def _packets(spectrum: RigorousSpectrum) -> NDArray[np.uint32]:
     may dip below zero, or exceed one, by its error.
     """
     packets = np.empty((spectrum.axes.nodes, spectrum.axes.planes - 1, 4), np.uint32)
-    for m in _orders(spectrum.axes):
-        square = np.moveaxis(_squares(spectrum, m), 0, -1)
+    for m in spectrum.axes.orders:
+        square = np.moveaxis(spectrum.axes.square(spectrum.values, m), 0, -1)
         side, start = square.shape[0], spectrum.axes.offset(m)
         steps = np.rint(np.clip(square, 0, 1).astype(np.float64) * STEPS).astype(np.uint32)
         words = np.pad(steps[..., :-1] | steps[..., 1:] << 16, [(0, 1), (0, 1), (0, 0)], mode="edge")
@@ -288,9 +276,9 @@ def _shares(spectrum: RigorousSpectrum, cells: int) -> NDArray[np.float64]:
     ends = ends // cells + np.sin(np.pi / 2 * (ends % cells) / cells) ** 2
     beyond = int((ends > -margin).sum())
     shares = np.zeros((planes, whole, whole, 2 * axes.largest + 1))
-    for column, m in enumerate(_orders(axes)):
+    for column, m in enumerate(axes.orders):
         units = axes.units(m) * cells
-        average = _averaged(_averaged(_averaged(_squares(spectrum, m), 0, planes), 1, units), 2, units)
+        average = _averaged(_averaged(_averaged(axes.square(spectrum.values, m), 0, planes), 1, units), 2, units)
         padded = np.pad(average, [(0, 0), (beyond, 0), (beyond, 0)], mode="edge")
         padded[:, :beyond] *= 0.5
         padded[:, :, :beyond] *= 0.5

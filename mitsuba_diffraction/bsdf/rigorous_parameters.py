@@ -1,4 +1,4 @@
-"""What a scene may say of a grating whose efficiencies are rigorous: its material, and what only scalar theory has."""
+"""The parameters of a scene that apply to rigorous efficiencies, and those that only scalar theory has."""
 
 from __future__ import annotations
 

@@ -72,12 +72,13 @@ def surface_from(props: mi.Properties, coat: Coat | None) -> tuple[Spectrum, Rec
 
 def warn_of_range(recipe: Recipe) -> None:
     """Mitsuba's log says once for each surface if scalar theory is not to be trusted there."""
-    told = json.dumps(dict(recipe.surface), sort_keys=True, default=str)
+    told = json.dumps([str(recipe.folder), dict(recipe.surface)], sort_keys=True, default=str)
     if told in _told:
         return
     _told.add(told)
-    if beyond := range_warning(recipe.height_field()):
-        mi.Log(mi.LogLevel.Warn, f"diffraction_grating, {recipe.height_field().source}: {beyond}")
+    surface = recipe.height_field()
+    if beyond := range_warning(surface):
+        mi.Log(mi.LogLevel.Warn, f"diffraction_grating, {surface.source}: {beyond}")
 
 
 def _inside(coat: Coat | None, recipe: Recipe) -> Recipe:

@@ -27,10 +27,11 @@ from .film import pass_seed, samples_drawn, trace_pass
 from .scene import channel_wavelengths, load_spectral_scene, scene_digest
 from .spectral_image import SpectralImage
 
-# Two million samples take some seconds on two cores, which keeps progress and interrupts responsive. Large pictures
-# take at least eight samples per pixel, as adding a pass to the sum takes one core as long as a third of a sample.
+# Two million samples take some seconds on two cores, which keeps progress and interrupts responsive. Passes
+# of large pictures take up to eight samples per pixel, as adding a pass to the sum takes one core as long as a third of
+# a sample.
 SAMPLES_PER_PASS = 2**21
-LEAST_SAMPLES_PER_PIXEL = 8
+SAMPLES_PER_PIXEL_OF_LARGE_PICTURES = 8
 # The stopping criterion estimates the noise from four passes on, and needs at least sixteen in all.
 _PASSES_TO_JUDGE = 4
 _LEAST_PASSES_TO_CONVERGE = 16
@@ -215,7 +216,7 @@ def split(scene: mi.Scene, spp: int, least: int = 1) -> tuple[int, ...]:
     Determined by the request alone, so that an interruption does not change the passes.
     """
     pixels = math.prod(scene.sensors()[0].film().crop_size())
-    passes = -(-spp * pixels // max(SAMPLES_PER_PASS, LEAST_SAMPLES_PER_PIXEL * pixels))
+    passes = -(-spp * pixels // max(SAMPLES_PER_PASS, SAMPLES_PER_PIXEL_OF_LARGE_PICTURES * pixels))
     if passes > _MOST_PASSES:
         raise RequestError(f"spp: got {spp}, wanted at most {_MOST_PASSES * spp // passes:.2g} for so large a picture")
     passes = min(max(passes, least), spp)

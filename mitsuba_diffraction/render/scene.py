@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from ..errors import Bug, RequestError, is_bug
 from ..recipe import Recipe
+from ..variants import is_spectral
 from ..wavelengths import VISIBLE
 
 # The spacing of the channels, nm.
@@ -82,7 +83,7 @@ def load_spectral_scene(
             scene is wrong.
     """
     variant = mi.variant()
-    if variant is None or "spectral" not in variant:
+    if variant is None or not is_spectral(variant):
         raise RequestError(f"variant: got {variant!r}, wanted a spectral one, such as 'llvm_ad_spectral'")
     for name, size in (("width", width), ("height", height)):
         if size is not None and size < 1:
@@ -150,7 +151,7 @@ def scene_digest(path: str | os.PathLike[str], parameters: Mapping[str, str] | N
                 named = Path(str(mi.file_resolver().resolve(value))) if name == "filename" else None
                 if named is None or not named.is_file():
                     content.update(f"{name}={_in_full(value)}\n".encode())
-                elif named.suffix == ".toml":
+                elif named.suffix.lower() == ".toml":
                     content.update(Recipe.load(named).digest().encode())
                 else:
                     with open(named, "rb") as stream:

@@ -1,4 +1,4 @@
-"""Gratings as Maxwell's equations have them: rigorous efficiencies of surfaces of one row."""
+"""Rigorous efficiencies of one-dimensional gratings, by Maxwell's equations."""
 
 from .efficiencies import Efficiencies, efficiencies
 from .materials import refractive_index

@@ -67,6 +67,11 @@ class Axes:
         """M, the largest order that any pair of directions reaches."""
         return int(np.ceil(self.reach)) - 1
 
+    @property
+    def orders(self) -> range:
+        """−M … M."""
+        return range(-self.largest, self.largest + 1)
+
     def units(self, m: int) -> int:
         """How many units P and R of order m cover."""
         return int(np.ceil(self.reach - abs(m)))
@@ -78,6 +83,11 @@ class Axes:
     def offset(self, m: int) -> int:
         """Where the nodes of order m start in a plane: [P, R] of order −M first."""
         return sum(self.side(k) ** 2 for k in range(-self.largest, m))
+
+    def square(self, values: NDArray[np.float32], m: int) -> NDArray[np.float32]:
+        """Of `values` (K, nodes), those of order m: (K, P, R)."""
+        side, start = self.side(m), self.offset(m)
+        return values[:, start : start + side**2].reshape(-1, side, side)
 
     @property
     def nodes(self) -> int:

@@ -7,7 +7,9 @@ import os
 import warnings
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +18,7 @@ from ..coherence import SUN_COHERENCE_LENGTH, lobe_width
 from ..errors import RequestError
 from ..files import whole_file
 from ..surface.heightfield import HeightField
+from ..wavelengths import VISIBLE
 from .axes import LARGEST_PERIOD, STORED, Axes
 from .blas import one_thread
 from .coordinate_transformation import Grating, light_from, scatter
@@ -53,7 +56,7 @@ def build_spectrum(
     ext_ior: float = 1.0,
     polarised: bool = False,
     coherence_length: float = SUN_COHERENCE_LENGTH,
-    wavelengths: tuple[float, float] = (360.0, 830.0),
+    wavelengths: tuple[float, float] = VISIBLE,
     tolerance: float = 1e-2,
     progress: Progress | None = None,
     checkpoints: Path | None = None,
@@ -77,7 +80,8 @@ def build_spectrum(
         ValueError: if an argument is out of range, or the period is above ten of the shortest wavelength.
 
     Warns:
-        UserWarning: if the finest table errs by more than `tolerance`; its `error` says by how much.
+        UserWarning: if the finest table errs by more than `tolerance`, or its Mueller matrices by more than three times
+            that; `error` and `polarisation_error` say by how much.
     """
     if not 1e-4 <= tolerance < 1:
         raise RequestError(f"tolerance: got {tolerance!r}, wanted a share of the reflected light from 1e-4 to 1")
@@ -104,27 +108,30 @@ def build_spectrum(
         for solved in _SOLVED:
             axes = Axes(surface.period, surface.wavelengths, STORED * solved, PLANES)
             table = _Table(surface, axes, solved, polarised)
-            values, mueller = table.values(progress or (lambda done, total: None), checkpoints)
+            values, matrices = table.values(progress or (lambda done, total: None), checkpoints)
             spectrum = RigorousSpectrum(
                 axes=axes,
                 values=values,
                 material=material or "",
                 int_ior=complex(int_ior or 0),
                 ext_ior=float(ext_ior),
-                mueller=mueller,
+                mueller=matrices,
                 coherence_length=float(coherence_length),
                 tolerance=float(tolerance),
                 harmonics=surface.harmonics,
                 source=height_field.source,
                 source_digest=height_field.digest,
-                **_errors(axes, values, mueller, checks),
+                **_errors(axes, values, matrices, checks),
             )
             # NaN: there are no matrices.
             if spectrum.error <= tolerance and not spectrum.polarisation_error > MATRICES * tolerance:
                 return spectrum
+    got, wanted = f"{spectrum.error:.2g}", f"{tolerance:.2g}"
+    if polarised:
+        got += f" and {spectrum.polarisation_error:.2g} of the Mueller matrices"
+        wanted += f" and {MATRICES * tolerance:.2g}"
     warnings.warn(
-        f"rigorous table: got a mean error of {spectrum.error:.2g} with {_SOLVED[-1]} steps to a unit, wanted at most "
-        f"{tolerance:.2g}",
+        f"rigorous table: got a mean error of {got} with {_SOLVED[-1]} steps to a unit, wanted at most {wanted}",
         stacklevel=2,
     )
     return spectrum
@@ -285,7 +292,7 @@ class _Table:
         axes, steps, largest, entries = self.axes, self.steps, self.axes.largest, self.entries
         matrices = np.zeros((axes.planes, axes.nodes, entries, entries), np.float32)
         signs = np.outer(REVERSED, REVERSED)[:entries, :entries]
-        for m in range(-largest, largest + 1):
+        for m in axes.orders:
             side, solved = axes.side(m), self.lattice.side(m)
             found = np.full((solved, solved, axes.planes, entries, entries), np.nan)
             for row, of_row in rows.items():
@@ -345,9 +352,9 @@ class _Checkpoint:
         self._unwritten = 0
         if self.path and self.path.is_file():
             try:
-                with np.load(self.path) as file:
+                with open(self.path, "rb") as stream, np.load(stream) as file:
                     self.done = {int(row): file[row] for row in file.files}
-            except (OSError, ValueError, EOFError, KeyError):
+            except (OSError, ValueError, EOFError, KeyError, BadZipFile):
                 self.path.unlink(missing_ok=True)
 
     def add(self, row: int, values: NDArray[np.float32]) -> None:
@@ -357,12 +364,15 @@ class _Checkpoint:
             self.write()
 
     def write(self) -> None:
-        if self.path:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            with whole_file(self.path) as temporary, open(temporary, "wb") as file:
-                np.savez(file, **{str(row): values for row, values in self.done.items()})
+        # A checkpoint only saves time: a folder that cannot be written to is no reason to stop.
+        with suppress(OSError):
+            if self.path:
+                self.path.parent.mkdir(parents=True, exist_ok=True)
+                with whole_file(self.path) as temporary, open(temporary, "wb") as file:
+                    np.savez(file, **{str(row): values for row, values in self.done.items()})
         self._unwritten = 0
 
     def remove(self) -> None:
-        if self.path:
-            self.path.unlink(missing_ok=True)
+        with suppress(OSError):
+            if self.path:
+                self.path.unlink(missing_ok=True)

@@ -1,6 +1,6 @@
 """The coordinate-transformation method (Chandezon et al. 1982), for steep and vertical facets too.
 
-The profile is a curve x(t), h(t); its period is the same in t as in x. Points are told by t and by the distance u from
+The profile is a curve x(t), h(t); its period is the same in t as in x. A point is given by t and by its distance u from
 the curve along one direction (sin ζ, cos ζ):
 
     x = x(t) + u sin ζ,    z = h(t) + u cos ζ.

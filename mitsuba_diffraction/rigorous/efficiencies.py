@@ -24,8 +24,8 @@ MOST_HARMONICS = 80
 class Efficiencies:
     """What a grating reflects of light from one direction.
 
-    The polarisation of a wave that travels along k̂ is told by ŝ = ẑ × k̂ / |ẑ × k̂| (ŷ along the normal) and p̂ = k̂ × ŝ;
-    k̂ = −ω_i of the incident light, and k̂ = ω_o of an order.
+    The polarisation of a wave that travels along k̂ is given in the basis ŝ = ẑ × k̂ / |ẑ × k̂| (ŷ along the
+    normal) and p̂ = k̂ × ŝ; k̂ = −ω_i of the incident light, and k̂ = ω_o of an order.
 
     Attributes:
         orders: m of the orders that propagate, ascending, (n,); q_x = m / period, ω_o,x = −λ m / period − ω_i,x.
@@ -79,8 +79,8 @@ def efficiencies(
         int_ior: index of refraction of a dielectric, or n + ik.
         material: or a conductor by Mitsuba's name, "Al".
         tolerance: harmonics are raised until the efficiencies change by less than this share of the reflected light (of
-            s and of p light), or their number reaches 80 and twice the orders; `Efficiencies.error` says what was
-            reached.
+            s and of p light), or their number reaches the larger of 80 and twice the largest order;
+            `Efficiencies.error` says what was reached.
         harmonics: N, to take this number as it is; at least the largest |m| that propagates.
 
     Raises:

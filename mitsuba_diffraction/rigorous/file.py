@@ -36,16 +36,15 @@ def save(spectrum: RigorousSpectrum, path: str | os.PathLike[str], recipe: str =
         OSError: if the file cannot be written.
     """
     axes = spectrum.axes
-    orders = range(-axes.largest, axes.largest + 1)
-    height, width = sum(axes.side(m) for m in orders), axes.side(0)
+    height, width = sum(axes.side(m) for m in axes.orders), axes.side(0)
     matrices = np.zeros((axes.planes, 0)) if spectrum.mueller is None else spectrum.mueller.reshape(axes.planes, -1)
     more = -(-matrices.shape[1] // width)
     sheet = np.zeros((axes.planes, height + more, width), np.float32)
     sheet[:, height:].reshape(axes.planes, -1)[:, : matrices.shape[1]] = matrices
     top = 0
-    for m in orders:
+    for m in axes.orders:
         side = axes.side(m)
-        sheet[:, top : top + side, :side] = _square(axes, spectrum.values, m)
+        sheet[:, top : top + side, :side] = axes.square(spectrum.values, m)
         top += side
     index = complex(spectrum.int_ior)
     header = {
@@ -72,7 +71,7 @@ def load(path: str | os.PathLike[str], construct: Callable[..., Spectrum], recip
         axes = Axes(float(period), wavelengths, header["steps"], header["planes"])
         sheet = np.stack([channels[_channel(k)].pixels for k in range(axes.planes)])
         squares, top = [], 0
-        for m in range(-axes.largest, axes.largest + 1):
+        for m in axes.orders:
             side = axes.side(m)
             squares.append(sheet[:, top : top + side, :side].reshape(axes.planes, side**2))
             top += side
@@ -93,11 +92,6 @@ def load(path: str | os.PathLike[str], construct: Callable[..., Spectrum], recip
         raise RequestError(f"{path}: a damaged spectrum, {error} is missing") from None
     except (TypeError, ValueError, IndexError) as error:
         raise RequestError(f"{path}: a damaged spectrum ({one_line(error)})") from None
-
-
-def _square(axes: Axes, values: np.ndarray, m: int) -> np.ndarray:
-    side, start = axes.side(m), axes.offset(m)
-    return values[:, start : start + side**2].reshape(-1, side, side)
 
 
 def _channel(plane: int) -> str:

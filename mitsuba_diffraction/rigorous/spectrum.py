@@ -148,9 +148,8 @@ class RigorousSpectrum:
         p, r = g + c - half, g - c - half
         there = (p > 0) & (r > 0) & (p + r + 2 * half <= axes.reach * (1 + 1e-9))
         p, r, order = (np.where(there, v, 0) for v in (p, r, m))
-        known = np.arange(-axes.largest, axes.largest + 1)
-        side = np.array([axes.side(k) for k in known])[order + axes.largest]
-        offset = np.array([axes.offset(k) for k in known])[order + axes.largest]
+        side = np.array([axes.side(k) for k in axes.orders])[order + axes.largest]
+        offset = np.array([axes.offset(k) for k in axes.orders])[order + axes.largest]
         first, last = axes.range(g)
         z = np.clip((wavelength - first) / np.maximum(last - first, 1e-9), 0, 1) * (axes.planes - 1)
         result = np.zeros((*m.shape, *table.shape[2:]))
@@ -173,7 +172,7 @@ class RigorousSpectrum:
         omega = np.asarray(direction, np.float64) / np.linalg.norm(direction)
         alpha, k_y = -omega[:2] * self.axes.period / wavelength
         g = np.sqrt((self.axes.period / wavelength) ** 2 - k_y**2)
-        m = np.arange(-self.axes.largest, self.axes.largest + 1)
+        m = np.array(self.axes.orders)
         m = m[np.abs(alpha - m) < g]
         return m, self.evaluate(m, alpha - m / 2, g, wavelength)
 

@@ -51,8 +51,8 @@ DEEP, PAIRS = 30, 7.5e6  # the largest κ times the height range in radians; pai
 # From one round to the next, so that the places of few rounds cover a cell evenly (Roberts 2018: powers of the root of
 # x⁴ = x + 1).
 STRIDE = np.array([0.8191725, 0.6710436, 0.5497005], np.float32)
-MUCH = 0.05  # from which the cells about are looked at again
-LIKELY = 0.8  # the albedo at neighbouring nodes from which a cell is looked at
+MUCH = 0.05  # a node lowered by more than this has the cells around it examined again
+LIKELY = 0.8  # a cell is examined if the albedo at a node nearby exceeds this
 
 # The gathered spectrum: lengths in cycles/µm.
 NARROW = 0.01  # λσ_q of lobes so narrow that ω_o,y = −ω_i,y holds

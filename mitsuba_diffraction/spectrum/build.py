@@ -115,7 +115,16 @@ def precompute(
     check_wavelengths(wavelengths)
     if theory not in THEORIES:
         raise RequestError(f"theory: got {theory!r}, wanted one of {', '.join(THEORIES)}")
+    if not largest_height_range > 0:
+        raise RequestError(f"largest_height_range: got {largest_height_range!r}, wanted a positive number of µm")
+    if height_range > largest_height_range:
+        raise RequestError(
+            f"heights: got a range of {height_range:.4g} µm, wanted at most {largest_height_range:g}: are "
+            "these nanometres? If the surface is so deep, raise largest_height_range"
+        )
     if theory == "rigorous":
+        if len(patches) > 1:
+            raise RequestError(f"patches: got {len(patches)} with theory 'rigorous', wanted one")
         if (extent, largest_angle, representation) != ("tile", 90.0, "auto"):
             raise RequestError(
                 f"theory: got rigorous with extent {extent!r}, largest_angle {largest_angle!r} and representation "
@@ -144,13 +153,6 @@ def precompute(
     lobe_width(coherence_length)
     if representation not in REPRESENTATIONS:
         raise RequestError(f"representation: got {representation!r}, wanted one of {', '.join(REPRESENTATIONS)}")
-    if not largest_height_range > 0:
-        raise RequestError(f"largest_height_range: got {largest_height_range!r}, wanted a positive number of µm")
-    if height_range > largest_height_range:
-        raise RequestError(
-            f"heights: got a range of {height_range:.4g} µm, wanted at most {largest_height_range:g}: are "
-            "these nanometres? If the surface is so deep, raise largest_height_range"
-        )
     shortest = wavelengths[0] * 1e-3
     largest_kappa = 4 * np.pi / shortest
     reach = 2 * np.sin(np.deg2rad(largest_angle)) / shortest

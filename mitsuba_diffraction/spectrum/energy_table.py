@@ -51,10 +51,10 @@ class EnergyTable:
         frequencies: (smallest, largest) ν in 1/µm.
         conical: ν = c/λ and N_y = 1; else ν = 1/λ.
         shadowing: "v_cavity" or "none".
-        excess: an upper confidence bound of 95 % of A − 1 at the places where it was found largest (`furnace.py`): 48
-            of 1024 random directions, to 89.9°, and wavelengths, or three times of 4096 of a deep surface, and of
-            places about the largest of these; none of them made or lowered the table. Half of those of a tile lie where
-            an order emerges. A is the albedo with E, the rounding of `packed` included.
+        excess: an upper 95 % confidence bound of A − 1, A being the albedo with E and with the rounding of `packed`
+            (`furnace.py`): of the largest of 48 places, found among 1024 random directions (to 89.9°) and wavelengths,
+            for deep surfaces in three sets of 4096, and by a search around the largest of them. None of these places
+            made or lowered the table. For a tile, half of them lie where an order emerges.
         loss: (mean, largest) 1 − e over those of them with a ≤ 1: light that is lost to the table's resolution.
     """
 

@@ -6,6 +6,7 @@ import contextlib
 import io
 import os
 import sys
+import threading
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -17,20 +18,24 @@ from ..errors import RequestError
 from ..files import UNSEALED, is_intact, seal, whole_file
 from ..outputs import made_for
 
+# Streams belong to the whole process, and Mitsuba loads plugins on several threads.
+_silencing = threading.Lock()
+
 
 @contextlib.contextmanager
 def silence() -> Iterator[None]:
     """Keep the library from giving its own account of a broken file, from Python and from C, before it raises."""
-    sys.stderr.flush()
-    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
-    try:
-        os.dup2(nowhere, 2)
-        with contextlib.redirect_stdout(io.StringIO()):
-            yield
-    finally:
-        os.dup2(kept, 2)
-        os.close(kept)
-        os.close(nowhere)
+    with _silencing:
+        sys.stderr.flush()
+        kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+        try:
+            os.dup2(nowhere, 2)
+            with contextlib.redirect_stdout(io.StringIO()):
+                yield
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+            os.close(nowhere)
 
 
 def doubles(*values: float) -> np.ndarray:

@@ -65,7 +65,7 @@ def save(spectrum: GratingSpectrum, path: str | os.PathLike[str], recipe: str = 
         # repr of a float is exact.
         header["modes"] = json.dumps(spectrum.table.series.modes.tolist())
     # Scenes seldom ask for another kind of shadowing: of the others, those that are there.
-    kinds = dict.fromkeys(["v_cavity", *spectrum.energy])
+    kinds = dict.fromkeys(["v_cavity", *spectrum.shadowings()])
     header["energy"] = json.dumps({kind: spectrum.energy_table(kind).as_plain() for kind in kinds})
     channels = _channels(spectrum.table)
     header["channelCount"] = len(channels)

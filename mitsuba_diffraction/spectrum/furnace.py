@@ -51,8 +51,8 @@ BOUNDED = ((48, 512), (48, 2048), (12, 8192))
 REPETITIONS = 4
 CONFIDENCE = 2.353 / REPETITIONS**0.5  # one-sided 95 %: Student's t with REPETITIONS − 1 degrees of freedom
 ALLOWED = 1e-3  # what an upper confidence bound of A may exceed one by
-LITTLE = 0.02  # the same, without more than the nodes about it being lowered anew
-MANY, MUCH = 12, 0.1  # places where A exceeds that, or what it exceeds one by, from which on the whole table is
+LITTLE = 0.02  # the excess of A above which the nodes around the cell are lowered, too
+MANY, MUCH = 12, 0.1  # with more such places, or a larger excess, the whole table is lowered
 WIDEST = 2  # cells about a place
 ROUNDS = 16
 PASSED_DEEP = 3  # sets of places one after the other that find nothing in a deep surface: one might by luck
@@ -200,7 +200,7 @@ class Furnace:
         rng: np.random.Generator,
         height_scale: float = 1.0,
     ) -> NDArray[np.float64]:
-        """As `albedo`, (3, n), but of A an upper confidence bound of 95 %, so close that it tells if A is allowed."""
+        """As `albedo`, (3, n), but of A an upper 95 % confidence bound, tight enough to decide whether A is allowed."""
         result, unsure = np.empty((3, len(directions))), np.arange(len(directions))
         for most, points in BOUNDED:
             if len(unsure) > most:
@@ -389,7 +389,7 @@ def _emerging(
 def conserving(spectrum: GratingSpectrum, table: EnergyTable, height_scale: float = 1.0) -> EnergyTable:
     """The table, lowered where the albedo exceeds one, with the excess and the loss that were measured.
 
-    Each set of places lowers the table, or tells the excess and the loss; the last ones lower nothing.
+    Each set of places lowers the table, or measures the excess and the loss; the last sets lower nothing.
 
     Args:
         spectrum: what the table was made for.

@@ -142,7 +142,7 @@ class GratingSpectrum:
 
     @property
     def neighbours(self) -> tuple[int, int]:
-        """How many nodes along x and y hold at one q, to the tolerance."""
+        """How many nodes along x and y contribute at one q, to the tolerance."""
         return tuple(lobe.count for lobe in self.lobes) if isinstance(self.grid, OrderGrid) else (3, 3)
 
     @property
@@ -206,6 +206,11 @@ class GratingSpectrum:
             if shadowing not in self._energy:
                 self._energy[shadowing] = conserving(self, energy_table(GatheredSpectrum.of(self), shadowing))
             return self._energy[shadowing]
+
+    def shadowings(self) -> list[str]:
+        """The kinds of shadowing for which there is an energy table already."""
+        with _computing:
+            return list(self._energy)
 
     @cached_property
     def _energy(self) -> dict[str, EnergyTable]:

@@ -21,7 +21,7 @@ class LobeAxis:
     """How the lobe of an order is truncated along one axis.
 
     Attributes:
-        count: how many orders hold at one q.
+        count: how many lobes overlap at one q.
         half_width: |q − m/T| up to which the order m holds, cycles/µm; infinite where all orders hold everywhere.
         inside: the share of the Gaussian within `half_width`, by which it is divided.
     """

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from ..coherence import lobe_width
 from ..surface.heightfield import HeightField
-from ..welch import WindowAxis, window_axes
+from ..welch import UNIFORM, WindowAxis, window_axes
 from .spline_grid import SplineGrid
 
 # Along an axis on which the surface is uniform the lobe is followed to this many σ_q.
@@ -70,8 +70,7 @@ class SamplePowers:
     def _autocorrelation(self, kappa: float) -> NDArray[np.complex128]:
         """ρ(τ) of the windowed phase, averaged over the places: (lags τ_y, lags τ_x ≥ 0); ρ(0) = 1."""
         (window_x, starts_x), (window_y, starts_y) = (
-            (np.ones(1), np.zeros(1, int)) if lags.axis is None else (lags.axis.window, lags.axis.starts)
-            for lags in self._lags
+            (axis.window, axis.starts) for axis in (lags.axis or UNIFORM for lags in self._lags)
         )
         wave = np.exp(1j * kappa * self._phase)
         shape = tuple(scipy.fft.next_fast_len(2 * len(w) - 1) for w in (window_y, window_x))

@@ -8,7 +8,7 @@ import scipy.ndimage
 from numpy.typing import NDArray
 
 from ..surface.heightfield import HeightField
-from ..welch import WindowAxis, window_axes
+from ..welch import UNIFORM, WindowAxis, window_axes
 
 # Correlation of a surface beyond the width of a window is seen between batches of segments, not between segments.
 _BATCHES = 4  # along each axis
@@ -38,8 +38,7 @@ def standard_error(height_field: HeightField, *, coherence_length: float, larges
         largest_kappa: κ up to which S is wanted, rad/µm.
         reach: largest |q_x| and |q_y| that light reaches, cycles/µm.
     """
-    uniform = WindowAxis(np.ones(1), np.zeros(1, np.int64))
-    axes = [axis or uniform for axis in window_axes(height_field, coherence_length)]
+    axes = [axis or UNIFORM for axis in window_axes(height_field, coherence_length)]
     correlation, within = 1.0, 1.0
     for axis in axes:
         rho, share = _correlation(axis), _batches(axis)
