@@ -48,7 +48,10 @@ def start(**options):
 
 @pytest.fixture
 def threads_of_this_process():
-    """A cluster of two workers that are threads of this process."""
+    """A cluster of two workers that are threads of this process: for what traces nothing.
+
+    While one thread traces, no other may let go of a scene: Dr.Jit calls every BSDF that there is in the process.
+    """
     with start(n_workers=2, processes=False, protocol="tcp") as local:
         yield local.scheduler_address
 
@@ -67,9 +70,9 @@ def with_light_from_gratings(scene):
 
 @pytest.mark.few(1)
 @pytest.mark.parametrize("scene", [SCENE, with_light_from_gratings(SCENE)], ids=["path", "diffraction_path"])
-def test_a_cluster_gives_the_bits_of_one_machine(scene, threads_of_this_process, command):
+def test_a_cluster_gives_the_bits_of_one_machine(scene, two_processes, command):
     Path("scene.xml").write_text(scene)
-    line = f"render scene.xml -o out.exr --spp 9 --variant llvm_ad_spectral --dask {threads_of_this_process}"
+    line = f"render scene.xml -o out.exr --spp 9 --variant llvm_ad_spectral --dask {two_processes.scheduler_address}"
     code, _, err = command(line)
     assert (code, err) == (0, "")
     here = render("scene.xml", spp=9)
@@ -81,10 +84,8 @@ def test_a_cluster_gives_the_bits_of_one_machine(scene, threads_of_this_process,
             signal.raise_signal(signal.SIGINT)
 
     with pytest.raises(Interrupted):
-        render("scene.xml", spp=9, checkpoint="c", tracer=trace_on(threads_of_this_process), progress=ctrl_c)
-    # A worker may be at a pass that nobody waits for; Dr.Jit cannot trace two at once in one process.
-    with cluster.one_pass:
-        resumed = render("scene.xml", spp=9, checkpoint="c")
+        render("scene.xml", spp=9, checkpoint="c", tracer=trace_on(two_processes.scheduler_address), progress=ctrl_c)
+    resumed = render("scene.xml", spp=9, checkpoint="c")
     np.testing.assert_array_equal(resumed.radiance, here.radiance)
 
 
