@@ -27,6 +27,7 @@ Array = NDArray[np.float64]
 INCIDENCES = (0.0, 30.0, 60.0)
 """Degrees, of the rows of predicted colours."""
 
+_CELLS = 181  # of the spectrum along an axis, at most
 _ANGLES = np.arange(-89.75, 89.8, 0.5)
 _HIGHEST_FREQUENCY = 5.0  # cycles/µm, about what visible light reaches
 _DECADES = 5
@@ -144,7 +145,9 @@ def _spectrum(axes: Axes, inspection: Inspection) -> None:
     limit = min(_HIGHEST_FREQUENCY, max(q_x.max(), q_y.max()))
     if inspection.periods:
         limit = min(limit, 4.5 / min(period.period for period in inspection.periods[:1]))
-    top = power[(np.abs(q_y) <= limit)][:, np.abs(q_x) <= limit].max()
+    near_x, near_y = np.abs(q_x) <= limit, np.abs(q_y) <= limit
+    q_x, q_y, power = _strongest(q_x[near_x], q_y[near_y], power[np.ix_(near_y, near_x)])
+    top = power.max()
     decibel = np.log10(np.maximum(power / top, 10.0**-_DECADES)) if top > 0 else np.full_like(power, -_DECADES)
     axes.pcolormesh(q_x, q_y, decibel, cmap="magma", vmin=-_DECADES, vmax=0, shading="nearest", rasterized=True)
     axes.set(xlim=(-limit, limit), ylim=(limit, -limit), aspect="equal", facecolor="black")
@@ -180,6 +183,16 @@ def _height_spectrum(field: HeightField, extent: str) -> tuple[Array, Array, Arr
     q_y, q_x = (np.fft.fftshift(np.fft.fftfreq(n, p)) for n, p in zip(level.shape, field.pixel_size[::-1], strict=True))
     keep_x, keep_y = np.abs(q_x) <= _HIGHEST_FREQUENCY * 1.01, np.abs(q_y) <= _HIGHEST_FREQUENCY * 1.01
     return q_x[keep_x], q_y[keep_y], power[np.ix_(keep_y, keep_x)]
+
+
+def _strongest(q_x: Array, q_y: Array, power: Array) -> tuple[Array, Array, Array]:
+    """The largest power of each cell of a coarser grid: a single spot would be smaller than a pixel of the picture."""
+    cells = []
+    for axis, q in enumerate((q_x, q_y)):
+        starts = np.unique(np.linspace(0, len(q), min(len(q), _CELLS), endpoint=False).astype(int))
+        cells.append(np.add.reduceat(q, starts) / np.diff([*starts, len(q)]))
+        power = np.maximum.reduceat(power, starts, axis=1 - axis)
+    return *cells, power
 
 
 def _facts(axes: Axes, inspection: Inspection) -> None:
