@@ -12,7 +12,6 @@ import tempfile
 from pathlib import Path
 
 import matplotlib.pyplot as plt
-import mitsuba as mi
 from PIL import Image
 
 from mitsuba_diffraction.files import whole_file
@@ -68,9 +67,11 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=160, help="pixels of a panel")
     parser.add_argument("--spp", type=int, default=96, help="samples per pixel")
     arguments = parser.parse_args()
+    import mitsuba as mi  # after the package, which chooses LLVM
+
     mi.set_variant(choose_variant(None))
     recipes = sorted(HERE.glob("*.toml"))
-    columns = 5
+    columns = 6
     rows = math.ceil(len(recipes) / columns)
     inch = arguments.size / 96
     figure, axes = plt.subplots(
