@@ -72,7 +72,9 @@ def surface_from(props: mi.Properties, coat: Coat | None) -> tuple[Spectrum, Rec
 
 def warn_of_range(recipe: Recipe) -> None:
     """Mitsuba's log says once for each surface if scalar theory is not to be trusted there."""
-    told = json.dumps([str(recipe.folder), dict(recipe.surface)], sort_keys=True, default=str)
+    # A scan is named from the folder of its recipe.
+    where = str(recipe.folder) if "scan" in recipe.surface else ""
+    told = json.dumps([where, dict(recipe.surface)], sort_keys=True, default=str)
     if told in _told:
         return
     _told.add(told)
