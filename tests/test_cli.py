@@ -1,5 +1,6 @@
 """The commands as a person meets them: one line for a mistake, a file for a success, nothing for an interrupt."""
 
+import contextlib
 import os
 import re
 import signal
@@ -17,6 +18,7 @@ import pytest
 import mitsuba_diffraction as md
 from mitsuba_diffraction.cli.arguments import scene_parameters
 from mitsuba_diffraction.cli.console import log_lines
+from mitsuba_diffraction.render import passes
 from mitsuba_diffraction.render.spectral_image import SpectralImage
 
 # So shallow that scalar theory holds: a warning would be told by whichever test is the first.
@@ -473,6 +475,24 @@ def test_an_interrupt_inside_a_plugin_is_no_error_of_the_scene(command):
     assert (code, out) == (130, "")
     assert err.strip() == "mitsuba-diffraction: interrupted: nothing was written"
     assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_an_interrupt_that_something_ignored_ends_the_rendering(command, monkeypatch):
+    """As C++ code and the garbage collector may do while the scene is loaded."""
+
+    load = passes.load_spectral_scene
+
+    def ignoring(*args, **kwargs):
+        with contextlib.suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        return load(*args, **kwargs)
+
+    monkeypatch.setattr(passes, "load_spectral_scene", ignoring)
+    Path("scene.xml").write_text(SCENE)
+    code, _, err = command("render scene.xml --spp 1")
+    assert code == 130
+    assert err.strip() == "mitsuba-diffraction: interrupted: nothing was written"
+    assert not Path("scene.exr").exists()
 
 
 @pytest.mark.slow

@@ -255,6 +255,9 @@ def _deferred_interrupt() -> Iterator[Callable[[], bool]]:
         yield lambda: False
         return
     asked = threading.Event()
+    # The command line's handler has raised an exception already, and something on its way out has swallowed it.
+    if getattr(before, "pressed", False):
+        asked.set()
 
     def note(number: int, frame: object) -> None:
         asked.set()
