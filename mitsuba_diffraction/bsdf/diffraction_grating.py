@@ -16,6 +16,7 @@ from ..rigorous.spectrum import RigorousSpectrum
 from ..spectrum.energy_table import SHADOWING
 from ..surface.heightfield import HeightField
 from ..wavelengths import VISIBLE
+from .arithmetic import larger, limited, smaller
 from .base import base_from
 from .coat import coat_from
 from .geometry import Geometry
@@ -210,7 +211,7 @@ def define() -> type:
                 value, density = scattered(wi, wo, height_scale)
             # The mean over the covered wavelengths: any of them may have chosen the direction.
             diffuse = _diffuse_share(count)
-            density = diffuse * dr.inv_pi + (1 - diffuse) * density / dr.maximum(count, 1)
+            density = diffuse * dr.inv_pi + (1 - diffuse) * density / larger(count, 1)
             return value, density * outside
 
         def _meets(self, si: mi.SurfaceInteraction3f, u: mi.Float, v: mi.Float) -> mi.Bool:
@@ -238,7 +239,7 @@ def define() -> type:
             index = 1.0 if self.coat is None else self.coat.eta
             geometry = Geometry(wi, wo)
             # Directions beyond the largest angle are black, but they are drawn: they have a density.
-            within = dr.minimum(geometry.cos_i, geometry.cos_o) >= self.least_cosine
+            within = smaller(geometry.cos_i, geometry.cos_o) >= self.least_cosine
             value, density = mi.UnpolarizedSpectrum(0.0), mi.Float(0.0)
             for channel in range(len(value)):
                 wavelength = si.wavelengths[channel] * 1e-3  # µm
@@ -254,8 +255,8 @@ def define() -> type:
                         active & covered[channel],
                         drawn,
                     )
-                value[channel] = dr.select(within, power / dr.square(wavelength), 0)
-                density += share / dr.square(wavelength)
+                value[channel] = dr.select(within, power * dr.square(frequency), 0)
+                density = dr.fma(share, dr.square(frequency), density)
             if self.rigorous:
                 value *= geometry.cos_o
             else:
@@ -265,7 +266,7 @@ def define() -> type:
                 value *= geometry.factor(self.shadowing == "v_cavity")
             if self.coat is not None:
                 # The solid angle inside the coat is smaller: cos θ'_o dω'_o = cos θ_o dω_o/n².
-                value *= outside / dr.maximum(geometry.cos_o, 1e-7)
+                value *= outside / larger(geometry.cos_o, 1e-7)
             return value, density
 
         def _mueller(
@@ -412,7 +413,7 @@ def define() -> type:
             if grating or below is not None:
                 # From behind and along the horizon the front reflects all; Python's numbers cannot be divided by zero.
                 below_front = dr.select(front_share < 1, 1 - front_share, 1)
-                rest = dr.minimum((sample1 - front_share) / below_front, BELOW_ONE)
+                rest = smaller((sample1 - front_share) / below_front, BELOW_ONE)
                 bs, result = self._sample_below(
                     ctx, si, lobes, 1 - front_share, rest, sample2, active & (sample1 >= front_share)
                 )
@@ -458,7 +459,7 @@ def define() -> type:
             if grating:
                 bs.wo = self._draw(si, sample1 / share, sample2, active & (sample1 < share))
             if below is not None:
-                rest = dr.minimum((sample1 - share) / (1 - share), BELOW_ONE)
+                rest = smaller((sample1 - share) / (1 - share), BELOW_ONE)
                 drawn, weight = self.base.bsdf.sample(below, si, rest, sample2, of_base)
                 bs.wo = dr.select(of_base, drawn.wo, bs.wo)
                 bs.sampled_type = dr.select(of_base, drawn.sampled_type, bs.sampled_type)
@@ -483,10 +484,10 @@ def define() -> type:
             share = _diffuse_share(count)
             # In scalar variants these are Python's, for which ~ is no negation.
             diffuse, diffracted = u < share, u >= share
-            u = (u - share) / dr.maximum(1 - share, DEFENSIVE)
+            u = (u - share) / larger(1 - share, DEFENSIVE)
             # Only wavelengths that the spectrum covers draw directions.
-            chosen = dr.clip(dr.floor(u * count), 0, dr.maximum(count - 1, 0))
-            rest = dr.clip(u * count - chosen, 0, BELOW_ONE)
+            chosen = smaller(dr.floor(u * count), larger(count - 1, 0))
+            rest = limited(u * count - chosen, 0, BELOW_ONE)
             wavelength, before = mi.Float(si.wavelengths[0]), mi.Float(0.0)
             for channel, use in enumerate(covered):
                 wavelength = dr.select(use & (before == chosen), si.wavelengths[channel], wavelength)

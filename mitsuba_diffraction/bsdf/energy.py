@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..spectrum.energy_table import HORIZON, EnergyTable
+from .arithmetic import larger, limited, smaller
 from .tables import PacketTable, opaque
 
 
@@ -61,15 +62,15 @@ class Energy:
         result = mi.UnpolarizedSpectrum(1.0)
         for channel in range(len(result)):
             frequency = self.per_frequency / wavelengths[channel]
-            result[channel] = dr.minimum(self.bound(there, frequency), self.bound(back, frequency))
+            result[channel] = smaller(self.bound(there, frequency), self.bound(back, frequency))
         return result
 
     def place(self, omega: mi.Vector3f) -> Place:
         """The place of ω, along the pattern's axes."""
-        z = dr.maximum(omega.z, 0)
+        z = larger(omega.z, 0)
         c = dr.sqrt(dr.square(omega.x) + dr.square(z))
-        tangent = omega.x / dr.maximum(c + z, 1e-7)
-        rest = dr.maximum(1 - dr.abs(tangent), 0)
+        tangent = omega.x / larger(c + z, 1e-7)
+        rest = larger(1 - dr.abs(tangent), 0)
         s = dr.copysign(1 - 0.5 * (dr.sqrt(rest) + rest), tangent)
         column, x = _cell(0.5 * (s + 1) * self.columns, self.columns)
         row, y = mi.UInt32(0), mi.Float(0)
@@ -87,7 +88,7 @@ class Energy:
         if self.slope is not None:
             e += self._between(lambda i: self.slope(i, True), index, place, t) * self.change
         if self.shadowing == "none":
-            e *= dr.square(dr.minimum(1, place.z / HORIZON))
+            e *= dr.square(smaller(place.z / HORIZON, 1))
         return e
 
     def _between(
@@ -125,6 +126,6 @@ def _corners(values: np.ndarray) -> np.ndarray:
 
 def _cell(x: mi.Float, count: int) -> tuple[mi.UInt32, mi.Float]:
     """The cell of x, 0 ≤ x ≤ count, and the place in it; outside, the nearest."""
-    x = dr.clip(x, 0, count)
+    x = limited(x, 0, count)
     cell = dr.minimum(mi.UInt32(x), count - 1)
     return cell, x - mi.Float(cell)

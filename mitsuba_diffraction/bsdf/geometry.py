@@ -5,6 +5,8 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from .arithmetic import larger, smaller
+
 
 class Geometry:
     """What a pair of directions fixes, whatever the surface. All angles are to the macroscopic normal, z.
@@ -40,7 +42,7 @@ class Geometry:
         2(n·h)(n·ω)/(ω_o·h) = −2w cos θ/D. Together they stay finite at grazing angles.
         """
         # cos θ_o cancels; the guard keeps masked lanes finite.
-        k = dr.square(self.d) / (dr.maximum(self.cos_i, 1e-7) * dr.square(self.w))
+        k = dr.square(self.d) / (larger(self.cos_i, 1e-7) * dr.square(self.w))
         if not shadowing:
             return k
-        return k * dr.minimum(1.0, -2 * self.w * dr.minimum(self.cos_i, self.cos_o) / self.d)
+        return k * smaller(-2 * self.w * smaller(self.cos_i, self.cos_o) / self.d, 1)

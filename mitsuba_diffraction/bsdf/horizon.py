@@ -12,6 +12,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from .arithmetic import larger, limited
 from .incidence import Incidence
 from .tables import opaque
 
@@ -62,12 +63,12 @@ class HorizonBins:
 
 
 def _cell(x: mi.Float, count: int) -> mi.UInt32:
-    return mi.UInt32(dr.clip(x, 0, count - 1))
+    return mi.UInt32(limited(x, 0, count - 1))
 
 
 def _azimuth(x: mi.Float, y: mi.Float) -> mi.Float:
     """−2 to 2, instead of −π to π: the place on a square |x| + |y| = 1, which needs no arc tangent."""
-    along = x / dr.maximum(dr.abs(x) + dr.abs(y), 1e-12)
+    along = x / larger(dr.abs(x) + dr.abs(y), 1e-12)
     return dr.select(y >= 0, 1 - along, along - 1)
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..spectrum import GratingSpectrum
+from .arithmetic import larger, limited
 from .incidence import Incidence
 from .tables import BELOW_ONE, opaque
 
@@ -32,7 +33,7 @@ class KappaCells:
     def weights(self, incidence: Incidence) -> mi.Vector4f:
         """w_j for one wavelength."""
         first, step = incidence.least_kappa / incidence.kappa_span, self.width / incidence.kappa_span
-        inner = [dr.clip(dr.fma(cell, step, -first), 0, 1) for cell in range(1, CELLS)]
+        inner = [limited(dr.fma(cell, step, -first), 0, 1) for cell in range(1, CELLS)]
         squares = [0.0, *map(dr.square, inner), 1.0]
         return mi.Vector4f(*(squares[cell + 1] - squares[cell] for cell in range(CELLS)))
 
@@ -67,4 +68,4 @@ def choose(shares: mi.Vector4f, u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
         chosen = dr.select(past, mi.UInt32(cell), chosen)
         start, end = dr.select(past, ends[cell - 1], start), dr.select(past, ends[cell], end)
     # Where nothing is drawn, in a masked lane, all shares are zero.
-    return chosen, dr.clip((x - start) / dr.maximum(end - start, 1e-30), 0, BELOW_ONE)
+    return chosen, limited((x - start) / larger(end - start, 1e-30), 0, BELOW_ONE)

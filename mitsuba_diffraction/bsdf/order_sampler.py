@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..spectrum import GratingSpectrum
+from .arithmetic import larger, limited
 from .incidence import Incidence
 from .kappa_cells import CELLS, KappaCells, averages, choose
 from .tables import BELOW_ONE, PacketTable, opaque
@@ -75,7 +76,7 @@ class OrderSampler:
             return mi.Int32(0), mi.Int32(1)
         half = frequency
         if lines == 1:
-            half = dr.safe_sqrt(dr.square(frequency) - dr.square(dr.maximum(dr.abs(across) - self.margin, 0)))
+            half = dr.safe_sqrt(dr.square(frequency) - dr.square(larger(dr.abs(across) - self.margin, 0)))
         half = half + self.margin
         first = mi.Int32(dr.ceil((-along - half) * tile))
         last = mi.Int32(dr.floor((half - along) * tile))
@@ -92,7 +93,7 @@ class OrderSampler:
         weights = self.cells.weights(incidence)
         bottom, top, left, right = self.rectangle(incidence)
         total = dr.dot(weights, self._masses(bottom, top, self._start(left, right), active))
-        return weights * dr.rcp(dr.maximum(total, 1))
+        return weights * dr.rcp(larger(total, 1))
 
     def _start(self, left: mi.Int32, right: mi.Int32) -> mi.Int32:
         """Where the sums over the rows begin in their table."""
@@ -185,4 +186,4 @@ def locate(
         further = value <= target
         index = dr.select(further, trial, index)
         low, high = dr.select(further, value, low), dr.select(further, high, value)
-    return index, dr.clip((target - low) / dr.maximum(high - low, 1e-30), 0, BELOW_ONE)
+    return index, limited((target - low) / larger(high - low, 1e-30), 0, BELOW_ONE)

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..spectrum import GratingSpectrum
 from ..spectrum.orders import LobeAxis
+from .arithmetic import larger
 from .cell_sampler import CellSampler
 from .incidence import Incidence
 from .order_power import order_power
@@ -71,7 +72,7 @@ class OrderSpectrum:
             power = self._power(m_x, m_y, along_x.lobes(m_x, q_x), along_y.lobes(m_y, q_y), kappa, active)
             density = self.cells.density(q_x, q_y, incidence, active)
         # Interpolation may dip below zero by its error.
-        return dr.select(active, dr.maximum(power, 0), 0), density
+        return dr.select(active, larger(power, 0), 0), density
 
     def _power(
         self,

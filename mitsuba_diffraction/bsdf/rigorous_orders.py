@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ..rigorous.mueller import MIRRORED
 from ..rigorous.spectrum import RigorousSpectrum
+from .arithmetic import larger, limited, smaller
 from .incidence import Incidence
 from .order_sampler import WHOLE, search
 from .tables import PacketTable, opaque
@@ -92,7 +93,7 @@ class RigorousOrders:
         """q_x, q_y in cycles/µm, and k_y, c, g and the third coordinate of `Axes`."""
         nu = self.period * frequency
         k_y, c = 0.5 * nu * (wo.y - wi.y), 0.5 * nu * (wo.x - wi.x)
-        g = dr.sqrt(dr.maximum(dr.square(nu) - dr.square(k_y), 0))
+        g = dr.sqrt(larger(dr.square(nu) - dr.square(k_y), 0))
         return -(wi.x + wo.x) * frequency, -(wi.y + wo.y) * frequency, k_y, c, g, self._z(g, frequency)
 
     def _read(self, frequency: mi.Float, near: mi.Bool, wi: mi.Vector3f, wo: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
@@ -172,17 +173,17 @@ class RigorousOrders:
 
     def _z(self, g: mi.Float, frequency: mi.Float) -> mi.Float:
         """Z / (K − 1), from 0 to 1."""
-        most = self.period / dr.maximum(g, 1e-6)
-        first, last = dr.minimum(self.shortest, most), dr.minimum(self.longest, most)
-        return dr.clip((dr.rcp(frequency) - first) / dr.maximum(last - first, 1e-6), 0, 1)
+        most = self.period / larger(g, 1e-6)
+        first, last = smaller(self.shortest, most), smaller(self.longest, most)
+        return limited((dr.rcp(frequency) - first) / larger(last - first, 1e-6), 0, 1)
 
     def _position(self, p: mi.Float) -> mi.Float:
         """X / s of P ≥ 0."""
         whole = dr.floor(p)
         part = p - whole
-        near = dr.minimum(part, 1 - part)
+        near = smaller(part, 1 - part)
         # Above zero, where the root has a derivative.
-        root = dr.sqrt(dr.maximum(near, 1e-12))
+        root = dr.sqrt(larger(near, 1e-12))
         value = mi.Float(_ARC_SINE[-1])
         for coefficient in _ARC_SINE[-2::-1]:
             value = dr.fma(value, near, coefficient)
@@ -231,7 +232,7 @@ class RigorousOrders:
         nu, wi = self.period * incidence.frequency, incidence.wi
         g = nu * dr.safe_sqrt(1 - dr.square(wi.y))
         p, r = (
-            dr.clip(mi.Int32(self.cells * self._position(dr.maximum(x, 0))), 0, self.cells_across - 1)
+            dr.clip(mi.Int32(self.cells * self._position(larger(x, 0))), 0, self.cells_across - 1)
             for x in (g - nu * wi.x, g + nu * wi.x)
         )
         z = dr.clip(mi.Int32(self._z(g, incidence.frequency) * self.sampler_planes), 0, self.sampler_planes - 1)

@@ -7,6 +7,7 @@ import mitsuba as mi
 
 from ..spectrum import GratingSpectrum
 from ..spectrum.spline_grid import spline_weights
+from .arithmetic import larger
 from .cell_sampler import CellSampler
 from .incidence import Incidence
 from .order_power import order_power
@@ -63,7 +64,7 @@ class SplineSpectrum:
         )
         inside = active & (dr.abs(q_x) <= self.limit_x) & (dr.abs(q_y) <= self.limit_y)
         # Interpolation may dip below zero by its error.
-        power = dr.maximum(power, 0) * self.per_area
+        power = larger(power, 0) * self.per_area
         return dr.select(inside, power, 0), self.cells.density(q_x, q_y, incidence, active)
 
     def sample(
