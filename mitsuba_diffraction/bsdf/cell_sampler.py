@@ -13,6 +13,7 @@ from scipy.special import ndtr
 from ..spectrum import GratingSpectrum
 from ..spectrum.orders import OrderGrid
 from ..spectrum.spline_grid import spline_integral
+from .arithmetic import larger
 from .horizon import HorizonBins
 from .incidence import Incidence
 from .kappa_cells import CELLS, KappaCells, averages, choose
@@ -20,7 +21,7 @@ from .order_sampler import locate, target_between
 from .tables import FloatTable, PacketTable, ShareTable, opaque
 
 # The widest cells: in σ_q, to follow the lobes, and in cycles/µm, to follow the horizon.
-WIDEST, FINE = 2.0, 0.04
+WIDEST, FINE = 2.0, 0.06
 BLOCK = 0.05  # cycles/µm: cells are taken together in blocks of about this width
 LOBE = 4.0  # σ_q: how far the lobes of orders are followed
 
@@ -77,7 +78,7 @@ class CellSampler:
         cell = mi.UInt32((m_y + self.largest_y) * self.columns + m_x + self.largest_x)
         weights = self.cells.weights(incidence)
         total = self.area * dr.dot(weights, self.masses(self.horizon.bin(incidence), active))
-        return dr.dot(self.shares(cell, active), weights) * dr.rcp(dr.maximum(total, 1e-20))
+        return dr.dot(self.shares(cell, active), weights) * dr.rcp(larger(total, 1e-20))
 
     def sample(self, incidence: Incidence, u: mi.Float, v: mi.Point2f, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
         """Draw q in cycles/µm, for one wavelength.
@@ -93,7 +94,9 @@ class CellSampler:
         ends = mi.Vector2i(self.ends(chosen_bin * self.blocks_y + mi.UInt32(row), active))
         column, x = self.before_x.search(mi.UInt32(row), kappa_cell, ends.x, ends.y, v.x, active)
         block = mi.UInt32(row * self.blocks_x + column)
-        cell, _ = self.before_cell.search(block, kappa_cell, zero, mi.Int32(self.in_block), u, active)
+        cell = zero
+        if self.in_block > 1:
+            cell, _ = self.before_cell.search(block, kappa_cell, zero, mi.Int32(self.in_block), u, active)
         m_x = mi.Float(column * self.edge_x + cell % self.edge_x - self.largest_x)
         m_y = mi.Float(row * self.edge_y + cell // self.edge_x - self.largest_y)
         return (m_x + x - 0.5) * self.spacing_x, (m_y + v.y - 0.5) * self.spacing_y
