@@ -91,7 +91,7 @@ def test_a_run_reports_every_combination(llvm, tmp_path):
 
 @pytest.mark.slow
 def test_sampling_is_measured(llvm):
-    (found,) = measure([BLAZE], count=1 << 12, size=16, spp=4, repetitions=1)
+    (found,) = measure([BLAZE], 1e-2, count=1 << 12, size=16, spp=4, repetitions=1)
     assert min(found.fractions[:4]) >= 0.5
     assert found.fractions[4] >= 0.25
     assert 1 < found.largest_weight < 100

@@ -34,7 +34,7 @@ def benchmark(
     import mitsuba as mi
 
     from ..studies import report
-    from ..studies.benchmark import run, save_json, save_plot, tables
+    from ..studies.benchmark import TOLERANCES, run, save_json, save_plot, tables
     from ..studies.cases import bundled_cases, scan_case
     from ..studies.sampling import measure
     from ..studies.theories import COLUMNS, compare_theories
@@ -65,9 +65,10 @@ def benchmark(
             report.save_json({"theories": costs}, json)
         return
     with progress_bar("speed and error") as progress:
-        results, shaders = run(cases, **({"tolerances": tolerance} if tolerance else {}), progress=progress)
+        results, shaders = run(cases, tolerances=tolerance or TOLERANCES, progress=progress)
     with progress_bar("sampling") as progress:
-        sampling = measure(cases, progress=progress)
+        # Pictures need no more.
+        sampling = measure(cases, max(tolerance or TOLERANCES), progress=progress)
     wide.print(*tables(results, shaders, sampling), sep="\n\n")
     if json is not None:
         save_json(results, shaders, sampling, json)

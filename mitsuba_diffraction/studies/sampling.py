@@ -49,6 +49,7 @@ class Sampling:
 
 def measure(
     cases: Sequence[Case],
+    tolerance: float,
     *,
     count: int = 1 << 16,
     size: int = 128,
@@ -60,6 +61,7 @@ def measure(
 
     Args:
         cases: surfaces.
+        tolerance: of their spectra.
         count: samples for each direction and draw of wavelengths.
         size: of the picture, pixels.
         spp: of the picture, samples per pixel.
@@ -68,7 +70,7 @@ def measure(
     """
     results = []
     for case in cases:
-        grating = {"type": "diffraction_grating", "spectrum": case.spectrum()}
+        grating = {"type": "diffraction_grating", "spectrum": case.spectrum(tolerance=tolerance)}
         mirror = mi.load_dict({**grating, "material": "none"})
         fractions, largest = zip(*(_fraction(mirror, angle, count) for angle in ANGLES), strict=True)
         pictures = {
