@@ -143,9 +143,9 @@ def run_toml(text):
 
 
 def run_xml(text):
-    # Of the mean over many patches two will do.
+    # Of the mean over many patches two will do, and a rough table.
     disc = '<string name="profile" value="compact_disc"/>'
-    text = text.replace(disc, f'{disc}<integer name="patches" value="2"/>')
+    text = text.replace(disc, f'{disc}<integer name="patches" value="2"/><float name="tolerance" value="0.05"/>')
     Path("block.xml").write_text(f'<scene version="3.0.0">{text}</scene>')
     mi.load_file("block.xml")
 
