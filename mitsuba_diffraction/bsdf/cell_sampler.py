@@ -16,9 +16,9 @@ from ..spectrum.spline_grid import spline_integral
 from .arithmetic import larger
 from .horizon import HorizonBins
 from .incidence import Incidence
+from .inversion import SumTable
 from .kappa_cells import CELLS, KappaCells, averages, choose
-from .order_sampler import locate, target_between
-from .tables import FloatTable, PacketTable, ShareTable, opaque
+from .tables import NumberTable, PacketTable, ShareTable, opaque
 
 # The widest cells: in σ_q, to follow the lobes, and in cycles/µm, to follow the horizon.
 WIDEST, FINE = 2.0, 0.06
@@ -57,7 +57,7 @@ class CellSampler:
         blocks = blocks.swapaxes(1, 2).reshape(*blocks.shape[:3:2], -1, CELLS)
         self.blocks_y, self.blocks_x, self.in_block, _ = blocks.shape
         before_x = _sums_before(blocks.sum(axis=2))
-        self.before_cell, self.before_x = _SumTable(_sums_before(blocks)), _SumTable(before_x)
+        self.before_cell, self.before_x = SumTable(_sums_before(blocks)), SumTable(before_x)
 
         edge = (np.arange(self.blocks_y + 1) * self.edge_y - largest[1] - 0.5) * spacing[1]
         ends = self.horizon.columns(edge[:-1], edge[1:])
@@ -67,9 +67,9 @@ class CellSampler:
         row = np.arange(self.blocks_y)
         # As they are read: differences of float32.
         before_y = _sums_before(np.float64(before_x[row, end]) - before_x[row, first])
-        self.before_y = _SumTable(before_y)
+        self.before_y = SumTable(before_y)
         self.masses = PacketTable(before_y[:, -1])
-        self.ends = PacketTable(np.stack([first, end], axis=-1), width=2)
+        self.ends = NumberTable(first | end << 16)
 
     def density(self, q_x: mi.Float, q_y: mi.Float, incidence: Incidence, active: mi.Bool) -> mi.Float:
         """p(q) in µm², q in cycles/µm, for one wavelength; of a q that propagates."""
@@ -89,51 +89,20 @@ class CellSampler:
         masses = self.masses(chosen_bin, active)
         kappa_cell, u = choose(self.cells.weights(incidence) * masses, u)
 
-        zero = mi.Int32(0)
-        row, u = self.before_y.search(chosen_bin, kappa_cell, zero, mi.Int32(self.blocks_y), u, active)
-        ends = mi.Vector2i(self.ends(chosen_bin * self.blocks_y + mi.UInt32(row), active))
-        column, x = self.before_x.search(mi.UInt32(row), kappa_cell, ends.x, ends.y, v.x, active)
-        block = mi.UInt32(row * self.blocks_x + column)
-        cell = zero
+        none, mass = mi.Float(0.0), self.masses.entry(chosen_bin, kappa_cell, active)
+        row, u = self.before_y.search(chosen_bin, kappa_cell, none, mass, u, active)
+        line, cell = mi.UInt32(row), mi.Int32(0)
+        ends = self.ends(chosen_bin * self.blocks_y + line)
+        ends = mi.Int32(ends & 0xFFFF), mi.Int32(ends >> 16)
+        low, high = (self.before_x.before(line, kappa_cell, end, active) for end in ends)
+        column, x = self.before_x.search(line, kappa_cell, low, high, v.x, active)
         if self.in_block > 1:
-            cell, _ = self.before_cell.search(block, kappa_cell, zero, mi.Int32(self.in_block), u, active)
+            block = mi.UInt32(row * self.blocks_x + column)
+            mass = self.before_cell.before(block, kappa_cell, mi.Int32(self.in_block), active)
+            cell, _ = self.before_cell.search(block, kappa_cell, none, mass, u, active)
         m_x = mi.Float(column * self.edge_x + cell % self.edge_x - self.largest_x)
         m_y = mi.Float(row * self.edge_y + cell // self.edge_x - self.largest_y)
         return (m_x + x - 0.5) * self.spacing_x, (m_y + v.y - 0.5) * self.spacing_y
-
-
-class _SumTable:
-    """Sums F before each of n numbers, for lines of them and for each κ cell.
-
-    Binary searches take two steps, in every sixteenth sum and in those between: few lines of the cache.
-    """
-
-    GROUP = 16
-
-    def __init__(self, sums: NDArray[np.float32]) -> None:
-        """Takes F (..., n + 1, κ cells)."""
-        sums = sums.swapaxes(-1, -2)
-        self.count = sums.shape[-1] - 1
-        self.groups = -(-self.count // self.GROUP)
-        self.fine, self.coarse = FloatTable(sums), FloatTable(sums[..., : self.count : self.GROUP])
-
-    def search(
-        self, line: mi.UInt32, kappa_cell: mi.UInt32, first: mi.Int32, end: mi.Int32, u: mi.Float, active: mi.Bool
-    ) -> tuple[mi.Int32, mi.Float]:
-        """As `order_sampler.search`, of one line and κ cell."""
-        line = line * CELLS + kappa_cell
-
-        def fine(i: mi.Int32) -> mi.Float:
-            return self.fine(line * (self.count + 1) + mi.UInt32(i), active)
-
-        def coarse(i: mi.Int32) -> mi.Float:
-            return self.coarse(line * self.groups + mi.UInt32(i), active)
-
-        target = target_between(fine(first), fine(end), u)
-        if self.groups > 1:
-            group, _ = locate(coarse, mi.Int32(0), mi.Int32(self.groups - 1), self.groups, target)
-            first, end = dr.maximum(first, self.GROUP * group), dr.minimum(end, self.GROUP * (group + 1))
-        return locate(fine, first, end, min(self.GROUP, self.count), target)
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ import numpy as np
 
 from ..spectrum.energy_table import HORIZON, EnergyTable
 from .arithmetic import larger, limited, smaller
-from .tables import PacketTable, opaque
+from .tables import NumberTable, PacketTable, opaque
 
 
 @dataclass
@@ -44,7 +44,7 @@ class Energy:
         self.slices, self.columns = slices - 1, columns - 1
         self.conical, self.shadowing = table.conical, table.shadowing
         steps, least, step = table.packed()
-        self.table = _NumberTable(_corners(steps) @ (np.uint32(1) << np.arange(0, 32, 8, dtype=np.uint32)))
+        self.table = NumberTable(_corners(steps) @ (np.uint32(1) << np.arange(0, 32, 8, dtype=np.uint32)))
         self.least, self.step = opaque(least), opaque(step)
         self.slope = None if slope is None else PacketTable(_corners(slope))
         self.change = change
@@ -99,19 +99,6 @@ class Energy:
         if self.rows > 1:
             values = dr.lerp(values, corners(index + self.slices * self.columns), place.y)
         return dr.lerp(dr.lerp(values[0], values[1], place.x), dr.lerp(values[2], values[3], place.x), t)
-
-
-class _NumberTable:
-    """A flat table of 32-bit numbers."""
-
-    def __init__(self, numbers: np.ndarray) -> None:
-        flat = np.ascontiguousarray(numbers, np.uint32).ravel()
-        # Scalar variants have no gather.
-        self.values = mi.UInt32(flat) if dr.is_jit_v(mi.Float) else flat
-
-    def __call__(self, index: mi.UInt32) -> mi.UInt32:
-        """The number at `index`."""
-        return dr.gather(mi.UInt32, self.values, index) if dr.is_jit_v(mi.Float) else int(self.values[index])
 
 
 def _bytes(number: mi.UInt32) -> mi.Vector4f:

@@ -18,7 +18,7 @@ from .tables import opaque
 
 # Bins: equal in cos θ_i, so that they are finest where the horizon is near the mirror direction; in azimuth (eight to
 # a quadrant), which moves the horizon along itself there; and in 1/λ.
-COSINES, AZIMUTHS, FREQUENCIES = 8, 32, 8
+COSINES, AZIMUTHS, FREQUENCIES = 8, 32, 4
 _STEP = 0.02  # between the s that stand for a border
 _BEYOND = 1e-4  # for rounding at run time
 

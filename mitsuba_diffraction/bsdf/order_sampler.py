@@ -11,18 +11,17 @@ each made wider by the reach of the lobes.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
 from ..spectrum import GratingSpectrum
-from .arithmetic import larger, limited
+from .arithmetic import larger
 from .incidence import Incidence
+from .inversion import search
 from .kappa_cells import CELLS, KappaCells, averages, choose
-from .tables import BELOW_ONE, PacketTable, opaque
+from .tables import PacketTable, opaque
 
 FLOOR = 0.05  # the share of each κ cell that all orders have alike, for those that its average misses
 WHOLE = 2**24  # a float32 holds whole numbers up to here
@@ -148,42 +147,3 @@ def _units(average: NDArray[np.float64]) -> NDArray[np.int64]:
     """A_jm of one κ cell in units of 2⁻²⁴: at least one, no more than 2²⁴ together."""
     mixed = (1 - FLOOR) * average + FLOOR / average.size
     return 1 + np.floor(mixed * (WHOLE - average.size)).astype(np.int64)
-
-
-def search(
-    before: Callable[[mi.Int32], mi.Float], first: mi.Int32, end: mi.Int32, count: int, u: mi.Float
-) -> tuple[mi.Int32, mi.Float]:
-    """The index i with F(i) ≤ F(first) + u (F(end) − F(first)) < F(i + 1), first ≤ i < end.
-
-    Args:
-        before: F, which does not fall.
-        first: where the search begins.
-        end: where it ends.
-        count: end − first at most.
-        u: in [0, 1).
-
-    Returns:
-        i, and the place between F(i) and F(i + 1), in [0, 1).
-    """
-    return locate(before, first, end, count, target_between(before(first), before(end), u))
-
-
-def target_between(low: mi.Float, high: mi.Float, u: mi.Float) -> mi.Float:
-    """low + u (high − low), less than high."""
-    target = dr.fma(u, high - low, low)
-    # The sum may round up to the end.
-    return dr.select(target < high, target, low)
-
-
-def locate(
-    before: Callable[[mi.Int32], mi.Float], first: mi.Int32, end: mi.Int32, count: int, target: mi.Float
-) -> tuple[mi.Int32, mi.Float]:
-    """`search` for F(i) ≤ `target` < F(i + 1)."""
-    index, low, high = first, before(first), before(end)
-    for bit in reversed(range((count - 1).bit_length())):
-        trial = dr.minimum(index + (1 << bit), end)
-        value = before(trial)
-        further = value <= target
-        index = dr.select(further, trial, index)
-        low, high = dr.select(further, value, low), dr.select(further, high, value)
-    return index, limited((target - low) / larger(high - low, 1e-30), 0, BELOW_ONE)

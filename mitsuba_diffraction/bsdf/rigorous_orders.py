@@ -14,7 +14,8 @@ from ..rigorous.mueller import MIRRORED
 from ..rigorous.spectrum import RigorousSpectrum
 from .arithmetic import larger, limited, smaller
 from .incidence import Incidence
-from .order_sampler import WHOLE, search
+from .inversion import search
+from .order_sampler import WHOLE
 from .tables import PacketTable, opaque
 
 CELLS = 8  # of the sampler to each unit of P and R

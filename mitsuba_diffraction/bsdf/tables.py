@@ -68,6 +68,20 @@ class PacketTable(FloatTable):
         return super().__call__(self.width * index + place, active)
 
 
+class NumberTable:
+    """A flat table of 32-bit numbers."""
+
+    def __init__(self, numbers: np.ndarray) -> None:
+        """Takes an array of any shape."""
+        flat = aligned(np.asarray(numbers, np.uint32).ravel())
+        # Scalar variants have no gather.
+        self.values = mi.UInt32(flat) if dr.is_jit_v(mi.Float) else flat
+
+    def __call__(self, index: mi.UInt32) -> mi.UInt32:
+        """The number at `index`."""
+        return dr.gather(mi.UInt32, self.values, index) if dr.is_jit_v(mi.Float) else int(self.values[index])
+
+
 def aligned(values: np.ndarray) -> np.ndarray:
     """Flat float32 or uint32 at an address that is a multiple of 64 bytes.
 

@@ -1,0 +1,132 @@
+"""Draws from discrete distributions by inversion: binary searches in sums F(i) of the probabilities before each i."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from .arithmetic import larger, limited
+from .kappa_cells import CELLS
+from .tables import BELOW_ONE, FloatTable
+
+
+def search(
+    before: Callable[[mi.Int32], mi.Float], first: mi.Int32, end: mi.Int32, count: int, u: mi.Float
+) -> tuple[mi.Int32, mi.Float]:
+    """The index i with F(i) ≤ F(first) + u (F(end) − F(first)) < F(i + 1), first ≤ i < end.
+
+    Args:
+        before: F, which does not fall.
+        first: where the search begins.
+        end: where it ends.
+        count: end − first at most.
+        u: in [0, 1).
+
+    Returns:
+        i, and the place between F(i) and F(i + 1), in [0, 1).
+    """
+    low, high = before(first), before(end)
+    target = _between(low, high, u)
+    index, low, high = _locate(before, first, end, count, target, low, high)
+    return index, _place(target, low, high)
+
+
+class SumTable:
+    """F for lines of n numbers, and for each κ cell.
+
+    A search takes two steps, in every sixteenth sum and in those between. Either are sixteen floats, one line of the
+    cache: what a search costs is the lines that it reads.
+    """
+
+    GROUP = 16
+
+    def __init__(self, sums: NDArray[np.float32]) -> None:
+        """Takes F (..., n + 1, κ cells)."""
+        lines = sums.swapaxes(-1, -2)
+        self.count = lines.shape[-1] - 1
+        grouped = self.count > self.GROUP
+        if grouped:
+            lines = _in_groups(lines, self.GROUP)
+        self.stride, self.fine = lines.shape[-1], FloatTable(lines)
+        self.groups = self.stride // self.GROUP if grouped else 1
+        coarse = _in_groups(lines[..., :: self.GROUP], self.GROUP)
+        self.coarse_stride, self.coarse = coarse.shape[-1], FloatTable(coarse)
+
+    def before(self, line: mi.UInt32, kappa_cell: mi.UInt32, i: mi.Int32, active: mi.Bool) -> mi.Float:
+        """F(i), 0 ≤ i ≤ n."""
+        return self.fine((line * CELLS + kappa_cell) * self.stride + mi.UInt32(i), active)
+
+    def search(
+        self, line: mi.UInt32, kappa_cell: mi.UInt32, low: mi.Float, high: mi.Float, u: mi.Float, active: mi.Bool
+    ) -> tuple[mi.Int32, mi.Float]:
+        """The index i with F(i) ≤ low + u (high − low) < F(i + 1), and the place between, as `search` has them.
+
+        Args:
+            line: which of the lines.
+            kappa_cell: which κ cell.
+            low: one of the F.
+            high: a later one of them.
+            u: in [0, 1).
+            active: mask.
+        """
+        line = line * CELLS + kappa_cell
+
+        def fine(i: mi.Int32) -> mi.Float:
+            return self.fine(line * self.stride + mi.UInt32(i), active)
+
+        def coarse(i: mi.Int32) -> mi.Float:
+            return self.coarse(line * self.coarse_stride + mi.UInt32(i), active)
+
+        target = _between(low, high, u)
+        first, low = mi.Int32(0), mi.Float(0.0)
+        if self.groups > 1:
+            group, low, high = _locate(coarse, first, mi.Int32(self.groups - 1), self.groups, target, low, high)
+            first = self.GROUP * group
+        size = min(self.GROUP, self.count)
+        index, low, high = _locate(fine, first, first + size, size, target, low, high)
+        # Where nothing is drawn, in a masked lane, all are zero.
+        return dr.minimum(index, self.count - 1), _place(target, low, high)
+
+
+def _in_groups(lines: NDArray[np.float32], group: int) -> NDArray[np.float32]:
+    """(..., n) → (..., whole groups), continued with the last number of each line."""
+    pad = [(0, 0)] * (lines.ndim - 1) + [(0, -lines.shape[-1] % group)]
+    return np.pad(lines, pad, mode="edge")
+
+
+def _between(low: mi.Float, high: mi.Float, u: mi.Float) -> mi.Float:
+    """low + u (high − low), less than high."""
+    target = dr.fma(u, high - low, low)
+    # The sum may round up to the end.
+    return dr.select(target < high, target, low)
+
+
+def _locate(
+    before: Callable[[mi.Int32], mi.Float],
+    first: mi.Int32,
+    end: mi.Int32,
+    count: int,
+    target: mi.Float,
+    low: mi.Float,
+    high: mi.Float,
+) -> tuple[mi.Int32, mi.Float, mi.Float]:
+    """The index i with F(i) ≤ `target` < F(i + 1), F(i), F(i + 1).
+
+    `low` is F(first) and `high` what F(i + 1) is if it was not met on the way.
+    """
+    index = first
+    for bit in reversed(range((count - 1).bit_length())):
+        trial = dr.minimum(index + (1 << bit), end)
+        value = before(trial)
+        further = value <= target
+        index = dr.select(further, trial, index)
+        low, high = dr.select(further, value, low), dr.select(further, high, value)
+    return index, low, high
+
+
+def _place(target: mi.Float, low: mi.Float, high: mi.Float) -> mi.Float:
+    return limited((target - low) / larger(high - low, 1e-30), 0, BELOW_ONE)
