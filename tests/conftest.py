@@ -16,7 +16,7 @@ from hypothesis import settings
 import mitsuba_diffraction as md  # before Dr.Jit, so that it has an LLVM that works
 from mitsuba_diffraction import cli
 from mitsuba_diffraction.files import whole_file
-from mitsuba_diffraction.spectrum.energy_table import SHADOWING
+from mitsuba_diffraction.spectrum.energy_table import SHADOWING, EnergyTable
 from mitsuba_diffraction.spectrum.grating_spectrum import GratingSpectrum
 
 from bsdf_support import use  # isort: skip
@@ -75,6 +75,14 @@ def energy_tables(cache_folder):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(GratingSpectrum, "energy_table", energy_table)
         yield
+
+
+@pytest.fixture
+def no_energy_tables(cache_folder, monkeypatch):
+    """E = 1, for tests of what surrounds a spectrum: files, words and exit codes. What is cached is kept apart."""
+    ones = EnergyTable(np.ones((1, 2, 2), np.float32), (1.0, 3.0), True)
+    monkeypatch.setattr(GratingSpectrum, "energy_table", lambda spectrum, shadowing="v_cavity": ones)
+    monkeypatch.setenv("MITSUBA_DIFFRACTION_CACHE", str(cache_folder / "without energy tables"))
 
 
 @pytest.fixture(scope="session", autouse=True)

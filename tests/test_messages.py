@@ -9,6 +9,8 @@ import pytest
 import mitsuba_diffraction
 from mitsuba_diffraction.render.scene import load_spectral_scene
 
+pytestmark = pytest.mark.usefixtures("no_energy_tables")
+
 SCENE = """<scene version="3.0.0"><default name="light" value="sun"/><include filename="lights/$light.xml"/>
 <sensor type="perspective"/><shape type="sphere">%s</shape></scene>"""
 GRATING = '<bsdf type="diffraction_grating">%s</bsdf>'
