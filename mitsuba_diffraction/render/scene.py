@@ -93,6 +93,8 @@ def load_spectral_scene(
         raise FileNotFoundError(f"{path}: no such file")
 
     config = mi.parser.ParserConfig(variant)
+    # On several threads, Mitsuba 3.9.1 failed in one of thirty loads of a scene with gratings and sunsky.
+    config.parallel = False
     with _files_beside(path):
         try:
             state = mi.parser.parse_file(config, str(path.resolve()), **(parameters or {}))
