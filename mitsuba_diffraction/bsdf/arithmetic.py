@@ -1,6 +1,6 @@
 """The larger and the smaller of two floats, in one instruction each.
 
-`dr.maximum` and its kin follow IEEE 754 for NaN and signed zeros, for which LLVM needs six instructions where a
+`dr.maximum` and its kin follow IEEE 754 for NaN and signed zeros, for which LLVM needs several instructions where a
 processor has one for a comparison and a choice. Here a comparison with NaN is false.
 """
 

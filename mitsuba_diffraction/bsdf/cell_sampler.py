@@ -57,7 +57,8 @@ class CellSampler:
         blocks = blocks.swapaxes(1, 2).reshape(*blocks.shape[:3:2], -1, CELLS)
         self.blocks_y, self.blocks_x, self.in_block, _ = blocks.shape
         before_x = _sums_before(blocks.sum(axis=2))
-        self.before_cell, self.before_x = SumTable(_sums_before(blocks)), SumTable(before_x)
+        self.before_cell = SumTable(_sums_before(blocks)) if self.in_block > 1 else None
+        self.before_x = SumTable(before_x)
 
         edge = (np.arange(self.blocks_y + 1) * self.edge_y - largest[1] - 0.5) * spacing[1]
         ends = self.horizon.columns(edge[:-1], edge[1:])
@@ -96,7 +97,7 @@ class CellSampler:
         ends = mi.Int32(ends & 0xFFFF), mi.Int32(ends >> 16)
         low, high = (self.before_x.before(line, kappa_cell, end, active) for end in ends)
         column, x = self.before_x.search(line, kappa_cell, low, high, v.x, active)
-        if self.in_block > 1:
+        if self.before_cell is not None:
             block = mi.UInt32(row * self.blocks_x + column)
             mass = self.before_cell.before(block, kappa_cell, mi.Int32(self.in_block), active)
             cell, _ = self.before_cell.search(block, kappa_cell, none, mass, u, active)

@@ -48,13 +48,13 @@ class SumTable:
         """Takes F (..., n + 1, κ cells)."""
         lines = sums.swapaxes(-1, -2)
         self.count = lines.shape[-1] - 1
-        grouped = self.count > self.GROUP
-        if grouped:
+        self.groups = 1
+        if self.count > self.GROUP:
             lines = _in_groups(lines, self.GROUP)
+            self.groups = lines.shape[-1] // self.GROUP
+            coarse = _in_groups(lines[..., :: self.GROUP], self.GROUP)
+            self.coarse_stride, self.coarse = coarse.shape[-1], FloatTable(coarse)
         self.stride, self.fine = lines.shape[-1], FloatTable(lines)
-        self.groups = self.stride // self.GROUP if grouped else 1
-        coarse = _in_groups(lines[..., :: self.GROUP], self.GROUP)
-        self.coarse_stride, self.coarse = coarse.shape[-1], FloatTable(coarse)
 
     def before(self, line: mi.UInt32, kappa_cell: mi.UInt32, i: mi.Int32, active: mi.Bool) -> mi.Float:
         """F(i), 0 ≤ i ≤ n."""
