@@ -245,6 +245,19 @@ def test_mistakes_are_refused(llvm, parameters, text):
         mi.load_dict({"type": "diffraction_grating", "spectrum": spectrum("blazed"), **parameters})
 
 
+def test_constructors_leave_the_file_resolver_alone(llvm, monkeypatch):
+    """mi.load_dict exchanges it, while Mitsuba's other threads load plugins that ask for it: sunsky failed at times."""
+    load = mi.load_dict
+    path = load({"type": "path"})
+    monkeypatch.setattr(mi, "load_dict", None)
+    for medium in ({"material": "Al"}, {"int_ior": 1.7}):
+        bsdf = load(
+            {"type": "diffraction_grating", "profile": "blazed", **medium, "coat_ior": 1.5, "conserve_energy": False}
+        )
+        assert type(bsdf).__name__ == "DiffractionGrating"
+    assert type(load({"type": "diffraction_path"}).path) is type(path)
+
+
 @pytest.mark.parametrize(
     ("kind", "parameters"),
     [

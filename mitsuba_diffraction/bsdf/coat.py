@@ -17,6 +17,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import RequestError
+from ..nested_plugin import nested_plugin
 from .tables import opaque
 
 
@@ -41,7 +42,7 @@ def absolute_index(name: str, index: float | str) -> float:
     """An index of refraction, given by a number or by a preset's name as in Mitsuba's `dielectric`."""
     if isinstance(index, int | float) and not 0 < index < np.inf:
         raise RequestError(f"{name}: got {index}, wanted a positive index of refraction, or a name such as 'bk7'")
-    interface = mi.load_dict({"type": "dielectric", "int_ior": index, "ext_ior": 1.0})
+    interface = nested_plugin("dielectric", int_ior=index, ext_ior=1.0)
     return float(np.ravel(mi.traverse(interface)["eta"])[0])
 
 

@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import RequestError
+from ..nested_plugin import nested_plugin
 from ..wavelengths import VISIBLE
 from .coat import Coat, absolute_index
 
@@ -93,7 +94,7 @@ class Conductor:
 
     def __init__(self, material: str, model: str, outside: float) -> None:
         _refuse_unknown_material(material)
-        metal = mi.traverse(mi.load_dict({"type": "conductor", "material": material}))
+        metal = mi.traverse(nested_plugin("conductor", material=material))
         self.eta, self.k = (self._spectrum(metal, name, outside) for name in ("eta", "k"))
         self.material = material
         self.model = model
@@ -104,9 +105,7 @@ class Conductor:
         nanometres = np.arange(VISIBLE[0], VISIBLE[1] + 1)
         values = np.interp(nanometres, metal[f"{name}.wavelengths"], metal[f"{name}.values"]) / outside
         text = ", ".join(repr(float(value)) for value in values)
-        return mi.load_dict(
-            {"type": "regular", "wavelength_min": VISIBLE[0], "wavelength_max": VISIBLE[1], "values": text}
-        )
+        return nested_plugin("regular", wavelength_min=VISIBLE[0], wavelength_max=VISIBLE[1], values=text)
 
     def __call__(self, si: mi.SurfaceInteraction3f, cos_half: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
         eta, k = self.eta.eval(si, active), self.k.eval(si, active)

@@ -7,6 +7,7 @@ import mitsuba as mi
 
 from ..errors import RequestError
 from ..manual import Parameter, listed
+from ..nested_plugin import nested_plugin
 from . import eye_paths
 from .gratings import Gratings
 from .light_paths import LightPaths
@@ -62,7 +63,7 @@ def define() -> type:
             self.max_depth, self.rr_depth = props.get("max_depth", -1), props.get("rr_depth", 5)
             if props.get("hide_emitters", False):
                 raise RequestError("hide_emitters: got true, wanted false: diffraction_path shows all lights")
-            self.path = mi.load_dict({"type": "path", "max_depth": self.max_depth, "rr_depth": self.rr_depth})
+            self.path = nested_plugin("path", max_depth=self.max_depth, rr_depth=self.rr_depth)
 
         def parts(self, scene: mi.Scene, sensor: mi.Sensor) -> tuple[mi.SamplingIntegrator, LightPaths | None]:
             """What traces from the eye, and what traces from the light; None where there are no such paths.
