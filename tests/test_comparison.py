@@ -8,6 +8,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from PIL import Image
+from test_rigorous_bsdf import made_up
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction.color import delta_E, spectrum_to_XYZ
@@ -211,6 +212,7 @@ def test_corrected_the_shader_converges_to_the_model_within_the_limit(llvm, tmp_
     assert published.mean > 2 * found.mean
 
 
+@pytest.mark.usefixtures("no_energy_tables")
 def test_pixels_that_show_surfaces_and_nothing_else(llvm, tmp_path):
     pictures = Pictures(write(tmp_path / "scene.xml", shapes=SPHERE), "gem", width=64)
     rows, columns = pictures.surface.shape
@@ -310,6 +312,13 @@ def test_compare_writes_pictures_numbers_and_a_figure(command, llvm, folder):
         assert np.ptp(np.asarray(picture.convert("L"))) > 100
 
 
+def test_a_coat_is_told(llvm, folder):
+    coat = GRATING.format(profile="blazed", period=2.0, coherence=3.0, base='<float name="coat_ior" value="1.5"/>')
+    write(Path("scene.xml"), SUN, coat)
+    found = compare("scene.xml", "gem", width=4, spp=1, shading_points=1, shares=False)
+    assert sum(line.startswith("coat: the shader shows") for line in summary.notes(found)) == 1
+
+
 @pytest.mark.slow
 def test_the_same_seed_gives_the_same_numbers(llvm, folder):
     write(Path("scene.xml"), rfilter="gaussian")
@@ -327,6 +336,7 @@ def test_the_same_seed_gives_the_same_numbers(llvm, folder):
         assert picture.width > 400
 
 
+@pytest.mark.usefixtures("no_energy_tables")
 @pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("arguments", "of", "words"),
@@ -346,11 +356,17 @@ def test_the_same_seed_gives_the_same_numbers(llvm, folder):
             {"bsdf": '<bsdf type="diffraction_grating"><string name="filename" value="blaze.exr"/></bsdf>'},
             "a saved spectrum does not hold them",
         ),
+        (
+            "scene.xml",
+            {"bsdf": '<bsdf type="diffraction_grating"><string name="filename" value="ruled.exr"/></bsdf>'},
+            "got a grating with theory=rigorous, wanted one of scalar theory",
+        ),
     ],
 )
 def test_a_mistake_is_one_line_and_exit_code_2(command, llvm, folder, arguments, of, words):
     write(Path("scene.xml"), **of)
     md.precompute(md.gratings.blazed(2.5, 0.25, samples=64), coherence_length=20).save("blaze.exr")
+    made_up().save("ruled.exr")
     before = names()
     code, out, err = command(f"compare {arguments}")
     assert (code, out) == (2, "")

@@ -551,6 +551,7 @@ def test_shadows_only_on_request():
     assert not dark.any()
 
 
+@pytest.mark.usefixtures("no_energy_tables")
 def test_both_sides_of_twosided():
     both = {"type": "twosided", "inner": GRATING}
     settings = shader(as_published=False, terms=16)
@@ -579,6 +580,9 @@ def test_a_recipe_gives_the_heights(tmp_path):
         ({"varriant": "flss"}, {}, "varriant"),
         ({"variant": "gem", "terms": 3}, {}, "terms"),
         ({"diffuse_weight": 2.0}, {}, "diffuse_weight: got 2.0, wanted 0 to 1"),
+        ({"as_published": "false"}, {}, "as_published: got 'false', wanted true or false"),
+        ({"shadows": "false"}, {}, "shadows: got 'false', wanted true or false"),
+        ({"window_pi": "false"}, {}, "window_pi: got 'false', wanted True or False"),
         ({}, {"light": {"type": "constant"}}, "no directional or point light"),
         (
             {},
@@ -595,6 +599,7 @@ def test_what_the_integrator_cannot_show_is_refused_in_one_line(parameters, of, 
     assert "\n" not in line
 
 
+@pytest.mark.usefixtures("no_energy_tables")
 def test_a_saved_spectrum_holds_no_heights(tmp_path):
     path = tmp_path / "blaze.exr"
     md.precompute(BLAZE).save(path)

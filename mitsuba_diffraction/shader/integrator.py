@@ -41,12 +41,12 @@ Parameters (XML or dictionary):
 {listed(PARAMETERS)}
 
 Surfaces with a `diffraction_grating`, or one inside `twosided`, are shaded with their heights, which must come from a
-recipe or a profile; all other BSDFs as they are. Light comes straight from directional and point lights; other lights,
-the background and reflections between surfaces are left out.
+recipe or a profile, in scalar theory and without their coat; all other BSDFs as they are. Light comes straight from
+directional and point lights; other lights, the background and reflections between surfaces are left out.
 
 The shader gives RGB. The picture is light of that colour, as a spectrum (`Emission`), so that any film records it; a
 colour that sRGB cannot show has negative radiance at some wavelengths. Corrected, FLSS and NMM are in the scene's units
-and show the direct light of a path tracer with fresnel="schlick", without the BRDF's factor E.
+and show the direct light of a path tracer with fresnel="schlick", without a coat and the BRDF's factor E.
 """
 
 
@@ -69,10 +69,10 @@ def define() -> type:
             self.variant = props.get("variant", "flss")
             if self.variant not in VARIANTS:
                 raise RequestError(f"variant: got {self.variant!r}, wanted one of {', '.join(VARIANTS)}")
-            quirks = Quirks.as_published() if props.get("as_published", True) else Quirks.corrected()
+            quirks = Quirks.as_published() if _boolean(props, "as_published", True) else Quirks.corrected()
             self.quirks = replace(quirks, **{name: props[name] for name in Quirks.names() if name in props})
             self.settings = {name: props[name] for name in _settings(self.variant) if name in props}
-            self.shadows = props.get("shadows", False)
+            self.shadows = _boolean(props, "shadows", False)
             self.diffuse_weight = props.get("diffuse_weight", 0.5)
             if not (isinstance(self.diffuse_weight, int | float) and 0 <= self.diffuse_weight <= 1):
                 raise RequestError(f"diffuse_weight: got {self.diffuse_weight!r}, wanted 0 to 1")
@@ -190,6 +190,13 @@ def define() -> type:
             )
 
     return DiffractionShader
+
+
+def _boolean(props: mi.Properties, name: str, default: bool) -> bool:
+    value = props.get(name, default)
+    if not isinstance(value, bool):
+        raise RequestError(f"{name}: got {value!r}, wanted true or false")
+    return value
 
 
 def _settings(variant: str) -> tuple[str, ...]:

@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..bsdf.base import Base
+from ..bsdf.coat import Coat
 from ..bsdf.nesting import contains_grating, nested
 from ..errors import RequestError
 from ..surface.heightfield import HeightField
@@ -23,12 +24,16 @@ class ShadedGrating(Protocol):
         height_scale: scales the heights.
         shadowing: "v_cavity" or "none".
         base: what lies under the surface.
+        coat: what lies above it, which the shader does not know.
+        rigorous: whether its efficiencies are those of rigorous theory.
         reflectance: R(si, cos θ, active) at the angle to the microfacet.
     """
 
     height_scale: mi.Float
     shadowing: str
     base: Base | None
+    coat: Coat | None
+    rigorous: bool
     reflectance: Callable[[mi.SurfaceInteraction3f, mi.Float, mi.Bool], mi.UnpolarizedSpectrum]
 
     def heights(self) -> tuple[HeightField, float]:
@@ -68,7 +73,7 @@ def surfaces_of(scene: mi.Scene) -> list[Surface]:
     """All gratings of a scene.
 
     Raises:
-        ValueError: if a grating is nested in a BSDF other than `twosided`.
+        ValueError: if a grating is nested in a BSDF other than `twosided`, or is of rigorous theory.
     """
     found: list[Surface] = []
     seen: list[mi.BSDF] = []
@@ -89,4 +94,6 @@ def surfaces_of(scene: mi.Scene) -> list[Surface]:
                 f"diffraction_shader: a diffraction_grating stands inside {bsdf.class_name()}, wanted on a shape or "
                 "inside twosided"
             )
+    if any(surface.grating.rigorous for surface in found):
+        raise RequestError("diffraction_shader: got a grating with theory=rigorous, wanted one of scalar theory")
     return found

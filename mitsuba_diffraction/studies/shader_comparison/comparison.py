@@ -48,6 +48,7 @@ class Comparison:
         shader_reads: texels (two numbers each) that one shading point of the shader reads, at most.
         model_reads: packets (four numbers each) that one BRDF value of the project's model reads for a ray.
         left_out: the most of a line's power that the shader's 3 × 3 texels leave out; None without such.
+        coated: whether a grating has a coat, which the shader does not show.
         shares: of the quirks; None if they were not asked for.
     """
 
@@ -64,6 +65,7 @@ class Comparison:
     shader_reads: int
     model_reads: int
     left_out: float | None
+    coated: bool
     shares: QuirkShares | None
 
 
@@ -141,5 +143,6 @@ def compare(
         shader_reads=of.shader_reads,
         model_reads=of.model_reads,
         left_out=of.left_out,
+        coated=of.has_coat,
         shares=of_quirks,
     )

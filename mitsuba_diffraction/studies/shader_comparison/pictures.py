@@ -71,6 +71,7 @@ class Pictures:
         shaders: of the gratings.
         spectra: of the gratings.
         has_base: whether something lies below a grating.
+        has_coat: whether a layer lies above a grating.
     """
 
     def __init__(
@@ -116,6 +117,7 @@ class Pictures:
         self.shaders: list[Shader] = [shader for _, shader, _ in prepared.surfaces]
         self.spectra = [surface.grating.spectrum for surface, _, _ in prepared.surfaces]
         self.has_base = any(surface.grating.base is not None for surface, _, _ in prepared.surfaces)
+        self.has_coat = any(surface.grating.coat is not None for surface, _, _ in prepared.surfaces)
         self.film_size = tuple(int(size) for size in self.scene.sensors()[0].film().size())
         self.surface = _shows_surfaces(self.scene)
         if not self.surface.any():

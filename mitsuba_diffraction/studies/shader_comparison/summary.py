@@ -91,7 +91,9 @@ def notes(comparison: Comparison) -> list[str]:
         lines.append(
             f"noise: makes a mean ΔE00 of {noise[0]:.2f} in the path-traced picture, {noise[1]:.2f} in the same light's"
         )
-    if comparison.left_out is not None:
+    if comparison.coated:
+        lines.append("coat: the shader shows coated gratings without their coat; it does not converge to this model")
+    elif comparison.left_out is not None:
         lines.append(
             "limit: corrected, the shader converges to this model in the same light; its 3 × 3 texels leave out at "
             f"most {100 * comparison.left_out:.2g} % of a line, and less the longer "
