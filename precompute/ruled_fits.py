@@ -1,4 +1,4 @@
-"""Fits the facet angles of the measured gratings: `python precompute/ruled_fits.py [OUT.json]`; a minute on one core.
+"""Fits facet angles to measured gratings: `python precompute/ruled_fits.py [OUT.json]`; two minutes on one core.
 
 `studies/measured_gratings.py` reads what it writes.
 """

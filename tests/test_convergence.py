@@ -9,7 +9,7 @@ from PIL import Image
 from test_comparison import GRATING, SUN, write
 
 import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a variant is set)
-from mitsuba_diffraction.studies.shader_comparison.convergence import Convergence, Point, convergence
+from mitsuba_diffraction.studies.shader_comparison.convergence import Convergence, Point, convergence, save_plot
 
 WITH_TOLERANCE = GRATING.format(profile="blazed", period=2.0, coherence=3.0, base="").replace(
     "</bsdf>", '<float name="tolerance" value="$tolerance"/></bsdf>'
@@ -41,6 +41,13 @@ def test_when_the_path_tracer_overtakes():
         assert found.overtaken("nmm, as published", error) == pytest.approx(0.1)  # from the first picture on
         assert found.overtaken("pq, as published", error) == pytest.approx(4 * 4 ** (np.log(4 / 2.5) / np.log(2)))
         assert np.isnan(found.overtaken("pq, corrected", error))
+
+
+def test_any_number_of_tolerances_is_drawn(tmp_path):
+    points = [point(f"tolerance {0.1 * 2**-k:g}", 1.0 + seconds, 9.0 - k) for k in range(6) for seconds in range(2)]
+    save_plot(Convergence("scene.xml", (8, 8), 0.0, tuple(points)), tmp_path / "plot.png")
+    with Image.open(tmp_path / "plot.png") as picture:
+        assert picture.width > 1000
 
 
 @pytest.mark.slow
@@ -84,7 +91,9 @@ def test_the_command_writes_a_plot_and_numbers(command, llvm, tmp_path, monkeypa
     ("arguments", "words"),
     [
         ("", "unused parameters: - $tolerance"),
-        ("--tolerance -1", "tolerance: got -1.0, wanted a positive number"),
+        ("--tolerance -1", "tolerance: got -1, wanted at least 3e-05: the reference takes a third of the finest"),
+        ("--tolerance 0.1 --tolerance 2e-5", "tolerance: got 2e-05, wanted at least 3e-05"),
+        ("-o plot.pdf", "-o: got plot.pdf, wanted a file name that ends in .png"),
         ("--spp 0", "--spp"),
         ("--width 8 --width 9", "--width: got it twice, wanted one value"),
         ("-o scene.xml", "--output: got it twice"),
@@ -93,7 +102,8 @@ def test_the_command_writes_a_plot_and_numbers(command, llvm, tmp_path, monkeypa
 def test_a_mistake_is_one_line(arguments, words, command, llvm, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write(Path("scene.xml"))
-    code, out, err = command(f"convergence scene.xml -o plot.png --variant llvm_ad_spectral {arguments}")
+    output = "" if "-o plot" in arguments else "-o plot.png"
+    code, out, err = command(f"convergence scene.xml {output} --variant llvm_ad_spectral {arguments}")
     assert (code, out) == (2, "")
     assert len(err.splitlines()) == 1, err
     assert words in err

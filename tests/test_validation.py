@@ -10,7 +10,7 @@ import pytest
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction import rigorous, scalar_theory
-from mitsuba_diffraction.studies import analytic, conservation, coupled_waves, report
+from mitsuba_diffraction.studies import analytic, conservation, coupled_waves, measured_gratings, report
 from mitsuba_diffraction.studies.accuracy import against_reference
 from mitsuba_diffraction.studies.checks import checks, main_period, scalar_range, surface_checks
 from mitsuba_diffraction.studies.record import Check, Record
@@ -51,6 +51,15 @@ def test_a_record_is_within_its_bound_or_not():
     worst = Record.worst([1.0, 2.0], [1.2, 2.5], [0.1, 1.0])
     assert (worst.measured, worst.bound, worst.ok) == (1.2, 0.1, False)
     assert Record.worst([10.0, 1.0], [12.0, 1.3], 1.0, relative=True).error == pytest.approx(0.3)
+
+
+@pytest.mark.slow
+def test_measured_gratings_are_drawn_beside_both_theories():
+    panels = measured_gratings.plot(step=250).axes
+    assert [panel.get_title().split(":")[0] for panel in panels] == ["R150", "R400", "B600", "R831"]
+    for panel in panels:
+        labels = panel.get_legend_handles_labels()[1]
+        assert [label.split()[0] for label in labels] == ["rigorous", "scalar", "measured"]
 
 
 @pytest.mark.slow
@@ -317,7 +326,12 @@ def test_wrong_requests_are_refused(command, tmp_path):
     for option in ("--json", "--markdown"):
         code, _, error = command("validate", option, str(tmp_path / "nowhere" / "results"))
         assert (code, error.count("\n"), error.count("nowhere is not there")) == (2, 1, 1)
-    code, _, error = command("validate", "--variant", "scalar_spectral")
+    (tmp_path / "ruled.toml").write_text('[surface]\nprofile = "blazed"\n[spectrum]\ntheory = "rigorous"\n')
+    code, _, error = command("validate", str(tmp_path / "ruled.toml"))
+    assert (code, error.count("\n")) == (2, 1)
+    assert "ruled.toml: got theory = 'rigorous', wanted scalar" in error
+    code, _, error = command("validate", "--variant", "scalar_spectral", "--figures", str(tmp_path / "figures"))
+    assert not (tmp_path / "figures").exists()
     assert (code, error.count("\n")) == (2, 1)
     assert "wanted llvm_" in error
 

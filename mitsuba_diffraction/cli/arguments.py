@@ -75,6 +75,13 @@ def claim(
     )
 
 
+def wanted_suffix(option: str, path: Path, *suffixes: str) -> None:
+    """Raises ValueError unless the name of an output ends in one of these."""
+    if path.suffix.lower() not in suffixes:
+        wanted = " or ".join(filter(None, [", ".join(suffixes[:-1]), suffixes[-1]]))
+        raise RequestError(f"{option}: got {path}, wanted a file name that ends in {wanted}")
+
+
 def _refuse_other_than_utf8(text: str) -> None:
     try:
         text.encode()

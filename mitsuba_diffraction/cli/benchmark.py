@@ -10,7 +10,7 @@ from rich.console import Console
 
 from ..errors import RequestError
 from ..surface.readers import read_height_field
-from .arguments import Overwrite, Variant, claim
+from .arguments import Overwrite, Variant, claim, wanted_suffix
 from .console import out, progress_bar
 from .inputs import files_read
 
@@ -41,6 +41,8 @@ def benchmark(
     from ..surface.gratings import ruled
     from ..variants import choose_variant
 
+    if plot is not None:
+        wanted_suffix("--plot", plot, ".png")
     writes = [(option, path) for option, path in (("--json", json), ("--plot", plot)) if path is not None]
     claim(context, [] if scan is None else files_read(scan), writes)
     cases = bundled_cases()

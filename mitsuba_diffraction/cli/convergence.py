@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from .arguments import Define, Overwrite, Variant, claim, scene_parameters
+from .arguments import Define, Overwrite, Variant, claim, scene_parameters, wanted_suffix
 from .console import out, progress_bar, tell
 from .inputs import files_read
 
@@ -38,6 +38,7 @@ def convergence(
     from ..variants import choose_variant
 
     parameters = scene_parameters(define)
+    wanted_suffix("-o", plot, ".png")
     written = [("-o", plot), *([("--json", json)] if json is not None else [])]
     claim(context, files_read(scene, parameters), written)
     mi.set_variant(choose_variant(variant))

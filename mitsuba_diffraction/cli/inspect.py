@@ -12,14 +12,13 @@ from rich.console import Console
 from rich.table import Table
 
 from ..coherence import SUN_COHERENCE_LENGTH, lobe_width
-from ..errors import RequestError
 from ..outputs import free_name, save_json
 from ..scalar_theory import TRUSTED
 from ..studies.inspection import Inspection, save_picture
 from ..studies.inspection import inspect as look
 from ..studies.inspection.picture import with_uncertainty
 from ..studies.inspection.uncertainty import GREEN
-from .arguments import Overwrite, claim
+from .arguments import Overwrite, claim, wanted_suffix
 from .console import out, progress_bar, tell
 from .inputs import files_read
 from .scan import (
@@ -59,8 +58,7 @@ def inspect(
     reads = files_read(source)
     by_default = free_name(f"{source.stem}_inspect", lambda stem: [Path(f"{stem}.png")], reads)
     picture = output or Path(f"{by_default}.png")
-    if picture.suffix.lower() not in (".png", ".pdf", ".svg"):
-        raise RequestError(f"-o: got {picture}, wanted a file name that ends in .png, .pdf or .svg")
+    wanted_suffix("-o", picture, ".png", ".pdf", ".svg")
     claim(context, reads, [("-o", picture), *([("--json", json)] if json else [])])
     of_scan = options_of_scan(
         pixel_size, height_range, fill_missing, channel, unit, [*["level_plane"] * plane, *(prepare or [])]

@@ -15,7 +15,7 @@ from ..spectrum import GratingSpectrum
 from ..spectrum.build import REPRESENTATIONS, THEORIES
 from ..spectrum.load import Spectrum
 from ..surface.seam import seam_matters, seam_steps
-from .arguments import Overwrite, claim
+from .arguments import Overwrite, claim, wanted_suffix
 from .console import progress_bar, tell
 from .inputs import files_read
 from .scan import (
@@ -47,7 +47,9 @@ def precompute(
     representation: Annotated[str | None, typer.Option(help=f"{', '.join(REPRESENTATIONS)}; default: auto")] = None,
     tolerance: Annotated[
         float | None,
-        typer.Option(help="largest error, a fraction of the reflected power; default: 0.001, rigorous 0.01"),
+        typer.Option(
+            help="largest error, a fraction of the reflected power; default: 0.001, samples and rigorous up to 0.01"
+        ),
     ] = None,
     theory: Annotated[
         str | None,
@@ -85,8 +87,7 @@ def precompute(
     of_scan = options_of_scan(pixel_size, height_range, fill_missing, channel, unit, prepare)
     targets = [output or Path(source.name or "spectrum").with_suffix(".exr") for source in sources]
     for target in targets:
-        if target.suffix.lower() != ".exr":
-            raise RequestError(f"-o: got {target}, wanted a file name that ends in .exr")
+        wanted_suffix("-o", target, ".exr")
     reads = [file for source in sources for file in files_read(source)]
     claim(context, reads, [("-o" if output else f"spectrum of {s}", t) for s, t in zip(sources, targets, strict=True)])
     seams = [_seam(source, recipe_of(source, of_scan, settings)) for source in sources]

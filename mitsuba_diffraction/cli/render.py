@@ -10,7 +10,7 @@ import typer
 
 from ..errors import RequestError
 from ..outputs import free_name
-from .arguments import Define, Overwrite, Variant, claim, scene_parameters
+from .arguments import Define, Overwrite, Variant, claim, scene_parameters, wanted_suffix
 from .console import Stopped, progress_bar, tell
 from .inputs import files_read
 
@@ -63,8 +63,8 @@ def render(
     from ..render.turntable import orbit as motions_of_orbit
     from ..variants import choose_variant
 
-    if output is not None and output.suffix.lower() != ".exr":
-        raise RequestError(f"-o: got {output}, wanted a file name that ends in .exr")
+    if output is not None:
+        wanted_suffix("-o", output, ".exr")
     if (frames is not None) != orbit:
         raise RequestError("--frames N and --orbit go together")
     parameters = scene_parameters(define)

@@ -51,16 +51,17 @@ def validate(
     if surface is None and (of_scan or settings):
         names = ", ".join(f"--{name.replace('_', '-')}" for name in {**of_scan, **settings})
         raise RequestError(f"{names}: got no surface; they go with a scan, --extent with a recipe, too")
+    chosen = choose_variant(variant)
+    if chosen.startswith("scalar"):
+        raise RequestError(f"--variant: got {chosen}, wanted llvm_… or cuda_…: the checks take millions of directions")
+    reads = [] if surface is None else files_read(surface)
     writes = [(option, path) for option, path in (("--json", json), ("--markdown", markdown)) if path is not None]
     if figures is not None:
         from ..studies.figures import figure_names, save_figures
 
         figures.mkdir(parents=True, exist_ok=True)
         writes += [("--figures", figures / name) for name in figure_names()]
-    claim(context, [] if surface is None else files_read(surface), writes)
-    chosen = choose_variant(variant)
-    if chosen.startswith("scalar"):
-        raise RequestError(f"--variant: got {chosen}, wanted llvm_… or cuda_…: the checks take millions of directions")
+    claim(context, reads, writes)
     mi.set_variant(chosen)
     these = checks() if surface is None else _of_surface(surface, of_scan, settings)
     results = []
@@ -92,5 +93,7 @@ def _of_surface(path: Path, of_scan: dict[str, object], settings: dict[str, obje
     if path.suffix.lower() != ".toml":
         settings = {"extent": "sample", **settings}
     recipe = recipe_of(path, of_scan, settings).of_one_patch()
+    if recipe.spectrum.get("theory") == "rigorous":
+        raise RequestError(f"{path}: got theory = 'rigorous', wanted scalar; precompute prints the measured errors")
     with progress_bar(f"spectrum of {path.name}") as progress:
         return surface_checks(recipe.height_field(), recipe.cached(progress))

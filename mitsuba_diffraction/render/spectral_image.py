@@ -15,13 +15,13 @@ from ..color import spectrum_to_linear_sRGB
 from ..errors import RequestError
 from ..files import whole_file
 from ..outputs import made_for
+from ..spectrum.exr import one_line, silence
 
 _LAYOUT_VERSION = "1.0"
 # Radiance per nm, the unit in the channel names: the authors of the layout and pbrt-v4 omit the nm⁻¹, and
 # colour-science integrates the channels over wavelength.
 _UNITS = "W.m^-2.sr^-1"
 _CHANNEL = re.compile(r"S0\.(\d+(?:,\d+)?)nm")
-_MAGIC = b"\x76\x2f\x31\x01"
 # Header entries of OpenEXR and of the layout, which are not attributes.
 _RESERVED = frozenset(
     (
@@ -121,15 +121,16 @@ class SpectralImage:
         """
         import OpenEXR
 
-        with Path(path).open("rb") as stream:
-            # OpenEXR would print to stderr before raising.
-            if stream.read(4) != _MAGIC:
-                raise RequestError(f"{os.fspath(path)}: not an OpenEXR file")
+        if not Path(path).is_file():
+            raise FileNotFoundError(f"{os.fspath(path)}: no such file")
         try:
-            file = OpenEXR.File(os.fspath(path), separate_channels=True)
-            header, channels = file.header(), file.channels()
+            with silence():
+                file = OpenEXR.File(os.fspath(path), separate_channels=True)
+                header, channels = file.header(), file.channels()
         except (RuntimeError, ValueError) as error:
-            raise RequestError(f"{os.fspath(path)}: cannot be read as OpenEXR, is it whole? ({error})") from error
+            raise RequestError(
+                f"{os.fspath(path)}: cannot be read as OpenEXR, is it whole? ({one_line(error)})"
+            ) from error
         for name, wanted in (("spectralLayoutVersion", _LAYOUT_VERSION), ("emissiveUnits", _UNITS)):
             if header.get(name) != wanted:
                 raise RequestError(f"{os.fspath(path)}: {name} is {header.get(name)!r}, wanted {wanted!r}")

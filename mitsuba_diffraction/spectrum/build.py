@@ -48,6 +48,7 @@ _LARGEST_TABLE = 4e9  # bytes
 # Where none is asked for: the tolerances that measurements and pictures need, and in between, of a sample, a share of
 # its standard error. A table exact to 1e-3 of what is known to 25 % is waste.
 _FINEST, _COARSEST = 1e-3, 1e-2
+LEAST_TOLERANCE = 1e-5
 _SCATTER_SHARE = 0.1
 
 Progress = Callable[[int, int], None]
@@ -124,7 +125,7 @@ def precompute(
         )
     if theory == "rigorous":
         if len(patches) > 1:
-            raise RequestError(f"patches: got {len(patches)} with theory 'rigorous', wanted one")
+            raise RequestError(f"theory: got rigorous of {height_field.source}, wanted a profile h(x) of one row")
         if (extent, largest_angle, representation) != ("tile", 90.0, "auto"):
             raise RequestError(
                 f"theory: got rigorous with extent {extent!r}, largest_angle {largest_angle!r} and representation "
@@ -220,8 +221,10 @@ def _digest(patches: Sequence[HeightField]) -> str:
 
 def check_tolerance(tolerance: float) -> None:
     """Raises ValueError unless `tolerance` is a share of the power that float32 can keep."""
-    if not 1e-5 <= tolerance < 1:
-        raise RequestError(f"tolerance: got {tolerance!r}, wanted a share of the reflected power from 1e-5 to 1")
+    if not LEAST_TOLERANCE <= tolerance < 1:
+        raise RequestError(
+            f"tolerance: got {tolerance!r}, wanted a share of the reflected power from {LEAST_TOLERANCE:g} to 1"
+        )
 
 
 def _tile_splines(

@@ -16,6 +16,7 @@ import numpy as np
 from ...errors import RequestError
 from ...files import whole_file
 from ...outputs import metadata
+from ...spectrum.build import LEAST_TOLERANCE
 from ..report import cells
 from .comparison import no_progress
 from .difference import as_shown, difference, noise, white_luminance
@@ -135,8 +136,11 @@ def convergence(
         FileNotFoundError: if there is no such scene.
         ValueError: if the request is wrong, or a shader cannot show the scene.
     """
-    if not min(tolerances) > 0:
-        raise RequestError(f"tolerance: got {min(tolerances)}, wanted a positive number")
+    if not min(tolerances) >= 3 * LEAST_TOLERANCE:
+        raise RequestError(
+            f"tolerance: got {min(tolerances):g}, wanted at least {3 * LEAST_TOLERANCE:g}: "
+            "the reference takes a third of the finest"
+        )
 
     def pictures(tolerance: float, shader: str = SHADERS[0], seed: int = 0) -> Pictures:
         chosen = {**(parameters or {}), "tolerance": f"{tolerance:g}"}
@@ -183,19 +187,21 @@ def rows(found: Convergence) -> list[list[str]]:
 
 def save_plot(found: Convergence, path: str | os.PathLike[str]) -> None:
     """Draws both errors against time: down is more accurate, left is faster."""
+    from matplotlib import colormaps
     from matplotlib.figure import Figure
 
+    traced = {point.name for point in found.points if point.traced}
     figure = Figure(figsize=(9.5, 4.6), layout="constrained")
     panels = figure.subplots(1, 2)
     for panel, error, label in zip(
         panels, ("delta_e", "relative_mse"), ("mean ΔE00", "relative mean square error"), strict=True
     ):
-        colours = iter(("#1b6ca8", "#3fa0d9", "#8fcdf2", "#bfe3f7"))
+        blues = iter(colormaps["Blues"](np.linspace(0.5, 0.9, len(traced))[::-1]))
         shaders = dict(zip(SHADERS, ("#c0392b", "#d98c1f", "#6b8e23"), strict=True))
         for name, curve in found.curves().items():
             seconds, errors = ([getattr(point, key) for point in curve] for key in ("seconds", error))
             if curve[0].traced:
-                panel.loglog(seconds, errors, "o-", color=next(colours), markersize=4, label=f"path tracer, {name}")
+                panel.loglog(seconds, errors, "o-", color=next(blues), markersize=4, label=f"path tracer, {name}")
                 continue
             colour, published = shaders[name.split(",")[0]], name.endswith("published")
             panel.loglog(
