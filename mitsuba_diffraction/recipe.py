@@ -33,7 +33,9 @@ tolerance = 1e-3                 # of a sample by default a tenth of its standar
 largest_height_range = 20.0      # µm; deeper surfaces are refused
 theory = "scalar"                # or "rigorous", of one row and of one material:
 material = "Al"                  # a conductor by Mitsuba's name,
-int_ior = 1.5                    # or an index of refraction
+int_ior = 1.5                    # or an index of refraction;
+ext_ior = 1.0                    # of the medium above, that of a coat
+polarised = false                # with Mueller matrices, for polarised variants
 """
 
 from __future__ import annotations
@@ -54,6 +56,7 @@ from typing import Any
 
 from .errors import RequestError
 from .files import cache_folder, refuse_special
+from .rigorous import build as rigorous
 from .spectrum.build import precompute
 from .spectrum.file import FORMAT_VERSION
 from .spectrum.load import Spectrum, load_spectrum
@@ -215,7 +218,7 @@ class Recipe:
         scan = read_height_field(path, keep_missing=True, **parameters)
         try:
             ready = apply_steps(scan, steps)
-            return HeightField(ready.heights, ready.pixel_size, ready.source, fill_missing=fill)
+            return HeightField(ready.heights, ready.pixel_size, ready.source, fill_missing=fill, filled=ready.filled)
         except RequestError as error:
             raise RequestError(f"{path}: {error}") from None
 
@@ -228,7 +231,10 @@ class Recipe:
 
     def digest(self) -> str:
         """SHA-256 of everything that determines the spectrum: the recipe and the contents of the scan."""
-        content = hashlib.sha256(f"{FORMAT_VERSION}.{_BUILD_VERSION}".encode())
+        versions = [FORMAT_VERSION, _BUILD_VERSION]
+        if self.spectrum.get("theory") == "rigorous":
+            versions.append(rigorous.BUILD_VERSION)
+        content = hashlib.sha256(".".join(map(str, versions)).encode())
         surface = dict(self.surface)
         if "scan" in surface:
             scan = self.folder / surface.pop("scan")

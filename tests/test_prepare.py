@@ -54,6 +54,13 @@ ALL = ["level_plane", "level_quadratic", "align_lines", "despike", {"rotate": 18
 # ---------------------------------------------------------------- every step
 
 
+@pytest.mark.parametrize("step", ["level_plane", "despike", {"rotate": 20}, {"trim_edges": 0.1}, {"crop_periods": "x"}])
+def test_what_was_filled_is_remembered(step):
+    field = with_gaps(HeightField(grating((40, 60)), PIXEL))
+    count = int(field.gaps.sum())
+    assert prepare.apply_steps(field, ["fill_missing", step, "fill_missing"]).filled == count > 0
+
+
 @given(heights=fields, step=st.sampled_from(ALL))
 def test_a_step_is_pure_and_keeps_what_is_missing(heights, step):
     field = field_of(heights)

@@ -463,6 +463,16 @@ def test_missing_pixels_wait_for_the_last_step(tmp_path):
         Recipe.load(write(tmp_path, text.replace('"level_plane"', "{ trim_edges = 9 }"))).height_field()
 
 
+def test_tables_of_rigorous_theory_are_built_anew_after_a_change_of_theirs(tmp_path, monkeypatch):
+    scalar, rigorous = (
+        Recipe.load(write(tmp_path, BLAZE + f"[spectrum]\ntheory = '{t}'\n")) for t in ("scalar", "rigorous")
+    )
+    before = scalar.digest(), rigorous.digest()
+    monkeypatch.setattr("mitsuba_diffraction.rigorous.build.BUILD_VERSION", 999)
+    assert scalar.digest() == before[0]
+    assert rigorous.digest() != before[1]
+
+
 def test_the_cache_knows_the_steps_and_their_order(tmp_path):
     tilted(tmp_path)
     texts = [

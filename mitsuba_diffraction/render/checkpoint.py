@@ -2,7 +2,7 @@
 
 A checkpoint is an uncompressed `.npz` file (noise does not compress) with the fields of `Accumulation` and the `digest`
 of the request (`passes.Job`). The comment of the archive is the SHA-256 of the file (`files.seal`). It takes 8 bytes
-per pixel and channel, 690 MB for 1280 × 720 pixels, and twice that while it is being replaced.
+per pixel and channel, 710 MB for 1280 × 720 pixels, and twice that while it is being replaced.
 """
 
 from __future__ import annotations

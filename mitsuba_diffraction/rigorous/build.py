@@ -43,7 +43,7 @@ _NEAR = 0.02
 _CHECKS = 200
 # Light at which the harmonics are chosen: near the normal, and oblique from both sides.
 _HARD = ((0.1, 0, 1), (0.8, 0.3, 0.5), (-0.8, 0.3, 0.5))
-_BUILD_VERSION = 2
+BUILD_VERSION = 2  # raised when tables of equal requests change
 MATRICES = 3.0
 """Bound of `polarisation_error`, in tolerances: matrices vary faster than η."""
 
@@ -161,7 +161,7 @@ class _Surface:
         # What the table is compared with is solved with more.
         self.finer = Grating(curve, int(1.4 * self.harmonics))
         self.digest = hashlib.sha256(
-            repr((height_field.digest, wavelengths, named, self.harmonics, _BUILD_VERSION)).encode()
+            repr((height_field.digest, wavelengths, named, self.harmonics, BUILD_VERSION)).encode()
         ).hexdigest()
 
     def _harmonics(self, height_field: HeightField, direction: tuple[float, ...], tolerance: float) -> int:

@@ -39,11 +39,11 @@ class HeightField:
         heights: (N_y, N_x) float64, µm; row ↔ +y, column ↔ +x.
         pixel_size: (x, y) in µm; one number for square pixels.
         source: origin of the heights (a file name, a formula) and processing steps, as text.
-        filled: number of missing pixels that were filled.
+        filled: number of pixels that were missing and are filled.
 
     Missing pixels (NaN, infinite or masked) are refused. `fill_missing=True` interpolates them instead; see
-    `missing.fill_missing`. `keep_missing=True` keeps them as NaN for the steps of `prepare`; such a height field has
-    neither a height range nor a spectrum.
+    `missing.fill_missing`; they are added to `filled`. `keep_missing=True` keeps them as NaN for the steps of
+    `prepare`; such a height field has neither a height range nor a spectrum.
 
     Raises:
         ValueError: if the heights are not a two-dimensional array of finite numbers with at least one pixel (with
@@ -63,6 +63,7 @@ class HeightField:
         source: str = "array",
         fill_missing: bool = False,
         keep_missing: bool = False,
+        filled: int = 0,
     ) -> None:
         for name, value in (("fill_missing", fill_missing), ("keep_missing", keep_missing)):
             if not isinstance(value, bool | np.bool_):
@@ -70,10 +71,11 @@ class HeightField:
         array = np.array(missing.as_heights(heights), order="C")
         pixel_size = as_pixel_size(pixel_size)
         gaps = ~np.isfinite(array)
-        filled = int(gaps.sum()) if fill_missing else 0
-        if filled:
+        if fill_missing and gaps.any():
+            count = int(gaps.sum())
             array = missing.fill_missing(array, pixel_size)
-            source = f"{source} ({filled} missing pixel{'s' if filled > 1 else ''} filled)"
+            source = f"{source} ({count} missing pixel{'s' if count > 1 else ''} filled)"
+            filled += count
         elif keep_missing:
             if gaps.all():
                 raise RequestError(f"heights: all {gaps.size} pixels are missing, wanted at least one height in µm")

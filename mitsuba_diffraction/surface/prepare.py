@@ -138,7 +138,8 @@ def _noise(heights: NDArray[np.float64]) -> float:
 def fill_missing(height_field: HeightField) -> HeightField:
     """Fill missing pixels by harmonic interpolation (`missing.fill_missing`)."""
     filled = missing.fill_missing(height_field.heights, height_field.pixel_size)
-    return _after(height_field, filled, f"fill_missing: {height_field.gaps.sum()} of {filled.size} pixels")
+    count = int(height_field.gaps.sum())
+    return _after(height_field, filled, f"fill_missing: {count} of {filled.size} pixels", filled=count)
 
 
 def trim_edges(height_field: HeightField, width: float) -> HeightField:
@@ -370,10 +371,15 @@ def _parts(step: object) -> tuple[str, object]:
 
 
 def _after(
-    height_field: HeightField, heights: NDArray, told: str, pixel_size: tuple[float, float] | None = None
+    height_field: HeightField,
+    heights: NDArray,
+    told: str,
+    pixel_size: tuple[float, float] | None = None,
+    filled: int = 0,
 ) -> HeightField:
     source = f"{height_field.source}; {told}"
-    return HeightField(heights, pixel_size or height_field.pixel_size, source, keep_missing=True)
+    size, filled = pixel_size or height_field.pixel_size, height_field.filled + filled
+    return HeightField(heights, size, source, keep_missing=True, filled=filled)
 
 
 def _check_positive(name: str, value: object, wanted: str) -> None:
