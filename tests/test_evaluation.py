@@ -50,10 +50,10 @@ def test_a_flat_mirror_has_the_relative_reflectance_one(llvm):
     np.testing.assert_allclose(found, 1, atol=2e-3)  # what cutting off the lobes and the bytes of E leave
 
 
+@pytest.mark.usefixtures("no_energy_tables")
 @pytest.mark.few(1)
 @pytest.mark.parametrize("order", [-1, 0, 1])
 def test_orders_of_a_shallow_blaze_are_the_analytic_ones(llvm, order):
-    # So shallow that energy is conserved of itself (E = 1).
     depth, period, incidence = 0.02, 2.5, np.deg2rad(20.0)
     spectrum = md.precompute(md.gratings.blazed(period, depth), tolerance=1e-4)
     for nanometres in (400.0, 550.0, 777.0):
@@ -197,6 +197,7 @@ def test_nmm_sees_only_the_orders_of_the_tile(llvm, incidence):
 # ---------------------------------------------------------------- maps of directions
 
 
+@pytest.mark.usefixtures("no_energy_tables")
 @pytest.mark.few(1)
 @pytest.mark.parametrize("projection", PROJECTIONS)
 def test_an_order_is_where_the_map_says(llvm, projection):
