@@ -6,20 +6,20 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from ..errors import RequestError
 from ..surface.readers import read_height_field
 from .arguments import Overwrite, Variant, claim, wanted_suffix
-from .console import out, progress_bar
+from .console import progress_bar, show
 from .inputs import files_read
+from .scan import HeightRange, PixelSize
 
 
 def benchmark(
     context: typer.Context,
     scan: Annotated[Path | None, typer.Argument(metavar="[SCAN]", help="a scan to include")] = None,
-    pixel_size: Annotated[float | None, typer.Option(help="pixel size of the scan, µm")] = None,
-    height_range: Annotated[float | None, typer.Option(help="heights from black to white, µm")] = None,
+    pixel_size: PixelSize = None,
+    height_range: HeightRange = None,
     surface: Annotated[list[str] | None, typer.Option(help="only these of the built-in surfaces")] = None,
     tolerance: Annotated[list[float] | None, typer.Option(help="only these tolerances")] = None,
     variant: Variant = None,
@@ -53,8 +53,6 @@ def benchmark(
     if scan is not None:
         cases.append(scan_case(read_height_field(scan, pixel_size=pixel_size, height_range=height_range)))
     mi.set_variant(choose_variant(variant))
-    # Wide enough in any terminal, and in a file.
-    wide = Console(highlight=False, width=max(out.width, 140))
     if rigorous:
         if scan is not None or surface or tolerance or plot is not None:
             raise RequestError(
@@ -62,7 +60,7 @@ def benchmark(
             )
         with progress_bar("rigorous efficiencies") as progress:
             costs = compare_theories(ruled(1200), progress=progress)
-        wide.print(report.table(COLUMNS, (report.cells(COLUMNS, cost) for cost in costs)))
+        show(report.table(COLUMNS, (report.cells(COLUMNS, cost) for cost in costs)), width=140)
         if json is not None:
             report.save_json({"theories": costs}, json)
         return
@@ -71,7 +69,7 @@ def benchmark(
     with progress_bar("sampling") as progress:
         # Pictures need no more.
         sampling = measure(cases, max(tolerance or TOLERANCES), progress=progress)
-    wide.print(*tables(results, shaders, sampling), sep="\n\n")
+    show(*tables(results, shaders, sampling), width=140)
     if json is not None:
         save_json(results, shaders, sampling, json)
     if plot is not None:

@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from ..files import whole_file
 from ..outputs import free_name
 from .arguments import Define, Overwrite, Variant, claim, scene_parameters
-from .console import out, progress_bar, tell
+from .console import progress_bar, show, tell
 from .inputs import files_read
 
 _PICTURES = {"-path.exr": "path_traced", "-published.exr": "published", "-corrected.exr": "corrected"}
@@ -77,10 +76,7 @@ def compare(
         summary.save_figure(found, files.enter_context(whole_file(f"{prefix}.png")))
         if json is not None:
             summary.save_json(found, files.enter_context(whole_file(json)))
-    # Wide enough in any terminal, and in a file.
-    wide = Console(highlight=False, width=max(out.width, 120))
-    wide.print(summary.picture_table(found))
-    if found.shares is not None:
-        wide.print("", summary.quirk_table(found), sep="\n")
+    of_quirks = () if found.shares is None else (summary.quirk_table(found),)
+    show(summary.picture_table(found), *of_quirks, width=120)
     tell("\n" + "\n".join(summary.notes(found)))
     tell(f"{', '.join(str(target) for _, target in written)}: {found.variant}, {time.perf_counter() - start:.1f} s")

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from rich.console import Console
+from rich.console import Console, RenderableType
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 NAME = "mitsuba-diffraction"
@@ -61,6 +61,11 @@ def progress_bar(label: str, unit: str = "") -> Iterator[Callable[..., None]]:
 def tell(text: str) -> None:
     # File names are not markup.
     out.print(text, markup=False, emoji=False)
+
+
+def show(*tables: RenderableType, width: int) -> None:
+    """Print tables, at least `width` characters wide: whole in any terminal, and in a file."""
+    Console(highlight=False, width=max(out.width, width)).print(*tables, sep="\n\n")
 
 
 def say(kind: str, message: object) -> None:

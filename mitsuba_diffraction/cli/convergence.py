@@ -7,10 +7,9 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from .arguments import Define, Overwrite, Variant, claim, scene_parameters, wanted_suffix
-from .console import out, progress_bar, tell
+from .console import progress_bar, show, tell
 from .inputs import files_read
 
 
@@ -54,8 +53,7 @@ def convergence(
     study.save_plot(found, plot)
     if json is not None:
         report.save_json(found, json)
-    wide = Console(highlight=False, width=max(out.width, 100))
-    wide.print(report.table(study.COLUMNS, study.rows(found)))
+    show(report.table(study.COLUMNS, study.rows(found)), width=100)
     for name, curve in found.curves().items():
         if not curve[0].traced:
             times = [found.overtaken(name, error) for error in ("delta_e", "relative_mse")]

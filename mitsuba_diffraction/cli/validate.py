@@ -6,12 +6,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
 
 from ..errors import RequestError
 from ..outputs import save_markdown
 from .arguments import Overwrite, Variant, claim
-from .console import out, progress_bar, tell
+from .console import progress_bar, show, tell
 from .inputs import files_read
 from .scan import Channel, FillMissing, HeightRange, PixelSize, Prepare, Unit, options_of_scan, recipe_of
 
@@ -69,7 +68,7 @@ def validate(
         for check in these:
             results.append(check.run())
             progress(len(results), len(these))
-    Console(highlight=False, width=max(out.width, 120)).print(report.record_table(results))
+    show(report.record_table(results), width=120)
     missed = [result.name for result in results if not result.ok]
     promised = sum(result.bound is not None for result in results)
     tell(
