@@ -88,23 +88,14 @@ def load_spectral_scene(
     for name, size in (("width", width), ("height", height)):
         if size is not None and size < 1:
             raise RequestError(f"{name}: got {size}, wanted a positive number of pixels")
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
-
-    config = mi.parser.ParserConfig(variant)
-    # On several threads, Mitsuba 3.9.1 failed in one of thirty loads of a scene with gratings and sunsky.
-    config.parallel = False
-    with _files_beside(path):
-        try:
-            state = mi.parser.parse_file(config, str(path.resolve()), **(parameters or {}))
-            _replace_films(state, width, height)
-            if motion is not None:
-                _move_first_sensor(state, motion)
-            mi.parser.transform_all(config, state)
-            scene = mi.parser.instantiate(config, state)
-        except Exception as error:
-            raise RequestError(f"{path}: {root_cause(error)}{_what_there_is(path, str(error))}") from error
+    with _parsed(path, parameters) as (config, state):
+        _replace_films(state, width, height)
+        if motion is not None:
+            _move_first_sensor(state, motion)
+        mi.parser.transform_all(config, state)
+        # On several threads, Mitsuba 3.9.1 failed in one of thirty loads of a scene with gratings and sunsky.
+        config.parallel = False
+        scene = mi.parser.instantiate(config, state)
     if not isinstance(scene, mi.Scene):
         raise RequestError(f"{path}: the file holds a {type(scene).__name__}, wanted a scene")
     if scene.integrator().aov_names():
@@ -119,22 +110,14 @@ def named_sample_count(path: str | os.PathLike[str], parameters: Mapping[str, st
         FileNotFoundError: if there is no such file.
         ValueError: if the scene is wrong.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
-    with _files_beside(path):
-        try:
-            config = mi.parser.ParserConfig(mi.variant())
-            state = mi.parser.parse_file(config, str(path.resolve()), **(parameters or {}))
-        except Exception as error:
-            raise RequestError(f"{path}: {root_cause(error)}{_what_there_is(path, str(error))}") from error
-    for node in state.nodes:
-        if node.type == mi.ObjectType.Sensor:
-            for child in _children(node.props).values():
-                props = state.nodes[child].props
-                if state.nodes[child].type == mi.ObjectType.Sampler and "sample_count" in props:
-                    return int(props["sample_count"])
-            return None
+    with _parsed(path, parameters) as (_, state):
+        for node in state.nodes:
+            if node.type == mi.ObjectType.Sensor:
+                for child in _children(node.props).values():
+                    props = state.nodes[child].props
+                    if state.nodes[child].type == mi.ObjectType.Sampler and "sample_count" in props:
+                        return int(props["sample_count"])
+                return None
     return None
 
 
@@ -143,10 +126,8 @@ def scene_digest(path: str | os.PathLike[str], parameters: Mapping[str, str] | N
 
     Files enter by content, not by path; a recipe includes the scan it references.
     """
-    path = Path(path)
-    content = hashlib.sha256(path.read_bytes())
-    with _files_beside(path):
-        state = mi.parser.parse_file(mi.parser.ParserConfig(mi.variant()), str(path.resolve()), **(parameters or {}))
+    content = hashlib.sha256(Path(path).read_bytes())
+    with _parsed(path, parameters) as (_, state):
         for node in state.nodes:
             content.update(f"{node.props.plugin_name()}\n".encode())
             for name, value in node.props.items():
@@ -172,14 +153,27 @@ def _in_full(value: object) -> str:
 
 
 @contextmanager
-def _files_beside(scene: Path) -> Iterator[None]:
-    """Makes Mitsuba search the folder of a scene first."""
+def _parsed(
+    path: str | os.PathLike[str], parameters: Mapping[str, str] | None
+) -> Iterator[tuple[mi.parser.ParserConfig, mi.parser.ParserState]]:
+    """A scene as it is parsed; in the block, Mitsuba searches the folder of the scene first.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if parsing or the block fails, with the cause in one line.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file")
     resolver = mi.file_resolver()
     beside_scene = mi.FileResolver(resolver)
-    beside_scene.prepend(str(scene.resolve().parent))
+    beside_scene.prepend(str(path.resolve().parent))
     mi.set_file_resolver(beside_scene)
     try:
-        yield
+        config = mi.parser.ParserConfig(mi.variant())
+        yield config, mi.parser.parse_file(config, str(path.resolve()), **(parameters or {}))
+    except Exception as error:
+        raise RequestError(f"{path}: {root_cause(error)}{_what_there_is(path, str(error))}") from error
     finally:
         mi.set_file_resolver(resolver)
 
