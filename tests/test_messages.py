@@ -26,7 +26,7 @@ BLAZED = '<string name="profile" value="blazed"/><float name="period" value="2.5
         (
             GRATING % (BLAZED + '<string name="material" value="Alu"/>'),
             {},
-            r"'Alu', did you mean Al or .*of none, ",
+            r"'Alu', did you mean Al or .*of Ag, Al, ",
         ),
         (GRATING % (BLAZED + '<bsdf type="diffuse"/>'), {}, 'wanted <bsdf name="base"'),
         (GRATING % (BLAZED + '<string name="height_scale" value="a"/>'), {}, "height_scale: got 'a', wanted a number"),
