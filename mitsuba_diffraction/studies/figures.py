@@ -39,7 +39,7 @@ MAP_COHERENCE = {"blaze": 6.5}
 """µm, of the BRDF maps: in sunlight the orders of the blaze would be thinner than a pixel."""
 
 TITLES = {MODEL: "this model", "flss": "FLSS", "nmm": "NMM", "pq": "PQ", "gem": "GEM"}
-_PEAK, _EQUATION = "#d62728", "#1f77b4"
+_PEAK = "#d62728"
 _DARKEST = 1e-3  # of the strongest reflectance outside of the specular peak
 
 
