@@ -93,7 +93,7 @@ def load_spectral_scene(
         if motion is not None:
             _move_first_sensor(state, motion)
         mi.parser.transform_all(config, state)
-        # On several threads, Mitsuba 3.9.1 failed in one of thirty loads of a scene with gratings and sunsky.
+        # Plugins one after the other: on several threads, a loop of loads and renderings once ended in a crash.
         config.parallel = False
         scene = mi.parser.instantiate(config, state)
     if not isinstance(scene, mi.Scene):
