@@ -9,10 +9,7 @@ from hypothesis import strategies as st
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction.coherence import lobe_reach
-from mitsuba_diffraction.spectrum.expansions import nodes_for
-from mitsuba_diffraction.spectrum.expansions.chebyshev import ChebyshevSeries
-from mitsuba_diffraction.spectrum.expansions.svd import SvdSeries
-from mitsuba_diffraction.spectrum.expansions.taylor import TaylorSeries
+from mitsuba_diffraction.spectrum.expansions import chebyshev, nodes_for, svd, taylor
 from mitsuba_diffraction.spectrum.orders import OrderGrid
 from mitsuba_diffraction.spectrum.series_table import SeriesTable
 from mitsuba_diffraction.spectrum.slice_table import SliceTable, halved, packed
@@ -197,10 +194,10 @@ def build(kind, field):
     nodes = nodes_for(LARGEST_KAPPA * field.half_range, 1e-7)
     if kind == "svd":
         kappas = (1 - np.cos(np.pi * (np.arange(nodes) + 0.5) / nodes)) / 2 * LARGEST_KAPPA
-        series = SvdSeries.fit(LARGEST_KAPPA, np.array([powers(kappa).ravel() for kappa in kappas]))
+        series, projection = svd(LARGEST_KAPPA, np.array([powers(kappa).ravel() for kappa in kappas]))
     else:
-        series = {"taylor": TaylorSeries, "chebyshev": ChebyshevSeries}[kind](LARGEST_KAPPA, nodes)
-    return SeriesTable.build(series, nodes, powers, ignore)
+        series, projection = {"taylor": taylor, "chebyshev": chebyshev}[kind](LARGEST_KAPPA, nodes)
+    return SeriesTable.build(series, projection, powers, ignore)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -305,7 +302,7 @@ def test_no_density_is_negative(extent, representation):
 )
 def test_series_tables_check_their_numbers(terms):
     with pytest.raises(ValueError, match="terms: got"):
-        SeriesTable(TaylorSeries(0.1, 3), terms)
+        SeriesTable(taylor(0.1, 3)[0], terms)
 
 
 @pytest.mark.parametrize(

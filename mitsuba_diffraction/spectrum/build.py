@@ -19,10 +19,17 @@ from ..surface.heightfield import HeightField
 from ..wavelengths import VISIBLE
 from ..welch import carried_coherence_length
 from . import GratingSpectrum
-from .expansions import chebyshev_nodes, chebyshev_polynomials, chebyshev_transform, nodes_for, position
-from .expansions.chebyshev import ChebyshevSeries
-from .expansions.svd import SvdSeries
-from .expansions.taylor import TaylorSeries
+from .expansions import (
+    Series,
+    chebyshev,
+    chebyshev_nodes,
+    chebyshev_polynomials,
+    chebyshev_transform,
+    nodes_for,
+    position,
+    svd,
+    taylor,
+)
 from .grating_spectrum import TAIL_SHARE, check_angle, check_wavelengths
 from .load import Spectrum
 from .orders import LobeAxis, inner
@@ -34,7 +41,7 @@ from .standard_error import standard_error
 from .tile import TilePowers, TileSplines
 
 THEORIES = ("scalar", "rigorous")
-REPRESENTATIONS = ("auto", TaylorSeries.name, ChebyshevSeries.name, SvdSeries.name, SliceTable.representation)
+REPRESENTATIONS = ("auto", "taylor", "chebyshev", "svd", SliceTable.representation)
 
 # Shares of the tolerance.
 _DROP_SHARE = 0.1  # weak frequencies
@@ -400,21 +407,21 @@ class _Build:
             return SliceTable.build(
                 intervals, storage.terms, self._largest_kappa, self._powers, storage.rounded, self._phase(0.3, 0.8)
             )
-        if representation == SvdSeries.name:
-            modes = SvdSeries.fit(self._largest_kappa, self._pilot)
-            series = modes.first(self._terms(modes, allowed))
-        else:
-            if representation == TaylorSeries.name and 2.0**-24 * np.exp(min(self._x, 80.0)) > 20 * self._allowed:
+        if representation == "taylor":
+            if 2.0**-24 * np.exp(min(self._x, 80.0)) > 20 * self._allowed:
                 # Each term is good to 2^-24 of its size, and their sizes add up to e^x; the bound is generous by 20.
                 raise RequestError(self._refusal(representation, None))
-            kind = TaylorSeries if representation == TaylorSeries.name else ChebyshevSeries
-            whole = kind(self._largest_kappa, self._nodes)
-            series = kind(self._largest_kappa, self._terms(whole, allowed))
-        _check_size(self.kept.shape, series.terms)
-        return SeriesTable.build(series, self._nodes, self._powers, self._phase(0.3, 0.8))
+            series, projection = taylor(self._largest_kappa, self._nodes)
+        elif representation == "chebyshev":
+            series, projection = chebyshev(self._largest_kappa, self._nodes)
+        else:
+            series, projection = svd(self._largest_kappa, self._pilot)
+        terms = self._terms(series, projection, allowed)
+        _check_size(self.kept.shape, terms)
+        return SeriesTable.build(series.first(terms), projection[:terms], self._powers, self._phase(0.3, 0.8))
 
     def _refusal(self, representation: str, error: float | None) -> str:
-        if representation == TaylorSeries.name:
+        if representation == "taylor":
             why = f"the terms of the series grow to e^{self._x:.1f} and cancel; representation 'slices' keeps it"
         else:
             why = "rounding does not allow it"
@@ -430,11 +437,11 @@ class _Build:
         vander = chebyshev_polynomials(position(kappas, self._largest_kappa), self._nodes)
         return kappas, vander @ chebyshev_transform(self._nodes)
 
-    def _terms(self, series: TaylorSeries | ChebyshevSeries | SvdSeries, allowed: float) -> int:
+    def _terms(self, series: Series, projection: NDArray[np.float64], allowed: float) -> int:
         """The fewest terms with which the pilot is kept at every κ."""
         allowed *= self._pilot_share
         kappas, interpolate = self._between()
-        terms = series.projection(self._nodes) @ self._pilot
+        terms = projection @ self._pilot
         weights = series.weights(kappas)
         error = np.abs(interpolate @ self._pilot).sum(axis=1)
         remainder = interpolate @ self._pilot

@@ -19,9 +19,7 @@ import numpy as np
 
 from ..errors import RequestError
 from .energy_table import EnergyTable
-from .expansions.chebyshev import ChebyshevSeries
-from .expansions.svd import SvdSeries
-from .expansions.taylor import TaylorSeries
+from .expansions import Series, chebyshev, taylor
 from .exr import doubles, one_line, read, write
 from .orders import OrderGrid
 from .series_table import SeriesTable
@@ -61,7 +59,7 @@ def save(spectrum: GratingSpectrum, path: str | os.PathLike[str], recipe: str = 
         "sourceSha256": spectrum.source_digest,
         "units": "lengths in micrometres, wavelengths in nanometres",
     }
-    if isinstance(spectrum.table, SeriesTable) and isinstance(spectrum.table.series, SvdSeries):
+    if spectrum.representation == "svd":
         # repr of a float is exact.
         header["modes"] = json.dumps(spectrum.table.series.modes.tolist())
     # Scenes seldom ask for another kind of shadowing: of the others, those that are there.
@@ -131,9 +129,9 @@ def _grid(header: dict, shape: tuple[int, int]) -> OrderGrid | SplineGrid:
 
 
 _TERM_NAMES = {
-    TaylorSeries.name: "B{{t^{:03d}}}",
-    ChebyshevSeries.name: "B{{T_{:03d}}}",
-    SvdSeries.name: "B{{mode {:03d}}}",
+    "taylor": "B{{t^{:03d}}}",
+    "chebyshev": "B{{T_{:03d}}}",
+    "svd": "B{{mode {:03d}}}",
 }
 _REPRESENTATIONS = (*_TERM_NAMES, SliceTable.representation)
 
@@ -150,11 +148,12 @@ def _table(header: dict, pixels: dict[str, np.ndarray], largest_kappa: float) ->
         terms = 4 if "S(000.3)" in pixels else 3
         values = [[pixels[f"S({k:03d}.{p})"] for p in range(terms)] for k in range(count // terms)]
         return SliceTable(largest_kappa, np.array(values, np.float32))
-    if kind == SvdSeries.name:
-        series = SvdSeries(largest_kappa, np.array(json.loads(header["modes"]), np.float64))
+    terms = np.stack([pixels[_TERM_NAMES[kind].format(n)] for n in range(count)])
+    if kind == "svd":
+        series = Series(kind, largest_kappa, np.array(json.loads(header["modes"]), np.float64))
     else:
-        series = (TaylorSeries if kind == TaylorSeries.name else ChebyshevSeries)(largest_kappa, count)
-    return SeriesTable(series, np.stack([pixels[_TERM_NAMES[kind].format(n)] for n in range(count)]))
+        series, _ = (taylor if kind == "taylor" else chebyshev)(largest_kappa, count)
+    return SeriesTable(series, terms)
 
 
 def _single(value: np.ndarray) -> float:

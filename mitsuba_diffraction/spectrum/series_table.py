@@ -36,12 +36,19 @@ class SeriesTable:
     def build(
         cls,
         series: Series,
-        nodes: int,
+        projection: NDArray[np.float64],
         powers: Callable[[float], NDArray[np.float64]],
         progress: Callable[[int, int], None],
     ) -> SeriesTable:
-        """Adds up the terms over `nodes` Chebyshev nodes in κ; little more than the result is held in memory."""
-        projection = series.projection(nodes)
+        """Adds up the terms, little more than which is held in memory.
+
+        Args:
+            series: the g_n(κ).
+            projection: (N, J), B_n = Σ_j projection_nj S(κ_j) over J Chebyshev nodes.
+            powers: S(κ) on the grid, κ in rad/µm.
+            progress: called with (nodes done, J).
+        """
+        nodes = projection.shape[1]
         # Taylor's terms come out of sums that cancel; those of the others are as large as what is summed.
         dtype = np.float64 if np.abs(projection).sum(axis=1).max() > 100 else np.float32
         terms = None
