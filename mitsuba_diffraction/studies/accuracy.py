@@ -53,27 +53,13 @@ def l1_error(
     margin = spectrum.reach * spectrum.lobe_width if lines else 0.0
     q = q[np.hypot(*q.T) < reached - margin]
     approximate = spectrum.evaluate(q, kappa)
+    exact = power_spectrum(height_field, q, kappa, extent=spectrum.extent, coherence_length=spectrum.coherence_length)
     # q are drawn from S/∫S itself, as far as it is not negative; what is not a number stays.
     drawn = ~(approximate <= 0)
-    error = np.abs(approximate - _exact(spectrum, height_field, q, kappa))[drawn] / approximate[drawn]
+    error = np.abs(approximate - exact)[drawn] / approximate[drawn]
     # What lies beyond the reach of the lobes is not drawn.
     tail = 1 - np.prod([lobe.inside for lobe in spectrum.lobes]) if lines else 0.0
     return float(error.sum() / count * shares.sum(dtype=np.float64) + spectrum.dropped + tail)
-
-
-def peak_error(spectrum: GratingSpectrum, height_field: HeightField, kappa: float, count: int = 200) -> float:
-    """The largest relative error at the strongest nodes of the table, of those that reach 1 % of the strongest."""
-    q_x, q_y = spectrum.grid.frequencies()
-    powers = spectrum.powers(kappa)
-    row, column = np.unravel_index(np.argsort(powers.ravel())[::-1][:count], powers.shape)
-    q = np.stack([q_x[column], q_y[row]], axis=-1)
-    exact = _exact(spectrum, height_field, q, kappa)
-    strong = exact > 0.01 * exact.max()
-    return float((np.abs(spectrum.evaluate(q, kappa) - exact)[strong] / exact[strong]).max())
-
-
-def _exact(spectrum: GratingSpectrum, height_field: HeightField, q: Array, kappa: float) -> Array:
-    return power_spectrum(height_field, q, kappa, extent=spectrum.extent, coherence_length=spectrum.coherence_length)
 
 
 def _drawn(
@@ -101,12 +87,10 @@ class Accuracy:
 
     Attributes:
         l1: max over κ of ∫|ΔS| dq, a share of the reflected power.
-        peak: largest relative error of S at peaks, at least a hundredth as strong as the strongest.
         delta_e: (mean, largest) CIEDE2000 of twelve patches of colour.
     """
 
     l1: float
-    peak: float
     delta_e: tuple[float, float]
 
 
@@ -135,7 +119,6 @@ class Exact:
         field, random = self._case.height_field, np.random.default_rng(2)
         return Accuracy(
             l1=float(np.max([l1_error(spectrum, field, kappa, self._points, random) for kappa in self._kappas])),
-            peak=float(np.max([peak_error(spectrum, field, kappa) for kappa in self._kappas])),
             delta_e=patch_difference(self.xyz, self._xyz(spectrum.evaluate(self._q, self._kappa))),
         )
 

@@ -36,7 +36,6 @@ COLUMNS = {
     "MB": "{.megabytes:.3g}",
     "build\ns": "{.build_seconds:.2g}",
     "L1\nerror": "{.accuracy.l1:.1e}",
-    "peak\nerror": "{.accuracy.peak:.1e}",
     "ΔE00\nmean": "{0.accuracy.delta_e[0]:.3f}",
     "ΔE00\nmax": "{0.accuracy.delta_e[1]:.3f}",
     "eval_pdf\n10⁶/s": "{.millions:.1f}",
