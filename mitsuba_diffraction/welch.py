@@ -12,6 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+import scipy.fft
 from numpy.typing import NDArray
 
 from .coherence import lobe_width
@@ -23,6 +24,8 @@ _SUPPORT = 6.0
 # Windows of three quarters of the scan leave room for three positions along each axis, σ_s apart.
 _LARGEST = 0.5
 _FEWEST_PIXELS = 4
+# Segments are transformed in batches of about this many numbers.
+_BATCH = 1 << 17
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +76,29 @@ def window_axes(height_field: HeightField, coherence_length: float) -> tuple[Win
         _axis(count, pixel, sigma) if count > 1 else None
         for count, pixel in zip(height_field.shape[::-1], height_field.pixel_size, strict=True)
     )
+
+
+def mean_periodogram(
+    wave: NDArray[np.complex128], x: WindowAxis, y: WindowAxis, shape: tuple[int, int]
+) -> NDArray[np.float64]:
+    """(1/P) Σ_p |Σ_n a(x_n − x_p) wave_n e^{−2πi q·x_n}|² over all positions of the windows along x and y.
+
+    Args:
+        wave: (rows, columns) at the pixels.
+        x: windows along x.
+        y: windows along y.
+        shape: (rows, columns) of the result, at least those of the window: q as in `scipy.fft.fft2` of zero-padded
+            segments.
+    """
+    window = np.outer(y.window, x.window)
+    segments = np.lib.stride_tricks.sliding_window_view(wave, window.shape)
+    places = np.array([(row, column) for row in y.starts for column in x.starts])
+    total, step = np.zeros(shape), max(1, _BATCH // (shape[0] * shape[1]))
+    for first in range(0, len(places), step):
+        row, column = places[first : first + step].T
+        transform = scipy.fft.fft2(segments[row, column] * window, shape, overwrite_x=True, workers=2)
+        total += (transform.real**2 + transform.imag**2).sum(axis=0)
+    return total / len(places)
 
 
 def _axis(count: int, pixel: float, sigma: float) -> WindowAxis:

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mitsuba_diffraction import HeightField
-from mitsuba_diffraction.welch import carried_coherence_length, window_axes
+from mitsuba_diffraction.welch import WindowAxis, carried_coherence_length, mean_periodogram, window_axes
 
 
 def flat(rows, columns, pixel):
@@ -92,3 +92,23 @@ def test_each_axis_has_windows_of_its_own():
     assert along_y.starts[-1] == 10
     assert window_axes(flat(1, 1, 0.1), 4.0) == (None, None)
     assert window_axes(flat(40, 1, 0.1), 1.0)[0] is None
+
+
+@pytest.mark.parametrize("shape", [(4, 5), (7, 12)])
+def test_periodograms_are_those_of_direct_sums(shape, monkeypatch):
+    rng = np.random.default_rng(0)
+    wave = np.exp(1j * rng.random((9, 11)))
+    x, y = WindowAxis(rng.random(5), np.array([0, 2, 6])), WindowAxis(rng.random(4), np.array([0, 5]))
+    # In batches of one, and of all segments at once.
+    several = [mean_periodogram(wave, x, y, shape)]
+    monkeypatch.setattr("mitsuba_diffraction.welch._BATCH", 1)
+    several.append(mean_periodogram(wave, x, y, shape))
+    rows, columns = np.arange(shape[0]), np.arange(shape[1])
+    wanted = np.zeros(shape)
+    for j in y.starts:
+        for i in x.starts:
+            segment = np.outer(y.window, x.window) * wave[j : j + 4, i : i + 5]
+            along_x = np.exp(-2j * np.pi * np.outer(np.arange(5), columns) / shape[1])
+            along_y = np.exp(-2j * np.pi * np.outer(rows, np.arange(4)) / shape[0])
+            wanted += np.abs(along_y @ segment @ along_x) ** 2 / 6
+    np.testing.assert_allclose(several, [wanted, wanted], rtol=1e-10)

@@ -8,13 +8,11 @@ from numpy.typing import NDArray
 
 from ..coherence import lobe_width
 from ..surface.heightfield import HeightField
-from ..welch import UNIFORM, WindowAxis, window_axes
+from ..welch import UNIFORM, WindowAxis, mean_periodogram, window_axes
 from .spline_grid import SplineGrid
 
 # Along an axis on which the surface is uniform the lobe is followed to this many σ_q.
 _UNIFORM_REACH = 6.0
-# Pieces are transformed in batches of about this many numbers.
-_BATCH = 1 << 17
 
 
 class _Lags:
@@ -69,23 +67,13 @@ class SamplePowers:
 
     def _autocorrelation(self, kappa: float) -> NDArray[np.complex128]:
         """ρ(τ) of the windowed phase, averaged over the places: (lags τ_y, lags τ_x ≥ 0); ρ(0) = 1."""
-        (window_x, starts_x), (window_y, starts_y) = (
-            (axis.window, axis.starts) for axis in (lags.axis or UNIFORM for lags in self._lags)
-        )
-        wave = np.exp(1j * kappa * self._phase)
-        shape = tuple(scipy.fft.next_fast_len(2 * len(w) - 1) for w in (window_y, window_x))
-        pieces = np.lib.stride_tricks.sliding_window_view(wave, (len(window_y), len(window_x)))
-        window = np.outer(window_y, window_x)
-        total = np.zeros(shape)
-        places = [(y, x) for y in starts_y for x in starts_x]
-        step = max(1, _BATCH // (shape[0] * shape[1]))
-        for first in range(0, len(places), step):
-            y, x = np.array(places[first : first + step]).T
-            transform = scipy.fft.fft2(pieces[y, x] * window, shape, overwrite_x=True, workers=2)
-            total += (transform.real**2 + transform.imag**2).sum(axis=0)
-        half = np.conj(scipy.fft.rfft2(total / len(places), norm="forward"))
-        rows = np.arange(-len(window_y) + 1, len(window_y))
-        half = half[rows % shape[0], : len(window_x)]
+        axis_x, axis_y = (lags.axis or UNIFORM for lags in self._lags)
+        width, height = len(axis_x.window), len(axis_y.window)
+        # Padded with zeros, so that the lags do not wrap around.
+        shape = scipy.fft.next_fast_len(2 * height - 1), scipy.fft.next_fast_len(2 * width - 1)
+        power = mean_periodogram(np.exp(1j * kappa * self._phase), axis_x, axis_y, shape)
+        half = np.conj(scipy.fft.rfft2(power, norm="forward"))
+        half = half[np.arange(-height + 1, height) % shape[0], :width]
         x, y = self._lags
         # Along a uniform axis the only row, or column, is drawn out by the window's own autocorrelation.
         if y.axis is None:

@@ -8,12 +8,11 @@ import scipy.ndimage
 from numpy.typing import NDArray
 
 from ..surface.heightfield import HeightField
-from ..welch import UNIFORM, WindowAxis, window_axes
+from ..welch import UNIFORM, WindowAxis, mean_periodogram, window_axes
 
 # Correlation of a surface beyond the width of a window is seen between batches of segments, not between segments.
 _BATCHES = 4  # along each axis
 _KAPPAS = 4
-_CHUNK = 1 << 20  # complex numbers in one intermediate array
 
 
 def standard_error(height_field: HeightField, *, coherence_length: float, largest_kappa: float, reach: float) -> float:
@@ -74,19 +73,12 @@ def _batches(axis: WindowAxis) -> list[NDArray[np.int64]]:
 def _scatter(wave: NDArray[np.complex128], axes: list[WindowAxis]) -> NDArray[np.float64]:
     """⟨(S_b − Ŝ)²⟩ on the frequencies of the window's own transform, shares of the power: (W_y, W_x)."""
     x, y = axes
-    window = np.outer(y.window, x.window)
-    pieces = np.lib.stride_tricks.sliding_window_view(wave, window.shape)
-    step = max(1, _CHUNK // window.size)
+    shape = len(y.window), len(x.window)
     means, weights = [], []
     for rows in _batches(y):
         for columns in _batches(x):
-            places = np.array([(j, i) for j in y.starts[rows] for i in x.starts[columns]])
-            total = np.zeros(window.shape)
-            for first in range(0, len(places), step):
-                j, i = places[first : first + step].T
-                transform = scipy.fft.fft2(pieces[j, i] * window, overwrite_x=True)
-                total += (transform.real**2 + transform.imag**2).sum(axis=0)
-            means.append(total / (len(places) * window.size))
-            weights.append(len(places))
+            batch = WindowAxis(x.window, x.starts[columns]), WindowAxis(y.window, y.starts[rows])
+            means.append(mean_periodogram(wave, *batch, shape) / (shape[0] * shape[1]))
+            weights.append(len(rows) * len(columns))
     mean = np.average(means, axis=0, weights=weights)
     return np.average((np.array(means) - mean) ** 2, axis=0, weights=weights)
