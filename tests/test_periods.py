@@ -216,6 +216,22 @@ def test_the_count_is_a_positive_integer(count):
         find_periods(HeightField(wave((20, 20), 0.3, 0), PIXEL), count)
 
 
+def test_the_extent_is_known():
+    with pytest.raises(ValueError, match="extent: got 'ribbon', wanted 'tile' or 'sample'"):
+        find_periods(HeightField(wave((20, 20), 0.3, 0), PIXEL), extent="ribbon")
+
+
+@pytest.mark.parametrize("periods", [1, 5])
+def test_the_period_of_a_tile_is_an_order_of_its_lattice(periods):
+    x = (np.arange(50) + 0.5) / 50 * periods
+    tile = HeightField(0.02 * np.sin(2 * np.pi * x) + np.zeros((30, 1)), PIXEL)
+    (found,) = find_periods(tile, extent="tile")
+    assert (found.period, found.direction) == (pytest.approx(tile.tile_size[0] / periods, rel=1e-12), 0)
+    assert found.period_uncertainty == found.direction_uncertainty == 0
+    # As a sample, a single wave is none that stands out, and several are known only so well.
+    assert [round(one.period, 2) for one in find_periods(tile)] == [round(found.period, 2)] * (periods > 1)
+
+
 def test_a_period_is_plain_numbers():
     (found,) = find_periods(HeightField(wave((40, 40), 0.5, 10), PIXEL))
     assert isinstance(found, Period)

@@ -9,7 +9,7 @@ import numpy as np
 from ..scalar_theory import TRUSTED, equivalent_depth, expected_error
 from ..spectrum import GratingSpectrum
 from ..surface.heightfield import HeightField
-from ..surface.periods import find_periods, find_periods_of_tile
+from ..surface.periods import find_periods
 from . import analytic, bumps, conservation, coupled_waves, measured_gratings, rough_surface, viewing_angle
 from .accuracy import against_reference
 from .inspection.statistics import statistics
@@ -46,7 +46,7 @@ def surface_checks(height_field: HeightField, spectrum: GratingSpectrum) -> tupl
 
 def main_period(height_field: HeightField, extent: str) -> float:
     """The strongest period in µm; NaN if there is none."""
-    found = find_periods_of_tile(height_field, 1) if extent == "tile" else find_periods(height_field, 1)
+    found = find_periods(height_field, 1, extent=extent)
     return found[0].period if found else float("nan")
 
 

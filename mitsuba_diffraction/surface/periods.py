@@ -93,7 +93,7 @@ class Period:
         )
 
 
-def find_periods(height_field: HeightField, count: int = 2) -> tuple[Period, ...]:
+def find_periods(height_field: HeightField, count: int = 2, *, extent: str = "sample") -> tuple[Period, ...]:
     """The strongest periods of a height field.
 
     A wave is detected where the power of the levelled and windowed (Hann) heights exceeds the background by a factor
@@ -120,19 +120,27 @@ def find_periods(height_field: HeightField, count: int = 2) -> tuple[Period, ...
     A peak broader than a bin of the spectrum is a band of periods: its centre, width and strength are fitted to all
     bins (`bands`), and the scatter of the centre over the quarters of the patch is added in the same way.
 
+    A wave is detected in a patch that holds several of its periods: a tile is repeated until there are enough. Its
+    single periods are orders of its lattice, and exactly known.
+
     Args:
         height_field: need not be levelled; missing pixels are filled first.
         count: largest number of periods.
+        extent: "tile": the patch repeats for ever; "sample": it is a piece of a larger surface.
 
     Returns:
         Single periods, strongest first, then bands, strongest first, with directions at least 15° apart. Empty if none
         is significant (noise, a flat surface).
 
     Raises:
-        ValueError: if count is not a positive integer.
+        ValueError: if count is not a positive integer, or the extent is unknown.
     """
     if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
         raise RequestError(f"count: got {count!r}, wanted a positive integer")
+    if extent not in ("tile", "sample"):
+        raise RequestError(f"extent: got {extent!r}, wanted 'tile' or 'sample'")
+    if extent == "tile":
+        return _periods_of_tile(height_field, count)
     heights = fill_missing(height_field.heights, height_field.pixel_size)
     spectrum = _Spectrum(heights, height_field.pixel_size)
     if not spectrum.scale > 1e-13 * np.abs(heights).max():  # flat up to rounding
@@ -417,11 +425,7 @@ class _LeastSquares:
         return self._inverse @ self._gram(2) @ self._inverse
 
 
-def find_periods_of_tile(tile: HeightField, count: int = 2) -> tuple[Period, ...]:
-    """The strongest periods of a height field that repeats: orders of its lattice; see `find_periods`.
-
-    A wave stands out of a patch with several of its periods; the tile is repeated until there are enough.
-    """
+def _periods_of_tile(tile: HeightField, count: int) -> tuple[Period, ...]:
     # Of one period of a profile, harmonics stand out before the period does.
     for times in (_MOST_TIMES,) if 1 in tile.shape else (1, 2, 4, _MOST_TIMES):
         if found := find_periods(repeated(tile, times), count):

@@ -17,7 +17,7 @@ from ...spectrum import GratingSpectrum
 from ...spectrum.build import precompute
 from ...spectrum.standard_error import standard_error
 from ...surface.heightfield import HeightField
-from ...surface.periods import Period, find_periods, find_periods_of_tile, repeated
+from ...surface.periods import Period, find_periods, repeated
 from ...wavelengths import VISIBLE
 from ...welch import carried_coherence_length
 from .colours import LONGEST_COHERENCE
@@ -137,11 +137,7 @@ def inspect(
 
     numbers = statistics(height_field, extent=extent)
     shortest = VISIBLE[0] * 1e-3
-
-    def find(surface: HeightField) -> tuple[Period, ...]:
-        return find_periods_of_tile(surface) if extent == "tile" else find_periods(surface)
-
-    periods = find(height_field)
+    periods = find_periods(height_field, extent=extent)
     spectrum = build(height_field)
     depth = equivalent_depth(numbers.Sq)
     result = Inspection(
@@ -160,7 +156,7 @@ def inspect(
             nm: float(np.max([expected_error(period.period, depth, nm * 1e-3) for period in periods]))
             for nm in (SCALAR_AT if periods else ())
         },
-        changes=changes(height_field, spectrum, periods[0], extent=extent, build=build, find=find) if periods else (),
+        changes=changes(height_field, spectrum, periods[0], extent=extent, build=build) if periods else (),
         concerns=concerns(
             height_field, numbers, used, measured=measured, periods=[period.period for period in periods]
         ),

@@ -12,7 +12,7 @@ from ...color import spectrum_to_XYZ
 from ...errors import RequestError
 from ...spectrum import GratingSpectrum
 from ...surface.heightfield import HeightField
-from ...surface.periods import Period
+from ...surface.periods import Period, find_periods
 from .colours import WAVELENGTHS, order_angle, order_share, radiance
 from .tip import broadened
 
@@ -65,7 +65,6 @@ def changes(
     *,
     extent: str,
     build: Callable[[HeightField], GratingSpectrum],
-    find: Callable[[HeightField], tuple[Period, ...]],
 ) -> tuple[Change, ...]:
     """Two of each kind, + and −.
 
@@ -78,7 +77,6 @@ def changes(
         main: its main period.
         extent: "tile" or "sample".
         build: makes spectra alike.
-        find: finds periods.
     """
     orders = [m for m in ORDERS if order_angle(m, main.period, GREEN) is not None]
     before = _View(spectrum, main.period)
@@ -105,7 +103,8 @@ def changes(
             other, radius = broadened(height_field, by, extent=extent)
         except RequestError:
             continue  # steps from one pixel to the next: no tip is that sharp
-        found.append(change("tip broadening", by, _View(build(other), _same_period(find(other), main)), radius))
+        period = _same_period(find_periods(other, extent=extent), main)
+        found.append(change("tip broadening", by, _View(build(other), period), radius))
     return tuple(found)
 
 
