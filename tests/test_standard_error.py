@@ -1,6 +1,5 @@
 """The standard error of one scan against the scatter of many, whose truth is known."""
 
-import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -115,16 +114,8 @@ def test_in_between_it_is_a_tenth(rough):
 
 def test_a_tile_has_none():
     spectrum = md.precompute(md.gratings.blazed(samples=64))
-    assert spectrum.standard_error is None
-    with pytest.raises(ValueError, match=r"standard_error: got 0.1 of a tile, wanted a number ≥ 0 of a sample only"):
-        dataclasses.replace(spectrum, standard_error=0.1)
-
-
-@pytest.mark.parametrize("standard_error", [None, -0.1, np.nan])
-def test_a_sample_has_one(rough, standard_error):
-    spectrum = md.precompute(rough, extent="sample", coherence_length=1.0, tolerance=0.03)
-    with pytest.raises(ValueError, match=f"standard_error: got {standard_error} of a sample"):
-        dataclasses.replace(spectrum, standard_error=standard_error)
+    with pytest.raises(ValueError, match="standard_error: got a tile, wanted a sample"):
+        spectrum.standard_error  # noqa: B018
 
 
 @pytest.mark.slow

@@ -216,7 +216,7 @@ def precompute(
         largest_angle=float(largest_angle),
         dropped=build.dropped,
         beyond=build.beyond,
-        standard_error=scatter,
+        scatter=scatter,
     )
 
 

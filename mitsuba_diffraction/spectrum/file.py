@@ -54,7 +54,7 @@ def save(spectrum: GratingSpectrum, path: str | os.PathLike[str], recipe: str = 
         "dropped": doubles(spectrum.dropped),
         "beyond": doubles(spectrum.beyond),
         "patches": spectrum.patches,
-        **({} if spectrum.standard_error is None else {"standardError": doubles(spectrum.standard_error)}),
+        **({"standardError": doubles(spectrum.standard_error)} if spectrum.extent == "sample" else {}),
         "source": spectrum.source,
         "sourceSha256": spectrum.source_digest,
         "units": "lengths in micrometres, wavelengths in nanometres",
@@ -106,7 +106,7 @@ def load(path: str | os.PathLike[str], construct: Callable[..., Spectrum], recip
             dropped=_single(header["dropped"]),
             beyond=_single(header["beyond"]),
             patches=header["patches"],
-            standard_error=_single(header["standardError"]) if header["extent"] == "sample" else None,
+            scatter=_single(header["standardError"]) if header["extent"] == "sample" else None,
             energy={kind: EnergyTable.from_plain(t) for kind, t in json.loads(header["energy"]).items()},
         )
     except KeyError as error:

@@ -51,9 +51,7 @@ class GratingSpectrum:
         beyond: the largest share of the power, over κ, at frequencies that no pair of directions reaches, or that the
             pixels do not resolve.
         patches: of how many draws of an irregular surface it is the mean.
-        standard_error: of a sample, ∫ of the standard error of Welch's estimate over q, at the worst κ: of one scan
-            about the mean of many. A share of the reflected power, comparable to `error`; see `standard_error.py`. None
-            of a tile: a patch that repeats for ever is known exactly.
+        scatter: of a sample, its `standard_error`; None of a tile.
         energy: the tables that bound the albedo, by the kind of shadowing; `energy_table` computes what is missing.
     """
 
@@ -72,7 +70,7 @@ class GratingSpectrum:
     dropped: float = 0.0
     beyond: float = 0.0
     patches: int = 1
-    standard_error: float | None = None
+    scatter: float | None = None
     energy: Mapping[str, EnergyTable] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
@@ -92,10 +90,8 @@ class GratingSpectrum:
             raise RequestError(f"dropped, beyond: got {self.dropped}, {self.beyond}, wanted shares of the power")
         if not (isinstance(self.patches, int) and self.patches >= 1):
             raise RequestError(f"patches: got {self.patches!r}, wanted a whole number of at least 1")
-        if (self.standard_error is None) != (self.extent == "tile") or not 0 <= (self.standard_error or 0.0) < np.inf:
-            raise RequestError(
-                f"standard_error: got {self.standard_error} of a {self.extent}, wanted a number ≥ 0 of a sample only"
-            )
+        if (self.scatter is not None) != (self.extent == "sample") or not 0 <= (self.scatter or 0.0) < np.inf:
+            raise RequestError(f"scatter: got {self.scatter} of a {self.extent}, wanted a number ≥ 0 of a sample only")
         if not all(key == getattr(table, "shadowing", None) for key, table in self.energy.items()):
             raise RequestError(
                 f"energy: got {', '.join(map(str, self.energy))}, wanted energy tables by their shadowing"
@@ -108,6 +104,21 @@ class GratingSpectrum:
     def representation(self) -> str:
         """How the powers are stored: "taylor", "chebyshev", "svd" or "slices"."""
         return self.table.representation
+
+    @property
+    def standard_error(self) -> float:
+        """∫ of the standard error of Welch's estimate over q, at the worst κ: of one scan about the mean of many.
+
+        A share of the reflected power, comparable to `error`; see `standard_error.standard_error`.
+
+        Raises:
+            RequestError: of a tile.
+        """
+        if self.scatter is None:
+            raise RequestError(
+                "standard_error: got a tile, wanted a sample: a patch that repeats for ever is known exactly"
+            )
+        return self.scatter
 
     @property
     def largest_kappa(self) -> float:
