@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import scipy.special
 
@@ -27,7 +29,7 @@ def lobe_width(coherence_length: float) -> float:
         raise RequestError(
             f"coherence_length: got {coherence_length!r}, wanted a positive number of µm, {SHORTEST:g} to {LONGEST:g}"
         )
-    return 1 / (2 * np.sqrt(2) * np.pi * (coherence_length / 4))
+    return 1 / (2 * math.sqrt(2) * math.pi * (coherence_length / 4))
 
 
 def lobe_reach(share: float) -> float:

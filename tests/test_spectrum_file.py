@@ -21,6 +21,7 @@ from mitsuba_diffraction.files import seal
 from mitsuba_diffraction.spectrum.energy_table import SHADOWING, EnergyTable
 from mitsuba_diffraction.spectrum.file import FORMAT_VERSION
 from mitsuba_diffraction.spectrum.slice_table import SliceTable
+from mitsuba_diffraction.spectrum.spline_grid import SplineGrid
 
 SHAPES = [(1, 1), (1, 8), (7, 1), (5, 5), (4, 6)]
 KINDS = ["taylor", "chebyshev", "svd", "slices"]
@@ -64,6 +65,14 @@ def saved(request, tmp_path):
     spectrum = built(extent, kind)
     spectrum.save(tmp_path / "saved.exr")
     return spectrum, tmp_path / "saved.exr"
+
+
+@pytest.mark.parametrize("coherence_length", [65.0, 0.8])
+def test_what_was_read_shares_the_tables_of_what_was_built(tmp_path, coherence_length):
+    spectrum = make(shape=(16, 16), tolerance=0.05, coherence_length=coherence_length)
+    assert isinstance(spectrum.grid, SplineGrid) == (coherence_length < 1)
+    spectrum.save(tmp_path / "saved.exr")
+    assert GratingSpectrum.load(tmp_path / "saved.exr").digest == spectrum.digest
 
 
 def contents(path):

@@ -280,7 +280,7 @@ def _refined(lattice: Callable[[float], Splines], sigma: float, largest_kappa: f
         if error <= allowed:
             return powers
         # The error of quadratic splines falls with the third power of the spacing.
-        spacing *= min(0.95, 0.95 * (allowed / error) ** (1 / 3))
+        spacing *= float(min(0.95, 0.95 * (allowed / error) ** (1 / 3)))
 
 
 @dataclasses.dataclass(frozen=True)

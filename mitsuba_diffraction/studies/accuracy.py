@@ -68,7 +68,7 @@ def _drawn(
     """`count` frequencies q with the density S: a node, and a place in its lobe or spline."""
     q_x, q_y = spectrum.grid.frequencies()
     total = np.cumsum(shares.ravel(), dtype=np.float64)
-    # Evenly spread numbers in random order: less noise than independent ones.
+    # One random number in each of `count` equal steps: less noise than independent ones.
     places = (np.arange(count) + random.random(count)) / count * total[-1]
     row, column = np.unravel_index(np.minimum(np.searchsorted(total, places), total.size - 1), shares.shape)
     if isinstance(spectrum.grid, OrderGrid):
