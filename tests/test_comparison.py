@@ -253,14 +253,14 @@ def test_a_share_is_what_it_says(llvm, tmp_path):
 
     assert against.published == pytest.approx(mean(*names))
     assert against.corrected == pytest.approx(mean())
-    one = against.shares["power_gamma"]
+    one = against.quirks["power_gamma"]
     assert one.drop == pytest.approx(mean(*names) - mean("constant_blend", "infrared_rainbow", NO_SHADOWS))
     assert one.rise == pytest.approx(mean("power_gamma") - mean())
-    assert against.share("power_gamma") == pytest.approx((one.drop + one.rise) / 2 / mean(*names))
+    assert one.share == pytest.approx((one.drop + one.rise) / 2 / mean(*names))
     # The sky is none of the shader's.
     assert found.path_traced.corrected > against.corrected
     # A plate without shadows is no picture of a plate with one.
-    assert found.same_light.shares[NO_SHADOWS].rise > 1
+    assert found.same_light.quirks[NO_SHADOWS].rise > 1
 
 
 def test_what_is_read_for_a_point(llvm, tmp_path):
@@ -299,6 +299,8 @@ def test_compare_writes_pictures_numbers_and_a_figure(command, llvm, folder):
     assert f"{found['exposure factor']:.3g}" in out
     assert 0 < found["mean"] <= found["95 %"] <= found["max"]
     assert numbers["shares"]["size"] == [12, 9]
+    for reference in ("of path tracer", "of same light"):
+        assert {*numbers["shares"][reference]["quirks"]["power_gamma"]} == {"drop", "rise", "share"}
     for name in ("constant_blend", "infrared_rainbow", "power_gamma", NO_SHADOWS):
         assert name in out
     # The pictures are those of the numbers.

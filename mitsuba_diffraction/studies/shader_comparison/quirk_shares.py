@@ -10,15 +10,17 @@ from .pictures import Pictures, Progress, silent
 
 @dataclass(frozen=True)
 class QuirkShare:
-    """One quirk against one reference; both numbers are differences of mean CIEDE2000.
+    """One quirk against one reference.
 
     Attributes:
-        drop: of the published shader, when this quirk alone is corrected.
-        rise: of the corrected shader, when this quirk alone is put in.
+        drop: of the mean CIEDE2000 of the published shader, when this quirk alone is corrected.
+        rise: of the mean CIEDE2000 of the corrected shader, when this quirk alone is put in.
+        share: (drop + rise)/2 over the mean CIEDE2000 of the published shader.
     """
 
     drop: float
     rise: float
+    share: float
 
 
 @dataclass(frozen=True)
@@ -29,17 +31,13 @@ class AgainstReference:
         published: mean CIEDE2000 of the shader as published.
         corrected: of the shader without quirks.
         noise: of the reference; None if it has one sample per pixel.
-        shares: by the name of the quirk.
+        quirks: by name.
     """
 
     published: float
     corrected: float
     noise: float | None
-    shares: dict[str, QuirkShare]
-
-    def share(self, name: str) -> float:
-        """The share of a quirk in the difference of the published shader: (drop + rise)/2 over `published`."""
-        return (self.shares[name].drop + self.shares[name].rise) / 2 / self.published
+    quirks: dict[str, QuirkShare]
 
 
 @dataclass(frozen=True)
@@ -51,13 +49,15 @@ class QuirkShares:
 
     Attributes:
         size: (width, height) of the pictures.
-        samples: per pixel of the path tracer, and shading points of the shader.
+        samples: per pixel of the path tracer.
+        shading_points: per pixel of the shader.
         path_traced: against the path tracer's picture.
         same_light: against the project's model under the light that the shader knows.
     """
 
     size: tuple[int, int]
-    samples: tuple[int, int]
+    samples: int
+    shading_points: int
     path_traced: AgainstReference
     same_light: AgainstReference
 
@@ -90,17 +90,14 @@ def quirk_shares(pictures: Pictures, samples: int, shading_points: int, progress
     published, corrected = distances(names), distances(())
     without = {name: distances(tuple(other for other in names if other != name)) for name in names}
     alone = {name: distances((name,)) for name in names}
-    results = [
-        AgainstReference(
-            published=published[index],
-            corrected=corrected[index],
-            noise=noise(reference.halves, pictures.surface, white),
-            shares={
-                name: QuirkShare(published[index] - without[name][index], alone[name][index] - corrected[index])
-                for name in names
-            },
-        )
-        for index, reference in enumerate(references)
-    ]
+
+    def against(index: int) -> AgainstReference:
+        quirks = {}
+        for name in names:
+            drop, rise = published[index] - without[name][index], alone[name][index] - corrected[index]
+            quirks[name] = QuirkShare(drop, rise, (drop + rise) / 2 / published[index])
+        floor = noise(references[index].halves, pictures.surface, white)
+        return AgainstReference(published[index], corrected[index], floor, quirks)
+
     rows, columns = pictures.surface.shape
-    return QuirkShares((columns, rows), (samples, shading_points), *results)
+    return QuirkShares((columns, rows), samples, shading_points, path_traced=against(0), same_light=against(1))

@@ -64,17 +64,17 @@ def quirk_table(comparison: Comparison) -> Table:
     for name in ordered(shares.path_traced):
         row = [name]
         for against in (shares.path_traced, shares.same_light):
-            one = against.shares[name]
+            one = against.quirks[name]
             # Adding zero takes the sign from a zero.
             row += [f"{round(value, 2) + 0.0:+.2f}" for value in (one.drop, one.rise)]
-            row.append(f"{against.share(name):.0%}")
+            row.append(f"{one.share:.0%}")
         rows.append(row)
     return report.table(columns, rows)
 
 
 def ordered(against: AgainstReference) -> list[str]:
     """The quirks, the largest share first."""
-    return sorted(against.shares, key=against.share, reverse=True)
+    return sorted(against.quirks, key=lambda name: against.quirks[name].share, reverse=True)
 
 
 def notes(comparison: Comparison) -> list[str]:
@@ -101,8 +101,8 @@ def notes(comparison: Comparison) -> list[str]:
         )
     if (shares := comparison.shares) is not None:
         lines.append(
-            f"quirks: pictures of {shares.size[0]} × {shares.size[1]} pixels, {shares.samples[0]} samples, "
-            f"{shares.samples[1]} shading points"
+            f"quirks: pictures of {shares.size[0]} × {shares.size[1]} pixels, {shares.samples} samples, "
+            f"{shares.shading_points} shading points"
         )
         for name, one in (("path tracer", shares.path_traced), ("same light", shares.same_light)):
             lines.append(
@@ -117,33 +117,18 @@ def notes(comparison: Comparison) -> list[str]:
     return lines
 
 
-_DIFFERENCE = {
-    "exposure factor": "exposure",
-    "mean": "mean",
-    "95 %": "percentile_95",
-    "max": "largest",
-    "luminance error": "luminance_error",
-}
-
-
 def _difference(found: Difference) -> dict[str, float]:
-    return {label: getattr(found, attribute) for label, attribute in _DIFFERENCE.items()}
-
-
-def _against(reference: AgainstReference) -> dict[str, object]:
     return {
-        "published": reference.published,
-        "corrected": reference.corrected,
-        "noise": reference.noise,
-        "quirks": {
-            name: {"drop": one.drop, "rise": one.rise, "share": reference.share(name)}
-            for name, one in reference.shares.items()
-        },
+        "exposure factor": found.exposure,
+        "mean": found.mean,
+        "95 %": found.percentile_95,
+        "max": found.largest,
+        "luminance error": found.luminance_error,
     }
 
 
 def as_dict(comparison: Comparison) -> dict[str, object]:
-    """All numbers, for JSON."""
+    """All numbers, for `report.save_json`."""
     shares = comparison.shares
     return {
         "scene": comparison.scene,
@@ -166,10 +151,10 @@ def as_dict(comparison: Comparison) -> dict[str, object]:
         "shares": shares
         and {
             "size": shares.size,
-            "samples": shares.samples[0],
-            "shading points": shares.samples[1],
-            "of path tracer": _against(shares.path_traced),
-            "of same light": _against(shares.same_light),
+            "samples": shares.samples,
+            "shading points": shares.shading_points,
+            "of path tracer": shares.path_traced,
+            "of same light": shares.same_light,
         },
     }
 
@@ -225,7 +210,7 @@ def _bars(panel: Axes, against: AgainstReference) -> None:
         (-0.2, "rise", "C0", "put in alone"),
         (0.2, "drop", "0.6", "corrected alone"),
     ):
-        values = [getattr(against.shares[name], attribute) for name in names]
+        values = [getattr(against.quirks[name], attribute) for name in names]
         panel.barh(places + offset, values, height=0.4, color=colour, label=label)
     panel.axvline(0, color="0.3", linewidth=0.8)
     panel.set_yticks(places, [name.replace("_", " ") for name in names], fontsize="x-small")
