@@ -365,10 +365,18 @@ def test_inspect_tells_and_draws(folder, command):
         assert words in out, words
     assert "\x1b" not in out
     assert "pixel size +5%" in out
+    assert "…" not in out.partition("5 % more or less of")[2]  # no column is cut
     assert json.loads(Path("numbers.json").read_text())["carried_coherence_length"] == pytest.approx(4.0)
     assert {path.name for path in folder.iterdir()} == {
         *("waves.npy", "grey.png", "foil.toml", "numbers.json", "waves_inspect.png")
     }
+
+
+def test_a_file_name_is_shown_as_it_is(folder, command):
+    np.save("[red]:smile:.npy", np.random.default_rng(0).standard_normal((40, 40)) * 0.01)
+    code, out, err = command("inspect [red]:smile:.npy --pixel-size 0.08 -o picture.png")
+    assert (code, err) == (0, "")
+    assert "surface           [red]:smile:.npy" in out
 
 
 @pytest.mark.slow

@@ -10,6 +10,7 @@ import numpy as np
 import typer
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from ..coherence import SUN_COHERENCE_LENGTH, lobe_width
 from ..outputs import free_name, save_json
@@ -18,6 +19,7 @@ from ..studies.inspection import Inspection, save_picture
 from ..studies.inspection import inspect as look
 from ..studies.inspection.picture import with_uncertainty
 from ..studies.inspection.uncertainty import GREEN
+from ..studies.report import table
 from .arguments import Overwrite, claim, wanted_suffix
 from .console import out, progress_bar, tell
 from .inputs import files_read
@@ -90,12 +92,12 @@ def inspect(
 
 
 def _table(inspection: Inspection) -> Table:
-    table = Table(box=None, show_header=False, pad_edge=False)
-    table.add_column(style="bold", no_wrap=True)
-    table.add_column()
+    shown = Table(box=None, show_header=False, pad_edge=False)
+    shown.add_column(style="bold", no_wrap=True)
+    shown.add_column()
     for name, value in [*_surface(inspection), *_light(inspection)]:
-        table.add_row(name, value)
-    return table
+        shown.add_row(name, Text(value))  # file names are not markup
+    return shown
 
 
 def _surface(inspection: Inspection) -> list[tuple[str, str]]:
@@ -106,7 +108,7 @@ def _surface(inspection: Inspection) -> list[tuple[str, str]]:
     if 1 < numbers.levels <= 256:
         levels += f", {numbers.step * 1e3:.3g} nm apart"
     return [
-        ("surface", _escaped(f"{field.source} ({kind})")),
+        ("surface", f"{field.source} ({kind})"),
         ("size", f"{field.tile_size[0]:.4g} × {field.tile_size[1]:.4g} µm, {columns} × {rows} pixels"),
         ("pixel size", f"{field.pixel_size[0] * 1e3:.4g} × {field.pixel_size[1] * 1e3:.4g} nm"),
         ("missing", f"{field.filled} pixels, filled" if field.filled else "none"),
@@ -172,33 +174,24 @@ def _scalar(inspection: Inspection) -> str:
 
 def _changes_table(inspection: Inspection) -> Table:
     before = inspection.changes[0].before
-    table = Table(box=None, pad_edge=False)
-    table.add_column("5 % more or less of", no_wrap=True)
-    table.add_column("period", justify="right")
+    columns = ["5 % more or less of", "period"]
     for order, share in before.items():
-        table.add_column(f"power in orders ±{order}, {share:.3g}", justify="right")
-        table.add_column("their colour", justify="right")
+        columns += [f"power in orders\n±{order}, {share:.3g}", "their colour"]
+    rows = []
     for change in inspection.changes:
         name = f"{change.what} {change.by:+.0%}"
         if np.isfinite(change.tip_radius):
             kind = "blunter" if change.tip_radius > 0 else "sharper"
             name += f" (tip {kind} by {abs(change.tip_radius) * 1e3:.0f} nm)"
-        cells = [f"{change.period:+.1%}"]
+        row = [name, f"{change.period:+.1%}"]
         for order, share in before.items():
-            cells += [
+            row += [
                 f"{change.after[order] / share - 1:+.1%}" if share > 0 else "",
                 f"ΔE00 {change.colour[order]:.1f}",
             ]
-        table.add_row(name, *cells)
-    return table
+        rows.append(row)
+    return table(columns, rows)
 
 
 def _nm(length: float) -> str:
     return f"{length * 1e3:.3g} nm" if length < 1 else f"{length:.4g} µm"
-
-
-def _escaped(text: str) -> str:
-    """No markup in file names."""
-    from rich.markup import escape
-
-    return escape(text)

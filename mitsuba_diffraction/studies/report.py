@@ -93,14 +93,15 @@ def record_dicts(records: Iterable[Record]) -> list[dict[str, object]]:
 
 def save_json(content: object, path: str | os.PathLike[str]) -> None:
     """Writes a dataclass or a dictionary of dataclasses and sequences; what is not finite becomes null."""
-    outputs.save_json(_plain(content), path)
+    outputs.save_json(plain(content), path)
 
 
-def _plain(value: object) -> object:
+def plain(value: object) -> object:
+    """As JSON has it: dataclasses become dictionaries, tuples lists, and floats that are not finite None."""
     if dataclasses.is_dataclass(value):
         value = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
     if isinstance(value, Mapping):
-        return {name: _plain(item) for name, item in value.items()}
+        return {name: plain(item) for name, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-import math
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -20,6 +18,7 @@ from ...surface.heightfield import HeightField
 from ...surface.periods import Period, find_periods, repeated
 from ...wavelengths import VISIBLE
 from ...welch import carried_coherence_length
+from ..report import plain
 from .colours import LONGEST_COHERENCE
 from .concerns import concerns
 from .statistics import Statistics, statistics
@@ -71,9 +70,9 @@ class Inspection:
         return self.periods[0].direction if self.periods else 0.0
 
     def as_json(self) -> dict[str, object]:
-        """All numbers under their names, lengths in µm; what is not a number is null."""
+        """All numbers under their names, lengths in µm; what is not a number is None."""
         rows, columns = self.height_field.shape
-        return _plain(
+        return plain(
             {
                 "source": self.height_field.source,
                 "extent": self.extent,
@@ -81,13 +80,13 @@ class Inspection:
                 "pixel_size": self.height_field.pixel_size,
                 "size": self.height_field.tile_size,
                 "filled": self.height_field.filled,
-                "statistics": dataclasses.asdict(self.statistics),
-                "periods": [dataclasses.asdict(period) for period in self.periods],
+                "statistics": self.statistics,
+                "periods": self.periods,
                 "carried_coherence_length": self.carried,
                 "coherence_length": self.coherence_length,
                 "standard_error": self.standard_error,
                 "scalar_error": self.scalar_error,
-                "changes": [dataclasses.asdict(change) for change in self.changes],
+                "changes": self.changes,
                 "concerns": self.concerns,
             }
         )
@@ -176,14 +175,3 @@ def _widened(field: HeightField) -> HeightField:
             sizes[1 - axis] = field.tile_size[axis] / count
             return HeightField(np.repeat(field.heights, count, axis), (sizes[0], sizes[1]), field.source)
     return field
-
-
-def _plain(value: object) -> object:
-    """As JSON has it: dictionaries with texts for keys, lists, finite numbers or None."""
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
