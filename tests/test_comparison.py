@@ -123,7 +123,7 @@ def test_noise_is_estimated_from_two_halves():
 def test_each_shader_names_the_quirks_that_change_it(kind):
     mi.set_variant("scalar_spectral")
     surface = md.HeightField(np.random.default_rng(1).normal(0, 0.05, (4, 6)), 0.3)
-    more = {} if kind == "gem" else {"terms": 5, "step": 50.0, "coherence_length": 2.0}
+    more = {} if kind == "gem" else {"terms": 5, "coherence_length": 2.0}
 
     def colours(quirks):
         shader = VARIANTS[kind](surface, quirks, **more)
@@ -145,7 +145,7 @@ def test_each_shader_names_the_quirks_that_change_it(kind):
 def test_other_quirks_for_a_shader_that_is_there(kind):
     mi.set_variant("scalar_spectral")
     surface = md.HeightField(np.random.default_rng(1).normal(0, 0.05, (4, 6)), 0.3)
-    more = {} if kind == "gem" else {"terms": 4, "step": 100.0}
+    more = {} if kind == "gem" else {"terms": 4}
     wi, wo = mi.Vector3f(0.3, 0.2, 0.933), mi.Vector3f(-0.2, 0.1, 0.975)
     for first, second in ((True, False), (False, True)):
         quirks = [Quirks.as_published() if published else Quirks.corrected() for published in (first, second)]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from numbers import Integral, Real
+from numbers import Integral
 from typing import ClassVar
 
 import drjit as dr
@@ -21,7 +21,7 @@ from .quirks import Quirks
 from .spectral_weights import SpectralWeights
 from .taylor_textures import PUBLISHED_TERMS, TaylorTextures
 from .texture_sum import TextureSum
-from .tristimulus import LONGEST, PUBLISHED_STEP, SHORTEST, rgb_matrix
+from .tristimulus import SHORTEST, STEP, WAVELENGTH_COUNT, rgb_matrix
 
 
 class Shader:
@@ -104,7 +104,6 @@ class TextureShader(Shader):
         *,
         coherence_length: float = SUN_COHERENCE_LENGTH,
         terms: int = PUBLISHED_TERMS,
-        step: float = PUBLISHED_STEP,
         shadowing: bool = True,
     ) -> None:
         """Computes the textures.
@@ -114,7 +113,6 @@ class TextureShader(Shader):
             quirks: the quirks of the published shader to keep.
             coherence_length: L_c in µm.
             terms: number of Taylor terms.
-            step: wavelength spacing, nm, a divisor of 400.
             shadowing: include G.
 
         Raises:
@@ -122,12 +120,7 @@ class TextureShader(Shader):
         """
         super().__init__(height_field, quirks, shadowing)
         lobe_width(coherence_length)  # raises unless it is a valid length
-        steps = (LONGEST - SHORTEST) / step if isinstance(step, Real) and step > 0 else 0
-        if steps < 1 or abs(steps - round(steps)) > 1e-9:
-            raise RequestError(f"step: got {step!r}, wanted a part of the {LONGEST - SHORTEST:g} nm from 380 to 780 nm")
         self.coherence_length = coherence_length
-        self.step = float(step)
-        self.wavelength_count = round(steps) + 1
         self._height_field, self._terms = height_field, terms
         self._textures: dict[bool, TextureSum] = {}
         self._bind()
@@ -161,35 +154,15 @@ class TextureShader(Shader):
         """|P(q; κ)|² at a wavelength in µm, one for a flat mirror at q = 0."""
         raise NotImplementedError
 
-    def relative_radiance(
-        self,
-        wi: mi.Vector3f,
-        wo: mi.Vector3f,
-        wavelength: mi.Float,
-        r_0: mi.Float = PUBLISHED_R0,
-        height_scale: mi.Float = 1.0,
-    ) -> mi.Float:
-        """ρ(λ) at a wavelength in nm (eq. 3.11), including shadowing."""
+    def relative_radiance(self, wi: mi.Vector3f, wo: mi.Vector3f, wavelength: mi.Float) -> mi.Float:
+        """ρ(λ) at a wavelength in nm (eq. 3.11), for an index of 1.5, including shadowing."""
         gain = Gain(wi, wo, self.shadowing, mi.Bool(True))
-        r_0 = PUBLISHED_R0 if self.quirks.fixed_index else r_0
-        power = self.power(gain, mi.Float(wavelength) * 1e-3, mi.Float(height_scale), gain.active)
-        return gain.factor * self.fresnel(mi.Float(r_0), gain) * power
+        power = self.power(gain, mi.Float(wavelength) * 1e-3, mi.Float(1), gain.active)
+        return gain.factor * self.fresnel(mi.Float(PUBLISHED_R0), gain) * power
 
     def fresnel(self, r_0: mi.Float, gain: Gain) -> mi.Float:
         """F/F₀ or its square."""
         return fresnel_ratio(r_0, gain.falloff, self.quirks.fresnel_squared)
-
-    def xyz(
-        self,
-        wi: mi.Vector3f,
-        wo: mi.Vector3f,
-        weights: SpectralWeights,
-        active: mi.Bool = True,
-        height_scale: mi.Float = 1.0,
-    ) -> mi.Color3f:
-        """CIE XYZ; arguments as in `rgb`."""
-        gain = Gain(wi, wo, self.shadowing, mi.Bool(active))
-        return gain.factor * self.integral(gain, weights, mi.Float(height_scale))
 
     def integral(self, gain: Gain, weights: SpectralWeights, height_scale: mi.Float) -> mi.Color3f:
         """∫ F/F₀ |P|² S (x̄, ȳ, z̄) dλ by the trapezoidal rule."""
@@ -203,7 +176,8 @@ class TextureShader(Shader):
         active: mi.Bool = True,
         height_scale: mi.Float = 1.0,
     ) -> mi.Color3f:
-        xyz = self.xyz(wi, wo, weights, active, height_scale)
+        gain = Gain(wi, wo, self.shadowing, mi.Bool(active))
+        xyz = gain.factor * self.integral(gain, weights, mi.Float(height_scale))
         return mi.Color3f(*(sum(row[i] * xyz[i] for i in range(3)) for row in self.matrix))
 
     @property
@@ -213,7 +187,7 @@ class TextureShader(Shader):
 
     @property
     def texel_reads(self) -> int:
-        return self.wavelength_count * self.textures.terms * self.texels_per_term
+        return WAVELENGTH_COUNT * self.textures.terms * self.texels_per_term
 
 
 @dr.syntax
@@ -225,14 +199,14 @@ def trapezoid(
     height_scale: mi.Float,
     active: mi.Bool,
 ) -> mi.Color3f:
-    """Σ_j F/F₀ power(λ_j) S (x̄, ȳ, z̄)(λ_j) Δλ over the wavelengths of the shader, with half weight at both ends."""
+    """Σ_j F/F₀ power(λ_j) S (x̄, ȳ, z̄)(λ_j) Δλ over the 81 wavelengths, with half weight at both ends."""
     result = mi.Color3f(0)
     index = mi.UInt32(0)
-    while active & (index < shader.wavelength_count):
-        wavelength = SHORTEST + shader.step * mi.Float(index)
+    while active & (index < WAVELENGTH_COUNT):
+        wavelength = SHORTEST + STEP * mi.Float(index)
         weight, r_0 = weights(wavelength, active)
-        at_end = (index == 0) | (index == shader.wavelength_count - 1)
-        share = dr.select(at_end, 0.5 * shader.step, shader.step) * shader.fresnel(r_0, gain)
+        at_end = (index == 0) | (index == WAVELENGTH_COUNT - 1)
+        share = dr.select(at_end, 0.5 * STEP, STEP) * shader.fresnel(r_0, gain)
         result += weight * (share * power(gain, wavelength * 1e-3, height_scale, active))
         index += 1
     return result

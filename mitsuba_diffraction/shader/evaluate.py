@@ -14,12 +14,10 @@ from .base import Shader
 from .flss import FLSS
 from .gem import GEM
 from .nmm import NMM
-from .picture import encode
 from .pq import PQ
 from .quirks import Quirks
 
 VARIANTS = {"flss": FLSS, "nmm": NMM, "pq": PQ, "gem": GEM}
-QUANTITIES = ("encoded", "rgb", "xyz")
 
 
 def shader_for(height_field: HeightField, variant: str, quirks: Quirks, **settings: object) -> Shader:
@@ -42,12 +40,9 @@ def colour(
     *,
     variant: str = "flss",
     quirks: Quirks | None = None,
-    quantity: str = "rgb",
-    r_0: ArrayLike = 0.04,
-    light: ArrayLike | None = None,
     **settings: object,
 ) -> NDArray[np.float32]:
-    """The colour of a tile as computed by the shader.
+    """The colour of a tile with an index of 1.5 under D65, as computed by the shader.
 
     Args:
         height_field: the tile.
@@ -55,29 +50,17 @@ def colour(
         wo: ω_o, likewise; shapes broadcast.
         variant: "flss", "nmm", "pq" or "gem".
         quirks: default: as published.
-        quantity: "xyz" (not for gem), linear "rgb", or "encoded", display values clamped to [0, 1].
-        r_0: power reflectance at normal incidence.
-        light: irradiance per nm at `tristimulus.wavelengths`; default: D65 with Y = 1.
         settings: further arguments of the shader class.
 
     Returns:
-        (..., 3).
+        Linear RGB, (..., 3).
 
     Raises:
         ValueError: if an argument is invalid.
     """
-    if quantity not in QUANTITIES:
-        raise RequestError(f"quantity: got {quantity!r}, wanted one of {', '.join(QUANTITIES)}")
-    quirks = quirks or Quirks.as_published()
-    shader = shader_for(height_field, variant, quirks, **settings)
-    if quantity == "xyz" and variant == "gem":
-        raise RequestError("quantity: gem has no XYZ, only RGB")
+    shader = shader_for(height_field, variant, quirks or Quirks.as_published(), **settings)
     wi, wo, shape = _directions(wi, wo)
-    weights = shader.weights(r_0, light)
-    result = shader.xyz(wi, wo, weights) if quantity == "xyz" else shader.rgb(wi, wo, weights)
-    if quantity == "encoded":
-        result = dr.minimum(encode(result, quirks.power_gamma), 1)
-    return array(result).T.reshape(*shape, 3)
+    return array(shader.rgb(wi, wo, shader.weights())).T.reshape(*shape, 3)
 
 
 def relative_radiance(
@@ -88,10 +71,9 @@ def relative_radiance(
     *,
     variant: str = "flss",
     quirks: Quirks | None = None,
-    r_0: float = 0.04,
     **settings: object,
 ) -> NDArray[np.float32]:
-    """ρ(λ), the radiance relative to that of a flat mirror at normal incidence (eq. 3.11).
+    """ρ(λ), the radiance relative to that of a flat mirror at normal incidence (eq. 3.11), for an index of 1.5.
 
     Args:
         height_field: the tile.
@@ -100,7 +82,6 @@ def relative_radiance(
         wavelengths: (...) in nm; all three broadcast.
         variant: "flss" or "pq"; "nmm" is evaluated as at one of its own wavelengths, which equals "flss".
         quirks: default: as published.
-        r_0: power reflectance at normal incidence.
         settings: further arguments of the shader class.
 
     Returns:
@@ -116,7 +97,7 @@ def relative_radiance(
     wi, wo = (np.broadcast_to(omega, (*wavelengths.shape, 3)) if np.ndim(omega) == 1 else omega for omega in (wi, wo))
     wi, wo, shape = _directions(wi, wo)
     wavelengths = np.broadcast_to(wavelengths, shape).ravel()
-    return np.array(shader.relative_radiance(wi, wo, mi.Float(wavelengths), r_0)).reshape(shape)
+    return np.array(shader.relative_radiance(wi, wo, mi.Float(wavelengths))).reshape(shape)
 
 
 def _directions(wi: ArrayLike, wo: ArrayLike) -> tuple[mi.Vector3f, mi.Vector3f, tuple[int, ...]]:

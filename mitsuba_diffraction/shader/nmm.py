@@ -12,7 +12,7 @@ from .base import trapezoid
 from .flss import FLSS, REACH
 from .gain import Gain
 from .spectral_weights import SpectralWeights
-from .tristimulus import LONGEST, SHORTEST
+from .tristimulus import LONGEST, SHORTEST, STEP, WAVELENGTH_COUNT
 
 _FAR = 4.0  # σ_f, at which the power of a line has fallen to e^{−4²} = 1e-7
 
@@ -41,7 +41,7 @@ class NMM(FLSS):
         """At |u| = 2, the maximum."""
         longest = max(self.tile_size)
         most = np.floor(2e3 * longest / SHORTEST) - np.ceil(2e3 * longest / LONGEST) + 1
-        return round(self.textures.terms * (self.wavelength_count + most * self.texels_per_term))
+        return round(self.textures.terms * (WAVELENGTH_COUNT + most * self.texels_per_term))
 
     def integral(self, gain: Gain, weights: SpectralWeights, height_scale: mi.Float) -> mi.Color3f:
         slope = dr.sqrt(dr.square(gain.u) + dr.square(gain.v))
@@ -58,7 +58,7 @@ class NMM(FLSS):
             wavelength = path / mi.Float(n)
             x, y = self.position(gain, wavelength * 1e-3)
             if self.quirks.no_jacobian:
-                window, width = self.window(x, y), mi.Float(self.step)
+                window, width = self.window(x, y), mi.Float(STEP)
             else:
                 # p is the distance perpendicular to (u, v). Other orders of the main axis have their own wavelengths
                 # and must not be counted twice.

@@ -11,7 +11,8 @@ from scipy.optimize import lsq_linear
 from ..color import daylight
 from ..wavelengths import VISIBLE
 
-SHORTEST, LONGEST, PUBLISHED_STEP = 380.0, 780.0, 5.0  # nm: 81 wavelengths
+SHORTEST, LONGEST, STEP = 380.0, 780.0, 5.0  # nm
+WAVELENGTH_COUNT = 81  # from the shortest to the longest, in such steps
 
 CIE_RGB = np.array([[0.41847, -0.15866, -0.082835], [-0.091169, 0.25243, 0.015708], [0.00092090, -0.0025498, 0.17860]])
 """XYZ → CIE RGB of 1931 (Smith and Guild 1931), eq. 4.9 of the thesis. Rows sum to 0.177."""
@@ -41,7 +42,7 @@ def d65_weights() -> NDArray[np.float64]:
     Normalised to Y = 1 for the integral of the shader, the trapezoidal rule at 5 nm.
     """
     weights = daylight(wavelengths())[:, None] * matching_functions()
-    return weights / np.trapezoid(weights[:: int(PUBLISHED_STEP), 1], dx=PUBLISHED_STEP)
+    return weights / np.trapezoid(weights[:: int(STEP), 1], dx=STEP)
 
 
 def light_weights(spectrum: ArrayLike) -> NDArray[np.float64]:
@@ -51,7 +52,7 @@ def light_weights(spectrum: ArrayLike) -> NDArray[np.float64]:
 
 def d65_white() -> NDArray[np.float64]:
     """XYZ of D65 by the integral of the shader, Y = 1: (3,)."""
-    return np.trapezoid(d65_weights()[:: int(PUBLISHED_STEP)], dx=PUBLISHED_STEP, axis=0)
+    return np.trapezoid(d65_weights()[:: int(STEP)], dx=STEP, axis=0)
 
 
 def rgb_matrix(*, cie_rgb_matrix: bool, d65_twice: bool) -> NDArray[np.float64]:
