@@ -19,8 +19,7 @@ from ..surface.heightfield import HeightField
 from .gain import PUBLISHED_R0, Gain, fresnel_ratio
 from .quirks import Quirks
 from .spectral_weights import SpectralWeights
-from .taylor_textures import PUBLISHED_TERMS, TaylorTextures
-from .texture_sum import TextureSum
+from .taylor_textures import PUBLISHED_TERMS, TaylorTextures, taylor_transforms
 from .tristimulus import SHORTEST, STEP, WAVELENGTH_COUNT, rgb_matrix
 
 
@@ -95,7 +94,7 @@ class TextureShader(Shader):
         *("fresnel_squared", "fixed_index", "floor_anchor", "heights_from_zero"),
         *("d65_light", "relative", "d65_twice", "cie_rgb_matrix"),
     )
-    origin = "corner"
+    origin_at_centre: ClassVar[bool] = False
 
     def __init__(
         self,
@@ -122,7 +121,7 @@ class TextureShader(Shader):
         lobe_width(coherence_length)  # raises unless it is a valid length
         self.coherence_length = coherence_length
         self._height_field, self._terms = height_field, terms
-        self._textures: dict[bool, TextureSum] = {}
+        self._textures: dict[bool, TaylorTextures] = {}
         self._bind()
 
     def with_quirks(self, quirks: Quirks) -> TextureShader:
@@ -134,9 +133,13 @@ class TextureShader(Shader):
         """Sets up what depends on the quirks."""
         from_zero = self.quirks.heights_from_zero
         if from_zero not in self._textures:
-            self._textures[from_zero] = TextureSum(
-                TaylorTextures.of(self._height_field, self._terms, heights_from_zero=from_zero, origin=self.origin)
+            texels, height = taylor_transforms(
+                self._height_field,
+                self._terms,
+                heights_from_zero=from_zero,
+                origin_at_centre=self.origin_at_centre,
             )
+            self._textures[from_zero] = TaylorTextures(texels, height)
         self.textures = self._textures[from_zero]
         matrix = rgb_matrix(cie_rgb_matrix=self.quirks.cie_rgb_matrix, d65_twice=self.quirks.d65_twice)
         self.matrix = [[opaque(float(entry)) for entry in row] for row in matrix]

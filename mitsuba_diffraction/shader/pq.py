@@ -34,7 +34,7 @@ class PQ(TextureShader):
     """
 
     own_quirks = (*TextureShader.own_quirks, "wrong_product")
-    origin = "centre"
+    origin_at_centre = True
 
     def __init__(
         self,
