@@ -18,15 +18,29 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .errors import RequestError
+from .wavelengths import VISIBLE
 
 _OBSERVER = "CIE 1931 2 Degree Standard Observer"
+
+
+def matching_functions(wavelengths: ArrayLike) -> NDArray[np.float64]:
+    """x̄, ȳ, z̄ of the observer, linearly interpolated.
+
+    Args:
+        wavelengths: (n,), nm.
+
+    Returns:
+        (n, 3).
+    """
+    import colour
+
+    cmfs = colour.MSDS_CMFS[_OBSERVER]
+    return np.stack([np.interp(wavelengths, cmfs.wavelengths, column) for column in cmfs.values.T], axis=1)
 
 
 @lru_cache(maxsize=8)
 def _xyz_matrix(wavelengths: tuple[float, ...]) -> NDArray[np.float64]:
     """The matrix m of `spectrum_to_XYZ`, (n, 3)."""
-    import colour
-
     centres = np.asarray(wavelengths)
     steps = np.diff(centres)
     if centres.size < 2 or steps[0] < 1 or np.ptp(steps) > 1e-3 * steps[0]:
@@ -35,10 +49,9 @@ def _xyz_matrix(wavelengths: tuple[float, ...]) -> NDArray[np.float64]:
             f"wavelengths: got {centres.size}{ends}, wanted two or more, ascending in equal steps of at least 1 nm"
         )
     step = float(np.mean(steps))
-    cmfs = colour.MSDS_CMFS[_OBSERVER]
     spacing = 0.25
-    fine = np.arange(cmfs.wavelengths[0], cmfs.wavelengths[-1] + spacing / 2, spacing)
-    matching = np.stack([np.interp(fine, cmfs.wavelengths, column) for column in cmfs.values.T], axis=1)
+    fine = np.arange(VISIBLE[0], VISIBLE[1] + spacing / 2, spacing)
+    matching = matching_functions(fine)
     hats = np.maximum(0.0, 1 - np.abs(fine[:, None] - centres) / step) / step
     matrix = np.linalg.lstsq(hats, matching, rcond=None)[0] / (spacing * matching[:, 1].sum())
     matrix.setflags(write=False)

@@ -16,7 +16,7 @@ from mitsuba_diffraction.bsdf.geometry import Geometry
 from mitsuba_diffraction.color import into_gamut, spectrum_to_linear_sRGB, spectrum_to_XYZ
 from mitsuba_diffraction.scalar_theory import equivalent_depth, expected_error, geometry
 from mitsuba_diffraction.studies.inspection import inspect, save_picture
-from mitsuba_diffraction.studies.inspection.colours import WAVELENGTHS, daylight, order_angle, order_share, radiance
+from mitsuba_diffraction.studies.inspection.colours import WAVELENGTHS, illumination, order_angle, order_share, radiance
 from mitsuba_diffraction.studies.inspection.concerns import concerns
 from mitsuba_diffraction.studies.inspection.picture import piece_shown, with_uncertainty
 from mitsuba_diffraction.studies.inspection.statistics import statistics
@@ -105,7 +105,7 @@ def test_radiance_is_that_of_the_bsdf(theta_i, theta_o):
     cos_o = np.cos(np.deg2rad(theta_o))
     f = np.array(bsdf.eval(mi.BSDFContext(), si, towards(theta_o))) / cos_o
     at = np.searchsorted(WAVELENGTHS, wavelengths)
-    got = (radiance(spectrum, 0.0, theta_i, theta_o) / daylight())[at]
+    got = (radiance(spectrum, 0.0, theta_i, theta_o) / illumination())[at]
     share = f * np.cos(np.deg2rad(theta_i)) / got
     np.testing.assert_allclose(share, 1, atol=1e-3)
     factor = Geometry(si.wi, towards(theta_o)).factor(True) / cos_o

@@ -5,12 +5,12 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..bsdf.tables import PacketTable
 from .gain import PUBLISHED_R0
 from .quirks import Quirks
-from .tristimulus import FLAT, LONGEST, SHORTEST, d65_weights, light_weights, matching_functions, wavelengths
+from .tristimulus import LONGEST, SHORTEST, d65_weights, light_weights, wavelengths
 
 
 class SpectralWeights:
@@ -36,7 +36,7 @@ class SpectralWeights:
             light: spectrum of the light, (401,); default: D65 with Y = 1.
         """
         weights = d65_weights() if light is None else light_weights(light)
-        self.luminance = 1.0 if light is None else _luminance(light)
+        self.luminance = 1.0 if light is None else float(np.trapezoid(weights[:, 1]))
         if quirks.d65_light:
             weights = d65_weights() * self.luminance
         r_0 = PUBLISHED_R0 if quirks.fixed_index else r_0
@@ -53,9 +53,3 @@ class SpectralWeights:
         below, above = self.table(index, active), self.table(index + 1, active)
         value = below + (place - mi.Float(index)) * (above - below)
         return mi.Color3f(value.x, value.y, value.z), value.w
-
-
-def _luminance(light: ArrayLike) -> float:
-    """∫ E ȳ dλ / ∫ ȳ dλ."""
-    values: NDArray[np.float64] = np.asarray(light, np.float64) * matching_functions()[:, 1]
-    return float(np.trapezoid(values) / FLAT)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import lsq_linear
 
-from ..color import daylight
+from ..color import daylight, matching_functions
 from ..wavelengths import VISIBLE
 
 SHORTEST, LONGEST, STEP = 380.0, 780.0, 5.0  # nm
@@ -27,27 +27,18 @@ def wavelengths() -> NDArray[np.float64]:
 
 
 @lru_cache(maxsize=1)
-def matching_functions() -> NDArray[np.float64]:
-    """x̄, ȳ, z̄ of the CIE 1931 2° observer at `wavelengths`: (401, 3)."""
-    import colour
-
-    cmfs = colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"]
-    return np.stack([np.interp(wavelengths(), cmfs.wavelengths, column) for column in cmfs.values.T], axis=1)
-
-
-@lru_cache(maxsize=1)
 def d65_weights() -> NDArray[np.float64]:
     """S(λ) (x̄, ȳ, z̄) of the illuminant D65 (CIE 15:2018), (401, 3) per nm.
 
     Normalised to Y = 1 for the integral of the shader, the trapezoidal rule at 5 nm.
     """
-    weights = daylight(wavelengths())[:, None] * matching_functions()
+    weights = daylight(wavelengths())[:, None] * matching_functions(wavelengths())
     return weights / np.trapezoid(weights[:: int(STEP), 1], dx=STEP)
 
 
 def light_weights(spectrum: ArrayLike) -> NDArray[np.float64]:
     """S(λ) (x̄, ȳ, z̄)/∫ȳ dλ of a light with the spectrum S at `wavelengths`, (401,) per nm: (401, 3) per nm."""
-    return np.asarray(spectrum, np.float64)[:, None] * matching_functions() / FLAT
+    return np.asarray(spectrum, np.float64)[:, None] * matching_functions(wavelengths()) / FLAT
 
 
 def d65_white() -> NDArray[np.float64]:
@@ -77,10 +68,8 @@ def primary_spectra() -> NDArray[np.float64]:
     import colour
 
     fine = np.arange(EMISSION[0], EMISSION[-1] + 0.5)
-    cmfs = colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"]
-    matching = np.stack([np.interp(fine, cmfs.wavelengths, column) for column in cmfs.values.T]) / FLAT
     hats = np.maximum(0.0, 1 - np.abs(fine[:, None] - EMISSION) / (EMISSION[1] - EMISSION[0]))
-    to_xyz = matching @ hats
+    to_xyz = matching_functions(fine).T @ hats / FLAT
     primaries = colour.RGB_COLOURSPACES["sRGB"].matrix_RGB_to_XYZ
     system = np.concatenate([1e4 * to_xyz, 1e-2 * np.eye(EMISSION.size)])
     rest = np.zeros(EMISSION.size)

@@ -10,12 +10,10 @@ Angles are positive on the far side from the light: the mirror direction is θ_o
 
 from __future__ import annotations
 
-from functools import lru_cache
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ...color import spectrum_to_XYZ
+from ...color import daylight, spectrum_to_XYZ
 from ...scalar_theory import geometry
 from ...spectrum import GratingSpectrum
 from ...wavelengths import VISIBLE
@@ -29,13 +27,9 @@ LONGEST_COHERENCE = 20.0
 """µm. At 65 µm the orders of one wavelength are narrower than a pixel of the picture."""
 
 
-@lru_cache(maxsize=1)
-def daylight() -> Array:
+def illumination() -> Array:
     """D65 at `WAVELENGTHS`, of luminance Y = 1."""
-    import colour
-
-    source = colour.SDS_ILLUMINANTS["D65"]
-    values = np.interp(WAVELENGTHS, source.wavelengths, source.values)
+    values = daylight(WAVELENGTHS)
     return values / spectrum_to_XYZ(values, WAVELENGTHS)[1]
 
 
@@ -72,7 +66,7 @@ def radiance(
     density = lateral_scale**2 * spectrum.evaluate(vector, height_scale * kappa)
     # The light comes from −θ_i.
     k_g = geometry(cos_i, cos_o, np.cos(theta_i + theta_o)[..., None])
-    return daylight() * k_g * density / wavelengths**2 * cos_i
+    return illumination() * k_g * density / wavelengths**2 * cos_i
 
 
 def order_angle(order: int, period: float, wavelength: float) -> float | None:

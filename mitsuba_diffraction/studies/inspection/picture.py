@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ...color import auto_exposure, into_gamut, roll_off, spectrum_to_linear_sRGB
+from ...color import auto_exposure, into_gamut, on_screen, spectrum_to_linear_sRGB
 from ...errors import RequestError
 from ...files import whole_file
 from ...outputs import metadata
@@ -242,7 +242,7 @@ def _colours(rows: list[Axes], inspection: Inspection) -> None:
     """One strip for each angle of incidence, its mirror direction marked."""
     light = radiance(inspection.spectrum, inspection.direction, np.array(INCIDENCES)[:, None], _ANGLES)
     rgb = into_gamut(spectrum_to_linear_sRGB(light, WAVELENGTHS))
-    shown = _encoded(roll_off(rgb * _exposure(rgb)))
+    shown = on_screen(rgb * _exposure(rgb))
     for axes, strip, incidence in zip(rows, shown, INCIDENCES, strict=True):
         axes.imshow(strip[None], extent=(-90, 90, 0, 1), aspect="auto", interpolation="bilinear")
         axes.set_yticks([])
@@ -269,9 +269,3 @@ def _exposure(rgb: Array) -> float:
     """That of a picture of what lies aside of the mirror direction, which would make all else black."""
     aside = [strip[np.abs(_ANGLES - incidence) > 5] for strip, incidence in zip(rgb, INCIDENCES, strict=True)]
     return auto_exposure(np.concatenate(aside))
-
-
-def _encoded(rgb: Array) -> Array:
-    import colour
-
-    return np.clip(colour.cctf_encoding(rgb, function="sRGB"), 0, 1)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ...color import spectrum_to_XYZ
+from ...color import delta_E, spectrum_to_XYZ
 from ...errors import RequestError
 from ...spectrum import GratingSpectrum
 from ...surface.heightfield import HeightField
@@ -89,7 +89,8 @@ def changes(
     def change(what: str, by: float, after: _View, tip_radius: float = float("nan")) -> Change:
         after_shares = {m: _share(after, main, m) for m in orders}
         colour = {
-            m: _delta_E(exposure * colours[m], exposure * _XYZ(after, main, sides[m], main.period)) for m in orders
+            m: float(delta_E(exposure * colours[m], exposure * _XYZ(after, main, sides[m], main.period)))
+            for m in orders
         }
         return Change(what, by, after.period / main.period - 1, shares, after_shares, colour, tip_radius)
 
@@ -131,7 +132,7 @@ def _share(view: _View, main: Period, order: int) -> float:
 
 
 def _XYZ(view: _View, main: Period, order: int, period: float) -> NDArray[np.float64]:
-    """XYZ of what is seen at normal incidence in the direction in which `period` sends 550 nm."""
+    """XYZ, not negative, of what is seen at normal incidence in the direction in which `period` sends 550 nm."""
     light = radiance(
         view.spectrum,
         main.direction,
@@ -140,17 +141,8 @@ def _XYZ(view: _View, main: Period, order: int, period: float) -> NDArray[np.flo
         height_scale=view.height_scale,
         lateral_scale=view.lateral_scale,
     )
-    return spectrum_to_XYZ(light, WAVELENGTHS)
+    return np.maximum(spectrum_to_XYZ(light, WAVELENGTHS), 0)
 
 
 def _brighter_side(view: _View, main: Period, order: int) -> int:
     return max((order, -order), key=lambda m: _XYZ(view, main, m, main.period)[1])
-
-
-def _delta_E(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
-    """CIEDE2000 between two colours, white D65 with Y = 1."""
-    import colour
-
-    white = colour.CCS_ILLUMINANTS["CIE 1931 2 Degree Standard Observer"]["D65"]
-    Lab = [colour.XYZ_to_Lab(np.maximum(XYZ, 0), white) for XYZ in (first, second)]
-    return float(colour.delta_E(*Lab, method="CIE 2000"))
