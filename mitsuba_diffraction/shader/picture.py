@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..bsdf.tables import PacketTable
+from .spectral_weights import interpolated
 from .tristimulus import EMISSION, primary_spectra
 
 
@@ -33,11 +34,8 @@ class Emission:
     def __call__(self, rgb: mi.Color3f, wavelengths: mi.UnpolarizedSpectrum, active: mi.Bool) -> mi.UnpolarizedSpectrum:
         """Per nm, at the wavelengths of a ray, in nm."""
         result = mi.UnpolarizedSpectrum(0)
-        last = EMISSION.size - 1
+        first, spacing = float(EMISSION[0]), float(EMISSION[1] - EMISSION[0])
         for channel in range(len(result)):
-            place = dr.clip((wavelengths[channel] - float(EMISSION[0])) / float(EMISSION[1] - EMISSION[0]), 0, last)
-            index = mi.UInt32(dr.minimum(place, last - 1))
-            below, above = self.table(index, active), self.table(index + 1, active)
-            b = below + (place - mi.Float(index)) * (above - below)
+            b = interpolated(self.table, (wavelengths[channel] - first) / spacing, EMISSION.size - 1, active)
             result[channel] = rgb.x * b.x + rgb.y * b.y + rgb.z * b.z
         return result

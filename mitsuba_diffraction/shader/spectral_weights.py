@@ -48,8 +48,13 @@ class SpectralWeights:
     def __call__(self, wavelength: mi.Float, active: mi.Bool) -> tuple[mi.Color3f, mi.Float]:
         """(X, Y, Z) per nm, and R₀, at a wavelength in nm; zero outside 380 to 780 nm."""
         active = active & (wavelength >= SHORTEST - 1e-3) & (wavelength <= LONGEST + 1e-3)
-        place = dr.clip(wavelength - SHORTEST, 0, LONGEST - SHORTEST)
-        index = mi.UInt32(dr.minimum(place, LONGEST - SHORTEST - 1))
-        below, above = self.table(index, active), self.table(index + 1, active)
-        value = below + (place - mi.Float(index)) * (above - below)
+        value = interpolated(self.table, wavelength - SHORTEST, int(LONGEST - SHORTEST), active)
         return mi.Color3f(value.x, value.y, value.z), value.w
+
+
+def interpolated(table: PacketTable, place: mi.Float, last: int, active: mi.Bool) -> mi.Vector4f:
+    """The packets 0 … `last` of a table, linearly interpolated at `place` and constant beyond; zero if not `active`."""
+    place = dr.clip(place, 0, last)
+    index = mi.UInt32(dr.minimum(place, last - 1))
+    below, above = table(index, active), table(index + 1, active)
+    return below + (place - mi.Float(index)) * (above - below)
