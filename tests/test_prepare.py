@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
@@ -151,6 +151,12 @@ def test_a_surface_of_second_order_makes_no_difference_to_level_quadratic(height
     np.testing.assert_allclose(other, one, atol=1e-11)
 
 
+# Five heights, through which more than one quadratic passes.
+FEW = np.full((6, 7), np.nan)
+FEW[[0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 3, 0]] = 0, 0, 0, 1, 0, 0
+
+
+@example(heights=FEW, step="level_quadratic")
 @given(heights=fields, step=st.sampled_from(["level_plane", "level_quadratic"]))
 def test_levelling_twice_is_levelling_once(heights, step):
     once = prepare.apply_steps(field_of(heights), [step])

@@ -55,7 +55,11 @@ def _level(height_field: HeightField, degree: int) -> HeightField:
     there = ~height_field.gaps
     middle = heights[there].mean()
     terms = np.array([(y[:, None] ** j * x**i)[there] for i, j in powers])
-    coefficients = np.linalg.lstsq(terms @ terms.T, terms @ (heights[there] - middle), rcond=1e-12)[0]
+    coefficients = np.zeros(len(powers))
+    # By the normal equations, which are small; their second solution, of what is left, removes the error of the first.
+    for _ in range(2):
+        rest = heights[there] - middle - coefficients @ terms
+        coefficients += np.linalg.lstsq(terms @ terms.T, terms @ rest, rcond=1e-12)[0]
     surface = sum(c * y[:, None] ** j * x**i for c, (i, j) in zip(coefficients, powers, strict=True))
     found = dict(zip(powers, coefficients, strict=True))
     half = [max((n - 1) / 2, 1) * size for n, size in zip((columns, rows), height_field.pixel_size, strict=True)]
