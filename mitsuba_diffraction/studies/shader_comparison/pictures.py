@@ -202,19 +202,25 @@ class Pictures:
         rows, columns = self.surface.shape
         per_dispatch = max(1, _SHADING_POINTS // samples)
         firsts = range(0, rows * columns, per_dispatch)
-        self._shade(0, 1, samples)  # one pixel compiles the kernels
+        # Two pixels compile the kernels; of one, which may have one sample, they would be others.
+        self._averaged([self._shade(0, 2, samples)] * (rows * columns))
         begin = time.perf_counter()
         points = []
         for index, first in enumerate(firsts):
             points.append(self._shade(first, min(per_dispatch, rows * columns - first), samples))
             progress(index + 1, len(firsts))
+        return self._averaged(points), time.perf_counter() - begin
+
+    def _averaged(self, points: list[NDArray[np.float32]]) -> NDArray[np.float64]:
+        """The means over the pixels, (height, width, 3), of what `_shade` returns, as many points for each pixel."""
+        rows, columns = self.surface.shape
         x, y, *rgb = (mi.Float(column) for column in np.concatenate(points, axis=1))
         channels = [dr.opaque(mi.Float, channel, shape=len(x)) for channel in range(3)]
         rfilter = self.scene.sensors()[0].film().rfilter()
         count = dr.opaque(mi.UInt32, len(x) // (rows * columns))
         sums = collect(rfilter, mi.Point2f(x, y), channels, rgb, (rows, columns), 0, evenly(count), 3)
         values = np.array(sums, np.float64).reshape(rows, columns, 4)
-        return values[..., :3] / values[..., 3:], time.perf_counter() - begin
+        return ratio(values[..., :3], values[..., 3:])
 
     def _shade(self, first: int, count: int, samples: int) -> NDArray[np.float32]:
         """Shading points of `count` pixels, from `first` on: (5, n), position in the picture and linear sRGB."""
