@@ -1,5 +1,7 @@
 """What all tests share: a cache of their own, the measured scans, and the command."""
 
+import functools
+import math
 import os
 import pickle
 import shlex
@@ -15,6 +17,8 @@ from hypothesis import settings
 
 import mitsuba_diffraction as md  # before Dr.Jit, so that it has an LLVM that works
 from mitsuba_diffraction import cli
+from mitsuba_diffraction.cli import console
+from mitsuba_diffraction.cli.console import log_lines
 from mitsuba_diffraction.files import whole_file
 from mitsuba_diffraction.spectrum.energy_table import SHADOWING, EnergyTable
 from mitsuba_diffraction.spectrum.grating_spectrum import GratingSpectrum
@@ -129,6 +133,8 @@ def command(monkeypatch, capfd):
     def call(*words):
         arguments = shlex.split(words[0]) if len(words) == 1 else words
         monkeypatch.setattr(sys, "argv", [cli.NAME, *arguments])
+        # On a slow machine a command says after half a minute how far it is.
+        monkeypatch.setattr(console, "log_lines", functools.partial(log_lines, seconds=math.inf))
         # Warnings are shown, as they are to a person, and what shows them is put back afterwards.
         with warnings.catch_warnings():
             warnings.simplefilter("default")
