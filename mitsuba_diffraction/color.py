@@ -24,7 +24,7 @@ _OBSERVER = "CIE 1931 2 Degree Standard Observer"
 
 
 def matching_functions(wavelengths: ArrayLike) -> NDArray[np.float64]:
-    """x̄, ȳ, z̄ of the observer, linearly interpolated.
+    """x̄, ȳ, z̄ of the CIE 1931 2° observer, linear between its wavelengths and constant beyond them.
 
     Args:
         wavelengths: (n,), nm.

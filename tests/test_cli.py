@@ -450,6 +450,12 @@ def test_a_value_of_a_parameter_is_a_file_only_if_it_looks_like_one(folder, valu
     assert scene_parameters([f"p={value}"]) == {"p": wanted}
 
 
+def test_benchmark_plots_png_only(command):
+    code, out, err = command("benchmark --plot speed.pdf")
+    assert (code, out) == (2, "")
+    assert "--plot: got speed.pdf, wanted a file name that ends in .png" in err
+
+
 @pytest.mark.slow
 def test_benchmark_refuses_a_tolerance_before_it_measures(command):
     code, out, err = command("benchmark --tolerance -1")

@@ -1,6 +1,7 @@
 """The path tracer against the shader: measures against known numbers, pictures against Mitsuba's own integrators."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -303,6 +304,7 @@ def test_compare_writes_pictures_numbers_and_a_figure(command, llvm, folder):
         assert {*numbers["shares"][reference]["quirks"]["power_gamma"]} == {"drop", "rise", "share"}
     for name in ("constant_blend", "infrared_rainbow", "power_gamma", NO_SHADOWS):
         assert name in out
+    assert re.search(r"\n\s*\n\s*path tracer +same light", out)  # a line between the tables
     # The pictures are those of the numbers.
     path, published = (md.render.SpectralImage.load(f"scene-gem-{name}.exr") for name in ("path", "published"))
     xyz = [spectrum_to_XYZ(image.radiance, image.wavelengths) for image in (path, published)]
@@ -315,10 +317,14 @@ def test_compare_writes_pictures_numbers_and_a_figure(command, llvm, folder):
 
 
 def test_a_coat_is_told(llvm, folder):
-    coat = GRATING.format(profile="blazed", period=2.0, coherence=3.0, base='<float name="coat_ior" value="1.5"/>')
-    write(Path("scene.xml"), SUN, coat)
-    found = compare("scene.xml", "gem", width=4, spp=1, shading_points=1, shares=False)
-    assert sum(line.startswith("coat: the shader shows") for line in summary.notes(found)) == 1
+    write(Path("scene.xml"), base=BASE + '<float name="coat_ior" value="1.5"/>')
+    found = compare("scene.xml", "flss", width=4, spp=1, shading_points=1, shares=False)
+    assert found.coated
+    for coated in (True, False):
+        heads = [line.split(":")[0] for line in summary.notes(replace(found, coated=coated))]
+        assert (heads.count("coat"), heads.count("limit")) == (coated, not coated)
+    write(Path("bare.xml"))
+    assert not Pictures("bare.xml", width=4).has_coat
 
 
 @pytest.mark.slow

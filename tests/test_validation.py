@@ -327,7 +327,7 @@ def test_wrong_requests_are_refused(command, tmp_path):
         code, _, error = command("validate", option, str(tmp_path / "nowhere" / "results"))
         assert (code, error.count("\n"), error.count("nowhere is not there")) == (2, 1, 1)
     (tmp_path / "ruled.toml").write_text('[surface]\nprofile = "blazed"\n[spectrum]\ntheory = "rigorous"\n')
-    code, _, error = command("validate", str(tmp_path / "ruled.toml"))
+    code, _, error = command("validate", str(tmp_path / "ruled.toml"), "--figures", str(tmp_path / "figures"))
     assert (code, error.count("\n")) == (2, 1)
     assert "ruled.toml: got theory = 'rigorous', wanted scalar" in error
     code, _, error = command("validate", "--variant", "scalar_spectral", "--figures", str(tmp_path / "figures"))

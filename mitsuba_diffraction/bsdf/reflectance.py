@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -93,7 +95,11 @@ class Conductor:
     transparent = False
 
     def __init__(self, material: str, model: str, outside: float) -> None:
-        wavelengths, *index = conductor(material)
+        data = Path(str(mi.file_resolver().resolve("data/ior/Al.eta.spd"))).parent
+        try:
+            wavelengths, *index = conductor(material, data)
+        except RequestError as error:
+            raise RequestError(f"{error}, or none (R = 1)") from None
         self.eta, self.k = (self._spectrum(wavelengths, values / outside) for values in index)
         self.material = material
         self.model = model

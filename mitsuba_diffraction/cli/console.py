@@ -64,8 +64,12 @@ def tell(text: str) -> None:
 
 
 def show(*tables: RenderableType, width: int) -> None:
-    """Print tables, at least `width` characters wide: whole in any terminal, and in a file."""
-    Console(highlight=False, width=max(out.width, width)).print(*tables, sep="\n\n")
+    """Print tables with a line between them, on `width` characters or more, so that no column is ever cut."""
+    console = Console(highlight=False, width=max(out.width, width))
+    for index, table in enumerate(tables):
+        if index:
+            console.print()
+        console.print(table)
 
 
 def say(kind: str, message: object) -> None:

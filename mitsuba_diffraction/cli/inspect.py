@@ -8,7 +8,6 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
@@ -21,7 +20,7 @@ from ..studies.inspection.picture import with_uncertainty
 from ..studies.inspection.uncertainty import GREEN
 from ..studies.report import table
 from .arguments import Overwrite, claim, wanted_suffix
-from .console import out, progress_bar, tell
+from .console import progress_bar, show, tell
 from .inputs import files_read
 from .scan import (
     Channel,
@@ -79,13 +78,7 @@ def inspect(
     save_picture(inspection, picture, title=source.stem if source.suffix == ".toml" else source.name)
     if json is not None:
         save_json(inspection.as_json(), json)
-    # Wide enough in any terminal, and in a file.
-    wide = Console(highlight=False, width=max(out.width, 130))
-    wide.print(_table(inspection))
-    if inspection.changes:
-        wide.print()
-        wide.print(_changes_table(inspection))
-        wide.print()
+    show(_table(inspection), *([_changes_table(inspection), ""] if inspection.changes else []), width=130)
     for concern in inspection.concerns:
         tell(f"! {concern}")
     tell(f"{picture}: height map, spectrum and predicted colours" + (f"\n{json}: the numbers" if json else ""))

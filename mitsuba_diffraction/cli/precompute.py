@@ -48,7 +48,7 @@ def precompute(
     tolerance: Annotated[
         float | None,
         typer.Option(
-            help="largest error, a fraction of the reflected power; default: 0.001, samples and rigorous up to 0.01"
+            help="largest error, a fraction of the power; default: 0.001, of samples up to 0.01, rigorous 0.01"
         ),
     ] = None,
     theory: Annotated[

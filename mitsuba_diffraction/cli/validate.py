@@ -15,6 +15,7 @@ from .inputs import files_read
 from .scan import Channel, FillMissing, HeightRange, PixelSize, Prepare, Unit, options_of_scan, recipe_of
 
 if TYPE_CHECKING:
+    from ..recipe import Recipe
     from ..studies.record import Check
 
 
@@ -53,6 +54,7 @@ def validate(
     chosen = choose_variant(variant)
     if chosen.startswith("scalar"):
         raise RequestError(f"--variant: got {chosen}, wanted llvm_… or cuda_…: the checks take millions of directions")
+    recipe = None if surface is None else _recipe(surface, of_scan, settings)
     reads = [] if surface is None else files_read(surface)
     writes = [(option, path) for option, path in (("--json", json), ("--markdown", markdown)) if path is not None]
     if figures is not None:
@@ -62,7 +64,7 @@ def validate(
         writes += [("--figures", figures / name) for name in figure_names()]
     claim(context, reads, writes)
     mi.set_variant(chosen)
-    these = checks() if surface is None else _of_surface(surface, of_scan, settings)
+    these = checks() if recipe is None else _of_surface(recipe, surface.name)
     results = []
     with progress_bar("validation") as progress:
         for check in these:
@@ -86,13 +88,17 @@ def validate(
         raise RuntimeError(f"{len(missed)} of {promised} checks missed: {'; '.join(missed)}")
 
 
-def _of_surface(path: Path, of_scan: dict[str, object], settings: dict[str, object]) -> tuple[Check, ...]:
-    from ..studies.checks import surface_checks
-
+def _recipe(path: Path, of_scan: dict[str, object], settings: dict[str, object]) -> Recipe:
     if path.suffix.lower() != ".toml":
         settings = {"extent": "sample", **settings}
     recipe = recipe_of(path, of_scan, settings).of_one_patch()
     if recipe.spectrum.get("theory") == "rigorous":
         raise RequestError(f"{path}: got theory = 'rigorous', wanted scalar; precompute prints the measured errors")
-    with progress_bar(f"spectrum of {path.name}") as progress:
+    return recipe
+
+
+def _of_surface(recipe: Recipe, name: str) -> tuple[Check, ...]:
+    from ..studies.checks import surface_checks
+
+    with progress_bar(f"spectrum of {name}") as progress:
         return surface_checks(recipe.height_field(), recipe.cached(progress))

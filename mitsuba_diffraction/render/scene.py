@@ -93,7 +93,7 @@ def load_spectral_scene(
         if motion is not None:
             _move_first_sensor(state, motion)
         mi.parser.transform_all(config, state)
-        # Plugins one after the other: on several threads, a loop of loads and renderings once ended in a crash.
+        # Serially: on several threads, Mitsuba 3.9.1 crashed once in a loop of loads and renderings.
         config.parallel = False
         scene = mi.parser.instantiate(config, state)
     if not isinstance(scene, mi.Scene):
@@ -125,6 +125,10 @@ def scene_digest(path: str | os.PathLike[str], parameters: Mapping[str, str] | N
     """SHA-256 of a valid scene: its XML after substitution of the parameters, and the files it references.
 
     Files enter by content, not by path; a recipe includes the scan it references.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if the scene is wrong.
     """
     content = hashlib.sha256(Path(path).read_bytes())
     with _parsed(path, parameters) as (_, state):

@@ -32,25 +32,25 @@ def refractive_index(wavelength: float, *, int_ior: complex | None = None, mater
         if not (0.01 <= abs(number) <= 100 and number.real >= 0 and number.imag >= 0):
             raise RequestError(f"int_ior: got {int_ior!r}, wanted a refractive index, a number or n + ik with k ≥ 0")
         return number
-    wavelengths, n, k = conductor(material)
+    data = Path(str(metadata.distribution("mitsuba").locate_file("mitsuba/data/ior")))
+    wavelengths, n, k = conductor(material, data)
     return complex(np.interp(wavelength, wavelengths, n), np.interp(wavelength, wavelengths, k))
 
 
 @functools.cache
-def conductor(material: str) -> tuple[NDArray[np.float64], ...]:
-    """The table of a conductor: wavelengths in µm, n and k there, (n,) each.
+def conductor(material: str, folder: Path) -> tuple[NDArray[np.float64], ...]:
+    """The table of a conductor in Mitsuba's folder of indices: wavelengths in µm, n and k there, (J,) each.
 
     Raises:
         ValueError: if there is none of that name.
     """
-    folder = Path(str(metadata.distribution("mitsuba").locate_file("mitsuba/data/ior")))
     known = sorted(path.name.removesuffix(".eta.spd") for path in folder.glob("*.eta.spd"))
     if material not in known:
         close = [name for name in known if name.lower().startswith(str(material)[:2].lower())]
         raise RequestError(
             f"material: got {material!r}, "
             + (f"did you mean {' or '.join(close)}? " if close else "")
-            + f"wanted one of {', '.join(known)}, or in a scene 'none' (R = 1)"
+            + f"wanted one of {', '.join(known) or 'none: no tables found'}"
         )
     (nm, n), (nm_k, k) = (np.loadtxt(folder / f"{material}.{part}.spd").T for part in ("eta", "k"))
     return nm * 1e-3, n, np.interp(nm, nm_k, k)

@@ -40,13 +40,13 @@ MANUAL = f"""The real-time shader of structural colour, on the same scene that a
 Parameters (XML or dictionary):
 {listed(PARAMETERS)}
 
-Surfaces with a `diffraction_grating`, or one inside `twosided`, are shaded with their heights, which must come from a
-recipe or a profile, in scalar theory and without their coat; all other BSDFs as they are. Light comes straight from
-directional and point lights; other lights, the background and reflections between surfaces are left out.
+Gratings (`diffraction_grating`, also inside `twosided`) are shaded from their heights, which must come from a recipe or
+a profile. Rigorous theory is refused, and coats are ignored. All other BSDFs are shaded as they are. Light comes
+straight from directional and point lights; other lights, the background and reflections between surfaces are left out.
 
 The shader gives RGB. The picture is light of that colour, as a spectrum (`Emission`), so that any film records it; a
 colour that sRGB cannot show has negative radiance at some wavelengths. Corrected, FLSS and NMM are in the scene's units
-and show the direct light of a path tracer with fresnel="schlick", without a coat and the BRDF's factor E.
+and show the direct light of a path tracer with fresnel="schlick", without a coat and without the factor E of the BRDF.
 """
 
 

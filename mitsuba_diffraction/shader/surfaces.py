@@ -24,7 +24,7 @@ class ShadedGrating(Protocol):
         height_scale: scales the heights.
         shadowing: "v_cavity" or "none".
         base: what lies under the surface.
-        coat: what lies above it, which the shader does not know.
+        coat: what lies above it, ignored by the shader.
         rigorous: whether its efficiencies are those of rigorous theory.
         reflectance: R(si, cos θ, active) at the angle to the microfacet.
     """

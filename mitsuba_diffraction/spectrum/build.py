@@ -132,7 +132,9 @@ def precompute(
         )
     if theory == "rigorous":
         if len(patches) > 1:
-            raise RequestError(f"theory: got rigorous of {height_field.source}, wanted a profile h(x) of one row")
+            raise RequestError(
+                f"theory: got rigorous and {len(patches)} patches ({height_field.source}, …), wanted one, of one row"
+            )
         if (extent, largest_angle, representation) != ("tile", 90.0, "auto"):
             raise RequestError(
                 f"theory: got rigorous with extent {extent!r}, largest_angle {largest_angle!r} and representation "

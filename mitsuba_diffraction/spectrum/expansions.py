@@ -49,7 +49,7 @@ class Series:
         return chebyshev_polynomials(position(kappa, self.largest_kappa), self.modes.shape[1]) @ self.modes.T
 
     def first(self, terms: int) -> Series:
-        """The first functions only, without the degrees that none of them holds."""
+        """The first functions only, without the degrees that none of them contains."""
         modes = self.modes[:terms]
         degrees = 1 + max(np.flatnonzero(modes.any(axis=0)), default=0)
         return dataclasses.replace(self, modes=modes[:, :degrees].copy())
@@ -65,7 +65,7 @@ def taylor(largest_kappa: float, nodes: int) -> tuple[Series, NDArray[np.float64
 
     Args:
         largest_kappa: κ_max in rad/µm.
-        nodes: J, of which the polynomial through S must resolve it; its coefficients are the B_n.
+        nodes: J, enough for the polynomial through S at the nodes to resolve it; its coefficients are the B_n.
     """
     monomials = _triangle(np.polynomial.chebyshev.poly2cheb, nodes)
     coefficients = _triangle(np.polynomial.chebyshev.cheb2poly, nodes).T
@@ -80,7 +80,7 @@ def chebyshev(largest_kappa: float, nodes: int) -> tuple[Series, NDArray[np.floa
 
     Args:
         largest_kappa: κ_max in rad/µm.
-        nodes: J, of which the polynomial through S must resolve it; its Chebyshev coefficients are the B_n.
+        nodes: J, enough for the polynomial through S at the nodes to resolve it; the B_n are its coefficients.
     """
     return Series("chebyshev", largest_kappa, np.eye(nodes)), chebyshev_transform(nodes)
 

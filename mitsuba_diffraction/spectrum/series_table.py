@@ -40,7 +40,7 @@ class SeriesTable:
         powers: Callable[[float], NDArray[np.float64]],
         progress: Callable[[int, int], None],
     ) -> SeriesTable:
-        """Adds up the terms, little more than which is held in memory.
+        """Accumulates the terms node by node; little more than the result is held in memory.
 
         Args:
             series: the g_n(κ).

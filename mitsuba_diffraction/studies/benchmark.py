@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import mitsuba as mi
+from rich.table import Table
 
 from ..errors import RequestError
 from ..files import whole_file
@@ -179,7 +180,7 @@ def cells(result: Result) -> list[str]:
     return [*head, "refused", *[""] * (len(COLUMNS) - len(head) - 1)]
 
 
-def tables(results: Sequence[Result], shaders: Sequence[ShaderSpeed], sampled: Sequence[Sampling]) -> list[object]:
+def tables(results: Sequence[Result], shaders: Sequence[ShaderSpeed], sampled: Sequence[Sampling]) -> list[Table]:
     """Speed and error, the real-time shaders, and sampling, for a terminal."""
     return [
         report.table(COLUMNS, map(cells, results), texts=2),

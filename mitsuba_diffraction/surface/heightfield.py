@@ -39,7 +39,7 @@ class HeightField:
         heights: (N_y, N_x) float64, µm; row ↔ +y, column ↔ +x.
         pixel_size: (x, y) in µm; one number for square pixels.
         source: origin of the heights (a file name, a formula) and processing steps, as text.
-        filled: number of pixels that were missing and are filled.
+        filled: how many missing pixels were filled, including those that were cut off since.
 
     Missing pixels (NaN, infinite or masked) are refused. `fill_missing=True` interpolates them instead; see
     `missing.fill_missing`; they are added to `filled`. `keep_missing=True` keeps them as NaN for the steps of
@@ -68,6 +68,8 @@ class HeightField:
         for name, value in (("fill_missing", fill_missing), ("keep_missing", keep_missing)):
             if not isinstance(value, bool | np.bool_):
                 raise RequestError(f"{name}: got {value!r}, wanted True or False")
+        if not (isinstance(filled, int) and filled >= 0):
+            raise RequestError(f"filled: got {filled!r}, wanted a number of pixels")
         array = np.array(missing.as_heights(heights), order="C")
         pixel_size = as_pixel_size(pixel_size)
         gaps = ~np.isfinite(array)

@@ -120,8 +120,8 @@ def find_periods(height_field: HeightField, count: int = 2, *, extent: str = "sa
     A peak broader than a bin of the spectrum is a band of periods: its centre, width and strength are fitted to all
     bins (`bands`), and the scatter of the centre over the quarters of the patch is added in the same way.
 
-    A wave is detected in a patch that holds several of its periods: a tile is repeated until there are enough. Its
-    single periods are orders of its lattice, and exactly known.
+    A wave is detected in a patch that holds several of its periods. A tile is repeated until it does; its own periods
+    are orders of its lattice, and exact.
 
     Args:
         height_field: need not be levelled; missing pixels are filled first.

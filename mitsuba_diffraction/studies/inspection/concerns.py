@@ -70,8 +70,8 @@ def concerns(
         )
     if height_field.filled:
         found.append(
-            f"{height_field.filled} of {height_field.heights.size} pixels were missing and are filled: "
-            "what is there is a guess."
+            f"{height_field.filled} pixels of the scan were missing and are filled: where they remain, the heights are "
+            "a guess."
         )
     if numbers.steepest > _STEEP:
         found.append(

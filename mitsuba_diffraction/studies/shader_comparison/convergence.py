@@ -136,7 +136,7 @@ def convergence(
         FileNotFoundError: if there is no such scene.
         ValueError: if the request is wrong, or a shader cannot show the scene.
     """
-    if not min(tolerances) >= 3 * LEAST_TOLERANCE:
+    if not min(tolerances) / 3 >= LEAST_TOLERANCE:
         raise RequestError(
             f"tolerance: got {min(tolerances):g}, wanted at least {3 * LEAST_TOLERANCE:g}: "
             "the reference takes a third of the finest"

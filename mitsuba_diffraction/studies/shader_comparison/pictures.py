@@ -202,8 +202,8 @@ class Pictures:
         rows, columns = self.surface.shape
         per_dispatch = max(1, _SHADING_POINTS // samples)
         firsts = range(0, rows * columns, per_dispatch)
-        # Two pixels compile the kernels; of one, which may have one sample, they would be others.
-        self._averaged([self._shade(0, 2, samples)] * (rows * columns))
+        # Compiles the kernels. A single pixel may hold a single sample, for which Dr.Jit compiles others; hence two.
+        self._averaged([self._shade(0, 2, samples)] * -(-rows * columns // 2))
         begin = time.perf_counter()
         points = []
         for index, first in enumerate(firsts):

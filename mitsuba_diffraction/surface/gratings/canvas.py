@@ -33,7 +33,8 @@ class Canvas:
         check_positive("pixel_size", pixel_size)
         if self.size[0] < 2 * pitch[0] or self.size[1] < 4 * pitch[1]:
             raise RequestError(
-                f"size: got {size!r} µm, wanted 2 × 4 mean spacings or more, {2 * pitch[0]:.4g} × {4 * pitch[1]:.4g}"
+                f"size: got {size!r} µm, wanted at least 2 × 4 mean spacings, {2 * pitch[0]:.4g} × {4 * pitch[1]:.4g} "
+                "µm"
             )
         if pixel_size > min(pitch) / 4:
             raise RequestError(f"pixel_size: got {pixel_size!r} µm, wanted at most {min(pitch) / 4:.4g} µm")
