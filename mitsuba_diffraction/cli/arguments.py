@@ -75,7 +75,7 @@ def claim(
     )
 
 
-def wanted_suffix(option: str, path: Path, *suffixes: str) -> None:
+def check_suffix(option: str, path: Path, *suffixes: str) -> None:
     """Raises ValueError unless the name of an output ends in one of these."""
     if path.suffix.lower() not in suffixes:
         wanted = " or ".join(filter(None, [", ".join(suffixes[:-1]), suffixes[-1]]))

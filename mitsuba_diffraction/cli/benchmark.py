@@ -9,7 +9,7 @@ import typer
 
 from ..errors import RequestError
 from ..surface.readers import read_height_field
-from .arguments import Overwrite, Variant, claim, wanted_suffix
+from .arguments import Overwrite, Variant, check_suffix, claim
 from .console import progress_bar, show
 from .inputs import files_read
 from .scan import HeightRange, PixelSize
@@ -42,7 +42,7 @@ def benchmark(
     from ..variants import choose_variant
 
     if plot is not None:
-        wanted_suffix("--plot", plot, ".png")
+        check_suffix("--plot", plot, ".png")
     writes = [(option, path) for option, path in (("--json", json), ("--plot", plot)) if path is not None]
     claim(context, [] if scan is None else files_read(scan), writes)
     cases = bundled_cases()

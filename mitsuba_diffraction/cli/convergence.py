@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from .arguments import Define, Overwrite, Variant, claim, scene_parameters, wanted_suffix
+from .arguments import Define, Overwrite, Variant, check_suffix, claim, scene_parameters
 from .console import progress_bar, show, tell
 from .inputs import files_read
 
@@ -37,7 +37,7 @@ def convergence(
     from ..variants import choose_variant
 
     parameters = scene_parameters(define)
-    wanted_suffix("-o", plot, ".png")
+    check_suffix("-o", plot, ".png")
     written = [("-o", plot), *([("--json", json)] if json is not None else [])]
     claim(context, files_read(scene, parameters), written)
     mi.set_variant(choose_variant(variant))

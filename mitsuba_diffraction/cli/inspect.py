@@ -19,7 +19,7 @@ from ..studies.inspection import inspect as look
 from ..studies.inspection.picture import with_uncertainty
 from ..studies.inspection.uncertainty import GREEN
 from ..studies.report import table
-from .arguments import Overwrite, claim, wanted_suffix
+from .arguments import Overwrite, check_suffix, claim
 from .console import progress_bar, show, tell
 from .inputs import files_read
 from .scan import (
@@ -59,7 +59,7 @@ def inspect(
     reads = files_read(source)
     by_default = free_name(f"{source.stem}_inspect", lambda stem: [Path(f"{stem}.png")], reads)
     picture = output or Path(f"{by_default}.png")
-    wanted_suffix("-o", picture, ".png", ".pdf", ".svg")
+    check_suffix("-o", picture, ".png", ".pdf", ".svg")
     claim(context, reads, [("-o", picture), *([("--json", json)] if json else [])])
     of_scan = options_of_scan(
         pixel_size, height_range, fill_missing, channel, unit, [*["level_plane"] * plane, *(prepare or [])]
@@ -78,7 +78,9 @@ def inspect(
     save_picture(inspection, picture, title=source.stem if source.suffix == ".toml" else source.name)
     if json is not None:
         save_json(inspection.as_json(), json)
-    show(_table(inspection), *([_changes_table(inspection), ""] if inspection.changes else []), width=130)
+    show(_table(inspection), *([_changes_table(inspection)] if inspection.changes else []), width=130)
+    if inspection.changes:
+        tell("")
     for concern in inspection.concerns:
         tell(f"! {concern}")
     tell(f"{picture}: height map, spectrum and predicted colours" + (f"\n{json}: the numbers" if json else ""))

@@ -15,7 +15,7 @@ from ..spectrum import GratingSpectrum
 from ..spectrum.build import REPRESENTATIONS, THEORIES
 from ..spectrum.load import Spectrum
 from ..surface.seam import seam_matters, seam_steps
-from .arguments import Overwrite, claim, wanted_suffix
+from .arguments import Overwrite, check_suffix, claim
 from .console import progress_bar, tell
 from .inputs import files_read
 from .scan import (
@@ -87,7 +87,7 @@ def precompute(
     of_scan = options_of_scan(pixel_size, height_range, fill_missing, channel, unit, prepare)
     targets = [output or Path(source.name or "spectrum").with_suffix(".exr") for source in sources]
     for target in targets:
-        wanted_suffix("-o", target, ".exr")
+        check_suffix("-o", target, ".exr")
     reads = [file for source in sources for file in files_read(source)]
     claim(context, reads, [("-o" if output else f"spectrum of {s}", t) for s, t in zip(sources, targets, strict=True)])
     seams = [_seam(source, recipe_of(source, of_scan, settings)) for source in sources]

@@ -10,7 +10,7 @@ import typer
 
 from ..errors import RequestError
 from ..outputs import free_name
-from .arguments import Define, Overwrite, Variant, claim, scene_parameters, wanted_suffix
+from .arguments import Define, Overwrite, Variant, check_suffix, claim, scene_parameters
 from .console import Stopped, progress_bar, tell
 from .inputs import files_read
 
@@ -64,7 +64,7 @@ def render(
     from ..variants import choose_variant
 
     if output is not None:
-        wanted_suffix("-o", output, ".exr")
+        check_suffix("-o", output, ".exr")
     if (frames is not None) != orbit:
         raise RequestError("--frames N and --orbit go together")
     parameters = scene_parameters(define)
