@@ -2,28 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from numpy.typing import NDArray
-from scipy.special import ndtr
 
 from ..spectrum import GratingSpectrum
-from ..spectrum.orders import OrderGrid
-from ..spectrum.spline_grid import spline_integral
 from .arithmetic import larger
+from .cell_axis import CellAxis
 from .horizon import HorizonBins
 from .incidence import Incidence
-from .inversion import SumTable
+from .inversion import SumTable, sums_before
 from .kappa_cells import CELLS, KappaCells, averages, choose
 from .tables import NumberTable, PacketTable, ShareTable, opaque
 
-# The widest cells: in σ_q, to follow the lobes, and in cycles/µm, to follow the horizon.
-WIDEST, FINE = 2.0, 0.06
+WIDEST = 2.0  # σ_q: cells are no wider
 BLOCK = 0.05  # cycles/µm: cells are taken together in blocks of about this width
-LOBE = 4.0  # σ_q: how far the lobes of orders are followed
 
 
 class CellSampler:
@@ -36,12 +29,12 @@ class CellSampler:
     """
 
     def __init__(self, spectrum: GratingSpectrum) -> None:
-        along_x, along_y = (_CellAxis.of(spectrum, axis) for axis in (0, 1))
+        along_x, along_y = (CellAxis.of(spectrum, axis, WIDEST) for axis in (0, 1))
         shares = np.moveaxis(along_y.shares @ averages(spectrum) @ along_x.shares.T, 0, -1)
         # Coefficients of splines may be below zero.
         shares = np.maximum(shares, 0)
         spacing, largest = (along_x.spacing, along_y.spacing), (along_x.largest, along_y.largest)
-        self.cells, self.horizon = KappaCells(spectrum.largest_kappa), HorizonBins(spectrum.wavelengths)
+        self.cells = KappaCells(spectrum.largest_kappa)
         self.spacing_x, self.spacing_y = (opaque(s) for s in spacing)
         self.per_q_x, self.per_q_y = (opaque(1 / s) for s in spacing)
         self.edge_x, self.edge_y = (
@@ -56,10 +49,11 @@ class CellSampler:
         blocks = shares.reshape(self.rows // self.edge_y, self.edge_y, self.columns // self.edge_x, self.edge_x, CELLS)
         blocks = blocks.swapaxes(1, 2).reshape(*blocks.shape[:3:2], -1, CELLS)
         self.blocks_y, self.blocks_x, self.in_block, _ = blocks.shape
-        before_x = _sums_before(blocks.sum(axis=2))
-        self.before_cell = SumTable(_sums_before(blocks)) if self.in_block > 1 else None
+        before_x = sums_before(blocks.sum(axis=2))
+        self.before_cell = SumTable(sums_before(blocks)) if self.in_block > 1 else None
         self.before_x = SumTable(before_x)
 
+        self.horizon = HorizonBins(spectrum.wavelengths, self.blocks_y)
         edge = (np.arange(self.blocks_y + 1) * self.edge_y - largest[1] - 0.5) * spacing[1]
         ends = self.horizon.columns(edge[:-1], edge[1:])
         ends = ends / (spacing[0] * self.edge_x) + (largest[0] + 0.5) / self.edge_x
@@ -67,7 +61,7 @@ class CellSampler:
         end = np.maximum(np.clip(np.ceil(ends[..., 1]), 0, self.blocks_x).astype(np.int64), first)
         row = np.arange(self.blocks_y)
         # As they are read: differences of float32.
-        before_y = _sums_before(np.float64(before_x[row, end]) - before_x[row, first])
+        before_y = sums_before(np.float64(before_x[row, end]) - before_x[row, first])
         self.before_y = SumTable(before_y)
         self.masses = PacketTable(before_y[:, -1])
         self.ends = NumberTable(first | end << 16)
@@ -104,43 +98,3 @@ class CellSampler:
         m_x = mi.Float(column * self.edge_x + cell % self.edge_x - self.largest_x)
         m_y = mi.Float(row * self.edge_y + cell // self.edge_x - self.largest_y)
         return (m_x + x - 0.5) * self.spacing_x, (m_y + v.y - 0.5) * self.spacing_y
-
-
-@dataclass(frozen=True, eq=False)
-class _CellAxis:
-    """The cells along one axis.
-
-    Attributes:
-        spacing: Δ in cycles/µm, a whole part of the spacing of the nodes.
-        largest: M, |m| ≤ M.
-        shares: (2 M + 1, nodes), the integral of the lobe or spline of each node over each cell.
-    """
-
-    spacing: float
-    largest: int
-    shares: NDArray[np.float64]
-
-    @classmethod
-    def of(cls, spectrum: GratingSpectrum, axis: int) -> _CellAxis:
-        """Along x (0) or y (1)."""
-        grid, sigma = spectrum.grid, spectrum.lobe_width
-        nodes = grid.frequencies()[axis]
-        if isinstance(grid, OrderGrid):
-            between, side = 1 / grid.tile_size[axis], min(spectrum.lobes[axis].half_width, LOBE * sigma)
-        else:
-            between, side = grid.spacing[axis], 1.5 * grid.spacing[axis]
-        spacing = between / np.ceil(between / min(WIDEST * sigma, FINE))
-        largest = int(np.ceil((nodes[-1] + side) / spacing - 0.5))
-        ends = (np.arange(-largest, largest + 2) - 0.5) * spacing
-        if isinstance(grid, OrderGrid):
-            below = ndtr((ends[:, None] - nodes) / sigma)
-        else:
-            below = spline_integral((ends[:, None] - nodes) / between)
-        return cls(spacing, largest, np.diff(below, axis=0))
-
-
-def _sums_before(shares: NDArray[np.float64]) -> NDArray[np.float32]:
-    """(..., n, κ cells) → (..., n + 1, κ cells): the sums of those before each, as they are read."""
-    result = np.zeros((*shares.shape[:-2], shares.shape[-2] + 1, shares.shape[-1]), np.float32)
-    result[..., 1:, :] = shares.cumsum(axis=-2)
-    return result

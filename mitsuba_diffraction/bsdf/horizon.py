@@ -7,6 +7,8 @@ larger than bins, of the s on the border of the bin.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -16,31 +18,44 @@ from .arithmetic import larger, limited
 from .incidence import Incidence
 from .tables import opaque
 
-# Bins: equal in cos θ_i, so that they are finest where the horizon is near the mirror direction; in azimuth (eight to
-# a quadrant), which moves the horizon along itself there; and in 1/λ.
-COSINES, AZIMUTHS, FREQUENCIES = 8, 32, 4
 _STEP = 0.02  # between the s that stand for a border
 _BEYOND = 1e-4  # for rounding at run time
+
+
+@dataclass(frozen=True)
+class _Resolution:
+    """How many bins there are.
+
+    They are equal in cos θ_i, so that they are finest where the horizon is near the mirror direction; in azimuth, which
+    moves the horizon along itself there; and in 1/λ.
+    """
+
+    cosines: int
+    azimuths: int
+    frequencies: int
+
+
+COARSE, FINE = _Resolution(8, 32, 4), _Resolution(32, 64, 4)
+FEW = 48  # rows: regions of no more take little memory, so that there can be many
 
 
 class HorizonBins:
     """The bins, and the region of each."""
 
-    count = COSINES * AZIMUTHS * FREQUENCIES
-
-    def __init__(self, wavelengths: tuple[float, float]) -> None:
-        """Takes (shortest, longest) in nm."""
+    def __init__(self, wavelengths: tuple[float, float], rows: int) -> None:
+        """Takes (shortest, longest) in nm and the number of rows of a region."""
+        self.resolution = FINE if rows <= FEW else COARSE
         self._first, self._last = 1e3 / wavelengths[1], 1e3 / wavelengths[0]
         self.first = opaque(self._first)
-        self.per_frequency = opaque(FREQUENCIES / (self._last - self._first))
+        self.per_frequency = opaque(self.resolution.frequencies / (self._last - self._first))
 
     def bin(self, incidence: Incidence) -> mi.UInt32:
         """The bin of one wavelength and where it comes from; beyond the ends, the nearest."""
-        wi = incidence.wi
-        cosine = _cell(wi.z * COSINES, COSINES)
-        azimuth = _cell((_azimuth(wi.x, wi.y) + 2) * (AZIMUTHS / 4), AZIMUTHS)
-        frequency = _cell((incidence.frequency - self.first) * self.per_frequency, FREQUENCIES)
-        return (frequency * COSINES + cosine) * AZIMUTHS + azimuth
+        wi, bins = incidence.wi, self.resolution
+        cosine = _cell(wi.z * bins.cosines, bins.cosines)
+        azimuth = _cell((_azimuth(wi.x, wi.y) + 2) * (bins.azimuths / 4), bins.azimuths)
+        frequency = _cell((incidence.frequency - self.first) * self.per_frequency, bins.frequencies)
+        return (frequency * bins.cosines + cosine) * bins.azimuths + azimuth
 
     def columns(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.float64]:
         """The interval of q_x that propagates for some q_y of a row, low ≤ q_y ≤ high (rows,), all in cycles/µm.
@@ -48,18 +63,19 @@ class HorizonBins:
         Returns:
             (bins, rows, 2), the first and last q_x; where there are none, the first is larger.
         """
-        largest = self._first + (self._last - self._first) * np.arange(1, FREQUENCIES + 1)[:, None] / FREQUENCIES
+        bins = self.resolution
+        largest = np.linspace(self._first, self._last, bins.frequencies + 1)[1:, None]
         largest, low, high = (np.asarray(x, np.float32) for x in (largest, low, high))
-        result = np.empty((FREQUENCIES, COSINES, AZIMUTHS, len(low), 2))
+        result = np.empty((bins.frequencies, bins.cosines, bins.azimuths, len(low), 2))
         # The border is represented by points: each disc is enlarged to cover those up to half a step away.
         square = (1 + _STEP / 2 + _BEYOND) ** 2
-        for cosine, azimuth in np.ndindex(COSINES, AZIMUTHS):
-            s_x, s_y = (s[:, None, None].astype(np.float32) for s in _border(cosine, azimuth))
+        for cosine, azimuth in np.ndindex(bins.cosines, bins.azimuths):
+            s_x, s_y = (s[:, None, None].astype(np.float32) for s in _border(bins, cosine, azimuth))
             y = np.clip(0, low / largest + s_y, high / largest + s_y)
             half = np.where(y**2 < square, np.sqrt(np.maximum(square - y**2, 0)), -np.inf)
             result[:, cosine, azimuth, :, 0] = largest * (-s_x - half).min(axis=0)
             result[:, cosine, azimuth, :, 1] = largest * (half - s_x).max(axis=0)
-        return result.reshape(self.count, len(low), 2)
+        return result.reshape(-1, len(low), 2)
 
 
 def _cell(x: mi.Float, count: int) -> mi.UInt32:
@@ -72,11 +88,11 @@ def _azimuth(x: mi.Float, y: mi.Float) -> mi.Float:
     return dr.select(y >= 0, 1 - along, along - 1)
 
 
-def _border(cosine: int, azimuth: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _border(bins: _Resolution, cosine: int, azimuth: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """s_x and s_y (n,) of the border of a bin, at most `_STEP` apart."""
-    radius = np.sqrt(1 - (np.array([cosine + 1, cosine]) / COSINES) ** 2)
+    radius = np.sqrt(1 - (np.array([cosine + 1, cosine]) / bins.cosines) ** 2)
     # No arc is longer than twice its part of the square.
-    ends = (azimuth + np.linspace(0, 1, int(np.ceil(8 / AZIMUTHS / _STEP)) + 1)) / (AZIMUTHS / 4) - 2
+    ends = (azimuth + np.linspace(0, 1, int(np.ceil(8 / bins.azimuths / _STEP)) + 1)) / (bins.azimuths / 4) - 2
     # The inverse of `_azimuth`.
     along = 1 - np.abs(ends)
     angle = np.arctan2(np.sign(ends) * (1 - np.abs(along)), along)

@@ -92,6 +92,13 @@ class SumTable:
         return dr.minimum(index, self.count - 1), _place(target, low, high)
 
 
+def sums_before(shares: NDArray[np.float64]) -> NDArray[np.float32]:
+    """(..., n, κ cells) → (..., n + 1, κ cells): the sums of those before each, as they are read."""
+    result = np.zeros((*shares.shape[:-2], shares.shape[-2] + 1, shares.shape[-1]), np.float32)
+    result[..., 1:, :] = shares.cumsum(axis=-2)
+    return result
+
+
 def _in_groups(lines: NDArray[np.float32], group: int) -> NDArray[np.float32]:
     """(..., n) → (..., whole groups), continued with the last number of each line."""
     pad = [(0, 0)] * (lines.ndim - 1) + [(0, -lines.shape[-1] % group)]

@@ -38,9 +38,13 @@ class KappaCells:
         return mi.Vector4f(*(squares[cell + 1] - squares[cell] for cell in range(CELLS)))
 
 
-def averages(spectrum: GratingSpectrum) -> NDArray[np.float64]:
-    """A_jm, (CELLS, rows, columns): the mean of the powers over each cell, scaled to the sum one."""
-    return np.stack([_average(spectrum, cell) for cell in range(CELLS)])
+def averages(spectrum: GratingSpectrum, floor: float = 0.0) -> NDArray[np.float64]:
+    """A_jm, (CELLS, rows, columns): the mean of the powers over each cell, scaled to the sum one.
+
+    Of each, all orders have the share `floor` alike, for those that are strong at some κ only.
+    """
+    means = np.stack([_average(spectrum, cell) for cell in range(CELLS)])
+    return (1 - floor) * means + floor / means[0].size
 
 
 def _average(spectrum: GratingSpectrum, cell: int) -> NDArray[np.float64]:

@@ -23,7 +23,7 @@ from .inversion import search
 from .kappa_cells import CELLS, KappaCells, averages, choose
 from .tables import PacketTable, opaque
 
-FLOOR = 0.05  # the share of each κ cell that all orders have alike, for those that its average misses
+FLOOR = 0.05  # the share of each κ cell that all orders have alike
 WHOLE = 2**24  # a float32 holds whole numbers up to here
 LARGEST_TABLE = 2**19  # packets (8 MB); where the sums over rectangles take more, all orders can be drawn
 
@@ -42,7 +42,7 @@ class OrderSampler:
         self.tile_x, self.tile_y = (opaque(t) for t in spectrum.grid.tile_size)
         self.margin = opaque(spectrum.reach * spectrum.lobe_width)
         self.restricted = (self.largest_x + 1) ** 2 * (self.rows + 1) <= LARGEST_TABLE
-        units = np.stack([_units(average) for average in averages(spectrum)], axis=-1)
+        units = np.stack([_units(average) for average in averages(spectrum, FLOOR)], axis=-1)
         self.shares = PacketTable(units)
         # The sums of A_j over the columns before x, for each row.
         before_x = np.zeros((self.rows, self.columns + 1, CELLS), np.int64)
@@ -145,5 +145,4 @@ class OrderSampler:
 
 def _units(average: NDArray[np.float64]) -> NDArray[np.int64]:
     """A_jm of one κ cell in units of 2⁻²⁴: at least one, no more than 2²⁴ together."""
-    mixed = (1 - FLOOR) * average + FLOOR / average.size
-    return 1 + np.floor(mixed * (WHOLE - average.size)).astype(np.int64)
+    return 1 + np.floor(average * (WHOLE - average.size)).astype(np.int64)

@@ -13,9 +13,12 @@ from ..spectrum.orders import LobeAxis
 from .arithmetic import larger
 from .cell_sampler import CellSampler
 from .incidence import Incidence
+from .line_sampler import LineSampler
 from .order_power import order_power
 from .order_sampler import OrderSampler
 from .tables import opaque
+
+NARROW = 0.03  # cycles/µm: the horizon cuts through wider lobes, so that q is drawn instead of orders
 
 
 class OrderSpectrum:
@@ -23,7 +26,7 @@ class OrderSpectrum:
 
     N ends as `OrderGrid.lobes` says. Orders that stand apart need one of them, so that one evaluation reads
     `order_power` once; a tile as large as the coherence length needs 4 × 4. The density is Σ_m P_m N(q − m/T) with the
-    P_m of `OrderSampler`, or, where orders overlap, that of `CellSampler`; either reads one packet.
+    P_m of `OrderSampler`, or, where orders overlap or are wide, that of `LineSampler` or `CellSampler`.
     """
 
     def __init__(self, spectrum: GratingSpectrum) -> None:
@@ -32,9 +35,11 @@ class OrderSpectrum:
             _Axis(lobe, size, largest, sigma)
             for lobe, size, largest in zip(spectrum.lobes, grid.tile_size, grid.largest, strict=True)
         )
-        self.apart = all(axis.count == 1 for axis in self.axes)
+        self.apart = sigma <= NARROW and all(axis.count == 1 for axis in self.axes)
         self.power = order_power(spectrum.table, tuple(axis.rim for axis in self.axes), windows=not self.apart)
-        self.cells = None if self.apart else CellSampler(spectrum)
+        self.cells = None
+        if not self.apart:
+            self.cells = LineSampler(spectrum) if 1 in grid.shape else CellSampler(spectrum)
         self.orders = OrderSampler(spectrum) if self.apart else None
         self.columns = grid.shape[1]
         self.deviation = opaque(sigma)
