@@ -48,10 +48,10 @@ SMALL = {
 WIDE = {
     **{name: BUNDLED[name] for name in ("blazed", "sinusoidal", "lamellar")},
     "ruled": md.gratings.PROFILES["ruled"],
+    "morpho_ridges": md.gratings.PROFILES["morpho_ridges"],
     "skewed ruled": lambda: md.HeightField(
         0.4 * np.interp(np.arange(96) / 96, [0, 0.7, 1], [0, 1, 0])[None], (1.9 / 96, 1.9)
     ),
-    "morpho_ridges": md.gratings.PROFILES["morpho_ridges"],
 }
 """With few rows of orders; their lobes are as wide as the horizon is near at a coherence length of 5 µm."""
 RECIPE_COHERENCE = {"elaphe": 26.0, "xenopeltis": 26.0}
