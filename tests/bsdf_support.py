@@ -125,9 +125,9 @@ def hemisphere(side=512):
     return np.stack([x, y, np.sqrt(1 - x**2 - y**2)], -1), (2 / side) ** 2
 
 
-def albedo(bsdf, wi, **arguments):
+def albedo(bsdf, wi, side=512, **arguments):
     """∫ f cos θ_o dω_o = ∫ f du dv of what `eval` shows, (4,)."""
-    wo, area = hemisphere()
+    wo, area = hemisphere(side)
     return (evaluate(bsdf, wi, wo, **arguments)[0] / wo[:, 2]).sum(1) * area
 
 

@@ -42,8 +42,6 @@ class OrderSpectrum:
             self.cells = LineSampler(spectrum) if 1 in grid.shape else CellSampler(spectrum)
         self.orders = OrderSampler(spectrum) if self.apart else None
         self.columns = grid.shape[1]
-        self.deviation = opaque(sigma)
-        self.inside = opaque(spectrum.lobes[0].inside * spectrum.lobes[1].inside)
 
     def meets(self, q_x: mi.Float, q_y: mi.Float) -> mi.Bool:
         """Whether q lies in the lobe of an order, where they stand apart; q in cycles/µm."""
@@ -131,9 +129,8 @@ class OrderSpectrum:
         lobes_x, lobes_y = self.axes[0].lobes(m_x, q_x), self.axes[1].lobes(m_y, q_y)
         power = self._power(m_x, m_y, lobes_x, lobes_y, kappa, near)
         order = mi.UInt32((m_y + self.axes[1].largest) * self.columns + m_x + self.axes[0].largest)
-        density = self.inside * lobes_x[0] * lobes_y[0]
-        density *= self.orders.share(order, self.orders.weights(incidence, near), near)
-        return power, density
+        share = self.orders.share(order, self.orders.weights(incidence, near), near)
+        return power, share * lobes_x[0] * lobes_y[0]
 
     def sample(
         self,
@@ -146,10 +143,7 @@ class OrderSpectrum:
         if self.cells is not None:
             return self.cells.sample(incidence, u, v, active)
         row, column, v = self.orders.sample(incidence, u, v, active)
-        # A Gaussian as a whole: where it was truncated there is nothing, and the density knows.
-        radius = self.deviation * dr.sqrt(-2 * dr.log(1 - v.x))
-        sin, cos = dr.sincos(dr.two_pi * v.y)
-        return self.axes[0].place(column, radius * cos), self.axes[1].place(row, radius * sin)
+        return self.axes[0].place(column, v.x), self.axes[1].place(row, v.y)
 
 
 class _Axis:
@@ -163,6 +157,7 @@ class _Axis:
         self.size, self.pitch = opaque(size), opaque(1 / size)
         self.half_width = opaque(min(lobe.half_width, 1e30))
         self.falloff = opaque(-0.5 / sigma**2)
+        self.inside, self.spread = opaque(lobe.inside), opaque(np.sqrt(2) * sigma)
         self.peak = opaque(1 / (np.sqrt(2 * np.pi) * sigma * lobe.inside))
         self.slope = opaque(1 / (size * sigma**2))
         self.steps = [opaque(np.exp(-0.5 * (k / (size * sigma)) ** 2)) for k in range(1, 0 if self.all else self.count)]
@@ -192,6 +187,6 @@ class _Axis:
             lobes.append(lobe * step)
         return lobes
 
-    def place(self, node: mi.Int32, offset: mi.Float) -> mi.Float:
-        """The q that is off the order at a row or column by so much, cycles/µm."""
-        return dr.fma(self.pitch, mi.Float(node) - self.largest, offset)
+    def place(self, node: mi.Int32, u: mi.Float) -> mi.Float:
+        """The q in the lobe of the order at a row or column with the share `u` of it below, cycles/µm."""
+        return dr.fma(self.pitch, mi.Float(node) - self.largest, self.spread * dr.erfinv(self.inside * (2 * u - 1)))
