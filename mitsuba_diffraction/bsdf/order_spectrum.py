@@ -18,7 +18,8 @@ from .order_power import order_power
 from .order_sampler import OrderSampler
 from .tables import opaque
 
-NARROW = 0.03  # cycles/µm: the horizon cuts through wider lobes, so that q is drawn instead of orders
+# cycles/µm: of a line grating with wider lobes, which the horizon cuts through, q is drawn instead of an order.
+NARROW = 0.03
 
 
 class OrderSpectrum:
@@ -26,7 +27,8 @@ class OrderSpectrum:
 
     N ends as `OrderGrid.lobes` says. Orders that stand apart need one of them, so that one evaluation reads
     `order_power` once; a tile as large as the coherence length needs 4 × 4. The density is Σ_m P_m N(q − m/T) with the
-    P_m of `OrderSampler`, or, where orders overlap or are wide, that of `LineSampler` or `CellSampler`.
+    P_m of `OrderSampler`; where orders overlap, that of `CellSampler`. For a line grating whose orders overlap or are
+    wide, it is that of `LineSampler`.
     """
 
     def __init__(self, spectrum: GratingSpectrum) -> None:
@@ -35,11 +37,12 @@ class OrderSpectrum:
             _Axis(lobe, size, largest, sigma)
             for lobe, size, largest in zip(spectrum.lobes, grid.tile_size, grid.largest, strict=True)
         )
-        self.apart = sigma <= NARROW and all(axis.count == 1 for axis in self.axes)
+        line = 1 in grid.shape
+        self.apart = all(axis.count == 1 for axis in self.axes) and not (line and sigma > NARROW)
         self.power = order_power(spectrum.table, tuple(axis.rim for axis in self.axes), windows=not self.apart)
         self.cells = None
         if not self.apart:
-            self.cells = LineSampler(spectrum) if 1 in grid.shape else CellSampler(spectrum)
+            self.cells = LineSampler(spectrum) if line else CellSampler(spectrum)
         self.orders = OrderSampler(spectrum) if self.apart else None
         self.columns = grid.shape[1]
 
