@@ -362,7 +362,7 @@ def test_orders_are_drawn_with_their_shares_and_only_those_that_propagate(llvm, 
 @pytest.mark.parametrize("theta", [0, 40])
 def test_no_wavelength_draws_beyond_its_own_lobe(llvm, theta):
     # Regression: lobes were drawn whole and evaluated truncated. What a short wavelength drew beyond its lobe of the
-    # mirror order counted for longer ones, which reflected up to 4 % too much at a tolerance of 0.1.
+    # mirror order counted for longer ones: 800 nm reflected 5.8 % too much.
     spectrum = md.precompute(md.gratings.sinusoidal(2.5, 0.02), coherence_length=16.0, tolerance=0.1)
     assert OrderSpectrum(spectrum).orders is not None
     bsdf = plugin(spectrum, conserve_energy=False)

@@ -1,4 +1,4 @@
-"""Draws from discrete distributions by inversion: binary searches in sums F(i) of the probabilities before each i."""
+"""Draws by inversion: from sums F(i) of the probabilities before each i, by binary search, and from a Gaussian."""
 
 from __future__ import annotations
 
@@ -90,6 +90,17 @@ class SumTable:
         index, low, high = _locate(fine, first, first + size, size, target, low, high)
         # Where nothing is drawn, in a masked lane, all are zero.
         return dr.minimum(index, self.count - 1), _place(target, low, high)
+
+
+def truncated_gaussian(u: mi.Float, inside: mi.Float, spread: mi.Float) -> mi.Float:
+    """√2 σ erf⁻¹(I (2u − 1)), a Gaussian truncated alike on both sides, as lobes are.
+
+    Args:
+        u: in [0, 1).
+        inside: I, the share of the Gaussian that is left.
+        spread: √2 σ.
+    """
+    return spread * dr.erfinv(inside * (2 * u - 1))
 
 
 def sums_before(shares: NDArray[np.float64]) -> NDArray[np.float32]:

@@ -13,6 +13,7 @@ from ..spectrum.orders import LobeAxis
 from .arithmetic import larger
 from .cell_sampler import CellSampler
 from .incidence import Incidence
+from .inversion import truncated_gaussian
 from .line_sampler import LineSampler
 from .order_power import order_power
 from .order_sampler import OrderSampler
@@ -192,4 +193,4 @@ class _Axis:
 
     def place(self, node: mi.Int32, u: mi.Float) -> mi.Float:
         """The q in the lobe of the order at a row or column with the share `u` of it below, cycles/µm."""
-        return dr.fma(self.pitch, mi.Float(node) - self.largest, self.spread * dr.erfinv(self.inside * (2 * u - 1)))
+        return dr.fma(self.pitch, mi.Float(node) - self.largest, truncated_gaussian(u, self.inside, self.spread))

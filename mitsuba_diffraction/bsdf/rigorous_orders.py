@@ -14,7 +14,7 @@ from ..rigorous.mueller import MIRRORED
 from ..rigorous.spectrum import RigorousSpectrum
 from .arithmetic import larger, limited, smaller
 from .incidence import Incidence
-from .inversion import search
+from .inversion import search, truncated_gaussian
 from .order_sampler import WHOLE
 from .tables import PacketTable, opaque
 
@@ -55,7 +55,7 @@ class RigorousOrders:
         self.orders = PacketTable(np.stack([before, np.append(units, 0 * units[..., :1], axis=-1)], axis=-1), width=2)
         sigma, reach = spectrum.lobe_width, spectrum.reach
         inside = math.erf(reach / math.sqrt(2))  # the share of the Gaussian within its reach, along one axis
-        self.deviation, self.inside = opaque(np.sqrt(2) * sigma), opaque(inside)
+        self.spread, self.inside = opaque(np.sqrt(2) * sigma), opaque(inside)
         self.peak, self.falloff = opaque(1 / (2 * np.pi * (sigma * inside) ** 2)), opaque(-0.5 / sigma**2)
         self.half_width = opaque(reach * sigma)
         self.period, self.pitch = opaque(axes.period), opaque(1 / axes.period)
@@ -169,7 +169,7 @@ class RigorousOrders:
             return self.orders(mi.UInt32(middle + m), active).x
 
         m, _ = search(before, mi.Int32(-largest), mi.Int32(largest + 1), 2 * largest + 1, u)
-        x, y = (self.deviation * dr.erfinv(self.inside * (2 * number - 1)) for number in v)
+        x, y = (truncated_gaussian(number, self.inside, self.spread) for number in v)
         return dr.fma(self.pitch, mi.Float(m), x), y
 
     def _z(self, g: mi.Float, frequency: mi.Float) -> mi.Float:
