@@ -33,11 +33,16 @@ settings.load_profile("tests")
 MEASURED = Path(__file__).parents[1] / "precompute" / "measured"
 _HEIGHT_RANGE = {"elaphe": 0.375, "xenopeltis": 0.819}
 """µm, black to white."""
+_TAKES_LONG = {"mi", "Furnace", "NotebookClient", "subprocess"}
+"""What test modules import whose tests compile kernels, trace light in a furnace or start Python anew."""
 
 
 @pytest.hookimpl(tryfirst=True)  # before -m selects
 def pytest_collection_modifyitems(items):
-    """Of a test marked `few(n)`, n of the cases that are not slow stay so, evenly spaced; the others are slow."""
+    """Mark cases of tests as `slow` or `quick`.
+
+    Of a test marked `few(n)`, n of the cases that are not slow stay so, evenly spaced; the others are slow.
+    """
     cases = defaultdict(list)
     for item in items:
         if (few := item.get_closest_marker("few")) and not item.get_closest_marker("slow"):
@@ -46,6 +51,13 @@ def pytest_collection_modifyitems(items):
         kept = np.linspace(0, len(those) - 1, count).round()
         for case in set(range(len(those))) - set(kept):
             those[case].add_marker(pytest.mark.slow)
+    # Of the tests that do none of what takes long, one case each is quick.
+    tests = set()
+    for item in items:
+        takes_long = "llvm" in item.fixturenames or _TAKES_LONG & vars(item.module).keys()
+        if not (takes_long or item.get_closest_marker("slow") or item.function in tests):
+            tests.add(item.function)
+            item.add_marker(pytest.mark.quick)
 
 
 @pytest.fixture(scope="session", autouse=True)

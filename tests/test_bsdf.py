@@ -97,6 +97,7 @@ def test_orders_have_their_power_and_nothing_lies_between(llvm, name, theta, phi
         assert evaluate(bsdf, wi, wo)[0][:, channel].max() < 1e-6 * wanted.max()
 
 
+@pytest.mark.quick
 def test_blaze_goes_to_the_side_that_its_facets_mirror(llvm):
     wi = direction(0)
     wo = towards(wi, np.array([[0.4, 0], [-0.4, 0]]), 500)

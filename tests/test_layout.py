@@ -41,6 +41,7 @@ def in_a_fresh_process(program):
     return done.stdout.split()
 
 
+@pytest.mark.quick
 def test_no_module_imports_itself_by_way_of_others():
     graph = {module: set(imports(module)) - {module} for module in MODULES}
     assert sum(map(len, graph.values())) > 200

@@ -245,6 +245,7 @@ def film_of(path, **sizes):
     return load_spectral_scene(path, **sizes).sensors()[0].film()
 
 
+@pytest.mark.quick
 def test_size_crop_and_filter(llvm, tmp_path):
     film = """<film type="hdrfilm"><integer name="width" value="40"/><integer name="height" value="20"/>
         <integer name="crop_offset_x" value="10"/><integer name="crop_offset_y" value="4"/>
