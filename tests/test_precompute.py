@@ -8,6 +8,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.special import jv
+from threadpoolctl import threadpool_info, threadpool_limits
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction import HeightField, precompute
@@ -358,6 +359,23 @@ def test_pixels_too_coarse_are_told(pixel, axis):
 
 def test_an_axis_of_one_pixel_has_no_limit_to_tell():
     precompute(HeightField(np.linspace(0, 0.1, 30)[None], (0.08, 50.0)))
+
+
+def test_small_matrices_are_multiplied_on_one_thread(monkeypatch):
+    """On several, a small tile whose lobes overlap took thirteen times as long where other work kept the cores busy."""
+    limited = []
+    monkeypatch.setattr(
+        "mitsuba_diffraction.spectrum.build.lobe_width",
+        lambda length: (
+            limited.append({pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"})
+            or lobe_width(length)
+        ),
+    )
+    with threadpool_limits(2, user_api="blas"):
+        precompute(md.gratings.blazed(period=2.5, depth=0.25))
+        assert all(pool["num_threads"] == 2 for pool in threadpool_info() if pool["user_api"] == "blas")
+    assert limited
+    assert all(threads == {1} for threads in limited)
 
 
 def test_progress_counts_up_to_the_whole():

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import functools
-from contextlib import AbstractContextManager
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 from threadpoolctl import ThreadpoolController
 
@@ -13,6 +14,12 @@ def _controller() -> ThreadpoolController:
     return ThreadpoolController()
 
 
-def one_thread() -> AbstractContextManager:
-    """Within it BLAS takes one thread: on matrices of a hundred rows more of them wait for each other."""
-    return _controller().limit(limits=1, user_api="blas")
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Run BLAS on one thread in the block, or in the function that this decorates.
+
+    On matrices of some hundred rows several threads wait for each other: the spectrum of a tile of 26 × 36 pixels whose
+    lobes overlap took 5 s instead of 0.7 s on two idle cores, and up to thirteen times as long on busy ones.
+    """
+    with _controller().limit(limits=1, user_api="blas"):
+        yield

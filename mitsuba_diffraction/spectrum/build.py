@@ -14,6 +14,7 @@ from ..coherence import SUN_COHERENCE_LENGTH, lobe_reach, lobe_width
 from ..errors import RequestError
 from ..files import cache_folder
 from ..reference import check_extent
+from ..rigorous.blas import one_thread
 from ..rigorous.build import build_spectrum
 from ..surface.heightfield import HeightField
 from ..wavelengths import VISIBLE
@@ -63,6 +64,7 @@ Splines = SamplePowers | TileSplines
 Table = SeriesTable | SliceTable
 
 
+@one_thread()
 def precompute(
     height_field: HeightField | Sequence[HeightField],
     *,
@@ -190,7 +192,7 @@ def precompute(
             warnings.warn(
                 f"coherence_length: a scan of {x:.4g} × {y:.4g} µm carries {carried:.4g} µm of the "
                 f"{coherence_length:.4g} µm asked for; the lobes are as wide as the scan allows",
-                stacklevel=2,
+                stacklevel=3,
             )
         powers = _refined(
             lambda spacing: SamplePowers(height_field, carried, spacing, reach),
@@ -512,5 +514,5 @@ def _check_resolution(height_field: HeightField, reach: float) -> None:
             warnings.warn(
                 f"pixels of {size * 1e3:.4g} nm along {axis} hold no frequency beyond {1 / (2 * size):.3g} cycles/µm, "
                 f"but light reaches {reach:.3g}: what lies between is missing",
-                stacklevel=3,
+                stacklevel=4,
             )
