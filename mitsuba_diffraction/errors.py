@@ -2,6 +2,16 @@
 
 from __future__ import annotations
 
+import builtins
+import re
+
+# An exception in a Python plugin comes as text: where the scene names the plugin, lines that are indented, then the
+# class of the exception and its message.
+_OF_PLUGIN = re.compile(
+    r'(?:At (?P<place>.+): failed to instantiate .+ plugin of type "(?P<plugin>\w+)": )?'
+    r"Traceback \(most recent call last\):\n(?:\s+.*\n)*(?:\w+\.)*(?P<kind>\w+)(?:: )?"
+)
+
 
 class RequestError(ValueError):
     """An argument, a file or a scene is wrong; the text quotes what came and says what was wanted."""
@@ -15,3 +25,35 @@ def is_bug(kind: type[BaseException]) -> bool:
     """Whether an exception of this class is a mistake of the code: neither a wrong request nor a failure around it."""
     foreseen = RequestError, RuntimeError, OSError, MemoryError, ImportError
     return not issubclass(kind, foreseen) or issubclass(kind, NotImplementedError | RecursionError)
+
+
+def is_number(value: object) -> bool:
+    """Tell whether a parameter is a number: True and False are none."""
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def root_cause(error: BaseException) -> str:
+    """Return the message at the end of the chain of exceptions of Mitsuba, as one line.
+
+    Mitsuba raises "Error while ..." with the actual error as `__cause__`; its messages span several lines and begin
+    with the location in its C++ sources.
+
+    Raises:
+        KeyboardInterrupt: if that is the cause.
+        Bug: if the cause is a mistake of the code.
+    """
+    while error.__cause__ is not None:
+        error = error.__cause__
+    if isinstance(error, KeyboardInterrupt):
+        raise error
+    kind, text = type(error), re.sub(r"\[\w+\.(cpp|h):\d+\] ?", "", str(error))
+    if (match := _OF_PLUGIN.search(text)) is not None:
+        kind = {"RequestError": RequestError}.get(match["kind"]) or getattr(builtins, match["kind"], Exception)
+        place = f"{match['plugin']} at {match['place']}: " if match["plugin"] else ""
+        text = text[: match.start()] + place + text[match.end() :]
+    if kind is KeyboardInterrupt:
+        raise KeyboardInterrupt from error
+    text = " ".join(text.split()) or kind.__name__
+    if is_bug(kind):
+        raise Bug(f"{kind.__name__}: {text}") from error
+    return text

@@ -15,6 +15,7 @@ import mitsuba as mi
 from . import llvm
 from .bsdf import diffraction_grating
 from .bsdf.surface import hand_over
+from .errors import Bug, root_cause
 from .integrator import diffraction_path
 from .shader import integrator
 from .variants import is_spectral
@@ -48,20 +49,32 @@ def _refusal(reason: str) -> Callable[[mi.Properties], mi.Object]:
     return refuse
 
 
-def _accept_spectra() -> None:
-    """Make mi.load_dict accept a GratingSpectrum as a value, which Mitsuba refuses."""
-    original = mi.load_dict
+def _wrap_loaders() -> None:
+    """Make mi.load_dict accept a GratingSpectrum as a value, and all loaders tell in one line what a plugin refuses."""
+    for name in ("load_dict", "load_file", "load_string"):
+        setattr(mi, name, _telling(getattr(mi, name)))
 
-    @functools.wraps(original)
-    def load_dict(dict: dict, *args: object, **kwargs: object) -> object:
-        return original(hand_over(dict), *args, **kwargs)
 
-    mi.load_dict = load_dict
+def _telling(load: Callable[..., mi.Object]) -> Callable[..., mi.Object]:
+    @functools.wraps(load)
+    def loader(scene: dict | str, *args: object, **kwargs: object) -> mi.Object:
+        try:
+            return load(hand_over(scene), *args, **kwargs)
+        except RuntimeError as error:
+            if not any(f'plugin of type "{name}"' in str(error) for name, *_ in PLUGINS):
+                raise
+            try:
+                line = root_cause(error)
+            except Bug:
+                raise error from None  # whole, with the place in the code
+        raise RuntimeError(line)
+
+    return loader
 
 
 # A reload must not do this twice.
 if not getattr(mi, "_mitsuba_diffraction_registered", False):
-    _accept_spectra()
+    _wrap_loaders()
     mi._mitsuba_diffraction_registered = True
     # With one thread, on a machine of one core, Mitsuba 3.9.1 waits for ever where it reads or writes an EXR picture.
     if dr.thread_count() < 2:

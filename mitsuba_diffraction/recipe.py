@@ -54,7 +54,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from .errors import RequestError
+from .errors import RequestError, is_number
 from .files import cache_folder, refuse_special
 from .rigorous import build as rigorous
 from .spectrum.build import precompute
@@ -133,7 +133,7 @@ class Recipe:
             if not (_is_plain(value) or (isinstance(value, list | tuple) and all(_is_plain(v) for v in value))):
                 raise RequestError(f"{name}: got {value!r}, wanted a number, a text, or a list of them")
         for name in ("tolerance", "coherence_length", "largest_angle", "largest_height_range", "int_ior", "ext_ior"):
-            if name in self.spectrum and not _is_number(self.spectrum[name]):
+            if name in self.spectrum and not is_number(self.spectrum[name]):
                 raise RequestError(f"{name}: got {self.spectrum[name]!r}, wanted a number")
         if "wavelengths" in self.spectrum and not isinstance(self.spectrum["wavelengths"], list | tuple):
             raise RequestError(f"wavelengths: got {self.spectrum['wavelengths']!r}, wanted [shortest, longest] in nm")
@@ -287,10 +287,6 @@ def _refuse_unknown(where: str, table: Mapping[str, Any], known: frozenset[str])
         raise RequestError(
             f"{where}: got the unknown name {', '.join(unknown)}, wanted among {', '.join(sorted(known))}"
         )
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def _is_plain(value: object) -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import builtins
 import hashlib
 import os
 import re
@@ -16,7 +15,7 @@ import mitsuba.parser
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import Bug, RequestError, is_bug
+from ..errors import RequestError, root_cause
 from ..recipe import Recipe
 from ..variants import is_spectral
 from ..wavelengths import VISIBLE
@@ -30,9 +29,6 @@ _STEP = 5.0
 
 _MOST_PIXELS = 2**25  # above 7680 × 4320; sums take 750 bytes per pixel
 _DEFAULT_SIZE = (768, 576)  # that of Mitsuba's films
-
-# An exception in a Python plugin comes as text: lines that are indented, then its class and its message.
-_INNER_TRACEBACK = re.compile(r"Traceback \(most recent call last\):\n(?:\s+.*\n)*(?:\w+\.)*(\w+)(?:: )?")
 
 
 def channel_wavelengths() -> NDArray[np.float64]:
@@ -98,6 +94,8 @@ def load_spectral_scene(
         scene = mi.parser.instantiate(config, state)
     if not isinstance(scene, mi.Scene):
         raise RequestError(f"{path}: the file holds a {type(scene).__name__}, wanted a scene")
+    if scene.integrator() is None:
+        raise RequestError(f'{path}: the scene has no integrator, wanted one, such as <integrator type="path"/>')
     if scene.integrator().aov_names():
         raise RequestError(f"{path}: the integrator gives {scene.integrator().aov_names()}, wanted radiance alone")
     return scene
@@ -280,27 +278,3 @@ def _what_there_is(scene: Path, error: str) -> str:
         known = sorted({*re.findall(r"\$(\w+)", text), *re.findall(r'<default\s+name="(\w+)"', text)})
         return f"; the scene's parameters are {', '.join(known) or 'none'}"
     return ""
-
-
-def root_cause(error: BaseException) -> str:
-    """The message at the end of the chain of exceptions of Mitsuba, as one line.
-
-    Mitsuba raises "Error while ..." with the actual error as `__cause__`; its messages span several lines and begin
-    with the location in its C++ sources.
-
-    Raises:
-        KeyboardInterrupt: if that is the cause.
-        Bug: if the cause is a mistake of the code.
-    """
-    while error.__cause__ is not None:
-        error = error.__cause__
-    if isinstance(error, KeyboardInterrupt):
-        raise error
-    kind, text = type(error), re.sub(r"\[\w+\.(cpp|h):\d+\]", "", str(error))
-    if (match := _INNER_TRACEBACK.search(text)) is not None:
-        kind = {"RequestError": RequestError}.get(match[1]) or getattr(builtins, match[1], Exception)
-        text = text[: match.start()] + text[match.end() :]
-    text = " ".join(text.split()) or kind.__name__
-    if is_bug(kind):
-        raise Bug(f"{kind.__name__}: {text}") from error
-    return text
