@@ -182,6 +182,28 @@ def test_a_wrong_layer_is_refused(llvm, parameters, text):
         coated(**parameters)
 
 
+@pytest.mark.parametrize(
+    ("layer", "without"),
+    [
+        ({"coat_ior": 1.0, "material": "Al"}, {"material": "Al"}),
+        ({"coat_ior": "air", "int_ior": 1.8, "coat_thickness": 2.0, "coat_absorption": 0.0}, {"int_ior": 1.8}),
+        ({"coat_ior": 1.33, "ext_ior": 1.33, "int_ior": 1.8}, {"ext_ior": 1.33, "int_ior": 1.8}),
+        # A layer of the index of water on a metal in water.
+        (
+            {"coat_ior": 1.33, "ext_ior": 1.33, "material": "Al"},
+            {"coat_ior": 1.3314, "ext_ior": 1.33, "material": "Al"},
+        ),
+    ],
+)
+def test_a_layer_of_the_index_of_the_outside_is_none(llvm, layer, without):
+    found = coated(**layer)
+    assert found.coat is None
+    plain = {"type": "diffraction_grating", "profile": "blazed", "period": 2.5, "depth": 0.25, "coherence_length": 3.0}
+    wi, wo = direction(20.0), direction(-30.0)
+    values = [probe.evaluate(bsdf, wi, wo, [550]) for bsdf in (found, mi.load_dict({**plain, **without}))]
+    np.testing.assert_allclose(values[0], values[1], rtol=1e-6 if "coat_ior" not in without else 0.02)
+
+
 def test_a_layer_without_an_index_or_without_its_wavelengths_is_refused(llvm):
     plain = {"type": "diffraction_grating", "profile": "blazed", "period": 2.5, "depth": 0.25}
     with pytest.raises(RuntimeError, match="got a layer without coat_ior"):

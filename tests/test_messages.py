@@ -21,12 +21,13 @@ BLAZED = '<string name="profile" value="blazed"/><float name="period" value="2.5
     ("body", "parameters", "words"),
     [
         ("", {"light": "moon"}, "lights holds lamp, sun"),
+        ("", {}, 'the scene has no integrator, wanted one, such as <integrator type="path"/>'),
         ("", {"lamp": "moon"}, "the scene's parameters are light"),
         (GRATING % '<string name="filename" value="gone.exr"/>', {}, r"gone.exr: no such file; .* holds skin.exr"),
         (
             GRATING % (BLAZED + '<string name="material" value="Alu"/>'),
             {},
-            r"'Alu', did you mean Al or .*of Ag, Al, ",
+            r"'Alu', did you mean Al; none is the perfect mirror",
         ),
         (GRATING % (BLAZED + '<bsdf type="diffuse"/>'), {}, 'wanted <bsdf name="base"'),
         (GRATING % (BLAZED + '<string name="height_scale" value="a"/>'), {}, "height_scale: got 'a', wanted a number"),
@@ -48,6 +49,66 @@ def test_what_there_is_is_said(body, parameters, words, tmp_path, llvm):
     (tmp_path / "scene.xml").write_text(SCENE % body)
     with pytest.raises(ValueError, match=words):
         load_spectral_scene(tmp_path / "scene.xml", parameters=parameters)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        ({"material": "Aluminium"}, "material: got 'Aluminium', did you mean Al; none is the perfect mirror, R = 1"),
+        ({"material": "silver"}, "material: got 'silver', did you mean Ag; none is the perfect mirror, R = 1"),
+        ({"material": "Nickel"}, "material: got 'Nickel', did you mean Ni_palik; none is the perfect mirror, R = 1"),
+        ({"material": "Al_palik"}, "material: got 'Al_palik', did you mean Al; none is the perfect mirror, R = 1"),
+        ({"material": [1.0, 2, 3]}, "material: got [1, 2, 3], wanted the name of a conductor, such as 'Al', or 'none'"),
+        ({"coat_ior": 1.5, "coat_absorption": "x"}, "coat_absorption: got 'x', wanted a number ≥ 0"),
+        ({"coat_ior": 1.5, "coat_thickness": [1.0, 2, 3]}, "coat_thickness: got [1, 2, 3], wanted a number ≥ 0"),
+        ({"coat_ior": 1.5, "coat_absorption": True}, "coat_absorption: got True, wanted a number ≥ 0"),
+        ({"coat_ior": [1.0, 2, 3]}, "coat_ior: got [1, 2, 3], wanted a positive index of refraction, or a name such "),
+        ({"int_ior": True}, "int_ior: got True, wanted a positive index of refraction, or a name such as 'bk7'"),
+        ({"int_ior": "bk8"}, "int_ior: got 'bk8', wanted a number or one of vacuum, helium, "),
+        ({"height_scale": True}, "height_scale: got True, wanted a number"),
+        ({"profile": "blaze"}, "profile: got 'blaze', wanted one of blazed, sinusoidal, "),
+    ],
+)
+def test_loaders_refuse_in_one_line(parameters, message, tmp_path, llvm):
+    grating = {"type": "diffraction_grating", "profile": "blazed", "period": 2.5, "depth": 0.25, **parameters}
+    with pytest.raises(RuntimeError) as caught:
+        mi.load_dict({"type": "scene", "shape": {"type": "sphere", "bsdf": grating}})
+    assert str(caught.value).startswith(f'diffraction_grating at dictionary node "shape.bsdf": {message}')
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 400
+
+
+def test_xml_is_refused_in_one_line_too(tmp_path, llvm):
+    text = f'<scene version="3.0.0">{GRATING}</scene>' % '<string name="profile" value="blaze"/>'
+    (tmp_path / "scene.xml").write_text(text)
+    for load, source in ((mi.load_string, text), (mi.load_file, str(tmp_path / "scene.xml"))):
+        with pytest.raises(RuntimeError, match=r"^diffraction_grating at [^\n]*: profile: got 'blaze', wanted [^\n]*$"):
+            load(source)
+
+
+def test_a_mistake_of_the_code_keeps_its_traceback(monkeypatch, llvm):
+    monkeypatch.setattr("mitsuba_diffraction.bsdf.surface.Recipe", None)
+    with pytest.raises(RuntimeError, match=r"Traceback(.|\n)*TypeError: 'NoneType' object is not callable"):
+        mi.load_dict({"type": "diffraction_grating", "profile": "blazed", "period": 2.5, "depth": 0.25})
+
+
+def test_what_is_logged_is_plain(caplog, capfd, llvm, command, tmp_path):
+    """One line each, without colours and places in the code; Mitsuba's own log has both, in files too."""
+    grating = {"type": "diffraction_grating", "profile": "blazed", "period": 2.5, "depth": 0.25, "coat_ior": 1.5}
+    told = "diffraction_grating: coat_thickness changes nothing: absorption needs coat_absorption and coat_thickness"
+    mi.load_dict({**grating, "coat_thickness": 10.0})
+    assert told in [record.getMessage() for record in caplog.records]
+    assert "".join(capfd.readouterr()) == ""
+    body = BLAZED + '<float name="coat_ior" value="1.5"/><float name="coat_thickness" value="10"/>'
+    (tmp_path / "lights").mkdir()
+    (tmp_path / "lights" / "sun.xml").write_text('<scene version="3.0.0"><emitter type="constant"/></scene>')
+    scene = (SCENE % GRATING % body).replace("<sensor", '<integrator type="path"/><sensor')
+    (tmp_path / "scene.xml").write_text(scene)
+    output = tmp_path / "scene.exr"
+    code, _, err = command("render", str(tmp_path / "scene.xml"), "-o", str(output), "--width", "4", "--spp", "1")
+    assert code == 0, err
+    assert f"mitsuba-diffraction: warning: {told}\n" in err
+    assert "\x1b" not in err
 
 
 def test_wrong_requests_have_a_class_of_their_own():

@@ -12,37 +12,58 @@ lost; the front face itself reflects F as a mirror.
 
 from __future__ import annotations
 
+import logging
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..errors import RequestError
+from ..errors import RequestError, is_number
 from ..nested_plugin import nested_plugin
 from .tables import opaque
 
+_SAME_INDEX = 1e-3  # indices of refraction that differ by less, such as those of air and vacuum, are the same
+_log = logging.getLogger(__name__)
+
 
 def coat_from(props: mi.Properties) -> Coat | None:
-    """The layer that the parameters `coat_ior`, `coat_absorption` and `coat_thickness` describe, if there is one.
+    """Return the layer that `coat_ior`, `coat_absorption` and `coat_thickness` describe, if there is one.
+
+    One that has the index of the outside and does not absorb is none.
 
     Raises:
-        ValueError: if its index is below one or below that of the outside, or a parameter makes no sense.
+        RequestError: if its index is below one or below that of the outside, or a parameter is out of range.
     """
-    absorption, thickness = props.get("coat_absorption", 0.0), props.get("coat_thickness", 0.0)
+    given = {name: props[name] for name in ("coat_absorption", "coat_thickness") if name in props}
     if "coat_ior" not in props:
-        if "coat_absorption" in props or "coat_thickness" in props:
+        if given:
             raise RequestError("coat_absorption, coat_thickness: got a layer without coat_ior, wanted its index, too")
         return None
-    for name, value in (("coat_absorption", absorption), ("coat_thickness", thickness)):
-        if not 0 <= value < np.inf:
-            raise RequestError(f"{name}: got {value}, wanted a number ≥ 0")
-    return Coat(props["coat_ior"], props.get("ext_ior", "air"), absorption * thickness)
+    for name, value in given.items():
+        if not (is_number(value) and 0 <= value < np.inf):
+            raise RequestError(f"{name}: got {value!r}, wanted a number ≥ 0")
+    if len(given) == 1:
+        _log.warning(
+            "diffraction_grating: %s changes nothing: absorption needs coat_absorption and coat_thickness", *given
+        )
+    depth = given.get("coat_absorption", 0.0) * given.get("coat_thickness", 0.0)
+    coat = Coat(props["coat_ior"], props.get("ext_ior", "air"), depth)
+    return None if coat.relative < 1 + _SAME_INDEX and not coat.absorbs else coat
 
 
 def absolute_index(name: str, index: float | str) -> float:
-    """An index of refraction, given by a number or by a preset's name as in Mitsuba's `dielectric`."""
-    if isinstance(index, int | float) and not 0 < index < np.inf:
-        raise RequestError(f"{name}: got {index}, wanted a positive index of refraction, or a name such as 'bk7'")
-    interface = nested_plugin("dielectric", int_ior=index, ext_ior=1.0)
+    """Return an index of refraction, given by a number or by a preset's name as in Mitsuba's `dielectric`.
+
+    Raises:
+        RequestError: if it is neither.
+    """
+    if not isinstance(index, str) and not (is_number(index) and 0 < index < np.inf):
+        raise RequestError(f"{name}: got {index!r}, wanted a positive index of refraction, or a name such as 'bk7'")
+    try:
+        interface = nested_plugin("dielectric", int_ior=index, ext_ior=1.0)
+    except RuntimeError as error:
+        known = str(error).partition("Valid choices are:")[2].strip()
+        raise RequestError(f"{name}: got {index!r}, wanted a number or one of {known}") from None
     return float(np.ravel(mi.traverse(interface)["eta"])[0])
 
 
@@ -58,9 +79,9 @@ class Coat:
     def __init__(self, index: float | str, outside: float | str, depth: float) -> None:
         self.index = absolute_index("coat_ior", index)
         outer = absolute_index("ext_ior", outside)
-        if not (self.index >= 1 and self.index >= outer):
+        if self.index < max(1, (1 - _SAME_INDEX) * outer):
             raise RequestError(f"coat_ior: got {self.index:g}, wanted at least one and that of the outside, {outer:g}")
-        self.relative = self.index / outer
+        self.relative = max(self.index / outer, 1.0)
         self.eta, self.depth = opaque(self.relative), opaque(depth)
         self.absorbs = depth > 0
 

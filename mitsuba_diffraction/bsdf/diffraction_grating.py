@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..coherence import SUN_COHERENCE_LENGTH
-from ..errors import RequestError
+from ..errors import RequestError, is_number
 from ..manual import Parameter, listed
 from ..rigorous.spectrum import RigorousSpectrum
 from ..spectrum.energy_table import SHADOWING
@@ -59,7 +59,12 @@ PARAMETERS = (
     Parameter("height_scale", "float", "scales the heights", "1"),
     Parameter("shadowing", "string", "v_cavity or none", "v_cavity"),
     Parameter("conserve_energy", "boolean", "false leaves out E, to compare with closed forms", "true"),
-    Parameter("coat_ior", "float or string", "index of a clear plane layer over the grating, as for int_ior", "none"),
+    Parameter(
+        "coat_ior",
+        "float or string",
+        "index of a clear plane layer over the grating, as for int_ior; that of the outside is no layer",
+        "none",
+    ),
     Parameter("coat_absorption", "float", "of the layer, 1/µm", "0"),
     Parameter("coat_thickness", "float", "of the layer, µm; it matters only with coat_absorption", "0"),
     Parameter(
@@ -118,7 +123,7 @@ def define() -> type:
             )
             self.orientation = _orientation(props)
             height_scale = props.get("height_scale", 1.0)
-            if not isinstance(height_scale, int | float):
+            if not is_number(height_scale):
                 raise RequestError(f"height_scale: got {height_scale!r}, wanted a number")
             self.height_scale = mi.Float(height_scale)
             self.shadowing = props.get("shadowing", "v_cavity")

@@ -30,12 +30,18 @@ def reflectance_from(props: mi.Properties, coat: Coat | None) -> PerfectMirror |
     if "material" not in props:
         outside = props.get("ext_ior", "air")
         return Dielectric(props.get("int_ior", 1.5), outside if coat is None else coat.index, model)
-    if "int_ior" in props or ("ext_ior" in props and coat is None):
+    if "int_ior" in props or ("ext_ior" in props and "coat_ior" not in props):
         raise RequestError(
             "material: a conductor or a perfect mirror takes no int_ior or ext_ior; give one or the other"
         )
     material = props["material"]
-    return PerfectMirror() if material == "none" else Conductor(material, model, 1.0 if coat is None else coat.index)
+    if not isinstance(material, str):
+        raise RequestError(f"material: got {material!r}, wanted the name of a conductor, such as 'Al', or 'none'")
+    if material == "none":
+        return PerfectMirror()
+    # A coat that has the index of the outside is none.
+    outside = coat.index if coat is not None else absolute_index("ext_ior", props.get("ext_ior", 1.0))
+    return Conductor(material, model, outside)
 
 
 class PerfectMirror:
@@ -99,7 +105,7 @@ class Conductor:
         try:
             wavelengths, *index = conductor(material, data)
         except RequestError as error:
-            raise RequestError(f"{error}, or none (R = 1)") from None
+            raise RequestError(f"{error}; none is the perfect mirror, R = 1") from None
         self.eta, self.k = (self._spectrum(wavelengths, values / outside) for values in index)
         self.material = material
         self.model = model

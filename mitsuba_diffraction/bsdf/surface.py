@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import json
+import logging
 import weakref
 from pathlib import Path
 
@@ -21,6 +22,7 @@ from ..wavelengths import VISIBLE
 from .coat import Coat
 from .rigorous_parameters import settings_from, settings_of_medium
 
+_log = logging.getLogger(__name__)
 _PREFIX = "handed over: "
 _told: set[str] = set()  # surfaces whose range was looked up
 _handed_over: weakref.WeakValueDictionary[str, Spectrum] = weakref.WeakValueDictionary()
@@ -80,7 +82,7 @@ def warn_of_range(recipe: Recipe) -> None:
     _told.add(told)
     surface = recipe.height_field()
     if beyond := range_warning(surface):
-        mi.Log(mi.LogLevel.Warn, f"diffraction_grating, {surface.source}: {beyond}")
+        _log.warning("diffraction_grating, %s: %s", surface.source, beyond)
 
 
 def _inside(coat: Coat | None, recipe: Recipe) -> Recipe:

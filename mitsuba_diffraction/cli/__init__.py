@@ -6,6 +6,7 @@ Exit codes: 0 done; 1 the work failed; 2 the request was wrong; 130 interrupted.
 from __future__ import annotations
 
 import io
+import logging
 import signal
 import sys
 import traceback
@@ -19,7 +20,7 @@ from typer.core import TyperCommand
 from ..errors import Bug, RequestError, is_bug
 from .benchmark import benchmark
 from .compare import compare
-from .console import NAME, Stopped, say, tell
+from .console import NAME, Log, Stopped, say, tell
 from .convergence import convergence
 from .inspect import inspect
 from .precompute import precompute
@@ -78,6 +79,8 @@ def main() -> None:
         if isinstance(stream, io.TextIOWrapper):  # neither file names nor terminals need be UTF-8
             stream.reconfigure(errors="backslashreplace")
     warnings.showwarning = lambda message, *args, **kwargs: say("warning", message)
+    log, logger = Log(), logging.getLogger(__package__.partition(".")[0])
+    logger.addHandler(log)
     options: dict[str, bool] = {}
     ctrl_c, before = _CtrlC(), signal.getsignal(signal.SIGINT)
     # Ctrl-C stays ignored where it is, as in background jobs of a script.
@@ -92,6 +95,7 @@ def main() -> None:
         code = _tell(KeyboardInterrupt() if lost else error, **options)
     finally:
         signal.signal(signal.SIGINT, before)
+        logger.removeHandler(log)
     sys.exit(code)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import time
 from collections.abc import Callable, Iterator
@@ -74,3 +75,10 @@ def show(*tables: RenderableType, width: int) -> None:
 
 def say(kind: str, message: object) -> None:
     err.print(f"{NAME}: {kind}: {' '.join(str(message).split())}", markup=False, emoji=False)
+
+
+class Log(logging.Handler):
+    """Shows what the package logs as the command's own messages."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        say(record.levelname.lower(), record.getMessage())

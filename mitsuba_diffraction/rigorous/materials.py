@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from difflib import get_close_matches
 from importlib import metadata
 from numbers import Complex
 from pathlib import Path
@@ -11,6 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RequestError
+
+_SYMBOLS = {
+    **{"aluminium": "Al", "aluminum": "Al", "beryllium": "Be", "chrome": "Cr", "chromium": "Cr", "copper": "Cu"},
+    **{"gold": "Au", "iridium": "Ir", "mercury": "Hg", "molybdenum": "Mo", "nickel": "Ni", "niobium": "Nb"},
+    **{"rhodium": "Rh", "silver": "Ag", "tantalum": "Ta", "tungsten": "W", "vanadium": "V"},
+}
 
 
 def refractive_index(wavelength: float, *, int_ior: complex | None = None, material: str | None = None) -> complex:
@@ -37,6 +44,16 @@ def refractive_index(wavelength: float, *, int_ior: complex | None = None, mater
     return complex(np.interp(wavelength, wavelengths, n), np.interp(wavelength, wavelengths, k))
 
 
+def _near(name: str, known: list[str]) -> list[str]:
+    """Return those of `known` that `name` may stand for: of that element, of that beginning, or spelt much like it."""
+    lower = name.lower()
+    if lower in _SYMBOLS:
+        return [other for other in known if other.partition("_")[0] == _SYMBOLS[lower]]
+    same = [other for other in known if other.lower().startswith(lower)]
+    first = max((other for other in known if len(other) > 1 and lower.startswith(other.lower())), key=len, default=None)
+    return [first] if first else same[:3] or get_close_matches(name, known)
+
+
 @functools.cache
 def conductor(material: str, folder: Path) -> tuple[NDArray[np.float64], ...]:
     """The table of a conductor in Mitsuba's folder of indices: wavelengths in µm, n and k there, (J,) each.
@@ -46,11 +63,9 @@ def conductor(material: str, folder: Path) -> tuple[NDArray[np.float64], ...]:
     """
     known = sorted(path.name.removesuffix(".eta.spd") for path in folder.glob("*.eta.spd"))
     if material not in known:
-        close = [name for name in known if name.lower().startswith(str(material)[:2].lower())]
-        raise RequestError(
-            f"material: got {material!r}, "
-            + (f"did you mean {' or '.join(close)}? " if close else "")
-            + f"wanted one of {', '.join(known) or 'none: no tables found'}"
-        )
+        wanted = f"one of {', '.join(known) or 'none: no tables found'}"
+        if near := _near(str(material), known):
+            wanted = " or ".join(near)
+        raise RequestError(f"material: got {material!r}, {'did you mean' if near else 'wanted'} {wanted}")
     (nm, n), (nm_k, k) = (np.loadtxt(folder / f"{material}.{part}.spd").T for part in ("eta", "k"))
     return nm * 1e-3, n, np.interp(nm, nm_k, k)
