@@ -1,16 +1,19 @@
 """What a wrong scene is told: not only what is missing, but what there is."""
 
 import ast
+import shutil
 from pathlib import Path
 
 import mitsuba as mi
 import pytest
 
 import mitsuba_diffraction
+from mitsuba_diffraction.recipe import Recipe
 from mitsuba_diffraction.render.scene import load_spectral_scene
 
 pytestmark = pytest.mark.usefixtures("no_energy_tables")
 
+SCENES = Path(__file__).parents[1] / "scenes"
 SCENE = """<scene version="3.0.0"><default name="light" value="sun"/><include filename="lights/$light.xml"/>
 <sensor type="perspective"/><shape type="sphere">%s</shape></scene>"""
 GRATING = '<bsdf type="diffraction_grating">%s</bsdf>'
@@ -49,6 +52,28 @@ def test_what_there_is_is_said(body, parameters, words, tmp_path, llvm):
     (tmp_path / "scene.xml").write_text(SCENE % body)
     with pytest.raises(ValueError, match=words):
         load_spectral_scene(tmp_path / "scene.xml", parameters=parameters)
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("compare scenes/elaphe.xml", "shader knows no other; choose -D light=bulb or -D light=parallel"),
+        ("convergence scenes/blaze.xml -o out.png", "shader knows no other; choose -D light=bulb or -D light=parallel"),
+        (
+            "render scenes/rainbow.xml",
+            "models/disc_metal.ply: no such file; it is made by: python scenes/disc.py && python scenes/ground.py",
+        ),
+        ("render scenes/foil.xml", "no such file; it is made by: python scenes/foil.py && python scenes/ground.py"),
+    ],
+)
+def test_what_a_scene_lacks_is_told_before_spectra_are_computed(line, message, command, tmp_path, monkeypatch, llvm):
+    shutil.copytree(SCENES, tmp_path / "scenes", ignore=shutil.ignore_patterns("models", "*.npz"))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(Recipe, "cached", lambda *args: pytest.fail("a spectrum was computed"))
+    code, out, err = command(line)
+    assert (code, out) == (2, "")
+    assert len(err.splitlines()) == 1
+    assert err.endswith(f"{message}\n")
 
 
 @pytest.mark.parametrize(

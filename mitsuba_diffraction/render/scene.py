@@ -119,6 +119,12 @@ def named_sample_count(path: str | os.PathLike[str], parameters: Mapping[str, st
     return None
 
 
+def emitters_of(path: str | os.PathLike[str], parameters: Mapping[str, str] | None = None) -> set[str]:
+    """Return the plugin names of the emitters of a scene, without loading it; errors as `named_sample_count`."""
+    with _parsed(path, parameters) as (_, state):
+        return {node.props.plugin_name() for node in state.nodes if node.type == mi.ObjectType.Emitter}
+
+
 def scene_digest(path: str | os.PathLike[str], parameters: Mapping[str, str] | None = None) -> str:
     """SHA-256 of a valid scene: its XML after substitution of the parameters, and the files it references.
 
@@ -173,11 +179,29 @@ def _parsed(
     mi.set_file_resolver(beside_scene)
     try:
         config = mi.parser.ParserConfig(mi.variant())
-        yield config, mi.parser.parse_file(config, str(path.resolve()), **(parameters or {}))
+        state = mi.parser.parse_file(config, str(path.resolve()), **(parameters or {}))
+        _refuse_missing_files(path, state)
+        yield config, state
     except Exception as error:
         raise RequestError(f"{path}: {root_cause(error)}{_what_there_is(path, str(error))}") from error
     finally:
         mi.set_file_resolver(resolver)
+
+
+def _refuse_missing_files(path: Path, state: mi.parser.ParserState) -> None:
+    """Raise RequestError if a mesh or texture is missing, before spectra are computed for the scene.
+
+    The message quotes the command that a comment of the scene gives for them: "… made by: python scenes/disc.py".
+    """
+    for node in state.nodes:
+        name = node.props.get("filename") if "filename" in node.props else None
+        # The grating tells which spectra there are instead.
+        if not isinstance(name, str) or node.props.plugin_name() == "diffraction_grating":
+            continue
+        if not Path(str(mi.file_resolver().resolve(name))).is_file():
+            text = path.read_text(encoding="utf-8", errors="replace")
+            made = re.search(r"made by:\s+(python \S+\.py(?: && python \S+\.py)*)", text)
+            raise RequestError(f"{name}: no such file" + (f"; it is made by: {made[1]}" if made else ""))
 
 
 def _move_first_sensor(state: mi.parser.ParserState, motion: tuple[float, ...]) -> None:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+import re
 import time
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
@@ -18,7 +20,7 @@ from ...render import SpectralImage
 from ...render.accumulation import Accumulation, ratio
 from ...render.film import collect, evenly, pass_seed, trace_pass
 from ...render.passes import split
-from ...render.scene import channel_wavelengths, load_spectral_scene
+from ...render.scene import channel_wavelengths, emitters_of, load_spectral_scene
 from ...shader.base import Shader
 from ...shader.evaluate import VARIANTS
 from ...shader.flss import FLSS
@@ -104,6 +106,7 @@ class Pictures:
             raise RequestError(f"seed: got {seed}, wanted an integer that is not negative")
         if not dr.is_jit_v(mi.Float):
             raise RequestError(f"variant: got {mi.variant()!r}, wanted a vectorised one, such as 'llvm_ad_spectral'")
+        _check_lights(Path(scene_path), parameters)
         self.scene = load_spectral_scene(scene_path, width=width, height=height, parameters=parameters)
         if hasattr(self.scene.integrator(), "quirks"):
             raise RequestError(f"{scene_path}: its integrator is the shader itself, wanted a path tracer (type='path')")
@@ -238,6 +241,23 @@ class Pictures:
         rgb, _, _ = self._shader.shade(self.scene, mi.RayDifferential3f(ray))
         dr.eval(position, rgb)
         return np.concatenate([np.array(position), np.array(rgb)])
+
+
+def _check_lights(scene: Path, parameters: Mapping[str, str] | None) -> None:
+    """Raise RequestError if the shader knows none of a scene's lights, before any spectrum is computed."""
+    if emitters_of(scene, parameters) & {"directional", "point"}:
+        return
+    text, advice = scene.read_text(encoding="utf-8", errors="replace"), ""
+    if "lights/$light.xml" in text:
+        lights = {path.stem: path.read_text("utf-8") for path in sorted((scene.parent / "lights").glob("*.xml"))}
+        known = [
+            f"-D light={name}"
+            for name, light in lights.items()
+            if re.search(r'<emitter type="(directional|point)"', light)
+            and ("<integrator" in light) != ("<integrator" in text)
+        ]
+        advice = f"; choose {' or '.join(known)}" if known else ""
+    raise RequestError(f"{scene}: the scene has no directional or point light, and the shader knows no other{advice}")
 
 
 def _channel_spectra() -> NDArray[np.float64]:
