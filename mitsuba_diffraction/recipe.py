@@ -49,13 +49,14 @@ import threading
 import warnings
 import weakref
 from collections.abc import Callable, Mapping
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from .errors import RequestError, is_number
 from .files import cache_folder, refuse_special
+from .progress import Progress, no_progress, part, silent
 from .rigorous import build as rigorous
 from .spectrum.build import precompute
 from .spectrum.file import FORMAT_VERSION
@@ -79,6 +80,7 @@ _SPECTRUM_KEYS = frozenset(
 )
 # Incremented when the same input gives a different result, to invalidate the cache.
 _BUILD_VERSION = 5
+_OF_HEIGHTS = 0.3  # the share of the time that the heights of many patches take, roughly
 # Mitsuba constructs plugins in parallel; two with the same recipe must not both compute its spectrum.
 _building = threading.Lock()
 # Spectra in use, by the digest of their recipe: many BSDFs of one recipe read its file once.
@@ -182,15 +184,18 @@ class Recipe:
             return self
         return Recipe({**self.surface, "patches": 1}, self.spectrum, self.folder)
 
-    def height_fields(self) -> tuple[HeightField, ...]:
+    def height_fields(self, progress: Progress = silent) -> tuple[HeightField, ...]:
         """The patches: seed, seed + 1, …; one where nothing is drawn at random."""
         if self.patches == 1:
             return (self.height_field(),)
         parameters = {name: value for name, value in self.surface.items() if name != "patches"}
         seed = parameters.pop("seed", 0)
         first = self.height_field()  # which refuses a wrong seed
-        others = [Recipe({**parameters, "patches": 1, "seed": seed + k}).height_field() for k in range(1, self.patches)]
-        return (first, *others)
+        fields = [first]
+        for k in range(1, self.patches):
+            fields.append(Recipe({**parameters, "patches": 1, "seed": seed + k}).height_field())
+            progress(len(fields), self.patches)
+        return tuple(fields)
 
     def height_field(self) -> HeightField:
         """The surface; of several patches, the first."""
@@ -222,12 +227,13 @@ class Recipe:
         except RequestError as error:
             raise RequestError(f"{path}: {error}") from None
 
-    def build(self, progress: Callable[[int, int], None] | None = None) -> Spectrum:
-        """Compute the spectrum."""
+    def build(self, progress: Progress = silent) -> Spectrum:
+        """Compute the spectrum; `progress` is called with (steps done, steps in all)."""
         arguments = dict(self.spectrum)
         if "wavelengths" in arguments:
             arguments["wavelengths"] = tuple(arguments["wavelengths"])
-        return precompute(self.height_fields(), progress=progress, **arguments)
+        fields = self.height_fields(part(progress, 0, _OF_HEIGHTS))
+        return precompute(fields, progress=part(progress, _OF_HEIGHTS if len(fields) > 1 else 0, 1), **arguments)
 
     def digest(self) -> str:
         """SHA-256 of everything that determines the spectrum: the recipe and the contents of the scan."""
@@ -247,8 +253,8 @@ class Recipe:
         content.update(json.dumps([surface, self.patches, dict(self.spectrum)], sort_keys=True).encode())
         return content.hexdigest()
 
-    def cached(self, progress: Callable[[int, int], None] | None = None) -> Spectrum:
-        """The spectrum from the cache, or computed and cached.
+    def cached(self, progress: Callable[[str], AbstractContextManager[Progress]] = no_progress) -> Spectrum:
+        """The spectrum from the cache, or computed and cached; then progress(label) is a context, for its progress.
 
         The cache is a folder of spectra named by `digest`: $MITSUBA_DIFFRACTION_CACHE, or the user's cache folder. A
         damaged entry, or one of another recipe, is replaced.
@@ -263,10 +269,15 @@ class Recipe:
                 spectrum = _in_use[digest] = self._from_cache(digest, progress)
             return spectrum
 
-    def _from_cache(self, digest: str, progress: Callable[[int, int], None] | None) -> Spectrum:
+    def _from_cache(self, digest: str, progress: Callable[[str], AbstractContextManager[Progress]]) -> Spectrum:
         path = cache_folder() / f"{digest}.exr"
         with suppress(RequestError, OSError):
             return load_spectrum(path, recipe=digest)
+        with progress(f"spectrum of {self.surface.get('scan') or self.surface['profile']}") as report:
+            return self._built(path, digest, report)
+
+    def _built(self, path: Path, digest: str, progress: Progress) -> Spectrum:
+        """The spectrum, computed and written to the cache."""
         spectrum = self.build(progress)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)

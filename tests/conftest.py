@@ -16,10 +16,9 @@ import pytest
 from hypothesis import settings
 
 import mitsuba_diffraction as md  # before Dr.Jit, so that it has an LLVM that works
-from mitsuba_diffraction import cli
-from mitsuba_diffraction.cli import console
-from mitsuba_diffraction.cli.console import log_lines
+from mitsuba_diffraction import cli, progress
 from mitsuba_diffraction.files import whole_file
+from mitsuba_diffraction.progress import log_lines
 from mitsuba_diffraction.spectrum.energy_table import SHADOWING, EnergyTable
 from mitsuba_diffraction.spectrum.grating_spectrum import GratingSpectrum
 
@@ -145,8 +144,8 @@ def command(monkeypatch, capfd):
     def call(*words):
         arguments = shlex.split(words[0]) if len(words) == 1 else words
         monkeypatch.setattr(sys, "argv", [cli.NAME, *arguments])
-        # On a slow machine a command says after half a minute how far it is.
-        monkeypatch.setattr(console, "log_lines", functools.partial(log_lines, seconds=math.inf))
+        # On a slow machine a command says how far it is.
+        monkeypatch.setattr(progress, "log_lines", functools.partial(log_lines, first=math.inf))
         # Warnings are shown, as they are to a person, and what shows them is put back afterwards.
         with warnings.catch_warnings():
             warnings.simplefilter("default")

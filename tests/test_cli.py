@@ -17,7 +17,7 @@ import pytest
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction.cli.arguments import scene_parameters
-from mitsuba_diffraction.cli.console import log_lines
+from mitsuba_diffraction.progress import log_lines
 from mitsuba_diffraction.render import passes
 from mitsuba_diffraction.render.spectral_image import SpectralImage
 
@@ -260,7 +260,7 @@ def test_help_says_the_defaults(command):
 
 
 def test_work_without_a_terminal_says_lines(capfd):
-    show = log_lines("scene.xml", seconds=0)
+    show = log_lines("scene.xml", first=0)
     show(3, 7)
     assert re.fullmatch(r"mitsuba-diffraction: scene.xml: 3 of 7, 0 s\n", capfd.readouterr().err)
     log_lines("scene.xml")(3, 7)  # short work says nothing

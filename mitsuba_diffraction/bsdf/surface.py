@@ -12,6 +12,7 @@ from pathlib import Path
 import mitsuba as mi
 
 from ..errors import RequestError
+from ..progress import progress_bar
 from ..recipe import Recipe
 from ..rigorous.spectrum import RigorousSpectrum
 from ..scalar_theory import range_warning
@@ -69,7 +70,7 @@ def surface_from(props: mi.Properties, coat: Coat | None) -> tuple[Spectrum, Rec
     if theory == "rigorous":
         settings |= {"theory": theory, **settings_from(props, coat)}
     recipe = _inside(coat, Recipe(surface, settings))
-    return recipe.cached(), recipe
+    return recipe.cached(progress_bar), recipe
 
 
 def warn_of_range(recipe: Recipe) -> None:
@@ -106,7 +107,7 @@ def _from_file(path: Path, coat: Coat | None, tolerance: float | None) -> tuple[
         recipe = _inside(coat, Recipe.load(path))
         if tolerance is not None:
             recipe = dataclasses.replace(recipe, spectrum={**recipe.spectrum, "tolerance": tolerance})
-        return recipe.cached(), recipe
+        return recipe.cached(progress_bar), recipe
     if suffix == ".exr":
         if tolerance is not None:
             raise RequestError(f"tolerance: got {tolerance} with {path}, wanted it when the spectrum is computed")

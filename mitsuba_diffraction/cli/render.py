@@ -106,7 +106,7 @@ def render(
         if denoise:
             guides = guides_of(load_spectral_scene(scene, **where, motion=motion))
         try:
-            with progress_bar(label, "spp") as progress:
+            with progress_bar(label, "spp", "loading and compiling") as progress:
                 image = trace(
                     scene,
                     spp=spp,

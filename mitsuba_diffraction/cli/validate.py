@@ -64,7 +64,7 @@ def validate(
         writes += [("--figures", figures / name) for name in figure_names()]
     claim(context, reads, writes)
     mi.set_variant(chosen)
-    these = checks() if recipe is None else _of_surface(recipe, surface.name)
+    these = checks() if recipe is None else _of_surface(recipe)
     results = []
     with progress_bar("validation") as progress:
         for check in these:
@@ -97,8 +97,7 @@ def _recipe(path: Path, of_scan: dict[str, object], settings: dict[str, object])
     return recipe
 
 
-def _of_surface(recipe: Recipe, name: str) -> tuple[Check, ...]:
+def _of_surface(recipe: Recipe) -> tuple[Check, ...]:
     from ..studies.checks import surface_checks
 
-    with progress_bar(f"spectrum of {name}") as progress:
-        return surface_checks(recipe.height_field(), recipe.cached(progress))
+    return surface_checks(recipe.height_field(), recipe.cached(progress_bar))

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ..coherence import SUN_COHERENCE_LENGTH, lobe_reach, lobe_width
 from ..errors import RequestError
 from ..files import cache_folder
+from ..progress import Progress, part, silent
 from ..reference import check_extent
 from ..rigorous.blas import one_thread
 from ..rigorous.build import build_spectrum
@@ -59,7 +60,8 @@ _FINEST, _COARSEST = 1e-3, 1e-2
 LEAST_TOLERANCE = 1e-5
 _SCATTER_SHARE = 0.1
 
-Progress = Callable[[int, int], None]
+_OF_MEAN = 0.7  # the share of the time that the mean of many patches takes, roughly
+
 Splines = SamplePowers | TileSplines
 Table = SeriesTable | SliceTable
 
@@ -75,7 +77,7 @@ def precompute(
     representation: str = "auto",
     tolerance: float | None = None,
     largest_height_range: float = 20.0,
-    progress: Progress | None = None,
+    progress: Progress = silent,
     theory: str = "scalar",
     int_ior: complex | None = None,
     material: str | None = None,
@@ -175,7 +177,8 @@ def precompute(
         sigma, rho = lobe_width(carried), lobe_reach(TAIL_SHARE * tolerance)
         orders = TilePowers(height_field, reach, rho * sigma)
         if len(patches) > 1:
-            orders = MeanPowers(patches, reach, rho * sigma, largest_kappa, (1 - TAIL_SHARE) * tolerance)
+            of_mean, progress = part(progress, 0, _OF_MEAN), part(progress, _OF_MEAN, 1)
+            orders = MeanPowers(patches, reach, rho * sigma, largest_kappa, (1 - TAIL_SHARE) * tolerance, of_mean)
         lobes = orders.grid.lobes(sigma, rho)
         powers = _tile_splines(orders, lobes, sigma, reach, largest_kappa, tolerance)
         if powers is None:
@@ -200,7 +203,7 @@ def precompute(
             largest_kappa,
             tolerance,
         )
-    build = _Build(powers, height_range, largest_kappa, allowed, progress or (lambda done, total: None))
+    build = _Build(powers, height_range, largest_kappa, allowed, progress)
     table, error = build(SliceTable.representation if representation == "auto" else representation)
     return GratingSpectrum(
         table=table,
@@ -374,13 +377,13 @@ class _Build:
         self._pilot_share = float(np.abs(pilot).sum() / total)
 
     def _phase(self, begin: float, end: float) -> Progress:
-        """Reports a part of the whole, in per cent; what is done again does not count back."""
+        """Return what reports a part of the whole, in per cent; what is done again does not count back."""
 
-        def report(done: int, total: int) -> None:
-            self._done = max(self._done, round(100 * (begin + (end - begin) * done / total)))
-            self._progress(self._done, 100)
+        def forward(done: int, total: int) -> None:
+            self._done = max(self._done, done)
+            self._progress(self._done, total)
 
-        return report
+        return part(forward, begin, end)
 
     def __call__(self, representation: str) -> tuple[Table, float]:
         """The cheapest table of this representation, and its measured error."""

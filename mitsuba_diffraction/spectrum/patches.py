@@ -9,6 +9,7 @@ import scipy.fft
 from numpy.typing import NDArray
 
 from ..errors import RequestError
+from ..progress import Progress
 from ..surface.heightfield import HeightField
 from .expansions import chebyshev_nodes, chebyshev_polynomials, chebyshev_transform, nodes_for, position
 from .tile import TilePowers
@@ -33,21 +34,26 @@ class MeanPowers(TilePowers):
         lobe_radius: float,
         largest_kappa: float,
         tolerance: float,
+        progress: Progress,
     ) -> None:
-        """Takes patches of one size; reach and radius as `TilePowers`; the largest κ in rad/µm; and the tolerance."""
+        """Takes patches of one size; reach and radius as `TilePowers`; the largest κ in rad/µm; and the tolerance.
+
+        `progress` is called with the patches done and in all.
+        """
         super().__init__(height_fields[0], reach, lobe_radius)
         self._largest_kappa = largest_kappa
         height_range = max(field.height_range for field in height_fields)
         self._nodes = nodes_for(largest_kappa * height_range / 2, 0.01 * tolerance)
         total = np.zeros((self._nodes, *self.grid.shape))
         checked = np.zeros((len(_CHECKED), *self.grid.shape))
-        for field in height_fields:
+        for number, field in enumerate(height_fields, 1):
             heights = field.centred.astype(np.float32)
             for j, kappa in enumerate((1 + chebyshev_nodes(self._nodes)) / 2 * largest_kappa):
                 total[j] += self.grid.take(_powers(heights, kappa))
             one = TilePowers(field, reach, lobe_radius)
             for j, share in enumerate(_CHECKED):
                 checked[j] += one(share * largest_kappa)
+            progress(number, len(height_fields))
         flat = total.reshape(self._nodes, -1) / len(height_fields)
         self._coefficients = chebyshev_transform(self._nodes) @ flat
         self.own_error = max(

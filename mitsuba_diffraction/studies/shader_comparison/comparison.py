@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,20 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import RequestError
+from ...progress import Progress, no_progress
 from .difference import Difference, difference, noise, white_luminance
-from .pictures import Picture, Pictures, Progress, silent
+from .pictures import Picture, Pictures
 from .quirk_shares import QuirkShares, quirk_shares
 
 # The quirks are counted in small pictures, each of which is rendered well: 28 of them take about a minute on two cores.
 SHARES_SIDE = 96
 SHARES_SAMPLES = 256
 SHARES_POINTS = 9
-
-
-@contextmanager
-def no_progress(label: str) -> Iterator[Progress]:
-    """No progress is shown."""
-    yield silent
 
 
 @dataclass(frozen=True, eq=False)

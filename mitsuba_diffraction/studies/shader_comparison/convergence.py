@@ -16,11 +16,11 @@ import numpy as np
 from ...errors import RequestError
 from ...files import whole_file
 from ...outputs import metadata
+from ...progress import Progress, no_progress
 from ...spectrum.build import LEAST_TOLERANCE
 from ..report import cells
-from .comparison import no_progress
 from .difference import as_shown, difference, noise, white_luminance
-from .pictures import Picture, Pictures, Progress
+from .pictures import Picture, Pictures
 
 TOLERANCES = (1e-1, 1e-2, 1e-3)
 SAMPLES = (1, 4, 16, 64, 256)

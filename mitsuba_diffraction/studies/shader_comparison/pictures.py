@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ...color import spectrum_to_XYZ
 from ...errors import RequestError
+from ...progress import Progress, silent
 from ...render import SpectralImage
 from ...render.accumulation import Accumulation, ratio
 from ...render.film import collect, evenly, pass_seed, trace_pass
@@ -28,16 +29,10 @@ from ...shader.quirks import Quirks
 from ...shader.tristimulus import EMISSION, primary_spectra
 from .integrators import same_light, without_gratings
 
-Progress = Callable[[int, int], None]
-
 NO_SHADOWS = "no_shadows"
 
 # Per dispatch, so that progress shows: some seconds of work on two cores.
 _SHADING_POINTS = 2**16
-
-
-def silent(done: int, total: int) -> None:
-    """No progress is shown."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,126 @@
+"""Progress of long work: a bar in a terminal, a line that changes in a notebook, a line now and then in a log."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import Progress as Bars
+
+NAME = "mitsuba-diffraction"
+
+Progress = Callable[[int, int], None]  # called with how much is done, and how much there is
+
+err = Console(stderr=True, highlight=False, soft_wrap=True)
+
+_SHORT = 2.0  # seconds of work of which neither a log nor a notebook says anything
+_lock = threading.Lock()
+_bars: list[Bars] = []  # the display that all bars share: rich shows one at a time
+
+
+def silent(done: int, total: int) -> None:
+    """Show no progress."""
+
+
+@contextmanager
+def no_progress(label: str) -> Iterator[Progress]:
+    """Yield what shows no progress, in place of `progress_bar`."""
+    yield silent
+
+
+def part(whole: Progress, begin: float, end: float) -> Progress:
+    """Return what reports a part of the whole, from `begin` to `end` of it, in per cent."""
+    return lambda done, total: whole(round(100 * (begin + (end - begin) * done / total)), 100)
+
+
+def say(kind: str, message: object) -> None:
+    """Print a message on stderr, in one line."""
+    err.print(f"{NAME}: {kind}: {' '.join(str(message).split())}", markup=False, emoji=False)
+
+
+def log_lines(label: str, seconds: float = 30.0, first: float = _SHORT) -> Callable[..., None]:
+    """Progress without a terminal: a line on stderr after `first` seconds, then at the interval of `seconds`."""
+    start = time.monotonic()
+    due = start + first
+
+    def show(done: int, total: int, error: float = math.nan) -> None:
+        nonlocal due
+        if (now := time.monotonic()) >= due:
+            due = now + seconds
+            say(label, f"{done} of {total}, {now - start:.0f} s")
+
+    return show
+
+
+@contextmanager
+def progress_bar(label: str, unit: str = "", begin: str = "") -> Iterator[Callable[..., None]]:
+    """Yield what shows how much is done: called with that, the total, and the relative error so far where there is one.
+
+    Bars may be opened inside of others, and on other threads: a terminal then shows one below the other.
+
+    Args:
+        label: what is done.
+        unit: of what is counted.
+        begin: what is done before anything can be counted.
+    """
+    if err.is_jupyter:
+        with _notebook_line(label) as show:
+            yield show
+        return
+    if not err.is_terminal:
+        yield log_lines(label)
+        return
+    with _lock:
+        if outermost := not _bars:
+            columns = (
+                TextColumn("{task.description}", markup=False),
+                BarColumn(),
+                MofNCompleteColumn(),
+                TextColumn("{task.fields[after]}"),
+                TimeElapsedColumn(),
+                TimeRemainingColumn(),
+            )
+            # Passes of a large picture take longer than the usual half minute.
+            _bars.append(Bars(*columns, console=err, transient=True, speed_estimate_period=600))
+            _bars[0].start()
+        bars = _bars[0]
+    task = bars.add_task(label, total=None, after=begin or unit)
+
+    def show(done: int, total: int, error: float = math.nan) -> None:
+        after = unit if math.isnan(error) else f"{unit}, error {error:.2g}"
+        bars.update(task, completed=done, total=total, after=after if done else begin or unit)
+
+    try:
+        yield show
+    finally:
+        bars.remove_task(task)
+        if outermost:
+            with _lock:
+                _bars.clear()
+            bars.stop()
+
+
+@contextmanager
+def _notebook_line(label: str) -> Iterator[Callable[..., None]]:
+    """A line of the cell's output, in which the count and at last the time stand."""
+    from IPython.display import display
+
+    start, handle = time.monotonic(), None
+
+    def show(done: int, total: int, error: float = math.nan) -> None:
+        nonlocal handle
+        seconds = time.monotonic() - start
+        line = {"text/plain": f"{label}: {done} of {total}, {seconds:.0f} s"}
+        if handle is not None:
+            handle.update(line, raw=True)
+        elif seconds >= _SHORT:
+            handle = display(line, raw=True, display_id=True)
+
+    yield show
+    if handle is not None:
+        handle.update({"text/plain": f"{label}: {time.monotonic() - start:.0f} s"}, raw=True)

@@ -1,0 +1,66 @@
+"""Progress of long work, in a log, a terminal and a notebook."""
+
+import functools
+import io
+import math
+import re
+
+import mitsuba as mi
+import nbformat
+import pytest
+from nbclient import NotebookClient
+from rich.console import Console
+
+import mitsuba_diffraction as md
+from mitsuba_diffraction import progress
+
+RUBBED = {"profile": "xenopeltis", "size": 5.0, "patches": 3}
+
+
+@pytest.mark.usefixtures("no_energy_tables")
+def test_a_log_tells_in_one_line_that_a_spectrum_is_computed(llvm, capfd, monkeypatch):
+    """From Python a skin took half a minute without a word."""
+    monkeypatch.setattr(progress, "log_lines", functools.partial(progress.log_lines, first=0, seconds=math.inf))
+    for _ in range(2):  # the second time it is read from the cache
+        mi.load_dict({"type": "diffraction_grating", "profile": "lamellar", "period": 3.1, "depth": 0.1})
+    out, err = capfd.readouterr()
+    assert out == ""
+    assert re.fullmatch(r"mitsuba-diffraction: spectrum of lamellar: \d+ of 100, 0 s\n", err)
+
+
+def test_progress_begins_with_the_heights_and_does_not_go_back():
+    told = []
+    md.Recipe(RUBBED, {"coherence_length": 3.0, "tolerance": 0.05}).build(lambda *numbers: told.append(numbers))
+    done, total = zip(*told, strict=True)
+    assert set(total) == {100}
+    assert list(done) == sorted(done)
+    assert done[0] <= 20
+    assert done[-1] == 100
+
+
+def test_a_terminal_shows_a_bar_below_another(monkeypatch):
+    shown = io.StringIO()
+    monkeypatch.setattr(progress, "err", Console(file=shown, force_terminal=True, width=100))
+    with progress.progress_bar("scene.xml", "spp", "loading") as outer:
+        with progress.progress_bar("spectrum of elaphe") as inner:
+            inner(3, 7)
+            progress._bars[0].refresh()
+        outer(1, 64, 0.25)
+        progress._bars[0].refresh()
+    text = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", shown.getvalue())
+    for words in ("loading", "spectrum of elaphe", "3/7", "1/64 spp, error 0.25"):
+        assert words in text
+    assert not progress._bars
+
+
+def test_a_notebook_shows_a_line():
+    source = """
+from mitsuba_diffraction import progress
+progress._SHORT = 0
+with progress.progress_bar("spectrum of elaphe") as show:
+    show(3, 7)
+"""
+    notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(source)])
+    NotebookClient(notebook, timeout=120).execute()
+    (output,) = notebook.cells[0].outputs
+    assert output["data"]["text/plain"] == "spectrum of elaphe: 0 s"
