@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.special import chdtri
 
 from ..errors import RequestError
 from .bands import Band, fit_band
@@ -20,14 +21,23 @@ _FEWEST = 2.0
 _LEAST_ANGLE = 15.0
 """Least angle between two waves, degrees; closer ones are one drifting period, or its harmonics."""
 
+_SAME = 0.5
+"""Wave vectors closer than this share of the shorter one are one period that varies, and turns, over the patch."""
+
 _FALSE_ALARM = 1e-4
 """Probability of a false detection in noise."""
+
+_CHANCE = 0.1
+"""Probability that noise is mistaken for a drift of a period over the patch."""
 
 _RING = 24
 """Fewest frequencies from which the lower quartile, i.e. the background, is estimated."""
 
 _LEAST_STRENGTH = 1e-3
 """Least fraction of the variance of a wave, to exclude hum of the instrument."""
+
+_LEAST_BAND = 1e-2
+"""Least fraction of the variance of a band; a weaker one is the background's own unevenness."""
 
 _ROUNDING = 1e-20
 """Relative to the largest power: far below a wave of `_LEAST_STRENGTH`, far above rounding errors."""
@@ -64,6 +74,11 @@ class Period:
     strength: float
     width: float = 0.0
     direction_width: float = 0.0
+
+    @property
+    def q(self) -> NDArray[np.float64]:
+        """The wave vector, (2,), cycles/µm."""
+        return _unit(np.deg2rad(self.direction)) / self.period
 
     @classmethod
     def of(cls, q: NDArray[np.float64], spread: NDArray[np.float64], strength: float) -> Period:
@@ -113,12 +128,15 @@ def find_periods(height_field: HeightField, count: int = 2, *, extent: str = "sa
     (Rife and Boorstyn 1974, "Single-tone parameter estimation from discrete-time observations", IEEE Transactions
     on Information Theory 20(5), 591–598, equation 22), var q = 6 n/(π² |c|² T²) along a side of length T.
 
-    If a period drifts over the patch, like the fingers of a skin, its uncertainty is larger. Fits to the halves of a
-    line, or to the quarters of a patch, scatter owing to noise such that their mean has four times that covariance
-    (eight times for each of two halves, sixteen times for each of four quarters). The excess over that is added.
+    If a period drifts over the patch, like the fingers of a skin, another part of the surface has another one, and the
+    uncertainty says so: the excess of the scatter of fits to the halves of a line, or to the quarters of a patch, over
+    that owing to the background (eight times that covariance for a half, sixteen times for a quarter) is added where it
+    is significant. Of a patch that holds fewer than four periods, the parts are larger and overlap, so that each holds
+    two.
 
     A peak broader than a bin of the spectrum is a band of periods: its centre, width and strength are fitted to all
-    bins (`bands`), and the scatter of the centre over the quarters of the patch is added in the same way.
+    bins (`bands`), and the scatter of the centre over the quarters of the patch is added in the same way. A wave and a
+    band of the same pitch are one thing: the wave if it has twice the strength of the band, else the band.
 
     A wave is detected in a patch that holds several of its periods. A tile is repeated until it does; its own periods
     are orders of its lattice, and exact.
@@ -146,8 +164,36 @@ def find_periods(height_field: HeightField, count: int = 2, *, extent: str = "sa
     if not spectrum.scale > 1e-13 * np.abs(heights).max():  # flat up to rounding
         return ()
     waves, bands = spectrum.peaks(int(count))
-    found = [*spectrum.fit(waves), *(spectrum.band(band) for band in bands)]
+    fitted = [*spectrum.fit(waves), *(spectrum.band(band) for band in bands if band.share >= _LEAST_BAND)]
+    found: list[Period] = []
+    for period in sorted(fitted, key=lambda period: -period.strength * (2 if period.width else 1)):
+        if not any(_one(period.q, other.q) for other in found):
+            found.append(period)
     return tuple(sorted(found, key=lambda period: (period.width > 0, -period.strength)))
+
+
+def height_spectrum(height_field: HeightField, extent: str) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """Compute the power spectrum of the heights.
+
+    Args:
+        height_field: the surface.
+        extent: "tile": as it is; "sample": levelled to second order, under a Hann window.
+
+    Returns:
+        |q| in cycles/µm and the power |FFT|², both (N_y, N_x), and the r.m.s. height, µm. The power is zero where
+        heights differ by rounding errors only.
+    """
+    if extent == "tile":
+        heights = height_field.centred - height_field.centred.mean()
+        q = [np.fft.fftfreq(n, p) for n, p in zip(heights.shape[::-1], height_field.pixel_size, strict=True)]
+        power, scale = np.abs(np.fft.fft2(heights)) ** 2, float(heights.std())
+        power[0, 0] = 0
+    else:
+        spectrum = _Spectrum(height_field.heights, height_field.pixel_size)
+        q, power, scale = spectrum._q, spectrum._power, spectrum.scale
+    if not scale > 1e-13 * np.abs(height_field.heights).max():
+        power, scale = np.zeros_like(power), 0.0
+    return np.hypot(*np.meshgrid(*q)), power, scale
 
 
 class _Spectrum:
@@ -164,6 +210,7 @@ class _Spectrum:
         self._levelled = self._heights - _LeastSquares(_polynomials(self._x, self._y, 2), flat).fit(self._heights)
         self.scale = float(self._levelled.std())
         weight = np.outer(_hann(rows), _hann(columns))
+        self._weight = float(np.sum(weight**2))
         self._power = np.abs(np.fft.fft2(weight * self._levelled)) ** 2
         self._q = (np.fft.fftfreq(columns, pixel_size[0]), np.fft.fftfreq(rows, pixel_size[1]))
 
@@ -176,7 +223,7 @@ class _Spectrum:
 
         def known(q: NDArray[np.float64]) -> bool:
             others = [*waves, *(band.centre[0] * _unit(band.centre[1]) for band in bands)]
-            return any(_angle(q, other) < _LEAST_ANGLE for other in others) or any(band.holds(q) for band in bands)
+            return any(_one(q, other) for other in others) or any(band.holds(q) for band in bands)
 
         for row, column in self._candidates:
             q = self._frequency(row, column)
@@ -187,7 +234,7 @@ class _Spectrum:
                 bands.append(band)
             elif not known(q := self._fundamental(q)):
                 waves.append(q)
-            if len(waves) + len(bands) == count:
+            if len(waves) + sum(band.share >= _LEAST_BAND for band in bands) == count:
                 break
         return waves, bands
 
@@ -287,39 +334,40 @@ class _Spectrum:
             waves = [wave for wave, kept in zip(waves, near, strict=True) if kept]
         if not waves:
             return []
-        amplitude, noise, variance = whole.amplitudes(q)
+        amplitude, unit, density, variance = whole.amplitudes(q)
         strength = np.abs(amplitude) ** 2 / 2 / variance
-        found = []
-        for k in range(len(q)):
-            spread = noise[k] + self._wander(q[k], 4 * noise[k])
-            found.append(Period.of(q[k], spread, float(min(strength[k], 1.0))))
+        columns, rows = np.rint(q * self._size).astype(int).T
+        background = self._rings[rows, columns] / np.log(4 / 3) / self._weight
+        covariance = [
+            density[k] * unit[k] + self._wander(q[k], min(density[k], background[k]) * unit[k]) for k in range(len(q))
+        ]
+        found = [Period.of(*wave) for wave in zip(q, covariance, np.minimum(strength, 1.0).tolist(), strict=True)]
         return [period for period in found if period.strength >= _LEAST_STRENGTH]
 
     def band(self, band: Band) -> Period:
         """The period of a band; its uncertainty includes the excess scatter of the quarters."""
-        found, expected = [], []
-        for r in _halves(self._heights.shape[0]):
-            for c in _halves(self._heights.shape[1]):
-                part = _Spectrum(self._heights[r, c], self._pixel_size)
-                at = band.centre[0] * _unit(band.centre[1])
-                quarter = fit_band(part._power, part._rings, part._q, part._size, at)
-                found.append(quarter.centre)
-                expected.append(quarter.covariance)
-        return Period.of_band(band, band.covariance + _beyond(np.array(found), np.mean(expected, axis=0) / len(found)))
-
-    def _wander(self, q: NDArray[np.float64], expected: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The covariance of the mean frequency of the halves or quarters of the patch, in excess of noise."""
-        if np.hypot(*(q * self._size)) < 2 * _FEWEST:
-            return np.zeros((2, 2))
-        rows, columns = (_halves(count) for count in self._heights.shape)
-        found = np.array(
-            [
-                _Waves(self._levelled[r, c], self._x[c], self._y[r], degree=0).frequencies(q[None], 1e-3)[0]
-                for r in rows
-                for c in columns
-            ]
+        q, quarters = band.centre[0] * _unit(band.centre[1]), []
+        for part in self._parts():
+            spectrum = _Spectrum(self._heights[part], self._pixel_size)
+            quarters.append(fit_band(spectrum._power, spectrum._rings, spectrum._q, spectrum._size, q))
+        centres, noise = (
+            np.array([one.centre for one in quarters]),
+            np.mean([one.covariance for one in quarters], axis=0),
         )
-        return _beyond(found, expected)
+        return Period.of_band(band, band.covariance + _beyond(centres, noise))
+
+    def _wander(self, q: NDArray[np.float64], noise: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The covariance of the frequency over the halves or quarters of the patch, in excess of noise."""
+        share = float(np.clip(_FEWEST / np.hypot(*(q * self._size)), 0.5, 1))
+        parts = self._parts(share)
+        waves = [_Waves(self._levelled[r, c], self._x[c], self._y[r], degree=0) for r, c in parts]
+        of_part = noise / share ** (2 + np.log2(len(parts)))
+        return _beyond(np.array([part.frequencies(q[None], 1e-3)[0] for part in waves]), of_part)
+
+    def _parts(self, share: float = 0.5) -> list[tuple[slice, slice]]:
+        """Both ends of a line, or the corners of a patch, of this share of its length and width."""
+        rows, columns = (_ends(count, share) for count in self._heights.shape)
+        return [(r, c) for r in rows for c in columns]
 
 
 class _Waves:
@@ -345,8 +393,8 @@ class _Waves:
                 break
         return q
 
-    def amplitudes(self, q: NDArray[np.float64]) -> tuple[NDArray, NDArray[np.float64], float]:
-        """c, (k,), the covariance of each q given the noise around it, (k, 2, 2), and the variance of h − p."""
+    def amplitudes(self, q: NDArray[np.float64]) -> tuple[NDArray, NDArray[np.float64], NDArray[np.float64], float]:
+        """c, (k,), the covariance of each q in noise of density 1, (k, 2, 2), its density there, var (h − p)."""
         model = self._model(q)
         coefficients = model.solve(self._heights)
         amplitude, _ = self._amplitudes(coefficients)
@@ -360,9 +408,9 @@ class _Waves:
             for axis in range(2):
                 gradient[axis, place + 1 + axis] = 1 / (4j * np.pi * c)
                 gradient[axis, place + 4 + axis] = np.conj(1 / (4j * np.pi * c))
-            spread.append(np.real(gradient @ covariance @ gradient.conj().T) * density[k])
+            spread.append(np.real(gradient @ covariance @ gradient.conj().T))
         surface = np.where(np.arange(len(coefficients)) < len(self._polynomials), coefficients, 0)
-        return amplitude, np.array(spread), float((self._heights - model.evaluate(surface)).var())
+        return amplitude, np.array(spread), density, float((self._heights - model.evaluate(surface)).var())
 
     def _model(self, q: NDArray[np.float64]) -> _LeastSquares:
         """The polynomials, and for each wave e, xe, ye with e = e^{2πi q·x}/2, and their conjugates."""
@@ -451,13 +499,15 @@ def repeated(tile: HeightField, times: int) -> HeightField:
     return HeightField(np.tile(tile.heights, (times, times)), tile.pixel_size, tile.source)
 
 
-def _beyond(found: NDArray[np.float64], expected: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The covariance of the mean of estimates (n, 2) from their scatter, in excess of that expected from noise."""
-    if len(found) == 1:
+def _beyond(found: NDArray[np.float64], noise: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The covariance of estimates (n, 2) from parts of a patch, in excess of that owing to noise, if significant."""
+    free = len(found) - 1
+    if free == 0:
         return np.zeros((2, 2))
-    scatter = (found - found.mean(axis=0)).T @ (found - found.mean(axis=0)) / len(found) / (len(found) - 1)
-    values, axes = np.linalg.eigh(scatter - expected)
-    return axes @ np.diag(np.maximum(values, 0)) @ axes.T
+    scatter, axes = np.linalg.eigh(np.cov(found.T))
+    expected = np.einsum("ik,ij,jk->k", axes, noise, axes)
+    excess = np.where(scatter * free > chdtri(free, _CHANCE) * expected, scatter - expected, 0)
+    return axes @ np.diag(np.maximum(excess, 0)) @ axes.T
 
 
 def _unit(phi: float) -> NDArray[np.float64]:
@@ -477,8 +527,9 @@ def _polynomials(x: NDArray, y: NDArray, degree: int) -> list[tuple[NDArray, NDA
     return [(x**i, y**j) for i, j in powers]
 
 
-def _halves(count: int) -> list[slice]:
-    return [slice(0, count // 2), slice(count - count // 2, count)] if count >= 16 else [slice(0, count)]
+def _ends(count: int, share: float) -> list[slice]:
+    size = int(share * count)
+    return [slice(0, size), slice(count - size, count)] if count >= 16 else [slice(0, count)]
 
 
 def _length(places: NDArray[np.float64]) -> float:
@@ -508,6 +559,8 @@ def _power_law(x: NDArray, points: NDArray, values: NDArray) -> NDArray[np.float
     return np.exp(np.interp(x, points, values))
 
 
-def _angle(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
-    """Angle between two waves irrespective of their sign, degrees in [0, 90]."""
-    return float(np.degrees(np.arctan2(abs(one[0] * other[1] - one[1] * other[0]), abs(one @ other))))
+def _one(one: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
+    """Whether two wave vectors belong to one period or its harmonics, irrespective of their sign."""
+    angle = np.degrees(np.arctan2(abs(one[0] * other[1] - one[1] * other[0]), abs(one @ other)))
+    apart = np.hypot(*(one - np.copysign(1, one @ other) * other))
+    return bool(angle < _LEAST_ANGLE or apart < _SAME * min(np.hypot(*one), np.hypot(*other)))
