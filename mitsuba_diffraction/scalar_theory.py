@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import functools
 import json
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,9 @@ from .errors import RequestError
 from .geometry import k_g
 from .rigorous.axes import LARGEST_PERIOD
 from .rigorous.curve import is_profile
+from .rigorous.efficiencies import efficiencies
 from .surface.heightfield import HeightField
+from .surface.periods import height_spectrum
 from .wavelengths import VISIBLE
 
 Array = NDArray[np.float64]
@@ -34,8 +37,22 @@ OrderPowers = Callable[[NDArray[np.int64], Array], Array]
 STORED = Path(__file__).parent / "data" / "rigorous.json"
 MAP = STORED.with_name("scalar_error.json")
 
+INDEX = 1.5
+ANGLES = (0.0, 20.0, -20.0)
+"""Degrees of incidence for which the error of a surface is told; the map is the same for ±20°."""
+
+WAVELENGTHS = (0.45, 0.55, 0.65)
+"""µm."""
+
+RANGE = "mean over 450 to 650 nm and incidence up to 20°, n = 1.5"
+
 TRUSTED = 0.1
-"""Expected error above which a surface is considered outside the range of scalar theory."""
+"""Error above which a surface is considered outside the range of scalar theory."""
+
+ESTIMATE_FACTOR = 1.4
+"""R.m.s. factor between the error estimated from the map and that of 48 solved profiles; docs/validation.md."""
+
+_CONVERGED = 1e-2
 
 
 def fresnel(cosine: ArrayLike, index: complex) -> tuple[Array, Array]:
@@ -234,51 +251,98 @@ def expected_error(
     return float(np.exp(_interpolated(material, float(largest_angle), mean)(np.log(place))).item())
 
 
-def strongest_period(height_field: HeightField) -> float:
-    """The period of the strongest wave in a patch that repeats, µm; NaN of a plane."""
-    power = np.abs(np.fft.rfft2(height_field.centred)) ** 2
-    power[0, 0] = 0
-    if not power.max() > 1e-20 * height_field.heights.size**2:
-        return float("nan")
-    row, column = np.unravel_index(np.argmax(power), power.shape)
-    rows = len(power)
-    width, length = height_field.tile_size
-    return float(1 / np.hypot(column / width, (row - rows * (2 * row > rows)) / length))
+@dataclass(frozen=True)
+class ScalarError:
+    """The error of scalar theory for one surface: the mean over `ANGLES` and `WAVELENGTHS`, for n = 1.5.
+
+    Attributes:
+        share: Σ|Δη_m| relative to the reflected power; infinite where rigorous results do not reach (depths above 2 λ).
+        estimated: from the stored map, good to a factor of `ESTIMATE_FACTOR`; otherwise solved for the surface itself.
+        remedy: what takes the place of scalar theory for this surface.
+    """
+
+    share: float
+    estimated: bool
+    remedy: str
+
+    @property
+    def bound(self) -> float:
+        """The share above which the surface is considered outside the range of scalar theory."""
+        return TRUSTED * (ESTIMATE_FACTOR if self.estimated else 1)
+
+    @property
+    def warning(self) -> str:
+        """A sentence if the share is above the bound, else ""."""
+        return f"scalar theory: {self}; {self.remedy}" if self.share > self.bound else ""
+
+    def __str__(self) -> str:
+        if not np.isfinite(self.share):
+            return "error unknown, the surface is deeper than two wavelengths"
+        about = "about " if self.estimated else ""
+        return f"errs by {about}{float(f'{100 * self.share:.2g}'):g}% of the reflected light ({RANGE})"
 
 
-def range_warning(height_field: HeightField, periods: Sequence[float] | None = None) -> str:
-    """A sentence if scalar theory is expected to err by more than `TRUSTED`, or does not hold; "" if not.
+def scalar_error(height_field: HeightField, extent: str = "tile") -> ScalarError:
+    """Determine the error of scalar theory for a surface.
 
-    Where rigorous theory can take its place, half of that is enough. What counts is the mean error over the stored
-    directions, of a dielectric or of aluminium, for blue, green or red light, the largest.
+    A profile that repeats and for which rigorous theory is offered is solved. For any other surface, the map is
+    averaged over the waves in the spectrum of its heights, each weighted by its share of the variance, at the depth of
+    the sinusoid of equal roughness. Periods outside the map take the value at its boundary.
 
     Args:
         height_field: the surface.
-        periods: that stand out, µm, the worst of which counts; by default that of the strongest wave.
+        extent: "tile": it repeats; "sample": a piece of a larger surface, levelled first.
     """
-    periods = [strongest_period(height_field)] if periods is None else periods
-    depth = equivalent_depth(float(height_field.centred.std()))
-    worst, period = max(((_mean_error(each, depth), each) for each in periods if np.isfinite(each)), default=(0.0, 0.0))
+    lengths, power, rms_height = height_spectrum(height_field, extent)
+    depth = equivalent_depth(rms_height)
     longest = LARGEST_PERIOD * VISIBLE[0] * 1e-3
-    rigorous = is_profile(height_field) and height_field.tile_size[0] <= longest
-    if worst <= (TRUSTED / 2 if rigorous else TRUSTED):
-        return ""
-    place = f"(period {period:.3g} µm, depth {depth:.2g} µm)"
-    error = f"is expected to err by {worst:.0%} of the reflected light" if np.isfinite(worst) else "does not hold"
-    if rigorous:
-        remedy = "theory=rigorous has it right"
-    elif is_profile(height_field):
+    solved = float("nan")
+    if not (extent == "tile" and is_profile(height_field)):
+        remedy = "no rigorous theory is offered for a surface that varies along y"
+    elif height_field.tile_size[0] > longest:
         remedy = f"rigorous theory is offered for tiles of up to {longest:.2g} µm along x"
     else:
-        remedy = "no rigorous theory is offered for a surface that varies along y"
-    return f"scalar theory {error} here {place}; {remedy}"
+        remedy = "theory=rigorous has it right"
+        # Deeper profiles take long to solve, and are far outside of the range.
+        if depth <= WAVELENGTHS[0]:
+            solved = _solved_error(height_field) if depth > 0 else 0.0
+    if np.isfinite(solved):
+        return ScalarError(solved, False, remedy)
+    return ScalarError(_estimated_error(lengths, power, depth), True, remedy)
 
 
-def _mean_error(period: float, depth: float) -> float:
-    """For `range_warning`; infinite where the map does not reach at any of the wavelengths."""
-    errors = [
-        expected_error(period, depth, wavelength, material=material, largest_angle=90.0, mean=True)
-        for material in ("dielectric", "Al")
-        for wavelength in (0.45, 0.55, 0.65)
-    ]
-    return float(np.nanmax(errors)) if np.isfinite(errors).any() else float("inf")
+def _solved_error(profile: HeightField) -> float:
+    """The mean error of a profile; NaN if the solver does not converge."""
+    period = profile.tile_size[0]
+    row = HeightField(profile.heights[:1], profile.pixel_size)
+    powers = profile_powers(row)
+    errors = []
+    for wavelength in WAVELENGTHS:
+        for angle in ANGLES:
+            light = -np.sin(np.deg2rad(angle)), 0.0, np.cos(np.deg2rad(angle))
+            try:
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore", UserWarning)
+                    exact = efficiencies(row, light, wavelength, int_ior=INDEX, tolerance=_CONVERGED)
+            except RequestError:
+                return float("nan")
+            if not exact.error <= _CONVERGED:
+                return float("nan")
+            scalar = scalar_orders(powers, period, wavelength, angle, INDEX)
+            errors.append(difference(scalar.unpolarised, exact.unpolarised))
+    return float(np.mean(errors))
+
+
+def _estimated_error(lengths: Array, power: Array, depth: float) -> float:
+    """The mean of the map over waves of these |q|, cycles/µm, and powers; infinite for a depth outside the map."""
+    if depth == 0:
+        return 0.0
+    nodes = error_map()[0]
+    mean = np.zeros_like(power)
+    for wavelength in WAVELENGTHS:
+        errors = [expected_error(node, depth / wavelength, 1.0, mean=True) for node in nodes]
+        if not np.isfinite(errors).all():
+            return float("inf")
+        waves = -np.log(np.maximum(lengths, 1e-12) * wavelength)
+        mean += np.exp(np.interp(waves, np.log(nodes), np.log(errors))) / len(WAVELENGTHS)
+    return float((power * mean).sum() / power.sum())

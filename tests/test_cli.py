@@ -154,8 +154,7 @@ def test_precompute_writes_the_file_that_it_names_and_says_its_error(command):
     assert (code, err.strip()) == (0, "")
     spectrum = md.GratingSpectrum.load("blaze.exr")
     assert out.startswith("blaze.exr: ")
-    assert len(out.splitlines()) == 3
-    assert out.splitlines()[2].startswith("! scalar theory is expected to err by 6% ")
+    assert len(out.splitlines()) == 2
     for part in ("blazed grating", "2.5 × 2.5 µm", "27 × 1 orders", "MB", f"error {spectrum.error:.1e}", "0.001"):
         assert part in out
     assert "tile, " in out

@@ -14,7 +14,7 @@ from scipy.special import jv
 import mitsuba_diffraction as md
 from mitsuba_diffraction.bsdf.geometry import Geometry
 from mitsuba_diffraction.color import into_gamut, spectrum_to_linear_sRGB, spectrum_to_XYZ
-from mitsuba_diffraction.scalar_theory import equivalent_depth, expected_error, geometry
+from mitsuba_diffraction.scalar_theory import geometry, scalar_error
 from mitsuba_diffraction.studies.inspection import inspect, save_picture
 from mitsuba_diffraction.studies.inspection.colours import WAVELENGTHS, illumination, order_angle, order_share, radiance
 from mitsuba_diffraction.studies.inspection.concerns import concerns
@@ -233,7 +233,9 @@ def test_the_period_of_a_tile_is_exact(grating):
 
 
 def about(field, measured=True):
-    return concerns(field, statistics(field), 4.0, measured=measured)
+    return concerns(
+        field, statistics(field), 4.0, measured=measured, scalar=scalar_error(field, "sample" if measured else "tile")
+    )
 
 
 @pytest.mark.parametrize(
@@ -260,9 +262,8 @@ def test_what_stands_in_the_way_is_said(field, words):
 
 
 def test_a_grating_too_fine_for_scalar_theory_is_a_concern():
-    fine = md.gratings.sinusoidal(0.8, 0.3)
-    (said,) = concerns(fine, statistics(fine), 65.0, measured=False, periods=[0.8])
-    assert said.startswith("Scalar theory is expected to err by ")
+    (said,) = about(md.gratings.sinusoidal(0.8, 0.3), measured=False)
+    assert said.startswith("Scalar theory: errs by ")
     assert said.endswith("; theory=rigorous has it right.")
 
 
@@ -285,7 +286,6 @@ def test_a_sample_is_told_in_numbers(sample):
     assert period.period == pytest.approx(PERIOD, abs=4 * period.period_uncertainty + 0.01)
     assert abs(period.direction) < 1
     assert sample.carried == pytest.approx(4.0)
-    assert set(sample.scalar_error) == {450, 550, 650}
     told = json.loads(json.dumps(sample.as_json()))
     assert told["pixels"] == [100, 100]
     assert told["statistics"]["Sq"] == pytest.approx(DEPTH / np.sqrt(8), rel=0.03)
@@ -297,7 +297,7 @@ def test_a_sample_is_told_in_numbers(sample):
 def test_a_surface_without_a_period_says_so(tmp_path):
     noise = md.HeightField(np.random.default_rng(0).standard_normal((40, 40)) * 0.01, 0.08)
     seen = inspect(noise)
-    assert (seen.periods, seen.changes, dict(seen.scalar_error)) == ((), (), {})
+    assert (seen.periods, seen.changes) == ((), ())
     save_picture(seen, tmp_path / "noise.png")
     with Image.open(tmp_path / "noise.png") as picture:
         assert picture.size == (1920, 1080)
@@ -359,7 +359,7 @@ def test_inspect_tells_and_draws(folder, command):
         "Sq 70.7 nm",
         "2.00",
         "largest for this scan: 4; sunlight: 65",
-        "of rigorous",
+        "errs by about",
         "ΔE00",
     ):
         assert words in out, words
@@ -410,15 +410,18 @@ def test_options_of_precompute(folder, command):
     assert "coherence length  3 µm" in out
 
 
-@pytest.mark.slow
-def test_scalar_theory_is_judged_at_every_period():
-    x = (np.arange(150) + 0.5) * 0.08
-    crossed = 0.04 * np.sin(2 * np.pi * x / 3) + 0.02 * np.sin(2 * np.pi * x / 0.8)[:, None]
-    both = inspect(md.HeightField(crossed, 0.08))
-    assert [round(period.period, 2) for period in both.periods] == [3.0, 0.8]
-    depth = equivalent_depth(both.statistics.Sq)
-    assert both.scalar_error[550] == pytest.approx(expected_error(both.periods[1].period, depth, 0.55))
-    assert both.scalar_error[550] > 2 * expected_error(3.0, depth, 0.55)
+def test_inspect_precompute_and_the_log_tell_one_error_of_scalar_theory(folder, command, llvm, capfd):
+    Path("lamellar.toml").write_text('[surface]\nprofile = "lamellar"\nperiod = 1.6\ndepth = 0.2\nsamples = 64\n')
+    said = [command("inspect lamellar.toml --json n.json")[1], command("precompute lamellar.toml")[1]]
+    mi.load_dict({"type": "diffraction_grating", "filename": "lamellar.toml"})
+    said.append("".join(capfd.readouterr()))
+    warned = [re.findall(r"[Ss]calar theory: (errs by .*right)", text) for text in said]
+    assert warned[0] == warned[1] == warned[2]
+    assert len(warned[0]) == 1
+    (told,) = re.findall(r"^scalar theory +(errs by .*\))", said[0], re.MULTILINE)
+    assert warned[0] == [f"{told}; theory=rigorous has it right"]
+    share = json.loads(Path("n.json").read_text())["scalar_error"]["share"]
+    assert told.startswith(f"errs by {100 * share:.0f}% ")
 
 
 @pytest.mark.slow

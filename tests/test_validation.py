@@ -12,7 +12,7 @@ import mitsuba_diffraction as md
 from mitsuba_diffraction import rigorous, scalar_theory
 from mitsuba_diffraction.studies import analytic, conservation, coupled_waves, measured_gratings, report
 from mitsuba_diffraction.studies.accuracy import against_reference
-from mitsuba_diffraction.studies.checks import checks, main_period, scalar_range, surface_checks
+from mitsuba_diffraction.studies.checks import checks, scalar_range, surface_checks
 from mitsuba_diffraction.studies.record import Check, Record
 
 PRECOMPUTE = Path(__file__).parents[1] / "precompute"
@@ -147,16 +147,82 @@ def test_the_map_is_that_of_the_solver(material):
         assert found == pytest.approx(errors[i, j, k], rel=0.03, abs=0.003)
 
 
-def test_who_goes_beyond_scalar_theory_is_told():
-    blaze = scalar_theory.range_warning(md.gratings.ruled(1200))
-    assert "expected to err by 3" in blaze
-    assert blaze.endswith("(period 0.833 µm, depth 0.21 µm); theory=rigorous has it right")
-    crossed = scalar_theory.range_warning(md.gratings.foil(0.8, 0.5))
+def test_a_surface_outside_the_range_of_scalar_theory_is_told():
+    fine = scalar_theory.scalar_error(md.gratings.ruled(1200)).warning
+    assert fine.startswith(
+        "scalar theory: errs by 29% of the reflected light (mean over 450 to 650 nm and incidence up"
+    )
+    assert fine.endswith("; theory=rigorous has it right")
+    crossed = scalar_theory.scalar_error(md.gratings.foil(0.8, 0.5, samples=32)).warning
+    assert "errs by about" in crossed
     assert crossed.endswith("no rigorous theory is offered for a surface that varies along y")
-    assert scalar_theory.range_warning(md.gratings.sinusoidal(0.3, 0.1)).startswith("scalar theory does not hold here")
-    assert scalar_theory.range_warning(md.gratings.sinusoidal(4.0, 1.5)).endswith("for tiles of up to 3.6 µm along x")
-    for good in (md.gratings.sinusoidal(3.0, 0.05), md.gratings.compact_disc(), md.HeightField(np.zeros((1, 8)), 0.1)):
-        assert scalar_theory.range_warning(good) == ""
+    deep = scalar_theory.scalar_error(md.gratings.sinusoidal(4.0, 1.5)).warning
+    assert deep.startswith("scalar theory: error unknown, the surface is deeper than two wavelengths; ")
+    assert deep.endswith("for tiles of up to 3.6 µm along x")
+    for flat in (md.HeightField(np.zeros((1, 8)), 0.1), md.HeightField(np.full((8, 8), 0.7), 0.1)):
+        for extent in ("tile", "sample"):
+            assert scalar_theory.scalar_error(flat, extent).share == 0
+
+
+@pytest.mark.parametrize("name", ["sinusoidal", "blazed"])
+@pytest.mark.parametrize("period", [3.25, 3.7, 8.0])
+def test_no_surface_within_the_promised_range_is_warned_of(name, period):
+    # Period ≥ 5 λ and depth ≤ λ/2 from 450 to 650 nm: within 2 % (sinusoids) and 8 % (blazes), says the README.
+    found = scalar_theory.scalar_error(md.gratings.PROFILES[name](period, 0.225))
+    assert found.share < {"sinusoidal": 0.02, "blazed": 0.08}[name]
+    assert found.warning == ""
+
+
+def test_built_in_surfaces_of_long_period_raise_no_warning():
+    for surface in (md.gratings.blazed(), md.gratings.compact_disc(), md.gratings.elaphe(), md.gratings.xenopeltis()):
+        assert scalar_theory.scalar_error(surface).warning == ""
+
+
+def test_error_of_a_profile_is_that_of_coupled_waves(monkeypatch):
+    """The stored results of meent for a blaze of 2.5 × 0.25 µm."""
+    monkeypatch.setattr(scalar_theory, "WAVELENGTHS", (0.45, 0.65))
+    monkeypatch.setattr(scalar_theory, "ANGLES", (0.0, 20.0))
+    stored = [
+        scalar_theory.difference(case.scalar().unpolarised, case.unpolarised)
+        for case in coupled_waves.cases()
+        if (case.profile, case.period, case.depth, case.material) == ("blazed", 2.5, 0.25, "dielectric")
+        and case.angle <= 20
+    ]
+    assert len(stored) == 4
+    found = scalar_theory.scalar_error(md.gratings.blazed(2.5, 0.25))
+    assert not found.estimated
+    assert found.share == pytest.approx(np.mean(stored), abs=0.005)
+
+
+def random_profiles(count):
+    """Blazes, lamellar gratings, triangles, and sums of five waves."""
+    generator = np.random.default_rng(7)
+    phase = (np.arange(128) + 0.5) / 128
+    for number in range(count):
+        period, depth = np.exp(generator.uniform(np.log([0.9, 0.05]), np.log([2.5, 0.3])))
+        waves = generator.standard_normal((5, 1)) * np.cos(2 * np.pi * (np.arange(1, 6)[:, None] * phase + 0.3))
+        heights = (
+            phase,
+            1.0 * (phase < generator.uniform(0.3, 0.7)),
+            np.abs(2 * phase - 1),
+            (waves / np.arange(1, 6)[:, None] ** 1.0).sum(axis=0),
+        )[number % 4]
+        yield md.HeightField(depth * heights[None] / np.ptp(heights), (period / 128, period))
+
+
+@pytest.mark.parametrize("count", [12, pytest.param(48, marks=pytest.mark.slow)])
+def test_estimated_error_is_near_the_solved_one(count):
+    factors = []
+    for profile in random_profiles(count):
+        # The same tile, called a surface in two dimensions, is not solved.
+        solved = scalar_theory.scalar_error(profile)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(scalar_theory, "is_profile", lambda surface: False)
+            estimated = scalar_theory.scalar_error(profile)
+        assert (solved.estimated, estimated.estimated) == (False, True)
+        factors.append(np.log(estimated.share / solved.share))
+    assert np.exp(np.sqrt(np.mean(np.square(factors)))) < 1.5
+    assert np.exp(np.abs(factors).max()) < 3
 
 
 def test_expected_error_tells_where_it_holds():
@@ -271,20 +337,12 @@ class NotANumber:
 
 
 def test_a_tilt_is_no_roughness():
-    x = (np.arange(100) + 0.5) * 0.08
-    waves = np.tile(0.05 * np.cos(2 * np.pi * x / 2.0), (100, 1))
-    level, tilted = (
-        scalar_range(md.HeightField(waves + slope * x[:, None], 0.08), "sample").measured for slope in (0.0, 0.1)
-    )
+    x = (np.arange(300) + 0.5) * 0.08
+    waves = np.tile(0.05 * np.cos(2 * np.pi * x / 2.0), (150, 1))
+    level, tilted = (scalar_range(md.HeightField(waves + slope * x, 0.08), "sample").measured for slope in (0.0, 0.1))
     assert tilted == pytest.approx(level, rel=1e-3)
-    assert level == pytest.approx(scalar_theory.expected_error(2.0, 0.1, 0.55), rel=0.02)
-
-
-def test_the_period_of_a_surface_is_seen():
-    # The fingers of the synthetic skin, and its rows, are 1.144 µm apart in a patch of whole numbers of them.
-    assert main_period(md.gratings.elaphe((20.0, 1.144 * 14), seed=1), "tile") == pytest.approx(1.144, rel=0.05)
-    assert main_period(md.gratings.blazed(2.5, 0.1), "tile") == pytest.approx(2.5)
-    assert np.isnan(main_period(md.HeightField(np.zeros((1, 4)), 0.05), "tile"))
+    of_wave = [scalar_theory.expected_error(2.0, 0.1, each, mean=True) for each in scalar_theory.WAVELENGTHS]
+    assert level == pytest.approx(np.mean(of_wave), rel=0.1)  # the window broadens the wave
 
 
 def test_a_surface_outside_of_the_range_is_missed(command, tmp_path):

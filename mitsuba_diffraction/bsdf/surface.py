@@ -15,7 +15,7 @@ from ..errors import RequestError
 from ..progress import progress_bar
 from ..recipe import Recipe
 from ..rigorous.spectrum import RigorousSpectrum
-from ..scalar_theory import range_warning
+from ..scalar_theory import scalar_error
 from ..spectrum.build import THEORIES
 from ..spectrum.load import Spectrum, load_spectrum
 from ..surface.gratings import COHERENCE_LENGTHS, PROFILES
@@ -82,7 +82,7 @@ def warn_of_range(recipe: Recipe) -> None:
         return
     _told.add(told)
     surface = recipe.height_field()
-    if beyond := range_warning(surface):
+    if beyond := scalar_error(surface, recipe.spectrum.get("extent", "tile")).warning:
         _log.warning("diffraction_grating, %s: %s", surface.source, beyond)
 
 

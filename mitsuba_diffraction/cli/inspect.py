@@ -13,7 +13,6 @@ from rich.text import Text
 
 from ..coherence import SUN_COHERENCE_LENGTH, lobe_width
 from ..outputs import free_name, save_json
-from ..scalar_theory import TRUSTED
 from ..studies.inspection import Inspection, save_picture
 from ..studies.inspection import inspect as look
 from ..studies.inspection.picture import with_uncertainty
@@ -147,24 +146,8 @@ def _light(inspection: Inspection) -> list[tuple[str, str]]:
     if inspection.standard_error is not None:
         known = f"{inspection.standard_error:.2g} of the reflected power, as the scatter within this one scan tells"
         lines.append(("standard error", known))
-    lines.append(("scalar theory", _scalar(inspection)))
+    lines.append(("scalar theory", str(inspection.scalar_error)))
     return lines
-
-
-def _scalar(inspection: Inspection) -> str:
-    errors = inspection.scalar_error
-    if not errors:
-        return "unknown without a period"
-    told = [nm for nm, error in errors.items() if np.isfinite(error)]
-    if not told:
-        return "invalid: period below one wavelength, or depth above two"
-    text = f"within {' / '.join(f'{errors[nm]:.1%}' for nm in told)} of rigorous theory at "
-    text += f"{' / '.join(map(str, told))} nm"
-    beyond = [f"{nm} nm" for nm in errors if nm not in told]
-    text += f"; outside the stored range at {', '.join(beyond)}" if beyond else ""
-    text += " (for the worst period)" if len(inspection.periods) > 1 else ""
-    worst = max(errors[nm] for nm in told)
-    return text + ("; exact directions, approximate efficiencies" if worst > TRUSTED else "")
 
 
 def _changes_table(inspection: Inspection) -> Table:

@@ -10,7 +10,7 @@ import typer
 from ..errors import RequestError
 from ..recipe import Recipe
 from ..rigorous.spectrum import RigorousSpectrum
-from ..scalar_theory import range_warning
+from ..scalar_theory import scalar_error
 from ..spectrum import GratingSpectrum
 from ..spectrum.build import REPRESENTATIONS, THEORIES
 from ..spectrum.load import Spectrum
@@ -100,8 +100,10 @@ def precompute(
             f"{target}: {spectrum.source}; {spectrum.extent}, {spectrum.grid}; coherence length "
             f"{spectrum.coherence_length:.4g} µm; {_table(spectrum)}{seam}"
         )
-        if isinstance(spectrum, GratingSpectrum) and (beyond := range_warning(recipe.height_field())):
-            tell(f"! {beyond}")
+        if isinstance(spectrum, GratingSpectrum):
+            beyond = scalar_error(recipe.height_field(), spectrum.extent).warning
+            if beyond:
+                tell(f"! {beyond}")
 
 
 def _table(spectrum: Spectrum) -> str:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from ...coherence import lobe_width
-from ...scalar_theory import range_warning
+from ...scalar_theory import ScalarError
 from ...surface.heightfield import HeightField
 from .statistics import Statistics, hann
 
@@ -25,7 +23,7 @@ def concerns(
     coherence_length: float,
     *,
     measured: bool,
-    periods: Sequence[float] = (),
+    scalar: ScalarError,
 ) -> tuple[str, ...]:
     """Sentences, none if all is well.
 
@@ -34,7 +32,7 @@ def concerns(
         numbers: its statistics.
         coherence_length: of the light, as far as the surface carries it, µm.
         measured: whether it is a scan; a formula has neither tilt nor steps of its own.
-        periods: that stand out, µm.
+        scalar: the error of scalar theory.
     """
     found = []
     axes = zip(height_field.pixel_size, height_field.shape[::-1], strict=True)
@@ -44,7 +42,7 @@ def concerns(
             f"Pixels of {coarsest * 1e3:.0f} nm are too coarse for light: orders beyond {1 / (2 * coarsest):.2g} "
             "cycles/µm are missing. Scan again with pixels of at most 90 nm."
         )
-    if beyond := range_warning(height_field, periods):
+    if beyond := scalar.warning:
         found.append(f"{beyond[0].upper()}{beyond[1:]}.")
     if not measured:
         return tuple(found)

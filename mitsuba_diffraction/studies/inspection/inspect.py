@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from ...coherence import SUN_COHERENCE_LENGTH, lobe_width
 from ...reference import check_extent
-from ...scalar_theory import equivalent_depth, expected_error
+from ...scalar_theory import ScalarError, scalar_error
 from ...spectrum import GratingSpectrum
 from ...spectrum.build import precompute
 from ...spectrum.standard_error import standard_error
@@ -23,9 +23,6 @@ from .colours import LONGEST_COHERENCE
 from .concerns import concerns
 from .statistics import Statistics, statistics
 from .uncertainty import SHARE, Change, changes
-
-SCALAR_AT = (450, 550, 650)
-"""nm."""
 
 _TOLERANCE = 0.02
 _MOST_TIMES = 8
@@ -43,8 +40,7 @@ class Inspection:
         carried: the coherence length that a scan carries, µm, at most that of sunlight; of a tile, any.
         coherence_length: what is asked for, as far as it is carried, µm.
         standard_error: of a sample's spectrum at that coherence length, a share of the reflected power; None of a tile.
-        scalar_error: nm → expected error of scalar theory as a share of the reflected power, the greatest of all
-            periods; NaN where rigorous results do not reach for one of them; empty without a period.
+        scalar_error: of scalar theory for this surface.
         changes: what ±5 % of height scale, pixel size and tip broadening do; empty without a period.
         concerns: what stands in the way of a right picture.
         spectrum: of at most `LONGEST_COHERENCE`, for predicted colours.
@@ -58,7 +54,7 @@ class Inspection:
     carried: float
     coherence_length: float
     standard_error: float | None
-    scalar_error: Mapping[int, float]
+    scalar_error: ScalarError
     changes: tuple[Change, ...]
     concerns: tuple[str, ...]
     spectrum: GratingSpectrum = field(repr=False)
@@ -138,7 +134,7 @@ def inspect(
     shortest = VISIBLE[0] * 1e-3
     periods = find_periods(height_field, extent=extent)
     spectrum = build(height_field)
-    depth = equivalent_depth(numbers.Sq)
+    scalar = scalar_error(height_field, extent)
     result = Inspection(
         height_field=height_field,
         extent=extent,
@@ -151,14 +147,9 @@ def inspect(
         )
         if extent == "sample"
         else None,
-        scalar_error={
-            nm: float(np.max([expected_error(period.period, depth, nm * 1e-3) for period in periods]))
-            for nm in (SCALAR_AT if periods else ())
-        },
+        scalar_error=scalar,
         changes=changes(height_field, spectrum, periods[0], extent=extent, build=build) if periods else (),
-        concerns=concerns(
-            height_field, numbers, used, measured=measured, periods=[period.period for period in periods]
-        ),
+        concerns=concerns(height_field, numbers, used, measured=measured, scalar=scalar),
         spectrum=spectrum,
         shown=_widened(repeated(height_field, _MOST_TIMES) if extent == "tile" else height_field),
     )
