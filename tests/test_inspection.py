@@ -190,6 +190,33 @@ def test_a_tip_is_found_that_broadens_ridges_by_a_share(share):
     assert np.mean(other.heights > 0) / np.mean(surface.heights > 0) - 1 == pytest.approx(share, abs=0.01)
 
 
+def test_a_sawtooth_changes_alike_under_both_tips_and_round_ridges_do_not():
+    """−h(−x) is the same sawtooth: what dilation does to one, erosion does to the other, and |F{e^iκh}| is equal."""
+    x = (np.arange(256) + 0.5) / 256
+    ridges = md.HeightField(DEPTH * np.abs(np.sin(np.pi * x))[None], (PERIOD / 256, PERIOD))
+    differ = []
+    for surface in (md.gratings.blazed(PERIOD, DEPTH, samples=256), ridges):
+        powers = []
+        for radius in (0.02, -0.02):
+            heights = scanned(surface, radius, extent="tile").heights[0]
+            powers.append(np.abs(np.fft.fft(np.exp(4j * np.pi / 0.55 * heights)) / 256) ** 2)
+        differ.append(np.abs(powers[0] - powers[1]).sum())
+    assert differ[0] < 1e-10
+    assert differ[1] > 1e-3
+
+
+def test_a_profile_by_formula_has_met_no_tip():
+    seen = inspect(md.gratings.sinusoidal(PERIOD, DEPTH, samples=64), extent="tile", measured=False)
+    assert {change.what for change in seen.changes} == {"height scale", "pixel size"}
+
+
+def test_slopes_of_a_binary_grating_are_its_walls():
+    numbers = statistics(md.gratings.lamellar(PERIOD, DEPTH, samples=400), extent="tile")
+    # The gradient of a pixel is over two of 5 nm.
+    assert numbers.steepest == pytest.approx(np.degrees(np.arctan(DEPTH / 0.01)))
+    assert statistics(md.HeightField(np.zeros((4, 4)), 0.1)).steepest == 0
+
+
 def test_a_flat_surface_has_no_ridges_to_broaden():
     with pytest.raises(ValueError, match="flat surface"):
         broadened(md.HeightField(np.ones((8, 8)), 0.1), 0.05)
@@ -200,7 +227,7 @@ def test_a_flat_surface_has_no_ridges_to_broaden():
 
 @pytest.fixture(scope="module")
 def grating():
-    return inspect(md.gratings.sinusoidal(PERIOD, DEPTH, samples=128), extent="tile", measured=False)
+    return inspect(md.gratings.sinusoidal(PERIOD, DEPTH, samples=128), extent="tile")
 
 
 def test_changes_are_those_of_the_closed_form(grating):

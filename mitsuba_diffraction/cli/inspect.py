@@ -113,7 +113,7 @@ def _surface(inspection: Inspection) -> list[tuple[str, str]]:
             else []
         ),
         ("roughness", f"Sa {_nm(numbers.Sa)}, Sq {_nm(numbers.Sq)}, Sz {_nm(numbers.Sz)}"),
-        ("slopes", f"Sdq {numbers.Sdq:.3g} (r.m.s.); 1 % of the pixels above {numbers.steepest:.3g}°"),
+        ("slopes", f"Sdq {numbers.Sdq:.3g} (r.m.s.); 1 % of the sloping pixels above {numbers.steepest:.3g}°"),
     ]
 
 

@@ -73,8 +73,8 @@ def concerns(
         )
     if numbers.steepest > _STEEP:
         found.append(
-            f"One pixel in a hundred is steeper than {numbers.steepest:.0f}°: light is reflected more than once there, "
-            "which is not computed, and a tip does not reach down such walls."
+            f"One sloping pixel in a hundred is steeper than {numbers.steepest:.0f}°: light is reflected more than "
+            "once there, which is not computed, and a tip does not reach down such walls."
         )
     return tuple(found)
 

@@ -41,7 +41,7 @@ class Inspection:
         coherence_length: what is asked for, as far as it is carried, µm.
         standard_error: of a sample's spectrum at that coherence length, a share of the reflected power; None of a tile.
         scalar_error: of scalar theory for this surface.
-        changes: what ±5 % of height scale, pixel size and tip broadening do; empty without a period.
+        changes: what ±5 % of height scale, pixel size and, of a scan, tip broadening do; empty without a period.
         concerns: what stands in the way of a right picture.
         spectrum: of at most `LONGEST_COHERENCE`, for predicted colours.
         shown: the height field, a small tile repeated until it shows how it goes on, a profile as wide as it is long.
@@ -102,7 +102,7 @@ def inspect(
         height_field: the surface.
         extent: "sample": a piece of a larger, irregular surface; "tile": it repeats.
         coherence_length: that is wanted, µm.
-        measured: whether it is a scan; only of scans one asks for tilt and steps of the heights.
+        measured: whether it is a scan; only of scans one asks for tilt, steps of the heights and the tip.
         progress: called with (steps done, steps in all).
 
     Raises:
@@ -148,7 +148,9 @@ def inspect(
         if extent == "sample"
         else None,
         scalar_error=scalar,
-        changes=changes(height_field, spectrum, periods[0], extent=extent, build=build) if periods else (),
+        changes=changes(height_field, spectrum, periods[0], extent=extent, measured=measured, build=build)
+        if periods
+        else (),
         concerns=concerns(height_field, numbers, used, measured=measured, scalar=scalar),
         spectrum=spectrum,
         shown=_widened(repeated(height_field, _MOST_TIMES) if extent == "tile" else height_field),

@@ -21,7 +21,7 @@ class Statistics:
         Sq: root mean square height, µm.
         Sz: maximum height, highest to lowest, µm.
         Sdq: root mean square slope (gradient between neighbouring pixels), a number.
-        steepest: slope, in degrees, that one pixel in a hundred exceeds.
+        steepest: slope, in degrees, that one in a hundred of the pixels that are not flat exceeds.
         tilt: of the reference plane, degrees from level.
         tilt_height: height difference of the reference plane from corner to corner of the patch, µm.
         levels: how many different heights there are.
@@ -49,6 +49,8 @@ def statistics(height_field: HeightField, *, extent: str = "sample") -> Statisti
         for axis, pixel in ((1, height_field.pixel_size[0]), (0, height_field.pixel_size[1]))
     ]
     slope = np.hypot(*gradients)
+    # Walls of few pixels between plateaus are slopes, too.
+    sloping = slope[slope > 1e-9 * max(slope.max(), 1e-300)]
     values = np.unique(heights)
     # What arithmetic makes of equal numbers is no difference.
     steps = np.diff(values)
@@ -58,7 +60,7 @@ def statistics(height_field: HeightField, *, extent: str = "sample") -> Statisti
         Sq=float(np.sqrt(np.mean(level**2))),
         Sz=float(np.ptp(level)),
         Sdq=float(np.sqrt(np.mean(slope**2))),
-        steepest=float(np.degrees(np.arctan(np.quantile(slope, 0.99)))),
+        steepest=float(np.degrees(np.arctan(np.quantile(sloping, 0.99)))) if sloping.size else 0.0,
         tilt=float(np.degrees(np.arctan(np.hypot(*slopes)))),
         tilt_height=float(np.ptp(plane)),
         levels=len(steps) + 1,

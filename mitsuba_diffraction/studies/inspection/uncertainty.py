@@ -64,9 +64,13 @@ def changes(
     main: Period,
     *,
     extent: str,
+    measured: bool,
     build: Callable[[HeightField], GratingSpectrum],
 ) -> tuple[Change, ...]:
-    """Two of each kind, + and −.
+    """Two of each kind, + and −; of the tip only if it is a scan.
+
+    A blunter and a sharper tip change a surface that is the same upside down, such as a sinusoid or a sawtooth, alike:
+    one widens the ridges, the other the grooves, and h and −h have the same powers.
 
     Height scale and pixel size scale the arguments of the one spectrum (`radiance`); the tip makes another surface, of
     which periods are searched for and a spectrum is built.
@@ -76,6 +80,7 @@ def changes(
         spectrum: of it, for wavelengths from 360 nm divided by 1.05.
         main: its main period.
         extent: "tile" or "sample".
+        measured: whether it is a scan.
         build: makes spectra alike.
     """
     orders = [m for m in ORDERS if order_angle(m, main.period, GREEN) is not None]
@@ -99,7 +104,7 @@ def changes(
         found.append(change("height scale", by, _View(spectrum, main.period, height_scale=1 + by)))
     for by in (SHARE, -SHARE):
         found.append(change("pixel size", by, _View(spectrum, main.period * (1 + by), lateral_scale=1 + by)))
-    for by in (SHARE, -SHARE):
+    for by in (SHARE, -SHARE) if measured else ():
         try:
             other, radius = broadened(height_field, by, extent=extent)
         except RequestError:
