@@ -300,6 +300,25 @@ def test_an_archive_that_unpacks_to_too_much_is_refused(tmp_path, refuse, monkey
     refuse("scan.npz", "wanted at most 1000")
 
 
+def test_coloured_annotation_on_a_grey_picture_is_missing(tmp_path, refuse):
+    x = np.arange(60) / 60
+    grey = np.round(100 + 80 * np.sin(2 * np.pi * 3 * x) * np.ones((50, 1))).astype(np.uint8)
+    picture = np.repeat(grey[..., None], 3, axis=-1)
+    picture[42:45, 5:25] = (255, 0, 0)
+    Image.fromarray(picture).save(tmp_path / "bar.png")
+    refuse("bar.png", r"2\.00% of the pixels are coloured, annotation .*--fill-missing", height_range=1.0)
+    kept = read_height_field(tmp_path / "bar.png", 0.1, 1.0, keep_missing=True)
+    assert kept.gaps.sum() == kept.gaps[42:45, 5:25].sum() == 60
+    filled = read_height_field(tmp_path / "bar.png", 0.1, 1.0, fill_missing=True)
+    assert filled.filled == 60
+    # The surroundings go on: no trench, and no wall, of the bar.
+    np.testing.assert_allclose(filled.heights, grey / 255, atol=0.12)
+    np.testing.assert_array_equal(filled.heights[:40], grey[:40] / 255)
+    picture[20:40] = (0, 200, 30)
+    Image.fromarray(picture).save(tmp_path / "bar.png")
+    refuse("bar.png", "colour picture", height_range=1.0, fill_missing=True)
+
+
 def test_colours_transparency_and_palettes_are_refused(tmp_path, refuse):
     colour = np.stack([GREY, GREY, GREY[::-1]], axis=-1)
     Image.fromarray(colour).save(tmp_path / "colour.png")

@@ -56,7 +56,7 @@ def read_height_field(
     |---|---|---|
     | .npy | floats are µm; integers run over the full range of their type | pixel_size; integers: height_range |
     | .npz | array `heights`, as .npy, and optionally `pixel_size` in µm, one number or (x, y) | as .npy |
-    | .png, .tif, .tiff | 8 or 16 bit grey; colour if grey and opaque | pixel_size, height_range |
+    | .png, .tif, .tiff | 8 or 16 bit grey; colour if grey and opaque but for annotation | pixel_size, height_range |
     | .tif, .tiff | 32 bit float, µm | pixel_size |
     | .gwy, .gsf | Gwyddion, Gwyddion Simple Field | unit, if the file has none |
     | .xyz | points x y z on a regular grid | unit |
@@ -95,6 +95,11 @@ def read_height_field(
                     "(x, y) in µm, and the height in µm from black to white"
                 )
             heights = _as_micrometres(scan.numbers, height_range)
+        if not (fill_missing or keep_missing) and scan.numbers.dtype.kind in "iu" and np.ma.is_masked(scan.numbers):
+            raise RequestError(
+                f"{scan.numbers.mask.mean():.2%} of the pixels are coloured, annotation on a grey picture; they can be "
+                "taken for missing and filled from their surroundings (fill_missing=True, or --fill-missing)"
+            )
         pixel_size = scan.pixel_size if pixel_size is None else pixel_size
         if pixel_size is None:
             raise RequestError("pixel_size: the file has none, wanted one number or (x, y) in µm")

@@ -12,6 +12,9 @@ from PIL import Image, UnidentifiedImageError
 from ...errors import RequestError
 from .scan import DAMAGED, Scan
 
+MOST_ANNOTATION = 0.25
+"""Largest share of coloured pixels in a grey picture: a scale bar or lettering on it. More is a colour map."""
+
 
 def read(path: Path) -> Scan:
     """The channel of an image."""
@@ -57,13 +60,14 @@ def _numbers_of(picture: Image.Image) -> NDArray:
 
 
 def _grey(pixels: NDArray, mode: str) -> NDArray:
-    """The common channel of a colour image that is grey and opaque."""
+    """Return the common channel of a colour image that is grey and opaque; coloured annotation on it is masked."""
     if mode.endswith("A") and not (pixels[..., -1] == 255).all():
         raise RequestError("got a picture with transparent pixels, wanted an opaque grey one")
     colours = pixels[..., : len(mode.removesuffix("A"))]
-    if not (colours == colours[..., :1]).all():
+    coloured = (colours != colours[..., :1]).any(axis=-1)
+    if coloured.mean() > MOST_ANNOTATION:
         raise RequestError(
             "got a colour picture, wanted a grey one: colours of a map are no heights; export the data itself (.gwy, "
             ".gsf, a .tif of 32 bit) or choose a grey palette"
         )
-    return colours[..., 0]
+    return np.ma.masked_array(colours[..., 0], coloured) if coloured.any() else colours[..., 0]
