@@ -200,6 +200,15 @@ def test_a_period_must_be_positive(name, period):
         PROFILES[name](period=period, depth=0.1)
 
 
+@pytest.mark.parametrize("name", ["sinusoidal", "foil", "compact_disc", "elaphe"])
+def test_a_period_that_looks_like_nm_is_asked_about(name):
+    given = {"depth": 0.1} if name == "sinusoidal" else {}
+    with pytest.raises(ValueError, match=r"period: got 2000 µm, wanted at most 100; is it in nm \(2 µm\)\?"):
+        PROFILES[name](period=2000, **given)
+    with pytest.raises(ValueError, match="period_y: got 1500"):
+        PROFILES["crossed"](period=2.0, depth=0.1, period_y=1500)
+
+
 @pytest.mark.parametrize("name", sorted(set(PROFILES) - {"ruled"}))
 @pytest.mark.parametrize("depth", [-0.1, np.nan, None])
 def test_a_depth_must_not_be_negative(name, depth):

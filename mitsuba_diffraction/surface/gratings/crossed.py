@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..heightfield import HeightField
-from .checks import check_pixels, check_positive, check_profile
+from .checks import check_period, check_pixels, check_profile
 from .line_profile import phase
 
 
@@ -27,7 +27,7 @@ def crossed(period: float, depth: float, *, period_y: float | None = None, sampl
     check_profile(period, depth, samples)
     check_pixels(samples, samples)
     period_y = period if period_y is None else period_y
-    check_positive("period_y", period_y)
+    check_period("period_y", period_y)
     wave = depth / 2 * np.sin(2 * np.pi * phase(samples))
     return HeightField(
         wave[:, None] + wave,
