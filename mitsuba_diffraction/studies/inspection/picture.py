@@ -160,7 +160,7 @@ def _spectrum(axes: Axes, inspection: Inspection) -> None:
         along = np.deg2rad(period.direction)
         q = np.array([np.cos(along), np.sin(along)]) / period.period
         for sign in (1, -1):
-            axes.plot(*(sign * q), "o", ms=13, mfc="none", mec=colour, mew=1.8)
+            axes.plot(*(sign * q), "o", ms=13, mfc="none", mec=colour, mew=1.8, zorder=4)  # above all labels
         x, y = spot * q
         # Outwards, but for the rim.
         side = (-1 if x < -0.02 * limit else 1) * (-1 if abs(x) > 0.6 * limit else 1)
