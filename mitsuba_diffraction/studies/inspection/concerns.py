@@ -7,7 +7,8 @@ import numpy as np
 from ...coherence import lobe_width
 from ...scalar_theory import ScalarError
 from ...surface.heightfield import HeightField
-from .statistics import Statistics, hann
+from ...surface.periods import hann
+from .statistics import Statistics
 
 _COARSE = 0.09  # µm: a quarter of the shortest wavelength, as light of grazing incidence and exit wants
 _BLUE, _GREEN = 0.45, 0.55  # µm

@@ -15,9 +15,10 @@ from ...errors import RequestError
 from ...files import whole_file
 from ...outputs import metadata
 from ...surface.heightfield import HeightField
+from ...surface.periods import hann
 from .colours import WAVELENGTHS, radiance
 from .inspect import Inspection
-from .statistics import hann, reference_plane
+from .statistics import reference_plane
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -68,11 +68,6 @@ def statistics(height_field: HeightField, *, extent: str = "sample") -> Statisti
     )
 
 
-def hann(shape: tuple[int, int]) -> Array:
-    """Hann's window of a patch, (N_y, N_x); ones along an axis of one pixel."""
-    return np.outer(*(np.hanning(n + 2)[1:-1] if n > 1 else np.ones(1) for n in shape))
-
-
 def reference_plane(height_field: HeightField, extent: str) -> tuple[Array, tuple[float, float]]:
     """The plane from which heights are told, (N_y, N_x) µm, and its slopes along x and y.
 
