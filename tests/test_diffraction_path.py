@@ -9,6 +9,7 @@ import pytest
 from bsdf_support import grating, uniform, use
 
 import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a variant is set)
+from mitsuba_diffraction.render import scene as scene_module
 from mitsuba_diffraction.render.film import trace_pass
 from mitsuba_diffraction.render.scene import channel_weights, load_spectral_scene
 
@@ -231,6 +232,28 @@ def test_passes_have_the_same_bits_whatever_the_threads_and_agree_with_mitsubas_
     own = np.mean([halves(each[..., :-1] / each[..., -1:]) for each in own], 0)
     theirs = np.mean([halves(np.array(mi.render(built, spp=1024, seed=k)) / channel_weights()) for k in range(4)], 0)
     np.testing.assert_allclose(own, theirs, rtol=0.1)
+
+
+def test_both_halves_draw_the_lines_of_a_lamp(llvm, tmp_path, monkeypatch):
+    path = tmp_path / "scene.xml"
+    line = '<spectrum name="irradiance" value="545:0, 546:1, 547:0"/></emitter>'
+    path.write_text(SCENE.replace("</emitter>", line))
+
+    def pictures():
+        built = load_spectral_scene(path)
+        eye, _ = built.integrator().parts(built, built.sensors()[0])
+        for k in range(8):
+            whole = trace_pass(built, 32, k)[..., :-1].sum((0, 1, 2))
+            from_eye = trace_pass(built, 32, k, eye)[..., :-1].sum((0, 1, 2))
+            yield from_eye, whole - from_eye
+
+    found = np.array(list(pictures()))
+    # Drawn by the response of the film alone they have the same mean and far more noise.
+    monkeypatch.setattr(scene_module, "_draw_wavelengths_of_lights", lambda built: None)
+    wanted = np.array(list(pictures()))
+    error = np.std(wanted, 0, ddof=1) / np.sqrt(len(wanted))
+    np.testing.assert_array_less(np.abs(found.mean(0) - wanted.mean(0)), 4 * error)
+    np.testing.assert_array_less(10 * np.var(found, 0, ddof=1), np.var(wanted, 0, ddof=1))
 
 
 @pytest.mark.slow

@@ -74,6 +74,52 @@ def test_line_of_a_directional_light_is_in_its_channel(llvm, tmp_path):
     assert (np.delete(means, [at - 1, at, at + 1]) == 0).all()
 
 
+WALL = """<shape type="rectangle"><transform name="to_world"><scale value="9"/></transform>
+    <bsdf type="diffuse"><spectrum name="reflectance" value="0.5"/></bsdf></shape>"""
+# 1 nm wide at half its height, as of a lamp: three quarters of it lie in the channel around 545 nm.
+LINE = '<emitter type="directional"><vector name="direction" x="0" y="0" z="-1"/>'
+LINE += spectrum("irradiance", 545, 547, "0, 1, 0") + "</emitter>"
+
+
+def test_line_of_a_lamp_and_daylight_have_the_radiance_of_the_closed_form(llvm, tmp_path):
+    image = render(write_scene(tmp_path, WALL + LINE), spp=64)
+    expected = np.interp(546, [540, 545, 550], [0, 0.2, 0]) * 0.5 / np.pi  # the mean of the hat over the line
+    channel = image.radiance[..., int(np.argmin(np.abs(GRID - 545)))]
+    np.testing.assert_allclose(channel.mean(), expected, rtol=0.003)
+    # A pixel of 64 samples: 1.3 times the mean if wavelengths are drawn by the film's response alone.
+    assert channel.std() < 0.05 * expected
+    # Beside it, a sky of radiance one, in all channels.
+    both = render(write_scene(tmp_path, WALL + LINE + CONSTANT), spp=4096).radiance.mean((0, 1))
+    wanted = 0.5 + 0.5 / np.pi * np.interp(546, [540, 545, 550], [0, 0.2, 0]) * (np.abs(GRID - 545) < 1)
+    wanted[np.argmin(np.abs(GRID - 550))] += 0.5 / np.pi * np.interp(546, [545, 550], [0, 0.2])
+    np.testing.assert_allclose(both, wanted, rtol=0.06)
+    np.testing.assert_allclose(both.mean(), wanted.mean(), rtol=0.01)
+
+
+def test_the_four_wavelengths_of_a_ray_are_spread_over_line_and_film(llvm, tmp_path):
+    sensor = load_spectral_scene(write_scene(tmp_path, WALL + LINE + CONSTANT)).sensors()[0]
+    drawn, _ = sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), (dr.arange(mi.Float, 1000) + 0.5) / 1000)
+    drawn = np.sort(np.array(drawn), axis=0)
+    in_line = np.abs(drawn - 546) < 1.3
+    assert (in_line.sum(0) == 1).mean() > 0.97
+    # The other three are thirds of the film's response apart.
+    one = in_line.sum(0) == 1
+    rest = drawn.T[one][~in_line.T[one]].reshape(-1, 3)
+    fine = np.linspace(360, 830, 4701)
+    response = np.interp(fine, [360, *GRID, 830], [0, *channel_weights(), 0])
+    share = np.interp(rest, fine, response.cumsum() / response.sum())
+    np.testing.assert_allclose(np.diff(share, axis=1), 1 / 3, atol=0.02)
+
+
+@pytest.mark.parametrize("light", ['<emitter type="constant"/>', '<emitter type="sunsky"/>', CONSTANT])
+def test_wavelengths_of_daylight_are_drawn_by_the_response_of_the_film(llvm, tmp_path, light):
+    built = load_spectral_scene(write_scene(tmp_path, WALL + light))
+    drawn_from = np.array(mi.traverse(built.sensors()[0].film().sensor_response_function())["values"])
+    fine = np.linspace(360, 830, drawn_from.size)
+    expected = np.interp(fine, [360, *GRID, 830], [0, *channel_weights() / 5, 0])
+    np.testing.assert_allclose(drawn_from, expected, rtol=0, atol=1e-6)
+
+
 @pytest.mark.slow
 def test_rgb_is_that_of_mitsubas_own_film(llvm, tmp_path):
     path = write_scene(tmp_path, SPHERE + '<emitter type="constant"/>')

@@ -27,6 +27,10 @@ from ..wavelengths import VISIBLE
 # resolved. The spacing affects memory but not time, as `film` adds a sample to at most eight channels.
 _STEP = 5.0
 
+# Wavelengths are drawn from a density on a grid as fine as this, nm, which is less than a lamp's lines are wide.
+_DENSITY_STEP = 0.25
+_DRAWS_PER_LIGHT = 2**14  # of four wavelengths, to learn its spectrum
+
 _MOST_PIXELS = 2**25  # above 7680 × 4320; sums take 750 bytes per pixel
 _DEFAULT_SIZE = (768, 576)  # that of Mitsuba's films
 
@@ -98,7 +102,54 @@ def load_spectral_scene(
         raise RequestError(f'{path}: the scene has no integrator, wanted one, such as <integrator type="path"/>')
     if scene.integrator().aov_names():
         raise RequestError(f"{path}: the integrator gives {scene.integrator().aov_names()}, wanted radiance alone")
+    _draw_wavelengths_of_lights(scene)
     return scene
+
+
+def _draw_wavelengths_of_lights(scene: mi.Scene) -> None:
+    """Make the sensors draw a quarter of the wavelengths, one of a ray's four, in the spectral lines of the lights.
+
+    Mitsuba draws them in proportion to the response r(λ) of the film: one in some hundred meets a line of 1 nm, and
+    counts a hundredfold. With s_e(λ) the spectrum of the light e and ∫ r dλ = ∫ r s_e dλ = 1, they are drawn here from
+
+        p ∝ r (1 + e/(3 max(1, ∫ r e dλ))),    e(λ) = max(0, max_e s_e(λ) − 4).
+
+    Daylight and incandescent lamps leave p = r. How strong the lights are does not enter, as it says little of what
+    arrives at a pixel. The film divides by p, and p > 0 where r > 0: every channel keeps its expectation.
+    """
+    emissions = [_emission(emitter) for emitter in scene.emitters()]
+    for sensor in scene.sensors():
+        # Sensor and film share this object.
+        drawn_from = mi.traverse(sensor.film().sensor_response_function())
+        response = np.array(drawn_from["values"], np.float64)
+        response /= response.sum()
+        lines = np.zeros_like(response)
+        for emission in emissions:
+            seen = response * emission
+            lines = np.maximum(lines, seen / (seen.sum() or 1) - 4 * response)
+        if lines.any():
+            density = response + lines / (3 * max(1, lines.sum()))
+            # Whole numbers, whose sums are exact in single precision: Mitsuba adds them up to invert their sum.
+            density = np.ceil(density * (2**23 / density.sum()))
+            drawn_from["values"] = type(drawn_from["values"])(density.astype(np.float32))
+            drawn_from.update()
+
+
+def _emission(emitter: mi.Emitter) -> NDArray[np.float64]:
+    """Return the spectrum of a light on the grid of the density, (n,), up to a factor.
+
+    It is a histogram of wavelengths that the light draws itself, so that no line is too narrow. A light that is not the
+    same everywhere is seen at one place or in one direction.
+    """
+    place = dr.zeros(mi.SurfaceInteraction3f)
+    place.wi = mi.Vector3f(0, 0, -1)
+    numbers = (np.arange(_DRAWS_PER_LIGHT, dtype=np.float32) + 0.5) / _DRAWS_PER_LIGHT
+    batches = [mi.Float(numbers)] if dr.is_jit_v(mi.Float) else numbers.tolist()
+    drawn = [emitter.sample_wavelengths(place, batch) for batch in batches]
+    pairs = [np.broadcast_arrays(wavelengths, mi.unpolarized_spectrum(weights)) for wavelengths, weights in drawn]
+    wavelengths, weights = np.concatenate(pairs, axis=-1).reshape(2, -1)
+    edges = np.arange(VISIBLE[0] - _DENSITY_STEP / 2, VISIBLE[1] + _DENSITY_STEP, _DENSITY_STEP)
+    return np.histogram(wavelengths, edges, weights=weights)[0]
 
 
 def named_sample_count(path: str | os.PathLike[str], parameters: Mapping[str, str] | None = None) -> int | None:
@@ -280,10 +331,11 @@ def _spectral_film(
     for name, index in _children(old).items():
         if state.nodes[index].type == mi.ObjectType.ReconstructionFilter:
             film[name] = mi.Properties.ResolvedReference(index)
+    triangle = 1 - np.abs(np.linspace(-1, 1, round(2 * _STEP / _DENSITY_STEP) + 1))
     for number, (centre, weight) in enumerate(zip(channel_wavelengths(), channel_weights(), strict=True)):
         hat = mi.Properties("regular")
         hat["wavelength_min"], hat["wavelength_max"] = float(centre - _STEP), float(centre + _STEP)
-        hat["values"] = f"0, {weight / _STEP:.17g}, 0"
+        hat["values"] = ", ".join(f"{weight / _STEP * share:.17g}" for share in triangle)
         # Channels are numbered, as the parser refuses names with a dot; films keep the order of names.
         film[f"channel_{number:03d}"] = _add(state, mi.ObjectType.Texture, hat)
     return film
