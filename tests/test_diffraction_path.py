@@ -234,6 +234,41 @@ def test_passes_have_the_same_bits_whatever_the_threads_and_agree_with_mitsubas_
     np.testing.assert_allclose(own, theirs, rtol=0.1)
 
 
+@pytest.mark.few(1)
+def test_aov_around_it_gives_its_picture(llvm):
+    built = sun_alone()
+    inner = {"type": "diffraction_path", "max_depth": 3}
+    around = mi.load_dict({"type": "aov", "aovs": "z:depth", "inner": inner})
+    own = np.array(mi.render(built, integrator=mi.load_dict(inner), spp=16, seed=5))
+    channels = np.array(mi.render(built, integrator=around, spp=16, seed=5))
+    assert channels.shape[2] == own.shape[2] + 1
+    np.testing.assert_allclose(channels[..., :3], own[..., :3], rtol=1e-4)
+
+
+@pytest.mark.parametrize("mode", ["forward", "backward"])
+def test_gradients_are_finite_differences(llvm, mode):
+    built = sun_alone()
+    integrator = mi.load_dict({"type": "diffraction_path", "max_depth": 3})
+    params = mi.traverse(built)
+
+    def brightness(reflectance):
+        params["wall.bsdf.reflectance.value"] = reflectance
+        params.update()
+        return dr.mean(mi.render(built, params, integrator=integrator, seed=7, spp=1024), axis=None)
+
+    # Light that meets the wall twice is beyond max_depth, so that the brightness is a linear function.
+    finite = (brightness(mi.Float(0.9)) - brightness(mi.Float(0.7))) / 0.2
+    reflectance = mi.Float(0.8)
+    dr.enable_grad(reflectance)
+    picture = brightness(reflectance)
+    if mode == "forward":
+        dr.forward(reflectance)
+    else:
+        dr.backward(picture)
+    found = dr.grad(picture if mode == "forward" else reflectance)
+    np.testing.assert_allclose(np.array(found).item(), np.array(finite).item(), rtol=0.03)
+
+
 def test_both_halves_draw_the_lines_of_a_lamp(llvm, tmp_path, monkeypatch):
     path = tmp_path / "scene.xml"
     line = '<spectrum name="irradiance" value="545:0, 546:1, 547:0"/></emitter>'

@@ -46,8 +46,8 @@ to the sensor. There is one path from the light for eight samples of the film. A
 not seen in a mirror: it is left out where the grating next to it scatters by a delta component.
 
 Without a grating, with max_depth below 3, in polarised variants, and for sensors that points cannot be connected to
-(all but `perspective` and `thinlens`), this is `path`. Instances and curves count as X. Where Mitsuba asks for single
-rays, as inside of `aov`, all paths are traced from the eye.
+(all but `perspective` and `thinlens`), this is `path`. Instances and curves count as X. It works inside of `aov`.
+Gradients are those of `path` (forward) and `prb` (backward), and single rays (`sample`) those of `path`.
 """
 
 
@@ -99,7 +99,7 @@ def define() -> type:
             self,
             scene: mi.Scene,
             sensor: mi.Sensor | int = 0,
-            seed: int = 0,
+            seed: mi.UInt32 | int = 0,
             spp: int = 0,
             develop: bool = True,
             evaluate: bool = True,
@@ -119,6 +119,26 @@ def define() -> type:
                 put(film, block, splats.position + corner, splats.wavelengths, splats.value * spp)
             film.put_block(block)
             return film.develop() if develop else mi.TensorXf()
+
+        # Dr.Jit does not differentiate splats: derivatives are those of `path`, which has the same expectation. `prb`
+        # gives them backward; forward it fails in spectral variants of Mitsuba 3.9.1, where that of `path` does not.
+
+        def render_forward(
+            self, scene: mi.Scene, params: object, sensor: mi.Sensor, seed: mi.UInt32 | int = 0, spp: int = 0
+        ) -> mi.TensorXf:
+            return self.path.render_forward(scene, params, sensor, seed, spp)
+
+        def render_backward(
+            self,
+            scene: mi.Scene,
+            params: object,
+            grad_in: mi.TensorXf,
+            sensor: mi.Sensor,
+            seed: mi.UInt32 | int = 0,
+            spp: int = 0,
+        ) -> None:
+            prb = nested_plugin("prb", max_depth=self.max_depth, rr_depth=self.rr_depth)
+            prb.render_backward(scene, params, grad_in, sensor, seed, spp)
 
         def to_string(self) -> str:
             return f"DiffractionPath[\n  max_depth = {self.max_depth},\n  rr_depth = {self.rr_depth}\n]"

@@ -46,7 +46,7 @@ class LightPaths:
         """How many paths are traced beside `spp` samples per pixel."""
         return max(1, round(_PATHS_PER_SAMPLE * spp * self.pixels))
 
-    def splats(self, seed: int, count: int) -> Iterator[Splats]:
+    def splats(self, seed: mi.UInt32 | int, count: int) -> Iterator[Splats]:
         """Traces `count` paths. What comes, and in which order, depends on the seed and the count alone."""
         step = _PATHS_AT_ONCE if dr.is_jit_v(mi.Float) else 1
         capacity = min(step, count)
@@ -61,13 +61,15 @@ class LightPaths:
             yield from buffer.content()
 
     @dr.syntax
-    def _trace(self, seed: int, first: int, count: int, scale: float, buffer: SplatBuffer) -> None:
+    def _trace(self, seed: mi.UInt32 | int, first: int, count: int, scale: float, buffer: SplatBuffer) -> None:
         """Traces the paths from the number `first` on, and leaves in `buffer` what they give to the sensor."""
         path = dr.arange(mi.UInt32, count) if dr.is_jit_v(mi.Float) else 0
         path += dr.opaque(mi.UInt32, first)
         rng = mi.PCG32()
         # Other numbers than the sampler draws from the same seed.
-        state, sequence = mi.sample_tea_32(path, dr.opaque(mi.UInt32, seed ^ 0x9E3779B9))
+        key = mi.UInt32(seed) ^ 0x9E3779B9
+        dr.make_opaque(key)
+        state, sequence = mi.sample_tea_32(path, key)
         rng.seed(mi.UInt64(state), mi.UInt64(sequence))
         ray, power, active = self._start(rng)
         power *= dr.opaque(mi.Float, scale)
