@@ -18,8 +18,15 @@ obeys
 
     [(α − ρM) J⁻¹ (α − ρM) + ρ²J] F = γ² J F,
 
-one eigenproblem of twice the harmonics for each medium. Half of its solutions are outgoing upwards, half downwards.
-Where a medium has no loss, those that travel are replaced by the Rayleigh waves e^{i(α_m x + β_m z)}, which are exact.
+one eigenproblem of twice the harmonics for each medium, which with S = (J + M J⁻¹ M)⁻¹ and C = M J⁻¹ α is
+
+    ρ ⎡ ψ  ⎤ = ⎡ SC          S   ⎤ ⎡ ψ  ⎤
+      ⎣ −iG⎦   ⎣ γ²J − αSα   C†S ⎦ ⎣ −iG⎦.
+
+Half of its solutions are outgoing upwards, half downwards. The eigenvectors of deep profiles are all but parallel: of
+the fields e^{−|β|z} one is e^{|β| depth} times as strong in the valleys as on the ridges. The spaces that they span are
+well separated; Schur vectors, the eigenvalues of one space first, are an orthonormal basis of it. Where a medium has no
+loss, solutions that travel are replaced by the Rayleigh waves e^{i(α_m x + β_m z)}, which are exact.
 
 Conical incidence (Plumey et al. 1995): with e^{i k_y y}, both E_y and H_y (H in units of E) obey the equation above
 with γ² = k² − k_y², and along the curve
@@ -33,7 +40,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import lu_factor, lu_solve, toeplitz
+from scipy.linalg import lu_factor, lu_solve, schur, toeplitz
+from scipy.linalg.lapack import ztrsen
 
 from .curve import Curve
 
@@ -47,6 +55,7 @@ class Grating:
     Attributes:
         n: the harmonics −N … N.
         j, m: J and M as Toeplitz matrices, (2N + 1, 2N + 1).
+        s: S, and `sm`: S M J⁻¹, (2N + 1, 2N + 1).
     """
 
     def __init__(self, curve: Curve, harmonics: int) -> None:
@@ -56,10 +65,9 @@ class Grating:
         self.x, self.z = (2 * np.pi * c for c in curve.middle)
         self.t = 2 * np.pi * (np.arange(len(self.x)) + 0.5) / len(self.x)
         self.j, self.m = (self._toeplitz(values) for values in curve.tangent)
-        self.inverse = np.linalg.inv(self.j)
-        self.left = self.inverse @ self.m
-        self.mass = self.m @ self.left + self.j
-        self.square = np.linalg.inv(self.mass)
+        left = np.linalg.solve(self.j, self.m).conj().T  # M J⁻¹
+        self.s = np.linalg.inv(left @ self.m + self.j)
+        self.sm = self.s @ left
 
     def _coefficients(self, values: Complex) -> Complex:
         """∫₀¹ f e^{−2πi n t} dt of values (…, samples) between the points of the curve, n as in `fft`."""
@@ -70,21 +78,22 @@ class Grating:
         n, c = 2 * self.harmonics + 1, self._coefficients(values)
         return toeplitz(c[:n], c[-np.arange(n)])
 
-    def eigenmodes(self, alpha: Real, gamma2: complex) -> tuple[Complex, Complex, Complex]:
-        """ρ, and of each solution ψ and −iG along the curve as columns: (2n,), (n, 2n), (n, 2n)."""
+    def bounded(self, alpha: Real, gamma2: complex, upwards: bool, count: int) -> tuple[Complex, Complex]:
+        """ψ and −iG along the curve, (n, count) each, of fields that span those decaying fastest in one direction."""
         n = len(alpha)
-        cross = self.left.conj().T * alpha[None, :]  # M J⁻¹ α
-        linear = cross + cross.conj().T
-        constant = gamma2 * self.j - alpha[:, None] * self.inverse * alpha[None, :]
-        matrix = np.zeros((2 * n, 2 * n), complex)
-        matrix[:n, n:] = np.eye(n)
-        matrix[n:, :n] = self.square @ constant
-        matrix[n:, n:] = self.square @ linear
-        rho, vectors = np.linalg.eig(matrix)
-        psi = vectors[:n]
-        # G = J v − M w with v = iρψ and J w = ∂_t ψ − M v.
-        flux = self.mass @ (psi * rho) - cross @ psi
-        return rho, psi, flux
+        # −iG is stored in this unit, so that both halves of a vector weigh the same.
+        unit = np.sqrt(np.abs(gamma2) + n**2)
+        matrix = np.empty((2 * n, 2 * n), complex)
+        matrix[:n, :n] = self.sm * alpha[None, :]
+        matrix[:n, n:] = self.s * unit
+        matrix[n:, :n] = (gamma2 * self.j - alpha[:, None] * self.s * alpha[None, :]) / unit
+        matrix[n:, n:] = matrix[:n, :n].conj().T
+        triangle, basis = schur(matrix, output="complex", overwrite_a=True, check_finite=False)
+        decay = np.diag(triangle).imag * (1 if upwards else -1)
+        first = np.zeros(2 * n, np.int32)
+        first[np.argsort(-decay)[:count]] = 1
+        basis = ztrsen(first, triangle, basis, job="N", lwork=1)[1][:, :count]
+        return basis[:n], basis[n:] * unit
 
     def rayleigh(self, alpha: Real, orders: NDArray[np.int64], beta: Complex) -> tuple[Complex, Complex]:
         """ψ and −iG of the plane waves e^{i(α_m x + β z)} along the curve as columns, (n, orders) each."""
@@ -126,15 +135,13 @@ def half_space(grating: Grating, alpha: Real, gamma2: complex, upwards: bool) ->
         gamma2: γ², of positive imaginary part or real.
         upwards: whether outgoing is up.
     """
-    sign = 1 if upwards else -1
-    rho, psi, flux = grating.eigenmodes(alpha, gamma2)
     square = gamma2 - alpha**2
     propagates = (square.real > 0) & (np.imag(gamma2) == 0)
     orders, beta = grating.n[propagates], np.sqrt(square[propagates].real)
     # Of the solutions without loss, 2p travel; the others are pairs, one of which is bounded on this side.
-    chosen = np.argsort(-sign * rho.imag)[: len(alpha) - len(orders)]
-    waves = grating.rayleigh(alpha, orders, sign * beta.astype(complex))
-    psi, flux = (np.hstack([w, f[:, chosen]]) for w, f in zip(waves, (psi, flux), strict=True))
+    modes = grating.bounded(alpha, gamma2, upwards, len(alpha) - len(orders))
+    waves = grating.rayleigh(alpha, orders, (beta if upwards else -beta).astype(complex))
+    psi, flux = (np.hstack(both) for both in zip(waves, modes, strict=True))
     factors = lu_factor(psi, check_finite=False)
     admittance = lu_solve(factors, flux.T.conj(), trans=2, check_finite=False).conj().T
     return HalfSpace(orders, beta, factors, admittance)
@@ -181,11 +188,13 @@ class Scattered:
         orders: n of the reflected orders, whose α is α_0 + n, (p,).
         reflected: (p, 2, 2), [order, polarisation of the order, of the incident light], so scaled that |·|² is a share
             of the incident power.
-        transmitted: the same of the orders that propagate below, (r, 2, 2).
+        orders_below: n of the orders that propagate below, (r,).
+        transmitted: the same of these, (r, 2, 2).
     """
 
     orders: NDArray[np.int64]
     reflected: Complex
+    orders_below: NDArray[np.int64]
     transmitted: Complex
 
 
@@ -212,4 +221,4 @@ def scatter(grating: Grating, light: Light, k_y: float, index: complex) -> Scatt
     if len(below.orders):
         down = np.stack([below.amplitudes(field) for field in total], axis=1) * [[1, -1], [-1, 1]]
         down *= np.sqrt(below.beta / light.beta * light.square / square)[:, None, None] * [[index.real], [1]]
-    return Scattered(above.orders, reflected, down)
+    return Scattered(above.orders, reflected, below.orders, down)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import median_filter
 
 from ..errors import RequestError
 from ..surface.heightfield import HeightField
@@ -14,11 +15,14 @@ from ..surface.heightfield import HeightField
 Real = NDArray[np.float64]
 
 SAMPLES = 4096
-# An edge turns the curve by more than this (rad) and by more than so many times the median turn.
+# An edge turns the curve by more than this (rad) and by more than so many times the median turn of nine pixels.
 _EDGE, _OF_MEDIAN, _MOST_EDGES = 0.1, 8.0, 8
 # At an edge the curve runs as slowly in t as 1 − this of its mean; a piece of the length l has a share l^_SHARE of t.
 # Of those tried, 0.8 … 0.95 and 0.35 … 1 on blazes, ruled and lamellar gratings, these need the fewest harmonics.
 _GRADING, _SHARE = 0.9, 0.65
+# A bend of one radian takes as much of t as this share of the whole length. Of 0 … 0.32, this needs the fewest
+# harmonics: a sinusoid of silver eight times as deep as wide 56, without it more than 140.
+_BEND = 0.04
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,8 +61,9 @@ def curve_of(height_field: HeightField) -> Curve:
     """The curve of a surface of one row: straight lines from pixel to pixel, round the end of the tile.
 
     The facet that leads back in a sawtooth is thus one pixel wide, and so is the wall of a lamellar grating. Between
-    edges the length of the curve grows as τ − (η/2π) sin 2πτ, slowly near the edges, where fields are singular (Granet
-    1999).
+    edges the length of the curve grows at a rate of 1 − η (4 cos 2πτ + cos 4πτ)/5: slowly near the edges, where fields
+    are singular (Granet 1999), and evenly away from them, where a fast run makes for short waves. Smooth bends count as
+    length (`_BEND`), so that sharp crests are resolved.
 
     Raises:
         ValueError: if the rows of the height field differ.
@@ -75,15 +80,19 @@ def curve_of(height_field: HeightField) -> Curve:
     z = np.append(rows[0], rows[0, 0]) / period
     angles = np.arctan2(np.diff(z), np.diff(x))
     turns = np.abs(angles - np.roll(angles, 1))
-    edges = np.flatnonzero(turns > max(_EDGE, _OF_MEDIAN * np.median(turns)))
+    edges = np.flatnonzero(turns > np.maximum(_EDGE, _OF_MEDIAN * median_filter(turns, 9, mode="wrap")))
     edges = np.sort(edges[np.argsort(-turns[edges])[:_MOST_EDGES]])
+    turns[edges] = 0
+    steps = np.hypot(np.diff(x), np.diff(z))
+    steps = steps / steps.sum() + _BEND / 2 * (turns + np.roll(turns, -1))
     if len(edges):
         # Begin at an edge.
         x, z = (np.append(np.roll(c[:-1], -edges[0]), 0) for c in (x, z))
         x[:-1] += x[:-1] < x[0]
         x[-1], z[-1] = x[0] + 1, z[0]
+        steps = np.roll(steps, -edges[0])
         edges = edges - edges[0]
-    s = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(z)))])
+    s = np.concatenate([[0.0], np.cumsum(steps)])
     at = _graded(s[edges], s[-1]) if len(edges) else np.linspace(0, s[-1], SAMPLES + 1)
     return Curve(np.interp(at, s, x), np.interp(at, s, z), -(angles.min() + angles.max()) / 2)
 
@@ -96,5 +105,5 @@ def _graded(edges: Real, length: float) -> Real:
     at = [np.zeros(1)]
     for (a, b), n in zip(itertools.pairwise(ends), np.diff(steps), strict=True):
         t = np.arange(1, n + 1) / max(n, 1)
-        at.append(a + (b - a) * (t - _GRADING / (2 * np.pi) * np.sin(2 * np.pi * t)))
+        at.append(a + (b - a) * (t - _GRADING / (20 * np.pi) * (8 * np.sin(2 * np.pi * t) + np.sin(4 * np.pi * t))))
     return np.concatenate(at)
