@@ -165,10 +165,77 @@ def test_all_orders_of_a_coarse_grating_are_found():
     np.testing.assert_array_equal(found.orders, np.arange(np.ceil(-13.7 * (1 - sine)), np.floor(13.7 * (1 + sine)) + 1))
 
 
-def test_where_harmonics_run_out_the_error_tells():
-    found = rigorous.efficiencies(gratings.sinusoidal(0.5, 4.0), CONICAL, 0.55, material="Ag", tolerance=1e-9)
+def ridged(period, depth, samples=512):
+    """|sin|: a sharp valley between round ridges."""
+    x = (np.arange(samples) + 0.5) / samples
+    return HeightField(depth * np.abs(np.sin(np.pi * x))[None], (period / samples, period))
+
+
+@pytest.mark.parametrize(
+    ("surface", "direction", "wavelength", "index"),
+    [
+        (gratings.sinusoidal(4.21678, 1.17292, samples=256), (-0.17501, 0.178126, 0.968319), 0.593122, 3.44014),
+        (gratings.sinusoidal(2.0, 2.3, samples=512), CONICAL, 0.55, 3.5),
+        (ridged(3.58, 0.83), CONICAL, 0.637, 3.424),
+        (gratings.blazed(6.0, 2.57), CONICAL, 0.55, 3.36),
+    ],
+    ids=["sinusoid", "deep sinusoid", "ridges", "blaze"],
+)
+def test_deep_dielectrics_of_high_index_conserve_energy(surface, direction, wavelength, index):
+    found = rigorous.efficiencies(surface, direction, wavelength, int_ior=index)
+    assert found.error < 1e-3
+    np.testing.assert_allclose(np.add([found.s.sum(), found.p.sum()], found.transmitted), 1, atol=1e-5)
+    assert (abs(found.transmitted_amplitudes) ** 2).sum(axis=(0, 1)) == pytest.approx(found.transmitted)
+    # Orders propagate below up to |k_x + m/T| = n/λ, in the plane of constant k_y.
+    k_x, k_y = -np.array(direction)[:2] / np.linalg.norm(direction)
+    m = np.arange(-60, 61)
+    below = m[(k_x - m * wavelength / surface.tile_size[0]) ** 2 + k_y**2 < index**2]
+    np.testing.assert_array_equal(found.transmitted_orders, below)
+
+
+def test_a_sinusoid_eight_times_as_deep_as_wide_converges():
+    """Its crests are sharp: their radius is a thousandth of their height."""
+    found = rigorous.efficiencies(gratings.sinusoidal(0.5, 4.0), CONICAL, 0.55, int_ior=1.5)
+    assert found.harmonics < 80
+    assert found.error < 1e-3
+    np.testing.assert_allclose(np.add([found.s.sum(), found.p.sum()], found.transmitted), 1, atol=1e-3)
+
+
+def test_more_harmonics_do_not_lose_digits():
+    surface = gratings.sinusoidal(2.0, 2.3, samples=512)
+    some, more = (
+        rigorous.efficiencies(surface, CONICAL, 0.55, int_ior=3.5, harmonics=harmonics) for harmonics in (60, 80)
+    )
+    assert difference(some.s, more.s) < 1e-7
+    assert difference(some.p, more.p) < 1e-7
+
+
+def test_a_deep_dielectric_agrees_with_meent():
+    """s light; 22 harmonics, 128 and 256 layers, extrapolated (`precompute/coupled_waves.py`)."""
+    found = rigorous.efficiencies(gratings.sinusoidal(1.3, 1.6), light(20), 0.6, int_ior=3.0)
+    np.testing.assert_array_equal(found.orders, [-1, 0, 1, 2])
+    assert difference(found.s, np.array([0.0254429, 0.0295994, 0.0012986, 0.0009813])) < 3e-3
+
+
+def test_deep_gold_at_grazing_incidence_converges():
+    found = rigorous.efficiencies(gratings.sinusoidal(2.8, 8.2), light(88), 0.55, material="Au")
+    assert found.error < 1e-3
+    assert 0.8 < found.p.sum() < found.s.sum() < 1
+
+
+def test_where_harmonics_run_out_a_warning_tells():
+    surface = gratings.sinusoidal(0.5, 4.0)
+    with pytest.warns(UserWarning, match=r"error of 0\.\d+ with 80 harmonics, wanted at most 1e-09") as told:
+        found = rigorous.efficiencies(surface, CONICAL, 0.55, material="Ag", tolerance=1e-9)
+    assert len(told) == 1
     assert found.harmonics == 80
     assert found.error > 1e-9
+
+
+def test_more_light_than_came_is_refused():
+    deep = gratings.sinusoidal(5.0, 10.0)
+    with pytest.raises(ValueError, match="wanted at most 1; 10 µm are too deep for a period of 5 µm"):
+        rigorous.efficiencies(deep, CONICAL, 0.55, int_ior=3.0, harmonics=60)
 
 
 def test_light_along_the_grooves_and_grazing_light_stay_finite():

@@ -22,8 +22,8 @@ from ..wavelengths import VISIBLE
 from .axes import LARGEST_PERIOD, STORED, Axes
 from .blas import one_thread
 from .coordinate_transformation import Grating, light_from, scatter
-from .curve import curve_of
-from .efficiencies import efficiencies
+from .curve import Curve, curve_of
+from .efficiencies import converge, solve, wave_numbers
 from .materials import refractive_index
 from .mueller import REVERSED, mueller
 from .spectrum import RigorousSpectrum
@@ -43,7 +43,7 @@ _NEAR = 0.02
 _CHECKS = 200
 # Light at which the harmonics are chosen: near the normal, and oblique from both sides.
 _HARD = ((0.1, 0, 1), (0.8, 0.3, 0.5), (-0.8, 0.3, 0.5))
-BUILD_VERSION = 2  # raised when tables of equal requests change
+BUILD_VERSION = 3  # raised when tables of equal requests change
 MATRICES = 3.0
 """Bound of `polarisation_error`, in tolerances: matrices vary faster than η."""
 
@@ -155,8 +155,9 @@ class _Surface:
         self.period = height_field.tile_size[0]
         self.wavelengths = wavelengths
         self.index = index
+        self.tolerance = tolerance
         curve = curve_of(height_field)
-        self.harmonics = max(self._harmonics(height_field, d, tolerance / 10) for d in _HARD)
+        self.harmonics = max(self._harmonics(curve, np.array(d) / np.linalg.norm(d)) for d in _HARD)
         self.grating = Grating(curve, self.harmonics)
         # What the table is compared with is solved with more.
         self.finer = Grating(curve, int(1.4 * self.harmonics))
@@ -164,16 +165,22 @@ class _Surface:
             repr((height_field.digest, wavelengths, named, self.harmonics, BUILD_VERSION)).encode()
         ).hexdigest()
 
-    def _harmonics(self, height_field: HeightField, direction: tuple[float, ...], tolerance: float) -> int:
-        """The fewest harmonics that are right to the tolerance, at the shortest wavelength."""
-        wavelength = self.wavelengths[0]
-        material = {"int_ior": self.index(wavelength)}
-        exact = efficiencies(height_field, direction, wavelength, tolerance=tolerance / 2, **material)
+    def _harmonics(self, curve: Curve, omega: Real) -> int:
+        """The fewest harmonics that are right to a tenth of the tolerance, at the shortest wavelength."""
+        index, k_0 = self.index(self.wavelengths[0]), self.period / self.wavelengths[0]
+        exact = converge(curve, omega, k_0, index, self.tolerance / 20)
+        if exact.error > self.tolerance:
+            raise RequestError(
+                f"height field: got an error of {exact.error:.2g} with {exact.harmonics} harmonics at a wavelength of "
+                f"{1e3 * self.wavelengths[0]:.4g} nm, wanted at most {self.tolerance:.2g}; it is too deep for its "
+                "period with theory=rigorous"
+            )
         # At grazing incidence there are orders up to 2 T/λ.
-        count = int(np.ceil(2 * self.period / wavelength))
+        count, _ = wave_numbers(curve, k_0, index, 1.0)
         while count < exact.harmonics:
-            found = efficiencies(height_field, direction, wavelength, harmonics=count, **material)
-            if np.abs(found.unpolarised - exact.unpolarised).sum() <= tolerance * exact.unpolarised.sum():
+            found = solve(curve, omega, k_0, index, count)
+            difference = np.abs(found.unpolarised - exact.unpolarised).sum()
+            if max(difference / exact.unpolarised.sum(), found.imbalance) <= self.tolerance / 10:
                 break
             count = int(np.ceil(1.1 * count))
         return count

@@ -1,7 +1,9 @@
-"""The efficiencies of the orders that a grating reflects, by Maxwell's equations, and how far they have converged."""
+"""The efficiencies of the orders of a grating, by Maxwell's equations, and how far they have converged."""
 
 from __future__ import annotations
 
+import dataclasses
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,13 +13,15 @@ from ..errors import RequestError
 from ..surface.heightfield import HeightField
 from .blas import one_thread
 from .coordinate_transformation import Grating, light_from, scatter
-from .curve import curve_of
+from .curve import Curve, curve_of
 from .materials import refractive_index
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 MOST_HARMONICS = 80
+# A solution with as many takes half a minute.
+_FOR_DEEP_PROFILES = 300
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,15 +35,20 @@ class Efficiencies:
         orders: m of the orders that propagate, ascending, (n,); q_x = m / period, ω_o,x = −λ m / period − ω_i,x.
         amplitudes: (n, 2, 2), [order, polarisation of the order, of the incident light], s before p; |·|² is a share of
             the incident power.
+        transmitted_orders: m of the orders that propagate below, ascending, (k,); none if the material absorbs.
+        transmitted_amplitudes: (k, 2, 2), as `amplitudes`, k̂ along the transmitted wave.
         transmitted: the share of the incident power that is transmitted, (2,), of s and p light; NaN if the material
             absorbs.
         harmonics: N; fields are sums of 2N + 1 waves.
-        error: by how much the efficiencies changed at the last raise of N: Σ|Δη_m| / Σ η_m, of s or p, the larger. NaN
-            if N was given.
+        error: the largest, of s and of p light, of three numbers: by how much the efficiencies of the reflected orders
+            changed at the last raise of N, as a share of the reflected light, Σ|Δη_m| / Σ η_m; the same of those
+            transmitted; and `imbalance`. If N was given it is `imbalance` alone.
     """
 
     orders: NDArray[np.int64]
     amplitudes: Complex
+    transmitted_orders: NDArray[np.int64]
+    transmitted_amplitudes: Complex
     transmitted: Real
     harmonics: int
     error: float
@@ -47,17 +56,25 @@ class Efficiencies:
     @property
     def s(self) -> Real:
         """η_m of s-polarised incident light, (n,)."""
-        return (np.abs(self.amplitudes[:, :, 0]) ** 2).sum(axis=1)
+        return _powers(self.amplitudes)[:, 0]
 
     @property
     def p(self) -> Real:
         """η_m of p-polarised incident light, (n,)."""
-        return (np.abs(self.amplitudes[:, :, 1]) ** 2).sum(axis=1)
+        return _powers(self.amplitudes)[:, 1]
 
     @property
     def unpolarised(self) -> Real:
         """η_m of unpolarised light, the mean of both, (n,)."""
         return (self.s + self.p) / 2
+
+    @property
+    def imbalance(self) -> float:
+        """|R + T − 1|, of s or p light, the larger; if the material absorbs, the excess of R over one."""
+        reflected = _powers(self.amplitudes).sum(axis=0)
+        if np.isnan(self.transmitted).any():
+            return float(np.maximum(reflected - 1, 0).max())
+        return float(np.abs(reflected + self.transmitted - 1).max())
 
 
 def efficiencies(
@@ -78,13 +95,16 @@ def efficiencies(
         wavelength: µm, in vacuum.
         int_ior: index of refraction of a dielectric, or n + ik.
         material: or a conductor by Mitsuba's name, "Al".
-        tolerance: harmonics are raised until the efficiencies change by less than this share of the reflected light (of
-            s and of p light), or their number reaches the larger of 80 and twice the largest order;
-            `Efficiencies.error` says what was reached.
-        harmonics: N, to take this number as it is; at least the largest |m| that propagates.
+        tolerance: harmonics are raised until `Efficiencies.error` is below, or until their number reaches the largest
+            of 80, twice the largest order, and one and a half times the waves that the profile is long (at most 300).
+        harmonics: N, to take this number as it is; at least the largest |m| that propagates, above or below.
 
     Raises:
-        ValueError: if an argument is out of range.
+        ValueError: if an argument is out of range, or if more light leaves than came, by more than the tolerance: the
+            profile is too deep for the wavelength.
+
+    Warns:
+        UserWarning: if `Efficiencies.error` is above the tolerance.
     """
     if not (np.isfinite(wavelength) and 0.01 <= wavelength <= 100):
         raise RequestError(f"wavelength: got {wavelength!r}, wanted µm, from 0.01 to 100")
@@ -94,41 +114,97 @@ def efficiencies(
     if omega.shape != (3,) or not (np.isfinite(length) and length > 0 and omega[2] > 0):
         raise RequestError(f"direction: got {direction!r}, wanted three numbers, to the light, the third positive")
     omega = omega / length
-    # Every order that propagates is among the harmonics.
-    fewest = int(np.ceil(height_field.tile_size[0] / wavelength * (1 + abs(omega[0]))))
-    if harmonics is not None:
-        if not fewest <= harmonics <= 500:
-            raise RequestError(f"harmonics: got {harmonics!r}, wanted a number from {fewest} to 500")
-        return _solve(height_field, omega, wavelength, index, harmonics)
     if not 0 < tolerance < 1:
         raise RequestError(f"tolerance: got {tolerance!r}, wanted a share of the reflected light between 0 and 1")
-    count = fewest + 6
-    most = max(MOST_HARMONICS, 2 * fewest)
-    found = _solve(height_field, omega, wavelength, index, count)
-    while True:
+    curve, k_0 = curve_of(height_field), height_field.tile_size[0] / wavelength
+    if harmonics is None:
+        found = converge(curve, omega, k_0, index, tolerance)
+    else:
+        fewest, _ = wave_numbers(curve, k_0, index, omega[0])
+        if not fewest <= harmonics <= 500:
+            raise RequestError(f"harmonics: got {harmonics!r}, wanted a number from {fewest} to 500")
+        found = solve(curve, omega, k_0, index, harmonics)
+        found = dataclasses.replace(found, error=found.imbalance)
+    exceeding = max(found.s.sum(), found.p.sum(), *np.nan_to_num(found.transmitted))
+    if not exceeding <= 1 + tolerance:
+        raise RequestError(
+            f"height field: got orders with {exceeding:.3g} of the incident light, with {found.harmonics} harmonics, "
+            f"wanted at most 1; {np.ptp(height_field.heights):.3g} µm are too deep for a period of "
+            f"{height_field.tile_size[0]:.3g} µm and a wavelength of {wavelength:.3g} µm"
+        )
+    if found.error > tolerance:
+        warnings.warn(
+            f"rigorous efficiencies: got an error of {found.error:.2g} with {found.harmonics} harmonics, "
+            f"wanted at most {tolerance:.2g}",
+            stacklevel=2,
+        )
+    return found
+
+
+def converge(curve: Curve, omega: Real, k_0: float, index: complex, tolerance: float) -> Efficiencies:
+    """Raise the harmonics as `efficiencies` says, whatever error is reached; k_0 = period / wavelength."""
+    fewest, waves = wave_numbers(curve, k_0, index, omega[0])
+    most = max(MOST_HARMONICS, 2 * fewest, min(int(1.5 * waves), _FOR_DEEP_PROFILES))
+    count = min(max(fewest + 6, waves), int(0.8 * most))
+    found = solve(curve, omega, k_0, index, count)
+    while found.error > tolerance and found.harmonics < most:
         count = min(int(np.ceil(1.25 * count)) + 1, most)
-        before, found = found, _solve(height_field, omega, wavelength, index, count)
-        error = max(np.abs(a - b).sum() / b.sum() for a, b in ((before.s, found.s), (before.p, found.p)))
-        if error <= tolerance or count == most:
-            return Efficiencies(found.orders, found.amplitudes, found.transmitted, count, float(error))
+        before, found = found, solve(curve, omega, k_0, index, count)
+        found = dataclasses.replace(found, error=max(_change(before, found), found.imbalance))
+    return found
 
 
-def _solve(height_field: HeightField, omega: Real, wavelength: float, index: complex, harmonics: int) -> Efficiencies:
-    k_0 = height_field.tile_size[0] / wavelength
+def wave_numbers(curve: Curve, k_0: float, index: complex, omega_x: float) -> tuple[int, int]:
+    """The largest order that propagates, above or below, and the waves that a profile is long.
+
+    Light that travels along the curve has, where t runs fastest, as many waves to a unit of t as the second number
+    says: below it, the efficiencies of deep profiles have nothing to do with their limit; above it, they converge
+    exponentially.
+    """
+    largest = k_0 * np.sqrt(max(1.0, (index**2).real))
+    return int(np.ceil(largest + k_0 * abs(omega_x))), int(np.ceil(largest * np.hypot(*curve.tangent).max()))
+
+
+def solve(curve: Curve, omega: Real, k_0: float, index: complex, harmonics: int) -> Efficiencies:
+    """Solve with this number of harmonics; the error is unknown, ∞."""
     alpha, k_y = -omega[:2] * k_0
     with one_thread():
-        grating = Grating(curve_of(height_field), harmonics)
+        grating = Grating(curve, harmonics)
         solved = scatter(grating, light_from(grating, alpha, k_0**2 - k_y**2), k_y, index)
     light = _frames(np.array([[alpha, k_y, -k_0 * omega[2]]]) / k_0)
-    alphas = alpha + solved.orders
-    heights = np.sqrt(k_0**2 - k_y**2 - alphas**2)
-    orders = _frames(np.stack([alphas, np.full_like(alphas, k_y), heights], axis=1) / k_0)
-    amplitudes = orders.transpose(0, 2, 1) @ solved.reflected @ light
-    transmitted = np.full(2, np.nan)
-    if index.imag == 0:
-        transmitted = (np.abs(solved.transmitted @ light) ** 2).sum(axis=(0, 1))
-    # Orders count along the change of k_x there, and along q = −(ω_i + ω_o)/λ here.
-    return Efficiencies(-solved.orders[::-1], amplitudes[::-1], transmitted, harmonics, float("nan"))
+
+    def in_frames(orders: NDArray[np.int64], amplitudes: Complex, k: float, sign: int) -> Complex:
+        alphas = alpha + orders
+        heights = sign * np.sqrt(k**2 - k_y**2 - alphas**2)
+        frames = _frames(np.stack([alphas, np.full_like(alphas, k_y), heights], axis=1) / k)
+        # Orders count along the change of k_x there, and along q = −(ω_i + ω_o)/λ here.
+        return (frames.transpose(0, 2, 1) @ amplitudes @ light)[::-1]
+
+    transmitted = in_frames(solved.orders_below, solved.transmitted, k_0 * index.real, -1)
+    return Efficiencies(
+        orders=-solved.orders[::-1],
+        amplitudes=in_frames(solved.orders, solved.reflected, k_0, 1),
+        transmitted_orders=-solved.orders_below[::-1],
+        transmitted_amplitudes=transmitted,
+        transmitted=_powers(transmitted).sum(axis=0) if index.imag == 0 else np.full(2, np.nan),
+        harmonics=harmonics,
+        error=float("inf"),
+    )
+
+
+def _powers(amplitudes: Complex) -> Real:
+    """η of each order, of s and of p light, (n, 2)."""
+    return (np.abs(amplitudes) ** 2).sum(axis=1)
+
+
+def _change(before: Efficiencies, after: Efficiencies) -> float:
+    """Σ|Δη_m| / Σ η_m, of reflected or transmitted orders, of s or p light, the largest."""
+    pairs = (
+        (before.amplitudes, after.amplitudes),
+        (before.transmitted_amplitudes, after.transmitted_amplitudes),
+    )
+    changes = [np.abs(a - b).sum(axis=0) / b.sum(axis=0) for a, b in (map(_powers, pair) for pair in pairs) if len(b)]
+    return float(np.max(changes))
 
 
 def _frames(k: Real) -> Real:
