@@ -155,6 +155,21 @@ def test_what_a_grating_throws_onto_a_wall_is_far_less_noisy(llvm):
     assert at_wall["path"] > 50 * at_wall["diffraction_path"]
 
 
+def test_a_grating_seen_in_another_is_less_noisy_than_with_path(llvm):
+    narrow = blaze(26.0, material="Al")
+    ball = {"type": "sphere", "center": [0, 0, 0.8], "radius": 0.8, "bsdf": narrow}
+    built = scene(floor=plate(narrow, 4, 0), wall=ball, sky=SKY)
+    noise, means, errors = [], [], []
+    for name in ("path", "diffraction_path"):
+        integrator = mi.load_dict({"type": name, "max_depth": 6})
+        pictures = np.array([mi.render(built, integrator=integrator, spp=32, seed=k) for k in range(12)])
+        noise.append(pictures.var(0, ddof=1).mean())
+        means.append(pictures.mean())
+        errors.append(pictures.mean((1, 2, 3)).std(ddof=1) / np.sqrt(len(pictures)))
+    assert abs(means[0] - means[1]) < 4 * np.hypot(*errors)
+    assert noise[0] > 1.4 * noise[1], noise
+
+
 @pytest.mark.few(1)
 @pytest.mark.parametrize(("bsdf", "depth"), [(blaze, 1), (blaze, 2), (lambda: diffuse(0.5), 5)])
 def test_without_such_light_it_is_path(bsdf, depth, llvm):

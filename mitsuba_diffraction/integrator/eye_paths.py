@@ -66,6 +66,7 @@ def define() -> type:
                 met |= on_grating ^ True
                 active &= dr.any(throughput != 0)
                 ray = si.spawn_ray(si.to_world(bs.wo))
+                ray.wavelengths = carried(ray.wavelengths, throughput)
                 following = scene.ray_intersect(ray, active)
                 ds = mi.DirectionSample3f(scene, following, si)
                 pdf = _density(scene, si, ds, active)
@@ -85,6 +86,18 @@ def define() -> type:
             return result, seen, []
 
     return EyePaths
+
+
+def carried(wavelengths: mi.Spectrum, throughput: mi.Spectrum) -> mi.Spectrum:
+    """Return wavelengths for the rest of a path: the strongest of them in the place of those that carry nothing more.
+
+    A grating sends the wavelengths different ways. At the next one a direction would be drawn for any of the four, and
+    three of four paths would end. What stands in the place of a wavelength without throughput adds nothing.
+    """
+    strongest, most = wavelengths[0], throughput[0]
+    for wavelength, power in zip(wavelengths, throughput, strict=True):
+        strongest, most = dr.select(power > most, wavelength, strongest), dr.maximum(power, most)
+    return dr.select(throughput > 0, wavelengths, strongest)
 
 
 # Scalar variants have None where there is no emitter.

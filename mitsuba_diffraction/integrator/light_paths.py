@@ -8,6 +8,7 @@ from collections.abc import Iterator
 import drjit as dr
 import mitsuba as mi
 
+from .eye_paths import carried
 from .gratings import Gratings
 from .ratio import ratio
 from .splats import SplatBuffer, Splats
@@ -84,6 +85,7 @@ class LightPaths:
             buffer.add(Splats(position, ray.wavelengths, value * power * throughput), path, depth, reached)
             ray, weight, widening, _ = self._scatter(si, bsdf, rng, active)
             throughput *= weight
+            ray.wavelengths = carried(ray.wavelengths, power * throughput)
             eta *= widening
             depth += 1
             gambles = depth >= self.rr_depth
@@ -123,6 +125,7 @@ class LightPaths:
             candidate += 1
         power = response * received * (total / (own * _CANDIDATES))
 
+        wavelengths = carried(wavelengths, power)
         # All of the surface at that point, with its tangents, as a ray along the normal meets it.
         off = mi.math.RayEpsilon * (1 + dr.max(dr.abs(point)))
         si = self.scene.ray_intersect(mi.Ray3f(point + normal * off, -normal, 2 * off, time, wavelengths), total > 0)
@@ -135,6 +138,7 @@ class LightPaths:
         power *= dr.abs(dr.dot(direction, si.n))
         ray, weight, _, mirrored = self._scatter(si, si.bsdf(), rng, active)
         power *= weight
+        ray.wavelengths = carried(ray.wavelengths, power)
         # `path` does not see a light without extent in a mirror.
         active &= dr.any(power != 0) & ((mirrored & delta) ^ True)
         return ray, power, active
