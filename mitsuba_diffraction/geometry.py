@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+SHADOWING = ("v_cavity", "none")
+
 HORIZON_GAIN = (-0.04034151, 0.81494507, -5.03522703, 10.57318562, -9.23048089, 3.5662365)
 """Coefficients of a least-squares fit to (g(x) − 1)/t², t = 1 − x/4."""
 
@@ -34,7 +36,7 @@ def k_g_between(wi: ArrayLike, wo: ArrayLike, shadowing: bool = True) -> NDArray
 
 
 def horizon_gain(x: ArrayLike) -> NDArray[np.float64]:
-    """g(x), which makes up for what a Gaussian lobe loses below the horizon; x ≥ 0 in standard deviations.
+    """Return g(x), which makes up for what a Gaussian lobe loses below the horizon; x ≥ 0 in standard deviations.
 
     Of lobes centred at x and cut off at 0, g(x) g(y) φ(x − y) is symmetric and integrates to one:
 

@@ -3,7 +3,6 @@
 import functools
 import math
 import os
-import pickle
 import shlex
 import signal
 import sys
@@ -17,10 +16,7 @@ from hypothesis import settings
 
 import mitsuba_diffraction as md  # before Dr.Jit, so that it has an LLVM that works
 from mitsuba_diffraction import cli, progress
-from mitsuba_diffraction.files import whole_file
 from mitsuba_diffraction.progress import log_lines
-from mitsuba_diffraction.spectrum.energy_table import SHADOWING, EnergyTable
-from mitsuba_diffraction.spectrum.grating_spectrum import GratingSpectrum
 
 from bsdf_support import use  # isort: skip
 from mitsuba_diffraction.render import passes  # isort: skip
@@ -68,36 +64,6 @@ def cache_folder(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("MITSUBA_DIFFRACTION_CACHE", str(folder))
         yield folder
-
-
-@pytest.fixture(scope="session", autouse=True)
-def energy_tables(cache_folder):
-    """The energy table of equal spectra is computed once in this session, whichever process asks first."""
-    compute, tables = GratingSpectrum.energy_table, {}
-
-    def energy_table(spectrum, shadowing="v_cavity"):
-        if shadowing in spectrum.energy or shadowing not in SHADOWING:
-            return compute(spectrum, shadowing)
-        path = cache_folder / f"{spectrum.digest}-{shadowing}.pickle"
-        if path not in tables and path.is_file():
-            tables[path] = pickle.loads(path.read_bytes())
-        if path not in tables:
-            tables[path] = compute(spectrum, shadowing)
-            with whole_file(path) as temporary:
-                temporary.write_bytes(pickle.dumps(tables[path]))
-        return tables[path]
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(GratingSpectrum, "energy_table", energy_table)
-        yield
-
-
-@pytest.fixture
-def no_energy_tables(cache_folder, monkeypatch):
-    """E = 1, for tests of what surrounds a spectrum: files, words and exit codes. What is cached is kept apart."""
-    ones = EnergyTable(np.ones((1, 2, 2), np.float32), (1.0, 3.0), True)
-    monkeypatch.setattr(GratingSpectrum, "energy_table", lambda spectrum, shadowing="v_cavity": ones)
-    monkeypatch.setenv("MITSUBA_DIFFRACTION_CACHE", str(cache_folder / "without energy tables"))
 
 
 @pytest.fixture(scope="session", autouse=True)

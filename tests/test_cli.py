@@ -21,8 +21,6 @@ from mitsuba_diffraction.progress import log_lines
 from mitsuba_diffraction.render import passes
 from mitsuba_diffraction.render.spectral_image import SpectralImage
 
-pytestmark = pytest.mark.usefixtures("no_energy_tables")
-
 # So shallow that scalar theory holds: a warning would be told by whichever test is the first.
 BLAZE = '[surface]\nprofile = "blazed"\nperiod = 2.5\ndepth = 0.2\nsamples = 64\n'
 # Lobes so wide that the energy table is a small one.

@@ -213,7 +213,6 @@ def test_corrected_the_shader_converges_to_the_model_within_the_limit(llvm, tmp_
     assert published.mean > 2 * found.mean
 
 
-@pytest.mark.usefixtures("no_energy_tables")
 def test_pixels_that_show_surfaces_and_nothing_else(llvm, tmp_path):
     pictures = Pictures(write(tmp_path / "scene.xml", shapes=SPHERE), "gem", width=64)
     rows, columns = pictures.surface.shape
@@ -344,7 +343,6 @@ def test_the_same_seed_gives_the_same_numbers(llvm, folder):
         assert picture.width > 400
 
 
-@pytest.mark.usefixtures("no_energy_tables")
 @pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("arguments", "of", "words"),

@@ -50,7 +50,6 @@ def test_a_flat_mirror_has_the_relative_reflectance_one(llvm):
     np.testing.assert_allclose(found, 1, atol=2e-3)  # what cutting off the lobes and the bytes of E leave
 
 
-@pytest.mark.usefixtures("no_energy_tables")
 @pytest.mark.few(1)
 @pytest.mark.parametrize("order", [-1, 0, 1])
 def test_orders_of_a_shallow_blaze_are_the_analytic_ones(llvm, order):
@@ -197,7 +196,6 @@ def test_nmm_sees_only_the_orders_of_the_tile(llvm, incidence):
 # ---------------------------------------------------------------- maps of directions
 
 
-@pytest.mark.usefixtures("no_energy_tables")
 @pytest.mark.few(1)
 @pytest.mark.parametrize("projection", PROJECTIONS)
 def test_an_order_is_where_the_map_says(llvm, projection):

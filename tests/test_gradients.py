@@ -96,13 +96,14 @@ def test_derivative_by_a_number(case, mode):
 
 
 def energy_near(of, at, height_scale):
-    """E of the heights `at`, as the renderer has it, plus what the gathered table changes by up to `height_scale`.
+    """E of the heights `at`, as the renderer has it, plus what the table changes by up to `height_scale`.
 
-    The table itself is lowered by samples and rounded, both of which differences would show.
+    The table itself is rounded, which differences would show.
     """
     tables = shared.SharedTables.of(of)
-    here, there = (tables.gathered_table("v_cavity", scale).values for scale in (at, height_scale))
-    return energy.Energy(tables.energy_table("v_cavity", at), there - here, mi.Float(1.0))
+    table = tables.energy_table(at)
+    here, there = (tables.corners(table, scale) for scale in (at, height_scale))
+    return energy.Energy(table, there - here, mi.Float(1.0))
 
 
 @pytest.mark.slow
@@ -294,7 +295,7 @@ class Count:
 def test_changes_rebuild_only_what_depends_on_them(monkeypatch):
     bsdf = mi.load_dict(grating("deep blazed", int_ior=1.5, base={"type": "diffuse", "reflectance": uniform(0.3)}))
     parameters = mi.traverse(bsdf)
-    tables = Count(monkeypatch, shared, "energy_table")
+    tables = Count(monkeypatch, shared.EnergyTable, "of")
     lines = Count(monkeypatch, shared, "OrderSpectrum")
     scattering, table = bsdf.scattering, bsdf.energy
     for key, value in (("orientation.value", 20.0), ("eta", 1.4), ("base.reflectance.value", 0.1)):
@@ -309,7 +310,7 @@ def test_changes_rebuild_only_what_depends_on_them(monkeypatch):
     assert bsdf.energy is not table
     parameters["height_scale"] = 1.0
     parameters.update()
-    # That of the first height is still known.
+    # That of the spectrum's own height is kept with it.
     assert tables.calls == 1
     assert bsdf.scattering is scattering
     assert lines.calls == 0

@@ -11,8 +11,6 @@ import mitsuba_diffraction
 from mitsuba_diffraction.recipe import Recipe
 from mitsuba_diffraction.render.scene import load_spectral_scene
 
-pytestmark = pytest.mark.usefixtures("no_energy_tables")
-
 SCENES = Path(__file__).parents[1] / "scenes"
 SCENE = """<scene version="3.0.0"><default name="light" value="sun"/><include filename="lights/$light.xml"/>
 <sensor type="perspective"/><shape type="sphere">%s</shape></scene>"""

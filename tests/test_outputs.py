@@ -19,8 +19,6 @@ from mitsuba_diffraction.cli.inputs import files_read
 from mitsuba_diffraction.files import is_intact, refuse_unwritable, seal, whole_file
 from mitsuba_diffraction.outputs import claimed, made_for
 
-pytestmark = pytest.mark.usefixtures("no_energy_tables")
-
 BLAZE = """[surface]
 profile = "blazed"
 period = 2.5

@@ -296,7 +296,6 @@ NAMED = {
 }
 
 
-@pytest.mark.usefixtures("no_energy_tables")
 @pytest.mark.few(3)
 @pytest.mark.parametrize("name", sorted(NAMED))
 def test_a_ready_surface_stands_in_a_scene_by_its_name(name):
@@ -314,7 +313,6 @@ def test_a_ready_surface_stands_in_a_scene_by_its_name(name):
     assert bsdf.spectrum.coherence_length == COHERENCE_LENGTHS.get(name, 65.0)
 
 
-@pytest.mark.usefixtures("no_energy_tables")
 @pytest.mark.few(1)
 @pytest.mark.parametrize("name", ["blazed", "ruled", "foil"])
 def test_gratings_are_ready_without_any_number(name):

@@ -11,8 +11,6 @@ import mitsuba_diffraction as md
 from mitsuba_diffraction import GratingSpectrum, Recipe
 from mitsuba_diffraction import recipe as recipe_module
 
-pytestmark = pytest.mark.usefixtures("no_energy_tables")
-
 SLOW = {"compact_disc", "dvd", "elaphe", "morpho_ridges", "xenopeltis", "xenopeltis_afm"}
 RECIPES = sorted((Path(__file__).parents[1] / "precompute").glob("*.toml"))
 BLAZE = '[surface]\nprofile = "blazed"\nperiod = 2.5\ndepth = 0.25\n'

@@ -11,6 +11,7 @@ from bsdf_support import check_chi_square, direction, evaluate, interaction, ran
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction.bsdf import probe
+from mitsuba_diffraction.geometry import horizon_gain
 from mitsuba_diffraction.rigorous.axes import Axes
 from mitsuba_diffraction.rigorous.mueller import mueller
 from mitsuba_diffraction.rigorous.spectrum import RigorousSpectrum
@@ -67,7 +68,7 @@ def plugin(spectrum, **parameters):
 
 
 def expected(spectrum, wi, wo, wavelength):
-    """f = Σ_m η_m N(q − m/T; σ_q² I)/λ² in float64; wi, wo (n, 3), λ in µm."""
+    """f = Σ_m η_m N(q − m/T; σ_q² I)/λ², lobes normalised at the horizon, in float64; wi, wo (n, 3), λ in µm."""
     axes, sigma = spectrum.axes, spectrum.lobe_width
     nu = axes.period / wavelength
     k_y, c = ((wo - wi)[:, i] * nu / 2 for i in (1, 0))
@@ -77,6 +78,10 @@ def expected(spectrum, wi, wo, wavelength):
         square = ((q - [m / axes.period, 0]) ** 2).sum(1)
         lobe = np.exp(-square / (2 * sigma**2)) / (2 * np.pi * sigma**2 * -np.expm1(-(spectrum.reach**2) / 2))
         lobe = np.where(square <= (spectrum.reach * sigma) ** 2, lobe, 0)
+        shift = [wavelength * m / axes.period, 0]
+        sent = [1 - ((omega[:, :2] + shift) ** 2).sum(1) for omega in (wi, wo)]
+        for s, omega in zip(sent, (wi, wo), strict=True):
+            lobe *= np.where(s > 0, horizon_gain(np.minimum(s, omega[:, 2] ** 2) / (2 * wavelength * sigma)), 0)
         f += np.maximum(spectrum.evaluate(m, c, g, wavelength), 0) * lobe
     return f / wavelength**2
 
@@ -395,7 +400,7 @@ def test_a_grating_is_built_for_the_coat_and_the_variant_of_the_scene(monkeypatc
     """What is asked for; the table would take minutes."""
     use("llvm_ad_spectral_polarized")
     asked = []
-    monkeypatch.setattr(md.Recipe, "cached", lambda recipe: asked.append(dict(recipe.spectrum)) or made_up())
+    monkeypatch.setattr(md.Recipe, "cached", lambda recipe, *_: asked.append(dict(recipe.spectrum)) or made_up())
     scene = {"type": "diffraction_grating", "profile": "sinusoidal", "period": 0.3, "depth": 0.05, "theory": "rigorous"}
     for material in ({"material": "Al"}, {"int_ior": 1.8}):
         with pytest.raises(RuntimeError, match="polarised=True"):

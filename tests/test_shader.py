@@ -568,7 +568,6 @@ def test_shadows_only_on_request():
     assert not dark.any()
 
 
-@pytest.mark.usefixtures("no_energy_tables")
 def test_both_sides_of_twosided():
     both = {"type": "twosided", "inner": GRATING}
     settings = shader(as_published=False, terms=16)
@@ -616,7 +615,6 @@ def test_what_the_integrator_cannot_show_is_refused_in_one_line(parameters, of, 
     assert "\n" not in line
 
 
-@pytest.mark.usefixtures("no_energy_tables")
 def test_a_saved_spectrum_holds_no_heights(tmp_path):
     path = tmp_path / "blaze.exr"
     md.precompute(BLAZE).save(path)

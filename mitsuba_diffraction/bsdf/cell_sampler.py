@@ -75,7 +75,7 @@ class CellSampler:
         total = self.area * dr.dot(weights, self.masses(self.horizon.bin(incidence), active))
         return dr.dot(self.shares(cell, active), weights) * dr.rcp(larger(total, 1e-20))
 
-    def sample(self, incidence: Incidence, u: mi.Float, v: mi.Point2f, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
+    def sample(self, incidence: Incidence, u: mi.Float, v: mi.Point2f, active: mi.Bool) -> mi.Point2f:
         """Draw q in cycles/µm, for one wavelength.
 
         κ cell, row of blocks and cell come from `u`, the block and q_x from `v.x`: one number alone has too few bits.
@@ -97,4 +97,4 @@ class CellSampler:
             cell, _ = self.before_cell.search(block, kappa_cell, none, mass, u, active)
         m_x = mi.Float(column * self.edge_x + cell % self.edge_x - self.largest_x)
         m_y = mi.Float(row * self.edge_y + cell // self.edge_x - self.largest_y)
-        return (m_x + x - 0.5) * self.spacing_x, (m_y + v.y - 0.5) * self.spacing_y
+        return mi.Point2f((m_x + x - 0.5) * self.spacing_x, (m_y + v.y - 0.5) * self.spacing_y)

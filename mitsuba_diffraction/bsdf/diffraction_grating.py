@@ -11,9 +11,9 @@ import numpy as np
 
 from ..coherence import SUN_COHERENCE_LENGTH
 from ..errors import RequestError, is_number
+from ..geometry import SHADOWING
 from ..manual import Parameter, listed
 from ..rigorous.spectrum import RigorousSpectrum
-from ..spectrum.energy_table import SHADOWING
 from ..surface.heightfield import HeightField
 from ..wavelengths import VISIBLE
 from .arithmetic import larger, limited, smaller
@@ -28,7 +28,9 @@ from .shared import SharedTables
 from .surface import surface_from, warn_of_range
 from .tables import BELOW_ONE, opaque
 
-DEFENSIVE = 0.02  # the share of samples that follow the cosine, for lobes that the sampler's averages miss
+# The share of samples that are uniform, for lobes that the sampler's averages miss; where both directions graze, K G
+# grows faster than samples that follow the cosine could bear.
+DEFENSIVE = 0.02
 LEAST_SHARE = 0.1  # of the samples, for the grating and for its base: what each reflects is only estimated
 
 PARAMETERS = (
@@ -89,7 +91,7 @@ first edge of each triangle and is discontinuous: such a mesh needs UVs. Where d
 The BRDF is R · K · G · S(q; κ)/λ² · E: R the power reflectance at the half vector, K and G as in `geometry.py`, S as in
 `order_spectrum.py` (orders) or `spline_spectrum.py` (a lattice), with q = −(ω_i + ω_o)/λ along the pattern's axes
 and κ = 2π (cos θ_i + cos θ_o)/λ. E, as in `energy.py`, bounds the albedo by one; it is one where the albedo is
-below one without it. Without shadowing K diverges as 1/cos θ near the horizon: from 85° on E then falls with cos² θ.
+below one without it. Without shadowing K diverges as 1/cos θ near the horizon, and there is no E.
 
 Of rigorous theory the BRDF is Σ_m η_m N(q − m/T; σ_q² I)/λ², as in `rigorous_orders.py`: R, K, G and E are in η_m.
 
@@ -216,8 +218,8 @@ def define() -> type:
                 value, density = scattered(wi, wo, height_scale)
             # The mean over the covered wavelengths: any of them may have chosen the direction.
             diffuse = _diffuse_share(count)
-            density = diffuse * dr.inv_pi + (1 - diffuse) * density / larger(count, 1)
-            return value, density * outside
+            density = (1 - diffuse) * density * outside / larger(count, 1)
+            return value, dr.fma(diffuse, dr.inv_two_pi, density)
 
         def _meets(self, si: mi.SurfaceInteraction3f, u: mi.Float, v: mi.Float) -> mi.Bool:
             """Whether the lobe of an order holds (u, v) = λq at any wavelength."""
@@ -238,40 +240,26 @@ def define() -> type:
             height_scale: mi.Float,
         ) -> tuple[mi.UnpolarizedSpectrum, mi.Float]:
             """f cos θ_o, and the sum over the wavelengths of the densities; directions along the pattern's axes."""
-            u, v, towards, outside = -wi.x - wo.x, -wi.y - wo.y, wi, wo.z
-            if self.coat is not None:
-                wi, wo = self.coat.refracted(wi), self.coat.refracted(wo)
-            index = 1.0 if self.coat is None else self.coat.eta
-            geometry = Geometry(wi, wo)
+            geometry = Geometry.of(wi, wo, self.coat)
             # Directions beyond the largest angle are black, but they are drawn: they have a density.
             within = smaller(geometry.cos_i, geometry.cos_o) >= self.least_cosine
             value, density = mi.UnpolarizedSpectrum(0.0), mi.Float(0.0)
             for channel in range(len(value)):
                 wavelength = si.wavelengths[channel] * 1e-3  # µm
                 frequency = dr.rcp(wavelength)
-                if self.rigorous:
-                    power, share = self.scattering.evaluate(wi, wo, index * frequency, active & covered[channel], drawn)
-                else:
-                    power, share = self.scattering.evaluate(
-                        u * frequency,
-                        v * frequency,
-                        -geometry.w * dr.two_pi * index * frequency * height_scale,
-                        Incidence.of(towards, frequency, height_scale, self.coat),
-                        active & covered[channel],
-                        drawn,
-                    )
+                incidence = Incidence.of(wi, frequency, height_scale, self.coat)
+                surface = () if self.rigorous else (height_scale, self.shadowing == "v_cavity")
+                power, share = self.scattering.evaluate(geometry, *surface, incidence, active & covered[channel], drawn)
                 value[channel] = dr.select(within, power * dr.square(frequency), 0)
                 density = dr.fma(share, dr.square(frequency), density)
-            if self.rigorous:
-                value *= geometry.cos_o
-            else:
+            if not self.rigorous:
                 if self.energy is not None:
-                    value *= self.energy.factor(wi, wo, mi.UnpolarizedSpectrum(si.wavelengths) * (1e-3 / index))
+                    inside = mi.UnpolarizedSpectrum(si.wavelengths) * (1e-3 / geometry.index)
+                    value *= self.energy.factor(*geometry.inside(), inside)
                 value *= self.reflectance(si, geometry.cos_half(), active)
-                value *= geometry.factor(self.shadowing == "v_cavity")
             if self.coat is not None:
                 # The solid angle inside the coat is smaller: cos θ'_o dω'_o = cos θ_o dω_o/n².
-                value *= outside / larger(geometry.cos_o, 1e-7)
+                value *= wo.z / larger(geometry.cos_o, 1e-7)
             return value, density
 
         def _mueller(
@@ -500,16 +488,12 @@ def define() -> type:
             wavelength = dr.detach(wavelength) * 1e-3
             sin, cos = (dr.detach(x) for x in self._frame(si, active))
             towards, frequency = _turned(si.wi, sin, cos), dr.rcp(wavelength)
-            if self.rigorous and self.coat is not None:
-                # Inside, as its tables are.
-                incidence = Incidence.of(self.coat.refracted(towards), frequency * self.coat.relative, mi.Float(1))
-            else:
-                incidence = Incidence.of(towards, frequency, self.height_scale, self.coat)
-            q_x, q_y = self.scattering.sample(incidence, rest, v, active & diffracted)
-            x = -wavelength * (cos * q_x - sin * q_y) - si.wi.x
-            y = -wavelength * (sin * q_x + cos * q_y) - si.wi.y
-            z = dr.safe_sqrt(1 - dr.square(x) - dr.square(y))
-            return dr.select(diffuse, mi.warp.square_to_cosine_hemisphere(v), mi.Vector3f(x, y, z))
+            incidence = Incidence.of(towards, frequency, self.height_scale, self.coat)
+            q, propagates = self.scattering.sample(incidence, rest, v, active & diffracted)
+            x = -wavelength * (cos * q.x - sin * q.y) - si.wi.x
+            y = -wavelength * (sin * q.x + cos * q.y) - si.wi.y
+            z = dr.select(propagates, dr.safe_sqrt(1 - dr.square(x) - dr.square(y)), 0)
+            return dr.select(diffuse, mi.warp.square_to_uniform_hemisphere(v), mi.Vector3f(x, y, z))
 
         # What the real-time shader asks of a grating: `shader.surfaces.ShadedGrating`.
 
@@ -563,7 +547,7 @@ def _orientation(props: mi.Properties) -> mi.Texture:
 
 
 def _diffuse_share(covered: mi.Float) -> mi.Float:
-    """The share of samples that follow the cosine: all of them where no wavelength is covered."""
+    """Return the share of samples that are uniform: all of them where no wavelength is covered."""
     return dr.select(covered > 0, mi.Float(DEFENSIVE), 1)
 
 

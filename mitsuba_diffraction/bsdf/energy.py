@@ -1,6 +1,6 @@
 """E(ω_i, ω_o, λ) at run time: what keeps the grating from reflecting more light than it receives.
 
-E = min(e(ω_i, λ), e(ω_o, λ)), e as in `spectrum/energy_table.py`.
+E = min(e(ω_i, λ), e(ω_o, λ)), e as in `energy/table.py`.
 """
 
 from __future__ import annotations
@@ -12,107 +12,113 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..spectrum.energy_table import HORIZON, EnergyTable
+from ..energy.table import EnergyTable
 from .arithmetic import larger, limited, smaller
 from .tables import NumberTable, PacketTable, opaque
 
 
 @dataclass
 class Place:
-    """Where a direction lies in the table: cells and the place in them, 0 to 1, c and cos θ."""
+    """c − ω_x and c + ω_x of a direction, and where it lies among the slices: the one below, and how far from it."""
 
-    column: mi.UInt32
-    x: mi.Float
-    row: mi.UInt32
-    y: mi.Float
-    c: mi.Float
-    z: mi.Float
+    u: mi.Float
+    v: mi.Float
+    below: mi.UInt32
+    beyond: mi.Float
 
 
 class Energy:
-    """e(ω, λ) from a table, linear in y, ν and s.
+    """e(ω, λ) from a table, linear between the corners of a cell.
 
-    The four corners of a cell in (ν, x) are packed as bytes into one number, so that a direction and a wavelength cost
-    one read of four bytes, or two where the table has more than one row: reads cost more than the arithmetic. Bytes
-    are rounded down, which leaves e a lower bound.
+    The four corners of a cell are packed as bytes into one number, so that a direction and a wavelength cost one read
+    of four bytes, or two where e is linear between slices: reads cost more than the arithmetic.
     """
 
     def __init__(self, table: EnergyTable, slope: np.ndarray | None = None, change: mi.Float | None = None) -> None:
         """`slope` times `change`, which is zero but for its gradient, is added to the table."""
-        self.measured = table.excess, *table.loss
-        self.rows, slices, columns = table.values.shape
-        self.slices, self.columns = slices - 1, columns - 1
-        self.conical, self.shadowing = table.conical, table.shadowing
-        steps, least, step = table.packed()
-        self.table = NumberTable(_corners(steps) @ (np.uint32(1) << np.arange(0, 32, 8, dtype=np.uint32)))
-        self.least, self.step = opaque(least), opaque(step)
-        self.slope = None if slope is None else PacketTable(_corners(slope))
+        self.loss, layout = table.loss, table.layout
+        self.slices, self.side = table.steps.shape[:2]
+        self.layout = layout
+        self.table = NumberTable(table.steps @ (np.uint32(1) << np.arange(0, 32, 8, dtype=np.uint32)))
+        self.step = opaque((1 - table.least) / 255)
+        self.slope = None if slope is None else PacketTable(slope)
         self.change = change
-        first, last = table.frequencies
-        self.first = opaque(first)
-        self.per_frequency = opaque(self.slices / (last - first))
+        self.period = opaque(layout.period)
+        self.first = opaque(layout.frequencies[0])
+        self.per_frequency = opaque(self.slices / (layout.frequencies[1] - layout.frequencies[0]))
+        self.squares = opaque(layout.squares - 1)
+        self.cells, self.first_cells = opaque(layout.cells), opaque(layout.first)
 
     def __str__(self) -> str:
-        text = "albedo at most 1 + {:.2g}; where a ≤ 1, 1 − e is {:.2g} in the mean, {:.2g} at most"
-        return text.format(*self.measured)
+        return "bounds the albedo by one, and loses {:.2g} in the mean, {:.2g} at most".format(*self.loss)
 
     def factor(self, wi: mi.Vector3f, wo: mi.Vector3f, wavelengths: mi.UnpolarizedSpectrum) -> mi.UnpolarizedSpectrum:
         """E of each wavelength."""
         there, back = self.place(wi), self.place(wo)
         result = mi.UnpolarizedSpectrum(1.0)
         for channel in range(len(result)):
-            frequency = self.per_frequency / wavelengths[channel]
+            frequency = dr.rcp(wavelengths[channel])
             result[channel] = smaller(self.bound(there, frequency), self.bound(back, frequency))
         return result
 
     def place(self, omega: mi.Vector3f) -> Place:
         """The place of ω, along the pattern's axes."""
-        z = larger(omega.z, 0)
-        c = dr.sqrt(dr.square(omega.x) + dr.square(z))
-        tangent = omega.x / larger(c + z, 1e-7)
-        rest = larger(1 - dr.abs(tangent), 0)
-        s = dr.copysign(1 - 0.5 * (dr.sqrt(rest) + rest), tangent)
-        column, x = _cell(0.5 * (s + 1) * self.columns, self.columns)
-        row, y = mi.UInt32(0), mi.Float(0)
-        if self.rows > 1:
-            row, y = _cell(0.5 * (omega.y / (1 + c) + 1) * (self.rows - 1), self.rows - 1)
-        return Place(column, x, row, y, c, z)
+        x, y = (omega.y, omega.x) if self.layout.turned else (omega.x, omega.y)
+        square = dr.square(larger(omega.z, 0))
+        c = dr.sqrt(dr.square(x) + square)
+        longer = c + dr.abs(x)
+        # c − |x| without cancellation.
+        shorter = square / larger(longer, 1e-12)
+        place = Place(dr.select(x > 0, shorter, longer), dr.select(x > 0, longer, shorter), mi.UInt32(0), mi.Float(0))
+        if not self.layout.lines:
+            y = y / (1 + c)
+            row = 0.5 * (self.slices - 1) * (1 + dr.copysign(1 - _equidistant(1 - dr.abs(y)), y))
+            place.below, place.beyond = _cell(row, self.slices - 1)
+        return place
 
     def bound(self, place: Place, frequency: mi.Float) -> mi.Float:
-        """e of the direction at `place`; `frequency` is 1/λ in cells of the table."""
-        nu = place.c * frequency if self.conical else frequency - self.first * self.per_frequency
-        cell, t = _cell(nu, self.slices)
-        index = (place.row * self.slices + cell) * self.columns + place.column
-        steps = self._between(lambda i: _bytes(self.table(i)), index, place, t)
-        e = dr.fma(steps, self.step, self.least)
+        """e of the direction at `place`; `frequency` is 1/λ in 1/µm."""
+        per_length = self.period * frequency
+        (column, x), (row, y) = (self._column(u * per_length) for u in (place.u, place.v))
+        below = place.below
+        if self.layout.lines:
+            below = mi.UInt32(limited((frequency - self.first) * self.per_frequency, 0, self.slices - 1))
+        index = (below * self.side + row) * self.side + column
+
+        def between(corners: Callable[[mi.UInt32], mi.Vector4f]) -> mi.Float:
+            values = corners(index)
+            if not self.layout.lines:
+                values = dr.lerp(values, corners(index + self.side * self.side), place.beyond)
+            return dr.lerp(dr.lerp(values[0], values[1], x), dr.lerp(values[2], values[3], x), y)
+
+        # From above, so that one stays one.
+        e = 1 - (255 - between(lambda i: _bytes(self.table(i)))) * self.step
         if self.slope is not None:
-            e += self._between(lambda i: self.slope(i, True), index, place, t) * self.change
-        if self.shadowing == "none":
-            e *= dr.square(smaller(place.z / HORIZON, 1))
+            e += between(lambda i: self.slope(i, True)) * self.change
         return e
 
-    def _between(
-        self, corners: Callable[[mi.UInt32], mi.Vector4f], index: mi.UInt32, place: Place, t: mi.Float
-    ) -> mi.Float:
-        """Linear between the corners of the cell at `index`."""
-        values = corners(index)
-        if self.rows > 1:
-            values = dr.lerp(values, corners(index + self.slices * self.columns), place.y)
-        return dr.lerp(dr.lerp(values[0], values[1], place.x), dr.lerp(values[2], values[3], place.x), t)
+    def _column(self, u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
+        """The cell of u along one axis, and the place in it."""
+        square = smaller(dr.floor(u), self.squares)
+        inner = square > 0
+        cells = dr.select(inner, self.cells, self.first_cells)
+        cell, x = _cell(_equidistant(u - square) * cells, cells)
+        start = dr.select(inner, dr.fma(square - 1, self.cells, self.first_cells), 0)
+        return cell + mi.UInt32(start), x
+
+
+def _equidistant(f: mi.Float) -> mi.Float:
+    """(t + t²)/2 of f = t⁴, from 0 to 1."""
+    root = dr.sqrt(limited(f, 0, 1))
+    return 0.5 * (dr.sqrt(root) + root)
 
 
 def _bytes(number: mi.UInt32) -> mi.Vector4f:
     return mi.Vector4f(*(mi.Float(mi.Int32((number >> shift) & 255)) for shift in range(0, 32, 8)))
 
 
-def _corners(values: np.ndarray) -> np.ndarray:
-    """(rows, slices, columns) → (rows, slices − 1, columns − 1, 4): two neighbours in x, and the same at the next ν."""
-    below, above = values[:, :-1], values[:, 1:]
-    return np.stack([below[..., :-1], below[..., 1:], above[..., :-1], above[..., 1:]], -1)
-
-
-def _cell(x: mi.Float, count: int) -> tuple[mi.UInt32, mi.Float]:
+def _cell(x: mi.Float, count: mi.Float | int) -> tuple[mi.UInt32, mi.Float]:
     """The cell of x, 0 ≤ x ≤ count, and the place in it; outside, the nearest."""
     x = limited(x, 0, count)
-    cell = dr.minimum(mi.UInt32(x), count - 1)
+    cell = dr.minimum(mi.UInt32(x), mi.UInt32(count) - 1)
     return cell, x - mi.Float(cell)

@@ -1,48 +1,142 @@
-"""The geometry of Kirchhoff reflection: direction cosines, Stam's factor K, V-cavity shadowing G."""
+"""The geometry of a pair of directions: Stam's factor K, V-cavity shadowing G, and lobes cut by the horizon."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 
+from ..geometry import HORIZON_GAIN
 from .arithmetic import larger, smaller
+from .coat import Coat
 
 
+# Not frozen: Dr.Jit rebuilds what enters a branch field by field.
+@dataclass(eq=False)
 class Geometry:
     """What a pair of directions fixes, whatever the surface. All angles are to the macroscopic normal, z.
 
-    With (u, v, w) = −ω_i − ω_o and D = 1 + ω_i·ω_o = (u² + v² + w²)/2, the half vector h has
-
-        ω_i·h = ω_o·h = √(D/2),    n·h = −w/√(2D)
-
-    D is taken from the sum of squares: 1 + ω_i·ω_o cancels where both directions are grazing.
+    Attributes:
+        wi: ω_i along the pattern's axes, outside of a coat.
+        wo: ω_o, likewise.
+        cos_i: cos θ_i, inside of a coat.
+        cos_o: cos θ_o, likewise.
+        index: n of the coat relative to the outside; one without.
     """
 
-    def __init__(self, wi: mi.Vector3f, wo: mi.Vector3f) -> None:
-        self.cos_i = mi.Frame3f.cos_theta(wi)
-        self.cos_o = mi.Frame3f.cos_theta(wo)
-        self.u = -wi.x - wo.x
-        self.v = -wi.y - wo.y
-        self.w = -self.cos_i - self.cos_o
-        self.d = 0.5 * (dr.square(self.u) + dr.square(self.v) + dr.square(self.w))
+    wi: mi.Vector3f
+    wo: mi.Vector3f
+    cos_i: mi.Float
+    cos_o: mi.Float
+    index: mi.Float
+
+    @classmethod
+    def of(cls, wi: mi.Vector3f, wo: mi.Vector3f, coat: Coat | None = None) -> Geometry:
+        """Return that of ω_i and ω_o, along the pattern's axes and outside of the coat."""
+        cosines = (omega.z if coat is None else coat.refracted(omega).z for omega in (wi, wo))
+        return cls(wi, wo, *cosines, mi.Float(1.0) if coat is None else coat.eta)
+
+    @property
+    def tangent(self) -> mi.Vector2f:
+        """(u, v) = −(ω_i + ω_o)_t = λq, outside of a coat."""
+        return mi.Vector2f(-self.wi.x - self.wo.x, -self.wi.y - self.wo.y)
+
+    @property
+    def w(self) -> mi.Float:
+        """−(cos θ_i + cos θ_o)."""
+        return -self.cos_i - self.cos_o
+
+    def inside(self) -> tuple[mi.Vector3f, mi.Vector3f]:
+        """ω_i and ω_o inside of the coat."""
+        pairs = (self.wi, self.cos_i), (self.wo, self.cos_o)
+        return tuple(mi.Vector3f(omega.x / self.index, omega.y / self.index, cos) for omega, cos in pairs)
 
     def reflects(self) -> mi.Bool:
         """Both directions are above the surface."""
         return (self.cos_i > 0) & (self.cos_o > 0)
 
+    def kappa(self, frequency: mi.Float, height_scale: mi.Float) -> mi.Float:
+        """κ = 2π n (cos θ_i + cos θ_o)/λ times the scale of the heights; `frequency` is 1/λ, outside of a coat."""
+        return -self.w * dr.two_pi * self.index * frequency * height_scale
+
     def cos_half(self) -> mi.Float:
-        """ω_i·h."""
-        return dr.sqrt(0.5 * self.d)
+        """ω_i·h = ω_o·h = √(D/2)."""
+        return dr.sqrt(0.5 * _d(dr.squared_norm(self.tangent) / dr.square(self.index), self.cos_i + self.cos_o))
 
-    def factor(self, shadowing: bool) -> mi.Float:
-        """K · G · cos θ_o.
+    def k_g(self, shadowing: bool) -> mi.Float:
+        """K G of the pair of directions."""
+        square = dr.squared_norm(self.tangent) / dr.square(self.index)
+        return k_g(self.cos_i, self.cos_o, square, shadowing)
 
-        K = (1 + ω_i·ω_o)²/(cos θ_i cos θ_o w²) (Stam 1999) and, with `shadowing`,
-        G = min(1, 2(n·h)(n·ω_o)/(ω_o·h), 2(n·h)(n·ω_i)/(ω_o·h)) (Torrance and Sparrow 1967), where
-        2(n·h)(n·ω)/(ω_o·h) = −2w cos θ/D. Together they stay finite at grazing angles.
+    def of_order(self, tangent: mi.Vector2f, per_width: mi.Float) -> tuple[mi.Float, mi.Float, mi.Float]:
+        """cos θ_i, cos θ_o and gain of the order that the pair sees in its lobe.
+
+        The order sends ω_i near to ω_o, and ω_o near to ω_i: the cosines, inside of a coat, are the root mean squares
+        of both, at the centre of the lobe those of the pair. Within the lobe K would vary with the directions, and grow
+        without bound at grazing incidence; of the mirror order K G is one.
+
+        The gain makes up for the part of the lobe below the horizon, and is zero where the order does not propagate.
+        With σ the width of the lobe in direction cosines, x = cos² θ/2σ is the distance from the horizon in standard
+        deviations. The gain is g(x_i) g(x_o), g as in `geometry.horizon_gain`, x_i the smaller one of ω_i and of the
+        direction into which the order sends it, x_o likewise: it is reciprocal, and an order keeps its power from the
+        direction on in which it emerges.
+
+        Args:
+            tangent: (u, v) = λq of the order.
+            per_width: 1/σ = 1/(λσ_q).
         """
-        # cos θ_o cancels; the guard keeps masked lanes finite.
-        k = dr.square(self.d) / (larger(self.cos_i, 1e-7) * dr.square(self.w))
-        if not shadowing:
-            return k
-        return k * smaller(-2 * self.w * smaller(self.cos_i, self.cos_o) / self.d, 1)
+        sent = [cos_square(omega, tangent) for omega in (self.wi, self.wo)]
+        come = [dr.square(omega.z) for omega in (self.wi, self.wo)]
+        x_i, x_o = (0.5 * per_width * smaller(there, back) for there, back in zip(sent, come, strict=True))
+        gain = dr.select(smaller(*sent) > 0, horizon_gain(x_i) * horizon_gain(x_o), 0)
+        outside = 0.5 * (come[0] + sent[1]), 0.5 * (come[1] + sent[0])
+        # Where the order does not propagate the root would have no derivative.
+        cosines = (dr.sqrt(larger(1 - (1 - square) / dr.square(self.index), 1e-12)) for square in outside)
+        return *cosines, gain
+
+
+def _d(square: mi.Float, w: mi.Float) -> mi.Float:
+    """D = 1 + ω_i·ω_o = (u² + v² + w²)/2, from u² + v².
+
+    As a sum of squares: 1 + ω_i·ω_o cancels where both directions are grazing.
+    """
+    return 0.5 * (square + dr.square(w))
+
+
+def k_g(cos_i: mi.Float, cos_o: mi.Float, square: mi.Float, shadowing: bool) -> mi.Float:
+    """K G.
+
+    K = D²/(cos θ_i cos θ_o w²) (Stam 1999) and, with `shadowing`,
+    G = min(1, 2(n·h)(n·ω_o)/(ω_o·h), 2(n·h)(n·ω_i)/(ω_o·h)) (Torrance and Sparrow 1967), where
+    2(n·h)(n·ω)/(ω_o·h) = 2w cos θ/D, with w = cos θ_i + cos θ_o.
+
+    Args:
+        cos_i: cos θ_i.
+        cos_o: cos θ_o.
+        square: u² + v².
+        shadowing: if false, K alone.
+    """
+    w = cos_i + cos_o
+    d = _d(square, w)
+    # The guards keep masked lanes finite.
+    k = dr.square(d) / (larger(cos_i, 1e-7) * larger(cos_o, 1e-7) * dr.square(w))
+    return k * smaller(2 * w * smaller(cos_i, cos_o) / d, 1) if shadowing else k
+
+
+def cos_square(omega: mi.Vector3f, tangent: mi.Vector2f) -> mi.Float:
+    """cos² θ of the direction into which the order at (u, v) = λq sends ω; negative where it does not propagate.
+
+    From cos² θ of ω, which 1 − |ω_t + λq|² would lose to rounding at grazing incidence.
+    """
+    change = tangent.x * (2 * omega.x + tangent.x) + tangent.y * (2 * omega.y + tangent.y)
+    return dr.square(omega.z) - change
+
+
+def horizon_gain(x: mi.Float) -> mi.Float:
+    """g(x) of `geometry.horizon_gain`."""
+    t = larger(dr.fma(-0.25, x, 1), 0)
+    result = mi.Float(HORIZON_GAIN[-1])
+    for coefficient in HORIZON_GAIN[-2::-1]:
+        result = dr.fma(result, t, coefficient)
+    return dr.fma(dr.square(t), result, 1)

@@ -16,14 +16,16 @@ class Incidence:
     """One wavelength from one direction.
 
     Attributes:
-        wi: ω_i along the axes of the pattern.
-        frequency: 1/λ in cycles/µm.
+        wi: ω_i along the axes of the pattern, outside of a coat.
+        frequency: 1/λ in cycles/µm, outside of a coat.
+        index: n of the coat relative to the outside; one without.
         least_kappa: κ of light that leaves along the horizon, rad/µm.
         kappa_span: by how much κ is larger for light that leaves along the normal, rad/µm.
     """
 
     wi: mi.Vector3f
     frequency: mi.Float
+    index: mi.Float
     least_kappa: mi.Float
     kappa_span: mi.Float
 
@@ -35,9 +37,10 @@ class Incidence:
         """
         kappa_per_cosine = dr.two_pi * frequency * height_scale
         least, span = kappa_per_cosine * wi.z, kappa_per_cosine
+        index = mi.Float(1.0) if coat is None else coat.eta
         if coat is not None:
             critical = dr.sqrt(1 - dr.rcp(dr.square(coat.eta)))
             kappa_per_cosine *= coat.relative
             least = kappa_per_cosine * (coat.refracted(wi).z + critical)
             span = kappa_per_cosine * (1 - critical)
-        return cls(*(dr.detach(value) for value in (wi, frequency, least, span)))
+        return cls(*(dr.detach(value) for value in (wi, frequency, index, least, span)))

@@ -65,7 +65,7 @@ class LineSampler:
         total = larger(total, 1e-20) * larger(high - low, 1e-6)
         return dr.dot(weights, self.shares(cell, active)) * lobe * dr.rcp(total)
 
-    def sample(self, incidence: Incidence, u: mi.Float, v: mi.Point2f, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
+    def sample(self, incidence: Incidence, u: mi.Float, v: mi.Point2f, active: mi.Bool) -> mi.Point2f:
         """Draw q in cycles/µm, for one wavelength.
 
         The κ cell comes from `u`, the place along the orders from `v.x` and that across from `v.y`.
@@ -80,7 +80,7 @@ class LineSampler:
         along = (mi.Float(cell - self.largest) + place - 0.5) * self.spacing
         low, high = self._across(along, incidence)
         t = 2 * dr.sin(dr.asin(1.5 * dr.fma(v.y, high - low, low)) / 3)
-        return self._axes(along, t * dr.rsqrt(1 - dr.square(t)) / self.per_scale)
+        return mi.Point2f(*self._axes(along, t * dr.rsqrt(1 - dr.square(t)) / self.per_scale))
 
     def _axes(self, x: mi.Float, y: mi.Float) -> tuple[mi.Float, mi.Float]:
         """Along the orders and across from x and y, and the reverse."""

@@ -5,8 +5,6 @@ that propagate: light on other orders goes nowhere, and at grazing incidence mos
 the sum of A_jm over the rectangle. A one-row grating has the exact interval: with s the direction of incidence,
 
     |m_x/T_x + s_x/λ| ≤ √(1/λ² − s_y²/λ²)
-
-each made wider by the reach of the lobes.
 """
 
 from __future__ import annotations
@@ -40,7 +38,6 @@ class OrderSampler:
         self.rows, self.columns = spectrum.grid.shape
         self.largest_x, self.largest_y = spectrum.grid.largest
         self.tile_x, self.tile_y = (opaque(t) for t in spectrum.grid.tile_size)
-        self.margin = opaque(spectrum.reach * spectrum.lobe_width)
         self.restricted = (self.largest_x + 1) ** 2 * (self.rows + 1) <= LARGEST_TABLE
         units = np.stack([_units(average) for average in averages(spectrum, FLOOR)], axis=-1)
         self.shares = PacketTable(units)
@@ -75,8 +72,7 @@ class OrderSampler:
             return mi.Int32(0), mi.Int32(1)
         half = frequency
         if lines == 1:
-            half = dr.safe_sqrt(dr.square(frequency) - dr.square(larger(dr.abs(across) - self.margin, 0)))
-        half = half + self.margin
+            half = dr.safe_sqrt(dr.square(frequency) - dr.square(across))
         first = mi.Int32(dr.ceil((-along - half) * tile))
         last = mi.Int32(dr.floor((half - along) * tile))
         # The mirror order m = 0 is always among them.

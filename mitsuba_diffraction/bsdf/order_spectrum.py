@@ -10,8 +10,9 @@ import numpy as np
 
 from ..spectrum import GratingSpectrum
 from ..spectrum.orders import LobeAxis
-from .arithmetic import larger
+from .arithmetic import larger, limited
 from .cell_sampler import CellSampler
+from .geometry import Geometry, cos_square, k_g
 from .incidence import Incidence
 from .inversion import truncated_gaussian
 from .line_sampler import LineSampler
@@ -45,7 +46,8 @@ class OrderSpectrum:
         if not self.apart:
             self.cells = LineSampler(spectrum) if line else CellSampler(spectrum)
         self.orders = OrderSampler(spectrum) if self.apart else None
-        self.columns = grid.shape[1]
+        self.columns, self.line = grid.shape[1], line
+        self.per_width = opaque(1 / sigma)
 
     def meets(self, q_x: mi.Float, q_y: mi.Float) -> mi.Bool:
         """Whether q lies in the lobe of an order, where they stand apart; q in cycles/µm."""
@@ -54,32 +56,73 @@ class OrderSpectrum:
 
     def evaluate(
         self,
-        q_x: mi.Float,
-        q_y: mi.Float,
-        kappa: mi.Float,
+        geometry: Geometry,
+        height_scale: mi.Float,
+        shadowing: bool,
         incidence: Incidence,
         active: mi.Bool,
         drawn: bool,
     ) -> tuple[mi.Float, mi.Float]:
-        """S(q; κ) and the density of q, both in µm², for one wavelength.
+        """K G S(q; κ) cos θ_o and the density of q, both in µm², for one wavelength.
+
+        K and G are those of each order, and its lobe keeps its power at the horizon (`Geometry.gain`).
 
         Args:
-            q_x: cycles/µm.
-            q_y: cycles/µm.
-            kappa: rad/µm.
+            geometry: of the pair of directions.
+            height_scale: times the heights.
+            shadowing: whether G is a factor.
             incidence: the wavelength and where it comes from.
             active: mask.
             drawn: whether the direction is a sample, so that an order meets it.
         """
-        along_x, along_y = self.axes
-        m_x, m_y = along_x.first(q_x), along_y.first(q_y)
         if self.apart:
-            power, density = self._apart(m_x, m_y, q_x, q_y, kappa, incidence, active, drawn)
+            power, density = self._apart(geometry, height_scale, shadowing, incidence, active, drawn)
         else:
-            power = self._power(m_x, m_y, along_x.lobes(m_x, q_x), along_y.lobes(m_y, q_y), kappa, active)
-            density = self.cells.density(q_x, q_y, incidence, active)
+            q, kappa = geometry.tangent * incidence.frequency, geometry.kappa(incidence.frequency, height_scale)
+            m_x, m_y = (axis.first(q) for axis, q in zip(self.axes, q, strict=True))
+            lobes_x, lobes_y = self.axes[0].lobes(m_x, q.x), self.axes[1].lobes(m_y, q.y)
+            factor = 1
+            if self.line:
+                lobes_x, lobes_y = self._weighted(m_x, m_y, lobes_x, lobes_y, geometry, shadowing, incidence)
+            else:
+                factor = of_continuum(geometry, shadowing, incidence, self.per_width)
+            power = factor * self._power(m_x, m_y, lobes_x, lobes_y, kappa, active)
+            density = self.cells.density(q.x, q.y, incidence, active)
         # Interpolation may dip below zero by its error.
         return dr.select(active, larger(power, 0), 0), density
+
+    def _weighted(
+        self,
+        m_x: mi.Int32,
+        m_y: mi.Int32,
+        lobes_x: list[mi.Float],
+        lobes_y: list[mi.Float],
+        geometry: Geometry,
+        shadowing: bool,
+        incidence: Incidence,
+    ) -> tuple[list[mi.Float], list[mi.Float]]:
+        """The lobes of the orders of a line grating from (m_x, m_y) on, times K G cos θ_o and gain of each order."""
+
+        def factor(x: int, y: int) -> mi.Float:
+            return self._factor(m_x + x, m_y + y, geometry, shadowing, incidence)
+
+        if len(lobes_x) > 1:
+            return [lobe * factor(step, 0) for step, lobe in enumerate(lobes_x)], lobes_y
+        return lobes_x, [lobe * factor(0, step) for step, lobe in enumerate(lobes_y)]
+
+    def _factor(
+        self, m_x: mi.Int32, m_y: mi.Int32, geometry: Geometry, shadowing: bool, incidence: Incidence
+    ) -> mi.Float:
+        """K G cos θ_o of an order, times the gain of its lobe."""
+        tangent = self._tangent(m_x, m_y, incidence)
+        cos_i, cos_o, gain = geometry.of_order(tangent, incidence.frequency * self.per_width)
+        square = dr.squared_norm(tangent) / dr.square(geometry.index)
+        return k_g(cos_i, cos_o, square, shadowing) * gain * geometry.cos_o
+
+    def _tangent(self, m_x: mi.Int32, m_y: mi.Int32, incidence: Incidence) -> mi.Vector2f:
+        """λq of an order."""
+        pitches = (axis.pitch for axis in self.axes)
+        return mi.Vector2f(*(mi.Float(m) * p for m, p in zip((m_x, m_y), pitches, strict=True))) / incidence.frequency
 
     def _power(
         self,
@@ -98,43 +141,40 @@ class OrderSpectrum:
     @dr.syntax
     def _apart(
         self,
-        m_x: mi.Int32,
-        m_y: mi.Int32,
-        q_x: mi.Float,
-        q_y: mi.Float,
-        kappa: mi.Float,
+        geometry: Geometry,
+        height_scale: mi.Float,
+        shadowing: bool,
         incidence: Incidence,
         active: mi.Bool,
         drawn: bool,
     ) -> tuple[mi.Float, mi.Float]:
-        """`_power` of the one order that may hold at q, and the density.
+        """`evaluate` of the one order that may hold at q.
 
         Most directions lie between the orders of a grating: unless drawn, they jump over all that reads tables.
         """
-        near = active & self.meets(q_x, q_y)
+        q = geometry.tangent * incidence.frequency
+        near = active & self.meets(q.x, q.y)
         power, density, needed = mi.Float(0.0), mi.Float(0.0), drawn or near
         # What has no derivative is bound here: Dr.Jit carries all other state through the branch.
-        read = functools.partial(self._read, m_x, m_y, incidence, near)
+        read = functools.partial(self._read, shadowing, incidence, near)
         if needed:
-            power, density = read(q_x, q_y, kappa)
+            power, density = read(geometry, height_scale)
         return power, density
 
     def _read(
-        self,
-        m_x: mi.Int32,
-        m_y: mi.Int32,
-        incidence: Incidence,
-        near: mi.Bool,
-        q_x: mi.Float,
-        q_y: mi.Float,
-        kappa: mi.Float,
+        self, shadowing: bool, incidence: Incidence, near: mi.Bool, geometry: Geometry, height_scale: mi.Float
     ) -> tuple[mi.Float, mi.Float]:
         """As `_apart`, where `near`; else zero."""
-        lobes_x, lobes_y = self.axes[0].lobes(m_x, q_x), self.axes[1].lobes(m_y, q_y)
-        power = self._power(m_x, m_y, lobes_x, lobes_y, kappa, near)
+        q = geometry.tangent * incidence.frequency
+        m_x, m_y = (axis.first(q) for axis, q in zip(self.axes, q, strict=True))
+        lobes_x, lobes_y = self.axes[0].lobes(m_x, q.x), self.axes[1].lobes(m_y, q.y)
+        power = self._power(m_x, m_y, lobes_x, lobes_y, geometry.kappa(incidence.frequency, height_scale), near)
+        power *= self._factor(m_x, m_y, geometry, shadowing, incidence)
         order = mi.UInt32((m_y + self.axes[1].largest) * self.columns + m_x + self.axes[0].largest)
         share = self.orders.share(order, self.orders.weights(incidence, near), near)
-        return power, share * lobes_x[0] * lobes_y[0]
+        # An order that does not propagate is not drawn.
+        there = cos_square(geometry.wi, self._tangent(m_x, m_y, incidence)) > 0
+        return power, dr.select(there, share * lobes_x[0] * lobes_y[0], 0)
 
     def sample(
         self,
@@ -142,12 +182,28 @@ class OrderSpectrum:
         u: mi.Float,
         v: mi.Point2f,
         active: mi.Bool,
-    ) -> tuple[mi.Float, mi.Float]:
-        """Draw q in cycles/µm, for one wavelength; `incidence` as in `evaluate`."""
+    ) -> tuple[mi.Point2f, mi.Bool]:
+        """Draw q in cycles/µm, for one wavelength, and tell whether the order of q propagates."""
         if self.cells is not None:
-            return self.cells.sample(incidence, u, v, active)
+            return self.cells.sample(incidence, u, v, active), active
         row, column, v = self.orders.sample(incidence, u, v, active)
-        return self.axes[0].place(column, v.x), self.axes[1].place(row, v.y)
+        tangent = self._tangent(column - self.axes[0].largest, row - self.axes[1].largest, incidence)
+        q = mi.Point2f(self.axes[0].place(column, v.x), self.axes[1].place(row, v.y))
+        return q, cos_square(incidence.wi, tangent) > 0
+
+
+def of_continuum(geometry: Geometry, shadowing: bool, incidence: Incidence, per_width: mi.Float) -> mi.Float:
+    """K G cos θ_o and gain where orders overlap, so that no single one is known.
+
+    At grazing incidence the mirror order has nearly all of the power, and K grows without bound within its lobe. From
+    cos θ = 0.2 down, and up to 4 σ_q from q = 0, S is taken for that of the mirror order, K G for one; from cos θ = 0.4
+    up, and from 5 σ_q on, K and G are those at q, and what lobes lose below the horizon they get from those beyond.
+    """
+    per_width = incidence.frequency * per_width
+    mirror = limited((25 - dr.squared_norm(geometry.tangent) * dr.square(per_width)) / 9, 0, 1)
+    mirror *= limited(2 - 5 * larger(geometry.wi.z, geometry.wo.z), 0, 1)
+    *_, gain = geometry.of_order(mi.Vector2f(0), per_width)
+    return dr.lerp(geometry.k_g(shadowing), gain, mirror) * geometry.cos_o
 
 
 class _Axis:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ..rigorous.mueller import MIRRORED
 from ..rigorous.spectrum import RigorousSpectrum
 from .arithmetic import larger, limited, smaller
+from .geometry import Geometry, cos_square
 from .incidence import Incidence
 from .inversion import search, truncated_gaussian
 from .order_sampler import WHOLE
@@ -57,7 +58,7 @@ class RigorousOrders:
         inside = math.erf(reach / math.sqrt(2))  # the share of the Gaussian within its reach, along one axis
         self.spread, self.inside = opaque(np.sqrt(2) * sigma), opaque(inside)
         self.peak, self.falloff = opaque(1 / (2 * np.pi * (sigma * inside) ** 2)), opaque(-0.5 / sigma**2)
-        self.half_width = opaque(reach * sigma)
+        self.half_width, self.per_width = opaque(reach * sigma), opaque(1 / sigma)
         self.period, self.pitch = opaque(axes.period), opaque(1 / axes.period)
         self.shortest, self.longest = (opaque(w) for w in axes.wavelengths)
 
@@ -71,23 +72,26 @@ class RigorousOrders:
 
     @dr.syntax
     def evaluate(
-        self, wi: mi.Vector3f, wo: mi.Vector3f, frequency: mi.Float, active: mi.Bool, drawn: bool
+        self, geometry: Geometry, incidence: Incidence, active: mi.Bool, drawn: bool
     ) -> tuple[mi.Float, mi.Float]:
-        """Σ_m η_m N and the density of q, both in µm², for one wavelength.
+        """cos θ_o Σ_m η_m N and the density of q, both in µm², for one wavelength.
+
+        The lobe of each order keeps its power at the horizon (`Geometry.gain`).
 
         Args:
-            wi, wo: ω_i and ω_o along the pattern's axes.
-            frequency: 1/λ in cycles/µm.
+            geometry: of the pair of directions, along the pattern's axes.
+            incidence: the wavelength and where it comes from.
             active: mask.
             drawn: whether ω_o is a sample, so that an order meets it.
         """
-        near = active & self.meets(-(wi.x + wo.x) * frequency, -(wi.y + wo.y) * frequency)
+        q = geometry.tangent * incidence.frequency
+        near = active & self.meets(q.x, q.y)
         power, density, needed = mi.Float(0.0), mi.Float(0.0), drawn or near
         # Most directions lie between the orders: unless drawn, they jump over all that reads tables.
         # What has no derivative is bound here: Dr.Jit carries all other state through the branch.
-        read = functools.partial(self._read, frequency, near)
+        read = functools.partial(self._read, incidence, near)
         if needed:
-            power, density = read(wi, wo)
+            power, density = read(geometry)
         return power, density
 
     def _coordinates(self, wi: mi.Vector3f, wo: mi.Vector3f, frequency: mi.Float) -> tuple[mi.Float, ...]:
@@ -97,10 +101,12 @@ class RigorousOrders:
         g = dr.sqrt(larger(dr.square(nu) - dr.square(k_y), 0))
         return -(wi.x + wo.x) * frequency, -(wi.y + wo.y) * frequency, k_y, c, g, self._z(g, frequency)
 
-    def _read(self, frequency: mi.Float, near: mi.Bool, wi: mi.Vector3f, wo: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
+    def _read(self, incidence: Incidence, near: mi.Bool, geometry: Geometry) -> tuple[mi.Float, mi.Float]:
         """As `evaluate`, where `near`; else zero."""
-        q_x, q_y, _, c, g, z = self._coordinates(wi, wo, frequency)
-        cell = self._cell(Incidence.of(wi, frequency, mi.Float(1)))
+        # Its tables are those inside of a coat.
+        frequency = incidence.frequency
+        q_x, q_y, _, c, g, z = self._coordinates(*geometry.inside(), geometry.index * frequency)
+        cell = self._cell(incidence)
         first = self._first(q_x)
         power, density = mi.Float(0.0), mi.Float(0.0)
         for step in range(self.count):
@@ -109,9 +115,13 @@ class RigorousOrders:
             there = near & (dr.abs(offset) <= self.half_width) & (dr.abs(m) <= self.axes.largest)
             square = dr.square(offset) + dr.square(q_y)
             lobe = dr.select(there, self.peak * dr.exp(self.falloff * square), 0)
-            power += lobe * self._efficiency(m, c, g, z, there)
-            density += lobe * self.orders(mi.UInt32(dr.select(there, cell + m, 0)), there).y
-        return power, density / WHOLE
+            tangent = mi.Vector2f(mi.Float(m) * self.pitch / frequency, 0)
+            *_, gain = geometry.of_order(tangent, frequency * self.per_width)
+            power += lobe * gain * self._efficiency(m, c, g, z, there)
+            # An order that does not propagate is not drawn.
+            there &= cos_square(geometry.wi, tangent) > 0
+            density += dr.select(there, lobe, 0) * self.orders(mi.UInt32(dr.select(there, cell + m, 0)), there).y
+        return power * geometry.cos_o, density / WHOLE
 
     def mueller(
         self, source: mi.Vector3f, exit_: mi.Vector3f, frequency: mi.Float, active: mi.Bool
@@ -160,8 +170,11 @@ class RigorousOrders:
                 rows[row] += weight * packet
         return rows
 
-    def sample(self, incidence: Incidence, u: mi.Float, v: mi.Point2f, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
-        """Draw q in cycles/µm, for one wavelength: the order from `u`, its place in the lobe from `v`."""
+    def sample(self, incidence: Incidence, u: mi.Float, v: mi.Point2f, active: mi.Bool) -> tuple[mi.Point2f, mi.Bool]:
+        """Draw q in cycles/µm, for one wavelength, and tell whether the order of q propagates.
+
+        The order comes from `u`, its place in the lobe from `v`.
+        """
         middle = self._cell(incidence)
         largest = self.axes.largest
 
@@ -170,7 +183,8 @@ class RigorousOrders:
 
         m, _ = search(before, mi.Int32(-largest), mi.Int32(largest + 1), 2 * largest + 1, u)
         x, y = (truncated_gaussian(number, self.inside, self.spread) for number in v)
-        return dr.fma(self.pitch, mi.Float(m), x), y
+        tangent = mi.Vector2f(mi.Float(m) * self.pitch / incidence.frequency, 0)
+        return mi.Point2f(dr.fma(self.pitch, mi.Float(m), x), y), cos_square(incidence.wi, tangent) > 0
 
     def _z(self, g: mi.Float, frequency: mi.Float) -> mi.Float:
         """Z / (K − 1), from 0 to 1."""
@@ -230,13 +244,15 @@ class RigorousOrders:
 
     def _cell(self, incidence: Incidence) -> mi.Int32:
         """Where order 0 of the sampler's cell stands in its table."""
-        nu, wi = self.period * incidence.frequency, incidence.wi
-        g = nu * dr.safe_sqrt(1 - dr.square(wi.y))
+        # Tangential components are the same inside of a coat.
+        along, across = (self.period * incidence.frequency * s for s in (incidence.wi.x, incidence.wi.y))
+        frequency = incidence.index * incidence.frequency
+        g = dr.safe_sqrt(dr.square(self.period * frequency) - dr.square(across))
         p, r = (
             dr.clip(mi.Int32(self.cells * self._position(larger(x, 0))), 0, self.cells_across - 1)
-            for x in (g - nu * wi.x, g + nu * wi.x)
+            for x in (g - along, g + along)
         )
-        z = dr.clip(mi.Int32(self._z(g, incidence.frequency) * self.sampler_planes), 0, self.sampler_planes - 1)
+        z = dr.clip(mi.Int32(self._z(g, frequency) * self.sampler_planes), 0, self.sampler_planes - 1)
         width = 2 * self.axes.largest + 2
         return ((z * self.cells_across + p) * self.cells_across + r) * width + self.axes.largest
 

@@ -9,10 +9,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..energy.furnace import Furnace
+from ..energy.table import EnergyTable, corners
 from ..rigorous.spectrum import RigorousSpectrum
-from ..spectrum.albedo import GatheredSpectrum, energy_table
-from ..spectrum.energy_table import EnergyTable
-from ..spectrum.furnace import conserving
 from ..spectrum.load import Spectrum
 from ..spectrum.orders import OrderGrid
 from .energy import Energy
@@ -33,18 +32,14 @@ class SharedTables:
         scattering: S(q; κ) and its sampler.
     """
 
-    KEPT = 8  # energy tables of other heights
-
     def __init__(self, spectrum: Spectrum) -> None:
         if isinstance(spectrum, RigorousSpectrum):
             self.scattering = RigorousOrders(spectrum)
         else:
             self.scattering = (OrderSpectrum if isinstance(spectrum.grid, OrderGrid) else SplineSpectrum)(spectrum)
         self._spectrum = spectrum
-        self._gathered: GatheredSpectrum | None = None
-        self._tables: dict[tuple[str, float], EnergyTable] = {}
-        self._energies: dict[tuple[str, float], Energy] = {}
-        self._lock = threading.RLock()
+        self._last: tuple[float, Energy | None] | None = None
+        self._lock = threading.Lock()
 
     @classmethod
     def of(cls, spectrum: Spectrum) -> SharedTables:
@@ -59,44 +54,29 @@ class SharedTables:
                 tables = _shared[key] = cls(spectrum)
             return tables
 
-    def energy_table(self, shadowing: str, height_scale: float) -> EnergyTable:
-        """The spectrum's own, or computed for another height."""
-        if height_scale == 1:
-            return self._spectrum.energy_table(shadowing)
-        key = shadowing, height_scale
-        with self._lock:
-            if key not in self._tables:
-                table = conserving(self._spectrum, self.gathered_table(shadowing, height_scale), height_scale)
-                self._keep(self._tables, key, table)
-            return self._tables[key]
-
-    def gathered_table(self, shadowing: str, height_scale: float) -> EnergyTable:
-        with self._lock:
-            if self._gathered is None:
-                self._gathered = GatheredSpectrum.of(self._spectrum)
-            return energy_table(self._gathered, shadowing, height_scale)
-
     def energy(self, shadowing: str, height_scale: mi.Float) -> Energy | None:
-        """The factor E, or None if it is one for all directions and wavelengths.
+        """The factor E, or None if it is one for all directions and wavelengths, or `shadowing` is "none".
 
         Where a gradient is tracked through `height_scale`, the entries of the table carry theirs, from a central
         difference.
         """
-        scale = float(np.max(height_scale))
-        table = self.energy_table(shadowing, scale)
-        if dr.grad_enabled(height_scale):
-            lower, upper = max(scale - STEP, 0.0), scale + STEP
-            above, below = (self.gathered_table(shadowing, s).values for s in (upper, lower))
-            return Energy(table, (above - below) / (upper - lower), height_scale - dr.detach(height_scale))
-        if not table.needed:
+        if shadowing == "none":
             return None
-        key = shadowing, scale
+        scale = float(np.max(height_scale))
+        if dr.grad_enabled(height_scale):
+            table, lower, upper = self.energy_table(scale), max(scale - STEP, 0.0), scale + STEP
+            above, below = (self.corners(table, s) for s in (upper, lower))
+            return Energy(table, (above - below) / (upper - lower), height_scale - dr.detach(height_scale))
         with self._lock:
-            if key not in self._energies:
-                self._keep(self._energies, key, Energy(table))
-            return self._energies[key]
+            if self._last is None or self._last[0] != scale:
+                table = self.energy_table(scale)
+                self._last = scale, Energy(table) if table.needed else None
+            return self._last[1]
 
-    def _keep(self, tables: dict, key: tuple[str, float], table: object) -> None:
-        while len(tables) >= self.KEPT:
-            del tables[next(iter(tables))]
-        tables[key] = table
+    def energy_table(self, height_scale: float) -> EnergyTable:
+        """The spectrum's own, or made for other heights."""
+        return self._spectrum.energy_table() if height_scale == 1 else EnergyTable.of(self._spectrum, height_scale)
+
+    def corners(self, table: EnergyTable, height_scale: float) -> np.ndarray:
+        """e at the corners of the cells of `table`, not rounded, for other heights."""
+        return corners(Furnace.of(self._spectrum, height_scale), table.layout)[0]

@@ -9,8 +9,10 @@ from ..spectrum import GratingSpectrum
 from ..spectrum.spline_grid import spline_weights
 from .arithmetic import larger
 from .cell_sampler import CellSampler
+from .geometry import Geometry
 from .incidence import Incidence
 from .order_power import order_power
+from .order_spectrum import of_continuum
 from .tables import opaque
 
 RIM = 3  # rings of zeros, so many as are read in a row
@@ -31,27 +33,20 @@ class SplineSpectrum:
         self.per_q_x, self.per_q_y = (opaque(1 / d) for d in grid.spacing)
         self.per_area = opaque(1 / (grid.spacing[0] * grid.spacing[1]))
         self.limit_x, self.limit_y = (opaque(limit) for limit in grid.limit)
+        self.per_width = opaque(1 / spectrum.lobe_width)
         self.cells = CellSampler(spectrum)
 
     def evaluate(
         self,
-        q_x: mi.Float,
-        q_y: mi.Float,
-        kappa: mi.Float,
+        geometry: Geometry,
+        height_scale: mi.Float,
+        shadowing: bool,
         incidence: Incidence,
         active: mi.Bool,
         drawn: bool,
     ) -> tuple[mi.Float, mi.Float]:
-        """S(q; κ) and the density of q, both in µm², for one wavelength.
-
-        Args:
-            q_x: cycles/µm.
-            q_y: cycles/µm.
-            kappa: rad/µm.
-            incidence: the wavelength and where it comes from.
-            active: mask.
-            drawn: as of `OrderSpectrum`; here all directions cost the same.
-        """
+        """K G S(q; κ) cos θ_o and the density of q; as of `OrderSpectrum`, but all directions cost the same."""
+        q_x, q_y = geometry.tangent * incidence.frequency
         x, y = q_x * self.per_q_x, q_y * self.per_q_y
         m_x, m_y = mi.Int32(dr.round(x)), mi.Int32(dr.round(y))
         power = self.power.window(
@@ -59,12 +54,12 @@ class SplineSpectrum:
             m_x + (self.largest_x + RIM - 1),
             spline_weights(x - mi.Float(m_x)),
             spline_weights(y - mi.Float(m_y)),
-            self.power.at(kappa, active),
+            self.power.at(geometry.kappa(incidence.frequency, height_scale), active),
             active,
         )
         inside = active & (dr.abs(q_x) <= self.limit_x) & (dr.abs(q_y) <= self.limit_y)
         # Interpolation may dip below zero by its error.
-        power = larger(power, 0) * self.per_area
+        power = larger(power, 0) * self.per_area * of_continuum(geometry, shadowing, incidence, self.per_width)
         return dr.select(inside, power, 0), self.cells.density(q_x, q_y, incidence, active)
 
     def sample(
@@ -73,6 +68,6 @@ class SplineSpectrum:
         u: mi.Float,
         v: mi.Point2f,
         active: mi.Bool,
-    ) -> tuple[mi.Float, mi.Float]:
-        """Draw q in cycles/µm, for one wavelength; `incidence` as in `evaluate`."""
-        return self.cells.sample(incidence, u, v, active)
+    ) -> tuple[mi.Point2f, mi.Bool]:
+        """Draw q in cycles/µm, for one wavelength; no single order would not propagate."""
+        return self.cells.sample(incidence, u, v, active), active

@@ -2,8 +2,8 @@
 
 Channels are named after what they hold. Series: `B{t^003}` (taylor), `B{T_003}` (chebyshev), `B{mode 003}` (svd), the
 terms B_n of S = Σ g_n(κ) B_n; "slices": `S(012.2)`, the coefficient of t² on interval 12 of κ. Rows
-are orders m_y, columns m_x, from −M to M. Numbers in the header are double precision. `energy` is JSON: the tables of
-`energy_table.py`, by the kind of shadowing. `contentSha256` covers every byte of the file, so that a damaged one is
+are orders m_y, columns m_x, from −M to M. Numbers in the header are double precision. `energy` is JSON: the table of
+`energy/table.py`. `contentSha256` covers every byte of the file, so that a damaged one is
 known as such.
 """
 
@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
+from ..energy.table import EnergyTable
 from ..errors import RequestError
-from .energy_table import EnergyTable
 from .expansions import Series, chebyshev, taylor
 from .exr import doubles, one_line, read, write
 from .orders import OrderGrid
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 Spectrum = TypeVar("Spectrum")
 FORMAT = "mitsuba_diffraction grating spectrum"
-FORMAT_VERSION = 5
+FORMAT_VERSION = 6
 
 
 def save(spectrum: GratingSpectrum, path: str | os.PathLike[str], recipe: str = "") -> None:
@@ -62,9 +62,7 @@ def save(spectrum: GratingSpectrum, path: str | os.PathLike[str], recipe: str = 
     if spectrum.representation == "svd":
         # repr of a float is exact.
         header["modes"] = json.dumps(spectrum.table.series.modes.tolist())
-    # Scenes seldom ask for another kind of shadowing: of the others, those that are there.
-    kinds = dict.fromkeys(["v_cavity", *spectrum.shadowings()])
-    header["energy"] = json.dumps({kind: spectrum.energy_table(kind).as_plain() for kind in kinds})
+    header["energy"] = json.dumps(spectrum.energy_table().as_plain())
     channels = _channels(spectrum.table)
     header["channelCount"] = len(channels)
     write(path, FORMAT, FORMAT_VERSION, header, channels, recipe)
@@ -107,7 +105,7 @@ def load(path: str | os.PathLike[str], construct: Callable[..., Spectrum], recip
             beyond=_single(header["beyond"]),
             patches=header["patches"],
             scatter=_single(header["standardError"]) if header["extent"] == "sample" else None,
-            energy={kind: EnergyTable.from_plain(t) for kind, t in json.loads(header["energy"]).items()},
+            energy=EnergyTable.from_plain(json.loads(header["energy"])),
         )
     except KeyError as error:
         raise RequestError(f"{path}: a damaged spectrum, {error} is missing") from None

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import os
 import threading
-from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 
@@ -14,11 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import matching
 from ..coherence import lobe_reach, lobe_width
+from ..energy.table import EnergyTable
 from ..errors import RequestError
-from .albedo import GatheredSpectrum, energy_table
-from .energy_table import EnergyTable
 from .file import load, save
-from .furnace import conserving
 from .orders import LobeAxis, OrderGrid
 from .series_table import SeriesTable
 from .slice_table import SliceTable
@@ -52,7 +49,7 @@ class GratingSpectrum:
             pixels do not resolve.
         patches: of how many draws of an irregular surface it is the mean.
         scatter: of a sample, its `standard_error`; None of a tile.
-        energy: the tables that bound the albedo, by the kind of shadowing; `energy_table` computes what is missing.
+        energy: the table that bounds the albedo, if it came with the file; else `energy_table` makes it.
     """
 
     table: SeriesTable | SliceTable
@@ -71,7 +68,7 @@ class GratingSpectrum:
     beyond: float = 0.0
     patches: int = 1
     scatter: float | None = None
-    energy: Mapping[str, EnergyTable] = field(default_factory=dict, repr=False)
+    energy: EnergyTable | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         if self.extent not in ("tile", "sample"):
@@ -92,10 +89,6 @@ class GratingSpectrum:
             raise RequestError(f"patches: got {self.patches!r}, wanted a whole number of at least 1")
         if (self.scatter is not None) != (self.extent == "sample") or not 0 <= (self.scatter or 0.0) < np.inf:
             raise RequestError(f"scatter: got {self.scatter} of a {self.extent}, wanted a number ≥ 0 of a sample only")
-        if not all(key == getattr(table, "shadowing", None) for key, table in self.energy.items()):
-            raise RequestError(
-                f"energy: got {', '.join(map(str, self.energy))}, wanted energy tables by their shadowing"
-            )
         check_wavelengths(self.wavelengths)
         check_angle(self.largest_angle)
         lobe_width(self.coherence_length)
@@ -196,25 +189,14 @@ class GratingSpectrum:
             )
         return kappa
 
-    def energy_table(self, shadowing: str = "v_cavity") -> EnergyTable:
-        """What bounds the albedo by one, for these heights; computed at the first call unless it came with the file.
-
-        Raises:
-            ValueError: unless `shadowing` is "v_cavity" or "none".
-        """
+    def energy_table(self) -> EnergyTable:
+        """Return what bounds the albedo by one; made at the first call unless it came with the file."""
         with _computing:
-            if shadowing not in self._energy:
-                self._energy[shadowing] = conserving(self, energy_table(GatheredSpectrum.of(self), shadowing))
-            return self._energy[shadowing]
-
-    def shadowings(self) -> list[str]:
-        """The kinds of shadowing for which there is an energy table already."""
-        with _computing:
-            return list(self._energy)
+            return self._energy
 
     @cached_property
-    def _energy(self) -> dict[str, EnergyTable]:
-        return dict(self.energy)
+    def _energy(self) -> EnergyTable:
+        return EnergyTable.of(self) if self.energy is None else self.energy
 
     @cached_property
     def digest(self) -> str:

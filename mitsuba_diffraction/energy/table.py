@@ -1,0 +1,354 @@
+"""The factor e(ω, λ) that bounds the albedo by one, as a table.
+
+With R = 1 the BSDF without E has an albedo a(ω_i, λ) (`furnace.py`) that exceeds one for some directions. It multiplies
+by
+
+    E = min(e(ω_i, λ), e(ω_o, λ)),    e ≤ min(1, 1/a)
+
+which is reciprocal, bounds the albedo by one, and is one where neither direction reflects more than it receives.
+
+Of a grating with the period T, c = √(1 − ω_y²) and
+
+    u = (c − ω_x) T/λ,    v = (c + ω_x) T/λ
+
+the order m > 0 propagates if m < u, and m < 0 if −m < v: e jumps where u or v is a whole number, and is continuous
+between. So each unit square of (u, v) is divided into cells by itself, finest near its lower edges, where an order has
+just emerged; at u = 0 and v = 0 ω itself is at the horizon. With f = t⁴ the fraction of u, nodes are equidistant in
+(t + t²)/2. Of narrow lobes a depends on u and v alone, but for orders within a few λσ_q of the horizon: the table has
+one slice for each of a few bands of 1/λ.
+
+Of surfaces with orders in two dimensions, and of samples, T is so short that one square holds all directions, and
+slices are equidistant in the same function of the fraction 1 − |y|, y = ω_y/(1 + c).
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import dataclasses
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import RequestError
+from ..spectrum.orders import OrderGrid
+from .furnace import RADIAL, Furnace, albedo_of_nodes
+
+if TYPE_CHECKING:
+    from ..spectrum.grating_spectrum import GratingSpectrum
+
+SLACK = 1e-3
+"""What an albedo may exceed one by."""
+GATHERED = 5e-3  # by which the albedo of gathered cells may err where it is not seen
+CHECKED = 40  # random places at which a table is held against the spectrum itself
+GENERAL = 17, 22  # slices, and cells along u and v, of a table for orders in two dimensions and for samples
+PLACES, WORK = 3e4, 1e7  # of a line grating, at most: nodes of the table, and points in lobes
+ROUNDS, PAIRS = (1, 32), 5e6  # random places in each cell, at least and at most; about so many pairs with components
+STRIDE = np.array([0.8191725, 0.6710436, 0.5497005])  # of places in a cell, so that few rounds cover it (Roberts 2018)
+LEAST, HORIZON = 1e-7, 1e-4  # the least fraction of u and v, and of y
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where the cells of a table lie.
+
+    Attributes:
+        period: T in µm.
+        squares: unit squares of (u, v) along each.
+        first: cells along u or v from 0 to 1, where ω is near the horizon.
+        cells: along the side of the other unit squares.
+        slices: bands of 1/λ, or nodes of y.
+        frequencies: (smallest, largest) 1/λ in 1/µm.
+        lines: slices are bands of 1/λ.
+        turned: the grating is periodic along y: x and y change places.
+    """
+
+    period: float
+    squares: int
+    first: int
+    cells: int
+    slices: int
+    frequencies: tuple[float, float]
+    lines: bool
+    turned: bool = False
+
+    def __post_init__(self) -> None:
+        if not (0 < self.period < np.inf and 0 < self.frequencies[0] < self.frequencies[1] < np.inf):
+            raise RequestError(f"energy table: got period {self.period}, frequencies {self.frequencies}, wanted > 0")
+        if min(self.squares, self.first, self.cells, self.slices - (not self.lines)) < 1:
+            raise RequestError(
+                f"energy table: got {self.squares}, {self.first}, {self.cells}, {self.slices}, wanted at least one"
+            )
+
+    @property
+    def shape(self) -> tuple[int, int, int, int]:
+        """Slices, cells along v and u, and the four corners of each."""
+        side = self.first + (self.squares - 1) * self.cells
+        return self.slices, side, side, 4
+
+    @classmethod
+    def of(cls, spectrum: GratingSpectrum, furnace: Furnace) -> Layout:
+        """Choose the layout for `spectrum`: as fine as the work allows."""
+        shortest, longest = (w * 1e-3 for w in spectrum.wavelengths)
+        frequencies = 1 / longest, 1 / shortest
+        if not (isinstance(spectrum.grid, OrderGrid) and 1 in spectrum.grid.shape):
+            return cls(shortest / 2, 1, GENERAL[1], 1, GENERAL[0], frequencies, False)
+        turned = spectrum.grid.shape[1] == 1 and spectrum.grid.shape[0] > 1
+        # So many places that the work is about the same for all gratings.
+        bands, work = furnace.lobe_work(longest)
+        side = np.sqrt(2 * min(PLACES, WORK / (work * max(len(furnace.q) / 2, 1))))
+        first = int(np.clip(side / 8, 4, 16))
+        period, rest = spectrum.grid.tile_size[int(turned)], (side - 2 * first - 1) / 3
+        period /= max(np.ceil(2 * period / shortest / max(rest, 2)), 1)
+        squares = int(np.ceil(2 * period / shortest))
+        cells = int(np.clip((3 * rest / max(squares - 1, 1) - 1) / 2, 1, 16))
+        return cls(float(period), squares, first, cells, bands, frequencies, True, turned)
+
+    def places(
+        self, directions: NDArray[np.float64], wavelengths: ArrayLike
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Return slice, row and column of ω (n, 3) and λ (µm), in cells: each (n,)."""
+        x, y, z = directions.T
+        if self.turned:
+            x, y = y, x
+        c = np.sqrt(x**2 + z**2)
+        longer = c + np.abs(x)
+        shorter = z**2 / np.maximum(longer, 1e-12)
+        per_length = self.period / np.asarray(wavelengths)
+        u, v = (self._place(np.where(x * sign > 0, shorter, longer) * per_length) for sign in (1, -1))
+        if self.lines:
+            first, last = self.frequencies
+            share = np.clip((1 / np.asarray(wavelengths) - first) / (last - first), 0, 1)
+            row = np.minimum(np.floor(share * self.slices), self.slices - 1) + 0 * x
+        else:
+            y = y / (1 + c)
+            row = (1 - np.copysign(1 - _equidistant(1 - np.abs(y)), -y)) / 2 * (self.slices - 1)
+        return row, v, u
+
+    def _place(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
+        square = np.minimum(np.floor(u), self.squares - 1)
+        start = np.where(square > 0, self.first + (square - 1) * self.cells, 0)
+        return start + _equidistant(u - square) * np.where(square > 0, self.cells, self.first)
+
+    def nodes(self, square: int) -> NDArray[np.float64]:
+        """Return u at the nodes of a unit square and in the middle between them."""
+        count = 2 * (self.first if square == 0 else self.cells)
+        return square + np.clip(_fraction(np.arange(count + 1) / count), LEAST, 1 - LEAST)
+
+
+def _equidistant(f: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (t + t²)/2 of f = t⁴; below 0 and above 1, of the nearest."""
+    root = np.sqrt(np.clip(f, 0, 1))
+    return (np.sqrt(root) + root) / 2
+
+
+def _fraction(h: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the inverse of `_equidistant`."""
+    return ((np.sqrt(1 + 8 * h) - 1) / 2) ** 4
+
+
+@dataclass(frozen=True, eq=False)
+class EnergyTable:
+    """e at the corners of cells, linear between them.
+
+    Attributes:
+        layout: where the cells lie.
+        steps: uint8 (slices, rows, columns, 4): e = `least` + (1 − `least`)/255 · step at (u, v), (u⁺, v), (u, v⁺) and
+            (u⁺, v⁺).
+        least: the smallest e.
+        loss: (mean, largest) 1 − e max(1, a) in the middle of the cells.
+    """
+
+    layout: Layout
+    steps: NDArray[np.uint8] = field(repr=False)
+    least: float
+    loss: tuple[float, float]
+
+    def __post_init__(self) -> None:
+        got = self.steps
+        if got.shape != self.layout.shape or got.dtype != np.uint8:
+            raise RequestError(f"energy table: got {got.dtype} {got.shape}, wanted uint8 {self.layout.shape}")
+        if not 0 <= self.least <= 1:
+            raise RequestError(f"energy table: got {self.least} as its smallest value, wanted 0 to 1")
+        got.setflags(write=False)
+
+    @classmethod
+    def of(cls, spectrum: GratingSpectrum, height_scale: float = 1.0) -> EnergyTable:
+        """Make the table of `spectrum`, with its heights scaled by `height_scale`."""
+        furnace = Furnace.of(spectrum, height_scale)
+        layout = Layout.of(spectrum, furnace)
+        e, loss = corners(furnace, layout)
+        table = cls.packed(layout, e, loss)
+        if furnace.by_order or not table.needed:
+            return table
+        # Of gathered cells, against the spectrum itself.
+        places = random_places(spectrum.wavelengths)
+        # Of two estimates the smaller: what both exceed is no noise.
+        found = [albedo_of_nodes(spectrum, *places, height_scale, table.at, seed) for seed in (0, 1)]
+        excess = max(float(np.minimum(*found).max()) - 1, GATHERED)
+        return cls.packed(layout, e / (1 + excess), (loss[0] + excess, loss[1] + excess))
+
+    @classmethod
+    def packed(cls, layout: Layout, e: NDArray[np.float64], loss: tuple[float, float]) -> EnergyTable:
+        """Round e at the corners of cells to bytes, so that it exceeds the numbers by no more than `SLACK`."""
+        least = float(e.min())
+        steps = np.floor(np.minimum((e * (1 + SLACK) - least) / max(1 - least, 1e-9), 1) * 255)
+        return cls(layout, np.maximum(steps, 0).astype(np.uint8), least, loss)
+
+    @property
+    def needed(self) -> bool:
+        """Some direction would reflect more than it receives."""
+        return self.least < 1
+
+    def at(self, directions: NDArray[np.float64], wavelengths: ArrayLike) -> NDArray[np.float64]:
+        """Return e(ω, λ) as the renderer has it, (n,), for ω (n, 3) along the pattern's axes and λ in µm."""
+        slices, *places = self.layout.places(directions, wavelengths)
+        cells = [np.clip(place.astype(np.int64), 0, self.steps.shape[1] - 1) for place in places]
+        weights = _bilinear(places[1] - cells[1], places[0] - cells[0])
+        below = np.minimum(slices.astype(np.int64), self.steps.shape[0] - 1)
+        steps = (self.steps[(below, *cells)] * weights).sum(-1)
+        if not self.layout.lines:
+            above = (self.steps[(np.minimum(below + 1, self.steps.shape[0] - 1), *cells)] * weights).sum(-1)
+            steps += (slices - below) * (above - steps)
+        return self.least + (1 - self.least) / 255 * steps
+
+    def as_plain(self) -> dict[str, Any]:
+        """Return the table as numbers and texts, for JSON."""
+        packed = base64.b64encode(zlib.compress(self.steps.tobytes(), 9)).decode("ascii")
+        return {"layout": dataclasses.asdict(self.layout), "least": self.least, "loss": self.loss, "steps": packed}
+
+    @classmethod
+    def from_plain(cls, plain: Mapping[str, Any]) -> EnergyTable:
+        """Return the table that `as_plain` describes.
+
+        Raises:
+            ValueError, TypeError or KeyError: if it is not a table.
+        """
+        if plain.keys() != {"layout", "least", "loss", "steps"}:
+            raise RequestError(f"energy table: got {', '.join(plain)}, wanted layout, least, loss, steps")
+        layout = Layout(**{**plain["layout"], "frequencies": tuple(plain["layout"]["frequencies"])})
+        size = int(np.prod(layout.shape, dtype=np.int64))
+        try:
+            # No more than there should be: a damaged file may hold a long row of zeros.
+            content = zlib.decompressobj().decompress(base64.b64decode(plain["steps"]), size + 1)
+        except (zlib.error, binascii.Error) as error:
+            raise RequestError(f"energy table: {error}") from None
+        if not 0 < size < 1 << 26 or len(content) != size:
+            raise RequestError(f"energy table: got {len(content)} bytes, wanted {size}")
+        steps = np.frombuffer(content, np.uint8).reshape(layout.shape)
+        mean, largest = plain["loss"]
+        return cls(layout, steps, float(plain["least"]), (float(mean), float(largest)))
+
+
+def random_places(wavelengths: tuple[float, float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return `CHECKED` directions (n, 3), half of them beyond 60°, and λ in µm, (n,); `wavelengths` in nm."""
+    rng = np.random.default_rng(0)
+    theta = np.deg2rad(rng.uniform(np.where(rng.random(CHECKED) < 0.5, 0, 60), 88))
+    phi = rng.uniform(0, 2 * np.pi, CHECKED)
+    directions = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1)
+    return directions, rng.uniform(*wavelengths, CHECKED) * 1e-3
+
+
+def corners(furnace: Furnace, layout: Layout) -> tuple[NDArray[np.float64], tuple[float, float]]:
+    """Compute e at the corners of all cells, a lower bound of 1/a between them.
+
+    Returns:
+        e of the shape `layout.shape`, and (mean, largest) of what is lost in the middle of the cells.
+    """
+    return (_line_corners if layout.lines else _general_corners)(furnace, layout)
+
+
+def _line_corners(furnace: Furnace, layout: Layout) -> tuple[NDArray[np.float64], tuple[float, float]]:
+    """As `corners`, of a line grating: each slice bounds a at both ends of its band."""
+    first, last = layout.frequencies
+    nodes = [layout.nodes(square) for square in range(layout.squares)]
+    lattice = np.concatenate(nodes)
+    square = np.repeat(np.arange(layout.squares), [len(n) for n in nodes])
+    v, u = np.meshgrid(lattice, lattice, indexing="ij")
+    nu = (u + v) / (2 * layout.period)
+    reached = np.add.outer(square, square) < 2 * layout.period * last
+    wavelengths = 1 / np.linspace(last, first, layout.slices + 1)
+    e = np.ones((layout.slices, *nu.shape))
+    if layout.turned:
+        furnace = dataclasses.replace(furnace, q=furnace.q[:, ::-1])
+    a = furnace.line_albedo(((v - u) / (u + v))[reached], nu[reached], wavelengths)
+    e[:, reached] = 1 / np.maximum(np.maximum(a[1:], a[:-1])[::-1], 1)
+    inside = reached & (nu <= last)
+    # The cells: each second node but the last of a unit square.
+    start = np.concatenate([np.arange(0, len(n) - 1, 2) + np.flatnonzero(square == k)[0] for k, n in enumerate(nodes)])
+
+    def at(values: NDArray, j: int, i: int) -> NDArray:
+        return values[..., start[:, None] + j, start + i]
+
+    result = np.stack([at(e, j, i) for j in (0, 2) for i in (0, 2)], -1)
+    # In the middle of the cells and of their edges.
+    excess = np.zeros(result.shape[:-1])
+    for j, i in ((1, 1), (0, 1), (1, 0), (2, 1), (1, 2)):
+        over = result @ _bilinear(np.float64(i / 2), np.float64(j / 2)) - at(e, j, i)
+        excess = np.maximum(excess, np.where(at(inside, j, i), over, 0))
+    result = np.maximum(result - excess[..., None], 0)
+    lost = (1 - result.mean(-1) / at(e, 1, 1))[:, at(inside, 1, 1)]
+    return result, (float(lost.mean()), float(lost.max()))
+
+
+def _general_corners(furnace: Furnace, layout: Layout) -> tuple[NDArray[np.float64], tuple[float, float]]:
+    """As `corners`, of orders in two dimensions and of samples: lowered at random places in the cells."""
+    side, (first, last) = layout.first, layout.frequencies
+    cells = np.indices((layout.slices - 1, side, side)).reshape(3, -1).T
+
+    def latitude(slices: NDArray[np.float64]) -> NDArray[np.float64]:
+        place = 2 * slices / (layout.slices - 1) - 1
+        return np.copysign(1 - np.maximum(_fraction(1 - np.abs(place)), HORIZON), place)
+
+    def bound(places: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """1/max(1, a) at places (slice, row, column), (n, 3), and whether there is light there."""
+        y = latitude(places[:, 0])
+        u, v = (np.maximum(_fraction(p / side), LEAST) for p in (places[:, 2], places[:, 1]))
+        c, nu = (1 - y**2) / (1 + y**2), (u + v) / (2 * layout.period)
+        lengths = c / nu
+        there = (lengths >= 1 / last) & (lengths <= 1 / first)
+        directions = np.stack([c * (v - u) / (u + v), 2 * y / (1 + y**2), c * 2 * np.sqrt(u * v) / (u + v)], -1)
+        if layout.turned:
+            directions = directions[:, [1, 0, 2]]
+        a = furnace.albedo(directions, np.clip(lengths, 1 / last, 1 / first))
+        return 1 / np.maximum(a, 1), there
+
+    # Cells that light reaches at some wavelength.
+    y = latitude(cells[:, :1] + [0, 0.5, 1])
+    c = (1 - y**2) / (1 + y**2)
+    low, high = (_fraction((cells[:, 1] + k) / side) + _fraction((cells[:, 2] + k) / side) for k in (0, 1))
+    per = 2 * layout.period
+    cells = cells[(low <= per * last * c.max(-1)) & (high >= per * first * c.min(-1))]
+    # Nodes, each of them once.
+    eight = np.array(list(np.ndindex(2, 2, 2)))
+    nodes, corner = np.unique((cells[:, None] + eight).reshape(-1, 3), axis=0, return_inverse=True)
+    e = bound(nodes.astype(np.float64))[0][corner.reshape(-1, 8)]
+    start = np.random.default_rng(0).random((len(cells), 3))
+    work = furnace.lobe_work(1 / first)[1] / RADIAL if furnace.by_order else 1
+    rounds = int(np.clip(PAIRS / (len(cells) * len(furnace.q) * work), *ROUNDS))
+    for index in range(rounds):
+        inside = (start + index * STRIDE) % 1
+        wanted, there = bound(cells + inside)
+        weights = np.prod(np.where(eight, inside[:, None], 1 - inside[:, None]), -1)
+        over = (weights * e).sum(-1) - wanted
+        lost = np.clip(1 - (weights * e).sum(-1) / wanted, 0, 1)[there]
+        e -= np.where(there, np.maximum(over, 0), 0)[:, None]
+    # Two cells share a corner (slice, row, column, corner).
+    full = np.ones(layout.shape)
+    for k, (above, j, i) in enumerate(eight):
+        np.minimum.at(full, (cells[:, 0] + above, cells[:, 1], cells[:, 2], 2 * j + i), np.maximum(e[:, k], 0))
+    return full, (float(lost.mean()), float(lost.max()))
+
+
+def _four(nodes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the four corners of each cell: (..., n, n) → (..., n − 1, n − 1, 4)."""
+    below, above = nodes[..., :-1, :], nodes[..., 1:, :]
+    return np.stack([below[..., :-1], below[..., 1:], above[..., :-1], above[..., 1:]], -1)
+
+
+def _bilinear(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y], -1)
