@@ -7,7 +7,6 @@ import re
 
 import mitsuba as mi
 import nbformat
-import pytest
 from nbclient import NotebookClient
 from rich.console import Console
 
@@ -17,7 +16,6 @@ from mitsuba_diffraction import progress
 RUBBED = {"profile": "xenopeltis", "size": 5.0, "patches": 3}
 
 
-@pytest.mark.usefixtures("no_energy_tables")
 def test_a_log_tells_in_one_line_that_a_spectrum_is_computed(llvm, capfd, monkeypatch):
     """From Python a skin took half a minute without a word."""
     monkeypatch.setattr(progress, "log_lines", functools.partial(progress.log_lines, first=0, seconds=math.inf))
