@@ -1,5 +1,7 @@
 """The table of rigorous efficiencies against the solver."""
 
+import warnings
+
 import numpy as np
 import pytest
 
@@ -55,6 +57,28 @@ def test_grazing_light_is_mirrored(spectrum):
     m, eta = spectrum.efficiencies((1 - 1e-9, 0, 1e-6), 0.45)
     assert eta[list(m).index(0)] == pytest.approx(1, abs=1e-3)
     assert eta.sum() <= 1 + 1e-3
+
+
+@pytest.mark.parametrize(
+    ("depth", "material"), [(0.15, {"material": "Al"}), (0.05, {"int_ior": 1.5, "ext_ior": 1.6})], ids=["metal", "coat"]
+)
+def test_a_coarse_table_holds_no_more_light_than_came(depth, material, monkeypatch):
+    """Few harmonics are enough for most light, not for all."""
+    monkeypatch.setattr("mitsuba_diffraction.rigorous.build._SOLVED", (4,))
+    monkeypatch.setattr("mitsuba_diffraction.rigorous.build._CHECKS", 2)
+    surface = gratings.blazed(0.5, depth, samples=256)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        table = build_spectrum(surface, **material, wavelengths=(400.0, 450.0), tolerance=0.2)
+    assert table.values.min() >= 0
+    assert table.values.max() <= 1
+
+
+def test_a_profile_that_does_not_converge_is_refused():
+    with pytest.raises(
+        ValueError, match=r"error of 0\.\d+ with 80 harmonics at a wavelength of 400 nm, wanted at most"
+    ):
+        build_spectrum(gratings.lamellar(0.3, 0.3), material="Ag", wavelengths=(400.0, 450.0), tolerance=1e-4)
 
 
 def test_a_spectrum_survives_its_file(spectrum, tmp_path):

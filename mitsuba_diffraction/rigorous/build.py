@@ -77,7 +77,8 @@ def build_spectrum(
         checkpoints: a folder for what is done so far; an interrupted build goes on from there.
 
     Raises:
-        ValueError: if an argument is out of range, or the period is above ten of the shortest wavelength.
+        ValueError: if an argument is out of range, the period is above ten of the shortest wavelength, or the profile
+            is too deep for efficiencies that converge and conserve energy within the tolerance.
 
     Warns:
         UserWarning: if the finest table errs by more than `tolerance`, or its Mueller matrices by more than three times
@@ -158,9 +159,8 @@ class _Surface:
         self.tolerance = tolerance
         curve = curve_of(height_field)
         self.harmonics = max(self._harmonics(curve, np.array(d) / np.linalg.norm(d)) for d in _HARD)
-        self.grating = Grating(curve, self.harmonics)
-        # What the table is compared with is solved with more.
-        self.finer = Grating(curve, int(1.4 * self.harmonics))
+        # The table takes the first; the others are for light that needs more, and for what it is compared with.
+        self.gratings = [Grating(curve, int(1.4**k * self.harmonics)) for k in range(5)]
         self.digest = hashlib.sha256(
             repr((height_field.digest, wavelengths, named, self.harmonics, BUILD_VERSION)).encode()
         ).hexdigest()
@@ -186,20 +186,33 @@ class _Surface:
         return count
 
     def solve(
-        self, alpha: float, g: float, wavelengths: Iterable[float], grating: Grating | None = None
+        self, alpha: float, g: float, wavelengths: Iterable[float], finer: int = 0
     ) -> tuple[NDArray[np.int64], Real]:
         """m of the orders, and M_ij, (wavelengths, orders, 4, 4), for k_x = α and g (times period/2π).
 
-        M_00 is η of unpolarised light.
+        M_00 is η of unpolarised light. The harmonics, those of `gratings[finer]`, are raised where R + T is not one
+        within the tolerance, or where R is above one if the material absorbs.
+
+        Raises:
+            ValueError: if the largest number of harmonics does not conserve energy either.
         """
-        grating = grating or self.grating
-        light = light_from(grating, alpha, g**2)
-        found = []
-        for wavelength in wavelengths:
-            k_y = np.sqrt(max((self.period / wavelength) ** 2 - g**2, 0))
-            solved = scatter(grating, light, k_y, self.index(wavelength))
-            found.append(mueller(solved.reflected))
-        return -solved.orders, np.array(found)
+        wavelengths = list(wavelengths)
+        for grating in self.gratings[finer:]:
+            light, found, excess = light_from(grating, alpha, g**2), [], 0.0
+            for wavelength in wavelengths:
+                k_y, index = np.sqrt(max((self.period / wavelength) ** 2 - g**2, 0)), self.index(wavelength)
+                solved = scatter(grating, light, k_y, index)
+                total = [(np.abs(a) ** 2).sum(axis=(0, 1)) for a in (solved.reflected, solved.transmitted)]
+                beyond = sum(total) - 1
+                excess = max(excess, np.max(np.abs(beyond) if index.imag == 0 else beyond))
+                found.append(mueller(solved.reflected))
+            if excess <= self.tolerance:
+                return -solved.orders, np.array(found)
+        raise RequestError(
+            f"height field: got an excess of {excess:.2g} of the incident light with {grating.harmonics} harmonics at "
+            f"{1e3 * wavelengths[0]:.4g} to {1e3 * wavelengths[-1]:.4g} nm, wanted at most {self.tolerance:.2g}; "
+            "it is too deep for its period with theory=rigorous"
+        )
 
     def checks(self) -> list[tuple[float, float, float, NDArray[np.int64], Real]]:
         """α, g, λ, m and M_ij at random places, directions uniform over the hemisphere, wavelengths over the range."""
@@ -210,7 +223,7 @@ class _Surface:
             k = np.sqrt(1 - cosine**2) * self.period / wavelength
             alpha, k_y = k * np.cos(2 * np.pi * turn), k * np.sin(2 * np.pi * turn)
             g = np.sqrt((self.period / wavelength) ** 2 - k_y**2)
-            m, matrices = self.solve(alpha, g, [wavelength], self.finer)
+            m, matrices = self.solve(alpha, g, [wavelength], finer=1)
             checks.append((alpha, g, wavelength, m, matrices[0]))
         return checks
 
@@ -317,6 +330,9 @@ class _Table:
             block = np.einsum("ai,bj,ijkxy->kabxy", refine, refine, both, optimize=True)
             start = axes.offset(m)
             matrices[:, start : start + side**2] = block.reshape(axes.planes, -1, entries, entries)
+        # Beside a kink the polynomials overshoot.
+        eta = matrices[..., :1, :1]
+        matrices *= np.divide(np.clip(eta, 0, 1), eta, out=np.zeros_like(eta), where=eta != 0)
         return np.ascontiguousarray(matrices[..., 0, 0]), matrices if entries == 4 else None
 
 
