@@ -104,7 +104,7 @@ def test_an_interrupted_build_goes_on(tmp_path):
         pass
 
     def stop(done, total):
-        if done == 5:
+        if done >= 5:
             raise Enough
 
     small = gratings.sinusoidal(0.15, 0.03, samples=32)
@@ -116,9 +116,26 @@ def test_an_interrupted_build_goes_on(tmp_path):
         small, **REQUEST, progress=lambda done, total: steps.append((done, total)), checkpoints=tmp_path
     )
     assert steps[0][0] > 5
-    assert steps[-1][0] == steps[-1][1]
     np.testing.assert_array_equal(again.values, build_spectrum(small, **REQUEST).values)
     assert not list(tmp_path.iterdir())
+
+
+def test_progress_is_one_count_in_per_cent(monkeypatch):
+    """Also where finer tables follow."""
+    monkeypatch.setattr("mitsuba_diffraction.rigorous.build._SOLVED", (4, 5, 6))
+    monkeypatch.setattr("mitsuba_diffraction.rigorous.build._CHECKS", 2)
+    told = []
+    with pytest.warns(UserWarning, match="with 6 steps to a unit"):
+        build_spectrum(
+            gratings.sinusoidal(0.15, 0.03, samples=32),
+            **REQUEST | {"tolerance": 1e-4},
+            progress=lambda done, total: told.append((done, total)),
+        )
+    done, total = np.transpose(told)
+    assert (np.diff(done) >= 0).all()
+    assert len(set(done)) > 10
+    assert set(total) == {100}
+    assert done[-1] == 100
 
 
 def test_a_checkpoint_is_no_reason_to_fail(tmp_path):
@@ -129,7 +146,7 @@ def test_a_checkpoint_is_no_reason_to_fail(tmp_path):
     np.testing.assert_array_equal(build_spectrum(small, **REQUEST, checkpoints=tmp_path / "file" / "x").values, wanted)
 
     def leave(done, total):
-        if done == 3:
+        if done >= 3:
             raise InterruptedError
 
     with pytest.raises(InterruptedError):

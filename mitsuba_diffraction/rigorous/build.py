@@ -73,7 +73,7 @@ def build_spectrum(
         wavelengths: (shortest, longest) in nm, in the medium above.
         tolerance: bound of `RigorousSpectrum.error`, the mean of Σ|Δη_m| / Σ η_m over directions and wavelengths, and
             of a third of `polarisation_error`.
-        progress: called with (steps done, steps in all).
+        progress: called with (per cent done, 100); it never counts back.
         checkpoints: a folder for what is done so far; an interrupted build goes on from there.
 
     Raises:
@@ -106,10 +106,16 @@ def build_spectrum(
             repr((int_ior, material, ext_ior, polarised)),
         )
         checks = surface.checks()
+        report = progress or (lambda done, total: None)
+        error, done = np.inf, 0
         for solved in _SOLVED:
+            # Twice the steps cost four times as much and leave an eighth of the error: which table will be the last?
+            begin, done = done, 95 if error <= 8 * tolerance or solved == _SOLVED[-1] else done + 20
             axes = Axes(surface.period, surface.wavelengths, STORED * solved, PLANES)
             table = _Table(surface, axes, solved, polarised)
-            values, matrices = table.values(progress or (lambda done, total: None), checkpoints)
+            values, matrices = table.values(
+                lambda row, rows, a=begin, b=done: report(a + (b - a) * row // rows, 100), checkpoints
+            )
             spectrum = RigorousSpectrum(
                 axes=axes,
                 values=values,
@@ -126,7 +132,10 @@ def build_spectrum(
             )
             # NaN: there are no matrices.
             if spectrum.error <= tolerance and not spectrum.polarisation_error > MATRICES * tolerance:
+                report(100, 100)
                 return spectrum
+            error = spectrum.error
+    report(100, 100)
     got, wanted = f"{spectrum.error:.2g}", f"{tolerance:.2g}"
     if polarised:
         got += f" and {spectrum.polarisation_error:.2g} of the Mueller matrices"
