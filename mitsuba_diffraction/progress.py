@@ -43,7 +43,12 @@ def say(kind: str, message: object) -> None:
     err.print(f"{NAME}: {kind}: {' '.join(str(message).split())}", markup=False, emoji=False)
 
 
-def log_lines(label: str, seconds: float = 30.0, first: float = _SHORT) -> Callable[..., None]:
+def _count(done: int, total: int, unit: str) -> str:
+    """Return how much is done, as a person reads it."""
+    return f"{done} %" if unit == "%" else f"{done} of {total} {unit}".rstrip()
+
+
+def log_lines(label: str, unit: str = "", seconds: float = 30.0, first: float = _SHORT) -> Callable[..., None]:
     """Progress without a terminal: a line on stderr after `first` seconds, then at the interval of `seconds`."""
     start = time.monotonic()
     due = start + first
@@ -52,7 +57,7 @@ def log_lines(label: str, seconds: float = 30.0, first: float = _SHORT) -> Calla
         nonlocal due
         if (now := time.monotonic()) >= due:
             due = now + seconds
-            say(label, f"{done} of {total}, {now - start:.0f} s")
+            say(label, f"{_count(done, total, unit)}, {now - start:.0f} s")
 
     return show
 
@@ -69,11 +74,11 @@ def progress_bar(label: str, unit: str = "", begin: str = "") -> Iterator[Callab
         begin: what is done before anything can be counted.
     """
     if err.is_jupyter:
-        with _notebook_line(label) as show:
+        with _notebook_line(label, unit) as show:
             yield show
         return
     if not err.is_terminal:
-        yield log_lines(label)
+        yield log_lines(label, unit)
         return
     with _lock:
         if outermost := not _bars:
@@ -106,7 +111,7 @@ def progress_bar(label: str, unit: str = "", begin: str = "") -> Iterator[Callab
 
 
 @contextmanager
-def _notebook_line(label: str) -> Iterator[Callable[..., None]]:
+def _notebook_line(label: str, unit: str) -> Iterator[Callable[..., None]]:
     """A line of the cell's output, in which the count and at last the time stand."""
     from IPython.display import display
 
@@ -115,7 +120,7 @@ def _notebook_line(label: str) -> Iterator[Callable[..., None]]:
     def show(done: int, total: int, error: float = math.nan) -> None:
         nonlocal handle
         seconds = time.monotonic() - start
-        line = {"text/plain": f"{label}: {done} of {total}, {seconds:.0f} s"}
+        line = {"text/plain": f"{label}: {_count(done, total, unit)}, {seconds:.0f} s"}
         if handle is not None:
             handle.update(line, raw=True)
         elif seconds >= _SHORT:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import inspect
 import json
 import logging
@@ -24,6 +25,7 @@ from .coat import Coat
 from .rigorous_parameters import settings_from, settings_of_medium
 
 _log = logging.getLogger(__name__)
+_per_cent = functools.partial(progress_bar, unit="%")
 _PREFIX = "handed over: "
 _told: set[str] = set()  # surfaces whose range was looked up
 _handed_over: weakref.WeakValueDictionary[str, Spectrum] = weakref.WeakValueDictionary()
@@ -70,7 +72,7 @@ def surface_from(props: mi.Properties, coat: Coat | None) -> tuple[Spectrum, Rec
     if theory == "rigorous":
         settings |= {"theory": theory, **settings_from(props, coat)}
     recipe = _inside(coat, Recipe(surface, settings))
-    return recipe.cached(progress_bar), recipe
+    return recipe.cached(_per_cent), recipe
 
 
 def warn_of_range(recipe: Recipe) -> None:
@@ -107,7 +109,7 @@ def _from_file(path: Path, coat: Coat | None, tolerance: float | None) -> tuple[
         recipe = _inside(coat, Recipe.load(path))
         if tolerance is not None:
             recipe = dataclasses.replace(recipe, spectrum={**recipe.spectrum, "tolerance": tolerance})
-        return recipe.cached(progress_bar), recipe
+        return recipe.cached(_per_cent), recipe
     if suffix == ".exr":
         if tolerance is not None:
             raise RequestError(f"tolerance: got {tolerance} with {path}, wanted it when the spectrum is computed")

@@ -92,7 +92,7 @@ def precompute(
     claim(context, reads, [("-o" if output else f"spectrum of {s}", t) for s, t in zip(sources, targets, strict=True)])
     seams = [_seam(source, recipe_of(source, of_scan, settings)) for source in sources]
     for source, target, seam in zip(sources, targets, seams, strict=True):
-        with progress_bar(f"spectrum of {source.name}") as progress:
+        with progress_bar(f"spectrum of {source.name}", "%") as progress:
             recipe = recipe_of(source, of_scan, settings)
             spectrum = recipe.build(progress)
             spectrum.save(target)
