@@ -44,8 +44,6 @@ class Energy:
         self.slope = None if slope is None else PacketTable(slope)
         self.change = change
         self.period = opaque(layout.period)
-        self.first = opaque(layout.frequencies[0])
-        self.per_frequency = opaque(self.slices / (layout.frequencies[1] - layout.frequencies[0]))
         self.squares = opaque(layout.squares - 1)
         self.cells, self.first_cells = opaque(layout.cells), opaque(layout.first)
 
@@ -80,10 +78,7 @@ class Energy:
         """e of the direction at `place`; `frequency` is 1/λ in 1/µm."""
         per_length = self.period * frequency
         (column, x), (row, y) = (self._column(u * per_length) for u in (place.u, place.v))
-        below = place.below
-        if self.layout.lines:
-            below = mi.UInt32(limited((frequency - self.first) * self.per_frequency, 0, self.slices - 1))
-        index = (below * self.side + row) * self.side + column
+        index = (place.below * self.side + row) * self.side + column
 
         def between(corners: Callable[[mi.UInt32], mi.Vector4f]) -> mi.Float:
             values = corners(index)
@@ -108,9 +103,8 @@ class Energy:
 
 
 def _equidistant(f: mi.Float) -> mi.Float:
-    """(t + t²)/2 of f = t⁴, from 0 to 1."""
-    root = dr.sqrt(limited(f, 0, 1))
-    return 0.5 * (dr.sqrt(root) + root)
+    """√f, from 0 to 1."""
+    return dr.sqrt(limited(f, 0, 1))
 
 
 def _bytes(number: mi.UInt32) -> mi.Vector4f:

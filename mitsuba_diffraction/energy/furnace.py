@@ -22,7 +22,6 @@ and of |λm/T|. Orders that overlap, and samples, have (1 − b) K G + b g(d(s_i
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
@@ -32,9 +31,11 @@ from numpy.polynomial.legendre import leggauss
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import maximum_filter1d
+from scipy.special import ndtri
 
 from ..geometry import horizon_gain, k_g
 from ..spectrum.orders import OrderGrid
+from ..spectrum.spline_grid import spline_integral
 
 if TYPE_CHECKING:
     from ..spectrum.grating_spectrum import GratingSpectrum
@@ -126,25 +127,9 @@ class Furnace:
         below = flat[index]
         return below + (place - cell) * (flat[index + 1] - below)
 
-    def lobe_work(self, longest: float) -> tuple[int, int]:
-        """Return for how many bands of λ an albedo is computed, and about how many points an order then takes.
-
-        Args:
-            longest: λ in µm.
-        """
-        if longest * self.lobe_width > NARROW:
-            return 2, 3 * RADIAL * AZIMUTHAL
-        turns = 2 * np.pi * self.height_range * self.lobe_width > TURN / 4
-        return (2, 3 * RADIAL) if turns else (6, RADIAL)
-
     def _place(self, kappa: NDArray[np.float64]) -> NDArray[np.float64]:
         last = self.powers.shape[1] - 1
         return np.minimum(kappa * (self.height_scale * last / self.max_kappa), last * (1 - 1e-12))
-
-    @functools.cached_property
-    def upper(self) -> NDArray[np.float32]:
-        """The largest p_j up to each κ, (n, K)."""
-        return np.maximum.accumulate(self.powers, axis=1)
 
     def albedo(self, directions: NDArray[np.float64], wavelengths: NDArray[np.float64]) -> NDArray[np.float64]:
         """Compute a(ω, λ).
@@ -176,50 +161,33 @@ class Furnace:
             result[some] += np.bincount(i, self._lobes(s[i], cos_i[i], length[i], j), len(some))
         return result
 
-    def line_albedo(
-        self, x: NDArray[np.float64], nu: NDArray[np.float64], wavelengths: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Compute a of a line grating along x for several wavelengths that share one c/λ, c = √(1 − ω_y²).
-
-        Away from the horizon a depends on x and ν alone; near it also on the width of the lobes.
+    def line_albedo(self, x: NDArray[np.float64], nu: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Compute a of a line grating along x, which depends on x and ν alone, c = √(1 − ω_y²).
 
         Args:
             x: ω_x/c, (n,).
             nu: c/λ in 1/µm, (n,).
-            wavelengths: λ in µm that ascend, (k,); where λ > 1/ν, 1/ν takes its place.
 
         Returns:
-            (k, n).
+            (n,).
         """
-        result = np.zeros((len(wavelengths), len(x)))
+        result, cos_i = np.zeros(len(x)), np.sqrt(1 - x**2)
         for some in np.array_split(np.arange(len(x)), 1 + len(x) * len(self.q) // (8 * CHUNK)):
-            t = x[some, None] + np.divide.outer(1 / nu[some], 1 / np.where(self.q[:, 0] == 0, 1e-30, self.q[:, 0]))
+            t = x[some, None] + np.multiply.outer(1 / nu[some], self.q[:, 0])
             place, component = np.nonzero(np.abs(t) < 1)
-            at, length = some[place], 1 / nu[some[place]]
-            square = 1 - t[place, component] ** 2
-            least = np.minimum(wavelengths[0], length)
-            far = self._far(square, self.widths[component] * length**2 / least, length)
-            i, j = at[far], component[far]
-            cos_i = np.sqrt(1 - x**2)
-            same = np.bincount(i, self._centre(i, j, cos_i, 1 / nu, np.sqrt(square[far])), len(x))[some]
-            at, j = at[~far], component[~far]
-            for k, wavelength in enumerate(wavelengths):
-                active = np.ones(len(at), bool) if k == 0 else wavelengths[k - 1] * nu[at] < 1
-                i = at[active]
-                length = np.minimum(wavelength, 1 / nu[i])
-                c = np.minimum(length * nu[i], 1)
-                s = np.stack([c * x[i], np.sqrt(1 - c**2)], -1)
-                near = np.bincount(i, self._lobes(s, c * cos_i[i], length, j[active]), len(x))[some]
-                done = wavelengths[k - 1] * nu[some] >= 1 if k else np.zeros(len(some), bool)
-                result[k, some] = np.where(done, result[k - 1, some], near + same)
+            cos_o = np.sqrt(1 - t[place, component] ** 2)
+            result[some] = np.bincount(place, self._centre(some[place], component, cos_i, 1 / nu, cos_o), len(some))
         return result
 
     def _far(
         self, square: NDArray[np.float64], sigma: NDArray[np.float64], length: NDArray[np.float64]
     ) -> NDArray[np.bool_]:
         """Return whether a component is represented by its centre; cos² θ_o, λσ and λ of each."""
+        if self.by_order:
+            # K and G are those of the order, and its lobe keeps its power at the horizon.
+            return np.ones(square.shape, bool)
         turn = 2 * np.pi * self.height_range * sigma / length / TURN
-        return (square > (FAR if self.by_order else FAR_CELL) * sigma) & (square > turn**2)
+        return (square > FAR_CELL * sigma) & (square > turn**2)
 
     def _centre(self, i, j, cos_i, length, cos_o) -> NDArray[np.float64]:
         """Return K G W p of the centres of components j from places i."""
@@ -239,23 +207,16 @@ class Furnace:
         length: NDArray[np.float64],
         component: NDArray[np.int64],
     ) -> NDArray[np.float64]:
-        """Integrate K G W p over the lobes of components near the horizon, (n,)."""
+        """Integrate K G W p over cells near the horizon and the lobe of the mirror order, (n,)."""
         result = np.empty(len(s))
-        sigma, mirror = length * self.widths[component], (self.q[component] == 0).all(-1)
-        lobes = mirror | self.by_order
-        wide, grazing = lobes & (sigma > NARROW), self.by_order & ~mirror & (cos_i**2 < FAR * sigma)
-        # Where light grazes both ways all phases are about the same.
-        strongest = self.upper[
-            component, self._place(np.pi * (3 * cos_i + 2 * np.sqrt(FAR * sigma)) / length).astype(np.int64)
-        ]
-        grazing &= strongest > WEAK
-        kinds = (~lobes, 1), (wide, AZIMUTHAL), (~wide & grazing, GRAZING), (lobes & ~wide & ~grazing, 1)
-        for those, count in kinds:
+        mirror = (self.q[component] == 0).all(-1)
+        wide = mirror & (length * self.widths[component] > NARROW)
+        for those, count in ((~mirror, 1), (wide, AZIMUTHAL), (mirror & ~wide, 1)):
             some = np.flatnonzero(those)
             for part in np.array_split(some, 1 + len(some) * RADIAL * count // CHUNK):
                 if len(part):
                     arguments = s[part], cos_i[part], length[part], component[part]
-                    result[part] = self._lobe(*arguments, count, bool(lobes[part[0]]))
+                    result[part] = self._lobe(*arguments, count, bool(mirror[part[0]]))
         return result
 
     def _lobe(
@@ -267,7 +228,7 @@ class Furnace:
         azimuths: int,
         lobes: bool,
     ) -> NDArray[np.float64]:
-        """Integrate K G W p over the lobes of components near the horizon, (n,).
+        """Integrate K G W p over cells, or the lobe of the mirror order, near the horizon, (n,).
 
         In polar coordinates of −ω_o,t = r (cos φ, sin φ), r² = 1 − cos² θ_o and r dr = −cos θ_o dcos θ_o.
         """
@@ -303,21 +264,10 @@ class Furnace:
         w = cos_i + cos_o
         own = length * self.lobe_width
         from_horizon = cos_i**2 / (2 * own), cos_o**2 / (2 * own)
-        if self.by_order:
-            back = np.hypot(*np.moveaxis(s + out - t, -1, 0))
-            gain = horizon_gain(np.minimum(from_horizon[0], np.maximum(1 - rho**2, 0) / (2 * own))) * horizon_gain(
-                np.maximum(np.minimum(from_horizon[1], (1 - back**2) / (2 * own)), 0)
-            )
-            gain = gain * (back < 1)
-            # At the centre of the lobe.
-            squares = cos_i**2 + 1 - back**2, cos_o**2 + 1 - rho**2
-            centre = [np.sqrt(np.maximum(square / 2, 1e-12)) for square in squares]
-            value = k_g(*centre, ((offset**2).sum(-1) + (centre[0] + centre[1]) ** 2) / 2) * gain
-        else:
-            square = ((out - s) ** 2).sum(-1)
-            value, b = k_g(cos_i, cos_o, (square + w**2) / 2), mirrored(square / own**2, cos_i, cos_o)
-            if b.any():
-                value = (1 - b) * value + b * horizon_gain(from_horizon[0]) * horizon_gain(from_horizon[1])
+        square = ((out - s) ** 2).sum(-1)
+        value, b = k_g(cos_i, cos_o, (square + w**2) / 2), mirrored(square / own**2, cos_i, cos_o)
+        if b.any():
+            value = (1 - b) * value + b * horizon_gain(from_horizon[0]) * horizon_gain(from_horizon[1])
         return (weight * value * self.power(component[:, None, None], 2 * np.pi * w / length)).sum((1, 2))
 
 
@@ -373,7 +323,7 @@ def albedo_of_nodes(
     bound: Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]],
     seed: int = 0,
 ) -> NDArray[np.float64]:
-    """Compute the albedo with E of overlapping orders or a sample from the stored spectrum, nothing gathered.
+    """Compute the albedo with E from the stored spectrum, nothing gathered and lobes as wide as they are.
 
     By Monte Carlo: at least one point in the lobe of each node, more in strong ones.
 
@@ -393,25 +343,38 @@ def albedo_of_nodes(
     lines = isinstance(grid, OrderGrid)
     reach = 4 * sigma if lines else 1.5 * np.hypot(*grid.spacing)
     strength = sum(np.maximum(spectrum.powers(x * spectrum.largest_kappa), 0).ravel() for x in (0.1, 0.4, 0.7, 1.0))
+    offsets = np.linspace(-1.5, 1.5, 1025)
+    integral = spline_integral(offsets)
     result = np.empty(len(directions))
     for index, (omega, length) in enumerate(zip(directions, wavelengths, strict=True)):
         s, cos_i = omega[:2], omega[2]
         reached = np.flatnonzero(np.hypot(*(s + length * q).T) < 1 + length * reach)
         count = 1 + (POINTS * strength[reached] / strength[reached].sum()).astype(np.int64)
         node, weight = np.repeat(reached, count), np.repeat(1 / count, count)
-        # A B-spline is the density of the sum of three numbers.
-        spread = rng.standard_normal((len(node), 2)) if lines else rng.random((3, len(node), 2)).sum(0) - 1.5
-        u = length * (q[node] + spread * (sigma if lines else grid.spacing))
+        # Points of one node follow each other in a sequence of low discrepancy (Roberts 2018).
+        t = (rng.random(2) + np.arange(len(node))[:, None] * [0.7548776662466927, 0.5698402909980532]) % 1
+        spread = ndtri(t) * sigma if lines else np.interp(t, integral, offsets) * grid.spacing
+        u = length * (q[node] + spread)
         square = 1 - ((s + u) ** 2).sum(-1)
         lit = (square > 0) & (lines or (np.abs(u) < length * np.array(grid.limit)).all(-1))
         u, node, weight, cos_o = u[lit], node[lit], weight[lit], np.sqrt(square[lit])
         w, tangent = cos_i + cos_o, (u**2).sum(-1)
-        b = mirrored(tangent / (length * sigma) ** 2, cos_i, cos_o)
-        gain = [horizon_gain(np.square(c) / (2 * length * sigma)) for c in (cos_i, cos_o)]
         kappa = np.minimum(2 * np.pi * w * height_scale / length, spectrum.largest_kappa)
         power = spectrum.table.powers_at(*np.divmod(node, grid.shape[1]), kappa)
-        value = weight * power * ((1 - b) * k_g(cos_i, cos_o, (tangent + w**2) / 2) + b * gain[0] * gain[1])
         out = np.concatenate([-s - u, cos_o[:, None]], -1)
+        if evaluated_by_order(spectrum):
+            offset = length * q[node]
+            sent = 1 - ((s + offset) ** 2).sum(-1), 1 - ((out[:, :2] + offset) ** 2).sum(-1)
+            centre = [np.sqrt(np.maximum(x, 1e-12) / 2) for x in (cos_i**2 + sent[1], cos_o**2 + sent[0])]
+            nearest = np.minimum(cos_i**2, sent[0]), np.minimum(cos_o**2, sent[1])
+            factor = k_g(*centre, ((offset**2).sum(-1) + (centre[0] + centre[1]) ** 2) / 2) * (np.minimum(*sent) > 0)
+            share = 1.0
+        else:
+            nearest, share = (np.square(cos_i), cos_o**2), mirrored(tangent / (length * sigma) ** 2, cos_i, cos_o)
+            factor = 1.0
+        gain = [horizon_gain(np.maximum(x, 0) / (2 * length * sigma)) for x in nearest]
+        value = (1 - share) * k_g(cos_i, cos_o, (tangent + w**2) / 2) + share * factor * gain[0] * gain[1]
+        value *= weight * power
         e = np.minimum(bound(omega[None], length), bound(out, np.full(len(out), length)))
         result[index] = (value * e).sum()
     return result

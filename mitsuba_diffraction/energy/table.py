@@ -13,9 +13,8 @@ Of a grating with the period T, c = √(1 − ω_y²) and
 
 the order m > 0 propagates if m < u, and m < 0 if −m < v: e jumps where u or v is a whole number, and is continuous
 between. So each unit square of (u, v) is divided into cells by itself, finest near its lower edges, where an order has
-just emerged; at u = 0 and v = 0 ω itself is at the horizon. With f = t⁴ the fraction of u, nodes are equidistant in
-(t + t²)/2. Of narrow lobes a depends on u and v alone, but for orders within a few λσ_q of the horizon: the table has
-one slice for each of a few bands of 1/λ.
+just emerged; at u = 0 and v = 0 ω itself is at the horizon. With f the fraction of u, nodes are equidistant in √f, as
+cos θ_o of that order is. a depends on u and v alone: the table has one slice.
 
 Of surfaces with orders in two dimensions, and of samples, T is so short that one square holds all directions, and
 slices are equidistant in the same function of the fraction 1 − |y|, y = ω_y/(1 + c).
@@ -36,7 +35,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import RequestError
 from ..spectrum.orders import OrderGrid
-from .furnace import RADIAL, Furnace, albedo_of_nodes
+from .furnace import NARROW, Furnace, albedo_of_nodes
 
 if TYPE_CHECKING:
     from ..spectrum.grating_spectrum import GratingSpectrum
@@ -44,9 +43,9 @@ if TYPE_CHECKING:
 SLACK = 1e-3
 """What an albedo may exceed one by."""
 GATHERED = 5e-3  # by which the albedo of gathered cells may err where it is not seen
-CHECKED = 40  # random places at which a table is held against the spectrum itself
+CHECKED = 40  # random places, at least, at which a table is held against the spectrum itself
 GENERAL = 17, 22  # slices, and cells along u and v, of a table for orders in two dimensions and for samples
-PLACES, WORK = 3e4, 1e7  # of a line grating, at most: nodes of the table, and points in lobes
+PLACES = 1.5e5  # nodes of the table of a line grating, at most
 ROUNDS, PAIRS = (1, 32), 5e6  # random places in each cell, at least and at most; about so many pairs with components
 STRIDE = np.array([0.8191725, 0.6710436, 0.5497005])  # of places in a cell, so that few rounds cover it (Roberts 2018)
 LEAST, HORIZON = 1e-7, 1e-4  # the least fraction of u and v, and of y
@@ -61,9 +60,9 @@ class Layout:
         squares: unit squares of (u, v) along each.
         first: cells along u or v from 0 to 1, where ω is near the horizon.
         cells: along the side of the other unit squares.
-        slices: bands of 1/λ, or nodes of y.
+        slices: one, or nodes of y.
         frequencies: (smallest, largest) 1/λ in 1/µm.
-        lines: slices are bands of 1/λ.
+        lines: of a line grating.
         turned: the grating is periodic along y: x and y change places.
     """
 
@@ -99,14 +98,13 @@ class Layout:
             return cls(shortest / 2, 1, GENERAL[1], 1, GENERAL[0], frequencies, False)
         turned = spectrum.grid.shape[1] == 1 and spectrum.grid.shape[0] > 1
         # So many places that the work is about the same for all gratings.
-        bands, work = furnace.lobe_work(longest)
-        side = np.sqrt(2 * min(PLACES, WORK / (work * max(len(furnace.q) / 2, 1))))
-        first = int(np.clip(side / 8, 4, 16))
+        side = np.sqrt(2 * min(PLACES, PAIRS / max(len(furnace.q) / 2, 1)))
+        first = int(np.clip(side / 8, 4, 24))
         period, rest = spectrum.grid.tile_size[int(turned)], (side - 2 * first - 1) / 3
         period /= max(np.ceil(2 * period / shortest / max(rest, 2)), 1)
         squares = int(np.ceil(2 * period / shortest))
-        cells = int(np.clip((3 * rest / max(squares - 1, 1) - 1) / 2, 1, 16))
-        return cls(float(period), squares, first, cells, bands, frequencies, True, turned)
+        cells = int(np.clip((3 * rest / max(squares - 1, 1) - 1) / 2, 1, 24))
+        return cls(float(period), squares, first, cells, 1, frequencies, True, turned)
 
     def places(
         self, directions: NDArray[np.float64], wavelengths: ArrayLike
@@ -121,9 +119,7 @@ class Layout:
         per_length = self.period / np.asarray(wavelengths)
         u, v = (self._place(np.where(x * sign > 0, shorter, longer) * per_length) for sign in (1, -1))
         if self.lines:
-            first, last = self.frequencies
-            share = np.clip((1 / np.asarray(wavelengths) - first) / (last - first), 0, 1)
-            row = np.minimum(np.floor(share * self.slices), self.slices - 1) + 0 * x
+            row = np.zeros(len(x))
         else:
             y = y / (1 + c)
             row = (1 - np.copysign(1 - _equidistant(1 - np.abs(y)), -y)) / 2 * (self.slices - 1)
@@ -141,14 +137,13 @@ class Layout:
 
 
 def _equidistant(f: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (t + t²)/2 of f = t⁴; below 0 and above 1, of the nearest."""
-    root = np.sqrt(np.clip(f, 0, 1))
-    return (np.sqrt(root) + root) / 2
+    """Return √f; below 0 and above 1, of the nearest."""
+    return np.sqrt(np.clip(f, 0, 1))
 
 
 def _fraction(h: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the inverse of `_equidistant`."""
-    return ((np.sqrt(1 + 8 * h) - 1) / 2) ** 4
+    return h**2
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,13 +178,13 @@ class EnergyTable:
         layout = Layout.of(spectrum, furnace)
         e, loss = corners(furnace, layout)
         table = cls.packed(layout, e, loss)
-        if furnace.by_order or not table.needed:
+        if not table.needed or (furnace.by_order and spectrum.wavelengths[1] * 1e-3 * spectrum.lobe_width < NARROW):
             return table
-        # Of gathered cells, against the spectrum itself.
-        places = random_places(spectrum.wavelengths)
+        # Against the spectrum itself: cells were gathered, and orders represented by the centres of their lobes.
+        places = random_places(spectrum.wavelengths, int(np.clip(2e5 / np.prod(spectrum.grid.shape), CHECKED, 150)))
         # Of two estimates the smaller: what both exceed is no noise.
         found = [albedo_of_nodes(spectrum, *places, height_scale, table.at, seed) for seed in (0, 1)]
-        excess = max(float(np.minimum(*found).max()) - 1, GATHERED)
+        excess = max(float(np.minimum(*found).max()) - 1, 0.0 if furnace.by_order else GATHERED)
         return cls.packed(layout, e / (1 + excess), (loss[0] + excess, loss[1] + excess))
 
     @classmethod
@@ -244,13 +239,13 @@ class EnergyTable:
         return cls(layout, steps, float(plain["least"]), (float(mean), float(largest)))
 
 
-def random_places(wavelengths: tuple[float, float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return `CHECKED` directions (n, 3), half of them beyond 60°, and λ in µm, (n,); `wavelengths` in nm."""
+def random_places(wavelengths: tuple[float, float], count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return `count` directions (n, 3), half of them beyond 60°, and λ in µm, (n,); `wavelengths` in nm."""
     rng = np.random.default_rng(0)
-    theta = np.deg2rad(rng.uniform(np.where(rng.random(CHECKED) < 0.5, 0, 60), 88))
-    phi = rng.uniform(0, 2 * np.pi, CHECKED)
+    theta = np.deg2rad(rng.uniform(np.where(rng.random(count) < 0.5, 0, 60), 88))
+    phi = rng.uniform(0, 2 * np.pi, count)
     directions = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1)
-    return directions, rng.uniform(*wavelengths, CHECKED) * 1e-3
+    return directions, rng.uniform(*wavelengths, count) * 1e-3
 
 
 def corners(furnace: Furnace, layout: Layout) -> tuple[NDArray[np.float64], tuple[float, float]]:
@@ -263,20 +258,18 @@ def corners(furnace: Furnace, layout: Layout) -> tuple[NDArray[np.float64], tupl
 
 
 def _line_corners(furnace: Furnace, layout: Layout) -> tuple[NDArray[np.float64], tuple[float, float]]:
-    """As `corners`, of a line grating: each slice bounds a at both ends of its band."""
-    first, last = layout.frequencies
+    """As `corners`, of a line grating."""
+    last = layout.frequencies[1]
     nodes = [layout.nodes(square) for square in range(layout.squares)]
     lattice = np.concatenate(nodes)
     square = np.repeat(np.arange(layout.squares), [len(n) for n in nodes])
     v, u = np.meshgrid(lattice, lattice, indexing="ij")
     nu = (u + v) / (2 * layout.period)
     reached = np.add.outer(square, square) < 2 * layout.period * last
-    wavelengths = 1 / np.linspace(last, first, layout.slices + 1)
-    e = np.ones((layout.slices, *nu.shape))
+    e = np.ones((1, *nu.shape))
     if layout.turned:
         furnace = dataclasses.replace(furnace, q=furnace.q[:, ::-1])
-    a = furnace.line_albedo(((v - u) / (u + v))[reached], nu[reached], wavelengths)
-    e[:, reached] = 1 / np.maximum(np.maximum(a[1:], a[:-1])[::-1], 1)
+    e[0, reached] = 1 / np.maximum(furnace.line_albedo(((v - u) / (u + v))[reached], nu[reached]), 1)
     inside = reached & (nu <= last)
     # The cells: each second node but the last of a unit square.
     start = np.concatenate([np.arange(0, len(n) - 1, 2) + np.flatnonzero(square == k)[0] for k, n in enumerate(nodes)])
@@ -286,11 +279,11 @@ def _line_corners(furnace: Furnace, layout: Layout) -> tuple[NDArray[np.float64]
 
     result = np.stack([at(e, j, i) for j in (0, 2) for i in (0, 2)], -1)
     # In the middle of the cells and of their edges.
-    excess = np.zeros(result.shape[:-1])
+    share = np.ones(result.shape[:-1])
     for j, i in ((1, 1), (0, 1), (1, 0), (2, 1), (1, 2)):
-        over = result @ _bilinear(np.float64(i / 2), np.float64(j / 2)) - at(e, j, i)
-        excess = np.maximum(excess, np.where(at(inside, j, i), over, 0))
-    result = np.maximum(result - excess[..., None], 0)
+        got = result @ _bilinear(np.float64(i / 2), np.float64(j / 2))
+        share = np.minimum(share, np.where(at(inside, j, i), at(e, j, i) / np.maximum(got, 1e-30), 1))
+    result = result * share[..., None]
     lost = (1 - result.mean(-1) / at(e, 1, 1))[:, at(inside, 1, 1)]
     return result, (float(lost.mean()), float(lost.max()))
 
@@ -328,15 +321,14 @@ def _general_corners(furnace: Furnace, layout: Layout) -> tuple[NDArray[np.float
     nodes, corner = np.unique((cells[:, None] + eight).reshape(-1, 3), axis=0, return_inverse=True)
     e = bound(nodes.astype(np.float64))[0][corner.reshape(-1, 8)]
     start = np.random.default_rng(0).random((len(cells), 3))
-    work = furnace.lobe_work(1 / first)[1] / RADIAL if furnace.by_order else 1
-    rounds = int(np.clip(PAIRS / (len(cells) * len(furnace.q) * work), *ROUNDS))
+    rounds = int(np.clip(PAIRS / (len(cells) * len(furnace.q)), *ROUNDS))
     for index in range(rounds):
         inside = (start + index * STRIDE) % 1
         wanted, there = bound(cells + inside)
         weights = np.prod(np.where(eight, inside[:, None], 1 - inside[:, None]), -1)
-        over = (weights * e).sum(-1) - wanted
-        lost = np.clip(1 - (weights * e).sum(-1) / wanted, 0, 1)[there]
-        e -= np.where(there, np.maximum(over, 0), 0)[:, None]
+        got = (weights * e).sum(-1)
+        lost = np.clip(1 - got / wanted, 0, 1)[there]
+        e *= np.where(there, np.minimum(wanted / np.maximum(got, 1e-30), 1), 1)[:, None]
     # Two cells share a corner (slice, row, column, corner).
     full = np.ones(layout.shape)
     for k, (above, j, i) in enumerate(eight):
