@@ -12,7 +12,7 @@ import importlib
 from .registration import register as _register
 
 _HOME = {
-    "GratingSpectrum": "spectrum",
+    "GratingSpectrum": "spectrum.grating_spectrum",
     "HeightField": "surface.heightfield",
     "Recipe": "recipe",
     "precompute": "spectrum.build",

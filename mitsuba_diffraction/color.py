@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .errors import RequestError
-from .wavelengths import VISIBLE
+from .settings import VISIBLE
 
 _OBSERVER = "CIE 1931 2 Degree Standard Observer"
 

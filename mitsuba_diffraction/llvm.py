@@ -1,4 +1,4 @@
-"""A usable LLVM for Dr.Jit's CPU backend.
+"""A usable LLVM for Dr.Jit's CPU backend, and the variant of Mitsuba to render with.
 
 Dr.Jit loads libLLVM once, when it is imported: the library in ``DRJIT_LIBLLVM_PATH``, or else the newest of the system.
 That may be missing or too old, without an error: with LLVM 15 and 16 the first kernel with ``dr.maximum`` or
@@ -14,6 +14,8 @@ import platform
 import warnings
 from importlib import metadata
 from pathlib import Path
+
+from .errors import RequestError
 
 MINIMUM_VERSION = (17, 0, 0)
 """Oldest LLVM that compiles every kernel: 15 and 16 abort at ``fmaximum``, Dr.Jit itself refuses 14."""
@@ -90,3 +92,51 @@ def _wheel_library() -> str | None:
             if file.name.startswith("libLLVM") and _usable(_library_version(file)):
                 return str(file)
     return None
+
+
+def is_spectral(name: str) -> bool:
+    """Whether a variant carries wavelengths, e.g. ``llvm_ad_spectral`` or ``scalar_spectral_polarized``."""
+    return "spectral" in name.split("_")
+
+
+def spectral_variants() -> list[str]:
+    """The spectral variants of the installed Mitsuba."""
+    import mitsuba as mi
+
+    return [name for name in mi.variants() if is_spectral(name)]
+
+
+def choose_variant(requested: str | None = None) -> str:
+    """The variant to render with: the requested one, or the fastest that runs on this machine.
+
+    Args:
+        requested: a spectral variant, or None for ``cuda_ad_spectral`` with a GPU and ``llvm_ad_spectral`` without.
+
+    Raises:
+        ValueError: ``requested`` is not a spectral variant.
+        RuntimeError: the variant cannot run on this machine; the message names what to install.
+    """
+    import drjit as dr
+
+    available = spectral_variants()
+    if requested is None:
+        if "cuda_ad_spectral" in available and dr.has_backend(dr.JitBackend.CUDA):
+            return "cuda_ad_spectral"
+        if "llvm_ad_spectral" not in available:
+            raise RuntimeError(
+                f"this Mitsuba has neither cuda_ad_spectral nor llvm_ad_spectral, only {', '.join(available)}"
+            )
+        if message := problem():
+            raise RuntimeError(f"{message}. `--variant scalar_spectral` works without it, much more slowly")
+        return "llvm_ad_spectral"
+
+    if requested not in available:
+        import mitsuba as mi
+
+        reason = "is not spectral" if requested in mi.variants() else "is unknown"
+        raise RequestError(f"variant {requested!r} {reason}; use one of {', '.join(available)}")
+    if requested.startswith("cuda") and not dr.has_backend(dr.JitBackend.CUDA):
+        raise RuntimeError(f"variant {requested!r} needs an NVIDIA GPU with a recent driver, and Dr.Jit found none")
+    if requested.startswith("llvm") and (message := problem()):
+        raise RuntimeError(f"variant {requested!r} cannot be used: {message}")
+    return requested

@@ -7,9 +7,11 @@ PNG, metadata of PDF, SVG and WebP, an entry of JSON, or a comment in Markdown.
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import itertools
 import json
+import math
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -103,12 +105,27 @@ def png_text(path: str | os.PathLike[str]) -> PngInfo:
     return text
 
 
-def save_json(content: Mapping[str, object], path: str | os.PathLike[str]) -> None:
-    """Writes a JSON file atomically."""
+def save_json(content: object, path: str | os.PathLike[str]) -> None:
+    """Write a dataclass, or a dictionary of such and of sequences, as a JSON file, whole or not at all.
+
+    What is not finite becomes null.
+    """
+    content = plain(content)
     request = made_for(path)
-    marked = dict(content) if request is None else {**content, "made for": request}
+    marked = content if request is None else {**content, "made for": request}
     with whole_file(path) as temporary:
         temporary.write_text(json.dumps(marked, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def plain(value: object) -> object:
+    """As JSON has it: dataclasses become dictionaries, tuples lists, and floats that are not finite None."""
+    if dataclasses.is_dataclass(value):
+        value = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return {name: plain(item) for name, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def save_markdown(text: str, path: str | os.PathLike[str]) -> None:

@@ -7,30 +7,29 @@ variant; importing `mitsuba_diffraction` has the same effect in all versions.
 from __future__ import annotations
 
 import functools
+import importlib
 from collections.abc import Callable
 
 import drjit as dr
 import mitsuba as mi
 
 from . import llvm
-from .bsdf import diffraction_grating
 from .bsdf.surface import hand_over
 from .errors import Bug, root_cause
-from .integrator import diffraction_path
-from .shader import integrator
-from .variants import is_spectral
+from .llvm import is_spectral
 
-# Name, registration function of Mitsuba, and a function that defines the class for the current variant.
+# Name, registration function of Mitsuba, and the module whose `define` makes the class for the current variant.
 PLUGINS = (
-    ("diffraction_grating", "register_bsdf", diffraction_grating.define),
-    ("diffraction_path", "register_integrator", diffraction_path.define),
-    ("diffraction_shader", "register_integrator", integrator.define),
+    ("diffraction_grating", "register_bsdf", "bsdf.diffraction_grating"),
+    ("diffraction_path", "register_integrator", "integrator.diffraction_path"),
+    ("diffraction_shader", "register_integrator", "evaluation.realtime_shader.integrator"),
 )
 
 
 def register(variant: str) -> None:
     """Register the plugins for `variant`, or stand-ins that raise the reason why they cannot work."""
-    for name, function, define in PLUGINS:
+    for name, function, module in PLUGINS:
+        define = importlib.import_module(f".{module}", __package__).define
         reason = None
         if not is_spectral(variant):
             reason = (

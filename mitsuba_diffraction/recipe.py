@@ -59,7 +59,7 @@ from .files import cache_folder, refuse_special
 from .progress import Progress, no_progress, part, silent
 from .rigorous import build as rigorous
 from .spectrum.build import precompute
-from .spectrum.file import FORMAT_VERSION
+from .spectrum.grating_spectrum import FORMAT_VERSION
 from .spectrum.load import Spectrum, load_spectrum
 from .surface.gratings import PATCHES, PROFILES
 from .surface.heightfield import HeightField

@@ -24,7 +24,7 @@ def register() -> None:
 def _watch(mitsuba: ModuleType) -> None:
     mitsuba.detail.add_variant_callback(_on_variant_change)
     if mitsuba.variant() is not None:
-        from . import plugin  # noqa: F401  (registers when it is imported)
+        from . import plugin  # noqa: F401
 
 
 def _on_variant_change(old: str | None, new: str | None) -> None:

@@ -26,9 +26,9 @@ from .geometry import k_g
 from .rigorous.axes import LARGEST_PERIOD
 from .rigorous.curve import is_profile
 from .rigorous.efficiencies import efficiencies
+from .settings import VISIBLE
 from .surface.heightfield import HeightField
 from .surface.periods import height_spectrum
-from .wavelengths import VISIBLE
 
 Array = NDArray[np.float64]
 OrderPowers = Callable[[NDArray[np.int64], Array], Array]

@@ -15,9 +15,9 @@ import matplotlib.pyplot as plt
 from PIL import Image
 
 from mitsuba_diffraction.files import whole_file
+from mitsuba_diffraction.llvm import choose_variant
 from mitsuba_diffraction.render import render
 from mitsuba_diffraction.render.preview import save_preview
-from mitsuba_diffraction.variants import choose_variant
 
 HERE = Path(__file__).parent
 DISCS = {"compact_disc", "dvd"}

@@ -1,6 +1,6 @@
 """Makes the stored rigorous results: `python precompute/rigorous_reference.py [OUT.json]`.
 
-Needs the extra "rigorous" (meent); about ten minutes on two cores. `scalar_theory.py` and `studies/coupled_waves.py`
+Needs the extra "rigorous" (meent); about ten minutes on two cores. `scalar_theory.py` and `validation/coupled_waves.py`
 read what it writes.
 """
 

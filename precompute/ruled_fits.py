@@ -1,6 +1,6 @@
 """Fits facet angles to measured gratings: `python precompute/ruled_fits.py [OUT.json]`; two minutes on one core.
 
-`studies/measured_gratings.py` reads what it writes.
+`validation/measured_gratings.py` reads what it writes.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from pathlib import Path
 
 from rich.progress import track
 
+from mitsuba_diffraction.evaluation.validation.ruled_fit import FITS, LINES_PER_MM, fit
 from mitsuba_diffraction.files import whole_file
-from mitsuba_diffraction.rigorous.ruled_fit import FITS, LINES_PER_MM, fit
 
 
 def make(path: Path) -> None:

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import mitsuba_diffraction as md
-from mitsuba_diffraction.bsdf import probe
+from mitsuba_diffraction import testing
 
-array, direction, floats, vectors = probe.array, probe.direction, probe.floats, probe.vectors
+array, direction, floats, vectors = testing.array, testing.direction, testing.floats, testing.vectors
 WAVELENGTHS = (400.0, 500.0, 600.0, 700.0)
 PERIOD = 2.5
 
@@ -77,18 +77,18 @@ def random_directions(rng, count, least=0.05):
 
 
 def interaction(wi, wavelengths=WAVELENGTHS, count=1, uv=(0.0, 0.0)):
-    return probe.interaction(np.broadcast_to(wi, (count, 3)), wavelengths, uv)
+    return testing.interaction(np.broadcast_to(wi, (count, 3)), wavelengths, uv)
 
 
 def evaluate(bsdf, wi, wo, ctx=None, wavelengths=WAVELENGTHS, uv=(0.0, 0.0)):
     """f cos θ_o (4, n) and pdf (n,)."""
-    value, pdf = probe.evaluate_pdf(bsdf, wi, np.atleast_2d(wo), wavelengths, ctx, uv)
+    value, pdf = testing.evaluate_pdf(bsdf, wi, np.atleast_2d(wo), wavelengths, ctx, uv)
     return value.T, pdf[:, 0]
 
 
 def draw(bsdf, wi, count, ctx=None, seed=1, uv=(0.0, 0.0), wavelengths=WAVELENGTHS):
     """Samples and their weights (4, n)."""
-    _, weights, bs = probe.sample(bsdf, np.broadcast_to(wi, (count, 3)), wavelengths, seed, ctx, uv)
+    _, weights, bs = testing.sample(bsdf, np.broadcast_to(wi, (count, 3)), wavelengths, seed, ctx, uv)
     return bs, weights.T
 
 

@@ -19,7 +19,7 @@ from mitsuba_diffraction import cli, progress
 from mitsuba_diffraction.progress import log_lines
 
 from bsdf_support import use  # isort: skip
-from mitsuba_diffraction.render import passes  # isort: skip
+from mitsuba_diffraction.render import passes
 
 # One example may be the first to import or to compile something.
 settings.register_profile("tests", deadline=None)

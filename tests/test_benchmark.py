@@ -10,13 +10,14 @@ from rich.console import Console
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction import gratings
-from mitsuba_diffraction.spectrum.slice_table import SliceTable
-from mitsuba_diffraction.studies import benchmark, report
-from mitsuba_diffraction.studies.accuracy import Exact
-from mitsuba_diffraction.studies.cases import Case, bundled_cases, scan_case
-from mitsuba_diffraction.studies.sampling import measure
-from mitsuba_diffraction.studies.theories import COLUMNS, compare_theories
-from mitsuba_diffraction.wavelengths import VISIBLE
+from mitsuba_diffraction.evaluation import report
+from mitsuba_diffraction.evaluation.benchmark import benchmark
+from mitsuba_diffraction.evaluation.benchmark.accuracy import Exact
+from mitsuba_diffraction.evaluation.benchmark.cases import Case, bundled_cases, scan_case
+from mitsuba_diffraction.evaluation.benchmark.sampling import measure
+from mitsuba_diffraction.evaluation.validation.theories import COLUMNS, compare_theories
+from mitsuba_diffraction.settings import VISIBLE
+from mitsuba_diffraction.spectrum.tables import SliceTable
 
 BLAZE = Case("blaze", gratings.blazed(2.5, 0.25), "tile", 65.0)
 SKIN = Case("skin", gratings.elaphe(8.0, pixel_size=0.08), "sample", 2.0)

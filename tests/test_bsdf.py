@@ -9,8 +9,8 @@ import pytest
 from bsdf_support import WAVELENGTHS, check_chi_square, direction, floats, interaction, plugin, random_directions, use
 
 import mitsuba_diffraction as md
-from mitsuba_diffraction.bsdf.probe import evaluate_pdf
-from mitsuba_diffraction.coherence import lobe_width
+from mitsuba_diffraction.settings import lobe_width
+from mitsuba_diffraction.testing import evaluate_pdf
 
 MAKE = {
     "flat": lambda: md.HeightField(np.zeros((1, 4)), 0.05),

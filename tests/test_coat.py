@@ -6,7 +6,7 @@ import pytest
 from bsdf_support import array, check_chi_square, direction, interaction, random_directions, use, vectors
 
 import mitsuba_diffraction as md
-from mitsuba_diffraction.bsdf import probe
+from mitsuba_diffraction import testing
 from mitsuba_diffraction.geometry import k_g
 from mitsuba_diffraction.scalar_theory import fresnel
 
@@ -46,11 +46,11 @@ def test_orders_have_the_powers_of_the_closed_form_inside(llvm, theta):
     checked = 0
     for m in (-3, -1, 0, 1, 3):
         q = np.stack(np.broadcast_arrays(m / 2.5 + offsets[:, None], offsets), -1).reshape(-1, 2)
-        wo = probe.towards(wi, q, 1e3 * wavelength)
-        centre = probe.towards(wi, np.array([m / 2.5, 0.0]), 1e3 * wavelength)
+        wo = testing.towards(wi, q, 1e3 * wavelength)
+        centre = testing.towards(wi, np.array([m / 2.5, 0.0]), 1e3 * wavelength)
         if not np.isfinite(wo).all() or centre[2] < 0.2:
             continue
-        power = wavelength**2 * cell * (probe.evaluate(bsdf, wi, wo, [1e3 * wavelength])[:, 0] / wo[:, 2]).sum()
+        power = wavelength**2 * cell * (testing.evaluate(bsdf, wi, wo, [1e3 * wavelength])[:, 0] / wo[:, 2]).sum()
         i, o = inside(wi), inside(centre)
         kappa = 2 * np.pi * RELATIVE * (i[2] + o[2]) / wavelength
         eta = np.cos(kappa * 0.05) ** 2 if m == 0 else (2 / (np.pi * m) * np.sin(kappa * 0.05)) ** 2
@@ -67,9 +67,9 @@ def test_a_coat_of_air_is_none(llvm):
     rng = np.random.default_rng(0)
     wi, wo = random_directions(rng, 200), random_directions(rng, 200)
     plain = {"coat_ior": AIR, "material": "Al"}
-    with_coat = probe.evaluate(coated(**plain), wi, wo, [400, 500, 600, 700])
+    with_coat = testing.evaluate(coated(**plain), wi, wo, [400, 500, 600, 700])
     bare = {"type": "diffraction_grating", "profile": "blazed", "period": 2.5, "depth": 0.25, "material": "Al"}
-    without = probe.evaluate(mi.load_dict({**bare, "coherence_length": 3.0}), wi, wo, [400, 500, 600, 700])
+    without = testing.evaluate(mi.load_dict({**bare, "coherence_length": 3.0}), wi, wo, [400, 500, 600, 700])
     np.testing.assert_allclose(with_coat, without, rtol=2e-3, atol=1e-5)
 
 
@@ -78,8 +78,8 @@ def test_reciprocal(llvm, material):
     rng = np.random.default_rng(1)
     wi, wo = random_directions(rng, 500, 0.1), random_directions(rng, 500, 0.1)
     bsdf = coated(**material)
-    there = probe.evaluate(bsdf, wi, wo, [450, 650]) / wo[:, 2:]
-    back = probe.evaluate(bsdf, wo, wi, [450, 650]) / wi[:, 2:]
+    there = testing.evaluate(bsdf, wi, wo, [450, 650]) / wo[:, 2:]
+    back = testing.evaluate(bsdf, wo, wi, [450, 650]) / wi[:, 2:]
     np.testing.assert_allclose(there, back, rtol=1e-4, atol=1e-4)
     assert there.max() > 0.01
 
@@ -89,7 +89,7 @@ def test_reciprocal(llvm, material):
 def test_the_front_face_reflects_as_fresnel_says_and_no_light_is_gained(llvm, theta, turned):
     wi = np.broadcast_to(direction(theta, turned), (100_000, 3))
     bsdf = coated()
-    wo, weight, bs = probe.sample(bsdf, wi, [550] * 4)
+    wo, weight, bs = testing.sample(bsdf, wi, [550] * 4)
     mirrored = np.array(mi.has_flag(bs.sampled_type, mi.BSDFFlags.DeltaReflection)) & (np.array(bs.pdf) > 0)
     np.testing.assert_allclose(wo[mirrored], np.broadcast_to(wi[0] * [-1, -1, 1], (mirrored.sum(), 3)), atol=1e-6)
     assert np.unique(np.array(bs.sampled_component)[mirrored]) == [1]
@@ -109,8 +109,8 @@ def test_samples_pass_the_chi_square_test(llvm, theta):
 
 def test_an_absorbing_layer_attenuates_both_passes(llvm):
     wi, wo = direction(30.0), direction([10.0, 40.0, 60.0], 180)
-    clear = probe.evaluate(coated(), wi, wo, [550])
-    dyed = probe.evaluate(coated(coat_absorption=0.004, coat_thickness=100.0), wi, wo, [550])
+    clear = testing.evaluate(coated(), wi, wo, [550])
+    dyed = testing.evaluate(coated(coat_absorption=0.004, coat_thickness=100.0), wi, wo, [550])
     cosines = inside(wi)[2], inside(wo)[:, 2]
     np.testing.assert_allclose(dyed[:, 0], clear[:, 0] * np.exp(-0.4 * (1 / cosines[0] + 1 / cosines[1])), rtol=1e-4)
 
@@ -120,7 +120,7 @@ def test_a_pigmented_base_is_seen_through_the_layer(llvm):
     wi, wo = direction(20.0), direction(65.0, 90)
     context = mi.BSDFContext()
     context.component = 1
-    value, _ = probe.evaluate_pdf(coated(int_ior=INDEX, base=base), wi, wo, [550], context)
+    value, _ = testing.evaluate_pdf(coated(int_ior=INDEX, base=base), wi, wo, [550], context)
     # The grating's own index is that of the layer: only the front face reflects.
     expected = transmittance(wi[2]) * transmittance(wo[2]) * 0.5 / np.pi * wo[2]
     assert value[0] == pytest.approx(expected, rel=1e-4)
@@ -131,7 +131,7 @@ def test_scalar_and_polarised_variants_agree():
     found = []
     for variant in ("llvm_ad_spectral", "scalar_spectral", "llvm_ad_spectral_polarized"):
         use(variant)
-        found.append(probe.evaluate(coated(material="Al"), wi, wo, [450, 550, 650, 750]))
+        found.append(testing.evaluate(coated(material="Al"), wi, wo, [450, 550, 650, 750]))
     np.testing.assert_allclose(found[1], found[0], rtol=1e-3)
     # Off the normal s and p pass the front face unequally: a little more or less passes twice.
     np.testing.assert_allclose(found[2], found[0], rtol=1e-2)
@@ -200,7 +200,7 @@ def test_a_layer_of_the_index_of_the_outside_is_none(llvm, layer, without):
     assert found.coat is None
     plain = {"type": "diffraction_grating", "profile": "blazed", "period": 2.5, "depth": 0.25, "coherence_length": 3.0}
     wi, wo = direction(20.0), direction(-30.0)
-    values = [probe.evaluate(bsdf, wi, wo, [550]) for bsdf in (found, mi.load_dict({**plain, **without}))]
+    values = [testing.evaluate(bsdf, wi, wo, [550]) for bsdf in (found, mi.load_dict({**plain, **without}))]
     np.testing.assert_allclose(values[0], values[1], rtol=1e-6 if "coat_ior" not in without else 0.02)
 
 

@@ -13,13 +13,13 @@ from test_rigorous_bsdf import made_up
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction.color import delta_E, spectrum_to_XYZ
+from mitsuba_diffraction.evaluation.comparison import compare, summary
+from mitsuba_diffraction.evaluation.comparison.difference import difference, noise, white_luminance
+from mitsuba_diffraction.evaluation.comparison.pictures import NO_SHADOWS, Pictures
+from mitsuba_diffraction.evaluation.comparison.quirk_shares import quirk_shares
+from mitsuba_diffraction.evaluation.realtime_shader.evaluate import VARIANTS
+from mitsuba_diffraction.evaluation.realtime_shader.quirks import Quirks
 from mitsuba_diffraction.render.scene import channel_wavelengths, channel_weights
-from mitsuba_diffraction.shader.evaluate import VARIANTS
-from mitsuba_diffraction.shader.quirks import Quirks
-from mitsuba_diffraction.studies.shader_comparison import compare, summary
-from mitsuba_diffraction.studies.shader_comparison.difference import difference, noise, white_luminance
-from mitsuba_diffraction.studies.shader_comparison.pictures import NO_SHADOWS, Pictures
-from mitsuba_diffraction.studies.shader_comparison.quirk_shares import quirk_shares
 
 # A sphere above a plate, with a pigment; broad lobes, so that small pictures resolve them.
 GRATING = """<bsdf type="diffraction_grating"><string name="profile" value="{profile}"/>

@@ -167,8 +167,8 @@ def test_a_block_that_is_wrong_is_found(folder, command, llvm, capfd):
 
 def test_the_manual_lists_the_parameters_of_the_plugins(llvm):
     from mitsuba_diffraction.bsdf import diffraction_grating
+    from mitsuba_diffraction.evaluation.realtime_shader import integrator
     from mitsuba_diffraction.integrator import diffraction_path
-    from mitsuba_diffraction.shader import integrator
 
     text, listed, head = (ROOT / "docs" / "plugin.md").read_text().replace("`", ""), set(), []
     for line in text.splitlines():

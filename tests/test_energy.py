@@ -13,7 +13,7 @@ from bsdf_support import array, floats, interaction, use, vectors
 from bsdf_support import plugin as conserving_plugin
 
 import mitsuba_diffraction as md
-from mitsuba_diffraction.bsdf import probe
+from mitsuba_diffraction import testing
 from mitsuba_diffraction.energy.furnace import Furnace
 from mitsuba_diffraction.energy.table import EnergyTable
 from mitsuba_diffraction.geometry import horizon_gain, k_g
@@ -58,7 +58,7 @@ def random_directions(rng, count):
 
 def evaluate(bsdf, wi, wo, wavelengths):
     """f cos θ_o, (n,); directions (n, 3) or (3,), wavelengths (nm) (n,) or a number."""
-    return probe.evaluate(bsdf, wi, wo, np.broadcast_to(wavelengths, len(wo))[:, None])[:, 0]
+    return testing.evaluate(bsdf, wi, wo, np.broadcast_to(wavelengths, len(wo))[:, None])[:, 0]
 
 
 def near_orders(of, wi, wavelength, half=10, spacing=0.32, turn=0.0):

@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 from PIL import Image
 
 import mitsuba_diffraction as md
-from mitsuba_diffraction.shader.quirks import Quirks
-from mitsuba_diffraction.studies.brdf_map import MAP_METHODS, PROJECTIONS, brdf_map
-from mitsuba_diffraction.studies.figures import save_figures
-from mitsuba_diffraction.studies.published_surfaces import SURFACES, PublishedSurface
-from mitsuba_diffraction.studies.viewing_angle import (
+from mitsuba_diffraction.evaluation.realtime_shader.quirks import Quirks
+from mitsuba_diffraction.evaluation.validation.brdf_map import MAP_METHODS, PROJECTIONS, brdf_map
+from mitsuba_diffraction.evaluation.validation.figures import save_figures
+from mitsuba_diffraction.evaluation.validation.published_surfaces import SURFACES, PublishedSurface
+from mitsuba_diffraction.evaluation.validation.viewing_angle import (
     METHODS,
     ReflectanceMap,
     fit_period,

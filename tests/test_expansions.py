@@ -9,8 +9,10 @@ from hypothesis import strategies as st
 from scipy.special import jv
 
 import mitsuba_diffraction as md
-from mitsuba_diffraction.spectrum.expansions import (
+from mitsuba_diffraction.spectrum.tables import (
     Series,
+    SeriesTable,
+    SliceTable,
     chebyshev,
     chebyshev_nodes,
     chebyshev_polynomials,
@@ -19,8 +21,6 @@ from mitsuba_diffraction.spectrum.expansions import (
     svd,
     taylor,
 )
-from mitsuba_diffraction.spectrum.series_table import SeriesTable
-from mitsuba_diffraction.spectrum.slice_table import SliceTable
 
 LARGEST_KAPPA = 4 * np.pi / 0.36
 CENTRE = LARGEST_KAPPA / 2

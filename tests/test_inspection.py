@@ -14,13 +14,12 @@ from scipy.special import jv
 import mitsuba_diffraction as md
 from mitsuba_diffraction.bsdf.geometry import Geometry
 from mitsuba_diffraction.color import into_gamut, spectrum_to_linear_sRGB, spectrum_to_XYZ
+from mitsuba_diffraction.inspection import inspect, save_picture
+from mitsuba_diffraction.inspection.colours import WAVELENGTHS, illumination, order_angle, order_share, radiance
+from mitsuba_diffraction.inspection.picture import piece_shown, with_uncertainty
+from mitsuba_diffraction.inspection.statistics import broadened, scanned, statistics
+from mitsuba_diffraction.inspection.uncertainty import concerns
 from mitsuba_diffraction.scalar_theory import geometry, scalar_error
-from mitsuba_diffraction.studies.inspection import inspect, save_picture
-from mitsuba_diffraction.studies.inspection.colours import WAVELENGTHS, illumination, order_angle, order_share, radiance
-from mitsuba_diffraction.studies.inspection.concerns import concerns
-from mitsuba_diffraction.studies.inspection.picture import piece_shown, with_uncertainty
-from mitsuba_diffraction.studies.inspection.statistics import statistics
-from mitsuba_diffraction.studies.inspection.tip import broadened, scanned
 
 ROOT = Path(__file__).parents[1]
 PERIOD, DEPTH = 2.0, 0.2

@@ -127,7 +127,7 @@ def test_no_llvm_at_all(first: str) -> None:
         IMPORT,
         "print(llvm.problem())",
         "mi.set_variant('scalar_spectral'); mi.load_dict({'type': 'diffuse'})",
-        "from mitsuba_diffraction.variants import choose_variant",
+        "from mitsuba_diffraction.llvm import choose_variant",
         "assert choose_variant('scalar_spectral') == 'scalar_spectral'",
         "try: choose_variant('llvm_ad_spectral')",
         "except RuntimeError as error: print(error)",

@@ -15,10 +15,8 @@ from PIL import Image
 
 import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a variant is set)
 from mitsuba_diffraction.color import spectrum_to_XYZ
-from mitsuba_diffraction.render import SpectralImage, checkpoint, passes, render
-from mitsuba_diffraction.render.accumulation import Accumulation
-from mitsuba_diffraction.render.checkpoint import load_checkpoint, save_checkpoint
-from mitsuba_diffraction.render.passes import Interrupted
+from mitsuba_diffraction.render import SpectralImage, passes, render
+from mitsuba_diffraction.render.passes import Accumulation, Interrupted, load_checkpoint, save_checkpoint
 from mitsuba_diffraction.render.scene import channel_wavelengths, load_spectral_scene, scene_digest
 from mitsuba_diffraction.render.turntable import orbit
 
@@ -468,7 +466,7 @@ def test_a_checkpoint_is_the_old_one_until_the_new_one_is_whole(monkeypatch):
         assert Path("c").read_bytes() == whole
         raise ZeroDivisionError
 
-    monkeypatch.setattr(checkpoint, "seal", fail)
+    monkeypatch.setattr(passes, "seal", fail)
     with pytest.raises(ZeroDivisionError):
         save_checkpoint("c", "second", sums)
     assert files() == {"scene.xml", "c"}

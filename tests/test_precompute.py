@@ -12,7 +12,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction import HeightField, precompute
-from mitsuba_diffraction.coherence import lobe_width
+from mitsuba_diffraction.settings import lobe_width
 from mitsuba_diffraction.spectrum.spline_grid import SplineGrid
 
 REACHED = 2 / 0.36

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from bsdf_support import floats, random_directions, use, vectors
 
-from mitsuba_diffraction.bsdf import probe
+from mitsuba_diffraction import testing
 from mitsuba_diffraction.bsdf.geometry import Geometry
 from mitsuba_diffraction.geometry import k_g_between
 
@@ -17,8 +17,8 @@ DIRECTIONS = random_directions(np.random.default_rng(1), 5, 0.2)
 @pytest.mark.parametrize("variant", ["llvm_ad_spectral", "scalar_spectral", "llvm_ad_spectral_polarized"])
 def test_values_are_those_of_single_calls(variant):
     use(variant)
-    bsdf, wi = mi.load_dict(COPPER), probe.direction(30, 20)
-    value, pdf = probe.evaluate_pdf(bsdf, wi, DIRECTIONS, WAVELENGTHS)
+    bsdf, wi = mi.load_dict(COPPER), testing.direction(30, 20)
+    value, pdf = testing.evaluate_pdf(bsdf, wi, DIRECTIONS, WAVELENGTHS)
     assert (value.shape, pdf.shape) == ((5, 6), (5, 2))
     si = mi.SurfaceInteraction3f()
     si.wi, si.sh_frame = vectors(wi), mi.Frame3f(mi.Normal3f(0, 0, 1))
@@ -32,28 +32,28 @@ def test_values_are_those_of_single_calls(variant):
 
 
 def test_every_direction_may_have_wavelengths_of_its_own(llvm):
-    bsdf, wi = mi.load_dict(COPPER), probe.direction(30)
-    together = probe.evaluate(bsdf, wi, DIRECTIONS, WAVELENGTHS)
-    each = probe.evaluate(bsdf, DIRECTIONS[:, None], wi, WAVELENGTHS[:, None])  # reciprocal, but for the cosine
+    bsdf, wi = mi.load_dict(COPPER), testing.direction(30)
+    together = testing.evaluate(bsdf, wi, DIRECTIONS, WAVELENGTHS)
+    each = testing.evaluate(bsdf, DIRECTIONS[:, None], wi, WAVELENGTHS[:, None])  # reciprocal, but for the cosine
     np.testing.assert_allclose(each[..., 0] * DIRECTIONS[:, 2:], together * wi[2], rtol=1e-4)
 
 
 def test_samples_agree_with_values(llvm):
     bsdf = mi.load_dict(COPPER)
-    wi = np.broadcast_to(probe.direction(30), (64, 3))
-    wo, weights, found = probe.sample(bsdf, wi, WAVELENGTHS[:4])
-    value, pdf = probe.evaluate_pdf(bsdf, wi, wo, WAVELENGTHS[:4])
+    wi = np.broadcast_to(testing.direction(30), (64, 3))
+    wo, weights, found = testing.sample(bsdf, wi, WAVELENGTHS[:4])
+    value, pdf = testing.evaluate_pdf(bsdf, wi, wo, WAVELENGTHS[:4])
     np.testing.assert_allclose(weights * pdf, value, rtol=1e-3, atol=1e-6)
     np.testing.assert_allclose(np.array(found.pdf), pdf[:, 0], rtol=1e-3)
 
 
 def test_shapes_that_do_not_fit_are_refused(llvm):
     with pytest.raises(ValueError, match="wi, wo, wavelengths: got shapes"):
-        probe.evaluate(mi.load_dict(COPPER), [0, 0, 1], [0, 1], [500.0])
+        testing.evaluate(mi.load_dict(COPPER), [0, 0, 1], [0, 1], [500.0])
 
 
 @pytest.mark.parametrize("shadowing", [True, False])
 def test_k_g_is_that_of_the_bsdf(llvm, shadowing):
     wi, wo = (random_directions(np.random.default_rng(seed), 200, 0.01) for seed in (1, 2))
-    found = np.array(Geometry.of(probe.vectors(wi), probe.vectors(wo)).k_g(shadowing))
+    found = np.array(Geometry.of(testing.vectors(wi), testing.vectors(wo)).k_g(shadowing))
     np.testing.assert_allclose(k_g_between(wi, wo, shadowing), found, rtol=1e-4)

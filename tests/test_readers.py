@@ -296,7 +296,7 @@ def test_a_picture_that_unpacks_to_too_much_is_refused(tmp_path, refuse, monkeyp
 
 def test_an_archive_that_unpacks_to_too_much_is_refused(tmp_path, refuse, monkeypatch):
     np.savez_compressed(tmp_path / "scan.npz", heights=np.zeros((100, 100)))
-    monkeypatch.setattr("mitsuba_diffraction.surface.readers.arrays.MOST_BYTES", 1000)
+    monkeypatch.setattr("mitsuba_diffraction.surface.readers.pictures.MOST_BYTES", 1000)
     refuse("scan.npz", "wanted at most 1000")
 
 

@@ -9,9 +9,10 @@ import pytest
 from scipy.special import jv
 
 from mitsuba_diffraction import Recipe
-from mitsuba_diffraction.coherence import lobe_width
+from mitsuba_diffraction.settings import lobe_width
 from mitsuba_diffraction.surface.gratings import (
     COHERENCE_LENGTHS,
+    EIGHT_TO_FOURTEEN,
     PATCHES,
     PROFILES,
     compact_disc,
@@ -20,7 +21,6 @@ from mitsuba_diffraction.surface.gratings import (
     morpho_ridges,
     ruled,
 )
-from mitsuba_diffraction.surface.gratings.tracks import EIGHT_TO_FOURTEEN
 
 RECIPES = Path(__file__).parents[1] / "precompute"
 DISCS = {"compact_disc": (compact_disc, 1.6, 0.833, 3.054), "dvd": (dvd, 0.74, 0.400, 1.866)}

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from scipy.special import erfc, jv
 
 from mitsuba_diffraction import HeightField, gratings
-from mitsuba_diffraction.coherence import lobe_width
 from mitsuba_diffraction.reference import amplitudes, finite_tiles_spectrum, order_powers, power_spectrum
-from mitsuba_diffraction.welch import window_axes
+from mitsuba_diffraction.settings import lobe_width
+from mitsuba_diffraction.spectrum.sample import window_axes
 
 shapes = st.sampled_from([(1, 1), (1, 2), (2, 1), (1, 7), (6, 1), (2, 2), (3, 3), (4, 6), (5, 4), (7, 7), (8, 3)])
 kappas = st.floats(0, 4 * np.pi / 0.36)

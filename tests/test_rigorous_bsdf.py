@@ -10,10 +10,10 @@ import pytest
 from bsdf_support import check_chi_square, direction, evaluate, interaction, random_directions, use, vectors
 
 import mitsuba_diffraction as md
-from mitsuba_diffraction.bsdf import probe
+from mitsuba_diffraction import testing
 from mitsuba_diffraction.geometry import horizon_gain
 from mitsuba_diffraction.rigorous.axes import Axes
-from mitsuba_diffraction.rigorous.mueller import mueller
+from mitsuba_diffraction.rigorous.efficiencies import mueller
 from mitsuba_diffraction.rigorous.spectrum import RigorousSpectrum
 from mitsuba_diffraction.scalar_theory import fresnel
 
@@ -103,7 +103,7 @@ def pairs(spectrum, wavelength, count=400):
 def test_f_is_the_sum_over_the_orders(variant, spectrum):
     use(variant)
     wi, wo = pairs(spectrum, 0.47, 400 if variant.startswith("llvm") else 40)
-    value, _ = probe.evaluate_pdf(plugin(spectrum), wi, wo, (470.0,) * 4)
+    value, _ = testing.evaluate_pdf(plugin(spectrum), wi, wo, (470.0,) * 4)
     wanted = expected(spectrum, wi, wo, 0.47) * wo[:, 2]
     assert wanted.max() > 0
     np.testing.assert_allclose(value[:, 0], wanted, rtol=5e-3, atol=1e-3 * wanted.max())
@@ -112,7 +112,7 @@ def test_f_is_the_sum_over_the_orders(variant, spectrum):
 def test_exchange_of_the_directions_changes_nothing(llvm, spectrum):
     wi, wo = pairs(spectrum, 0.47)
     there, back = (
-        probe.evaluate_pdf(plugin(spectrum), a, b, (470.0,) * 4)[0][:, 0] / b[:, 2] for a, b in ((wi, wo), (wo, wi))
+        testing.evaluate_pdf(plugin(spectrum), a, b, (470.0,) * 4)[0][:, 0] / b[:, 2] for a, b in ((wi, wo), (wo, wi))
     )
     assert there.max() > 0
     np.testing.assert_allclose(there, back, rtol=1e-4, atol=1e-6 * there.max())
@@ -122,7 +122,7 @@ def test_exchange_of_the_directions_changes_nothing(llvm, spectrum):
 def test_samples_carry_the_efficiencies_evenly(llvm, spectrum, theta):
     wi = direction(theta, 30)
     for wavelength in (405.0, 470.0):
-        _, weights, _ = probe.sample(plugin(spectrum), np.broadcast_to(wi, (100_000, 3)), (wavelength,) * 4, 1)
+        _, weights, _ = testing.sample(plugin(spectrum), np.broadcast_to(wi, (100_000, 3)), (wavelength,) * 4, 1)
         weights = weights[:, 0]
         albedo = weights.mean()
         _, eta = spectrum.efficiencies(wi, wavelength * 1e-3)
@@ -152,7 +152,7 @@ def test_the_albedo_is_that_of_the_solver(llvm, solved):
     """By samples, of directions and wavelengths that are not nodes."""
     for theta, phi, wavelength in ((10, 20, 412.0), (50, 70, 450.0), (70, 0, 490.0)):
         wi = direction(theta, phi)
-        _, weights, _ = probe.sample(plugin(solved), np.broadcast_to(wi, (40_000, 3)), (wavelength,) * 4, 2)
+        _, weights, _ = testing.sample(plugin(solved), np.broadcast_to(wi, (40_000, 3)), (wavelength,) * 4, 2)
         exact = md.rigorous.efficiencies(md.gratings.blazed(0.3, 0.05, samples=64), wi, wavelength * 1e-3, int_ior=1.5)
         assert weights[:, 0].mean() == pytest.approx(exact.unpolarised.sum(), rel=0.05)
 
@@ -162,7 +162,7 @@ def test_a_profile_by_formula_is_built_in_the_scene(llvm):
     fine = {"type": "diffraction_grating", "profile": "sinusoidal", "period": 0.2, "depth": 0.05, "samples": 32}
     bsdf = mi.load_dict({**fine, "theory": "rigorous", "int_ior": 1.5, "ext_ior": 1.0, "tolerance": 0.9})
     wi = direction(30, 20)
-    _, weights, _ = probe.sample(bsdf, np.broadcast_to(wi, (20_000, 3)), (600.0,) * 4, 3)
+    _, weights, _ = testing.sample(bsdf, np.broadcast_to(wi, (20_000, 3)), (600.0,) * 4, 3)
     exact = md.rigorous.efficiencies(md.gratings.sinusoidal(0.2, 0.05, samples=32), wi, 0.6, int_ior=1.5)
     assert weights[:, 0].mean() == pytest.approx(exact.unpolarised.sum(), rel=0.1)
     assert "rigorous" in str(bsdf)
@@ -286,7 +286,7 @@ def test_polarised_light_is_split_as_the_solver_has_it(solved):
 def test_unpolarised_light_is_that_of_variants_without_polarisation(variant, solved):
     wi, wo = (omega[:6] for omega in pairs(solved, 0.47, 60))
     use("llvm_ad_spectral")
-    wanted = probe.evaluate_pdf(plugin(solved), wi, wo, (470.0,) * 4)[0][:, 0]
+    wanted = testing.evaluate_pdf(plugin(solved), wi, wo, (470.0,) * 4)[0][:, 0]
     use(variant)
     bsdf = plugin(solved)
     # `evaluate_pdf` has the cosine of the light's direction, ω_o of the BSDF.
@@ -345,7 +345,7 @@ def passed(theta, phi, wavelength):
 def test_a_coat_lets_through_what_the_solver_sends_out(llvm, coated, theta, phi, wavelength):
     wi = np.broadcast_to(direction(theta, phi), (40_000, 3))
     front, below = passed(theta, phi, wavelength)
-    _, weights, _ = probe.sample(under_coat(coated), wi, (wavelength * 1e3,) * 4, 2)
+    _, weights, _ = testing.sample(under_coat(coated), wi, (wavelength * 1e3,) * 4, 2)
     assert weights[:, 0].mean() == pytest.approx(front + below, rel=0.03)
     assert weights[:, 0].mean() < 1
 
@@ -365,7 +365,7 @@ def test_a_grating_under_a_coat_is_reciprocal(llvm, coated):
     wi, t = wi[inside], t[inside]
     wo = np.concatenate([t, np.sqrt(1 - (t**2).sum(1, keepdims=True))], axis=1)
     there, back = (
-        probe.evaluate_pdf(under_coat(coated), a, b, (450.0,) * 4)[0][:, 0] / b[:, 2] for a, b in ((wi, wo), (wo, wi))
+        testing.evaluate_pdf(under_coat(coated), a, b, (450.0,) * 4)[0][:, 0] / b[:, 2] for a, b in ((wi, wo), (wo, wi))
     )
     assert there.max() > 0
     np.testing.assert_allclose(there, back, rtol=2e-4, atol=1e-5 * there.max())
@@ -380,7 +380,7 @@ def test_polarised_light_passes_a_coat(coated):
     assert 0.02 < np.linalg.norm(found[1:, 0]) / found[0, 0] < 1
     # Without polarisation the mean transmittance of each face is taken, not that of s and of p.
     use("llvm_ad_spectral")
-    plain = probe.evaluate_pdf(under_coat(coated), wi[None], wo[None], (450.0,) * 4)[0][0, 0]
+    plain = testing.evaluate_pdf(under_coat(coated), wi[None], wo[None], (450.0,) * 4)[0][0, 0]
     assert found[0, 0] == pytest.approx(plain, rel=0.1)
 
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from mitsuba_diffraction import HeightField, gratings, rigorous
+from mitsuba_diffraction.evaluation.validation.coupled_waves import PROFILES, cases
 from mitsuba_diffraction.scalar_theory import fresnel, profile_powers, scalar_orders
-from mitsuba_diffraction.studies.coupled_waves import PROFILES, cases
 
 SCATMECH = json.loads((Path(__file__).parent / "data" / "scatmech.json").read_text(encoding="utf-8"))
 CONICAL = np.array([-0.3, 0.35, 0.887])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mitsuba_diffraction import rigorous
-from mitsuba_diffraction.rigorous import ruled_fit
+from mitsuba_diffraction.evaluation.validation import ruled_fit
 
 
 def test_the_profile_has_its_facets_at_right_angles():
@@ -53,7 +53,7 @@ def test_the_stored_angles_fit_best(theory):
 
 @pytest.mark.slow
 def test_measured_gratings_are_drawn_with_both_theories(llvm):
-    from mitsuba_diffraction.studies import measured_gratings
+    from mitsuba_diffraction.evaluation.validation import measured_gratings
 
     figure = measured_gratings.plot(step=300)
     assert len(figure.axes) == 4

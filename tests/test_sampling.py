@@ -22,12 +22,10 @@ from bsdf_support import (
 )
 
 import mitsuba_diffraction as md
-from mitsuba_diffraction.bsdf import probe
+from mitsuba_diffraction import testing
 from mitsuba_diffraction.bsdf.cell_sampler import CellSampler
-from mitsuba_diffraction.bsdf.incidence import Incidence
-from mitsuba_diffraction.bsdf.line_sampler import LineSampler
-from mitsuba_diffraction.bsdf.order_sampler import OrderSampler
-from mitsuba_diffraction.bsdf.order_spectrum import OrderSpectrum
+from mitsuba_diffraction.bsdf.geometry import Incidence
+from mitsuba_diffraction.bsdf.orders import LineSampler, OrderSampler, OrderSpectrum
 
 SKINS = "elaphe", "xenopeltis"  # slow to build
 BUNDLED = {
@@ -190,7 +188,7 @@ def test_a_spectrum_need_not_begin_at_the_shortest_wavelength(llvm):
         for s in (spectrum, md.precompute(md.gratings.sinusoidal(2.5, 0.25), coherence_length=3.0))
     )
     wi, wo = direction(20, 40), direction([10, 25, 60], 220)
-    found, wanted = (probe.evaluate(b, wi, wo, [380.0, 401.0, 550.0, 699.0]) for b in (bsdf, whole))
+    found, wanted = (testing.evaluate(b, wi, wo, [380.0, 401.0, 550.0, 699.0]) for b in (bsdf, whole))
     assert (found[:, 0] == 0).all()
     np.testing.assert_allclose(found[:, 1:], wanted[:, 1:], rtol=0.02, atol=1e-3 * wanted.max())
     with pytest.raises(RuntimeError, match=r"height_scale: got 1\.1, wanted 0 to 1"):

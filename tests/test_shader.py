@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 
 import mitsuba_diffraction as md
-from mitsuba_diffraction.bsdf.probe import array, vectors
-from mitsuba_diffraction.finite_tiles import tile_factor
+from mitsuba_diffraction.evaluation.realtime_shader import tristimulus
+from mitsuba_diffraction.evaluation.realtime_shader.evaluate import VARIANTS, colour, relative_radiance, shader_for
+from mitsuba_diffraction.evaluation.realtime_shader.picture import Emission, decode, encode
+from mitsuba_diffraction.evaluation.realtime_shader.quirks import Quirks
+from mitsuba_diffraction.evaluation.realtime_shader.taylor_textures import taylor_transforms
+from mitsuba_diffraction.evaluation.realtime_shader.tiling import tile_factor as tile_factor_drjit
+from mitsuba_diffraction.evaluation.realtime_shader.tiling import tiling_power
+from mitsuba_diffraction.reference import tile_factor
 from mitsuba_diffraction.render.scene import root_cause
-from mitsuba_diffraction.shader import tristimulus
-from mitsuba_diffraction.shader.evaluate import VARIANTS, colour, relative_radiance, shader_for
-from mitsuba_diffraction.shader.picture import Emission, decode, encode
-from mitsuba_diffraction.shader.quirks import Quirks
-from mitsuba_diffraction.shader.taylor_textures import taylor_transforms
-from mitsuba_diffraction.shader.tiling import tile_factor as tile_factor_drjit
-from mitsuba_diffraction.shader.tiling import tiling_power
+from mitsuba_diffraction.testing import array, vectors
 
 PUBLISHED, CORRECTED = Quirks.as_published(), Quirks.corrected()
 BLAZE = md.gratings.blazed(2.5, 0.25, samples=64)

@@ -8,12 +8,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import mitsuba_diffraction as md
-from mitsuba_diffraction.coherence import lobe_reach
-from mitsuba_diffraction.spectrum.expansions import chebyshev, nodes_for, svd, taylor
+from mitsuba_diffraction.settings import lobe_reach
 from mitsuba_diffraction.spectrum.orders import OrderGrid
-from mitsuba_diffraction.spectrum.series_table import SeriesTable
-from mitsuba_diffraction.spectrum.slice_table import SliceTable, halved, packed
 from mitsuba_diffraction.spectrum.spline_grid import SplineGrid, spline_integral
+from mitsuba_diffraction.spectrum.tables import (
+    SeriesTable,
+    SliceTable,
+    chebyshev,
+    halved,
+    nodes_for,
+    packed,
+    svd,
+    taylor,
+)
 
 LARGEST_KAPPA = 4 * np.pi / 0.36
 

@@ -19,9 +19,9 @@ import mitsuba_diffraction as md
 from mitsuba_diffraction import GratingSpectrum
 from mitsuba_diffraction.energy.table import EnergyTable, Layout
 from mitsuba_diffraction.files import seal
-from mitsuba_diffraction.spectrum.file import FORMAT_VERSION
-from mitsuba_diffraction.spectrum.slice_table import SliceTable
+from mitsuba_diffraction.spectrum.grating_spectrum import FORMAT_VERSION
 from mitsuba_diffraction.spectrum.spline_grid import SplineGrid
+from mitsuba_diffraction.spectrum.tables import SliceTable
 
 SHAPES = [(1, 1), (1, 8), (7, 1), (5, 5), (4, 6)]
 KINDS = ["taylor", "chebyshev", "svd", "slices"]

@@ -7,8 +7,8 @@ import pytest
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction.reference import power_spectrum
-from mitsuba_diffraction.spectrum import GratingSpectrum
-from mitsuba_diffraction.spectrum.standard_error import standard_error
+from mitsuba_diffraction.spectrum.grating_spectrum import GratingSpectrum
+from mitsuba_diffraction.spectrum.sample import standard_error
 
 KAPPA, REACH = 34.9, 5.56
 """rad/µm and cycles/µm: what light of 360 nm reaches."""

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 import mitsuba_diffraction as md
-from mitsuba_diffraction import rigorous, scalar_theory
-from mitsuba_diffraction.studies import analytic, conservation, coupled_waves, measured_gratings, report
-from mitsuba_diffraction.studies.accuracy import against_reference
-from mitsuba_diffraction.studies.checks import checks, scalar_range, surface_checks
-from mitsuba_diffraction.studies.record import Check, Record
+from mitsuba_diffraction import outputs, rigorous, scalar_theory
+from mitsuba_diffraction.evaluation import report
+from mitsuba_diffraction.evaluation.benchmark.accuracy import against_reference
+from mitsuba_diffraction.evaluation.validation import analytic, conservation, coupled_waves, measured_gratings
+from mitsuba_diffraction.evaluation.validation.checks import checks, scalar_range, surface_checks
+from mitsuba_diffraction.evaluation.validation.record import Check, Record
 
 PRECOMPUTE = Path(__file__).parents[1] / "precompute"
 CHECKS = checks()
@@ -360,14 +361,14 @@ def test_the_command_prints_and_writes(command, tmp_path, monkeypatch):
         Check("one", "good", lambda: Record(1.01, 1.0, 0.1, note="a | b"), "theory"),
         Check("two", "shown", lambda: Record(2.0, 1.0, None), "theory"),
     )
-    monkeypatch.setattr("mitsuba_diffraction.studies.checks.checks", lambda: few)
+    monkeypatch.setattr("mitsuba_diffraction.evaluation.validation.checks.checks", lambda: few)
     code, out, _ = command("validate", "--markdown", str(tmp_path / "a.md"), "--json", str(tmp_path / "a.json"))
     assert code == 0
     assert "1 of 1 within their bounds; 1 reported without one" in out
     assert "| one | good | 1 | 1.01 | 0.01 | 0.1 | ok | a \\| b | theory |" in (tmp_path / "a.md").read_text("utf-8")
     assert [r["name"] for r in json.loads((tmp_path / "a.json").read_text("utf-8"))["checks"]] == ["good", "shown"]
     bad = Check("one", "bad", lambda: Record(2.0, 1.0, 0.1), "theory")
-    monkeypatch.setattr("mitsuba_diffraction.studies.checks.checks", lambda: (*few, bad))
+    monkeypatch.setattr("mitsuba_diffraction.evaluation.validation.checks.checks", lambda: (*few, bad))
     code, out, error = command("validate")
     assert code == 1
     assert "bad" in error
@@ -405,7 +406,7 @@ def test_a_scan_is_validated_with_the_options_that_other_commands_take(command, 
         seen.append((height_field.filled, spectrum.extent))
         return ()
 
-    monkeypatch.setattr("mitsuba_diffraction.studies.checks.surface_checks", checks_of)
+    monkeypatch.setattr("mitsuba_diffraction.evaluation.validation.checks.surface_checks", checks_of)
     line = ("validate", str(tmp_path / "scan.npy"), "--pixel-size", "0.2", "--fill-missing")
     for extent in ("sample", "tile"):
         code, _, error = command(*line, *(("--extent", extent) if extent == "tile" else ()))
@@ -418,9 +419,9 @@ def test_a_scan_is_validated_with_the_options_that_other_commands_take(command, 
 
 def test_figures_are_drawn(command, tmp_path, monkeypatch):
     called = []
-    monkeypatch.setattr("mitsuba_diffraction.studies.checks.checks", lambda: ())
+    monkeypatch.setattr("mitsuba_diffraction.evaluation.validation.checks.checks", lambda: ())
     monkeypatch.setattr(
-        "mitsuba_diffraction.studies.figures.save_figures", lambda folder, progress: called.append(folder)
+        "mitsuba_diffraction.evaluation.validation.figures.save_figures", lambda folder, progress: called.append(folder)
     )
     assert command("validate", "--figures", str(tmp_path / "figures"))[0] == 0
     assert called == [tmp_path / "figures"]
@@ -428,7 +429,7 @@ def test_figures_are_drawn(command, tmp_path, monkeypatch):
 
 def test_results_are_plain_json(tmp_path):
     record = Check("energy", "b", lambda: Record(float("nan"), 0.0, 0.1), "c").run()
-    report.save_json({"checks": report.record_dicts([record])}, tmp_path / "a.json")
+    outputs.save_json({"checks": report.record_dicts([record])}, tmp_path / "a.json")
     assert json.loads((tmp_path / "a.json").read_text("utf-8"))["checks"][0]["found"] is None
 
 

@@ -3,7 +3,7 @@ from __future__ import annotations
 import drjit as dr
 import pytest
 
-from mitsuba_diffraction import llvm, variants
+from mitsuba_diffraction import llvm
 
 
 @pytest.fixture
@@ -19,49 +19,49 @@ def machine(monkeypatch: pytest.MonkeyPatch):
 
 @pytest.mark.parametrize("name", ["scalar_spectral", "llvm_ad_spectral", "cuda_ad_spectral_polarized"])
 def test_is_spectral(name: str) -> None:
-    assert variants.is_spectral(name)
-    assert name in variants.spectral_variants()
+    assert llvm.is_spectral(name)
+    assert name in llvm.spectral_variants()
 
 
 @pytest.mark.parametrize("name", ["scalar_rgb", "llvm_ad_mono_polarized", ""])
 def test_is_not_spectral(name: str) -> None:
-    assert not variants.is_spectral(name)
-    assert name not in variants.spectral_variants()
+    assert not llvm.is_spectral(name)
+    assert name not in llvm.spectral_variants()
 
 
 def test_gpu_comes_first(machine) -> None:
     machine(gpu=True, problem="no LLVM")
-    assert variants.choose_variant() == "cuda_ad_spectral"
+    assert llvm.choose_variant() == "cuda_ad_spectral"
 
 
 def test_llvm_where_there_is_no_gpu(machine) -> None:
     machine(gpu=False, problem=None)
-    assert variants.choose_variant() == "llvm_ad_spectral"
+    assert llvm.choose_variant() == "llvm_ad_spectral"
 
 
 def test_neither_gpu_nor_llvm(machine) -> None:
     machine(gpu=False, problem="install this")
     with pytest.raises(RuntimeError, match=r"install this.*--variant scalar_spectral"):
-        variants.choose_variant()
-    assert variants.choose_variant("scalar_spectral") == "scalar_spectral"
+        llvm.choose_variant()
+    assert llvm.choose_variant("scalar_spectral") == "scalar_spectral"
 
 
 @pytest.mark.parametrize("name", ["llvm_ad_spectral_polarized", "scalar_spectral"])
 def test_requested_variant(machine, name: str) -> None:
     machine(gpu=False, problem=None)
-    assert variants.choose_variant(name) == name
+    assert llvm.choose_variant(name) == name
 
 
 def test_requested_variant_that_cannot_run(machine) -> None:
     machine(gpu=False, problem="install this")
     with pytest.raises(RuntimeError, match=r"'llvm_ad_spectral' cannot be used: install this"):
-        variants.choose_variant("llvm_ad_spectral")
+        llvm.choose_variant("llvm_ad_spectral")
     with pytest.raises(RuntimeError, match=r"'cuda_ad_spectral' needs an NVIDIA GPU"):
-        variants.choose_variant("cuda_ad_spectral")
+        llvm.choose_variant("cuda_ad_spectral")
 
 
 @pytest.mark.parametrize(("name", "reason"), [("llvm_ad_rgb", "is not spectral"), ("spectral", "is unknown")])
 def test_requested_variant_that_is_refused(machine, name: str, reason: str) -> None:
     machine(gpu=True, problem=None)
     with pytest.raises(ValueError, match=rf"'{name}' {reason}; use one of .*llvm_ad_spectral"):
-        variants.choose_variant(name)
+        llvm.choose_variant(name)

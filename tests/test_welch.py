@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mitsuba_diffraction import HeightField
-from mitsuba_diffraction.welch import WindowAxis, carried_coherence_length, mean_periodogram, window_axes
+from mitsuba_diffraction.spectrum.sample import WindowAxis, carried_coherence_length, mean_periodogram, window_axes
 
 
 def flat(rows, columns, pixel):
@@ -101,7 +101,7 @@ def test_periodograms_are_those_of_direct_sums(shape, monkeypatch):
     x, y = WindowAxis(rng.random(5), np.array([0, 2, 6])), WindowAxis(rng.random(4), np.array([0, 5]))
     # In batches of one, and of all segments at once.
     several = [mean_periodogram(wave, x, y, shape)]
-    monkeypatch.setattr("mitsuba_diffraction.welch._BATCH", 1)
+    monkeypatch.setattr("mitsuba_diffraction.spectrum.sample._BATCH", 1)
     several.append(mean_periodogram(wave, x, y, shape))
     rows, columns = np.arange(shape[0]), np.arange(shape[1])
     wanted = np.zeros(shape)

@@ -1,4 +1,4 @@
-"""What lies under the surface: a nested BSDF that reflects."""
+"""What lies under the surface, a nested BSDF that reflects; plugins made by the constructors of other plugins."""
 
 from __future__ import annotations
 
@@ -6,6 +6,46 @@ import drjit as dr
 import mitsuba as mi
 
 from ..errors import RequestError
+
+
+def nested_plugin(kind: str, **parameters: object) -> mi.Object:
+    """A plugin without children.
+
+    Unlike mi.load_dict, this leaves Mitsuba's file resolver alone. mi.load_dict exchanges it for the time of the call,
+    and other plugins of the scene, which Mitsuba instantiates at the same time on other threads, may ask for it then.
+    """
+    props = mi.Properties(kind)
+    for name, value in parameters.items():
+        props[name] = value
+    return mi.PluginManager.instance().create_object(props)
+
+
+def is_grating(bsdf: mi.BSDF) -> bool:
+    """Whether a BSDF is of the class behind `diffraction_grating`."""
+    return hasattr(bsdf, "spectrum") and hasattr(bsdf, "along_pattern")
+
+
+def contains_grating(bsdf: mi.BSDF) -> bool:
+    """Whether a BSDF is a grating or one is nested in it."""
+    return is_grating(bsdf) or any(map(contains_grating, nested(bsdf)))
+
+
+def nested(bsdf: mi.BSDF) -> list[mi.BSDF]:
+    """The BSDFs that a BSDF holds, such as the two sides of a `twosided`."""
+
+    class Children(mi.TraversalCallback):
+        def __init__(self) -> None:
+            mi.TraversalCallback.__init__(self)
+            self.found: list[mi.BSDF] = []
+
+        def put(self, name: str, value: object, *rest: object) -> None:
+            if isinstance(value, mi.BSDF):
+                self.found.append(value)
+
+    callback = Children()
+    bsdf.traverse(callback)
+    return callback.found
+
 
 TRANSMITS = (
     mi.BSDFFlags.DiffuseTransmission

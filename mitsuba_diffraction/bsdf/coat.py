@@ -19,7 +19,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import RequestError, is_number
-from ..nested_plugin import nested_plugin
+from .base import nested_plugin
 from .tables import opaque
 
 _SAME_INDEX = 1e-3  # indices of refraction that differ by less, such as those of air and vacuum, are the same

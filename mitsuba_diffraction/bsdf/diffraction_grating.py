@@ -9,24 +9,21 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..coherence import SUN_COHERENCE_LENGTH
 from ..errors import RequestError, is_number
 from ..geometry import SHADOWING
 from ..manual import Parameter, listed
 from ..rigorous.spectrum import RigorousSpectrum
+from ..settings import SUN_COHERENCE_LENGTH, VISIBLE
 from ..surface.heightfield import HeightField
-from ..wavelengths import VISIBLE
-from .arithmetic import larger, limited, smaller
 from .base import base_from
 from .coat import coat_from
-from .geometry import Geometry
-from .incidence import Incidence
+from .geometry import Geometry, Incidence
 from .polarisation import Split, of_orders, of_plane, reflected, through_layer, unpolarised
 from .reflectance import reflectance_from
 from .rigorous_parameters import check_parameters
 from .shared import SharedTables
 from .surface import surface_from, warn_of_range
-from .tables import BELOW_ONE, opaque
+from .tables import BELOW_ONE, larger, limited, opaque, smaller
 
 # The share of samples that are uniform, for lobes that the sampler's averages miss; where both directions graze, K G
 # grows faster than samples that follow the cosine could bear.
@@ -89,7 +86,7 @@ rotate it without reflecting it; the back of a `twosided` shows its mirror image
 first edge of each triangle and is discontinuous: such a mesh needs UVs. Where dp_du vanishes Mitsuba picks an axis.
 
 The BRDF is R · K · G · S(q; κ)/λ² · E: R the power reflectance at the half vector, K and G as in `geometry.py`, S as in
-`order_spectrum.py` (orders) or `spline_spectrum.py` (a lattice), with q = −(ω_i + ω_o)/λ along the pattern's axes
+`orders.py` (orders) or `spline_spectrum.py` (a lattice), with q = −(ω_i + ω_o)/λ along the pattern's axes
 and κ = 2π (cos θ_i + cos θ_o)/λ. E, as in `energy.py`, bounds the albedo by one; it is one where the albedo is
 below one without it. Without shadowing K diverges as 1/cos θ near the horizon, and there is no E.
 

@@ -13,8 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..energy.table import EnergyTable
-from .arithmetic import larger, limited, smaller
-from .tables import NumberTable, PacketTable, opaque
+from .tables import NumberTable, PacketTable, larger, limited, opaque, smaller
 
 
 @dataclass

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RequestError
-from ..nested_plugin import nested_plugin
 from ..rigorous.materials import conductor
-from ..wavelengths import VISIBLE
+from ..settings import VISIBLE
+from .base import nested_plugin
 from .coat import Coat, absolute_index
 
 MODELS = ("exact", "schlick")

@@ -10,14 +10,12 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..rigorous.mueller import MIRRORED
+from ..rigorous.efficiencies import MIRRORED
 from ..rigorous.spectrum import RigorousSpectrum
-from .arithmetic import larger, limited, smaller
-from .geometry import Geometry, cos_square
-from .incidence import Incidence
+from .geometry import Geometry, Incidence, cos_square
 from .inversion import search, truncated_gaussian
-from .order_sampler import WHOLE
-from .tables import PacketTable, opaque
+from .orders import WHOLE
+from .tables import PacketTable, larger, limited, opaque, smaller
 
 CELLS = 8  # of the sampler to each unit of P and R
 PLANES = 4  # of its cells over the wavelengths

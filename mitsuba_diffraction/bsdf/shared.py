@@ -15,7 +15,7 @@ from ..rigorous.spectrum import RigorousSpectrum
 from ..spectrum.load import Spectrum
 from ..spectrum.orders import OrderGrid
 from .energy import Energy
-from .order_spectrum import OrderSpectrum
+from .orders import OrderSpectrum
 from .rigorous_orders import RigorousOrders
 from .spline_spectrum import SplineSpectrum
 

@@ -5,15 +5,12 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..spectrum import GratingSpectrum
+from ..spectrum.grating_spectrum import GratingSpectrum
 from ..spectrum.spline_grid import spline_weights
-from .arithmetic import larger
 from .cell_sampler import CellSampler
-from .geometry import Geometry
-from .incidence import Incidence
-from .order_power import order_power
-from .order_spectrum import of_continuum
-from .tables import opaque
+from .geometry import Geometry, Incidence
+from .orders import of_continuum, order_power
+from .tables import larger, opaque
 
 RIM = 3  # rings of zeros, so many as are read in a row
 

@@ -17,10 +17,10 @@ from ..progress import progress_bar
 from ..recipe import Recipe
 from ..rigorous.spectrum import RigorousSpectrum
 from ..scalar_theory import scalar_error
+from ..settings import VISIBLE
 from ..spectrum.build import THEORIES
 from ..spectrum.load import Spectrum, load_spectrum
 from ..surface.gratings import COHERENCE_LENGTHS, PROFILES
-from ..wavelengths import VISIBLE
 from .coat import Coat
 from .rigorous_parameters import settings_from, settings_of_medium
 

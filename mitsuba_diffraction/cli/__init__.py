@@ -5,6 +5,7 @@ Exit codes: 0 done; 1 the work failed; 2 the request was wrong; 130 interrupted.
 
 from __future__ import annotations
 
+import importlib
 import io
 import logging
 import signal
@@ -18,14 +19,10 @@ import typer
 from typer.core import TyperCommand
 
 from ..errors import Bug, RequestError, is_bug
-from .benchmark import benchmark
-from .compare import compare
 from .console import NAME, Log, Stopped, say, tell
-from .convergence import convergence
 from .inspect import inspect
 from .precompute import precompute
 from .render import render
-from .validate import validate
 
 # Click's, or that of the copy of Click which newer versions of Typer carry.
 _UsageError = typer.BadParameter.__base__
@@ -43,7 +40,10 @@ class _Command(TyperCommand):
 
 
 app = typer.Typer(add_completion=False, no_args_is_help=False, help="Diffraction gratings for Mitsuba 3.")
-for _command in (inspect, precompute, render, compare, convergence, validate, benchmark):
+# What judges the product is looked up by name: nothing depends on it.
+_JUDGES = ("compare", "convergence", "validate", "benchmark")
+_judges = (getattr(importlib.import_module(f"..evaluation.commands.{n}", __name__), n) for n in _JUDGES)
+for _command in (inspect, precompute, render, *_judges):
     app.command(cls=_Command)(_command)
 
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterable, Sequence
 
 from rich.console import Console, RenderableType
+from rich.table import Table
 
 from ..progress import NAME, progress_bar, say
 
-__all__ = ["NAME", "Log", "Stopped", "out", "progress_bar", "say", "show", "tell"]
+__all__ = ["NAME", "Log", "Stopped", "out", "progress_bar", "say", "show", "table", "tell"]
 
 out = Console(highlight=False, soft_wrap=True)
 
@@ -36,3 +38,13 @@ class Log(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         say(record.levelname.lower(), record.getMessage())
+
+
+def table(columns: Iterable[str], rows: Iterable[Sequence[str]], texts: int = 1) -> Table:
+    """For a terminal; the first `texts` columns hold texts, the others numbers."""
+    shown = Table(box=None, pad_edge=False)
+    for index, column in enumerate(columns):
+        shown.add_column(column, justify="left" if index < texts else "right", no_wrap=True)
+    for row in rows:
+        shown.add_row(*row)
+    return shown

@@ -11,15 +11,14 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
-from ..coherence import SUN_COHERENCE_LENGTH, lobe_width
+from ..inspection import Inspection, save_picture
+from ..inspection import inspect as look
+from ..inspection.picture import with_uncertainty
+from ..inspection.uncertainty import GREEN
 from ..outputs import free_name, save_json
-from ..studies.inspection import Inspection, save_picture
-from ..studies.inspection import inspect as look
-from ..studies.inspection.picture import with_uncertainty
-from ..studies.inspection.uncertainty import GREEN
-from ..studies.report import table
+from ..settings import SUN_COHERENCE_LENGTH, lobe_width
 from .arguments import Overwrite, check_suffix, claim
-from .console import progress_bar, show, tell
+from .console import progress_bar, show, table, tell
 from .inputs import files_read
 from .scan import (
     Channel,

@@ -11,10 +11,10 @@ from ..errors import RequestError
 from ..recipe import Recipe
 from ..rigorous.spectrum import RigorousSpectrum
 from ..scalar_theory import scalar_error
-from ..spectrum import GratingSpectrum
 from ..spectrum.build import REPRESENTATIONS, THEORIES
+from ..spectrum.grating_spectrum import GratingSpectrum
 from ..spectrum.load import Spectrum
-from ..surface.seam import seam_matters, seam_steps
+from ..surface.prepare import seam_matters, seam_steps
 from .arguments import Overwrite, check_suffix, claim
 from .console import progress_bar, tell
 from .inputs import files_read

@@ -52,16 +52,15 @@ def render(
     """Path-trace a scene into a spectral picture (.exr) with a preview (.png)."""
     import mitsuba as mi
 
-    from ..render.checkpoint import checkpoint_path
+    from ..llvm import choose_variant
     from ..render.denoise import guides as guides_of
-    from ..render.passes import Interrupted, trace_here
+    from ..render.passes import Interrupted, checkpoint_path, trace_here
     from ..render.passes import render as trace
     from ..render.preview import save_preview
     from ..render.scene import load_spectral_scene, named_sample_count
     from ..render.spectral_image import SpectralImage
     from ..render.turntable import frame_path, save_animation
     from ..render.turntable import orbit as motions_of_orbit
-    from ..variants import choose_variant
 
     if output is not None:
         check_suffix("-o", output, ".exr")

@@ -7,9 +7,9 @@ from typing import Annotated
 
 import typer
 
-from ..coherence import SUN_COHERENCE_LENGTH
 from ..errors import RequestError
 from ..recipe import Recipe
+from ..settings import SUN_COHERENCE_LENGTH
 from ..surface.prepare import STEP_NAMES, step_of
 
 PixelSize = Annotated[float | None, typer.Option(help="pixel size of the scan, µm")]

@@ -24,7 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 from numpy.polynomial.legendre import leggauss
@@ -34,11 +34,9 @@ from scipy.ndimage import maximum_filter1d
 from scipy.special import ndtri
 
 from ..geometry import horizon_gain, k_g
-from ..spectrum.orders import OrderGrid
-from ..spectrum.spline_grid import spline_integral
-
-if TYPE_CHECKING:
-    from ..spectrum.grating_spectrum import GratingSpectrum
+from ..spectrum.orders import LobeAxis, OrderGrid
+from ..spectrum.spline_grid import SplineGrid, spline_integral
+from ..spectrum.tables import SeriesTable, SliceTable
 
 KAPPA_STEP = 0.1  # radians of the fastest oscillation over κ, between which powers are linear
 CELL, CELLS = 0.2, 500  # width of a gathered cell in direction cosines at the shortest wavelength; cells at least
@@ -55,7 +53,22 @@ POINTS = 6000  # drawn by power among the nodes of a spectrum
 CHUNK = 1 << 16  # pairs (direction, component) at once, so that they stay in the cache
 
 
-def evaluated_by_order(spectrum: GratingSpectrum) -> bool:
+class PowerSpectrum(Protocol):
+    """What the furnace asks of a `GratingSpectrum`."""
+
+    grid: OrderGrid | SplineGrid
+    table: SeriesTable | SliceTable
+    lobes: tuple[LobeAxis, LobeAxis]
+    lobe_width: float
+    largest_kappa: float
+    height_range: float
+    wavelengths: tuple[float, float]
+
+    def powers(self, kappa: float) -> NDArray[np.float32]:
+        """Return the share of the reflected power of each node."""
+
+
+def evaluated_by_order(spectrum: PowerSpectrum) -> bool:
     """Return whether the BSDF evaluates the orders of `spectrum` one by one: of line gratings, and if none overlap."""
     if not isinstance(spectrum.grid, OrderGrid):
         return False
@@ -87,7 +100,7 @@ class Furnace:
     by_order: bool
 
     @classmethod
-    def of(cls, spectrum: GratingSpectrum, height_scale: float = 1.0) -> Furnace:
+    def of(cls, spectrum: PowerSpectrum, height_scale: float = 1.0) -> Furnace:
         """Return the components of `spectrum`, with its heights scaled by `height_scale`."""
         grid, by_order = spectrum.grid, evaluated_by_order(spectrum)
         max_kappa = spectrum.largest_kappa
@@ -279,7 +292,7 @@ def mirrored(
 
 
 def _gathered(
-    spectrum: GratingSpectrum, kappas: NDArray[np.float64], own: NDArray[np.float64] | float
+    spectrum: PowerSpectrum, kappas: NDArray[np.float64], own: NDArray[np.float64] | float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Gather the nodes of `spectrum` in the cells of a lattice, those near the mirror direction apart.
 
@@ -316,7 +329,7 @@ def _gathered(
 
 
 def albedo_of_nodes(
-    spectrum: GratingSpectrum,
+    spectrum: PowerSpectrum,
     directions: NDArray[np.float64],
     wavelengths: NDArray[np.float64],
     height_scale: float,

@@ -28,17 +28,14 @@ import dataclasses
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import RequestError
 from ..spectrum.orders import OrderGrid
-from .furnace import NARROW, Furnace, albedo_of_nodes
-
-if TYPE_CHECKING:
-    from ..spectrum.grating_spectrum import GratingSpectrum
+from .furnace import NARROW, Furnace, PowerSpectrum, albedo_of_nodes
 
 SLACK = 1e-3
 """What an albedo may exceed one by."""
@@ -90,7 +87,7 @@ class Layout:
         return self.slices, side, side, 4
 
     @classmethod
-    def of(cls, spectrum: GratingSpectrum, furnace: Furnace) -> Layout:
+    def of(cls, spectrum: PowerSpectrum, furnace: Furnace) -> Layout:
         """Choose the layout for `spectrum`: as fine as the work allows."""
         shortest, longest = (w * 1e-3 for w in spectrum.wavelengths)
         frequencies = 1 / longest, 1 / shortest
@@ -172,7 +169,7 @@ class EnergyTable:
         got.setflags(write=False)
 
     @classmethod
-    def of(cls, spectrum: GratingSpectrum, height_scale: float = 1.0) -> EnergyTable:
+    def of(cls, spectrum: PowerSpectrum, height_scale: float = 1.0) -> EnergyTable:
         """Make the table of `spectrum`, with its heights scaled by `height_scale`."""
         furnace = Furnace.of(spectrum, height_scale)
         layout = Layout.of(spectrum, furnace)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from ..bsdf.base import nested_plugin
 from ..errors import RequestError
 from ..manual import Parameter, listed
-from ..nested_plugin import nested_plugin
 from . import eye_paths
-from .gratings import Gratings
+from .eye_paths import Gratings
 from .light_paths import LightPaths
 
 PARAMETERS = (

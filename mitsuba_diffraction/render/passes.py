@@ -1,4 +1,9 @@
-"""Path-trace a scene in passes."""
+"""Path-trace a scene in passes, with the standard error of their sum and checkpoints of unfinished renderings.
+
+A checkpoint is an uncompressed `.npz` file (noise does not compress) with the fields of `Accumulation` and the `digest`
+of the request (`passes.Job`). The comment of the archive is the SHA-256 of the file (`files.seal`). It takes 8 bytes
+per pixel and channel, 710 MB for 1280 × 720 pixels, and twice that while it is being replaced.
+"""
 
 from __future__ import annotations
 
@@ -11,21 +16,152 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from importlib import metadata
 from itertools import pairwise
 from pathlib import Path
+from zipfile import BadZipFile, ZipFile
 
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..color import spectrum_to_XYZ
 from ..errors import RequestError
-from .accumulation import Accumulation
-from .checkpoint import load_checkpoint, save_checkpoint
+from ..files import UNSEALED, is_intact, seal, whole_file
 from .film import pass_seed, samples_drawn, trace_pass
 from .scene import channel_wavelengths, load_spectral_scene, scene_digest
 from .spectral_image import SpectralImage
+
+
+@dataclass(eq=False)
+class Accumulation:
+    """Sums over passes p = 1 … P of n_p samples per pixel each.
+
+    y_p is the luminance Y of a pixel in pass p alone. Floating-point sums depend on their order: passes must be added
+    in the order of their indices.
+
+    Attributes:
+        wavelengths: (n,) float64, nm.
+        sums: (height, width, n + 1) float64, Σ_p of the results of `trace_pass`.
+        luminance: (height, width) float64, Σ_p n_p y_p.
+        squares: (height, width) float64, Σ_p n_p y_p².
+        passes: P.
+        samples: N = Σ_p n_p.
+    """
+
+    wavelengths: NDArray[np.float64]
+    sums: NDArray[np.float64]
+    luminance: NDArray[np.float64]
+    squares: NDArray[np.float64]
+    passes: int = 0
+    samples: int = 0
+
+    @classmethod
+    def empty(cls, rows: int, columns: int, wavelengths: NDArray[np.float64]) -> Accumulation:
+        """Zero passes."""
+        return cls(
+            wavelengths,
+            np.zeros((rows, columns, wavelengths.size + 1)),
+            np.zeros((rows, columns)),
+            np.zeros((rows, columns)),
+        )
+
+    def add(self, traced: NDArray[np.float32], samples: int) -> None:
+        """Adds the result of `trace_pass` with that many samples per pixel."""
+        # einsum adds in a fixed order; a matrix product may be multithreaded.
+        weights = spectrum_to_XYZ(np.eye(self.wavelengths.size), self.wavelengths)[:, 1].astype(np.float32)
+        luminance = np.einsum("yxi,i->yx", traced[..., :-1], weights).astype(np.float64)
+        luminance = ratio(luminance, traced[..., -1])
+        self.sums += traced
+        self.luminance += samples * luminance
+        self.squares += samples * luminance**2
+        self.passes += 1
+        self.samples += samples
+
+    def radiance(self) -> NDArray[np.float32]:
+        """(height, width, n) float32, W m⁻² sr⁻¹ nm⁻¹."""
+        # Row by row, to avoid a second copy of the sums of a large picture.
+        return np.stack([ratio(row[:, :-1], row[:, -1:]).astype(np.float32) for row in self.sums])
+
+    def error(self) -> float:
+        """The 90th percentile of the relative standard error of luminance over all non-black pixels.
+
+        With σ² the variance of the luminance of a sample, y_p has the variance σ²/n_p. An unbiased estimate of σ² is
+
+            s² = (Σ_p n_p y_p² − (Σ_p n_p y_p)²/N) / (P − 1),
+
+        and the relative error of a pixel is (s/√N) / (Σ_p n_p y_p/N). The mean square over all pixels is not useful
+        where a lamp is seen by way of two gratings: it is dominated by fireflies and does not fall for hours. With few
+        passes the percentile is biased upwards by the variance of s².
+
+        Returns:
+            The error; NaN before two passes, or for a black picture.
+        """
+        lit = self.luminance > 0
+        if self.passes < 2 or not lit.any():
+            return float("nan")
+        luminance, squares = self.luminance[lit], self.squares[lit]
+        variance = np.maximum(squares - luminance**2 / self.samples, 0) / (self.passes - 1)
+        return float(np.percentile(np.sqrt(variance * self.samples) / luminance, 90))
+
+
+def ratio(sums: NDArray, weights: NDArray) -> NDArray:
+    """sums/weights, zero where the filter covers no sample."""
+    return np.divide(sums, weights, out=np.zeros_like(sums), where=weights != 0)
+
+
+def checkpoint_path(picture: Path) -> Path:
+    """The path of the checkpoint of a picture, next to it."""
+    return picture.with_name(f"{picture.name}.checkpoint")
+
+
+def save_checkpoint(path: str | os.PathLike[str], digest: str, sums: Accumulation) -> None:
+    """Writes a checkpoint atomically: after a kill or a power cut, `path` is either the old or the new one.
+
+    Raises:
+        OSError: if it cannot be written; the old one is kept.
+    """
+    with whole_file(path) as temporary:
+        with open(temporary, "wb") as stream:
+            np.savez(stream, digest=digest, **vars(sums))
+        with ZipFile(temporary, "a") as archive:
+            archive.comment = UNSEALED.encode()
+        seal(temporary)
+
+
+def load_checkpoint(path: str | os.PathLike[str], digest: str) -> Accumulation | None:
+    """Reads a checkpoint.
+
+    Args:
+        path: the file.
+        digest: of the request.
+
+    Returns:
+        The sums, or None if there is no such file.
+
+    Raises:
+        ValueError: if it is damaged, not a checkpoint, or one of another request.
+    """
+    if not os.path.exists(path):
+        return None
+    with open(path, "rb") as stream:
+        try:
+            if not is_intact(path):
+                raise RequestError("its contents do not match its digest")
+            with np.load(stream) as content:
+                found = content["digest"].item()
+                if found == digest:
+                    read = {name: content[name] for name in (field.name for field in fields(Accumulation))}
+                    return Accumulation(**{name: value if value.ndim else value.item() for name, value in read.items()})
+        # Raised by NumPy and zipfile for damaged files.
+        except (ValueError, KeyError, TypeError, EOFError, AttributeError, RuntimeError, OSError, BadZipFile) as error:
+            raise RequestError(f"{os.fspath(path)}: not a checkpoint, or a damaged one ({error})") from None
+    raise RequestError(
+        f"{os.fspath(path)}: of another rendering: the scene or a file that it references, an option or a version has "
+        "changed; repeat the original command, or remove the file to start over"
+    )
+
 
 # Two million samples take some seconds on two cores, which keeps progress and interrupts responsive. Passes
 # of large pictures take up to eight samples per pixel, as adding a pass to the sum takes one core as long as a third of

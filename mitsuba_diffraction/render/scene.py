@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RequestError, root_cause
+from ..llvm import is_spectral
 from ..recipe import Recipe
-from ..variants import is_spectral
-from ..wavelengths import VISIBLE
+from ..settings import VISIBLE
 
 # The spacing of the channels, nm.
 #

@@ -14,18 +14,15 @@ from zipfile import BadZipFile
 import numpy as np
 from numpy.typing import NDArray
 
-from ..coherence import SUN_COHERENCE_LENGTH, lobe_width
 from ..errors import RequestError
 from ..files import whole_file
+from ..settings import SUN_COHERENCE_LENGTH, VISIBLE, lobe_width
 from ..surface.heightfield import HeightField
-from ..wavelengths import VISIBLE
 from .axes import LARGEST_PERIOD, STORED, Axes
-from .blas import one_thread
 from .coordinate_transformation import Grating, light_from, scatter
 from .curve import Curve, curve_of
-from .efficiencies import converge, solve, wave_numbers
+from .efficiencies import REVERSED, converge, mueller, one_thread, solve, wave_numbers
 from .materials import refractive_index
-from .mueller import REVERSED, mueller
 from .spectrum import RigorousSpectrum
 
 Real = NDArray[np.float64]

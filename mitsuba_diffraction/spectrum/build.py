@@ -10,36 +10,37 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ..coherence import SUN_COHERENCE_LENGTH, lobe_reach, lobe_width
 from ..errors import RequestError
 from ..files import cache_folder
 from ..progress import Progress, part, silent
 from ..reference import check_extent
-from ..rigorous.blas import one_thread
 from ..rigorous.build import build_spectrum
+from ..rigorous.efficiencies import one_thread
+from ..settings import SUN_COHERENCE_LENGTH, VISIBLE, lobe_reach, lobe_width
 from ..surface.heightfield import HeightField
-from ..wavelengths import VISIBLE
-from ..welch import carried_coherence_length
-from . import GratingSpectrum
-from .expansions import (
+from .grating_spectrum import TAIL_SHARE, GratingSpectrum, check_angle, check_wavelengths
+from .load import Spectrum
+from .orders import LobeAxis
+from .patches import MeanPowers, check_patches
+from .sample import SamplePowers, carried_coherence_length, standard_error
+from .spline_grid import inner
+from .tables import (
     Series,
+    SeriesTable,
+    SliceTable,
     chebyshev,
     chebyshev_nodes,
     chebyshev_polynomials,
     chebyshev_transform,
+    halved,
     nodes_for,
+    packed,
+    place,
     position,
     svd,
     taylor,
+    to_polynomial,
 )
-from .grating_spectrum import TAIL_SHARE, check_angle, check_wavelengths
-from .load import Spectrum
-from .orders import LobeAxis, inner
-from .patches import MeanPowers, check_patches
-from .sample import SamplePowers
-from .series_table import SeriesTable
-from .slice_table import SliceTable, halved, packed, place, to_polynomial
-from .standard_error import standard_error
 from .tile import TilePowers, TileSplines
 
 THEORIES = ("scalar", "rigorous")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 
-from ..rigorous import file as rigorous_file
+from ..rigorous import spectrum as rigorous_file
 from ..rigorous.spectrum import RigorousSpectrum
 from .grating_spectrum import GratingSpectrum
 

@@ -4,16 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.special
 from numpy.typing import NDArray
 
 from ..errors import RequestError
-
-if TYPE_CHECKING:
-    from .spline_grid import SplineGrid
 
 
 @dataclass(frozen=True)
@@ -133,8 +129,3 @@ class OrderGrid:
             inside = float(scipy.special.erf(half_width / (np.sqrt(2) * lobe_width)))
             result.append(LobeAxis(count, half_width, inside))
         return tuple(result)
-
-
-def inner(grid: OrderGrid | SplineGrid, kept: OrderGrid | SplineGrid) -> tuple[slice, slice]:
-    """Where the nodes of `kept` lie among those of the larger `grid`."""
-    return tuple(slice(m - n, m + n + 1) for m, n in zip(grid.largest[::-1], kept.largest[::-1], strict=True))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..errors import RequestError
 from ..progress import Progress
 from ..surface.heightfield import HeightField
-from .expansions import chebyshev_nodes, chebyshev_polynomials, chebyshev_transform, nodes_for, position
+from .tables import chebyshev_nodes, chebyshev_polynomials, chebyshev_transform, nodes_for, position
 from .tile import TilePowers
 
 # Where the interpolation in κ is compared with direct sums, parts of the largest κ.

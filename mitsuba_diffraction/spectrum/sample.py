@@ -1,15 +1,120 @@
-"""The spectrum of a piece of a larger, irregular surface, by Welch's method (`welch.py`)."""
+"""The spectrum of a piece of a larger, irregular surface, by Welch's method (Welch 1967), and its standard error.
+
+Its power spectrum is estimated from windowed segments,
+
+    S(q; κ) = (d_x d_y/P) Σ_p |Σ_n a(x_n − x_p) e^{iκh_n} e^{−2πi q·x_n}|² / Σ_n a²            [µm²]
+
+averaged over P positions x_p; d is the pixel size. No window extends beyond the edge or wraps around.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
+
 import numpy as np
 import scipy.fft
+import scipy.ndimage
 from numpy.typing import NDArray
 
-from ..coherence import lobe_width
+from ..errors import RequestError
+from ..settings import lobe_width
 from ..surface.heightfield import HeightField
-from ..welch import UNIFORM, WindowAxis, mean_periodogram, window_axes
 from .spline_grid import SplineGrid
+
+# Windows are truncated at ±3 σ_s, where their amplitude is e^{−9/2}, 1 %.
+_SUPPORT = 6.0
+# Windows of three quarters of the scan leave room for three positions along each axis, σ_s apart.
+_LARGEST = 0.5
+_FEWEST_PIXELS = 4
+# Segments are transformed in batches of about this many numbers.
+_BATCH = 1 << 17
+
+
+@dataclass(frozen=True, eq=False)
+class WindowAxis:
+    """The windows along one axis.
+
+    Attributes:
+        window: a, (W,), sampled at the pixels, Σ a² = 1.
+        starts: first pixel of each position.
+    """
+
+    window: NDArray[np.float64] = field(repr=False)
+    starts: NDArray[np.int64] = field(repr=False)
+
+
+UNIFORM = WindowAxis(np.ones(1), np.zeros(1, np.int64))
+"""The window along an axis of one pixel."""
+
+
+def carried_coherence_length(height_field: HeightField, asked: float) -> float:
+    """The coherence length in µm that a scan supports: `asked`, but at most half of its shorter side.
+
+    An axis of one pixel imposes no limit: the surface is uniform along it.
+
+    Raises:
+        ValueError: if it is below four pixels, too short for a window.
+    """
+    lobe_width(asked)
+    axes = list(zip(height_field.tile_size, height_field.pixel_size, height_field.shape[::-1], strict=True))
+    carried = min([float(asked), *(_LARGEST * size for size, _, count in axes if count > 1)])
+    for _, pixel, count in axes:
+        if count > 1 and carried < _FEWEST_PIXELS * pixel * (1 - 1e-9):
+            raise RequestError(
+                f"coherence_length: got {asked:g} µm, of which the scan of {axes[0][0]:.4g} × {axes[1][0]:.4g} µm "
+                f"carries {carried:.4g}; wanted at least {_FEWEST_PIXELS} pixels ({_FEWEST_PIXELS * pixel:.4g} µm)"
+            )
+    return carried
+
+
+def window_axes(height_field: HeightField, coherence_length: float) -> tuple[WindowAxis | None, WindowAxis | None]:
+    """The windows along x and y for a coherence length (µm) that the scan supports; None for an axis of one pixel.
+
+    a(x) = exp(−x²/2σ_s²) with σ_s = L_c/4, about the centre of its support, 6σ_s rounded up to whole pixels. The
+    positions are evenly spaced from edge to edge of the scan, at most σ_s apart, rounded to whole pixels.
+    """
+    sigma = coherence_length / 4
+    return tuple(
+        _axis(count, pixel, sigma) if count > 1 else None
+        for count, pixel in zip(height_field.shape[::-1], height_field.pixel_size, strict=True)
+    )
+
+
+def mean_periodogram(
+    wave: NDArray[np.complex128], x: WindowAxis, y: WindowAxis, shape: tuple[int, int]
+) -> NDArray[np.float64]:
+    """(1/P) Σ_p |Σ_n a(x_n − x_p) wave_n e^{−2πi q·x_n}|² over all positions of the windows along x and y.
+
+    Args:
+        wave: (rows, columns) at the pixels.
+        x: windows along x.
+        y: windows along y.
+        shape: (rows, columns) of the result, at least those of the window: q as in `scipy.fft.fft2` of zero-padded
+            segments.
+    """
+    window = np.outer(y.window, x.window)
+    segments = np.lib.stride_tricks.sliding_window_view(wave, window.shape)
+    places = np.array([(row, column) for row in y.starts for column in x.starts])
+    total, step = np.zeros(shape), max(1, _BATCH // (shape[0] * shape[1]))
+    for first in range(0, len(places), step):
+        row, column = places[first : first + step].T
+        transform = scipy.fft.fft2(segments[row, column] * window, shape, overwrite_x=True, workers=2)
+        total += (transform.real**2 + transform.imag**2).sum(axis=0)
+    return total / len(places)
+
+
+def _axis(count: int, pixel: float, sigma: float) -> WindowAxis:
+    width = min(count, max(_FEWEST_PIXELS, _rounded_up(_SUPPORT * sigma / pixel)))
+    x = (np.arange(width) - (width - 1) / 2) * pixel
+    window = np.exp(-(x**2) / (2 * sigma**2))
+    places = _rounded_up((count - width) * pixel / sigma) + 1
+    return WindowAxis(window / np.linalg.norm(window), np.rint(np.linspace(0, count - width, places)).astype(np.int64))
+
+
+def _rounded_up(value: float) -> int:
+    """The ceiling, tolerant of rounding errors just above an integer."""
+    return int(np.ceil(value * (1 - 1e-9)))
+
 
 # Along an axis on which the surface is uniform the lobe is followed to this many σ_q.
 _UNIFORM_REACH = 6.0
@@ -112,3 +217,77 @@ class SamplePowers:
         ramp = [np.exp(-2j * np.pi * s * lags.lags / lags.count) for s, lags in zip(shift, self._lags, strict=True)]
         exact = self._transform(self._autocorrelation(kappa) * ramp[1][:, None] * ramp[0][self._lags[0].lags >= 0])
         return self.grid.error(kept, powers, exact, shift, self._reached)
+
+
+# Correlation of a surface beyond the width of a window is seen between batches of segments, not between segments.
+_BATCHES = 4  # along each axis
+_KAPPAS = 4
+
+
+def standard_error(height_field: HeightField, *, coherence_length: float, largest_kappa: float, reach: float) -> float:
+    """∫ of the standard error of S(q; κ) over q, at the worst of four κ: a share of the reflected power.
+
+    Welch's estimate Ŝ is the mean of P periodograms S_p. Those of overlapping windows are correlated; where the
+    phase is that of many independent features (Welch 1967, eq. 10 and 11; a is the window, Σ a² = 1),
+
+        ρ_ij = (Σ_n a(x_n − x_i) a(x_n − x_j))²,     var Ŝ(q) = σ²(q)/P_eff,     1/P_eff = Σ_ij ρ_ij/P²,
+
+    with σ² the variance of one periodogram. It follows from the scatter of the means S_b of at most four batches of
+    neighbouring places along each axis, ⟨·⟩ weighted by their places, r_b the mean of ρ within batch b:
+
+        ⟨(S_b − Ŝ)²⟩ = σ² (⟨r_b⟩ − 1/P_eff).
+
+    The variance is averaged over three by three frequencies 1/6σ_s apart, about one lobe, before its root is taken.
+    As `GratingSpectrum.error`, it is compared with ∫|ΔS| dq; of normal errors that is √(2/π) = 0.8 of it.
+
+    Args:
+        height_field: the scan.
+        coherence_length: in µm, that the scan carries.
+        largest_kappa: κ up to which S is wanted, rad/µm.
+        reach: largest |q_x| and |q_y| that light reaches, cycles/µm.
+    """
+    axes = [axis or UNIFORM for axis in window_axes(height_field, coherence_length)]
+    correlation, within = 1.0, 1.0
+    for axis in axes:
+        rho, share = _correlation(axis), _batches(axis)
+        correlation *= rho.mean()
+        within *= sum(rho[np.ix_(batch, batch)].sum() / len(batch) for batch in share) / len(axis.starts)
+    if within - correlation < 1e-12:
+        return 0.0  # a single pixel
+    inside = [
+        np.abs(scipy.fft.fftfreq(len(axis.window), pixel)) <= reach if len(axis.window) > 1 else np.ones(1, bool)
+        for axis, pixel in zip(axes, height_field.pixel_size, strict=True)
+    ]
+    errors = []
+    for kappa in largest_kappa * np.arange(1, _KAPPAS + 1) / _KAPPAS:
+        variance = _scatter(np.exp(1j * kappa * height_field.centred), axes) * correlation / (within - correlation)
+        smooth = scipy.ndimage.uniform_filter(variance, 3, mode="wrap")
+        errors.append(inside[1] @ np.sqrt(np.maximum(smooth, 0)) @ inside[0])
+    return float(max(errors))
+
+
+def _correlation(axis: WindowAxis) -> NDArray[np.float64]:
+    """ρ of the places along one axis, (P, P)."""
+    width = len(axis.window)
+    overlap = np.correlate(axis.window, axis.window, "full")[width - 1 :]
+    apart = np.abs(axis.starts[:, None] - axis.starts)
+    return np.where(apart < width, overlap[np.minimum(apart, width - 1)], 0) ** 2
+
+
+def _batches(axis: WindowAxis) -> list[NDArray[np.int64]]:
+    places = np.arange(len(axis.starts))
+    return np.array_split(places, min(_BATCHES, len(places)))
+
+
+def _scatter(wave: NDArray[np.complex128], axes: list[WindowAxis]) -> NDArray[np.float64]:
+    """⟨(S_b − Ŝ)²⟩ on the frequencies of the window's own transform, shares of the power: (W_y, W_x)."""
+    x, y = axes
+    shape = len(y.window), len(x.window)
+    means, weights = [], []
+    for rows in _batches(y):
+        for columns in _batches(x):
+            batch = WindowAxis(x.window, x.starts[columns]), WindowAxis(y.window, y.starts[rows])
+            means.append(mean_periodogram(wave, *batch, shape) / (shape[0] * shape[1]))
+            weights.append(len(rows) * len(columns))
+    mean = np.average(means, axis=0, weights=weights)
+    return np.average((np.array(means) - mean) ** 2, axis=0, weights=weights)

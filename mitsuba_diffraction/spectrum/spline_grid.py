@@ -10,7 +10,7 @@ import scipy.ndimage
 from numpy.typing import NDArray
 
 from ..errors import RequestError
-from .orders import inner
+from .orders import OrderGrid
 
 
 @dataclass(frozen=True)
@@ -119,3 +119,8 @@ def spline_integral(x: NDArray[np.float64]) -> NDArray[np.float64]:
     """∫B from −∞ to x."""
     x = np.clip(x, -1.5, 1.5)
     return sum(c * np.maximum(x + 1.5 - k, 0) ** 3 for k, c in enumerate((1, -3, 3, -1))) / 6
+
+
+def inner(grid: OrderGrid | SplineGrid, kept: OrderGrid | SplineGrid) -> tuple[slice, slice]:
+    """Where the nodes of `kept` lie among those of the larger `grid`."""
+    return tuple(slice(m - n, m + n + 1) for m, n in zip(grid.largest[::-1], kept.largest[::-1], strict=True))

@@ -10,8 +10,8 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from ..surface.heightfield import HeightField
-from .orders import OrderGrid, inner
-from .spline_grid import SplineGrid, spline
+from .orders import OrderGrid
+from .spline_grid import SplineGrid, inner, spline
 
 
 class TilePowers:

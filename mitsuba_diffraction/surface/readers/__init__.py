@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ...errors import RequestError
 from ...files import refuse_special
 from ..heightfield import HeightField
-from . import arrays, gwyddion, instruments, pictures, simple_field, text
+from . import gwyddion, instruments, pictures, simple_field, text
 from .scan import Scan
 
 __all__ = ["read_height_field"]
@@ -26,8 +26,8 @@ _SHOWN = 300
 """Longest error text of a library to quote, characters: some quote a damaged header in full."""
 
 _WITHOUT_UNIT = {
-    ".npy": arrays.read_npy,
-    ".npz": arrays.read_npz,
+    ".npy": pictures.read_npy,
+    ".npz": pictures.read_npz,
     ".png": pictures.read,
     ".tif": pictures.read,
     ".tiff": pictures.read,

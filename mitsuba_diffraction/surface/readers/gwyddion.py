@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import RequestError
-from . import units
+from . import scan
 from .scan import MOST_BYTES, Channel, Scan, choose
 
 _NUMBERS = {"b": "<B", "c": "<B", "i": "<i", "q": "<q", "d": "<d"}
@@ -47,22 +47,22 @@ def read(path: Path, unit: str | tuple[str, str] | None, channel: str | int | No
             fields[int(match[1])] = dict(value[1].components())
         elif (match := _TITLE.fullmatch(name)) and isinstance(value, str):
             titles[int(match[1])] = value
-    given = units.pair(unit)
+    given = scan.pair(unit)
     described = {n: (_unit(field, "si_unit_xy") or given[0], _unit(field, "si_unit_z")) for n, field in fields.items()}
     channels = [
-        Channel(n, titles.get(n, "untitled"), units.is_length(z) or not z) for n, (_, z) in sorted(described.items())
+        Channel(n, titles.get(n, "untitled"), scan.is_length(z) or not z) for n, (_, z) in sorted(described.items())
     ]
     chosen = choose(channels, channel)
     along, high = described[chosen.number]
     high = high or given[1]
     for what, one in (("heights", high), ("width", along)):
         if not one:
-            raise RequestError(f"unit: the file names none for the {what}, wanted one of {units.UNITS}")
+            raise RequestError(f"unit: the file names none for the {what}, wanted one of {scan.UNITS}")
     heights, size = _heights(fields[chosen.number])
-    scale = units.micrometres(along, "the width")
+    scale = scan.micrometres(along, "the width")
     rows, columns = heights.shape
     pixel_size = (size[0] * scale / columns, size[1] * scale / rows)
-    return Scan(heights * units.micrometres(high, "the heights"), pixel_size, chosen.name)
+    return Scan(heights * scan.micrometres(high, "the heights"), pixel_size, chosen.name)
 
 
 def _heights(field: dict[str, object]) -> tuple[NDArray[np.float64], tuple[float, float]]:

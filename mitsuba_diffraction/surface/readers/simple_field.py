@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import RequestError
-from . import units
+from . import scan
 from .scan import MOST_BYTES, Scan
 
 _MAGIC = b"Gwyddion Simple Field 1.0\n"
@@ -41,16 +41,16 @@ def read(path: Path, unit: str | tuple[str, str] | None) -> Scan:
         file.seek(start)
         numbers = np.frombuffer(file.read(4 * rows * columns), "<f4").reshape(rows, columns)
     along, high = (
-        fields.get(name, "") or given for name, given in zip(("XYUnits", "ZUnits"), units.pair(unit), strict=True)
+        fields.get(name, "") or given for name, given in zip(("XYUnits", "ZUnits"), scan.pair(unit), strict=True)
     )
     if not high:
-        raise RequestError(f"unit: the file names none for its heights, wanted one of {units.UNITS}")
-    heights = numbers.astype(np.float64) * units.micrometres(high, "ZUnits")
+        raise RequestError(f"unit: the file names none for its heights, wanted one of {scan.UNITS}")
+    heights = numbers.astype(np.float64) * scan.micrometres(high, "ZUnits")
     if not ("XReal" in fields and "YReal" in fields):
         return Scan(heights, None, fields.get("Title", ""))
     if not along:
-        raise RequestError(f"unit: the file names none along the surface, wanted one of {units.UNITS}")
-    scale = units.micrometres(along, "XYUnits")
+        raise RequestError(f"unit: the file names none along the surface, wanted one of {scan.UNITS}")
+    scale = scan.micrometres(along, "XYUnits")
     pixel_size = (_length(fields, "XReal") * scale / columns, _length(fields, "YReal") * scale / rows)
     return Scan(heights, pixel_size, fields.get("Title", ""))
 

@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import RequestError
-from . import units
+from . import scan
 from .scan import MOST_BYTES, Scan
 
 _OFF_GRID = 0.1
@@ -54,10 +54,10 @@ def read_points(path: Path, unit: str | tuple[str, str] | None) -> Scan:
     points = _table(_text(path))
     if points.shape[1] != 3:
         raise RequestError(f"got {points.shape[1]} numbers in a line, wanted three: x y z")
-    along, high = units.pair(unit)
+    along, high = scan.pair(unit)
     if not along:
         raise RequestError(
-            f"unit: .xyz names none, wanted one of {units.UNITS} (two: along the surface, of the heights)"
+            f"unit: .xyz names none, wanted one of {scan.UNITS} (two: along the surface, of the heights)"
         )
     if not np.isfinite(points[:, :2]).all():
         raise RequestError("got a point without x or y")
@@ -69,9 +69,9 @@ def read_points(path: Path, unit: str | tuple[str, str] | None) -> Scan:
         raise RequestError("two points at one place: wanted a regular grid along x and y")
     heights = np.full(rows * columns, np.nan)
     heights[place] = points[:, 2]
-    scale = units.micrometres(along, "unit")
+    scale = scan.micrometres(along, "unit")
     pixel_size = (d_x * scale, d_y * scale) if d_x and d_y else None  # a single line determines only one of them
-    return Scan(heights.reshape(rows, columns) * units.micrometres(high, "unit"), pixel_size)
+    return Scan(heights.reshape(rows, columns) * scan.micrometres(high, "unit"), pixel_size)
 
 
 def read_table(path: Path, unit: str | tuple[str, str] | None) -> Scan:
@@ -89,14 +89,14 @@ def read_table(path: Path, unit: str | tuple[str, str] | None) -> Scan:
     rows, columns = heights.shape
     if not header and columns == 3 and _may_be_points(heights):
         raise RequestError("three numbers a line that may be points x y z: wanted the extension .xyz for points")
-    along, high = units.pair(unit)
+    along, high = scan.pair(unit)
     high = header.get("Value units", high)
     if not high:
-        raise RequestError(f"unit: the file names none, wanted one of {units.UNITS}")
+        raise RequestError(f"unit: the file names none, wanted one of {scan.UNITS}")
     pixel_size = None
     if "Width" in header and "Height" in header:
         pixel_size = (_length(header["Width"], along) / columns, _length(header["Height"], along) / rows)
-    return Scan(heights * units.micrometres(high, "Value units"), pixel_size, header.get("Channel", ""))
+    return Scan(heights * scan.micrometres(high, "Value units"), pixel_size, header.get("Channel", ""))
 
 
 def _esri(text: str, unit: str | tuple[str, str] | None) -> Scan:
@@ -112,10 +112,10 @@ def _esri(text: str, unit: str | tuple[str, str] | None) -> Scan:
             raise RequestError(f"the header: got the line {line[:60]!r}, wanted a name and a number") from None
     if not {"ncols", "nrows", "cellsize"} <= header.keys():
         raise RequestError(f"the header of an ESRI grid: got {', '.join(header)}, wanted ncols, nrows and cellsize")
-    along, high = units.pair(unit)
+    along, high = scan.pair(unit)
     if not along:
         raise RequestError(
-            f"unit: an ESRI grid names none, wanted one of {units.UNITS} (two: along the surface, of the heights)"
+            f"unit: an ESRI grid names none, wanted one of {scan.UNITS} (two: along the surface, of the heights)"
         )
     heights = _table("\n".join(lines[len(header) :]))
     if heights.shape != (header["nrows"], header["ncols"]):
@@ -124,8 +124,8 @@ def _esri(text: str, unit: str | tuple[str, str] | None) -> Scan:
         )
     if "nodata_value" in header:
         heights = np.where(heights == header["nodata_value"], np.nan, heights)
-    cell = header["cellsize"] * units.micrometres(along, "unit")
-    return Scan(heights[::-1] * units.micrometres(high, "unit"), cell)
+    cell = header["cellsize"] * scan.micrometres(along, "unit")
+    return Scan(heights[::-1] * scan.micrometres(high, "unit"), cell)
 
 
 def _text(path: Path) -> str:
@@ -193,4 +193,4 @@ def _length(text: str, unit: str) -> float:
         value = float(number)
     except ValueError:
         raise RequestError(f"the header: got the length {text[:60]!r}, wanted a number and a unit") from None
-    return value * units.micrometres(own.strip() or unit, "the header")
+    return value * scan.micrometres(own.strip() or unit, "the header")

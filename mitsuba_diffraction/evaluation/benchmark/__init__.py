@@ -1,0 +1,1 @@
+"""The studies of `mitsuba-diffraction benchmark`: speed against error."""

@@ -1,0 +1,66 @@
+"""The surfaces that are measured."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+
+from ...settings import SUN_COHERENCE_LENGTH
+from ...spectrum.build import precompute
+from ...spectrum.grating_spectrum import GratingSpectrum
+from ...spectrum.sample import carried_coherence_length
+from ...surface import gratings
+from ...surface.heightfield import HeightField
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A surface and the way it is read.
+
+    Attributes:
+        name: as reports show it.
+        height_field: the surface.
+        extent: "tile" or "sample".
+        coherence_length: µm.
+    """
+
+    name: str
+    height_field: HeightField
+    extent: str
+    coherence_length: float
+
+    def spectrum(self, representation: str = "auto", tolerance: float = 1e-3) -> GratingSpectrum:
+        """The spectrum of the surface; arguments and errors as of `precompute`."""
+        with warnings.catch_warnings():
+            # That pixels are coarse is known.
+            warnings.simplefilter("ignore", UserWarning)
+            return precompute(
+                self.height_field,
+                extent=self.extent,
+                coherence_length=self.coherence_length,
+                representation=representation,
+                tolerance=tolerance,
+            )
+
+
+def bundled_cases() -> list[Case]:
+    """The gratings by formula, the synthetic skins of the recipes, and a surface of 65 µm with 512² pixels."""
+    sun = SUN_COHERENCE_LENGTH
+    large = gratings.xenopeltis(65.0, pixel_size=65 / 512, seed=1)
+    return [
+        Case("blazed", gratings.blazed(2.5, 0.25), "tile", sun),
+        Case("sinusoidal", gratings.sinusoidal(2.5, 0.3), "tile", sun),
+        Case("lamellar", gratings.lamellar(2.5, 0.2), "tile", sun),
+        Case("crossed", gratings.crossed(2.0, 0.1), "tile", sun),
+        # Coherence as in precompute/elaphe.toml and xenopeltis.toml.
+        Case("elaphe", gratings.elaphe(32.0, seed=1), "tile", 26.0),
+        Case("xenopeltis", gratings.xenopeltis(32.0, seed=1), "tile", 26.0),
+        Case("65 µm tile", large, "tile", sun),
+        Case("65 µm sample", large, "sample", carried_coherence_length(large, sun)),
+    ]
+
+
+def scan_case(height_field: HeightField) -> Case:
+    """A scan as a piece of an irregular surface, with the longest coherence length that it carries."""
+    coherence = carried_coherence_length(height_field, SUN_COHERENCE_LENGTH)
+    return Case(height_field.source, height_field, "sample", coherence)

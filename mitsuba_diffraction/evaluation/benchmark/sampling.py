@@ -1,0 +1,152 @@
+"""How much work a sample of the BSDF does: effective fraction, variance at equal time, time of a whole picture."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ... import testing
+from ...settings import VISIBLE
+from .cases import Case
+from .speed import seconds
+
+ANGLES = (0.0, 30.0, 60.0, 75.0, 85.0)
+_AZIMUTHS = (0.0, 30.0, 60.0, 90.0)
+_DRAWS = 4  # of the four wavelengths of a ray
+
+COLUMNS = {
+    "surface": "{.surface}",
+    **{f"fraction\n{angle:g}°": f"{{0.fractions[{index}]:.2f}}" for index, angle in enumerate(ANGLES)},
+    "largest\nweight": "{.largest_weight:.1f}",
+    "variance of\ncosine sampling": "{.variance_ratio:.0f}",
+    "picture\ntime": "{.picture_ratio:.2f}",
+}
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How well a surface is sampled.
+
+    Attributes:
+        surface: name of the case.
+        fractions: E[w]²/E[w²] at each of `ANGLES`, the least over azimuths; R = 1.
+        largest_weight: of all samples drawn.
+        variance_ratio: of cosine sampling to the BSDF's own, under a uniform sky, at equal time; the least over angles.
+        picture_ratio: seconds of a sphere under sun and sky, to the same with roughconductor (Al), at equal samples.
+    """
+
+    surface: str
+    fractions: tuple[float, ...]
+    largest_weight: float
+    variance_ratio: float
+    picture_ratio: float
+
+
+def measure(
+    cases: Sequence[Case],
+    tolerance: float,
+    *,
+    count: int = 1 << 16,
+    size: int = 128,
+    spp: int = 64,
+    repetitions: int = 3,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> list[Sampling]:
+    """Measures under the variant in force.
+
+    Args:
+        cases: surfaces.
+        tolerance: of their spectra.
+        count: samples for each direction and draw of wavelengths.
+        size: of the picture, pixels.
+        spp: of the picture, samples per pixel.
+        repetitions: of each timing, interleaved.
+        progress: called with (steps done, steps in all).
+    """
+    results = []
+    for case in cases:
+        grating = {"type": "diffraction_grating", "spectrum": case.spectrum(tolerance=tolerance)}
+        mirror = mi.load_dict({**grating, "material": "none"})
+        fractions, largest = zip(*(_fraction(mirror, angle, count) for angle in ANGLES), strict=True)
+        pictures = {
+            "grating": _sphere({**grating, "material": "Al"}, size),
+            "rough": _sphere({"type": "roughconductor", "material": "Al"}, size),
+        }
+        work = {name: lambda s=scene: dr.eval(mi.render(s, spp=spp)) for name, scene in pictures.items()}
+        taken = seconds(work, repetitions)
+        results.append(
+            Sampling(
+                surface=case.name,
+                fractions=fractions,
+                largest_weight=max(largest),
+                variance_ratio=min(_against_cosine(mirror, angle, count, repetitions) for angle in ANGLES),
+                picture_ratio=taken["grating"] / taken["rough"],
+            )
+        )
+        progress(len(results), len(cases))
+    return results
+
+
+def _wavelengths(shift: ArrayLike) -> NDArray[np.float64]:
+    """Equally spaced, shifted together, as Mitsuba's path tracer takes them: (..., 4) nm of shifts (..., 1)."""
+    return VISIBLE[0] + (VISIBLE[1] - VISIBLE[0]) * (shift + np.arange(4)) / 4
+
+
+def _fraction(bsdf: mi.BSDF, angle: float, count: int) -> tuple[float, float]:
+    """E[w]²/E[w²], the least over azimuths, and the largest w; the weight w is averaged over the four wavelengths.
+
+    The mean over draws of wavelengths.
+    """
+    drawn = _wavelengths((np.arange(_DRAWS)[:, None] + 0.5) / _DRAWS)
+    shape = len(_AZIMUTHS), _DRAWS, count
+    wi = np.broadcast_to(testing.direction(angle, np.array(_AZIMUTHS))[:, None, None], (*shape, 3))
+    wavelengths = np.broadcast_to(drawn[:, None], (*shape, 4))
+    _, weights, _ = testing.sample(bsdf, wi.reshape(-1, 3), wavelengths.reshape(-1, 4))
+    weight = weights.mean(axis=1).reshape(shape)
+    fractions = (weight.mean(axis=-1) ** 2 / (weight**2).mean(axis=-1)).mean(axis=-1)
+    return float(fractions.min()), float(weight.max())
+
+
+def _against_cosine(bsdf: mi.BSDF, angle: float, count: int, repetitions: int) -> float:
+    """Variance times seconds of cosine sampling, over those of the BSDF's own sampling, under a uniform sky."""
+    random = np.random.default_rng(1)
+    si = testing.interaction(np.broadcast_to(testing.direction(angle, 30.0), (count, 3)), _wavelengths(0.3))
+    sample1, sample2 = mi.Float(random.random(count)), mi.Point2f(random.random((2, count)))
+    dr.eval(si, sample1, sample2)
+
+    def own() -> mi.Float:
+        return dr.mean(mi.unpolarized_spectrum(bsdf.sample(mi.BSDFContext(), si, sample1, sample2)[1]))
+
+    def cosine() -> mi.Float:
+        wo = mi.warp.square_to_cosine_hemisphere(sample2)
+        value = dr.mean(mi.unpolarized_spectrum(bsdf.eval(mi.BSDFContext(), si, wo)))
+        return value / mi.warp.square_to_cosine_hemisphere_pdf(wo)
+
+    ways = {"cosine": cosine, "own": own}
+    taken = seconds({name: lambda way=way: dr.eval(way()) for name, way in ways.items()}, repetitions)
+    costs = {name: np.array(way(), np.float64).var() * taken[name] for name, way in ways.items()}
+    return float(costs["cosine"] / costs["own"])
+
+
+def _sphere(bsdf: dict, size: int) -> mi.Scene:
+    """A sphere under sun and sky."""
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "path", "max_depth": 4},
+            "sensor": {
+                "type": "perspective",
+                "fov": 30,
+                "to_world": mi.ScalarTransform4f().look_at(origin=[0, -4, 1], target=[0, 0, 0], up=[0, 0, 1]),
+                "film": {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}},
+            },
+            "sphere": {"type": "sphere", "bsdf": bsdf},
+            "sun": {"type": "directional", "direction": [-0.4, 0.6, -0.7]},
+            "sky": {"type": "constant"},
+        }
+    )

@@ -1,0 +1,96 @@
+"""The real-time shader on the same surfaces: what it reads, how fast it is, and how far its colours are off."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ...geometry import k_g_between
+from ...testing import vectors
+from ..realtime_shader.evaluate import shader_for
+from ..realtime_shader.quirks import Quirks
+from .accuracy import Exact, patch_difference, patch_directions
+from .cases import Case
+from .speed import Rays, seconds
+
+_R_0 = 0.04  # skin
+_SHADERS = (("flss", True), ("flss", False), ("nmm", True), ("pq", True))
+
+COLUMNS = {
+    "surface": "{.surface}",
+    "shader": "{.shader}",
+    "texel reads": "{.texel_reads}",
+    "speed\nratio": "{.evaluate_ratio:.1e}",
+    "ΔE00\nmean": "{0.delta_e[0]:.2f}",
+    "ΔE00\nmax": "{0.delta_e[1]:.1f}",
+}
+
+
+@dataclass(frozen=True)
+class ShaderSpeed:
+    """A shader on a tile.
+
+    Attributes:
+        surface: name of the case.
+        variant: "flss", "nmm" or "pq".
+        as_published: with its published peculiarities, or with none.
+        texel_reads: for one shading point, at most.
+        evaluate_ratio: shading points per second, to eval_pdf of roughconductor (Al) in the same run.
+        delta_e: (mean, largest) CIEDE2000 of the twelve patches against the exact model, after one factor of exposure.
+    """
+
+    surface: str
+    variant: str
+    as_published: bool
+    texel_reads: int
+    evaluate_ratio: float
+    delta_e: tuple[float, float]
+
+    @property
+    def shader(self) -> str:
+        """The variant as reports name it."""
+        return self.variant + (", as published" if self.as_published else ", corrected")
+
+
+def shader_speeds(case: Case, exact: Exact, *, count: int = 1 << 14, repetitions: int = 3) -> list[ShaderSpeed]:
+    """Measures the shaders on a tile under the variant in force.
+
+    Args:
+        case: the tile.
+        exact: of the same case.
+        count: shading points at once.
+        repetitions: of each timing, interleaved.
+    """
+    import colour
+
+    rays = Rays(count)
+    rough = mi.load_dict({"type": "roughconductor", "material": "Al"})
+    wi, wo = patch_directions()
+    cos_half = np.sqrt((1 + (wi * wo).sum(axis=-1)) / 2)
+    wanted = exact.xyz * ((_R_0 + (1 - _R_0) * (1 - cos_half) ** 5) * k_g_between(wi, wo))[:, None]
+    shaders, work = {}, {"rough": lambda: rays.evaluate(rough)}
+    for variant, published in _SHADERS:
+        shader = shader_for(case.height_field, variant, Quirks.as_published() if published else Quirks.corrected())
+        weights = shader.weights(_R_0)
+        shaders[variant, published] = shader, weights
+        work[variant, published] = lambda s=shader, w=weights: dr.eval(s.rgb(rays.si.wi, rays.wo, w))
+    taken = seconds(work, repetitions)
+    results = []
+    for (variant, published), (shader, weights) in shaders.items():
+        rgb = np.array(shader.rgb(vectors(wi), vectors(wo), weights), np.float64).T
+        xyz = rgb @ colour.RGB_COLOURSPACES["sRGB"].matrix_RGB_to_XYZ.T
+        xyz *= wanted[:, 1].sum() / xyz[:, 1].sum()
+        results.append(
+            ShaderSpeed(
+                surface=case.name,
+                variant=variant,
+                as_published=published,
+                texel_reads=shader.texel_reads,
+                evaluate_ratio=taken["rough"] / taken[variant, published],
+                delta_e=patch_difference(wanted, xyz),
+            )
+        )
+    return results

@@ -1,0 +1,1 @@
+"""The commands that judge the product: compare, convergence, validate, benchmark."""

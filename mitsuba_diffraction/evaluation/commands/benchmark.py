@@ -1,0 +1,77 @@
+"""`mitsuba-diffraction benchmark`: speed against error."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ... import outputs
+from ...cli.arguments import Overwrite, Variant, check_suffix, claim
+from ...cli.console import progress_bar, show, table
+from ...cli.inputs import files_read
+from ...cli.scan import HeightRange, PixelSize
+from ...errors import RequestError
+from ...surface.readers import read_height_field
+
+
+def benchmark(
+    context: typer.Context,
+    scan: Annotated[Path | None, typer.Argument(metavar="[SCAN]", help="a scan to include")] = None,
+    pixel_size: PixelSize = None,
+    height_range: HeightRange = None,
+    surface: Annotated[list[str] | None, typer.Option(help="only these of the built-in surfaces")] = None,
+    tolerance: Annotated[list[float] | None, typer.Option(help="only these tolerances")] = None,
+    variant: Variant = None,
+    rigorous: Annotated[
+        bool, typer.Option("--rigorous", help="compare the theories on 1200 lines/mm in aluminium instead; minutes")
+    ] = False,
+    json: Annotated[Path | None, typer.Option(help="save the results (.json)")] = None,
+    plot: Annotated[Path | None, typer.Option(help="plot error against speed (.png)")] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Measure error and speed of every representation, relative to Mitsuba's roughconductor."""
+    import mitsuba as mi
+
+    from ...llvm import choose_variant
+    from ...surface.gratings import ruled
+    from .. import report
+    from ..benchmark.benchmark import TOLERANCES, run, save_json, save_plot, tables
+    from ..benchmark.cases import bundled_cases, scan_case
+    from ..benchmark.sampling import measure
+    from ..validation.theories import COLUMNS, compare_theories
+
+    if plot is not None:
+        check_suffix("--plot", plot, ".png")
+    writes = [(option, path) for option, path in (("--json", json), ("--plot", plot)) if path is not None]
+    claim(context, [] if scan is None else files_read(scan), writes)
+    cases = bundled_cases()
+    names = [case.name for case in cases]
+    if unknown := set(surface or []) - set(names):
+        raise RequestError(f"--surface: got {', '.join(sorted(unknown))}, wanted among {', '.join(names)}")
+    cases = [case for case in cases if not surface or case.name in surface]
+    if scan is not None:
+        cases.append(scan_case(read_height_field(scan, pixel_size=pixel_size, height_range=height_range)))
+    mi.set_variant(choose_variant(variant))
+    if rigorous:
+        if scan is not None or surface or tolerance or plot is not None:
+            raise RequestError(
+                "--rigorous: got other surfaces, tolerances or a plot, too; it has one grating of its own"
+            )
+        with progress_bar("rigorous efficiencies") as progress:
+            costs = compare_theories(ruled(1200), progress=progress)
+        show(table(COLUMNS, (report.cells(COLUMNS, cost) for cost in costs)), width=140)
+        if json is not None:
+            outputs.save_json({"theories": costs}, json)
+        return
+    with progress_bar("speed and error") as progress:
+        results, shaders = run(cases, tolerances=tolerance or TOLERANCES, progress=progress)
+    with progress_bar("sampling") as progress:
+        # Pictures need no more.
+        sampling = measure(cases, max(tolerance or TOLERANCES), progress=progress)
+    show(*tables(results, shaders, sampling), width=140)
+    if json is not None:
+        save_json(results, shaders, sampling, json)
+    if plot is not None:
+        save_plot(results, plot)

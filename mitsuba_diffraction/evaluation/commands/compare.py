@@ -1,0 +1,82 @@
+"""`mitsuba-diffraction compare`: the path tracer against the real-time shader."""
+
+from __future__ import annotations
+
+import time
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ...cli.arguments import Define, Overwrite, Variant, claim, scene_parameters
+from ...cli.console import progress_bar, show, tell
+from ...cli.inputs import files_read
+from ...files import whole_file
+from ...outputs import free_name
+
+_PICTURES = {"-path.exr": "path_traced", "-published.exr": "published", "-corrected.exr": "corrected"}
+"""Suffix → picture."""
+
+
+def compare(
+    context: typer.Context,
+    scene: Annotated[Path, typer.Argument(metavar="SCENE.xml")],
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="prefix of the output files, or a folder")
+    ] = None,
+    shader: Annotated[str, typer.Option(help="flss, nmm, pq or gem")] = "flss",
+    spp: Annotated[int, typer.Option(min=1, help="samples per pixel of the path tracer")] = 64,
+    shading_points: Annotated[int, typer.Option(min=1, help="shading points per pixel of the shader")] = 4,
+    width: Annotated[int | None, typer.Option(min=1, help="pixels; default: that of the scene")] = None,
+    height: Annotated[int | None, typer.Option(min=1, help="pixels; default: that of the scene")] = None,
+    shares: Annotated[bool, typer.Option(help="measure the cost of each quirk of the shader")] = True,
+    variant: Variant = None,
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+    json: Annotated[Path | None, typer.Option(help="save the numbers (.json)")] = None,
+    define: Define = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Compare renderings of a scene by the path tracer and the real-time shader."""
+    import mitsuba as mi
+
+    from ...llvm import choose_variant
+    from ..comparison import compare as run
+    from ..comparison import summary
+
+    parameters = scene_parameters(define)
+    reads = files_read(scene, parameters)
+    prefix = output
+    if output is None or output.is_dir():
+        folder = output or Path()
+        prefix = folder / free_name(
+            f"{scene.stem}-{shader}", lambda stem: [folder / f"{stem}{end}" for end in (*_PICTURES, ".png")], reads
+        )
+    images = {f"{prefix}{end}": picture for end, picture in _PICTURES.items()}
+    written = [("-o", Path(target)) for target in (*images, f"{prefix}.png")]
+    written += [("--json", json)] if json is not None else []
+    claim(context, reads, written)
+    mi.set_variant(choose_variant(variant))
+    start = time.perf_counter()
+    found = run(
+        scene,
+        shader,
+        width=width,
+        height=height,
+        spp=spp,
+        shading_points=shading_points,
+        seed=seed,
+        parameters=parameters,
+        shares=shares,
+        progress=progress_bar,
+    )
+    with ExitStack() as files:  # all of them or none
+        for target, picture in images.items():
+            found.pictures[picture].image.save(files.enter_context(whole_file(target)))
+        summary.save_figure(found, files.enter_context(whole_file(f"{prefix}.png")))
+        if json is not None:
+            summary.save_json(found, files.enter_context(whole_file(json)))
+    of_quirks = () if found.shares is None else (summary.quirk_table(found),)
+    show(summary.picture_table(found), *of_quirks, width=120)
+    tell("\n" + "\n".join(summary.notes(found)))
+    tell(f"{', '.join(str(target) for _, target in written)}: {found.variant}, {time.perf_counter() - start:.1f} s")

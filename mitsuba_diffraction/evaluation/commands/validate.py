@@ -1,0 +1,104 @@
+"""`mitsuba-diffraction validate`: the BSDF against closed forms and rigorous results."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from ... import outputs
+from ...cli.arguments import Overwrite, Variant, claim
+from ...cli.console import progress_bar, show, tell
+from ...cli.inputs import files_read
+from ...cli.scan import Channel, FillMissing, HeightRange, PixelSize, Prepare, Unit, options_of_scan, recipe_of
+from ...errors import RequestError
+from ...outputs import save_markdown
+
+if TYPE_CHECKING:
+    from ...recipe import Recipe
+    from ..validation.record import Check
+
+
+def validate(
+    context: typer.Context,
+    surface: Annotated[
+        Path | None, typer.Argument(metavar="[SURFACE]", help="check this recipe (.toml) or scan instead")
+    ] = None,
+    pixel_size: PixelSize = None,
+    height_range: HeightRange = None,
+    fill_missing: FillMissing = False,
+    channel: Channel = None,
+    unit: Unit = None,
+    prepare: Prepare = None,
+    extent: Annotated[
+        str | None, typer.Option(help="tile or sample; default: that of the recipe, sample for a scan")
+    ] = None,
+    variant: Variant = None,
+    json: Annotated[Path | None, typer.Option(help="save the results (.json)")] = None,
+    markdown: Annotated[Path | None, typer.Option(help="save a table with notes and sources (.md)")] = None,
+    figures: Annotated[Path | None, typer.Option(metavar="DIR", help="save the figures of the evaluation here")] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Validate against closed forms and rigorous results, or validate one surface. Fails if a bound is exceeded."""
+    import mitsuba as mi
+
+    from ...llvm import choose_variant
+    from .. import report
+    from ..validation.checks import checks
+
+    of_scan = options_of_scan(pixel_size, height_range, fill_missing, channel, unit, prepare)
+    settings = {} if extent is None else {"extent": extent}
+    if surface is None and (of_scan or settings):
+        names = ", ".join(f"--{name.replace('_', '-')}" for name in {**of_scan, **settings})
+        raise RequestError(f"{names}: got no surface; they go with a scan, --extent with a recipe, too")
+    chosen = choose_variant(variant)
+    if chosen.startswith("scalar"):
+        raise RequestError(f"--variant: got {chosen}, wanted llvm_… or cuda_…: the checks take millions of directions")
+    recipe = None if surface is None else _recipe(surface, of_scan, settings)
+    reads = [] if surface is None else files_read(surface)
+    writes = [(option, path) for option, path in (("--json", json), ("--markdown", markdown)) if path is not None]
+    if figures is not None:
+        from ..validation.figures import figure_names, save_figures
+
+        figures.mkdir(parents=True, exist_ok=True)
+        writes += [("--figures", figures / name) for name in figure_names()]
+    claim(context, reads, writes)
+    mi.set_variant(chosen)
+    these = checks() if recipe is None else _of_surface(recipe)
+    results = []
+    with progress_bar("validation") as progress:
+        for check in these:
+            results.append(check.run())
+            progress(len(results), len(these))
+    show(report.record_table(results), width=120)
+    missed = [result.name for result in results if not result.ok]
+    promised = sum(result.bound is not None for result in results)
+    tell(
+        f"{promised - len(missed)} of {promised} within their bounds; {len(results) - promised} reported without one. "
+        "Differences are absolute, |found − expected|, unless stated otherwise"
+    )
+    if json is not None:
+        outputs.save_json({"checks": report.record_dicts(results)}, json)
+    if markdown is not None:
+        save_markdown(report.record_markdown(results), markdown)
+    if figures is not None:
+        with progress_bar("figures") as progress:
+            save_figures(figures, progress=progress)
+    if missed:
+        raise RuntimeError(f"{len(missed)} of {promised} checks missed: {'; '.join(missed)}")
+
+
+def _recipe(path: Path, of_scan: dict[str, object], settings: dict[str, object]) -> Recipe:
+    if path.suffix.lower() != ".toml":
+        settings = {"extent": "sample", **settings}
+    recipe = recipe_of(path, of_scan, settings).of_one_patch()
+    if recipe.spectrum.get("theory") == "rigorous":
+        raise RequestError(f"{path}: got theory = 'rigorous', wanted scalar; precompute prints the measured errors")
+    return recipe
+
+
+def _of_surface(recipe: Recipe) -> tuple[Check, ...]:
+    from ..validation.checks import surface_checks
+
+    return surface_checks(recipe.height_field(), recipe.cached(progress_bar))

@@ -1,0 +1,60 @@
+"""Integrators that only the comparison needs: parts of what the path tracer or the shader shows."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from ..realtime_shader.lights import lights_of
+
+
+def same_light(scene: mi.Scene) -> mi.SamplingIntegrator:
+    """The scene's own BSDFs under the light that the shader knows.
+
+    Light comes straight from directional and point lights and is stopped by what stands before them: no sky, no other
+    lights, nothing from surface to surface.
+
+    Raises:
+        ValueError: if the scene has no such light.
+    """
+    lights = lights_of(scene)
+
+    class SameLight(mi.SamplingIntegrator):
+        def sample(
+            self,
+            scene: mi.Scene,
+            sampler: mi.Sampler,
+            ray: mi.RayDifferential3f,
+            medium: mi.Medium | None = None,
+            active: mi.Bool = True,
+        ) -> tuple[mi.Spectrum, mi.Bool, list[mi.Float]]:
+            si = scene.ray_intersect(ray, active)
+            active = active & si.is_valid()
+            bsdf = si.bsdf(ray)
+            radiance = mi.Spectrum(0)
+            for light in lights:
+                ds, _, irradiance = light.sample(si, active)
+                lit = active & (scene.ray_test(si.spawn_ray_to(ds.p), active) ^ True)
+                value = bsdf.eval(mi.BSDFContext(), si, si.to_local(ds.d), lit)
+                radiance += dr.select(lit, value * irradiance, 0)
+            return radiance, active, []
+
+    return SameLight(mi.Properties("same_light"))
+
+
+def without_gratings(shader: mi.SamplingIntegrator) -> mi.SamplingIntegrator:
+    """What a `diffraction_shader` shows, less the gratings: other BSDFs, and those below gratings."""
+
+    class WithoutGratings(mi.SamplingIntegrator):
+        def sample(
+            self,
+            scene: mi.Scene,
+            sampler: mi.Sampler,
+            ray: mi.RayDifferential3f,
+            medium: mi.Medium | None = None,
+            active: mi.Bool = True,
+        ) -> tuple[mi.Spectrum, mi.Bool, list[mi.Float]]:
+            _, radiance, active = shader.shade(scene, ray, active)
+            return mi.depolarizer(radiance), active, []
+
+    return WithoutGratings(mi.Properties("without_gratings"))

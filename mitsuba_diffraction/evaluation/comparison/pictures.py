@@ -1,0 +1,276 @@
+"""One scene, rendered by the path tracer and by the shader."""
+
+from __future__ import annotations
+
+import os
+import re
+import time
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from ...color import spectrum_to_XYZ
+from ...errors import RequestError
+from ...progress import Progress, silent
+from ...render import SpectralImage
+from ...render.film import collect, evenly, pass_seed, trace_pass
+from ...render.passes import Accumulation, ratio, split
+from ...render.scene import channel_wavelengths, emitters_of, load_spectral_scene
+from ..realtime_shader.base import Shader
+from ..realtime_shader.evaluate import VARIANTS
+from ..realtime_shader.flss import FLSS
+from ..realtime_shader.quirks import Quirks
+from ..realtime_shader.tristimulus import EMISSION, primary_spectra
+from .integrators import same_light, without_gratings
+
+NO_SHADOWS = "no_shadows"
+
+# Per dispatch, so that progress shows: some seconds of work on two cores.
+_SHADING_POINTS = 2**16
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """A rendering.
+
+    Attributes:
+        image: spectral radiance.
+        samples: per pixel.
+        seconds: it took, without loading the scene, and without compiling kernels.
+        halves: XYZ (2, height, width, 3) of two pictures with half of the samples each, that are independent; none of
+            a picture with next to no noise.
+        xyz: (height, width, 3), CIE XYZ as `color` scales it.
+    """
+
+    image: SpectralImage
+    samples: int
+    seconds: float
+    halves: NDArray[np.float64] | None = None
+    xyz: NDArray[np.float64] = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "xyz", spectrum_to_XYZ(self.image.radiance, self.image.wavelengths))
+
+
+class Pictures:
+    """The pictures of a scene at one size, under the variant in force.
+
+    Attributes:
+        scene: Mitsuba's.
+        film_size: (width, height) of the whole film; a picture shows its crop window.
+        surface: (height, width) bool, where a picture shows surfaces and nothing else.
+        shaders: of the gratings.
+        spectra: of the gratings.
+        has_base: whether something lies below a grating.
+        has_coat: whether a layer lies above a grating.
+    """
+
+    def __init__(
+        self,
+        scene_path: str | os.PathLike[str],
+        shader: str = "flss",
+        *,
+        width: int | None = None,
+        height: int | None = None,
+        seed: int = 0,
+        parameters: Mapping[str, str] | None = None,
+    ) -> None:
+        """Loads the scene; see `load_spectral_scene`.
+
+        Args:
+            scene_path: an XML scene whose integrator is a path tracer.
+            shader: "flss", "nmm", "pq" or "gem".
+            width: pixels, if the film's size shall not hold.
+            height: likewise.
+            seed: of the random numbers, not negative.
+            parameters: values for the scene's `$name` parameters.
+
+        Raises:
+            FileNotFoundError: if there is no such scene.
+            ValueError: if the request is wrong, or the shader cannot show the scene.
+        """
+        if shader not in VARIANTS:
+            raise RequestError(f"shader: got {shader!r}, wanted one of {', '.join(VARIANTS)}")
+        if seed < 0:
+            raise RequestError(f"seed: got {seed}, wanted an integer that is not negative")
+        if not dr.is_jit_v(mi.Float):
+            raise RequestError(f"variant: got {mi.variant()!r}, wanted a vectorised one, such as 'llvm_ad_spectral'")
+        _check_lights(Path(scene_path), parameters)
+        self.scene = load_spectral_scene(scene_path, width=width, height=height, parameters=parameters)
+        if hasattr(self.scene.integrator(), "quirks"):
+            raise RequestError(f"{scene_path}: its integrator is the shader itself, wanted a path tracer (type='path')")
+        self.seed = seed
+        self._others: dict[tuple[bool, bool, int], Picture] = {}
+        self._shader = mi.load_dict({"type": "diffraction_shader", "variant": shader})
+        # Refuses a scene that the shader cannot show.
+        prepared = self._shader.prepare(self.scene)
+        if not prepared.surfaces:
+            raise RequestError(f"{scene_path}: no shape has a diffraction_grating, there is nothing to compare")
+        self.shaders: list[Shader] = [shader for _, shader, _ in prepared.surfaces]
+        self.spectra = [surface.grating.spectrum for surface, _, _ in prepared.surfaces]
+        self.has_base = any(surface.grating.base is not None for surface, _, _ in prepared.surfaces)
+        self.has_coat = any(surface.grating.coat is not None for surface, _, _ in prepared.surfaces)
+        self.film_size = tuple(int(size) for size in self.scene.sensors()[0].film().size())
+        self.surface = _shows_surfaces(self.scene)
+        if not self.surface.any():
+            raise RequestError(f"{scene_path}: no pixel shows a surface, there is nothing to compare")
+
+    @property
+    def quirks(self) -> tuple[str, ...]:
+        """What is as published and changes something in this scene with this shader: `Quirks`, and no cast shadows."""
+        of_integrator = ("power_gamma", *(("constant_blend",) if self.has_base else ()))
+        own = (*self.shaders[0].own_quirks, *of_integrator)
+        return (*(name for name in Quirks.names() if name in own), NO_SHADOWS)
+
+    @property
+    def shader_reads(self) -> int:
+        """How many texels one shading point of the shader reads, at most."""
+        return max(shader.texel_reads for shader in self.shaders)
+
+    @property
+    def model_reads(self) -> int:
+        """How many packets of at most 16 bytes one BRDF value of the model reads for the wavelengths of a ray."""
+        packets = [np.prod(s.neighbours) * -(-s.table.words_per_node // 4) for s in self.spectra]
+        return len(mi.UnpolarizedSpectrum(0)) * int(max(packets))
+
+    @property
+    def left_out(self) -> float | None:
+        """The most of a line's power that the shader's 3 × 3 texels leave out; None if it has no such neighbourhood."""
+        found = [shader.left_out for shader in self.shaders if isinstance(shader, FLSS)]
+        return max(found) if found else None
+
+    def path_traced(self, samples: int, progress: Progress = silent) -> Picture:
+        """By the scene's own integrator."""
+        return self._traced(self.scene.integrator(), samples, progress)
+
+    def same_light(self, samples: int, progress: Progress = silent) -> Picture:
+        """By the scene's BSDFs, with the light alone that the shader knows; see `integrators.same_light`."""
+        return self._traced(same_light(self.scene), samples, progress)
+
+    def shaded(self, quirks: Collection[str], samples: int, others: int, progress: Progress = silent) -> Picture:
+        """By the shader: what its integrator converges to, with far fewer samples.
+
+        The integrator computes the colour of a shading point out of 81 wavelengths, and shows it at the four
+        wavelengths of a ray. Here the colours are averaged over a pixel, and the spectrum Σ_c RGB_c b_c(λ) follows from
+        the average. All other BSDFs, which are cheap, get samples of their own.
+
+        Args:
+            quirks: names among `quirks` of what the shader does as published.
+            samples: shading points per pixel.
+            others: samples per pixel of what is no grating.
+            progress: called with (done, total).
+        """
+        self._shader.take(Quirks(**{name: name in quirks for name in Quirks.names()}))
+        self._shader.shadows = NO_SHADOWS not in quirks
+        self._shader.prepare(self.scene)
+        known = ("constant_blend" in quirks, self._shader.shadows, others)
+        if known not in self._others:
+            self._others[known] = self._traced(without_gratings(self._shader), others, silent, halves=False)
+        rest = self._others[known]
+        rgb, seconds = self._colours(samples, progress)
+        radiance = rest.image.radiance + rgb @ _channel_spectra().T
+        return Picture(SpectralImage(rest.image.wavelengths, radiance), samples, seconds + rest.seconds)
+
+    def _traced(self, integrator: mi.Integrator, samples: int, progress: Progress, halves: bool = True) -> Picture:
+        rows, columns = self.surface.shape
+        passes = split(self.scene, samples, 2 if halves else 1)
+        trace_pass(self.scene, 1, self.seed, integrator)  # compiles the kernels
+        sums = Accumulation.empty(rows, columns, channel_wavelengths())
+        pair = np.zeros((2, rows, columns, 4))  # sums of XYZ and of the filter, of every other pass
+        begin = time.perf_counter()
+        for index, some in enumerate(passes):
+            traced = trace_pass(self.scene, some, pass_seed(self.seed, index), integrator)
+            sums.add(traced, some)
+            pair[index % 2, ..., :3] += spectrum_to_XYZ(traced[..., :-1], sums.wavelengths)
+            pair[index % 2, ..., 3] += traced[..., -1]
+            progress(sums.samples, sum(passes))
+        seconds = time.perf_counter() - begin
+        image = SpectralImage(sums.wavelengths, sums.radiance())
+        in_halves = ratio(pair[..., :3], pair[..., 3:]) if halves and len(passes) > 1 else None
+        return Picture(image, sums.samples, seconds, in_halves)
+
+    def _colours(self, samples: int, progress: Progress) -> tuple[NDArray[np.float64], float]:
+        """Linear sRGB of the gratings, (height, width, 3), and seconds."""
+        rows, columns = self.surface.shape
+        per_dispatch = max(1, _SHADING_POINTS // samples)
+        firsts = range(0, rows * columns, per_dispatch)
+        # Compiles the kernels. A single pixel may hold a single sample, for which Dr.Jit compiles others; hence two.
+        self._averaged([self._shade(0, 2, samples)] * -(-rows * columns // 2))
+        begin = time.perf_counter()
+        points = []
+        for index, first in enumerate(firsts):
+            points.append(self._shade(first, min(per_dispatch, rows * columns - first), samples))
+            progress(index + 1, len(firsts))
+        return self._averaged(points), time.perf_counter() - begin
+
+    def _averaged(self, points: list[NDArray[np.float32]]) -> NDArray[np.float64]:
+        """The means over the pixels, (height, width, 3), of what `_shade` returns, as many points for each pixel."""
+        rows, columns = self.surface.shape
+        x, y, *rgb = (mi.Float(column) for column in np.concatenate(points, axis=1))
+        channels = [dr.opaque(mi.Float, channel, shape=len(x)) for channel in range(3)]
+        rfilter = self.scene.sensors()[0].film().rfilter()
+        count = dr.opaque(mi.UInt32, len(x) // (rows * columns))
+        sums = collect(rfilter, mi.Point2f(x, y), channels, rgb, (rows, columns), 0, evenly(count), 3)
+        values = np.array(sums, np.float64).reshape(rows, columns, 4)
+        return ratio(values[..., :3], values[..., 3:])
+
+    def _shade(self, first: int, count: int, samples: int) -> NDArray[np.float32]:
+        """Shading points of `count` pixels, from `first` on: (5, n), position in the picture and linear sRGB."""
+        sensor = self.scene.sensors()[0]
+        columns, rows = (int(size) for size in sensor.film().crop_size())
+        sampler = mi.load_dict({"type": "multijitter", "sample_count": samples})
+        samples = sampler.sample_count()  # the next product of two like numbers
+        sampler.set_samples_per_wavefront(samples)
+        sampler.seed(pass_seed(self.seed, first), count * samples)
+        pixel = dr.opaque(mi.UInt32, first) + dr.arange(mi.UInt32, count * samples) // samples
+        position = mi.Point2f(mi.Float(pixel % columns), mi.Float(pixel // columns)) + sampler.next_2d()
+        # Time and aperture; a shader needs no wavelengths.
+        size = mi.Vector2f(columns, rows)
+        ray, _ = sensor.sample_ray(sampler.next_1d(), 0.5, position / size, sampler.next_2d())
+        rgb, _, _ = self._shader.shade(self.scene, mi.RayDifferential3f(ray))
+        dr.eval(position, rgb)
+        return np.concatenate([np.array(position), np.array(rgb)])
+
+
+def _check_lights(scene: Path, parameters: Mapping[str, str] | None) -> None:
+    """Raise RequestError if the shader knows none of a scene's lights, before any spectrum is computed."""
+    if emitters_of(scene, parameters) & {"directional", "point"}:
+        return
+    text, advice = scene.read_text(encoding="utf-8", errors="replace"), ""
+    if "lights/$light.xml" in text:
+        lights = {path.stem: path.read_text("utf-8") for path in sorted((scene.parent / "lights").glob("*.xml"))}
+        known = [
+            f"-D light={name}"
+            for name, light in lights.items()
+            if re.search(r'<emitter type="(directional|point)"', light)
+            and ("<integrator" in light) != ("<integrator" in text)
+        ]
+        advice = f"; choose {' or '.join(known)}" if known else ""
+    raise RequestError(f"{scene}: the scene has no directional or point light, and the shader knows no other{advice}")
+
+
+def _channel_spectra() -> NDArray[np.float64]:
+    """b_c of `primary_spectra`, averaged over the hats of the film's channels: (n, 3).
+
+    b_c is linear between nodes that are the middles of the hats, so that the average is (b₋ + 4b + b₊)/6.
+    """
+    b = primary_spectra()
+    averages = (b[:-2] + 4 * b[1:-1] + b[2:]) / 6
+    assert np.array_equal(EMISSION[1:-1], channel_wavelengths())
+    return averages
+
+
+def _shows_surfaces(scene: mi.Scene) -> NDArray[np.bool_]:
+    """Where each of 4 × 4 rays through a pixel meets a surface, (height, width)."""
+    sensor = scene.sensors()[0]
+    columns, rows = sensor.film().crop_size()
+    y, x = (np.mgrid[: 4 * rows, : 4 * columns].reshape(2, -1) + 0.5) / np.array([[4 * rows], [4 * columns]])
+    position = mi.Point2f(x.astype(np.float32), y.astype(np.float32))
+    ray, _ = sensor.sample_ray(0.0, 0.5, position, mi.Point2f(0.5))
+    hit = np.array(scene.ray_test(ray)).reshape(rows, 4, columns, 4)
+    return hit.all(axis=(1, 3))

@@ -1,0 +1,230 @@
+"""What a comparison found: tables for the terminal, notes, JSON, and a figure."""
+
+from __future__ import annotations
+
+import os
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.table import Table
+
+from ... import outputs
+from ...color import XYZ_to_linear_sRGB, into_gamut, on_screen
+from ...files import whole_file
+from ...outputs import metadata
+from .. import report
+from .comparison import Comparison
+from .difference import Difference
+from .quirk_shares import AgainstReference
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+def titles(comparison: Comparison) -> dict[str, str]:
+    """What the pictures are called."""
+    shader = comparison.shader.upper()
+    return {
+        "path_traced": "path tracer, this model",
+        "same_light": "this model, the shader's light",
+        "published": f"{shader} as published",
+        "corrected": f"{shader} corrected",
+    }
+
+
+_TO_REFERENCE = {
+    "exposure\nfactor": "{.exposure:.3g}",
+    "ΔE00\nmean": "{.mean:.2f}",
+    "ΔE00\n95 %": "{.percentile_95:.1f}",
+    "ΔE00\nmax": "{.largest:.1f}",
+    "luminance\nerror": "{.luminance_error:.1%}",
+}
+
+
+def picture_table(comparison: Comparison) -> Table:
+    """The pictures and their differences, for a terminal."""
+    columns = (*_TO_REFERENCE, "ΔE00 mean to\nsame light", "reads per\npoint", "samples\nper pixel", "seconds")
+    rows = []
+    for name, title in titles(comparison).items():
+        found, same = comparison.to_path_traced.get(name), comparison.to_same_light.get(name)
+        picture = comparison.pictures[name]
+        reads = comparison.model_reads if name in ("path_traced", "same_light") else comparison.shader_reads
+        differences = ["1", "", "", "", ""] if found is None else report.cells(_TO_REFERENCE, found)
+        same_light = "" if same is None else f"{same.mean:.2f}"
+        rows.append([title, *differences, same_light, str(reads), str(picture.samples), f"{picture.seconds:.1f}"])
+    return report.table(("picture", *columns), rows)
+
+
+def quirk_table(comparison: Comparison) -> Table:
+    """The quirks, those that make the most first, for a terminal."""
+    shares = comparison.shares
+    columns = ("quirk", "path tracer\ndrop", "\nrise", "\nshare", "same light\ndrop", "\nrise", "\nshare")
+    rows = []
+    for name in ordered(shares.path_traced):
+        row = [name]
+        for against in (shares.path_traced, shares.same_light):
+            one = against.quirks[name]
+            # Adding zero takes the sign from a zero.
+            row += [f"{round(value, 2) + 0.0:+.2f}" for value in (one.drop, one.rise)]
+            row.append(f"{one.share:.0%}")
+        rows.append(row)
+    return report.table(columns, rows)
+
+
+def ordered(against: AgainstReference) -> list[str]:
+    """The quirks, the largest share first."""
+    return sorted(against.quirks, key=lambda name: against.quirks[name].share, reverse=True)
+
+
+def notes(comparison: Comparison) -> list[str]:
+    """What one must know to read the tables, a line each."""
+    rows, columns = comparison.surface.shape
+    lines = [
+        f"compared: the {100 * comparison.surface.mean():.0f} % of {columns} × {rows} pixels that show surfaces alone; "
+        f"Y = {comparison.white:.4g} is white; one exposure factor gives a picture the mean luminance of its reference",
+        "the shader's light: straight from directional and point lights; here with the shadows that surfaces cast",
+        "reads: texels of two numbers (shader), or packets of four for the wavelengths of a ray (this model)",
+    ]
+    noise = comparison.noise["path_traced"], comparison.noise["same_light"]
+    if None not in noise:
+        lines.append(
+            f"noise: makes a mean ΔE00 of {noise[0]:.2f} in the path-traced picture, {noise[1]:.2f} in the same light's"
+        )
+    if comparison.coated:
+        lines.append("coat: the shader shows coated gratings without their coat; it does not converge to this model")
+    elif comparison.left_out is not None:
+        lines.append(
+            "limit: corrected, the shader converges to this model in the same light; its 3 × 3 texels leave out at "
+            f"most {100 * comparison.left_out:.2g} % of a line, and less the longer "
+            "the coherence length is relative to the tile"
+        )
+    if (shares := comparison.shares) is not None:
+        lines.append(
+            f"quirks: pictures of {shares.size[0]} × {shares.size[1]} pixels, {shares.samples} samples, "
+            f"{shares.shading_points} shading points"
+        )
+        for name, one in (("path tracer", shares.path_traced), ("same light", shares.same_light)):
+            lines.append(
+                f"quirks, mean ΔE00 to the {name}: {one.published:.2f} as published, {one.corrected:.2f} corrected"
+                + ("" if one.noise is None else f"; noise {one.noise:.2f}")
+            )
+        lines += [
+            "drop: what the published shader's mean ΔE00 loses with this quirk alone corrected",
+            "rise: what the corrected shader's mean ΔE00 gains with this quirk alone put in",
+            "share: the mean of both, of the published shader's mean ΔE00; shares do not add up",
+        ]
+    return lines
+
+
+def _difference(found: Difference) -> dict[str, float]:
+    return {
+        "exposure factor": found.exposure,
+        "mean": found.mean,
+        "95 %": found.percentile_95,
+        "max": found.largest,
+        "luminance error": found.luminance_error,
+    }
+
+
+def as_dict(comparison: Comparison) -> dict[str, object]:
+    """All numbers, for `report.save_json`."""
+    shares = comparison.shares
+    return {
+        "scene": comparison.scene,
+        "shader": comparison.shader,
+        "variant": comparison.variant,
+        "seed": comparison.seed,
+        "width": comparison.surface.shape[1],
+        "height": comparison.surface.shape[0],
+        "share of pixels compared": float(comparison.surface.mean()),
+        "luminance of white": comparison.white,
+        "pictures": {
+            name: {"samples": picture.samples, "seconds": picture.seconds, "noise": comparison.noise[name]}
+            for name, picture in comparison.pictures.items()
+        },
+        "to path tracer": {name: _difference(found) for name, found in comparison.to_path_traced.items()},
+        "to same light": {name: _difference(found) for name, found in comparison.to_same_light.items()},
+        "texel reads of the shader": comparison.shader_reads,
+        "packet reads of this model": comparison.model_reads,
+        "left out by the neighbourhood": comparison.left_out,
+        "shares": shares
+        and {
+            "size": shares.size,
+            "samples": shares.samples,
+            "shading points": shares.shading_points,
+            "of path tracer": shares.path_traced,
+            "of same light": shares.same_light,
+        },
+    }
+
+
+def save_json(comparison: Comparison, path: str | os.PathLike[str]) -> None:
+    """Writes `as_dict`, whole or not at all."""
+    outputs.save_json(as_dict(comparison), path)
+
+
+def shown(comparison: Comparison, name: str) -> NDArray[np.uint8]:
+    """A picture of the comparison for a screen, at its exposure: (height, width, 3)."""
+    found = comparison.to_path_traced.get(name)
+    exposure = (1 if found is None else found.exposure) / comparison.white
+    return on_screen(into_gamut(XYZ_to_linear_sRGB(comparison.pictures[name].xyz * exposure)))
+
+
+def figure(comparison: Comparison) -> Figure:
+    """The pictures side by side, below them their CIEDE2000 to the path tracer's, and the shares of the quirks."""
+    from matplotlib.figure import Figure
+
+    aspect = comparison.surface.shape[0] / comparison.surface.shape[1]
+    result = Figure(figsize=(12, 4.9 * aspect + 1), layout="constrained")
+    axes = result.subplots(2, 4)
+    names = titles(comparison)
+    limit = max(2.0, float(np.ceil(comparison.to_path_traced["published"].percentile_95)))
+    for column, (name, title) in enumerate(names.items()):
+        axes[0, column].imshow(shown(comparison, name), interpolation="nearest")
+        axes[0, column].set_title(title, fontsize="medium")
+        axes[0, column].set_axis_off()
+        if (found := comparison.to_path_traced.get(name)) is not None:
+            panel = axes[1, column]
+            image = panel.imshow(found.delta_e, cmap="inferno", vmin=0, vmax=limit, interpolation="nearest")
+            panel.set_facecolor("0.88")
+            panel.set(xticks=[], yticks=[])
+            panel.set_title(f"mean {found.mean:.1f}, 95 % {found.percentile_95:.1f}", fontsize="medium")
+            for spine in panel.spines.values():
+                spine.set_visible(False)
+    bar = result.colorbar(image, ax=axes[1, 3], extend="max", pad=0.03)
+    bar.set_label("CIEDE2000 to the path tracer")
+    if comparison.shares is None:
+        axes[1, 0].set_axis_off()
+    else:
+        _bars(axes[1, 0], comparison.shares.path_traced)
+        axes[1, 0].set_box_aspect(aspect)
+    return result
+
+
+def _bars(panel: Axes, against: AgainstReference) -> None:
+    """`rise` and `drop` of the quirks."""
+    names = ordered(against)
+    places = np.arange(len(names))
+    for offset, attribute, colour, label in (
+        (-0.2, "rise", "C0", "put in alone"),
+        (0.2, "drop", "0.6", "corrected alone"),
+    ):
+        values = [getattr(against.quirks[name], attribute) for name in names]
+        panel.barh(places + offset, values, height=0.4, color=colour, label=label)
+    panel.axvline(0, color="0.3", linewidth=0.8)
+    panel.set_yticks(places, [name.replace("_", " ") for name in names], fontsize="x-small")
+    panel.invert_yaxis()
+    panel.tick_params(axis="x", labelsize="x-small")
+    panel.set_xlabel("mean ΔE00 that a quirk makes", fontsize="small")
+    widest = max(1.0, *map(abs, panel.get_xlim()))  # noise is not to look like a finding
+    panel.set_xlim(min(panel.get_xlim()[0], -0.1 * widest), max(panel.get_xlim()[1], widest))
+    panel.legend(fontsize="x-small", frameon=False, loc="lower center", bbox_to_anchor=(0.4, 1), ncols=2)
+    panel.spines[["top", "right"]].set_visible(False)
+
+
+def save_figure(comparison: Comparison, path: str | os.PathLike[str], dpi: float = 150) -> None:
+    """Writes `figure` as PNG, whole or not at all."""
+    with whole_file(path) as temporary:
+        figure(comparison).savefig(temporary, format="png", dpi=dpi, metadata=metadata(path))

@@ -1,0 +1,222 @@
+"""Base classes of the variants of the shader."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from numbers import Integral
+from typing import ClassVar
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ...bsdf.tables import opaque
+from ...errors import RequestError
+from ...settings import SUN_COHERENCE_LENGTH, lobe_width
+from ...surface.heightfield import HeightField
+from .gain import PUBLISHED_R0, Gain, fresnel_ratio
+from .quirks import Quirks
+from .spectral_weights import SpectralWeights
+from .taylor_textures import PUBLISHED_TERMS, TaylorTextures, taylor_transforms
+from .tristimulus import SHORTEST, STEP, WAVELENGTH_COUNT, rgb_matrix
+
+
+class Shader:
+    """Shades a tile: directions → linear RGB.
+
+    Directions are unit vectors in the frame of the tile, z being the normal, and point away from the surface: ω_i to
+    the light, ω_o to the viewer. An instance is bound to the Mitsuba variant in which it was made.
+
+    Attributes:
+        own_quirks: names of the quirks that affect this shader.
+    """
+
+    own_quirks: ClassVar[tuple[str, ...]]
+
+    def __init__(self, height_field: HeightField, quirks: Quirks, shadowing: bool = True) -> None:
+        self.tile_size = height_field.tile_size
+        self.quirks = quirks
+        self.shadowing = shadowing
+
+    def with_quirks(self, quirks: Quirks) -> Shader:
+        """The same shader with other quirks; tables are shared."""
+        other = copy.copy(self)
+        other.quirks = quirks
+        return other
+
+    def weights(self, r_0: ArrayLike = PUBLISHED_R0, light: ArrayLike | None = None) -> SpectralWeights:
+        """The `SpectralWeights` of a material and a light."""
+        return SpectralWeights(self.quirks, self.peak, r_0=r_0, light=light)
+
+    @property
+    def peak(self) -> float:
+        """S(0) of a flat surface, µm², the normalisation of the relative radiance."""
+        raise NotImplementedError
+
+    @property
+    def texel_reads(self) -> int:
+        """The largest number of texels read for one shading point."""
+        raise NotImplementedError
+
+    def rgb(
+        self,
+        wi: mi.Vector3f,
+        wo: mi.Vector3f,
+        weights: SpectralWeights,
+        active: mi.Bool = True,
+        height_scale: mi.Float = 1.0,
+    ) -> mi.Color3f:
+        """Linear RGB, before gamma.
+
+        Args:
+            wi: ω_i.
+            wo: ω_o.
+            weights: from `weights`.
+            active: mask.
+            height_scale: scales the heights.
+        """
+        raise NotImplementedError
+
+
+class TextureShader(Shader):
+    """A shader that sums Taylor textures, wavelength by wavelength, into XYZ.
+
+    The relative radiance of algorithm 4.3 is
+
+        ρ(λ) = F/F₀ · K G cos θ_i · |P(q; κ)|²,     q = (u, v)/λ,     κ = −2πw/λ,
+
+    with |P|² = 1 for a flat mirror, and the colour is ∫ ρ(λ) S(λ) (x̄, ȳ, z̄) dλ.
+    """
+
+    own_quirks = (
+        *("fresnel_squared", "fixed_index", "floor_anchor", "heights_from_zero"),
+        *("d65_light", "relative", "d65_twice", "cie_rgb_matrix"),
+    )
+    origin_at_centre: ClassVar[bool] = False
+
+    def __init__(
+        self,
+        height_field: HeightField,
+        quirks: Quirks,
+        *,
+        coherence_length: float = SUN_COHERENCE_LENGTH,
+        terms: int = PUBLISHED_TERMS,
+        shadowing: bool = True,
+    ) -> None:
+        """Computes the textures.
+
+        Args:
+            height_field: the tile.
+            quirks: the quirks of the published shader to keep.
+            coherence_length: L_c in µm.
+            terms: number of Taylor terms.
+            shadowing: include G.
+
+        Raises:
+            ValueError: if an argument is invalid.
+        """
+        super().__init__(height_field, quirks, shadowing)
+        lobe_width(coherence_length)  # raises unless it is a valid length
+        self.coherence_length = coherence_length
+        self._height_field, self._terms = height_field, terms
+        self._textures: dict[bool, TaylorTextures] = {}
+        self._bind()
+
+    def with_quirks(self, quirks: Quirks) -> TextureShader:
+        other = super().with_quirks(quirks)
+        other._bind()
+        return other
+
+    def _bind(self) -> None:
+        """Sets up what depends on the quirks."""
+        from_zero = self.quirks.heights_from_zero
+        if from_zero not in self._textures:
+            texels, height = taylor_transforms(
+                self._height_field,
+                self._terms,
+                heights_from_zero=from_zero,
+                origin_at_centre=self.origin_at_centre,
+            )
+            self._textures[from_zero] = TaylorTextures(texels, height)
+        self.textures = self._textures[from_zero]
+        matrix = rgb_matrix(cie_rgb_matrix=self.quirks.cie_rgb_matrix, d65_twice=self.quirks.d65_twice)
+        self.matrix = [[opaque(float(entry)) for entry in row] for row in matrix]
+
+    @property
+    def sigma(self) -> float:
+        """σ_f = 1/(2πσ_s) in cycles/µm, σ_s = L_c/4, of the window in amplitude, √2 times as wide as in power."""
+        return float(np.sqrt(2) * lobe_width(self.coherence_length))
+
+    @property
+    def peak(self) -> float:
+        return 1 / (float(np.pi) * self.sigma**2)
+
+    def power(self, gain: Gain, wavelength: mi.Float, height_scale: mi.Float, active: mi.Bool) -> mi.Float:
+        """|P(q; κ)|² at a wavelength in µm, one for a flat mirror at q = 0."""
+        raise NotImplementedError
+
+    def relative_radiance(self, wi: mi.Vector3f, wo: mi.Vector3f, wavelength: mi.Float) -> mi.Float:
+        """ρ(λ) at a wavelength in nm (eq. 3.11), for an index of 1.5, including shadowing."""
+        gain = Gain(wi, wo, self.shadowing, mi.Bool(True))
+        power = self.power(gain, mi.Float(wavelength) * 1e-3, mi.Float(1), gain.active)
+        return gain.factor * self.fresnel(mi.Float(PUBLISHED_R0), gain) * power
+
+    def fresnel(self, r_0: mi.Float, gain: Gain) -> mi.Float:
+        """F/F₀ or its square."""
+        return fresnel_ratio(r_0, gain.falloff, self.quirks.fresnel_squared)
+
+    def integral(self, gain: Gain, weights: SpectralWeights, height_scale: mi.Float) -> mi.Color3f:
+        """∫ F/F₀ |P|² S (x̄, ȳ, z̄) dλ by the trapezoidal rule."""
+        return trapezoid(self, self.power, gain, weights, height_scale, gain.active)
+
+    def rgb(
+        self,
+        wi: mi.Vector3f,
+        wo: mi.Vector3f,
+        weights: SpectralWeights,
+        active: mi.Bool = True,
+        height_scale: mi.Float = 1.0,
+    ) -> mi.Color3f:
+        gain = Gain(wi, wo, self.shadowing, mi.Bool(active))
+        xyz = gain.factor * self.integral(gain, weights, mi.Float(height_scale))
+        return mi.Color3f(*(sum(row[i] * xyz[i] for i in range(3)) for row in self.matrix))
+
+    @property
+    def texels_per_term(self) -> int:
+        """Texels read per Taylor term and wavelength."""
+        raise NotImplementedError
+
+    @property
+    def texel_reads(self) -> int:
+        return WAVELENGTH_COUNT * self.textures.terms * self.texels_per_term
+
+
+@dr.syntax
+def trapezoid(
+    shader: TextureShader,
+    power: Callable[[Gain, mi.Float, mi.Float, mi.Bool], mi.Float],
+    gain: Gain,
+    weights: SpectralWeights,
+    height_scale: mi.Float,
+    active: mi.Bool,
+) -> mi.Color3f:
+    """Σ_j F/F₀ power(λ_j) S (x̄, ȳ, z̄)(λ_j) Δλ over the 81 wavelengths, with half weight at both ends."""
+    result = mi.Color3f(0)
+    index = mi.UInt32(0)
+    while active & (index < WAVELENGTH_COUNT):
+        wavelength = SHORTEST + STEP * mi.Float(index)
+        weight, r_0 = weights(wavelength, active)
+        at_end = (index == 0) | (index == WAVELENGTH_COUNT - 1)
+        share = dr.select(at_end, 0.5 * STEP, STEP) * shader.fresnel(r_0, gain)
+        result += weight * (share * power(gain, wavelength * 1e-3, height_scale, active))
+        index += 1
+    return result
+
+
+def check_whole(name: str, value: int, least: int) -> int:
+    """`value` as an int ≥ `least`, or ValueError."""
+    if isinstance(value, bool) or not isinstance(value, Integral) or value < least:
+        raise RequestError(f"{name}: got {value!r}, wanted a whole number ≥ {least}")
+    return int(value)

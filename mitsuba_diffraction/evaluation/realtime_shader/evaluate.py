@@ -1,0 +1,109 @@
+"""Evaluates the shader for NumPy arrays of directions."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ...errors import RequestError
+from ...surface.heightfield import HeightField
+from ...testing import array, vectors
+from .base import Shader
+from .flss import FLSS
+from .gem import GEM
+from .nmm import NMM
+from .pq import PQ
+from .quirks import Quirks
+
+VARIANTS = {"flss": FLSS, "nmm": NMM, "pq": PQ, "gem": GEM}
+
+
+def shader_for(height_field: HeightField, variant: str, quirks: Quirks, **settings: object) -> Shader:
+    """The shader of a given name (`VARIANTS`) in the current Mitsuba variant.
+
+    Raises:
+        ValueError: if the name is unknown, or no vectorised Mitsuba variant is set.
+    """
+    if variant not in VARIANTS:
+        raise RequestError(f"variant: got {variant!r}, wanted one of {', '.join(VARIANTS)}")
+    if mi.variant() is None or not dr.is_jit_v(mi.Float) or not mi.is_spectral:
+        raise RequestError(f"variant: Mitsuba's is {mi.variant()}, wanted a spectral one such as llvm_ad_spectral")
+    return VARIANTS[variant](height_field, quirks, **settings)
+
+
+def colour(
+    height_field: HeightField,
+    wi: ArrayLike,
+    wo: ArrayLike,
+    *,
+    variant: str = "flss",
+    quirks: Quirks | None = None,
+    **settings: object,
+) -> NDArray[np.float32]:
+    """The colour of a tile with an index of 1.5 under D65, as computed by the shader.
+
+    Args:
+        height_field: the tile.
+        wi: ω_i, (..., 3) in the frame of the tile.
+        wo: ω_o, likewise; shapes broadcast.
+        variant: "flss", "nmm", "pq" or "gem".
+        quirks: default: as published.
+        settings: further arguments of the shader class.
+
+    Returns:
+        Linear RGB, (..., 3).
+
+    Raises:
+        ValueError: if an argument is invalid.
+    """
+    shader = shader_for(height_field, variant, quirks or Quirks.as_published(), **settings)
+    wi, wo, shape = _directions(wi, wo)
+    return array(shader.rgb(wi, wo, shader.weights())).T.reshape(*shape, 3)
+
+
+def relative_radiance(
+    height_field: HeightField,
+    wi: ArrayLike,
+    wo: ArrayLike,
+    wavelengths: ArrayLike,
+    *,
+    variant: str = "flss",
+    quirks: Quirks | None = None,
+    **settings: object,
+) -> NDArray[np.float32]:
+    """ρ(λ), the radiance relative to that of a flat mirror at normal incidence (eq. 3.11), for an index of 1.5.
+
+    Args:
+        height_field: the tile.
+        wi: ω_i, (..., 3) in the frame of the tile.
+        wo: ω_o, likewise.
+        wavelengths: (...) in nm; all three broadcast.
+        variant: "flss" or "pq"; "nmm" is evaluated as at one of its own wavelengths, which equals "flss".
+        quirks: default: as published.
+        settings: further arguments of the shader class.
+
+    Returns:
+        (...).
+
+    Raises:
+        ValueError: if an argument is invalid.
+    """
+    if variant == "gem":
+        raise RequestError("variant: gem has no spectrum, only RGB")
+    shader = shader_for(height_field, variant, quirks or Quirks.as_published(), **settings)
+    wavelengths = np.asarray(wavelengths, np.float32)
+    wi, wo = (np.broadcast_to(omega, (*wavelengths.shape, 3)) if np.ndim(omega) == 1 else omega for omega in (wi, wo))
+    wi, wo, shape = _directions(wi, wo)
+    wavelengths = np.broadcast_to(wavelengths, shape).ravel()
+    return np.array(shader.relative_radiance(wi, wo, mi.Float(wavelengths))).reshape(shape)
+
+
+def _directions(wi: ArrayLike, wo: ArrayLike) -> tuple[mi.Vector3f, mi.Vector3f, tuple[int, ...]]:
+    """Two arrays (..., 3) of directions as Dr.Jit arrays, and the shape (...)."""
+    wi, wo = (np.asarray(omega, np.float32) for omega in (wi, wo))
+    if wi.shape[-1:] != (3,) or wo.shape[-1:] != (3,):
+        raise RequestError(f"wi, wo: got shapes {wi.shape} and {wo.shape}, wanted (..., 3)")
+    wi, wo = np.broadcast_arrays(wi, wo)
+    return vectors(wi.reshape(-1, 3)), vectors(wo.reshape(-1, 3)), wi.shape[:-1]

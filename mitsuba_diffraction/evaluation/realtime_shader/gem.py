@@ -1,0 +1,89 @@
+"""GEM: a rainbow per order, independent of the height field."""
+
+from __future__ import annotations
+
+from numbers import Real
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import scipy.fft
+
+from ...errors import RequestError
+from ...surface.heightfield import HeightField
+from .base import Shader
+from .quirks import Quirks
+from .spectral_weights import SpectralWeights
+
+ORDERS = 7
+_RAINBOW = (0.75, 0.5, 0.25)  # peaks of red, green and blue
+
+
+class GEM(Shader):
+    """The shader of GPU Gems 1, chapter 8, "Simulating Diffraction" (Stam, in Fernando 2004).
+
+    A lattice of period d along x diffracts the wavelengths λ_n = d |u|/n into a direction. Each of the first seven
+    orders adds a rainbow of three parabolas; order zero is a highlight:
+
+        c = Σ_{n=1}^{7} max(0, 1 − 16 (y_n − y_c)²) + e^{−(r d u/w)²},     y_c = 3/4, 1/2, 1/4 for red, green, blue,
+
+    with y = 2λ − 1 (λ in µm), which maps 0.5 to 1 µm to the rainbow. The profile of the surface is ignored.
+
+    Attributes:
+        spacing: d in µm.
+        roughness: r in 1/µm.
+    """
+
+    own_quirks = ("infrared_rainbow",)
+
+    def __init__(
+        self,
+        height_field: HeightField,
+        quirks: Quirks,
+        *,
+        spacing: float | None = None,
+        roughness: float = 5.0,
+        shadowing: bool = True,
+    ) -> None:
+        """The default of d is the period of the strongest component of the heights along x."""
+        super().__init__(height_field, quirks, shadowing)
+        self.spacing = strongest_period(height_field) if spacing is None else spacing
+        self.roughness = roughness
+        if not all(isinstance(number, Real) and number > 0 for number in (self.spacing, self.roughness)):
+            raise RequestError(f"spacing, roughness: got {spacing!r}, {roughness!r}, wanted positive numbers")
+
+    @property
+    def peak(self) -> float:
+        """Unused: the shader computes colours, not a relative radiance."""
+        return 1.0
+
+    @property
+    def texel_reads(self) -> int:
+        return 0
+
+    def rgb(
+        self,
+        wi: mi.Vector3f,
+        wo: mi.Vector3f,
+        weights: SpectralWeights,
+        active: mi.Bool = True,
+        height_scale: mi.Float = 1.0,
+    ) -> mi.Color3f:
+        active = mi.Bool(active) & (wi.z > 0) & (wo.z > 0)
+        path = dr.abs(wi.x + wo.x) * self.spacing
+        highlight = dr.exp(-dr.square(self.roughness * path / dr.maximum(wi.z + wo.z, 1e-6)))
+        result = mi.Color3f(highlight)
+        start, width = (0.5, 0.5) if self.quirks.infrared_rainbow else (0.38, 0.4)  # µm
+        for n in range(1, ORDERS + 1):
+            y = (path / n - start) / width
+            result += mi.Color3f(*(dr.maximum(1 - dr.square(4 * (y - middle)), 0) for middle in _RAINBOW))
+        return dr.select(active, weights.luminance * result, 0)
+
+
+def strongest_period(height_field: HeightField) -> float:
+    """The period along x, in µm, of the strongest Fourier component of the heights; that of the tile if flat."""
+    power = np.abs(scipy.fft.rfft(height_field.centred - height_field.centred.mean(), axis=1)) ** 2
+    orders = power.sum(axis=0)[1:]
+    if orders.size == 0 or orders.max() == 0:
+        return height_field.tile_size[0]
+    return height_field.tile_size[0] / (1 + int(orders.argmax()))

@@ -1,0 +1,72 @@
+"""The lights supported by a real-time shader: directional and point lights."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from ...errors import RequestError
+from ...testing import array, interaction
+from .tristimulus import wavelengths
+
+
+def spectrum_of(evaluate: Callable[[mi.SurfaceInteraction3f], mi.UnpolarizedSpectrum]) -> NDArray[np.float64]:
+    """A spectral function of a SurfaceInteraction3f, evaluated at `tristimulus.wavelengths`: (401,)."""
+    nanometres, channels = wavelengths(), len(mi.UnpolarizedSpectrum(0))
+    groups = np.resize(nanometres, (-(-nanometres.size // channels), channels))
+    found = []
+    for group in [groups] if dr.is_jit_v(mi.Float) else groups[:, None]:
+        values = array(evaluate(interaction((0, 0, 1), group)), np.float64).reshape(channels, -1)
+        found.append(np.broadcast_to(values, (channels, len(group))))
+    return np.concatenate(found, axis=1).T.ravel()[: nanometres.size]
+
+
+class Light:
+    """A directional or point emitter of a scene.
+
+    Attributes:
+        emitter: the Mitsuba emitter.
+        spectrum: (401,) at `tristimulus.wavelengths`: normal irradiance per nm, for point lights at distance one.
+    """
+
+    KINDS = ("DirectionalEmitter", "PointLight")
+
+    def __init__(self, emitter: mi.Emitter) -> None:
+        self.emitter = emitter
+        self.at_point = emitter.class_name() == "PointLight"
+        # At distance one from a point light; directional light is uniform.
+        place = mi.Point3f(mi.traverse(emitter)["position"]) if self.at_point else mi.Point3f(0)
+
+        def irradiance(si: mi.SurfaceInteraction3f) -> mi.UnpolarizedSpectrum:
+            si.p = place + mi.Vector3f(0, 0, 1)
+            _, value = emitter.sample_direction(si, mi.Point2f(0.5), True)
+            return mi.unpolarized_spectrum(value)
+
+        self.spectrum = spectrum_of(irradiance)
+
+    def sample(
+        self, si: mi.SurfaceInteraction3f, active: mi.Bool
+    ) -> tuple[mi.DirectionSample3f, mi.Float, mi.UnpolarizedSpectrum]:
+        """Direction of the light, the factor of `spectrum`, and the irradiance at the wavelengths of the ray."""
+        ds, value = self.emitter.sample_direction(si, mi.Point2f(0.5), active)
+        falloff = dr.rcp(dr.square(ds.dist)) if self.at_point else mi.Float(1)
+        return ds, falloff, mi.unpolarized_spectrum(value)
+
+
+def lights_of(scene: mi.Scene) -> list[Light]:
+    """The directional and point lights of a scene; others are ignored.
+
+    Raises:
+        ValueError: if there is none.
+    """
+    found = [Light(emitter) for emitter in scene.emitters() if emitter.class_name() in Light.KINDS]
+    if not found:
+        raise RequestError(
+            "diffraction_shader: the scene has no directional or point light, and it knows no other; in place of a "
+            "sun's disc give it a directional light"
+        )
+    return found

@@ -1,0 +1,103 @@
+"""PQ: a finite number of tiles."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import drjit as dr
+import mitsuba as mi
+
+from ...errors import RequestError
+from ...surface.heightfield import HeightField
+from .base import TextureShader, check_whole
+from .gain import Gain
+from .quirks import Quirks
+from .tiling import tile_factor, tiling_power
+
+INTERPOLATIONS = ("sinc", "linear")
+
+
+class PQ(TextureShader):
+    """The PQ factors (thesis of 2014, sections 3.2.1 and 3.2.2, algorithm 4.5; "P" and "Q" are tiles along x and y).
+
+    The surface consists of P × Q tiles only. With A the transform of one tile, divided by its number of pixels,
+
+        |P(q; κ)|² = |A(q; κ)|² · |Σ_{n<P} e^{−2πi n q_x T_x}|² |Σ_{n<Q} e^{−2πi n q_y T_y}|²/(PQ)²,
+
+    one for a flat mirror. A is interpolated between texels: linearly (2 × 2 texels), or with the kernel
+
+        D(t/N; N)/N = sin(πt)/(N sin(πt/N)),     t = q_j T_j − m_j,
+
+    of a tile of N pixels, which is exact if summed over all texels and tends to sinc(t) for large N. The published
+    neighbourhood is 3 × 3. The origin is the centre of the tile, so that the kernel is real. Frequencies beyond the
+    Nyquist limit are zero. The thesis sums n = 0 … N, i.e. N + 1 tiles (eq. 3.33).
+    """
+
+    own_quirks = (*TextureShader.own_quirks, "wrong_product")
+    origin_at_centre = True
+
+    def __init__(
+        self,
+        height_field: HeightField,
+        quirks: Quirks,
+        *,
+        tiles: tuple[int, int] | None = None,
+        interpolation: str = "sinc",
+        reach: int = 1,
+        **settings: object,
+    ) -> None:
+        """As TextureShader, and:
+
+        Args:
+            tiles: (P, Q); default: as many as the coherence length covers.
+            interpolation: "sinc" or "linear".
+            reach: of the sinc kernel, in texels on each side.
+        """
+        super().__init__(height_field, quirks, **settings)
+        if interpolation not in INTERPOLATIONS:
+            raise RequestError(f"interpolation: got {interpolation!r}, wanted one of {', '.join(INTERPOLATIONS)}")
+        if tiles is None:
+            tiles = tuple(max(1, round(self.coherence_length / size)) for size in self.tile_size)
+        self.tiles = tuple(check_whole("tiles", count, 1) for count in tiles)
+        if len(self.tiles) != 2:
+            raise RequestError(f"tiles: got {tiles!r}, wanted two whole numbers ≥ 1, along x and y")
+        self.interpolation = interpolation
+        self.reach = check_whole("reach", reach, 1)
+
+    @property
+    def peak(self) -> float:
+        """The area of the surface."""
+        return self.tile_size[0] * self.tile_size[1] * self.tiles[0] * self.tiles[1]
+
+    @property
+    def texels_per_term(self) -> int:
+        return (2 if self.interpolation == "linear" else 2 * self.reach + 1) ** 2
+
+    def power(self, gain: Gain, wavelength: mi.Float, height_scale: mi.Float, active: mi.Bool) -> mi.Float:
+        x, y = gain.u * self.tile_size[0] / wavelength, gain.v * self.tile_size[1] / wavelength
+        columns, rows = self.textures.columns, self.textures.rows
+        active = active & (dr.abs(x) <= columns / 2) & (dr.abs(y) <= rows / 2)
+        if self.interpolation == "linear":
+            first, size = [dr.floor(c) for c in (x, y)], (2, 2)
+        else:
+            anchor = dr.floor if self.quirks.floor_anchor else dr.round
+            first, size = [anchor(c) - self.reach for c in (x, y)], (2 * self.reach + 1,) * 2
+        corner = tuple(mi.Int32(dr.clip(c, -1e6, 1e6)) for c in first)
+        kappa = -dr.two_pi * gain.w / wavelength * height_scale
+        tile, _ = self.textures.over(corner, size, kappa, self._kernel(x, y), active)
+        return dr.select(active, tile * tiling_power(x, y, self.tiles, self.quirks.wrong_product), 0)
+
+    def _kernel(self, x: mi.Float, y: mi.Float) -> Callable[[mi.Int32, mi.Int32], mi.Float]:
+        """The weight of texel m at the position (x, y)."""
+        counts = self.textures.columns, self.textures.rows
+
+        def linear(m_x: mi.Int32, m_y: mi.Int32) -> mi.Float:
+            return dr.maximum(1 - dr.abs(mi.Float(m_x) - x), 0) * dr.maximum(1 - dr.abs(mi.Float(m_y) - y), 0)
+
+        def sinc(m_x: mi.Int32, m_y: mi.Int32) -> mi.Float:
+            value = mi.Float(1)
+            for t, count in zip((x - mi.Float(m_x), y - mi.Float(m_y)), counts, strict=True):
+                value *= tile_factor(t / count, count) / count
+            return value
+
+        return linear if self.interpolation == "linear" else sinc

@@ -1,0 +1,69 @@
+"""The quirks of the published shader: deviations from the physics, each of which can be toggled."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+from ...errors import RequestError
+
+
+@dataclass(frozen=True)
+class Quirks:
+    """True means "as published", false "corrected"; equations are those of the thesis of 2014.
+
+    Attributes:
+        fresnel_squared: F² with Schlick's F, which is already a power reflectance (eq. 3.4, 3.10); corrected: F.
+        fixed_index: F is that of an index of 1.5 for any material; corrected: R at normal incidence of the material.
+        window_pi: the Gaussian window has the height π (eq. 3.30); corrected: 1, which gives one for a flat mirror.
+        complex_window_sum: |Σ φ F|² without the spatial average ⟨·⟩; corrected: Σ φ² |F|².
+        floor_anchor: the neighbourhood is centred at ⌊·⌋ of the texel position (algorithm 4.3, lines 12 and 13);
+            corrected: at the nearest texel.
+        heights_from_zero: heights are measured from the lowest point (algorithm 4.1); corrected: from the centre of
+            their range, which halves the number of Taylor terms and the loss of digits.
+        no_jacobian: NMM sums its wavelengths without dλ/dn; corrected: each represents the area of its line.
+        wrong_product: the imaginary part of a product in PQ is p₁p₂ + q₁q₂ (eq. 3.48); corrected: p₁q₂ + q₁p₂.
+        d65_light: the light is D65; corrected: the spectrum of the light in the scene.
+        relative: radiance is relative to a flat mirror, which omits R₀ S(0)/λ² (eq. 3.7); corrected: radiance.
+        d65_twice: XYZ, already weighted by D65, is multiplied by the white point of D65 (eq. 4.10); corrected: once.
+        cie_rgb_matrix: XYZ is converted to CIE RGB but displayed as sRGB (eq. 4.9); corrected: sRGB.
+        power_gamma: the picture is encoded with a power of 1/2.2; corrected: the transfer function of sRGB.
+        constant_blend: the layer below is blended with a constant weight (algorithm 4.4, whose test |F| > 1 is never
+            true); corrected: weighted by the transmittance (1 − R_i)(1 − R_o).
+        infrared_rainbow: the rainbow of GEM spans 0.5 to 1 µm; corrected: 0.38 to 0.78 µm.
+    """
+
+    fresnel_squared: bool
+    fixed_index: bool
+    window_pi: bool
+    complex_window_sum: bool
+    floor_anchor: bool
+    heights_from_zero: bool
+    no_jacobian: bool
+    wrong_product: bool
+    d65_light: bool
+    relative: bool
+    d65_twice: bool
+    cie_rgb_matrix: bool
+    power_gamma: bool
+    constant_blend: bool
+    infrared_rainbow: bool
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            if not isinstance(getattr(self, field.name), bool):
+                raise RequestError(f"{field.name}: got {getattr(self, field.name)!r}, wanted True or False")
+
+    @classmethod
+    def names(cls) -> tuple[str, ...]:
+        """The names of all quirks."""
+        return tuple(field.name for field in fields(cls))
+
+    @classmethod
+    def as_published(cls) -> Quirks:
+        """All on."""
+        return cls(**dict.fromkeys(cls.names(), True))
+
+    @classmethod
+    def corrected(cls) -> Quirks:
+        """All off."""
+        return cls(**dict.fromkeys(cls.names(), False))

@@ -1,0 +1,140 @@
+"""The Fourier transforms of the powers of a height field as textures (algorithm 4.1), and sums over their texels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import scipy.fft
+from numpy.typing import NDArray
+
+from ...bsdf.tables import PacketTable, opaque
+from ...errors import RequestError
+from ...surface.heightfield import HeightField
+
+PUBLISHED_TERMS = 37  # 81 wavelengths × 37 terms × 9 texels are the 27,000 reads of the published shader
+
+
+def taylor_transforms(
+    height_field: HeightField, terms: int, *, heights_from_zero: bool, origin_at_centre: bool
+) -> tuple[NDArray[np.complex64], float]:
+    """F{tⁿ}(m) with t = h/H, n < N; |t| ≤ 1 bounds them by one.
+
+    Args:
+        height_field: the tile, h.
+        terms: N.
+        heights_from_zero: measure heights from the lowest point (H is the full range) instead of the centre.
+        origin_at_centre: x = 0 at the centre of the tile instead of the first pixel, which affects the phase.
+
+    Returns:
+        The texels, (N_y, N_x, N), with frequency zero at (N_y // 2, N_x // 2) (eq. 4.3); and H in µm.
+
+    Raises:
+        ValueError: if there are no terms.
+    """
+    if isinstance(terms, bool) or not isinstance(terms, int) or terms < 1:
+        raise RequestError(f"terms: got {terms!r}, wanted a whole number ≥ 1")
+    heights = height_field.heights - height_field.heights.min() if heights_from_zero else height_field.centred
+    height = height_field.height_range if heights_from_zero else height_field.half_range
+    t = heights / (height or 1.0)
+    powers = t[None] ** np.arange(terms)[:, None, None]
+    spectrum = scipy.fft.fftshift(scipy.fft.fft2(powers, norm="forward"), axes=(1, 2))
+    if origin_at_centre:
+        for axis, count in zip((1, 2), height_field.shape, strict=True):
+            order = np.arange(count) - count // 2
+            phase = np.exp(1j * np.pi * order * (count - 1) / count)
+            spectrum = spectrum * np.expand_dims(phase, [a for a in (0, 1, 2) if a != axis])
+    return np.ascontiguousarray(np.moveaxis(spectrum, 0, -1), np.complex64), float(height)
+
+
+class TaylorTextures:
+    """The transforms F{tⁿ}(m), t = h/H, as textures. With κ in rad/µm,
+
+        F_m(κ) = Σ_n (iκH)ⁿ/n! · F{tⁿ}(m),     n < N.
+
+    Each term of each texel is one read of a complex number; the truncation error is at most (κH)^N/N!. The thesis
+    transforms e^{ikwh}, kw = −κ, with the opposite sign in the exponent, which gives the complex conjugate of F_m and
+    the same power.
+
+    Attributes:
+        columns, rows: the numbers of texels along x and y.
+        terms: N.
+    """
+
+    def __init__(self, texels: NDArray[np.complex64], height: float) -> None:
+        """Takes what `taylor_transforms` returns."""
+        self.rows, self.columns, self.terms = texels.shape
+        self.height = opaque(height)
+        self.table = PacketTable(np.stack([texels.real, texels.imag], axis=-1), width=2)
+
+    def amplitude(self, m_x: mi.Int32, m_y: mi.Int32, kappa: mi.Float, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
+        """Real and imaginary part of F_m(κ); zero where the order lies outside the texture."""
+        column, row = m_x + self.columns // 2, m_y + self.rows // 2
+        held = active & (column >= 0) & (column < self.columns) & (row >= 0) & (row < self.rows)
+        first = mi.UInt32(dr.select(held, (row * self.columns + column) * self.terms, 0))
+        return _taylor_series(self.table, first, kappa * self.height, self.terms, held)
+
+    def over(
+        self,
+        first: tuple[mi.Int32, mi.Int32],
+        size: tuple[int, int],
+        kappa: mi.Float,
+        weight: Callable[[mi.Int32, mi.Int32], mi.Float],
+        active: mi.Bool,
+    ) -> tuple[mi.Float, mi.Float]:
+        """|Σ_m φ_m F_m(κ)|² and Σ_m φ_m² |F_m(κ)|² over a rectangle of texels.
+
+        Args:
+            first: the texel of lowest order along x and y.
+            size: numbers of texels along x and y.
+            kappa: κ in rad/µm.
+            weight: φ of the orders (m_x, m_y).
+            active: mask.
+        """
+        return _rectangle(self, mi.Int32(first[0]), mi.Int32(first[1]), size[0], size[1], kappa, weight, active)
+
+
+@dr.syntax
+def _taylor_series(
+    table: PacketTable, first: mi.UInt32, x: mi.Float, terms: int, active: mi.Bool
+) -> tuple[mi.Float, mi.Float]:
+    """Σ_n (ix)ⁿ/n! B_n."""
+    re, im = mi.Float(0), mi.Float(0)
+    # (ix)ⁿ/n!
+    c_re, c_im = mi.Float(1), mi.Float(0)
+    n = mi.UInt32(0)
+    while n < terms:
+        term = table(first + n, active)
+        re += c_re * term.x - c_im * term.y
+        im += c_re * term.y + c_im * term.x
+        n += 1
+        step = x / mi.Float(n)
+        c_re, c_im = -step * c_im, step * c_re
+    return re, im
+
+
+@dr.syntax
+def _rectangle(
+    textures: TaylorTextures,
+    first_x: mi.Int32,
+    first_y: mi.Int32,
+    columns: int,
+    rows: int,
+    kappa: mi.Float,
+    weight: Callable[[mi.Int32, mi.Int32], mi.Float],
+    active: mi.Bool,
+) -> tuple[mi.Float, mi.Float]:
+    re, im, powers = mi.Float(0), mi.Float(0), mi.Float(0)
+    index = mi.Int32(0)
+    while index < columns * rows:
+        m_x = first_x + index % columns
+        m_y = first_y + index // columns
+        part_re, part_im = textures.amplitude(m_x, m_y, kappa, active)
+        phi = weight(m_x, m_y)
+        re += phi * part_re
+        im += phi * part_im
+        powers += dr.square(phi) * (dr.square(part_re) + dr.square(part_im))
+        index += 1
+    return dr.square(re) + dr.square(im), powers

@@ -1,0 +1,77 @@
+"""Tables for the terminal, Markdown and JSON of records and of other rows of numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+from rich.table import Table
+from rich.text import Text
+
+from .validation.record import Record
+
+RECORD_COLUMNS = ("check", "expected", "found", "difference", "bound", "")
+
+
+def cells(columns: Mapping[str, str], row: object) -> list[str]:
+    """A row as texts; `columns` are titles and format strings such as "{.error:.1e}"."""
+    return [text.format(row) for text in columns.values()]
+
+
+def markdown(columns: Sequence[str], rows: Iterable[Sequence[str]], texts: int = 1) -> str:
+    """The same in Markdown."""
+    ruler = ["---" if index < texts else "---:" for index in range(len(columns))]
+    lines = ([cell.replace("|", "\\|") for cell in line] for line in (columns, ruler, *rows))
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+def record_cells(record: Record) -> list[str]:
+    """A record under `RECORD_COLUMNS`."""
+    numbers = [f"{value:.4g}" for value in (record.expected, record.measured)]
+    small = ["—" if value is None else f"{float(f'{value:.2g}'):.4g}" for value in (record.error, record.bound)]
+    return [record.name, *numbers, *small, _verdict(record)]
+
+
+def _verdict(record: Record) -> str:
+    return "shown" if record.bound is None else "ok" if record.ok else "MISSED"
+
+
+def record_table(records: Sequence[Record]) -> Table:
+    """Records for a terminal, group by group."""
+    shown = Table(*RECORD_COLUMNS)
+    for column in shown.columns[1:5]:
+        column.justify = "right"
+    group = None
+    for record in records:
+        if record.group != group:
+            group = record.group
+            shown.add_section()
+            shown.add_row(Text(group, style="bold"))
+        *line, verdict = record_cells(record)
+        style = {"ok": "green", "MISSED": "bold red"}.get(verdict, "dim")
+        shown.add_row(*map(Text, line), Text(verdict, style=style))
+    return shown
+
+
+def record_markdown(records: Iterable[Record]) -> str:
+    """Records with their notes and sources."""
+    rows = [[record.group, *record_cells(record), record.note, record.source] for record in records]
+    return markdown(("group", *RECORD_COLUMNS, "note", "source"), rows, texts=9)
+
+
+def record_dicts(records: Iterable[Record]) -> list[dict[str, object]]:
+    """Records for JSON."""
+    return [
+        {
+            "group": record.group,
+            "name": record.name,
+            "expected": record.expected,
+            "found": record.measured,
+            "difference": record.error,
+            "relative": record.relative,
+            "bound": record.bound,
+            "ok": record.ok,
+            "note": record.note,
+            "source": record.source,
+        }
+        for record in records
+    ]

@@ -1,0 +1,1 @@
+"""The checks of `mitsuba-diffraction validate`: closed forms, statistics, rigorous theory, measured gratings."""

@@ -1,0 +1,138 @@
+"""BRDF maps: the colours that a surface sends into all directions from one light, as a viewer would see them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...color import auto_exposure, daylight, into_gamut, on_screen, spectrum_to_linear_sRGB
+from ...errors import RequestError
+from ...testing import direction
+from ..realtime_shader.evaluate import VARIANTS, colour
+from ..realtime_shader.quirks import Quirks
+from .published_surfaces import PublishedSurface
+from .viewing_angle import MODEL, relative_reflectance, wavelengths
+
+Array = NDArray[np.float64]
+
+MAP_METHODS = (MODEL, *VARIANTS)
+PROJECTIONS = ("hemisphere", "uv")
+
+
+@dataclass(frozen=True, eq=False)
+class BRDFMap:
+    """Colours over directions.
+
+    Attributes:
+        surface: what was evaluated.
+        method: one of `MAP_METHODS`.
+        projection: "hemisphere": a disc, the radius θ_o and the angle φ_o of the direction to the viewer. "uv": the
+            plane of (u, v), minus the sums of the direction cosines of light and viewer, where an order m of a tile
+            stands at (u, v) = λ m/T wherever the light is.
+        incidence: (θ_i, φ_i) in degrees.
+        x, y: (side,) centres of the pixels: θ_o cos φ_o and θ_o sin φ_o in degrees, or u and v.
+        rgb: (side, side, 3) linear sRGB, rows ↔ y; NaN where there is no direction above the surface.
+        exposure: what `picture` multiplies with.
+    """
+
+    surface: PublishedSurface
+    method: str
+    projection: str
+    incidence: tuple[float, float]
+    x: Array
+    y: Array
+    rgb: Array
+    exposure: float
+
+    @property
+    def picture(self) -> Array:
+        """sRGB (side, side, 3) from 0 to 1; 0.5 grey outside."""
+        return np.where(np.isnan(self.rgb), 0.5, on_screen(into_gamut(self.rgb) * self.exposure) / 255)
+
+    def places_of_orders(self, nanometres: Array, orders: Array) -> tuple[Array, Array]:
+        """Where the grating equation with the published period puts the orders, in the map's x and y.
+
+        The direction cosines of light and viewer along the diffracting axis add up to −nλ/d, across it to zero.
+
+        Args:
+            nanometres: (...) wavelengths.
+            orders: (...) n; the two broadcast.
+
+        Returns:
+            x and y, (...) each; NaN where the order is evanescent.
+        """
+        path = np.asarray(orders) * np.asarray(nanometres) * 1e-3 / self.surface.period
+        sums = np.zeros((*path.shape, 2))
+        sums[..., self.surface.axis] = path
+        out = -sums - direction(*self.incidence)[:2]
+        radius = np.hypot(out[..., 0], out[..., 1])
+        place = sums if self.projection == "uv" else _over_angle(out, radius)
+        place = np.where((radius < 1)[..., None], place, np.nan)
+        return place[..., 0], place[..., 1]
+
+
+def brdf_map(
+    surface: PublishedSurface,
+    method: str = MODEL,
+    *,
+    projection: str = "hemisphere",
+    incidence: tuple[float, float] = (30.0, 0.0),
+    side: int = 240,
+    quirks: Quirks | None = None,
+) -> BRDFMap:
+    """Evaluates a surface over the outgoing hemisphere under D65.
+
+    The model's relative reflectance, at every 5 nm, becomes XYZ and sRGB; the shader's variants give their own linear
+    RGB. Each map has the exposure of its own that `color.auto_exposure` finds, and says it.
+
+    Args:
+        surface: what to look at.
+        method: one of `MAP_METHODS`.
+        projection: one of `PROJECTIONS`.
+        incidence: (θ_i, φ_i) in degrees, φ_i from the x axis.
+        side: pixels along x and along y.
+        quirks: of the shader; as published if none are given.
+
+    Raises:
+        ValueError: if an argument makes no sense, or Mitsuba has no vectorised spectral variant set.
+    """
+    if method not in MAP_METHODS:
+        raise RequestError(f"method: got {method!r}, wanted one of {', '.join(MAP_METHODS)}")
+    if projection not in PROJECTIONS:
+        raise RequestError(f"projection: got {projection!r}, wanted one of {', '.join(PROJECTIONS)}")
+    wi = direction(*incidence)
+    if not wi[2] > 0:
+        raise RequestError(f"incidence: got {incidence!r}, wanted an angle from the normal below 90 degrees first")
+    axis = (np.arange(side) + 0.5) / side * 2 - 1
+    if projection == "hemisphere":
+        x = y = 90 * axis
+        theta, phi = np.hypot(*np.meshgrid(x, y)), np.rad2deg(np.arctan2(y[:, None], x))
+        wo = direction(theta, phi)
+        above = theta < 90
+    else:
+        x, y = axis - wi[0], axis - wi[1]
+        out = -np.stack(np.meshgrid(x, y), axis=-1) - wi[:2]
+        z = 1 - (out**2).sum(axis=-1)
+        above = z > 0
+        wo = np.concatenate([out, np.sqrt(np.maximum(z, 0))[..., None]], axis=-1)
+    rgb = np.full((side, side, 3), np.nan)
+    rgb[above] = _linear_rgb(surface, method, wi, wo[above], quirks)
+    shown = into_gamut(rgb[above])
+    return BRDFMap(surface, method, projection, incidence, x, y, rgb, auto_exposure(shown))
+
+
+def _linear_rgb(surface: PublishedSurface, method: str, wi: Array, wo: Array, quirks: Quirks | None) -> Array:
+    if method != MODEL:
+        settings = {} if method == "gem" else {"coherence_length": surface.coherence_length}
+        return colour(surface.height_field, wi, wo, variant=method, quirks=quirks, **settings)
+    nanometres = wavelengths()
+    values = relative_reflectance(surface.spectrum, wi, wo, nanometres)
+    return spectrum_to_linear_sRGB(values * daylight(nanometres), nanometres)
+
+
+def _over_angle(cosines: Array, radius: Array) -> Array:
+    """Direction cosines (..., 2) of length `radius` → (θ cos φ, θ sin φ) in degrees."""
+    theta = np.rad2deg(np.arcsin(np.minimum(radius, 1)))
+    return cosines * np.divide(theta, radius, out=np.full_like(radius, np.rad2deg(1)), where=radius > 0)[..., None]

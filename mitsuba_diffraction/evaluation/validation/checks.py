@@ -1,0 +1,44 @@
+"""The lists of checks: of the product, and of a surface of one's own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from ...scalar_theory import scalar_error
+from ...spectrum.grating_spectrum import GratingSpectrum
+from ...surface.heightfield import HeightField
+from ..benchmark.accuracy import against_reference
+from . import analytic, bumps, conservation, coupled_waves, measured_gratings, rough_surface, viewing_angle
+from .record import GROUPS, Check, Record
+
+
+def checks() -> tuple[Check, ...]:
+    """What `mitsuba-diffraction validate` runs, group by group."""
+    modules = (analytic, bumps, viewing_angle, measured_gratings, rough_surface, conservation, coupled_waves)
+    every = [check for module in modules for check in module.CHECKS]
+    return tuple(sorted(every, key=lambda check: GROUPS.index(check.group)))
+
+
+def surface_checks(height_field: HeightField, spectrum: GratingSpectrum) -> tuple[Check, ...]:
+    """Checks of the spectrum of a surface and of the BSDF that shows it."""
+
+    def check(name: str, measure: Callable[[], Record], source: str) -> Check:
+        return Check("surface", name, measure, source)
+
+    return (
+        check("Parseval", lambda: conservation.parseval(spectrum), "Σ_m η_m = 1"),
+        check(
+            "table against heights",
+            lambda: against_reference(height_field, spectrum),
+            "reference.power_spectrum, float64",
+        ),
+        check("reciprocity", lambda: conservation.reciprocity(spectrum), "f(ω_i, ω_o) = f(ω_o, ω_i)"),
+        check("albedo of a perfect mirror", lambda: conservation.energy(spectrum), "at most one"),
+        check("range of scalar theory", lambda: scalar_range(height_field, spectrum.extent), "rigorous orders"),
+    )
+
+
+def scalar_range(height_field: HeightField, extent: str) -> Record:
+    """The error of scalar theory, as `inspect` and `precompute` tell it."""
+    found = scalar_error(height_field, extent)
+    return Record(found.share, 0.0, found.bound, note=str(found))

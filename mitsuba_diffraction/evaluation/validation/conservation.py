@@ -1,0 +1,100 @@
+"""What holds of any surface: reciprocity, no more light than comes in, samples that agree with values."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from ... import testing
+from ...spectrum.grating_spectrum import GratingSpectrum
+from ...surface import gratings
+from ...surface.heightfield import HeightField
+from .lobes import brdf, grating, spectrum_of
+from .record import Check, Record
+
+Array = NDArray[np.float64]
+
+WAVELENGTHS = (0.42, 0.55, 0.68)  # µm
+ANGLES = (0.0, 30.0, 60.0, 80.0)  # degrees
+DEVIATIONS = 4.0  # of averages of random samples
+SAMPLES = 1 << 17
+
+
+def _drawn(bsdf: mi.BSDF, wi: Array, wavelength: float) -> tuple[Array, Array]:
+    """Samples ω_o (n, 3) and their weights f cos θ_o / pdf (n,) for ω_i (n, 3)."""
+    wo, weights, _ = testing.sample(bsdf, wi, [1e3 * wavelength] * len(mi.UnpolarizedSpectrum(0)))
+    return wo, weights[:, 0]
+
+
+def _near_orders(spectrum: GratingSpectrum, wavelength: float, count: int) -> tuple[Array, Array]:
+    """Pairs of directions (count, 3), the second drawn by the BSDF for the first: where there is light."""
+    random = np.random.default_rng(3)
+    cosine, phi = random.uniform(0.1, 1, count), random.uniform(0, 360, count)
+    wi = testing.direction(np.rad2deg(np.arccos(cosine)), phi)
+    wo, weight = _drawn(grating(spectrum), wi, wavelength)
+    kept = (weight > 0) & (wo[:, 2] > 0.1)
+    return wi[kept], wo[kept]
+
+
+def parseval(spectrum: GratingSpectrum) -> Record:
+    """Σ over all frequencies that the spectrum holds; what it says it left out is allowed for."""
+    kappas = np.linspace(0.2, 1, 9) * spectrum.largest_kappa
+    found = [spectrum.powers(kappa).sum(dtype=np.float64) for kappa in kappas]
+    return Record.worst(1.0, found, spectrum.tolerance + spectrum.beyond + spectrum.dropped, "Σ_m η_m, nine κ")
+
+
+def reciprocity(spectrum: GratingSpectrum) -> Record:
+    """f(ω_i, ω_o) = f(ω_o, ω_i), as a share of the larger."""
+    bsdf = grating(spectrum, int_ior=1.5)
+    there, back = [], []
+    for wavelength in WAVELENGTHS:
+        wi, wo = _near_orders(spectrum, wavelength, 4000)
+        there.append(brdf(bsdf, wi, wo, wavelength))
+        back.append(brdf(bsdf, wo, wi, wavelength))
+    there, back = np.concatenate(there), np.concatenate(back)
+    return Record.worst(1.0, back / there, 1e-4, f"f(ω_o, ω_i)/f(ω_i, ω_o), {len(there)} pairs that the BSDF draws")
+
+
+def energy(spectrum: GratingSpectrum) -> Record:
+    """By how much the largest albedo of a perfect mirror exceeds one, by the BSDF's own samples."""
+    return excess(grating(spectrum))
+
+
+def excess(bsdf: mi.BSDF) -> Record:
+    """The same of any BSDF."""
+    found = []
+    for wavelength in WAVELENGTHS:
+        for angle in ANGLES:
+            for phi in (0.0, 90.0):
+                wi = np.broadcast_to(testing.direction(angle, phi), (SAMPLES, 3))
+                _, weight = _drawn(bsdf, wi, wavelength)
+                found.append((weight.mean(), weight.std() / np.sqrt(SAMPLES)))
+    # The first that is not a number, if one is: it counts as the largest.
+    largest, error = found[int(np.argmax([mean for mean, _ in found]))]
+    note = f"above one; largest albedo {largest:.5f} of 24 directions and wavelengths"
+    return Record(np.maximum(largest - 1, 0), 0.0, 1e-3 + DEVIATIONS * error, note=note)
+
+
+_SURFACES: dict[str, Callable[[], HeightField]] = {
+    "sinusoid": functools.cache(lambda: gratings.sinusoidal(2.5, 0.3)),
+    "blaze": functools.cache(lambda: gratings.blazed(2.5, 0.25)),
+    "crossed": functools.cache(lambda: gratings.crossed(2.0, 0.1, samples=32)),
+}
+
+
+def _of(make: Callable[[], HeightField], measure: Callable[[GratingSpectrum], Record]) -> Callable[[], Record]:
+    return lambda: measure(spectrum_of(make(), tolerance=1e-3))
+
+
+CHECKS = tuple(
+    check
+    for name, make in _SURFACES.items()
+    for check in (
+        Check("energy", f"{name}: reciprocity", _of(make, reciprocity), "f(ω_i, ω_o) = f(ω_o, ω_i)", slow=True),
+        Check("energy", f"{name}: albedo of a perfect mirror", _of(make, energy), "at most one", slow=True),
+    )
+)

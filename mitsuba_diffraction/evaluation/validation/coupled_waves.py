@@ -1,0 +1,259 @@
+"""The BSDF against the stored results of coupled-wave analysis, order by order.
+
+A difference is Σ_m |Δη_m| / Σ_m η_m: a share of the light that is rigorously reflected. What is promised:
+
+- sinusoids of period ≥ 5 λ and depth ≤ λ/2, light at up to 20°: 2 %;
+- blazes and triangles, which have edges, of depth ≤ λ/2, up to 20°: 10 %.
+
+Everything else is outside of the range of scalar theory: shown, and nothing promised.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...scalar_theory import (
+    Orders,
+    difference,
+    error_map,
+    expected_error,
+    profile_powers,
+    scalar_orders,
+    sinusoid_powers,
+    stored,
+)
+from ...surface import gratings
+from ...surface.heightfield import HeightField
+from ...testing import direction
+from .lobes import grating, lobe_powers, spectrum_of
+from .record import Check, Record
+
+Array = NDArray[np.float64]
+
+BOUNDS = {"sinusoidal": 0.02, "blazed": 0.1, "triangular": 0.1}
+SHORTEST_PERIOD, LARGEST_DEPTH, LARGEST_ANGLE = 5.0, 0.5, 20.0  # in wavelengths, degrees
+
+
+def triangular(period: float, depth: float, *, samples: int = 512) -> HeightField:
+    """h = depth (1 − |2x/period − 1|), one period, (1, samples); lengths in µm."""
+    x = (np.arange(samples) + 0.5) / samples
+    return HeightField(depth * (1 - np.abs(2 * x - 1))[None, :], (period / samples, period), "triangular grating")
+
+
+PROFILES: dict[str, Callable[..., HeightField]] = {
+    "sinusoidal": gratings.sinusoidal,
+    "blazed": gratings.blazed,
+    "triangular": triangular,
+}
+
+
+@dataclass(frozen=True)
+class RigorousResult:
+    """One stored result.
+
+    Attributes:
+        profile: a name of `PROFILES`.
+        period, depth, wavelength: µm.
+        angle: of incidence, degrees; the light comes from −x.
+        material: "dielectric" (n = 1.5) or a metal by Mitsuba's name.
+        index: n + ik.
+        orders: those that propagate, (n,).
+        te, tm: rigorous efficiencies, (n,).
+        change: by how much they changed at the last refinement, as a share of the reflected light.
+    """
+
+    profile: str
+    period: float
+    depth: float
+    wavelength: float
+    angle: float
+    material: str
+    index: complex
+    orders: NDArray[np.int64]
+    te: Array
+    tm: Array
+    change: float
+
+    @property
+    def unpolarised(self) -> Array:
+        """(n,)"""
+        return (self.te + self.tm) / 2
+
+    @property
+    def in_range(self) -> bool:
+        """Where a bound is promised."""
+        fine = self.period >= SHORTEST_PERIOD * self.wavelength or self.profile != "sinusoidal"
+        return fine and self.depth <= LARGEST_DEPTH * self.wavelength and self.angle <= LARGEST_ANGLE
+
+    def __str__(self) -> str:
+        return (
+            f"{self.period:g} × {self.depth:g} µm ({self.period / self.wavelength:.1f} × "
+            f"{self.depth / self.wavelength:.2f} λ), {self.angle:g}°"
+        )
+
+    def scalar(self) -> Orders:
+        """R K G E η_m of this case, in float64."""
+        powers = profile_powers(PROFILES[self.profile](self.period, self.depth))
+        return scalar_orders(powers, self.period, self.wavelength, self.angle, self.index)
+
+    def found(self) -> Array:
+        """What the BSDF reflects into the orders, (n,)."""
+        spectrum, bsdf = _plugin(self.profile, self.period, self.depth, self.material)
+        q = np.stack([self.orders / self.period, np.zeros(len(self.orders))], axis=-1)
+        return lobe_powers(bsdf, spectrum, direction(self.angle, 180.0), q, self.wavelength)
+
+
+@functools.cache
+def _plugin(profile: str, period: float, depth: float, material: str) -> tuple[Any, Any]:
+    spectrum = spectrum_of(PROFILES[profile](period, depth), coherence_length=200.0, tolerance=1e-4)
+    parameters = {"int_ior": 1.5, "ext_ior": 1.0} if material == "dielectric" else {"material": material}
+    return spectrum, grating(spectrum, **parameters)
+
+
+@functools.cache
+def cases() -> tuple[RigorousResult, ...]:
+    """All stored ones."""
+    names = ("profile", "period", "depth", "wavelength", "angle", "material", "change")
+    return tuple(
+        RigorousResult(
+            **{name: case[name] for name in names},
+            index=complex(*case["index"]),
+            orders=np.arange(case["orders"][0], case["orders"][1] + 1),
+            te=np.array(case["te"]),
+            tm=np.array(case["tm"]),
+        )
+        for case in stored()["cases"]
+    )
+
+
+def _worst(
+    those: list[RigorousResult],
+    found: Callable[[RigorousResult], Array],
+    rigorous: Callable[[RigorousResult], Array],
+    bound: float | None,
+) -> Record:
+    """The grating that differs most, and its strongest order."""
+    differences = [difference(found(case), rigorous(case)) for case in those]
+    case = those[worst := int(np.argmax(differences))]
+    strongest = int(np.argmax(rigorous(case)))
+    note = (
+        f"Σ|Δη|/Σ η, worst of {len(those)}: {case}; order {case.orders[strongest]} has {found(case)[strongest]:.4g}, "
+        f"rigorous {rigorous(case)[strongest]:.4g}; converged to {max(c.change for c in those):.1e}"
+    )
+    return Record(differences[worst], 0.0, bound, note=note)
+
+
+def _dielectric(profile: str, choose: Callable[[RigorousResult], bool]) -> Record:
+    those = [case for case in cases() if case.profile == profile and case.material == "dielectric" and choose(case)]
+    bound = BOUNDS[profile] if all(case.in_range for case in those) else None
+    return _worst(those, RigorousResult.found, lambda case: case.unpolarised, bound)
+
+
+def _metal(profile: str, te: bool) -> Record:
+    """Nothing is promised for metals: see docs/validation.md."""
+    those = [c for c in cases() if c.profile == profile and c.material != "dielectric" and c.angle <= LARGEST_ANGLE]
+    if te:
+        return _worst(those, lambda case: case.scalar().s, lambda case: case.te, None)
+    return _worst(those, RigorousResult.found, lambda case: case.unpolarised, None)
+
+
+def formula(those: Iterable[RigorousResult]) -> Record:
+    """R K G E η_m in float64, on which the map stands, against the BSDF, integrated lobe by lobe."""
+    differences = [difference(case.scalar().unpolarised, case.found()) for case in those]
+    # E is read from a table of lower bounds.
+    note = f"Σ|Δη|/Σ η, worst of {len(differences)}; mean {np.mean(differences):.1e}"
+    return Record(np.max(differences), 0.0, 2e-2, note=note)
+
+
+def polarised_shares(case: RigorousResult) -> tuple[Array, Array, Array]:
+    """η_te/(η_te + η_tm): rigorous, and by R_s and R_p at the half vector; and the share of the light in the orders."""
+    orders = case.scalar()
+    total = case.te + case.tm
+    with np.errstate(invalid="ignore", divide="ignore"):
+        rigorous, scalar = case.te / total, orders.s / (orders.s + orders.p)
+    return np.nan_to_num(rigorous, nan=0.5), np.nan_to_num(scalar, nan=0.5), total / total.sum()
+
+
+def _polarisation(split: bool) -> Record:
+    """The share of s light in an order, mean over the orders by their light; unpolarised light at under 40°."""
+    rows = []
+    for case in cases():
+        if case.material == "dielectric" and case.angle < 40:
+            rigorous, scalar, weight = polarised_shares(case)
+            rows.append((weight @ np.abs((scalar if split else 0.5) - rigorous), str(case)))
+    worst, case = max(rows)
+    note = f"mean |Δ| over orders, worst of {len(rows)}: {case}; mean {np.mean([row[0] for row in rows]):.3f}"
+    return Record(worst, 0.0, 0.1 if split else None, note=note)
+
+
+def _map(shortest: float, deepest: float, bound: float | None) -> Record:
+    """Largest error of the map, at its nodes and, between them, at the shortest period and largest depth."""
+    periods, depths, _, _ = error_map()
+    places = itertools.product([shortest, *periods[periods > shortest]], [*depths[depths < deepest], deepest])
+    worst, period, depth = max((expected_error(period, depth, 1.0), period, depth) for period, depth in places)
+    return Record(worst, 0.0, bound, note=f"Σ|Δη|/Σ η, largest at {period:g} × {depth:g} λ")
+
+
+def _map_again() -> Record:
+    """The map, whose rigorous efficiencies are our own, against coupled waves at the same periods and depths."""
+    periods, depths, directions, errors = error_map()
+    found, expected = [], []
+    for point in stored()["map"]:
+        place = point["period"], 1.0, point["angle"]
+        scalar = scalar_orders(sinusoid_powers(point["depth"]), *place, complex(stored()["map index"]))
+        expected.append(difference(scalar.unpolarised, point["unpolarised"]))
+        angle = np.flatnonzero((directions == [point["angle"], 0]).all(axis=1))[0]
+        found.append(errors[np.searchsorted(periods, point["period"]), np.searchsorted(depths, point["depth"]), angle])
+    return Record.worst(np.array(expected), np.array(found), 0.01, f"{len(found)} sinusoids, 0° and 20°")
+
+
+def _check(name: str, measure: Callable[[], Record], slow: bool = False) -> Check:
+    return Check("rigorous", name, measure, "coupled waves (meent), stored", slow)
+
+
+def _of_profile(profile: str) -> tuple[Check, ...]:
+    near = f"≤ {LARGEST_ANGLE:g}°"
+    short = f", period ≥ {SHORTEST_PERIOD:g} λ" if profile == "sinusoidal" else ""
+
+    def dielectric(choose: Callable[[RigorousResult], bool]) -> Callable[[], Record]:
+        return functools.partial(_dielectric, profile, choose)
+
+    return (
+        _check(f"{profile}, n = 1.5, depth ≤ λ/2{short}, {near}", dielectric(lambda case: case.in_range), slow=True),
+        _check(
+            f"{profile}, n = 1.5, {near}, outside of that",
+            dielectric(lambda case: not case.in_range and case.angle <= LARGEST_ANGLE),
+            slow=True,
+        ),
+        *(
+            _check(f"{profile}, n = 1.5, {angle:g}°", dielectric(lambda case, a=angle: case.angle == a), slow=True)
+            for angle in (40.0, 60.0)
+        ),
+        _check(f"{profile}, Al, {near}, s", functools.partial(_metal, profile, True)),
+        _check(f"{profile}, Al, {near}, unpolarised", functools.partial(_metal, profile, False), slow=True),
+    )
+
+
+CHECKS = (
+    Check(
+        "rigorous",
+        "BSDF's lobes against R K G E η_m",
+        lambda: formula(case for case in cases() if case.angle <= 40),
+        "scalar_theory.py, float64",
+        slow=True,
+    ),
+    *(check for profile in PROFILES for check in _of_profile(profile)),
+    _check("map against coupled waves", _map_again),
+    _check("map, period ≥ 5 λ, depth ≤ λ/2", lambda: _map(5.0, 0.5, 0.02)),
+    _check("map, period ≥ 3.5 λ, depth ≤ λ/5", lambda: _map(3.5, 0.2, 0.02)),
+    _check("map, period ≥ 3.5 λ, depth ≤ λ/2", lambda: _map(3.5, 0.5, None)),
+    _check("s share of the light, by R_s and R_p", lambda: _polarisation(True)),
+    _check("s share of the light, taken for 1/2", lambda: _polarisation(False)),
+)

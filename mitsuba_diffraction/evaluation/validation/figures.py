@@ -1,0 +1,275 @@
+"""The evaluation of the thesis of 2014 (chapter 5) for the real-time shader and for this model: figures and a table."""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ...errors import RequestError
+from ...files import whole_file
+from ...outputs import made_for, png_text, save_markdown
+from ..realtime_shader.quirks import Quirks
+from ..report import markdown
+from .brdf_map import MAP_METHODS, PROJECTIONS, BRDFMap, brdf_map
+from .published_surfaces import SURFACES, PublishedSurface
+from .viewing_angle import (
+    METHODS,
+    MODEL,
+    ReflectanceMap,
+    fit_period,
+    grating_equation,
+    peak_angles,
+    reflectance_map,
+    wavelengths,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.figure import Figure
+    from PIL.PngImagePlugin import PngInfo
+
+MAP_COHERENCE = {"blaze": 6.5}
+"""µm, of the BRDF maps: in sunlight the orders of the blaze would be thinner than a pixel."""
+
+TITLES = {MODEL: "this model", "flss": "FLSS", "nmm": "NMM", "pq": "PQ", "gem": "GEM"}
+_PEAK = "#d62728"
+_DARKEST = 1e-3  # of the strongest reflectance outside of the specular peak
+
+
+def figure(width: float, height: float) -> Figure:
+    """An empty figure, inches, that belongs to no window."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def png(drawn: Figure, dpi: float = 110, pnginfo: PngInfo | None = None) -> bytes:
+    """A figure as a PNG of 256 colours and their mixtures, half the size of one of all colours."""
+    from PIL import Image
+
+    whole, reduced = io.BytesIO(), io.BytesIO()
+    drawn.savefig(whole, format="png", dpi=dpi)
+    with Image.open(whole) as picture:
+        picture = picture.convert("RGB")
+        palette = picture.quantize(256, kmeans=2)
+        # Pillow mixes colours only for a palette that it is given.
+        mixed = picture.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG)
+        mixed.save(reduced, format="png", optimize=True, pnginfo=pnginfo)
+    return reduced.getvalue()
+
+
+def plot_reflectance(maps: Sequence[ReflectanceMap]) -> Figure:
+    """Reflectance over wavelength and viewing angle, with the peak curve and the grating equation over it.
+
+    One panel for each map; all maps are of one surface and one θ_i. Each panel has the logarithmic scale of its own
+    strongest reflectance outside of the specular peak, three decades deep.
+    """
+    drawn = figure(3.1 * len(maps) + 0.9, 4.4)
+    axes = drawn.subplots(1, len(maps), sharex=True, sharey=True, squeeze=False)[0]
+    for panel, found in zip(axes, maps, strict=True):
+        image = _draw_map(panel, found)
+        fit = fit_period(found)
+        variance = f"{fit.variance:.2g}" if fit.variance >= 1e-3 else "< 0.001"
+        panel.set_title(f"{TITLES[found.method]}\nperiod {fit.mean:.1f} nm, variance {variance} nm²", fontsize=10)
+        panel.set_xlabel("wavelength λ / nm")
+    surface, incidence = maps[0].surface, maps[0].incidence
+    axes[0].set_ylabel("viewing angle θ$_r$ / °")
+    bar = drawn.colorbar(image, ax=axes, pad=0.01)
+    bar.set_label("reflectance / strongest\noutside of the mirror direction")
+    drawn.suptitle(f"{surface.name}: light at θ$_i$ = {incidence:g}°, mirror direction at θ$_r$ = {-incidence:g}°")
+    handles, labels = axes[0].get_legend_handles_labels()
+    drawn.legend(handles, labels, loc="outside lower center", ncols=2, frameon=False)
+    return drawn
+
+
+def _draw_map(panel: Axes, found: ReflectanceMap) -> ScalarMappable:
+    from matplotlib.collections import LineCollection
+    from matplotlib.colors import LogNorm
+
+    strongest = np.nanmax(np.where(found.order > 0.5, found.reflectance, 0))
+    shown = np.clip(found.reflectance / strongest, _DARKEST, 1)
+    style = {"cmap": "viridis", "norm": LogNorm(_DARKEST, 1), "rasterized": True}
+    if found.discrete:
+        # A line for each order; between them there is nothing.
+        panel.set_facecolor("0.85")
+        places = np.stack([np.broadcast_to(found.wavelengths[:, None], shown.shape), found.angles], axis=-1)
+        steps = np.stack([places[:-1], places[1:]], axis=2).reshape(-1, 2, 2)
+        image = panel.add_collection(LineCollection(steps, array=shown[:-1].ravel(), linewidths=0.9, **style))
+    else:
+        image = panel.pcolormesh(found.wavelengths, found.angles, shown.T, shading="nearest", **style)
+    panel.plot(found.wavelengths, peak_angles(found), color=_PEAK, linewidth=2.5, label="peak")
+    period = found.surface.period
+    equation = grating_equation(period, found.incidence, found.wavelengths)
+    panel.plot(
+        found.wavelengths, equation, color="black", linewidth=1, linestyle=(0, (4, 4)),
+        label=f"grating equation, d = {1e3 * period:g} nm",
+    )  # fmt: skip
+    panel.set_xlim(found.wavelengths[[0, -1]])
+    panel.set_ylim(-90, 90)
+    panel.set_yticks(range(-90, 91, 30))
+    return image
+
+
+def plot_brdf_maps(maps: Sequence[Sequence[BRDFMap]]) -> Figure:
+    """BRDF maps, a row for each projection and a column for each method; all of one surface and one light.
+
+    The ticks beside the diffracting axis are where the grating equation puts 450, 550 and 650 nm of the orders.
+    """
+    drawn = figure(2.5 * len(maps[0]) + 0.3, 2.75 * len(maps) + 0.5)
+    axes = drawn.subplots(len(maps), len(maps[0]), squeeze=False)
+    for row, panels in zip(maps, axes, strict=True):
+        for column, (found, panel) in enumerate(zip(row, panels, strict=True)):
+            _draw_brdf(panel, found, labelled=column == 0)
+    first = maps[0][0]
+    theta, phi = first.incidence
+    coherence = first.surface.coherence_length
+    drawn.suptitle(
+        f"{first.surface.name}: light from θ$_i$ = {theta:g}°, φ$_i$ = {phi:g}°, coherent over {coherence:g} µm"
+    )
+    return drawn
+
+
+def _draw_brdf(panel: Axes, found: BRDFMap, labelled: bool) -> None:
+    half = [(axis[1] - axis[0]) / 2 for axis in (found.x, found.y)]
+    extent = (found.x[0] - half[0], found.x[-1] + half[0], found.y[0] - half[1], found.y[-1] + half[1])
+    alpha = ~np.isnan(found.rgb[..., 0])
+    picture = np.concatenate([found.picture, alpha[..., None]], axis=-1)
+    panel.imshow(picture, origin="lower", extent=extent, interpolation="nearest")
+    panel.set_title(f"{TITLES[found.method]}, exposure {float(f'{found.exposure:.2g}'):g}", fontsize=9)
+    _mark_orders(panel, found)
+    panel.tick_params(labelsize=7)
+    if found.projection == "hemisphere":
+        panel.set_xticks((-90, -45, 0, 45, 90))
+        panel.set_yticks((-90, -45, 0, 45, 90))
+    if labelled:
+        names = {"hemisphere": ("θ$_o$ cos φ$_o$ / °", "θ$_o$ sin φ$_o$ / °"), "uv": ("u", "v")}[found.projection]
+        panel.set_xlabel(names[0], fontsize=9)
+        panel.set_ylabel(names[1], fontsize=9)
+    panel.set_frame_on(False)
+
+
+def _mark_orders(panel: Axes, found: BRDFMap) -> None:
+    """Ticks beside the places of the orders, so that they hide no light."""
+    across = 1 - found.surface.axis
+    size = found.x[-1] - found.x[0]
+    for order in (-2, -1, 1, 2):
+        for nanometres, tint in ((450.0, "#6677ff"), (550.0, "#33cc33"), (650.0, "#ff4433")):
+            place = np.array(found.places_of_orders(np.float64(nanometres), np.int64(order)))
+            ends = np.stack([place, place])
+            ends[:, across] += np.array([0.08, 0.12]) * size
+            panel.plot(*ends.T, color=tint, linewidth=1)
+            if nanometres == 550 and np.isfinite(place).all():
+                place[across] += 0.15 * size
+                panel.text(*place, f"{order}", color="0.7", size=7, ha="center", va="center")
+
+
+PERIOD_COLUMNS = (
+    "surface",
+    "method",
+    "period / nm",
+    "variance / nm²",
+    "thesis: period / nm",
+    "thesis: variance / nm²",
+)
+
+
+def period_rows(surface: PublishedSurface, maps: Iterable[ReflectanceMap], step: float = 5.0) -> list[list[str]]:
+    """The fits under `PERIOD_COLUMNS`: of maps that are there, the shader as published, and of the shader corrected.
+
+    Args:
+        surface: what the maps are of.
+        maps: as `reflectance_map` gives them.
+        step: between wavelengths of what is still to be evaluated, nm.
+    """
+    rows = []
+    for found in maps:
+        name, fits = TITLES[found.method], {"": found}
+        if found.method != MODEL:
+            corrected = reflectance_map(
+                surface,
+                found.method,
+                incidence=found.incidence,
+                wavelengths=wavelengths(step),
+                quirks=Quirks.corrected(),
+            )
+            fits = {", as published": found, ", corrected": corrected}
+        for manner, one in fits.items():
+            fit, published = fit_period(one), surface.published
+            numbers = f"{fit.mean:.2f}", f"{fit.variance:.3f}", f"{published[0]:.2f}", f"{published[1]:.2f}"
+            rows.append([surface.name, name + manner, *numbers])
+    return rows
+
+
+def figure_names(surfaces: Iterable[str] = tuple(SURFACES)) -> list[str]:
+    """The files that `save_figures` writes."""
+    return [
+        *(f"{kind}_{name}.png" for name in surfaces for kind in ("viewing_angle", "brdf")),
+        *("periods.md", "periods.csv"),
+    ]
+
+
+def save_figures(
+    folder: str | os.PathLike[str],
+    *,
+    surfaces: Iterable[str] = tuple(SURFACES),
+    step: float = 5.0,
+    side: int = 200,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> list[Path]:
+    """Evaluates and draws, as chapter 5 of the thesis of 2014 does, under Mitsuba's variant in force.
+
+    Written, each whole or not at all: for every surface `viewing_angle_NAME.png` and `brdf_NAME.png`; and the fitted
+    periods, `periods.md` and `periods.csv`.
+
+    Args:
+        folder: where to write; made if it is not there.
+        surfaces: names among `published_surfaces.SURFACES`.
+        step: between wavelengths, nm.
+        side: pixels of a BRDF map.
+        progress: called with (steps done, steps in all).
+
+    Returns:
+        The files.
+
+    Raises:
+        ValueError: on an unknown surface, or where Mitsuba has no vectorised spectral variant set.
+    """
+    surfaces = list(surfaces)
+    if unknown := [name for name in surfaces if name not in SURFACES]:
+        raise RequestError(f"surfaces: got {', '.join(map(repr, unknown))}, wanted among {', '.join(SURFACES)}")
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    files: list[Path] = []
+    rows: list[list[str]] = []
+
+    def save(drawn: Figure, name: str) -> None:
+        with whole_file(folder / name) as temporary:
+            temporary.write_bytes(png(drawn, pnginfo=png_text(folder / name)))
+        files.append(folder / name)
+        progress(len(files), 2 * len(surfaces))
+
+    for name in surfaces:
+        surface = SURFACES[name]
+        maps = [reflectance_map(surface, method, wavelengths=wavelengths(step)) for method in METHODS]
+        rows += period_rows(surface, maps, step)
+        save(plot_reflectance(maps), f"viewing_angle_{name}.png")
+        mapped = surface.coherent_over(MAP_COHERENCE[name]) if name in MAP_COHERENCE else surface
+        brdf_maps = [
+            [brdf_map(mapped, method, projection=projection, side=side) for method in MAP_METHODS]
+            for projection in PROJECTIONS
+        ]
+        save(plot_brdf_maps(brdf_maps), f"brdf_{name}.png")
+    tables = [folder / "periods.md", folder / "periods.csv"]
+    save_markdown(markdown(PERIOD_COLUMNS, rows, texts=2), tables[0])
+    with whole_file(tables[1]) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
+        csv.writer(file).writerows([PERIOD_COLUMNS, *rows])
+        if (request := made_for(tables[1])) is not None:
+            file.write(f"# {request}\n")
+    return [*files, *tables]

@@ -1,0 +1,105 @@
+"""The lobes of a BSDF: what a grating reflects into each order, by quadrature over what the plugin shows.
+
+Wavelengths are in µm here, as in the closed forms.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ... import testing
+from ...geometry import k_g_between
+from ...spectrum.build import precompute
+from ...spectrum.grating_spectrum import GratingSpectrum
+from ...surface.heightfield import HeightField
+
+Array = NDArray[np.float64]
+
+TOLERANCE = 1e-5
+"""Of the spectra: an analytic check to 1e-4 is to see the model, not its tables."""
+_POINTS = 16
+
+
+def grating(spectrum: GratingSpectrum, conserve: bool = True, **parameters: Any) -> mi.BSDF:
+    """The plugin; a perfect mirror unless an index or a material is given.
+
+    `conserve=False` leaves out E, which is no part of what closed forms describe: R K G S/λ² alone.
+    """
+    if not {"int_ior", "material"} & set(parameters):
+        parameters["material"] = "none"
+    return mi.load_dict(
+        {"type": "diffraction_grating", "spectrum": spectrum, "conserve_energy": conserve, **parameters}
+    )
+
+
+@functools.lru_cache(maxsize=32)
+def _built(height_field: HeightField, settings: tuple[tuple[str, Any], ...]) -> GratingSpectrum:
+    return precompute(height_field, **dict(settings))
+
+
+def spectrum_of(height_field: HeightField, **settings: Any) -> GratingSpectrum:
+    """`precompute`, to 1e-5 by default; kept for the next check of the same surface."""
+    return _built(height_field, tuple(sorted({"tolerance": TOLERANCE, **settings}.items())))
+
+
+def towards(wi: Array, q: ArrayLike, wavelength: float) -> Array:
+    """ω_o (..., 3) of frequencies q (..., 2)."""
+    return testing.towards(wi, q, 1e3 * wavelength)
+
+
+def brdf(bsdf: mi.BSDF, wi: ArrayLike, wo: ArrayLike, wavelength: float) -> Array:
+    """f [1/sr] of directions (..., 3); zero where ω_o is not above the surface."""
+    value = testing.evaluate(bsdf, wi, wo, [1e3 * wavelength])[..., 0]
+    cosine = np.broadcast_to(np.asarray(wo)[..., 2], value.shape)
+    return np.divide(value, cosine, out=np.zeros_like(value), where=cosine > 0)
+
+
+def density(bsdf: mi.BSDF, wi: Array, wo: Array, wavelength: float) -> Array:
+    """S [µm²] as a perfect mirror without E shows it: f λ²/(K G)."""
+    return brdf(bsdf, wi, wo, wavelength) * wavelength**2 / k_g_between(wi, wo)
+
+
+def lobe_powers(bsdf: mi.BSDF, spectrum: GratingSpectrum, wi: Array, q: ArrayLike, wavelength: float) -> Array:
+    """The share of the incident power that is reflected into the lobes about q: ∫ f cos θ_o dω_o = λ² ∫ f dq.
+
+    By Gauss–Legendre quadrature over the square at which a lobe ends.
+
+    Args:
+        bsdf: of the spectrum.
+        spectrum: of a tile whose lobes do not overlap.
+        wi: (3,).
+        q: (n, 2) cycles/µm; what of a lobe is below the horizon does not count.
+        wavelength: µm.
+
+    Returns:
+        (n,).
+    """
+    x, weights = np.polynomial.legendre.leggauss(_POINTS)
+    reach = spectrum.reach * spectrum.lobe_width
+    offset = reach * np.stack(np.meshgrid(x, x), axis=-1).reshape(-1, 2)
+    points = np.asarray(q, np.float64)[:, None, :] + offset
+    area = reach**2 * np.outer(weights, weights).ravel()
+    return brdf(bsdf, wi, towards(wi, points, wavelength), wavelength) @ area * wavelength**2
+
+
+def orders_above(spectrum: GratingSpectrum, wi: Array, wavelength: float, largest: float = 80.0) -> Array:
+    """The orders m (n, 2) of a tile that leave at up to `largest` degrees from the normal."""
+    m_x, m_y = np.meshgrid(*spectrum.grid.axes())
+    m = np.stack([m_x.ravel(), m_y.ravel()], axis=-1)
+    across = -wavelength * m / spectrum.grid.tile_size - wi[:2]
+    return m[np.hypot(*across.T) < np.sin(np.deg2rad(largest))]
+
+
+def order_powers(
+    bsdf: mi.BSDF, spectrum: GratingSpectrum, wi: Array, m: Array, wavelength: float
+) -> tuple[Array, Array]:
+    """η_m (n,) that the BSDF shows, of the orders m (n, 2): what their lobes reflect, without K and G; and their κ."""
+    q = m / np.asarray(spectrum.grid.tile_size)
+    wo = towards(wi, q, wavelength)
+    kappa = 2 * np.pi * (wi[2] + wo[:, 2]) / wavelength
+    return lobe_powers(bsdf, spectrum, wi, q, wavelength) / k_g_between(wi, wo), kappa

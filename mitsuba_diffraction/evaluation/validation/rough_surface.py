@@ -1,0 +1,179 @@
+"""Random surfaces, of which scalar theory knows the mean: Gaussian heights with a Gaussian correlation.
+
+With g = κ²σ² and the correlation of heights σ² e^{−τ²/ℓ²} (Beckmann and Spizzichino 1963; Stam 1999), for a surface
+that is rough along x and uniform along y,
+
+    S(q) = e^{−g} δ(q_x) + e^{−g} Σ_{n≥1} gⁿ/n! ℓ √(π/n) e^{−π²ℓ²q_x²/n}
+
+the specular and the diffuse component, both convolved with the Gaussian lobe of the coherence length. For g ≫ 1 the
+density of slopes remains: Beckmann's microfacets.
+
+One realisation differs from the mean. With length A of the profile, the mean field over all of it has the variance
+V/A in its real part, V the terms of even n at q = 0, so that the specular share e^{−g} has the standard deviation
+2 e^{−g/2} √(V/A); a band of width B holds A·B independent speckles and has 1/√(A·B). Bounds are three of these.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammaln, ndtr
+
+from ...settings import lobe_width
+from ...spectrum.grating_spectrum import GratingSpectrum
+from ...surface.heightfield import HeightField
+from ...testing import direction
+from .lobes import brdf, density, grating, spectrum_of, towards
+from .record import Check, Record
+
+Array = NDArray[np.float64]
+
+LENGTH = 8_000.0  # µm of profile
+PIXEL = 0.135  # µm: holds all frequencies that the settings below reach
+SETTINGS = {"largest_angle": 41.5}
+WEAK = (0.06, 0.8)  # rms height and correlation length, µm
+LARGE = (0.2, 2.7)
+COHERENCE = 20.0  # µm
+DEVIATIONS = 3.0  # standard deviations allowed
+
+
+def random_profile(rms: float, correlation: float, seed: int = 0) -> HeightField:
+    """One row of Gaussian heights, correlated as σ² e^{−τ²/ℓ²}; lengths in µm."""
+    count = round(LENGTH / PIXEL)
+    q = np.fft.rfftfreq(count, PIXEL)
+    amplitude = np.sqrt(rms**2 * correlation * np.sqrt(np.pi) / PIXEL) * np.exp(-((np.pi * q * correlation) ** 2) / 2)
+    noise = np.fft.rfft(np.random.default_rng(seed).standard_normal(count))
+    heights = np.fft.irfft(noise * amplitude, count)
+    return HeightField(
+        heights[None, :], PIXEL, f"random profile, rms {rms:g} µm, correlation length {correlation:g} µm"
+    )
+
+
+def diffuse(q: Array, g: float, correlation: float, broadened: float = 0.0, even: bool = False) -> Array:
+    """The diffuse component of S in µm, convolved with a lobe of σ_q = `broadened`; q (...) in cycles/µm."""
+    n = np.arange(2 if even else 1, int(g + 12 * np.sqrt(g) + 20), 2 if even else 1)
+    weight = np.exp(n * np.log(g) - g - gammaln(n + 1))
+    variance = n / (2 * (np.pi * correlation) ** 2) + broadened**2
+    return (weight * np.exp(-(np.asarray(q)[..., None] ** 2) / (2 * variance)) / np.sqrt(2 * np.pi * variance)).sum(-1)
+
+
+@functools.cache
+def _spectrum(rms: float, correlation: float) -> GratingSpectrum:
+    surface = random_profile(rms, correlation)
+    return spectrum_of(surface, extent="sample", coherence_length=COHERENCE, tolerance=2e-3, **SETTINGS)
+
+
+def _coherent(wavelength: float, angle: float) -> Record:
+    """Power within 5 σ_q of the specular direction: e^{−g}, and a little of the diffuse component."""
+    rms, correlation = WEAK
+    spectrum = _spectrum(rms, correlation)
+    wi = direction(angle)
+    kappa = 4 * np.pi * wi[2] / wavelength
+    g = (kappa * rms) ** 2
+    sigma = lobe_width(COHERENCE)
+    axis = np.linspace(-5, 5, 51) * sigma
+    step = axis[1] - axis[0]
+    q = np.stack(np.meshgrid(axis, axis), axis=-1)
+    found = density(grating(spectrum, conserve=False), wi, towards(wi, q, wavelength), wavelength).sum() * step**2
+    near = diffuse(axis, g, correlation, sigma).sum() * step
+    noise = np.hypot(
+        2 * np.exp(-g / 2) * np.sqrt(diffuse(np.zeros(1), g, correlation, even=True)[0] / LENGTH),
+        near / np.sqrt(LENGTH * 10 * sigma),
+    )
+    return Record(found - near, np.exp(-g), DEVIATIONS * noise + spectrum.tolerance, note=f"κσ = {kappa * rms:.2f}")
+
+
+def _diffuse_bands() -> Record:
+    """The diffuse component in bands of q as wide as 1/ℓ, against the series."""
+    rms, correlation = WEAK
+    spectrum = _spectrum(rms, correlation)
+    wi, wavelength = direction(0), 0.5
+    g = (4 * np.pi / wavelength * rms) ** 2
+    sigma = lobe_width(COHERENCE)
+    y = np.linspace(-5, 5, 41) * sigma
+    edges = np.arange(0.15, 1.01, 0.17)
+    bsdf = grating(spectrum, conserve=False)
+    expected, found, bounds = [], [], []
+    for low, high in itertools.pairwise(edges):
+        x = (np.arange(40) + 0.5) / 40 * (high - low) + low
+        q = np.stack(np.meshgrid(np.concatenate([-x, x]), y), axis=-1)
+        wo = towards(wi, q, wavelength)
+        kappa = 2 * np.pi * (1 + wo[..., 2]) / wavelength
+        # κ falls with the angle; the series takes it at every point.
+        series = np.vectorize(lambda a, k: diffuse(a, (k * rms) ** 2, correlation, sigma))
+        area = (x[1] - x[0]) * (y[1] - y[0])
+        expected.append((series(q[..., 0], kappa) * np.exp(-((q[..., 1] / sigma) ** 2) / 2)).sum() * area)
+        expected[-1] /= np.sqrt(2 * np.pi) * sigma
+        found.append(density(bsdf, wi, wo, wavelength).sum() * area)
+        bounds.append(DEVIATIONS * expected[-1] / np.sqrt(LENGTH * 2 * (high - low)) + spectrum.tolerance)
+    return Record.worst(expected, found, bounds, f"worst of {len(found)} bands, g = {g:.2f}")
+
+
+def _microfacets(angle: float) -> Record:
+    """Against `roughconductor`, Beckmann distribution, of a rough profile; K S/λ² is D/(4 cos θ_i cos θ_o) there.
+
+    In the plane of incidence, bands of the half vector's slope out to one and a half rms slopes, on both sides of the
+    mirror direction. Both are perfect mirrors. No facet hides another there: G is one in both models; E is left out.
+    `roughconductor` gets along y the width that the coherence length gives the lobe.
+    """
+    rms, correlation = LARGE
+    spectrum = _spectrum(rms, correlation)
+    wi, wavelength = direction(angle), 0.42
+    slope = np.sqrt(2) * rms / correlation
+    sigma = lobe_width(COHERENCE)
+    w = 2 * wi[2]
+    broadened = np.hypot(slope, sigma * wavelength / w)
+    facets = mi.load_dict(
+        {
+            "type": "roughconductor",
+            "material": "none",
+            "distribution": "beckmann",
+            "alpha_u": float(np.sqrt(2) * broadened),
+            "alpha_v": float(np.sqrt(2) * sigma * wavelength / w),
+        }
+    )
+    bsdf = grating(spectrum, conserve=False, shadowing="none")
+    edges = np.linspace(-1.5, 1.5, 7) * broadened
+    expected, found, bounds = [], [], []
+    for low, high in itertools.pairwise(edges):
+        s = (np.arange(64) + 0.5) / 64 * (high - low) + low
+        half = np.stack([-s, 0 * s, np.ones_like(s)], axis=-1) / np.sqrt(1 + s**2)[:, None]
+        wo = 2 * (half @ wi)[:, None] * half - wi
+        expected.append(brdf(facets, wi, wo, wavelength).mean())
+        found.append(brdf(bsdf, wi, wo, wavelength).mean())
+        # Facets of about a correlation length are bright or dark as a whole.
+        share = ndtr(high / broadened) - ndtr(low / broadened)
+        speckles = LENGTH * (high - low) * w / wavelength
+        noise = np.hypot(np.sqrt((1 - share) / share * correlation / LENGTH), 1 / np.sqrt(speckles))
+        bounds.append(DEVIATIONS * noise)
+    note = f"f [1/sr]; relative; κσ = {2 * np.pi * w / wavelength * rms:.0f}; worst of {len(found)} bands of slope"
+    return Record.worst(expected, found, bounds, note, relative=True)
+
+
+CHECKS = (
+    *(
+        Check(
+            "statistical",
+            f"roughness: specular share e^{{−κ²σ²}}, {name}",
+            functools.partial(_coherent, wavelength, angle),
+            "Beckmann 1963",
+            slow=True,
+        )
+        for name, wavelength, angle in (("weak", 0.82, 33.0), ("medium", 0.8, 0.0), ("strong", 0.5, 0.0))
+    ),
+    Check("statistical", "roughness: diffuse component in bands", _diffuse_bands, "Beckmann's series", slow=True),
+    *(
+        Check(
+            "statistical",
+            f"large roughness: roughconductor, {angle:g}°",
+            functools.partial(_microfacets, angle),
+            "Mitsuba, Beckmann",
+            slow=True,
+        )
+        for angle in (0.0, 20.0)
+    ),
+)

@@ -1,0 +1,128 @@
+"""Scalar and rigorous theory of one grating: what each costs, and how far from the solver it is."""
+
+from __future__ import annotations
+
+import functools
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ...rigorous import efficiencies, refractive_index
+from ...rigorous.spectrum import RigorousSpectrum
+from ...scalar_theory import difference, profile_powers, scalar_orders
+from ...spectrum.build import precompute
+from ...spectrum.load import Spectrum
+from ...surface.heightfield import HeightField
+from ..benchmark.speed import Rays, seconds
+
+COLUMNS = {
+    "theory": "{.theory}",
+    "build\nCPU s": "{.build_seconds:.2g}",
+    "MB": "{.megabytes:.3g}",
+    "error to the solver\nmean": "{.error:.1%}",
+    "\nworst": "{.worst:.1%}",
+    "eval_pdf\nratio": "{.evaluate_ratio:.2f}",
+    "in the\nlobes": "{.lobe_ratio:.2f}",
+    "sample\nratio": "{.sample_ratio:.2f}",
+}
+_PLACES = 60  # directions and wavelengths at which the solver is asked
+
+
+@dataclass(frozen=True)
+class TheoryCost:
+    """What a theory costs, and what it is worth.
+
+    Attributes:
+        theory: "scalar" or "rigorous".
+        build_seconds: of processor time, of `precompute`.
+        megabytes: of the table.
+        error, worst: Σ|Δη_m| / Σ η_m against the solver, that of the theory and that of the table, the mean and the
+            largest over directions, uniform over the hemisphere, and wavelengths from 400 to 700 nm; unpolarised.
+        evaluate_ratio: speed of eval_pdf to that of roughconductor (Al), random directions, the same run.
+        lobe_ratio: the same for pairs of directions of which one was drawn by the grating.
+        sample_ratio: of sample.
+    """
+
+    theory: str
+    build_seconds: float
+    megabytes: float
+    error: float
+    worst: float
+    evaluate_ratio: float
+    lobe_ratio: float
+    sample_ratio: float
+
+
+def compare_theories(
+    height_field: HeightField,
+    material: str = "Al",
+    *,
+    tolerance: float = 1e-2,
+    count: int = 1 << 19,
+    repetitions: int = 5,
+    progress: Callable[[int, int], None] | None = None,
+) -> list[TheoryCost]:
+    """Scalar, then rigorous theory of a surface of one row, under Mitsuba's variant in force.
+
+    Args:
+        height_field: the surface.
+        material: a conductor by Mitsuba's name.
+        tolerance: of the rigorous table; minutes of work.
+        count: rays at once.
+        repetitions: of each timing, interleaved.
+        progress: of the table, called with (steps done, steps in all).
+    """
+    spectra, built = {}, {}
+    for theory, settings in (("scalar", {}), ("rigorous", {"material": material, "tolerance": tolerance})):
+        start = time.process_time()
+        spectra[theory] = precompute(height_field, theory=theory, progress=progress, **settings)
+        built[theory] = time.process_time() - start
+    errors = _errors(height_field, material, spectra["rigorous"])
+    taken = _seconds(spectra, material, count, repetitions)
+    return [
+        TheoryCost(
+            theory,
+            built[theory],
+            spectrum.megabytes,
+            float(np.mean(errors[theory])),
+            float(np.max(errors[theory])),
+            *(taken["rough", work] / taken[theory, work] for work in ("evaluate", "lobes", "sample")),
+        )
+        for theory, spectrum in spectra.items()
+    ]
+
+
+def _errors(height_field: HeightField, material: str, table: RigorousSpectrum) -> dict[str, list[float]]:
+    """Of both theories at the same places."""
+    errors: dict[str, list[float]] = {"scalar": [], "rigorous": []}
+    period, powers = height_field.tile_size[0], profile_powers(height_field)
+    for cosine, turn, share in np.random.default_rng(0).random((_PLACES, 3)):
+        angle, wavelength = np.arccos(cosine), 0.4 + 0.3 * share
+        sine = np.sin(angle)
+        omega = -sine * np.cos(2 * np.pi * turn), -sine * np.sin(2 * np.pi * turn), cosine
+        index = refractive_index(wavelength, material=material)
+        exact = efficiencies(height_field, omega, wavelength, int_ior=index, tolerance=2e-3)
+        scalar = scalar_orders(powers, period, wavelength, np.rad2deg(angle), index, 360 * turn)
+        errors["scalar"].append(difference(scalar.unpolarised, exact.unpolarised))
+        errors["rigorous"].append(difference(table.efficiencies(omega, wavelength)[1], exact.unpolarised))
+    return errors
+
+
+def _seconds(spectra: dict[str, Spectrum], material: str, count: int, repetitions: int) -> dict[tuple[str, str], float]:
+    bsdfs = {"rough": mi.load_dict({"type": "roughconductor", "material": "Al"})}
+    for theory, spectrum in spectra.items():
+        bsdfs[theory] = mi.load_dict({"type": "diffraction_grating", "spectrum": spectrum, "material": material})
+    rays, lobes = Rays(count), Rays(count)
+    drawn = bsdfs["rigorous"].sample(mi.BSDFContext(), rays.si, rays.sample1, rays.sample2)[0]
+    lobes.si, lobes.wo = rays.si, drawn.wo
+    dr.eval(lobes.wo)
+    work = {}
+    for name, bsdf in bsdfs.items():
+        work[name, "evaluate"] = functools.partial(rays.evaluate, bsdf)
+        work[name, "lobes"] = functools.partial(lobes.evaluate, bsdf)
+        work[name, "sample"] = functools.partial(rays.sample, bsdf)
+    return seconds(work, repetitions)

@@ -1,0 +1,272 @@
+"""An inspection on one slide: the surface, its spectrum, and the colours that it will show."""
+
+from __future__ import annotations
+
+import os
+import textwrap
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..color import auto_exposure, into_gamut, on_screen, spectrum_to_linear_sRGB
+from ..errors import RequestError
+from ..files import whole_file
+from ..outputs import metadata
+from ..surface.heightfield import HeightField
+from ..surface.periods import hann
+from .colours import WAVELENGTHS, radiance
+from .inspect import Inspection
+from .statistics import reference_plane
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+Array = NDArray[np.float64]
+
+INCIDENCES = (0.0, 30.0, 60.0)
+"""Degrees, of the rows of predicted colours."""
+
+_CELLS = 181  # of the spectrum along an axis, at most
+_ANGLES = np.arange(-89.75, 89.8, 0.5)
+_HIGHEST_FREQUENCY = 5.0  # cycles/µm, about what visible light reaches
+_DECADES = 5
+
+
+def save_picture(inspection: Inspection, path: str | os.PathLike[str], *, title: str | None = None) -> None:
+    """Draws a slide, 16 : 9, as PNG, PDF or SVG.
+
+    Args:
+        inspection: what to draw.
+        path: where to write.
+        title: of the slide; what the heights come from, if left out.
+
+    Raises:
+        ValueError: if matplotlib knows no format of that ending.
+        FileNotFoundError: if the folder is not there.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(12.8, 7.2), dpi=150)
+    kinds = FigureCanvasAgg(figure).get_supported_filetypes()
+    if Path(path).suffix.lower().removeprefix(".") not in kinds:
+        raise RequestError(f"picture: got {os.fspath(path)!r}, wanted a file name that ends in .png, .pdf or .svg")
+    source = inspection.height_field.source
+    figure.text(0.04, 0.95, _short(title or source, 80), fontsize=17, weight="bold", va="center")
+    below = [_headline(inspection)] if title in (None, source) else [_short(source, 150), _headline(inspection)]
+    figure.text(0.04, 0.927, "\n".join(below), fontsize=11, color="0.25", va="top", linespacing=1.35)
+    top = {"top": 0.82, "bottom": 0.41}
+    left, middle, right = (
+        figure.add_gridspec(1, 1, left=start, right=end, **top)[0]
+        for start, end in ((0.04, 0.27), (0.43, 0.665), (0.705, 0.985))
+    )
+    lower = figure.add_gridspec(len(INCIDENCES), 1, top=0.285, bottom=0.085, hspace=0.16, left=0.115, right=0.985)
+    _height_map(figure.add_subplot(left), piece_shown(inspection), inspection.extent)
+    _spectrum(figure.add_subplot(middle), inspection)
+    _facts(figure.add_subplot(right), inspection)
+    _colours([figure.add_subplot(row) for row in lower], inspection)
+    with whole_file(path) as temporary:
+        figure.savefig(temporary, metadata=metadata(path))
+
+
+def _short(text: str, length: int) -> str:
+    return textwrap.shorten(text, length, placeholder=" …")
+
+
+def _headline(inspection: Inspection) -> str:
+    x, y = inspection.height_field.tile_size
+    rows, columns = inspection.height_field.shape
+    pixel = _both(*(p * 1e3 for p in inspection.height_field.pixel_size))
+    kind = "one tile of a surface that repeats, " if inspection.extent == "tile" else ""
+    return f"{kind}{x:.3g} × {y:.3g} µm, {columns} × {rows} pixels of {pixel} nm"
+
+
+def _both(x: float, y: float) -> str:
+    return f"{x:.4g}" if np.isclose(x, y, rtol=1e-3) else f"{x:.4g} × {y:.4g}"
+
+
+def _height_map(axes: Axes, field: HeightField, extent: str) -> None:
+    """Heights about the mean plane, with a scale bar in place of axes."""
+    field = _square_cut(field)
+    size_x, size_y = field.tile_size
+    level = (field.heights - reference_plane(field, extent)[0]) * 1e3
+    low, high = np.quantile(level, [0.002, 0.998])
+    image = axes.imshow(
+        level,
+        extent=(0, size_x, size_y, 0),
+        cmap="cividis",
+        vmin=low,
+        vmax=max(high, low + 1e-3),
+        aspect="equal",
+        interpolation="nearest",
+    )
+    axes.set(xticks=[], yticks=[], anchor="NW")
+    axes.set_title("The surface", fontsize=12, loc="left")
+    bar = axes.figure.colorbar(image, cax=axes.inset_axes([1.03, 0, 0.05, 1]))
+    bar.set_label("height, nm", fontsize=10)
+    bar.ax.tick_params(labelsize=9)
+    length = _round_length(size_x / 4)
+    y = size_y * 0.94
+    box = {"facecolor": "black", "alpha": 0.6, "edgecolor": "none", "pad": 3}
+    axes.plot([size_x * 0.05, size_x * 0.05 + length], [y, y], color="white", lw=4, solid_capstyle="butt")
+    axes.text(size_x * 0.05, y - size_y * 0.04, f"{length:g} µm", color="white", fontsize=11, va="bottom", bbox=box)
+
+
+def piece_shown(inspection: Inspection) -> HeightField:
+    """Of a surface that repeats, as much as shows its periods: a dozen of the shortest, but four of the longest."""
+    field = inspection.shown
+    if inspection.extent == "sample" or not inspection.periods:
+        return field
+    lengths = [period.period for period in inspection.periods]
+    side = max(12 * min(lengths), 4 * max(lengths))
+    columns, rows = (max(1, round(side / pixel)) for pixel in field.pixel_size)
+    return HeightField(field.heights[:rows, :columns], field.pixel_size, field.source)
+
+
+def _square_cut(field: HeightField) -> HeightField:
+    """A piece of a long patch that is at most twice as long as wide."""
+    rows, columns = field.shape
+    size_x, size_y = field.tile_size
+    rows = min(rows, max(1, int(rows * 2 * size_x / size_y)))
+    columns = min(columns, max(1, int(columns * 2 * size_y / size_x)))
+    return HeightField(field.heights[:rows, :columns], field.pixel_size, field.source)
+
+
+def _round_length(length: float) -> float:
+    """The largest of 1, 2 or 5 times a power of ten that is not above."""
+    power = 10.0 ** np.floor(np.log10(length))
+    return float(max(step * power for step in (1, 2, 5) if step * power <= length * (1 + 1e-9)))
+
+
+def _spectrum(axes: Axes, inspection: Inspection) -> None:
+    """The power spectrum of the heights, a wave is a pair of bright spots."""
+    q_x, q_y, power = _height_spectrum(inspection.shown, inspection.extent)
+    limit = min(_HIGHEST_FREQUENCY, max(q_x.max(), q_y.max()))
+    if inspection.periods:
+        limit = min(limit, 4.5 / min(period.period for period in inspection.periods[:1]))
+    near_x, near_y = np.abs(q_x) <= limit, np.abs(q_y) <= limit
+    q_x, q_y, power = _strongest(q_x[near_x], q_y[near_y], power[np.ix_(near_y, near_x)])
+    top = power.max()
+    decibel = np.log10(np.maximum(power / top, 10.0**-_DECADES)) if top > 0 else np.full_like(power, -_DECADES)
+    axes.pcolormesh(q_x, q_y, decibel, cmap="magma", vmin=-_DECADES, vmax=0, shading="nearest", rasterized=True)
+    axes.set(xlim=(-limit, limit), ylim=(limit, -limit), aspect="equal", facecolor="black")
+    axes.set_xlabel("cycles/µm along x", fontsize=10)
+    axes.set_ylabel("cycles/µm along y (down)", fontsize=10)
+    axes.tick_params(labelsize=9)
+    axes.set_title("Its spectrum: spots are regular waves", fontsize=12, loc="left")
+    # Labels at opposite sides, so that they do not meet.
+    for period, colour, spot in zip(inspection.periods, ("cyan", "lime"), (1, -1), strict=False):
+        along = np.deg2rad(period.direction)
+        q = np.array([np.cos(along), np.sin(along)]) / period.period
+        for sign in (1, -1):
+            axes.plot(*(sign * q), "o", ms=13, mfc="none", mec=colour, mew=1.8, zorder=4)  # above all labels
+        x, y = spot * q
+        # Outwards, but for the rim.
+        side = (-1 if x < -0.02 * limit else 1) * (-1 if abs(x) > 0.6 * limit else 1)
+        axes.annotate(
+            f"{period.period:.3g} µm" + (", band" if period.width else ""),
+            (x, y),
+            xytext=(side * 10, 10 if y <= 0 else -20),
+            textcoords="offset points",
+            ha="left" if side > 0 else "right",
+            color=colour,
+            fontsize=11,
+            bbox={"facecolor": "black", "alpha": 0.6, "edgecolor": "none", "pad": 2},
+        )
+
+
+def _height_spectrum(field: HeightField, extent: str) -> tuple[Array, Array, Array]:
+    """q_x, q_y in ascending order and the power of the levelled, Hann-windowed heights, at most about 1000² points."""
+    level = field.heights - reference_plane(field, extent)[0]
+    power = np.fft.fftshift(np.abs(np.fft.fft2(level * hann(level.shape))) ** 2)
+    q_y, q_x = (np.fft.fftshift(np.fft.fftfreq(n, p)) for n, p in zip(level.shape, field.pixel_size[::-1], strict=True))
+    keep_x, keep_y = np.abs(q_x) <= _HIGHEST_FREQUENCY * 1.01, np.abs(q_y) <= _HIGHEST_FREQUENCY * 1.01
+    return q_x[keep_x], q_y[keep_y], power[np.ix_(keep_y, keep_x)]
+
+
+def _strongest(q_x: Array, q_y: Array, power: Array) -> tuple[Array, Array, Array]:
+    """The largest power of each cell of a coarser grid: a single spot would be smaller than a pixel of the picture."""
+    cells = []
+    for axis, q in enumerate((q_x, q_y)):
+        starts = np.unique(np.linspace(0, len(q), min(len(q), _CELLS), endpoint=False).astype(int))
+        cells.append(np.add.reduceat(q, starts) / np.diff([*starts, len(q)]))
+        power = np.maximum.reduceat(power, starts, axis=1 - axis)
+    return *cells, power
+
+
+def _facts(axes: Axes, inspection: Inspection) -> None:
+    """What a person would read out."""
+    axes.set_axis_off()
+    axes.set_title("In numbers", fontsize=12, loc="left")
+    numbers = inspection.statistics
+    lines = [
+        ("roughness Sq", f"{numbers.Sq * 1e3:.3g} nm"),
+        ("highest to lowest, Sz", f"{numbers.Sz * 1e3:.3g} nm"),
+        ("slope, r.m.s.", f"{np.degrees(np.arctan(numbers.Sdq)):.2g}°"),
+    ]
+    for number, period in enumerate(inspection.periods):
+        lines.append(
+            (
+                "band of periods" if period.width else "period" if number == 0 else "second period",
+                with_uncertainty(period.period, period.period_uncertainty) + " µm",
+            )
+        )
+        lines.append(("   direction", with_uncertainty(period.direction, period.direction_uncertainty) + "°"))
+    if not inspection.periods:
+        lines.append(("period", "none stands out"))
+    if inspection.extent == "sample":
+        lines.append(("carries coherence of", f"{inspection.carried:.3g} µm"))
+    y = 0.95
+    for name, value in lines:
+        axes.text(0.0, y, name, fontsize=11.5, color="0.3", va="center", transform=axes.transAxes)
+        axes.text(1.0, y, value, fontsize=11.5, weight="bold", va="center", ha="right", transform=axes.transAxes)
+        y -= 0.095
+    text = (
+        "A spot q cycles/µm from the centre sends light\nof wavelength λ to sin(out) = sin(in) ± q·λ:\n"
+        "red is turned most, blue least."
+    )
+    axes.text(0.0, 0.0, text, fontsize=10.5, color="0.3", va="bottom", linespacing=1.4, transform=axes.transAxes)
+
+
+def with_uncertainty(value: float, uncertainty: float) -> str:
+    """Such as 1.144 ± 0.012: the uncertainty to two digits, the value to as many places."""
+    if not (np.isfinite(uncertainty) and uncertainty > 0):
+        return f"{value:.4g}"
+    places = int(np.clip(1 - np.floor(np.log10(uncertainty)), 0, 6))
+    # Adding zero takes the sign off a zero.
+    return f"{round(value, places) + 0.0:.{places}f} ± {uncertainty:.{places}f}".replace("-", "−")
+
+
+def _colours(rows: list[Axes], inspection: Inspection) -> None:
+    """One strip for each angle of incidence, its mirror direction marked."""
+    light = radiance(inspection.spectrum, inspection.direction, np.array(INCIDENCES)[:, None], _ANGLES)
+    rgb = into_gamut(spectrum_to_linear_sRGB(light, WAVELENGTHS))
+    shown = on_screen(rgb * _exposure(rgb))
+    for axes, strip, incidence in zip(rows, shown, INCIDENCES, strict=True):
+        axes.imshow(strip[None], extent=(-90, 90, 0, 1), aspect="auto", interpolation="bilinear")
+        axes.set_yticks([])
+        axes.set_xlim(-90, 90)
+        axes.set_ylabel(f"light at {incidence:g}°", rotation=0, ha="right", va="center", fontsize=10.5)
+        axes.set_xticks(np.arange(-90, 91, 30), labels=[] if axes is not rows[-1] else None)
+        axes.plot([incidence], [1.0], marker="v", ms=9, color="black", clip_on=False)
+    rows[-1].tick_params(labelsize=9.5)
+    rows[-1].set_xticks(np.arange(-90, 91, 30), labels=[f"{angle}°".replace("-", "−") for angle in range(-90, 91, 30)])
+    rows[-1].set_xlabel(
+        "viewing angle from the surface's normal, across the lines (positive: the side away from the light)",
+        fontsize=10,
+    )
+    where = f"at {round(inspection.direction) + 0:d}° from x".replace("-", "−") if inspection.periods else "along x"
+    rows[0].set_title(
+        f"Colours that it will show in daylight, in the plane {where}   (▼ mirror direction)",
+        fontsize=12,
+        loc="left",
+        pad=9,
+    )
+
+
+def _exposure(rgb: Array) -> float:
+    """That of a picture of what lies aside of the mirror direction, which would make all else black."""
+    aside = [strip[np.abs(_ANGLES - incidence) > 5] for strip, incidence in zip(rgb, INCIDENCES, strict=True)]
+    return auto_exposure(np.concatenate(aside))
