@@ -128,8 +128,8 @@ class Geometry:
         gain = dr.select(smaller(*sent) > 0, horizon_gain(x_i) * horizon_gain(x_o), 0)
         outside = 0.5 * (come[0] + sent[1]), 0.5 * (come[1] + sent[0])
         # Where the order does not propagate the root would have no derivative.
-        cosines = (dr.sqrt(larger(1 - (1 - square) / dr.square(self.index), 1e-12)) for square in outside)
-        return *cosines, gain
+        per = dr.rcp(dr.square(self.index))
+        return *(dr.sqrt(larger(dr.fma(x, per, 1 - per), 1e-12)) for x in outside), gain
 
 
 def _d(square: mi.Float, w: mi.Float) -> mi.Float:
@@ -153,11 +153,14 @@ def k_g(cos_i: mi.Float, cos_o: mi.Float, square: mi.Float, shadowing: bool) -> 
         square: u² + v².
         shadowing: if false, K alone.
     """
-    w = cos_i + cos_o
-    d = _d(square, w)
     # The guards keep masked lanes finite.
-    k = dr.square(d) / (larger(cos_i, 1e-7) * larger(cos_o, 1e-7) * dr.square(w))
-    return k * smaller(2 * w * smaller(cos_i, cos_o) / d, 1) if shadowing else k
+    cos_i, cos_o = larger(cos_i, 1e-7), larger(cos_o, 1e-7)
+    w, product = cos_i + cos_o, cos_i * cos_o
+    d = _d(square, w)
+    per = dr.rcp(product * w)
+    # K = D/(cos θ_i cos θ_o w) · D/w and K G ≤ D/(cos θ_i cos θ_o w) · 2 min(cos θ_i, cos θ_o)
+    ratio = d * product * per
+    return d * per * (smaller(ratio, 2 * smaller(cos_i, cos_o)) if shadowing else ratio)
 
 
 def cos_square(omega: mi.Vector3f, tangent: mi.Vector2f) -> mi.Float:
