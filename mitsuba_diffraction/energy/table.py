@@ -237,9 +237,12 @@ class EnergyTable:
 
 
 def random_places(wavelengths: tuple[float, float], count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return `count` directions (n, 3), half of them beyond 60°, and λ in µm, (n,); `wavelengths` in nm."""
+    """Return `count` directions (n, 3), two thirds of them beyond 60°, one beyond 85°, and λ in µm, (n,).
+
+    `wavelengths` are the shortest and the longest, in nm.
+    """
     rng = np.random.default_rng(0)
-    theta = np.deg2rad(rng.uniform(np.where(rng.random(count) < 0.5, 0, 60), 88))
+    theta = np.deg2rad(rng.uniform(rng.choice([0, 60, 85], count), 89.9))
     phi = rng.uniform(0, 2 * np.pi, count)
     directions = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1)
     return directions, rng.uniform(*wavelengths, count) * 1e-3
