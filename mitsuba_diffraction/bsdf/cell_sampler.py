@@ -150,7 +150,7 @@ BLOCK = 0.05  # cycles/µm: cells are taken together in blocks of about this wid
 class CellSampler:
     """The density p(q) = P_m/(Δ_x Δ_y) on the cell m, |q_x − m_x Δ_x| ≤ Δ_x/2 and |q_y − m_y Δ_y| ≤ Δ_y/2.
 
-    P_m = Σ_j w_j A_jm / Σ_j w_j M_j, a mixture over κ (`kappa_cells`), restricted to a region that holds all that
+    P_m = Σ_j w_j A_jm / Σ_j w_j M_j, a mixture over κ (`KappaCells`), restricted to a region that holds all that
     propagates (`horizon`); M_j is the sum of A_jm over it. A region is made of blocks of cells, an interval of them in
     each row. A cell is drawn by binary searches: the row of blocks, the block, the cell in it. The density at a given q
     reads one word for the cell and one packet for M_j.

@@ -492,7 +492,7 @@ def define() -> type:
             z = dr.select(propagates, dr.safe_sqrt(1 - dr.square(x) - dr.square(y)), 0)
             return dr.select(diffuse, mi.warp.square_to_uniform_hemisphere(v), mi.Vector3f(x, y, z))
 
-        # What the real-time shader asks of a grating: `shader.surfaces.ShadedGrating`.
+        # What the real-time shader asks of a grating: `evaluation.realtime_shader.surfaces.ShadedGrating`.
 
         def heights(self) -> tuple[HeightField, float]:
             """The height field and its coherence length in µm.

@@ -1,6 +1,6 @@
 """S(q; κ) of a tile at run time: the few orders near q, their powers and lobes, and how an order is drawn.
 
-P_m = Σ_j w_j A_jm / Σ_j w_j M_j is a mixture over κ (`kappa_cells`), restricted to the rectangle of orders around those
+P_m = Σ_j w_j A_jm / Σ_j w_j M_j is a mixture over κ (`KappaCells`), restricted to the rectangle of orders around those
 that propagate: light on other orders goes nowhere, and at grazing incidence most of the mixture would lie there. M_j is
 the sum of A_jm over the rectangle. A one-row grating has the exact interval: with s the direction of incidence,
 
@@ -328,7 +328,7 @@ class LineSampler:
 
         p(q) = P_m/Δ · F′(q_y)/(F(b) − F(a)),    |q_x − mΔ| ≤ Δ/2
 
-    P_m = Σ_j w_j A_jm / Σ_j w_j M_j is a mixture over κ (`kappa_cells`), restricted to the cells in which something
+    P_m = Σ_j w_j A_jm / Σ_j w_j M_j is a mixture over κ (`KappaCells`), restricted to the cells in which something
     propagates, over which M_j is the sum of A_jm. Across the orders, Student's distribution with four degrees of
     freedom stands for the Gaussian, which takes longer to restrict to what propagates at q_x, a ≤ q_y ≤ b:
 
@@ -464,7 +464,7 @@ class OrderSpectrum:
     ) -> tuple[mi.Float, mi.Float]:
         """K G S(q; κ) cos θ_o and the density of q, both in µm², for one wavelength.
 
-        K and G are those of each order, and its lobe keeps its power at the horizon (`Geometry.gain`).
+        K and G are those of each order, and its lobe keeps its power at the horizon (`Geometry.of_order`).
 
         Args:
             geometry: of the pair of directions.

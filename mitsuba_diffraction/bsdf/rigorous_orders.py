@@ -74,7 +74,7 @@ class RigorousOrders:
     ) -> tuple[mi.Float, mi.Float]:
         """cos θ_o Σ_m η_m N and the density of q, both in µm², for one wavelength.
 
-        The lobe of each order keeps its power at the horizon (`Geometry.gain`).
+        The lobe of each order keeps its power at the horizon (`Geometry.of_order`).
 
         Args:
             geometry: of the pair of directions, along the pattern's axes.

@@ -113,7 +113,7 @@ class GratingSpectrum:
     def standard_error(self) -> float:
         """∫ of the standard error of Welch's estimate over q, at the worst κ: of one scan about the mean of many.
 
-        A share of the reflected power, comparable to `error`; see `standard_error.standard_error`.
+        A share of the reflected power, comparable to `error`; see `sample.standard_error`.
 
         Raises:
             RequestError: of a tile.

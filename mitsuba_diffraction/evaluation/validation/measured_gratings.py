@@ -1,6 +1,6 @@
 """Scalar and rigorous theory against the efficiencies of four ruled gratings, as their maker measured them.
 
-The facet angle alone is fitted (`rigorous.ruled_fit`); `precompute/ruled_fits.py` stores the angles.
+The facet angle alone is fitted (`ruled_fit`); `precompute/ruled_fits.py` stores the angles.
 """
 
 from __future__ import annotations
