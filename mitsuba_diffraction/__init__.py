@@ -8,8 +8,18 @@ without importing Mitsuba.
 from __future__ import annotations
 
 import importlib
+from typing import TYPE_CHECKING
 
 from .registration import register as _register
+
+if TYPE_CHECKING:  # type checkers do not see what is imported on first use
+    from . import reference, rigorous
+    from .recipe import Recipe
+    from .spectrum.build import precompute
+    from .spectrum.grating_spectrum import GratingSpectrum
+    from .surface import gratings
+    from .surface.heightfield import HeightField
+    from .surface.readers import read_height_field
 
 _HOME = {
     "GratingSpectrum": "spectrum.grating_spectrum",
@@ -20,7 +30,16 @@ _HOME = {
 }
 _MODULES = {"gratings": "surface.gratings", "reference": "reference", "rigorous": "rigorous"}
 
-__all__ = [*_HOME, *_MODULES]
+__all__ = [
+    "GratingSpectrum",
+    "HeightField",
+    "Recipe",
+    "gratings",
+    "precompute",
+    "read_height_field",
+    "reference",
+    "rigorous",
+]
 
 
 def __getattr__(name: str) -> object:

@@ -75,7 +75,7 @@ def _exact_product(a: np.floating, b: NDArray[np.floating]) -> tuple[NDArray[np.
         return high, value - high
 
     product = a * b
-    (a_high, a_low), (b_high, b_low) = split(a), split(b)
+    (a_high, a_low), (b_high, b_low) = split(np.asarray(a)), split(b)
     return product, ((a_high * b_high - product) + a_high * b_low + a_low * b_high) + a_low * b_low
 
 
@@ -239,7 +239,7 @@ def _periodograms(
     height_field: HeightField,
     q: NDArray[np.float64],
     kappa: NDArray[np.float64],
-    axes: tuple[WindowAxis, WindowAxis],
+    axes: tuple[WindowAxis, ...],
 ) -> NDArray[np.float64]:
     """Mean over the places x_p of |Σ_n a(x_n − x_p) e^{iκh_n} e^{−2πi q·x_n}|² for q (M, 2) and κ (M,): (M,).
 

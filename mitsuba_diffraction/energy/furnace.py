@@ -56,13 +56,26 @@ CHUNK = 1 << 16  # pairs (direction, component) at once, so that they stay in th
 class PowerSpectrum(Protocol):
     """What the furnace asks of a `GratingSpectrum`."""
 
-    grid: OrderGrid | SplineGrid
-    table: SeriesTable | SliceTable
-    lobes: tuple[LobeAxis, LobeAxis]
-    lobe_width: float
-    largest_kappa: float
-    height_range: float
-    wavelengths: tuple[float, float]
+    @property
+    def grid(self) -> OrderGrid | SplineGrid: ...
+
+    @property
+    def table(self) -> SeriesTable | SliceTable: ...
+
+    @property
+    def lobes(self) -> tuple[LobeAxis, LobeAxis]: ...
+
+    @property
+    def lobe_width(self) -> float: ...
+
+    @property
+    def largest_kappa(self) -> float: ...
+
+    @property
+    def height_range(self) -> float: ...
+
+    @property
+    def wavelengths(self) -> tuple[float, float]: ...
 
     def powers(self, kappa: float) -> NDArray[np.float32]:
         """Return the share of the reflected power of each node."""
@@ -104,8 +117,11 @@ class Furnace:
         """Return the components of `spectrum`, with its heights scaled by `height_scale`."""
         grid, by_order = spectrum.grid, evaluated_by_order(spectrum)
         max_kappa = spectrum.largest_kappa
-        kappas = np.linspace(0, max_kappa, int(max_kappa * spectrum.height_range / KAPPA_STEP) + 3)
+        kappas = np.linspace(0, max_kappa, int(max_kappa * spectrum.height_range / KAPPA_STEP) + 3, dtype=np.float64)
         q_x, q_y = grid.frequencies()
+        q: NDArray[np.float64]
+        widths: NDArray[np.float64]
+        powers: NDArray[np.floating]
         if by_order:
             powers = np.stack([spectrum.powers(kappa).ravel() for kappa in kappas], 1)
             q = np.stack(np.meshgrid(q_x, q_y), -1).reshape(-1, 2)
@@ -354,9 +370,18 @@ def albedo_of_nodes(
     rng, grid, sigma = np.random.default_rng(seed), spectrum.grid, spectrum.lobe_width
     q = np.stack(np.meshgrid(*grid.frequencies()), -1).reshape(-1, 2)
     lines = isinstance(grid, OrderGrid)
-    reach = 4 * sigma if lines else 1.5 * np.hypot(*grid.spacing)
-    strength = sum(np.maximum(spectrum.powers(x * spectrum.largest_kappa), 0).ravel() for x in (0.1, 0.4, 0.7, 1.0))
-    offsets = np.linspace(-1.5, 1.5, 1025)
+    spacing: NDArray[np.float64]
+    limit: NDArray[np.float64]
+    # A node is a Gaussian, or a B-spline that ends at the Nyquist limit.
+    if isinstance(grid, OrderGrid):
+        spacing, limit, reach = np.full(2, sigma), np.full(2, np.inf), 4 * sigma
+    else:
+        spacing, limit = np.array(grid.spacing), np.array(grid.limit)
+        reach = 1.5 * np.hypot(*spacing)
+    strength = np.sum(
+        [np.maximum(spectrum.powers(x * spectrum.largest_kappa), 0).ravel() for x in (0.1, 0.4, 0.7, 1.0)], axis=0
+    )
+    offsets = np.linspace(-1.5, 1.5, 1025, dtype=np.float64)
     integral = spline_integral(offsets)
     result = np.empty(len(directions))
     for index, (omega, length) in enumerate(zip(directions, wavelengths, strict=True)):
@@ -366,22 +391,23 @@ def albedo_of_nodes(
         node, weight = np.repeat(reached, count), np.repeat(1 / count, count)
         # Points of one node follow each other in a sequence of low discrepancy (Roberts 2018).
         t = (rng.random(2) + np.arange(len(node))[:, None] * [0.7548776662466927, 0.5698402909980532]) % 1
-        spread = ndtri(t) * sigma if lines else np.interp(t, integral, offsets) * grid.spacing
+        spread = (ndtri(t) if lines else np.interp(t, integral, offsets)) * spacing
         u = length * (q[node] + spread)
         square = 1 - ((s + u) ** 2).sum(-1)
-        lit = (square > 0) & (lines or (np.abs(u) < length * np.array(grid.limit)).all(-1))
+        lit = (square > 0) & (np.abs(u) < length * limit).all(-1)
         u, node, weight, cos_o = u[lit], node[lit], weight[lit], np.sqrt(square[lit])
         w, tangent = cos_i + cos_o, (u**2).sum(-1)
         kappa = np.minimum(2 * np.pi * w * height_scale / length, spectrum.largest_kappa)
-        power = spectrum.table.powers_at(*np.divmod(node, grid.shape[1]), kappa)
+        row, column = np.divmod(node, grid.shape[1])
+        power = spectrum.table.powers_at(row, column, kappa)
         out = np.concatenate([-s - u, cos_o[:, None]], -1)
         if evaluated_by_order(spectrum):
             offset = length * q[node]
             sent = 1 - ((s + offset) ** 2).sum(-1), 1 - ((out[:, :2] + offset) ** 2).sum(-1)
-            centre = [np.sqrt(np.maximum(x, 1e-12) / 2) for x in (cos_i**2 + sent[1], cos_o**2 + sent[0])]
+            in_, out_ = (np.sqrt(np.maximum(x, 1e-12) / 2) for x in (cos_i**2 + sent[1], cos_o**2 + sent[0]))
             nearest = np.minimum(cos_i**2, sent[0]), np.minimum(cos_o**2, sent[1])
-            factor = k_g(*centre, ((offset**2).sum(-1) + (centre[0] + centre[1]) ** 2) / 2) * (np.minimum(*sent) > 0)
-            share = 1.0
+            factor = k_g(in_, out_, ((offset**2).sum(-1) + (in_ + out_) ** 2) / 2) * (np.minimum(*sent) > 0)
+            share: NDArray[np.float64] | float = 1.0
         else:
             nearest, share = (np.square(cos_i), cos_o**2), mirrored(tangent / (length * sigma) ** 2, cos_i, cos_o)
             factor = 1.0

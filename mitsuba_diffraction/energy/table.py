@@ -199,12 +199,12 @@ class EnergyTable:
     def at(self, directions: NDArray[np.float64], wavelengths: ArrayLike) -> NDArray[np.float64]:
         """Return e(ω, λ) as the renderer has it, (n,), for ω (n, 3) along the pattern's axes and λ in µm."""
         slices, *places = self.layout.places(directions, wavelengths)
-        cells = [np.clip(place.astype(np.int64), 0, self.steps.shape[1] - 1) for place in places]
-        weights = _bilinear(places[1] - cells[1], places[0] - cells[0])
+        row, column = (np.clip(place.astype(np.int64), 0, self.steps.shape[1] - 1) for place in places)
+        weights = _bilinear(places[1] - column, places[0] - row)
         below = np.minimum(slices.astype(np.int64), self.steps.shape[0] - 1)
-        steps = (self.steps[(below, *cells)] * weights).sum(-1)
+        steps = (self.steps[below, row, column] * weights).sum(-1)
         if not self.layout.lines:
-            above = (self.steps[(np.minimum(below + 1, self.steps.shape[0] - 1), *cells)] * weights).sum(-1)
+            above = (self.steps[np.minimum(below + 1, self.steps.shape[0] - 1), row, column] * weights).sum(-1)
             steps += (slices - below) * (above - steps)
         return self.least + (1 - self.least) / 255 * steps
 
@@ -342,5 +342,5 @@ def _four(nodes: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack([below[..., :-1], below[..., 1:], above[..., :-1], above[..., 1:]], -1)
 
 
-def _bilinear(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+def _bilinear(x: NDArray[np.float64] | np.float64, y: NDArray[np.float64] | np.float64) -> NDArray[np.float64]:
     return np.stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y], -1)

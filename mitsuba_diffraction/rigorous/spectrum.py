@@ -74,9 +74,9 @@ class RigorousSpectrum:
         if self.values.shape != wanted or self.values.dtype != np.float32:
             raise RequestError(f"values: got {self.values.shape} of {self.values.dtype}, wanted {wanted} of float32")
         if self.mueller is not None:
-            wanted = self.axes.planes, self.axes.nodes, 4, 4
-            if self.mueller.shape != wanted or self.mueller.dtype != np.float32:
-                raise RequestError(f"mueller: got {self.mueller.shape}, wanted {wanted} of float32")
+            matrices = (*wanted, 4, 4)
+            if self.mueller.shape != matrices or self.mueller.dtype != np.float32:
+                raise RequestError(f"mueller: got {self.mueller.shape}, wanted {matrices} of float32")
         lobe_width(self.coherence_length)
 
     # As a `GratingSpectrum` has them.
@@ -257,8 +257,8 @@ def load(path: str | os.PathLike[str], construct: Callable[..., Spectrum], recip
     path = Path(path)
     header, channels = read(path, FORMAT, FORMAT_VERSION, recipe)
     try:
-        (period,), wavelengths = header["period"], tuple(float(x) for x in header["wavelengths"])
-        axes = Axes(float(period), wavelengths, header["steps"], header["planes"])
+        (period,), (shortest, longest) = header["period"], header["wavelengths"]
+        axes = Axes(float(period), (float(shortest), float(longest)), header["steps"], header["planes"])
         sheet = np.stack([channels[_channel(k)].pixels for k in range(axes.planes)])
         squares, top = [], 0
         for m in axes.orders:

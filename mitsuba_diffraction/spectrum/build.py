@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 import warnings
 from collections.abc import Callable, Sequence
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,6 +65,7 @@ _SCATTER_SHARE = 0.1
 _OF_MEAN = 0.7  # the share of the time that the mean of many patches takes, roughly
 
 Splines = SamplePowers | TileSplines
+Lattice = TypeVar("Lattice", SamplePowers, TileSplines)
 Table = SeriesTable | SliceTable
 
 
@@ -173,6 +175,7 @@ def precompute(
     reach = 2 * np.sin(np.deg2rad(largest_angle)) / shortest
     _check_resolution(height_field, reach)
     carried, scatter, tail = float(coherence_length), None, 0.0
+    powers: TilePowers | Splines | None
     if extent == "tile":
         allowed = tolerance = _FINEST if tolerance is None else tolerance
         sigma, rho = lobe_width(carried), lobe_reach(TAIL_SHARE * tolerance)
@@ -275,7 +278,7 @@ def _cost(packets: int, shape: tuple[int, int]) -> float:
     return packets * max(1.0, shape[0] * shape[1] * 8e-6) ** 0.5
 
 
-def _refined(lattice: Callable[[float], Splines], sigma: float, largest_kappa: float, tolerance: float) -> Splines:
+def _refined(lattice: Callable[[float], Lattice], sigma: float, largest_kappa: float, tolerance: float) -> Lattice:
     """The coarsest lattice, a function of its spacing, that keeps its share of the tolerance between its nodes."""
     allowed, spacing = _SPLINE_SHARE * tolerance, _WIDEST_SPACING * sigma
     while True:
@@ -351,7 +354,8 @@ class _Build:
         """Over the Chebyshev nodes in κ: where the power lies, and a pilot, the strongest frequencies."""
         kappas = (1 + chebyshev_nodes(self._nodes)) / 2 * self._largest_kappa
         grid, report = self._exact.grid, self._phase(0.0, 0.3)
-        rims, missing, total, strongest = ([], []), [], 0.0, None
+        rims: tuple[list[NDArray[np.float64]], list[NDArray[np.float64]]] = ([], [])
+        missing, total, strongest = [], 0.0, None
         pilot = np.empty((self._nodes, min(_PILOT, int(np.prod(grid.shape)))))
         for j, kappa in enumerate(kappas):
             power = self._exact(kappa)
@@ -372,7 +376,7 @@ class _Build:
             outside = (between @ np.array(rim)).max(axis=0)
             largest.append(int(np.argmax(outside <= _DROP_SHARE / 2 * self._allowed)) if whole else 0)
             self.dropped += float(np.clip(outside[largest[-1]], 0, 1))
-        self.kept = dataclasses.replace(grid, largest=tuple(largest))
+        self.kept = dataclasses.replace(grid, largest=(largest[0], largest[1]))
         self._pilot = pilot
         # The others are taken to err as much for their power.
         self._pilot_share = float(np.abs(pilot).sum() / total)
@@ -395,9 +399,9 @@ class _Build:
             while self._allowed >= storage.least:
                 try:
                     table = self._build(representation, storage, _MARGIN * self._allowed * refine)
-                except _TooLargeError as error:
+                except _TooLargeError as too_large:
                     # Another storage may need fewer intervals.
-                    refusal = error
+                    refusal = too_large
                     break
                 error = self._measured(table) / _MARGIN
                 if error <= self._allowed:
@@ -441,7 +445,7 @@ class _Build:
 
     def _between(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Many κ, four to an oscillation, and the pilot's powers there, (κ, n), by Chebyshev interpolation."""
-        kappas = np.linspace(0, self._largest_kappa, 16 + int(np.ceil(4 * self._x)))
+        kappas = np.linspace(0, self._largest_kappa, 16 + int(np.ceil(4 * self._x)), dtype=np.float64)
         vander = chebyshev_polynomials(position(kappas, self._largest_kappa), self._nodes)
         return kappas, vander @ chebyshev_transform(self._nodes)
 

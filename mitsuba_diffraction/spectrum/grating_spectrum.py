@@ -141,13 +141,19 @@ class GratingSpectrum:
 
     @property
     def lobes(self) -> tuple[LobeAxis, LobeAxis]:
-        """Where the lobes of the orders end along x and y; of a grid of orders only."""
+        """Where the lobes of the orders end along x and y.
+
+        Raises:
+            RequestError: of a lattice of splines.
+        """
+        if not isinstance(self.grid, OrderGrid):
+            raise RequestError("lobes: got a lattice of splines, wanted a grid of orders")
         return self.grid.lobes(self.lobe_width, self.reach)
 
     @property
     def neighbours(self) -> tuple[int, int]:
         """How many nodes along x and y contribute at one q, to the tolerance."""
-        return tuple(lobe.count for lobe in self.lobes) if isinstance(self.grid, OrderGrid) else (3, 3)
+        return (self.lobes[0].count, self.lobes[1].count) if isinstance(self.grid, OrderGrid) else (3, 3)
 
     @property
     def words_per_evaluation(self) -> int:
@@ -167,7 +173,7 @@ class GratingSpectrum:
         Raises:
             ValueError: if κ (rad/µm) is outside of what the table holds.
         """
-        return self.table.powers(float(self._checked(np.float64(kappa))))
+        return self.table.powers(float(self._checked(np.asarray(kappa, np.float64))))
 
     def evaluate(self, q: ArrayLike, kappa: ArrayLike) -> NDArray[np.float64]:
         """S(q; κ) from the table.
@@ -185,8 +191,8 @@ class GratingSpectrum:
         q, kappa = matching(q, kappa)
         self._checked(kappa)
         result = np.zeros(kappa.shape)
-        lines = isinstance(self.grid, OrderGrid)
-        around = self.grid.around(q, self.lobe_width, self.reach) if lines else self.grid.around(q)
+        grid = self.grid
+        around = grid.around(q, self.lobe_width, self.reach) if isinstance(grid, OrderGrid) else grid.around(q)
         for row, column, weight in around:
             result += weight * self.table.powers_at(row, column, kappa)
         # Interpolation may dip below zero by its error.
@@ -217,7 +223,7 @@ class GratingSpectrum:
             if f.name not in ("table", "energy", "source", "source_digest"):
                 content.update(f"{f.name}={getattr(self, f.name)!r};".encode())
         for array in self.table.content():
-            content.update(array)
+            content.update(array.data)
         return content.hexdigest()
 
     def save(self, path: str | os.PathLike[str], recipe: str = "") -> None:
@@ -286,7 +292,7 @@ def save(spectrum: GratingSpectrum, path: str | os.PathLike[str], recipe: str = 
         "sourceSha256": spectrum.source_digest,
         "units": "lengths in micrometres, wavelengths in nanometres",
     }
-    if spectrum.representation == "svd":
+    if isinstance(spectrum.table, SeriesTable) and spectrum.representation == "svd":
         # repr of a float is exact.
         header["modes"] = json.dumps(spectrum.table.series.modes.tolist())
     header["energy"] = json.dumps(spectrum.energy_table().as_plain())
@@ -370,8 +376,8 @@ def _channels(table: SeriesTable | SliceTable) -> dict[str, np.ndarray]:
 def _table(header: dict, pixels: dict[str, np.ndarray], largest_kappa: float) -> SeriesTable | SliceTable:
     kind, count = header["representation"], header["channelCount"]
     if kind == SliceTable.representation:
-        terms = 4 if "S(000.3)" in pixels else 3
-        values = [[pixels[f"S({k:03d}.{p})"] for p in range(terms)] for k in range(count // terms)]
+        powers = 4 if "S(000.3)" in pixels else 3
+        values = [[pixels[f"S({k:03d}.{p})"] for p in range(powers)] for k in range(count // powers)]
         return SliceTable(largest_kappa, np.array(values, np.float32))
     terms = np.stack([pixels[_TERM_NAMES[kind].format(n)] for n in range(count)])
     if kind == "svd":

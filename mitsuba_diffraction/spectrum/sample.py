@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from ..errors import RequestError
 from ..settings import lobe_width
 from ..surface.heightfield import HeightField
+from .orders import OrderGrid
 from .spline_grid import SplineGrid
 
 # Windows are truncated at ±3 σ_s, where their amplitude is e^{−9/2}, 1 %.
@@ -205,7 +206,7 @@ class SamplePowers:
         """The share of the power where light reaches and the pixels resolve; takes c_m of the grid."""
         return self.grid.within(powers, self._reached)
 
-    def error(self, kept: SplineGrid, powers: NDArray[np.float32], kappa: float) -> float:
+    def error(self, kept: OrderGrid | SplineGrid, powers: NDArray[np.float32], kappa: float) -> float:
         """∫|S_approx − S_exact| dq where light reaches, by the rule of rectangles on a shifted lattice.
 
         Args:

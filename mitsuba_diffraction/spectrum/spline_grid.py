@@ -77,7 +77,7 @@ class SplineGrid:
 
     def error(
         self,
-        kept: SplineGrid,
+        kept: OrderGrid | SplineGrid,
         coefficients: NDArray[np.float32],
         exact: NDArray[np.float64],
         shift: NDArray[np.float64],

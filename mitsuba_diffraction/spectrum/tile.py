@@ -39,7 +39,7 @@ class TilePowers:
         """The share of the power in orders that lie where light reaches; takes η_m of the grid."""
         return float(powers[inner(self.grid, self._reached)].sum())
 
-    def error(self, kept: OrderGrid, powers: NDArray[np.float32], kappa: float) -> float:
+    def error(self, kept: OrderGrid | SplineGrid, powers: NDArray[np.float32], kappa: float) -> float:
         """∫|S_approx − S_exact| dq over the frequencies of this grid: of lobes that stand apart; of others, a bound.
 
         Args:
@@ -112,7 +112,7 @@ class TileSplines:
         """The share of the power where light reaches; takes c_m of the grid."""
         return self.grid.within(powers, self._reached)
 
-    def error(self, kept: SplineGrid, powers: NDArray[np.float32], kappa: float) -> float:
+    def error(self, kept: OrderGrid | SplineGrid, powers: NDArray[np.float32], kappa: float) -> float:
         """∫|S_approx − S_exact| dq where light reaches; arguments as of `TilePowers.error`."""
         shift = self._random.uniform(-0.5, 0.5, 2)
         along_x, along_y = (

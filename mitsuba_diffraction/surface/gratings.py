@@ -253,7 +253,7 @@ def foil(period: float = 1.0, depth: float = 0.15, *, directions: int = 2, sampl
     span = 4.0 if directions == 2 else 4.5
     return HeightField(
         waves * depth / span,
-        tuple(float(s * period / n) for s, n in zip(size, pixels, strict=True)),
+        (float(size[0] * period / pixels[0]), float(size[1] * period / pixels[1])),
         f"embossed foil, {directions} directions, period {period:g} µm, depth {depth:g} µm",
     )
 
@@ -501,9 +501,6 @@ def morpho_ridges(
     )
 
 
-Array = NDArray[np.float64]
-
-
 class Canvas:
     """A periodic patch for drawing small shapes, which wrap around at its edges.
 
@@ -533,16 +530,19 @@ class Canvas:
         columns, rows = (round(s / pixel_size) for s in self.size)
         self.count = tuple(round(s / p) for s, p in zip(self.size, pitch, strict=True))
         # The period is preserved: along its axis the size is adjusted, not the pitch.
-        self.size = tuple(pitch[i] * self.count[i] if i == axis else self.size[i] for i in (0, 1))
+        x, y = (pitch[i] * self.count[i] if i == axis else self.size[i] for i in (0, 1))
+        self.size = (x, y)
         self.pitch = tuple(s / n for s, n in zip(self.size, self.count, strict=True))
         self.pixel = (self.size[0] / columns, self.size[1] / rows)
         self.heights = np.zeros((rows, columns))
 
     def places(self, axis: int) -> Array:
         """Centres of the pitches along x (0) or y (1), µm."""
-        return (np.arange(self.count[axis]) + 0.5) * self.pitch[axis]
+        return (np.arange(self.count[axis], dtype=np.float64) + 0.5) * self.pitch[axis]
 
-    def window(self, x: tuple[float, float], y: tuple[float, float]) -> tuple[tuple[Array, Array], Array, Array]:
+    def window(
+        self, x: tuple[float, float], y: tuple[float, float]
+    ) -> tuple[tuple[NDArray[np.signedinteger], ...], Array, Array]:
         """Pixels of the box x[0]…x[1], y[0]…y[1] µm.
 
         Returns:
@@ -554,7 +554,8 @@ class Canvas:
             for (a, b), p, n in zip((x, y), self.pixel, self.heights.shape[::-1], strict=True)
         )
         index = np.ix_(rows % self.heights.shape[0], columns % self.heights.shape[1])
-        return index, (columns[None, :] + 0.5) * self.pixel[0], (rows[:, None] + 0.5) * self.pixel[1]
+        x_index, y_index = columns[None, :].astype(np.float64), rows[:, None].astype(np.float64)
+        return index, (x_index + 0.5) * self.pixel[0], (y_index + 0.5) * self.pixel[1]
 
     def noise(self, rng: np.random.Generator, length_x: float, length_y: float) -> Array:
         """Periodic Gaussian noise, mean 0, standard deviation 1, correlation exp(−x²/4 length_x² − …), (N_y, N_x)."""

@@ -22,7 +22,8 @@ def as_pixel_size(value: float | tuple[float, float]) -> tuple[float, float]:
     try:
         if isinstance(value, str | bool):
             raise TypeError
-        x, y = (value, value) if isinstance(value, Real) else value
+        # To type checkers a float is no Real.
+        x, y = (value, value) if isinstance(value, float | Real) else value
         pair = (float(x), float(y))
     except (TypeError, ValueError, OverflowError):
         raise RequestError(f"pixel_size: got {value!r}, wanted one number or (x, y) in µm") from None
@@ -93,7 +94,8 @@ class HeightField:
     @property
     def shape(self) -> tuple[int, int]:
         """(N_y, N_x): rows, columns."""
-        return self.heights.shape
+        rows, columns = self.heights.shape
+        return rows, columns
 
     @property
     def tile_size(self) -> tuple[float, float]:

@@ -96,8 +96,9 @@ def read_height_field(
                 )
             heights = _as_micrometres(scan.numbers, height_range)
         if not (fill_missing or keep_missing) and scan.numbers.dtype.kind in "iu" and np.ma.is_masked(scan.numbers):
+            share = np.ma.getmaskarray(scan.numbers).mean()
             raise RequestError(
-                f"{scan.numbers.mask.mean():.2%} of the pixels are coloured, annotation on a grey picture; they can be "
+                f"{share:.2%} of the pixels are coloured, annotation on a grey picture; they can be "
                 "taken for missing and filled from their surroundings (fill_missing=True, or --fill-missing)"
             )
         pixel_size = scan.pixel_size if pixel_size is None else pixel_size
@@ -136,7 +137,7 @@ def _read(path: Path, channel: str | int | None, unit: str | tuple[str, str] | N
     return _WITHOUT_UNIT[extension](path)
 
 
-def _as_micrometres(numbers: NDArray, height_range: object) -> NDArray[np.float64]:
+def _as_micrometres(numbers: NDArray, height_range: float | None) -> NDArray[np.float64]:
     """Integers scaled by the full range of their type, floats unchanged; (N_y, N_x) µm."""
     if numbers.dtype.kind not in "iuf":
         raise RequestError(f"got numbers of type {numbers.dtype}, wanted real floats in µm or integers")
@@ -152,7 +153,7 @@ def _as_micrometres(numbers: NDArray, height_range: object) -> NDArray[np.float6
         raise RequestError(
             f"height_range: missing for {numbers.dtype} heights, wanted the height in µm from black to white"
         )
-    if isinstance(height_range, bool) or not isinstance(height_range, Real):
+    if isinstance(height_range, bool) or not isinstance(height_range, float | Real):
         raise RequestError(f"height_range: got {height_range!r}, wanted a number in µm")
     if not (np.isfinite(height_range) and height_range > 0):
         raise RequestError(f"height_range: got {height_range!r}, wanted a positive number in µm")
