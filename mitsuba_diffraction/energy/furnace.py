@@ -4,10 +4,10 @@ With R = 1 and E = 1 the BSDF reflects
 
     a(ω_i, λ) = ∫ K G S(q; κ) W dq    over the q whose ω_o is above the surface (du dv = cos θ_o dω_o = λ² dq)
 
-a is summed over components of S: the orders of a grating, each with its Gaussian lobe, or, where orders overlap and of
-a sample, the cells of a lattice in which S is gathered, each represented by a Gaussian as wide as the cell. A component
-whose ω_o stays away from the horizon is represented by its centre, as K G and κ hardly change within it; others by
-points that are evenly spaced in cos θ_o.
+a is summed over components of S: the orders of a grating, or, where orders overlap and of a sample, the cells of a
+lattice in which S is gathered, each represented by a Gaussian as wide as the cell. An order is represented by the
+centre of its lobe, which keeps its power, and so is a cell whose ω_o stays away from the horizon, as K G and κ hardly
+change within it; other cells, and the lobe of the mirror direction, by points that are evenly spaced in cos θ_o.
 
 K, G and W are those of the BSDF. With s_i = ω_i,t, s_o = ω_o,t, w = cos θ_i + cos θ_o, d(s) = (1 − |s|²)/2λσ_q and
 g the `horizon_gain`, an order m that is evaluated by itself has
@@ -41,14 +41,13 @@ from ..spectrum.tables import SeriesTable, SliceTable
 KAPPA_STEP = 0.1  # radians of the fastest oscillation over κ, between which powers are linear
 CELL, CELLS = 0.2, 500  # width of a gathered cell in direction cosines at the shortest wavelength; cells at least
 MIRROR_CELL = 0.75  # the same in the lobe of the mirror direction, in σ_q, at most
-FAR, FAR_CELL = 12, 20  # cos² θ_o in λσ from which an order, or a cell, is represented by its centre
-TURN = 0.5  # radians by which the phase of the deepest point may change within such a component
+FAR_CELL = 20  # cos² θ_o in λσ from which a cell is represented by its centre
+TURN = 0.5  # radians by which the phase of the deepest point may change within such a cell
 REACH = 4.2  # standard deviations to which a component is integrated
 NARROW = 0.02  # λσ up to which a lobe is integrated along the radius alone
-RADIAL, AZIMUTHAL, GRAZING = 9, 13, 5  # points of a lobe
+RADIAL, AZIMUTHAL = 9, 13  # points of a lobe
 RADIAL_CELL = 3  # of a cell
-BLUR = 0.05  # a cell of such a table, as a share of the largest κ
-WEAK = 1e-3  # power of an order below which GRAZING is one
+BLUR = 0.05  # a cell of a table in three dimensions, as a share of the largest κ
 POINTS = 6000  # drawn by power among the nodes of a spectrum
 CHUNK = 1 << 16  # pairs (direction, component) at once, so that they stay in the cache
 

@@ -336,11 +336,5 @@ def _general_corners(furnace: Furnace, layout: Layout) -> tuple[NDArray[np.float
     return full, (float(lost.mean()), float(lost.max()))
 
 
-def _four(nodes: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the four corners of each cell: (..., n, n) → (..., n − 1, n − 1, 4)."""
-    below, above = nodes[..., :-1, :], nodes[..., 1:, :]
-    return np.stack([below[..., :-1], below[..., 1:], above[..., :-1], above[..., 1:]], -1)
-
-
 def _bilinear(x: NDArray[np.float64] | np.float64, y: NDArray[np.float64] | np.float64) -> NDArray[np.float64]:
     return np.stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y], -1)
