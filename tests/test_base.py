@@ -220,7 +220,7 @@ def test_samples_are_shared_as_the_light_is(theta, reflectance):
 
     bsdf = over({"type": "diffuse", "reflectance": uniform(reflectance)}, "blazed", 65.0)
     found = fraction(bsdf)
-    bsdf._share = lambda *_: mi.Float(0.5)
+    bsdf.layers._share = lambda *_: mi.Float(0.5)
     assert found > fraction(bsdf) + 0.04
     if reflectance == 0.5 and theta <= 60:
         assert found > 0.93

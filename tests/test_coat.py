@@ -197,7 +197,7 @@ def test_a_wrong_layer_is_refused(llvm, parameters, text):
 )
 def test_a_layer_of_the_index_of_the_outside_is_none(llvm, layer, without):
     found = coated(**layer)
-    assert found.coat is None
+    assert found.layers.coat is None
     plain = {"type": "diffraction_grating", "profile": "blazed", "period": 2.5, "depth": 0.25, "coherence_length": 3.0}
     wi, wo = direction(20.0), direction(-30.0)
     values = [testing.evaluate(bsdf, wi, wo, [550]) for bsdf in (found, mi.load_dict({**plain, **without}))]

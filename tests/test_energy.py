@@ -192,7 +192,7 @@ def test_untouched_where_neither_direction_reflects_too_much(name):
 
 def energies(bsdf, omega, wavelength):
     """e of the table, (n,)."""
-    energy = bsdf.energy
+    energy = bsdf.layers.grating.theory.energy
     return np.array(energy.bound(energy.place(vectors(omega)), floats(1e3 / wavelength)))
 
 
@@ -265,7 +265,7 @@ def test_table_follows_height_scale_and_carries_its_derivative():
     dr.enable_grad(scale)
     parameters["height_scale"] = scale
     parameters.update()
-    energy = bsdf.energy
+    energy = bsdf.layers.grating.theory.energy
     place = energy.place(vectors(omega))
     e = energy.bound(place, mi.Float(np.full(300, 2.0)))
     dr.forward(scale)
@@ -348,7 +348,7 @@ def test_what_the_table_loses_is_measured_and_shown():
 
 
 def test_without_shadowing_there_is_no_bound():
-    assert plugin(spectrum("blazed"), shadowing="none").energy is None
+    assert plugin(spectrum("blazed"), shadowing="none").layers.grating.theory.energy is None
 
 
 @pytest.mark.few(1)
@@ -391,7 +391,7 @@ def test_the_table_is_stored_with_the_spectrum(tmp_path, monkeypatch):
     np.testing.assert_array_equal(there.steps, here.steps)
     assert (there.layout, there.least, there.loss) == (here.layout, here.least, here.loss)
     bsdf = mi.load_dict({"type": "diffraction_grating", "filename": str(tmp_path / "s.exr")})
-    assert str(bsdf.energy) == str(plugin(of).energy)
+    assert str(bsdf.layers.grating.theory.energy) == str(plugin(of).layers.grating.theory.energy)
 
 
 @pytest.mark.parametrize(
@@ -420,14 +420,14 @@ def test_instances_of_one_surface_share_their_tables(tmp_path):
     of = spectrum("blazed")
     of.save(tmp_path / "s.exr")
     one, other = (mi.load_dict({"type": "diffraction_grating", "filename": str(tmp_path / "s.exr")}) for _ in range(2))
-    assert one.scattering is other.scattering is plugin(of).scattering
-    assert one.energy is other.energy
+    assert one.layers.grating.scattering is other.layers.grating.scattering is plugin(of).layers.grating.scattering
+    assert one.layers.grating.theory.energy is other.layers.grating.theory.energy
     profile = {"type": "diffraction_grating", "profile": "blazed", "period": 2.5, "depth": 0.123}
     many = mi.load_dict({"type": "scene", **{f"s{i}": {"type": "sphere", "bsdf": {**profile}} for i in range(20)}})
     bsdfs = [shape.bsdf() for shape in many.shapes()]
-    assert len({id(bsdf.scattering) for bsdf in bsdfs}) == 1
+    assert len({id(bsdf.layers.grating.scattering) for bsdf in bsdfs}) == 1
     # Nothing is kept once no BSDF uses it.
-    last = weakref.ref(bsdfs[0].scattering)
+    last = weakref.ref(bsdfs[0].layers.grating.scattering)
     del many, bsdfs
     gc.collect()
     gc.collect()

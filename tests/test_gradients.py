@@ -31,6 +31,7 @@ class Total:
 
     def __init__(self, key, wavelengths=(500.0,) * 4, **parameters):
         self.bsdf = mi.load_dict(grating(**{"coherence_length": 10.0, **parameters}))
+        self.theory = self.bsdf.layers.grating.theory
         self.parameters = mi.traverse(self.bsdf)
         self.key = key
         self.wo, self.weights = near_orders()
@@ -79,8 +80,8 @@ def test_derivative_by_a_number(case, mode):
     total = Total(key, **parameters)
     if key == "height_scale":
         # With E, whose table is coarse, in the test below.
-        total.bsdf._update = lambda: None
-        total.bsdf.energy = None
+        total.theory.update = lambda: None
+        total.theory.energy = None
     wanted = difference(total.number, at, step)
     x = mi.Float(at)
     dr.enable_grad(x)
@@ -112,18 +113,18 @@ def test_derivative_by_height_includes_the_energy_factor(at):
     total = Total("height_scale", name="deep blazed")
 
     def exact(value):
-        total.bsdf._update = lambda: setattr(total.bsdf, "energy", energy_near(total.bsdf.spectrum, at, value))
+        total.theory.update = lambda: setattr(total.theory, "energy", energy_near(total.bsdf.spectrum, at, value))
         return total.number(value)
 
     wanted = (exact(at + shared.STEP) - exact(at - shared.STEP)) / (2 * shared.STEP)
-    del total.bsdf._update
+    del total.theory.update
 
     def slope(change_of_table):
         x = mi.Float(at)
         dr.enable_grad(x)
         total.parameters["height_scale"] = x
         total.parameters.update()
-        total.bsdf.energy.change *= change_of_table
+        total.theory.energy.change *= change_of_table
         f = total.bsdf.eval(mi.BSDFContext(), total.si, vectors(total.wo))[1]
         dr.backward(dr.sum(f * floats(total.weights)))
         return dr.grad(x)[0]
@@ -297,22 +298,23 @@ def test_changes_rebuild_only_what_depends_on_them(monkeypatch):
     parameters = mi.traverse(bsdf)
     tables = Count(monkeypatch, shared.EnergyTable, "of")
     lines = Count(monkeypatch, shared, "OrderSpectrum")
-    scattering, table = bsdf.scattering, bsdf.energy
+    theory = bsdf.layers.grating.theory
+    scattering, table = theory.scattering, theory.energy
     for key, value in (("orientation.value", 20.0), ("eta", 1.4), ("base.reflectance.value", 0.1)):
         assert key in parameters
         parameters[key] = value
         parameters.update()
         assert tables.calls == 0
-        assert bsdf.energy is table
+        assert theory.energy is table
     parameters["height_scale"] = 0.87
     parameters.update()
     assert tables.calls == 1
-    assert bsdf.energy is not table
+    assert theory.energy is not table
     parameters["height_scale"] = 1.0
     parameters.update()
     # That of the spectrum's own height is kept with it.
     assert tables.calls == 1
-    assert bsdf.scattering is scattering
+    assert theory.scattering is scattering
     assert lines.calls == 0
 
 

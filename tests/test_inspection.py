@@ -107,7 +107,7 @@ def test_radiance_is_that_of_the_bsdf(theta_i, theta_o):
     got = (radiance(spectrum, 0.0, theta_i, theta_o) / illumination())[at]
     share = f * np.cos(np.deg2rad(theta_i)) / got
     np.testing.assert_allclose(share, 1, atol=1e-3)
-    factor = Geometry.of(si.wi, towards(theta_o)).k_g(True)
+    factor = Geometry.of(si.wi, towards(theta_o)).k_g()
     between = np.cos(np.deg2rad(theta_i + theta_o))
     assert geometry(np.cos(np.deg2rad(theta_i)), cos_o, between) == pytest.approx(factor, rel=1e-5)
 

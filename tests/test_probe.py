@@ -55,5 +55,5 @@ def test_shapes_that_do_not_fit_are_refused(llvm):
 @pytest.mark.parametrize("shadowing", [True, False])
 def test_k_g_is_that_of_the_bsdf(llvm, shadowing):
     wi, wo = (random_directions(np.random.default_rng(seed), 200, 0.01) for seed in (1, 2))
-    found = np.array(Geometry.of(testing.vectors(wi), testing.vectors(wo)).k_g(shadowing))
+    found = np.array(Geometry.of(testing.vectors(wi), testing.vectors(wo), shadowing=shadowing).k_g())
     np.testing.assert_allclose(k_g_between(wi, wo, shadowing), found, rtol=1e-4)

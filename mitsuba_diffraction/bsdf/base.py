@@ -21,8 +21,8 @@ def nested_plugin(kind: str, **parameters: object) -> mi.Object:
 
 
 def is_grating(bsdf: mi.BSDF) -> bool:
-    """Whether a BSDF is of the class behind `diffraction_grating`."""
-    return hasattr(bsdf, "spectrum") and hasattr(bsdf, "along_pattern")
+    """Return whether a BSDF is of the class behind `diffraction_grating`."""
+    return hasattr(bsdf, "layers")
 
 
 def contains_grating(bsdf: mi.BSDF) -> bool:

@@ -9,7 +9,7 @@ import mitsuba as mi
 
 from ..geometry import HORIZON_GAIN
 from .coat import Coat
-from .tables import larger, smaller
+from .tables import larger, limited, smaller
 
 
 # Not frozen: Dr.Jit rebuilds what enters a branch field by field.
@@ -59,6 +59,8 @@ class Geometry:
         cos_i: cos θ_i, inside of a coat.
         cos_o: cos θ_o, likewise.
         index: n of the coat relative to the outside; one without.
+        height_scale: times the heights.
+        shadowing: whether G is a factor.
     """
 
     wi: mi.Vector3f
@@ -66,12 +68,21 @@ class Geometry:
     cos_i: mi.Float
     cos_o: mi.Float
     index: mi.Float
+    height_scale: mi.Float
+    shadowing: bool
 
     @classmethod
-    def of(cls, wi: mi.Vector3f, wo: mi.Vector3f, coat: Coat | None = None) -> Geometry:
+    def of(
+        cls,
+        wi: mi.Vector3f,
+        wo: mi.Vector3f,
+        coat: Coat | None = None,
+        height_scale: mi.Float | float = 1.0,
+        shadowing: bool = True,
+    ) -> Geometry:
         """Return that of ω_i and ω_o, along the pattern's axes and outside of the coat."""
         cosines = (omega.z if coat is None else coat.refracted(omega).z for omega in (wi, wo))
-        return cls(wi, wo, *cosines, mi.Float(1.0) if coat is None else coat.eta)
+        return cls(wi, wo, *cosines, mi.Float(1.0) if coat is None else coat.eta, mi.Float(height_scale), shadowing)
 
     @property
     def tangent(self) -> mi.Vector2f:
@@ -92,18 +103,37 @@ class Geometry:
         """Both directions are above the surface."""
         return (self.cos_i > 0) & (self.cos_o > 0)
 
-    def kappa(self, frequency: mi.Float, height_scale: mi.Float) -> mi.Float:
-        """κ = 2π n (cos θ_i + cos θ_o)/λ times the scale of the heights; `frequency` is 1/λ, outside of a coat."""
-        return -self.w * dr.two_pi * self.index * frequency * height_scale
+    def kappa(self, frequency: mi.Float) -> mi.Float:
+        """Return κ = 2π n (cos θ_i + cos θ_o)/λ times the scale of the heights; `frequency` is 1/λ outside."""
+        return -self.w * dr.two_pi * self.index * frequency * self.height_scale
 
     def cos_half(self) -> mi.Float:
         """ω_i·h = ω_o·h = √(D/2)."""
         return dr.sqrt(0.5 * _d(dr.squared_norm(self.tangent) / dr.square(self.index), self.cos_i + self.cos_o))
 
-    def k_g(self, shadowing: bool) -> mi.Float:
-        """K G of the pair of directions."""
+    def k_g(self) -> mi.Float:
+        """Return K G of the pair of directions."""
         square = dr.squared_norm(self.tangent) / dr.square(self.index)
-        return k_g(self.cos_i, self.cos_o, square, shadowing)
+        return k_g(self.cos_i, self.cos_o, square, self.shadowing)
+
+    def order_factor(self, tangent: mi.Vector2f, per_width: mi.Float) -> mi.Float:
+        """Return K G cos θ_o of the order at (u, v) = λq, times the gain of its lobe; arguments as of `of_order`."""
+        cos_i, cos_o, gain = self.of_order(tangent, per_width)
+        square = dr.squared_norm(tangent) / dr.square(self.index)
+        return k_g(cos_i, cos_o, square, self.shadowing) * gain * self.cos_o
+
+    def continuum_factor(self, per_width: mi.Float) -> mi.Float:
+        """Return K G cos θ_o and gain where orders overlap, so that no single one is known.
+
+        At grazing incidence the mirror order has nearly all of the power, and K grows without bound within its lobe.
+        From cos θ = 0.2 down, and up to 4 σ_q from q = 0, S is taken for that of the mirror order, K G for one; from
+        cos θ = 0.4 up, and from 5 σ_q on, K and G are those at q, and what lobes lose below the horizon they get from
+        those beyond.
+        """
+        mirror = limited((25 - dr.squared_norm(self.tangent) * dr.square(per_width)) / 9, 0, 1)
+        mirror *= limited(2 - 5 * larger(self.wi.z, self.wo.z), 0, 1)
+        *_, gain = self.of_order(mi.Vector2f(0), per_width)
+        return dr.lerp(self.k_g(), gain, mirror) * self.cos_o
 
     def of_order(self, tangent: mi.Vector2f, per_width: mi.Float) -> tuple[mi.Float, mi.Float, mi.Float]:
         """cos θ_i, cos θ_o and gain of the order that the pair sees in its lobe.
@@ -130,6 +160,11 @@ class Geometry:
         # Where the order does not propagate the root would have no derivative.
         per = dr.rcp(dr.square(self.index))
         return *(dr.sqrt(larger(dr.fma(x, per, 1 - per), 1e-12)) for x in outside), gain
+
+
+def turned(omega: mi.Vector3f, sin: mi.Float, cos: mi.Float) -> mi.Vector3f:
+    """Return ω along the pattern's axes, from sine and cosine of the angle from the tangent to its x axis."""
+    return mi.Vector3f(cos * omega.x + sin * omega.y, cos * omega.y - sin * omega.x, omega.z)
 
 
 def _d(square: mi.Float, w: mi.Float) -> mi.Float:

@@ -21,7 +21,7 @@ from ..spectrum.grating_spectrum import GratingSpectrum
 from ..spectrum.orders import LobeAxis
 from ..spectrum.tables import HALF_SCALE, SeriesTable, SliceTable, shared_exponents
 from .cell_sampler import LOBE, CellAxis, CellSampler
-from .geometry import Geometry, Incidence, cos_square, k_g
+from .geometry import Geometry, Incidence, cos_square
 from .inversion import CELLS, KappaCells, averages, choose, search, sums_before, truncated_gaussian
 from .tables import HalfTable, PacketTable, SharedExponentTable, ShareTable, larger, limited, opaque
 
@@ -439,12 +439,12 @@ class OrderSpectrum:
             for lobe, size, largest in zip(spectrum.lobes, grid.tile_size, grid.largest, strict=True)
         )
         line = 1 in grid.shape
-        self.apart = all(axis.count == 1 for axis in self.axes) and not (line and sigma > NARROW)
-        self.power = order_power(spectrum.table, tuple(axis.rim for axis in self.axes), windows=not self.apart)
+        self.resolved = all(axis.count == 1 for axis in self.axes) and not (line and sigma > NARROW)
+        self.power = order_power(spectrum.table, tuple(axis.rim for axis in self.axes), windows=not self.resolved)
         self.cells = None
-        if not self.apart:
+        if not self.resolved:
             self.cells = LineSampler(spectrum) if line else CellSampler(spectrum)
-        self.orders = OrderSampler(spectrum) if self.apart else None
+        self.orders = OrderSampler(spectrum) if self.resolved else None
         self.columns, self.line = grid.shape[1], line
         self.per_width = opaque(1 / sigma)
 
@@ -456,35 +456,31 @@ class OrderSpectrum:
     def evaluate(
         self,
         geometry: Geometry,
-        height_scale: mi.Float,
-        shadowing: bool,
         incidence: Incidence,
         active: mi.Bool,
-        drawn: bool,
+        wo_is_sample: bool,
     ) -> tuple[mi.Float, mi.Float]:
-        """K G S(q; κ) cos θ_o and the density of q, both in µm², for one wavelength.
+        """Evaluate K G S(q; κ) cos θ_o and the density of q, both in µm², for one wavelength.
 
         K and G are those of each order, and its lobe keeps its power at the horizon (`Geometry.of_order`).
 
         Args:
             geometry: of the pair of directions.
-            height_scale: times the heights.
-            shadowing: whether G is a factor.
             incidence: the wavelength and where it comes from.
             active: mask.
-            drawn: whether the direction is a sample, so that an order meets it.
+            wo_is_sample: whether ω_o was drawn, so that nearly always it lies in the lobe of an order.
         """
-        if self.apart:
-            power, density = self._apart(geometry, height_scale, shadowing, incidence, active, drawn)
+        if self.resolved:
+            power, density = self._resolved(geometry, incidence, active, wo_is_sample)
         else:
-            q, kappa = geometry.tangent * incidence.frequency, geometry.kappa(incidence.frequency, height_scale)
+            q, kappa = geometry.tangent * incidence.frequency, geometry.kappa(incidence.frequency)
             m_x, m_y = (axis.first(q) for axis, q in zip(self.axes, q, strict=True))
             lobes_x, lobes_y = self.axes[0].lobes(m_x, q.x), self.axes[1].lobes(m_y, q.y)
             factor = 1
             if self.line:
-                lobes_x, lobes_y = self._weighted(m_x, m_y, lobes_x, lobes_y, geometry, shadowing, incidence)
+                lobes_x, lobes_y = self._weighted(m_x, m_y, lobes_x, lobes_y, geometry, incidence)
             else:
-                factor = of_continuum(geometry, shadowing, incidence, self.per_width)
+                factor = geometry.continuum_factor(incidence.frequency * self.per_width)
             power = factor * self._power(m_x, m_y, lobes_x, lobes_y, kappa, active)
             density = self.cells.density(q.x, q.y, incidence, active)
         # Interpolation may dip below zero by its error.
@@ -497,26 +493,17 @@ class OrderSpectrum:
         lobes_x: list[mi.Float],
         lobes_y: list[mi.Float],
         geometry: Geometry,
-        shadowing: bool,
         incidence: Incidence,
     ) -> tuple[list[mi.Float], list[mi.Float]]:
-        """The lobes of the orders of a line grating from (m_x, m_y) on, times K G cos θ_o and gain of each order."""
+        """Return the lobes of a line grating's orders from (m_x, m_y) on, times K G cos θ_o and gain of each."""
 
         def factor(x: int, y: int) -> mi.Float:
-            return self._factor(m_x + x, m_y + y, geometry, shadowing, incidence)
+            tangent = self._tangent(m_x + x, m_y + y, incidence)
+            return geometry.order_factor(tangent, incidence.frequency * self.per_width)
 
         if len(lobes_x) > 1:
             return [lobe * factor(step, 0) for step, lobe in enumerate(lobes_x)], lobes_y
         return lobes_x, [lobe * factor(0, step) for step, lobe in enumerate(lobes_y)]
-
-    def _factor(
-        self, m_x: mi.Int32, m_y: mi.Int32, geometry: Geometry, shadowing: bool, incidence: Incidence
-    ) -> mi.Float:
-        """K G cos θ_o of an order, times the gain of its lobe."""
-        tangent = self._tangent(m_x, m_y, incidence)
-        cos_i, cos_o, gain = geometry.of_order(tangent, incidence.frequency * self.per_width)
-        square = dr.squared_norm(tangent) / dr.square(geometry.index)
-        return k_g(cos_i, cos_o, square, shadowing) * gain * geometry.cos_o
 
     def _tangent(self, m_x: mi.Int32, m_y: mi.Int32, incidence: Incidence) -> mi.Vector2f:
         """λq of an order."""
@@ -538,41 +525,34 @@ class OrderSpectrum:
         return self.power.window(row, column, lobes_x, lobes_y, at, active)
 
     @dr.syntax
-    def _apart(
-        self,
-        geometry: Geometry,
-        height_scale: mi.Float,
-        shadowing: bool,
-        incidence: Incidence,
-        active: mi.Bool,
-        drawn: bool,
+    def _resolved(
+        self, geometry: Geometry, incidence: Incidence, active: mi.Bool, wo_is_sample: bool
     ) -> tuple[mi.Float, mi.Float]:
-        """`evaluate` of the one order that may hold at q.
+        """Evaluate the one order in whose lobe q may lie.
 
-        Most directions lie between the orders of a grating: unless drawn, they jump over all that reads tables.
+        Most directions lie between the orders of a grating: unless ω_o is a sample, they skip all that reads tables.
         """
         q = geometry.tangent * incidence.frequency
         near = active & self.meets(q.x, q.y)
-        power, density, needed = mi.Float(0.0), mi.Float(0.0), drawn or near
+        power, density, needed = mi.Float(0.0), mi.Float(0.0), wo_is_sample or near
         # What has no derivative is bound here: Dr.Jit carries all other state through the branch.
-        read = functools.partial(self._read, shadowing, incidence, near)
+        read = functools.partial(self._read, incidence, near)
         if needed:
-            power, density = read(geometry, height_scale)
+            power, density = read(geometry)
         return power, density
 
-    def _read(
-        self, shadowing: bool, incidence: Incidence, near: mi.Bool, geometry: Geometry, height_scale: mi.Float
-    ) -> tuple[mi.Float, mi.Float]:
-        """As `_apart`, where `near`; else zero."""
+    def _read(self, incidence: Incidence, near: mi.Bool, geometry: Geometry) -> tuple[mi.Float, mi.Float]:
+        """Return what `_resolved` does, where `near`; else zero."""
         q = geometry.tangent * incidence.frequency
         m_x, m_y = (axis.first(q) for axis, q in zip(self.axes, q, strict=True))
         lobes_x, lobes_y = self.axes[0].lobes(m_x, q.x), self.axes[1].lobes(m_y, q.y)
-        power = self._power(m_x, m_y, lobes_x, lobes_y, geometry.kappa(incidence.frequency, height_scale), near)
-        power *= self._factor(m_x, m_y, geometry, shadowing, incidence)
+        power = self._power(m_x, m_y, lobes_x, lobes_y, geometry.kappa(incidence.frequency), near)
+        tangent = self._tangent(m_x, m_y, incidence)
+        power *= geometry.order_factor(tangent, incidence.frequency * self.per_width)
         order = mi.UInt32((m_y + self.axes[1].largest) * self.columns + m_x + self.axes[0].largest)
         share = self.orders.share(order, self.orders.weights(incidence, near), near)
         # An order that does not propagate is not drawn.
-        there = cos_square(geometry.wi, self._tangent(m_x, m_y, incidence)) > 0
+        there = cos_square(geometry.wi, tangent) > 0
         return power, dr.select(there, share * lobes_x[0] * lobes_y[0], 0)
 
     def sample(
@@ -589,20 +569,6 @@ class OrderSpectrum:
         tangent = self._tangent(column - self.axes[0].largest, row - self.axes[1].largest, incidence)
         q = mi.Point2f(self.axes[0].place(column, v.x), self.axes[1].place(row, v.y))
         return q, cos_square(incidence.wi, tangent) > 0
-
-
-def of_continuum(geometry: Geometry, shadowing: bool, incidence: Incidence, per_width: mi.Float) -> mi.Float:
-    """K G cos θ_o and gain where orders overlap, so that no single one is known.
-
-    At grazing incidence the mirror order has nearly all of the power, and K grows without bound within its lobe. From
-    cos θ = 0.2 down, and up to 4 σ_q from q = 0, S is taken for that of the mirror order, K G for one; from cos θ = 0.4
-    up, and from 5 σ_q on, K and G are those at q, and what lobes lose below the horizon they get from those beyond.
-    """
-    per_width = incidence.frequency * per_width
-    mirror = limited((25 - dr.squared_norm(geometry.tangent) * dr.square(per_width)) / 9, 0, 1)
-    mirror *= limited(2 - 5 * larger(geometry.wi.z, geometry.wo.z), 0, 1)
-    *_, gain = geometry.of_order(mi.Vector2f(0), per_width)
-    return dr.lerp(geometry.k_g(shadowing), gain, mirror) * geometry.cos_o
 
 
 class _Axis:

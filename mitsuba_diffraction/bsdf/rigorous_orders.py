@@ -36,7 +36,7 @@ class RigorousOrders:
     and of the wavelength: in p and r the orders of one direction share one cell.
     """
 
-    apart = True
+    resolved = True
 
     def __init__(self, spectrum: RigorousSpectrum) -> None:
         axes = spectrum.axes
@@ -70,7 +70,7 @@ class RigorousOrders:
 
     @dr.syntax
     def evaluate(
-        self, geometry: Geometry, incidence: Incidence, active: mi.Bool, drawn: bool
+        self, geometry: Geometry, incidence: Incidence, active: mi.Bool, wo_is_sample: bool
     ) -> tuple[mi.Float, mi.Float]:
         """cos θ_o Σ_m η_m N and the density of q, both in µm², for one wavelength.
 
@@ -80,12 +80,12 @@ class RigorousOrders:
             geometry: of the pair of directions, along the pattern's axes.
             incidence: the wavelength and where it comes from.
             active: mask.
-            drawn: whether ω_o is a sample, so that an order meets it.
+            wo_is_sample: whether ω_o was drawn, so that nearly always it lies in the lobe of an order.
         """
         q = geometry.tangent * incidence.frequency
         near = active & self.meets(q.x, q.y)
-        power, density, needed = mi.Float(0.0), mi.Float(0.0), drawn or near
-        # Most directions lie between the orders: unless drawn, they jump over all that reads tables.
+        power, density, needed = mi.Float(0.0), mi.Float(0.0), wo_is_sample or near
+        # Most directions lie between the orders: unless ω_o is a sample, they skip all that reads tables.
         # What has no derivative is bound here: Dr.Jit carries all other state through the branch.
         read = functools.partial(self._read, incidence, near)
         if needed:

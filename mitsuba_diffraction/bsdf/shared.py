@@ -54,14 +54,12 @@ class SharedTables:
                 tables = _shared[key] = cls(spectrum)
             return tables
 
-    def energy(self, shadowing: str, height_scale: mi.Float) -> Energy | None:
-        """The factor E, or None if it is one for all directions and wavelengths, or `shadowing` is "none".
+    def energy(self, height_scale: mi.Float) -> Energy | None:
+        """Return the factor E, or None if it is one for all directions and wavelengths.
 
         Where a gradient is tracked through `height_scale`, the entries of the table carry theirs, from a central
         difference.
         """
-        if shadowing == "none":
-            return None
         scale = float(np.max(height_scale))
         if dr.grad_enabled(height_scale):
             table, lower, upper = self.energy_table(scale), max(scale - STEP, 0.0), scale + STEP

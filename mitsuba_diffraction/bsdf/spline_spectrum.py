@@ -9,7 +9,7 @@ from ..spectrum.grating_spectrum import GratingSpectrum
 from ..spectrum.spline_grid import spline_weights
 from .cell_sampler import CellSampler
 from .geometry import Geometry, Incidence
-from .orders import of_continuum, order_power
+from .orders import order_power
 from .tables import larger, opaque
 
 RIM = 3  # rings of zeros, so many as are read in a row
@@ -21,7 +21,7 @@ class SplineSpectrum:
     One evaluation reads three by three nodes and one packet for the density.
     """
 
-    apart = False
+    resolved = False
 
     def __init__(self, spectrum: GratingSpectrum) -> None:
         grid = spectrum.grid
@@ -36,13 +36,11 @@ class SplineSpectrum:
     def evaluate(
         self,
         geometry: Geometry,
-        height_scale: mi.Float,
-        shadowing: bool,
         incidence: Incidence,
         active: mi.Bool,
-        drawn: bool,
+        wo_is_sample: bool,
     ) -> tuple[mi.Float, mi.Float]:
-        """K G S(q; κ) cos θ_o and the density of q; as of `OrderSpectrum`, but all directions cost the same."""
+        """Evaluate K G S(q; κ) cos θ_o and the density of q; as `OrderSpectrum`, but all directions cost the same."""
         q_x, q_y = geometry.tangent * incidence.frequency
         x, y = q_x * self.per_q_x, q_y * self.per_q_y
         m_x, m_y = mi.Int32(dr.round(x)), mi.Int32(dr.round(y))
@@ -51,12 +49,12 @@ class SplineSpectrum:
             m_x + (self.largest_x + RIM - 1),
             spline_weights(x - mi.Float(m_x)),
             spline_weights(y - mi.Float(m_y)),
-            self.power.at(geometry.kappa(incidence.frequency, height_scale), active),
+            self.power.at(geometry.kappa(incidence.frequency), active),
             active,
         )
         inside = active & (dr.abs(q_x) <= self.limit_x) & (dr.abs(q_y) <= self.limit_y)
         # Interpolation may dip below zero by its error.
-        power = larger(power, 0) * self.per_area * of_continuum(geometry, shadowing, incidence, self.per_width)
+        power = larger(power, 0) * self.per_area * geometry.continuum_factor(incidence.frequency * self.per_width)
         return dr.select(inside, power, 0), self.cells.density(q_x, q_y, incidence, active)
 
     def sample(

@@ -22,7 +22,7 @@ from ..spectrum.build import THEORIES
 from ..spectrum.load import Spectrum, load_spectrum
 from ..surface.gratings import COHERENCE_LENGTHS, PROFILES
 from .coat import Coat
-from .rigorous_parameters import settings_from, settings_of_medium
+from .theories import settings_from, settings_of_medium
 
 _log = logging.getLogger(__name__)
 _per_cent = functools.partial(progress_bar, unit="%")

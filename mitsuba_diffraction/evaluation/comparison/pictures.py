@@ -112,9 +112,9 @@ class Pictures:
         if not prepared.surfaces:
             raise RequestError(f"{scene_path}: no shape has a diffraction_grating, there is nothing to compare")
         self.shaders: list[Shader] = [shader for _, shader, _ in prepared.surfaces]
-        self.spectra = [surface.grating.spectrum for surface, _, _ in prepared.surfaces]
-        self.has_base = any(surface.grating.base is not None for surface, _, _ in prepared.surfaces)
-        self.has_coat = any(surface.grating.coat is not None for surface, _, _ in prepared.surfaces)
+        self.spectra = [surface.layers.grating.spectrum for surface, _, _ in prepared.surfaces]
+        self.has_base = any(surface.layers.base is not None for surface, _, _ in prepared.surfaces)
+        self.has_coat = any(surface.layers.coat is not None for surface, _, _ in prepared.surfaces)
         self.film_size = tuple(int(size) for size in self.scene.sensors()[0].film().size())
         self.surface = _shows_surfaces(self.scene)
         if not self.surface.any():

@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ...bsdf.layers import Layers
 from ...errors import RequestError
 from ...manual import Parameter, listed
 from .base import Shader
@@ -17,7 +18,7 @@ from .lights import Light, lights_of, spectrum_of
 from .picture import Emission, decode, encode
 from .quirks import Quirks
 from .spectral_weights import SpectralWeights
-from .surfaces import ShadedGrating, Surface, surfaces_of
+from .surfaces import Surface, along_pattern, heights_of, surfaces_of, transmitted
 
 PARAMETERS = (
     Parameter("variant", "string", "flss, nmm, pq or gem", "flss"),
@@ -78,7 +79,7 @@ def define() -> type:
                 raise RequestError(f"diffuse_weight: got {self.diffuse_weight!r}, wanted 0 to 1")
             self.emission = Emission()
             mi.SamplingIntegrator.__init__(self, props)
-            self._shaders: list[tuple[ShadedGrating, Shader]] = []
+            self._shaders: list[tuple[Layers, Shader]] = []
             self.prepared: Prepared | None = None
 
         def take(self, quirks: Quirks) -> None:
@@ -95,22 +96,22 @@ def define() -> type:
             lights = lights_of(scene)
             surfaces = []
             for surface in surfaces_of(scene):
-                shader, r_0 = self.shader_of(surface.grating), _normal_reflectance(surface.grating)
+                shader, r_0 = self.shader_of(surface.layers), _normal_reflectance(surface.layers)
                 surfaces.append((surface, shader, [shader.weights(r_0, light.spectrum) for light in lights]))
             self.prepared = Prepared(lights, surfaces)
             return self.prepared
 
-        def shader_of(self, grating: ShadedGrating) -> Shader:
-            """The shader of a grating; its textures are computed once."""
+        def shader_of(self, layers: Layers) -> Shader:
+            """Return the shader of a grating; its textures are computed once."""
             for known, shader in self._shaders:
-                if known is grating:
+                if known is layers:
                     return shader
-            height_field, coherence_length = grating.heights()
-            settings = dict(self.settings, shadowing=grating.shadowing == "v_cavity")
+            height_field, coherence_length = heights_of(layers)
+            settings = dict(self.settings, shadowing=layers.grating.theory.shadowing)
             if self.variant != "gem":
                 settings["coherence_length"] = coherence_length
             shader = VARIANTS[self.variant](height_field, self.quirks, **settings)
-            self._shaders.append((grating, shader))
+            self._shaders.append((layers, shader))
             return shader
 
         def sample(
@@ -157,25 +158,25 @@ def define() -> type:
                 radiance += dr.select(plain & lit, value * irradiance, 0)
                 for (surface, shader, weights), here in zip(prepared.surfaces, places, strict=True):
                     here = here & lit
-                    grating = surface.grating
+                    layers = surface.layers
                     own = mi.SurfaceInteraction3f(si)
                     own.wi = mi.Vector3f(si.wi.x, si.wi.y, surface.side * si.wi.z)
                     wi = mi.Vector3f(direction.x, direction.y, surface.side * direction.z)
                     colour = shader.rgb(
-                        grating.along_pattern(own, wi, here),
-                        grating.along_pattern(own, own.wi, here),
+                        along_pattern(layers, own, wi, here),
+                        along_pattern(layers, own, own.wi, here),
                         weights[index],
                         here,
-                        grating.height_scale,
+                        layers.grating.theory.height_scale,
                     )
                     share = mi.Float(1)
-                    if grating.base is not None:
-                        below = mi.unpolarized_spectrum(grating.base.bsdf.eval(mi.BSDFContext(), own, wi, here))
+                    if layers.base is not None:
+                        below = mi.unpolarized_spectrum(layers.base.bsdf.eval(mi.BSDFContext(), own, wi, here))
                         if self.quirks.constant_blend:
                             share = mi.Float(1 - self.diffuse_weight)
                             below *= self.diffuse_weight
                         else:
-                            below *= grating.transmitted(own, mi.Frame3f.cos_theta(wi), here)
+                            below *= transmitted(layers, own, mi.Frame3f.cos_theta(wi), here)
                         radiance += dr.select(here, below * irradiance, 0)
                     rgb += dr.select(here, share * falloff * colour, 0)
             if self.quirks.power_gamma:
@@ -204,6 +205,6 @@ def _settings(variant: str) -> tuple[str, ...]:
     return {"pq": ("terms", "interpolation"), "gem": ("spacing", "roughness")}.get(variant, ("terms",))
 
 
-def _normal_reflectance(grating: ShadedGrating) -> NDArray[np.float64]:
+def _normal_reflectance(layers: Layers) -> NDArray[np.float64]:
     """R at normal incidence at `tristimulus.wavelengths`, (401,)."""
-    return spectrum_of(lambda si: grating.reflectance(si, mi.Float(1), mi.Bool(True)))
+    return spectrum_of(lambda si: layers.grating.theory.material(si, mi.Float(1), mi.Bool(True)))

@@ -2,47 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import drjit as dr
 import mitsuba as mi
 
-from ...bsdf.base import Base, contains_grating, nested
-from ...bsdf.coat import Coat
+from ...bsdf.base import contains_grating, is_grating, nested
+from ...bsdf.geometry import turned
+from ...bsdf.layers import Layers
+from ...bsdf.theories import RigorousTheory
 from ...errors import RequestError
+from ...settings import SUN_COHERENCE_LENGTH
 from ...surface.heightfield import HeightField
-
-
-@runtime_checkable
-class ShadedGrating(Protocol):
-    """What the shader asks of a BSDF to shade it as a grating.
-
-    Attributes:
-        height_scale: scales the heights.
-        shadowing: "v_cavity" or "none".
-        base: what lies under the surface.
-        coat: what lies above it, ignored by the shader.
-        rigorous: whether its efficiencies are those of rigorous theory.
-        reflectance: R(si, cos θ, active) at the angle to the microfacet.
-    """
-
-    height_scale: mi.Float
-    shadowing: str
-    base: Base | None
-    coat: Coat | None
-    rigorous: bool
-    reflectance: Callable[[mi.SurfaceInteraction3f, mi.Float, mi.Bool], mi.UnpolarizedSpectrum]
-
-    def heights(self) -> tuple[HeightField, float]:
-        """The height field and its coherence length in µm; ValueError where they are not known."""
-
-    def along_pattern(self, si: mi.SurfaceInteraction3f, omega: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:
-        """A direction of the shading frame, along the pattern's axes."""
-
-    def transmitted(self, si: mi.SurfaceInteraction3f, cos_o: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
-        """(1 − R_i)(1 − R_o): what the surface lets through to the base and back."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,12 +22,12 @@ class Surface:
 
     Attributes:
         bsdf: the BSDF of the shape, the grating or a `twosided` around it.
-        grating: the `diffraction_grating`.
+        layers: of the `diffraction_grating`; the shader ignores a coat.
         side: 1 for the front, −1 for the back.
     """
 
     bsdf: mi.BSDF
-    grating: ShadedGrating
+    layers: Layers
     side: int
 
     def is_of(self, bsdf: mi.BSDF) -> mi.Bool:
@@ -81,18 +52,46 @@ def surfaces_of(scene: mi.Scene) -> list[Surface]:
         if bsdf is None or any(bsdf is other for other in seen):
             continue
         seen.append(bsdf)
-        if isinstance(bsdf, ShadedGrating):
-            found.append(Surface(bsdf, bsdf, 1))
+        if is_grating(bsdf):
+            found.append(Surface(bsdf, bsdf.layers, 1))
             continue
         parts = nested(bsdf)
         if bsdf.class_name() == "TwoSidedBRDF":
             sides = ((parts[0], 1), (parts[-1], -1))
-            found += [Surface(bsdf, part, side) for part, side in sides if isinstance(part, ShadedGrating)]
+            found += [Surface(bsdf, part.layers, side) for part, side in sides if is_grating(part)]
         elif any(map(contains_grating, parts)):
             raise RequestError(
                 f"diffraction_shader: a diffraction_grating stands inside {bsdf.class_name()}, wanted on a shape or "
                 "inside twosided"
             )
-    if any(surface.grating.rigorous for surface in found):
+    if any(isinstance(surface.layers.grating.theory, RigorousTheory) for surface in found):
         raise RequestError("diffraction_shader: got a grating with theory=rigorous, wanted one of scalar theory")
     return found
+
+
+def heights_of(layers: Layers) -> tuple[HeightField, float]:
+    """Return the height field and its coherence length in µm.
+
+    Raises:
+        ValueError: for a saved spectrum, which does not hold heights.
+    """
+    recipe = layers.grating.recipe
+    if recipe is None:
+        raise RequestError(
+            "diffraction_shader: it needs heights, and a saved spectrum does not hold them; give the grating a "
+            "recipe (filename=….toml) or a profile"
+        )
+    return recipe.height_field(), float(recipe.spectrum.get("coherence_length", SUN_COHERENCE_LENGTH))
+
+
+def along_pattern(layers: Layers, si: mi.SurfaceInteraction3f, omega: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:
+    """Return a direction of the shading frame along the pattern's axes."""
+    return turned(omega, *layers.grating.frame(si, active))
+
+
+def transmitted(
+    layers: Layers, si: mi.SurfaceInteraction3f, cos_o: mi.Float, active: mi.Bool
+) -> mi.UnpolarizedSpectrum:
+    """Return (1 − R_i)(1 − R_o), what the surface lets through to the base and back."""
+    entering = layers.grating.entering
+    return entering(si, mi.Frame3f.cos_theta(si.wi), active) * entering(si, cos_o, active)

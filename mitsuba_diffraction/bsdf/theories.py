@@ -1,0 +1,242 @@
+"""What each theory adds to the powers of orders: parameters, material, the factors R and E, polarisation."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..errors import RequestError, is_number
+from ..geometry import SHADOWING
+from ..rigorous.spectrum import RigorousSpectrum
+from ..settings import VISIBLE
+from ..spectrum.grating_spectrum import GratingSpectrum
+from .coat import Coat
+from .geometry import Geometry, turned
+from .polarisation import Split, of_orders, of_plane, unpolarised
+from .reflectance import Conductor, PerfectMirror, reflectance_from
+from .shared import SharedTables
+
+_SCALAR_ONLY = {
+    "height_scale": "build the spectrum of the other depth",
+    "base": "what passes the surface is not computed; leave it out",
+    "shadowing": "it is part of the efficiencies; leave it out",
+    "fresnel": "it is part of the efficiencies; leave it out",
+}
+
+
+def settings_from(props: mi.Properties, coat: Coat | None) -> dict[str, str | float]:
+    """`material` or `int_ior` as `precompute` takes them, by Mitsuba's names; an index relative to the outside.
+
+    Raises:
+        ValueError: if they are unknown, or the material is the perfect mirror.
+    """
+    found = reflectance_from(props, coat)
+    if isinstance(found, Conductor):
+        return {"material": found.material}
+    if isinstance(found, PerfectMirror):
+        raise RequestError("material: got 'none', wanted a real one for theory=rigorous, such as 'Al'")
+    # As many digits as a float32 has.
+    eta = float(found.eta[0] if hasattr(found.eta, "__len__") else found.eta) * (1 if coat is None else coat.relative)
+    return {"int_ior": float(f"{eta:.6g}")}
+
+
+def settings_of_medium(coat: Coat | None) -> dict[str, float | bool]:
+    """What `precompute` needs to know of the coat and of the variant."""
+    medium = {} if coat is None else {"ext_ior": float(f"{coat.relative:.6g}")}
+    return {**medium, "polarised": True} if mi.is_polarized else medium
+
+
+class ScalarTheory:
+    """f cos θ_o = R · K · G · S(q; κ)/λ² · E cos θ_o.
+
+    Attributes:
+        scattering: K G S cos θ_o and its sampler.
+        material: R.
+        height_scale: times the heights.
+        shadowing: whether G is a factor.
+        energy: E, or None where it is one.
+    """
+
+    def __init__(self, props: mi.Properties, spectrum: GratingSpectrum, coat: Coat | None) -> None:
+        self.spectrum, self.coat = spectrum, coat
+        self.material = reflectance_from(props, coat)
+        height_scale = props.get("height_scale", 1.0)
+        if not is_number(height_scale):
+            raise RequestError(f"height_scale: got {height_scale!r}, wanted a number")
+        self.height_scale = mi.Float(height_scale)
+        shadowing = props.get("shadowing", SHADOWING[0])
+        if shadowing not in SHADOWING:
+            raise RequestError(f"shadowing: got {shadowing!r}, wanted one of {', '.join(SHADOWING)}")
+        self.shadowing = shadowing == "v_cavity"
+        self.conserve_energy = props.get("conserve_energy", True)
+        if not isinstance(self.conserve_energy, bool):
+            raise RequestError(f"conserve_energy: got {self.conserve_energy!r}, wanted true or false")
+        self.tables = SharedTables.of(spectrum)
+        self.scattering = self.tables.scattering
+        self.update()
+
+    def update(self) -> None:
+        """Check the parameters that can change, and recompute what depends on them.
+
+        Raises:
+            ValueError: if the spectrum does not cover the heights, or the wavelengths inside a coat.
+        """
+        shortest = VISIBLE[0] / (1 if self.coat is None else self.coat.relative)
+        largest = shortest / self.spectrum.wavelengths[0]
+        if self.coat is not None and largest < 1 - 1e-6:
+            raise RequestError(
+                f"coat_ior: got {self.coat.index:g}, and a spectrum for wavelengths from "
+                f"{self.spectrum.wavelengths[0]:g} nm; inside the coat they are shorter: build it from "
+                f"{shortest:.4g} nm"
+            )
+        # At wavelengths that the spectrum does not cover the grating is black, and κ is less at the others.
+        largest = max(largest, 1.0)
+        scale = np.max(self.height_scale)
+        if not 0 <= scale <= largest * (1 + 1e-6):
+            raise RequestError(
+                f"height_scale: got {scale:.6g}, wanted 0 to {largest:.4g}: the spectrum was built for "
+                f"wavelengths from {self.spectrum.wavelengths[0]:g} nm; for larger heights build it from "
+                f"{shortest:.4g} nm divided by the scale"
+            )
+        dr.make_opaque(self.height_scale)
+        conserves = self.conserve_energy and self.shadowing
+        self.energy = self.tables.energy(self.height_scale) if conserves else None
+
+    def parameters_changed(self, keys: list[str]) -> None:
+        """Recompute what depends on the parameters `keys`; on all of them if none is named."""
+        if not keys or "height_scale" in keys:
+            self.update()
+        self.material.update()
+
+    def traverse(self, callback: mi.TraversalCallback) -> None:
+        callback.put("height_scale", self.height_scale, mi.ParamFlags.Differentiable)
+        self.material.traverse(callback)
+
+    def weighted(
+        self, value: mi.UnpolarizedSpectrum, si: mi.SurfaceInteraction3f, geometry: Geometry, active: mi.Bool
+    ) -> mi.UnpolarizedSpectrum:
+        """Return `value` times R E."""
+        if self.energy is not None:
+            inside = mi.UnpolarizedSpectrum(si.wavelengths) * (1e-3 / geometry.index)
+            value *= self.energy.factor(*geometry.inside(), inside)
+        return value * self.material(si, geometry.cos_half(), active)
+
+    def split(
+        self,
+        value: mi.UnpolarizedSpectrum,
+        si: mi.SurfaceInteraction3f,
+        frame: tuple[mi.Float, mi.Float],
+        active: mi.Bool,
+    ) -> Split:
+        """Return how the grating splits `value` into s and p."""
+        index = self.material.index(si, active)
+        return unpolarised(value) if index is None else of_plane(value, index)
+
+    def __str__(self) -> str:
+        lines = {
+            "reflectance": self.material,
+            "height_scale": self.height_scale,
+            "shadowing": SHADOWING[0 if self.shadowing else 1],
+            "energy": self.energy or ("conserved by itself" if self.conserve_energy else "not conserved"),
+        }
+        return "\n".join(f"{name} = {value}" for name, value in lines.items())
+
+
+class RigorousTheory:
+    """f cos θ_o = Σ_m η_m N(q − m/T; σ_q² I)/λ² cos θ_o: R, K, G and E are in the efficiencies η_m.
+
+    Attributes:
+        scattering: Σ_m η_m N cos θ_o and its sampler.
+        material: R = 1 beside the efficiencies.
+    """
+
+    height_scale, shadowing = 1.0, True  # of no effect
+
+    def __init__(self, props: mi.Properties, spectrum: RigorousSpectrum, coat: Coat | None) -> None:
+        self.coat = coat
+        self.material = check_parameters(props, spectrum, coat)
+        self.scattering = SharedTables.of(spectrum).scattering
+
+    def parameters_changed(self, keys: list[str]) -> None:
+        """Do nothing: a table of efficiencies has no parameters."""
+
+    def traverse(self, callback: mi.TraversalCallback) -> None:
+        """Show no parameters."""
+
+    def weighted(
+        self, value: mi.UnpolarizedSpectrum, si: mi.SurfaceInteraction3f, geometry: Geometry, active: mi.Bool
+    ) -> mi.UnpolarizedSpectrum:
+        """Return `value`."""
+        return value
+
+    def split(
+        self,
+        value: mi.UnpolarizedSpectrum,
+        si: mi.SurfaceInteraction3f,
+        frame: tuple[mi.Float, mi.Float],
+        active: mi.Bool,
+    ) -> Split:
+        """Return how the grating splits `value` into s and p."""
+        sin, cos = frame
+        relative = 1e3 if self.coat is None else 1e3 * self.coat.relative
+
+        def entries(channel: int, source: mi.Vector3f, exit_: mi.Vector3f) -> list[list[mi.Float]]:
+            frequency = relative / si.wavelengths[channel]
+            return self.scattering.mueller(turned(source, sin, cos), turned(exit_, sin, cos), frequency, active)
+
+        return of_orders(value, entries, mi.Vector3f(-sin, cos, 0))
+
+    def __str__(self) -> str:
+        return f"reflectance = {self.material}"
+
+
+def check_parameters(props: mi.Properties, spectrum: RigorousSpectrum, coat: Coat | None) -> InEfficiencies:
+    """What a scene says beside a rigorous spectrum.
+
+    Raises:
+        ValueError: if it is of another material, medium or kind of light, or says something that rigorous theory does
+            not have.
+    """
+    if mi.is_polarized and spectrum.mueller is None:
+        raise RequestError(
+            f"theory: got a rigorous spectrum of unpolarised light in the variant {mi.variant()}, wanted one that was "
+            "built with polarised=True"
+        )
+    for name, advice in _SCALAR_ONLY.items():
+        if name in props:
+            got = "a BSDF" if name == "base" else repr(props[name])
+            raise RequestError(f"{name}: got {got}, wanted none with theory=rigorous: {advice}")
+    medium = 1.0 if coat is None else coat.relative
+    if abs(spectrum.ext_ior - medium) > 1e-3 * medium:
+        raise RequestError(
+            f"coat_ior: got {'none' if coat is None else f'{coat.index:g}'}, but the rigorous spectrum is of a grating "
+            f"below a medium of index {spectrum.ext_ior:g}: build it with ext_ior={medium:.4g}"
+        )
+    # Over a coat, ext_ior is what lies above it.
+    if any(name in props for name in ("material", "int_ior", *(["ext_ior"] if coat is None else []))):
+        wanted = settings_from(props, coat)
+        if "material" in wanted:
+            same = wanted["material"] == spectrum.material
+        else:
+            same = not spectrum.material and abs(wanted["int_ior"] - spectrum.int_ior) < 1e-3 * abs(spectrum.int_ior)
+        if not same:
+            raise RequestError(
+                f"material: got {_named(wanted)}, but the rigorous spectrum is of {spectrum.material_name}: "
+                "leave it out, or build the spectrum for this material"
+            )
+    return InEfficiencies(spectrum.material_name)
+
+
+def _named(material: dict[str, str | float]) -> str:
+    return " ".join(f"{name} {value}" for name, value in material.items())
+
+
+class InEfficiencies(PerfectMirror):
+    """R = 1 beside efficiencies that are those of the material."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    def __repr__(self) -> str:
+        return f"{self.name}, in the efficiencies"
