@@ -300,7 +300,7 @@ def test_cells_are_drawn_with_their_density_and_few_that_do_not_propagate(llvm, 
     # The density at the middles of all cells; those outside of the region are told by no q that propagates.
     middles = [np.arange(-m, m + 1) * d for m, d in zip((sampler.largest_x, sampler.largest_y), spacing, strict=True)]
     x, y = (axis.ravel() for axis in np.meshgrid(*middles))
-    density = np.array(sampler.density(floats(x), floats(y), incidence, mi.Bool(True)), np.float64)
+    density = np.array(sampler.density(mi.Vector2f(floats(x), floats(y)), incidence, mi.Bool(True)), np.float64)
     corners = [
         np.hypot(wavelength * (x + a * spacing[0]) + s[0], wavelength * (y + b * spacing[1]) + s[1])
         for a in (-0.5, 0, 0.5)
@@ -319,7 +319,7 @@ def test_cells_are_drawn_with_their_density_and_few_that_do_not_propagate(llvm, 
     assert abs(chi_square - often.sum()) < 4 * np.sqrt(2 * often.sum())
     assert found[inside].sum() == pytest.approx(wanted[inside].sum(), abs=4 * np.sqrt(count))
     assert (np.hypot(wavelength * q[0] + s[0], wavelength * q[1] + s[1]) < 1).mean() > 0.5
-    outside = sampler.density(mi.Float(100.0, 0.0), mi.Float(0.0, -100.0), incidence, mi.Bool(True))
+    outside = sampler.density(mi.Vector2f(mi.Float(100.0, 0.0), mi.Float(0.0, -100.0)), incidence, mi.Bool(True))
     assert (np.array(outside) == 0).all()
 
 

@@ -83,8 +83,9 @@ FEW = 48  # rows: regions of no more take little memory, so that there can be ma
 class HorizonBins:
     """The bins, and the region of each."""
 
-    def __init__(self, wavelengths: tuple[float, float], rows: int) -> None:
-        """Takes (shortest, longest) in nm and the number of rows of a region."""
+    def __init__(self, wavelengths: tuple[float, float], rows: int, farthest: float = 1.0) -> None:
+        """Take (shortest, longest) in nm, the number of rows of a region and the largest |s|."""
+        self._farthest = farthest
         self.resolution = FINE if rows <= FEW else COARSE
         self._first, self._last = 1e3 / wavelengths[1], 1e3 / wavelengths[0]
         self.first = opaque(self._first)
@@ -93,9 +94,9 @@ class HorizonBins:
     def bin(self, incidence: Incidence) -> mi.UInt32:
         """The bin of one wavelength and where it comes from; beyond the ends, the nearest."""
         wi, bins = incidence.wi, self.resolution
-        cosine = _cell(wi.z * bins.cosines, bins.cosines)
+        cosine = _cell(incidence.cosine * bins.cosines, bins.cosines)
         azimuth = _cell((_azimuth(wi.x, wi.y) + 2) * (bins.azimuths / 4), bins.azimuths)
-        frequency = _cell((incidence.frequency - self.first) * self.per_frequency, bins.frequencies)
+        frequency = _cell((incidence.radius - self.first) * self.per_frequency, bins.frequencies)
         return (frequency * bins.cosines + cosine) * bins.azimuths + azimuth
 
     def columns(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -111,7 +112,7 @@ class HorizonBins:
         # The border is represented by points: each disc is enlarged to cover those up to half a step away.
         square = (1 + _STEP / 2 + _BEYOND) ** 2
         for cosine, azimuth in np.ndindex(bins.cosines, bins.azimuths):
-            s_x, s_y = (s[:, None, None].astype(np.float32) for s in _border(bins, cosine, azimuth))
+            s_x, s_y = (self._farthest * s[:, None, None].astype(np.float32) for s in _border(bins, cosine, azimuth))
             y = np.clip(0, low / largest + s_y, high / largest + s_y)
             half = np.where(y**2 < square, np.sqrt(np.maximum(square - y**2, 0)), -np.inf)
             result[:, cosine, azimuth, :, 0] = largest * (-s_x - half).min(axis=0)
@@ -156,13 +157,13 @@ class CellSampler:
     reads one word for the cell and one packet for M_j.
     """
 
-    def __init__(self, spectrum: GratingSpectrum) -> None:
+    def __init__(self, spectrum: GratingSpectrum, most: float | None = None, farthest: float = 1.0) -> None:
+        self.cells = KappaCells(spectrum.largest_kappa, most)
         along_x, along_y = (CellAxis.of(spectrum, axis, WIDEST) for axis in (0, 1))
-        shares = np.moveaxis(along_y.shares @ averages(spectrum) @ along_x.shares.T, 0, -1)
+        shares = np.moveaxis(along_y.shares @ averages(spectrum, self.cells) @ along_x.shares.T, 0, -1)
         # Coefficients of splines may be below zero.
         shares = np.maximum(shares, 0)
         spacing, largest = (along_x.spacing, along_y.spacing), (along_x.largest, along_y.largest)
-        self.cells = KappaCells(spectrum.largest_kappa)
         self.spacing_x, self.spacing_y = (opaque(s) for s in spacing)
         self.per_q_x, self.per_q_y = (opaque(1 / s) for s in spacing)
         self.edge_x, self.edge_y = (
@@ -181,7 +182,7 @@ class CellSampler:
         self.before_cell = SumTable(sums_before(blocks)) if self.in_block > 1 else None
         self.before_x = SumTable(before_x)
 
-        self.horizon = HorizonBins(spectrum.wavelengths, self.blocks_y)
+        self.horizon = HorizonBins(spectrum.wavelengths, self.blocks_y, farthest)
         edge = (np.arange(self.blocks_y + 1) * self.edge_y - largest[1] - 0.5) * spacing[1]
         ends = self.horizon.columns(edge[:-1], edge[1:])
         ends = ends / (spacing[0] * self.edge_x) + (largest[0] + 0.5) / self.edge_x
@@ -194,9 +195,9 @@ class CellSampler:
         self.masses = PacketTable(before_y[:, -1])
         self.ends = NumberTable(first | end << 16)
 
-    def density(self, q_x: mi.Float, q_y: mi.Float, incidence: Incidence, active: mi.Bool) -> mi.Float:
-        """p(q) in µm², q in cycles/µm, for one wavelength; of a q that propagates."""
-        m_x, m_y = mi.Int32(dr.round(q_x * self.per_q_x)), mi.Int32(dr.round(q_y * self.per_q_y))
+    def density(self, q: mi.Vector2f, incidence: Incidence, active: mi.Bool) -> mi.Float:
+        """Return p(q) in µm², q in cycles/µm, for one wavelength; of a q that propagates."""
+        m_x, m_y = mi.Int32(dr.round(q.x * self.per_q_x)), mi.Int32(dr.round(q.y * self.per_q_y))
         active = active & (dr.abs(m_x) <= self.largest_x) & (dr.abs(m_y) <= self.largest_y)
         cell = mi.UInt32((m_y + self.largest_y) * self.columns + m_x + self.largest_x)
         weights = self.cells.weights(incidence)

@@ -22,7 +22,7 @@ from ..errors import RequestError, is_number
 from .base import nested_plugin
 from .tables import opaque
 
-_SAME_INDEX = 1e-3  # indices of refraction that differ by less, such as those of air and vacuum, are the same
+SAME_INDEX = 1e-3  # indices of refraction that differ by less, such as those of air and vacuum, are the same
 _log = logging.getLogger(__name__)
 
 
@@ -48,7 +48,7 @@ def coat_from(props: mi.Properties) -> Coat | None:
         )
     depth = given.get("coat_absorption", 0.0) * given.get("coat_thickness", 0.0)
     coat = Coat(props["coat_ior"], props.get("ext_ior", "air"), depth)
-    return None if coat.relative < 1 + _SAME_INDEX and not coat.absorbs else coat
+    return None if coat.relative < 1 + SAME_INDEX and not coat.absorbs else coat
 
 
 def absolute_index(name: str, index: float | str) -> float:
@@ -79,7 +79,7 @@ class Coat:
     def __init__(self, index: float | str, outside: float | str, depth: float) -> None:
         self.index = absolute_index("coat_ior", index)
         outer = absolute_index("ext_ior", outside)
-        if self.index < max(1, (1 - _SAME_INDEX) * outer):
+        if self.index < max(1, (1 - SAME_INDEX) * outer):
             raise RequestError(f"coat_ior: got {self.index:g}, wanted at least one and that of the outside, {outer:g}")
         self.relative = max(self.index / outer, 1.0)
         self.eta, self.depth = opaque(self.relative), opaque(depth)
@@ -93,10 +93,6 @@ class Coat:
     def cos_inside(self, cos: mi.Float) -> mi.Float:
         """cos θ' for the cosine of an angle outside."""
         return dr.safe_sqrt(1 - (1 - dr.square(cos)) / dr.square(self.eta))
-
-    def indices(self) -> list[mi.Complex2f]:
-        """The relative index, for every wavelength."""
-        return [mi.Complex2f(self.eta, 0)] * len(mi.UnpolarizedSpectrum(0.0))
 
     def reflectance(self, cos: mi.Float) -> mi.Float:
         """F at the cosine of an angle outside."""

@@ -47,6 +47,14 @@ PARAMETERS = (
     Parameter("coat_absorption", "float", "of the layer, 1/µm", "0"),
     Parameter("coat_thickness", "float", "of the layer, µm; it matters only with coat_absorption", "0"),
     Parameter(
+        "transmission",
+        "string",
+        "what becomes of light that enters a dielectric: none, it is absorbed or reaches the base; interface, it "
+        "enters the medium of int_ior, as in `roughdielectric`; sheet, it passes a film with one flat face, below, and "
+        "ext_ior on both sides",
+        "none",
+    ),
+    Parameter(
         "base",
         "BSDF",
         "what lies under a dielectric surface (pigment): any BSDF that reflects and lets nothing through. Its value "

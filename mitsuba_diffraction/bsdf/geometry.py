@@ -31,6 +31,26 @@ class Incidence:
     least_kappa: mi.Float
     kappa_span: mi.Float
 
+    mirrored = None  # q is drawn as it is read
+
+    @property
+    def radius(self) -> mi.Float:
+        """To which |q| of propagating light extends around that of light along the normal, cycles/µm."""
+        return self.frequency
+
+    @property
+    def cosine(self) -> mi.Float:
+        """cos θ_i."""
+        return self.wi.z
+
+    def below(self, kappa: mi.Float) -> mi.Float:
+        """Return the share of light with less than κ (rad/µm), if it is reflected as by a diffuse surface."""
+        return dr.square(limited((kappa - self.least_kappa) / self.kappa_span, 0, 1))
+
+    def propagates(self, tangent: mi.Vector2f) -> mi.Bool:
+        """Return whether the order at (u, v) = λq propagates."""
+        return cos_square(self.wi, tangent) > 0
+
     @classmethod
     def of(cls, wi: mi.Vector3f, frequency: mi.Float, height_scale: mi.Float, coat: Coat | None = None) -> Incidence:
         """κ = 2π (cos θ_i + cos θ_o)/λ times the scale of the heights; under a coat, with what holds inside of it.
@@ -116,13 +136,26 @@ class Geometry:
         square = dr.squared_norm(self.tangent) / dr.square(self.index)
         return k_g(self.cos_i, self.cos_o, square, self.shadowing)
 
-    def order_factor(self, tangent: mi.Vector2f, per_width: mi.Float) -> mi.Float:
-        """Return K G cos θ_o of the order at (u, v) = λq, times the gain of its lobe; arguments as of `of_order`."""
-        cos_i, cos_o, gain = self.of_order(tangent, per_width)
+    def small(self) -> None:
+        """κ of reflected light is never too small for a table."""
+
+    def cosines(self) -> tuple[mi.Float, mi.Float]:
+        """Return cos θ_i and cos θ_o, inside of a coat."""
+        return self.cos_i, self.cos_o
+
+    def order_factor(self, tangent: mi.Vector2f, frequency: mi.Float, per_width: mi.Float) -> mi.Float:
+        """Return K G cos θ_o of an order, times the gain of its lobe.
+
+        Args:
+            tangent: (u, v) = λq of the order.
+            frequency: 1/λ, outside of a coat.
+            per_width: 1/σ_q.
+        """
+        cos_i, cos_o, gain = self.of_order(tangent, frequency * per_width)
         square = dr.squared_norm(tangent) / dr.square(self.index)
         return k_g(cos_i, cos_o, square, self.shadowing) * gain * self.cos_o
 
-    def continuum_factor(self, per_width: mi.Float) -> mi.Float:
+    def continuum_factor(self, frequency: mi.Float, per_width: mi.Float) -> mi.Float:
         """Return K G cos θ_o and gain where orders overlap, so that no single one is known.
 
         At grazing incidence the mirror order has nearly all of the power, and K grows without bound within its lobe.
@@ -130,6 +163,7 @@ class Geometry:
         cos θ = 0.4 up, and from 5 σ_q on, K and G are those at q, and what lobes lose below the horizon they get from
         those beyond.
         """
+        per_width = frequency * per_width
         mirror = limited((25 - dr.squared_norm(self.tangent) * dr.square(per_width)) / 9, 0, 1)
         mirror *= limited(2 - 5 * larger(self.wi.z, self.wo.z), 0, 1)
         *_, gain = self.of_order(mi.Vector2f(0), per_width)

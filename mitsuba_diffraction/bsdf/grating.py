@@ -10,12 +10,13 @@ import numpy as np
 
 from ..errors import RequestError
 from ..rigorous.spectrum import RigorousSpectrum
-from .coat import Coat
 from .geometry import Geometry, Incidence, turned
+from .media import Media
 from .polarisation import reflected, through_layer
 from .surface import surface_from, warn_of_range
 from .tables import BELOW_ONE, larger, limited, opaque, smaller
 from .theories import RigorousTheory, ScalarTheory
+from .transmission import Crossing, CrossingIncidence
 
 # The share of samples that are uniform, for lobes that the sampler's averages miss; where both directions graze, K G
 # grows faster than samples that follow the cosine could bear.
@@ -23,23 +24,23 @@ DEFENSIVE = 0.02
 
 
 class Grating:
-    """A spectrum on a surface, with its theory, under a coat or without.
+    """A spectrum on a surface, with its theory, between media.
 
     Attributes:
         spectrum: of the surface.
         recipe: behind the spectrum; None for a saved one.
         theory: R, E and what else multiplies the powers of orders.
-        coat: the layer over the grating.
+        media: about the grating; `coat` is that of them.
         orientation: degrees from the tangent to the pattern's x axis.
     """
 
-    def __init__(self, props: mi.Properties, coat: Coat | None) -> None:
-        self.coat = coat
-        self.spectrum, self.recipe = surface_from(props, coat)
+    def __init__(self, props: mi.Properties, media: Media) -> None:
+        self.media, self.coat = media, media.coat
+        self.spectrum, self.recipe = surface_from(props, media)
         rigorous = isinstance(self.spectrum, RigorousSpectrum)
         if self.recipe is not None and not rigorous:
             warn_of_range(self.recipe)
-        self.theory = (RigorousTheory if rigorous else ScalarTheory)(props, self.spectrum, coat)
+        self.theory = (RigorousTheory if rigorous else ScalarTheory)(props, self.spectrum, media)
         self.scattering = self.theory.scattering
         angle = props.get("orientation", 0.0)
         if isinstance(angle, float) and not np.isfinite(angle):
@@ -58,26 +59,34 @@ class Grating:
 
     @dr.syntax
     def evaluate(
-        self, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool, wo_is_sample: bool
+        self, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool, wo_is_sample: bool, passing: mi.Float
     ) -> tuple[mi.UnpolarizedSpectrum, mi.Float]:
-        """Evaluate f cos θ_o, and the density of `sample`, for directions above the surface.
+        """Evaluate f cos θ_o of light from ω_o, and the density of `sample`.
 
-        Under a coat, without the transmittances of its front face.
+        Under a coat, without the transmittances of its front face; of a sheet, without those of its flat face.
 
         Args:
             si: the point, with ω_i.
             wo: ω_o.
-            active: mask.
+            active: mask; both directions lie above the surface, or light passes it.
             wo_is_sample: whether ω_o was drawn, so that nearly always it lies in the lobe of an order.
+            passing: the share of samples on the other side.
         """
         sin, cos = self.frame(si, active)
         # From here on along the pattern's axes.
         wi, wo, outside = turned(si.wi, sin, cos), turned(wo, sin, cos), mi.Frame3f.cos_theta(wo)
+        u, v, interface = -wi.x - wo.x, -wi.y - wo.y, self.theory.interface
+        side_share = mi.Float(1.0)
+        if interface is not None:
+            i, o = interface.side(wi), interface.side(wo)
+            u, v = -i.tangent - o.tangent
+            outside = dr.abs(outside) * dr.square(o.outside)
+            side_share = dr.select(i.sign == o.sign, 1 - passing, passing)
         covered, count = self._covered(si)
         value, density = mi.UnpolarizedSpectrum(0.0), mi.Float(0.0)
         # Most directions lie between the orders of a grating at all wavelengths: unless drawn, they skip what follows.
         skips = self.scattering.resolved and not wo_is_sample
-        needed = active & self._meets(si, -wi.x - wo.x, -wi.y - wo.y) if skips else True
+        needed = active & self._meets(si, u, v) if skips else True
         # What has no derivative is bound here: Dr.Jit carries all other state through the branch.
         diffracted = functools.partial(self._diffracted, si, covered, active, wo_is_sample)
         height_scale = self.theory.height_scale
@@ -86,13 +95,17 @@ class Grating:
         # The mean over the covered wavelengths: any of them may have chosen the direction.
         uniform = _uniform_share(count)
         density = (1 - uniform) * density * outside / larger(count, 1)
-        return value, dr.fma(uniform, dr.inv_two_pi, density)
+        return value, side_share * dr.fma(uniform, dr.inv_two_pi, density)
+
+    def _frequency(self, si: mi.SurfaceInteraction3f, channel: int) -> mi.Float:
+        """Return 1/λ in the medium above, cycles/µm."""
+        return 1e3 * self.media.outside / si.wavelengths[channel]
 
     def _meets(self, si: mi.SurfaceInteraction3f, u: mi.Float, v: mi.Float) -> mi.Bool:
         """Return whether (u, v) = λq lies in the lobe of an order at any wavelength."""
         result = mi.Bool(False)
-        for wavelength in si.wavelengths:
-            frequency = 1e3 / wavelength
+        for channel in range(len(si.wavelengths)):
+            frequency = self._frequency(si, channel)
             result |= self.scattering.meets(u * frequency, v * frequency)
         return result
 
@@ -107,14 +120,21 @@ class Grating:
         height_scale: mi.Float,
     ) -> tuple[mi.UnpolarizedSpectrum, mi.Float]:
         """Return f cos θ_o, and the sum over the wavelengths of the densities; directions along the pattern's axes."""
-        geometry = Geometry.of(wi, wo, self.coat, height_scale, self.theory.shadowing)
+        interface, shadowing = self.theory.interface, self.theory.shadowing
+        if interface is None:
+            geometry = Geometry.of(wi, wo, self.coat, height_scale, shadowing)
+        else:
+            sides = interface.side(wi), interface.side(wo)
+            geometry = Crossing(*sides, mi.Float(height_scale), shadowing, interface.least_kappa)
         # Directions beyond the largest angle are black, but they are drawn: they have a density.
-        within = smaller(geometry.cos_i, geometry.cos_o) >= self.least_cosine
+        within = smaller(*geometry.cosines()) >= self.least_cosine
         value, density = mi.UnpolarizedSpectrum(0.0), mi.Float(0.0)
         for channel in range(len(value)):
-            wavelength = si.wavelengths[channel] * 1e-3  # µm
-            frequency = dr.rcp(wavelength)
-            incidence = Incidence.of(wi, frequency, height_scale, self.coat)
+            frequency = self._frequency(si, channel)
+            if interface is None:
+                incidence = Incidence.of(wi, frequency, height_scale, self.coat)
+            else:
+                incidence = CrossingIncidence.of(*sides, interface, frequency, height_scale, geometry.flip)
             power, share = self.scattering.evaluate(geometry, incidence, active & covered[channel], wo_is_sample)
             value[channel] = dr.select(within, power * dr.square(frequency), 0)
             density = dr.fma(share, dr.square(frequency), density)
@@ -136,7 +156,13 @@ class Grating:
 
         Under a coat, after both passes through it, T_i T_o.
         """
-        directions = si.wi, wo
+        directions, interface = (si.wi, wo), self.theory.interface
+        if interface is not None and not interface.is_sheet and ctx.mode == mi.TransportMode.Radiance:
+            # Radiance is compressed along with the solid angle.
+            i, o = interface.side(si.wi), interface.side(wo)
+            value *= dr.square(i.outside / o.outside)
+        if interface is not None and interface.is_sheet:
+            value *= interface.flat(si.wi) * interface.flat(wo)
         if self.coat is None:
             if not mi.is_polarized:
                 return value
@@ -152,7 +178,7 @@ class Grating:
 
     def _covered(self, si: mi.SurfaceInteraction3f) -> tuple[list[mi.Bool], mi.Float]:
         """Return which of the wavelengths the spectrum covers, and how many: at the others the grating is black."""
-        index = 1 if self.coat is None else self.coat.relative
+        index = 1 if isinstance(self.theory, RigorousTheory) and self.coat is None else self.media.index
         shortest, longest = (
             w * index * d for w, d in zip(self.spectrum.wavelengths, (1 - 1e-6, 1 + 1e-6), strict=True)
         )
@@ -166,9 +192,19 @@ class Grating:
         inside = self.coat.cos_inside(cos)
         return self.coat.transmittance(cos, inside) * (1 - self.theory.material(si, inside, active))
 
-    def sample(self, si: mi.SurfaceInteraction3f, u: mi.Float, v: mi.Point2f, active: mi.Bool) -> mi.Vector3f:
-        """Draw a direction for one of the wavelengths; below the horizon (z = 0) where its order is evanescent."""
+    def sample(
+        self, si: mi.SurfaceInteraction3f, u: mi.Float, v: mi.Point2f, active: mi.Bool, passing: mi.Float
+    ) -> mi.Vector3f:
+        """Draw a direction for one of the wavelengths; along the horizon (z = 0) where its order is evanescent.
+
+        The share `passing` of the samples lies on the other side.
+        """
         covered, count = self._covered(si)
+        interface = self.theory.interface
+        if interface is not None:
+            u_side, passes = u, u < passing
+            u = dr.select(passes, u / larger(passing, 1e-7), (u - passing) / larger(1 - passing, 1e-7))
+            u = limited(u, 0, BELOW_ONE)
         share = _uniform_share(count)
         # In scalar variants these are Python's, for which ~ is no negation.
         uniform, diffracted = u < share, u >= share
@@ -176,18 +212,29 @@ class Grating:
         # Only wavelengths that the spectrum covers draw directions.
         chosen = smaller(dr.floor(u * count), larger(count - 1, 0))
         rest = limited(u * count - chosen, 0, BELOW_ONE)
-        wavelength, before = mi.Float(si.wavelengths[0]), mi.Float(0.0)
+        frequency, before = self._frequency(si, 0), mi.Float(0.0)
         for channel, use in enumerate(covered):
-            wavelength = dr.select(use & (before == chosen), si.wavelengths[channel], wavelength)
+            frequency = dr.select(use & (before == chosen), self._frequency(si, channel), frequency)
             before += dr.select(use, 1, 0)
-        wavelength = dr.detach(wavelength) * 1e-3
+        frequency = dr.detach(frequency)
+        wavelength = dr.rcp(frequency)
         sin, cos = (dr.detach(x) for x in self.frame(si, active))
-        incidence = Incidence.of(turned(si.wi, sin, cos), dr.rcp(wavelength), self.theory.height_scale, self.coat)
+        wi, height_scale = turned(si.wi, sin, cos), self.theory.height_scale
+        if interface is None:
+            incidence = Incidence.of(wi, frequency, height_scale, self.coat)
+            q, propagates = self.scattering.sample(incidence, rest, v, active & diffracted)
+            x = -wavelength * (cos * q.x - sin * q.y) - si.wi.x
+            y = -wavelength * (sin * q.x + cos * q.y) - si.wi.y
+            z = dr.select(propagates, dr.safe_sqrt(1 - dr.square(x) - dr.square(y)), 0)
+            return dr.select(uniform, mi.warp.square_to_uniform_hemisphere(v), mi.Vector3f(x, y, z))
+        i = interface.side(wi)
+        o = interface.other(i, u_side >= passing)
+        incidence = CrossingIncidence.of(i, o, interface, frequency, height_scale, None)
         q, propagates = self.scattering.sample(incidence, rest, v, active & diffracted)
-        x = -wavelength * (cos * q.x - sin * q.y) - si.wi.x
-        y = -wavelength * (sin * q.x + cos * q.y) - si.wi.y
-        z = dr.select(propagates, dr.safe_sqrt(1 - dr.square(x) - dr.square(y)), 0)
-        return dr.select(uniform, mi.warp.square_to_uniform_hemisphere(v), mi.Vector3f(x, y, z))
+        drawn = turned(mi.Vector3f(*(o.tangent - wavelength * incidence.mirrored * q), 0), -sin, cos) / o.outside
+        z = dr.select(propagates, dr.safe_sqrt(1 - dr.square(drawn.x) - dr.square(drawn.y)), 0)
+        drawn = dr.select(uniform, mi.warp.square_to_uniform_hemisphere(v), mi.Vector3f(drawn.x, drawn.y, z))
+        return dr.detach(mi.Vector3f(drawn.x, drawn.y, o.sign * drawn.z))
 
     def __str__(self) -> str:
         lines = [

@@ -26,33 +26,38 @@ CELLS = 4  # one packet
 
 
 class KappaCells:
-    """Equal cells of 0 ≤ κ ≤ `largest_kappa` (rad/µm); the last one takes what lies beyond, too."""
+    """Cells of 0 ≤ κ ≤ `largest_kappa` (rad/µm); the last one takes what lies beyond, too.
 
-    def __init__(self, largest_kappa: float) -> None:
-        self.width = opaque(largest_kappa / CELLS)
+    They are equal, or three equal ones up to `most` and one beyond, where most light has less than `most`.
+    """
+
+    def __init__(self, largest_kappa: float, most: float | None = None) -> None:
+        if most is None:
+            ends = np.linspace(0, largest_kappa, CELLS + 1)
+        else:
+            ends = np.append(np.linspace(0, min(most, 0.75 * largest_kappa), CELLS), largest_kappa)
+        self.ends = ends
+        self.inner = [opaque(end) for end in ends[1:-1]]
 
     def weights(self, incidence: Incidence) -> mi.Vector4f:
-        """w_j for one wavelength."""
-        first, step = incidence.least_kappa / incidence.kappa_span, self.width / incidence.kappa_span
-        inner = [limited(dr.fma(cell, step, -first), 0, 1) for cell in range(1, CELLS)]
-        squares = [0.0, *map(dr.square, inner), 1.0]
-        return mi.Vector4f(*(squares[cell + 1] - squares[cell] for cell in range(CELLS)))
+        """Return w_j for one wavelength."""
+        below = [0.0, *map(incidence.below, self.inner), 1.0]
+        return mi.Vector4f(*(below[cell + 1] - below[cell] for cell in range(CELLS)))
 
 
-def averages(spectrum: GratingSpectrum, floor: float = 0.0) -> NDArray[np.float64]:
-    """A_jm, (CELLS, rows, columns): the mean of the powers over each cell, scaled to the sum one.
+def averages(spectrum: GratingSpectrum, cells: KappaCells, floor: float = 0.0) -> NDArray[np.float64]:
+    """Return A_jm, (CELLS, rows, columns): the mean of the powers over each cell, scaled to the sum one.
 
     Of each, all orders have the share `floor` alike, for those that are strong at some κ only.
     """
-    means = np.stack([_average(spectrum, cell) for cell in range(CELLS)])
+    means = np.stack([_average(spectrum, *ends) for ends in zip(cells.ends[:-1], cells.ends[1:], strict=True)])
     return (1 - floor) * means + floor / means[0].size
 
 
-def _average(spectrum: GratingSpectrum, cell: int) -> NDArray[np.float64]:
-    width = spectrum.largest_kappa / CELLS
+def _average(spectrum: GratingSpectrum, first: float, end: float) -> NDArray[np.float64]:
     # The powers oscillate in κ with the angular frequency of the height range at most.
-    points = int(np.ceil(width * spectrum.height_range)) + 2
-    nodes = (cell + (np.arange(points) + 0.5) / points) * width
+    points = int(np.ceil((end - first) * spectrum.height_range)) + 2
+    nodes = first + (np.arange(points) + 0.5) / points * (end - first)
     total = sum(spectrum.powers(kappa).astype(np.float64) for kappa in nodes)
     return total / total.sum()
 

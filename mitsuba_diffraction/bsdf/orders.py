@@ -21,7 +21,7 @@ from ..spectrum.grating_spectrum import GratingSpectrum
 from ..spectrum.orders import LobeAxis
 from ..spectrum.tables import HALF_SCALE, SeriesTable, SliceTable, shared_exponents
 from .cell_sampler import LOBE, CellAxis, CellSampler
-from .geometry import Geometry, Incidence, cos_square
+from .geometry import Geometry, Incidence
 from .inversion import CELLS, KappaCells, averages, choose, search, sums_before, truncated_gaussian
 from .tables import HalfTable, PacketTable, SharedExponentTable, ShareTable, larger, limited, opaque
 
@@ -44,6 +44,28 @@ def order_power(
         windows: whether several nodes are read at a time.
     """
     return (SlicePower if isinstance(table, SliceTable) else SeriesPower)(table, rim, _SQUARE if windows else 1)
+
+
+Small = tuple["mi.Float", "mi.Bool"]
+
+
+def small_kappa(
+    kappa: mi.Float, small: Small, factors: mi.Vector4f, first: mi.Vector4f, second: mi.Vector4f
+) -> mi.Vector4f:
+    """Return the factors that give κ₁²/κ² c_m(κ) where κ < κ₁, the others unchanged.
+
+    c_m of m ≠ 0 falls as κ², which an absolute error of the table would hide: c_m/κ² is the line through its values at
+    κ₁ and 2κ₁.
+
+    Args:
+        kappa: κ in rad/µm.
+        small: κ₁, and the directions for which this holds.
+        factors, first, second: at κ, κ₁ and 2κ₁.
+    """
+    least, where = small
+    x = kappa / least
+    line = (2 - x) * first + 0.25 * (x - 1) * second
+    return dr.select(where & (x < 1), line, factors)
 
 
 class _Power:
@@ -137,13 +159,24 @@ class SlicePower(_Power):
         self.intervals = table.intervals
         self.per_kappa = opaque(table.intervals / table.largest_kappa)
 
-    def at(self, kappa: mi.Float, active: mi.Bool) -> list[tuple[mi.UInt32, mi.Vector3f | mi.Vector4f]]:
-        """Where the packets of node 0 lie at κ (rad/µm), and the factors of their numbers."""
+    def at(
+        self, kappa: mi.Float, active: mi.Bool, small: Small | None = None
+    ) -> list[tuple[mi.UInt32, mi.Vector3f | mi.Vector4f]]:
+        """Return where the packets of node 0 lie at κ (rad/µm), and the factors of their numbers.
+
+        `small` as of `small_kappa`; κ₁ is at most half of the first interval.
+        """
         x = kappa * self.per_kappa
         interval = dr.minimum(mi.UInt32(x), self.intervals - 1)
-        t = 2 * (x - mi.Float(interval)) - 1
-        factors = [1, t, dr.square(t), dr.square(t) * t]
-        return [(interval * self.nodes, self.packet(factors[: len(self.packet(0))]))]
+        factors = self._factors(2 * (x - mi.Float(interval)) - 1)
+        if small is not None:
+            first, second = (self._factors(2 * n * small[0] * self.per_kappa - 1) for n in (1, 2))
+            factors = small_kappa(kappa, small, factors, first, second)
+        return [(interval * self.nodes, factors)]
+
+    def _factors(self, t: mi.Float) -> mi.Vector3f | mi.Vector4f:
+        """Return the powers of t."""
+        return self.packet([1, t, dr.square(t), dr.square(t) * t][: len(self.packet(0))])
 
 
 class SeriesPower(_Power):
@@ -166,17 +199,27 @@ class SeriesPower(_Power):
         self.weights = PacketTable(padded.reshape(-1, self.packets, 4))
         self.per_kappa = opaque(self.steps / table.largest_kappa)
 
-    def at(self, kappa: mi.Float, active: mi.Bool) -> list[tuple[mi.UInt32, mi.Vector4f]]:
-        """Where the packets of node 0 lie at κ (rad/µm), and the factors of their four floats."""
-        x = kappa * self.per_kappa
-        step = dr.minimum(mi.UInt32(x), self.steps - 1)
-        t = x - mi.Float(step)
+    def at(self, kappa: mi.Float, active: mi.Bool, small: Small | None = None) -> list[tuple[mi.UInt32, mi.Vector4f]]:
+        """Return where the packets of node 0 lie at κ (rad/µm), and the factors of their four floats.
+
+        `small` as of `small_kappa`.
+        """
         result = []
         for packet in range(self.packets):
-            low = self.weights(step * self.packets + packet, active)
-            high = self.weights((step + 1) * self.packets + packet, active)
-            result.append((mi.UInt32(packet * self.nodes), dr.fma(t, high - low, low)))
+            factors = self._factors(kappa, packet, active)
+            if small is not None:
+                first, second = (self._factors(n * small[0], packet, active) for n in (1, 2))
+                factors = small_kappa(kappa, small, factors, first, second)
+            result.append((mi.UInt32(packet * self.nodes), factors))
         return result
+
+    def _factors(self, kappa: mi.Float, packet: int, active: mi.Bool) -> mi.Vector4f:
+        """Return g_n(κ)."""
+        x = kappa * self.per_kappa
+        step = dr.minimum(mi.UInt32(x), self.steps - 1)
+        low = self.weights(step * self.packets + packet, active)
+        high = self.weights((step + 1) * self.packets + packet, active)
+        return dr.fma(x - mi.Float(step), high - low, low)
 
 
 def _rimmed(values: np.ndarray, rim: tuple[int, int]) -> np.ndarray:
@@ -208,13 +251,13 @@ class OrderSampler:
     is the probability that is reported.
     """
 
-    def __init__(self, spectrum: GratingSpectrum) -> None:
-        self.cells = KappaCells(spectrum.largest_kappa)
+    def __init__(self, spectrum: GratingSpectrum, most: float | None = None) -> None:
+        self.cells = KappaCells(spectrum.largest_kappa, most)
         self.rows, self.columns = spectrum.grid.shape
         self.largest_x, self.largest_y = spectrum.grid.largest
         self.tile_x, self.tile_y = (opaque(t) for t in spectrum.grid.tile_size)
         self.restricted = (self.largest_x + 1) ** 2 * (self.rows + 1) <= LARGEST_TABLE
-        units = np.stack([_units(average) for average in averages(spectrum, FLOOR)], axis=-1)
+        units = np.stack([_units(average) for average in averages(spectrum, self.cells, FLOOR)], axis=-1)
         self.shares = PacketTable(units)
         # The sums of A_j over the columns before x, for each row.
         before_x = np.zeros((self.rows, self.columns + 1, CELLS), np.int64)
@@ -235,19 +278,19 @@ class OrderSampler:
             return mi.Int32(0), mi.Int32(self.rows), mi.Int32(0), mi.Int32(self.columns)
         frequency = incidence.frequency
         s_x, s_y = incidence.wi.x * frequency, incidence.wi.y * frequency
-        rows = self._interval(s_y, s_x, self.columns, frequency, self.tile_y, self.largest_y)
-        columns = self._interval(s_x, s_y, self.rows, frequency, self.tile_x, self.largest_x)
+        rows = self._interval(s_y, s_x, self.columns, incidence.radius, self.tile_y, self.largest_y)
+        columns = self._interval(s_x, s_y, self.rows, incidence.radius, self.tile_x, self.largest_x)
         return *rows, *columns
 
     def _interval(
-        self, along: mi.Float, across: mi.Float, lines: int, frequency: mi.Float, tile: mi.Float, largest: int
+        self, along: mi.Float, across: mi.Float, lines: int, radius: mi.Float, tile: mi.Float, largest: int
     ) -> tuple[mi.Int32, mi.Int32]:
         """The orders |m/T + s/λ| ≤ ρ along one axis, of which there are `lines` side by side: first and end."""
         if largest == 0:
             return mi.Int32(0), mi.Int32(1)
-        half = frequency
+        half = radius
         if lines == 1:
-            half = dr.safe_sqrt(dr.square(frequency) - dr.square(across))
+            half = dr.safe_sqrt(dr.square(radius) - dr.square(across))
         first = mi.Int32(dr.ceil((-along - half) * tile))
         last = mi.Int32(dr.floor((half - along) * tile))
         # The mirror order m = 0 is always among them.
@@ -340,11 +383,11 @@ class LineSampler:
         |q_y + s_y/λ| ≤ √(1/λ² − (q_x + s_x/λ)²),   |q_y| ≤ 4σ_q
     """
 
-    def __init__(self, spectrum: GratingSpectrum) -> None:
+    def __init__(self, spectrum: GratingSpectrum, most: float | None = None) -> None:
         self.along_x = spectrum.grid.shape[0] == 1
         axis = CellAxis.of(spectrum, 0 if self.along_x else 1, WIDEST)
-        self.cells, self.largest, self.count = KappaCells(spectrum.largest_kappa), axis.largest, len(axis.shares)
-        shares = axis.shares @ averages(spectrum, FLOOR).reshape(CELLS, -1).T
+        self.cells, self.largest, self.count = KappaCells(spectrum.largest_kappa, most), axis.largest, len(axis.shares)
+        shares = axis.shares @ averages(spectrum, self.cells, FLOOR).reshape(CELLS, -1).T
         self.shares = ShareTable(np.maximum(shares, 0))
         # The sums of A_j over the cells before each.
         self.before = PacketTable(sums_before(np.float64(self.shares.values)))
@@ -353,9 +396,9 @@ class LineSampler:
         per_scale = 1 / (SCALE * spectrum.lobe_width)
         self.per_scale, self.per_area = opaque(per_scale), opaque(per_scale / axis.spacing)
 
-    def density(self, q_x: mi.Float, q_y: mi.Float, incidence: Incidence, active: mi.Bool) -> mi.Float:
-        """p(q) in µm², q in cycles/µm, for one wavelength; of a q that propagates."""
-        along, across = self._axes(q_x, q_y)
+    def density(self, q: mi.Vector2f, incidence: Incidence, active: mi.Bool) -> mi.Float:
+        """Return p(q) in µm², q in cycles/µm, for one wavelength; of a q that propagates."""
+        along, across = self._axes(q.x, q.y)
         m = mi.Int32(dr.round(along * self.per_q))
         active = active & (dr.abs(m) <= self.largest) & (dr.abs(across) <= self.reach)
         cell = mi.UInt32(m + self.largest)
@@ -394,7 +437,7 @@ class LineSampler:
         """The first cell in which something propagates, and the end of them."""
         frequency = incidence.frequency
         along, across = (s * frequency for s in self._axes(incidence.wi.x, incidence.wi.y))
-        half = dr.safe_sqrt(dr.square(frequency) - dr.square(larger(dr.abs(across) - self.reach, 0)))
+        half = dr.safe_sqrt(dr.square(incidence.radius) - dr.square(larger(dr.abs(across) - self.reach, 0)))
         first = mi.Int32(dr.floor(dr.fma(-along - half, self.per_q, 0.5)))
         end = mi.Int32(dr.ceil(dr.fma(half - along, self.per_q, 0.5)))
         # The mirror direction m = 0 is always among them.
@@ -408,7 +451,7 @@ class LineSampler:
         """F(a) and F(b)."""
         frequency = incidence.frequency
         s_along, s_across = (s * frequency for s in self._axes(incidence.wi.x, incidence.wi.y))
-        half = dr.safe_sqrt(dr.square(frequency) - dr.square(along + s_along))
+        half = dr.safe_sqrt(dr.square(incidence.radius) - dr.square(along + s_along))
         low, high = (_cumulative((end - s_across) * self.per_scale) for end in (-half, half))
         return limited(low, -self.limit, self.limit), limited(high, -self.limit, self.limit)
 
@@ -432,7 +475,7 @@ class OrderSpectrum:
     wide, it is that of `LineSampler`.
     """
 
-    def __init__(self, spectrum: GratingSpectrum) -> None:
+    def __init__(self, spectrum: GratingSpectrum, most: float | None = None, farthest: float = 1.0) -> None:
         grid, sigma = spectrum.grid, spectrum.lobe_width
         self.axes = tuple(
             _Axis(lobe, size, largest, sigma)
@@ -443,8 +486,8 @@ class OrderSpectrum:
         self.power = order_power(spectrum.table, tuple(axis.rim for axis in self.axes), windows=not self.resolved)
         self.cells = None
         if not self.resolved:
-            self.cells = LineSampler(spectrum) if line else CellSampler(spectrum)
-        self.orders = OrderSampler(spectrum) if self.resolved else None
+            self.cells = LineSampler(spectrum, most) if line else CellSampler(spectrum, most, farthest)
+        self.orders = OrderSampler(spectrum, most) if self.resolved else None
         self.columns, self.line = grid.shape[1], line
         self.per_width = opaque(1 / sigma)
 
@@ -480,9 +523,9 @@ class OrderSpectrum:
             if self.line:
                 lobes_x, lobes_y = self._weighted(m_x, m_y, lobes_x, lobes_y, geometry, incidence)
             else:
-                factor = geometry.continuum_factor(incidence.frequency * self.per_width)
-            power = factor * self._power(m_x, m_y, lobes_x, lobes_y, kappa, active)
-            density = self.cells.density(q.x, q.y, incidence, active)
+                factor = geometry.continuum_factor(incidence.frequency, self.per_width)
+            power = factor * self._power(m_x, m_y, lobes_x, lobes_y, kappa, geometry.small(), active)
+            density = self.cells.density(q if incidence.mirrored is None else incidence.mirrored * q, incidence, active)
         # Interpolation may dip below zero by its error.
         return dr.select(active, larger(power, 0), 0), density
 
@@ -499,7 +542,7 @@ class OrderSpectrum:
 
         def factor(x: int, y: int) -> mi.Float:
             tangent = self._tangent(m_x + x, m_y + y, incidence)
-            return geometry.order_factor(tangent, incidence.frequency * self.per_width)
+            return geometry.order_factor(tangent, incidence.frequency, self.per_width)
 
         if len(lobes_x) > 1:
             return [lobe * factor(step, 0) for step, lobe in enumerate(lobes_x)], lobes_y
@@ -517,10 +560,11 @@ class OrderSpectrum:
         lobes_x: list[mi.Float],
         lobes_y: list[mi.Float],
         kappa: mi.Float,
+        small: Small | None,
         active: mi.Bool,
     ) -> mi.Float:
-        """Σ_m η_m(κ) N(q − m/T; σ_q² I) over the orders from (m_x, m_y) on."""
-        at = self.power.at(kappa, active)
+        """Return Σ_m η_m(κ) N(q − m/T; σ_q² I) over the orders from (m_x, m_y) on."""
+        at = self.power.at(kappa, active, small)
         row, column = (m + (axis.largest + axis.rim) for m, axis in zip((m_y, m_x), self.axes[::-1], strict=True))
         return self.power.window(row, column, lobes_x, lobes_y, at, active)
 
@@ -546,13 +590,16 @@ class OrderSpectrum:
         q = geometry.tangent * incidence.frequency
         m_x, m_y = (axis.first(q) for axis, q in zip(self.axes, q, strict=True))
         lobes_x, lobes_y = self.axes[0].lobes(m_x, q.x), self.axes[1].lobes(m_y, q.y)
-        power = self._power(m_x, m_y, lobes_x, lobes_y, geometry.kappa(incidence.frequency), near)
+        power = self._power(m_x, m_y, lobes_x, lobes_y, geometry.kappa(incidence.frequency), geometry.small(), near)
         tangent = self._tangent(m_x, m_y, incidence)
-        power *= geometry.order_factor(tangent, incidence.frequency * self.per_width)
+        power *= geometry.order_factor(tangent, incidence.frequency, self.per_width)
+        if incidence.mirrored is not None:
+            m_x, m_y = (mi.Int32(incidence.mirrored) * m for m in (m_x, m_y))
+            tangent = incidence.mirrored * tangent
         order = mi.UInt32((m_y + self.axes[1].largest) * self.columns + m_x + self.axes[0].largest)
         share = self.orders.share(order, self.orders.weights(incidence, near), near)
         # An order that does not propagate is not drawn.
-        there = cos_square(geometry.wi, tangent) > 0
+        there = incidence.propagates(tangent)
         return power, dr.select(there, share * lobes_x[0] * lobes_y[0], 0)
 
     def sample(
@@ -568,7 +615,7 @@ class OrderSpectrum:
         row, column, v = self.orders.sample(incidence, u, v, active)
         tangent = self._tangent(column - self.axes[0].largest, row - self.axes[1].largest, incidence)
         q = mi.Point2f(self.axes[0].place(column, v.x), self.axes[1].place(row, v.y))
-        return q, cos_square(incidence.wi, tangent) > 0
+        return q, incidence.propagates(tangent)
 
 
 class _Axis:

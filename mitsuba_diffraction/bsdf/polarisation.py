@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 Split = Callable[..., "mi.Spectrum"]
 """The Mueller matrix of a grating, from (source, exit, source's x axis, exit's x axis)."""
@@ -84,6 +85,37 @@ def of_plane(value: mi.UnpolarizedSpectrum, index: list[mi.Complex2f]) -> Split:
         axes = [dr.cross(half, -source), dr.cross(half, exit_)]
         returns = dr.squared_norm(axes[0]) < 1e-12
         across = mi.coordinate_system(half)[0]
+        axes = [dr.select(returns, across, dr.normalize(axis)) for axis in axes]
+        return mi.mueller.rotate_mueller_basis(matrix, -source, axes[0], source_axis, exit_, axes[1], exit_axis)
+
+    return split
+
+
+def of_interface(value: mi.UnpolarizedSpectrum, eta: mi.Float) -> Split:
+    """Return the split by a plane perpendicular to h, the normal of the facet that refracts or reflects the pair.
+
+    Args:
+        value: as of `of_plane`, or that of transmitted light.
+        eta: index below relative to that above.
+    """
+
+    def split(source: mi.Vector3f, exit_: mi.Vector3f, source_axis: mi.Vector3f, exit_axis: mi.Vector3f) -> mi.Spectrum:
+        n_i, n_o = (dr.select(omega.z > 0, 1, eta) for omega in (source, exit_))
+        reflects = (source.z > 0) == (exit_.z > 0)
+        half = dr.normalize(n_i * source + n_o * exit_)
+        cos_half = mi.UnpolarizedSpectrum(dr.abs(dr.dot(source, half)))
+        other = mi.UnpolarizedSpectrum(dr.select(reflects, dr.square(eta) / n_i, n_o) / n_i)
+        back = mi.mueller.specular_reflection(cos_half, mi.Complex2f(other[0], 0))
+        on = mi.mueller.specular_transmission(cos_half, other)
+        plane = dr.select(reflects, back, on)
+        bright = dr.select(plane[0, 0] > 0, plane[0, 0], 1)
+        matrix = mi.Spectrum(0.0)
+        for i, j in np.ndindex(4, 4):
+            matrix[i, j] = value * plane[i, j] / bright
+        across = mi.coordinate_system(half)[0]
+        axes = [dr.cross(half, -source), dr.cross(half, exit_)]
+        axes[1] *= dr.select(reflects | (dr.dot(axes[0], axes[1]) > 0), mi.Float(1), -1)
+        returns = dr.squared_norm(axes[0]) < 1e-12
         axes = [dr.select(returns, across, dr.normalize(axis)) for axis in axes]
         return mi.mueller.rotate_mueller_basis(matrix, -source, axes[0], source_axis, exit_, axes[1], exit_axis)
 

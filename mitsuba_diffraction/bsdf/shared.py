@@ -12,6 +12,7 @@ import numpy as np
 from ..energy.furnace import Furnace
 from ..energy.table import EnergyTable, corners
 from ..rigorous.spectrum import RigorousSpectrum
+from ..settings import VISIBLE
 from ..spectrum.load import Spectrum
 from ..spectrum.orders import OrderGrid
 from .energy import Energy
@@ -22,7 +23,7 @@ from .spline_spectrum import SplineSpectrum
 STEP = 1e-3  # of height_scale, for the derivative of the energy table
 
 _making = threading.Lock()
-_shared: weakref.WeakValueDictionary[tuple[str, str], SharedTables] = weakref.WeakValueDictionary()
+_shared: weakref.WeakValueDictionary[tuple[str, str, float | None], SharedTables] = weakref.WeakValueDictionary()
 
 
 class SharedTables:
@@ -32,26 +33,29 @@ class SharedTables:
         scattering: S(q; κ) and its sampler.
     """
 
-    def __init__(self, spectrum: Spectrum) -> None:
+    def __init__(self, spectrum: Spectrum, eta: float | None) -> None:
         if isinstance(spectrum, RigorousSpectrum):
             self.scattering = RigorousOrders(spectrum)
         else:
-            self.scattering = (OrderSpectrum if isinstance(spectrum.grid, OrderGrid) else SplineSpectrum)(spectrum)
+            represented = OrderSpectrum if isinstance(spectrum.grid, OrderGrid) else SplineSpectrum
+            self.scattering = represented(spectrum, *([] if eta is None else passing(eta)))
         self._spectrum = spectrum
         self._last: tuple[float, Energy | None] | None = None
         self._lock = threading.Lock()
 
     @classmethod
-    def of(cls, spectrum: Spectrum) -> SharedTables:
-        """Those of an equal spectrum, while some BSDF has them; else new ones.
+    def of(cls, spectrum: Spectrum, eta: float | None = None) -> SharedTables:
+        """Return those of an equal spectrum, while some BSDF has them; else new ones.
+
+        `eta` is the relative index where light passes the grating, too.
 
         Mitsuba constructs plugins on several threads: one of them makes the tables, the others wait.
         """
-        key = mi.variant(), spectrum.digest
+        key = mi.variant(), spectrum.digest, eta
         with _making:
             tables = _shared.get(key)
             if tables is None:
-                tables = _shared[key] = cls(spectrum)
+                tables = _shared[key] = cls(spectrum, eta)
             return tables
 
     def energy(self, height_scale: mi.Float) -> Energy | None:
@@ -78,3 +82,11 @@ class SharedTables:
     def corners(self, table: EnergyTable, height_scale: float) -> np.ndarray:
         """e at the corners of the cells of `table`, not rounded, for other heights."""
         return corners(Furnace.of(self._spectrum, height_scale), table.layout)[0]
+
+
+def passing(eta: float) -> tuple[float, float]:
+    """Return what samplers need for light that passes: κ below which nearly all of it lies, and the largest |k_∥|/n_o.
+
+    Undiffracted light along the normal has κ = 2π |η − 1|/λ.
+    """
+    return 3 * np.pi * abs(eta - 1) / (VISIBLE[0] * 1e-3), max(eta, 1 / eta)

@@ -23,7 +23,7 @@ class SplineSpectrum:
 
     resolved = False
 
-    def __init__(self, spectrum: GratingSpectrum) -> None:
+    def __init__(self, spectrum: GratingSpectrum, most: float | None = None, farthest: float = 1.0) -> None:
         grid = spectrum.grid
         self.power = order_power(spectrum.table, (RIM, RIM))
         self.largest_x, self.largest_y = grid.largest
@@ -31,7 +31,7 @@ class SplineSpectrum:
         self.per_area = opaque(1 / (grid.spacing[0] * grid.spacing[1]))
         self.limit_x, self.limit_y = (opaque(limit) for limit in grid.limit)
         self.per_width = opaque(1 / spectrum.lobe_width)
-        self.cells = CellSampler(spectrum)
+        self.cells = CellSampler(spectrum, most, farthest)
 
     def evaluate(
         self,
@@ -41,21 +41,22 @@ class SplineSpectrum:
         wo_is_sample: bool,
     ) -> tuple[mi.Float, mi.Float]:
         """Evaluate K G S(q; κ) cos θ_o and the density of q; as `OrderSpectrum`, but all directions cost the same."""
-        q_x, q_y = geometry.tangent * incidence.frequency
-        x, y = q_x * self.per_q_x, q_y * self.per_q_y
+        q = geometry.tangent * incidence.frequency
+        x, y = q.x * self.per_q_x, q.y * self.per_q_y
         m_x, m_y = mi.Int32(dr.round(x)), mi.Int32(dr.round(y))
         power = self.power.window(
             m_y + (self.largest_y + RIM - 1),
             m_x + (self.largest_x + RIM - 1),
             spline_weights(x - mi.Float(m_x)),
             spline_weights(y - mi.Float(m_y)),
-            self.power.at(geometry.kappa(incidence.frequency), active),
+            self.power.at(geometry.kappa(incidence.frequency), active, geometry.small()),
             active,
         )
-        inside = active & (dr.abs(q_x) <= self.limit_x) & (dr.abs(q_y) <= self.limit_y)
+        inside = active & (dr.abs(q.x) <= self.limit_x) & (dr.abs(q.y) <= self.limit_y)
         # Interpolation may dip below zero by its error.
-        power = larger(power, 0) * self.per_area * geometry.continuum_factor(incidence.frequency * self.per_width)
-        return dr.select(inside, power, 0), self.cells.density(q_x, q_y, incidence, active)
+        power = larger(power, 0) * self.per_area * geometry.continuum_factor(incidence.frequency, self.per_width)
+        drawn = q if incidence.mirrored is None else incidence.mirrored * q
+        return dr.select(inside, power, 0), self.cells.density(drawn, incidence, active)
 
     def sample(
         self,

@@ -21,7 +21,7 @@ from ..settings import VISIBLE
 from ..spectrum.build import THEORIES
 from ..spectrum.load import Spectrum, load_spectrum
 from ..surface.gratings import COHERENCE_LENGTHS, PROFILES
-from .coat import Coat
+from .media import Media
 from .theories import settings_from, settings_of_medium
 
 _log = logging.getLogger(__name__)
@@ -31,10 +31,10 @@ _told: set[str] = set()  # surfaces whose range was looked up
 _handed_over: weakref.WeakValueDictionary[str, Spectrum] = weakref.WeakValueDictionary()
 
 
-def surface_from(props: mi.Properties, coat: Coat | None) -> tuple[Spectrum, Recipe | None]:
+def surface_from(props: mi.Properties, media: Media) -> tuple[Spectrum, Recipe | None]:
     """The spectrum that the parameters `filename`, `spectrum`, or `profile` with its own parameters name.
 
-    Wavelengths are shorter inside a coat: what is built here is built for λ/n.
+    Wavelengths are shorter inside a coat or a dielectric: what is built here is built for λ/n.
 
     Returns:
         The spectrum, and the recipe behind it. A saved spectrum has none: it does not say which heights it is of.
@@ -56,7 +56,7 @@ def surface_from(props: mi.Properties, coat: Coat | None) -> tuple[Spectrum, Rec
             spectrum, recipe = _taken_over(props["spectrum"]), None
         else:
             spectrum, recipe = _from_file(
-                Path(str(mi.file_resolver().resolve(str(props["filename"])))), coat, props.get("tolerance")
+                Path(str(mi.file_resolver().resolve(str(props["filename"])))), media, props.get("tolerance")
             )
         found = "rigorous" if isinstance(spectrum, RigorousSpectrum) else "scalar"
         if props.get("theory", found) != found:
@@ -70,8 +70,8 @@ def surface_from(props: mi.Properties, coat: Coat | None) -> tuple[Spectrum, Rec
     settings = {"coherence_length": COHERENCE_LENGTHS[name]} if name in COHERENCE_LENGTHS else {}
     settings |= {key: props[key] for key in ("coherence_length", "tolerance", "largest_height_range") if key in props}
     if theory == "rigorous":
-        settings |= {"theory": theory, **settings_from(props, coat)}
-    recipe = _inside(coat, Recipe(surface, settings))
+        settings |= {"theory": theory, **settings_from(props, media.coat)}
+    recipe = _inside(media, Recipe(surface, settings))
     return recipe.cached(_per_cent), recipe
 
 
@@ -88,17 +88,18 @@ def warn_of_range(recipe: Recipe) -> None:
         _log.warning("diffraction_grating, %s: %s", surface.source, beyond)
 
 
-def _inside(coat: Coat | None, recipe: Recipe) -> Recipe:
-    """The recipe for the wavelengths that there are inside a coat, and, of rigorous theory, for the variant."""
+def _inside(media: Media, recipe: Recipe) -> Recipe:
+    """Return the recipe for the wavelengths next to the relief, and, of rigorous theory, for the variant."""
     inside = {}
-    if coat is not None and "wavelengths" not in recipe.spectrum:
-        inside["wavelengths"] = [nanometres / coat.relative for nanometres in VISIBLE]
-    if recipe.spectrum.get("theory") == "rigorous":
-        inside |= settings_of_medium(coat)
+    rigorous = recipe.spectrum.get("theory") == "rigorous"
+    if media.index > 1 and "wavelengths" not in recipe.spectrum and not (rigorous and media.coat is None):
+        inside["wavelengths"] = [nanometres / media.index for nanometres in VISIBLE]
+    if rigorous:
+        inside |= settings_of_medium(media.coat)
     return Recipe(recipe.surface, {**recipe.spectrum, **inside}, recipe.folder) if inside else recipe
 
 
-def _from_file(path: Path, coat: Coat | None, tolerance: float | None) -> tuple[Spectrum, Recipe | None]:
+def _from_file(path: Path, media: Media, tolerance: float | None) -> tuple[Spectrum, Recipe | None]:
     suffix = path.suffix.lower()
     if suffix in (".toml", ".exr") and not path.is_file():
         # What is not found stays relative; the folder of a scene is searched first.
@@ -106,7 +107,7 @@ def _from_file(path: Path, coat: Coat | None, tolerance: float | None) -> tuple[
         there = sorted(other.name for other in folder.glob("*") if other.suffix.lower() in (".exr", ".toml"))
         raise FileNotFoundError(f"{path}: no such file; {folder} holds {', '.join(there) or 'no spectrum'}")
     if suffix == ".toml":
-        recipe = _inside(coat, Recipe.load(path))
+        recipe = _inside(media, Recipe.load(path))
         if tolerance is not None:
             recipe = dataclasses.replace(recipe, spectrum={**recipe.spectrum, "tolerance": tolerance})
         return recipe.cached(_per_cent), recipe

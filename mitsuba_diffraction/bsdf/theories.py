@@ -13,9 +13,12 @@ from ..settings import VISIBLE
 from ..spectrum.grating_spectrum import GratingSpectrum
 from .coat import Coat
 from .geometry import Geometry, turned
-from .polarisation import Split, of_orders, of_plane, unpolarised
+from .media import Media
+from .polarisation import Split, of_interface, of_orders, of_plane, unpolarised
 from .reflectance import Conductor, PerfectMirror, reflectance_from
 from .shared import SharedTables
+from .tables import opaque
+from .transmission import Interface
 
 _SCALAR_ONLY = {
     "height_scale": "build the spectrum of the other depth",
@@ -56,11 +59,14 @@ class ScalarTheory:
         height_scale: times the heights.
         shadowing: whether G is a factor.
         energy: E, or None where it is one.
+        interface: the media on both sides where light passes, else None.
     """
 
-    def __init__(self, props: mi.Properties, spectrum: GratingSpectrum, coat: Coat | None) -> None:
-        self.spectrum, self.coat = spectrum, coat
-        self.material = reflectance_from(props, coat)
+    def __init__(self, props: mi.Properties, spectrum: GratingSpectrum, media: Media) -> None:
+        self.spectrum, self.media = spectrum, media
+        self.material = reflectance_from(props, media.coat)
+        if media.eta is not None and self.material.model == "schlick":
+            raise RequestError("fresnel: got 'schlick' with a transmission, wanted 'exact'")
         height_scale = props.get("height_scale", 1.0)
         if not is_number(height_scale):
             raise RequestError(f"height_scale: got {height_scale!r}, wanted a number")
@@ -72,7 +78,7 @@ class ScalarTheory:
         self.conserve_energy = props.get("conserve_energy", True)
         if not isinstance(self.conserve_energy, bool):
             raise RequestError(f"conserve_energy: got {self.conserve_energy!r}, wanted true or false")
-        self.tables = SharedTables.of(spectrum)
+        self.tables = SharedTables.of(spectrum, media.eta)
         self.scattering = self.tables.scattering
         self.update()
 
@@ -82,12 +88,15 @@ class ScalarTheory:
         Raises:
             ValueError: if the spectrum does not cover the heights, or the wavelengths inside a coat.
         """
-        shortest = VISIBLE[0] / (1 if self.coat is None else self.coat.relative)
+        shortest = VISIBLE[0] / self.media.index
         largest = shortest / self.spectrum.wavelengths[0]
-        if self.coat is not None and largest < 1 - 1e-6:
+        if self.media.index > 1 and largest < 1 - 1e-6:
+            name, place = "int_ior", "the material"
+            if self.media.eta is None:
+                name, place = ("ext_ior", "it") if self.media.coat is None else ("coat_ior", "the coat")
             raise RequestError(
-                f"coat_ior: got {self.coat.index:g}, and a spectrum for wavelengths from "
-                f"{self.spectrum.wavelengths[0]:g} nm; inside the coat they are shorter: build it from "
+                f"{name}: got {self.media.index:g}, and a spectrum for wavelengths from "
+                f"{self.spectrum.wavelengths[0]:g} nm; inside {place} they are shorter: build it from "
                 f"{shortest:.4g} nm"
             )
         # At wavelengths that the spectrum does not cover the grating is black, and κ is less at the others.
@@ -100,8 +109,14 @@ class ScalarTheory:
                 f"{shortest:.4g} nm divided by the scale"
             )
         dr.make_opaque(self.height_scale)
-        conserves = self.conserve_energy and self.shadowing
+        conserves = self.conserve_energy and self.shadowing and self.media.eta is None
         self.energy = self.tables.energy(self.height_scale) if conserves else None
+        self.interface = None
+        if self.media.eta is not None:
+            # Half of the first interval of κ; of the undiffracted order, κ is larger at all wavelengths.
+            undiffracted = 1.6e3 * np.pi * abs(self.media.eta - 1) / VISIBLE[1] * self.media.outside * scale
+            least = opaque(min(self.spectrum.table.first_interval / 2, max(undiffracted, 1e-6)))
+            self.interface = Interface(self.material.eta, self.media.transmission == "sheet", least)
 
     def parameters_changed(self, keys: list[str]) -> None:
         """Recompute what depends on the parameters `keys`; on all of them if none is named."""
@@ -118,9 +133,12 @@ class ScalarTheory:
     ) -> mi.UnpolarizedSpectrum:
         """Return `value` times R E."""
         if self.energy is not None:
-            inside = mi.UnpolarizedSpectrum(si.wavelengths) * (1e-3 / geometry.index)
+            inside = mi.UnpolarizedSpectrum(si.wavelengths) * (1e-3 / self.media.outside / geometry.index)
             value *= self.energy.factor(*geometry.inside(), inside)
-        return value * self.material(si, geometry.cos_half(), active)
+        reflected = self.material(si, geometry.cos_half(), active)
+        if self.media.eta is not None:
+            reflected = dr.select(geometry.reflects, reflected, 1 - reflected)
+        return value * reflected
 
     def split(
         self,
@@ -131,7 +149,9 @@ class ScalarTheory:
     ) -> Split:
         """Return how the grating splits `value` into s and p."""
         index = self.material.index(si, active)
-        return unpolarised(value) if index is None else of_plane(value, index)
+        if index is None:
+            return unpolarised(value)
+        return of_plane(value, index) if self.media.eta is None else of_interface(value, self.material.eta)
 
     def __str__(self) -> str:
         lines = {
@@ -152,9 +172,12 @@ class RigorousTheory:
     """
 
     height_scale, shadowing = 1.0, True  # of no effect
+    interface = None
 
-    def __init__(self, props: mi.Properties, spectrum: RigorousSpectrum, coat: Coat | None) -> None:
-        self.coat = coat
+    def __init__(self, props: mi.Properties, spectrum: RigorousSpectrum, media: Media) -> None:
+        self.coat = coat = media.coat
+        if media.outside > 1 and coat is None:
+            raise RequestError(f"ext_ior: got {media.outside:g} with theory=rigorous, wanted air or a coat")
         self.material = check_parameters(props, spectrum, coat)
         self.scattering = SharedTables.of(spectrum).scattering
 

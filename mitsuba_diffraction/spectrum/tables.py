@@ -207,6 +207,11 @@ class SeriesTable:
         return self.series.name
 
     @property
+    def first_interval(self) -> float:
+        """The length of the interval from κ = 0 in which c_m/κ² of m ≠ 0 is nearly a line, rad/µm."""
+        return self.largest_kappa / 16
+
+    @property
     def largest_kappa(self) -> float:
         """κ_max in rad/µm."""
         return self.series.largest_kappa
@@ -272,6 +277,11 @@ class SliceTable:
         if got.ndim != 4 or got.shape[1] not in (3, 4) or got.dtype != np.float32 or not np.isfinite(got).all():
             raise RequestError(f"values: got {got.dtype} {got.shape}, wanted finite float32 (K, 3 or 4, rows, columns)")
         got.setflags(write=False)
+
+    @property
+    def first_interval(self) -> float:
+        """Δκ in rad/µm."""
+        return self.largest_kappa / len(self.values)
 
     @classmethod
     def build(

@@ -1,0 +1,280 @@
+"""Light that passes a dielectric relief: pairs of directions on either side of it, and one direction with its sampler.
+
+Media of index n_i, where ω_i lies, and n_o, both directions away from the surface, k = n ω their wave vectors in units
+of 2π/λ and v = k_i + k_o:
+
+    q = −v_∥/λ,    κ = 2π v_z/λ,    K = |k_i·v| |k_o·v| / (|k_i,z| |k_o,z| v_z²),    k_i·v = (|v|² + n_i² − n_o²)/2
+
+holds for reflection (n_i = n_o: the K of `geometry.py`) and for transmission alike (cf. Walter et al. 2007). κ has a
+sign: S(q; −κ) = S(−q; κ), so that tables for κ ≥ 0 serve, read at −q where κ < 0.
+
+Where v_z → 0 the factor K grows without bound and S(q; κ) falls as κ². For |κ| < κ₁ both are taken together: v_z² is
+not less than that of κ₁, and the table gives κ₁²/κ² S (`tables.small`).
+
+Of a sheet the lower face is flat, and outside of it there is the medium above once more: tangential components are
+those outside, normal components those inside.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from .geometry import horizon_gain, k_g
+from .tables import larger, limited, smaller
+
+KINDS = ("none", "interface", "sheet")
+
+
+# Not frozen: Dr.Jit rebuilds what enters a branch field by field.
+@dataclass(eq=False)
+class Side:
+    """A direction and the media on its side, indices relative to the medium above.
+
+    Attributes:
+        tangent: k_∥.
+        square: k_z² outside.
+        outside: n outside.
+        inside: n next to the relief; they differ below a sheet.
+        sign: 1 above, −1 below.
+    """
+
+    tangent: mi.Vector2f
+    square: mi.Float
+    outside: mi.Float
+    inside: mi.Float
+    sign: mi.Float
+
+    def normal(self, square: mi.Float) -> mi.Float:
+        """Return |k_z| next to the relief, from k_z² outside."""
+        # Above zero, where the root has a derivative.
+        return dr.sqrt(larger(square + dr.square(self.inside) - dr.square(self.outside), 1e-12))
+
+    @property
+    def z(self) -> mi.Float:
+        """k_z next to the relief, with its sign."""
+        return self.sign * self.normal(self.square)
+
+
+class Interface:
+    """The relief between two media, or on one face of a sheet.
+
+    Attributes:
+        eta: index below relative to that above.
+        is_sheet: the medium above is below the sheet, too.
+        least_kappa: κ₁ in rad/µm.
+    """
+
+    def __init__(self, eta: mi.Float, is_sheet: bool, least_kappa: mi.Float) -> None:
+        self.eta, self.is_sheet, self.least_kappa = eta, is_sheet, least_kappa
+
+    def side(self, omega: mi.Vector3f) -> Side:
+        """Return the side on which ω lies."""
+        above = omega.z > 0
+        inside = dr.select(above, 1, self.eta)
+        outside = mi.Float(1.0) if self.is_sheet else inside
+        return Side(
+            mi.Vector2f(omega.x, omega.y) * outside,
+            dr.square(omega.z * outside),
+            outside,
+            inside,
+            dr.select(above, mi.Float(1), -1),
+        )
+
+    def other(self, side: Side, reflects: mi.Bool) -> Side:
+        """Return where light from `side` goes, without the direction."""
+        sign = dr.select(reflects, side.sign, -side.sign)
+        inside = dr.select(sign > 0, 1, self.eta)
+        return Side(-side.tangent, side.square, mi.Float(1.0) if self.is_sheet else inside, inside, sign)
+
+    def flat(self, omega: mi.Vector3f) -> mi.Float:
+        """Return the transmittance of the flat face of a sheet, one above."""
+        through = 1 - mi.fresnel(dr.abs(omega.z), self.eta)[0]
+        return dr.select(omega.z > 0, 1, through)
+
+
+@dataclass(eq=False)
+class Crossing:
+    """A pair of directions on the same or on both sides; with the methods of `geometry.Geometry`.
+
+    Attributes:
+        i, o: the sides of ω_i and ω_o.
+        height_scale: times the heights.
+        shadowing: whether G is a factor of reflected light; of transmitted light there is none.
+        least_kappa: κ₁ in rad/µm.
+    """
+
+    i: Side
+    o: Side
+    height_scale: mi.Float
+    shadowing: bool
+    least_kappa: mi.Float
+
+    @property
+    def reflects(self) -> mi.Bool:
+        """Both directions lie on one side."""
+        return self.i.sign == self.o.sign
+
+    @property
+    def w(self) -> mi.Float:
+        """v_z."""
+        return self.i.z + self.o.z
+
+    @property
+    def flip(self) -> mi.Float:
+        """The sign of κ."""
+        return dr.select(self.w < 0, mi.Float(-1), 1)
+
+    @property
+    def tangent(self) -> mi.Vector2f:
+        """λq where κ > 0, else −λq: where the table is read."""
+        return -self.flip * (self.i.tangent + self.o.tangent)
+
+    def kappa(self, frequency: mi.Float) -> mi.Float:
+        """Return |κ| in rad/µm; `frequency` is 1/λ above."""
+        return dr.abs(self.w) * dr.two_pi * frequency * self.height_scale
+
+    def small(self) -> tuple[mi.Float, mi.Bool]:
+        """Return κ₁, and where the table is read with it."""
+        return self.least_kappa, ~self.reflects if dr.is_jit_v(mi.Float) else not self.reflects
+
+    def cosines(self) -> tuple[mi.Float, mi.Float]:
+        """Return |cos θ_i| and |cos θ_o| next to the relief."""
+        return self.i.normal(self.i.square) / self.i.inside, self.o.normal(self.o.square) / self.o.inside
+
+    def cos_half(self) -> mi.Float:
+        """Return ω_i·h, negative from below, as `mi.fresnel` takes it."""
+        square = dr.squared_norm(self.i.tangent + self.o.tangent) + dr.square(self.w)
+        along = 0.5 * (square + dr.square(self.i.inside) - dr.square(self.o.inside))
+        cos = dr.abs(along) * dr.rsqrt(larger(square, 1e-12)) / self.i.inside
+        return self.i.sign * smaller(cos, 1)
+
+    def inside(self) -> tuple[mi.Vector3f, mi.Vector3f]:
+        """Return ω_i and ω_o next to the relief."""
+        return tuple(mi.Vector3f(*(side.tangent / side.inside), side.z / side.inside) for side in (self.i, self.o))
+
+    def order_factor(self, tangent: mi.Vector2f, frequency: mi.Float, per_width: mi.Float) -> mi.Float:
+        """Return n_o² K G |cos θ_o| of an order, times the gain of its lobe, as `Geometry.order_factor`.
+
+        Args:
+            tangent: λq of the order where κ > 0, else −λq.
+            frequency: 1/λ above.
+            per_width: 1/σ_q.
+        """
+        squares, gain = self._of_order(self.flip * tangent, frequency * per_width)
+        return self._k_g(*squares, dr.squared_norm(tangent), frequency) * gain * self._outgoing
+
+    def continuum_factor(self, frequency: mi.Float, per_width: mi.Float) -> mi.Float:
+        """Return n_o² K G |cos θ_o| and gain where orders overlap, as `Geometry.continuum_factor`."""
+        square, per_width = dr.squared_norm(self.tangent), frequency * per_width
+        mirror = limited((25 - square * dr.square(per_width)) / 9, 0, 1)
+        most = larger(self.i.square, self.o.square)
+        grazing = dr.select(self.reflects, most, smaller(self.i.square, self.o.square))
+        mirror *= limited(2 - 5 * dr.sqrt(larger(grazing, 1e-12)), 0, 1)
+        _, gain = self._of_order(mi.Vector2f(0), per_width)
+        of_pair = self._k_g(self.i.square, self.o.square, square, frequency)
+        return dr.lerp(of_pair, gain, mirror) * self._outgoing
+
+    @property
+    def _outgoing(self) -> mi.Float:
+        """n_o² |cos θ_o| outside."""
+        return self.o.outside * dr.sqrt(self.o.square)
+
+    def _of_order(self, change: mi.Vector2f, per_width: mi.Float) -> tuple[tuple[mi.Float, mi.Float], mi.Float]:
+        """Return k_z² of both sides in the middle of the lobe, and its gain, as `Geometry.of_order`.
+
+        Args:
+            change: λq of the order.
+            per_width: 1/(λσ_q).
+        """
+        i, o = self.i, self.o
+        between = dr.square(o.outside) - dr.square(i.outside)
+        sent_o = between + i.square - dr.dot(change, 2 * i.tangent + change)
+        sent_i = o.square - between - dr.dot(change, 2 * o.tangent + change)
+        x_i = 0.5 * per_width * smaller(i.square, sent_i) / i.outside
+        x_o = 0.5 * per_width * smaller(o.square, sent_o) / o.outside
+        gain = dr.select(smaller(sent_i, sent_o) > 0, horizon_gain(x_i) * horizon_gain(x_o), 0)
+        return (0.5 * (i.square + sent_i), 0.5 * (o.square + sent_o)), gain
+
+    def _k_g(self, square_i: mi.Float, square_o: mi.Float, along: mi.Float, frequency: mi.Float) -> mi.Float:
+        """Return K G from k_z² of both sides outside, and |v_∥|²."""
+        z_i, z_o = self.i.normal(square_i), self.o.normal(square_o)
+        reflected = k_g(z_i, z_o, along, self.shadowing)
+        w = dr.square(z_i - z_o)
+        between = dr.square(self.i.inside) - dr.square(self.o.inside)
+        length = along + w
+        product = 0.25 * dr.abs((length + between) * (length - between))
+        least = self.least_kappa / (dr.two_pi * frequency * larger(self.height_scale, 1e-6))
+        passed = product / (larger(z_i, 1e-7) * larger(z_o, 1e-7) * larger(w, dr.square(least)))
+        return dr.select(self.reflects, reflected, passed)
+
+
+@dataclass(eq=False)
+class CrossingIncidence:
+    """One wavelength from one direction that is reflected or passes; with what samplers ask of `geometry.Incidence`.
+
+    κ of reflected light is positive above and negative below; that of transmitted light is taken for negative, as it
+    is of all but steeply diffracted light. Where it is negative, −q is drawn.
+
+    Attributes:
+        wi: k_i,∥, or its opposite where −q is drawn; z is not used.
+        frequency: 1/λ above.
+        radius: n_o/λ, to which |q| of propagating light extends around −k_i,∥/λ.
+        cosine: √(1 − |k_i,∥|²/(n_o R)²), R the largest of |k_i,∥|/n_o.
+        mirrored: what takes the q that is read to the one that was drawn, 1 or −1.
+        square: n_o² − |k_i,∥|².
+        index: one.
+        kappas: |κ| of the undiffracted order, of light at 45° to it, and of light along the horizon and the normal.
+    """
+
+    wi: mi.Vector3f
+    frequency: mi.Float
+    radius: mi.Float
+    cosine: mi.Float
+    mirrored: mi.Float
+    square: mi.Float
+    kappas: list[mi.Float]
+    reflects: mi.Bool
+
+    @classmethod
+    def of(
+        cls, i: Side, o: Side, interface: Interface, frequency: mi.Float, height_scale: mi.Float, flip: mi.Float | None
+    ) -> CrossingIncidence:
+        """Return that of light from the side `i` to the side `o`.
+
+        `flip` is the sign of κ of a pair that is evaluated; None where a direction is drawn.
+        """
+        reflects = i.sign == o.sign
+        assumed = dr.select(reflects & (i.sign > 0), mi.Float(1), -1)
+        square = dr.square(o.outside) - dr.square(i.outside) + i.square
+        radius = o.outside
+        largest = mi.Float(1.0) if interface.is_sheet else larger(interface.eta, dr.rcp(interface.eta))
+        across = dr.squared_norm(i.tangent) / dr.square(radius * largest)
+        per = dr.two_pi * frequency * height_scale
+        z_i, snell = i.z, o.normal(larger(square, 0))
+        kappas = [per * dr.abs(z_i + o.sign * z) for z in (snell, 0.7 * snell, o.normal(mi.Float(0)), o.inside)]
+        values = (
+            mi.Vector3f(assumed * i.tangent.x, assumed * i.tangent.y, 0),
+            frequency,
+            radius * frequency,
+            dr.safe_sqrt(1 - across),
+            assumed if flip is None else assumed * flip,
+            square,
+        )
+        return cls(*(dr.detach(value) for value in values), [dr.detach(kappa) for kappa in kappas], reflects)
+
+    def below(self, kappa: mi.Float) -> mi.Float:
+        """Return the share of light with less than κ: half of it near the undiffracted order, half as if diffuse."""
+        first, second, horizon, normal = self.kappas
+        low, high = smaller(first, second), larger(first, second)
+        near = limited((kappa - low) / larger(high - low, 1e-3), 0, 1)
+        least, most = smaller(horizon, normal), larger(horizon, normal)
+        spread = limited((kappa - least) / larger(most - least, 1e-3), 0, 1)
+        return dr.select(self.reflects, dr.square(spread), 0.5 * (near + spread))
+
+    def propagates(self, tangent: mi.Vector2f) -> mi.Bool:
+        """Return whether the order at λq, as it is drawn, propagates."""
+        change = tangent.x * (2 * self.wi.x + tangent.x) + tangent.y * (2 * self.wi.y + tangent.y)
+        return self.square - change > 0
