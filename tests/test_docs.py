@@ -29,7 +29,7 @@ REDUCED = {
 }
 """Options that make a command quick, instead of those that it has."""
 SHOWN = {"text", "bash"}
-"""What is shown and not run: output, and what needs several machines (tests/test_cluster.py)."""
+"""What is shown and not run: output, and what needs several machines (tests/render/test_cluster.py)."""
 BY_OTHER_MEANS = (
     *("python3 -m venv", "python -m pytest", "pip install", "jupyter ", "mkdocs "),
     *("mitsuba-diffraction benchmark", "mitsuba-diffraction convergence", "mitsuba-diffraction validate"),

@@ -22,7 +22,7 @@ from mitsuba_diffraction.surface.gratings import (
     ruled,
 )
 
-RECIPES = Path(__file__).parents[1] / "precompute"
+RECIPES = Path(__file__).parents[2] / "precompute"
 DISCS = {"compact_disc": (compact_disc, 1.6, 0.833, 3.054), "dvd": (dvd, 0.74, 0.400, 1.866)}
 """Name → function, track pitch, shortest and longest pit but for sync codes' (3 and 11 channel bits; DVD: 14), µm."""
 

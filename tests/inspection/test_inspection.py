@@ -21,7 +21,7 @@ from mitsuba_diffraction.inspection.statistics import broadened, scanned, statis
 from mitsuba_diffraction.inspection.uncertainty import concerns
 from mitsuba_diffraction.scalar_theory import geometry, scalar_error
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 PERIOD, DEPTH = 2.0, 0.2
 """µm"""
 

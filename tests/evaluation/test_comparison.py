@@ -8,8 +8,8 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 import pytest
+from bsdf_support import made_up
 from PIL import Image
-from test_rigorous_bsdf import made_up
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction.color import delta_E, spectrum_to_XYZ

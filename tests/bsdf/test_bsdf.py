@@ -34,7 +34,7 @@ def spectrum(name, coherence_length=65.0, representation="auto"):
 
 
 def raw_plugin(of, **parameters):
-    """The plugin without E, which tests/test_energy.py examines."""
+    """The plugin without E, which tests/energy/test_energy.py examines."""
     return plugin(of, conserve_energy=False, **parameters)
 
 

@@ -7,12 +7,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from bsdf_support import check_chi_square, direction, evaluate, interaction, random_directions, use, vectors
+from bsdf_support import check_chi_square, direction, evaluate, interaction, made_up, random_directions, use, vectors
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction import testing
 from mitsuba_diffraction.geometry import horizon_gain
-from mitsuba_diffraction.rigorous.axes import Axes
 from mitsuba_diffraction.rigorous.efficiencies import mueller
 from mitsuba_diffraction.rigorous.spectrum import RigorousSpectrum
 from mitsuba_diffraction.scalar_theory import fresnel
@@ -42,18 +41,6 @@ def recipe_file(tmp_path_factory):
 @pytest.fixture(scope="module")
 def solved(recipe_file):
     return md.Recipe.load(recipe_file).cached()
-
-
-def made_up(coherence_length=65.0):
-    """A table of η that no solver knows, symmetric in P and R, of a grating with many orders; Σ η_m < 1."""
-    axes = Axes(1.7, (0.36, 0.83), 8, 5)
-    values = np.empty((axes.planes, axes.nodes), np.float32)
-    for m in range(-axes.largest, axes.largest + 1):
-        side, start = axes.side(m), axes.offset(m)
-        x = np.sin(0.2 * np.arange(side) + m) ** 2
-        square = (1 + np.add.outer(x, x)) * np.linspace(1, 2, axes.planes)[:, None, None] / (60 + 5 * m)
-        values[:, start : start + side**2] = square.reshape(axes.planes, -1)
-    return RigorousSpectrum(axes, values, "Al", 0j, coherence_length, 0.01, 0, 0, 0, 1, "made up", "")
 
 
 @pytest.fixture(scope="module", params=["solved", "made up", "made up, wide lobes"])
@@ -206,7 +193,7 @@ def test_surfaces_of_several_rows_are_refused(llvm):
 
 
 def test_the_rigorous_recipes_are_of_one_row():
-    found = sorted((Path(__file__).parents[1] / "precompute" / "rigorous").glob("*.toml"))
+    found = sorted((Path(__file__).parents[2] / "precompute" / "rigorous").glob("*.toml"))
     assert len(found) == 4
     for recipe in map(md.Recipe.load, found):
         assert recipe.height_field().shape[0] == 1
@@ -217,7 +204,7 @@ def test_the_rigorous_recipes_are_of_one_row():
 @pytest.mark.parametrize("name", ["dvd_grooves", "foil_one_direction", "ruled_1200"])
 def test_a_rigorous_recipe_keeps_its_tolerance(name):
     """Minutes each. `ruled_600` takes half an hour: what its table errs by is in precompute/README.md."""
-    spectrum = md.Recipe.load(Path(__file__).parents[1] / "precompute" / "rigorous" / f"{name}.toml").build()
+    spectrum = md.Recipe.load(Path(__file__).parents[2] / "precompute" / "rigorous" / f"{name}.toml").build()
     assert spectrum.error <= spectrum.tolerance == 1e-2
 
 

@@ -10,7 +10,7 @@ from mitsuba_diffraction import HeightField, gratings, rigorous
 from mitsuba_diffraction.evaluation.validation.coupled_waves import PROFILES, cases
 from mitsuba_diffraction.scalar_theory import fresnel, profile_powers, scalar_orders
 
-SCATMECH = json.loads((Path(__file__).parent / "data" / "scatmech.json").read_text(encoding="utf-8"))
+SCATMECH = json.loads((Path(__file__).parents[1] / "data" / "scatmech.json").read_text(encoding="utf-8"))
 CONICAL = np.array([-0.3, 0.35, 0.887])
 
 

@@ -16,7 +16,7 @@ from mitsuba_diffraction.evaluation.validation import analytic, conservation, co
 from mitsuba_diffraction.evaluation.validation.checks import checks, scalar_range, surface_checks
 from mitsuba_diffraction.evaluation.validation.record import Check, Record
 
-PRECOMPUTE = Path(__file__).parents[1] / "precompute"
+PRECOMPUTE = Path(__file__).parents[2] / "precompute"
 CHECKS = checks()
 
 
