@@ -1,4 +1,4 @@
-"""Everything there is to know about a surface before it is rendered."""
+"""Inspection of a surface before it is rendered."""
 
 from __future__ import annotations
 
@@ -59,11 +59,11 @@ class Inspection:
 
     @property
     def direction(self) -> float:
-        """Of the plane in which colours are shown: that of the main period, else x; degrees."""
+        """The direction, in degrees, of the plane in which colours are shown: that of the main period, else x."""
         return self.periods[0].direction if self.periods else 0.0
 
     def as_json(self) -> dict[str, object]:
-        """All numbers under their names, lengths in µm; what is not a number is None."""
+        """Return all numbers by name, lengths in µm; what is not a number is None."""
         rows, columns = self.height_field.shape
         return plain(
             {
@@ -93,7 +93,7 @@ def inspect(
     measured: bool = True,
     progress: Callable[[int, int], None] | None = None,
 ) -> Inspection:
-    """Look at a surface.
+    """Inspect a surface.
 
     Args:
         height_field: the surface.
@@ -157,7 +157,7 @@ def inspect(
 
 
 def _widened(field: HeightField) -> HeightField:
-    """A profile, which is uniform along its axis of one pixel, as a square."""
+    """Extend a profile along its axis of one pixel to a square."""
     for axis in (0, 1):
         if field.shape[axis] == 1 < field.shape[1 - axis]:
             count = min(field.shape[1 - axis], 256)

@@ -1,4 +1,4 @@
-"""How far colours can be trusted, and what stands in the way of a right picture.
+"""Uncertainty of the predicted colours, and reasons to distrust a picture.
 
 How far colours can be trusted: what ±5 % of the height scale, the pixel size and the tip's broadening change.
 """
@@ -32,7 +32,7 @@ ORDERS = (1, 2)
 
 @dataclass(frozen=True)
 class Change:
-    """What becomes of period and orders when one thing about the scan was different.
+    """Change of period and orders with one property of the scan.
 
     Attributes:
         what: "height scale", "pixel size" or "tip broadening".
@@ -55,7 +55,7 @@ class Change:
 
 @dataclass(frozen=True)
 class _View:
-    """A surface and how it is scaled."""
+    """A surface and its scale."""
 
     spectrum: GratingSpectrum
     period: float
@@ -72,7 +72,7 @@ def changes(
     measured: bool,
     build: Callable[[HeightField], GratingSpectrum],
 ) -> tuple[Change, ...]:
-    """Two of each kind, + and −; of the tip only if it is a scan.
+    """Compute two changes of each kind, + and −; of the tip only if the surface is a scan.
 
     A blunter and a sharper tip change a surface that is the same upside down, such as a sinusoid or a sawtooth, alike:
     one widens the ridges, the other the grooves, and h and −h have the same powers.
@@ -120,7 +120,7 @@ def changes(
 
 
 def _same_period(found: tuple[Period, ...], main: Period) -> float:
-    """The period that is nearest to the main one in direction, else the main one itself."""
+    """Return the period nearest to the main one in direction, else the main one itself."""
 
     def apart(other: Period) -> float:
         return abs((other.direction - main.direction + 90) % 180 - 90)
@@ -142,7 +142,7 @@ def _share(view: _View, main: Period, order: int) -> float:
 
 
 def _XYZ(view: _View, main: Period, order: int, period: float) -> NDArray[np.float64]:
-    """XYZ, not negative, of what is seen at normal incidence in the direction in which `period` sends 550 nm."""
+    """Return non-negative XYZ at normal incidence in the direction to which `period` diffracts 550 nm."""
     light = radiance(
         view.spectrum,
         main.direction,
@@ -174,7 +174,7 @@ def concerns(
     measured: bool,
     scalar: ScalarError,
 ) -> tuple[str, ...]:
-    """Sentences, none if all is well.
+    """Return concerns about the surface as sentences; none if all is well.
 
     Args:
         height_field: the surface.
@@ -229,7 +229,7 @@ def concerns(
 
 
 def _share_at_limit(height_field: HeightField) -> float:
-    """The share of the phase's power at 450 nm and normal incidence beyond 0.8 of the Nyquist limit."""
+    """Return the share of the phase's power at 450 nm and normal incidence beyond 0.8 of the Nyquist limit."""
     phase = np.exp(1j * 4 * np.pi / _BLUE * height_field.centred)
     power = np.abs(np.fft.fft2(phase * hann(phase.shape))) ** 2
     outside = np.zeros(power.shape, bool)

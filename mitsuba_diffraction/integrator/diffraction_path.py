@@ -52,7 +52,7 @@ Gradients are those of `path` (forward) and `prb` (backward), and single rays (`
 
 
 def define() -> type:
-    """The plugin's class for the variant in force: its base class belongs to that variant."""
+    """Define the plugin class for the current variant, to which its base class belongs."""
     eye_class = eye_paths.define()
 
     class DiffractionPath(mi.SamplingIntegrator):
@@ -66,7 +66,7 @@ def define() -> type:
             self.path = nested_plugin("path", max_depth=self.max_depth, rr_depth=self.rr_depth)
 
         def parts(self, scene: mi.Scene, sensor: mi.Sensor) -> tuple[mi.SamplingIntegrator, LightPaths | None]:
-            """What traces from the eye, and what traces from the light; None where there are no such paths.
+            """Return the tracers of paths from the eye and from the light; None where there are no such paths.
 
             Raises:
                 ValueError: if the film takes samples beyond its edge.
@@ -149,7 +149,7 @@ def define() -> type:
 def put(
     film: mi.Film, block: mi.ImageBlock, position: mi.Point2f, wavelengths: mi.Spectrum, value: mi.Spectrum
 ) -> None:
-    """Adds to a block without adding to its weight."""
+    """Add to a block without adding to its weight."""
     if mi.has_flag(film.flags(), mi.FilmFlags.Special):
         block.put(position, film.prepare_sample(value, wavelengths, block.channel_count(), 0.0, 0.0))
     else:
@@ -157,7 +157,7 @@ def put(
 
 
 def _connects(sensor: mi.Sensor) -> bool:
-    """Whether points of the scene can be connected to a sensor: to `perspective` and `thinlens`."""
+    """Return whether points of the scene can be connected to a sensor: `perspective` and `thinlens`."""
     try:
         sensor.sample_direction(dr.zeros(mi.SurfaceInteraction3f), mi.Point2f(0.5))
     except RuntimeError as error:

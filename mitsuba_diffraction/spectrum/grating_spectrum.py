@@ -106,7 +106,7 @@ class GratingSpectrum:
 
     @property
     def representation(self) -> str:
-        """How the powers are stored: "taylor", "chebyshev", "svd" or "slices"."""
+        """The storage of the powers: "taylor", "chebyshev", "svd" or "slices"."""
         return self.table.representation
 
     @property
@@ -136,12 +136,12 @@ class GratingSpectrum:
 
     @property
     def reach(self) -> float:
-        """How far the lobe of an order is followed along each axis at least, in standard deviations σ_q."""
+        """The least truncation of the lobes of orders, in standard deviations σ_q."""
         return lobe_reach(TAIL_SHARE * self.tolerance)
 
     @property
     def lobes(self) -> tuple[LobeAxis, LobeAxis]:
-        """Where the lobes of the orders end along x and y.
+        """The truncation of the orders' lobes along x and y.
 
         Raises:
             RequestError: of a lattice of splines.
@@ -152,12 +152,12 @@ class GratingSpectrum:
 
     @property
     def neighbours(self) -> tuple[int, int]:
-        """How many nodes along x and y contribute at one q, to the tolerance."""
+        """The number of nodes along x and y that contribute at one q, to the tolerance."""
         return (self.lobes[0].count, self.lobes[1].count) if isinstance(self.grid, OrderGrid) else (3, 3)
 
     @property
     def words_per_evaluation(self) -> int:
-        """How many words of 32 bits of the table one evaluation of S reads."""
+        """The number of 32-bit words of the table that one evaluation of S reads."""
         return self.neighbours[0] * self.neighbours[1] * self.table.words_per_node
 
     @property
@@ -166,7 +166,7 @@ class GratingSpectrum:
         return self.table.nbytes / 1e6
 
     def powers(self, kappa: float) -> NDArray[np.float32]:
-        """The share of the reflected power of each node, (2 M_y + 1, 2 M_x + 1), in float32 as a renderer computes it.
+        """Return the share of the reflected power of each node, (2 M_y + 1, 2 M_x + 1), in float32 as a renderer does.
 
         Of orders, η_m(κ). Shares may be below zero: by the error, and as coefficients of splines.
 
@@ -176,7 +176,7 @@ class GratingSpectrum:
         return self.table.powers(float(self._checked(np.asarray(kappa, np.float64))))
 
     def evaluate(self, q: ArrayLike, kappa: ArrayLike) -> NDArray[np.float64]:
-        """S(q; κ) from the table.
+        """Evaluate S(q; κ) from the table.
 
         Args:
             q: (..., 2) cycles/µm, along x and y.
@@ -207,7 +207,7 @@ class GratingSpectrum:
         return kappa
 
     def energy_table(self) -> EnergyTable:
-        """Return what bounds the albedo by one; made at the first call unless it came with the file."""
+        """Return the table of E, which bounds the albedo by one; made at the first call unless the file has it."""
         with _computing:
             return self._energy
 
@@ -217,7 +217,7 @@ class GratingSpectrum:
 
     @cached_property
     def digest(self) -> str:
-        """SHA-256 of what a renderer needs of it: spectra that have one show the same."""
+        """SHA-256 of everything that a renderer needs: spectra of equal digest render alike."""
         content = hashlib.sha256()
         for f in fields(self):
             if f.name not in ("table", "energy", "source", "source_digest"):
@@ -227,7 +227,7 @@ class GratingSpectrum:
         return content.hexdigest()
 
     def save(self, path: str | os.PathLike[str], recipe: str = "") -> None:
-        """Write the spectrum as an OpenEXR file, whole or not at all; `recipe` is the digest of its `Recipe`.
+        """Write the spectrum as an OpenEXR file, atomically; `recipe` is the digest of its `Recipe`.
 
         Raises:
             OSError: if the file cannot be written.
@@ -247,7 +247,7 @@ class GratingSpectrum:
 
 
 def check_wavelengths(wavelengths: tuple[float, float]) -> None:
-    """Raises ValueError unless `wavelengths` is (shortest, longest) in nm."""
+    """Raise ValueError unless `wavelengths` is (shortest, longest) in nm."""
     try:
         shortest, longest = (float(w) for w in wavelengths)
     except (TypeError, ValueError):
@@ -257,7 +257,7 @@ def check_wavelengths(wavelengths: tuple[float, float]) -> None:
 
 
 def check_angle(largest_angle: float) -> None:
-    """Raises ValueError unless `largest_angle` is an angle from the normal in degrees."""
+    """Raise ValueError unless `largest_angle` is an angle from the normal in degrees."""
     if not 0 < largest_angle <= 90:
         raise RequestError(f"largest_angle: got {largest_angle!r}, wanted degrees from the normal, above 0, at most 90")
 
@@ -268,7 +268,7 @@ FORMAT_VERSION = 6
 
 
 def save(spectrum: GratingSpectrum, path: str | os.PathLike[str], recipe: str = "") -> None:
-    """Write `spectrum` to `path`, whole or not at all; `recipe` is the digest of that from which it was built.
+    """Write `spectrum` to `path` atomically; `recipe` is the digest of its `Recipe`.
 
     Raises:
         OSError: if the file cannot be written.
@@ -302,7 +302,7 @@ def save(spectrum: GratingSpectrum, path: str | os.PathLike[str], recipe: str = 
 
 
 def load(path: str | os.PathLike[str], construct: Callable[..., Spectrum], recipe: str | None = None) -> Spectrum:
-    """Hand what `save` wrote to the constructor of a `GratingSpectrum`; errors as in `GratingSpectrum.load`."""
+    """Read what `save` wrote and build a `GratingSpectrum` from it; errors as in `GratingSpectrum.load`."""
     path = Path(path)
     header, channels = read(path, FORMAT, FORMAT_VERSION, recipe)
     if header.get("representation") not in _REPRESENTATIONS:

@@ -1,4 +1,4 @@
-"""The real-time shader on the same surfaces: what it reads, how fast it is, and how far its colours are off."""
+"""The real-time shader on the same surfaces: memory reads, speed, and error of its colours."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class ShaderSpeed:
 
 
 def shader_speeds(case: Case, exact: Exact, *, count: int = 1 << 14, repetitions: int = 3) -> list[ShaderSpeed]:
-    """Measures the shaders on a tile under the variant in force.
+    """Measure the shaders on a tile under the current variant.
 
     Args:
         case: the tile.

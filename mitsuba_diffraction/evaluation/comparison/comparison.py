@@ -26,7 +26,7 @@ SHARES_POINTS = 9
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """What a comparison found.
+    """Results of a comparison.
 
     Attributes:
         scene: file name.
@@ -78,7 +78,7 @@ def compare(
     shares_side: int = SHARES_SIDE,
     progress: Callable[[str], AbstractContextManager[Progress]] = no_progress,
 ) -> Comparison:
-    """Renders a scene with the path tracer and with the shader, under the variant in force, and compares.
+    """Render a scene with the path tracer and with the shader under the current variant, and compare.
 
     Args:
         scene_path: an XML scene whose integrator is a path tracer, with a directional or point light.

@@ -77,12 +77,12 @@ class Convergence:
     points: tuple[Point, ...]
 
     def curves(self) -> dict[str, list[Point]]:
-        """Points by name."""
+        """Group the points by name."""
         names = dict.fromkeys(point.name for point in self.points)
         return {name: [point for point in self.points if point.name == name] for name in names}
 
     def overtaken(self, name: str, error: str) -> float:
-        """When the path tracer's error falls below the least of a shader.
+        """Return the time at which the path tracer's error falls below the least error of a shader.
 
         Args:
             name: of the shader's curve.
@@ -118,7 +118,7 @@ def convergence(
     parameters: Mapping[str, str] | None = None,
     progress: Callable[[str], AbstractContextManager[Progress]] = no_progress,
 ) -> Convergence:
-    """Renders a scene in many ways, under the variant in force.
+    """Render a scene in many ways under the current variant.
 
     Args:
         scene_path: an XML scene with a parameter `tolerance` of its gratings, whose integrator is a path tracer, with a
@@ -181,12 +181,12 @@ def convergence(
 
 
 def rows(found: Convergence) -> list[list[str]]:
-    """The points under `COLUMNS`."""
+    """Return the points as rows of `COLUMNS`."""
     return [cells(COLUMNS, point) for point in found.points]
 
 
 def save_plot(found: Convergence, path: str | os.PathLike[str]) -> None:
-    """Draws both errors against time: down is more accurate, left is faster."""
+    """Plot both errors against time: down is more accurate, left is faster."""
     from matplotlib import colormaps
     from matplotlib.figure import Figure
 

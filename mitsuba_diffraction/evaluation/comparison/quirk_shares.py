@@ -1,4 +1,4 @@
-"""How much of the difference each peculiarity of the published shader makes."""
+"""The share of each quirk of the published shader in the difference."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class QuirkShares:
 
 
 def quirk_shares(pictures: Pictures, samples: int, shading_points: int, progress: Progress = silent) -> QuirkShares:
-    """Renders the shader with every single quirk corrected, and with every single quirk put in.
+    """Render the shader with each single quirk corrected, and with each single quirk added.
 
     Args:
         pictures: of a small size.
@@ -80,7 +80,7 @@ def quirk_shares(pictures: Pictures, samples: int, shading_points: int, progress
     white = white_luminance(references[0].xyz, pictures.surface)
 
     def distances(quirks: tuple[str, ...]) -> list[float]:
-        """To both references."""
+        """Compare with both references."""
         nonlocal done
         xyz = pictures.shaded(quirks, shading_points, samples).xyz
         done += 1

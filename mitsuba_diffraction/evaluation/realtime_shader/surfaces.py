@@ -17,7 +17,7 @@ from ...surface.heightfield import HeightField
 
 @runtime_checkable
 class ShadedGrating(Protocol):
-    """What the shader asks of a BSDF to shade it as a grating.
+    """The interface of a BSDF that the shader can shade as a grating.
 
     Attributes:
         height_scale: scales the heights.
@@ -36,13 +36,13 @@ class ShadedGrating(Protocol):
     reflectance: Callable[[mi.SurfaceInteraction3f, mi.Float, mi.Bool], mi.UnpolarizedSpectrum]
 
     def heights(self) -> tuple[HeightField, float]:
-        """The height field and its coherence length in µm; ValueError where they are not known."""
+        """Return the height field and its coherence length in µm; raise ValueError where they are not known."""
 
     def along_pattern(self, si: mi.SurfaceInteraction3f, omega: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:
-        """A direction of the shading frame, along the pattern's axes."""
+        """Rotate a direction of the shading frame to the axes of the pattern."""
 
     def transmitted(self, si: mi.SurfaceInteraction3f, cos_o: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
-        """(1 − R_i)(1 − R_o): what the surface lets through to the base and back."""
+        """Return (1 − R_i)(1 − R_o), the share transmitted to the base and back."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,16 +60,16 @@ class Surface:
     side: int
 
     def is_of(self, bsdf: mi.BSDF) -> mi.Bool:
-        """Whether a point has the BSDF of this surface."""
+        """Return whether a point has the BSDF of this surface."""
         return bsdf == mi.BSDFPtr(self.bsdf) if dr.is_jit_v(mi.Float) else mi.Bool(bsdf is self.bsdf)
 
     def holds(self, bsdf: mi.BSDF, wo: mi.Vector3f) -> mi.Bool:
-        """Whether a point with this BSDF, seen from ω_o, lies on this side of this surface."""
+        """Return whether a point with this BSDF, seen from ω_o, lies on this side of this surface."""
         return self.is_of(bsdf) & (self.side * wo.z > 0)
 
 
 def surfaces_of(scene: mi.Scene) -> list[Surface]:
-    """All gratings of a scene.
+    """Return all gratings of a scene.
 
     Raises:
         ValueError: if a grating is nested in a BSDF other than `twosided`, or is of rigorous theory.

@@ -52,7 +52,7 @@ class BRDFMap:
         return np.where(np.isnan(self.rgb), 0.5, on_screen(into_gamut(self.rgb) * self.exposure) / 255)
 
     def places_of_orders(self, nanometres: Array, orders: Array) -> tuple[Array, Array]:
-        """Where the grating equation with the published period puts the orders, in the map's x and y.
+        """Return the orders by the grating equation with the published period, in the map's x and y.
 
         The direction cosines of light and viewer along the diffracting axis add up to −nλ/d, across it to zero.
 
@@ -82,7 +82,7 @@ def brdf_map(
     side: int = 240,
     quirks: Quirks | None = None,
 ) -> BRDFMap:
-    """Evaluates a surface over the outgoing hemisphere under D65.
+    """Evaluate a surface over the outgoing hemisphere under D65.
 
     The model's relative reflectance, at every 5 nm, becomes XYZ and sRGB; the shader's variants give their own linear
     RGB. Each map has the exposure of its own that `color.auto_exposure` finds, and says it.
@@ -133,6 +133,6 @@ def _linear_rgb(surface: PublishedSurface, method: str, wi: Array, wo: Array, qu
 
 
 def _over_angle(cosines: Array, radius: Array) -> Array:
-    """Direction cosines (..., 2) of length `radius` → (θ cos φ, θ sin φ) in degrees."""
+    """Convert direction cosines (..., 2) of length `radius` to (θ cos φ, θ sin φ) in degrees."""
     theta = np.rad2deg(np.arcsin(np.minimum(radius, 1)))
     return cosines * np.divide(theta, radius, out=np.full_like(radius, np.rad2deg(1)), where=radius > 0)[..., None]

@@ -34,7 +34,7 @@ _EV_MICROMETRE = 1.239842
 
 
 def aluminium(wavelength: float) -> complex:
-    """n + ik of aluminium at a wavelength in µm by the Lorentz–Drude model of Rakić et al. (1998).
+    """Return n + ik of aluminium at a wavelength in µm by the Lorentz–Drude model of Rakić et al. (1998).
 
     The measurements reach farther into the infrared than Mitsuba's table does; where both hold they agree to 5 %.
     """
@@ -47,7 +47,7 @@ def aluminium(wavelength: float) -> complex:
 
 
 def right_angled(period: float, facet_angle: float, samples: int = 512) -> HeightField:
-    """One period, (1, samples), of two facets that meet at 90°; the wider rises along +x.
+    """Return one period, (1, samples), of two facets that meet at 90°; the wider rises along +x.
 
     Args:
         period: µm.
@@ -62,7 +62,7 @@ def right_angled(period: float, facet_angle: float, samples: int = 512) -> Heigh
 
 
 def littrow(period: float, facet_angle: float, wavelength: float, rigorous: bool) -> float:
-    """η₁ of unpolarised light that returns along its way, by rigorous or by scalar theory.
+    """Compute η₁ in the Littrow mount for unpolarised light, by rigorous or by scalar theory.
 
     Args:
         period, wavelength: µm.
@@ -95,7 +95,7 @@ class Fit:
 
 
 def measured(name: str) -> tuple[Real, Real]:
-    """Wavelengths in µm and η₁ of a grating of `LINES_PER_MM`, (n,) each.
+    """Return measured wavelengths in µm and η₁ of a grating of `LINES_PER_MM`, (n,) each.
 
     Raises:
         ValueError: if there is no such grating.
@@ -107,19 +107,19 @@ def measured(name: str) -> tuple[Real, Real]:
 
 
 def littrow_curve(name: str, facet_angle: float, wavelengths: Real, rigorous: bool) -> Real:
-    """η₁ of a grating of `LINES_PER_MM` at wavelengths in µm, (n,), as `littrow` has it."""
+    """Compute η₁ of a grating of `LINES_PER_MM` at wavelengths in µm, (n,), by `littrow`."""
     period = 1000 / LINES_PER_MM[name]
     return np.array([littrow(period, facet_angle, wavelength, rigorous) for wavelength in wavelengths])
 
 
 @functools.cache
 def stored_angles() -> dict[str, dict[str, float]]:
-    """Grating → "scalar" or "rigorous" → facet angle in degrees that `fit` found, by `precompute/ruled_fits.py`."""
+    """Return facet angles (degrees) found by `fit`, by grating and theory (`precompute/ruled_fits.py`)."""
     return json.loads(FITS.read_text(encoding="utf-8"))["facet angles"]
 
 
 def fit(name: str, rigorous: bool) -> Fit:
-    """The facet angle that fits a measured grating best in the mean square, by rigorous or by scalar theory.
+    """Fit the facet angle to a measured grating in the mean square, by rigorous or by scalar theory.
 
     Rigorous: up to a minute.
 
