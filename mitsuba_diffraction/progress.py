@@ -69,9 +69,9 @@ def progress_bar(label: str, unit: str = "", begin: str = "") -> Iterator[Callab
     Bars may be opened inside of others, and on other threads: a terminal then shows one below the other.
 
     Args:
-        label: what is done.
-        unit: of what is counted.
-        begin: what is done before anything can be counted.
+        label: name of the computation.
+        unit: of the count.
+        begin: message until something can be counted.
     """
     if err.is_jupyter:
         with _notebook_line(label, unit) as show:

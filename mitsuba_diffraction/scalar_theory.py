@@ -39,7 +39,7 @@ MAP = STORED.with_name("scalar_error.json")
 
 INDEX = 1.5
 ANGLES = (0.0, 20.0, -20.0)
-"""Degrees of incidence for which the error of a surface is told; the map is the same for ±20°."""
+"""Degrees of incidence for which the error of a surface is reported; the map is the same for ±20°."""
 
 WAVELENGTHS = (0.45, 0.55, 0.65)
 """µm."""
@@ -256,9 +256,9 @@ class ScalarError:
     """The error of scalar theory for one surface: the mean over `ANGLES` and `WAVELENGTHS`, for n = 1.5.
 
     Attributes:
-        share: Σ|Δη_m| relative to the reflected power; infinite where rigorous results do not reach (depths above 2 λ).
+        share: Σ|Δη_m| relative to the reflected power; infinite beyond the rigorous results (depths above 2 λ).
         estimated: from the stored map, good to a factor of `ESTIMATE_FACTOR`; otherwise solved for the surface itself.
-        remedy: what takes the place of scalar theory for this surface.
+        remedy: the alternative to scalar theory for this surface.
     """
 
     share: float

@@ -43,7 +43,7 @@ def vectors(omega: ArrayLike) -> mi.Vector3f:
 def floats(values: ArrayLike) -> mi.Float:
     """Convert (n,) or a number to floats of Mitsuba; n = 1 in scalar variants.
 
-    A copy that is neither a literal nor where NumPy happens to have it: the same kernel serves the next one.
+    The copy is neither a literal nor NumPy's own memory, so that the next call reuses the kernel.
     """
     values = np.atleast_1d(np.asarray(values, np.float32))
     if not dr.is_jit_v(mi.Float):
@@ -93,10 +93,10 @@ def evaluate_pdf(
     As many wavelengths are evaluated at once as a ray has (four); the last group is filled up by repetition.
 
     Args:
-        bsdf: of the variant in force, which is a spectral one.
+        bsdf: of the current variant, which is a spectral one.
         wi, wo: ω_i and ω_o, (..., 3) along dp_du, dp_dv and the normal.
         wavelengths: (..., c) in nm.
-        context: what of the BSDF; all by default.
+        context: the components of the BSDF; all by default.
         uv: (..., 2).
 
     Returns:
@@ -154,11 +154,11 @@ def sample(
     """Sample a BSDF in vectorised variants.
 
     Args:
-        bsdf: of the variant in force.
+        bsdf: of the current variant.
         wi: ω_i, (n, 3), for one sample each.
         wavelengths: (c,) or (n, c) in nm, as many as a ray has.
         seed: of the random numbers.
-        context: what of the BSDF; all by default.
+        context: the components of the BSDF; all by default.
         uv: (n, 2) or (2,).
 
     Returns:

@@ -1,11 +1,11 @@
 """Predicted colours: against the viewing angle, and the share and the colour of single orders.
 
 All in the plane of incidence that holds the wave vector of the main period, for a surface that reflects all wavelengths
-alike (R = 1), under daylight (D65), without the bound on energy E:
+alike (R = 1), under daylight (D65), without the energy factor E:
 
     L(λ) ∝ D65(λ) K G S(q e; κ)/λ² · cos θ_i,    q = (sin θ_i − sin θ_o)/λ,    κ = 2π (cos θ_i + cos θ_o)/λ
 
-Angles are positive on the far side from the light: the mirror direction is θ_o = θ_i.
+Angles are positive on the side opposite to the light: the specular direction is θ_o = θ_i.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ def radiance(
 ) -> Array:
     """Compute L(λ), which the docstring of this module defines.
 
-    Scaled heights are another κ, S(q; s κ). A surface that is wider by s has the spectrum s² S(s q; κ), coherence
-    length scaled with it.
+    Heights scaled by s have the spectrum S(q; s κ). A surface stretched by s has s² S(s q; κ), where the coherence
+    length is scaled as well.
 
     Args:
         spectrum: of the surface.

@@ -73,7 +73,7 @@ def statistics(height_field: HeightField, *, extent: str = "sample") -> Statisti
 def reference_plane(height_field: HeightField, extent: str) -> tuple[Array, tuple[float, float]]:
     """Return the plane to which heights refer, (N_y, N_x) µm, and its slopes along x and y.
 
-    Of a sample, the plane that fits best (least squares). A tile repeats, so that it is level on the whole.
+    For a sample, the least-squares plane; for a tile, which is periodic, a level one.
     """
     rows, columns = height_field.shape
     if extent == "tile":
@@ -121,8 +121,8 @@ def scanned(height_field: HeightField, radius: float, *, extent: str = "sample")
 def broadened(height_field: HeightField, share: float, *, extent: str = "sample") -> tuple[HeightField, float]:
     """Return the surface with ridges wider by `share`, and the radius (µm, signed) of the tip that widens them so.
 
-    How wide ridges are is told by the area above mid-height, half way between the mean of the heights above the average
-    and the mean of those below; the tip's radius is searched for with which it grows by `share` (shrinks, if negative).
+    The width of ridges is measured by the area above mid-height, half way between the mean of the heights above the
+    average and the mean of those below; a tip radius is sought for which it grows by `share` (shrinks, if negative).
 
     Raises:
         ValueError: if no tip does that: a flat surface.

@@ -17,14 +17,14 @@ PARAMETERS = (
     Parameter("rr_depth", "integer", "as in `path`: depth at which Russian roulette begins", "5"),
 )
 
-MANUAL = f"""A path tracer that also finds the light that gratings throw onto other surfaces.
+MANUAL = f"""A path tracer that also finds the light that gratings cast onto other surfaces.
 
 Parameters (XML or dictionary):
 {listed(PARAMETERS)}
 
-The picture converges to that of `path` with the same parameters. A path tracer meets a small or distant light by way of
-a grating only by chance, so that what gratings throw onto a wall is white specks. Those paths are traced from the light
-here, and all others from the eye.
+The picture converges to that of `path` with the same parameters. A path tracer hits a small or distant light via a
+grating only by chance, so that the light that gratings cast onto a wall appears as white specks. Those paths are traced
+from the light here, and all others from the eye.
 
 With L a light, G a vertex on a surface whose BSDF is or holds a `diffraction_grating` (whichever component of it
 scatters: both sides of `twosided`, all of a blend, the base), X a vertex on any other surface, and E the eye, the paths
@@ -34,7 +34,7 @@ scatters: both sides of `twosided`, all of a blend, the base), X a vertex on any
 are traced from the light if the vertex next to E scatters otherwise than as a perfect mirror or refraction does. So
 
     L G E, L G G E              from the eye: gratings alone
-    L G X E, L G G X E          from the light: what they throw onto a wall
+    L G X E, L G G X E          from the light: what they cast onto a wall
     L G X X E, L G M X E        from the light: that wall lights another one; M is a mirror or a pane of glass
     L G X G E, L G X M E        from the eye: that wall seen in a grating or a mirror
     L X G X E, L M G X E        from the eye: light that met another surface before the grating

@@ -22,7 +22,7 @@ class Gratings:
 
     Attributes:
         shapes: of the scene.
-        perturbed: whether the scene has a BSDF that turns the shading normal by itself, a normal or a bump map.
+        perturbed: whether the scene has a BSDF that perturbs the shading normal: a normal or a bump map.
     """
 
     def __init__(self, scene: mi.Scene) -> None:
@@ -162,8 +162,8 @@ def define() -> type:
 def carried(wavelengths: mi.Spectrum, throughput: mi.Spectrum) -> mi.Spectrum:
     """Return wavelengths for the rest of a path: the strongest replaces those without throughput.
 
-    A grating sends the wavelengths different ways. At the next one a direction would be drawn for any of the four, and
-    three of four paths would end. What stands in the place of a wavelength without throughput adds nothing.
+    A grating diffracts the wavelengths into different directions. At the next one a direction would be drawn for any of
+    the four, and three of four paths would end. A replaced wavelength has no throughput and adds nothing.
     """
     strongest, most = wavelengths[0], throughput[0]
     for wavelength, power in zip(wavelengths, throughput, strict=True):

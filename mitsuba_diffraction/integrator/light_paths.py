@@ -32,10 +32,10 @@ class Splats:
 class SplatBuffer:
     """A buffer for the contributions of paths, any number of each, from inside a recorded loop.
 
-    Threads fill it in any order; what comes out is sorted by path and vertex.
+    Threads fill it in any order; `content` is sorted by path and vertex.
 
     Attributes:
-        capacity: what is beyond is only counted.
+        capacity: contributions beyond it are only counted.
     """
 
     def __init__(self, capacity: int) -> None:

@@ -92,7 +92,7 @@ class Accumulation:
             s² = (Σ_p n_p y_p² − (Σ_p n_p y_p)²/N) / (P − 1),
 
         and the relative error of a pixel is (s/√N) / (Σ_p n_p y_p/N). The mean square over all pixels is not useful
-        where a lamp is seen by way of two gratings: it is dominated by fireflies and does not fall for hours. With few
+        where a lamp is seen via two gratings: it is dominated by fireflies and does not fall for hours. With few
         passes the percentile is biased upwards by the variance of s².
 
         Returns:

@@ -1,12 +1,12 @@
 """The precomputed power spectrum S(q; κ) of the phase e^{iκh} of a surface, and its file.
 
-A grating spectrum as an OpenEXR file: float32, ZIP, one part, one pixel per diffraction order or node.
+The file is OpenEXR: float32, ZIP, one part, one pixel per diffraction order or node.
 
 Channels are named after what they hold. Series: `B{t^003}` (taylor), `B{T_003}` (chebyshev), `B{mode 003}` (svd), the
 terms B_n of S = Σ g_n(κ) B_n; "slices": `S(012.2)`, the coefficient of t² on interval 12 of κ. Rows
 are orders m_y, columns m_x, from −M to M. Numbers in the header are double precision. `energy` is JSON: the table of
-`energy/table.py`. `contentSha256` covers every byte of the file, so that a damaged one is
-known as such.
+`energy/table.py`. `contentSha256` covers every byte of the file and
+reveals damage.
 """
 
 from __future__ import annotations
@@ -48,17 +48,17 @@ class GratingSpectrum:
         extent: "tile": the patch repeats for ever; "sample": it is a piece of a larger, irregular surface.
         pixel_size: (x, y) of the height field, µm.
         height_range: of the height field, µm.
-        coherence_length: L_c in µm; it sets the width σ_q of each order. Of a sample: what the scan carries.
+        coherence_length: L_c in µm; it sets the width σ_q of each order. Of a sample: at most what the scan supports.
         wavelengths: (shortest, longest) in nm for which the table holds.
-        tolerance: the bound that was asked for.
-        error: what was measured: max over κ of ∫|S_approx − S_exact| dq over the frequencies that light can reach.
-        source: where the heights came from.
+        tolerance: the requested bound.
+        error: the measured one: max over κ of ∫|S_approx − S_exact| dq over the frequencies that light can reach.
+        source: origin of the heights.
         source_digest: SHA-256 of the height field.
         largest_angle: in degrees from the normal, of both directions, for which the table holds.
         dropped: the largest share of the power, over κ, in weak frequencies that were not kept; part of `error`.
         beyond: the largest share of the power, over κ, at frequencies that no pair of directions reaches, or that the
             pixels do not resolve.
-        patches: of how many draws of an irregular surface it is the mean.
+        patches: number of draws of an irregular surface that are averaged.
         scatter: of a sample, its `standard_error`; None of a tile.
         energy: the table that bounds the albedo, if it came with the file; else `energy_table` makes it.
     """

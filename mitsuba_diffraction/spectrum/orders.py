@@ -17,8 +17,8 @@ class LobeAxis:
     """Truncation of an order's lobe along one axis.
 
     Attributes:
-        count: how many lobes overlap at one q.
-        half_width: |q − m/T| up to which the order m holds, cycles/µm; infinite where all orders hold everywhere.
+        count: number of lobes that contribute at one q.
+        half_width: |q − m/T| up to which the order m contributes, cycles/µm; infinite if all contribute everywhere.
         inside: the share of the Gaussian within `half_width`, by which it is divided.
     """
 
@@ -116,8 +116,8 @@ class OrderGrid:
     def lobes(self, lobe_width: float, reach: float) -> tuple[LobeAxis, LobeAxis]:
         """Return the truncation of lobes of width σ_q (cycles/µm) along x and y: at `reach`·σ_q or further.
 
-        Orders that stand apart end there. Where several hold at one q, it is always the same number of them, the
-        nearest: each ends at so many half spacings. Where more would hold than there are, none ends.
+        Separate lobes are truncated there. Where lobes overlap, the same number of them, the nearest, contributes at
+        every q: each is truncated at that many half spacings. If more overlap than there are orders, none is truncated.
         """
         result = []
         for size, largest in zip(self.tile_size, self.largest, strict=True):

@@ -156,7 +156,7 @@ class SamplePowers:
     come from one transform of it, and S itself can be had at any other lattice exactly, which measures their error.
 
     Attributes:
-        grid: all nodes whose splines hold where light reaches and the pixels resolve.
+        grid: all nodes whose splines overlap the frequencies that light reaches and the pixels resolve.
     """
 
     def __init__(self, height_field: HeightField, coherence_length: float, spacing: float, reach: float) -> None:
@@ -243,7 +243,7 @@ def standard_error(height_field: HeightField, *, coherence_length: float, larges
 
     Args:
         height_field: the scan.
-        coherence_length: in µm, that the scan carries.
+        coherence_length: in µm, supported by the scan.
         largest_kappa: κ up to which S is wanted, rad/µm.
         reach: largest |q_x| and |q_y| that light reaches, cycles/µm.
     """

@@ -2,7 +2,7 @@
 
 S holds κ only in e^{iκu}, u = h(x) − h(x′) the differences in height, |u| ≤ R. With κ = κ_c (1 + t), κ_c = κ_max/2 and
 −1 ≤ t ≤ 1, every expansion of e^{iκ_c t u} in t is one of S, with real terms; it holds for the average ⟨·⟩ over places
-as well, which an expansion of the amplitude does not. The g_n are polynomials in t. x = κ_c R = κ_max H decides how
+as well, which an expansion of the amplitude does not. The g_n are polynomials in t. x = κ_c R = κ_max H determines how
 many are needed.
 
 `taylor`, `chebyshev` and `svd` return all the functions that J Chebyshev nodes κ_j allow, and a projection, (N, J):
@@ -61,10 +61,10 @@ class Series:
 def taylor(largest_kappa: float, nodes: int) -> tuple[Series, NDArray[np.float64]]:
     """Return g_n = tⁿ and B_n = F{(iκ_c u)ⁿ/n! · e^{iκ_c u}}, the series of e^{iκ_c t u} about the middle of all κ.
 
-    It is the way of Stam's diffraction shaders (Stam 1999) and of the shader after them. The derivatives of e^{ix} have
-    modulus one, so what N terms leave out is of the order of x^N/N! with x = κ_c R (Lagrange). The terms grow to about
-    e^x before they shrink, and so do their rounding errors: in float32 the series is lost for surfaces deeper than
-    about half a micrometre.
+    This is the expansion of Stam's diffraction shaders (Stam 1999) and their successors. The derivatives of e^{ix} have
+    modulus one, so that the remainder after N terms is of the order of x^N/N! with x = κ_c R (Lagrange). The terms grow
+    to about e^x before they shrink, and so do their rounding errors: in float32 the series fails for surfaces deeper
+    than about half a micrometre.
 
     Args:
         largest_kappa: κ_max in rad/µm.

@@ -18,7 +18,7 @@ class TilePowers:
     """η_m(κ) on an order grid, from one transform of the tile.
 
     Attributes:
-        grid: the orders of which a lobe, or a part of it, lies where light reaches.
+        grid: the orders whose lobes overlap the frequencies that light reaches.
         own_error: Σ_m |Δη_m|, the largest error of these powers themselves.
     """
 
@@ -65,7 +65,7 @@ class TileSplines:
     of A projects the lobe of one order.
 
     Attributes:
-        grid: all nodes whose splines hold where light reaches.
+        grid: all nodes whose splines overlap the frequencies that light reaches.
     """
 
     # Nodes beyond the grid, so that what lies there is not projected on its last ones.

@@ -58,7 +58,7 @@ class Picture:
 
 
 class Pictures:
-    """The pictures of a scene at one size, under the variant in force.
+    """The pictures of a scene at one size, under the current variant.
 
     Attributes:
         scene: Mitsuba's.

@@ -116,7 +116,7 @@ def _tracks(m: int) -> Record:
     middle = c[20, 20]
     expected = np.abs((m == 0) + middle * data().mean() * _box(WIDTH, m / TRACK) / TRACK) ** 2
     # The mean over the piece differs from the mean by a number of variance S/A; half of it is along the field. Of the
-    # light that varies, a band B holds A·B independent speckles.
+    # incoherent part, a band B holds A·B independent speckles.
     size = _size()
     noise = np.hypot(
         2 * np.sqrt(expected * between[20, 20] / 2 / size), between.sum() * area / np.sqrt(size * (10 * sigma) ** 2)

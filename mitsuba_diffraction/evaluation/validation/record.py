@@ -76,7 +76,7 @@ class Check:
 
     Attributes:
         group, name, source: as of `Record`.
-        measure: measures under Mitsuba's variant in force; its record lacks these three.
+        measure: measures under the current variant of Mitsuba; its record lacks these three.
         slow: takes more than three seconds.
     """
 

@@ -117,7 +117,7 @@ def _microfacets(angle: float) -> Record:
     """Compare a rough profile with `roughconductor`, Beckmann distribution; K S/λ² is D/(4 cos θ_i cos θ_o) there.
 
     In the plane of incidence, bands of the half vector's slope out to one and a half rms slopes, on both sides of the
-    mirror direction. Both are perfect mirrors. No facet hides another there: G is one in both models; E is left out.
+    specular direction. Both are perfect mirrors. No facet hides another there: G is one in both models; E is left out.
     `roughconductor` gets along y the width that the coherence length gives the lobe.
     """
     rms, correlation = LARGE

@@ -92,7 +92,7 @@ class ReflectanceMap:
         incidence: θ_i in degrees.
         wavelengths: (n,) nm.
         angles: θ_r in degrees: (m,), or (n, m) where a method has directions of its own for each wavelength (nmm;
-            NaN where it has fewer). −θ_i is the mirror direction.
+            NaN where it has fewer). −θ_i is the specular direction.
         reflectance: (n, m), a flat mirror at normal incidence being one; NaN where the angle is.
     """
 
