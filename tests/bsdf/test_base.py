@@ -67,7 +67,7 @@ pytestmark = pytest.mark.usefixtures("llvm")
 
 @pytest.mark.few(2)
 @pytest.mark.parametrize("name", sorted(SMOOTH))
-def test_value_is_the_grating_and_what_it_lets_through(name):
+def test_value_is_the_sum_of_the_grating_and_the_transmitted_base(name):
     rng = np.random.default_rng(3)
     wo, uv = random_directions(rng, 500), rng.random((500, 2))
     wi = random_directions(rng, 500)
@@ -80,7 +80,7 @@ def test_value_is_the_grating_and_what_it_lets_through(name):
 
 @pytest.mark.few(1)
 @pytest.mark.parametrize("name", sorted(SMOOTH))
-def test_weight_is_value_over_density_and_its_mean_the_albedo(name):
+def test_weights_are_value_over_density_and_average_to_the_albedo(name):
     bsdf, wi, count, uv = over(SMOOTH[name]()), direction(40, 30), 1 << 17, (0.3, 0.4)
     bs, weight = draw(bsdf, wi, count, uv=[uv])
     wo = np.array(bs.wo).T
@@ -151,18 +151,18 @@ def test_mirror_lobes_pass_the_surface_twice(name):
     ],
     ids=lambda base: base["type"],
 )
-def test_what_lets_light_through_is_refused(base):
+def test_a_transmissive_base_is_refused(base):
     with pytest.raises((RuntimeError, ValueError), match="base: got a BSDF that lets light through"):
         over(base)
 
 
-def test_what_is_no_bsdf_is_refused():
+def test_a_base_that_is_no_bsdf_is_refused():
     with pytest.raises((RuntimeError, ValueError), match="base"):
         over(uniform(0.5))
 
 
 @pytest.mark.slow
-def test_flags_and_components_are_those_of_both():
+def test_flags_and_components_are_those_of_grating_and_base():
     flags = mi.BSDFFlags
     for name, base in (*SMOOTH.items(), *MIRRORS.items()):
         nested, bsdf = mi.load_dict(base()), over(base())
@@ -187,7 +187,7 @@ def contexts():
     return result
 
 
-def test_each_part_can_be_asked_for():
+def test_components_can_be_evaluated_separately():
     bsdf, wi = over(DIFFUSE), direction(40, 30)
     rng = np.random.default_rng(4)
     wo = random_directions(rng, 200)
@@ -211,7 +211,7 @@ def test_each_part_can_be_asked_for():
 
 @pytest.mark.parametrize("theta", [0, 30, 60, 85])
 @pytest.mark.parametrize("reflectance", [0.02, 0.5])
-def test_samples_are_shared_as_the_light_is(theta, reflectance):
+def test_samples_are_split_in_proportion_to_power(theta, reflectance):
     def fraction(bsdf):
         _, weight = draw(bsdf, direction(theta, 30), 1 << 16)
         w = weight.mean(0)
@@ -226,7 +226,7 @@ def test_samples_are_shared_as_the_light_is(theta, reflectance):
         assert found > 0.93
 
 
-def test_texture_steers_the_samples():
+def test_samples_follow_a_textured_base():
     bsdf = over(SMOOTH["checkerboard"]())
     shares = []
     for uv in ((0.2, 0.2), (0.7, 0.2)):
@@ -239,7 +239,7 @@ def test_texture_steers_the_samples():
 @pytest.mark.parametrize("theta", [0, 70, 89, *(pytest.param(x, marks=pytest.mark.slow) for x in (30, 45, 80, 85))])
 @pytest.mark.parametrize("base", [{"type": "diffuse", "reflectance": uniform(1.0)}, {"type": "conductor"}])
 @pytest.mark.parametrize("name", ["blazed", "deep blazed", "elaphe"])
-def test_nothing_reflects_more_than_it_receives(name, base, theta):
+def test_the_albedo_with_a_base_is_at_most_one(name, base, theta):
     count = 1 << 16
     _, weight = draw(over(base, name, 65.0), direction(theta, 30), count)
     assert weight.mean() > 0.2
@@ -266,7 +266,7 @@ def values_and_samples(base, wi):
 
 @pytest.mark.few(1)
 @pytest.mark.parametrize("base", OTHERS)
-def test_polarised_variants_give_the_same(base):
+def test_polarised_variants_agree_with_the_unpolarised(base):
     wi = direction(40, 30)
     wanted = values_and_samples(base, wi)
     use("llvm_ad_spectral_polarized")
@@ -290,7 +290,7 @@ def test_polarised_variants_give_the_same(base):
 
 
 @pytest.mark.parametrize("base", OTHERS)
-def test_scalar_variants_give_the_same(base):
+def test_scalar_variants_agree_with_the_vectorised(base):
     wi = direction(40, 30)
     values, pdfs, *samples = values_and_samples(base, wi)
     use("scalar_spectral")

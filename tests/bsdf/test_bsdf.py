@@ -83,7 +83,7 @@ def test_flat_surface_gives_a_gaussian_about_the_mirror_direction(llvm):
 @pytest.mark.few(2)
 @pytest.mark.parametrize("name", ["blazed", "sinusoidal"])
 @pytest.mark.parametrize(("theta", "phi"), [(0, 0), (30, 0), (45, 70)])
-def test_orders_have_their_power_and_nothing_lies_between(llvm, name, theta, phi):
+def test_orders_have_their_powers_and_the_gaps_are_dark(llvm, name, theta, phi):
     bsdf, wi = raw_plugin(spectrum(name)), direction(theta, phi)
     for channel, wavelength in enumerate(WAVELENGTHS):
         orders = np.arange(-6, 7)
@@ -98,7 +98,7 @@ def test_orders_have_their_power_and_nothing_lies_between(llvm, name, theta, phi
 
 
 @pytest.mark.quick
-def test_blaze_goes_to_the_side_that_its_facets_mirror(llvm):
+def test_a_blaze_reflects_to_the_side_of_its_facets(llvm):
     wi = direction(0)
     wo = towards(wi, np.array([[0.4, 0], [-0.4, 0]]), 500)
     assert wo[0, 0] < 0
@@ -124,7 +124,7 @@ def test_dielectric_is_fresnel_at_the_half_vector(llvm):
         assert (ratio < 1).all()
 
 
-def test_orientation_turns_the_pattern(llvm):
+def test_orientation_rotates_the_pattern(llvm):
     wi = direction(0)
     wo = towards(wi, np.array([[0.4, 0], [0, 0.4]]), 500)
     along_x, along_y = evaluate(raw_plugin(spectrum("blazed"), orientation=90.0), wi, wo)[0][:, 1]
@@ -141,7 +141,7 @@ def test_orientation_turns_the_pattern(llvm):
 
 
 @pytest.mark.slow
-def test_reciprocity(llvm):
+def test_the_bsdf_is_reciprocal(llvm):
     bsdf = raw_plugin(spectrum("crossed", 3.0), int_ior=1.5)
     rng = np.random.default_rng(2)
     wi = random_directions(rng, 2000, 0.1)
@@ -158,7 +158,7 @@ def test_reciprocity(llvm):
 @pytest.mark.few(2)
 @pytest.mark.parametrize("representation", ["taylor", "slices"])
 @pytest.mark.parametrize("name", sorted(MAKE))
-def test_any_directions_give_finite_values(llvm, name, representation):
+def test_values_are_finite_for_any_directions(llvm, name, representation):
     bsdf = plugin(spectrum(name, representation=representation))
     rng = np.random.default_rng(3)
     wi, wo = random_directions(rng, 10_000), random_directions(rng, 10_000)
@@ -313,7 +313,7 @@ def test_other_variants_give_the_same_values(variant):
         np.testing.assert_allclose(np.array(pdf).ravel(), wanted_pdf[index], rtol=1e-3)
 
 
-def test_base_receives_what_the_surface_lets_through(llvm):
+def test_the_base_receives_the_transmitted_light(llvm):
     wi = direction(35, 10)
     wo = np.concatenate([random_directions(np.random.default_rng(5), 50, 0.05), wi[None] * [-1, -1, 1]])
     base = {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.5}}

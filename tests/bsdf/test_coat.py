@@ -37,7 +37,7 @@ def transmittance(cosine):
 
 @pytest.mark.few(1)
 @pytest.mark.parametrize("theta", [0.0, 25.0, 50.0])
-def test_orders_have_the_powers_of_the_closed_form_inside(llvm, theta):
+def test_orders_inside_the_coat_have_the_powers_of_the_closed_form(llvm, theta):
     wavelength, wi = 0.5, direction(theta)
     bsdf = coated("lamellar", coherence_length=200.0)
     sigma, energy = bsdf.spectrum.lobe_width, bsdf.spectrum.energy_table()
@@ -63,7 +63,7 @@ def test_orders_have_the_powers_of_the_closed_form_inside(llvm, theta):
 
 
 @pytest.mark.slow
-def test_a_coat_of_air_is_none(llvm):
+def test_a_coat_of_air_changes_nothing(llvm):
     rng = np.random.default_rng(0)
     wi, wo = random_directions(rng, 200), random_directions(rng, 200)
     plain = {"coat_ior": AIR, "material": "Al"}
@@ -74,7 +74,7 @@ def test_a_coat_of_air_is_none(llvm):
 
 
 @pytest.mark.parametrize("material", [{"material": "none"}, {"material": "Al"}, {"int_ior": 1.8}])
-def test_reciprocal(llvm, material):
+def test_a_coated_grating_is_reciprocal(llvm, material):
     rng = np.random.default_rng(1)
     wi, wo = random_directions(rng, 500, 0.1), random_directions(rng, 500, 0.1)
     bsdf = coated(**material)
@@ -86,7 +86,7 @@ def test_reciprocal(llvm, material):
 
 @pytest.mark.parametrize("theta", [0, 45, 75, 88])
 @pytest.mark.parametrize("turned", [0, 70])
-def test_the_front_face_reflects_as_fresnel_says_and_no_light_is_gained(llvm, theta, turned):
+def test_the_front_face_follows_fresnel_and_no_light_is_gained(llvm, theta, turned):
     wi = np.broadcast_to(direction(theta, turned), (100_000, 3))
     bsdf = coated()
     wo, weight, bs = testing.sample(bsdf, wi, [550] * 4)
@@ -154,7 +154,7 @@ def test_a_scalar_variant_divides_by_no_zero():
             assert np.isfinite([bs.pdf, *np.ravel(weight)]).all()
 
 
-def test_light_that_enters_along_s_passes_as_s():
+def test_s_polarised_light_stays_s_polarised():
     """At oblique incidence in the plane of the grooves' normal s light stays s light."""
     use("llvm_ad_spectral_polarized")
     wi = direction(56.0)
@@ -177,7 +177,7 @@ def test_light_that_enters_along_s_passes_as_s():
         ({"base": {"type": "diffuse"}}, "base: got a BSDF below a conductor"),
     ],
 )
-def test_a_wrong_layer_is_refused(llvm, parameters, text):
+def test_a_wrong_coat_is_refused(llvm, parameters, text):
     with pytest.raises(RuntimeError, match=text):
         coated(**parameters)
 
@@ -195,7 +195,7 @@ def test_a_wrong_layer_is_refused(llvm, parameters, text):
         ),
     ],
 )
-def test_a_layer_of_the_index_of_the_outside_is_none(llvm, layer, without):
+def test_a_coat_with_the_exterior_index_changes_nothing(llvm, layer, without):
     found = coated(**layer)
     assert found.coat is None
     plain = {"type": "diffraction_grating", "profile": "blazed", "period": 2.5, "depth": 0.25, "coherence_length": 3.0}
@@ -204,7 +204,7 @@ def test_a_layer_of_the_index_of_the_outside_is_none(llvm, layer, without):
     np.testing.assert_allclose(values[0], values[1], rtol=1e-6 if "coat_ior" not in without else 0.02)
 
 
-def test_a_layer_without_an_index_or_without_its_wavelengths_is_refused(llvm):
+def test_a_coat_without_index_or_wavelengths_is_refused(llvm):
     plain = {"type": "diffraction_grating", "profile": "blazed", "period": 2.5, "depth": 0.25}
     with pytest.raises(RuntimeError, match="got a layer without coat_ior"):
         mi.load_dict({**plain, "coat_absorption": 0.1})

@@ -89,7 +89,7 @@ def check(shape, origin, towards, n, x, y, orientation=0.0, wrap=lambda nested: 
     np.testing.assert_allclose(found, wanted, rtol=0.02, atol=1e-3 * wanted[0])
 
 
-def test_corner_is_what_it_is_meant_to_be():
+def test_the_corner_blaze_rises_along_x_and_y():
     h = corner_blaze().heights
     assert (np.diff(h[0])[:-1] > 0).all()
     assert (np.diff(h[:, 0])[:-1] > 0).all()
@@ -153,7 +153,7 @@ def test_mirrored_mesh_keeps_its_handedness(tmp_path, factors):
     check(shape, place + 2 * n, -n, n, x, np.cross(n, x))
 
 
-def test_flipped_normals_turn_y():
+def test_flipped_normals_reverse_y():
     shape = {"type": "rectangle", "flip_normals": True}
     check(shape, (0.4, 0.2, -2), (0, 0, 1), (0, 0, -1), (1, 0, 0), (0, -1, 0))
 

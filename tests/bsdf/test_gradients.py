@@ -74,7 +74,7 @@ NUMBERS = {
 @pytest.mark.few(4)
 @pytest.mark.parametrize("mode", ["forward", "backward"])
 @pytest.mark.parametrize("case", sorted(NUMBERS))
-def test_derivative_by_a_number(case, mode):
+def test_the_derivative_by_a_number_is_that_of_differences(case, mode):
     key, at, step, parameters = NUMBERS[case]
     total = Total(key, **parameters)
     if key == "height_scale":
@@ -108,7 +108,7 @@ def energy_near(of, at, height_scale):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("at", [0.6, 0.8])
-def test_derivative_by_height_includes_the_energy_factor(at):
+def test_the_derivative_by_height_includes_the_energy_factor(at):
     total = Total("height_scale", name="deep blazed")
 
     def exact(value):
@@ -137,7 +137,7 @@ def test_derivative_by_height_includes_the_energy_factor(at):
 
 @pytest.mark.parametrize("key", ["eta.values", "k.values"])
 @pytest.mark.parametrize("fresnel", ["exact", "schlick"])
-def test_derivative_by_the_index_of_a_metal(key, fresnel):
+def test_the_derivative_by_the_index_of_a_metal_is_that_of_differences(key, fresnel):
     total = Total(key, material="Cu", fresnel=fresnel)
     start = np.array(total.parameters[key], np.float64)
     # 360 + i nm: at 500 nm only the entry 140 counts.
@@ -151,7 +151,7 @@ def test_derivative_by_the_index_of_a_metal(key, fresnel):
     np.testing.assert_allclose(found.sum(), found[140], rtol=1e-4)
 
 
-def test_derivative_by_a_texture_of_orientations():
+def test_the_derivative_by_a_texture_of_orientations_is_that_of_differences():
     start = np.random.default_rng(3).uniform(-3, 3, (3, 3, 1)).astype(np.float32)
     total = Total("orientation.data", orientation=bitmap(start))
     assert tuple(total.parameters["orientation.data"].shape) == start.shape
@@ -250,7 +250,7 @@ def scene(**parameters):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("key", "at", "step"), [("eta", 1.5, 0.05), ("height_scale", 0.7, 0.05)])
-def test_derivative_of_a_rendering(key, at, step):
+def test_the_derivative_of_a_rendering_is_that_of_differences(key, at, step):
     world = scene(name="sinusoidal", int_ior=1.5, base={"type": "diffuse", "reflectance": uniform(0.2)})
     parameters = mi.traverse(world)
     key = next(name for name in parameters.keys() if name.endswith(f".{key}"))  # noqa: SIM118 (not a dict)

@@ -145,7 +145,7 @@ def test_at_q_zero_and_small_kappa_every_surface_is_a_mirror(name, representatio
 @example(depth=5.0, shape=(9, 9), kind="svd", extent="sample", share=1.0, seed=0)
 # Regression: the splines of nodes beyond the Nyquist limit were missing.
 @example(depth=0.3, shape=(1, 13), kind="slices", extent="sample", share=0.9, seed=0)
-def test_any_surface_at_any_kappa(depth, shape, kind, extent, share, seed):
+def test_any_surface_is_right_at_any_kappa(depth, shape, kind, extent, share, seed):
     field = field_of(np.random.default_rng(seed).random(shape) * depth)
     coherence_length = 0.38
     spectrum = md.precompute(

@@ -41,7 +41,7 @@ def matrices(bsdf, wi, wo, mode=None):
 
 @pytest.mark.few(1)
 @pytest.mark.parametrize("mode", ["Radiance", "Importance"])
-def test_metal_as_rough_conductor(polarised, mode):
+def test_a_metal_polarises_as_a_rough_conductor(polarised, mode):
     mode = getattr(mi.TransportMode, mode)
     wi, wo = directions()
     rough = mi.load_dict({"type": "roughconductor", "material": "Au", "distribution": "beckmann", "alpha": 0.6})
@@ -84,7 +84,7 @@ def test_without_an_index_light_leaves_unpolarised(polarised, parameters):
 
 
 @pytest.mark.slow
-def test_straight_back(polarised):
+def test_retroreflection_has_a_finite_matrix(polarised):
     wi = np.array([[0.0], [0.0], [1.0]])
     assert np.isfinite(matrices(grating(int_ior=1.5), wi, wi)).all()
 

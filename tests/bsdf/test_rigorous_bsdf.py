@@ -96,7 +96,7 @@ def test_f_is_the_sum_over_the_orders(variant, spectrum):
     np.testing.assert_allclose(value[:, 0], wanted, rtol=5e-3, atol=1e-3 * wanted.max())
 
 
-def test_exchange_of_the_directions_changes_nothing(llvm, spectrum):
+def test_the_bsdf_is_reciprocal(llvm, spectrum):
     wi, wo = pairs(spectrum, 0.47)
     there, back = (
         testing.evaluate_pdf(plugin(spectrum), a, b, (470.0,) * 4)[0][:, 0] / b[:, 2] for a, b in ((wi, wo), (wo, wi))
@@ -106,7 +106,7 @@ def test_exchange_of_the_directions_changes_nothing(llvm, spectrum):
 
 
 @pytest.mark.parametrize("theta", [0, 40, 75, 88])
-def test_samples_carry_the_efficiencies_evenly(llvm, spectrum, theta):
+def test_samples_have_even_weights_that_average_to_the_efficiencies(llvm, spectrum, theta):
     wi = direction(theta, 30)
     for wavelength in (405.0, 470.0):
         _, weights, _ = testing.sample(plugin(spectrum), np.broadcast_to(wi, (100_000, 3)), (wavelength,) * 4, 1)
@@ -182,7 +182,7 @@ def test_files_recipes_and_profiles_give_the_same(llvm, solved, recipe_file, tmp
         ({"theory": "vector"}, "theory: got 'vector', wanted one of scalar, rigorous"),
     ],
 )
-def test_what_only_scalar_theory_has_is_refused(llvm, solved, parameters, text):
+def test_parameters_of_scalar_theory_are_refused(llvm, solved, parameters, text):
     with pytest.raises(RuntimeError, match=text):
         plugin(solved, **parameters)
 
@@ -248,7 +248,7 @@ def test_mueller_matrices_of_a_plane_are_mitsubas():
 
 
 @pytest.mark.slow
-def test_polarised_light_is_split_as_the_solver_has_it(solved):
+def test_polarised_light_is_split_as_by_the_solver(solved):
     """Conical incidence from all sides, of a pattern that is turned."""
     use("llvm_ad_spectral_polarized")
     surface, bsdf = md.gratings.blazed(0.3, 0.05, samples=64), plugin(solved, orientation=25.0)
@@ -329,7 +329,7 @@ def passed(theta, phi, wavelength):
 
 @pytest.mark.few(1)
 @pytest.mark.parametrize(("theta", "phi", "wavelength"), [(10, 20, 0.412), (50, 70, 0.45), (65, 0, 0.48)])
-def test_a_coat_lets_through_what_the_solver_sends_out(llvm, coated, theta, phi, wavelength):
+def test_a_coat_transmits_the_efficiencies_of_the_solver(llvm, coated, theta, phi, wavelength):
     wi = np.broadcast_to(direction(theta, phi), (40_000, 3))
     front, below = passed(theta, phi, wavelength)
     _, weights, _ = testing.sample(under_coat(coated), wi, (wavelength * 1e3,) * 4, 2)

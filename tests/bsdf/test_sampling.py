@@ -238,7 +238,7 @@ def effective_fraction(bsdf, theta, phi, draws, count):
     ],
 )
 @pytest.mark.parametrize("name", [pytest.param(x, marks=pytest.mark.slow if x in SKINS else ()) for x in BUNDLED])
-def test_effective_sample_fraction(llvm, name, theta, least, phi):
+def test_the_effective_sample_fraction_is_above_its_bound(llvm, name, theta, least, phi):
     fraction, largest = effective_fraction(plugin(bundled(name)), theta, phi, draws=4, count=1 << 15)
     assert fraction >= least
     assert largest < 20
@@ -358,7 +358,7 @@ def test_orders_are_drawn_with_their_shares_and_only_those_that_propagate(llvm, 
 
 
 @pytest.mark.parametrize("theta", [0, 40])
-def test_no_wavelength_draws_beyond_its_own_lobe(llvm, theta):
+def test_no_wavelength_is_sampled_beyond_its_own_lobe(llvm, theta):
     # Regression: lobes were drawn whole and evaluated truncated. What a short wavelength drew beyond its lobe of the
     # mirror order counted for longer ones: 800 nm reflected 5.8 % too much.
     spectrum = md.precompute(md.gratings.sinusoidal(2.5, 0.02), coherence_length=16.0, tolerance=0.1)
@@ -372,7 +372,7 @@ def test_no_wavelength_draws_beyond_its_own_lobe(llvm, theta):
 
 
 @pytest.mark.slow
-def test_many_orders_are_drawn_without_a_rectangle(llvm):
+def test_the_probabilities_of_many_orders_sum_to_one(llvm):
     spectrum = md.precompute(md.gratings.xenopeltis(16.0))
     sampler = OrderSampler(spectrum)
     assert not sampler.restricted
@@ -390,7 +390,7 @@ def test_orders_are_drawn_where_their_lobes_are_narrow_and_apart(llvm):
 
 @pytest.mark.parametrize("name", ["blazed", "column"])
 @pytest.mark.parametrize(("theta", "phi"), [(0, 0), (60, 90), (85, 250)])
-def test_of_a_line_grating_nearly_all_that_is_drawn_propagates(llvm, name, theta, phi):
+def test_nearly_all_samples_of_a_line_grating_propagate(llvm, name, theta, phi):
     s, wavelength = direction(theta, phi), 0.5
     incidence = Incidence.of(vectors(s), floats(1 / wavelength), mi.Float(1.0), None)
     sampler = LineSampler(blurred(name))
@@ -409,7 +409,7 @@ def test_a_mirror_with_wide_lobes_is_sampled(llvm):
 @pytest.mark.few(2)
 @pytest.mark.parametrize("variant", ["scalar_spectral", "llvm_ad_spectral_polarized"])
 @pytest.mark.parametrize("name", ["blazed", "crossed", pytest.param("elaphe", marks=pytest.mark.slow)])
-def test_other_variants_draw_the_same(variant, name):
+def test_other_variants_draw_the_same_samples(variant, name):
     count, wi = 40, direction(50, 25)
     use("llvm_ad_spectral")
     bs, weight = sampled(plugin(blurred(name), conserve_energy=False), wi, WAVELENGTHS, count)

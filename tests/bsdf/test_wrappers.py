@@ -137,7 +137,7 @@ def test_twosided_takes_another_grating_for_its_back():
 
 
 @pytest.mark.slow
-def test_blend_by_a_texture():
+def test_a_blend_follows_its_texture():
     weights = bitmap([[[0.1], [0.8]], [[0.1], [0.8]]])
     bsdf = mi.load_dict({"type": "blendbsdf", "weight": weights, "first": wide(), "second": DIFFUSE})
     wi, wo = direction(20, 10), random_directions(np.random.default_rng(4), 100)
@@ -159,7 +159,7 @@ TURNS = {
 
 @pytest.mark.few(1)
 @pytest.mark.parametrize("name", sorted(TURNS))
-def test_texture_turns_the_pattern(name):
+def test_a_texture_rotates_the_pattern(name):
     texture, angles = TURNS[name]
     bsdf = mi.load_dict(wide(orientation=texture()))
     assert bsdf.flags() & +mi.BSDFFlags.SpatiallyVarying
@@ -217,7 +217,7 @@ def test_picture_has_no_nan(name):
 
 
 @pytest.mark.slow
-def test_wrappers_stand_inside_each_other():
+def test_wrappers_can_be_nested():
     inner = {**WRAPPERS["normalmap"](), "nested": grating("elaphe", 26.0, int_ior=1.5, base=DIFFUSE)}
     bsdf = mi.load_dict({"type": "twosided", "nested": {"type": "mask", "opacity": 1.0, "nested": inner}}["nested"])
     si = interaction(direction(20), uv=UV)

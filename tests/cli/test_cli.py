@@ -146,7 +146,7 @@ def test_a_spectrum_cut_short_is_one_line(command):
     assert "blaze.exr" in err
 
 
-def test_precompute_writes_the_file_that_it_names_and_says_its_error(command):
+def test_precompute_writes_the_file_that_it_names_and_prints_its_error(command):
     Path("blaze.toml").write_text(BLAZE.replace("0.2", "0.25"))
     code, out, err = command("precompute blaze.toml --coherence-length 65")
     assert (code, err.strip()) == (0, "")
@@ -171,7 +171,7 @@ def test_precompute_writes_the_file_that_it_names_and_says_its_error(command):
 
 @pytest.mark.few(1)
 @pytest.mark.parametrize("representation", ["taylor", "chebyshev", "svd", "slices"])
-def test_a_sample_by_options(command, representation):
+def test_precompute_takes_a_sample_by_options(command, representation):
     code, out, err = command(
         "precompute wide.npy --pixel-size 0.09 --extent sample --largest-angle 60 --tolerance 0.02 -o out.exr "
         f"--representation {representation}"
@@ -197,7 +197,7 @@ def test_a_smaller_angle_takes_fewer_orders(command):
     assert md.GratingSpectrum.load("blaze.exr").largest_angle == 29.0
 
 
-def test_options_go_before_the_recipe(command):
+def test_options_override_the_recipe(command):
     Path("blaze.toml").write_text(BLAZE + '[spectrum]\ntolerance = 0.1\nrepresentation = "slices"\n')
     code, _, _ = command(
         "precompute blaze.toml -o out.exr --tolerance 0.02 --representation taylor --coherence-length 20"
@@ -207,7 +207,7 @@ def test_options_go_before_the_recipe(command):
     assert (spectrum.tolerance, spectrum.representation, spectrum.coherence_length) == (0.02, "taylor", 20.0)
 
 
-def test_scans_with_their_scale(command):
+def test_scans_are_read_with_their_scale(command):
     code, _, _ = command("precompute counts.npy --extent tile --pixel-size 0.05 --height-range 0.5 -o out.exr")
     assert code == 0
     spectrum = md.GratingSpectrum.load("out.exr")
@@ -243,20 +243,20 @@ def test_a_bare_scan_with_a_seam_wants_an_extent(command):
     assert "repeated as a tile; r.m.s. steps at the seam" in out
 
 
-def test_the_version_is_said(command):
+def test_the_version_is_printed(command):
     code, out, err = command("--version")
     assert (code, err) == (0, "")
     assert re.fullmatch(r"mitsuba-diffraction [\d.]+\S*, Mitsuba 3\.\S+\n", out)
 
 
-def test_help_says_the_defaults(command):
+def test_help_shows_the_defaults(command):
     for words in (("precompute", "default: auto"), ("precompute", "default: 0.001"), ("render", "or 64")):
         code, out, _ = command(words[0], "--help")
         assert code == 0
         assert words[1] in " ".join(re.sub(r"[│|]", " ", out).split())
 
 
-def test_work_without_a_terminal_says_lines(capfd):
+def test_progress_without_a_terminal_is_printed_in_lines(capfd):
     show = log_lines("scene.xml", first=0)
     show(3, 7)
     assert re.fullmatch(r"mitsuba-diffraction: scene.xml: 3 of 7, 0 s\n", capfd.readouterr().err)
@@ -264,7 +264,7 @@ def test_work_without_a_terminal_says_lines(capfd):
     assert capfd.readouterr().err == ""
 
 
-def test_many_sources_are_named_after_themselves(command):
+def test_spectra_of_many_sources_are_named_after_them(command):
     Path("other.toml").write_text(QUICK)
     code, out, _ = command("precompute", "blaze.toml", "other.toml")
     assert code == 0
@@ -274,7 +274,7 @@ def test_many_sources_are_named_after_themselves(command):
 
 @pytest.mark.few(2)
 @pytest.mark.parametrize("name", ["a[red]b.exr", "a[b]c.exr", "a:smile:.exr", "é ü.exr"])
-def test_the_name_that_is_said_is_the_name_of_the_file(command, name):
+def test_the_printed_name_is_that_of_the_file(command, name):
     # Regression: square brackets and words between colons were taken for markup.
     code, out, _ = command("precompute", "blaze.toml", "-o", name)
     assert code == 0
@@ -285,7 +285,7 @@ def test_the_name_that_is_said_is_the_name_of_the_file(command, name):
     assert name.replace(".exr", ".toml") in err
 
 
-def test_a_folder_whose_name_looks_like_markup_is_no_crash(command):
+def test_a_folder_whose_name_looks_like_markup_is_accepted(command):
     Path("dir[").mkdir()
     code, out, _ = command("precompute", "blaze.toml", "-o", "dir[/x].exr")
     assert code == 0
@@ -337,7 +337,7 @@ def broadcast(*arguments, **named):
     return np.zeros(2) + np.zeros(3)
 
 
-def test_a_mistake_of_the_code_is_told_as_such(command, monkeypatch):
+def test_a_bug_is_reported_as_such(command, monkeypatch):
     monkeypatch.setattr("mitsuba_diffraction.recipe.precompute", broadcast)
     code, out, err = command("precompute", "blaze.toml")
     assert (code, out) == (1, "")
@@ -349,7 +349,7 @@ def test_a_mistake_of_the_code_is_told_as_such(command, monkeypatch):
     assert BUG in err
 
 
-def test_a_mistake_of_the_code_inside_a_plugin_is_none_of_the_scene(command, monkeypatch):
+def test_a_bug_inside_a_plugin_is_not_blamed_on_the_scene(command, monkeypatch):
     Path("scene.xml").write_text(SCENE)
     monkeypatch.setattr("mitsuba_diffraction.bsdf.diffraction_grating.reflectance_from", broadcast)
     code, _, err = command("render scene.xml --variant scalar_spectral --spp 1 -o out.exr")
@@ -362,7 +362,7 @@ def test_a_mistake_of_the_code_inside_a_plugin_is_none_of_the_scene(command, mon
     assert "in broadcast" in err
 
 
-def test_a_mistake_of_the_code_while_it_renders_is_told_as_such(command, monkeypatch):
+def test_a_bug_while_rendering_is_reported_as_such(command, monkeypatch):
     Path("scene.xml").write_text(SCENE)
     monkeypatch.setattr("mitsuba_diffraction.render.film.trace_with_mitsubas_film", broadcast)
     code, out, err = command("render scene.xml --variant scalar_spectral --spp 1 -o out.exr")
@@ -377,14 +377,14 @@ def test_debug_shows_where_a_request_is_refused(command):
     assert err.splitlines()[-1].startswith("mitsuba-diffraction: error: tolerance: got 7")
 
 
-def test_help_is_for_asking(command):
+def test_help_exits_with_zero(command):
     code, out, _ = command("--help")
     assert code == 0
     assert "precompute" in out
     assert "render" in out
 
 
-def test_the_samples_of_a_scene_are_taken_and_a_file_may_be_half(command):
+def test_render_takes_the_samples_of_the_scene_and_writes_half_precision(command):
     line = "render sampled.xml -o out.exr --width 8 --variant llvm_ad_spectral -D spectrum=blaze.toml"
     sampler = '<sampler type="independent"><integer name="sample_count" value="3"/></sampler></sensor>'
     Path("sampled.xml").write_text(SCENE.replace("</sensor>", sampler))
@@ -460,7 +460,7 @@ def test_benchmark_refuses_a_tolerance_before_it_measures(command):
     assert "tolerance: got -1.0, wanted a share" in err
 
 
-def test_an_interrupt_inside_a_plugin_is_no_error_of_the_scene(command):
+def test_an_interrupt_inside_a_plugin_is_not_blamed_on_the_scene(command):
     """Mitsuba makes a RuntimeError of whatever a constructor raises."""
 
     mi.set_variant("scalar_spectral")
@@ -482,7 +482,7 @@ def test_an_interrupt_inside_a_plugin_is_no_error_of_the_scene(command):
     assert signal.getsignal(signal.SIGINT) is before
 
 
-def test_an_interrupt_that_something_ignored_ends_the_rendering(command, monkeypatch):
+def test_an_interrupt_swallowed_by_the_loader_ends_the_rendering(command, monkeypatch):
     """As C++ code and the garbage collector may do while the scene is loaded."""
 
     load = passes.load_spectral_scene

@@ -105,7 +105,7 @@ def test_no_albedo_above_one_for_scaled_heights(height_scale):
 
 
 @pytest.mark.slow
-def test_largest_height_scale():
+def test_no_albedo_above_one_at_the_largest_height_scale():
     of = md.precompute(MAKE["blazed"](), wavelengths=(250.0, 830.0))
     bsdf = plugin(of, height_scale=1.44)
     for wi, wavelength in ((random_directions(np.random.default_rng(3), 1)[0], 400), (np.array([0, 0, 1.0]), 600)):
@@ -169,7 +169,7 @@ def test_a_lit_sphere_is_nowhere_brighter_than_its_surroundings(name):
 
 @pytest.mark.few(1)
 @pytest.mark.parametrize("name", ["blazed", "crossed"])
-def test_untouched_where_neither_direction_reflects_too_much(name):
+def test_pairs_of_directions_with_albedo_below_one_are_unchanged(name):
     of, rng, wavelength = spectrum(name), np.random.default_rng(6), 500
     raw, bsdf = plugin(of, conserving=False), plugin(of)
     directions = random_directions(rng, 3000)
@@ -196,7 +196,7 @@ def energies(bsdf, omega, wavelength):
     return np.array(energy.bound(energy.place(vectors(omega)), floats(1e3 / wavelength)))
 
 
-def test_flat_surface_is_left_alone_away_from_the_horizon():
+def test_a_flat_surface_is_unchanged_away_from_the_horizon():
     bsdf, theta = plugin(spectrum("flat")), np.deg2rad(np.linspace(0, 75, 200))
     omega = np.stack([np.sin(theta) * 0.6, np.sin(theta) * 0.8, np.cos(theta)], -1)
     for wavelength in (360, 500, 830):
@@ -208,7 +208,7 @@ def test_flat_surface_is_left_alone_away_from_the_horizon():
 
 @pytest.mark.few(1)
 @pytest.mark.parametrize("name", ["deep blazed", "crossed"])
-def test_reciprocity(name):
+def test_the_energy_factor_is_reciprocal(name):
     bsdf, rng = plugin(spectrum(name, 10.0)), np.random.default_rng(8)
     wi = random_directions(rng, 4000)
     q = rng.integers(-2, 3, (4000, 2)) / (2.0 if name == "crossed" else 2.5) + rng.normal(0, 0.03, (4000, 2))

@@ -87,7 +87,7 @@ def test_exposure_is_matched_and_stated():
     assert np.array_equal(np.isnan(found.delta_e), ~where)
 
 
-def test_the_numbers_of_a_difference():
+def test_a_difference_has_the_known_numbers():
     grey = np.array([0.95047, 1, 1.08883]) * np.array([0.2, 0.4])[:, None, None] * np.ones((2, 50, 1))
     other = grey.copy()
     other[0], other[1] = 0.3, 0.3  # the same sum
@@ -143,7 +143,7 @@ def test_each_shader_names_the_quirks_that_change_it(kind):
 
 
 @pytest.mark.parametrize("kind", VARIANTS)
-def test_other_quirks_for_a_shader_that_is_there(kind):
+def test_a_shader_with_changed_quirks_is_that_made_anew(kind):
     mi.set_variant("scalar_spectral")
     surface = md.HeightField(np.random.default_rng(1).normal(0, 0.05, (4, 6)), 0.3)
     more = {} if kind == "gem" else {"terms": 4}
@@ -213,7 +213,7 @@ def test_corrected_the_shader_converges_to_the_model_within_the_limit(llvm, tmp_
     assert published.mean > 2 * found.mean
 
 
-def test_pixels_that_show_surfaces_and_nothing_else(llvm, tmp_path):
+def test_only_pixels_covered_by_surfaces_are_compared(llvm, tmp_path):
     pictures = Pictures(write(tmp_path / "scene.xml", shapes=SPHERE), "gem", width=64)
     rows, columns = pictures.surface.shape
     assert (rows, columns) == (48, 64)
@@ -237,7 +237,7 @@ def test_a_crop_window_is_compared_alone(llvm, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_share_is_what_it_says(llvm, tmp_path):
+def test_the_share_of_a_quirk_is_that_of_renderings_without_it(llvm, tmp_path):
     pictures = Pictures(write(tmp_path / "scene.xml", SUN + SKY), "gem", width=8)
     names = ("constant_blend", "infrared_rainbow", "power_gamma", NO_SHADOWS)
     assert sorted(pictures.quirks) == sorted(names)
@@ -263,7 +263,7 @@ def test_a_share_is_what_it_says(llvm, tmp_path):
     assert found.same_light.quirks[NO_SHADOWS].rise > 1
 
 
-def test_what_is_read_for_a_point(llvm, tmp_path):
+def test_the_reads_per_point_are_those_of_the_tables(llvm, tmp_path):
     pictures = Pictures(write(tmp_path / "scene.xml", base=""), "flss", width=4)
     assert pictures.shader_reads == 81 * 37 * 9
     spectrum = pictures.spectra[0]
@@ -315,7 +315,7 @@ def test_compare_writes_pictures_numbers_and_a_figure(command, llvm, folder):
         assert np.ptp(np.asarray(picture.convert("L"))) > 100
 
 
-def test_a_coat_is_told(llvm, folder):
+def test_a_coat_is_noted(llvm, folder):
     write(Path("scene.xml"), base=BASE + '<float name="coat_ior" value="1.5"/>')
     found = compare("scene.xml", "flss", width=4, spp=1, shading_points=1, shares=False)
     assert found.coated
@@ -383,7 +383,7 @@ def test_a_mistake_is_one_line_and_exit_code_2(command, llvm, folder, arguments,
 
 @pytest.mark.few(1)
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError("disk full")])
-def test_all_files_or_none(command, monkeypatch, llvm, folder, error):
+def test_a_failed_comparison_leaves_no_files(command, monkeypatch, llvm, folder, error):
     write(Path("scene.xml"))
 
     def fail(*args, **kwargs):

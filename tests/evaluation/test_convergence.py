@@ -20,7 +20,7 @@ def point(name, seconds, error):
     return Point(name, name.startswith("tolerance"), 1, seconds, error, error**2)
 
 
-def test_when_the_path_tracer_overtakes():
+def test_the_path_tracer_overtakes_at_the_interpolated_time():
     found = Convergence(
         "scene.xml",
         (8, 8),
@@ -43,7 +43,7 @@ def test_when_the_path_tracer_overtakes():
         assert np.isnan(found.overtaken("pq, corrected", error))
 
 
-def test_any_number_of_tolerances_is_drawn(tmp_path):
+def test_any_number_of_tolerances_is_plotted(tmp_path):
     points = [point(f"tolerance {0.1 * 2**-k:g}", 1.0 + seconds, 9.0 - k) for k in range(6) for seconds in range(2)]
     save_plot(Convergence("scene.xml", (8, 8), 0.0, tuple(points)), tmp_path / "plot.png")
     with Image.open(tmp_path / "plot.png") as picture:

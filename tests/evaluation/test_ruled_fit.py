@@ -30,7 +30,7 @@ def test_every_grating_has_its_measurements():
         ruled_fit.measured("R1200")
 
 
-def test_efficiencies_bend_where_an_order_passes_off():
+def test_efficiencies_bend_at_rayleigh_anomalies():
     # Orders −1 and 2 in Littrow: at λ/d = 2/3.
     period = 1000 / 831
     ratios = np.arange(0.6, 0.74, 0.01)
@@ -52,7 +52,7 @@ def test_the_stored_angles_fit_best(theory):
 
 
 @pytest.mark.slow
-def test_measured_gratings_are_drawn_with_both_theories(llvm):
+def test_measured_gratings_are_plotted_with_both_theories(llvm):
     from mitsuba_diffraction.evaluation.validation import measured_gratings
 
     figure = measured_gratings.plot(step=300)

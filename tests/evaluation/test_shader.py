@@ -238,7 +238,7 @@ def test_pq_of_n_tiles_is_the_transform_of_their_surface(surface, tiles):
     assert np.abs(wrong - rho).max() > 0.01 * rho.max()
 
 
-def test_at_whole_numbers_even_the_wrong_product_is_only_a_factor():
+def test_at_integers_the_wrong_product_is_only_a_factor():
     x = mi.Float([0.0, 1.0, 5.0, -3.0])
     np.testing.assert_allclose(np.array(tiling_power(x, x, (7, 4), False)), 1)
     np.testing.assert_allclose(np.array(tiling_power(x, x, (7, 4), True)), 2, rtol=1e-5)
@@ -294,7 +294,7 @@ def test_schlicks_value_is_a_power_already():
     assert wrong[3] > 8 * exact[3]
 
 
-def test_the_index_of_the_material_counts():
+def test_the_index_of_the_material_scales_the_colour():
     """A flat mirror under D65 shows white times F(θ)/F(0) cos θ_i."""
     wi, wo = unit(sines([75])), unit(-sines([75]))
     relative = replace(CORRECTED, relative=True)
@@ -388,7 +388,7 @@ def test_a_relative_radiance_lacks_the_wavelength():
     np.testing.assert_allclose(relative, tristimulus.d65_white(), rtol=1e-4)
 
 
-def test_encoding():
+def test_encoding_is_a_power_or_the_transfer_function_of_srgb():
     import colour as science
 
     values = np.linspace(0, 1, 50)
@@ -409,7 +409,7 @@ def test_quirks_are_switches():
 # --- Textures and colour tables ---------------------------------------------------------------------------------------
 
 
-def test_texels():
+def test_texels_are_the_transforms_of_the_powers_of_the_heights():
     texels, height = taylor_transforms(ROUGH, 3, heights_from_zero=False, origin_at_centre=False)
     assert texels.shape == (8, 16, 3)
     assert height == ROUGH.half_range
@@ -420,7 +420,7 @@ def test_texels():
         assert texels[4 - 2, 8 + 3, n] == pytest.approx(expected[-2, 3], abs=1e-6)
 
 
-def test_spectra_of_the_primaries():
+def test_spectra_of_the_primaries_have_their_colours():
     from mitsuba_diffraction.color import spectrum_to_linear_sRGB
 
     spectra = tristimulus.primary_spectra()
@@ -446,14 +446,14 @@ def test_spectra_of_the_primaries():
         ({"variant": "gem", "spacing": -1.0}, "spacing"),
     ],
 )
-def test_what_makes_no_sense_is_refused(settings, message):
+def test_wrong_arguments_are_refused(settings, message):
     with pytest.raises(ValueError, match=message):
         colour(BLAZE, unit([0.1]), unit([0.2]), **settings)
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("quirks", [PUBLISHED, CORRECTED], ids=["published", "corrected"])
-def test_hard_directions_stay_finite(variant, quirks):
+def test_values_are_finite_at_hard_directions(variant, quirks):
     grazing = [0.0, 1e-4, 0.5, 0.99999, 1.0]
     x_i, x_o = np.meshgrid(grazing, np.concatenate([grazing, -np.array(grazing)]))
     for surface in (FLAT, BLAZE, ROUGH):
@@ -547,7 +547,7 @@ def test_each_quirk_of_the_scene_is_a_parameter():
 
 
 @pytest.mark.slow
-def test_what_lies_below_gets_what_the_surface_lets_through():
+def test_the_base_receives_the_transmitted_light():
     bsdf = dict(GRATING, depth=0.0, base={"type": "diffuse", "reflectance": {"type": "uniform", "value": 1.0}})
     side = (slice(None), slice(0, 4))  # far from the mirror direction
     expected = picture(DIRECT, 256, bsdf=bsdf)[side].mean()
@@ -558,7 +558,7 @@ def test_what_lies_below_gets_what_the_surface_lets_through():
     assert wrong[side].mean() == pytest.approx(0.5 * plain[side].mean(), rel=0.02)
 
 
-def test_shadows_only_on_request():
+def test_shadows_are_cast_only_on_request():
     cover = {"type": "rectangle", "bsdf": {"type": "conductor"},
              "to_world": mi.ScalarTransform4f().translate([0, 0, 5]).rotate([1, 0, 0], 180).scale(4)}  # fmt: skip
     bsdf = {"type": "diffuse"}
@@ -568,7 +568,7 @@ def test_shadows_only_on_request():
     assert not dark.any()
 
 
-def test_both_sides_of_twosided():
+def test_twosided_shades_both_sides():
     both = {"type": "twosided", "inner": GRATING}
     settings = shader(as_published=False, terms=16)
     front = picture(settings, bsdf=both)

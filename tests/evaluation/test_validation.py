@@ -28,12 +28,12 @@ pytestmark = pytest.mark.usefixtures("llvm")
     [pytest.param(c, marks=pytest.mark.slow) if c.slow else c for c in CHECKS],
     ids=lambda check: f"{check.group}: {check.name}",
 )
-def test_check(check):
+def test_a_check_is_within_its_bound(check):
     record = check.run()
     assert record.ok, record
 
 
-def test_names_are_told_apart():
+def test_names_of_checks_are_unique():
     assert len({(check.group, check.name) for check in CHECKS}) == len(CHECKS)
 
 
@@ -55,7 +55,7 @@ def test_a_record_is_within_its_bound_or_not():
 
 
 @pytest.mark.slow
-def test_measured_gratings_are_drawn_beside_both_theories():
+def test_measured_gratings_are_plotted_with_both_theories():
     panels = measured_gratings.plot(step=250).axes
     assert [panel.get_title().split(":")[0] for panel in panels] == ["R150", "R400", "B600", "R831"]
     for panel in panels:
@@ -148,7 +148,7 @@ def test_the_map_is_that_of_the_solver(material):
         assert found == pytest.approx(errors[i, j, k], rel=0.03, abs=0.003)
 
 
-def test_a_surface_outside_the_range_of_scalar_theory_is_told():
+def test_a_surface_outside_the_range_of_scalar_theory_is_reported():
     fine = scalar_theory.scalar_error(md.gratings.ruled(1200)).warning
     assert fine.startswith(
         "scalar theory: errs by 29% of the reflected light (mean over 450 to 650 nm and incidence up"
@@ -226,7 +226,7 @@ def test_estimated_error_is_near_the_solved_one(count):
     assert np.exp(np.abs(factors).max()) < 3
 
 
-def test_expected_error_tells_where_it_holds():
+def test_the_expected_error_is_nan_where_it_does_not_hold():
     good = scalar_theory.expected_error(10.0, 0.05, 0.55)
     bad = scalar_theory.expected_error(0.8, 0.4, 0.55)
     assert good < 0.02 < 0.1 < bad
@@ -258,7 +258,7 @@ def solver(monkeypatch, name="coupled_waves"):
 
 
 @pytest.mark.slow
-def test_the_maker_of_the_stored_results_runs(monkeypatch, tmp_path):
+def test_the_script_of_the_stored_results_runs(monkeypatch, tmp_path):
     maker = solver(monkeypatch, "rigorous_reference")
     jobs = maker.all_jobs()
     assert len(jobs) == len(coupled_waves.cases()) + len(scalar_theory.stored()["map"])
@@ -302,14 +302,14 @@ def test_coupled_waves_send_a_blaze_to_the_side_of_its_facets(monkeypatch):
 
 
 @pytest.mark.slow
-def test_checks_of_a_surface():
+def test_the_checks_of_a_surface_pass():
     blaze = md.gratings.blazed(2.5, 0.1)
     results = {c.name: c.run() for c in surface_checks(blaze, md.precompute(blaze))}
     assert all(record.ok for record in results.values()), results
     assert results["range of scalar theory"].measured > 0
 
 
-def test_a_surface_that_is_not_the_spectrums_is_told():
+def test_a_surface_of_another_spectrum_is_reported():
     blaze, other = md.gratings.blazed(2.5, 0.25), md.gratings.blazed(2.5, 0.24)
     spectrum = md.precompute(blaze)
     assert against_reference(blaze, spectrum).ok
@@ -337,7 +337,7 @@ class NotANumber:
         return np.full(len(q), np.nan)
 
 
-def test_a_tilt_is_no_roughness():
+def test_a_tilt_does_not_count_as_roughness():
     x = (np.arange(300) + 0.5) * 0.08
     waves = np.tile(0.05 * np.cos(2 * np.pi * x / 2.0), (150, 1))
     level, tilted = (scalar_range(md.HeightField(waves + slope * x, 0.08), "sample").measured for slope in (0.0, 0.1))
@@ -346,7 +346,7 @@ def test_a_tilt_is_no_roughness():
     assert level == pytest.approx(np.mean(of_wave), rel=0.1)  # the window broadens the wave
 
 
-def test_a_surface_outside_of_the_range_is_missed(command, tmp_path):
+def test_a_surface_outside_of_the_range_misses_its_bound(command, tmp_path):
     recipe = tmp_path / "narrow.toml"
     recipe.write_text('[surface]\nprofile = "sinusoidal"\nperiod = 0.8\ndepth = 0.4\n')
     code, out, error = command("validate", str(recipe), "--json", str(tmp_path / "a.json"))

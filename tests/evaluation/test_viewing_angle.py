@@ -1,4 +1,4 @@
-"""The evaluation of chapter 5: against the grating equation, analytic orders, and direct sums."""
+"""Evaluation as in chapter 5 of the thesis of 2014: grating equation, analytic orders, direct sums."""
 
 import csv
 import functools
@@ -106,7 +106,7 @@ def test_the_fit_finds_the_period_of_gaussian_lobes_between_the_samples(period, 
     assert fit.variance < 1e-4
 
 
-def test_the_fit_tells_periods_that_vary_with_the_wavelength():
+def test_the_fit_reveals_periods_that_vary_with_the_wavelength():
     found = gaussian_lobes(2.5)
     half = found.wavelengths < 580
     other = gaussian_lobes(2.45).reflectance
@@ -124,14 +124,14 @@ def test_the_peaks_lie_on_the_grating_equation():
     np.testing.assert_allclose(peak_angles(found), grating_equation(2.5, 75.0, found.wavelengths), atol=1e-5)
 
 
-def test_the_grating_equation_by_hand():
+def test_the_grating_equation_gives_the_angles_computed_by_hand():
     # sin 30° = 0.5; 0.5 µm / 2.5 µm = 0.2.
     expected = np.rad2deg(np.arcsin([-0.3, -0.1, 0.9]))
     np.testing.assert_allclose([grating_equation(2.5, 30.0, 500.0, n) for n in (1, 2, 7)], expected)
     assert np.isnan(grating_equation(2.5, 30.0, 500.0, 8))
 
 
-def test_no_light_is_no_peak():
+def test_a_dark_map_has_no_peak():
     found = gaussian_lobes(2.5)
     dark = ReflectanceMap(BLAZE, "flss", 75.0, found.wavelengths, found.angles, 0 * found.reflectance)
     assert np.isnan(peak_angles(dark)).all()
@@ -280,7 +280,7 @@ def test_figures_and_the_table_are_written(llvm, tmp_path):
         (lambda: PublishedSurface("x", BLAZE.recipe, 0, 0.0, (0, 0)), r"period: got 0\.0"),
     ],
 )
-def test_misuse_is_refused(llvm, call, message):
+def test_wrong_arguments_are_refused(llvm, call, message):
     with pytest.raises(ValueError, match=message):
         call()
 

@@ -51,7 +51,7 @@ def test_statistics_of_a_sinusoid_are_those_of_the_formula(tilt):
     assert numbers.tilt == pytest.approx(np.degrees(np.arctan(tilt)), abs=1e-6)
 
 
-def test_a_plane_is_all_tilt():
+def test_a_plane_has_tilt_and_nothing_else():
     y, x = np.mgrid[:30, :40] * 0.1
     numbers = statistics(md.HeightField(0.2 * x - 0.1 * y, 0.1))
     assert numbers.tilt == pytest.approx(np.degrees(np.arctan(np.hypot(0.2, 0.1))))
@@ -154,7 +154,7 @@ def test_scales_are_those_of_a_surface_that_is_built_anew():
 # ---------------------------------------------------------------- the tip
 
 
-def test_a_spike_shows_the_tip():
+def test_a_scanned_spike_has_the_shape_of_the_tip():
     heights = np.zeros((41, 41))
     heights[20, 20] = 0.3
     pixel, radius = 0.02, 0.05
@@ -173,7 +173,7 @@ def test_erosion_gives_back_what_the_tip_touched():
     assert (once.heights >= surface.heights - 1e-12).all()
 
 
-def test_a_tile_goes_on_under_the_tip():
+def test_a_tile_is_continued_periodically_under_the_tip():
     tile = md.gratings.crossed(PERIOD, DEPTH, samples=40)
     rolled = md.HeightField(np.roll(tile.heights, (7, 11), (0, 1)), tile.pixel_size)
     np.testing.assert_allclose(
@@ -204,7 +204,7 @@ def test_a_sawtooth_changes_alike_under_both_tips_and_round_ridges_do_not():
     assert differ[1] > 1e-3
 
 
-def test_a_profile_by_formula_has_met_no_tip():
+def test_a_profile_by_formula_has_no_tip_broadening():
     seen = inspect(md.gratings.sinusoidal(PERIOD, DEPTH, samples=64), extent="tile", measured=False)
     assert {change.what for change in seen.changes} == {"height scale", "pixel size"}
 
@@ -282,7 +282,7 @@ def about(field, measured=True):
         (md.HeightField(waves().heights * 12, 0.05), "steeper than 7"),
     ],
 )
-def test_what_stands_in_the_way_is_said(field, words):
+def test_problems_of_a_scan_are_reported(field, words):
     said = about(field)
     assert any(words in sentence for sentence in said), said
 
@@ -307,7 +307,7 @@ def sample():
 
 
 @pytest.mark.slow
-def test_a_sample_is_told_in_numbers(sample):
+def test_a_sample_is_reported_in_numbers(sample):
     (period, *_) = sample.periods
     assert period.period == pytest.approx(PERIOD, abs=4 * period.period_uncertainty + 0.01)
     assert abs(period.direction) < 1
@@ -376,7 +376,7 @@ def folder(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_inspect_tells_and_draws(folder, command):
+def test_inspect_prints_numbers_and_draws_a_slide(folder, command):
     code, out, err = command("inspect waves.npy --pixel-size 0.08 --json numbers.json")
     assert (code, err) == (0, "")
     for words in (
@@ -406,7 +406,7 @@ def test_a_file_name_is_shown_as_it_is(folder, command):
 
 
 @pytest.mark.slow
-def test_one_period_of_a_profile(folder, command):
+def test_a_profile_of_one_period_is_inspected(folder, command):
     np.save("ridges.npy", 0.1 * np.abs(np.sin(np.pi * np.arange(256) / 256))[None])
     code, out, err = command("inspect ridges.npy --pixel-size 0.005078125")
     assert (code, err) == (0, "")
@@ -423,7 +423,7 @@ def test_one_period_of_a_profile(folder, command):
 
 
 @pytest.mark.slow
-def test_options_of_precompute(folder, command):
+def test_inspect_takes_the_options_of_precompute(folder, command):
     heights = np.load("waves.npy")
     np.save("waves.npy", heights + 0.01 * np.arange(100))
     code, out, _ = command("inspect waves.npy --pixel-size 0.08")
@@ -436,7 +436,7 @@ def test_options_of_precompute(folder, command):
     assert "coherence length  3 µm" in out
 
 
-def test_inspect_precompute_and_the_log_tell_one_error_of_scalar_theory(folder, command, llvm, caplog):
+def test_inspect_precompute_and_the_log_agree_on_the_error_of_scalar_theory(folder, command, llvm, caplog):
     Path("lamellar.toml").write_text('[surface]\nprofile = "lamellar"\nperiod = 1.6\ndepth = 0.2\nsamples = 64\n')
     said = [command("inspect lamellar.toml --json n.json")[1], command("precompute lamellar.toml")[1]]
     mi.load_dict({"type": "diffraction_grating", "filename": "lamellar.toml"})
@@ -490,7 +490,7 @@ def test_a_mistake_is_one_line_and_exit_code_2(folder, command, arguments, words
 
 
 @pytest.mark.slow
-def test_the_measured_skins(scan):
+def test_a_measured_skin_has_its_period_and_raises_no_concern(scan):
     seen = inspect(scan("elaphe"))
     assert seen.periods[0].period == pytest.approx(1.0, abs=0.05)
     assert abs(abs(seen.periods[0].direction) - 90) < 5
@@ -502,7 +502,7 @@ def test_the_measured_skins(scan):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("whole", [False, True])
-def test_the_notebook_runs_and_says_what_it_shows(monkeypatch, capsys, whole):
+def test_the_notebook_runs_and_prints_what_it_shows(monkeypatch, capsys, whole):
     if not dr.has_backend(dr.JitBackend.LLVM):
         pytest.skip("Dr.Jit finds no LLVM")
     plt = pytest.importorskip("matplotlib.pyplot")

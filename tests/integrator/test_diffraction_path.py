@@ -144,7 +144,7 @@ def test_converges_in_a_scalar_variant():
 
 
 @pytest.mark.slow
-def test_what_a_grating_throws_onto_a_wall_is_far_less_noisy(llvm):
+def test_light_cast_by_a_grating_onto_a_wall_is_far_less_noisy(llvm):
     narrow = blaze(26.0, material="Al")
     built = scene(plate=plate(narrow, 0.5), sun=SUN)
     at_wall = {}
@@ -172,7 +172,7 @@ def test_a_grating_seen_in_another_is_less_noisy_than_with_path(llvm):
 
 @pytest.mark.few(1)
 @pytest.mark.parametrize(("bsdf", "depth"), [(blaze, 1), (blaze, 2), (lambda: diffuse(0.5), 5)])
-def test_without_such_light_it_is_path(bsdf, depth, llvm):
+def test_without_light_cast_by_gratings_it_is_path(bsdf, depth, llvm):
     built = scene(plate=plate(bsdf()), sun=SUN, sky=SKY)
     pictures = [
         np.array(mi.render(built, integrator=mi.load_dict({"type": name, "max_depth": depth}), spp=4, seed=3))
@@ -230,7 +230,7 @@ SCENE = """<scene version="3.0.0">
 
 
 @pytest.mark.slow
-def test_passes_have_the_same_bits_whatever_the_threads_and_agree_with_mitsubas_film(llvm, tmp_path):
+def test_passes_do_not_depend_on_threads_and_agree_with_mitsubas_film(llvm, tmp_path):
     path = tmp_path / "scene.xml"
     path.write_text(SCENE)
     built = load_spectral_scene(path)
@@ -307,7 +307,7 @@ def test_both_halves_draw_the_lines_of_a_lamp(llvm, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_ctrl_c_is_left_alone(llvm):
+def test_the_handler_of_ctrl_c_is_kept(llvm):
     built = scene(plate=plate(blaze()), sun=SUN)
     handler = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:

@@ -141,7 +141,7 @@ def test_failures_of_a_worker_are_one_line(threads_of_this_process, monkeypatch,
     assert "a worker has mitsuba 2.0; wanted mitsuba 3" in err.splitlines()[-1]
 
 
-def test_a_scheduler_that_is_not_there(command, monkeypatch):
+def test_an_unreachable_scheduler_is_one_line(command, monkeypatch):
     monkeypatch.setattr(cluster, "SECONDS_TO_CONNECT", 0.5)
     line = "render scene.xml --spp 9 --variant llvm_ad_spectral --dask"
     for address in ("tcp://127.0.0.1:1", "nonsense://x"):
@@ -164,7 +164,7 @@ def test_a_port_that_is_silent_is_no_scheduler(command, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_scheduler_that_goes_leaves_the_checkpoint():
+def test_a_scheduler_that_stops_leaves_the_checkpoint():
     local = start(n_workers=1, processes=False, protocol="tcp")
 
     def close(done, total, error):

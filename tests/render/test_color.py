@@ -80,7 +80,7 @@ def test_into_gamut_shows_what_is_no_color_as_black(bad):
     assert (into_gamut(np.array([bad])) == 0).all()
 
 
-def test_roll_off():
+def test_roll_off_is_smooth_and_stays_below_one():
     grey = np.linspace(0, 50, 5001)[:, None] * np.ones(3)
     shown = roll_off(grey)
     np.testing.assert_allclose(shown[:, 0], shown[:, 2])
@@ -109,7 +109,7 @@ def test_auto_exposure_follows_the_picture():
     assert auto_exposure(np.zeros((2, 2, 3))) == 1
 
 
-def test_preview(tmp_path):
+def test_a_preview_shows_dark_and_red_pixels_as_such(tmp_path):
     radiance = np.zeros((6, 9, GRID.size), np.float32)
     radiance[:, 3:6] = 0.01 * np.random.default_rng(4).random((6, 3, 1))
     radiance[:, 6:, 60] = 0.2  # a red line

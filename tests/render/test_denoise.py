@@ -88,7 +88,7 @@ def test_the_preview_loses_its_noise_and_the_spectral_picture_stays(command, tmp
     np.testing.assert_array_equal(plain, clean)
 
 
-def test_what_is_missing_is_told_before_the_work(command, tmp_path, monkeypatch):
+def test_missing_requirements_are_reported_before_the_work(command, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("scene.xml").write_text(SCENE)
     code, _, err = command("render scene.xml --denoise --variant scalar_spectral")

@@ -101,7 +101,7 @@ def test_error_is_the_scatter_of_whole_pictures():
 
 
 @pytest.mark.slow
-def test_black_pictures_have_no_error_and_end(folder):
+def test_black_pictures_have_no_error_and_finish(folder):
     text = SCENE.replace("RFILTER", "box")
     Path("scene.xml").write_text(text[: text.index('<emitter type="constant"')] + "</scene>")
     image = render("scene.xml", spp=6, until_error=0.01)
@@ -110,7 +110,7 @@ def test_black_pictures_have_no_error_and_end(folder):
 
 
 @pytest.mark.slow
-def test_until_error_stops_where_the_noise_is_as_wanted():
+def test_until_error_stops_at_the_requested_noise():
     calls = []
     image = render("scene.xml", spp=4096, until_error=0.05, progress=lambda *call: calls.append(call))
     done = image.attributes["spp"]
@@ -213,7 +213,7 @@ def test_checkpoints_of_other_renderings_are_refused(change):
     assert Path("c").read_bytes() == before
 
 
-def test_the_digest_tells_scenes_and_the_files_they_name_by_content(tmp_path):
+def test_the_digest_depends_on_the_content_of_a_scene_and_its_files(tmp_path):
     texture = '<texture type="bitmap" name="reflectance"><string name="filename" value="grey.png"/></texture>'
     text = SCENE.replace("RFILTER", "box").replace('<rgb name="reflectance" value="$red, 0.2, 0.1"/>', texture)
 
@@ -442,7 +442,7 @@ def test_a_disk_that_the_picture_fills_is_one_line(command, small_disk, monkeypa
     assert not list(small_disk.iterdir())
 
 
-def test_a_folder_that_cannot_be_written_to_is_told_before_the_work(command, monkeypatch):
+def test_a_folder_that_cannot_be_written_to_is_refused_before_the_work(command, monkeypatch):
     monkeypatch.setattr(passes, "trace_pass", None)
     place = Path("closed")
     place.mkdir()
@@ -481,7 +481,7 @@ def camera(motion, scene="scene.xml"):
     return np.ravel(np.array(sensor.world_transform().matrix)).reshape(4, 4)
 
 
-def test_the_orbit_goes_round_the_target():
+def test_the_orbit_runs_around_the_target():
     motions = orbit("scene.xml", 4)
     np.testing.assert_allclose(camera(motions[0]), camera(None), atol=1e-6)
     for motion, origin in zip(motions[1:], ("4,0,2", "0,4,2", "-4,0,2"), strict=True):
@@ -489,7 +489,7 @@ def test_the_orbit_goes_round_the_target():
         np.testing.assert_allclose(camera(motion), camera(None, "moved.xml"), atol=1e-6)
 
 
-def test_parameters_and_matrices_say_where_the_orbit_is():
+def test_parameters_and_matrices_place_the_orbit():
     text = SCENE.replace("RFILTER", "box")
     Path("scene.xml").write_text(
         text.replace('target="0,0,0.5"', 'target="$x,0,0.5"').replace(
@@ -505,7 +505,7 @@ def test_parameters_and_matrices_say_where_the_orbit_is():
     np.testing.assert_allclose(camera(orbit("scene.xml", 2)[1])[:3, 3], [0, 4, 2], atol=1e-5)
 
 
-def test_the_orbit_needs_no_xml_but_what_mitsuba_takes():
+def test_the_orbit_takes_any_xml_that_mitsuba_takes():
     strange = SCENE.replace("RFILTER", "box").replace("<integrator", "<!-- caf\xe9 --><integrator", 1)
     Path("scene.xml").write_bytes(strange.replace('type="path"', 'type="path" id="a & b"', 1).encode("latin-1"))
     assert len(orbit("scene.xml", 3)) == 3

@@ -53,7 +53,7 @@ def test_constant_radiance_of_one_per_nm_is_one_in_every_channel(variant, spp, t
 
 
 @pytest.mark.slow
-def test_ramp(llvm, tmp_path):
+def test_a_ramp_of_radiance_is_a_ramp_over_the_channels(llvm, tmp_path):
     ramp = f'<emitter type="constant">{spectrum("radiance", 360, 830, "0, 4.7")}</emitter>'
     image = render(write_scene(tmp_path, ramp), spp=8192)
     means = image.radiance.mean((0, 1))
@@ -131,7 +131,7 @@ def test_rgb_is_that_of_mitsubas_own_film(llvm, tmp_path):
 
 
 @pytest.mark.slow
-def test_passes(llvm, tmp_path, monkeypatch):
+def test_passes_are_reproducible_and_report_progress(llvm, tmp_path, monkeypatch):
     path = write_scene(tmp_path, SPHERE + CONSTANT)
     whole = render(path, spp=512, seed=3)
     again = render(path, spp=512, seed=3)
@@ -196,7 +196,7 @@ def test_kernels_do_not_depend_on_where_numpy_puts_a_table(llvm, offset):
     assert len(hashes) == 1
 
 
-def test_uneven_passes(llvm, tmp_path, monkeypatch):
+def test_uneven_passes_add_up_to_all_samples(llvm, tmp_path, monkeypatch):
     monkeypatch.setattr(passes, "SAMPLES_PER_PASS", 1)  # a large picture, so to say
     monkeypatch.setattr(passes, "SAMPLES_PER_PIXEL_OF_LARGE_PICTURES", 4)
     calls = []
@@ -253,7 +253,7 @@ LENS = """<sensor type="thinlens"><float name="aperture_radius" value="0.3"/><fl
 
 
 @pytest.mark.slow
-def test_a_lens_and_a_shutter_take_their_random_numbers(llvm, tmp_path):
+def test_a_lens_and_a_shutter_draw_their_random_numbers(llvm, tmp_path):
     scene = load_spectral_scene(write_scene(tmp_path, SPHERE + '<emitter type="constant"/>', sensor=LENS))
     sums = trace_pass(scene, 5, 11)
     own = np.array(mi.render(scene, spp=5, seed=11)) / channel_weights()
@@ -280,7 +280,7 @@ def test_equal_seeds_give_equal_bits_on_any_number_of_threads(llvm, threads, tmp
 
 
 @pytest.mark.slow
-def test_integrators_that_do_not_trace_ray_by_ray(llvm, tmp_path):
+def test_integrators_that_do_not_trace_ray_by_ray_give_the_same_mean(llvm, tmp_path):
     path = write_scene(tmp_path, SPHERE + CONSTANT)
     expected = render(path, spp=256).radiance.mean()
     path.write_text(path.read_text().replace('"path"', '"prb"'))
@@ -292,7 +292,7 @@ def film_of(path, **sizes):
 
 
 @pytest.mark.quick
-def test_size_crop_and_filter(llvm, tmp_path):
+def test_size_crop_and_filter_of_the_film_are_kept(llvm, tmp_path):
     film = """<film type="hdrfilm"><integer name="width" value="40"/><integer name="height" value="20"/>
         <integer name="crop_offset_x" value="10"/><integer name="crop_offset_y" value="4"/>
         <integer name="crop_width" value="20"/><integer name="crop_height" value="8"/>
@@ -317,12 +317,12 @@ def test_spectral_film_of_the_scene_is_replaced_too(llvm, tmp_path):
     assert image.radiance.shape == (2, 3, GRID.size)
 
 
-def test_sensor_without_film(llvm, tmp_path):
+def test_a_sensor_without_a_film_gets_one(llvm, tmp_path):
     assert list(film_of(write_scene(tmp_path, CONSTANT, film=""), width=16).size()) == [16, 12]
 
 
 @pytest.mark.slow
-def test_parameters(llvm, tmp_path):
+def test_unknown_parameters_are_refused(llvm, tmp_path):
     path = write_scene(tmp_path, CONSTANT)
     assert render(path, spp=1, parameters={"width": "5"}).radiance.shape[1] == 5
     with pytest.raises(ValueError, match=r"\$nonsense=1") as caught:
@@ -330,7 +330,7 @@ def test_parameters(llvm, tmp_path):
     assert "\n" not in str(caught.value)
 
 
-def test_files_are_sought_beside_the_scene(llvm, tmp_path, monkeypatch):
+def test_files_are_looked_up_beside_the_scene(llvm, tmp_path, monkeypatch):
     folder, elsewhere = tmp_path / "scenes", tmp_path / "elsewhere"
     folder.mkdir()
     elsewhere.mkdir()
@@ -365,7 +365,7 @@ def test_wrong_scenes_give_one_line(llvm, tmp_path, content, message):
     assert "Traceback" not in str(caught.value)
 
 
-def test_wrong_requests(llvm, tmp_path):
+def test_wrong_requests_are_refused(llvm, tmp_path):
     path = write_scene(tmp_path, CONSTANT)
     with pytest.raises(FileNotFoundError, match=r"none\.xml"):
         render(tmp_path / "none.xml", spp=1)
@@ -401,7 +401,7 @@ def test_integrators_with_other_channels_are_refused(llvm, tmp_path):
         (KeyboardInterrupt, KeyboardInterrupt, "the order is zero"),
     ],
 )
-def test_failing_and_interrupted_renderings(llvm, tmp_path, raised, expected, message):
+def test_a_failing_rendering_raises_its_cause(llvm, tmp_path, raised, expected, message):
     class Failing(mi.BSDF):
         def __init__(self, props):
             super().__init__(props)
@@ -425,7 +425,7 @@ def test_failing_and_interrupted_renderings(llvm, tmp_path, raised, expected, me
     gc.collect()
 
 
-def test_interrupt_between_passes(llvm, tmp_path, monkeypatch):
+def test_an_interrupt_between_passes_is_raised(llvm, tmp_path, monkeypatch):
     monkeypatch.setattr(passes, "SAMPLES_PER_PASS", 64)
 
     def interrupt(done, total, error):

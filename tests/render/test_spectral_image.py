@@ -18,7 +18,7 @@ def image():
     return SpectralImage(GRID, radiance, {"scene": "a.xml", "spp": 16, "height_scale": 0.5})
 
 
-def test_round_trip(image, tmp_path):
+def test_a_saved_image_comes_back_unchanged(image, tmp_path):
     image.save(tmp_path / "a.exr")
     back = SpectralImage.load(tmp_path / "a.exr")
     np.testing.assert_array_equal(back.radiance, image.radiance)
@@ -27,13 +27,13 @@ def test_round_trip(image, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["a.exr"]
 
 
-def test_wavelengths_off_the_integers(tmp_path):
+def test_fractional_wavelengths_come_back_unchanged(tmp_path):
     image = SpectralImage([404.5, 412.25], np.ones((1, 1, 2)))
     image.save(tmp_path / "a.exr")
     np.testing.assert_array_equal(SpectralImage.load(tmp_path / "a.exr").wavelengths, [404.5, 412.25])
 
 
-def test_file_layout(image, tmp_path):
+def test_the_file_has_the_spectral_layout(image, tmp_path):
     image.save(tmp_path / "a.exr")
     file = OpenEXR.File(str(tmp_path / "a.exr"), separate_channels=True)
     header, channels = file.header(), file.channels()
@@ -48,7 +48,7 @@ def test_file_layout(image, tmp_path):
         np.testing.assert_allclose(channels[name].pixels, rgb[..., index], rtol=1e-5, atol=1e-6)
 
 
-def test_colour_science_reads_it(image, tmp_path):
+def test_colour_science_reads_the_file(image, tmp_path):
     pytest.importorskip("OpenImageIO", reason="colour-science reads spectral images through OpenImageIO")
     import colour
 
@@ -79,7 +79,7 @@ def test_wrong_images_are_refused(wavelengths, shape, attributes, message):
         SpectralImage(wavelengths, np.zeros(shape), attributes)
 
 
-def test_image_does_not_change_behind_ones_back():
+def test_an_image_owns_its_radiance():
     radiance = np.ones((1, 1, 2), np.float32)
     image = SpectralImage([500.0, 510.0], radiance)
     radiance[:] = 2
@@ -139,7 +139,7 @@ def test_failed_save_leaves_the_old_file(image, tmp_path, monkeypatch, error):
     assert (tmp_path / "a.exr").read_text() == "old"
 
 
-def test_whole_file(tmp_path):
+def test_a_whole_file_appears_at_the_end_only(tmp_path):
     target = tmp_path / "a.txt"
     with whole_file(target) as temporary:
         assert temporary.parent == tmp_path

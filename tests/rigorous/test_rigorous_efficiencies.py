@@ -114,7 +114,7 @@ def test_reversed_light_goes_the_same_way_back(profile, index):
         np.testing.assert_allclose(np.abs(amplitudes), np.abs(other.T), atol=1e-3)
 
 
-def test_a_wide_period_is_where_scalar_theory_holds():
+def test_scalar_theory_holds_for_a_wide_period():
     surface, wavelength = gratings.sinusoidal(10.0, 0.12), 0.5
     found = rigorous.efficiencies(surface, light(5), wavelength, int_ior=1.5)
     scalar = scalar_orders(profile_powers(surface), 10.0, wavelength, 5.0, 1.5)
@@ -141,7 +141,7 @@ def test_a_sawtooth_blazes_to_the_side_that_scalar_theory_blazes_to():
     ],
     ids=["half a wavelength", "deep blaze", "deep blaze of aluminium", "deep sinusoid of aluminium", "lamellar"],
 )
-def test_what_is_reported_as_the_error_is_the_error(surface, index, goal):
+def test_the_reported_error_is_the_actual_one(surface, index, goal):
     material = {"int_ior": index} if index else {"material": "Al"}
     found = rigorous.efficiencies(surface, CONICAL, 0.55, tolerance=goal, **material)
     exact = rigorous.efficiencies(surface, CONICAL, 0.55, harmonics=70, **material)
@@ -223,7 +223,7 @@ def test_deep_gold_at_grazing_incidence_converges():
     assert 0.8 < found.p.sum() < found.s.sum() < 1
 
 
-def test_where_harmonics_run_out_a_warning_tells():
+def test_too_few_harmonics_raise_a_warning():
     surface = gratings.sinusoidal(0.5, 4.0)
     with pytest.warns(UserWarning, match=r"error of 0\.\d+ with 80 harmonics, wanted at most 1e-09") as told:
         found = rigorous.efficiencies(surface, CONICAL, 0.55, material="Ag", tolerance=1e-9)

@@ -107,7 +107,7 @@ def test_the_first_of_many_functions_are_those_of_fewer_nodes(kind):
 
 
 @pytest.mark.parametrize("series", [taylor(2.0, 3)[0], chebyshev(2.0, 3)[0], Series("svd", 2.0, np.eye(3, 5))])
-def test_weights_of_many_kappas(series):
+def test_weights_of_many_kappas_are_those_of_each(series):
     kappas = np.linspace(0, 2, 6).reshape(2, 3)
     assert series.weights(kappas).shape == (2, 3, 3)
     np.testing.assert_allclose(series.weights(kappas)[1, 2], series.weights(2.0), atol=1e-15)
@@ -134,7 +134,7 @@ def left_out(kind, terms, height, nodes):
 
 
 @given(height=st.floats(-0.4, 0.4), terms=st.integers(1, 25))
-def test_what_taylor_leaves_out_is_bounded_by_lagrange(height, terms):
+def test_the_remainder_of_taylor_is_bounded_by_lagrange(height, terms):
     x = CENTRE * abs(height)
     nodes = max(terms, nodes_for(x, 1e-13))
     bound = x**terms / factorial(terms)
@@ -145,7 +145,7 @@ def test_what_taylor_leaves_out_is_bounded_by_lagrange(height, terms):
 
 
 @given(height=st.floats(-2, 2), terms=st.integers(1, 60))
-def test_what_chebyshev_leaves_out_are_the_bessel_functions_beyond(height, terms):
+def test_the_remainder_of_chebyshev_is_the_bessel_functions_beyond(height, terms):
     x = CENTRE * height
     nodes = max(terms, nodes_for(abs(x), 1e-13))
     bound = 2 * np.abs(jv(np.arange(terms, terms + 200), x)).sum()
@@ -215,14 +215,14 @@ def test_no_separable_sum_of_as_many_terms_is_nearer(values):
         assert np.linalg.norm(remainder * weight) == pytest.approx(np.linalg.norm(singular[terms:]), rel=1e-9)
 
 
-def test_frequencies_without_power_do_no_harm():
+def test_frequencies_without_power_change_nothing():
     series, _ = svd(LARGEST_KAPPA, np.stack([np.ones(8), np.zeros(8)], axis=-1))
     assert np.isfinite(series.modes).all()
     np.testing.assert_allclose(np.abs(series.first(1).weights(KAPPAS)), 8**-0.5, rtol=1e-9)
 
 
 @pytest.mark.parametrize("modes", [np.zeros(3), np.zeros((0, 3)), np.full((1, 2), np.nan)])
-def test_modes_that_cannot_be_are_refused(modes):
+def test_wrong_modes_are_refused(modes):
     with pytest.raises(ValueError, match="modes: got"):
         Series("svd", 1.0, modes)
 

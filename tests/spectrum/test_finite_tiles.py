@@ -30,7 +30,7 @@ def exact_factor(x, count):
 
 
 @given(x=st.floats(-3, 3), count=st.integers(1, 40))
-def test_it_is_the_sum_of_the_waves(x, count):
+def test_the_factor_is_the_sum_of_the_waves(x, count):
     places = np.arange(count) - (count - 1) / 2
     wanted = np.exp(2j * np.pi * x * places).sum()
     assert tile_factor(x, count) == pytest.approx(wanted.real, abs=1e-12 * count)
@@ -42,7 +42,7 @@ def test_it_is_the_sum_of_the_waves(x, count):
     offset=st.floats(2.0**-60, 0.5, width=32) | st.floats(-0.5, -(2.0**-60), width=32) | st.just(0.0),
     count=counts,
 )
-def test_float32_is_right_to_the_last_places(whole, offset, count):
+def test_the_factor_in_float32_is_right_to_the_last_places(whole, offset, count):
     x = np.float32(whole) + np.float32(offset)
     assert x.dtype == np.float32
     got, wanted = tile_factor(x, count), exact_factor(x, count)
@@ -52,7 +52,7 @@ def test_float32_is_right_to_the_last_places(whole, offset, count):
 
 @pytest.mark.skipif(np.finfo(np.longdouble).eps > 1e-18, reason="long double has no more digits than float64 here")
 @given(whole=st.integers(-9, 9), power=st.integers(-50, -1), mantissa=st.floats(0.5, 1), count=st.integers(1, 200))
-def test_float64_is_right_to_the_last_places(whole, power, mantissa, count):
+def test_the_factor_in_float64_is_right_to_the_last_places(whole, power, mantissa, count):
     x = np.float64(whole) + mantissa * 2.0**power
     r = np.longdouble(x) - np.rint(np.longdouble(x))
     if abs(r) * count < 1e-9:
@@ -68,7 +68,7 @@ def test_float64_is_right_to_the_last_places(whole, power, mantissa, count):
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("count", [1, 2, 3, 10, 101, 4096])
-def test_whole_numbers_give_the_number_of_tiles(dtype, count):
+def test_the_factor_at_integers_is_the_number_of_tiles(dtype, count):
     whole = np.arange(-5, 6).astype(dtype)
     got = tile_factor(whole, count)
     assert got.dtype == dtype
@@ -100,11 +100,11 @@ def test_the_square_integrates_to_the_number_of_tiles(count):
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("power", [24, 60, 100])
-def test_huge_arguments_are_whole_even_numbers(dtype, power):
+def test_huge_arguments_count_as_even_integers(dtype, power):
     np.testing.assert_array_equal(tile_factor(np.array([-1, 1], dtype) * dtype(2.0**power), 6), 6)
 
 
-def test_shapes_and_types():
+def test_shapes_and_types_are_preserved():
     assert tile_factor(np.zeros((2, 3)), 4).shape == (2, 3)
     assert tile_factor(np.zeros((0,)), 4).shape == (0,)
     assert np.shape(tile_factor(0.25, 2)) == ()

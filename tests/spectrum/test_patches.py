@@ -44,7 +44,7 @@ def test_the_spectrum_is_the_mean_of_theirs(recipe):
         assert kappa == 0 or np.abs(order_powers(fields[0], kappa)[np.ix_(m_y, m_x)] - wanted).sum() > 0.03
 
 
-def test_between_the_orders_too(recipe, spectrum):
+def test_the_spectrum_between_the_orders_is_the_mean_of_theirs(recipe, spectrum):
     rng = np.random.default_rng(0)
     q, kappa = rng.uniform(-1.5, 1.5, (300, 2)), np.full(300, GREEN)
     of_each = [power_spectrum(field, q, kappa, coherence_length=5.6) for field in recipe.height_fields()]
@@ -60,7 +60,7 @@ def test_a_saved_spectrum_says_how_many(spectrum, tmp_path):
     assert again.source.startswith("mean of 3 patches: synthetic Elaphe skin")
 
 
-def test_another_number_is_another_spectrum(recipe):
+def test_another_number_of_patches_is_another_spectrum(recipe):
     digests = {Recipe({**SURFACE, "patches": n}, recipe.spectrum).digest() for n in (1, 2, PATCHES["elaphe"])}
     assert len(digests) == 3
     assert Recipe(SURFACE).patches == PATCHES["elaphe"]
@@ -80,7 +80,7 @@ def test_another_number_is_another_spectrum(recipe):
         ({"scan": "a.png", "patches": 2}, "unknown name patches"),
     ],
 )
-def test_wrong_numbers_are_refused(surface, message):
+def test_wrong_numbers_of_patches_are_refused(surface, message):
     with pytest.raises(ValueError, match=message):
         Recipe(surface)
 
@@ -96,7 +96,7 @@ def test_patches_repeat_and_are_of_one_size(recipe):
 
 
 @pytest.mark.slow
-def test_a_scene_names_them(llvm):
+def test_a_scene_sets_the_number_of_patches(llvm):
     surface = {"type": "diffraction_grating", **{**SURFACE, "coherence_length": 5.6, "patches": 2}}
     assert mi.load_dict(surface).spectrum.patches == 2
     with pytest.raises(Exception, match="patches: got 0, wanted a whole number"):

@@ -135,7 +135,7 @@ def test_measured_skins_keep_the_tolerance(scan, name, representation, tolerance
     ids=["lamellar", "deep", "deep 1e-4", "random 1e-4", "spike"],
 )
 @pytest.mark.parametrize("representation", ["chebyshev", "svd", "slices"])
-def test_the_error_that_is_told_is_that_of_every_kappa(field, tolerance, representation):
+def test_the_reported_error_holds_for_every_kappa(field, tolerance, representation):
     # Regression: a dozen values of κ at which the error was measured missed its peaks by up to 40 %.
     spectrum = precompute(field, representation=representation, tolerance=tolerance, coherence_length=200.0)
     worst = worst_error(spectrum, field, np.linspace(0, LARGEST_KAPPA, 401))
@@ -145,7 +145,7 @@ def test_the_error_that_is_told_is_that_of_every_kappa(field, tolerance, represe
 @pytest.mark.few(4)
 @pytest.mark.parametrize("representation", KINDS)
 @pytest.mark.parametrize("tolerance", TOLERANCES)
-def test_the_error_that_is_told_is_no_more_than_what_is_there(representation, tolerance):
+def test_the_reported_error_is_no_more_than_the_actual_one(representation, tolerance):
     field = md.gratings.blazed(period=2.5, depth=0.25, samples=64)
     spectrum = precompute(field, representation=representation, tolerance=tolerance)
     # ∫|S_approx − S_exact| over the truncated lobes of S_approx, and what of S_exact lies outside of them.
@@ -275,7 +275,7 @@ def test_a_flat_surface_is_a_mirror(representation):
         assert isolated_error(spectrum, field, kappa) <= 1e-4
 
 
-def test_the_other_axis_is_the_other_axis():
+def test_the_axes_are_not_exchanged():
     # A grating along y, with pixels that are not square: nothing is exchanged on the way.
     depth, kappa = 0.1, 30.0
     heights = depth / 2 * np.cos(2 * np.pi * np.arange(64) / 64)[:, None]
@@ -302,7 +302,7 @@ def test_taylor_refuses_deep_surfaces_with_the_reason(extent, depth):
 
 @pytest.mark.parametrize("representation", ["chebyshev", "svd", "slices"])
 @pytest.mark.parametrize("depth", [1.0, 5.0])
-def test_the_others_keep_deep_surfaces(depth, representation):
+def test_other_representations_keep_the_tolerance_on_deep_surfaces(depth, representation):
     spectrum = precompute(md.gratings.sinusoidal(2.5, depth), representation=representation)
     for kappa in random_kappas(4):
         got = lobe_powers(spectrum, 2.5, ORDERS, kappa)
@@ -347,7 +347,7 @@ def test_the_orders_are_those_that_light_reaches():
 
 
 @pytest.mark.parametrize(("pixel", "axis"), [((0.2, 0.05), "x"), ((0.05, 0.1), "y")])
-def test_pixels_too_coarse_are_told(pixel, axis):
+def test_pixels_too_coarse_raise_a_warning(pixel, axis):
     field = HeightField(np.random.default_rng(1).random((6, 7)) * 0.1, pixel)
     with pytest.warns(UserWarning, match=rf"nm along {axis} hold no frequency beyond .* light reaches 5.56") as caught:
         spectrum = precompute(field)
@@ -357,7 +357,7 @@ def test_pixels_too_coarse_are_told(pixel, axis):
         assert largest / (count * size) < 1 / (2 * size)
 
 
-def test_an_axis_of_one_pixel_has_no_limit_to_tell():
+def test_an_axis_of_one_pixel_raises_no_warning():
     precompute(HeightField(np.linspace(0, 0.1, 30)[None], (0.08, 50.0)))
 
 
@@ -445,7 +445,7 @@ def power_outside(field, kappa, inside):
     ],
     ids=["blaze", "wavelengths", "angle", "random", "all"],
 )
-def test_what_lies_beyond_is_told(field, arguments):
+def test_the_unresolved_power_is_reported(field, arguments):
     spectrum = precompute(field, **arguments)
     angle = np.deg2rad(arguments.get("largest_angle", 90.0))
     reach = 2 * np.sin(angle) / arguments.get("wavelengths", (360.0,))[0] * 1e3
@@ -469,7 +469,7 @@ def test_what_lies_beyond_is_told(field, arguments):
     ids=["shallow", "deep", "bump"],
 )
 @pytest.mark.filterwarnings("ignore:pixels of")
-def test_weak_orders_are_dropped_and_their_power_is_told(field, tolerance):
+def test_weak_orders_are_dropped_and_their_power_is_reported(field, tolerance):
     spectrum = precompute(field, tolerance=tolerance)
     m_x, m_y = spectrum.grid.largest
     assert m_x < min((field.shape[1] - 1) // 2, int(REACHED * field.tile_size[0]))  # there was something to drop
@@ -587,7 +587,7 @@ def test_a_deep_sample_keeps_the_tolerance_or_is_refused(representation):
         assert sample_error(spectrum, field, kappa, 0.44, seed=1) <= 1e-3
 
 
-def test_what_a_sample_leaves_out_is_told():
+def test_the_unresolved_power_of_a_sample_is_reported():
     field = scan_of((20, 22), 0.3, 0.06)
     spectrum = precompute(field, extent="sample", coherence_length=0.55, largest_angle=40.0, tolerance=0.01)
     reach = REACHED * np.sin(np.deg2rad(40))
@@ -618,7 +618,7 @@ def test_the_weak_frequencies_of_a_smooth_sample_are_dropped():
     assert 0 < spectrum.dropped <= 0.1 * 0.01
 
 
-def test_the_coherence_that_a_scan_carries_is_told():
+def test_the_coherence_length_that_a_scan_supports_is_reported():
     field = scan_of((18, 30), 0.1, 0.09)
     with pytest.warns(UserWarning, match="coherence_length: ") as caught:
         spectrum = precompute(field, extent="sample", tolerance=0.05)

@@ -72,7 +72,7 @@ def test_a_common_offset_of_the_heights_changes_nothing(kappa, offset):
 
 
 @given(kappa=kappas, depth=st.floats(0, 5))
-def test_one_spike_on_a_flat_surface(kappa, depth):
+def test_one_spike_on_a_flat_surface_has_the_orders_of_the_closed_form(kappa, depth):
     # 1 − (1 − e^{iκd})/N in order zero, a share of |1 − e^{iκd}|²/N² in every other one.
     heights = np.zeros((3, 5))
     heights[1, 2] = depth
@@ -338,7 +338,7 @@ def test_a_slope_shifts_the_lobe(slope):
     assert at_shift > 0.9 * gauss(0, sigma_of(2.0)) ** 2
 
 
-def test_the_seam_of_a_sample_is_not_seen():
+def test_the_seam_of_a_sample_has_no_effect():
     # A ramp that repeats has a step where it is wrapped around, and a streak of orders along x; a scan of it has not.
     kappa, slope = 25.0, 0.13
     field = HeightField(np.tile(slope * np.arange(64) * 0.1, (64, 1)), 0.1)
@@ -389,7 +389,7 @@ def test_white_noise_has_a_white_spectrum():
     assert spectra.std() == pytest.approx(0.633, rel=0.1)
 
 
-def test_a_scan_carries_no_more_coherence_than_half_of_its_size():
+def test_a_scan_supports_a_coherence_length_of_half_its_size():
     field = HeightField(np.random.default_rng(6).random((30, 50)) * 0.3, 0.1)
     q = np.random.default_rng(7).uniform(-2, 2, (20, 2))
     q[0] = 0
@@ -399,7 +399,7 @@ def test_a_scan_carries_no_more_coherence_than_half_of_its_size():
     assert np.abs(less - carried).max() > 0.01 * carried.max()
 
 
-def test_a_uniform_axis_has_the_lobe_that_the_other_axis_carries():
+def test_a_uniform_axis_has_the_lobe_of_the_other_axis():
     # Along y 65 µm would be had for the asking, but both axes are seen through one window.
     field = HeightField(np.random.default_rng(8).random((1, 60)), (0.1, 5.0))
     across = np.array([0.0, 0.1, 0.3, 0.9])  # the last one beyond 1/2d_y, which is no limit here
@@ -426,7 +426,7 @@ def test_rounding_does_not_take_the_nyquist_limit_itself_away():
 
 
 @pytest.mark.parametrize("largest", [1, 100, 2**20])
-def test_how_many_at_a_time_does_not_matter(largest, monkeypatch):
+def test_the_size_of_chunks_does_not_matter(largest, monkeypatch):
     field = HeightField(np.random.default_rng(10).random((12, 9)), 0.1)
     q = np.random.default_rng(11).uniform(-5, 5, (5, 3, 2))
     q[1] = q[0]  # the same places again
@@ -437,7 +437,7 @@ def test_how_many_at_a_time_does_not_matter(largest, monkeypatch):
 
 
 @pytest.mark.parametrize("extent", ["tile", "sample"])
-def test_no_q_gives_no_numbers(extent):
+def test_an_empty_q_gives_an_empty_result(extent):
     field = HeightField(np.zeros((8, 8)), 0.1)
     assert power_spectrum(field, np.zeros((0, 2)), 1.0, extent=extent).shape == (0,)
 
@@ -523,7 +523,7 @@ def test_a_sample_of_too_few_pixels_is_refused():
 
 
 @pytest.mark.parametrize("q", [(np.nan, 0.0), (0.0, np.nan)])
-def test_what_is_not_a_number_does_not_become_one(q):
+def test_nan_does_not_become_a_number(q):
     field = HeightField([[0.0, 0.1]], 0.2)
     with contextlib.suppress(ValueError):
         assert np.isnan(power_spectrum(field, [q], [1.0])).all()

@@ -59,7 +59,7 @@ def test_axes_run_from_minus_to_plus_the_largest_order():
 
 
 @pytest.mark.parametrize("shape", [(3, 5), (4, 6), (7, 8)])
-def test_take_finds_the_waves_of_each_order(shape):
+def test_take_selects_the_power_of_each_order(shape):
     grid = OrderGrid((1.0, 1.0), ((shape[1] - 1) // 2, (shape[0] - 1) // 2))
     y, x = np.indices(shape)
     for row, m_y in enumerate(grid.axes()[1]):
@@ -79,7 +79,7 @@ def test_the_nyquist_order_lies_half_on_each_side():
 @pytest.mark.parametrize(
     "arguments", [((0.0, 1.0), (1, 1)), ((1.0, np.nan), (1, 1)), ((1.0, np.inf), (1, 1)), ((1.0, 1.0), (1, -1))]
 )
-def test_grids_that_cannot_be_are_refused(arguments):
+def test_wrong_grids_are_refused(arguments):
     with pytest.raises(ValueError, match=r"tile_size|largest order"):
         OrderGrid(*arguments)
 
@@ -95,7 +95,7 @@ def test_the_share_that_lobe_reach_names_is_the_one_that_the_cut_moves(share):
 
 @pytest.mark.parametrize("coherence_length", [1.0, 5.0, 20.0, 65.0])
 @pytest.mark.parametrize("tolerance", [1e-2, 1e-3])
-def test_lobes_that_end_keep_their_power_and_what_lies_outside_keeps_the_tolerance(coherence_length, tolerance):
+def test_truncated_lobes_keep_their_power_and_the_tolerance(coherence_length, tolerance):
     spectrum = md.precompute(random_surface(0.1, (40, 50)), coherence_length=coherence_length, tolerance=tolerance)
     grid = OrderGrid(spectrum.pixel_size, (30, 40))  # many orders, whatever the grid of the spectrum is
     grid = OrderGrid((4.0, 3.2), grid.largest)
@@ -134,7 +134,7 @@ def surface_of(grid, coefficients, q):
 
 
 @given(seed=st.integers(0, 2**32 - 1))
-def test_three_by_three_nodes_are_all_that_hold(seed):
+def test_only_three_by_three_nodes_contribute(seed):
     rng = np.random.default_rng(seed)
     grid = SplineGrid((0.3, 0.11), (3, 5), (np.inf, np.inf))
     coefficients = rng.normal(size=grid.shape)
@@ -151,7 +151,7 @@ def test_beyond_the_limit_a_sample_is_black():
 
 
 @given(x=st.floats(-3, 3))
-def test_the_integral_of_a_spline(x):
+def test_the_integral_of_a_spline_is_that_by_quadrature(x):
     fine = np.linspace(-1.5, 1.5, 6001)
     # The rule of the middle is good to the square of the step.
     middles = (fine[1:] + fine[:-1]) / 2
@@ -170,7 +170,7 @@ def test_the_integral_of_a_spline(x):
         ((1.0, 1.0), (1, 1), (np.nan, 1.0)),
     ],
 )
-def test_lattices_that_cannot_be_are_refused(arguments):
+def test_wrong_lattices_are_refused(arguments):
     with pytest.raises(ValueError, match=r"spacing|largest node|limit"):
         SplineGrid(*arguments)
 
@@ -280,7 +280,7 @@ def test_slices_are_stored_rounded_but_where_they_are_too_large(terms, rounded):
     assert table.words_per_node == 4
 
 
-def test_numbers_that_are_too_large_do_not_become_others():
+def test_numbers_too_large_to_be_rounded_are_not_finite():
     values = np.full((1, 3, 1, 1), 5.0, np.float32)
     assert not np.isfinite(packed(values)).any()
     assert not np.isfinite(halved(values)).any()

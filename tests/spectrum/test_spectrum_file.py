@@ -64,7 +64,7 @@ def saved(request, tmp_path):
 
 
 @pytest.mark.parametrize("coherence_length", [65.0, 0.8])
-def test_what_was_read_shares_the_tables_of_what_was_built(tmp_path, coherence_length):
+def test_a_read_spectrum_shares_the_tables_of_the_built_one(tmp_path, coherence_length):
     spectrum = make(shape=(16, 16), tolerance=0.05, coherence_length=coherence_length)
     assert isinstance(spectrum.grid, SplineGrid) == (coherence_length < 1)
     spectrum.save(tmp_path / "saved.exr")
@@ -280,7 +280,7 @@ def test_a_missing_entry_of_the_header_is_refused(saved):
 
 
 @pytest.mark.parametrize(("make", "kind", "name"), [(make, "svd", "modes"), (make_sample, "slices", "limit")])
-def test_what_only_some_spectra_have_is_not_done_without(tmp_path, make, kind, name):
+def test_a_missing_entry_that_only_some_spectra_have_is_refused(tmp_path, make, kind, name):
     path = tmp_path / "saved.exr"
     make(kind).save(path)
     rewrite(path, drop=[name])
@@ -307,7 +307,7 @@ def test_half_precision_is_refused(saved):
     refusal(saved[1])
 
 
-def test_numbers_that_cannot_be_are_refused(saved):
+def test_impossible_numbers_are_refused(saved):
     spectrum, path = saved
     content = path.read_bytes()
     for name, value in (

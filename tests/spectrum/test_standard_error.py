@@ -33,7 +33,7 @@ def spread(fields, coherence_length, kappa):
 
 
 @pytest.mark.parametrize("coherence_length", [1.0, 4.0])
-def test_of_speckle_it_is_that_of_as_many_independent_windows_as_fit(coherence_length):
+def test_the_standard_error_of_speckle_is_that_of_independent_windows(coherence_length):
     # The relative standard error is 1/√P_eff at every q, and Gaussian windows σ_s apart have P_eff = P/Σ_j e^{−j²/2}²…
     found = np.mean(
         [
@@ -49,13 +49,13 @@ def test_of_speckle_it_is_that_of_as_many_independent_windows_as_fit(coherence_l
     assert found == pytest.approx(correlation.mean(), rel=0.12)
 
 
-def test_a_flat_scan_is_known_exactly():
+def test_a_flat_scan_has_no_standard_error():
     flat = md.HeightField(np.zeros((60, 50)), 0.05)
     found = standard_error(flat, coherence_length=1.0, largest_kappa=KAPPA, reach=REACH)
     assert found == pytest.approx(0, abs=1e-12)
 
 
-def test_a_uniform_axis_has_no_scatter():
+def test_a_uniform_axis_adds_no_standard_error():
     # A row of pixels: all scatter is along it, and more of it than of a square, which has more places.
     rng = np.random.default_rng(1)
     heights = rng.uniform(0, 7, (120, 120))
@@ -69,7 +69,7 @@ def test_a_uniform_axis_has_no_scatter():
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["elaphe", "xenopeltis"])
 @pytest.mark.parametrize(("size", "coherence_length"), [(20.0, 5.0), (20.0, 10.0), (6.0, 1.5), (6.0, 3.0)])
-def test_of_a_synthetic_skin_it_is_right_within_a_factor_of_1_3(name, size, coherence_length):
+def test_the_standard_error_of_a_skin_is_right_within_a_factor_of_1_3(name, size, coherence_length):
     fields = []
     for seed in range(12):
         skin = md.gratings.PROFILES[name](32.0, seed=seed)
@@ -103,7 +103,7 @@ def test_the_tolerance_of_a_sample_follows_it(heights, coherence_length, toleran
     assert spectrum.error <= tolerance
 
 
-def test_in_between_it_is_a_tenth(rough):
+def test_the_tolerance_of_a_sample_is_a_tenth_of_its_standard_error(rough):
     spectrum = md.precompute(rough, extent="sample", coherence_length=1.0)
     assert 1e-3 < spectrum.tolerance < 1e-2
     assert spectrum.tolerance == pytest.approx(spectrum.standard_error / 10)
@@ -112,14 +112,14 @@ def test_in_between_it_is_a_tenth(rough):
     assert md.precompute(rough, extent="sample", coherence_length=1.0, tolerance=0.03).tolerance == 0.03
 
 
-def test_a_tile_has_none():
+def test_a_tile_has_no_standard_error():
     spectrum = md.precompute(md.gratings.blazed(samples=64))
     with pytest.raises(ValueError, match="standard_error: got a tile, wanted a sample"):
         spectrum.standard_error  # noqa: B018
 
 
 @pytest.mark.slow
-def test_the_command_prints_it_and_the_file_keeps_it(rough, tmp_path, command, monkeypatch):
+def test_the_standard_error_is_printed_and_stored(rough, tmp_path, command, monkeypatch):
     monkeypatch.chdir(tmp_path)
     recipe = Path("noise.toml")
     np.save("noise.npy", rough.heights)

@@ -27,7 +27,7 @@ def flat(rows, columns, pixel):
         (8, 8, 0.25, 65.0, 1.0),  # four pixels are just enough
     ],
 )
-def test_a_scan_carries_half_of_its_shorter_side(rows, columns, pixel, asked, wanted):
+def test_a_scan_supports_half_of_its_shorter_side(rows, columns, pixel, asked, wanted):
     assert carried_coherence_length(flat(rows, columns, pixel), asked) == pytest.approx(wanted, rel=1e-12)
 
 

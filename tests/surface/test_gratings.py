@@ -249,7 +249,7 @@ def test_the_other_period_must_be_positive(period_y):
         ({"seed": 0.5}, "seed: got 0.5"),
     ],
 )
-def test_misuse_of_a_skin_is_refused(make, arguments, message):
+def test_wrong_arguments_of_a_skin_are_refused(make, arguments, message):
     with pytest.raises(ValueError, match=message):
         make(**arguments)
 

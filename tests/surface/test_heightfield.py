@@ -44,7 +44,7 @@ def test_masked_pixels_are_refused_and_an_empty_mask_is_not(dtype):
     np.testing.assert_array_equal(HeightField(whole, 0.1).heights, heights.data)
 
 
-def test_the_refusal_says_how_to_ask_for_the_filling():
+def test_the_refusal_of_missing_pixels_says_how_to_fill_them():
     with pytest.raises(ValueError, match=r"\(fill_missing=True, or --fill-missing, fills them"):
         HeightField([[np.nan, 1]], 0.1)
 
@@ -100,7 +100,7 @@ def test_there_is_nothing_to_fill_from_where_all_is_missing(heights):
 
 
 @pytest.mark.parametrize("answer", ["no", 1, None])
-def test_the_filling_is_asked_for_with_true_or_false(answer):
+def test_fill_missing_is_true_or_false(answer):
     with pytest.raises(ValueError, match=r"fill_missing: got .* wanted True or False"):
         HeightField([[1, 2]], 0.1, fill_missing=answer)
 
@@ -116,7 +116,7 @@ def test_what_is_not_a_plane_of_heights_is_refused(heights):
 
 
 @pytest.mark.parametrize("size", [0, -1, np.nan, np.inf, (0.1, 0), (0.1, -0.1), (0.1,), (1, 2, 3), "0.1", "12", None])
-def test_pixel_sizes_that_are_not_are_refused(size):
+def test_wrong_pixel_sizes_are_refused(size):
     with pytest.raises(ValueError, match="pixel_size: got"):
         HeightField(np.zeros((2, 2)), size)
 

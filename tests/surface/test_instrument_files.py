@@ -65,7 +65,7 @@ def apart(one, other):
 # ---------------------------------------------------------------- real scans
 
 
-def test_the_pitch_of_a_line_grating(by_its_maker):
+def test_a_line_grating_has_its_pitch(by_its_maker):
     (found,) = find_periods(prepare.level_plane(by_its_maker("grid")))
     assert found.period == pytest.approx(PITCH, rel=0.01)
     assert found.direction == pytest.approx(-45, abs=1)
@@ -84,7 +84,7 @@ def test_the_pitch_of_a_line_grating(by_its_maker):
 
 
 @pytest.mark.parametrize("name", CROSSED)
-def test_the_pitches_of_crossed_structures(by_its_maker, name):
+def test_crossed_structures_have_their_pitches(by_its_maker, name):
     first, second = find_periods(prepare.level_plane(by_its_maker(name)))
     for found in (first, second):
         assert found.period == pytest.approx(10, rel=0.02)
@@ -109,7 +109,7 @@ def test_a_real_scan_is_prepared_to_a_tile(by_its_maker):
 
 @needs_the_extra
 @pytest.mark.parametrize("name", ["grid", "circles"])
-def test_nid_is_what_its_maker_reads(nid, by_its_maker, name):
+def test_nid_is_read_as_by_its_maker(nid, by_its_maker, name):
     field, expected = read_height_field(nid(name)), by_its_maker(name)
     np.testing.assert_allclose(field.heights, expected.heights, atol=1e-12)
     assert field.pixel_size == pytest.approx(expected.pixel_size)
@@ -117,7 +117,7 @@ def test_nid_is_what_its_maker_reads(nid, by_its_maker, name):
 
 
 @needs_the_extra
-def test_a_channel_is_named(nid):
+def test_a_channel_is_selected_by_name(nid):
     forward = read_height_field(nid("grid"))
     backward = read_height_field(nid("grid"), channel="scan backward")
     assert backward.source == "grid.nid, Scan backward (Z-Axis)"
@@ -129,7 +129,7 @@ def test_a_channel_is_named(nid):
 
 
 @needs_the_extra
-def test_surface_data_of_iso_25178(tmp_path):
+def test_surface_data_of_iso_25178_are_read(tmp_path):
     # Written by hand: ISO 25178-71, binary, 16 bit, metres.
     counts = np.array([[0, 100, 300], [-50, 7, 20]], "<i2")
     header = struct.pack("<8s10s12s12sHHddddBBB", b"bISO-1.0", *[b" "] * 3, 3, 2, 2e-7, 4e-7, 1e-9, -1, 0, 5, 0)
@@ -141,7 +141,7 @@ def test_surface_data_of_iso_25178(tmp_path):
 
 
 @needs_the_extra
-def test_missing_pixels_of_an_instrument_are_missing(tmp_path):
+def test_missing_pixels_of_an_instrument_stay_missing(tmp_path):
     counts = np.array([[0, 100, -(2**15)], [-50, 7, 20]], "<i2")  # the least number marks them
     header = struct.pack("<8s10s12s12sHHddddBBB", b"bISO-1.0", *[b" "] * 3, 3, 2, 2e-7, 4e-7, 1e-9, -1, 0, 5, 0)
     (tmp_path / "scan.sdf").write_bytes(header + counts.tobytes())
@@ -172,7 +172,7 @@ def test_a_cut_scan_is_refused_in_one_line(nid, tmp_path, length):
         (b"GroupCount=2", b"GroupCount=x"),
     ],
 )
-def test_a_header_that_lies_is_refused_in_one_line(nid, tmp_path, old, new):
+def test_a_header_with_wrong_sizes_is_refused_in_one_line(nid, tmp_path, old, new):
     path = tmp_path / "lie.nid"
     path.write_bytes(nid("circles").read_bytes().replace(old, new))
     with pytest.raises(ValueError, match=r"lie\.nid: ") as caught:
@@ -182,7 +182,7 @@ def test_a_header_that_lies_is_refused_in_one_line(nid, tmp_path, old, new):
 
 @needs_the_extra
 @pytest.mark.parametrize("extension", [*instruments.FORMATS, ".000", ".123"])
-def test_every_format_refuses_what_is_none(tmp_path, extension):
+def test_every_format_refuses_files_of_other_formats(tmp_path, extension):
     path = tmp_path / f"scan{extension}"
     for content in (b"", b"no scan at all\n" * 20, bytes(range(256)) * 8, b"PK\x05\x06" + bytes(18)):
         path.write_bytes(content)
@@ -214,7 +214,7 @@ def test_a_channel_without_a_name_is_listed(tmp_path, monkeypatch):
             read_height_field(tmp_path / "line.sur", channel=channel)
 
 
-def test_without_the_extra_it_is_named(tmp_path, monkeypatch):
+def test_a_missing_extra_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "SurfaceTopography", None)
     monkeypatch.setitem(sys.modules, "SurfaceTopography.IO", None)
     (tmp_path / "scan.nid").write_bytes(b"[DataSet]\r\n")

@@ -103,7 +103,7 @@ def test_waves_along_y_have_the_direction_90(direction):
     assert found.direction == pytest.approx(90)
 
 
-def test_the_sign_of_the_direction():
+def test_the_direction_has_the_sign_of_the_wave():
     # The crests of cos(x + y) fall towards +x: their wave vector points at 45°.
     assert find_periods(HeightField(wave((60, 60), 0.5, 45), PIXEL))[0].direction == pytest.approx(45)
     assert find_periods(HeightField(wave((60, 60), 0.5, 45)[::-1], PIXEL))[0].direction == pytest.approx(-45)
@@ -117,7 +117,7 @@ def test_the_sign_of_the_direction():
     [("sinusoidal", 1.0), ("lamellar", 8 / np.pi**2), ("blazed", 6 / np.pi**2)],  # Fourier series of the profiles
 )
 @pytest.mark.parametrize("rows", [1, 24])
-def test_gratings_by_formula(name, strength, rows):
+def test_gratings_by_formula_have_their_periods(name, strength, rows):
     grating = md.gratings.PROFILES[name](period=2.5, depth=0.25)
     pixel = 8 * grating.pixel_size[0]
     heights = np.tile(grating.heights[:, ::8], (rows, 5))
@@ -154,7 +154,7 @@ def test_missing_pixels_do_not_hide_a_period():
     assert found.period == pytest.approx(0.6, abs=4 * found.period_uncertainty)
 
 
-def test_a_grating_on_a_part_of_the_patch():
+def test_a_grating_on_a_part_of_the_patch_is_found():
     heights = wave((64, 64), 0.4, 30)
     heights[:, :32] = 0
     found = find_periods(HeightField(heights, PIXEL))[0]
@@ -164,7 +164,7 @@ def test_a_grating_on_a_part_of_the_patch():
 
 @pytest.mark.few(1)
 @pytest.mark.parametrize(("name", "directions"), [("elaphe", (90, 0)), ("xenopeltis", (0, 90))])
-def test_the_rows_of_a_synthetic_skin(name, directions):
+def test_the_rows_of_a_synthetic_skin_are_a_period(name, directions):
     # Its fingers wander, and the uncertainty says so.
     skin = md.gratings.PROFILES[name](size=32.0, depth=0.375, seed=1)
     skin = HeightField(skin.heights[::2, ::2], 2 * skin.pixel_size[0])
@@ -250,7 +250,7 @@ def fingers(seed, width=0.2, shape=(160, 160), pixel=0.06, q=1.8):
     return HeightField(np.fft.ifft2(white * np.sqrt(power)).real, pixel)
 
 
-def test_a_band_is_told_by_its_centre_and_not_by_its_strongest_bin():
+def test_a_band_is_given_by_its_centre_and_not_by_its_strongest_bin():
     errors = []
     for seed in range(8):
         (band,) = find_periods(fingers(seed), 1)

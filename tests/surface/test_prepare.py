@@ -55,7 +55,7 @@ ALL = ["level_plane", "level_quadratic", "align_lines", "despike", {"rotate": 18
 
 
 @pytest.mark.parametrize("step", ["level_plane", "despike", {"rotate": 20}, {"trim_edges": 0.1}, {"crop_periods": "x"}])
-def test_what_was_filled_is_remembered(step):
+def test_filled_pixels_are_counted_through_all_steps(step):
     field = with_gaps(HeightField(grating((40, 60)), PIXEL))
     count = int(field.gaps.sum())
     assert prepare.apply_steps(field, ["fill_missing", step, "fill_missing"]).filled == count > 0
@@ -103,7 +103,7 @@ def test_steps_are_done_in_their_order_and_say_what_they_did():
         ([{"crop_periods": 2.0}], "crop_periods: got 2.0"),
     ],
 )
-def test_wrong_steps_are_refused_before_there_is_a_scan(steps, message):
+def test_wrong_steps_are_refused_before_a_scan_is_read(steps, message):
     with pytest.raises(ValueError, match=message):
         prepare.check_steps(steps)
 
@@ -117,13 +117,13 @@ def test_wrong_steps_are_refused_before_there_is_a_scan(steps, message):
         ("crop_periods=x", {"crop_periods": "x"}),
     ],
 )
-def test_steps_as_they_are_typed(text, step):
+def test_steps_are_parsed_as_they_are_typed(text, step):
     assert prepare.step_of(text) == step
     prepare.check_steps([prepare.step_of(text)])
 
 
 @pytest.mark.parametrize("extent", ["tile", "sample"])
-def test_what_still_misses_pixels_has_no_spectrum(extent):
+def test_a_height_field_with_missing_pixels_has_no_spectrum(extent):
     field = with_gaps(rough((20, 30)))
     assert f"{field.gaps.sum()} missing" in repr(field)
     with pytest.raises(ValueError, match="of 600 pixels are missing"):
@@ -174,7 +174,7 @@ def test_the_plane_is_that_of_least_squares():
     np.testing.assert_allclose(prepare.level_plane(field).heights, expected, atol=1e-14)
 
 
-def test_the_bow_is_said_in_nanometres():
+def test_the_bow_is_reported_in_nanometres():
     x, y = places((31, 41))
     x, y = x / x.max() * 2 - 1, y / y.max() * 2 - 1
     after = prepare.level_quadratic(HeightField(0.012 * x**2 - 0.005 * y**2, PIXEL, "scan"))
@@ -205,7 +205,7 @@ def test_lines_across_a_grating_come_back():
     assert "align_lines: offsets" in after.source
 
 
-def test_a_lost_line_does_not_part_the_lines_about_it():
+def test_a_lost_line_does_not_separate_the_lines_about_it():
     heights = grating((20, 40))
     heights[7:] += 0.5
     heights[5] = np.nan
@@ -247,7 +247,7 @@ def test_the_edges_of_structures_are_no_spikes():
     assert prepare.despike(HeightField(heights, 1.0)).heights.tobytes() == heights.tobytes()
 
 
-def test_a_spike_on_a_level_surface_and_the_threshold():
+def test_a_spike_on_a_level_surface_is_replaced_above_the_threshold():
     heights = np.zeros((20, 20))
     heights[4, 5] = 1.0
     np.testing.assert_array_equal(prepare.despike(HeightField(heights, 1.0)).heights, 0)
@@ -325,7 +325,7 @@ def test_a_grating_turned_has_the_direction_turned():
     assert found.period == pytest.approx(0.45, rel=1e-3)
 
 
-def test_missing_pixels_are_turned_and_none_is_made_up():
+def test_missing_pixels_are_rotated_and_none_is_extrapolated():
     heights = grating((60, 60), 0.9)
     heights[30, 20] = np.nan
     after = prepare.rotate(field_of(heights), 10)
@@ -383,7 +383,7 @@ def test_a_crossed_grating_is_cropped_along_both():
     np.testing.assert_allclose(np.array(after.tile_size) / [0.61, 0.83], [9, 9], rtol=1e-3)
 
 
-def test_what_cannot_be_cropped_is_told():
+def test_a_surface_that_cannot_be_cropped_is_refused():
     with pytest.raises(ValueError, match="no period stands out"):
         prepare.crop_periods(rough((40, 40)))
     with pytest.raises(ValueError, match="1 pixels are missing, wanted fill_missing"):

@@ -382,12 +382,12 @@ def test_gwy_brings_its_scale_and_the_top_row_is_the_first(tmp_path):
 
 
 @pytest.mark.parametrize(("unit", "scale"), [("m", 1.0), ("um", 1e-6), ("µm", 1e-6), ("nm", 1e-9), ("Å", 1e-10)])
-def test_gwy_units(tmp_path, unit, scale):
+def test_gwy_units_are_converted(tmp_path, unit, scale):
     write_gwy(tmp_path / "scan.gwy", {3: ("Z", gwy_field(z=unit))})
     np.testing.assert_allclose(read_height_field(tmp_path / "scan.gwy").heights, HEIGHTS * scale, rtol=1e-12)
 
 
-def test_the_channel_is_chosen_or_named(tmp_path, refuse):
+def test_the_channel_is_that_of_the_heights_or_the_named_one(tmp_path, refuse):
     other = gwy_field(HEIGHTS * 2)
     channels = {0: ("Phase", gwy_field(z="deg")), 1: ("Amplitude", other), 2: ("ZSensor", gwy_field())}
     write_gwy(tmp_path / "scan.gwy", channels)
@@ -456,14 +456,14 @@ def in_field(inside):
         (in_field(b""), "data field of None"),
     ],
 )
-def test_gwy_files_that_lie_are_refused_at_once(tmp_path, refuse, content, text):
+def test_gwy_files_with_wrong_sizes_are_refused_at_once(tmp_path, refuse, content, text):
     (tmp_path / "scan.gwy").write_bytes(content)
     start = time.perf_counter()
     refuse("scan.gwy", text, unit="m")
     assert time.perf_counter() - start < 5
 
 
-def test_gwy_of_great_depth_or_many_parts_is_no_trouble(tmp_path, refuse):
+def test_gwy_of_great_depth_or_many_parts_is_parsed_at_once(tmp_path, refuse):
     deep = b""
     for _ in range(5000):
         deep = component("b", "o", b"A\0" + struct.pack("<I", len(deep)) + deep)
@@ -517,7 +517,7 @@ def test_gsf_without_a_scale_asks_for_it(tmp_path, refuse):
         ("Title = Z", "Title", "wanted 'name = value'"),
     ],
 )
-def test_gsf_headers_that_lie_are_refused(tmp_path, refuse, old, new, text):
+def test_wrong_gsf_headers_are_refused(tmp_path, refuse, old, new, text):
     write_gsf(tmp_path / "scan.gsf", GSF.replace(old, new))
     refuse("scan.gsf", text)
 
@@ -533,7 +533,7 @@ def points(heights=HEIGHTS, d_x=0.1, d_y=0.2, order=None, digits=8):
 
 
 @pytest.mark.parametrize("delimiter", [" ", "\t", ", ", ";"])
-def test_points_in_any_order(tmp_path, delimiter):
+def test_points_are_read_in_any_order(tmp_path, delimiter):
     text = "# made by hand\n" + points(order=[4, 2, 0, 1, 5, 3]).replace(" ", delimiter)
     (tmp_path / "scan.xyz").write_text(text)
     field = read_height_field(tmp_path / "scan.xyz", unit="um")
@@ -543,7 +543,7 @@ def test_points_in_any_order(tmp_path, delimiter):
     np.testing.assert_allclose(read_height_field(tmp_path / "scan.xyz", unit=("um", "nm")).heights, HEIGHTS * 1e-3)
 
 
-def test_points_with_rounded_places(tmp_path):
+def test_points_with_rounded_coordinates_are_read(tmp_path):
     heights = np.random.default_rng(0).random((40, 50))
     (tmp_path / "scan.xyz").write_text(points(heights, 0.0123, 0.0234, digits=4))
     field = read_height_field(tmp_path / "scan.xyz", unit="um")
@@ -551,7 +551,7 @@ def test_points_with_rounded_places(tmp_path):
     assert field.pixel_size == pytest.approx((0.0123, 0.0234), rel=1e-3)
 
 
-def test_points_that_are_not_there_are_missing(tmp_path, refuse):
+def test_absent_points_are_missing_pixels(tmp_path, refuse):
     (tmp_path / "scan.xyz").write_text(points(order=[0, 2, 3, 4, 5]))
     refuse("scan.xyz", "1 of 6 pixels are missing or not finite, the first at row 0, column 1", unit="um")
     assert read_height_field(tmp_path / "scan.xyz", unit="um", keep_missing=True).gaps.sum() == 1
@@ -589,7 +589,7 @@ MATRIX = "\n".join("\t".join(str(h * 1e-6) for h in row) for row in HEIGHTS)
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "latin-1"])
-def test_a_table_as_gwyddion_exports_it(tmp_path, encoding):
+def test_a_table_exported_by_gwyddion_is_read(tmp_path, encoding):
     header = "# Channel: Height (forward)\n# Width: 0.300 µm\n# Height: 400 nm\n# Value units: m\n"
     (tmp_path / "scan.asc").write_bytes((header + MATRIX).encode(encoding))
     field = read_height_field(tmp_path / "scan.asc")
@@ -598,7 +598,7 @@ def test_a_table_as_gwyddion_exports_it(tmp_path, encoding):
     assert field.source == "scan.asc, Height (forward)"
 
 
-def test_lengths_of_a_header_without_a_unit_are_in_the_users(tmp_path):
+def test_lengths_of_a_header_without_a_unit_are_in_the_given_one(tmp_path):
     (tmp_path / "scan.asc").write_text("# Width: 50\n# Height: 2.50\n1 2 3 4 5\n")
     assert read_height_field(tmp_path / "scan.asc", unit="nm").pixel_size == pytest.approx((0.01, 0.0025))
 

@@ -41,7 +41,7 @@ def kappa_of(wavelength, theta_i=0.0, theta_o=0.0):
 
 
 @pytest.mark.parametrize(("lines", "blaze", "angle"), [(600, 500, 8.63), (1200, 500, 17.46), (300, 1000, 8.63)])
-def test_a_ruled_grating_throws_its_blaze_wavelength_back_into_littrows_first_order(lines, blaze, angle):
+def test_a_ruled_grating_diffracts_its_blaze_wavelength_into_the_littrow_order(lines, blaze, angle):
     field = ruled(lines, blaze_wavelength=blaze)
     assert field.tile_size[0] == pytest.approx(1000 / lines)
     slope = np.diff(field.heights[0]) / field.pixel_size[0]
@@ -62,7 +62,7 @@ def test_a_ruled_grating_throws_its_blaze_wavelength_back_into_littrows_first_or
         ({"samples": 1}, "samples: got 1"),
     ],
 )
-def test_a_ruled_grating_that_cannot_be_is_refused(arguments, message):
+def test_an_impossible_ruled_grating_is_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
         ruled(**arguments)
 
@@ -78,7 +78,7 @@ def test_a_crossed_foil_has_products_of_bessel_orders():
     np.testing.assert_allclose(order_powers(field, kappa)[np.ix_(m, m)], wave[:, None] * wave, atol=1e-12)
 
 
-def test_a_hexagonal_foil_has_its_six_first_orders_where_and_as_strong_as_three_bessel_series_say():
+def test_a_hexagonal_foil_has_the_first_orders_of_three_bessel_series():
     period, depth, kappa = 1.3, 0.2, kappa_of(0.55)
     field = foil(period, depth, directions=3, samples=60)
     eta = order_powers(field, kappa)
@@ -103,7 +103,7 @@ def test_the_depth_of_a_foil_is_from_its_lowest_to_its_highest_point(directions,
 
 
 @pytest.mark.parametrize("arguments", [{"directions": 4}, {"directions": "2"}, {"samples": 33}])
-def test_a_foil_that_cannot_be_is_refused(arguments):
+def test_an_impossible_foil_is_refused(arguments):
     (name,) = arguments
     with pytest.raises(ValueError, match=f"{name}: got"):
         foil(**arguments)
@@ -122,7 +122,7 @@ def runs_along_a_track(field, period, track):
 
 
 @pytest.mark.parametrize("name", sorted(DISCS))
-def test_pits_have_the_lengths_of_the_standard_and_a_flat_floor_at_the_depth_seen_through_the_disc(name):
+def test_pits_have_the_lengths_and_the_depth_of_the_standard(name):
     make, period, shortest, longest = DISCS[name]
     field = make(pixel_size=0.04, seed=3)
     lengths = np.concatenate([runs_along_a_track(field, period, track) for track in range(15)])
@@ -174,7 +174,7 @@ def test_the_first_order_of_a_disc_is_that_of_its_pits_share(wavelength):
 
 
 @pytest.mark.parametrize("name", sorted(DISCS))
-def test_tracks_do_not_know_each_other_and_a_seed_names_a_disc(name):
+def test_tracks_are_independent_and_a_seed_determines_a_disc(name):
     make, period, *_ = DISCS[name]
     field = make(seed=1)
     middle = ((np.arange(20) + 0.5) * period / field.pixel_size[0]).astype(int)
@@ -197,7 +197,7 @@ def test_tracks_do_not_know_each_other_and_a_seed_names_a_disc(name):
         ({"seed": 0.5}, "seed: got 0.5"),
     ],
 )
-def test_a_disc_that_cannot_be_is_refused(arguments, message):
+def test_an_impossible_disc_is_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
         compact_disc(**arguments)
 
@@ -298,7 +298,7 @@ NAMED = {
 
 @pytest.mark.few(3)
 @pytest.mark.parametrize("name", sorted(NAMED))
-def test_a_ready_surface_stands_in_a_scene_by_its_name(name):
+def test_a_ready_surface_is_used_in_a_scene_by_its_name(name):
     mi.set_variant("scalar_spectral")
     numbers = "".join(
         f'<{"integer" if isinstance(value, int) else "float"} name="{key}" value="{value}"/>'
