@@ -56,16 +56,16 @@ class Result:
         surface: name of the case.
         extent: "tile" or "sample".
         representation: "taylor", "chebyshev", "svd" or "slices".
-        tolerance: what was asked for.
-        refused: why there is no such spectrum; then the rest is None.
+        tolerance: the requested one.
+        refused: the reason why there is no such spectrum; the rest is then None.
         terms: of the series, or intervals of the slices.
         words: of 32 bits that one evaluation of S reads from the table.
         megabytes: of the table.
         build_seconds: of `precompute`.
         evaluations: of eval_pdf per second, four wavelengths each.
-        read_ratio: of bare reading of the same words, which bounds any evaluation, to eval_pdf of roughconductor (Al).
-        evaluate_ratio: to eval_pdf of roughconductor (Al) in the same run.
-        sample_ratio: of sample to that of roughconductor (Al) in the same run.
+        read_ratio: speed of reading the same words alone, an upper bound, to eval_pdf of roughconductor (Al).
+        evaluate_ratio: speed of eval_pdf to that of roughconductor (Al) in the same run.
+        sample_ratio: speed of sample to that of roughconductor (Al) in the same run.
         accuracy: against the float64 reference.
     """
 

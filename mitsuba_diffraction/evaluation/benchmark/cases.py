@@ -18,7 +18,7 @@ class Case:
     """A surface and its extent.
 
     Attributes:
-        name: as reports show it.
+        name: for reports.
         height_field: the surface.
         extent: "tile" or "sample".
         coherence_length: µm.

@@ -100,7 +100,7 @@ def _wavelengths(shift: ArrayLike) -> NDArray[np.float64]:
 def _fraction(bsdf: mi.BSDF, angle: float, count: int) -> tuple[float, float]:
     """Return the least E[w]²/E[w²] over azimuths, and the largest w; w, the weight, is a mean over four wavelengths.
 
-    The mean over draws of wavelengths.
+    The ratio is averaged over draws of wavelengths.
     """
     drawn = _wavelengths((np.arange(_DRAWS)[:, None] + 0.5) / _DRAWS)
     shape = len(_AZIMUTHS), _DRAWS, count

@@ -43,7 +43,7 @@ class Rays:
         """Gather and sum the words about each q: the minimum work of any evaluation.
 
         Args:
-            spectrum: says which nodes and how many words.
+            spectrum: determines the nodes and the number of words.
             table: of `blank(spectrum)`.
         """
         q_x, q_y = spectrum.grid.frequencies()

@@ -48,8 +48,8 @@ class Point:
         samples: per pixel; shading points of a shader.
         seconds: of rendering, without loading and compiling.
         delta_e: mean CIEDE2000 to the reference.
-        relative_mse: Σ (Y − Y_ref)²/Σ Y_ref² over the pixels that show surfaces, at the same mean luminance; Y is at
-            most white, as few pixels that are far brighter would tell of themselves only.
+        relative_mse: Σ (Y − Y_ref)²/Σ Y_ref² over the pixels that show surfaces, at the same mean luminance; Y is
+            clipped at white, as a few much brighter pixels would dominate the sum.
     """
 
     name: str
@@ -67,7 +67,7 @@ class Convergence:
     Attributes:
         scene: file name and parameters.
         size: (width, height) in pixels.
-        noise: mean CIEDE2000 that the reference owes to noise.
+        noise: mean CIEDE2000 of the reference due to noise.
         points: in the order of measurement.
     """
 
@@ -128,7 +128,7 @@ def convergence(
         reference_samples: per pixel of the reference.
         shaders: names.
         shading_points: per pixel of the shaders, ascending.
-        width: pixels, if the film's size shall not hold.
+        width: in pixels; default: that of the film.
         parameters: further values for the scene's `$name` parameters.
         progress: progress(label) is a context whose value is called with (done, total).
 

@@ -11,8 +11,7 @@ from ..realtime_shader.lights import lights_of
 def same_light(scene: mi.Scene) -> mi.SamplingIntegrator:
     """Return an integrator of the scene's own BSDFs under the lights that the shader supports.
 
-    Light comes straight from directional and point lights and is stopped by what stands before them: no sky, no other
-    lights, nothing from surface to surface.
+    Only direct light of directional and point lights, with shadows: no sky, no other lights, no interreflection.
 
     Raises:
         ValueError: if the scene has no such light.

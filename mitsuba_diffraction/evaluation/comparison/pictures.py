@@ -41,9 +41,9 @@ class Picture:
     Attributes:
         image: spectral radiance.
         samples: per pixel.
-        seconds: it took, without loading the scene, and without compiling kernels.
-        halves: XYZ (2, height, width, 3) of two pictures with half of the samples each, that are independent; none of
-            a picture with next to no noise.
+        seconds: of rendering, without loading the scene and compiling kernels.
+        halves: XYZ (2, height, width, 3) of two independent pictures with half of the samples each; None for a
+            picture with next to no noise.
         xyz: (height, width, 3), CIE XYZ as `color` scales it.
     """
 
@@ -63,7 +63,7 @@ class Pictures:
     Attributes:
         scene: Mitsuba's.
         film_size: (width, height) of the whole film; a picture shows its crop window.
-        surface: (height, width) bool, where a picture shows surfaces and nothing else.
+        surface: (height, width) bool, the pixels covered by surfaces.
         shaders: of the gratings.
         spectra: of the gratings.
         has_base: whether something lies below a grating.
@@ -85,7 +85,7 @@ class Pictures:
         Args:
             scene_path: an XML scene whose integrator is a path tracer.
             shader: "flss", "nmm", "pq" or "gem".
-            width: pixels, if the film's size shall not hold.
+            width: in pixels; default: that of the film.
             height: likewise.
             seed: of the random numbers, not negative.
             parameters: values for the scene's `$name` parameters.
@@ -155,14 +155,14 @@ class Pictures:
     def shaded(self, quirks: Collection[str], samples: int, others: int, progress: Progress = silent) -> Picture:
         """Render the limit of the shader's integrator, with far fewer samples.
 
-        The integrator computes the colour of a shading point out of 81 wavelengths, and shows it at the four
+        The integrator computes the colour of a shading point from 81 wavelengths, and shows it at the four
         wavelengths of a ray. Here the colours are averaged over a pixel, and the spectrum Σ_c RGB_c b_c(λ) follows from
         the average. All other BSDFs, which are cheap, get samples of their own.
 
         Args:
-            quirks: names among `quirks` of what the shader does as published.
+            quirks: names among `quirks` that the shader has as published.
             samples: shading points per pixel.
-            others: samples per pixel of what is no grating.
+            others: samples per pixel of all but gratings.
             progress: called with (done, total).
         """
         self._shader.take(Quirks(**{name: name in quirks for name in Quirks.names()}))

@@ -14,7 +14,7 @@ class QuirkShare:
 
     Attributes:
         drop: of the mean CIEDE2000 of the published shader, when this quirk alone is corrected.
-        rise: of the mean CIEDE2000 of the corrected shader, when this quirk alone is put in.
+        rise: of the mean CIEDE2000 of the corrected shader, when this quirk alone is added.
         share: (drop + rise)/2 over the mean CIEDE2000 of the published shader.
     """
 
@@ -44,15 +44,15 @@ class AgainstReference:
 class QuirkShares:
     """Shares of all quirks.
 
-    `drop` is what a quirk makes beside all others, `rise` what it makes alone; a share takes the mean of both. Shares
-    do not add up to one, and may be negative: two quirks may cancel each other, or one may hide behind another.
+    `drop` is the effect of a quirk beside all others, `rise` its effect alone; a share takes the mean of both. Shares
+    do not add up to one, and may be negative: two quirks may cancel, or one may mask another.
 
     Attributes:
         size: (width, height) of the pictures.
         samples: per pixel of the path tracer.
         shading_points: per pixel of the shader.
         path_traced: against the path tracer's picture.
-        same_light: against the project's model under the light that the shader knows.
+        same_light: against the project's model under the lights that the shader supports.
     """
 
     size: tuple[int, int]

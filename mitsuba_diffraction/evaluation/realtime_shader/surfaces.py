@@ -22,8 +22,8 @@ class ShadedGrating(Protocol):
     Attributes:
         height_scale: scales the heights.
         shadowing: "v_cavity" or "none".
-        base: what lies under the surface.
-        coat: what lies above it, ignored by the shader.
+        base: the BSDF below the surface.
+        coat: the layer above it, ignored by the shader.
         rigorous: whether its efficiencies are those of rigorous theory.
         reflectance: R(si, cos θ, active) at the angle to the microfacet.
     """

@@ -1,6 +1,6 @@
 """Gratings of which scalar theory is known in closed form, evaluated through the BSDF.
 
-Where light leaves (the grating equation), how much of it (the orders' powers), and that none appears from nowhere.
+Directions of the orders (the grating equation), their powers, and energy conservation.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def compare_directions(height_field: HeightField, theta: float, phi: float) -> R
 def _peaks(bsdf: object, wi: Array, wavelength: float, width: float) -> list[Array]:
     """Return centres (u, v) of all lobes, two lobe widths apart, at up to 70 degrees, by an exhaustive search.
 
-    The mean of (u, v) weighted by f/(K G), which removes the variation of K G over a lobe.
+    A centre is the mean of (u, v) weighted by f/(K G), which removes the variation of K G over a lobe.
     """
 
     def look(u: Array, v: Array) -> Array:

@@ -7,12 +7,12 @@ Regular: one pit for every stretch s of a track. Then there are orders only,
 
     η_m = |δ_m + c B(m_x/t, m_y/s)/(ts)|².
 
-Random: along every track each stretch b holds a pit with the probability p, as data do. The mean field has the orders
+Random: along every track each stretch b holds a pit with the probability p. The mean field has the orders
 of the tracks alone; the variance scatters light along them, between the orders of the tracks:
 
     S(q) = Σ_m |δ_m + cp · a/t · sinc(ma/t)|² δ(q_x − m/t) δ(q_y) + |c|² p(1 − p) |B(q)|²/(tb).
 
-p is counted. A surface of pixels of size s has sums for integrals: sinc(aq) becomes sinc(aq)/sinc(sq).
+p is that of the drawn data. On pixels of size s, integrals are sums: sinc(aq) becomes sinc(aq)/sinc(sq).
 """
 
 from __future__ import annotations

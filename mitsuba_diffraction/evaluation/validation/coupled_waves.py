@@ -1,11 +1,11 @@
 """The BSDF against the stored results of coupled-wave analysis, order by order.
 
-A difference is Σ_m |Δη_m| / Σ_m η_m: a share of the light that is rigorously reflected. What is promised:
+A difference is Σ_m |Δη_m| / Σ_m η_m: a share of the rigorously reflected power. The claimed bounds:
 
 - sinusoids of period ≥ 5 λ and depth ≤ λ/2, light at up to 20°: 2 %;
 - blazes and triangles, which have edges, of depth ≤ λ/2, up to 20°: 10 %.
 
-Everything else is outside of the range of scalar theory: shown, and nothing promised.
+Everything else is outside of the range of scalar theory: it is reported without a bound.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class RigorousResult:
         index: n + ik.
         orders: those that propagate, (n,).
         te, tm: rigorous efficiencies, (n,).
-        change: by how much they changed at the last refinement, as a share of the reflected light.
+        change: of the efficiencies at the last refinement, as a share of the reflected power.
     """
 
     profile: str

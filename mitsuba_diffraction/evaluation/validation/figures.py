@@ -68,8 +68,8 @@ def png(drawn: Figure, dpi: float = 110, pnginfo: PngInfo | None = None) -> byte
 def plot_reflectance(maps: Sequence[ReflectanceMap]) -> Figure:
     """Plot reflectance over wavelength and viewing angle, with the peak curve and the grating equation on top.
 
-    One panel for each map; all maps are of one surface and one θ_i. Each panel has the logarithmic scale of its own
-    strongest reflectance outside of the specular peak, three decades deep.
+    One panel for each map; all maps are of one surface and one θ_i. Each panel has a logarithmic scale of three decades
+    below its largest reflectance outside of the specular peak.
     """
     drawn = figure(3.1 * len(maps) + 0.9, 4.4)
     axes = drawn.subplots(1, len(maps), sharex=True, sharey=True, squeeze=False)[0]
@@ -225,7 +225,7 @@ def save_figures(
 ) -> list[Path]:
     """Evaluate and plot as in chapter 5 of the thesis of 2014, under the current variant of Mitsuba.
 
-    Written, each whole or not at all: for every surface `viewing_angle_NAME.png` and `brdf_NAME.png`; and the fitted
+    Written atomically: for every surface `viewing_angle_NAME.png` and `brdf_NAME.png`; and the fitted
     periods, `periods.md` and `periods.csv`.
 
     Args:

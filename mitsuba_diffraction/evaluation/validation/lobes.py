@@ -28,7 +28,7 @@ _POINTS = 16
 def grating(spectrum: GratingSpectrum, conserve: bool = True, **parameters: Any) -> mi.BSDF:
     """Load the plugin; a perfect mirror unless an index or a material is given.
 
-    `conserve=False` leaves out E, which is no part of what closed forms describe: R K G S/λ² alone.
+    `conserve=False` omits E, which closed forms do not include: R K G S/λ² alone.
     """
     if not {"int_ior", "material"} & set(parameters):
         parameters["material"] = "none"
@@ -67,13 +67,13 @@ def density(bsdf: mi.BSDF, wi: Array, wo: Array, wavelength: float) -> Array:
 def lobe_powers(bsdf: mi.BSDF, spectrum: GratingSpectrum, wi: Array, q: ArrayLike, wavelength: float) -> Array:
     """Integrate the share of the incident power reflected into the lobes about q: ∫ f cos θ_o dω_o = λ² ∫ f dq.
 
-    By Gauss–Legendre quadrature over the square at which a lobe ends.
+    By Gauss–Legendre quadrature over the square to which a lobe is truncated.
 
     Args:
         bsdf: of the spectrum.
         spectrum: of a tile whose lobes do not overlap.
         wi: (3,).
-        q: (n, 2) cycles/µm; what of a lobe is below the horizon does not count.
+        q: (n, 2) cycles/µm; the part of a lobe below the horizon does not count.
         wavelength: µm.
 
     Returns:

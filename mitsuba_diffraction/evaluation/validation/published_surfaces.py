@@ -20,10 +20,10 @@ class PublishedSurface:
     """A grating, and the published numbers about it.
 
     Light and viewer are in the plane of the normal and the diffracting axis. Angles in it are positive on the side of
-    −x (−y): there the direction that blazes is positive, and the grating equation d (sin θ_i + sin θ_r) = nλ has n > 0.
+    −x (−y): there the blaze direction is positive, and the grating equation d (sin θ_i + sin θ_r) = nλ has n > 0.
 
     Attributes:
-        name: as titles show it.
+        name: for titles.
         recipe: the way to the heights and the spectrum.
         axis: the diffracting axis, 0 for x and 1 for y.
         period: d of the grating equation, µm, as published.

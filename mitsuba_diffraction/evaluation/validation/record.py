@@ -17,13 +17,13 @@ class Record:
     """A measured number beside the expected one.
 
     Attributes:
-        measured, expected: of many numbers, those that differ most.
-        bound: on the error; None where nothing is promised.
+        measured, expected: of several numbers, the pair that differs most.
+        bound: on the error; None where none is claimed.
         relative: whether the error is relative to `expected`.
-        note: what else a reader needs.
+        note: further information for the reader.
         group: one of `GROUPS`.
         name: what was measured, in words.
-        source: where `expected` comes from.
+        source: origin of `expected`.
     """
 
     measured: float

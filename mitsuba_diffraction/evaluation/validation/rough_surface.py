@@ -117,8 +117,8 @@ def _microfacets(angle: float) -> Record:
     """Compare a rough profile with `roughconductor`, Beckmann distribution; K S/λ² is D/(4 cos θ_i cos θ_o) there.
 
     In the plane of incidence, bands of the half vector's slope out to one and a half rms slopes, on both sides of the
-    specular direction. Both are perfect mirrors. No facet hides another there: G is one in both models; E is left out.
-    `roughconductor` gets along y the width that the coherence length gives the lobe.
+    specular direction. Both are perfect mirrors. No facet masks another there: G is one in both models; E is omitted.
+    Along y, `roughconductor` has the width of the lobe of the coherence length.
     """
     rms, correlation = LARGE
     spectrum = _spectrum(rms, correlation)

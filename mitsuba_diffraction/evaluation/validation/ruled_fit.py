@@ -1,7 +1,7 @@
 """Measured efficiencies of ruled gratings, with the facet angle as the only unknown.
 
-The gratings and the way they were measured: `data/gratings/README.md`. Their grooves are taken for two facets with an
-apex of 90°, aluminium; the mount is Littrow, the light unpolarised, the order the first.
+Gratings and measurements: `data/gratings/README.md`. The grooves are modelled as two aluminium facets with an apex of
+90°, in the first order of a Littrow mount, in unpolarised light.
 """
 
 from __future__ import annotations
@@ -85,8 +85,8 @@ class Fit:
 
     Attributes:
         facet_angle: degrees.
-        efficiencies: η₁ at the wavelengths that were measured, (n,).
-        rms: root of the mean square difference to what was measured.
+        efficiencies: η₁ at the measured wavelengths, (n,).
+        rms: root mean square difference from the measured efficiencies.
     """
 
     facet_angle: float

@@ -45,7 +45,7 @@ def relative_reflectance(spectrum: GratingSpectrum, wi: ArrayLike, wo: ArrayLike
         ρ(λ) = f cos θ_i · 2πσ_q² λ²/R₀ = R/R₀ · K G cos θ_i · 2πσ_q² S(q; κ) · E
 
     The coherence length of `spectrum` gives σ_q; 1/(2πσ_q²) is S(0) of a flat surface. This is the quantity that the
-    shader shows (eq. 3.11 of the thesis): 1/λ² has dropped out.
+    shader shows (eq. 3.11 of the thesis): 1/λ² cancels.
 
     Args:
         spectrum: of the surface.
@@ -134,12 +134,12 @@ def reflectance_map(
     """Evaluate a surface over viewing angle and wavelength.
 
     The model is that of the BSDF, averaged over the places that a pixel covers; the shader that of
-    `shader.evaluate.relative_radiance`. NMM knows at a viewing angle only the wavelengths
+    `shader.evaluate.relative_radiance`. NMM has at a viewing angle only the wavelengths
     λ_n = T (sin θ_i + sin θ_r)/n, T being the length of the tile; the other way round, a wavelength only at the angles
-    of the tile's orders. There it gives what FLSS gives. These are the angles of its map.
+    of the tile's orders, where it equals FLSS. These are the angles of its map.
 
     Args:
-        surface: what to look at.
+        surface: the surface.
         method: one of `METHODS`.
         incidence: θ_i in degrees.
         wavelengths: (n,) nm; every 5 nm from 380 to 780 nm if there are none.
@@ -147,7 +147,7 @@ def reflectance_map(
         quirks: of the shader; as published if none are given.
 
     Raises:
-        ValueError: if an argument makes no sense, or Mitsuba has no vectorised spectral variant set.
+        ValueError: if an argument is wrong, or Mitsuba has no vectorised spectral variant set.
     """
     if method not in METHODS:
         raise RequestError(f"method: got {method!r}, wanted one of {', '.join(METHODS)}")
@@ -191,8 +191,7 @@ def peak_angles(found: ReflectanceMap) -> Array:
 
     Outside means nearer to order one than to order zero of the published period: d (sin θ_i + sin θ_r) > λ/2. The
     place of the peak between the samples is the vertex of a parabola in the direction cosine through the logarithms of
-    three samples, which is exact for a Gaussian lobe. Where a method has directions of its own there is nothing in
-    between.
+    three samples, which is exact for a Gaussian lobe. A method with directions of its own is not interpolated.
 
     Returns:
         (n,) degrees; NaN where there is no light.
