@@ -24,7 +24,7 @@ _OBSERVER = "CIE 1931 2 Degree Standard Observer"
 
 
 def matching_functions(wavelengths: ArrayLike) -> NDArray[np.float64]:
-    """x̄, ȳ, z̄ of the CIE 1931 2° observer, linear between its wavelengths and constant beyond them.
+    """Return x̄, ȳ, z̄ of the CIE 1931 2° observer, linear between its wavelengths and constant beyond them.
 
     Args:
         wavelengths: (n,), nm.
@@ -40,7 +40,7 @@ def matching_functions(wavelengths: ArrayLike) -> NDArray[np.float64]:
 
 @lru_cache(maxsize=8)
 def _xyz_matrix(wavelengths: tuple[float, ...]) -> NDArray[np.float64]:
-    """The matrix m of `spectrum_to_XYZ`, (n, 3)."""
+    """Return the matrix m of `spectrum_to_XYZ`, (n, 3)."""
     centres = np.asarray(wavelengths)
     steps = np.diff(centres)
     if centres.size < 2 or steps[0] < 1 or np.ptp(steps) > 1e-3 * steps[0]:
@@ -59,7 +59,7 @@ def _xyz_matrix(wavelengths: tuple[float, ...]) -> NDArray[np.float64]:
 
 
 def spectrum_to_XYZ(radiance: ArrayLike, wavelengths: ArrayLike) -> NDArray[np.float64]:
-    """CIE 1931 XYZ of spectra.
+    """Compute CIE 1931 XYZ of spectra.
 
     A channel i of a spectral image is L_i = ∫ L(λ) t_i(λ) dλ with a hat t_i of unit area around λ_i. Colour is
     X = ∫ L(λ) x̄(λ) dλ. If x̄ = Σ_i m_i t_i, then X = Σ_i m_i L_i for any spectrum, smooth or a single line; m is
@@ -86,7 +86,7 @@ def spectrum_to_XYZ(radiance: ArrayLike, wavelengths: ArrayLike) -> NDArray[np.f
 
 
 def spectrum_to_linear_sRGB(radiance: ArrayLike, wavelengths: ArrayLike) -> NDArray[np.float64]:
-    """Linear sRGB of spectra: (..., n) → (..., 3). Colours outside the gamut have negative components.
+    """Compute linear sRGB of spectra, (..., n) → (..., 3). Colours outside the gamut have negative components.
 
     Arguments and errors are those of `spectrum_to_XYZ`.
     """
@@ -94,14 +94,14 @@ def spectrum_to_linear_sRGB(radiance: ArrayLike, wavelengths: ArrayLike) -> NDAr
 
 
 def XYZ_to_linear_sRGB(XYZ: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Linear sRGB of XYZ, (..., 3) each; negative components outside the gamut."""
+    """Convert XYZ to linear sRGB, (..., 3) each; negative components outside the gamut."""
     import colour
 
     return XYZ @ colour.RGB_COLOURSPACES["sRGB"].matrix_XYZ_to_RGB.T
 
 
 def delta_E(XYZ_1: ArrayLike, XYZ_2: ArrayLike) -> NDArray[np.float64]:
-    """The colour difference CIEDE2000 (CIE 142, ISO/CIE 11664-6) relative to D65 with Y = 1.
+    """Compute the colour difference CIEDE2000 (CIE 142, ISO/CIE 11664-6) relative to D65 with Y = 1.
 
     Args:
         XYZ_1: (..., 3).
@@ -117,7 +117,7 @@ def delta_E(XYZ_1: ArrayLike, XYZ_2: ArrayLike) -> NDArray[np.float64]:
 
 
 def daylight(wavelengths: ArrayLike) -> NDArray[np.float64]:
-    """The illuminant D65 (CIE 15:2018) relative to its value at 560 nm, linearly interpolated.
+    """Return the illuminant D65 (CIE 15:2018) relative to its value at 560 nm, linearly interpolated.
 
     Args:
         wavelengths: (n,), nm.
@@ -132,7 +132,7 @@ def daylight(wavelengths: ArrayLike) -> NDArray[np.float64]:
 
 
 def into_gamut(rgb: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Desaturates colours outside the sRGB gamut towards the grey of equal luminance, until no component is negative.
+    """Desaturate colours outside the sRGB gamut towards the grey of equal luminance, until no component is negative.
 
     c' = Y + t (c − Y), with the largest t ≤ 1 for which min(c') ≥ 0. Luminance is preserved, and so is the dominant
     wavelength. Clamping each channel at zero would instead brighten spectral colours, above all cyan and violet. The
@@ -161,7 +161,7 @@ _WHITENING = 0.15  # a pixel ten times too bright is desaturated by 58 %
 
 
 def roll_off(rgb: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Compresses highlights into [0, 1] without a shift of hue.
+    """Compress highlights into [0, 1] without a shift of hue.
 
     The brightest channel p of a pixel is unchanged up to 0.8 and beyond follows 1 − d²/(p + d − 0.8), d = 0.2, which is
     smooth and tends to 1; the other channels are scaled equally. Very bright pixels are then desaturated. This is the
@@ -183,7 +183,7 @@ def roll_off(rgb: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def auto_exposure(rgb: NDArray[np.floating]) -> float:
-    """Automatic exposure.
+    """Compute an automatic exposure.
 
     Scales the 97th percentile of the brightest channel over the lit pixels to one. A pixel is lit if it exceeds a
     thousandth of the 99th percentile, which makes the result robust against a black background, visible lamps and
@@ -204,7 +204,7 @@ def auto_exposure(rgb: NDArray[np.floating]) -> float:
 
 
 def on_screen(rgb: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """Exposed, non-negative linear sRGB → `roll_off` → transfer function of sRGB, 8 bits."""
+    """Encode exposed, non-negative linear sRGB for a display: `roll_off`, transfer function of sRGB, 8 bits."""
     import colour
 
     shown = colour.cctf_encoding(roll_off(rgb), function="sRGB")

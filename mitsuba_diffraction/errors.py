@@ -1,4 +1,4 @@
-"""Whose mistake an exception is: the caller's, the circumstances', or this package's."""
+"""Classes of exceptions: mistakes of the caller, failures of the environment, bugs of this package."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ _OF_PLUGIN = re.compile(
 
 
 class RequestError(ValueError):
-    """An argument, a file or a scene is wrong; the text quotes what came and says what was wanted."""
+    """An argument, a file or a scene is wrong; the message quotes the value given and what was wanted."""
 
 
 class Bug(Exception):
-    """A mistake of this package inside a plugin, of which Mitsuba keeps only the text: its class, then its message."""
+    """A bug of this package inside a plugin, of which Mitsuba keeps only the text: its class, then its message."""
 
 
 def is_bug(kind: type[BaseException]) -> bool:
-    """Whether an exception of this class is a mistake of the code: neither a wrong request nor a failure around it."""
+    """Return whether exceptions of this class are bugs: neither a wrong request nor a failure of the environment."""
     foreseen = RequestError, RuntimeError, OSError, MemoryError, ImportError
     return not issubclass(kind, foreseen) or issubclass(kind, NotImplementedError | RecursionError)
 
 
 def is_number(value: object) -> bool:
-    """Tell whether a parameter is a number: True and False are none."""
+    """Return whether a parameter is a number, not a boolean."""
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def root_cause(error: BaseException) -> str:
-    """Return the message at the end of the chain of exceptions of Mitsuba, as one line.
+    """Return the message of the innermost exception in Mitsuba's chain, as one line.
 
     Mitsuba raises "Error while ..." with the actual error as `__cause__`; its messages span several lines and begin
     with the location in its C++ sources.

@@ -12,7 +12,7 @@ HORIZON_GAIN = (-0.04034151, 0.81494507, -5.03522703, 10.57318562, -9.23048089, 
 
 
 def k_g(cos_i: ArrayLike, cos_o: ArrayLike, d: ArrayLike, shadowing: bool = True) -> NDArray[np.floating]:
-    """K G of pairs of directions; shapes broadcast, float32 is preserved.
+    """Compute K G of pairs of directions; shapes broadcast, float32 is preserved.
 
     With D = 1 + ω_i·ω_o and w = cos θ_i + cos θ_o,
 
@@ -30,13 +30,13 @@ def k_g(cos_i: ArrayLike, cos_o: ArrayLike, d: ArrayLike, shadowing: bool = True
 
 
 def k_g_between(wi: ArrayLike, wo: ArrayLike, shadowing: bool = True) -> NDArray[np.float64]:
-    """K G of unit vectors (..., 3) in the upper hemisphere; shapes broadcast."""
+    """Compute K G of unit vectors (..., 3) in the upper hemisphere; shapes broadcast."""
     wi, wo = np.asarray(wi, np.float64), np.asarray(wo, np.float64)
     return k_g(wi[..., 2], wo[..., 2], ((wi + wo) ** 2).sum(axis=-1) / 2, shadowing)
 
 
 def horizon_gain(x: ArrayLike) -> NDArray[np.float64]:
-    """Return g(x), which makes up for what a Gaussian lobe loses below the horizon; x ≥ 0 in standard deviations.
+    """Return g(x), which compensates the power of a Gaussian lobe below the horizon; x ≥ 0 in standard deviations.
 
     Of lobes centred at x and cut off at 0, g(x) g(y) φ(x − y) is symmetric and integrates to one:
 

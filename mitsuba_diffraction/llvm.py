@@ -28,7 +28,7 @@ _RUNTIME_LIBRARIES = ("libunwind.so.1", "libc++abi.so.1", "libc++.so.1")
 
 
 def choose() -> None:
-    """Points ``DRJIT_LIBLLVM_PATH`` to the wheel's library unless it names a suitable one. Call before Dr.Jit loads."""
+    """Point ``DRJIT_LIBLLVM_PATH`` to the wheel's library unless it names a suitable one. Call before Dr.Jit loads."""
     given = os.environ.get(_PATH_VARIABLE)
     if given and _usable(_library_version(given)):
         return
@@ -40,7 +40,7 @@ def choose() -> None:
 
 
 def problem() -> str | None:
-    """None if Dr.Jit has a suitable LLVM, otherwise one line with the problem and its remedy."""
+    """Return None if Dr.Jit has a suitable LLVM, otherwise one line with the problem and its remedy."""
     import drjit as dr
 
     version = tuple(dr.detail.llvm_version()) if dr.has_backend(dr.JitBackend.LLVM) else None
@@ -67,7 +67,7 @@ def _load(path: str | Path) -> ctypes.CDLL | None:
 
 
 def _library_version(path: str | Path) -> tuple[int, ...] | None:
-    """Version of the libLLVM at ``path``, or None if it does not load or is older than LLVM 16."""
+    """Return the version of the libLLVM at ``path``, or None if it does not load or is older than LLVM 16."""
     library = _load(path)
     if library is None or not hasattr(library, "LLVMGetVersion"):
         return None
@@ -77,7 +77,7 @@ def _library_version(path: str | Path) -> tuple[int, ...] | None:
 
 
 def _wheel_library() -> str | None:
-    """Path of the wheel's libLLVM if it loads, or None."""
+    """Return the path of the wheel's libLLVM if it loads, or None."""
     for distribution in metadata.distributions(name=_WHEEL):
         files = [
             Path(file.locate()).resolve()
@@ -95,19 +95,19 @@ def _wheel_library() -> str | None:
 
 
 def is_spectral(name: str) -> bool:
-    """Whether a variant carries wavelengths, e.g. ``llvm_ad_spectral`` or ``scalar_spectral_polarized``."""
+    """Return whether a variant is spectral, e.g. ``llvm_ad_spectral`` or ``scalar_spectral_polarized``."""
     return "spectral" in name.split("_")
 
 
 def spectral_variants() -> list[str]:
-    """The spectral variants of the installed Mitsuba."""
+    """Return the spectral variants of the installed Mitsuba."""
     import mitsuba as mi
 
     return [name for name in mi.variants() if is_spectral(name)]
 
 
 def choose_variant(requested: str | None = None) -> str:
-    """The variant to render with: the requested one, or the fastest that runs on this machine.
+    """Choose the variant to render with: the requested one, or the fastest that runs on this machine.
 
     Args:
         requested: a spectral variant, or None for ``cuda_ad_spectral`` with a GPU and ``llvm_ad_spectral`` without.

@@ -1,4 +1,4 @@
-"""The parameters of a plugin, from which its docstring is made and against which docs/plugin.md is tested."""
+"""Parameters of a plugin: its docstring is made from them, and docs/plugin.md is tested against them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Parameter:
 
 
 def listed(parameters: Iterable[Parameter]) -> str:
-    """A paragraph of a docstring for each."""
+    """Format the parameters as paragraphs of a docstring."""
     lines = []
     for p in parameters:
         text = f"{p.name} ({p.type}): {p.meaning}{f' ({p.default})' if p.default else ''}."

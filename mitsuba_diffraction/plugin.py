@@ -1,4 +1,4 @@
-"""Registers the plugins with Mitsuba, for every variant, now and after each mi.set_variant.
+"""Registration of the plugins with Mitsuba, for every variant, now and after each mi.set_variant.
 
 Mitsuba 3.10 and later discover this module through the entry point group `mitsuba` and reload it on each change of
 variant; importing `mitsuba_diffraction` has the same effect in all versions.
@@ -49,7 +49,7 @@ def _refusal(reason: str) -> Callable[[mi.Properties], mi.Object]:
 
 
 def _wrap_loaders() -> None:
-    """Make mi.load_dict accept a GratingSpectrum as a value, and all loaders tell in one line what a plugin refuses."""
+    """Make mi.load_dict accept a GratingSpectrum, and all loaders report in one line what a plugin refuses."""
     for name in ("load_dict", "load_file", "load_string"):
         setattr(mi, name, _telling(getattr(mi, name)))
 

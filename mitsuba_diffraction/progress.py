@@ -1,4 +1,4 @@
-"""Progress of long work: a bar in a terminal, a line that changes in a notebook, a line now and then in a log."""
+"""Progress of long computations: a bar in a terminal, a line in a notebook, occasional lines in a log."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ def silent(done: int, total: int) -> None:
 
 @contextmanager
 def no_progress(label: str) -> Iterator[Progress]:
-    """Yield what shows no progress, in place of `progress_bar`."""
+    """Yield a function that shows no progress, in place of `progress_bar`."""
     yield silent
 
 
 def part(whole: Progress, begin: float, end: float) -> Progress:
-    """Return what reports a part of the whole, from `begin` to `end` of it, in per cent."""
+    """Return a function that reports progress of a part of the whole, from `begin` to `end` in per cent."""
     return lambda done, total: whole(round(100 * (begin + (end - begin) * done / total)), 100)
 
 
@@ -44,12 +44,12 @@ def say(kind: str, message: object) -> None:
 
 
 def _count(done: int, total: int, unit: str) -> str:
-    """Return how much is done, as a person reads it."""
+    """Format how much is done."""
     return f"{done} %" if unit == "%" else f"{done} of {total} {unit}".rstrip()
 
 
 def log_lines(label: str, unit: str = "", seconds: float = 30.0, first: float = _SHORT) -> Callable[..., None]:
-    """Progress without a terminal: a line on stderr after `first` seconds, then at the interval of `seconds`."""
+    """Report progress without a terminal: a line on stderr after `first` seconds, then every `seconds`."""
     start = time.monotonic()
     due = start + first
 
@@ -64,14 +64,14 @@ def log_lines(label: str, unit: str = "", seconds: float = 30.0, first: float = 
 
 @contextmanager
 def progress_bar(label: str, unit: str = "", begin: str = "") -> Iterator[Callable[..., None]]:
-    """Yield what shows how much is done: called with that, the total, and the relative error so far where there is one.
+    """Yield a function that shows progress: it takes the part done, the total, and the relative error if there is one.
 
     Bars may be opened inside of others, and on other threads: a terminal then shows one below the other.
 
     Args:
-        label: what is done.
-        unit: of what is counted.
-        begin: what is done before anything can be counted.
+        label: name of the computation.
+        unit: of the count.
+        begin: message until something can be counted.
     """
     if err.is_jupyter:
         with _notebook_line(label, unit) as show:
@@ -112,7 +112,7 @@ def progress_bar(label: str, unit: str = "", begin: str = "") -> Iterator[Callab
 
 @contextmanager
 def _notebook_line(label: str, unit: str) -> Iterator[Callable[..., None]]:
-    """A line of the cell's output, in which the count and at last the time stand."""
+    """Display a line in the cell's output that shows progress and, at the end, the time."""
     from IPython.display import display
 
     start, handle = time.monotonic(), None

@@ -20,7 +20,7 @@ from .surface.heightfield import HeightField
 
 
 def tile_factor(x: ArrayLike, count: int) -> NDArray[np.floating]:
-    """D(x; N) = sin(πNx)/sin(πx): the sum of N unit phasors, successively shifted by x periods, about their centre.
+    """Compute D(x; N) = sin(πNx)/sin(πx), the sum of N unit phasors x periods apart, about their centre.
 
     N tiles of period T multiply the transform of one tile by D(qT; N), up to a phase. |D| ≤ N, and D² integrates to N
     over one period. The quotient is 0/0 at integers; with k the integer nearest to x and r = x − k, exact in floating
@@ -65,11 +65,11 @@ def tile_factor(x: ArrayLike, count: int) -> NDArray[np.floating]:
 
 
 def _exact_product(a: np.floating, b: NDArray[np.floating]) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-    """a·b as the rounded product and its rounding error, whose sum is exact (Dekker 1971)."""
+    """Return a·b as the rounded product and its rounding error, whose sum is exact (Dekker 1971)."""
     bits = np.finfo(b.dtype).nmant + 1
 
     def split(value: NDArray[np.floating]) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-        """Two numbers of half the digits each, whose products are exact."""
+        """Split a number into two of half the digits each, whose products are exact."""
         scaled = value * b.dtype.type(2 ** ((bits + 1) // 2) + 1)
         high = scaled - (scaled - value)
         return high, value - high
@@ -85,7 +85,7 @@ CHUNK = 2**20  # complex numbers in one intermediate array, 16 MiB
 
 
 def amplitudes(height_field: HeightField, kappa: float) -> NDArray[np.complex128]:
-    """F_m(κ): the Fourier coefficients of e^{iκh} on the tile, fft2 / (N_x N_y), heights centred.
+    """Compute F_m(κ), the Fourier coefficients of e^{iκh} on the tile: fft2 / (N_x N_y), heights centred.
 
     Args:
         height_field: the tile.
@@ -98,7 +98,7 @@ def amplitudes(height_field: HeightField, kappa: float) -> NDArray[np.complex128
 
 
 def order_powers(height_field: HeightField, kappa: float) -> NDArray[np.float64]:
-    """η_m(κ) = |F_m|²: the fraction of the reflected power in each order; layout as `amplitudes`."""
+    """Compute η_m(κ) = |F_m|², the fraction of the reflected power in each order; layout as `amplitudes`."""
     return np.abs(amplitudes(height_field, kappa)) ** 2
 
 
@@ -110,7 +110,7 @@ def power_spectrum(
     extent: str = "tile",
     coherence_length: float = SUN_COHERENCE_LENGTH,
 ) -> NDArray[np.float64]:
-    """S(q; κ), the power reflected by a patch per unit area of the frequency plane.
+    """Compute S(q; κ), the power reflected by a patch per unit area of the frequency plane.
 
     A "tile" is periodic and has a line spectrum:
 
@@ -152,7 +152,7 @@ def power_spectrum(
 def finite_tiles_spectrum(
     height_field: HeightField, q: ArrayLike, kappa: ArrayLike, *, tiles: tuple[int, int]
 ) -> NDArray[np.float64]:
-    """S(q; κ) of P × Q tiles without a window (the "PQ" form).
+    """Compute S(q; κ) of P × Q tiles without a window (the "PQ" form).
 
     With A the transform of one tile of N_x × N_y pixels, and D the factor of a row of tiles (`tile_factor`),
 
@@ -190,7 +190,7 @@ def finite_tiles_spectrum(
 
 
 def check_extent(extent: str) -> None:
-    """Raises ValueError unless `extent` is known."""
+    """Raise ValueError unless `extent` is known."""
     if extent not in EXTENTS:
         raise RequestError(f"extent: got {extent!r}, wanted 'tile' or 'sample'")
 
@@ -198,7 +198,7 @@ def check_extent(extent: str) -> None:
 def _tile_spectrum(
     height_field: HeightField, q: NDArray[np.float64], kappa: NDArray[np.float64], coherence_length: float
 ) -> NDArray[np.float64]:
-    """Σ_m η_m(κ) N(q − m/T; σ_q² I) for q (M, 2) and κ (M,): (M,) µm²."""
+    """Compute Σ_m η_m(κ) N(q − m/T; σ_q² I) for q (M, 2) and κ (M,): (M,) µm²."""
     sigma = lobe_width(coherence_length)
     result = np.zeros(kappa.shape)
     rows, columns = height_field.shape
@@ -223,7 +223,7 @@ def _tile_spectrum(
 def _sample_spectrum(
     height_field: HeightField, q: NDArray[np.float64], kappa: NDArray[np.float64], coherence_length: float
 ) -> NDArray[np.float64]:
-    """Welch's estimate of S for q (M, 2) and κ (M,): (M,) µm²."""
+    """Compute Welch's estimate of S for q (M, 2) and κ (M,): (M,) µm²."""
     carried = carried_coherence_length(height_field, coherence_length)
     windows = window_axes(height_field, carried)
     result = _periodograms(height_field, q, kappa, tuple(w or UNIFORM for w in windows))
@@ -241,7 +241,7 @@ def _periodograms(
     kappa: NDArray[np.float64],
     axes: tuple[WindowAxis, ...],
 ) -> NDArray[np.float64]:
-    """Mean over the places x_p of |Σ_n a(x_n − x_p) e^{iκh_n} e^{−2πi q·x_n}|² for q (M, 2) and κ (M,): (M,).
+    """Average |Σ_n a(x_n − x_p) e^{iκh_n} e^{−2πi q·x_n}|² over the places x_p for q (M, 2) and κ (M,): (M,).
 
     Window and wave are separable: first the sums over y, for all columns at once, then those over x.
     """
@@ -266,29 +266,29 @@ def _periodograms(
 
 
 def _waves(q: NDArray[np.float64], count: int, pixel: float) -> NDArray[np.complex128]:
-    """e^{−2πiqx} at x = 0, d, 2d, …: (M, count) for q (M,)."""
+    """Return e^{−2πiqx} at x = 0, d, 2d, …: (M, count) for q (M,)."""
     return np.exp(-2j * np.pi * np.outer(q, np.arange(count) * pixel))
 
 
 def _nyquist_density(q: NDArray[np.float64], pixel: float) -> NDArray[np.float64]:
-    """d for |q| ≤ 1/2d, else zero: (M,) µm; integrates to one."""
+    """Return d for |q| ≤ 1/2d, else zero: (M,) µm; integrates to one."""
     # Tolerates rounding of q at the limit itself.
     return np.where(np.abs(q) * 2 * pixel <= 1 + 1e-12, pixel, 0.0)
 
 
 def _gaussian(q: NDArray[np.float64], sigma: float) -> NDArray[np.float64]:
-    """N(q; σ²) along one axis, µm."""
+    """Return N(q; σ²) along one axis, µm."""
     return np.exp(-(q**2) / (2 * sigma**2)) / (np.sqrt(2 * np.pi) * sigma)
 
 
 def _by_kappa(kappa: NDArray[np.float64]) -> Iterator[tuple[float, NDArray[np.int64]]]:
-    """Each distinct value in κ (M,), with its indices."""
+    """Yield each distinct value in κ (M,), with its indices."""
     for value in np.unique(kappa):
         yield value, np.flatnonzero(kappa == value)
 
 
 def _checked(q: ArrayLike, kappa: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """As `matching`, and checks that κ is finite."""
+    """Broadcast q and κ as `matching` does, and raise ValueError unless κ is finite."""
     q, kappa = matching(q, kappa)
     if not np.isfinite(kappa).all():
         raise RequestError("kappa: got numbers that are not finite, wanted rad/µm")
@@ -296,7 +296,7 @@ def _checked(q: ArrayLike, kappa: ArrayLike) -> tuple[NDArray[np.float64], NDArr
 
 
 def _checked_tiles(tiles: tuple[int, int]) -> tuple[int, int]:
-    """Two integers ≥ 1, or ValueError."""
+    """Return two integers ≥ 1; raise ValueError for anything else."""
     pair = tuple(tiles) if isinstance(tiles, (tuple, list, np.ndarray)) else ()
     if len(pair) != 2 or not all(isinstance(n, Integral) and not isinstance(n, bool) and n >= 1 for n in pair):
         raise RequestError(f"tiles: got {tiles!r}, wanted two whole numbers ≥ 1, along x and y")

@@ -1,4 +1,4 @@
-"""Registers the plugins as soon as Mitsuba is imported, without importing it.
+"""Registration of the plugins as soon as Mitsuba is imported, without importing it.
 
 Precomputation, inspection and the readers do not need Mitsuba, which takes longer to import than they take to run.
 """
@@ -14,7 +14,7 @@ from types import ModuleType
 
 
 def register() -> None:
-    """Register for the variant that Mitsuba has, and for those that it will have; now, or when it is imported."""
+    """Register for Mitsuba's current and later variants; now, or when Mitsuba is imported."""
     if (mitsuba := sys.modules.get("mitsuba")) is not None:
         _watch(mitsuba)
     elif not any(isinstance(finder, _MitsubaFinder) for finder in sys.meta_path):

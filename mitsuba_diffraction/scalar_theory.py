@@ -39,7 +39,7 @@ MAP = STORED.with_name("scalar_error.json")
 
 INDEX = 1.5
 ANGLES = (0.0, 20.0, -20.0)
-"""Degrees of incidence for which the error of a surface is told; the map is the same for ±20°."""
+"""Degrees of incidence for which the error of a surface is reported; the map is the same for ±20°."""
 
 WAVELENGTHS = (0.45, 0.55, 0.65)
 """µm."""
@@ -56,7 +56,7 @@ _CONVERGED = 1e-2
 
 
 def fresnel(cosine: ArrayLike, index: complex) -> tuple[Array, Array]:
-    """Power reflectances (R_s, R_p) of a plane of index n + ik in air, for the cosine of the angle of incidence."""
+    """Return the power reflectances (R_s, R_p) of a plane of index n + ik in air, from the cosine of incidence."""
     cosine = np.asarray(cosine, np.float64)
     root = np.sqrt(complex(index) ** 2 - (1 - cosine**2))
     s = (cosine - root) / (cosine + root)
@@ -65,22 +65,22 @@ def fresnel(cosine: ArrayLike, index: complex) -> tuple[Array, Array]:
 
 
 def geometry(cos_i: ArrayLike, cos_o: ArrayLike, cos_between: ArrayLike) -> Array:
-    """K G from cos θ_i, cos θ_o and ω_i·ω_o; see `geometry.k_g`."""
+    """Compute K G from cos θ_i, cos θ_o and ω_i·ω_o; see `geometry.k_g`."""
     return k_g(cos_i, cos_o, np.add(1, cos_between))
 
 
 def equivalent_depth(rms_height: float) -> float:
-    """Peak-to-valley depth of the sinusoid of equal roughness: 2√2 times the r.m.s. height (any unit)."""
+    """Return the peak-to-valley depth of the sinusoid of equal roughness: 2√2 times the r.m.s. height (any unit)."""
     return 2 * np.sqrt(2) * rms_height
 
 
 def sinusoid_powers(depth: float) -> OrderPowers:
-    """η_m = J_m(κ · depth / 2)² of a sinusoid; peak-to-valley depth in µm."""
+    """Return η_m = J_m(κ · depth / 2)² of a sinusoid; peak-to-valley depth in µm."""
     return lambda m, kappa: jv(m, kappa * depth / 2) ** 2
 
 
 def profile_powers(height_field: HeightField) -> OrderPowers:
-    """η_m of a profile of one row, by direct summation for each pair (m, κ)."""
+    """Compute η_m of a profile of one row, by direct summation for each pair (m, κ)."""
     if height_field.shape[0] != 1:
         raise RequestError(f"height_field: got {height_field.shape[0]} rows, wanted a profile of one")
     heights, count = height_field.centred[0], height_field.shape[1]
@@ -116,7 +116,7 @@ class Orders:
 def scalar_orders(
     powers: OrderPowers, period: float, wavelength: float, angle: float, index: complex, turn: float = 0.0
 ) -> Orders:
-    """R K G E η_m(κ_m), the efficiencies of the BSDF in float64 in the limit of narrow lobes.
+    """Compute R K G E η_m(κ_m), the efficiencies of the BSDF in float64 in the limit of narrow lobes.
 
     Integrating the BRDF R K G S(q; κ)/λ² E (`bsdf/`) times cos θ_o over the lobe of an order, with du dv = λ² dq, gives
     these factors at the direction of the order.
@@ -144,7 +144,7 @@ def scalar_orders(
 def _mirror_orders(
     powers: OrderPowers, pitch: float, wavelength: float, sines: Array, across: float
 ) -> tuple[NDArray[np.int64], Array, Array, Array]:
-    """For ω_i,x (d,) and one ω_i,y = −ω_o,y.
+    """Return the specular orders for ω_i,x (d,) and one ω_i,y = −ω_o,y.
 
     m (n,), and (d, n) each ω_o,x, K G η_m for R = 1 (−1 where evanescent), and ω_i·h.
     """
@@ -162,26 +162,26 @@ def _mirror_orders(
 
 
 def _albedo(powers: OrderPowers, pitch: float, wavelength: float, sines: Array, across: float) -> Array:
-    """a(ω) of a perfect mirror for light from ω_x, (d,), and ω_y."""
+    """Compute a(ω) of a perfect mirror for light from ω_x, (d,), and ω_y."""
     factor = _mirror_orders(powers, pitch, wavelength, sines, across)[2]
     return np.maximum(factor, 0).sum(axis=1)
 
 
 @functools.cache
 def stored() -> dict[str, Any]:
-    """The stored rigorous results, as `precompute/rigorous_reference.py` wrote them."""
+    """Return the stored rigorous results, as `precompute/rigorous_reference.py` wrote them."""
     return json.loads(STORED.read_text(encoding="utf-8"))
 
 
 def difference(scalar: ArrayLike, rigorous: ArrayLike) -> float:
-    """L1 difference of efficiencies relative to the rigorously reflected power: Σ|Δη_m| / Σ η_m."""
+    """Return the L1 difference of efficiencies relative to the rigorously reflected power: Σ|Δη_m| / Σ η_m."""
     scalar, rigorous = np.asarray(scalar), np.asarray(rigorous)
     return float(np.abs(scalar - rigorous).sum() / rigorous.sum())
 
 
 @functools.cache
 def error_map(material: str = "dielectric") -> tuple[Array, Array, Array, Array]:
-    """Error of scalar theory for sinusoids in unpolarised light, as `precompute/scalar_theory_map.py` wrote it.
+    """Return the error of scalar theory for sinusoids in unpolarised light (`precompute/scalar_theory_map.py`).
 
     Args:
         material: "dielectric", n = 1.5, or "Al", aluminium at 550 nm.
@@ -215,7 +215,7 @@ def expected_error(
     largest_angle: float = 20.0,
     mean: bool = False,
 ) -> float:
-    """Expected error of scalar theory for a surface at incidence up to some angle.
+    """Return the expected error of scalar theory for a surface at incidence up to some angle.
 
     The largest of the stored errors at 0°, 20°, 40° and 60° up to `largest_angle`, at 40° and 60° conical incidence
     among them, interpolated linearly in the logarithms. They are for sinusoids. Other surfaces are represented by their
@@ -256,9 +256,9 @@ class ScalarError:
     """The error of scalar theory for one surface: the mean over `ANGLES` and `WAVELENGTHS`, for n = 1.5.
 
     Attributes:
-        share: Σ|Δη_m| relative to the reflected power; infinite where rigorous results do not reach (depths above 2 λ).
+        share: Σ|Δη_m| relative to the reflected power; infinite beyond the rigorous results (depths above 2 λ).
         estimated: from the stored map, good to a factor of `ESTIMATE_FACTOR`; otherwise solved for the surface itself.
-        remedy: what takes the place of scalar theory for this surface.
+        remedy: the alternative to scalar theory for this surface.
     """
 
     share: float
@@ -267,7 +267,7 @@ class ScalarError:
 
     @property
     def bound(self) -> float:
-        """The share above which the surface is considered outside the range of scalar theory."""
+        """The share above which the surface is outside the range of scalar theory."""
         return TRUSTED * (ESTIMATE_FACTOR if self.estimated else 1)
 
     @property
@@ -312,7 +312,7 @@ def scalar_error(height_field: HeightField, extent: str = "tile") -> ScalarError
 
 
 def _solved_error(profile: HeightField) -> float:
-    """The mean error of a profile; NaN if the solver does not converge."""
+    """Compute the mean error of a profile; NaN if the solver does not converge."""
     period = profile.tile_size[0]
     row = HeightField(profile.heights[:1], profile.pixel_size)
     powers = profile_powers(row)
@@ -334,7 +334,7 @@ def _solved_error(profile: HeightField) -> float:
 
 
 def _estimated_error(lengths: Array, power: Array, depth: float) -> float:
-    """The mean of the map over waves of these |q|, cycles/µm, and powers; infinite for a depth outside the map."""
+    """Return the mean of the map over waves of these |q|, cycles/µm, and powers; infinite for too large a depth."""
     if depth == 0:
         return 0.0
     nodes = error_map()[0]

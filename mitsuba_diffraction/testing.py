@@ -1,4 +1,4 @@
-"""Evaluates and samples BSDFs for NumPy arrays of directions and wavelengths: for whoever measures one."""
+"""Evaluation and sampling of BSDFs for NumPy arrays of directions and wavelengths."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ Array = NDArray[np.float64]
 
 
 def direction(theta: ArrayLike, phi: ArrayLike = 0.0) -> Array:
-    """Unit vectors (..., 3) at θ from the normal and φ from the x axis, in degrees; the two broadcast."""
+    """Return unit vectors (..., 3) at θ from the normal and φ from the x axis, in degrees; the two broadcast."""
     theta, phi = np.deg2rad(theta), np.deg2rad(phi)
     return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta) + 0 * phi], axis=-1)
 
 
 def towards(wi: Array, q: ArrayLike, wavelength: ArrayLike) -> Array:
-    """ω_o = (−λq − ω_i,t, z) of frequencies.
+    """Return ω_o = (−λq − ω_i,t, z) of frequencies.
 
     Args:
         wi: ω_i, (..., 3).
@@ -36,14 +36,14 @@ def towards(wi: Array, q: ArrayLike, wavelength: ArrayLike) -> Array:
 
 
 def vectors(omega: ArrayLike) -> mi.Vector3f:
-    """(n, 3) or (3,) → Mitsuba's; n = 1 in scalar variants."""
+    """Convert (n, 3) or (3,) to vectors of Mitsuba; n = 1 in scalar variants."""
     return _components(mi.Vector3f, omega)
 
 
 def floats(values: ArrayLike) -> mi.Float:
-    """(n,) or a number → Mitsuba's; n = 1 in scalar variants.
+    """Convert (n,) or a number to floats of Mitsuba; n = 1 in scalar variants.
 
-    A copy that is neither a literal nor where NumPy happens to have it: the same kernel serves the next one.
+    The copy is neither a literal nor NumPy's own memory, so that the next call reuses the kernel.
     """
     values = np.atleast_1d(np.asarray(values, np.float32))
     if not dr.is_jit_v(mi.Float):
@@ -54,7 +54,7 @@ def floats(values: ArrayLike) -> mi.Float:
 
 
 def array(value: object, dtype: type | None = None) -> NDArray:
-    """NumPy's array of a value of Dr.Jit, (components, n).
+    """Convert a value of Dr.Jit to a NumPy array, (components, n).
 
     It is computed first: a kernel that also arranges the components would be compiled for every n.
     """
@@ -63,7 +63,7 @@ def array(value: object, dtype: type | None = None) -> NDArray:
 
 
 def interaction(wi: ArrayLike, wavelengths: ArrayLike, uv: ArrayLike = (0.0, 0.0)) -> mi.SurfaceInteraction3f:
-    """Points of the plane z = 0, its tangents along x and y.
+    """Return points of the plane z = 0, with tangents along x and y.
 
     Args:
         wi: ω_i, (n, 3) or (3,); n = 1 in scalar variants.
@@ -88,15 +88,15 @@ def evaluate_pdf(
     context: mi.BSDFContext | None = None,
     uv: ArrayLike = (0.0, 0.0),
 ) -> tuple[Array, Array]:
-    """f cos θ_o and the density of the BSDF's samples; leading dimensions broadcast.
+    """Evaluate f cos θ_o and the density of the BSDF's samples; leading dimensions broadcast.
 
     As many wavelengths are evaluated at once as a ray has (four); the last group is filled up by repetition.
 
     Args:
-        bsdf: of the variant in force, which is a spectral one.
+        bsdf: of the current variant, which is a spectral one.
         wi, wo: ω_i and ω_o, (..., 3) along dp_du, dp_dv and the normal.
         wavelengths: (..., c) in nm.
-        context: what of the BSDF; all by default.
+        context: the components of the BSDF; all by default.
         uv: (..., 2).
 
     Returns:
@@ -139,7 +139,7 @@ def evaluate_pdf(
 
 
 def evaluate(bsdf: mi.BSDF, wi: ArrayLike, wo: ArrayLike, wavelengths: ArrayLike) -> Array:
-    """f cos θ_o in 1/sr, (..., c); arguments and errors of `evaluate_pdf`."""
+    """Evaluate f cos θ_o in 1/sr, (..., c); arguments and errors of `evaluate_pdf`."""
     return evaluate_pdf(bsdf, wi, wo, wavelengths)[0]
 
 
@@ -151,14 +151,14 @@ def sample(
     context: mi.BSDFContext | None = None,
     uv: ArrayLike = (0.0, 0.0),
 ) -> tuple[Array, Array, mi.BSDFSample3f]:
-    """Samples by vectorised variants.
+    """Sample a BSDF in vectorised variants.
 
     Args:
-        bsdf: of the variant in force.
+        bsdf: of the current variant.
         wi: ω_i, (n, 3), for one sample each.
         wavelengths: (c,) or (n, c) in nm, as many as a ray has.
         seed: of the random numbers.
-        context: what of the BSDF; all by default.
+        context: the components of the BSDF; all by default.
         uv: (n, 2) or (2,).
 
     Returns:
@@ -173,16 +173,16 @@ def sample(
 
 
 def _components(kind: type, values: ArrayLike) -> object:
-    """An array of Mitsuba's from (n, k) or (k,)."""
+    """Convert (n, k) or (k,) to an array of Mitsuba."""
     return kind(*map(floats, np.atleast_2d(values).T))
 
 
 def _channels() -> int:
-    """Wavelengths of a ray."""
+    """Return the wavelengths of a ray."""
     return len(mi.UnpolarizedSpectrum(0))
 
 
 def _spectrum(value: mi.Spectrum, count: int) -> Array:
-    """Of Mitsuba's spectrum, or of the first element of a Mueller matrix: (count, c)."""
+    """Convert a spectrum of Mitsuba, or the first element of a Mueller matrix: (count, c)."""
     found = array(mi.unpolarized_spectrum(value), np.float64).reshape(_channels(), -1)
     return np.broadcast_to(found, (len(found), count)).T

@@ -9,6 +9,8 @@ import pytest
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction import testing
+from mitsuba_diffraction.rigorous.axes import Axes
+from mitsuba_diffraction.rigorous.spectrum import RigorousSpectrum
 
 array, direction, floats, vectors = testing.array, testing.direction, testing.floats, testing.vectors
 WAVELENGTHS = (400.0, 500.0, 600.0, 700.0)
@@ -34,6 +36,18 @@ SURFACES = {
 @functools.cache
 def spectrum(name, coherence_length=65.0):
     return md.precompute(SURFACES[name](), coherence_length=coherence_length)
+
+
+def made_up(coherence_length=65.0):
+    """A table of η that no solver knows, symmetric in P and R, of a grating with many orders; Σ η_m < 1."""
+    axes = Axes(1.7, (0.36, 0.83), 8, 5)
+    values = np.empty((axes.planes, axes.nodes), np.float32)
+    for m in range(-axes.largest, axes.largest + 1):
+        side, start = axes.side(m), axes.offset(m)
+        x = np.sin(0.2 * np.arange(side) + m) ** 2
+        square = (1 + np.add.outer(x, x)) * np.linspace(1, 2, axes.planes)[:, None, None] / (60 + 5 * m)
+        values[:, start : start + side**2] = square.reshape(axes.planes, -1)
+    return RigorousSpectrum(axes, values, "Al", 0j, coherence_length, 0.01, 0, 0, 0, 1, "made up", "")
 
 
 def use(variant):

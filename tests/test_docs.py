@@ -29,7 +29,7 @@ REDUCED = {
 }
 """Options that make a command quick, instead of those that it has."""
 SHOWN = {"text", "bash"}
-"""What is shown and not run: output, and what needs several machines (tests/test_cluster.py)."""
+"""What is shown and not run: output, and what needs several machines (tests/render/test_cluster.py)."""
 BY_OTHER_MEANS = (
     *("python3 -m venv", "python -m pytest", "pip install", "jupyter ", "mkdocs "),
     *("mitsuba-diffraction benchmark", "mitsuba-diffraction convergence", "mitsuba-diffraction validate"),
@@ -152,7 +152,7 @@ def test_the_code_of_a_page_runs(page, folder, command, llvm, capfd):
             assert language in SHOWN, f"{page.name}: a block of {language!r}, which nothing runs"
 
 
-def test_a_block_that_is_wrong_is_found(folder, command, llvm, capfd):
+def test_a_wrong_block_of_code_is_found(folder, command, llvm, capfd):
     with pytest.raises(AssertionError):
         run_python("print(93, 365.0)  # 93 360.", {}, None, capfd)
     with pytest.raises(AssertionError):
@@ -192,7 +192,7 @@ def named_by(path):
     return found
 
 
-def test_the_page_on_python_names_what_there_is():
+def test_the_page_on_python_names_the_public_interface():
     page = (ROOT / "docs" / "python.md").read_text().replace("`md.", "`mitsuba_diffraction.")
     named = set(re.findall(r"mitsuba_diffraction\.[\w.]+\w", page))
     assert len(named) > 15
@@ -204,7 +204,7 @@ def test_the_page_on_python_names_what_there_is():
             assert argument.split("=")[0] == "…" or argument.split("=")[0] in parameters, summary
 
 
-def test_the_files_that_the_readme_names_are_there():
+def test_the_files_that_the_readme_names_exist():
     named = re.findall(r"(?:scenes|docs|precompute|notebooks)/[\w./]+\.(?:xml|png|toml|ipynb|md)", PAGES[0].read_text())
     assert len(named) >= 5
     for name in named:

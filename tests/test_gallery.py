@@ -31,14 +31,14 @@ def reference():
     return gallery.Reference.of([scene(seed) for seed in range(100, 100 + gallery.SEEDS)])
 
 
-def test_noise_passes(reference):
+def test_pictures_that_differ_by_noise_pass(reference):
     assert min(reference.probability(scene(seed)) for seed in range(40)) > gallery.SIGNIFICANCE
 
 
 @pytest.mark.parametrize(
     "change", [{"factor": 1.1}, {"factor": 0.9}, {"spoilt": np.s_[30:60, 75:105]}, {"spoilt": np.s_[..., 2]}]
 )
-def test_changes_do_not(reference, change):
+def test_pictures_that_differ_by_more_than_noise_fail(reference, change):
     assert max(reference.probability(scene(seed, **change)) for seed in range(20)) < gallery.SIGNIFICANCE
 
 

@@ -53,27 +53,27 @@ def run(*lines: str, library: str | None = None, python_path: Path | None = None
 @pytest.mark.few(1)
 @needs_wheel
 @pytest.mark.parametrize("major", [14, 15])
-def test_takes_the_place_of_an_old_llvm(major: int) -> None:
+def test_the_wheel_replaces_an_old_llvm(major: int) -> None:
     process = run(IMPORT, USE, library=old_library(major))
     assert "is not an LLVM 17 or later" in process.stderr
 
 
 @pytest.mark.slow
 @needs_wheel
-def test_takes_the_place_of_a_missing_llvm() -> None:
+def test_the_wheel_replaces_a_missing_llvm() -> None:
     run(IMPORT, USE, library="/nonexistent")
 
 
 @pytest.mark.slow
 @needs_wheel
-def test_without_the_user_doing_anything() -> None:
+def test_the_wheel_is_used_by_default() -> None:
     assert not run(IMPORT, USE).stderr
 
 
 @pytest.mark.few(1)
 @needs_wheel
 @pytest.mark.parametrize("first", ["import drjit", "import mitsuba"])
-def test_an_old_llvm_that_was_there_first_is_told_before_a_kernel_aborts(first: str) -> None:
+def test_an_old_llvm_that_was_loaded_first_is_reported_before_a_kernel_aborts(first: str) -> None:
     process = run(
         first,
         IMPORT,
@@ -98,7 +98,7 @@ def test_a_usable_llvm_of_the_user_stays(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.skipif(not any(file.name.startswith("libc++.so.1") for file in WHEEL_FILES), reason="no such wheel")
-def test_wheel_whose_links_are_not_made_yet(tmp_path: Path) -> None:
+def test_a_wheel_without_its_links_is_used(tmp_path: Path) -> None:
     """As right after pip, in the interpreter that runs on, or in an environment that is read-only."""
     folder = tmp_path / "lib"
     libraries = {file.name: file for file in WHEEL_FILES if file.name.startswith(("libLLVM", "libc++", "libunwind"))}
@@ -120,7 +120,7 @@ def test_wheel_whose_links_are_not_made_yet(tmp_path: Path) -> None:
 
 @pytest.mark.few(1)
 @pytest.mark.parametrize("first", ["", "import mitsuba"])
-def test_no_llvm_at_all(first: str) -> None:
+def test_without_any_llvm_only_scalar_variants_run(first: str) -> None:
     process = run(
         "from importlib import metadata; metadata.distributions = lambda **arguments: []",
         first,

@@ -42,7 +42,7 @@ BLAZED = '<string name="profile" value="blazed"/><float name="period" value="2.5
         ),
     ],
 )
-def test_what_there_is_is_said(body, parameters, words, tmp_path, llvm):
+def test_messages_name_what_is_available(body, parameters, words, tmp_path, llvm):
     (tmp_path / "lights").mkdir()
     for name in ("sun", "lamp"):
         (tmp_path / "lights" / f"{name}.xml").write_text('<scene version="3.0.0"><emitter type="constant"/></scene>')
@@ -64,7 +64,7 @@ def test_what_there_is_is_said(body, parameters, words, tmp_path, llvm):
         ("render scenes/foil.xml", "no such file; it is made by: python scenes/foil.py && python scenes/ground.py"),
     ],
 )
-def test_what_a_scene_lacks_is_told_before_spectra_are_computed(line, message, command, tmp_path, monkeypatch, llvm):
+def test_gaps_of_a_scene_are_reported_before_spectra_are_computed(line, message, command, tmp_path, monkeypatch, llvm):
     shutil.copytree(SCENES, tmp_path / "scenes", ignore=shutil.ignore_patterns("models", "*.npz"))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(Recipe, "cached", lambda *args: pytest.fail("a spectrum was computed"))
@@ -109,13 +109,13 @@ def test_xml_is_refused_in_one_line_too(tmp_path, llvm):
             load(source)
 
 
-def test_a_mistake_of_the_code_keeps_its_traceback(monkeypatch, llvm):
+def test_a_bug_keeps_its_traceback(monkeypatch, llvm):
     monkeypatch.setattr("mitsuba_diffraction.bsdf.surface.Recipe", None)
     with pytest.raises(RuntimeError, match=r"Traceback(.|\n)*TypeError: 'NoneType' object is not callable"):
         mi.load_dict({"type": "diffraction_grating", "profile": "blazed", "period": 2.5, "depth": 0.25})
 
 
-def test_what_is_logged_is_plain(caplog, capfd, llvm, command, tmp_path):
+def test_the_log_is_plain_text(caplog, capfd, llvm, command, tmp_path):
     """One line each, without colours and places in the code; Mitsuba's own log has both, in files too."""
     grating = {"type": "diffraction_grating", "profile": "blazed", "period": 2.5, "depth": 0.25, "coat_ior": 1.5}
     told = "diffraction_grating: coat_thickness changes nothing: absorption needs coat_absorption and coat_thickness"

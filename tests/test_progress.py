@@ -16,7 +16,7 @@ from mitsuba_diffraction import progress
 RUBBED = {"profile": "xenopeltis", "size": 5.0, "patches": 3}
 
 
-def test_a_log_tells_in_one_line_that_a_spectrum_is_computed(llvm, capfd, monkeypatch):
+def test_a_log_reports_in_one_line_that_a_spectrum_is_computed(llvm, capfd, monkeypatch):
     """From Python a skin took half a minute without a word."""
     monkeypatch.setattr(progress, "log_lines", functools.partial(progress.log_lines, first=0, seconds=math.inf))
     for _ in range(2):  # the second time it is read from the cache

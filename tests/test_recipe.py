@@ -89,7 +89,7 @@ def builds(monkeypatch):
         ("\x00", "not a TOML file"),
     ],
 )
-def test_recipes_that_are_none_are_refused(tmp_path, text, message):
+def test_wrong_recipes_are_refused(tmp_path, text, message):
     path = write(tmp_path, text)
     with pytest.raises(ValueError, match=message) as caught:
         Recipe.load(path)
@@ -222,7 +222,7 @@ def test_a_recipe_builds_what_its_words_say(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_recipe_of_a_sample(tmp_path, own_cache):
+def test_a_recipe_of_a_sample_builds_its_spectrum(tmp_path, own_cache):
     heights = np.random.default_rng(0).random((20, 24)) * 0.1
     np.save(tmp_path / "scan.npy", heights)
     path = write(
@@ -241,7 +241,7 @@ def test_a_recipe_of_a_sample(tmp_path, own_cache):
     assert Recipe.load(tile).digest() != Recipe.load(path).digest()
 
 
-def test_a_recipe_says_what_coherence_its_scan_carries(tmp_path):
+def test_a_recipe_reports_the_coherence_length_that_its_scan_supports(tmp_path):
     np.save(tmp_path / "scan.npy", np.zeros((20, 24)))
     path = write(
         tmp_path,
@@ -285,7 +285,7 @@ def test_a_profile_has_no_missing_pixels(tmp_path):
         Recipe.load(write(tmp_path, BLAZE + "fill_missing = true\n")).height_field()
 
 
-def test_a_measured_skin_by_recipe(tmp_path, scan_file, scan):
+def test_a_recipe_of_a_measured_skin_has_its_heights(tmp_path, scan_file, scan):
     text = f'[surface]\nscan = "{scan_file("elaphe")}"\npixel_size = 0.0586\nheight_range = 0.375\n'
     assert Recipe.load(write(tmp_path, text)).height_field().digest == scan("elaphe").digest
 
@@ -434,7 +434,7 @@ prepare = ["level_plane", "align_lines", "fill_missing", { trim_edges = 0.1 }, {
 """
 
 
-def test_a_scan_is_made_ready_and_the_spectrum_says_how(tmp_path):
+def test_a_scan_is_prepared_and_the_spectrum_says_how(tmp_path):
     tilted(tmp_path)
     recipe = Recipe.load(write(tmp_path, PREPARED + "[spectrum]\ntolerance = 0.01\n"))
     spectrum = recipe.build()
@@ -449,7 +449,7 @@ def test_a_scan_is_made_ready_and_the_spectrum_says_how(tmp_path):
     assert spectrum.grid.tile_size[0] == pytest.approx(5 * 0.613, rel=2e-3)
 
 
-def test_missing_pixels_wait_for_the_last_step(tmp_path):
+def test_missing_pixels_are_filled_after_the_last_step(tmp_path):
     tilted(tmp_path)
     text = '[surface]\nscan = "scan.npy"\npixel_size = 0.05\nprepare = ["level_plane"]\n'
     with pytest.raises(ValueError, match=r"scan\.npy: heights: 1 of 2800 pixels are missing"):
@@ -481,7 +481,7 @@ def test_the_cache_knows_the_steps_and_their_order(tmp_path):
     assert len({Recipe.load(write(tmp_path, text)).digest() for text in texts}) == 3
 
 
-def test_unit_and_channel_of_a_recipe(tmp_path):
+def test_a_recipe_takes_unit_and_channel(tmp_path):
     (tmp_path / "scan.xyz").write_text("0 0 1\n1 0 2\n0 1 3\n1 1 4\n")
     text = '[surface]\nscan = "scan.xyz"\nunit = ["um", "nm"]\npixel_size = [0.5, 1]\n'
     field = Recipe.load(write(tmp_path, text)).height_field()
@@ -492,7 +492,7 @@ def test_unit_and_channel_of_a_recipe(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_command_takes_the_same_of_a_scan(tmp_path, command, monkeypatch):
+def test_the_command_takes_the_same_options_of_a_scan(tmp_path, command, monkeypatch):
     monkeypatch.chdir(tmp_path)
     tilted(tmp_path)
     steps = "--prepare level_plane --prepare fill_missing --prepare trim_edges=0.1 --prepare crop_periods=x"

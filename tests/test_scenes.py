@@ -273,7 +273,7 @@ def test_foil_is_embossed_with_shards():
     assert counts.max() < 0.02 * turn.size
 
 
-def test_ground_may_be_repeated():
+def test_the_ground_texture_tiles():
     colour, _ = ground.stone(np.random.default_rng(1), 128)
     inside = np.abs(np.diff(colour, axis=1)).mean()
     assert np.abs(colour[:, 0] - colour[:, -1]).mean() < 2 * inside

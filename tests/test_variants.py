@@ -18,18 +18,18 @@ def machine(monkeypatch: pytest.MonkeyPatch):
 
 
 @pytest.mark.parametrize("name", ["scalar_spectral", "llvm_ad_spectral", "cuda_ad_spectral_polarized"])
-def test_is_spectral(name: str) -> None:
+def test_spectral_variants_are_recognised(name: str) -> None:
     assert llvm.is_spectral(name)
     assert name in llvm.spectral_variants()
 
 
 @pytest.mark.parametrize("name", ["scalar_rgb", "llvm_ad_mono_polarized", ""])
-def test_is_not_spectral(name: str) -> None:
+def test_other_variants_are_not_spectral(name: str) -> None:
     assert not llvm.is_spectral(name)
     assert name not in llvm.spectral_variants()
 
 
-def test_gpu_comes_first(machine) -> None:
+def test_a_gpu_comes_first(machine) -> None:
     machine(gpu=True, problem="no LLVM")
     assert llvm.choose_variant() == "cuda_ad_spectral"
 
@@ -39,7 +39,7 @@ def test_llvm_where_there_is_no_gpu(machine) -> None:
     assert llvm.choose_variant() == "llvm_ad_spectral"
 
 
-def test_neither_gpu_nor_llvm(machine) -> None:
+def test_without_gpu_and_llvm_only_scalar_variants_run(machine) -> None:
     machine(gpu=False, problem="install this")
     with pytest.raises(RuntimeError, match=r"install this.*--variant scalar_spectral"):
         llvm.choose_variant()
@@ -47,12 +47,12 @@ def test_neither_gpu_nor_llvm(machine) -> None:
 
 
 @pytest.mark.parametrize("name", ["llvm_ad_spectral_polarized", "scalar_spectral"])
-def test_requested_variant(machine, name: str) -> None:
+def test_the_requested_variant_is_chosen(machine, name: str) -> None:
     machine(gpu=False, problem=None)
     assert llvm.choose_variant(name) == name
 
 
-def test_requested_variant_that_cannot_run(machine) -> None:
+def test_a_requested_variant_that_cannot_run_is_refused(machine) -> None:
     machine(gpu=False, problem="install this")
     with pytest.raises(RuntimeError, match=r"'llvm_ad_spectral' cannot be used: install this"):
         llvm.choose_variant("llvm_ad_spectral")
@@ -61,7 +61,7 @@ def test_requested_variant_that_cannot_run(machine) -> None:
 
 
 @pytest.mark.parametrize(("name", "reason"), [("llvm_ad_rgb", "is not spectral"), ("spectral", "is unknown")])
-def test_requested_variant_that_is_refused(machine, name: str, reason: str) -> None:
+def test_a_requested_variant_that_is_unknown_or_not_spectral_is_refused(machine, name: str, reason: str) -> None:
     machine(gpu=True, problem=None)
     with pytest.raises(ValueError, match=rf"'{name}' {reason}; use one of .*llvm_ad_spectral"):
         llvm.choose_variant(name)

@@ -1,4 +1,4 @@
-"""What measures the product: against theory, rigorous theory and the shader, and speed against error.
+"""Evaluation of the product: validation, benchmark, and comparison with the real-time shader.
 
-Imports nothing, so that what is offline in here stays offline.
+Imports nothing, so that its offline modules do not load Mitsuba.
 """

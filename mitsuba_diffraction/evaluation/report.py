@@ -13,19 +13,19 @@ RECORD_COLUMNS = ("check", "expected", "found", "difference", "bound", "")
 
 
 def cells(columns: Mapping[str, str], row: object) -> list[str]:
-    """A row as texts; `columns` are titles and format strings such as "{.error:.1e}"."""
+    """Format a row as texts; `columns` are titles and format strings such as "{.error:.1e}"."""
     return [text.format(row) for text in columns.values()]
 
 
 def markdown(columns: Sequence[str], rows: Iterable[Sequence[str]], texts: int = 1) -> str:
-    """The same in Markdown."""
+    """Format a table in Markdown."""
     ruler = ["---" if index < texts else "---:" for index in range(len(columns))]
     lines = ([cell.replace("|", "\\|") for cell in line] for line in (columns, ruler, *rows))
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
 def record_cells(record: Record) -> list[str]:
-    """A record under `RECORD_COLUMNS`."""
+    """Format a record as the texts of `RECORD_COLUMNS`."""
     numbers = [f"{value:.4g}" for value in (record.expected, record.measured)]
     small = ["—" if value is None else f"{float(f'{value:.2g}'):.4g}" for value in (record.error, record.bound)]
     return [record.name, *numbers, *small, _verdict(record)]
@@ -36,7 +36,7 @@ def _verdict(record: Record) -> str:
 
 
 def record_table(records: Sequence[Record]) -> Table:
-    """Records for a terminal, group by group."""
+    """Format records for a terminal, group by group."""
     shown = Table(*RECORD_COLUMNS)
     for column in shown.columns[1:5]:
         column.justify = "right"
@@ -53,13 +53,13 @@ def record_table(records: Sequence[Record]) -> Table:
 
 
 def record_markdown(records: Iterable[Record]) -> str:
-    """Records with their notes and sources."""
+    """Format records, with notes and sources, in Markdown."""
     rows = [[record.group, *record_cells(record), record.note, record.source] for record in records]
     return markdown(("group", *RECORD_COLUMNS, "note", "source"), rows, texts=9)
 
 
 def record_dicts(records: Iterable[Record]) -> list[dict[str, object]]:
-    """Records for JSON."""
+    """Return records as dictionaries for JSON."""
     return [
         {
             "group": record.group,

@@ -1,4 +1,4 @@
-"""Look at a surface before it is rendered: statistics, periods, predicted colours, and how far they can be trusted."""
+"""Inspection of a surface before it is rendered: statistics, periods, predicted colours, and their uncertainty."""
 
 from .inspect import Inspection, inspect
 from .picture import save_picture

@@ -1,11 +1,11 @@
-"""What the eye will see: colours against the viewing angle, and the share and the colour of single orders.
+"""Predicted colours: against the viewing angle, and the share and the colour of single orders.
 
 All in the plane of incidence that holds the wave vector of the main period, for a surface that reflects all wavelengths
-alike (R = 1), under daylight (D65), without the bound on energy E:
+alike (R = 1), under daylight (D65), without the energy factor E:
 
     L(λ) ∝ D65(λ) K G S(q e; κ)/λ² · cos θ_i,    q = (sin θ_i − sin θ_o)/λ,    κ = 2π (cos θ_i + cos θ_o)/λ
 
-Angles are positive on the far side from the light: the mirror direction is θ_o = θ_i.
+Angles are positive on the side opposite to the light: the specular direction is θ_o = θ_i.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ LONGEST_COHERENCE = 20.0
 
 
 def illumination() -> Array:
-    """D65 at `WAVELENGTHS`, of luminance Y = 1."""
+    """Return D65 at `WAVELENGTHS`, of luminance Y = 1."""
     values = daylight(WAVELENGTHS)
     return values / spectrum_to_XYZ(values, WAVELENGTHS)[1]
 
@@ -42,10 +42,10 @@ def radiance(
     height_scale: float = 1.0,
     lateral_scale: float = 1.0,
 ) -> Array:
-    """L(λ) as at the head of this file.
+    """Compute L(λ), which the docstring of this module defines.
 
-    Scaled heights are another κ, S(q; s κ). A surface that is wider by s has the spectrum s² S(s q; κ), coherence
-    length scaled with it.
+    Heights scaled by s have the spectrum S(q; s κ). A surface stretched by s has s² S(s q; κ), where the coherence
+    length is scaled as well.
 
     Args:
         spectrum: of the surface.
@@ -70,7 +70,7 @@ def radiance(
 
 
 def order_angle(order: int, period: float, wavelength: float) -> float | None:
-    """θ_o in degrees of an order at normal incidence, sin θ_o = m λ/period (both µm); None where it is evanescent."""
+    """Return θ_o in degrees of an order at normal incidence, sin θ_o = m λ/period (µm); None if evanescent."""
     sine = order * wavelength / period
     return float(np.degrees(np.arcsin(sine))) if abs(sine) < 1 else None
 
@@ -85,7 +85,7 @@ def order_share(
     height_scale: float = 1.0,
     lateral_scale: float = 1.0,
 ) -> float:
-    """The share of the reflected power about one order and its opposite, at normal incidence (R = 1, K G = 1).
+    """Return the share of the reflected power about one order and its opposite, at normal incidence (R = 1, K G = 1).
 
     S is integrated over the cells of the lattice of orders, squares of side 1/period about q = ±m e/period, at the κ of
     the order. An irregular surface spreads its orders over these cells; a grating has them in the middle.

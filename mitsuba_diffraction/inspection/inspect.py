@@ -1,4 +1,4 @@
-"""Everything there is to know about a surface before it is rendered."""
+"""Inspection of a surface before it is rendered."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ class Inspection:
         height_field: the surface.
         extent: "tile" or "sample".
         statistics: heights, slopes, tilt.
-        periods: as of `find_periods`: single ones, then bands; none where nothing stands out.
-        carried: the coherence length that a scan carries, µm, at most that of sunlight; of a tile, any.
-        coherence_length: what is asked for, as far as it is carried, µm.
+        periods: as of `find_periods`: single ones, then bands; empty if none is significant.
+        carried: the coherence length that a scan supports, µm, at most that of sunlight; a tile supports any.
+        coherence_length: the requested one, limited to `carried`, µm.
         standard_error: of a sample's spectrum at that coherence length, a share of the reflected power; None of a tile.
         scalar_error: of scalar theory for this surface.
-        changes: what ±5 % of height scale, pixel size and, of a scan, tip broadening do; empty without a period.
-        concerns: what stands in the way of a right picture.
+        changes: effects of ±5 % of height scale, pixel size and, for a scan, tip broadening; empty without a period.
+        concerns: reasons to distrust a picture.
         spectrum: of at most `LONGEST_COHERENCE`, for predicted colours.
-        shown: the height field, a small tile repeated until it shows how it goes on, a profile as wide as it is long.
+        shown: the height field; a small tile is repeated, a profile extended to a square.
     """
 
     height_field: HeightField
@@ -59,11 +59,11 @@ class Inspection:
 
     @property
     def direction(self) -> float:
-        """Of the plane in which colours are shown: that of the main period, else x; degrees."""
+        """The direction, in degrees, of the plane in which colours are shown: that of the main period, else x."""
         return self.periods[0].direction if self.periods else 0.0
 
     def as_json(self) -> dict[str, object]:
-        """All numbers under their names, lengths in µm; what is not a number is None."""
+        """Return all numbers by name, lengths in µm; what is not a number is None."""
         rows, columns = self.height_field.shape
         return plain(
             {
@@ -93,13 +93,13 @@ def inspect(
     measured: bool = True,
     progress: Callable[[int, int], None] | None = None,
 ) -> Inspection:
-    """Look at a surface.
+    """Inspect a surface.
 
     Args:
         height_field: the surface.
         extent: "sample": a piece of a larger, irregular surface; "tile": it repeats.
-        coherence_length: that is wanted, µm.
-        measured: whether it is a scan; only of scans one asks for tilt, steps of the heights and the tip.
+        coherence_length: the requested one, µm.
+        measured: whether it is a scan; tilt, steps of the heights and the tip matter only for scans.
         progress: called with (steps done, steps in all).
 
     Raises:
@@ -157,7 +157,7 @@ def inspect(
 
 
 def _widened(field: HeightField) -> HeightField:
-    """A profile, which is uniform along its axis of one pixel, as a square."""
+    """Extend a profile along its axis of one pixel to a square."""
     for axis in (0, 1):
         if field.shape[axis] == 1 < field.shape[1 - axis]:
             count = min(field.shape[1 - axis], 256)

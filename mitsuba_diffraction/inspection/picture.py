@@ -35,7 +35,7 @@ _DECADES = 5
 
 
 def save_picture(inspection: Inspection, path: str | os.PathLike[str], *, title: str | None = None) -> None:
-    """Draws a slide, 16 : 9, as PNG, PDF or SVG.
+    """Write a slide, 16 : 9, as PNG, PDF or SVG.
 
     Args:
         inspection: what to draw.
@@ -88,7 +88,7 @@ def _both(x: float, y: float) -> str:
 
 
 def _height_map(axes: Axes, field: HeightField, extent: str) -> None:
-    """Heights about the mean plane, with a scale bar in place of axes."""
+    """Plot heights about the mean plane, with a scale bar in place of axes."""
     field = _square_cut(field)
     size_x, size_y = field.tile_size
     level = (field.heights - reference_plane(field, extent)[0]) * 1e3
@@ -115,7 +115,7 @@ def _height_map(axes: Axes, field: HeightField, extent: str) -> None:
 
 
 def piece_shown(inspection: Inspection) -> HeightField:
-    """Of a surface that repeats, as much as shows its periods: a dozen of the shortest, but four of the longest."""
+    """Return a piece of a periodic surface: a dozen of the shortest periods, but at least four of the longest."""
     field = inspection.shown
     if inspection.extent == "sample" or not inspection.periods:
         return field
@@ -126,7 +126,7 @@ def piece_shown(inspection: Inspection) -> HeightField:
 
 
 def _square_cut(field: HeightField) -> HeightField:
-    """A piece of a long patch that is at most twice as long as wide."""
+    """Crop a long patch to at most twice its width."""
     rows, columns = field.shape
     size_x, size_y = field.tile_size
     rows = min(rows, max(1, int(rows * 2 * size_x / size_y)))
@@ -135,13 +135,13 @@ def _square_cut(field: HeightField) -> HeightField:
 
 
 def _round_length(length: float) -> float:
-    """The largest of 1, 2 or 5 times a power of ten that is not above."""
+    """Return the largest 1, 2 or 5 times a power of ten that does not exceed a length."""
     power = 10.0 ** np.floor(np.log10(length))
     return float(max(step * power for step in (1, 2, 5) if step * power <= length * (1 + 1e-9)))
 
 
 def _spectrum(axes: Axes, inspection: Inspection) -> None:
-    """The power spectrum of the heights, a wave is a pair of bright spots."""
+    """Plot the power spectrum of the heights, where a wave is a pair of bright spots."""
     q_x, q_y, power = _height_spectrum(inspection.shown, inspection.extent)
     limit = min(_HIGHEST_FREQUENCY, max(q_x.max(), q_y.max()))
     if inspection.periods:
@@ -178,7 +178,7 @@ def _spectrum(axes: Axes, inspection: Inspection) -> None:
 
 
 def _height_spectrum(field: HeightField, extent: str) -> tuple[Array, Array, Array]:
-    """q_x, q_y in ascending order and the power of the levelled, Hann-windowed heights, at most about 1000² points."""
+    """Return ascending q_x, q_y and the power of levelled, Hann-windowed heights, at most about 1000² points."""
     level = field.heights - reference_plane(field, extent)[0]
     power = np.fft.fftshift(np.abs(np.fft.fft2(level * hann(level.shape))) ** 2)
     q_y, q_x = (np.fft.fftshift(np.fft.fftfreq(n, p)) for n, p in zip(level.shape, field.pixel_size[::-1], strict=True))
@@ -187,7 +187,7 @@ def _height_spectrum(field: HeightField, extent: str) -> tuple[Array, Array, Arr
 
 
 def _strongest(q_x: Array, q_y: Array, power: Array) -> tuple[Array, Array, Array]:
-    """The largest power of each cell of a coarser grid: a single spot would be smaller than a pixel of the picture."""
+    """Return the largest power of each cell of a coarser grid: a single peak would be smaller than a pixel."""
     cells = []
     for axis, q in enumerate((q_x, q_y)):
         starts = np.unique(np.linspace(0, len(q), min(len(q), _CELLS), endpoint=False).astype(int))
@@ -197,7 +197,7 @@ def _strongest(q_x: Array, q_y: Array, power: Array) -> tuple[Array, Array, Arra
 
 
 def _facts(axes: Axes, inspection: Inspection) -> None:
-    """What a person would read out."""
+    """Write the most important numbers."""
     axes.set_axis_off()
     axes.set_title("In numbers", fontsize=12, loc="left")
     numbers = inspection.statistics
@@ -231,7 +231,7 @@ def _facts(axes: Axes, inspection: Inspection) -> None:
 
 
 def with_uncertainty(value: float, uncertainty: float) -> str:
-    """Such as 1.144 ± 0.012: the uncertainty to two digits, the value to as many places."""
+    """Format as 1.144 ± 0.012: the uncertainty to two digits, the value to as many places."""
     if not (np.isfinite(uncertainty) and uncertainty > 0):
         return f"{value:.4g}"
     places = int(np.clip(1 - np.floor(np.log10(uncertainty)), 0, 6))
@@ -240,7 +240,7 @@ def with_uncertainty(value: float, uncertainty: float) -> str:
 
 
 def _colours(rows: list[Axes], inspection: Inspection) -> None:
-    """One strip for each angle of incidence, its mirror direction marked."""
+    """Plot one strip for each angle of incidence, its specular direction marked."""
     light = radiance(inspection.spectrum, inspection.direction, np.array(INCIDENCES)[:, None], _ANGLES)
     rgb = into_gamut(spectrum_to_linear_sRGB(light, WAVELENGTHS))
     shown = on_screen(rgb * _exposure(rgb))
@@ -267,6 +267,6 @@ def _colours(rows: list[Axes], inspection: Inspection) -> None:
 
 
 def _exposure(rgb: Array) -> float:
-    """That of a picture of what lies aside of the mirror direction, which would make all else black."""
+    """Return the exposure of all but the specular direction, which would make the rest black."""
     aside = [strip[np.abs(_ANGLES - incidence) > 5] for strip, incidence in zip(rgb, INCIDENCES, strict=True)]
     return auto_exposure(np.concatenate(aside))

@@ -1,4 +1,4 @@
-"""The numbers by which surfaces are compared (ISO 25178-2), and what a blunt tip does to them."""
+"""Surface statistics (ISO 25178-2), and the effect of a blunt tip on a surface."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Statistics:
 
 
 def statistics(height_field: HeightField, *, extent: str = "sample") -> Statistics:
-    """The numbers of a height field, about `reference_plane`."""
+    """Compute the statistics of a height field, about `reference_plane`."""
     heights = height_field.heights
     plane, slopes = reference_plane(height_field, extent)
     level = heights - plane
@@ -71,9 +71,9 @@ def statistics(height_field: HeightField, *, extent: str = "sample") -> Statisti
 
 
 def reference_plane(height_field: HeightField, extent: str) -> tuple[Array, tuple[float, float]]:
-    """The plane from which heights are told, (N_y, N_x) µm, and its slopes along x and y.
+    """Return the plane to which heights refer, (N_y, N_x) µm, and its slopes along x and y.
 
-    Of a sample, the plane that fits best (least squares). A tile repeats, so that it is level on the whole.
+    For a sample, the least-squares plane; for a tile, which is periodic, a level one.
     """
     rows, columns = height_field.shape
     if extent == "tile":
@@ -91,7 +91,7 @@ _HALVINGS = 12
 
 
 def scanned(height_field: HeightField, radius: float, *, extent: str = "sample") -> HeightField:
-    """The surface as a tip of this radius records it, or, for a negative radius, as it was before.
+    """Return the surface as a tip of this radius records it or, for a negative radius, as it was before.
 
     The lowest place that a paraboloid ρ²/2r can reach over each point is the dilation of the heights by it; erosion by
     the same gives back all that the tip touched (Villarrubia 1997, J. Res. NIST 102, 425–454):
@@ -119,10 +119,10 @@ def scanned(height_field: HeightField, radius: float, *, extent: str = "sample")
 
 
 def broadened(height_field: HeightField, share: float, *, extent: str = "sample") -> tuple[HeightField, float]:
-    """The surface whose ridges are wider by `share`, and the radius (µm, signed) of the tip that makes them so.
+    """Return the surface with ridges wider by `share`, and the radius (µm, signed) of the tip that widens them so.
 
-    How wide ridges are is told by the area above mid-height, half way between the mean of the heights above the average
-    and the mean of those below; the tip's radius is searched for with which it grows by `share` (shrinks, if negative).
+    The width of ridges is measured by the area above mid-height, half way between the mean of the heights above the
+    average and the mean of those below; a tip radius is sought for which it grows by `share` (shrinks, if negative).
 
     Raises:
         ValueError: if no tip does that: a flat surface.

@@ -1,6 +1,6 @@
-"""How far colours can be trusted, and what stands in the way of a right picture.
+"""Uncertainty of the predicted colours, and reasons to distrust a picture.
 
-How far colours can be trusted: what ±5 % of the height scale, the pixel size and the tip's broadening change.
+Uncertainty is the effect of ±5 % of the height scale, the pixel size and the tip's broadening.
 """
 
 from __future__ import annotations
@@ -25,23 +25,23 @@ SHARE = 0.05
 """The change that is tried, both ways."""
 
 GREEN = 0.55
-"""µm, the wavelength for which orders are told."""
+"""µm, the wavelength for which orders are reported."""
 
 ORDERS = (1, 2)
 
 
 @dataclass(frozen=True)
 class Change:
-    """What becomes of period and orders when one thing about the scan was different.
+    """Change of period and orders with one property of the scan.
 
     Attributes:
         what: "height scale", "pixel size" or "tip broadening".
         by: the change, +0.05 or −0.05.
         period: of the main period, a share of it.
         before, after: m → share of the reflected light in the orders ±m, 550 nm at normal incidence.
-        colour: m → ΔE00 of what is seen where the order m of 550 nm went before, on its brighter side. The brighter
-            of the orders has half of the luminance of a white sheet before.
-        tip_radius: of the tip that broadens so much, µm; NaN for the others.
+        colour: m → ΔE00 in the direction of the order m of 550 nm before the change, on its brighter side. Exposure
+            gives the brighter of the orders half of the luminance of a white sheet before the change.
+        tip_radius: of the tip that broadens the ridges so, µm; NaN for other changes.
     """
 
     what: str
@@ -55,7 +55,7 @@ class Change:
 
 @dataclass(frozen=True)
 class _View:
-    """A surface and how it is scaled."""
+    """A surface and its scale."""
 
     spectrum: GratingSpectrum
     period: float
@@ -72,13 +72,13 @@ def changes(
     measured: bool,
     build: Callable[[HeightField], GratingSpectrum],
 ) -> tuple[Change, ...]:
-    """Two of each kind, + and −; of the tip only if it is a scan.
+    """Compute two changes of each kind, + and −; of the tip only if the surface is a scan.
 
-    A blunter and a sharper tip change a surface that is the same upside down, such as a sinusoid or a sawtooth, alike:
-    one widens the ridges, the other the grooves, and h and −h have the same powers.
+    A blunter and a sharper tip have equal effects on a surface that is equal to its negative, such as a sinusoid or a
+    sawtooth: one widens the ridges, the other the grooves, and h and −h have the same powers.
 
-    Height scale and pixel size scale the arguments of the one spectrum (`radiance`); the tip makes another surface, of
-    which periods are searched for and a spectrum is built.
+    Height scale and pixel size scale the arguments of the one spectrum (`radiance`); the tip makes another surface,
+    whose periods and spectrum are computed anew.
 
     Args:
         height_field: the surface.
@@ -86,7 +86,7 @@ def changes(
         main: its main period.
         extent: "tile" or "sample".
         measured: whether it is a scan.
-        build: makes spectra alike.
+        build: builds a spectrum with the same settings.
     """
     orders = [m for m in ORDERS if order_angle(m, main.period, GREEN) is not None]
     before = _View(spectrum, main.period)
@@ -120,7 +120,7 @@ def changes(
 
 
 def _same_period(found: tuple[Period, ...], main: Period) -> float:
-    """The period that is nearest to the main one in direction, else the main one itself."""
+    """Return the period nearest to the main one in direction, else the main one itself."""
 
     def apart(other: Period) -> float:
         return abs((other.direction - main.direction + 90) % 180 - 90)
@@ -142,7 +142,7 @@ def _share(view: _View, main: Period, order: int) -> float:
 
 
 def _XYZ(view: _View, main: Period, order: int, period: float) -> NDArray[np.float64]:
-    """XYZ, not negative, of what is seen at normal incidence in the direction in which `period` sends 550 nm."""
+    """Return non-negative XYZ at normal incidence in the direction to which `period` diffracts 550 nm."""
     light = radiance(
         view.spectrum,
         main.direction,
@@ -174,12 +174,12 @@ def concerns(
     measured: bool,
     scalar: ScalarError,
 ) -> tuple[str, ...]:
-    """Sentences, none if all is well.
+    """Return concerns about the surface as sentences; none if all is well.
 
     Args:
         height_field: the surface.
         numbers: its statistics.
-        coherence_length: of the light, as far as the surface carries it, µm.
+        coherence_length: of the light, limited to what the surface supports, µm.
         measured: whether it is a scan; a formula has neither tilt nor steps of its own.
         scalar: the error of scalar theory.
     """
@@ -229,7 +229,7 @@ def concerns(
 
 
 def _share_at_limit(height_field: HeightField) -> float:
-    """The share of the phase's power at 450 nm and normal incidence beyond 0.8 of the Nyquist limit."""
+    """Return the share of the phase's power at 450 nm and normal incidence beyond 0.8 of the Nyquist limit."""
     phase = np.exp(1j * 4 * np.pi / _BLUE * height_field.centred)
     power = np.abs(np.fft.fft2(phase * hann(phase.shape))) ** 2
     outside = np.zeros(power.shape, bool)

@@ -17,14 +17,14 @@ PARAMETERS = (
     Parameter("rr_depth", "integer", "as in `path`: depth at which Russian roulette begins", "5"),
 )
 
-MANUAL = f"""A path tracer that also finds the light that gratings throw onto other surfaces.
+MANUAL = f"""A path tracer that also finds the light that gratings cast onto other surfaces.
 
 Parameters (XML or dictionary):
 {listed(PARAMETERS)}
 
-The picture converges to that of `path` with the same parameters. A path tracer meets a small or distant light by way of
-a grating only by chance, so that what gratings throw onto a wall is white specks. Those paths are traced from the light
-here, and all others from the eye.
+The picture converges to that of `path` with the same parameters. A path tracer hits a small or distant light via a
+grating only by chance, so that the light that gratings cast onto a wall appears as white specks. Those paths are traced
+from the light here, and all others from the eye.
 
 With L a light, G a vertex on a surface whose BSDF is or holds a `diffraction_grating` (whichever component of it
 scatters: both sides of `twosided`, all of a blend, the base), X a vertex on any other surface, and E the eye, the paths
@@ -34,7 +34,7 @@ scatters: both sides of `twosided`, all of a blend, the base), X a vertex on any
 are traced from the light if the vertex next to E scatters otherwise than as a perfect mirror or refraction does. So
 
     L G E, L G G E              from the eye: gratings alone
-    L G X E, L G G X E          from the light: what they throw onto a wall
+    L G X E, L G G X E          from the light: what they cast onto a wall
     L G X X E, L G M X E        from the light: that wall lights another one; M is a mirror or a pane of glass
     L G X G E, L G X M E        from the eye: that wall seen in a grating or a mirror
     L X G X E, L M G X E        from the eye: light that met another surface before the grating
@@ -52,7 +52,7 @@ Gradients are those of `path` (forward) and `prb` (backward), and single rays (`
 
 
 def define() -> type:
-    """The plugin's class for the variant in force: its base class belongs to that variant."""
+    """Define the plugin class for the current variant, to which its base class belongs."""
     eye_class = eye_paths.define()
 
     class DiffractionPath(mi.SamplingIntegrator):
@@ -66,7 +66,7 @@ def define() -> type:
             self.path = nested_plugin("path", max_depth=self.max_depth, rr_depth=self.rr_depth)
 
         def parts(self, scene: mi.Scene, sensor: mi.Sensor) -> tuple[mi.SamplingIntegrator, LightPaths | None]:
-            """What traces from the eye, and what traces from the light; None where there are no such paths.
+            """Return the tracers of paths from the eye and from the light; None where there are no such paths.
 
             Raises:
                 ValueError: if the film takes samples beyond its edge.
@@ -149,7 +149,7 @@ def define() -> type:
 def put(
     film: mi.Film, block: mi.ImageBlock, position: mi.Point2f, wavelengths: mi.Spectrum, value: mi.Spectrum
 ) -> None:
-    """Adds to a block without adding to its weight."""
+    """Add to a block without adding to its weight."""
     if mi.has_flag(film.flags(), mi.FilmFlags.Special):
         block.put(position, film.prepare_sample(value, wavelengths, block.channel_count(), 0.0, 0.0))
     else:
@@ -157,7 +157,7 @@ def put(
 
 
 def _connects(sensor: mi.Sensor) -> bool:
-    """Whether points of the scene can be connected to a sensor: to `perspective` and `thinlens`."""
+    """Return whether points of the scene can be connected to a sensor: `perspective` and `thinlens`."""
     try:
         sensor.sample_direction(dr.zeros(mi.SurfaceInteraction3f), mi.Point2f(0.5))
     except RuntimeError as error:

@@ -1,4 +1,4 @@
-"""The paths that are traced from the eye, and which shapes of a scene are gratings."""
+"""Paths from the eye, and the shapes of a scene that are gratings."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from ..bsdf.base import contains_grating, nested
 
 
 def ratio(a: mi.Float, b: mi.Float) -> mi.Float:
-    """a/b, and zero where b is: scalar variants raise there."""
+    """Return a/b, and zero where b is zero: scalar variants raise there."""
     divides = b != 0
     return dr.select(divides, a / dr.select(divides, b, 1), 0)
 
@@ -22,7 +22,7 @@ class Gratings:
 
     Attributes:
         shapes: of the scene.
-        perturbed: whether the scene has a BSDF that turns the shading normal by itself, a normal or a bump map.
+        perturbed: whether the scene has a BSDF that perturbs the shading normal: a normal or a bump map.
     """
 
     def __init__(self, scene: mi.Scene) -> None:
@@ -47,14 +47,14 @@ class Gratings:
         return any(shape is one for one in self.shapes)
 
     def hold(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Bool:
-        """Whether a point lies on one of them."""
+        """Return whether a point lies on one of the shapes."""
         if not dr.is_jit_v(mi.Float):
             return si.shape in self
         number = dr.reinterpret_array(mi.UInt32, si.shape)
         return dr.gather(mi.UInt32, self._table, number, active & (number < self._size)) == 1
 
     def sample(self, time: mi.Float, u: mi.Float, v: mi.Point2f) -> mi.PositionSample3f:
-        """A point on them, uniform by area; `pdf` is the density in area."""
+        """Sample a point on the shapes, uniform by area; `pdf` is the density in area."""
         index, share = self._choice.sample_pmf(u)
         if dr.is_jit_v(mi.Float):
             point = dr.gather(mi.ShapePtr, self._pointers, index).sample_position(time, v)
@@ -65,7 +65,7 @@ class Gratings:
 
 
 def _area(shape: mi.Shape) -> float:
-    """Zero where Mitsuba draws no points."""
+    """Return the area of a shape, zero where Mitsuba draws no points."""
     try:
         shape.sample_position(0.0, mi.Point2f(0.5))
         area = shape.surface_area()
@@ -81,7 +81,7 @@ def _perturbs(bsdf: mi.BSDF) -> bool:
 
 
 def define() -> type:
-    """The class for the variant in force: its base class belongs to that variant."""
+    """Define the class for the current variant, to which its base class belongs."""
 
     class EyePaths(mi.SamplingIntegrator):
         """Mitsuba's `path` without the paths that are traced from the light (see `diffraction_path`)."""
@@ -160,10 +160,10 @@ def define() -> type:
 
 
 def carried(wavelengths: mi.Spectrum, throughput: mi.Spectrum) -> mi.Spectrum:
-    """Return wavelengths for the rest of a path: the strongest of them in the place of those that carry nothing more.
+    """Return wavelengths for the rest of a path: the strongest replaces those without throughput.
 
-    A grating sends the wavelengths different ways. At the next one a direction would be drawn for any of the four, and
-    three of four paths would end. What stands in the place of a wavelength without throughput adds nothing.
+    A grating diffracts the wavelengths into different directions. At the next one a direction would be drawn for any of
+    the four, and three of four paths would end. A replaced wavelength has no throughput and adds nothing.
     """
     strongest, most = wavelengths[0], throughput[0]
     for wavelength, power in zip(wavelengths, throughput, strict=True):

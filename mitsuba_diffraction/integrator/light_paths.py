@@ -1,4 +1,4 @@
-"""The paths that are traced from the light, what gratings throw onto other surfaces, and their splats on the film."""
+"""Paths from the light: light that gratings cast onto other surfaces, and its splats on the film."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ class Splats:
 
 
 class SplatBuffer:
-    """Where paths leave their contributions, as many as they have, from inside a recorded loop.
+    """A buffer for the contributions of paths, any number of each, from inside a recorded loop.
 
-    Threads fill it in any order; what comes out is sorted by path and vertex.
+    Threads fill it in any order; `content` is sorted by path and vertex.
 
     Attributes:
-        capacity: what is beyond is only counted.
+        capacity: contributions beyond it are only counted.
     """
 
     def __init__(self, capacity: int) -> None:
@@ -48,7 +48,7 @@ class SplatBuffer:
             dr.make_opaque(self._count)
 
     def add(self, splats: Splats, path: mi.UInt32, vertex: mi.UInt32, active: mi.Bool) -> None:
-        """Adds one contribution of a path at one of its vertices."""
+        """Add the contribution of a path at one of its vertices."""
         if not dr.is_jit_v(mi.Float):
             if active:
                 self._scalar.append(splats)
@@ -62,14 +62,14 @@ class SplatBuffer:
         dr.scatter(self._vertex, vertex, slot, active)
 
     def count(self) -> int:
-        """How many were added; runs what is recorded."""
+        """Return how many contributions were added; evaluates the recorded loop."""
         if not dr.is_jit_v(mi.Float):
             return len(self._scalar)
         dr.eval(self._count, self._columns, self._path, self._vertex)
         return int(self._count[0])
 
     def content(self) -> list[Splats]:
-        """All of them, if there are no more than `capacity`."""
+        """Return all contributions, if there are no more than `capacity`."""
         count = self.count()
         if not dr.is_jit_v(mi.Float) or count == 0:
             return self._scalar
@@ -111,11 +111,11 @@ class LightPaths:
         self.rr_depth = dr.opaque(mi.UInt32, rr_depth)
 
     def count(self, spp: int) -> int:
-        """How many paths are traced beside `spp` samples per pixel."""
+        """Return how many paths are traced for `spp` samples per pixel."""
         return max(1, round(_PATHS_PER_SAMPLE * spp * self.pixels))
 
     def splats(self, seed: mi.UInt32 | int, count: int) -> Iterator[Splats]:
-        """Traces `count` paths. What comes, and in which order, depends on the seed and the count alone."""
+        """Trace `count` paths. The contributions and their order depend on the seed and the count alone."""
         step = _PATHS_AT_ONCE if dr.is_jit_v(mi.Float) else 1
         capacity = min(step, count)
         for first in range(0, count, step):
@@ -130,7 +130,7 @@ class LightPaths:
 
     @dr.syntax
     def _trace(self, seed: mi.UInt32 | int, first: int, count: int, scale: float, buffer: SplatBuffer) -> None:
-        """Traces the paths from the number `first` on, and leaves in `buffer` what they give to the sensor."""
+        """Trace the paths from the number `first` on, and add their contributions to the sensor to `buffer`."""
         path = dr.arange(mi.UInt32, count) if dr.is_jit_v(mi.Float) else 0
         path += dr.opaque(mi.UInt32, first)
         rng = mi.PCG32()
@@ -165,7 +165,7 @@ class LightPaths:
 
     @dr.syntax
     def _start(self, rng: mi.PCG32) -> tuple[mi.Ray3f, mi.Spectrum, mi.Bool]:
-        """From a light to a grating: the ray that leaves there, its power, and whether there is one."""
+        """Sample a path from a light to a grating: the scattered ray, its power, and whether there is one."""
         time = mi.Float(self.sensor.shutter_open())
         if dr.hint(self.sensor.shutter_open_time() > 0, mode="scalar"):
             time += _next_1d(rng) * self.sensor.shutter_open_time()
@@ -213,7 +213,7 @@ class LightPaths:
     def _scatter(
         self, si: mi.SurfaceInteraction3f, bsdf: mi.BSDF, rng: mi.PCG32, active: mi.Bool
     ) -> tuple[mi.Ray3f, mi.Spectrum, mi.Float, mi.Bool]:
-        """The ray that goes on, T_{j+1}/T_j, the relative index passed, and whether it went on as from a mirror."""
+        """Sample the next ray; return it, T_{j+1}/T_j, the relative index passed, and whether it was specular."""
         ctx = mi.BSDFContext(mi.TransportMode.Importance)
         bs, weight = bsdf.sample(ctx, si, _next_1d(rng), _next_2d(rng), active)
         mirrored = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
@@ -229,7 +229,7 @@ class LightPaths:
     def _connect(
         self, si: mi.SurfaceInteraction3f, bsdf: mi.BSDF, lens: mi.Point2f, active: mi.Bool
     ) -> tuple[mi.Point2f, mi.Spectrum, mi.Bool]:
-        """Where the sensor sees the point, what a unit of power there gives to it, and whether it sees it."""
+        """Connect a point to the sensor: position on the film, importance per unit of power, visibility."""
         active = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         ds, importance = self.sensor.sample_direction(si, lens, active)
         active &= ds.pdf > 0
@@ -240,7 +240,7 @@ class LightPaths:
 
 
 def _from(si: mi.SurfaceInteraction3f, wi: mi.Vector3f) -> mi.SurfaceInteraction3f:
-    """The same point seen from elsewhere."""
+    """Return the same point seen from elsewhere."""
     seen = mi.SurfaceInteraction3f(si)
     seen.wi = wi
     return seen

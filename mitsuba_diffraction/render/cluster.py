@@ -32,7 +32,7 @@ SECONDS_TO_CONNECT = 30
 
 
 def trace_on(address: str) -> Tracer:
-    """A tracer for `render` that uses the workers of a Dask cluster.
+    """Return a tracer for `render` that uses the workers of a Dask cluster.
 
     All workers need the same versions, the scene and its files under the same path (a shared disk) and, for identical
     bits, the same kind of processor.
@@ -88,7 +88,7 @@ def trace_on(address: str) -> Tracer:
 
 @contextmanager
 def _errors_are_told_here() -> Iterator[None]:
-    """Dask's client logs what it raises, with its traceback."""
+    """Silence the log of Dask's client, which repeats what it raises, with its traceback."""
     logger = logging.getLogger("distributed.client")
     before = logger.level
     logger.setLevel(logging.CRITICAL + 1)
@@ -99,7 +99,7 @@ def _errors_are_told_here() -> Iterator[None]:
 
 
 async def _greet(address: str) -> None:
-    """Shakes hands with a scheduler; a client would wait for minutes on a port that accepts but stays silent."""
+    """Shake hands with a scheduler; a client would wait for minutes on a port that accepts but stays silent."""
     import distributed
 
     comm = await asyncio.wait_for(distributed.comm.connect(address), SECONDS_TO_CONNECT)
@@ -107,7 +107,7 @@ async def _greet(address: str) -> None:
 
 
 def _trace_there(job: Job, index: int) -> NDArray[np.float32]:
-    """One pass, on a worker."""
+    """Trace one pass on a worker."""
     import distributed
 
     if versions() != job.versions:

@@ -25,7 +25,7 @@ _SMALLEST = 0.1  # √R, of filters that remove a frequency altogether
 
 @dataclass(frozen=True, eq=False)
 class Guides:
-    """What the denoiser knows of a scene beside its picture, for the first sensor.
+    """Auxiliary pictures for the denoiser, for the first sensor.
 
     Attributes:
         albedo: float32 (rows, columns, 3), 0 to 1: of diffuse surfaces seen first, else one.
@@ -39,7 +39,7 @@ class Guides:
 
 
 def guides(scene: mi.Scene) -> Guides:
-    """The guides of a scene.
+    """Render the guides of a scene.
 
     Raises:
         ValueError: if the variant is a scalar one, or pyoidn is not installed.
@@ -74,7 +74,7 @@ def guides(scene: mi.Scene) -> Guides:
 
 
 def _response(kernel: mi.ReconstructionFilter, size: int) -> NDArray[np.float64]:
-    """√R at the frequencies of a discrete cosine transform of `size` numbers, one at f = 0; (size,)."""
+    """Return √R at the frequencies of a discrete cosine transform of `size` numbers, one at f = 0; (size,)."""
     shifts = np.arange(int(np.ceil(2 * kernel.radius())) + 1)
     x = np.arange(-kernel.radius(), kernel.radius(), 1 / _STEPS) + 0.5 / _STEPS
     h = np.array(kernel.eval(mi.Float(x)))
@@ -85,7 +85,7 @@ def _response(kernel: mi.ReconstructionFilter, size: int) -> NDArray[np.float64]
 
 
 def denoised(XYZ: NDArray[np.floating], guide: Guides) -> NDArray[np.float64]:
-    """A picture without its noise.
+    """Denoise a picture.
 
     Args:
         XYZ: (rows, columns, 3), of any scale.

@@ -27,12 +27,12 @@ Samples = Callable[["mi.UInt32", "mi.Bool"], tuple["mi.UInt32", "mi.UInt32"]]
 
 
 def pass_seed(seed: int, index: int) -> int:
-    """A 32-bit seed for one pass, independent of those of other passes and other `seed`s."""
+    """Return a 32-bit seed for one pass, independent of those of other passes and other `seed`s."""
     return int(np.random.SeedSequence((seed, index)).generate_state(1)[0])
 
 
 def trace_pass(scene: mi.Scene, spp: int, seed: int, integrator: mi.Integrator | None = None) -> NDArray[np.float32]:
-    """Traces the first sensor once and returns the sums that determine radiance.
+    """Trace the first sensor once and return the sums that determine radiance.
 
     With the filter f, the position p_s of sample s on the film, its radiance L_s(λ) at four wavelengths λ_sj (divided
     by their density) and the hats t_i of unit area around the wavelengths of the channels, a pixel at c holds
@@ -71,7 +71,7 @@ def trace_pass(scene: mi.Scene, spp: int, seed: int, integrator: mi.Integrator |
 
 
 def samples_drawn(scene: mi.Scene, spp: int) -> int:
-    """Samples per pixel that the scene's sampler takes for `spp`; some round up to a square or a power of two."""
+    """Return the samples per pixel that the sampler takes for `spp`; some round up to a square or a power of two."""
     sampler = scene.sensors()[0].sampler().clone()
     sampler.set_sample_count(spp)
     return sampler.sample_count()
@@ -128,7 +128,7 @@ def _trace(scene: mi.Scene, integrator: mi.SamplingIntegrator, spp: int, seed: i
 
 
 def _on_channels(film: mi.Film, wavelengths: mi.Spectrum, value: mi.Spectrum) -> tuple[list[mi.Float], list[mi.Float]]:
-    """Where the wavelengths lie among the channels, and what they add there; `value` as the sensor gives it."""
+    """Return positions of the wavelengths among the channels, and their contributions; `value` as of the sensor."""
     # It holds the response of the film, by whose density wavelengths are drawn.
     seen = dr.zeros(mi.SurfaceInteraction3f)
     seen.wavelengths = wavelengths
@@ -140,7 +140,7 @@ def _on_channels(film: mi.Film, wavelengths: mi.Spectrum, value: mi.Spectrum) ->
 
 
 def _add_light(sums: NDArray[np.float32], film: mi.Film, found: Iterable[Splats], spp: int) -> None:
-    """Adds what came by way of paths from the light, which have no weight of their own.
+    """Add the contribution of paths from the light, which have no weight of their own.
 
     They are sorted by pixel, those of a pixel in the order in which they were traced.
     """
@@ -168,13 +168,13 @@ def _add_light(sums: NDArray[np.float32], film: mi.Film, found: Iterable[Splats]
 
 
 def evenly(count: mi.UInt32) -> Samples:
-    """The samples of each pixel, if all have as many."""
+    """Return the index range of a pixel's samples, where all pixels have equally many."""
     return lambda pixel, active: (pixel * count, pixel * count + count)
 
 
 @dr.syntax
 def collect(rfilter, position, channel, value, size, border, samples, channels):
-    """Gathers the samples under the filter of each pixel, row by row, in one lane per pixel.
+    """Gather the samples under the filter of each pixel, row by row, in one lane per pixel.
 
     `channel` and `value` are lists; a fractional channel splits the value linearly between its two neighbours. The
     result holds as many channels as asked for and then the filter sum of each pixel. Samples also lie in the `border`.

@@ -1,4 +1,4 @@
-"""Path-trace a scene in passes, with the standard error of their sum and checkpoints of unfinished renderings.
+"""Path tracing in passes, with the standard error of their sum and checkpoints of unfinished renderings.
 
 A checkpoint is an uncompressed `.npz` file (noise does not compress) with the fields of `Accumulation` and the `digest`
 of the request (`passes.Job`). The comment of the archive is the SHA-256 of the file (`files.seal`). It takes 8 bytes
@@ -59,7 +59,7 @@ class Accumulation:
 
     @classmethod
     def empty(cls, rows: int, columns: int, wavelengths: NDArray[np.float64]) -> Accumulation:
-        """Zero passes."""
+        """Return the sums of zero passes."""
         return cls(
             wavelengths,
             np.zeros((rows, columns, wavelengths.size + 1)),
@@ -68,7 +68,7 @@ class Accumulation:
         )
 
     def add(self, traced: NDArray[np.float32], samples: int) -> None:
-        """Adds the result of `trace_pass` with that many samples per pixel."""
+        """Add the result of `trace_pass` with that many samples per pixel."""
         # einsum adds in a fixed order; a matrix product may be multithreaded.
         weights = spectrum_to_XYZ(np.eye(self.wavelengths.size), self.wavelengths)[:, 1].astype(np.float32)
         luminance = np.einsum("yxi,i->yx", traced[..., :-1], weights).astype(np.float64)
@@ -80,19 +80,19 @@ class Accumulation:
         self.samples += samples
 
     def radiance(self) -> NDArray[np.float32]:
-        """(height, width, n) float32, W m⁻² sr⁻¹ nm⁻¹."""
+        """Return the radiance, (height, width, n) float32, W m⁻² sr⁻¹ nm⁻¹."""
         # Row by row, to avoid a second copy of the sums of a large picture.
         return np.stack([ratio(row[:, :-1], row[:, -1:]).astype(np.float32) for row in self.sums])
 
     def error(self) -> float:
-        """The 90th percentile of the relative standard error of luminance over all non-black pixels.
+        """Return the 90th percentile of the relative standard error of luminance over all non-black pixels.
 
         With σ² the variance of the luminance of a sample, y_p has the variance σ²/n_p. An unbiased estimate of σ² is
 
             s² = (Σ_p n_p y_p² − (Σ_p n_p y_p)²/N) / (P − 1),
 
         and the relative error of a pixel is (s/√N) / (Σ_p n_p y_p/N). The mean square over all pixels is not useful
-        where a lamp is seen by way of two gratings: it is dominated by fireflies and does not fall for hours. With few
+        where a lamp is seen via two gratings: it is dominated by fireflies and does not fall for hours. With few
         passes the percentile is biased upwards by the variance of s².
 
         Returns:
@@ -107,17 +107,17 @@ class Accumulation:
 
 
 def ratio(sums: NDArray, weights: NDArray) -> NDArray:
-    """sums/weights, zero where the filter covers no sample."""
+    """Return sums/weights, zero where the filter covers no sample."""
     return np.divide(sums, weights, out=np.zeros_like(sums), where=weights != 0)
 
 
 def checkpoint_path(picture: Path) -> Path:
-    """The path of the checkpoint of a picture, next to it."""
+    """Return the path of the checkpoint of a picture, next to it."""
     return picture.with_name(f"{picture.name}.checkpoint")
 
 
 def save_checkpoint(path: str | os.PathLike[str], digest: str, sums: Accumulation) -> None:
-    """Writes a checkpoint atomically: after a kill or a power cut, `path` is either the old or the new one.
+    """Write a checkpoint atomically: after a kill or a power cut, `path` is either the old or the new one.
 
     Raises:
         OSError: if it cannot be written; the old one is kept.
@@ -131,7 +131,7 @@ def save_checkpoint(path: str | os.PathLike[str], digest: str, sums: Accumulatio
 
 
 def load_checkpoint(path: str | os.PathLike[str], digest: str) -> Accumulation | None:
-    """Reads a checkpoint.
+    """Read a checkpoint.
 
     Args:
         path: the file.
@@ -179,7 +179,7 @@ CHECKPOINT_SHARE = 20
 
 @dataclass(frozen=True)
 class Job:
-    """Everything that determines the bits of a picture, except for the processor. Sent to workers.
+    """Everything that determines the bits of a picture, except for the processor; sent to workers.
 
     Attributes:
         scene: absolute path of the XML file.
@@ -205,12 +205,12 @@ class Job:
     versions: tuple[str, ...]
 
     def digest(self) -> str:
-        """SHA-256 of everything but the path of the scene."""
+        """Return the SHA-256 of everything but the path of the scene."""
         told = {name: value for name, value in asdict(self).items() if name != "scene"}
         return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
 
     def load(self) -> mi.Scene:
-        """The scene; raises as `load_spectral_scene`."""
+        """Load the scene; errors as of `load_spectral_scene`."""
         return load_spectral_scene(
             self.scene, width=self.width, height=self.height, parameters=dict(self.parameters), motion=self.motion
         )
@@ -233,13 +233,13 @@ class Interrupted(KeyboardInterrupt):
 
 
 def trace_here(job: Job, scene: mi.Scene, first: int) -> Iterator[NDArray[np.float32]]:
-    """The passes of a job from `first` on, traced in this process; see `trace_pass`."""
+    """Trace the passes of a job from `first` on in this process; see `trace_pass`."""
     for index in range(first, len(job.samples)):
         yield trace_pass(scene, job.samples[index], pass_seed(job.seed, index))
 
 
 def versions() -> tuple[str, ...]:
-    """Versions of the packages that determine the result of a pass."""
+    """Return the versions of the packages that determine the result of a pass."""
     return tuple(f"{name} {metadata.version(name)}" for name in ("mitsuba", "drjit", "mitsuba_diffraction"))
 
 
@@ -259,7 +259,7 @@ def render(
     tracer: Tracer = trace_here,
     progress: Callable[[int, int, float], None] = lambda done, total, error: None,
 ) -> SpectralImage:
-    """Renders the first sensor of a scene spectrally, with its own integrator, in the current variant.
+    """Render the first sensor of a scene spectrally, with its own integrator, in the current variant.
 
     The samples are split into passes with independent seeds, which are added in float64 in the order of their indices.
     The same seed therefore gives the same bits (within the limits of `trace_pass`), whether the rendering was
@@ -347,7 +347,7 @@ def render(
 
 
 def split(scene: mi.Scene, spp: int, least: int = 1) -> tuple[int, ...]:
-    """Samples per pixel of each pass; at least `least` passes, if there are enough samples.
+    """Return the samples per pixel of each pass; at least `least` passes, if there are enough samples.
 
     Determined by the request alone, so that an interruption does not change the passes.
     """
@@ -361,7 +361,7 @@ def split(scene: mi.Scene, spp: int, least: int = 1) -> tuple[int, ...]:
 
 
 def _judge(sums: Accumulation, job: Job, progress: Callable[[int, int, float], None]) -> bool:
-    """Reports progress and returns whether the picture is complete."""
+    """Report progress and return whether the picture is complete."""
     error = sums.error() if sums.passes >= _PASSES_TO_JUDGE else math.nan
     expected = total = sum(job.samples)
     if job.until_error is not None and not math.isnan(error):
@@ -381,7 +381,7 @@ def _save(checkpoint: str | os.PathLike[str], job: Job, sums: Accumulation, save
 
 @contextmanager
 def _deferred_interrupt() -> Iterator[Callable[[], bool]]:
-    """Yields a function that returns whether Ctrl-C was pressed; a second one interrupts at once.
+    """Yield a function that returns whether Ctrl-C was pressed; a second one interrupts at once.
 
     An exception between two statements could make the sums inconsistent with their count. Python handles signals in the
     main thread only. Ctrl-C stays ignored where it is, as in background jobs of a script.

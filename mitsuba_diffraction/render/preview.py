@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 def save_preview(
     image: SpectralImage, path: str | os.PathLike[str], exposure: float | None = None, guides: Guides | None = None
 ) -> float:
-    """Writes an 8-bit sRGB preview of a spectral image, in the format given by the suffix of `path`.
+    """Write an 8-bit sRGB preview of a spectral image, in the format given by the suffix of `path`.
 
     Spectra → XYZ → linear sRGB → `into_gamut` → × exposure → `roll_off` → sRGB's transfer function.
 

@@ -1,4 +1,4 @@
-"""Loads a Mitsuba scene with a spectral film."""
+"""Loading of Mitsuba scenes with a spectral film."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ _DEFAULT_SIZE = (768, 576)  # that of Mitsuba's films
 
 
 def channel_wavelengths() -> NDArray[np.float64]:
-    """Centres of the channels of the film, (n,), nm; their hats lie inside the range of Mitsuba's spectra."""
+    """Return the centres of the film's channels, (n,), nm; their hats lie inside the range of Mitsuba's spectra."""
     return np.arange(VISIBLE[0] + _STEP, VISIBLE[1] - _STEP / 2, _STEP)
 
 
 def channel_weights() -> NDArray[np.float64]:
-    """Area of the response of each channel, (n,); the recorded value divided by it is radiance.
+    """Return the area of the response of each channel, (n,); the recorded value divided by it is radiance.
 
     Mitsuba samples wavelengths in proportion to the sum of the responses of the film. Hats of unit area would spend
     half of the samples where the eye is insensitive; these weights follow the density of Mitsuba's RGB film,
@@ -59,7 +59,7 @@ def load_spectral_scene(
     parameters: Mapping[str, str] | None = None,
     motion: tuple[float, ...] | None = None,
 ) -> mi.Scene:
-    """Loads an XML scene in the current variant and replaces its film by a spectral one.
+    """Load an XML scene in the current variant and replace its film by a spectral one.
 
     The film becomes a `specfilm` of float32 whose channels are hat functions at `channel_wavelengths()` with areas of
     `channel_weights()`: divided by these, a channel is spectral radiance per nm, averaged over the hat. Size, crop and
@@ -153,7 +153,7 @@ def _emission(emitter: mi.Emitter) -> NDArray[np.float64]:
 
 
 def named_sample_count(path: str | os.PathLike[str], parameters: Mapping[str, str] | None = None) -> int | None:
-    """The sample_count of the sampler of the first sensor in a scene, None if unspecified.
+    """Return the sample_count of the sampler of a scene's first sensor, None if unspecified.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -177,7 +177,7 @@ def emitters_of(path: str | os.PathLike[str], parameters: Mapping[str, str] | No
 
 
 def scene_digest(path: str | os.PathLike[str], parameters: Mapping[str, str] | None = None) -> str:
-    """SHA-256 of a valid scene: its XML after substitution of the parameters, and the files it references.
+    """Return the SHA-256 of a valid scene: its XML after substitution of parameters, and the files it references.
 
     Files enter by content, not by path; a recipe includes the scan it references.
 
@@ -203,7 +203,7 @@ def scene_digest(path: str | os.PathLike[str], parameters: Mapping[str, str] | N
 
 
 def _in_full(value: object) -> str:
-    """A property as text without loss; Mitsuba's own abbreviates spectra and rounds."""
+    """Format a property as text without loss; Mitsuba's own abbreviates spectra and rounds."""
     if dr.is_array_v(value):
         return str(list(value))
     if hasattr(value, "wavelengths"):
@@ -215,7 +215,7 @@ def _in_full(value: object) -> str:
 def _parsed(
     path: str | os.PathLike[str], parameters: Mapping[str, str] | None
 ) -> Iterator[tuple[mi.parser.ParserConfig, mi.parser.ParserState]]:
-    """A scene as it is parsed; in the block, Mitsuba searches the folder of the scene first.
+    """Parse a scene; in the block, Mitsuba searches the folder of the scene first.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -265,7 +265,7 @@ def _move_first_sensor(state: mi.parser.ParserState, motion: tuple[float, ...]) 
 
 
 def _replace_films(state: mi.parser.ParserState, width: int | None, height: int | None) -> None:
-    """Replaces all films by spectral ones, and adds one to sensors without a film."""
+    """Replace all films by spectral ones, and add one to sensors without a film."""
     kinds = [node.type for node in state.nodes]
     if mi.ObjectType.Sensor not in kinds:
         raise RequestError("the scene has no sensor")
@@ -281,12 +281,12 @@ def _replace_films(state: mi.parser.ParserState, width: int | None, height: int 
 
 
 def _children(props: mi.Properties) -> dict[str, int]:
-    """Name → index in the parser's list of the children of a node."""
+    """Return name → index in the parser's list of the children of a node."""
     return {name: value.index() for name, value in props.items() if isinstance(value, mi.Properties.ResolvedReference)}
 
 
 def _add(state: mi.parser.ParserState, kind: mi.ObjectType, props: mi.Properties) -> mi.Properties.ResolvedReference:
-    """Appends a node and returns a reference to it for its parent."""
+    """Append a node and return a reference to it for its parent."""
     node = mi.parser.SceneNode()
     node.type = kind
     node.props = props
@@ -304,7 +304,7 @@ def _whole(film: mi.Properties, name: str, default: int) -> int:
 def _spectral_film(
     state: mi.parser.ParserState, old: mi.Properties, width: int | None, height: int | None
 ) -> mi.Properties:
-    """The properties of a spectral film with the crop window of `old`."""
+    """Return the properties of a spectral film with the crop window of `old`."""
     old_size = tuple(_whole(old, name, size) for name, size in zip(("width", "height"), _DEFAULT_SIZE, strict=True))
     if width is None:
         width = old_size[0] if height is None else max(1, round(height * old_size[0] / old_size[1]))
@@ -342,7 +342,7 @@ def _spectral_film(
 
 
 def _what_there_is(scene: Path, error: str) -> str:
-    """For a missing include, the available ones; for an unknown parameter, those of the scene."""
+    """Return what is available in place of a missing include or an unknown parameter, to end a message."""
     if (missing := re.search(r'included file "(.+?)" not found', error)) is not None:
         folder = scene.resolve().parent / Path(missing[1]).parent
         there = sorted(path.stem for path in folder.glob("*.xml"))

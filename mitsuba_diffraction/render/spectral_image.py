@@ -74,7 +74,7 @@ class SpectralImage:
         object.__setattr__(self, "attributes", dict(self.attributes))
 
     def save(self, path: str | os.PathLike[str], *, half: bool = False) -> None:
-        """Writes an OpenEXR file (ZIP) in the spectral layout of Fichet, Pacanowski and Wilkie 2021.
+        """Write an OpenEXR file (ZIP) in the spectral layout of Fichet, Pacanowski and Wilkie 2021.
 
         Channels `S0.405,000000nm` hold the radiance; R, G and B are linear sRGB (scaled as in `color`) for ordinary
         viewers.
@@ -113,7 +113,7 @@ class SpectralImage:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> SpectralImage:
-        """Reads a file written by `save`.
+        """Read a file written by `save`.
 
         Raises:
             FileNotFoundError: if there is no such file.

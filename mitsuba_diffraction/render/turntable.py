@@ -23,7 +23,7 @@ MOST_FRAMES = 3600  # a tenth of a degree apart, five minutes
 def orbit(
     scene_path: str | os.PathLike[str], frames: int, parameters: Mapping[str, str] | None = None
 ) -> list[tuple[float, ...]]:
-    """The motions of the first camera for one orbit, counterclockwise as seen from above.
+    """Return the motions of the first camera for one orbit, counterclockwise as seen from above.
 
     Frame k rotates it by 360° k/`frames` about the coordinate axis closest to its up vector, through the point on its
     line of sight that is closest to the centre of the scene's bounding box.
@@ -54,7 +54,7 @@ def orbit(
 
 
 def _view(scene: mi.Scene) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The point the first camera looks at, and the coordinate axis closest to its up vector."""
+    """Return the point the first camera looks at, and the coordinate axis closest to its up vector."""
     to_world = np.array(scene.sensors()[0].world_transform().matrix, np.float64).reshape(4, 4)
     origin, forward, own_up = to_world[:3, 3], to_world[:3, 2] / np.linalg.norm(to_world[:3, 2]), to_world[:3, 1]
     middle = np.ravel(np.array(scene.bbox().center(), np.float64))
@@ -65,13 +65,13 @@ def _view(scene: mi.Scene) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def frame_path(picture: Path, frame: int, frames: int) -> Path:
-    """`picture.exr` → `picture_007.exr`."""
+    """Return the path of a frame: `picture.exr` → `picture_007.exr`."""
     digits = max(3, len(str(frames - 1)))
     return picture.with_name(f"{picture.stem}_{frame:0{digits}d}{picture.suffix}")
 
 
 def save_animation(previews: Iterable[Path], path: str | os.PathLike[str]) -> None:
-    """Joins pictures of equal size into a looping animated WebP at twelve frames per second."""
+    """Join pictures of equal size into a looping animated WebP at twelve frames per second."""
     from PIL import Image
 
     first, *others = (Image.open(preview).convert("RGB") for preview in previews)

@@ -24,7 +24,7 @@ _silencing = threading.Lock()
 
 @contextlib.contextmanager
 def silence() -> Iterator[None]:
-    """Keep the library from giving its own account of a broken file, from Python and from C, before it raises."""
+    """Silence the library's own messages about a broken file, from Python and from C."""
     with _silencing:
         sys.stderr.flush()
         kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
@@ -39,7 +39,7 @@ def silence() -> Iterator[None]:
 
 
 def doubles(*values: float) -> np.ndarray:
-    """Numbers for a header: a Python float would be written in single precision."""
+    """Return numbers for a header in double precision: a Python float would be written in single precision."""
     return np.array(values, np.float64)
 
 
@@ -51,7 +51,7 @@ def write(
     channels: Mapping[str, np.ndarray],
     recipe: str,
 ) -> None:
-    """Write a spectrum of the format `kind`, whole or not at all; `recipe` is the digest of that of which it was built.
+    """Write a spectrum of the format `kind` atomically; `recipe` is the digest of its recipe.
 
     Raises:
         OSError: if the file cannot be written.
@@ -73,7 +73,7 @@ def write(
 
 
 def read(path: Path, kind: str, version: int, recipe: str | None) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Header and channels of what `write` wrote.
+    """Read header and channels of a file that `write` wrote.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -107,5 +107,5 @@ def read(path: Path, kind: str, version: int, recipe: str | None) -> tuple[dict[
 
 
 def one_line(error: Exception) -> str:
-    """What an exception says."""
+    """Return the message of an exception as one line."""
     return " ".join(str(error).split())

@@ -1,12 +1,12 @@
 """The precomputed power spectrum S(q; κ) of the phase e^{iκh} of a surface, and its file.
 
-A grating spectrum as an OpenEXR file: float32, ZIP, one part, one pixel per diffraction order or node.
+The file is OpenEXR: float32, ZIP, one part, one pixel per diffraction order or node.
 
 Channels are named after what they hold. Series: `B{t^003}` (taylor), `B{T_003}` (chebyshev), `B{mode 003}` (svd), the
 terms B_n of S = Σ g_n(κ) B_n; "slices": `S(012.2)`, the coefficient of t² on interval 12 of κ. Rows
 are orders m_y, columns m_x, from −M to M. Numbers in the header are double precision. `energy` is JSON: the table of
-`energy/table.py`. `contentSha256` covers every byte of the file, so that a damaged one is
-known as such.
+`energy/table.py`. `contentSha256` covers every byte of the file and
+reveals damage.
 """
 
 from __future__ import annotations
@@ -48,17 +48,17 @@ class GratingSpectrum:
         extent: "tile": the patch repeats for ever; "sample": it is a piece of a larger, irregular surface.
         pixel_size: (x, y) of the height field, µm.
         height_range: of the height field, µm.
-        coherence_length: L_c in µm; it sets the width σ_q of each order. Of a sample: what the scan carries.
+        coherence_length: L_c in µm; it sets the width σ_q of each order. Of a sample: at most what the scan supports.
         wavelengths: (shortest, longest) in nm for which the table holds.
-        tolerance: the bound that was asked for.
-        error: what was measured: max over κ of ∫|S_approx − S_exact| dq over the frequencies that light can reach.
-        source: where the heights came from.
+        tolerance: the requested bound.
+        error: the measured one: max over κ of ∫|S_approx − S_exact| dq over the frequencies that light can reach.
+        source: origin of the heights.
         source_digest: SHA-256 of the height field.
         largest_angle: in degrees from the normal, of both directions, for which the table holds.
         dropped: the largest share of the power, over κ, in weak frequencies that were not kept; part of `error`.
         beyond: the largest share of the power, over κ, at frequencies that no pair of directions reaches, or that the
             pixels do not resolve.
-        patches: of how many draws of an irregular surface it is the mean.
+        patches: number of draws of an irregular surface that are averaged.
         scatter: of a sample, its `standard_error`; None of a tile.
         energy: the table that bounds the albedo, if it came with the file; else `energy_table` makes it.
     """
@@ -106,7 +106,7 @@ class GratingSpectrum:
 
     @property
     def representation(self) -> str:
-        """How the powers are stored: "taylor", "chebyshev", "svd" or "slices"."""
+        """The storage of the powers: "taylor", "chebyshev", "svd" or "slices"."""
         return self.table.representation
 
     @property
@@ -136,12 +136,12 @@ class GratingSpectrum:
 
     @property
     def reach(self) -> float:
-        """How far the lobe of an order is followed along each axis at least, in standard deviations σ_q."""
+        """The least truncation of the lobes of orders, in standard deviations σ_q."""
         return lobe_reach(TAIL_SHARE * self.tolerance)
 
     @property
     def lobes(self) -> tuple[LobeAxis, LobeAxis]:
-        """Where the lobes of the orders end along x and y.
+        """The truncation of the orders' lobes along x and y.
 
         Raises:
             RequestError: of a lattice of splines.
@@ -152,12 +152,12 @@ class GratingSpectrum:
 
     @property
     def neighbours(self) -> tuple[int, int]:
-        """How many nodes along x and y contribute at one q, to the tolerance."""
+        """The number of nodes along x and y that contribute at one q, to the tolerance."""
         return (self.lobes[0].count, self.lobes[1].count) if isinstance(self.grid, OrderGrid) else (3, 3)
 
     @property
     def words_per_evaluation(self) -> int:
-        """How many words of 32 bits of the table one evaluation of S reads."""
+        """The number of 32-bit words of the table that one evaluation of S reads."""
         return self.neighbours[0] * self.neighbours[1] * self.table.words_per_node
 
     @property
@@ -166,7 +166,7 @@ class GratingSpectrum:
         return self.table.nbytes / 1e6
 
     def powers(self, kappa: float) -> NDArray[np.float32]:
-        """The share of the reflected power of each node, (2 M_y + 1, 2 M_x + 1), in float32 as a renderer computes it.
+        """Return the share of the reflected power of each node, (2 M_y + 1, 2 M_x + 1), in float32 as a renderer does.
 
         Of orders, η_m(κ). Shares may be below zero: by the error, and as coefficients of splines.
 
@@ -176,7 +176,7 @@ class GratingSpectrum:
         return self.table.powers(float(self._checked(np.asarray(kappa, np.float64))))
 
     def evaluate(self, q: ArrayLike, kappa: ArrayLike) -> NDArray[np.float64]:
-        """S(q; κ) from the table.
+        """Evaluate S(q; κ) from the table.
 
         Args:
             q: (..., 2) cycles/µm, along x and y.
@@ -207,7 +207,7 @@ class GratingSpectrum:
         return kappa
 
     def energy_table(self) -> EnergyTable:
-        """Return what bounds the albedo by one; made at the first call unless it came with the file."""
+        """Return the table of E, which bounds the albedo by one; made at the first call unless the file has it."""
         with _computing:
             return self._energy
 
@@ -217,7 +217,7 @@ class GratingSpectrum:
 
     @cached_property
     def digest(self) -> str:
-        """SHA-256 of what a renderer needs of it: spectra that have one show the same."""
+        """SHA-256 of everything that a renderer needs: spectra of equal digest render alike."""
         content = hashlib.sha256()
         for f in fields(self):
             if f.name not in ("table", "energy", "source", "source_digest"):
@@ -227,7 +227,7 @@ class GratingSpectrum:
         return content.hexdigest()
 
     def save(self, path: str | os.PathLike[str], recipe: str = "") -> None:
-        """Write the spectrum as an OpenEXR file, whole or not at all; `recipe` is the digest of its `Recipe`.
+        """Write the spectrum as an OpenEXR file, atomically; `recipe` is the digest of its `Recipe`.
 
         Raises:
             OSError: if the file cannot be written.
@@ -247,7 +247,7 @@ class GratingSpectrum:
 
 
 def check_wavelengths(wavelengths: tuple[float, float]) -> None:
-    """Raises ValueError unless `wavelengths` is (shortest, longest) in nm."""
+    """Raise ValueError unless `wavelengths` is (shortest, longest) in nm."""
     try:
         shortest, longest = (float(w) for w in wavelengths)
     except (TypeError, ValueError):
@@ -257,7 +257,7 @@ def check_wavelengths(wavelengths: tuple[float, float]) -> None:
 
 
 def check_angle(largest_angle: float) -> None:
-    """Raises ValueError unless `largest_angle` is an angle from the normal in degrees."""
+    """Raise ValueError unless `largest_angle` is an angle from the normal in degrees."""
     if not 0 < largest_angle <= 90:
         raise RequestError(f"largest_angle: got {largest_angle!r}, wanted degrees from the normal, above 0, at most 90")
 
@@ -268,7 +268,7 @@ FORMAT_VERSION = 6
 
 
 def save(spectrum: GratingSpectrum, path: str | os.PathLike[str], recipe: str = "") -> None:
-    """Write `spectrum` to `path`, whole or not at all; `recipe` is the digest of that from which it was built.
+    """Write `spectrum` to `path` atomically; `recipe` is the digest of its `Recipe`.
 
     Raises:
         OSError: if the file cannot be written.
@@ -302,7 +302,7 @@ def save(spectrum: GratingSpectrum, path: str | os.PathLike[str], recipe: str = 
 
 
 def load(path: str | os.PathLike[str], construct: Callable[..., Spectrum], recipe: str | None = None) -> Spectrum:
-    """Hand what `save` wrote to the constructor of a `GratingSpectrum`; errors as in `GratingSpectrum.load`."""
+    """Read what `save` wrote and build a `GratingSpectrum` from it; errors as in `GratingSpectrum.load`."""
     path = Path(path)
     header, channels = read(path, FORMAT, FORMAT_VERSION, recipe)
     if header.get("representation") not in _REPRESENTATIONS:

@@ -14,11 +14,11 @@ from ..errors import RequestError
 
 @dataclass(frozen=True)
 class LobeAxis:
-    """How the lobe of an order is truncated along one axis.
+    """Truncation of an order's lobe along one axis.
 
     Attributes:
-        count: how many lobes overlap at one q.
-        half_width: |q − m/T| up to which the order m holds, cycles/µm; infinite where all orders hold everywhere.
+        count: number of lobes that contribute at one q.
+        half_width: |q − m/T| up to which the order m contributes, cycles/µm; infinite if all contribute everywhere.
         inside: the share of the Gaussian within `half_width`, by which it is divided.
     """
 
@@ -47,7 +47,7 @@ class OrderGrid:
 
     @classmethod
     def reachable(cls, tile_size: tuple[float, float], pixels: tuple[int, int], largest_frequency: float) -> OrderGrid:
-        """The orders up to `largest_frequency` (cycles/µm), as far as the pixels resolve them.
+        """Return the orders up to `largest_frequency` (cycles/µm), as far as the pixels resolve them.
 
         Args:
             tile_size: (T_x, T_y) in µm.
@@ -69,16 +69,16 @@ class OrderGrid:
         return f"{x:.4g} × {y:.4g} µm, {self.shape[1]} × {self.shape[0]} orders"
 
     def axes(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """m_x of the columns and m_y of the rows."""
+        """Return m_x of the columns and m_y of the rows."""
         m_x, m_y = self.largest
         return np.arange(-m_x, m_x + 1), np.arange(-m_y, m_y + 1)
 
     def frequencies(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """q_x of the columns and q_y of the rows, cycles/µm."""
+        """Return q_x of the columns and q_y of the rows, cycles/µm."""
         return tuple(m / size for m, size in zip(self.axes(), self.tile_size, strict=True))
 
     def take(self, powers: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The kept orders out of the powers of all.
+        """Select the kept orders from the powers of all.
 
         Args:
             powers: (N_y, N_x), in the order of `scipy.fft.fft2`.
@@ -96,7 +96,7 @@ class OrderGrid:
     def around(
         self, q: NDArray[np.float64], lobe_width: float, reach: float
     ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]]:
-        """The orders whose lobes hold q (..., 2): row, column and N(q − m/T; σ_q² I), one neighbour at a time.
+        """Yield the orders whose lobes hold q (..., 2): row, column and N(q − m/T; σ_q² I), one neighbour at a time.
 
         The lobe is cut off as `lobes` says and scaled to the integral one; it is 0 beyond, and beyond the grid.
         """
@@ -114,10 +114,10 @@ class OrderGrid:
             yield row, column, np.where(kept, peak * np.exp(-(offset**2).sum(axis=-1) / (2 * lobe_width**2)), 0)
 
     def lobes(self, lobe_width: float, reach: float) -> tuple[LobeAxis, LobeAxis]:
-        """Where lobes of the width σ_q (cycles/µm) end along x and y: at `reach`·σ_q or further.
+        """Return the truncation of lobes of width σ_q (cycles/µm) along x and y: at `reach`·σ_q or further.
 
-        Orders that stand apart end there. Where several hold at one q, it is always the same number of them, the
-        nearest: each ends at so many half spacings. Where more would hold than there are, none ends.
+        Separate lobes are truncated there. Where lobes overlap, the same number of them, the nearest, contributes at
+        every q: each is truncated at that many half spacings. If more overlap than there are orders, none is truncated.
         """
         result = []
         for size, largest in zip(self.tile_size, self.largest, strict=True):

@@ -19,7 +19,7 @@ _CHECKED = (0.137, 0.618, 0.983)
 
 
 class MeanPowers(TilePowers):
-    """(1/P) Σ_p η_m(κ) of P patches that each repeat for ever: what a pixel sees, which covers thousands of them.
+    """(1/P) Σ_p η_m(κ) of P patches that each repeat: the mean over the many patches that a pixel covers.
 
     Powers are band-limited in κ by the height range, so that their values at Chebyshev nodes give them everywhere
     (Jacobi–Anger); transforming every patch anew for every κ would take ten times as long. The transforms at the nodes
@@ -36,7 +36,7 @@ class MeanPowers(TilePowers):
         tolerance: float,
         progress: Progress,
     ) -> None:
-        """Takes patches of one size; reach and radius as `TilePowers`; the largest κ in rad/µm; and the tolerance.
+        """Take patches of one size; reach and radius as `TilePowers`; the largest κ in rad/µm; and the tolerance.
 
         `progress` is called with the patches done and in all.
         """
@@ -62,13 +62,13 @@ class MeanPowers(TilePowers):
         )
 
     def __call__(self, kappa: float) -> NDArray[np.float64]:
-        """The mean of η_m(κ), (rows, columns); κ in rad/µm."""
+        """Compute the mean of η_m(κ), (rows, columns); κ in rad/µm."""
         values = chebyshev_polynomials(position(np.array([kappa]), self._largest_kappa), self._nodes)
         return (values @ self._coefficients).reshape(self.grid.shape)
 
 
 def _powers(heights: NDArray[np.float32], kappa: float) -> NDArray[np.float32]:
-    """η_m(κ) of all orders in single precision, (N_y, N_x), as in `scipy.fft.fftfreq`."""
+    """Compute η_m(κ) of all orders in single precision, (N_y, N_x), as in `scipy.fft.fftfreq`."""
     phase = np.float32(kappa) * heights
     wave = np.empty(heights.shape, np.complex64)
     wave.real, wave.imag = np.cos(phase), np.sin(phase)
@@ -77,7 +77,7 @@ def _powers(heights: NDArray[np.float32], kappa: float) -> NDArray[np.float32]:
 
 
 def check_patches(height_fields: Sequence[HeightField], extent: str) -> None:
-    """Raises RequestError unless there is one patch, or several of one size that repeat."""
+    """Raise RequestError unless there is one patch, or several of one size that repeat."""
     if not height_fields:
         raise RequestError("patches: got none, wanted at least one")
     if len(height_fields) > 1 and extent != "tile":

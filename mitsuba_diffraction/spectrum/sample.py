@@ -49,7 +49,7 @@ UNIFORM = WindowAxis(np.ones(1), np.zeros(1, np.int64))
 
 
 def carried_coherence_length(height_field: HeightField, asked: float) -> float:
-    """The coherence length in µm that a scan supports: `asked`, but at most half of its shorter side.
+    """Return the coherence length in µm that a scan supports: `asked`, but at most half of its shorter side.
 
     An axis of one pixel imposes no limit: the surface is uniform along it.
 
@@ -69,7 +69,7 @@ def carried_coherence_length(height_field: HeightField, asked: float) -> float:
 
 
 def window_axes(height_field: HeightField, coherence_length: float) -> tuple[WindowAxis | None, WindowAxis | None]:
-    """The windows along x and y for a coherence length (µm) that the scan supports; None for an axis of one pixel.
+    """Return the windows along x and y for a coherence length (µm) that the scan supports; None for a one-pixel axis.
 
     a(x) = exp(−x²/2σ_s²) with σ_s = L_c/4, about the centre of its support, 6σ_s rounded up to whole pixels. The
     positions are evenly spaced from edge to edge of the scan, at most σ_s apart, rounded to whole pixels.
@@ -84,7 +84,7 @@ def window_axes(height_field: HeightField, coherence_length: float) -> tuple[Win
 def mean_periodogram(
     wave: NDArray[np.complex128], x: WindowAxis, y: WindowAxis, shape: tuple[int, int]
 ) -> NDArray[np.float64]:
-    """(1/P) Σ_p |Σ_n a(x_n − x_p) wave_n e^{−2πi q·x_n}|² over all positions of the windows along x and y.
+    """Compute (1/P) Σ_p |Σ_n a(x_n − x_p) wave_n e^{−2πi q·x_n}|² over all positions of the windows along x and y.
 
     Args:
         wave: (rows, columns) at the pixels.
@@ -113,7 +113,7 @@ def _axis(count: int, pixel: float, sigma: float) -> WindowAxis:
 
 
 def _rounded_up(value: float) -> int:
-    """The ceiling, tolerant of rounding errors just above an integer."""
+    """Return the ceiling, tolerant of rounding errors just above an integer."""
     return int(np.ceil(value * (1 - 1e-9)))
 
 
@@ -156,11 +156,11 @@ class SamplePowers:
     come from one transform of it, and S itself can be had at any other lattice exactly, which measures their error.
 
     Attributes:
-        grid: all nodes whose splines hold where light reaches and the pixels resolve.
+        grid: all nodes whose splines overlap the frequencies that light reaches and the pixels resolve.
     """
 
     def __init__(self, height_field: HeightField, coherence_length: float, spacing: float, reach: float) -> None:
-        """Takes the scan, the coherence length it carries (µm), and the spacing and reach of the nodes (cycles/µm)."""
+        """Take the scan, its effective coherence length (µm), and the spacing and reach of the nodes (cycles/µm)."""
         self._phase = height_field.centred
         self._lags = [
             _Lags(axis, pixel, coherence_length, spacing, reach)
@@ -172,7 +172,7 @@ class SamplePowers:
         self._random = np.random.default_rng(0)
 
     def _autocorrelation(self, kappa: float) -> NDArray[np.complex128]:
-        """ρ(τ) of the windowed phase, averaged over the places: (lags τ_y, lags τ_x ≥ 0); ρ(0) = 1."""
+        """Compute ρ(τ) of the windowed phase, averaged over the places: (lags τ_y, lags τ_x ≥ 0); ρ(0) = 1."""
         axis_x, axis_y = (lags.axis or UNIFORM for lags in self._lags)
         width, height = len(axis_x.window), len(axis_y.window)
         # Padded with zeros, so that the lags do not wrap around.
@@ -189,7 +189,7 @@ class SamplePowers:
         return half
 
     def _transform(self, half: NDArray[np.complex128]) -> NDArray[np.float64]:
-        """From lags to the nodes of the grid, times the area of a cell: shares of the power."""
+        """Transform from lags to the nodes of the grid, times the area of a cell: shares of the power."""
         x, y = self._lags
         padded = np.zeros((y.count, x.count // 2 + 1), np.complex128)
         padded[y.lags % y.count, : half.shape[1]] = half
@@ -198,16 +198,16 @@ class SamplePowers:
         return full[np.ix_(m_y % y.count, m_x % x.count)]
 
     def __call__(self, kappa: float) -> NDArray[np.float64]:
-        """c_m(κ), (rows, columns), with Σ c = 1 over all frequencies; κ in rad/µm."""
+        """Compute c_m(κ), (rows, columns), with Σ c = 1 over all frequencies; κ in rad/µm."""
         x, y = self._lags
         return self._transform(self._autocorrelation(kappa) * y.projection[:, None] * x.projection[x.lags >= 0])
 
     def reached(self, powers: NDArray[np.float64]) -> float:
-        """The share of the power where light reaches and the pixels resolve; takes c_m of the grid."""
+        """Return the share of the power at frequencies that light reaches and pixels resolve; takes c_m of the grid."""
         return self.grid.within(powers, self._reached)
 
     def error(self, kept: OrderGrid | SplineGrid, powers: NDArray[np.float32], kappa: float) -> float:
-        """∫|S_approx − S_exact| dq where light reaches, by the rule of rectangles on a shifted lattice.
+        """Compute ∫|S_approx − S_exact| dq where light reaches, by the rectangle rule on a shifted lattice.
 
         Args:
             kept: the smaller grid of the approximation.
@@ -226,7 +226,7 @@ _KAPPAS = 4
 
 
 def standard_error(height_field: HeightField, *, coherence_length: float, largest_kappa: float, reach: float) -> float:
-    """∫ of the standard error of S(q; κ) over q, at the worst of four κ: a share of the reflected power.
+    """Return ∫ of the standard error of S(q; κ) over q, at the worst of four κ: a share of the reflected power.
 
     Welch's estimate Ŝ is the mean of P periodograms S_p. Those of overlapping windows are correlated; where the
     phase is that of many independent features (Welch 1967, eq. 10 and 11; a is the window, Σ a² = 1),
@@ -243,7 +243,7 @@ def standard_error(height_field: HeightField, *, coherence_length: float, larges
 
     Args:
         height_field: the scan.
-        coherence_length: in µm, that the scan carries.
+        coherence_length: in µm, supported by the scan.
         largest_kappa: κ up to which S is wanted, rad/µm.
         reach: largest |q_x| and |q_y| that light reaches, cycles/µm.
     """
@@ -268,7 +268,7 @@ def standard_error(height_field: HeightField, *, coherence_length: float, larges
 
 
 def _correlation(axis: WindowAxis) -> NDArray[np.float64]:
-    """ρ of the places along one axis, (P, P)."""
+    """Compute ρ of the places along one axis, (P, P)."""
     width = len(axis.window)
     overlap = np.correlate(axis.window, axis.window, "full")[width - 1 :]
     apart = np.abs(axis.starts[:, None] - axis.starts)
@@ -281,7 +281,7 @@ def _batches(axis: WindowAxis) -> list[NDArray[np.int64]]:
 
 
 def _scatter(wave: NDArray[np.complex128], axes: list[WindowAxis]) -> NDArray[np.float64]:
-    """⟨(S_b − Ŝ)²⟩ on the frequencies of the window's own transform, shares of the power: (W_y, W_x)."""
+    """Compute ⟨(S_b − Ŝ)²⟩ at the frequencies of the window's own transform, shares of the power: (W_y, W_x)."""
     x, y = axes
     shape = len(y.window), len(x.window)
     means, weights = [], []

@@ -48,13 +48,13 @@ class SplineGrid:
         return f"{self.shape[1]} × {self.shape[0]} frequencies, {x:.3g} × {y:.3g} cycles/µm apart"
 
     def frequencies(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """q_x of the columns and q_y of the rows, cycles/µm."""
+        """Return q_x of the columns and q_y of the rows, cycles/µm."""
         return tuple(np.arange(-m, m + 1) * d for m, d in zip(self.largest, self.spacing, strict=True))
 
     def around(
         self, q: NDArray[np.float64]
     ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]]:
-        """The nodes about q (..., 2): row, column and weight, one of nine at a time; weight 0 beyond grid or limit."""
+        """Yield the nodes about q (..., 2): row, column and weight, one of nine at a time; weight 0 beyond the grid."""
         place = q / np.array(self.spacing)
         nearest = np.rint(place).astype(np.int64)
         weights = spline_weights(place - nearest)
@@ -68,7 +68,7 @@ class SplineGrid:
             yield row, column, np.where(kept, weights[i][..., 0] * weights[j][..., 1] / area, 0)
 
     def within(self, coefficients: NDArray[np.float64], reached: tuple[float, float]) -> float:
-        """∫ Σ c B B/(Δ_x Δ_y) over |q_x| and |q_y| up to `reached` (cycles/µm)."""
+        """Compute ∫ Σ c B B/(Δ_x Δ_y) over |q_x| and |q_y| up to `reached` (cycles/µm)."""
         inside = []
         for largest, spacing, end in zip(self.largest, self.spacing, reached, strict=True):
             m = np.arange(-largest, largest + 1)
@@ -83,7 +83,7 @@ class SplineGrid:
         shift: NDArray[np.float64],
         reached: tuple[float, float],
     ) -> float:
-        """∫|S_approx − S_exact| dq up to `reached`, by the rule of rectangles on the lattice shifted by `shift` Δ.
+        """Compute ∫|S_approx − S_exact| dq up to `reached`, by the rectangle rule on the lattice shifted by `shift` Δ.
 
         Args:
             kept: the smaller grid of the approximation.
@@ -105,22 +105,22 @@ class SplineGrid:
 
 
 def spline(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """B(x)."""
+    """Evaluate B(x)."""
     x = np.abs(x)
     return np.where(x <= 0.5, 0.75 - x**2, 0.5 * np.maximum(1.5 - x, 0) ** 2)
 
 
 def spline_weights(t: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """B(t + 1), B(t), B(t − 1) for |t| ≤ ½: the weights of the nodes before, at and after the nearest."""
+    """Return B(t + 1), B(t), B(t − 1) for |t| ≤ ½: the weights of the nodes before, at and after the nearest."""
     return 0.5 * (0.5 - t) ** 2, 0.75 - t**2, 0.5 * (0.5 + t) ** 2
 
 
 def spline_integral(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """∫B from −∞ to x."""
+    """Return ∫B from −∞ to x."""
     x = np.clip(x, -1.5, 1.5)
     return sum(c * np.maximum(x + 1.5 - k, 0) ** 3 for k, c in enumerate((1, -3, 3, -1))) / 6
 
 
 def inner(grid: OrderGrid | SplineGrid, kept: OrderGrid | SplineGrid) -> tuple[slice, slice]:
-    """Where the nodes of `kept` lie among those of the larger `grid`."""
+    """Return slices of the nodes of `kept` among those of the larger `grid`."""
     return tuple(slice(m - n, m + n + 1) for m, n in zip(grid.largest[::-1], kept.largest[::-1], strict=True))

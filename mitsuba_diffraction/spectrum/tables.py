@@ -2,7 +2,7 @@
 
 S holds κ only in e^{iκu}, u = h(x) − h(x′) the differences in height, |u| ≤ R. With κ = κ_c (1 + t), κ_c = κ_max/2 and
 −1 ≤ t ≤ 1, every expansion of e^{iκ_c t u} in t is one of S, with real terms; it holds for the average ⟨·⟩ over places
-as well, which an expansion of the amplitude does not. The g_n are polynomials in t. x = κ_c R = κ_max H decides how
+as well, which an expansion of the amplitude does not. The g_n are polynomials in t. x = κ_c R = κ_max H determines how
 many are needed.
 
 `taylor`, `chebyshev` and `svd` return all the functions that J Chebyshev nodes κ_j allow, and a projection, (N, J):
@@ -48,23 +48,23 @@ class Series:
         return len(self.modes)
 
     def weights(self, kappa: ArrayLike) -> NDArray[np.float64]:
-        """g_n(κ) for κ (...) in rad/µm: (..., N)."""
+        """Evaluate g_n(κ) for κ (...) in rad/µm: (..., N)."""
         return chebyshev_polynomials(position(kappa, self.largest_kappa), self.modes.shape[1]) @ self.modes.T
 
     def first(self, terms: int) -> Series:
-        """The first functions only, without the degrees that none of them contains."""
+        """Return the first functions only, without the degrees that none of them contains."""
         modes = self.modes[:terms]
         degrees = 1 + max(np.flatnonzero(modes.any(axis=0)), default=0)
         return dataclasses.replace(self, modes=modes[:, :degrees].copy())
 
 
 def taylor(largest_kappa: float, nodes: int) -> tuple[Series, NDArray[np.float64]]:
-    """g_n = tⁿ and B_n = F{(iκ_c u)ⁿ/n! · e^{iκ_c u}}, the series of e^{iκ_c t u} about the middle of the range of κ.
+    """Return g_n = tⁿ and B_n = F{(iκ_c u)ⁿ/n! · e^{iκ_c u}}, the series of e^{iκ_c t u} about the middle of all κ.
 
-    It is the way of Stam's diffraction shaders (Stam 1999) and of the shader after them. The derivatives of e^{ix} have
-    modulus one, so what N terms leave out is of the order of x^N/N! with x = κ_c R (Lagrange). The terms grow to about
-    e^x before they shrink, and so do their rounding errors: in float32 the series is lost for surfaces deeper than
-    about half a micrometre.
+    This is the expansion of Stam's diffraction shaders (Stam 1999) and their successors. The derivatives of e^{ix} have
+    modulus one, so that the remainder after N terms is of the order of x^N/N! with x = κ_c R (Lagrange). The terms grow
+    to about e^x before they shrink, and so do their rounding errors: in float32 the series fails for surfaces deeper
+    than about half a micrometre.
 
     Args:
         largest_kappa: κ_max in rad/µm.
@@ -76,7 +76,7 @@ def taylor(largest_kappa: float, nodes: int) -> tuple[Series, NDArray[np.float64
 
 
 def chebyshev(largest_kappa: float, nodes: int) -> tuple[Series, NDArray[np.float64]]:
-    """g_n = T_n(t) and B_n = F{ε_n iⁿ J_n(κ_c u) e^{iκ_c u}}, by e^{iκ_c u t} = Σ_n ε_n iⁿ J_n(κ_c u) T_n(t).
+    """Return g_n = T_n(t) and B_n = F{ε_n iⁿ J_n(κ_c u) e^{iκ_c u}}, by e^{iκ_c u t} = Σ_n ε_n iⁿ J_n(κ_c u) T_n(t).
 
     This is the Jacobi–Anger expansion (Dhillon and Ghosh 2016 used it in the height); ε_0 = 1, else 2. Everything is
     bounded by two, so nothing cancels; the terms fall off faster than any power once n > x = κ_c R.
@@ -89,7 +89,7 @@ def chebyshev(largest_kappa: float, nodes: int) -> tuple[Series, NDArray[np.floa
 
 
 def svd(largest_kappa: float, values: NDArray[np.float64]) -> tuple[Series, NDArray[np.float64]]:
-    """The singular value decomposition of S(q; κ) over κ and q, the strongest modes first.
+    """Return the singular value decomposition of S(q; κ) over κ and q, the strongest modes first.
 
     The g_n are orthonormal over the Chebyshev nodes, so that B_n = Σ_j g_n(κ_j) S(q; κ_j). For the values given, no
     separable sum of as many terms is nearer. An error counts by its modulus, ∫|ΔS| dq. By Cauchy–Schwarz
@@ -106,7 +106,7 @@ def svd(largest_kappa: float, values: NDArray[np.float64]) -> tuple[Series, NDAr
 
 
 def _triangle(convert: Callable[[NDArray[np.float64]], NDArray[np.float64]], count: int) -> NDArray[np.float64]:
-    """The coefficients in one basis of the polynomials of the other, one in each row: (count, count)."""
+    """Return the coefficients in one basis of the polynomials of the other, one in each row: (count, count)."""
     rows = np.zeros((count, count))
     for n in range(count):
         rows[n, : n + 1] = convert(np.eye(n + 1)[n])
@@ -114,23 +114,23 @@ def _triangle(convert: Callable[[NDArray[np.float64]], NDArray[np.float64]], cou
 
 
 def position(kappa: ArrayLike, largest_kappa: float) -> NDArray[np.float64]:
-    """t = 2κ/κ_max − 1."""
+    """Return t = 2κ/κ_max − 1."""
     return 2 * np.asarray(kappa, np.float64) / largest_kappa - 1
 
 
 def chebyshev_nodes(count: int) -> NDArray[np.float64]:
-    """The zeros of T_J in t, ascending: (J,)."""
+    """Return the zeros of T_J in t, ascending: (J,)."""
     return -np.cos(np.pi * (np.arange(count) + 0.5) / count)
 
 
 def chebyshev_polynomials(t: ArrayLike, count: int) -> NDArray[np.float64]:
-    """T_n(t), n < `count`, for t (...): (..., count)."""
+    """Evaluate T_n(t), n < `count`, for t (...): (..., count)."""
     t = np.asarray(t, np.float64)
     return np.polynomial.chebyshev.chebvander(t, count - 1).reshape(*t.shape, count)
 
 
 def chebyshev_transform(count: int) -> NDArray[np.float64]:
-    """(J, J): from values at `chebyshev_nodes` to the Chebyshev coefficients of the polynomial through them."""
+    """Return the matrix, (J, J), from values at `chebyshev_nodes` to Chebyshev coefficients of their interpolant."""
     values = chebyshev_polynomials(chebyshev_nodes(count), count)
     norm = np.full(count, 2.0)
     norm[0] = 1.0
@@ -138,7 +138,7 @@ def chebyshev_transform(count: int) -> NDArray[np.float64]:
 
 
 def nodes_for(x: float, tolerance: float) -> int:
-    """How many Chebyshev nodes resolve e^{ixt} on −1 ≤ t ≤ 1 to `tolerance`.
+    """Return how many Chebyshev nodes resolve e^{ixt} on −1 ≤ t ≤ 1 to `tolerance`.
 
     Jacobi–Anger: the coefficient of T_n is 2 iⁿ J_n(x), and |J_n(x)| ≤ (x/2)ⁿ/n!.
     """
@@ -180,7 +180,7 @@ class SeriesTable:
         powers: Callable[[float], NDArray[np.float64]],
         progress: Callable[[int, int], None],
     ) -> SeriesTable:
-        """Accumulates the terms node by node; little more than the result is held in memory.
+        """Accumulate the terms node by node; little more than the result is held in memory.
 
         Args:
             series: the g_n(κ).
@@ -222,7 +222,7 @@ class SeriesTable:
         return self.terms.shape[1:]
 
     def content(self) -> list[NDArray]:
-        """All that tells it from others, C-contiguous."""
+        """Return all that distinguishes the table, as C-contiguous arrays."""
         weights = self.series.weights(np.linspace(0, self.largest_kappa, 2 * self.series.terms + 2))
         return [
             np.frombuffer(self.representation.encode(), np.uint8),
@@ -241,14 +241,14 @@ class SeriesTable:
         return 4 * -(-len(self.terms) // 4)
 
     def powers(self, kappa: float) -> NDArray[np.float32]:
-        """c_m(κ) of all nodes, (rows, columns), in float32 as a renderer computes them; κ in rad/µm."""
+        """Evaluate c_m(κ) of all nodes, (rows, columns), in float32 as a renderer computes them; κ in rad/µm."""
         # The last bits of BLAS depend on the number of cores.
         return np.einsum("n,nyx->yx", self.series.weights(kappa).astype(np.float32), self.terms)
 
     def powers_at(
         self, row: NDArray[np.int64], column: NDArray[np.int64], kappa: NDArray[np.float64]
     ) -> NDArray[np.float32]:
-        """c_m(κ) at one node and one κ each; all arguments and the result of one shape (...)."""
+        """Evaluate c_m(κ) at one node and one κ each; all arguments and the result of one shape (...)."""
         weights = self.series.weights(kappa).astype(np.float32)
         return np.einsum("...n,n...->...", weights, self.terms[:, row, column])
 
@@ -293,7 +293,7 @@ class SliceTable:
         rounded: Callable[[NDArray[np.float32]], NDArray[np.float32]],
         progress: Callable[[int, int], None],
     ) -> SliceTable:
-        """Takes the powers at one κ after the other, so that little more than the result is held in memory.
+        """Build from the powers at one κ after the other, so that little more than the result is held in memory.
 
         Args:
             intervals: K.
@@ -323,7 +323,7 @@ class SliceTable:
 
     @property
     def terms(self) -> int:
-        """How many a_p."""
+        """The number of coefficients a_p."""
         return self.values.shape[1]
 
     @property
@@ -332,7 +332,7 @@ class SliceTable:
         return self.values.shape[2:]
 
     def content(self) -> list[NDArray]:
-        """All that tells it from others, C-contiguous."""
+        """Return all that distinguishes the table, as C-contiguous arrays."""
         return [np.ascontiguousarray(self.values)]
 
     @cached_property
@@ -350,7 +350,7 @@ class SliceTable:
         return 4 * self.words_per_node * self.intervals * self.shape[0] * self.shape[1]
 
     def powers(self, kappa: float) -> NDArray[np.float32]:
-        """c_m(κ) of all nodes, (rows, columns), in float32 as a renderer computes them; κ in rad/µm."""
+        """Evaluate c_m(κ) of all nodes, (rows, columns), in float32 as a renderer computes them; κ in rad/µm."""
         interval, t = place(kappa, self.largest_kappa, self.intervals)
         # The last bits of BLAS depend on the number of cores.
         return np.einsum("n,nyx->yx", t ** np.arange(self.terms, dtype=np.float32), self.values[interval])
@@ -358,7 +358,7 @@ class SliceTable:
     def powers_at(
         self, row: NDArray[np.int64], column: NDArray[np.int64], kappa: NDArray[np.float64]
     ) -> NDArray[np.float32]:
-        """c_m(κ) at one node and one κ each; all arguments and the result of one shape (...)."""
+        """Evaluate c_m(κ) at one node and one κ each; all arguments and the result of one shape (...)."""
         interval, t = place(kappa, self.largest_kappa, self.intervals)
         result = np.float32(0)
         for power in reversed(range(self.terms)):
@@ -371,7 +371,7 @@ HALF_SCALE = 2.0**14
 
 
 def halved(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """`values` rounded to half precision after scaling.
+    """Round `values` to half precision after scaling.
 
     Those too small for its full precision become zero, those too large infinite.
     """
@@ -386,13 +386,13 @@ MANTISSA, LEAST_EXPONENT, EXPONENTS = 255, -36, 31
 
 
 def packed(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """`values` (K, 3, ...) as three whole numbers and one exponent for each node and interval can represent them."""
+    """Round `values` (K, 3, ...) to three whole numbers and one exponent for each node and interval."""
     mantissas, exponents = shared_exponents(values)
     return np.ldexp(mantissas, exponents[:, None]).astype(np.float32)
 
 
 def shared_exponents(values: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """Whole numbers m (K, 3, ...) and exponents e (K, ...), `values` ≈ m 2^e; infinite m for those too large."""
+    """Return whole numbers m (K, 3, ...) and exponents e (K, ...), `values` ≈ m 2^e; infinite m for those too large."""
     largest = np.abs(values).max(axis=1)
     exponents = np.frexp(largest / np.float32(MANTISSA + 0.5))[1]
     exponents = np.where(largest > 0, np.maximum(exponents, LEAST_EXPONENT), LEAST_EXPONENT)
@@ -402,12 +402,12 @@ def shared_exponents(values: NDArray[np.float32]) -> tuple[NDArray[np.float32], 
 
 
 def to_polynomial(terms: int) -> NDArray[np.float64]:
-    """Row p: the coefficient of t^p as a combination of the values at as many Chebyshev points."""
+    """Return the matrix whose row p gives the coefficient of t^p from the values at as many Chebyshev points."""
     return np.linalg.inv(np.vander(chebyshev_nodes(terms), increasing=True))
 
 
 def place(kappa: ArrayLike, largest_kappa: float, intervals: int) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """The interval of κ (...), and the place t in it, −1 to 1."""
+    """Return the interval of κ (...), and the place t in it, −1 to 1."""
     x = np.asarray(kappa, np.float64) / largest_kappa * intervals
     interval = np.clip(np.floor(x), 0, intervals - 1).astype(np.int64)
     return interval, (2 * (x - interval) - 1).astype(np.float32)

@@ -18,29 +18,29 @@ class TilePowers:
     """η_m(κ) on an order grid, from one transform of the tile.
 
     Attributes:
-        grid: the orders of which a lobe, or a part of it, lies where light reaches.
+        grid: the orders whose lobes overlap the frequencies that light reaches.
         own_error: Σ_m |Δη_m|, the largest error of these powers themselves.
     """
 
     own_error: float = 0.0
 
     def __init__(self, height_field: HeightField, reach: float, lobe_radius: float) -> None:
-        """Takes the tile, the largest |q| that light reaches and the radius of a lobe, both in cycles/µm."""
+        """Take the tile, the largest |q| that light reaches and the radius of a lobe, both in cycles/µm."""
         self._height_field = height_field
         pixels = height_field.shape[::-1]
         self.grid = OrderGrid.reachable(height_field.tile_size, pixels, reach + lobe_radius)
         self._reached = OrderGrid.reachable(height_field.tile_size, pixels, reach)
 
     def __call__(self, kappa: float) -> NDArray[np.float64]:
-        """η_m(κ), (rows, columns); κ in rad/µm."""
+        """Compute η_m(κ), (rows, columns); κ in rad/µm."""
         return self.grid.take(_powers(self._height_field, kappa))
 
     def reached(self, powers: NDArray[np.float64]) -> float:
-        """The share of the power in orders that lie where light reaches; takes η_m of the grid."""
+        """Return the share of the power in orders that light reaches; takes η_m of the grid."""
         return float(powers[inner(self.grid, self._reached)].sum())
 
     def error(self, kept: OrderGrid | SplineGrid, powers: NDArray[np.float32], kappa: float) -> float:
-        """∫|S_approx − S_exact| dq over the frequencies of this grid: of lobes that stand apart; of others, a bound.
+        """Return ∫|S_approx − S_exact| dq over the frequencies of this grid; an upper bound if lobes overlap.
 
         Args:
             kept: the smaller grid of the approximation.
@@ -53,7 +53,7 @@ class TilePowers:
 
 
 def _powers(height_field: HeightField, kappa: float) -> NDArray[np.float64]:
-    """η_m(κ) = |F_m|² of all orders, (N_y, N_x), as in `scipy.fft.fftfreq`."""
+    """Compute η_m(κ) = |F_m|² of all orders, (N_y, N_x), as in `scipy.fft.fftfreq`."""
     transform = scipy.fft.fft2(np.exp(1j * kappa * height_field.centred), norm="forward", overwrite_x=True)
     return transform.real**2 + transform.imag**2
 
@@ -65,14 +65,14 @@ class TileSplines:
     of A projects the lobe of one order.
 
     Attributes:
-        grid: all nodes whose splines hold where light reaches.
+        grid: all nodes whose splines overlap the frequencies that light reaches.
     """
 
     # Nodes beyond the grid, so that what lies there is not projected on its last ones.
     _MARGIN = 12
 
     def __init__(self, powers: TilePowers, lobe_width: float, spacing: float, reach: float) -> None:
-        """Takes η_m(κ), σ_q, and the largest spacing and reach of the nodes, all in cycles/µm."""
+        """Take η_m(κ), σ_q, and the largest spacing and reach of the nodes, all in cycles/µm."""
         self._powers, self._sigma, self._spacing = powers, lobe_width, spacing
         self._orders = powers.grid.frequencies()
         # Beyond six σ_q of the last order there is nothing.
@@ -87,7 +87,7 @@ class TileSplines:
         return [self._projected(m, q) for m, q in zip(self.grid.largest, self._orders, strict=True)]
 
     def _projected(self, largest: int, orders: NDArray[np.float64]) -> NDArray[np.float64]:
-        """A, (nodes, orders), along one axis."""
+        """Compute A, (nodes, orders), along one axis."""
         nodes = np.arange(-largest - self._MARGIN, largest + self._MARGIN + 1)
         x, weights = np.polynomial.legendre.leggauss(8)
         # B is a parabola on each of three pieces.
@@ -99,21 +99,21 @@ class TileSplines:
         return scipy.linalg.solveh_banded(gram, moments)[self._MARGIN : -self._MARGIN]
 
     def _lobes(self, places: NDArray[np.float64], orders: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Δ N(q − m/T; σ_q²) at q = Δ · `places`, (places, orders)."""
+        """Compute Δ N(q − m/T; σ_q²) at q = Δ · `places`, (places, orders)."""
         offset = (places[:, None] * self._spacing - orders) / self._sigma
         return self._spacing / (np.sqrt(2 * np.pi) * self._sigma) * np.exp(-(offset**2) / 2)
 
     def __call__(self, kappa: float) -> NDArray[np.float64]:
-        """c_m(κ), (rows, columns), with Σ c = 1 over all frequencies; κ in rad/µm."""
+        """Compute c_m(κ), (rows, columns), with Σ c = 1 over all frequencies; κ in rad/µm."""
         along_x, along_y = self._projection
         return along_y @ self._powers(kappa) @ along_x.T
 
     def reached(self, powers: NDArray[np.float64]) -> float:
-        """The share of the power where light reaches; takes c_m of the grid."""
+        """Return the share of the power at frequencies that light reaches; takes c_m of the grid."""
         return self.grid.within(powers, self._reached)
 
     def error(self, kept: OrderGrid | SplineGrid, powers: NDArray[np.float32], kappa: float) -> float:
-        """∫|S_approx − S_exact| dq where light reaches; arguments as of `TilePowers.error`."""
+        """Return ∫|S_approx − S_exact| dq where light reaches; arguments as of `TilePowers.error`."""
         shift = self._random.uniform(-0.5, 0.5, 2)
         along_x, along_y = (
             self._lobes(np.arange(-largest, largest + 1) + s, orders)

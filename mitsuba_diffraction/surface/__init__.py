@@ -1,1 +1,1 @@
-"""Surfaces: height fields, where they come from, how scans are prepared, and what periods they have."""
+"""Surfaces: height fields, profiles and readers, preparation of scans, and periods."""

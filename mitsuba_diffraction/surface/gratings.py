@@ -26,7 +26,7 @@ LONGEST_PERIOD = 100.0
 
 
 def check_pixels(columns: float, rows: float) -> None:
-    """Refuses a patch before its memory is allocated."""
+    """Raise RequestError for too large a patch before its memory is allocated."""
     if not columns * rows <= MOST_PIXELS:
         raise RequestError(f"got a patch of {columns:.4g} × {rows:.4g} pixels, wanted at most {MOST_PIXELS} in all")
 
@@ -64,7 +64,7 @@ Array = NDArray[np.float64]
 
 
 def phase(samples: int) -> Array:
-    """x / period at the centres of the pixels, (samples,)."""
+    """Return x / period at the centres of the pixels, (samples,)."""
     return (np.arange(samples) + 0.5) / samples
 
 
@@ -73,7 +73,7 @@ def one_row(heights: Array, period: float, source: str) -> HeightField:
 
 
 def blazed(period: float = 2.5, depth: float = 0.246, *, samples: int = 512) -> HeightField:
-    """Sawtooth h = depth · x / period, rising along +x.
+    """Return a sawtooth h = depth · x / period, rising along +x.
 
     At normal incidence its facets reflect light towards −x: into ω_o = −λq with q = m / period, m = 2 depth / λ.
 
@@ -94,7 +94,7 @@ def blazed(period: float = 2.5, depth: float = 0.246, *, samples: int = 512) -> 
 
 
 def ruled(lines_per_mm: float = 600.0, *, blaze_wavelength: float = 500.0, samples: int = 512) -> HeightField:
-    """Blazed grating with given lines per millimetre and blaze wavelength.
+    """Return a blazed grating with given lines per millimetre and blaze wavelength.
 
     The blaze wavelength λ_B is that of the first order in Littrow mounting, where light returns along the normal of the
     facets, at the blaze angle θ_B (Palmer 2020, Diffraction Grating Handbook, chapters 2 and 9). With the
@@ -138,7 +138,7 @@ def ruled(lines_per_mm: float = 600.0, *, blaze_wavelength: float = 500.0, sampl
 
 
 def sinusoidal(period: float, depth: float, *, samples: int = 512) -> HeightField:
-    """Sinusoid h = (depth / 2) · sin(2π x / period), so |F_m|² = J_m(κ · depth / 2)².
+    """Return a sinusoid h = (depth / 2) · sin(2π x / period), so |F_m|² = J_m(κ · depth / 2)².
 
     Args:
         period: along x, µm.
@@ -157,7 +157,7 @@ def sinusoidal(period: float, depth: float, *, samples: int = 512) -> HeightFiel
 
 
 def lamellar(period: float, depth: float, *, duty: float = 0.5, samples: int = 512) -> HeightField:
-    """Binary grating: the first part of the period is at `depth`, the rest at zero.
+    """Return a binary grating: the first part of the period is at `depth`, the rest at zero.
 
     Args:
         period: along x, µm.
@@ -185,7 +185,7 @@ def lamellar(period: float, depth: float, *, duty: float = 0.5, samples: int = 5
 
 
 def crossed(period: float, depth: float, *, period_y: float | None = None, samples: int = 128) -> HeightField:
-    """Sum of a sinusoid along x and one along y, so that the orders are products |F_m|² = |F_{m_x}|² |F_{m_y}|².
+    """Return the sum of sinusoids along x and y, so that the orders are products |F_m|² = |F_{m_x}|² |F_{m_y}|².
 
     Args:
         period: wavelength along x, µm.
@@ -212,7 +212,7 @@ def crossed(period: float, depth: float, *, period_y: float | None = None, sampl
 
 
 def foil(period: float = 1.0, depth: float = 0.15, *, directions: int = 2, samples: int = 64) -> HeightField:
-    """Crossed sinusoids of equal amplitude, as from successive interference exposures.
+    """Return crossed sinusoids of equal amplitude, as from successive interference exposures.
 
         h(x) = a Σ_j cos(2π k_j·x),    k_j = (cos α_j, sin α_j) / period
 
@@ -280,7 +280,7 @@ def draw_tracks(
     runs: Mapping[int, float],
     name: str,
 ) -> HeightField:
-    """A periodic patch of tracks along y, side by side along x; arguments as in `compact_disc`.
+    """Draw a periodic patch of tracks along y, side by side along x; arguments as in `compact_disc`.
 
     Args:
         runs: run length in channel bits → probability.
@@ -338,7 +338,7 @@ def draw_tracks(
 def _pits(
     rng: np.random.Generator, bits: int, runs: Mapping[int, float]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Where pits start and end on a closed track of so many channel bits, in bits; pits and lands alternate."""
+    """Draw starts and ends of the pits on a closed track, in channel bits; pits and lands alternate."""
     lengths = np.array(list(runs))
     probability = np.array(list(runs.values())) / sum(runs.values())
     while True:
@@ -364,7 +364,7 @@ def compact_disc(
     pixel_size: float = 0.05,
     seed: int = 0,
 ) -> HeightField:
-    """The metal of a compact disc.
+    """Draw the metal layer of a compact disc.
 
     Tracks run along y and diffract along x. On Mitsuba's `disk` x is radial, so that an orientation of 0 is correct.
 
@@ -424,7 +424,7 @@ def dvd(
     pixel_size: float = 0.05,
     seed: int = 0,
 ) -> HeightField:
-    """The metal of a DVD.
+    """Draw the metal layer of a DVD.
 
     As `compact_disc`, with the numbers of ECMA-267 (one layer): a track pitch of 0.74 µm, channel bits of 133.3 nm,
     pits and lands of 3 to 11 of them and 14 in sync codes, so 0.40 to 1.87 µm, read at 650 nm (λ/4n = 0.105 µm). The
@@ -456,7 +456,7 @@ def morpho_ridges(
     pixel_size: float = 0.0625,
     seed: int = 0,
 ) -> HeightField:
-    """Parallel ridges along y of unequal heights: the grating of a Morpho scale, **not its blue**.
+    """Draw parallel ridges along y of unequal heights: the grating of a Morpho scale, **not its blue**.
 
     The blue is due to a stack of lamellae within each ridge, an interference filter that a height field cannot
     represent; this surface only models the scattering perpendicular to the ridges. Their uneven heights weaken the
@@ -537,13 +537,13 @@ class Canvas:
         self.heights = np.zeros((rows, columns))
 
     def places(self, axis: int) -> Array:
-        """Centres of the pitches along x (0) or y (1), µm."""
+        """Return the centres of the pitches along x (0) or y (1), µm."""
         return (np.arange(self.count[axis], dtype=np.float64) + 0.5) * self.pitch[axis]
 
     def window(
         self, x: tuple[float, float], y: tuple[float, float]
     ) -> tuple[tuple[NDArray[np.signedinteger], ...], Array, Array]:
-        """Pixels of the box x[0]…x[1], y[0]…y[1] µm.
+        """Return the pixels of the box x[0]…x[1], y[0]…y[1] µm.
 
         Returns:
             index: of the pixels in `heights`, wrapped.
@@ -558,7 +558,7 @@ class Canvas:
         return index, (x_index + 0.5) * self.pixel[0], (y_index + 0.5) * self.pixel[1]
 
     def noise(self, rng: np.random.Generator, length_x: float, length_y: float) -> Array:
-        """Periodic Gaussian noise, mean 0, standard deviation 1, correlation exp(−x²/4 length_x² − …), (N_y, N_x)."""
+        """Draw periodic Gaussian noise, mean 0, variance 1, correlation exp(−x²/4 length_x² − …), (N_y, N_x)."""
         rows, columns = self.heights.shape
         q_x = np.fft.rfftfreq(columns, self.pixel[0])
         q_y = np.fft.fftfreq(rows, self.pixel[1])[:, None]
@@ -568,18 +568,18 @@ class Canvas:
         return field / field.std()
 
     def at(self, field: Array, x: float, y: float) -> float:
-        """Value of a field at a position, µm, wrapped."""
+        """Return the value of a field at a position, µm, wrapped."""
         rows, columns = field.shape
         return field[int(y / self.pixel[1]) % rows, int(x / self.pixel[0]) % columns]
 
     def height_field(self, rng: np.random.Generator, depth: float, source: str) -> HeightField:
-        """The drawing, scaled to `depth` and shifted by a random offset, as seeds must not share a lattice."""
+        """Return the drawing, scaled to `depth` and shifted by a random offset, as seeds must not share a lattice."""
         heights = np.roll(self.heights - self.heights.min(), rng.integers(self.heights.shape), axis=(0, 1))
         return HeightField(heights / heights.max() * depth, self.pixel, source)
 
 
 def smooth_step(x: Array, width: float) -> Array:
-    """Smooth step from 0 to 1 at x = 0."""
+    """Return a smooth step from 0 to 1 at x = 0."""
     return (1 + erf(x / width)) / 2
 
 
@@ -591,7 +591,7 @@ def elaphe(
     period: float = 1.144,
     seed: int = 0,
 ) -> HeightField:
-    """Synthetic replica of the shed skin of *Elaphe guttata*, not a measurement.
+    """Draw a synthetic replica of the shed skin of *Elaphe guttata*, not a measurement.
 
     Fingers along x that taper towards +x, side by side along **y**, the diffracting direction. Between two fingers a
     groove starts as a deep narrow crotch and widens up to the tips of the fingers, where the next row begins, 2.93
@@ -645,7 +645,7 @@ def elaphe(
 
 
 def _elaphe_groove(canvas: Canvas, rng: np.random.Generator, x_0: float, y_0: float) -> None:
-    """The groove between two fingers, from its crotch at (x_0, y_0) along +x."""
+    """Draw the groove between two fingers, from its crotch at (x_0, y_0) along +x."""
     row_pitch, pitch = canvas.pitch
     length = row_pitch * (0.97 + rng.normal(0, 0.035))
     tilt = (-0.1 + rng.normal(0, 0.05)) * pitch / row_pitch
@@ -666,7 +666,7 @@ def _elaphe_groove(canvas: Canvas, rng: np.random.Generator, x_0: float, y_0: fl
 
 
 def _elaphe_tip(canvas: Canvas, rng: np.random.Generator, x_0: float, y_0: float) -> None:
-    """The round edge where a finger ends on the next row, which lies lower there and rises again."""
+    """Draw the round edge where a finger ends on the next row, which lies lower there and rises again."""
     row_pitch, pitch = canvas.pitch
     x_tip = x_0 + row_pitch * (0.93 + rng.normal(0, 0.05))
     y_tip = y_0 - 0.1 * pitch
@@ -678,7 +678,7 @@ def _elaphe_tip(canvas: Canvas, rng: np.random.Generator, x_0: float, y_0: float
 
 
 def _elaphe_granules(canvas: Canvas, granules: Array, rng: np.random.Generator, x_0: float, y_0: float) -> None:
-    """A few large granules and some small ones along the ridge of a finger; where two meet, the higher stays."""
+    """Draw a few large granules and some small ones along the ridge of a finger; overlaps keep the higher one."""
     row_pitch, pitch = canvas.pitch
     for number, radius, height in ((rng.poisson(2.6), 0.12, 0.09), (rng.poisson(5.0), 0.055, 0.03)):
         for _ in range(number):
@@ -702,7 +702,7 @@ def xenopeltis(
     period: float = 1.552,
     seed: int = 0,
 ) -> HeightField:
-    """Synthetic replica of the shed skin of *Xenopeltis unicolor*, not a measurement.
+    """Draw a synthetic replica of the shed skin of *Xenopeltis unicolor*, not a measurement.
 
     Rows of short round fingers, which point along +x and rise towards their tips like roof tiles. Rows run along y, one
     period apart along **x**, the diffracting direction; they meander by 10 to 20 degrees and occasionally fork or end.
@@ -776,18 +776,18 @@ class _Fault:
     extra: bool
 
     def weight(self, y: float, size_y: float) -> float:
-        """1 inside the fault, 0 outside, smooth at its ends."""
+        """Return 1 inside the fault, 0 outside, smooth at its ends."""
         d = _wrapped(y - self.y, size_y)
         return float((erf((d + self.half) / 1.2) - erf((d - self.half) / 1.2)) / 2)
 
 
 def _wrapped(distance: float, size: float) -> float:
-    """Shortest distance on a circle of circumference `size`."""
+    """Return the shortest distance on a circle of circumference `size`."""
     return (distance + size / 2) % size - size / 2
 
 
 def _faults(canvas: Canvas, rng: np.random.Generator) -> list[_Fault]:
-    """Faults apart from each other, about one per 200 µm²; as many rows more as less, so that the mean pitch stays."""
+    """Draw separate faults, about one per 200 µm²; as many add a row as remove one, so that the mean pitch stays."""
     row_pitch = canvas.pitch[0]
     faults: list[_Fault] = []
     wanted = 2 * round(canvas.size[0] * canvas.size[1] / 400)
@@ -808,7 +808,7 @@ def _faults(canvas: Canvas, rng: np.random.Generator) -> list[_Fault]:
 
 
 def _present(faults: list[_Fault], own: _Fault | None, x: float, y: float, canvas: Canvas) -> bool:
-    """Whether the row at x has a finger at y; `own` is the fault that made the row, if one did."""
+    """Return whether the row at x has a finger at y; `own` is the fault that made the row, if one did."""
     if own is not None:
         return own.weight(y, canvas.size[1]) > 0.5
     return all(
@@ -820,7 +820,7 @@ def _present(faults: list[_Fault], own: _Fault | None, x: float, y: float, canva
 
 
 def _fault_shift(faults: list[_Fault], x: float, y: float, canvas: Canvas) -> float:
-    """How far the faults push the row at x along x, µm: away from a row more, towards a row less."""
+    """Return the shift of the row at x by the faults, µm: away from an added row, towards a missing one."""
     row_pitch = canvas.pitch[0]
     shift = 0.0
     for fault in faults:
@@ -832,7 +832,7 @@ def _fault_shift(faults: list[_Fault], x: float, y: float, canvas: Canvas) -> fl
 
 
 def _xenopeltis_finger(canvas: Canvas, rng: np.random.Generator, x_0: float, y_0: float, length: float) -> None:
-    """A finger that rises from its root at x_0 to a round tip; the higher of it and what is there stays."""
+    """Draw a finger that rises from its root at x_0 to a round tip; the higher of it and what is there stays."""
     pitch = canvas.pitch[1]
     # Some are swollen and join their neighbour.
     swollen = rng.uniform() < 0.1
@@ -855,7 +855,7 @@ def _xenopeltis_finger(canvas: Canvas, rng: np.random.Generator, x_0: float, y_0
 
 
 def _xenopeltis_pit(canvas: Canvas, rng: np.random.Generator, x_0: float, y_0: float, length: float) -> None:
-    """The pit between two fingers, deepest near their roots."""
+    """Draw the pit between two fingers, deepest near their roots."""
     pitch = canvas.pitch[1]
     depth = rng.uniform(0.01, 0.03) if rng.uniform() < 0.1 else rng.uniform(0.04, 0.11)
     start = 0.1 + rng.normal(0, 0.04)

@@ -14,7 +14,7 @@ from . import missing
 
 
 def as_pixel_size(value: float | tuple[float, float]) -> tuple[float, float]:
-    """One number or (x, y), in µm, as a pair of positive floats.
+    """Return one number or (x, y), in µm, as a pair of positive floats.
 
     Raises:
         ValueError: if the value is neither, or not positive and finite.

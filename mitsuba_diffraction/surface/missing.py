@@ -11,7 +11,7 @@ from ..errors import RequestError
 
 
 def as_heights(heights: ArrayLike) -> NDArray[np.float64]:
-    """Heights as an array, (N_y, N_x) µm, NaN where masked; copied only if necessary.
+    """Return heights as an array, (N_y, N_x) µm, NaN where masked; copied only if necessary.
 
     Raises:
         ValueError: if it is not a two-dimensional array of real numbers with at least one pixel.

@@ -64,13 +64,13 @@ class Band:
     sharp: bool
 
     def holds(self, q: Array) -> bool:
-        """Whether a wave vector, or its opposite, lies within three widths of the centre."""
+        """Return whether a wave vector, or its opposite, lies within three widths of the centre."""
         apart = np.array([np.hypot(*q) - self.centre[0], _turned(np.arctan2(q[1], q[0]), self.centre[1])])
         return bool((np.abs(apart) <= 3 * self.width).all())
 
 
 def fit_band(power: Array, background: Array, q: tuple[Array, Array], size: Array, peak: Array) -> Band:
-    """The band about a peak.
+    """Fit the band about a peak.
 
     Args:
         power: |FFT|² of the heights under a Hann window, (N_y, N_x).
@@ -92,7 +92,7 @@ def fit_band(power: Array, background: Array, q: tuple[Array, Array], size: Arra
     bin_width = 1 / size[long].min()
 
     def model(theta: Array) -> tuple[Array, Array, Array]:
-        """The Gaussian, P, and ∂ln P/∂θ, for θ = (ln A, ρ₀, ln σ_ρ, φ₀, ln σ_φ, ln b)."""
+        """Return the Gaussian, P, and ∂ln P/∂θ, for θ = (ln A, ρ₀, ln σ_ρ, φ₀, ln σ_φ, ln b)."""
         sigma_rho, sigma_phi = np.exp(theta[[2, 4]])
         s, t = (rho - theta[1]) / sigma_rho, (phi - theta[3]) / sigma_phi
         gaussian = np.exp(theta[0] - (s**2 + t**2) / 2)
@@ -135,7 +135,7 @@ def fit_band(power: Array, background: Array, q: tuple[Array, Array], size: Arra
 
 
 def _turned(phi: Array, phi_0: float) -> Array:
-    """φ − φ₀ of axes, in [−π/2, π/2)."""
+    """Return φ − φ₀ of axes, in [−π/2, π/2)."""
     return (phi - phi_0 + np.pi / 2) % np.pi - np.pi / 2
 
 
@@ -203,7 +203,7 @@ class Period:
 
     @classmethod
     def of(cls, q: NDArray[np.float64], spread: NDArray[np.float64], strength: float) -> Period:
-        """From a frequency (2,) in cycles/µm and its covariance (2, 2)."""
+        """Make a period from a frequency (2,) in cycles/µm and its covariance (2, 2)."""
         length = float(np.hypot(*q))
         along, across = q / length, np.array([-q[1], q[0]]) / length
         return cls(
@@ -216,7 +216,7 @@ class Period:
 
     @classmethod
     def of_band(cls, band: Band, spread: NDArray[np.float64]) -> Period:
-        """From a band and the covariance (2, 2) of its centre (ρ₀, φ₀)."""
+        """Make a period from a band and the covariance (2, 2) of its centre (ρ₀, φ₀)."""
         length, phi = band.centre
         return cls(
             period=float(1 / length),
@@ -230,7 +230,7 @@ class Period:
 
 
 def find_periods(height_field: HeightField, count: int = 2, *, extent: str = "sample") -> tuple[Period, ...]:
-    """The strongest periods of a height field.
+    """Find the strongest periods of a height field.
 
     A wave is detected where the power of the levelled and windowed (Hann) heights exceeds the background by a factor
     that noise on an exactly known background would exceed in one of ten thousand height fields (with the background
@@ -338,7 +338,7 @@ class _Spectrum:
     # ------------------------------------------------------------ detection
 
     def peaks(self, count: int) -> tuple[list[NDArray[np.float64]], list[Band]]:
-        """The frequencies, cycles/µm, of the bins at the strongest peaks that stand out, and bands; none collinear."""
+        """Return the frequencies (cycles/µm) of the strongest significant peaks, and bands; none collinear."""
         waves: list[NDArray[np.float64]] = []
         bands: list[Band] = []
 
@@ -360,7 +360,7 @@ class _Spectrum:
         return waves, bands
 
     def _alone(self, q: NDArray[np.float64]) -> bool:
-        """Whether the lobe of a peak holds nearly all power within half an octave and 45°."""
+        """Return whether the lobe of a peak holds nearly all power within half an octave and 45°."""
         q_x, q_y = np.meshgrid(*self._q)
         octaves = np.abs(np.log2(np.maximum(np.hypot(q_x, q_y), 1e-300) / np.hypot(*q)))
         along, across = q_x * q[0] + q_y * q[1], q_y * q[0] - q_x * q[1]
@@ -417,7 +417,7 @@ class _Spectrum:
         return background
 
     def _streak(self, row: int, column: int) -> float:
-        """The larger of the lower quartiles along the row and the column of a frequency, excluding its lobe."""
+        """Return the larger of the lower quartiles along the row and the column of a frequency, excluding its lobe."""
         quartiles = [0.0]
         for line, place in ((self._power[row], column), (self._power[:, column], row)):
             reach = min(12, (len(line) - 1) // 2)
@@ -427,7 +427,7 @@ class _Spectrum:
         return max(quartiles)
 
     def _fundamental(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The longest wave of which q is the third or second harmonic, if significant or as strong as q; else q."""
+        """Return the longest wave with q as third or second harmonic, if significant or as strong as q; else q."""
         column, row = (np.rint(q * self._size).astype(int)).tolist()
         power = self._power[row, column]
         for order in (3, 2):
@@ -444,7 +444,7 @@ class _Spectrum:
     # ------------------------------------------------------------ fit
 
     def fit(self, waves: list[NDArray[np.float64]]) -> list[Period]:
-        """The waves by least squares, starting from the frequencies of their bins."""
+        """Fit the waves by least squares, starting from the frequencies of their bins."""
         whole = _Waves(self._heights, self._x, self._y, degree=2)
         while waves:
             q = whole.frequencies(np.array(waves))
@@ -466,7 +466,7 @@ class _Spectrum:
         return [period for period in found if period.strength >= _LEAST_STRENGTH]
 
     def band(self, band: Band) -> Period:
-        """The period of a band; its uncertainty includes the excess scatter of the quarters."""
+        """Return the period of a band; its uncertainty includes the excess scatter of the quarters."""
         q, quarters = band.centre[0] * _unit(band.centre[1]), []
         for part in self._parts():
             spectrum = _Spectrum(self._heights[part], self._pixel_size)
@@ -478,7 +478,7 @@ class _Spectrum:
         return Period.of_band(band, band.covariance + _beyond(centres, noise))
 
     def _wander(self, q: NDArray[np.float64], noise: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The covariance of the frequency over the halves or quarters of the patch, in excess of noise."""
+        """Return the covariance of the frequency over the halves or quarters of the patch, in excess of noise."""
         share = float(np.clip(_FEWEST / np.hypot(*(q * self._size)), 0.5, 1))
         parts = self._parts(share)
         waves = [_Waves(self._levelled[r, c], self._x[c], self._y[r], degree=0) for r, c in parts]
@@ -486,7 +486,7 @@ class _Spectrum:
         return _beyond(np.array([part.frequencies(q[None], 1e-3)[0] for part in waves]), of_part)
 
     def _parts(self, share: float = 0.5) -> list[tuple[slice, slice]]:
-        """Both ends of a line, or the corners of a patch, of this share of its length and width."""
+        """Yield both ends of a line, or the corners of a patch, of this share of its length and width."""
         rows, columns = (_ends(count, share) for count in self._heights.shape)
         return [(r, c) for r in rows for c in columns]
 
@@ -502,7 +502,7 @@ class _Waves:
         self._polynomials = _polynomials(self._x, self._y, degree)
 
     def frequencies(self, q: NDArray[np.float64], bins: float = 1e-7) -> NDArray[np.float64]:
-        """The best q, (k, 2), from these starting points, until a step is less than `bins`."""
+        """Find the best q, (k, 2), from these starting points, until a step is less than `bins`."""
         for _ in range(20):
             amplitude, slope = self._amplitudes(self._model(q).solve(self._heights))
             # c e^{2πi(q + δ)·x} ≈ (c + 2πi c δ·x) e^{2πi q·x}; without a wave, c = 0, q is unchanged.
@@ -515,7 +515,7 @@ class _Waves:
         return q
 
     def amplitudes(self, q: NDArray[np.float64]) -> tuple[NDArray, NDArray[np.float64], NDArray[np.float64], float]:
-        """c, (k,), the covariance of each q in noise of density 1, (k, 2, 2), its density there, var (h − p)."""
+        """Return c (k,), the covariance of each q in noise of density 1 (k, 2, 2), its density there, var (h − p)."""
         model = self._model(q)
         coefficients = model.solve(self._heights)
         amplitude, _ = self._amplitudes(coefficients)
@@ -534,7 +534,7 @@ class _Waves:
         return amplitude, np.array(spread), density, float((self._heights - model.evaluate(surface)).var())
 
     def _model(self, q: NDArray[np.float64]) -> _LeastSquares:
-        """The polynomials, and for each wave e, xe, ye with e = e^{2πi q·x}/2, and their conjugates."""
+        """Return the polynomials, and for each wave e, xe, ye with e = e^{2πi q·x}/2, and their conjugates."""
         basis = list(self._polynomials)
         for wave in q:
             x, y = np.exp(2j * np.pi * wave[0] * self._x), np.exp(2j * np.pi * wave[1] * self._y)
@@ -543,12 +543,12 @@ class _Waves:
         return _LeastSquares(basis, self._window)
 
     def _amplitudes(self, coefficients: NDArray) -> tuple[NDArray, NDArray]:
-        """c, (k,), and the coefficients of xe and ye, (k, 2)."""
+        """Return c, (k,), and the coefficients of xe and ye, (k, 2)."""
         table = coefficients[len(self._polynomials) :].reshape(-1, 6)
         return table[:, 0], table[:, 1:3]
 
     def _density(self, residual: NDArray[np.float64], q: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The variance per pixel of white noise with the power density of the residual around each q, (k,)."""
+        """Return the variance per pixel of white noise with the power density of the residual around each q, (k,)."""
         weight = hann(residual.shape)
         power = np.abs(np.fft.fft2(weight * residual)) ** 2 / np.sum(weight**2)
         rows, columns = residual.shape
@@ -576,21 +576,21 @@ class _LeastSquares:
         return ((self._along_x.conj() * u) @ self._along_x.T) * ((self._along_y.conj() * v) @ self._along_y.T)
 
     def solve(self, heights: NDArray[np.float64]) -> NDArray:
-        """The coefficients."""
+        """Solve for the coefficients."""
         u, v = self._window
         sums = np.einsum("ky,ky->k", self._along_y.conj() * v, (self._along_x.conj() * u) @ heights.T)
         return self._inverse @ sums
 
     def evaluate(self, coefficients: NDArray) -> NDArray[np.float64]:
-        """The model, (N_y, N_x)."""
+        """Evaluate the model, (N_y, N_x)."""
         return np.real((self._along_y.T * coefficients) @ self._along_x)
 
     def fit(self, heights: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The model of the heights."""
+        """Fit the model to the heights."""
         return self.evaluate(self.solve(heights))
 
     def covariance(self) -> NDArray:
-        """Covariance of the coefficients for white noise of variance one."""
+        """Return the covariance of the coefficients for white noise of variance one."""
         return self._inverse @ self._gram(2) @ self._inverse
 
 
@@ -603,7 +603,7 @@ def _periods_of_tile(tile: HeightField, count: int) -> tuple[Period, ...]:
 
 
 def _on_lattice(period: Period, tile: HeightField) -> Period:
-    """A period of a tile that repeats is one of its orders: exactly known."""
+    """Round a period of a repeating tile to one of its orders, whose period is known exactly."""
     if period.width:
         return period
     along = np.deg2rad(period.direction)
@@ -614,14 +614,14 @@ def _on_lattice(period: Period, tile: HeightField) -> Period:
 
 
 def repeated(tile: HeightField, times: int) -> HeightField:
-    """A tile so many times along each axis, or fewer times where that would be many pixels."""
+    """Repeat a tile so many times along each axis, or fewer times where that would be many pixels."""
     while tile.heights.size * times**2 > _MOST_PIXELS and times > 1:
         times //= 2
     return HeightField(np.tile(tile.heights, (times, times)), tile.pixel_size, tile.source)
 
 
 def _beyond(found: NDArray[np.float64], noise: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The covariance of estimates (n, 2) from parts of a patch, in excess of that owing to noise, if significant."""
+    """Return the covariance of estimates (n, 2) from parts of a patch in excess of that by noise, if significant."""
     free = len(found) - 1
     if free == 0:
         return np.zeros((2, 2))
@@ -636,13 +636,13 @@ def _unit(phi: float) -> NDArray[np.float64]:
 
 
 def _as_direction(phi: float) -> float:
-    """Degrees in (−90, 90]; −90 up to rounding becomes 90."""
+    """Return degrees in (−90, 90]; −90 up to rounding becomes 90."""
     degrees = float(np.degrees(phi))
     return min(float(degrees - 180 * np.ceil((degrees - 90) / 180 - 1e-12)), 90.0)
 
 
 def _polynomials(x: NDArray, y: NDArray, degree: int) -> list[tuple[NDArray, NDArray]]:
-    """1, x, y, x², xy, y² … as pairs of factors in x and y, as far as the points determine them."""
+    """Return 1, x, y, x², xy, y² … as pairs of factors in x and y, as far as the points determine them."""
     x, y = (v / max(np.abs(v).max(), 1e-300) for v in (x, y))
     powers = [(i, j) for i in range(degree + 1) for j in range(degree + 1 - i) if i < len(x) and j < len(y)]
     return [(x**i, y**j) for i, j in powers]
@@ -654,29 +654,29 @@ def _ends(count: int, share: float) -> list[slice]:
 
 
 def _length(places: NDArray[np.float64]) -> float:
-    """Length of a row of pixels from their positions; arbitrary for one pixel, which has no frequency."""
+    """Return the length of a row of pixels from their positions; arbitrary for one pixel, which has no frequency."""
     return float(len(places) * (places[1] - places[0])) if len(places) > 1 else 1.0
 
 
 def _hann(count: int) -> NDArray[np.float64]:
-    """Hann window without its zeros; one for a single pixel."""
+    """Return a Hann window without its zeros; one for a single pixel."""
     return np.sin(np.pi * (np.arange(count) + 0.5) / count) ** 2
 
 
 def hann(shape: tuple[int, int]) -> NDArray[np.float64]:
-    """Compute Hann's window of a patch, (N_y, N_x)."""
+    """Return the Hann window of a patch, (N_y, N_x)."""
     return np.outer(*map(_hann, shape))
 
 
 def _quartiles(values: NDArray[np.float64], counts: NDArray[np.intp]) -> NDArray[np.float64]:
-    """The lower quartile of consecutive runs of values of these lengths."""
+    """Return the lower quartile of consecutive runs of values of these lengths."""
     label = np.repeat(np.arange(len(counts)), counts)
     ordered = values[np.lexsort((values, label))]
     return ordered[np.cumsum(counts) - counts + (counts - 1) // 4]
 
 
 def _power_law(x: NDArray, points: NDArray, values: NDArray) -> NDArray[np.float64]:
-    """Linear interpolation of the logarithms, extrapolated before the first point."""
+    """Interpolate linearly between logarithms, extrapolated before the first point."""
     x, points, values = np.log(x), np.log(points), np.log(values)
     if len(points) > 1:
         slope = min((values[1] - values[0]) / (points[1] - points[0]), 0.0)
@@ -686,7 +686,7 @@ def _power_law(x: NDArray, points: NDArray, values: NDArray) -> NDArray[np.float
 
 
 def _one(one: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
-    """Whether two wave vectors belong to one period or its harmonics, irrespective of their sign."""
+    """Return whether two wave vectors belong to one period or its harmonics, irrespective of their sign."""
     angle = np.degrees(np.arctan2(abs(one[0] * other[1] - one[1] * other[0]), abs(one @ other)))
     apart = np.hypot(*(one - np.copysign(1, one @ other) * other))
     return bool(angle < _LEAST_ANGLE or apart < _SAME * min(np.hypot(*one), np.hypot(*other)))

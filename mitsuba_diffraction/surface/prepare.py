@@ -28,7 +28,7 @@ _LEAST = 0.002
 
 
 def seam_steps(height_field: HeightField) -> dict[str, tuple[float, float]]:
-    """Height steps between adjacent pixels across the seam and inside the patch.
+    """Return the height steps between adjacent pixels across the seam and inside the patch.
 
     Returns:
         For each axis of more than two pixels, "x" or "y": the r.m.s. step from the last pixel to the first, and from
@@ -43,7 +43,7 @@ def seam_steps(height_field: HeightField) -> dict[str, tuple[float, float]]:
 
 
 def seam_matters(steps: dict[str, tuple[float, float]]) -> bool:
-    """Whether a seam is visible: the period of the tiling would then act as a grating."""
+    """Return whether a seam is visible: the period of the tiling would then act as a grating."""
     return any(across > max(_VISIBLE * inside, _LEAST) for across, inside in steps.values())
 
 
@@ -158,7 +158,7 @@ def despike(height_field: HeightField, threshold: float = 5.0) -> HeightField:
 
 
 def _noise(heights: NDArray[np.float64]) -> float:
-    """Standard deviation of white noise on a smooth surface, µm."""
+    """Estimate the standard deviation of white noise on a smooth surface, µm."""
     differences = heights
     for dimension, count in enumerate(heights.shape):
         if count > 2:
@@ -234,7 +234,7 @@ def rotate(height_field: HeightField, degrees: float) -> HeightField:
 
 
 def largest_rectangle(width: float, height: float, cos: float, sin: float) -> tuple[float, float]:
-    """Sides along x and y of the largest rectangle inside a rotated one, for an angle with cos, sin > 0.
+    """Return the sides of the largest rectangle inside a rotated one, for an angle with cos, sin > 0.
 
     If all four corners lie on the rotated rectangle, W = w cos + h sin and H = w sin + h cos give w and h. For a long
     and narrow rectangle only two corners on its long sides are active, and wh is largest at w sin = h cos, half of the
@@ -284,7 +284,7 @@ def crop_periods(height_field: HeightField, axes: str = "xy") -> HeightField:
 def _crop(
     heights: NDArray[np.float64], dimension: int, size: float, waves: Sequence[Period], axis: str
 ) -> tuple[NDArray[np.float64], float, str]:
-    """Along one axis: the heights, their pixel size, and a description."""
+    """Crop along one axis; return the heights, their pixel size, and a description."""
     count = heights.shape[dimension]
     q, uncertainty = (np.array(v) for v in zip(*(_component(wave, axis) for wave in waves), strict=True))
     across = np.flatnonzero(q * count * size >= 1 - 1e-9)
@@ -317,7 +317,7 @@ def _crop(
 
 
 def _component(wave: Period, axis: str) -> tuple[float, float]:
-    """|q| along an axis in cycles/µm, and its standard uncertainty."""
+    """Return |q| along an axis in cycles/µm, and its standard uncertainty."""
     angle = np.radians(wave.direction)
     along, across = (np.cos(angle), np.sin(angle)) if axis == "x" else (np.sin(angle), np.cos(angle))
     spread = (
@@ -368,7 +368,7 @@ def check_steps(steps: object) -> None:
 
 
 def apply_steps(height_field: HeightField, steps: Sequence[Step]) -> HeightField:
-    """The height field after all steps, in order.
+    """Apply all steps in order and return the height field.
 
     Raises:
         ValueError: if a step is invalid or cannot be applied.
@@ -382,7 +382,7 @@ def apply_steps(height_field: HeightField, steps: Sequence[Step]) -> HeightField
 
 
 def step_of(text: str) -> Step:
-    """A step given on the command line: `level_plane`, `despike=4`, `crop_periods=x`."""
+    """Parse a step given on the command line: `level_plane`, `despike=4`, `crop_periods=x`."""
     name, equals, argument = text.partition("=")
     if not equals:
         return name

@@ -1,4 +1,4 @@
-"""What a spectrum gets wrong, against the float64 reference."""
+"""Errors of a spectrum relative to the float64 reference."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ PATCHES = tuple(direction(np.array([30.0, -45.0, -15.0, -5.0, 10.0, 45.0, 60.0])
 
 
 def against_reference(height_field: HeightField, spectrum: GratingSpectrum) -> Record:
-    """∫|ΔS| dq of the table, at three κ."""
+    """Compute ∫|ΔS| dq of the table, at three κ."""
     random = np.random.default_rng(5)
     errors = [
         l1_error(spectrum, height_field, kappa, 400, random)
@@ -37,7 +37,7 @@ def against_reference(height_field: HeightField, spectrum: GratingSpectrum) -> R
 def l1_error(
     spectrum: GratingSpectrum, height_field: HeightField, kappa: float, count: int, random: np.random.Generator
 ) -> float:
-    """∫|ΔS| dq at κ over the frequencies that light reaches, by importance sampling of S.
+    """Estimate ∫|ΔS| dq at κ over the frequencies that light reaches, by importance sampling of S.
 
     Args:
         spectrum: of the surface.
@@ -65,7 +65,7 @@ def l1_error(
 def _drawn(
     spectrum: GratingSpectrum, shares: NDArray[np.float32], count: int, random: np.random.Generator
 ) -> NDArray[np.float64]:
-    """`count` frequencies q with the density S: a node, and a place in its lobe or spline."""
+    """Draw `count` frequencies q with the density S: a node, then a place in its lobe or spline."""
     q_x, q_y = spectrum.grid.frequencies()
     total = np.cumsum(shares.ravel(), dtype=np.float64)
     # One random number in each of `count` equal steps: less noise than independent ones.
@@ -95,7 +95,7 @@ class Accuracy:
 
 
 class Exact:
-    """A case, and what of its reference serves every spectrum of it."""
+    """A case, and the parts of its reference that all of its spectra share."""
 
     def __init__(self, case: Case, wavelengths: tuple[float, float], kappas: int = 4, points: int = 2000) -> None:
         self._case, self._points = case, points
@@ -115,7 +115,7 @@ class Exact:
         return spectrum_to_XYZ(s * light, self._wavelengths)
 
     def accuracy(self, spectrum: GratingSpectrum) -> Accuracy:
-        """The errors of a spectrum of the same case."""
+        """Compute the errors of a spectrum of the same case."""
         field, random = self._case.height_field, np.random.default_rng(2)
         return Accuracy(
             l1=float(np.max([l1_error(spectrum, field, kappa, self._points, random) for kappa in self._kappas])),
@@ -124,11 +124,11 @@ class Exact:
 
 
 def patch_difference(exact: Array, approximate: Array) -> tuple[float, float]:
-    """(mean, largest) CIEDE2000 of XYZ (n, 3), both exposed so that the brightest exact patch is a light grey."""
+    """Return mean and largest CIEDE2000 of XYZ (n, 3), exposed so that the brightest exact patch is a light grey."""
     difference = delta_E(*(xyz * 0.5 / exact[:, 1].max() for xyz in (exact, approximate)))
     return float(difference.mean()), float(difference.max())
 
 
 def patch_directions() -> tuple[Array, Array]:
-    """ω_i and ω_o of the patches, (12, 3) each."""
+    """Return ω_i and ω_o of the patches, (12, 3) each."""
     return np.repeat([plane[0] for plane in PATCHES], 6, axis=0), np.concatenate([plane[1:] for plane in PATCHES])

@@ -56,16 +56,16 @@ class Result:
         surface: name of the case.
         extent: "tile" or "sample".
         representation: "taylor", "chebyshev", "svd" or "slices".
-        tolerance: what was asked for.
-        refused: why there is no such spectrum; then the rest is None.
+        tolerance: the requested one.
+        refused: the reason why there is no such spectrum; the rest is then None.
         terms: of the series, or intervals of the slices.
         words: of 32 bits that one evaluation of S reads from the table.
         megabytes: of the table.
         build_seconds: of `precompute`.
         evaluations: of eval_pdf per second, four wavelengths each.
-        read_ratio: of bare reading of the same words, which bounds any evaluation, to eval_pdf of roughconductor (Al).
-        evaluate_ratio: to eval_pdf of roughconductor (Al) in the same run.
-        sample_ratio: of sample to that of roughconductor (Al) in the same run.
+        read_ratio: speed of reading the same words alone, an upper bound, to eval_pdf of roughconductor (Al).
+        evaluate_ratio: speed of eval_pdf to that of roughconductor (Al) in the same run.
+        sample_ratio: speed of sample to that of roughconductor (Al) in the same run.
         accuracy: against the float64 reference.
     """
 
@@ -100,7 +100,7 @@ def run(
     repetitions: int = 5,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> tuple[list[Result], list[ShaderSpeed]]:
-    """Measures under the variant in force.
+    """Measure under the current variant.
 
     Args:
         cases: surfaces.
@@ -175,7 +175,7 @@ def _measured(
 
 
 def cells(result: Result) -> list[str]:
-    """Under `COLUMNS`."""
+    """Return the values of `COLUMNS` as texts."""
     if result.refused is None:
         return report.cells(COLUMNS, result)
     head = [text.format(result) for text in list(COLUMNS.values())[:3]]
@@ -183,7 +183,7 @@ def cells(result: Result) -> list[str]:
 
 
 def tables(results: Sequence[Result], shaders: Sequence[ShaderSpeed], sampled: Sequence[Sampling]) -> list[Table]:
-    """Speed and error, the real-time shaders, and sampling, for a terminal."""
+    """Return tables of speed and error, of the real-time shaders and of sampling, for a terminal."""
     return [
         report.table(COLUMNS, map(cells, results), texts=2),
         report.table(shader_speed.COLUMNS, (report.cells(shader_speed.COLUMNS, row) for row in shaders), texts=2),
@@ -197,12 +197,12 @@ def save_json(
     sampled: Sequence[Sampling],
     path: str | os.PathLike[str],
 ) -> None:
-    """Writes all, whole or not at all."""
+    """Write all results atomically."""
     outputs.save_json({"speed and error": results, "real-time shader": shaders, "sampling": sampled}, path)
 
 
 def save_plot(results: Sequence[Result], path: str | os.PathLike[str]) -> None:
-    """Draws error against speed, one panel for each surface: right is faster, down is more accurate."""
+    """Plot error against speed, one panel for each surface: right is faster, down is more accurate."""
     from matplotlib.figure import Figure
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 

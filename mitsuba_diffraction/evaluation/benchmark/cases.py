@@ -15,10 +15,10 @@ from ...surface.heightfield import HeightField
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A surface and the way it is read.
+    """A surface and its extent.
 
     Attributes:
-        name: as reports show it.
+        name: for reports.
         height_field: the surface.
         extent: "tile" or "sample".
         coherence_length: µm.
@@ -30,7 +30,7 @@ class Case:
     coherence_length: float
 
     def spectrum(self, representation: str = "auto", tolerance: float = 1e-3) -> GratingSpectrum:
-        """The spectrum of the surface; arguments and errors as of `precompute`."""
+        """Compute the spectrum of the surface; arguments and errors as of `precompute`."""
         with warnings.catch_warnings():
             # That pixels are coarse is known.
             warnings.simplefilter("ignore", UserWarning)
@@ -44,7 +44,7 @@ class Case:
 
 
 def bundled_cases() -> list[Case]:
-    """The gratings by formula, the synthetic skins of the recipes, and a surface of 65 µm with 512² pixels."""
+    """Return analytic gratings, the synthetic skins of the recipes, and a surface of 65 µm with 512² pixels."""
     sun = SUN_COHERENCE_LENGTH
     large = gratings.xenopeltis(65.0, pixel_size=65 / 512, seed=1)
     return [
@@ -61,6 +61,6 @@ def bundled_cases() -> list[Case]:
 
 
 def scan_case(height_field: HeightField) -> Case:
-    """A scan as a piece of an irregular surface, with the longest coherence length that it carries."""
+    """Return a scan as a sample of an irregular surface, with the longest coherence length that it supports."""
     coherence = carried_coherence_length(height_field, SUN_COHERENCE_LENGTH)
     return Case(height_field.source, height_field, "sample", coherence)

@@ -1,4 +1,4 @@
-"""How much work a sample of the BSDF does: effective fraction, variance at equal time, time of a whole picture."""
+"""Sampling efficiency of the BSDF: effective sample fraction, variance at equal time, time of a whole picture."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ COLUMNS = {
 
 @dataclass(frozen=True)
 class Sampling:
-    """How well a surface is sampled.
+    """Sampling efficiency of a surface.
 
     Attributes:
         surface: name of the case.
@@ -57,7 +57,7 @@ def measure(
     repetitions: int = 3,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[Sampling]:
-    """Measures under the variant in force.
+    """Measure under the current variant.
 
     Args:
         cases: surfaces.
@@ -93,14 +93,14 @@ def measure(
 
 
 def _wavelengths(shift: ArrayLike) -> NDArray[np.float64]:
-    """Equally spaced, shifted together, as Mitsuba's path tracer takes them: (..., 4) nm of shifts (..., 1)."""
+    """Return equally spaced wavelengths as Mitsuba's path tracer draws them: (..., 4) nm from shifts (..., 1)."""
     return VISIBLE[0] + (VISIBLE[1] - VISIBLE[0]) * (shift + np.arange(4)) / 4
 
 
 def _fraction(bsdf: mi.BSDF, angle: float, count: int) -> tuple[float, float]:
-    """E[w]²/E[w²], the least over azimuths, and the largest w; the weight w is averaged over the four wavelengths.
+    """Return the least E[w]²/E[w²] over azimuths, and the largest w; w, the weight, is a mean over four wavelengths.
 
-    The mean over draws of wavelengths.
+    The ratio is averaged over draws of wavelengths.
     """
     drawn = _wavelengths((np.arange(_DRAWS)[:, None] + 0.5) / _DRAWS)
     shape = len(_AZIMUTHS), _DRAWS, count
@@ -113,7 +113,7 @@ def _fraction(bsdf: mi.BSDF, angle: float, count: int) -> tuple[float, float]:
 
 
 def _against_cosine(bsdf: mi.BSDF, angle: float, count: int, repetitions: int) -> float:
-    """Variance times seconds of cosine sampling, over those of the BSDF's own sampling, under a uniform sky."""
+    """Return variance times seconds of cosine sampling over those of the BSDF's own sampling, under a uniform sky."""
     random = np.random.default_rng(1)
     si = testing.interaction(np.broadcast_to(testing.direction(angle, 30.0), (count, 3)), _wavelengths(0.3))
     sample1, sample2 = mi.Float(random.random(count)), mi.Point2f(random.random((2, count)))
@@ -134,7 +134,7 @@ def _against_cosine(bsdf: mi.BSDF, angle: float, count: int, repetitions: int) -
 
 
 def _sphere(bsdf: dict, size: int) -> mi.Scene:
-    """A sphere under sun and sky."""
+    """Return a scene of a sphere under sun and sky."""
     return mi.load_dict(
         {
             "type": "scene",

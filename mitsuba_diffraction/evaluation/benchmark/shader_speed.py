@@ -1,4 +1,4 @@
-"""The real-time shader on the same surfaces: what it reads, how fast it is, and how far its colours are off."""
+"""The real-time shader on the same surfaces: memory reads, speed, and error of its colours."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ class ShaderSpeed:
     Attributes:
         surface: name of the case.
         variant: "flss", "nmm" or "pq".
-        as_published: with its published peculiarities, or with none.
-        texel_reads: for one shading point, at most.
+        as_published: with all published quirks, or with none.
+        texel_reads: the largest number for one shading point.
         evaluate_ratio: shading points per second, to eval_pdf of roughconductor (Al) in the same run.
         delta_e: (mean, largest) CIEDE2000 of the twelve patches against the exact model, after one factor of exposure.
     """
@@ -56,7 +56,7 @@ class ShaderSpeed:
 
 
 def shader_speeds(case: Case, exact: Exact, *, count: int = 1 << 14, repetitions: int = 3) -> list[ShaderSpeed]:
-    """Measures the shaders on a tile under the variant in force.
+    """Measure the shaders on a tile under the current variant.
 
     Args:
         case: the tile.

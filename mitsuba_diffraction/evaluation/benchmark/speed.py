@@ -1,4 +1,4 @@
-"""How fast BSDFs evaluate and sample, as ratios to Mitsuba's roughconductor in the same run."""
+"""Speed of evaluation and sampling of BSDFs, as ratios to Mitsuba's roughconductor in the same run."""
 
 from __future__ import annotations
 
@@ -31,19 +31,19 @@ class Rays:
         dr.eval(self.si, self.wo, self.sample1, self.sample2)
 
     def evaluate(self, bsdf: mi.BSDF) -> None:
-        """eval_pdf of all."""
+        """Evaluate `eval_pdf` of all rays."""
         dr.eval(bsdf.eval_pdf(mi.BSDFContext(), self.si, self.wo))
 
     def sample(self, bsdf: mi.BSDF) -> None:
-        """sample of all."""
+        """Sample all rays."""
         sample, weight = bsdf.sample(mi.BSDFContext(), self.si, self.sample1, self.sample2)
         dr.eval(sample.wo, sample.pdf, weight)
 
     def read(self, spectrum: GratingSpectrum, table: mi.UInt32) -> None:
-        """What no evaluation can do without: the words about each q, gathered and added up.
+        """Gather and sum the words about each q: the minimum work of any evaluation.
 
         Args:
-            spectrum: says which nodes and how many words.
+            spectrum: determines the nodes and the number of words.
             table: of `blank(spectrum)`.
         """
         q_x, q_y = spectrum.grid.frequencies()
@@ -78,14 +78,14 @@ def _directions(random: np.random.Generator, count: int) -> np.ndarray:
 
 
 def blank(spectrum: GratingSpectrum) -> mi.UInt32:
-    """Zeros as many as the words of one κ that the table of a spectrum holds at run time."""
+    """Return as many zeros as a spectrum's table holds words for one κ at run time."""
     words = dr.zeros(mi.UInt32, int(np.prod(spectrum.grid.shape)) * spectrum.table.words_per_node)
     dr.make_opaque(words)
     return words
 
 
 def seconds(work: Mapping[Name, Callable[[], None]], repetitions: int) -> dict[Name, float]:
-    """Of each call: medians of interleaved repetitions, so that all see the same load of the machine."""
+    """Return seconds per call: medians of interleaved repetitions, so that all calls see the same machine load."""
     times: dict[Name, list[float]] = {name: [] for name in work}
     for repetition in range(-1, repetitions):  # the first compiles
         for name, call in work.items():

@@ -26,25 +26,25 @@ SHARES_POINTS = 9
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """What a comparison found.
+    """Results of a comparison.
 
     Attributes:
         scene: file name.
         shader: "flss", "nmm", "pq" or "gem".
         variant: Mitsuba's.
         seed: of the random numbers.
-        pictures: by name: "path_traced", "same_light" (the project's model under the light that the shader knows),
+        pictures: by name: "path_traced", "same_light" (the project's model under the lights that the shader supports),
             "published" and "corrected" (the shader with and without its quirks).
-        surface: (height, width) bool, the pixels that are compared: those that show surfaces and nothing else.
+        surface: (height, width) bool, the pixels that are compared: those covered by surfaces.
         white: the luminance that is shown as white.
-        to_path_traced: of each other picture, its difference to the path-traced one.
-        to_same_light: of the shader's pictures, their difference to the same light's.
-        noise: the mean CIEDE2000 that noise makes in the traced pictures; None of one sample per pixel.
+        to_path_traced: difference of each other picture from the path-traced one.
+        to_same_light: difference of the shader's pictures from "same_light".
+        noise: the mean CIEDE2000 due to noise in the traced pictures; None for one sample per pixel.
         shader_reads: texels (two numbers each) that one shading point of the shader reads, at most.
         model_reads: packets (four numbers each) that one BRDF value of the project's model reads for a ray.
-        left_out: the most of a line's power that the shader's 3 × 3 texels leave out; None without such.
+        left_out: the largest share of a line's power outside of the shader's 3 × 3 texels; None without these.
         coated: whether a grating has a coat, which the shader does not show.
-        shares: of the quirks; None if they were not asked for.
+        shares: of the quirks; None if not requested.
     """
 
     scene: str
@@ -78,18 +78,18 @@ def compare(
     shares_side: int = SHARES_SIDE,
     progress: Callable[[str], AbstractContextManager[Progress]] = no_progress,
 ) -> Comparison:
-    """Renders a scene with the path tracer and with the shader, under the variant in force, and compares.
+    """Render a scene with the path tracer and with the shader under the current variant, and compare.
 
     Args:
         scene_path: an XML scene whose integrator is a path tracer, with a directional or point light.
         shader: "flss", "nmm", "pq" or "gem".
-        width: pixels, if the film's size shall not hold.
+        width: in pixels; default: that of the film.
         height: likewise.
         spp: samples per pixel of the path tracer.
         shading_points: per pixel of the shader, each with its whole spectrum.
         seed: of the random numbers, not negative.
         parameters: values for the scene's `$name` parameters.
-        shares: measure what each quirk makes.
+        shares: measure the share of each quirk.
         shares_side: the longer side, in pixels, of the pictures for that; never more than that of the picture.
         progress: progress(label) is a context whose value is called with (done, total).
 

@@ -48,8 +48,8 @@ class Point:
         samples: per pixel; shading points of a shader.
         seconds: of rendering, without loading and compiling.
         delta_e: mean CIEDE2000 to the reference.
-        relative_mse: Σ (Y − Y_ref)²/Σ Y_ref² over the pixels that show surfaces, at the same mean luminance; Y is at
-            most white, as few pixels that are far brighter would tell of themselves only.
+        relative_mse: Σ (Y − Y_ref)²/Σ Y_ref² over the pixels that show surfaces, at the same mean luminance; Y is
+            clipped at white, as a few much brighter pixels would dominate the sum.
     """
 
     name: str
@@ -67,7 +67,7 @@ class Convergence:
     Attributes:
         scene: file name and parameters.
         size: (width, height) in pixels.
-        noise: mean CIEDE2000 that the reference owes to noise.
+        noise: mean CIEDE2000 of the reference due to noise.
         points: in the order of measurement.
     """
 
@@ -77,12 +77,12 @@ class Convergence:
     points: tuple[Point, ...]
 
     def curves(self) -> dict[str, list[Point]]:
-        """Points by name."""
+        """Group the points by name."""
         names = dict.fromkeys(point.name for point in self.points)
         return {name: [point for point in self.points if point.name == name] for name in names}
 
     def overtaken(self, name: str, error: str) -> float:
-        """When the path tracer's error falls below the least of a shader.
+        """Return the time at which the path tracer's error falls below the least error of a shader.
 
         Args:
             name: of the shader's curve.
@@ -118,7 +118,7 @@ def convergence(
     parameters: Mapping[str, str] | None = None,
     progress: Callable[[str], AbstractContextManager[Progress]] = no_progress,
 ) -> Convergence:
-    """Renders a scene in many ways, under the variant in force.
+    """Render a scene in many ways under the current variant.
 
     Args:
         scene_path: an XML scene with a parameter `tolerance` of its gratings, whose integrator is a path tracer, with a
@@ -128,7 +128,7 @@ def convergence(
         reference_samples: per pixel of the reference.
         shaders: names.
         shading_points: per pixel of the shaders, ascending.
-        width: pixels, if the film's size shall not hold.
+        width: in pixels; default: that of the film.
         parameters: further values for the scene's `$name` parameters.
         progress: progress(label) is a context whose value is called with (done, total).
 
@@ -181,12 +181,12 @@ def convergence(
 
 
 def rows(found: Convergence) -> list[list[str]]:
-    """The points under `COLUMNS`."""
+    """Return the points as rows of `COLUMNS`."""
     return [cells(COLUMNS, point) for point in found.points]
 
 
 def save_plot(found: Convergence, path: str | os.PathLike[str]) -> None:
-    """Draws both errors against time: down is more accurate, left is faster."""
+    """Plot both errors against time: down is more accurate, left is faster."""
     from matplotlib import colormaps
     from matplotlib.figure import Figure
 

@@ -1,4 +1,4 @@
-"""How far one picture is from another: exposure, CIEDE2000, luminance."""
+"""The difference between two pictures: exposure, CIEDE2000, luminance."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ...errors import RequestError
 
 @dataclass(frozen=True, eq=False)
 class Difference:
-    """Of a picture to a reference.
+    """Difference of a picture from a reference.
 
     Attributes:
         exposure: the factor by which the picture was multiplied, so that both have the same mean luminance.
@@ -32,7 +32,7 @@ class Difference:
 
     @property
     def percentile_95(self) -> float:
-        """What 95 % of the pixels stay below."""
+        """The 95th percentile of CIEDE2000."""
         return float(np.nanpercentile(self.delta_e, 95))
 
     @property
@@ -42,19 +42,19 @@ class Difference:
 
 
 def as_shown(xyz: NDArray[np.float64]) -> NDArray[np.float64]:
-    """What is brighter than white, Y > 1, keeps its chromaticity and gets Y = 1: CIEDE2000 knows nothing beyond."""
+    """Scale colours with Y > 1 to Y = 1 at equal chromaticity: CIEDE2000 is not defined beyond white."""
     return xyz / np.maximum(xyz[..., 1:2], 1)
 
 
 def white_luminance(xyz: NDArray[np.float64], where: NDArray[np.bool_]) -> float:
-    """The luminance that a preview of the picture shows as white (`auto_exposure` of the pixels that count)."""
+    """Return the luminance that a preview of the picture shows as white (`auto_exposure` of the pixels that count)."""
     return 1 / auto_exposure(into_gamut(XYZ_to_linear_sRGB(xyz[where])))
 
 
 def difference(
     reference: NDArray[np.float64], xyz: NDArray[np.float64], where: NDArray[np.bool_], white: float
 ) -> Difference:
-    """Compares two pictures.
+    """Compare two pictures.
 
     Args:
         reference: XYZ, (height, width, 3).
@@ -77,7 +77,7 @@ def difference(
 
 
 def noise(halves: NDArray[np.float64] | None, where: NDArray[np.bool_], white: float) -> float | None:
-    """The mean CIEDE2000 of a picture to itself without noise, estimated as half of that between its two halves.
+    """Estimate the mean CIEDE2000 between a picture and its noise-free limit, as half of that between its two halves.
 
     The variance of the mean of two halves is a quarter of that of their difference.
 

@@ -9,10 +9,9 @@ from ..realtime_shader.lights import lights_of
 
 
 def same_light(scene: mi.Scene) -> mi.SamplingIntegrator:
-    """The scene's own BSDFs under the light that the shader knows.
+    """Return an integrator of the scene's own BSDFs under the lights that the shader supports.
 
-    Light comes straight from directional and point lights and is stopped by what stands before them: no sky, no other
-    lights, nothing from surface to surface.
+    Only direct light of directional and point lights, with shadows: no sky, no other lights, no interreflection.
 
     Raises:
         ValueError: if the scene has no such light.
@@ -43,7 +42,7 @@ def same_light(scene: mi.Scene) -> mi.SamplingIntegrator:
 
 
 def without_gratings(shader: mi.SamplingIntegrator) -> mi.SamplingIntegrator:
-    """What a `diffraction_shader` shows, less the gratings: other BSDFs, and those below gratings."""
+    """Return an integrator of a `diffraction_shader` without gratings: other BSDFs, and those below gratings."""
 
     class WithoutGratings(mi.SamplingIntegrator):
         def sample(

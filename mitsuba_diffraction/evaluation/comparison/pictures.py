@@ -41,9 +41,9 @@ class Picture:
     Attributes:
         image: spectral radiance.
         samples: per pixel.
-        seconds: it took, without loading the scene, and without compiling kernels.
-        halves: XYZ (2, height, width, 3) of two pictures with half of the samples each, that are independent; none of
-            a picture with next to no noise.
+        seconds: of rendering, without loading the scene and compiling kernels.
+        halves: XYZ (2, height, width, 3) of two independent pictures with half of the samples each; None for a
+            picture with next to no noise.
         xyz: (height, width, 3), CIE XYZ as `color` scales it.
     """
 
@@ -58,12 +58,12 @@ class Picture:
 
 
 class Pictures:
-    """The pictures of a scene at one size, under the variant in force.
+    """The pictures of a scene at one size, under the current variant.
 
     Attributes:
         scene: Mitsuba's.
         film_size: (width, height) of the whole film; a picture shows its crop window.
-        surface: (height, width) bool, where a picture shows surfaces and nothing else.
+        surface: (height, width) bool, the pixels covered by surfaces.
         shaders: of the gratings.
         spectra: of the gratings.
         has_base: whether something lies below a grating.
@@ -80,12 +80,12 @@ class Pictures:
         seed: int = 0,
         parameters: Mapping[str, str] | None = None,
     ) -> None:
-        """Loads the scene; see `load_spectral_scene`.
+        """Load the scene; see `load_spectral_scene`.
 
         Args:
             scene_path: an XML scene whose integrator is a path tracer.
             shader: "flss", "nmm", "pq" or "gem".
-            width: pixels, if the film's size shall not hold.
+            width: in pixels; default: that of the film.
             height: likewise.
             seed: of the random numbers, not negative.
             parameters: values for the scene's `$name` parameters.
@@ -122,19 +122,19 @@ class Pictures:
 
     @property
     def quirks(self) -> tuple[str, ...]:
-        """What is as published and changes something in this scene with this shader: `Quirks`, and no cast shadows."""
+        """`Quirks` that are as published and change something in this scene with this shader, and no cast shadows."""
         of_integrator = ("power_gamma", *(("constant_blend",) if self.has_base else ()))
         own = (*self.shaders[0].own_quirks, *of_integrator)
         return (*(name for name in Quirks.names() if name in own), NO_SHADOWS)
 
     @property
     def shader_reads(self) -> int:
-        """How many texels one shading point of the shader reads, at most."""
+        """The largest number of texels that one shading point of the shader reads."""
         return max(shader.texel_reads for shader in self.shaders)
 
     @property
     def model_reads(self) -> int:
-        """How many packets of at most 16 bytes one BRDF value of the model reads for the wavelengths of a ray."""
+        """The largest number of packets of at most 16 bytes that one BRDF value of the model reads for a ray."""
         packets = [np.prod(s.neighbours) * -(-s.table.words_per_node // 4) for s in self.spectra]
         return len(mi.UnpolarizedSpectrum(0)) * int(max(packets))
 
@@ -145,24 +145,24 @@ class Pictures:
         return max(found) if found else None
 
     def path_traced(self, samples: int, progress: Progress = silent) -> Picture:
-        """By the scene's own integrator."""
+        """Render by the scene's own integrator."""
         return self._traced(self.scene.integrator(), samples, progress)
 
     def same_light(self, samples: int, progress: Progress = silent) -> Picture:
-        """By the scene's BSDFs, with the light alone that the shader knows; see `integrators.same_light`."""
+        """Render the scene's BSDFs under the lights that the shader supports; see `integrators.same_light`."""
         return self._traced(same_light(self.scene), samples, progress)
 
     def shaded(self, quirks: Collection[str], samples: int, others: int, progress: Progress = silent) -> Picture:
-        """By the shader: what its integrator converges to, with far fewer samples.
+        """Render the limit of the shader's integrator, with far fewer samples.
 
-        The integrator computes the colour of a shading point out of 81 wavelengths, and shows it at the four
+        The integrator computes the colour of a shading point from 81 wavelengths, and shows it at the four
         wavelengths of a ray. Here the colours are averaged over a pixel, and the spectrum Σ_c RGB_c b_c(λ) follows from
         the average. All other BSDFs, which are cheap, get samples of their own.
 
         Args:
-            quirks: names among `quirks` of what the shader does as published.
+            quirks: names among `quirks` that the shader has as published.
             samples: shading points per pixel.
-            others: samples per pixel of what is no grating.
+            others: samples per pixel of all but gratings.
             progress: called with (done, total).
         """
         self._shader.take(Quirks(**{name: name in quirks for name in Quirks.names()}))
@@ -195,7 +195,7 @@ class Pictures:
         return Picture(image, sums.samples, seconds, in_halves)
 
     def _colours(self, samples: int, progress: Progress) -> tuple[NDArray[np.float64], float]:
-        """Linear sRGB of the gratings, (height, width, 3), and seconds."""
+        """Return linear sRGB of the gratings, (height, width, 3), and seconds."""
         rows, columns = self.surface.shape
         per_dispatch = max(1, _SHADING_POINTS // samples)
         firsts = range(0, rows * columns, per_dispatch)
@@ -209,7 +209,7 @@ class Pictures:
         return self._averaged(points), time.perf_counter() - begin
 
     def _averaged(self, points: list[NDArray[np.float32]]) -> NDArray[np.float64]:
-        """The means over the pixels, (height, width, 3), of what `_shade` returns, as many points for each pixel."""
+        """Return the means over the pixels, (height, width, 3), of `_shade`, with equally many points per pixel."""
         rows, columns = self.surface.shape
         x, y, *rgb = (mi.Float(column) for column in np.concatenate(points, axis=1))
         channels = [dr.opaque(mi.Float, channel, shape=len(x)) for channel in range(3)]
@@ -220,7 +220,7 @@ class Pictures:
         return ratio(values[..., :3], values[..., 3:])
 
     def _shade(self, first: int, count: int, samples: int) -> NDArray[np.float32]:
-        """Shading points of `count` pixels, from `first` on: (5, n), position in the picture and linear sRGB."""
+        """Shade points of `count` pixels, from `first` on: (5, n), position in the picture and linear sRGB."""
         sensor = self.scene.sensors()[0]
         columns, rows = (int(size) for size in sensor.film().crop_size())
         sampler = mi.load_dict({"type": "multijitter", "sample_count": samples})
@@ -238,7 +238,7 @@ class Pictures:
 
 
 def _check_lights(scene: Path, parameters: Mapping[str, str] | None) -> None:
-    """Raise RequestError if the shader knows none of a scene's lights, before any spectrum is computed."""
+    """Raise RequestError if the shader supports none of a scene's lights, before any spectrum is computed."""
     if emitters_of(scene, parameters) & {"directional", "point"}:
         return
     text, advice = scene.read_text(encoding="utf-8", errors="replace"), ""
@@ -255,7 +255,7 @@ def _check_lights(scene: Path, parameters: Mapping[str, str] | None) -> None:
 
 
 def _channel_spectra() -> NDArray[np.float64]:
-    """b_c of `primary_spectra`, averaged over the hats of the film's channels: (n, 3).
+    """Return b_c of `primary_spectra`, averaged over the hats of the film's channels: (n, 3).
 
     b_c is linear between nodes that are the middles of the hats, so that the average is (b₋ + 4b + b₊)/6.
     """
@@ -266,7 +266,7 @@ def _channel_spectra() -> NDArray[np.float64]:
 
 
 def _shows_surfaces(scene: mi.Scene) -> NDArray[np.bool_]:
-    """Where each of 4 × 4 rays through a pixel meets a surface, (height, width)."""
+    """Return a mask of pixels of which all of 4 × 4 rays meet a surface, (height, width)."""
     sensor = scene.sensors()[0]
     columns, rows = sensor.film().crop_size()
     y, x = (np.mgrid[: 4 * rows, : 4 * columns].reshape(2, -1) + 0.5) / np.array([[4 * rows], [4 * columns]])

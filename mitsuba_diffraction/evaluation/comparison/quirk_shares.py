@@ -1,4 +1,4 @@
-"""How much of the difference each peculiarity of the published shader makes."""
+"""The share of each quirk of the published shader in the difference."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class QuirkShare:
 
     Attributes:
         drop: of the mean CIEDE2000 of the published shader, when this quirk alone is corrected.
-        rise: of the mean CIEDE2000 of the corrected shader, when this quirk alone is put in.
+        rise: of the mean CIEDE2000 of the corrected shader, when this quirk alone is added.
         share: (drop + rise)/2 over the mean CIEDE2000 of the published shader.
     """
 
@@ -44,15 +44,15 @@ class AgainstReference:
 class QuirkShares:
     """Shares of all quirks.
 
-    `drop` is what a quirk makes beside all others, `rise` what it makes alone; a share takes the mean of both. Shares
-    do not add up to one, and may be negative: two quirks may cancel each other, or one may hide behind another.
+    `drop` is the effect of a quirk beside all others, `rise` its effect alone; a share takes the mean of both. Shares
+    do not add up to one, and may be negative: two quirks may cancel, or one may mask another.
 
     Attributes:
         size: (width, height) of the pictures.
         samples: per pixel of the path tracer.
         shading_points: per pixel of the shader.
         path_traced: against the path tracer's picture.
-        same_light: against the project's model under the light that the shader knows.
+        same_light: against the project's model under the lights that the shader supports.
     """
 
     size: tuple[int, int]
@@ -63,7 +63,7 @@ class QuirkShares:
 
 
 def quirk_shares(pictures: Pictures, samples: int, shading_points: int, progress: Progress = silent) -> QuirkShares:
-    """Renders the shader with every single quirk corrected, and with every single quirk put in.
+    """Render the shader with each single quirk corrected, and with each single quirk added.
 
     Args:
         pictures: of a small size.
@@ -80,7 +80,7 @@ def quirk_shares(pictures: Pictures, samples: int, shading_points: int, progress
     white = white_luminance(references[0].xyz, pictures.surface)
 
     def distances(quirks: tuple[str, ...]) -> list[float]:
-        """To both references."""
+        """Compare with both references."""
         nonlocal done
         xyz = pictures.shaded(quirks, shading_points, samples).xyz
         done += 1

@@ -1,4 +1,4 @@
-"""What a comparison found: tables for the terminal, notes, JSON, and a figure."""
+"""Results of a comparison: tables for the terminal, notes, JSON, and a figure."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 def titles(comparison: Comparison) -> dict[str, str]:
-    """What the pictures are called."""
+    """Return the titles of the pictures."""
     shader = comparison.shader.upper()
     return {
         "path_traced": "path tracer, this model",
@@ -44,7 +44,7 @@ _TO_REFERENCE = {
 
 
 def picture_table(comparison: Comparison) -> Table:
-    """The pictures and their differences, for a terminal."""
+    """Return a table of the pictures and their differences, for a terminal."""
     columns = (*_TO_REFERENCE, "ΔE00 mean to\nsame light", "reads per\npoint", "samples\nper pixel", "seconds")
     rows = []
     for name, title in titles(comparison).items():
@@ -58,7 +58,7 @@ def picture_table(comparison: Comparison) -> Table:
 
 
 def quirk_table(comparison: Comparison) -> Table:
-    """The quirks, those that make the most first, for a terminal."""
+    """Return a table of the quirks, the largest share first, for a terminal."""
     shares = comparison.shares
     columns = ("quirk", "path tracer\ndrop", "\nrise", "\nshare", "same light\ndrop", "\nrise", "\nshare")
     rows = []
@@ -74,12 +74,12 @@ def quirk_table(comparison: Comparison) -> Table:
 
 
 def ordered(against: AgainstReference) -> list[str]:
-    """The quirks, the largest share first."""
+    """Sort the quirks, the largest share first."""
     return sorted(against.quirks, key=lambda name: against.quirks[name].share, reverse=True)
 
 
 def notes(comparison: Comparison) -> list[str]:
-    """What one must know to read the tables, a line each."""
+    """Return what one must know to read the tables, one line each."""
     rows, columns = comparison.surface.shape
     lines = [
         f"compared: the {100 * comparison.surface.mean():.0f} % of {columns} × {rows} pixels that show surfaces alone; "
@@ -129,7 +129,7 @@ def _difference(found: Difference) -> dict[str, float]:
 
 
 def as_dict(comparison: Comparison) -> dict[str, object]:
-    """All numbers, for `report.save_json`."""
+    """Return all numbers, for `report.save_json`."""
     shares = comparison.shares
     return {
         "scene": comparison.scene,
@@ -161,19 +161,19 @@ def as_dict(comparison: Comparison) -> dict[str, object]:
 
 
 def save_json(comparison: Comparison, path: str | os.PathLike[str]) -> None:
-    """Writes `as_dict`, whole or not at all."""
+    """Write `as_dict` atomically."""
     outputs.save_json(as_dict(comparison), path)
 
 
 def shown(comparison: Comparison, name: str) -> NDArray[np.uint8]:
-    """A picture of the comparison for a screen, at its exposure: (height, width, 3)."""
+    """Return a picture of the comparison for a display, at its exposure: (height, width, 3)."""
     found = comparison.to_path_traced.get(name)
     exposure = (1 if found is None else found.exposure) / comparison.white
     return on_screen(into_gamut(XYZ_to_linear_sRGB(comparison.pictures[name].xyz * exposure)))
 
 
 def figure(comparison: Comparison) -> Figure:
-    """The pictures side by side, below them their CIEDE2000 to the path tracer's, and the shares of the quirks."""
+    """Plot the pictures side by side, below them their CIEDE2000 to the path tracer's, and the shares of the quirks."""
     from matplotlib.figure import Figure
 
     aspect = comparison.surface.shape[0] / comparison.surface.shape[1]
@@ -204,7 +204,7 @@ def figure(comparison: Comparison) -> Figure:
 
 
 def _bars(panel: Axes, against: AgainstReference) -> None:
-    """`rise` and `drop` of the quirks."""
+    """Plot `rise` and `drop` of the quirks."""
     names = ordered(against)
     places = np.arange(len(names))
     for offset, attribute, colour, label in (
@@ -225,6 +225,6 @@ def _bars(panel: Axes, against: AgainstReference) -> None:
 
 
 def save_figure(comparison: Comparison, path: str | os.PathLike[str], dpi: float = 150) -> None:
-    """Writes `figure` as PNG, whole or not at all."""
+    """Write `figure` as PNG, atomically."""
     with whole_file(path) as temporary:
         figure(comparison).savefig(temporary, format="png", dpi=dpi, metadata=metadata(path))

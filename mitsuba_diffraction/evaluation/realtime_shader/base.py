@@ -41,13 +41,13 @@ class Shader:
         self.shadowing = shadowing
 
     def with_quirks(self, quirks: Quirks) -> Shader:
-        """The same shader with other quirks; tables are shared."""
+        """Return the same shader with other quirks; tables are shared."""
         other = copy.copy(self)
         other.quirks = quirks
         return other
 
     def weights(self, r_0: ArrayLike = PUBLISHED_R0, light: ArrayLike | None = None) -> SpectralWeights:
-        """The `SpectralWeights` of a material and a light."""
+        """Return the `SpectralWeights` of a material and a light."""
         return SpectralWeights(self.quirks, self.peak, r_0=r_0, light=light)
 
     @property
@@ -68,7 +68,7 @@ class Shader:
         active: mi.Bool = True,
         height_scale: mi.Float = 1.0,
     ) -> mi.Color3f:
-        """Linear RGB, before gamma.
+        """Return linear RGB, before gamma.
 
         Args:
             wi: ω_i.
@@ -105,7 +105,7 @@ class TextureShader(Shader):
         terms: int = PUBLISHED_TERMS,
         shadowing: bool = True,
     ) -> None:
-        """Computes the textures.
+        """Compute the textures.
 
         Args:
             height_field: the tile.
@@ -130,7 +130,7 @@ class TextureShader(Shader):
         return other
 
     def _bind(self) -> None:
-        """Sets up what depends on the quirks."""
+        """Set up everything that depends on the quirks."""
         from_zero = self.quirks.heights_from_zero
         if from_zero not in self._textures:
             texels, height = taylor_transforms(
@@ -154,21 +154,21 @@ class TextureShader(Shader):
         return 1 / (float(np.pi) * self.sigma**2)
 
     def power(self, gain: Gain, wavelength: mi.Float, height_scale: mi.Float, active: mi.Bool) -> mi.Float:
-        """|P(q; κ)|² at a wavelength in µm, one for a flat mirror at q = 0."""
+        """Evaluate |P(q; κ)|² at a wavelength in µm; it is one for a flat mirror at q = 0."""
         raise NotImplementedError
 
     def relative_radiance(self, wi: mi.Vector3f, wo: mi.Vector3f, wavelength: mi.Float) -> mi.Float:
-        """ρ(λ) at a wavelength in nm (eq. 3.11), for an index of 1.5, including shadowing."""
+        """Evaluate ρ(λ) at a wavelength in nm (eq. 3.11), for an index of 1.5, including shadowing."""
         gain = Gain(wi, wo, self.shadowing, mi.Bool(True))
         power = self.power(gain, mi.Float(wavelength) * 1e-3, mi.Float(1), gain.active)
         return gain.factor * self.fresnel(mi.Float(PUBLISHED_R0), gain) * power
 
     def fresnel(self, r_0: mi.Float, gain: Gain) -> mi.Float:
-        """F/F₀ or its square."""
+        """Return F/F₀ or its square."""
         return fresnel_ratio(r_0, gain.falloff, self.quirks.fresnel_squared)
 
     def integral(self, gain: Gain, weights: SpectralWeights, height_scale: mi.Float) -> mi.Color3f:
-        """∫ F/F₀ |P|² S (x̄, ȳ, z̄) dλ by the trapezoidal rule."""
+        """Integrate F/F₀ |P|² S (x̄, ȳ, z̄) over λ by the trapezoidal rule."""
         return trapezoid(self, self.power, gain, weights, height_scale, gain.active)
 
     def rgb(
@@ -202,7 +202,7 @@ def trapezoid(
     height_scale: mi.Float,
     active: mi.Bool,
 ) -> mi.Color3f:
-    """Σ_j F/F₀ power(λ_j) S (x̄, ȳ, z̄)(λ_j) Δλ over the 81 wavelengths, with half weight at both ends."""
+    """Return Σ_j F/F₀ power(λ_j) S (x̄, ȳ, z̄)(λ_j) Δλ over the 81 wavelengths, with half weight at both ends."""
     result = mi.Color3f(0)
     index = mi.UInt32(0)
     while active & (index < WAVELENGTH_COUNT):
@@ -216,7 +216,7 @@ def trapezoid(
 
 
 def check_whole(name: str, value: int, least: int) -> int:
-    """`value` as an int ≥ `least`, or ValueError."""
+    """Return `value` as an int; raise ValueError unless it is a whole number ≥ `least`."""
     if isinstance(value, bool) or not isinstance(value, Integral) or value < least:
         raise RequestError(f"{name}: got {value!r}, wanted a whole number ≥ {least}")
     return int(value)

@@ -1,4 +1,4 @@
-"""Evaluates the shader for NumPy arrays of directions."""
+"""Evaluation of the shader for NumPy arrays of directions."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ VARIANTS = {"flss": FLSS, "nmm": NMM, "pq": PQ, "gem": GEM}
 
 
 def shader_for(height_field: HeightField, variant: str, quirks: Quirks, **settings: object) -> Shader:
-    """The shader of a given name (`VARIANTS`) in the current Mitsuba variant.
+    """Return the shader of a given name (`VARIANTS`) in the current Mitsuba variant.
 
     Raises:
         ValueError: if the name is unknown, or no vectorised Mitsuba variant is set.
@@ -42,7 +42,7 @@ def colour(
     quirks: Quirks | None = None,
     **settings: object,
 ) -> NDArray[np.float32]:
-    """The colour of a tile with an index of 1.5 under D65, as computed by the shader.
+    """Compute the shader's colour of a tile with an index of 1.5 under D65.
 
     Args:
         height_field: the tile.
@@ -73,7 +73,7 @@ def relative_radiance(
     quirks: Quirks | None = None,
     **settings: object,
 ) -> NDArray[np.float32]:
-    """ρ(λ), the radiance relative to that of a flat mirror at normal incidence (eq. 3.11), for an index of 1.5.
+    """Compute ρ(λ), the radiance relative to a flat mirror at normal incidence (eq. 3.11), for an index of 1.5.
 
     Args:
         height_field: the tile.
@@ -101,7 +101,7 @@ def relative_radiance(
 
 
 def _directions(wi: ArrayLike, wo: ArrayLike) -> tuple[mi.Vector3f, mi.Vector3f, tuple[int, ...]]:
-    """Two arrays (..., 3) of directions as Dr.Jit arrays, and the shape (...)."""
+    """Return two arrays (..., 3) of directions as Dr.Jit arrays, and the shape (...)."""
     wi, wo = (np.asarray(omega, np.float32) for omega in (wi, wo))
     if wi.shape[-1:] != (3,) or wo.shape[-1:] != (3,):
         raise RequestError(f"wi, wo: got shapes {wi.shape} and {wo.shape}, wanted (..., 3)")

@@ -43,13 +43,13 @@ class FLSS(TextureShader):
         return self.windowed(gain, x, y, wavelength, height_scale, self.window(x, y), active)
 
     def position(self, gain: Gain, wavelength: mi.Float) -> tuple[mi.Float, mi.Float]:
-        """c, in texels relative to frequency zero."""
+        """Return c, in texels relative to frequency zero."""
         return gain.u * self.tile_size[0] / wavelength, gain.v * self.tile_size[1] / wavelength
 
     def window(
         self, x: mi.Float, y: mi.Float, stretch_x: mi.Float = 1.0, stretch_y: mi.Float = 1.0
     ) -> Callable[[mi.Int32, mi.Int32], mi.Float]:
-        """φ of the texels m, with distances along x and y scaled by the given factors."""
+        """Return φ of the texels m, with distances along x and y scaled by the given factors."""
         height = float(np.pi) if self.quirks.window_pi else 1.0
         scale = 1 / (float(np.sqrt(2)) * self.sigma)
 
@@ -71,7 +71,7 @@ class FLSS(TextureShader):
         active: mi.Bool,
         reach: int = REACH,
     ) -> mi.Float:
-        """|Σ φ F|² or Σ φ² |F|² around the position (x, y)."""
+        """Return |Σ φ F|² or Σ φ² |F|² around the position (x, y)."""
         anchor = dr.floor if self.quirks.floor_anchor else dr.round
         # Far outside the texture nothing is read; clamping keeps the conversion in range.
         first = tuple(mi.Int32(dr.clip(anchor(c), -1e6, 1e6)) - reach for c in (x, y))

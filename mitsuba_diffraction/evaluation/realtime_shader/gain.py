@@ -11,13 +11,13 @@ PUBLISHED_R0 = 0.04  # an index of 1.5, close to that of snake skin
 
 
 def schlick_falloff(cos_half: mi.Float) -> mi.Float:
-    """(1 − ω_o·h)⁵ (Schlick 1994; eq. B.1): F = R₀ + (1 − R₀)(1 − ω_o·h)⁵."""
+    """Return (1 − ω_o·h)⁵ (Schlick 1994; eq. B.1): F = R₀ + (1 − R₀)(1 − ω_o·h)⁵."""
     away = 1 - cos_half
     return dr.square(dr.square(away)) * away
 
 
 def fresnel_ratio(r_0: mi.Float, falloff: mi.Float, squared: bool) -> mi.Float:
-    """F(ω_o·h)/F(1), or its square."""
+    """Return F(ω_o·h)/F(1), or its square."""
     ratio = (r_0 + (1 - r_0) * falloff) / r_0
     return dr.square(ratio) if squared else ratio
 

@@ -45,7 +45,7 @@ class GEM(Shader):
         roughness: float = 5.0,
         shadowing: bool = True,
     ) -> None:
-        """The default of d is the period of the strongest component of the heights along x."""
+        """Set up the shader; d defaults to the period of the strongest component of the heights along x."""
         super().__init__(height_field, quirks, shadowing)
         self.spacing = strongest_period(height_field) if spacing is None else spacing
         self.roughness = roughness
@@ -81,7 +81,7 @@ class GEM(Shader):
 
 
 def strongest_period(height_field: HeightField) -> float:
-    """The period along x, in µm, of the strongest Fourier component of the heights; that of the tile if flat."""
+    """Return the period along x (µm) of the strongest Fourier component of the heights; that of the tile if flat."""
     power = np.abs(scipy.fft.rfft(height_field.centred - height_field.centred.mean(), axis=1)) ** 2
     orders = power.sum(axis=0)[1:]
     if orders.size == 0 or orders.max() == 0:

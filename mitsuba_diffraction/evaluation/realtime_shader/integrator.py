@@ -60,7 +60,7 @@ class Prepared:
 
 
 def define() -> type:
-    """The plugin class for the current variant, to which its base class belongs."""
+    """Define the plugin class for the current variant, to which its base class belongs."""
 
     class DiffractionShader(mi.SamplingIntegrator):
         __doc__ = MANUAL
@@ -83,12 +83,12 @@ def define() -> type:
             self.prepared: Prepared | None = None
 
         def take(self, quirks: Quirks) -> None:
-            """Sets the quirks for the next `prepare`; existing textures are kept."""
+            """Set the quirks for the next `prepare`; existing textures are kept."""
             self.quirks = quirks
             self._shaders = [(grating, shader.with_quirks(quirks)) for grating, shader in self._shaders]
 
         def prepare(self, scene: mi.Scene) -> Prepared:
-            """Reads the lights and the gratings of a scene.
+            """Read the lights and the gratings of a scene.
 
             Raises:
                 ValueError: if the shader does not support them.
@@ -133,7 +133,7 @@ def define() -> type:
         def shade(
             self, scene: mi.Scene, ray: mi.RayDifferential3f, active: mi.Bool = True
         ) -> tuple[mi.Color3f, mi.UnpolarizedSpectrum, mi.Bool]:
-            """Shades the surface hit by a ray.
+            """Shade the surface hit by a ray.
 
             Returns:
                 Linear sRGB of gratings from the shader; radiance of all other BSDFs, per nm at the wavelengths of the
@@ -201,10 +201,10 @@ def _boolean(props: mi.Properties, name: str, default: bool) -> bool:
 
 
 def _settings(variant: str) -> tuple[str, ...]:
-    """The parameters specific to a variant of the shader."""
+    """Return the parameters specific to a variant of the shader."""
     return {"pq": ("terms", "interpolation"), "gem": ("spacing", "roughness")}.get(variant, ("terms",))
 
 
 def _normal_reflectance(layers: Layers) -> NDArray[np.float64]:
-    """R at normal incidence at `tristimulus.wavelengths`, (401,)."""
+    """Return R at normal incidence at `tristimulus.wavelengths`, (401,)."""
     return spectrum_of(lambda si: layers.grating.theory.material(si, mi.Float(1), mi.Bool(True)))

@@ -15,7 +15,7 @@ from .tristimulus import wavelengths
 
 
 def spectrum_of(evaluate: Callable[[mi.SurfaceInteraction3f], mi.UnpolarizedSpectrum]) -> NDArray[np.float64]:
-    """A spectral function of a SurfaceInteraction3f, evaluated at `tristimulus.wavelengths`: (401,)."""
+    """Evaluate a spectral function of a SurfaceInteraction3f at `tristimulus.wavelengths`: (401,)."""
     nanometres, channels = wavelengths(), len(mi.UnpolarizedSpectrum(0))
     groups = np.resize(nanometres, (-(-nanometres.size // channels), channels))
     found = []
@@ -51,14 +51,14 @@ class Light:
     def sample(
         self, si: mi.SurfaceInteraction3f, active: mi.Bool
     ) -> tuple[mi.DirectionSample3f, mi.Float, mi.UnpolarizedSpectrum]:
-        """Direction of the light, the factor of `spectrum`, and the irradiance at the wavelengths of the ray."""
+        """Return direction of the light, factor of `spectrum`, and irradiance at the wavelengths of the ray."""
         ds, value = self.emitter.sample_direction(si, mi.Point2f(0.5), active)
         falloff = dr.rcp(dr.square(ds.dist)) if self.at_point else mi.Float(1)
         return ds, falloff, mi.unpolarized_spectrum(value)
 
 
 def lights_of(scene: mi.Scene) -> list[Light]:
-    """The directional and point lights of a scene; others are ignored.
+    """Return the directional and point lights of a scene; others are ignored.
 
     Raises:
         ValueError: if there is none.

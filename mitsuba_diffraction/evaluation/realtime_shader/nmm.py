@@ -54,7 +54,7 @@ class NMM(FLSS):
         last = mi.Int32(dr.floor(path / SHORTEST))
 
         def share(n: mi.Int32) -> tuple[mi.Float, mi.Float]:
-            """λ_n in nm, and |P|² times the width in nm that it represents."""
+            """Return λ_n in nm, and |P|² times the width in nm that it represents."""
             wavelength = path / mi.Float(n)
             x, y = self.position(gain, wavelength * 1e-3)
             if self.quirks.no_jacobian:
@@ -72,7 +72,7 @@ class NMM(FLSS):
     def _own_line(
         self, x: mi.Float, y: mi.Float, along_x: mi.Bool, tilt: mi.Float
     ) -> Callable[[mi.Int32, mi.Int32], mi.Float]:
-        """φ at the distance p, for the texels whose order along the main axis is the closest."""
+        """Return φ at the distance p, for the texels whose order along the main axis is the closest."""
         phi = self.window(x, y, dr.select(along_x, 0, tilt), dr.select(along_x, tilt, 0))
         main = dr.round(dr.select(along_x, x, y))
 
@@ -82,7 +82,7 @@ class NMM(FLSS):
         return own
 
     def _order_zero(self, gain: Gain, wavelength: mi.Float, height_scale: mi.Float, active: mi.Bool) -> mi.Float:
-        """φ² |F_0|²."""
+        """Return φ² |F_0|²."""
         x, y = self.position(gain, wavelength)
         zero = mi.Float(0)
         return self.windowed(gain, zero, zero, wavelength, height_scale, self.window(x, y), active, reach=0)
@@ -97,7 +97,7 @@ def _over_orders(
     gain: Gain,
     weights: SpectralWeights,
 ) -> mi.Color3f:
-    """Σ_n F/F₀ share(n) S (x̄, ȳ, z̄)(λ_n)."""
+    """Return Σ_n F/F₀ share(n) S (x̄, ȳ, z̄)(λ_n)."""
     result = mi.Color3f(0)
     n = mi.Int32(first)
     while gain.active & (n <= last):

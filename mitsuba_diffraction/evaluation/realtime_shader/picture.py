@@ -12,7 +12,7 @@ from .tristimulus import EMISSION, primary_spectra
 
 
 def encode(rgb: mi.Color3f, power_gamma: bool) -> mi.Color3f:
-    """Linear RGB to display values: a power of 1/2.2, or the transfer function of sRGB (IEC 61966-2-1)."""
+    """Encode linear RGB for a display: a power of 1/2.2, or the transfer function of sRGB (IEC 61966-2-1)."""
     rgb = dr.maximum(rgb, 0)
     if power_gamma:
         return dr.power(rgb, 1 / 2.2)
@@ -20,7 +20,7 @@ def encode(rgb: mi.Color3f, power_gamma: bool) -> mi.Color3f:
 
 
 def decode(encoded: mi.Color3f) -> mi.Color3f:
-    """The linear sRGB that an sRGB display emits for these values."""
+    """Return the linear sRGB that an sRGB display emits for these values."""
     return dr.select(encoded <= 0.04045, encoded / 12.92, dr.power((encoded + 0.055) / 1.055, 2.4))
 
 
@@ -32,7 +32,7 @@ class Emission:
         self.table = PacketTable(np.concatenate([spectra, np.zeros((len(spectra), 1))], axis=1))
 
     def __call__(self, rgb: mi.Color3f, wavelengths: mi.UnpolarizedSpectrum, active: mi.Bool) -> mi.UnpolarizedSpectrum:
-        """Per nm, at the wavelengths of a ray, in nm."""
+        """Evaluate the spectrum, per nm, at the wavelengths of a ray, in nm."""
         result = mi.UnpolarizedSpectrum(0)
         first, spacing = float(EMISSION[0]), float(EMISSION[1] - EMISSION[0])
         for channel in range(len(result)):

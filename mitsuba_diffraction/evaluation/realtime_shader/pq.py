@@ -46,7 +46,7 @@ class PQ(TextureShader):
         reach: int = 1,
         **settings: object,
     ) -> None:
-        """As TextureShader, and:
+        """Set up the shader with the arguments of `TextureShader` and those below.
 
         Args:
             tiles: (P, Q); default: as many as the coherence length covers.
@@ -88,7 +88,7 @@ class PQ(TextureShader):
         return dr.select(active, tile * tiling_power(x, y, self.tiles, self.quirks.wrong_product), 0)
 
     def _kernel(self, x: mi.Float, y: mi.Float) -> Callable[[mi.Int32, mi.Int32], mi.Float]:
-        """The weight of texel m at the position (x, y)."""
+        """Return the weight of texel m at the position (x, y)."""
         counts = self.textures.columns, self.textures.rows
 
         def linear(m_x: mi.Int32, m_y: mi.Int32) -> mi.Float:

@@ -55,15 +55,15 @@ class Quirks:
 
     @classmethod
     def names(cls) -> tuple[str, ...]:
-        """The names of all quirks."""
+        """Return the names of all quirks."""
         return tuple(field.name for field in fields(cls))
 
     @classmethod
     def as_published(cls) -> Quirks:
-        """All on."""
+        """Return all quirks switched on."""
         return cls(**dict.fromkeys(cls.names(), True))
 
     @classmethod
     def corrected(cls) -> Quirks:
-        """All off."""
+        """Return all quirks switched off."""
         return cls(**dict.fromkeys(cls.names(), False))

@@ -24,7 +24,7 @@ class SpectralWeights:
         r_0: ArrayLike = PUBLISHED_R0,
         light: ArrayLike | None = None,
     ) -> None:
-        """Builds the table.
+        """Build the table.
 
         For the irradiance E(λ) per nm and the relative radiance ρ(λ), the colour is ∫ ρ E (x̄, ȳ, z̄) dλ / ∫ȳ dλ.
         Absolute radiance has the additional factor R₀ S(0)/λ², where S(0) is the density of a flat surface at q = 0.
@@ -46,14 +46,14 @@ class SpectralWeights:
         self.table = PacketTable(np.concatenate([weights, r_0[:, None]], axis=1))
 
     def __call__(self, wavelength: mi.Float, active: mi.Bool) -> tuple[mi.Color3f, mi.Float]:
-        """(X, Y, Z) per nm, and R₀, at a wavelength in nm; zero outside 380 to 780 nm."""
+        """Return (X, Y, Z) per nm, and R₀, at a wavelength in nm; zero outside 380 to 780 nm."""
         active = active & (wavelength >= SHORTEST - 1e-3) & (wavelength <= LONGEST + 1e-3)
         value = interpolated(self.table, wavelength - SHORTEST, int(LONGEST - SHORTEST), active)
         return mi.Color3f(value.x, value.y, value.z), value.w
 
 
 def interpolated(table: PacketTable, place: mi.Float, last: int, active: mi.Bool) -> mi.Vector4f:
-    """The packets 0 … `last` of a table, linearly interpolated at `place` and constant beyond; zero if not `active`."""
+    """Return packets 0 … `last` of a table, linear at `place`, constant beyond the ends, and zero if not `active`."""
     place = dr.clip(place, 0, last)
     index = mi.UInt32(dr.minimum(place, last - 1))
     below, above = table(index, active), table(index + 1, active)

@@ -31,16 +31,16 @@ class Surface:
     side: int
 
     def is_of(self, bsdf: mi.BSDF) -> mi.Bool:
-        """Whether a point has the BSDF of this surface."""
+        """Return whether a point has the BSDF of this surface."""
         return bsdf == mi.BSDFPtr(self.bsdf) if dr.is_jit_v(mi.Float) else mi.Bool(bsdf is self.bsdf)
 
     def holds(self, bsdf: mi.BSDF, wo: mi.Vector3f) -> mi.Bool:
-        """Whether a point with this BSDF, seen from ω_o, lies on this side of this surface."""
+        """Return whether a point with this BSDF, seen from ω_o, lies on this side of this surface."""
         return self.is_of(bsdf) & (self.side * wo.z > 0)
 
 
 def surfaces_of(scene: mi.Scene) -> list[Surface]:
-    """All gratings of a scene.
+    """Return all gratings of a scene.
 
     Raises:
         ValueError: if a grating is nested in a BSDF other than `twosided`, or is of rigorous theory.

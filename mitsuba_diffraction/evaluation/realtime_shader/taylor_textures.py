@@ -20,7 +20,7 @@ PUBLISHED_TERMS = 37  # 81 wavelengths × 37 terms × 9 texels are the 27,000 re
 def taylor_transforms(
     height_field: HeightField, terms: int, *, heights_from_zero: bool, origin_at_centre: bool
 ) -> tuple[NDArray[np.complex64], float]:
-    """F{tⁿ}(m) with t = h/H, n < N; |t| ≤ 1 bounds them by one.
+    """Compute F{tⁿ}(m) with t = h/H, n < N; |t| ≤ 1 bounds them by one.
 
     Args:
         height_field: the tile, h.
@@ -64,13 +64,13 @@ class TaylorTextures:
     """
 
     def __init__(self, texels: NDArray[np.complex64], height: float) -> None:
-        """Takes what `taylor_transforms` returns."""
+        """Store the result of `taylor_transforms`."""
         self.rows, self.columns, self.terms = texels.shape
         self.height = opaque(height)
         self.table = PacketTable(np.stack([texels.real, texels.imag], axis=-1), width=2)
 
     def amplitude(self, m_x: mi.Int32, m_y: mi.Int32, kappa: mi.Float, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
-        """Real and imaginary part of F_m(κ); zero where the order lies outside the texture."""
+        """Return real and imaginary part of F_m(κ); zero where the order lies outside the texture."""
         column, row = m_x + self.columns // 2, m_y + self.rows // 2
         held = active & (column >= 0) & (column < self.columns) & (row >= 0) & (row < self.rows)
         first = mi.UInt32(dr.select(held, (row * self.columns + column) * self.terms, 0))
@@ -84,7 +84,7 @@ class TaylorTextures:
         weight: Callable[[mi.Int32, mi.Int32], mi.Float],
         active: mi.Bool,
     ) -> tuple[mi.Float, mi.Float]:
-        """|Σ_m φ_m F_m(κ)|² and Σ_m φ_m² |F_m(κ)|² over a rectangle of texels.
+        """Return |Σ_m φ_m F_m(κ)|² and Σ_m φ_m² |F_m(κ)|² over a rectangle of texels.
 
         Args:
             first: the texel of lowest order along x and y.
@@ -100,7 +100,7 @@ class TaylorTextures:
 def _taylor_series(
     table: PacketTable, first: mi.UInt32, x: mi.Float, terms: int, active: mi.Bool
 ) -> tuple[mi.Float, mi.Float]:
-    """Σ_n (ix)ⁿ/n! B_n."""
+    """Return Σ_n (ix)ⁿ/n! B_n."""
     re, im = mi.Float(0), mi.Float(0)
     # (ix)ⁿ/n!
     c_re, c_im = mi.Float(1), mi.Float(0)

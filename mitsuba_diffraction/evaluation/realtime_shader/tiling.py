@@ -9,7 +9,7 @@ _AT_INTEGER = 2.0**-13.5  # a quarter of √ε in float32
 
 
 def tile_factor(x: mi.Float, count: int) -> mi.Float:
-    """D(x; N) = sin(πNx)/sin(πx), as derived in `mitsuba_diffraction.reference.tile_factor`.
+    """Compute D(x; N) = sin(πNx)/sin(πx), as derived in `mitsuba_diffraction.reference.tile_factor`.
 
     With k the integer nearest to x and r = x − k,
 
@@ -28,7 +28,7 @@ def tile_factor(x: mi.Float, count: int) -> mi.Float:
 
 
 def tile_sum(x: mi.Float, count: int) -> tuple[mi.Float, mi.Float]:
-    """p + iq = Σ_{n<N} e^{−2πinx} = e^{−πi(N−1)x} D(x; N) (eq. 3.36, 3.45), stable where the thesis has 0/0."""
+    """Return p + iq = Σ_{n<N} e^{−2πinx} = e^{−πi(N−1)x} D(x; N) (eq. 3.36, 3.45), stable where the thesis has 0/0."""
     k = dr.round(x)
     r = x - k
     # e^{−πi(N−1)k} = (−1)^{k(N−1)} cancels the same sign in D.
@@ -39,7 +39,7 @@ def tile_sum(x: mi.Float, count: int) -> tuple[mi.Float, mi.Float]:
 
 
 def tiling_power(x: mi.Float, y: mi.Float, counts: tuple[int, int], wrong_product: bool) -> mi.Float:
-    """p² + q² of (p₁ + iq₁)(p₂ + iq₂), divided by the squared number of tiles, i.e. one at integer x and y.
+    """Return p² + q² of (p₁ + iq₁)(p₂ + iq₂) over the squared number of tiles: one at integer x and y.
 
     Args:
         x: q_x T_x.

@@ -22,13 +22,13 @@ FLAT = 106.857
 
 
 def wavelengths() -> NDArray[np.float64]:
-    """The nodes of the tables below, 1 nm apart: (401,), nm."""
+    """Return the nodes of the tables below, 1 nm apart: (401,), nm."""
     return np.arange(SHORTEST, LONGEST + 0.5)
 
 
 @lru_cache(maxsize=1)
 def d65_weights() -> NDArray[np.float64]:
-    """S(λ) (x̄, ȳ, z̄) of the illuminant D65 (CIE 15:2018), (401, 3) per nm.
+    """Return S(λ) (x̄, ȳ, z̄) of the illuminant D65 (CIE 15:2018), (401, 3) per nm.
 
     Normalised to Y = 1 for the integral of the shader, the trapezoidal rule at 5 nm.
     """
@@ -37,17 +37,17 @@ def d65_weights() -> NDArray[np.float64]:
 
 
 def light_weights(spectrum: ArrayLike) -> NDArray[np.float64]:
-    """S(λ) (x̄, ȳ, z̄)/∫ȳ dλ of a light with the spectrum S at `wavelengths`, (401,) per nm: (401, 3) per nm."""
+    """Return S(λ) (x̄, ȳ, z̄)/∫ȳ dλ, (401, 3) per nm, for the spectrum S of a light at `wavelengths`, (401,) per nm."""
     return np.asarray(spectrum, np.float64)[:, None] * matching_functions(wavelengths()) / FLAT
 
 
 def d65_white() -> NDArray[np.float64]:
-    """XYZ of D65 by the integral of the shader, Y = 1: (3,)."""
+    """Return XYZ of D65 by the integral of the shader, Y = 1: (3,)."""
     return np.trapezoid(d65_weights()[:: int(STEP)], dx=STEP, axis=0)
 
 
 def rgb_matrix(*, cie_rgb_matrix: bool, d65_twice: bool) -> NDArray[np.float64]:
-    """(3, 3): XYZ → linear RGB, M or, eq. 4.10, M diag(D65). M is CIE RGB or sRGB (IEC 61966-2-1)."""
+    """Return the matrix XYZ → linear RGB: M or, eq. 4.10, M diag(D65), where M is CIE RGB or sRGB (IEC 61966-2-1)."""
     import colour
 
     matrix = CIE_RGB if cie_rgb_matrix else colour.RGB_COLOURSPACES["sRGB"].matrix_XYZ_to_RGB
@@ -60,7 +60,7 @@ EMISSION = np.arange(VISIBLE[0], VISIBLE[1] + 0.5, 5.0)
 
 @lru_cache(maxsize=1)
 def primary_spectra() -> NDArray[np.float64]:
-    """Spectra b_c(λ) of the sRGB primaries at `EMISSION`, piecewise linear: (95, 3).
+    """Return spectra b_c(λ) of the sRGB primaries at `EMISSION`, piecewise linear: (95, 3).
 
     The spectrum Σ_c RGB_c b_c(λ) has the colour RGB. b_c is the non-negative spectrum of least power, whose smoothness
     keeps the noise of wavelength sampling low.

@@ -1,6 +1,6 @@
 """Gratings of which scalar theory is known in closed form, evaluated through the BSDF.
 
-Where light leaves (the grating equation), how much of it (the orders' powers), and that none appears from nowhere.
+Directions of the orders (the grating equation), their powers, and energy conservation.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ NARROW = {"coherence_length": 200.0}  # µm: η_m(κ), K and G change little ove
 
 
 def compare_directions(height_field: HeightField, theta: float, phi: float) -> Record:
-    """Peaks of the BSDF over the whole hemisphere, against u = −ω_i,x − mλ/period, v = −ω_i,y; the period is 2.5 µm."""
+    """Compare peaks of the BSDF over the hemisphere with u = −ω_i,x − mλ/period, v = −ω_i,y; the period is 2.5 µm."""
     spectrum = spectrum_of(height_field, **NARROW)
     bsdf = grating(spectrum, conserve=False)
     wi = direction(theta, phi)
@@ -47,9 +47,9 @@ def compare_directions(height_field: HeightField, theta: float, phi: float) -> R
 
 
 def _peaks(bsdf: object, wi: Array, wavelength: float, width: float) -> list[Array]:
-    """Centres (u, v) of the lobes found by looking everywhere, two lobe widths apart, at up to 70 degrees.
+    """Return centres (u, v) of all lobes, two lobe widths apart, at up to 70 degrees, by an exhaustive search.
 
-    The mean of (u, v) weighted by f/(K G), which removes the variation of K G over a lobe.
+    A centre is the mean of (u, v) weighted by f/(K G), which removes the variation of K G over a lobe.
     """
 
     def look(u: Array, v: Array) -> Array:
@@ -79,7 +79,7 @@ def _peaks(bsdf: object, wi: Array, wavelength: float, width: float) -> list[Arr
 def compare_orders(
     height_field: HeightField, closed_form: Callable[[Array, Array], Array], azimuth: float = 0.0
 ) -> Record:
-    """η_m of the orders that leave at up to 80 degrees; `closed_form` takes m (n, 2) and κ (n,)."""
+    """Compare η_m of the orders at up to 80° with `closed_form`, which takes m (n, 2) and κ (n,)."""
     spectrum = spectrum_of(height_field, **NARROW)
     bsdf = grating(spectrum, conserve=False)
     expected, found = [], []
@@ -95,7 +95,7 @@ def compare_orders(
 
 
 def _binary(m: Array, kappa: Array, depth: float) -> Array:
-    """cos²(κd/2) in the mirror order, (2/πm)² sin²(κd/2) in odd ones, nothing in even ones; half duty."""
+    """Return cos²(κd/2) for the specular order, (2/πm)² sin²(κd/2) for odd orders, zero for even ones; half duty."""
     odd = m[:, 0] % 2 == 1
     with np.errstate(divide="ignore"):
         share = np.where(odd, (2 / (np.pi * m[:, 0])) ** 2, 0) * np.sin(kappa * depth / 2) ** 2
@@ -103,7 +103,7 @@ def _binary(m: Array, kappa: Array, depth: float) -> Array:
 
 
 def _literature() -> Record:
-    """Binary, phase π between ridge and groove: orders of light that enters n = 1.5, found by FDTD by others."""
+    """Compare orders of a binary grating of phase π, transmitted into n = 1.5, with published FDTD results."""
     # n − 1 = 1/2 times 0.5 µm delays by half of 0.5 µm; in reflection at normal incidence a depth of λ/4 does.
     transmitted = 1 - 0.04
     published = np.array([0.3891, 0.0429, 0.0152, 0.0076]) / transmitted
@@ -118,7 +118,7 @@ def _literature() -> Record:
 
 
 def _flat() -> Record:
-    """K N(q; σ_q²)/λ² of a flat mirror, as a share of its peak, out to 3 σ_q."""
+    """Compare a flat mirror with K N(q; σ_q²)/λ² as a share of its peak, out to 3 σ_q."""
     spectrum = spectrum_of(HeightField(np.zeros((1, 4)), 0.05, "flat mirror"))
     bsdf = grating(spectrum)
     sigma = lobe_width(spectrum.coherence_length)
@@ -138,12 +138,12 @@ SINUSOID, BLAZE = gratings.sinusoidal(PERIOD, 0.3), gratings.blazed(PERIOD, 0.25
 
 
 def sinusoid_orders(m: Array, kappa: Array) -> Array:
-    """J_m²(κ depth/2) (Jacobi–Anger)."""
+    """Return J_m²(κ depth/2) (Jacobi–Anger)."""
     return jv(m[:, 0], kappa * 0.15) ** 2
 
 
 def blaze_orders(m: Array, kappa: Array) -> Array:
-    """sinc²(m − κ depth/2π)."""
+    """Return sinc²(m − κ depth/2π)."""
     return np.sinc(m[:, 0] - kappa * 0.25 / (2 * np.pi)) ** 2
 
 

@@ -30,11 +30,11 @@ class BRDFMap:
         method: one of `MAP_METHODS`.
         projection: "hemisphere": a disc, the radius θ_o and the angle φ_o of the direction to the viewer. "uv": the
             plane of (u, v), minus the sums of the direction cosines of light and viewer, where an order m of a tile
-            stands at (u, v) = λ m/T wherever the light is.
+            lies at (u, v) = λ m/T for any direction of the light.
         incidence: (θ_i, φ_i) in degrees.
         x, y: (side,) centres of the pixels: θ_o cos φ_o and θ_o sin φ_o in degrees, or u and v.
         rgb: (side, side, 3) linear sRGB, rows ↔ y; NaN where there is no direction above the surface.
-        exposure: what `picture` multiplies with.
+        exposure: the factor of `picture`.
     """
 
     surface: PublishedSurface
@@ -52,7 +52,7 @@ class BRDFMap:
         return np.where(np.isnan(self.rgb), 0.5, on_screen(into_gamut(self.rgb) * self.exposure) / 255)
 
     def places_of_orders(self, nanometres: Array, orders: Array) -> tuple[Array, Array]:
-        """Where the grating equation with the published period puts the orders, in the map's x and y.
+        """Return the orders by the grating equation with the published period, in the map's x and y.
 
         The direction cosines of light and viewer along the diffracting axis add up to −nλ/d, across it to zero.
 
@@ -82,13 +82,13 @@ def brdf_map(
     side: int = 240,
     quirks: Quirks | None = None,
 ) -> BRDFMap:
-    """Evaluates a surface over the outgoing hemisphere under D65.
+    """Evaluate a surface over the outgoing hemisphere under D65.
 
     The model's relative reflectance, at every 5 nm, becomes XYZ and sRGB; the shader's variants give their own linear
-    RGB. Each map has the exposure of its own that `color.auto_exposure` finds, and says it.
+    RGB. Each map has its own exposure by `color.auto_exposure`, and stores it.
 
     Args:
-        surface: what to look at.
+        surface: the surface.
         method: one of `MAP_METHODS`.
         projection: one of `PROJECTIONS`.
         incidence: (θ_i, φ_i) in degrees, φ_i from the x axis.
@@ -96,7 +96,7 @@ def brdf_map(
         quirks: of the shader; as published if none are given.
 
     Raises:
-        ValueError: if an argument makes no sense, or Mitsuba has no vectorised spectral variant set.
+        ValueError: if an argument is wrong, or Mitsuba has no vectorised spectral variant set.
     """
     if method not in MAP_METHODS:
         raise RequestError(f"method: got {method!r}, wanted one of {', '.join(MAP_METHODS)}")
@@ -133,6 +133,6 @@ def _linear_rgb(surface: PublishedSurface, method: str, wi: Array, wo: Array, qu
 
 
 def _over_angle(cosines: Array, radius: Array) -> Array:
-    """Direction cosines (..., 2) of length `radius` → (θ cos φ, θ sin φ) in degrees."""
+    """Convert direction cosines (..., 2) of length `radius` to (θ cos φ, θ sin φ) in degrees."""
     theta = np.rad2deg(np.arcsin(np.minimum(radius, 1)))
     return cosines * np.divide(theta, radius, out=np.full_like(radius, np.rad2deg(1)), where=radius > 0)[..., None]

@@ -7,12 +7,12 @@ Regular: one pit for every stretch s of a track. Then there are orders only,
 
     η_m = |δ_m + c B(m_x/t, m_y/s)/(ts)|².
 
-Random: along every track each stretch b holds a pit with the probability p, as data do. The mean field has the orders
+Random: along every track each stretch b holds a pit with the probability p. The mean field has the orders
 of the tracks alone; the variance scatters light along them, between the orders of the tracks:
 
     S(q) = Σ_m |δ_m + cp · a/t · sinc(ma/t)|² δ(q_x − m/t) δ(q_y) + |c|² p(1 − p) |B(q)|²/(tb).
 
-p is counted. A surface of pixels of size s has sums for integrals: sinc(aq) becomes sinc(aq)/sinc(sq).
+p is that of the drawn data. On pixels of size s, integrals are sums: sinc(aq) becomes sinc(aq)/sinc(sq).
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ DEVIATIONS = 3.0
 
 
 def regular() -> HeightField:
-    """One pit, (N_y, N_x)."""
+    """Return the heights of one pit, (N_y, N_x)."""
     columns, rows = round(TRACK / FINE), round(STRETCH / FINE)
     heights = np.zeros((rows, columns))
     heights[: round(LENGTH / FINE), : round(WIDTH / FINE)] = -DEPTH
@@ -50,12 +50,12 @@ def regular() -> HeightField:
 
 @functools.cache
 def data(seed: int = 0) -> NDArray[np.bool_]:
-    """Where there are pits, (stretches, tracks)."""
+    """Draw the data: a mask of pits, (stretches, tracks)."""
     return np.random.default_rng(seed).random((STRETCHES, TRACKS)) < 0.5
 
 
 def random() -> HeightField:
-    """A piece of a disc with random data."""
+    """Return a piece of a disc with random data."""
     track = np.zeros(round(TRACK / COARSE))
     track[: round(WIDTH / COARSE)] = -DEPTH
     heights = np.kron(data(), np.ones((round(LENGTH / COARSE), 1)) * track)
@@ -72,7 +72,7 @@ def _regular() -> Record:
 
 
 def _contrast(kappa: Array) -> NDArray[np.complex128]:
-    """c."""
+    """Return c."""
     return np.exp(-1j * kappa * DEPTH) - 1
 
 
@@ -82,7 +82,7 @@ def _spectrum() -> GratingSpectrum:
 
 
 def _seen(q: Array, wavelength: float) -> tuple[Array, NDArray[np.complex128]]:
-    """S as the BSDF shows it for light along the normal, and c of κ there."""
+    """Return S as the BSDF shows it at normal incidence, and c of κ there."""
     wi = direction(0)
     wo = towards(wi, q, wavelength)
     kappa = 2 * np.pi * (1 + wo[..., 2]) / wavelength
@@ -99,13 +99,13 @@ def _between(q: Array, c: Array) -> Array:
 
 
 def _size() -> float:
-    """µm² that Welch's windows weigh alike: their centres keep 3 σ_s from the edges (`sample.py`)."""
+    """Return the area (µm²) that Welch's windows weigh equally: their centres keep 3 σ_s from the edges."""
     margin = 6 * COHERENCE / 4
     return (TRACKS * TRACK - margin) * (STRETCHES * LENGTH - margin)
 
 
 def _tracks(m: int) -> Record:
-    """Power of an order of the tracks: within 5 σ_q of q = (m/t, 0), without the light that varies."""
+    """Compare the power of an order of the tracks, within 5 σ_q of q = (m/t, 0), without the incoherent part."""
     wavelength, sigma = 0.5, lobe_width(COHERENCE)
     axis = np.linspace(-5, 5, 41) * sigma
     q = np.stack(np.meshgrid(m / TRACK + axis, axis), axis=-1)
@@ -116,7 +116,7 @@ def _tracks(m: int) -> Record:
     middle = c[20, 20]
     expected = np.abs((m == 0) + middle * data().mean() * _box(WIDTH, m / TRACK) / TRACK) ** 2
     # The mean over the piece differs from the mean by a number of variance S/A; half of it is along the field. Of the
-    # light that varies, a band B holds A·B independent speckles.
+    # incoherent part, a band B holds A·B independent speckles.
     size = _size()
     noise = np.hypot(
         2 * np.sqrt(expected * between[20, 20] / 2 / size), between.sum() * area / np.sqrt(size * (10 * sigma) ** 2)
@@ -126,7 +126,7 @@ def _tracks(m: int) -> Record:
 
 
 def _between_tracks() -> Record:
-    """Light that varies: a band between the orders of the tracks, 0.2 to 0.5 cycles/µm, and along them to ±0.7."""
+    """Compare the incoherent part in a band between the orders of the tracks, 0.2 to 0.5 by −0.7 to 0.7 cycles/µm."""
     wavelength = 0.5
     x, y = np.linspace(0.2, 0.5, 31), np.linspace(-0.7, 0.7, 141)
     q = np.stack(np.meshgrid(x, y), axis=-1)

@@ -13,14 +13,14 @@ from .record import GROUPS, Check, Record
 
 
 def checks() -> tuple[Check, ...]:
-    """What `mitsuba-diffraction validate` runs, group by group."""
+    """Return the checks of `mitsuba-diffraction validate`, group by group."""
     modules = (analytic, bumps, viewing_angle, measured_gratings, rough_surface, conservation, coupled_waves)
     every = [check for module in modules for check in module.CHECKS]
     return tuple(sorted(every, key=lambda check: GROUPS.index(check.group)))
 
 
 def surface_checks(height_field: HeightField, spectrum: GratingSpectrum) -> tuple[Check, ...]:
-    """Checks of the spectrum of a surface and of the BSDF that shows it."""
+    """Return checks of the spectrum of a surface and of its BSDF."""
 
     def check(name: str, measure: Callable[[], Record], source: str) -> Check:
         return Check("surface", name, measure, source)
@@ -39,6 +39,6 @@ def surface_checks(height_field: HeightField, spectrum: GratingSpectrum) -> tupl
 
 
 def scalar_range(height_field: HeightField, extent: str) -> Record:
-    """The error of scalar theory, as `inspect` and `precompute` tell it."""
+    """Return the error of scalar theory, as `inspect` and `precompute` report it."""
     found = scalar_error(height_field, extent)
     return Record(found.share, 0.0, found.bound, note=str(found))

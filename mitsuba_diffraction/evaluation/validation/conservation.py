@@ -1,4 +1,4 @@
-"""What holds of any surface: reciprocity, no more light than comes in, samples that agree with values."""
+"""Properties of any surface: reciprocity, energy conservation, samples that agree with values."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ SAMPLES = 1 << 17
 
 
 def _drawn(bsdf: mi.BSDF, wi: Array, wavelength: float) -> tuple[Array, Array]:
-    """Samples ω_o (n, 3) and their weights f cos θ_o / pdf (n,) for ω_i (n, 3)."""
+    """Draw ω_o (n, 3) for ω_i (n, 3); return them and their weights f cos θ_o / pdf (n,)."""
     wo, weights, _ = testing.sample(bsdf, wi, [1e3 * wavelength] * len(mi.UnpolarizedSpectrum(0)))
     return wo, weights[:, 0]
 
 
 def _near_orders(spectrum: GratingSpectrum, wavelength: float, count: int) -> tuple[Array, Array]:
-    """Pairs of directions (count, 3), the second drawn by the BSDF for the first: where there is light."""
+    """Return pairs of directions (count, 3), the second sampled by the BSDF for the first: near orders."""
     random = np.random.default_rng(3)
     cosine, phi = random.uniform(0.1, 1, count), random.uniform(0, 360, count)
     wi = testing.direction(np.rad2deg(np.arccos(cosine)), phi)
@@ -41,14 +41,14 @@ def _near_orders(spectrum: GratingSpectrum, wavelength: float, count: int) -> tu
 
 
 def parseval(spectrum: GratingSpectrum) -> Record:
-    """Σ over all frequencies that the spectrum holds; what it says it left out is allowed for."""
+    """Check the sum over all frequencies of the spectrum, with allowance for its stated truncated power."""
     kappas = np.linspace(0.2, 1, 9) * spectrum.largest_kappa
     found = [spectrum.powers(kappa).sum(dtype=np.float64) for kappa in kappas]
     return Record.worst(1.0, found, spectrum.tolerance + spectrum.beyond + spectrum.dropped, "Σ_m η_m, nine κ")
 
 
 def reciprocity(spectrum: GratingSpectrum) -> Record:
-    """f(ω_i, ω_o) = f(ω_o, ω_i), as a share of the larger."""
+    """Check f(ω_i, ω_o) = f(ω_o, ω_i), as a share of the larger."""
     bsdf = grating(spectrum, int_ior=1.5)
     there, back = [], []
     for wavelength in WAVELENGTHS:
@@ -60,12 +60,12 @@ def reciprocity(spectrum: GratingSpectrum) -> Record:
 
 
 def energy(spectrum: GratingSpectrum) -> Record:
-    """By how much the largest albedo of a perfect mirror exceeds one, by the BSDF's own samples."""
+    """Return the excess over one of the largest albedo of a perfect mirror, by the BSDF's own samples."""
     return excess(grating(spectrum))
 
 
 def excess(bsdf: mi.BSDF) -> Record:
-    """The same of any BSDF."""
+    """Return the excess over one of the largest albedo of any BSDF."""
     found = []
     for wavelength in WAVELENGTHS:
         for angle in ANGLES:

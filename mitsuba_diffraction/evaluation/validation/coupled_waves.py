@@ -1,11 +1,11 @@
 """The BSDF against the stored results of coupled-wave analysis, order by order.
 
-A difference is Σ_m |Δη_m| / Σ_m η_m: a share of the light that is rigorously reflected. What is promised:
+A difference is Σ_m |Δη_m| / Σ_m η_m: a share of the rigorously reflected power. The claimed bounds:
 
 - sinusoids of period ≥ 5 λ and depth ≤ λ/2, light at up to 20°: 2 %;
 - blazes and triangles, which have edges, of depth ≤ λ/2, up to 20°: 10 %.
 
-Everything else is outside of the range of scalar theory: shown, and nothing promised.
+Everything else is outside of the range of scalar theory: it is reported without a bound.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ SHORTEST_PERIOD, LARGEST_DEPTH, LARGEST_ANGLE = 5.0, 0.5, 20.0  # in wavelengths
 
 
 def triangular(period: float, depth: float, *, samples: int = 512) -> HeightField:
-    """h = depth (1 − |2x/period − 1|), one period, (1, samples); lengths in µm."""
+    """Return h = depth (1 − |2x/period − 1|) over one period, (1, samples); lengths in µm."""
     x = (np.arange(samples) + 0.5) / samples
     return HeightField(depth * (1 - np.abs(2 * x - 1))[None, :], (period / samples, period), "triangular grating")
 
@@ -66,7 +66,7 @@ class RigorousResult:
         index: n + ik.
         orders: those that propagate, (n,).
         te, tm: rigorous efficiencies, (n,).
-        change: by how much they changed at the last refinement, as a share of the reflected light.
+        change: of the efficiencies at the last refinement, as a share of the reflected power.
     """
 
     profile: str
@@ -88,7 +88,7 @@ class RigorousResult:
 
     @property
     def in_range(self) -> bool:
-        """Where a bound is promised."""
+        """Whether a bound is claimed."""
         fine = self.period >= SHORTEST_PERIOD * self.wavelength or self.profile != "sinusoidal"
         return fine and self.depth <= LARGEST_DEPTH * self.wavelength and self.angle <= LARGEST_ANGLE
 
@@ -99,12 +99,12 @@ class RigorousResult:
         )
 
     def scalar(self) -> Orders:
-        """R K G E η_m of this case, in float64."""
+        """Compute R K G E η_m of this case, in float64."""
         powers = profile_powers(PROFILES[self.profile](self.period, self.depth))
         return scalar_orders(powers, self.period, self.wavelength, self.angle, self.index)
 
     def found(self) -> Array:
-        """What the BSDF reflects into the orders, (n,)."""
+        """The efficiencies of the BSDF, (n,)."""
         spectrum, bsdf = _plugin(self.profile, self.period, self.depth, self.material)
         q = np.stack([self.orders / self.period, np.zeros(len(self.orders))], axis=-1)
         return lobe_powers(bsdf, spectrum, direction(self.angle, 180.0), q, self.wavelength)
@@ -119,7 +119,7 @@ def _plugin(profile: str, period: float, depth: float, material: str) -> tuple[A
 
 @functools.cache
 def cases() -> tuple[RigorousResult, ...]:
-    """All stored ones."""
+    """Return all stored results."""
     names = ("profile", "period", "depth", "wavelength", "angle", "material", "change")
     return tuple(
         RigorousResult(
@@ -139,7 +139,7 @@ def _worst(
     rigorous: Callable[[RigorousResult], Array],
     bound: float | None,
 ) -> Record:
-    """The grating that differs most, and its strongest order."""
+    """Compare the grating that differs most, at its strongest order."""
     differences = [difference(found(case), rigorous(case)) for case in those]
     case = those[worst := int(np.argmax(differences))]
     strongest = int(np.argmax(rigorous(case)))
@@ -157,7 +157,7 @@ def _dielectric(profile: str, choose: Callable[[RigorousResult], bool]) -> Recor
 
 
 def _metal(profile: str, te: bool) -> Record:
-    """Nothing is promised for metals: see docs/validation.md."""
+    """Compare metals, for which no bound is claimed: see docs/validation.md."""
     those = [c for c in cases() if c.profile == profile and c.material != "dielectric" and c.angle <= LARGEST_ANGLE]
     if te:
         return _worst(those, lambda case: case.scalar().s, lambda case: case.te, None)
@@ -165,7 +165,7 @@ def _metal(profile: str, te: bool) -> Record:
 
 
 def formula(those: Iterable[RigorousResult]) -> Record:
-    """R K G E η_m in float64, on which the map stands, against the BSDF, integrated lobe by lobe."""
+    """Compare R K G E η_m in float64, on which the map is based, with the BSDF integrated lobe by lobe."""
     differences = [difference(case.scalar().unpolarised, case.found()) for case in those]
     # E is read from a table of lower bounds.
     note = f"Σ|Δη|/Σ η, worst of {len(differences)}; mean {np.mean(differences):.1e}"
@@ -173,7 +173,7 @@ def formula(those: Iterable[RigorousResult]) -> Record:
 
 
 def polarised_shares(case: RigorousResult) -> tuple[Array, Array, Array]:
-    """η_te/(η_te + η_tm): rigorous, and by R_s and R_p at the half vector; and the share of the light in the orders."""
+    """Return η_te/(η_te + η_tm), rigorous and by R_s and R_p at the half vector, and the share of power per order."""
     orders = case.scalar()
     total = case.te + case.tm
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -182,7 +182,7 @@ def polarised_shares(case: RigorousResult) -> tuple[Array, Array, Array]:
 
 
 def _polarisation(split: bool) -> Record:
-    """The share of s light in an order, mean over the orders by their light; unpolarised light at under 40°."""
+    """Compare the power-weighted mean share of s light in the orders, for unpolarised light at under 40°."""
     rows = []
     for case in cases():
         if case.material == "dielectric" and case.angle < 40:
@@ -194,7 +194,7 @@ def _polarisation(split: bool) -> Record:
 
 
 def _map(shortest: float, deepest: float, bound: float | None) -> Record:
-    """Largest error of the map, at its nodes and, between them, at the shortest period and largest depth."""
+    """Return the largest error of the map, at its nodes and, between them, at the shortest period and largest depth."""
     periods, depths, _, _ = error_map()
     places = itertools.product([shortest, *periods[periods > shortest]], [*depths[depths < deepest], deepest])
     worst, period, depth = max((expected_error(period, depth, 1.0), period, depth) for period, depth in places)
@@ -202,7 +202,7 @@ def _map(shortest: float, deepest: float, bound: float | None) -> Record:
 
 
 def _map_again() -> Record:
-    """The map, whose rigorous efficiencies are our own, against coupled waves at the same periods and depths."""
+    """Compare the map, of this package's rigorous efficiencies, with coupled waves at the same periods and depths."""
     periods, depths, directions, errors = error_map()
     found, expected = [], []
     for point in stored()["map"]:

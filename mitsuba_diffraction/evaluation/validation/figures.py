@@ -44,14 +44,14 @@ _DARKEST = 1e-3  # of the strongest reflectance outside of the specular peak
 
 
 def figure(width: float, height: float) -> Figure:
-    """An empty figure, inches, that belongs to no window."""
+    """Return an empty figure, in inches, that belongs to no window."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height), layout="constrained")
 
 
 def png(drawn: Figure, dpi: float = 110, pnginfo: PngInfo | None = None) -> bytes:
-    """A figure as a PNG of 256 colours and their mixtures, half the size of one of all colours."""
+    """Encode a figure as a PNG of a palette of 256 colours, half the size of a PNG of all colours."""
     from PIL import Image
 
     whole, reduced = io.BytesIO(), io.BytesIO()
@@ -66,10 +66,10 @@ def png(drawn: Figure, dpi: float = 110, pnginfo: PngInfo | None = None) -> byte
 
 
 def plot_reflectance(maps: Sequence[ReflectanceMap]) -> Figure:
-    """Reflectance over wavelength and viewing angle, with the peak curve and the grating equation over it.
+    """Plot reflectance over wavelength and viewing angle, with the peak curve and the grating equation on top.
 
-    One panel for each map; all maps are of one surface and one θ_i. Each panel has the logarithmic scale of its own
-    strongest reflectance outside of the specular peak, three decades deep.
+    One panel for each map; all maps are of one surface and one θ_i. Each panel has a logarithmic scale of three decades
+    below its largest reflectance outside of the specular peak.
     """
     drawn = figure(3.1 * len(maps) + 0.9, 4.4)
     axes = drawn.subplots(1, len(maps), sharex=True, sharey=True, squeeze=False)[0]
@@ -118,7 +118,7 @@ def _draw_map(panel: Axes, found: ReflectanceMap) -> ScalarMappable:
 
 
 def plot_brdf_maps(maps: Sequence[Sequence[BRDFMap]]) -> Figure:
-    """BRDF maps, a row for each projection and a column for each method; all of one surface and one light.
+    """Plot BRDF maps of one surface and one light, a row for each projection and a column for each method.
 
     The ticks beside the diffracting axis are where the grating equation puts 450, 550 and 650 nm of the orders.
     """
@@ -156,7 +156,7 @@ def _draw_brdf(panel: Axes, found: BRDFMap, labelled: bool) -> None:
 
 
 def _mark_orders(panel: Axes, found: BRDFMap) -> None:
-    """Ticks beside the places of the orders, so that they hide no light."""
+    """Mark the orders by ticks beside them, so that the ticks hide no light."""
     across = 1 - found.surface.axis
     size = found.x[-1] - found.x[0]
     for order in (-2, -1, 1, 2):
@@ -181,7 +181,7 @@ PERIOD_COLUMNS = (
 
 
 def period_rows(surface: PublishedSurface, maps: Iterable[ReflectanceMap], step: float = 5.0) -> list[list[str]]:
-    """The fits under `PERIOD_COLUMNS`: of maps that are there, the shader as published, and of the shader corrected.
+    """Return the fits as rows of `PERIOD_COLUMNS`: available maps, the shader as published and corrected.
 
     Args:
         surface: what the maps are of.
@@ -208,7 +208,7 @@ def period_rows(surface: PublishedSurface, maps: Iterable[ReflectanceMap], step:
 
 
 def figure_names(surfaces: Iterable[str] = tuple(SURFACES)) -> list[str]:
-    """The files that `save_figures` writes."""
+    """Return the names of the files that `save_figures` writes."""
     return [
         *(f"{kind}_{name}.png" for name in surfaces for kind in ("viewing_angle", "brdf")),
         *("periods.md", "periods.csv"),
@@ -223,9 +223,9 @@ def save_figures(
     side: int = 200,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[Path]:
-    """Evaluates and draws, as chapter 5 of the thesis of 2014 does, under Mitsuba's variant in force.
+    """Evaluate and plot as in chapter 5 of the thesis of 2014, under the current variant of Mitsuba.
 
-    Written, each whole or not at all: for every surface `viewing_angle_NAME.png` and `brdf_NAME.png`; and the fitted
+    Written atomically: for every surface `viewing_angle_NAME.png` and `brdf_NAME.png`; and the fitted
     periods, `periods.md` and `periods.csv`.
 
     Args:

@@ -1,4 +1,4 @@
-"""The lobes of a BSDF: what a grating reflects into each order, by quadrature over what the plugin shows.
+"""The lobes of a BSDF: the power that a grating reflects into each order, by quadrature over the plugin.
 
 Wavelengths are in µm here, as in the closed forms.
 """
@@ -26,9 +26,9 @@ _POINTS = 16
 
 
 def grating(spectrum: GratingSpectrum, conserve: bool = True, **parameters: Any) -> mi.BSDF:
-    """The plugin; a perfect mirror unless an index or a material is given.
+    """Load the plugin; a perfect mirror unless an index or a material is given.
 
-    `conserve=False` leaves out E, which is no part of what closed forms describe: R K G S/λ² alone.
+    `conserve=False` omits E, which closed forms do not include: R K G S/λ² alone.
     """
     if not {"int_ior", "material"} & set(parameters):
         parameters["material"] = "none"
@@ -43,37 +43,37 @@ def _built(height_field: HeightField, settings: tuple[tuple[str, Any], ...]) -> 
 
 
 def spectrum_of(height_field: HeightField, **settings: Any) -> GratingSpectrum:
-    """`precompute`, to 1e-5 by default; kept for the next check of the same surface."""
+    """Precompute a spectrum, to 1e-5 by default; cached for the next check of the same surface."""
     return _built(height_field, tuple(sorted({"tolerance": TOLERANCE, **settings}.items())))
 
 
 def towards(wi: Array, q: ArrayLike, wavelength: float) -> Array:
-    """ω_o (..., 3) of frequencies q (..., 2)."""
+    """Return ω_o (..., 3) of frequencies q (..., 2)."""
     return testing.towards(wi, q, 1e3 * wavelength)
 
 
 def brdf(bsdf: mi.BSDF, wi: ArrayLike, wo: ArrayLike, wavelength: float) -> Array:
-    """f [1/sr] of directions (..., 3); zero where ω_o is not above the surface."""
+    """Evaluate f [1/sr] at directions (..., 3); zero where ω_o is not above the surface."""
     value = testing.evaluate(bsdf, wi, wo, [1e3 * wavelength])[..., 0]
     cosine = np.broadcast_to(np.asarray(wo)[..., 2], value.shape)
     return np.divide(value, cosine, out=np.zeros_like(value), where=cosine > 0)
 
 
 def density(bsdf: mi.BSDF, wi: Array, wo: Array, wavelength: float) -> Array:
-    """S [µm²] as a perfect mirror without E shows it: f λ²/(K G)."""
+    """Evaluate S [µm²] by a perfect mirror without E: f λ²/(K G)."""
     return brdf(bsdf, wi, wo, wavelength) * wavelength**2 / k_g_between(wi, wo)
 
 
 def lobe_powers(bsdf: mi.BSDF, spectrum: GratingSpectrum, wi: Array, q: ArrayLike, wavelength: float) -> Array:
-    """The share of the incident power that is reflected into the lobes about q: ∫ f cos θ_o dω_o = λ² ∫ f dq.
+    """Integrate the share of the incident power reflected into the lobes about q: ∫ f cos θ_o dω_o = λ² ∫ f dq.
 
-    By Gauss–Legendre quadrature over the square at which a lobe ends.
+    By Gauss–Legendre quadrature over the square to which a lobe is truncated.
 
     Args:
         bsdf: of the spectrum.
         spectrum: of a tile whose lobes do not overlap.
         wi: (3,).
-        q: (n, 2) cycles/µm; what of a lobe is below the horizon does not count.
+        q: (n, 2) cycles/µm; the part of a lobe below the horizon does not count.
         wavelength: µm.
 
     Returns:
@@ -88,7 +88,7 @@ def lobe_powers(bsdf: mi.BSDF, spectrum: GratingSpectrum, wi: Array, q: ArrayLik
 
 
 def orders_above(spectrum: GratingSpectrum, wi: Array, wavelength: float, largest: float = 80.0) -> Array:
-    """The orders m (n, 2) of a tile that leave at up to `largest` degrees from the normal."""
+    """Return the orders m (n, 2) of a tile at up to `largest` degrees from the normal."""
     m_x, m_y = np.meshgrid(*spectrum.grid.axes())
     m = np.stack([m_x.ravel(), m_y.ravel()], axis=-1)
     across = -wavelength * m / spectrum.grid.tile_size - wi[:2]
@@ -98,7 +98,7 @@ def orders_above(spectrum: GratingSpectrum, wi: Array, wavelength: float, larges
 def order_powers(
     bsdf: mi.BSDF, spectrum: GratingSpectrum, wi: Array, m: Array, wavelength: float
 ) -> tuple[Array, Array]:
-    """η_m (n,) that the BSDF shows, of the orders m (n, 2): what their lobes reflect, without K and G; and their κ."""
+    """Return η_m (n,) of the orders m (n, 2) by the BSDF, what their lobes reflect without K and G, and their κ."""
     q = m / np.asarray(spectrum.grid.tile_size)
     wo = towards(wi, q, wavelength)
     kappa = 2 * np.pi * (wi[2] + wo[:, 2]) / wavelength

@@ -1,4 +1,4 @@
-"""Scalar and rigorous theory against the efficiencies of four ruled gratings, as their maker measured them.
+"""Scalar and rigorous theory against the manufacturer's measured efficiencies of four ruled gratings.
 
 The facet angle alone is fitted (`ruled_fit`); `precompute/ruled_fits.py` stores the angles.
 """
@@ -24,7 +24,7 @@ _COLOURS = {"rigorous": "#d95f02", "scalar": "#7570b3"}
 
 
 def difference(name: str, theory: str) -> Record:
-    """The root of the mean square difference to the measured efficiencies."""
+    """Compute the root mean square difference from the measured efficiencies."""
     wavelengths, wanted = measured(name)
     angle = stored_angles()[name][theory]
     found = littrow_curve(name, angle, wavelengths, theory == "rigorous")
@@ -36,7 +36,7 @@ def difference(name: str, theory: str) -> Record:
 
 
 def plot(step: float = 4.0) -> Figure:
-    """The measured efficiencies of each grating and the curves of both theories; a point every `step` nm."""
+    """Plot the measured efficiencies of each grating and the curves of both theories; a point every `step` nm."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9.5, 6.6), layout="constrained")

@@ -17,13 +17,13 @@ from ...surface.heightfield import HeightField
 
 @dataclass(frozen=True, eq=False)
 class PublishedSurface:
-    """A grating, and what was published about it.
+    """A grating, and the published numbers about it.
 
     Light and viewer are in the plane of the normal and the diffracting axis. Angles in it are positive on the side of
-    −x (−y): there the direction that blazes is positive, and the grating equation d (sin θ_i + sin θ_r) = nλ has n > 0.
+    −x (−y): there the blaze direction is positive, and the grating equation d (sin θ_i + sin θ_r) = nλ has n > 0.
 
     Attributes:
-        name: as titles show it.
+        name: for titles.
         recipe: the way to the heights and the spectrum.
         axis: the diffracting axis, 0 for x and 1 for y.
         period: d of the grating equation, µm, as published.
@@ -58,20 +58,20 @@ class PublishedSurface:
         return float(self.recipe.spectrum.get("coherence_length", SUN_COHERENCE_LENGTH))
 
     def direction(self, angle: ArrayLike) -> NDArray[np.float64]:
-        """Unit vectors (..., 3) at angles (...) from the normal, in degrees, in the plane of the surface."""
+        """Return unit vectors (..., 3) at angles (...) in degrees from the normal, in the plane of the surface."""
         angle = np.deg2rad(np.asarray(angle, np.float64))
         result = np.zeros((*angle.shape, 3))
         result[..., self.axis], result[..., 2] = -np.sin(angle), np.cos(angle)
         return result
 
     def coherent_over(self, coherence_length: float) -> PublishedSurface:
-        """The same surface in light of another coherence length, µm."""
+        """Return the same surface in light of another coherence length, µm."""
         recipe = Recipe(self.recipe.surface, {**self.recipe.spectrum, "coherence_length": coherence_length})
         return PublishedSurface(self.name, recipe, self.axis, self.period, self.published)
 
 
 def _skin(profile: str, depth: float) -> Recipe:
-    """As in precompute/elaphe.toml and xenopeltis.toml."""
+    """Return the surface of precompute/elaphe.toml or xenopeltis.toml."""
     return Recipe(
         {"profile": profile, "size": 32.0, "depth": depth, "seed": 1, "patches": 1}, {"coherence_length": 26.0}
     )

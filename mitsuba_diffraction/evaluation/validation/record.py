@@ -1,4 +1,4 @@
-"""What a check or a measurement found."""
+"""Results of checks and measurements."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ GROUPS = ("analytic", "literature", "statistical", "energy", "rigorous", "surfac
 
 @dataclass(frozen=True)
 class Record:
-    """A number that was measured on the product, beside the number that was expected.
+    """A measured number beside the expected one.
 
     Attributes:
-        measured, expected: of many numbers, those that differ most.
-        bound: on the error; None where nothing is promised.
+        measured, expected: of several numbers, the pair that differs most.
+        bound: on the error; None where none is claimed.
         relative: whether the error is relative to `expected`.
-        note: what else a reader needs.
+        note: further information for the reader.
         group: one of `GROUPS`.
         name: what was measured, in words.
-        source: where `expected` comes from.
+        source: origin of `expected`.
     """
 
     measured: float
@@ -51,7 +51,7 @@ class Record:
         *,
         relative: bool = False,
     ) -> Record:
-        """Of many numbers those with the largest error, as a multiple of its bound; NaN is the largest."""
+        """Return the pair with the largest error as a multiple of its bound; NaN is the largest."""
         limits = 1.0 if bound is None else bound
         expected, measured, limits = (np.ravel(x) for x in np.broadcast_arrays(expected, measured, limits))
         error = np.abs(measured - expected) / (np.abs(expected) if relative else 1) / limits
@@ -72,11 +72,11 @@ class Record:
 
 @dataclass(frozen=True)
 class Check:
-    """How a record comes about: one line of the table, and one test.
+    """A function that makes a record: one line of the table, and one test.
 
     Attributes:
         group, name, source: as of `Record`.
-        measure: measures under Mitsuba's variant in force; its record lacks these three.
+        measure: measures under the current variant of Mitsuba; its record lacks these three.
         slow: takes more than three seconds.
     """
 
@@ -87,5 +87,5 @@ class Check:
     slow: bool = False
 
     def run(self) -> Record:
-        """The record."""
+        """Return the record of the check."""
         return dataclasses.replace(self.measure(), group=self.group, name=self.name, source=self.source)

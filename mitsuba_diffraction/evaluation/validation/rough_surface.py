@@ -42,7 +42,7 @@ DEVIATIONS = 3.0  # standard deviations allowed
 
 
 def random_profile(rms: float, correlation: float, seed: int = 0) -> HeightField:
-    """One row of Gaussian heights, correlated as σ² e^{−τ²/ℓ²}; lengths in µm."""
+    """Draw one row of Gaussian heights, correlated as σ² e^{−τ²/ℓ²}; lengths in µm."""
     count = round(LENGTH / PIXEL)
     q = np.fft.rfftfreq(count, PIXEL)
     amplitude = np.sqrt(rms**2 * correlation * np.sqrt(np.pi) / PIXEL) * np.exp(-((np.pi * q * correlation) ** 2) / 2)
@@ -54,7 +54,7 @@ def random_profile(rms: float, correlation: float, seed: int = 0) -> HeightField
 
 
 def diffuse(q: Array, g: float, correlation: float, broadened: float = 0.0, even: bool = False) -> Array:
-    """The diffuse component of S in µm, convolved with a lobe of σ_q = `broadened`; q (...) in cycles/µm."""
+    """Compute the diffuse component of S in µm, convolved with a lobe of σ_q = `broadened`; q (...) in cycles/µm."""
     n = np.arange(2 if even else 1, int(g + 12 * np.sqrt(g) + 20), 2 if even else 1)
     weight = np.exp(n * np.log(g) - g - gammaln(n + 1))
     variance = n / (2 * (np.pi * correlation) ** 2) + broadened**2
@@ -68,7 +68,7 @@ def _spectrum(rms: float, correlation: float) -> GratingSpectrum:
 
 
 def _coherent(wavelength: float, angle: float) -> Record:
-    """Power within 5 σ_q of the specular direction: e^{−g}, and a little of the diffuse component."""
+    """Compare the power within 5 σ_q of the specular direction: e^{−g}, and a little of the diffuse component."""
     rms, correlation = WEAK
     spectrum = _spectrum(rms, correlation)
     wi = direction(angle)
@@ -88,7 +88,7 @@ def _coherent(wavelength: float, angle: float) -> Record:
 
 
 def _diffuse_bands() -> Record:
-    """The diffuse component in bands of q as wide as 1/ℓ, against the series."""
+    """Compare the diffuse component in bands of q of width 1/ℓ with the series."""
     rms, correlation = WEAK
     spectrum = _spectrum(rms, correlation)
     wi, wavelength = direction(0), 0.5
@@ -114,11 +114,11 @@ def _diffuse_bands() -> Record:
 
 
 def _microfacets(angle: float) -> Record:
-    """Against `roughconductor`, Beckmann distribution, of a rough profile; K S/λ² is D/(4 cos θ_i cos θ_o) there.
+    """Compare a rough profile with `roughconductor`, Beckmann distribution; K S/λ² is D/(4 cos θ_i cos θ_o) there.
 
     In the plane of incidence, bands of the half vector's slope out to one and a half rms slopes, on both sides of the
-    mirror direction. Both are perfect mirrors. No facet hides another there: G is one in both models; E is left out.
-    `roughconductor` gets along y the width that the coherence length gives the lobe.
+    specular direction. Both are perfect mirrors. No facet masks another there: G is one in both models; E is omitted.
+    Along y, `roughconductor` has the width of the lobe of the coherence length.
     """
     rms, correlation = LARGE
     spectrum = _spectrum(rms, correlation)

@@ -1,7 +1,7 @@
 """Measured efficiencies of ruled gratings, with the facet angle as the only unknown.
 
-The gratings and the way they were measured: `data/gratings/README.md`. Their grooves are taken for two facets with an
-apex of 90°, aluminium; the mount is Littrow, the light unpolarised, the order the first.
+Gratings and measurements: `data/gratings/README.md`. The grooves are modelled as two aluminium facets with an apex of
+90°, in the first order of a Littrow mount, in unpolarised light.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _EV_MICROMETRE = 1.239842
 
 
 def aluminium(wavelength: float) -> complex:
-    """n + ik of aluminium at a wavelength in µm by the Lorentz–Drude model of Rakić et al. (1998).
+    """Return n + ik of aluminium at a wavelength in µm by the Lorentz–Drude model of Rakić et al. (1998).
 
     The measurements reach farther into the infrared than Mitsuba's table does; where both hold they agree to 5 %.
     """
@@ -47,7 +47,7 @@ def aluminium(wavelength: float) -> complex:
 
 
 def right_angled(period: float, facet_angle: float, samples: int = 512) -> HeightField:
-    """One period, (1, samples), of two facets that meet at 90°; the wider rises along +x.
+    """Return one period, (1, samples), of two facets that meet at 90°; the wider rises along +x.
 
     Args:
         period: µm.
@@ -62,7 +62,7 @@ def right_angled(period: float, facet_angle: float, samples: int = 512) -> Heigh
 
 
 def littrow(period: float, facet_angle: float, wavelength: float, rigorous: bool) -> float:
-    """η₁ of unpolarised light that returns along its way, by rigorous or by scalar theory.
+    """Compute η₁ in the Littrow mount for unpolarised light, by rigorous or by scalar theory.
 
     Args:
         period, wavelength: µm.
@@ -85,8 +85,8 @@ class Fit:
 
     Attributes:
         facet_angle: degrees.
-        efficiencies: η₁ at the wavelengths that were measured, (n,).
-        rms: root of the mean square difference to what was measured.
+        efficiencies: η₁ at the measured wavelengths, (n,).
+        rms: root mean square difference from the measured efficiencies.
     """
 
     facet_angle: float
@@ -95,7 +95,7 @@ class Fit:
 
 
 def measured(name: str) -> tuple[Real, Real]:
-    """Wavelengths in µm and η₁ of a grating of `LINES_PER_MM`, (n,) each.
+    """Return measured wavelengths in µm and η₁ of a grating of `LINES_PER_MM`, (n,) each.
 
     Raises:
         ValueError: if there is no such grating.
@@ -107,19 +107,19 @@ def measured(name: str) -> tuple[Real, Real]:
 
 
 def littrow_curve(name: str, facet_angle: float, wavelengths: Real, rigorous: bool) -> Real:
-    """η₁ of a grating of `LINES_PER_MM` at wavelengths in µm, (n,), as `littrow` has it."""
+    """Compute η₁ of a grating of `LINES_PER_MM` at wavelengths in µm, (n,), by `littrow`."""
     period = 1000 / LINES_PER_MM[name]
     return np.array([littrow(period, facet_angle, wavelength, rigorous) for wavelength in wavelengths])
 
 
 @functools.cache
 def stored_angles() -> dict[str, dict[str, float]]:
-    """Grating → "scalar" or "rigorous" → facet angle in degrees that `fit` found, by `precompute/ruled_fits.py`."""
+    """Return facet angles (degrees) found by `fit`, by grating and theory (`precompute/ruled_fits.py`)."""
     return json.loads(FITS.read_text(encoding="utf-8"))["facet angles"]
 
 
 def fit(name: str, rigorous: bool) -> Fit:
-    """The facet angle that fits a measured grating best in the mean square, by rigorous or by scalar theory.
+    """Fit the facet angle to a measured grating in the mean square, by rigorous or by scalar theory.
 
     Rigorous: up to a minute.
 

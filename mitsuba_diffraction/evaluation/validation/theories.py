@@ -1,4 +1,4 @@
-"""Scalar and rigorous theory of one grating: what each costs, and how far from the solver it is."""
+"""Scalar and rigorous theory of one grating: their costs, and their deviations from the solver."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _PLACES = 60  # directions and wavelengths at which the solver is asked
 
 @dataclass(frozen=True)
 class TheoryCost:
-    """What a theory costs, and what it is worth.
+    """Cost and accuracy of a theory.
 
     Attributes:
         theory: "scalar" or "rigorous".
@@ -66,7 +66,7 @@ def compare_theories(
     repetitions: int = 5,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[TheoryCost]:
-    """Scalar, then rigorous theory of a surface of one row, under Mitsuba's variant in force.
+    """Compare scalar, then rigorous theory of a surface of one row, under the current variant of Mitsuba.
 
     Args:
         height_field: the surface.
@@ -97,7 +97,7 @@ def compare_theories(
 
 
 def _errors(height_field: HeightField, material: str, table: RigorousSpectrum) -> dict[str, list[float]]:
-    """Of both theories at the same places."""
+    """Return the errors of both theories at the same places."""
     errors: dict[str, list[float]] = {"scalar": [], "rigorous": []}
     period, powers = height_field.tile_size[0], profile_powers(height_field)
     for cosine, turn, share in np.random.default_rng(0).random((_PLACES, 3)):

@@ -1,4 +1,4 @@
-"""Reflectance over viewing angle and wavelength, its peak curve, and the period that the peaks tell.
+"""Reflectance over viewing angle and wavelength, its peak curve, and the period fitted to the peaks.
 
 The evaluation of the thesis of 2014 (section 5.3): light at a fixed angle θ_i, every viewing angle θ_r in the plane of
 the diffracting axis, every wavelength. For each wavelength the viewing angle of the greatest reflectance gives a period
@@ -40,12 +40,12 @@ _R_0 = ((_INDEX - 1) / (_INDEX + 1)) ** 2
 
 
 def relative_reflectance(spectrum: GratingSpectrum, wi: ArrayLike, wo: ArrayLike, wavelengths: ArrayLike) -> Array:
-    """f cos θ_i of the BSDF, of index 1.5, over its value for a flat surface lit and seen at normal incidence.
+    """Return f cos θ_i of the BSDF, index 1.5, over that of a flat surface at normal incidence and exit.
 
         ρ(λ) = f cos θ_i · 2πσ_q² λ²/R₀ = R/R₀ · K G cos θ_i · 2πσ_q² S(q; κ) · E
 
     The coherence length of `spectrum` gives σ_q; 1/(2πσ_q²) is S(0) of a flat surface. This is the quantity that the
-    shader shows (eq. 3.11 of the thesis): 1/λ² has dropped out.
+    shader shows (eq. 3.11 of the thesis): 1/λ² cancels.
 
     Args:
         spectrum: of the surface.
@@ -70,12 +70,12 @@ def relative_reflectance(spectrum: GratingSpectrum, wi: ArrayLike, wo: ArrayLike
 
 
 def wavelengths(step: float = 5.0) -> Array:
-    """380 to 780 nm."""
+    """Return wavelengths from 380 to 780 nm."""
     return np.arange(380.0, 780.0 + step / 2, step)
 
 
 def viewing_angles(step: float = 0.1) -> Array:
-    """From one horizon to the other, degrees, without the horizons.
+    """Return viewing angles from one horizon to the other in degrees, without the horizons.
 
     The lobes of PQ as published are 0.3° wide in sunlight; with steps of half a degree their peaks are missed.
     """
@@ -92,7 +92,7 @@ class ReflectanceMap:
         incidence: θ_i in degrees.
         wavelengths: (n,) nm.
         angles: θ_r in degrees: (m,), or (n, m) where a method has directions of its own for each wavelength (nmm;
-            NaN where it has fewer). −θ_i is the mirror direction.
+            NaN where it has fewer). −θ_i is the specular direction.
         reflectance: (n, m), a flat mirror at normal incidence being one; NaN where the angle is.
     """
 
@@ -131,15 +131,15 @@ def reflectance_map(
     angles: ArrayLike | None = None,
     quirks: Quirks | None = None,
 ) -> ReflectanceMap:
-    """Evaluates a surface over viewing angle and wavelength.
+    """Evaluate a surface over viewing angle and wavelength.
 
     The model is that of the BSDF, averaged over the places that a pixel covers; the shader that of
-    `shader.evaluate.relative_radiance`. NMM knows at a viewing angle only the wavelengths
+    `shader.evaluate.relative_radiance`. NMM has at a viewing angle only the wavelengths
     λ_n = T (sin θ_i + sin θ_r)/n, T being the length of the tile; the other way round, a wavelength only at the angles
-    of the tile's orders. There it gives what FLSS gives. These are the angles of its map.
+    of the tile's orders, where it equals FLSS. These are the angles of its map.
 
     Args:
-        surface: what to look at.
+        surface: the surface.
         method: one of `METHODS`.
         incidence: θ_i in degrees.
         wavelengths: (n,) nm; every 5 nm from 380 to 780 nm if there are none.
@@ -147,7 +147,7 @@ def reflectance_map(
         quirks: of the shader; as published if none are given.
 
     Raises:
-        ValueError: if an argument makes no sense, or Mitsuba has no vectorised spectral variant set.
+        ValueError: if an argument is wrong, or Mitsuba has no vectorised spectral variant set.
     """
     if method not in METHODS:
         raise RequestError(f"method: got {method!r}, wanted one of {', '.join(METHODS)}")
@@ -177,7 +177,7 @@ def reflectance_map(
 
 
 def _order_angles(surface: PublishedSurface, incidence: float, nanometres: Array) -> Array:
-    """θ_r of the tile's orders but zero at each wavelength, (n, m) degrees; NaN beyond the horizon."""
+    """Return θ_r of the tile's orders but zero at each wavelength, (n, m) degrees; NaN beyond the horizon."""
     tile = surface.height_field.tile_size[surface.axis] * 1e3
     sine = np.sin(np.deg2rad(incidence))
     first, last = (int(tile * reach / nanometres.min()) for reach in (sine - 1, sine + 1))
@@ -187,12 +187,11 @@ def _order_angles(surface: PublishedSurface, incidence: float, nanometres: Array
 
 
 def peak_angles(found: ReflectanceMap) -> Array:
-    """θ_r of the greatest reflectance outside of the specular peak, for each wavelength.
+    """Return θ_r of the greatest reflectance outside of the specular peak, for each wavelength.
 
     Outside means nearer to order one than to order zero of the published period: d (sin θ_i + sin θ_r) > λ/2. The
     place of the peak between the samples is the vertex of a parabola in the direction cosine through the logarithms of
-    three samples, which is exact for a Gaussian lobe. Where a method has directions of its own there is nothing in
-    between.
+    three samples, which is exact for a Gaussian lobe. A method with directions of its own is not interpolated.
 
     Returns:
         (n,) degrees; NaN where there is no light.
@@ -212,7 +211,7 @@ def peak_angles(found: ReflectanceMap) -> Array:
 
 
 def _vertex(x: Array, y: Array) -> Array:
-    """x of the vertex of the parabola through three points, (n, 3) each; the middle point must not be below both."""
+    """Return x of the vertex of the parabola through three points, (n, 3) each; the middle one is not the lowest."""
     left, right = x[:, 1] - x[:, 0], x[:, 2] - x[:, 1]
     slope_left, slope_right = (y[:, 1] - y[:, 0]) / left, (y[:, 2] - y[:, 1]) / right
     curvature = (slope_right - slope_left) / (left + right)
@@ -221,7 +220,7 @@ def _vertex(x: Array, y: Array) -> Array:
 
 
 def grating_equation(period: float, incidence: float, wavelengths: ArrayLike, order: int = 1) -> Array:
-    """θ_r = arcsin(nλ/d − sin θ_i) in degrees (eq. 5.2), NaN where the order is evanescent.
+    """Return θ_r = arcsin(nλ/d − sin θ_i) in degrees (eq. 5.2), NaN where the order is evanescent.
 
     Args:
         period: d in µm.
@@ -235,7 +234,7 @@ def grating_equation(period: float, incidence: float, wavelengths: ArrayLike, or
 
 @dataclass(frozen=True)
 class PeriodFit:
-    """The period that the peaks of a map tell.
+    """The period fitted to the peaks of a map.
 
     Attributes:
         mean: over the wavelengths, nm.
@@ -247,7 +246,7 @@ class PeriodFit:
 
 
 def fit_period(found: ReflectanceMap) -> PeriodFit:
-    """Mean and variance over the wavelengths of d = λ/(sin θ_i + sin θ_r) at the peaks (table 5.1).
+    """Return mean and variance over the wavelengths of d = λ/(sin θ_i + sin θ_r) at the peaks (table 5.1).
 
     Raises:
         ValueError: if there is no light outside of the specular peak at some wavelength.
@@ -261,7 +260,7 @@ def fit_period(found: ReflectanceMap) -> PeriodFit:
 
 
 def published_period(name: str) -> Record:
-    """The period of the thesis (table 5.1), fitted to the peaks of this model as they were there to the shader's."""
+    """Fit the period of the thesis (table 5.1) to the peaks of this model, as the thesis did for the shader's."""
     surface = SURFACES[name]
     found = fit_period(reflectance_map(surface, wavelengths=wavelengths(20.0))).mean
     # Peaks are read on a grid of 0.1°, which moves a period of 2.5 µm by 7 nm at one wavelength, by 1.6 nm in the mean.

@@ -138,7 +138,7 @@ def _read(path: Path, channel: str | int | None, unit: str | tuple[str, str] | N
 
 
 def _as_micrometres(numbers: NDArray, height_range: float | None) -> NDArray[np.float64]:
-    """Integers scaled by the full range of their type, floats unchanged; (N_y, N_x) µm."""
+    """Scale integers by the full range of their type, floats unchanged; (N_y, N_x) µm."""
     if numbers.dtype.kind not in "iuf":
         raise RequestError(f"got numbers of type {numbers.dtype}, wanted real floats in µm or integers")
     if numbers.ndim != 2 or numbers.size == 0:

@@ -27,7 +27,7 @@ _LONGEST_NAME = 4096
 
 
 def read(path: Path, unit: str | tuple[str, str] | None, channel: str | int | None) -> Scan:
-    """One data field; the top row of its image is row 0. Masks are ignored.
+    """Read one data field; the top row of its image is row 0. Masks are ignored.
 
     Raises:
         ValueError: if it is not a Gwyddion file, is truncated, or has no such channel.
@@ -66,7 +66,7 @@ def read(path: Path, unit: str | tuple[str, str] | None, channel: str | int | No
 
 
 def _heights(field: dict[str, object]) -> tuple[NDArray[np.float64], tuple[float, float]]:
-    """The array of a data field, and its width and height, in the units of the file."""
+    """Return the array of a data field, and its width and height, in the units of the file."""
     columns, rows, values = field.get("xres"), field.get("yres"), field.get("data")
     if not (isinstance(columns, int) and isinstance(rows, int) and columns > 0 and rows > 0):
         raise RequestError(f"a data field of {columns!r} × {rows!r} pixels")
@@ -96,14 +96,14 @@ class _Bytes:
         self._data, self._place, self._end = data, place, end
 
     def object(self) -> tuple[str, _Bytes]:
-        """The name and the inside of an object that is here; goes on after it."""
+        """Read the name and the content of an object here, and move past it."""
         name = self._text(_LONGEST_NAME)
         size = self._number("<I")
         start = self._skip(size)
         return name, _Bytes(self._data, start, start + size)
 
     def components(self) -> Iterator[tuple[str, object]]:
-        """Name and value of each; an object is (name, inside), an array of doubles is an array, other arrays None."""
+        """Yield name and value of each component: (name, content) of an object, an array of doubles, or None."""
         while self._place < self._end:
             yield self._text(_LONGEST_NAME), self._value()
 
@@ -127,7 +127,7 @@ class _Bytes:
         return None
 
     def _skip(self, count: int) -> int:
-        """The place of the next bytes, which are passed over."""
+        """Skip bytes and return where they begin."""
         start = self._place
         if count > self._end - start:
             raise RequestError("the file ends, or a part of it, before what it announces: truncated or damaged")

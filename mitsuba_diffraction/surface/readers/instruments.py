@@ -56,12 +56,12 @@ NAMES = (
 
 
 def format_of(extension: str) -> str | None:
-    """SurfaceTopography's name of the format for this extension (lower case), if it is an instrument format."""
+    """Return SurfaceTopography's name of the format for this extension (lower case), if it is an instrument format."""
     return "di" if re.fullmatch(r"\.\d{3}", extension) else FORMATS.get(extension)
 
 
 def read(path: Path, unit: str | tuple[str, str] | None, channel: str | int | None) -> Scan:
-    """One channel of an instrument file; the top row of its image is row 0.
+    """Read one channel of an instrument file; the top row of its image is row 0.
 
     Raises:
         ValueError: if SurfaceTopography is not installed, cannot read the file, or finds no such channel.
@@ -104,7 +104,7 @@ def read(path: Path, unit: str | tuple[str, str] | None, channel: str | int | No
 
 
 def _refuse_bomb(path: Path) -> None:
-    """Checks archives, which the library unpacks into memory."""
+    """Raise RequestError for archives that the library would unpack to too much memory."""
     if zipfile.is_zipfile(path):
         try:
             with zipfile.ZipFile(path) as archive:

@@ -18,13 +18,13 @@ from .scan import DAMAGED, MOST_BYTES, Scan
 
 
 def read_npy(path: Path) -> Scan:
-    """The array of a file."""
+    """Read the array of a file."""
     with path.open("rb") as file:
         return Scan(_load_array(file))
 
 
 def read_npz(path: Path) -> Scan:
-    """The array `heights` of an archive, and its `pixel_size`, if any."""
+    """Read the array `heights` of an archive, and its `pixel_size`, if any."""
     try:
         with zipfile.ZipFile(path) as archive:
             unpacked = max((member.file_size for member in archive.infolist()), default=0)
@@ -53,7 +53,7 @@ def read_npz(path: Path) -> Scan:
 
 
 def _load_array(file: BinaryIO) -> NDArray:
-    """An array in NumPy's format; pickles are refused."""
+    """Read an array in NumPy's format; pickles are refused."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", UserWarning)
@@ -67,7 +67,7 @@ MOST_ANNOTATION = 0.25
 
 
 def read(path: Path) -> Scan:
-    """The channel of an image."""
+    """Read the channel of an image."""
     with warnings.catch_warnings():
         # Warnings of Pillow (decompression bombs, damaged metadata) are errors here.
         warnings.simplefilter("error", Image.DecompressionBombWarning)
@@ -89,7 +89,7 @@ def read(path: Path) -> Scan:
 
 
 def _numbers_of(picture: Image.Image) -> NDArray:
-    """The channel of a greyscale image in its own precision: uint8, uint16 or float32."""
+    """Return the channel of a greyscale image in its own precision: uint8, uint16 or float32."""
     mode = picture.mode
     # The pixel format of the file, which Pillow discards on loading.
     packing = str(picture.tile[0][3]) if picture.tile else ""

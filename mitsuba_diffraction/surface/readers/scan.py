@@ -28,12 +28,12 @@ UNITS = "m, cm, mm, um, nm, Å, pm"
 
 
 def is_length(unit: str) -> bool:
-    """Whether this is a unit of length."""
+    """Return whether this is a unit of length."""
     return unit.strip() in _MICROMETRES
 
 
 def micrometres(unit: str, what: str) -> float:
-    """One of `unit` in µm.
+    """Return the length of one `unit` in µm.
 
     Raises:
         ValueError: if it is not a unit of length.
@@ -44,7 +44,7 @@ def micrometres(unit: str, what: str) -> float:
 
 
 def pair(unit: str | tuple[str, str] | None) -> tuple[str, str]:
-    """The given units of lateral lengths and heights; empty if none.
+    """Return the given units of lateral lengths and heights; empty if none.
 
     Raises:
         ValueError: if it is neither one unit of length nor two.
@@ -97,7 +97,7 @@ class Channel:
 
 
 def choose(channels: Sequence[Channel], wanted: str | int | None) -> Channel:
-    """The named channel, or that of the heights.
+    """Return the named channel, or that of the heights.
 
     Args:
         wanted: number, name or unique part of a name (case-insensitive). None selects the only channel of lengths, or

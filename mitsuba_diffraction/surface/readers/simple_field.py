@@ -18,7 +18,7 @@ _LONGEST_HEADER = 2**20
 
 
 def read(path: Path, unit: str | tuple[str, str] | None) -> Scan:
-    """The field of a file; the top row of its image is row 0.
+    """Read the field of a file; the top row of its image is row 0.
 
     Raises:
         ValueError: if it is not in this format, or truncated.

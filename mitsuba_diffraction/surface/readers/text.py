@@ -46,7 +46,7 @@ _ESRI = ("ncols", "nrows", "xllcorner", "yllcorner", "xllcenter", "yllcenter", "
 
 
 def read_points(path: Path, unit: str | tuple[str, str] | None) -> Scan:
-    """Points x y z on a regular grid.
+    """Read points x y z on a regular grid.
 
     Raises:
         ValueError: if a line does not have three numbers, no unit is given, or the points are not on a grid.
@@ -75,7 +75,7 @@ def read_points(path: Path, unit: str | tuple[str, str] | None) -> Scan:
 
 
 def read_table(path: Path, unit: str | tuple[str, str] | None) -> Scan:
-    """A table of heights.
+    """Read a table of heights.
 
     Raises:
         ValueError: if it is not a table, could be a list of points, or has no known unit.
@@ -141,7 +141,7 @@ def _text(path: Path) -> str:
 
 
 def _table(text: str) -> NDArray[np.float64]:
-    """Numbers in lines of equal length, separated by white space, commas or semicolons."""
+    """Parse numbers in lines of equal length, separated by white space, commas or semicolons."""
     first = next((line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")), "")
     if not first:
         raise RequestError("the file holds no numbers")
@@ -155,7 +155,7 @@ def _table(text: str) -> NDArray[np.float64]:
 
 
 def _grid(places: NDArray[np.float64], axis: str) -> tuple[NDArray[np.int64], int, float]:
-    """The index of each coordinate on its regular grid, the length of the grid, and its spacing (0 for one point)."""
+    """Return the index of each coordinate on its regular grid, the grid's length, and its spacing (0 for one point)."""
     values = np.unique(places)
     if values[-1] == values[0]:
         return np.zeros(len(places), np.int64), 1, 0.0
@@ -187,7 +187,7 @@ def _may_be_points(table: NDArray[np.float64]) -> bool:
 
 
 def _length(text: str, unit: str) -> float:
-    """A length in µm, in its own unit or else in the given one."""
+    """Parse a length in its own unit, or else in the given one; in µm."""
     number, own = _LENGTH.match(text).groups()
     try:
         value = float(number)

@@ -1,0 +1,322 @@
+"""What lies under the grating: any BSDF that reflects, its part of the light and of the samples."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from bsdf_support import (
+    WAVELENGTHS,
+    albedo,
+    array,
+    check_chi_square,
+    direction,
+    draw,
+    evaluate,
+    grating,
+    interaction,
+    random_directions,
+    through,
+    towards,
+    uniform,
+    use,
+    vectors,
+)
+
+DIFFUSE = {"type": "diffuse", "reflectance": uniform(0.5)}
+ROUGH = {"type": "roughconductor", "alpha": 0.3}
+SMOOTH = {
+    "diffuse": lambda: DIFFUSE,
+    "checkerboard": lambda: {
+        "type": "diffuse",
+        "reflectance": {"type": "checkerboard", "color0": uniform(0.1), "color1": uniform(0.9)},
+    },
+    "bitmap": lambda: {"type": "diffuse", "reflectance": bitmap(np.random.default_rng(1).random((4, 4, 3)))},
+    "roughplastic": lambda: {"type": "roughplastic", "alpha": 0.2, "diffuse_reflectance": uniform(0.4)},
+    "principled": lambda: {"type": "principled", "base_color": uniform(0.6), "roughness": 0.4, "metallic": 0.3},
+    "roughconductor": lambda: ROUGH,
+    "blendbsdf": lambda: {"type": "blendbsdf", "weight": 0.3, "first": DIFFUSE, "second": ROUGH},
+    "bumpmap": lambda: {
+        "type": "bumpmap",
+        "texture": bitmap(np.random.default_rng(2).random((8, 8, 1)), raw=True),
+        "scale": 0.05,
+        "nested": DIFFUSE,
+    },
+    "twosided": lambda: {"type": "twosided", "nested": DIFFUSE},
+    "grating": lambda: grating("corner", coherence_length=3.0),
+}
+MIRRORS = {
+    "conductor": lambda: {"type": "conductor", "material": "Al"},
+    "plastic": lambda: {"type": "plastic", "diffuse_reflectance": uniform(0.5)},
+}
+
+
+def bitmap(values, raw=False):
+    return {"type": "bitmap", "bitmap": mi.Bitmap(values.astype(np.float32)), "raw": raw}
+
+
+def over(base, name="blazed", coherence_length=3.0):
+    return mi.load_dict(grating(name, coherence_length, int_ior=1.5, ext_ior=1.0, base=base))
+
+
+def alone(name="blazed", coherence_length=3.0):
+    return mi.load_dict(grating(name, coherence_length, int_ior=1.5, ext_ior=1.0))
+
+
+pytestmark = pytest.mark.usefixtures("llvm")
+
+
+@pytest.mark.few(2)
+@pytest.mark.parametrize("name", sorted(SMOOTH))
+def test_value_is_the_sum_of_the_grating_and_the_transmitted_base(name):
+    rng = np.random.default_rng(3)
+    wo, uv = random_directions(rng, 500), rng.random((500, 2))
+    wi = random_directions(rng, 500)
+    base = mi.load_dict(SMOOTH[name]())
+    below = evaluate(base, wi, wo, uv=uv)[0]
+    assert below.max() > 0.01
+    wanted = evaluate(alone(), wi, wo)[0] + through(wi[:, 2]) * through(wo[:, 2]) * below
+    np.testing.assert_allclose(evaluate(over(SMOOTH[name]()), wi, wo, uv=uv)[0], wanted, rtol=2e-4, atol=1e-6)
+
+
+@pytest.mark.few(1)
+@pytest.mark.parametrize("name", sorted(SMOOTH))
+def test_weights_are_value_over_density_and_average_to_the_albedo(name):
+    bsdf, wi, count, uv = over(SMOOTH[name]()), direction(40, 30), 1 << 17, (0.3, 0.4)
+    bs, weight = draw(bsdf, wi, count, uv=[uv])
+    wo = np.array(bs.wo).T
+    value, pdf = evaluate(bsdf, wi, wo, uv=[uv])
+    some = np.array(bs.pdf) > 0
+    np.testing.assert_allclose(np.array(bs.pdf)[some], pdf[some], rtol=1e-3)
+    np.testing.assert_allclose((weight * pdf)[:, some], value[:, some], rtol=2e-3, atol=1e-6)
+    error = weight.std(1) / np.sqrt(count)
+    wanted = albedo(bsdf, wi, uv=[uv])
+    np.testing.assert_array_less(np.abs(weight.mean(1) - wanted), 4 * error + 2e-3 * wanted)
+
+
+@pytest.mark.parametrize(
+    ("base", "theta"),
+    [
+        ("diffuse", 60),
+        ("plastic", 0),
+        ("roughplastic", 85),
+        *(
+            pytest.param(base, theta, marks=pytest.mark.slow)
+            for base, theta in [
+                ("diffuse", 0),
+                ("diffuse", 85),
+                ("plastic", 60),
+                ("plastic", 85),
+                ("roughplastic", 0),
+                ("roughplastic", 60),
+            ]
+        ),
+    ],
+)
+def test_samples_pass_the_chi_square_test(base, theta):
+    check_chi_square(over({**SMOOTH, **MIRRORS}[base]()), direction(theta, 20), cases=9)
+
+
+@pytest.mark.few(1)
+@pytest.mark.parametrize("name", sorted(MIRRORS))
+def test_mirror_lobes_pass_the_surface_twice(name):
+    wi, count = direction(50, 70), 1 << 16
+    bsdf, base = over(MIRRORS[name]()), mi.load_dict(MIRRORS[name]())
+    bs, weight = draw(bsdf, wi, count)
+    mirror = np.array(mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta))
+    assert 0.02 < mirror.mean() < 0.95
+    np.testing.assert_allclose(np.array(bs.wo).T[mirror], np.tile(wi * [-1, -1, 1], (mirror.sum(), 1)), atol=1e-6)
+    # pdf is the share of the samples.
+    share = np.array(bs.pdf)[mirror]
+    np.testing.assert_allclose(share, mirror.mean(), atol=4 * np.sqrt(0.25 / count))
+    # What the mirror returns, and with it the whole.
+    of_base, of_base_weight = draw(base, wi, count)
+    returned = np.where(mi.has_flag(of_base.sampled_type, mi.BSDFFlags.Delta), of_base_weight, 0).mean(1)
+    wanted = through(wi[2]) ** 2 * returned
+    np.testing.assert_allclose(np.where(mirror, weight, 0).mean(1), wanted, rtol=0.02)
+    np.testing.assert_allclose(weight.mean(1), wanted + albedo(bsdf, wi), rtol=0.02)
+    # eval and pdf do not see it.
+    value, _ = evaluate(bsdf, wi, np.array(bs.wo).T[mirror][:1])
+    assert value.max() < 10
+
+
+@pytest.mark.parametrize(
+    "base",
+    [
+        {"type": "dielectric"},
+        {"type": "thindielectric"},
+        {"type": "roughdielectric"},
+        {"type": "null"},
+        {"type": "mask", "opacity": 0.5, "nested": DIFFUSE},
+        {"type": "principled", "spec_trans": 0.5},
+    ],
+    ids=lambda base: base["type"],
+)
+def test_a_transmissive_base_is_refused(base):
+    with pytest.raises((RuntimeError, ValueError), match="base: got a BSDF that lets light through"):
+        over(base)
+
+
+def test_a_base_that_is_no_bsdf_is_refused():
+    with pytest.raises((RuntimeError, ValueError), match="base"):
+        over(uniform(0.5))
+
+
+@pytest.mark.slow
+def test_flags_and_components_are_those_of_grating_and_base():
+    flags = mi.BSDFFlags
+    for name, base in (*SMOOTH.items(), *MIRRORS.items()):
+        nested, bsdf = mi.load_dict(base()), over(base())
+        assert bsdf.component_count() == 1 + nested.component_count()
+        assert bsdf.flags(0) & +flags.GlossyReflection
+        kinds = +flags.All | +flags.SpatiallyVarying
+        for i in range(nested.component_count()):
+            assert bsdf.flags(i + 1) & kinds == nested.flags(i) & kinds
+        assert not bsdf.flags() & +flags.BackSide
+        for flag in (flags.DiffuseReflection, flags.DeltaReflection, flags.SpatiallyVarying):
+            assert bool(bsdf.flags() & +flag) == bool(nested.flags() & +flag), (name, flag)
+
+
+def contexts():
+    """What asks for the grating alone, and what asks for the base alone."""
+    result = []
+    for index in (0, 1):
+        result.append(mi.BSDFContext())
+        result[-1].component = index
+        result.append(mi.BSDFContext())
+        result[-1].type_mask = +(mi.BSDFFlags.GlossyReflection, mi.BSDFFlags.DiffuseReflection)[index]
+    return result
+
+
+def test_components_can_be_evaluated_separately():
+    bsdf, wi = over(DIFFUSE), direction(40, 30)
+    rng = np.random.default_rng(4)
+    wo = random_directions(rng, 200)
+    of_grating, its_pdf = evaluate(alone(), wi, wo)
+    of_base = through(wi[2]) * through(wo[:, 2]) * 0.5 / np.pi * wo[:, 2] + np.zeros((4, 1))
+    wanted = [(of_grating, its_pdf)] * 2 + [(of_base, wo[:, 2] / np.pi)] * 2
+    for ctx, (value, pdf), component in zip(contexts(), wanted, (0, 0, 1, 1), strict=True):
+        found = evaluate(bsdf, wi, wo, ctx)
+        np.testing.assert_allclose(found[0], value, rtol=1e-3, atol=1e-6)
+        np.testing.assert_allclose(found[1], pdf, rtol=1e-3)
+        bs, weight = draw(bsdf, wi, 1 << 12, ctx)
+        assert (np.array(bs.sampled_component) == component).all()
+        some = np.array(bs.pdf) > 0
+        value, pdf = evaluate(bsdf, wi, np.array(bs.wo).T, ctx)
+        np.testing.assert_allclose((weight * pdf)[:, some], value[:, some], rtol=2e-3, atol=1e-6)
+    ctx = mi.BSDFContext()
+    ctx.component = 2
+    assert evaluate(bsdf, wi, wo, ctx)[0].max() == 0
+    assert draw(bsdf, wi, 16, ctx)[1].max() == 0
+
+
+@pytest.mark.parametrize("theta", [0, 30, 60, 85])
+@pytest.mark.parametrize("reflectance", [0.02, 0.5])
+def test_samples_are_split_in_proportion_to_power(theta, reflectance):
+    def fraction(bsdf):
+        _, weight = draw(bsdf, direction(theta, 30), 1 << 16)
+        w = weight.mean(0)
+        assert w.max() < 6 * w.mean()
+        return w.mean() ** 2 / (w**2).mean()
+
+    bsdf = over({"type": "diffuse", "reflectance": uniform(reflectance)}, "blazed", 65.0)
+    found = fraction(bsdf)
+    bsdf.layers._share = lambda *_: mi.Float(0.5)
+    assert found > fraction(bsdf) + 0.04
+    if reflectance == 0.5 and theta <= 60:
+        assert found > 0.93
+
+
+def test_samples_follow_a_textured_base():
+    bsdf = over(SMOOTH["checkerboard"]())
+    shares = []
+    for uv in ((0.2, 0.2), (0.7, 0.2)):
+        bs, _ = draw(bsdf, direction(20), 1 << 12, uv=[uv])
+        shares.append((np.array(bs.sampled_component) == 0).mean())
+    assert max(shares) > 2 * min(shares)
+
+
+@pytest.mark.few(12)
+@pytest.mark.parametrize("theta", [0, 70, 89, *(pytest.param(x, marks=pytest.mark.slow) for x in (30, 45, 80, 85))])
+@pytest.mark.parametrize("base", [{"type": "diffuse", "reflectance": uniform(1.0)}, {"type": "conductor"}])
+@pytest.mark.parametrize("name", ["blazed", "deep blazed", "elaphe"])
+def test_the_albedo_with_a_base_is_at_most_one(name, base, theta):
+    count = 1 << 16
+    _, weight = draw(over(base, name, 65.0), direction(theta, 30), count)
+    assert weight.mean() > 0.2
+    assert (weight.mean(1) <= 1 + 4 * weight.std(1) / np.sqrt(count)).all()
+
+
+OTHERS = [None, "diffuse", "conductor"]
+
+
+def over_or_alone(base):
+    return alone() if base is None else over({**SMOOTH, **MIRRORS}[base]())
+
+
+def some_directions(wi):
+    return np.concatenate([towards(wi, [[0, 0], [1, 0], [-1, 0]], 500), random_directions(np.random.default_rng(5), 5)])
+
+
+def values_and_samples(base, wi):
+    value, pdf = evaluate(over_or_alone(base), wi, some_directions(wi))
+    bs, weight = draw(over_or_alone(base), wi, 16)
+    component = np.array(bs.sampled_component) + np.zeros(16)
+    return value.T, pdf, np.array(bs.wo).T, np.array(bs.pdf), weight.T, component
+
+
+@pytest.mark.few(1)
+@pytest.mark.parametrize("base", OTHERS)
+def test_polarised_variants_agree_with_the_unpolarised(base):
+    wi = direction(40, 30)
+    wanted = values_and_samples(base, wi)
+    use("llvm_ad_spectral_polarized")
+    for found, value in zip(values_and_samples(base, wi), wanted, strict=True):
+        np.testing.assert_allclose(found, value, rtol=5e-3, atol=2e-4)
+    # The grating polarises (test_polarisation.py); neither does a diffuse base, nor a mirror in other directions.
+    wo = some_directions(wi)
+    si = interaction(np.tile(wi, (len(wo), 1)), count=len(wo))
+    value, of_grating = (
+        array(bsdf.eval(mi.BSDFContext(), si, vectors(wo))).reshape(16, -1) for bsdf in (over_or_alone(base), alone())
+    )
+    assert np.abs(of_grating[1:]).max() > 0
+    np.testing.assert_array_equal(value[1:], of_grating[1:])
+    u = np.random.default_rng(1).random((3, 16)).astype(np.float32)
+    si = interaction(np.tile(wi, (16, 1)), count=16)
+    bs, weight = over_or_alone(base).sample(mi.BSDFContext(), si, mi.Float(u[0]), mi.Point2f(u[1], u[2]))
+    dr.eval(bs, weight)
+    if base == "conductor":
+        of_mirror = np.array(bs.sampled_component) == 1
+        assert np.abs(np.array(weight).reshape(16, 4, 16)[1:][..., of_mirror]).max() > 0.1
+
+
+@pytest.mark.parametrize("base", OTHERS)
+def test_scalar_variants_agree_with_the_vectorised(base):
+    wi = direction(40, 30)
+    values, pdfs, *samples = values_and_samples(base, wi)
+    use("scalar_spectral")
+    bsdf, ctx = over_or_alone(base), mi.BSDFContext()
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    si.wi, si.wavelengths = mi.Vector3f(*map(float, wi)), type(si.wavelengths)(*WAVELENGTHS)
+    for o, value, pdf in zip(some_directions(wi), values, pdfs, strict=True):
+        found, density = bsdf.eval_pdf(ctx, si, mi.Vector3f(*map(float, o)))
+        np.testing.assert_allclose(np.array(found).ravel(), value, rtol=2e-3, atol=1e-6)
+        np.testing.assert_allclose(density, pdf, rtol=2e-3)
+    u = np.random.default_rng(1).random((3, 16)).astype(np.float32)
+    for numbers, wo, pdf, weight, component in zip(u.T, *samples, strict=True):
+        one = [float(x) for x in numbers]
+        bs, found = bsdf.sample(ctx, si, one[0], mi.Point2f(*one[1:]))
+        if pdf == 0:
+            assert bs.pdf == 0
+            continue
+        np.testing.assert_allclose(np.array(bs.wo).ravel(), wo, atol=2e-4)
+        np.testing.assert_allclose(bs.pdf, pdf, rtol=5e-3)
+        np.testing.assert_allclose(np.array(found).ravel(), weight, rtol=5e-3, atol=1e-4)
+        assert bs.sampled_component == component
+
+
+def test_base_is_dark_from_behind():
+    for name in ("principled", "twosided"):
+        bsdf = over(SMOOTH[name]())
+        value, pdf = bsdf.eval_pdf(mi.BSDFContext(), interaction([0.6, 0, -0.8]), vectors([-0.6, 0, -0.8]))
+        assert np.array(value).max() == 0
+        assert np.array(pdf).max() == 0

@@ -1,0 +1,213 @@
+"""A clear layer over the grating, against Fresnel's formulas and closed forms inside the layer."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from bsdf_support import array, check_chi_square, direction, interaction, random_directions, use, vectors
+
+import mitsuba_diffraction as md
+from mitsuba_diffraction import testing
+from mitsuba_diffraction.geometry import k_g
+from mitsuba_diffraction.scalar_theory import fresnel
+
+INDEX = 1.55
+GRATING = {"type": "diffraction_grating", "coherence_length": 3.0}
+AIR = 1.000277
+RELATIVE = INDEX / AIR
+
+
+def coated(profile="blazed", **parameters):
+    surface = {"blazed": {"period": 2.5, "depth": 0.25}, "lamellar": {"period": 2.5, "depth": 0.1}}[profile]
+    given = {"coat_ior": INDEX, "coherence_length": 3.0, **parameters}
+    if "int_ior" not in given:
+        given.setdefault("material", "none")
+    return mi.load_dict({"type": "diffraction_grating", "profile": profile, **surface, **given})
+
+
+def inside(omega):
+    """Directions in the layer, by Snell's law."""
+    across = omega[..., :2] / RELATIVE
+    return np.concatenate([across, np.sqrt(1 - (across**2).sum(-1, keepdims=True))], -1)
+
+
+def transmittance(cosine):
+    """Of unpolarised light through the front face."""
+    return 1 - np.mean(fresnel(cosine, RELATIVE), axis=0)
+
+
+@pytest.mark.few(1)
+@pytest.mark.parametrize("theta", [0.0, 25.0, 50.0])
+def test_orders_inside_the_coat_have_the_powers_of_the_closed_form(llvm, theta):
+    wavelength, wi = 0.5, direction(theta)
+    bsdf = coated("lamellar", coherence_length=200.0)
+    sigma, energy = bsdf.spectrum.lobe_width, bsdf.spectrum.energy_table()
+    offsets = np.linspace(-6, 6, 61) * sigma
+    cell = (offsets[1] - offsets[0]) ** 2
+    checked = 0
+    for m in (-3, -1, 0, 1, 3):
+        q = np.stack(np.broadcast_arrays(m / 2.5 + offsets[:, None], offsets), -1).reshape(-1, 2)
+        wo = testing.towards(wi, q, 1e3 * wavelength)
+        centre = testing.towards(wi, np.array([m / 2.5, 0.0]), 1e3 * wavelength)
+        if not np.isfinite(wo).all() or centre[2] < 0.2:
+            continue
+        power = wavelength**2 * cell * (testing.evaluate(bsdf, wi, wo, [1e3 * wavelength])[:, 0] / wo[:, 2]).sum()
+        i, o = inside(wi), inside(centre)
+        kappa = 2 * np.pi * RELATIVE * (i[2] + o[2]) / wavelength
+        eta = np.cos(kappa * 0.05) ** 2 if m == 0 else (2 / (np.pi * m) * np.sin(kappa * 0.05)) ** 2
+        geometry = k_g(i[2], o[2], 1 + i @ o, True)
+        bound = energy.at(np.stack([i, o]), np.full(2, wavelength / RELATIVE)).min()
+        expected = transmittance(wi[2]) * transmittance(centre[2]) * geometry * eta * bound
+        assert power == pytest.approx(expected, abs=1e-3)
+        checked += 1
+    assert checked >= 3
+
+
+@pytest.mark.slow
+def test_a_coat_of_air_changes_nothing(llvm):
+    rng = np.random.default_rng(0)
+    wi, wo = random_directions(rng, 200), random_directions(rng, 200)
+    plain = {"coat_ior": AIR, "material": "Al"}
+    with_coat = testing.evaluate(coated(**plain), wi, wo, [400, 500, 600, 700])
+    bare = {"type": "diffraction_grating", "profile": "blazed", "period": 2.5, "depth": 0.25, "material": "Al"}
+    without = testing.evaluate(mi.load_dict({**bare, "coherence_length": 3.0}), wi, wo, [400, 500, 600, 700])
+    np.testing.assert_allclose(with_coat, without, rtol=2e-3, atol=1e-5)
+
+
+@pytest.mark.parametrize("material", [{"material": "none"}, {"material": "Al"}, {"int_ior": 1.8}])
+def test_a_coated_grating_is_reciprocal(llvm, material):
+    rng = np.random.default_rng(1)
+    wi, wo = random_directions(rng, 500, 0.1), random_directions(rng, 500, 0.1)
+    bsdf = coated(**material)
+    there = testing.evaluate(bsdf, wi, wo, [450, 650]) / wo[:, 2:]
+    back = testing.evaluate(bsdf, wo, wi, [450, 650]) / wi[:, 2:]
+    np.testing.assert_allclose(there, back, rtol=1e-4, atol=1e-4)
+    assert there.max() > 0.01
+
+
+@pytest.mark.parametrize("theta", [0, 45, 75, 88])
+@pytest.mark.parametrize("turned", [0, 70])
+def test_the_front_face_follows_fresnel_and_no_light_is_gained(llvm, theta, turned):
+    wi = np.broadcast_to(direction(theta, turned), (100_000, 3))
+    bsdf = coated()
+    wo, weight, bs = testing.sample(bsdf, wi, [550] * 4)
+    mirrored = np.array(mi.has_flag(bs.sampled_type, mi.BSDFFlags.DeltaReflection)) & (np.array(bs.pdf) > 0)
+    np.testing.assert_allclose(wo[mirrored], np.broadcast_to(wi[0] * [-1, -1, 1], (mirrored.sum(), 3)), atol=1e-6)
+    assert np.unique(np.array(bs.sampled_component)[mirrored]) == [1]
+    front = np.mean(fresnel(wi[0, 2], RELATIVE))
+    # The share of the front face times the weight of its samples is exact.
+    np.testing.assert_allclose(np.array(bs.pdf)[mirrored] * weight[mirrored, 0], front, rtol=1e-4)
+    albedo = weight[:, 0].mean()
+    assert front < albedo < 1 + 4 * weight[:, 0].std() / np.sqrt(len(weight))
+
+
+@pytest.mark.parametrize("theta", [0, 60])
+def test_samples_pass_the_chi_square_test(llvm, theta):
+    context = mi.BSDFContext()
+    context.type_mask = +mi.BSDFFlags.GlossyReflection
+    check_chi_square(coated(conserve_energy=False), direction(theta, 20), ctx=context)
+
+
+def test_an_absorbing_layer_attenuates_both_passes(llvm):
+    wi, wo = direction(30.0), direction([10.0, 40.0, 60.0], 180)
+    clear = testing.evaluate(coated(), wi, wo, [550])
+    dyed = testing.evaluate(coated(coat_absorption=0.004, coat_thickness=100.0), wi, wo, [550])
+    cosines = inside(wi)[2], inside(wo)[:, 2]
+    np.testing.assert_allclose(dyed[:, 0], clear[:, 0] * np.exp(-0.4 * (1 / cosines[0] + 1 / cosines[1])), rtol=1e-4)
+
+
+def test_a_pigmented_base_is_seen_through_the_layer(llvm):
+    base = {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.5}}
+    wi, wo = direction(20.0), direction(65.0, 90)
+    context = mi.BSDFContext()
+    context.component = 1
+    value, _ = testing.evaluate_pdf(coated(int_ior=INDEX, base=base), wi, wo, [550], context)
+    # The grating's own index is that of the layer: only the front face reflects.
+    expected = transmittance(wi[2]) * transmittance(wo[2]) * 0.5 / np.pi * wo[2]
+    assert value[0] == pytest.approx(expected, rel=1e-4)
+
+
+def test_scalar_and_polarised_variants_agree():
+    wi, wo = direction(1e-3), direction(12.0, 30)
+    found = []
+    for variant in ("llvm_ad_spectral", "scalar_spectral", "llvm_ad_spectral_polarized"):
+        use(variant)
+        found.append(testing.evaluate(coated(material="Al"), wi, wo, [450, 550, 650, 750]))
+    np.testing.assert_allclose(found[1], found[0], rtol=1e-3)
+    # Off the normal s and p pass the front face unequally: a little more or less passes twice.
+    np.testing.assert_allclose(found[2], found[0], rtol=1e-2)
+
+
+def test_a_scalar_variant_divides_by_no_zero():
+    """From behind, along the horizon, and where drawn directions are evanescent even inside."""
+    use("scalar_spectral")
+    thin = {"profile": "crossed", "period": 2.0, "depth": 0.3, "material": "none", "coat_ior": 1.05}
+    thin |= {"coat_absorption": 0.1, "coat_thickness": 1.0, "conserve_energy": False}
+    rng = np.random.default_rng(0)
+    for bsdf, wi in (
+        (coated(conserve_energy=False), (0.95, 0, -0.3)),
+        (coated(conserve_energy=False), (1.0, 0, 0)),
+        (mi.load_dict(GRATING | thin), (0.6, 0, 0.8)),
+    ):
+        si = interaction(np.array(wi) / np.linalg.norm(wi))
+        for first, *second in rng.random((100, 3)).tolist():
+            bs, weight = bsdf.sample(mi.BSDFContext(), si, first, mi.Point2f(*second))
+            assert np.isfinite([bs.pdf, *np.ravel(weight)]).all()
+
+
+def test_s_polarised_light_stays_s_polarised():
+    """At oblique incidence in the plane of the grooves' normal s light stays s light."""
+    use("llvm_ad_spectral_polarized")
+    wi = direction(56.0)
+    wo = wi * [-1, 1, 1]
+    bsdf = coated(material="none")
+    si = interaction(wi)
+    matrix = array(bsdf.eval(mi.BSDFContext(), si, vectors(wo)))[..., 0, 0]
+    s, p = 1 - np.array(fresnel(wi[2], RELATIVE)).ravel()
+    # The stokes basis of either direction lies along s or p: both passes leave (s² + p²)/2 and ±(s² − p²)/2.
+    assert abs(matrix[0, 1] / matrix[0, 0]) == pytest.approx(abs(s - p) / (s + p), rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "text"),
+    [
+        ({"coat_ior": 0.9}, "coat_ior: got 0.9, wanted at least one"),
+        ({"coat_ior": 1.2, "ext_ior": 1.33, "int_ior": 1.5}, "coat_ior: got 1.2, wanted at least one and that of"),
+        ({"coat_ior": float("nan")}, "coat_ior: got nan"),
+        ({"coat_thickness": -1.0}, "coat_thickness: got -1.0"),
+        ({"base": {"type": "diffuse"}}, "base: got a BSDF below a conductor"),
+    ],
+)
+def test_a_wrong_coat_is_refused(llvm, parameters, text):
+    with pytest.raises(RuntimeError, match=text):
+        coated(**parameters)
+
+
+@pytest.mark.parametrize(
+    ("layer", "without"),
+    [
+        ({"coat_ior": 1.0, "material": "Al"}, {"material": "Al"}),
+        ({"coat_ior": "air", "int_ior": 1.8, "coat_thickness": 2.0, "coat_absorption": 0.0}, {"int_ior": 1.8}),
+        ({"coat_ior": 1.33, "ext_ior": 1.33, "int_ior": 1.8}, {"ext_ior": 1.33, "int_ior": 1.8}),
+        # A layer of the index of water on a metal in water.
+        (
+            {"coat_ior": 1.33, "ext_ior": 1.33, "material": "Al"},
+            {"coat_ior": 1.3314, "ext_ior": 1.33, "material": "Al"},
+        ),
+    ],
+)
+def test_a_coat_with_the_exterior_index_changes_nothing(llvm, layer, without):
+    found = coated(**layer)
+    assert found.layers.coat is None
+    plain = {"type": "diffraction_grating", "profile": "blazed", "period": 2.5, "depth": 0.25, "coherence_length": 3.0}
+    wi, wo = direction(20.0), direction(-30.0)
+    values = [testing.evaluate(bsdf, wi, wo, [550]) for bsdf in (found, mi.load_dict({**plain, **without}))]
+    np.testing.assert_allclose(values[0], values[1], rtol=1e-6 if "coat_ior" not in without else 0.02)
+
+
+def test_a_coat_without_index_or_wavelengths_is_refused(llvm):
+    plain = {"type": "diffraction_grating", "profile": "blazed", "period": 2.5, "depth": 0.25}
+    with pytest.raises(RuntimeError, match="got a layer without coat_ior"):
+        mi.load_dict({**plain, "coat_absorption": 0.1})
+    spectrum = md.precompute(md.gratings.blazed(2.5, 0.25))
+    with pytest.raises(RuntimeError, match=r"build it from 232\.3 nm"):
+        mi.load_dict({"type": "diffraction_grating", "spectrum": spectrum, "coat_ior": INDEX})

@@ -1,0 +1,220 @@
+"""Which way the pattern lies in the world: the side to which a blazed corner sends its light."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from bsdf_support import PERIOD, WAVELENGTHS, array, corner_blaze, evaluate, grating, vectors
+
+DOWN = (0.0, 0.0, -1.0)
+SQUARE = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], float)
+S = np.sqrt(0.5)
+
+
+pytestmark = pytest.mark.usefixtures("llvm")
+
+
+def scale(*factors):
+    return mi.ScalarTransform4f().scale(list(factors))
+
+
+def corner(**parameters):
+    """Without E, which says nothing of frames and would take longer than all else."""
+    return grating("corner", conserve_energy=False, **parameters)
+
+
+def mesh(uv=None):
+    """The unit square of two triangles, (0 1 2) and (0 2 3), with or without UVs."""
+    result = mi.Mesh("square", 4, 2, has_vertex_texcoords=uv is not None)
+    parameters = mi.traverse(result)
+    corners = np.concatenate([SQUARE, np.zeros((4, 1))], 1)
+    parameters["vertex_positions"] = mi.Float(corners.ravel().astype(np.float32))
+    parameters["faces"] = mi.UInt32([0, 1, 2, 0, 2, 3])
+    if uv is not None:
+        parameters["vertex_texcoords"] = mi.Float(np.asarray(uv, np.float32).ravel())
+    parameters.update()
+    return result
+
+
+def bent(uv, to_world, folder):
+    """The same from a file, moved by `to_world`."""
+    path = folder / "square.ply"
+    mesh(uv).write_ply(str(path))
+    return {"type": "ply", "filename": str(path), "face_normals": True, "to_world": to_world}
+
+
+def hit(shape, origin, towards, bsdf):
+    """The interaction of a ray with the shape, which must show `bsdf`."""
+    if isinstance(shape, dict):
+        shape = {**shape, "bsdf": bsdf}
+    scene = mi.load_dict({"type": "scene", "shape": shape})
+    ray = mi.Ray3f(mi.Point3f(*map(float, origin)), mi.Vector3f(*map(float, towards)))
+    si = scene.ray_intersect(ray)
+    # Before the scene goes, on which what is not yet computed depends.
+    dr.eval(si)
+    assert dr.all(si.is_valid())
+    si.wavelengths = type(si.wavelengths)(*WAVELENGTHS)
+    return si
+
+
+def world(si, bsdf, omega):
+    """f cos θ_o at 500 nm for directions (n, 3) in the world."""
+    return array(bsdf.eval(mi.BSDFContext(), si, si.to_local(vectors(omega))))[1]
+
+
+def orders(mirror, x, y, n):
+    """The directions of the orders (1, 1), (1, −1), (−1, 1), (−1, −1) at 500 nm, in the world."""
+    step = 0.5 / PERIOD
+    tangent = mirror - n * (mirror @ n)
+    result = []
+    for a, b in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+        t = tangent - step * (a * x + b * y)
+        result.append(t + n * np.sqrt(1 - t @ t))
+    return np.array(result)
+
+
+def check(shape, origin, towards, n, x, y, orientation=0.0, wrap=lambda nested: nested):
+    """The order (1, 1) of the corner, and it alone, must shine to −x −y."""
+    bsdf = mi.load_dict(wrap(corner(orientation=orientation)))
+    plain = mi.load_dict(corner())
+    n, x, y, d = (np.asarray(v, float) for v in (n, x, y, towards))
+    d = d / np.linalg.norm(d)
+    si = hit(shape, origin, d, bsdf)
+    mirror = d - 2 * n * (n @ d)
+    found = world(si, bsdf, orders(mirror, x, y, n))
+    # The plain grating on a table of its own.
+    axes = np.stack([x, y, n])
+    wanted = evaluate(plain, -axes @ d, orders(axes @ mirror, *np.eye(3)))[0][1]
+    assert wanted[0] > 5 * max(wanted[1:])
+    np.testing.assert_allclose(found, wanted, rtol=0.02, atol=1e-3 * wanted[0])
+
+
+def test_the_corner_blaze_rises_along_x_and_y():
+    h = corner_blaze().heights
+    assert (np.diff(h[0])[:-1] > 0).all()
+    assert (np.diff(h[:, 0])[:-1] > 0).all()
+
+
+FLAT = {
+    "rectangle": ({"type": "rectangle"}, (1, 0, 0), (0, 1, 0)),
+    "rectangle of mirrored u": ({"type": "rectangle", "to_world": (-1, 1, 1)}, (-1, 0, 0), (0, -1, 0)),
+    "rectangle of mirrored v": ({"type": "rectangle", "to_world": (1, -1, 1)}, (1, 0, 0), (0, 1, 0)),
+    "stretched rectangle": ({"type": "rectangle", "to_world": (2, 0.5, 1)}, (1, 0, 0), (0, 1, 0)),
+    "mesh": (SQUARE, (1, 0, 0), (0, 1, 0)),
+    "mesh of mirrored u": (SQUARE * [-1, 1], (-1, 0, 0), (0, -1, 0)),
+    "mesh of mirrored v": (SQUARE * [1, -1], (1, 0, 0), (0, 1, 0)),
+    "mesh of exchanged u and v": (SQUARE[:, ::-1], (0, 1, 0), (-1, 0, 0)),
+    "mesh of sheared u": (SQUARE @ [[1, 0], [0.5, 1]], (1, 0, 0), (0, 1, 0)),
+    # u = x, v = x + y: dp_du is (1, −1), at 45° to dp_dv.
+    "mesh of sheared v": (SQUARE @ [[1, 1], [0, 1]], (S, -S, 0), (S, S, 0)),
+}
+
+
+@pytest.mark.parametrize(
+    ("towards", "orientation"), [(DOWN, 0.0), ((0.3, -0.2, -1.0), 30.0)], ids=["normal", "oblique and turned"]
+)
+@pytest.mark.parametrize("name", sorted(FLAT))
+def test_x_lies_along_dp_du_and_y_across(name, towards, orientation):
+    shape, x, y = FLAT[name]
+    if not isinstance(shape, dict):
+        shape = mesh(shape)
+    elif "to_world" in shape:
+        shape = {**shape, "to_world": scale(*shape["to_world"])}
+    x, y, a = np.array(x, float), np.array(y, float), np.deg2rad(orientation)
+    x, y = np.cos(a) * x + np.sin(a) * y, np.cos(a) * y - np.sin(a) * x
+    origin = np.array([0.4, 0.2, 0]) - 2 * np.array(towards)
+    check(shape, origin, towards, (0, 0, 1), x, y, orientation)
+
+
+@pytest.mark.parametrize(
+    ("at", "x"),
+    [((0.4, 0.2), (1, 0, 0)), ((0.2, 0.4), (S, S, 0))],
+    ids=["first triangle", "second triangle"],
+)
+def test_mesh_without_uvs_takes_the_first_edge_of_each_triangle(at, x):
+    check(mesh(), (*at, 2), DOWN, (0, 0, 1), x, np.cross((0, 0, 1), x))
+
+
+def test_mesh_of_one_uv_for_all_has_one_frame():
+    si = [hit(mesh(np.zeros((4, 2))), (*at, 2), DOWN, None) for at in ((0.4, 0.2), (0.2, 0.4))]
+    s, t = (np.array([np.array(getattr(i.sh_frame, axis)).ravel() for i in si]) for axis in "st")
+    np.testing.assert_array_equal(s[0], s[1])
+    check(mesh(np.zeros((4, 2))), (0.4, 0.2, 2), DOWN, (0, 0, 1), s[0], t[0])
+
+
+@pytest.mark.parametrize("factors", [(-1, 1, 1), (1, -1, 1), (-2, 3, 1)])
+def test_mirrored_mesh_keeps_its_handedness(tmp_path, factors):
+    """The normal of a mesh turns with its triangles: a mirrored one is seen from below, with u along ±x."""
+    shape = bent(SQUARE, scale(*factors), tmp_path)
+    x = np.array([np.sign(factors[0]), 0, 0.0])
+    place = np.array([0.4 * factors[0], 0.2 * factors[1], 0])
+    si = hit(shape, place + 2 * np.array([0, 0, 1.0]), DOWN, mi.load_dict(corner()))
+    n = np.array(si.sh_frame.n).ravel()
+    check(shape, place + 2 * n, -n, n, x, np.cross(n, x))
+
+
+def test_flipped_normals_reverse_y():
+    shape = {"type": "rectangle", "flip_normals": True}
+    check(shape, (0.4, 0.2, -2), (0, 0, 1), (0, 0, -1), (1, 0, 0), (0, -1, 0))
+
+
+@pytest.mark.parametrize("at", [(0.3, 0.2), (-0.5, 0.1), (0.1, -0.6)])
+@pytest.mark.parametrize("oblique", [0.0, 0.3])
+def test_sphere_has_x_along_its_parallels(at, oblique):
+    n = np.array([*at, np.sqrt(1 - at[0] ** 2 - at[1] ** 2)])
+    x = np.array([-n[1], n[0], 0]) / np.hypot(n[0], n[1])
+    towards = -n + oblique * x
+    # On a sphere y is −dp_dv: v grows from the north pole.
+    check({"type": "sphere"}, n - towards, towards, n, x, np.cross(n, x))
+
+
+def test_disk_has_x_along_its_radius():
+    x = np.array([0.6, 0.8, 0])
+    check({"type": "disk"}, (*(0.5 * x[:2]), 2), DOWN, (0, 0, 1), x, np.cross((0, 0, 1), x))
+
+
+def test_poles_of_a_sphere_are_finite():
+    bsdf = mi.load_dict(corner())
+    si = hit({"type": "sphere"}, (0, 0, 3), DOWN, bsdf)
+    value = world(si, bsdf, orders(np.array([0, 0, 1.0]), *np.eye(3)))
+    assert np.isfinite(value).all()
+    assert value.max() > 0
+
+
+@pytest.mark.slow
+def test_back_of_a_twosided_surface_is_the_mirror_image():
+    def twosided(nested):
+        return {"type": "twosided", "nested": nested}
+
+    # In the world the light goes to −x −y on either side: x, y and the normal −z are left-handed.
+    for z in (1.0, -1.0):
+        check({"type": "rectangle"}, (0.4, 0.2, 2 * z), (0, 0, -z), (0, 0, z), (1, 0, 0), (0, 1, 0), wrap=twosided)
+    a = np.deg2rad(30)
+    x, y = (np.cos(a), np.sin(a), 0), (-np.sin(a), np.cos(a), 0)
+    check({"type": "rectangle"}, (0.4, 0.2, -2), (0.2, 0.1, 1), (0, 0, -1), x, y, 30.0, twosided)
+
+
+def test_interpolated_normals_carry_the_tangent_along(tmp_path):
+    """x is dp_du less its part along the shading normal, not the geometric one."""
+    result = mi.Mesh("square", 4, 2, has_vertex_texcoords=True, has_vertex_normals=True)
+    parameters = mi.traverse(result)
+    n = np.array([0.3, 0.1, 1]) / np.linalg.norm([0.3, 0.1, 1])
+    parameters["vertex_positions"] = mi.Float(np.c_[SQUARE, np.zeros(4)].ravel().astype(np.float32))
+    parameters["faces"] = mi.UInt32([0, 1, 2, 0, 2, 3])
+    parameters["vertex_texcoords"] = mi.Float(SQUARE.ravel().astype(np.float32))
+    parameters["vertex_normals"] = mi.Float(np.tile(n, 4).astype(np.float32))
+    path = tmp_path / "square.ply"
+    result.write_ply(str(path))
+    x = np.array([1, 0, 0]) - n * n[0]
+    x /= np.linalg.norm(x)
+    place = np.array([0.4, 0.2, 0])
+    check({"type": "ply", "filename": str(path)}, place + 2 * n, -n, n, x, np.cross(n, x))
+
+
+def test_period_is_that_of_the_pattern():
+    """The step from order to order is λ/T, so that the directions above are those of bright orders."""
+    bsdf = mi.load_dict(corner())
+    si = hit({"type": "rectangle", "to_world": scale(3, 3, 3)}, (0.4, 0.2, 2), DOWN, bsdf)
+    on = world(si, bsdf, orders(np.array([0, 0, 1.0]), *np.eye(3)))[0]
+    off = world(si, bsdf, orders(np.array([0, 0, 1.0]), *(1.2 * np.eye(3)[:2]), np.eye(3)[2]))[0]
+    assert on > 1e3 * off

@@ -1,0 +1,95 @@
+"""The Mueller matrix of the grating against that of Mitsuba's rough conductor, whose facets are planes as well."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from bsdf_support import array, use, vectors
+
+import mitsuba_diffraction as md
+
+WAVELENGTHS = (400.0, 500.0, 600.0, 700.0)
+
+
+@pytest.fixture
+def polarised():
+    use("llvm_ad_spectral_polarized")
+
+
+def grating(**parameters):
+    # Lobes as wide as the facets': light everywhere.
+    spectrum = md.precompute(md.gratings.sinusoidal(2.5, 0.3), coherence_length=2.0)
+    return mi.load_dict({"type": "diffraction_grating", "spectrum": spectrum, "conserve_energy": False, **parameters})
+
+
+def directions(count=200):
+    random = np.random.default_rng(4)
+    cosine, phi = random.uniform(0.4, 0.95, (2, count)), random.uniform(0, 2 * np.pi, (2, count))
+    sine = np.sqrt(1 - cosine**2)
+    return np.stack([sine * np.cos(phi), sine * np.sin(phi), cosine], axis=1)
+
+
+def matrices(bsdf, wi, wo, mode=None):
+    """(4, 4, wavelengths, n)"""
+    si = dr.zeros(mi.SurfaceInteraction3f, wi.shape[1])
+    si.wi = vectors(wi.T)
+    si.wavelengths = type(si.wavelengths)(*WAVELENGTHS)
+    si.sh_frame = mi.Frame3f(mi.Normal3f(0, 0, 1))
+    ctx = mi.BSDFContext(mode or mi.TransportMode.Radiance)
+    return array(bsdf.eval(ctx, si, vectors(wo.T)), np.float64)
+
+
+@pytest.mark.few(1)
+@pytest.mark.parametrize("mode", ["Radiance", "Importance"])
+def test_a_metal_polarises_as_a_rough_conductor(polarised, mode):
+    mode = getattr(mi.TransportMode, mode)
+    wi, wo = directions()
+    rough = mi.load_dict({"type": "roughconductor", "material": "Au", "distribution": "beckmann", "alpha": 0.6})
+    found, expected = (matrices(bsdf, wi, wo, mode) for bsdf in (grating(material="Au"), rough))
+    there = (found[0, 0] > 1e-6) & (expected[0, 0] > 1e-6)
+    assert there.sum() > 300
+    for row, column in np.ndindex(4, 4):
+        np.testing.assert_allclose(
+            (found[row, column] / np.where(there, found[0, 0], 1))[there],
+            (expected[row, column] / np.where(there, expected[0, 0], 1))[there],
+            atol=2e-4,
+            err_msg=f"{row}, {column}",
+        )
+
+
+@pytest.mark.slow
+def test_light_reflected_at_brewsters_angle_is_s_light(polarised):
+    angle = np.arctan(1.5)
+    wi = np.array([[np.sin(angle)], [0], [np.cos(angle)]])
+    m = matrices(grating(int_ior=1.5, ext_ior=1.0), wi, np.array([[-1], [1], [1]]) * wi)[..., 0]
+    assert (m[0, 0] > 0).all()
+    np.testing.assert_allclose(np.hypot(m[1, 0], m[2, 0]) / m[0, 0], 1, atol=1e-3)
+
+
+@pytest.mark.slow
+def test_unpolarised_light_is_as_bright_as_in_the_other_variants(polarised):
+    wi, wo = directions(50)
+    brightness = matrices(grating(int_ior=1.5), wi, wo)[0, 0]
+    mi.set_variant("llvm_ad_spectral")
+    np.testing.assert_allclose(brightness, matrices(grating(int_ior=1.5), wi, wo), rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.few(1)
+@pytest.mark.parametrize("parameters", [{"material": "none"}, {"int_ior": 1.5, "fresnel": "schlick"}])
+def test_without_an_index_light_leaves_unpolarised(polarised, parameters):
+    m = matrices(grating(**parameters), *directions(20))
+    assert (m[0, 0] > 0).any()
+    m[0, 0] = 0
+    assert (m == 0).all()
+
+
+@pytest.mark.slow
+def test_retroreflection_has_a_finite_matrix(polarised):
+    wi = np.array([[0.0], [0.0], [1.0]])
+    assert np.isfinite(matrices(grating(int_ior=1.5), wi, wi)).all()
+
+
+@pytest.mark.slow
+def test_indices_that_match_reflect_nothing(polarised):
+    m = matrices(grating(int_ior=1.0, ext_ior=1.0), *directions(20))
+    assert (m == 0).all()

@@ -1,0 +1,429 @@
+"""Samples against their density, the density against the sphere, and how much work a sample does."""
+
+import functools
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from bsdf_support import (
+    WAVELENGTHS,
+    albedo,
+    array,
+    check_chi_square,
+    direction,
+    draw,
+    floats,
+    hemisphere,
+    interaction,
+    plugin,
+    use,
+    vectors,
+)
+
+import mitsuba_diffraction as md
+from mitsuba_diffraction import testing
+from mitsuba_diffraction.bsdf.cell_sampler import CellSampler
+from mitsuba_diffraction.bsdf.geometry import Incidence
+from mitsuba_diffraction.bsdf.orders import LineSampler, OrderSampler, OrderSpectrum
+
+SKINS = "elaphe", "xenopeltis"  # slow to build
+BUNDLED = {
+    "blazed": lambda: md.gratings.blazed(2.5, 0.246),
+    "sinusoidal": lambda: md.gratings.sinusoidal(2.5, 0.25),
+    "lamellar": lambda: md.gratings.lamellar(2.5, 0.25),
+    "crossed": lambda: md.gratings.crossed(2.5, 0.25),
+    "elaphe": lambda: md.gratings.elaphe(32.0, seed=1),
+    "xenopeltis": lambda: md.gratings.xenopeltis(32.0, seed=1),
+}
+SMALL = {
+    **BUNDLED,
+    "elaphe": lambda: md.gratings.elaphe(8.0),
+    "xenopeltis": lambda: md.gratings.xenopeltis(8.0),
+    "sample": lambda: md.gratings.xenopeltis((9.0, 8.0)),
+    "column": lambda: md.HeightField(md.gratings.blazed(2.5, 0.246).heights.T, (2.5, 2.5 / 512)),
+}
+WIDE = {
+    **{name: BUNDLED[name] for name in ("blazed", "sinusoidal", "lamellar")},
+    "ruled": md.gratings.PROFILES["ruled"],
+    "morpho_ridges": md.gratings.PROFILES["morpho_ridges"],
+    "skewed ruled": lambda: md.HeightField(
+        0.4 * np.interp(np.arange(96) / 96, [0, 0.7, 1], [0, 1, 0])[None], (1.9 / 96, 1.9)
+    ),
+}
+"""With few rows of orders; their lobes are as wide as the horizon is near at a coherence length of 5 µm."""
+RECIPE_COHERENCE = {"elaphe": 26.0, "xenopeltis": 26.0}
+"""µm, as in precompute/*.toml; 65 otherwise."""
+
+
+@functools.cache
+def bundled(name):
+    return md.precompute(BUNDLED[name](), coherence_length=RECIPE_COHERENCE.get(name, 65.0))
+
+
+@functools.cache
+def blurred(name):
+    """With lobes so wide that the bins of a chi² test resolve them."""
+    if name == "sample":
+        return md.precompute(SMALL[name](), extent="sample", coherence_length=4.0)
+    return md.precompute(SMALL[name](), coherence_length=6.0 if name in RECIPE_COHERENCE else 3.0)
+
+
+def numbers(count, seed=0):
+    return np.random.default_rng(seed).random((3, count), dtype=np.float32)
+
+
+def points(u):
+    """(3, count) as `sample` takes them."""
+    first, *second = map(floats, u)
+    return first, mi.Point2f(*second)
+
+
+def sampled(bsdf, wi, wavelengths, count, seed=0):
+    """The sample of Mitsuba, and its weights (4, count) in float64."""
+    bs, weight = bsdf.sample(mi.BSDFContext(), interaction(wi, wavelengths, count), *points(numbers(count, seed)))
+    dr.eval(bs, weight)
+    return bs, np.array(weight, np.float64)
+
+
+# ---------------------------------------------------------------- the density
+
+ALONE = [(w,) * 4 for w in WAVELENGTHS]
+REDUCED = [
+    ("blazed", 0, 0, WAVELENGTHS),
+    ("blazed", 60, 20, WAVELENGTHS),
+    ("blazed", 80, 110, ALONE[1]),
+    ("column", 60, 20, WAVELENGTHS),
+    ("lamellar", 80, 20, WAVELENGTHS),
+    ("sinusoidal", 30, 70, ALONE[0]),
+    ("crossed", 60, 35, ALONE[2]),
+    ("crossed", 80, 200, WAVELENGTHS),
+    ("elaphe", 30, 20, WAVELENGTHS),
+    ("xenopeltis", 60, 290, WAVELENGTHS),
+    ("xenopeltis", 80, 20, ALONE[3]),
+    ("sample", 0, 0, WAVELENGTHS),
+    ("sample", 60, 20, ALONE[1]),
+    ("sample", 80, 200, WAVELENGTHS),
+]
+FULL = [
+    (name, theta, phi, wavelengths)
+    for name in SMALL
+    for theta, phi in ((0, 0), (30, 20), (30, 110), (60, 20), (60, 200), (80, 70), (80, 290))
+    for wavelengths in (WAVELENGTHS, *ALONE)
+]
+CASES = [*REDUCED, *(pytest.param(*case, marks=pytest.mark.slow) for case in FULL if case not in REDUCED)]
+
+
+@pytest.mark.few(2)
+@pytest.mark.parametrize(("name", "theta", "phi", "wavelengths"), CASES)
+def test_samples_pass_the_chi_square_test(llvm, name, theta, phi, wavelengths):
+    check_chi_square(plugin(blurred(name), conserve_energy=False), direction(theta, phi), wavelengths, cases=len(CASES))
+
+
+@pytest.mark.few(1)
+@pytest.mark.parametrize("theta", [0, 60])
+@pytest.mark.parametrize("extent", ["tile", "sample"])
+@pytest.mark.parametrize("name", ["elaphe", "xenopeltis"])
+def test_samples_of_a_real_scan_pass_the_chi_square_test(llvm, scan, name, extent, theta):
+    spectrum = md.precompute(scan(name), extent=extent, coherence_length=2.9)
+    check_chi_square(plugin(spectrum, conserve_energy=False), direction(theta, 20), cases=len(CASES))
+
+
+@pytest.mark.few(2)
+@pytest.mark.parametrize("name", ["blazed", "column", "crossed", "elaphe", "sample"])
+def test_density_integrates_to_the_share_of_samples_above_the_horizon(llvm, name):
+    bsdf, wi, count = plugin(blurred(name), conserve_energy=False), direction(70, 40), 1 << 19
+    bs, _ = sampled(bsdf, wi, WAVELENGTHS, count)
+    above = np.array(bs.pdf) > 0
+    wo = mi.warp.square_to_uniform_hemisphere(points(numbers(count, seed=1))[1])
+    pdf = 2 * np.pi * np.array(bsdf.pdf(mi.BSDFContext(), interaction(wi, WAVELENGTHS, count), wo), np.float64)
+    error = np.hypot(pdf.std(), above.std()) / np.sqrt(count)
+    assert abs(pdf.mean() - above.mean()) < 4 * error
+
+
+@pytest.mark.few(2)
+@pytest.mark.parametrize("name", ["blazed", "crossed", "xenopeltis", "sample"])
+@pytest.mark.parametrize("theta", [0, 60, 85])
+def test_mean_weight_is_the_albedo(llvm, name, theta):
+    bsdf, wi, count = plugin(blurred(name), conserve_energy=False), direction(theta, 40), 1 << 18
+    _, weight = sampled(bsdf, wi, WAVELENGTHS, count)
+    # The integral by another sampling: uniform in the plane of direction cosines, dω = du dv / cos θ_o.
+    u = np.stack([(np.arange(2048) + 0.5) / 2048] * 2)
+    x, y = (2 * axis.ravel() - 1 for axis in np.meshgrid(*u))
+    z = np.sqrt(np.maximum(1 - x**2 - y**2, 0))
+    inside = z > 0
+    x, y, z = x[inside], y[inside], z[inside]
+    wo = vectors(np.stack([x, y, z], axis=-1))
+    value = array(bsdf.eval(mi.BSDFContext(), interaction(wi, WAVELENGTHS, len(x)), wo), np.float64)
+    albedo = (value / z).sum(axis=1) * (2 / 2048) ** 2
+    error = weight.std(axis=1) / np.sqrt(count)
+    np.testing.assert_array_less(np.abs(weight.mean(axis=1) - albedo), 4 * error + 2e-3 * albedo)
+
+
+@pytest.mark.few(1)
+@pytest.mark.parametrize("longest", [700.0, 600.0, 390.0])
+def test_wavelengths_that_are_not_covered_take_no_part_in_the_sampling(llvm, longest):
+    heights = md.gratings.sinusoidal(2.5, 0.25)
+    spectrum = md.precompute(heights, wavelengths=(360.0, longest), coherence_length=3.0)
+    bsdf = plugin(spectrum, conserve_energy=False)
+    wi, wavelengths = direction(20, 40), (450.0, 550.0, 650.0, 750.0)
+    bs, weight = draw(bsdf, wi, 1 << 18, wavelengths=wavelengths)
+    wanted = albedo(bsdf, wi, wavelengths=wavelengths)
+    assert (wanted[np.array(wavelengths) > longest] == 0).all()
+    error = weight.std(1) / np.sqrt(weight.shape[1])
+    np.testing.assert_array_less(np.abs(weight.mean(1) - wanted), 4 * error + 2e-3 * wanted + 1e-9)
+    # The density is that of the samples.
+    wo, area = hemisphere()
+    si = interaction(wi, wavelengths, len(wo))
+    pdf = np.array(bsdf.pdf(mi.BSDFContext(), si, vectors(wo)), np.float64)
+    drawn = (np.array(bs.pdf) > 0).mean()
+    assert abs((pdf / wo[:, 2]).sum() * area - drawn) < 5e-3
+
+
+def test_a_spectrum_need_not_begin_at_the_shortest_wavelength(llvm):
+    # Regression: height_scale = 1 was refused.
+    spectrum = md.precompute(md.gratings.sinusoidal(2.5, 0.25), wavelengths=(400.0, 700.0), coherence_length=3.0)
+    bsdf, whole = (
+        plugin(s, conserve_energy=False)
+        for s in (spectrum, md.precompute(md.gratings.sinusoidal(2.5, 0.25), coherence_length=3.0))
+    )
+    wi, wo = direction(20, 40), direction([10, 25, 60], 220)
+    found, wanted = (testing.evaluate(b, wi, wo, [380.0, 401.0, 550.0, 699.0]) for b in (bsdf, whole))
+    assert (found[:, 0] == 0).all()
+    np.testing.assert_allclose(found[:, 1:], wanted[:, 1:], rtol=0.02, atol=1e-3 * wanted.max())
+    with pytest.raises(RuntimeError, match=r"height_scale: got 1\.1, wanted 0 to 1"):
+        plugin(spectrum, height_scale=1.1)
+
+
+@pytest.mark.slow
+def test_beyond_the_largest_angle_only_the_base_reflects(llvm):
+    of = md.precompute(md.gratings.sinusoidal(2.5, 0.25), largest_angle=60.0, coherence_length=3.0)
+    bsdf = plugin(of, int_ior=1.5, base={"type": "diffuse"}, conserve_energy=False)
+    for theta in (40, 70):
+        _, weight = draw(bsdf, direction(theta, 20), 1 << 18)
+        wanted = albedo(bsdf, direction(theta, 20))
+        error = weight.std(1) / np.sqrt(weight.shape[1])
+        np.testing.assert_array_less(np.abs(weight.mean(1) - wanted), 4 * error + 2e-3 * wanted)
+
+
+# ---------------------------------------------------------------- the work that a sample does
+
+
+def shifted(u):
+    """Four wavelengths as Mitsuba's path tracer samples them: equally spaced over 360–830 nm, shifted by `u`."""
+    return 360 + 470 * ((u + np.arange(4) / 4) % 1)
+
+
+def effective_fraction(bsdf, theta, phi, draws, count):
+    """E[w]²/E[w²] of the weight w averaged over the wavelengths, averaged over draws of them; and max w / E[w]."""
+    fractions, largest = [], 0.0
+    for seed in range(draws):
+        _, weight = sampled(bsdf, direction(theta, phi), shifted((seed + 0.5) / draws / 4), count, seed=seed)
+        assert np.isfinite(weight).all()
+        assert (weight >= 0).all()
+        w = weight.mean(axis=0)
+        fractions.append(w.mean() ** 2 / (w**2).mean())
+        largest = max(largest, w.max() / w.mean())
+    return np.mean(fractions), largest
+
+
+@pytest.mark.few(2)
+@pytest.mark.parametrize("phi", [0, 30, *(pytest.param(x, marks=pytest.mark.slow) for x in (60, 90, 180, 210, 300))])
+@pytest.mark.parametrize(
+    ("theta", "least"),
+    [
+        (60, 0.5),
+        (85, 0.4),
+        *(pytest.param(theta, 0.5, marks=pytest.mark.slow) for theta in (0, 15, 30, 45, 75)),
+    ],
+)
+@pytest.mark.parametrize("name", [pytest.param(x, marks=pytest.mark.slow if x in SKINS else ()) for x in BUNDLED])
+def test_the_effective_sample_fraction_is_above_its_bound(llvm, name, theta, least, phi):
+    fraction, largest = effective_fraction(plugin(bundled(name)), theta, phi, draws=4, count=1 << 15)
+    assert fraction >= least
+    assert largest < 20
+
+
+@pytest.mark.few(2)
+@pytest.mark.parametrize("phi", [90, 0, 30, 210])
+@pytest.mark.parametrize("theta", [75, 85, 60, 30, 0])
+@pytest.mark.parametrize("name", WIDE)
+def test_lobes_that_the_horizon_cuts_are_drawn_where_they_propagate(llvm, name, theta, phi):
+    # Regression: 0.33 to 0.48 for light that comes in along the grooves, at 75° and more.
+    bsdf = plugin(md.precompute(WIDE[name](), coherence_length=5.0, tolerance=1e-2))
+    fractions = []
+    for wavelength in (420.0, 500.0, 580.0, 660.0):
+        _, weight = sampled(bsdf, direction(theta, phi), (wavelength,) * 4, 1 << 15)
+        fractions.append(weight[0].mean() ** 2 / (weight[0] ** 2).mean())
+    # Four cells of κ are few for a lamellar grating: S has zeros in κ.
+    least = 0.4 if theta == 85 else 0.45 if name == "lamellar" else 0.5
+    assert np.mean(fractions) >= least
+
+
+@pytest.mark.few(4)
+@pytest.mark.parametrize("theta", [0, 50, 89, 89.99])
+@pytest.mark.parametrize("name", ["blazed", "crossed", pytest.param("elaphe", marks=pytest.mark.slow)])
+def test_weights_are_finite_and_pdf_is_that_of_the_sample(llvm, name, theta):
+    bsdf, wi, count = plugin(bundled(name)), direction(theta, 30), 1 << 15
+    for wavelengths in ((360.0, 830.0, 360.0, 830.0), (355.0, 835.0, 500.0, 500.0)):
+        bs, weight = sampled(bsdf, wi, wavelengths, count)
+        assert np.isfinite(weight).all()
+        assert (weight >= 0).all()
+        again = np.array(bsdf.pdf(mi.BSDFContext(), interaction(wi, wavelengths, count), bs.wo))
+        pdf = np.array(bs.pdf)
+        assert np.isfinite(pdf).all()
+        some = pdf > 0
+        np.testing.assert_allclose(pdf[some], again[some], rtol=1e-3)
+
+
+def test_height_scale_reaches_the_sampler(llvm):
+    bsdf = plugin(bundled("blazed"), height_scale=0.5, conserve_energy=False)
+    assert effective_fraction(bsdf, 60, 30, draws=4, count=1 << 15)[0] > 0.5
+
+
+# ---------------------------------------------------------------- the samplers
+
+
+@pytest.mark.few(3)
+@pytest.mark.parametrize("name", ["crossed", "sample", pytest.param("elaphe", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("theta", "phi"), [(0, 0), (40, 130), (85, 250)])
+def test_cells_are_drawn_with_their_density_and_few_that_do_not_propagate(llvm, name, theta, phi):
+    spectrum, count, wavelength = blurred(name), 1 << 20, 0.5
+    sampler = CellSampler(spectrum)
+    s = direction(theta, phi)
+    incidence = Incidence.of(vectors(s), floats(1 / wavelength), mi.Float(1.0), None)
+    q = sampler.sample(incidence, *points(numbers(count)), True)
+    dr.eval(q)
+    q = [np.array(x) for x in q]
+    spacing = [float(np.array(x).item()) for x in (sampler.spacing_x, sampler.spacing_y)]
+
+    # The density at the middles of all cells; those outside of the region are told by no q that propagates.
+    middles = [np.arange(-m, m + 1) * d for m, d in zip((sampler.largest_x, sampler.largest_y), spacing, strict=True)]
+    x, y = (axis.ravel() for axis in np.meshgrid(*middles))
+    density = np.array(sampler.density(mi.Vector2f(floats(x), floats(y)), incidence, mi.Bool(True)), np.float64)
+    corners = [
+        np.hypot(wavelength * (x + a * spacing[0]) + s[0], wavelength * (y + b * spacing[1]) + s[1])
+        for a in (-0.5, 0, 0.5)
+        for b in (-0.5, 0, 0.5)
+    ]
+    propagates = np.min(corners, axis=0) < 1
+
+    # Each cell cut into 2 × 2, so that the place in the cell is tested as well.
+    ends = [np.linspace(m[0] - d / 2, m[-1] + d / 2, 2 * len(m) + 1) for m, d in zip(middles, spacing, strict=True)]
+    found, _, _ = np.histogram2d(q[1], q[0], bins=ends[::-1])
+    assert found.sum() == count
+    wanted = np.kron(density.reshape(len(middles[1]), -1), np.full((2, 2), 0.25)) * np.prod(spacing) * count
+    inside = np.kron(propagates.reshape(len(middles[1]), -1), np.ones((2, 2))) > 0
+    often = inside & (wanted > 5)
+    chi_square = ((found - wanted)[often] ** 2 / wanted[often]).sum()
+    assert abs(chi_square - often.sum()) < 4 * np.sqrt(2 * often.sum())
+    assert found[inside].sum() == pytest.approx(wanted[inside].sum(), abs=4 * np.sqrt(count))
+    assert (np.hypot(wavelength * q[0] + s[0], wavelength * q[1] + s[1]) < 1).mean() > 0.5
+    outside = sampler.density(mi.Vector2f(mi.Float(100.0, 0.0), mi.Float(0.0, -100.0)), incidence, mi.Bool(True))
+    assert (np.array(outside) == 0).all()
+
+
+@pytest.mark.parametrize("name", ["blazed", "column", "crossed"])
+@pytest.mark.parametrize(("theta", "phi"), [(0, 0), (40, 130), (85, 250)])
+def test_orders_are_drawn_with_their_shares_and_only_those_that_propagate(llvm, name, theta, phi):
+    spectrum, count = md.precompute(SMALL[name]()), 1 << 20
+    sampler = OrderSampler(spectrum)
+    incidence = Incidence.of(vectors(direction(theta, phi)), floats(1 / 0.5), mi.Float(1.0), None)
+    row, column, _ = sampler.sample(incidence, *points(numbers(count)), True)
+    dr.eval(row, column)
+    rows, columns = spectrum.grid.shape
+    order = dr.arange(mi.UInt32, rows * columns)
+    weights = sampler.weights(incidence, mi.Bool(True))
+    share = np.array(sampler.share(order, weights, mi.Bool(True))).reshape(rows, columns)
+    bottom, top, left, right = (int(x[0]) for x in map(mi.Int32, sampler.rectangle(incidence)))
+    inside = np.zeros((rows, columns), bool)
+    inside[bottom:top, left:right] = True
+    np.testing.assert_allclose(share[inside].sum(), 1, rtol=1e-5)
+
+    row, column = (np.array(x) + np.zeros(count, int) for x in (row, column))
+    found = np.bincount(row * columns + column, minlength=rows * columns).reshape(rows, columns)
+    assert found[~inside].sum() == 0
+    wanted = share[inside] * count
+    chi_square, degrees = ((found[inside] - wanted) ** 2 / wanted).sum(), inside.sum() - 1
+    assert abs(chi_square - degrees) < 4 * np.sqrt(2 * degrees)
+
+    # All that propagate are in the rectangle, and of a single row nothing else.
+    m_x, m_y = np.meshgrid(*spectrum.grid.axes())
+    s = np.array(direction(theta, phi))
+    t_x, t_y = (m * 0.5 / tile for m, tile in zip((m_x, m_y), spectrum.grid.tile_size, strict=True))
+    propagates = (t_x + s[0]) ** 2 + (t_y + s[1]) ** 2 < 1
+    assert inside[propagates].all()
+    if name != "crossed":
+        assert inside.sum() <= propagates.sum() + 2
+
+
+@pytest.mark.parametrize("theta", [0, 40])
+def test_no_wavelength_is_sampled_beyond_its_own_lobe(llvm, theta):
+    # Regression: lobes were drawn whole and evaluated truncated. What a short wavelength drew beyond its lobe of the
+    # mirror order counted for longer ones: 800 nm reflected 5.8 % too much.
+    spectrum = md.precompute(md.gratings.sinusoidal(2.5, 0.02), coherence_length=16.0, tolerance=0.1)
+    assert OrderSpectrum(spectrum).orders is not None
+    bsdf = plugin(spectrum, conserve_energy=False)
+    wi, wavelengths = direction(theta, 20), (400.0, 410.0, 420.0, 800.0)
+    _, weight = draw(bsdf, wi, 1 << 18, wavelengths=wavelengths)
+    wanted = albedo(bsdf, wi, side=2048, wavelengths=wavelengths)
+    error = weight.std(1) / np.sqrt(weight.shape[1])
+    np.testing.assert_array_less(np.abs(weight.mean(1) - wanted), 4 * error + 2e-3 * wanted)
+
+
+@pytest.mark.slow
+def test_the_probabilities_of_many_orders_sum_to_one(llvm):
+    spectrum = md.precompute(md.gratings.xenopeltis(16.0))
+    sampler = OrderSampler(spectrum)
+    assert not sampler.restricted
+    incidence = Incidence.of(vectors((0.6, 0.0, 0.8)), floats(2.0), mi.Float(1.0), None)
+    weights = sampler.weights(incidence, mi.Bool(True))
+    order = dr.arange(mi.UInt32, spectrum.grid.shape[0] * spectrum.grid.shape[1])
+    np.testing.assert_allclose(dr.sum(sampler.share(order, weights, mi.Bool(True))), 1, rtol=1e-4)
+
+
+def test_orders_are_drawn_where_their_lobes_are_narrow_and_apart(llvm):
+    assert isinstance(OrderSpectrum(md.precompute(SMALL["elaphe"](), coherence_length=26.0)).cells, CellSampler)
+    assert isinstance(OrderSpectrum(blurred("blazed")).cells, LineSampler)
+    assert OrderSpectrum(bundled("blazed")).orders is not None
+
+
+@pytest.mark.parametrize("name", ["blazed", "column"])
+@pytest.mark.parametrize(("theta", "phi"), [(0, 0), (60, 90), (85, 250)])
+def test_nearly_all_samples_of_a_line_grating_propagate(llvm, name, theta, phi):
+    s, wavelength = direction(theta, phi), 0.5
+    incidence = Incidence.of(vectors(s), floats(1 / wavelength), mi.Float(1.0), None)
+    sampler = LineSampler(blurred(name))
+    q = np.array(sampler.sample(incidence, *points(numbers(1 << 16)), mi.Bool(True)))
+    assert (np.hypot(*(wavelength * q + np.array(s)[:2, None])) < 1).mean() > 0.9
+
+
+def test_a_mirror_with_wide_lobes_is_sampled(llvm):
+    bsdf = plugin(md.precompute(md.HeightField(np.zeros((1, 8)), 0.05), coherence_length=3.0), conserve_energy=False)
+    check_chi_square(bsdf, direction(60, 20), WAVELENGTHS)
+
+
+# ---------------------------------------------------------------- other variants
+
+
+@pytest.mark.few(2)
+@pytest.mark.parametrize("variant", ["scalar_spectral", "llvm_ad_spectral_polarized"])
+@pytest.mark.parametrize("name", ["blazed", "crossed", pytest.param("elaphe", marks=pytest.mark.slow)])
+def test_other_variants_draw_the_same_samples(variant, name):
+    count, wi = 40, direction(50, 25)
+    use("llvm_ad_spectral")
+    bs, weight = sampled(plugin(blurred(name), conserve_energy=False), wi, WAVELENGTHS, count)
+    wanted, wanted_pdf = np.array(bs.wo).T, np.array(bs.pdf)
+    use(variant)
+    bsdf, u = plugin(blurred(name), conserve_energy=False), numbers(count)
+    # In a scalar variant one after the other.
+    for part in [np.arange(count)] if dr.is_jit_v(mi.Float) else np.arange(count)[:, None]:
+        si = interaction(wi, WAVELENGTHS, len(part))
+        bs, value = bsdf.sample(mi.BSDFContext(), si, *points(u[:, part]))
+        value = value[0, 0] if mi.is_polarized else value
+        drawn = wanted_pdf[part] > 0
+        np.testing.assert_allclose(np.array(bs.pdf).reshape(-1), wanted_pdf[part], rtol=5e-3)
+        np.testing.assert_allclose(np.array(bs.wo).reshape(3, -1).T[drawn], wanted[part][drawn], atol=2e-5)
+        np.testing.assert_allclose(
+            np.array(value).reshape(4, -1)[:, drawn], weight[:, part][:, drawn], rtol=5e-3, atol=1e-4
+        )

@@ -1,0 +1,521 @@
+"""The commands as a person meets them: one line for a mistake, a file for a success, nothing for an interrupt."""
+
+import contextlib
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import OpenEXR
+import pytest
+
+import mitsuba_diffraction as md
+from mitsuba_diffraction.cli.arguments import scene_parameters
+from mitsuba_diffraction.progress import log_lines
+from mitsuba_diffraction.render import passes
+from mitsuba_diffraction.render.spectral_image import SpectralImage
+
+# So shallow that scalar theory holds: a warning would be told by whichever test is the first.
+BLAZE = '[surface]\nprofile = "blazed"\nperiod = 2.5\ndepth = 0.2\nsamples = 64\n'
+# Lobes so wide that the energy table is a small one.
+QUICK = BLAZE + "[spectrum]\ncoherence_length = 20\n"
+SCENE = """<scene version="3.0.0"><default name="spectrum" value="blaze.toml"/><integrator type="path"/>
+<sensor type="perspective"><transform name="to_world"><lookat origin="0,0,4" target="0,0,0" up="0,1,0"/></transform>
+<film type="hdrfilm"><integer name="width" value="16"/><integer name="height" value="16"/></film></sensor>
+<emitter type="constant"/><shape type="sphere"><bsdf type="diffraction_grating">
+<string name="filename" value="$spectrum"/></bsdf></shape></scene>"""
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    """Each test stands in a folder of its own, with a recipe and a scan."""
+    monkeypatch.chdir(tmp_path)
+    Path("blaze.toml").write_text(QUICK)
+    Path("deep.toml").write_text(BLAZE.replace("0.2", "5"))
+    np.save("wide.npy", np.random.default_rng(1).random((20, 24)) * 0.1)
+    np.save("scan.npy", np.random.default_rng(1).random((6, 8)) * 0.1)
+    holed = np.load("scan.npy")
+    holed[2, 3] = np.nan
+    np.save("holed.npy", holed)
+    np.save("counts.npy", np.arange(48, dtype=np.uint8).reshape(6, 8))
+    return tmp_path
+
+
+def files():
+    return {path.name for path in Path().iterdir()}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ("", "command"),
+        ("frobnicate", "frobnicate"),
+        ("precompute", "Missing argument"),
+        ("precompute gone.toml", "gone.toml"),
+        ("precompute gone.npy --pixel-size 0.1", "gone.npy"),
+        ("precompute .", ""),
+        ("precompute blaze.toml --colour red", "--colour"),
+        ("precompute blaze.toml --tolerance fine", "--tolerance"),
+        ("precompute blaze.toml --tolerance 7", "tolerance: got 7"),
+        ("precompute blaze.toml --tolerance nan", "tolerance: got nan"),
+        ("precompute blaze.toml --coherence-length -3", "coherence_length: got -3"),
+        ("precompute blaze.toml --representation wavelets", "representation: got 'wavelets'"),
+        ("precompute blaze.toml --extent ribbon", "extent: got 'ribbon', wanted 'tile' or 'sample'"),
+        ("precompute blaze.toml --largest-angle 91", "largest_angle: got 91"),
+        ("precompute blaze.toml --largest-angle steep", "--largest-angle"),
+        ("precompute deep.toml --representation taylor", "taylor: a surface of height range 4.92 µm"),
+        ("precompute scan.npy --pixel-size 0.05 --extent sample", "wanted at least 4 pixels (0.2 µm)"),
+        ("precompute blaze.toml --pixel-size 0.1", "--pixel-size"),
+        ("precompute blaze.toml --fill-missing", "--fill-missing go with a scan; the recipe blaze.toml"),
+        ("precompute holed.npy --pixel-size 0.05", "1 of 48 pixels are missing"),
+        ("precompute holed.npy --pixel-size 0.05", "--fill-missing, fills them from their surroundings"),
+        ("precompute blaze.toml -o out.png", "out.png"),
+        ("precompute blaze.toml -o out", "ends in .exr"),
+        ("precompute blaze.toml -o nowhere/out.exr", "nowhere/out.exr"),
+        ("precompute blaze.toml blaze.toml -o out.exr", "-o: got 2 sources"),
+        ("precompute scan.npy scan.toml", "scan.exr would be written twice"),
+        ("precompute scan.npy", "pixel_size"),
+        ("precompute counts.npy", "pixel_size, height_range: both missing"),
+        ("render scene.xml -D a=1 -D a=2", "-D a: got it twice"),
+        ("precompute scan.npy --pixel-size 0", "pixel_size: got 0"),
+        ("precompute scan.npy --pixel-size 0.05 --height-range 1", "height_range"),
+        ("precompute counts.npy --pixel-size 0.05", "height_range: missing"),
+        ("render", "Missing argument"),
+        ("render gone.xml", "gone.xml"),
+        ("render scene.xml -o out.png", "out.png"),
+        ("render scene.xml -o nowhere/out.exr", "nowhere"),
+        ("render scene.xml -D spectrum", "-D: got 'spectrum', wanted NAME=VALUE"),
+        ("render scene.xml -D =blaze.toml", "-D: got '=blaze.toml'"),
+        ("render scene.xml --spp 0", "--spp"),
+        ("render scene.xml --spp many", "--spp"),
+        ("render scene.xml --width 0", "--width"),
+        ("render scene.xml --seed -1", "--seed"),
+        ("render scene.xml --variant scalar_rgb", "scalar_rgb"),
+        ("render scene.xml --variant scalar_rgbx", "unknown"),
+        ("render scene.xml --variant scalar_spectral --spp 1 -D spectrum=gone.exr", "gone.exr"),
+        ("render scene.xml --variant scalar_spectral --spp 1 -D spectre=blaze.toml", "spectre"),
+    ],
+)
+def test_a_mistake_is_one_line_and_exit_code_2(command, arguments, words):
+    Path("scene.xml").write_text(SCENE)
+    before = files()
+    code, out, err = command(arguments)
+    assert code == 2
+    assert out == ""
+    assert len(err.splitlines()) == 1, err
+    assert err.startswith("mitsuba-diffraction: error: ")
+    assert words in err
+    assert "Traceback" not in err
+    assert files() == before
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[surface",
+        '[surface]\nprofile = "blased"\n',
+        '[surface]\nprofile = ["blazed"]\n',
+        "[surface]\nscan = 3\npixel_size = 0.05\n",
+        BLAZE + '[spectrum]\ntolerance = "fine"\n',
+        BLAZE + "[spectrum]\nwavelengths = 500\n",
+        BLAZE + 'typo = "\\u001b[31m\\n"\n',
+    ],
+)
+def test_a_recipe_that_is_wrong_is_one_line(command, text):
+    Path("wrong.toml").write_text(text)
+    code, out, err = command("precompute", "wrong.toml")
+    assert (code, out) == (2, "")
+    assert len(err.splitlines()) == 1, err
+    assert "\x1b" not in err
+
+
+def test_a_spectrum_cut_short_is_one_line(command):
+    Path("scene.xml").write_text(SCENE)
+    command("precompute", "blaze.toml")
+    content = Path("blaze.exr").read_bytes()
+    Path("blaze.exr").write_bytes(content[: len(content) * 3 // 4])
+    code, out, err = command("render scene.xml --variant scalar_spectral --spp 1 -D spectrum=blaze.exr")
+    assert (code, out) == (2, "")
+    assert len(err.splitlines()) == 1, err
+    assert "blaze.exr" in err
+
+
+def test_precompute_writes_the_file_that_it_names_and_prints_its_error(command):
+    Path("blaze.toml").write_text(BLAZE.replace("0.2", "0.25"))
+    code, out, err = command("precompute blaze.toml --coherence-length 65")
+    assert (code, err.strip()) == (0, "")
+    spectrum = md.GratingSpectrum.load("blaze.exr")
+    assert out.startswith("blaze.exr: ")
+    assert len(out.splitlines()) == 2
+    for part in ("blazed grating", "2.5 × 2.5 µm", "27 × 1 orders", "MB", f"error {spectrum.error:.1e}", "0.001"):
+        assert part in out
+    assert "tile, " in out
+    assert "coherence length 65 µm; slices, " in out
+    assert out.splitlines()[1].startswith("truncated, at most: 0.0e+00 of the power at weak frequencies; ")
+    # All but the orders up to 13, the last one below 2/λ: summed here.
+    kappa = np.linspace(0, spectrum.largest_kappa, 2000)[:, None]
+    eta = [
+        np.abs(np.exp(1j * kappa * 0.25 * np.arange(64) / 64 - 2j * np.pi * m * np.arange(64) / 64).mean(axis=1)) ** 2
+        for m in range(-13, 14)
+    ]
+    told = float(out.split("frequencies; ")[1].split()[0])
+    assert told == pytest.approx(1 - np.sum(eta, axis=0).min(), rel=0.05)
+    assert f"{spectrum.beyond:.1e} at frequencies that no direction reaches" in out
+
+
+@pytest.mark.few(1)
+@pytest.mark.parametrize("representation", ["taylor", "chebyshev", "svd", "slices"])
+def test_precompute_takes_a_sample_by_options(command, representation):
+    code, out, err = command(
+        "precompute wide.npy --pixel-size 0.09 --extent sample --largest-angle 60 --tolerance 0.02 -o out.exr "
+        f"--representation {representation}"
+    )
+    assert code == 0
+    told = err.splitlines()
+    assert len(told) == 1
+    assert told[0].startswith("mitsuba-diffraction: warning: coherence_length: a scan of 2.16 × 1.8 µm carries 0.9 µm")
+    spectrum = md.GratingSpectrum.load("out.exr")
+    assert (spectrum.extent, spectrum.largest_angle, spectrum.tolerance) == ("sample", 60.0, 0.02)
+    assert spectrum.representation == representation
+    rows, columns = spectrum.grid.shape
+    for part in (f"sample, {columns} × {rows} frequencies", "cycles/µm apart", "coherence length 0.9 µm", "truncated"):
+        assert part in out
+    assert f"{spectrum.dropped:.1e} of the power" in out
+    assert f"{spectrum.beyond:.1e} at frequencies that" in out
+
+
+def test_a_smaller_angle_takes_fewer_orders(command):
+    code, out, _ = command("precompute blaze.toml --largest-angle 29")
+    assert code == 0
+    assert "13 × 1 orders" in out
+    assert md.GratingSpectrum.load("blaze.exr").largest_angle == 29.0
+
+
+def test_options_override_the_recipe(command):
+    Path("blaze.toml").write_text(BLAZE + '[spectrum]\ntolerance = 0.1\nrepresentation = "slices"\n')
+    code, _, _ = command(
+        "precompute blaze.toml -o out.exr --tolerance 0.02 --representation taylor --coherence-length 20"
+    )
+    assert code == 0
+    spectrum = md.GratingSpectrum.load("out.exr")
+    assert (spectrum.tolerance, spectrum.representation, spectrum.coherence_length) == (0.02, "taylor", 20.0)
+
+
+def test_scans_are_read_with_their_scale(command):
+    code, _, _ = command("precompute counts.npy --extent tile --pixel-size 0.05 --height-range 0.5 -o out.exr")
+    assert code == 0
+    spectrum = md.GratingSpectrum.load("out.exr")
+    assert spectrum.height_range == pytest.approx(47 / 255 * 0.5)
+    assert spectrum.pixel_size == (0.05, 0.05)
+    assert spectrum.source == "counts.npy"
+
+
+def test_missing_pixels_of_a_scan_are_filled_on_request(command):
+    code, out, _ = command("precompute holed.npy --extent tile --pixel-size 0.05 --fill-missing -o out.exr")
+    assert code == 0
+    assert "out.exr: holed.npy (1 missing pixel filled); " in out
+    spectrum = md.GratingSpectrum.load("out.exr")
+    assert spectrum.source == "holed.npy (1 missing pixel filled)"
+    assert spectrum.source_digest == md.HeightField(np.load("holed.npy"), 0.05, fill_missing=True).digest
+
+
+def test_a_bare_scan_with_a_seam_wants_an_extent(command):
+    x = np.arange(48) * 0.05
+    np.save("whole.npy", 0.1 * np.sin(2 * np.pi * x / 0.8) + np.zeros((8, 1)))
+    np.save("broken.npy", 0.1 * np.sin(2 * np.pi * x / 0.9) + np.zeros((8, 1)))
+    before = files()
+    code, out, err = command("precompute broken.npy --pixel-size 0.05 --tolerance 0.01")
+    assert (code, out, files()) == (2, "", before)
+    assert len(err.splitlines()) == 1
+    assert re.search(r"r.m.s. steps of 64.3 nm along x \(\d\d.\d inside\) and 0 nm along y", err)
+    for words in ("--extent sample", "--extent tile", "crop_periods"):
+        assert words in err
+    code, out, _ = command("precompute broken.npy --pixel-size 0.05 --tolerance 0.01 --extent tile")
+    assert (code, "seam" in out) == (0, False)
+    code, out, _ = command("precompute whole.npy --pixel-size 0.05 --tolerance 0.01")
+    assert code == 0
+    assert "repeated as a tile; r.m.s. steps at the seam" in out
+
+
+def test_the_version_is_printed(command):
+    code, out, err = command("--version")
+    assert (code, err) == (0, "")
+    assert re.fullmatch(r"mitsuba-diffraction [\d.]+\S*, Mitsuba 3\.\S+\n", out)
+
+
+def test_help_shows_the_defaults(command):
+    for words in (("precompute", "default: auto"), ("precompute", "default: 0.001"), ("render", "or 64")):
+        code, out, _ = command(words[0], "--help")
+        assert code == 0
+        assert words[1] in " ".join(re.sub(r"[│|]", " ", out).split())
+
+
+def test_progress_without_a_terminal_is_printed_in_lines(capfd):
+    show = log_lines("scene.xml", first=0)
+    show(3, 7)
+    assert re.fullmatch(r"mitsuba-diffraction: scene.xml: 3 of 7, 0 s\n", capfd.readouterr().err)
+    log_lines("scene.xml")(3, 7)  # short work says nothing
+    assert capfd.readouterr().err == ""
+
+
+def test_spectra_of_many_sources_are_named_after_them(command):
+    Path("other.toml").write_text(QUICK)
+    code, out, _ = command("precompute", "blaze.toml", "other.toml")
+    assert code == 0
+    assert [line.split(":")[0] for line in out.splitlines() if ".exr: " in line] == ["blaze.exr", "other.exr"]
+    assert {"blaze.exr", "other.exr"} <= files()
+
+
+@pytest.mark.few(2)
+@pytest.mark.parametrize("name", ["a[red]b.exr", "a[b]c.exr", "a:smile:.exr", "é ü.exr"])
+def test_the_printed_name_is_that_of_the_file(command, name):
+    # Regression: square brackets and words between colons were taken for markup.
+    code, out, _ = command("precompute", "blaze.toml", "-o", name)
+    assert code == 0
+    assert name in files()
+    assert out.startswith(f"{name}: ")
+    code, _, err = command("precompute", name.replace(".exr", ".toml"))
+    assert code == 2
+    assert name.replace(".exr", ".toml") in err
+
+
+def test_a_folder_whose_name_looks_like_markup_is_accepted(command):
+    Path("dir[").mkdir()
+    code, out, _ = command("precompute", "blaze.toml", "-o", "dir[/x].exr")
+    assert code == 0
+    assert out.startswith("dir[/x].exr: ")
+
+
+def test_a_warning_is_a_line_and_not_a_failure(command):
+    code, out, err = command("precompute scan.npy --extent tile --pixel-size 0.2 -o out.exr")
+    assert code == 0
+    assert "out.exr" in out
+    told = [line for line in err.splitlines() if line]
+    assert len(told) == 2  # one for each axis
+    assert all(line.startswith("mitsuba-diffraction: warning: pixels of 200 nm along ") for line in told)
+
+
+@pytest.mark.parametrize("place", ["precompute", "save"])
+def test_an_interrupt_leaves_no_file(command, monkeypatch, place):
+    def interrupted(*arguments, **named):
+        raise KeyboardInterrupt
+
+    if place == "precompute":
+        monkeypatch.setattr("mitsuba_diffraction.recipe.precompute", interrupted)
+    else:
+        monkeypatch.setattr(OpenEXR.File, "write", interrupted, raising=True)
+    before = files()
+    code, out, err = command("precompute", "blaze.toml")
+    assert (code, out) == (130, "")
+    assert err.strip() == "mitsuba-diffraction: interrupted: nothing was written"
+    assert files() == before
+
+
+@pytest.mark.parametrize("error", [MemoryError(), OSError("disk full"), RuntimeError("no luck")])
+def test_a_failure_is_one_line_and_exit_code_1(command, monkeypatch, error):
+    def fail(*arguments, **named):
+        raise error
+
+    monkeypatch.setattr("mitsuba_diffraction.recipe.precompute", fail)
+    code, out, err = command("precompute", "blaze.toml")
+    assert (code, out) == (1, "")
+    assert err.strip() == f"mitsuba-diffraction: error: {str(error) or 'MemoryError'}"
+
+
+BROADCAST = "operands could not be broadcast together with shapes (2,) (3,) "
+BUG = "mitsuba-diffraction: error: this is a bug in mitsuba_diffraction ("
+
+
+def broadcast(*arguments, **named):
+    """A mistake as code makes it, with NumPy's own exception, a ValueError."""
+    return np.zeros(2) + np.zeros(3)
+
+
+def test_a_bug_is_reported_as_such(command, monkeypatch):
+    monkeypatch.setattr("mitsuba_diffraction.recipe.precompute", broadcast)
+    code, out, err = command("precompute", "blaze.toml")
+    assert (code, out) == (1, "")
+    assert err == f"{BUG}ValueError: {BROADCAST}); mitsuba-diffraction --debug … shows where\n"
+    code, out, err = command("--debug precompute blaze.toml")
+    assert (code, out) == (1, "")
+    assert err.startswith("Traceback")
+    assert "in broadcast" in err
+    assert BUG in err
+
+
+def test_a_bug_inside_a_plugin_is_not_blamed_on_the_scene(command, monkeypatch):
+    Path("scene.xml").write_text(SCENE)
+    monkeypatch.setattr("mitsuba_diffraction.bsdf.diffraction_grating.reflectance_from", broadcast)
+    code, _, err = command("render scene.xml --variant scalar_spectral --spp 1 -o out.exr")
+    assert code == 1
+    assert len(err.splitlines()) == 1, err
+    assert err.startswith(f"{BUG}ValueError: ")
+    assert BROADCAST.strip() in err
+    code, _, err = command("--debug render scene.xml --variant scalar_spectral --spp 1 -o out.exr")
+    assert code == 1
+    assert "in broadcast" in err
+
+
+def test_a_bug_while_rendering_is_reported_as_such(command, monkeypatch):
+    Path("scene.xml").write_text(SCENE)
+    monkeypatch.setattr("mitsuba_diffraction.render.film.trace_with_mitsubas_film", broadcast)
+    code, out, err = command("render scene.xml --variant scalar_spectral --spp 1 -o out.exr")
+    assert (code, out) == (1, "")
+    assert err.startswith(f"{BUG}ValueError: ")
+
+
+def test_debug_shows_where_a_request_is_refused(command):
+    code, _, err = command("--debug precompute blaze.toml --tolerance 7")
+    assert code == 2
+    assert err.startswith("Traceback")
+    assert err.splitlines()[-1].startswith("mitsuba-diffraction: error: tolerance: got 7")
+
+
+def test_help_exits_with_zero(command):
+    code, out, _ = command("--help")
+    assert code == 0
+    assert "precompute" in out
+    assert "render" in out
+
+
+def test_render_takes_the_samples_of_the_scene_and_writes_half_precision(command):
+    line = "render sampled.xml -o out.exr --width 8 --variant llvm_ad_spectral -D spectrum=blaze.toml"
+    sampler = '<sampler type="independent"><integer name="sample_count" value="3"/></sampler></sensor>'
+    Path("sampled.xml").write_text(SCENE.replace("</sensor>", sampler))
+    code, out, err = command(line)
+    assert code == 0, err
+    whole, size = SpectralImage.load("out.exr"), Path("out.exr").stat().st_size
+    assert whole.attributes["spp"] == 3
+    assert f" s, {size / 1e6:.3g} MB\n" in out
+    for name in ("out.exr", "out.png"):
+        Path(name).unlink()
+    code, _, err = command(f"{line} --half")
+    assert code == 0, err
+    assert Path("out.exr").stat().st_size < 0.7 * size
+    half = SpectralImage.load("out.exr").radiance
+    np.testing.assert_allclose(half, whole.radiance, rtol=2.0**-11, atol=3e-8)
+    assert (half != whole.radiance).any()
+
+
+def test_render_writes_a_spectral_picture_and_a_preview(command):
+    if not dr.has_backend(dr.JitBackend.LLVM):
+        pytest.skip("Dr.Jit finds no LLVM")
+    Path("scene.xml").write_text(SCENE)
+    code, out, err = command(
+        "render scene.xml -o out.exr --spp 2 --width 8 --variant llvm_ad_spectral -D spectrum=blaze.toml"
+    )
+    assert (code, err.strip()) == (0, "")
+    channels = OpenEXR.File("out.exr", separate_channels=True).channels()
+    assert channels["R"].pixels.shape == (8, 8)
+    assert any(name.startswith("S0.") and name.endswith("nm") for name in channels)
+    assert np.isfinite(channels["G"].pixels).all()
+    assert channels["G"].pixels[4, 4] > 0
+    assert out.startswith("out.exr: 8 × 8 pixels")
+    assert "out.png" in files()
+
+
+def test_the_installed_command_ends_with_its_exit_code(folder):
+    program = Path(sys.executable).with_name("mitsuba-diffraction")
+    start = (
+        [str(program)] if program.is_file() else [sys.executable, "-c", "import mitsuba_diffraction.cli as c; c.main()"]
+    )
+    done = subprocess.run([*start, "precompute", "gone.toml"], cwd=folder, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr == "mitsuba-diffraction: error: gone.toml: no such file\n"
+
+
+def test_precompute_refuses_where_it_cannot_write_before_the_work(command, monkeypatch):
+    monkeypatch.setattr("mitsuba_diffraction.recipe.precompute", lambda *_, **__: pytest.fail("it went to work"))
+    code, _, err = command("precompute blaze.toml -o nowhere/out.exr")
+    assert (code, err.count("got nowhere/out.exr, but the folder nowhere is not there")) == (2, 1)
+
+
+@pytest.mark.parametrize(
+    ("value", "is_file"), [("blazed", False), ("0.25", False), ("./blazed", True), ("a.exr", True)]
+)
+def test_a_value_of_a_parameter_is_a_file_only_if_it_looks_like_one(folder, value, is_file):
+    for name in ("blazed", "0.25", "a.exr"):
+        Path(name).touch()
+    wanted = str((folder / value).resolve()) if is_file else value
+    assert scene_parameters([f"p={value}"]) == {"p": wanted}
+
+
+def test_benchmark_plots_png_only(command):
+    code, out, err = command("benchmark --plot speed.pdf")
+    assert (code, out) == (2, "")
+    assert "--plot: got speed.pdf, wanted a file name that ends in .png" in err
+
+
+@pytest.mark.slow
+def test_benchmark_refuses_a_tolerance_before_it_measures(command):
+    code, out, err = command("benchmark --tolerance -1")
+    assert (code, out) == (2, "")
+    assert "tolerance: got -1.0, wanted a share" in err
+
+
+def test_an_interrupt_inside_a_plugin_is_not_blamed_on_the_scene(command):
+    """Mitsuba makes a RuntimeError of whatever a constructor raises."""
+
+    mi.set_variant("scalar_spectral")
+
+    class Pressing(mi.BSDF):
+        def __init__(self, props):
+            mi.BSDF.__init__(self, props)
+            try:
+                signal.raise_signal(signal.SIGINT)
+            except KeyboardInterrupt:
+                raise ValueError("no such grating") from None
+
+    mi.register_bsdf("pressing", Pressing)
+    Path("scene.xml").write_text(SCENE.replace("diffraction_grating", "pressing"))
+    before = signal.getsignal(signal.SIGINT)
+    code, out, err = command("render scene.xml --variant scalar_spectral --spp 1")
+    assert (code, out) == (130, "")
+    assert err.strip() == "mitsuba-diffraction: interrupted: nothing was written"
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_an_interrupt_swallowed_by_the_loader_ends_the_rendering(command, monkeypatch):
+    """As C++ code and the garbage collector may do while the scene is loaded."""
+
+    load = passes.load_spectral_scene
+
+    def ignoring(*args, **kwargs):
+        with contextlib.suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        return load(*args, **kwargs)
+
+    monkeypatch.setattr(passes, "load_spectral_scene", ignoring)
+    Path("scene.xml").write_text(SCENE)
+    code, _, err = command("render scene.xml --spp 1")
+    assert code == 130
+    assert err.strip() == "mitsuba-diffraction: interrupted: nothing was written"
+    assert not Path("scene.exr").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seconds", [0.5, 1.0, 2.0, 3.0, 4.0, 6.0])
+def test_an_interrupt_at_any_time_is_one_line(seconds):
+    Path("scene.xml").write_text(SCENE)
+    start = "import signal as s; s.signal(s.SIGINT, s.default_int_handler)"
+    run = f"{start}; from mitsuba_diffraction.__main__ import main; main()"
+    arguments = ["render", "scene.xml", "--spp", "100000000"]
+    environment = {**os.environ, "PYTHONPATH": str(Path(md.__file__).parents[1])}
+    running = subprocess.Popen(
+        [sys.executable, "-c", run, *arguments], stdout=-1, stderr=-1, text=True, env=environment
+    )
+    time.sleep(seconds)
+    running.send_signal(signal.SIGINT)
+    out, err = running.communicate()
+    assert running.returncode == 130
+    # Mitsuba's log goes there, of a grating too fine for scalar theory.
+    assert all("scalar theory" in line for line in out.replace("\x1b[0m", "").splitlines() if line)
+    assert len(err.splitlines()) == 1
+    assert err.startswith("mitsuba-diffraction: interrupted: ")

@@ -1,0 +1,396 @@
+"""The path tracer against the shader: measures against known numbers, pictures against Mitsuba's own integrators."""
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from bsdf_support import made_up
+from PIL import Image
+
+import mitsuba_diffraction as md
+from mitsuba_diffraction.color import delta_E, spectrum_to_XYZ
+from mitsuba_diffraction.evaluation.comparison import compare, summary
+from mitsuba_diffraction.evaluation.comparison.difference import difference, noise, white_luminance
+from mitsuba_diffraction.evaluation.comparison.pictures import NO_SHADOWS, Pictures
+from mitsuba_diffraction.evaluation.comparison.quirk_shares import quirk_shares
+from mitsuba_diffraction.evaluation.realtime_shader.evaluate import VARIANTS
+from mitsuba_diffraction.evaluation.realtime_shader.quirks import Quirks
+from mitsuba_diffraction.render.scene import channel_wavelengths, channel_weights
+
+# A sphere above a plate, with a pigment; broad lobes, so that small pictures resolve them.
+GRATING = """<bsdf type="diffraction_grating"><string name="profile" value="{profile}"/>
+<float name="period" value="{period}"/><float name="depth" value="0.2"/><integer name="samples" value="64"/>
+<float name="coherence_length" value="{coherence}"/><string name="fresnel" value="schlick"/>{base}</bsdf>"""
+BASE = '<bsdf name="base" type="diffuse"><spectrum name="reflectance" value="0.05"/></bsdf>'
+SUN = """<emitter type="directional"><vector name="direction" x="-0.3" y="0.2" z="-1"/>
+<spectrum name="irradiance" type="d65"/></emitter>"""
+MIRRORED = SUN.replace('x="-0.3" y="0.2" z="-1"', 'x="0" y="-0.77" z="-0.64"')  # by the plate into the camera
+SKY = '<emitter type="constant"><spectrum name="radiance" value="0.02"/></emitter>'
+PLATE = '<shape type="rectangle"><transform name="to_world"><scale x="3" y="3"/></transform>{}</shape>'
+SPHERE = '<shape type="sphere"><point name="center" x="0" y="0" z="1.2"/>{}</shape>'
+SCENE = """<scene version="3.0.0">{integrator}<sensor type="perspective"><float name="fov" value="35"/>
+<transform name="to_world"><lookat origin="0,-6,5" target="0,0,0.7" up="0,0,1"/></transform><film type="hdrfilm">
+<integer name="width" value="16"/><integer name="height" value="12"/><rfilter type="{rfilter}"/></film></sensor>
+{light}{shapes}</scene>"""
+
+
+def write(
+    path, light=SUN, bsdf=None, shapes=SPHERE + PLATE, integrator='<integrator type="path"/>', rfilter="box", **of
+):
+    """A scene file; `of` are period, coherence, profile and base of its gratings."""
+    of = {"profile": "blazed", "period": 2.0, "coherence": 3.0, "base": BASE, **of}
+    shapes = shapes.replace("{}", bsdf or GRATING.format(**of))
+    path.write_text(SCENE.format(light=light, shapes=shapes, integrator=integrator, rfilter=rfilter))
+    return path
+
+
+def to_xyz(tensor):
+    return spectrum_to_XYZ(np.array(tensor) / channel_weights(), channel_wavelengths())
+
+
+# --- Differences ------------------------------------------------------------------------------------------------------
+
+
+def xyz_of(lab):
+    """CIELAB under D65 → XYZ, by its definition (CIE 15)."""
+    f_y = (lab[0] + 16) / 116
+    f = np.array([f_y + lab[1] / 500, f_y, f_y - lab[2] / 200])
+    x, y = 0.3127, 0.3290
+    return np.where(f > 6 / 29, f**3, 3 * (6 / 29) ** 2 * (f - 4 / 29)) * [x / y, 1, (1 - x - y) / y]
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "expected"),
+    [  # Sharma, Wu and Dalal 2005, table 1: pairs 1, 5, 17, 25
+        ((50, 2.6772, -79.7751), (50, 0, -82.7485), 2.0425),
+        ((50, -1.1848, -84.8006), (50, 0, -82.7485), 1.0000),
+        ((50, 2.5, 0), (73, 25, -18), 27.1492),
+        ((60.2574, -34.0099, 36.2677), (60.4626, -34.1751, 39.4387), 1.2644),
+    ],
+)
+def test_ciede2000_is_that_of_the_published_pairs(first, second, expected):
+    assert delta_E(xyz_of(first), xyz_of(second)) == pytest.approx(expected, abs=2e-4)
+
+
+def test_exposure_is_matched_and_stated():
+    random = np.random.default_rng(1)
+    reference = random.uniform(0.1, 2, (6, 5, 3))
+    where = random.random((6, 5)) > 0.3
+    found = difference(reference, reference / 3, where, 1.5)
+    assert found.exposure == pytest.approx(3)
+    assert found.largest == pytest.approx(0, abs=1e-9)
+    assert found.luminance_error == pytest.approx(0, abs=1e-12)
+    assert np.array_equal(np.isnan(found.delta_e), ~where)
+
+
+def test_a_difference_has_the_known_numbers():
+    grey = np.array([0.95047, 1, 1.08883]) * np.array([0.2, 0.4])[:, None, None] * np.ones((2, 50, 1))
+    other = grey.copy()
+    other[0], other[1] = 0.3, 0.3  # the same sum
+    other *= [0.95047, 1, 1.08883]
+    where = np.ones((2, 50), bool)
+    found = difference(grey, other, where, 1.0)
+    assert found.exposure == pytest.approx(1)
+    assert found.luminance_error == pytest.approx(0.2 / 0.6)
+    each = delta_E(grey[:, 0], other[:, 0])
+    assert (found.mean, found.largest) == pytest.approx((each.mean(), each.max()))
+    assert found.percentile_95 == pytest.approx(np.percentile(np.repeat(each, 50), 95))
+    # Beyond white nothing is brighter.
+    assert difference(grey, other, where, 1e-3).largest < 0.1
+
+
+def test_a_black_picture_has_no_exposure():
+    with pytest.raises(ValueError, match="wanted positive"):
+        difference(np.ones((2, 2, 3)), np.zeros((2, 2, 3)), np.ones((2, 2), bool), 1.0)
+
+
+def test_noise_is_estimated_from_two_halves():
+    random = np.random.default_rng(2)
+    truth = np.full((60, 60, 3), 0.4)
+    halves = truth + 0.01 * random.normal(size=(2, 60, 60, 3))
+    where = np.ones((60, 60), bool)
+    assert noise(halves, where, 1.0) == pytest.approx(delta_E(truth, halves.mean(0)).mean(), rel=0.05)
+    assert noise(None, where, 1.0) is None
+
+
+# --- Quirks -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", VARIANTS)
+def test_each_shader_names_the_quirks_that_change_it(kind):
+    mi.set_variant("scalar_spectral")
+    surface = md.HeightField(np.random.default_rng(1).normal(0, 0.05, (4, 6)), 0.3)
+    more = {} if kind == "gem" else {"terms": 5, "coherence_length": 2.0}
+
+    def colours(quirks):
+        shader = VARIANTS[kind](surface, quirks, **more)
+        light = np.linspace(0.5, 1.5, 401)
+        weights = shader.weights(0.1, light)
+        wo = [mi.Vector3f(x, y, np.sqrt(1 - x * x - y * y)) for x, y in ((-0.61, 0.33), (0.42, -0.27), (0.1, 0.7))]
+        return np.array([shader.rgb(mi.Vector3f(0.3, 0.2, np.sqrt(0.87)), w, weights) for w in wo]).ravel()
+
+    plain = colours(Quirks.corrected())
+    changing = [
+        name
+        for name in Quirks.names()
+        if not np.allclose(colours(replace(Quirks.corrected(), **{name: True})), plain, rtol=1e-4, atol=1e-6)
+    ]
+    assert set(changing) == set(VARIANTS[kind].own_quirks)
+
+
+@pytest.mark.parametrize("kind", VARIANTS)
+def test_a_shader_with_changed_quirks_is_that_made_anew(kind):
+    mi.set_variant("scalar_spectral")
+    surface = md.HeightField(np.random.default_rng(1).normal(0, 0.05, (4, 6)), 0.3)
+    more = {} if kind == "gem" else {"terms": 4}
+    wi, wo = mi.Vector3f(0.3, 0.2, 0.933), mi.Vector3f(-0.2, 0.1, 0.975)
+    for first, second in ((True, False), (False, True)):
+        quirks = [Quirks.as_published() if published else Quirks.corrected() for published in (first, second)]
+        fresh = VARIANTS[kind](surface, quirks[1], **more)
+        changed = VARIANTS[kind](surface, quirks[0], **more).with_quirks(quirks[1])
+        np.testing.assert_array_equal(*(np.array(s.rgb(wi, wo, s.weights())) for s in (fresh, changed)))
+
+
+# --- Pictures ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rfilter", ["gaussian", "box"])
+def test_the_shader_is_what_its_integrator_converges_to(llvm, tmp_path, rfilter):
+    pictures = Pictures(write(tmp_path / "scene.xml", rfilter=rfilter), "gem")
+    for quirks in (("power_gamma", "constant_blend", "infrared_rainbow", NO_SHADOWS), ()):
+        found = pictures.shaded(quirks, 64, 256)
+        switches = {name: name in quirks for name in Quirks.names()}
+        parameters = {"type": "diffraction_shader", "variant": "gem", "shadows": NO_SHADOWS not in quirks, **switches}
+        expected = to_xyz(mi.render(pictures.scene, integrator=mi.load_dict(parameters), spp=1024, seed=3))
+        assert np.abs(found.xyz - expected).sum() < 0.03 * expected.sum()
+        np.testing.assert_allclose(found.xyz.sum((0, 1)), expected.sum((0, 1)), rtol=0.01)
+        assert found.samples == 64
+        assert found.seconds > 0
+
+
+@pytest.mark.slow
+def test_the_same_light_is_direct_light(llvm, tmp_path):
+    pictures = Pictures(write(tmp_path / "scene.xml"), "gem")
+    found = pictures.same_light(1024)
+    direct = mi.load_dict({"type": "direct", "emitter_samples": 1, "bsdf_samples": 0})
+    expected = to_xyz(mi.render(pictures.scene, integrator=direct, spp=1024, seed=5))
+    np.testing.assert_allclose(found.xyz.sum((0, 1)), expected.sum((0, 1)), rtol=0.02)
+    assert np.abs(found.xyz - expected).sum() < 0.1 * expected.sum()
+    # Of the sky it sees nothing, the path tracer does.
+    under_sky = Pictures(write(tmp_path / "sky.xml", SUN + SKY), "gem")
+    np.testing.assert_allclose(under_sky.same_light(64).xyz, pictures.same_light(64).xyz, rtol=1e-5, atol=1e-9)
+    assert under_sky.path_traced(64).xyz.sum() > 1.3 * expected.sum()
+    # Two halves make the whole.
+    np.testing.assert_allclose(found.halves.mean(0), found.xyz, rtol=1e-4, atol=1e-7)
+    assert not np.array_equal(*found.halves)
+
+
+@pytest.mark.few(1)
+@pytest.mark.parametrize(("ratio", "agrees"), [(0.45, False), (1.5, True)])
+def test_corrected_the_shader_converges_to_the_model_within_the_limit(llvm, tmp_path, ratio, agrees):
+    # Coherence length over tile. Without E, which the shader lacks.
+    without = '<boolean name="conserve_energy" value="false"/>'
+    of = {"base": without, "profile": "sinusoidal", "period": 3.0, "coherence": 3.0 * ratio}
+    scene = write(tmp_path / "scene.xml", MIRRORED, shapes=PLATE, **of)
+    pictures = Pictures(scene, "flss", width=8)
+    assert pictures.left_out == pytest.approx(np.exp(-((1.5 * np.pi * ratio / 2) ** 2)))
+    model, shader = pictures.same_light(2048), pictures.shaded((), 64, 1)
+    white = model.xyz[pictures.surface][:, 1].max()
+    found = difference(model.xyz, shader.xyz, pictures.surface, white)
+    floor = noise(model.halves, pictures.surface, white)
+    if agrees:
+        assert found.mean < 1.5 * floor + 0.1 < 1
+        assert found.exposure == pytest.approx(1, abs=0.02)
+    else:
+        assert found.mean > 3 * floor
+        assert 0.02 < abs(found.exposure - 1) < 4 * pictures.left_out
+    published = difference(model.xyz, pictures.shaded(pictures.quirks, 16, 1).xyz, pictures.surface, white)
+    assert published.mean > 2 * found.mean
+
+
+def test_only_pixels_covered_by_surfaces_are_compared(llvm, tmp_path):
+    pictures = Pictures(write(tmp_path / "scene.xml", shapes=SPHERE), "gem", width=64)
+    rows, columns = pictures.surface.shape
+    assert (rows, columns) == (48, 64)
+    # The disc of a sphere at the distance √(6² + 3.8²), seen through 35° over 64 pixels, less its rim.
+    radius = np.tan(np.arcsin(1 / np.hypot(6, 3.8))) / np.tan(np.deg2rad(17.5)) * 32
+    disc = np.pi * radius**2
+    assert disc - 2 * np.pi * radius < pictures.surface.sum() < disc
+
+
+def test_a_crop_window_is_compared_alone(llvm, tmp_path):
+    scene = write(tmp_path / "scene.xml")
+    whole = Pictures(scene, "gem")
+    window = '<integer name="crop_offset_x" value="4"/><integer name="crop_width" value="8"/>'
+    scene.write_text(scene.read_text().replace('<integer name="width"', window + '<integer name="width"'))
+    cropped = Pictures(scene, "gem")
+    assert cropped.film_size == (16, 12)
+    np.testing.assert_array_equal(cropped.surface, whole.surface[:, 4:12])
+    pair = [pictures.shaded((), 256, 64).xyz for pictures in (cropped, whole)]
+    pair[1] = pair[1][:, 4:12]
+    assert np.abs(pair[0] - pair[1]).sum() < 0.05 * pair[1].sum()
+
+
+@pytest.mark.slow
+def test_the_share_of_a_quirk_is_that_of_renderings_without_it(llvm, tmp_path):
+    pictures = Pictures(write(tmp_path / "scene.xml", SUN + SKY), "gem", width=8)
+    names = ("constant_blend", "infrared_rainbow", "power_gamma", NO_SHADOWS)
+    assert sorted(pictures.quirks) == sorted(names)
+    steps = []
+    found = quirk_shares(pictures, 16, 4, lambda done, total: steps.append((done, total)))
+    assert steps == [(i + 1, 12) for i in range(12)]
+    assert found.size == (8, 6)
+    white = white_luminance(pictures.path_traced(16).xyz, pictures.surface)
+    against, reference = found.same_light, pictures.same_light(16)
+
+    def mean(*quirks):
+        return difference(reference.xyz, pictures.shaded(quirks, 4, 16).xyz, pictures.surface, white).mean
+
+    assert against.published == pytest.approx(mean(*names))
+    assert against.corrected == pytest.approx(mean())
+    one = against.quirks["power_gamma"]
+    assert one.drop == pytest.approx(mean(*names) - mean("constant_blend", "infrared_rainbow", NO_SHADOWS))
+    assert one.rise == pytest.approx(mean("power_gamma") - mean())
+    assert one.share == pytest.approx((one.drop + one.rise) / 2 / mean(*names))
+    # The sky is none of the shader's.
+    assert found.path_traced.corrected > against.corrected
+    # A plate without shadows is no picture of a plate with one.
+    assert found.same_light.quirks[NO_SHADOWS].rise > 1
+
+
+def test_the_reads_per_point_are_those_of_the_tables(llvm, tmp_path):
+    pictures = Pictures(write(tmp_path / "scene.xml", base=""), "flss", width=4)
+    assert pictures.shader_reads == 81 * 37 * 9
+    spectrum = pictures.spectra[0]
+    assert pictures.model_reads == 4 * np.prod(spectrum.neighbours)  # slices: a packet a node, four wavelengths
+    assert "constant_blend" not in pictures.quirks
+
+
+# --- The command ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def names():
+    return {path.name for path in Path().iterdir()}
+
+
+@pytest.mark.slow
+def test_compare_writes_pictures_numbers_and_a_figure(command, llvm, folder):
+    write(Path("scene.xml"), SUN + SKY)
+    code, out, err = command(
+        "compare scene.xml --shader gem --spp 8 --width 12 --json numbers.json -o . --variant llvm_ad_spectral"
+    )
+    assert (code, err) == (0, "")
+    files = {"scene-gem-path.exr", "scene-gem-published.exr", "scene-gem-corrected.exr", "scene-gem.png"}
+    assert names() == {"scene.xml", "numbers.json", *files}
+    numbers = json.loads(Path("numbers.json").read_text(encoding="utf-8"))
+    found = numbers["to path tracer"]["published"]
+    assert f"{found['mean']:.2f}" in out
+    assert f"{found['exposure factor']:.3g}" in out
+    assert 0 < found["mean"] <= found["95 %"] <= found["max"]
+    assert numbers["shares"]["size"] == [12, 9]
+    for reference in ("of path tracer", "of same light"):
+        assert {*numbers["shares"][reference]["quirks"]["power_gamma"]} == {"drop", "rise", "share"}
+    for name in ("constant_blend", "infrared_rainbow", "power_gamma", NO_SHADOWS):
+        assert name in out
+    assert re.search(r"\n\s*\n\s*path tracer +same light", out)  # a line between the tables
+    # The pictures are those of the numbers.
+    path, published = (md.render.SpectralImage.load(f"scene-gem-{name}.exr") for name in ("path", "published"))
+    xyz = [spectrum_to_XYZ(image.radiance, image.wavelengths) for image in (path, published)]
+    surface = Pictures("scene.xml", "gem", width=12).surface
+    again = difference(*xyz, surface, numbers["luminance of white"])
+    assert again.mean == pytest.approx(found["mean"], rel=1e-3)
+    with Image.open("scene-gem.png") as picture:
+        assert picture.width > 1000
+        assert np.ptp(np.asarray(picture.convert("L"))) > 100
+
+
+def test_a_coat_is_noted(llvm, folder):
+    write(Path("scene.xml"), base=BASE + '<float name="coat_ior" value="1.5"/>')
+    found = compare("scene.xml", "flss", width=4, spp=1, shading_points=1, shares=False)
+    assert found.coated
+    for coated in (True, False):
+        heads = [line.split(":")[0] for line in summary.notes(replace(found, coated=coated))]
+        assert (heads.count("coat"), heads.count("limit")) == (coated, not coated)
+    write(Path("bare.xml"))
+    assert not Pictures("bare.xml", width=4).has_coat
+
+
+@pytest.mark.slow
+def test_the_same_seed_gives_the_same_numbers(llvm, folder):
+    write(Path("scene.xml"), rfilter="gaussian")
+    found = [compare("scene.xml", "gem", spp=16, seed=1, shares=False) for _ in range(2)]
+    for first, second in zip(*(one.pictures.values() for one in found), strict=True):
+        np.testing.assert_array_equal(first.image.radiance, second.image.radiance)
+    numbers = [summary.as_dict(one) for one in found]
+    assert numbers[0]["shares"] is None
+    for one in numbers:
+        del one["pictures"]  # seconds
+    assert numbers[0] == numbers[1]
+    # Without the shares, too, there is a figure.
+    summary.save_figure(found[0], "figure.png", dpi=40)
+    with Image.open("figure.png") as picture:
+        assert picture.width > 400
+
+
+@pytest.mark.few(2)
+@pytest.mark.parametrize(
+    ("arguments", "of", "words"),
+    [
+        ("gone.xml", {}, "gone.xml"),
+        ("scene.xml --shader flsss", {}, "shader: got 'flsss', wanted one of flss, nmm, pq, gem"),
+        ("scene.xml -o nowhere/out", {}, "the folder nowhere is not there"),
+        ("scene.xml --json nowhere/out.json", {}, "the folder nowhere is not there"),
+        ("scene.xml --spp 0", {}, "--spp"),
+        ("scene.xml -D colour", {}, "-D: got 'colour', wanted NAME=VALUE"),
+        ("scene.xml --variant scalar_spectral", {}, "wanted a vectorised one"),
+        ("scene.xml", {"light": SKY}, "no directional or point light"),
+        ("scene.xml", {"bsdf": '<bsdf type="diffuse"/>'}, "no shape has a diffraction_grating"),
+        ("scene.xml", {"integrator": '<integrator type="diffraction_shader"/>'}, "its integrator is the shader itself"),
+        (
+            "scene.xml",
+            {"bsdf": '<bsdf type="diffraction_grating"><string name="filename" value="blaze.exr"/></bsdf>'},
+            "a saved spectrum does not hold them",
+        ),
+        (
+            "scene.xml",
+            {"bsdf": '<bsdf type="diffraction_grating"><string name="filename" value="ruled.exr"/></bsdf>'},
+            "got a grating with theory=rigorous, wanted one of scalar theory",
+        ),
+    ],
+)
+def test_a_mistake_is_one_line_and_exit_code_2(command, llvm, folder, arguments, of, words):
+    write(Path("scene.xml"), **of)
+    md.precompute(md.gratings.blazed(2.5, 0.25, samples=64), coherence_length=20).save("blaze.exr")
+    made_up().save("ruled.exr")
+    before = names()
+    code, out, err = command(f"compare {arguments}")
+    assert (code, out) == (2, "")
+    assert len(err.splitlines()) == 1, err
+    assert words in err
+    assert names() == before
+
+
+@pytest.mark.few(1)
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError("disk full")])
+def test_a_failed_comparison_leaves_no_files(command, monkeypatch, llvm, folder, error):
+    write(Path("scene.xml"))
+
+    def fail(*args, **kwargs):
+        raise error
+
+    monkeypatch.setattr(summary, "save_figure", fail)
+    code, out, err = command("compare scene.xml --shader gem --spp 1 --width 4 --no-shares")
+    assert (code, out) == (130 if isinstance(error, KeyboardInterrupt) else 1, "")
+    assert len(err.splitlines()) == 1
+    assert names() == {"scene.xml"}

@@ -1,0 +1,669 @@
+"""The published shader against float64, against this project's model, and one peculiarity after the other."""
+
+import signal
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import mitsuba_diffraction as md
+from mitsuba_diffraction.evaluation.realtime_shader import tristimulus
+from mitsuba_diffraction.evaluation.realtime_shader.evaluate import VARIANTS, colour, relative_radiance, shader_for
+from mitsuba_diffraction.evaluation.realtime_shader.picture import Emission, decode, encode
+from mitsuba_diffraction.evaluation.realtime_shader.quirks import Quirks
+from mitsuba_diffraction.evaluation.realtime_shader.taylor_textures import taylor_transforms
+from mitsuba_diffraction.evaluation.realtime_shader.tiling import tile_factor as tile_factor_drjit
+from mitsuba_diffraction.evaluation.realtime_shader.tiling import tiling_power
+from mitsuba_diffraction.reference import tile_factor
+from mitsuba_diffraction.render.scene import root_cause
+from mitsuba_diffraction.testing import array, vectors
+
+PUBLISHED, CORRECTED = Quirks.as_published(), Quirks.corrected()
+BLAZE = md.gratings.blazed(2.5, 0.25, samples=64)
+FLAT = md.HeightField(np.zeros((1, 4)), 0.625)
+ROUGH = md.HeightField(np.random.default_rng(1).normal(0, 0.03, (8, 16)), 0.1)
+
+
+pytestmark = pytest.mark.usefixtures("llvm")
+
+
+def only(name):
+    """Corrected, but for one peculiarity."""
+    return replace(CORRECTED, **{name: True})
+
+
+def unit(x, y=0.0):
+    """Direction cosines → unit vectors above the surface, (..., 3)."""
+    x, y = np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float))
+    return np.stack([x, y, np.sqrt(1 - x**2 - y**2)], axis=-1)
+
+
+def sines(degrees):
+    return np.sin(np.deg2rad(degrees))
+
+
+def gain(wi, wo, shadowing=True):
+    """F/F₀ K G cos θ_i of an index of 1.5, in float64."""
+    d = 1 + (wi * wo).sum(-1)
+    cos_i, cos_o = wi[..., 2], wo[..., 2]
+    k = d**2 / (cos_o * (cos_i + cos_o) ** 2)
+    g = np.minimum(1, 2 * (cos_i + cos_o) * np.minimum(cos_i, cos_o) / d) if shadowing else 1
+    return (1 + 24 * (1 - np.sqrt(d / 2)) ** 5) * k * g
+
+
+def kappa_of(wi, wo, nanometres):
+    return 2e3 * np.pi * (wi[..., 2] + wo[..., 2]) / nanometres
+
+
+def tile_spectrum(height_field, wi, wo, nanometres, coherence_length=65.0):
+    """S(q; κ)/S_flat(0) of this project's model."""
+    q = -(wi + wo)[..., :2] * 1e3 / np.asarray(nanometres, float)[..., None]
+    kappa = kappa_of(wi, wo, nanometres)
+    s, flat = (
+        md.reference.power_spectrum(surface, at, kappa, coherence_length=coherence_length)
+        for surface, at in ((height_field, q), (FLAT, 0 * q))
+    )
+    return s / flat
+
+
+def xyz(rgb):
+    """The CIE XYZ that a shader shows as this linear sRGB."""
+    return rgb @ np.linalg.inv(tristimulus.rgb_matrix(cie_rgb_matrix=False, d65_twice=False)).T
+
+
+def seen(shader, wi, wo, **weights):
+    """CIE XYZ of a material and a light, (n, 3)."""
+    return xyz(array(shader.rgb(vectors(wi), vectors(wo), shader.weights(**weights))).T)
+
+
+def finely(surface, wi, wo, step, coherence_length):
+    """CIE XYZ of corrected FLSS, (n, 3): the trapezoidal rule over ρ(λ) with steps that resolve its lines, nm."""
+    nanometres = np.arange(380, 780 + step / 2, step)
+    shader = shader_for(surface, "flss", CORRECTED, coherence_length=coherence_length)
+    weights, _ = shader.weights()(mi.Float(nanometres), mi.Bool(True))
+    total = []
+    for omega_i, omega_o in zip(wi, wo, strict=True):
+        rho = relative_radiance(
+            surface, omega_i, omega_o, nanometres, quirks=CORRECTED, coherence_length=coherence_length
+        )
+        total.append(np.trapezoid(rho * array(weights), dx=step))
+    return np.array(total)
+
+
+# --- FLSS -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("quirks", [PUBLISHED, CORRECTED], ids=["published", "corrected"])
+def test_flss_at_the_centre_of_an_order_is_that_texel_of_the_taylor_series(quirks):
+    nanometres, orders = 500.0, np.arange(-4, 4)
+    wi = unit(0.2)
+    wo = unit(-0.2 - orders * 0.5 / 2.5)
+    kappa = kappa_of(wi, wo, nanometres)
+    heights = BLAZE.heights - BLAZE.heights.min() if quirks.heights_from_zero else BLAZE.centred
+    factorials = np.cumprod(np.maximum(np.arange(37.0), 1))
+    series = sum((1j * kappa) ** n / factorials[n] * np.fft.fft2(heights**n)[0, orders] / 64 for n in range(37))
+    expected = gain(wi, wo) * np.abs(series) ** 2
+    if quirks is PUBLISHED:
+        d = np.sqrt((1 + (wi * wo).sum(-1)) / 2)
+        expected *= np.pi**2 * (1 + 24 * (1 - d) ** 5)
+    rho = relative_radiance(BLAZE, wi, wo, np.full(8, nanometres), quirks=quirks)
+    np.testing.assert_allclose(rho, expected, rtol=1e-4, atol=1e-7 * expected.max())
+
+
+@pytest.mark.parametrize("surface", [BLAZE, ROUGH], ids=["blaze", "rough"])
+def test_corrected_flss_is_the_projects_model(surface):
+    # Everywhere between the orders too; what the 3 × 3 texels leave out is e^{−(3/2)²/(σ_f T)²}, nothing for T ≪ L_c.
+    rng = np.random.default_rng(2)
+    wi, wo = (unit(*rng.uniform(-0.6, 0.6, (2, 500))) for _ in range(2))
+    near = -wi[:250, 0] - rng.integers(-2, 3, 250) * 0.2 + rng.normal(0, 0.01, 250)
+    wo[:250] = unit(np.clip(near, -0.75, 0.75), -wi[:250, 1])
+    nanometres = np.full(500, 500.0)
+    expected = gain(wi, wo) * tile_spectrum(surface, wi, wo, nanometres)
+    rho = relative_radiance(surface, wi, wo, nanometres, quirks=CORRECTED)
+    assert expected.max() > 1e-3
+    np.testing.assert_allclose(rho, expected, atol=3e-5 * expected.max())
+
+
+@pytest.mark.parametrize("ratio", [0.7, 1.0, 2.0])
+def test_the_limit_of_the_neighbourhood_is_as_stated(ratio):
+    """Against the model, for L_c/T from below to above one."""
+    size = ROUGH.tile_size[0]
+    coherence = ratio * size
+    surface = md.HeightField(ROUGH.heights[:1], ROUGH.pixel_size)
+    wo = unit(np.linspace(-0.9, 0.9, 300))
+    wi, nanometres = np.broadcast_to(unit(0.1), wo.shape), np.full(300, 500.0)
+    rho = relative_radiance(surface, wi, wo, nanometres, quirks=CORRECTED, coherence_length=coherence)
+    expected = gain(wi, wo) * tile_spectrum(surface, wi, wo, nanometres, coherence)
+    left_out = np.exp(-((1.5 / (2 / (np.pi * coherence) * size)) ** 2))
+    assert np.abs(rho - expected).max() < (2 * left_out + 1e-5) * expected.max()
+
+
+def test_corrected_flss_in_radiance_is_the_bsdf():
+    bsdf = mi.load_dict(
+        {"type": "diffraction_grating", "profile": "blazed", "period": 2.5, "depth": 0.25, "samples": 64,
+         "fresnel": "schlick", "int_ior": 1.5, "ext_ior": 1.0, "tolerance": 1e-4, "conserve_energy": False}
+    )  # fmt: skip
+    shader = shader_for(BLAZE, "flss", CORRECTED)
+    x = np.linspace(-0.8, 0.5, 400)
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    si.wi = mi.Vector3f(unit(x).T.astype(np.float32))
+    light = mi.Vector3f(*(float(c) for c in unit(0.2)))
+    si.wavelengths = mi.UnpolarizedSpectrum(550)
+    expected = np.array(bsdf.eval(mi.BSDFContext(), si, light))[0]
+    rho = relative_radiance(BLAZE, unit(0.2), unit(x), np.full(400, 550.0), quirks=CORRECTED)
+    np.testing.assert_allclose(rho * 0.04 * shader.peak / 0.55**2, expected, atol=1e-3 * expected.max())
+
+
+def test_27000_texels_are_read_for_a_point():
+    assert shader_for(BLAZE, "flss", PUBLISHED).texel_reads == 81 * 37 * 9 == 26973
+    assert shader_for(BLAZE, "flss", PUBLISHED, terms=30).texel_reads == 81 * 30 * 9
+    assert shader_for(BLAZE, "pq", PUBLISHED, interpolation="linear").texel_reads == 81 * 37 * 4
+    # At |u| = 2 the orders 7 … 13 are in the light.
+    assert shader_for(BLAZE, "nmm", PUBLISHED).texel_reads == 37 * (81 + 7 * 9)
+    assert shader_for(BLAZE, "gem", PUBLISHED).texel_reads == 0
+
+
+# --- NMM --------------------------------------------------------------------------------------------------------------
+
+
+def test_nmm_with_its_jacobian_converges_to_flss():
+    x = np.linspace(-0.9, 0.8, 60)
+    wi, wo = np.broadcast_to(unit(0.2), (60, 3)), unit(x)
+    errors = []
+    for coherence, step in ((65.0, 0.5), (260.0, 0.125), (1040.0, 0.1)):
+        flss = finely(BLAZE, wi, wo, step, coherence)
+        nmm = xyz(colour(BLAZE, wi, wo, variant="nmm", quirks=CORRECTED, coherence_length=coherence))
+        lines = np.abs(x + 0.2) > 0.1  # order zero is summed alike
+        errors.append(np.abs(nmm - flss)[lines].max() / flss[lines].max())
+        np.testing.assert_allclose(nmm[~lines], flss[~lines], rtol=0.05, atol=0.03 * flss.max())
+    # Lines of finite width blur the colour; that goes with the square of the width.
+    assert errors[0] < 0.06
+    assert errors[1] < 0.15 * errors[0]
+    assert errors[2] < 1.5e-3
+
+
+def test_nmm_in_the_diagonal_counts_every_line_once():
+    crossed = md.gratings.crossed(2.0, 0.1, samples=16)
+    rng = np.random.default_rng(4)
+    lines = np.array([(1, 1), (1, -1), (2, 1), (1, 2), (0, 1), (2, 0)])
+    u, v = (lines[rng.integers(0, 6, 100)] * rng.uniform(0.42, 0.68, (100, 1)) / 2).T + rng.normal(0, 0.001, (2, 100))
+    wi, wo = np.broadcast_to(unit(0.05, 0.02), (100, 3)), unit(-0.05 - u, -0.02 - v)
+    flss = finely(crossed, wi, wo, 0.25, 130.0)
+    nmm = xyz(colour(crossed, wi, wo, variant="nmm", quirks=CORRECTED, coherence_length=130.0))
+    assert np.abs(nmm - flss).max() < 0.05 * flss.max()
+
+
+def test_without_the_jacobian_nmm_is_purple():
+    x = np.linspace(-1.0, 0.6, 300)
+    x = x[np.abs(x + 0.2) > 0.1]
+    total = [
+        xyz(colour(BLAZE, unit(0.2), unit(x), variant="nmm", quirks=q)).sum(0) for q in (only("no_jacobian"), CORRECTED)
+    ]
+    wrong, right = (t / t[1] for t in total)
+    assert wrong[2] > 1.1 * right[2]
+
+
+# --- PQ ---------------------------------------------------------------------------------------------------------------
+
+
+def test_tile_factor_is_that_of_the_reference():
+    x = np.concatenate([np.linspace(-40, 40, 4001), np.arange(-9, 10), np.arange(1, 200) / 26, 3 + 1e-6 * np.arange(9)])
+    x = x.astype(np.float32)
+    for count in (1, 2, 7, 26):
+        np.testing.assert_allclose(
+            np.array(tile_factor_drjit(mi.Float(x), count)), tile_factor(x, count), rtol=2e-5, atol=2e-5
+        )
+
+
+@pytest.mark.few(2)
+@pytest.mark.parametrize("tiles", [(1, 1), (5, 1), (26, 3)])
+@pytest.mark.parametrize("surface", [BLAZE, ROUGH], ids=["blaze", "rough"])
+def test_pq_of_n_tiles_is_the_transform_of_their_surface(surface, tiles):
+    rng = np.random.default_rng(3)
+    wi, wo = unit(*rng.uniform(-0.07, 0.07, (2, 150))), unit(*rng.uniform(-0.07, 0.07, (2, 150)))
+    wo[:, 0] = rng.uniform(-0.9, 0.6, 150)
+    wo[:75, 1] = -wi[:75, 1]
+    wo[:, 2] = np.sqrt(1 - wo[:, 0] ** 2 - wo[:, 1] ** 2)
+    nanometres = np.full(150, 600.0)
+    q = -(wi + wo)[:, :2] / 0.6
+    area = np.prod(surface.tile_size) * np.prod(tiles)
+    s = md.reference.finite_tiles_spectrum(surface, q, kappa_of(wi, wo, nanometres), tiles=tiles) / area
+    reach = max(surface.shape)
+    settings = dict(variant="pq", quirks=CORRECTED, tiles=tiles, reach=reach)
+    rho = relative_radiance(surface, wi, wo, nanometres, **settings)
+    np.testing.assert_allclose(rho, gain(wi, wo) * s, atol=3e-5 * (gain(wi, wo) * s).max())
+    wrong = relative_radiance(surface, wi, wo, nanometres, **settings | {"quirks": only("wrong_product")})
+    assert np.abs(wrong - rho).max() > 0.01 * rho.max()
+
+
+def test_at_integers_the_wrong_product_is_only_a_factor():
+    x = mi.Float([0.0, 1.0, 5.0, -3.0])
+    np.testing.assert_allclose(np.array(tiling_power(x, x, (7, 4), False)), 1)
+    np.testing.assert_allclose(np.array(tiling_power(x, x, (7, 4), True)), 2, rtol=1e-5)
+
+
+def test_pq_interpolations_agree_at_the_orders_and_differ_between():
+    nanometres, orders = 500.0, np.arange(-3, 3)
+    wi, wo = unit(0.2), unit(-0.2 - orders * 0.2)
+    rho = [
+        relative_radiance(BLAZE, wi, wo, np.full(6, nanometres), variant="pq", quirks=CORRECTED, **s)
+        for s in ({}, {"interpolation": "linear"}, {"reach": 8})
+    ]
+    np.testing.assert_allclose(rho[1], rho[0], rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(rho[2], rho[0], rtol=1e-4, atol=1e-6)
+    between = unit(-0.2 - (orders + 0.5) * 0.2)
+    one = dict(variant="pq", quirks=CORRECTED, tiles=(1, 1))
+    linear = relative_radiance(BLAZE, wi, between, np.full(6, nanometres), interpolation="linear", **one)
+    exact = relative_radiance(BLAZE, wi, between, np.full(6, nanometres), reach=32, **one)
+    near = relative_radiance(BLAZE, wi, between, np.full(6, nanometres), **one)
+    assert np.abs(near - exact).max() < np.abs(linear - exact).max()
+
+
+# --- GEM --------------------------------------------------------------------------------------------------------------
+
+
+def test_gem_puts_its_rainbow_on_the_wavelengths_of_the_grating_equation():
+    # First order of d = 1 µm alone: λ = |u| µm.
+    red, green, blue = 0.68, 0.58, 0.48
+    wo = unit(-np.array([red, green, blue]))
+    settings = dict(variant="gem", spacing=1.0, roughness=50.0)
+    rgb = colour(BLAZE, unit(0.0), wo, quirks=CORRECTED, **settings)
+    np.testing.assert_allclose(rgb, np.eye(3), atol=0.01)
+    # As published, 0.625 µm is blue.
+    rgb = colour(BLAZE, unit(0.0), unit([-0.625]), quirks=PUBLISHED, **settings)
+    np.testing.assert_allclose(rgb, [[0, 0, 1]], atol=0.01)
+    assert shader_for(BLAZE, "gem", PUBLISHED).spacing == pytest.approx(2.5)
+    three = md.HeightField(np.tile(BLAZE.heights, 3), BLAZE.pixel_size)
+    assert shader_for(three, "gem", PUBLISHED).spacing == pytest.approx(2.5)
+
+
+# --- The peculiarities, one by one ------------------------------------------------------------------------------------
+
+
+def test_schlicks_value_is_a_power_already():
+    """On a flat surface ρ in the mirror direction is R(θ)/R₀ cos θ_i, since K = G = 1."""
+    theta = np.array([10.0, 60, 70, 80])
+    wi, wo, at = unit(sines(theta)), unit(-sines(theta)), np.full(4, 550.0)
+    exact = np.array(mi.fresnel(mi.Float(np.cos(np.deg2rad(theta))), 1.5)[0]) / 0.04 * wi[:, 2]
+    right = relative_radiance(FLAT, wi, wo, at, quirks=CORRECTED)
+    wrong = relative_radiance(FLAT, wi, wo, at, quirks=only("fresnel_squared"))
+    np.testing.assert_allclose(right, exact, rtol=0.25)
+    assert (wrong[1:] > 1.25 * exact[1:]).all()
+    assert wrong[3] > 8 * exact[3]
+
+
+def test_the_index_of_the_material_scales_the_colour():
+    """A flat mirror under D65 shows white times F(θ)/F(0) cos θ_i."""
+    wi, wo = unit(sines([75])), unit(-sines([75]))
+    relative = replace(CORRECTED, relative=True)
+    right = seen(shader_for(FLAT, "flss", relative), wi, wo, r_0=0.9) / tristimulus.d65_white()
+    away = (1 - np.cos(np.deg2rad(75))) ** 5
+    np.testing.assert_allclose(right, np.full((1, 3), (0.9 + 0.1 * away) / 0.9 * wi[0, 2]), rtol=1e-5)
+    fixed = seen(shader_for(FLAT, "flss", replace(relative, fixed_index=True)), wi, wo, r_0=0.9)
+    fixed /= tristimulus.d65_white()
+    np.testing.assert_allclose(fixed, np.full((1, 3), (0.04 + 0.96 * away) / 0.04 * wi[0, 2]), rtol=1e-5)
+
+
+def test_a_flat_mirror_gives_one_unless_the_window_has_the_height_pi():
+    up = unit([0.0])
+    assert relative_radiance(FLAT, up, up, [550.0], quirks=CORRECTED) == pytest.approx(1, rel=1e-6)
+    assert relative_radiance(FLAT, up, up, [550.0], quirks=only("window_pi")) == pytest.approx(np.pi**2, rel=1e-6)
+
+
+def test_the_average_over_places_is_the_sum_of_powers():
+    """Rolling the tile moves x₀; the mean of |Σ φ F|² over all places is Σ φ² |F|²."""
+    heights = ROUGH.heights[:1]
+    wo = unit(np.linspace(-0.5, 0.5, 40))
+    settings = dict(wavelengths=np.full(40, 500.0), coherence_length=1.0)
+    places = [
+        relative_radiance(md.HeightField(np.roll(heights, n), 0.1), unit(0.0), wo, quirks=only("complex_window_sum"),
+                          **settings)
+        for n in range(16)
+    ]  # fmt: skip
+    right = relative_radiance(md.HeightField(heights, 0.1), unit(0.0), wo, quirks=CORRECTED, **settings)
+    np.testing.assert_allclose(np.mean(places, axis=0), right, rtol=1e-4, atol=1e-6)
+    assert np.abs(places[0] - right).max() > 0.1 * right.max()
+
+
+def test_the_floor_leaves_out_a_neighbour():
+    surface = md.HeightField(ROUGH.heights[:1], 0.1)
+    wo = unit(np.linspace(-0.6, 0.6, 200))
+    wi, at = np.broadcast_to(unit(0.1), wo.shape), np.full(200, 500.0)
+    expected = gain(wi, wo) * tile_spectrum(surface, wi, wo, at, 1.6)
+    right, wrong = (
+        relative_radiance(surface, wi, wo, at, quirks=q, coherence_length=1.6)
+        for q in (CORRECTED, only("floor_anchor"))
+    )
+    assert np.abs(right - expected).max() < 0.01 * expected.max()
+    assert np.abs(wrong - expected).max() > 0.04 * expected.max()
+
+
+def test_heights_about_the_middle_need_fewer_terms():
+    deep = md.gratings.blazed(2.5, 0.8, samples=64)
+    orders = np.arange(-4, 4)
+    wi, wo, at = unit(0.0), unit(-orders * 0.16), np.full(8, 400.0)
+    expected = gain(wi, wo) * np.diagonal([md.reference.order_powers(deep, k)[0, orders] for k in kappa_of(wi, wo, at)])
+    right = relative_radiance(deep, wi, wo, at, quirks=CORRECTED)
+    wrong = relative_radiance(deep, wi, wo, at, quirks=only("heights_from_zero"))
+    np.testing.assert_allclose(right, expected, atol=0.02 * expected.max())
+    assert not np.allclose(wrong, expected, atol=0.5 * expected.max())
+
+
+def test_a_flat_mirror_under_d65_is_white():
+    up = unit([0.0])
+    np.testing.assert_allclose(
+        colour(FLAT, up, up, quirks=replace(CORRECTED, relative=True)), np.ones((1, 3)), atol=1e-3
+    )
+    rgb = {
+        name: colour(FLAT, up, up, quirks=replace(CORRECTED, relative=True, **{name: True}))[0]
+        for name in ("d65_twice", "cie_rgb_matrix")
+    }
+    assert np.ptp(rgb["d65_twice"]) > 0.1
+    # The matrix keeps the white of equal energy, not that of D65, and makes it dark.
+    np.testing.assert_allclose(rgb["cie_rgb_matrix"], tristimulus.CIE_RGB @ tristimulus.d65_white(), rtol=1e-4)
+    assert rgb["cie_rgb_matrix"].max() < 0.2
+
+
+def test_the_light_has_its_own_spectrum():
+    up, light = unit([0.0]), np.full(401, 2.0)
+    relative = replace(CORRECTED, relative=True)
+    right = seen(shader_for(FLAT, "flss", relative), up, up, light=light)
+    np.testing.assert_allclose(right, np.full((1, 3), 2.0), rtol=2e-3)
+    fixed = seen(shader_for(FLAT, "flss", replace(relative, d65_light=True)), up, up, light=light)
+    np.testing.assert_allclose(fixed[0], 2 * tristimulus.d65_white(), rtol=2e-3)
+
+
+def test_a_relative_radiance_lacks_the_wavelength():
+    """The colour of a flat mirror: ∫ D65 (x̄, ȳ, z̄) R₀ S(0)/λ² dλ."""
+    up = unit([0.0])
+    nodes = tristimulus.wavelengths()[::5]
+    weights = (
+        tristimulus.d65_weights()[::5] * (0.04 * shader_for(FLAT, "flss", CORRECTED).peak * 1e6 / nodes**2)[:, None]
+    )
+    right = xyz(colour(FLAT, up, up, quirks=CORRECTED))[0]
+    np.testing.assert_allclose(right, np.trapezoid(weights, dx=5.0, axis=0), rtol=1e-4)
+    relative = xyz(colour(FLAT, up, up, quirks=only("relative")))[0]
+    np.testing.assert_allclose(relative, tristimulus.d65_white(), rtol=1e-4)
+
+
+def test_encoding_is_a_power_or_the_transfer_function_of_srgb():
+    import colour as science
+
+    values = np.linspace(0, 1, 50)
+    rgb = mi.Color3f(mi.Float(values.astype(np.float32)))
+    np.testing.assert_allclose(
+        np.array(encode(rgb, False))[0], science.cctf_encoding(values, function="sRGB"), atol=1e-5
+    )
+    np.testing.assert_allclose(np.array(encode(rgb, True))[0], values ** (1 / 2.2), atol=1e-5)
+    np.testing.assert_allclose(np.array(decode(encode(rgb, False)))[0], values, atol=1e-5)
+
+
+def test_quirks_are_switches():
+    with pytest.raises(ValueError, match="window_pi: got 1, wanted True or False"):
+        replace(PUBLISHED, window_pi=1)
+    assert all(getattr(PUBLISHED, name) and not getattr(CORRECTED, name) for name in Quirks.names())
+
+
+# --- Textures and colour tables ---------------------------------------------------------------------------------------
+
+
+def test_texels_are_the_transforms_of_the_powers_of_the_heights():
+    texels, height = taylor_transforms(ROUGH, 3, heights_from_zero=False, origin_at_centre=False)
+    assert texels.shape == (8, 16, 3)
+    assert height == ROUGH.half_range
+    t = ROUGH.centred / ROUGH.half_range
+    for n in range(3):
+        expected = np.fft.fft2(t**n) / t.size
+        assert texels[4, 8, n] == pytest.approx(expected[0, 0], abs=1e-6)
+        assert texels[4 - 2, 8 + 3, n] == pytest.approx(expected[-2, 3], abs=1e-6)
+
+
+def test_spectra_of_the_primaries_have_their_colours():
+    from mitsuba_diffraction.color import spectrum_to_linear_sRGB
+
+    spectra = tristimulus.primary_spectra()
+    assert spectra.min() > -1e-6
+    np.testing.assert_allclose(spectrum_to_linear_sRGB(spectra.T, tristimulus.EMISSION), np.eye(3), atol=6e-3)
+    wavelengths = mi.UnpolarizedSpectrum(360, 452.5, 700, 830)
+    light = np.array(Emission()(mi.Color3f(0.5, 1, 2), wavelengths, mi.Bool(True))).ravel()
+    expected = [np.interp(w, tristimulus.EMISSION, spectra @ [0.5, 1, 2]) for w in (360, 452.5, 700, 830)]
+    np.testing.assert_allclose(light, expected, rtol=1e-4, atol=1e-6)
+
+
+# --- Arguments --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"variant": "flsss"}, "variant: got 'flsss', wanted one of flss, nmm, pq, gem"),
+        ({"terms": 0}, "terms: got 0"),
+        ({"coherence_length": 0}, "coherence_length"),
+        ({"variant": "pq", "interpolation": "cubic"}, "interpolation: got 'cubic', wanted one of sinc, linear"),
+        ({"variant": "pq", "tiles": (0, 1)}, "tiles: got 0"),
+        ({"variant": "gem", "spacing": -1.0}, "spacing"),
+    ],
+)
+def test_wrong_arguments_are_refused(settings, message):
+    with pytest.raises(ValueError, match=message):
+        colour(BLAZE, unit([0.1]), unit([0.2]), **settings)
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("quirks", [PUBLISHED, CORRECTED], ids=["published", "corrected"])
+def test_values_are_finite_at_hard_directions(variant, quirks):
+    grazing = [0.0, 1e-4, 0.5, 0.99999, 1.0]
+    x_i, x_o = np.meshgrid(grazing, np.concatenate([grazing, -np.array(grazing)]))
+    for surface in (FLAT, BLAZE, ROUGH):
+        rgb = colour(surface, unit(x_i), unit(x_o), variant=variant, quirks=quirks, terms=20) if (
+            variant != "gem"
+        ) else colour(surface, unit(x_i), unit(x_o), variant=variant, quirks=quirks)  # fmt: skip
+        assert rgb.shape == (*x_i.shape, 3)
+        assert np.isfinite(rgb).all()
+    below = unit(0.3) * [1, 1, -1]
+    more = {"terms": 20} if variant != "gem" else {}
+    assert not colour(BLAZE, below, unit(0.3), variant=variant, quirks=quirks, **more).any()
+
+
+# --- The integrator ---------------------------------------------------------------------------------------------------
+
+GRATING = {"type": "diffraction_grating", "profile": "blazed", "period": 2.5, "depth": 0.25, "samples": 64,
+           "coherence_length": 5.0}  # fmt: skip
+SUN = {"type": "directional", "direction": [0, 0, -1], "irradiance": {"type": "d65"}}
+DIRECT = {"type": "direct", "emitter_samples": 1, "bsdf_samples": 0}
+
+
+def scene(integrator, bsdf=GRATING, light=SUN, **more):
+    camera = mi.ScalarTransform4f().look_at([0, 0, 1], [0, 0, 0], [0, 1, 0])
+    film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}, "pixel_format": "xyz",
+            "component_format": "float32"}  # fmt: skip
+    return mi.load_dict(
+        {"type": "scene", "integrator": integrator, "plate": {"type": "rectangle", "bsdf": bsdf}, "light": light,
+         "sensor": {"type": "perspective", "to_world": camera, "fov": 80, "film": film}, **more}
+    )  # fmt: skip
+
+
+def picture(integrator, spp=16, **of):
+    return np.array(mi.render(scene(integrator, **of), spp=spp, seed=1))
+
+
+def shader(variant="flss", **parameters):
+    return {"type": "diffraction_shader", "variant": variant, **parameters}
+
+
+def viewing_cosines(built):
+    """(u, v) = −ω_o at the middles of the pixels, for light along the normal: (2, 16, 16)."""
+    y, x = np.mgrid[:16, :16].reshape(2, -1) + 0.5
+    position = mi.Point2f(*(c.astype(np.float32) / 16 for c in (x, y)))
+    ray, _ = built.sensors()[0].sample_ray(0, 0.5, position, mi.Point2f(0.5))
+    return np.array(ray.d)[:2].reshape(2, 16, 16)
+
+
+@pytest.mark.parametrize("as_published", [True, False])
+@pytest.mark.parametrize("variant", ["flss", "nmm", "pq"])
+def test_bright_pixels_are_where_the_grating_equation_says(variant, as_published):
+    # u = mλ/T: order 1 of T = 1 µm lies at 0.38 < u < 0.78; the second is out of sight.
+    bsdf = dict(GRATING, period=1.0, depth=0.25, coherence_length=20.0)
+    built = scene(shader(variant, as_published=as_published, terms=28), bsdf)
+    image = np.array(mi.render(built, spp=32, seed=1))
+    assert image.shape == (16, 16, 3)
+    assert np.isfinite(image).all()
+    u, v = viewing_cosines(built)
+    luminance = np.abs(image[..., 1])
+    # Half a pixel is 0.05 wide, and three σ_q λ of a lobe 0.04 more.
+    zero, one = np.abs(u) < 0.1, (np.abs(u) > 0.29) & (np.abs(u) < 0.87)
+    on = (np.abs(v) < 0.1) & (zero | one)
+    # A finite number of tiles has side lobes, 1/x².
+    assert luminance[~on].max() < (0.2 if variant == "pq" else 2e-3) * luminance.max()
+    # The facets mirror 2 depth/λ = 1, and green most of all to the eye.
+    row = image[7:9].mean(0)[:, 1]
+    u = u[7:9].mean(0)
+    assert (row[(u > 0.45) & (u < 0.64)] > 0.05 * row.max()).all()
+    assert row[(u > 0.3)].sum() > 10 * np.abs(row[u < -0.3].sum())
+    assert u[(row * (np.abs(u) > 0.1)).argmax()] == pytest.approx(0.55, abs=0.08)
+
+
+@pytest.mark.slow
+def test_the_corrected_integrator_shows_what_the_path_tracer_does():
+    # A rougher lobe, so that 16 × 16 pixels resolve it.
+    base = {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.4}}
+    bsdf = dict(GRATING, fresnel="schlick", conserve_energy=False, base=base)
+    for light in (SUN, {"type": "point", "position": [0.5, 0.3, 1.5], "intensity": {"type": "uniform", "value": 2.0}}):
+        for grating in (bsdf, {"type": "diffuse"}):
+            expected = picture(DIRECT, 4096, bsdf=grating, light=light)
+            image = picture(shader(as_published=False, terms=16), 64, bsdf=grating, light=light)
+            np.testing.assert_allclose(image.sum((0, 1)), expected.sum((0, 1)), rtol=0.03)
+            assert np.abs(image - expected).sum() < 0.06 * expected.sum()
+
+
+@pytest.mark.slow
+def test_each_quirk_of_the_scene_is_a_parameter():
+    published = picture(shader(terms=16), 4)
+    for name in ("window_pi", "d65_twice", "cie_rgb_matrix", "relative", "power_gamma"):
+        changed = picture(shader(terms=16, **{name: False}), 4)
+        assert np.abs(changed - published).max() > 0.003 * published.max(), name
+
+
+@pytest.mark.slow
+def test_the_base_receives_the_transmitted_light():
+    bsdf = dict(GRATING, depth=0.0, base={"type": "diffuse", "reflectance": {"type": "uniform", "value": 1.0}})
+    side = (slice(None), slice(0, 4))  # far from the mirror direction
+    expected = picture(DIRECT, 256, bsdf=bsdf)[side].mean()
+    right = picture(shader(as_published=False, terms=2), 256, bsdf=bsdf)[side].mean()
+    assert right == pytest.approx(expected, rel=0.02)
+    wrong = picture(shader(as_published=False, constant_blend=True, diffuse_weight=0.5, terms=2), 256, bsdf=bsdf)
+    plain = picture(DIRECT, 256, bsdf={"type": "diffuse", "reflectance": {"type": "uniform", "value": 1.0}})
+    assert wrong[side].mean() == pytest.approx(0.5 * plain[side].mean(), rel=0.02)
+
+
+def test_shadows_are_cast_only_on_request():
+    cover = {"type": "rectangle", "bsdf": {"type": "conductor"},
+             "to_world": mi.ScalarTransform4f().translate([0, 0, 5]).rotate([1, 0, 0], 180).scale(4)}  # fmt: skip
+    bsdf = {"type": "diffuse"}
+    lit = picture(shader(), bsdf=bsdf, cover=cover)
+    dark = picture(shader(shadows=True), bsdf=bsdf, cover=cover)
+    np.testing.assert_allclose(lit.mean(), picture(shader(), bsdf=bsdf).mean(), rtol=0.03)
+    assert not dark.any()
+
+
+def test_twosided_shades_both_sides():
+    both = {"type": "twosided", "inner": GRATING}
+    settings = shader(as_published=False, terms=16)
+    front = picture(settings, bsdf=both)
+    np.testing.assert_allclose(front, picture(settings), atol=1e-3 * front.max())
+    turned = mi.ScalarTransform4f().rotate([0, 1, 0], 180)
+    plate = {"type": "rectangle", "bsdf": both, "to_world": turned}
+    back = picture(settings, plate=plate)
+    assert back.sum() == pytest.approx(front.sum(), rel=0.05)
+    assert not picture(settings, plate=dict(plate, bsdf=GRATING)).any()
+
+
+def test_a_recipe_gives_the_heights(tmp_path):
+    recipe = tmp_path / "blaze.toml"
+    recipe.write_text(
+        '[surface]\nprofile = "blazed"\nperiod = 2.5\ndepth = 0.25\nsamples = 64\n[spectrum]\ncoherence_length = 5.0\n'
+    )
+    image = picture(shader(terms=8), bsdf={"type": "diffraction_grating", "filename": str(recipe)})
+    np.testing.assert_allclose(image, picture(shader(terms=8)), rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "of", "message"),
+    [
+        ({"variant": "flsss"}, {}, "variant: got 'flsss', wanted one of flss, nmm, pq, gem"),
+        ({"varriant": "flss"}, {}, "varriant"),
+        ({"variant": "gem", "terms": 3}, {}, "terms"),
+        ({"diffuse_weight": 2.0}, {}, "diffuse_weight: got 2.0, wanted 0 to 1"),
+        ({"as_published": "false"}, {}, "as_published: got 'false', wanted true or false"),
+        ({"shadows": "false"}, {}, "shadows: got 'false', wanted true or false"),
+        ({"window_pi": "false"}, {}, "window_pi: got 'false', wanted True or False"),
+        ({}, {"light": {"type": "constant"}}, "no directional or point light"),
+        (
+            {},
+            {"bsdf": {"type": "mask", "inner": GRATING}},
+            "stands inside MaskBSDF, wanted on a shape or inside twosided",
+        ),
+    ],
+)
+def test_what_the_integrator_cannot_show_is_refused_in_one_line(parameters, of, message):
+    with pytest.raises(Exception) as caught:  # noqa: PT011 (Mitsuba's own types, by where it happens)
+        picture({"type": "diffraction_shader", **parameters}, **of)
+    line = root_cause(caught.value)
+    assert message in line
+    assert "\n" not in line
+
+
+def test_a_saved_spectrum_holds_no_heights(tmp_path):
+    path = tmp_path / "blaze.exr"
+    md.precompute(BLAZE).save(path)
+    with pytest.raises(Exception) as caught:  # noqa: PT011
+        picture(shader(), bsdf={"type": "diffraction_grating", "filename": str(path)})
+    assert "needs heights, and a saved spectrum does not hold them" in root_cause(caught.value)
+
+
+def test_other_spectral_variants_show_the_same():
+    settings = dict(height_field=BLAZE, quirks=CORRECTED, terms=4)
+    wi, wo = ([float(x) for x in unit(s)] for s in (0.2, -0.42))
+    values = []
+    for name in ("llvm_ad_spectral", "scalar_spectral", "llvm_ad_spectral_polarized"):
+        mi.set_variant(name)
+        for kind in ("flss", "nmm", "pq"):
+            built = VARIANTS[kind](**settings)
+            values.append(np.array(built.rgb(mi.Vector3f(*wi), mi.Vector3f(*wo), built.weights())).ravel())
+    values = np.array(values).reshape(3, 3, 3)
+    assert values[0].any()
+    np.testing.assert_allclose(values[1], values[0], rtol=2e-3, atol=1e-4 * np.abs(values).max())
+    np.testing.assert_allclose(values[2], values[0], rtol=1e-5)
+    image = picture(shader(terms=4))
+    assert np.isfinite(image).all()
+    assert image.any()
+
+
+def test_variants_without_wavelengths_are_refused():
+    mi.set_variant("llvm_ad_rgb")
+    with pytest.raises(Exception, match="needs the wavelength of light"):
+        mi.load_dict({"type": "diffraction_shader"})
+    with pytest.raises(ValueError, match="wanted a spectral one"):
+        colour(BLAZE, unit(0.1), unit(0.1))
+
+
+def test_a_picture_follows_its_light_and_leaves_ctrl_c_alone():
+    light = {"type": "directional", "direction": [0, 0, -1], "irradiance": {"type": "uniform", "value": 1.0}}
+    built = scene({"type": "diffraction_shader"}, light=light)
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        before = np.array(mi.render(built, spp=1, seed=1))
+        parameters = mi.traverse(built)
+        names = list(parameters.keys())
+        (name,) = (name for name in names if name.endswith("irradiance.value"))
+        parameters[name] = 2 * parameters[name]
+        parameters.update()
+        after = np.array(mi.render(built, spp=1, seed=1))
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+    finally:
+        signal.signal(signal.SIGINT, handler)
+    assert before.max() > 0
+    assert after.sum() > 1.1 * before.sum()

@@ -1,0 +1,291 @@
+"""Evaluation as in chapter 5 of the thesis of 2014: grating equation, analytic orders, direct sums."""
+
+import csv
+import functools
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+
+import mitsuba_diffraction as md
+from mitsuba_diffraction.evaluation.realtime_shader.quirks import Quirks
+from mitsuba_diffraction.evaluation.validation.brdf_map import MAP_METHODS, PROJECTIONS, brdf_map
+from mitsuba_diffraction.evaluation.validation.figures import save_figures
+from mitsuba_diffraction.evaluation.validation.published_surfaces import SURFACES, PublishedSurface
+from mitsuba_diffraction.evaluation.validation.viewing_angle import (
+    METHODS,
+    ReflectanceMap,
+    fit_period,
+    grating_equation,
+    peak_angles,
+    reflectance_map,
+    relative_reflectance,
+    viewing_angles,
+    wavelengths,
+)
+
+BLAZE = SURFACES["blaze"]
+COARSE = wavelengths(40.0)
+SKINS = {"elaphe": (1, 1.144), "xenopeltis": (0, 1.552)}
+"""Diffracting axis, period in µm."""
+
+
+@functools.cache
+def small_skin(name):
+    axis, period = SKINS[name]
+    surface = {"profile": name, "size": 12.0, "pixel_size": 0.085, "seed": 1}
+    return PublishedSurface(name, md.Recipe(surface, {"coherence_length": 10.0}), axis, period, (1e3 * period, 0.0))
+
+
+# ---------------------------------------------------------------- the model at directions
+
+
+def test_a_flat_mirror_has_the_relative_reflectance_one(llvm):
+    flat = md.precompute(md.HeightField(np.zeros((8, 8)), 0.05))
+    found = relative_reflectance(flat, [0, 0, 1], [[0, 0, 1]], COARSE)
+    assert found.shape == (1, COARSE.size)
+    np.testing.assert_allclose(found, 1, atol=2e-3)  # what cutting off the lobes and the bytes of E leave
+
+
+@pytest.mark.few(1)
+@pytest.mark.parametrize("order", [-1, 0, 1])
+def test_orders_of_a_shallow_blaze_are_the_analytic_ones(llvm, order):
+    depth, period, incidence = 0.02, 2.5, np.deg2rad(20.0)
+    spectrum = md.precompute(md.gratings.blazed(period, depth), tolerance=1e-4)
+    for nanometres in (400.0, 550.0, 777.0):
+        # Light comes from −x; the order m of the phase leaves to −λm/T − ω_i.
+        x = np.sin(incidence) - nanometres * 1e-3 * order / period
+        wi, wo = np.array([-np.sin(incidence), 0, np.cos(incidence)]), np.array([x, 0, np.sqrt(1 - x**2)])
+        cosines = wi[2] + wo[2]
+        eta = np.sinc(order - cosines * 1e3 / nanometres * depth) ** 2
+        d = 1 + wi @ wo
+        k = d**2 / (wi[2] * wo[2] * cosines**2)
+        g = min(1, 2 * cosines * min(wi[2], wo[2]) / d)
+        expected = fresnel(np.sqrt(d / 2)) / 0.04 * k * g * wi[2] * eta
+        found = relative_reflectance(spectrum, wi, wo, [nanometres])
+        assert found == pytest.approx(np.array([expected]), rel=5e-3)
+
+
+def fresnel(cosine, index=1.5):
+    """Unpolarised power reflectance."""
+    t = np.sqrt(1 - (1 - cosine**2) / index**2)
+    s, p = (cosine - index * t) / (cosine + index * t), (index * cosine - t) / (index * cosine + t)
+    return (s**2 + p**2) / 2
+
+
+def test_the_number_of_wavelengths_need_not_be_a_multiple_of_four(llvm):
+    wi, wo = BLAZE.direction(75.0), BLAZE.direction([-55.0, -50.0, -45.0])
+    together = relative_reflectance(BLAZE.spectrum, wi, wo, COARSE[:7])
+    for nanometres, row in zip(COARSE, together.T, strict=False):
+        np.testing.assert_allclose(relative_reflectance(BLAZE.spectrum, wi, wo, [nanometres])[:, 0], row, rtol=1e-5)
+
+
+def test_directions_below_the_surface_are_dark(llvm):
+    assert relative_reflectance(BLAZE.spectrum, [0, 0, 1], [[0, 0.6, -0.8], [0, 1, 0]], [500.0]).max() == 0
+
+
+# ---------------------------------------------------------------- viewing angle
+
+
+def gaussian_lobes(period, incidence=75.0, step=0.25, width=0.0069):
+    """A map as a grating with Gaussian lobes about orders 0, 1 and 2 would give it."""
+    nanometres, angles = wavelengths(20.0), viewing_angles(step)
+    sines = np.sin(np.deg2rad(incidence)) + np.sin(np.deg2rad(angles))
+    q = sines / (nanometres[:, None] * 1e-3)
+    lobes = sum(s * np.exp(-((q - n / period) ** 2) / (2 * width**2)) for n, s in ((0, 9.0), (1, 1.0), (2, 0.3)))
+    return ReflectanceMap(BLAZE, "flss", incidence, nanometres, angles, lobes)
+
+
+@given(period=st.floats(2.3, 2.7), incidence=st.floats(20.0, 80.0))
+def test_the_fit_finds_the_period_of_gaussian_lobes_between_the_samples(period, incidence):
+    fit = fit_period(gaussian_lobes(period, incidence))
+    assert fit.mean == pytest.approx(period * 1e3, rel=1e-6)
+    assert fit.variance < 1e-4
+
+
+def test_the_fit_reveals_periods_that_vary_with_the_wavelength():
+    found = gaussian_lobes(2.5)
+    half = found.wavelengths < 580
+    other = gaussian_lobes(2.45).reflectance
+    mixed = ReflectanceMap(
+        BLAZE, "flss", 75.0, found.wavelengths, found.angles, np.where(half[:, None], found.reflectance, other)
+    )
+    fit = fit_period(mixed)
+    share = half.mean()
+    assert fit.mean == pytest.approx(2450 + 50 * share, abs=0.01)
+    assert fit.variance == pytest.approx(2500 * share * (1 - share), rel=1e-3)
+
+
+def test_the_peaks_lie_on_the_grating_equation():
+    found = gaussian_lobes(2.5)
+    np.testing.assert_allclose(peak_angles(found), grating_equation(2.5, 75.0, found.wavelengths), atol=1e-5)
+
+
+def test_the_grating_equation_gives_the_angles_computed_by_hand():
+    # sin 30° = 0.5; 0.5 µm / 2.5 µm = 0.2.
+    expected = np.rad2deg(np.arcsin([-0.3, -0.1, 0.9]))
+    np.testing.assert_allclose([grating_equation(2.5, 30.0, 500.0, n) for n in (1, 2, 7)], expected)
+    assert np.isnan(grating_equation(2.5, 30.0, 500.0, 8))
+
+
+def test_a_dark_map_has_no_peak():
+    found = gaussian_lobes(2.5)
+    dark = ReflectanceMap(BLAZE, "flss", 75.0, found.wavelengths, found.angles, 0 * found.reflectance)
+    assert np.isnan(peak_angles(dark)).all()
+    with pytest.raises(ValueError, match=r"reflectance: got none outside of the specular peak at 380 nm"):
+        fit_period(dark)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("published", [True, False], ids=["published", "corrected"])
+def test_the_period_of_the_blaze_is_fitted_within_a_thousandth(llvm, method, published):
+    quirks = Quirks.as_published() if published else Quirks.corrected()
+    fit = fit_period(reflectance_map(BLAZE, method, wavelengths=COARSE, quirks=quirks))
+    assert fit.mean == pytest.approx(2500, rel=1e-3)
+    assert fit.variance < 0.5
+
+
+def test_any_other_angle_gives_the_same_period(llvm):
+    fit = fit_period(reflectance_map(BLAZE, incidence=30.0, wavelengths=COARSE))
+    assert fit.mean == pytest.approx(2500, rel=1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SKINS)
+def test_the_period_of_a_small_skin_is_fitted_within_a_hundredth(llvm, name):
+    found = reflectance_map(small_skin(name), wavelengths=COARSE, angles=viewing_angles(0.25))
+    assert fit_period(found).mean == pytest.approx(1e3 * SKINS[name][1], rel=1e-2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("name", SKINS)
+def test_the_period_of_a_skin_is_fitted_within_a_hundredth(llvm, name, method):
+    surface = SURFACES[name]
+    fit = fit_period(reflectance_map(surface, method))
+    assert fit.mean == pytest.approx(surface.published[0], rel=1e-2)
+    if method == "model":
+        assert fit.variance < 0.5
+
+
+def test_model_and_corrected_shader_agree_on_the_orders(llvm):
+    # Both relative to the same flat mirror; E ≤ 1 and the exact Fresnel formula are the model's own.
+    angles = grating_equation(BLAZE.period, 30.0, 380.0)
+    model, shader = (
+        reflectance_map(BLAZE, m, incidence=30.0, wavelengths=[380.0], angles=[angles], quirks=Quirks.corrected())
+        for m in ("model", "flss")
+    )
+    assert model.reflectance == pytest.approx(shader.reflectance, rel=0.02)
+
+
+@pytest.mark.parametrize("incidence", [30.0, 75.0])
+def test_nmm_sees_only_the_orders_of_the_tile(llvm, incidence):
+    found = reflectance_map(BLAZE, "nmm", incidence=incidence, wavelengths=[400.0, 780.0])
+    sine = np.sin(np.deg2rad(incidence))
+    for row, nanometres in zip(found.angles, found.wavelengths, strict=True):
+        orders = 2.5 * (sine + np.sin(np.deg2rad(row))) / (nanometres * 1e-3)
+        first, last = int(2500 * (sine - 1) / nanometres), int(2500 * (sine + 1) / nanometres)
+        expected = [n for n in range(first, last + 1) if n]
+        np.testing.assert_allclose(orders[np.isfinite(orders)], expected, rtol=1e-9)
+    np.testing.assert_array_equal(np.isnan(found.angles), np.isnan(found.reflectance))
+
+
+# ---------------------------------------------------------------- maps of directions
+
+
+@pytest.mark.few(1)
+@pytest.mark.parametrize("projection", PROJECTIONS)
+def test_an_order_is_where_the_map_says(llvm, projection):
+    found = brdf_map(BLAZE.coherent_over(6.5), projection=projection, side=120, incidence=(30.0, 20.0))
+    for nanometres, channel in ((450.0, 2), (650.0, 0)):
+        x, y = found.places_of_orders(np.float64(nanometres), np.int64(1))
+        column, row = np.abs(found.x - x).argmin(), np.abs(found.y - y).argmin()
+        colour = found.rgb[row, column]
+        assert colour.argmax() == channel
+        # Nothing beside it, and an order beyond the horizon has no place.
+        assert found.rgb[(row + 30) % 120, column].max() < 1e-2 * colour.max()
+    assert np.isnan(found.places_of_orders(np.float64(650.0), np.int64(9))).all()
+
+
+def test_an_order_stands_still_in_the_plane_of_u_and_v(llvm):
+    places = [
+        brdf_map(BLAZE, "gem", projection="uv", side=8, incidence=(theta, 10.0)).places_of_orders(550.0, np.int64(-1))
+        for theta in (0.0, 20.0, 40.0)
+    ]
+    np.testing.assert_allclose(places, [(-0.55 / 2.5, 0)] * 3, atol=1e-12)
+
+
+@pytest.mark.parametrize("method", MAP_METHODS)
+def test_a_map_is_a_picture_of_the_hemisphere(llvm, method):
+    found = brdf_map(BLAZE.coherent_over(6.5), method, side=40)
+    inside = np.hypot(*np.meshgrid(found.x, found.y)) < 90
+    np.testing.assert_array_equal(np.isfinite(found.rgb).all(axis=-1), inside)
+    picture = found.picture
+    assert picture.min() >= 0
+    assert picture.max() <= 1
+    assert np.ptp(picture[inside]) > 0.5
+    assert found.exposure > 0
+
+
+# ---------------------------------------------------------------- figures
+
+
+@pytest.mark.slow
+def test_figures_and_the_table_are_written(llvm, tmp_path):
+    steps = []
+    folder = tmp_path / "new" / "figures"
+    files = save_figures(
+        folder, surfaces=["blaze"], step=50.0, side=24, progress=lambda done, total: steps.append((done, total))
+    )
+    assert steps == [(1, 2), (2, 2)]
+    names = {"viewing_angle_blaze.png", "brdf_blaze.png", "periods.md", "periods.csv"}
+    assert {path.name for path in files} == {path.name for path in folder.iterdir()} == names
+    for path in folder.glob("*.png"):
+        with Image.open(path) as picture:
+            picture.load()
+            assert min(picture.size) > 200
+    with open(folder / "periods.csv", newline="", encoding="utf-8") as file:
+        head, *rows = csv.reader(file)
+    assert [row[1] for row in rows] == [
+        "this model",
+        *(f"{name}, {how}" for name in ("FLSS", "NMM", "PQ") for how in ("as published", "corrected")),
+    ]
+    for row in rows:
+        assert float(row[head.index("period / nm")]) == pytest.approx(2500, rel=1e-3)
+    table = (folder / "periods.md").read_text(encoding="utf-8").splitlines()
+    assert len(table) == 2 + len(rows)
+    assert f"| {' | '.join(rows[0])} |" == table[2]
+
+
+# ---------------------------------------------------------------- misuse
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (
+            lambda: save_figures("nowhere", surfaces=["blaze", "python"]),
+            "surfaces: got 'python', wanted among blaze, elaphe, xenopeltis",
+        ),
+        (lambda: reflectance_map(BLAZE, "gem"), "method: got 'gem', wanted one of model, flss, nmm, pq"),
+        (lambda: reflectance_map(BLAZE, incidence=90.0), r"incidence: got 90\.0, wanted degrees"),
+        (lambda: brdf_map(BLAZE, "none"), "method: got 'none'"),
+        (lambda: brdf_map(BLAZE, projection="fisheye"), "projection: got 'fisheye'"),
+        (lambda: brdf_map(BLAZE, incidence=(95.0, 0.0)), r"incidence: got \(95\.0, 0\.0\)"),
+        (lambda: relative_reflectance(BLAZE.spectrum, [0, 0, 1], [[0, 1]], [500.0]), "wi, wo, wavelengths: got shapes"),
+        (lambda: PublishedSurface("x", BLAZE.recipe, 2, 1.0, (0, 0)), "axis: got 2"),
+        (lambda: PublishedSurface("x", BLAZE.recipe, 0, 0.0, (0, 0)), r"period: got 0\.0"),
+    ],
+)
+def test_wrong_arguments_are_refused(llvm, call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+def test_a_variant_without_wavelengths_is_refused():
+    mi.set_variant("scalar_rgb")
+    with pytest.raises(ValueError, match="variant: Mitsuba's is scalar_rgb, wanted a spectral one"):
+        relative_reflectance(BLAZE.spectrum, [0, 0, 1], [0, 0, 1], [500.0])

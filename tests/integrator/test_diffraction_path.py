@@ -1,0 +1,318 @@
+"""The integrator `diffraction_path` beside Mitsuba's `path`."""
+
+import signal
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from bsdf_support import grating, uniform, use
+
+import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a variant is set)
+from mitsuba_diffraction.render import scene as scene_module
+from mitsuba_diffraction.render.film import trace_pass
+from mitsuba_diffraction.render.scene import channel_weights, load_spectral_scene
+
+SUN = {"type": "directional", "direction": [0, 0.6, -0.8], "irradiance": uniform(1.0)}
+SKY = {"type": "constant", "radiance": uniform(0.05)}
+
+
+def blaze(coherence_length=1.5, **parameters):
+    """A grating, by default with lobes so wide that `path` converges as well; without E, for speed."""
+    return grating("blazed", coherence_length, conserve_energy=False, **parameters)
+
+
+def at(*place):
+    return mi.ScalarTransform4f().translate(place)
+
+
+def diffuse(reflectance):
+    return {"type": "diffuse", "reflectance": uniform(reflectance)}
+
+
+def plate(bsdf, scale=1.0, height=0.1):
+    return {"type": "rectangle", "to_world": at(0, 0, height).scale(scale), "bsdf": bsdf}
+
+
+def scene(sensor=None, film=None, **parts):
+    """A floor and a wall behind it, white; z is up, and the camera looks along y."""
+    look = mi.ScalarTransform4f().look_at([0, -3.5, 2.5], [0, 0.5, 0.5], [0, 0, 1])
+    size = {"width": 8, "height": 8, "component_format": "float32", "pixel_format": "rgb", "rfilter": {"type": "box"}}
+    wall = at(0, 1.5, 0).rotate([1, 0, 0], 90).scale(4)
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": {
+                **{"type": "perspective", "fov": 60, "to_world": look, **(sensor or {})},
+                **{"film": {"type": "hdrfilm", **size, **(film or {})}, "sampler": {"type": "independent"}},
+            },
+            "floor": {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(4), "bsdf": diffuse(0.6)},
+            "wall": {"type": "rectangle", "to_world": wall, "bsdf": diffuse(0.8)},
+            **parts,
+        }
+    )
+
+
+def sun_alone():
+    return scene(plate=plate(blaze(material="Al"), height=0.4), sun=SUN)
+
+
+def sun_and_sky():
+    """A grating with pigment on both sides of a plate."""
+    pigment = blaze(int_ior=1.8, base=diffuse(0.4))
+    return scene(plate={**plate({"type": "twosided", "bsdf": pigment}, height=0.4)}, sun=SUN, sky=SKY)
+
+
+def lamp_and_spot():
+    """Two gratings, one with a direction that changes from place to place, a mirror, and a camera with a lens."""
+    turn = {
+        **{"type": "bitmap", "raw": True, "filter_type": "nearest"},
+        "bitmap": mi.Bitmap(np.array([[0, 90], [45, 120]], np.float32)[..., None]),
+    }
+    mirror = {"type": "conductor", "material": "none"}
+    return scene(
+        sensor={"type": "thinlens", "aperture_radius": 0.2, "focus_distance": 4.0},
+        plate=plate(blaze(material="Al", orientation=turn)),
+        ball={"type": "sphere", "center": [-1, 0.3, 0.5], "radius": 0.4, "bsdf": blaze(material="Al")},
+        mirror={"type": "rectangle", "to_world": at(2.2, 0.5, 1).rotate([0, 1, 0], -90), "bsdf": mirror},
+        lamp={
+            **{"type": "sphere", "center": [0.5, -1, 3], "radius": 0.3},
+            "emitter": {"type": "area", "radiance": uniform(2.0)},
+        },
+        spot={
+            **{"type": "spot", "intensity": uniform(2.0), "cutoff_angle": 25},
+            "to_world": mi.ScalarTransform4f().look_at([-1, -2, 3], [0, 0, 0], [0, 1, 0]),
+        },
+    )
+
+
+def blend_under_a_point():
+    """A grating blended with a mirror, on a normal map, which turns the normal by 15°."""
+    tilt = np.array([np.sin(np.deg2rad(15)), 0, np.cos(np.deg2rad(15))])
+    normals = {
+        **{"type": "bitmap", "raw": True},
+        "bitmap": mi.Bitmap(np.tile((tilt + 1) / 2, (2, 2, 1)).astype(np.float32)),
+    }
+    blend = {"type": "blendbsdf", "weight": 0.3, "grating": blaze()}
+    blend["mirror"] = {"type": "roughconductor", "material": "Al", "alpha": 0.4}
+    tilted = {"type": "normalmap", "normalmap": normals, "bsdf": blend}
+    light = {"type": "point", "position": [0, -1, 3], "intensity": uniform(5.0)}
+    return scene(plate=plate({"type": "twosided", "bsdf": tilted}), light=light, sky=SKY)
+
+
+def halves(picture):
+    """Means over 2 × 2 regions of a picture."""
+    rows, columns = picture.shape[:2]
+    return picture[..., :3].reshape(2, rows // 2, 2, columns // 2, 3).mean((1, 3, 4))
+
+
+def region_means(built, integrator, spp, pictures=12):
+    """Means and their standard errors, (2, 2) each, from independent pictures."""
+    means = [halves(np.array(mi.render(built, integrator=integrator, spp=spp, seed=k))) for k in range(pictures)]
+    return np.mean(means, 0), np.std(means, 0, ddof=1) / np.sqrt(pictures)
+
+
+def assert_agree(built, depth, spp, **parameters):
+    names = ("path", "diffraction_path")
+    integrators = [mi.load_dict({"type": name, "max_depth": depth, **parameters}) for name in names]
+    (wanted, its_error), (found, error) = (region_means(built, each, spp) for each in integrators)
+    np.testing.assert_array_less(np.abs(found - wanted), 4 * np.hypot(its_error, error))
+    # Without the light's part the check would fail.
+    eye, light = integrators[1].parts(built, built.sensors()[0])
+    left, _ = region_means(built, eye, spp)
+    assert light is not None
+    assert ((wanted - left) / its_error).max() > 6
+
+
+@pytest.mark.parametrize(
+    ("build", "depth", "spp"),
+    [
+        (sun_alone, 3, 1024),
+        pytest.param(sun_and_sky, 4, 1024, marks=pytest.mark.slow),
+        pytest.param(lamp_and_spot, 5, 2048, marks=pytest.mark.slow),
+        pytest.param(blend_under_a_point, -1, 1024, marks=pytest.mark.slow),
+    ],
+)
+def test_converges_to_what_path_converges_to(build, depth, spp, llvm):
+    assert_agree(build(), depth, spp, rr_depth=3)
+
+
+@pytest.mark.slow
+def test_converges_in_a_scalar_variant():
+    use("scalar_spectral")
+    assert_agree(scene(plate=plate(blaze()), sun=SUN, film={"width": 4, "height": 4}), 3, 16)
+
+
+@pytest.mark.slow
+def test_light_cast_by_a_grating_onto_a_wall_is_far_less_noisy(llvm):
+    narrow = blaze(26.0, material="Al")
+    built = scene(plate=plate(narrow, 0.5), sun=SUN)
+    at_wall = {}
+    for name in ("path", "diffraction_path"):
+        integrator = mi.load_dict({"type": name, "max_depth": 3})
+        pictures = [np.array(mi.render(built, integrator=integrator, spp=64, seed=k))[:4] for k in range(12)]
+        at_wall[name] = np.var(pictures, 0, ddof=1).mean()
+    assert at_wall["path"] > 50 * at_wall["diffraction_path"]
+
+
+def test_a_grating_seen_in_another_is_less_noisy_than_with_path(llvm):
+    narrow = blaze(26.0, material="Al")
+    ball = {"type": "sphere", "center": [0, 0, 0.8], "radius": 0.8, "bsdf": narrow}
+    built = scene(floor=plate(narrow, 4, 0), wall=ball, sky=SKY)
+    noise, means, errors = [], [], []
+    for name in ("path", "diffraction_path"):
+        integrator = mi.load_dict({"type": name, "max_depth": 6})
+        pictures = np.array([mi.render(built, integrator=integrator, spp=32, seed=k) for k in range(12)])
+        noise.append(pictures.var(0, ddof=1).mean())
+        means.append(pictures.mean())
+        errors.append(pictures.mean((1, 2, 3)).std(ddof=1) / np.sqrt(len(pictures)))
+    assert abs(means[0] - means[1]) < 4 * np.hypot(*errors)
+    assert noise[0] > 1.4 * noise[1], noise
+
+
+@pytest.mark.few(1)
+@pytest.mark.parametrize(("bsdf", "depth"), [(blaze, 1), (blaze, 2), (lambda: diffuse(0.5), 5)])
+def test_without_light_cast_by_gratings_it_is_path(bsdf, depth, llvm):
+    built = scene(plate=plate(bsdf()), sun=SUN, sky=SKY)
+    pictures = [
+        np.array(mi.render(built, integrator=mi.load_dict({"type": name, "max_depth": depth}), spp=4, seed=3))
+        for name in ("path", "diffraction_path")
+    ]
+    np.testing.assert_array_equal(*pictures)
+
+
+def test_polarised_variants_trace_from_the_eye():
+    use("llvm_ad_spectral_polarized")
+    built = scene(plate=plate(blaze()), sun=SUN)
+    integrator = mi.load_dict({"type": "diffraction_path", "max_depth": 3})
+    assert integrator.parts(built, built.sensors()[0]) == (integrator.path, None)
+
+
+def test_sensors_without_a_connection_trace_from_the_eye(llvm):
+    built = scene(plate=plate(blaze()), sun=SUN)
+    integrator = mi.load_dict({"type": "diffraction_path"})
+    assert integrator.parts(built, mi.load_dict({"type": "orthographic"})) == (integrator.path, None)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "message"), [({"hide_emitters": True}, "hide_emitters: got true"), ({"max_dept": 3}, "max_dept")]
+)
+def test_wrong_parameters_are_refused(parameters, message, llvm):
+    with pytest.raises(RuntimeError, match=message):
+        mi.load_dict({"type": "diffraction_path", **parameters})
+
+
+def test_samples_beyond_the_edge_are_refused(llvm):
+    beyond = {"sample_border": True, "rfilter": {"type": "gaussian"}}
+    built = scene(plate=plate(blaze()), sun=SUN, film=beyond)
+    with pytest.raises(ValueError, match="sample_border: got true"):
+        mi.load_dict({"type": "diffraction_path"}).render(built)
+
+
+SCENE = """<scene version="3.0.0">
+    <integrator type="diffraction_path"><integer name="max_depth" value="4"/></integrator>
+    <sensor type="perspective"><float name="fov" value="60"/>
+        <transform name="to_world"><lookat origin="0,-3.5,2.5" target="0,.5,.5" up="0,0,1"/></transform>
+        <film type="hdrfilm"><integer name="width" value="16"/><integer name="height" value="12"/>
+            <integer name="crop_offset_x" value="3"/><integer name="crop_width" value="12"/>
+            <integer name="crop_offset_y" value="2"/><integer name="crop_height" value="8"/>
+            <rfilter type="gaussian"/></film>
+    </sensor>
+    <shape type="rectangle"><transform name="to_world"><scale value="4"/></transform></shape>
+    <shape type="rectangle"><transform name="to_world"><rotate x="1" angle="90"/><scale value="4"/>
+        <translate y="1.5"/></transform></shape>
+    <shape type="rectangle"><transform name="to_world"><translate z=".1"/></transform>
+        <bsdf type="diffraction_grating"><string name="profile" value="blazed"/><float name="period" value="2.5"/>
+            <float name="depth" value="0.25"/><float name="coherence_length" value="6"/>
+            <string name="material" value="none"/></bsdf></shape>
+    <emitter type="directional"><vector name="direction" x="0" y=".6" z="-.8"/></emitter>
+</scene>"""
+
+
+@pytest.mark.slow
+def test_passes_do_not_depend_on_threads_and_agree_with_mitsubas_film(llvm, tmp_path):
+    path = tmp_path / "scene.xml"
+    path.write_text(SCENE)
+    built = load_spectral_scene(path)
+    threads = dr.thread_count()
+    try:
+        passes = []
+        for count in (1, 3):
+            dr.set_thread_count(count)
+            passes.append(trace_pass(built, 64, 5))
+    finally:
+        dr.set_thread_count(threads)
+    np.testing.assert_array_equal(*passes)
+    own = [trace_pass(built, 1024, k) for k in range(4)]
+    own = np.mean([halves(each[..., :-1] / each[..., -1:]) for each in own], 0)
+    theirs = np.mean([halves(np.array(mi.render(built, spp=1024, seed=k)) / channel_weights()) for k in range(4)], 0)
+    np.testing.assert_allclose(own, theirs, rtol=0.1)
+
+
+@pytest.mark.few(1)
+def test_aov_around_it_gives_its_picture(llvm):
+    built = sun_alone()
+    inner = {"type": "diffraction_path", "max_depth": 3}
+    around = mi.load_dict({"type": "aov", "aovs": "z:depth", "inner": inner})
+    own = np.array(mi.render(built, integrator=mi.load_dict(inner), spp=16, seed=5))
+    channels = np.array(mi.render(built, integrator=around, spp=16, seed=5))
+    assert channels.shape[2] == own.shape[2] + 1
+    np.testing.assert_allclose(channels[..., :3], own[..., :3], rtol=1e-4)
+
+
+@pytest.mark.parametrize("mode", ["forward", "backward"])
+def test_gradients_are_finite_differences(llvm, mode):
+    built = sun_alone()
+    integrator = mi.load_dict({"type": "diffraction_path", "max_depth": 3})
+    params = mi.traverse(built)
+
+    def brightness(reflectance):
+        params["wall.bsdf.reflectance.value"] = reflectance
+        params.update()
+        return dr.mean(mi.render(built, params, integrator=integrator, seed=7, spp=1024), axis=None)
+
+    # Light that meets the wall twice is beyond max_depth, so that the brightness is a linear function.
+    finite = (brightness(mi.Float(0.9)) - brightness(mi.Float(0.7))) / 0.2
+    reflectance = mi.Float(0.8)
+    dr.enable_grad(reflectance)
+    picture = brightness(reflectance)
+    if mode == "forward":
+        dr.forward(reflectance)
+    else:
+        dr.backward(picture)
+    found = dr.grad(picture if mode == "forward" else reflectance)
+    np.testing.assert_allclose(np.array(found).item(), np.array(finite).item(), rtol=0.03)
+
+
+def test_both_halves_draw_the_lines_of_a_lamp(llvm, tmp_path, monkeypatch):
+    path = tmp_path / "scene.xml"
+    line = '<spectrum name="irradiance" value="545:0, 546:1, 547:0"/></emitter>'
+    path.write_text(SCENE.replace("</emitter>", line))
+
+    def pictures():
+        built = load_spectral_scene(path)
+        eye, _ = built.integrator().parts(built, built.sensors()[0])
+        for k in range(8):
+            whole = trace_pass(built, 32, k)[..., :-1].sum((0, 1, 2))
+            from_eye = trace_pass(built, 32, k, eye)[..., :-1].sum((0, 1, 2))
+            yield from_eye, whole - from_eye
+
+    found = np.array(list(pictures()))
+    # Drawn by the response of the film alone they have the same mean and far more noise.
+    monkeypatch.setattr(scene_module, "_draw_wavelengths_of_lights", lambda built: None)
+    wanted = np.array(list(pictures()))
+    error = np.std(wanted, 0, ddof=1) / np.sqrt(len(wanted))
+    np.testing.assert_array_less(np.abs(found.mean(0) - wanted.mean(0)), 4 * error)
+    np.testing.assert_array_less(10 * np.var(found, 0, ddof=1), np.var(wanted, 0, ddof=1))
+
+
+@pytest.mark.slow
+def test_the_handler_of_ctrl_c_is_kept(llvm):
+    built = scene(plate=plate(blaze()), sun=SUN)
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        mi.render(built, integrator=mi.load_dict({"type": "diffraction_path", "max_depth": 3}), spp=1)
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+    finally:
+        signal.signal(signal.SIGINT, handler)

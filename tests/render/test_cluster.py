@@ -1,0 +1,225 @@
+"""Passes on a Dask cluster: the bits of one machine, also when a worker is lost."""
+
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import drjit as dr
+import numpy as np
+import pytest
+
+import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a variant is set)
+from mitsuba_diffraction.render import SpectralImage, cluster, passes, render
+from mitsuba_diffraction.render.cluster import trace_on
+from mitsuba_diffraction.render.passes import Interrupted
+
+distributed = pytest.importorskip("distributed")
+
+SIZE = 16
+SCENE = f"""<scene version="3.0.0"><integrator type="path"/>
+<sensor type="perspective"><transform name="to_world"><lookat origin="0,-4,2" target="0,0,0.5" up="0,0,1"/></transform>
+<film type="hdrfilm"><integer name="width" value="{SIZE}"/><integer name="height" value="{SIZE}"/>
+<rfilter type="gaussian"/></film></sensor><emitter type="constant"/>
+<shape type="sphere"><point name="center" x="0.4" y="0" z="0.5"/><bsdf type="diffraction_grating">
+<string name="profile" value="blazed"/><float name="period" value="2.5"/><float name="depth" value="0.25"/>
+</bsdf></shape></scene>"""
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch, small_passes):
+    """Each test stands in a folder of its own, with a scene; passes take one sample per pixel."""
+    small_passes(SIZE)
+    monkeypatch.chdir(tmp_path)
+    Path("scene.xml").write_text(SCENE)
+    threads = dr.thread_count()
+    yield tmp_path
+    cluster.scene_of.cache_clear()
+    dr.set_thread_count(threads)
+
+
+def start(**options):
+    return distributed.LocalCluster(dashboard_address=":0", threads_per_worker=1, **options)
+
+
+@pytest.fixture
+def threads_of_this_process():
+    """A cluster of two workers that are threads of this process: for what traces nothing.
+
+    While one thread traces, no other may let go of a scene: Dr.Jit calls every BSDF that there is in the process.
+    """
+    with start(n_workers=2, processes=False, protocol="tcp") as local:
+        yield local.scheduler_address
+
+
+@pytest.fixture
+def two_processes():
+    with start(n_workers=2, processes=True) as local:
+        yield local
+
+
+def with_light_from_gratings(scene):
+    """The same on a floor in the sun, by the integrator that finds what the grating throws onto it."""
+    sun = '<emitter type="directional"><vector name="direction" x="0" y="1" z="-1"/></emitter>'
+    return scene.replace('"path"', '"diffraction_path"').replace("</scene>", f'{sun}<shape type="rectangle"/></scene>')
+
+
+@pytest.mark.few(1)
+@pytest.mark.parametrize("scene", [SCENE, with_light_from_gratings(SCENE)], ids=["path", "diffraction_path"])
+def test_a_cluster_gives_the_bits_of_one_machine(scene, two_processes, command):
+    Path("scene.xml").write_text(scene)
+    line = f"render scene.xml -o out.exr --spp 9 --variant llvm_ad_spectral --dask {two_processes.scheduler_address}"
+    code, _, err = command(line)
+    assert (code, err) == (0, "")
+    here = render("scene.xml", spp=9)
+    np.testing.assert_array_equal(SpectralImage.load("out.exr").radiance, here.radiance)
+
+    # Interrupted there and resumed here.
+    def ctrl_c(done, total, error):
+        if done == 4:
+            signal.raise_signal(signal.SIGINT)
+
+    with pytest.raises(Interrupted):
+        render("scene.xml", spp=9, checkpoint="c", tracer=trace_on(two_processes.scheduler_address), progress=ctrl_c)
+    resumed = render("scene.xml", spp=9, checkpoint="c")
+    np.testing.assert_array_equal(resumed.radiance, here.radiance)
+
+
+def test_results_that_come_out_of_order_are_added_in_order(threads_of_this_process, monkeypatch):
+    ended = []
+
+    def invented(scene, spp, seed):
+        """Numbers whose sum depends on the order, after a while that is different for each pass."""
+        rng = np.random.default_rng(seed)
+        time.sleep(rng.uniform(0, 0.1))
+        ended.append(seed)
+        return (rng.normal(size=(SIZE, SIZE, 94)) * 10 ** rng.uniform(-9, 9)).astype(np.float32)
+
+    monkeypatch.setattr(passes, "trace_pass", invented)
+    here = render("scene.xml", spp=16)
+    in_order = ended.copy()
+    ended.clear()
+    monkeypatch.setattr(cluster, "trace_pass", invented)
+    monkeypatch.setattr(cluster, "one_pass", contextlib.nullcontext())
+    there = render("scene.xml", spp=16, tracer=trace_on(threads_of_this_process))
+    assert sorted(ended) == sorted(in_order)
+    assert ended != in_order
+    np.testing.assert_array_equal(there.radiance, here.radiance)
+
+
+def test_failures_of_a_worker_are_one_line(threads_of_this_process, monkeypatch, command):
+    line = f"render scene.xml --spp 9 --variant llvm_ad_spectral --dask {threads_of_this_process}"
+
+    def fail(scene, spp, seed):
+        raise RuntimeError("rendering failed: no luck")
+
+    monkeypatch.setattr(cluster, "trace_pass", fail)
+    code, out, err = command(line)
+    assert (code, out) == (1, "")
+    assert err.splitlines()[-1] == "mitsuba-diffraction: error: rendering failed: no luck"
+
+    def miss(job):
+        raise FileNotFoundError("scene.xml: no such file")
+
+    with monkeypatch.context() as only_here:
+        only_here.setattr(passes.Job, "load", miss)
+        cluster.scene_of.cache_clear()
+        code, out, err = command(line)
+    assert (code, out) == (1, "")
+    assert err.splitlines()[-1].endswith("error: a worker cannot load the scene: scene.xml: no such file")
+    monkeypatch.setattr(cluster, "scene_digest", lambda *arguments: "another")
+    cluster.scene_of.cache_clear()
+    code, out, err = command(line)
+    assert (code, out) == (1, "")
+    assert "scene.xml: a worker finds another scene there" in err.splitlines()[-1]
+    monkeypatch.setattr(cluster, "versions", lambda: ("mitsuba 2.0",))
+    code, out, err = command(line)
+    assert "a worker has mitsuba 2.0; wanted mitsuba 3" in err.splitlines()[-1]
+
+
+def test_an_unreachable_scheduler_is_one_line(command, monkeypatch):
+    monkeypatch.setattr(cluster, "SECONDS_TO_CONNECT", 0.5)
+    line = "render scene.xml --spp 9 --variant llvm_ad_spectral --dask"
+    for address in ("tcp://127.0.0.1:1", "nonsense://x"):
+        code, out, err = command(f"{line} {address}")
+        assert (code, out) == (1, "")
+        assert f"mitsuba-diffraction: error: no Dask scheduler at {address}" in err.splitlines()[-1]
+    with start(n_workers=0, processes=False, protocol="tcp") as local:
+        code, out, err = command(f"{line} {local.scheduler_address}")
+        assert (code, out) == (1, "")
+        assert err.splitlines()[-1].endswith("has no workers")
+
+
+def test_a_port_that_is_silent_is_no_scheduler(command, monkeypatch):
+    monkeypatch.setattr(cluster, "SECONDS_TO_CONNECT", 0.5)
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
+        code, out, err = command(f"render scene.xml --spp 9 --variant llvm_ad_spectral --dask {address}")
+    assert (code, out) == (1, "")
+    assert err.strip() == f"mitsuba-diffraction: error: no Dask scheduler at {address}: it does not answer"
+
+
+@pytest.mark.slow
+def test_a_scheduler_that_stops_leaves_the_checkpoint():
+    local = start(n_workers=1, processes=False, protocol="tcp")
+
+    def close(done, total, error):
+        if done == 3:
+            local.close()
+
+    with local, pytest.raises(RuntimeError, match=r"the Dask scheduler at tcp://.* is gone"):
+        render("scene.xml", spp=60, checkpoint="c", seconds=0, tracer=trace_on(local.scheduler_address), progress=close)
+    whole = render("scene.xml", spp=60, checkpoint="c")
+    np.testing.assert_array_equal(whole.radiance, render("scene.xml", spp=60).radiance)
+
+
+@pytest.mark.slow
+def test_a_killed_scheduler_is_one_line():
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"tcp://127.0.0.1:{free.getsockname()[1]}"
+    scheduler = ["scheduler", "--host", "127.0.0.1", "--port", address.rpartition(":")[2], "--no-dashboard"]
+    dask = [
+        subprocess.Popen([sys.executable, "-m", "dask", *words], stderr=subprocess.DEVNULL)
+        for words in (scheduler, ["worker", address, "--no-dashboard", "--no-nanny", "--death-timeout", "20"])
+    ]
+    line = f"render scene.xml -o out.exr --spp 100000 --checkpoint 0 --variant llvm_ad_spectral --dask {address}"
+    try:
+        command = [sys.executable, "-m", "mitsuba_diffraction", *line.split()]
+        rendering = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+        until = time.monotonic() + 120
+        while not Path("out.exr.checkpoint").exists():
+            assert rendering.poll() is None, rendering.stderr.read()
+            assert time.monotonic() < until
+            time.sleep(0.1)
+        dask[0].kill()
+        _, err = rendering.communicate(timeout=120)
+    finally:
+        for process in dask:
+            process.kill()
+            process.wait()
+    assert rendering.returncode == 1
+    lines = [text for text in err.splitlines() if " %," not in text]
+    assert lines == [f"mitsuba-diffraction: error: the Dask scheduler at {address} is gone"]
+
+
+@pytest.mark.slow
+def test_the_passes_of_a_lost_worker_are_traced_again(two_processes):
+    here = render("scene.xml", spp=60)
+    with distributed.Client(two_processes.scheduler_address, set_as_default=False) as client:
+        pids = list(client.run(os.getpid).values())
+    assert len(set(pids)) == 2
+    calls = []
+
+    def kill(done, total, error):
+        calls.append(done)
+        if done == 7:
+            os.kill(pids[0], signal.SIGKILL)
+
+    there = render("scene.xml", spp=60, tracer=trace_on(two_processes.scheduler_address), progress=kill)
+    assert calls == list(range(61))
+    np.testing.assert_array_equal(there.radiance, here.radiance)

@@ -1,0 +1,130 @@
+import colour
+import numpy as np
+import pytest
+from PIL import Image
+
+from mitsuba_diffraction.color import auto_exposure, into_gamut, roll_off, spectrum_to_linear_sRGB, spectrum_to_XYZ
+from mitsuba_diffraction.render.preview import save_preview
+from mitsuba_diffraction.render.spectral_image import SpectralImage
+
+GRID = np.arange(365.0, 830.0, 5.0)
+FINE = np.arange(360.0, 831.0)
+CMFS = colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"]
+LUMINANCE = colour.RGB_COLOURSPACES["sRGB"].matrix_RGB_to_XYZ[1]
+
+
+def through_hats(spectrum):
+    """What a film with unit hats on GRID records of a spectrum given at FINE."""
+    hats = np.maximum(0, 1 - np.abs(FINE[:, None] - GRID) / 5) / 5
+    return spectrum @ hats
+
+
+def exact_XYZ(spectrum):
+    sd = colour.SpectralDistribution(spectrum, FINE)
+    return colour.sd_to_XYZ(sd, CMFS, k=1 / CMFS.values[:, 1].sum(), method="Integration")
+
+
+def test_flat_spectrum_of_one_is_equal_energy_white():
+    np.testing.assert_allclose(spectrum_to_XYZ(np.ones(GRID.size), GRID), exact_XYZ(np.ones(FINE.size)), rtol=2e-4)
+    np.testing.assert_allclose(spectrum_to_XYZ(np.ones(GRID.size), GRID)[1], 1, rtol=2e-4)
+
+
+def test_D65_is_white():
+    d65 = colour.SDS_ILLUMINANTS["D65"]
+    rgb = spectrum_to_linear_sRGB(through_hats(np.interp(FINE, d65.wavelengths, d65.values)), GRID)
+    np.testing.assert_allclose(rgb / rgb[1], 1, atol=2e-3)
+
+
+@pytest.mark.parametrize("wavelength", [420.0, 447.0, 500.0, 503.0, 546.0, 588.0, 633.0, 680.0])
+@pytest.mark.parametrize("width", [1.0, 4.0, 20.0])
+def test_narrow_lines_have_the_right_color(wavelength, width):
+    line = np.exp(-((FINE - wavelength) ** 2) / (2 * width**2))
+    white = colour.CCS_ILLUMINANTS["CIE 1931 2 Degree Standard Observer"]["D65"]
+    exact = exact_XYZ(line)
+    labs = [
+        colour.XYZ_to_Lab(XYZ / (2 * exact[1]), white) for XYZ in (exact, spectrum_to_XYZ(through_hats(line), GRID))
+    ]
+    assert colour.delta_E(*labs, method="CIE 2000") < 0.25
+
+
+def test_pictures_are_converted_pixel_by_pixel():
+    spectra = np.random.default_rng(1).random((3, 4, GRID.size))
+    rgb = spectrum_to_linear_sRGB(spectra, GRID)
+    assert rgb.shape == (3, 4, 3)
+    np.testing.assert_allclose(rgb[2, 1], spectrum_to_linear_sRGB(spectra[2, 1], GRID))
+
+
+@pytest.mark.parametrize("grid", [[], [500.0], [500.0, 510.0, 530.0], [510.0, 500.0], [500.0, 500.5]])
+def test_other_grids_are_refused(grid):
+    with pytest.raises(ValueError, match="equal steps"):
+        spectrum_to_XYZ(np.ones(len(grid)), grid)
+
+
+def test_disagreeing_shapes_are_refused():
+    with pytest.raises(ValueError, match=r"\(2, 5\)"):
+        spectrum_to_XYZ(np.ones((2, 5)), GRID)
+
+
+def test_into_gamut_keeps_luminance_and_what_is_inside():
+    spectral = spectrum_to_linear_sRGB(np.eye(GRID.size)[10:60], GRID)
+    assert (spectral.min(axis=-1) < 0).all()
+    shown = into_gamut(spectral)
+    assert (shown >= 0).all()
+    np.testing.assert_allclose(shown @ LUMINANCE, spectral @ LUMINANCE, rtol=1e-9)
+    inside = np.random.default_rng(2).random((50, 3))
+    np.testing.assert_allclose(into_gamut(inside), inside)
+
+
+@pytest.mark.parametrize("bad", [(np.nan, 1, 1), (-1, -2, -3), (0, 0, 0), (np.inf, -np.inf, 0)])
+def test_into_gamut_shows_what_is_no_color_as_black(bad):
+    assert (into_gamut(np.array([bad])) == 0).all()
+
+
+def test_roll_off_is_smooth_and_stays_below_one():
+    grey = np.linspace(0, 50, 5001)[:, None] * np.ones(3)
+    shown = roll_off(grey)
+    np.testing.assert_allclose(shown[:, 0], shown[:, 2])
+    np.testing.assert_allclose(shown[:80], grey[:80])
+    assert (np.diff(shown[:, 0]) > 0).all()
+    assert shown.max() < 1
+    slope = np.diff(shown[:, 0]) / 0.01
+    assert np.abs(np.diff(slope)).max() < 0.15  # no kink where the shoulder begins
+
+    red = roll_off(np.array([[0.5, 0, 0], [2, 0, 0], [1000, 0, 0]]))
+    np.testing.assert_allclose(red[0], [0.5, 0, 0])
+    assert red[1, 1] == red[1, 2] < 0.2 < 0.9 < red[1, 0]
+    assert red[2].min() > 0.95
+
+
+def test_auto_exposure_follows_the_picture():
+    rgb = np.random.default_rng(3).random((40, 40, 3))
+    exposure = auto_exposure(rgb)
+    assert 0.9 < exposure < 1.2
+    np.testing.assert_allclose(auto_exposure(1e-5 * rgb), 1e5 * exposure)
+    framed = np.zeros((200, 200, 3))
+    framed[80:120, 80:120] = rgb
+    np.testing.assert_allclose(auto_exposure(framed), exposure, rtol=0.02)
+    rgb[3, 4] = 1e9
+    np.testing.assert_allclose(auto_exposure(rgb), exposure, rtol=0.02)
+    assert auto_exposure(np.zeros((2, 2, 3))) == 1
+
+
+def test_a_preview_shows_dark_and_red_pixels_as_such(tmp_path):
+    radiance = np.zeros((6, 9, GRID.size), np.float32)
+    radiance[:, 3:6] = 0.01 * np.random.default_rng(4).random((6, 3, 1))
+    radiance[:, 6:, 60] = 0.2  # a red line
+    radiance[0, 0] = np.nan
+    exposure = save_preview(SpectralImage(GRID, radiance), tmp_path / "a.png")
+    assert exposure > 1
+    with Image.open(tmp_path / "a.png") as picture:
+        assert (picture.mode, picture.size) == ("RGB", (9, 6))
+        pixels = np.array(picture).astype(int)
+    assert (pixels[:, :3] == 0).all()
+    assert (pixels[:, 6:, 0] > pixels[:, 6:, 2] + 60).all()
+    assert pixels.max() > 200
+
+
+def test_preview_of_unknown_format_leaves_nothing(tmp_path):
+    with pytest.raises(ValueError, match=r"\.nonsense"):
+        save_preview(SpectralImage(GRID, np.ones((2, 2, GRID.size))), tmp_path / "a.nonsense")
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,101 @@
+"""Previews without noise, by Open Image Denoise; the spectral picture stays as it is."""
+
+import sys
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from bsdf_support import grating, uniform, use
+from PIL import Image
+
+import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a variant is set)
+from mitsuba_diffraction.render.denoise import Guides, denoised, guides
+
+SCENE = """<scene version="3.0.0"><integrator type="direct"/>
+<sensor type="perspective"><transform name="to_world"><lookat origin="0,-4,2" target="0,0,0.5" up="0,0,1"/></transform>
+<film type="hdrfilm"><integer name="width" value="64"/><integer name="height" value="48"/><rfilter type="gaussian"/>
+</film></sensor><emitter type="constant"/>
+<shape type="rectangle"><transform name="to_world"><scale value="3"/></transform>
+<bsdf type="diffuse"><rgb name="reflectance" value="0.8, 0.3, 0.1"/></bsdf></shape>
+<shape type="sphere"><point name="center" x="0" y="0" z="1"/><bsdf type="diffraction_grating">
+<string name="profile" value="blazed"/><float name="period" value="2.5"/><float name="depth" value="0.25"/>
+<float name="coherence_length" value="5"/><integer name="samples" value="64"/></bsdf></shape></scene>"""
+
+
+@pytest.mark.slow
+def test_guides_are_of_what_is_seen_first(llvm):
+    look = mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0])
+    film = {"type": "hdrfilm", "width": 30, "height": 20, "rfilter": {"type": "box"}}
+    painted = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.1, 0.4, 0.8]}}
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": {"type": "perspective", "to_world": look, "fov": 60, "film": film},
+            "light": {"type": "constant", "radiance": uniform(1.0)},
+            "left": {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([-1, 0, 0]), "bsdf": painted},
+            "right": {
+                "type": "rectangle",
+                "to_world": mi.ScalarTransform4f().translate([1, 0, 0]).rotate([0, 1, 0], 30),
+                "bsdf": grating("blazed"),
+            },
+        }
+    )
+    found = guides(scene)
+    rows, columns = found.albedo.shape[:2]
+    assert (rows, columns) == (20, 30)
+    np.testing.assert_allclose(found.albedo[10, 9], [0.1, 0.4, 0.8], atol=0.12)  # upsampled, at one wavelength each
+    np.testing.assert_allclose(found.normals[10, 9], [0, 0, 1], atol=1e-5)
+    np.testing.assert_allclose(found.albedo[10, 20], 1)
+    np.testing.assert_allclose(np.abs(found.normals[10, 20]), [0.5, 0, 0.75**0.5], atol=1e-4)
+    np.testing.assert_allclose(found.albedo[0], 1)
+    assert not found.normals[0].any()
+    np.testing.assert_allclose(found.response, 1, atol=0.01)
+
+
+@pytest.mark.parametrize("rfilter", ["box", "gaussian", "mitchell"])
+def test_the_noise_of_any_reconstruction_filter_goes(rfilter, llvm):
+    """White noise through the filter of a film, as a film makes it, about a grey that stays."""
+    size, samples = 96, 16
+    film = mi.load_dict({"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": rfilter}})
+    sensor = mi.load_dict({"type": "perspective", "film": film})
+    response = guides(mi.load_dict({"type": "scene", "sensor": sensor})).response
+    rng = np.random.default_rng(0)
+    block = mi.ImageBlock((size, size), (0, 0), 4, film.rfilter(), border=True)
+    places = mi.Point2f(rng.random((2, samples * size**2)) * size)
+    values = rng.exponential(size=(3, samples * size**2))
+    block.put(places, [*(mi.Float(v) for v in values), mi.Float(np.ones(samples * size**2))])
+    border = block.border_size()
+    picture = np.array(block.tensor())[border : border + size, border : border + size]
+    noisy = picture[..., :3] / picture[..., 3:]
+    plain = np.ones((size, size, 3), np.float32)
+    clean = denoised(noisy, Guides(plain, plain * np.float32([0, 0, 1]), response))
+    assert np.abs(clean.mean() - 1) < 0.02
+    assert (clean - 1).std() < 0.2 * (noisy - 1).std()
+
+
+@pytest.mark.slow
+def test_the_preview_loses_its_noise_and_the_spectral_picture_stays(command, tmp_path, monkeypatch):
+    use("llvm_ad_spectral")
+    monkeypatch.chdir(tmp_path)
+    Path("scene.xml").write_text(SCENE)
+    for line in ("--spp 256 -o long.exr", "--spp 4 -o plain.exr", "--spp 4 --denoise -o clean.exr"):
+        code, _, err = command(f"render scene.xml --variant llvm_ad_spectral {line}")
+        assert code == 0, err
+    long, plain, clean = (np.array(Image.open(f"{name}.png"), float) for name in ("long", "plain", "clean"))
+    assert ((clean - long) ** 2).mean() < 0.3 * ((plain - long) ** 2).mean()
+    plain, clean = (mi.TensorXf(mi.Bitmap(f"{name}.exr")) for name in ("plain", "clean"))
+    np.testing.assert_array_equal(plain, clean)
+
+
+def test_missing_requirements_are_reported_before_the_work(command, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("scene.xml").write_text(SCENE)
+    code, _, err = command("render scene.xml --denoise --variant scalar_spectral")
+    assert (code, err.count("\n")) == (2, 1)
+    assert "wanted a vectorised one" in err
+    monkeypatch.setitem(sys.modules, "pyoidn", None)
+    code, _, err = command("render scene.xml --denoise --variant llvm_ad_spectral")
+    assert (code, err.count("\n")) == (2, 1)
+    assert "pip install 'mitsuba_diffraction[denoise]'" in err
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["scene.xml"]

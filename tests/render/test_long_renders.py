@@ -1,0 +1,559 @@
+"""Renderings that take long: noise that tells when to stop, kills, Ctrl-C, full disks, and the turntable."""
+
+import itertools
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a variant is set)
+from mitsuba_diffraction.color import spectrum_to_XYZ
+from mitsuba_diffraction.render import SpectralImage, passes, render
+from mitsuba_diffraction.render.passes import Accumulation, Interrupted, load_checkpoint, save_checkpoint
+from mitsuba_diffraction.render.scene import channel_wavelengths, load_spectral_scene, scene_digest
+from mitsuba_diffraction.render.turntable import orbit
+
+SIZE = 16
+SCENE = f"""<scene version="3.0.0"><default name="red" value="0.5"/><integrator type="path"/>
+<sensor type="perspective"><transform name="to_world"><lookat origin="0,-4,2" target="0,0,0.5" up="0,0,1"/></transform>
+<film type="hdrfilm"><integer name="width" value="{SIZE}"/><integer name="height" value="{SIZE}"/>
+<rfilter type="RFILTER"/></film></sensor><emitter type="constant"/>
+<emitter type="point"><point name="position" x="2" y="-1" z="2"/></emitter>
+<shape type="sphere"><point name="center" x="0.4" y="0" z="0.5"/>
+<bsdf type="diffuse"><rgb name="reflectance" value="$red, 0.2, 0.1"/></bsdf></shape></scene>"""
+# The command with passes of one sample per pixel, so that a small picture has many.
+SMALL_PASSES = f"""import mitsuba_diffraction.cli, mitsuba_diffraction.render.passes as passes
+passes.SAMPLES_PER_PASS, passes.SAMPLES_PER_PIXEL_OF_LARGE_PICTURES = {SIZE**2}, 1
+mitsuba_diffraction.cli.main()"""
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch, small_passes):
+    """Each test stands in a folder of its own, with a scene; passes take one sample per pixel."""
+    small_passes(SIZE)
+    monkeypatch.chdir(tmp_path)
+    Path("scene.xml").write_text(SCENE.replace("RFILTER", "tent"))
+    return tmp_path
+
+
+def stop_after(count):
+    """A tracer of passes that presses Ctrl-C while it traces the last of `count`."""
+
+    def trace(job, scene, first):
+        for number, traced in enumerate(passes.trace_here(job, scene, first), 1):
+            if number == count:
+                signal.raise_signal(signal.SIGINT)
+            yield traced
+
+    return trace
+
+
+def press_ctrl_c(monkeypatch, count):
+    """Lets the command be interrupted in its pass number `count`."""
+    original, number = passes.trace_pass, itertools.count(1)
+
+    def trace_pass(*arguments):
+        if next(number) == count:
+            signal.raise_signal(signal.SIGINT)
+        return original(*arguments)
+
+    monkeypatch.setattr(passes, "trace_pass", trace_pass)
+
+
+def files():
+    return {path.name for path in Path().iterdir()}
+
+
+def samples_in(checkpoint):
+    """How far a checkpoint is; every array in it is read, and its checksum with it."""
+    with np.load(checkpoint) as content:
+        return {name: content[name] for name in content.files}["samples"].item()
+
+
+# --- the error of the picture ---
+
+
+def test_error_is_the_scatter_of_whole_pictures():
+    # Luminances with a known relative scatter per sample in each pixel; passes of unequal size.
+    rng = np.random.default_rng(5)
+    wavelengths = channel_wavelengths()
+    scatter = rng.uniform(0.2, 2.0, (40, 50))
+    scatter[3:5] = 50.0  # some pixels never converge, and do not decide
+    sums = Accumulation.empty(40, 50, wavelengths)
+    assert np.isnan(sums.error())
+    for number in range(400):
+        samples = 2 + number % 3
+        luminance = 3 * (1 + scatter * rng.normal(size=scatter.shape) / np.sqrt(samples))
+        luminance[0, :] = 0.0  # black, and not counted
+        traced = np.repeat(luminance[..., None], wavelengths.size + 1, axis=2)
+        traced[..., -1] = 1.0
+        sums.add((traced * samples).astype(np.float32), samples)
+    assert (sums.passes, sums.samples) == (400, 1199)
+    expected = np.percentile((scatter[1:] / np.sqrt(1199)), 90)
+    assert sums.error() == pytest.approx(expected, rel=0.05)
+
+
+@pytest.mark.slow
+def test_black_pictures_have_no_error_and_finish(folder):
+    text = SCENE.replace("RFILTER", "box")
+    Path("scene.xml").write_text(text[: text.index('<emitter type="constant"')] + "</scene>")
+    image = render("scene.xml", spp=6, until_error=0.01)
+    assert image.attributes["spp"] == 6
+    assert not image.radiance.any()
+
+
+@pytest.mark.slow
+def test_until_error_stops_at_the_requested_noise():
+    calls = []
+    image = render("scene.xml", spp=4096, until_error=0.05, progress=lambda *call: calls.append(call))
+    done = image.attributes["spp"]
+    assert 16 <= done < 4096
+    assert image.attributes["error"] <= 0.05
+    assert all(error > 0.05 or index <= 3 for index, (_, _, error) in enumerate(calls[:-1]))
+    # What remains is foreseen: the error falls with the root of the samples.
+    assert calls[done // 2][1] == pytest.approx(done, rel=0.4)
+    # The pictures of other seeds scatter as was said.
+    others = [render("scene.xml", spp=done, seed=seed) for seed in range(1, 9)]
+    others = np.stack([spectrum_to_XYZ(other.radiance, other.wavelengths)[..., 1] for other in others])
+    lit = others.mean(axis=0) > 0
+    told = np.percentile(others.std(axis=0, ddof=1)[lit] / others.mean(axis=0)[lit], 90)
+    assert told == pytest.approx(0.05, rel=0.8)
+
+    with pytest.raises(Interrupted):
+        render("scene.xml", spp=4096, until_error=0.05, checkpoint="c", tracer=stop_after(done // 2))
+    resumed = render("scene.xml", spp=4096, until_error=0.05, checkpoint="c")
+    np.testing.assert_array_equal(resumed.radiance, image.radiance)
+    assert resumed.attributes == image.attributes
+
+
+@pytest.mark.parametrize("error", [0, -1, 1, float("nan")])
+def test_errors_out_of_range_are_refused(error):
+    with pytest.raises(ValueError, match="until_error: got"):
+        render("scene.xml", spp=4, until_error=error)
+
+
+# --- checkpoints ---
+
+
+@pytest.mark.slow
+def test_ctrl_c_gives_what_there_is_and_resuming_gives_the_same_bits():
+    whole = render("scene.xml", spp=7)
+    with pytest.raises(Interrupted) as caught:
+        render("scene.xml", spp=7, checkpoint="c", tracer=stop_after(3))
+    partial = caught.value.image
+    assert partial.attributes["spp"] == 3
+    assert "digest" not in partial.attributes
+    np.testing.assert_allclose(partial.radiance.mean(), whole.radiance.mean(), rtol=0.3)
+    calls = []
+    with pytest.raises(Interrupted):
+        render("scene.xml", spp=7, checkpoint="c", tracer=stop_after(2), progress=lambda *call: calls.append(call))
+    assert [call[:2] for call in calls] == [(3, 7), (4, 7), (5, 7)]
+    resumed = render("scene.xml", spp=7, checkpoint="c")
+    np.testing.assert_array_equal(resumed.radiance, whole.radiance)
+    assert resumed.attributes == whole.attributes
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_second_ctrl_c_does_not_wait():
+    def trace(job, scene, first):
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+        yield pytest.fail("the first one alone was heard")
+
+    with pytest.raises(KeyboardInterrupt) as caught:
+        render("scene.xml", spp=7, checkpoint="c", tracer=trace)
+    assert not isinstance(caught.value, Interrupted)
+    assert files() == {"scene.xml"}
+
+
+def test_ctrl_c_stays_ignored_where_it_was():
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        assert render("scene.xml", spp=3, tracer=stop_after(2)).attributes["spp"] == 3
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.slow
+def test_checkpoints_are_written_every_so_often(monkeypatch):
+    clock = iter(np.arange(0, 1000, 4.0))  # each look at the clock is four seconds after the one before
+    monkeypatch.setattr(passes.time, "monotonic", lambda: next(clock))
+    written = []
+    monkeypatch.setattr(passes, "save_checkpoint", lambda checkpoint, digest, sums: written.append(sums.samples))
+    render("scene.xml", spp=60, checkpoint="c", seconds=10)
+    # After three looks; then twenty times the four seconds that one took to write, counted from its beginning.
+    assert written == [3, 22, 41]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"spp": 8},
+        {"seed": 1},
+        {"width": 12},
+        {"parameters": {"red": "0.6"}},
+        {"until_error": 0.1},
+        {"motion": (1.0, 0, 0, 0.5, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1)},
+    ],
+)
+def test_checkpoints_of_other_renderings_are_refused(change):
+    with pytest.raises(Interrupted):
+        render("scene.xml", spp=7, checkpoint="c", tracer=stop_after(2))
+    before = Path("c").read_bytes()
+    with pytest.raises(ValueError, match="c: of another rendering"):
+        render("scene.xml", **{"spp": 7, "checkpoint": "c", **change})
+    assert Path("c").read_bytes() == before
+
+
+def test_the_digest_depends_on_the_content_of_a_scene_and_its_files(tmp_path):
+    texture = '<texture type="bitmap" name="reflectance"><string name="filename" value="grey.png"/></texture>'
+    text = SCENE.replace("RFILTER", "box").replace('<rgb name="reflectance" value="$red, 0.2, 0.1"/>', texture)
+
+    def digest(folder, grey, text=text):
+        folder.mkdir(exist_ok=True)
+        Image.new("L", (2, 2), grey).save(folder / "grey.png")
+        (folder / "scene.xml").write_text(text)
+        return scene_digest(folder / "scene.xml")
+
+    first = digest(tmp_path / "a", 100)
+    assert digest(tmp_path / "b", 100) == first
+    assert digest(tmp_path / "b", 101) != first
+    assert digest(tmp_path / "b", 100, text.replace("0.4", "0.41")) != first
+
+    # An included file, and a table of a spectrum.
+    (tmp_path / "a" / "light.spd").write_text("400 1\n700 2\n")
+    included = """<scene version="3.0.0">
+        <emitter type="constant"><spectrum name="radiance" filename="light.spd"/></emitter>
+        <shape type="sphere"><transform name="to_world"><translate x="0.1"/></transform><bsdf type="diffuse">
+        <rgb name="reflectance" value="0.1, 0.2, 0.3"/></bsdf></shape>
+        <emitter type="constant"><spectrum name="radiance" value="400:0.1, 700:0.5"/></emitter></scene>"""
+    (tmp_path / "a" / "more.xml").write_text(included)
+    text = SCENE.replace("RFILTER", "box").replace("</scene>", '<include filename="more.xml"/></scene>')
+    (tmp_path / "a" / "scene.xml").write_text(text)
+    first = scene_digest(tmp_path / "a" / "scene.xml")
+    for old, new in (("0.5", "0.6"), ('x="0.1"', 'x="0.1000001"'), ("0.3", "0.3000001")):
+        assert old in included
+        (tmp_path / "a" / "more.xml").write_text(included.replace(old, new))
+        assert scene_digest(tmp_path / "a" / "scene.xml") != first, new
+    (tmp_path / "a" / "more.xml").write_text(included)
+    assert scene_digest(tmp_path / "a" / "scene.xml") == first
+    (tmp_path / "a" / "light.spd").write_text("400 1\n700 3\n")
+    assert scene_digest(tmp_path / "a" / "scene.xml") != first
+
+    grating = '<bsdf type="diffraction_grating"><string name="filename" value="recipe.toml"/></bsdf>'
+    Path("scene.xml").write_text(SCENE.replace("RFILTER", "box").replace("</scene>", f"{grating}</scene>"))
+    recipe = '[surface]\nscan = "scan.npy"\npixel_size = 0.1\n'
+    Path("recipe.toml").write_text(recipe)
+    np.save("scan.npy", np.zeros((4, 4)))
+    first = scene_digest("scene.xml")
+    np.save("scan.npy", np.ones((4, 4)))
+    assert scene_digest("scene.xml") != first
+
+
+@pytest.mark.parametrize("damage", ["cut", "changed", "encrypted", "text", "empty", "other", "incomplete", "edited"])
+def test_damaged_checkpoints_are_refused(damage):
+    sums = Accumulation.empty(3, 4, channel_wavelengths())
+    save_checkpoint("c", "abc", sums)
+    assert load_checkpoint("c", "abc").samples == 0
+    whole = Path("c").read_bytes()
+    content = bytearray(whole)
+    content[2000] ^= 1
+    encrypted = bytearray(whole)
+    encrypted[whole.index(b"PK\x01\x02") + 8] ^= 1  # a flag that zipfile does not take for damage
+    if damage == "edited":
+        sums.sums[0, 0, 0] = np.nan
+        np.savez("edited.npz", digest="abc", **vars(sums))
+        Path("edited.npz").rename("c")
+    elif damage in ("other", "incomplete"):
+        fields = {name: value for name, value in vars(sums).items() if name != "samples"}
+        np.savez("other.npz", digest="abc", **(fields if damage == "incomplete" else {}))
+        Path("other.npz").rename("c")
+    else:
+        spoilt = {"cut": content[:-300], "changed": content, "encrypted": encrypted}
+        Path("c").write_bytes({**spoilt, "text": b"[surface]\n", "empty": b""}[damage])
+    with pytest.raises(ValueError, match="c: not a checkpoint, or a damaged one") as caught:
+        load_checkpoint("c", "abc")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("kills", "rfilter"),
+    [(2, "box"), (10, "box"), (10, "gaussian")],
+)
+def test_killed_renderings_go_on_and_give_the_same_bits(command, kills, rfilter):
+    Path("scene.xml").write_text(SCENE.replace("RFILTER", rfilter))
+    rng = np.random.default_rng(20)
+    checkpoint = Path("out.exr.checkpoint")
+    spp, reached = 300, 0
+    for _ in range(kills):
+        words = ("render", "scene.xml", "--variant", "llvm_ad_spectral", "-o", "out.exr", "--spp", str(spp))
+        process = subprocess.Popen(
+            [sys.executable, "-c", SMALL_PASSES, *words, "--checkpoint", "0", "--resume"],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+        )
+        before = checkpoint.stat().st_mtime_ns if reached else None
+        while process.poll() is None and not (checkpoint.exists() and checkpoint.stat().st_mtime_ns != before):
+            time.sleep(0.001)
+        time.sleep(rng.uniform(0, 0.15))
+        process.kill()
+        _, told = process.communicate()
+        assert process.returncode == -signal.SIGKILL, told
+        now = samples_in(checkpoint)
+        assert reached < now < spp
+        reached = now
+    code, out, err = command(*words, "--resume")
+    assert code == 0, err
+    assert f"{spp} samples per pixel" in out
+    assert files() == {"scene.xml", "out.exr", "out.png"}
+    expected = render("scene.xml", spp=spp)
+    resumed = SpectralImage.load("out.exr")
+    np.testing.assert_array_equal(resumed.radiance, expected.radiance)
+    assert resumed.attributes["digest"] == expected.attributes["digest"]
+
+
+# --- the command ---
+
+RENDER = "render scene.xml --variant llvm_ad_spectral"
+LINE = f"{RENDER} -o out.exr --spp 6"
+
+
+@pytest.mark.slow
+def test_the_command_is_interrupted_and_goes_on(command, monkeypatch):
+    press_ctrl_c(monkeypatch, 2)
+    code, out, err = command(LINE)
+    assert (code, out) == (130, "")
+    expected = (
+        "mitsuba-diffraction: interrupted: out.exr holds 2 samples per pixel; the same command with --resume continues"
+    )
+    assert err.strip() == expected
+    assert files() == {"scene.xml", "out.exr", "out.png", "out.exr.checkpoint"}
+    assert SpectralImage.load("out.exr").attributes["spp"] == 2
+
+    code, out, err = command(LINE)
+    assert (code, out) == (2, "")
+    assert err.startswith(
+        "mitsuba-diffraction: error: out.exr.checkpoint is of an unfinished rendering: --resume continues"
+    )
+    code, out, err = command(f"{LINE} --resume --seed 3 --overwrite")
+    assert (code, out) == (2, "")
+    assert "out.exr.checkpoint: of another rendering" in err
+    assert samples_in("out.exr.checkpoint") == 2
+
+    code, out, err = command(f"{LINE} --resume")
+    assert (code, err) == (0, "")
+    assert "6 samples per pixel, relative error of luminance" in out
+    assert files() == {"scene.xml", "out.exr", "out.png"}
+    picture = SpectralImage.load("out.exr")
+    np.testing.assert_array_equal(picture.radiance, render("scene.xml", spp=6).radiance)
+    # Done already: nothing is traced again.
+    monkeypatch.setattr(passes, "trace_pass", None)
+    written = Path("out.exr").stat().st_mtime_ns
+    assert command(f"{LINE} --resume")[0] == 0
+    assert Path("out.exr").stat().st_mtime_ns == written
+
+
+def test_the_command_stops_at_an_error_and_says_if_it_is_not_reached(command):
+    code, out, err = command(f"{RENDER} -o out.exr --spp 4096 --until-error 0.2")
+    assert (code, err) == (0, "")
+    picture = SpectralImage.load("out.exr")
+    assert picture.attributes["spp"] < 4096
+    assert picture.attributes["error"] <= 0.2
+    assert "increase --spp" not in out
+    code, out, err = command(f"{RENDER} -o out.exr --spp 8 --until-error 0.001 --overwrite")
+    assert (code, err) == (0, "")
+    assert "8 samples per pixel, relative error of luminance at most 0." in out
+    assert "(above 0.001: increase --spp)" in out
+
+
+def test_an_interrupt_before_the_first_pass_writes_nothing(command, monkeypatch):
+    def interrupted(*arguments, **named):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(passes, "load_spectral_scene", interrupted)
+    code, out, err = command(LINE)
+    assert (code, out) == (130, "")
+    assert err.strip() == "mitsuba-diffraction: interrupted: nothing was written"
+    assert files() == {"scene.xml"}
+
+
+@pytest.mark.slow
+def test_a_full_disk_is_one_line_and_leaves_the_last_checkpoint(command, monkeypatch):
+    def limited(line):
+        # Not even the superuser writes more than this; a disk that is full raises another number.
+        soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, hard))
+        try:
+            return command(line)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+    line = f"{LINE} --checkpoint 0"
+    code, out, err = limited(line)
+    assert (code, out) == (1, "")
+    expected = "mitsuba-diffraction: error: out.exr.checkpoint: cannot be written (File too large); there is none yet"
+    assert err.strip() == expected
+    assert files() == {"scene.xml"}
+
+    press_ctrl_c(monkeypatch, 2)
+    command(line)
+    code, out, err = limited(f"{line} --resume")
+    assert (code, out) == (1, "")
+    assert err.strip().endswith("(File too large); the last one, of 2 samples per pixel, is kept")
+    assert samples_in("out.exr.checkpoint") == 2
+    assert command(f"{line} --resume")[0] == 0
+    np.testing.assert_array_equal(SpectralImage.load("out.exr").radiance, render("scene.xml", spp=6).radiance)
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A disk of 300 kB."""
+    place = tmp_path / "disk"
+    place.mkdir()
+    done = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=300k", "tmpfs", place], capture_output=True)
+    if done.returncode:
+        pytest.skip("nothing may be mounted here")
+    yield place
+    subprocess.run(["umount", place], check=True)
+
+
+def test_a_disk_that_the_picture_fills_is_one_line(command, small_disk, monkeypatch):
+    monkeypatch.setattr(passes, "CHECKPOINT_SHARE", 0)  # after each pass, however long a checkpoint takes
+    # A checkpoint is 200 kB, two of them do not fit; a larger picture does not fit at all.
+    code, out, err = command(f"{RENDER} --spp 6 -o disk/out.exr --checkpoint 0")
+    assert (code, out) == (1, "")
+    assert "disk/out.exr.checkpoint: cannot be written (No space left on device)" in err
+    assert len(err.splitlines()) == 1
+    assert samples_in("disk/out.exr.checkpoint") == 1
+    Path("disk/out.exr.checkpoint").unlink()
+    code, out, err = command(f"{RENDER} -o disk/out.exr --width 80 --spp 1")
+    assert (code, out) == (1, "")
+    assert len(err.splitlines()) == 1, err
+    assert "disk/out.exr or its preview cannot be written" in err
+    assert not list(small_disk.iterdir())
+
+
+def test_a_folder_that_cannot_be_written_to_is_refused_before_the_work(command, monkeypatch):
+    monkeypatch.setattr(passes, "trace_pass", None)
+    place = Path("closed")
+    place.mkdir()
+    place.chmod(0o555)
+    if os.access(place, os.W_OK):  # the superuser may; the kernel's own folders are closed to all
+        place = Path("/sys")
+        if not place.is_dir():
+            pytest.skip("there is no folder that is closed")
+    code, out, err = command(f"{RENDER} --spp 6 -o {place}/out.exr")
+    assert (code, out) == (2, "")
+    assert len(err.splitlines()) == 1
+    assert err.startswith(f"mitsuba-diffraction: error: cannot write '{place}/out.exr': ")
+
+
+def test_a_checkpoint_is_the_old_one_until_the_new_one_is_whole(monkeypatch):
+    sums = Accumulation.empty(3, 4, channel_wavelengths())
+    save_checkpoint("c", "first", sums)
+    whole = Path("c").read_bytes()
+
+    def fail(path):
+        assert Path("c").read_bytes() == whole
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(passes, "seal", fail)
+    with pytest.raises(ZeroDivisionError):
+        save_checkpoint("c", "second", sums)
+    assert files() == {"scene.xml", "c"}
+    assert Path("c").read_bytes() == whole
+
+
+# --- the turntable ---
+
+
+def camera(motion, scene="scene.xml"):
+    sensor = load_spectral_scene(scene, motion=motion).sensors()[0]
+    return np.ravel(np.array(sensor.world_transform().matrix)).reshape(4, 4)
+
+
+def test_the_orbit_runs_around_the_target():
+    motions = orbit("scene.xml", 4)
+    np.testing.assert_allclose(camera(motions[0]), camera(None), atol=1e-6)
+    for motion, origin in zip(motions[1:], ("4,0,2", "0,4,2", "-4,0,2"), strict=True):
+        Path("moved.xml").write_text(SCENE.replace("RFILTER", "box").replace("0,-4,2", origin))
+        np.testing.assert_allclose(camera(motion), camera(None, "moved.xml"), atol=1e-6)
+
+
+def test_parameters_and_matrices_place_the_orbit():
+    text = SCENE.replace("RFILTER", "box")
+    Path("scene.xml").write_text(
+        text.replace('target="0,0,0.5"', 'target="$x,0,0.5"').replace(
+            "<integrator", '<default name="x" value="0"/><integrator'
+        )
+    )
+    assert orbit("scene.xml", 3, {"x": "1"}) != orbit("scene.xml", 3)
+    np.testing.assert_allclose(camera(orbit("scene.xml", 2)[1])[:3, 3], [0, 4, 2], atol=1e-6)
+    # Without a lookat: the same axis.
+    matrix = " ".join(f"{number:.9g}" for number in camera(None).ravel())
+    lookat = '<lookat origin="0,-4,2" target="0,0,0.5" up="0,0,1"/>'
+    Path("scene.xml").write_text(text.replace(lookat, f'<matrix value="{matrix}"/>'))
+    np.testing.assert_allclose(camera(orbit("scene.xml", 2)[1])[:3, 3], [0, 4, 2], atol=1e-5)
+
+
+def test_the_orbit_takes_any_xml_that_mitsuba_takes():
+    strange = SCENE.replace("RFILTER", "box").replace("<integrator", "<!-- caf\xe9 --><integrator", 1)
+    Path("scene.xml").write_bytes(strange.replace('type="path"', 'type="path" id="a & b"', 1).encode("latin-1"))
+    assert len(orbit("scene.xml", 3)) == 3
+
+
+def test_a_turntable_writes_frames_and_an_animation_and_resumes(command, monkeypatch):
+    line = f"{RENDER} -o out.exr --frames 3 --orbit --spp 2"
+    press_ctrl_c(monkeypatch, 3)
+    code, _, err = command(line)
+    assert code == 130
+    assert "out_001.exr holds 1 samples per pixel; the same command with --resume continues" in err
+    assert "out_001.exr.checkpoint" in files()
+    first = Path("out_000.exr").stat().st_mtime_ns
+    code, out, err = command(f"{line} --resume")
+    assert (code, err) == (0, "")
+    expected = {f"out_{number:03d}.{kind}" for number in range(3) for kind in ("exr", "png")}
+    assert files() == {"scene.xml", "out.webp", *expected}
+    assert Path("out_000.exr").stat().st_mtime_ns == first
+    assert len({line.split("radiance times ")[1] for line in out.splitlines() if "exposure" in line}) == 1
+    for number, motion in enumerate(orbit("scene.xml", 3)):
+        picture = SpectralImage.load(f"out_{number:03d}.exr")
+        np.testing.assert_array_equal(picture.radiance, render("scene.xml", spp=2, motion=motion).radiance)
+    with Image.open("out.webp") as animation:
+        assert (animation.n_frames, animation.size) == (3, (SIZE, SIZE))
+        for number in range(3):
+            animation.seek(number)
+            still = np.asarray(Image.open(f"out_{number:03d}.png"), dtype=float)
+            assert np.abs(np.asarray(animation.convert("RGB"), dtype=float) - still).mean() < 25
+
+
+def test_a_second_ctrl_c_in_a_turntable_says_what_is_there(command, monkeypatch):
+    original, number = passes.trace_pass, itertools.count(1)
+
+    def trace_pass(*arguments):
+        if next(number) == 3:
+            raise KeyboardInterrupt
+        return original(*arguments)
+
+    monkeypatch.setattr(passes, "trace_pass", trace_pass)
+    code, _, err = command(f"{RENDER} -o out.exr --frames 3 --orbit --spp 2")
+    assert code == 130
+    assert "interrupted: 1 of 3 pictures are complete; the same command with --resume continues" in err
+    assert files() == {"scene.xml", "out_000.exr", "out_000.png"}
+
+
+@pytest.mark.parametrize("options", ["--frames 3", "--orbit", "--frames 1 --orbit", "--frames 1000000 --orbit"])
+def test_turntables_need_both_options(command, options):
+    code, out, err = command(f"{LINE} {options}")
+    assert (code, out) == (2, "")
+    assert len(err.splitlines()) == 1
+    assert "--frames" in err

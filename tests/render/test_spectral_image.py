@@ -1,0 +1,177 @@
+import os
+import stat
+
+import numpy as np
+import OpenEXR
+import pytest
+
+from mitsuba_diffraction.color import spectrum_to_linear_sRGB
+from mitsuba_diffraction.files import whole_file
+from mitsuba_diffraction.render.spectral_image import SpectralImage
+
+GRID = np.arange(365.0, 830.0, 5.0)
+
+
+@pytest.fixture
+def image():
+    radiance = np.random.default_rng(0).normal(size=(4, 7, GRID.size)).astype(np.float32)
+    return SpectralImage(GRID, radiance, {"scene": "a.xml", "spp": 16, "height_scale": 0.5})
+
+
+def test_a_saved_image_comes_back_unchanged(image, tmp_path):
+    image.save(tmp_path / "a.exr")
+    back = SpectralImage.load(tmp_path / "a.exr")
+    np.testing.assert_array_equal(back.radiance, image.radiance)
+    np.testing.assert_array_equal(back.wavelengths, image.wavelengths)
+    assert back.attributes == image.attributes
+    assert [path.name for path in tmp_path.iterdir()] == ["a.exr"]
+
+
+def test_fractional_wavelengths_come_back_unchanged(tmp_path):
+    image = SpectralImage([404.5, 412.25], np.ones((1, 1, 2)))
+    image.save(tmp_path / "a.exr")
+    np.testing.assert_array_equal(SpectralImage.load(tmp_path / "a.exr").wavelengths, [404.5, 412.25])
+
+
+def test_the_file_has_the_spectral_layout(image, tmp_path):
+    image.save(tmp_path / "a.exr")
+    file = OpenEXR.File(str(tmp_path / "a.exr"), separate_channels=True)
+    header, channels = file.header(), file.channels()
+    assert header["spectralLayoutVersion"] == "1.0"
+    assert header["emissiveUnits"] == "W.m^-2.sr^-1"
+    assert header["compression"] == OpenEXR.ZIP_COMPRESSION
+    assert len(channels) == GRID.size + 3
+    assert channels["S0.405,000000nm"].pixels.dtype == np.float32
+    np.testing.assert_array_equal(channels["S0.405,000000nm"].pixels, image.radiance[..., 8])
+    rgb = spectrum_to_linear_sRGB(image.radiance, GRID)
+    for index, name in enumerate("RGB"):
+        np.testing.assert_allclose(channels[name].pixels, rgb[..., index], rtol=1e-5, atol=1e-6)
+
+
+def test_colour_science_reads_the_file(image, tmp_path):
+    pytest.importorskip("OpenImageIO", reason="colour-science reads spectral images through OpenImageIO")
+    import colour
+
+    image.save(tmp_path / "a.exr")
+    components, specification = colour.read_spectral_image_Fichet2021(tmp_path / "a.exr", additional_data=True)
+    assert specification.is_emissive
+    assert list(components) == ["S0"]
+    wavelengths, values = components["S0"]
+    order = np.argsort(wavelengths)
+    np.testing.assert_allclose(wavelengths[order], GRID)
+    np.testing.assert_array_equal(values[..., order], image.radiance)
+
+
+@pytest.mark.parametrize(
+    ("wavelengths", "shape", "attributes", "message"),
+    [
+        ([500.0, 490.0], (1, 1, 2), {}, "ascending"),
+        ([], (1, 1, 0), {}, "ascending"),
+        ([500.0, 510.0], (1, 1, 3), {}, r"\(1, 1, 3\)"),
+        ([500.0, 510.0], (1, 2), {}, r"\(1, 2\)"),
+        ([500.0, 510.0], (1, 1, 2), {"compression": "none"}, "compression"),
+        ([500.0, 510.0], (1, 1, 2), {"list": [1]}, "list"),
+        ([500.0, 510.0], (1, 1, 2), {"big": 2**31}, "32 bits"),
+    ],
+)
+def test_wrong_images_are_refused(wavelengths, shape, attributes, message):
+    with pytest.raises(ValueError, match=message):
+        SpectralImage(wavelengths, np.zeros(shape), attributes)
+
+
+def test_an_image_owns_its_radiance():
+    radiance = np.ones((1, 1, 2), np.float32)
+    image = SpectralImage([500.0, 510.0], radiance)
+    radiance[:] = 2
+    assert (image.radiance == 1).all()
+    with pytest.raises(ValueError, match="read-only"):
+        image.radiance[:] = 3
+
+
+def write_exr(path, attributes, channels):
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **attributes}
+    OpenEXR.File(header, {name: np.ones((2, 2), np.float32) for name in channels}).write(str(path))
+
+
+@pytest.mark.parametrize(
+    ("attributes", "channels", "message"),
+    [
+        ({}, ["R"], "spectralLayoutVersion is None, wanted '1.0'"),
+        ({"spectralLayoutVersion": "2.0"}, ["R"], "'2.0'"),
+        ({"spectralLayoutVersion": "1.0", "emissiveUnits": "lux"}, ["R"], "'lux'"),
+        ({"spectralLayoutVersion": "1.0", "emissiveUnits": "W.m^-2.sr^-1"}, ["T.500nm", "S0.5,0e14Hz"], "no channel"),
+    ],
+)
+def test_unknown_layouts_are_refused(attributes, channels, message, tmp_path):
+    write_exr(tmp_path / "a.exr", attributes, channels)
+    with pytest.raises(ValueError, match=message):
+        SpectralImage.load(tmp_path / "a.exr")
+
+
+def test_unreadable_files_are_refused(image, tmp_path, capfd):
+    with pytest.raises(FileNotFoundError):
+        SpectralImage.load(tmp_path / "none.exr")
+    (tmp_path / "text.exr").write_text("hello")
+    with pytest.raises(ValueError, match="cannot be read as OpenEXR"):
+        SpectralImage.load(tmp_path / "text.exr")
+    image.save(tmp_path / "half.exr")
+    whole = (tmp_path / "half.exr").read_bytes()
+    (tmp_path / "half.exr").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(ValueError, match="cannot be read as OpenEXR, is it whole"):
+        SpectralImage.load(tmp_path / "half.exr")
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("error", [OSError("disk full"), KeyboardInterrupt()])
+def test_failed_save_leaves_the_old_file(image, tmp_path, monkeypatch, error):
+    (tmp_path / "a.exr").write_text("old")
+
+    class Failing(OpenEXR.File):
+        def write(self, path):
+            with open(path, "w") as stream:
+                stream.write("half")
+            raise error
+
+    monkeypatch.setattr(OpenEXR, "File", Failing)
+    with pytest.raises(type(error)):
+        image.save(tmp_path / "a.exr")
+    assert [path.name for path in tmp_path.iterdir()] == ["a.exr"]
+    assert (tmp_path / "a.exr").read_text() == "old"
+
+
+def test_a_whole_file_appears_at_the_end_only(tmp_path):
+    target = tmp_path / "a.txt"
+    with whole_file(target) as temporary:
+        assert temporary.parent == tmp_path
+        assert temporary.suffix == ".txt"
+        temporary.write_text("new")
+        assert not target.exists()
+    assert target.read_text() == "new"
+    assert len(list(tmp_path.iterdir())) == 1
+    beside = tmp_path / "beside.txt"
+    beside.write_text("")
+    assert stat.S_IMODE(target.stat().st_mode) == stat.S_IMODE(beside.stat().st_mode)
+
+
+def test_whole_file_refuses_other_places(tmp_path):
+    with pytest.raises(FileNotFoundError, match="folder"), whole_file(tmp_path / "none" / "a.txt"):
+        pass
+    with pytest.raises(ValueError, match="not an ordinary file"), whole_file(tmp_path):
+        pass
+
+
+@pytest.mark.skipif(os.name == "nt", reason="symbolic links need a privilege on Windows")
+def test_whole_file_follows_links(tmp_path):
+    (tmp_path / "target.txt").write_text("old")
+    (tmp_path / "link.txt").symlink_to("target.txt")
+    with whole_file(tmp_path / "link.txt") as temporary:
+        temporary.write_text("new")
+    assert (tmp_path / "link.txt").is_symlink()
+    assert (tmp_path / "target.txt").read_text() == "new"
+
+
+def test_half_precision_refuses_what_it_cannot_hold(tmp_path):
+    image = SpectralImage([500.0, 505.0], np.full((1, 1, 2), 7e4))
+    with pytest.raises(ValueError, match=r"half: got radiances up to .*float32"):
+        image.save(tmp_path / "a.exr", half=True)
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,703 @@
+"""Files to height fields: round trips of every format of the core, and every misuse told in one line."""
+
+import struct
+import time
+import zlib
+
+import gwyfile
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as npst
+from PIL import Image
+
+from mitsuba_diffraction.surface.readers import read_height_field
+
+HEIGHTS = np.array([[0.0, 0.1, 0.25], [0.3, 0.2, 0.05]])
+"""µm"""
+GREY = np.array([[0, 51, 255], [102, 7, 30]], dtype=np.uint8)
+
+
+@pytest.fixture
+def refuse(tmp_path):
+    """Check that a file is refused in one line that names it and holds the text given."""
+
+    def check(name, text, pixel_size=0.1, height_range=None, **more):
+        with pytest.raises(ValueError, match=text) as caught:
+            read_height_field(tmp_path / name, pixel_size, height_range, **more)
+        assert name in str(caught.value)
+        assert "\n" not in str(caught.value)
+
+    return check
+
+
+def png(width, height, bits, colour, data):
+    """A PNG file by hand, for the kinds that Pillow does not write."""
+
+    def chunk(name, content):
+        return struct.pack(">I", len(content)) + name + content + struct.pack(">I", zlib.crc32(name + content))
+
+    header = struct.pack(">IIBBBBB", width, height, bits, colour, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(data)) + chunk(b"IEND", b"")
+
+
+# ---------------------------------------------------------------- round trips
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    heights=npst.arrays(
+        st.sampled_from(["<f8", ">f8", "<f4"]),
+        npst.array_shapes(min_dims=2, max_dims=2, max_side=6),
+        elements=st.floats(-5, 5, width=32),
+    ),
+    fortran=st.booleans(),
+)
+def test_npy_keeps_the_heights(tmp_path_factory, heights, fortran):
+    path = tmp_path_factory.mktemp("npy") / "scan.npy"
+    np.save(path, np.asfortranarray(heights) if fortran else heights)
+    field = read_height_field(path, pixel_size=(0.1, 0.2))
+    np.testing.assert_array_equal(field.heights, heights)
+    assert field.pixel_size == (0.1, 0.2)
+    assert field.source == "scan.npy"
+
+
+@pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
+@pytest.mark.parametrize(
+    ("own", "expected"), [(0.05, (0.05, 0.05)), ((0.05, 0.1), (0.05, 0.1)), ([0.05], (0.05, 0.05))]
+)
+def test_npz_brings_its_pixel_size(tmp_path, save, own, expected):
+    save(tmp_path / "scan.npz", heights=HEIGHTS, pixel_size=own)
+    field = read_height_field(tmp_path / "scan.npz")
+    np.testing.assert_array_equal(field.heights, HEIGHTS)
+    assert field.pixel_size == expected
+    assert read_height_field(tmp_path / "scan.npz", pixel_size=0.3).pixel_size == (0.3, 0.3)
+
+
+@pytest.mark.parametrize("extension", ["png", "tif", "tiff", "PNG"])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_grey_pictures_are_scaled_by_the_full_range(tmp_path, extension, dtype):
+    path = tmp_path / f"scan.{extension}"
+    grey = GREY.astype(dtype) * (257 if dtype == np.uint16 else 1)
+    Image.fromarray(grey).save(path)
+    field = read_height_field(str(path), pixel_size=0.0586, height_range=0.375)
+    np.testing.assert_allclose(field.heights, GREY / 255 * 0.375, rtol=1e-15)
+
+
+@pytest.mark.parametrize("mode", ["RGB", "RGBA", "LA"])
+def test_colour_that_is_grey_and_opaque_is_read(tmp_path, mode):
+    Image.fromarray(GREY).convert(mode).save(tmp_path / "scan.png")
+    field = read_height_field(tmp_path / "scan.png", 0.1, 0.375)
+    np.testing.assert_allclose(field.heights, GREY / 255 * 0.375)
+
+
+def test_float_tiff_is_in_micrometres(tmp_path):
+    Image.fromarray(HEIGHTS.astype(np.float32)).save(tmp_path / "scan.tif")
+    field = read_height_field(tmp_path / "scan.tif", pixel_size=0.1)
+    np.testing.assert_array_equal(field.heights, HEIGHTS.astype(np.float32))
+
+
+@pytest.mark.parametrize("dtype", [np.int32, np.uint32, np.int64, np.uint64])
+def test_counts_that_are_flat_beside_the_range_of_their_type_are_refused(tmp_path, refuse, dtype):
+    np.save(tmp_path / "scan.npy", GREY.astype(dtype))
+    refuse("scan.npy", f"got {np.dtype(dtype)} heights from 0 to 255, flat", height_range=0.5)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.int16, np.int32, np.uint64])
+def test_integers_run_over_the_range_of_their_type(tmp_path, dtype):
+    scale = np.iinfo(dtype)
+    np.save(tmp_path / "scan.npy", np.array([[scale.min, scale.max]], dtype=dtype))
+    np.testing.assert_allclose(read_height_field(tmp_path / "scan.npy", 0.1, 0.5).heights, [[0.0, 0.5]])
+
+
+def test_the_top_row_of_a_picture_is_the_first_row(tmp_path):
+    grey = np.zeros((4, 3), dtype=np.uint8)
+    grey[0] = 255
+    Image.fromarray(grey).save(tmp_path / "scan.png")
+    np.testing.assert_array_equal(read_height_field(tmp_path / "scan.png", 0.1, 1.0).heights[:, 0], [1, 0, 0, 0])
+
+
+# ---------------------------------------------------------------- missing pixels
+
+HOLED = np.array([[0.1, np.nan, 0.3, 0.4], [0.1, 0.2, np.inf, 0.4]])
+"""µm; the two pixels are 0.2 and 0.3 by interpolation."""
+
+
+def write_holed(path):
+    if path.suffix == ".npy":
+        np.save(path, HOLED)
+    elif path.suffix == ".npz":
+        np.savez(path, heights=HOLED)
+    else:
+        Image.fromarray(HOLED.astype(np.float32)).save(path)
+
+
+@pytest.mark.parametrize("name", ["scan.npy", "scan.npz", "scan.tif"])
+def test_missing_pixels_are_filled_on_request(tmp_path, refuse, name):
+    write_holed(tmp_path / name)
+    refuse(name, r"2 of 8 pixels are missing .*row 0, column 1; .*--fill-missing, fills them")
+    field = read_height_field(tmp_path / name, 0.1, fill_missing=True)
+    np.testing.assert_allclose(field.heights, [[0.1, 0.2, 0.3, 0.4]] * 2, rtol=1e-6)
+    assert (field.filled, field.source) == (2, f"{name} (2 missing pixels filled)")
+
+
+def test_a_scan_without_a_height_is_refused_by_name(tmp_path):
+    np.save(tmp_path / "scan.npy", np.full((2, 3), np.nan))
+    with pytest.raises(ValueError, match=r"scan\.npy: heights: all 6 pixels are missing"):
+        read_height_field(tmp_path / "scan.npy", 0.1, fill_missing=True)
+
+
+# ---------------------------------------------------------------- misuse of the arguments
+
+
+def test_a_missing_file_is_a_missing_file(tmp_path):
+    with pytest.raises(FileNotFoundError):
+        read_height_field(tmp_path / "none.npy", 0.1)
+
+
+@pytest.mark.parametrize("name", ["scan.txt", "scan", "scan.png.bak"])
+def test_an_unknown_extension_is_answered_with_the_known_ones(tmp_path, refuse, name):
+    (tmp_path / name).write_bytes(b"1 2 3")
+    refuse(name, r"wanted one of \.npy, \.npz, \.png, \.tif, \.tiff")
+
+
+@pytest.mark.parametrize("pixel_size", [None, 0.0, -1.0, np.nan, "wide", (1.0, 2.0, 3.0)])
+def test_the_pixel_size_must_be_known_and_positive(tmp_path, refuse, pixel_size):
+    np.save(tmp_path / "scan.npy", HEIGHTS)
+    refuse("scan.npy", "pixel_size: ", pixel_size=pixel_size)
+
+
+@pytest.mark.parametrize("height_range", [None, 0.0, -1.0, np.inf, "high", True])
+@pytest.mark.parametrize("name", ["scan.npy", "scan.png"])
+def test_integers_need_a_height_range(tmp_path, refuse, name, height_range):
+    np.save(tmp_path / "scan.npy", GREY)
+    Image.fromarray(GREY).save(tmp_path / "scan.png")
+    refuse(name, "height_range: ", height_range=height_range)
+
+
+@pytest.mark.parametrize("name", ["scan.npy", "scan.tif"])
+def test_floats_refuse_a_height_range(tmp_path, refuse, name):
+    np.save(tmp_path / "scan.npy", HEIGHTS)
+    Image.fromarray(HEIGHTS.astype(np.float32)).save(tmp_path / "scan.tif")
+    refuse(name, r"height_range: got 0\.5 for float.* in µm", height_range=0.5)
+
+
+# ---------------------------------------------------------------- misuse of the numbers
+
+
+@pytest.mark.parametrize(
+    ("array", "text"),
+    [
+        (HEIGHTS * 1j, "type complex128"),
+        (HEIGHTS > 0, "type bool"),
+        (np.array([["a"]]), "type <U1"),
+        (np.zeros((2, 2), dtype=[("h", float)]), "real floats"),
+        (HEIGHTS[None], r"shape \(1, 2, 3\)"),
+        (HEIGHTS[0], r"shape \(3,\)"),
+        (np.zeros((0, 4)), r"shape \(0, 4\)"),
+        (
+            np.array([[1.0, np.nan], [np.inf, 0.0]]),
+            "2 of 4 pixels are missing or not finite, the first at row 0, column 1",
+        ),
+    ],
+)
+def test_what_are_not_heights_is_refused(tmp_path, refuse, array, text):
+    np.save(tmp_path / "scan.npy", array)
+    np.savez(tmp_path / "scan.npz", heights=array)
+    refuse("scan.npy", text)
+    refuse("scan.npz", text)
+
+
+def test_pickles_are_not_opened(tmp_path, refuse):
+    class Trap:
+        def __reduce__(self):
+            return (pytest.fail, ("the reader executed a file",))
+
+    np.save(tmp_path / "scan.npy", np.array([[Trap()]], dtype=object), allow_pickle=True)
+    np.savez(tmp_path / "scan.npz", heights=np.array([[Trap()]], dtype=object))
+    refuse("scan.npy", "allow_pickle=False")
+    refuse("scan.npz", "allow_pickle=False")
+
+
+def test_an_archive_must_hold_heights(tmp_path, refuse):
+    np.savez(tmp_path / "scan.npz", surface=HEIGHTS)
+    refuse("scan.npz", r"got the arrays \['surface'\], wanted 'heights'")
+
+
+@pytest.mark.parametrize("own", ["0.1", [0.1, 0.2, 0.3], [[0.1]]])
+def test_an_archive_must_hold_a_sound_pixel_size(tmp_path, refuse, own):
+    np.savez(tmp_path / "scan.npz", heights=HEIGHTS, pixel_size=own)
+    refuse("scan.npz", "pixel_size: got an array", pixel_size=None)
+
+
+# ---------------------------------------------------------------- damaged files
+
+
+@pytest.mark.parametrize("name", ["scan.npy", "scan.npz", "scan.png", "scan.tif"])
+def test_empty_foreign_and_cut_files_are_refused(tmp_path, refuse, name):
+    path = tmp_path / name
+    noise = np.random.default_rng(0).integers(0, 256, (40, 40), dtype=np.uint8)
+    if name == "scan.npy":
+        np.save(path, noise)
+    elif name == "scan.npz":
+        np.savez_compressed(path, heights=noise)
+    else:
+        Image.fromarray(noise).save(path)
+    whole = path.read_bytes()
+    path.write_bytes(b"")
+    refuse(name, "empty")
+    path.write_bytes(b"this is not what the name says\n" * 9)
+    refuse(name, "not a")
+    for length in (1, 10, 60, len(whole) // 2):
+        path.write_bytes(whole[:length])
+        refuse(name, name, height_range=1.0)
+    path.unlink()
+    path.mkdir()
+    refuse(name, name)
+
+
+@settings(max_examples=150, deadline=None)
+@given(name=st.sampled_from(["scan.npy", "scan.npz", "scan.png", "scan.tif"]), data=st.data())
+def test_a_changed_byte_gives_heights_or_one_line(tmp_path_factory, name, data):
+    path = tmp_path_factory.mktemp("changed") / name
+    if name == "scan.npy":
+        np.save(path, GREY)
+    elif name == "scan.npz":
+        np.savez_compressed(path, heights=GREY, pixel_size=0.1)
+    else:
+        Image.fromarray(GREY).save(path)
+    content = bytearray(path.read_bytes())
+    content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+    path.write_bytes(content)
+    try:
+        message = ""
+        assert np.isfinite(read_height_field(path, 0.1, 1.0).heights).all()
+    except ValueError as error:
+        message = str(error)
+    assert not message or (name in message and "\n" not in message)
+
+
+def test_several_pages_are_refused(tmp_path, refuse):
+    page = Image.fromarray(GREY)
+    page.save(tmp_path / "scan.tif", save_all=True, append_images=[page, page])
+    refuse("scan.tif", "got 3 pages", height_range=1.0)
+    page.save(tmp_path / "scan.png", save_all=True, append_images=[Image.fromarray(GREY[::-1])])
+    refuse("scan.png", "got 2 pages", height_range=1.0)
+
+
+@pytest.mark.parametrize("factor", [0.6, 3])
+def test_a_picture_that_unpacks_to_too_much_is_refused(tmp_path, refuse, monkeypatch, factor):
+    Image.fromarray(np.zeros((30, 30), dtype=np.uint8)).save(tmp_path / "scan.png")
+    # Pillow warns above its limit and raises above twice that.
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", int(900 / (2 * factor)))
+    refuse("scan.png", "too large", height_range=1.0)
+
+
+def test_an_archive_that_unpacks_to_too_much_is_refused(tmp_path, refuse, monkeypatch):
+    np.savez_compressed(tmp_path / "scan.npz", heights=np.zeros((100, 100)))
+    monkeypatch.setattr("mitsuba_diffraction.surface.readers.pictures.MOST_BYTES", 1000)
+    refuse("scan.npz", "wanted at most 1000")
+
+
+def test_coloured_annotation_on_a_grey_picture_is_missing(tmp_path, refuse):
+    x = np.arange(60) / 60
+    grey = np.round(100 + 80 * np.sin(2 * np.pi * 3 * x) * np.ones((50, 1))).astype(np.uint8)
+    picture = np.repeat(grey[..., None], 3, axis=-1)
+    picture[42:45, 5:25] = (255, 0, 0)
+    Image.fromarray(picture).save(tmp_path / "bar.png")
+    refuse("bar.png", r"2\.00% of the pixels are coloured, annotation .*--fill-missing", height_range=1.0)
+    kept = read_height_field(tmp_path / "bar.png", 0.1, 1.0, keep_missing=True)
+    assert kept.gaps.sum() == kept.gaps[42:45, 5:25].sum() == 60
+    filled = read_height_field(tmp_path / "bar.png", 0.1, 1.0, fill_missing=True)
+    assert filled.filled == 60
+    # The surroundings go on: no trench, and no wall, of the bar.
+    np.testing.assert_allclose(filled.heights, grey / 255, atol=0.12)
+    np.testing.assert_array_equal(filled.heights[:40], grey[:40] / 255)
+    picture[20:40] = (0, 200, 30)
+    Image.fromarray(picture).save(tmp_path / "bar.png")
+    refuse("bar.png", "colour picture", height_range=1.0, fill_missing=True)
+
+
+def test_colours_transparency_and_palettes_are_refused(tmp_path, refuse):
+    colour = np.stack([GREY, GREY, GREY[::-1]], axis=-1)
+    Image.fromarray(colour).save(tmp_path / "colour.png")
+    refuse("colour.png", "colour picture", height_range=1.0)
+    Image.fromarray(np.stack([GREY, GREY, GREY, GREY], axis=-1), "RGBA").save(tmp_path / "clear.png")
+    refuse("clear.png", "transparent", height_range=1.0)
+    Image.fromarray(GREY).convert("P").save(tmp_path / "palette.png")
+    refuse("palette.png", "mode 'P'", height_range=1.0)
+    Image.fromarray(GREY).save(tmp_path / "key.png", transparency=7)
+    refuse("key.png", "wanted opaque grey", height_range=1.0)
+
+
+def test_precision_is_never_lost_in_silence(tmp_path, refuse):
+    # Pillow would halve the depth of these two, and take the next two for something else.
+    (tmp_path / "rgb16.png").write_bytes(png(2, 1, 16, 2, b"\0" + b"\x12\x34" * 6))
+    refuse("rgb16.png", "wanted opaque grey of 8 or 16 bit", height_range=1.0)
+    (tmp_path / "la16.png").write_bytes(png(2, 1, 16, 4, b"\0" + b"\x12\x34" * 4))
+    refuse("la16.png", "wanted opaque grey of 8 or 16 bit", height_range=1.0)
+    Image.fromarray(GREY.astype(np.int32)).save(tmp_path / "int32.tif")
+    refuse("int32.tif", "mode 'I'", height_range=1.0)
+    Image.fromarray(GREY.astype(np.uint16)).save(tmp_path / "inverse.tif", tiffinfo={262: 0})
+    refuse("inverse.tif", "black at zero", height_range=1.0)
+
+
+# ---------------------------------------------------------------- Gwyddion: written by another program's library
+
+
+def gwy_field(heights=HEIGHTS, xy="m", z="m", **more):
+    size = {"xreal": 3e-6, "yreal": 4e-6} | more
+    return gwyfile.objects.GwyDataField(np.asarray(heights) * 1e-6, si_unit_xy=xy, si_unit_z=z, **size)
+
+
+def write_gwy(path, channels):
+    """A file with these channels: number → (title, data field)."""
+    container = gwyfile.objects.GwyContainer()
+    # Not the whole path: how long it is would differ between the examples of a property.
+    container["/filename"] = path.name
+    container["/0/mask"] = gwy_field(np.ones_like(HEIGHTS))
+    for number, (title, field) in channels.items():
+        container[f"/{number}/data/title"] = title
+        container[f"/{number}/data"] = field
+        container[f"/{number}/data/visible"] = True
+    container.tofile(str(path))
+
+
+def component(name, kind, value):
+    return name.encode() + b"\0" + kind.encode() + value
+
+
+def gwy_bytes(inside, name=b"GwyContainer"):
+    return b"GWYP" + name + b"\0" + struct.pack("<I", len(inside)) + inside
+
+
+def test_gwy_brings_its_scale_and_the_top_row_is_the_first(tmp_path):
+    write_gwy(tmp_path / "scan.gwy", {0: ("Height (measured)", gwy_field())})
+    field = read_height_field(tmp_path / "scan.gwy")
+    np.testing.assert_allclose(field.heights, HEIGHTS, rtol=1e-14)
+    assert field.pixel_size == pytest.approx((1.0, 2.0))
+    assert field.source == "scan.gwy, Height (measured)"
+    assert read_height_field(tmp_path / "scan.gwy", pixel_size=0.5).pixel_size == (0.5, 0.5)
+
+
+@pytest.mark.parametrize(("unit", "scale"), [("m", 1.0), ("um", 1e-6), ("µm", 1e-6), ("nm", 1e-9), ("Å", 1e-10)])
+def test_gwy_units_are_converted(tmp_path, unit, scale):
+    write_gwy(tmp_path / "scan.gwy", {3: ("Z", gwy_field(z=unit))})
+    np.testing.assert_allclose(read_height_field(tmp_path / "scan.gwy").heights, HEIGHTS * scale, rtol=1e-12)
+
+
+def test_the_channel_is_that_of_the_heights_or_the_named_one(tmp_path, refuse):
+    other = gwy_field(HEIGHTS * 2)
+    channels = {0: ("Phase", gwy_field(z="deg")), 1: ("Amplitude", other), 2: ("ZSensor", gwy_field())}
+    write_gwy(tmp_path / "scan.gwy", channels)
+    assert read_height_field(tmp_path / "scan.gwy").source == "scan.gwy, ZSensor"
+    for name in ("Amplitude", "amplitude", "ampl", 1, "1"):
+        np.testing.assert_allclose(read_height_field(tmp_path / "scan.gwy", channel=name).heights, HEIGHTS * 2)
+    refuse("scan.gwy", "0 'Phase' holds no lengths", channel="Phase")
+    refuse(
+        "scan.gwy", "channel: got 'Friction', wanted one of 0 'Phase', 1 'Amplitude', 2 'ZSensor'", channel="Friction"
+    )
+    refuse("scan.gwy", "wanted one of 0 'Phase', 1 'Amplitude'", channel="a")
+    refuse("scan.gwy", "channel: got True", channel=True)
+    write_gwy(tmp_path / "scan.gwy", {0: ("One", other), 1: ("Two", other)})
+    refuse("scan.gwy", r"channel: which of 0 'One', 1 'Two'\?")
+    write_gwy(tmp_path / "scan.gwy", {0: ("Phase", gwy_field(z="deg"))})
+    refuse("scan.gwy", "wanted a channel of heights in a unit of length, got 0 'Phase'")
+    np.save(tmp_path / "scan.npy", HEIGHTS)
+    refuse("scan.npy", "channel: got 'Height' for .npy, which holds one only", channel="Height")
+
+
+def test_a_unit_that_is_missing_is_asked_for(tmp_path, refuse):
+    write_gwy(tmp_path / "scan.gwy", {0: ("Height", gwy_field(HEIGHTS * 1e6, xy=None, z=None, xreal=3.0, yreal=4.0))})
+    refuse("scan.gwy", "unit: the file names none for the heights")
+    field = read_height_field(tmp_path / "scan.gwy", unit=("um", "nm"))
+    np.testing.assert_allclose(field.heights, HEIGHTS * 1e-3, rtol=1e-12)
+    assert field.pixel_size == pytest.approx((1.0, 2.0))
+    for wrong in ("V", ("m",), ("m", "m", "m"), 3):
+        refuse("scan.gwy", "unit: ", unit=wrong)
+    np.save(tmp_path / "scan.npy", HEIGHTS)
+    refuse("scan.npy", "unit: got 'nm' for .npy", unit="nm")
+
+
+DOUBLES = struct.pack("<I", 6) + np.zeros(6).tobytes()
+GOOD = (
+    component("xres", "i", struct.pack("<i", 3))
+    + component("yres", "i", struct.pack("<i", 2))
+    + component("xreal", "d", struct.pack("<d", 1))
+    + component("yreal", "d", struct.pack("<d", 1))
+    + component("data", "D", DOUBLES)
+)
+
+
+def in_field(inside):
+    return gwy_bytes(component("/0/data", "o", b"GwyDataField\0" + struct.pack("<I", len(inside)) + inside))
+
+
+@pytest.mark.parametrize(
+    ("content", "text"),
+    [
+        (b"GWYQ" + bytes(30), "not a Gwyddion file"),
+        (b"GWYO" + bytes(30), "not a Gwyddion file"),
+        (b"GWYPGwyContainer", "text without an end"),
+        (gwy_bytes(b"")[:-1], "truncated"),
+        (gwy_bytes(b"", b"GwyGraph"), "wanted a GwyContainer"),
+        (gwy_bytes(b""), "got none"),
+        (gwy_bytes(component("a", "S", struct.pack("<I", 2**31 - 1) + b"x\0")), "text without an end"),
+        (gwy_bytes(component("a", "O", struct.pack("<I", 2**31 - 1))), "text without an end"),
+        (gwy_bytes(component("a", "D", struct.pack("<I", 2**32 - 1))), "truncated"),
+        (gwy_bytes(component("a", "C", struct.pack("<I", 2**32 - 1))), "truncated"),
+        (gwy_bytes(component("a", "z", b"")), "unknown type 'z'"),
+        (gwy_bytes(component("a", "o", b"B\0" + struct.pack("<I", 99))), "truncated"),
+        (gwy_bytes(b"\xff\xfe\0ix"), "decode"),
+        (in_field(GOOD.replace(b"xres\0i\x03", b"xres\0i\x04")), "4 × 2 pixels with 6 heights"),
+        (in_field(GOOD.replace(b"xres\0i\x03\0\0\0", b"xres\0i\xff\xff\xff\xff")), "data field of -1 × 2"),
+        (in_field(GOOD.replace(struct.pack("<d", 1), struct.pack("<d", np.nan))), "size"),
+        (in_field(b""), "data field of None"),
+    ],
+)
+def test_gwy_files_with_wrong_sizes_are_refused_at_once(tmp_path, refuse, content, text):
+    (tmp_path / "scan.gwy").write_bytes(content)
+    start = time.perf_counter()
+    refuse("scan.gwy", text, unit="m")
+    assert time.perf_counter() - start < 5
+
+
+def test_gwy_of_great_depth_or_many_parts_is_parsed_at_once(tmp_path, refuse):
+    deep = b""
+    for _ in range(5000):
+        deep = component("b", "o", b"A\0" + struct.pack("<I", len(deep)) + deep)
+    many = b"".join(component(str(k), "i", bytes(4)) for k in range(100_000))
+    (tmp_path / "scan.gwy").write_bytes(
+        gwy_bytes(component("a", "o", b"A\0" + struct.pack("<I", len(deep)) + deep) + many)
+    )
+    start = time.perf_counter()
+    refuse("scan.gwy", "got none")
+    assert time.perf_counter() - start < 5
+
+
+# ---------------------------------------------------------------- Gwyddion's simple field
+
+GSF = "Gwyddion Simple Field 1.0\nXRes = 3\nYRes = 2\nXReal = 3e-6\nYReal = 4e-6\nXYUnits = m\nZUnits = m\nTitle = Z\n"
+
+
+def write_gsf(path, header=GSF, heights=HEIGHTS * 1e-6):
+    text = header.encode()
+    path.write_bytes(text + bytes(4 - len(text) % 4) + np.asarray(heights, "<f4").tobytes())
+
+
+@pytest.mark.parametrize("padding", range(4))
+def test_gsf_is_read_at_every_padding(tmp_path, padding):
+    write_gsf(tmp_path / "scan.gsf", GSF + f"Comment = {'x' * padding}\n")
+    field = read_height_field(tmp_path / "scan.gsf")
+    np.testing.assert_allclose(field.heights, HEIGHTS, rtol=1e-6)
+    assert field.pixel_size == pytest.approx((1.0, 2.0))
+    assert field.source == "scan.gsf, Z"
+
+
+def test_gsf_without_a_scale_asks_for_it(tmp_path, refuse):
+    write_gsf(tmp_path / "scan.gsf", "Gwyddion Simple Field 1.0\nXRes = 3\nYRes = 2\n", HEIGHTS * 1e3)
+    refuse("scan.gsf", "unit: the file names none for its heights")
+    refuse("scan.gsf", "pixel_size: the file has none", pixel_size=None, unit="nm")
+    field = read_height_field(tmp_path / "scan.gsf", 0.1, unit="nm")
+    np.testing.assert_allclose(field.heights, HEIGHTS, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "text"),
+    [
+        ("1.0", "2.0", "not a Gwyddion Simple Field"),
+        ("XRes = 3", "XRes = 4", "bytes, wanted"),
+        ("XRes = 3", "XRes = 999999999", "wanted at most"),
+        ("XRes = 3", "XRes = -3", "XRes: got -3"),
+        ("XRes = 3\n", "", "XRes: got none"),
+        ("XReal = 3e-6", "XReal = wide", "XReal: got wide"),
+        ("XReal = 3e-6", "XReal = -1", "XReal: got -1"),
+        ("ZUnits = m", "ZUnits = V", "ZUnits: got the unit 'V'"),
+        ("Title = Z", "Title", "wanted 'name = value'"),
+    ],
+)
+def test_wrong_gsf_headers_are_refused(tmp_path, refuse, old, new, text):
+    write_gsf(tmp_path / "scan.gsf", GSF.replace(old, new))
+    refuse("scan.gsf", text)
+
+
+# ---------------------------------------------------------------- text
+
+
+def points(heights=HEIGHTS, d_x=0.1, d_y=0.2, order=None, digits=8):
+    y, x = np.mgrid[: heights.shape[0], : heights.shape[1]]
+    table = np.stack([5 + x.ravel() * d_x, -3 + y.ravel() * d_y, heights.ravel()], axis=1)
+    table = table if order is None else table[order]
+    return "\n".join(" ".join(f"{value:.{digits}g}" for value in line) for line in table) + "\n"
+
+
+@pytest.mark.parametrize("delimiter", [" ", "\t", ", ", ";"])
+def test_points_are_read_in_any_order(tmp_path, delimiter):
+    text = "# made by hand\n" + points(order=[4, 2, 0, 1, 5, 3]).replace(" ", delimiter)
+    (tmp_path / "scan.xyz").write_text(text)
+    field = read_height_field(tmp_path / "scan.xyz", unit="um")
+    np.testing.assert_allclose(field.heights, HEIGHTS)
+    assert field.pixel_size == pytest.approx((0.1, 0.2))
+    # Along the surface in micrometres, the heights in nanometres.
+    np.testing.assert_allclose(read_height_field(tmp_path / "scan.xyz", unit=("um", "nm")).heights, HEIGHTS * 1e-3)
+
+
+def test_points_with_rounded_coordinates_are_read(tmp_path):
+    heights = np.random.default_rng(0).random((40, 50))
+    (tmp_path / "scan.xyz").write_text(points(heights, 0.0123, 0.0234, digits=4))
+    field = read_height_field(tmp_path / "scan.xyz", unit="um")
+    np.testing.assert_allclose(field.heights, heights, rtol=1e-3)
+    assert field.pixel_size == pytest.approx((0.0123, 0.0234), rel=1e-3)
+
+
+def test_absent_points_are_missing_pixels(tmp_path, refuse):
+    (tmp_path / "scan.xyz").write_text(points(order=[0, 2, 3, 4, 5]))
+    refuse("scan.xyz", "1 of 6 pixels are missing or not finite, the first at row 0, column 1", unit="um")
+    assert read_height_field(tmp_path / "scan.xyz", unit="um", keep_missing=True).gaps.sum() == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("1 2\n3 4\n", "got 2 numbers in a line, wanted three"),
+        ("0 0 1\n0 1\n", "not a table of numbers"),
+        ("0 0 1\nNo Data\n", "not a table of numbers"),
+        ("# nothing\n", "holds no numbers"),
+        ("0 0 1\n0 0 2\n1 0 1\n1 1 1", "two points at one place"),
+        ("0 0 1\n1 0 2\n1.4 1 1\n3 1 1", "regular grid"),
+        ("0 nan 1\n1 0 2\n", "without x or y"),
+        (" ".join(map(str, [0, 0, 1])) + "\n100 100 1\n1 1 1\n2 2 1\n", "wanted a regular grid"),
+        ("0 0 1\0", "zero bytes"),
+        ("0 0 1,5\n", "table of numbers|numbers in a line"),
+    ],
+)
+def test_points_that_are_no_grid_are_refused(tmp_path, refuse, text, message):
+    (tmp_path / "scan.xyz").write_text(text)
+    refuse("scan.xyz", message, unit="um")
+
+
+def test_points_need_a_unit_and_a_line_a_pixel_size(tmp_path, refuse):
+    (tmp_path / "scan.xyz").write_text(points())
+    refuse("scan.xyz", "unit: .xyz names none")
+    (tmp_path / "scan.xyz").write_text(points(HEIGHTS[:1]))
+    refuse("scan.xyz", "pixel_size: the file has none", pixel_size=None, unit="um")
+    assert read_height_field(tmp_path / "scan.xyz", (0.1, 1.0), unit="um").shape == (1, 3)
+
+
+MATRIX = "\n".join("\t".join(str(h * 1e-6) for h in row) for row in HEIGHTS)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "latin-1"])
+def test_a_table_exported_by_gwyddion_is_read(tmp_path, encoding):
+    header = "# Channel: Height (forward)\n# Width: 0.300 µm\n# Height: 400 nm\n# Value units: m\n"
+    (tmp_path / "scan.asc").write_bytes((header + MATRIX).encode(encoding))
+    field = read_height_field(tmp_path / "scan.asc")
+    np.testing.assert_allclose(field.heights, HEIGHTS)
+    assert field.pixel_size == pytest.approx((0.1, 0.2))
+    assert field.source == "scan.asc, Height (forward)"
+
+
+def test_lengths_of_a_header_without_a_unit_are_in_the_given_one(tmp_path):
+    (tmp_path / "scan.asc").write_text("# Width: 50\n# Height: 2.50\n1 2 3 4 5\n")
+    assert read_height_field(tmp_path / "scan.asc", unit="nm").pixel_size == pytest.approx((0.01, 0.0025))
+
+
+@pytest.mark.parametrize("width", ["a" + " " * 200_000 + "b", "1" * 200_000 + " x y"])
+def test_a_header_line_of_any_length_is_read_at_once(tmp_path, refuse, width):
+    (tmp_path / "scan.asc").write_text(f"# Width: {width}\n# Height: 1 m\n1 2\n")
+    start = time.perf_counter()
+    refuse("scan.asc", "the header: got", unit="m")
+    assert time.perf_counter() - start < 5
+
+
+def test_a_bare_table_asks_for_its_scale(tmp_path, refuse):
+    (tmp_path / "scan.asc").write_text(MATRIX)
+    refuse("scan.asc", "unit: the file names none")
+    refuse("scan.asc", "pixel_size: the file has none", pixel_size=None, unit="m")
+    np.testing.assert_allclose(read_height_field(tmp_path / "scan.asc", 0.1, unit="m").heights, HEIGHTS)
+
+
+def test_a_table_that_may_be_points_is_refused(tmp_path, refuse):
+    (tmp_path / "scan.asc").write_text(points())
+    refuse("scan.asc", "wanted the extension .xyz", unit="um")
+
+
+ESRI = "ncols 3\nnrows 2\nxllcorner 10\nyllcorner 20\ncellsize 0.1\nNODATA_value -9999\n"
+
+
+def test_an_esri_grid_comes_from_the_top_down(tmp_path, refuse):
+    (tmp_path / "scan.asc").write_text(ESRI + "1 2 3\n4 -9999 6\n")
+    field = read_height_field(tmp_path / "scan.asc", unit=("um", "nm"), keep_missing=True)
+    np.testing.assert_allclose(field.heights, np.array([[4, np.nan, 6], [1, 2, 3]]) * 1e-3)
+    assert field.pixel_size == pytest.approx((0.1, 0.1))
+    refuse("scan.asc", "unit: an ESRI grid names none")
+    (tmp_path / "scan.asc").write_text(ESRI + "1 2 3\n")
+    refuse("scan.asc", "got 1 lines of 3, wanted 2 of 3", unit="um")
+    (tmp_path / "scan.asc").write_text("ncols 3\nnrows\n1 2 3\n")
+    refuse("scan.asc", "the header: got the line 'nrows'", unit="um")
+    (tmp_path / "scan.asc").write_text("ncols 3\nnrows 1\n1 2 3\n")
+    refuse("scan.asc", "wanted ncols, nrows and cellsize", unit="um")
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("scan.xyz", "1e308 0 1\n-1e308 0 2\n", "x goes from -1e\\+308 to 1e\\+308"),
+        ("scan.xyz", "0 0 1e308\n1 0 1\n", "1 of 2 pixels are missing or not finite"),
+        ("scan.asc", "# Value units: m\n1e308 2\n", "1 of 2 pixels are missing or not finite"),
+        ("scan.asc", "1e308 0 1\n-1e308 0 2\n0 0 1\n", "2 of 9 pixels are missing or not finite"),
+        ("scan.asc", "0 inf 1\n1 nan 2\n", "2 of 6 pixels are missing or not finite"),
+    ],
+)
+def test_numbers_beyond_those_of_a_float_are_refused_in_one_line(tmp_path, refuse, name, text, message):
+    (tmp_path / name).write_text(text)
+    refuse(name, message, unit="m")
+
+
+def test_signalling_numbers_are_missing_pixels(tmp_path, refuse):
+    """A bit pattern that complains when it is turned into a double."""
+    write_gsf(tmp_path / "scan.gsf")
+    content = (tmp_path / "scan.gsf").read_bytes()
+    (tmp_path / "scan.gsf").write_bytes(content[:-4] + b"\x01\x00\x80\x7f")
+    refuse("scan.gsf", "1 of 6 pixels are missing or not finite")
+
+
+# ---------------------------------------------------------------- damaged files of these formats
+
+
+def write_each(path):
+    if path.suffix == ".gwy":
+        write_gwy(path, {0: ("Height", gwy_field())})
+    elif path.suffix == ".gsf":
+        write_gsf(path)
+    elif path.suffix == ".xyz":
+        path.write_text(points())
+    else:
+        path.write_text(ESRI + "1 2 3\n4 5 6\n")
+
+
+@pytest.mark.parametrize("name", ["scan.gwy", "scan.gsf"])
+def test_every_cut_of_a_binary_file_is_refused(tmp_path, refuse, name):
+    write_each(tmp_path / name)
+    whole = (tmp_path / name).read_bytes()
+    for length in range(len(whole)):
+        (tmp_path / name).write_bytes(whole[:length])
+        refuse(name, name, unit="m")
+
+
+@settings(max_examples=200, deadline=None)
+@given(name=st.sampled_from(["scan.gwy", "scan.gsf", "scan.xyz", "scan.asc"]), data=st.data())
+def test_changed_bytes_give_heights_or_one_line(tmp_path_factory, name, data):
+    path = tmp_path_factory.mktemp("changed") / name
+    write_each(path)
+    content = bytearray(path.read_bytes())
+    for _ in range(data.draw(st.integers(1, 4))):
+        content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+    path.write_bytes(content)
+    try:
+        message = ""
+        assert np.isfinite(read_height_field(path, 0.1, unit="um").heights).all()
+    except ValueError as error:
+        message = str(error)
+    assert not message or (name in message and "\n" not in message)
