@@ -22,8 +22,18 @@ from ..spectrum.orders import LobeAxis
 from ..spectrum.tables import HALF_SCALE, SeriesTable, SliceTable, shared_exponents
 from .cell_sampler import LOBE, CellAxis, CellSampler
 from .geometry import Geometry, Incidence
-from .inversion import CELLS, KappaCells, averages, choose, search, sums_before, truncated_gaussian
-from .tables import HalfTable, PacketTable, SharedExponentTable, ShareTable, larger, limited, opaque
+from .inversion import CELLS, KappaCells, averages, choose, diffracted_averages, search, sums_before, truncated_gaussian
+from .tables import (
+    BELOW_ONE,
+    FloatTable,
+    HalfTable,
+    PacketTable,
+    SharedExponentTable,
+    ShareTable,
+    larger,
+    limited,
+    opaque,
+)
 
 # Linear interpolation of g_n(κ) errs by less than this share of its largest value.
 _WEIGHT_ERROR = 1e-5
@@ -240,6 +250,7 @@ def _weights(table: SeriesTable) -> np.ndarray:
 
 
 FLOOR = 0.05  # the share of each κ cell that all orders have alike
+STEPS = 256  # over κ, in the table of the undiffracted order
 WHOLE = 2**24  # a float32 holds whole numbers up to here
 LARGEST_TABLE = 2**19  # packets (8 MB); where the sums over rectangles take more, all orders can be drawn
 
@@ -249,6 +260,9 @@ class OrderSampler:
 
     The A_jm are whole numbers of units 2⁻²⁴, so that sums over rectangles are exact: the probability of what is drawn
     is the probability that is reported.
+
+    Where light passes the grating, the undiffracted order is drawn apart, as κ of that order is known; the others with
+    `diffracted_averages`, w_j times the sum over the orders and κ_0²/κ_j² of transmitted light.
     """
 
     def __init__(self, spectrum: GratingSpectrum, most: float | None = None) -> None:
@@ -257,7 +271,18 @@ class OrderSampler:
         self.largest_x, self.largest_y = spectrum.grid.largest
         self.tile_x, self.tile_y = (opaque(t) for t in spectrum.grid.tile_size)
         self.restricted = (self.largest_x + 1) ** 2 * (self.rows + 1) <= LARGEST_TABLE
-        units = np.stack([_units(average) for average in averages(spectrum, self.cells, FLOOR)], axis=-1)
+        self.undiffracted = None
+        if most is None:
+            shares = averages(spectrum, self.cells, FLOOR)
+        else:
+            shares, sums = diffracted_averages(spectrum, self.cells, FLOOR)
+            self.sums = mi.Vector4f(*map(float, sums / WHOLE))
+            dr.make_opaque(self.sums)
+            kappas = np.linspace(0, spectrum.largest_kappa, STEPS + 1)
+            middle = tuple(n // 2 for n in spectrum.grid.shape)
+            self.undiffracted = FloatTable(np.array([max(spectrum.powers(kappa)[middle], 0) for kappa in kappas]))
+            self.per_kappa = opaque(STEPS / spectrum.largest_kappa)
+        units = np.stack([_units(average) for average in shares], axis=-1)
         self.shares = PacketTable(units)
         # The sums of A_j over the columns before x, for each row.
         before_x = np.zeros((self.rows, self.columns + 1, CELLS), np.int64)
@@ -296,17 +321,29 @@ class OrderSampler:
         # The mirror order m = 0 is always among them.
         return dr.clip(first, -largest, 0) + largest, dr.clip(last, 0, largest) + (largest + 1)
 
-    def weights(self, incidence: Incidence, active: mi.Bool) -> mi.Vector4f:
-        """w_j / Σ_j w_j M_j for one wavelength.
+    def _weights(self, incidence: Incidence, active: mi.Bool) -> tuple[mi.Vector4f, mi.Float]:
+        """Return w_j and the power of the undiffracted order where it is drawn apart, else zero; not normalised."""
+        weights = self.cells.weights(incidence)
+        if self.undiffracted is None:
+            return weights, mi.Float(0.0)
+        kappa = incidence.kappas[0]
+        step = dr.minimum(mi.UInt32(dr.fma(kappa, self.per_kappa, 0.5)), STEPS)
+        raised = dr.select(incidence.reflects, 1, dr.square(kappa) / self.cells.squares)
+        undiffracted = dr.select(incidence.square > 0, larger(self.undiffracted(step, active), 1e-3), 0)
+        return weights * self.sums * raised, undiffracted
+
+    def weights(self, incidence: Incidence, active: mi.Bool) -> tuple[mi.Vector4f, mi.Float]:
+        """Return w_j / (P_0 + Σ_j w_j M_j) and P_0 / (P_0 + Σ_j w_j M_j) for one wavelength.
 
         Args:
             incidence: the wavelength and where it comes from.
             active: mask.
         """
-        weights = self.cells.weights(incidence)
+        weights, undiffracted = self._weights(incidence, active)
         bottom, top, left, right = self.rectangle(incidence)
-        total = dr.dot(weights, self._masses(bottom, top, self._start(left, right), active))
-        return weights * dr.rcp(larger(total, 1))
+        total = undiffracted + dr.dot(weights, self._masses(bottom, top, self._start(left, right), active))
+        per = dr.rcp(larger(total, 1e-7))
+        return weights * per, undiffracted * per
 
     def _start(self, left: mi.Int32, right: mi.Int32) -> mi.Int32:
         """Where the sums over the rows begin in their table."""
@@ -319,9 +356,12 @@ class OrderSampler:
         masses = self.before_y(mi.UInt32(start + top), active)
         return masses - self.before_y(mi.UInt32(start + bottom), active) if self.rows > 1 else masses
 
-    def share(self, order: mi.UInt32, weights: mi.Vector4f, active: mi.Bool) -> mi.Float:
-        """P_m of the order with flat index `order`, which is among those of the rectangle."""
-        return dr.dot(self.shares(order, active), weights)
+    def share(self, order: mi.UInt32, weights: tuple[mi.Vector4f, mi.Float], active: mi.Bool) -> mi.Float:
+        """Return P_m of the order with flat index `order`, which is among those of the rectangle."""
+        share = dr.dot(self.shares(order, active), weights[0])
+        if self.undiffracted is None:
+            return share
+        return share + dr.select(order == self.largest_y * self.columns + self.largest_x, weights[1], 0)
 
     def sample(
         self,
@@ -340,7 +380,13 @@ class OrderSampler:
         bottom, top, left, right = self.rectangle(incidence)
         start = self._start(left, right)
         masses = self._masses(bottom, top, start, active)
-        cell, u = choose(self.cells.weights(incidence) * masses, u)
+        weights, undiffracted = self._weights(incidence, active)
+        shares = weights * masses
+        if self.undiffracted is not None:
+            apart = undiffracted / larger(undiffracted + dr.sum(shares), 1e-7)
+            is_undiffracted = u < apart
+            u = limited((u - apart) / larger(1 - apart, 1e-7), 0, BELOW_ONE)
+        cell, u = choose(shares, u)
 
         def before_y(y: mi.Int32) -> mi.Float:
             return self.before_y.entry(mi.UInt32(start + y), cell, active)
@@ -351,10 +397,14 @@ class OrderSampler:
         if self.rows == 1:
             row = mi.Int32(0)
             column, _ = search(before_x, left, right, self.columns, u)
-            return row, column, v
-        row, _ = search(before_y, bottom, top, self.rows, u)
-        column, rest = search(before_x, left, right, self.columns, v.x)
-        return row, column, mi.Point2f(rest, v.y)
+        else:
+            row, _ = search(before_y, bottom, top, self.rows, u)
+            column, rest = search(before_x, left, right, self.columns, v.x)
+            v = mi.Point2f(rest if self.undiffracted is None else dr.select(is_undiffracted, v.x, rest), v.y)
+        if self.undiffracted is not None:
+            row = dr.select(is_undiffracted, self.largest_y, row)
+            column = dr.select(is_undiffracted, self.largest_x, column)
+        return row, column, v
 
 
 def _units(average: NDArray[np.float64]) -> NDArray[np.int64]:

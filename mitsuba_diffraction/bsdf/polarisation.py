@@ -9,7 +9,6 @@ from collections.abc import Callable, Sequence
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 Split = Callable[..., "mi.Spectrum"]
 """The Mueller matrix of a grating, from (source, exit, source's x axis, exit's x axis)."""
@@ -103,15 +102,14 @@ def of_interface(value: mi.UnpolarizedSpectrum, eta: mi.Float) -> Split:
         n_i, n_o = (dr.select(omega.z > 0, 1, eta) for omega in (source, exit_))
         reflects = (source.z > 0) == (exit_.z > 0)
         half = dr.normalize(n_i * source + n_o * exit_)
-        cos_half = mi.UnpolarizedSpectrum(dr.abs(dr.dot(source, half)))
-        other = mi.UnpolarizedSpectrum(dr.select(reflects, dr.square(eta) / n_i, n_o) / n_i)
-        back = mi.mueller.specular_reflection(cos_half, mi.Complex2f(other[0], 0))
+        cos_half = dr.abs(dr.dot(source, half))
+        other = dr.select(reflects, dr.select(source.z > 0, eta, dr.rcp(eta)), n_o / n_i)
+        back = mi.mueller.specular_reflection(cos_half, mi.Complex2f(other, 0))
         on = mi.mueller.specular_transmission(cos_half, other)
-        plane = dr.select(reflects, back, on)
-        bright = dr.select(plane[0, 0] > 0, plane[0, 0], 1)
-        matrix = mi.Spectrum(0.0)
-        for i, j in np.ndindex(4, 4):
-            matrix[i, j] = value * plane[i, j] / bright
+        bright = dr.select(reflects, back[0, 0], on[0, 0])
+        per = dr.rcp(dr.select(bright > 0, bright, 1))
+        entries = [[dr.select(reflects, back[i, j], on[i, j]) * per for j in range(4)] for i in range(4)]
+        matrix = _matrix(value, [entries] * len(value))
         across = mi.coordinate_system(half)[0]
         axes = [dr.cross(half, -source), dr.cross(half, exit_)]
         axes[1] *= dr.select(reflects | (dr.dot(axes[0], axes[1]) > 0), mi.Float(1), -1)

@@ -113,9 +113,10 @@ class ScalarTheory:
         self.energy = self.tables.energy(self.height_scale) if conserves else None
         self.interface = None
         if self.media.eta is not None:
-            # Half of the first interval of κ; of the undiffracted order, κ is larger at all wavelengths.
+            # A quarter of the first interval of κ, where the table's error weighs as little as that of the line; of the
+            # undiffracted order, κ is larger at all wavelengths.
             undiffracted = 1.6e3 * np.pi * abs(self.media.eta - 1) / VISIBLE[1] * self.media.outside * scale
-            least = opaque(min(self.spectrum.table.first_interval / 2, max(undiffracted, 1e-6)))
+            least = opaque(min(self.spectrum.table.first_interval / 4, max(undiffracted, 1e-6)))
             self.interface = Interface(self.material.eta, self.media.transmission == "sheet", least)
 
     def parameters_changed(self, keys: list[str]) -> None:
