@@ -1,0 +1,274 @@
+"""Light that passes a dielectric relief, against closed forms, Mitsuba's own interfaces and quadrature."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+import scipy.special
+from bsdf_support import direction, interaction, use, vectors
+
+import mitsuba_diffraction as md
+
+PERIOD, ETA, WAVELENGTH = 3.35, 1.5, 0.5
+IMPORTANCE = mi.TransportMode.Importance
+KINDS = ["interface", "sheet"]
+
+
+@pytest.fixture(autouse=True)
+def llvm():
+    use("llvm_ad_spectral")
+
+
+def passing(kind, profile="sinusoidal", depth=0.5, **parameters):
+    return mi.load_dict(
+        {
+            "type": "diffraction_grating",
+            "profile": profile,
+            "period": PERIOD,
+            "depth": depth,
+            "int_ior": ETA,
+            "ext_ior": 1.0,
+            "transmission": kind,
+            **parameters,
+        }
+    )
+
+
+def towards(theta, phi, side):
+    return np.array(direction(theta, phi)) * [1, 1, side]
+
+
+def outside(kind, side):
+    return ETA if side < 0 and kind == "interface" else 1.0
+
+
+def order_power(profile, depth, m, kappa):
+    """c_m(κ) of a profile of full depth `depth`."""
+    if profile == "sinusoidal":
+        return scipy.special.jv(m, kappa * depth / 2) ** 2
+    return np.sinc(kappa * depth / (2 * np.pi) - m) ** 2
+
+
+def fresnel(cos_i, cos_o, n_i, n_o):
+    s = (n_i * cos_i - n_o * cos_o) / (n_i * cos_i + n_o * cos_o)
+    p = (n_o * cos_i - n_i * cos_o) / (n_o * cos_i + n_i * cos_o)
+    return (s**2 + p**2) / 2
+
+
+def closed_form(kind, profile, depth, wi, m):
+    """K (1 − F) c_m of transmitted light, and the direction of the order; None where it does not propagate."""
+    side = np.sign(wi[2])
+    k_i = outside(kind, side) * wi[:2]
+    k_o = -k_i - [m * WAVELENGTH / PERIOD, 0]
+    n_out = outside(kind, -side)
+    if k_o @ k_o >= 0.999 * n_out**2:
+        return None
+    n_i, n_o = (1, ETA) if side > 0 else (ETA, 1)
+    z_i, z_o = np.sqrt(n_i**2 - k_i @ k_i), np.sqrt(n_o**2 - k_o @ k_o)
+    v = np.append(k_i + k_o, side * (z_i - z_o))
+    square = v @ v
+    a_i, a_o = (square + n_i**2 - n_o**2) / 2, (square + n_o**2 - n_i**2) / 2
+    k = abs(a_i * a_o) / (z_i * z_o * v[2] ** 2)
+    cosines = abs(a_i) / np.sqrt(square) / n_i, abs(a_o) / np.sqrt(square) / n_o
+    power = k * (1 - fresnel(*cosines, n_i, n_o)) * order_power(profile, depth, m, 2 * np.pi * v[2] / WAVELENGTH)
+    if kind == "sheet":
+        cos = np.sqrt(1 - k_o @ k_o) if side > 0 else abs(wi[2])
+        power *= 1 - fresnel(cos, np.sqrt(1 - (1 - cos**2) / ETA**2), 1, ETA)
+    return power, np.append(k_o, -side * np.sqrt(n_out**2 - k_o @ k_o)) / n_out
+
+
+def power_of_order(bsdf, kind, wi, wo):
+    """The power in the lobe around ω_o, by quadrature."""
+    sigma = bsdf.spectrum.lobe_width
+    step = np.linspace(-4, 4, 33) * sigma * WAVELENGTH
+    u, v = (x.ravel() for x in np.meshgrid(step, step))
+    n = outside(kind, np.sign(wo[2]))
+    k = n * wo[:2, None] + [u, v]
+    z = n**2 - (k**2).sum(0)
+    omega = np.stack([*k, np.sign(wo[2]) * np.sqrt(np.maximum(z, 0))]) / n
+    si = interaction(wi, (WAVELENGTH * 1e3,) * 4, omega.shape[1])
+    value = np.array(bsdf.eval(mi.BSDFContext(IMPORTANCE), si, vectors(omega.T)))[0]
+    # dk² = n² cos θ dω.
+    return (value / np.maximum(n**2 * abs(omega[2]), 1e-6) * (z > 0)).sum() * (step[1] - step[0]) ** 2
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(("profile", "depth"), [("sinusoidal", 0.5), ("blazed", 0.5), ("blazed", 0.8)])
+@pytest.mark.parametrize(("theta", "phi"), [(0, 0), (25, 40), (50, 200)])
+def test_orders_have_the_powers_of_the_closed_form(kind, profile, depth, theta, phi):
+    bsdf = passing(kind, profile, depth, conserve_energy=False)
+    for side in (1, -1):
+        wi = towards(theta, phi, side)
+        found, wanted = [], []
+        for m in range(-14, 15):
+            if (order := closed_form(kind, profile, depth, wi, m)) is not None:
+                wanted.append(order[0])
+                found.append(power_of_order(bsdf, kind, wi, order[1]))
+        assert len(wanted) > 5
+        assert np.abs(np.subtract(found, wanted)).sum() < 0.005 * max(1, np.sum(wanted))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("profile", ["sinusoidal", "blazed"])
+def test_transmission_is_reciprocal(kind, profile):
+    bsdf = passing(kind, profile)
+    rng = np.random.default_rng(4)
+    count = 4096
+    wi = rng.normal(size=(count, 3))
+    wi /= np.linalg.norm(wi, axis=1, keepdims=True)
+    n_i = np.where(wi[:, 2] < 0, outside(kind, -1), 1.0)
+    n_o = np.where(wi[:, 2] > 0, outside(kind, -1), 1.0)
+    # Directions near orders: elsewhere both are zero.
+    m = rng.integers(-4, 5, count)
+    k = -n_i[:, None] * wi[:, :2] - np.stack([m * WAVELENGTH / PERIOD, 0 * m], -1) + rng.normal(size=(count, 2)) * 2e-3
+    z = n_o**2 - (k**2).sum(-1)
+    keep = (z > 0.01) & (abs(wi[:, 2]) > 0.1)
+    wo = np.concatenate([k, (-np.sign(wi[:, 2]) * np.sqrt(np.maximum(z, 0)))[:, None]], -1)[keep] / n_o[keep, None]
+    wi, n_i, n_o = wi[keep], n_i[keep], n_o[keep]
+    ctx, wavelengths = mi.BSDFContext(IMPORTANCE), (WAVELENGTH * 1e3,) * 4
+
+    def f(i, o):
+        value = np.array(bsdf.eval(ctx, interaction(i, wavelengths, len(i)), vectors(o)))[0]
+        return value / abs(o[:, 2])
+
+    there, back = f(wi, wo) / n_o**2, f(wo, wi) / n_i**2
+    assert (there > 1).sum() > 200
+    np.testing.assert_allclose(there, back, rtol=1e-4, atol=1e-4 * there.max())
+    # Radiance is scaled by the squared ratio of the indices.
+    radiance = np.array(bsdf.eval(mi.BSDFContext(), interaction(wi, wavelengths, len(wi)), vectors(wo)))[0]
+    np.testing.assert_allclose(radiance, there * abs(wo[:, 2]) * n_i**2, rtol=1e-5, atol=1e-5 * radiance.max())
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("side", [1, -1])
+@pytest.mark.parametrize("component", [0, 1])
+def test_samples_follow_the_density_on_both_sides(kind, side, component):
+    bsdf = passing(kind, "sinusoidal", 0.4, coherence_length=6.0)
+    wi, wavelengths = towards(35, 20, side), (450.0, 500.0, 550.0, 650.0)
+    ctx = mi.BSDFContext()
+    ctx.component = component
+    goes = side if component == 0 else -side
+
+    def sample(points):
+        bs, _ = bsdf.sample(
+            ctx, interaction(wi, wavelengths, dr.width(points)), points.x, mi.Point2f(points.y, points.z)
+        )
+        keep = bs.pdf > 0
+        assert not dr.any(keep & (bs.wo.z * goes <= 0))
+        return dr.select(keep, mi.Vector2f(bs.wo.x, bs.wo.y), 0), dr.select(keep, mi.Float(1), 0)
+
+    def density(p):
+        z = dr.safe_sqrt(1 - dr.squared_norm(p))
+        pdf = bsdf.pdf(ctx, interaction(wi, wavelengths, dr.width(p)), mi.Vector3f(p.x, p.y, goes * z))
+        return dr.select(z > 0, pdf / z, 0)
+
+    test = mi.chi2.ChiSquareTest(
+        mi.chi2.PlanarDomain(), sample, density, sample_dim=3, sample_count=400_000, res=41, ires=64
+    )
+    assert test.run(significance_level=0.01, test_count=8, quiet=True), test.messages
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_samples_name_their_component_and_index(kind):
+    bsdf = passing(kind)
+    assert bsdf.component_count() == (3 if kind == "sheet" else 2)
+    assert mi.has_flag(bsdf.flags(), mi.BSDFFlags.GlossyTransmission)
+    count = 4096
+    u = np.random.default_rng(1).random((3, count)).astype(np.float32)
+    for side in (1, -1):
+        wi = towards(30, 10, side)
+        bs, _ = bsdf.sample(mi.BSDFContext(), interaction(wi, count=count), mi.Float(u[0]), mi.Point2f(u[1:]))
+        passes = np.array(bs.wo)[2] * wi[2] < 0
+        assert 0.5 < passes.mean() < 0.99
+        names = np.where(passes, int(mi.BSDFFlags.GlossyTransmission), int(mi.BSDFFlags.GlossyReflection))
+        drawn = (np.array(bs.pdf) > 0) & (np.array(bs.sampled_type) != int(mi.BSDFFlags.DeltaReflection))
+        np.testing.assert_array_equal(np.array(bs.sampled_type)[drawn], names[drawn])
+        np.testing.assert_array_equal(np.array(bs.sampled_component)[drawn], passes[drawn])
+        eta = np.where(passes, outside(kind, -side) / outside(kind, side), 1)
+        np.testing.assert_allclose(np.array(bs.eta)[drawn], eta[drawn], rtol=1e-6)
+
+
+def test_the_flat_face_of_a_sheet_is_a_mirror():
+    bsdf, plane = passing("sheet"), mi.load_dict({"type": "dielectric", "int_ior": ETA, "ext_ior": 1.0})
+    ctx = mi.BSDFContext()
+    ctx.component = 2
+    wi = towards(60, 20, -1)
+    bs, weight = bsdf.sample(ctx, interaction(wi), 0.3, mi.Point2f(0.2, 0.7))
+    np.testing.assert_allclose(np.ravel(bs.wo), wi * [-1, -1, 1], atol=1e-6)
+    ctx.component = 0
+    _, wanted = plane.sample(ctx, interaction(wi * [1, 1, -1]), 0.3, mi.Point2f(0.2, 0.7))
+    np.testing.assert_allclose(np.ravel(weight), np.ravel(wanted), rtol=1e-5)
+    assert bs.sampled_type[0] == int(mi.BSDFFlags.DeltaReflection)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "named"),
+    [
+        ({"transmission": "both"}, "transmission: got 'both'"),
+        ({"transmission": "sheet", "material": "Al"}, "material: got 'Al' with transmission=sheet"),
+        ({"transmission": "sheet", "int_ior": 1.5, "coat_ior": 1.4}, "coat_ior: got 1.4"),
+        ({"transmission": "interface", "base": {"type": "diffuse"}}, "base: got a BSDF"),
+        ({"transmission": "interface", "int_ior": 1.33, "ext_ior": 1.33}, "int_ior: got that of the outside"),
+        ({"transmission": "interface", "fresnel": "schlick"}, "fresnel: got 'schlick'"),
+    ],
+)
+def test_what_light_cannot_pass_is_refused(parameters, named):
+    with pytest.raises(RuntimeError, match=named.replace("(", "\\(")):
+        mi.load_dict({"type": "diffraction_grating", "profile": "blazed", "period": 2.5, "depth": 0.2, **parameters})
+
+
+def test_a_spectrum_without_the_short_wavelengths_inside_is_refused():
+    spectrum = md.precompute(md.gratings.blazed(2.5, 0.2))
+    with pytest.raises(RuntimeError, match="build it from 240 nm"):
+        mi.load_dict(
+            {
+                "type": "diffraction_grating",
+                "spectrum": spectrum,
+                "int_ior": 1.5,
+                "transmission": "sheet",
+                "ext_ior": 1.0,
+            }
+        )
+
+
+@pytest.mark.parametrize("variant", ["scalar_spectral", "llvm_ad_spectral_polarized"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_other_variants_pass_the_same_light(variant, kind):
+    directions = np.array([towards(20, 30, 1), towards(50, 250, -1)])
+    u = [(0.05, 0.4, 0.6), (0.3, 0.2, 0.7), (0.8, 0.9, 0.1)]
+
+    def drawn():
+        bsdf, found = passing(kind, "blazed"), []
+        for wi in directions:
+            for one, *two in u:
+                bs, weight = bsdf.sample(mi.BSDFContext(), interaction(wi), one, mi.Point2f(*two))
+                value, pdf = bsdf.eval_pdf(mi.BSDFContext(), interaction(wi), bs.wo)
+                parts = (mi.unpolarized_spectrum(weight), mi.unpolarized_spectrum(value), bs.wo, bs.eta, pdf)
+                found.append(np.concatenate([np.ravel(np.array(part)) for part in parts]))
+        return np.array(found)
+
+    wanted = drawn()
+    use(variant)
+    np.testing.assert_allclose(drawn(), wanted, rtol=2e-3, atol=1e-4 * wanted.max())
+
+
+def test_water_shortens_wavelengths_outside():
+    """At q = m/T orders lie at sin θ = m λ/(n T)."""
+    bsdf = mi.load_dict(
+        {
+            "type": "diffraction_grating",
+            "profile": "blazed",
+            "period": 2.5,
+            "depth": 0.2,
+            "ext_ior": 1.33,
+            "int_ior": 1.5,
+        }
+    )
+    x = np.linspace(0.1, 0.4, 3001)
+    wo = np.stack([-x, 0 * x, np.sqrt(1 - x**2)], -1)
+    value = np.array(bsdf.eval(mi.BSDFContext(), interaction((0, 0, 1), (500.0,) * 4, len(x)), vectors(wo)))[0]
+    value2 = np.array(
+        bsdf.eval(mi.BSDFContext(), interaction((0, 0, 1), (500.0,) * 4, len(x)), vectors(wo * [-1, 1, 1]))
+    )[0]
+    strongest = x[np.argmax(np.maximum(value, value2))]
+    assert min(abs(strongest - m * 0.5 / 1.33 / 2.5) for m in (1, 2)) < 1e-3
