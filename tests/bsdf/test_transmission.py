@@ -8,6 +8,7 @@ import scipy.special
 from bsdf_support import direction, interaction, use, vectors
 
 import mitsuba_diffraction as md
+from mitsuba_diffraction.bsdf.transmission import Crossing, Interface
 
 PERIOD, ETA, WAVELENGTH = 3.35, 1.5, 0.5
 IMPORTANCE = mi.TransportMode.Importance
@@ -272,3 +273,33 @@ def test_water_shortens_wavelengths_outside():
     )[0]
     strongest = x[np.argmax(np.maximum(value, value2))]
     assert min(abs(strongest - m * 0.5 / 1.33 / 2.5) for m in (1, 2)) < 1e-3
+
+
+@pytest.mark.parametrize("side", [1, -1])
+@pytest.mark.parametrize("theta", [0, 30])
+def test_large_smooth_facets_are_those_of_roughdielectric(theta, side):
+    """S(q; κ) dq is the density of slopes s = −v_∥/v_z there, so that S = P(s) λ²/v_z²."""
+    alpha = 0.05
+    facets = mi.load_dict(
+        {"type": "roughdielectric", "distribution": "beckmann", "alpha": alpha, "int_ior": ETA, "ext_ior": 1.0}
+    )
+    rng = np.random.default_rng(3)
+    slope = rng.uniform(-1.5, 1.5, (500, 2)) * alpha
+    wi = towards(theta, 40, side)
+    h = np.concatenate([-slope, np.ones((500, 1))], -1)
+    h /= np.linalg.norm(h, axis=1, keepdims=True)
+    n_i, n_o = (1, ETA) if side > 0 else (ETA, 1)
+    cos = h @ wi
+    through = np.sqrt(1 - (n_i / n_o) ** 2 * (1 - cos**2))
+    wo = (-n_i * wi + (n_i * cos - np.sign(cos) * n_o * through)[:, None] * h) / n_o
+    si = interaction(wi, (500.0,) * 4, 500)
+    wanted = np.array(facets.eval(mi.BSDFContext(IMPORTANCE), si, vectors(wo)))[0]
+
+    material = mi.Float(ETA)
+    interface = Interface(material, False, mi.Float(1e-6))
+    pair = Crossing(interface.side(vectors(wi)), interface.side(vectors(wo)), mi.Float(1.0), True, mi.Float(1e-6))
+    factor = pair.order_factor(pair.tangent, mi.Float(2.0), mi.Float(1e6)) * (
+        1 - mi.fresnel(pair.cos_half(), material)[0]
+    )
+    density = np.exp(-(slope**2).sum(-1) / alpha**2) / (np.pi * alpha**2)
+    np.testing.assert_allclose(np.array(factor / dr.square(pair.w)) * density, wanted, rtol=5e-3)
