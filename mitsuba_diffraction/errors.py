@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import builtins
 import re
+from numbers import Real
 
 # An exception in a Python plugin comes as text: where the scene names the plugin, lines that are indented, then the
 # class of the exception and its message.
@@ -29,7 +30,7 @@ def is_bug(kind: type[BaseException]) -> bool:
 
 def is_number(value: object) -> bool:
     """Tell whether a parameter is a number: True and False are none."""
-    return isinstance(value, int | float) and not isinstance(value, bool)
+    return isinstance(value, Real) and not isinstance(value, bool)
 
 
 def root_cause(error: BaseException) -> str:

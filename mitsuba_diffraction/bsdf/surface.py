@@ -13,13 +13,12 @@ from pathlib import Path
 import mitsuba as mi
 
 from ..errors import RequestError
+from ..precomputation import Spectrum, load_spectrum
 from ..progress import progress_bar
 from ..recipe import Recipe
 from ..rigorous.spectrum import RigorousSpectrum
 from ..scalar_theory import scalar_error
-from ..settings import VISIBLE
-from ..spectrum.build import THEORIES
-from ..spectrum.load import Spectrum, load_spectrum
+from ..settings import THEORIES, VISIBLE
 from ..surface.gratings import COHERENCE_LENGTHS, PROFILES
 from .coat import Coat
 from .rigorous_parameters import settings_from, settings_of_medium

@@ -8,12 +8,12 @@ from typing import Annotated
 import typer
 
 from ..errors import RequestError
+from ..grating_spectrum import GratingSpectrum
+from ..precomputation import Spectrum
 from ..recipe import Recipe
 from ..rigorous.spectrum import RigorousSpectrum
 from ..scalar_theory import scalar_error
-from ..spectrum.build import REPRESENTATIONS, THEORIES
-from ..spectrum.grating_spectrum import GratingSpectrum
-from ..spectrum.load import Spectrum
+from ..settings import REPRESENTATIONS, THEORIES
 from ..surface.prepare import seam_matters, seam_steps
 from .arguments import Overwrite, check_suffix, claim
 from .console import progress_bar, tell
@@ -90,10 +90,10 @@ def precompute(
         check_suffix("-o", target, ".exr")
     reads = [file for source in sources for file in files_read(source)]
     claim(context, reads, [("-o" if output else f"spectrum of {s}", t) for s, t in zip(sources, targets, strict=True)])
-    seams = [_seam(source, recipe_of(source, of_scan, settings)) for source in sources]
-    for source, target, seam in zip(sources, targets, seams, strict=True):
+    recipes = [recipe_of(source, of_scan, settings) for source in sources]
+    seams = [_seam(source, recipe) for source, recipe in zip(sources, recipes, strict=True)]
+    for source, recipe, target, seam in zip(sources, recipes, targets, seams, strict=True):
         with progress_bar(f"spectrum of {source.name}", "%") as progress:
-            recipe = recipe_of(source, of_scan, settings)
             spectrum = recipe.build(progress)
             spectrum.save(target)
         tell(

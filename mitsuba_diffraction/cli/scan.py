@@ -64,5 +64,4 @@ def recipe_of(source: Path, of_scan: dict[str, object], settings: dict[str, obje
     if of_scan:
         names = ", ".join(f"--{name.replace('_', '-')}" for name in of_scan)
         raise RequestError(f"{names} go with a scan; the recipe {source} has its own")
-    recipe = Recipe.load(source)
-    return Recipe(recipe.surface, {**recipe.spectrum, **settings}, recipe.folder)
+    return Recipe.load(source, **settings)

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..color import daylight, spectrum_to_XYZ
+from ..grating_spectrum import GratingSpectrum
 from ..scalar_theory import geometry
 from ..settings import VISIBLE
-from ..spectrum.grating_spectrum import GratingSpectrum
 
 Array = NDArray[np.float64]
 
