@@ -40,9 +40,11 @@ class GratingSpectrum(PowerSpectrum):
 
     Attributes:
         energy: the table of E, if it came with the file; else `energy_table` makes it.
+        warning: why scalar theory is not to be trusted for the surface of a recipe; "" where it is.
     """
 
     energy: EnergyTable | None = field(default=None, repr=False)
+    warning: str = field(default="", repr=False)
 
     def energy_table(self) -> EnergyTable:
         """Return what bounds the albedo by one; made at the first call unless it came with the file."""
@@ -77,6 +79,7 @@ class GratingSpectrum(PowerSpectrum):
             "source": self.source,
             "sourceSha256": self.source_digest,
             "units": "lengths in micrometres, wavelengths in nanometres",
+            **({"warning": self.warning} if self.warning else {}),
         }
         if isinstance(self.table, SeriesTable) and self.representation == "svd":
             # repr of a float is exact.
@@ -130,6 +133,7 @@ class GratingSpectrum(PowerSpectrum):
                 patches=header["patches"],
                 scatter=_single(header["standardError"]) if header["extent"] == "sample" else None,
                 energy=EnergyTable.from_plain(json.loads(header["energy"])),
+                warning=header.get("warning", ""),
             )
         except KeyError as error:
             raise RequestError(f"{path}: a damaged spectrum, {error} is missing") from None

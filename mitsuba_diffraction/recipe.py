@@ -50,17 +50,18 @@ import warnings
 import weakref
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, suppress
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from .errors import RequestError
 from .files import cache_folder, refuse_special
-from .grating_spectrum import FORMAT_VERSION
+from .grating_spectrum import FORMAT_VERSION, GratingSpectrum
 from .precomputation import Spectrum, load_spectrum, precompute
 from .progress import Progress, no_progress, part, silent
 from .rigorous import build as rigorous
+from .scalar_theory import scalar_error
 from .settings import Settings
 from .surface.gratings import PATCHES, PROFILES
 from .surface.heightfield import HeightField
@@ -223,7 +224,11 @@ class Recipe:
     def build(self, progress: Progress = silent) -> Spectrum:
         """Compute the spectrum; `progress` is called with (steps done, steps in all)."""
         patches = self.height_fields(part(progress, 0, _OF_HEIGHTS))
-        return precompute(patches, progress=part(progress, _OF_HEIGHTS if len(patches) > 1 else 0, 1), **self.spectrum)
+        report = part(progress, _OF_HEIGHTS if len(patches) > 1 else 0, 1)
+        spectrum = precompute(patches, progress=report, **self.spectrum)
+        if isinstance(spectrum, GratingSpectrum):
+            spectrum = replace(spectrum, warning=scalar_error(patches[0], spectrum.extent).warning)
+        return spectrum
 
     def digest(self) -> str:
         """SHA-256 of everything that determines the spectrum: the recipe and the contents of the scan."""

@@ -10,6 +10,7 @@ import pytest
 import mitsuba_diffraction as md
 from mitsuba_diffraction import GratingSpectrum, Recipe
 from mitsuba_diffraction import recipe as recipe_module
+from mitsuba_diffraction.surface.readers import read_height_field
 
 SLOW = {"compact_disc", "dvd", "elaphe", "morpho_ridges", "xenopeltis", "xenopeltis_afm"}
 RECIPES = sorted((Path(__file__).parents[1] / "precompute").glob("*.toml"))
@@ -574,3 +575,52 @@ def test_a_spectrum_of_another_surface_under_a_name_of_the_cache_is_not_used(own
     assert one.cached().source_digest == one.height_field().digest
     one.cached()
     assert len(builds) == 4
+
+
+# ---------------------------------------------------------------- reading a scan
+
+
+SAMPLE = """[surface]
+scan = "scan.npy"
+pixel_size = 0.05
+[spectrum]
+extent = "sample"
+coherence_length = 0.4
+tolerance = 0.05
+"""
+
+
+@pytest.mark.parametrize(
+    ("line", "reads"),
+    [
+        ("precompute scan.npy --pixel-size 0.05 --tolerance 0.05", 1),
+        ("precompute scan.toml", 1),
+        ("inspect scan.toml", 1),
+        ("render scene.xml --spp 1 --width 4 --variant scalar_spectral --overwrite", 1),
+        ("render scene.xml --spp 1 --width 4 --variant scalar_spectral --overwrite", 0),  # from the cache
+    ],
+    ids=["precompute", "recipe", "inspect", "render", "render again"],
+)
+def test_a_command_reads_a_scan_once(tmp_path, command, monkeypatch, own_cache, line, reads):
+    counted = []
+
+    def read(path, **options):
+        counted.append(path)
+        return read_height_field(path, **options)
+
+    monkeypatch.chdir(tmp_path)
+    np.save("scan.npy", np.tile(np.sin(np.arange(24) * np.pi / 4) * 0.1, (20, 1)))
+    write(tmp_path, SAMPLE, "scan.toml")
+    grating = '<bsdf type="diffraction_grating"><string name="filename" value="scan.toml"/></bsdf>'
+    shapes = 2 * f'<shape type="rectangle">{grating}</shape>'
+    write(
+        tmp_path,
+        f'<scene version="3.0.0"><integrator type="path"/><sensor type="perspective"/>{shapes}</scene>',
+        "scene.xml",
+    )
+    if not reads:
+        Recipe.load("scan.toml").cached()
+    monkeypatch.setattr(recipe_module, "read_height_field", read)
+    code, _, err = command(line)
+    assert code == 0, err
+    assert len(counted) == reads

@@ -113,8 +113,8 @@ def define() -> type:
             self.coat = coat_from(props)
             self.spectrum, self._recipe = surface_from(props, self.coat)
             self.rigorous = isinstance(self.spectrum, RigorousSpectrum)
-            if self._recipe is not None and not self.rigorous:
-                warn_of_range(self._recipe)
+            if not self.rigorous:
+                warn_of_range(self.spectrum)
             self.reflectance = (
                 check_parameters(props, self.spectrum, self.coat)
                 if self.rigorous

@@ -12,7 +12,6 @@ from ..grating_spectrum import GratingSpectrum
 from ..precomputation import Spectrum
 from ..recipe import Recipe
 from ..rigorous.spectrum import RigorousSpectrum
-from ..scalar_theory import scalar_error
 from ..settings import REPRESENTATIONS, THEORIES
 from ..surface.prepare import seam_matters, seam_steps
 from .arguments import Overwrite, check_suffix, claim
@@ -100,10 +99,8 @@ def precompute(
             f"{target}: {spectrum.source}; {spectrum.extent}, {spectrum.grid}; coherence length "
             f"{spectrum.coherence_length:.4g} µm; {_table(spectrum)}{seam}"
         )
-        if isinstance(spectrum, GratingSpectrum):
-            beyond = scalar_error(recipe.height_field(), spectrum.extent).warning
-            if beyond:
-                tell(f"! {beyond}")
+        if isinstance(spectrum, GratingSpectrum) and spectrum.warning:
+            tell(f"! {spectrum.warning}")
 
 
 def _table(spectrum: Spectrum) -> str:

@@ -185,8 +185,8 @@ class PowerSpectrum:
     def digest(self) -> str:
         """SHA-256 of what a renderer needs of it: spectra that have one show the same."""
         content = hashlib.sha256()
-        for f in fields(self):
-            if f.name not in ("table", "energy", "source", "source_digest"):
+        for f in fields(PowerSpectrum):
+            if f.name not in ("table", "source", "source_digest"):
                 content.update(f"{f.name}={getattr(self, f.name)!r};".encode())
         for array in self.table.content():
             content.update(array.data)
