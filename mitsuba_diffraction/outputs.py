@@ -52,18 +52,16 @@ def claimed(
         ValueError: if an output is also an input, is named twice, exists and was not made for this request, or cannot
             be written.
     """
-    writes = [(option, os.fspath(path)) for option, path in writes]
-    taken = {identity: os.fspath(path) for path in reads for identity in _identities(path)}
-    planned: dict[object, str] = {}
-    for option, path in [*writes, *(("checkpoint", os.fspath(path)) for path in scratch)]:
-        identities = _identities(path)
-        for read in (taken[identity] for identity in identities & taken.keys()):
+    reads, writes = list(reads), list(writes)
+    planned: dict[str, str] = {}
+    for option, path in [*writes, *(("checkpoint", path) for path in scratch)]:
+        if read := next((read for read in reads if _is_same(path, read)), None):
             by = "" if os.path.abspath(path) == os.path.abspath(read) else f" as {read}"
             raise RequestError(f"{option}: got {path}, which is read{by} and would be lost; wanted another name")
-        identities.add(os.path.realpath(path).casefold())  # names that differ in case only may be the same file
-        for other in (planned[identity] for identity in identities & planned.keys()):
-            raise RequestError(f"{option}: {path} would be written twice, for {other} too; wanted another name")
-        planned.update(dict.fromkeys(identities, option))
+        name = os.path.realpath(path).casefold()  # names that differ in case only may be the same file
+        if name in planned:
+            raise RequestError(f"{option}: {path} would be written twice, for {planned[name]} too; wanted another name")
+        planned[name] = option
     marks = {}
     for option, path in writes:
         if not Path(path).parent.is_dir():
@@ -75,13 +73,11 @@ def claimed(
             raise RequestError(
                 f"{option}: {path} exists and was not made by this command with these options; --overwrite replaces it"
             )
-    before = dict(_claims)
     _claims.update(marks)
     try:
         yield
     finally:
         _claims.clear()
-        _claims.update(before)
 
 
 def made_for(path: str | os.PathLike[str]) -> str | None:
@@ -137,18 +133,14 @@ def save_markdown(text: str, path: str | os.PathLike[str]) -> None:
 
 def free_name(stem: str, files_of: Callable[[str], Iterable[Path]], reads: Iterable[str | os.PathLike[str]]) -> str:
     """A default name: the first of `stem`, `stem`_2, … none of whose files (`files_of`) is an input."""
-    taken = {identity for path in reads for identity in _identities(path)}
+    reads = list(reads)
     names = (stem if number == 1 else f"{stem}_{number}" for number in itertools.count(1))
-    return next(name for name in names if not any(taken & _identities(path) for path in files_of(name)))
+    return next(name for name in names if not any(_is_same(path, read) for path in files_of(name) for read in reads))
 
 
-def _identities(path: str | os.PathLike[str]) -> set[object]:
-    """Identifies a file independently of its name: resolves symbolic and hard links."""
-    found: set[object] = {os.path.realpath(path)}
-    if os.path.exists(path):
-        status = os.stat(path)
-        found.add((status.st_dev, status.st_ino))
-    return found
+def _is_same(path: str | os.PathLike[str], other: str | os.PathLike[str]) -> bool:
+    """Return whether two names are of one file that exists, be it by a link."""
+    return os.path.exists(path) and os.path.exists(other) and os.path.samefile(path, other)
 
 
 def _mark(option: str, request: Mapping[str, object], folder: Path) -> str:

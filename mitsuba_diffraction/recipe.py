@@ -158,7 +158,13 @@ class Recipe:
                 raise RequestError("wanted the tables [surface] and [spectrum]")
             return cls(surface, {**spectrum, **settings}, path.parent)
         except RequestError as error:
-            raise RequestError(f"{path}: {error}") from None
+            of_file = str(error).partition(":")[0] not in settings
+            raise RequestError(f"{path}: {error}" if of_file else str(error)) from None
+
+    @property
+    def files(self) -> list[Path]:
+        """The files that the recipe names: its scan, or none."""
+        return [self.folder / self.surface["scan"]] if "scan" in self.surface else []
 
     @property
     def _has_seed(self) -> bool:
@@ -236,9 +242,8 @@ class Recipe:
         if self.spectrum.get("theory") == "rigorous":
             versions.append(rigorous.BUILD_VERSION)
         content = hashlib.sha256(".".join(map(str, versions)).encode())
-        surface = dict(self.surface)
-        if "scan" in surface:
-            scan = self.folder / surface.pop("scan")
+        surface = {name: value for name, value in self.surface.items() if name != "scan"}
+        for scan in self.files:
             refuse_special(scan)
             try:
                 content.update(scan.read_bytes())

@@ -140,9 +140,17 @@ def test_a_recipe_that_is_not_there_is_named(tmp_path):
 )
 def test_values_of_the_spectrum_that_cannot_be_are_refused_by_name(tmp_path, entry, name):
     path = write(tmp_path, f"{BLAZE}[spectrum]\n{entry}\n")
-    with pytest.raises(ValueError, match=f"{name}: ") as caught:
-        Recipe.load(path).build()
+    with pytest.raises(ValueError, match=f"recipe.toml: {name}: ") as caught:
+        Recipe.load(path)
     assert "\n" not in str(caught.value)
+
+
+def test_options_take_the_place_of_a_recipes_values(tmp_path):
+    path = write(tmp_path, BLAZE + '[spectrum]\ntolerance = 2\nmaterial = "Al"\n')
+    recipe = Recipe.load(path, tolerance=0.1, theory="rigorous")
+    assert recipe.spectrum == {"tolerance": 0.1, "material": "Al", "theory": "rigorous"}
+    with pytest.raises(ValueError, match=r"^tolerance: got 7"):  # not a mistake of the file
+        Recipe.load(path, tolerance=7, theory="rigorous")
 
 
 @pytest.mark.parametrize(

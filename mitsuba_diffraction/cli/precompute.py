@@ -16,7 +16,6 @@ from ..settings import REPRESENTATIONS, THEORIES
 from ..surface.prepare import seam_matters, seam_steps
 from .arguments import Overwrite, check_suffix, claim
 from .console import progress_bar, tell
-from .inputs import files_read
 from .scan import (
     Channel,
     CoherenceLength,
@@ -87,9 +86,9 @@ def precompute(
     targets = [output or Path(source.name or "spectrum").with_suffix(".exr") for source in sources]
     for target in targets:
         check_suffix("-o", target, ".exr")
-    reads = [file for source in sources for file in files_read(source)]
-    claim(context, reads, [("-o" if output else f"spectrum of {s}", t) for s, t in zip(sources, targets, strict=True)])
     recipes = [recipe_of(source, of_scan, settings) for source in sources]
+    reads = [*sources, *(file for recipe in recipes for file in recipe.files)]
+    claim(context, reads, [("-o" if output else f"spectrum of {s}", t) for s, t in zip(sources, targets, strict=True)])
     seams = [_seam(source, recipe) for source, recipe in zip(sources, recipes, strict=True)]
     for source, recipe, target, seam in zip(sources, recipes, targets, seams, strict=True):
         with progress_bar(f"spectrum of {source.name}", "%") as progress:

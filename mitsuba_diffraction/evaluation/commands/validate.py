@@ -10,7 +10,6 @@ import typer
 from ... import outputs
 from ...cli.arguments import Overwrite, Variant, claim
 from ...cli.console import progress_bar, show, tell
-from ...cli.inputs import files_read
 from ...cli.scan import Channel, FillMissing, HeightRange, PixelSize, Prepare, Unit, options_of_scan, recipe_of
 from ...errors import RequestError
 from ...outputs import save_markdown
@@ -56,7 +55,7 @@ def validate(
     if chosen.startswith("scalar"):
         raise RequestError(f"--variant: got {chosen}, wanted llvm_… or cuda_…: the checks take millions of directions")
     recipe = None if surface is None else _recipe(surface, of_scan, settings)
-    reads = [] if surface is None else files_read(surface)
+    reads = [] if surface is None else [surface, *recipe.files]
     writes = [(option, path) for option, path in (("--json", json), ("--markdown", markdown)) if path is not None]
     if figures is not None:
         from ..validation.figures import figure_names, save_figures
