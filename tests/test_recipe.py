@@ -250,6 +250,16 @@ def test_a_recipe_of_a_sample(tmp_path, own_cache):
     assert Recipe.load(tile).digest() != Recipe.load(path).digest()
 
 
+def test_a_spectrum_keeps_the_warning_of_scalar_theory(tmp_path):
+    surface = {"profile": "sinusoidal", "period": 0.71, "depth": 0.3, "samples": 64}
+    spectrum = Recipe(surface, FAST).build()
+    assert spectrum.warning.startswith("scalar theory: errs by 63% of the reflected light")
+    spectrum.save(tmp_path / "fine.exr")
+    assert GratingSpectrum.load(tmp_path / "fine.exr").warning == spectrum.warning
+    assert spectrum.digest == md.precompute(md.gratings.sinusoidal(0.71, 0.3, samples=64), **FAST).digest
+    assert Recipe({**surface, "period": 3.0, "depth": 0.05}, FAST).build().warning == ""
+
+
 def test_a_recipe_says_what_coherence_its_scan_carries(tmp_path):
     np.save(tmp_path / "scan.npy", np.zeros((20, 24)))
     path = write(
