@@ -30,6 +30,7 @@ from .scan import (
     Unit,
     options_of_scan,
     recipe_of,
+    settings_of,
 )
 
 
@@ -53,11 +54,7 @@ def inspect(
     overwrite: Overwrite = False,
 ) -> None:
     """Report and plot the statistics, periods and predicted colours of a surface, and their reliability."""
-    of_scan = options_of_scan(
-        pixel_size, height_range, fill_missing, channel, unit, [*["level_plane"] * plane, *(prepare or [])]
-    )
-    settings = {"extent": extent, "coherence_length": coherence_length}
-    recipe = recipe_of(source, of_scan, {name: value for name, value in settings.items() if value is not None})
+    recipe = recipe_of(source, options_of_scan(context), settings_of(context))
     reads = [source, *recipe.files]
     by_default = free_name(f"{source.stem}_inspect", lambda stem: [Path(f"{stem}.png")], reads)
     picture = output or Path(f"{by_default}.png")

@@ -27,6 +27,7 @@ from .scan import (
     Unit,
     options_of_scan,
     recipe_of,
+    settings_of,
 )
 
 
@@ -68,25 +69,10 @@ def precompute(
     """Compute the power spectrum of the phase from recipes or scans."""
     if output is not None and len(sources) > 1:
         raise RequestError(f"-o: got {len(sources)} sources, wanted one (without -o each is named after its source)")
-    given = {
-        "extent": extent,
-        "coherence_length": coherence_length,
-        "largest_angle": largest_angle,
-        "largest_height_range": largest_height_range,
-        "representation": representation,
-        "tolerance": tolerance,
-        "theory": theory,
-        "material": material,
-        "int_ior": int_ior,
-        "ext_ior": ext_ior,
-        "polarised": polarised or None,
-    }
-    settings = {name: value for name, value in given.items() if value is not None}
-    of_scan = options_of_scan(pixel_size, height_range, fill_missing, channel, unit, prepare)
     targets = [output or Path(source.name or "spectrum").with_suffix(".exr") for source in sources]
     for target in targets:
         check_suffix("-o", target, ".exr")
-    recipes = [recipe_of(source, of_scan, settings) for source in sources]
+    recipes = [recipe_of(source, options_of_scan(context), settings_of(context)) for source in sources]
     reads = [*sources, *(file for recipe in recipes for file in recipe.files)]
     claim(context, reads, [("-o" if output else f"spectrum of {s}", t) for s, t in zip(sources, targets, strict=True)])
     seams = [_seam(source, recipe) for source, recipe in zip(sources, recipes, strict=True)]
