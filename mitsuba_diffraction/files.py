@@ -155,7 +155,7 @@ UNSEALED = _BEFORE_DIGEST + _ZEROS
 
 
 def seal(path: str | os.PathLike[str]) -> None:
-    """Replaces the placeholder `UNSEALED`, or an earlier digest, by the SHA-256 of the file.
+    """Replace the placeholder `UNSEALED`, or an earlier digest, by the SHA-256 of the file.
 
     Raises:
         ValueError: if the file has no placeholder.
@@ -169,7 +169,7 @@ def seal(path: str | os.PathLike[str]) -> None:
 
 
 def is_intact(path: str | os.PathLike[str]) -> bool | None:
-    """Whether a sealed file is unchanged; None if it is not sealed."""
+    """Return whether a sealed file is unchanged; None if it is not sealed."""
     with open(path, "rb") as stream:
         if (found := _digest(stream)) is None:
             return None

@@ -172,19 +172,19 @@ class Recipe:
 
     @property
     def patches(self) -> int:
-        """Over how many seeds the spectrum is averaged: one of a sample, and of what is not drawn at random."""
+        """Return over how many seeds the spectrum is averaged: one of a sample, and of what is not drawn at random."""
         if "patches" in self.surface:
             return int(self.surface["patches"])
         return PATCHES.get(self.surface.get("profile", ""), 1) if self.spectrum.get("extent", "tile") == "tile" else 1
 
     def of_one_patch(self) -> Recipe:
-        """The recipe without the mean over seeds: its spectrum is that of `height_field`."""
+        """Return the recipe without the mean over seeds: its spectrum is that of `height_field`."""
         if self.patches == 1:
             return self
         return Recipe({**self.surface, "patches": 1}, self.spectrum, self.folder)
 
     def height_fields(self, progress: Progress = silent) -> tuple[HeightField, ...]:
-        """The patches: seed, seed + 1, …; one where nothing is drawn at random."""
+        """Return the patches: seed, seed + 1, …; one where nothing is drawn at random."""
         if self.patches == 1:
             return (self.height_field(),)
         patches = [self.height_field()]  # which refuses a wrong seed
@@ -237,7 +237,7 @@ class Recipe:
         return spectrum
 
     def digest(self) -> str:
-        """SHA-256 of everything that determines the spectrum: the recipe and the contents of the scan."""
+        """Return the SHA-256 of everything that determines the spectrum: the recipe and the contents of the scan."""
         versions = [FORMAT_VERSION, _BUILD_VERSION]
         if self.spectrum.get("theory") == "rigorous":
             versions.append(rigorous.BUILD_VERSION)
@@ -254,7 +254,7 @@ class Recipe:
         return content.hexdigest()
 
     def cached(self, progress: Callable[[str], AbstractContextManager[Progress]] = no_progress) -> Spectrum:
-        """The spectrum from the cache, or computed and cached; then progress(label) is a context, for its progress.
+        """Return the spectrum from the cache, or compute and cache it, within the context progress(label).
 
         The cache is a folder of spectra named by `digest`: $MITSUBA_DIFFRACTION_CACHE, or the user's cache folder. A
         damaged entry, or one of another recipe, is replaced.
@@ -277,7 +277,7 @@ class Recipe:
             return self._built(path, digest, report)
 
     def _built(self, path: Path, digest: str, progress: Progress) -> Spectrum:
-        """The spectrum, computed and written to the cache."""
+        """Compute the spectrum and write it to the cache."""
         spectrum = self.build(progress)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)

@@ -16,7 +16,7 @@ from PIL import Image
 import mitsuba_diffraction as md
 from mitsuba_diffraction import outputs
 from mitsuba_diffraction.files import is_intact, refuse_unwritable, seal, whole_file
-from mitsuba_diffraction.outputs import claimed, made_for
+from mitsuba_diffraction.outputs import claim, made_for
 from mitsuba_diffraction.render.scene import files_of_scene
 
 BLAZE = """[surface]
@@ -214,14 +214,14 @@ def test_every_format_carries_its_request(name):
             Figure(figsize=(1, 1)).savefig(name, metadata=outputs.metadata(name))
 
     for seed in (1, 1):
-        with claimed({"seed": seed}, [], [("-o", name)]):
-            assert made_for(name)
-            write()
-    with pytest.raises(ValueError, match="--overwrite"), claimed({"seed": 2}, [], [("-o", name)]):
-        pass
-    with claimed({"seed": 2}, [], [("-o", name)], overwrite=True):
+        claim({"seed": seed}, [], [("-o", name)])
+        assert made_for(name)
         write()
-    assert made_for(name) is None
+    with pytest.raises(ValueError, match="--overwrite"):
+        claim({"seed": 2}, [], [("-o", name)])
+    claim({"seed": 2}, [], [("-o", name)], overwrite=True)
+    write()
+    claim({"seed": 2}, [], [("-o", name)])
     if name.endswith("json"):
         assert json.loads(Path(name).read_text())["a"] == 1
 

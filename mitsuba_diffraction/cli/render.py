@@ -77,7 +77,7 @@ def render(
 
     target = output or Path(free_name(scene.stem, lambda stem: written(Path(f"{stem}.exr")), reads) + ".exr")
     targets, animation = pictures(target), target.with_suffix(".webp")
-    claim(context, reads, [("-o", path) for path in written(target)], map(checkpoint_path, targets))
+    claim(context, reads, [("-o", path) for path in written(target)])
     for path in targets:
         if checkpoint_path(path).exists() and not resume:
             raise RequestError(
