@@ -279,6 +279,8 @@ class Recipe:
     def _built(self, path: Path, digest: str, progress: Progress) -> Spectrum:
         """Compute the spectrum and write it to the cache."""
         spectrum = self.build(progress)
+        # A scene holds its recipes, and needs their heights no more.
+        self.__dict__.pop("_height_field", None)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             spectrum.save(path, recipe=digest)
