@@ -14,18 +14,18 @@ from .registration import register as _register
 
 if TYPE_CHECKING:  # type checkers do not see what is imported on first use
     from . import reference, rigorous
+    from .grating_spectrum import GratingSpectrum
+    from .precomputation import precompute
     from .recipe import Recipe
-    from .spectrum.build import precompute
-    from .spectrum.grating_spectrum import GratingSpectrum
     from .surface import gratings
     from .surface.heightfield import HeightField
     from .surface.readers import read_height_field
 
 _HOME = {
-    "GratingSpectrum": "spectrum.grating_spectrum",
+    "GratingSpectrum": "grating_spectrum",
     "HeightField": "surface.heightfield",
     "Recipe": "recipe",
-    "precompute": "spectrum.build",
+    "precompute": "precomputation",
     "read_height_field": "surface.readers",
 }
 _MODULES = {"gratings": "surface.gratings", "reference": "reference", "rigorous": "rigorous"}

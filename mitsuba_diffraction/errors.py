@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import builtins
 import re
+import sys
+from numbers import Real
 
 # An exception in a Python plugin comes as text: where the scene names the plugin, lines that are indented, then the
 # class of the exception and its message.
@@ -28,8 +30,8 @@ def is_bug(kind: type[BaseException]) -> bool:
 
 
 def is_number(value: object) -> bool:
-    """Return whether a parameter is a number, not a boolean."""
-    return isinstance(value, int | float) and not isinstance(value, bool)
+    """Tell whether a parameter is a number that a float can hold: True, False, infinity and NaN are none."""
+    return isinstance(value, Real) and not isinstance(value, bool) and bool(abs(value) <= sys.float_info.max)
 
 
 def root_cause(error: BaseException) -> str:

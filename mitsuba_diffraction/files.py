@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import mmap
 import os
 import re
 import secrets
@@ -150,54 +151,44 @@ def refuse_special(path: str | os.PathLike[str]) -> None:
 _BEFORE_DIGEST = "SHA-256 of this file with zeros for it: "
 _ZEROS = 64 * "0"
 UNSEALED = _BEFORE_DIGEST + _ZEROS
-"""Placeholder for the digest, in the first or last megabyte of the file; see `seal`."""
-_MEGABYTE = 2**20
+"""Placeholder for the digest; see `seal`."""
 
 
 def seal(path: str | os.PathLike[str]) -> None:
-    """Replaces the placeholder `UNSEALED`, or an earlier digest, by the SHA-256 of the file.
+    """Replace the placeholder `UNSEALED`, or an earlier digest, by the SHA-256 of the file.
 
     Raises:
         ValueError: if the file has no placeholder.
     """
     with open(path, "r+b") as stream:
-        place = _place_of_digest(stream)
-        if place is None:
+        if (found := _digest(stream)) is None:
             raise RequestError(f"{os.fspath(path)}: has no place for its digest")
-        digest = _digest(stream, place)
+        place, digest = found
         stream.seek(place)
         stream.write(digest)
 
 
 def is_intact(path: str | os.PathLike[str]) -> bool | None:
-    """Whether a sealed file is unchanged; None if it is not sealed."""
+    """Return whether a sealed file is unchanged; None if it is not sealed."""
     with open(path, "rb") as stream:
-        place = _place_of_digest(stream)
-        if place is None:
+        if (found := _digest(stream)) is None:
             return None
+        place, digest = found
         stream.seek(place)
-        return stream.read(len(_ZEROS)) == _digest(stream, place)
+        return stream.read(len(_ZEROS)) == digest
 
 
-def _place_of_digest(stream: BinaryIO) -> int | None:
-    size = stream.seek(0, os.SEEK_END)
-    for start in (0, max(0, size - _MEGABYTE)):
-        stream.seek(start)
-        found = stream.read(_MEGABYTE).find(_BEFORE_DIGEST.encode())
-        if found >= 0:
-            return start + found + len(_BEFORE_DIGEST)
-    return None
-
-
-def _digest(stream: BinaryIO, place: int) -> bytes:
-    content = hashlib.sha256()
-    stream.seek(0)
-    left = place
-    while block := stream.read(min(left, 16 * _MEGABYTE)):
-        content.update(block)
-        left -= len(block)
-    content.update(_ZEROS.encode())
-    stream.seek(place + len(_ZEROS))
-    while block := stream.read(16 * _MEGABYTE):
-        content.update(block)
-    return content.hexdigest().encode()
+def _digest(stream: BinaryIO) -> tuple[int, bytes] | None:
+    """Return where the digest of a file stands, and what it should be; None if there is no place for one."""
+    if not os.fstat(stream.fileno()).st_size:
+        return None
+    with mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as content:
+        found = content.find(_BEFORE_DIGEST.encode())
+        if found < 0:
+            return None
+        place = found + len(_BEFORE_DIGEST)
+        with memoryview(content) as view, view[:place] as before, view[place + len(_ZEROS) :] as after:
+            digest = hashlib.sha256(before)
+            digest.update(_ZEROS.encode())
+            digest.update(after)
+        return place, digest.hexdigest().encode()

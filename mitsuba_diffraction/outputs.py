@@ -1,6 +1,6 @@
 """Protection of files: a command overwrites neither its inputs nor files that were made for another request.
 
-A command declares the files it reads and writes (`claimed`). Every output carries a digest of the request (`made_for`),
+A command declares the files it reads and writes (`claim`). Every output carries a digest of the request (`made_for`),
 by which a later run of the same command recognises its own files. It is stored in the header of OpenEXR, text chunks of
 PNG, metadata of PDF, SVG and WebP, an entry of JSON, or a comment in Markdown.
 """
@@ -13,8 +13,7 @@ import itertools
 import json
 import math
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -29,74 +28,62 @@ _MEGABYTE = 2**20
 _claims: dict[Path, str] = {}
 
 
-@contextmanager
-def claimed(
+def claim(
     request: Mapping[str, object],
     reads: Iterable[str | os.PathLike[str]],
     writes: Iterable[tuple[str, str | os.PathLike[str]]],
     *,
-    scratch: Iterable[str | os.PathLike[str]] = (),
     overwrite: bool = False,
-) -> Iterator[None]:
-    """Refuses to overwrite protected files before any work is done, and marks the files written inside the block.
+) -> None:
+    """Refuse to overwrite protected files before any work is done, and mark those that are written from now on.
 
     Args:
         request: everything that determines the output, by name. File names are stored relative to the output, so that
             a folder may be moved.
         reads: input files.
         writes: (option, file) of each output.
-        scratch: intermediate files, which identify their request themselves.
         overwrite: replace outputs of other requests. Inputs are never replaced.
 
     Raises:
         ValueError: if an output is also an input, is named twice, exists and was not made for this request, or cannot
             be written.
     """
-    writes = [(option, os.fspath(path)) for option, path in writes]
-    taken = {identity: os.fspath(path) for path in reads for identity in _identities(path)}
-    planned: dict[object, str] = {}
-    for option, path in [*writes, *(("checkpoint", os.fspath(path)) for path in scratch)]:
-        identities = _identities(path)
-        for read in (taken[identity] for identity in identities & taken.keys()):
+    reads, writes = list(reads), list(writes)
+    planned: dict[str, str] = {}
+    for option, path in writes:
+        if read := next((read for read in reads if _is_same(path, read)), None):
             by = "" if os.path.abspath(path) == os.path.abspath(read) else f" as {read}"
             raise RequestError(f"{option}: got {path}, which is read{by} and would be lost; wanted another name")
-        identities.add(os.path.realpath(path).casefold())  # names that differ in case only may be the same file
-        for other in (planned[identity] for identity in identities & planned.keys()):
-            raise RequestError(f"{option}: {path} would be written twice, for {other} too; wanted another name")
-        planned.update(dict.fromkeys(identities, option))
-    marks = {}
+        name = os.path.realpath(path).casefold()  # names that differ in case only may be the same file
+        if name in planned:
+            raise RequestError(f"{option}: {path} would be written twice, for {planned[name]} too; wanted another name")
+        planned[name] = option
+    _claims.clear()
     for option, path in writes:
         if not Path(path).parent.is_dir():
             raise RequestError(f"{option}: got {path}, but the folder {Path(path).parent} is not there")
         refuse_unwritable(path)
         real = final_path(path)
-        marks[real] = _mark(option, request, real.parent)
-        if os.path.exists(path) and not overwrite and not _carries(real, marks[real]):
+        _claims[real] = _mark(option, request, real.parent)
+        if os.path.exists(path) and not overwrite and not _carries(real, _claims[real]):
             raise RequestError(
                 f"{option}: {path} exists and was not made by this command with these options; --overwrite replaces it"
             )
-    before = dict(_claims)
-    _claims.update(marks)
-    try:
-        yield
-    finally:
-        _claims.clear()
-        _claims.update(before)
 
 
 def made_for(path: str | os.PathLike[str]) -> str | None:
-    """The mark of an output, ASCII; None if no command has claimed it."""
+    """Return the mark of an output, ASCII; None if no command has claimed it."""
     return _claims.get(final_path(path))
 
 
 def metadata(path: str | os.PathLike[str]) -> dict[str, str]:
-    """The mark as metadata for Matplotlib's `savefig`, under a key common to PNG, PDF and SVG."""
+    """Return the mark as metadata for Matplotlib's `savefig`, under a key common to PNG, PDF and SVG."""
     request = made_for(path)
     return {} if request is None else {"Keywords": request}
 
 
 def png_text(path: str | os.PathLike[str]) -> PngInfo:
-    """The mark as text chunks for Pillow's `save`."""
+    """Return the mark as text chunks for Pillow's `save`."""
     from PIL.PngImagePlugin import PngInfo
 
     text = PngInfo()
@@ -118,7 +105,7 @@ def save_json(content: object, path: str | os.PathLike[str]) -> None:
 
 
 def plain(value: object) -> object:
-    """As JSON has it: dataclasses become dictionaries, tuples lists, and floats that are not finite None."""
+    """Convert to what JSON has: dataclasses become dictionaries, tuples lists, and floats that are not finite None."""
     if dataclasses.is_dataclass(value):
         value = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
     if isinstance(value, Mapping):
@@ -129,26 +116,22 @@ def plain(value: object) -> object:
 
 
 def save_markdown(text: str, path: str | os.PathLike[str]) -> None:
-    """Writes a Markdown file atomically."""
+    """Write a Markdown file, whole or not at all."""
     request = made_for(path)
     with whole_file(path) as temporary:
         temporary.write_text(text if request is None else f"{text}\n<!-- {request} -->\n", encoding="utf-8")
 
 
 def free_name(stem: str, files_of: Callable[[str], Iterable[Path]], reads: Iterable[str | os.PathLike[str]]) -> str:
-    """A default name: the first of `stem`, `stem`_2, … none of whose files (`files_of`) is an input."""
-    taken = {identity for path in reads for identity in _identities(path)}
+    """Return a default name: the first of `stem`, `stem`_2, … none of whose files (`files_of`) is an input."""
+    reads = list(reads)
     names = (stem if number == 1 else f"{stem}_{number}" for number in itertools.count(1))
-    return next(name for name in names if not any(taken & _identities(path) for path in files_of(name)))
+    return next(name for name in names if not any(_is_same(path, read) for path in files_of(name) for read in reads))
 
 
-def _identities(path: str | os.PathLike[str]) -> set[object]:
-    """Identifies a file independently of its name: resolves symbolic and hard links."""
-    found: set[object] = {os.path.realpath(path)}
-    if os.path.exists(path):
-        status = os.stat(path)
-        found.add((status.st_dev, status.st_ino))
-    return found
+def _is_same(path: str | os.PathLike[str], other: str | os.PathLike[str]) -> bool:
+    """Return whether two names are of one file that exists, be it by a link."""
+    return os.path.exists(path) and os.path.exists(other) and os.path.samefile(path, other)
 
 
 def _mark(option: str, request: Mapping[str, object], folder: Path) -> str:
@@ -167,7 +150,7 @@ def _relative(value: object, folder: Path) -> object:
 
 
 def _carries(path: Path, mark: str) -> bool:
-    """Whether a file carries the mark; all formats store it near the beginning or the end."""
+    """Return whether a file carries the mark; all formats store it near the beginning or the end."""
     with open(path, "rb") as stream:
         if mark.encode() in stream.read(_MEGABYTE):
             return True

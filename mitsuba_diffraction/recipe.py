@@ -50,17 +50,19 @@ import warnings
 import weakref
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from .errors import RequestError, is_number
+from .errors import RequestError
 from .files import cache_folder, refuse_special
+from .grating_spectrum import FORMAT_VERSION, GratingSpectrum
+from .precomputation import Spectrum, load_spectrum, precompute
 from .progress import Progress, no_progress, part, silent
 from .rigorous import build as rigorous
-from .spectrum.build import precompute
-from .spectrum.grating_spectrum import FORMAT_VERSION
-from .spectrum.load import Spectrum, load_spectrum
+from .scalar_theory import scalar_error
+from .settings import Settings
 from .surface.gratings import PATCHES, PROFILES
 from .surface.heightfield import HeightField
 from .surface.prepare import apply_steps, check_steps
@@ -72,12 +74,7 @@ else:
     import tomli as tomllib
 
 _SCAN_KEYS = frozenset({"scan", "pixel_size", "height_range", "fill_missing", "channel", "unit", "prepare"})
-_SPECTRUM_KEYS = frozenset(
-    {
-        *("extent", "coherence_length", "wavelengths", "largest_angle", "representation", "tolerance"),
-        *("largest_height_range", "theory", "material", "int_ior", "ext_ior", "polarised"),
-    }
-)
+_SPECTRUM_KEYS = frozenset(f.name for f in fields(Settings))
 # Incremented when the same input gives a different result, to invalidate the cache.
 _BUILD_VERSION = 5
 _OF_HEIGHTS = 0.3  # the share of the time that the heights of many patches take, roughly
@@ -134,15 +131,11 @@ class Recipe:
                 raise RequestError(f"{name}: got {value!r}, wanted a number or a text")
             if not (_is_plain(value) or (isinstance(value, list | tuple) and all(_is_plain(v) for v in value))):
                 raise RequestError(f"{name}: got {value!r}, wanted a number, a text, or a list of them")
-        for name in ("tolerance", "coherence_length", "largest_angle", "largest_height_range", "int_ior", "ext_ior"):
-            if name in self.spectrum and not is_number(self.spectrum[name]):
-                raise RequestError(f"{name}: got {self.spectrum[name]!r}, wanted a number")
-        if "wavelengths" in self.spectrum and not isinstance(self.spectrum["wavelengths"], list | tuple):
-            raise RequestError(f"wavelengths: got {self.spectrum['wavelengths']!r}, wanted [shortest, longest] in nm")
+        Settings(**self.spectrum)
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> Recipe:
-        """Read a recipe.
+    def load(cls, path: str | os.PathLike[str], **settings: Any) -> Recipe:
+        """Read a recipe; `settings` take the place of its own, under `[spectrum]`.
 
         Raises:
             FileNotFoundError: if there is no such file.
@@ -163,9 +156,15 @@ class Recipe:
             surface, spectrum = content.get("surface", {}), content.get("spectrum", {})
             if not (isinstance(surface, dict) and isinstance(spectrum, dict)):
                 raise RequestError("wanted the tables [surface] and [spectrum]")
-            return cls(surface, spectrum, path.parent)
+            return cls(surface, {**spectrum, **settings}, path.parent)
         except RequestError as error:
-            raise RequestError(f"{path}: {error}") from None
+            of_file = str(error).partition(":")[0] not in settings
+            raise RequestError(f"{path}: {error}" if of_file else str(error)) from None
+
+    @property
+    def files(self) -> list[Path]:
+        """The files that the recipe names: its scan, or none."""
+        return [self.folder / self.surface["scan"]] if "scan" in self.surface else []
 
     @property
     def _has_seed(self) -> bool:
@@ -173,32 +172,33 @@ class Recipe:
 
     @property
     def patches(self) -> int:
-        """Over how many seeds the spectrum is averaged: one of a sample, and of what is not drawn at random."""
+        """Return over how many seeds the spectrum is averaged: one of a sample, and of what is not drawn at random."""
         if "patches" in self.surface:
             return int(self.surface["patches"])
         return PATCHES.get(self.surface.get("profile", ""), 1) if self.spectrum.get("extent", "tile") == "tile" else 1
 
     def of_one_patch(self) -> Recipe:
-        """The recipe without the mean over seeds: its spectrum is that of `height_field`."""
+        """Return the recipe without the mean over seeds: its spectrum is that of `height_field`."""
         if self.patches == 1:
             return self
         return Recipe({**self.surface, "patches": 1}, self.spectrum, self.folder)
 
     def height_fields(self, progress: Progress = silent) -> tuple[HeightField, ...]:
-        """The patches: seed, seed + 1, …; one where nothing is drawn at random."""
+        """Return the patches: seed, seed + 1, …; one where nothing is drawn at random."""
         if self.patches == 1:
             return (self.height_field(),)
-        parameters = {name: value for name, value in self.surface.items() if name != "patches"}
-        seed = parameters.pop("seed", 0)
-        first = self.height_field()  # which refuses a wrong seed
-        fields = [first]
-        for k in range(1, self.patches):
-            fields.append(Recipe({**parameters, "patches": 1, "seed": seed + k}).height_field())
-            progress(len(fields), self.patches)
-        return tuple(fields)
+        patches = [self.height_field()]  # which refuses a wrong seed
+        for seed in range(self.surface.get("seed", 0) + 1, self.surface.get("seed", 0) + self.patches):
+            patches.append(Recipe({**self.surface, "patches": 1, "seed": seed}).height_field())
+            progress(len(patches), self.patches)
+        return tuple(patches)
 
     def height_field(self) -> HeightField:
-        """The surface; of several patches, the first."""
+        """Return the surface, read or computed at the first call; of several patches, the first."""
+        return self._height_field
+
+    @cached_property
+    def _height_field(self) -> HeightField:
         parameters = dict(self.surface)
         if "scan" in parameters:
             return self._prepared_scan(parameters)
@@ -229,21 +229,21 @@ class Recipe:
 
     def build(self, progress: Progress = silent) -> Spectrum:
         """Compute the spectrum; `progress` is called with (steps done, steps in all)."""
-        arguments = dict(self.spectrum)
-        if "wavelengths" in arguments:
-            arguments["wavelengths"] = tuple(arguments["wavelengths"])
-        fields = self.height_fields(part(progress, 0, _OF_HEIGHTS))
-        return precompute(fields, progress=part(progress, _OF_HEIGHTS if len(fields) > 1 else 0, 1), **arguments)
+        patches = self.height_fields(part(progress, 0, _OF_HEIGHTS))
+        report = part(progress, _OF_HEIGHTS if len(patches) > 1 else 0, 1)
+        spectrum = precompute(patches, progress=report, **self.spectrum)
+        if isinstance(spectrum, GratingSpectrum):
+            spectrum = replace(spectrum, warning=scalar_error(patches[0], spectrum.extent).warning)
+        return spectrum
 
     def digest(self) -> str:
-        """SHA-256 of everything that determines the spectrum: the recipe and the contents of the scan."""
+        """Return the SHA-256 of everything that determines the spectrum: the recipe and the contents of the scan."""
         versions = [FORMAT_VERSION, _BUILD_VERSION]
         if self.spectrum.get("theory") == "rigorous":
             versions.append(rigorous.BUILD_VERSION)
         content = hashlib.sha256(".".join(map(str, versions)).encode())
-        surface = dict(self.surface)
-        if "scan" in surface:
-            scan = self.folder / surface.pop("scan")
+        surface = {name: value for name, value in self.surface.items() if name != "scan"}
+        for scan in self.files:
             refuse_special(scan)
             try:
                 content.update(scan.read_bytes())
@@ -254,7 +254,7 @@ class Recipe:
         return content.hexdigest()
 
     def cached(self, progress: Callable[[str], AbstractContextManager[Progress]] = no_progress) -> Spectrum:
-        """The spectrum from the cache, or computed and cached; then progress(label) is a context, for its progress.
+        """Return the spectrum from the cache, or compute and cache it, within the context progress(label).
 
         The cache is a folder of spectra named by `digest`: $MITSUBA_DIFFRACTION_CACHE, or the user's cache folder. A
         damaged entry, or one of another recipe, is replaced.
@@ -277,8 +277,10 @@ class Recipe:
             return self._built(path, digest, report)
 
     def _built(self, path: Path, digest: str, progress: Progress) -> Spectrum:
-        """The spectrum, computed and written to the cache."""
+        """Compute the spectrum and write it to the cache."""
         spectrum = self.build(progress)
+        # A scene holds its recipes, and needs their heights no more.
+        self.__dict__.pop("_height_field", None)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             spectrum.save(path, recipe=digest)

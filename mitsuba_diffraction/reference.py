@@ -14,7 +14,7 @@ import scipy.fft
 from numpy.typing import ArrayLike, NDArray
 
 from .errors import RequestError
-from .settings import SUN_COHERENCE_LENGTH, lobe_width, matching
+from .settings import SUN_COHERENCE_LENGTH, Settings, lobe_width, matching
 from .spectrum.sample import UNIFORM, WindowAxis, carried_coherence_length, window_axes
 from .surface.heightfield import HeightField
 
@@ -79,7 +79,6 @@ def _exact_product(a: np.floating, b: NDArray[np.floating]) -> tuple[NDArray[np.
     return product, ((a_high * b_high - product) + a_high * b_low + a_low * b_high) + a_low * b_low
 
 
-EXTENTS = ("tile", "sample")
 _FAR = 9.0  # standard deviations; e^{−9²/2} is under 3e-18
 CHUNK = 2**20  # complex numbers in one intermediate array, 16 MiB
 
@@ -142,8 +141,7 @@ def power_spectrum(
         ValueError: if the extent is unknown, the coherence length is not positive or, for a sample, below four pixels,
             an argument is not finite, or the shapes do not match.
     """
-    check_extent(extent)
-    lobe_width(coherence_length)
+    Settings(extent, coherence_length)
     q, kappa = _checked(q, kappa)
     evaluate = _tile_spectrum if extent == "tile" else _sample_spectrum
     return evaluate(height_field, q.reshape(-1, 2), kappa.ravel(), coherence_length).reshape(kappa.shape)
@@ -187,12 +185,6 @@ def finite_tiles_spectrum(
         factor = tile_factor(q[:, axis] * height_field.tile_size[axis], tiles[axis])
         result *= factor**2 / tiles[axis] * _nyquist_density(q[:, axis], height_field.pixel_size[axis])
     return result.reshape(shape)
-
-
-def check_extent(extent: str) -> None:
-    """Raise ValueError unless `extent` is known."""
-    if extent not in EXTENTS:
-        raise RequestError(f"extent: got {extent!r}, wanted 'tile' or 'sample'")
 
 
 def _tile_spectrum(

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import functools
 import json
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,8 +23,8 @@ from scipy.special import jv
 from .errors import RequestError
 from .geometry import k_g
 from .rigorous.axes import LARGEST_PERIOD
-from .rigorous.curve import is_profile
-from .rigorous.efficiencies import efficiencies
+from .rigorous.curve import curve_of, is_profile
+from .rigorous.efficiencies import converge
 from .settings import VISIBLE
 from .surface.heightfield import HeightField
 from .surface.periods import height_spectrum
@@ -62,11 +61,6 @@ def fresnel(cosine: ArrayLike, index: complex) -> tuple[Array, Array]:
     s = (cosine - root) / (cosine + root)
     p = (index**2 * cosine - root) / (index**2 * cosine + root)
     return np.abs(s) ** 2, np.abs(p) ** 2
-
-
-def geometry(cos_i: ArrayLike, cos_o: ArrayLike, cos_between: ArrayLike) -> Array:
-    """Compute K G from cos θ_i, cos θ_o and ω_i·ω_o; see `geometry.k_g`."""
-    return k_g(cos_i, cos_o, np.add(1, cos_between))
 
 
 def equivalent_depth(rms_height: float) -> float:
@@ -157,7 +151,7 @@ def _mirror_orders(
     cos_o = np.sqrt(np.where(there, most - sine_o**2, 1))
     cos_between = sine_i * np.where(there, sine_o, 0) - across**2 + cos_i * cos_o
     kappa = 2 * np.pi * (cos_i + cos_o) / wavelength
-    factor = np.where(there, geometry(cos_i, cos_o, cos_between) * powers(m, kappa), -1)
+    factor = np.where(there, k_g(cos_i, cos_o, 1 + cos_between) * powers(m, kappa), -1)
     return m, sine_o, factor, np.sqrt((1 + cos_between) / 2)
 
 
@@ -315,17 +309,12 @@ def _solved_error(profile: HeightField) -> float:
     """Compute the mean error of a profile; NaN if the solver does not converge."""
     period = profile.tile_size[0]
     row = HeightField(profile.heights[:1], profile.pixel_size)
-    powers = profile_powers(row)
+    powers, curve = profile_powers(row), curve_of(row)
     errors = []
     for wavelength in WAVELENGTHS:
         for angle in ANGLES:
-            light = -np.sin(np.deg2rad(angle)), 0.0, np.cos(np.deg2rad(angle))
-            try:
-                with warnings.catch_warnings():
-                    warnings.simplefilter("ignore", UserWarning)
-                    exact = efficiencies(row, light, wavelength, int_ior=INDEX, tolerance=_CONVERGED)
-            except RequestError:
-                return float("nan")
+            light = np.array([-np.sin(np.deg2rad(angle)), 0.0, np.cos(np.deg2rad(angle))])
+            exact = converge(curve, light, period / wavelength, INDEX, _CONVERGED)
             if not exact.error <= _CONVERGED:
                 return float("nan")
             scalar = scalar_orders(powers, period, wavelength, angle, INDEX)

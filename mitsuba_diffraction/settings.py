@@ -1,14 +1,15 @@
-"""What a spectrum is made for: the visible range, the coherence length and its lobe, arguments q and κ."""
+"""The parameters of a spectrum, checked in one place; the coherence length and its lobe, arguments q and κ."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.special
 from numpy.typing import ArrayLike, NDArray
 
-from .errors import RequestError
+from .errors import RequestError, is_number
 
 VISIBLE = (360.0, 830.0)
 """nm: the range of the CIE 1931 observer, from which Mitsuba draws wavelengths."""
@@ -19,6 +20,102 @@ SUN_COHERENCE_LENGTH = 65.0
 
 # 1 nm to 1 m, beyond which the lobes under- or overflow in floating point.
 SHORTEST, LONGEST = 1e-3, 1e6
+
+EXTENTS = ("tile", "sample")
+THEORIES = ("scalar", "rigorous")
+REPRESENTATIONS = ("auto", "taylor", "chebyshev", "svd", "slices")
+LEAST_TOLERANCE = 1e-5
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The parameters of a spectrum, as recipes, scenes, the command line and `precompute` have them.
+
+    Attributes:
+        extent: "tile": the patch repeats for ever; "sample": it is a piece of a larger, irregular surface.
+        coherence_length: L_c in µm.
+        wavelengths: (shortest, longest) in nm.
+        largest_angle: of incidence and exit that the scene has, degrees from the normal; less than 90 keeps fewer
+            frequencies.
+        representation: "taylor", "chebyshev", "svd" or "slices"; "auto" is "slices", than which none reads fewer bytes.
+        tolerance: bound of max over κ of ∫|S_approx(q; κ) − S_exact(q; κ)| dq, a share of the reflected power; by
+            default 1e-3, and of a sample a tenth of its `standard_error`, at least 1e-3 and at most 1e-2. Of rigorous
+            theory the bound of `RigorousSpectrum.error`, by default 1e-2.
+        largest_height_range: in µm; a deeper surface is refused, as one whose heights are in nm. Time and memory grow
+            with the height range.
+        theory: "scalar", or "rigorous": Maxwell's equations, for a tile of one row and one material only.
+        int_ior: of rigorous theory, index of refraction of a dielectric, or n + ik.
+        material: of rigorous theory, or a conductor by the name that Mitsuba has for it.
+        ext_ior: of rigorous theory, index of the medium above relative to air, for a grating under a coat; wavelengths
+            are those there.
+        polarised: of rigorous theory, whether polarised variants can use the table, which is then seventeen times as
+            large.
+
+    Raises:
+        ValueError: if one is out of range, or they contradict each other.
+    """
+
+    extent: str = "tile"
+    coherence_length: float = SUN_COHERENCE_LENGTH
+    wavelengths: tuple[float, float] = VISIBLE
+    largest_angle: float = 90.0
+    representation: str = "auto"
+    tolerance: float | None = None
+    largest_height_range: float = 20.0
+    theory: str = "scalar"
+    int_ior: complex | None = None
+    material: str | None = None
+    ext_ior: float = 1.0
+    polarised: bool = False
+
+    def __post_init__(self) -> None:
+        if self.extent not in EXTENTS:
+            raise RequestError(f"extent: got {self.extent!r}, wanted 'tile' or 'sample'")
+        for name, known in (("theory", THEORIES), ("representation", REPRESENTATIONS)):
+            if (value := getattr(self, name)) not in known:
+                raise RequestError(f"{name}: got {value!r}, wanted one of {', '.join(known)}")
+        for name in ("coherence_length", "largest_angle", "tolerance", "largest_height_range", "ext_ior"):
+            value = getattr(self, name)
+            if not (is_number(value) or (name == "tolerance" and value is None)):
+                raise RequestError(f"{name}: got {value!r}, wanted a number")
+        lobe_width(self.coherence_length)
+        try:
+            shortest, longest = (float(w) for w in self.wavelengths)
+        except (TypeError, ValueError, OverflowError):
+            raise RequestError(f"wavelengths: got {self.wavelengths!r}, wanted (shortest, longest) in nm") from None
+        if not 50 <= shortest < longest < math.inf:
+            raise RequestError(
+                f"wavelengths: got {self.wavelengths!r}, wanted (shortest, longest) in nm, at least 50 nm"
+            )
+        object.__setattr__(self, "wavelengths", (shortest, longest))
+        if not 0 < self.largest_angle <= 90:
+            raise RequestError(
+                f"largest_angle: got {self.largest_angle!r}, wanted degrees from the normal, above 0, at most 90"
+            )
+        least = LEAST_TOLERANCE if self.theory == "scalar" else 1e-4
+        if self.tolerance is not None and not least <= self.tolerance < 1:
+            raise RequestError(
+                f"tolerance: got {self.tolerance!r}, wanted a share of the reflected power from {least:g} to 1"
+            )
+        if not self.largest_height_range > 0:
+            raise RequestError(
+                f"largest_height_range: got {self.largest_height_range!r}, wanted a positive number of µm"
+            )
+        if not 1 <= self.ext_ior <= 10:
+            raise RequestError(f"ext_ior: got {self.ext_ior!r}, wanted the index of the medium above, from 1 to 10")
+        if not isinstance(self.polarised, bool):
+            raise RequestError(f"polarised: got {self.polarised!r}, wanted True or False")
+        if self.theory == "rigorous" and (self.extent, self.largest_angle, self.representation) != ("tile", 90, "auto"):
+            raise RequestError(
+                f"theory: got rigorous with extent {self.extent!r}, largest_angle {self.largest_angle!r} and "
+                f"representation {self.representation!r}; it has its own table of a tile, for all directions"
+            )
+        of_rigorous = self.int_ior, self.material, self.ext_ior, self.polarised
+        if self.theory == "scalar" and of_rigorous != (None, None, 1, False):
+            raise RequestError(
+                "int_ior, material, ext_ior, polarised: the spectrum of scalar theory is that of every material; "
+                "wanted none of them"
+            )
 
 
 def lobe_width(coherence_length: float) -> float:

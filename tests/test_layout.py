@@ -17,6 +17,25 @@ MODULES = {
 }
 
 
+ROOMS = {
+    # The lowest first: a room imports from those above it in this list, and from itself.
+    "base": "color errors files geometry llvm manual outputs progress settings",
+    "surface": "surface",
+    "spectrum": "spectrum",
+    "energy": "energy",
+    "rigorous": "rigorous",
+    "theory": "reference scalar_theory",
+    "precompute": "grating_spectrum precomputation recipe",
+    "bsdf": "bsdf",
+    "render": "integrator render testing",
+    "inspection": "inspection",
+    "registration": "plugin registration",
+    "cli": "cli __main__",
+    "evaluation": "evaluation",
+}
+LEVELS = {name: level for level, names in enumerate(ROOMS.values()) for name in names.split()}
+
+
 def imports(module):
     """The modules of the package that a module imports, at its head, inside a function or for its annotations."""
     path = MODULES[module]
@@ -42,6 +61,20 @@ def test_no_module_imports_itself_by_way_of_others():
     graph = {module: set(imports(module)) - {module} for module in MODULES}
     assert sum(map(len, graph.values())) > 200
     graphlib.TopologicalSorter(graph).prepare()
+
+
+@pytest.mark.quick
+def test_no_room_imports_a_higher_one():
+    def level(module):
+        return LEVELS[module.split(".")[1]]
+
+    wrong = [
+        f"{module} imports {found}"
+        for module in MODULES.keys() - {"mitsuba_diffraction"}
+        for found in imports(module)
+        if found != "mitsuba_diffraction" and level(found) > level(module)
+    ]
+    assert not wrong, wrong
 
 
 def test_nothing_depends_on_what_judges_the_product():

@@ -10,6 +10,7 @@ import pytest
 import mitsuba_diffraction as md
 from mitsuba_diffraction import GratingSpectrum, Recipe
 from mitsuba_diffraction import recipe as recipe_module
+from mitsuba_diffraction.surface.readers import read_height_field
 
 SLOW = {"compact_disc", "dvd", "elaphe", "morpho_ridges", "xenopeltis", "xenopeltis_afm"}
 RECIPES = sorted((Path(__file__).parents[1] / "precompute").glob("*.toml"))
@@ -139,9 +140,17 @@ def test_a_recipe_that_is_not_there_is_named(tmp_path):
 )
 def test_values_of_the_spectrum_that_cannot_be_are_refused_by_name(tmp_path, entry, name):
     path = write(tmp_path, f"{BLAZE}[spectrum]\n{entry}\n")
-    with pytest.raises(ValueError, match=f"{name}: ") as caught:
-        Recipe.load(path).build()
+    with pytest.raises(ValueError, match=f"recipe.toml: {name}: ") as caught:
+        Recipe.load(path)
     assert "\n" not in str(caught.value)
+
+
+def test_options_take_the_place_of_a_recipes_values(tmp_path):
+    path = write(tmp_path, BLAZE + '[spectrum]\ntolerance = 2\nmaterial = "Al"\n')
+    recipe = Recipe.load(path, tolerance=0.1, theory="rigorous")
+    assert recipe.spectrum == {"tolerance": 0.1, "material": "Al", "theory": "rigorous"}
+    with pytest.raises(ValueError, match=r"^tolerance: got 7"):  # not a mistake of the file
+        Recipe.load(path, tolerance=7, theory="rigorous")
 
 
 @pytest.mark.parametrize(
@@ -241,6 +250,16 @@ def test_a_recipe_of_a_sample_builds_its_spectrum(tmp_path, own_cache):
     assert Recipe.load(tile).digest() != Recipe.load(path).digest()
 
 
+def test_a_spectrum_keeps_the_warning_of_scalar_theory(tmp_path):
+    surface = {"profile": "sinusoidal", "period": 0.71, "depth": 0.3, "samples": 64}
+    spectrum = Recipe(surface, FAST).build()
+    assert spectrum.warning.startswith("scalar theory: errs by 63% of the reflected light")
+    spectrum.save(tmp_path / "fine.exr")
+    assert GratingSpectrum.load(tmp_path / "fine.exr").warning == spectrum.warning
+    assert spectrum.digest == md.precompute(md.gratings.sinusoidal(0.71, 0.3, samples=64), **FAST).digest
+    assert Recipe({**surface, "period": 3.0, "depth": 0.05}, FAST).build().warning == ""
+
+
 def test_a_recipe_reports_the_coherence_length_that_its_scan_supports(tmp_path):
     np.save(tmp_path / "scan.npy", np.zeros((20, 24)))
     path = write(
@@ -322,6 +341,7 @@ def test_the_cache_is_read_the_second_time(own_cache, builds):
 def test_a_spectrum_in_use_is_neither_built_nor_read_again(own_cache, builds):
     recipe = Recipe(BLAZED, FAST)
     first = recipe.cached()
+    assert not any(isinstance(value, md.HeightField) for value in vars(recipe).values())
     shutil.rmtree(own_cache)
     assert recipe.cached() is first
     assert len(builds) == 1
@@ -574,3 +594,52 @@ def test_a_spectrum_of_another_surface_under_a_name_of_the_cache_is_not_used(own
     assert one.cached().source_digest == one.height_field().digest
     one.cached()
     assert len(builds) == 4
+
+
+# ---------------------------------------------------------------- reading a scan
+
+
+SAMPLE = """[surface]
+scan = "scan.npy"
+pixel_size = 0.05
+[spectrum]
+extent = "sample"
+coherence_length = 0.4
+tolerance = 0.05
+"""
+
+
+@pytest.mark.parametrize(
+    ("line", "reads"),
+    [
+        ("precompute scan.npy --pixel-size 0.05 --tolerance 0.05", 1),
+        ("precompute scan.toml", 1),
+        ("inspect scan.toml", 1),
+        ("render scene.xml --spp 1 --width 4 --variant scalar_spectral --overwrite", 1),
+        ("render scene.xml --spp 1 --width 4 --variant scalar_spectral --overwrite", 0),  # from the cache
+    ],
+    ids=["precompute", "recipe", "inspect", "render", "render again"],
+)
+def test_a_command_reads_a_scan_once(tmp_path, command, monkeypatch, own_cache, line, reads):
+    counted = []
+
+    def read(path, **options):
+        counted.append(path)
+        return read_height_field(path, **options)
+
+    monkeypatch.chdir(tmp_path)
+    np.save("scan.npy", np.tile(np.sin(np.arange(24) * np.pi / 4) * 0.1, (20, 1)))
+    write(tmp_path, SAMPLE, "scan.toml")
+    grating = '<bsdf type="diffraction_grating"><string name="filename" value="scan.toml"/></bsdf>'
+    shapes = 2 * f'<shape type="rectangle">{grating}</shape>'
+    write(
+        tmp_path,
+        f'<scene version="3.0.0"><integrator type="path"/><sensor type="perspective"/>{shapes}</scene>',
+        "scene.xml",
+    )
+    if not reads:
+        Recipe.load("scan.toml").cached()
+    monkeypatch.setattr(recipe_module, "read_height_field", read)
+    code, _, err = command(line)
+    assert code == 0, err
+    assert len(counted) == reads

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from ..spectrum.grating_spectrum import GratingSpectrum
+from ..grating_spectrum import GratingSpectrum
 from ..spectrum.orders import OrderGrid
 from ..spectrum.spline_grid import spline_integral
 from .geometry import Incidence

@@ -38,8 +38,8 @@ class Grating:
         self.media, self.coat = media, media.coat
         self.spectrum, self.recipe = surface_from(props, media)
         rigorous = isinstance(self.spectrum, RigorousSpectrum)
-        if self.recipe is not None and not rigorous:
-            warn_of_range(self.recipe)
+        if not rigorous:
+            warn_of_range(self.spectrum)
         self.theory = (RigorousTheory if rigorous else ScalarTheory)(props, self.spectrum, media)
         self.scattering = self.theory.scattering
         angle = props.get("orientation", 0.0)

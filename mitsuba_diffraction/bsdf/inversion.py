@@ -18,7 +18,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..spectrum.grating_spectrum import GratingSpectrum
+from ..grating_spectrum import GratingSpectrum
 from .geometry import Incidence
 from .tables import BELOW_ONE, FloatTable, larger, limited, opaque
 

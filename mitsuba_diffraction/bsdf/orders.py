@@ -17,7 +17,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..spectrum.grating_spectrum import GratingSpectrum
+from ..grating_spectrum import GratingSpectrum
 from ..spectrum.orders import LobeAxis
 from ..spectrum.tables import HALF_SCALE, SeriesTable, SliceTable, shared_exponents
 from .cell_sampler import LOBE, CellAxis, CellSampler

@@ -11,9 +11,9 @@ import numpy as np
 
 from ..energy.furnace import Furnace
 from ..energy.table import EnergyTable, corners
+from ..precomputation import Spectrum
 from ..rigorous.spectrum import RigorousSpectrum
 from ..settings import VISIBLE
-from ..spectrum.load import Spectrum
 from ..spectrum.orders import OrderGrid
 from .energy import Energy
 from .orders import OrderSpectrum

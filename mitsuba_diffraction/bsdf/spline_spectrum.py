@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..spectrum.grating_spectrum import GratingSpectrum
+from ..grating_spectrum import GratingSpectrum
 from ..spectrum.spline_grid import spline_weights
 from .cell_sampler import CellSampler
 from .geometry import Geometry, Incidence

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import inspect
-import json
 import logging
 import weakref
 from pathlib import Path
@@ -13,13 +12,12 @@ from pathlib import Path
 import mitsuba as mi
 
 from ..errors import RequestError
+from ..grating_spectrum import GratingSpectrum
+from ..precomputation import Spectrum, load_spectrum
 from ..progress import progress_bar
 from ..recipe import Recipe
 from ..rigorous.spectrum import RigorousSpectrum
-from ..scalar_theory import scalar_error
-from ..settings import VISIBLE
-from ..spectrum.build import THEORIES
-from ..spectrum.load import Spectrum, load_spectrum
+from ..settings import THEORIES, VISIBLE
 from ..surface.gratings import COHERENCE_LENGTHS, PROFILES
 from .media import Media
 from .theories import settings_from, settings_of_medium
@@ -27,7 +25,7 @@ from .theories import settings_from, settings_of_medium
 _log = logging.getLogger(__name__)
 _per_cent = functools.partial(progress_bar, unit="%")
 _PREFIX = "handed over: "
-_told: set[str] = set()  # surfaces whose range was looked up
+_told: set[str] = set()  # warnings, each of which is given once
 _handed_over: weakref.WeakValueDictionary[str, Spectrum] = weakref.WeakValueDictionary()
 
 
@@ -75,17 +73,12 @@ def surface_from(props: mi.Properties, media: Media) -> tuple[Spectrum, Recipe |
     return recipe.cached(_per_cent), recipe
 
 
-def warn_of_range(recipe: Recipe) -> None:
-    """Mitsuba's log says once for each surface if scalar theory is not to be trusted there."""
-    # A scan is named from the folder of its recipe.
-    where = str(recipe.folder) if "scan" in recipe.surface else ""
-    told = json.dumps([where, dict(recipe.surface)], sort_keys=True, default=str)
-    if told in _told:
-        return
-    _told.add(told)
-    surface = recipe.height_field()
-    if beyond := scalar_error(surface, recipe.spectrum.get("extent", "tile")).warning:
-        _log.warning("diffraction_grating, %s: %s", surface.source, beyond)
+def warn_of_range(spectrum: GratingSpectrum) -> None:
+    """Say in Mitsuba's log, once for each surface, if scalar theory is not to be trusted there."""
+    told = f"diffraction_grating, {spectrum.source}: {spectrum.warning}"
+    if spectrum.warning and told not in _told:
+        _told.add(told)
+        _log.warning("%s", told)
 
 
 def _inside(media: Media, recipe: Recipe) -> Recipe:

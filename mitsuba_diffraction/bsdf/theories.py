@@ -8,9 +8,9 @@ import numpy as np
 
 from ..errors import RequestError, is_number
 from ..geometry import SHADOWING
+from ..grating_spectrum import GratingSpectrum
 from ..rigorous.spectrum import RigorousSpectrum
 from ..settings import VISIBLE
-from ..spectrum.grating_spectrum import GratingSpectrum
 from .coat import Coat
 from .geometry import Geometry, turned
 from .media import Media

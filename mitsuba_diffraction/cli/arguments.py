@@ -9,12 +9,12 @@ from typing import Annotated
 
 import typer
 
+from .. import outputs
 from ..errors import RequestError
-from ..outputs import claimed
 
 
 def scene_parameters(define: Sequence[str] | None) -> dict[str, str]:
-    """Scene parameters from the options -D NAME=VALUE.
+    """Return the scene parameters from the options -D NAME=VALUE.
 
     Raises:
         ValueError: if one is not of this form, not UTF-8, or given twice.
@@ -43,18 +43,13 @@ _NOT_OF_THE_REQUEST = frozenset(
 )
 
 
-def claim(
-    context: typer.Context,
-    reads: Iterable[Path],
-    writes: Iterable[tuple[str, Path]],
-    scratch: Iterable[Path] = (),
-) -> None:
-    """`outputs.claimed` for the duration of the command; the request is the command line without defaults.
+def claim(context: typer.Context, reads: Iterable[Path], writes: Iterable[tuple[str, Path]]) -> None:
+    """Claim the outputs of a command (`outputs.claim`); the request is its command line without defaults.
 
     Raises:
-        ValueError: as `outputs.claimed`, or if a file name is not UTF-8, which OpenEXR and Mitsuba require.
+        ValueError: as `outputs.claim`, or if a file name is not UTF-8, which OpenEXR and Mitsuba require.
     """
-    reads, writes, scratch = list(reads), list(writes), list(scratch)
+    reads, writes = list(reads), list(writes)
     for path in [*reads, *(path for _, path in writes)]:
         _refuse_other_than_utf8(os.path.realpath(path))
     request = {
@@ -64,19 +59,12 @@ def claim(
     }
     if "define" in request:
         request["define"] = scene_parameters(request["define"])
-    context.with_resource(
-        claimed(
-            {"command": context.command.name, **request},
-            reads,
-            writes,
-            scratch=scratch,
-            overwrite=context.params["overwrite"],
-        )
-    )
+    request["command"] = context.command.name
+    outputs.claim(request, reads, writes, overwrite=context.params["overwrite"])
 
 
 def check_suffix(option: str, path: Path, *suffixes: str) -> None:
-    """Raises ValueError unless the name of an output ends in one of these."""
+    """Raise ValueError unless the name of an output ends in one of these."""
     if path.suffix.lower() not in suffixes:
         wanted = " or ".join(filter(None, [", ".join(suffixes[:-1]), suffixes[-1]]))
         raise RequestError(f"{option}: got {path}, wanted a file name that ends in {wanted}")

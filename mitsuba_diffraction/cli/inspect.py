@@ -19,7 +19,6 @@ from ..outputs import free_name, save_json
 from ..settings import SUN_COHERENCE_LENGTH, lobe_width
 from .arguments import Overwrite, check_suffix, claim
 from .console import progress_bar, show, table, tell
-from .inputs import files_read
 from .scan import (
     Channel,
     CoherenceLength,
@@ -31,6 +30,7 @@ from .scan import (
     Unit,
     options_of_scan,
     recipe_of,
+    settings_of,
 )
 
 
@@ -54,16 +54,12 @@ def inspect(
     overwrite: Overwrite = False,
 ) -> None:
     """Report and plot the statistics, periods and predicted colours of a surface, and their reliability."""
-    reads = files_read(source)
+    recipe = recipe_of(source, options_of_scan(context), settings_of(context))
+    reads = [source, *recipe.files]
     by_default = free_name(f"{source.stem}_inspect", lambda stem: [Path(f"{stem}.png")], reads)
     picture = output or Path(f"{by_default}.png")
     check_suffix("-o", picture, ".png", ".pdf", ".svg")
     claim(context, reads, [("-o", picture), *([("--json", json)] if json else [])])
-    of_scan = options_of_scan(
-        pixel_size, height_range, fill_missing, channel, unit, [*["level_plane"] * plane, *(prepare or [])]
-    )
-    settings = {"extent": extent, "coherence_length": coherence_length}
-    recipe = recipe_of(source, of_scan, {name: value for name, value in settings.items() if value is not None})
     height_field = recipe.height_field()
     with progress_bar(f"spectra of {source.name}") as progress:
         inspection = look(

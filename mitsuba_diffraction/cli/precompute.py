@@ -8,16 +8,14 @@ from typing import Annotated
 import typer
 
 from ..errors import RequestError
+from ..grating_spectrum import GratingSpectrum
+from ..precomputation import Spectrum
 from ..recipe import Recipe
 from ..rigorous.spectrum import RigorousSpectrum
-from ..scalar_theory import scalar_error
-from ..spectrum.build import REPRESENTATIONS, THEORIES
-from ..spectrum.grating_spectrum import GratingSpectrum
-from ..spectrum.load import Spectrum
+from ..settings import REPRESENTATIONS, THEORIES
 from ..surface.prepare import seam_matters, seam_steps
 from .arguments import Overwrite, check_suffix, claim
 from .console import progress_bar, tell
-from .inputs import files_read
 from .scan import (
     Channel,
     CoherenceLength,
@@ -29,6 +27,7 @@ from .scan import (
     Unit,
     options_of_scan,
     recipe_of,
+    settings_of,
 )
 
 
@@ -70,40 +69,23 @@ def precompute(
     """Compute the power spectrum of the phase from recipes or scans."""
     if output is not None and len(sources) > 1:
         raise RequestError(f"-o: got {len(sources)} sources, wanted one (without -o each is named after its source)")
-    given = {
-        "extent": extent,
-        "coherence_length": coherence_length,
-        "largest_angle": largest_angle,
-        "largest_height_range": largest_height_range,
-        "representation": representation,
-        "tolerance": tolerance,
-        "theory": theory,
-        "material": material,
-        "int_ior": int_ior,
-        "ext_ior": ext_ior,
-        "polarised": polarised or None,
-    }
-    settings = {name: value for name, value in given.items() if value is not None}
-    of_scan = options_of_scan(pixel_size, height_range, fill_missing, channel, unit, prepare)
     targets = [output or Path(source.name or "spectrum").with_suffix(".exr") for source in sources]
     for target in targets:
         check_suffix("-o", target, ".exr")
-    reads = [file for source in sources for file in files_read(source)]
+    recipes = [recipe_of(source, options_of_scan(context), settings_of(context)) for source in sources]
+    reads = [*sources, *(file for recipe in recipes for file in recipe.files)]
     claim(context, reads, [("-o" if output else f"spectrum of {s}", t) for s, t in zip(sources, targets, strict=True)])
-    seams = [_seam(source, recipe_of(source, of_scan, settings)) for source in sources]
-    for source, target, seam in zip(sources, targets, seams, strict=True):
+    seams = [_seam(source, recipe) for source, recipe in zip(sources, recipes, strict=True)]
+    for source, recipe, target, seam in zip(sources, recipes, targets, seams, strict=True):
         with progress_bar(f"spectrum of {source.name}", "%") as progress:
-            recipe = recipe_of(source, of_scan, settings)
             spectrum = recipe.build(progress)
             spectrum.save(target)
         tell(
             f"{target}: {spectrum.source}; {spectrum.extent}, {spectrum.grid}; coherence length "
             f"{spectrum.coherence_length:.4g} µm; {_table(spectrum)}{seam}"
         )
-        if isinstance(spectrum, GratingSpectrum):
-            beyond = scalar_error(recipe.height_field(), spectrum.extent).warning
-            if beyond:
-                tell(f"! {beyond}")
+        if isinstance(spectrum, GratingSpectrum) and spectrum.warning:
+            tell(f"! {spectrum.warning}")
 
 
 def _table(spectrum: Spectrum) -> str:

@@ -12,7 +12,6 @@ from ..errors import RequestError
 from ..outputs import free_name
 from .arguments import Define, Overwrite, Variant, check_suffix, claim, scene_parameters
 from .console import Stopped, progress_bar, tell
-from .inputs import files_read
 
 
 def render(
@@ -57,7 +56,7 @@ def render(
     from ..render.passes import Interrupted, checkpoint_path, trace_here
     from ..render.passes import render as trace
     from ..render.preview import save_preview
-    from ..render.scene import load_spectral_scene, named_sample_count
+    from ..render.scene import files_of_scene, load_spectral_scene, named_sample_count
     from ..render.spectral_image import SpectralImage
     from ..render.turntable import frame_path, save_animation
     from ..render.turntable import orbit as motions_of_orbit
@@ -67,7 +66,7 @@ def render(
     if (frames is not None) != orbit:
         raise RequestError("--frames N and --orbit go together")
     parameters = scene_parameters(define)
-    reads = files_read(scene, parameters)
+    reads = files_of_scene(scene, parameters)
 
     def pictures(target: Path) -> list[Path]:
         return [target] if frames is None else [frame_path(target, frame, frames) for frame in range(frames)]
@@ -78,7 +77,7 @@ def render(
 
     target = output or Path(free_name(scene.stem, lambda stem: written(Path(f"{stem}.exr")), reads) + ".exr")
     targets, animation = pictures(target), target.with_suffix(".webp")
-    claim(context, reads, [("-o", path) for path in written(target)], map(checkpoint_path, targets))
+    claim(context, reads, [("-o", path) for path in written(target)])
     for path in targets:
         if checkpoint_path(path).exists() and not resume:
             raise RequestError(

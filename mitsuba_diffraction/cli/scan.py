@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from dataclasses import fields
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from ..errors import RequestError
 from ..recipe import Recipe
-from ..settings import SUN_COHERENCE_LENGTH
+from ..settings import SUN_COHERENCE_LENGTH, Settings
 from ..surface.prepare import STEP_NAMES, step_of
 
 PixelSize = Annotated[float | None, typer.Option(help="pixel size of the scan, µm")]
@@ -33,28 +35,27 @@ CoherenceLength = Annotated[
 ]
 
 
-def options_of_scan(
-    pixel_size: float | None,
-    height_range: float | None,
-    fill_missing: bool,
-    channel: str | None,
-    unit: list[str] | None,
-    prepare: list[str] | None,
-) -> dict[str, object]:
-    """The options given, under their names in recipes."""
-    given = {
-        "pixel_size": pixel_size,
-        "height_range": height_range,
-        "fill_missing": fill_missing or None,
-        "channel": channel,
-        "unit": unit[0] if unit and len(unit) == 1 else unit or None,
-        "prepare": [step_of(text) for text in prepare] if prepare else None,
-    }
-    return {name: value for name, value in given.items() if value is not None}
+def options_of_scan(context: typer.Context) -> dict[str, object]:
+    """Return the options of a scan that the command was given, under their names in recipes."""
+    given = _given(context, ("pixel_size", "height_range", "fill_missing", "channel", "unit", "prepare"))
+    if len(unit := given.get("unit", ())) == 1:
+        given["unit"] = unit[0]
+    steps = [*["level_plane"] * context.params.get("plane", False), *given.get("prepare", [])]
+    return {**given, "prepare": [step_of(text) for text in steps]} if steps else given
+
+
+def settings_of(context: typer.Context) -> dict[str, object]:
+    """Return the options of the spectrum that the command was given, under their names in `Settings`."""
+    return _given(context, [field.name for field in fields(Settings)])
+
+
+def _given(context: typer.Context, names: Iterable[str]) -> dict[str, Any]:
+    # A number may be zero, which is refused elsewhere.
+    return {n: value for n in names if (value := context.params.get(n)) not in (None, ()) and value is not False}
 
 
 def recipe_of(source: Path, of_scan: dict[str, object], settings: dict[str, object]) -> Recipe:
-    """The recipe in a file, or the one equivalent to a scan and its options; `settings` override its spectrum.
+    """Return the recipe in a file, or the one equivalent to a scan and its options; `settings` override its spectrum.
 
     Raises:
         ValueError: if options of a scan are given for a recipe, or something in either is wrong.
@@ -64,5 +65,4 @@ def recipe_of(source: Path, of_scan: dict[str, object], settings: dict[str, obje
     if of_scan:
         names = ", ".join(f"--{name.replace('_', '-')}" for name in of_scan)
         raise RequestError(f"{names} go with a scan; the recipe {source} has its own")
-    recipe = Recipe.load(source)
-    return Recipe(recipe.surface, {**recipe.spectrum, **settings}, recipe.folder)
+    return Recipe.load(source, **settings)

@@ -24,7 +24,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 from numpy.polynomial.legendre import leggauss
@@ -34,9 +33,9 @@ from scipy.ndimage import maximum_filter1d
 from scipy.special import ndtri
 
 from ..geometry import horizon_gain, k_g
-from ..spectrum.orders import LobeAxis, OrderGrid
-from ..spectrum.spline_grid import SplineGrid, spline_integral
-from ..spectrum.tables import SeriesTable, SliceTable
+from ..spectrum.orders import OrderGrid
+from ..spectrum.power_spectrum import PowerSpectrum
+from ..spectrum.spline_grid import spline_integral
 
 KAPPA_STEP = 0.1  # radians of the fastest oscillation over κ, between which powers are linear
 CELL, CELLS = 0.2, 500  # width of a gathered cell in direction cosines at the shortest wavelength; cells at least
@@ -50,34 +49,6 @@ RADIAL_CELL = 3  # of a cell
 BLUR = 0.05  # a cell of a table in three dimensions, as a share of the largest κ
 POINTS = 6000  # drawn by power among the nodes of a spectrum
 CHUNK = 1 << 16  # pairs (direction, component) at once, so that they stay in the cache
-
-
-class PowerSpectrum(Protocol):
-    """What the furnace asks of a `GratingSpectrum`."""
-
-    @property
-    def grid(self) -> OrderGrid | SplineGrid: ...
-
-    @property
-    def table(self) -> SeriesTable | SliceTable: ...
-
-    @property
-    def lobes(self) -> tuple[LobeAxis, LobeAxis]: ...
-
-    @property
-    def lobe_width(self) -> float: ...
-
-    @property
-    def largest_kappa(self) -> float: ...
-
-    @property
-    def height_range(self) -> float: ...
-
-    @property
-    def wavelengths(self) -> tuple[float, float]: ...
-
-    def powers(self, kappa: float) -> NDArray[np.float32]:
-        """Return the share of the reflected power of each node."""
 
 
 def evaluated_by_order(spectrum: PowerSpectrum) -> bool:

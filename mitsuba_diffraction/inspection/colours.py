@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..color import daylight, spectrum_to_XYZ
-from ..scalar_theory import geometry
+from ..geometry import k_g
+from ..grating_spectrum import GratingSpectrum
 from ..settings import VISIBLE
-from ..spectrum.grating_spectrum import GratingSpectrum
 
 Array = NDArray[np.float64]
 
@@ -65,8 +65,8 @@ def radiance(
     vector = lateral_scale * q[..., None] * np.array([np.cos(along), np.sin(along)])
     density = lateral_scale**2 * spectrum.evaluate(vector, height_scale * kappa)
     # The light comes from −θ_i.
-    k_g = geometry(cos_i, cos_o, np.cos(theta_i + theta_o)[..., None])
-    return illumination() * k_g * density / wavelengths**2 * cos_i
+    factor = k_g(cos_i, cos_o, 1 + np.cos(theta_i + theta_o)[..., None])
+    return illumination() * factor * density / wavelengths**2 * cos_i
 
 
 def order_angle(order: int, period: float, wavelength: float) -> float | None:

@@ -8,12 +8,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from ..grating_spectrum import GratingSpectrum
 from ..outputs import plain
-from ..reference import check_extent
+from ..precomputation import precompute
 from ..scalar_theory import ScalarError, scalar_error
-from ..settings import SUN_COHERENCE_LENGTH, VISIBLE, lobe_width
-from ..spectrum.build import precompute
-from ..spectrum.grating_spectrum import GratingSpectrum
+from ..settings import SUN_COHERENCE_LENGTH, VISIBLE, Settings
 from ..spectrum.sample import carried_coherence_length, standard_error
 from ..surface.heightfield import HeightField
 from ..surface.periods import Period, find_periods, repeated
@@ -105,8 +104,7 @@ def inspect(
     Raises:
         ValueError: on an unknown extent, a coherence length that is not positive, or a sample of too few pixels.
     """
-    check_extent(extent)
-    lobe_width(coherence_length)
+    Settings(extent, coherence_length)
     sun = SUN_COHERENCE_LENGTH
     carried = carried_coherence_length(height_field, sun) if extent == "sample" else max(sun, coherence_length)
     used = min(float(coherence_length), carried)

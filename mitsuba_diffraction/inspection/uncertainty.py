@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from ..color import delta_E, spectrum_to_XYZ
 from ..errors import RequestError
+from ..grating_spectrum import GratingSpectrum
 from ..scalar_theory import ScalarError
 from ..settings import lobe_width
-from ..spectrum.grating_spectrum import GratingSpectrum
 from ..surface.heightfield import HeightField
 from ..surface.periods import Period, find_periods, hann
 from .colours import WAVELENGTHS, order_angle, order_share, radiance

@@ -229,7 +229,7 @@ def _parsed(
     beside_scene.prepend(str(path.resolve().parent))
     mi.set_file_resolver(beside_scene)
     try:
-        config = mi.parser.ParserConfig(mi.variant())
+        config = mi.parser.ParserConfig(mi.variant() or "scalar_spectral")
         state = mi.parser.parse_file(config, str(path.resolve()), **(parameters or {}))
         _refuse_missing_files(path, state)
         yield config, state
@@ -237,6 +237,27 @@ def _parsed(
         raise RequestError(f"{path}: {root_cause(error)}{_what_there_is(path, str(error))}") from error
     finally:
         mi.set_file_resolver(resolver)
+
+
+def files_of_scene(path: str | os.PathLike[str], parameters: Mapping[str, str] | None = None) -> list[Path]:
+    """Return the files that a scene names: itself, what it includes, files of its plugins, scans of its recipes.
+
+    Tables of spectra (`<spectrum filename="…"/>`) are not among them: of these the parser keeps the values alone.
+
+    Raises:
+        FileNotFoundError: if there is no such scene, or a mesh or a texture is missing.
+        ValueError: if the scene or a recipe is wrong.
+    """
+    with _parsed(path, parameters) as (_, state):
+        texts = [
+            node.props[key]
+            for node in state.nodes
+            for key in node.props.keys()  # noqa: SIM118 (no mapping)
+            if node.props.type(key) == mi.Properties.Type.String
+        ]
+        named = [Path(str(mi.file_resolver().resolve(str(name)))) for name in [*state.files, *texts]]
+    found = [file for file in named if file.is_file()]
+    return [*found, *(scan for file in found if file.suffix.lower() == ".toml" for scan in Recipe.load(file).files)]
 
 
 def _refuse_missing_files(path: Path, state: mi.parser.ParserState) -> None:

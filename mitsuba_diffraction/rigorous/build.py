@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from ..errors import RequestError
 from ..files import whole_file
-from ..settings import SUN_COHERENCE_LENGTH, VISIBLE, lobe_width
+from ..progress import Progress, silent
+from ..settings import SUN_COHERENCE_LENGTH, Settings
 from ..surface.heightfield import HeightField
 from .axes import LARGEST_PERIOD, STORED, Axes
 from .coordinate_transformation import Grating, light_from, scatter
@@ -26,7 +27,6 @@ from .materials import refractive_index
 from .spectrum import RigorousSpectrum
 
 Real = NDArray[np.float64]
-Progress = Callable[[int, int], None]
 
 # Steps to a unit that are solved, one after the other until the error is kept.
 _SOLVED = (8, 16, 32)
@@ -47,47 +47,30 @@ MATRICES = 3.0
 
 def build_spectrum(
     height_field: HeightField,
-    *,
-    int_ior: complex | None = None,
-    material: str | None = None,
-    ext_ior: float = 1.0,
-    polarised: bool = False,
-    coherence_length: float = SUN_COHERENCE_LENGTH,
-    wavelengths: tuple[float, float] = VISIBLE,
-    tolerance: float = 1e-2,
-    progress: Progress | None = None,
+    settings: Settings,
+    progress: Progress = silent,
     checkpoints: Path | None = None,
 ) -> RigorousSpectrum:
-    """The table of a surface of one row.
+    """Compute the table of a surface of one row.
 
     Args:
         height_field: the surface; rows that differ are refused.
-        int_ior: index of refraction of a dielectric, or n + ik.
-        material: or a conductor by Mitsuba's name.
-        ext_ior: index of refraction of the medium above, relative to air: that of a coat.
-        polarised: whether the table holds the Mueller matrices of the orders, too; it is seventeen times as large.
-        coherence_length: L_c in µm.
-        wavelengths: (shortest, longest) in nm, in the medium above.
-        tolerance: bound of `RigorousSpectrum.error`, the mean of Σ|Δη_m| / Σ η_m over directions and wavelengths, and
-            of a third of `polarisation_error`.
+        settings: of rigorous theory. The tolerance bounds `RigorousSpectrum.error`, the mean of Σ|Δη_m| / Σ η_m over
+            directions and wavelengths, and a third of `polarisation_error`.
         progress: called with (per cent done, 100); it never counts back.
         checkpoints: a folder for what is done so far; an interrupted build goes on from there.
 
     Raises:
-        ValueError: if an argument is out of range, the period is above ten of the shortest wavelength, or the profile
-            is too deep for efficiencies that converge and conserve energy within the tolerance.
+        ValueError: if the material is unknown, the period is above ten of the shortest wavelength, or the profile is
+            too deep for efficiencies that converge and conserve energy within the tolerance.
 
     Warns:
-        UserWarning: if the finest table errs by more than `tolerance`, or its Mueller matrices by more than three times
-            that; `error` and `polarisation_error` say by how much.
+        UserWarning: if the finest table errs by more than the tolerance, or its Mueller matrices by more than three
+            times that; `error` and `polarisation_error` say by how much.
     """
-    if not 1e-4 <= tolerance < 1:
-        raise RequestError(f"tolerance: got {tolerance!r}, wanted a share of the reflected light from 1e-4 to 1")
-    lobe_width(coherence_length)
-    if not (isinstance(ext_ior, int | float) and 1 <= ext_ior <= 10):
-        raise RequestError(f"ext_ior: got {ext_ior!r}, wanted the index of the medium above, from 1 to 10")
-    if not isinstance(polarised, bool):
-        raise RequestError(f"polarised: got {polarised!r}, wanted True or False")
+    tolerance = 1e-2 if settings.tolerance is None else settings.tolerance
+    wavelengths = settings.wavelengths
+    int_ior, material, ext_ior, polarised = settings.int_ior, settings.material, settings.ext_ior, settings.polarised
     period, longest = height_field.tile_size[0], LARGEST_PERIOD * wavelengths[0] * 1e-3
     if period > longest:
         raise RequestError(
@@ -103,7 +86,6 @@ def build_spectrum(
             repr((int_ior, material, ext_ior, polarised)),
         )
         checks = surface.checks()
-        report = progress or (lambda done, total: None)
         error, done = np.inf, 0
         for solved in _SOLVED:
             # Twice the steps cost four times as much and leave an eighth of the error: which table will be the last?
@@ -111,7 +93,7 @@ def build_spectrum(
             axes = Axes(surface.period, surface.wavelengths, STORED * solved, PLANES)
             table = _Table(surface, axes, solved, polarised)
             values, matrices = table.values(
-                lambda row, rows, a=begin, b=done: report(a + (b - a) * row // rows, 100), checkpoints
+                lambda row, rows, a=begin, b=done: progress(a + (b - a) * row // rows, 100), checkpoints
             )
             spectrum = RigorousSpectrum(
                 axes=axes,
@@ -120,7 +102,7 @@ def build_spectrum(
                 int_ior=complex(int_ior or 0),
                 ext_ior=float(ext_ior),
                 mueller=matrices,
-                coherence_length=float(coherence_length),
+                coherence_length=float(settings.coherence_length),
                 tolerance=float(tolerance),
                 harmonics=surface.harmonics,
                 source=height_field.source,
@@ -129,17 +111,17 @@ def build_spectrum(
             )
             # NaN: there are no matrices.
             if spectrum.error <= tolerance and not spectrum.polarisation_error > MATRICES * tolerance:
-                report(100, 100)
+                progress(100, 100)
                 return spectrum
             error = spectrum.error
-    report(100, 100)
+    progress(100, 100)
     got, wanted = f"{spectrum.error:.2g}", f"{tolerance:.2g}"
     if polarised:
         got += f" and {spectrum.polarisation_error:.2g} of the Mueller matrices"
         wanted += f" and {MATRICES * tolerance:.2g}"
     warnings.warn(
         f"rigorous table: got a mean error of {got} with {_SOLVED[-1]} steps to a unit, wanted at most {wanted}",
-        stacklevel=2,
+        stacklevel=4,
     )
     return spectrum
 

@@ -1,4 +1,4 @@
-"""From a height field to its spectrum, to a tolerance."""
+"""From a height field to its power spectrum, to a tolerance."""
 
 from __future__ import annotations
 
@@ -12,17 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RequestError
-from ..files import cache_folder
-from ..progress import Progress, part, silent
-from ..reference import check_extent
-from ..rigorous.build import build_spectrum
-from ..rigorous.efficiencies import one_thread
-from ..settings import SUN_COHERENCE_LENGTH, VISIBLE, lobe_reach, lobe_width
+from ..progress import Progress, part
+from ..settings import Settings, lobe_reach, lobe_width
 from ..surface.heightfield import HeightField
-from .grating_spectrum import TAIL_SHARE, GratingSpectrum, check_angle, check_wavelengths
-from .load import Spectrum
 from .orders import LobeAxis
-from .patches import MeanPowers, check_patches
+from .patches import MeanPowers
+from .power_spectrum import TAIL_SHARE, PowerSpectrum
 from .sample import SamplePowers, carried_coherence_length, standard_error
 from .spline_grid import inner
 from .tables import (
@@ -44,9 +39,6 @@ from .tables import (
 )
 from .tile import TilePowers, TileSplines
 
-THEORIES = ("scalar", "rigorous")
-REPRESENTATIONS = ("auto", "taylor", "chebyshev", "svd", SliceTable.representation)
-
 # Shares of the tolerance.
 _DROP_SHARE = 0.1  # weak frequencies
 _SPLINE_SHARE = 0.4  # what lies between the nodes in q
@@ -59,7 +51,6 @@ _LARGEST_TABLE = 4e9  # bytes
 # Where none is asked for: the tolerances that measurements and pictures need, and in between, of a sample, a share of
 # its standard error. A table exact to 1e-3 of what is known to 25 % is waste.
 _FINEST, _COARSEST = 1e-3, 1e-2
-LEAST_TOLERANCE = 1e-5
 _SCATTER_SHARE = 0.1
 
 _OF_MEAN = 0.7  # the share of the time that the mean of many patches takes, roughly
@@ -69,114 +60,32 @@ Lattice = TypeVar("Lattice", SamplePowers, TileSplines)
 Table = SeriesTable | SliceTable
 
 
-@one_thread()
-def precompute(
-    height_field: HeightField | Sequence[HeightField],
-    *,
-    extent: str = "tile",
-    coherence_length: float = SUN_COHERENCE_LENGTH,
-    wavelengths: tuple[float, float] = VISIBLE,
-    largest_angle: float = 90.0,
-    representation: str = "auto",
-    tolerance: float | None = None,
-    largest_height_range: float = 20.0,
-    progress: Progress = silent,
-    theory: str = "scalar",
-    int_ior: complex | None = None,
-    material: str | None = None,
-    ext_ior: float = 1.0,
-    polarised: bool = False,
-) -> Spectrum:
-    """The spectrum of the phase e^{iκh}, or the table of rigorous efficiencies, its error at most `tolerance`.
+def build_spectrum(patches: Sequence[HeightField], settings: Settings, progress: Progress) -> PowerSpectrum:
+    """Compute the power spectrum of the phase e^{iκh}, its error at most the tolerance.
 
     Args:
-        height_field: the surface; or several patches of one size that repeat (extent "tile"), drawn from one kind of
-            irregular surface: the spectrum is the mean of theirs.
-        extent: "tile": the patch repeats for ever; "sample": it is a piece of a larger, irregular surface.
-        coherence_length: L_c in µm.
-        wavelengths: (shortest, longest) in nm.
-        largest_angle: in degrees from the normal, of incidence and exit, that the scene has; less than 90 keeps fewer
-            frequencies.
-        representation: "taylor", "chebyshev", "svd" or "slices"; "auto" is "slices", than which none reads fewer bytes.
-        tolerance: bound of max over κ of ∫|S_approx(q; κ) − S_exact(q; κ)| dq, a share of the reflected power; by
-            default 1e-3, and of a sample a tenth of its `standard_error`, at least 1e-3 and at most 1e-2. Of rigorous
-            theory: see `rigorous.build.build_spectrum`, 1e-2.
-        largest_height_range: in µm; a deeper surface is refused, as one whose heights are in nm. Time and memory grow
-            with the height range.
+        patches: of one size; the spectrum is the mean of theirs.
+        settings: of scalar theory.
         progress: called with (steps done, steps in all).
-        theory: "scalar", or "rigorous": Maxwell's equations, for a tile of one row and one material only. An
-            interrupted build goes on from what it left in the cache folder.
-        int_ior: of rigorous theory, index of refraction of a dielectric.
-        material: of rigorous theory, a conductor by the name that Mitsuba has for it.
-        ext_ior: of rigorous theory, index of the medium above, for a grating under a coat; wavelengths are those there.
-        polarised: of rigorous theory, whether polarised variants can use the table.
-
-    Returns:
-        The spectrum; its `error` is what was measured, at values of κ that were not used to build it.
 
     Raises:
-        ValueError: if an argument is out of range, the surface is deeper than `largest_height_range`, or the tolerance
-            cannot be kept: in float32 by a Taylor series for so deep a surface, or within a table of 4 GB.
+        ValueError: if the tolerance cannot be kept: in float32 by a Taylor series for so deep a surface, or within a
+            table of 4 GB.
 
     Warns:
         UserWarning: if the pixels are too coarse to hold all the frequencies that the shortest wavelength can reach, or
             a sample is too small for the coherence length.
     """
-    check_extent(extent)
-    patches = (height_field,) if isinstance(height_field, HeightField) else tuple(height_field)
-    check_patches(patches, extent)
     height_field = patches[0]
     height_range = max(patch.height_range for patch in patches)
-    check_wavelengths(wavelengths)
-    if theory not in THEORIES:
-        raise RequestError(f"theory: got {theory!r}, wanted one of {', '.join(THEORIES)}")
-    if not largest_height_range > 0:
-        raise RequestError(f"largest_height_range: got {largest_height_range!r}, wanted a positive number of µm")
-    if height_range > largest_height_range:
-        raise RequestError(
-            f"heights: got a range of {height_range:.4g} µm, wanted at most {largest_height_range:g}: are "
-            "these nanometres? If the surface is so deep, raise largest_height_range"
-        )
-    if theory == "rigorous":
-        if len(patches) > 1:
-            raise RequestError(
-                f"theory: got rigorous and {len(patches)} patches ({height_field.source}, …), wanted one, of one row"
-            )
-        if (extent, largest_angle, representation) != ("tile", 90.0, "auto"):
-            raise RequestError(
-                f"theory: got rigorous with extent {extent!r}, largest_angle {largest_angle!r} and representation "
-                f"{representation!r}; it has its own table of a tile, for all directions"
-            )
-        return build_spectrum(
-            height_field,
-            int_ior=int_ior,
-            material=material,
-            ext_ior=ext_ior,
-            polarised=polarised,
-            coherence_length=coherence_length,
-            wavelengths=wavelengths,
-            tolerance=1e-2 if tolerance is None else tolerance,
-            progress=progress,
-            checkpoints=cache_folder(),
-        )
-    if int_ior is not None or material is not None or ext_ior != 1 or polarised:
-        raise RequestError(
-            "int_ior, material, ext_ior, polarised: the spectrum of scalar theory is that of every material; wanted "
-            "none of them"
-        )
-    if tolerance is not None:
-        check_tolerance(tolerance)
-    check_angle(largest_angle)
-    lobe_width(coherence_length)
-    if representation not in REPRESENTATIONS:
-        raise RequestError(f"representation: got {representation!r}, wanted one of {', '.join(REPRESENTATIONS)}")
-    shortest = wavelengths[0] * 1e-3
+    coherence_length, tolerance = settings.coherence_length, settings.tolerance
+    shortest = settings.wavelengths[0] * 1e-3
     largest_kappa = 4 * np.pi / shortest
-    reach = 2 * np.sin(np.deg2rad(largest_angle)) / shortest
+    reach = 2 * np.sin(np.deg2rad(settings.largest_angle)) / shortest
     _check_resolution(height_field, reach)
     carried, scatter, tail = float(coherence_length), None, 0.0
     powers: TilePowers | Splines | None
-    if extent == "tile":
+    if settings.extent == "tile":
         allowed = tolerance = _FINEST if tolerance is None else tolerance
         sigma, rho = lobe_width(carried), lobe_reach(TAIL_SHARE * tolerance)
         orders = TilePowers(height_field, reach, rho * sigma)
@@ -199,7 +108,7 @@ def precompute(
             warnings.warn(
                 f"coherence_length: a scan of {x:.4g} × {y:.4g} µm carries {carried:.4g} µm of the "
                 f"{coherence_length:.4g} µm asked for; the lobes are as wide as the scan allows",
-                stacklevel=3,
+                stacklevel=4,
             )
         powers = _refined(
             lambda spacing: SamplePowers(height_field, carried, spacing, reach),
@@ -208,15 +117,15 @@ def precompute(
             tolerance,
         )
     build = _Build(powers, height_range, largest_kappa, allowed, progress)
-    table, error = build(SliceTable.representation if representation == "auto" else representation)
-    return GratingSpectrum(
+    table, error = build(SliceTable.representation if settings.representation == "auto" else settings.representation)
+    return PowerSpectrum(
         table=table,
         grid=build.kept,
-        extent=extent,
+        extent=settings.extent,
         pixel_size=height_field.pixel_size,
         height_range=height_range,
         coherence_length=carried,
-        wavelengths=(float(wavelengths[0]), float(wavelengths[1])),
+        wavelengths=settings.wavelengths,
         tolerance=float(tolerance),
         error=error + tail,
         source=height_field.source
@@ -224,7 +133,7 @@ def precompute(
         else f"mean of {len(patches)} patches: {height_field.source}, …",
         source_digest=_digest(patches),
         patches=len(patches),
-        largest_angle=float(largest_angle),
+        largest_angle=float(settings.largest_angle),
         dropped=build.dropped,
         beyond=build.beyond,
         scatter=scatter,
@@ -235,14 +144,6 @@ def _digest(patches: Sequence[HeightField]) -> str:
     """SHA-256 of the height field, or of those of all patches."""
     digests = [patch.digest for patch in patches]
     return digests[0] if len(digests) == 1 else hashlib.sha256("".join(digests).encode()).hexdigest()
-
-
-def check_tolerance(tolerance: float) -> None:
-    """Raises ValueError unless `tolerance` is a share of the power that float32 can keep."""
-    if not LEAST_TOLERANCE <= tolerance < 1:
-        raise RequestError(
-            f"tolerance: got {tolerance!r}, wanted a share of the reflected power from {LEAST_TOLERANCE:g} to 1"
-        )
 
 
 def _tile_splines(
@@ -522,5 +423,5 @@ def _check_resolution(height_field: HeightField, reach: float) -> None:
             warnings.warn(
                 f"pixels of {size * 1e3:.4g} nm along {axis} hold no frequency beyond {1 / (2 * size):.3g} cycles/µm, "
                 f"but light reaches {reach:.3g}: what lies between is missing",
-                stacklevel=4,
+                stacklevel=5,
             )

@@ -23,6 +23,7 @@ from scipy.optimize import minimize
 from scipy.special import chdtri
 
 from ..errors import RequestError
+from ..settings import Settings
 from .heightfield import HeightField
 from .missing import fill_missing
 
@@ -276,8 +277,7 @@ def find_periods(height_field: HeightField, count: int = 2, *, extent: str = "sa
     """
     if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
         raise RequestError(f"count: got {count!r}, wanted a positive integer")
-    if extent not in ("tile", "sample"):
-        raise RequestError(f"extent: got {extent!r}, wanted 'tile' or 'sample'")
+    Settings(extent)
     if extent == "tile":
         return _periods_of_tile(height_field, count)
     heights = fill_missing(height_field.heights, height_field.pixel_size)

@@ -6,16 +6,14 @@ Each step takes a height field and returns a new one, whose `source` records the
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Mapping, Sequence
-from numbers import Real
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.interpolate import RectBivariateSpline, make_interp_spline
 
-from ..errors import RequestError
+from ..errors import RequestError, is_number
 from . import missing
 from .heightfield import HeightField
 from .periods import Period, find_periods
@@ -203,7 +201,7 @@ def rotate(height_field: HeightField, degrees: float) -> HeightField:
     Raises:
         ValueError: if the angle is not a finite number, or no pixel fits into the rotated patch.
     """
-    if not _is_number(degrees):
+    if not is_number(degrees):
         raise RequestError(f"rotate: got {degrees!r}, wanted an angle in degrees")
     quarters = degrees / 90
     if quarters == np.rint(quarters):
@@ -361,7 +359,7 @@ def check_steps(steps: object) -> None:
                 raise RequestError(f"prepare: {name}: missing its argument, wanted {{ {name} = … }}")
         elif kind is None:
             raise RequestError(f"prepare: {name}: got {argument!r}, wanted no argument")
-        elif kind is float and not _is_number(argument):
+        elif kind is float and not is_number(argument):
             raise RequestError(f"prepare: {name}: got {argument!r}, wanted a number")
         elif kind is str and argument not in ("x", "y", "xy"):
             raise RequestError(f"prepare: {name}: got {argument!r}, wanted 'x', 'y' or 'xy'")
@@ -414,15 +412,10 @@ def _after(
 
 
 def _check_positive(name: str, value: object, wanted: str) -> None:
-    if not (_is_number(value) and value > 0):
+    if not (is_number(value) and value > 0):
         raise RequestError(f"{name}: got {value!r}, wanted {wanted}, positive")
 
 
 def _check_any(name: str, heights: NDArray[np.float64]) -> None:
     if np.isnan(heights).all():
         raise RequestError(f"{name}: all pixels that are left are missing")
-
-
-def _is_number(value: object) -> bool:
-    # Whole numbers may be too great for a float.
-    return isinstance(value, Real) and not isinstance(value, bool) and bool(abs(value) <= sys.float_info.max)

@@ -79,7 +79,7 @@ def files():
         ("precompute blaze.toml -o out", "ends in .exr"),
         ("precompute blaze.toml -o nowhere/out.exr", "nowhere/out.exr"),
         ("precompute blaze.toml blaze.toml -o out.exr", "-o: got 2 sources"),
-        ("precompute scan.npy scan.toml", "scan.exr would be written twice"),
+        ("precompute blaze.toml blaze.npy", "blaze.exr would be written twice"),
         ("precompute scan.npy", "pixel_size"),
         ("precompute counts.npy", "pixel_size, height_range: both missing"),
         ("render scene.xml -D a=1 -D a=2", "-D a: got it twice"),

@@ -15,9 +15,9 @@ from PIL import Image
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction import outputs
-from mitsuba_diffraction.cli.inputs import files_read
 from mitsuba_diffraction.files import is_intact, refuse_unwritable, seal, whole_file
-from mitsuba_diffraction.outputs import claimed, made_for
+from mitsuba_diffraction.outputs import claim, made_for
+from mitsuba_diffraction.render.scene import files_of_scene
 
 BLAZE = """[surface]
 profile = "blazed"
@@ -84,11 +84,11 @@ RENDER = "render u.xml --spp 1 --width 2 --variant scalar_spectral"
 # --- what is read ---
 
 
-def test_a_scene_reads_what_it_names():
-    named = {os.path.normpath(path) for path in files_read("u.xml")}
-    assert named == {"u.xml", "u.exr", "tex.png", "lights/sky.xml", "sky.spd"}
-    named = {os.path.normpath(path) for path in files_read("u.xml", {"spectrum": "scan.toml"})}
-    assert named == {"u.xml", "scan.toml", "scan.png", "tex.png", "lights/sky.xml", "sky.spd"}
+def test_a_scene_names_files(folder):
+    named = {os.path.relpath(path, folder) for path in files_of_scene("u.xml")}
+    assert named == {"u.xml", "u.exr", "tex.png", "lights/sky.xml"}
+    named = {os.path.relpath(path, folder) for path in files_of_scene("u.xml", {"spectrum": "scan.toml"})}
+    assert named == {"u.xml", "scan.toml", "scan.png", "tex.png", "lights/sky.xml"}
 
 
 @pytest.mark.parametrize(
@@ -103,7 +103,6 @@ def test_a_scene_reads_what_it_names():
         (f"{RENDER} -D spectrum=scan.toml -o scan.exr", "scan.png"),
         (f"{RENDER} -D spectrum=u_001.exr -o u.exr --frames 2 --orbit", "u_001.exr"),
         ("compare u.xml --json lights/sky.xml -o a", "lights/sky.xml"),
-        ("compare u.xml --json sky.spd -o a", "sky.spd"),
         ("precompute scan.toml -o scan.EXR", ""),
         ("inspect scan.toml -o scan.png", "scan.png"),
         ("inspect scan.toml --json scan.toml", "scan.toml"),
@@ -176,9 +175,12 @@ def test_a_command_knows_what_it_made(command, line, other, name):
     assert command(line)[0] == 0
 
 
-def test_a_preview_of_another_is_not_replaced(command):
+@pytest.mark.parametrize(
+    ("line", "name"), [(f"{RENDER} -o a.exr", "a.png"), ("compare u.xml --json sky.spd -o b", "sky.spd")]
+)
+def test_what_another_made_is_not_replaced(command, line, name):
     Path("a.png").write_text("a year's work")
-    refused(command, f"{RENDER} -o a.exr", "a.png")
+    refused(command, line, name)
 
 
 def test_a_folder_may_move(command):
@@ -212,14 +214,14 @@ def test_every_format_carries_its_request(name):
             Figure(figsize=(1, 1)).savefig(name, metadata=outputs.metadata(name))
 
     for seed in (1, 1):
-        with claimed({"seed": seed}, [], [("-o", name)]):
-            assert made_for(name)
-            write()
-    with pytest.raises(ValueError, match="--overwrite"), claimed({"seed": 2}, [], [("-o", name)]):
-        pass
-    with claimed({"seed": 2}, [], [("-o", name)], overwrite=True):
+        claim({"seed": seed}, [], [("-o", name)])
+        assert made_for(name)
         write()
-    assert made_for(name) is None
+    with pytest.raises(ValueError, match="--overwrite"):
+        claim({"seed": 2}, [], [("-o", name)])
+    claim({"seed": 2}, [], [("-o", name)], overwrite=True)
+    write()
+    claim({"seed": 2}, [], [("-o", name)])
     if name.endswith("json"):
         assert json.loads(Path(name).read_text())["a"] == 1
 

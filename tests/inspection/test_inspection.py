@@ -14,12 +14,13 @@ from scipy.special import jv
 import mitsuba_diffraction as md
 from mitsuba_diffraction.bsdf.geometry import Geometry
 from mitsuba_diffraction.color import into_gamut, spectrum_to_linear_sRGB, spectrum_to_XYZ
+from mitsuba_diffraction.geometry import k_g
 from mitsuba_diffraction.inspection import inspect, save_picture
 from mitsuba_diffraction.inspection.colours import WAVELENGTHS, illumination, order_angle, order_share, radiance
 from mitsuba_diffraction.inspection.picture import piece_shown, with_uncertainty
 from mitsuba_diffraction.inspection.statistics import broadened, scanned, statistics
 from mitsuba_diffraction.inspection.uncertainty import concerns
-from mitsuba_diffraction.scalar_theory import geometry, scalar_error
+from mitsuba_diffraction.scalar_theory import scalar_error
 
 ROOT = Path(__file__).parents[2]
 PERIOD, DEPTH = 2.0, 0.2
@@ -108,8 +109,8 @@ def test_radiance_is_that_of_the_bsdf(theta_i, theta_o):
     share = f * np.cos(np.deg2rad(theta_i)) / got
     np.testing.assert_allclose(share, 1, atol=1e-3)
     factor = Geometry.of(si.wi, towards(theta_o)).k_g()
-    between = np.cos(np.deg2rad(theta_i + theta_o))
-    assert geometry(np.cos(np.deg2rad(theta_i)), cos_o, between) == pytest.approx(factor, rel=1e-5)
+    d = 1 + np.cos(np.deg2rad(theta_i + theta_o))
+    assert k_g(np.cos(np.deg2rad(theta_i)), cos_o, d) == pytest.approx(factor, rel=1e-5)
 
 
 def test_colours_go_where_the_grating_equation_sends_them():

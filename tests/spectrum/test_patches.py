@@ -6,9 +6,9 @@ import pytest
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction import Recipe
+from mitsuba_diffraction.grating_spectrum import GratingSpectrum
 from mitsuba_diffraction.reference import order_powers, power_spectrum
 from mitsuba_diffraction.settings import lobe_width
-from mitsuba_diffraction.spectrum.grating_spectrum import GratingSpectrum
 from mitsuba_diffraction.surface.gratings import COHERENCE_LENGTHS, PATCHES, PROFILES
 
 SURFACE = {"profile": "elaphe", "size": 7.0, "seed": 3}

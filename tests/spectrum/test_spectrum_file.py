@@ -19,7 +19,7 @@ import mitsuba_diffraction as md
 from mitsuba_diffraction import GratingSpectrum
 from mitsuba_diffraction.energy.table import EnergyTable, Layout
 from mitsuba_diffraction.files import seal
-from mitsuba_diffraction.spectrum.grating_spectrum import FORMAT_VERSION
+from mitsuba_diffraction.grating_spectrum import FORMAT_VERSION
 from mitsuba_diffraction.spectrum.spline_grid import SplineGrid
 from mitsuba_diffraction.spectrum.tables import SliceTable
 

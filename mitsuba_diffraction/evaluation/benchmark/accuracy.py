@@ -9,8 +9,8 @@ import scipy.special
 from numpy.typing import NDArray
 
 from ...color import daylight, delta_E, spectrum_to_XYZ
+from ...grating_spectrum import GratingSpectrum
 from ...reference import power_spectrum
-from ...spectrum.grating_spectrum import GratingSpectrum
 from ...spectrum.orders import OrderGrid
 from ...surface.heightfield import HeightField
 from ...testing import direction

@@ -14,10 +14,9 @@ from rich.table import Table
 from ... import outputs
 from ...errors import RequestError
 from ...files import whole_file
+from ...grating_spectrum import GratingSpectrum
 from ...outputs import metadata
-from ...settings import VISIBLE
-from ...spectrum.build import check_tolerance
-from ...spectrum.grating_spectrum import GratingSpectrum
+from ...settings import VISIBLE, Settings
 from ...spectrum.tables import SliceTable
 from .. import report
 from . import sampling, shader_speed
@@ -118,7 +117,7 @@ def run(
         ValueError: if a tolerance is out of range.
     """
     for tolerance in tolerances:
-        check_tolerance(tolerance)
+        Settings(tolerance=tolerance)
     cases = list(cases)
     results, shaders, total = [], [], len(cases) * len(tolerances) * len(representations)
     progress(0, total)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass
 
+from ...grating_spectrum import GratingSpectrum
+from ...precomputation import precompute
 from ...settings import SUN_COHERENCE_LENGTH
-from ...spectrum.build import precompute
-from ...spectrum.grating_spectrum import GratingSpectrum
 from ...spectrum.sample import carried_coherence_length
 from ...surface import gratings
 from ...surface.heightfield import HeightField

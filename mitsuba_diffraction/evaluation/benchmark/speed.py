@@ -11,8 +11,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...grating_spectrum import GratingSpectrum
 from ...settings import VISIBLE
-from ...spectrum.grating_spectrum import GratingSpectrum
 from ...testing import interaction, vectors
 
 Name = TypeVar("Name", bound=Hashable)

@@ -10,7 +10,6 @@ import typer
 from ... import outputs
 from ...cli.arguments import Overwrite, Variant, check_suffix, claim
 from ...cli.console import progress_bar, show, table
-from ...cli.inputs import files_read
 from ...cli.scan import HeightRange, PixelSize
 from ...errors import RequestError
 from ...surface.readers import read_height_field
@@ -45,7 +44,7 @@ def benchmark(
     if plot is not None:
         check_suffix("--plot", plot, ".png")
     writes = [(option, path) for option, path in (("--json", json), ("--plot", plot)) if path is not None]
-    claim(context, [] if scan is None else files_read(scan), writes)
+    claim(context, [] if scan is None else [scan], writes)
     cases = bundled_cases()
     names = [case.name for case in cases]
     if unknown := set(surface or []) - set(names):

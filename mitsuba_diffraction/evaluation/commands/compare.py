@@ -11,7 +11,6 @@ import typer
 
 from ...cli.arguments import Define, Overwrite, Variant, claim, scene_parameters
 from ...cli.console import progress_bar, show, tell
-from ...cli.inputs import files_read
 from ...files import whole_file
 from ...outputs import free_name
 
@@ -41,11 +40,12 @@ def compare(
     import mitsuba as mi
 
     from ...llvm import choose_variant
+    from ...render.scene import files_of_scene
     from ..comparison import compare as run
     from ..comparison import summary
 
     parameters = scene_parameters(define)
-    reads = files_read(scene, parameters)
+    reads = files_of_scene(scene, parameters)
     prefix = output
     if output is None or output.is_dir():
         folder = output or Path()

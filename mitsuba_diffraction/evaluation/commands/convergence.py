@@ -11,7 +11,6 @@ import typer
 from ... import outputs
 from ...cli.arguments import Define, Overwrite, Variant, check_suffix, claim, scene_parameters
 from ...cli.console import progress_bar, show, table, tell
-from ...cli.inputs import files_read
 
 
 def convergence(
@@ -34,12 +33,13 @@ def convergence(
     import mitsuba as mi
 
     from ...llvm import choose_variant
+    from ...render.scene import files_of_scene
     from ..comparison import convergence as study
 
     parameters = scene_parameters(define)
     check_suffix("-o", plot, ".png")
     written = [("-o", plot), *([("--json", json)] if json is not None else [])]
-    claim(context, files_read(scene, parameters), written)
+    claim(context, files_of_scene(scene, parameters), written)
     mi.set_variant(choose_variant(variant))
     found = study.convergence(
         scene,

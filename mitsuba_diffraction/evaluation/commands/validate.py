@@ -10,8 +10,17 @@ import typer
 from ... import outputs
 from ...cli.arguments import Overwrite, Variant, claim
 from ...cli.console import progress_bar, show, tell
-from ...cli.inputs import files_read
-from ...cli.scan import Channel, FillMissing, HeightRange, PixelSize, Prepare, Unit, options_of_scan, recipe_of
+from ...cli.scan import (
+    Channel,
+    FillMissing,
+    HeightRange,
+    PixelSize,
+    Prepare,
+    Unit,
+    options_of_scan,
+    recipe_of,
+    settings_of,
+)
 from ...errors import RequestError
 from ...outputs import save_markdown
 
@@ -47,8 +56,7 @@ def validate(
     from .. import report
     from ..validation.checks import checks
 
-    of_scan = options_of_scan(pixel_size, height_range, fill_missing, channel, unit, prepare)
-    settings = {} if extent is None else {"extent": extent}
+    of_scan, settings = options_of_scan(context), settings_of(context)
     if surface is None and (of_scan or settings):
         names = ", ".join(f"--{name.replace('_', '-')}" for name in {**of_scan, **settings})
         raise RequestError(f"{names}: got no surface; they go with a scan, --extent with a recipe, too")
@@ -56,7 +64,7 @@ def validate(
     if chosen.startswith("scalar"):
         raise RequestError(f"--variant: got {chosen}, wanted llvm_… or cuda_…: the checks take millions of directions")
     recipe = None if surface is None else _recipe(surface, of_scan, settings)
-    reads = [] if surface is None else files_read(surface)
+    reads = [] if surface is None else [surface, *recipe.files]
     writes = [(option, path) for option, path in (("--json", json), ("--markdown", markdown)) if path is not None]
     if figures is not None:
         from ..validation.figures import figure_names, save_figures

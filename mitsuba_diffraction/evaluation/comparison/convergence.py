@@ -17,7 +17,7 @@ from ...errors import RequestError
 from ...files import whole_file
 from ...outputs import metadata
 from ...progress import Progress, no_progress
-from ...spectrum.build import LEAST_TOLERANCE
+from ...settings import LEAST_TOLERANCE
 from ..report import cells
 from .difference import as_shown, difference, noise, white_luminance
 from .pictures import Picture, Pictures

@@ -22,8 +22,8 @@ import functools
 import numpy as np
 from numpy.typing import NDArray
 
+from ...grating_spectrum import GratingSpectrum
 from ...settings import lobe_width
-from ...spectrum.grating_spectrum import GratingSpectrum
 from ...surface.heightfield import HeightField
 from ...testing import direction
 from .analytic import compare_orders

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from ...grating_spectrum import GratingSpectrum
 from ...scalar_theory import scalar_error
-from ...spectrum.grating_spectrum import GratingSpectrum
 from ...surface.heightfield import HeightField
 from ..benchmark.accuracy import against_reference
 from . import analytic, bumps, conservation, coupled_waves, measured_gratings, rough_surface, viewing_angle

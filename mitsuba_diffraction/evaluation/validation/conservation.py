@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ... import testing
-from ...spectrum.grating_spectrum import GratingSpectrum
+from ...grating_spectrum import GratingSpectrum
 from ...surface import gratings
 from ...surface.heightfield import HeightField
 from .lobes import brdf, grating, spectrum_of

@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ... import testing
 from ...geometry import k_g_between
-from ...spectrum.build import precompute
-from ...spectrum.grating_spectrum import GratingSpectrum
+from ...grating_spectrum import GratingSpectrum
+from ...precomputation import precompute
 from ...surface.heightfield import HeightField
 
 Array = NDArray[np.float64]

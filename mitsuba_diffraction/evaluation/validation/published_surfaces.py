@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ...errors import RequestError
+from ...grating_spectrum import GratingSpectrum
 from ...recipe import Recipe
 from ...settings import SUN_COHERENCE_LENGTH
-from ...spectrum.grating_spectrum import GratingSpectrum
 from ...surface.heightfield import HeightField
 
 

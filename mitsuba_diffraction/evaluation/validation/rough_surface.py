@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln, ndtr
 
+from ...grating_spectrum import GratingSpectrum
 from ...settings import lobe_width
-from ...spectrum.grating_spectrum import GratingSpectrum
 from ...surface.heightfield import HeightField
 from ...testing import direction
 from .lobes import brdf, density, grating, spectrum_of, towards

@@ -11,11 +11,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...precomputation import Spectrum, precompute
 from ...rigorous import efficiencies, refractive_index
 from ...rigorous.spectrum import RigorousSpectrum
 from ...scalar_theory import difference, profile_powers, scalar_orders
-from ...spectrum.build import precompute
-from ...spectrum.load import Spectrum
 from ...surface.heightfield import HeightField
 from ..benchmark.speed import Rays, seconds
 

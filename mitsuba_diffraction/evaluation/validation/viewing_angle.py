@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ... import testing
 from ...errors import RequestError
-from ...spectrum.grating_spectrum import GratingSpectrum
+from ...grating_spectrum import GratingSpectrum
 from ..realtime_shader.evaluate import relative_radiance
 from ..realtime_shader.quirks import Quirks
 from .published_surfaces import SURFACES, PublishedSurface

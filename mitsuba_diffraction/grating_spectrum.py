@@ -1,0 +1,193 @@
+"""A power spectrum with the table that bounds its albedo, and its file.
+
+The file is OpenEXR: float32, ZIP, one part, one pixel per diffraction order or node.
+
+Channels are named after what they hold. Series: `B{t^003}` (taylor), `B{T_003}` (chebyshev), `B{mode 003}` (svd), the
+terms B_n of S = Σ g_n(κ) B_n; "slices": `S(012.2)`, the coefficient of t² on interval 12 of κ. Rows
+are orders m_y, columns m_x, from −M to M. Numbers in the header are double precision. `energy` is JSON: the table of
+`energy/table.py`. `contentSha256` covers every byte of the file and
+reveals damage.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import threading
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from .energy.table import EnergyTable
+from .errors import RequestError
+from .spectrum.exr import doubles, one_line, read, write
+from .spectrum.orders import OrderGrid
+from .spectrum.power_spectrum import PowerSpectrum
+from .spectrum.spline_grid import SplineGrid
+from .spectrum.tables import Series, SeriesTable, SliceTable, chebyshev, taylor
+
+FORMAT = "mitsuba_diffraction grating spectrum"
+FORMAT_VERSION = 6
+
+_computing = threading.Lock()
+
+
+@dataclass(frozen=True, eq=False)
+class GratingSpectrum(PowerSpectrum):
+    """A power spectrum, the factor E that bounds the albedo by one, and its file.
+
+    Attributes:
+        energy: the table of E, if it came with the file; else `energy_table` makes it.
+        warning: why scalar theory is not to be trusted for the surface of a recipe; "" where it is.
+    """
+
+    energy: EnergyTable | None = field(default=None, repr=False)
+    warning: str = field(default="", repr=False)
+
+    def energy_table(self) -> EnergyTable:
+        """Return the table of E, which bounds the albedo by one; made at the first call unless the file has it."""
+        with _computing:
+            return self._energy
+
+    @cached_property
+    def _energy(self) -> EnergyTable:
+        return EnergyTable.of(self) if self.energy is None else self.energy
+
+    def save(self, path: str | os.PathLike[str], recipe: str = "") -> None:
+        """Write the spectrum as an OpenEXR file, atomically; `recipe` is the digest of its `Recipe`.
+
+        Raises:
+            OSError: if the file cannot be written.
+        """
+        header = {
+            "representation": self.representation,
+            "extent": self.extent,
+            "heightRange": doubles(self.height_range),
+            "pixelSize": doubles(*self.pixel_size),
+            **_grid_header(self.grid),
+            "coherenceLength": doubles(self.coherence_length),
+            "wavelengths": doubles(*self.wavelengths),
+            "tolerance": doubles(self.tolerance),
+            "error": doubles(self.error),
+            "largestAngle": doubles(self.largest_angle),
+            "dropped": doubles(self.dropped),
+            "beyond": doubles(self.beyond),
+            "patches": self.patches,
+            **({"standardError": doubles(self.standard_error)} if self.extent == "sample" else {}),
+            "source": self.source,
+            "sourceSha256": self.source_digest,
+            "units": "lengths in micrometres, wavelengths in nanometres",
+            **({"warning": self.warning} if self.warning else {}),
+        }
+        if isinstance(self.table, SeriesTable) and self.representation == "svd":
+            # repr of a float is exact.
+            header["modes"] = json.dumps(self.table.series.modes.tolist())
+        header["energy"] = json.dumps(self.energy_table().as_plain())
+        channels = _channels(self.table)
+        header["channelCount"] = len(channels)
+        write(path, FORMAT, FORMAT_VERSION, header, channels, recipe)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str], recipe: str | None = None) -> GratingSpectrum:
+        """Read a spectrum that `save` wrote.
+
+        Raises:
+            FileNotFoundError: if there is no such file.
+            ValueError: if it is not a spectrum, is damaged (be it by a single bit), is of a version or representation
+                not known here, or was not built from that recipe.
+        """
+        path = Path(path)
+        header, channels = read(path, FORMAT, FORMAT_VERSION, recipe)
+        if header.get("representation") not in _REPRESENTATIONS:
+            got = header.get("representation")
+            raise RequestError(f"{path}: got representation {got!r}, wanted one of {', '.join(_REPRESENTATIONS)}")
+        try:
+            pixels = {name: channel.pixels for name, channel in channels.items()}
+            if halves := [name for name, values in pixels.items() if values.dtype != np.float32]:
+                raise RequestError(f"{halves[0]} is not of type float")
+            wavelengths = _pair(header["wavelengths"])
+            table = _table(header, pixels, 4 * np.pi / (wavelengths[0] * 1e-3))
+            names = _channels(table).keys()
+            if pixels.keys() != names or len(names) != header["channelCount"]:
+                unknown = ", ".join(sorted(pixels.keys() - names)) or "none unknown"
+                raise RequestError(
+                    f"got {len(pixels)} channels ({unknown}), wanted {header['channelCount']} of known names"
+                )
+            return cls(
+                table=table,
+                grid=_grid(header, table.shape),
+                extent=header["extent"],
+                pixel_size=_pair(header["pixelSize"]),
+                height_range=_single(header["heightRange"]),
+                coherence_length=_single(header["coherenceLength"]),
+                wavelengths=wavelengths,
+                tolerance=_single(header["tolerance"]),
+                error=_single(header["error"]),
+                source=header["source"],
+                source_digest=header["sourceSha256"],
+                largest_angle=_single(header["largestAngle"]),
+                dropped=_single(header["dropped"]),
+                beyond=_single(header["beyond"]),
+                patches=header["patches"],
+                scatter=_single(header["standardError"]) if header["extent"] == "sample" else None,
+                energy=EnergyTable.from_plain(json.loads(header["energy"])),
+                warning=header.get("warning", ""),
+            )
+        except KeyError as error:
+            raise RequestError(f"{path}: a damaged spectrum, {error} is missing") from None
+        except (TypeError, ValueError, IndexError, AttributeError, OverflowError, MemoryError) as error:
+            raise RequestError(f"{path}: a damaged spectrum ({one_line(error)})") from None
+
+
+def _grid_header(grid: OrderGrid | SplineGrid) -> dict[str, np.ndarray]:
+    if isinstance(grid, OrderGrid):
+        return {"tileSize": doubles(*grid.tile_size)}
+    return {"spacing": doubles(*grid.spacing), "limit": doubles(*grid.limit)}
+
+
+def _grid(header: dict, shape: tuple[int, int]) -> OrderGrid | SplineGrid:
+    largest = ((shape[1] - 1) // 2, (shape[0] - 1) // 2)
+    if "tileSize" in header:
+        return OrderGrid(_pair(header["tileSize"]), largest)
+    return SplineGrid(_pair(header["spacing"]), largest, _pair(header["limit"]))
+
+
+_TERM_NAMES = {
+    "taylor": "B{{t^{:03d}}}",
+    "chebyshev": "B{{T_{:03d}}}",
+    "svd": "B{{mode {:03d}}}",
+}
+_REPRESENTATIONS = (*_TERM_NAMES, SliceTable.representation)
+
+
+def _channels(table: SeriesTable | SliceTable) -> dict[str, np.ndarray]:
+    if isinstance(table, SliceTable):
+        return {f"S({k:03d}.{p})": table.values[k, p] for k, p in np.ndindex(table.intervals, table.terms)}
+    return {_TERM_NAMES[table.representation].format(n): term for n, term in enumerate(table.terms)}
+
+
+def _table(header: dict, pixels: dict[str, np.ndarray], largest_kappa: float) -> SeriesTable | SliceTable:
+    kind, count = header["representation"], header["channelCount"]
+    if kind == SliceTable.representation:
+        powers = 4 if "S(000.3)" in pixels else 3
+        values = [[pixels[f"S({k:03d}.{p})"] for p in range(powers)] for k in range(count // powers)]
+        return SliceTable(largest_kappa, np.array(values, np.float32))
+    terms = np.stack([pixels[_TERM_NAMES[kind].format(n)] for n in range(count)])
+    if kind == "svd":
+        series = Series(kind, largest_kappa, np.array(json.loads(header["modes"]), np.float64))
+    else:
+        series, _ = (taylor if kind == "taylor" else chebyshev)(largest_kappa, count)
+    return SeriesTable(series, terms)
+
+
+def _single(value: np.ndarray) -> float:
+    if not isinstance(value, np.ndarray) or value.shape != (1,):
+        raise RequestError(f"got {value!r}, wanted one double")
+    return float(value[0])
+
+
+def _pair(value: np.ndarray) -> tuple[float, float]:
+    x, y = (float(v) for v in value)
+    return x, y

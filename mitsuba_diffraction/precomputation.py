@@ -1,0 +1,111 @@
+"""From height fields to spectra, and from files to spectra: one door to scalar and to rigorous theory."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+
+from .errors import RequestError
+from .files import cache_folder
+from .grating_spectrum import GratingSpectrum
+from .progress import Progress, silent
+from .rigorous import build as rigorous
+from .rigorous.efficiencies import one_thread
+from .rigorous.spectrum import FORMAT as RIGOROUS_FORMAT
+from .rigorous.spectrum import RigorousSpectrum
+from .settings import SUN_COHERENCE_LENGTH, VISIBLE, Settings
+from .spectrum import build as scalar
+from .spectrum.patches import check_patches
+from .surface.heightfield import HeightField
+
+Spectrum = GratingSpectrum | RigorousSpectrum
+
+_HEADER = 2**16  # bytes, in which the format is told
+
+
+@one_thread()
+def precompute(
+    height_field: HeightField | Sequence[HeightField],
+    *,
+    extent: str = "tile",
+    coherence_length: float = SUN_COHERENCE_LENGTH,
+    wavelengths: tuple[float, float] = VISIBLE,
+    largest_angle: float = 90.0,
+    representation: str = "auto",
+    tolerance: float | None = None,
+    largest_height_range: float = 20.0,
+    progress: Progress = silent,
+    theory: str = "scalar",
+    int_ior: complex | None = None,
+    material: str | None = None,
+    ext_ior: float = 1.0,
+    polarised: bool = False,
+) -> Spectrum:
+    """Compute the spectrum of the phase e^{iκh}, or the table of rigorous efficiencies, its error at most `tolerance`.
+
+    Args:
+        height_field: the surface; or several patches of one size that repeat (extent "tile"), drawn from one kind of
+            irregular surface: the spectrum is the mean of theirs.
+        progress: called with (steps done, steps in all). An interrupted build of rigorous theory goes on from what it
+            left in the cache folder.
+
+    All others are those of `Settings`.
+
+    Returns:
+        The spectrum; its `error` is what was measured, at values of κ that were not used to build it.
+
+    Raises:
+        ValueError: if an argument is out of range, the surface is deeper than `largest_height_range`, or the tolerance
+            cannot be kept: in float32 by a Taylor series for so deep a surface, or within a table of 4 GB.
+
+    Warns:
+        UserWarning: if the pixels are too coarse to hold all the frequencies that the shortest wavelength can reach, or
+            a sample is too small for the coherence length.
+    """
+    settings = Settings(
+        extent=extent,
+        coherence_length=coherence_length,
+        wavelengths=wavelengths,
+        largest_angle=largest_angle,
+        representation=representation,
+        tolerance=tolerance,
+        largest_height_range=largest_height_range,
+        theory=theory,
+        int_ior=int_ior,
+        material=material,
+        ext_ior=ext_ior,
+        polarised=polarised,
+    )
+    patches = (height_field,) if isinstance(height_field, HeightField) else tuple(height_field)
+    check_patches(patches, extent)
+    height_range = max(patch.height_range for patch in patches)
+    if height_range > largest_height_range:
+        raise RequestError(
+            f"heights: got a range of {height_range:.4g} µm, wanted at most {largest_height_range:g}: are "
+            "these nanometres? If the surface is so deep, raise largest_height_range"
+        )
+    if theory == "scalar":
+        return GratingSpectrum(**vars(scalar.build_spectrum(patches, settings, progress)))
+    if len(patches) > 1:
+        raise RequestError(
+            f"theory: got rigorous and {len(patches)} patches ({patches[0].source}, …), wanted one, of one row"
+        )
+    return rigorous.build_spectrum(patches[0], settings, progress, cache_folder())
+
+
+def load_spectrum(path: str | os.PathLike[str], recipe: str | None = None) -> Spectrum:
+    """Read a spectrum that `save` wrote.
+
+    Args:
+        path: the file.
+        recipe: the digest of the recipe from which it must have been built.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is not a spectrum, is damaged, of another version, or was not built from that recipe.
+    """
+    of_rigorous = False
+    if os.path.isfile(path):
+        with open(path, "rb") as stream:
+            of_rigorous = RIGOROUS_FORMAT.encode() in stream.read(_HEADER)
+    return (RigorousSpectrum if of_rigorous else GratingSpectrum).load(path, recipe)

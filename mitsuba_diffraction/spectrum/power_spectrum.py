@@ -1,0 +1,193 @@
+"""The precomputed power spectrum S(q; κ) of the phase e^{iκh} of a surface."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, field, fields
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import RequestError
+from ..settings import Settings, lobe_reach, lobe_width, matching
+from .orders import LobeAxis, OrderGrid
+from .spline_grid import SplineGrid
+from .tables import SeriesTable, SliceTable
+
+# The part of the tolerance that is spent on the tails of the lobes.
+TAIL_SHARE = 0.4
+
+
+@dataclass(frozen=True, eq=False)
+class PowerSpectrum:
+    """S(q; κ): Σ_m η_m(κ) N(q − m/T; σ_q² I) of a tile, or, of a sample and where many lobes overlap, B-splines.
+
+    Attributes:
+        table: η_m(κ), or the coefficients of the splines, in one of the representations.
+        grid: the diffraction orders m, or the nodes, that are kept.
+        extent: "tile": the patch repeats for ever; "sample": it is a piece of a larger, irregular surface.
+        pixel_size: (x, y) of the height field, µm.
+        height_range: of the height field, µm.
+        coherence_length: L_c in µm; it sets the width σ_q of each order. Of a sample: at most what the scan supports.
+        wavelengths: (shortest, longest) in nm for which the table holds.
+        tolerance: the requested bound.
+        error: the measured one: max over κ of ∫|S_approx − S_exact| dq over the frequencies that light can reach.
+        source: origin of the heights.
+        source_digest: SHA-256 of the height field.
+        largest_angle: in degrees from the normal, of both directions, for which the table holds.
+        dropped: the largest share of the power, over κ, in weak frequencies that were not kept; part of `error`.
+        beyond: the largest share of the power, over κ, at frequencies that no pair of directions reaches, or that the
+            pixels do not resolve.
+        patches: number of draws of an irregular surface that are averaged.
+        scatter: of a sample, its `standard_error`; None of a tile.
+    """
+
+    table: SeriesTable | SliceTable
+    grid: OrderGrid | SplineGrid
+    extent: str
+    pixel_size: tuple[float, float]
+    height_range: float
+    coherence_length: float
+    wavelengths: tuple[float, float]
+    tolerance: float
+    error: float
+    source: str
+    source_digest: str = field(repr=False)
+    largest_angle: float = 90.0
+    dropped: float = 0.0
+    beyond: float = 0.0
+    patches: int = 1
+    scatter: float | None = None
+
+    def __post_init__(self) -> None:
+        Settings(self.extent, self.coherence_length, self.wavelengths, self.largest_angle, tolerance=self.tolerance)
+        if self.table.shape != self.grid.shape:
+            raise RequestError(f"table: got {self.table.shape} nodes, wanted {self.grid.shape}")
+        if not all(np.isfinite(p) and p > 0 for p in self.pixel_size):
+            raise RequestError(f"pixel_size: got {self.pixel_size}, wanted two positive lengths in µm")
+        if not (np.isfinite(self.height_range) and self.height_range >= 0):
+            raise RequestError(f"height_range: got {self.height_range}, wanted a length ≥ 0 in µm")
+        if not 0 <= self.error < np.inf:
+            raise RequestError(f"error: got {self.error}, wanted a share of the power")
+        if not (isinstance(self.source, str) and isinstance(self.source_digest, str)):
+            raise RequestError(f"source: got {self.source!r}, {self.source_digest!r}, wanted texts")
+        if not (0 <= self.dropped <= 1 and 0 <= self.beyond <= 1):
+            raise RequestError(f"dropped, beyond: got {self.dropped}, {self.beyond}, wanted shares of the power")
+        if not (isinstance(self.patches, int) and self.patches >= 1):
+            raise RequestError(f"patches: got {self.patches!r}, wanted a whole number of at least 1")
+        if (self.scatter is not None) != (self.extent == "sample") or not 0 <= (self.scatter or 0.0) < np.inf:
+            raise RequestError(f"scatter: got {self.scatter} of a {self.extent}, wanted a number ≥ 0 of a sample only")
+
+    @property
+    def representation(self) -> str:
+        """The storage of the powers: "taylor", "chebyshev", "svd" or "slices"."""
+        return self.table.representation
+
+    @property
+    def standard_error(self) -> float:
+        """∫ of the standard error of Welch's estimate over q, at the worst κ: of one scan about the mean of many.
+
+        A share of the reflected power, comparable to `error`; see `sample.standard_error`.
+
+        Raises:
+            RequestError: of a tile.
+        """
+        if self.scatter is None:
+            raise RequestError(
+                "standard_error: got a tile, wanted a sample: a patch that repeats for ever is known exactly"
+            )
+        return self.scatter
+
+    @property
+    def largest_kappa(self) -> float:
+        """4π/λ_min in rad/µm: normal incidence and exit at the shortest wavelength."""
+        return 4 * np.pi / (self.wavelengths[0] * 1e-3)
+
+    @property
+    def lobe_width(self) -> float:
+        """σ_q in cycles/µm."""
+        return lobe_width(self.coherence_length)
+
+    @property
+    def reach(self) -> float:
+        """The least truncation of the lobes of orders, in standard deviations σ_q."""
+        return lobe_reach(TAIL_SHARE * self.tolerance)
+
+    @property
+    def lobes(self) -> tuple[LobeAxis, LobeAxis]:
+        """The truncation of the orders' lobes along x and y.
+
+        Raises:
+            RequestError: of a lattice of splines.
+        """
+        if not isinstance(self.grid, OrderGrid):
+            raise RequestError("lobes: got a lattice of splines, wanted a grid of orders")
+        return self.grid.lobes(self.lobe_width, self.reach)
+
+    @property
+    def neighbours(self) -> tuple[int, int]:
+        """The number of nodes along x and y that contribute at one q, to the tolerance."""
+        return (self.lobes[0].count, self.lobes[1].count) if isinstance(self.grid, OrderGrid) else (3, 3)
+
+    @property
+    def words_per_evaluation(self) -> int:
+        """The number of 32-bit words of the table that one evaluation of S reads."""
+        return self.neighbours[0] * self.neighbours[1] * self.table.words_per_node
+
+    @property
+    def megabytes(self) -> float:
+        """Size of the table in memory."""
+        return self.table.nbytes / 1e6
+
+    def powers(self, kappa: float) -> NDArray[np.float32]:
+        """Return the share of the reflected power of each node, (2 M_y + 1, 2 M_x + 1), in float32 as a renderer does.
+
+        Of orders, η_m(κ). Shares may be below zero: by the error, and as coefficients of splines.
+
+        Raises:
+            ValueError: if κ (rad/µm) is outside of what the table holds.
+        """
+        return self.table.powers(float(self._checked(np.asarray(kappa, np.float64))))
+
+    def evaluate(self, q: ArrayLike, kappa: ArrayLike) -> NDArray[np.float64]:
+        """Evaluate S(q; κ) from the table.
+
+        Args:
+            q: (..., 2) cycles/µm, along x and y.
+            kappa: (...) rad/µm, 0 ≤ κ ≤ `largest_kappa`.
+
+        Returns:
+            (...) µm².
+
+        Raises:
+            ValueError: if shapes do not match or κ is outside of what the table holds.
+        """
+        q, kappa = matching(q, kappa)
+        self._checked(kappa)
+        result = np.zeros(kappa.shape)
+        grid = self.grid
+        around = grid.around(q, self.lobe_width, self.reach) if isinstance(grid, OrderGrid) else grid.around(q)
+        for row, column, weight in around:
+            result += weight * self.table.powers_at(row, column, kappa)
+        # Interpolation may dip below zero by its error.
+        return np.maximum(result, 0)
+
+    def _checked(self, kappa: NDArray[np.float64]) -> NDArray[np.float64]:
+        if not (np.all(kappa >= 0) and np.all(kappa <= self.largest_kappa * (1 + 1e-6))):
+            raise RequestError(
+                f"kappa: got values from {np.min(kappa):.6g} to {np.max(kappa):.6g} rad/µm, wanted 0 to "
+                f"{self.largest_kappa:.6g} (the spectrum was built for wavelengths from {self.wavelengths[0]:g} nm)"
+            )
+        return kappa
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 of everything that a renderer needs: spectra of equal digest render alike."""
+        content = hashlib.sha256()
+        for f in fields(PowerSpectrum):
+            if f.name not in ("table", "source", "source_digest"):
+                content.update(f"{f.name}={getattr(self, f.name)!r};".encode())
+        for array in self.table.content():
+            content.update(array.data)
+        return content.hexdigest()
