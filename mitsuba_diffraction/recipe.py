@@ -36,6 +36,7 @@ material = "Al"                  # a conductor by Mitsuba's name,
 int_ior = 1.5                    # or an index of refraction;
 ext_ior = 1.0                    # of the medium above, that of a coat
 polarised = false                # with Mueller matrices, for polarised variants
+transmission = "none"            # or, of a dielectric, "interface" or "sheet": what is transmitted, too
 """
 
 from __future__ import annotations
@@ -75,7 +76,7 @@ _SCAN_KEYS = frozenset({"scan", "pixel_size", "height_range", "fill_missing", "c
 _SPECTRUM_KEYS = frozenset(
     {
         *("extent", "coherence_length", "wavelengths", "largest_angle", "representation", "tolerance"),
-        *("largest_height_range", "theory", "material", "int_ior", "ext_ior", "polarised"),
+        *("largest_height_range", "theory", "material", "int_ior", "ext_ior", "polarised", "transmission"),
     }
 )
 # Incremented when the same input gives a different result, to invalidate the cache.

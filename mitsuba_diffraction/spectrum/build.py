@@ -86,6 +86,7 @@ def precompute(
     material: str | None = None,
     ext_ior: float = 1.0,
     polarised: bool = False,
+    transmission: str = "none",
 ) -> Spectrum:
     """The spectrum of the phase e^{iκh}, or the table of rigorous efficiencies, its error at most `tolerance`.
 
@@ -110,6 +111,7 @@ def precompute(
         material: of rigorous theory, a conductor by the name that Mitsuba has for it.
         ext_ior: of rigorous theory, index of the medium above, for a grating under a coat; wavelengths are those there.
         polarised: of rigorous theory, whether polarised variants can use the table.
+        transmission: of rigorous theory, "interface" or "sheet" for what a dielectric transmits, too.
 
     Returns:
         The spectrum; its `error` is what was measured, at values of κ that were not used to build it.
@@ -153,16 +155,17 @@ def precompute(
             material=material,
             ext_ior=ext_ior,
             polarised=polarised,
+            transmission=transmission,
             coherence_length=coherence_length,
             wavelengths=wavelengths,
             tolerance=1e-2 if tolerance is None else tolerance,
             progress=progress,
             checkpoints=cache_folder(),
         )
-    if int_ior is not None or material is not None or ext_ior != 1 or polarised:
+    if int_ior is not None or material is not None or ext_ior != 1 or polarised or transmission != "none":
         raise RequestError(
-            "int_ior, material, ext_ior, polarised: the spectrum of scalar theory is that of every material; wanted "
-            "none of them"
+            "int_ior, material, ext_ior, polarised, transmission: the spectrum of scalar theory is that of every "
+            "material; wanted none of them"
         )
     if tolerance is not None:
         check_tolerance(tolerance)
