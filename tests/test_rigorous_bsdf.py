@@ -14,7 +14,7 @@ from mitsuba_diffraction import testing
 from mitsuba_diffraction.geometry import horizon_gain
 from mitsuba_diffraction.rigorous.axes import Axes
 from mitsuba_diffraction.rigorous.efficiencies import mueller
-from mitsuba_diffraction.rigorous.spectrum import RigorousSpectrum
+from mitsuba_diffraction.rigorous.spectrum import RigorousSpectrum, Table
 from mitsuba_diffraction.scalar_theory import fresnel
 
 SURFACE = {"profile": "blazed", "period": 0.3, "depth": 0.05, "samples": 64}
@@ -53,7 +53,7 @@ def made_up(coherence_length=65.0):
         x = np.sin(0.2 * np.arange(side) + m) ** 2
         square = (1 + np.add.outer(x, x)) * np.linspace(1, 2, axes.planes)[:, None, None] / (60 + 5 * m)
         values[:, start : start + side**2] = square.reshape(axes.planes, -1)
-    return RigorousSpectrum(axes, values, "Al", 0j, coherence_length, 0.01, 0, 0, 0, 1, "made up", "")
+    return RigorousSpectrum((Table(axes, values),), "Al", 0j, coherence_length, 0.01, 0, 0, 0, 1, "made up", "")
 
 
 @pytest.fixture(scope="module", params=["solved", "made up", "made up, wide lobes"])
