@@ -37,13 +37,12 @@ _Checked = tuple[float, float, float, bool, dict[tuple[int, int], tuple[NDArray[
 
 # Steps to a unit that are solved, one after the other until the error is kept.
 _SOLVED = (8, 16, 32)
-# Of an interface, whose light from below is less smooth: 600 lines/mm in glass keep 1 % at the first.
+# Of an interface, whose light from below is less smooth. 600 lines/mm in glass have a mean error of 0.0106 with eight.
 _SOLVED_BOTH = (10, 20, 40)
 PLANES = 17
 # Wavelengths that are solved, by the least g λ / T (the cosine of the cone angle) of these: metals in light along the
 # grooves show narrow lines that move with the wavelength.
 _CONES = ((0.45, 17), (0.7, 9), (1.0, 5))
-_BETWEEN = 9  # of an interface, where lines of the other side cross the range: twice as many gain a twentieth
 # η is stored in steps of this: files are half as large.
 _ROUNDED = 2.0**-16
 # An order at exactly grazing exit has no Rayleigh wave.
@@ -372,8 +371,7 @@ class _Build:
             shortest, longest = axes.range(g)
             count = 1
             if longest > shortest:
-                of_cone = next((count for limit, count in _CONES if g < limit * nu), _CONES[-1][1])
-                count = _BETWEEN if self.local else of_cone
+                count = next((count for limit, count in _CONES if abs(g) < limit * nu), _CONES[-1][1])
             at, weights = _between(count, axes.planes) if self.local else _chebyshev(count, axes.planes)
             wavelengths = shortest + at * (longest - shortest)
             nodes = np.full((count, *shape, entries, entries), np.nan)
