@@ -35,6 +35,53 @@ def k_g_between(wi: ArrayLike, wo: ArrayLike, shadowing: bool = True) -> NDArray
     return k_g(wi[..., 2], wo[..., 2], ((wi + wo) ** 2).sum(axis=-1) / 2, shadowing)
 
 
+def fresnel(cosine: ArrayLike, index: float) -> NDArray[np.float64]:
+    """Return F, the reflectance of unpolarised light, of an interface with the relative index n_o/n_i.
+
+    Args:
+        cosine: of the angle of incidence; shapes broadcast.
+        index: n_o/n_i, real. Below one, light is totally reflected beyond the critical angle.
+    """
+    within = np.sqrt(np.maximum(1 - (1 - np.square(cosine)) / index**2, 0))
+    return _fresnel(cosine, within, index)
+
+
+def _fresnel(cos_i: ArrayLike, cos_o: ArrayLike, index: float) -> NDArray[np.float64]:
+    """Return F from the cosines on both sides."""
+    s = (cos_i - index * cos_o) / np.maximum(cos_i + index * cos_o, 1e-12)
+    p = (index * cos_i - cos_o) / np.maximum(index * cos_i + cos_o, 1e-12)
+    return (s**2 + p**2) / 2
+
+
+def transmitted(cos_i: ArrayLike, cos_o: ArrayLike, tangent: ArrayLike, index: float) -> NDArray[np.float64]:
+    """Return K_t G_t (1 − F) of a pair of directions on both sides of an interface; shapes broadcast.
+
+    With v = ω_i + η ω_o and h = v/|v|, lengths in units of n_i,
+
+        K_t = |ω_i·h| |ω_o·h|/(cos θ_i cos θ_o h_z²)
+        G_t = min(1, 2 cos θ_i/|ω_i·h|, 2 cos θ_o/|ω_o·h|)² if |v|² < |1 − η²|, else 0
+
+    K_t diverges where v_z → 0, and S falls as v_z² there. Beyond |v|² no facet refracts ω_i into ω_o (Walter et al.
+    2007); at the limit the facet is lit at grazing incidence and F = 1. Towards the horizon what is transmitted falls
+    as cos θ, as of rigorous orders: hence the square of what V-cavities shadow (Torrance and Sparrow 1967), without the
+    factor h_z, as where v_z → 0 no facet is as steep as h.
+
+    Args:
+        cos_i, cos_o: |cos θ_i| and |cos θ_o|, positive.
+        tangent: |ω_i,t + η ω_o,t|² = |λq|², λ in the medium of ω_i.
+        index: η = n_o/n_i.
+    """
+    v_z = np.maximum(np.abs(cos_i - index * cos_o), 1e-9)
+    square = tangent + v_z**2
+    length = np.sqrt(square)
+    refracted = square < np.abs(1 - index**2)
+    # |ω_i·h| and |ω_o·h|
+    i, o = np.abs(square + 1 - index**2) / (2 * length), np.abs(square - 1 + index**2) / (2 * index * length)
+    k = i * o * square / (cos_i * cos_o * v_z**2)
+    g = refracted * np.minimum(1, 2 * np.minimum(cos_i / np.maximum(i, 1e-12), cos_o / np.maximum(o, 1e-12))) ** 2
+    return k * g * (1 - _fresnel(i, o, index))
+
+
 def horizon_gain(x: ArrayLike) -> NDArray[np.float64]:
     """Return g(x), which makes up for what a Gaussian lobe loses below the horizon; x ≥ 0 in standard deviations.
 

@@ -44,11 +44,11 @@ def random_surface(seed):
 
 
 @functools.lru_cache(2)
-def spectrum_of(seed):
+def spectrum_of(seed, wavelengths=(360.0, 830.0)):
     """Of a random surface; skips the test if it is refused."""
     heights, request, rng = random_surface(seed)
     try:
-        return md.precompute(heights, tolerance=1e-2, **request), rng
+        return md.precompute(heights, tolerance=1e-2, wavelengths=wavelengths, **request), rng
     except ValueError as refusal:
         pytest.skip(str(refusal))
 

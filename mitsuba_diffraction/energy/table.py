@@ -32,19 +32,22 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import minimum_filter
 
 from ..errors import RequestError
 from ..spectrum.orders import OrderGrid
-from .furnace import NARROW, Furnace, PowerSpectrum, albedo_of_nodes
+from .furnace import Furnace, PowerSpectrum
 
 SLACK = 1e-3
 """What an albedo may exceed one by."""
 GATHERED = 5e-3  # by which the albedo of gathered cells may err where it is not seen
 CHECKED = 40  # random places, at least, at which a table is held against the spectrum itself
-GENERAL = 17, 22  # slices, and cells along u and v, of a table for orders in two dimensions and for samples
+GENERAL, FINEST = (17, 22), 3  # slices, and cells along u and v, of other tables; finer by this, at most
 PLACES = 1.5e5  # nodes of the table of a line grating, at most
 ROUNDS, PAIRS = (1, 32), 5e6  # random places in each cell, at least and at most; about so many pairs with components
+STEEP = 0.98  # e is lowered so far inside of a cell or its neighbours, where more places are tried
 STRIDE = np.array([0.8191725, 0.6710436, 0.5497005])  # of places in a cell, so that few rounds cover it (Roberts 2018)
+TURNED = 1.0, 0.5  # c for which a is computed, where it matters
 LEAST, HORIZON = 1e-7, 1e-4  # the least fraction of u and v, and of y
 
 
@@ -89,10 +92,15 @@ class Layout:
     @classmethod
     def of(cls, spectrum: PowerSpectrum, furnace: Furnace) -> Layout:
         """Choose the layout for `spectrum`: as fine as the work allows."""
-        shortest, longest = (w * 1e-3 for w in spectrum.wavelengths)
+        # Those of the spectrum are in the denser medium.
+        shortest, longest = (w * 1e-3 * max(furnace.index or 1, 1) for w in spectrum.wavelengths)
         frequencies = 1 / longest, 1 / shortest
-        if not (isinstance(spectrum.grid, OrderGrid) and 1 in spectrum.grid.shape):
-            return cls(shortest / 2, 1, GENERAL[1], 1, GENERAL[0], frequencies, False)
+        lines = isinstance(spectrum.grid, OrderGrid) and 1 in spectrum.grid.shape
+        if furnace.index is not None or not lines:
+            # As fine as the work allows, which is about the same for all.
+            finer = np.clip(np.cbrt(PAIRS / (len(furnace.q) * GENERAL[0] * GENERAL[1] ** 2)), 1, FINEST)
+            slices, side = 1 + 2 * int(GENERAL[0] * finer / 2), int(GENERAL[1] * finer)
+            return cls(shortest / 2, 1, side, 1, slices, frequencies, False)
         turned = spectrum.grid.shape[1] == 1 and spectrum.grid.shape[0] > 1
         # So many places that the work is about the same for all gratings.
         side = np.sqrt(2 * min(PLACES, PAIRS / max(len(furnace.q) / 2, 1)))
@@ -169,18 +177,24 @@ class EnergyTable:
         got.setflags(write=False)
 
     @classmethod
-    def of(cls, spectrum: PowerSpectrum, height_scale: float = 1.0) -> EnergyTable:
-        """Make the table of `spectrum`, with its heights scaled by `height_scale`."""
-        furnace = Furnace.of(spectrum, height_scale)
+    def of(
+        cls, spectrum: PowerSpectrum, height_scale: float = 1.0, index: float | None = None, side: int = 1
+    ) -> EnergyTable:
+        """Make the table of `spectrum`; the arguments are those of `Furnace.of`.
+
+        With `index` it bounds what is reflected and transmitted, of light that comes from `side`; the spectrum holds
+        wavelengths in the denser medium.
+        """
+        furnace = Furnace.of(spectrum, height_scale, index, side)
         layout = Layout.of(spectrum, furnace)
         e, loss = corners(furnace, layout)
         table = cls.packed(layout, e, loss)
-        if not table.needed or (furnace.by_order and spectrum.wavelengths[1] * 1e-3 * spectrum.lobe_width < NARROW):
+        if not table.needed or (furnace.by_order and not furnace.wide and not furnace.turning):
             return table
         # Against the spectrum itself: cells were gathered, and orders represented by the centres of their lobes.
-        places = random_places(spectrum.wavelengths, int(np.clip(2e5 / np.prod(spectrum.grid.shape), CHECKED, 150)))
+        places = random_places(layout.frequencies, int(np.clip(2e5 / np.prod(spectrum.grid.shape), CHECKED, 150)))
         # Of two estimates the smaller: what both exceed is no noise.
-        found = [albedo_of_nodes(spectrum, *places, height_scale, table.at, seed) for seed in (0, 1)]
+        found = [furnace.albedo_of_nodes(spectrum, *places, table.at, seed) for seed in (0, 1)]
         excess = max(float(np.minimum(*found).max()) - 1, 0.0 if furnace.by_order else GATHERED)
         return cls.packed(layout, e / (1 + excess), (loss[0] + excess, loss[1] + excess))
 
@@ -236,16 +250,16 @@ class EnergyTable:
         return cls(layout, steps, float(plain["least"]), (float(mean), float(largest)))
 
 
-def random_places(wavelengths: tuple[float, float], count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def random_places(frequencies: tuple[float, float], count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return `count` directions (n, 3), two thirds of them beyond 60°, one beyond 85°, and λ in µm, (n,).
 
-    `wavelengths` are the shortest and the longest, in nm.
+    `frequencies` are the least and the largest 1/λ, in 1/µm.
     """
     rng = np.random.default_rng(0)
     theta = np.deg2rad(rng.uniform(rng.choice([0, 60, 85], count), 89.9))
     phi = rng.uniform(0, 2 * np.pi, count)
     directions = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1)
-    return directions, rng.uniform(*wavelengths, count) * 1e-3
+    return directions, rng.uniform(1 / frequencies[1], 1 / frequencies[0], count)
 
 
 def corners(furnace: Furnace, layout: Layout) -> tuple[NDArray[np.float64], tuple[float, float]]:
@@ -269,7 +283,12 @@ def _line_corners(furnace: Furnace, layout: Layout) -> tuple[NDArray[np.float64]
     e = np.ones((1, *nu.shape))
     if layout.turned:
         furnace = dataclasses.replace(furnace, q=furnace.q[:, ::-1])
-    e[0, reached] = 1 / np.maximum(furnace.line_albedo(((v - u) / (u + v))[reached], nu[reached]), 1)
+    x = ((v - u) / (u + v))[reached]
+    omega = np.stack([x, np.zeros(len(x)), np.sqrt(1 - x**2)], -1)
+    # Where phases turn within lobes a depends on c, too: seen in the scale of c, lobes are 1/c as wide.
+    scales = TURNED if furnace.turning else (1.0,)
+    a = [dataclasses.replace(furnace, widths=furnace.widths / c).albedo(omega, 1 / nu[reached]) for c in scales]
+    e[0, reached] = 1 / np.maximum(np.max(a, axis=0), 1)
     inside = reached & (nu <= last)
     # The cells: each second node but the last of a unit square.
     start = np.concatenate([np.arange(0, len(n) - 1, 2) + np.flatnonzero(square == k)[0] for k, n in enumerate(nodes)])
@@ -305,8 +324,6 @@ def _general_corners(furnace: Furnace, layout: Layout) -> tuple[NDArray[np.float
         lengths = c / nu
         there = (lengths >= 1 / last) & (lengths <= 1 / first)
         directions = np.stack([c * (v - u) / (u + v), 2 * y / (1 + y**2), c * 2 * np.sqrt(u * v) / (u + v)], -1)
-        if layout.turned:
-            directions = directions[:, [1, 0, 2]]
         a = furnace.albedo(directions, np.clip(lengths, 1 / last, 1 / first))
         return 1 / np.maximum(a, 1), there
 
@@ -320,15 +337,33 @@ def _general_corners(furnace: Furnace, layout: Layout) -> tuple[NDArray[np.float
     eight = np.array(list(np.ndindex(2, 2, 2)))
     nodes, corner = np.unique((cells[:, None] + eight).reshape(-1, 3), axis=0, return_inverse=True)
     e = bound(nodes.astype(np.float64))[0][corner.reshape(-1, 8)]
-    start = np.random.default_rng(0).random((len(cells), 3))
-    rounds = int(np.clip(PAIRS / (len(cells) * len(furnace.q)), *ROUNDS))
-    for index in range(rounds):
-        inside = (start + index * STRIDE) % 1
-        wanted, there = bound(cells + inside)
-        weights = np.prod(np.where(eight, inside[:, None], 1 - inside[:, None]), -1)
-        got = (weights * e).sum(-1)
-        lost = np.clip(1 - got / wanted, 0, 1)[there]
-        e *= np.where(there, np.minimum(wanted / np.maximum(got, 1e-30), 1), 1)[:, None]
+    start, lowered = np.random.default_rng(0).random((len(cells), 3)), np.ones(len(cells))
+
+    def of_neighbours() -> NDArray[np.float64]:
+        near = np.ones(np.add(layout.shape[:3], (-1, 0, 0)))
+        near[tuple(cells.T)] = lowered
+        return minimum_filter(near, 3)[tuple(cells.T)]
+
+    some, done = np.arange(len(cells)), 0
+    # All cells, and again those that are steep.
+    for steep in (False, True)[: 1 + furnace.by_order]:
+        if steep:
+            some = np.flatnonzero(of_neighbours() < STEEP)
+        rounds = int(np.clip(PAIRS / max(len(some) * len(furnace.q), 1), *ROUNDS)) if len(some) else 0
+        for index in range(done, done + rounds):
+            inside = (start[some] + index * STRIDE) % 1
+            wanted, there = bound(cells[some] + inside)
+            weights = np.prod(np.where(eight, inside[:, None], 1 - inside[:, None]), -1)
+            got = (weights * e[some]).sum(-1)
+            if not steep:
+                lost = np.clip(1 - got / wanted, 0, 1)[there]
+            share = np.where(there, np.minimum(wanted / np.maximum(got, 1e-30), 1), 1)
+            e[some] *= share[:, None]
+            lowered[some] *= share
+        done += rounds
+    if furnace.by_order:
+        # What few places show in one cell may lie between those in its neighbours.
+        e *= (of_neighbours() / np.maximum(lowered, 1e-30))[:, None]
     # Two cells share a corner (slice, row, column, corner).
     full = np.ones(layout.shape)
     for k, (above, j, i) in enumerate(eight):
