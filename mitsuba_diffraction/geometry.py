@@ -56,30 +56,27 @@ def _fresnel(cos_i: ArrayLike, cos_o: ArrayLike, index: float) -> NDArray[np.flo
 def transmitted(cos_i: ArrayLike, cos_o: ArrayLike, tangent: ArrayLike, index: float) -> NDArray[np.float64]:
     """Return K_t G_t (1 − F) of a pair of directions on both sides of an interface; shapes broadcast.
 
-    With v = ω_i + η ω_o and h = v/|v|, lengths in units of n_i,
+    With v = ω_i + η ω_o, h = v/|v| and lengths in units of n_i,
 
-        K_t = |ω_i·h| |ω_o·h|/(cos θ_i cos θ_o h_z²)
-        G_t = min(1, 2 cos θ_i/|ω_i·h|, 2 cos θ_o/|ω_o·h|)² if |v|² < |1 − η²|, else 0
+        r_i = |ω_i·h|/(cos θ_i |h_z|),  r_o = |ω_o·h|/(cos θ_o |h_z|),    K_t = r_i r_o,
+        G_t = min(1, 2/r_i, 2/r_o)² if |v|² < |1 − η²|, else 0
 
-    K_t diverges where v_z → 0, and S falls as v_z² there. Beyond |v|² no facet refracts ω_i into ω_o (Walter et al.
-    2007); at the limit the facet is lit at grazing incidence and F = 1. Towards the horizon what is transmitted falls
-    as cos θ, as of rigorous orders: hence the square of what V-cavities shadow (Torrance and Sparrow 1967), without the
-    factor h_z, as where v_z → 0 no facet is as steep as h.
+    so that K_t G_t ≤ 4. Beyond that |v|² no facet refracts ω_i into ω_o (Walter et al. 2007); at the limit F = 1. The
+    square of what V-cavities shadow (Torrance and Sparrow 1967) makes an order vanish as cos θ towards the horizon, as
+    rigorous orders do.
 
     Args:
         cos_i, cos_o: |cos θ_i| and |cos θ_o|, positive.
         tangent: |ω_i,t + η ω_o,t|² = |λq|², λ in the medium of ω_i.
         index: η = n_o/n_i.
     """
-    v_z = np.maximum(np.abs(cos_i - index * cos_o), 1e-9)
+    v_z = np.abs(cos_i - index * cos_o)
     square = tangent + v_z**2
-    length = np.sqrt(square)
-    refracted = square < np.abs(1 - index**2)
-    # |ω_i·h| and |ω_o·h|
-    i, o = np.abs(square + 1 - index**2) / (2 * length), np.abs(square - 1 + index**2) / (2 * index * length)
-    k = i * o * square / (cos_i * cos_o * v_z**2)
-    g = refracted * np.minimum(1, 2 * np.minimum(cos_i / np.maximum(i, 1e-12), cos_o / np.maximum(o, 1e-12))) ** 2
-    return k * g * (1 - _fresnel(i, o, index))
+    # |ω_i·v| and |ω_o·v|
+    i, o = np.abs(square + 1 - index**2) / 2, np.abs(square - 1 + index**2) / (2 * index)
+    r_i, r_o = i / np.maximum(cos_i * v_z, 1e-12), o / np.maximum(cos_o * v_z, 1e-12)
+    k_g = np.minimum(np.minimum(r_i * r_o, 4 * r_o / np.maximum(r_i, 1e-12)), 4 * r_i / np.maximum(r_o, 1e-12))
+    return k_g * (square < np.abs(1 - index**2)) * (1 - _fresnel(i, o, index))
 
 
 def horizon_gain(x: ArrayLike) -> NDArray[np.float64]:

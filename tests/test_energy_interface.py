@@ -2,17 +2,19 @@
 
 import functools
 
+import mitsuba as mi
 import numpy as np
 import pytest
+from bsdf_support import floats, vectors
 from scipy.special import jv
 from test_energy_random import INTEGRAL, OFFSETS, anywhere, spectrum_of
 
 import mitsuba_diffraction as md
+from mitsuba_diffraction.bsdf.energy import Energy
 from mitsuba_diffraction.energy.furnace import Furnace
 from mitsuba_diffraction.energy.table import EnergyTable
 from mitsuba_diffraction.geometry import horizon_gain, k_g
 from mitsuba_diffraction.spectrum.spline_grid import SplineGrid
-from mitsuba_diffraction.spectrum.tables import small_kappa_weights
 
 INDEX, MOST = 1.5, 1.002
 SHORT, LONG = 360.0, 830.0
@@ -47,7 +49,7 @@ def pair(wi, wo, n_i, n_o):
     i, o = np.abs((wi * h).sum(-1)), np.abs((wo * h).sum(-1))
     cos_i, cos_o = np.abs(wi[..., 2]), np.abs(wo[..., 2])
     k = i * o / (cos_i * cos_o * h[..., 2] ** 2)
-    g = np.minimum(1, 2 * np.minimum(cos_i / i, cos_o / o)) ** 2
+    g = np.minimum(1, 2 * np.abs(h[..., 2]) * np.minimum(cos_i / i, cos_o / o)) ** 2
     return np.where((v**2).sum(-1) < abs(n_i**2 - n_o**2), k * g * (1 - reflectance(i, n_o / n_i)), 0)
 
 
@@ -89,12 +91,11 @@ def test_the_furnace_of_an_interface_is_the_closed_form(name, side):
     np.testing.assert_allclose(found, wanted, atol=2e-3)
     e = table(name, side).at(omega, inside)
     assert (e * wanted).max() <= 1 + 2e-3
-    assert (wanted > 1.02).any()
     # Where scalar theory holds, nothing is taken away.
     near = theta < np.deg2rad(45 if side > 0 else 15)
     assert (1 - e * np.maximum(wanted, 1))[near].mean() < 0.02
     if side > 0:
-        assert (e * wanted)[near].mean() > 0.98
+        assert (e * wanted)[near].mean() > {"sinusoid": 0.995, "sawtooth": 0.97}[name]
 
 
 def scattered(of, tables, wi, side, wavelength, rng, points, sheet=False):
@@ -119,7 +120,6 @@ def scattered(of, tables, wi, side, wavelength, rng, points, sheet=False):
     sigma, q = of.lobe_width, np.stack(np.meshgrid(*of.grid.frequencies()), -1).reshape(-1, 2)
     row, column = np.divmod(np.arange(len(q)), of.grid.shape[1])
     e_i = tables[side].at(wi[None], np.array([wavelength / n_i]))[0]
-    small = of.small_kappa(INDEX)
     sums = []
     for _ in range(4):
         if splines:
@@ -166,15 +166,13 @@ def scattered(of, tables, wi, side, wavelength, rng, points, sheet=False):
                     between = np.abs(n_i * cos_i - n_o * cos_exit)
                     # Of an order, κ is that of its K_t.
                     kappa = 2 * np.pi * between / wavelength
-                    low = kappa < small
                     power = of.table.powers_at(row[node], column[node], np.minimum(kappa, of.largest_kappa))
-                    near, far = small_kappa_weights(np.minimum(kappa / small, 1))
-                    at = [of.table.powers_at(row[node], column[node], np.full(len(u), k * small)) for k in (1, 2)]
-                    power = np.where(low, near * at[0] + far * at[1], power)
                     square_v = tangent + between**2
                     i, o = (np.abs(square_v + s * (n_i**2 - n_o**2)) / 2 / k for s, k in ((1, n_i), (-1, n_o)))
                     i, o = i / np.sqrt(square_v), o / np.sqrt(square_v)
-                    g = np.minimum(1, 2 * np.minimum(cos_i / i, cos_exit / o)) ** 2 * (square_v < abs(n_i**2 - n_o**2))
+                    h_z = between / np.sqrt(square_v)
+                    g = np.minimum(1, 2 * h_z * np.minimum(cos_i / i, cos_exit / o)) ** 2
+                    g = g * (square_v < abs(n_i**2 - n_o**2))
                     factor = i * o * square_v / (cos_i * cos_exit * between**2) * g * (1 - reflectance(i, n_o / n_i))
                 out = np.concatenate([-(u + n_i * wi[:2]) / n, cos_o[:, None]], -1)
                 e = np.minimum(e_i, tables[side * up].at(out, np.full(len(out), wavelength / n)))
@@ -207,3 +205,19 @@ def test_no_interface_and_no_sheet_sends_out_more_than_came(seed):
             if mean + 2 * error > 1.001:
                 mean, error = scattered(of, tables, omega[k], side, wavelengths[k], rng, 16 * few)
             assert mean - 2 * error <= MOST, (side, mean, error, omega[k], wavelengths[k])
+
+
+@pytest.mark.usefixtures("llvm")
+def test_the_renderer_reads_the_table_of_each_side():
+    above, below = (table("sawtooth", side) for side in (1, -1))
+    energy = Energy(above, under=below, index=INDEX)
+    omega, wavelengths = anywhere(np.random.default_rng(3), 400)
+    for side, of, n in ((1, above, 1), (-1, below, INDEX)):
+        place = energy.place(vectors(omega * [1, 1, side]))
+        found = np.array(energy.bound(place, floats(1 / wavelengths)))
+        np.testing.assert_allclose(found, of.at(omega, wavelengths / n), atol=5e-4)
+    e = [of.at(omega[:1], wavelengths[:1] / n)[0] for of, n in ((above, 1), (below, INDEX))]
+    there, back = vectors(omega[:1]), vectors(omega[:1] * [1, 1, -1])
+    for wi, wo in ((there, back), (back, there)):
+        found = energy.factor(wi, wo, mi.UnpolarizedSpectrum(float(wavelengths[0])))
+        np.testing.assert_allclose(np.array(found).ravel(), min(e), atol=5e-4)

@@ -37,9 +37,10 @@ from scipy.special import ndtri
 from ..geometry import fresnel, horizon_gain, k_g, transmitted
 from ..spectrum.orders import LobeAxis, OrderGrid
 from ..spectrum.spline_grid import SplineGrid, spline_integral
-from ..spectrum.tables import SeriesTable, SliceTable, small_kappa_weights
+from ..spectrum.tables import SeriesTable, SliceTable
 
 KAPPA_STEP = 0.1  # radians of the fastest oscillation over κ, between which powers are linear
+COARSER = 1.6  # cells, where there are three ways for light to go
 CELL, CELLS = 0.2, 500  # width of a gathered cell in direction cosines at the shortest wavelength; cells at least
 MIRROR_CELL = 0.75  # the same in the lobe of the mirror direction, in σ_q, at most
 FAR_CELL = 20  # cos² θ_o in λσ from which a cell is represented by its centre
@@ -81,9 +82,6 @@ class PowerSpectrum(Protocol):
     def powers(self, kappa: float) -> NDArray[np.float32]:
         """Return the share of the power of each node."""
 
-    def small_kappa(self, index: float, height_scale: float) -> float:
-        """Return κ₁, below which S/κ² of transmitted light is extrapolated."""
-
 
 def evaluated_by_order(spectrum: PowerSpectrum) -> bool:
     """Return whether the BSDF evaluates the orders of `spectrum` one by one: of line gratings, and if none overlap."""
@@ -109,7 +107,6 @@ class Furnace:
         side: 1, ω is above the surface; −1, below, where the surface seen has the heights −h, S that of −q.
         turning: they are, and phases turn within their lobes, so that their powers are averages over these.
         wide: lobes are wide.
-        small_kappa: κ₁ of `GratingSpectrum.small_kappa`, rad/µm for scaled heights.
     """
 
     q: NDArray[np.float64] = field(repr=False)
@@ -124,7 +121,6 @@ class Furnace:
     wide: bool = False
     index: float | None = None
     side: int = 1
-    small_kappa: float = 1.0
 
     @classmethod
     def of(
@@ -153,7 +149,7 @@ class Furnace:
             widths = np.full(len(q), spectrum.lobe_width)
         else:
             own = spectrum.lobe_width if isinstance(grid, OrderGrid) else np.array(grid.spacing) / 2
-            q, widths, powers = _gathered(spectrum, kappas, own)
+            q, widths, powers = _gathered(spectrum, kappas, own, 1.0 if index is None else COARSER)
         # In deep surfaces phases turn faster than a table in three dimensions follows: where few nodes make up a
         # component, its power is the largest near.
         deep = max_kappa * spectrum.height_range * height_scale * BLUR > 1
@@ -176,7 +172,6 @@ class Furnace:
             wide,
             seen,
             side,
-            1.0 if index is None else spectrum.small_kappa(index, height_scale) / max(height_scale, 1e-9),
         )
 
     def power(self, component: NDArray[np.int64], kappa: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -206,6 +201,13 @@ class Furnace:
         return result
 
     @property
+    def work(self) -> int:
+        """Return about how many components the work for one direction amounts to."""
+        if self.by_order:
+            return (len(self.q) + 20) * (RADIAL if self.turning else 1)
+        return len(self.q) * len(self.ways) ** 2
+
+    @property
     def ways(self) -> tuple[int, ...]:
         """0, light is reflected; ±1, it is transmitted with that sign of v_z, where there is a medium below."""
         return (0,) if self.index is None else (0, 1, -1)
@@ -227,7 +229,7 @@ class Furnace:
         lowest = 0.0 if self.by_order else -2 * REACH / index * np.multiply.outer(length, self.widths[reached])
         i, j = np.nonzero(square > lowest)
         square, j = square[i, j], reached[j]
-        far = self._far(square, length[i] * self.widths[j] / index, length[i])
+        far = self._far(square, length[i] * self.widths[j] / index, length[i], way)
         if way:
             # What goes the other way at its centre does so.
             kept = ~far | (way * (cos_i[i] - index * np.sqrt(np.maximum(square, 0))) > 0)
@@ -241,13 +243,13 @@ class Furnace:
         return np.bincount(at, value, len(s)) + np.bincount(i, near, len(s))
 
     def _far(
-        self, square: NDArray[np.float64], sigma: NDArray[np.float64], length: NDArray[np.float64]
+        self, square: NDArray[np.float64], sigma: NDArray[np.float64], length: NDArray[np.float64], way: int
     ) -> NDArray[np.bool_]:
         """Return whether a component is represented by its centre; cos² θ_o, the width in ω_o and λ of each."""
         turn = 2 * np.pi * self.height_range * sigma / (length * TURN)
         if self.by_order:
             # K and G are those of the order, and its lobe keeps its power at the horizon: κ alone may change.
-            return (square > turn**2) | (not self.turning)
+            return (square > turn**2) | (not self.turning) | (way != 0)
         return (square > FAR_CELL * sigma) & (square > turn**2)
 
     def _factor(
@@ -282,9 +284,7 @@ class Furnace:
         if not way:
             return power(2 * np.pi / length * (cos_i + cos_o))
         v_z = way * (cos_i - self.index * cos_o)
-        x = 2 * np.pi / self.small_kappa * v_z / length
-        near, far = small_kappa_weights(np.clip(x, 0, 1))
-        return near * power(np.maximum(x, 1) * self.small_kappa) + far * power(np.full_like(x, 2 * self.small_kappa))
+        return power(2 * np.pi / length * np.maximum(v_z, 0)) * (v_z > 0)
 
     def _lobes(
         self,
@@ -414,7 +414,7 @@ class Furnace:
                 cos_i2, cos_o2 = 1 - ((s + u - order) ** 2).sum(-1), 1 - ((s + order) ** 2).sum(-1) / index**2
                 in_, out = (np.sqrt(np.maximum(x, 1e-12) / 2) for x in (cos_i**2 + cos_i2, cos_o**2 + cos_o2))
                 value = self._factor(in_, out, length, (order**2).sum(-1), way) * ((cos_i2 > 0) & (cos_o2 > 0))
-                # Where v_z → 0 of an order, K_t diverges and its power must fall with the same v_z.
+                # Transmitted light has κ of the order, with which K_t changes as fast.
                 kappa_of = (in_, out) if way else kappa_of
                 for x in (np.minimum(cos_i**2, index * cos_o2), np.minimum(index * cos_o**2, cos_i2)):
                     value *= horizon_gain(np.maximum(x, 0) / (2 * length * sigma))
@@ -443,7 +443,7 @@ def mirrored(
 
 
 def _gathered(
-    spectrum: PowerSpectrum, kappas: NDArray[np.float64], own: NDArray[np.float64] | float
+    spectrum: PowerSpectrum, kappas: NDArray[np.float64], own: NDArray[np.float64] | float, coarser: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Gather the nodes of `spectrum` in the cells of a lattice, those near the mirror direction apart.
 
@@ -451,6 +451,7 @@ def _gathered(
         spectrum: of overlapping orders or of a sample.
         kappas: rad/µm, equidistant.
         own: the standard deviation of what a node stands for, cycles/µm, along x and y.
+        coarser: times the width of a cell.
 
     Returns:
         Centres of power (n, 2), standard deviations (n,), both in cycles/µm, and powers (n, K).
@@ -458,7 +459,7 @@ def _gathered(
     sigma = spectrum.lobe_width
     q = np.stack(np.meshgrid(*spectrum.grid.frequencies()), -1).reshape(-1, 2)
     shortest = 4 * np.pi / spectrum.largest_kappa
-    width = min(CELL / shortest, np.sqrt(np.prod(np.minimum(np.ptp(q, axis=0), 4 / shortest)) / CELLS))
+    width = coarser * min(CELL / shortest, np.sqrt(np.prod(np.minimum(np.ptp(q, axis=0), 4 / shortest)) / CELLS))
     # Smaller ones where b is not zero.
     near = np.hypot(*q.T) < 6 * sigma
     place = np.rint(q / np.where(near, min(width, MIRROR_CELL * sigma), width)[:, None])

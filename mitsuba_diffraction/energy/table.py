@@ -98,7 +98,9 @@ class Layout:
         lines = isinstance(spectrum.grid, OrderGrid) and 1 in spectrum.grid.shape
         if furnace.index is not None or not lines:
             # As fine as the work allows, which is about the same for all.
-            finer = np.clip(np.cbrt(PAIRS / (len(furnace.q) * GENERAL[0] * GENERAL[1] ** 2)), 1, FINEST)
+            places = GENERAL[0] * GENERAL[1] ** 2
+            finest = 1 if furnace.index is None else FINEST
+            finer = np.clip(np.cbrt(PAIRS / (furnace.work * places)), 1, finest)
             slices, side = 1 + 2 * int(GENERAL[0] * finer / 2), int(GENERAL[1] * finer)
             return cls(shortest / 2, 1, side, 1, slices, frequencies, False)
         turned = spectrum.grid.shape[1] == 1 and spectrum.grid.shape[0] > 1
@@ -192,7 +194,9 @@ class EnergyTable:
         if not table.needed or (furnace.by_order and not furnace.wide and not furnace.turning):
             return table
         # Against the spectrum itself: cells were gathered, and orders represented by the centres of their lobes.
-        places = random_places(layout.frequencies, int(np.clip(2e5 / np.prod(spectrum.grid.shape), CHECKED, 150)))
+        places = random_places(
+            layout.frequencies, int(np.clip(2e5 / np.prod(spectrum.grid.shape) / len(furnace.ways), CHECKED, 150))
+        )
         # Of two estimates the smaller: what both exceed is no noise.
         found = [furnace.albedo_of_nodes(spectrum, *places, table.at, seed) for seed in (0, 1)]
         excess = max(float(np.minimum(*found).max()) - 1, 0.0 if furnace.by_order else GATHERED)
@@ -346,10 +350,11 @@ def _general_corners(furnace: Furnace, layout: Layout) -> tuple[NDArray[np.float
 
     some, done = np.arange(len(cells)), 0
     # All cells, and again those that are steep.
-    for steep in (False, True)[: 1 + furnace.by_order]:
+    jumps = furnace.by_order and furnace.index is not None
+    for steep in (False, True)[: 1 + jumps]:
         if steep:
             some = np.flatnonzero(of_neighbours() < STEEP)
-        rounds = int(np.clip(PAIRS / max(len(some) * len(furnace.q), 1), *ROUNDS)) if len(some) else 0
+        rounds = int(np.clip(PAIRS / max(len(some) * furnace.work, 1), *ROUNDS)) if len(some) else 0
         for index in range(done, done + rounds):
             inside = (start[some] + index * STRIDE) % 1
             wanted, there = bound(cells[some] + inside)
@@ -361,9 +366,10 @@ def _general_corners(furnace: Furnace, layout: Layout) -> tuple[NDArray[np.float
             e[some] *= share[:, None]
             lowered[some] *= share
         done += rounds
-    if furnace.by_order:
+    if jumps:
         # What few places show in one cell may lie between those in its neighbours.
         e *= (of_neighbours() / np.maximum(lowered, 1e-30))[:, None]
+        e[e < 1] *= 1 - 2 * SLACK
     # Two cells share a corner (slice, row, column, corner).
     full = np.ones(layout.shape)
     for k, (above, j, i) in enumerate(eight):

@@ -35,8 +35,6 @@ from .tables import Series, SeriesTable, SliceTable, chebyshev, taylor
 # The part of the tolerance that is spent on the tails of the lobes.
 TAIL_SHARE = 0.4
 
-SMALL_PHASE = 0.4  # κ₁ times the height range: a table's error and that of the straight line are each about 2 %
-
 _computing = threading.Lock()
 
 
@@ -207,19 +205,6 @@ class GratingSpectrum:
                 f"{self.largest_kappa:.6g} (the spectrum was built for wavelengths from {self.wavelengths[0]:g} nm)"
             )
         return kappa
-
-    def small_kappa(self, index: float, height_scale: float = 1.0) -> float:
-        """Return κ₁ in rad/µm of the stored heights: below it, c_m(κ) is that of `tables.small_kappa_weights`.
-
-        It is as small as the error of a table allows, and less than κ of the undiffracted order at any angle.
-
-        Args:
-            index: n of the medium below relative to the one above; the spectrum holds wavelengths in the denser one.
-            height_scale: times the heights.
-        """
-        denser = max(index, 1 / index)
-        undiffracted = 2 * np.pi * (1 - 1 / denser) / (self.wavelengths[1] * 1e-3) * height_scale
-        return float(min(SMALL_PHASE / max(self.height_range, 1e-9), 0.8 * undiffracted, self.largest_kappa / 2))
 
     def energy_table(self) -> EnergyTable:
         """Return what bounds the albedo by one; made at the first call unless it came with the file."""

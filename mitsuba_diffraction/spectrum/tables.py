@@ -15,14 +15,12 @@ import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import ClassVar, TypeVar
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import RequestError
-
-_Number = TypeVar("_Number")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -403,18 +401,3 @@ def place(kappa: ArrayLike, largest_kappa: float, intervals: int) -> tuple[NDArr
     x = np.asarray(kappa, np.float64) / largest_kappa * intervals
     interval = np.clip(np.floor(x), 0, intervals - 1).astype(np.int64)
     return interval, (2 * (x - interval) - 1).astype(np.float32)
-
-
-def small_kappa_weights(x: _Number) -> tuple[_Number, _Number]:
-    """Return the weights of c_m(κ₁) and c_m(2κ₁) that make up c_m(κ), κ = x κ₁, of an order that vanishes at κ = 0.
-
-    What transmission divides by κ² falls as κ², and a table has an absolute error. So c_m/κ² is the straight line
-    through its values at κ₁ and 2κ₁:
-
-        c_m(κ) ≈ x² (2 − x) c_m(κ₁) + x² (x − 1)/4 c_m(2κ₁)
-
-    Args:
-        x: κ/κ₁, 0 to 1, where the weights are 1 and 0; of NumPy or Dr.Jit.
-    """
-    square = x * x
-    return square * (2 - x), square * (x - 1) / 4
