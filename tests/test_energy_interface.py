@@ -205,6 +205,10 @@ def test_no_interface_and_no_sheet_sends_out_more_than_came(seed):
             if mean + 2 * error > 1.001:
                 mean, error = scattered(of, tables, omega[k], side, wavelengths[k], rng, 16 * few)
             assert mean - 2 * error <= MOST, (side, mean, error, omega[k], wavelengths[k])
+        # A sheet: from its flat face with what that reflects, and what it transmits.
+        mean, error = scattered(of, tables, omega[k], side, wavelengths[k], rng, few, sheet=True)
+        flat = reflectance(omega[k][2], 1 / INDEX) if side < 0 else 0.0
+        assert flat + (1 - flat) * (mean - 2 * error) <= MOST
 
 
 @pytest.mark.usefixtures("llvm")

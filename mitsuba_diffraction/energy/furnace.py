@@ -18,6 +18,15 @@ if |t_i| < 1 and |t_o| < 1, else W = 0, and K G of the cosines √(cos² θ_i + 
 and of |λm/T|. Orders that overlap, and samples, have (1 − b) K G + b g(d(s_i)) g(d(s_o)) with
 
     b = clip((25 − |q|²/σ_q²)/9, 0, 1) clip(2 − 5 max(cos θ_i, cos θ_o), 0, 1)
+
+Of an interface between media, a is what is reflected and transmitted together, of light from one of its sides:
+
+    a(ω_i, λ) = ∫ F K G S(q; κ) W dq + ∫ (1 − F) K_t G_t S(q; κ_t) W_t dq,    κ_t = 2π (cos θ_i − η cos θ_o)/λ
+
+with λ and lengths of the medium of ω_i, `geometry.transmitted`, and S(q; −κ) = S(−q; κ). A transmitted order has the
+same cosines as above with |t_i| and |t_o| in units of their media, K_t, G_t and κ_t of these cosines, and in W_t each d
+in its medium; where orders overlap, W_t = 1. From below a surface is that with −h. A sheet has the table of an
+interface: its flat face only takes away.
 """
 
 from __future__ import annotations
@@ -246,11 +255,12 @@ class Furnace:
         self, square: NDArray[np.float64], sigma: NDArray[np.float64], length: NDArray[np.float64], way: int
     ) -> NDArray[np.bool_]:
         """Return whether a component is represented by its centre; cos² θ_o, the width in ω_o and λ of each."""
+        # The lobe of an order keeps its power at the horizon, with K and G of the order, and of transmitted light with
+        # its κ: that of reflected light alone may change.
+        if self.by_order and (way or not self.turning):
+            return np.ones(square.shape, bool)
         turn = 2 * np.pi * self.height_range * sigma / (length * TURN)
-        if self.by_order:
-            # K and G are those of the order, and its lobe keeps its power at the horizon: κ alone may change.
-            return (square > turn**2) | (not self.turning) | (way != 0)
-        return (square > FAR_CELL * sigma) & (square > turn**2)
+        return (square > turn**2) & (self.by_order | (square > FAR_CELL * sigma))
 
     def _factor(
         self,

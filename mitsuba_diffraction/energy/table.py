@@ -17,7 +17,8 @@ just emerged; at u = 0 and v = 0 ω itself is at the horizon. With f the fractio
 cos θ_o of that order is. a depends on u and v alone: the table has one slice.
 
 Of surfaces with orders in two dimensions, and of samples, T is so short that one square holds all directions, and
-slices are equidistant in the same function of the fraction 1 − |y|, y = ω_y/(1 + c).
+slices are equidistant in the same function of the fraction 1 − |y|, y = ω_y/(1 + c). So it is of an interface, where
+transmitted orders emerge elsewhere; it has one table for the light of each side.
 """
 
 from __future__ import annotations
@@ -211,7 +212,7 @@ class EnergyTable:
 
     @property
     def needed(self) -> bool:
-        """Some direction would reflect more than it receives."""
+        """Return whether some direction would reflect more than it receives."""
         return self.least < 1
 
     def at(self, directions: NDArray[np.float64], wavelengths: ArrayLike) -> NDArray[np.float64]:
@@ -276,7 +277,7 @@ def corners(furnace: Furnace, layout: Layout) -> tuple[NDArray[np.float64], tupl
 
 
 def _line_corners(furnace: Furnace, layout: Layout) -> tuple[NDArray[np.float64], tuple[float, float]]:
-    """As `corners`, of a line grating."""
+    """Compute `corners` of a line grating."""
     last = layout.frequencies[1]
     nodes = [layout.nodes(square) for square in range(layout.squares)]
     lattice = np.concatenate(nodes)
@@ -312,7 +313,7 @@ def _line_corners(furnace: Furnace, layout: Layout) -> tuple[NDArray[np.float64]
 
 
 def _general_corners(furnace: Furnace, layout: Layout) -> tuple[NDArray[np.float64], tuple[float, float]]:
-    """As `corners`, of orders in two dimensions and of samples: lowered at random places in the cells."""
+    """Compute `corners` of orders in two dimensions and of samples: lowered at random places in the cells."""
     side, (first, last) = layout.first, layout.frequencies
     cells = np.indices((layout.slices - 1, side, side)).reshape(3, -1).T
 
@@ -321,7 +322,7 @@ def _general_corners(furnace: Furnace, layout: Layout) -> tuple[NDArray[np.float
         return np.copysign(1 - np.maximum(_fraction(1 - np.abs(place)), HORIZON), place)
 
     def bound(places: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """1/max(1, a) at places (slice, row, column), (n, 3), and whether there is light there."""
+        """Return 1/max(1, a) at places (slice, row, column), (n, 3), and whether there is light there."""
         y = latitude(places[:, 0])
         u, v = (np.maximum(_fraction(p / side), LEAST) for p in (places[:, 2], places[:, 1]))
         c, nu = (1 - y**2) / (1 + y**2), (u + v) / (2 * layout.period)
