@@ -186,7 +186,7 @@ def scattered(of, tables, wi, side, wavelength, rng, points, sheet=False):
 SEEDS = range(6000, 6200)
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(1)
 @pytest.mark.filterwarnings("ignore::UserWarning")
 @pytest.mark.parametrize("seed", SEEDS)
 def test_no_interface_and_no_sheet_sends_out_more_than_came(seed):
