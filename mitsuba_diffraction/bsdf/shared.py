@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import weakref
+from collections.abc import Sequence
 
 import drjit as dr
 import mitsuba as mi
@@ -39,7 +40,7 @@ class SharedTables:
         else:
             represented = OrderSpectrum if isinstance(spectrum.grid, OrderGrid) else SplineSpectrum
             self.scattering = represented(spectrum, *([] if eta is None else passing(eta)))
-        self._spectrum = spectrum
+        self._spectrum, self._eta = spectrum, eta
         self._last: tuple[float, Energy | None] | None = None
         self._lock = threading.Lock()
 
@@ -64,24 +65,31 @@ class SharedTables:
         Where a gradient is tracked through `height_scale`, the entries of the table carry theirs, from a central
         difference.
         """
-        scale = float(np.max(height_scale))
+        scale, index = float(np.max(height_scale)), self._eta or 1.0
         if dr.grad_enabled(height_scale):
-            table, lower, upper = self.energy_table(scale), max(scale - STEP, 0.0), scale + STEP
-            above, below = (self.corners(table, s) for s in (upper, lower))
-            return Energy(table, (above - below) / (upper - lower), height_scale - dr.detach(height_scale))
+            tables, lower, upper = self.energy_tables(scale), max(scale - STEP, 0.0), scale + STEP
+            above, below = (self.corners(tables, s) for s in (upper, lower))
+            slopes = (above - below) / (upper - lower)
+            return Energy(tables, slopes, height_scale - dr.detach(height_scale), index)
         with self._lock:
             if self._last is None or self._last[0] != scale:
-                table = self.energy_table(scale)
-                self._last = scale, Energy(table) if table.needed else None
+                tables = self.energy_tables(scale)
+                needed = any(table.needed for table in tables)
+                self._last = scale, Energy(tables, index=index) if needed else None
             return self._last[1]
 
-    def energy_table(self, height_scale: float) -> EnergyTable:
-        """The spectrum's own, or made for other heights."""
-        return self._spectrum.energy_table() if height_scale == 1 else EnergyTable.of(self._spectrum, height_scale)
+    def energy_tables(self, height_scale: float) -> list[EnergyTable]:
+        """Return the spectrum's own, or those made for other heights, or for both sides where light passes."""
+        if self._eta is not None:
+            return EnergyTable.of_interface(self._spectrum, self._eta, height_scale)
+        own = height_scale == 1
+        return [self._spectrum.energy_table() if own else EnergyTable.of(self._spectrum, height_scale)]
 
-    def corners(self, table: EnergyTable, height_scale: float) -> np.ndarray:
-        """e at the corners of the cells of `table`, not rounded, for other heights."""
-        return corners(Furnace.of(self._spectrum, height_scale), table.layout)[0]
+    def corners(self, tables: Sequence[EnergyTable], height_scale: float) -> np.ndarray:
+        """Return e at the corners of the cells of `tables`, not rounded, for other heights."""
+        sides = ((1, tables[0]),) if self._eta is None else ((1, tables[0]), (-1, tables[-1]))
+        furnaces = [(Furnace.of(self._spectrum, height_scale, self._eta, side), table) for side, table in sides]
+        return np.concatenate([corners(furnace, table.layout)[0] for furnace, table in furnaces])
 
 
 def passing(eta: float) -> tuple[float, float]:

@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..energy.furnace import least_kappa
 from ..errors import RequestError, is_number
 from ..geometry import SHADOWING
 from ..grating_spectrum import GratingSpectrum
@@ -109,14 +110,11 @@ class ScalarTheory:
                 f"{shortest:.4g} nm divided by the scale"
             )
         dr.make_opaque(self.height_scale)
-        conserves = self.conserve_energy and self.shadowing and self.media.eta is None
+        conserves = self.conserve_energy and self.shadowing
         self.energy = self.tables.energy(self.height_scale) if conserves else None
         self.interface = None
         if self.media.eta is not None:
-            # A quarter of the first interval of κ, where the table's error weighs as little as that of the line; of the
-            # undiffracted order, κ is larger at all wavelengths.
-            undiffracted = 1.6e3 * np.pi * abs(self.media.eta - 1) / VISIBLE[1] * self.media.outside * scale
-            least = opaque(min(self.spectrum.table.first_interval / 4, max(undiffracted, 1e-6)))
+            least = opaque(least_kappa(self.spectrum, self.media.eta, scale))
             self.interface = Interface(self.material.eta, self.media.transmission == "sheet", least)
 
     def parameters_changed(self, keys: list[str]) -> None:
@@ -134,8 +132,8 @@ class ScalarTheory:
     ) -> mi.UnpolarizedSpectrum:
         """Return `value` times R E."""
         if self.energy is not None:
-            inside = mi.UnpolarizedSpectrum(si.wavelengths) * (1e-3 / self.media.outside / geometry.index)
-            value *= self.energy.factor(*geometry.inside(), inside)
+            wavelengths = mi.UnpolarizedSpectrum(si.wavelengths) * (1e-3 / self.media.outside / geometry.index)
+            value *= self.energy.factor(*geometry.inside(), wavelengths)
         reflected = self.material(si, geometry.cos_half(), active)
         if self.media.eta is not None:
             reflected = dr.select(geometry.reflects, reflected, 1 - reflected)
