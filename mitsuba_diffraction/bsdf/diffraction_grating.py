@@ -49,9 +49,9 @@ PARAMETERS = (
     Parameter(
         "transmission",
         "string",
-        "what becomes of light that enters a dielectric: none, it is absorbed or reaches the base; interface, it "
-        "enters the medium of int_ior, as in `roughdielectric`; sheet, it passes a film with one flat face, below, and "
-        "ext_ior on both sides",
+        "light that enters a dielectric: none, it is absorbed or reaches the base; interface, it enters the medium of "
+        "int_ior, as in `roughdielectric`; sheet, it passes a film with one flat face, below, and ext_ior on both "
+        "sides",
         "none",
     ),
     Parameter(
@@ -80,11 +80,14 @@ below one without it. Without shadowing K diverges as 1/cos θ near the horizon,
 
 Of rigorous theory the BRDF is Σ_m η_m N(q − m/T; σ_q² I)/λ², as in `rigorous_orders.py`: R, K, G and E are in η_m.
 
+With a transmission (`transmission.py`), light passes the grating from either side: q and κ as above with the indices of
+both media, 1 − R for R, and the K and G of `geometry.transmitted`. From below, a sheet's flat face is a mirror.
+
 Under a coat (`coat.py`) all this holds inside of it, where wavelengths are shorter and directions steeper; the front
 face of the coat is a mirror. A saved spectrum must cover the shorter wavelengths; one built from a recipe or a profile
 does.
 
-In polarised variants scalar theory reflects s and p light as a plane perpendicular to the half vector does; rigorous
+In polarised variants scalar theory splits s and p light as a plane perpendicular to the half vector does; rigorous
 theory uses the Mueller matrices of the orders. A perfect mirror and Schlick's formula depolarise.
 """
 
