@@ -14,6 +14,7 @@ from .registration import register as _register
 
 if TYPE_CHECKING:  # type checkers do not see what is imported on first use
     from . import reference, rigorous
+    from .efficiency import efficiencies
     from .recipe import Recipe
     from .spectrum.build import precompute
     from .spectrum.grating_spectrum import GratingSpectrum
@@ -25,6 +26,7 @@ _HOME = {
     "GratingSpectrum": "spectrum.grating_spectrum",
     "HeightField": "surface.heightfield",
     "Recipe": "recipe",
+    "efficiencies": "efficiency",
     "precompute": "spectrum.build",
     "read_height_field": "surface.readers",
 }
@@ -34,6 +36,7 @@ __all__ = [
     "GratingSpectrum",
     "HeightField",
     "Recipe",
+    "efficiencies",
     "gratings",
     "precompute",
     "read_height_field",

@@ -39,7 +39,7 @@ Overwrite = Annotated[bool, typer.Option("--overwrite", help="replace existing f
 Variant = Annotated[str | None, typer.Option(help="Mitsuba variant; default: the fastest spectral one")]
 # Options that affect where and how files are written, but not their content.
 _NOT_OF_THE_REQUEST = frozenset(
-    {"output", "json", "plot", "markdown", "figures", "overwrite", "resume", "checkpoint", "dask"}
+    {"output", "json", "csv", "plot", "markdown", "figures", "overwrite", "resume", "checkpoint", "dask"}
 )
 
 
@@ -80,6 +80,28 @@ def check_suffix(option: str, path: Path, *suffixes: str) -> None:
     if path.suffix.lower() not in suffixes:
         wanted = " or ".join(filter(None, [", ".join(suffixes[:-1]), suffixes[-1]]))
         raise RequestError(f"{option}: got {path}, wanted a file name that ends in {wanted}")
+
+
+def surface_of(text: str) -> tuple[str, dict[str, int | float | str]]:
+    """Return the parts of RECIPE|PROFILE[,name=value…]; numbers are read as such.
+
+    Raises:
+        ValueError: if it is not of this form, or a name is given twice.
+    """
+    source, *items = text.split(",")
+    values: dict[str, int | float | str] = {}
+    for name, equals, value in (item.strip().partition("=") for item in items):
+        if not (name and equals and value) or name in values:
+            raise RequestError(f"{text}: got {name + equals + value!r}, wanted name=value, each name once")
+        values[name] = next((number for kind in (int, float) if (number := _read(kind, value)) is not None), value)
+    return source, values
+
+
+def _read(kind: type[int] | type[float], text: str) -> int | float | None:
+    try:
+        return kind(text)
+    except ValueError:
+        return None
 
 
 def _refuse_other_than_utf8(text: str) -> None:
