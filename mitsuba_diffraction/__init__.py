@@ -14,6 +14,7 @@ from .registration import register as _register
 
 if TYPE_CHECKING:  # type checkers do not see what is imported on first use
     from . import reference, rigorous
+    from .efficiency import efficiencies
     from .grating_spectrum import GratingSpectrum
     from .precomputation import precompute
     from .recipe import Recipe
@@ -25,6 +26,7 @@ _HOME = {
     "GratingSpectrum": "grating_spectrum",
     "HeightField": "surface.heightfield",
     "Recipe": "recipe",
+    "efficiencies": "efficiency",
     "precompute": "precomputation",
     "read_height_field": "surface.readers",
 }
@@ -34,6 +36,7 @@ __all__ = [
     "GratingSpectrum",
     "HeightField",
     "Recipe",
+    "efficiencies",
     "gratings",
     "precompute",
     "read_height_field",

@@ -16,16 +16,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.polynomial import chebyshev
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import RegularGridInterpolator
 from scipy.special import jv
 
 from .errors import RequestError
 from .geometry import k_g
+from .reference import amplitudes
 from .rigorous.axes import LARGEST_PERIOD
 from .rigorous.curve import curve_of, is_profile
 from .rigorous.efficiencies import converge
 from .settings import VISIBLE
+from .spectrum.orders import OrderGrid
 from .surface.heightfield import HeightField
 from .surface.periods import height_spectrum
 
@@ -87,12 +90,38 @@ def profile_powers(height_field: HeightField) -> OrderPowers:
     return powers
 
 
+def tile_powers(height_field: HeightField, shortest: float) -> OrderPowers:
+    """Compute η_m of a tile, for pairs of m = (m_x, m_y), (…, 2), and κ up to 4π/`shortest`, a wavelength in µm.
+
+    F_m(κ) is interpolated by Chebyshev polynomials in κ, exactly in float64: e^{iκh} varies no faster than e^{iκH}, and
+    the coefficients beyond the order κH/2 fall faster than exponentially.
+    """
+    largest = 4 * np.pi / shortest
+    degree = int(np.ceil(largest * height_field.half_range / 2)) + 25
+    grid = OrderGrid.reachable(height_field.tile_size, height_field.shape[::-1], 2 / shortest)
+    m_x, m_y = (axis.ravel() for axis in np.meshgrid(*grid.axes()))
+    coefficients = chebyshev.chebinterpolate(
+        lambda x: [amplitudes(height_field, kappa)[m_y, m_x] for kappa in largest / 2 * (x + 1)], degree
+    )
+
+    def powers(m: NDArray[np.int64], kappa: Array) -> Array:
+        inside = (np.abs(m) <= grid.largest).all(axis=-1)
+        columns, rows = np.moveaxis(np.where(inside[..., None], m + grid.largest, 0), -1, 0)
+        waves = chebyshev.chebvander(2 * kappa / largest - 1, degree)
+        amplitude = (waves * np.moveaxis(coefficients[:, rows * grid.shape[1] + columns], 0, -1)).sum(axis=-1)
+        # Those of the Nyquist frequency have no sign.
+        inside &= (2 * np.abs(m) < height_field.shape[::-1]).all(axis=-1)
+        return np.where(inside, np.abs(amplitude) ** 2, 0.0)
+
+    return powers
+
+
 @dataclass(frozen=True)
 class Orders:
     """Efficiencies of the propagating orders of a grating.
 
     Attributes:
-        m: the orders, (n,).
+        m: the orders, (n,), of a tile (n, 2).
         s, p: fraction of the incident power in each, polarised perpendicular and parallel to the plane of incidence,
             (n,).
     """
@@ -108,7 +137,12 @@ class Orders:
 
 
 def scalar_orders(
-    powers: OrderPowers, period: float, wavelength: float, angle: float, index: complex, turn: float = 0.0
+    powers: OrderPowers,
+    period: float | tuple[float, float],
+    wavelength: float,
+    angle: float,
+    index: complex,
+    turn: float = 0.0,
 ) -> Orders:
     """Compute R K G E η_m(κ_m), the efficiencies of the BSDF in float64 in the limit of narrow lobes.
 
@@ -116,49 +150,49 @@ def scalar_orders(
     these factors at the direction of the order.
 
     Args:
-        powers: of the profile.
-        period: µm.
+        powers: of the profile or tile.
+        period: µm, of a profile; of a tile along x and y.
         wavelength: µm.
         angle: of incidence, degrees; the light comes from −x.
-        index: n + ik of the material.
+        index: n + ik of the material; ∞ of a perfect mirror.
         turn: of the plane of incidence, degrees; 0: it is perpendicular to the grooves, 90: parallel (conical).
     """
-    pitch = wavelength / period
-    sine = -np.sin(np.deg2rad(angle))
-    along, across = sine * np.cos(np.deg2rad(turn)), sine * np.sin(np.deg2rad(turn))
-    m, sines, factor, cos_half = _mirror_orders(powers, pitch, wavelength, np.array([along]), across)
+    pitch = wavelength / np.atleast_1d(period)
+    turn, angle = np.deg2rad((turn, angle))
+    light = -np.sin(angle) * np.array([[np.cos(turn), np.sin(turn)]])
+    m, leaving, factor, cos_half = _mirror_orders(powers, pitch, wavelength, light)
     kept = factor[0] > -1
-    m, sines, factor, cos_half = m[kept], sines[0, kept], factor[0, kept], cos_half[0, kept]
-    albedo = np.maximum(factor.sum(), _albedo(powers, pitch, wavelength, sines, across))
-    reflected = factor / np.maximum(1, albedo)
-    s, p = fresnel(cos_half, index)
-    return Orders(m, s * reflected, p * reflected)
+    leaving, factor, cos_half = leaving[0, kept], factor[0, kept], cos_half[0, kept]
+    # One direction at a time, since a tile has hundreds.
+    albedo = [np.maximum(_mirror_orders(powers, pitch, wavelength, one[None])[2], 0).sum() for one in leaving]
+    reflected = factor / np.maximum(1, np.maximum(factor.sum(), albedo))
+    s, p = (1.0, 1.0) if np.isinf(index) else fresnel(cos_half, index)
+    return Orders(m[kept], s * reflected, p * reflected)
 
 
 def _mirror_orders(
-    powers: OrderPowers, pitch: float, wavelength: float, sines: Array, across: float
+    powers: OrderPowers, pitch: Array, wavelength: float, light: Array
 ) -> tuple[NDArray[np.int64], Array, Array, Array]:
-    """Return the specular orders for ω_i,x (d,) and one ω_i,y = −ω_o,y.
+    """Return the specular orders for tangential parts of ω_i, (d, 2); pitch is λ/T, (1,) of a profile, (2,) of a tile.
 
-    m (n,), and (d, n) each ω_o,x, K G η_m for R = 1 (−1 where evanescent), and ω_i·h.
+    m, (n,) or (n, 2), and for each pair of light and order the tangential part of ω_o, (d, n, 2), K G η_m for R = 1 (−1
+    where evanescent), and ω_i·h, (d, n).
     """
-    m = np.arange(-int(2 / pitch) - 1, int(2 / pitch) + 2)
-    sine_i = sines[:, None]
-    sine_o = -m * pitch - sine_i
-    most = 1 - across**2
-    there = sine_o**2 < most
-    cos_i = np.sqrt(most - sine_i**2)
-    cos_o = np.sqrt(np.where(there, most - sine_o**2, 1))
-    cos_between = sine_i * np.where(there, sine_o, 0) - across**2 + cos_i * cos_o
-    kappa = 2 * np.pi * (cos_i + cos_o) / wavelength
-    factor = np.where(there, k_g(cos_i, cos_o, 1 + cos_between) * powers(m, kappa), -1)
-    return m, sine_o, factor, np.sqrt((1 + cos_between) / 2)
-
-
-def _albedo(powers: OrderPowers, pitch: float, wavelength: float, sines: Array, across: float) -> Array:
-    """Compute a(ω) of a perfect mirror for light from ω_x, (d,), and ω_y."""
-    factor = _mirror_orders(powers, pitch, wavelength, sines, across)[2]
-    return np.maximum(factor, 0).sum(axis=1)
+    m = np.stack(np.meshgrid(*(np.arange(-int(2 / p) - 1, int(2 / p) + 2) for p in pitch), indexing="ij"), axis=-1)
+    m = m.reshape(-1, len(pitch))
+    steps = np.zeros((len(m), 2))
+    steps[:, : len(pitch)] = m * pitch
+    leaving = -steps - light[:, None]
+    square_i, square_o = (light**2).sum(axis=-1)[:, None], (leaving**2).sum(axis=-1)
+    there = square_o < 1
+    cos_i, cos_o = np.broadcast_arrays(np.sqrt(1 - square_i), np.sqrt(np.where(there, 1 - square_o, 1)))
+    w = cos_i + cos_o
+    d = ((steps**2).sum(axis=-1) + w**2) / 2  # 1 + ω_i·ω_o
+    of_pairs = np.broadcast_to(m, (*there.shape, len(pitch)))[there]
+    m, of_pairs = (m, of_pairs) if len(pitch) == 2 else (m[:, 0], of_pairs[:, 0])
+    factor = np.full(there.shape, -1.0)
+    factor[there] = k_g(cos_i[there], cos_o[there], d[there]) * powers(of_pairs, 2 * np.pi * w[there] / wavelength)
+    return m, leaving, factor, np.sqrt(d / 2)
 
 
 @functools.cache

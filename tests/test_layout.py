@@ -24,7 +24,7 @@ ROOMS = {
     "spectrum": "spectrum",
     "energy": "energy",
     "rigorous": "rigorous",
-    "theory": "reference scalar_theory",
+    "theory": "efficiency reference scalar_theory",
     "precompute": "grating_spectrum precomputation recipe",
     "bsdf": "bsdf",
     "render": "integrator render testing",

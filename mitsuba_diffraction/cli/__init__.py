@@ -20,6 +20,8 @@ from typer.core import TyperCommand
 
 from ..errors import Bug, RequestError, is_bug
 from .console import NAME, Log, Stopped, say, tell
+from .efficiency import efficiency
+from .examples import examples
 from .inspect import inspect
 from .precompute import precompute
 from .render import render
@@ -43,7 +45,7 @@ app = typer.Typer(add_completion=False, no_args_is_help=False, help="Diffraction
 # What judges the product is looked up by name: nothing depends on it.
 _JUDGES = ("compare", "convergence", "validate", "benchmark")
 _judges = (getattr(importlib.import_module(f"..evaluation.commands.{n}", __name__), n) for n in _JUDGES)
-for _command in (inspect, precompute, render, *_judges):
+for _command in (inspect, precompute, render, efficiency, examples, *_judges):
     app.command(cls=_Command)(_command)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -11,6 +12,8 @@ import typer
 
 from .. import outputs
 from ..errors import RequestError
+
+Value = bool | int | float | str
 
 
 def scene_parameters(define: Sequence[str] | None) -> dict[str, str]:
@@ -39,7 +42,7 @@ Overwrite = Annotated[bool, typer.Option("--overwrite", help="replace existing f
 Variant = Annotated[str | None, typer.Option(help="Mitsuba variant; default: the fastest spectral one")]
 # Options that affect where and how files are written, but not their content.
 _NOT_OF_THE_REQUEST = frozenset(
-    {"output", "json", "plot", "markdown", "figures", "overwrite", "resume", "checkpoint", "dask"}
+    {"output", "json", "csv", "plot", "markdown", "figures", "overwrite", "resume", "checkpoint", "dask"}
 )
 
 
@@ -68,6 +71,51 @@ def check_suffix(option: str, path: Path, *suffixes: str) -> None:
     if path.suffix.lower() not in suffixes:
         wanted = " or ".join(filter(None, [", ".join(suffixes[:-1]), suffixes[-1]]))
         raise RequestError(f"{option}: got {path}, wanted a file name that ends in {wanted}")
+
+
+def surface_of(text: str) -> tuple[str, dict[str, Value]]:
+    """Return the parts of RECIPE|PROFILE[,name=value…]; numbers, true and false are read as such.
+
+    Raises:
+        ValueError: if it is not of this form, or a name is given twice.
+    """
+    source, *items = text.split(",")
+    values: dict[str, Value] = {}
+    for name, equals, value in (item.strip().partition("=") for item in items):
+        if not (name and equals and value) or name in values:
+            raise RequestError(f"{text}: got {name + equals + value!r}, wanted name=value, each name once")
+        values[name] = _read(value)
+    return source, values
+
+
+def _read(text: str) -> Value:
+    for kind in (int, float):
+        with suppress(ValueError):
+            return kind(text)
+    return {"true": True, "false": False}.get(text, text)
+
+
+def materials_of(texts: Sequence[str] | None) -> dict[str, dict[str, Value]]:
+    """Return the parameters of the gratings that take the place of BSDFs, from the options --material ID=….
+
+    Raises:
+        ValueError: if one is not of the form ID=RECIPE|PROFILE[,name=value…], or an id is given twice.
+        FileNotFoundError: if there is no such recipe.
+    """
+    materials: dict[str, dict[str, Value]] = {}
+    for text in texts or []:
+        name, equals, rest = text.partition("=")
+        source, values = surface_of(rest)
+        if not (name and equals and source):
+            raise RequestError(f"--material: got {text!r}, wanted ID=RECIPE|PROFILE[,name=value…]")
+        if name in materials:
+            raise RequestError(f"--material {name}: got it twice, wanted one grating")
+        is_file = Path(source).suffix.lower() in (".toml", ".exr")
+        if is_file and not os.path.isfile(source):
+            raise FileNotFoundError(f"{source}: no such file")
+        # The scene has a folder of its own, to which its file names are relative.
+        materials[name] = {**({"filename": os.path.abspath(source)} if is_file else {"profile": source}), **values}
+    return materials
 
 
 def _refuse_other_than_utf8(text: str) -> None:

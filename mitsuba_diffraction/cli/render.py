@@ -10,7 +10,7 @@ import typer
 
 from ..errors import RequestError
 from ..outputs import free_name
-from .arguments import Define, Overwrite, Variant, check_suffix, claim, scene_parameters
+from .arguments import Define, Overwrite, Variant, check_suffix, claim, materials_of, scene_parameters
 from .console import Stopped, progress_bar, tell
 
 
@@ -30,6 +30,13 @@ def render(
     variant: Variant = None,
     seed: Annotated[int, typer.Option(min=0)] = 0,
     define: Define = None,
+    material: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="ID=RECIPE|PROFILE[,name=value…]",
+            help="put a grating in the place of the BSDF of that id; name=value: its parameters",
+        ),
+    ] = None,
     until_error: Annotated[
         float | None, typer.Option(metavar="ERROR", help="stop at this relative standard error of luminance, e.g. 0.01")
     ] = None,
@@ -66,7 +73,8 @@ def render(
     if (frames is not None) != orbit:
         raise RequestError("--frames N and --orbit go together")
     parameters = scene_parameters(define)
-    reads = files_of_scene(scene, parameters)
+    materials = materials_of(material)
+    reads = files_of_scene(scene, parameters, materials)
 
     def pictures(target: Path) -> list[Path]:
         return [target] if frames is None else [frame_path(target, frame, frames) for frame in range(frames)]
@@ -91,9 +99,9 @@ def render(
         from ..render.cluster import trace_on
 
         tracer = trace_on(dask)
-    motions = [None] if frames is None else motions_of_orbit(scene, frames, parameters)
+    motions = [None] if frames is None else motions_of_orbit(scene, frames, parameters, materials)
 
-    where = {"width": width, "height": height, "parameters": parameters}
+    where = {"width": width, "height": height, "parameters": parameters, "materials": materials}
     exposure = None
     for number, (path, motion) in enumerate(zip(targets, motions, strict=True)):
         start = time.perf_counter()

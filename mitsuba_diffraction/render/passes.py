@@ -30,7 +30,7 @@ from ..color import spectrum_to_XYZ
 from ..errors import RequestError
 from ..files import UNSEALED, is_intact, seal, whole_file
 from .film import pass_seed, samples_drawn, trace_pass
-from .scene import channel_wavelengths, load_spectral_scene, scene_digest
+from .scene import Materials, channel_wavelengths, load_spectral_scene, scene_digest
 from .spectral_image import SpectralImage
 
 
@@ -183,7 +183,7 @@ class Job:
 
     Attributes:
         scene: absolute path of the XML file.
-        width, height, parameters, motion: see `load_spectral_scene`.
+        width, height, parameters, materials, motion: see `load_spectral_scene`.
         variant: Mitsuba variant.
         seed: random seed.
         samples: samples per pixel of each pass.
@@ -196,6 +196,7 @@ class Job:
     width: int | None
     height: int | None
     parameters: tuple[tuple[str, str], ...]
+    materials: tuple[tuple[str, tuple[tuple[str, bool | float | str], ...]], ...]
     motion: tuple[float, ...] | None
     variant: str
     seed: int
@@ -211,8 +212,9 @@ class Job:
 
     def load(self) -> mi.Scene:
         """Load the scene; errors as of `load_spectral_scene`."""
+        where = {"width": self.width, "height": self.height, "motion": self.motion}
         return load_spectral_scene(
-            self.scene, width=self.width, height=self.height, parameters=dict(self.parameters), motion=self.motion
+            self.scene, **where, parameters=dict(self.parameters), materials=dict(self.materials)
         )
 
 
@@ -251,6 +253,7 @@ def render(
     height: int | None = None,
     seed: int = 0,
     parameters: Mapping[str, str] | None = None,
+    materials: Materials | None = None,
     motion: tuple[float, ...] | None = None,
     until_error: float | None = None,
     checkpoint: str | os.PathLike[str] | None = None,
@@ -272,6 +275,7 @@ def render(
         height: likewise.
         seed: random seed, not negative.
         parameters: values for the scene's `$name` parameters.
+        materials: gratings in the place of BSDFs, see `load_spectral_scene`.
         motion: of the camera, see `load_spectral_scene`.
         until_error: stop when the relative error of the picture (`Accumulation.error`) is at most this; spp is then the
             maximum.
@@ -301,20 +305,21 @@ def render(
         raise RequestError(f"seed: got {seed}, wanted an integer that is not negative")
     if until_error is not None and not 0 < until_error < 1:
         raise RequestError(f"until_error: got {until_error}, wanted a relative error between 0 and 1, such as 0.01")
-    where = {"width": width, "height": height, "parameters": dict(parameters or {}), "motion": motion}
-    scene = load_spectral_scene(scene_path, **where)
+    content = {"parameters": dict(parameters or {}), "materials": dict(materials or {})}
+    scene = load_spectral_scene(scene_path, width=width, height=height, **content, motion=motion)
     columns, rows = (int(size) for size in scene.sensors()[0].film().crop_size())
     job = Job(
         scene=str(Path(scene_path).resolve()),
         width=width,
         height=height,
-        parameters=tuple(sorted(where["parameters"].items())),
+        parameters=tuple(sorted(content["parameters"].items())),
+        materials=tuple(sorted((name, tuple(values.items())) for name, values in content["materials"].items())),
         motion=motion,
         variant=mi.variant(),
         seed=seed,
         samples=split(scene, spp, 1 if until_error is None else _LEAST_PASSES_TO_CONVERGE),
         until_error=until_error,
-        content=scene_digest(scene_path, parameters),
+        content=scene_digest(scene_path, **content),
         versions=versions(),
     )
     if finished is not None and finished.attributes.get("digest") == job.digest():

@@ -35,6 +35,9 @@ _STEP = 5.0
 _DENSITY_STEP = 0.25
 _DRAWS_PER_LIGHT = 2**14  # of four wavelengths, to learn its spectrum
 
+Materials = Mapping[str, Mapping[str, bool | float | str]]
+"""Id of a BSDF → parameters of the grating that takes its place."""
+
 _RAYS_FROM_BELOW = 4096  # to find out whether gratings are seen and lit from above
 _MOST_PIXELS = 2**25  # above 7680 × 4320; sums take 750 bytes per pixel
 _DEFAULT_SIZE = (768, 576)  # that of Mitsuba's films
@@ -62,6 +65,7 @@ def load_spectral_scene(
     width: int | None = None,
     height: int | None = None,
     parameters: Mapping[str, str] | None = None,
+    materials: Materials | None = None,
     motion: tuple[float, ...] | None = None,
 ) -> mi.Scene:
     """Load an XML scene in the current variant and replace its film by a spectral one.
@@ -76,6 +80,8 @@ def load_spectral_scene(
             the aspect ratio is preserved.
         height: likewise.
         parameters: values for the scene's `$name` parameters (`-Dname=value` of Mitsuba's command line).
+        materials: id of a BSDF → parameters of the `diffraction_grating` that takes its place. A `twosided` stays, and
+            what is in it is replaced, unless the grating transmits light.
         motion: of the first sensor: an affine map of world space, 16 numbers in row-major order, applied after its
             `to_world`.
 
@@ -84,8 +90,8 @@ def load_spectral_scene(
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if no spectral variant is set, a size is not positive, a parameter is unknown to the scene, or the
-            scene is wrong.
+        ValueError: if no spectral variant is set, a size is not positive, a parameter is unknown to the scene, no BSDF
+            has one of the ids, or the scene is wrong.
     """
     variant = mi.variant()
     if variant is None or not is_spectral(variant):
@@ -93,8 +99,9 @@ def load_spectral_scene(
     for name, size in (("width", width), ("height", height)):
         if size is not None and size < 1:
             raise RequestError(f"{name}: got {size}, wanted a positive number of pixels")
-    with _parsed(path, parameters) as (config, state):
+    with _parsed(path, parameters, materials) as (config, state):
         _replace_films(state, width, height)
+        _take_radiance_alone(state)
         if motion is not None:
             _move_first_sensor(state, motion)
         mi.parser.transform_all(config, state)
@@ -108,6 +115,7 @@ def load_spectral_scene(
     if scene.integrator().aov_names():
         raise RequestError(f"{path}: the integrator gives {scene.integrator().aov_names()}, wanted radiance alone")
     _draw_wavelengths_of_lights(scene)
+    _warn_of_missing_uvs(scene)
     _warn_of_light_from_below(scene)
     return scene
 
@@ -138,6 +146,17 @@ def _warn_of_light_from_below(scene: mi.Scene) -> None:
                 shape.id(),
                 side,
             )
+
+
+def _warn_of_missing_uvs(scene: mi.Scene) -> None:
+    """Log a line if gratings lie on meshes without texture coordinates; meshes lose their ids when they are merged."""
+    bsdfs = [shape.bsdf() for shape in scene.shapes() if shape.is_mesh() and not shape.has_vertex_texcoords()]
+    if names := sorted({bsdf.id() or "a BSDF" for bsdf in bsdfs if "DiffractionGrating[" in str(bsdf)}):
+        _log.warning(
+            "%s: on a mesh without UVs, where the grating changes its direction from triangle to triangle; "
+            "wanted a mesh with UVs",
+            ", ".join(names),
+        )
 
 
 def _draw_wavelengths_of_lights(scene: mi.Scene) -> None:
@@ -210,7 +229,9 @@ def emitters_of(path: str | os.PathLike[str], parameters: Mapping[str, str] | No
         return {node.props.plugin_name() for node in state.nodes if node.type == mi.ObjectType.Emitter}
 
 
-def scene_digest(path: str | os.PathLike[str], parameters: Mapping[str, str] | None = None) -> str:
+def scene_digest(
+    path: str | os.PathLike[str], parameters: Mapping[str, str] | None = None, materials: Materials | None = None
+) -> str:
     """Return the SHA-256 of a valid scene: its XML after substitution of parameters, and the files it references.
 
     Files enter by content, not by path; a recipe includes the scan it references.
@@ -220,7 +241,7 @@ def scene_digest(path: str | os.PathLike[str], parameters: Mapping[str, str] | N
         ValueError: if the scene is wrong.
     """
     content = hashlib.sha256(Path(path).read_bytes())
-    with _parsed(path, parameters) as (_, state):
+    with _parsed(path, parameters, materials) as (_, state):
         for node in state.nodes:
             content.update(f"{node.props.plugin_name()}\n".encode())
             for name, value in node.props.items():
@@ -247,7 +268,7 @@ def _in_full(value: object) -> str:
 
 @contextmanager
 def _parsed(
-    path: str | os.PathLike[str], parameters: Mapping[str, str] | None
+    path: str | os.PathLike[str], parameters: Mapping[str, str] | None, materials: Materials | None = None
 ) -> Iterator[tuple[mi.parser.ParserConfig, mi.parser.ParserState]]:
     """Parse a scene; in the block, Mitsuba searches the folder of the scene first.
 
@@ -265,6 +286,7 @@ def _parsed(
     try:
         config = mi.parser.ParserConfig(mi.variant() or "scalar_spectral")
         state = mi.parser.parse_file(config, str(path.resolve()), **(parameters or {}))
+        _replace_materials(state, materials or {})
         _refuse_missing_files(path, state)
         yield config, state
     except Exception as error:
@@ -273,7 +295,28 @@ def _parsed(
         mi.set_file_resolver(resolver)
 
 
-def files_of_scene(path: str | os.PathLike[str], parameters: Mapping[str, str] | None = None) -> list[Path]:
+def _replace_materials(state: mi.parser.ParserState, materials: Materials) -> None:
+    """Put gratings in the place of BSDFs; see `load_spectral_scene`."""
+    bsdfs = {node.props.id(): k for k, node in enumerate(state.nodes) if node.type == mi.ObjectType.BSDF}
+    for name, values in materials.items():
+        if name not in bsdfs:
+            known = ", ".join(sorted(filter(None, bsdfs))) or "none: its BSDFs have no ids"
+            raise RequestError(f"material: got the id {name!r}, the ids of BSDFs in the scene are {known}")
+        grating = mi.Properties("diffraction_grating")
+        for key, value in dict(values).items():
+            grating[key] = value
+        node = state.nodes[bsdfs[name]]
+        if node.props.plugin_name() == "twosided" and grating.get("transmission", "none") == "none":
+            both_sides = mi.Properties("twosided")
+            both_sides["bsdf"] = _add(state, mi.ObjectType.BSDF, grating)
+            grating = both_sides
+        grating.set_id(name)
+        state.nodes[bsdfs[name]].props = grating
+
+
+def files_of_scene(
+    path: str | os.PathLike[str], parameters: Mapping[str, str] | None = None, materials: Materials | None = None
+) -> list[Path]:
     """Return the files that a scene names: itself, what it includes, files of its plugins, scans of its recipes.
 
     Tables of spectra (`<spectrum filename="…"/>`) are not among them: of these the parser keeps the values alone.
@@ -282,7 +325,7 @@ def files_of_scene(path: str | os.PathLike[str], parameters: Mapping[str, str] |
         FileNotFoundError: if there is no such scene, or a mesh or a texture is missing.
         ValueError: if the scene or a recipe is wrong.
     """
-    with _parsed(path, parameters) as (_, state):
+    with _parsed(path, parameters, materials) as (_, state):
         texts = [
             node.props[key]
             for node in state.nodes
@@ -308,6 +351,15 @@ def _refuse_missing_files(path: Path, state: mi.parser.ParserState) -> None:
             text = path.read_text(encoding="utf-8", errors="replace")
             made = re.search(r"made by:\s+(python \S+\.py(?: && python \S+\.py)*)", text)
             raise RequestError(f"{name}: no such file" + (f"; it is made by: {made[1]}" if made else ""))
+
+
+def _take_radiance_alone(state: mi.parser.ParserState) -> None:
+    """Replace integrators that add other quantities to radiance by the one inside of them."""
+    for node in state.nodes:
+        if node.type == mi.ObjectType.Integrator and node.props.plugin_name() in ("aov", "moment"):
+            inner = [state.nodes[child] for child in _children(node.props).values()]
+            if inner := [child for child in inner if child.type == mi.ObjectType.Integrator]:
+                node.props = mi.Properties(inner[0].props)
 
 
 def _move_first_sensor(state: mi.parser.ParserState, motion: tuple[float, ...]) -> None:

@@ -14,14 +14,17 @@ from scipy.spatial.transform import Rotation
 from ..errors import RequestError
 from ..files import whole_file
 from ..outputs import made_for
-from .scene import load_spectral_scene
+from .scene import Materials, load_spectral_scene
 
 _FRAMES_PER_SECOND = 12
 MOST_FRAMES = 3600  # a tenth of a degree apart, five minutes
 
 
 def orbit(
-    scene_path: str | os.PathLike[str], frames: int, parameters: Mapping[str, str] | None = None
+    scene_path: str | os.PathLike[str],
+    frames: int,
+    parameters: Mapping[str, str] | None = None,
+    materials: Materials | None = None,
 ) -> list[tuple[float, ...]]:
     """Return the motions of the first camera for one orbit, counterclockwise as seen from above.
 
@@ -32,6 +35,7 @@ def orbit(
         scene_path: the scene.
         frames: number of frames, at least two.
         parameters: values for the scene's `$name` parameters.
+        materials: see `load_spectral_scene`.
 
     Returns:
         One affine map of world space per frame, for `load_spectral_scene`; the first is the identity.
@@ -42,7 +46,7 @@ def orbit(
     """
     if not 2 <= frames <= MOST_FRAMES:
         raise RequestError(f"frames: got {frames}, wanted 2 to {MOST_FRAMES}")
-    scene = load_spectral_scene(scene_path, width=1, height=1, parameters=parameters)
+    scene = load_spectral_scene(scene_path, width=1, height=1, parameters=parameters, materials=materials)
     centre, up = _view(scene)
     motions = []
     for k in range(frames):

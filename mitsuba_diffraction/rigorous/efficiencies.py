@@ -120,6 +120,20 @@ class Efficiencies:
             return float(np.maximum(reflected - 1, 0).max())
         return float(np.abs(reflected + self.transmitted - 1).max())
 
+    def __str__(self) -> str:
+        """Return a table of all orders."""
+        lines = [f"{'order':>17}{'s':>9}{'p':>9}{'unpolarised':>14}    % of the incident light"]
+        sides = (
+            ("reflected", self.orders, self.amplitudes),
+            ("transmitted", self.transmitted_orders, self.transmitted_amplitudes),
+        )
+        for name, orders, amplitudes in sides:
+            for m, (s, p) in zip(orders, 100 * _powers(amplitudes), strict=True):
+                lines.append(f"{name:<11}{m:>6d}{s:>9.3f}{p:>9.3f}{(s + p) / 2:>14.3f}")
+        return "\n".join([*lines, f"error {self.error:.1e}, {self.harmonics} harmonics"])
+
+    __repr__ = __str__
+
 
 def efficiencies(
     height_field: HeightField,

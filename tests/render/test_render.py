@@ -385,10 +385,14 @@ def test_wrong_requests_are_refused(llvm, tmp_path):
         render(path, spp=1)
 
 
-def test_integrators_with_other_channels_are_refused(llvm, tmp_path):
+def test_of_integrators_with_other_channels_the_radiance_is_taken(llvm, tmp_path):
     path = write_scene(tmp_path, SPHERE + CONSTANT)
-    aov = '<integrator type="aov"><string name="aovs" value="z:depth"/><integrator type="path"/></integrator>'
-    path.write_text(path.read_text().replace('<integrator type="path"/>', aov))
+    plain = '<integrator type="path"/>'
+    aov = f'<integrator type="aov"><string name="aovs" value="z:depth"/>{plain}</integrator>'
+    expected = render(path, spp=1).radiance
+    path.write_text(path.read_text().replace(plain, aov))
+    np.testing.assert_array_equal(render(path, spp=1).radiance, expected)
+    path.write_text(path.read_text().replace(aov, aov.replace(plain, "")))
     with pytest.raises(ValueError, match="wanted radiance alone"):
         render(path, spp=1)
 

@@ -1,0 +1,50 @@
+"""`mitsuba-diffraction examples`: the scenes, recipes and measured skins that the package brings."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ..errors import RequestError
+from ..files import whole_file
+from .arguments import Overwrite
+from .console import tell
+
+_PACKAGE = Path(__file__).parents[1]
+# In a checkout the folders lie beside the package; setup.py copies them into it.
+_SOURCE = next((root for root in (_PACKAGE / "examples", _PACKAGE.parent) if (root / "scenes").is_dir()), None)
+_LEFT = {"models", "out", "__pycache__"}
+"""Folders with what scripts and renderings left in a checkout."""
+
+
+def examples(
+    folder: Annotated[Path, typer.Argument(metavar="[DIR]", help="where to; made if it is not there")] = Path(),
+    overwrite: Overwrite = False,
+) -> None:
+    """Copy the scenes, recipes and measured skins that the package brings."""
+    if _SOURCE is None:
+        raise RuntimeError(f"{_PACKAGE}: the package was installed without its scenes and recipes")
+    contents = {folder / path: (_SOURCE / path).read_bytes() for path in _files(_SOURCE)}
+    new = {target: content for target, content in contents.items() if not _holds(target, content)}
+    for target in new:
+        if target.exists() and not overwrite:
+            raise RequestError(f"{target} exists and is another file; --overwrite replaces it")
+    for target, content in new.items():
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with whole_file(target) as temporary:
+            temporary.write_bytes(content)
+    tell(f"{folder}: {len(contents)} files, described in scenes/README.md and precompute/README.md")
+
+
+def _files(root: Path) -> list[Path]:
+    """Return the files of the examples, relative to `root`."""
+    found = [path.relative_to(root) for name in ("scenes", "precompute") for path in sorted((root / name).rglob("*"))]
+    left = [path for path in found if _LEFT & set(path.parts) or path.name.startswith(".") or path.suffix == ".exr"]
+    return [path for path in found if path not in left and (root / path).is_file()]
+
+
+def _holds(path: Path, content: bytes) -> bool:
+    """Return whether a file is there and has this content."""
+    return path.is_file() and path.read_bytes() == content

@@ -1,0 +1,301 @@
+"""The efficiencies of the orders of a grating over angles and wavelengths, in either theory, as arrays and a plot."""
+
+from __future__ import annotations
+
+import csv
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from . import rigorous
+from .errors import RequestError
+from .files import whole_file
+from .outputs import made_for, metadata
+from .progress import Progress, silent
+from .rigorous import refractive_index
+from .rigorous.curve import is_profile
+from .scalar_theory import profile_powers, scalar_orders, tile_powers
+from .settings import THEORIES
+from .surface.heightfield import HeightField
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Array = NDArray[np.float64]
+
+POLARISATIONS = ("s", "p")
+_MOST_ORDERS = 1000  # scalar theory compares each with all others, for E
+_ROWS, _COLUMNS = 24, 8  # of a table that is printed
+_LINES, _MAPS = 7, 6  # of a plot
+
+
+@dataclass(frozen=True, eq=False)
+class OrderEfficiencies:
+    """The share of the incident light that each order of a grating reflects.
+
+    Attributes:
+        values: (order, angle, wavelength, polarisation), that of s- before that of p-polarised incident light; 0 where
+            an order does not propagate.
+        orders: m, (n,), ascending; of a tile that varies along x and y (m_x, m_y), (n, 2).
+        angles: of incidence, degrees, (a,).
+        wavelengths: nm, in vacuum, (w,).
+        source: what was computed, as text.
+    """
+
+    values: Array
+    orders: NDArray[np.int64]
+    angles: Array
+    wavelengths: Array
+    source: str
+
+    @property
+    def axes(self) -> dict[str, list]:
+        """Return the names of the axes of `values` and the coordinates along them."""
+        return {
+            "order": [int(m) if np.ndim(m) == 0 else tuple(map(int, m)) for m in self.orders],
+            "angle": self.angles.tolist(),
+            "wavelength": self.wavelengths.tolist(),
+            "polarisation": list(POLARISATIONS),
+        }
+
+    @property
+    def unpolarised(self) -> Array:
+        """Return the mean of both polarisations, (order, angle, wavelength)."""
+        return self.values.mean(axis=-1)
+
+    def order(self, *m: int) -> Array:
+        """Return the efficiencies of one order, (angle, wavelength, polarisation).
+
+        Raises:
+            ValueError: if it propagates nowhere, or a tile that varies along x and y is not asked for (m_x, m_y).
+        """
+        orders = self.axes["order"]
+        wanted = m[0] if len(m) == 1 else m
+        if wanted not in orders:
+            raise RequestError(f"order: got {wanted!r}, wanted one from {orders[0]} to {orders[-1]} that propagates")
+        return self.values[orders.index(wanted)]
+
+    def __str__(self) -> str:
+        """Return a table of unpolarised light: a row for each angle and wavelength, a column for each strong order."""
+        kept = np.sort(self._strongest(_COLUMNS))
+        names = [_name(self.axes["order"][index]) for index in kept]
+        width = max(8, *(len(name) + 2 for name in names))
+        rows = [
+            [f"{angle:g}°", f"{wavelength:g} nm", *(f"{100 * e:.3f}" for e in (*of_all[kept], of_all.sum()))]
+            for angle, of_angle in zip(self.angles, np.moveaxis(self.unpolarised, 0, -1), strict=True)
+            for wavelength, of_all in zip(self.wavelengths, of_angle, strict=True)
+        ]
+        lines = ["".join(f"{cell:>{width}}" for cell in row) for row in [["angle", "λ", *names, "sum"], *rows[:_ROWS]]]
+        if len(rows) > _ROWS:
+            lines.append(f"… {len(rows)} rows")
+        if len(self.orders) > _COLUMNS:
+            lines.append(f"the {_COLUMNS} strongest of {len(self.orders)} orders; the sum is of all")
+        return "\n".join([f"{self.source}; unpolarised, % of the incident light", *lines])
+
+    __repr__ = __str__
+
+    def _strongest(self, count: int) -> NDArray[np.int64]:
+        """Return the indices of the orders of the largest efficiencies, the strongest first, (count,) or fewer."""
+        return np.argsort(-self.unpolarised.max(axis=(1, 2)), kind="stable")[:count]
+
+    def save_csv(self, path: str | os.PathLike[str]) -> None:
+        """Write a row for each order, angle and wavelength.
+
+        Raises:
+            FileNotFoundError: if the folder is not there.
+        """
+        request = made_for(path)
+        with whole_file(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as stream:
+            rows = csv.writer(stream)
+            names = ["order"] if self.orders.ndim == 1 else ["order_x", "order_y"]
+            rows.writerow([*names, "angle_deg", "wavelength_nm", *POLARISATIONS, "unpolarised"])
+            for order, a, w in np.ndindex(self.values.shape[:3]):
+                pair = self.values[order, a, w]
+                numbers = self.angles[a], self.wavelengths[w], *pair, pair.mean()
+                rows.writerow([*np.atleast_1d(self.orders[order]), *(f"{number:.9g}" for number in numbers)])
+            if request is not None:
+                stream.write(f"# {request}\n")
+
+    def plot(self, path: str | os.PathLike[str] | None = None) -> Figure:
+        """Plot the strongest orders; lines over the wavelength or the angle, or if both vary, a map for each order.
+
+        Args:
+            path: where to write, if given: PNG, PDF or SVG.
+
+        Returns:
+            The figure.
+        """
+        from matplotlib.figure import Figure
+
+        figure = Figure(figsize=(9, 5.2), dpi=120, layout="constrained")
+        (self._plot_maps if min(len(self.angles), len(self.wavelengths)) > 1 else self._plot_lines)(figure)
+        figure.suptitle(self.source, fontsize=10)
+        if path is not None:
+            with whole_file(path) as temporary:
+                figure.savefig(temporary, metadata=metadata(path))
+        return figure
+
+    def _plot_lines(self, figure: Figure) -> None:
+        over_wavelengths = len(self.angles) == 1
+        x = self.wavelengths if over_wavelengths else self.angles
+        values = self.values[:, 0] if over_wavelengths else self.values[:, :, 0]
+        axes = figure.add_subplot()
+        for number, index in enumerate(self._strongest(_LINES)):
+            own = {"color": f"C{number}", "marker": "." if len(x) < 30 else None}
+            axes.plot(x, values[index].mean(axis=-1), **own, label=f"order {_name(self.axes['order'][index])}")
+            axes.plot(x, values[index, :, 0], "--", color=own["color"], lw=0.8)
+            axes.plot(x, values[index, :, 1], ":", color=own["color"], lw=1)
+        axes.plot(x, values.mean(axis=-1).sum(axis=0), color="0.6", label="all orders")
+        axes.plot([], [], "k--", lw=0.8, label="s-polarised")
+        axes.plot([], [], "k:", lw=1, label="p-polarised")
+        axes.set(xlabel=_WAVELENGTH if over_wavelengths else _ANGLE, ylabel="efficiency", ylim=(0, None))
+        fixed = f"{self.angles[0]:g}° incidence" if over_wavelengths else f"{self.wavelengths[0]:g} nm"
+        axes.set_title(f"{fixed}; solid: unpolarised", fontsize=9)
+        axes.legend(fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5))
+
+    def _plot_maps(self, figure: Figure) -> None:
+        from matplotlib.colors import PowerNorm
+
+        kept = self._strongest(_MAPS)
+        columns = min(3, len(kept))
+        grid = np.ravel(figure.subplots(-(-len(kept) // columns), columns, sharex=True, sharey=True, squeeze=False))
+        scale = PowerNorm(0.5, 0, self.unpolarised[kept].max() or 1.0)  # weak orders can be seen, too
+        for axes, index in zip(grid, kept, strict=False):
+            of_order = self.unpolarised[index]
+            shown = axes.pcolormesh(self.wavelengths, self.angles, of_order, norm=scale, shading="nearest")
+            axes.set_title(f"order {_name(self.axes['order'][index])}", fontsize=9)
+        for axes in grid[len(kept) :]:
+            axes.set_axis_off()
+        figure.supxlabel(_WAVELENGTH, fontsize=10)
+        figure.supylabel(_ANGLE, fontsize=10)
+        figure.colorbar(shown, ax=grid.tolist(), label="efficiency, unpolarised")
+
+
+_WAVELENGTH, _ANGLE = "wavelength (nm)", "angle of incidence (°)"
+
+
+def _name(order: int | tuple[int, int]) -> str:
+    return f"{order:+d}" if isinstance(order, int) and order else str(order).replace(" ", "")
+
+
+def efficiencies(
+    height_field: HeightField,
+    angles: ArrayLike,
+    wavelengths: ArrayLike,
+    *,
+    theory: str = "scalar",
+    material: str | None = None,
+    int_ior: complex | None = None,
+    azimuth: float = 0.0,
+    progress: Progress = silent,
+) -> OrderEfficiencies:
+    """Compute the efficiencies of the reflected orders of a grating in air.
+
+    Light at the angle θ_i comes from −x. An order at θ_m, positive on the side of the light too, has
+
+        sin θ_i + sin θ_m = m λ/T    (azimuth 0).
+
+    In scalar theory the efficiencies are those of the BSDF in the limit of narrow lobes, R K G E η_m(κ_m), in float64
+    without tables (`scalar_theory.scalar_orders`); in rigorous theory they are those of Maxwell's equations
+    (`rigorous.efficiencies`).
+
+    Args:
+        height_field: one period of a surface that repeats; of rigorous theory a profile, h(x).
+        angles: of incidence, degrees, one or (a,), above −90 and below 90.
+        wavelengths: nm, in vacuum, one or (w,).
+        theory: "scalar" or "rigorous".
+        material: a conductor by Mitsuba's name, "Al"; or "none", the perfect mirror R = 1, in scalar theory.
+        int_ior: or an index of refraction, or n + ik; 1.5 if neither is given, as in a scene.
+        azimuth: of the plane of incidence, degrees from the x axis; 90: along the grooves (conical incidence).
+        progress: called with (steps done, steps in all).
+
+    Raises:
+        ValueError: if an argument is out of range; of scalar theory if more than 1000 orders propagate; of rigorous
+            theory as `rigorous.efficiencies`.
+
+    Warns:
+        UserWarning: as `rigorous.efficiencies`.
+    """
+    angles = _numbers("angles", angles, "degrees above −90 and below 90", -90.0, 90.0)
+    wavelengths = _numbers("wavelengths", wavelengths, "nm from 10 to 100000 (100 µm)", 9.999, 100_000.001)
+    if theory not in THEORIES:
+        raise RequestError(f"theory: got {theory!r}, wanted one of {', '.join(THEORIES)}")
+    if not np.isfinite(azimuth):
+        raise RequestError(f"azimuth: got {azimuth!r}, wanted degrees")
+    if material is None and int_ior is None:
+        int_ior = 1.5
+    profile = is_profile(height_field)
+    if profile:
+        height_field = HeightField(height_field.heights[:1], height_field.pixel_size, height_field.source)
+    solve = (_scalar if theory == "scalar" else _rigorous)(height_field, azimuth, wavelengths.min() * 1e-3)
+    found: dict[tuple[int, ...], Array] = {}
+    for step, (a, w) in enumerate(np.ndindex(len(angles), len(wavelengths)), 1):
+        wavelength, index = float(wavelengths[w]) * 1e-3, complex("inf")
+        if theory == "rigorous" or material != "none" or int_ior is not None:
+            index = refractive_index(wavelength, int_ior=int_ior, material=material)
+        for m, *pair in zip(*solve(float(angles[a]), wavelength, index), strict=True):
+            of_order = found.setdefault(tuple(np.atleast_1d(m).tolist()), np.zeros((len(angles), len(wavelengths), 2)))
+            of_order[a, w] = pair
+        progress(step, len(angles) * len(wavelengths))
+    orders = sorted(found)
+    what = material if material is not None else f"n = {int_ior:g}"
+    plane = f", plane of incidence at {azimuth:g}°" if azimuth else ""
+    return OrderEfficiencies(
+        np.stack([found[m] for m in orders]),
+        np.array(orders)[:, 0] if profile else np.array(orders),
+        angles,
+        wavelengths,
+        f"{height_field.source}; {what}, {theory} theory{plane}",
+    )
+
+
+_Solve = Callable[[float, float, complex], tuple[NDArray[np.int64], Array, Array]]
+"""(angle in degrees, wavelength in µm, index) → orders, their efficiencies of s- and of p-polarised light."""
+
+
+def _scalar(height_field: HeightField, azimuth: float, shortest: float) -> _Solve:
+    x, y = height_field.tile_size
+    profile = height_field.shape[0] == 1
+    if (count := 2 * x / shortest if profile else np.pi * x * y / shortest**2) > _MOST_ORDERS:
+        raise RequestError(
+            f"height field: got about {count:.0f} orders of a tile of {x:.4g} × {y:.4g} µm at {1e3 * shortest:g} nm, "
+            f"wanted at most {_MOST_ORDERS}: one period of a grating"
+        )
+    powers = profile_powers(height_field) if profile else tile_powers(height_field, shortest)
+
+    def solve(angle: float, wavelength: float, index: complex) -> tuple[NDArray[np.int64], Array, Array]:
+        found = scalar_orders(powers, x if profile else (x, y), wavelength, angle, index, azimuth)
+        return found.m, found.s, found.p
+
+    return solve
+
+
+def _rigorous(height_field: HeightField, azimuth: float, shortest: float) -> _Solve:
+    def solve(angle: float, wavelength: float, index: complex) -> tuple[NDArray[np.int64], Array, Array]:
+        theta, phi = np.deg2rad((angle, azimuth))
+        direction = -np.sin(theta) * np.cos(phi), -np.sin(theta) * np.sin(phi), np.cos(theta)
+        found = rigorous.efficiencies(height_field, direction, wavelength, int_ior=index)
+        return found.orders, found.s, found.p
+
+    return solve
+
+
+def _numbers(name: str, values: ArrayLike, wanted: str, low: float, high: float) -> Array:
+    """Return one number or several as (n,).
+
+    Raises:
+        ValueError: unless they are above `low` and below `high`.
+    """
+    try:
+        array = np.atleast_1d(np.asarray(values, np.float64))
+    except (TypeError, ValueError):
+        raise RequestError(f"{name}: got {values!r}, wanted {wanted}") from None
+    if array.ndim != 1 or not array.size:
+        raise RequestError(f"{name}: got an array of shape {array.shape}, wanted one number or several")
+    if not (inside := (low < array) & (array < high)).all():
+        raise RequestError(f"{name}: got {array[~inside][0]:g}, wanted {wanted}")
+    return array

@@ -1,0 +1,25 @@
+"""Brings scenes and recipes into the package when it is built; everything else is in pyproject.toml."""
+
+import shutil
+from pathlib import Path
+
+from setuptools import setup
+from setuptools.command.build_py import build_py
+
+
+class BuildWithExamples(build_py):
+    """Copies what the command `examples` gives out; from a checkout, it takes it from there."""
+
+    def run(self) -> None:
+        super().run()
+        if self.editable_mode:
+            return
+        examples = Path(self.build_lib) / "mitsuba_diffraction" / "examples"
+        shutil.rmtree(examples, ignore_errors=True)
+        for folder in ("scenes", "precompute"):
+            # What the scenes' scripts and earlier renderings left.
+            left = shutil.ignore_patterns("models", "out", "__pycache__", ".*", "*.exr")
+            shutil.copytree(folder, examples / folder, ignore=left)
+
+
+setup(cmdclass={"build_py": BuildWithExamples})

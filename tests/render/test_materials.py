@@ -1,0 +1,163 @@
+"""Gratings in the place of BSDFs in scenes that other programs exported."""
+
+import logging
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsuba_diffraction.cli.arguments import materials_of
+from mitsuba_diffraction.render import render
+from mitsuba_diffraction.render.scene import load_spectral_scene, scene_digest
+
+MIRROR = {"profile": "blazed", "period": 2.0, "depth": 0.2, "material": "none", "conserve_energy": False}
+PLAIN = "".join(
+    f'<{kind} name="{name}" value="{value}"/>'
+    for kind, name, value in [
+        *(("string", "profile", "blazed"), ("float", "period", "2"), ("float", "depth", "0.2")),
+        *(("string", "material", "none"), ("boolean", "conserve_energy", "false")),
+    ]
+)
+GRATING = f'<bsdf type="diffraction_grating" name="bsdf">{PLAIN}</bsdf>'
+PRINCIPLED = (
+    '<bsdf type="principled" name="bsdf"><rgb value="0.8 0.2 0.1" name="base_color"/>'
+    '<float name="roughness" value="0.25"/></bsdf>'
+)
+BLEND = (
+    '<bsdf type="blendbsdf"><float name="weight" value="0.5"/><bsdf type="plastic"/>'
+    '<bsdf type="diffuse" id="b"/></bsdf>'
+)
+# As the add-on for Blender writes it.
+EXPORTED = """<scene version="2.1.0">
+    <default name="spp" value="4"/>
+    <integrator type="moment"><integrator type="path">
+        <integer name="max_depth" value="3"/><boolean name="hide_emitters" value="true"/>
+    </integrator></integrator>
+    <sensor type="perspective">
+        <float name="fov" value="40"/>
+        <transform name="to_world"><lookat origin="0, 0, 4" target="0, 0, 0" up="0, 1, 0"/></transform>
+        <sampler type="independent"><integer name="sample_count" value="$spp"/></sampler>
+        <film type="hdrfilm"><integer name="width" value="32"/><integer name="height" value="24"/>
+            <string name="pixel_format" value="rgb"/><rfilter type="box"/></film>
+    </sensor>
+    <bsdf type="twosided" id="mat-Disc" name="mat-Disc">DISC</bsdf>
+    <bsdf type="diffuse" id="mat-Floor" name="mat-Floor"><rgb value="0.5 0.5 0.5" name="reflectance"/></bsdf>
+    <emitter type="constant" id="World" name="World"><rgb value="1 0.9 0.8" name="radiance"/></emitter>
+    <shape type="ply" id="elm__1" name="elm__1">
+        <string name="filename" value="meshes/Disc.ply"/><ref id="mat-Disc" name="bsdf"/>
+    </shape>
+    <shape type="ply" id="elm__2" name="elm__2">
+        <string name="filename" value="meshes/Floor.ply"/><boolean name="face_normals" value="true"/>
+        <ref id="mat-Floor" name="bsdf"/>
+        <transform name="to_world"><translate x="0.5" z="-1"/></transform>
+    </shape>
+</scene>"""
+
+
+@pytest.fixture
+def exported(llvm, tmp_path):
+    """exported(disc, uvs): a scene as exported, with this in the material of its disc."""
+
+    def write(disc=PRINCIPLED, uvs=True):
+        (tmp_path / "meshes").mkdir(exist_ok=True)
+        for name in ("Disc", "Floor"):
+            mesh = mi.Mesh(name, 4, 2, has_vertex_texcoords=uvs)
+            corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float32)
+            written = mi.traverse(mesh)
+            written["vertex_positions"] = corners.ravel()
+            written["faces"] = np.array([0, 1, 2, 0, 2, 3], np.uint32)
+            if uvs:
+                written["vertex_texcoords"] = (corners[:, :2] / 2 + 0.5).ravel()
+            written.update()
+            mesh.write_ply(str(tmp_path / "meshes" / f"{name}.ply"))
+        path = tmp_path / "exported.xml"
+        path.write_text(EXPORTED.replace("DISC", disc))
+        return path
+
+    return write
+
+
+def test_a_replaced_material_renders_as_if_the_scene_had_the_grating(exported):
+    wanted = render(exported(GRATING), spp=2).radiance
+    found = render(path := exported(), spp=2, materials={"mat-Disc": MIRROR}).radiance
+    np.testing.assert_array_equal(found, wanted)
+    before = render(path, spp=2).radiance
+    assert np.abs(found - before).max() > 0.1
+    assert not found[0, 0].any()  # hide_emitters
+    assert not before[0, 0].any()
+
+
+@pytest.mark.parametrize(
+    ("disc", "name", "kept"),
+    [
+        (PRINCIPLED, "mat-Disc", "TwoSided["),
+        (PRINCIPLED.replace("<bsdf ", '<bsdf id="inner" '), "inner", "TwoSided["),
+        (BLEND, "b", "BlendBSDF["),
+    ],
+    ids=["twosided", "in a twosided", "in a blend"],
+)
+def test_a_material_is_replaced_wherever_it_is(exported, disc, name, kept):
+    shapes = load_spectral_scene(exported(disc), materials={name: MIRROR}).shapes()
+    (told,) = [told for told in (str(shape.bsdf()) for shape in shapes) if "DiffractionGrating[" in told]
+    assert kept in told
+
+
+def test_a_transmitting_grating_takes_the_place_of_a_twosided(exported):
+    glass = {**MIRROR, "transmission": "interface", "int_ior": 1.5}
+    del glass["material"]
+    scene = load_spectral_scene(exported(), materials={"mat-Disc": glass})
+    assert any(str(shape.bsdf()).startswith("DiffractionGrating[") for shape in scene.shapes())
+
+
+def test_an_unknown_id_is_refused_with_those_that_there_are(exported):
+    with pytest.raises(ValueError, match=r"got the id 'Disc', the ids of BSDFs in the scene are mat-Disc, mat-Floor"):
+        load_spectral_scene(exported(), materials={"Disc": MIRROR})
+
+
+@pytest.mark.parametrize("uvs", [True, False])
+def test_a_grating_on_a_mesh_without_uvs_is_told(exported, uvs, caplog):
+    with caplog.at_level(logging.WARNING, "mitsuba_diffraction"):
+        load_spectral_scene(exported(uvs=uvs), materials={"mat-Disc": MIRROR})
+    told = [record.getMessage() for record in caplog.records if "UVs" in record.getMessage()]
+    assert len(told) == (0 if uvs else 1)
+    assert all(line.startswith("mat-Disc: on a mesh without UVs") for line in told)
+
+
+def test_the_digest_of_a_scene_is_that_of_its_materials(exported):
+    path = exported()
+    other = {**MIRROR, "depth": 0.3}
+    digests = [scene_digest(path, materials=m) for m in (None, {"mat-Disc": MIRROR}, {"mat-Disc": other})]
+    assert len(set(digests)) == 3
+
+
+def test_the_command_replaces_several_materials(exported, command, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    exported()
+    Path("wall.toml").write_text('[surface]\nprofile = "sinusoidal"\nperiod = 2.0\ndepth = 0.1\n')
+    words = ("--material", "mat-Floor=wall.toml,int_ior=1.4", "--material", "mat-Disc=blazed,depth=0.2,material=Al")
+    code, _, error = command("render", "exported.xml", *words, "--spp", "1", "--width", "8")
+    assert code == 0, error
+    code, _, error = command("render", "exported.xml", "--material", "Disc=blazed", "--overwrite")
+    assert code == 2
+    assert "mat-Disc, mat-Floor" in error
+    assert error.count("\n") == 1
+
+
+def test_materials_are_read_from_the_command_line(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("a.toml").touch()
+    found = materials_of(["mat-A=a.toml,int_ior=1.5", "B=blazed,period=2,material=Al,conserve_energy=false"])
+    assert found == {
+        "mat-A": {"filename": str(tmp_path / "a.toml"), "int_ior": 1.5},
+        "B": {"profile": "blazed", "period": 2, "material": "Al", "conserve_energy": False},
+    }
+    for texts, message in (
+        (["mat-A"], "got 'mat-A', wanted ID="),
+        (["mat-A="], "got 'mat-A=', wanted ID="),
+        (["mat-A=b.toml"], "b.toml: no such file"),
+        (["A=blazed", "A=blazed"], "A: got it twice"),
+        (["A=blazed,depth"], "got 'depth', wanted name=value"),
+    ):
+        with pytest.raises((ValueError, FileNotFoundError), match=message):
+            materials_of(texts)
