@@ -22,7 +22,7 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.special import jv
 
 from .errors import RequestError
-from .geometry import k_g
+from .geometry import k_g, transmitted
 from .reference import amplitudes
 from .rigorous.axes import LARGEST_PERIOD
 from .rigorous.curve import curve_of, is_profile
@@ -46,7 +46,7 @@ ANGLES = (0.0, 20.0, -20.0)
 WAVELENGTHS = (0.45, 0.55, 0.65)
 """µm."""
 
-RANGE = "mean over 450 to 650 nm and incidence up to 20°, n = 1.5"
+RANGE = "mean over 450–650 nm and 0–20°, n = 1.5"
 
 TRUSTED = 0.1
 """Error above which a surface is considered outside the range of scalar theory."""
@@ -170,6 +170,41 @@ def scalar_orders(
     return Orders(m[kept], s * reflected, p * reflected)
 
 
+def transmitted_orders(
+    powers: OrderPowers,
+    period: float,
+    wavelength: float,
+    angle: float,
+    index: float,
+    turn: float = 0.0,
+    from_below: bool = False,
+) -> tuple[NDArray[np.int64], Array]:
+    """Compute K_t G_t (1 − F) η_m(κ_m), the transmitted orders of the BSDF in the limit of narrow lobes.
+
+    Args:
+        powers: of the profile.
+        period: µm.
+        wavelength: µm.
+        angle: in air, degrees: of incidence, or, from below, of light that a plane would refract to it.
+        index: n of the dielectric.
+        turn: of the plane of incidence, degrees, as in `scalar_orders`.
+        from_below: whether the light comes from inside.
+
+    Returns:
+        The orders that propagate on the other side, ascending, and their efficiencies, at most one together.
+    """
+    n_i, n_o, side = (index, 1.0, -1) if from_below else (1.0, index, 1)
+    sine, pitch = -np.sin(np.deg2rad(angle)), wavelength / period
+    k_x, k_y = sine * np.cos(np.deg2rad(turn)), sine * np.sin(np.deg2rad(turn))
+    m = np.arange(-int((n_i + n_o) / pitch) - 1, int((n_i + n_o) / pitch) + 2)
+    square = n_o**2 - (k_x + m * pitch) ** 2 - k_y**2
+    m, z_o = m[square > 0], np.sqrt(square[square > 0])
+    z_i = np.sqrt(n_i**2 - sine**2)
+    kappa = 2 * np.pi * side * (z_i - z_o) / wavelength
+    efficiency = transmitted(z_i / n_i, z_o / n_o, (m * pitch / n_i) ** 2, n_o / n_i) * powers(m, kappa)
+    return m, efficiency / max(1.0, efficiency.sum())
+
+
 def _mirror_orders(
     powers: OrderPowers, pitch: Array, wavelength: float, light: Array
 ) -> tuple[NDArray[np.int64], Array, Array, Array]:
@@ -212,7 +247,8 @@ def error_map(material: str = "dielectric") -> tuple[Array, Array, Array, Array]
     """Return the error of scalar theory for sinusoids in unpolarised light (`precompute/scalar_theory_map.py`).
 
     Args:
-        material: "dielectric", n = 1.5, or "Al", aluminium at 550 nm.
+        material: "dielectric", n = 1.5, or "Al", aluminium at 550 nm; "transmitted" and "transmitted from below", the
+            light that passes the dielectric, directions being those in air.
 
     Returns:
         period/λ (n,), depth/λ (k,), directions (a, 2) in degrees, of incidence and of the plane of incidence from that
@@ -253,14 +289,14 @@ def expected_error(
         period: µm.
         depth: peak to valley, µm.
         wavelength: µm.
-        material: "dielectric", n = 1.5, or "Al".
+        material: as of `error_map`.
         largest_angle: degrees.
         mean: of these errors instead of the largest.
 
     Returns:
-        Σ|Δη_m| relative to the reflected power. Above the largest stored period (20 λ) and below the smallest depth
-        (λ/20), the value at the boundary, an upper bound. NaN for periods below λ or depths above 2 λ, which are not
-        stored and beyond scalar theory.
+        Σ|Δη_m| relative to the reflected, or transmitted, power. Above the largest stored period (20 λ) and below the
+        smallest depth (λ/20), the value at the boundary, an upper bound. NaN for periods below λ or depths above 2 λ,
+        which are not stored and beyond scalar theory.
 
     Raises:
         ValueError: unless period and wavelength are positive and the depth is not negative, or for another material.
@@ -285,11 +321,13 @@ class ScalarError:
 
     Attributes:
         share: Σ|Δη_m| relative to the reflected power; infinite beyond the rigorous results (depths above 2 λ).
+        transmitted: the same of the transmitted light.
         estimated: from the stored map, good to a factor of `ESTIMATE_FACTOR`; otherwise solved for the surface itself.
         remedy: the alternative to scalar theory for this surface.
     """
 
     share: float
+    transmitted: float
     estimated: bool
     remedy: str
 
@@ -307,7 +345,8 @@ class ScalarError:
         if not np.isfinite(self.share):
             return "error unknown, the surface is deeper than two wavelengths"
         about = "about " if self.estimated else ""
-        return f"errs by {about}{float(f'{100 * self.share:.2g}'):g}% of the reflected light ({RANGE})"
+        reflected, passed = (f"{float(f'{100 * share:.2g}'):g}%" for share in (self.share, self.transmitted))
+        return f"errs by {about}{reflected} of the reflected light, {passed} of the transmitted ({RANGE})"
 
 
 def scalar_error(height_field: HeightField, extent: str = "tile") -> ScalarError:
@@ -324,7 +363,7 @@ def scalar_error(height_field: HeightField, extent: str = "tile") -> ScalarError
     lengths, power, rms_height = height_spectrum(height_field, extent)
     depth = equivalent_depth(rms_height)
     longest = LARGEST_PERIOD * VISIBLE[0] * 1e-3
-    solved = float("nan")
+    solved = float("nan"), float("nan")
     if not (extent == "tile" and is_profile(height_field)):
         remedy = "no rigorous theory is offered for a surface that varies along y"
     elif height_field.tile_size[0] > longest:
@@ -333,14 +372,15 @@ def scalar_error(height_field: HeightField, extent: str = "tile") -> ScalarError
         remedy = "theory=rigorous has it right"
         # Deeper profiles take long to solve, and are far outside of the range.
         if depth <= WAVELENGTHS[0]:
-            solved = _solved_error(height_field) if depth > 0 else 0.0
-    if np.isfinite(solved):
-        return ScalarError(solved, False, remedy)
-    return ScalarError(_estimated_error(lengths, power, depth), True, remedy)
+            solved = _solved_error(height_field) if depth > 0 else (0.0, 0.0)
+    if np.isfinite(solved[0]):
+        return ScalarError(*solved, False, remedy)
+    estimated = (_estimated_error(lengths, power, depth, name) for name in ("dielectric", "transmitted"))
+    return ScalarError(*estimated, True, remedy)
 
 
-def _solved_error(profile: HeightField) -> float:
-    """Compute the mean error of a profile; NaN if the solver does not converge."""
+def _solved_error(profile: HeightField) -> tuple[float, float]:
+    """Compute the mean error of reflected and of transmitted light; NaN if the solver does not converge."""
     period = profile.tile_size[0]
     row = HeightField(profile.heights[:1], profile.pixel_size)
     powers, curve = profile_powers(row), curve_of(row)
@@ -350,20 +390,27 @@ def _solved_error(profile: HeightField) -> float:
             light = np.array([-np.sin(np.deg2rad(angle)), 0.0, np.cos(np.deg2rad(angle))])
             exact = converge(curve, light, period / wavelength, INDEX, _CONVERGED)
             if not exact.error <= _CONVERGED:
-                return float("nan")
+                return float("nan"), float("nan")
             scalar = scalar_orders(powers, period, wavelength, angle, INDEX)
-            errors.append(difference(scalar.unpolarised, exact.unpolarised))
-    return float(np.mean(errors))
+            _, passed = transmitted_orders(powers, period, wavelength, angle, INDEX)
+            errors.append(
+                (
+                    difference(scalar.unpolarised, exact.unpolarised),
+                    difference(passed, exact.transmitted_unpolarised),
+                )
+            )
+    reflected, on = np.mean(errors, axis=0)
+    return float(reflected), float(on)
 
 
-def _estimated_error(lengths: Array, power: Array, depth: float) -> float:
+def _estimated_error(lengths: Array, power: Array, depth: float, material: str) -> float:
     """Return the mean of the map over waves of these |q|, cycles/µm, and powers; infinite for too large a depth."""
     if depth == 0:
         return 0.0
     nodes = error_map()[0]
     mean = np.zeros_like(power)
     for wavelength in WAVELENGTHS:
-        errors = [expected_error(node, depth / wavelength, 1.0, mean=True) for node in nodes]
+        errors = [expected_error(node, depth / wavelength, 1.0, material=material, mean=True) for node in nodes]
         if not np.isfinite(errors).all():
             return float("inf")
         waves = -np.log(np.maximum(lengths, 1e-12) * wavelength)

@@ -1,7 +1,8 @@
 """Makes the map of scalar theory: `python precompute/scalar_theory_map.py [OUT.json]`.
 
 For sinusoids of many periods and depths, in a dielectric and in aluminium, it compares scalar efficiencies with those
-of `mitsuba_diffraction.rigorous`; four minutes on two cores. `scalar_theory.py` reads what it writes.
+of `mitsuba_diffraction.rigorous`, of reflected light and of light that passes the dielectric; eight minutes on two
+cores. `scalar_theory.py` reads what it writes.
 """
 
 from __future__ import annotations
@@ -19,14 +20,20 @@ from rich.progress import track
 
 from mitsuba_diffraction import gratings, rigorous
 from mitsuba_diffraction.files import whole_file
-from mitsuba_diffraction.scalar_theory import MAP, difference, scalar_orders, sinusoid_powers
+from mitsuba_diffraction.scalar_theory import MAP, difference, scalar_orders, sinusoid_powers, transmitted_orders
 
 # In wavelengths. No multiples of λ or of λ/n: there an order grazes, and the error is that of one narrow line.
 PERIODS = (0.97, 1.45, 2.05, 2.7, 3.5, 4.7, 6.7, 9.4, 13.7, 20.3)
 DEPTHS = (0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.4, 2.0)
 # Degrees: of incidence, and from the plane perpendicular to the grooves (90: light along the grooves).
 DIRECTIONS = ((0, 0), (20, 0), (40, 0), (60, 0), (40, 45), (60, 45), (40, 90), (60, 90))
-MATERIALS = {"dielectric": 1.5 + 0j, "Al": rigorous.refractive_index(0.55, material="Al")}
+DIELECTRIC = 1.5 + 0j
+MATERIALS = {
+    "dielectric": DIELECTRIC,
+    "Al": rigorous.refractive_index(0.55, material="Al"),
+    "transmitted": DIELECTRIC,
+    "transmitted from below": DIELECTRIC,
+}
 TOLERANCE = 3e-3
 SAMPLES = 512
 
@@ -34,15 +41,21 @@ SAMPLES = 512
 def solved(job: tuple[str, tuple[int, int], float, float]) -> tuple[float, float]:
     """Error of scalar theory, and how far the rigorous efficiencies are from converged, for λ = 1 µm."""
     material, (angle, turn), depth, period = job
-    index = MATERIALS[material]
-    scalar = scalar_orders(sinusoid_powers(depth), period, 1.0, angle, index, turn)
-    sine, cosine = np.sin(np.deg2rad(angle)), np.cos(np.deg2rad(angle))
+    index, passes, below = MATERIALS[material], material.startswith("transmitted"), material.endswith("below")
+    sine = np.sin(np.deg2rad(angle)) / (index.real if below else 1)
+    cosine = np.sqrt(1 - sine**2) * (-1 if below else 1)
     light = -sine * np.cos(np.deg2rad(turn)), -sine * np.sin(np.deg2rad(turn)), cosine
     surface = gratings.sinusoidal(period, depth, samples=SAMPLES)
     found = rigorous.efficiencies(surface, light, 1.0, int_ior=index, tolerance=TOLERANCE)
-    if not np.array_equal(found.orders, scalar.m):
-        raise RuntimeError(f"{job}: got the orders {scalar.m}, wanted {found.orders}")
-    return difference(scalar.unpolarised, found.unpolarised), found.error
+    if passes:
+        orders, efficiencies = transmitted_orders(sinusoid_powers(depth), period, 1.0, angle, index.real, turn, below)
+        wanted, exact = found.transmitted_orders, found.transmitted_unpolarised
+    else:
+        scalar = scalar_orders(sinusoid_powers(depth), period, 1.0, angle, index, turn)
+        orders, efficiencies, wanted, exact = scalar.m, scalar.unpolarised, found.orders, found.unpolarised
+    if not np.array_equal(wanted, orders):
+        raise RuntimeError(f"{job}: got the orders {orders}, wanted {wanted}")
+    return difference(efficiencies, exact), found.error
 
 
 def make(path: Path) -> None:

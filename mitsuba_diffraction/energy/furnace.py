@@ -143,12 +143,13 @@ class Furnace:
         seen = None if index is None else float(index) ** side
         sigma, depth = spectrum.lobe_width, spectrum.height_range * height_scale
         wide = spectrum.wavelengths[1] * 1e-3 * max(seen or 1, 1) * sigma > NARROW
-        passed, least = None, 0.0
+        passed: NDArray[np.float32] | None = None
+        least = 0.0
         if index is not None:
             least = least_kappa(spectrum, index, height_scale)
             at_least = [np.array([np.interp(n * least, kappas, row) for row in powers[kept]]) for n in (1, 2)]
-            passed = small_kappa(kappas, least, powers[kept], *(at[:, None] for at in at_least))
-            passed = np.ascontiguousarray(np.maximum(passed, 0), np.float32)
+            small = small_kappa(kappas, least, powers[kept], *(at[:, None] for at in at_least))
+            passed = np.ascontiguousarray(np.maximum(small, 0), np.float32)
         return cls(
             side * q[kept],
             widths[kept],
@@ -168,7 +169,7 @@ class Furnace:
 
     def power(self, component: NDArray[np.int64], kappa: NDArray[np.float64], way: int = 0) -> NDArray[np.float64]:
         """Return p_j(κ) of light that goes a way, linear between nodes; κ in rad/µm; shapes broadcast."""
-        table = self.passed if way else self.powers
+        table = self.passed if way and self.passed is not None else self.powers
         last = table.shape[1] - 1
         place = np.minimum(kappa * (self.height_scale * last / self.max_kappa), last * (1 - 1e-12))
         cell = place.astype(np.int64)
@@ -234,7 +235,7 @@ class Furnace:
         value = value * self._power(partial(self.power, component, way=way), cos_i[at], cos_o, length[at], way)
         i, j = i[~far], j[~far]
         near = self._lobes(s[i], cos_i[i], length[i], j, way)
-        return np.bincount(at, value, len(s)) + np.bincount(i, near, len(s))
+        return np.bincount(np.append(at, i), np.append(value, near), len(s)).astype(np.float64)
 
     def _far(
         self, square: NDArray[np.float64], sigma: NDArray[np.float64], length: NDArray[np.float64], way: int
@@ -254,11 +255,11 @@ class Furnace:
         length: NDArray[np.float64],
         tangent: NDArray[np.float64],
         way: int,
-    ) -> NDArray[np.float64]:
+    ) -> NDArray[np.floating]:
         """Return K G F and gain, or K_t (1 − F), at |λq|² = `tangent`; F = 1 without a medium below."""
         if way:
             least = self.least_kappa / max(self.height_scale, 1e-9) * length / (2 * np.pi)
-            return transmitted(cos_i, cos_o, tangent, self.index, least)
+            return transmitted(cos_i, cos_o, tangent, self.index or 1.0, least)
         square = tangent + (cos_i + cos_o) ** 2
         value = k_g(cos_i, cos_o, square / 2)
         if not self.by_order:
@@ -275,11 +276,11 @@ class Furnace:
         cos_o: NDArray[np.float64],
         length: NDArray[np.float64],
         way: int,
-    ) -> NDArray[np.float64]:
+    ) -> NDArray[np.floating]:
         """Return `power` at κ in rad/µm between two directions; of transmitted light with that sign of v_z only."""
         if not way:
             return power(2 * np.pi / length * (cos_i + cos_o))
-        v_z = way * (cos_i - self.index * cos_o)
+        v_z = way * (cos_i - (self.index or 1.0) * cos_o)
         return power(2 * np.pi / length * np.maximum(v_z, 0)) * (v_z > 0)
 
     def _lobes(
@@ -380,9 +381,9 @@ class Furnace:
         rng, grid, sigma = np.random.default_rng(seed), spectrum.grid, spectrum.lobe_width
         q = np.stack(np.meshgrid(*grid.frequencies()), -1).reshape(-1, 2) * self.side
         # A node is a Gaussian, or a B-spline that ends at the Nyquist limit.
-        lines = isinstance(grid, OrderGrid)
-        spacing = np.full(2, sigma) if lines else np.array(grid.spacing)
-        limit = np.full(2, np.inf) if lines else np.array(grid.limit)
+        lines, spacing, limit = isinstance(grid, OrderGrid), np.full(2, sigma), np.full(2, np.inf)
+        if not isinstance(grid, OrderGrid):
+            spacing, limit = np.array(grid.spacing), np.array(grid.limit)
         extent = 4 * sigma if lines else 1.5 * np.hypot(*spacing)
         strength = np.sum(
             [np.maximum(spectrum.powers(x * spectrum.largest_kappa), 0).ravel() for x in (0.1, 0.4, 0.7, 1.0)], axis=0

@@ -96,19 +96,19 @@ class Layout:
         # Those of the spectrum are in the denser medium.
         shortest, longest = (w * 1e-3 * max(furnace.index or 1, 1) for w in spectrum.wavelengths)
         frequencies = 1 / longest, 1 / shortest
-        lines = isinstance(spectrum.grid, OrderGrid) and 1 in spectrum.grid.shape
-        if furnace.index is not None or not lines:
+        grid = spectrum.grid
+        if furnace.index is not None or not (isinstance(grid, OrderGrid) and 1 in grid.shape):
             # As fine as the work allows, which is about the same for all.
             places = GENERAL[0] * GENERAL[1] ** 2
             finest = 1 if furnace.index is None else FINEST
             finer = np.clip(np.cbrt(PAIRS / (furnace.work * places)), 1, finest)
             slices, side = 1 + 2 * int(GENERAL[0] * finer / 2), int(GENERAL[1] * finer)
             return cls(shortest / 2, 1, side, 1, slices, frequencies, False)
-        turned = spectrum.grid.shape[1] == 1 and spectrum.grid.shape[0] > 1
+        turned = grid.shape[1] == 1 and grid.shape[0] > 1
         # So many places that the work is about the same for all gratings.
         side = np.sqrt(2 * min(PLACES, PAIRS / max(len(furnace.q) / 2, 1)))
         first = int(np.clip(side / 8, 4, 24))
-        period, rest = spectrum.grid.tile_size[int(turned)], (side - 2 * first - 1) / 3
+        period, rest = grid.tile_size[int(turned)], (side - 2 * first - 1) / 3
         period /= max(np.ceil(2 * period / shortest / max(rest, 2)), 1)
         squares = int(np.ceil(2 * period / shortest))
         cells = int(np.clip((3 * rest / max(squares - 1, 1) - 1) / 2, 1, 24))
@@ -326,9 +326,13 @@ def _line_corners(furnace: Furnace, layout: Layout) -> tuple[NDArray[np.float64]
         furnace = dataclasses.replace(furnace, q=furnace.q[:, ::-1])
     x = ((v - u) / (u + v))[reached]
     omega = np.stack([x, np.zeros(len(x)), np.sqrt(1 - x**2)], -1)
-    # Where phases turn within lobes a depends on c, too: seen in the scale of c, lobes are 1/c as wide.
-    scales = TURNED if furnace.turning else (1.0,)
-    a = [dataclasses.replace(furnace, widths=furnace.widths / c).albedo(omega, 1 / nu[reached])[0] for c in scales]
+    # Where phases turn within lobes a depends on c, too: seen in the scale of c, lobes are 1/c as wide. At grazing
+    # incidence, where K changes within wide lobes, their centres come nearer.
+    furnaces = [furnace]
+    if furnace.turning:
+        furnaces = [dataclasses.replace(furnace, widths=furnace.widths / c) for c in TURNED]
+        furnaces.append(dataclasses.replace(furnace, turning=False))
+    a = [one.albedo(omega, 1 / nu[reached])[0] for one in furnaces]
     e[0, reached] = 1 / np.maximum(np.max(a, axis=0), 1)
     inside = reached & (nu <= last)
     # The cells: each second node but the last of a unit square.

@@ -113,6 +113,11 @@ class Efficiencies:
         return (self.s + self.p) / 2
 
     @property
+    def transmitted_unpolarised(self) -> Real:
+        """The efficiencies of `transmitted_orders` for unpolarised light, (k,)."""
+        return _powers(self.transmitted_amplitudes).mean(axis=1)
+
+    @property
     def imbalance(self) -> float:
         """|R + T − 1|, of s or p light, the larger; if the material absorbs, the excess of R over one."""
         reflected = _powers(self.amplitudes).sum(axis=0)

@@ -71,7 +71,7 @@ class Table:
             c, g, wavelength: as in `Axes`, µm in the medium above.
             mueller: whether to return the matrices of light with k_y ≥ 0.
         """
-        table = self.mueller if mueller else self.values
+        table: NDArray[np.float32] = self.mueller if mueller and self.mueller is not None else self.values
         m, c, g, wavelength = np.broadcast_arrays(np.asarray(m, np.int64), c, g, wavelength)
         axes = self.axes
         p, r, there = axes.coordinates(m, c, g, wavelength)

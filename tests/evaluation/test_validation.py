@@ -148,11 +148,26 @@ def test_the_map_is_that_of_the_solver(material):
         assert found == pytest.approx(errors[i, j, k], rel=0.03, abs=0.003)
 
 
+@pytest.mark.parametrize("way", ["transmitted", "transmitted from below"])
+@pytest.mark.parametrize(("period", "depth", "angle"), [(6.7, 1.0, 0), (6.7, 1.0, 20), (2.7, 0.2, 40)])
+def test_the_map_of_transmitted_light_is_what_the_solver_finds(way, period, depth, angle):
+    periods, depths, directions, errors = scalar_theory.error_map(way)
+    stored = errors[list(periods).index(period), list(depths).index(depth), directions.tolist().index([angle, 0])]
+    below = way.endswith("below")
+    sine = np.sin(np.deg2rad(angle)) / (1.5 if below else 1)
+    light = (-sine, 0, np.sqrt(1 - sine**2) * (-1 if below else 1))
+    exact = rigorous.efficiencies(md.gratings.sinusoidal(period, depth, samples=512), light, 1.0, int_ior=1.5)
+    m, found = scalar_theory.transmitted_orders(
+        scalar_theory.sinusoid_powers(depth), period, 1.0, angle, 1.5, from_below=below
+    )
+    np.testing.assert_array_equal(m, exact.transmitted_orders)
+    assert scalar_theory.difference(found, exact.transmitted_unpolarised) == pytest.approx(stored, rel=0.03, abs=2e-3)
+
+
 def test_a_surface_outside_the_range_of_scalar_theory_is_reported():
     fine = scalar_theory.scalar_error(md.gratings.ruled(1200)).warning
-    assert fine.startswith(
-        "scalar theory: errs by 29% of the reflected light (mean over 450 to 650 nm and incidence up"
-    )
+    assert fine.startswith("scalar theory: errs by 29% of the reflected light, ")
+    assert "of the transmitted (mean over 450–650 nm and 0–20°" in fine
     assert fine.endswith("; theory=rigorous has it right")
     crossed = scalar_theory.scalar_error(md.gratings.foil(0.8, 0.5, samples=32)).warning
     assert "errs by about" in crossed
