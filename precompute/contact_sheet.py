@@ -63,7 +63,7 @@ def panel(recipe: Path, folder: Path, size: int, spp: int) -> Image.Image:
     if recipe.stem in SKINS:
         content |= {"coat": SKIN, "sun": 1.0, "sky": 0.001}
     if recipe.stem in PANES:
-        content |= {"coat": SHEET, "shapes": PANE, "sun": 1e-6, "lamp": 1e-6, "sky": 0.0001, "fov": 50}
+        content |= {"coat": SHEET, "shapes": PANE, "sun": 1e-9, "lamp": 1e-9, "sky": 1e-9, "fov": 50}
     text = SCENE.format(recipe=recipe.resolve().as_posix(), height=0 if disc else 0.25, **content)
     scene.write_text(text, encoding="utf-8")
     save_preview(render(scene, spp=spp, width=size, height=size), picture)
