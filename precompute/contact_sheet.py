@@ -1,7 +1,7 @@
 """Renders every recipe of this folder into one picture: python precompute/contact_sheet.py docs/ready_surfaces.png
 
-Discs (compact_disc, dvd) are shown as discs, everything else on a sphere and a plate. The light is a sun at the left, a
-narrow lamp, and a dim sky.
+Discs (compact_disc, dvd) are shown as discs, films and gratings that light passes as a pane before a small lamp,
+everything else on a sphere and a plate. The light is a sun at the left, a narrow lamp, and a dim sky.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from mitsuba_diffraction.render.preview import save_preview
 
 HERE = Path(__file__).parent
 DISCS = {"compact_disc", "dvd"}
+PANES = {"film", "transmission_300", "transmission_600"}
 SKINS = {"elaphe", "elaphe_afm", "xenopeltis", "xenopeltis_afm", "morpho_ridges"}
 METAL = '<string name="material" value="Al"/>'
 SKIN = """<float name="int_ior" value="1.5"/>
@@ -29,12 +30,18 @@ SKIN = """<float name="int_ior" value="1.5"/>
 DISC = """<shape type="disk"><ref id="surface"/></shape>
 <shape type="disk"><transform name="to_world"><scale value="0.2"/><translate z="0.002"/></transform>
     <bsdf type="diffuse"><rgb name="reflectance" value="0.01"/></bsdf></shape>"""
+PANE = """<shape type="rectangle"><transform name="to_world"><scale value="1.4"/>
+    <lookat origin="0, -2.1, 1.8" target="0, -4.2, 3.4" up="0, 0, 1"/></transform><ref id="surface"/></shape>
+<shape type="sphere"><point name="center" x="0" y="0.2" z="0"/><float name="radius" value="0.06"/>
+    <emitter type="area"><spectrum name="radiance" type="d65"><float name="scale" value="3"/></spectrum></emitter>
+</shape>"""
+SHEET = '<float name="int_ior" value="1.5"/><string name="transmission" value="sheet"/>'
 SPHERE = """<shape type="sphere"><point name="center" x="0" y="0.15" z="0.42"/><float name="radius" value="0.42"/>
     <ref id="surface"/></shape>
 <shape type="rectangle"><transform name="to_world"><scale x="1.0" y="0.85"/></transform>
     <ref id="surface"/></shape>"""
 SCENE = """<scene version="3.0.0"><integrator type="path"><integer name="max_depth" value="3"/></integrator>
-<sensor type="perspective"><float name="fov" value="22"/><transform name="to_world">
+<sensor type="perspective"><float name="fov" value="{fov}"/><transform name="to_world">
     <lookat origin="0, -4.2, 3.4" target="0, 0, {height}" up="0, 0, 1"/></transform>
     <film type="hdrfilm"><rfilter type="gaussian"/></film></sensor>
 <bsdf type="diffraction_grating" id="surface"><string name="filename" value="{recipe}"/>{coat}</bsdf>
@@ -43,7 +50,7 @@ SCENE = """<scene version="3.0.0"><integrator type="path"><integer name="max_dep
     <spectrum name="irradiance" type="d65"><float name="scale" value="{sun}"/></spectrum></emitter>
 <shape type="rectangle"><transform name="to_world"><scale x="0.12" y="1.6"/>
     <lookat origin="-1.9, 0.3, 3.0" target="0, 0, 0" up="0, 1, 0"/></transform>
-    <emitter type="area"><spectrum name="radiance" type="d65"><float name="scale" value="3"/></spectrum></emitter>
+    <emitter type="area"><spectrum name="radiance" type="d65"><float name="scale" value="{lamp}"/></spectrum></emitter>
 </shape>
 <emitter type="constant"><spectrum name="radiance" value="{sky}"/></emitter></scene>"""
 
@@ -52,9 +59,11 @@ def panel(recipe: Path, folder: Path, size: int, spp: int) -> Image.Image:
     """The picture of one recipe."""
     scene, picture = folder / f"{recipe.stem}.xml", folder / f"{recipe.stem}.png"
     disc = recipe.stem in DISCS
-    content = {"coat": METAL, "shapes": DISC if disc else SPHERE, "sun": 0.1, "sky": 0.0015}
+    content = {"coat": METAL, "shapes": DISC if disc else SPHERE, "sun": 0.1, "lamp": 3, "sky": 0.0015, "fov": 22}
     if recipe.stem in SKINS:
         content |= {"coat": SKIN, "sun": 1.0, "sky": 0.001}
+    if recipe.stem in PANES:
+        content |= {"coat": SHEET, "shapes": PANE, "sun": 1e-9, "lamp": 1e-9, "sky": 1e-9, "fov": 50}
     text = SCENE.format(recipe=recipe.resolve().as_posix(), height=0 if disc else 0.25, **content)
     scene.write_text(text, encoding="utf-8")
     save_preview(render(scene, spp=spp, width=size, height=size), picture)

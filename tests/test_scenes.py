@@ -46,6 +46,14 @@ def test_scene_renders(llvm, name):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "parameters"), [("glasses", {}), ("spectroscope", {}), ("spectroscope", {"grating": "transmission_300"})]
+)
+def test_scene_of_transmitted_light_renders(llvm, name, parameters):
+    check(render(SCENES / f"{name}.xml", spp=4, width=32, parameters=parameters), 32, 18)
+
+
+@pytest.mark.slow
 def test_scene_of_a_scan_renders(llvm, tmp_path):
     path = tmp_path / "spectrum.exr"
     md.precompute(md.gratings.elaphe(8)).save(path)
@@ -100,6 +108,7 @@ PICTURES = [
     ("compact_disc", {"light": "sun"}),
     ("foil", {"light": "sun"}),
     ("rainbow", {}),
+    ("window", {}),
 ]
 
 
@@ -279,35 +288,36 @@ def test_the_ground_texture_tiles():
     assert np.abs(colour[:, 0] - colour[:, -1]).mean() < 2 * inside
 
 
-# ---------------------------------------------------------------- the spectrometer
+# ---------------------------------------------------------------- the spectrometer and the spectroscope
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("lines", "parameters"),
+    ("name", "screen", "lines_per_mm", "offset", "lines", "parameters"),
     [
-        ((404.66, 435.83, 546.07), {}),
-        ((589.3,), {"lines": "587.99:0, 588.99:2, 589.29:1.9, 589.59:1, 590.59:0"}),
+        ("spectrometer", 50, 1200, 0.5, (404.66, 435.83, 546.07), {}),
+        ("spectrometer", 50, 1200, 0.5, (589.3,), {"lines": "587.99:0, 588.99:2, 589.29:1.9, 589.59:1, 590.59:0"}),
+        ("spectroscope", 40, 600, 0, (404.66, 435.83, 546.07), {}),
     ],
-    ids=["mercury", "sodium"],
+    ids=["mercury", "sodium", "transmission"],
 )
-def test_lines_are_where_the_grating_equation_has_them(llvm, lines, parameters):
-    path, size = SCENES / "spectrometer.xml", (160, 90)
+def test_lines_are_where_the_grating_equation_has_them(llvm, name, screen, lines_per_mm, offset, lines, parameters):
+    path, size = SCENES / f"{name}.xml", (320, 180)
     parameters = {"room": "1e-12", **parameters}
-    image = render(path, spp=32, width=size[0], height=size[1], parameters=parameters)
+    image = render(path, spp=16, width=size[0], height=size[1], parameters=parameters)
     built = load_spectral_scene(path, width=size[0], height=size[1], parameters=parameters)
     pixel = dr.arange(mi.UInt32, size[0] * size[1])
     at = mi.Point2f(pixel % size[0], pixel // size[0]) + 0.5
     ray, _ = built.sensors()[0].sample_ray(0, 0.5, at / mi.Point2f(size), mi.Point2f(0.5))
     si = built.ray_intersect(ray)
     x, y = (np.array(axis).reshape(size[::-1]) for axis in (si.p.x, si.p.y))
-    on_screen = np.abs(y - 50) < 1e-3
-    period = 1e6 / 1200  # nm
+    on_screen = np.abs(y - screen) < 1e-3
+    period = 1e6 / lines_per_mm  # nm
     for line in lines:
         in_line = np.abs(image.wavelengths - line) < 5
         light = np.where(on_screen, image.radiance[..., in_line].sum(-1), 0)
-        expected = 50 * np.tan(np.arcsin(line / period - 0.5))
+        expected = screen * np.tan(np.arcsin(line / period - offset))
         light[np.abs(x - expected) > 1.5] = 0  # what the screen and the table scatter
         mean = (x * light).sum() / light.sum()
-        measured = period * (np.sin(np.arctan(mean / 50)) + 0.5)
+        measured = period * (np.sin(np.arctan(mean / screen)) + offset)
         assert measured == pytest.approx(line, rel=0.005), line

@@ -27,14 +27,15 @@ grating only by chance, so that the light that gratings cast onto a wall appears
 from the light here, and all others from the eye.
 
 With L a light, G a vertex on a surface whose BSDF is or holds a `diffraction_grating` (whichever component of it
-scatters: both sides of `twosided`, all of a blend, the base), X a vertex on any other surface, and E the eye, the paths
+reflects light or lets it through: both sides of `twosided` and of a film, all of a blend, the base), X a vertex on any
+other surface, and E the eye, the paths
 
     L G⁺ X E    and    L G⁺ X (G | X)* X E
 
 are traced from the light if the vertex next to E scatters otherwise than as a perfect mirror or refraction does. So
 
-    L G E, L G G E              from the eye: gratings alone
-    L G X E, L G G X E          from the light: what they cast onto a wall
+    L G E, L G G E              from the eye: gratings alone, a lamp seen through a film
+    L G X E, L G G X E          from the light: what they cast onto a wall, a film in a window onto the floor
     L G X X E, L G M X E        from the light: that wall lights another one; M is a mirror or a pane of glass
     L G X G E, L G X M E        from the eye: that wall seen in a grating or a mirror
     L X G X E, L M G X E        from the eye: light that met another surface before the grating

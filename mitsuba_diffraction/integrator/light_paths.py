@@ -144,19 +144,19 @@ class LightPaths:
         si = self.scene.ray_intersect(ray, active)
         depth = mi.UInt32(2)
         active &= si.is_valid()
-        throughput, eta = mi.Spectrum(1), mi.Float(1)
+        throughput = mi.Spectrum(1)
         while active:
             bsdf = si.bsdf(ray)
             plain = active & (self.gratings.hold(si, active) ^ True)
             position, value, reached = self._connect(si, bsdf, _next_2d(rng), plain)
             buffer.add(Splats(position, ray.wavelengths, value * power * throughput), path, depth, reached)
-            ray, weight, widening, _ = self._scatter(si, bsdf, rng, active)
+            ray, weight, _ = self._scatter(si, bsdf, rng, active)
             throughput *= weight
             ray.wavelengths = carried(ray.wavelengths, power * throughput)
-            eta *= widening
             depth += 1
             gambles = depth >= self.rr_depth
-            survival = dr.minimum(dr.max(throughput) * dr.square(eta), 0.95)
+            # As of `path`, without the indices passed: unlike radiance, power does not change with them.
+            survival = dr.minimum(dr.max(throughput), 0.95)
             active &= dr.any(throughput != 0) & (depth < self.max_depth)
             active &= (gambles ^ True) | (_next_1d(rng) < survival)
             throughput *= dr.select(gambles, ratio(1, survival), 1)
@@ -203,7 +203,7 @@ class LightPaths:
         active &= self.scene.ray_test(si.spawn_ray_to(light), active) ^ True
         si.wi = si.to_local(direction)
         power *= dr.abs(dr.dot(direction, si.n))
-        ray, weight, _, mirrored = self._scatter(si, si.bsdf(), rng, active)
+        ray, weight, mirrored = self._scatter(si, si.bsdf(), rng, active)
         power *= weight
         ray.wavelengths = carried(ray.wavelengths, power)
         # `path` does not see a light without extent in a mirror.
@@ -212,8 +212,8 @@ class LightPaths:
 
     def _scatter(
         self, si: mi.SurfaceInteraction3f, bsdf: mi.BSDF, rng: mi.PCG32, active: mi.Bool
-    ) -> tuple[mi.Ray3f, mi.Spectrum, mi.Float, mi.Bool]:
-        """Sample the next ray; return it, T_{j+1}/T_j, the relative index passed, and whether it was specular."""
+    ) -> tuple[mi.Ray3f, mi.Spectrum, mi.Bool]:
+        """Sample the next ray; return it, T_{j+1}/T_j, and whether it was specular."""
         ctx = mi.BSDFContext(mi.TransportMode.Importance)
         bs, weight = bsdf.sample(ctx, si, _next_1d(rng), _next_2d(rng), active)
         mirrored = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
@@ -224,7 +224,7 @@ class LightPaths:
             back = dr.sum(bsdf.eval(mi.BSDFContext(), _from(si, bs.wo), si.wi, active & (mirrored ^ True)))
             turn = dr.select(mirrored, turn, ratio(back, forth))
         turn *= dr.abs(ratio(dr.dot(ray.d, si.n), dr.dot(si.to_world(si.wi), si.n)))
-        return ray, dr.select(active, weight * turn, 0), bs.eta, mirrored
+        return ray, dr.select(active, weight * turn, 0), mirrored
 
     def _connect(
         self, si: mi.SurfaceInteraction3f, bsdf: mi.BSDF, lens: mi.Point2f, active: mi.Bool

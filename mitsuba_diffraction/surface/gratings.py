@@ -137,6 +137,43 @@ def ruled(lines_per_mm: float = 600.0, *, blaze_wavelength: float = 500.0, sampl
     )
 
 
+def right_angled(period: float, facet_angle: float, *, samples: int = 512) -> HeightField:
+    """Return two facets that meet at 90°, as a ruling diamond leaves them; the wider one rises along +x.
+
+    Args:
+        period: along x, µm.
+        facet_angle: between the wider facet and the surface, degrees, above 0 and at most 45.
+        samples: pixels per period.
+
+    Returns:
+        One period, (1, samples).
+
+    Raises:
+        ValueError: if the period is not positive, the angle out of range, or samples below two.
+    """
+    check_profile(period, 0.0, samples)
+    if not (isinstance(facet_angle, Real) and 0 < facet_angle <= 45):
+        raise RequestError(f"facet_angle: got {facet_angle!r}, wanted degrees above 0 and at most 45")
+    slope = np.tan(np.deg2rad(facet_angle))
+    x = phase(samples)
+    heights = period * np.minimum(x * slope, (1 - x) / slope)
+    return one_row(heights, period, f"ruled grating, period {period:g} µm, facets of {facet_angle:g}°")
+
+
+def transmission_300(*, facet_angle: float = 17.5, samples: int = 512) -> HeightField:
+    """Return a ruled transmission grating of 300 lines/mm, `right_angled`; of glass, light passes it as a sheet.
+
+    17.5° is the groove angle that Thorlabs states for its 300/mm grating for visible light (GT25-03, in B270 glass,
+    n = 1.52). The wide facets deflect light as prisms do, at normal incidence to the first order of about 0.55 µm.
+    """
+    return right_angled(1000 / 300, facet_angle, samples=samples)
+
+
+def transmission_600(*, facet_angle: float = 28.7, samples: int = 512) -> HeightField:
+    """Return a ruled transmission grating of 600 lines/mm, as `transmission_300`; the angle is that of GT25-06V."""
+    return right_angled(1000 / 600, facet_angle, samples=samples)
+
+
 def sinusoidal(period: float, depth: float, *, samples: int = 512) -> HeightField:
     """Return a sinusoid h = (depth / 2) · sin(2π x / period), so |F_m|² = J_m(κ · depth / 2)².
 
@@ -256,6 +293,27 @@ def foil(period: float = 1.0, depth: float = 0.15, *, directions: int = 2, sampl
         (float(size[0] * period / pixels[0]), float(size[1] * period / pixels[1])),
         f"embossed foil, {directions} directions, period {period:g} µm, depth {depth:g} µm",
     )
+
+
+def film(period: float = 1 / 0.53, depth: float = 0.76, *, samples: int = 64) -> HeightField:
+    """Return the embossing of diffraction glasses, a `foil` with two directions; light passes it as a sheet.
+
+    The film is sold as "double axis, 13,500 lines per inch", 530/mm. Its depth is not published; of two sinusoids, each
+    of amplitude a = depth/4, the orders (±1, 0) and (0, ±1) have J_1(κa)² J_0(κa)² of the light, at most 11 % each
+    where κa = 1.08. With κ = 2π (n − 1)/λ and n = 1.5 that is the depth here at λ = 0.55 µm.
+
+    Args:
+        period: of each wave, µm.
+        depth: lowest to highest point of the sum, µm.
+        samples: pixels per period, even.
+
+    Returns:
+        One period in each direction, (samples, samples).
+
+    Raises:
+        ValueError: as `foil`.
+    """
+    return foil(period, depth, directions=2, samples=samples)
 
 
 # Horizontal width of the walls of a pit, µm, which slope by about 45 to 60 degrees.
@@ -877,7 +935,10 @@ PROFILES: dict[str, Callable[..., HeightField]] = {
     "lamellar": lamellar,
     "crossed": crossed,
     "ruled": ruled,
+    "transmission_300": transmission_300,
+    "transmission_600": transmission_600,
     "foil": foil,
+    "film": film,
     "compact_disc": compact_disc,
     "dvd": dvd,
     "elaphe": elaphe,
@@ -902,4 +963,4 @@ At 550 nm and normal incidence ∫|ΔS| dq to the mean of as many other seeds as
 is less, since the eye sees streaks in their faint fans.
 """
 
-__all__ = ["COHERENCE_LENGTHS", "PATCHES", "PROFILES", *PROFILES]
+__all__ = ["COHERENCE_LENGTHS", "PATCHES", "PROFILES", "right_angled", *PROFILES]

@@ -7,13 +7,6 @@ from mitsuba_diffraction import rigorous
 from mitsuba_diffraction.evaluation.validation import ruled_fit
 
 
-def test_the_profile_has_its_facets_at_right_angles():
-    profile = ruled_fit.right_angled(2.0, 20.0, samples=2000).heights[0]
-    slopes = np.diff(profile) / 1e-3
-    assert slopes[0] == pytest.approx(np.tan(np.deg2rad(20)))
-    assert slopes[0] * slopes[-1] == pytest.approx(-1)
-
-
 @pytest.mark.parametrize("wavelength", [0.4, 0.5, 0.6, 0.7, 0.8])
 def test_aluminium_is_that_of_the_table(wavelength):
     model, table = ruled_fit.aluminium(wavelength), rigorous.refractive_index(wavelength, material="Al")

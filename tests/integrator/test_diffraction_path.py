@@ -1,6 +1,7 @@
 """The integrator `diffraction_path` beside Mitsuba's `path`."""
 
 import signal
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
@@ -100,6 +101,36 @@ def blend_under_a_point():
     return scene(plate=plate({"type": "twosided", "bsdf": tilted}), light=light, sky=SKY)
 
 
+def film(kind, facing=1, **parameters):
+    """A film above the floor, its relief above (`facing` 1) or below (−1)."""
+    turned = mi.ScalarTransform4f().rotate([0, 1, 0], 0 if facing > 0 else 180)
+    bsdf = {"type": "diffraction_grating", "profile": "blazed", "coherence_length": 1.5, "transmission": kind}
+    bsdf = {**bsdf, "conserve_energy": False, **parameters}
+    return {"type": "rectangle", "to_world": at(0, 0, 0.8) @ turned, "bsdf": bsdf}
+
+
+def window(kind, facing=1):
+    """Sunlight that passes a film on its way to the floor."""
+    return scene(pane=film(kind, facing), sun=SUN)
+
+
+def films_between_lamps(kind="sheet"):
+    """A film on a normal map with a lamp of some extent and a point light below it, and a film of which it is seen."""
+    tilt = (np.array([np.sin(0.2), 0, np.cos(0.2)]) + 1) / 2
+    normals = {**{"type": "bitmap", "raw": True}, "bitmap": mi.Bitmap(np.tile(tilt, (2, 2, 1)).astype(np.float32))}
+    tilted = film(kind)
+    tilted["bsdf"] = {"type": "normalmap", "normalmap": normals, "bsdf": tilted["bsdf"]}
+    return scene(
+        tilted=tilted,
+        upright={**film(kind), "to_world": at(1.2, -0.3, 1).rotate([1, 0, 0], 70).scale(0.6)},
+        lamp={
+            **{"type": "sphere", "center": [0.3, -0.8, 2.5], "radius": 0.3},
+            "emitter": {"type": "area", "radiance": uniform(2.0)},
+        },
+        below={"type": "point", "position": [-0.4, 0.5, 0.3], "intensity": uniform(0.3)},
+    )
+
+
 def halves(picture):
     """Means over 2 × 2 regions of a picture."""
     rows, columns = picture.shape[:2]
@@ -128,6 +159,12 @@ def assert_agree(built, depth, spp, **parameters):
     ("build", "depth", "spp"),
     [
         (sun_alone, 3, 1024),
+        pytest.param(partial(window, "interface"), 3, 1024, id="enters"),
+        pytest.param(partial(window, "interface", -1), 3, 1024, marks=pytest.mark.slow, id="leaves"),
+        pytest.param(partial(window, "sheet"), 3, 1024, marks=pytest.mark.slow, id="relief first"),
+        pytest.param(partial(window, "sheet", -1), 3, 1024, id="flat face first"),
+        pytest.param(films_between_lamps, 5, 2048, marks=pytest.mark.slow, id="films"),
+        pytest.param(partial(films_between_lamps, "interface"), 5, 2048, marks=pytest.mark.slow, id="glass"),
         pytest.param(sun_and_sky, 4, 1024, marks=pytest.mark.slow),
         pytest.param(lamp_and_spot, 5, 2048, marks=pytest.mark.slow),
         pytest.param(blend_under_a_point, -1, 1024, marks=pytest.mark.slow),
@@ -144,15 +181,22 @@ def test_converges_in_a_scalar_variant():
 
 
 @pytest.mark.slow
-def test_light_cast_by_a_grating_onto_a_wall_is_far_less_noisy(llvm):
-    narrow = blaze(26.0, material="Al")
-    built = scene(plate=plate(narrow, 0.5), sun=SUN)
-    at_wall = {}
+@pytest.mark.parametrize(
+    ("grating", "where"),
+    [
+        (lambda: plate(blaze(26.0, material="Al"), 0.5), np.s_[:4]),
+        (lambda: film("sheet", coherence_length=26.0), np.s_[4:]),
+    ],
+    ids=["onto a wall", "through a film onto the floor"],
+)
+def test_light_cast_by_a_grating_is_far_less_noisy(grating, where, llvm):
+    built = scene(grating=grating(), sun=SUN)
+    noise = {}
     for name in ("path", "diffraction_path"):
         integrator = mi.load_dict({"type": name, "max_depth": 3})
-        pictures = [np.array(mi.render(built, integrator=integrator, spp=64, seed=k))[:4] for k in range(12)]
-        at_wall[name] = np.var(pictures, 0, ddof=1).mean()
-    assert at_wall["path"] > 50 * at_wall["diffraction_path"]
+        pictures = [np.array(mi.render(built, integrator=integrator, spp=64, seed=k))[where] for k in range(12)]
+        noise[name] = np.var(pictures, 0, ddof=1).mean()
+    assert noise["path"] > 50 * noise["diffraction_path"], noise
 
 
 def test_a_grating_seen_in_another_is_less_noisy_than_with_path(llvm):

@@ -17,9 +17,12 @@ from mitsuba_diffraction.surface.gratings import (
     PROFILES,
     compact_disc,
     dvd,
+    film,
     foil,
     morpho_ridges,
     ruled,
+    transmission_300,
+    transmission_600,
 )
 
 RECIPES = Path(__file__).parents[2] / "precompute"
@@ -67,7 +70,44 @@ def test_an_impossible_ruled_grating_is_refused(arguments, message):
         ruled(**arguments)
 
 
-# ---------------------------------------------------------------- foil
+@pytest.mark.parametrize(("make", "lines", "angle"), [(transmission_300, 300, 17.5), (transmission_600, 600, 28.7)])
+def test_a_transmission_grating_has_facets_at_right_angles(make, lines, angle):
+    field = make(samples=2000)
+    slopes = np.diff(field.heights[0]) / field.pixel_size[0]
+    assert field.tile_size[0] == pytest.approx(1000 / lines)
+    assert slopes[0] == pytest.approx(np.tan(np.deg2rad(angle)))
+    assert slopes[0] * slopes[-1] == pytest.approx(-1)
+
+
+def test_the_facets_of_a_transmission_grating_deflect_light_as_prisms_do():
+    # A prism of glass under air turns light along its normal by asin(n sin α) − α.
+    index, angle = 1.52, np.deg2rad(17.5)
+    deflected = np.sin(np.arcsin(index * np.sin(angle)) - angle)
+    wavelength = deflected * 1000 / 300
+    assert wavelength == pytest.approx(0.55, abs=0.02)
+    cosine = np.sqrt(1 - deflected**2)
+    eta = order_powers(transmission_300(), 2 * np.pi / wavelength * (index - cosine))[0]
+    assert eta.max() == max(eta[1], eta[-1]) > 0.7
+
+
+@pytest.mark.parametrize("angle", [0, -3.0, 50, np.nan, "17.5"])
+def test_an_impossible_facet_angle_is_refused(angle):
+    with pytest.raises(ValueError, match=r"facet_angle: got .*, wanted degrees above 0"):
+        transmission_300(facet_angle=angle)
+
+
+# ---------------------------------------------------------------- foil and film
+
+
+def test_the_first_orders_of_the_film_are_as_bright_as_sinusoids_can_make_them():
+    kappa = 2 * np.pi * 0.5 / 0.55
+    first = [order_powers(film(depth=depth), kappa)[0, 1] for depth in (0.6, film().height_range, 0.9)]
+    assert (
+        first[1]
+        == max(first)
+        == pytest.approx(np.max(jv(1, x := np.linspace(0, 2, 999)) ** 2 * jv(0, x) ** 2), rel=1e-2)
+    )
+    assert film().tile_size == pytest.approx((1000 / 530, 1000 / 530))
 
 
 def test_a_crossed_foil_has_products_of_bessel_orders():
@@ -269,11 +309,14 @@ def test_a_recipe_and_a_scene_agree_on_coherence_length_and_patches(name):
 # ---------------------------------------------------------------- recipes, and by name in a scene
 
 
-@pytest.mark.parametrize("name", ["blaze", "ruled_600", "ruled_1200", "foil_crossed", "foil_hexagonal"])
-def test_recipes_of_gratings_are_small_and_keep_their_tolerance(name):
+SMALL = ["blaze", "ruled_600", "ruled_1200", "foil_crossed", "foil_hexagonal", "transmission_300", "transmission_600"]
+
+
+@pytest.mark.parametrize(("name", "megabytes"), [*((name, 0.05) for name in SMALL), ("film", 0.11)])
+def test_recipes_of_gratings_are_small_and_keep_their_tolerance(name, megabytes):
     spectrum = Recipe.load(RECIPES / f"{name}.toml").build()
     assert spectrum.error <= 1e-3
-    assert spectrum.megabytes < 0.05
+    assert spectrum.megabytes < megabytes
 
 
 @pytest.mark.slow
@@ -288,6 +331,9 @@ NAMED = {
     "blazed": {},
     "ruled": {"lines_per_mm": 1200.0},
     "foil": {"directions": 3},
+    "film": {"samples": 32},
+    "transmission_300": {"facet_angle": 20.0},
+    "transmission_600": {},
     "compact_disc": {"tracks": 2, "length": 13.0},
     "dvd": {"tracks": 2, "length": 8.0},
     "elaphe": {"size": 7.0},
@@ -314,7 +360,7 @@ def test_a_ready_surface_is_used_in_a_scene_by_its_name(name):
 
 
 @pytest.mark.few(1)
-@pytest.mark.parametrize("name", ["blazed", "ruled", "foil"])
+@pytest.mark.parametrize("name", ["blazed", "ruled", "foil", "film", "transmission_300"])
 def test_gratings_are_ready_without_any_number(name):
     mi.set_variant("scalar_spectral")
     bsdf = mi.load_dict({"type": "diffraction_grating", "profile": name})

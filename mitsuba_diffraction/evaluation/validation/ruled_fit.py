@@ -18,7 +18,7 @@ from scipy.optimize import minimize_scalar
 from ...errors import RequestError
 from ...rigorous.efficiencies import efficiencies
 from ...scalar_theory import profile_powers, scalar_orders
-from ...surface.heightfield import HeightField
+from ...surface.gratings import right_angled
 
 Real = NDArray[np.float64]
 
@@ -44,21 +44,6 @@ def aluminium(wavelength: float) -> complex:
     for strength, damping, resonance in _INTERBAND:
         permittivity += strength * _PLASMA**2 / (resonance**2 - energy**2 - 1j * energy * damping)
     return complex(np.sqrt(permittivity))
-
-
-def right_angled(period: float, facet_angle: float, samples: int = 512) -> HeightField:
-    """Return one period, (1, samples), of two facets that meet at 90°; the wider rises along +x.
-
-    Args:
-        period: µm.
-        facet_angle: between the wider facet and the surface, degrees, above 0 and at most 45.
-    """
-    slope = np.tan(np.deg2rad(facet_angle))
-    x = (np.arange(samples) + 0.5) / samples
-    heights = period * np.minimum(x * slope, (1 - x) / slope)
-    return HeightField(
-        heights[None], (period / samples, period), f"ruled grating, period {period:g} µm, facets of {facet_angle:g}°"
-    )
 
 
 def littrow(period: float, facet_angle: float, wavelength: float, rigorous: bool) -> float:
