@@ -520,10 +520,11 @@ class OrderSpectrum:
     """S(q; κ) = Σ_m η_m(κ) N(q − m/T; σ_q² I), and the density from which q is drawn.
 
     N ends as `OrderGrid.lobes` says. Orders that stand apart need one of them, so that one evaluation reads
-    `order_power` once; a tile as large as the coherence length needs 4 × 4. With a lateral scale s orders that stand
-    apart lie at m/(sT), with lobes as wide as without: tables are read at sq. The density is Σ_m P_m N(q − m/T) with the
+    `order_power` once; a tile as large as the coherence length needs 4 × 4. The density is Σ_m P_m N(q − m/T) with the
     P_m of `OrderSampler`; where orders overlap, that of `CellSampler`. For a line grating whose orders overlap or are
     wide, it is that of `LineSampler`.
+
+    With a lateral scale s, orders that stand apart lie at m/(sT), with lobes as wide as without: the rest is read at sq.
     """
 
     def __init__(self, spectrum: GratingSpectrum, most: float | None = None, farthest: float = 1.0) -> None:

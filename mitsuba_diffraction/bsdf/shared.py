@@ -8,9 +8,10 @@ import weakref
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
 from ..energy.furnace import Furnace
-from ..energy.table import EnergyTable, corners
+from ..energy.table import EnergyTable, Stretched, between, corners
 from ..precomputation import Spectrum
 from ..rigorous.spectrum import RigorousSpectrum
 from ..settings import VISIBLE
@@ -21,6 +22,8 @@ from .rigorous_orders import RigorousOrders
 from .spline_spectrum import SplineSpectrum
 
 STEP = 1e-3  # of height_scale, for the derivative of the energy table
+TURN = 0.25  # radians between tables over the ratio of scales
+PARTS = 16  # of an interval of ratios, at most
 
 _making = threading.Lock()
 _shared: weakref.WeakValueDictionary[tuple[str, str, float | None], SharedTables] = weakref.WeakValueDictionary()
@@ -74,6 +77,30 @@ class SharedTables:
                 table = self.energy_table(scale)
                 self._last = scale, Energy(table) if table.needed else None
             return self._last[1]
+
+    def scaled_energy(
+        self, ratios: NDArray[np.float64], laterals: NDArray[np.float64], complete: bool
+    ) -> Energy | None:
+        """Return the factor E where scales vary, or None if it is one for all; `Scales.ratios` has the arguments.
+
+        Each ratio has its table if there are no others; else there are bounds for the parts of their interval, between
+        which and the middle phases turn by `TURN` at most where there are no more than `PARTS` of them.
+        """
+        spectrum = self._spectrum
+        if not complete:
+            low, high = ratios
+            turn = 0.5 * spectrum.largest_kappa * spectrum.height_range * (high - low)
+            ratios = np.linspace(low, high, 2 * int(np.clip(turn / (2 * TURN), 1, PARTS)) + 1)
+            laterals = np.repeat(laterals[:1], len(ratios))
+        tables = [
+            EnergyTable.of(Stretched(spectrum, float(lateral)), float(ratio))
+            for ratio, lateral in zip(ratios, laterals, strict=True)
+        ]
+        edges = (ratios[1:] + ratios[:-1]) / 2
+        if not complete:
+            tables, edges = [between(*tables[k : k + 3]) for k in range(0, len(ratios) - 2, 2)], ratios[2:-1:2]
+        needed = any(table.needed for table in tables)
+        return Energy(tables[0], ratios=(tables, [float(edge) for edge in edges])) if needed else None
 
     def energy_table(self, height_scale: float) -> EnergyTable:
         """The spectrum's own, or made for other heights."""

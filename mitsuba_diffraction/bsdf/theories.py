@@ -14,9 +14,9 @@ from ..settings import VISIBLE
 from .coat import Coat
 from .geometry import Geometry, turned
 from .media import Media
-from .scales import Scales
 from .polarisation import Split, of_interface, of_orders, of_plane, unpolarised
 from .reflectance import Conductor, PerfectMirror, reflectance_from
+from .scales import Scales
 from .shared import SharedTables
 from .tables import opaque
 from .transmission import Interface
@@ -101,8 +101,11 @@ class ScalarTheory:
         scales.check(self.spectrum.wavelengths, self.media.index, getattr(self.scattering, "max_scale", None))
         conserves = self.conserve_energy and self.shadowing and self.media.eta is None
         self.energy = None
-        if conserves and scales.lateral is None and not scales.height.varies:
-            self.energy = self.tables.energy(scales.height.value)
+        if conserves:
+            vary = scales.vary
+            self.energy = (
+                self.tables.scaled_energy(*scales.ratios()) if vary else self.tables.energy(scales.height.value)
+            )
         self.interface = None
         if self.media.eta is not None:
             undiffracted = 1.6e3 * np.pi * abs(self.media.eta - 1) / VISIBLE[1] * self.media.outside
@@ -129,7 +132,7 @@ class ScalarTheory:
         """Return `value` times R E."""
         if self.energy is not None:
             inside = mi.UnpolarizedSpectrum(si.wavelengths) * (1e-3 / self.media.outside / geometry.index)
-            value *= self.energy.factor(*geometry.inside(), inside)
+            value *= self.energy.factor(*geometry.inside(), inside, geometry.height_scale, geometry.lateral_scale)
         reflected = self.material(si, geometry.cos_half(), active)
         if self.media.eta is not None:
             reflected = dr.select(geometry.reflects, reflected, 1 - reflected)

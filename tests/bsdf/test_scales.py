@@ -112,14 +112,14 @@ def test_samples_of_scaled_gratings_are_unbiased(llvm, surface, parameters, late
 def test_textures_of_scales_are_read_at_the_point(llvm):
     of = for_scales(SURFACES["blazed"](), 1.5)
     laterals, heights = np.array([[0.7, 1.0], [1.2, 1.5]]), np.array([[0.4, 0.8, 1.1]])
-    textured = plugin(of, lateral_scale=bitmap(laterals), height_scale=bitmap(heights))
+    textured = plugin(of, lateral_scale=bitmap(laterals), height_scale=bitmap(heights), conserve_energy=False)
     for v, row in enumerate(laterals):
         for u, lateral in enumerate(row):
             for column, height in enumerate(heights[0]):
                 uv = ((u + (column + 0.5) / 3) / 2, (v + 0.5) / 2)
                 height = heights[0, int(uv[0] * 3)]
                 wo = near_orders(lateral, LINE)
-                alone = plugin(of, lateral_scale=lateral, height_scale=height)
+                alone = plugin(of, lateral_scale=lateral, height_scale=height, conserve_energy=False)
                 for found, wanted in zip(evaluate(textured, WI, wo, uv=uv), evaluate(alone, WI, wo), strict=True):
                     np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-4 * wanted.max())
 
@@ -137,7 +137,7 @@ def test_scales_in_other_variants(variant):
 
     def evaluated(name):
         use(name)
-        scales = {"lateral_scale": bitmap([[0.7, 1.3]]), "height_scale": bitmap([[0.5, 0.9]])}
+        scales = {"lateral_scale": bitmap([[0.7, 1.3]]), "height_scale": bitmap([[0.5, 0.9]]), "conserve_energy": False}
         return evaluate(plugin(of, **scales), WI, wo, uv=uv)
 
     wanted, found = evaluated("llvm_ad_spectral"), evaluated(variant)
@@ -228,3 +228,65 @@ def test_scales_that_let_orders_overlap_are_refused(llvm):
     of = for_scales(corner_blaze(), 1.5, coherence_length=10)
     with pytest.raises(RuntimeError, match=r"lateral_scale: got .*1.5.*, wanted 1 or less than 1\.\d+: only"):
         plugin(of, lateral_scale=1.5)
+
+
+def albedo_of_orders(bsdf, of, wi, wavelength, lateral, uv):
+    """∫ f cos θ_o dω_o = ∫ f du dv of one wavelength (nm), by the sum over points in the lobes of all orders."""
+    offsets = 0.32 * of.lobe_width * np.arange(-10, 11)
+    q = [(q[:, None] / lateral + offsets).ravel() for q in of.grid.frequencies()]
+    t = -1e-3 * wavelength * np.stack(np.meshgrid(*q), -1).reshape(-1, 2) - wi[:2]
+    t = t[(t**2).sum(-1) < 1 - 1e-8]
+    wo = np.concatenate([t, np.sqrt(1 - (t**2).sum(-1, keepdims=True))], -1)
+    value = evaluate(bsdf, wi, wo, uv=uv, wavelengths=(wavelength,) * 4)[0][0].astype(np.float64)
+    return (value / wo[:, 2]).sum() * (1e-3 * wavelength * offsets[11]) ** 2
+
+
+def grazing(rng, count):
+    """Directions, half of them uniform in solid angle, half in the polar angle, to 89.5°."""
+    uniform = random_directions(rng, count, 0.01)
+    polar = direction(rng.uniform(0, 89.5, count), rng.uniform(0, 360, count))
+    return np.where(rng.random(count)[:, None] < 0.5, uniform, polar)
+
+
+SCALED = {
+    "sinusoidal": lambda: md.gratings.sinusoidal(1.0, 0.25),
+    "blazed": lambda: md.gratings.blazed(2.5, 0.25),
+    "foil": lambda: md.gratings.foil(1.0, 0.15, directions=3),
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "pairs"),
+    [("sinusoidal", 8), *(pytest.param(name, 100, marks=pytest.mark.slow) for name in sorted(SCALED))],
+)
+def test_no_albedo_above_one_at_random_scales(llvm, name, pairs):
+    """Of scales that are too many for a table each."""
+    rng, side = np.random.default_rng(5), int(np.ceil(np.sqrt(pairs)))
+    of = for_scales(SCALED[name](), 1.6, coherence_length=20)
+    laterals, heights = rng.uniform(0.6, 1.6, (side, side)), rng.uniform(0, 1.6, (side, side))
+    if pairs < 20:
+        # Fewer tables for fewer pairs: heights that hardly turn the phase.
+        heights = rng.uniform(0.8, 0.9, (side, side))
+    bsdf = plugin(of, lateral_scale=bitmap(laterals), height_scale=bitmap(heights))
+    found = [
+        albedo_of_orders(
+            bsdf, of, wi, rng.uniform(360, 830), laterals[place], ((place[1] + 0.5) / side, (place[0] + 0.5) / side)
+        )
+        for place, wi in zip(list(np.ndindex(side, side))[:pairs], grazing(rng, pairs), strict=True)
+    ]
+    assert max(found) <= 1.002
+    assert np.mean(found) > 0.7
+
+
+@pytest.mark.parametrize("name", ["sinusoidal", pytest.param("foil", marks=pytest.mark.slow)])
+def test_few_scales_lose_no_more_than_one_grating(llvm, name):
+    """E of each of three pitches is that of a grating built with it."""
+    of, laterals = for_scales(SCALED[name](), 1.5, coherence_length=20), (0.8, 1.0, 1.4)
+    bsdf = plugin(of, lateral_scale=bitmap([laterals]))
+    rng = np.random.default_rng(6)
+    for k, lateral in enumerate(laterals):
+        alone = plugin(for_scales(stretched(SCALED[name](), lateral, 1), 1.5, coherence_length=20))
+        for wi in grazing(rng, 4):
+            lost = [albedo_of_orders(b, of, wi, 450.0, lateral, ((k + 0.5) / 3, 0.5)) for b in (bsdf, alone)]
+            assert lost[0] <= 1.002
+            assert lost[0] > lost[1] - 0.01
