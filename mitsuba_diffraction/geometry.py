@@ -35,6 +35,52 @@ def k_g_between(wi: ArrayLike, wo: ArrayLike, shadowing: bool = True) -> NDArray
     return k_g(wi[..., 2], wo[..., 2], ((wi + wo) ** 2).sum(axis=-1) / 2, shadowing)
 
 
+def fresnel(cosine: ArrayLike, index: float) -> NDArray[np.float64]:
+    """Return F, the reflectance of unpolarised light, of an interface with the relative index n_o/n_i.
+
+    Args:
+        cosine: of the angle of incidence; shapes broadcast.
+        index: n_o/n_i, real. Below one, light is totally reflected beyond the critical angle.
+    """
+    within = np.sqrt(np.maximum(1 - (1 - np.square(cosine)) / index**2, 0))
+    return _fresnel(cosine, within, index)
+
+
+def _fresnel(cos_i: ArrayLike, cos_o: ArrayLike, index: float) -> NDArray[np.float64]:
+    """Return F from the cosines on both sides."""
+    s = (cos_i - index * cos_o) / np.maximum(cos_i + index * cos_o, 1e-12)
+    p = (index * cos_i - cos_o) / np.maximum(index * cos_i + cos_o, 1e-12)
+    return (s**2 + p**2) / 2
+
+
+def transmitted(
+    cos_i: ArrayLike, cos_o: ArrayLike, tangent: ArrayLike, index: float, least: ArrayLike = 0.0
+) -> NDArray[np.float64]:
+    """Return K_t G_t (1 − F) of a pair of directions on both sides of an interface; shapes broadcast.
+
+    With v = ω_i + η ω_o, h = v/|v| and lengths in units of n_i (K_t as in Walter et al. 2007),
+
+        K_t = |ω_i·v| |ω_o·v| / (cos θ_i cos θ_o v_z²),    G_t = min(1, 2 cos θ_i/|ω_i·h|, 2 cos θ_o/|ω_o·h|)²
+
+    so that an order vanishes as cos θ towards the horizon, as rigorous orders do. Where |v|² > |1 − η²| no facet
+    refracts ω_i into ω_o, and nothing is transmitted; at the limit F = 1.
+
+    Args:
+        cos_i, cos_o: |cos θ_i| and |cos θ_o|, positive.
+        tangent: |ω_i,t + η ω_o,t|² = |λq|², λ in the medium of ω_i.
+        index: η = n_o/n_i.
+        least: |v_z| at least, in K_t.
+    """
+    v_z = np.abs(cos_i - index * cos_o)
+    square = tangent + v_z**2
+    # |ω_i·v| and |ω_o·v|
+    i, o = np.abs(square + 1 - index**2) / 2, np.abs(square - 1 + index**2) / (2 * index)
+    length = np.sqrt(square)
+    g = np.minimum(1, 2 * length * np.minimum(cos_i / np.maximum(i, 1e-12), cos_o / np.maximum(o, 1e-12))) ** 2
+    k = i * o / np.maximum(cos_i * cos_o * np.maximum(v_z, least) ** 2, 1e-12)
+    return k * g * (square < np.abs(1 - index**2)) * (1 - _fresnel(i, o, index))
+
+
 def horizon_gain(x: ArrayLike) -> NDArray[np.float64]:
     """Return g(x), which compensates the power of a Gaussian lobe below the horizon; x ≥ 0 in standard deviations.
 

@@ -40,6 +40,7 @@ def precompute(
     material: str | None = None,
     ext_ior: float = 1.0,
     polarised: bool = False,
+    transmission: str = "none",
 ) -> Spectrum:
     """Compute the spectrum of the phase e^{iκh}, or the table of rigorous efficiencies, its error at most `tolerance`.
 
@@ -75,6 +76,7 @@ def precompute(
         material=material,
         ext_ior=ext_ior,
         polarised=polarised,
+        transmission=transmission,
     )
     patches = (height_field,) if isinstance(height_field, HeightField) else tuple(height_field)
     check_patches(patches, extent)

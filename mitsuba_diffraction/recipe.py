@@ -36,6 +36,7 @@ material = "Al"                  # a conductor by Mitsuba's name,
 int_ior = 1.5                    # or an index of refraction;
 ext_ior = 1.0                    # of the medium above, that of a coat
 polarised = false                # with Mueller matrices, for polarised variants
+transmission = "none"            # or, of a dielectric, "interface" or "sheet": what is transmitted, too
 """
 
 from __future__ import annotations

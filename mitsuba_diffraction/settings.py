@@ -27,6 +27,10 @@ REPRESENTATIONS = ("auto", "taylor", "chebyshev", "svd", "slices")
 LEAST_TOLERANCE = 1e-5
 
 
+TRANSMISSIONS = ("none", "interface", "sheet")
+"""What becomes of the light that enters a dielectric: it is lost, goes on in it, or leaves through a plane below."""
+
+
 @dataclass(frozen=True)
 class Settings:
     """The parameters of a spectrum, as recipes, scenes, the command line and `precompute` have them.
@@ -50,6 +54,7 @@ class Settings:
             are those there.
         polarised: of rigorous theory, whether polarised variants can use the table, which is then seventeen times as
             large.
+        transmission: of rigorous theory, "interface" or "sheet" for what a dielectric transmits, too.
 
     Raises:
         ValueError: if one is out of range, or they contradict each other.
@@ -67,11 +72,16 @@ class Settings:
     material: str | None = None
     ext_ior: float = 1.0
     polarised: bool = False
+    transmission: str = "none"
 
     def __post_init__(self) -> None:
         if self.extent not in EXTENTS:
             raise RequestError(f"extent: got {self.extent!r}, wanted 'tile' or 'sample'")
-        for name, known in (("theory", THEORIES), ("representation", REPRESENTATIONS)):
+        for name, known in (
+            ("theory", THEORIES),
+            ("representation", REPRESENTATIONS),
+            ("transmission", TRANSMISSIONS),
+        ):
             if (value := getattr(self, name)) not in known:
                 raise RequestError(f"{name}: got {value!r}, wanted one of {', '.join(known)}")
         for name in ("coherence_length", "largest_angle", "tolerance", "largest_height_range", "ext_ior"):
@@ -110,12 +120,21 @@ class Settings:
                 f"theory: got rigorous with extent {self.extent!r}, largest_angle {self.largest_angle!r} and "
                 f"representation {self.representation!r}; it has its own table of a tile, for all directions"
             )
-        of_rigorous = self.int_ior, self.material, self.ext_ior, self.polarised
-        if self.theory == "scalar" and of_rigorous != (None, None, 1, False):
+        of_rigorous = self.int_ior, self.material, self.ext_ior, self.polarised, self.transmission
+        if self.theory == "scalar" and of_rigorous != (None, None, 1, False, "none"):
             raise RequestError(
-                "int_ior, material, ext_ior, polarised: the spectrum of scalar theory is that of every material; "
-                "wanted none of them"
+                "int_ior, material, ext_ior, polarised, transmission: the spectrum of scalar theory is that of every "
+                "material; wanted none of them"
             )
+        if self.transmission != "none":
+            if self.int_ior is None or np.imag(self.int_ior) != 0:
+                raise RequestError(
+                    f"transmission: got {self.transmission} and int_ior {self.int_ior!r}, wanted a dielectric"
+                )
+            if self.ext_ior != 1:
+                raise RequestError(
+                    f"transmission: got {self.transmission} and ext_ior {self.ext_ior!r}, wanted no coat"
+                )
 
 
 def lobe_width(coherence_length: float) -> float:

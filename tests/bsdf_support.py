@@ -10,7 +10,7 @@ import pytest
 import mitsuba_diffraction as md
 from mitsuba_diffraction import testing
 from mitsuba_diffraction.rigorous.axes import Axes
-from mitsuba_diffraction.rigorous.spectrum import RigorousSpectrum
+from mitsuba_diffraction.rigorous.spectrum import RigorousSpectrum, Table
 
 array, direction, floats, vectors = testing.array, testing.direction, testing.floats, testing.vectors
 WAVELENGTHS = (400.0, 500.0, 600.0, 700.0)
@@ -47,7 +47,7 @@ def made_up(coherence_length=65.0):
         x = np.sin(0.2 * np.arange(side) + m) ** 2
         square = (1 + np.add.outer(x, x)) * np.linspace(1, 2, axes.planes)[:, None, None] / (60 + 5 * m)
         values[:, start : start + side**2] = square.reshape(axes.planes, -1)
-    return RigorousSpectrum(axes, values, "Al", 0j, coherence_length, 0.01, 0, 0, 0, 1, "made up", "")
+    return RigorousSpectrum((Table(axes, values),), "Al", 0j, coherence_length, 0.01, 0, 0, 0, 1, "made up", "")
 
 
 def use(variant):

@@ -1,11 +1,15 @@
-"""E(ω_i, ω_o, λ) at run time: what keeps the grating from reflecting more light than it receives.
+"""E(ω_i, ω_o, λ) at run time: what keeps the grating from sending out more light than it receives.
 
-E = min(e(ω_i, λ), e(ω_o, λ)), e as in `energy/table.py`.
+E = min(e(ω_i, λ), e(ω_o, λ)), e as in `energy/table.py`; of an interface, e of each side and of
+reflected or transmitted light.
+
+With lengths along the surface times s and heights times h, a relief is at λ what it is with heights times r = h/s at
+λ/s: where scales vary there are tables over r, read at λ/s.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import drjit as dr
@@ -13,17 +17,20 @@ import mitsuba as mi
 import numpy as np
 
 from ..energy.table import EnergyTable
-from .tables import NumberTable, PacketTable, larger, limited, opaque, smaller
+from .tables import FloatTable, NumberTable, PacketTable, larger, limited, opaque, smaller
 
 
 @dataclass
 class Place:
-    """c − ω_x and c + ω_x of a direction, and where it lies among the slices: the one below, and how far from it."""
+    """c − ω_x and c + ω_x of a direction, where it lies among the slices (the one below, and how far from it),
+    whether it is under the surface, and where its ratio of scales lies among those of tables."""
 
     u: mi.Float
     v: mi.Float
     below: mi.UInt32
     beyond: mi.Float
+    under: mi.Bool
+    ratio: mi.UInt32 | None = None
 
 
 class Energy:
@@ -33,51 +40,111 @@ class Energy:
     of four bytes, or two where e is linear between slices: reads cost more than the arithmetic.
     """
 
-    def __init__(self, table: EnergyTable, slope: np.ndarray | None = None, change: mi.Float | None = None) -> None:
-        """`slope` times `change`, which is zero but for its gradient, is added to the table."""
-        self.loss, layout = table.loss, table.layout
-        self.slices, self.side = table.steps.shape[:2]
-        self.layout = layout
-        self.table = NumberTable(table.steps @ (np.uint32(1) << np.arange(0, 32, 8, dtype=np.uint32)))
-        self.step = opaque((1 - table.least) / 255)
-        self.slope = None if slope is None else PacketTable(slope)
+    def __init__(
+        self,
+        tables: Sequence[EnergyTable],
+        slopes: np.ndarray | None = None,
+        change: mi.Float | None = None,
+        index: float = 1.0,
+        edges: Sequence[float] | None = None,
+    ) -> None:
+        """Pack the tables.
+
+        Args:
+            tables: of reflected light; or, of an interface, of reflected and of transmitted light from above, and the
+                same from below.
+            slopes: times `change`, are added to the tables; those of one after the other.
+            change: zero but for its gradient.
+            index: n below relative to n above.
+            edges: where scales vary, the ratios between that of one and that of the next; tables of one ratio follow
+                those of the one before.
+        """
+        first, layout = tables[0], tables[0].layout
+        self.loss = np.max([table.loss for table in tables], axis=0)
+        self.slices, self.side = first.steps.shape[:2]
+        self.layout, self.cells_of_table = layout, first.steps.size // 4
+        self.two_sided = len(tables) > 1 + len(edges or ())
+        steps = np.concatenate([of.steps for of in tables])
+        self.table = NumberTable(steps @ (np.uint32(1) << np.arange(0, 32, 8, dtype=np.uint32)))
+        heights = [(1 - of.least) / 255 for of in tables]
+        self.steps = [opaque(height) for height in heights] if edges is None else FloatTable(np.array(heights))
+        self.edges = None if edges is None else [opaque(edge) for edge in edges]
+        self.slope = None if slopes is None else PacketTable(slopes)
         self.change = change
-        self.period = opaque(layout.period)
+        # Wavelengths are those above.
+        self.periods = [opaque(tables[k].layout.period * n) for k, n in ((0, 1), (-1, index))]
         self.squares = opaque(layout.squares - 1)
         self.cells, self.first_cells = opaque(layout.cells), opaque(layout.first)
 
     def __str__(self) -> str:
         return "bounds the albedo by one, and loses {:.2g} in the mean, {:.2g} at most".format(*self.loss)
 
-    def factor(self, wi: mi.Vector3f, wo: mi.Vector3f, wavelengths: mi.UnpolarizedSpectrum) -> mi.UnpolarizedSpectrum:
-        """E of each wavelength."""
+    def factor(
+        self,
+        wi: mi.Vector3f,
+        wo: mi.Vector3f,
+        wavelengths: mi.UnpolarizedSpectrum,
+        height_scale: mi.Float,
+        lateral_scale: mi.Float | None,
+    ) -> mi.UnpolarizedSpectrum:
+        """Return E of each wavelength.
+
+        Args:
+            wi, wo: along the pattern's axes, each inside the medium that it is in, z < 0 below.
+            wavelengths: µm, in the medium above.
+            height_scale: of the heights at the point; of effect where there are tables for it.
+            lateral_scale: likewise; None for one.
+        """
         there, back = self.place(wi), self.place(wo)
+        if self.edges is not None:
+            lateral_scale = mi.Float(1.0) if lateral_scale is None else dr.detach(lateral_scale)
+            ratio = dr.detach(height_scale) / lateral_scale
+            there.ratio = back.ratio = sum((dr.select(ratio > e, mi.UInt32(1), 0) for e in self.edges), mi.UInt32(0))
+            wavelengths = wavelengths / lateral_scale
+        passes = wi.z * wo.z < 0
         result = mi.UnpolarizedSpectrum(1.0)
         for channel in range(len(result)):
             frequency = dr.rcp(wavelengths[channel])
-            result[channel] = smaller(self.bound(there, frequency), self.bound(back, frequency))
+            result[channel] = smaller(self.bound(there, frequency, passes), self.bound(back, frequency, passes))
         return result
 
     def place(self, omega: mi.Vector3f) -> Place:
-        """The place of ω, along the pattern's axes."""
+        """Return the place of ω, along the pattern's axes."""
         x, y = (omega.y, omega.x) if self.layout.turned else (omega.x, omega.y)
-        square = dr.square(larger(omega.z, 0))
+        square = dr.square(omega.z if self.two_sided else larger(omega.z, 0))
         c = dr.sqrt(dr.square(x) + square)
         longer = c + dr.abs(x)
         # c − |x| without cancellation.
         shorter = square / larger(longer, 1e-12)
-        place = Place(dr.select(x > 0, shorter, longer), dr.select(x > 0, longer, shorter), mi.UInt32(0), mi.Float(0))
+        u, v = dr.select(x > 0, shorter, longer), dr.select(x > 0, longer, shorter)
+        place = Place(u, v, mi.UInt32(0), mi.Float(0), omega.z < 0)
         if not self.layout.lines:
             y = y / (1 + c)
             row = 0.5 * (self.slices - 1) * (1 + dr.copysign(1 - _equidistant(1 - dr.abs(y)), y))
             place.below, place.beyond = _cell(row, self.slices - 1)
         return place
 
-    def bound(self, place: Place, frequency: mi.Float) -> mi.Float:
-        """e of the direction at `place`; `frequency` is 1/λ in 1/µm."""
-        per_length = self.period * frequency
-        (column, x), (row, y) = (self._column(u * per_length) for u in (place.u, place.v))
+    def bound(self, place: Place, frequency: mi.Float, passes: mi.Bool | None = None) -> mi.Float:
+        """Return e of reflected light, or of light that passes, of the direction at `place`.
+
+        `frequency` is 1/λ in 1/µm, λ in the medium above.
+        """
+        period, number = self.periods[0], place.ratio
+        if self.two_sided:
+            period = dr.select(place.under, self.periods[1], period)
+            number = dr.select(place.under, mi.UInt32(2), 0) + dr.select(passes, mi.UInt32(1), 0)
+            number = number if place.ratio is None else 4 * place.ratio + number
+        if place.ratio is not None:
+            step = self.steps(number, True)
+        elif self.two_sided:
+            above, below = (dr.select(passes, self.steps[k + 1], self.steps[k]) for k in (0, 2))
+            step = dr.select(place.under, below, above)
+        else:
+            step = self.steps[0]
+        (column, x), (row, y) = (self._column(u * (period * frequency)) for u in (place.u, place.v))
         index = (place.below * self.side + row) * self.side + column
+        if number is not None:
+            index += number * self.cells_of_table
 
         def between(corners: Callable[[mi.UInt32], mi.Vector4f]) -> mi.Float:
             values = corners(index)
@@ -86,13 +153,13 @@ class Energy:
             return dr.lerp(dr.lerp(values[0], values[1], x), dr.lerp(values[2], values[3], x), y)
 
         # From above, so that one stays one.
-        e = 1 - (255 - between(lambda i: _bytes(self.table(i)))) * self.step
+        e = 1 - (255 - between(lambda i: _bytes(self.table(i)))) * step
         if self.slope is not None:
             e += between(lambda i: self.slope(i, True)) * self.change
         return e
 
     def _column(self, u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
-        """The cell of u along one axis, and the place in it."""
+        """Return the cell of u along one axis, and the place in it."""
         square = smaller(dr.floor(u), self.squares)
         inner = square > 0
         cells = dr.select(inner, self.cells, self.first_cells)
@@ -102,7 +169,7 @@ class Energy:
 
 
 def _equidistant(f: mi.Float) -> mi.Float:
-    """√f, from 0 to 1."""
+    """Return √f, from 0 to 1."""
     return dr.sqrt(limited(f, 0, 1))
 
 
@@ -111,7 +178,7 @@ def _bytes(number: mi.UInt32) -> mi.Vector4f:
 
 
 def _cell(x: mi.Float, count: mi.Float | int) -> tuple[mi.UInt32, mi.Float]:
-    """The cell of x, 0 ≤ x ≤ count, and the place in it; outside, the nearest."""
+    """Return the cell of x, 0 ≤ x ≤ count, and the place in it; outside, the nearest."""
     x = limited(x, 0, count)
     cell = dr.minimum(mi.UInt32(x), mi.UInt32(count) - 1)
     return cell, x - mi.Float(cell)

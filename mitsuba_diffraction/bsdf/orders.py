@@ -524,7 +524,7 @@ class OrderSpectrum:
     P_m of `OrderSampler`; where orders overlap, that of `CellSampler`. For a line grating whose orders overlap or are
     wide, it is that of `LineSampler`.
 
-    With a lateral scale s, orders that stand apart lie at m/(sT), with lobes as wide as without: the rest is read at sq.
+    With a lateral scale s, orders that stand apart lie at m/(sT), with lobes as wide: tables are read at sq.
     """
 
     def __init__(self, spectrum: GratingSpectrum, most: float | None = None, farthest: float = 1.0) -> None:

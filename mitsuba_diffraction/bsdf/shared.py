@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import weakref
+from collections.abc import Sequence
 
 import drjit as dr
 import mitsuba as mi
@@ -42,7 +43,7 @@ class SharedTables:
         else:
             represented = OrderSpectrum if isinstance(spectrum.grid, OrderGrid) else SplineSpectrum
             self.scattering = represented(spectrum, *([] if eta is None else passing(eta)))
-        self._spectrum = spectrum
+        self._spectrum, self._eta = spectrum, eta
         self._last: tuple[float, Energy | None] | None = None
         self._lock = threading.Lock()
 
@@ -67,15 +68,17 @@ class SharedTables:
         Where a gradient is tracked through `height_scale`, the entries of the table carry theirs, from a central
         difference.
         """
-        scale = float(np.max(height_scale))
+        scale, index = float(np.max(height_scale)), self._eta or 1.0
         if dr.grad_enabled(height_scale):
-            table, lower, upper = self.energy_table(scale), max(scale - STEP, 0.0), scale + STEP
-            above, below = (self.corners(table, s) for s in (upper, lower))
-            return Energy(table, (above - below) / (upper - lower), height_scale - dr.detach(height_scale))
+            tables, lower, upper = self.energy_tables(scale), max(scale - STEP, 0.0), scale + STEP
+            above, below = (self.corners(tables, s) for s in (upper, lower))
+            slopes = (above - below) / (upper - lower)
+            return Energy(tables, slopes, height_scale - dr.detach(height_scale), index)
         with self._lock:
             if self._last is None or self._last[0] != scale:
-                table = self.energy_table(scale)
-                self._last = scale, Energy(table) if table.needed else None
+                tables = self.energy_tables(scale)
+                needed = any(table.needed for table in tables)
+                self._last = scale, Energy(tables, index=index) if needed else None
             return self._last[1]
 
     def scaled_energy(
@@ -83,8 +86,8 @@ class SharedTables:
     ) -> Energy | None:
         """Return the factor E where scales vary, or None if it is one for all; `Scales.ratios` has the arguments.
 
-        Each ratio has its table if there are no others; else there are bounds for the parts of their interval, between
-        which and the middle phases turn by `TURN` at most where there are no more than `PARTS` of them.
+        Each ratio has its tables if there are no others; else there are bounds for the parts of their interval, from
+        its ends and its middle, between which phases turn by `TURN` unless there would be more than `PARTS`.
         """
         spectrum = self._spectrum
         if not complete:
@@ -92,23 +95,34 @@ class SharedTables:
             turn = 0.5 * spectrum.largest_kappa * spectrum.height_range * (high - low)
             ratios = np.linspace(low, high, 2 * int(np.clip(turn / (2 * TURN), 1, PARTS)) + 1)
             laterals = np.repeat(laterals[:1], len(ratios))
-        tables = [
-            EnergyTable.of(Stretched(spectrum, float(lateral)), float(ratio))
+        found = [
+            self.energy_tables(float(ratio), Stretched(spectrum, float(lateral)))
             for ratio, lateral in zip(ratios, laterals, strict=True)
         ]
         edges = (ratios[1:] + ratios[:-1]) / 2
         if not complete:
-            tables, edges = [between(*tables[k : k + 3]) for k in range(0, len(ratios) - 2, 2)], ratios[2:-1:2]
+            found = [[between(*of) for of in zip(*found[k : k + 3], strict=True)] for k in range(0, len(ratios) - 2, 2)]
+            edges = ratios[2:-1:2]
+        tables = [table for of_ratio in found for table in of_ratio]
         needed = any(table.needed for table in tables)
-        return Energy(tables[0], ratios=(tables, [float(edge) for edge in edges])) if needed else None
+        return Energy(tables, index=self._eta or 1.0, edges=edges.tolist()) if needed else None
 
-    def energy_table(self, height_scale: float) -> EnergyTable:
-        """The spectrum's own, or made for other heights."""
-        return self._spectrum.energy_table() if height_scale == 1 else EnergyTable.of(self._spectrum, height_scale)
+    def energy_tables(self, height_scale: float, stretched: Stretched | None = None) -> list[EnergyTable]:
+        """Return the spectrum's own, or those made for other heights, or for both sides where light passes.
 
-    def corners(self, table: EnergyTable, height_scale: float) -> np.ndarray:
-        """e at the corners of the cells of `table`, not rounded, for other heights."""
-        return corners(Furnace.of(self._spectrum, height_scale), table.layout)[0]
+        With a lateral scale they are of the stretched spectrum.
+        """
+        spectrum = stretched or self._spectrum
+        if self._eta is not None:
+            return EnergyTable.of_interface(spectrum, self._eta, height_scale)
+        own = height_scale == 1 and stretched is None
+        return [self._spectrum.energy_table() if own else EnergyTable.of(spectrum, height_scale)]
+
+    def corners(self, tables: Sequence[EnergyTable], height_scale: float) -> np.ndarray:
+        """Return e at the corners of the cells of `tables`, not rounded, for other heights."""
+        sides = ((1, tables[0]),) if self._eta is None else ((1, tables[0]), (-1, tables[-1]))
+        furnaces = [(Furnace.of(self._spectrum, height_scale, self._eta, side), table) for side, table in sides]
+        return np.concatenate([corners(furnace, table.layout)[0] for furnace, table in furnaces])
 
 
 def passing(eta: float) -> tuple[float, float]:

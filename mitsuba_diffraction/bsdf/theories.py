@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
+from ..energy.furnace import small_kappas
 from ..errors import RequestError
 from ..geometry import SHADOWING
 from ..grating_spectrum import GratingSpectrum
@@ -99,17 +99,13 @@ class ScalarTheory:
             )
         scales = self.scales
         scales.check(self.spectrum.wavelengths, self.media.index, getattr(self.scattering, "max_scale", None))
-        conserves = self.conserve_energy and self.shadowing and self.media.eta is None
         self.energy = None
-        if conserves:
-            vary = scales.vary
-            self.energy = (
-                self.tables.scaled_energy(*scales.ratios()) if vary else self.tables.energy(scales.height.value)
-            )
+        if self.conserve_energy and self.shadowing:
+            of_number = self.tables.energy
+            self.energy = self.tables.scaled_energy(*scales.ratios()) if scales.vary else of_number(scales.height.value)
         self.interface = None
         if self.media.eta is not None:
-            undiffracted = 1.6e3 * np.pi * abs(self.media.eta - 1) / VISIBLE[1] * self.media.outside
-            kappas = opaque(self.spectrum.table.first_interval / 4), opaque(undiffracted)
+            kappas = tuple(opaque(kappa) for kappa in small_kappas(self.spectrum, self.media.eta))
             self.interface = Interface(self.material.eta, self.media.transmission == "sheet", kappas)
 
     def parameters_changed(self, keys: list[str]) -> None:
@@ -131,8 +127,9 @@ class ScalarTheory:
     ) -> mi.UnpolarizedSpectrum:
         """Return `value` times R E."""
         if self.energy is not None:
-            inside = mi.UnpolarizedSpectrum(si.wavelengths) * (1e-3 / self.media.outside / geometry.index)
-            value *= self.energy.factor(*geometry.inside(), inside, geometry.height_scale, geometry.lateral_scale)
+            wavelengths = mi.UnpolarizedSpectrum(si.wavelengths) * (1e-3 / self.media.outside / geometry.index)
+            scales = geometry.height_scale, geometry.lateral_scale
+            value *= self.energy.factor(*geometry.inside(), wavelengths, *scales)
         reflected = self.material(si, geometry.cos_half(), active)
         if self.media.eta is not None:
             reflected = dr.select(geometry.reflects, reflected, 1 - reflected)

@@ -6,10 +6,16 @@ of 2π/λ and v = k_i + k_o:
     q = −v_∥/λ,    κ = 2π v_z/λ,    K = |k_i·v| |k_o·v| / (|k_i,z| |k_o,z| v_z²),    k_i·v = (|v|² + n_i² − n_o²)/2
 
 holds for reflection (n_i = n_o: the K of `geometry.py`) and for transmission alike (cf. Walter et al. 2007). κ has a
-sign: S(q; −κ) = S(−q; κ), so that tables for κ ≥ 0 serve, read at −q where κ < 0.
+sign: S(q; −κ) = S(−q; κ), so that tables for κ ≥ 0 serve, read at −q where κ < 0. Light passes only if
+|v|² < |n_i² − n_o²|: beyond, no facet refracts ω_i into ω_o, and at the limit F = 1. Of transmitted light
+
+    G = min(1, 2 cos θ_i/|ω_i·h|, 2 cos θ_o/|ω_o·h|)²
+
+takes orders to zero as cos θ at the horizon, as rigorous ones go; the shadows of V-cavities, with h_z in them, would
+take away light that is there where v_z is small.
 
 Where v_z → 0 the factor K grows without bound and S(q; κ) falls as κ². For |κ| < κ₁ both are taken together: v_z² is
-not less than that of κ₁, and the table gives κ₁²/κ² S (`tables.small`).
+not less than that of κ₁, and the table gives κ₁²/κ² S (`orders.small_kappa`).
 
 Of a sheet the lower face is flat, and outside of it there is the medium above once more: tangential components are
 those outside, normal components those inside.
@@ -108,7 +114,7 @@ class Crossing:
     Attributes:
         i, o: the sides of ω_i and ω_o.
         height_scale: times the heights.
-        shadowing: whether G is a factor of reflected light; of transmitted light there is none.
+        shadowing: whether G is a factor.
         least_kappa: κ₁ in rad/µm.
         lateral_scale: times the lengths along the surface; None for one.
     """
@@ -119,6 +125,8 @@ class Crossing:
     shadowing: bool
     least_kappa: mi.Float
     lateral_scale: mi.Float | None = None
+
+    index = 1.0  # of the wavelengths that are handed to E, those above
 
     @property
     def reflects(self) -> mi.Bool:
@@ -179,8 +187,7 @@ class Crossing:
         square, per_width = dr.squared_norm(self.tangent), frequency * per_width
         mirror = limited((25 - square * dr.square(per_width)) / 9, 0, 1)
         most = larger(self.i.square, self.o.square)
-        grazing = dr.select(self.reflects, most, smaller(self.i.square, self.o.square))
-        mirror *= limited(2 - 5 * dr.sqrt(larger(grazing, 1e-12)), 0, 1)
+        mirror *= dr.select(self.reflects, limited(2 - 5 * dr.sqrt(larger(most, 1e-12)), 0, 1), 0)
         _, gain = self._of_order(mi.Vector2f(0), per_width)
         of_pair = self._k_g(self.i.square, self.o.square, square, frequency)
         return dr.lerp(of_pair, gain, mirror) * self._outgoing
@@ -213,10 +220,15 @@ class Crossing:
         w = dr.square(z_i - z_o)
         between = dr.square(self.i.inside) - dr.square(self.o.inside)
         length = along + w
-        product = 0.25 * dr.abs((length + between) * (length - between))
+        along_i, along_o = 0.5 * dr.abs(length + between), 0.5 * dr.abs(length - between)
         least = self.least_kappa / (dr.two_pi * frequency * larger(self.height_scale, 1e-6))
-        passed = product / (larger(z_i, 1e-7) * larger(z_o, 1e-7) * larger(w, dr.square(least)))
-        return dr.select(self.reflects, reflected, passed)
+        z_i, z_o = larger(z_i, 1e-7), larger(z_o, 1e-7)
+        passed = along_i * along_o / (z_i * z_o * larger(w, dr.square(least)))
+        if self.shadowing:
+            ratio = smaller(z_i / larger(along_i, 1e-9), z_o / larger(along_o, 1e-9))
+            passed *= smaller(1, 4 * length * dr.square(ratio))
+        refracted = length < dr.abs(between)
+        return dr.select(self.reflects, reflected, dr.select(refracted, passed, 0))
 
 
 @dataclass(eq=False)
@@ -234,8 +246,11 @@ class CrossingIncidence:
         cosine: √(1 − |k_i,∥|²/(n_o R)²), R the largest of |k_i,∥|/n_o.
         mirrored: what takes the q that is read to the one that was drawn, 1 or −1.
         square: n_o² − |k_i,∥|².
-        index: one.
-        kappas: |κ| of the undiffracted order, of light at 45° to it, and of light along the horizon and the normal.
+        kappas: |κ| of the undiffracted order, and of light that leaves with 0.7 of its k_z, rad/µm.
+        per_kappa: |v_z| for one rad/µm.
+        come: |k_i,z|.
+        leaves: |k_o,z| of light along the horizon and along the normal.
+        reflects: whether it is reflected.
     """
 
     wi: mi.Vector3f
@@ -245,6 +260,9 @@ class CrossingIncidence:
     cosine: mi.Float
     mirrored: mi.Float
     square: mi.Float
+    per_kappa: mi.Float
+    come: mi.Float
+    leaves: list[mi.Float]
     kappas: list[mi.Float]
     reflects: mi.Bool
 
@@ -271,7 +289,8 @@ class CrossingIncidence:
         across = dr.squared_norm(i.tangent) / dr.square(radius * largest)
         per = dr.two_pi * frequency * height_scale
         z_i, snell = i.z, o.normal(larger(square, 0))
-        kappas = [per * dr.abs(z_i + o.sign * z) for z in (snell, 0.7 * snell, o.normal(mi.Float(0)), o.inside)]
+        kappas = [dr.detach(per * dr.abs(z_i + o.sign * z)) for z in (snell, 0.7 * snell)]
+        leaves = [dr.detach(z) for z in (o.normal(mi.Float(0)), o.inside)]
         lateral = scaled(frequency, lateral_scale)
         values = (
             mi.Vector3f(assumed * i.tangent.x, assumed * i.tangent.y, 0),
@@ -281,17 +300,22 @@ class CrossingIncidence:
             dr.safe_sqrt(1 - across),
             assumed if flip is None else assumed * flip,
             square,
+            dr.rcp(larger(per, 1e-6)),
+            dr.abs(z_i),
         )
-        return cls(*(dr.detach(value) for value in values), [dr.detach(kappa) for kappa in kappas], reflects)
+        return cls(*(dr.detach(value) for value in values), leaves, kappas, reflects)
 
     def below(self, kappa: mi.Float) -> mi.Float:
-        """Return the share of light with less than κ: half of it near the undiffracted order, half as if diffuse."""
-        first, second, horizon, normal = self.kappas
+        """Return the share of light with less than κ: half of it near the undiffracted order, half at any k_o,z."""
+        first, second = self.kappas
         low, high = smaller(first, second), larger(first, second)
         near = limited((kappa - low) / larger(high - low, 1e-3), 0, 1)
-        least, most = smaller(horizon, normal), larger(horizon, normal)
-        spread = limited((kappa - least) / larger(most - least, 1e-3), 0, 1)
-        return dr.select(self.reflects, dr.square(spread), 0.5 * (near + spread))
+        v_z, (horizon, normal) = kappa * self.per_kappa, self.leaves
+        per = dr.rcp(larger(normal - horizon, 1e-3))
+        back = limited((v_z - self.come - horizon) * per, 0, 1)
+        most, least = smaller(self.come + v_z, normal), larger(self.come - v_z, horizon)
+        on = limited((most - least) * per, 0, 1)
+        return dr.select(self.reflects, dr.square(back), 0.5 * (near + on))
 
     def propagates(self, tangent: mi.Vector2f) -> mi.Bool:
         """Return whether the order at λq, as it is drawn, propagates."""

@@ -18,12 +18,22 @@ if |t_i| < 1 and |t_o| < 1, else W = 0, and K G of the cosines √(cos² θ_i + 
 and of |λm/T|. Orders that overlap, and samples, have (1 − b) K G + b g(d(s_i)) g(d(s_o)) with
 
     b = clip((25 − |q|²/σ_q²)/9, 0, 1) clip(2 − 5 max(cos θ_i, cos θ_o), 0, 1)
+
+Of an interface between media, reflected and transmitted light from one of its sides are
+
+    R(ω_i, λ) = ∫ F K G S(q; κ) W dq,    T(ω_i, λ) = ∫ (1 − F) K_t S(q; κ_t) W_t dq,    κ_t = 2π (cos θ_i − η cos θ_o)/λ
+
+with λ and lengths of the medium of ω_i, `geometry.transmitted`, and S(q; −κ) = S(−q; κ). A transmitted order has the
+same cosines as above with |t_i| and |t_o| in units of their media, K_t and κ_t of these cosines, and in W_t each d in
+its medium; where orders overlap, W_t = 1. From below a surface is that with −h. A sheet has the tables of an interface:
+its flat face only takes away.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from numpy.polynomial.legendre import leggauss
@@ -32,17 +42,19 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import maximum_filter1d
 from scipy.special import ndtri
 
-from ..geometry import horizon_gain, k_g
+from ..geometry import fresnel, horizon_gain, k_g, transmitted
 from ..spectrum.orders import OrderGrid
 from ..spectrum.power_spectrum import PowerSpectrum
 from ..spectrum.spline_grid import spline_integral
 
 KAPPA_STEP = 0.1  # radians of the fastest oscillation over κ, between which powers are linear
+COARSER = 1.6  # cells, where there are three ways for light to go
 CELL, CELLS = 0.2, 500  # width of a gathered cell in direction cosines at the shortest wavelength; cells at least
 MIRROR_CELL = 0.75  # the same in the lobe of the mirror direction, in σ_q, at most
 FAR_CELL = 20  # cos² θ_o in λσ from which a cell is represented by its centre
 TURN = 0.5  # radians by which the phase of the deepest point may change within such a cell
 REACH = 4.2  # standard deviations to which a component is integrated
+FLAT = 0.5  # cos θ_o down to which no phase of a narrow order may turn so far
 NARROW = 0.02  # λσ up to which a lobe is integrated along the radius alone
 RADIAL, AZIMUTHAL = 9, 13  # points of a lobe
 RADIAL_CELL = 3  # of a cell
@@ -71,6 +83,12 @@ class Furnace:
         height_range: µm, times `height_scale`.
         lobe_width: σ_q in cycles/µm.
         by_order: components are orders that are evaluated one by one.
+        index: η = n_o/n_i, n_i that of the medium of ω; None if nothing is transmitted and F = 1.
+        side: 1, ω is above the surface; −1, below, where the surface seen has the heights −h, S that of −q.
+        passed: as `powers`, with κ₁²/κ² p_j below κ₁ as `small_kappa` gives it; None if nothing is transmitted.
+        least_kappa: κ₁ in rad/µm of the heights as they are.
+        turning: they are, and phases turn within their lobes, so that their powers are averages over these.
+        wide: lobes are wide.
     """
 
     q: NDArray[np.float64] = field(repr=False)
@@ -81,10 +99,25 @@ class Furnace:
     height_range: float
     lobe_width: float
     by_order: bool
+    turning: bool = False
+    wide: bool = False
+    index: float | None = None
+    side: int = 1
+    passed: NDArray[np.float32] | None = field(default=None, repr=False)
+    least_kappa: float = 0.0
 
     @classmethod
-    def of(cls, spectrum: PowerSpectrum, height_scale: float = 1.0) -> Furnace:
-        """Return the components of `spectrum`, with its heights scaled by `height_scale`."""
+    def of(
+        cls, spectrum: PowerSpectrum, height_scale: float = 1.0, index: float | None = None, side: int = 1
+    ) -> Furnace:
+        """Return the components of `spectrum`.
+
+        Args:
+            spectrum: S(q; κ).
+            height_scale: times the heights.
+            index: n of the medium below the surface relative to the one above, if light is transmitted.
+            side: 1, of light from above; −1, from below.
+        """
         grid, by_order = spectrum.grid, evaluated_by_order(spectrum)
         max_kappa = spectrum.largest_kappa
         kappas = np.linspace(0, max_kappa, int(max_kappa * spectrum.height_range / KAPPA_STEP) + 3, dtype=np.float64)
@@ -100,104 +133,154 @@ class Furnace:
             widths = np.full(len(q), spectrum.lobe_width)
         else:
             own = spectrum.lobe_width if isinstance(grid, OrderGrid) else np.array(grid.spacing) / 2
-            q, widths, powers = _gathered(spectrum, kappas, own)
+            q, widths, powers = _gathered(spectrum, kappas, own, 1.0 if index is None else COARSER)
         # In deep surfaces phases turn faster than a table in three dimensions follows: where few nodes make up a
         # component, its power is the largest near.
         deep = max_kappa * spectrum.height_range * height_scale * BLUR > 1
         if deep and 1 not in grid.shape and 16 * len(q) > np.prod(grid.shape):
             powers = maximum_filter1d(powers, 1 + int(BLUR * len(kappas)), axis=1)
         kept = powers.max(-1) > 1e-7
+        seen = None if index is None else float(index) ** side
+        sigma, depth = spectrum.lobe_width, spectrum.height_range * height_scale
+        wide = spectrum.wavelengths[1] * 1e-3 * max(seen or 1, 1) * sigma > NARROW
+        passed, least = None, 0.0
+        if index is not None:
+            least = least_kappa(spectrum, index, height_scale)
+            at_least = [np.array([np.interp(n * least, kappas, row) for row in powers[kept]]) for n in (1, 2)]
+            passed = small_kappa(kappas, least, powers[kept], *(at[:, None] for at in at_least))
+            passed = np.ascontiguousarray(np.maximum(passed, 0), np.float32)
         return cls(
-            q[kept],
+            side * q[kept],
             widths[kept],
             np.ascontiguousarray(np.maximum(powers[kept], 0), np.float32),
             max_kappa,
             height_scale,
-            spectrum.height_range * height_scale,
-            spectrum.lobe_width,
+            depth,
+            sigma,
             by_order,
+            by_order and 2 * np.pi * depth * sigma > TURN * FLAT,
+            wide,
+            seen,
+            side,
+            passed,
+            least,
         )
 
-    def power(self, component: NDArray[np.int64], kappa: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return p_j(κ), linear between nodes; κ in rad/µm of the scaled heights; shapes broadcast."""
-        place = self._place(kappa)
+    def power(self, component: NDArray[np.int64], kappa: NDArray[np.float64], way: int = 0) -> NDArray[np.float64]:
+        """Return p_j(κ) of light that goes a way, linear between nodes; κ in rad/µm; shapes broadcast."""
+        table = self.passed if way else self.powers
+        last = table.shape[1] - 1
+        place = np.minimum(kappa * (self.height_scale * last / self.max_kappa), last * (1 - 1e-12))
         cell = place.astype(np.int64)
-        flat, index = self.powers.ravel(), component * self.powers.shape[1] + cell
+        flat, index = table.ravel(), component * table.shape[1] + cell
         below = flat[index]
         return below + (place - cell) * (flat[index + 1] - below)
 
-    def _place(self, kappa: NDArray[np.float64]) -> NDArray[np.float64]:
-        last = self.powers.shape[1] - 1
-        return np.minimum(kappa * (self.height_scale * last / self.max_kappa), last * (1 - 1e-12))
-
     def albedo(self, directions: NDArray[np.float64], wavelengths: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Compute a(ω, λ).
+        """Compute a(ω, λ), of an interface R and T.
 
         Args:
-            directions: ω, (n, 3) unit vectors above the surface, along the pattern's axes.
-            wavelengths: λ in µm, (n,).
+            directions: ω, (n, 3) unit vectors, along the pattern's axes; on which side is up to the furnace.
+            wavelengths: λ in µm in the medium of ω, (n,).
 
         Returns:
-            (n,).
+            (1, n), or (2, n): R and T.
         """
-        result = np.zeros(len(directions))
+        result = np.zeros((1 if self.index is None else 2, len(directions)))
         # Neighbours reach about the same components.
         for some in np.array_split(np.arange(len(directions)), 1 + len(directions) * len(self.q) // (8 * CHUNK)):
-            s, cos_i, length = directions[some, :2], directions[some, 2], wavelengths[some]
-            edge = 0.0 if self.by_order else REACH * self.widths
-            middle, mean = s.mean(0), (length.min() + length.max()) / 2
-            spread = np.hypot(*(s - middle).T).max()
-            reach = 1 + spread + (length.max() - mean) * np.hypot(*self.q.T) + length.max() * edge
-            reached = np.flatnonzero(np.hypot(*(middle + mean * self.q).T) < reach)
-            square = 1 - sum((s[:, k, None] + np.multiply.outer(length, self.q[reached, k])) ** 2 for k in (0, 1))
-            lowest = 0.0 if self.by_order else -2 * REACH * np.multiply.outer(length, self.widths[reached])
-            place, component = np.nonzero(square > lowest)
-            square, component = square[place, component], reached[component]
-            far = self._far(square, length[place] * self.widths[component], length[place])
-            i, j = place[far], component[far]
-            result[some] += np.bincount(i, self._centre(i, j, cos_i, length, np.sqrt(square[far])), len(some))
-            i, j = place[~far], component[~far]
-            result[some] += np.bincount(i, self._lobes(s[i], cos_i[i], length[i], j), len(some))
+            for way in self.ways:
+                sent = self._sent(directions[some, :2], np.abs(directions[some, 2]), wavelengths[some], way)
+                result[abs(way), some] += sent
         return result
 
-    def line_albedo(self, x: NDArray[np.float64], nu: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Compute a of a line grating along x, which depends on x and ν alone, c = √(1 − ω_y²).
+    @property
+    def work(self) -> int:
+        """Return about how many components the work for one direction amounts to."""
+        if self.by_order:
+            return (len(self.q) + 20) * (RADIAL if self.turning else 1)
+        return len(self.q) * len(self.ways) ** 2
 
-        Args:
-            x: ω_x/c, (n,).
-            nu: c/λ in 1/µm, (n,).
+    @property
+    def ways(self) -> tuple[int, ...]:
+        """0, light is reflected; ±1, it is transmitted with that sign of v_z, where there is a medium below."""
+        return (0,) if self.index is None else (0, 1, -1)
 
-        Returns:
-            (n,).
-        """
-        result, cos_i = np.zeros(len(x)), np.sqrt(1 - x**2)
-        for some in np.array_split(np.arange(len(x)), 1 + len(x) * len(self.q) // (8 * CHUNK)):
-            t = x[some, None] + np.multiply.outer(1 / nu[some], self.q[:, 0])
-            place, component = np.nonzero(np.abs(t) < 1)
-            cos_o = np.sqrt(1 - t[place, component] ** 2)
-            result[some] = np.bincount(place, self._centre(some[place], component, cos_i, 1 / nu, cos_o), len(some))
-        return result
+    def _sent(
+        self, s: NDArray[np.float64], cos_i: NDArray[np.float64], length: NDArray[np.float64], way: int
+    ) -> NDArray[np.float64]:
+        """Compute the part of a that goes one way."""
+        q, index = self.q * (way or 1), (way and self.index) or 1.0
+        edge = 0.0 if self.by_order else REACH * self.widths
+        middle, mean = s.mean(0), (length.min() + length.max()) / 2
+        reach = index + np.hypot(*(s - middle).T).max() + (length.max() - mean) * np.hypot(*q.T) + length.max() * edge
+        reached = np.flatnonzero(np.hypot(*(middle + mean * q).T) < reach)
+        # cos² θ_o = 1 − |ω_i,t + λq|²/η²
+        square = np.repeat(1 - (1 - cos_i[:, None] ** 2) / index**2, len(reached), axis=1)
+        for k in np.flatnonzero(q.any(0)):
+            u = np.multiply.outer(length, q[reached, k])
+            square -= u * (u + 2 * s[:, k, None]) / index**2
+        lowest = 0.0 if self.by_order else -2 * REACH / index * np.multiply.outer(length, self.widths[reached])
+        i, j = np.nonzero(square > lowest)
+        square, j = square[i, j], reached[j]
+        far = self._far(square, length[i] * self.widths[j] / index, length[i], way)
+        if way:
+            # What goes the other way at its centre does so.
+            kept = ~far | (way * (cos_i[i] - index * np.sqrt(np.maximum(square, 0))) > 0)
+            i, j, square, far = i[kept], j[kept], square[kept], far[kept]
+        at, component, cos_o = i[far], j[far], np.sqrt(square[far])
+        tangent = length[at] ** 2 * (q[component] ** 2).sum(-1)
+        value = self._factor(cos_i[at], cos_o, length[at], tangent, way)
+        value = value * self._power(partial(self.power, component, way=way), cos_i[at], cos_o, length[at], way)
+        i, j = i[~far], j[~far]
+        near = self._lobes(s[i], cos_i[i], length[i], j, way)
+        return np.bincount(at, value, len(s)) + np.bincount(i, near, len(s))
 
     def _far(
-        self, square: NDArray[np.float64], sigma: NDArray[np.float64], length: NDArray[np.float64]
+        self, square: NDArray[np.float64], sigma: NDArray[np.float64], length: NDArray[np.float64], way: int
     ) -> NDArray[np.bool_]:
-        """Return whether a component is represented by its centre; cos² θ_o, λσ and λ of each."""
-        if self.by_order:
-            # K and G are those of the order, and its lobe keeps its power at the horizon.
+        """Return whether a component is represented by its centre; cos² θ_o, the width in ω_o and λ of each."""
+        # The lobe of an order keeps its power at the horizon, with K and G of the order, and of transmitted light with
+        # its κ: that of reflected light alone may change.
+        if self.by_order and (way or not self.turning):
             return np.ones(square.shape, bool)
-        turn = 2 * np.pi * self.height_range * sigma / length / TURN
-        return (square > FAR_CELL * sigma) & (square > turn**2)
+        turn = 2 * np.pi * self.height_range * sigma / (length * TURN)
+        return (square > turn**2) & (self.by_order | (square > FAR_CELL * sigma))
 
-    def _centre(self, i, j, cos_i, length, cos_o) -> NDArray[np.float64]:
-        """Return K G W p of the centres of components j from places i."""
-        cos_i, length = cos_i[i], length[i]
-        w = cos_i + cos_o
-        square = length**2 * (self.q[j] ** 2).sum(-1)
-        value = k_g(cos_i, cos_o, (square + w**2) / 2)
+    def _factor(
+        self,
+        cos_i: NDArray[np.float64],
+        cos_o: NDArray[np.float64],
+        length: NDArray[np.float64],
+        tangent: NDArray[np.float64],
+        way: int,
+    ) -> NDArray[np.float64]:
+        """Return K G F and gain, or K_t (1 − F), at |λq|² = `tangent`; F = 1 without a medium below."""
+        if way:
+            least = self.least_kappa / max(self.height_scale, 1e-9) * length / (2 * np.pi)
+            return transmitted(cos_i, cos_o, tangent, self.index, least)
+        square = tangent + (cos_i + cos_o) ** 2
+        value = k_g(cos_i, cos_o, square / 2)
         if not self.by_order:
-            b = mirrored(square / (length * self.lobe_width) ** 2, cos_i, cos_o)
-            value = (1 - b) * value + b
-        return value * self.power(j, 2 * np.pi * w / length)
+            b = mirrored(tangent / (length * self.lobe_width) ** 2, cos_i, cos_o)
+            if b.any():
+                gain = [horizon_gain(cos**2 / (2 * length * self.lobe_width)) for cos in (cos_i, cos_o)]
+                value = (1 - b) * value + b * gain[0] * gain[1]
+        return value if self.index is None else value * fresnel(np.sqrt(square) / 2, self.index)
+
+    def _power(
+        self,
+        power: Callable[[NDArray[np.float64]], NDArray[np.floating]],
+        cos_i: NDArray[np.float64],
+        cos_o: NDArray[np.float64],
+        length: NDArray[np.float64],
+        way: int,
+    ) -> NDArray[np.float64]:
+        """Return `power` at κ in rad/µm between two directions; of transmitted light with that sign of v_z only."""
+        if not way:
+            return power(2 * np.pi / length * (cos_i + cos_o))
+        v_z = way * (cos_i - self.index * cos_o)
+        return power(2 * np.pi / length * np.maximum(v_z, 0)) * (v_z > 0)
 
     def _lobes(
         self,
@@ -205,17 +288,18 @@ class Furnace:
         cos_i: NDArray[np.float64],
         length: NDArray[np.float64],
         component: NDArray[np.int64],
+        way: int,
     ) -> NDArray[np.float64]:
-        """Integrate K G W p over cells near the horizon and the lobe of the mirror order, (n,)."""
+        """Integrate over lobes and cells in which K, G or κ change, (n,)."""
         result = np.empty(len(s))
-        mirror = (self.q[component] == 0).all(-1)
-        wide = mirror & (length * self.widths[component] > NARROW)
-        for those, count in ((~mirror, 1), (wide, AZIMUTHAL), (mirror & ~wide, 1)):
+        lobe = (self.q[component] == 0).all(-1) | self.by_order
+        wide = lobe & (length * self.widths[component] > NARROW) & (not self.by_order)
+        for those, count in ((~lobe, 1), (wide, AZIMUTHAL), (lobe & ~wide, 1)):
             some = np.flatnonzero(those)
             for part in np.array_split(some, 1 + len(some) * RADIAL * count // CHUNK):
                 if len(part):
                     arguments = s[part], cos_i[part], length[part], component[part]
-                    result[part] = self._lobe(*arguments, count, bool(mirror[part[0]]))
+                    result[part] = self._lobe(*arguments, way, count, bool(lobe[part[0]]))
         return result
 
     def _lobe(
@@ -224,16 +308,18 @@ class Furnace:
         cos_i: NDArray[np.float64],
         length: NDArray[np.float64],
         component: NDArray[np.int64],
+        way: int,
         azimuths: int,
         lobes: bool,
     ) -> NDArray[np.float64]:
-        """Integrate K G W p over cells, or the lobe of the mirror order, near the horizon, (n,).
+        """Integrate over lobes or cells, (n,).
 
         In polar coordinates of −ω_o,t = r (cos φ, sin φ), r² = 1 − cos² θ_o and r dr = −cos θ_o dcos θ_o.
         """
         s, cos_i, length = s[:, None, None], cos_i[:, None, None], length[:, None, None]
+        index, sign = (way and self.index) or 1.0, way or 1
         sigma, offset = length * self.widths[component, None, None], length[..., None] * self.q[component, None, None]
-        t = s + offset
+        sigma, t = sigma / index, (s + sign * offset) / index
         rho = np.hypot(t[..., 0], t[..., 1])
         reach = (REACH if lobes else np.sqrt(3)) * sigma
         nearest, farthest = np.maximum(rho - reach, 0), rho + reach
@@ -255,19 +341,127 @@ class Furnace:
         else:
             square = (r - rho) ** 2 + 4 * r * rho * np.sin(phi / 2) ** 2
             weight = weight * (2 / azimuths) * opening * np.exp(-square / (2 * sigma**2)) / (2 * np.pi * sigma**2)
+        power = weight * self._power(partial(self.power, component[:, None, None], way=way), cos_i, cos_o, length, way)
+        if self.by_order:
+            # Of the order, K and G; its lobe keeps its power.
+            value = self._factor(cos_i, np.sqrt(1 - rho**2), length, (offset**2).sum(-1), way)
+            return (value * power.sum(1, keepdims=True) / weight.sum(1, keepdims=True))[:, 0, 0]
         ahead = t / np.maximum(rho, 1e-12)[..., None]
         cosine, sine = r * np.cos(phi), r * np.sin(phi)
         out = np.stack(
             [ahead[..., 0] * cosine - ahead[..., 1] * sine, ahead[..., 1] * cosine + ahead[..., 0] * sine], -1
         )  # −ω_o,t
-        w = cos_i + cos_o
-        own = length * self.lobe_width
-        from_horizon = cos_i**2 / (2 * own), cos_o**2 / (2 * own)
-        square = ((out - s) ** 2).sum(-1)
-        value, b = k_g(cos_i, cos_o, (square + w**2) / 2), mirrored(square / own**2, cos_i, cos_o)
-        if b.any():
-            value = (1 - b) * value + b * horizon_gain(from_horizon[0]) * horizon_gain(from_horizon[1])
-        return (weight * value * self.power(component[:, None, None], 2 * np.pi * w / length)).sum((1, 2))
+        return (power * self._factor(cos_i, cos_o, length, ((index * out - s) ** 2).sum(-1), way)).sum((1, 2))
+
+    def albedo_of_nodes(
+        self,
+        spectrum: PowerSpectrum,
+        directions: NDArray[np.float64],
+        wavelengths: NDArray[np.float64],
+        bounds: Sequence[Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]],
+        seed: int = 0,
+    ) -> NDArray[np.float64]:
+        """Compute the albedo with E from the stored spectrum, nothing gathered and lobes as wide as they are.
+
+        By Monte Carlo: at least one point in the lobe of each node, more in strong ones. Transmitted light has E = e of
+        the incident direction, which is no less than E.
+
+        Args:
+            spectrum: S(q; κ), of which the furnace is.
+            directions: ω_i, (n, 3) unit vectors, along the pattern's axes.
+            wavelengths: λ in µm in the medium of ω_i, (n,).
+            bounds: e(ω, λ) of reflected and of transmitted light, for directions (m, 3) and wavelengths (m,) on the
+                side of ω_i.
+            seed: of the points.
+
+        Returns:
+            (n,).
+        """
+        rng, grid, sigma = np.random.default_rng(seed), spectrum.grid, spectrum.lobe_width
+        q = np.stack(np.meshgrid(*grid.frequencies()), -1).reshape(-1, 2) * self.side
+        # A node is a Gaussian, or a B-spline that ends at the Nyquist limit.
+        lines = isinstance(grid, OrderGrid)
+        spacing = np.full(2, sigma) if lines else np.array(grid.spacing)
+        limit = np.full(2, np.inf) if lines else np.array(grid.limit)
+        extent = 4 * sigma if lines else 1.5 * np.hypot(*spacing)
+        strength = np.sum(
+            [np.maximum(spectrum.powers(x * spectrum.largest_kappa), 0).ravel() for x in (0.1, 0.4, 0.7, 1.0)], axis=0
+        )
+        offsets = np.linspace(-1.5, 1.5, 1025, dtype=np.float64)
+        integral = spline_integral(offsets)
+        result = np.zeros(len(directions))
+        for place, way in np.ndindex(len(directions), len(self.ways)):
+            way, s, cos_i, length = self.ways[way], directions[place, :2], directions[place, 2], wavelengths[place]
+            index, sent = (way and self.index) or 1.0, q * (way or 1)
+            reached = np.flatnonzero(np.hypot(*(s + length * sent).T) < index + length * extent)
+            if not len(reached):
+                continue
+            count = 1 + (POINTS * strength[reached] / strength[reached].sum()).astype(np.int64)
+            node, weight = np.repeat(reached, count), np.repeat(1 / count, count)
+            # Points of one node follow each other in a sequence of low discrepancy (Roberts 2018).
+            t = (rng.random(2) + np.arange(len(node))[:, None] * [0.7548776662466927, 0.5698402909980532]) % 1
+            spread = (ndtri(t) if lines else np.interp(t, integral, offsets)) * spacing
+            u = length * (sent[node] + spread)
+            square = 1 - ((s + u) ** 2).sum(-1) / index**2
+            lit = (square > 0) & (np.abs(u) < length * limit).all(-1)
+            u, node, weight, cos_o = u[lit], node[lit], weight[lit], np.sqrt(square[lit])
+            kappa_of = cos_i, cos_o
+            if self.by_order:
+                order = length * sent[node]
+                cos_i2, cos_o2 = 1 - ((s + u - order) ** 2).sum(-1), 1 - ((s + order) ** 2).sum(-1) / index**2
+                in_, out = (np.sqrt(np.maximum(x, 1e-12) / 2) for x in (cos_i**2 + cos_i2, cos_o**2 + cos_o2))
+                value = self._factor(in_, out, length, (order**2).sum(-1), way) * ((cos_i2 > 0) & (cos_o2 > 0))
+                # Transmitted light has κ of the order, with which K_t changes as fast.
+                kappa_of = (in_, out) if way else kappa_of
+                for x in (np.minimum(cos_i**2, index * cos_o2), np.minimum(index * cos_o**2, cos_i2)):
+                    value *= horizon_gain(np.maximum(x, 0) / (2 * length * sigma))
+            else:
+                value = self._factor(cos_i, cos_o, length, (u**2).sum(-1), way)
+            power = self._power(partial(self._power_of_nodes, spectrum, node, way), *kappa_of, length, way)
+            e = bounds[abs(way)](directions[place, None], wavelengths[place, None])
+            if not way:
+                out = np.concatenate([-s - u, cos_o[:, None]], -1)
+                e = np.minimum(e, bounds[0](out, np.full(len(out), length)))
+            result[place] += (value * weight * power * e).sum()
+        return result
+
+    def _power_of_nodes(
+        self, spectrum: PowerSpectrum, node: NDArray[np.int64], way: int, kappa: NDArray[np.float64]
+    ) -> NDArray[np.floating]:
+        kappa = np.minimum(kappa * self.height_scale, spectrum.largest_kappa)
+
+        def power(kappa: NDArray[np.float64]) -> NDArray[np.float32]:
+            return spectrum.table.powers_at(*np.divmod(node, spectrum.grid.shape[1]), kappa)
+
+        if not way:
+            return power(kappa)
+        first, second = (power(np.full(len(node), n * self.least_kappa)) for n in (1, 2))
+        return small_kappa(kappa, self.least_kappa, power(kappa), first, second)
+
+
+def least_kappa(spectrum: PowerSpectrum, index: float, height_scale: float = 1.0) -> float:
+    """Return κ₁, below which c_m/κ² of transmitted light is a line, in rad/µm of the heights as they are."""
+    first, undiffracted = small_kappas(spectrum, index)
+    return min(first, max(undiffracted * height_scale, 1e-6))
+
+
+def small_kappas(spectrum: PowerSpectrum, index: float) -> tuple[float, float]:
+    """Return the two numbers of which κ₁ is the smaller, in rad/µm.
+
+    A quarter of the first interval of the table, where its error weighs as little as that of the line; and, times the
+    scale of the heights, less than κ of the undiffracted order at all wavelengths, those of the spectrum being in the
+    denser medium.
+    """
+    longest = spectrum.wavelengths[1] * 1e-3 * max(index, 1)
+    return spectrum.table.first_interval / 4, 1.6 * np.pi * abs(index - 1) / longest
+
+
+def small_kappa(
+    kappa: NDArray[np.float64], least: float, power: NDArray, first: NDArray, second: NDArray
+) -> NDArray[np.float64]:
+    """Return κ₁²/κ² c_m(κ) below κ₁ = `least`, the line through c_m/κ² at κ₁ and 2κ₁; `power`, c_m(κ), above."""
+    x = kappa / least
+    return np.where(x < 1, (2 - x) * first + 0.25 * (x - 1) * second, power)
 
 
 def mirrored(
@@ -278,7 +472,7 @@ def mirrored(
 
 
 def _gathered(
-    spectrum: PowerSpectrum, kappas: NDArray[np.float64], own: NDArray[np.float64] | float
+    spectrum: PowerSpectrum, kappas: NDArray[np.float64], own: NDArray[np.float64] | float, coarser: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Gather the nodes of `spectrum` in the cells of a lattice, those near the mirror direction apart.
 
@@ -286,6 +480,7 @@ def _gathered(
         spectrum: of overlapping orders or of a sample.
         kappas: rad/µm, equidistant.
         own: the standard deviation of what a node stands for, cycles/µm, along x and y.
+        coarser: times the width of a cell.
 
     Returns:
         Centres of power (n, 2), standard deviations (n,), both in cycles/µm, and powers (n, K).
@@ -293,7 +488,7 @@ def _gathered(
     sigma = spectrum.lobe_width
     q = np.stack(np.meshgrid(*spectrum.grid.frequencies()), -1).reshape(-1, 2)
     shortest = 4 * np.pi / spectrum.largest_kappa
-    width = min(CELL / shortest, np.sqrt(np.prod(np.minimum(np.ptp(q, axis=0), 4 / shortest)) / CELLS))
+    width = coarser * min(CELL / shortest, np.sqrt(np.prod(np.minimum(np.ptp(q, axis=0), 4 / shortest)) / CELLS))
     # Smaller ones where b is not zero.
     near = np.hypot(*q.T) < 6 * sigma
     place = np.rint(q / np.where(near, min(width, MIRROR_CELL * sigma), width)[:, None])
@@ -312,78 +507,3 @@ def _gathered(
     centre, square = np.stack(moments[1:3], -1) / moments[0][:, None], np.stack(moments[3:], -1) / moments[0][:, None]
     widths = np.sqrt((np.maximum(square - centre**2, 0) + np.square(own)).mean(-1))
     return centre, widths, CubicSpline(few, powers, axis=1)(kappas)
-
-
-def albedo_of_nodes(
-    spectrum: PowerSpectrum,
-    directions: NDArray[np.float64],
-    wavelengths: NDArray[np.float64],
-    height_scale: float,
-    bound: Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]],
-    seed: int = 0,
-) -> NDArray[np.float64]:
-    """Compute the albedo with E from the stored spectrum, nothing gathered and lobes as wide as they are.
-
-    By Monte Carlo: at least one point in the lobe of each node, more in strong ones.
-
-    Args:
-        spectrum: S(q; κ).
-        directions: ω_i, (n, 3) unit vectors, along the pattern's axes.
-        wavelengths: λ in µm, (n,).
-        height_scale: times the heights.
-        bound: e(ω, λ) of directions (m, 3) and wavelengths (m,).
-        seed: of the points.
-
-    Returns:
-        (n,).
-    """
-    rng, grid, sigma = np.random.default_rng(seed), spectrum.grid, spectrum.lobe_width
-    q = np.stack(np.meshgrid(*grid.frequencies()), -1).reshape(-1, 2)
-    lines = isinstance(grid, OrderGrid)
-    spacing: NDArray[np.float64]
-    limit: NDArray[np.float64]
-    # A node is a Gaussian, or a B-spline that ends at the Nyquist limit.
-    if isinstance(grid, OrderGrid):
-        spacing, limit, reach = np.full(2, sigma), np.full(2, np.inf), 4 * sigma
-    else:
-        spacing, limit = np.array(grid.spacing), np.array(grid.limit)
-        reach = 1.5 * np.hypot(*spacing)
-    strength = np.sum(
-        [np.maximum(spectrum.powers(x * spectrum.largest_kappa), 0).ravel() for x in (0.1, 0.4, 0.7, 1.0)], axis=0
-    )
-    offsets = np.linspace(-1.5, 1.5, 1025, dtype=np.float64)
-    integral = spline_integral(offsets)
-    result = np.empty(len(directions))
-    for index, (omega, length) in enumerate(zip(directions, wavelengths, strict=True)):
-        s, cos_i = omega[:2], omega[2]
-        reached = np.flatnonzero(np.hypot(*(s + length * q).T) < 1 + length * reach)
-        count = 1 + (POINTS * strength[reached] / strength[reached].sum()).astype(np.int64)
-        node, weight = np.repeat(reached, count), np.repeat(1 / count, count)
-        # Points of one node follow each other in a sequence of low discrepancy (Roberts 2018).
-        t = (rng.random(2) + np.arange(len(node))[:, None] * [0.7548776662466927, 0.5698402909980532]) % 1
-        spread = (ndtri(t) if lines else np.interp(t, integral, offsets)) * spacing
-        u = length * (q[node] + spread)
-        square = 1 - ((s + u) ** 2).sum(-1)
-        lit = (square > 0) & (np.abs(u) < length * limit).all(-1)
-        u, node, weight, cos_o = u[lit], node[lit], weight[lit], np.sqrt(square[lit])
-        w, tangent = cos_i + cos_o, (u**2).sum(-1)
-        kappa = np.minimum(2 * np.pi * w * height_scale / length, spectrum.largest_kappa)
-        row, column = np.divmod(node, grid.shape[1])
-        power = spectrum.table.powers_at(row, column, kappa)
-        out = np.concatenate([-s - u, cos_o[:, None]], -1)
-        if evaluated_by_order(spectrum):
-            offset = length * q[node]
-            sent = 1 - ((s + offset) ** 2).sum(-1), 1 - ((out[:, :2] + offset) ** 2).sum(-1)
-            in_, out_ = (np.sqrt(np.maximum(x, 1e-12) / 2) for x in (cos_i**2 + sent[1], cos_o**2 + sent[0]))
-            nearest = np.minimum(cos_i**2, sent[0]), np.minimum(cos_o**2, sent[1])
-            factor = k_g(in_, out_, ((offset**2).sum(-1) + (in_ + out_) ** 2) / 2) * (np.minimum(*sent) > 0)
-            share: NDArray[np.float64] | float = 1.0
-        else:
-            nearest, share = (np.square(cos_i), cos_o**2), mirrored(tangent / (length * sigma) ** 2, cos_i, cos_o)
-            factor = 1.0
-        gain = [horizon_gain(np.maximum(x, 0) / (2 * length * sigma)) for x in nearest]
-        value = (1 - share) * k_g(cos_i, cos_o, (tangent + w**2) / 2) + share * factor * gain[0] * gain[1]
-        value *= weight * power
-        e = np.minimum(bound(omega[None], length), bound(out, np.full(len(out), length)))
-        result[index] = (value * e).sum()
-    return result

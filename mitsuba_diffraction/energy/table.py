@@ -17,7 +17,8 @@ just emerged; at u = 0 and v = 0 ω itself is at the horizon. With f the fractio
 cos θ_o of that order is. a depends on u and v alone: the table has one slice.
 
 Of surfaces with orders in two dimensions, and of samples, T is so short that one square holds all directions, and
-slices are equidistant in the same function of the fraction 1 − |y|, y = ω_y/(1 + c).
+slices are equidistant in the same function of the fraction 1 − |y|, y = ω_y/(1 + c). So it is of an interface, where
+transmitted orders emerge elsewhere; it has one table for the light of each side.
 """
 
 from __future__ import annotations
@@ -32,19 +33,22 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import minimum_filter
 
 from ..errors import RequestError
 from ..spectrum.orders import OrderGrid
-from .furnace import NARROW, Furnace, PowerSpectrum, albedo_of_nodes
+from .furnace import Furnace, PowerSpectrum
 
 SLACK = 1e-3
 """What an albedo may exceed one by."""
 GATHERED = 5e-3  # by which the albedo of gathered cells may err where it is not seen
 CHECKED = 40  # random places, at least, at which a table is held against the spectrum itself
-GENERAL = 17, 22  # slices, and cells along u and v, of a table for orders in two dimensions and for samples
+GENERAL, FINEST = (17, 22), 3  # slices, and cells along u and v, of other tables; finer by this, at most
 PLACES = 1.5e5  # nodes of the table of a line grating, at most
 ROUNDS, PAIRS = (1, 32), 5e6  # random places in each cell, at least and at most; about so many pairs with components
+STEEP = 0.98  # e is lowered so far inside of a cell or its neighbours, where more places are tried
 STRIDE = np.array([0.8191725, 0.6710436, 0.5497005])  # of places in a cell, so that few rounds cover it (Roberts 2018)
+TURNED = 1.0, 0.5  # c for which a is computed, where it matters
 LEAST, HORIZON = 1e-7, 1e-4  # the least fraction of u and v, and of y
 
 
@@ -89,10 +93,17 @@ class Layout:
     @classmethod
     def of(cls, spectrum: PowerSpectrum, furnace: Furnace) -> Layout:
         """Choose the layout for `spectrum`: as fine as the work allows."""
-        shortest, longest = (w * 1e-3 for w in spectrum.wavelengths)
+        # Those of the spectrum are in the denser medium.
+        shortest, longest = (w * 1e-3 * max(furnace.index or 1, 1) for w in spectrum.wavelengths)
         frequencies = 1 / longest, 1 / shortest
-        if not (isinstance(spectrum.grid, OrderGrid) and 1 in spectrum.grid.shape):
-            return cls(shortest / 2, 1, GENERAL[1], 1, GENERAL[0], frequencies, False)
+        lines = isinstance(spectrum.grid, OrderGrid) and 1 in spectrum.grid.shape
+        if furnace.index is not None or not lines:
+            # As fine as the work allows, which is about the same for all.
+            places = GENERAL[0] * GENERAL[1] ** 2
+            finest = 1 if furnace.index is None else FINEST
+            finer = np.clip(np.cbrt(PAIRS / (furnace.work * places)), 1, finest)
+            slices, side = 1 + 2 * int(GENERAL[0] * finer / 2), int(GENERAL[1] * finer)
+            return cls(shortest / 2, 1, side, 1, slices, frequencies, False)
         turned = spectrum.grid.shape[1] == 1 and spectrum.grid.shape[0] > 1
         # So many places that the work is about the same for all gratings.
         side = np.sqrt(2 * min(PLACES, PAIRS / max(len(furnace.q) / 2, 1)))
@@ -171,18 +182,39 @@ class EnergyTable:
     @classmethod
     def of(cls, spectrum: PowerSpectrum, height_scale: float = 1.0) -> EnergyTable:
         """Make the table of `spectrum`, with its heights scaled by `height_scale`."""
-        furnace = Furnace.of(spectrum, height_scale)
+        return cls._of_side(spectrum, Furnace.of(spectrum, height_scale))[0]
+
+    @classmethod
+    def of_interface(cls, spectrum: PowerSpectrum, index: float, height_scale: float = 1.0) -> list[EnergyTable]:
+        """Make the tables of an interface: reflected and transmitted light from above, and the same from below.
+
+        Args:
+            spectrum: it holds wavelengths in the denser medium.
+            index: of the medium below relative to that above.
+            height_scale: times the heights.
+        """
+        furnaces = [Furnace.of(spectrum, height_scale, index, side) for side in (1, -1)]
+        return [table for furnace in furnaces for table in cls._of_side(spectrum, furnace)]
+
+    @classmethod
+    def _of_side(cls, spectrum: PowerSpectrum, furnace: Furnace) -> list[EnergyTable]:
         layout = Layout.of(spectrum, furnace)
-        e, loss = corners(furnace, layout)
-        table = cls.packed(layout, e, loss)
-        if not table.needed or (furnace.by_order and spectrum.wavelengths[1] * 1e-3 * spectrum.lobe_width < NARROW):
-            return table
+        e, losses = corners(furnace, layout)
+        tables = [cls.packed(layout, *of) for of in zip(e, losses, strict=True)]
+        if not any(table.needed for table in tables) or (furnace.by_order and not furnace.wide and not furnace.turning):
+            return tables
         # Against the spectrum itself: cells were gathered, and orders represented by the centres of their lobes.
-        places = random_places(spectrum.wavelengths, int(np.clip(2e5 / np.prod(spectrum.grid.shape), CHECKED, 150)))
+        places = random_places(
+            layout.frequencies, int(np.clip(2e5 / np.prod(spectrum.grid.shape) / len(furnace.ways), CHECKED, 150))
+        )
         # Of two estimates the smaller: what both exceed is no noise.
-        found = [albedo_of_nodes(spectrum, *places, height_scale, table.at, seed) for seed in (0, 1)]
+        bounds = [table.at for table in tables]
+        found = [furnace.albedo_of_nodes(spectrum, *places, bounds, seed) for seed in (0, 1)]
         excess = max(float(np.minimum(*found).max()) - 1, 0.0 if furnace.by_order else GATHERED)
-        return cls.packed(layout, e / (1 + excess), (loss[0] + excess, loss[1] + excess))
+        return [
+            cls.packed(layout, of / (1 + excess), (loss[0] + excess, loss[1] + excess))
+            for of, loss in zip(e, losses, strict=True)
+        ]
 
     @classmethod
     def packed(cls, layout: Layout, e: NDArray[np.float64], loss: tuple[float, float]) -> EnergyTable:
@@ -193,7 +225,7 @@ class EnergyTable:
 
     @property
     def needed(self) -> bool:
-        """Some direction would reflect more than it receives."""
+        """Return whether some direction would reflect more than it receives."""
         return self.least < 1
 
     def at(self, directions: NDArray[np.float64], wavelengths: ArrayLike) -> NDArray[np.float64]:
@@ -236,29 +268,94 @@ class EnergyTable:
         return cls(layout, steps, float(plain["least"]), (float(mean), float(largest)))
 
 
-def random_places(wavelengths: tuple[float, float], count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+@dataclass(frozen=True)
+class Stretched:
+    """A spectrum seen with lengths along the surface times a lateral scale s as the unit of length.
+
+    Wavelengths are shorter by s, and lobes wider; orders stay where they are.
+
+    Attributes:
+        spectrum: S(q; κ).
+        least: s; of several the least.
+    """
+
+    spectrum: PowerSpectrum
+    least: float
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.spectrum, name)
+
+    @property
+    def lobe_width(self) -> float:
+        """s σ_q in cycles/µm; of several s, of the least, with which λσ_q is right at the longest wavelength."""
+        return self.spectrum.lobe_width * self.least
+
+    @property
+    def wavelengths(self) -> tuple[float, float]:
+        """λ/s in nm, from the shortest that the spectrum covers."""
+        shortest, longest = self.spectrum.wavelengths
+        return shortest, longest / self.least
+
+
+def between(below: EnergyTable, middle: EnergyTable, above: EnergyTable) -> EnergyTable:
+    """Return a lower bound of e between two tables from these and the one in the middle.
+
+    A parabola through three equidistant values exceeds them by no more than an eighth of its second difference.
+    """
+    first, second, third = (t.least + (1 - t.least) / 255 * t.steps.astype(np.float64) for t in (below, middle, above))
+    lowest = np.minimum(np.minimum(first, second), third)
+    e = np.maximum(lowest - np.abs(first - 2 * second + third) / 8, 0)
+    lost = e / np.maximum(second, 1e-9)
+    loss = below.loss[0] + float(1 - lost.mean()), below.loss[1] + float(1 - lost.min())
+    return EnergyTable.packed(middle.layout, e / (1 + SLACK), loss)
+
+
+def random_places(frequencies: tuple[float, float], count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return `count` directions (n, 3), two thirds of them beyond 60°, one beyond 85°, and λ in µm, (n,).
 
-    `wavelengths` are the shortest and the longest, in nm.
+    `frequencies` are the least and the largest 1/λ, in 1/µm.
     """
     rng = np.random.default_rng(0)
     theta = np.deg2rad(rng.uniform(rng.choice([0, 60, 85], count), 89.9))
     phi = rng.uniform(0, 2 * np.pi, count)
     directions = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1)
-    return directions, rng.uniform(*wavelengths, count) * 1e-3
+    return directions, rng.uniform(1 / frequencies[1], 1 / frequencies[0], count)
 
 
-def corners(furnace: Furnace, layout: Layout) -> tuple[NDArray[np.float64], tuple[float, float]]:
-    """Compute e at the corners of all cells, a lower bound of 1/a between them.
+def bounds_of(albedo: NDArray[np.float64], index: float | None) -> NDArray[np.float64]:
+    """Return e from what the furnace finds.
+
+    Reflected light alone has e = 1/max(1, a). Of an interface transmitted light comes first, as scalar theory sends all
+    of it on where steep facets reflect it totally, but for what a plane reflects at normal incidence, F₀:
+
+        e_T = min(1, (1 − min(R, F₀))/T),    e_R = min(1, (1 − e_T T)/R),    e_R R + e_T T = min(1, R + T)
+
+    Args:
+        albedo: (1, n), or R and T (2, n).
+        index: η; None of reflected light alone.
 
     Returns:
-        e of the shape `layout.shape`, and (mean, largest) of what is lost in the middle of the cells.
+        As `albedo`.
+    """
+    if index is None:
+        return 1 / np.maximum(albedo, 1)
+    r, t = albedo
+    e_t = np.minimum(1, (1 - np.minimum(r, ((index - 1) / (index + 1)) ** 2)) / np.maximum(t, 1e-9))
+    return np.stack([np.minimum(1, (1 - e_t * t) / np.maximum(r, 1e-9)), e_t])
+
+
+def corners(furnace: Furnace, layout: Layout) -> tuple[NDArray[np.float64], list[tuple[float, float]]]:
+    """Compute e at the corners of all cells, a lower bound of `bounds_of` between them.
+
+    Returns:
+        e of reflected, and of an interface of transmitted light, (1 or 2, *layout.shape), and of each (mean, largest)
+        of what is lost in the middle of the cells.
     """
     return (_line_corners if layout.lines else _general_corners)(furnace, layout)
 
 
-def _line_corners(furnace: Furnace, layout: Layout) -> tuple[NDArray[np.float64], tuple[float, float]]:
-    """As `corners`, of a line grating."""
+def _line_corners(furnace: Furnace, layout: Layout) -> tuple[NDArray[np.float64], list[tuple[float, float]]]:
+    """Compute `corners` of a line grating."""
     last = layout.frequencies[1]
     nodes = [layout.nodes(square) for square in range(layout.squares)]
     lattice = np.concatenate(nodes)
@@ -269,7 +366,12 @@ def _line_corners(furnace: Furnace, layout: Layout) -> tuple[NDArray[np.float64]
     e = np.ones((1, *nu.shape))
     if layout.turned:
         furnace = dataclasses.replace(furnace, q=furnace.q[:, ::-1])
-    e[0, reached] = 1 / np.maximum(furnace.line_albedo(((v - u) / (u + v))[reached], nu[reached]), 1)
+    x = ((v - u) / (u + v))[reached]
+    omega = np.stack([x, np.zeros(len(x)), np.sqrt(1 - x**2)], -1)
+    # Where phases turn within lobes a depends on c, too: seen in the scale of c, lobes are 1/c as wide.
+    scales = TURNED if furnace.turning else (1.0,)
+    a = [dataclasses.replace(furnace, widths=furnace.widths / c).albedo(omega, 1 / nu[reached])[0] for c in scales]
+    e[0, reached] = 1 / np.maximum(np.max(a, axis=0), 1)
     inside = reached & (nu <= last)
     # The cells: each second node but the last of a unit square.
     start = np.concatenate([np.arange(0, len(n) - 1, 2) + np.flatnonzero(square == k)[0] for k, n in enumerate(nodes)])
@@ -285,11 +387,11 @@ def _line_corners(furnace: Furnace, layout: Layout) -> tuple[NDArray[np.float64]
         share = np.minimum(share, np.where(at(inside, j, i), at(e, j, i) / np.maximum(got, 1e-30), 1))
     result = result * share[..., None]
     lost = (1 - result.mean(-1) / at(e, 1, 1))[:, at(inside, 1, 1)]
-    return result, (float(lost.mean()), float(lost.max()))
+    return result[None], [(float(lost.mean()), float(lost.max()))]
 
 
-def _general_corners(furnace: Furnace, layout: Layout) -> tuple[NDArray[np.float64], tuple[float, float]]:
-    """As `corners`, of orders in two dimensions and of samples: lowered at random places in the cells."""
+def _general_corners(furnace: Furnace, layout: Layout) -> tuple[NDArray[np.float64], list[tuple[float, float]]]:
+    """Compute `corners` of orders in two dimensions and of samples: lowered at random places in the cells."""
     side, (first, last) = layout.first, layout.frequencies
     cells = np.indices((layout.slices - 1, side, side)).reshape(3, -1).T
 
@@ -298,17 +400,15 @@ def _general_corners(furnace: Furnace, layout: Layout) -> tuple[NDArray[np.float
         return np.copysign(1 - np.maximum(_fraction(1 - np.abs(place)), HORIZON), place)
 
     def bound(places: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """1/max(1, a) at places (slice, row, column), (n, 3), and whether there is light there."""
+        """Return `bounds_of` at places (slice, row, column), (n, 3), and whether there is light there."""
         y = latitude(places[:, 0])
         u, v = (np.maximum(_fraction(p / side), LEAST) for p in (places[:, 2], places[:, 1]))
         c, nu = (1 - y**2) / (1 + y**2), (u + v) / (2 * layout.period)
         lengths = c / nu
         there = (lengths >= 1 / last) & (lengths <= 1 / first)
         directions = np.stack([c * (v - u) / (u + v), 2 * y / (1 + y**2), c * 2 * np.sqrt(u * v) / (u + v)], -1)
-        if layout.turned:
-            directions = directions[:, [1, 0, 2]]
         a = furnace.albedo(directions, np.clip(lengths, 1 / last, 1 / first))
-        return 1 / np.maximum(a, 1), there
+        return bounds_of(a, furnace.index), there
 
     # Cells that light reaches at some wavelength.
     y = latitude(cells[:, :1] + [0, 0.5, 1])
@@ -319,21 +419,42 @@ def _general_corners(furnace: Furnace, layout: Layout) -> tuple[NDArray[np.float
     # Nodes, each of them once.
     eight = np.array(list(np.ndindex(2, 2, 2)))
     nodes, corner = np.unique((cells[:, None] + eight).reshape(-1, 3), axis=0, return_inverse=True)
-    e = bound(nodes.astype(np.float64))[0][corner.reshape(-1, 8)]
-    start = np.random.default_rng(0).random((len(cells), 3))
-    rounds = int(np.clip(PAIRS / (len(cells) * len(furnace.q)), *ROUNDS))
-    for index in range(rounds):
-        inside = (start + index * STRIDE) % 1
-        wanted, there = bound(cells + inside)
-        weights = np.prod(np.where(eight, inside[:, None], 1 - inside[:, None]), -1)
-        got = (weights * e).sum(-1)
-        lost = np.clip(1 - got / wanted, 0, 1)[there]
-        e *= np.where(there, np.minimum(wanted / np.maximum(got, 1e-30), 1), 1)[:, None]
+    e = bound(nodes.astype(np.float64))[0][:, corner.reshape(-1, 8)]
+    start, lowered = np.random.default_rng(0).random((len(cells), 3)), np.ones((len(e), len(cells)))
+
+    def of_neighbours() -> NDArray[np.float64]:
+        near = np.ones((len(e), *np.add(layout.shape[:3], (-1, 0, 0))))
+        near[(slice(None), *cells.T)] = lowered
+        return minimum_filter(near, (1, 3, 3, 3))[(slice(None), *cells.T)]
+
+    some, done = np.arange(len(cells)), 0
+    # All cells, and again those that are steep.
+    jumps = furnace.by_order and furnace.index is not None
+    for steep in (False, True)[: 1 + jumps]:
+        if steep:
+            some = np.flatnonzero(of_neighbours().min(0) < STEEP)
+        rounds = int(np.clip(PAIRS / max(len(some) * furnace.work, 1), *ROUNDS)) if len(some) else 0
+        for index in range(done, done + rounds):
+            inside = (start[some] + index * STRIDE) % 1
+            wanted, there = bound(cells[some] + inside)
+            weights = np.prod(np.where(eight, inside[:, None], 1 - inside[:, None]), -1)
+            got = (weights * e[:, some]).sum(-1)
+            if not steep:
+                lost = np.clip(1 - got / np.maximum(wanted, 1e-30), 0, 1)[:, there]
+            share = np.where(there, np.minimum(wanted / np.maximum(got, 1e-30), 1), 1)
+            e[:, some] *= share[..., None]
+            lowered[:, some] *= share
+        done += rounds
+    if jumps:
+        # What few places show in one cell may lie between those in its neighbours.
+        e *= (of_neighbours() / np.maximum(lowered, 1e-30))[..., None]
+        e[e < 1] *= 1 - 2 * SLACK
     # Two cells share a corner (slice, row, column, corner).
-    full = np.ones(layout.shape)
-    for k, (above, j, i) in enumerate(eight):
-        np.minimum.at(full, (cells[:, 0] + above, cells[:, 1], cells[:, 2], 2 * j + i), np.maximum(e[:, k], 0))
-    return full, (float(lost.mean()), float(lost.max()))
+    full = np.ones((len(e), *layout.shape))
+    for of, to in zip(e, full, strict=True):
+        for k, (above, j, i) in enumerate(eight):
+            np.minimum.at(to, (cells[:, 0] + above, cells[:, 1], cells[:, 2], 2 * j + i), np.maximum(of[:, k], 0))
+    return full, [(float(one.mean()), float(one.max())) for one in lost]
 
 
 def _bilinear(x: NDArray[np.float64] | np.float64, y: NDArray[np.float64] | np.float64) -> NDArray[np.float64]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 import os
 import re
 from collections.abc import Iterator, Mapping
@@ -15,10 +16,13 @@ import mitsuba.parser
 import numpy as np
 from numpy.typing import NDArray
 
+from ..bsdf.base import is_grating
 from ..errors import RequestError, root_cause
 from ..llvm import is_spectral
 from ..recipe import Recipe
 from ..settings import VISIBLE
+
+_log = logging.getLogger(__name__)
 
 # The spacing of the channels, nm.
 #
@@ -31,6 +35,7 @@ _STEP = 5.0
 _DENSITY_STEP = 0.25
 _DRAWS_PER_LIGHT = 2**14  # of four wavelengths, to learn its spectrum
 
+_RAYS_FROM_BELOW = 4096  # to find out whether gratings are seen and lit from above
 _MOST_PIXELS = 2**25  # above 7680 × 4320; sums take 750 bytes per pixel
 _DEFAULT_SIZE = (768, 576)  # that of Mitsuba's films
 
@@ -103,7 +108,36 @@ def load_spectral_scene(
     if scene.integrator().aov_names():
         raise RequestError(f"{path}: the integrator gives {scene.integrator().aov_names()}, wanted radiance alone")
     _draw_wavelengths_of_lights(scene)
+    _warn_of_light_from_below(scene)
     return scene
+
+
+def _warn_of_light_from_below(scene: mi.Scene) -> None:
+    """Say in the log which gratings are black because they are seen, or lit, from below only and let no light pass.
+
+    By rays of the first sensor, one light of each; scalar variants are spared it.
+    """
+    opaque = [shape for shape in scene.shapes() if is_grating(shape.bsdf()) and shape.bsdf().layers.interface is None]
+    if not opaque or not dr.is_jit_v(mi.Float) or not scene.sensors():
+        return
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(0, _RAYS_FROM_BELOW)
+    ray, _ = scene.sensors()[0].sample_ray(0, sampler.next_1d(), sampler.next_2d(), sampler.next_2d())
+    si = scene.ray_intersect(mi.Ray3f(ray))
+    light, weight = scene.sample_emitter_direction(si, sampler.next_2d(), False, si.is_valid())
+    lit = dr.any(mi.unpolarized_spectrum(weight) != 0)
+    seen_above, lit_above = si.wi.z > 0, lit & (mi.Frame3f.cos_theta(si.to_local(light.d)) > 0)
+    for shape in opaque:
+        here = si.is_valid() & (si.shape == mi.ShapePtr(shape))
+        bright = seen_above & lit_above
+        if dr.count(here & lit)[0] > 0 and dr.count(here & bright)[0] == 0:
+            side = "lit" if dr.count(here & seen_above)[0] > 0 else "seen"
+            _log.warning(
+                "diffraction_grating of shape %s is %s from below only, where it is black: transmission=sheet or "
+                "interface lets light pass, twosided puts a second relief there",
+                shape.id(),
+                side,
+            )
 
 
 def _draw_wavelengths_of_lights(scene: mi.Scene) -> None:

@@ -40,17 +40,33 @@ class Axes:
 
         λ = λ₀ + (λ₁ − λ₀) Z / (K − 1),    λ₀ = min(λ_min, T/g),    λ₁ = min(λ_max, T/g).
 
+    Of an interface to a dielectric of index n (relative to the medium above), g and λ are those above for all light; g
+    is signed, g = −√(k_y² − ν²) where no light travels above. Inside, g'² = g|g| + (n² − 1) ν². Light that enters comes
+    in with k_x = c + m/2 again; its coordinates are those of the incident direction alone, the same for all m,
+
+        P = g + c + m/2,    R = g − c − m/2.
+
+    Light that is reflected inside has lines where an order becomes totally reflected, at the same whole numbers:
+
+        P = D + g + c − |m|/2,    R = D + g − c − |m|/2,
+
+    the whole number D large enough that both are above zero for all of it.
+
     Attributes:
         period: T in µm.
         wavelengths: (shortest, longest) in µm.
         steps: s.
         planes: K.
+        index: n of the medium below, relative to that above.
+        way: sides from which and to which the light goes, 0 above and 1 below.
     """
 
     period: float
     wavelengths: tuple[float, float]
     steps: int
     planes: int
+    index: float = 1.0
+    way: tuple[int, int] = (0, 0)
 
     @property
     def solved(self) -> Axes:
@@ -59,8 +75,18 @@ class Axes:
 
     @property
     def reach(self) -> float:
-        """2 ν of the shortest wavelength: P + R + |m| is below."""
-        return 2 * self.period / self.wavelengths[0]
+        """The sum of g of the media of both ways, of the shortest wavelength: the largest order is below."""
+        return sum((1.0, self.index)[side] for side in self.way) * self.period / self.wavelengths[0]
+
+    @property
+    def beyond(self) -> float:
+        """√(n² − 1), or 0: g > −√(n² − 1) ν."""
+        return float(np.sqrt(max(self.index**2 - 1, 0.0)))
+
+    @property
+    def shift(self) -> int:
+        """D, at least g' − g."""
+        return int(np.ceil(np.sqrt(2) * self.beyond * self.period / self.wavelengths[0])) if self.way == (1, 1) else 0
 
     @property
     def largest(self) -> int:
@@ -72,9 +98,28 @@ class Axes:
         """−M … M."""
         return range(-self.largest, self.largest + 1)
 
+    def least(self, m: NDArray[np.int64] | int) -> tuple[NDArray[np.int64] | int, NDArray[np.int64] | int]:
+        """By how much P and R of order m are less than D + g + k_x and D + g − k_x of the incident light."""
+        enters = self.way == (0, 1) and self.index != 1
+        return (0 * m, 0 * m) if enters else (np.maximum(m, 0), np.maximum(-m, 0))
+
+    def coordinates(
+        self, m: NDArray[np.int64], c: Real, g: Real, wavelength: Real
+    ) -> tuple[Real, Real, NDArray[np.bool_]]:
+        """P and R, and whether order m propagates."""
+        less = self.least(m)
+        p, r = self.shift + g + c + m / 2 - less[0], self.shift + g - c - m / 2 - less[1]
+        inside = g * np.abs(g) + (self.index**2 - 1) * (self.period / wavelength) ** 2
+        there = (p > 0) & (r > 0) & (g <= self.period / self.wavelengths[0] * (1 + 1e-9))
+        for side, k_x in zip(self.way, (c + m / 2, c - m / 2), strict=True):
+            there &= k_x**2 < (inside if side else g * np.abs(g))
+        return p, r, there
+
     def units(self, m: int) -> int:
         """How many units P and R of order m cover."""
-        return int(np.ceil(self.reach - abs(m)))
+        # The largest g + |k_x| of the incident light.
+        longest = (1 + (1.0, self.index)[self.way[0]]) * self.period / self.wavelengths[0]
+        return int(np.ceil(self.shift + longest - sum(self.least(m))))
 
     def side(self, m: int) -> int:
         """Nodes of order m along P, and along R."""
@@ -106,4 +151,5 @@ class Axes:
 
     def range(self, g: Real) -> tuple[Real, Real]:
         """λ₀ and λ₁ at g, µm."""
-        return tuple(np.minimum(w, self.period / np.maximum(g, 1e-12)) for w in self.wavelengths)
+        longest = self.period * np.where(g < 0, self.beyond * (1 - 1e-6), 1.0) / np.maximum(np.abs(g), 1e-12)
+        return tuple(np.minimum(w, longest) for w in self.wavelengths)

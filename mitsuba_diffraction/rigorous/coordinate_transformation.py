@@ -95,32 +95,43 @@ class Grating:
         basis = ztrsen(first, triangle, basis, job="N", lwork=1)[1][:, :count]
         return basis[:n], basis[n:] * unit
 
-    def rayleigh(self, alpha: Real, orders: NDArray[np.int64], beta: Complex) -> tuple[Complex, Complex]:
-        """ψ and −iG of the plane waves e^{i(α_m x + β z)} along the curve as columns, (n, orders) each."""
-        alpha_m = alpha[orders + self.harmonics][:, None]
+    def rayleigh(self, alpha: Real, orders: NDArray[np.int64], beta: Real) -> tuple[tuple[Complex, Complex], ...]:
+        """ψ and −iG of the plane waves e^{i(α_m x ± β z)} along the curve as columns, (n, orders) each; + and −."""
         # Without e^{iα_0 t}, which all harmonics share.
-        phase = alpha_m * self.x + beta[:, None] * self.z - alpha[self.harmonics] * self.t
-        psi = self._coefficients(np.exp(1j * phase))[:, self.n].T
+        alpha_0 = alpha[self.harmonics]
+        along_x = np.exp(1j * (alpha_0 * (self.x - self.t) + orders[:, None] * self.x))
+        along_z = np.exp(1j * beta[:, None] * self.z)
         cos, sin = np.cos(self.tilt), np.sin(self.tilt)
-        along, across = alpha_m[:, 0] * sin + beta * cos, alpha_m[:, 0] * cos - beta * sin
-        return psi, self.j @ (psi * along) - self.m @ (psi * across)
+        found = []
+        for waves, k_z in ((along_z, beta), (along_z.conj(), -beta)):
+            psi = self._coefficients(along_x * waves)[:, self.n].T
+            k_x = alpha_0 + orders
+            along, across = k_x * sin + k_z * cos, k_x * cos - k_z * sin
+            found.append((psi, self.j @ (psi * along) - self.m @ (psi * across)))
+        return tuple(found)
 
 
 @dataclass(frozen=True, eq=False)
 class HalfSpace:
-    """Bounded and outgoing fields on one side of a curve.
+    """Bounded and outgoing fields on one side of a curve, and the light that may come in there.
 
     Attributes:
+        square: γ².
         orders: that propagate, (p,); none in an absorbing medium.
         beta: β_m of these, positive, (p,).
         factors: LU of the matrix whose columns are ψ of the outgoing fields, (n, n); the first p are Rayleigh waves.
         admittance: Y, −iG = Yψ for each sum ψ of outgoing fields, (n, n).
+        psi: ψ of the incoming Rayleigh wave of each order, along the curve, (n, p).
+        rise: −iG of these less Yψ, (n, p).
     """
 
+    square: complex
     orders: NDArray[np.int64]
     beta: Real
     factors: tuple[Complex, NDArray[np.int32]]
     admittance: Complex
+    psi: Complex
+    rise: Complex
 
     def amplitudes(self, psi: Complex) -> Complex:
         """Of the Rayleigh waves in a sum of outgoing fields ψ (n, …), (p, …)."""
@@ -140,85 +151,82 @@ def half_space(grating: Grating, alpha: Real, gamma2: complex, upwards: bool) ->
     orders, beta = grating.n[propagates], np.sqrt(square[propagates].real)
     # Of the solutions without loss, 2p travel; the others are pairs, one of which is bounded on this side.
     modes = grating.bounded(alpha, gamma2, upwards, len(alpha) - len(orders))
-    waves = grating.rayleigh(alpha, orders, (beta if upwards else -beta).astype(complex))
-    psi, flux = (np.hstack(both) for both in zip(waves, modes, strict=True))
+    up, down = grating.rayleigh(alpha, orders, beta)
+    outgoing, incoming = (up, down) if upwards else (down, up)
+    psi, flux = (np.hstack(both) for both in zip(outgoing, modes, strict=True))
     factors = lu_factor(psi, check_finite=False)
     admittance = lu_solve(factors, flux.T.conj(), trans=2, check_finite=False).conj().T
-    return HalfSpace(orders, beta, factors, admittance)
+    psi, flux = incoming
+    return HalfSpace(gamma2, orders, beta, factors, admittance, psi, flux - admittance @ psi)
 
 
-@dataclass(frozen=True, eq=False)
-class Light:
-    """A plane wave from above, of unit amplitude, and what is above.
-
-    Attributes:
-        alpha: α_m of all harmonics, (n,); that of the light is in the middle.
-        square: γ² above.
-        beta: β of the light, positive; it travels downwards.
-        above: the outgoing fields above.
-        psi: ψ of the light along the curve, (n, 1).
-        rise: −iG of the light less Yψ, (n, 1).
-    """
-
-    alpha: Real
-    square: float
-    beta: float
-    above: HalfSpace
-    psi: Complex
-    rise: Complex
-
-
-def light_from(grating: Grating, alpha_0: float, square: float) -> Light:
-    """The light whose wave vector has x component α_0, with γ² = k² − k_y² (times period / 2π, and its square)."""
-    alpha = alpha_0 + grating.n
-    above = half_space(grating, alpha, square, True)
-    beta = float(np.sqrt(square - alpha_0**2))
-    psi, flux = grating.rayleigh(alpha, np.array([0]), np.array([-beta]))
-    return Light(alpha, square, beta, above, psi, flux - above.admittance @ psi)
+ABOVE, BELOW = 0, 1
 
 
 @dataclass(frozen=True, eq=False)
 class Scattered:
-    """What became of light from above.
+    """What becomes of light of any order from either side.
 
     A wave that travels along k̂ is polarised as (ê, k̂ × ê), ê the direction of ŷ − (ŷ·k̂)k̂: "y" light, whose electric
     field lies along the grooves as far as it can, comes before its orthogonal.
 
     Attributes:
-        orders: n of the reflected orders, whose α is α_0 + n, (p,).
-        reflected: (p, 2, 2), [order, polarisation of the order, of the incident light], so scaled that |·|² is a share
-            of the incident power.
-        orders_below: n of the orders that propagate below, (r,).
-        transmitted: the same of these, (r, 2, 2).
+        orders: n of the orders that propagate above, (p,), and below, (r,); their α is α_0 + n.
+        amplitudes: amplitudes[i][o] of light that comes in on side i and leaves on side o, (orders of o, 2, orders of
+            i, 2), [order, polarisation, incident order, its polarisation], so scaled that |·|² is a share of the
+            incident power.
+        alpha: α of the orders above, (p,), and below, (r,).
+        k_y, k_0: of all of this light, k_0 in the medium above, times period / 2π.
     """
 
-    orders: NDArray[np.int64]
-    reflected: Complex
-    orders_below: NDArray[np.int64]
-    transmitted: Complex
+    orders: tuple[NDArray[np.int64], NDArray[np.int64]]
+    amplitudes: tuple[tuple[Complex, Complex], tuple[Complex, Complex]]
+    alpha: tuple[Real, Real]
+    k_y: float
+    k_0: float
+
+    def of_light(self, order: int, side: int) -> tuple[Complex, Complex]:
+        """Amplitudes of the orders above and below, (p, 2, 2) and (r, 2, 2), of light of this order from one side."""
+        j = int(np.flatnonzero(self.orders[side] == order)[0])
+        return tuple(block[:, :, j] for block in self.amplitudes[side])
 
 
-def scatter(grating: Grating, light: Light, k_y: float, index: complex) -> Scattered:
-    """Solve for light of this k_y (times period / 2π) in air above a medium of the index n + ik."""
-    k_0 = np.sqrt(light.square + k_y**2)
-    square = k_0**2 * (index.real**2 if index.imag == 0 else index**2) - k_y**2
-    above, below = light.above, half_space(grating, light.alpha, square, False)
-    # ψ_E and ψ_H on the curve, from E_t and H_t, which are continuous. Above, −iG = Yψ + rise.
-    #   k_y α ψ_E (1/γ₁² − 1/γ₂²) − k_0 (Y₁/γ₁² − Y₂/γ₂²) ψ_H = k_0/γ₁² rise_H
-    #   k_y α ψ_H (1/γ₁² − 1/γ₂²) + k_0 (Y₁/γ₁² − n² Y₂/γ₂²) ψ_E = −k_0/γ₁² rise_E
-    coupling = np.diag(k_y * light.alpha * (1 / light.square - 1 / square))
-    upper, lower = k_0 / light.square * above.admittance, k_0 / square * below.admittance
+def scatter(alpha: Real, above: HalfSpace, below: HalfSpace, k_y: float, index: complex) -> Scattered:
+    """Solve for light of this k_y (times period / 2π), with air above and a medium of the index n + ik below.
+
+    Args:
+        alpha: α_m of all harmonics, (n,), those of both half-spaces.
+    """
+    k_0 = np.sqrt(above.square + k_y**2)
+    # ψ_E and ψ_H on the curve, from E_t and H_t, which are continuous. −iG = Yψ + rise on either side.
+    #   k_y α ψ_E (1/γ₁² − 1/γ₂²) − k_0 (Y₁/γ₁² − Y₂/γ₂²) ψ_H = k_0 (rise_H1/γ₁² − rise_H2/γ₂²)
+    #   k_y α ψ_H (1/γ₁² − 1/γ₂²) + k_0 (Y₁/γ₁² − n² Y₂/γ₂²) ψ_E = −k_0 (rise_E1/γ₁² − n² rise_E2/γ₂²)
+    coupling = np.diag(k_y * alpha * (1 / above.square - 1 / below.square))
+    upper, lower = k_0 / above.square * above.admittance, k_0 / below.square * below.admittance
     matrix = np.block([[coupling, lower - upper], [upper - index**2 * lower, coupling]])
-    zero = np.zeros_like(light.rise)
-    right = k_0 / light.square * np.block([[zero, light.rise], [-light.rise, zero]])
-    # [ψ_E or ψ_H, harmonic, light in E_y or in H_y].
-    total = np.linalg.solve(matrix, right).reshape(2, -1, 2)
-    scattered = total - np.stack([np.hstack([light.psi, zero]), np.hstack([zero, light.psi])])
-    # Of unit waves, E_y = γ/k and H_y = −n γ/k.
-    up = np.stack([above.amplitudes(field) for field in scattered], axis=1) * [[1, -1], [-1, 1]]
-    reflected = np.sqrt(above.beta / light.beta)[:, None, None] * up
-    down = np.zeros((len(below.orders), 2, 2), complex)
-    if len(below.orders):
-        down = np.stack([below.amplitudes(field) for field in total], axis=1) * [[1, -1], [-1, 1]]
-        down *= np.sqrt(below.beta / light.beta * light.square / square)[:, None, None] * [[index.real], [1]]
-    return Scattered(above.orders, reflected, below.orders, down)
+    factors = lu_factor(matrix, check_finite=False)
+    # Of unit waves, E_y = γ/k and H_y = −n γ/k, and the power is as β.
+    units = [
+        np.sqrt(half.beta) * (k_0 / np.sqrt(np.abs(half.square))) * np.array([[n], [-1]])
+        for half, n in ((above, 1.0), (below, index))
+    ]
+    blocks = []
+    for side, (half, n) in enumerate(((above, 1.0), (below, index))):
+        sign, zero = (1, -1)[side], np.zeros_like(half.rise)
+        rise = sign * k_0 / half.square * half.rise
+        right = np.block([[zero, rise], [-(n**2) * rise, zero]])
+        # [ψ_E or ψ_H, harmonic, light in E_y or in H_y, its order].
+        total = lu_solve(factors, right, check_finite=False).reshape(2, len(alpha), 2, -1)
+        scattered = total - np.eye(2)[:, None, :, None] * half.psi[:, None]
+        of_side = []
+        for other, to in enumerate((above, below)):
+            found = np.stack(
+                [to.amplitudes(field.reshape(len(alpha), -1)) for field in (total if other != side else scattered)]
+            )
+            found = found.reshape(2, len(to.orders), 2, len(half.orders)).transpose(1, 0, 2, 3)
+            found = units[other].T[:, :, None, None] * found / units[side]
+            of_side.append(found.transpose(0, 1, 3, 2))
+        blocks.append(tuple(of_side))
+    orders = above.orders, below.orders
+    middle = len(alpha) // 2
+    return Scattered(orders, tuple(blocks), tuple(alpha[n + middle] for n in orders), k_y, k_0)

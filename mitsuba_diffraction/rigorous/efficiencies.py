@@ -15,7 +15,7 @@ from threadpoolctl import ThreadpoolController
 
 from ..errors import RequestError
 from ..surface.heightfield import HeightField
-from .coordinate_transformation import Grating, light_from, scatter
+from .coordinate_transformation import ABOVE, BELOW, Grating, Scattered, half_space, scatter
 from .curve import Curve, curve_of
 from .materials import refractive_index
 
@@ -35,6 +35,11 @@ def mueller(amplitudes: NDArray[np.complex128]) -> NDArray[np.float64]:
     Polarised waves are written in (ê, k̂ × ê), as in `coordinate_transformation.Scattered`.
     """
     return np.einsum("iab,...bc,jcd,...ad->...ij", _PAULI, amplitudes, _PAULI, amplitudes.conj()).real / 2
+
+
+def matrices_of(solved: Scattered, side: int, to: int) -> NDArray[np.float64]:
+    """Return the Mueller matrices of light from a side to a side, (orders out, orders in, 4, 4)."""
+    return mueller(solved.amplitudes[side][to].transpose(0, 2, 1, 3))
 
 
 @functools.cache
@@ -69,10 +74,12 @@ class Efficiencies:
     normal) and p̂ = k̂ × ŝ; k̂ = −ω_i of the incident light, and k̂ = ω_o of an order.
 
     Attributes:
-        orders: m of the orders that propagate, ascending, (n,); q_x = m / period, ω_o,x = −λ m / period − ω_i,x.
+        orders: m of the orders that propagate on the side of the light, ascending, (n,); q_x = m / period; on either
+            side n_o ω_o,x = −λ m / period − n_i ω_i,x, with the indices of the media of ω_o and ω_i.
         amplitudes: (n, 2, 2), [order, polarisation of the order, of the incident light], s before p; |·|² is a share of
             the incident power.
-        transmitted_orders: m of the orders that propagate below, ascending, (k,); none if the material absorbs.
+        transmitted_orders: m of the orders that propagate on the other side, ascending, (k,); none if the material
+            absorbs, or beyond the critical angle.
         transmitted_amplitudes: (k, 2, 2), as `amplitudes`, k̂ along the transmitted wave.
         transmitted: the share of the incident power that is transmitted, (2,), of s and p light; NaN if the material
             absorbs.
@@ -128,7 +135,8 @@ def efficiencies(
 
     Args:
         height_field: one period (rows that differ are refused); straight lines join the pixels (`curve_of`).
-        direction: ω_i, (3,), to the light, in the local frame; it is normalised. ω_i,z > 0.
+        direction: ω_i, (3,), to the light, in the local frame; it is normalised. ω_i,z < 0: the light comes from below,
+            ω_i is its direction inside of the dielectric.
         wavelength: µm, in vacuum.
         int_ior: index of refraction of a dielectric, or n + ik.
         material: or a conductor by Mitsuba's name, "Al".
@@ -148,8 +156,10 @@ def efficiencies(
     index = refractive_index(wavelength, int_ior=int_ior, material=material)
     omega = np.asarray(direction, np.float64)
     length = np.linalg.norm(omega)
-    if omega.shape != (3,) or not (np.isfinite(length) and length > 0 and omega[2] > 0):
-        raise RequestError(f"direction: got {direction!r}, wanted three numbers, to the light, the third positive")
+    if omega.shape != (3,) or not (np.isfinite(length) and length > 0 and omega[2] != 0):
+        raise RequestError(f"direction: got {direction!r}, wanted three numbers, to the light, the third not zero")
+    if omega[2] < 0 and index.imag:
+        raise RequestError(f"direction: got {direction!r}, light from inside of an absorbing material, wanted it above")
     omega = omega / length
     if not 0 < tolerance < 1:
         raise RequestError(f"tolerance: got {tolerance!r}, wanted a share of the reflected light between 0 and 1")
@@ -157,7 +167,7 @@ def efficiencies(
     if harmonics is None:
         found = converge(curve, omega, k_0, index, tolerance)
     else:
-        fewest, _ = wave_numbers(curve, k_0, index, omega[0])
+        fewest, _ = wave_numbers(curve, k_0, index, omega)
         if not fewest <= harmonics <= 500:
             raise RequestError(f"harmonics: got {harmonics!r}, wanted a number from {fewest} to 500")
         found = solve(curve, omega, k_0, index, harmonics)
@@ -180,7 +190,7 @@ def efficiencies(
 
 def converge(curve: Curve, omega: Real, k_0: float, index: complex, tolerance: float) -> Efficiencies:
     """Raise the harmonics as `efficiencies` says, whatever error is reached; k_0 = period / wavelength."""
-    fewest, waves = wave_numbers(curve, k_0, index, omega[0])
+    fewest, waves = wave_numbers(curve, k_0, index, omega)
     most = max(MOST_HARMONICS, 2 * fewest, min(int(1.5 * waves), _FOR_DEEP_PROFILES))
     count = min(max(fewest + 6, waves), int(0.8 * most))
     found = solve(curve, omega, k_0, index, count)
@@ -191,7 +201,7 @@ def converge(curve: Curve, omega: Real, k_0: float, index: complex, tolerance: f
     return found
 
 
-def wave_numbers(curve: Curve, k_0: float, index: complex, omega_x: float) -> tuple[int, int]:
+def wave_numbers(curve: Curve, k_0: float, index: complex, omega: Real) -> tuple[int, int]:
     """The largest order that propagates, above or below, and the waves that a profile is long.
 
     Light that travels along the curve has, where t runs fastest, as many waves to a unit of t as the second number
@@ -199,29 +209,36 @@ def wave_numbers(curve: Curve, k_0: float, index: complex, omega_x: float) -> tu
     exponentially.
     """
     largest = k_0 * np.sqrt(max(1.0, (index**2).real))
-    return int(np.ceil(largest + k_0 * abs(omega_x))), int(np.ceil(largest * np.hypot(*curve.tangent).max()))
+    k_x = k_0 * abs(omega[0]) * (1 if omega[2] >= 0 else index.real)
+    return int(np.ceil(largest + k_x)), int(np.ceil(largest * np.hypot(*curve.tangent).max()))
 
 
 def solve(curve: Curve, omega: Real, k_0: float, index: complex, harmonics: int) -> Efficiencies:
     """Solve with this number of harmonics; the error is unknown, ∞."""
-    alpha, k_y = -omega[:2] * k_0
+    side = ABOVE if omega[2] > 0 else BELOW
+    k = k_0, k_0 * index.real
+    alpha, k_y = -omega[:2] * k[side]
     with one_thread():
         grating = Grating(curve, harmonics)
-        solved = scatter(grating, light_from(grating, alpha, k_0**2 - k_y**2), k_y, index)
-    light = _frames(np.array([[alpha, k_y, -k_0 * omega[2]]]) / k_0)
+        alphas = alpha + grating.n
+        above = half_space(grating, alphas, k_0**2 - k_y**2, True)
+        square = k_0**2 * (index.real**2 if index.imag == 0 else index**2) - k_y**2
+        solved = scatter(alphas, above, half_space(grating, alphas, square, False), k_y, index)
+    light = frames(-omega[None])
 
-    def in_frames(orders: NDArray[np.int64], amplitudes: Complex, k: float, sign: int) -> Complex:
+    def inframes(orders: NDArray[np.int64], amplitudes: Complex, to: int) -> Complex:
         alphas = alpha + orders
-        heights = sign * np.sqrt(k**2 - k_y**2 - alphas**2)
-        frames = _frames(np.stack([alphas, np.full_like(alphas, k_y), heights], axis=1) / k)
-        # Orders count along the change of k_x there, and along q = −(ω_i + ω_o)/λ here.
-        return (frames.transpose(0, 2, 1) @ amplitudes @ light)[::-1]
+        heights = (1, -1)[to] * np.sqrt(k[to] ** 2 - k_y**2 - alphas**2)
+        of_orders = frames(np.stack([alphas, np.full_like(alphas, k_y), heights], axis=1) / k[to])
+        # Orders count along the change of k_x there, and along q = −(ω_i + ω_o)_∥/λ here.
+        return (of_orders.transpose(0, 2, 1) @ amplitudes @ light)[::-1]
 
-    transmitted = in_frames(solved.orders_below, solved.transmitted, k_0 * index.real, -1)
+    of_sides = solved.of_light(0, side)
+    amplitudes, transmitted = (inframes(solved.orders[to], of_sides[to], to) for to in (side, 1 - side))
     return Efficiencies(
-        orders=-solved.orders[::-1],
-        amplitudes=in_frames(solved.orders, solved.reflected, k_0, 1),
-        transmitted_orders=-solved.orders_below[::-1],
+        orders=-solved.orders[side][::-1],
+        amplitudes=amplitudes,
+        transmitted_orders=-solved.orders[1 - side][::-1],
         transmitted_amplitudes=transmitted,
         transmitted=_powers(transmitted).sum(axis=0) if index.imag == 0 else np.full(2, np.nan),
         harmonics=harmonics,
@@ -244,7 +261,7 @@ def _change(before: Efficiencies, after: Efficiencies) -> float:
     return float(np.max(changes))
 
 
-def _frames(k: Real) -> Real:
+def frames(k: Real) -> Real:
     """(n, 2, 2): ŝ and p̂ (columns) of waves along k (n, 3) in terms of ê and k̂ × ê (rows), as in `Scattered`."""
     across = np.hypot(k[:, 0], k[:, 1])
     s = np.stack([-k[:, 1], k[:, 0], np.zeros(len(k))], axis=1)

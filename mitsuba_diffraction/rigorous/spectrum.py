@@ -2,13 +2,14 @@
 
 A rigorous spectrum as an OpenEXR file: float32, ZIP, one part.
 
-Channel `eta(07)` holds plane 7 of the table (`Axes`): the squares [P, R] of the orders −M … M from top to bottom, each
-at the left; below them, if the table is polarised, the Mueller matrices of this plane, one after the other. Numbers in
-the header are double precision.
+Channel `eta(07)` holds plane 7 of each table (`Axes`), one below the other: the squares [P, R] of the orders −M … M
+from top to bottom, each at the left; below them, if the table is polarised, the Mueller matrices of this plane, one
+after the other. Numbers in the header are double precision.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import os
 from dataclasses import dataclass, field
@@ -19,46 +20,106 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import RequestError
-from ..settings import lobe_reach, lobe_width
+from ..settings import TRANSMISSIONS, lobe_reach, lobe_width
 from ..spectrum.exr import doubles, one_line, read, write
 from ..spectrum.orders import OrderGrid
 from .axes import Axes
+from .efficiencies import REVERSED
 
 Real = NDArray[np.float64]
 
 FORMAT = "mitsuba_diffraction rigorous spectrum"
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 
 _NUMBERS = ("ext_ior", "coherence_length", "tolerance", "error", "worst", "worst_near", "polarisation_error")
-_TEXTS = ("material", "source", "source_digest")
+_TEXTS = ("material", "transmission", "source", "source_digest")
+
+
+WAYS = ((0, 0), (1, 1), (0, 1))
+"""From which side to which the light of each of `RigorousSpectrum.tables` goes."""
 
 
 @dataclass(frozen=True, eq=False)
-class RigorousSpectrum:
-    """η_m of unpolarised light, over `Axes`, and what else a BSDF needs: f = Σ_m η_m N(q − m/T; σ_q² I) / λ².
+class Table:
+    """η_m of unpolarised light over `Axes`.
 
     Attributes:
         axes: what the table stands over.
         values: (K, nodes) float32, η at the nodes of `axes`; of order m, side² values from offset(m), [P, R].
+        mueller: (K, nodes, 4, 4) float32, the Mueller matrices of the orders for k_y ≥ 0, between
+            waves in (ê, k̂ × ê), ê the direction of ŷ − (ŷ·k̂)k̂; or None.
+    """
+
+    axes: Axes
+    values: NDArray[np.float32] = field(repr=False)
+    mueller: NDArray[np.float32] | None = field(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        wanted = self.axes.planes, self.axes.nodes
+        if self.values.shape != wanted or self.values.dtype != np.float32:
+            raise RequestError(f"values: got {self.values.shape} of {self.values.dtype}, wanted {wanted} of float32")
+        if self.mueller is not None:
+            matrices = (*wanted, 4, 4)
+            if self.mueller.shape != matrices or self.mueller.dtype != np.float32:
+                raise RequestError(f"mueller: got {self.mueller.shape}, wanted {matrices} of float32")
+
+    def evaluate(self, m: ArrayLike, c: ArrayLike, g: ArrayLike, wavelength: ArrayLike, mueller: bool = False) -> Real:
+        """η_m, or M_ij (…, 4, 4), linear between the nodes; 0 for an order that does not propagate.
+
+        Args:
+            m: orders, broadcast against the others.
+            c, g, wavelength: as in `Axes`, µm in the medium above.
+            mueller: whether to return the matrices of light with k_y ≥ 0.
+        """
+        table = self.mueller if mueller else self.values
+        m, c, g, wavelength = np.broadcast_arrays(np.asarray(m, np.int64), c, g, wavelength)
+        axes = self.axes
+        p, r, there = axes.coordinates(m, c, g, wavelength)
+        p, r, order = (np.where(there, v, 0) for v in (p, r, m))
+        side = np.array([axes.side(k) for k in axes.orders])[order + axes.largest]
+        offset = np.array([axes.offset(k) for k in axes.orders])[order + axes.largest]
+        first, last = axes.range(g)
+        z = np.clip((wavelength - first) / np.maximum(last - first, 1e-9), 0, 1) * (axes.planes - 1)
+        result = np.zeros((*m.shape, *table.shape[2:]))
+        wide = (..., *[None] * (table.ndim - 2))
+        places = [_split(axes.position(p), side), _split(axes.position(r), side), _split(z, axes.planes)]
+        for corner in np.ndindex(2, 2, 2):
+            (i, j, k), weights = zip(
+                *((low + up, f if up else 1 - f) for (low, f), up in zip(places, corner, strict=True)), strict=True
+            )
+            result += np.prod(weights, axis=0)[wide] * table[k, offset + i * side + j]
+        return np.where(there[wide], result, 0)
+
+
+@dataclass(frozen=True, eq=False)
+class RigorousSpectrum:
+    """η_m of unpolarised light as tables, and what else a BSDF needs: f = Σ_m η_m N(q − m/T; σ_q² I) n_o² / λ².
+
+    Side 0 is above, side 1 below. With transmission "interface" the medium of `int_ior` is below; of a "sheet" it is
+    air. The sides' light is one reciprocal set, of which `tables` holds three: what is reflected above, what is
+    reflected below, and what crosses from above to below. Light that crosses from below is the reverse of the last.
+
+    Attributes:
+        tables: of reflected light alone, (above → above,); with transmission (above → above, below → below,
+            above → below).
+        transmission: one of `TRANSMISSIONS`.
         material: a conductor by Mitsuba's name, or "" for a dielectric.
         int_ior: n + ik if there is no material.
         coherence_length: L_c in µm; it sets the width σ_q of each order.
         tolerance: what was asked for.
         error: what was measured at directions (uniform over the hemisphere) and wavelengths that were not used to build
-            the table: the mean of Σ|Δη_m| / Σ η_m.
+            the tables: the mean of Σ|Δη_m| / Σ η_m, the sum over all orders that leave, on either side; with
+            transmission, light comes from either side.
         worst: the largest of these, away from the lines where an order passes off (P or R within 0.02 of an integer).
         worst_near: the largest of these near such a line.
         harmonics: N of the solver.
         source: where the heights came from.
         source_digest: SHA-256 of the height field.
         ext_ior: index of the medium above relative to air; wavelengths are those in this medium.
-        mueller: (K, nodes, 4, 4) float32, the Mueller matrices of the orders for k_y ≥ 0, between
-            waves in (ê, k̂ × ê), ê the direction of ŷ − (ŷ·k̂)k̂; or None.
-        polarisation_error: of `mueller`, as `error`: the mean of Σ_m max_ij |ΔM_ij| / Σ η_m; NaN if there is none.
+        polarisation_error: of the matrices, as `error`: the mean of Σ_m max_ij |ΔM_ij| / Σ η_m; NaN if there are none.
     """
 
-    axes: Axes
-    values: NDArray[np.float32]
+    tables: tuple[Table, ...]
     material: str
     int_ior: complex
     coherence_length: float
@@ -70,18 +131,36 @@ class RigorousSpectrum:
     source: str
     source_digest: str = field(repr=False)
     ext_ior: float = 1.0
-    mueller: NDArray[np.float32] | None = field(default=None, repr=False)
+    transmission: str = "none"
     polarisation_error: float = float("nan")
 
     def __post_init__(self) -> None:
-        wanted = self.axes.planes, self.axes.nodes
-        if self.values.shape != wanted or self.values.dtype != np.float32:
-            raise RequestError(f"values: got {self.values.shape} of {self.values.dtype}, wanted {wanted} of float32")
-        if self.mueller is not None:
-            matrices = (*wanted, 4, 4)
-            if self.mueller.shape != matrices or self.mueller.dtype != np.float32:
-                raise RequestError(f"mueller: got {self.mueller.shape}, wanted {matrices} of float32")
+        if self.transmission not in TRANSMISSIONS:
+            raise RequestError(f"transmission: got {self.transmission!r}, wanted one of {', '.join(TRANSMISSIONS)}")
+        wanted = 1 if self.transmission == "none" else 3
+        if len(self.tables) != wanted:
+            raise RequestError(f"tables: got {len(self.tables)}, wanted {wanted} for transmission {self.transmission}")
         lobe_width(self.coherence_length)
+
+    @property
+    def axes(self) -> Axes:
+        """Of the light that is reflected above."""
+        return self.tables[0].axes
+
+    @property
+    def values(self) -> NDArray[np.float32]:
+        """Of the light that is reflected above."""
+        return self.tables[0].values
+
+    @property
+    def mueller(self) -> NDArray[np.float32] | None:
+        """Of the light that is reflected above."""
+        return self.tables[0].mueller
+
+    @property
+    def indices(self) -> tuple[float, float]:
+        """Of the media of side 0 and side 1, relative to that of side 0."""
+        return 1.0, self.int_ior.real if self.transmission == "interface" else 1.0
 
     # As a `GratingSpectrum` has them.
     extent = "tile"
@@ -110,8 +189,9 @@ class RigorousSpectrum:
 
     @property
     def megabytes(self) -> float:
-        """Size of the table in memory."""
-        return (self.values.nbytes + (0 if self.mueller is None else self.mueller.nbytes)) / 1e6
+        """Size of the tables in memory."""
+        arrays = [a for table in self.tables for a in (table.values, table.mueller) if a is not None]
+        return sum(a.nbytes for a in arrays) / 1e6
 
     @property
     def lobe_width(self) -> float:
@@ -126,69 +206,73 @@ class RigorousSpectrum:
     @cached_property
     def digest(self) -> str:
         """SHA-256 of what a renderer needs of it: spectra that have one show the same."""
-        told = repr((self.axes, self.material, self.int_ior, self.coherence_length, self.tolerance, self.ext_ior))
-        matrices = b"" if self.mueller is None else self.mueller.tobytes()
-        return hashlib.sha256(told.encode() + self.values.tobytes() + matrices).hexdigest()
+        axes = [table.axes for table in self.tables]
+        told = repr((axes, self.material, self.int_ior, self.coherence_length, self.tolerance, self.ext_ior))
+        arrays = [a for table in self.tables for a in (table.values, table.mueller) if a is not None]
+        return hashlib.sha256((told + self.transmission).encode() + b"".join(a.tobytes() for a in arrays)).hexdigest()
 
-    def evaluate(self, m: ArrayLike, c: ArrayLike, g: ArrayLike, wavelength: ArrayLike) -> Real:
-        """η_m from the table, linear between its nodes.
+    def evaluate(
+        self,
+        m: ArrayLike,
+        c: ArrayLike,
+        g: ArrayLike,
+        wavelength: ArrayLike,
+        sides: tuple[int, int] = (0, 0),
+        mueller: bool = False,
+    ) -> Real:
+        """η_m of light from a side to a side, from the tables, or its Mueller matrix, linear between the nodes.
+
+        With n_i and n_o the `indices` of the sides of ω_i and ω_o, and ν = T/λ,
+
+            c = (n_o ω_o,x − n_i ω_i,x) ν / 2,    k_y = (n_o ω_o,y − n_i ω_i,y) ν / 2,    g = ± √|ν² − k_y²|,
+
+        g of the sign of ν² − k_y². Light that crosses upwards is evaluated as the reversed light, with −c.
 
         Args:
             m: orders, broadcast against the others.
-            c, g: as in `Axes`.
-            wavelength: µm.
+            c, g: as above.
+            wavelength: µm, in the medium of side 0.
+            sides: from which the light comes and to which it leaves, 0 above and 1 below.
+            mueller: whether to return M_ij, (…, 4, 4), of light with k_y ≥ 0.
 
         Returns:
             η_m; 0 for an order that does not propagate, or that is beyond the wavelengths of the table.
-        """
-        return self._interpolated(self.values, m, c, g, wavelength)
-
-    def evaluate_mueller(self, m: ArrayLike, c: ArrayLike, g: ArrayLike, wavelength: ArrayLike) -> Real:
-        """M_ij of light with k_y ≥ 0, (…, 4, 4), as `evaluate` has η_m.
 
         Raises:
-            ValueError: if the table has none.
+            ValueError: if there is no such table.
         """
-        if self.mueller is None:
+        if len(self.tables) == 1 and sides != (0, 0):
+            raise RequestError(f"sides: got {sides!r} of a table with transmission none, wanted (0, 0)")
+        if mueller and self.mueller is None:
             raise RequestError("mueller: got a table of unpolarised light, wanted one built with polarised=True")
-        return self._interpolated(self.mueller, m, c, g, wavelength)
+        table = self.tables[WAYS.index((min(sides), max(sides)))]
+        upwards = sides == (1, 0)
+        found = table.evaluate(m, np.negative(c) if upwards else c, g, wavelength, mueller)
+        if mueller and upwards:
+            found = np.outer(REVERSED, REVERSED) * np.swapaxes(found, -1, -2)
+        return found
 
-    def _interpolated(
-        self, table: NDArray[np.float32], m: ArrayLike, c: ArrayLike, g: ArrayLike, wavelength: ArrayLike
-    ) -> Real:
-        """What stands at the nodes, (K, nodes, …), linear between them."""
-        m, c, g, wavelength = np.broadcast_arrays(np.asarray(m, np.int64), c, g, wavelength)
-        axes, half = self.axes, np.abs(m) / 2
-        p, r = g + c - half, g - c - half
-        there = (p > 0) & (r > 0) & (p + r + 2 * half <= axes.reach * (1 + 1e-9))
-        p, r, order = (np.where(there, v, 0) for v in (p, r, m))
-        side = np.array([axes.side(k) for k in axes.orders])[order + axes.largest]
-        offset = np.array([axes.offset(k) for k in axes.orders])[order + axes.largest]
-        first, last = axes.range(g)
-        z = np.clip((wavelength - first) / np.maximum(last - first, 1e-9), 0, 1) * (axes.planes - 1)
-        result = np.zeros((*m.shape, *table.shape[2:]))
-        wide = (..., *[None] * (table.ndim - 2))
-        places = [_split(axes.position(p), side), _split(axes.position(r), side), _split(z, axes.planes)]
-        for corner in np.ndindex(2, 2, 2):
-            (i, j, k), weights = zip(
-                *((low + up, f if up else 1 - f) for (low, f), up in zip(places, corner, strict=True)), strict=True
-            )
-            result += np.prod(weights, axis=0)[wide] * table[k, offset + i * side + j]
-        return np.where(there[wide], result, 0)
-
-    def efficiencies(self, direction: ArrayLike, wavelength: float) -> tuple[NDArray[np.int64], Real]:
+    def efficiencies(
+        self, direction: ArrayLike, wavelength: float, transmitted: bool = False
+    ) -> tuple[NDArray[np.int64], Real]:
         """The orders that propagate, ascending, and η_m of unpolarised light, as `rigorous.efficiencies` has them.
 
         Args:
-            direction: ω_i, (3,), to the light.
-            wavelength: µm.
+            direction: ω_i, (3,), to the light; from below if ω_i,z < 0.
+            wavelength: µm, in the medium of side 0.
+            transmitted: the orders that leave on the other side, instead of those reflected.
         """
         omega = np.asarray(direction, np.float64) / np.linalg.norm(direction)
-        alpha, k_y = -omega[:2] * self.axes.period / wavelength
-        g = np.sqrt((self.axes.period / wavelength) ** 2 - k_y**2)
-        m = np.array(self.axes.orders)
-        m = m[np.abs(alpha - m) < g]
-        return m, self.evaluate(m, alpha - m / 2, g, wavelength)
+        side = int(omega[2] < 0)
+        to = 1 - side if transmitted else side
+        nu = self.axes.period / wavelength
+        alpha, k_y = -omega[:2] * self.indices[side] * nu
+        square = nu**2 - k_y**2
+        g_out = np.sqrt(max((self.indices[to] * nu) ** 2 - k_y**2, 0))
+        m = np.arange(np.ceil(alpha - g_out), np.floor(alpha + g_out) + 1).astype(int)
+        m = m[np.abs(alpha - m) < g_out]
+        g = np.sign(square) * np.sqrt(abs(square))
+        return m, self.evaluate(m, alpha - m / 2, g, wavelength, (side, to))
 
     def save(self, path: str | os.PathLike[str], recipe: str = "") -> None:
         """Write the spectrum as an OpenEXR file, whole or not at all; `recipe` is the digest of its `Recipe`.
@@ -196,17 +280,17 @@ class RigorousSpectrum:
         Raises:
             OSError: if the file cannot be written.
         """
-        axes = self.axes
-        height, width = sum(axes.side(m) for m in axes.orders), axes.side(0)
-        matrices = np.zeros((axes.planes, 0)) if self.mueller is None else self.mueller.reshape(axes.planes, -1)
-        more = -(-matrices.shape[1] // width)
-        sheet = np.zeros((axes.planes, height + more, width), np.float32)
-        sheet[:, height:].reshape(axes.planes, -1)[:, : matrices.shape[1]] = matrices
-        top = 0
-        for m in axes.orders:
-            side = axes.side(m)
-            sheet[:, top : top + side, :side] = axes.square(self.values, m)
-            top += side
+        axes, width = self.axes, max(table.axes.side(0) for table in self.tables)
+        rows = []
+        for table in self.tables:
+            for m in table.axes.orders:
+                square = table.axes.square(table.values, m)
+                rows.append(np.pad(square, [(0, 0), (0, 0), (0, width - square.shape[2])]))
+            if table.mueller is not None:
+                matrices = table.mueller.reshape(axes.planes, -1)
+                matrices = np.pad(matrices, [(0, 0), (0, -matrices.shape[1] % width)])
+                rows.append(matrices.reshape(axes.planes, -1, width))
+        sheet = np.concatenate(rows, axis=1)
         index = complex(self.int_ior)
         header = {
             "period": doubles(axes.period),
@@ -234,25 +318,29 @@ class RigorousSpectrum:
         header, channels = read(path, FORMAT, FORMAT_VERSION, recipe)
         try:
             (period,), (shortest, longest) = header["period"], header["wavelengths"]
-            axes = Axes(float(period), (float(shortest), float(longest)), header["steps"], header["planes"])
-            sheet = np.stack([channels[_channel(k)].pixels for k in range(axes.planes)])
-            squares, top = [], 0
-            for m in axes.orders:
-                side = axes.side(m)
-                squares.append(sheet[:, top : top + side, :side].reshape(axes.planes, side**2))
-                top += side
-            mueller = None
-            if header["polarised"]:
-                flat = sheet[:, top:].reshape(axes.planes, -1)[:, : 16 * axes.nodes]
-                mueller = np.ascontiguousarray(flat.reshape(axes.planes, axes.nodes, 4, 4))
+            first = Axes(float(period), (float(shortest), float(longest)), header["steps"], header["planes"])
+            index = complex(*(float(x) for x in header["intIor"]))
+            sheet, top, tables = np.stack([channels[_channel(k)].pixels for k in range(first.planes)]), 0, []
+            for axes in axes_of(first, header["transmission"], index.real):
+                squares = []
+                for m in axes.orders:
+                    side = axes.side(m)
+                    squares.append(sheet[:, top : top + side, :side].reshape(axes.planes, side**2))
+                    top += side
+                mueller = None
+                if header["polarised"]:
+                    count = 16 * axes.nodes
+                    more = -(-count // sheet.shape[2])
+                    flat = sheet[:, top : top + more].reshape(axes.planes, -1)[:, :count]
+                    mueller = np.ascontiguousarray(flat.reshape(axes.planes, axes.nodes, 4, 4))
+                    top += more
+                tables.append(Table(axes, np.ascontiguousarray(np.concatenate(squares, axis=1)), mueller))
             return cls(
-                axes=axes,
-                mueller=mueller,
-                values=np.ascontiguousarray(np.concatenate(squares, axis=1)),
-                int_ior=complex(*(float(x) for x in header["intIor"])),
+                tables=tuple(tables),
+                int_ior=index,
                 harmonics=header["harmonics"],
-                **{name: header[_camel(name)] for name in _TEXTS},
                 **{name: header[_camel(name)].item() for name in _NUMBERS},
+                **{name: header[_camel(name)] for name in _TEXTS},
             )
         except KeyError as error:
             raise RequestError(f"{path}: a damaged spectrum, {error} is missing") from None
@@ -264,6 +352,13 @@ def _split(x: Real, count: NDArray[np.int64] | int) -> tuple[NDArray[np.int64], 
     """The node below x, at most the last but one, and how far x is beyond it."""
     low = np.clip(np.floor(x).astype(np.int64), 0, np.maximum(np.asarray(count) - 2, 0))
     return low, x - low
+
+
+def axes_of(axes: Axes, transmission: str, index: float) -> tuple[Axes, ...]:
+    """Return those of `RigorousSpectrum.tables`, from those of the light that is reflected above."""
+    index = index if transmission == "interface" else 1.0
+    ways = WAYS[:1] if transmission == "none" else WAYS
+    return tuple(dataclasses.replace(axes, index=index, way=way) for way in ways)
 
 
 def _channel(plane: int) -> str:

@@ -103,9 +103,9 @@ def energy_near(of, at, height_scale):
     The table itself is rounded, which differences would show.
     """
     tables = shared.SharedTables.of(of)
-    table = tables.energy_table(at)
-    here, there = (tables.corners(table, scale) for scale in (at, height_scale))
-    return energy.Energy(table, there - here, mi.Float(1.0))
+    of_heights = tables.energy_tables(at)
+    here, there = (tables.corners(of_heights, scale) for scale in (at, height_scale))
+    return energy.Energy(of_heights, there - here, mi.Float(1.0))
 
 
 @pytest.mark.slow

@@ -69,6 +69,8 @@ def closed_form(kind, profile, depth, wi, m):
     v = np.append(k_i + k_o, side * (z_i - z_o))
     square = v @ v
     a_i, a_o = (square + n_i**2 - n_o**2) / 2, (square + n_o**2 - n_i**2) / 2
+    if a_i * a_o > 0:
+        return 0.0, np.append(k_o, -side * np.sqrt(n_out**2 - k_o @ k_o)) / n_out  # no facet refracts the pair
     k = abs(a_i * a_o) / (z_i * z_o * v[2] ** 2)
     cosines = abs(a_i) / np.sqrt(square) / n_i, abs(a_o) / np.sqrt(square) / n_o
     power = k * (1 - fresnel(*cosines, n_i, n_o)) * order_power(profile, depth, m, 2 * np.pi * v[2] / WAVELENGTH)
@@ -97,7 +99,7 @@ def power_of_order(bsdf, kind, wi, wo):
 @pytest.mark.parametrize(("profile", "depth"), [("sinusoidal", 0.5), ("blazed", 0.5), ("blazed", 0.8)])
 @pytest.mark.parametrize(("theta", "phi"), [(0, 0), (25, 40), (50, 200)])
 def test_orders_have_the_powers_of_the_closed_form(kind, profile, depth, theta, phi):
-    bsdf = passing(kind, profile, depth, conserve_energy=False)
+    bsdf = passing(kind, profile, depth, shadowing="none")
     for side in (1, -1):
         wi = towards(theta, phi, side)
         found, wanted = [], []
@@ -167,6 +169,24 @@ def test_samples_follow_the_density_on_both_sides(kind, side, component):
         mi.chi2.PlanarDomain(), sample, density, sample_dim=3, sample_count=400_000, res=41, ires=64
     )
     assert test.run(significance_level=0.01, test_count=8, quiet=True), test.messages
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("theta", [0, 40, 75])
+@pytest.mark.parametrize("side", [1, -1])
+def test_few_samples_do_for_all_light(kind, theta, side):
+    bsdf = passing(kind, "sinusoidal", 0.25)
+    count = 1 << 17
+    u = np.random.default_rng(1).random((3, count)).astype(np.float32)
+    si = interaction(towards(theta, 10, side), (450.0, 500.0, 550.0, 650.0), count)
+    bs, weight = bsdf.sample(mi.BSDFContext(IMPORTANCE), si, mi.Float(u[0]), mi.Point2f(u[1:]))
+    weight = np.array(weight).mean(0)
+    assert weight.mean() < 1.004
+    # From inside near the critical angle, less.
+    assert weight.mean() ** 2 / (weight**2).mean() > (0.5 if side > 0 or theta < 30 or kind == "sheet" else 0.3)
+    pdf = bsdf.pdf(mi.BSDFContext(IMPORTANCE), si, bs.wo)
+    glossy = (np.array(bs.pdf) > 0) & ~np.array(mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta))
+    np.testing.assert_allclose(np.array(pdf)[glossy], np.array(bs.pdf)[glossy], rtol=1e-3)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -5,12 +5,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction import gratings, rigorous
+from mitsuba_diffraction.rigorous import build
 from mitsuba_diffraction.rigorous.axes import Axes
 from mitsuba_diffraction.rigorous.build import build_spectrum
 from mitsuba_diffraction.rigorous.spectrum import RigorousSpectrum
+from mitsuba_diffraction.scalar_theory import fresnel
 from mitsuba_diffraction.settings import Settings
 
 SURFACE = gratings.blazed(0.3, 0.05, samples=64)
@@ -89,9 +93,93 @@ def test_a_profile_that_does_not_converge_is_refused():
 def test_a_spectrum_survives_its_file(spectrum, tmp_path):
     spectrum.save(tmp_path / "table.exr")
     loaded = RigorousSpectrum.load(tmp_path / "table.exr")
-    np.testing.assert_array_equal(loaded.values, spectrum.values)
+    for ours, theirs in zip(loaded.tables, spectrum.tables, strict=True):
+        assert ours.axes == theirs.axes
+        np.testing.assert_array_equal(ours.values, theirs.values)
     for name in ("axes", "material", "int_ior", "coherence_length", "error", "harmonics", "source", "source_digest"):
         assert getattr(loaded, name) == getattr(spectrum, name)
+
+
+@pytest.fixture(scope="module", params=["interface", "sheet"])
+def glass(request):
+    """A coarse table of light that passes, with its matrices."""
+    with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for steps in ("_SOLVED", "_SOLVED_BOTH"):
+            patch.setattr(f"mitsuba_diffraction.rigorous.build.{steps}", (4,))
+        patch.setattr("mitsuba_diffraction.rigorous.build._CHECKS", 40)
+        return build_spectrum(SURFACE, replace(REQUEST, polarised=True, transmission=request.param))
+
+
+def test_a_table_of_glass_survives_its_file(glass, tmp_path):
+    glass.save(tmp_path / "glass.exr")
+    loaded = RigorousSpectrum.load(tmp_path / "glass.exr")
+    assert loaded.transmission == glass.transmission
+    for ours, theirs in zip(loaded.tables, glass.tables, strict=True):
+        assert ours.axes == theirs.axes
+        np.testing.assert_array_equal(ours.values, theirs.values)
+        np.testing.assert_array_equal(ours.mueller, theirs.mueller)
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+@given(
+    cosine=st.floats(0.02, 1),
+    turn=st.floats(0, 2 * np.pi),
+    side=st.sampled_from([1, -1]),
+    wavelength=st.floats(0.4, 0.5),
+)
+def test_light_is_reflected_or_transmitted(glass, cosine, turn, side, wavelength):
+    sine = np.sqrt(1 - cosine**2)
+    omega = sine * np.cos(turn), sine * np.sin(turn), side * cosine
+    total = sum(glass.efficiencies(omega, wavelength, transmitted)[1].sum() for transmitted in (False, True))
+    assert total == pytest.approx(1, abs=2 * max(glass.worst, glass.worst_near))
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+@given(
+    cosine=st.floats(0.05, 1),
+    turn=st.floats(0, 2 * np.pi),
+    side=st.sampled_from([1, -1]),
+    wavelength=st.floats(0.4, 0.5),
+)
+def test_reversed_light_goes_back_as_it_came(glass, cosine, turn, side, wavelength):
+    """Through the interface or the sheet and back: n_o ω_o,x = −λ m/T − n_i ω_i,x."""
+    sine = np.sqrt(1 - cosine**2)
+    omega = np.array([sine * np.cos(turn), sine * np.sin(turn), side * cosine])
+    n_i, n_o = glass.indices[::side]
+    for m, eta in zip(*glass.efficiencies(omega, wavelength, transmitted=True), strict=True):
+        x, y = (-n_i * omega[:2] - [wavelength * m / 0.3, 0]) / n_o
+        if x**2 + y**2 < 0.999:
+            orders, back = glass.efficiencies((x, y, -side * np.sqrt(1 - x**2 - y**2)), wavelength, transmitted=True)
+            assert back[list(orders).index(m)] == pytest.approx(eta, abs=1e-6)
+
+
+def test_the_matrices_of_reversed_light_are_those_of_the_solver(glass, monkeypatch):
+    """From below to above nothing is stored; the sheet has its own closed sum for it."""
+    monkeypatch.setattr("mitsuba_diffraction.rigorous.build._CHECKS", 30)
+    surface = build._Surface(SURFACE, (0.4, 0.5), lambda wavelength: 1.5 + 0j, 0.2, "", glass.transmission)
+    errors = []
+    for alpha, g, wavelength, near, orders in surface.checks():
+        if (1, 0) in orders and not near:
+            m, matrices = orders[1, 0]
+            found = glass.evaluate(m, alpha - m / 2, g, wavelength, (1, 0), mueller=True)
+            errors.append(np.abs(found - matrices).max(initial=0))
+    assert len(errors) > 8
+    assert np.mean(errors) < 0.05
+
+
+def test_a_sheet_with_a_flat_grating_is_a_plate():
+    """All bounces: T = (1 − R)/(1 + R) of each polarisation, and R + T = 1."""
+    flat = build._Surface(gratings.blazed(0.3, 0.0, samples=64), (0.4, 0.5), lambda w: 1.5 + 0j, 0.01, "", "sheet")
+    k_0, alpha, k_y = 0.3 / 0.45, 0.3, 0.35
+    (solved,) = flat.solve(alpha, np.sqrt(k_0**2 - k_y**2), [0.45])
+    ways = flat.matrices(solved)
+    reflectance = np.array(fresnel(np.sqrt(1 - (alpha**2 + k_y**2) / k_0**2), 1.5))
+    wanted = np.mean((1 - reflectance) / (1 + reflectance))
+    for way, (of_in, of_out, matrices) in ways.items():
+        (place,) = np.flatnonzero(of_in == 0)
+        assert (of_in == of_out).all()
+        assert matrices[place, place, 0, 0] == pytest.approx(wanted if way[0] != way[1] else 1 - wanted, abs=1e-7)
 
 
 def test_a_scalar_spectrum_is_refused(spectrum, tmp_path):
@@ -168,6 +256,9 @@ def test_a_checkpoint_is_no_reason_to_fail(tmp_path):
         ({"extent": "sample"}, "got rigorous with extent 'sample'"),
         ({"int_ior": None}, "wanted one of the two"),
         ({"theory": "exact"}, "theory: got 'exact'"),
+        ({"transmission": "glass"}, "transmission: got 'glass', wanted one of none, interface, sheet"),
+        ({"transmission": "sheet", "int_ior": None, "material": "Al"}, "sheet and int_ior None, wanted a dielectric"),
+        ({"transmission": "interface", "ext_ior": 1.3}, "and ext_ior 1.3, wanted no coat"),
         ({"theory": "scalar"}, "wanted none of them"),
         ({"height_field": gratings.crossed(2.0, 0.2, samples=8)}, "rows that differ"),
         ({"height_field": [SURFACE, SURFACE]}, r"theory: got rigorous and 2 patches .*, wanted one, of one row"),

@@ -8,13 +8,23 @@ from ...grating_spectrum import GratingSpectrum
 from ...scalar_theory import scalar_error
 from ...surface.heightfield import HeightField
 from ..benchmark.accuracy import against_reference
-from . import analytic, bumps, conservation, coupled_waves, measured_gratings, rough_surface, viewing_angle
+from . import (
+    analytic,
+    bumps,
+    conservation,
+    coupled_waves,
+    measured_gratings,
+    rough_surface,
+    transmission_grating,
+    viewing_angle,
+)
 from .record import GROUPS, Check, Record
 
 
 def checks() -> tuple[Check, ...]:
     """Return the checks of `mitsuba-diffraction validate`, group by group."""
-    modules = (analytic, bumps, viewing_angle, measured_gratings, rough_surface, conservation, coupled_waves)
+    gratings = (measured_gratings, transmission_grating)
+    modules = (analytic, bumps, viewing_angle, *gratings, rough_surface, conservation, coupled_waves)
     every = [check for module in modules for check in module.CHECKS]
     return tuple(sorted(every, key=lambda check: GROUPS.index(check.group)))
 

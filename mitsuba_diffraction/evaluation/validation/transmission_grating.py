@@ -1,0 +1,199 @@
+"""Scalar and rigorous theory against a measured transmission grating, T300: `data/gratings/README.md`.
+
+300 lines/mm, a replica on B270 glass, first order, at normal incidence; it is taken to be lit through its plane face.
+The groove angle and one factor are fitted: the factor stands for what the glass, the replica and scattering take.
+The ratio of the second order to the first needs no factor; estimates from star spectra stand beside it.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
+
+from ...rigorous.efficiencies import efficiencies
+from ...scalar_theory import fresnel, profile_powers
+from ...surface.gratings import blazed
+from ...surface.heightfield import HeightField
+from .record import Check, Record
+from .ruled_fit import DATA, FITS, right_angled
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Real = NDArray[np.float64]
+
+PERIOD = 1000 / 300
+GROOVES = ("right-angled", "vertical wall")
+THEORIES = ("scalar", "rigorous")
+BOUND = 0.02
+"""Of the rms difference, rigorous theory."""
+
+# λ in µm → second order over first, from spectra of stars.
+RATIOS = {0.45: 0.27, 0.5: 0.10, 0.55: 0.03}
+
+_COLOURS = {"rigorous": "#d95f02", "scalar": "#7570b3"}
+_ORDERS = np.array([1, 2])
+
+
+def b270(wavelength: float) -> float:
+    """Return the index of B270 glass at a wavelength in µm: Cauchy's formula through n_d = 1.5230 and V_d = 58.5."""
+    slope = (0.5230 / 58.5) / (0.48613**-2 - 0.65627**-2)
+    return 1.5230 + slope * (wavelength**-2 - 0.58756**-2)
+
+
+def groove(shape: str, angle: float) -> HeightField:
+    """Return one period of grooves with facets of this angle in degrees, and a wall at 90° to them or vertical."""
+    if shape == "right-angled":
+        return right_angled(PERIOD, angle)
+    return blazed(PERIOD, PERIOD * np.tan(np.deg2rad(angle)), samples=512)
+
+
+def transmitted(surface: HeightField, wavelength: float, rigorous: bool) -> Real:
+    """Compute η of the orders 1 and 2 on the blazed side, unpolarised light at normal incidence through the plane face.
+
+    Scalar theory: K_t (1 − F) η_m(κ), with v = n ω_i + ω_o, κ = 2π v_z/λ and F at the direction of v (docs/theory.md).
+    """
+    index = b270(wavelength)
+    face = 1 - fresnel(1.0, index)[0]
+    if rigorous:
+        # Fifteen harmonics more change the efficiencies by less than 1e-3.
+        harmonics = int(2 * index * PERIOD / wavelength) + 15
+        found = efficiencies(surface, (0, 0, -1), wavelength, int_ior=index, tolerance=0.02, harmonics=harmonics)
+        powers = (np.abs(found.transmitted_amplitudes) ** 2).sum(axis=(1, 2)) / 2
+        return face * np.array([powers[found.transmitted_orders == -m][0] for m in _ORDERS])
+    sine = _ORDERS * wavelength / PERIOD
+    cosine = np.sqrt(1 - sine**2)
+    v = np.stack([sine, cosine - index])
+    length = np.linalg.norm(v, axis=0)
+    inside, outside = np.abs(v[1]) / length, np.abs(v[0] * sine + v[1] * cosine) / length
+    gain = inside * outside * length**2 / (cosine * v[1] ** 2)
+    passed = 1 - np.mean(fresnel(outside, index), axis=0)
+    return face * gain * passed * profile_powers(surface)(-_ORDERS, 2 * np.pi * v[1] / wavelength)
+
+
+@functools.cache
+def measured() -> tuple[Real, Real]:
+    """Wavelengths in µm and η₁, (n,) each."""
+    nanometres, found, _ = np.loadtxt(DATA / "T300.csv", delimiter=",", skiprows=2, unpack=True)
+    return nanometres * 1e-3, found
+
+
+@functools.cache
+def curve(shape: str, angle: float, rigorous: bool, step: int = 1) -> Real:
+    """η₁ at every `step`th measured wavelength."""
+    surface = groove(shape, angle)
+    return np.array([transmitted(surface, wavelength, rigorous)[0] for wavelength in measured()[0][::step]])
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Grooves and a factor, fitted to what was measured.
+
+    Attributes:
+        angle: of the facets, degrees.
+        factor: by which the efficiencies are scaled.
+        rms: root of the mean square difference.
+    """
+
+    angle: float
+    factor: float
+    rms: float
+
+
+def scaled(found: Real, step: int = 1) -> tuple[float, float]:
+    """The factor that fits efficiencies to the measured ones best, and the rms difference that is left."""
+    wanted = measured()[1][::step]
+    factor = float(found @ wanted / (found @ found))
+    return factor, float(np.sqrt(((factor * found - wanted) ** 2).mean()))
+
+
+def fit(shape: str, rigorous: bool, step: int = 3) -> Fit:
+    """Fit the groove angle and the factor in the mean square, to every `step`th wavelength."""
+    best = minimize_scalar(
+        lambda angle: scaled(curve(shape, round(float(angle), 3), rigorous, step), step)[1],
+        bounds=(14.0, 22.0),
+        method="bounded",
+        options={"xatol": 0.05},
+    )
+    angle = round(float(best.x), 2)
+    return Fit(angle, *scaled(curve(shape, angle, rigorous, step), step))
+
+
+@functools.cache
+def stored_angles() -> dict[str, dict[str, float]]:
+    """Shape of the grooves → theory → angle in degrees that `fit` found, by `precompute/ruled_fits.py`."""
+    return json.loads(FITS.read_text(encoding="utf-8"))["groove angles"]
+
+
+def difference(shape: str, theory: str) -> Record:
+    """The root of the mean square difference to the measured efficiencies, both scaled by the best factor."""
+    angle = stored_angles()[shape][theory]
+    found = curve(shape, angle, theory == "rigorous")
+    factor, rms = scaled(found)
+    raw = float(np.sqrt(((found - measured()[1]) ** 2).mean()))
+    note = f"rms over {len(found)} wavelengths, facets of {angle:.2f}°, all scaled by {factor:.3f}; {raw:.3f} unscaled"
+    return Record(rms, 0.0, BOUND if theory == "rigorous" else None, note=note)
+
+
+def ratios(shape: str, theory: str) -> Record:
+    """The second order over the first at the wavelengths of `RATIOS`; the first of these is the number."""
+    surface = groove(shape, stored_angles()[shape][theory])
+    found = []
+    for wavelength in RATIOS:
+        first, second = transmitted(surface, wavelength, theory == "rigorous")
+        found.append(second / first)
+    told = ", ".join(f"{value:.3f}" for value in found)
+    places = ", ".join(f"{1e3 * wavelength:g}" for wavelength in RATIOS)
+    return Record(found[0], next(iter(RATIOS.values())), None, note=f"{told} at {places} nm")
+
+
+def plot() -> Figure:
+    """The measured efficiencies, and the curves of both theories and both shapes, each with its factor."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9.5, 3.8), layout="constrained")
+    panels = figure.subplots(1, 2, sharey=True)
+    wavelengths, wanted = measured()
+    for panel, shape in zip(panels, GROOVES, strict=True):
+        for theory, colour in _COLOURS.items():
+            angle = stored_angles()[shape][theory]
+            found = curve(shape, angle, theory == "rigorous")
+            factor, rms = scaled(found)
+            panel.plot(
+                1e3 * wavelengths,
+                factor * found,
+                color=colour,
+                linestyle="-" if theory == "rigorous" else "--",
+                label=f"{theory} theory, {angle:.1f}°, × {factor:.2f}: rms {rms:.3f}",
+            )
+        panel.plot(1e3 * wavelengths, wanted, "o", color="black", markersize=3.5, label="measured")
+        panel.set_title(f"300 lines/mm in glass, {shape}", fontsize=10)
+        panel.legend(frameon=False, fontsize=8, loc="lower left")
+        panel.set_ylim(0, 0.8)
+        panel.set_xlabel("wavelength / nm")
+        panel.grid(alpha=0.2)
+    panels[0].set_ylabel("transmitted efficiency of order 1")
+    return figure
+
+
+CHECKS = tuple(
+    Check(
+        "literature",
+        f"T300, 300 lines/mm in glass, {shape}: {what} theory {theory}",
+        functools.partial(measure, shape, theory),
+        source,
+        slow=theory == "rigorous",
+    )
+    for shape in GROOVES
+    for theory in THEORIES
+    for what, measure, source in (
+        ("order 1,", difference, "data/gratings/README.md"),
+        ("order 2 over 1,", ratios, "estimate from star spectra"),
+    )
+)

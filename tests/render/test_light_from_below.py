@@ -1,0 +1,36 @@
+"""A grating that is black because it is opaque and lit, or seen, from below is named in the log."""
+
+import logging
+
+import mitsuba as mi
+import pytest
+
+from mitsuba_diffraction.render.scene import load_spectral_scene
+
+SCENE = """<scene version="3.0.0"><integrator type="path"/>
+<sensor type="perspective"><transform name="to_world"><lookat origin="0,0,{eye}" target="0,0,0" up="0,1,0"/></transform>
+<film type="hdrfilm"/></sensor>
+<shape type="rectangle" id="film"><bsdf type="diffraction_grating"><string name="profile" value="blazed"/>
+<float name="period" value="2.5"/><float name="depth" value="0.1"/><string name="transmission" value="{kind}"/></bsdf>
+</shape>
+<shape type="sphere"><point name="center" x="0.3" y="0" z="{light}"/><float name="radius" value="0.3"/>
+<emitter type="area"><rgb name="radiance" value="1"/></emitter></shape></scene>"""
+
+
+@pytest.mark.parametrize(
+    ("eye", "light", "kind", "told"),
+    [
+        (4, -5, "none", "of shape film is lit from below only"),
+        (-4, 5, "none", "of shape film is seen from below only"),
+        (4, 5, "none", ""),
+        (4, -5, "sheet", ""),
+    ],
+)
+def test_an_opaque_grating_in_the_dark_is_told(tmp_path, caplog, eye, light, kind, told):
+    mi.set_variant("llvm_ad_spectral")
+    (tmp_path / "s.xml").write_text(SCENE.format(eye=eye, light=light, kind=kind))
+    with caplog.at_level(logging.WARNING, logger="mitsuba_diffraction.render.scene"):
+        load_spectral_scene(tmp_path / "s.xml", width=8, height=8)
+    messages = [record.getMessage() for record in caplog.records]
+    assert len(messages) == bool(told)
+    assert all(told in message and "transmission=sheet" in message for message in messages)
