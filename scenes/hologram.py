@@ -23,7 +23,7 @@ from scipy.special import j1, jnp_zeros
 from mitsuba_diffraction.color import spectrum_to_linear_sRGB
 
 PICTURE = Path(__file__).parents[1] / "docs" / "gallery" / "snake_xenopeltis_sun.png"
-PERIOD, DEPTH = 1.0, 0.25  # µm, as in hologram.xml
+PERIOD, DEPTH = 1.5, 0.25  # µm, as in hologram.xml
 WIDTH = 16.0  # cm, of the hologram; its height is that of the picture
 WAVELENGTHS = np.array([0.620, 0.535, 0.460])  # µm, of the stripes
 BAND = 0.06  # of a wavelength, which the width of the lamp lets the eye see
