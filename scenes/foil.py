@@ -1,7 +1,8 @@
 """A sheet of holographic foil, as a mesh and a texture for foil.xml: `python scenes/foil.py`.
 
 The sheet has been crumpled and laid flat again: folds in random directions, rounded, and both ends curl up. It is
-embossed with shards (cells of random sites), each with a grating in a direction of its own. Lengths are cm.
+embossed with shards (cells of random sites), each with a grating of one of three pitches in a direction of its own.
+Lengths are cm.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from scipy.spatial import cKDTree
 
 WIDTH, HEIGHT = 30.0, 17.0
 SHARDS = 330
+PITCHES = (0.8, 1.0, 1.3)  # µm
 
 
 def crumpled(rng: np.random.Generator, x: Array, y: Array) -> Array:
@@ -56,19 +58,21 @@ def sheet(count: int) -> tuple[Array, Array, Array]:
     return places, u, v
 
 
-def shards(rng: np.random.Generator, columns: int) -> Array:
-    """Directions of the grating, degrees, (rows, columns)."""
+def shards(rng: np.random.Generator, columns: int) -> tuple[Array, Array]:
+    """Directions of the grating in degrees and pitches in µm, (rows, columns) each."""
     rows = round(columns * HEIGHT / WIDTH)
     sites = rng.random((SHARDS, 2)) * (HEIGHT, WIDTH)
     y, x = (np.arange(n) + 0.5 for n in (rows, columns))
     place = np.stack(np.meshgrid(y * HEIGHT / rows, x * WIDTH / columns, indexing="ij"), -1)
-    return rng.uniform(0, 180, SHARDS)[cKDTree(sites).query(place)[1]]
+    shard = cKDTree(sites).query(place)[1]
+    return rng.uniform(0, 180, SHARDS)[shard], rng.choice(PITCHES, SHARDS)[shard]
 
 
 def make(folder: Path, count: int = 900) -> None:
-    """Writes foil.ply, `count` cells long, and foil_turn.exr."""
+    """Writes foil.ply, `count` cells long, foil_turn.exr and foil_pitch.exr."""
     write_sheets(folder / "foil.ply", [sheet(count)])
-    write_numbers(folder / "foil_turn.exr", shards(np.random.default_rng(6), 2 * count))
+    for name, values in zip(("turn", "pitch"), shards(np.random.default_rng(6), 2 * count), strict=True):
+        write_numbers(folder / f"foil_{name}.exr", values)
 
 
 if __name__ == "__main__":

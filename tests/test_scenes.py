@@ -11,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from scipy.special import j1
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction.render import render
@@ -23,6 +24,7 @@ sys.path.insert(0, str(SCENES))
 import disc  # noqa: E402
 import foil  # noqa: E402
 import ground  # noqa: E402
+import hologram  # noqa: E402
 import snake  # noqa: E402
 
 
@@ -97,6 +99,7 @@ def small_scenes(tmp_path_factory):
     disc.make(models, count=64)
     foil.make(models, count=60)
     ground.make(models, size=256)
+    hologram.make(models, hologram.PICTURE, np.array(hologram.LIGHT), np.array(hologram.EYE), count=32)
     return scenes
 
 
@@ -107,6 +110,7 @@ PICTURES = [
     ("snake", {"skin": "elaphe", "light": "lamp"}),
     ("compact_disc", {"light": "sun"}),
     ("foil", {"light": "sun"}),
+    ("hologram", {}),
     ("rainbow", {}),
     ("window", {}),
 ]
@@ -135,6 +139,26 @@ def hit(small_scenes, name, origins, directions):
     found = [scene.ray_intersect(mi.Ray3f(o, d)) for o, d in zip(origins, directions, strict=True)]
     assert all(si.is_valid() for si in found)
     return found
+
+
+# ---------------------------------------------------------------- the hologram
+
+
+def test_stripes_of_the_hologram_send_their_colours_from_the_lamp_to_the_eye():
+    """By the grating equation; as bright as they should be by J_1²."""
+    light, eye = np.array(hologram.LIGHT), np.array(hologram.EYE)
+    brightness = np.random.default_rng(0).random((4, 6, 3))
+    lateral, heights, turn = (x.ravel() for x in hologram.gratings(brightness, light, eye))
+    pixel = hologram.WIDTH / 18
+    y, x = np.mgrid[:4, :18]
+    places = np.stack([(x + 0.5) * pixel - 8, (1.5 - y) * 3 * pixel, 0 * x], -1).reshape(-1, 3)
+    to_light, to_eye = (hologram.directions(places, there) for there in (light, eye))
+    turn, wavelength = np.deg2rad(turn), np.tile(hologram.WAVELENGTHS, 24)
+    sent = (wavelength / (lateral * hologram.PERIOD))[:, None] * np.stack([np.cos(turn), np.sin(turn)], -1)
+    np.testing.assert_allclose(-to_light[:, :2] - sent, to_eye[:, :2], atol=1e-12)
+    kappa = 2 * np.pi * (to_light[:, 2] + to_eye[:, 2]) / wavelength
+    share = j1(kappa * heights * hologram.DEPTH / 2) ** 2
+    np.testing.assert_allclose(share / 0.3386, brightness.ravel(), atol=2e-3)
 
 
 # ---------------------------------------------------------------- the snake

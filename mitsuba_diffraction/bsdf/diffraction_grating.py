@@ -25,8 +25,8 @@ PARAMETERS = (
         "theory",
         "string",
         "of a profile: scalar, or rigorous, Maxwell's equations for the material that is given and for gratings of one "
-        "row; files and spectra say which they are. Rigorous efficiencies exclude height_scale, shadowing, fresnel and "
-        "base",
+        "row; files and spectra say which they are. Rigorous efficiencies exclude height_scale, lateral_scale, "
+        "shadowing, fresnel and base",
         "scalar",
     ),
     Parameter("int_ior, ext_ior", "float or string", "a dielectric, as in Mitsuba's `dielectric`", "1.5, air"),
@@ -35,7 +35,13 @@ PARAMETERS = (
     ),
     Parameter("fresnel", "string", "exact, or Schlick's approximation schlick", "exact"),
     Parameter("orientation", "float or texture", "degrees from the tangent dp_du to the pattern's x axis", "0"),
-    Parameter("height_scale", "float", "scales the heights", "1"),
+    Parameter("height_scale", "float or texture", "scales the heights", "1"),
+    Parameter(
+        "lateral_scale",
+        "float or texture",
+        "scales the lengths along the surface, but not the lobes, of orders that stand apart",
+        "1",
+    ),
     Parameter("shadowing", "string", "v_cavity or none", "v_cavity"),
     Parameter("conserve_energy", "boolean", "false leaves out E, to compare with closed forms", "true"),
     Parameter(

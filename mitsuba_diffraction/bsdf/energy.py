@@ -2,6 +2,9 @@
 
 E = min(e(ω_i, λ), e(ω_o, λ)), e as in `energy/table.py`; of an interface, e of each side and of
 reflected or transmitted light.
+
+With lengths along the surface times s and heights times h, a relief is at λ what it is with heights times r = h/s at
+λ/s: where scales vary there are tables over r, read at λ/s.
 """
 
 from __future__ import annotations
@@ -14,19 +17,20 @@ import mitsuba as mi
 import numpy as np
 
 from ..energy.table import EnergyTable
-from .tables import NumberTable, PacketTable, larger, limited, opaque, smaller
+from .tables import FloatTable, NumberTable, PacketTable, larger, limited, opaque, smaller
 
 
 @dataclass
 class Place:
-    """c − ω_x and c + ω_x of a direction, where it lies among the slices (the one below, and how far from it), and
-    whether it is under the surface."""
+    """c − ω_x and c + ω_x of a direction, where it lies among the slices (the one below, and how far from it),
+    whether it is under the surface, and where its ratio of scales lies among those of tables."""
 
     u: mi.Float
     v: mi.Float
     below: mi.UInt32
     beyond: mi.Float
     under: mi.Bool
+    ratio: mi.UInt32 | None = None
 
 
 class Energy:
@@ -42,6 +46,7 @@ class Energy:
         slopes: np.ndarray | None = None,
         change: mi.Float | None = None,
         index: float = 1.0,
+        edges: Sequence[float] | None = None,
     ) -> None:
         """Pack the tables.
 
@@ -51,14 +56,19 @@ class Energy:
             slopes: times `change`, are added to the tables; those of one after the other.
             change: zero but for its gradient.
             index: n below relative to n above.
+            edges: where scales vary, the ratios between that of one and that of the next; tables of one ratio follow
+                those of the one before.
         """
         first, layout = tables[0], tables[0].layout
         self.loss = np.max([table.loss for table in tables], axis=0)
         self.slices, self.side = first.steps.shape[:2]
-        self.layout, self.two_sided, self.cells_of_table = layout, len(tables) > 1, first.steps.size // 4
+        self.layout, self.cells_of_table = layout, first.steps.size // 4
+        self.two_sided = len(tables) > 1 + len(edges or ())
         steps = np.concatenate([of.steps for of in tables])
         self.table = NumberTable(steps @ (np.uint32(1) << np.arange(0, 32, 8, dtype=np.uint32)))
-        self.steps = [opaque((1 - of.least) / 255) for of in tables]
+        heights = [(1 - of.least) / 255 for of in tables]
+        self.steps = [opaque(height) for height in heights] if edges is None else FloatTable(np.array(heights))
+        self.edges = None if edges is None else [opaque(edge) for edge in edges]
         self.slope = None if slopes is None else PacketTable(slopes)
         self.change = change
         # Wavelengths are those above.
@@ -69,14 +79,28 @@ class Energy:
     def __str__(self) -> str:
         return "bounds the albedo by one, and loses {:.2g} in the mean, {:.2g} at most".format(*self.loss)
 
-    def factor(self, wi: mi.Vector3f, wo: mi.Vector3f, wavelengths: mi.UnpolarizedSpectrum) -> mi.UnpolarizedSpectrum:
+    def factor(
+        self,
+        wi: mi.Vector3f,
+        wo: mi.Vector3f,
+        wavelengths: mi.UnpolarizedSpectrum,
+        height_scale: mi.Float,
+        lateral_scale: mi.Float | None,
+    ) -> mi.UnpolarizedSpectrum:
         """Return E of each wavelength.
 
         Args:
             wi, wo: along the pattern's axes, each inside the medium that it is in, z < 0 below.
             wavelengths: µm, in the medium above.
+            height_scale: of the heights at the point; of effect where there are tables for it.
+            lateral_scale: likewise; None for one.
         """
         there, back = self.place(wi), self.place(wo)
+        if self.edges is not None:
+            lateral_scale = mi.Float(1.0) if lateral_scale is None else dr.detach(lateral_scale)
+            ratio = dr.detach(height_scale) / lateral_scale
+            there.ratio = back.ratio = sum((dr.select(ratio > e, mi.UInt32(1), 0) for e in self.edges), mi.UInt32(0))
+            wavelengths = wavelengths / lateral_scale
         passes = wi.z * wo.z < 0
         result = mi.UnpolarizedSpectrum(1.0)
         for channel in range(len(result)):
@@ -105,15 +129,21 @@ class Energy:
 
         `frequency` is 1/λ in 1/µm, λ in the medium above.
         """
-        period, step = self.periods[0], self.steps[0]
+        period, number = self.periods[0], place.ratio
         if self.two_sided:
             period = dr.select(place.under, self.periods[1], period)
+            number = dr.select(place.under, mi.UInt32(2), 0) + dr.select(passes, mi.UInt32(1), 0)
+            number = number if place.ratio is None else 4 * place.ratio + number
+        if place.ratio is not None:
+            step = self.steps(number, True)
+        elif self.two_sided:
             above, below = (dr.select(passes, self.steps[k + 1], self.steps[k]) for k in (0, 2))
             step = dr.select(place.under, below, above)
+        else:
+            step = self.steps[0]
         (column, x), (row, y) = (self._column(u * (period * frequency)) for u in (place.u, place.v))
         index = (place.below * self.side + row) * self.side + column
-        if self.two_sided:
-            number = dr.select(place.under, mi.UInt32(2), 0) + dr.select(passes, mi.UInt32(1), 0)
+        if number is not None:
             index += number * self.cells_of_table
 
         def between(corners: Callable[[mi.UInt32], mi.Vector4f]) -> mi.Float:

@@ -20,6 +20,7 @@ class Incidence:
     Attributes:
         wi: ω_i along the axes of the pattern, outside of a coat.
         frequency: 1/λ in cycles/µm, outside of a coat.
+        lateral_frequency: 1/λ times the lateral scale: q of the table per λq.
         index: n of the coat relative to the outside; one without.
         least_kappa: κ of light that leaves along the horizon, rad/µm.
         kappa_span: by how much κ is larger for light that leaves along the normal, rad/µm.
@@ -27,6 +28,7 @@ class Incidence:
 
     wi: mi.Vector3f
     frequency: mi.Float
+    lateral_frequency: mi.Float
     index: mi.Float
     least_kappa: mi.Float
     kappa_span: mi.Float
@@ -35,8 +37,8 @@ class Incidence:
 
     @property
     def radius(self) -> mi.Float:
-        """To which |q| of propagating light extends around that of light along the normal, cycles/µm."""
-        return self.frequency
+        """To which |q| of the table extends around that of light along the normal where it propagates, cycles/µm."""
+        return self.lateral_frequency
 
     @property
     def cosine(self) -> mi.Float:
@@ -52,7 +54,14 @@ class Incidence:
         return cos_square(self.wi, tangent) > 0
 
     @classmethod
-    def of(cls, wi: mi.Vector3f, frequency: mi.Float, height_scale: mi.Float, coat: Coat | None = None) -> Incidence:
+    def of(
+        cls,
+        wi: mi.Vector3f,
+        frequency: mi.Float,
+        height_scale: mi.Float,
+        coat: Coat | None = None,
+        lateral_scale: mi.Float | None = None,
+    ) -> Incidence:
         """κ = 2π (cos θ_i + cos θ_o)/λ times the scale of the heights; under a coat, with what holds inside of it.
 
         Without gradients: directions are drawn, and what is drawn does not follow the parameters.
@@ -65,7 +74,8 @@ class Incidence:
             kappa_per_cosine *= coat.relative
             least = kappa_per_cosine * (coat.refracted(wi).z + critical)
             span = kappa_per_cosine * (1 - critical)
-        return cls(*(dr.detach(value) for value in (wi, frequency, index, least, span)))
+        lateral = scaled(frequency, lateral_scale)
+        return cls(*(dr.detach(value) for value in (wi, frequency, lateral, index, least, span)))
 
 
 # Not frozen: Dr.Jit rebuilds what enters a branch field by field.
@@ -81,6 +91,7 @@ class Geometry:
         index: n of the coat relative to the outside; one without.
         height_scale: times the heights.
         shadowing: whether G is a factor.
+        lateral_scale: times the lengths along the surface; None for one.
     """
 
     wi: mi.Vector3f
@@ -90,6 +101,7 @@ class Geometry:
     index: mi.Float
     height_scale: mi.Float
     shadowing: bool
+    lateral_scale: mi.Float | None = None
 
     @classmethod
     def of(
@@ -99,10 +111,12 @@ class Geometry:
         coat: Coat | None = None,
         height_scale: mi.Float | float = 1.0,
         shadowing: bool = True,
+        lateral_scale: mi.Float | None = None,
     ) -> Geometry:
         """Return that of ω_i and ω_o, along the pattern's axes and outside of the coat."""
         cosines = (omega.z if coat is None else coat.refracted(omega).z for omega in (wi, wo))
-        return cls(wi, wo, *cosines, mi.Float(1.0) if coat is None else coat.eta, mi.Float(height_scale), shadowing)
+        index = mi.Float(1.0) if coat is None else coat.eta
+        return cls(wi, wo, *cosines, index, mi.Float(height_scale), shadowing, lateral_scale)
 
     @property
     def tangent(self) -> mi.Vector2f:
@@ -194,6 +208,11 @@ class Geometry:
         # Where the order does not propagate the root would have no derivative.
         per = dr.rcp(dr.square(self.index))
         return *(dr.sqrt(larger(dr.fma(x, per, 1 - per), 1e-12)) for x in outside), gain
+
+
+def scaled(frequency: mi.Float, lateral_scale: mi.Float | None) -> mi.Float:
+    """Return a frequency times the lateral scale; None is one, and costs nothing."""
+    return frequency if lateral_scale is None else frequency * lateral_scale
 
 
 def turned(omega: mi.Vector3f, sin: mi.Float, cos: mi.Float) -> mi.Vector3f:

@@ -13,6 +13,7 @@ from ..rigorous.spectrum import RigorousSpectrum
 from .geometry import Geometry, Incidence, turned
 from .media import Media
 from .polarisation import reflected, through_layer
+from .scales import Scales
 from .surface import surface_from, warn_of_range
 from .tables import BELOW_ONE, larger, limited, opaque, smaller
 from .theories import RigorousTheory, ScalarTheory
@@ -31,16 +32,21 @@ class Grating:
         recipe: behind the spectrum; None for a saved one.
         theory: R, E and what else multiplies the powers of orders.
         media: about the grating; `coat` is that of them.
+        scales: of heights and of lengths along the surface; of rigorous theory one.
         orientation: degrees from the tangent to the pattern's x axis.
     """
 
     def __init__(self, props: mi.Properties, media: Media) -> None:
         self.media, self.coat = media, media.coat
-        self.spectrum, self.recipe = surface_from(props, media)
+        self.scales = Scales(props)
+        self.spectrum, self.recipe = surface_from(props, media, self.scales.largest)
         rigorous = isinstance(self.spectrum, RigorousSpectrum)
         if not rigorous:
             warn_of_range(self.spectrum)
-        self.theory = (RigorousTheory if rigorous else ScalarTheory)(props, self.spectrum, media)
+        if rigorous:
+            self.theory = RigorousTheory(props, self.spectrum, media)
+        else:
+            self.theory = ScalarTheory(props, self.spectrum, media, self.scales)
         self.scattering = self.theory.scattering
         angle = props.get("orientation", 0.0)
         if isinstance(angle, float) and not np.isfinite(angle):
@@ -86,12 +92,12 @@ class Grating:
         value, density = mi.UnpolarizedSpectrum(0.0), mi.Float(0.0)
         # Most directions lie between the orders of a grating at all wavelengths: unless drawn, they skip what follows.
         skips = self.scattering.resolved and not wo_is_sample
-        needed = active & self._meets(si, u, v) if skips else True
+        height_scale, lateral_scale = self.scales.at(si, active)
+        needed = active & self._meets(si, u, v, lateral_scale) if skips else True
         # What has no derivative is bound here: Dr.Jit carries all other state through the branch.
         diffracted = functools.partial(self._diffracted, si, covered, active, wo_is_sample)
-        height_scale = self.theory.height_scale
         if needed:
-            value, density = diffracted(wi, wo, height_scale)
+            value, density = diffracted(wi, wo, height_scale, lateral_scale)
         # The mean over the covered wavelengths: any of them may have chosen the direction.
         uniform = _uniform_share(count)
         density = (1 - uniform) * density * outside / larger(count, 1)
@@ -101,12 +107,12 @@ class Grating:
         """Return 1/λ in the medium above, cycles/µm."""
         return 1e3 * self.media.outside / si.wavelengths[channel]
 
-    def _meets(self, si: mi.SurfaceInteraction3f, u: mi.Float, v: mi.Float) -> mi.Bool:
+    def _meets(self, si: mi.SurfaceInteraction3f, u: mi.Float, v: mi.Float, lateral_scale: mi.Float | None) -> mi.Bool:
         """Return whether (u, v) = λq lies in the lobe of an order at any wavelength."""
         result = mi.Bool(False)
         for channel in range(len(si.wavelengths)):
             frequency = self._frequency(si, channel)
-            result |= self.scattering.meets(u * frequency, v * frequency)
+            result |= self.scattering.meets(u * frequency, v * frequency, *_given(lateral_scale))
         return result
 
     def _diffracted(
@@ -118,23 +124,26 @@ class Grating:
         wi: mi.Vector3f,
         wo: mi.Vector3f,
         height_scale: mi.Float,
+        lateral_scale: mi.Float | None,
     ) -> tuple[mi.UnpolarizedSpectrum, mi.Float]:
         """Return f cos θ_o, and the sum over the wavelengths of the densities; directions along the pattern's axes."""
         interface, shadowing = self.theory.interface, self.theory.shadowing
         if interface is None:
-            geometry = Geometry.of(wi, wo, self.coat, height_scale, shadowing)
+            geometry = Geometry.of(wi, wo, self.coat, height_scale, shadowing, lateral_scale)
         else:
             sides = interface.side(wi), interface.side(wo)
-            geometry = Crossing(*sides, mi.Float(height_scale), shadowing, interface.least_kappa)
+            least = interface.least_kappa(height_scale)
+            geometry = Crossing(*sides, mi.Float(height_scale), shadowing, least, lateral_scale)
         # Directions beyond the largest angle are black, but they are drawn: they have a density.
         within = smaller(*geometry.cosines()) >= self.least_cosine
         value, density = mi.UnpolarizedSpectrum(0.0), mi.Float(0.0)
         for channel in range(len(value)):
             frequency = self._frequency(si, channel)
             if interface is None:
-                incidence = Incidence.of(wi, frequency, height_scale, self.coat)
+                incidence = Incidence.of(wi, frequency, height_scale, self.coat, lateral_scale)
             else:
-                incidence = CrossingIncidence.of(*sides, interface, frequency, height_scale, geometry.flip)
+                flip = geometry.flip
+                incidence = CrossingIncidence.of(*sides, interface, frequency, height_scale, flip, lateral_scale)
             power, share = self.scattering.evaluate(geometry, incidence, active & covered[channel], wo_is_sample)
             value[channel] = dr.select(within, power * dr.square(frequency), 0)
             density = dr.fma(share, dr.square(frequency), density)
@@ -219,18 +228,20 @@ class Grating:
         frequency = dr.detach(frequency)
         wavelength = dr.rcp(frequency)
         sin, cos = (dr.detach(x) for x in self.frame(si, active))
-        wi, height_scale = turned(si.wi, sin, cos), self.theory.height_scale
+        wi = turned(si.wi, sin, cos)
+        height_scale, lateral_scale = (None if s is None else dr.detach(s) for s in self.scales.at(si, active))
+        arguments = rest, v, active & diffracted, *_given(lateral_scale)
         if interface is None:
-            incidence = Incidence.of(wi, frequency, height_scale, self.coat)
-            q, propagates = self.scattering.sample(incidence, rest, v, active & diffracted)
+            incidence = Incidence.of(wi, frequency, height_scale, self.coat, lateral_scale)
+            q, propagates = self.scattering.sample(incidence, *arguments)
             x = -wavelength * (cos * q.x - sin * q.y) - si.wi.x
             y = -wavelength * (sin * q.x + cos * q.y) - si.wi.y
             z = dr.select(propagates, dr.safe_sqrt(1 - dr.square(x) - dr.square(y)), 0)
             return dr.select(uniform, mi.warp.square_to_uniform_hemisphere(v), mi.Vector3f(x, y, z))
         i = interface.side(wi)
         o = interface.other(i, u_side >= passing)
-        incidence = CrossingIncidence.of(i, o, interface, frequency, height_scale, None)
-        q, propagates = self.scattering.sample(incidence, rest, v, active & diffracted)
+        incidence = CrossingIncidence.of(i, o, interface, frequency, height_scale, None, lateral_scale)
+        q, propagates = self.scattering.sample(incidence, *arguments)
         drawn = turned(mi.Vector3f(*(o.tangent - wavelength * incidence.mirrored * q), 0), -sin, cos) / o.outside
         z = dr.select(propagates, dr.safe_sqrt(1 - dr.square(drawn.x) - dr.square(drawn.y)), 0)
         drawn = dr.select(uniform, mi.warp.square_to_uniform_hemisphere(v), mi.Vector3f(drawn.x, drawn.y, z))
@@ -247,6 +258,11 @@ class Grating:
             str(self.theory),
         ]
         return "\n".join(lines)
+
+
+def _given(lateral_scale: mi.Float | None) -> list[mi.Float]:
+    """Return a lateral scale as an argument of spectra that can have one."""
+    return [] if lateral_scale is None else [lateral_scale]
 
 
 def _uniform_share(covered: mi.Float) -> mi.Float:

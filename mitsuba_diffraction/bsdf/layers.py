@@ -58,7 +58,7 @@ class Layers:
         if self.base is not None and not self.grating.theory.material.transparent:
             raise RequestError("base: got a BSDF below a conductor or a perfect mirror, which let no light through")
         flags = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.Anisotropic | mi.BSDFFlags.FrontSide
-        if self.grating.orientation.is_spatially_varying():
+        if self.grating.orientation.is_spatially_varying() or any(scale.varies for scale in self.grating.scales):
             flags = flags | mi.BSDFFlags.SpatiallyVarying
         self.components = [+flags, *(self.base.components if self.base is not None else [])]
         face = self.coat and mi.BSDFFlags.FrontSide

@@ -21,7 +21,7 @@ from ..grating_spectrum import GratingSpectrum
 from ..spectrum.orders import LobeAxis
 from ..spectrum.tables import HALF_SCALE, SeriesTable, SliceTable, shared_exponents
 from .cell_sampler import LOBE, CellAxis, CellSampler
-from .geometry import Geometry, Incidence
+from .geometry import Geometry, Incidence, scaled
 from .inversion import CELLS, KappaCells, averages, choose, diffracted_averages, search, sums_before, truncated_gaussian
 from .tables import (
     BELOW_ONE,
@@ -301,7 +301,7 @@ class OrderSampler:
         """The first row, the end of the rows, the first column, the end of the columns."""
         if not self.restricted:
             return mi.Int32(0), mi.Int32(self.rows), mi.Int32(0), mi.Int32(self.columns)
-        frequency = incidence.frequency
+        frequency = incidence.lateral_frequency
         s_x, s_y = incidence.wi.x * frequency, incidence.wi.y * frequency
         rows = self._interval(s_y, s_x, self.columns, incidence.radius, self.tile_y, self.largest_y)
         columns = self._interval(s_x, s_y, self.rows, incidence.radius, self.tile_x, self.largest_x)
@@ -523,6 +523,8 @@ class OrderSpectrum:
     `order_power` once; a tile as large as the coherence length needs 4 × 4. The density is Σ_m P_m N(q − m/T) with the
     P_m of `OrderSampler`; where orders overlap, that of `CellSampler`. For a line grating whose orders overlap or are
     wide, it is that of `LineSampler`.
+
+    With a lateral scale s, orders that stand apart lie at m/(sT), with lobes as wide: tables are read at sq.
     """
 
     def __init__(self, spectrum: GratingSpectrum, most: float | None = None, farthest: float = 1.0) -> None:
@@ -541,10 +543,17 @@ class OrderSpectrum:
         self.columns, self.line = grid.shape[1], line
         self.per_width = opaque(1 / sigma)
 
-    def meets(self, q_x: mi.Float, q_y: mi.Float) -> mi.Bool:
-        """Whether q lies in the lobe of an order, where they stand apart; q in cycles/µm."""
+    @property
+    def max_scale(self) -> float | None:
+        """The lateral scale up to which orders stand apart; None where they do not."""
+        scales = (axis.max_scale for axis in self.axes if axis.largest)
+        return min(scales, default=np.inf) if self.resolved else None
+
+    def meets(self, q_x: mi.Float, q_y: mi.Float, scale: mi.Float | None = None) -> mi.Bool:
+        """Return whether q (cycles/µm) lies in the lobe of an order, where they stand apart; `scale` is lateral."""
         along_x, along_y = self.axes
-        return along_x.holds(along_x.first(q_x), q_x) & along_y.holds(along_y.first(q_y), q_y)
+        q_x, q_y = scaled(q_x, scale), scaled(q_y, scale)
+        return along_x.holds(along_x.first(q_x), q_x, scale) & along_y.holds(along_y.first(q_y), q_y, scale)
 
     def evaluate(
         self,
@@ -591,17 +600,17 @@ class OrderSpectrum:
         """Return the lobes of a line grating's orders from (m_x, m_y) on, times K G cos θ_o and gain of each."""
 
         def factor(x: int, y: int) -> mi.Float:
-            tangent = self._tangent(m_x + x, m_y + y, incidence)
+            tangent = self._tangent(m_x + x, m_y + y, incidence.frequency)
             return geometry.order_factor(tangent, incidence.frequency, self.per_width)
 
         if len(lobes_x) > 1:
             return [lobe * factor(step, 0) for step, lobe in enumerate(lobes_x)], lobes_y
         return lobes_x, [lobe * factor(0, step) for step, lobe in enumerate(lobes_y)]
 
-    def _tangent(self, m_x: mi.Int32, m_y: mi.Int32, incidence: Incidence) -> mi.Vector2f:
-        """λq of an order."""
+    def _tangent(self, m_x: mi.Int32, m_y: mi.Int32, frequency: mi.Float) -> mi.Vector2f:
+        """Return λq of an order; `frequency` is 1/λ times the lateral scale."""
         pitches = (axis.pitch for axis in self.axes)
-        return mi.Vector2f(*(mi.Float(m) * p for m, p in zip((m_x, m_y), pitches, strict=True))) / incidence.frequency
+        return mi.Vector2f(*(mi.Float(m) * p for m, p in zip((m_x, m_y), pitches, strict=True))) / frequency
 
     def _power(
         self,
@@ -627,7 +636,7 @@ class OrderSpectrum:
         Most directions lie between the orders of a grating: unless ω_o is a sample, they skip all that reads tables.
         """
         q = geometry.tangent * incidence.frequency
-        near = active & self.meets(q.x, q.y)
+        near = active & self.meets(q.x, q.y, geometry.lateral_scale)
         power, density, needed = mi.Float(0.0), mi.Float(0.0), wo_is_sample or near
         # What has no derivative is bound here: Dr.Jit carries all other state through the branch.
         read = functools.partial(self._read, incidence, near)
@@ -637,11 +646,13 @@ class OrderSpectrum:
 
     def _read(self, incidence: Incidence, near: mi.Bool, geometry: Geometry) -> tuple[mi.Float, mi.Float]:
         """Return what `_resolved` does, where `near`; else zero."""
-        q = geometry.tangent * incidence.frequency
+        scale = geometry.lateral_scale
+        frequency = scaled(incidence.frequency, scale)
+        q = geometry.tangent * frequency
         m_x, m_y = (axis.first(q) for axis, q in zip(self.axes, q, strict=True))
-        lobes_x, lobes_y = self.axes[0].lobes(m_x, q.x), self.axes[1].lobes(m_y, q.y)
+        lobes_x, lobes_y = self.axes[0].lobes(m_x, q.x, scale), self.axes[1].lobes(m_y, q.y, scale)
         power = self._power(m_x, m_y, lobes_x, lobes_y, geometry.kappa(incidence.frequency), geometry.small(), near)
-        tangent = self._tangent(m_x, m_y, incidence)
+        tangent = self._tangent(m_x, m_y, frequency)
         power *= geometry.order_factor(tangent, incidence.frequency, self.per_width)
         if incidence.mirrored is not None:
             m_x, m_y = (mi.Int32(incidence.mirrored) * m for m in (m_x, m_y))
@@ -658,13 +669,15 @@ class OrderSpectrum:
         u: mi.Float,
         v: mi.Point2f,
         active: mi.Bool,
+        scale: mi.Float | None = None,
     ) -> tuple[mi.Point2f, mi.Bool]:
-        """Draw q in cycles/µm, for one wavelength, and tell whether the order of q propagates."""
+        """Draw q in cycles/µm, for one wavelength, and tell whether the order of q propagates; `scale` is lateral."""
         if self.cells is not None:
             return self.cells.sample(incidence, u, v, active), active
         row, column, v = self.orders.sample(incidence, u, v, active)
-        tangent = self._tangent(column - self.axes[0].largest, row - self.axes[1].largest, incidence)
-        q = mi.Point2f(self.axes[0].place(column, v.x), self.axes[1].place(row, v.y))
+        m_x, m_y = column - self.axes[0].largest, row - self.axes[1].largest
+        tangent = self._tangent(m_x, m_y, incidence.lateral_frequency)
+        q = mi.Point2f(self.axes[0].place(column, v.x, scale), self.axes[1].place(row, v.y, scale))
         return q, incidence.propagates(tangent)
 
 
@@ -678,6 +691,7 @@ class _Axis:
         self.rim = 0 if self.all else self.count
         self.size, self.pitch = opaque(size), opaque(1 / size)
         self.half_width = opaque(min(lobe.half_width, 1e30))
+        self.max_scale = (1 + 1e-6) / (2 * lobe.half_width * size)
         self.falloff = opaque(-0.5 / sigma**2)
         self.inside, self.spread = opaque(lobe.inside), opaque(np.sqrt(2) * sigma)
         self.peak = opaque(1 / (np.sqrt(2 * np.pi) * sigma * lobe.inside))
@@ -688,14 +702,19 @@ class _Axis:
         """The first of the `count` orders that contribute at q (cycles/µm)."""
         return mi.Int32(-self.largest) if self.all else mi.Int32(dr.ceil(q * self.size - 0.5 * self.count))
 
-    def holds(self, m: mi.Int32, q: mi.Float) -> mi.Bool:
-        """Whether there is an order m, and q lies in its lobe."""
+    def holds(self, m: mi.Int32, q: mi.Float, scale: mi.Float | None = None) -> mi.Bool:
+        """Return whether there is an order m, and q, times the lateral scale, lies in its lobe."""
         offset = dr.fma(-self.pitch, mi.Float(m), q)
-        return (dr.abs(m) <= self.largest) & (dr.abs(offset) <= self.half_width)
+        return (dr.abs(m) <= self.largest) & (dr.abs(offset) <= scaled(self.half_width, scale))
 
-    def lobes(self, first: mi.Int32, q: mi.Float) -> list[mi.Float]:
-        """N(q − m/T; σ_q²) of each of these orders, µm; zero beyond the half width."""
+    def lobes(self, first: mi.Int32, q: mi.Float, scale: mi.Float | None = None) -> list[mi.Float]:
+        """Return N(q − m/T; σ_q²) of each of these orders, µm; zero beyond the half width.
+
+        With a lateral scale s, `q` is s times the frequency, and there is one order: N(q/s − m/(sT); σ_q²).
+        """
         offset = dr.fma(-self.pitch, mi.Float(first), q)
+        if scale is not None:
+            offset = offset / scale
         if self.all:
             offsets = [dr.fma(-self.pitch, step, offset) for step in range(self.count)]
             return [self.peak * dr.exp(self.falloff * dr.square(offset)) for offset in offsets]
@@ -709,6 +728,7 @@ class _Axis:
             lobes.append(lobe * step)
         return lobes
 
-    def place(self, node: mi.Int32, u: mi.Float) -> mi.Float:
-        """The q in the lobe of the order at a row or column with the share `u` of it below, cycles/µm."""
-        return dr.fma(self.pitch, mi.Float(node) - self.largest, truncated_gaussian(u, self.inside, self.spread))
+    def place(self, node: mi.Int32, u: mi.Float, scale: mi.Float | None = None) -> mi.Float:
+        """Return the q in the lobe of the order at a row or column with the share `u` of it below, cycles/µm."""
+        pitch = self.pitch if scale is None else self.pitch / scale
+        return dr.fma(pitch, mi.Float(node) - self.largest, truncated_gaussian(u, self.inside, self.spread))

@@ -9,9 +9,10 @@ from collections.abc import Sequence
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
 from ..energy.furnace import Furnace
-from ..energy.table import EnergyTable, corners
+from ..energy.table import EnergyTable, Stretched, between, corners
 from ..precomputation import Spectrum
 from ..rigorous.spectrum import RigorousSpectrum
 from ..settings import VISIBLE
@@ -22,6 +23,8 @@ from .rigorous_orders import RigorousOrders
 from .spline_spectrum import SplineSpectrum
 
 STEP = 1e-3  # of height_scale, for the derivative of the energy table
+TURN = 0.25  # radians between tables over the ratio of scales
+PARTS = 16  # of an interval of ratios, at most
 
 _making = threading.Lock()
 _shared: weakref.WeakValueDictionary[tuple[str, str, float | None], SharedTables] = weakref.WeakValueDictionary()
@@ -78,12 +81,42 @@ class SharedTables:
                 self._last = scale, Energy(tables, index=index) if needed else None
             return self._last[1]
 
-    def energy_tables(self, height_scale: float) -> list[EnergyTable]:
-        """Return the spectrum's own, or those made for other heights, or for both sides where light passes."""
+    def scaled_energy(
+        self, ratios: NDArray[np.float64], laterals: NDArray[np.float64], complete: bool
+    ) -> Energy | None:
+        """Return the factor E where scales vary, or None if it is one for all; `Scales.ratios` has the arguments.
+
+        Each ratio has its tables if there are no others; else there are bounds for the parts of their interval, from
+        its ends and its middle, between which phases turn by `TURN` unless there would be more than `PARTS`.
+        """
+        spectrum = self._spectrum
+        if not complete:
+            low, high = ratios
+            turn = 0.5 * spectrum.largest_kappa * spectrum.height_range * (high - low)
+            ratios = np.linspace(low, high, 2 * int(np.clip(turn / (2 * TURN), 1, PARTS)) + 1)
+            laterals = np.repeat(laterals[:1], len(ratios))
+        found = [
+            self.energy_tables(float(ratio), Stretched(spectrum, float(lateral)))
+            for ratio, lateral in zip(ratios, laterals, strict=True)
+        ]
+        edges = (ratios[1:] + ratios[:-1]) / 2
+        if not complete:
+            found = [[between(*of) for of in zip(*found[k : k + 3], strict=True)] for k in range(0, len(ratios) - 2, 2)]
+            edges = ratios[2:-1:2]
+        tables = [table for of_ratio in found for table in of_ratio]
+        needed = any(table.needed for table in tables)
+        return Energy(tables, index=self._eta or 1.0, edges=edges.tolist()) if needed else None
+
+    def energy_tables(self, height_scale: float, stretched: Stretched | None = None) -> list[EnergyTable]:
+        """Return the spectrum's own, or those made for other heights, or for both sides where light passes.
+
+        With a lateral scale they are of the stretched spectrum.
+        """
+        spectrum = stretched or self._spectrum
         if self._eta is not None:
-            return EnergyTable.of_interface(self._spectrum, self._eta, height_scale)
-        own = height_scale == 1
-        return [self._spectrum.energy_table() if own else EnergyTable.of(self._spectrum, height_scale)]
+            return EnergyTable.of_interface(spectrum, self._eta, height_scale)
+        own = height_scale == 1 and stretched is None
+        return [self._spectrum.energy_table() if own else EnergyTable.of(spectrum, height_scale)]
 
     def corners(self, tables: Sequence[EnergyTable], height_scale: float) -> np.ndarray:
         """Return e at the corners of the cells of `tables`, not rounded, for other heights."""

@@ -29,10 +29,11 @@ _told: set[str] = set()  # warnings, each of which is given once
 _handed_over: weakref.WeakValueDictionary[str, Spectrum] = weakref.WeakValueDictionary()
 
 
-def surface_from(props: mi.Properties, media: Media) -> tuple[Spectrum, Recipe | None]:
+def surface_from(props: mi.Properties, media: Media, scale: float = 1.0) -> tuple[Spectrum, Recipe | None]:
     """The spectrum that the parameters `filename`, `spectrum`, or `profile` with its own parameters name.
 
-    Wavelengths are shorter inside a coat or a dielectric: what is built here is built for λ/n.
+    Wavelengths are shorter inside a coat or a dielectric: what is built here is built for λ/n, and for the largest
+    `scale` of lengths, as if wavelengths were shorter by it.
 
     Returns:
         The spectrum, and the recipe behind it. A saved spectrum has none: it does not say which heights it is of.
@@ -54,7 +55,7 @@ def surface_from(props: mi.Properties, media: Media) -> tuple[Spectrum, Recipe |
             spectrum, recipe = _taken_over(props["spectrum"]), None
         else:
             spectrum, recipe = _from_file(
-                Path(str(mi.file_resolver().resolve(str(props["filename"])))), media, props.get("tolerance")
+                Path(str(mi.file_resolver().resolve(str(props["filename"])))), media, scale, props.get("tolerance")
             )
         found = "rigorous" if isinstance(spectrum, RigorousSpectrum) else "scalar"
         if props.get("theory", found) != found:
@@ -69,7 +70,7 @@ def surface_from(props: mi.Properties, media: Media) -> tuple[Spectrum, Recipe |
     settings |= {key: props[key] for key in ("coherence_length", "tolerance", "largest_height_range") if key in props}
     if theory == "rigorous":
         settings |= {"theory": theory, **settings_from(props, media.coat)}
-    recipe = _inside(media, Recipe(surface, settings))
+    recipe = _inside(media, scale, Recipe(surface, settings))
     return recipe.cached(_per_cent), recipe
 
 
@@ -81,18 +82,21 @@ def warn_of_range(spectrum: GratingSpectrum) -> None:
         _log.warning("%s", told)
 
 
-def _inside(media: Media, recipe: Recipe) -> Recipe:
-    """Return the recipe for the wavelengths next to the relief, and, of rigorous theory, for the variant."""
+def _inside(media: Media, scale: float, recipe: Recipe) -> Recipe:
+    """Return the recipe for the wavelengths next to the relief, and, of rigorous theory, for the variant.
+
+    A larger `scale` of lengths needs shorter ones, too.
+    """
     inside = {}
     rigorous = recipe.spectrum.get("theory") == "rigorous"
-    if media.index > 1 and "wavelengths" not in recipe.spectrum and not (rigorous and media.coat is None):
-        inside["wavelengths"] = [nanometres / media.index for nanometres in VISIBLE]
+    if media.index * scale > 1 and "wavelengths" not in recipe.spectrum and not (rigorous and media.coat is None):
+        inside["wavelengths"] = [VISIBLE[0] / (media.index * scale), VISIBLE[1] / media.index]
     if rigorous:
         inside |= settings_of_medium(media.coat)
     return Recipe(recipe.surface, {**recipe.spectrum, **inside}, recipe.folder) if inside else recipe
 
 
-def _from_file(path: Path, media: Media, tolerance: float | None) -> tuple[Spectrum, Recipe | None]:
+def _from_file(path: Path, media: Media, scale: float, tolerance: float | None) -> tuple[Spectrum, Recipe | None]:
     suffix = path.suffix.lower()
     if suffix in (".toml", ".exr") and not path.is_file():
         # What is not found stays relative; the folder of a scene is searched first.
@@ -100,7 +104,7 @@ def _from_file(path: Path, media: Media, tolerance: float | None) -> tuple[Spect
         there = sorted(other.name for other in folder.glob("*") if other.suffix.lower() in (".exr", ".toml"))
         raise FileNotFoundError(f"{path}: no such file; {folder} holds {', '.join(there) or 'no spectrum'}")
     if suffix == ".toml":
-        recipe = _inside(media, Recipe.load(path))
+        recipe = _inside(media, scale, Recipe.load(path))
         if tolerance is not None:
             recipe = dataclasses.replace(recipe, spectrum={**recipe.spectrum, "tolerance": tolerance})
         return recipe.cached(_per_cent), recipe

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
-from ..energy.furnace import least_kappa
-from ..errors import RequestError, is_number
+from ..energy.furnace import small_kappas
+from ..errors import RequestError
 from ..geometry import SHADOWING
 from ..grating_spectrum import GratingSpectrum
 from ..rigorous.spectrum import RigorousSpectrum
@@ -17,12 +16,14 @@ from .geometry import Geometry, turned
 from .media import Media
 from .polarisation import Split, of_interface, of_orders, of_plane, unpolarised
 from .reflectance import Conductor, PerfectMirror, reflectance_from
+from .scales import Scales
 from .shared import SharedTables
 from .tables import opaque
 from .transmission import Interface
 
 _SCALAR_ONLY = {
     "height_scale": "build the spectrum of the other depth",
+    "lateral_scale": "build the spectrum of the other period",
     "base": "what passes the surface is not computed; leave it out",
     "shadowing": "it is part of the efficiencies; leave it out",
     "fresnel": "it is part of the efficiencies; leave it out",
@@ -57,21 +58,17 @@ class ScalarTheory:
     Attributes:
         scattering: K G S cos θ_o and its sampler.
         material: R.
-        height_scale: times the heights.
+        scales: of heights and of lengths along the surface.
         shadowing: whether G is a factor.
         energy: E, or None where it is one.
         interface: the media on both sides where light passes, else None.
     """
 
-    def __init__(self, props: mi.Properties, spectrum: GratingSpectrum, media: Media) -> None:
-        self.spectrum, self.media = spectrum, media
+    def __init__(self, props: mi.Properties, spectrum: GratingSpectrum, media: Media, scales: Scales) -> None:
+        self.spectrum, self.media, self.scales = spectrum, media, scales
         self.material = reflectance_from(props, media.coat)
         if media.eta is not None and self.material.model == "schlick":
             raise RequestError("fresnel: got 'schlick' with a transmission, wanted 'exact'")
-        height_scale = props.get("height_scale", 1.0)
-        if not is_number(height_scale):
-            raise RequestError(f"height_scale: got {height_scale!r}, wanted a number")
-        self.height_scale = mi.Float(height_scale)
         shadowing = props.get("shadowing", SHADOWING[0])
         if shadowing not in SHADOWING:
             raise RequestError(f"shadowing: got {shadowing!r}, wanted one of {', '.join(SHADOWING)}")
@@ -87,7 +84,7 @@ class ScalarTheory:
         """Check the parameters that can change, and recompute what depends on them.
 
         Raises:
-            ValueError: if the spectrum does not cover the heights, or the wavelengths inside a coat.
+            ValueError: if the spectrum does not cover the scales, or the wavelengths inside a coat.
         """
         shortest = VISIBLE[0] / self.media.index
         largest = shortest / self.spectrum.wavelengths[0]
@@ -100,31 +97,29 @@ class ScalarTheory:
                 f"{self.spectrum.wavelengths[0]:g} nm; inside {place} they are shorter: build it from "
                 f"{shortest:.4g} nm"
             )
-        # At wavelengths that the spectrum does not cover the grating is black, and κ is less at the others.
-        largest = max(largest, 1.0)
-        scale = np.max(self.height_scale)
-        if not 0 <= scale <= largest * (1 + 1e-6):
-            raise RequestError(
-                f"height_scale: got {scale:.6g}, wanted 0 to {largest:.4g}: the spectrum was built for "
-                f"wavelengths from {self.spectrum.wavelengths[0]:g} nm; for larger heights build it from "
-                f"{shortest:.4g} nm divided by the scale"
-            )
-        dr.make_opaque(self.height_scale)
-        conserves = self.conserve_energy and self.shadowing
-        self.energy = self.tables.energy(self.height_scale) if conserves else None
+        scales = self.scales
+        scales.check(self.spectrum.wavelengths, self.media.index, getattr(self.scattering, "max_scale", None))
+        self.energy = None
+        if self.conserve_energy and self.shadowing:
+            of_number = self.tables.energy
+            self.energy = self.tables.scaled_energy(*scales.ratios()) if scales.vary else of_number(scales.height.value)
         self.interface = None
         if self.media.eta is not None:
-            least = opaque(least_kappa(self.spectrum, self.media.eta, scale))
-            self.interface = Interface(self.material.eta, self.media.transmission == "sheet", least)
+            kappas = tuple(opaque(kappa) for kappa in small_kappas(self.spectrum, self.media.eta))
+            self.interface = Interface(self.material.eta, self.media.transmission == "sheet", kappas)
 
     def parameters_changed(self, keys: list[str]) -> None:
         """Recompute what depends on the parameters `keys`; on all of them if none is named."""
-        if not keys or "height_scale" in keys:
+        changed = [scale for scale in self.scales if not keys or scale.name in keys]
+        for scale in changed:
+            scale.read()
+        if changed:
             self.update()
         self.material.update()
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
-        callback.put("height_scale", self.height_scale, mi.ParamFlags.Differentiable)
+        for scale in self.scales:
+            scale.put(callback)
         self.material.traverse(callback)
 
     def weighted(
@@ -133,7 +128,8 @@ class ScalarTheory:
         """Return `value` times R E."""
         if self.energy is not None:
             wavelengths = mi.UnpolarizedSpectrum(si.wavelengths) * (1e-3 / self.media.outside / geometry.index)
-            value *= self.energy.factor(*geometry.inside(), wavelengths)
+            scales = geometry.height_scale, geometry.lateral_scale
+            value *= self.energy.factor(*geometry.inside(), wavelengths, *scales)
         reflected = self.material(si, geometry.cos_half(), active)
         if self.media.eta is not None:
             reflected = dr.select(geometry.reflects, reflected, 1 - reflected)
@@ -155,7 +151,7 @@ class ScalarTheory:
     def __str__(self) -> str:
         lines = {
             "reflectance": self.material,
-            "height_scale": self.height_scale,
+            **{scale.name: scale for scale in self.scales},
             "shadowing": SHADOWING[0 if self.shadowing else 1],
             "energy": self.energy or ("conserved by itself" if self.conserve_energy else "not conserved"),
         }
@@ -170,7 +166,7 @@ class RigorousTheory:
         material: R = 1 beside the efficiencies.
     """
 
-    height_scale, shadowing = 1.0, True  # of no effect
+    shadowing = True  # of no effect
     interface = None
 
     def __init__(self, props: mi.Properties, spectrum: RigorousSpectrum, media: Media) -> None:
@@ -227,7 +223,13 @@ def check_parameters(props: mi.Properties, spectrum: RigorousSpectrum, coat: Coa
         )
     for name, advice in _SCALAR_ONLY.items():
         if name in props:
-            got = "a BSDF" if name == "base" else repr(props[name])
+            got = (
+                "a BSDF"
+                if name == "base"
+                else "a texture"
+                if isinstance(props[name], mi.Texture)
+                else repr(props[name])
+            )
             raise RequestError(f"{name}: got {got}, wanted none with theory=rigorous: {advice}")
     medium = 1.0 if coat is None else coat.relative
     if abs(spectrum.ext_ior - medium) > 1e-3 * medium:

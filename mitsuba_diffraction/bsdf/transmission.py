@@ -28,7 +28,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from .geometry import horizon_gain, k_g
+from .geometry import horizon_gain, k_g, scaled
 from .tables import larger, limited, smaller
 
 KINDS = ("none", "interface", "sheet")
@@ -70,11 +70,17 @@ class Interface:
     Attributes:
         eta: index below relative to that above.
         is_sheet: the medium above is below the sheet, too.
-        least_kappa: κ₁ in rad/µm.
+        kappas: a quarter of the table's first interval of κ, where its error weighs as little as that of the line, and
+            the least κ of the undiffracted order of the heights as they are; rad/µm.
     """
 
-    def __init__(self, eta: mi.Float, is_sheet: bool, least_kappa: mi.Float) -> None:
-        self.eta, self.is_sheet, self.least_kappa = eta, is_sheet, least_kappa
+    def __init__(self, eta: mi.Float, is_sheet: bool, kappas: tuple[mi.Float, mi.Float]) -> None:
+        self.eta, self.is_sheet, self.kappas = eta, is_sheet, kappas
+
+    def least_kappa(self, height_scale: mi.Float) -> mi.Float:
+        """Return κ₁ in rad/µm: of the undiffracted order κ is larger at all wavelengths."""
+        first, undiffracted = self.kappas
+        return smaller(first, larger(undiffracted * dr.detach(height_scale), 1e-6))
 
     def side(self, omega: mi.Vector3f) -> Side:
         """Return the side on which ω lies."""
@@ -110,6 +116,7 @@ class Crossing:
         height_scale: times the heights.
         shadowing: whether G is a factor.
         least_kappa: κ₁ in rad/µm.
+        lateral_scale: times the lengths along the surface; None for one.
     """
 
     i: Side
@@ -117,6 +124,7 @@ class Crossing:
     height_scale: mi.Float
     shadowing: bool
     least_kappa: mi.Float
+    lateral_scale: mi.Float | None = None
 
     index = 1.0  # of the wavelengths that are handed to E, those above
 
@@ -233,7 +241,8 @@ class CrossingIncidence:
     Attributes:
         wi: k_i,∥, or its opposite where −q is drawn; z is not used.
         frequency: 1/λ above.
-        radius: n_o/λ, to which |q| of propagating light extends around −k_i,∥/λ.
+        lateral_frequency: 1/λ times the lateral scale: q of the table per λq.
+        radius: n_o times that, to which |q| of the table extends around that of −k_i,∥ where light propagates.
         cosine: √(1 − |k_i,∥|²/(n_o R)²), R the largest of |k_i,∥|/n_o.
         mirrored: what takes the q that is read to the one that was drawn, 1 or −1.
         square: n_o² − |k_i,∥|².
@@ -246,6 +255,7 @@ class CrossingIncidence:
 
     wi: mi.Vector3f
     frequency: mi.Float
+    lateral_frequency: mi.Float
     radius: mi.Float
     cosine: mi.Float
     mirrored: mi.Float
@@ -258,7 +268,14 @@ class CrossingIncidence:
 
     @classmethod
     def of(
-        cls, i: Side, o: Side, interface: Interface, frequency: mi.Float, height_scale: mi.Float, flip: mi.Float | None
+        cls,
+        i: Side,
+        o: Side,
+        interface: Interface,
+        frequency: mi.Float,
+        height_scale: mi.Float,
+        flip: mi.Float | None,
+        lateral_scale: mi.Float | None = None,
     ) -> CrossingIncidence:
         """Return that of light from the side `i` to the side `o`.
 
@@ -274,10 +291,12 @@ class CrossingIncidence:
         z_i, snell = i.z, o.normal(larger(square, 0))
         kappas = [dr.detach(per * dr.abs(z_i + o.sign * z)) for z in (snell, 0.7 * snell)]
         leaves = [dr.detach(z) for z in (o.normal(mi.Float(0)), o.inside)]
+        lateral = scaled(frequency, lateral_scale)
         values = (
             mi.Vector3f(assumed * i.tangent.x, assumed * i.tangent.y, 0),
             frequency,
-            radius * frequency,
+            lateral,
+            radius * lateral,
             dr.safe_sqrt(1 - across),
             assumed if flip is None else assumed * flip,
             square,

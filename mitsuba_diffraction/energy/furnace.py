@@ -441,14 +441,20 @@ class Furnace:
 
 
 def least_kappa(spectrum: PowerSpectrum, index: float, height_scale: float = 1.0) -> float:
-    """Return κ₁, below which c_m/κ² of transmitted light is a line, in rad/µm of the heights as they are.
+    """Return κ₁, below which c_m/κ² of transmitted light is a line, in rad/µm of the heights as they are."""
+    first, undiffracted = small_kappas(spectrum, index)
+    return min(first, max(undiffracted * height_scale, 1e-6))
 
-    A quarter of the first interval of the table, where its error weighs as little as that of the line; of the
-    undiffracted order, κ is larger at all wavelengths, those of the spectrum being in the denser medium.
+
+def small_kappas(spectrum: PowerSpectrum, index: float) -> tuple[float, float]:
+    """Return the two numbers of which κ₁ is the smaller, in rad/µm.
+
+    A quarter of the first interval of the table, where its error weighs as little as that of the line; and, times the
+    scale of the heights, less than κ of the undiffracted order at all wavelengths, those of the spectrum being in the
+    denser medium.
     """
     longest = spectrum.wavelengths[1] * 1e-3 * max(index, 1)
-    undiffracted = 1.6 * np.pi * abs(index - 1) / longest * height_scale
-    return min(spectrum.table.first_interval / 4, max(undiffracted, 1e-6))
+    return spectrum.table.first_interval / 4, 1.6 * np.pi * abs(index - 1) / longest
 
 
 def small_kappa(

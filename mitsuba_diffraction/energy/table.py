@@ -268,6 +268,48 @@ class EnergyTable:
         return cls(layout, steps, float(plain["least"]), (float(mean), float(largest)))
 
 
+@dataclass(frozen=True)
+class Stretched:
+    """A spectrum seen with lengths along the surface times a lateral scale s as the unit of length.
+
+    Wavelengths are shorter by s, and lobes wider; orders stay where they are.
+
+    Attributes:
+        spectrum: S(q; κ).
+        least: s; of several the least.
+    """
+
+    spectrum: PowerSpectrum
+    least: float
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.spectrum, name)
+
+    @property
+    def lobe_width(self) -> float:
+        """s σ_q in cycles/µm; of several s, of the least, with which λσ_q is right at the longest wavelength."""
+        return self.spectrum.lobe_width * self.least
+
+    @property
+    def wavelengths(self) -> tuple[float, float]:
+        """λ/s in nm, from the shortest that the spectrum covers."""
+        shortest, longest = self.spectrum.wavelengths
+        return shortest, longest / self.least
+
+
+def between(below: EnergyTable, middle: EnergyTable, above: EnergyTable) -> EnergyTable:
+    """Return a lower bound of e between two tables from these and the one in the middle.
+
+    A parabola through three equidistant values exceeds them by no more than an eighth of its second difference.
+    """
+    first, second, third = (t.least + (1 - t.least) / 255 * t.steps.astype(np.float64) for t in (below, middle, above))
+    lowest = np.minimum(np.minimum(first, second), third)
+    e = np.maximum(lowest - np.abs(first - 2 * second + third) / 8, 0)
+    lost = e / np.maximum(second, 1e-9)
+    loss = below.loss[0] + float(1 - lost.mean()), below.loss[1] + float(1 - lost.min())
+    return EnergyTable.packed(middle.layout, e / (1 + SLACK), loss)
+
+
 def random_places(frequencies: tuple[float, float], count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return `count` directions (n, 3), two thirds of them beyond 60°, one beyond 85°, and λ in µm, (n,).
 

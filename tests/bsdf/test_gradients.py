@@ -64,6 +64,7 @@ NUMBERS = {
     "height": ("height_scale", 0.7, 0.01, {"name": "sinusoidal"}),
     "height of a blaze": ("height_scale", 0.8, 0.01, {}),
     "height of skin": ("height_scale", 0.8, 0.01, {"name": "elaphe"}),
+    "lateral": ("lateral_scale", 0.9, 1e-3, {"name": "sinusoidal", "coherence_length": 20.0, "lateral_scale": 0.9}),
     "orientation": ("orientation.value", 2.0, 0.1, {}),
     "orientation of skin": ("orientation.value", 25.0, 0.3, {"name": "elaphe"}),
     "index": ("eta", 1.5, 0.02, {"int_ior": 1.5}),
@@ -78,7 +79,7 @@ NUMBERS = {
 def test_the_derivative_by_a_number_is_that_of_differences(case, mode):
     key, at, step, parameters = NUMBERS[case]
     total = Total(key, **parameters)
-    if key == "height_scale":
+    if key in ("height_scale", "lateral_scale"):
         # With E, whose table is coarse, in the test below.
         total.theory.update = lambda: None
         total.theory.energy = None

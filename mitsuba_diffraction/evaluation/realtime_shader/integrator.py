@@ -167,7 +167,7 @@ def define() -> type:
                         along_pattern(layers, own, own.wi, here),
                         weights[index],
                         here,
-                        layers.grating.theory.height_scale,
+                        layers.grating.scales.height.value,
                     )
                     share = mi.Float(1)
                     if layers.base is not None:

@@ -1,0 +1,168 @@
+"""The scales of the relief in a scene, `height_scale` and `lateral_scale`: a number or a texture each."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import RequestError, is_number
+from ..settings import VISIBLE
+
+MOST_RATIOS = 16  # of height and lateral scale, for which there is a table of E each
+
+
+class Scale:
+    """A factor of lengths that may vary over the surface.
+
+    Attributes:
+        name: of the parameter.
+        value: a number, or a texture of numbers.
+        values: all of a texture, each once, ascending; interpolation stays between them.
+    """
+
+    def __init__(self, props: mi.Properties, name: str) -> None:
+        """Read the parameter `name`.
+
+        Raises:
+            ValueError: if it is neither a number nor a texture whose values are known.
+        """
+        self.name, value = name, props.get(name, 1.0)
+        if not is_number(value) and not isinstance(value, mi.Texture):
+            raise RequestError(f"{name}: got {value!r}, wanted a number or a texture")
+        self.value = value if isinstance(value, mi.Texture) else mi.Float(value)
+        self.read()
+
+    @property
+    def varies(self) -> bool:
+        """Whether it is a texture."""
+        return isinstance(self.value, mi.Texture)
+
+    def read(self) -> None:
+        """Read the values, which the user may have changed.
+
+        Raises:
+            ValueError: if they cannot be known, as those of a mesh attribute, or are not finite.
+        """
+        found = [self.value]
+        if self.varies:
+            parameters = mi.traverse(self.value)
+            found = [parameters[key] for key in parameters.keys() if key.split(".")[-1] != "to_uv"]  # noqa: SIM118
+            known = all(key.split(".")[-1] in ("data", "value", "to_uv") for key in parameters.keys())  # noqa: SIM118
+            if not found or not known:
+                raise RequestError(
+                    f"{self.name}: got a {self.value.class_name()}, whose range is not known, wanted a number, bitmap "
+                    "or checkerboard"
+                )
+        self.values = np.unique(np.concatenate([np.ravel(np.array(dr.detach(v), np.float64)) for v in found]))
+        if not np.isfinite(self.values).all():
+            raise RequestError(f"{self.name}: got values that are not finite, wanted numbers")
+
+    def at(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Float:
+        """Evaluate it at a point."""
+        return self.value.eval_1(si, active) if self.varies else self.value
+
+    def only_values(self) -> bool:
+        """Return whether the surface has no other values than `values`: nothing interpolates between texels."""
+        if not self.varies:
+            return True
+        parameters = mi.traverse(self.value)
+        if "data" not in parameters:
+            return not any(key.endswith("data") for key in parameters.keys())  # noqa: SIM118 (not a dict)
+        if not dr.is_jit_v(mi.Float):
+            return False
+        # Between the centres of texels.
+        rows, columns = parameters["data"].shape[:2]
+        v, u = ((x.ravel() + 0.75) / n for x, n in zip(np.mgrid[:rows, :columns], (rows, columns), strict=True))
+        matrix = np.linalg.inv(np.array(parameters["to_uv"].matrix, np.float64).reshape(3, 3))
+        si = dr.zeros(mi.SurfaceInteraction3f, rows * columns)
+        si.uv = mi.Point2f(*(mi.Float(row[0] * u + row[1] * v + row[2]) for row in matrix[:2]))
+        return bool(np.isin(np.array(self.value.eval_1(si)), np.float32(self.values)).all())
+
+    def put(self, callback: mi.TraversalCallback) -> None:
+        """Show it among the parameters of the scene."""
+        callback.put(self.name, self.value, mi.ParamFlags.Differentiable)
+
+    def __str__(self) -> str:
+        low, high = self.values[[0, -1]]
+        return f"{low:.6g} to {high:.6g}" if self.varies else str(self.value)
+
+
+class Scales:
+    """Both scales of a scene.
+
+    Attributes:
+        height: of the heights.
+        lateral: of the lengths along the surface; None where it is the number 1, which costs nothing.
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        self.height, lateral = Scale(props, "height_scale"), Scale(props, "lateral_scale")
+        self.lateral = lateral if lateral.varies or lateral.values[0] != 1 else None
+
+    def __iter__(self):
+        return iter([self.height] if self.lateral is None else [self.height, self.lateral])
+
+    @property
+    def largest(self) -> float:
+        """By how much shorter wavelengths the spectrum must reach than without scales."""
+        return max(1.0, *(float(scale.values[-1]) for scale in self))
+
+    def at(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> tuple[mi.Float, mi.Float | None]:
+        """Evaluate the height scale and the lateral one, None for 1, at a point."""
+        return self.height.at(si, active), None if self.lateral is None else self.lateral.at(si, active)
+
+    @property
+    def vary(self) -> bool:
+        """Whether E needs tables for them: a texture, or a lateral scale."""
+        return self.lateral is not None or self.height.varies
+
+    def ratios(self) -> tuple[NDArray[np.float64], NDArray[np.float64], bool]:
+        """Return height over lateral scale: few that are all there are, or the limits of an interval.
+
+        Returns:
+            The ratios (n,), ascending; the least lateral scale of each, (n,); and whether there are no others.
+        """
+        heights, laterals = self.height.values, np.ones(1) if self.lateral is None else self.lateral.values
+        if len(heights) * len(laterals) <= MOST_RATIOS**2 and all(scale.only_values() for scale in self):
+            pairs = np.stack(np.meshgrid(heights, laterals), -1).reshape(-1, 2)
+            found, index = np.unique(np.round(pairs[:, 0] / pairs[:, 1], 5), return_inverse=True)
+            if len(found) <= MOST_RATIOS:
+                return found, np.array([pairs[index.ravel() == k, 1].min() for k in range(len(found))]), True
+        limits = np.array([heights[0] / laterals[-1], heights[-1] / laterals[0]])
+        return limits, np.repeat(laterals[:1], 2), False
+
+    def check(self, wavelengths: tuple[float, float], index: float, most: float | None) -> None:
+        """Check the values against what a spectrum covers.
+
+        Args:
+            wavelengths: shortest and longest of the spectrum, nm.
+            index: the largest index next to the relief.
+            most: the lateral scale up to which orders stand apart; None if they do not.
+
+        Raises:
+            ValueError: naming the wavelengths from which to build.
+        """
+        shortest = VISIBLE[0] / index
+        # At wavelengths that the spectrum does not cover the grating is black; κ and q are less at the others.
+        covered = max(shortest / wavelengths[0], 1.0)
+        for scale in self:
+            if not scale.varies:
+                dr.make_opaque(scale.value)
+            low, high = scale.values[[0, -1]]
+            if low < 0 or high > covered * (1 + 1e-6) or (low == 0 and scale is self.lateral):
+                bad = low if low <= 0 else high
+                raise RequestError(
+                    f"{scale.name}: got {bad:.6g}, wanted {'0' if scale is self.height else 'more than 0 and up'} to "
+                    f"{covered:.4g}: the spectrum was built for wavelengths from {wavelengths[0]:g} nm; for larger "
+                    f"scales build it from {shortest:.4g} nm divided by the scale"
+                    + (f", here {shortest / high:.4g} nm" if high > covered else "")
+                )
+        if self.lateral is not None and (most is None or self.lateral.values[-1] > most):
+            raise RequestError(
+                f"lateral_scale: got {self.lateral}, wanted 1"
+                + ("" if most is None else f" or less than {most:.4g}")
+                + ": only of orders that stand apart the lobes keep their width (not of samples, of tiles as large as "
+                "the coherence length, nor of line gratings with a coherence length below 15 um)"
+            )

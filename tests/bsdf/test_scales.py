@@ -1,0 +1,301 @@
+"""Scales of the relief, numbers and textures, against gratings whose heights and lengths are what they say."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from bsdf_support import (
+    PERIOD,
+    SURFACES,
+    albedo,
+    array,
+    check_chi_square,
+    direction,
+    draw,
+    evaluate,
+    floats,
+    interaction,
+    made_up,
+    of_spectrum,
+    plugin,
+    random_directions,
+    towards,
+    use,
+    vectors,
+)
+
+import mitsuba_diffraction as md
+
+WI = direction(30, 20)
+PASSES = {"int_ior": 1.5, "transmission": "interface"}
+
+
+def corner():
+    """As `corner_blaze`, on as many pixels as its orders at the shortest wavelengths need."""
+    along_x = md.gratings.blazed(PERIOD, 0.2, samples=96).heights[0]
+    return md.HeightField(along_x[None, :] + along_x[:, None], PERIOD / 96)
+
+
+def stretched(surface, lateral, heights):
+    """The surface with its lengths and heights scaled."""
+    return md.HeightField(surface.heights * heights, np.multiply(surface.pixel_size, lateral))
+
+
+def for_scales(surface, largest, **settings):
+    """A spectrum that covers scales up to the largest."""
+    return md.precompute(surface, wavelengths=(360 / largest, 830), **settings)
+
+
+def bitmap(values, **parameters):
+    values = np.asarray(values, np.float32)
+    return {
+        "type": "bitmap",
+        "bitmap": mi.Bitmap(values.reshape(*values.shape[:2], 1)),
+        "raw": True,
+        "format": "variant",
+        "filter_type": "nearest",
+        **parameters,
+    }
+
+
+def near_orders(lateral, orders, wi=WI):
+    """Directions of the orders at 500 nm, of their slopes, and anywhere."""
+    wo = [towards(wi, np.add(orders, by), 500, 1 / (PERIOD * lateral)) for by in ([0, 0], [0.02, 0.01])]
+    return np.concatenate([*wo, random_directions(np.random.default_rng(0), 500)])
+
+
+LINE = [(m, 0) for m in range(-6, 7)]
+SQUARE = [(m, n) for m in range(-4, 5) for n in range(-4, 5)]
+
+
+@pytest.mark.few(3)
+@pytest.mark.parametrize(("lateral", "heights"), [(1.4, 0.8), (0.6, 1.3)])
+@pytest.mark.parametrize(
+    ("surface", "orders", "parameters"),
+    [
+        (SURFACES["blazed"], LINE, {}),
+        (corner, SQUARE, {}),
+        (SURFACES["blazed"], LINE, {"coat_ior": 1.5}),
+        (SURFACES["blazed"], LINE, PASSES),
+        (SURFACES["blazed"], LINE, {"int_ior": 1.5, "transmission": "sheet"}),
+    ],
+    ids=["line", "crossed", "coat", "interface", "sheet"],
+)
+def test_constant_scales_equal_a_grating_built_with_them(llvm, surface, orders, parameters, lateral, heights):
+    """Orders, lobes, K, G, gains and layers alike; densities differ, for they average over other intervals of κ."""
+    parameters = {"conserve_energy": False, **parameters}
+    largest = 1.5 * (1.5 if len(parameters) > 1 else 1)
+    of_table = plugin(for_scales(surface(), largest), lateral_scale=lateral, height_scale=heights, **parameters)
+    built = plugin(for_scales(stretched(surface(), lateral, heights), largest), **parameters)
+    wo = near_orders(lateral, orders)
+    if "transmission" in parameters:
+        below = near_orders(lateral, orders, WI)
+        wo = np.concatenate([wo, below * [1, 1, -1]])
+    found, wanted = (evaluate(bsdf, WI, wo)[0] for bsdf in (of_table, built))
+    assert wanted.max() > 100
+    # Both tables err by their tolerance.
+    np.testing.assert_allclose(found, wanted, rtol=2e-3, atol=5e-4 * wanted.max())
+
+
+@pytest.mark.few(2)
+@pytest.mark.parametrize("lateral", [1.4, 0.6])
+@pytest.mark.parametrize(
+    ("surface", "parameters"), [(SURFACES["blazed"], {}), (corner, {}), (SURFACES["blazed"], PASSES)]
+)
+def test_samples_of_scaled_gratings_are_unbiased(llvm, surface, parameters, lateral):
+    bsdf = plugin(
+        for_scales(surface(), 2.5, coherence_length=20),
+        **{"lateral_scale": lateral, "height_scale": 1.2, "conserve_energy": False, **parameters},
+    )
+    ctx = mi.BSDFContext()
+    ctx.type_mask = mi.BSDFFlags.GlossyReflection
+    count = 1 << 18
+    _, weights = draw(bsdf, WI, count, ctx)
+    error = weights.std(1) / np.sqrt(count)
+    np.testing.assert_array_less(np.abs(weights.mean(1) - albedo(bsdf, WI, ctx=ctx)), 4 * error + 2e-3)
+    check_chi_square(bsdf, WI, ctx=ctx)
+
+
+def test_textures_of_scales_are_read_at_the_point(llvm):
+    of = for_scales(SURFACES["blazed"](), 1.5)
+    laterals, heights = np.array([[0.7, 1.0], [1.2, 1.5]]), np.array([[0.4, 0.8, 1.1]])
+    textured = plugin(of, lateral_scale=bitmap(laterals), height_scale=bitmap(heights), conserve_energy=False)
+    for v, row in enumerate(laterals):
+        for u, lateral in enumerate(row):
+            for column, height in enumerate(heights[0]):
+                uv = ((u + (column + 0.5) / 3) / 2, (v + 0.5) / 2)
+                height = heights[0, int(uv[0] * 3)]
+                wo = near_orders(lateral, LINE)
+                alone = plugin(of, lateral_scale=lateral, height_scale=height, conserve_energy=False)
+                for found, wanted in zip(evaluate(textured, WI, wo, uv=uv), evaluate(alone, WI, wo), strict=True):
+                    np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-4 * wanted.max())
+
+
+def test_a_lateral_scale_of_one_is_none(llvm):
+    bsdf = plugin(for_scales(SURFACES["blazed"](), 1), lateral_scale=1.0)
+    assert bsdf.layers.grating.scales.lateral is None
+    assert "lateral_scale" not in mi.traverse(bsdf)
+
+
+@pytest.mark.parametrize("variant", ["scalar_spectral", "llvm_ad_spectral_polarized"])
+def test_scales_in_other_variants(variant):
+    of = for_scales(SURFACES["blazed"](), 1.5)
+    uv, wo = (0.9, 0.5), near_orders(1.3, [(m, 0) for m in range(-2, 3)])[:10]
+
+    def evaluated(name):
+        use(name)
+        scales = {"lateral_scale": bitmap([[0.7, 1.3]]), "height_scale": bitmap([[0.5, 0.9]]), "conserve_energy": False}
+        return evaluate(plugin(of, **scales), WI, wo, uv=uv)
+
+    wanted, found = evaluated("llvm_ad_spectral"), evaluated(variant)
+    for a, b in zip(found, wanted, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4 * b.max())
+
+
+def difference(function, at, step):
+    """Central, of fourth order."""
+    f = [function(at + k * step) for k in (-2, -1, 1, 2)]
+    return (8 * (f[2] - f[1]) - (f[3] - f[0])) / (12 * step)
+
+
+@pytest.mark.parametrize("parameters", [{}, pytest.param(PASSES, marks=pytest.mark.slow)], ids=["mirror", "interface"])
+@pytest.mark.parametrize(("name", "step"), [("height_scale", 0.01), ("lateral_scale", 1e-3)])
+def test_derivatives_by_texels_are_those_of_differences(llvm, name, step, parameters):
+    start = np.random.default_rng(3).uniform(0.85, 0.95, (2, 3, 1)).astype(np.float32)
+    scales = {"lateral_scale": 0.9, name: bitmap(start, filter_type="bilinear")}
+    settings = {"conserve_energy": False, **scales, **parameters}
+    bsdf = plugin(for_scales(SURFACES["sinusoidal"](), 1.5, coherence_length=20), **settings)
+    scene, key = mi.traverse(bsdf), f"{name}.data"
+    wo = near_orders(0.9, np.repeat(np.array(LINE)[3:-3], 3, axis=0))
+    wo = wo[: len(wo) - 500]
+    rng = np.random.default_rng(1)
+    weights, uv = rng.uniform(0.5, 1.5, len(wo)), rng.random((len(wo), 2))
+    si = interaction(np.tile(WI, (len(wo), 1)), (500.0,) * 4, len(wo), uv)
+
+    def value(tensor):
+        scene[key] = tensor
+        scene.update()
+        return bsdf.eval(mi.BSDFContext(), si, vectors(wo))[1]
+
+    x = mi.TensorXf(start)
+    dr.enable_grad(x)
+    dr.backward(dr.sum(value(x) * floats(weights)))
+    found = np.array(dr.grad(x))
+    scale = np.abs(found).max()
+    assert scale > 1
+    for place in np.ndindex(*start.shape):
+        one = np.zeros_like(start)
+        one[place] = 1
+
+        def total(s, one=one):
+            return array(value(mi.TensorXf(start + np.float32(s) * one)), np.float64).ravel() @ weights
+
+        np.testing.assert_allclose(found[place], difference(total, 0.0, step), rtol=0.01, atol=5e-3 * scale)
+
+
+def test_recipes_and_profiles_are_built_for_the_scales(llvm):
+    parameters = {"type": "diffraction_grating", "profile": "blazed", "period": PERIOD, "depth": 0.2}
+    bsdf = mi.load_dict(parameters | {"lateral_scale": bitmap([[0.5, 1.5]]), "height_scale": 1.2})
+    assert bsdf.spectrum.wavelengths == pytest.approx((240, 830))
+    assert bsdf.layers.components[0] & +mi.BSDFFlags.SpatiallyVarying
+    bsdf = mi.load_dict(parameters | {"height_scale": 2.0, "coat_ior": 1.5})
+    assert bsdf.spectrum.wavelengths == pytest.approx((120, 830 / 1.5), rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        ({"lateral_scale": [[0.5, 1.25]]}, "lateral_scale: got 1.25, wanted .* up to 1: .* 360 nm; .* here 288 nm"),
+        ({"height_scale": [[0.5, 1.25]]}, "height_scale: got 1.25, wanted 0 to 1: .* here 288 nm"),
+        ({"height_scale": [[-0.5, 0.5]]}, "height_scale: got -0.5, wanted 0 to 1"),
+        ({"lateral_scale": [[0.0, 0.5]]}, "lateral_scale: got 0, wanted more than 0"),
+        ({"lateral_scale": [[np.nan, 0.5]]}, "lateral_scale: got values that are not finite"),
+        ({"lateral_scale": "a"}, "lateral_scale: got 'a', wanted a number or a texture"),
+        ({"lateral_scale": {"type": "mesh_attribute", "name": "vertex_s"}}, "MeshAttribute, whose range is not known"),
+        ({"coherence_length": 5.0, "lateral_scale": 0.5}, "lateral_scale: got .*0.5.*, wanted 1: only of orders"),
+        (
+            {"lateral_scale": [[0.5, 1.0]], "theory": "rigorous"},
+            "lateral_scale: got a texture, wanted none with theory=rigorous: build the spectrum of the other period",
+        ),
+    ],
+)
+def test_scales_that_the_spectrum_does_not_cover_are_refused(llvm, parameters, message):
+    """In one line, which says what to build."""
+    parameters = {name: bitmap(v) if isinstance(v, list) else v for name, v in parameters.items()}
+    if "theory" in parameters:
+        of, parameters = made_up(), {"material": "Al", "lateral_scale": parameters["lateral_scale"]}
+    else:
+        of = for_scales(SURFACES["blazed"](), 1, coherence_length=parameters.pop("coherence_length", 65.0))
+    with pytest.raises(RuntimeError, match=message) as caught:
+        mi.load_dict(of_spectrum(of, **parameters))
+    assert "\n" not in str(caught.value).split("lateral_scale: got")[-1].strip()
+
+
+def test_scales_that_let_orders_overlap_are_refused(llvm):
+    of = for_scales(corner(), 1.5, coherence_length=10)
+    with pytest.raises(RuntimeError, match=r"lateral_scale: got .*1.5.*, wanted 1 or less than 1\.\d+: only"):
+        plugin(of, lateral_scale=1.5)
+
+
+def albedo_of_orders(bsdf, of, wi, wavelength, lateral, uv):
+    """∫ f cos θ_o dω_o = ∫ f du dv of one wavelength (nm), by the sum over points in the lobes of all orders."""
+    # The horizon cuts lobes near it.
+    half = 10 if wi[2] > 0.1 else 40
+    offsets = 3.2 / half * of.lobe_width * np.arange(-half, half + 1)
+    q = [(q[:, None] / lateral + offsets).ravel() for q in of.grid.frequencies()]
+    t = -1e-3 * wavelength * np.stack(np.meshgrid(*q), -1).reshape(-1, 2) - wi[:2]
+    t = t[(t**2).sum(-1) < 1 - 1e-8]
+    wo = np.concatenate([t, np.sqrt(1 - (t**2).sum(-1, keepdims=True))], -1)
+    value = evaluate(bsdf, wi, wo, uv=uv, wavelengths=(wavelength,) * 4)[0][0].astype(np.float64)
+    return (value / wo[:, 2]).sum() * (1e-3 * wavelength * (offsets[1] - offsets[0])) ** 2
+
+
+def grazing(rng, count):
+    """Directions, half of them uniform in solid angle, half in the polar angle, to 89.5°."""
+    uniform = random_directions(rng, count, 0.01)
+    polar = direction(rng.uniform(0, 89.5, count), rng.uniform(0, 360, count))
+    return np.where(rng.random(count)[:, None] < 0.5, uniform, polar)
+
+
+SCALED = {
+    "sinusoidal": lambda: md.gratings.sinusoidal(1.0, 0.25),
+    "blazed": lambda: md.gratings.blazed(2.5, 0.25),
+    "foil": lambda: md.gratings.foil(1.0, 0.15, directions=3),
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "pairs"),
+    [("sinusoidal", 8), *(pytest.param(name, 100, marks=pytest.mark.slow) for name in sorted(SCALED))],
+)
+def test_no_albedo_above_one_at_random_scales(llvm, name, pairs):
+    """Of scales that are too many for a table each."""
+    rng, side = np.random.default_rng(5), int(np.ceil(np.sqrt(pairs)))
+    of = for_scales(SCALED[name](), 1.6, coherence_length=65)
+    laterals, heights = rng.uniform(0.6, 1.6, (side, side)), rng.uniform(0, 1.6, (side, side))
+    if pairs < 20:
+        # An interval of few tables.
+        laterals, heights = (rng.uniform(0.8, 0.9, (side, side)) for _ in range(2))
+    bsdf = plugin(of, lateral_scale=bitmap(laterals), height_scale=bitmap(heights))
+    found = [
+        albedo_of_orders(
+            bsdf, of, wi, rng.uniform(360, 830), laterals[place], ((place[1] + 0.5) / side, (place[0] + 0.5) / side)
+        )
+        for place, wi in zip(list(np.ndindex(side, side))[:pairs], grazing(rng, pairs), strict=True)
+    ]
+    assert max(found) <= 1.002
+    assert np.mean(found) > 0.7
+
+
+@pytest.mark.parametrize("name", ["sinusoidal", pytest.param("foil", marks=pytest.mark.slow)])
+def test_few_scales_lose_no_more_than_one_grating(llvm, name):
+    """E of each of three pitches is that of a grating built with it."""
+    of, laterals = for_scales(SCALED[name](), 1.5, coherence_length=65), (0.8, 1.0, 1.4)
+    bsdf = plugin(of, lateral_scale=bitmap([laterals]))
+    rng = np.random.default_rng(6)
+    for k, lateral in enumerate(laterals):
+        alone = plugin(for_scales(stretched(SCALED[name](), lateral, 1), 1.5, coherence_length=65))
+        for wi in grazing(rng, 4):
+            lost = [albedo_of_orders(b, of, wi, 450.0, lateral, ((k + 0.5) / 3, 0.5)) for b in (bsdf, alone)]
+            assert lost[0] <= 1.002
+            assert lost[0] > lost[1] - 0.01
