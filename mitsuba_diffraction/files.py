@@ -26,14 +26,14 @@ _being_written: dict[str, Path] = {}
 
 
 def final_path(path: str | os.PathLike[str]) -> Path:
-    """The real path of a file; the final path of a temporary file from `whole_file`."""
+    """Return the real path of a file; the final path of a temporary file from `whole_file`."""
     real = os.path.realpath(path)
     return _being_written.get(real, Path(real))
 
 
 @contextmanager
 def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Yields a temporary path next to `path` and renames it to `path` if the block succeeds.
+    """Yield a temporary path next to `path` and renames it to `path` if the block succeeds.
 
     A reader sees either the old or the new file, whichever process writes it, and after the block the new file is on
     disk (fsync). If the block raises, including KeyboardInterrupt, the temporary file is removed and `path` is left
@@ -87,7 +87,7 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def _locked_temporary(target: Path) -> tuple[Path, int]:
-    """A new file next to `target`, and the descriptor that holds its lock."""
+    """Return a new file next to `target`, and the descriptor that holds its lock."""
     while True:
         # Not tempfile.mkstemp, whose files are readable by their owner only, also after the rename.
         temporary = target.with_name(f".{target.stem}-{secrets.token_hex(8)}{target.suffix}")
@@ -112,7 +112,7 @@ def _remove_what_a_kill_left(target: Path) -> None:
 
 
 def refuse_unwritable(path: str | os.PathLike[str]) -> None:
-    """Raises if `path` cannot be written, to be called before long computations.
+    """Raise if `path` cannot be written, to be called before long computations.
 
     Raises:
         ValueError: with the reason.
@@ -131,13 +131,13 @@ class _Writable(Exception):
 
 
 def cache_folder() -> Path:
-    """Where what took long to build is kept: $MITSUBA_DIFFRACTION_CACHE, or the user's cache folder."""
+    """Return where what took long to build is kept: $MITSUBA_DIFFRACTION_CACHE, or the user's cache folder."""
     named = os.environ.get("MITSUBA_DIFFRACTION_CACHE")
     return Path(named) if named else platformdirs.user_cache_path("mitsuba_diffraction")
 
 
 def refuse_special(path: str | os.PathLike[str]) -> None:
-    """Raises if `path` is a pipe or a device, which may be endless.
+    """Raise if `path` is a pipe or a device, which may be endless.
 
     Raises:
         ValueError: if so.

@@ -138,7 +138,7 @@ class Settings:
 
 
 def lobe_width(coherence_length: float) -> float:
-    """σ_q in cycles/µm for the coherence length L_c in µm.
+    """Return σ_q in cycles/µm for the coherence length L_c in µm.
 
     The window is Gaussian in amplitude, a(x) = exp(−|x|²/2σ_s²) with σ_s = L_c/4; the power of its transform is a
     Gaussian of standard deviation σ_q = 1/(2√2 π σ_s).
@@ -164,7 +164,7 @@ def lobe_reach(share: float) -> float:
 
 
 def matching(q: ArrayLike, kappa: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """q (..., 2) and κ (...) as float64 arrays, broadcast against each other.
+    """Return q (..., 2) and κ (...) as float64 arrays, broadcast against each other.
 
     Raises:
         ValueError: if q does not end in a pair or is not finite, or the shapes do not broadcast.

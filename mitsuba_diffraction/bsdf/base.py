@@ -9,7 +9,7 @@ from ..errors import RequestError
 
 
 def nested_plugin(kind: str, **parameters: object) -> mi.Object:
-    """A plugin without children.
+    """Make a plugin without children.
 
     Unlike mi.load_dict, this leaves Mitsuba's file resolver alone. mi.load_dict exchanges it for the time of the call,
     and other plugins of the scene, which Mitsuba instantiates at the same time on other threads, may ask for it then.
@@ -26,12 +26,12 @@ def is_grating(bsdf: mi.BSDF) -> bool:
 
 
 def contains_grating(bsdf: mi.BSDF) -> bool:
-    """Whether a BSDF is a grating or one is nested in it."""
+    """Return whether a BSDF is a grating or one is nested in it."""
     return is_grating(bsdf) or any(map(contains_grating, nested(bsdf)))
 
 
 def nested(bsdf: mi.BSDF) -> list[mi.BSDF]:
-    """The BSDFs that a BSDF holds, such as the two sides of a `twosided`."""
+    """Return the BSDFs that a BSDF holds, such as the two sides of a `twosided`."""
 
     class Children(mi.TraversalCallback):
         def __init__(self) -> None:
@@ -57,7 +57,7 @@ REFLECTS = mi.BSDFFlags.DiffuseReflection, mi.BSDFFlags.GlossyReflection, mi.BSD
 
 
 def base_from(props: mi.Properties) -> Base | None:
-    """The nested BSDF that the parameter `base` holds, if there is one.
+    """Return the nested BSDF that the parameter `base` holds, if there is one.
 
     Raises:
         ValueError: if it is not a BSDF that reflects and lets nothing through, or has another name.
@@ -112,7 +112,7 @@ class Base:
         return bool(front) and any(flags & +kind and ctx.is_enabled(kind, component) for kind in REFLECTS)
 
     def albedo(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Float:
-        """About what it reflects, averaged over the wavelengths: only to divide samples by."""
+        """Estimate the albedo, averaged over the wavelengths, to divide samples by."""
         if not self._is_diffuse:
             return mi.Float(1.0)
         value = mi.unpolarized_spectrum(self.bsdf.eval_diffuse_reflectance(si, active))

@@ -42,7 +42,7 @@ class CellAxis:
 
     @classmethod
     def of(cls, spectrum: GratingSpectrum, axis: int, widest: float) -> CellAxis:
-        """Along x (0) or y (1), of cells that are no wider than so many σ_q."""
+        """Make the cells along x (0) or y (1), no wider than so many σ_q."""
         grid, sigma = spectrum.grid, spectrum.lobe_width
         nodes = grid.frequencies()[axis]
         if isinstance(grid, OrderGrid):
@@ -92,7 +92,7 @@ class HorizonBins:
         self.per_frequency = opaque(self.resolution.frequencies / (self._last - self._first))
 
     def bin(self, incidence: Incidence) -> mi.UInt32:
-        """The bin of one wavelength and where it comes from; beyond the ends, the nearest."""
+        """Return the bin of one wavelength and where it comes from; beyond the ends, the nearest."""
         wi, bins = incidence.wi, self.resolution
         cosine = _cell(incidence.cosine * bins.cosines, bins.cosines)
         azimuth = _cell((_azimuth(wi.x, wi.y) + 2) * (bins.azimuths / 4), bins.azimuths)
@@ -100,7 +100,7 @@ class HorizonBins:
         return (frequency * bins.cosines + cosine) * bins.azimuths + azimuth
 
     def columns(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The interval of q_x that propagates for some q_y of a row, low ≤ q_y ≤ high (rows,), all in cycles/µm.
+        """Return the interval of q_x that propagates for some q_y of a row, low ≤ q_y ≤ high (rows,), all in cycles/µm.
 
         Returns:
             (bins, rows, 2), the first and last q_x; where there are none, the first is larger.
@@ -125,13 +125,13 @@ def _cell(x: mi.Float, count: int) -> mi.UInt32:
 
 
 def _azimuth(x: mi.Float, y: mi.Float) -> mi.Float:
-    """−2 to 2, instead of −π to π: the place on a square |x| + |y| = 1, which needs no arc tangent."""
+    """Return −2 to 2, instead of −π to π: the place on a square |x| + |y| = 1, which needs no arc tangent."""
     along = x / larger(dr.abs(x) + dr.abs(y), 1e-12)
     return dr.select(y >= 0, 1 - along, along - 1)
 
 
 def _border(bins: _Resolution, cosine: int, azimuth: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """s_x and s_y (n,) of the border of a bin, at most `_STEP` apart."""
+    """Return s_x and s_y (n,) of the border of a bin, at most `_STEP` apart."""
     radius = np.sqrt(1 - (np.array([cosine + 1, cosine]) / bins.cosines) ** 2)
     # No arc is longer than twice its part of the square.
     ends = (azimuth + np.linspace(0, 1, int(np.ceil(8 / bins.azimuths / _STEP)) + 1)) / (bins.azimuths / 4) - 2

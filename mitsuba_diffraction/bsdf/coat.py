@@ -86,28 +86,28 @@ class Coat:
         self.absorbs = depth > 0
 
     def refracted(self, omega: mi.Vector3f) -> mi.Vector3f:
-        """The direction inside, away from the grating, of light that is outside in the direction ω."""
+        """Return the direction inside, away from the grating, of light that is outside in the direction ω."""
         x, y = omega.x / self.eta, omega.y / self.eta
         return mi.Vector3f(x, y, dr.safe_sqrt(1 - dr.square(x) - dr.square(y)))
 
     def cos_inside(self, cos: mi.Float) -> mi.Float:
-        """cos θ' for the cosine of an angle outside."""
+        """Return cos θ' for the cosine of an angle outside."""
         return dr.safe_sqrt(1 - (1 - dr.square(cos)) / dr.square(self.eta))
 
     def reflectance(self, cos: mi.Float) -> mi.Float:
-        """F at the cosine of an angle outside."""
+        """Return F at the cosine of an angle outside."""
         return mi.fresnel(cos, self.eta)[0]
 
     def absorption(self, cos_inside: mi.Float) -> mi.Float:
-        """e^{−σd/cos θ'}."""
+        """Return e^{−σd/cos θ'}."""
         return dr.exp(-self.depth / dr.maximum(cos_inside, 1e-7)) if self.absorbs else mi.Float(1.0)
 
     def transmittance(self, cos: mi.Float, cos_inside: mi.Float) -> mi.Float:
-        """T."""
+        """Return T."""
         return (1 - self.reflectance(cos)) * self.absorption(cos_inside)
 
     def share(self, cos: mi.Float, below: mi.Float) -> mi.Float:
-        """The share of samples that the front face gets, where what is below reflects `below`."""
+        """Return the share of samples that the front face gets, where what is below reflects `below`."""
         front = self.reflectance(cos)
         return dr.detach(dr.clip(front / (front + dr.square(1 - front) * below), 0, 1))
 

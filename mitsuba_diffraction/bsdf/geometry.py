@@ -129,12 +129,12 @@ class Geometry:
         return -self.cos_i - self.cos_o
 
     def inside(self) -> tuple[mi.Vector3f, mi.Vector3f]:
-        """ω_i and ω_o inside of the coat."""
+        """Return ω_i and ω_o inside of the coat."""
         pairs = (self.wi, self.cos_i), (self.wo, self.cos_o)
         return tuple(mi.Vector3f(omega.x / self.index, omega.y / self.index, cos) for omega, cos in pairs)
 
     def reflects(self) -> mi.Bool:
-        """Both directions are above the surface."""
+        """Return whether both directions are above the surface."""
         return (self.cos_i > 0) & (self.cos_o > 0)
 
     def kappa(self, frequency: mi.Float) -> mi.Float:
@@ -142,7 +142,7 @@ class Geometry:
         return -self.w * dr.two_pi * self.index * frequency * self.height_scale
 
     def cos_half(self) -> mi.Float:
-        """ω_i·h = ω_o·h = √(D/2)."""
+        """Return ω_i·h = ω_o·h = √(D/2)."""
         return dr.sqrt(0.5 * _d(dr.squared_norm(self.tangent) / dr.square(self.index), self.cos_i + self.cos_o))
 
     def k_g(self) -> mi.Float:
@@ -151,7 +151,7 @@ class Geometry:
         return k_g(self.cos_i, self.cos_o, square, self.shadowing)
 
     def small(self) -> None:
-        """κ of reflected light is never too small for a table."""
+        """Return None: κ of reflected light is never too small for a table."""
 
     def cosines(self) -> tuple[mi.Float, mi.Float]:
         """Return cos θ_i and cos θ_o, inside of a coat."""
@@ -184,7 +184,7 @@ class Geometry:
         return dr.lerp(self.k_g(), gain, mirror) * self.cos_o
 
     def of_order(self, tangent: mi.Vector2f, per_width: mi.Float) -> tuple[mi.Float, mi.Float, mi.Float]:
-        """cos θ_i, cos θ_o and gain of the order that the pair sees in its lobe.
+        """Return cos θ_i, cos θ_o and gain of the order that the pair sees in its lobe.
 
         The order sends ω_i near to ω_o, and ω_o near to ω_i: the cosines, inside of a coat, are the root mean squares
         of both, at the centre of the lobe those of the pair. Within the lobe K would vary with the directions, and grow
@@ -221,7 +221,7 @@ def turned(omega: mi.Vector3f, sin: mi.Float, cos: mi.Float) -> mi.Vector3f:
 
 
 def _d(square: mi.Float, w: mi.Float) -> mi.Float:
-    """D = 1 + ω_i·ω_o = (u² + v² + w²)/2, from u² + v².
+    """Return D = 1 + ω_i·ω_o = (u² + v² + w²)/2, from u² + v².
 
     As a sum of squares: 1 + ω_i·ω_o cancels where both directions are grazing.
     """
@@ -229,7 +229,7 @@ def _d(square: mi.Float, w: mi.Float) -> mi.Float:
 
 
 def k_g(cos_i: mi.Float, cos_o: mi.Float, square: mi.Float, shadowing: bool) -> mi.Float:
-    """K G.
+    """Return K G.
 
     K = D²/(cos θ_i cos θ_o w²) (Stam 1999) and, with `shadowing`,
     G = min(1, 2(n·h)(n·ω_o)/(ω_o·h), 2(n·h)(n·ω_i)/(ω_o·h)) (Torrance and Sparrow 1967), where
@@ -252,7 +252,7 @@ def k_g(cos_i: mi.Float, cos_o: mi.Float, square: mi.Float, shadowing: bool) -> 
 
 
 def cos_square(omega: mi.Vector3f, tangent: mi.Vector2f) -> mi.Float:
-    """cos² θ of the direction into which the order at (u, v) = λq sends ω; negative where it does not propagate.
+    """Return cos² θ of the direction into which the order at (u, v) = λq sends ω; negative where it does not propagate.
 
     From cos² θ of ω, which 1 − |ω_t + λq|² would lose to rounding at grazing incidence.
     """
@@ -261,7 +261,7 @@ def cos_square(omega: mi.Vector3f, tangent: mi.Vector2f) -> mi.Float:
 
 
 def horizon_gain(x: mi.Float) -> mi.Float:
-    """g(x) of `geometry.horizon_gain`."""
+    """Return g(x) of `geometry.horizon_gain`."""
     t = larger(dr.fma(-0.25, x, 1), 0)
     result = mi.Float(HORIZON_GAIN[-1])
     for coefficient in HORIZON_GAIN[-2::-1]:

@@ -84,7 +84,7 @@ def _average(
 
 
 def choose(shares: mi.Vector4f, u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
-    """A cell with probability proportional to its share.
+    """Choose a cell with probability proportional to its share.
 
     Returns:
         Its index, and what is left of `u`: a number uniform in [0, 1).
@@ -105,7 +105,7 @@ def choose(shares: mi.Vector4f, u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
 def search(
     before: Callable[[mi.Int32], mi.Float], first: mi.Int32, end: mi.Int32, count: int, u: mi.Float
 ) -> tuple[mi.Int32, mi.Float]:
-    """The index i with F(i) ≤ F(first) + u (F(end) − F(first)) < F(i + 1), first ≤ i < end.
+    """Find the index i with F(i) ≤ F(first) + u (F(end) − F(first)) < F(i + 1), first ≤ i < end.
 
     Args:
         before: F, which does not fall.
@@ -133,7 +133,7 @@ class SumTable:
     GROUP = 16
 
     def __init__(self, sums: NDArray[np.float32]) -> None:
-        """Takes F (..., n + 1, κ cells)."""
+        """Take F (..., n + 1, κ cells)."""
         lines = sums.swapaxes(-1, -2)
         self.count = lines.shape[-1] - 1
         self.groups = 1
@@ -145,13 +145,13 @@ class SumTable:
         self.stride, self.fine = lines.shape[-1], FloatTable(lines)
 
     def before(self, line: mi.UInt32, kappa_cell: mi.UInt32, i: mi.Int32, active: mi.Bool) -> mi.Float:
-        """F(i), 0 ≤ i ≤ n."""
+        """Return F(i), 0 ≤ i ≤ n."""
         return self.fine((line * CELLS + kappa_cell) * self.stride + mi.UInt32(i), active)
 
     def search(
         self, line: mi.UInt32, kappa_cell: mi.UInt32, low: mi.Float, high: mi.Float, u: mi.Float, active: mi.Bool
     ) -> tuple[mi.Int32, mi.Float]:
-        """The index i with F(i) ≤ low + u (high − low) < F(i + 1), and the place between, as `search` has them.
+        """Return the index i with F(i) ≤ low + u (high − low) < F(i + 1), and the place between, as `search` has them.
 
         Args:
             line: which of the lines.
@@ -181,7 +181,7 @@ class SumTable:
 
 
 def truncated_gaussian(u: mi.Float, inside: mi.Float, spread: mi.Float) -> mi.Float:
-    """√2 σ erf⁻¹(I (2u − 1)), a Gaussian truncated alike on both sides, as lobes are.
+    """Return √2 σ erf⁻¹(I (2u − 1)), a Gaussian truncated alike on both sides, as lobes are.
 
     Args:
         u: in [0, 1).
@@ -192,20 +192,20 @@ def truncated_gaussian(u: mi.Float, inside: mi.Float, spread: mi.Float) -> mi.Fl
 
 
 def sums_before(shares: NDArray[np.float64]) -> NDArray[np.float32]:
-    """(..., n, κ cells) → (..., n + 1, κ cells): the sums of those before each, as they are read."""
+    """Return (..., n, κ cells) → (..., n + 1, κ cells): the sums of those before each, as they are read."""
     result = np.zeros((*shares.shape[:-2], shares.shape[-2] + 1, shares.shape[-1]), np.float32)
     result[..., 1:, :] = shares.cumsum(axis=-2)
     return result
 
 
 def _in_groups(lines: NDArray[np.float32], group: int) -> NDArray[np.float32]:
-    """(..., n) → (..., whole groups), continued with the last number of each line."""
+    """Return (..., n) → (..., whole groups), continued with the last number of each line."""
     pad = [(0, 0)] * (lines.ndim - 1) + [(0, -lines.shape[-1] % group)]
     return np.pad(lines, pad, mode="edge")
 
 
 def _between(low: mi.Float, high: mi.Float, u: mi.Float) -> mi.Float:
-    """low + u (high − low), less than high."""
+    """Return low + u (high − low), less than high."""
     target = dr.fma(u, high - low, low)
     # The sum may round up to the end.
     return dr.select(target < high, target, low)
@@ -220,7 +220,7 @@ def _locate(
     low: mi.Float,
     high: mi.Float,
 ) -> tuple[mi.Int32, mi.Float, mi.Float]:
-    """The index i with F(i) ≤ `target` < F(i + 1), F(i), F(i + 1).
+    """Return the index i with F(i) ≤ `target` < F(i + 1), F(i), F(i + 1).
 
     `low` is F(first) and `high` what F(i + 1) is if it was not met on the way.
     """

@@ -46,7 +46,7 @@ _SQUARE = 4
 def order_power(
     table: SeriesTable | SliceTable, rim: tuple[int, int] = (0, 0), windows: bool = True
 ) -> SeriesPower | SlicePower:
-    """The evaluation that fits the table.
+    """Return the evaluation that fits the table.
 
     Args:
         table: of a spectrum.
@@ -95,7 +95,7 @@ class _Power:
         self.nodes = -(-rows // square) * self.row
 
     def _arranged(self, packets: np.ndarray) -> np.ndarray:
-        """(..., rows, columns) → (..., nodes)."""
+        """Return (..., rows, columns) → (..., nodes)."""
         square, (rows, columns) = self.square, packets.shape[-2:]
         pad = [(0, 0)] * (packets.ndim - 2) + [(0, -rows % square), (0, -columns % square)]
         padded = np.pad(packets, pad)
@@ -119,7 +119,7 @@ class _Power:
         at: list[tuple[mi.UInt32, mi.Vector4f]],
         active: mi.Bool,
     ) -> mi.Float:
-        """Σ_ij w_x,i w_y,j c of the nodes from (row, column) on.
+        """Return Σ_ij w_x,i w_y,j c of the nodes from (row, column) on.
 
         Args:
             row: of the first node, the rim included; beyond the table, where a window holds zeros only, the nearest.
@@ -233,12 +233,12 @@ class SeriesPower(_Power):
 
 
 def _rimmed(values: np.ndarray, rim: tuple[int, int]) -> np.ndarray:
-    """(..., rows, columns) with nodes of zero around them."""
+    """Return (..., rows, columns) with nodes of zero around them."""
     return np.pad(values, ((0, 0), (0, 0), (rim[1], rim[1]), (rim[0], rim[0])))
 
 
 def _weights(table: SeriesTable) -> np.ndarray:
-    """g_n at steps in κ so small that straight lines between them serve: (steps + 1, N)."""
+    """Return g_n at steps in κ so small that straight lines between them serve: (steps + 1, N)."""
     steps = 64
     while True:
         kappas = np.linspace(0, table.largest_kappa, 2 * steps + 1)
@@ -298,7 +298,7 @@ class OrderSampler:
         self.before_y = PacketTable(before_y)
 
     def rectangle(self, incidence: Incidence) -> tuple[mi.Int32, mi.Int32, mi.Int32, mi.Int32]:
-        """The first row, the end of the rows, the first column, the end of the columns."""
+        """Return the first row, the end of the rows, the first column, the end of the columns."""
         if not self.restricted:
             return mi.Int32(0), mi.Int32(self.rows), mi.Int32(0), mi.Int32(self.columns)
         frequency = incidence.lateral_frequency
@@ -310,7 +310,7 @@ class OrderSampler:
     def _interval(
         self, along: mi.Float, across: mi.Float, lines: int, radius: mi.Float, tile: mi.Float, largest: int
     ) -> tuple[mi.Int32, mi.Int32]:
-        """The orders |m/T + s/λ| ≤ ρ along one axis, of which there are `lines` side by side: first and end."""
+        """Return the orders |m/T + s/λ| ≤ ρ along one axis, of which there are `lines` side by side: first and end."""
         if largest == 0:
             return mi.Int32(0), mi.Int32(1)
         half = radius
@@ -346,13 +346,13 @@ class OrderSampler:
         return weights * per, undiffracted * per
 
     def _start(self, left: mi.Int32, right: mi.Int32) -> mi.Int32:
-        """Where the sums over the rows begin in their table."""
+        """Return where the sums over the rows begin in their table."""
         if not self.restricted:
             return mi.Int32(0)
         return (left * (self.largest_x + 1) + right - (self.largest_x + 1)) * (self.rows + 1)
 
     def _masses(self, bottom: mi.Int32, top: mi.Int32, start: mi.Int32, active: mi.Bool) -> mi.Vector4f:
-        """M_j in units."""
+        """Return M_j in units."""
         masses = self.before_y(mi.UInt32(start + top), active)
         return masses - self.before_y(mi.UInt32(start + bottom), active) if self.rows > 1 else masses
 
@@ -408,7 +408,7 @@ class OrderSampler:
 
 
 def _units(average: NDArray[np.float64]) -> NDArray[np.int64]:
-    """A_jm of one κ cell in units of 2⁻²⁴: at least one, no more than 2²⁴ together."""
+    """Return A_jm of one κ cell in units of 2⁻²⁴: at least one, no more than 2²⁴ together."""
     return 1 + np.floor(average * (WHOLE - average.size)).astype(np.int64)
 
 
@@ -484,7 +484,7 @@ class LineSampler:
         return (x, y) if self.along_x else (y, x)
 
     def _interval(self, incidence: Incidence) -> tuple[mi.Int32, mi.Int32]:
-        """The first cell in which something propagates, and the end of them."""
+        """Return the first cell in which something propagates, and the end of them."""
         frequency = incidence.frequency
         along, across = (s * frequency for s in self._axes(incidence.wi.x, incidence.wi.y))
         half = dr.safe_sqrt(dr.square(incidence.radius) - dr.square(larger(dr.abs(across) - self.reach, 0)))
@@ -494,11 +494,11 @@ class LineSampler:
         return dr.clip(first, -self.largest, 0) + self.largest, dr.clip(end, 1, self.largest + 1) + self.largest
 
     def _masses(self, first: mi.Int32, end: mi.Int32, active: mi.Bool) -> mi.Vector4f:
-        """M_j."""
+        """Return M_j."""
         return self.before(mi.UInt32(end), active) - self.before(mi.UInt32(first), active)
 
     def _across(self, along: mi.Float, incidence: Incidence) -> tuple[mi.Float, mi.Float]:
-        """F(a) and F(b)."""
+        """Return F(a) and F(b)."""
         frequency = incidence.frequency
         s_along, s_across = (s * frequency for s in self._axes(incidence.wi.x, incidence.wi.y))
         half = dr.safe_sqrt(dr.square(incidence.radius) - dr.square(along + s_along))
@@ -507,7 +507,7 @@ class LineSampler:
 
 
 def _cumulative(x: mi.Float) -> mi.Float:
-    """F(τx)."""
+    """Return F(τx)."""
     t = x * dr.rsqrt(1 + dr.square(x))
     return t - dr.square(t) * t / 3
 
@@ -699,7 +699,7 @@ class _Axis:
         self.steps = [opaque(np.exp(-0.5 * (k / (size * sigma)) ** 2)) for k in range(1, 0 if self.all else self.count)]
 
     def first(self, q: mi.Float) -> mi.Int32:
-        """The first of the `count` orders that contribute at q (cycles/µm)."""
+        """Return the first of the `count` orders that contribute at q (cycles/µm)."""
         return mi.Int32(-self.largest) if self.all else mi.Int32(dr.ceil(q * self.size - 0.5 * self.count))
 
     def holds(self, m: mi.Int32, q: mi.Float, scale: mi.Float | None = None) -> mi.Bool:

@@ -53,7 +53,7 @@ class PerfectMirror:
         return mi.UnpolarizedSpectrum(1.0)
 
     def index(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> None:
-        """It has none."""
+        """Return None: a constant reflectance has no index."""
 
     def update(self) -> None:
         pass
@@ -85,7 +85,7 @@ class Dielectric:
         return mi.UnpolarizedSpectrum(_schlick(dr.square((self.eta - 1) / (self.eta + 1)), cos_half))
 
     def index(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> list[mi.Complex2f] | None:
-        """n + ik of every wavelength; Schlick's formula knows no polarisation."""
+        """Return n + ik of every wavelength; Schlick's formula knows no polarisation."""
         return None if self.model == "schlick" else [mi.Complex2f(self.eta, 0)] * len(mi.UnpolarizedSpectrum(0.0))
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
@@ -112,7 +112,7 @@ class Conductor:
 
     @staticmethod
     def _spectrum(wavelengths: NDArray[np.float64], values: NDArray[np.float64]) -> mi.Texture:
-        """From the values at wavelengths in µm."""
+        """Make a texture from the values at wavelengths in µm."""
         # A regular table is read at once; in an irregular one every look-up searches, which took half of all time.
         nanometres = np.arange(VISIBLE[0], VISIBLE[1] + 1)
         text = ", ".join(repr(float(value)) for value in np.interp(nanometres * 1e-3, wavelengths, values))
@@ -129,7 +129,7 @@ class Conductor:
         return _schlick(normal, cos_half)
 
     def index(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> list[mi.Complex2f] | None:
-        """n + ik of every wavelength; Schlick's formula knows no polarisation."""
+        """Return n + ik of every wavelength; Schlick's formula knows no polarisation."""
         if self.model == "schlick":
             return None
         eta, k = self.eta.eval(si, active), self.k.eval(si, active)
@@ -147,6 +147,6 @@ class Conductor:
 
 
 def _schlick(normal: mi.UnpolarizedSpectrum, cos_half: mi.Float) -> mi.UnpolarizedSpectrum:
-    """R₀ + (1 − R₀)(1 − cos)⁵ (Schlick 1994); R₀ is a power already and is not squared."""
+    """Return R₀ + (1 − R₀)(1 − cos)⁵ (Schlick 1994); R₀ is a power already and is not squared."""
     away = 1 - cos_half
     return normal + (1 - normal) * dr.square(dr.square(away)) * away

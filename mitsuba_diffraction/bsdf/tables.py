@@ -14,22 +14,22 @@ from ..spectrum.tables import LEAST_EXPONENT
 
 
 def larger(a: mi.Float, b: mi.Float) -> mi.Float:
-    """`a` where it is more than `b`, else `b`."""
+    """Return `a` where it is more than `b`, else `b`."""
     return dr.select(a > b, a, b)
 
 
 def smaller(a: mi.Float, b: mi.Float) -> mi.Float:
-    """`a` where it is less than `b`, else `b`."""
+    """Return `a` where it is less than `b`, else `b`."""
     return dr.select(a < b, a, b)
 
 
 def limited(x: mi.Float, low: float, high: float) -> mi.Float:
-    """`x`, or the nearest number from `low` to `high`."""
+    """Return `x`, or the nearest number from `low` to `high`."""
     return smaller(larger(x, low), high)
 
 
 def opaque(value: float) -> mi.Float:
-    """A number held as an array, not as a literal, so that one kernel serves every surface."""
+    """Return a number held as an array, not as a literal, so that one kernel serves every surface."""
     result = mi.Float(value)
     dr.make_opaque(result)
     return result
@@ -42,13 +42,13 @@ class FloatTable:
     """A flat table of floats."""
 
     def __init__(self, numbers: np.ndarray) -> None:
-        """Takes an array of any shape."""
+        """Take an array of any shape."""
         flat = aligned(np.asarray(numbers, np.float32).ravel())
         # Scalar variants have no gather.
         self.values = mi.Float(flat) if dr.is_jit_v(mi.Float) else flat
 
     def __call__(self, index: mi.UInt32, active: mi.Bool) -> mi.Float:
-        """The floats at `index`; zero where not `active`."""
+        """Return the floats at `index`; zero where not `active`."""
         if dr.is_jit_v(mi.Float):
             return dr.gather(mi.Float, self.values, index, active)
         return float(self.values[index]) if active else 0.0
@@ -60,7 +60,7 @@ class PacketTable(FloatTable):
     unit = 1.0
 
     def __init__(self, packets: np.ndarray, width: int = 4) -> None:
-        """Takes the packets one after the other, of any shape; uint32 in fours stays so, all else becomes float32."""
+        """Take the packets one after the other, of any shape; uint32 in fours stays so, all else becomes float32."""
         self.width = width
         if packets.dtype == np.uint32:
             flat = aligned(packets.ravel())
@@ -71,7 +71,7 @@ class PacketTable(FloatTable):
             self.packet = {2: mi.Vector2f, 4: mi.Vector4f}[width]
 
     def __call__(self, index: mi.UInt32, active: mi.Bool) -> mi.Vector2f | mi.Vector4f | mi.Vector4u:
-        """The packets at `index`; zero where not `active`."""
+        """Return the packets at `index`; zero where not `active`."""
         if dr.is_jit_v(mi.Float):
             return dr.gather(self.packet, self.values, index, active)
         if not active:
@@ -79,7 +79,7 @@ class PacketTable(FloatTable):
         return self.packet(*self.values[self.width * index : self.width * (index + 1)].tolist())
 
     def add(self, packet: mi.Vector4f, weight: mi.Float, index: mi.UInt32, active: mi.Bool) -> mi.Vector4f:
-        """`packet` + `weight` times what is at `index`."""
+        """Return `packet` + `weight` times what is at `index`."""
         return dr.fma(weight, self(index, active), packet)
 
     def entry(self, index: mi.UInt32, place: mi.UInt32, active: mi.Bool) -> mi.Float:
@@ -91,18 +91,18 @@ class NumberTable:
     """A flat table of 32-bit numbers."""
 
     def __init__(self, numbers: np.ndarray) -> None:
-        """Takes an array of any shape."""
+        """Take an array of any shape."""
         flat = aligned(np.asarray(numbers, np.uint32).ravel())
         # Scalar variants have no gather.
         self.values = mi.UInt32(flat) if dr.is_jit_v(mi.Float) else flat
 
     def __call__(self, index: mi.UInt32) -> mi.UInt32:
-        """The number at `index`."""
+        """Return the number at `index`."""
         return dr.gather(mi.UInt32, self.values, index) if dr.is_jit_v(mi.Float) else int(self.values[index])
 
 
 def aligned(values: np.ndarray) -> np.ndarray:
-    """Flat float32 or uint32 at an address that is a multiple of 64 bytes.
+    """Return Flat float32 or uint32 at an address that is a multiple of 64 bytes.
 
     Dr.Jit uses the memory of NumPy's arrays as it is, and reads a packet at once only where it is aligned so: else the
     kernel would be slower, and another one from one allocation to the next.
@@ -125,11 +125,11 @@ class HalfTable:
     unit = 2.0**112  # the exponents of the two formats are 15 and 127 for the same number
 
     def __init__(self, packets: np.ndarray) -> None:
-        """Takes numbers of half precision in packets of four, in an array of any shape."""
+        """Take numbers of half precision in packets of four, in an array of any shape."""
         self.words = mi.UInt32(aligned(np.ascontiguousarray(packets, np.float16).view(np.uint32).ravel()))
 
     def add(self, packet: mi.Vector4f, weight: mi.Float, index: mi.UInt32, active: mi.Bool) -> mi.Vector4f:
-        """`packet` + `weight` times what is at `index`."""
+        """Return `packet` + `weight` times what is at `index`."""
         numbers = []
         for half in (0, 1):
             word = dr.gather(mi.UInt32, self.words, 2 * index + half, active)
@@ -147,13 +147,13 @@ class SharedExponentTable:
     unit = 2.0 ** (126 + LEAST_EXPONENT)  # the exponent 1 is 2⁻¹²⁶ in a float32
 
     def __init__(self, mantissas: np.ndarray, exponents: np.ndarray) -> None:
-        """Takes m (..., 3) and e (...), the numbers being m 2^e."""
+        """Take m (..., 3) and e (...), the numbers being m 2^e."""
         m = mantissas.astype(np.int64) & 511
         words = (m[..., 0] << 23) | (m[..., 1] << 14) | (m[..., 2] << 5) | (exponents - LEAST_EXPONENT + 1)
         self.words = mi.UInt32(aligned(words.astype(np.uint32).ravel()))
 
     def add(self, packet: mi.Vector3f, weight: mi.Float, index: mi.UInt32, active: mi.Bool) -> mi.Vector3f:
-        """`packet` + `weight` times what is at `index`."""
+        """Return `packet` + `weight` times what is at `index`."""
         word = dr.gather(mi.UInt32, self.words, index, active)
         signed = mi.Int32(word)
         numbers = mi.Vector3f(mi.Float(signed >> 23), mi.Float((signed << 9) >> 23), mi.Float((signed << 18) >> 23))
@@ -170,7 +170,7 @@ class ShareTable:
     """
 
     def __init__(self, packets: np.ndarray) -> None:
-        """Takes packets (..., 4)."""
+        """Take packets (..., 4)."""
         exponents = np.frexp(packets.max(axis=-1).astype(np.float32) / np.float32(63))[1]
         # Smaller ones are zero: nothing in a float32.
         exponents = np.maximum(exponents, -100)
@@ -184,7 +184,7 @@ class ShareTable:
             self.words = PacketTable(self.values)
 
     def __call__(self, index: mi.UInt32, active: mi.Bool) -> mi.Vector4f:
-        """The packets at `index`; zero where not `active`."""
+        """Return the packets at `index`; zero where not `active`."""
         if not dr.is_jit_v(mi.Float):
             return self.words(index, active)
         word = dr.gather(mi.UInt32, self.words, index, active)

@@ -102,7 +102,7 @@ def main() -> None:
 
 
 def _tell(error: BaseException, debug: bool = False) -> int:
-    """Reports an error on one line, after the traceback if `debug`, and returns the exit code."""
+    """Report an error on one line, after the traceback if `debug`, and returns the exit code."""
     if isinstance(error, Stopped | KeyboardInterrupt | typer.Abort):
         say("interrupted", error if isinstance(error, Stopped) else "nothing was written")
         return 130

@@ -106,7 +106,7 @@ def _table(spectrum: Spectrum) -> str:
 
 
 def _seam(source: Path, recipe: Recipe) -> str:
-    """A line on the seam of a scan for which no extent is given.
+    """Return a line on the seam of a scan for which no extent is given.
 
     Raises:
         ValueError: if the seam would be visible.

@@ -106,7 +106,7 @@ class Axes:
     def coordinates(
         self, m: NDArray[np.int64], c: Real, g: Real, wavelength: Real
     ) -> tuple[Real, Real, NDArray[np.bool_]]:
-        """P and R, and whether order m propagates."""
+        """Return P and R, and whether order m propagates."""
         less = self.least(m)
         p, r = self.shift + g + c + m / 2 - less[0], self.shift + g - c - m / 2 - less[1]
         inside = g * np.abs(g) + (self.index**2 - 1) * (self.period / wavelength) ** 2
@@ -116,7 +116,7 @@ class Axes:
         return p, r, there
 
     def units(self, m: int) -> int:
-        """How many units P and R of order m cover."""
+        """Return how many units P and R of order m cover."""
         # The largest g + |k_x| of the incident light.
         longest = (1 + (1.0, self.index)[self.way[0]]) * self.period / self.wavelengths[0]
         return int(np.ceil(self.shift + longest - sum(self.least(m))))
@@ -126,7 +126,7 @@ class Axes:
         return self.units(m) * self.steps + 1
 
     def offset(self, m: int) -> int:
-        """Where the nodes of order m start in a plane: [P, R] of order −M first."""
+        """Return where the nodes of order m start in a plane: [P, R] of order −M first."""
         return sum(self.side(k) ** 2 for k in range(-self.largest, m))
 
     def square(self, values: NDArray[np.float32], m: int) -> NDArray[np.float32]:
@@ -140,16 +140,16 @@ class Axes:
         return self.offset(self.largest + 1)
 
     def nodes_at(self, count: int) -> Real:
-        """P at X = 0 … count − 1."""
+        """Return P at X = 0 … count − 1."""
         i, f = np.divmod(np.arange(count), self.steps)
         return i + np.sin(np.pi / 2 * f / self.steps) ** 2
 
     def position(self, p: Real) -> Real:
-        """X of P ≥ 0."""
+        """Return X of P ≥ 0."""
         i = np.floor(p)
         return self.steps * (i + 2 / np.pi * np.arcsin(np.sqrt(p - i)))
 
     def range(self, g: Real) -> tuple[Real, Real]:
-        """λ₀ and λ₁ at g, µm."""
+        """Return λ₀ and λ₁ at g, µm."""
         longest = self.period * np.where(g < 0, self.beyond * (1 - 1e-6), 1.0) / np.maximum(np.abs(g), 1e-12)
         return tuple(np.minimum(w, longest) for w in self.wavelengths)

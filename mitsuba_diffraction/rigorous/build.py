@@ -171,7 +171,7 @@ class _Surface:
         ).hexdigest()
 
     def _harmonics(self, curve: Curve, omega: Real) -> int:
-        """The fewest harmonics that are right to a tenth of the tolerance, at the shortest wavelength."""
+        """Return the fewest harmonics that are right to a tenth of the tolerance, at the shortest wavelength."""
         index, k_0 = self.index(self.wavelengths[0]), self.period / self.wavelengths[0]
         exact = converge(curve, omega, k_0, index, self.tolerance / 20)
         if exact.error > self.tolerance:
@@ -191,7 +191,7 @@ class _Surface:
         return count
 
     def solve(self, alpha: float, g: float, wavelengths: Iterable[float], finer: int = 0) -> list[Scattered]:
-        """Light of all orders from either side, k_x = α of order 0, at each wavelength; α and g times period/2π.
+        """Return Light of all orders from either side, k_x = α of order 0, at each wavelength; α and g times period/2π.
 
         The harmonics, those of `gratings[finer]`, are raised where R + T is not one within the tolerance, or where R is
         above one if the material absorbs.
@@ -224,7 +224,7 @@ class _Surface:
         )
 
     def matrices(self, solved: Scattered) -> dict[tuple[int, int], _Orders]:
-        """(from, to) → n of the orders in and of those out, and M_ij, (orders out, orders in, 4, 4)."""
+        """Return (from, to) → n of the orders in and of those out, and M_ij, (orders out, orders in, 4, 4)."""
         if self.transmission == "sheet":
             of_air = solved.orders[ABOVE], solved.orders[ABOVE]
             found = through_sheet(solved, self.index(self.wavelengths[0]).real)
@@ -234,7 +234,7 @@ class _Surface:
         return {(i, o): (solved.orders[i], solved.orders[o], matrices_of(solved, i, o)) for i, o in ways}
 
     def checks(self) -> list[_Checked]:
-        """Light at random places, directions uniform over the hemispheres, wavelengths over the range."""
+        """Return Light at random places, directions uniform over the hemispheres, wavelengths over the range."""
         rng = np.random.default_rng(0)
         checks = []
         for number, (cosine, turn, share) in enumerate(rng.random((_CHECKS, 3))):
@@ -257,7 +257,7 @@ class _Surface:
 
 
 def _errors(spectrum: RigorousSpectrum, checks: list[_Checked]) -> dict[str, float]:
-    """`error`, `worst`, `worst_near` and `polarisation_error` of a table."""
+    """Return `error`, `worst`, `worst_near` and `polarisation_error` of a table."""
     error, split = [], []
     for alpha, g, wavelength, _, orders in checks:
         total, difference, matrices_differ = 0.0, 0.0, 0.0
@@ -302,7 +302,7 @@ class _Build:
         self.jobs = [(part, units) for part in range(steps) for units in range(-below, axes.units(0) + 2)]
 
     def tables(self, progress: Progress, checkpoints: Path | None) -> tuple[Table, ...]:
-        """Those of `RigorousSpectrum`."""
+        """Return those of `RigorousSpectrum`."""
         done = _Checkpoint(checkpoints, f"{self.surface.digest}-{self.steps}")
         left = [job for job in range(len(self.jobs)) if job not in done.done]
         with ThreadPoolExecutor(os.cpu_count()) as pool:
@@ -412,7 +412,7 @@ def _chebyshev(count: int, planes: int) -> tuple[Real, Real]:
 
 
 def _lagrange(x: Real, nodes: Real) -> Real:
-    """(x, nodes): weights of values at the nodes in the polynomial through them."""
+    """Return (x, nodes): weights of values at the nodes in the polynomial through them."""
     ratio = np.ones((len(x), len(nodes)))
     for j, node in enumerate(nodes):
         others = np.delete(nodes, j)
@@ -421,7 +421,7 @@ def _lagrange(x: Real, nodes: Real) -> Real:
 
 
 def _cubic(units: int, steps: int, finer: int) -> Real:
-    """(finer nodes, nodes): cubic interpolation between nodes, of each unit by its own."""
+    """Return (finer nodes, nodes): cubic interpolation between nodes, of each unit by its own."""
     matrix = np.zeros((units * finer + 1, units * steps + 1))
     for unit in range(units):
         for fine in range(finer + 1):

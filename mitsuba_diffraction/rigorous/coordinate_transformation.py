@@ -70,7 +70,7 @@ class Grating:
         self.sm = self.s @ left
 
     def _coefficients(self, values: Complex) -> Complex:
-        """∫₀¹ f e^{−2πi n t} dt of values (…, samples) between the points of the curve, n as in `fft`."""
+        """Return ∫₀¹ f e^{−2πi n t} dt of values (…, samples) between the points of the curve, n as in `fft`."""
         shift = np.exp(-1j * np.pi * np.fft.fftfreq(len(self.t)))
         return np.fft.fft(values) * shift / len(self.t)
 
@@ -139,7 +139,7 @@ class HalfSpace:
 
 
 def half_space(grating: Grating, alpha: Real, gamma2: complex, upwards: bool) -> HalfSpace:
-    """The fields with ∇²ψ + γ²ψ = 0 above a curve, or below it.
+    """Return the fields with ∇²ψ + γ²ψ = 0 above a curve, or below it.
 
     Args:
         alpha: α_m of all harmonics, (n,).

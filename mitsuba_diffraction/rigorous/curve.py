@@ -53,12 +53,12 @@ class Curve:
 
 
 def is_profile(height_field: HeightField) -> bool:
-    """Whether the heights do not change along y."""
+    """Return whether the heights do not change along y."""
     return bool(np.ptp(height_field.heights, axis=0).max() == 0)
 
 
 def curve_of(height_field: HeightField) -> Curve:
-    """The curve of a surface of one row: straight lines from pixel to pixel, round the end of the tile.
+    """Return the curve of a surface of one row: straight lines from pixel to pixel, round the end of the tile.
 
     The facet that leads back in a sawtooth is thus one pixel wide, and so is the wall of a lamellar grating. Between
     edges the length of the curve grows at a rate of 1 − η (4 cos 2πτ + cos 4πτ)/5: slowly near the edges, where fields
@@ -98,7 +98,7 @@ def curve_of(height_field: HeightField) -> Curve:
 
 
 def _graded(edges: Real, length: float) -> Real:
-    """s at t = 0, 1/n, … 1, with a whole number of steps between edges."""
+    """Return s at t = 0, 1/n, … 1, with a whole number of steps between edges."""
     ends = np.append(edges, length)
     shares = np.cumsum(np.diff(ends) ** _SHARE)
     steps = np.append(0, np.round(shares / shares[-1] * SAMPLES)).astype(int)

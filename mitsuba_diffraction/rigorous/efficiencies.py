@@ -30,7 +30,7 @@ MIRRORED = np.array([1, 1, -1, -1])
 
 
 def mueller(amplitudes: NDArray[np.complex128]) -> NDArray[np.float64]:
-    """M_ij = Tr(σ_i J σ_j J†) / 2 of amplitudes J, (…, 2, 2) → (…, 4, 4).
+    """Return M_ij = Tr(σ_i J σ_j J†) / 2 of amplitudes J, (…, 2, 2) → (…, 4, 4).
 
     Polarised waves are written in (ê, k̂ × ê), as in `coordinate_transformation.Scattered`.
     """
@@ -221,7 +221,7 @@ def converge(curve: Curve, omega: Real, k_0: float, index: complex, tolerance: f
 
 
 def wave_numbers(curve: Curve, k_0: float, index: complex, omega: Real) -> tuple[int, int]:
-    """The largest order that propagates, above or below, and the waves that a profile is long.
+    """Return the largest order that propagates, above or below, and the waves that a profile is long.
 
     Light that travels along the curve has, where t runs fastest, as many waves to a unit of t as the second number
     says: below it, the efficiencies of deep profiles have nothing to do with their limit; above it, they converge
@@ -266,12 +266,12 @@ def solve(curve: Curve, omega: Real, k_0: float, index: complex, harmonics: int)
 
 
 def _powers(amplitudes: Complex) -> Real:
-    """η of each order, of s and of p light, (n, 2)."""
+    """Return η of each order, of s and of p light, (n, 2)."""
     return (np.abs(amplitudes) ** 2).sum(axis=1)
 
 
 def _change(before: Efficiencies, after: Efficiencies) -> float:
-    """Σ|Δη_m| / Σ η_m, of reflected or transmitted orders, of s or p light, the largest."""
+    """Return Σ|Δη_m| / Σ η_m, of reflected or transmitted orders, of s or p light, the largest."""
     pairs = (
         (before.amplitudes, after.amplitudes),
         (before.transmitted_amplitudes, after.transmitted_amplitudes),

@@ -21,7 +21,7 @@ _SYMBOLS = {
 
 
 def refractive_index(wavelength: float, *, int_ior: complex | None = None, material: str | None = None) -> complex:
-    """n + ik of what lies below a surface.
+    """Return n + ik of what lies below a surface.
 
     Args:
         wavelength: µm, in vacuum.
@@ -56,7 +56,7 @@ def _near(name: str, known: list[str]) -> list[str]:
 
 @functools.cache
 def conductor(material: str, folder: Path) -> tuple[NDArray[np.float64], ...]:
-    """The table of a conductor in Mitsuba's folder of indices: wavelengths in µm, n and k there, (J,) each.
+    """Return the table of a conductor in Mitsuba's folder of indices: wavelengths in µm, n and k there, (J,) each.
 
     Raises:
         ValueError: if there is none of that name.

@@ -83,12 +83,12 @@ def _plane(alpha: Real, k_y: float, k: float, other: float, upwards: bool) -> tu
 
 
 def _together(matrices: Real) -> Real:
-    """(n, k, 4, 4) as one matrix, (4n, 4k)."""
+    """Return (n, k, 4, 4) as one matrix, (4n, 4k)."""
     n, k = matrices.shape[:2]
     return matrices.transpose(0, 2, 1, 3).reshape(4 * n, 4 * k)
 
 
 def _apart(matrix: Real) -> Real:
-    """(4n, 4k) as (n, k, 4, 4)."""
+    """Return (4n, 4k) as (n, k, 4, 4)."""
     n, k = (size // 4 for size in matrix.shape)
     return matrix.reshape(n, 4, k, 4).transpose(0, 2, 1, 3)

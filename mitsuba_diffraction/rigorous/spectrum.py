@@ -64,7 +64,7 @@ class Table:
                 raise RequestError(f"mueller: got {self.mueller.shape}, wanted {matrices} of float32")
 
     def evaluate(self, m: ArrayLike, c: ArrayLike, g: ArrayLike, wavelength: ArrayLike, mueller: bool = False) -> Real:
-        """η_m, or M_ij (…, 4, 4), linear between the nodes; 0 for an order that does not propagate.
+        """Return η_m, or M_ij (…, 4, 4), linear between the nodes; 0 for an order that does not propagate.
 
         Args:
             m: orders, broadcast against the others.
@@ -220,7 +220,7 @@ class RigorousSpectrum:
         sides: tuple[int, int] = (0, 0),
         mueller: bool = False,
     ) -> Real:
-        """η_m of light from a side to a side, from the tables, or its Mueller matrix, linear between the nodes.
+        """Return η_m of light from a side to a side, from the tables, or its Mueller matrix, linear between the nodes.
 
         With n_i and n_o the `indices` of the sides of ω_i and ω_o, and ν = T/λ,
 
@@ -349,7 +349,7 @@ class RigorousSpectrum:
 
 
 def _split(x: Real, count: NDArray[np.int64] | int) -> tuple[NDArray[np.int64], Real]:
-    """The node below x, at most the last but one, and how far x is beyond it."""
+    """Return the node below x, at most the last but one, and how far x is beyond it."""
     low = np.clip(np.floor(x).astype(np.int64), 0, np.maximum(np.asarray(count) - 2, 0))
     return low, x - low
 

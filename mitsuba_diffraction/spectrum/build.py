@@ -141,7 +141,7 @@ def build_spectrum(patches: Sequence[HeightField], settings: Settings, progress:
 
 
 def _digest(patches: Sequence[HeightField]) -> str:
-    """SHA-256 of the height field, or of those of all patches."""
+    """Return SHA-256 of the height field, or of those of all patches."""
     digests = [patch.digest for patch in patches]
     return digests[0] if len(digests) == 1 else hashlib.sha256("".join(digests).encode()).hexdigest()
 
@@ -154,7 +154,7 @@ def _tile_splines(
     largest_kappa: float,
     tolerance: float,
 ) -> TileSplines | None:
-    """A tile's lattice of splines, if it is read faster than its orders."""
+    """Return a tile's lattice of splines, if it is read faster than its orders."""
     cost = _cost(lobes[0].count * lobes[1].count, orders.grid.shape)
 
     def lattice(spacing: float) -> TileSplines:
@@ -292,7 +292,7 @@ class _Build:
         return part(forward, begin, end)
 
     def __call__(self, representation: str) -> tuple[Table, float]:
-        """The cheapest table of this representation, and its measured error."""
+        """Return the cheapest table of this representation, and its measured error."""
         packs = representation == SliceTable.representation and np.prod(self.kept.shape) > _SMALL
         storages = _STORAGES if packs else _STORAGES[-1:]
         for storage in storages:
@@ -351,7 +351,7 @@ class _Build:
         return kappas, vander @ chebyshev_transform(self._nodes)
 
     def _terms(self, series: Series, projection: NDArray[np.float64], allowed: float) -> int:
-        """The fewest terms with which the pilot is kept at every κ."""
+        """Return the fewest terms with which the pilot is kept at every κ."""
         allowed *= self._pilot_share
         kappas, interpolate = self._between()
         terms = projection @ self._pilot
@@ -366,7 +366,7 @@ class _Build:
         return series.terms
 
     def _intervals(self, allowed: float, terms: int) -> int:
-        """The fewest intervals with which the pilot is kept at every κ."""
+        """Return the fewest intervals with which the pilot is kept at every κ."""
         allowed *= self._pilot_share
         kappas, interpolate = self._between()
         exact = interpolate @ self._pilot
@@ -397,7 +397,7 @@ class _Build:
 
 
 def _rim(profile: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The sum of a profile over −M…M outside of each |m|: (M + 1,)."""
+    """Return the sum of a profile over −M…M outside of each |m|: (M + 1,)."""
     half = len(profile) // 2
     folded = profile[half:] + profile[half::-1]
     folded[0] /= 2
@@ -409,7 +409,7 @@ class _TooLargeError(RequestError):
 
 
 def _check_size(shape: tuple[int, int], floats: int) -> None:
-    """Refuses a table of so many floats a node before memory is asked for it."""
+    """Refuse a table of so many floats a node before memory is asked for it."""
     if 4.0 * np.prod(shape, dtype=float) * floats > _LARGEST_TABLE:
         raise _TooLargeError(
             f"tolerance: needs {' × '.join(map(str, shape))} frequencies of {floats} numbers, more than a table of "

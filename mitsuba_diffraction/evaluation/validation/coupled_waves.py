@@ -104,7 +104,7 @@ class RigorousResult:
         return scalar_orders(powers, self.period, self.wavelength, self.angle, self.index)
 
     def found(self) -> Array:
-        """The efficiencies of the BSDF, (n,)."""
+        """Return the efficiencies of the BSDF, (n,)."""
         spectrum, bsdf = _plugin(self.profile, self.period, self.depth, self.material)
         q = np.stack([self.orders / self.period, np.zeros(len(self.orders))], axis=-1)
         return lobe_powers(bsdf, spectrum, direction(self.angle, 180.0), q, self.wavelength)

@@ -86,7 +86,7 @@ def measured() -> tuple[Real, Real]:
 
 @functools.cache
 def curve(shape: str, angle: float, rigorous: bool, step: int = 1) -> Real:
-    """η₁ at every `step`th measured wavelength."""
+    """Return η₁ at every `step`th measured wavelength."""
     surface = groove(shape, angle)
     return np.array([transmitted(surface, wavelength, rigorous)[0] for wavelength in measured()[0][::step]])
 
@@ -107,7 +107,7 @@ class Fit:
 
 
 def scaled(found: Real, step: int = 1) -> tuple[float, float]:
-    """The factor that fits efficiencies to the measured ones best, and the rms difference that is left."""
+    """Return the factor that fits efficiencies to the measured ones best, and the rms difference that is left."""
     wanted = measured()[1][::step]
     factor = float(found @ wanted / (found @ found))
     return factor, float(np.sqrt(((factor * found - wanted) ** 2).mean()))
@@ -132,7 +132,7 @@ def stored_angles() -> dict[str, dict[str, float]]:
 
 
 def difference(shape: str, theory: str) -> Record:
-    """The root of the mean square difference to the measured efficiencies, both scaled by the best factor."""
+    """Return the root of the mean square difference to the measured efficiencies, both scaled by the best factor."""
     angle = stored_angles()[shape][theory]
     found = curve(shape, angle, theory == "rigorous")
     factor, rms = scaled(found)
@@ -142,7 +142,7 @@ def difference(shape: str, theory: str) -> Record:
 
 
 def ratios(shape: str, theory: str) -> Record:
-    """The second order over the first at the wavelengths of `RATIOS`; the first of these is the number."""
+    """Return the second order over the first at the wavelengths of `RATIOS`; the first of these is the number."""
     surface = groove(shape, stored_angles()[shape][theory])
     found = []
     for wavelength in RATIOS:
@@ -154,7 +154,7 @@ def ratios(shape: str, theory: str) -> Record:
 
 
 def plot() -> Figure:
-    """The measured efficiencies, and the curves of both theories and both shapes, each with its factor."""
+    """Return the measured efficiencies, and the curves of both theories and both shapes, each with its factor."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9.5, 3.8), layout="constrained")
