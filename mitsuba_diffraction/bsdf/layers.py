@@ -66,9 +66,9 @@ class Layers:
             both = mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide
             passes = (flags & ~+mi.BSDFFlags.GlossyReflection) | mi.BSDFFlags.GlossyTransmission | both
             self.components = [+(flags | both), +passes]
-            if self.interface.is_sheet:
+            if self.interface.has_flat_face:
                 face = mi.BSDFFlags.BackSide
-            else:
+            if not self.interface.is_sheet:
                 self.components[1] |= +mi.BSDFFlags.NonSymmetric
         self.face = len(self.components)
         if face:
