@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from bsdf_support import direction, interaction, use, vectors
 
+import mitsuba_diffraction as md
 from mitsuba_diffraction import gratings
 from mitsuba_diffraction.rigorous.build import build_spectrum
 from mitsuba_diffraction.settings import Settings
@@ -171,3 +172,99 @@ def test_samples_have_the_light_of_the_table(glass, theta, side):
 
 def test_a_sheet_has_no_second_flat_face(glass):
     assert plugin(glass).component_count() == 2
+
+
+def entries(matrix):
+    """Of the first wavelength, (4, 4)."""
+    dr.eval(matrix)  # in one kernel
+    return np.array([[np.ravel(matrix[i, j][0])[0] for j in range(4)] for i in range(4)])
+
+
+def between_stokes_axes(matrix, source, exit_):
+    """A matrix between waves in (ê, k̂ × ê), ê the part of ŷ across k̂, as one between Mitsuba's axes."""
+    full = mi.Spectrum(0.0)
+    for i, j in np.ndindex(4, 4):
+        full[i, j] = mi.UnpolarizedSpectrum(float(matrix[i, j]))
+    waves = [vectors(-source), vectors(exit_)]
+    axes = [dr.normalize(mi.Vector3f(0, 1, 0) - k.y * k) for k in waves]
+    turned = [(k, axis, mi.mueller.stokes_basis(k)) for k, axis in zip(waves, axes, strict=True)]
+    return entries(mi.mueller.rotate_mueller_basis(full, *turned[0], *turned[1]))
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_spectral_polarized", "scalar_spectral_polarized"])
+def test_mueller_matrices_are_those_of_the_table(glass, variant):
+    use(variant)
+    bsdf, seen = plugin(glass), 0
+    for theta, phi, side in ((50, 20, 1), (40, 200, -1)):
+        wi = towards(theta, phi, side)
+        alpha, k_y = -index(glass, wi) * wi[:2] * PERIOD / WAVELENGTH
+        square = (PERIOD / WAVELENGTH) ** 2 - k_y**2
+        g = np.sign(square) * np.sqrt(abs(square))
+        for transmitted in (False, True):
+            ways = int(side < 0), int((side < 0) != transmitted)
+            for m in (-1, 0, 1):
+                if (wo := exit_of(glass, wi, m, transmitted)) is None:
+                    continue
+                wanted = glass.evaluate(m, alpha - m / 2, g, WAVELENGTH, ways, mueller=True)
+                # Light of the opposite k_y is mirrored at the plane of incidence.
+                signs = np.array([1, 1, -1, -1]) if k_y < 0 else np.ones(4)
+                wanted = between_stokes_axes(np.outer(signs, signs) * wanted / wanted[0, 0], wi, wo)
+                si = interaction(wi, (WAVELENGTH * 1e3,) * 4)
+                found = entries(bsdf.eval(mi.BSDFContext(IMPORTANCE), si, vectors(wo)))
+                np.testing.assert_allclose(found / found[0, 0], wanted, atol=2e-3)
+                seen += 1
+    assert seen >= 7
+
+
+@pytest.mark.parametrize("variant", ["scalar_spectral", "llvm_ad_spectral_polarized"])
+def test_other_variants_pass_the_same_light(glass, variant):
+    directions = np.array([towards(20, 30, 1), towards(50, 250, -1)])
+    u = [(0.05, 0.4, 0.6), (0.3, 0.2, 0.7), (0.8, 0.9, 0.1)]
+
+    def drawn():
+        bsdf, found = plugin(glass), []
+        for wi in directions:
+            for one, *two in u:
+                bs, weight = bsdf.sample(mi.BSDFContext(), interaction(wi, WAVELENGTHS), one, mi.Point2f(*two))
+                value, pdf = bsdf.eval_pdf(mi.BSDFContext(), interaction(wi, WAVELENGTHS), bs.wo)
+                parts = (mi.unpolarized_spectrum(weight), mi.unpolarized_spectrum(value), bs.wo, bs.eta, pdf)
+                found.append(np.concatenate([np.ravel(np.array(part)) for part in parts]))
+        return np.array(found)
+
+    wanted = drawn()
+    use(variant)
+    np.testing.assert_allclose(drawn(), wanted, rtol=2e-3, atol=1e-4 * wanted.max())
+
+
+@pytest.mark.parametrize(
+    ("parameters", "text"),
+    [
+        ({"transmission": "none"}, "transmission: got 'none', but the rigorous spectrum is of transmission={}: say"),
+        ({"int_ior": 1.6}, "got int_ior 1.6, but the rigorous spectrum is of int_ior 1.5"),
+        ({"material": "Al"}, "material: got 'Al' with transmission={}"),
+        ({"coat_ior": 1.4}, "coat_ior: got 1.4 with transmission={}"),
+        ({"height_scale": 0.5}, "height_scale: got 0.5, wanted none with theory=rigorous"),
+    ],
+)
+def test_other_light_than_that_of_the_table_is_refused(glass, parameters, text):
+    with pytest.raises(RuntimeError, match=text.format(glass.transmission)):
+        plugin(glass, **parameters)
+
+
+def test_scenes_build_tables_of_light_that_passes(glass, monkeypatch, tmp_path):
+    """A profile and a recipe ask for the light of the scene."""
+    asked = []
+    monkeypatch.setattr(md.Recipe, "cached", lambda recipe, *_: asked.append(dict(recipe.spectrum)) or glass)
+    scene = {"type": "diffraction_grating", "int_ior": ETA, "ext_ior": 1.0, "transmission": glass.transmission}
+    recipe = tmp_path / "glass.toml"
+    recipe.write_text(
+        '[surface]\nprofile = "blazed"\nperiod = 0.3\ndepth = 0.05\n[spectrum]\ntheory = "rigorous"\nint_ior = 1.5\n',
+        encoding="utf-8",
+    )
+    mi.load_dict({**scene, "profile": "blazed", "period": 0.3, "depth": 0.05, "theory": "rigorous"})
+    mi.load_dict({**scene, "filename": str(recipe)})
+    assert [settings["transmission"] for settings in asked] == [glass.transmission] * 2
+    recipe.write_text(recipe.read_text() + 'transmission = "sheet"\n', encoding="utf-8")
+    with pytest.raises(RuntimeError, match="transmission: got 'none', but the rigorous spectrum is of"):
+        mi.load_dict({**scene, "filename": str(recipe), "transmission": "none"})
+    assert len(asked) == 2  # nothing was built
