@@ -268,3 +268,26 @@ def test_scenes_build_tables_of_light_that_passes(glass, monkeypatch, tmp_path):
     with pytest.raises(RuntimeError, match="transmission: got 'none', but the rigorous spectrum is of"):
         mi.load_dict({**scene, "filename": str(recipe), "transmission": "none"})
     assert len(asked) == 2  # nothing was built
+
+
+@pytest.mark.parametrize("glass", ["sheet"], indirect=True)
+@pytest.mark.parametrize("side", [1, -1])
+def test_a_sheet_before_a_uniform_sky_has_the_light_of_the_table(glass, side):
+    """Rendered by `path`: reflected and transmitted light together, nothing twice."""
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "sky": {"type": "constant", "radiance": {"type": "uniform", "value": 1.0}},
+            "sheet": {"type": "rectangle", "bsdf": plugin(glass)},
+        }
+    )
+    count = 1 << 16
+    sampler = mi.load_dict({"type": "independent", "sample_count": count})
+    sampler.seed(0, count)
+    wi = towards(25, 40, side)
+    ray = mi.Ray3f(mi.Point3f(*map(float, wi)), vectors(-wi))
+    ray.wavelengths = mi.Spectrum(*WAVELENGTHS)
+    found, valid, _ = mi.load_dict({"type": "path", "max_depth": 3}).sample(scene, sampler, mi.RayDifferential3f(ray))
+    assert dr.all(valid)
+    wanted = [sum(glass.efficiencies(wi, w * 1e-3, way)[1].sum() for way in (False, True)) for w in WAVELENGTHS]
+    np.testing.assert_allclose(np.array(found).mean(1), wanted, atol=0.02)
