@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..rigorous.efficiencies import MIRRORED, REVERSED
-from ..rigorous.spectrum import RigorousSpectrum, Table
+from ..rigorous.spectrum import RigorousSpectrum
 from .geometry import Geometry, Incidence
 from .inversion import search, truncated_gaussian
 from .orders import WHOLE
@@ -84,7 +84,7 @@ class RigorousOrders:
         axes = spectrum.axes
         self.axes = axes
         self.count = int(2 * spectrum.reach * spectrum.lobe_width * axes.period) + 1  # lobes that overlap
-        self.table = PacketTable(np.concatenate([_packets(table) for table in spectrum.tables]))
+        self.table = PacketTable(_packets(spectrum))
         if mi.is_polarized:
             self.matrices = PacketTable(np.concatenate([np.moveaxis(t.mueller, 0, 1) for t in spectrum.tables]))
         self.transmits = len(spectrum.tables) > 1
@@ -382,22 +382,25 @@ def _split(x: mi.Float, count: mi.UInt32) -> tuple[mi.UInt32, mi.Float]:
     return low, x - mi.Float(low)
 
 
-def _packets(table: Table) -> NDArray[np.uint32]:
-    """η_m at the eight nodes about each cell, in steps of 1/65535: (nodes, K − 1, 4).
+def _packets(spectrum: RigorousSpectrum) -> NDArray[np.uint32]:
+    """η_m at the eight nodes about each cell, in steps of 1/65535: (nodes of all tables, K − 1, 4).
 
     Node (i, j, k) has the words of (i, j), (i, j + 1), (i + 1, j), (i + 1, j + 1), each with k in its lower half and
     k + 1 in its upper one: a single read of 16 bytes for an efficiency. Between the nodes that were solved the table
     may dip below zero, or exceed one, by its error.
     """
-    axes = table.axes
-    packets = np.empty((axes.nodes, axes.planes - 1, 4), np.uint32)
-    for m in axes.orders:
-        square = np.moveaxis(axes.square(table.values, m), 0, -1)
-        side, start = square.shape[0], axes.offset(m)
-        steps = np.rint(np.clip(square, 0, 1).astype(np.float64) * STEPS).astype(np.uint32)
-        words = np.pad(steps[..., :-1] | steps[..., 1:] << 16, [(0, 1), (0, 1), (0, 0)], mode="edge")
-        corners = [words[i : side + i, j : side + j] for i, j in np.ndindex(2, 2)]
-        packets[start : start + side**2] = np.stack(corners, axis=-1).reshape(side**2, -1, 4)
+    nodes, first = sum(table.axes.nodes for table in spectrum.tables), 0
+    packets = np.empty((nodes, spectrum.axes.planes - 1, 4), np.uint32)
+    for table in spectrum.tables:
+        axes = table.axes
+        for m in axes.orders:
+            square = np.moveaxis(axes.square(table.values, m), 0, -1)
+            side, start = square.shape[0], first + axes.offset(m)
+            steps = np.rint(np.clip(square, 0, 1).astype(np.float64) * STEPS).astype(np.uint32)
+            words = np.pad(steps[..., :-1] | steps[..., 1:] << 16, [(0, 1), (0, 1), (0, 0)], mode="edge")
+            corners = [words[i : side + i, j : side + j] for i, j in np.ndindex(2, 2)]
+            packets[start : start + side**2] = np.stack(corners, axis=-1).reshape(side**2, -1, 4)
+        first += axes.nodes
     return packets
 
 
