@@ -25,7 +25,7 @@ CELLS_BOTH = 4  # where light passes, too
 PLANES = 4  # of its cells over the wavelengths
 # 2/π asin √x = √x Σ_n a_n xⁿ for x ≤ 1/2, to 4e-7 (least squares at Chebyshev points).
 _ARC_SINE = (0.63661934, 0.10616330, 0.04642647, 0.03876191, -0.01541680, 0.06134137)
-_POINTS = ((0.25, 0.75), (0.75, 0.25))  # of each of these, along p and r, where η is taken
+_POINTS = tuple(itertools.product((0.1, 0.9), repeat=3))  # of each of these, along Z, p and r, where η is taken
 STEPS = 2**16 - 1  # of η in the table
 FLOOR = 0.05  # the share that all orders of a cell have alike, for those that vary within it
 
@@ -467,16 +467,17 @@ def _shares_of_sides(spectrum: RigorousSpectrum, cells: int) -> tuple[NDArray[np
         may = np.maximum(low[:, None] - m, m - high[:, None]) < g_out[:, None]
         possible[way, z, p, r] = may
         cell, order = np.nonzero(may)
-        found = np.zeros(len(cell))
-        for u, v in _POINTS:
+        found, of_order = np.zeros((2, len(cell))), m[order]
+        for t, u, v in _POINTS:
             x, y = placed(u)[p], placed(v)[r]
             g, alpha = (x + y) / 2, (x - y) / 2
-            wavelength = wavelengths(g, n_i, (z + 0.5) / planes)
+            wavelength = wavelengths(g, n_i, (z + t) / planes)
             square = g**2 - (n_i**2 - 1) * (axes.period / wavelength) ** 2
             g = np.sign(square) * np.sqrt(np.abs(square))
-            of_order = m[order]
-            found += spectrum.evaluate(of_order, alpha[cell] - of_order / 2, g[cell], wavelength[cell], (side, to))
-        shares[way, z[cell], p[cell], r[cell], order] = found
+            eta = spectrum.evaluate(of_order, alpha[cell] - of_order / 2, g[cell], wavelength[cell], (side, to))
+            found += eta, eta > 0
+        # The mean of where the order propagates: the horizon may cross a cell anywhere.
+        shares[way, z[cell], p[cell], r[cell], order] = found[0] / np.maximum(found[1], 1)
     return shares, possible
 
 
