@@ -6,11 +6,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from bsdf_support import direction, interaction, use, vectors
+from bsdf_support import direction, interaction, random_directions, use, vectors
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction import gratings
+from mitsuba_diffraction.rigorous.axes import Axes
 from mitsuba_diffraction.rigorous.build import build_spectrum
+from mitsuba_diffraction.rigorous.spectrum import RigorousSpectrum, Table, axes_of
 from mitsuba_diffraction.settings import Settings
 
 PERIOD, ETA, WAVELENGTH = 0.3, 1.5, 0.45
@@ -291,3 +293,19 @@ def test_a_sheet_before_a_uniform_sky_has_the_light_of_the_table(glass, side):
     assert dr.all(valid)
     wanted = [sum(glass.efficiencies(wi, w * 1e-3, way)[1].sum() for way in (False, True)) for w in WAVELENGTHS]
     np.testing.assert_allclose(np.array(found).mean(1), wanted, atol=0.02)
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_orders_that_emerge_within_a_cell_of_the_sampler_are_drawn(side):
+    """All orders are alike: an order that the cells miss would have a large weight."""
+    tables = axes_of(Axes(1.7, (0.36, 0.83), 4, 5), "interface", ETA)
+    values = [np.full((axes.planes, axes.nodes), 0.01, np.float32) for axes in tables]
+    alike = RigorousSpectrum(
+        tuple(map(Table, tables, values)), "", ETA + 0j, 65.0, 0.01, 0, 0, 0, 1, "made up", "", transmission="interface"
+    )
+    rng, count = np.random.default_rng(2), 1 << 16
+    wi = random_directions(rng, count, 0.2) * [1, 1, side]
+    u = rng.random((3, count)).astype(np.float32)
+    ctx = mi.BSDFContext(IMPORTANCE)
+    _, weight = plugin(alike).sample(ctx, interaction(wi, (500.0,) * 4, count), mi.Float(u[0]), mi.Point2f(u[1:]))
+    assert np.array(weight)[0].max() < 2
