@@ -57,7 +57,7 @@ PARAMETERS = (
         "string",
         "light that enters a dielectric: none, it is absorbed or reaches the base; interface, it enters the medium of "
         "int_ior, as in `roughdielectric`; sheet, it passes a film with one flat face, below, and ext_ior on both "
-        "sides",
+        "sides. A rigorous spectrum must be built for it",
         "none",
     ),
     Parameter(
@@ -85,6 +85,9 @@ and κ = 2π (cos θ_i + cos θ_o)/λ. E, as in `energy.py`, bounds the albedo b
 below one without it. Without shadowing K diverges as 1/cos θ near the horizon, and there is no E.
 
 Of rigorous theory the BRDF is Σ_m η_m N(q − m/T; σ_q² I)/λ², as in `rigorous_orders.py`: R, K, G and E are in η_m.
+Where light passes, the sum has the factor n_o², n_o the index of the medium of ω_o. The efficiencies of a sheet hold
+all of its light: what its flat face reflects is a lobe of order 0, where scalar theory has a mirror, and light that is
+reflected back and forth inside leaves in the orders into which it is diffracted.
 
 With a transmission (`transmission.py`), light passes the grating from either side: q and κ as above with the indices of
 both media, 1 − R for R, and the K and G of `geometry.transmitted`. From below, a sheet's flat face is a mirror.

@@ -170,7 +170,7 @@ class Grating:
             # Radiance is compressed along with the solid angle.
             i, o = interface.side(si.wi), interface.side(wo)
             value *= dr.square(i.outside / o.outside)
-        if interface is not None and interface.is_sheet:
+        if interface is not None and interface.has_flat_face:
             value *= interface.flat(si.wi) * interface.flat(wo)
         if self.coat is None:
             if not mi.is_polarized:

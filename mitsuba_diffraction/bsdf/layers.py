@@ -15,6 +15,7 @@ from .polarisation import of_plane, reflected
 from .tables import BELOW_ONE, smaller
 
 LEAST_SHARE = 0.1  # of the samples, for the grating and for its base: what each reflects is only estimated
+LEAST_SIDE = 0.2  # of the samples, for either side of a rigorous grating: fine ones are far from a plane
 
 
 @dataclass(frozen=True)
@@ -66,9 +67,9 @@ class Layers:
             both = mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide
             passes = (flags & ~+mi.BSDFFlags.GlossyReflection) | mi.BSDFFlags.GlossyTransmission | both
             self.components = [+(flags | both), +passes]
-            if self.interface.is_sheet:
+            if self.interface.has_flat_face:
                 face = mi.BSDFFlags.BackSide
-            else:
+            if not self.interface.is_sheet:
                 self.components[1] |= +mi.BSDFFlags.NonSymmetric
         self.face = len(self.components)
         if face:
@@ -96,7 +97,8 @@ class Layers:
         if self.interface.is_sheet:
             # Inside there is no total reflection.
             reflected = mi.fresnel(dr.abs(mi.Frame3f.cos_theta(si.wi)), eta)[0]
-        return dr.clip(1 - reflected, LEAST_SHARE, 1 - LEAST_SHARE)
+        least = LEAST_SIDE if self.interface.kappas is None else LEAST_SHARE
+        return dr.clip(1 - reflected, least, 1 - least)
 
     def _share(
         self, si: mi.SurfaceInteraction3f, asked: Asked, entering: mi.UnpolarizedSpectrum | None, active: mi.Bool

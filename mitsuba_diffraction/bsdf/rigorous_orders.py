@@ -3,26 +3,67 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import math
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..rigorous.efficiencies import MIRRORED
+from ..rigorous.efficiencies import MIRRORED, REVERSED
 from ..rigorous.spectrum import RigorousSpectrum
-from .geometry import Geometry, Incidence, cos_square
+from .geometry import Geometry, Incidence
 from .inversion import search, truncated_gaussian
 from .orders import WHOLE
 from .tables import PacketTable, larger, limited, opaque, smaller
+from .transmission import Crossing, CrossingIncidence
 
 CELLS = 8  # of the sampler to each unit of P and R
+CELLS_BOTH = 4  # where light passes, too
 PLANES = 4  # of its cells over the wavelengths
 # 2/π asin √x = √x Σ_n a_n xⁿ for x ≤ 1/2, to 4e-7 (least squares at Chebyshev points).
 _ARC_SINE = (0.63661934, 0.10616330, 0.04642647, 0.03876191, -0.01541680, 0.06134137)
+_POINTS = tuple(itertools.product((0.1, 0.9), repeat=3))  # of each of these, along Z, p and r, where η is taken
 STEPS = 2**16 - 1  # of η in the table
 FLOOR = 0.05  # the share that all orders of a cell have alike, for those that vary within it
+
+
+@dataclass(eq=False)
+class _Pair:
+    """A pair of directions in the coordinates of `Axes`, and where the table of its way stands.
+
+    Attributes:
+        q_x, q_y: cycles/µm.
+        k_y: as of `Axes`, in units of 2π/T.
+        c: as of `Axes`, of the reversed light where `upwards`.
+        g: as of `Axes`.
+        z: Z / (K − 1).
+        reflects: whether light leaves on its own side; None without transmission.
+        upwards: whether it crosses from below.
+        squares: of an interface, the square of g on the side where the table's light comes from and where it leaves.
+        shift: D.
+        longest: the side of order 0.
+        steps: by how much that of the next order is less.
+        largest: M.
+        before: where order 0 starts.
+    """
+
+    q_x: mi.Float
+    q_y: mi.Float
+    k_y: mi.Float
+    c: mi.Float
+    g: mi.Float
+    z: mi.Float
+    reflects: mi.Bool | None
+    upwards: mi.Bool | None
+    squares: tuple[mi.Float, mi.Float] | None
+    shift: mi.Float | int
+    longest: mi.Int32 | int
+    steps: mi.Int32 | int
+    largest: mi.Int32 | int
+    before: mi.Int32 | int
 
 
 class RigorousOrders:
@@ -33,7 +74,8 @@ class RigorousOrders:
 
         p = g + α = P + max(m, 0),    r = g − α = R − min(m, 0),    α = −ω_i,x ν,    g = ν √(1 − ω_i,y²),
 
-    and of the wavelength: in p and r the orders of one direction share one cell.
+    and of the wavelength: in p and r the orders of one direction share one cell. Where light passes, α and g are those
+    of the medium of ω_i, and each side has cells for reflected and for transmitted light.
     """
 
     resolved = True
@@ -44,12 +86,26 @@ class RigorousOrders:
         self.count = int(2 * spectrum.reach * spectrum.lobe_width * axes.period) + 1  # lobes that overlap
         self.table = PacketTable(_packets(spectrum))
         if mi.is_polarized:
-            self.matrices = PacketTable(np.moveaxis(spectrum.mueller, 0, 1))
-        self.cells = math.gcd(CELLS, axes.steps)
-        units = _units(_shares(spectrum, self.cells))
-        self.sampler_planes = units.shape[0]
-        self.cells_across = units.shape[1]
-        before = np.zeros((*units.shape[:3], units.shape[3] + 1))
+            self.matrices = PacketTable(np.concatenate([np.moveaxis(t.mueller, 0, 1) for t in spectrum.tables]))
+        self.transmits = len(spectrum.tables) > 1
+        self.interface = spectrum.transmission == "interface"
+        all_axes = [table.axes for table in spectrum.tables]
+        starts = itertools.accumulate((a.nodes for a in all_axes), initial=0)
+        # Of each table what `_Pair` has of it.
+        self.layouts = [
+            (a.shift, a.side(0), a.side(0) - a.side(1), a.largest, start + a.offset(0))
+            for a, start in zip(all_axes, starts, strict=False)
+        ]
+        self.largest = max(a.largest for a in all_axes)
+        if self.transmits:
+            self.beyond, self.excess = opaque(axes.beyond * (1 - 1e-6)), opaque(axes.index**2 - 1)
+            self.cells = math.gcd(CELLS_BOTH, axes.steps)
+            units = _units(*_shares_of_sides(spectrum, self.cells))
+        else:
+            self.cells = math.gcd(CELLS, axes.steps)
+            units = _units(_shares(spectrum, self.cells))
+        self.sampler_planes, self.cells_across = units.shape[-4], units.shape[-2]
+        before = np.zeros((*units.shape[:-1], units.shape[-1] + 1))
         before[..., 1:] = units.cumsum(axis=-1)
         self.orders = PacketTable(np.stack([before, np.append(units, 0 * units[..., :1], axis=-1)], axis=-1), width=2)
         sigma, reach = spectrum.lobe_width, spectrum.reach
@@ -70,9 +126,13 @@ class RigorousOrders:
 
     @dr.syntax
     def evaluate(
-        self, geometry: Geometry, incidence: Incidence, active: mi.Bool, wo_is_sample: bool
+        self,
+        geometry: Geometry | Crossing,
+        incidence: Incidence | CrossingIncidence,
+        active: mi.Bool,
+        wo_is_sample: bool,
     ) -> tuple[mi.Float, mi.Float]:
-        """cos θ_o Σ_m η_m N and the density of q, both in µm², for one wavelength.
+        """n_o² cos θ_o Σ_m η_m N and the density of q, both in µm², for one wavelength.
 
         The lobe of each order keeps its power at the horizon (`Geometry.of_order`).
 
@@ -92,58 +152,107 @@ class RigorousOrders:
             power, density = read(geometry)
         return power, density
 
-    def _coordinates(self, wi: mi.Vector3f, wo: mi.Vector3f, frequency: mi.Float) -> tuple[mi.Float, ...]:
-        """q_x, q_y in cycles/µm, and k_y, c, g and the third coordinate of `Axes`."""
-        nu = self.period * frequency
-        k_y, c = 0.5 * nu * (wo.y - wi.y), 0.5 * nu * (wo.x - wi.x)
-        g = dr.sqrt(larger(dr.square(nu) - dr.square(k_y), 0))
-        return -(wi.x + wo.x) * frequency, -(wi.y + wo.y) * frequency, k_y, c, g, self._z(g, frequency)
+    def _pair(
+        self,
+        k_i: mi.Vector2f | mi.Vector3f,
+        k_o: mi.Vector2f | mi.Vector3f,
+        frequency: mi.Float,
+        above: tuple[mi.Bool, mi.Bool] | None,
+    ) -> _Pair:
+        """Return the coordinates of a pair of directions.
 
-    def _read(self, incidence: Incidence, near: mi.Bool, geometry: Geometry) -> tuple[mi.Float, mi.Float]:
+        Args:
+            k_i, k_o: n ω of both, or their parts along the surface.
+            frequency: 1/λ above.
+            above: whether each is above; None without transmission.
+        """
+        nu = self.period * frequency
+        k_y, c = 0.5 * nu * (k_o.y - k_i.y), 0.5 * nu * (k_o.x - k_i.x)
+        square = dr.square(nu) - dr.square(k_y)
+        reflects = upwards = squares = None
+        layout = self.layouts[0]
+        if self.interface:
+            g = dr.sqrt(larger(dr.abs(square), 1e-12))
+            g = dr.select(square < 0, -g, g)
+        else:
+            g = dr.sqrt(larger(square, 0))
+        if self.transmits:
+            reflects = above[0] == above[1]
+            layout = [
+                one if one == two == three else dr.select(reflects, dr.select(above[0], one, two), three)
+                for one, two, three in zip(*self.layouts, strict=True)
+            ]
+            upwards = dr.select(reflects, mi.Bool(False), above[1])
+            c = dr.select(upwards, -c, c)
+        if self.interface:
+            inside = dr.fma(self.excess, dr.square(nu), square)
+            own = dr.select(above[0], square, inside)
+            squares = dr.select(reflects, own, square), dr.select(reflects, own, inside)
+        q_x, q_y = -(k_i.x + k_o.x) * frequency, -(k_i.y + k_o.y) * frequency
+        return _Pair(q_x, q_y, k_y, c, g, self._z(g, frequency), reflects, upwards, squares, *layout)
+
+    def _read(
+        self, incidence: Incidence | CrossingIncidence, near: mi.Bool, geometry: Geometry | Crossing
+    ) -> tuple[mi.Float, mi.Float]:
         """As `evaluate`, where `near`; else zero."""
-        # Its tables are those inside of a coat.
         frequency = incidence.frequency
-        q_x, q_y, _, c, g, z = self._coordinates(*geometry.inside(), geometry.index * frequency)
+        if self.transmits:
+            i, o = geometry.i, geometry.o
+            pair = self._pair(i.tangent, o.tangent, frequency, (i.sign > 0, o.sign > 0))
+        else:
+            # Its tables are those inside of a coat.
+            pair = self._pair(*geometry.inside(), geometry.index * frequency, None)
+        q_x, q_y = pair.q_x, pair.q_y
         cell = self._cell(incidence)
         first = self._first(q_x)
         power, density = mi.Float(0.0), mi.Float(0.0)
         for step in range(self.count):
             m = first + step
             offset = dr.fma(-self.pitch, mi.Float(m), q_x)
-            there = near & (dr.abs(offset) <= self.half_width) & (dr.abs(m) <= self.axes.largest)
+            there = near & (dr.abs(offset) <= self.half_width) & (dr.abs(m) <= pair.largest)
             square = dr.square(offset) + dr.square(q_y)
             lobe = dr.select(there, self.peak * dr.exp(self.falloff * square), 0)
             tangent = mi.Vector2f(mi.Float(m) * self.pitch / frequency, 0)
             *_, gain = geometry.of_order(tangent, frequency * self.per_width)
-            power += lobe * gain * self._efficiency(m, c, g, z, there)
+            power += lobe * gain * self._efficiency(m, pair, there)
             # An order that does not propagate is not drawn.
-            there &= cos_square(geometry.wi, tangent) > 0
+            there &= incidence.propagates(tangent)
             density += dr.select(there, lobe, 0) * self.orders(mi.UInt32(dr.select(there, cell + m, 0)), there).y
-        return power * geometry.cos_o, density / WHOLE
+        return power * (geometry.outgoing if self.transmits else geometry.cos_o), density / WHOLE
 
     def mueller(
-        self, source: mi.Vector3f, exit_: mi.Vector3f, frequency: mi.Float, active: mi.Bool
+        self,
+        source: mi.Vector2f | mi.Vector3f,
+        exit_: mi.Vector2f | mi.Vector3f,
+        frequency: mi.Float,
+        active: mi.Bool,
+        above: tuple[mi.Bool, mi.Bool] | None,
     ) -> list[list[mi.Float]]:
         """M_ij / M_00 of light from `source`, from all orders whose lobes reach the pair; the identity where none does.
 
         Args:
-            source, exit_: along the pattern's axes.
-            frequency: 1/λ in cycles/µm.
+            source, exit_: along the pattern's axes, times n where light passes.
+            frequency: 1/λ in cycles/µm, above.
             active: mask.
+            above: whether each is above; None without transmission.
         """
-        q_x, q_y, k_y, c, g, z = self._coordinates(source, exit_, frequency)
+        pair = self._pair(source, exit_, frequency, above)
+        q_x, q_y = pair.q_x, pair.q_y
         first = self._first(q_x)
         rows = [mi.Vector4f(0.0) for _ in range(4)]
         for step in range(self.count):
             m = first + step
             offset = dr.fma(-self.pitch, mi.Float(m), q_x)
             there = active & (dr.abs(offset) <= self.half_width) & (dr.abs(q_y) <= self.half_width)
-            there &= dr.abs(m) <= self.axes.largest
+            there &= dr.abs(m) <= pair.largest
             lobe = dr.select(there, dr.exp(self.falloff * (dr.square(offset) + dr.square(q_y))), 0)
-            for row, found in enumerate(self._matrix(m, c, g, z, there)):
+            for row, found in enumerate(self._matrix(m, pair, there)):
                 rows[row] += lobe * found
         bright = rows[0].x > 0
-        mirrored, changed = dr.select(k_y < 0, mi.Float(-1), mi.Float(1)), np.not_equal.outer(MIRRORED, MIRRORED)
+        if self.transmits:
+            back = [mi.Vector4f(*(float(REVERSED[i] * REVERSED[j]) * rows[j][i] for j in range(4))) for i in range(4)]
+            rows = [dr.select(pair.upwards, other, row) for row, other in zip(rows, back, strict=True)]
+        mirrored, changed = dr.select(pair.k_y < 0, mi.Float(-1), mi.Float(1)), np.not_equal.outer(MIRRORED, MIRRORED)
         scale = dr.rcp(dr.select(bright, rows[0].x, mi.Float(1)))
         return [
             [
@@ -153,10 +262,10 @@ class RigorousOrders:
             for i in range(4)
         ]
 
-    def _matrix(self, m: mi.Int32, c: mi.Float, g: mi.Float, z: mi.Float, active: mi.Bool) -> list[mi.Vector4f]:
+    def _matrix(self, m: mi.Int32, pair: _Pair, active: mi.Bool) -> list[mi.Vector4f]:
         """The rows of M of order m, linear between the nodes."""
-        active, start, side, places = self._place(m, c, g, active)
-        places = [*places, _split(z * (self.axes.planes - 1), mi.UInt32(self.axes.planes))]
+        active, start, side, places = self._place(m, pair, active)
+        places = [*places, _split(pair.z * (self.axes.planes - 1), mi.UInt32(self.axes.planes))]
         rows = [mi.Vector4f(0.0) for _ in range(4)]
         for i, j, k in np.ndindex(2, 2, 2):
             node = start + (places[0][0] + i) * side + places[1][0] + j
@@ -168,13 +277,15 @@ class RigorousOrders:
                 rows[row] += weight * packet
         return rows
 
-    def sample(self, incidence: Incidence, u: mi.Float, v: mi.Point2f, active: mi.Bool) -> tuple[mi.Point2f, mi.Bool]:
+    def sample(
+        self, incidence: Incidence | CrossingIncidence, u: mi.Float, v: mi.Point2f, active: mi.Bool
+    ) -> tuple[mi.Point2f, mi.Bool]:
         """Draw q in cycles/µm, for one wavelength, and tell whether the order of q propagates.
 
         The order comes from `u`, its place in the lobe from `v`.
         """
         middle = self._cell(incidence)
-        largest = self.axes.largest
+        largest = self.largest
 
         def before(m: mi.Int32) -> mi.Float:
             return self.orders(mi.UInt32(middle + m), active).x
@@ -182,11 +293,13 @@ class RigorousOrders:
         m, _ = search(before, mi.Int32(-largest), mi.Int32(largest + 1), 2 * largest + 1, u)
         x, y = (truncated_gaussian(number, self.inside, self.spread) for number in v)
         tangent = mi.Vector2f(mi.Float(m) * self.pitch / incidence.frequency, 0)
-        return mi.Point2f(dr.fma(self.pitch, mi.Float(m), x), y), cos_square(incidence.wi, tangent) > 0
+        return mi.Point2f(dr.fma(self.pitch, mi.Float(m), x), y), incidence.propagates(tangent)
 
     def _z(self, g: mi.Float, frequency: mi.Float) -> mi.Float:
         """Z / (K − 1), from 0 to 1."""
         most = self.period / larger(g, 1e-6)
+        if self.interface:
+            most = dr.select(g < 0, self.period * self.beyond / larger(-g, 1e-6), most)
         first, last = smaller(self.shortest, most), smaller(self.longest, most)
         return limited((dr.rcp(frequency) - first) / larger(last - first, 1e-6), 0, 1)
 
@@ -203,10 +316,10 @@ class RigorousOrders:
         value *= root
         return whole + dr.select(part < 0.5, value, 1 - value)
 
-    def _efficiency(self, m: mi.Int32, c: mi.Float, g: mi.Float, z: mi.Float, active: mi.Bool) -> mi.Float:
+    def _efficiency(self, m: mi.Int32, pair: _Pair, active: mi.Bool) -> mi.Float:
         """η_m(P, R, Z), linear between the nodes; 0 for an order that does not propagate."""
-        active, start, side, ((i, f), (j, h)) = self._place(m, c, g, active)
-        k, w = _split(z * (self.axes.planes - 1), mi.UInt32(self.axes.planes))
+        active, start, side, ((i, f), (j, h)) = self._place(m, pair, active)
+        k, w = _split(pair.z * (self.axes.planes - 1), mi.UInt32(self.axes.planes))
         packet = self.table((start + i * side + j) * (self.axes.planes - 1) + k, active)
         # Along Z the lower and the upper half of each word; then along R, then along P.
         along_z = [dr.lerp(mi.Float(word & 0xFFFF), mi.Float(word >> 16), w) for word in packet]
@@ -214,33 +327,35 @@ class RigorousOrders:
         return dr.select(active, found * (1 / STEPS), 0)
 
     def _place(
-        self, m: mi.Int32, c: mi.Float, g: mi.Float, active: mi.Bool
+        self, m: mi.Int32, pair: _Pair, active: mi.Bool
     ) -> tuple[mi.Bool, mi.UInt32, mi.UInt32, list[tuple[mi.UInt32, mi.Float]]]:
         """Whether order m propagates, where its nodes start, their side, the nodes along P and R and the rest."""
         half = 0.5 * mi.Float(dr.abs(m))
+        c, g = pair.c, pair.g
+        if self.interface:
+            k_x, (come, leave) = c + 0.5 * mi.Float(m), pair.squares
+            active = active & (dr.square(k_x) < come) & (dr.square(k_x - mi.Float(m)) < leave)
+            g, c, half = g + pair.shift, dr.select(pair.reflects, c, k_x), dr.select(pair.reflects, half, 0)
         p, r = g + c - half, g - c - half
         active = active & (p > 0) & (r > 0)
-        start, side = self._layout(dr.select(active, m, 0))
+        start, side = self._layout(dr.select(active, m, 0), pair)
         places = [_split(self._position(dr.select(active, x, 0)) * self.axes.steps, side) for x in (p, r)]
         return active, start, side, places
 
-    def _layout(self, m: mi.Int32) -> tuple[mi.UInt32, mi.UInt32]:
+    def _layout(self, m: mi.Int32, pair: _Pair) -> tuple[mi.UInt32, mi.UInt32]:
         """Where order m starts in a plane, and its side, as `Axes.offset` and `Axes.side` have them.
 
         The side of order k is A − s |k|; of the orders 1 … n the squares add up to n A² − A s n (n + 1)
         + s² n (n + 1)(2n + 1)/6.
         """
-        steps, longest, most = self.axes.steps, self.axes.side(0), self.axes.largest
-
-        def squares(n: mi.Int32 | int) -> mi.Int32 | int:
-            return n * longest**2 - longest * steps * n * (n + 1) + steps**2 * (n * (n + 1) * (2 * n + 1) // 6)
-
-        n = dr.abs(m)
-        side, below = longest - steps * n, squares(most)
-        start = dr.select(m > 0, below + longest**2 + squares(n) - side * side, below - squares(n))
+        steps, longest, n = pair.steps, pair.longest, dr.abs(m)
+        whole = longest * longest
+        before = n * whole - longest * steps * n * (n + 1) + steps * steps * (n * (n + 1) * (2 * n + 1) // 6)
+        side = longest - steps * n
+        start = dr.select(m > 0, pair.before + whole + before - side * side, pair.before - before)
         return mi.UInt32(start), mi.UInt32(side)
 
-    def _cell(self, incidence: Incidence) -> mi.Int32:
+    def _cell(self, incidence: Incidence | CrossingIncidence) -> mi.Int32:
         """Where order 0 of the sampler's cell stands in its table."""
         # Tangential components are the same inside of a coat.
         along, across = (self.period * incidence.frequency * s for s in (incidence.wi.x, incidence.wi.y))
@@ -250,9 +365,15 @@ class RigorousOrders:
             dr.clip(mi.Int32(self.cells * self._position(larger(x, 0))), 0, self.cells_across - 1)
             for x in (g - along, g + along)
         )
+        if self.transmits:
+            # In the medium of ω_i.
+            g, frequency = g / incidence.index, incidence.frequency
         z = dr.clip(mi.Int32(self._z(g, frequency) * self.sampler_planes), 0, self.sampler_planes - 1)
-        width = 2 * self.axes.largest + 2
-        return ((z * self.cells_across + p) * self.cells_across + r) * width + self.axes.largest
+        if self.transmits:
+            side = dr.select(incidence.above, 0, 2 * self.sampler_planes)
+            z += side + dr.select(incidence.reflects, 0, self.sampler_planes)
+        width = 2 * self.largest + 2
+        return ((z * self.cells_across + p) * self.cells_across + r) * width + self.largest
 
 
 def _split(x: mi.Float, count: mi.UInt32) -> tuple[mi.UInt32, mi.Float]:
@@ -262,20 +383,24 @@ def _split(x: mi.Float, count: mi.UInt32) -> tuple[mi.UInt32, mi.Float]:
 
 
 def _packets(spectrum: RigorousSpectrum) -> NDArray[np.uint32]:
-    """η_m at the eight nodes about each cell, in steps of 1/65535: (nodes, K − 1, 4).
+    """η_m at the eight nodes about each cell, in steps of 1/65535: (nodes of all tables, K − 1, 4).
 
     Node (i, j, k) has the words of (i, j), (i, j + 1), (i + 1, j), (i + 1, j + 1), each with k in its lower half and
     k + 1 in its upper one: a single read of 16 bytes for an efficiency. Between the nodes that were solved the table
     may dip below zero, or exceed one, by its error.
     """
-    packets = np.empty((spectrum.axes.nodes, spectrum.axes.planes - 1, 4), np.uint32)
-    for m in spectrum.axes.orders:
-        square = np.moveaxis(spectrum.axes.square(spectrum.values, m), 0, -1)
-        side, start = square.shape[0], spectrum.axes.offset(m)
-        steps = np.rint(np.clip(square, 0, 1).astype(np.float64) * STEPS).astype(np.uint32)
-        words = np.pad(steps[..., :-1] | steps[..., 1:] << 16, [(0, 1), (0, 1), (0, 0)], mode="edge")
-        corners = [words[i : side + i, j : side + j] for i, j in np.ndindex(2, 2)]
-        packets[start : start + side**2] = np.stack(corners, axis=-1).reshape(side**2, -1, 4)
+    nodes, first = sum(table.axes.nodes for table in spectrum.tables), 0
+    packets = np.empty((nodes, spectrum.axes.planes - 1, 4), np.uint32)
+    for table in spectrum.tables:
+        axes = table.axes
+        for m in axes.orders:
+            square = np.moveaxis(axes.square(table.values, m), 0, -1)
+            side, start = square.shape[0], first + axes.offset(m)
+            steps = np.rint(np.clip(square, 0, 1).astype(np.float64) * STEPS).astype(np.uint32)
+            words = np.pad(steps[..., :-1] | steps[..., 1:] << 16, [(0, 1), (0, 1), (0, 0)], mode="edge")
+            corners = [words[i : side + i, j : side + j] for i, j in np.ndindex(2, 2)]
+            packets[start : start + side**2] = np.stack(corners, axis=-1).reshape(side**2, -1, 4)
+        first += axes.nodes
     return packets
 
 
@@ -305,6 +430,57 @@ def _shares(spectrum: RigorousSpectrum, cells: int) -> NDArray[np.float64]:
     return shares
 
 
+def _shares_of_sides(spectrum: RigorousSpectrum, cells: int) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Return η_m in the cells of light that passes, and whether m may propagate, (4 ways, Z, p, r, orders).
+
+    The ways are above → above, above → below, below → below, below → above.
+    """
+    axes = spectrum.axes
+    planes = math.gcd(PLANES, axes.planes - 1)
+    nu = axes.period / axes.wavelengths[0]
+    largest = max(table.axes.largest for table in spectrum.tables)
+    m = np.arange(-largest, largest + 1)
+    across = int(np.ceil(2 * max(spectrum.indices) * nu)) * cells
+    shares = np.zeros((4, planes, across, across, len(m)))
+    possible = np.zeros(shares.shape, bool)
+    ends = np.arange(across + 1)
+    ends = ends // cells + np.sin(np.pi / 2 * (ends % cells) / cells) ** 2
+
+    def placed(share: float) -> NDArray[np.float64]:
+        return ends[:-1] + share * np.diff(ends)
+
+    def wavelengths(g: NDArray[np.float64], n: float, share: NDArray[np.float64]) -> NDArray[np.float64]:
+        first, last = (np.minimum(w, n * axes.period / np.maximum(g, 1e-9)) for w in axes.wavelengths)
+        return first + share * (last - first)
+
+    for way, (side, to) in enumerate(((0, 0), (0, 1), (1, 1), (1, 0))):
+        n_i, n_o = (spectrum.indices[s] for s in (side, to))
+        # The cells that some light has.
+        p, r = np.nonzero(np.add.outer(ends[:-1], ends[:-1]) < 2 * n_i * nu)
+        z, p, r = np.repeat(np.arange(planes), len(p)), np.tile(p, planes), np.tile(r, planes)
+        g_most = np.minimum((ends[p + 1] + ends[r + 1]) / 2, n_i * nu)
+        shortest = wavelengths(g_most, n_i, z / planes)
+        longest = wavelengths((ends[p] + ends[r]) / 2, n_i, (z + 1) / planes)
+        change = (n_o**2 - n_i**2) * (axes.period / (shortest if n_o > n_i else longest)) ** 2
+        g_out = np.sqrt(np.maximum(g_most**2 + change, 0))
+        low, high = (ends[p] - ends[r + 1]) / 2, (ends[p + 1] - ends[r]) / 2
+        may = np.maximum(low[:, None] - m, m - high[:, None]) < g_out[:, None]
+        possible[way, z, p, r] = may
+        cell, order = np.nonzero(may)
+        found, of_order = np.zeros((2, len(cell))), m[order]
+        for t, u, v in _POINTS:
+            x, y = placed(u)[p], placed(v)[r]
+            g, alpha = (x + y) / 2, (x - y) / 2
+            wavelength = wavelengths(g, n_i, (z + t) / planes)
+            square = g**2 - (n_i**2 - 1) * (axes.period / wavelength) ** 2
+            g = np.sign(square) * np.sqrt(np.abs(square))
+            eta = spectrum.evaluate(of_order, alpha[cell] - of_order / 2, g[cell], wavelength[cell], (side, to))
+            found += eta, eta > 0
+        # The mean of where the order propagates: the horizon may cross a cell anywhere.
+        shares[way, z[cell], p[cell], r[cell], order] = found[0] / np.maximum(found[1], 1)
+    return shares, possible
+
+
 def _averaged(values: NDArray, axis: int, cells: int) -> NDArray[np.float64]:
     """The mean over each of so many cells along one axis, of what is linear between the nodes."""
     values = np.moveaxis(np.asarray(values, np.float64), axis, 0)
@@ -312,11 +488,14 @@ def _averaged(values: NDArray, axis: int, cells: int) -> NDArray[np.float64]:
     return np.moveaxis(middle.reshape(cells, -1, *middle.shape[1:]).mean(axis=1), 0, axis)
 
 
-def _units(shares: NDArray[np.float64]) -> NDArray[np.int64]:
-    """P_m of every cell in units of 2⁻²⁴, 2²⁴ together, so that sums in float32 are exact."""
+def _units(shares: NDArray[np.float64], possible: NDArray[np.bool_] | None = None) -> NDArray[np.int64]:
+    """P_m of every cell in units of 2⁻²⁴, 2²⁴ together, so that sums in float32 are exact.
+
+    Orders have a floor where they are `possible`: where their share is not zero, unless it is given.
+    """
     mirror = shares.shape[-1] // 2
     shares = np.maximum(shares, 0)  # interpolation may dip below
-    possible = shares > 0
+    possible = shares > 0 if possible is None else possible
     possible[..., mirror] = True  # order 0 propagates always
     shares = shares / np.maximum(shares.sum(axis=-1, keepdims=True), 1e-30)
     shares = (1 - FLOOR) * shares + FLOOR * possible / possible.sum(axis=-1, keepdims=True)

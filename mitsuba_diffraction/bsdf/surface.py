@@ -20,7 +20,7 @@ from ..rigorous.spectrum import RigorousSpectrum
 from ..settings import THEORIES, VISIBLE
 from ..surface.gratings import COHERENCE_LENGTHS, PROFILES
 from .media import Media
-from .theories import settings_from, settings_of_medium
+from .theories import check_transmission, settings_from, settings_of_medium
 
 _log = logging.getLogger(__name__)
 _per_cent = functools.partial(progress_bar, unit="%")
@@ -92,7 +92,8 @@ def _inside(media: Media, scale: float, recipe: Recipe) -> Recipe:
     if media.index * scale > 1 and "wavelengths" not in recipe.spectrum and not (rigorous and media.coat is None):
         inside["wavelengths"] = [VISIBLE[0] / (media.index * scale), VISIBLE[1] / media.index]
     if rigorous:
-        inside |= settings_of_medium(media.coat)
+        check_transmission(recipe.spectrum.get("transmission", media.transmission), media)
+        inside |= settings_of_medium(media)
     return Recipe(recipe.surface, {**recipe.spectrum, **inside}, recipe.folder) if inside else recipe
 
 

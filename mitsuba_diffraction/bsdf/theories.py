@@ -46,9 +46,11 @@ def settings_from(props: mi.Properties, coat: Coat | None) -> dict[str, str | fl
     return {"int_ior": float(f"{eta:.6g}")}
 
 
-def settings_of_medium(coat: Coat | None) -> dict[str, float | bool]:
-    """What `precompute` needs to know of the coat and of the variant."""
-    medium = {} if coat is None else {"ext_ior": float(f"{coat.relative:.6g}")}
+def settings_of_medium(media: Media) -> dict[str, str | float | bool]:
+    """What `precompute` needs to know of the coat, of light that passes and of the variant."""
+    medium = {} if media.coat is None else {"ext_ior": float(f"{media.coat.relative:.6g}")}
+    if media.transmission != "none":
+        medium["transmission"] = media.transmission
     return {**medium, "polarised": True} if mi.is_polarized else medium
 
 
@@ -162,19 +164,23 @@ class RigorousTheory:
     """f cos θ_o = Σ_m η_m N(q − m/T; σ_q² I)/λ² cos θ_o: R, K, G and E are in the efficiencies η_m.
 
     Attributes:
-        scattering: Σ_m η_m N cos θ_o and its sampler.
+        scattering: Σ_m η_m N n_o² cos θ_o and its sampler.
         material: R = 1 beside the efficiencies.
+        interface: the media on both sides where light passes, else None.
     """
 
     shadowing = True  # of no effect
-    interface = None
 
     def __init__(self, props: mi.Properties, spectrum: RigorousSpectrum, media: Media) -> None:
         self.coat = coat = media.coat
         if media.outside > 1 and coat is None:
             raise RequestError(f"ext_ior: got {media.outside:g} with theory=rigorous, wanted air or a coat")
+        check_transmission(spectrum.transmission, media)
         self.material = check_parameters(props, spectrum, coat)
         self.scattering = SharedTables.of(spectrum).scattering
+        self.interface = None
+        if media.eta is not None:
+            self.interface = Interface(opaque(spectrum.int_ior.real), media.transmission == "sheet", None)
 
     def parameters_changed(self, keys: list[str]) -> None:
         """Do nothing: a table of efficiencies has no parameters."""
@@ -201,12 +207,29 @@ class RigorousTheory:
 
         def entries(channel: int, source: mi.Vector3f, exit_: mi.Vector3f) -> list[list[mi.Float]]:
             frequency = relative / si.wavelengths[channel]
-            return self.scattering.mueller(turned(source, sin, cos), turned(exit_, sin, cos), frequency, active)
+            pair, above = [turned(omega, sin, cos) for omega in (source, exit_)], None
+            if self.interface is not None:
+                sides = [self.interface.side(omega) for omega in pair]
+                pair, above = [side.tangent for side in sides], [side.sign > 0 for side in sides]
+            return self.scattering.mueller(*pair, frequency, active, above)
 
         return of_orders(value, entries, mi.Vector3f(-sin, cos, 0))
 
     def __str__(self) -> str:
         return f"reflectance = {self.material}"
+
+
+def check_transmission(of_spectrum: str, media: Media) -> None:
+    """Refuse a rigorous spectrum of other light than the scene asks for.
+
+    Raises:
+        ValueError: if `transmission` of both differs.
+    """
+    if of_spectrum != media.transmission:
+        raise RequestError(
+            f"transmission: got {media.transmission!r}, but the rigorous spectrum is of transmission={of_spectrum}: "
+            "say the same, or build the spectrum for it"
+        )
 
 
 def check_parameters(props: mi.Properties, spectrum: RigorousSpectrum, coat: Coat | None) -> InEfficiencies:

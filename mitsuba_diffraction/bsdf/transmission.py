@@ -71,16 +71,24 @@ class Interface:
         eta: index below relative to that above.
         is_sheet: the medium above is below the sheet, too.
         kappas: a quarter of the table's first interval of κ, where its error weighs as little as that of the line, and
-            the least κ of the undiffracted order of the heights as they are; rad/µm.
+            the least κ of the undiffracted order of the heights as they are; rad/µm. None of rigorous theory, whose
+            tables are read at q whatever the sign of κ, and hold the flat face of a sheet.
     """
 
-    def __init__(self, eta: mi.Float, is_sheet: bool, kappas: tuple[mi.Float, mi.Float]) -> None:
+    def __init__(self, eta: mi.Float, is_sheet: bool, kappas: tuple[mi.Float, mi.Float] | None) -> None:
         self.eta, self.is_sheet, self.kappas = eta, is_sheet, kappas
 
-    def least_kappa(self, height_scale: mi.Float) -> mi.Float:
-        """Return κ₁ in rad/µm: of the undiffracted order κ is larger at all wavelengths."""
+    def least_kappa(self, height_scale: mi.Float) -> mi.Float | None:
+        """Return κ₁ in rad/µm: of the undiffracted order κ is larger at all wavelengths; None of rigorous theory."""
+        if self.kappas is None:
+            return None
         first, undiffracted = self.kappas
         return smaller(first, larger(undiffracted * dr.detach(height_scale), 1e-6))
+
+    @property
+    def has_flat_face(self) -> bool:
+        """Whether there is a flat face beside the grating."""
+        return self.is_sheet and self.kappas is not None
 
     def side(self, omega: mi.Vector3f) -> Side:
         """Return the side on which ω lies."""
@@ -115,7 +123,7 @@ class Crossing:
         i, o: the sides of ω_i and ω_o.
         height_scale: times the heights.
         shadowing: whether G is a factor.
-        least_kappa: κ₁ in rad/µm.
+        least_kappa: κ₁ in rad/µm, or None, as of `Interface`.
         lateral_scale: times the lengths along the surface; None for one.
     """
 
@@ -123,7 +131,7 @@ class Crossing:
     o: Side
     height_scale: mi.Float
     shadowing: bool
-    least_kappa: mi.Float
+    least_kappa: mi.Float | None
     lateral_scale: mi.Float | None = None
 
     index = 1.0  # of the wavelengths that are handed to E, those above
@@ -140,7 +148,9 @@ class Crossing:
 
     @property
     def flip(self) -> mi.Float:
-        """The sign of κ."""
+        """The sign of κ, or one where it does not matter."""
+        if self.least_kappa is None:
+            return mi.Float(1.0)
         return dr.select(self.w < 0, mi.Float(-1), 1)
 
     @property
@@ -179,8 +189,8 @@ class Crossing:
             frequency: 1/λ above.
             per_width: 1/σ_q.
         """
-        squares, gain = self._of_order(self.flip * tangent, frequency * per_width)
-        return self._k_g(*squares, dr.squared_norm(tangent), frequency) * gain * self._outgoing
+        squares, gain = self.of_order(self.flip * tangent, frequency * per_width)
+        return self._k_g(*squares, dr.squared_norm(tangent), frequency) * gain * self.outgoing
 
     def continuum_factor(self, frequency: mi.Float, per_width: mi.Float) -> mi.Float:
         """Return n_o² K G |cos θ_o| and gain where orders overlap, as `Geometry.continuum_factor`."""
@@ -188,16 +198,16 @@ class Crossing:
         mirror = limited((25 - square * dr.square(per_width)) / 9, 0, 1)
         most = larger(self.i.square, self.o.square)
         mirror *= dr.select(self.reflects, limited(2 - 5 * dr.sqrt(larger(most, 1e-12)), 0, 1), 0)
-        _, gain = self._of_order(mi.Vector2f(0), per_width)
+        _, gain = self.of_order(mi.Vector2f(0), per_width)
         of_pair = self._k_g(self.i.square, self.o.square, square, frequency)
-        return dr.lerp(of_pair, gain, mirror) * self._outgoing
+        return dr.lerp(of_pair, gain, mirror) * self.outgoing
 
     @property
-    def _outgoing(self) -> mi.Float:
+    def outgoing(self) -> mi.Float:
         """n_o² |cos θ_o| outside."""
         return self.o.outside * dr.sqrt(self.o.square)
 
-    def _of_order(self, change: mi.Vector2f, per_width: mi.Float) -> tuple[tuple[mi.Float, mi.Float], mi.Float]:
+    def of_order(self, change: mi.Vector2f, per_width: mi.Float) -> tuple[tuple[mi.Float, mi.Float], mi.Float]:
         """Return k_z² of both sides in the middle of the lobe, and its gain, as `Geometry.of_order`.
 
         Args:
@@ -236,12 +246,14 @@ class CrossingIncidence:
     """One wavelength from one direction that is reflected or passes; with what samplers ask of `geometry.Incidence`.
 
     κ of reflected light is positive above and negative below; that of transmitted light is taken for negative, as it
-    is of all but steeply diffracted light. Where it is negative, −q is drawn.
+    is of all but steeply diffracted light. Where it is negative, −q is drawn; not of rigorous theory.
 
     Attributes:
         wi: k_i,∥, or its opposite where −q is drawn; z is not used.
         frequency: 1/λ above.
         lateral_frequency: 1/λ times the lateral scale: q of the table per λq.
+        above: whether it comes from above.
+        index: n_i outside.
         radius: n_o times that, to which |q| of the table extends around that of −k_i,∥ where light propagates.
         cosine: √(1 − |k_i,∥|²/(n_o R)²), R the largest of |k_i,∥|/n_o.
         mirrored: what takes the q that is read to the one that was drawn, 1 or −1.
@@ -256,6 +268,8 @@ class CrossingIncidence:
     wi: mi.Vector3f
     frequency: mi.Float
     lateral_frequency: mi.Float
+    above: mi.Bool
+    index: mi.Float
     radius: mi.Float
     cosine: mi.Float
     mirrored: mi.Float
@@ -283,6 +297,8 @@ class CrossingIncidence:
         """
         reflects = i.sign == o.sign
         assumed = dr.select(reflects & (i.sign > 0), mi.Float(1), -1)
+        if interface.kappas is None:
+            assumed = mi.Float(1.0)
         square = dr.square(o.outside) - dr.square(i.outside) + i.square
         radius = o.outside
         largest = mi.Float(1.0) if interface.is_sheet else larger(interface.eta, dr.rcp(interface.eta))
@@ -296,6 +312,8 @@ class CrossingIncidence:
             mi.Vector3f(assumed * i.tangent.x, assumed * i.tangent.y, 0),
             frequency,
             lateral,
+            i.sign > 0,
+            i.outside,
             radius * lateral,
             dr.safe_sqrt(1 - across),
             assumed if flip is None else assumed * flip,

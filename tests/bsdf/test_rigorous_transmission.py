@@ -1,0 +1,311 @@
+"""Light that passes a grating by rigorous theory: the BSDF against its tables in float64."""
+
+import warnings
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from bsdf_support import direction, interaction, random_directions, use, vectors
+
+import mitsuba_diffraction as md
+from mitsuba_diffraction import gratings
+from mitsuba_diffraction.rigorous.axes import Axes
+from mitsuba_diffraction.rigorous.build import build_spectrum
+from mitsuba_diffraction.rigorous.spectrum import RigorousSpectrum, Table, axes_of
+from mitsuba_diffraction.settings import Settings
+
+PERIOD, ETA, WAVELENGTH = 0.3, 1.5, 0.45
+WAVELENGTHS = (405.0, 440.0, 470.0, 498.0)
+IMPORTANCE = mi.TransportMode.Importance
+
+
+@pytest.fixture(scope="module", params=["interface", "sheet"])
+def glass(request):
+    """A coarse table of light that passes, with its matrices."""
+    settings = Settings(
+        theory="rigorous",
+        int_ior=ETA,
+        wavelengths=(400.0, 500.0),
+        tolerance=0.2,
+        coherence_length=40.0,
+        polarised=True,
+        transmission=request.param,
+    )
+    with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for steps in ("_SOLVED", "_SOLVED_BOTH"):
+            patch.setattr(f"mitsuba_diffraction.rigorous.build.{steps}", (4,))
+        patch.setattr("mitsuba_diffraction.rigorous.build._CHECKS", 40)
+        return build_spectrum(gratings.blazed(PERIOD, 0.05, samples=64), settings)
+
+
+@pytest.fixture(autouse=True)
+def llvm():
+    use("llvm_ad_spectral")
+
+
+def plugin(spectrum, **parameters):
+    scene = {"type": "diffraction_grating", "spectrum": spectrum, "transmission": spectrum.transmission}
+    return mi.load_dict({**scene, "int_ior": ETA, "ext_ior": 1.0, **parameters})
+
+
+def towards(theta, phi, side):
+    return np.array(direction(theta, phi)) * [1, 1, side]
+
+
+def index(spectrum, omega):
+    """n outside, of directions (…, 3)."""
+    return np.where(np.asarray(omega)[..., 2] < 0, spectrum.indices[1], 1.0)
+
+
+def exit_of(spectrum, wi, m, transmitted, wavelength=WAVELENGTH):
+    """The direction of order m; None near the horizon."""
+    side = -np.sign(wi[2]) if transmitted else np.sign(wi[2])
+    n = index(spectrum, [0, 0, side])
+    k = -index(spectrum, wi) * wi[:2] - [m * wavelength / PERIOD, 0]
+    return None if k @ k > (0.99 * n) ** 2 else np.append(k, side * np.sqrt(n**2 - k @ k)) / n
+
+
+def power_of_order(bsdf, wi, wo):
+    """The power in the lobe around ω_o, by quadrature: dk² = n² cos θ dω."""
+    spectrum = bsdf.spectrum
+    step = np.linspace(-4, 4, 33) * spectrum.lobe_width * WAVELENGTH
+    u, v = (x.ravel() for x in np.meshgrid(step, step))
+    n = index(spectrum, wo)
+    k = n * wo[:2, None] + [u, v]
+    z = n**2 - (k**2).sum(0)
+    omega = np.stack([*k, np.sign(wo[2]) * np.sqrt(np.maximum(z, 0))]) / n
+    value = bsdf.eval(mi.BSDFContext(IMPORTANCE), interaction(wi, (WAVELENGTH * 1e3,) * 4, len(u)), vectors(omega.T))
+    return (np.array(value)[0] / np.maximum(n**2 * abs(omega[2]), 1e-6) * (z > 0)).sum() * (step[1] - step[0]) ** 2
+
+
+@pytest.mark.parametrize("side", [1, -1])
+@pytest.mark.parametrize(("theta", "phi"), [(0, 0), (25, 40), (35, 200), (60, 95)])
+def test_orders_have_the_powers_of_the_table(glass, theta, phi, side):
+    bsdf, wi = plugin(glass), towards(theta, phi, side)
+    found, wanted = [], []
+    for transmitted in (False, True):
+        for m, eta in zip(*glass.efficiencies(wi, WAVELENGTH, transmitted), strict=True):
+            if (wo := exit_of(glass, wi, m, transmitted)) is not None:
+                found.append(power_of_order(bsdf, wi, wo))
+                wanted.append(eta)
+    # η varies within a lobe.
+    np.testing.assert_allclose(found, wanted, atol=0.01)
+    assert sum(wanted) > 0.8
+
+
+def pairs(spectrum, count=4096):
+    """Pairs of directions near orders, on the same and on both sides."""
+    rng = np.random.default_rng(4)
+    wi = rng.normal(size=(count, 3))
+    wi /= np.linalg.norm(wi, axis=1, keepdims=True)
+    side = rng.choice([1, -1], count)
+    n_o = index(spectrum, np.stack([0 * side, 0 * side, side], -1))
+    k = -index(spectrum, wi)[:, None] * wi[:, :2] + rng.normal(size=(count, 2)) * spectrum.lobe_width * WAVELENGTH
+    k[:, 0] -= rng.integers(-2, 3, count) * WAVELENGTH / PERIOD
+    z = n_o**2 - (k**2).sum(-1)
+    keep = (z > 0.01) & (abs(wi[:, 2]) > 0.1)
+    wo = np.concatenate([k, (side * np.sqrt(np.maximum(z, 0)))[:, None]], -1) / n_o[:, None]
+    return wi[keep], wo[keep]
+
+
+def test_light_of_both_sides_is_reciprocal(glass):
+    bsdf = plugin(glass)
+    wi, wo = pairs(glass)
+    n_i, n_o = index(glass, wi), index(glass, wo)
+
+    def f(i, o, mode=IMPORTANCE):
+        value = bsdf.eval(mi.BSDFContext(mode), interaction(i, (WAVELENGTH * 1e3,) * 4, len(i)), vectors(o))
+        return np.array(value)[0] / abs(o[:, 2])
+
+    there, back = f(wi, wo) / n_o**2, f(wo, wi) / n_i**2
+    assert (there > 1).sum() > 500
+    np.testing.assert_allclose(there, back, rtol=2e-4, atol=1e-4 * there.max())
+    # Radiance is scaled by the squared ratio of the indices.
+    radiance = f(wi, wo, mi.TransportMode.Radiance)
+    np.testing.assert_allclose(radiance, there * n_i**2, rtol=1e-5, atol=1e-5 * radiance.max())
+
+
+@pytest.mark.parametrize("side", [1, -1])
+@pytest.mark.parametrize("component", [0, 1])
+def test_samples_follow_the_density_on_both_sides(glass, side, component):
+    bsdf, wi = plugin(glass), towards(35, 20, side)
+    ctx = mi.BSDFContext()
+    ctx.component = component
+    goes = side if component == 0 else -side
+
+    def sample(points):
+        si = interaction(wi, WAVELENGTHS, dr.width(points))
+        bs, _ = bsdf.sample(ctx, si, points.x, mi.Point2f(points.y, points.z))
+        keep = bs.pdf > 0
+        assert not dr.any(keep & (bs.wo.z * goes <= 0))
+        return dr.select(keep, mi.Vector2f(bs.wo.x, bs.wo.y), 0), dr.select(keep, mi.Float(1), 0)
+
+    def density(p):
+        z = dr.safe_sqrt(1 - dr.squared_norm(p))
+        pdf = bsdf.pdf(ctx, interaction(wi, WAVELENGTHS, dr.width(p)), mi.Vector3f(p.x, p.y, goes * z))
+        return dr.select(z > 0, pdf / z, 0)
+
+    test = mi.chi2.ChiSquareTest(
+        mi.chi2.PlanarDomain(), sample, density, sample_dim=3, sample_count=400_000, res=41, ires=64
+    )
+    assert test.run(significance_level=0.01, test_count=8, quiet=True), test.messages
+
+
+@pytest.mark.parametrize("theta", [0, 40, 75])
+@pytest.mark.parametrize("side", [1, -1])
+def test_samples_have_the_light_of_the_table(glass, theta, side):
+    bsdf, wi, count = plugin(glass), towards(theta, 10, side), 1 << 16
+    u = np.random.default_rng(1).random((3, count)).astype(np.float32)
+    si = interaction(wi, (WAVELENGTH * 1e3,) * 4, count)
+    bs, weight = bsdf.sample(mi.BSDFContext(IMPORTANCE), si, mi.Float(u[0]), mi.Point2f(u[1:]))
+    weight, passes = np.array(weight)[0], np.array(bs.wo)[2] * wi[2] < 0
+    for transmitted in (False, True):
+        wanted = glass.efficiencies(wi, WAVELENGTH, transmitted)[1].sum()
+        assert weight[passes == transmitted].sum() / count == pytest.approx(wanted, abs=0.02)
+    assert weight.mean() ** 2 / (weight**2).mean() > 0.5
+    drawn = np.array(bs.pdf) > 0
+    pdf = np.array(bsdf.pdf(mi.BSDFContext(IMPORTANCE), si, bs.wo))
+    np.testing.assert_allclose(pdf[drawn], np.array(bs.pdf)[drawn], rtol=1e-3)
+    names = np.where(passes, int(mi.BSDFFlags.GlossyTransmission), int(mi.BSDFFlags.GlossyReflection))
+    np.testing.assert_array_equal(np.array(bs.sampled_type)[drawn], names[drawn])
+
+
+def test_a_sheet_has_no_second_flat_face(glass):
+    assert plugin(glass).component_count() == 2
+
+
+def entries(matrix):
+    """Of the first wavelength, (4, 4)."""
+    dr.eval(matrix)  # in one kernel
+    return np.array([[np.ravel(matrix[i, j][0])[0] for j in range(4)] for i in range(4)])
+
+
+def between_stokes_axes(matrix, source, exit_):
+    """A matrix between waves in (ê, k̂ × ê), ê the part of ŷ across k̂, as one between Mitsuba's axes."""
+    full = mi.Spectrum(0.0)
+    for i, j in np.ndindex(4, 4):
+        full[i, j] = mi.UnpolarizedSpectrum(float(matrix[i, j]))
+    waves = [vectors(-source), vectors(exit_)]
+    axes = [dr.normalize(mi.Vector3f(0, 1, 0) - k.y * k) for k in waves]
+    turned = [(k, axis, mi.mueller.stokes_basis(k)) for k, axis in zip(waves, axes, strict=True)]
+    return entries(mi.mueller.rotate_mueller_basis(full, *turned[0], *turned[1]))
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_spectral_polarized", "scalar_spectral_polarized"])
+def test_mueller_matrices_are_those_of_the_table(glass, variant):
+    use(variant)
+    bsdf, seen = plugin(glass), 0
+    for theta, phi, side in ((50, 20, 1), (40, 200, -1)):
+        wi = towards(theta, phi, side)
+        alpha, k_y = -index(glass, wi) * wi[:2] * PERIOD / WAVELENGTH
+        square = (PERIOD / WAVELENGTH) ** 2 - k_y**2
+        g = np.sign(square) * np.sqrt(abs(square))
+        for transmitted in (False, True):
+            ways = int(side < 0), int((side < 0) != transmitted)
+            for m in (-1, 0, 1):
+                if (wo := exit_of(glass, wi, m, transmitted)) is None:
+                    continue
+                wanted = glass.evaluate(m, alpha - m / 2, g, WAVELENGTH, ways, mueller=True)
+                # Light of the opposite k_y is mirrored at the plane of incidence.
+                signs = np.array([1, 1, -1, -1]) if k_y < 0 else np.ones(4)
+                wanted = between_stokes_axes(np.outer(signs, signs) * wanted / wanted[0, 0], wi, wo)
+                si = interaction(wi, (WAVELENGTH * 1e3,) * 4)
+                found = entries(bsdf.eval(mi.BSDFContext(IMPORTANCE), si, vectors(wo)))
+                np.testing.assert_allclose(found / found[0, 0], wanted, atol=2e-3)
+                seen += 1
+    assert seen >= 7
+
+
+@pytest.mark.parametrize("variant", ["scalar_spectral", "llvm_ad_spectral_polarized"])
+def test_other_variants_pass_the_same_light(glass, variant):
+    directions = np.array([towards(20, 30, 1), towards(50, 250, -1)])
+    u = [(0.05, 0.4, 0.6), (0.3, 0.2, 0.7), (0.8, 0.9, 0.1)]
+
+    def drawn():
+        bsdf, found = plugin(glass), []
+        for wi in directions:
+            for one, *two in u:
+                bs, weight = bsdf.sample(mi.BSDFContext(), interaction(wi, WAVELENGTHS), one, mi.Point2f(*two))
+                value, pdf = bsdf.eval_pdf(mi.BSDFContext(), interaction(wi, WAVELENGTHS), bs.wo)
+                parts = (mi.unpolarized_spectrum(weight), mi.unpolarized_spectrum(value), bs.wo, bs.eta, pdf)
+                found.append(np.concatenate([np.ravel(np.array(part)) for part in parts]))
+        return np.array(found)
+
+    wanted = drawn()
+    use(variant)
+    np.testing.assert_allclose(drawn(), wanted, rtol=2e-3, atol=1e-4 * wanted.max())
+
+
+@pytest.mark.parametrize(
+    ("parameters", "text"),
+    [
+        ({"transmission": "none"}, "transmission: got 'none', but the rigorous spectrum is of transmission={}: say"),
+        ({"int_ior": 1.6}, "got int_ior 1.6, but the rigorous spectrum is of int_ior 1.5"),
+        ({"material": "Al"}, "material: got 'Al' with transmission={}"),
+        ({"coat_ior": 1.4}, "coat_ior: got 1.4 with transmission={}"),
+        ({"height_scale": 0.5}, "height_scale: got 0.5, wanted none with theory=rigorous"),
+    ],
+)
+def test_other_light_than_that_of_the_table_is_refused(glass, parameters, text):
+    with pytest.raises(RuntimeError, match=text.format(glass.transmission)):
+        plugin(glass, **parameters)
+
+
+def test_scenes_build_tables_of_light_that_passes(glass, monkeypatch, tmp_path):
+    """A profile and a recipe ask for the light of the scene."""
+    asked = []
+    monkeypatch.setattr(md.Recipe, "cached", lambda recipe, *_: asked.append(dict(recipe.spectrum)) or glass)
+    scene = {"type": "diffraction_grating", "int_ior": ETA, "ext_ior": 1.0, "transmission": glass.transmission}
+    recipe = tmp_path / "glass.toml"
+    recipe.write_text(
+        '[surface]\nprofile = "blazed"\nperiod = 0.3\ndepth = 0.05\n[spectrum]\ntheory = "rigorous"\nint_ior = 1.5\n',
+        encoding="utf-8",
+    )
+    mi.load_dict({**scene, "profile": "blazed", "period": 0.3, "depth": 0.05, "theory": "rigorous"})
+    mi.load_dict({**scene, "filename": str(recipe)})
+    assert [settings["transmission"] for settings in asked] == [glass.transmission] * 2
+    recipe.write_text(recipe.read_text() + 'transmission = "sheet"\n', encoding="utf-8")
+    with pytest.raises(RuntimeError, match="transmission: got 'none', but the rigorous spectrum is of"):
+        mi.load_dict({**scene, "filename": str(recipe), "transmission": "none"})
+    assert len(asked) == 2  # nothing was built
+
+
+@pytest.mark.parametrize("glass", ["sheet"], indirect=True)
+@pytest.mark.parametrize("side", [1, -1])
+def test_a_sheet_before_a_uniform_sky_has_the_light_of_the_table(glass, side):
+    """Rendered by `path`: reflected and transmitted light together, nothing twice."""
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "sky": {"type": "constant", "radiance": {"type": "uniform", "value": 1.0}},
+            "sheet": {"type": "rectangle", "bsdf": plugin(glass)},
+        }
+    )
+    count = 1 << 16
+    sampler = mi.load_dict({"type": "independent", "sample_count": count})
+    sampler.seed(0, count)
+    wi = towards(25, 40, side)
+    ray = mi.Ray3f(mi.Point3f(*map(float, wi)), vectors(-wi))
+    ray.wavelengths = mi.Spectrum(*WAVELENGTHS)
+    found, valid, _ = mi.load_dict({"type": "path", "max_depth": 3}).sample(scene, sampler, mi.RayDifferential3f(ray))
+    assert dr.all(valid)
+    wanted = [sum(glass.efficiencies(wi, w * 1e-3, way)[1].sum() for way in (False, True)) for w in WAVELENGTHS]
+    np.testing.assert_allclose(np.array(found).mean(1), wanted, atol=0.02)
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_orders_that_emerge_within_a_cell_of_the_sampler_are_drawn(side):
+    """All orders are alike: an order that the cells miss would have a large weight."""
+    tables = axes_of(Axes(1.7, (0.36, 0.83), 4, 5), "interface", ETA)
+    values = [np.full((axes.planes, axes.nodes), 0.01, np.float32) for axes in tables]
+    alike = RigorousSpectrum(
+        tuple(map(Table, tables, values)), "", ETA + 0j, 65.0, 0.01, 0, 0, 0, 1, "made up", "", transmission="interface"
+    )
+    rng, count = np.random.default_rng(2), 1 << 16
+    wi = random_directions(rng, count, 0.2) * [1, 1, side]
+    u = rng.random((3, count)).astype(np.float32)
+    ctx = mi.BSDFContext(IMPORTANCE)
+    _, weight = plugin(alike).sample(ctx, interaction(wi, (500.0,) * 4, count), mi.Float(u[0]), mi.Point2f(u[1:]))
+    assert np.array(weight)[0].max() < 2
