@@ -17,9 +17,11 @@ class BuildWithExamples(build_py):
         examples = Path(self.build_lib) / "mitsuba_diffraction" / "examples"
         shutil.rmtree(examples, ignore_errors=True)
         for folder in ("scenes", "precompute"):
-            # What the scenes' scripts and earlier renderings left.
-            left = shutil.ignore_patterns("models", "out", "__pycache__", ".*", "*.exr")
+            # What the scenes' scripts and earlier renderings left; textures lie in folders of their own.
+            left = shutil.ignore_patterns("models", "out", "__pycache__", ".*")
             shutil.copytree(folder, examples / folder, ignore=left)
+            for picture in (examples / folder).glob("*.exr"):
+                picture.unlink()
 
 
 setup(cmdclass={"build_py": BuildWithExamples})

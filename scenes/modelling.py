@@ -23,12 +23,12 @@ Array = NDArray[np.float64]
 MODELS = Path(__file__).parent / "models"
 
 
-def command(make: Callable[[Path], None]) -> None:
-    """Makes the files of one scene and says which and how long it took."""
-    MODELS.mkdir(exist_ok=True)
+def command(make: Callable[[Path], None], folder: Path = MODELS) -> None:
+    """Makes the files of one scene and says where and how long it took."""
+    folder.mkdir(exist_ok=True)
     start = time.perf_counter()
-    make(MODELS)
-    print(f"{Path(sys.argv[0]).stem}: written to {MODELS}, {time.perf_counter() - start:.1f} s")
+    make(folder)
+    print(f"{Path(sys.argv[0]).stem}: written to {folder}, {time.perf_counter() - start:.1f} s")
 
 
 def write_sheets(

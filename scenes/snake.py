@@ -1,4 +1,4 @@
-"""A coiled snake, as meshes and textures for snake.xml: `python scenes/snake.py`.
+"""A coiled snake, as meshes and textures for snake.xml: `python scenes/snake.py`; with `--small`, for xenopeltis.xml.
 
 1. Body: a chain of nodes along the body's centre, laid down in a coil with the head on top, and let settle: it sinks,
    and nodes that are closer than their thickness push each other apart, and the body around them. A spline through the
@@ -12,6 +12,7 @@ The microstructure runs along the body; each scale turns it by some degrees. Len
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -368,17 +369,35 @@ def make(folder: Path, columns: int = 5120) -> None:
 
     Files: snake.ply, snake_eyes.ply, and NAME_normals.exr, NAME_turn.exr, NAME_pigment.png for each skin.
     """
-    sweep = Sweep.along(max(columns // 2, 64))
-    v = np.linspace(0, 1, max(columns // 80, 16) + 1)
-    write_sheets(folder / "snake.ply", [(sweep.surface(v), sweep.u, v)])
+    sweep = body(folder / "snake.ply", max(columns // 2, 64), max(columns // 80, 16))
     eyes(folder / "snake_eyes.ply", sweep)
-    for name, skin in SKINS.items():
-        texture = texels(sweep, skin, columns)
-        tilt = [skin.wobble * per_scale(texture, seed) for seed in (1, 2)]
-        normals = normals_from_slopes(texture.slope_u + tilt[0], texture.slope_v + tilt[1])
-        write_numbers(folder / f"{name}_normals.exr", normals)
-        write_numbers(folder / f"{name}_turn.exr", skin.turn * per_scale(texture, 3))
+    for name in SKINS:
+        texture = scales(folder, name, sweep, columns)
         write_colours(folder / f"{name}_pigment.png", pigment(name, texture))
+
+
+def small(folder: Path) -> None:
+    """Writes what xenopeltis.xml reads, few triangles and texels: snake.ply, xenopeltis_normals.exr, …_turn.exr."""
+    scales(folder, "xenopeltis", body(folder / "snake.ply", 800, 28), 2560)
+
+
+def body(path: Path, along: int, around: int) -> Sweep:
+    """The mesh of the body, of `along` × `around` cells."""
+    sweep = Sweep.along(along)
+    v = np.linspace(0, 1, around + 1)
+    write_sheets(path, [(sweep.surface(v), sweep.u, v)])
+    return sweep
+
+
+def scales(folder: Path, name: str, sweep: Sweep, columns: int) -> Texels:
+    """The textures of a skin's normals and of its microstructure's direction, degrees."""
+    skin = SKINS[name]
+    texture = texels(sweep, skin, columns)
+    tilt = [skin.wobble * per_scale(texture, seed) for seed in (1, 2)]
+    normals = normals_from_slopes(texture.slope_u + tilt[0], texture.slope_v + tilt[1])
+    write_numbers(folder / f"{name}_normals.exr", normals)
+    write_numbers(folder / f"{name}_turn.exr", skin.turn * per_scale(texture, 3))
+    return texture
 
 
 def eyes(path: Path, sweep: Sweep) -> None:
@@ -394,4 +413,7 @@ def eyes(path: Path, sweep: Sweep) -> None:
 
 
 if __name__ == "__main__":
-    command(make)
+    if sys.argv[1:] == ["--small"]:
+        command(small, Path(__file__).parent / "coil")
+    else:
+        command(make)

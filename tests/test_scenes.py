@@ -42,7 +42,7 @@ def llvm():
 
 
 @pytest.mark.few(1)
-@pytest.mark.parametrize("name", ["blaze", "elaphe", "xenopeltis"])
+@pytest.mark.parametrize("name", ["blaze", "elaphe", "xenopeltis", "xenopeltis_sphere"])
 def test_scene_renders(llvm, name):
     check(render(SCENES / f"{name}.xml", spp=4, width=16, height=16), 16, 16)
 
@@ -265,6 +265,23 @@ def test_models_are_the_same_each_time(tmp_path):
         files.append({path.name: path.read_bytes() for path in folder.iterdir()})
     assert files[0] == files[1]
     assert len(files[0]) == 8
+
+
+def test_the_small_models_are_those_of_the_script(tmp_path):
+    snake.small(tmp_path)
+    names = sorted(path.name for path in tmp_path.iterdir())
+    assert names == sorted(path.name for path in (SCENES / "coil").iterdir())
+    mi.set_variant("scalar_rgb")
+    for name in names:
+        folders = SCENES / "coil", tmp_path
+        if name.endswith(".ply"):
+            meshes = [mi.load_dict({"type": "ply", "filename": str(folder / name)}) for folder in folders]
+            kept, made = (np.array(mesh.vertex_positions_buffer()) for mesh in meshes)
+            np.testing.assert_allclose(kept, made, atol=1e-3)
+        else:
+            kept, made = (np.array(mi.Bitmap(str(folder / name))) for folder in folders)
+            # The edge of a scale may round to the next texel.
+            assert np.mean(np.abs(kept.astype(float) - made) > 1e-3) < 1e-3
 
 
 # ---------------------------------------------------------------- disc and foil

@@ -41,7 +41,9 @@ def examples(
 def _files(root: Path) -> list[Path]:
     """Return the files of the examples, relative to `root`."""
     found = [path.relative_to(root) for name in ("scenes", "precompute") for path in sorted((root / name).rglob("*"))]
-    left = [path for path in found if _LEFT & set(path.parts) or path.name.startswith(".") or path.suffix == ".exr"]
+    left = {path for path in found if _LEFT & set(path.parts) or path.name.startswith(".")}
+    # Beside scenes and recipes lie earlier renderings and spectra; deeper down, textures.
+    left |= {path for path in found if path.suffix == ".exr" and len(path.parts) == 2}
     return [path for path in found if path not in left and (root / path).is_file()]
 
 

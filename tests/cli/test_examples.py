@@ -13,9 +13,10 @@ def test_examples_are_copied_with_what_they_reference(command, tmp_path):
     assert said.startswith(f"{tmp_path / 'new' / 'folder'}: {len(copied)} files")
     names = {path.relative_to(tmp_path / "new" / "folder").as_posix() for path in copied}
     assert {"scenes/xenopeltis.xml", "precompute/elaphe.toml", "precompute/measured/LICENSE.txt"} <= names
-    assert not [name for name in names if name.endswith(".exr") or "models" in name or "__pycache__" in name]
+    assert not [name for name in names if "models" in name or "__pycache__" in name]
+    assert {Path(name).parent.as_posix() for name in names if name.endswith(".exr")} == {"scenes/coil"}
     for scene in (path for path in copied if path.suffix == ".xml"):
-        for recipe in re.findall(r'value="([^"$]+\.toml)"', scene.read_text()):
+        for recipe in re.findall(r'value="((?!models)[^"$]+\.(?:toml|ply|exr))"', scene.read_text()):
             assert (scene.parent / recipe).is_file(), scene
     for recipe in (path for path in copied if path.suffix == ".toml"):
         for scan in re.findall(r'^scan = "(.+)"', recipe.read_text(), re.MULTILINE):
