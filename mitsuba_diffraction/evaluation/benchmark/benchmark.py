@@ -12,6 +12,7 @@ import mitsuba as mi
 from rich.table import Table
 
 from ... import outputs
+from ...cli.console import table
 from ...errors import RequestError
 from ...files import whole_file
 from ...grating_spectrum import GratingSpectrum
@@ -184,9 +185,9 @@ def cells(result: Result) -> list[str]:
 def tables(results: Sequence[Result], shaders: Sequence[ShaderSpeed], sampled: Sequence[Sampling]) -> list[Table]:
     """Return tables of speed and error, of the real-time shaders and of sampling, for a terminal."""
     return [
-        report.table(COLUMNS, map(cells, results), texts=2),
-        report.table(shader_speed.COLUMNS, (report.cells(shader_speed.COLUMNS, row) for row in shaders), texts=2),
-        report.table(sampling.COLUMNS, (report.cells(sampling.COLUMNS, row) for row in sampled)),
+        table(COLUMNS, map(cells, results), texts=2),
+        table(shader_speed.COLUMNS, (report.cells(shader_speed.COLUMNS, row) for row in shaders), texts=2),
+        table(sampling.COLUMNS, (report.cells(sampling.COLUMNS, row) for row in sampled)),
     ]
 
 

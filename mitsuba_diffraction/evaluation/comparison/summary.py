@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from rich.table import Table
 
 from ... import outputs
+from ...cli.console import table
 from ...color import XYZ_to_linear_sRGB, into_gamut, on_screen
 from ...files import whole_file
 from ...outputs import metadata
@@ -54,7 +55,7 @@ def picture_table(comparison: Comparison) -> Table:
         differences = ["1", "", "", "", ""] if found is None else report.cells(_TO_REFERENCE, found)
         same_light = "" if same is None else f"{same.mean:.2f}"
         rows.append([title, *differences, same_light, str(reads), str(picture.samples), f"{picture.seconds:.1f}"])
-    return report.table(("picture", *columns), rows)
+    return table(("picture", *columns), rows)
 
 
 def quirk_table(comparison: Comparison) -> Table:
@@ -70,7 +71,7 @@ def quirk_table(comparison: Comparison) -> Table:
             row += [f"{round(value, 2) + 0.0:+.2f}" for value in (one.drop, one.rise)]
             row.append(f"{one.share:.0%}")
         rows.append(row)
-    return report.table(columns, rows)
+    return table(columns, rows)
 
 
 def ordered(against: AgainstReference) -> list[str]:
