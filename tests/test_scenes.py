@@ -315,7 +315,8 @@ def test_foil_keeps_its_size():
 
 
 def test_foil_is_embossed_with_shards():
-    turn = foil.shards(np.random.default_rng(6), 300)
+    turn, pitch = foil.shards(np.random.default_rng(6), 300)
+    assert set(np.unique(pitch)) == set(foil.PITCHES)
     values, counts = np.unique(turn, return_counts=True)
     assert 0.9 * foil.SHARDS < values.size <= foil.SHARDS
     assert values.min() >= 0
