@@ -80,6 +80,7 @@ def power_of_order(bsdf, wi, wo):
     return (np.array(value)[0] / np.maximum(n**2 * abs(omega[2]), 1e-6) * (z > 0)).sum() * (step[1] - step[0]) ** 2
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("side", [1, -1])
 @pytest.mark.parametrize(("theta", "phi"), [(0, 0), (25, 40), (35, 200), (60, 95)])
 def test_orders_have_the_powers_of_the_table(glass, theta, phi, side):
@@ -127,6 +128,7 @@ def test_light_of_both_sides_is_reciprocal(glass):
     np.testing.assert_allclose(radiance, there * n_i**2, rtol=1e-5, atol=1e-5 * radiance.max())
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("side", [1, -1])
 @pytest.mark.parametrize("component", [0, 1])
 def test_samples_follow_the_density_on_both_sides(glass, side, component):
@@ -153,6 +155,7 @@ def test_samples_follow_the_density_on_both_sides(glass, side, component):
     assert test.run(significance_level=0.01, test_count=8, quiet=True), test.messages
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("theta", [0, 40, 75])
 @pytest.mark.parametrize("side", [1, -1])
 def test_samples_have_the_light_of_the_table(glass, theta, side):

@@ -95,6 +95,7 @@ def power_of_order(bsdf, kind, wi, wo):
     return (value / np.maximum(n**2 * abs(omega[2]), 1e-6) * (z > 0)).sum() * (step[1] - step[0]) ** 2
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(("profile", "depth"), [("sinusoidal", 0.5), ("blazed", 0.5), ("blazed", 0.8)])
 @pytest.mark.parametrize(("theta", "phi"), [(0, 0), (25, 40), (50, 200)])
@@ -142,6 +143,7 @@ def test_transmission_is_reciprocal(kind, profile):
     np.testing.assert_allclose(radiance, there * abs(wo[:, 2]) * n_i**2, rtol=1e-5, atol=1e-5 * radiance.max())
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("side", [1, -1])
 @pytest.mark.parametrize("component", [0, 1])
@@ -171,6 +173,7 @@ def test_samples_follow_the_density_on_both_sides(kind, side, component):
     assert test.run(significance_level=0.01, test_count=8, quiet=True), test.messages
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("theta", [0, 40, 75])
 @pytest.mark.parametrize("side", [1, -1])
@@ -252,6 +255,7 @@ def test_a_spectrum_without_the_short_wavelengths_inside_is_refused():
         )
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("variant", ["scalar_spectral", "llvm_ad_spectral_polarized"])
 @pytest.mark.parametrize("kind", KINDS)
 def test_other_variants_pass_the_same_light(variant, kind):
@@ -295,6 +299,7 @@ def test_water_shortens_wavelengths_outside():
     assert min(abs(strongest - m * 0.5 / 1.33 / 2.5) for m in (1, 2)) < 1e-3
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("side", [1, -1])
 @pytest.mark.parametrize("theta", [0, 30])
 def test_large_smooth_facets_are_those_of_roughdielectric(theta, side):
