@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import mitsuba as mi
 
 from ..errors import RequestError
+from ..settings import TRANSMISSIONS
 from .coat import SAME_INDEX, Coat, absolute_index, coat_from
-from .transmission import KINDS
 
 
 @dataclass(frozen=True)
@@ -35,20 +35,19 @@ class Media:
             RequestError: if an index is out of range, or light cannot pass.
         """
         coat = coat_from(props)
-        outside = absolute_index("ext_ior", props.get("ext_ior", "air"))
-        outside = 1.0 if abs(outside - 1) < SAME_INDEX else outside
-        kind = props.get("transmission", KINDS[0])
-        if kind not in KINDS:
-            raise RequestError(f"transmission: got {kind!r}, wanted one of {', '.join(KINDS)}")
+        exterior = absolute_index("ext_ior", props.get("ext_ior", "air"))
+        outside = 1.0 if abs(exterior - 1) < SAME_INDEX else exterior
+        kind = props.get("transmission", TRANSMISSIONS[0])
+        if kind not in TRANSMISSIONS:
+            raise RequestError(f"transmission: got {kind!r}, wanted one of {', '.join(TRANSMISSIONS)}")
         if kind == "none":
             return cls(outside, coat, kind, None)
         for name in ("material", "base", "coat_ior"):
             if name in props:
                 got = repr(props[name]) if isinstance(props[name], str | float | int) else "a BSDF"
                 raise RequestError(f"{name}: got {got} with transmission={kind}, wanted a dielectric (int_ior) alone")
-        eta = absolute_index("int_ior", props.get("int_ior", 1.5)) / absolute_index(
-            "ext_ior", props.get("ext_ior", 1.0)
-        )
+        # As of `Dielectric`, in whose reflectance and in E it stands, too.
+        eta = absolute_index("int_ior", props.get("int_ior", 1.5)) / exterior
         if abs(eta - 1) < SAME_INDEX:
             raise RequestError(f"int_ior: got that of the outside with transmission={kind}, wanted another one")
         return cls(outside, coat, kind, eta)

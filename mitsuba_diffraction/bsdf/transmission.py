@@ -31,8 +31,6 @@ import mitsuba as mi
 from .geometry import horizon_gain, k_g, scaled
 from .tables import larger, limited, smaller
 
-KINDS = ("none", "interface", "sheet")
-
 
 # Not frozen: Dr.Jit rebuilds what enters a branch field by field.
 @dataclass(eq=False)
