@@ -1,8 +1,15 @@
 """Analytic height fields: classical gratings, technical surfaces, and synthetic replicas of natural ones.
 
-Every profile is exactly one period of a periodic surface (extent "tile" of the spectrum). Lengths are in µm. Each has
-an entry in `PROFILES`, the names used in scenes and recipes. Profiles with defaults for all parameters are ready-made
-surfaces.
+Every profile returns exactly one period of a periodic surface (extent "tile" of the spectrum). `PROFILES` has their
+names in scenes and recipes; those with defaults for all parameters are ready-made surfaces.
+
+Lengths are in µm: `period` along x, `depth` from the lowest to the highest point; `samples` is the number of pixels per
+period. What is drawn at random takes a `seed`, the `size` of the patch, one number or (x, y), and a `pixel_size`, both
+adjusted so that the patch tiles seamlessly and has a whole number of pixels.
+
+Raises:
+    ValueError: if a length is not positive, the depth negative, or another argument out of the range that the message
+        names.
 """
 
 from __future__ import annotations
@@ -24,16 +31,18 @@ MOST_PIXELS = 2**26
 LONGEST_PERIOD = 100.0
 """µm. Orders of visible light are then 0.3° apart, about the width of the sun, and any period in nm is above it."""
 
+Array = NDArray[np.float64]
+
 
 def check_pixels(columns: float, rows: float) -> None:
-    """Raise RequestError for too large a patch before its memory is allocated."""
+    """Refuse too large a patch before its memory is allocated."""
     if not columns * rows <= MOST_PIXELS:
         raise RequestError(f"got a patch of {columns:.4g} × {rows:.4g} pixels, wanted at most {MOST_PIXELS} in all")
 
 
-def check_positive(name: str, value: float) -> None:
+def check_positive(name: str, value: float, unit: str = "in µm") -> None:
     if not (isinstance(value, Real) and np.isfinite(value) and value > 0):
-        raise RequestError(f"{name}: got {value!r}, wanted a positive number in µm")
+        raise RequestError(f"{name}: got {value!r}, wanted a positive number {unit}")
 
 
 def check_period(name: str, value: float) -> None:
@@ -60,9 +69,6 @@ def generator(seed: int) -> np.random.Generator:
     return np.random.default_rng(int(seed))
 
 
-Array = NDArray[np.float64]
-
-
 def phase(samples: int) -> Array:
     """Return x / period at the centres of the pixels, (samples,)."""
     return (np.arange(samples) + 0.5) / samples
@@ -73,55 +79,27 @@ def one_row(heights: Array, period: float, source: str) -> HeightField:
 
 
 def blazed(period: float = 2.5, depth: float = 0.246, *, samples: int = 512) -> HeightField:
-    """Return a sawtooth h = depth · x / period, rising along +x.
+    """Return a sawtooth h = depth · x / period, rising along +x, (1, samples).
 
     At normal incidence its facets reflect light towards −x: into ω_o = −λq with q = m / period, m = 2 depth / λ.
-
-    Args:
-        period: along x, µm.
-        depth: µm.
-        samples: pixels per period.
-
-    Returns:
-        One period, (1, samples).
-
-    Raises:
-        ValueError: if the period is not positive, the depth negative, or samples below two.
     """
     check_profile(period, depth, samples)
-    heights = depth * phase(samples)
-    return one_row(heights, period, f"blazed grating, period {period:g} µm, depth {depth:g} µm")
+    return one_row(depth * phase(samples), period, f"blazed grating, period {period:g} µm, depth {depth:g} µm")
 
 
 def ruled(lines_per_mm: float = 600.0, *, blaze_wavelength: float = 500.0, samples: int = 512) -> HeightField:
-    """Return a blazed grating with given lines per millimetre and blaze wavelength.
+    """Return a blazed grating, (1, samples), with given lines per millimetre and blaze wavelength λ_B in nm.
 
-    The blaze wavelength λ_B is that of the first order in Littrow mounting, where light returns along the normal of the
+    The blaze wavelength is that of the first order in Littrow mounting, where light returns along the normal of the
     facets, at the blaze angle θ_B (Palmer 2020, Diffraction Grating Handbook, chapters 2 and 9). With the
     period d and the depth D of a groove,
 
         λ_B = 2 d sin θ_B,    D = d tan θ_B.
 
-    In that mounting κD = 2π, so that scalar theory diffracts all power into the first order.
-
-    Args:
-        lines_per_mm: grooves per millimetre; the period is 1000 / lines_per_mm in µm.
-        blaze_wavelength: λ_B in nm.
-        samples: pixels per period.
-
-    Returns:
-        One period, (1, samples), rising along +x.
-
-    Raises:
-        ValueError: if a number is not positive, samples are below two, or the blaze wavelength is not below twice the
-            period.
+    In that mounting κD = 2π, so that scalar theory diffracts all power into the first order. λ_B is below 2 d.
     """
-    for name, value, unit in (
-        ("lines_per_mm", lines_per_mm, "lines per mm"),
-        ("blaze_wavelength", blaze_wavelength, "nm"),
-    ):
-        if not (isinstance(value, Real) and np.isfinite(value) and value > 0):
-            raise RequestError(f"{name}: got {value!r}, wanted a positive number of {unit}")
+    check_positive("lines_per_mm", lines_per_mm, "of lines per mm")
+    check_positive("blaze_wavelength", blaze_wavelength, "of nm")
     period = 1000 / lines_per_mm
     sine = blaze_wavelength * 1e-3 / (2 * period)
     if sine >= 1:
@@ -129,27 +107,16 @@ def ruled(lines_per_mm: float = 600.0, *, blaze_wavelength: float = 500.0, sampl
             f"blaze_wavelength: got {blaze_wavelength:g} nm, wanted less than twice the period, {2000 * period:.4g} nm"
         )
     angle = np.arcsin(sine)
-    heights = blazed(period, period * np.tan(angle), samples=samples)
-    return HeightField(
-        heights.heights,
-        heights.pixel_size,
-        f"ruled grating, {lines_per_mm:g} lines/mm, blazed for {blaze_wavelength:g} nm ({np.degrees(angle):.2f}°)",
-    )
+    source = f"ruled grating, {lines_per_mm:g} lines/mm, blazed for {blaze_wavelength:g} nm ({np.degrees(angle):.2f}°)"
+    depth = period * np.tan(angle)
+    check_profile(period, depth, samples)
+    return one_row(depth * phase(samples), period, source)
 
 
 def right_angled(period: float, facet_angle: float, *, samples: int = 512) -> HeightField:
-    """Return two facets that meet at 90°, as a ruling diamond leaves them; the wider one rises along +x.
+    """Return two facets that meet at 90°, as a ruling diamond leaves them, (1, samples).
 
-    Args:
-        period: along x, µm.
-        facet_angle: between the wider facet and the surface, degrees, above 0 and at most 45.
-        samples: pixels per period.
-
-    Returns:
-        One period, (1, samples).
-
-    Raises:
-        ValueError: if the period is not positive, the angle out of range, or samples below two.
+    The wider one rises along +x, by `facet_angle` in degrees, above 0 and at most 45.
     """
     check_profile(period, 0.0, samples)
     if not (isinstance(facet_angle, Real) and 0 < facet_angle <= 45):
@@ -175,39 +142,16 @@ def transmission_600(*, facet_angle: float = 28.7, samples: int = 512) -> Height
 
 
 def sinusoidal(period: float, depth: float, *, samples: int = 512) -> HeightField:
-    """Return a sinusoid h = (depth / 2) · sin(2π x / period), so |F_m|² = J_m(κ · depth / 2)².
-
-    Args:
-        period: along x, µm.
-        depth: peak to valley, µm.
-        samples: pixels per period.
-
-    Returns:
-        One period, (1, samples).
-
-    Raises:
-        ValueError: if the period is not positive, the depth negative, or samples below two.
-    """
+    """Return a sinusoid h = (depth / 2) · sin(2π x / period), (1, samples), so |F_m|² = J_m(κ · depth / 2)²."""
     check_profile(period, depth, samples)
     heights = depth / 2 * np.sin(2 * np.pi * phase(samples))
     return one_row(heights, period, f"sinusoidal grating, period {period:g} µm, depth {depth:g} µm")
 
 
 def lamellar(period: float, depth: float, *, duty: float = 0.5, samples: int = 512) -> HeightField:
-    """Return a binary grating: the first part of the period is at `depth`, the rest at zero.
+    """Return a binary grating, (1, samples): the first part of the period is at `depth`, the rest at zero.
 
-    Args:
-        period: along x, µm.
-        depth: height of the ridges, µm.
-        duty: width of the ridges relative to the period, rounded to whole pixels.
-        samples: pixels per period.
-
-    Returns:
-        One period, (1, samples).
-
-    Raises:
-        ValueError: if the period is not positive, the depth negative, samples below two, or if the ridge or the
-            groove is narrower than half a pixel.
+    `duty`, the width of the ridges relative to the period, is rounded to whole pixels.
     """
     check_profile(period, depth, samples)
     if not (isinstance(duty, Real) and 0 < duty < 1):
@@ -222,19 +166,13 @@ def lamellar(period: float, depth: float, *, duty: float = 0.5, samples: int = 5
 
 
 def crossed(period: float, depth: float, *, period_y: float | None = None, samples: int = 128) -> HeightField:
-    """Return the sum of sinusoids along x and y, so that the orders are products |F_m|² = |F_{m_x}|² |F_{m_y}|².
+    """Return the sum of sinusoids along x and y, (samples, samples): the orders are products |F_{m_x}|² |F_{m_y}|².
 
     Args:
-        period: wavelength along x, µm.
+        period: along x, µm.
         depth: peak to valley of *each* sinusoid, µm; their sum spans twice that.
-        period_y: wavelength along y, µm; default: that along x.
+        period_y: along y, µm; default: that along x.
         samples: pixels per period in either direction.
-
-    Returns:
-        One period in each direction, (samples, samples).
-
-    Raises:
-        ValueError: if a period is not positive, the depth negative, or samples below two.
     """
     check_profile(period, depth, samples)
     check_pixels(samples, samples)
@@ -254,20 +192,10 @@ def foil(period: float = 1.0, depth: float = 0.15, *, directions: int = 2, sampl
         h(x) = a Σ_j cos(2π k_j·x),    k_j = (cos α_j, sin α_j) / period
 
     Two directions, α = 0° and 90°, give a square lattice with depth = 4a; three, 0°, 60° and 120°, a hexagonal one with
-    depth = 9a/2. Each wave alone has the orders J_m(κa)².
-
-    Args:
-        period: of each wave, µm.
-        depth: lowest to highest point of the sum, µm.
-        directions: 2 or 3.
-        samples: pixels per period, even.
+    depth = 9a/2. Each wave alone has the orders J_m(κa)². `samples` is even.
 
     Returns:
         One tile: period × period, (samples, samples); or 2 period × 2 period/√3, about (2 samples/√3, 2 samples).
-
-    Raises:
-        ValueError: if the period is not positive, the depth negative, samples not even or below two, or there are
-            other directions than these.
     """
     check_profile(period, depth, samples)
     if samples % 2:
@@ -276,10 +204,10 @@ def foil(period: float = 1.0, depth: float = 0.15, *, directions: int = 2, sampl
         raise RequestError(f"directions: got {directions!r}, wanted 2 (crossed) or 3 (hexagonal)")
     # In units of the period. The highest and the lowest point are on pixels.
     if directions == 2:
-        size, pixels = np.array([1.0, 1.0]), (samples, samples)
+        size, pixels, span = np.array([1.0, 1.0]), (samples, samples), 4.0
     else:
-        size = np.array([2.0, 2 / np.sqrt(3)])
         # The lowest points lie at a third of the period along x and half of the tile along y.
+        size, span = np.array([2.0, 2 / np.sqrt(3)]), 4.5
         pixels = (6 * round(samples / 3), 2 * round(samples / np.sqrt(3)))
     check_pixels(*pixels)
     x, y = (np.arange(n) / n * s for n, s in zip(pixels, size, strict=True))
@@ -287,7 +215,6 @@ def foil(period: float = 1.0, depth: float = 0.15, *, directions: int = 2, sampl
     for j in range(directions):
         angle = np.pi / directions * j
         waves += np.cos(2 * np.pi * (np.cos(angle) * x + np.sin(angle) * y[:, None]))
-    span = 4.0 if directions == 2 else 4.5
     return HeightField(
         waves * depth / span,
         (float(size[0] * period / pixels[0]), float(size[1] * period / pixels[1])),
@@ -301,17 +228,6 @@ def film(period: float = 1 / 0.53, depth: float = 0.76, *, samples: int = 64) ->
     The film is sold as "double axis, 13,500 lines per inch", 530/mm. Its depth is not published; of two sinusoids, each
     of amplitude a = depth/4, the orders (±1, 0) and (0, ±1) have J_1(κa)² J_0(κa)² of the light, at most 11 % each
     where κa = 1.08. With κ = 2π (n − 1)/λ and n = 1.5 that is the depth here at λ = 0.55 µm.
-
-    Args:
-        period: of each wave, µm.
-        depth: lowest to highest point of the sum, µm.
-        samples: pixels per period, even.
-
-    Returns:
-        One period in each direction, (samples, samples).
-
-    Raises:
-        ValueError: as `foil`.
     """
     return foil(period, depth, directions=2, samples=samples)
 
@@ -319,14 +235,15 @@ def film(period: float = 1 / 0.53, depth: float = 0.76, *, samples: int = 64) ->
 # Horizontal width of the walls of a pit, µm, which slope by about 45 to 60 degrees.
 _WALL = 0.1
 
-# Runs of at least 3 and at most 11 channel bits: the constraint (d, k) = (2, 10), whose capacity is C = 0.5418 bits.
-# In sequences of maximum entropy, runs of n bits have the probability 2^{−Cn} (Immink 2004, Codes for
-# Mass Data Storage Systems, chapter 4).
+# Run length in channel bits → probability. Runs of at least 3 and at most 11 channel bits: the constraint
+# (d, k) = (2, 10), whose capacity is C = 0.5418 bits. In sequences of maximum entropy, runs of n bits have the
+# probability 2^{−Cn} (Immink 2004, Codes for Mass Data Storage Systems, chapter 4).
 EIGHT_TO_FOURTEEN = {n: 2 ** (-0.5418 * n) for n in range(3, 12)}
 
 
 def draw_tracks(
-    *,
+    name: str,
+    runs: Mapping[int, float],
     period: float,
     depth: float,
     width: float,
@@ -335,15 +252,8 @@ def draw_tracks(
     length: float,
     pixel_size: float,
     seed: int,
-    runs: Mapping[int, float],
-    name: str,
 ) -> HeightField:
-    """Draw a periodic patch of tracks along y, side by side along x; arguments as in `compact_disc`.
-
-    Args:
-        runs: run length in channel bits → probability.
-        name: of the disc.
-    """
+    """Draw a periodic patch of tracks along y, side by side along x; `runs` as above, the others as `compact_disc`."""
     check_profile(period, depth)
     for label, value in (
         ("width", width),
@@ -437,32 +347,16 @@ def compact_disc(
 
     Args:
         period: track pitch, µm.
-        depth: geometric depth of the pits, µm.
-        width: of the pits at half their depth, µm.
+        depth: geometric depth of the pits, which protrude towards the light, µm.
+        width: of the pits at half their depth, µm; at most their length.
         channel_bit: length of a channel bit along the track, µm.
         tracks: number of tracks; times the period, the size of the patch along x.
-        length: of the patch along y, µm, rounded to whole channel bits.
-        pixel_size: µm, adjusted to a whole number of pixels per patch.
-        seed: random seed.
-
-    Returns:
-        The patch, which tiles seamlessly; pits protrude towards the light.
-
-    Raises:
-        ValueError: if a length is not positive, the depth negative, the pits wider than they are
-            long or than the track, the patch shorter than four pits, or the pixels too coarse.
+        length: of the patch along y, µm, at least four pits, rounded to whole channel bits.
+        pixel_size: µm, at most half of the width.
+        seed: of the lengths of pits and lands.
     """
     return draw_tracks(
-        period=period,
-        depth=depth,
-        width=width,
-        channel_bit=channel_bit,
-        tracks=tracks,
-        length=length,
-        pixel_size=pixel_size,
-        seed=seed,
-        runs=EIGHT_TO_FOURTEEN,
-        name="compact disc",
+        "compact disc", EIGHT_TO_FOURTEEN, period, depth, width, channel_bit, tracks, length, pixel_size, seed
     )
 
 
@@ -488,21 +382,8 @@ def dvd(
     pits and lands of 3 to 11 of them and 14 in sync codes, so 0.40 to 1.87 µm, read at 650 nm (λ/4n = 0.105 µm). The
     width of the pits is typical, not specified. What `compact_disc` says of the layer holds here, too. As the period is
     about a wavelength, the directions of the orders are exact, but their efficiencies approximate.
-
-    Args, Returns, Raises: those of `compact_disc`.
     """
-    return draw_tracks(
-        period=period,
-        depth=depth,
-        width=width,
-        channel_bit=channel_bit,
-        tracks=tracks,
-        length=length,
-        pixel_size=pixel_size,
-        seed=seed,
-        runs=_RUNS,
-        name="DVD",
-    )
+    return draw_tracks("DVD", _RUNS, period, depth, width, channel_bit, tracks, length, pixel_size, seed)
 
 
 def morpho_ridges(
@@ -522,20 +403,7 @@ def morpho_ridges(
     regular stack on irregular ridges, about 0.7 µm apart and 0.3 µm wide). Modelled on that description, neither
     measured nor of the real depth (about 2 µm, beyond scalar theory). For a blue butterfly, use a blue mirror.
 
-    Args:
-        period: mean spacing of the ridges along x, µm.
-        depth: lowest to highest point, µm.
-        width: of the ridges, µm.
-        size: extent of the patch, µm, one number or (x, y); size_x is rounded to whole periods.
-        pixel_size: µm, adjusted to a whole number of pixels per patch.
-        seed: random seed.
-
-    Returns:
-        The patch, which tiles seamlessly.
-
-    Raises:
-        ValueError: if a length is not positive, the depth negative, the ridges wider than the period, the seed not a
-            natural number, or the size too small or the pixels too coarse for the ridges.
+    `period` is the mean spacing of the ridges, `width` theirs, below it; size_x is rounded to whole periods.
     """
     check_profile(period, depth)
     check_positive("width", width)
@@ -656,21 +524,8 @@ def elaphe(
     periods further on. Granules sit on top of the fingers. Positions, lengths, widths, heights and tilts vary from
     finger to finger as in AFM scans of such skins. The shape is modelled on a 5.9 µm AFM scan of the LANE lab, Geneva.
 
-    The patch tiles seamlessly: size_y is rounded to whole periods, and the pitch of the rows is adjusted to size_x.
-
-    Args:
-        size: approximate size of the patch, µm, one number or (x, y).
-        pixel_size: µm, adjusted to a whole number of pixels per patch.
-        depth: lowest to highest point, µm.
-        period: mean distance from finger to finger along y, µm.
-        seed: random seed.
-
-    Returns:
-        The patch, (round(size_y / pixel_size), round(size_x / pixel_size)).
-
-    Raises:
-        ValueError: if a length is not positive, the depth negative, the seed not a natural number, the size below two
-            rows or four fingers, or the pixels too coarse for the fingers.
+    `period` is the mean distance from finger to finger. size_y is rounded to whole periods, and the pitch of the rows
+    is adjusted to size_x; the patch holds at least two rows and four fingers.
     """
     check_profile(period, depth)
     rng = generator(seed)
@@ -767,21 +622,8 @@ def xenopeltis(
     Fingers are 0.36 periods apart along y, with small deep pits between them; some are joined. The shape is modelled on
     a 5.9 µm AFM scan of the LANE lab, Geneva.
 
-    The patch tiles seamlessly: size_x is rounded to whole periods, and the pitch of the fingers is adjusted to size_y.
-
-    Args:
-        size: approximate size of the patch, µm, one number or (x, y).
-        pixel_size: µm, adjusted to a whole number of pixels per patch.
-        depth: lowest to highest point, µm.
-        period: mean distance from row to row along x, µm.
-        seed: random seed.
-
-    Returns:
-        The patch, (round(size_y / pixel_size), round(size_x / pixel_size)).
-
-    Raises:
-        ValueError: if a length is not positive, the depth negative, the seed not a natural number, the size below two
-            rows or four fingers, or the pixels too coarse for the fingers.
+    `period` is the mean distance from row to row. size_x is rounded to whole periods, and the pitch of the fingers is
+    adjusted to size_y; the patch holds at least two rows and four fingers.
     """
     check_profile(period, depth)
     rng = generator(seed)
@@ -917,13 +759,13 @@ def _xenopeltis_pit(canvas: Canvas, rng: np.random.Generator, x_0: float, y_0: f
     pitch = canvas.pitch[1]
     depth = rng.uniform(0.01, 0.03) if rng.uniform() < 0.1 else rng.uniform(0.04, 0.11)
     start = 0.1 + rng.normal(0, 0.04)
-    reach = rng.uniform(0.55, 0.8)
+    span = rng.uniform(0.55, 0.8)
     width = 0.17 * rng.uniform(0.7, 1.3)
     tilt = rng.normal(0.03, 0.06) * pitch / length
     index, x, y = canvas.window((x_0, x_0 + 1.1 * length), (y_0 - 0.9 * pitch, y_0 + 0.9 * pitch))
     s = (x - x_0) / length
     t = (y - y_0 - tilt * (x - x_0)) / pitch
-    u = np.clip((s - start) / reach, 0, 1)
+    u = np.clip((s - start) / span, 0, 1)
     half = width * 2 * np.sqrt(u * (1 - u))  # an ellipse
     pit = smooth_step(half - np.abs(t), 0.12) * smooth_step(s - start - 0.03, 0.04) * (1 - u) ** 0.7
     canvas.heights[index] -= depth * pit
