@@ -24,26 +24,33 @@ from scipy.special import chdtri
 
 from ..errors import RequestError
 from ..settings import Settings
-from .heightfield import HeightField
-from .missing import fill_missing
+from .heightfield import HeightField, harmonic_fill
 
 Array = NDArray[np.float64]
 
 _CORRELATED = 35 / 18
+# Variance of the power of a single wave under a Hann window, bins²: its three bins hold 1/6, 2/3 and 1/6.
 _BAND_LOBE = 1 / 3
-"""Variance of the power of a single wave under a Hann window, bins²: its three bins hold 1/6, 2/3 and 1/6."""
+_BAND_FALSE_ALARM = 1e-4  # probability that a bin of a band is mistaken for a single period
+_NARROW = 1.25  # bins; a narrower peak is a single period that drifts
+# Range of the fit: frequencies up to this factor from the peak, and radians from its direction.
+_FREQUENCY_RATIO, _SECTOR = 1.6, np.pi / 4
+_CENTRE_RATIO = 1.3  # factor by which the centre may differ from the peak; the width is at most a quarter of it
 
-_BAND_FALSE_ALARM = 1e-4
-"""Probability that a bin of a band is mistaken for a single period."""
-
-_NARROW = 1.25
-"""Bins; a narrower peak is a single period that drifts."""
-
-_REACH, _SECTOR = 1.6, np.pi / 4
-"""Range of the fit: frequencies up to this factor from the peak, and radians from its direction."""
-
-_SHIFT = 1.3
-"""Factor by which the centre may differ from the peak; the width is at most a quarter of it."""
+_FEWEST_PERIODS = 2.0  # fewest periods across a patch that determine their length
+_LEAST_ANGLE = 15.0  # least angle between two waves, degrees; closer ones are one drifting period, or its harmonics
+# Wave vectors closer than this share of the shorter one are one period that varies, and turns, over the patch.
+_SAME = 0.5
+_FALSE_ALARM = 1e-4  # probability of a false detection in noise
+_DRIFT_FALSE_ALARM = 0.1  # probability that noise is mistaken for a drift of a period over the patch
+_RING = 24  # fewest frequencies from which the lower quartile, i.e. the background, is estimated.
+# Least fraction of the variance of a wave or a band, to exclude hum of the instrument and uneven background.
+_LEAST_STRENGTH = 1e-2
+_ROUNDING = 1e-20  # relative to the largest power: far below a wave of `_LEAST_STRENGTH`, far above rounding errors
+_MOST_MAXIMA = 200  # local maxima considered
+_LOBE = 3  # half width of a peak in bins: two owing to the window, more if the period drifts
+_MOST_TIMES = 8  # that a tile is repeated along each axis
+_MOST_PIXELS = 2**22
 
 
 @dataclass(frozen=True)
@@ -66,8 +73,8 @@ class Band:
 
     def holds(self, q: Array) -> bool:
         """Return whether a wave vector, or its opposite, lies within three widths of the centre."""
-        apart = np.array([np.hypot(*q) - self.centre[0], _turned(np.arctan2(q[1], q[0]), self.centre[1])])
-        return bool((np.abs(apart) <= 3 * self.width).all())
+        offset = np.array([np.hypot(*q) - self.centre[0], _axis_difference(np.arctan2(q[1], q[0]), self.centre[1])])
+        return bool((np.abs(offset) <= 3 * self.width).all())
 
 
 def fit_band(power: Array, background: Array, q: tuple[Array, Array], size: Array, peak: Array) -> Band:
@@ -84,8 +91,13 @@ def fit_band(power: Array, background: Array, q: tuple[Array, Array], size: Arra
     rho_0, phi_0 = np.hypot(*peak), np.arctan2(peak[1], peak[0])
     rho, phi = np.hypot(q_x, q_y), np.arctan2(q_y, q_x)
     background = np.minimum(background, np.roll(background[::-1, ::-1], (1, 1), (0, 1)))
-    phi = _turned(phi, phi_0)
-    about = (np.abs(phi) < _SECTOR) & (rho > rho_0 / _REACH) & (rho < rho_0 * _REACH) & np.isfinite(background)
+    phi = _axis_difference(phi, phi_0)
+    about = (
+        (np.abs(phi) < _SECTOR)
+        & (rho > rho_0 / _FREQUENCY_RATIO)
+        & (rho < rho_0 * _FREQUENCY_RATIO)
+        & np.isfinite(background)
+    )
     about &= q_x * peak[0] + q_y * peak[1] > 0  # one of q and −q
     values, rho, phi = power[about], rho[about], phi[about]
     background = np.maximum(background[about], 1e-9 * values.max())
@@ -107,7 +119,7 @@ def fit_band(power: Array, background: Array, q: tuple[Array, Array], size: Arra
 
     bounds = [
         (np.log(1e-6 * values.max()), np.log(10 * values.max())),
-        (rho_0 / _SHIFT, rho_0 * _SHIFT),
+        (rho_0 / _CENTRE_RATIO, rho_0 * _CENTRE_RATIO),
         (np.log(bin_width / 3), np.log(max(rho_0 / 4, bin_width))),
         (-_SECTOR, _SECTOR),
         (np.log(bin_width / rho_0 / 3), np.log(max(_SECTOR, bin_width / rho_0))),
@@ -135,43 +147,9 @@ def fit_band(power: Array, background: Array, q: tuple[Array, Array], size: Arra
     )
 
 
-def _turned(phi: Array, phi_0: float) -> Array:
+def _axis_difference(phi: Array, phi_0: float) -> Array:
     """Return φ − φ₀ of axes, in [−π/2, π/2)."""
     return (phi - phi_0 + np.pi / 2) % np.pi - np.pi / 2
-
-
-_FEWEST = 2.0
-"""Fewest periods across a patch that determine their length."""
-
-_LEAST_ANGLE = 15.0
-"""Least angle between two waves, degrees; closer ones are one drifting period, or its harmonics."""
-
-_SAME = 0.5
-"""Wave vectors closer than this share of the shorter one are one period that varies, and turns, over the patch."""
-
-_FALSE_ALARM = 1e-4
-"""Probability of a false detection in noise."""
-
-_CHANCE = 0.1
-"""Probability that noise is mistaken for a drift of a period over the patch."""
-
-_RING = 24
-"""Fewest frequencies from which the lower quartile, i.e. the background, is estimated."""
-
-_LEAST_STRENGTH = 1e-2
-"""Least fraction of the variance of a wave or a band, to exclude hum of the instrument and uneven background."""
-
-_ROUNDING = 1e-20
-"""Relative to the largest power: far below a wave of `_LEAST_STRENGTH`, far above rounding errors."""
-
-_MOST_MAXIMA = 200
-"""Local maxima considered."""
-
-_LOBE = 3
-"""Half width of a peak in bins: two owing to the window, more if the period drifts."""
-
-_MOST_TIMES = 8  # that a tile is repeated along each axis
-_MOST_PIXELS = 2**22
 
 
 @dataclass(frozen=True)
@@ -198,12 +176,12 @@ class Period:
     direction_width: float = 0.0
 
     @property
-    def q(self) -> NDArray[np.float64]:
+    def q(self) -> Array:
         """The wave vector, (2,), cycles/µm."""
         return _unit(np.deg2rad(self.direction)) / self.period
 
     @classmethod
-    def of(cls, q: NDArray[np.float64], spread: NDArray[np.float64], strength: float) -> Period:
+    def of(cls, q: Array, spread: Array, strength: float) -> Period:
         """Make a period from a frequency (2,) in cycles/µm and its covariance (2, 2)."""
         length = float(np.hypot(*q))
         along, across = q / length, np.array([-q[1], q[0]]) / length
@@ -216,7 +194,7 @@ class Period:
         )
 
     @classmethod
-    def of_band(cls, band: Band, spread: NDArray[np.float64]) -> Period:
+    def of_band(cls, band: Band, spread: Array) -> Period:
         """Make a period from a band and the covariance (2, 2) of its centre (ρ₀, φ₀)."""
         length, phi = band.centre
         return cls(
@@ -235,10 +213,10 @@ def find_periods(height_field: HeightField, count: int = 2, *, extent: str = "sa
 
     A wave is detected where the power of the levelled and windowed (Hann) heights exceeds the background by a factor
     that noise on an exactly known background would exceed in one of ten thousand height fields (with the background
-    estimated as here, white noise did in one of 300). The background is estimated by the largest of three lower
-    quartiles: over frequencies of similar magnitude, and along the row and the column of the frequency, because of the
-    streaks of a scan. If a wave of two or three times the period is also significant, or stronger, it is the period,
-    and the first wave its harmonic.
+    estimated as here, white noise did in one of 300). The background is the largest of three lower quartiles: over
+    frequencies of similar magnitude, and along the row and the column of the frequency, because of the streaks of a
+    scan. If a wave of two or three times the period is also significant, or stronger, it is the period, and the first
+    wave its harmonic.
 
     The waves are then fitted jointly, together with a quadratic surface p: by weighted least squares for their complex
     amplitudes c, and by Gauss–Newton steps for their frequencies q,
@@ -250,18 +228,16 @@ def find_periods(height_field: HeightField, count: int = 2, *, extent: str = "sa
     (Rife and Boorstyn 1974, "Single-tone parameter estimation from discrete-time observations", IEEE Transactions
     on Information Theory 20(5), 591–598, equation 22), var q = 6 n/(π² |c|² T²) along a side of length T.
 
-    If a period drifts over the patch, like the fingers of a skin, another part of the surface has another one, and the
-    uncertainty says so: the excess of the scatter of fits to the halves of a line, or to the quarters of a patch, over
-    that owing to the background (eight times that covariance for a half, sixteen times for a quarter) is added where it
-    is significant. Of a patch that holds fewer than four periods, the parts are larger and overlap, so that each holds
-    two.
+    If a period drifts over the patch, like the fingers of a skin, another part of the surface has another one. The
+    uncertainty therefore includes the excess, where significant, of the scatter of fits to the halves of a line, or to
+    the quarters of a patch, over that owing to the background (eight times that covariance for a half, sixteen times
+    for a quarter). The parts of a patch that holds fewer than four periods overlap, so that each holds two.
 
     A peak broader than a bin of the spectrum is a band of periods: its centre, width and strength are fitted to all
-    bins (`bands`), and the scatter of the centre over the quarters of the patch is added in the same way. A wave and a
-    band of the same pitch are one thing: the wave if it has twice the strength of the band, else the band.
+    bins, and the scatter of the centre over the quarters is added in the same way. A wave and a band of the same pitch
+    are one thing: the wave if it has twice the strength of the band, else the band.
 
-    A wave is detected in a patch that holds several of its periods. A tile is repeated until it does; its own periods
-    are orders of its lattice, and exact.
+    A tile is repeated until it holds several of its periods, which are orders of its lattice, and exact.
 
     Args:
         height_field: need not be levelled; missing pixels are filled first.
@@ -280,7 +256,7 @@ def find_periods(height_field: HeightField, count: int = 2, *, extent: str = "sa
     Settings(extent)
     if extent == "tile":
         return _periods_of_tile(height_field, count)
-    heights = fill_missing(height_field.heights, height_field.pixel_size)
+    heights = harmonic_fill(height_field.heights, height_field.pixel_size)
     spectrum = _Spectrum(heights, height_field.pixel_size)
     if not spectrum.scale > 1e-13 * np.abs(heights).max():  # flat up to rounding
         return ()
@@ -288,12 +264,12 @@ def find_periods(height_field: HeightField, count: int = 2, *, extent: str = "sa
     fitted = [*spectrum.fit(waves), *(spectrum.band(band) for band in bands if band.share >= _LEAST_STRENGTH)]
     found: list[Period] = []
     for period in sorted(fitted, key=lambda period: -period.strength * (2 if period.width else 1)):
-        if not any(_one(period.q, other.q) for other in found):
+        if not any(_same_wave(period.q, other.q) for other in found):
             found.append(period)
     return tuple(sorted(found, key=lambda period: (period.width > 0, -period.strength)))
 
 
-def height_spectrum(height_field: HeightField, extent: str) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+def height_spectrum(height_field: HeightField, extent: str) -> tuple[Array, Array, float]:
     """Compute the power spectrum of the heights.
 
     Args:
@@ -320,7 +296,7 @@ def height_spectrum(height_field: HeightField, extent: str) -> tuple[NDArray[np.
 class _Spectrum:
     """The power spectrum of heights levelled to second order, under a Hann window."""
 
-    def __init__(self, heights: NDArray[np.float64], pixel_size: tuple[float, float]) -> None:
+    def __init__(self, heights: Array, pixel_size: tuple[float, float]) -> None:
         rows, columns = heights.shape
         self._pixel_size = pixel_size
         self._size = np.array([columns * pixel_size[0], rows * pixel_size[1]])
@@ -328,29 +304,28 @@ class _Spectrum:
         self._y = (np.arange(rows) - (rows - 1) / 2) * pixel_size[1]
         self._heights = heights - heights.mean()
         flat = (np.ones(columns), np.ones(rows))
-        self._levelled = self._heights - _LeastSquares(_polynomials(self._x, self._y, 2), flat).fit(self._heights)
+        surface = _LeastSquares(_polynomials(self._x, self._y, 2), flat)
+        self._levelled = self._heights - surface.evaluate(surface.solve(self._heights))
         self.scale = float(self._levelled.std())
         weight = hann(heights.shape)
         self._weight = float(np.sum(weight**2))
         self._power = np.abs(np.fft.fft2(weight * self._levelled)) ** 2
         self._q = (np.fft.fftfreq(columns, pixel_size[0]), np.fft.fftfreq(rows, pixel_size[1]))
 
-    # ------------------------------------------------------------ detection
-
-    def peaks(self, count: int) -> tuple[list[NDArray[np.float64]], list[Band]]:
+    def peaks(self, count: int) -> tuple[list[Array], list[Band]]:
         """Return the frequencies (cycles/µm) of the strongest significant peaks, and bands; none collinear."""
-        waves: list[NDArray[np.float64]] = []
+        waves: list[Array] = []
         bands: list[Band] = []
 
-        def known(q: NDArray[np.float64]) -> bool:
+        def known(q: Array) -> bool:
             others = [*waves, *(band.centre[0] * _unit(band.centre[1]) for band in bands)]
-            return any(_one(q, other) for other in others) or any(band.holds(q) for band in bands)
+            return any(_same_wave(q, other) for other in others) or any(band.holds(q) for band in bands)
 
         for row, column in self._candidates:
             q = self._frequency(row, column)
             if known(q):
                 continue
-            band = None if self._alone(q) else fit_band(self._power, self._rings, self._q, self._size, q)
+            band = None if self._isolated(q) else fit_band(self._power, self._rings, self._q, self._size, q)
             if band is not None and not band.sharp:
                 bands.append(band)
             elif not known(q := self._fundamental(q)):
@@ -359,7 +334,7 @@ class _Spectrum:
                 break
         return waves, bands
 
-    def _alone(self, q: NDArray[np.float64]) -> bool:
+    def _isolated(self, q: Array) -> bool:
         """Return whether the lobe of a peak holds nearly all power within half an octave and 45°."""
         q_x, q_y = np.meshgrid(*self._q)
         octaves = np.abs(np.log2(np.maximum(np.hypot(q_x, q_y), 1e-300) / np.hypot(*q)))
@@ -368,7 +343,7 @@ class _Spectrum:
         about = (octaves < 0.5) & (np.abs(across) < along) | lobe
         return bool(self._power[lobe].sum() > 0.8 * self._power[about].sum())
 
-    def _frequency(self, row: int, column: int) -> NDArray[np.float64]:
+    def _frequency(self, row: int, column: int) -> Array:
         return np.array([self._q[0][column], self._q[1][row]])
 
     @cached_property
@@ -376,7 +351,7 @@ class _Spectrum:
         """Mask: one of q and −q, if the patch holds enough periods."""
         q_x, q_y = np.meshgrid(*self._q)
         waves = np.hypot(q_x * self._size[0], q_y * self._size[1])
-        return ((q_x > 0) | ((q_x == 0) & (q_y > 0))) & (waves >= _FEWEST - 1e-9)
+        return ((q_x > 0) | ((q_x == 0) & (q_y > 0))) & (waves >= _FEWEST_PERIODS - 1e-9)
 
     @cached_property
     def _maxima(self) -> list[tuple[int, int]]:
@@ -399,7 +374,7 @@ class _Spectrum:
         return [p for p in self._maxima if power[p] > max(least, level * max(background[p], self._streak(*p)))]
 
     @cached_property
-    def _rings(self) -> NDArray[np.float64]:
+    def _rings(self) -> Array:
         """The lower quartile of the power over frequencies of similar magnitude, by power laws between rings."""
         usable, length = self._usable, np.hypot(*np.meshgrid(*self._q))
         lengths, powers = length[usable], self._power[usable]
@@ -420,13 +395,13 @@ class _Spectrum:
         """Return the larger of the lower quartiles along the row and the column of a frequency, excluding its lobe."""
         quartiles = [0.0]
         for line, place in ((self._power[row], column), (self._power[:, column], row)):
-            reach = min(12, (len(line) - 1) // 2)
-            if reach > _LOBE + 3:
-                away = np.r_[-reach:-_LOBE, _LOBE + 1 : reach + 1]
+            half = min(12, (len(line) - 1) // 2)
+            if half > _LOBE + 3:
+                away = np.r_[-half:-_LOBE, _LOBE + 1 : half + 1]
                 quartiles.append(float(np.quantile(line[(place + away) % len(line)], 0.25)))
         return max(quartiles)
 
-    def _fundamental(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _fundamental(self, q: Array) -> Array:
         """Return the longest wave with q as third or second harmonic, if significant or as strong as q; else q."""
         column, row = (np.rint(q * self._size).astype(int)).tolist()
         power = self._power[row, column]
@@ -441,9 +416,7 @@ class _Spectrum:
                         return signed
         return q
 
-    # ------------------------------------------------------------ fit
-
-    def fit(self, waves: list[NDArray[np.float64]]) -> list[Period]:
+    def fit(self, waves: list[Array]) -> list[Period]:
         """Fit the waves by least squares, starting from the frequencies of their bins."""
         whole = _Waves(self._heights, self._x, self._y, degree=2)
         while waves:
@@ -460,7 +433,7 @@ class _Spectrum:
         columns, rows = np.rint(q * self._size).astype(int).T
         background = self._rings[rows, columns] / np.log(4 / 3) / self._weight
         covariance = [
-            density[k] * unit[k] + self._wander(q[k], min(density[k], background[k]) * unit[k]) for k in range(len(q))
+            density[k] * unit[k] + self._drift(q[k], min(density[k], background[k]) * unit[k]) for k in range(len(q))
         ]
         found = [Period.of(*wave) for wave in zip(q, covariance, np.minimum(strength, 1.0).tolist(), strict=True)]
         return [period for period in found if period.strength >= _LEAST_STRENGTH]
@@ -471,37 +444,38 @@ class _Spectrum:
         for part in self._parts():
             spectrum = _Spectrum(self._heights[part], self._pixel_size)
             quarters.append(fit_band(spectrum._power, spectrum._rings, spectrum._q, spectrum._size, q))
-        centres, noise = (
-            np.array([one.centre for one in quarters]),
-            np.mean([one.covariance for one in quarters], axis=0),
-        )
-        return Period.of_band(band, band.covariance + _beyond(centres, noise))
+        centres = np.array([quarter.centre for quarter in quarters])
+        noise = np.mean([quarter.covariance for quarter in quarters], axis=0)
+        return Period.of_band(band, band.covariance + _excess_covariance(centres, noise))
 
-    def _wander(self, q: NDArray[np.float64], noise: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _drift(self, q: Array, noise: Array) -> Array:
         """Return the covariance of the frequency over the halves or quarters of the patch, in excess of noise."""
-        share = float(np.clip(_FEWEST / np.hypot(*(q * self._size)), 0.5, 1))
+        share = float(np.clip(_FEWEST_PERIODS / np.hypot(*(q * self._size)), 0.5, 1))
         parts = self._parts(share)
         waves = [_Waves(self._levelled[r, c], self._x[c], self._y[r], degree=0) for r, c in parts]
         of_part = noise / share ** (2 + np.log2(len(parts)))
-        return _beyond(np.array([part.frequencies(q[None], 1e-3)[0] for part in waves]), of_part)
+        return _excess_covariance(np.array([part.frequencies(q[None], 1e-3)[0] for part in waves]), of_part)
 
     def _parts(self, share: float = 0.5) -> list[tuple[slice, slice]]:
-        """Yield both ends of a line, or the corners of a patch, of this share of its length and width."""
-        rows, columns = (_ends(count, share) for count in self._heights.shape)
+        """Return both ends of a line, or the corners of a patch, of this share of its length and width."""
+        rows, columns = (
+            [slice(0, int(share * n)), slice(n - int(share * n), n)] if n >= 16 else [slice(0, n)]
+            for n in self._heights.shape
+        )
         return [(r, c) for r in rows for c in columns]
 
 
 class _Waves:
     """The model p(x) + Re Σ_k c_k e^{2πi q_k·x} of heights under a Hann window."""
 
-    def __init__(self, heights: NDArray[np.float64], x: NDArray, y: NDArray, degree: int) -> None:
+    def __init__(self, heights: Array, x: NDArray, y: NDArray, degree: int) -> None:
         self._heights = heights
         self._x, self._y = x - x.mean(), y - y.mean()
         self._size = np.array([_length(x), _length(y)])
         self._window = (_hann(len(x)), _hann(len(y)))
         self._polynomials = _polynomials(self._x, self._y, degree)
 
-    def frequencies(self, q: NDArray[np.float64], bins: float = 1e-7) -> NDArray[np.float64]:
+    def frequencies(self, q: Array, bins: float = 1e-7) -> Array:
         """Find the best q, (k, 2), from these starting points, until a step is less than `bins`."""
         for _ in range(20):
             amplitude, slope = self._amplitudes(self._model(q).solve(self._heights))
@@ -514,7 +488,7 @@ class _Waves:
                 break
         return q
 
-    def amplitudes(self, q: NDArray[np.float64]) -> tuple[NDArray, NDArray[np.float64], NDArray[np.float64], float]:
+    def amplitudes(self, q: Array) -> tuple[NDArray, Array, Array, float]:
         """Return c (k,), the covariance of each q in noise of density 1 (k, 2, 2), its density there, var (h − p)."""
         model = self._model(q)
         coefficients = model.solve(self._heights)
@@ -533,7 +507,7 @@ class _Waves:
         surface = np.where(np.arange(len(coefficients)) < len(self._polynomials), coefficients, 0)
         return amplitude, np.array(spread), density, float((self._heights - model.evaluate(surface)).var())
 
-    def _model(self, q: NDArray[np.float64]) -> _LeastSquares:
+    def _model(self, q: Array) -> _LeastSquares:
         """Return the polynomials, and for each wave e, xe, ye with e = e^{2πi q·x}/2, and their conjugates."""
         basis = list(self._polynomials)
         for wave in q:
@@ -547,7 +521,7 @@ class _Waves:
         table = coefficients[len(self._polynomials) :].reshape(-1, 6)
         return table[:, 0], table[:, 1:3]
 
-    def _density(self, residual: NDArray[np.float64], q: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _density(self, residual: Array, q: Array) -> Array:
         """Return the variance per pixel of white noise with the power density of the residual around each q, (k,)."""
         weight = hann(residual.shape)
         power = np.abs(np.fft.fft2(weight * residual)) ** 2 / np.sum(weight**2)
@@ -575,19 +549,15 @@ class _LeastSquares:
         u, v = (w**power for w in self._window)
         return ((self._along_x.conj() * u) @ self._along_x.T) * ((self._along_y.conj() * v) @ self._along_y.T)
 
-    def solve(self, heights: NDArray[np.float64]) -> NDArray:
+    def solve(self, heights: Array) -> NDArray:
         """Solve for the coefficients."""
         u, v = self._window
         sums = np.einsum("ky,ky->k", self._along_y.conj() * v, (self._along_x.conj() * u) @ heights.T)
         return self._inverse @ sums
 
-    def evaluate(self, coefficients: NDArray) -> NDArray[np.float64]:
+    def evaluate(self, coefficients: NDArray) -> Array:
         """Evaluate the model, (N_y, N_x)."""
         return np.real((self._along_y.T * coefficients) @ self._along_x)
-
-    def fit(self, heights: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Fit the model to the heights."""
-        return self.evaluate(self.solve(heights))
 
     def covariance(self) -> NDArray:
         """Return the covariance of the coefficients for white noise of variance one."""
@@ -604,11 +574,8 @@ def _periods_of_tile(tile: HeightField, count: int) -> tuple[Period, ...]:
 
 def _on_lattice(period: Period, tile: HeightField) -> Period:
     """Round a period of a repeating tile to one of its orders, whose period is known exactly."""
-    if period.width:
-        return period
-    along = np.deg2rad(period.direction)
-    order = np.rint(np.array([np.cos(along), np.sin(along)]) / period.period * tile.tile_size)
-    if not order.any():
+    order = np.rint(period.q * tile.tile_size)
+    if period.width or not order.any():
         return period
     return Period.of(order / tile.tile_size, np.zeros((2, 2)), period.strength)
 
@@ -620,18 +587,18 @@ def repeated(tile: HeightField, times: int) -> HeightField:
     return HeightField(np.tile(tile.heights, (times, times)), tile.pixel_size, tile.source)
 
 
-def _beyond(found: NDArray[np.float64], noise: NDArray[np.float64]) -> NDArray[np.float64]:
+def _excess_covariance(found: Array, noise: Array) -> Array:
     """Return the covariance of estimates (n, 2) from parts of a patch in excess of that by noise, if significant."""
     free = len(found) - 1
     if free == 0:
         return np.zeros((2, 2))
     scatter, axes = np.linalg.eigh(np.cov(found.T))
     expected = np.einsum("ik,ij,jk->k", axes, noise, axes)
-    excess = np.where(scatter * free > chdtri(free, _CHANCE) * expected, scatter - expected, 0)
+    excess = np.where(scatter * free > chdtri(free, _DRIFT_FALSE_ALARM) * expected, scatter - expected, 0)
     return axes @ np.diag(np.maximum(excess, 0)) @ axes.T
 
 
-def _unit(phi: float) -> NDArray[np.float64]:
+def _unit(phi: float) -> Array:
     return np.array([np.cos(phi), np.sin(phi)])
 
 
@@ -648,34 +615,29 @@ def _polynomials(x: NDArray, y: NDArray, degree: int) -> list[tuple[NDArray, NDA
     return [(x**i, y**j) for i, j in powers]
 
 
-def _ends(count: int, share: float) -> list[slice]:
-    size = int(share * count)
-    return [slice(0, size), slice(count - size, count)] if count >= 16 else [slice(0, count)]
-
-
-def _length(places: NDArray[np.float64]) -> float:
+def _length(places: Array) -> float:
     """Return the length of a row of pixels from their positions; arbitrary for one pixel, which has no frequency."""
     return float(len(places) * (places[1] - places[0])) if len(places) > 1 else 1.0
 
 
-def _hann(count: int) -> NDArray[np.float64]:
+def _hann(count: int) -> Array:
     """Return a Hann window without its zeros; one for a single pixel."""
     return np.sin(np.pi * (np.arange(count) + 0.5) / count) ** 2
 
 
-def hann(shape: tuple[int, int]) -> NDArray[np.float64]:
+def hann(shape: tuple[int, int]) -> Array:
     """Return the Hann window of a patch, (N_y, N_x)."""
     return np.outer(*map(_hann, shape))
 
 
-def _quartiles(values: NDArray[np.float64], counts: NDArray[np.intp]) -> NDArray[np.float64]:
+def _quartiles(values: Array, counts: NDArray[np.intp]) -> Array:
     """Return the lower quartile of consecutive runs of values of these lengths."""
     label = np.repeat(np.arange(len(counts)), counts)
     ordered = values[np.lexsort((values, label))]
     return ordered[np.cumsum(counts) - counts + (counts - 1) // 4]
 
 
-def _power_law(x: NDArray, points: NDArray, values: NDArray) -> NDArray[np.float64]:
+def _power_law(x: NDArray, points: NDArray, values: NDArray) -> Array:
     """Interpolate linearly between logarithms, extrapolated before the first point."""
     x, points, values = np.log(x), np.log(points), np.log(values)
     if len(points) > 1:
@@ -685,8 +647,8 @@ def _power_law(x: NDArray, points: NDArray, values: NDArray) -> NDArray[np.float
     return np.exp(np.interp(x, points, values))
 
 
-def _one(one: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
+def _same_wave(one: Array, other: Array) -> bool:
     """Return whether two wave vectors belong to one period or its harmonics, irrespective of their sign."""
     angle = np.degrees(np.arctan2(abs(one[0] * other[1] - one[1] * other[0]), abs(one @ other)))
-    apart = np.hypot(*(one - np.copysign(1, one @ other) * other))
-    return bool(angle < _LEAST_ANGLE or apart < _SAME * min(np.hypot(*one), np.hypot(*other)))
+    distance = np.hypot(*(one - np.copysign(1, one @ other) * other))
+    return bool(angle < _LEAST_ANGLE or distance < _SAME * min(np.hypot(*one), np.hypot(*other)))

@@ -14,15 +14,11 @@ from scipy import ndimage
 from scipy.interpolate import RectBivariateSpline, make_interp_spline
 
 from ..errors import RequestError, is_number
-from . import missing
-from .heightfield import HeightField
+from .heightfield import HeightField, harmonic_fill
 from .periods import Period, find_periods
 
-_VISIBLE = 1.5
-"""Ratio of steps above which a seam is visible."""
-
-_LEAST = 0.002
-"""µm; a step of 2 nm scatters (4π·0.002/0.45)² = 0.3 % of the blue light that falls on it."""
+_VISIBLE = 1.5  # ratio of steps above which a seam is visible
+_LEAST = 0.002  # µm; a step of 2 nm scatters (4π·0.002/0.45)² = 0.3 % of the blue light that falls on it
 
 
 def seam_steps(height_field: HeightField) -> dict[str, tuple[float, float]]:
@@ -45,18 +41,10 @@ def seam_matters(steps: dict[str, tuple[float, float]]) -> bool:
     return any(across > max(_VISIBLE * inside, _LEAST) for across, inside in steps.values())
 
 
-_SIDE = 5
-"""Side of the neighbourhood of a pixel, pixels."""
-
-_STANDARD = 1.4826
-"""Standard deviation of a normal distribution over its median absolute deviation."""
-
-_MISFIT = 0.05
-"""Largest misfit of a second wave at the seam, in periods."""
-
-_LEAST_STRENGTH = 0.1
-"""Least strength of a second wave relative to the strongest; a weaker one is ignored."""
-
+_SIDE = 5  # side of the neighbourhood of a pixel, pixels
+_STANDARD = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
+_MISFIT = 0.05  # largest misfit of a second wave at the seam, in periods
+_LEAST_STRENGTH = 0.1  # least strength of a second wave relative to the strongest; a weaker one is ignored
 Step = str | Mapping[str, object]
 """The name of a step, or {name: argument}."""
 
@@ -139,7 +127,7 @@ def despike(height_field: HeightField, threshold: float = 5.0) -> HeightField:
     """
     _check_positive("despike", threshold, "a number of standard deviations")
     gaps = height_field.gaps
-    whole = missing.fill_missing(height_field.heights, height_field.pixel_size)
+    whole = harmonic_fill(height_field.heights, height_field.pixel_size)
     # The surface is extended with its slope beyond the edges; a spike at the very corner is not detected.
     inside = slice(_SIDE // 2, -(_SIDE // 2))
     padded = np.pad(whole, _SIDE // 2, mode="reflect", reflect_type="odd")
@@ -149,7 +137,7 @@ def despike(height_field: HeightField, threshold: float = 5.0) -> HeightField:
     spikes = ~gaps & (excess > threshold * sigma) & (excess > 2 * (highest - lowest))
     cleaned = height_field.heights
     if spikes.any():
-        cleaned = missing.fill_missing(np.where(spikes, np.nan, whole), height_field.pixel_size)
+        cleaned = harmonic_fill(np.where(spikes, np.nan, whole), height_field.pixel_size)
         cleaned = np.where(gaps, np.nan, np.where(spikes, cleaned, height_field.heights))
     told = f"{spikes.sum()} of {spikes.size} pixels beyond {threshold:g} × {sigma * 1e3:.3g} nm"
     return _after(height_field, cleaned, f"despike: {told}")
@@ -165,8 +153,8 @@ def _noise(heights: NDArray[np.float64]) -> float:
 
 
 def fill_missing(height_field: HeightField) -> HeightField:
-    """Fill missing pixels by harmonic interpolation (`missing.fill_missing`)."""
-    filled = missing.fill_missing(height_field.heights, height_field.pixel_size)
+    """Fill missing pixels by harmonic interpolation (`heightfield.harmonic_fill`)."""
+    filled = harmonic_fill(height_field.heights, height_field.pixel_size)
     count = int(height_field.gaps.sum())
     return _after(height_field, filled, f"fill_missing: {count} of {filled.size} pixels", filled=count)
 
@@ -220,7 +208,7 @@ def rotate(height_field: HeightField, degrees: float) -> HeightField:
     x, y = ((np.arange(n) - (n - 1) / 2) * d for n, d in zip(count, (d_x, d_y), strict=True))
     x, y = np.meshgrid(x, y)
     places = np.array([(cos * y - sin * x) / d_y + (rows - 1) / 2, (cos * x + sin * y) / d_x + (columns - 1) / 2])
-    whole = missing.fill_missing(height_field.heights, height_field.pixel_size)
+    whole = harmonic_fill(height_field.heights, height_field.pixel_size)
     # Not ndimage's splines, whose slope vanishes at the edges.
     degree = [min(3, n - 1) for n in (rows, columns)]
     spline = RectBivariateSpline(np.arange(rows), np.arange(columns), whole, kx=degree[0], ky=degree[1])

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from mitsuba_diffraction import HeightField
-from mitsuba_diffraction.surface.missing import fill_missing
+from mitsuba_diffraction.surface.heightfield import harmonic_fill
 
 arrays = hnp.arrays(np.float64, hnp.array_shapes(min_dims=2, max_dims=2, max_side=9), elements=st.floats(-5, 5))
 
@@ -54,7 +54,7 @@ def test_missing_pixels_are_filled_on_request_and_counted(heights, place, bad):
     flat = place.draw(st.sets(st.integers(0, heights.size - 1), max_size=heights.size - 1))
     heights.ravel()[list(flat)] = bad
     field = HeightField(heights, (0.1, 0.2), source="scan.npy", fill_missing=True)
-    np.testing.assert_array_equal(field.heights, fill_missing(heights, (0.1, 0.2)))
+    np.testing.assert_array_equal(field.heights, harmonic_fill(heights, (0.1, 0.2)))
     assert not field.heights.flags.writeable
     assert heights.flags.writeable
     assert field.filled == len(flat)

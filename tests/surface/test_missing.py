@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from mitsuba_diffraction.surface.missing import fill_missing
+from mitsuba_diffraction.surface.heightfield import harmonic_fill
 
 Y, X = np.mgrid[:20, :30].astype(float)
 HARMONIC = {
@@ -58,21 +58,21 @@ def by_relaxation(heights, weight_x, weight_y, sweeps=4000):
 @pytest.mark.parametrize("pixel_size", [(1.0, 1.0), (0.05, 0.2), (3.0, 0.1)])
 def test_harmonic_functions_with_interior_holes_come_back(function, hole, pixel_size):
     heights = function(X * pixel_size[0], Y * pixel_size[1])
-    np.testing.assert_allclose(fill_missing(without(heights, hole), pixel_size), heights, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(harmonic_fill(without(heights, hole), pixel_size), heights, rtol=1e-9, atol=1e-9)
 
 
 def test_only_the_ratio_of_the_pixel_sizes_matters():
     heights = without(np.random.default_rng(0).random(X.shape), INTERIOR["block"])
-    one = fill_missing(heights, (0.1, 0.3))
-    np.testing.assert_allclose(fill_missing(heights, (1e-9, 3e-9)), one, rtol=1e-12)
-    assert np.abs(fill_missing(heights) - one).max() > 0.01
+    one = harmonic_fill(heights, (0.1, 0.3))
+    np.testing.assert_allclose(harmonic_fill(heights, (1e-9, 3e-9)), one, rtol=1e-12)
+    assert np.abs(harmonic_fill(heights) - one).max() > 0.01
 
 
 def test_a_great_offset_costs_no_digits():
     y, x = np.mgrid[:100, :100] / 128  # every height is a number that float64 holds exactly
     offset = 2.0**20
     heights = x - 2 * y + offset
-    filled = fill_missing(without(heights, INTERIOR["all but the frame"]))
+    filled = harmonic_fill(without(heights, INTERIOR["all but the frame"]))
     np.testing.assert_allclose(filled, heights, rtol=0, atol=2 * np.spacing(offset))
 
 
@@ -83,7 +83,7 @@ def test_the_fill_is_that_of_a_relaxation(pixel_size):
     heights[generator.random((9, 11)) < 0.6] = np.nan
     heights[:4, :5] = np.nan  # a hole at a corner
     weights = 1 / np.square(pixel_size)
-    np.testing.assert_allclose(fill_missing(heights, pixel_size), by_relaxation(heights, *weights), atol=1e-12)
+    np.testing.assert_allclose(harmonic_fill(heights, pixel_size), by_relaxation(heights, *weights), atol=1e-12)
 
 
 # ---------------------------------------------------------------- the edge of the array: no slope across it
@@ -100,29 +100,29 @@ def test_the_fill_is_that_of_a_relaxation(pixel_size):
     ids=["left", "right", "top", "bottom"],
 )
 def test_a_plane_that_slopes_along_the_edge_comes_back(plane, hole):
-    np.testing.assert_allclose(fill_missing(without(plane, hole)), plane, atol=1e-9)
+    np.testing.assert_allclose(harmonic_fill(without(plane, hole)), plane, atol=1e-9)
 
 
 def test_a_slope_across_the_edge_ends_at_the_hole():
     plane = 0.4 * X + 0.1 * Y
-    filled = fill_missing(without(plane, (slice(None), slice(0, 4))))
-    slope_along_the_edge_only = fill_missing(without(0.1 * Y, (slice(None), slice(0, 4))))
+    filled = harmonic_fill(without(plane, (slice(None), slice(0, 4))))
+    slope_along_the_edge_only = harmonic_fill(without(0.1 * Y, (slice(None), slice(0, 4))))
     np.testing.assert_allclose(filled, np.maximum(X, 4) * 0.4 + slope_along_the_edge_only, atol=1e-9)
     assert np.abs(filled - plane)[:, 0].min() > 1
 
 
 def test_a_corner_is_the_mean_of_its_two_neighbours():
     heights = without(X + 10 * Y, (0, 0))
-    assert fill_missing(heights)[0, 0] == pytest.approx((1 + 10) / 2, abs=1e-12)
+    assert harmonic_fill(heights)[0, 0] == pytest.approx((1 + 10) / 2, abs=1e-12)
     # Weights 1/d²: the neighbour in the row counts four times as much as that in the column.
-    assert fill_missing(heights, (1.0, 2.0))[0, 0] == pytest.approx((4 * 1 + 10) / 5, abs=1e-12)
+    assert harmonic_fill(heights, (1.0, 2.0))[0, 0] == pytest.approx((4 * 1 + 10) / 5, abs=1e-12)
 
 
 def test_lines_are_interpolated_and_end_level():
     line = [np.nan, np.nan, 1.0, np.nan, np.nan, 4.0, 2.0, np.nan, 3.0, np.nan]
     wanted = [1.0, 1.0, 1.0, 2.0, 3.0, 4.0, 2.0, 2.5, 3.0, 3.0]
-    np.testing.assert_allclose(fill_missing([line]), [wanted], atol=1e-14)
-    np.testing.assert_allclose(fill_missing(np.array([line]).T), np.array([wanted]).T, atol=1e-14)
+    np.testing.assert_allclose(harmonic_fill([line]), [wanted], atol=1e-14)
+    np.testing.assert_allclose(harmonic_fill(np.array([line]).T), np.array([wanted]).T, atol=1e-14)
 
 
 # ---------------------------------------------------------------- every array
@@ -138,7 +138,7 @@ holed = hnp.arrays(
 def test_nothing_rises_above_or_falls_below_the_known_pixels(heights, d_x, d_y):
     known = np.isfinite(heights)
     before = heights.tobytes()
-    filled = fill_missing(heights, (d_x, d_y))
+    filled = harmonic_fill(heights, (d_x, d_y))
     assert filled.shape == heights.shape
     assert filled.min() >= heights[known].min()
     assert filled.max() <= heights[known].max()
@@ -148,7 +148,7 @@ def test_nothing_rises_above_or_falls_below_the_known_pixels(heights, d_x, d_y):
 
 @given(heights=holed)
 def test_a_filled_pixel_is_the_mean_of_its_neighbours(heights):
-    filled = fill_missing(heights)
+    filled = harmonic_fill(heights)
     for row, column in np.argwhere(~np.isfinite(heights)):
         around = [(row - 1, column), (row + 1, column), (row, column - 1), (row, column + 1)]
         there = [filled[p] for p in around if 0 <= p[0] < heights.shape[0] and 0 <= p[1] < heights.shape[1]]
@@ -160,12 +160,12 @@ def test_a_filled_pixel_is_the_mean_of_its_neighbours(heights):
 def test_one_known_pixel_gives_its_height_to_all(place, height):
     heights = np.full((7, 5), np.nan)
     heights[place] = height
-    np.testing.assert_array_equal(fill_missing(heights), np.full((7, 5), height))
+    np.testing.assert_array_equal(harmonic_fill(heights), np.full((7, 5), height))
 
 
 def test_holes_in_a_level_surface_are_level_to_the_bit():
     level = np.full((20, 30), 0.1)
-    np.testing.assert_array_equal(fill_missing(without(level, INTERIOR["every other pixel"])), level)
+    np.testing.assert_array_equal(harmonic_fill(without(level, INTERIOR["every other pixel"])), level)
 
 
 # ---------------------------------------------------------------- what counts as missing
@@ -173,13 +173,13 @@ def test_holes_in_a_level_surface_are_level_to_the_bit():
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_what_is_not_finite_is_missing(value):
-    np.testing.assert_allclose(fill_missing([[1, value, 2]]), [[1, 1.5, 2]], rtol=1e-15)
+    np.testing.assert_allclose(harmonic_fill([[1, value, 2]]), [[1, 1.5, 2]], rtol=1e-15)
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.int16, np.uint8])
 def test_masked_pixels_are_missing_whatever_lies_under_the_mask(dtype):
     heights = np.ma.masked_equal(np.array([[1, 100, 2]], dtype), 100)
-    filled = fill_missing(heights)
+    filled = harmonic_fill(heights)
     assert not np.ma.isMaskedArray(filled)
     assert filled.dtype == np.float64
     np.testing.assert_allclose(filled, [[1, 1.5, 2]], rtol=1e-15)
@@ -187,14 +187,14 @@ def test_masked_pixels_are_missing_whatever_lies_under_the_mask(dtype):
 
 def test_where_nothing_is_missing_the_heights_are_returned():
     heights = np.random.default_rng(2).random((3, 4))
-    assert fill_missing(heights) is heights
-    np.testing.assert_array_equal(fill_missing([[1, 2]]), [[1.0, 2.0]])
+    assert harmonic_fill(heights) is heights
+    np.testing.assert_array_equal(harmonic_fill([[1, 2]]), [[1.0, 2.0]])
 
 
 @pytest.mark.parametrize("heights", [np.full((2, 3), np.nan), [[np.inf]], np.ma.masked_all((4, 5))])
 def test_where_all_are_missing_there_is_nothing_to_fill_from(heights):
     with pytest.raises(ValueError, match=f"all {np.size(heights)} pixels are missing"):
-        fill_missing(heights)
+        harmonic_fill(heights)
 
 
 @pytest.mark.parametrize(
@@ -202,7 +202,7 @@ def test_where_all_are_missing_there_is_nothing_to_fill_from(heights):
 )
 def test_what_is_not_a_plane_of_heights_is_refused(heights):
     with pytest.raises(ValueError, match="heights: got"):
-        fill_missing(heights)
+        harmonic_fill(heights)
 
 
 # ---------------------------------------------------------------- size
@@ -221,6 +221,6 @@ def test_a_hundred_thousand_pixels_are_filled_quickly(shape):
         hole[1 + inner // 510, 1 + inner % 510] = True
     assert hole.sum() >= 100_000
     start = time.perf_counter()
-    filled = fill_missing(without(heights, hole))
+    filled = harmonic_fill(without(heights, hole))
     assert time.perf_counter() - start < 5  # half a second on one core
     np.testing.assert_allclose(filled, heights, atol=1e-9)

@@ -497,7 +497,7 @@ def test_gsf_is_read_at_every_padding(tmp_path, padding):
 
 def test_gsf_without_a_scale_asks_for_it(tmp_path, refuse):
     write_gsf(tmp_path / "scan.gsf", "Gwyddion Simple Field 1.0\nXRes = 3\nYRes = 2\n", HEIGHTS * 1e3)
-    refuse("scan.gsf", "unit: the file names none for its heights")
+    refuse("scan.gsf", "unit: the file names none for the heights")
     refuse("scan.gsf", "pixel_size: the file has none", pixel_size=None, unit="nm")
     field = read_height_field(tmp_path / "scan.gsf", 0.1, unit="nm")
     np.testing.assert_allclose(field.heights, HEIGHTS, rtol=1e-6)
@@ -513,7 +513,7 @@ def test_gsf_without_a_scale_asks_for_it(tmp_path, refuse):
         ("XRes = 3\n", "", "XRes: got none"),
         ("XReal = 3e-6", "XReal = wide", "XReal: got wide"),
         ("XReal = 3e-6", "XReal = -1", "XReal: got -1"),
-        ("ZUnits = m", "ZUnits = V", "ZUnits: got the unit 'V'"),
+        ("ZUnits = m", "ZUnits = V", "the heights: got the unit 'V'"),
         ("Title = Z", "Title", "wanted 'name = value'"),
     ],
 )
@@ -579,7 +579,7 @@ def test_points_that_are_no_grid_are_refused(tmp_path, refuse, text, message):
 
 def test_points_need_a_unit_and_a_line_a_pixel_size(tmp_path, refuse):
     (tmp_path / "scan.xyz").write_text(points())
-    refuse("scan.xyz", "unit: .xyz names none")
+    refuse("scan.xyz", "unit: the file names none for its lengths")
     (tmp_path / "scan.xyz").write_text(points(HEIGHTS[:1]))
     refuse("scan.xyz", "pixel_size: the file has none", pixel_size=None, unit="um")
     assert read_height_field(tmp_path / "scan.xyz", (0.1, 1.0), unit="um").shape == (1, 3)
@@ -631,7 +631,7 @@ def test_an_esri_grid_comes_from_the_top_down(tmp_path, refuse):
     field = read_height_field(tmp_path / "scan.asc", unit=("um", "nm"), keep_missing=True)
     np.testing.assert_allclose(field.heights, np.array([[4, np.nan, 6], [1, 2, 3]]) * 1e-3)
     assert field.pixel_size == pytest.approx((0.1, 0.1))
-    refuse("scan.asc", "unit: an ESRI grid names none")
+    refuse("scan.asc", "unit: the file names none for its lengths")
     (tmp_path / "scan.asc").write_text(ESRI + "1 2 3\n")
     refuse("scan.asc", "got 1 lines of 3, wanted 2 of 3", unit="um")
     (tmp_path / "scan.asc").write_text("ncols 3\nnrows\n1 2 3\n")

@@ -17,14 +17,12 @@ from numpy.typing import NDArray
 from ...errors import RequestError
 from ...files import refuse_special
 from ..heightfield import HeightField
-from . import gwyddion, instruments, pictures, simple_field, text
+from . import gwyddion, instruments, pictures, text
 from .scan import Scan
 
 __all__ = ["read_height_field"]
 
-_SHOWN = 300
-"""Longest error text of a library to quote, characters: some quote a damaged header in full."""
-
+_SHOWN = 300  # longest error text of a library to quote, characters: some quote a damaged header in full
 _WITHOUT_UNIT = {
     ".npy": pictures.read_npy,
     ".npz": pictures.read_npz,
@@ -34,9 +32,8 @@ _WITHOUT_UNIT = {
 }
 """Extension → reader of formats with heights in µm, or scaled by `height_range`."""
 
-_WITH_UNIT = {".gsf": simple_field.read, ".xyz": text.read_points, ".asc": text.read_table}
-"""Extension → reader of single-channel formats with a unit."""
-
+# Extension → reader of single-channel formats with a unit.
+_WITH_UNIT = {".gsf": gwyddion.read_simple_field, ".xyz": text.read_points, ".asc": text.read_table}
 _EXTENSIONS = (*_WITHOUT_UNIT, ".gwy", *_WITH_UNIT)
 
 
@@ -68,8 +65,8 @@ def read_height_field(
         pixel_size: µm, one number or (x, y). Overrides that of the file; required if the file has none.
         height_range: height of the full range of the integer type (black to white), µm; heights start at zero.
             For integers only.
-        fill_missing: interpolate NaN or infinite pixels (`missing.fill_missing`) instead of refusing them. `source` and
-            `filled` of the height field report their number.
+        fill_missing: interpolate NaN or infinite pixels (`heightfield.harmonic_fill`), do not refuse them; `source`
+            and `filled` of the height field report their number.
         channel: of a file with several (.gwy and instrument formats), by name or number. None selects the one that
             holds lengths, or the first of those named height or topography; `source` reports which.
         unit: of lengths, e.g. "nm", for a file without one; ("um", "nm") if lateral lengths and heights differ.

@@ -1,9 +1,11 @@
-"""Gwyddion's own files (.gwy): a tree of named components in binary.
+"""Gwyddion's own files: .gwy, a tree of named components in binary, and .gsf, a header of text and 32 bit floats.
 
-The format: Gwyddion user guide, "Gwyddion native file format",
-http://gwyddion.net/documentation/user-guide-en/gwyfile-format.html. An object is its name, a zero byte, the number of
-bytes that follow (uint32) and its components; a component is its name, a zero byte, a letter for its type, and its
-value. All numbers are little-endian. Every size is checked against the remaining bytes before it is used.
+The formats: Gwyddion user guide, "Gwyddion native file format" and "Simple field files",
+http://gwyddion.net/documentation/user-guide-en/gwyfile-format.html and gsf.html.
+
+An object of a .gwy file is its name, a zero byte, the number of bytes that follow (uint32) and its components; a
+component is its name, a zero byte, a letter for its type, and its value. All numbers are little-endian. Every size is
+checked against the remaining bytes before it is used.
 """
 
 from __future__ import annotations
@@ -25,9 +27,12 @@ _ARRAYS = {"C": 1, "I": 4, "Q": 8, "D": 8}  # bytes of an element
 _FIELD, _TITLE = re.compile(r"/(\d{1,9})/data"), re.compile(r"/(\d{1,9})/data/title")
 _LONGEST_NAME = 4096
 
+_SIMPLE = b"Gwyddion Simple Field 1.0\n"
+_LONGEST_HEADER = 2**20
+
 
 def read(path: Path, unit: str | tuple[str, str] | None, channel: str | int | None) -> Scan:
-    """Read one data field; the top row of its image is row 0. Masks are ignored.
+    """Read one data field of a .gwy file; the top row of its image is row 0. Masks are ignored.
 
     Raises:
         ValueError: if it is not a Gwyddion file, is truncated, or has no such channel.
@@ -47,22 +52,15 @@ def read(path: Path, unit: str | tuple[str, str] | None, channel: str | int | No
             fields[int(match[1])] = dict(value[1].components())
         elif (match := _TITLE.fullmatch(name)) and isinstance(value, str):
             titles[int(match[1])] = value
-    given = scan.pair(unit)
-    described = {n: (_unit(field, "si_unit_xy") or given[0], _unit(field, "si_unit_z")) for n, field in fields.items()}
-    channels = [
-        Channel(n, titles.get(n, "untitled"), scan.is_length(z) or not z) for n, (_, z) in sorted(described.items())
-    ]
+    units = {n: _unit(field, "si_unit_z") for n, field in fields.items()}
+    channels = [Channel(n, titles.get(n, "untitled"), scan.is_length(z) or not z) for n, z in sorted(units.items())]
     chosen = choose(channels, channel)
-    along, high = described[chosen.number]
-    high = high or given[1]
-    for what, one in (("heights", high), ("width", along)):
-        if not one:
-            raise RequestError(f"unit: the file names none for the {what}, wanted one of {scan.UNITS}")
-    heights, size = _heights(fields[chosen.number])
-    scale = scan.micrometres(along, "the width")
+    field, (given_along, given_high) = fields[chosen.number], scan.pair(unit)
+    high = scan.scale(units[chosen.number], given_high, "the heights")
+    along = scan.scale(_unit(field, "si_unit_xy"), given_along, "the width")
+    heights, size = _heights(field)
     rows, columns = heights.shape
-    pixel_size = (size[0] * scale / columns, size[1] * scale / rows)
-    return Scan(heights * scan.micrometres(high, "the heights"), pixel_size, chosen.name)
+    return Scan(heights * high, (size[0] * along / columns, size[1] * along / rows), chosen.name)
 
 
 def _heights(field: dict[str, object]) -> tuple[NDArray[np.float64], tuple[float, float]]:
@@ -144,3 +142,62 @@ class _Bytes:
             raise RequestError("a text without an end: truncated or damaged")
         start = self._skip(zero + 1 - self._place)
         return self._data[start:zero].decode("utf-8")
+
+
+def read_simple_field(path: Path, unit: str | tuple[str, str] | None) -> Scan:
+    """Read the field of a .gsf file; the top row of its image is row 0.
+
+    Raises:
+        ValueError: if it is not in this format, or truncated.
+    """
+    with path.open("rb") as file:
+        head = file.read(_LONGEST_HEADER)
+        if not head.startswith(_SIMPLE):
+            raise RequestError("not a Gwyddion Simple Field, which begins with 'Gwyddion Simple Field 1.0'")
+        end = head.find(b"\0")
+        if end < 0:
+            raise RequestError("the header does not end: a truncated file")
+        fields = _fields(head[len(_SIMPLE) : end])
+        columns, rows = (_count(fields, name) for name in ("XRes", "YRes"))
+        if 4 * rows * columns > MOST_BYTES:
+            raise RequestError(f"got {columns} × {rows} pixels, wanted at most {MOST_BYTES} bytes")
+        start = end + 4 - end % 4
+        size = path.stat().st_size
+        if size != start + 4 * rows * columns:
+            raise RequestError(f"got {size} bytes, wanted {start + 4 * rows * columns} for {columns} × {rows} pixels")
+        file.seek(start)
+        numbers = np.frombuffer(file.read(4 * rows * columns), "<f4").reshape(rows, columns)
+    along, high = scan.pair(unit)
+    heights = numbers.astype(np.float64) * scan.scale(fields.get("ZUnits", ""), high, "the heights")
+    pixel_size = None
+    if "XReal" in fields and "YReal" in fields:
+        scale = scan.scale(fields.get("XYUnits", ""), along, "the width")
+        pixel_size = (_length(fields, "XReal") * scale / columns, _length(fields, "YReal") * scale / rows)
+    return Scan(heights, pixel_size, fields.get("Title", ""))
+
+
+def _fields(header: bytes) -> dict[str, str]:
+    fields = {}
+    for line in header.decode("utf-8").splitlines():
+        name, equals, value = line.partition("=")
+        if not equals:
+            raise RequestError(f"the header: got the line {line[:60]!r}, wanted 'name = value'")
+        fields[name.strip()] = value.strip()
+    return fields
+
+
+def _count(fields: dict[str, str], name: str) -> int:
+    text = fields.get(name, "none")
+    if not (text.isascii() and text.isdecimal() and len(text) < 10 and int(text) > 0):
+        raise RequestError(f"{name}: got {text}, wanted a number of pixels")
+    return int(text)
+
+
+def _length(fields: dict[str, str], name: str) -> float:
+    try:
+        value = float(fields[name])
+    except ValueError:
+        value = np.nan
+    if not (np.isfinite(value) and value > 0):
+        raise RequestError(f"{name}: got {fields[name]}, wanted a positive length")
+    return value

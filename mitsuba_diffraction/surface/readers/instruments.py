@@ -86,21 +86,17 @@ def read(path: Path, unit: str | tuple[str, str] | None, channel: str | int | No
         source = found[[c.index for c in found].index(chosen.number)]
         if 8 * int(np.prod(source.nb_grid_pts, dtype=object)) > MOST_BYTES:
             raise RequestError(f"got {source.nb_grid_pts} pixels, wanted at most {MOST_BYTES} bytes")
-        given = scan.pair(unit)
-        own = source.unit is not None
-        if not own and not given[0]:
-            raise RequestError(f"unit: the file names none, wanted one of {scan.UNITS}")
+        given, own = scan.pair(unit), source.unit or ""
+        along, high = (scan.scale(own, one, "its lengths") for one in given)
         try:
             topography = source.topography() if own else source.topography(unit=given[0])
             heights = np.ma.asarray(topography.heights(), np.float64).T
             size = topography.physical_sizes
         except Exception as error:
             raise RequestError(f"a damaged file ({_told(error)})") from None
-    along, high = (source.unit, source.unit) if own else given
     rows, columns = heights.shape
-    scale = scan.micrometres(along, "the file")
-    pixel_size = (size[0] * scale / columns, size[1] * scale / rows) if size is not None else None
-    return Scan(heights * scan.micrometres(high, "the file"), pixel_size, chosen.name)
+    pixel_size = (size[0] * along / columns, size[1] * along / rows) if size is not None else None
+    return Scan(heights * high, pixel_size, chosen.name)
 
 
 def _refuse_bomb(path: Path) -> None:

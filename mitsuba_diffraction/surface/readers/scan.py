@@ -43,6 +43,19 @@ def micrometres(unit: str, what: str) -> float:
     return _MICROMETRES[unit.strip()]
 
 
+def scale(own: str, given: str, what: str) -> float:
+    """Return the unit of a file, or else the given one, in µm.
+
+    Raises:
+        ValueError: if there is neither, or it is not a unit of length.
+    """
+    if not (own or given):
+        raise RequestError(
+            f"unit: the file names none for {what}, wanted one of {UNITS} (or two: along the surface, of the heights)"
+        )
+    return micrometres(own or given, what)
+
+
 def pair(unit: str | tuple[str, str] | None) -> tuple[str, str]:
     """Return the given units of lateral lengths and heights; empty if none.
 
@@ -65,8 +78,8 @@ MOST_BYTES = 2**31
 DAMAGED = (SyntaxError, TypeError, KeyError, EOFError, IndexError, OverflowError, struct.error, UserWarning)
 """Raised by Pillow and NumPy for damaged files, in addition to OSError and ValueError."""
 
+# Names of the height channel in instrument files.
 _HEIGHT_NAMES = ("height", "topograph", "z-axis", "zsensor", "z sensor")
-"""Names of the height channel in instrument files."""
 
 
 @dataclass(frozen=True)

@@ -34,12 +34,8 @@ from ...errors import RequestError
 from . import scan
 from .scan import MOST_BYTES, Scan
 
-_OFF_GRID = 0.1
-"""Largest deviation of a coordinate from the grid, in pixels, owing to rounding in text."""
-
-_FEWEST_POINTS = 0.25
-"""Least fraction of grid positions with a point."""
-
+_OFF_GRID = 0.1  # largest deviation of a coordinate from the grid, in pixels, owing to rounding in text
+_FEWEST_POINTS = 0.25  # least fraction of grid positions with a point
 _GWYDDION = re.compile(r"#\s*(Channel|Width|Height|Value units):(.*)")
 _LENGTH = re.compile(r"([-+.\deE]*)(.*)")
 _ESRI = ("ncols", "nrows", "xllcorner", "yllcorner", "xllcenter", "yllcenter", "cellsize", "nodata_value")
@@ -54,11 +50,7 @@ def read_points(path: Path, unit: str | tuple[str, str] | None) -> Scan:
     points = _table(_text(path))
     if points.shape[1] != 3:
         raise RequestError(f"got {points.shape[1]} numbers in a line, wanted three: x y z")
-    along, high = scan.pair(unit)
-    if not along:
-        raise RequestError(
-            f"unit: .xyz names none, wanted one of {scan.UNITS} (two: along the surface, of the heights)"
-        )
+    along, high = (scan.scale("", given, "its lengths") for given in scan.pair(unit))
     if not np.isfinite(points[:, :2]).all():
         raise RequestError("got a point without x or y")
     (column, columns, d_x), (row, rows, d_y) = (_grid(points[:, axis], name) for axis, name in enumerate("xy"))
@@ -69,9 +61,8 @@ def read_points(path: Path, unit: str | tuple[str, str] | None) -> Scan:
         raise RequestError("two points at one place: wanted a regular grid along x and y")
     heights = np.full(rows * columns, np.nan)
     heights[place] = points[:, 2]
-    scale = scan.micrometres(along, "unit")
-    pixel_size = (d_x * scale, d_y * scale) if d_x and d_y else None  # a single line determines only one of them
-    return Scan(heights.reshape(rows, columns) * scan.micrometres(high, "unit"), pixel_size)
+    pixel_size = (d_x * along, d_y * along) if d_x and d_y else None  # a single line determines only one of them
+    return Scan(heights.reshape(rows, columns) * high, pixel_size)
 
 
 def read_table(path: Path, unit: str | tuple[str, str] | None) -> Scan:
@@ -90,13 +81,11 @@ def read_table(path: Path, unit: str | tuple[str, str] | None) -> Scan:
     if not header and columns == 3 and _may_be_points(heights):
         raise RequestError("three numbers a line that may be points x y z: wanted the extension .xyz for points")
     along, high = scan.pair(unit)
-    high = header.get("Value units", high)
-    if not high:
-        raise RequestError(f"unit: the file names none, wanted one of {scan.UNITS}")
+    scale = scan.scale(header.get("Value units", ""), high, "the heights")
     pixel_size = None
     if "Width" in header and "Height" in header:
         pixel_size = (_length(header["Width"], along) / columns, _length(header["Height"], along) / rows)
-    return Scan(heights * scan.micrometres(high, "Value units"), pixel_size, header.get("Channel", ""))
+    return Scan(heights * scale, pixel_size, header.get("Channel", ""))
 
 
 def _esri(text: str, unit: str | tuple[str, str] | None) -> Scan:
@@ -112,11 +101,7 @@ def _esri(text: str, unit: str | tuple[str, str] | None) -> Scan:
             raise RequestError(f"the header: got the line {line[:60]!r}, wanted a name and a number") from None
     if not {"ncols", "nrows", "cellsize"} <= header.keys():
         raise RequestError(f"the header of an ESRI grid: got {', '.join(header)}, wanted ncols, nrows and cellsize")
-    along, high = scan.pair(unit)
-    if not along:
-        raise RequestError(
-            f"unit: an ESRI grid names none, wanted one of {scan.UNITS} (two: along the surface, of the heights)"
-        )
+    along, high = (scan.scale("", given, "its lengths") for given in scan.pair(unit))
     heights = _table("\n".join(lines[len(header) :]))
     if heights.shape != (header["nrows"], header["ncols"]):
         raise RequestError(
@@ -124,8 +109,7 @@ def _esri(text: str, unit: str | tuple[str, str] | None) -> Scan:
         )
     if "nodata_value" in header:
         heights = np.where(heights == header["nodata_value"], np.nan, heights)
-    cell = header["cellsize"] * scan.micrometres(along, "unit")
-    return Scan(heights[::-1] * scan.micrometres(high, "unit"), cell)
+    return Scan(heights[::-1] * high, header["cellsize"] * along)
 
 
 def _text(path: Path) -> str:
