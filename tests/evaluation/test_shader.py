@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import mitsuba_diffraction as md
+from mitsuba_diffraction.evaluation.finite_tiles import finite_tiles_spectrum, tile_factor
 from mitsuba_diffraction.evaluation.realtime_shader import tristimulus
 from mitsuba_diffraction.evaluation.realtime_shader.evaluate import VARIANTS, colour, relative_radiance, shader_for
 from mitsuba_diffraction.evaluation.realtime_shader.picture import Emission, decode, encode
@@ -16,7 +17,6 @@ from mitsuba_diffraction.evaluation.realtime_shader.quirks import Quirks
 from mitsuba_diffraction.evaluation.realtime_shader.taylor_textures import taylor_transforms
 from mitsuba_diffraction.evaluation.realtime_shader.tiling import tile_factor as tile_factor_drjit
 from mitsuba_diffraction.evaluation.realtime_shader.tiling import tiling_power
-from mitsuba_diffraction.reference import tile_factor
 from mitsuba_diffraction.render.scene import root_cause
 from mitsuba_diffraction.testing import array, vectors
 
@@ -229,7 +229,7 @@ def test_pq_of_n_tiles_is_the_transform_of_their_surface(surface, tiles):
     nanometres = np.full(150, 600.0)
     q = -(wi + wo)[:, :2] / 0.6
     area = np.prod(surface.tile_size) * np.prod(tiles)
-    s = md.reference.finite_tiles_spectrum(surface, q, kappa_of(wi, wo, nanometres), tiles=tiles) / area
+    s = finite_tiles_spectrum(surface, q, kappa_of(wi, wo, nanometres), tiles=tiles) / area
     reach = max(surface.shape)
     settings = dict(variant="pq", quirks=CORRECTED, tiles=tiles, reach=reach)
     rho = relative_radiance(surface, wi, wo, nanometres, **settings)

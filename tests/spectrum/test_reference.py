@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from scipy.special import erfc, jv
 
 from mitsuba_diffraction import HeightField, gratings
-from mitsuba_diffraction.reference import amplitudes, finite_tiles_spectrum, order_powers, power_spectrum
+from mitsuba_diffraction.evaluation.finite_tiles import finite_tiles_spectrum
+from mitsuba_diffraction.reference import amplitudes, order_powers, power_spectrum
 from mitsuba_diffraction.settings import lobe_width
 from mitsuba_diffraction.spectrum.sample import window_axes
 

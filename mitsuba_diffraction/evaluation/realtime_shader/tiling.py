@@ -9,7 +9,7 @@ _AT_INTEGER = 2.0**-13.5  # a quarter of √ε in float32
 
 
 def tile_factor(x: mi.Float, count: int) -> mi.Float:
-    """Compute D(x; N) = sin(πNx)/sin(πx), as derived in `mitsuba_diffraction.reference.tile_factor`.
+    """Compute D(x; N) = sin(πNx)/sin(πx), as derived in `finite_tiles.tile_factor`.
 
     With k the integer nearest to x and r = x − k,
 

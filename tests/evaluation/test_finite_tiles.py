@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mitsuba_diffraction.reference import tile_factor
+from mitsuba_diffraction.evaluation.finite_tiles import tile_factor
 
 counts = st.integers(1, 4096)
 
