@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 
+import numpy as np
+
 from .errors import RequestError
 from .files import cache_folder
 from .grating_spectrum import GratingSpectrum
@@ -15,7 +17,6 @@ from .rigorous.spectrum import FORMAT as RIGOROUS_FORMAT
 from .rigorous.spectrum import RigorousSpectrum
 from .settings import SUN_COHERENCE_LENGTH, VISIBLE, Settings
 from .spectrum import build as scalar
-from .spectrum.patches import check_patches
 from .surface.heightfield import HeightField
 
 Spectrum = GratingSpectrum | RigorousSpectrum
@@ -79,7 +80,7 @@ def precompute(
         transmission=transmission,
     )
     patches = (height_field,) if isinstance(height_field, HeightField) else tuple(height_field)
-    check_patches(patches, extent)
+    _check_patches(patches, extent)
     height_range = max(patch.height_range for patch in patches)
     if height_range > largest_height_range:
         raise RequestError(
@@ -93,6 +94,18 @@ def precompute(
             f"theory: got rigorous and {len(patches)} patches ({patches[0].source}, …), wanted one, of one row"
         )
     return rigorous.build_spectrum(patches[0], settings, progress, cache_folder())
+
+
+def _check_patches(height_fields: Sequence[HeightField], extent: str) -> None:
+    """Raise RequestError unless there is one patch, or several of one size that repeat."""
+    if not height_fields:
+        raise RequestError("patches: got none, wanted at least one")
+    if len(height_fields) > 1 and extent != "tile":
+        raise RequestError(f"patches: got {len(height_fields)} with extent {extent!r}, wanted 1, or extent 'tile'")
+    first = height_fields[0]
+    for field in height_fields[1:]:
+        if field.shape != first.shape or not np.allclose(field.tile_size, first.tile_size, rtol=1e-9):
+            raise RequestError(f"patches: got {field!r} beside {first!r}, wanted patches of one size")
 
 
 def load_spectrum(path: str | os.PathLike[str], recipe: str | None = None) -> Spectrum:

@@ -1,9 +1,8 @@
 """The range of scalar theory: its efficiencies in closed form, and their deviation from rigorous ones.
 
 Scalar theory treats each facet of the surface as a plane mirror (tangent-plane approximation), which holds if the
-surface varies slowly on the scale of a wavelength. Stored rigorous results quantify the error: a map over
-period/λ and depth/λ by the solver of `rigorous` (`precompute/scalar_theory_map.py`), and single gratings, which also
-check that map, by coupled-wave analysis (`precompute/rigorous_reference.py`).
+surface varies slowly on the scale of a wavelength. A stored map quantifies its error over period/λ and depth/λ, by the
+solver of `rigorous` (`precompute/scalar_theory_map.py`).
 """
 
 from __future__ import annotations
@@ -13,7 +12,6 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -36,24 +34,17 @@ Array = NDArray[np.float64]
 OrderPowers = Callable[[NDArray[np.int64], Array], Array]
 """(m, κ), broadcast against each other → η_m(κ)."""
 
-STORED = Path(__file__).parent / "data" / "rigorous.json"
-MAP = STORED.with_name("scalar_error.json")
+MAP = Path(__file__).parent / "data" / "scalar_error.json"
 
+# For which the error of a surface is reported; the map is the same for ±20°.
 INDEX = 1.5
-ANGLES = (0.0, 20.0, -20.0)
-"""Degrees of incidence for which the error of a surface is reported; the map is the same for ±20°."""
-
-WAVELENGTHS = (0.45, 0.55, 0.65)
-"""µm."""
-
+ANGLES = (0.0, 20.0, -20.0)  # of incidence, degrees
+WAVELENGTHS = (0.45, 0.55, 0.65)  # µm
 RANGE = "mean over 450–650 nm and 0–20°, n = 1.5"
 
-TRUSTED = 0.1
-"""Error above which a surface is considered outside the range of scalar theory."""
-
+TRUSTED = 0.1  # error above which a surface is considered outside the range of scalar theory
+# R.m.s. factor between the error estimated from the map and that of 48 solved profiles; docs/validation.md.
 ESTIMATE_FACTOR = 1.4
-"""R.m.s. factor between the error estimated from the map and that of 48 solved profiles; docs/validation.md."""
-
 _CONVERGED = 1e-2
 
 
@@ -230,12 +221,6 @@ def _mirror_orders(
     return m, leaving, factor, np.sqrt(d / 2)
 
 
-@functools.cache
-def stored() -> dict[str, Any]:
-    """Return the stored rigorous results, as `precompute/rigorous_reference.py` wrote them."""
-    return json.loads(STORED.read_text(encoding="utf-8"))
-
-
 def difference(scalar: ArrayLike, rigorous: ArrayLike) -> float:
     """Return the L1 difference of efficiencies relative to the rigorously reflected power: Σ|Δη_m| / Σ η_m."""
     scalar, rigorous = np.asarray(scalar), np.asarray(rigorous)
@@ -393,14 +378,10 @@ def _solved_error(profile: HeightField) -> tuple[float, float]:
                 return float("nan"), float("nan")
             scalar = scalar_orders(powers, period, wavelength, angle, INDEX)
             _, passed = transmitted_orders(powers, period, wavelength, angle, INDEX)
-            errors.append(
-                (
-                    difference(scalar.unpolarised, exact.unpolarised),
-                    difference(passed, exact.transmitted_unpolarised),
-                )
-            )
-    reflected, on = np.mean(errors, axis=0)
-    return float(reflected), float(on)
+            reflected = difference(scalar.unpolarised, exact.unpolarised)
+            errors.append((reflected, difference(passed, exact.transmitted_unpolarised)))
+    of_reflected, of_transmitted = np.mean(errors, axis=0)
+    return float(of_reflected), float(of_transmitted)
 
 
 def _estimated_error(lengths: Array, power: Array, depth: float, material: str) -> float:

@@ -20,8 +20,8 @@ import numpy as np
 from coupled_waves import Efficiencies, converged
 from rich.progress import track
 
+from mitsuba_diffraction.evaluation.validation.coupled_waves import STORED
 from mitsuba_diffraction.files import whole_file
-from mitsuba_diffraction.scalar_theory import STORED
 
 DIELECTRIC = 1.5
 TOLERANCE = 3e-3

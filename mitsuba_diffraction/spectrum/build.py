@@ -16,7 +16,6 @@ from ..progress import Progress, part
 from ..settings import Settings, lobe_reach, lobe_width
 from ..surface.heightfield import HeightField
 from .orders import LobeAxis
-from .patches import MeanPowers
 from .power_spectrum import TAIL_SHARE, PowerSpectrum
 from .sample import SamplePowers, carried_coherence_length, standard_error
 from .spline_grid import inner
@@ -37,7 +36,7 @@ from .tables import (
     taylor,
     to_polynomial,
 )
-from .tile import TilePowers, TileSplines
+from .tile import MeanPowers, TilePowers, TileSplines
 
 # Shares of the tolerance.
 _DROP_SHARE = 0.1  # weak frequencies

@@ -1,7 +1,8 @@
-"""The power of each order of a tile that repeats for ever."""
+"""The powers of a tile that repeats for ever: of each order, their mean over several tiles, and B-splines."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
@@ -9,9 +10,14 @@ import scipy.fft
 import scipy.linalg
 from numpy.typing import NDArray
 
+from ..progress import Progress
 from ..surface.heightfield import HeightField
 from .orders import OrderGrid
 from .spline_grid import SplineGrid, inner, spline
+from .tables import chebyshev_nodes, chebyshev_polynomials, chebyshev_transform, nodes_for, position
+
+# Where the interpolation in κ is compared with direct sums, parts of the largest κ.
+_CHECKED = (0.137, 0.618, 0.983)
 
 
 class TilePowers:
@@ -52,9 +58,67 @@ class TilePowers:
         return float(exact.sum() - inside.sum() + np.abs(np.maximum(powers, 0) - inside).sum()) + self.own_error
 
 
+class MeanPowers(TilePowers):
+    """(1/P) Σ_p η_m(κ) of P patches that each repeat: the mean over the many patches that a pixel covers.
+
+    Powers are band-limited in κ by the height range, so that their values at Chebyshev nodes give them everywhere
+    (Jacobi–Anger); transforming every patch anew for every κ would take ten times as long. The transforms at the nodes
+    are in single precision. What that and the interpolation change is measured against direct sums in double precision
+    and added to the error of a table.
+    """
+
+    def __init__(
+        self,
+        height_fields: Sequence[HeightField],
+        reach: float,
+        lobe_radius: float,
+        largest_kappa: float,
+        tolerance: float,
+        progress: Progress,
+    ) -> None:
+        """Take patches of one size; reach and radius as `TilePowers`; the largest κ in rad/µm; and the tolerance.
+
+        `progress` is called with the patches done and in all.
+        """
+        super().__init__(height_fields[0], reach, lobe_radius)
+        self._largest_kappa = largest_kappa
+        height_range = max(field.height_range for field in height_fields)
+        self._nodes = nodes_for(largest_kappa * height_range / 2, 0.01 * tolerance)
+        total = np.zeros((self._nodes, *self.grid.shape))
+        checked = np.zeros((len(_CHECKED), *self.grid.shape))
+        for number, field in enumerate(height_fields, 1):
+            heights = field.centred.astype(np.float32)
+            for j, kappa in enumerate((1 + chebyshev_nodes(self._nodes)) / 2 * largest_kappa):
+                total[j] += self.grid.take(_powers_float32(heights, kappa))
+            one = TilePowers(field, reach, lobe_radius)
+            for j, share in enumerate(_CHECKED):
+                checked[j] += one(share * largest_kappa)
+            progress(number, len(height_fields))
+        flat = total.reshape(self._nodes, -1) / len(height_fields)
+        self._coefficients = chebyshev_transform(self._nodes) @ flat
+        self.own_error = max(
+            float(np.abs(self(share * largest_kappa) - direct / len(height_fields)).sum())
+            for share, direct in zip(_CHECKED, checked, strict=True)
+        )
+
+    def __call__(self, kappa: float) -> NDArray[np.float64]:
+        """Compute the mean of η_m(κ), (rows, columns); κ in rad/µm."""
+        values = chebyshev_polynomials(position(np.array([kappa]), self._largest_kappa), self._nodes)
+        return (values @ self._coefficients).reshape(self.grid.shape)
+
+
 def _powers(height_field: HeightField, kappa: float) -> NDArray[np.float64]:
     """Compute η_m(κ) = |F_m|² of all orders, (N_y, N_x), as in `scipy.fft.fftfreq`."""
     transform = scipy.fft.fft2(np.exp(1j * kappa * height_field.centred), norm="forward", overwrite_x=True)
+    return transform.real**2 + transform.imag**2
+
+
+def _powers_float32(heights: NDArray[np.float32], kappa: float) -> NDArray[np.float32]:
+    """Compute η_m(κ) of all orders in single precision, (N_y, N_x), as in `scipy.fft.fftfreq`."""
+    phase = np.float32(kappa) * heights
+    wave = np.empty(heights.shape, np.complex64)
+    wave.real, wave.imag = np.cos(phase), np.sin(phase)
+    transform = scipy.fft.fft2(wave, norm="forward", overwrite_x=True)
     return transform.real**2 + transform.imag**2
 
 

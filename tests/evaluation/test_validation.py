@@ -255,7 +255,7 @@ def test_the_expected_error_is_nan_where_it_does_not_hold():
 
 
 def test_stored_results_conserve_energy_and_are_converged():
-    content = scalar_theory.stored()
+    content = coupled_waves.stored()
     for result in [*content["cases"], *content["map"]]:
         if result["lost"] is not None:
             assert result["lost"] < 1e-5
@@ -276,12 +276,12 @@ def solver(monkeypatch, name="coupled_waves"):
 def test_the_script_of_the_stored_results_runs(monkeypatch, tmp_path):
     maker = solver(monkeypatch, "rigorous_reference")
     jobs = maker.all_jobs()
-    assert len(jobs) == len(coupled_waves.cases()) + len(scalar_theory.stored()["map"])
+    assert len(jobs) == len(coupled_waves.cases()) + len(coupled_waves.stored()["map"])
     # As it does, on the two that are quickest.
     grating = next(j for j in jobs if j.get("profile") == "sinusoidal" and (j["period"], j["depth"]) == (1.75, 0.1))
     monkeypatch.setenv("PYTHONPATH", str(PRECOMPUTE))
     maker.make(tmp_path / "made.json", [grating, next(j for j in jobs if "profile" not in j)], workers=1)
-    made, stored = json.loads((tmp_path / "made.json").read_text("utf-8")), scalar_theory.stored()
+    made, stored = json.loads((tmp_path / "made.json").read_text("utf-8")), coupled_waves.stored()
     assert made.keys() == stored.keys()
     (case,), (point,) = made["cases"], made["map"]
     np.testing.assert_allclose(
