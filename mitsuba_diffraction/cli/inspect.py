@@ -13,8 +13,8 @@ from rich.text import Text
 
 from ..inspection import Inspection, save_picture
 from ..inspection import inspect as look
+from ..inspection.colours import GREEN
 from ..inspection.picture import with_uncertainty
-from ..inspection.uncertainty import GREEN
 from ..outputs import free_name, save_json
 from ..settings import SUN_COHERENCE_LENGTH, lobe_width
 from .arguments import Overwrite, check_suffix, claim

@@ -1,30 +1,36 @@
-"""Predicted colours: against the viewing angle, and the share and the colour of single orders.
+"""Predicted colours: against the viewing angle, of single orders, and their uncertainty.
 
 All in the plane of incidence that holds the wave vector of the main period, for a surface that reflects all wavelengths
 alike (R = 1), under daylight (D65), without the energy factor E:
 
     L(λ) ∝ D65(λ) K G S(q e; κ)/λ² · cos θ_i,    q = (sin θ_i − sin θ_o)/λ,    κ = 2π (cos θ_i + cos θ_o)/λ
 
-Angles are positive on the side opposite to the light: the specular direction is θ_o = θ_i.
+Angles are positive on the side opposite to the light: the specular direction is θ_o = θ_i. The uncertainty is the
+effect of ±5 % of the height scale, the pixel size and the tip's broadening.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import grey_dilation, grey_erosion
 
-from ..color import daylight, spectrum_to_XYZ
+from ..color import daylight, delta_E, spectrum_to_XYZ
+from ..errors import RequestError
 from ..geometry import k_g
 from ..grating_spectrum import GratingSpectrum
 from ..settings import VISIBLE
+from ..surface.heightfield import HeightField
+from ..surface.periods import Period, find_periods
 
 Array = NDArray[np.float64]
 
-WAVELENGTHS = np.arange(VISIBLE[0], VISIBLE[1] + 1, 2.0)
-"""nm; fine enough for the lobes of `LONGEST_COHERENCE`."""
-
-LONGEST_COHERENCE = 20.0
-"""µm. At 65 µm the orders of one wavelength are narrower than a pixel of the picture."""
+LONGEST_COHERENCE = 20.0  # µm; at 65 µm the orders of one wavelength are narrower than a pixel of the picture
+WAVELENGTHS = np.arange(VISIBLE[0], VISIBLE[1] + 1, 2.0)  # nm; fine enough for these lobes
 
 
 def illumination() -> Array:
@@ -108,3 +114,186 @@ def order_share(
         q = (sign * order / period + offset)[:, None, None] * e + offset[None, :, None] * across
         total += spectrum.evaluate(lateral_scale * q, np.float64(height_scale * kappa)).mean()
     return float(total * lateral_scale**2 / period**2)
+
+
+SHARE = 0.05  # the change that is tried, both ways
+GREEN = 0.55  # µm, the wavelength for which orders are reported
+ORDERS = (1, 2)
+
+
+@dataclass(frozen=True)
+class Change:
+    """Change of period and orders with one property of the scan.
+
+    Attributes:
+        what: "height scale", "pixel size" or "tip broadening".
+        by: the change, +0.05 or −0.05.
+        period: of the main period, a share of it.
+        before, after: m → share of the reflected light in the orders ±m, 550 nm at normal incidence.
+        colour: m → ΔE00 in the direction of the order m of 550 nm before the change, on its brighter side. Exposure
+            gives the brighter of the orders half of the luminance of a white sheet before the change.
+        tip_radius: of the tip that broadens the ridges so, µm; NaN for other changes.
+    """
+
+    what: str
+    by: float
+    period: float
+    before: Mapping[int, float]
+    after: Mapping[int, float]
+    colour: Mapping[int, float]
+    tip_radius: float = float("nan")
+
+
+class _View(NamedTuple):
+    """A surface: its spectrum, its period, and how it is scaled."""
+
+    spectrum: GratingSpectrum
+    period: float
+    scale: Mapping[str, float] = {}
+
+
+def changes(
+    height_field: HeightField,
+    spectrum: GratingSpectrum,
+    main: Period,
+    *,
+    extent: str,
+    measured: bool,
+    build: Callable[[HeightField], GratingSpectrum],
+) -> tuple[Change, ...]:
+    """Compute two changes of each kind, + and −; of the tip only if the surface is a scan.
+
+    A blunter and a sharper tip have equal effects on a surface that is equal to its negative, such as a sinusoid or a
+    sawtooth: one widens the ridges, the other the grooves, and h and −h have the same powers.
+
+    Height scale and pixel size scale the arguments of the one spectrum (`radiance`); the tip makes another surface,
+    whose periods and spectrum are computed anew.
+
+    Args:
+        height_field: the surface.
+        spectrum: of it, for wavelengths from 360 nm divided by 1.05.
+        main: its main period.
+        extent: "tile" or "sample".
+        measured: whether it is a scan.
+        build: builds a spectrum with the same settings.
+    """
+    orders = [m for m in ORDERS if order_angle(m, main.period, GREEN) is not None]
+    before = _View(spectrum, main.period)
+    sides = {m: _brighter_side(before, main, m) for m in orders}
+    shares = {m: _share(before, main, m) for m in orders}
+    colours = {m: _XYZ(before, main, sides[m], main.period) for m in orders}
+    brightest = max((XYZ[1] for XYZ in colours.values()), default=1.0)
+    exposure = 0.5 / brightest if brightest > 0 else 1.0
+
+    def change(what: str, by: float, after: _View, tip_radius: float = float("nan")) -> Change:
+        after_shares = {m: _share(after, main, m) for m in orders}
+        colour = {
+            m: float(delta_E(exposure * colours[m], exposure * _XYZ(after, main, sides[m], main.period)))
+            for m in orders
+        }
+        return Change(what, by, after.period / main.period - 1, shares, after_shares, colour, tip_radius)
+
+    found = []
+    for by in (SHARE, -SHARE):
+        found.append(change("height scale", by, _View(spectrum, main.period, {"height_scale": 1 + by})))
+    for by in (SHARE, -SHARE):
+        found.append(change("pixel size", by, _View(spectrum, main.period * (1 + by), {"lateral_scale": 1 + by})))
+    for by in (SHARE, -SHARE) if measured else ():
+        try:
+            other, radius = broadened(height_field, by, extent=extent)
+        except RequestError:
+            continue  # steps from one pixel to the next: no tip is that sharp
+        period = _same_period(find_periods(other, extent=extent), main)
+        found.append(change("tip broadening", by, _View(build(other), period), radius))
+    return tuple(found)
+
+
+def _same_period(found: tuple[Period, ...], main: Period) -> float:
+    """Return the period nearest to the main one in direction, else the main one itself."""
+
+    def angle(other: Period) -> float:
+        return abs((other.direction - main.direction + 90) % 180 - 90)
+
+    nearest = min(found, key=angle, default=main)
+    return nearest.period if angle(nearest) < 10 else main.period
+
+
+def _share(view: _View, main: Period, order: int) -> float:
+    return order_share(view.spectrum, main.direction, view.period, order, GREEN, **view.scale)
+
+
+def _XYZ(view: _View, main: Period, order: int, period: float) -> Array:
+    """Return non-negative XYZ at normal incidence in the direction to which `period` diffracts 550 nm."""
+    light = radiance(view.spectrum, main.direction, 0.0, order_angle(order, period, GREEN), **view.scale)
+    return np.maximum(spectrum_to_XYZ(light, WAVELENGTHS), 0)
+
+
+def _brighter_side(view: _View, main: Period, order: int) -> int:
+    return max((order, -order), key=lambda m: _XYZ(view, main, m, main.period)[1])
+
+
+_HALVINGS = 12
+
+
+def scanned(height_field: HeightField, radius: float, *, extent: str = "sample") -> HeightField:
+    """Return the surface as a tip of this radius records it or, for a negative radius, as it was before.
+
+    The lowest place that a paraboloid ρ²/2r can reach over each point is the dilation of the heights by it; erosion by
+    the same gives back all that the tip touched (Villarrubia 1997, J. Res. NIST 102, 425–454):
+
+        h_r(x) = max_ρ [h(x + ρ) − ρ²/2r],    h_{−r}(x) = min_ρ [h(x + ρ) + ρ²/2r]
+
+    Args:
+        height_field: the surface.
+        radius: r at the apex, µm.
+        extent: a "tile" is continued by itself, a "sample" by its edge.
+
+    Returns:
+        Heights on the same pixels.
+    """
+    heights = height_field.heights
+    mode = "wrap" if extent == "tile" else "nearest"
+    kernel_radius = np.sqrt(2 * abs(radius) * max(height_field.height_range, 1e-12))
+    for axis, pixel in ((1, height_field.pixel_size[0]), (0, height_field.pixel_size[1])):
+        half = min(int(np.ceil(kernel_radius / pixel)), heights.shape[axis] // 2)
+        # A paraboloid is the sum of a parabola along x and one along y: one axis after the other.
+        parabola = -((np.arange(-half, half + 1) * pixel) ** 2) / (2 * abs(radius))
+        structure = parabola[None, :] if axis == 1 else parabola[:, None]
+        heights = (grey_dilation if radius > 0 else grey_erosion)(heights, structure=structure, mode=mode)
+    return HeightField(heights, height_field.pixel_size, height_field.source)
+
+
+def broadened(height_field: HeightField, share: float, *, extent: str = "sample") -> tuple[HeightField, float]:
+    """Return the surface with ridges wider by `share`, and the radius (µm, signed) of the tip that widens them so.
+
+    The width of ridges is measured by the area above mid-height, half way between the mean of the heights above the
+    average and the mean of those below; a tip radius is sought for which it grows by `share` (shrinks, if negative).
+
+    Raises:
+        ValueError: if no tip does that: a flat surface.
+    """
+    heights = height_field.heights
+    if height_field.height_range < 1e-12:
+        raise RequestError("height_field: got a flat surface, wanted one with ridges")
+    high_part = heights > heights.mean()
+    level = (heights[high_part].mean() + heights[~high_part].mean()) / 2
+    above = np.mean(heights > level)
+
+    def is_broadened(radius: float) -> bool:
+        field = scanned(height_field, radius, extent=extent)
+        return abs(np.mean(field.heights > level) / above - 1) >= abs(share)
+
+    sign = float(np.sign(share))
+    low, high = 0.0, min(height_field.pixel_size) / 8
+    largest = max(height_field.tile_size) ** 2 / height_field.height_range
+    while not is_broadened(sign * high):
+        low, high = high, 2 * high
+        if high > largest:
+            raise RequestError("height_field: no tip broadens its ridges that much")
+    for _ in range(_HALVINGS):
+        middle_radius = (low + high) / 2
+        if is_broadened(sign * middle_radius):
+            high = middle_radius
+        else:
+            low = middle_radius
+    return scanned(height_field, sign * high, extent=extent), sign * high

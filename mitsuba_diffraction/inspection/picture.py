@@ -17,8 +17,7 @@ from ..outputs import metadata
 from ..surface.heightfield import HeightField
 from ..surface.periods import hann
 from .colours import WAVELENGTHS, radiance
-from .inspect import Inspection
-from .statistics import reference_plane
+from .report import Inspection, reference_plane
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

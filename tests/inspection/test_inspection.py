@@ -16,10 +16,17 @@ from mitsuba_diffraction.bsdf.geometry import Geometry
 from mitsuba_diffraction.color import into_gamut, spectrum_to_linear_sRGB, spectrum_to_XYZ
 from mitsuba_diffraction.geometry import k_g
 from mitsuba_diffraction.inspection import inspect, save_picture
-from mitsuba_diffraction.inspection.colours import WAVELENGTHS, illumination, order_angle, order_share, radiance
+from mitsuba_diffraction.inspection.colours import (
+    WAVELENGTHS,
+    broadened,
+    illumination,
+    order_angle,
+    order_share,
+    radiance,
+    scanned,
+)
 from mitsuba_diffraction.inspection.picture import piece_shown, with_uncertainty
-from mitsuba_diffraction.inspection.statistics import broadened, scanned, statistics
-from mitsuba_diffraction.inspection.uncertainty import concerns
+from mitsuba_diffraction.inspection.report import concerns, statistics
 from mitsuba_diffraction.scalar_theory import scalar_error
 
 ROOT = Path(__file__).parents[2]

@@ -1,0 +1,320 @@
+"""The report on a surface before it is rendered: statistics, periods, and reasons to distrust a picture."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..grating_spectrum import GratingSpectrum
+from ..outputs import plain
+from ..precomputation import precompute
+from ..progress import Progress, silent
+from ..scalar_theory import ScalarError, scalar_error
+from ..settings import SUN_COHERENCE_LENGTH, VISIBLE, Settings, lobe_width
+from ..spectrum.sample import carried_coherence_length, standard_error
+from ..surface.heightfield import HeightField
+from ..surface.periods import Period, find_periods, hann, repeated
+from .colours import LONGEST_COHERENCE, SHARE, Change, changes
+
+Array = NDArray[np.float64]
+
+_TOLERANCE = 0.02
+_MOST_TIMES = 8
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """A surface in numbers.
+
+    Attributes:
+        height_field: the surface.
+        extent: "tile" or "sample".
+        statistics: heights, slopes, tilt.
+        periods: as of `find_periods`: single ones, then bands; empty if none is significant.
+        carried: the coherence length that a scan supports, µm, at most that of sunlight; a tile supports any.
+        coherence_length: the requested one, limited to `carried`, µm.
+        standard_error: of a sample's spectrum at that coherence length, a share of the reflected power; None of a tile.
+        scalar_error: of scalar theory for this surface.
+        changes: effects of ±5 % of height scale, pixel size and, for a scan, tip broadening; empty without a period.
+        concerns: reasons to distrust a picture.
+        spectrum: of at most `LONGEST_COHERENCE`, for predicted colours.
+        shown: the height field; a small tile is repeated, a profile extended to a square.
+    """
+
+    height_field: HeightField
+    extent: str
+    statistics: Statistics
+    periods: tuple[Period, ...]
+    carried: float
+    coherence_length: float
+    standard_error: float | None
+    scalar_error: ScalarError
+    changes: tuple[Change, ...]
+    concerns: tuple[str, ...]
+    spectrum: GratingSpectrum = field(repr=False)
+    shown: HeightField = field(repr=False)
+
+    @property
+    def direction(self) -> float:
+        """The direction, in degrees, of the plane in which colours are shown: that of the main period, else x."""
+        return self.periods[0].direction if self.periods else 0.0
+
+    def as_json(self) -> dict[str, object]:
+        """Return all numbers by name, lengths in µm; what is not a number is None."""
+        rows, columns = self.height_field.shape
+        return plain(
+            {
+                "source": self.height_field.source,
+                "extent": self.extent,
+                "pixels": [columns, rows],
+                "pixel_size": self.height_field.pixel_size,
+                "size": self.height_field.tile_size,
+                "filled": self.height_field.filled,
+                "statistics": self.statistics,
+                "periods": self.periods,
+                "carried_coherence_length": self.carried,
+                "coherence_length": self.coherence_length,
+                "standard_error": self.standard_error,
+                "scalar_error": self.scalar_error,
+                "changes": self.changes,
+                "concerns": self.concerns,
+            }
+        )
+
+
+def inspect(
+    height_field: HeightField,
+    *,
+    extent: str = "sample",
+    coherence_length: float = SUN_COHERENCE_LENGTH,
+    measured: bool = True,
+    progress: Progress = silent,
+) -> Inspection:
+    """Inspect a surface.
+
+    Args:
+        height_field: the surface.
+        extent: "sample": a piece of a larger, irregular surface; "tile": it repeats.
+        coherence_length: the requested one, µm.
+        measured: whether it is a scan; tilt, steps of the heights and the tip matter only for scans.
+        progress: called with (steps done, steps in all).
+
+    Raises:
+        ValueError: on an unknown extent, a coherence length that is not positive, or a sample of too few pixels.
+    """
+    Settings(extent, coherence_length)
+    sun = SUN_COHERENCE_LENGTH
+    carried = carried_coherence_length(height_field, sun) if extent == "sample" else max(sun, coherence_length)
+    used = min(float(coherence_length), carried)
+    step = iter(range(1, 5))
+
+    def build(surface: HeightField) -> GratingSpectrum:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # of pixels and coherence `concerns` tells in its own words
+            spectrum = precompute(
+                surface,
+                extent=extent,
+                coherence_length=min(used, LONGEST_COHERENCE),
+                # Heights may be scaled up by the share that is tried.
+                wavelengths=(VISIBLE[0] / (1 + SHARE), VISIBLE[1]),
+                tolerance=_TOLERANCE,
+            )
+        progress(next(step), 4)
+        return spectrum
+
+    numbers = statistics(height_field, extent=extent)
+    shortest = VISIBLE[0] * 1e-3
+    periods = find_periods(height_field, extent=extent)
+    spectrum = build(height_field)
+    scalar = scalar_error(height_field, extent)
+    result = Inspection(
+        height_field=height_field,
+        extent=extent,
+        statistics=numbers,
+        periods=periods,
+        carried=carried,
+        coherence_length=used,
+        standard_error=standard_error(
+            height_field, coherence_length=used, largest_kappa=4 * np.pi / shortest, reach=2 / shortest
+        )
+        if extent == "sample"
+        else None,
+        scalar_error=scalar,
+        changes=changes(height_field, spectrum, periods[0], extent=extent, measured=measured, build=build)
+        if periods
+        else (),
+        concerns=concerns(height_field, numbers, used, measured=measured, scalar=scalar),
+        spectrum=spectrum,
+        shown=_widened(repeated(height_field, _MOST_TIMES) if extent == "tile" else height_field),
+    )
+    progress(4, 4)
+    return result
+
+
+def _widened(field: HeightField) -> HeightField:
+    """Extend a profile along its axis of one pixel to a square."""
+    for axis in (0, 1):
+        if field.shape[axis] == 1 < field.shape[1 - axis]:
+            count = min(field.shape[1 - axis], 256)
+            sizes = list(field.pixel_size)
+            sizes[1 - axis] = field.tile_size[axis] / count
+            return HeightField(np.repeat(field.heights, count, axis), (sizes[0], sizes[1]), field.source)
+    return field
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """A height field in numbers. Sa, Sq, Sz and Sdq are about the reference plane (ISO 25178-2, without filters).
+
+    Attributes:
+        Sa: arithmetical mean height, mean |h|, µm.
+        Sq: root mean square height, µm.
+        Sz: maximum height, highest to lowest, µm.
+        Sdq: root mean square slope (gradient between neighbouring pixels), a number.
+        steepest: slope, in degrees, that one in a hundred of the pixels that are not flat exceeds.
+        tilt: of the reference plane, degrees from level.
+        tilt_height: height difference of the reference plane from corner to corner of the patch, µm.
+        levels: how many different heights there are.
+        step: smallest difference between two of them, µm; 0 where all are equal.
+    """
+
+    Sa: float
+    Sq: float
+    Sz: float
+    Sdq: float
+    steepest: float
+    tilt: float
+    tilt_height: float
+    levels: int
+    step: float
+
+
+def statistics(height_field: HeightField, *, extent: str = "sample") -> Statistics:
+    """Compute the statistics of a height field, about `reference_plane`."""
+    heights = height_field.heights
+    plane, slopes = reference_plane(height_field, extent)
+    level = heights - plane
+    gradients = [
+        np.gradient(level, pixel, axis=axis) if level.shape[axis] > 1 else np.zeros_like(level)
+        for axis, pixel in ((1, height_field.pixel_size[0]), (0, height_field.pixel_size[1]))
+    ]
+    slope = np.hypot(*gradients)
+    # Walls of few pixels between plateaus are slopes, too.
+    sloping = slope[slope > 1e-9 * max(slope.max(), 1e-300)]
+    values = np.unique(heights)
+    # What arithmetic makes of equal numbers is no difference.
+    steps = np.diff(values)
+    steps = steps[steps > 1e-9 * max(np.abs(values).max(), 1e-300)]
+    return Statistics(
+        Sa=float(np.abs(level).mean()),
+        Sq=float(np.sqrt(np.mean(level**2))),
+        Sz=float(np.ptp(level)),
+        Sdq=float(np.sqrt(np.mean(slope**2))),
+        steepest=float(np.degrees(np.arctan(np.quantile(sloping, 0.99)))) if sloping.size else 0.0,
+        tilt=float(np.degrees(np.arctan(np.hypot(*slopes)))),
+        tilt_height=float(np.ptp(plane)),
+        levels=len(steps) + 1,
+        step=float(steps.min()) if len(steps) else 0.0,
+    )
+
+
+def reference_plane(height_field: HeightField, extent: str) -> tuple[Array, tuple[float, float]]:
+    """Return the plane to which heights refer, (N_y, N_x) µm, and its slopes along x and y.
+
+    For a sample, the least-squares plane; for a tile, which is periodic, a level one.
+    """
+    rows, columns = height_field.shape
+    if extent == "tile":
+        return np.full((rows, columns), height_field.heights.mean()), (0.0, 0.0)
+    # On a full grid the three unknowns do not mix.
+    x = (np.arange(columns) - (columns - 1) / 2) * height_field.pixel_size[0]
+    y = (np.arange(rows) - (rows - 1) / 2) * height_field.pixel_size[1]
+    mean = height_field.heights.mean()
+    slope_x = float(height_field.heights.mean(axis=0) @ x / max(x @ x, 1e-300))
+    slope_y = float(height_field.heights.mean(axis=1) @ y / max(y @ y, 1e-300))
+    return mean + slope_x * x + slope_y * y[:, None], (slope_x, slope_y)
+
+
+_COARSE = 0.09  # µm: a quarter of the shortest wavelength, as light of grazing incidence and exit wants
+_BLUE, _GREEN = 0.45, 0.55  # µm
+_LIMIT_SHARE = 0.02  # of the power beyond four fifths of the Nyquist limit
+_STEP_SHARE = 1e-3  # of the light that steps of the heights scatter
+_TURNED = 1.0  # degrees
+_STEEP = 45.0  # degrees: light is reflected twice
+
+
+def concerns(
+    height_field: HeightField,
+    numbers: Statistics,
+    coherence_length: float,
+    *,
+    measured: bool,
+    scalar: ScalarError,
+) -> tuple[str, ...]:
+    """Return concerns about the surface as sentences; none if all is well.
+
+    Args:
+        height_field: the surface.
+        numbers: its statistics.
+        coherence_length: of the light, limited to what the surface supports, µm.
+        measured: whether it is a scan; a formula has neither tilt nor steps of its own.
+        scalar: the error of scalar theory.
+    """
+    found = []
+    axes = zip(height_field.pixel_size, height_field.shape[::-1], strict=True)
+    coarsest = max([pixel for pixel, count in axes if count > 1], default=0.0)
+    if coarsest > _COARSE:
+        found.append(
+            f"Pixels of {coarsest * 1e3:.0f} nm are too coarse for light: orders beyond {1 / (2 * coarsest):.2g} "
+            "cycles/µm are missing. Scan again with pixels of at most 90 nm."
+        )
+    if beyond := scalar.warning:
+        found.append(f"{beyond[0].upper()}{beyond[1:]}.")
+    if not measured:
+        return tuple(found)
+    # A slope s turns all light by 2s, q by 2s/λ; less than a lobe is not seen, but a degree is too much in any case.
+    shift = 2 * np.tan(np.deg2rad(numbers.tilt)) / _GREEN
+    if shift > lobe_width(coherence_length) or 2 * numbers.tilt > _TURNED:
+        found.append(
+            f"The scan is tilted by {numbers.tilt:.2g}° ({numbers.tilt_height * 1e3:.0f} nm from corner to corner), "
+            f"which turns all reflected light by {2 * numbers.tilt:.2g}°. Level it: --prepare level_plane."
+        )
+    at_limit = _share_at_limit(height_field)
+    if at_limit > _LIMIT_SHARE:
+        found.append(
+            f"{at_limit:.0%} of the light at 450 nm goes to detail of less than 2.5 pixels: noise, or detail too fine "
+            "for the pixels, which shows in wrong directions. Scan again with smaller pixels, or filter the noise."
+        )
+    # Rounding to steps is noise of variance step²/12 and scatters (κ step)²/12 of the light.
+    scattered = (4 * np.pi / _BLUE * numbers.step) ** 2 / 12
+    if 16 <= numbers.levels <= 256 and scattered > _STEP_SHARE:
+        found.append(
+            f"Heights stand on {numbers.levels} levels, {numbers.step * 1e3:.2g} nm apart (8 bit?): rounding scatters "
+            f"{scattered:.1%} of blue light. Export 16 bit or floats."
+        )
+    if height_field.filled:
+        found.append(
+            f"{height_field.filled} pixels of the scan were missing and are filled: where they remain, the heights are "
+            "a guess."
+        )
+    if numbers.steepest > _STEEP:
+        found.append(
+            f"One sloping pixel in a hundred is steeper than {numbers.steepest:.0f}°: light is reflected more than "
+            "once there, which is not computed, and a tip does not reach down such walls."
+        )
+    return tuple(found)
+
+
+def _share_at_limit(height_field: HeightField) -> float:
+    """Return the share of the phase's power at 450 nm and normal incidence beyond 0.8 of the Nyquist limit."""
+    phase = np.exp(1j * 4 * np.pi / _BLUE * height_field.centred)
+    power = np.abs(np.fft.fft2(phase * hann(phase.shape))) ** 2
+    outside = np.zeros(power.shape, bool)
+    for axis, count in enumerate(power.shape):
+        if count > 1:
+            far = np.abs(np.fft.fftfreq(count)) > 0.4
+            outside |= far[:, None] if axis == 0 else far
+    return float(power[outside].sum() / power.sum())
