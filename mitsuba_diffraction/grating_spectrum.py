@@ -3,10 +3,9 @@
 The file is OpenEXR: float32, ZIP, one part, one pixel per diffraction order or node.
 
 Channels are named after what they hold. Series: `B{t^003}` (taylor), `B{T_003}` (chebyshev), `B{mode 003}` (svd), the
-terms B_n of S = Σ g_n(κ) B_n; "slices": `S(012.2)`, the coefficient of t² on interval 12 of κ. Rows
-are orders m_y, columns m_x, from −M to M. Numbers in the header are double precision. `energy` is JSON: the table of
-`energy/table.py`. `contentSha256` covers every byte of the file and
-reveals damage.
+terms B_n of S = Σ g_n(κ) B_n; "slices": `S(012.2)`, the coefficient of t² on interval 12 of κ. Rows are orders m_y,
+columns m_x, from −M to M. Numbers in the header are double precision. `energy` is JSON: the table of `energy/table.py`.
+`contentSha256` covers every byte of the file and reveals damage.
 """
 
 from __future__ import annotations
@@ -154,11 +153,7 @@ def _grid(header: dict, shape: tuple[int, int]) -> OrderGrid | SplineGrid:
     return SplineGrid(_pair(header["spacing"]), largest, _pair(header["limit"]))
 
 
-_TERM_NAMES = {
-    "taylor": "B{{t^{:03d}}}",
-    "chebyshev": "B{{T_{:03d}}}",
-    "svd": "B{{mode {:03d}}}",
-}
+_TERM_NAMES = {"taylor": "B{{t^{:03d}}}", "chebyshev": "B{{T_{:03d}}}", "svd": "B{{mode {:03d}}}"}
 _REPRESENTATIONS = (*_TERM_NAMES, SliceTable.representation)
 
 

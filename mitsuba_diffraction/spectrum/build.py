@@ -6,7 +6,7 @@ import dataclasses
 import hashlib
 import warnings
 from collections.abc import Callable, Sequence
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,21 +60,7 @@ Table = SeriesTable | SliceTable
 
 
 def build_spectrum(patches: Sequence[HeightField], settings: Settings, progress: Progress) -> PowerSpectrum:
-    """Compute the power spectrum of the phase e^{iκh}, its error at most the tolerance.
-
-    Args:
-        patches: of one size; the spectrum is the mean of theirs.
-        settings: of scalar theory.
-        progress: called with (steps done, steps in all).
-
-    Raises:
-        ValueError: if the tolerance cannot be kept: in float32 by a Taylor series for so deep a surface, or within a
-            table of 4 GB.
-
-    Warns:
-        UserWarning: if the pixels are too coarse to hold all the frequencies that the shortest wavelength can reach, or
-            a sample is too small for the coherence length.
-    """
+    """Compute the mean power spectrum of the phase e^{iκh} of patches of one size; raises and warns as `precompute`."""
     height_field = patches[0]
     height_range = max(patch.height_range for patch in patches)
     coherence_length, tolerance = settings.coherence_length, settings.tolerance
@@ -117,6 +103,10 @@ def build_spectrum(patches: Sequence[HeightField], settings: Settings, progress:
         )
     build = _Build(powers, height_range, largest_kappa, allowed, progress)
     table, error = build(SliceTable.representation if settings.representation == "auto" else settings.representation)
+    source, source_digest = height_field.source, height_field.digest
+    if len(patches) > 1:
+        source = f"mean of {len(patches)} patches: {source}, …"
+        source_digest = hashlib.sha256("".join(patch.digest for patch in patches).encode()).hexdigest()
     return PowerSpectrum(
         table=table,
         grid=build.kept,
@@ -127,22 +117,14 @@ def build_spectrum(patches: Sequence[HeightField], settings: Settings, progress:
         wavelengths=settings.wavelengths,
         tolerance=float(tolerance),
         error=error + tail,
-        source=height_field.source
-        if len(patches) == 1
-        else f"mean of {len(patches)} patches: {height_field.source}, …",
-        source_digest=_digest(patches),
+        source=source,
+        source_digest=source_digest,
         patches=len(patches),
         largest_angle=float(settings.largest_angle),
         dropped=build.dropped,
         beyond=build.beyond,
         scatter=scatter,
     )
-
-
-def _digest(patches: Sequence[HeightField]) -> str:
-    """Return SHA-256 of the height field, or of those of all patches."""
-    digests = [patch.digest for patch in patches]
-    return digests[0] if len(digests) == 1 else hashlib.sha256("".join(digests).encode()).hexdigest()
 
 
 def _tile_splines(
@@ -194,23 +176,14 @@ def _refined(lattice: Callable[[float], Lattice], sigma: float, largest_kappa: f
         spacing *= float(min(0.95, 0.95 * (allowed / error) ** (1 / 3)))
 
 
-@dataclasses.dataclass(frozen=True)
-class _Storage:
-    """How slices are stored.
+class _Storage(NamedTuple):
+    """How slices are stored."""
 
-    Attributes:
-        terms: of the polynomial in κ.
-        rounded: the values as they are read.
-        least: what is allowed from which on rounding may leave enough.
-        interpolation: the share of it that interpolation gets at first.
-        finest: the share below which finer intervals are given up.
-    """
-
-    terms: int
-    rounded: Callable[[NDArray[np.float32]], NDArray[np.float32]]
-    least: float
-    interpolation: float
-    finest: float
+    terms: int  # of the polynomial in κ
+    rounded: Callable[[NDArray[np.float32]], NDArray[np.float32]]  # the values as they are read
+    least: float  # allowed error from which on rounding may leave enough
+    interpolation: float  # the share of it that interpolation gets at first
+    finest: float  # the share below which finer intervals are given up
 
 
 # From the fastest to the most exact.

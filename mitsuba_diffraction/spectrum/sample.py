@@ -9,7 +9,7 @@ averaged over P positions x_p; d is the pixel size. No window extends beyond the
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 import scipy.fft
@@ -31,17 +31,11 @@ _FEWEST_PIXELS = 4
 _BATCH = 1 << 17
 
 
-@dataclass(frozen=True, eq=False)
-class WindowAxis:
-    """The windows along one axis.
+class WindowAxis(NamedTuple):
+    """The windows along one axis: a sampled at the pixels, (W,), Σ a² = 1, and the first pixel of each position."""
 
-    Attributes:
-        window: a, (W,), sampled at the pixels, Σ a² = 1.
-        starts: first pixel of each position.
-    """
-
-    window: NDArray[np.float64] = field(repr=False)
-    starts: NDArray[np.int64] = field(repr=False)
+    window: NDArray[np.float64]
+    starts: NDArray[np.int64]
 
 
 UNIFORM = WindowAxis(np.ones(1), np.zeros(1, np.int64))
@@ -86,12 +80,7 @@ def mean_periodogram(
 ) -> NDArray[np.float64]:
     """Compute (1/P) Σ_p |Σ_n a(x_n − x_p) wave_n e^{−2πi q·x_n}|² over all positions of the windows along x and y.
 
-    Args:
-        wave: (rows, columns) at the pixels.
-        x: windows along x.
-        y: windows along y.
-        shape: (rows, columns) of the result, at least those of the window: q as in `scipy.fft.fft2` of zero-padded
-            segments.
+    The result has q as in `scipy.fft.fft2` of segments padded with zeros to `shape`, (rows, columns).
     """
     window = np.outer(y.window, x.window)
     segments = np.lib.stride_tricks.sliding_window_view(wave, window.shape)

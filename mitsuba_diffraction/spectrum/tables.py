@@ -25,13 +25,7 @@ from ..errors import RequestError
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Series:
-    """The functions g_n(κ) = Σ_k modes_nk T_k(t), n < N.
-
-    Attributes:
-        name: of the representation.
-        largest_kappa: κ_max in rad/µm.
-        modes: (N, K) Chebyshev coefficients of the g_n.
-    """
+    """The functions g_n(κ) = Σ_k modes_nk T_k(t), n < N, of a representation; modes (N, K), κ_max in rad/µm."""
 
     name: str
     largest_kappa: float
@@ -64,11 +58,7 @@ def taylor(largest_kappa: float, nodes: int) -> tuple[Series, NDArray[np.float64
     This is the expansion of Stam's diffraction shaders (Stam 1999) and their successors. The derivatives of e^{ix} have
     modulus one, so that the remainder after N terms is of the order of x^N/N! with x = κ_c R (Lagrange). The terms grow
     to about e^x before they shrink, and so do their rounding errors: in float32 the series fails for surfaces deeper
-    than about half a micrometre.
-
-    Args:
-        largest_kappa: κ_max in rad/µm.
-        nodes: J, enough for the polynomial through S at the nodes to resolve it; its coefficients are the B_n.
+    than about half a micrometre. The polynomial through S at the `nodes`, J, must resolve it.
     """
     monomials = _triangle(np.polynomial.chebyshev.poly2cheb, nodes)
     coefficients = _triangle(np.polynomial.chebyshev.cheb2poly, nodes).T
@@ -79,25 +69,18 @@ def chebyshev(largest_kappa: float, nodes: int) -> tuple[Series, NDArray[np.floa
     """Return g_n = T_n(t) and B_n = F{ε_n iⁿ J_n(κ_c u) e^{iκ_c u}}, by e^{iκ_c u t} = Σ_n ε_n iⁿ J_n(κ_c u) T_n(t).
 
     This is the Jacobi–Anger expansion (Dhillon and Ghosh 2016 used it in the height); ε_0 = 1, else 2. Everything is
-    bounded by two, so nothing cancels; the terms fall off faster than any power once n > x = κ_c R.
-
-    Args:
-        largest_kappa: κ_max in rad/µm.
-        nodes: J, enough for the polynomial through S at the nodes to resolve it; the B_n are its coefficients.
+    bounded by two, so nothing cancels; the terms fall off faster than any power once n > x = κ_c R. The B_n are the
+    coefficients of the polynomial through S at the `nodes`, J, which must resolve it.
     """
     return Series("chebyshev", largest_kappa, np.eye(nodes)), chebyshev_transform(nodes)
 
 
 def svd(largest_kappa: float, values: NDArray[np.float64]) -> tuple[Series, NDArray[np.float64]]:
-    """Return the singular value decomposition of S(q; κ) over κ and q, the strongest modes first.
+    """Return the singular value decomposition of S at J Chebyshev nodes and n frequencies, the strongest modes first.
 
     The g_n are orthonormal over the Chebyshev nodes, so that B_n = Σ_j g_n(κ_j) S(q; κ_j). For the values given, no
     separable sum of as many terms is nearer. An error counts by its modulus, ∫|ΔS| dq. By Cauchy–Schwarz
     (Σ|ΔS|)² ≤ Σ S̄ · Σ ΔS²/S̄, so frequencies are weighted by 1/√S̄, S̄ the mean of |S| over κ.
-
-    Args:
-        largest_kappa: κ_max in rad/µm.
-        values: (J, n) S at J Chebyshev nodes and n frequencies.
     """
     mean = np.abs(values).mean(axis=0)
     weight = np.where(mean > 0, 1 / np.sqrt(np.where(mean > 0, mean, 1)), 0)
@@ -180,13 +163,9 @@ class SeriesTable:
         powers: Callable[[float], NDArray[np.float64]],
         progress: Callable[[int, int], None],
     ) -> SeriesTable:
-        """Accumulate the terms node by node; little more than the result is held in memory.
+        """Accumulate B_n = Σ_j projection_nj S(κ_j), one κ after the other, to hold little more than the result.
 
-        Args:
-            series: the g_n(κ).
-            projection: (N, J), B_n = Σ_j projection_nj S(κ_j) over J Chebyshev nodes.
-            powers: S(κ) on the grid, κ in rad/µm.
-            progress: called with (nodes done, J).
+        `projection` is (N, J) for J Chebyshev nodes, powers(κ) gives S on the grid, κ in rad/µm.
         """
         nodes = projection.shape[1]
         # Taylor's terms come out of sums that cancel; those of the others are as large as what is summed.
@@ -293,16 +272,10 @@ class SliceTable:
         rounded: Callable[[NDArray[np.float32]], NDArray[np.float32]],
         progress: Callable[[int, int], None],
     ) -> SliceTable:
-        """Build from the powers at one κ after the other, so that little more than the result is held in memory.
+        """Build from c_m = powers(κ) at one κ after the other, to hold little more than the result in memory.
 
-        Args:
-            intervals: K.
-            terms: how many a_p.
-            largest_kappa: κ_max in rad/µm.
-            powers: c_m at one κ.
-            rounded: values (K, terms, ...) as they are read, `packed` or `halved`; an interval stays as it is where
-                they are too large for it.
-            progress: called with what is done and what there is to do.
+        `rounded` gives the values (K, terms, ...) as they are read, `packed` or `halved`; an interval with values too
+        large for it stays as it is.
         """
         values, nodes, polynomial = None, chebyshev_nodes(terms), to_polynomial(terms)
         for interval, node in np.ndindex(intervals, terms):
