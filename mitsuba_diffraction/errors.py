@@ -30,7 +30,7 @@ def is_bug(kind: type[BaseException]) -> bool:
 
 
 def is_number(value: object) -> bool:
-    """Tell whether a parameter is a number that a float can hold: True, False, infinity and NaN are none."""
+    """Return whether a parameter is a number that a float can hold: True, False, infinity and NaN are none."""
     return isinstance(value, Real) and not isinstance(value, bool) and bool(abs(value) <= sys.float_info.max)
 
 

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from .errors import RequestError
 from .settings import SUN_COHERENCE_LENGTH, Settings, lobe_width, matching
-from .spectrum.sample import UNIFORM, WindowAxis, carried_coherence_length, window_axes
+from .spectrum.sample import UNIFORM, WindowAxis, effective_coherence_length, window_axes
 from .surface.heightfield import HeightField
 
 _FAR = 9.0  # standard deviations; e^{−9²/2} is under 3e-18
@@ -113,12 +113,12 @@ def _sample_spectrum(
     height_field: HeightField, q: NDArray[np.float64], kappa: NDArray[np.float64], coherence_length: float
 ) -> NDArray[np.float64]:
     """Compute Welch's estimate of S for q (M, 2) and κ (M,): (M,) µm²."""
-    carried = carried_coherence_length(height_field, coherence_length)
-    windows = window_axes(height_field, carried)
+    effective = effective_coherence_length(height_field, coherence_length)
+    windows = window_axes(height_field, effective)
     result = mean_periodograms(height_field, q, kappa, tuple(w or UNIFORM for w in windows))
     for axis in (0, 1):
         if windows[axis] is None:
-            result *= _gaussian(q[:, axis], lobe_width(carried))
+            result *= _gaussian(q[:, axis], lobe_width(effective))
         else:
             result *= nyquist_density(q[:, axis], height_field.pixel_size[axis])
     return result

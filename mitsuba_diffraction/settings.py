@@ -154,7 +154,7 @@ def lobe_width(coherence_length: float) -> float:
 
 
 def lobe_reach(share: float) -> float:
-    """Half the side ρ of the square at which a lobe is truncated, in standard deviations; the rest is renormalised.
+    """Return half the side ρ of the square at which a lobe is truncated, in standard deviations; the rest is rescaled.
 
     A two-dimensional Gaussian has the fraction 1 − erf(ρ/√2)² outside that square. Truncation and renormalisation
     change it by twice that in the L1 norm, which is set equal to `share`.

@@ -371,7 +371,7 @@ def test_another_parameter_is_another_spectrum(own_cache, builds, surface, spect
     wanted = other.build()
     for name in (
         *("representation", "wavelengths", "coherence_length", "tolerance", "source_digest", "largest_angle"),
-        *("dropped", "beyond", "grid"),
+        *("truncated_power", "unresolved_power", "grid"),
     ):
         assert getattr(got, name) == getattr(wanted, name)
 

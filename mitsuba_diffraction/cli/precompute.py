@@ -100,8 +100,8 @@ def _table(spectrum: Spectrum) -> str:
     scatter = f", standard error of one scan {spectrum.standard_error:.2g}" if spectrum.extent == "sample" else ""
     return (
         f"{spectrum.representation}, {size}, error {spectrum.error:.1e} {asked}{scatter}\n"
-        f"truncated, at most: {spectrum.dropped:.1e} of the power at weak frequencies; {spectrum.beyond:.1e} at "
-        "frequencies that no direction reaches or no pixel resolves"
+        f"truncated, at most: {spectrum.truncated_power:.1e} of the power at weak frequencies; "
+        f"{spectrum.unresolved_power:.1e} at frequencies that no direction reaches or no pixel resolves"
     )
 
 

@@ -14,7 +14,7 @@ from ..precomputation import precompute
 from ..progress import Progress, silent
 from ..scalar_theory import ScalarError, scalar_error
 from ..settings import SUN_COHERENCE_LENGTH, VISIBLE, Settings, lobe_width
-from ..spectrum.sample import carried_coherence_length, standard_error
+from ..spectrum.sample import effective_coherence_length, standard_error
 from ..surface.heightfield import HeightField
 from ..surface.periods import Period, find_periods, hann, repeated
 from .colours import LONGEST_COHERENCE, SHARE, Change, changes
@@ -107,7 +107,7 @@ def inspect(
     """
     Settings(extent, coherence_length)
     sun = SUN_COHERENCE_LENGTH
-    carried = carried_coherence_length(height_field, sun) if extent == "sample" else max(sun, coherence_length)
+    carried = effective_coherence_length(height_field, sun) if extent == "sample" else max(sun, coherence_length)
     used = min(float(coherence_length), carried)
     step = iter(range(1, 5))
 
@@ -138,7 +138,7 @@ def inspect(
         carried=carried,
         coherence_length=used,
         standard_error=standard_error(
-            height_field, coherence_length=used, largest_kappa=4 * np.pi / shortest, reach=2 / shortest
+            height_field, coherence_length=used, largest_kappa=4 * np.pi / shortest, max_frequency=2 / shortest
         )
         if extent == "sample"
         else None,

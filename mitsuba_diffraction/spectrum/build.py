@@ -17,7 +17,7 @@ from ..settings import Settings, lobe_reach, lobe_width
 from ..surface.heightfield import HeightField
 from .orders import LobeAxis
 from .power_spectrum import TAIL_SHARE, PowerSpectrum
-from .sample import SamplePowers, carried_coherence_length, standard_error
+from .sample import SamplePowers, effective_coherence_length, standard_error
 from .spline_grid import inner
 from .tables import (
     Series,
@@ -39,7 +39,7 @@ from .tables import (
 from .tile import MeanPowers, TilePowers, TileSplines
 
 # Shares of the tolerance.
-_DROP_SHARE = 0.1  # weak frequencies
+_TRUNCATED_SHARE = 0.1  # weak frequencies
 _SPLINE_SHARE = 0.4  # what lies between the nodes in q
 # What is chosen by the strongest frequencies, and measured at a few κ, is held to this part of what is allowed.
 _MARGIN = 0.7
@@ -50,7 +50,7 @@ _LARGEST_TABLE = 4e9  # bytes
 # Where none is asked for: the tolerances that measurements and pictures need, and in between, of a sample, a share of
 # its standard error. A table exact to 1e-3 of what is known to 25 % is waste.
 _FINEST, _COARSEST = 1e-3, 1e-2
-_SCATTER_SHARE = 0.1
+_STANDARD_ERROR_SHARE = 0.1
 
 _OF_MEAN = 0.7  # the share of the time that the mean of many patches takes, roughly
 
@@ -66,38 +66,42 @@ def build_spectrum(patches: Sequence[HeightField], settings: Settings, progress:
     coherence_length, tolerance = settings.coherence_length, settings.tolerance
     shortest = settings.wavelengths[0] * 1e-3
     largest_kappa = 4 * np.pi / shortest
-    reach = 2 * np.sin(np.deg2rad(settings.largest_angle)) / shortest
-    _check_resolution(height_field, reach)
-    carried, scatter, tail = float(coherence_length), None, 0.0
+    max_frequency = 2 * np.sin(np.deg2rad(settings.largest_angle)) / shortest
+    _check_resolution(height_field, max_frequency)
+    effective, found_error, tail = float(coherence_length), None, 0.0
     powers: TilePowers | Splines | None
     if settings.extent == "tile":
         allowed = tolerance = _FINEST if tolerance is None else tolerance
-        sigma, rho = lobe_width(carried), lobe_reach(TAIL_SHARE * tolerance)
-        orders = TilePowers(height_field, reach, rho * sigma)
+        sigma, rho = lobe_width(effective), lobe_reach(TAIL_SHARE * tolerance)
+        orders = TilePowers(height_field, max_frequency, rho * sigma)
         if len(patches) > 1:
             of_mean, progress = part(progress, 0, _OF_MEAN), part(progress, _OF_MEAN, 1)
-            orders = MeanPowers(patches, reach, rho * sigma, largest_kappa, (1 - TAIL_SHARE) * tolerance, of_mean)
+            orders = MeanPowers(
+                patches, max_frequency, rho * sigma, largest_kappa, (1 - TAIL_SHARE) * tolerance, of_mean
+            )
         lobes = orders.grid.lobes(sigma, rho)
-        powers = _tile_splines(orders, lobes, sigma, reach, largest_kappa, tolerance)
+        powers = _tile_splines(orders, lobes, sigma, max_frequency, largest_kappa, tolerance)
         if powers is None:
             powers, tail = orders, 2 * (1 - lobes[0].inside * lobes[1].inside)
             allowed -= tail
     else:
-        carried = carried_coherence_length(height_field, coherence_length)
-        scatter = standard_error(height_field, coherence_length=carried, largest_kappa=largest_kappa, reach=reach)
+        effective = effective_coherence_length(height_field, coherence_length)
+        found_error = standard_error(
+            height_field, coherence_length=effective, largest_kappa=largest_kappa, max_frequency=max_frequency
+        )
         if tolerance is None:
-            tolerance = float(np.clip(_SCATTER_SHARE * scatter, _FINEST, _COARSEST))
+            tolerance = float(np.clip(_STANDARD_ERROR_SHARE * found_error, _FINEST, _COARSEST))
         allowed = tolerance
-        if carried < coherence_length * (1 - 1e-9):
+        if effective < coherence_length * (1 - 1e-9):
             x, y = height_field.tile_size
             warnings.warn(
-                f"coherence_length: a scan of {x:.4g} × {y:.4g} µm carries {carried:.4g} µm of the "
+                f"coherence_length: a scan of {x:.4g} × {y:.4g} µm carries {effective:.4g} µm of the "
                 f"{coherence_length:.4g} µm asked for; the lobes are as wide as the scan allows",
                 stacklevel=4,
             )
         powers = _refined(
-            lambda spacing: SamplePowers(height_field, carried, spacing, reach),
-            lobe_width(carried),
+            lambda spacing: SamplePowers(height_field, effective, spacing, max_frequency),
+            lobe_width(effective),
             largest_kappa,
             tolerance,
         )
@@ -113,7 +117,7 @@ def build_spectrum(patches: Sequence[HeightField], settings: Settings, progress:
         extent=settings.extent,
         pixel_size=height_field.pixel_size,
         height_range=height_range,
-        coherence_length=carried,
+        coherence_length=effective,
         wavelengths=settings.wavelengths,
         tolerance=float(tolerance),
         error=error + tail,
@@ -121,9 +125,9 @@ def build_spectrum(patches: Sequence[HeightField], settings: Settings, progress:
         source_digest=source_digest,
         patches=len(patches),
         largest_angle=float(settings.largest_angle),
-        dropped=build.dropped,
-        beyond=build.beyond,
-        scatter=scatter,
+        truncated_power=build.truncated_power,
+        unresolved_power=build.unresolved_power,
+        standard_error=found_error,
     )
 
 
@@ -131,7 +135,7 @@ def _tile_splines(
     orders: TilePowers,
     lobes: tuple[LobeAxis, LobeAxis],
     sigma: float,
-    reach: float,
+    max_frequency: float,
     largest_kappa: float,
     tolerance: float,
 ) -> TileSplines | None:
@@ -139,7 +143,7 @@ def _tile_splines(
     cost = _cost(lobes[0].count * lobes[1].count, orders.grid.shape)
 
     def lattice(spacing: float) -> TileSplines:
-        splines = TileSplines(orders, sigma, spacing, reach)
+        splines = TileSplines(orders, sigma, spacing, max_frequency)
         # A finer one would be read slower still.
         if _cost(9, splines.grid.shape) >= cost:
             raise _TooLargeError(f"{splines.grid}: read no faster than the orders")
@@ -152,16 +156,16 @@ def _tile_splines(
 
 
 def _cost(packets: int, shape: tuple[int, int]) -> float:
-    """What an evaluation takes that reads so many packets of a table of (rows, columns) nodes, in reads of a small one.
+    """Return the cost of an evaluation that reads so many packets of a table of (rows, columns) nodes.
 
-    Measured on a CPU: reads take the same time while the nodes of one κ, at 8 bytes, fill less than 1 MB, beyond it
-    longer with the square root.
+    In reads of a small table. On a CPU they take the same time while the nodes of one κ, at 8 bytes, fill less than
+    1 MB, beyond it longer with the square root.
     """
     return packets * max(1.0, shape[0] * shape[1] * 8e-6) ** 0.5
 
 
 def _refined(lattice: Callable[[float], Lattice], sigma: float, largest_kappa: float, tolerance: float) -> Lattice:
-    """The coarsest lattice, a function of its spacing, that keeps its share of the tolerance between its nodes."""
+    """Return the coarsest lattice, a function of its spacing, that keeps its share of the tolerance between nodes."""
     allowed, spacing = _SPLINE_SHARE * tolerance, _WIDEST_SPACING * sigma
     while True:
         powers = lattice(spacing)
@@ -199,8 +203,8 @@ class _Build:
 
     Attributes:
         kept: the grid without the weak frequencies at its rim.
-        dropped: the largest share of the power outside of it, at most.
-        beyond: the largest share of the power that the whole grid does not reach.
+        truncated_power: the largest share of the power outside of it, at most.
+        unresolved_power: the largest share of the power that the whole grid does not reach.
     """
 
     def __init__(
@@ -224,7 +228,7 @@ class _Build:
         return self._exact(kappa)[inner(self._exact.grid, self.kept)]
 
     def _survey(self) -> None:
-        """Over the Chebyshev nodes in κ: where the power lies, and a pilot, the strongest frequencies."""
+        """Find, over the Chebyshev nodes in κ, where the power lies, and a pilot: the strongest frequencies."""
         kappas = (1 + chebyshev_nodes(self._nodes)) / 2 * self._largest_kappa
         grid, report = self._exact.grid, self._phase(0.0, 0.3)
         rims: tuple[list[NDArray[np.float64]], list[NDArray[np.float64]]] = ([], [])
@@ -243,12 +247,12 @@ class _Build:
             report(j + 1, self._nodes)
         # Between the nodes more may be missing, or lie at the rim.
         between = self._between()[1]
-        self.beyond = float(np.clip((between @ missing).max(), 0, 1))
-        largest, self.dropped = [], 0.0
+        self.unresolved_power = float(np.clip((between @ missing).max(), 0, 1))
+        largest, self.truncated_power = [], 0.0
         for whole, rim in zip(grid.largest, rims, strict=True):
             outside = (between @ np.array(rim)).max(axis=0)
-            largest.append(int(np.argmax(outside <= _DROP_SHARE / 2 * self._allowed)) if whole else 0)
-            self.dropped += float(np.clip(outside[largest[-1]], 0, 1))
+            largest.append(int(np.argmax(outside <= _TRUNCATED_SHARE / 2 * self._allowed)) if whole else 0)
+            self.truncated_power += float(np.clip(outside[largest[-1]], 0, 1))
         self.kept = dataclasses.replace(grid, largest=(largest[0], largest[1]))
         self._pilot = pilot
         # The others are taken to err as much for their power.
@@ -317,7 +321,7 @@ class _Build:
         )
 
     def _between(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Many κ, four to an oscillation, and the pilot's powers there, (κ, n), by Chebyshev interpolation."""
+        """Return many κ, four to an oscillation, and the matrix, (κ, n), that interpolates from the Chebyshev nodes."""
         kappas = np.linspace(0, self._largest_kappa, 16 + int(np.ceil(4 * self._x)), dtype=np.float64)
         vander = chebyshev_polynomials(position(kappas, self._largest_kappa), self._nodes)
         return kappas, vander @ chebyshev_transform(self._nodes)
@@ -357,15 +361,15 @@ class _Build:
             intervals = max(intervals + 1, int(intervals * min(2.0, 0.95 * (error / allowed) ** (1 / terms))))
 
     def _measured(self, table: Table) -> float:
-        """max over held-out κ of the error of S: both ends, and others between, at least four to an oscillation."""
+        """Return the largest error of S over held-out κ: both ends, and others between, four to an oscillation."""
         count = 12 + int(np.ceil(2 * self._x))
         golden = (np.sqrt(5) - 1) / 2
         held_out = self._largest_kappa * np.concatenate([[0.0, 1.0], np.sqrt((np.arange(1, count) * golden) % 1)])
-        worst, report = 0.0, self._phase(0.8, 1.0)
+        max_error, report = 0.0, self._phase(0.8, 1.0)
         for number, kappa in enumerate(held_out, 1):
-            worst = max(worst, self._exact.error(self.kept, table.powers(kappa), kappa))
+            max_error = max(max_error, self._exact.error(self.kept, table.powers(kappa), kappa))
             report(number, len(held_out))
-        return worst
+        return max_error
 
 
 def _rim(profile: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -389,11 +393,11 @@ def _check_size(shape: tuple[int, int], floats: int) -> None:
         )
 
 
-def _check_resolution(height_field: HeightField, reach: float) -> None:
+def _check_resolution(height_field: HeightField, max_frequency: float) -> None:
     for axis, size, count in zip("xy", height_field.pixel_size, height_field.shape[::-1], strict=True):
-        if count > 1 and 1 / (2 * size) < reach * (1 - 1e-9):
+        if count > 1 and 1 / (2 * size) < max_frequency * (1 - 1e-9):
             warnings.warn(
                 f"pixels of {size * 1e3:.4g} nm along {axis} hold no frequency beyond {1 / (2 * size):.3g} cycles/µm, "
-                f"but light reaches {reach:.3g}: what lies between is missing",
+                f"but light reaches {max_frequency:.3g}: what lies between is missing",
                 stacklevel=5,
             )

@@ -36,11 +36,12 @@ class PowerSpectrum:
         source: origin of the heights.
         source_digest: SHA-256 of the height field.
         largest_angle: in degrees from the normal, of both directions, for which the table holds.
-        dropped: the largest share of the power, over κ, in weak frequencies that were not kept; part of `error`.
-        beyond: the largest share of the power, over κ, at frequencies that no pair of directions reaches, or that the
-            pixels do not resolve.
+        truncated_power: the largest share of the power, over κ, at weak frequencies that are left out; part of `error`.
+        unresolved_power: the largest share of the power, over κ, at frequencies that no pair of directions reaches, or
+            that the pixels do not resolve.
         patches: number of draws of an irregular surface that are averaged.
-        scatter: of a sample, its `standard_error`; None of a tile.
+        standard_error: of a sample, ∫ of the standard error of Welch's estimate over q at the worst κ, a share of the
+            reflected power that is comparable to `error`; None of a tile, which is known exactly.
     """
 
     table: SeriesTable | SliceTable
@@ -55,10 +56,10 @@ class PowerSpectrum:
     source: str
     source_digest: str = field(repr=False)
     largest_angle: float = 90.0
-    dropped: float = 0.0
-    beyond: float = 0.0
+    truncated_power: float = 0.0
+    unresolved_power: float = 0.0
     patches: int = 1
-    scatter: float | None = None
+    standard_error: float | None = None
 
     def __post_init__(self) -> None:
         Settings(self.extent, self.coherence_length, self.wavelengths, self.largest_angle, tolerance=self.tolerance)
@@ -72,32 +73,19 @@ class PowerSpectrum:
             raise RequestError(f"error: got {self.error}, wanted a share of the power")
         if not (isinstance(self.source, str) and isinstance(self.source_digest, str)):
             raise RequestError(f"source: got {self.source!r}, {self.source_digest!r}, wanted texts")
-        if not (0 <= self.dropped <= 1 and 0 <= self.beyond <= 1):
-            raise RequestError(f"dropped, beyond: got {self.dropped}, {self.beyond}, wanted shares of the power")
+        if not (0 <= self.truncated_power <= 1 and 0 <= self.unresolved_power <= 1):
+            shares = f"{self.truncated_power}, {self.unresolved_power}"
+            raise RequestError(f"truncated_power, unresolved_power: got {shares}, wanted shares of the power")
         if not (isinstance(self.patches, int) and self.patches >= 1):
             raise RequestError(f"patches: got {self.patches!r}, wanted a whole number of at least 1")
-        if (self.scatter is not None) != (self.extent == "sample") or not 0 <= (self.scatter or 0.0) < np.inf:
-            raise RequestError(f"scatter: got {self.scatter} of a {self.extent}, wanted a number ≥ 0 of a sample only")
+        found = self.standard_error
+        if (found is not None) != (self.extent == "sample") or not 0 <= (found or 0.0) < np.inf:
+            raise RequestError(f"standard_error: got {found} of a {self.extent}, wanted a number ≥ 0 of a sample only")
 
     @property
     def representation(self) -> str:
         """The storage of the powers: "taylor", "chebyshev", "svd" or "slices"."""
         return self.table.representation
-
-    @property
-    def standard_error(self) -> float:
-        """∫ of the standard error of Welch's estimate over q, at the worst κ: of one scan about the mean of many.
-
-        A share of the reflected power, comparable to `error`; see `sample.standard_error`.
-
-        Raises:
-            RequestError: of a tile.
-        """
-        if self.scatter is None:
-            raise RequestError(
-                "standard_error: got a tile, wanted a sample: a patch that repeats for ever is known exactly"
-            )
-        return self.scatter
 
     @property
     def largest_kappa(self) -> float:

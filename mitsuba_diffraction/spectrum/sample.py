@@ -42,7 +42,7 @@ UNIFORM = WindowAxis(np.ones(1), np.zeros(1, np.int64))
 """The window along an axis of one pixel."""
 
 
-def carried_coherence_length(height_field: HeightField, asked: float) -> float:
+def effective_coherence_length(height_field: HeightField, asked: float) -> float:
     """Return the coherence length in µm that a scan supports: `asked`, but at most half of its shorter side.
 
     An axis of one pixel imposes no limit: the surface is uniform along it.
@@ -52,14 +52,14 @@ def carried_coherence_length(height_field: HeightField, asked: float) -> float:
     """
     lobe_width(asked)
     axes = list(zip(height_field.tile_size, height_field.pixel_size, height_field.shape[::-1], strict=True))
-    carried = min([float(asked), *(_LARGEST * size for size, _, count in axes if count > 1)])
+    effective = min([float(asked), *(_LARGEST * size for size, _, count in axes if count > 1)])
     for _, pixel, count in axes:
-        if count > 1 and carried < _FEWEST_PIXELS * pixel * (1 - 1e-9):
+        if count > 1 and effective < _FEWEST_PIXELS * pixel * (1 - 1e-9):
             raise RequestError(
                 f"coherence_length: got {asked:g} µm, of which the scan of {axes[0][0]:.4g} × {axes[1][0]:.4g} µm "
-                f"carries {carried:.4g}; wanted at least {_FEWEST_PIXELS} pixels ({_FEWEST_PIXELS * pixel:.4g} µm)"
+                f"carries {effective:.4g}; wanted at least {_FEWEST_PIXELS} pixels ({_FEWEST_PIXELS * pixel:.4g} µm)"
             )
-    return carried
+    return effective
 
 
 def window_axes(height_field: HeightField, coherence_length: float) -> tuple[WindowAxis | None, WindowAxis | None]:
@@ -107,17 +107,19 @@ def _rounded_up(value: float) -> int:
 
 
 # Along an axis on which the surface is uniform the lobe is followed to this many σ_q.
-_UNIFORM_REACH = 6.0
+_UNIFORM_SIGMAS = 6.0
 
 
 class _Lags:
     """One axis: the lags τ of the autocorrelation, and the frequency lattice that its transform falls on."""
 
-    def __init__(self, axis: WindowAxis | None, pixel: float, coherence_length: float, spacing: float, reach: float):
+    def __init__(
+        self, axis: WindowAxis | None, pixel: float, coherence_length: float, spacing: float, max_frequency: float
+    ):
         self.axis = axis
         sigma = lobe_width(coherence_length)
         if axis is None:
-            pixel, reach = 1 / (4 * _UNIFORM_REACH * sigma), _UNIFORM_REACH * sigma
+            pixel, max_frequency = 1 / (4 * _UNIFORM_SIGMAS * sigma), _UNIFORM_SIGMAS * sigma
             lags = int(np.ceil(6 * coherence_length / 4 * np.sqrt(2) / pixel))
         else:
             lags = len(axis.window) - 1
@@ -125,7 +127,7 @@ class _Lags:
         self.count = scipy.fft.next_fast_len(max(int(np.ceil(1 / (spacing * pixel))), 2 * lags + 1), real=True)
         self.spacing = 1 / (self.count * pixel)
         self.limit = np.inf if axis is None else 1 / (2 * pixel)
-        self.reached = min(reach, self.limit)
+        self.reached = min(max_frequency, self.limit)
         # Three nodes hold at the last frequency, too. Beyond the Nyquist limit S repeats.
         self.largest = int(np.rint(self.reached / self.spacing)) + 1
         self.lags = np.arange(-lags, lags + 1)
@@ -148,11 +150,13 @@ class SamplePowers:
         grid: all nodes whose splines overlap the frequencies that light reaches and the pixels resolve.
     """
 
-    def __init__(self, height_field: HeightField, coherence_length: float, spacing: float, reach: float) -> None:
-        """Take the scan, its effective coherence length (µm), and the spacing and reach of the nodes (cycles/µm)."""
+    def __init__(
+        self, height_field: HeightField, coherence_length: float, spacing: float, max_frequency: float
+    ) -> None:
+        """Take the scan, its effective coherence length in µm, spacing and largest frequency of the nodes in 1/µm."""
         self._phase = height_field.centred
         self._lags = [
-            _Lags(axis, pixel, coherence_length, spacing, reach)
+            _Lags(axis, pixel, coherence_length, spacing, max_frequency)
             for axis, pixel in zip(window_axes(height_field, coherence_length), height_field.pixel_size, strict=True)
         ]
         x, y = self._lags
@@ -214,7 +218,9 @@ _BATCHES = 4  # along each axis
 _KAPPAS = 4
 
 
-def standard_error(height_field: HeightField, *, coherence_length: float, largest_kappa: float, reach: float) -> float:
+def standard_error(
+    height_field: HeightField, *, coherence_length: float, largest_kappa: float, max_frequency: float
+) -> float:
     """Return ∫ of the standard error of S(q; κ) over q, at the worst of four κ: a share of the reflected power.
 
     Welch's estimate Ŝ is the mean of P periodograms S_p. Those of overlapping windows are correlated; where the
@@ -234,7 +240,7 @@ def standard_error(height_field: HeightField, *, coherence_length: float, larges
         height_field: the scan.
         coherence_length: in µm, supported by the scan.
         largest_kappa: κ up to which S is wanted, rad/µm.
-        reach: largest |q_x| and |q_y| that light reaches, cycles/µm.
+        max_frequency: largest |q_x| and |q_y| that light reaches, cycles/µm.
     """
     axes = [axis or UNIFORM for axis in window_axes(height_field, coherence_length)]
     correlation, within = 1.0, 1.0
@@ -245,12 +251,16 @@ def standard_error(height_field: HeightField, *, coherence_length: float, larges
     if within - correlation < 1e-12:
         return 0.0  # a single pixel
     inside = [
-        np.abs(scipy.fft.fftfreq(len(axis.window), pixel)) <= reach if len(axis.window) > 1 else np.ones(1, bool)
+        np.abs(scipy.fft.fftfreq(len(axis.window), pixel)) <= max_frequency
+        if len(axis.window) > 1
+        else np.ones(1, bool)
         for axis, pixel in zip(axes, height_field.pixel_size, strict=True)
     ]
     errors = []
     for kappa in largest_kappa * np.arange(1, _KAPPAS + 1) / _KAPPAS:
-        variance = _scatter(np.exp(1j * kappa * height_field.centred), axes) * correlation / (within - correlation)
+        variance = (
+            _batch_variance(np.exp(1j * kappa * height_field.centred), axes) * correlation / (within - correlation)
+        )
         smooth = scipy.ndimage.uniform_filter(variance, 3, mode="wrap")
         errors.append(inside[1] @ np.sqrt(np.maximum(smooth, 0)) @ inside[0])
     return float(max(errors))
@@ -260,8 +270,8 @@ def _correlation(axis: WindowAxis) -> NDArray[np.float64]:
     """Compute ρ of the places along one axis, (P, P)."""
     width = len(axis.window)
     overlap = np.correlate(axis.window, axis.window, "full")[width - 1 :]
-    apart = np.abs(axis.starts[:, None] - axis.starts)
-    return np.where(apart < width, overlap[np.minimum(apart, width - 1)], 0) ** 2
+    distance = np.abs(axis.starts[:, None] - axis.starts)
+    return np.where(distance < width, overlap[np.minimum(distance, width - 1)], 0) ** 2
 
 
 def _batches(axis: WindowAxis) -> list[NDArray[np.int64]]:
@@ -269,7 +279,7 @@ def _batches(axis: WindowAxis) -> list[NDArray[np.int64]]:
     return np.array_split(places, min(_BATCHES, len(places)))
 
 
-def _scatter(wave: NDArray[np.complex128], axes: list[WindowAxis]) -> NDArray[np.float64]:
+def _batch_variance(wave: NDArray[np.complex128], axes: list[WindowAxis]) -> NDArray[np.float64]:
     """Compute ⟨(S_b − Ŝ)²⟩ at the frequencies of the window's own transform, shares of the power: (W_y, W_x)."""
     x, y = axes
     shape = len(y.window), len(x.window)

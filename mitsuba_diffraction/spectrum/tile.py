@@ -30,12 +30,12 @@ class TilePowers:
 
     own_error: float = 0.0
 
-    def __init__(self, height_field: HeightField, reach: float, lobe_radius: float) -> None:
+    def __init__(self, height_field: HeightField, max_frequency: float, lobe_radius: float) -> None:
         """Take the tile, the largest |q| that light reaches and the radius of a lobe, both in cycles/µm."""
         self._height_field = height_field
         pixels = height_field.shape[::-1]
-        self.grid = OrderGrid.reachable(height_field.tile_size, pixels, reach + lobe_radius)
-        self._reached = OrderGrid.reachable(height_field.tile_size, pixels, reach)
+        self.grid = OrderGrid.reachable(height_field.tile_size, pixels, max_frequency + lobe_radius)
+        self._reached = OrderGrid.reachable(height_field.tile_size, pixels, max_frequency)
 
     def __call__(self, kappa: float) -> NDArray[np.float64]:
         """Compute η_m(κ), (rows, columns); κ in rad/µm."""
@@ -70,17 +70,17 @@ class MeanPowers(TilePowers):
     def __init__(
         self,
         height_fields: Sequence[HeightField],
-        reach: float,
+        max_frequency: float,
         lobe_radius: float,
         largest_kappa: float,
         tolerance: float,
         progress: Progress,
     ) -> None:
-        """Take patches of one size; reach and radius as `TilePowers`; the largest κ in rad/µm; and the tolerance.
+        """Take patches of one size; frequency and radius as `TilePowers`; the largest κ in rad/µm; and the tolerance.
 
         `progress` is called with the patches done and in all.
         """
-        super().__init__(height_fields[0], reach, lobe_radius)
+        super().__init__(height_fields[0], max_frequency, lobe_radius)
         self._largest_kappa = largest_kappa
         height_range = max(field.height_range for field in height_fields)
         self._nodes = nodes_for(largest_kappa * height_range / 2, 0.01 * tolerance)
@@ -90,7 +90,7 @@ class MeanPowers(TilePowers):
             heights = field.centred.astype(np.float32)
             for j, kappa in enumerate((1 + chebyshev_nodes(self._nodes)) / 2 * largest_kappa):
                 total[j] += self.grid.take(_powers_float32(heights, kappa))
-            one = TilePowers(field, reach, lobe_radius)
+            one = TilePowers(field, max_frequency, lobe_radius)
             for j, share in enumerate(_CHECKED):
                 checked[j] += one(share * largest_kappa)
             progress(number, len(height_fields))
@@ -135,12 +135,12 @@ class TileSplines:
     # Nodes beyond the grid, so that what lies there is not projected on its last ones.
     _MARGIN = 12
 
-    def __init__(self, powers: TilePowers, lobe_width: float, spacing: float, reach: float) -> None:
-        """Take η_m(κ), σ_q, and the largest spacing and reach of the nodes, all in cycles/µm."""
+    def __init__(self, powers: TilePowers, lobe_width: float, spacing: float, max_frequency: float) -> None:
+        """Take η_m(κ), σ_q, and the largest spacing and frequency of the nodes, all in cycles/µm."""
         self._powers, self._sigma, self._spacing = powers, lobe_width, spacing
         self._orders = powers.grid.frequencies()
         # Beyond six σ_q of the last order there is nothing.
-        self._reached = tuple(min(reach, q[-1] + 6 * lobe_width) for q in self._orders)
+        self._reached = tuple(min(max_frequency, q[-1] + 6 * lobe_width) for q in self._orders)
         largest = tuple(int(np.rint(end / spacing)) + 1 for end in self._reached)
         self.grid = SplineGrid((spacing, spacing), largest, (np.inf, np.inf))
         self._random = np.random.default_rng(0)

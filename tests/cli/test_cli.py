@@ -166,7 +166,7 @@ def test_precompute_writes_the_file_that_it_names_and_prints_its_error(command):
     ]
     told = float(out.split("frequencies; ")[1].split()[0])
     assert told == pytest.approx(1 - np.sum(eta, axis=0).min(), rel=0.05)
-    assert f"{spectrum.beyond:.1e} at frequencies that no direction reaches" in out
+    assert f"{spectrum.unresolved_power:.1e} at frequencies that no direction reaches" in out
 
 
 @pytest.mark.few(1)
@@ -186,8 +186,8 @@ def test_precompute_takes_a_sample_by_options(command, representation):
     rows, columns = spectrum.grid.shape
     for part in (f"sample, {columns} × {rows} frequencies", "cycles/µm apart", "coherence length 0.9 µm", "truncated"):
         assert part in out
-    assert f"{spectrum.dropped:.1e} of the power" in out
-    assert f"{spectrum.beyond:.1e} at frequencies that" in out
+    assert f"{spectrum.truncated_power:.1e} of the power" in out
+    assert f"{spectrum.unresolved_power:.1e} at frequencies that" in out
 
 
 def test_a_smaller_angle_takes_fewer_orders(command):

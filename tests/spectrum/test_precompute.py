@@ -454,7 +454,7 @@ def test_the_unresolved_power_is_reported(field, arguments):
         power_outside(field, kappa, lambda x, y: (np.abs(x / t_x) <= reach) & (np.abs(y / t_y) <= reach))
         for kappa in np.linspace(0, spectrum.largest_kappa, 400)
     )
-    assert spectrum.beyond == pytest.approx(worst, rel=0.02, abs=1e-9)
+    assert spectrum.unresolved_power == pytest.approx(worst, rel=0.02, abs=1e-9)
 
 
 @pytest.mark.few(3)
@@ -475,9 +475,9 @@ def test_weak_orders_are_dropped_and_their_power_is_reported(field, tolerance):
     assert m_x < min((field.shape[1] - 1) // 2, int(REACHED * field.tile_size[0]))  # there was something to drop
     kappas = np.linspace(0, LARGEST_KAPPA, 300)
     kept = [power_outside(field, kappa, lambda x, y: (np.abs(x) <= m_x) & (np.abs(y) <= m_y)) for kappa in kappas]
-    assert max(kept) <= spectrum.dropped * 1.001 + spectrum.beyond + 1e-12
-    assert spectrum.dropped <= 0.1 * tolerance
-    assert spectrum.dropped <= spectrum.error
+    assert max(kept) <= spectrum.truncated_power * 1.001 + spectrum.unresolved_power + 1e-12
+    assert spectrum.truncated_power <= 0.1 * tolerance
+    assert spectrum.truncated_power <= spectrum.error
     # With one order fewer on each side it would be more than may be dropped on one axis: a twentieth of what the tails
     # of the lobes leave of the tolerance.
     fewer = [power_outside(field, kappa, lambda x, y: np.abs(x) <= m_x - 1) for kappa in kappas]
@@ -501,7 +501,7 @@ def test_a_narrower_scene_has_a_smaller_table_that_is_right(extent):
     ]:
         assert narrow.largest_kappa == pytest.approx(largest_kappa)
         assert narrow.megabytes < 0.8 * whole.megabytes
-        assert narrow.beyond > whole.beyond
+        assert narrow.unresolved_power > whole.unresolved_power
         # Random places out to the very edge: their mean error is the tolerance at most.
         q = rng.uniform(-reach, reach, (800, 2))
         q = q[np.hypot(*q.T) <= reach]
@@ -599,7 +599,7 @@ def test_the_unresolved_power_of_a_sample_is_reported():
         md.reference.power_spectrum(field, q, kappa, extent="sample", coherence_length=0.55).mean() * (2 * reach) ** 2
         for kappa in np.linspace(0, LARGEST_KAPPA, 40)
     ]
-    assert spectrum.beyond == pytest.approx(1 - min(inside), abs=3e-3)
+    assert spectrum.unresolved_power == pytest.approx(1 - min(inside), abs=3e-3)
 
 
 def test_the_weak_frequencies_of_a_smooth_sample_are_dropped():
@@ -614,8 +614,8 @@ def test_the_weak_frequencies_of_a_smooth_sample_are_dropped():
     assert (spectrum.evaluate(q[outside], 30.0) == 0).all()
     for kappa in (0.0, 17.0, LARGEST_KAPPA):
         exact = md.reference.power_spectrum(field, q[outside], kappa, extent="sample", coherence_length=1.5)
-        assert exact.sum() * (sigma / 2) ** 2 <= spectrum.dropped
-    assert 0 < spectrum.dropped <= 0.1 * 0.01
+        assert exact.sum() * (sigma / 2) ** 2 <= spectrum.truncated_power
+    assert 0 < spectrum.truncated_power <= 0.1 * 0.01
 
 
 def test_the_coherence_length_that_a_scan_supports_is_reported():

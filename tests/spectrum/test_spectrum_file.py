@@ -27,7 +27,7 @@ SHAPES = [(1, 1), (1, 8), (7, 1), (5, 5), (4, 6)]
 KINDS = ["taylor", "chebyshev", "svd", "slices"]
 NUMBERS = (
     *("height_range", "coherence_length", "wavelengths", "tolerance", "error", "pixel_size"),
-    *("largest_angle", "dropped", "beyond"),
+    *("largest_angle", "truncated_power", "unresolved_power"),
 )
 # Random numbers, which tell a table that was read from one that was made.
 _LAYOUT = Layout(0.18, 1, 4, 1, 3, (1.2, 1 / 0.36), False)
@@ -155,8 +155,8 @@ def test_the_header_names_all_that_a_reader_needs(tmp_path, way):
         "error": (spectrum.error,),
         "tolerance": (1e-3 if way == "tile" else 0.05,),
         "largestAngle": (80.0,),
-        "dropped": (spectrum.dropped,),
-        "beyond": (spectrum.beyond,),
+        "dropped": (spectrum.truncated_power,),
+        "beyond": (spectrum.unresolved_power,),
     }
     if way == "tile":
         numbers["tileSize"] = (7 * 0.07, 4 * 0.0585)

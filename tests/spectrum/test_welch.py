@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mitsuba_diffraction import HeightField
-from mitsuba_diffraction.spectrum.sample import WindowAxis, carried_coherence_length, mean_periodogram, window_axes
+from mitsuba_diffraction.spectrum.sample import WindowAxis, effective_coherence_length, mean_periodogram, window_axes
 
 
 def flat(rows, columns, pixel):
@@ -28,7 +28,7 @@ def flat(rows, columns, pixel):
     ],
 )
 def test_a_scan_supports_half_of_its_shorter_side(rows, columns, pixel, asked, wanted):
-    assert carried_coherence_length(flat(rows, columns, pixel), asked) == pytest.approx(wanted, rel=1e-12)
+    assert effective_coherence_length(flat(rows, columns, pixel), asked) == pytest.approx(wanted, rel=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -44,7 +44,7 @@ def test_a_scan_supports_half_of_its_shorter_side(rows, columns, pixel, asked, w
 )
 def test_too_few_pixels_for_a_window_are_refused(rows, columns, asked, message):
     with pytest.raises(ValueError, match=message):
-        carried_coherence_length(flat(rows, columns, 0.1), asked)
+        effective_coherence_length(flat(rows, columns, 0.1), asked)
 
 
 @given(
@@ -80,7 +80,7 @@ def test_windows_are_gaussian_and_cover_the_scan(count, pixel, share):
 def test_the_widest_windows_have_three_places(count, pixel):
     # Whatever rounding makes of sizes that divide evenly.
     field = flat(count, count, pixel)
-    for axis in window_axes(field, carried_coherence_length(field, 65 * count)):
+    for axis in window_axes(field, effective_coherence_length(field, 65 * count)):
         assert len(axis.starts) == 3
 
 

@@ -31,7 +31,7 @@ def against_reference(height_field: HeightField, spectrum: GratingSpectrum) -> R
         for kappa in random.uniform(0.2, 1, 3) * spectrum.largest_kappa
     ]
     note = "∫|ΔS| dq, 400 frequencies at each of three κ"
-    return Record.worst(0.0, errors, spectrum.tolerance + spectrum.dropped, note)
+    return Record.worst(0.0, errors, spectrum.tolerance + spectrum.truncated_power, note)
 
 
 def l1_error(
@@ -59,7 +59,7 @@ def l1_error(
     error = np.abs(approximate - exact)[drawn] / approximate[drawn]
     # What lies beyond the reach of the lobes is not drawn.
     tail = 1 - np.prod([lobe.inside for lobe in spectrum.lobes]) if lines else 0.0
-    return float(error.sum() / count * shares.sum(dtype=np.float64) + spectrum.dropped + tail)
+    return float(error.sum() / count * shares.sum(dtype=np.float64) + spectrum.truncated_power + tail)
 
 
 def _drawn(

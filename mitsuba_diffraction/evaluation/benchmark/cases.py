@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from ...grating_spectrum import GratingSpectrum
 from ...precomputation import precompute
 from ...settings import SUN_COHERENCE_LENGTH
-from ...spectrum.sample import carried_coherence_length
+from ...spectrum.sample import effective_coherence_length
 from ...surface import gratings
 from ...surface.heightfield import HeightField
 
@@ -56,11 +56,11 @@ def bundled_cases() -> list[Case]:
         Case("elaphe", gratings.elaphe(32.0, seed=1), "tile", 26.0),
         Case("xenopeltis", gratings.xenopeltis(32.0, seed=1), "tile", 26.0),
         Case("65 µm tile", large, "tile", sun),
-        Case("65 µm sample", large, "sample", carried_coherence_length(large, sun)),
+        Case("65 µm sample", large, "sample", effective_coherence_length(large, sun)),
     ]
 
 
 def scan_case(height_field: HeightField) -> Case:
     """Return a scan as a sample of an irregular surface, with the longest coherence length that it supports."""
-    coherence = carried_coherence_length(height_field, SUN_COHERENCE_LENGTH)
+    coherence = effective_coherence_length(height_field, SUN_COHERENCE_LENGTH)
     return Case(height_field.source, height_field, "sample", coherence)

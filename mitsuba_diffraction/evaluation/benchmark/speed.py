@@ -40,7 +40,7 @@ class Rays:
         dr.eval(sample.wo, sample.pdf, weight)
 
     def read(self, spectrum: GratingSpectrum, table: mi.UInt32) -> None:
-        """Gather and sum the words about each q: the minimum work of any evaluation.
+        """Sum the words about each q: the minimum work of any evaluation.
 
         Args:
             spectrum: determines the nodes and the number of words.

@@ -44,7 +44,9 @@ def parseval(spectrum: GratingSpectrum) -> Record:
     """Check the sum over all frequencies of the spectrum, with allowance for its stated truncated power."""
     kappas = np.linspace(0.2, 1, 9) * spectrum.largest_kappa
     found = [spectrum.powers(kappa).sum(dtype=np.float64) for kappa in kappas]
-    return Record.worst(1.0, found, spectrum.tolerance + spectrum.beyond + spectrum.dropped, "Σ_m η_m, nine κ")
+    return Record.worst(
+        1.0, found, spectrum.tolerance + spectrum.unresolved_power + spectrum.truncated_power, "Σ_m η_m, nine κ"
+    )
 
 
 def reciprocity(spectrum: GratingSpectrum) -> Record:

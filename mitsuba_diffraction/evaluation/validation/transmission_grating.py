@@ -79,7 +79,7 @@ def transmitted(surface: HeightField, wavelength: float, rigorous: bool) -> Real
 
 @functools.cache
 def measured() -> tuple[Real, Real]:
-    """Wavelengths in µm and η₁, (n,) each."""
+    """Return wavelengths in µm and η₁, (n,) each."""
     nanometres, found, _ = np.loadtxt(DATA / "T300.csv", delimiter=",", skiprows=2, unpack=True)
     return nanometres * 1e-3, found
 
@@ -127,7 +127,7 @@ def fit(shape: str, rigorous: bool, step: int = 3) -> Fit:
 
 @functools.cache
 def stored_angles() -> dict[str, dict[str, float]]:
-    """Shape of the grooves → theory → angle in degrees that `fit` found, by `precompute/ruled_fits.py`."""
+    """Return shape of the grooves → theory → angle in degrees that `fit` found, by `precompute/ruled_fits.py`."""
     return json.loads(FITS.read_text(encoding="utf-8"))["groove angles"]
 
 
