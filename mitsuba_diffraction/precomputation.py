@@ -21,7 +21,7 @@ from .surface.heightfield import HeightField
 
 Spectrum = GratingSpectrum | RigorousSpectrum
 
-_HEADER = 2**16  # bytes, in which the format is told
+_HEADER = 2**16  # bytes, which hold the name of the format
 
 
 @one_thread()

@@ -87,18 +87,18 @@ def tile_powers(height_field: HeightField, shortest: float) -> OrderPowers:
     F_m(κ) is interpolated by Chebyshev polynomials in κ, exactly in float64: e^{iκh} varies no faster than e^{iκH}, and
     the coefficients beyond the order κH/2 fall faster than exponentially.
     """
-    largest = 4 * np.pi / shortest
-    degree = int(np.ceil(largest * height_field.half_range / 2)) + 25
+    max_kappa = 4 * np.pi / shortest
+    degree = int(np.ceil(max_kappa * height_field.half_range / 2)) + 25
     grid = OrderGrid.reachable(height_field.tile_size, height_field.shape[::-1], 2 / shortest)
     m_x, m_y = (axis.ravel() for axis in np.meshgrid(*grid.axes()))
     coefficients = chebyshev.chebinterpolate(
-        lambda x: [amplitudes(height_field, kappa)[m_y, m_x] for kappa in largest / 2 * (x + 1)], degree
+        lambda x: [amplitudes(height_field, kappa)[m_y, m_x] for kappa in max_kappa / 2 * (x + 1)], degree
     )
 
     def powers(m: NDArray[np.int64], kappa: Array) -> Array:
         inside = (np.abs(m) <= grid.largest).all(axis=-1)
         columns, rows = np.moveaxis(np.where(inside[..., None], m + grid.largest, 0), -1, 0)
-        waves = chebyshev.chebvander(2 * kappa / largest - 1, degree)
+        waves = chebyshev.chebvander(2 * kappa / max_kappa - 1, degree)
         amplitude = (waves * np.moveaxis(coefficients[:, rows * grid.shape[1] + columns], 0, -1)).sum(axis=-1)
         # Those of the Nyquist frequency have no sign.
         inside &= (2 * np.abs(m) < height_field.shape[::-1]).all(axis=-1)

@@ -285,10 +285,10 @@ def broadened(height_field: HeightField, share: float, *, extent: str = "sample"
 
     sign = float(np.sign(share))
     low, high = 0.0, min(height_field.pixel_size) / 8
-    largest = max(height_field.tile_size) ** 2 / height_field.height_range
+    max_radius = max(height_field.tile_size) ** 2 / height_field.height_range
     while not is_broadened(sign * high):
         low, high = high, 2 * high
-        if high > largest:
+        if high > max_radius:
             raise RequestError("height_field: no tip broadens its ridges that much")
     for _ in range(_HALVINGS):
         middle_radius = (low + high) / 2

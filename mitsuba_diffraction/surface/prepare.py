@@ -77,11 +77,13 @@ def _level(height_field: HeightField, degree: int) -> HeightField:
     found = dict(zip(powers, coefficients, strict=True))
     half = [max((n - 1) / 2, 1) * size for n, size in zip((columns, rows), height_field.pixel_size, strict=True)]
     tilts = [np.degrees(np.arctan(found.get(p, 0.0) / h)) for p, h in zip([(1, 0), (0, 1)], half, strict=True)]
-    told = f"tilt {tilts[0]:.3g}° along x, {tilts[1]:.3g}° along y"
+    description = f"tilt {tilts[0]:.3g}° along x, {tilts[1]:.3g}° along y"
     if degree == 2:
-        told += f", bow {found.get((2, 0), 0.0) * 1e3:.3g} nm along x, {found.get((0, 2), 0.0) * 1e3:.3g} nm along y"
+        description += (
+            f", bow {found.get((2, 0), 0.0) * 1e3:.3g} nm along x, {found.get((0, 2), 0.0) * 1e3:.3g} nm along y"
+        )
     name = "level_plane" if degree == 1 else "level_quadratic"
-    return _after(height_field, heights - middle - surface, f"{name}: {told}")
+    return _after(height_field, heights - middle - surface, f"{name}: {description}")
 
 
 def align_lines(height_field: HeightField) -> HeightField:
@@ -105,8 +107,8 @@ def align_lines(height_field: HeightField) -> HeightField:
     offsets -= np.polyval(np.polyfit(lines, offsets, 1 if len(lines) > 1 else 0), lines)
     aligned = heights.copy()
     aligned[lines] -= offsets[:, None]
-    told = f"offsets {offsets.std() * 1e3:.3g} nm rms, {np.abs(offsets).max() * 1e3:.3g} nm at most"
-    return _after(height_field, aligned, f"align_lines: {told}")
+    description = f"offsets {offsets.std() * 1e3:.3g} nm rms, {np.abs(offsets).max() * 1e3:.3g} nm at most"
+    return _after(height_field, aligned, f"align_lines: {description}")
 
 
 def despike(height_field: HeightField, threshold: float = 5.0) -> HeightField:
@@ -139,8 +141,8 @@ def despike(height_field: HeightField, threshold: float = 5.0) -> HeightField:
     if spikes.any():
         cleaned = harmonic_fill(np.where(spikes, np.nan, whole), height_field.pixel_size)
         cleaned = np.where(gaps, np.nan, np.where(spikes, cleaned, height_field.heights))
-    told = f"{spikes.sum()} of {spikes.size} pixels beyond {threshold:g} × {sigma * 1e3:.3g} nm"
-    return _after(height_field, cleaned, f"despike: {told}")
+    description = f"{spikes.sum()} of {spikes.size} pixels beyond {threshold:g} × {sigma * 1e3:.3g} nm"
+    return _after(height_field, cleaned, f"despike: {description}")
 
 
 def _noise(heights: NDArray[np.float64]) -> float:
@@ -256,15 +258,15 @@ def crop_periods(height_field: HeightField, axes: str = "xy") -> HeightField:
     waves = [wave for wave in found if wave.strength >= _LEAST_STRENGTH * found[0].strength]
     if not waves:
         raise RequestError("crop_periods: no period stands out of the spectrum of the heights")
-    told = []
+    description = []
     heights, sizes = height_field.heights, list(height_field.pixel_size)
     for axis in axes:
         k = "xy".index(axis)
         heights, sizes[k], what = _crop(heights, 1 - k, sizes[k], waves, axis)
-        told.append(what)
-    if all("no period" in what for what in told):
-        raise RequestError(f"crop_periods: {'; '.join(told)}")
-    return _after(height_field, heights, f"crop_periods: {', '.join(told)}", (sizes[0], sizes[1]))
+        description.append(what)
+    if all("no period" in what for what in description):
+        raise RequestError(f"crop_periods: {'; '.join(description)}")
+    return _after(height_field, heights, f"crop_periods: {', '.join(description)}", (sizes[0], sizes[1]))
 
 
 def _crop(
@@ -281,8 +283,8 @@ def _crop(
     numbers = np.arange(most, most // 2 - 1 if most > 1 else 0, -1)
     lengths = np.maximum(numbers, 1) / q[first]
     misfits = np.abs(q[:, None] * lengths - np.rint(q[:, None] * lengths))
-    worst = misfits.max(axis=0)
-    best = int(np.argmax(worst <= _MISFIT)) if (worst <= _MISFIT).any() else int(np.argmin(worst))
+    max_misfit = misfits.max(axis=0)
+    best = int(np.argmax(max_misfit <= _MISFIT)) if (max_misfit <= _MISFIT).any() else int(np.argmin(max_misfit))
     length, misfit = lengths[best], np.delete(misfits[:, best], first)
     exact = length / size
     new = int(np.rint(exact))
@@ -296,10 +298,10 @@ def _crop(
         heights = spline(start - 0.5 + (np.arange(new) + 0.5) * exact / new)
         how = f"{exact:.2f} of {count} pixels, resampled to {new}"
         size = length / new
-    told = f"{max(numbers[best], 1)} × {1e3 / q[first]:.4g} nm along {axis} ({how}, "
-    told += f"known to {length * uncertainty[first]:.2g} periods"
-    told += f", the other wave is {misfit.max():.2g} periods off)" if len(misfit) else ")"
-    return heights, size, told
+    description = f"{max(numbers[best], 1)} × {1e3 / q[first]:.4g} nm along {axis} ({how}, "
+    description += f"known to {length * uncertainty[first]:.2g} periods"
+    description += f", the other wave is {misfit.max():.2g} periods off)" if len(misfit) else ")"
+    return heights, size, description
 
 
 def _component(wave: Period, axis: str) -> tuple[float, float]:
@@ -390,11 +392,11 @@ def _parts(step: object) -> tuple[str, object]:
 def _after(
     height_field: HeightField,
     heights: NDArray,
-    told: str,
+    description: str,
     pixel_size: tuple[float, float] | None = None,
     filled: int = 0,
 ) -> HeightField:
-    source = f"{height_field.source}; {told}"
+    source = f"{height_field.source}; {description}"
     size, filled = pixel_size or height_field.pixel_size, height_field.filled + filled
     return HeightField(heights, size, source, keep_missing=True, filled=filled)
 

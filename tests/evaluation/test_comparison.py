@@ -190,7 +190,7 @@ def test_the_same_light_is_direct_light(llvm, tmp_path):
     assert not np.array_equal(*found.halves)
 
 
-@pytest.mark.few(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(("ratio", "agrees"), [(0.45, False), (1.5, True)])
 def test_corrected_the_shader_converges_to_the_model_within_the_limit(llvm, tmp_path, ratio, agrees):
     # Coherence length over tile. Without E, which the shader lacks.

@@ -180,6 +180,7 @@ def test_a_surface_outside_the_range_of_scalar_theory_is_reported():
             assert scalar_theory.scalar_error(flat, extent).share == 0
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("name", ["sinusoidal", "blazed"])
 @pytest.mark.parametrize("period", [3.25, 3.7, 8.0])
 def test_no_surface_within_the_promised_range_is_warned_of(name, period):
@@ -226,7 +227,7 @@ def random_profiles(count):
         yield md.HeightField(depth * heights[None] / np.ptp(heights), (period / 128, period))
 
 
-@pytest.mark.parametrize("count", [12, pytest.param(48, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [4, pytest.param(48, marks=pytest.mark.slow)])
 def test_estimated_error_is_near_the_solved_one(count):
     factors = []
     for profile in random_profiles(count):

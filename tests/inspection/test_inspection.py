@@ -533,7 +533,7 @@ def test_the_notebook_runs_and_prints_what_it_shows(monkeypatch, capsys, whole):
     assert np.ptp(names["picture"], axis=2).max() > 0.1 * names["picture"].max()
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("periods", [1, 2, 4, 9])
 def test_the_period_of_a_tile_is_found_whatever_it_holds(periods):
     x = (np.arange(96) + 0.5) / 96 * periods

@@ -122,7 +122,7 @@ def test_measured_skins_keep_the_tolerance(scan, name, representation, tolerance
     assert worst_error(spectrum, field, random_kappas(6, 4)) <= tolerance
 
 
-@pytest.mark.few(6)
+@pytest.mark.few(3)
 @pytest.mark.parametrize(
     ("field", "tolerance"),
     [
@@ -180,7 +180,7 @@ def overlapping_error(field, spectrum, kappa, coherence_length):
     return np.abs(spectrum.evaluate(q, kappa) - exact)[reached].sum() * step**2
 
 
-@pytest.mark.few(44)
+@pytest.mark.few(11)
 @pytest.mark.parametrize("tolerance", [1e-2, 1e-4])
 @pytest.mark.parametrize("representation", KINDS)
 @pytest.mark.parametrize(
@@ -300,6 +300,7 @@ def test_taylor_refuses_deep_surfaces_with_the_reason(extent, depth):
         precompute(field, extent=extent, representation="taylor", coherence_length=1.2)
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("representation", ["chebyshev", "svd", "slices"])
 @pytest.mark.parametrize("depth", [1.0, 5.0])
 def test_other_representations_keep_the_tolerance_on_deep_surfaces(depth, representation):
@@ -323,6 +324,7 @@ def test_slices_are_stored_in_as_few_bits_as_the_tolerance_allows(tolerance, wor
 
 
 # Where few orders hold at one q they are read themselves; where many do, a lattice of splines.
+@pytest.mark.few(2)
 @pytest.mark.parametrize(("coherence_length", "lattice"), [(12.0, False), (8.0, False), (2.0, True), (0.7, True)])
 def test_a_tile_is_read_from_a_lattice_where_its_lobes_overlap_widely(coherence_length, lattice):
     field = md.gratings.xenopeltis(8.0, seed=2)
@@ -552,7 +554,7 @@ SAMPLES = {
 }
 
 
-@pytest.mark.few(56)
+@pytest.mark.few(14)
 @EACH
 @pytest.mark.parametrize("tolerance", [3e-2, 1e-3])
 @pytest.mark.parametrize("name", SAMPLES)
@@ -574,6 +576,7 @@ def test_a_sample_keeps_the_tolerance(name, tolerance, representation):
         assert sample_error(spectrum, field, kappa, coherence_length, seed=5) <= spectrum.error
 
 
+@pytest.mark.few(2)
 @EACH
 def test_a_deep_sample_keeps_the_tolerance_or_is_refused(representation):
     field = scan_of((10, 12), 5.0, 0.09)

@@ -93,6 +93,7 @@ def test_the_share_that_lobe_reach_names_is_the_one_that_the_cut_moves(share):
     assert 2 * (1 - inside**2) == pytest.approx(share, rel=1e-3, abs=1e-9)
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("coherence_length", [1.0, 5.0, 20.0, 65.0])
 @pytest.mark.parametrize("tolerance", [1e-2, 1e-3])
 def test_truncated_lobes_keep_their_power_and_the_tolerance(coherence_length, tolerance):
@@ -369,6 +370,7 @@ def test_nothing_lies_far_from_the_orders(blaze):
     np.testing.assert_array_equal(blaze.evaluate([[1e6, 0.0], [0.0, -1e6], [0.2, 0.0]], 20.0), 0)
 
 
+@pytest.mark.few(7)
 @pytest.mark.parametrize("coherence_length", [0.3, 1.0, 2.0, 5.0, 9.0])
 @pytest.mark.parametrize("representation", KINDS)
 def test_lobes_wider_than_the_grid_of_orders_keep_all_orders(coherence_length, representation):

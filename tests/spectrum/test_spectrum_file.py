@@ -131,6 +131,7 @@ def test_a_spectrum_comes_back_bit_for_bit(
     assert_the_same(GratingSpectrum.load(path), spectrum)
 
 
+@pytest.mark.few(5)
 @pytest.mark.parametrize("shape", [(1, 9), (10, 1), (10, 9), (1, 1)])
 @pytest.mark.parametrize("representation", KINDS)
 def test_a_sample_comes_back_bit_for_bit(tmp_path, representation, shape):

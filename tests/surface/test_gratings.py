@@ -135,7 +135,7 @@ def test_a_seed_names_one_skin(name):
     assert abs(np.corrcoef(first.ravel(), other.ravel())[0, 1]) < 0.5
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", sorted(SKINS))
 @pytest.mark.parametrize("seed", [0, 7])
 def test_mean_period_of_a_skin_is_that_asked_for(name, seed):
@@ -160,6 +160,7 @@ def test_a_skin_is_irregular(skin):
     assert strongest[:20].sum() < 0.75 * eta.sum()
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("name", sorted(SKINS))
 @pytest.mark.parametrize("size", [8.0, 10.0, 32.0])
 def test_the_period_is_kept_whatever_the_size(name, size):

@@ -83,6 +83,7 @@ def test_a_line_grating_has_its_pitch(by_its_maker):
     assert found.period == pytest.approx(1 / np.hypot(q_x[column], q_y[row]), abs=2 * found.period_uncertainty)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", CROSSED)
 def test_crossed_structures_have_their_pitches(by_its_maker, name):
     first, second = find_periods(prepare.level_plane(by_its_maker(name)))
@@ -107,6 +108,7 @@ def test_a_real_scan_is_prepared_to_a_tile(by_its_maker):
 # ---------------------------------------------------------------- the extra
 
 
+@pytest.mark.few(1)
 @needs_the_extra
 @pytest.mark.parametrize("name", ["grid", "circles"])
 def test_nid_is_read_as_by_its_maker(nid, by_its_maker, name):

@@ -348,6 +348,7 @@ def test_edges_are_trimmed_by_at_least_their_width():
             prepare.trim_edges(field, width)
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("noise", [0.0, 0.01])
 @pytest.mark.parametrize(("period", "direction"), [(0.613, 0), (0.613, 30), (0.47, -62)])
 def test_a_grating_is_cropped_to_a_tile_without_a_seam(noise, period, direction):

@@ -289,6 +289,7 @@ def test_ridges_keep_their_period_and_are_uneven():
 # ---------------------------------------------------------------- the comb of a tile that repeats
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("name", sorted(COHERENCE_LENGTHS))
 def test_the_comb_of_a_drawn_tile_is_blurred(name):
     tile = PROFILES[name]().tile_size
@@ -312,6 +313,7 @@ def test_a_recipe_and_a_scene_agree_on_coherence_length_and_patches(name):
 SMALL = ["blaze", "ruled_600", "ruled_1200", "foil_crossed", "foil_hexagonal", "transmission_300", "transmission_600"]
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize(("name", "megabytes"), [*((name, 0.05) for name in SMALL), ("film", 0.11)])
 def test_recipes_of_gratings_are_small_and_keep_their_tolerance(name, megabytes):
     spectrum = Recipe.load(RECIPES / f"{name}.toml").build()
@@ -342,7 +344,7 @@ NAMED = {
 }
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("name", sorted(NAMED))
 def test_a_ready_surface_is_used_in_a_scene_by_its_name(name):
     mi.set_variant("scalar_spectral")

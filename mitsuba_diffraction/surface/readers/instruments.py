@@ -78,7 +78,7 @@ def read(path: Path, unit: str | tuple[str, str] | None, channel: str | int | No
             found = list(reader.channels)
         # Readers of binary files raise arbitrary exceptions for damaged files.
         except Exception as error:
-            raise RequestError(f"not a file of this instrument, or a damaged one ({_told(error)})") from None
+            raise RequestError(f"not a file of this instrument, or a damaged one ({_message(error)})") from None
         chosen = choose(
             [Channel(c.index, c.name or "untitled", c.dim == 2 and c.data_kind.value == "height") for c in found],
             channel,
@@ -93,7 +93,7 @@ def read(path: Path, unit: str | tuple[str, str] | None, channel: str | int | No
             heights = np.ma.asarray(topography.heights(), np.float64).T
             size = topography.physical_sizes
         except Exception as error:
-            raise RequestError(f"a damaged file ({_told(error)})") from None
+            raise RequestError(f"a damaged file ({_message(error)})") from None
     rows, columns = heights.shape
     pixel_size = (size[0] * along / columns, size[1] * along / rows) if size is not None else None
     return Scan(heights * high, pixel_size, chosen.name)
@@ -111,5 +111,5 @@ def _refuse_bomb(path: Path) -> None:
             raise RequestError(f"an archive of {unpacked} bytes, wanted at most {MOST_BYTES}")
 
 
-def _told(error: Exception) -> str:
+def _message(error: Exception) -> str:
     return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
