@@ -22,14 +22,19 @@ from bsdf_support import use  # isort: skip
 from mitsuba_diffraction.render import passes
 
 # One example may be the first to import or to compile something.
-settings.register_profile("tests", deadline=None)
-settings.load_profile("tests")
+settings.register_profile("tests", deadline=None, max_examples=30)
+settings.register_profile("slow", deadline=None)
 
 MEASURED = Path(__file__).parents[1] / "precompute" / "measured"
 _HEIGHT_RANGE = {"elaphe": 0.375, "xenopeltis": 0.819}
 """µm, black to white."""
 _TAKES_LONG = {"mi", "Furnace", "NotebookClient", "subprocess"}
 """What test modules import whose tests compile kernels, trace light in a furnace or start Python anew."""
+
+
+def pytest_configure(config):
+    """Draw fewer examples where slow tests are left out."""
+    settings.load_profile("tests" if "not slow" in config.option.markexpr else "slow")
 
 
 @pytest.hookimpl(tryfirst=True)  # before -m selects

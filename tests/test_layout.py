@@ -1,6 +1,7 @@
 """Imports run one way, and nothing offline imports Mitsuba or Dr.Jit."""
 
 import ast
+import functools
 import graphlib
 import subprocess
 import sys
@@ -36,8 +37,13 @@ ROOMS = {
 LEVELS = {name: level for level, names in enumerate(ROOMS.values()) for name in names.split()}
 
 
+@functools.cache
 def imports(module):
     """The modules of the package that a module imports, at its head, inside a function or for its annotations."""
+    return tuple(_imports(module))
+
+
+def _imports(module):
     path = MODULES[module]
     package = module if path.name == "__init__.py" else module.rpartition(".")[0]
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):

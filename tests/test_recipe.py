@@ -309,6 +309,7 @@ def test_a_recipe_of_a_measured_skin_has_its_heights(tmp_path, scan_file, scan):
     assert Recipe.load(write(tmp_path, text)).height_field().digest == scan("elaphe").digest
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize(
     "path", [pytest.param(p, id=p.name, marks=pytest.mark.slow if p.stem in SLOW else ()) for p in RECIPES]
 )

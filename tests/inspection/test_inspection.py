@@ -131,7 +131,7 @@ def test_colours_go_where_the_grating_equation_sends_them():
     assert order_angle(4, PERIOD, 0.55) is None
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("order", [1, 2])
 @pytest.mark.parametrize("extent", ["tile", "sample"])
 def test_orders_hold_what_bessel_says(order, extent):

@@ -142,7 +142,7 @@ def test_the_reported_error_holds_for_every_kappa(field, tolerance, representati
     assert worst <= spectrum.error <= tolerance
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("representation", KINDS)
 @pytest.mark.parametrize("tolerance", TOLERANCES)
 def test_the_reported_error_is_no_more_than_the_actual_one(representation, tolerance):

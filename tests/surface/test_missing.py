@@ -208,6 +208,7 @@ def test_what_is_not_a_plane_of_heights_is_refused(heights):
 # ---------------------------------------------------------------- size
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("shape", ["scattered", "one hole"])
 def test_a_hundred_thousand_pixels_are_filled_quickly(shape):
     y, x = np.mgrid[:512, :512] / 512

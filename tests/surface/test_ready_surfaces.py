@@ -344,7 +344,7 @@ NAMED = {
 }
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", sorted(NAMED))
 def test_a_ready_surface_is_used_in_a_scene_by_its_name(name):
     mi.set_variant("scalar_spectral")
