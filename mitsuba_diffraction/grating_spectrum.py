@@ -22,9 +22,8 @@ import numpy as np
 from .energy.table import EnergyTable
 from .errors import RequestError
 from .spectrum.exr import doubles, one_line, read, write
-from .spectrum.orders import OrderGrid
+from .spectrum.grids import OrderGrid, SplineGrid
 from .spectrum.power_spectrum import PowerSpectrum
-from .spectrum.spline_grid import SplineGrid
 from .spectrum.tables import Series, SeriesTable, SliceTable, chebyshev, taylor
 
 FORMAT = "mitsuba_diffraction grating spectrum"
@@ -163,17 +162,17 @@ def _channels(table: SeriesTable | SliceTable) -> dict[str, np.ndarray]:
     return {_TERM_NAMES[table.representation].format(n): term for n, term in enumerate(table.terms)}
 
 
-def _table(header: dict, pixels: dict[str, np.ndarray], largest_kappa: float) -> SeriesTable | SliceTable:
+def _table(header: dict, pixels: dict[str, np.ndarray], max_kappa: float) -> SeriesTable | SliceTable:
     kind, count = header["representation"], header["channelCount"]
     if kind == SliceTable.representation:
         powers = 4 if "S(000.3)" in pixels else 3
         values = [[pixels[f"S({k:03d}.{p})"] for p in range(powers)] for k in range(count // powers)]
-        return SliceTable(largest_kappa, np.array(values, np.float32))
+        return SliceTable(max_kappa, np.array(values, np.float32))
     terms = np.stack([pixels[_TERM_NAMES[kind].format(n)] for n in range(count)])
     if kind == "svd":
-        series = Series(kind, largest_kappa, np.array(json.loads(header["modes"]), np.float64))
+        series = Series(kind, max_kappa, np.array(json.loads(header["modes"]), np.float64))
     else:
-        series, _ = (taylor if kind == "taylor" else chebyshev)(largest_kappa, count)
+        series, _ = (taylor if kind == "taylor" else chebyshev)(max_kappa, count)
     return SeriesTable(series, terms)
 
 

@@ -26,7 +26,7 @@ from .rigorous.axes import LARGEST_PERIOD
 from .rigorous.curve import curve_of, is_profile
 from .rigorous.efficiencies import converge
 from .settings import VISIBLE
-from .spectrum.orders import OrderGrid
+from .spectrum.grids import OrderGrid
 from .surface.heightfield import HeightField
 from .surface.periods import height_spectrum
 
@@ -96,8 +96,8 @@ def tile_powers(height_field: HeightField, shortest: float) -> OrderPowers:
     )
 
     def powers(m: NDArray[np.int64], kappa: Array) -> Array:
-        inside = (np.abs(m) <= grid.largest).all(axis=-1)
-        columns, rows = np.moveaxis(np.where(inside[..., None], m + grid.largest, 0), -1, 0)
+        inside = (np.abs(m) <= grid.max_order).all(axis=-1)
+        columns, rows = np.moveaxis(np.where(inside[..., None], m + grid.max_order, 0), -1, 0)
         waves = chebyshev.chebvander(2 * kappa / max_kappa - 1, degree)
         amplitude = (waves * np.moveaxis(coefficients[:, rows * grid.shape[1] + columns], 0, -1)).sum(axis=-1)
         # Those of the Nyquist frequency have no sign.

@@ -153,7 +153,7 @@ def lobe_width(coherence_length: float) -> float:
     return 1 / (2 * math.sqrt(2) * math.pi * (coherence_length / 4))
 
 
-def lobe_reach(share: float) -> float:
+def lobe_cutoff(share: float) -> float:
     """Return half the side ρ of the square at which a lobe is truncated, in standard deviations; the rest is rescaled.
 
     A two-dimensional Gaussian has the fraction 1 − erf(ρ/√2)² outside that square. Truncation and renormalisation

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from ..grating_spectrum import GratingSpectrum
-from ..spectrum.orders import OrderGrid
-from ..spectrum.spline_grid import spline_integral
+from ..spectrum.grids import OrderGrid, spline_integral
 from .geometry import Incidence
 from .inversion import CELLS, KappaCells, SumTable, averages, choose, sums_before
 from .tables import NumberTable, PacketTable, ShareTable, larger, limited, opaque
@@ -158,7 +157,7 @@ class CellSampler:
     """
 
     def __init__(self, spectrum: GratingSpectrum, most: float | None = None, farthest: float = 1.0) -> None:
-        self.cells = KappaCells(spectrum.largest_kappa, most)
+        self.cells = KappaCells(spectrum.max_kappa, most)
         along_x, along_y = (CellAxis.of(spectrum, axis, WIDEST) for axis in (0, 1))
         shares = np.moveaxis(along_y.shares @ averages(spectrum, self.cells) @ along_x.shares.T, 0, -1)
         # Coefficients of splines may be below zero.

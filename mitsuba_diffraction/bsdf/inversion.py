@@ -26,16 +26,16 @@ CELLS = 4  # one packet
 
 
 class KappaCells:
-    """Cells of 0 ≤ κ ≤ `largest_kappa` (rad/µm); the last one takes what lies beyond, too.
+    """Cells of 0 ≤ κ ≤ `max_kappa` (rad/µm); the last one takes what lies beyond, too.
 
     They are equal, or three equal ones up to `most` and one beyond, where most light has less than `most`.
     """
 
-    def __init__(self, largest_kappa: float, most: float | None = None) -> None:
+    def __init__(self, max_kappa: float, most: float | None = None) -> None:
         if most is None:
-            ends = np.linspace(0, largest_kappa, CELLS + 1)
+            ends = np.linspace(0, max_kappa, CELLS + 1)
         else:
-            ends = np.append(np.linspace(0, min(most, 0.75 * largest_kappa), CELLS), largest_kappa)
+            ends = np.append(np.linspace(0, min(most, 0.75 * max_kappa), CELLS), max_kappa)
         self.ends = ends
         self.inner = [opaque(end) for end in ends[1:-1]]
         self.squares = mi.Vector4f(*(float(end**2) for end in ends[1:]))

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..grating_spectrum import GratingSpectrum
-from ..spectrum.orders import LobeAxis
+from ..spectrum.grids import LobeAxis
 from ..spectrum.tables import HALF_SCALE, SeriesTable, SliceTable, shared_exponents
 from .cell_sampler import LOBE, CellAxis, CellSampler
 from .geometry import Geometry, Incidence, scaled
@@ -167,7 +167,7 @@ class SlicePower(_Power):
         self.table, self.unit = packets, packets.unit / scale
         self.packet = mi.Vector3f if words == 1 else mi.Vector4f
         self.intervals = table.intervals
-        self.per_kappa = opaque(table.intervals / table.largest_kappa)
+        self.per_kappa = opaque(table.intervals / table.max_kappa)
 
     def at(
         self, kappa: mi.Float, active: mi.Bool, small: Small | None = None
@@ -207,7 +207,7 @@ class SeriesPower(_Power):
         padded = np.zeros((len(weights), self.packets * 4), np.float32)
         padded[:, :terms] = weights
         self.weights = PacketTable(padded.reshape(-1, self.packets, 4))
-        self.per_kappa = opaque(self.steps / table.largest_kappa)
+        self.per_kappa = opaque(self.steps / table.max_kappa)
 
     def at(self, kappa: mi.Float, active: mi.Bool, small: Small | None = None) -> list[tuple[mi.UInt32, mi.Vector4f]]:
         """Return where the packets of node 0 lie at κ (rad/µm), and the factors of their four floats.
@@ -241,7 +241,7 @@ def _weights(table: SeriesTable) -> np.ndarray:
     """Return g_n at steps in κ so small that straight lines between them serve: (steps + 1, N)."""
     steps = 64
     while True:
-        kappas = np.linspace(0, table.largest_kappa, 2 * steps + 1)
+        kappas = np.linspace(0, table.max_kappa, 2 * steps + 1)
         weights = table.series.weights(kappas)
         error = np.abs(weights[1::2] - (weights[:-1:2] + weights[2::2]) / 2).max(axis=0)
         if (error <= _WEIGHT_ERROR * np.abs(weights).max(axis=0)).all() or steps >= 1 << 14:
@@ -266,9 +266,9 @@ class OrderSampler:
     """
 
     def __init__(self, spectrum: GratingSpectrum, most: float | None = None) -> None:
-        self.cells = KappaCells(spectrum.largest_kappa, most)
+        self.cells = KappaCells(spectrum.max_kappa, most)
         self.rows, self.columns = spectrum.grid.shape
-        self.largest_x, self.largest_y = spectrum.grid.largest
+        self.largest_x, self.largest_y = spectrum.grid.max_order
         self.tile_x, self.tile_y = (opaque(t) for t in spectrum.grid.tile_size)
         self.restricted = (self.largest_x + 1) ** 2 * (self.rows + 1) <= LARGEST_TABLE
         self.undiffracted = None
@@ -278,10 +278,10 @@ class OrderSampler:
             shares, sums = diffracted_averages(spectrum, self.cells, FLOOR)
             self.sums = mi.Vector4f(*map(float, sums / WHOLE))
             dr.make_opaque(self.sums)
-            kappas = np.linspace(0, spectrum.largest_kappa, STEPS + 1)
+            kappas = np.linspace(0, spectrum.max_kappa, STEPS + 1)
             middle = tuple(n // 2 for n in spectrum.grid.shape)
             self.undiffracted = FloatTable(np.array([max(spectrum.powers(kappa)[middle], 0) for kappa in kappas]))
-            self.per_kappa = opaque(STEPS / spectrum.largest_kappa)
+            self.per_kappa = opaque(STEPS / spectrum.max_kappa)
         units = np.stack([_units(average) for average in shares], axis=-1)
         self.shares = PacketTable(units)
         # The sums of A_j over the columns before x, for each row.
@@ -436,7 +436,7 @@ class LineSampler:
     def __init__(self, spectrum: GratingSpectrum, most: float | None = None) -> None:
         self.along_x = spectrum.grid.shape[0] == 1
         axis = CellAxis.of(spectrum, 0 if self.along_x else 1, WIDEST)
-        self.cells, self.largest, self.count = KappaCells(spectrum.largest_kappa, most), axis.largest, len(axis.shares)
+        self.cells, self.largest, self.count = KappaCells(spectrum.max_kappa, most), axis.largest, len(axis.shares)
         shares = axis.shares @ averages(spectrum, self.cells, FLOOR).reshape(CELLS, -1).T
         self.shares = ShareTable(np.maximum(shares, 0))
         # The sums of A_j over the cells before each.
@@ -531,7 +531,7 @@ class OrderSpectrum:
         grid, sigma = spectrum.grid, spectrum.lobe_width
         self.axes = tuple(
             _Axis(lobe, size, largest, sigma)
-            for lobe, size, largest in zip(spectrum.lobes, grid.tile_size, grid.largest, strict=True)
+            for lobe, size, largest in zip(spectrum.lobes, grid.tile_size, grid.max_order, strict=True)
         )
         line = 1 in grid.shape
         self.resolved = all(axis.count == 1 for axis in self.axes) and not (line and sigma > NARROW)

@@ -83,7 +83,7 @@ class RigorousOrders:
     def __init__(self, spectrum: RigorousSpectrum) -> None:
         axes = spectrum.axes
         self.axes = axes
-        self.count = int(2 * spectrum.reach * spectrum.lobe_width * axes.period) + 1  # lobes that overlap
+        self.count = int(2 * spectrum.cutoff_sigmas * spectrum.lobe_width * axes.period) + 1  # lobes that overlap
         self.table = PacketTable(_packets(spectrum))
         if mi.is_polarized:
             self.matrices = PacketTable(np.concatenate([np.moveaxis(t.mueller, 0, 1) for t in spectrum.tables]))
@@ -108,7 +108,7 @@ class RigorousOrders:
         before = np.zeros((*units.shape[:-1], units.shape[-1] + 1))
         before[..., 1:] = units.cumsum(axis=-1)
         self.orders = PacketTable(np.stack([before, np.append(units, 0 * units[..., :1], axis=-1)], axis=-1), width=2)
-        sigma, reach = spectrum.lobe_width, spectrum.reach
+        sigma, reach = spectrum.lobe_width, spectrum.cutoff_sigmas
         inside = math.erf(reach / math.sqrt(2))  # the share of the Gaussian within its reach, along one axis
         self.spread, self.inside = opaque(np.sqrt(2) * sigma), opaque(inside)
         self.peak, self.falloff = opaque(1 / (2 * np.pi * (sigma * inside) ** 2)), opaque(-0.5 / sigma**2)
@@ -411,7 +411,7 @@ def _shares(spectrum: RigorousSpectrum, cells: int) -> NDArray[np.float64]:
     """
     axes = spectrum.axes
     planes = math.gcd(PLANES, axes.planes - 1)
-    margin = spectrum.reach * spectrum.lobe_width * axes.period
+    margin = spectrum.cutoff_sigmas * spectrum.lobe_width * axes.period
     whole = axes.units(0) * cells
     ends = -np.arange(whole)  # of the cells below P = 0
     ends = ends // cells + np.sin(np.pi / 2 * (ends % cells) / cells) ** 2

@@ -16,7 +16,7 @@ from ..energy.table import EnergyTable, Stretched, between, corners
 from ..precomputation import Spectrum
 from ..rigorous.spectrum import RigorousSpectrum
 from ..settings import VISIBLE
-from ..spectrum.orders import OrderGrid
+from ..spectrum.grids import OrderGrid
 from .energy import Energy
 from .orders import OrderSpectrum
 from .rigorous_orders import RigorousOrders
@@ -92,7 +92,7 @@ class SharedTables:
         spectrum = self._spectrum
         if not complete:
             low, high = ratios
-            turn = 0.5 * spectrum.largest_kappa * spectrum.height_range * (high - low)
+            turn = 0.5 * spectrum.max_kappa * spectrum.height_range * (high - low)
             ratios = np.linspace(low, high, 2 * int(np.clip(turn / (2 * TURN), 1, PARTS)) + 1)
             laterals = np.repeat(laterals[:1], len(ratios))
         found = [

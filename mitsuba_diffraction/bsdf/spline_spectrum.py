@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..grating_spectrum import GratingSpectrum
-from ..spectrum.spline_grid import spline_weights
+from ..spectrum.grids import spline_weights
 from .cell_sampler import CellSampler
 from .geometry import Geometry, Incidence
 from .orders import order_power
@@ -26,7 +26,7 @@ class SplineSpectrum:
     def __init__(self, spectrum: GratingSpectrum, most: float | None = None, farthest: float = 1.0) -> None:
         grid = spectrum.grid
         self.power = order_power(spectrum.table, (RIM, RIM))
-        self.largest_x, self.largest_y = grid.largest
+        self.largest_x, self.largest_y = grid.max_order
         self.per_q_x, self.per_q_y = (opaque(1 / d) for d in grid.spacing)
         self.per_area = opaque(1 / (grid.spacing[0] * grid.spacing[1]))
         self.limit_x, self.limit_y = (opaque(limit) for limit in grid.limit)

@@ -136,7 +136,7 @@ def _light(inspection: Inspection) -> list[tuple[str, str]]:
     lobe = math.degrees(GREEN * lobe_width(inspection.coherence_length))
     length = f"{inspection.coherence_length:.3g} µm"
     if inspection.extent == "sample":
-        length += f" (largest for this scan: {inspection.carried:.3g}; sunlight: {SUN_COHERENCE_LENGTH:g})"
+        length += f" (largest for this scan: {inspection.max_coherence_length:.3g}; sunlight: {SUN_COHERENCE_LENGTH:g})"
     lines.append(("coherence length", f"{length}: at 550 nm an order is ±{lobe:.2g}° wide (1 σ)"))
     if inspection.standard_error is not None:
         known = f"{inspection.standard_error:.2g} of the reflected power, as the scatter within this one scan tells"

@@ -43,9 +43,8 @@ from scipy.ndimage import maximum_filter1d
 from scipy.special import ndtri
 
 from ..geometry import fresnel, horizon_gain, k_g, transmitted
-from ..spectrum.orders import OrderGrid
+from ..spectrum.grids import OrderGrid, spline_integral
 from ..spectrum.power_spectrum import PowerSpectrum
-from ..spectrum.spline_grid import spline_integral
 
 KAPPA_STEP = 0.1  # radians of the fastest oscillation over κ, between which powers are linear
 COARSER = 1.6  # cells, where there are three ways for light to go
@@ -119,7 +118,7 @@ class Furnace:
             side: 1, of light from above; −1, from below.
         """
         grid, by_order = spectrum.grid, evaluated_by_order(spectrum)
-        max_kappa = spectrum.largest_kappa
+        max_kappa = spectrum.max_kappa
         kappas = np.linspace(0, max_kappa, int(max_kappa * spectrum.height_range / KAPPA_STEP) + 3, dtype=np.float64)
         q_x, q_y = grid.frequencies()
         q: NDArray[np.float64]
@@ -386,7 +385,7 @@ class Furnace:
             spacing, limit = np.array(grid.spacing), np.array(grid.limit)
         extent = 4 * sigma if lines else 1.5 * np.hypot(*spacing)
         strength = np.sum(
-            [np.maximum(spectrum.powers(x * spectrum.largest_kappa), 0).ravel() for x in (0.1, 0.4, 0.7, 1.0)], axis=0
+            [np.maximum(spectrum.powers(x * spectrum.max_kappa), 0).ravel() for x in (0.1, 0.4, 0.7, 1.0)], axis=0
         )
         offsets = np.linspace(-1.5, 1.5, 1025, dtype=np.float64)
         integral = spline_integral(offsets)
@@ -429,7 +428,7 @@ class Furnace:
     def _power_of_nodes(
         self, spectrum: PowerSpectrum, node: NDArray[np.int64], way: int, kappa: NDArray[np.float64]
     ) -> NDArray[np.floating]:
-        kappa = np.minimum(kappa * self.height_scale, spectrum.largest_kappa)
+        kappa = np.minimum(kappa * self.height_scale, spectrum.max_kappa)
 
         def power(kappa: NDArray[np.float64]) -> NDArray[np.float32]:
             return spectrum.table.powers_at(*np.divmod(node, spectrum.grid.shape[1]), kappa)
@@ -488,7 +487,7 @@ def _gathered(
     """
     sigma = spectrum.lobe_width
     q = np.stack(np.meshgrid(*spectrum.grid.frequencies()), -1).reshape(-1, 2)
-    shortest = 4 * np.pi / spectrum.largest_kappa
+    shortest = 4 * np.pi / spectrum.max_kappa
     width = coarser * min(CELL / shortest, np.sqrt(np.prod(np.minimum(np.ptp(q, axis=0), 4 / shortest)) / CELLS))
     # Smaller ones where b is not zero.
     near = np.hypot(*q.T) < 6 * sigma

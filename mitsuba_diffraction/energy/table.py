@@ -36,7 +36,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import minimum_filter
 
 from ..errors import RequestError
-from ..spectrum.orders import OrderGrid
+from ..spectrum.grids import OrderGrid
 from .furnace import Furnace, PowerSpectrum
 
 SLACK = 1e-3

@@ -34,8 +34,8 @@ class Inspection:
         extent: "tile" or "sample".
         statistics: heights, slopes, tilt.
         periods: as of `find_periods`: single ones, then bands; empty if none is significant.
-        carried: the coherence length that a scan supports, µm, at most that of sunlight; a tile supports any.
-        coherence_length: the requested one, limited to `carried`, µm.
+        max_coherence_length: what a scan supports, µm, at most that of sunlight; a tile supports any.
+        coherence_length: the requested one, limited to `max_coherence_length`, µm.
         standard_error: of a sample's spectrum at that coherence length, a share of the reflected power; None of a tile.
         scalar_error: of scalar theory for this surface.
         changes: effects of ±5 % of height scale, pixel size and, for a scan, tip broadening; empty without a period.
@@ -48,7 +48,7 @@ class Inspection:
     extent: str
     statistics: Statistics
     periods: tuple[Period, ...]
-    carried: float
+    max_coherence_length: float
     coherence_length: float
     standard_error: float | None
     scalar_error: ScalarError
@@ -75,7 +75,7 @@ class Inspection:
                 "filled": self.height_field.filled,
                 "statistics": self.statistics,
                 "periods": self.periods,
-                "carried_coherence_length": self.carried,
+                "carried_coherence_length": self.max_coherence_length,
                 "coherence_length": self.coherence_length,
                 "standard_error": self.standard_error,
                 "scalar_error": self.scalar_error,
@@ -107,8 +107,8 @@ def inspect(
     """
     Settings(extent, coherence_length)
     sun = SUN_COHERENCE_LENGTH
-    carried = effective_coherence_length(height_field, sun) if extent == "sample" else max(sun, coherence_length)
-    used = min(float(coherence_length), carried)
+    limit = effective_coherence_length(height_field, sun) if extent == "sample" else max(sun, coherence_length)
+    used = min(float(coherence_length), limit)
     step = iter(range(1, 5))
 
     def build(surface: HeightField) -> GratingSpectrum:
@@ -135,10 +135,10 @@ def inspect(
         extent=extent,
         statistics=numbers,
         periods=periods,
-        carried=carried,
+        max_coherence_length=limit,
         coherence_length=used,
         standard_error=standard_error(
-            height_field, coherence_length=used, largest_kappa=4 * np.pi / shortest, max_frequency=2 / shortest
+            height_field, coherence_length=used, max_kappa=4 * np.pi / shortest, max_frequency=2 / shortest
         )
         if extent == "sample"
         else None,

@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import RequestError
-from ..settings import TRANSMISSIONS, lobe_reach, lobe_width
+from ..settings import TRANSMISSIONS, lobe_cutoff, lobe_width
 from ..spectrum.exr import doubles, one_line, read, write
-from ..spectrum.orders import OrderGrid
+from ..spectrum.grids import OrderGrid
 from .axes import Axes
 from .efficiencies import REVERSED
 
@@ -199,9 +199,9 @@ class RigorousSpectrum:
         return lobe_width(self.coherence_length)
 
     @property
-    def reach(self) -> float:
+    def cutoff_sigmas(self) -> float:
         """How far the lobe of an order is followed, in standard deviations σ_q: a tenth of the tolerance is beyond."""
-        return lobe_reach(0.1 * self.tolerance)
+        return lobe_cutoff(0.1 * self.tolerance)
 
     @cached_property
     def digest(self) -> str:

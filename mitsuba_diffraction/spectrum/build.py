@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 
 from ..errors import RequestError
 from ..progress import Progress, part
-from ..settings import Settings, lobe_reach, lobe_width
+from ..settings import Settings, lobe_cutoff, lobe_width
 from ..surface.heightfield import HeightField
-from .orders import LobeAxis
+from .grids import LobeAxis, inner
 from .power_spectrum import TAIL_SHARE, PowerSpectrum
 from .sample import SamplePowers, effective_coherence_length, standard_error
-from .spline_grid import inner
 from .tables import (
     Series,
     SeriesTable,
@@ -65,29 +64,27 @@ def build_spectrum(patches: Sequence[HeightField], settings: Settings, progress:
     height_range = max(patch.height_range for patch in patches)
     coherence_length, tolerance = settings.coherence_length, settings.tolerance
     shortest = settings.wavelengths[0] * 1e-3
-    largest_kappa = 4 * np.pi / shortest
+    max_kappa = 4 * np.pi / shortest
     max_frequency = 2 * np.sin(np.deg2rad(settings.largest_angle)) / shortest
     _check_resolution(height_field, max_frequency)
     effective, found_error, tail = float(coherence_length), None, 0.0
     powers: TilePowers | Splines | None
     if settings.extent == "tile":
         allowed = tolerance = _FINEST if tolerance is None else tolerance
-        sigma, rho = lobe_width(effective), lobe_reach(TAIL_SHARE * tolerance)
+        sigma, rho = lobe_width(effective), lobe_cutoff(TAIL_SHARE * tolerance)
         orders = TilePowers(height_field, max_frequency, rho * sigma)
         if len(patches) > 1:
             of_mean, progress = part(progress, 0, _OF_MEAN), part(progress, _OF_MEAN, 1)
-            orders = MeanPowers(
-                patches, max_frequency, rho * sigma, largest_kappa, (1 - TAIL_SHARE) * tolerance, of_mean
-            )
+            orders = MeanPowers(patches, max_frequency, rho * sigma, max_kappa, (1 - TAIL_SHARE) * tolerance, of_mean)
         lobes = orders.grid.lobes(sigma, rho)
-        powers = _tile_splines(orders, lobes, sigma, max_frequency, largest_kappa, tolerance)
+        powers = _tile_splines(orders, lobes, sigma, max_frequency, max_kappa, tolerance)
         if powers is None:
             powers, tail = orders, 2 * (1 - lobes[0].inside * lobes[1].inside)
             allowed -= tail
     else:
         effective = effective_coherence_length(height_field, coherence_length)
         found_error = standard_error(
-            height_field, coherence_length=effective, largest_kappa=largest_kappa, max_frequency=max_frequency
+            height_field, coherence_length=effective, max_kappa=max_kappa, max_frequency=max_frequency
         )
         if tolerance is None:
             tolerance = float(np.clip(_STANDARD_ERROR_SHARE * found_error, _FINEST, _COARSEST))
@@ -102,10 +99,10 @@ def build_spectrum(patches: Sequence[HeightField], settings: Settings, progress:
         powers = _refined(
             lambda spacing: SamplePowers(height_field, effective, spacing, max_frequency),
             lobe_width(effective),
-            largest_kappa,
+            max_kappa,
             tolerance,
         )
-    build = _Build(powers, height_range, largest_kappa, allowed, progress)
+    build = _Build(powers, height_range, max_kappa, allowed, progress)
     table, error = build(SliceTable.representation if settings.representation == "auto" else settings.representation)
     source, source_digest = height_field.source, height_field.digest
     if len(patches) > 1:
@@ -136,7 +133,7 @@ def _tile_splines(
     lobes: tuple[LobeAxis, LobeAxis],
     sigma: float,
     max_frequency: float,
-    largest_kappa: float,
+    max_kappa: float,
     tolerance: float,
 ) -> TileSplines | None:
     """Return a tile's lattice of splines, if it is read faster than its orders."""
@@ -150,7 +147,7 @@ def _tile_splines(
         return splines
 
     try:
-        return _refined(lattice, sigma, largest_kappa, tolerance)
+        return _refined(lattice, sigma, max_kappa, tolerance)
     except _TooLargeError:
         return None
 
@@ -164,7 +161,7 @@ def _cost(packets: int, shape: tuple[int, int]) -> float:
     return packets * max(1.0, shape[0] * shape[1] * 8e-6) ** 0.5
 
 
-def _refined(lattice: Callable[[float], Lattice], sigma: float, largest_kappa: float, tolerance: float) -> Lattice:
+def _refined(lattice: Callable[[float], Lattice], sigma: float, max_kappa: float, tolerance: float) -> Lattice:
     """Return the coarsest lattice, a function of its spacing, that keeps its share of the tolerance between nodes."""
     allowed, spacing = _SPLINE_SHARE * tolerance, _WIDEST_SPACING * sigma
     while True:
@@ -172,7 +169,7 @@ def _refined(lattice: Callable[[float], Lattice], sigma: float, largest_kappa: f
         _check_size(powers.grid.shape, 4)
         error = max(
             powers.error(powers.grid, powers(kappa).astype(np.float32), kappa)
-            for kappa in (0.0, 0.35 * largest_kappa, largest_kappa)
+            for kappa in (0.0, 0.35 * max_kappa, max_kappa)
         )
         if error <= allowed:
             return powers
@@ -211,16 +208,16 @@ class _Build:
         self,
         powers: TilePowers | Splines,
         height_range: float,
-        largest_kappa: float,
+        max_kappa: float,
         allowed: float,
         progress: Progress,
     ) -> None:
         self._exact = powers
         self._range = height_range
-        self._largest_kappa = largest_kappa
+        self._max_kappa = max_kappa
         self._allowed = allowed
         self._progress, self._done = progress, 0
-        self._x = largest_kappa * height_range / 2
+        self._x = max_kappa * height_range / 2
         self._nodes = nodes_for(self._x, 0.01 * allowed)
         self._survey()
 
@@ -229,7 +226,7 @@ class _Build:
 
     def _survey(self) -> None:
         """Find, over the Chebyshev nodes in κ, where the power lies, and a pilot: the strongest frequencies."""
-        kappas = (1 + chebyshev_nodes(self._nodes)) / 2 * self._largest_kappa
+        kappas = (1 + chebyshev_nodes(self._nodes)) / 2 * self._max_kappa
         grid, report = self._exact.grid, self._phase(0.0, 0.3)
         rims: tuple[list[NDArray[np.float64]], list[NDArray[np.float64]]] = ([], [])
         missing, total, strongest = [], 0.0, None
@@ -248,12 +245,12 @@ class _Build:
         # Between the nodes more may be missing, or lie at the rim.
         between = self._between()[1]
         self.unresolved_power = float(np.clip((between @ missing).max(), 0, 1))
-        largest, self.truncated_power = [], 0.0
-        for whole, rim in zip(grid.largest, rims, strict=True):
+        max_order, self.truncated_power = [], 0.0
+        for whole, rim in zip(grid.max_order, rims, strict=True):
             outside = (between @ np.array(rim)).max(axis=0)
-            largest.append(int(np.argmax(outside <= _TRUNCATED_SHARE / 2 * self._allowed)) if whole else 0)
-            self.truncated_power += float(np.clip(outside[largest[-1]], 0, 1))
-        self.kept = dataclasses.replace(grid, largest=(largest[0], largest[1]))
+            max_order.append(int(np.argmax(outside <= _TRUNCATED_SHARE / 2 * self._allowed)) if whole else 0)
+            self.truncated_power += float(np.clip(outside[max_order[-1]], 0, 1))
+        self.kept = dataclasses.replace(grid, max_order=(max_order[0], max_order[1]))
         self._pilot = pilot
         # The others are taken to err as much for their power.
         self._pilot_share = float(np.abs(pilot).sum() / total)
@@ -294,17 +291,17 @@ class _Build:
             _check_size(self.kept.shape, intervals * storage.terms)
             # What is measured is what is stored.
             return SliceTable.build(
-                intervals, storage.terms, self._largest_kappa, self._powers, storage.rounded, self._phase(0.3, 0.8)
+                intervals, storage.terms, self._max_kappa, self._powers, storage.rounded, self._phase(0.3, 0.8)
             )
         if representation == "taylor":
             if 2.0**-24 * np.exp(min(self._x, 80.0)) > 20 * self._allowed:
                 # Each term is good to 2^-24 of its size, and their sizes add up to e^x; the bound is generous by 20.
                 raise RequestError(self._refusal(representation, None))
-            series, projection = taylor(self._largest_kappa, self._nodes)
+            series, projection = taylor(self._max_kappa, self._nodes)
         elif representation == "chebyshev":
-            series, projection = chebyshev(self._largest_kappa, self._nodes)
+            series, projection = chebyshev(self._max_kappa, self._nodes)
         else:
-            series, projection = svd(self._largest_kappa, self._pilot)
+            series, projection = svd(self._max_kappa, self._pilot)
         terms = self._terms(series, projection, allowed)
         _check_size(self.kept.shape, terms)
         return SeriesTable.build(series.first(terms), projection[:terms], self._powers, self._phase(0.3, 0.8))
@@ -317,13 +314,13 @@ class _Build:
         measured = f" (measured error {error:.2g})" if error is not None else ""
         return (
             f"{representation}: a surface of height range {self._range:.3g} µm cannot be kept to {self._allowed:.2g} "
-            f"in float32 up to κ = {self._largest_kappa:.1f} rad/µm: {why}{measured}"
+            f"in float32 up to κ = {self._max_kappa:.1f} rad/µm: {why}{measured}"
         )
 
     def _between(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return many κ, four to an oscillation, and the matrix, (κ, n), that interpolates from the Chebyshev nodes."""
-        kappas = np.linspace(0, self._largest_kappa, 16 + int(np.ceil(4 * self._x)), dtype=np.float64)
-        vander = chebyshev_polynomials(position(kappas, self._largest_kappa), self._nodes)
+        kappas = np.linspace(0, self._max_kappa, 16 + int(np.ceil(4 * self._x)), dtype=np.float64)
+        vander = chebyshev_polynomials(position(kappas, self._max_kappa), self._nodes)
         return kappas, vander @ chebyshev_transform(self._nodes)
 
     def _terms(self, series: Series, projection: NDArray[np.float64], allowed: float) -> int:
@@ -349,10 +346,10 @@ class _Build:
         coefficients = chebyshev_transform(self._nodes) @ self._pilot
         intervals = 1
         while True:
-            at = (np.arange(intervals)[:, None] + (1 + chebyshev_nodes(terms)) / 2) / intervals * self._largest_kappa
-            vander = chebyshev_polynomials(position(at.ravel(), self._largest_kappa), self._nodes)
+            at = (np.arange(intervals)[:, None] + (1 + chebyshev_nodes(terms)) / 2) / intervals * self._max_kappa
+            vander = chebyshev_polynomials(position(at.ravel(), self._max_kappa), self._nodes)
             values = (vander @ coefficients).reshape(*at.shape, -1)
-            interval, t = place(kappas, self._largest_kappa, intervals)
+            interval, t = place(kappas, self._max_kappa, intervals)
             weights = t[:, None] ** np.arange(terms) @ to_polynomial(terms)
             # One κ after the other: all at once would take more memory than the table.
             error = max(np.abs(w @ values[k] - e).sum() for k, w, e in zip(interval, weights, exact, strict=True))
@@ -364,7 +361,7 @@ class _Build:
         """Return the largest error of S over held-out κ: both ends, and others between, four to an oscillation."""
         count = 12 + int(np.ceil(2 * self._x))
         golden = (np.sqrt(5) - 1) / 2
-        held_out = self._largest_kappa * np.concatenate([[0.0, 1.0], np.sqrt((np.arange(1, count) * golden) % 1)])
+        held_out = self._max_kappa * np.concatenate([[0.0, 1.0], np.sqrt((np.arange(1, count) * golden) % 1)])
         max_error, report = 0.0, self._phase(0.8, 1.0)
         for number, kappa in enumerate(held_out, 1):
             max_error = max(max_error, self._exact.error(self.kept, table.powers(kappa), kappa))

@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import RequestError
-from ..settings import Settings, lobe_reach, lobe_width, matching
-from .orders import LobeAxis, OrderGrid
-from .spline_grid import SplineGrid
+from ..settings import Settings, lobe_cutoff, lobe_width, matching
+from .grids import LobeAxis, OrderGrid, SplineGrid
 from .tables import SeriesTable, SliceTable
 
 # The part of the tolerance that is spent on the tails of the lobes.
@@ -88,7 +87,7 @@ class PowerSpectrum:
         return self.table.representation
 
     @property
-    def largest_kappa(self) -> float:
+    def max_kappa(self) -> float:
         """4π/λ_min in rad/µm: normal incidence and exit at the shortest wavelength."""
         return 4 * np.pi / (self.wavelengths[0] * 1e-3)
 
@@ -98,9 +97,9 @@ class PowerSpectrum:
         return lobe_width(self.coherence_length)
 
     @property
-    def reach(self) -> float:
+    def cutoff_sigmas(self) -> float:
         """The least truncation of the lobes of orders, in standard deviations σ_q."""
-        return lobe_reach(TAIL_SHARE * self.tolerance)
+        return lobe_cutoff(TAIL_SHARE * self.tolerance)
 
     @property
     def lobes(self) -> tuple[LobeAxis, LobeAxis]:
@@ -111,7 +110,7 @@ class PowerSpectrum:
         """
         if not isinstance(self.grid, OrderGrid):
             raise RequestError("lobes: got a lattice of splines, wanted a grid of orders")
-        return self.grid.lobes(self.lobe_width, self.reach)
+        return self.grid.lobes(self.lobe_width, self.cutoff_sigmas)
 
     @property
     def neighbours(self) -> tuple[int, int]:
@@ -143,7 +142,7 @@ class PowerSpectrum:
 
         Args:
             q: (..., 2) cycles/µm, along x and y.
-            kappa: (...) rad/µm, 0 ≤ κ ≤ `largest_kappa`.
+            kappa: (...) rad/µm, 0 ≤ κ ≤ `max_kappa`.
 
         Returns:
             (...) µm².
@@ -155,17 +154,17 @@ class PowerSpectrum:
         self._checked(kappa)
         result = np.zeros(kappa.shape)
         grid = self.grid
-        around = grid.around(q, self.lobe_width, self.reach) if isinstance(grid, OrderGrid) else grid.around(q)
+        around = grid.around(q, self.lobe_width, self.cutoff_sigmas) if isinstance(grid, OrderGrid) else grid.around(q)
         for row, column, weight in around:
             result += weight * self.table.powers_at(row, column, kappa)
         # Interpolation may dip below zero by its error.
         return np.maximum(result, 0)
 
     def _checked(self, kappa: NDArray[np.float64]) -> NDArray[np.float64]:
-        if not (np.all(kappa >= 0) and np.all(kappa <= self.largest_kappa * (1 + 1e-6))):
+        if not (np.all(kappa >= 0) and np.all(kappa <= self.max_kappa * (1 + 1e-6))):
             raise RequestError(
                 f"kappa: got values from {np.min(kappa):.6g} to {np.max(kappa):.6g} rad/µm, wanted 0 to "
-                f"{self.largest_kappa:.6g} (the spectrum was built for wavelengths from {self.wavelengths[0]:g} nm)"
+                f"{self.max_kappa:.6g} (the spectrum was built for wavelengths from {self.wavelengths[0]:g} nm)"
             )
         return kappa
 

@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 from ..errors import RequestError
 from ..settings import lobe_width
 from ..surface.heightfield import HeightField
-from .orders import OrderGrid
-from .spline_grid import SplineGrid
+from .grids import OrderGrid, SplineGrid
 
 # Windows are truncated at ±3 σ_s, where their amplitude is e^{−9/2}, 1 %.
 _SUPPORT = 6.0
@@ -129,7 +128,7 @@ class _Lags:
         self.limit = np.inf if axis is None else 1 / (2 * pixel)
         self.reached = min(max_frequency, self.limit)
         # Three nodes hold at the last frequency, too. Beyond the Nyquist limit S repeats.
-        self.largest = int(np.rint(self.reached / self.spacing)) + 1
+        self.max_order = int(np.rint(self.reached / self.spacing)) + 1
         self.lags = np.arange(-lags, lags + 1)
         self.pixel = pixel
         # The transform of B, and of Σ_k B(x − k) times itself: dividing projects on the splines in the least squares.
@@ -160,7 +159,7 @@ class SamplePowers:
             for axis, pixel in zip(window_axes(height_field, coherence_length), height_field.pixel_size, strict=True)
         ]
         x, y = self._lags
-        self.grid = SplineGrid((x.spacing, y.spacing), (x.largest, y.largest), (x.limit, y.limit))
+        self.grid = SplineGrid((x.spacing, y.spacing), (x.max_order, y.max_order), (x.limit, y.limit))
         self._reached = x.reached, y.reached
         self._random = np.random.default_rng(0)
 
@@ -187,7 +186,7 @@ class SamplePowers:
         padded = np.zeros((y.count, x.count // 2 + 1), np.complex128)
         padded[y.lags % y.count, : half.shape[1]] = half
         full = scipy.fft.hfft2(padded, (y.count, x.count), norm="forward", overwrite_x=True, workers=2)
-        m_x, m_y = (np.arange(-lags.largest, lags.largest + 1) for lags in self._lags)
+        m_x, m_y = (np.arange(-lags.max_order, lags.max_order + 1) for lags in self._lags)
         return full[np.ix_(m_y % y.count, m_x % x.count)]
 
     def __call__(self, kappa: float) -> NDArray[np.float64]:
@@ -219,7 +218,7 @@ _KAPPAS = 4
 
 
 def standard_error(
-    height_field: HeightField, *, coherence_length: float, largest_kappa: float, max_frequency: float
+    height_field: HeightField, *, coherence_length: float, max_kappa: float, max_frequency: float
 ) -> float:
     """Return ∫ of the standard error of S(q; κ) over q, at the worst of four κ: a share of the reflected power.
 
@@ -239,7 +238,7 @@ def standard_error(
     Args:
         height_field: the scan.
         coherence_length: in µm, supported by the scan.
-        largest_kappa: κ up to which S is wanted, rad/µm.
+        max_kappa: κ up to which S is wanted, rad/µm.
         max_frequency: largest |q_x| and |q_y| that light reaches, cycles/µm.
     """
     axes = [axis or UNIFORM for axis in window_axes(height_field, coherence_length)]
@@ -257,7 +256,7 @@ def standard_error(
         for axis, pixel in zip(axes, height_field.pixel_size, strict=True)
     ]
     errors = []
-    for kappa in largest_kappa * np.arange(1, _KAPPAS + 1) / _KAPPAS:
+    for kappa in max_kappa * np.arange(1, _KAPPAS + 1) / _KAPPAS:
         variance = (
             _batch_variance(np.exp(1j * kappa * height_field.centred), axes) * correlation / (within - correlation)
         )

@@ -28,7 +28,7 @@ class Series:
     """The functions g_n(κ) = Σ_k modes_nk T_k(t), n < N, of a representation; modes (N, K), κ_max in rad/µm."""
 
     name: str
-    largest_kappa: float
+    max_kappa: float
     modes: NDArray[np.float64] = dataclasses.field(repr=False)
 
     def __post_init__(self) -> None:
@@ -43,7 +43,7 @@ class Series:
 
     def weights(self, kappa: ArrayLike) -> NDArray[np.float64]:
         """Evaluate g_n(κ) for κ (...) in rad/µm: (..., N)."""
-        return chebyshev_polynomials(position(kappa, self.largest_kappa), self.modes.shape[1]) @ self.modes.T
+        return chebyshev_polynomials(position(kappa, self.max_kappa), self.modes.shape[1]) @ self.modes.T
 
     def first(self, terms: int) -> Series:
         """Return the first functions only, without the degrees that none of them contains."""
@@ -52,7 +52,7 @@ class Series:
         return dataclasses.replace(self, modes=modes[:, :degrees].copy())
 
 
-def taylor(largest_kappa: float, nodes: int) -> tuple[Series, NDArray[np.float64]]:
+def taylor(max_kappa: float, nodes: int) -> tuple[Series, NDArray[np.float64]]:
     """Return g_n = tⁿ and B_n = F{(iκ_c u)ⁿ/n! · e^{iκ_c u}}, the series of e^{iκ_c t u} about the middle of all κ.
 
     This is the expansion of Stam's diffraction shaders (Stam 1999) and their successors. The derivatives of e^{ix} have
@@ -62,20 +62,20 @@ def taylor(largest_kappa: float, nodes: int) -> tuple[Series, NDArray[np.float64
     """
     monomials = _triangle(np.polynomial.chebyshev.poly2cheb, nodes)
     coefficients = _triangle(np.polynomial.chebyshev.cheb2poly, nodes).T
-    return Series("taylor", largest_kappa, monomials), coefficients @ chebyshev_transform(nodes)
+    return Series("taylor", max_kappa, monomials), coefficients @ chebyshev_transform(nodes)
 
 
-def chebyshev(largest_kappa: float, nodes: int) -> tuple[Series, NDArray[np.float64]]:
+def chebyshev(max_kappa: float, nodes: int) -> tuple[Series, NDArray[np.float64]]:
     """Return g_n = T_n(t) and B_n = F{ε_n iⁿ J_n(κ_c u) e^{iκ_c u}}, by e^{iκ_c u t} = Σ_n ε_n iⁿ J_n(κ_c u) T_n(t).
 
     This is the Jacobi–Anger expansion (Dhillon and Ghosh 2016 used it in the height); ε_0 = 1, else 2. Everything is
     bounded by two, so nothing cancels; the terms fall off faster than any power once n > x = κ_c R. The B_n are the
     coefficients of the polynomial through S at the `nodes`, J, which must resolve it.
     """
-    return Series("chebyshev", largest_kappa, np.eye(nodes)), chebyshev_transform(nodes)
+    return Series("chebyshev", max_kappa, np.eye(nodes)), chebyshev_transform(nodes)
 
 
-def svd(largest_kappa: float, values: NDArray[np.float64]) -> tuple[Series, NDArray[np.float64]]:
+def svd(max_kappa: float, values: NDArray[np.float64]) -> tuple[Series, NDArray[np.float64]]:
     """Return the singular value decomposition of S at J Chebyshev nodes and n frequencies, the strongest modes first.
 
     The g_n are orthonormal over the Chebyshev nodes, so that B_n = Σ_j g_n(κ_j) S(q; κ_j). For the values given, no
@@ -85,7 +85,7 @@ def svd(largest_kappa: float, values: NDArray[np.float64]) -> tuple[Series, NDAr
     mean = np.abs(values).mean(axis=0)
     weight = np.where(mean > 0, 1 / np.sqrt(np.where(mean > 0, mean, 1)), 0)
     at_nodes = np.linalg.svd(values * weight, full_matrices=False)[0].T
-    return Series("svd", largest_kappa, at_nodes @ chebyshev_transform(len(values)).T), at_nodes
+    return Series("svd", max_kappa, at_nodes @ chebyshev_transform(len(values)).T), at_nodes
 
 
 def _triangle(convert: Callable[[NDArray[np.float64]], NDArray[np.float64]], count: int) -> NDArray[np.float64]:
@@ -96,9 +96,9 @@ def _triangle(convert: Callable[[NDArray[np.float64]], NDArray[np.float64]], cou
     return rows
 
 
-def position(kappa: ArrayLike, largest_kappa: float) -> NDArray[np.float64]:
+def position(kappa: ArrayLike, max_kappa: float) -> NDArray[np.float64]:
     """Return t = 2κ/κ_max − 1."""
-    return 2 * np.asarray(kappa, np.float64) / largest_kappa - 1
+    return 2 * np.asarray(kappa, np.float64) / max_kappa - 1
 
 
 def chebyshev_nodes(count: int) -> NDArray[np.float64]:
@@ -172,7 +172,7 @@ class SeriesTable:
         dtype = np.float64 if np.abs(projection).sum(axis=1).max() > 100 else np.float32
         terms = None
         for j, t in enumerate(chebyshev_nodes(nodes)):
-            power = powers((1 + t) / 2 * series.largest_kappa).astype(dtype)
+            power = powers((1 + t) / 2 * series.max_kappa).astype(dtype)
             if terms is None:
                 terms = np.zeros((series.terms, *power.shape), dtype)
             for term, factor in zip(terms, projection[:, j].astype(dtype), strict=True):
@@ -188,12 +188,12 @@ class SeriesTable:
     @property
     def first_interval(self) -> float:
         """The length of the interval from κ = 0 in which c_m/κ² of m ≠ 0 is nearly a line, rad/µm."""
-        return self.largest_kappa / 16
+        return self.max_kappa / 16
 
     @property
-    def largest_kappa(self) -> float:
+    def max_kappa(self) -> float:
         """κ_max in rad/µm."""
-        return self.series.largest_kappa
+        return self.series.max_kappa
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -202,7 +202,7 @@ class SeriesTable:
 
     def content(self) -> list[NDArray]:
         """Return all that distinguishes the table, as C-contiguous arrays."""
-        weights = self.series.weights(np.linspace(0, self.largest_kappa, 2 * self.series.terms + 2))
+        weights = self.series.weights(np.linspace(0, self.max_kappa, 2 * self.series.terms + 2))
         return [
             np.frombuffer(self.representation.encode(), np.uint8),
             np.ascontiguousarray(weights),
@@ -242,11 +242,11 @@ class SliceTable:
     no digits.
 
     Attributes:
-        largest_kappa: κ_max in rad/µm.
+        max_kappa: κ_max in rad/µm.
         values: a_p of c_m = Σ_p a_p t^p, −1 ≤ t ≤ 1 on each interval; float32 (K, 3 or 4, rows, columns), on the grid.
     """
 
-    largest_kappa: float
+    max_kappa: float
     values: NDArray[np.float32] = field(repr=False)
 
     representation: ClassVar[str] = "slices"
@@ -260,14 +260,14 @@ class SliceTable:
     @property
     def first_interval(self) -> float:
         """Δκ in rad/µm."""
-        return self.largest_kappa / len(self.values)
+        return self.max_kappa / len(self.values)
 
     @classmethod
     def build(
         cls,
         intervals: int,
         terms: int,
-        largest_kappa: float,
+        max_kappa: float,
         powers: Callable[[float], NDArray[np.float64]],
         rounded: Callable[[NDArray[np.float32]], NDArray[np.float32]],
         progress: Callable[[int, int], None],
@@ -279,7 +279,7 @@ class SliceTable:
         """
         values, nodes, polynomial = None, chebyshev_nodes(terms), to_polynomial(terms)
         for interval, node in np.ndindex(intervals, terms):
-            power = powers((interval + (1 + nodes[node]) / 2) / intervals * largest_kappa)
+            power = powers((interval + (1 + nodes[node]) / 2) / intervals * max_kappa)
             if values is None:
                 values = np.zeros((intervals, terms, *power.shape), np.float32)
             for coefficient, factor in zip(values[interval], polynomial[:, node], strict=True):
@@ -287,7 +287,7 @@ class SliceTable:
             if node == terms - 1 and np.isfinite(stored := rounded(values[interval, None])).all():
                 values[interval] = stored[0]
             progress(interval * terms + node + 1, intervals * terms)
-        return cls(largest_kappa, values)
+        return cls(max_kappa, values)
 
     @property
     def intervals(self) -> int:
@@ -324,7 +324,7 @@ class SliceTable:
 
     def powers(self, kappa: float) -> NDArray[np.float32]:
         """Evaluate c_m(κ) of all nodes, (rows, columns), in float32 as a renderer computes them; κ in rad/µm."""
-        interval, t = place(kappa, self.largest_kappa, self.intervals)
+        interval, t = place(kappa, self.max_kappa, self.intervals)
         # The last bits of BLAS depend on the number of cores.
         return np.einsum("n,nyx->yx", t ** np.arange(self.terms, dtype=np.float32), self.values[interval])
 
@@ -332,7 +332,7 @@ class SliceTable:
         self, row: NDArray[np.int64], column: NDArray[np.int64], kappa: NDArray[np.float64]
     ) -> NDArray[np.float32]:
         """Evaluate c_m(κ) at one node and one κ each; all arguments and the result of one shape (...)."""
-        interval, t = place(kappa, self.largest_kappa, self.intervals)
+        interval, t = place(kappa, self.max_kappa, self.intervals)
         result = np.float32(0)
         for power in reversed(range(self.terms)):
             result = result * t + self.values[interval, power, row, column]
@@ -366,9 +366,9 @@ def packed(values: NDArray[np.float32]) -> NDArray[np.float32]:
 
 def shared_exponents(values: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
     """Return whole numbers m (K, 3, ...) and exponents e (K, ...), `values` ≈ m 2^e; infinite m for those too large."""
-    largest = np.abs(values).max(axis=1)
-    exponents = np.frexp(largest / np.float32(MANTISSA + 0.5))[1]
-    exponents = np.where(largest > 0, np.maximum(exponents, LEAST_EXPONENT), LEAST_EXPONENT)
+    peak = np.abs(values).max(axis=1)
+    exponents = np.frexp(peak / np.float32(MANTISSA + 0.5))[1]
+    exponents = np.where(peak > 0, np.maximum(exponents, LEAST_EXPONENT), LEAST_EXPONENT)
     mantissas = np.rint(np.ldexp(values, -exponents[:, None]))
     mantissas[np.broadcast_to((exponents >= LEAST_EXPONENT + EXPONENTS)[:, None], mantissas.shape)] = np.inf
     return mantissas, exponents
@@ -379,8 +379,8 @@ def to_polynomial(terms: int) -> NDArray[np.float64]:
     return np.linalg.inv(np.vander(chebyshev_nodes(terms), increasing=True))
 
 
-def place(kappa: ArrayLike, largest_kappa: float, intervals: int) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+def place(kappa: ArrayLike, max_kappa: float, intervals: int) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
     """Return the interval of κ (...), and the place t in it, −1 to 1."""
-    x = np.asarray(kappa, np.float64) / largest_kappa * intervals
+    x = np.asarray(kappa, np.float64) / max_kappa * intervals
     interval = np.clip(np.floor(x), 0, intervals - 1).astype(np.int64)
     return interval, (2 * (x - interval) - 1).astype(np.float32)

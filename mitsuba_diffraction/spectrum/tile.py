@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from ..progress import Progress
 from ..surface.heightfield import HeightField
-from .orders import OrderGrid
-from .spline_grid import SplineGrid, inner, spline
+from .grids import OrderGrid, SplineGrid, inner, spline
 from .tables import chebyshev_nodes, chebyshev_polynomials, chebyshev_transform, nodes_for, position
 
 # Where the interpolation in κ is compared with direct sums, parts of the largest κ.
@@ -72,7 +71,7 @@ class MeanPowers(TilePowers):
         height_fields: Sequence[HeightField],
         max_frequency: float,
         lobe_radius: float,
-        largest_kappa: float,
+        max_kappa: float,
         tolerance: float,
         progress: Progress,
     ) -> None:
@@ -81,29 +80,29 @@ class MeanPowers(TilePowers):
         `progress` is called with the patches done and in all.
         """
         super().__init__(height_fields[0], max_frequency, lobe_radius)
-        self._largest_kappa = largest_kappa
+        self._max_kappa = max_kappa
         height_range = max(field.height_range for field in height_fields)
-        self._nodes = nodes_for(largest_kappa * height_range / 2, 0.01 * tolerance)
+        self._nodes = nodes_for(max_kappa * height_range / 2, 0.01 * tolerance)
         total = np.zeros((self._nodes, *self.grid.shape))
         checked = np.zeros((len(_CHECKED), *self.grid.shape))
         for number, field in enumerate(height_fields, 1):
             heights = field.centred.astype(np.float32)
-            for j, kappa in enumerate((1 + chebyshev_nodes(self._nodes)) / 2 * largest_kappa):
+            for j, kappa in enumerate((1 + chebyshev_nodes(self._nodes)) / 2 * max_kappa):
                 total[j] += self.grid.take(_powers_float32(heights, kappa))
             one = TilePowers(field, max_frequency, lobe_radius)
             for j, share in enumerate(_CHECKED):
-                checked[j] += one(share * largest_kappa)
+                checked[j] += one(share * max_kappa)
             progress(number, len(height_fields))
         flat = total.reshape(self._nodes, -1) / len(height_fields)
         self._coefficients = chebyshev_transform(self._nodes) @ flat
         self.own_error = max(
-            float(np.abs(self(share * largest_kappa) - direct / len(height_fields)).sum())
+            float(np.abs(self(share * max_kappa) - direct / len(height_fields)).sum())
             for share, direct in zip(_CHECKED, checked, strict=True)
         )
 
     def __call__(self, kappa: float) -> NDArray[np.float64]:
         """Compute the mean of η_m(κ), (rows, columns); κ in rad/µm."""
-        values = chebyshev_polynomials(position(np.array([kappa]), self._largest_kappa), self._nodes)
+        values = chebyshev_polynomials(position(np.array([kappa]), self._max_kappa), self._nodes)
         return (values @ self._coefficients).reshape(self.grid.shape)
 
 
@@ -141,18 +140,18 @@ class TileSplines:
         self._orders = powers.grid.frequencies()
         # Beyond six σ_q of the last order there is nothing.
         self._reached = tuple(min(max_frequency, q[-1] + 6 * lobe_width) for q in self._orders)
-        largest = tuple(int(np.rint(end / spacing)) + 1 for end in self._reached)
-        self.grid = SplineGrid((spacing, spacing), largest, (np.inf, np.inf))
+        max_order = tuple(int(np.rint(end / spacing)) + 1 for end in self._reached)
+        self.grid = SplineGrid((spacing, spacing), max_order, (np.inf, np.inf))
         self._random = np.random.default_rng(0)
 
     @cached_property
     def _projection(self) -> list[NDArray[np.float64]]:
         """A_x and A_y, once coefficients are asked for."""
-        return [self._projected(m, q) for m, q in zip(self.grid.largest, self._orders, strict=True)]
+        return [self._projected(m, q) for m, q in zip(self.grid.max_order, self._orders, strict=True)]
 
-    def _projected(self, largest: int, orders: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _projected(self, max_order: int, orders: NDArray[np.float64]) -> NDArray[np.float64]:
         """Compute A, (nodes, orders), along one axis."""
-        nodes = np.arange(-largest - self._MARGIN, largest + self._MARGIN + 1)
+        nodes = np.arange(-max_order - self._MARGIN, max_order + self._MARGIN + 1)
         x, weights = np.polynomial.legendre.leggauss(8)
         # B is a parabola on each of three pieces.
         x = np.concatenate([piece + x / 2 for piece in (-1, 0, 1)])
@@ -180,8 +179,8 @@ class TileSplines:
         """Return ∫|S_approx − S_exact| dq where light reaches; arguments as of `TilePowers.error`."""
         shift = self._random.uniform(-0.5, 0.5, 2)
         along_x, along_y = (
-            self._lobes(np.arange(-largest, largest + 1) + s, orders)
-            for largest, s, orders in zip(self.grid.largest, shift, self._orders, strict=True)
+            self._lobes(np.arange(-max_order, max_order + 1) + s, orders)
+            for max_order, s, orders in zip(self.grid.max_order, shift, self._orders, strict=True)
         )
         exact = along_y @ self._powers(kappa) @ along_x.T
         return self.grid.error(kept, powers, exact, shift, self._reached) + self._powers.own_error

@@ -13,7 +13,7 @@ from test_bsdf import evaluate, k_g, random_directions, raw_plugin, towards
 import mitsuba_diffraction as md
 from mitsuba_diffraction.geometry import horizon_gain
 from mitsuba_diffraction.settings import lobe_width
-from mitsuba_diffraction.spectrum.orders import OrderGrid
+from mitsuba_diffraction.spectrum.grids import OrderGrid
 
 LARGEST_KAPPA = 4 * np.pi / 0.36
 REACHED = 2 / 0.36

@@ -63,8 +63,8 @@ def expected(spectrum, wi, wo, wavelength):
     f = np.zeros(len(wi))
     for m in range(-axes.largest, axes.largest + 1):
         square = ((q - [m / axes.period, 0]) ** 2).sum(1)
-        lobe = np.exp(-square / (2 * sigma**2)) / (2 * np.pi * sigma**2 * -np.expm1(-(spectrum.reach**2) / 2))
-        lobe = np.where(square <= (spectrum.reach * sigma) ** 2, lobe, 0)
+        lobe = np.exp(-square / (2 * sigma**2)) / (2 * np.pi * sigma**2 * -np.expm1(-(spectrum.cutoff_sigmas**2) / 2))
+        lobe = np.where(square <= (spectrum.cutoff_sigmas * sigma) ** 2, lobe, 0)
         shift = [wavelength * m / axes.period, 0]
         sent = [1 - ((omega[:, :2] + shift) ** 2).sum(1) for omega in (wi, wo)]
         for s, omega in zip(sent, (wi, wo), strict=True):

@@ -159,7 +159,7 @@ def test_precompute_writes_the_file_that_it_names_and_prints_its_error(command):
     assert "coherence length 65 µm; slices, " in out
     assert out.splitlines()[1].startswith("truncated, at most: 0.0e+00 of the power at weak frequencies; ")
     # All but the orders up to 13, the last one below 2/λ: summed here.
-    kappa = np.linspace(0, spectrum.largest_kappa, 2000)[:, None]
+    kappa = np.linspace(0, spectrum.max_kappa, 2000)[:, None]
     eta = [
         np.abs(np.exp(1j * kappa * 0.25 * np.arange(64) / 64 - 2j * np.pi * m * np.arange(64) / 64).mean(axis=1)) ** 2
         for m in range(-13, 14)

@@ -14,7 +14,7 @@ from mitsuba_diffraction.bsdf.energy import Energy
 from mitsuba_diffraction.energy.furnace import Furnace, least_kappa, small_kappa
 from mitsuba_diffraction.energy.table import EnergyTable
 from mitsuba_diffraction.geometry import horizon_gain, k_g
-from mitsuba_diffraction.spectrum.spline_grid import SplineGrid
+from mitsuba_diffraction.spectrum.grids import SplineGrid
 
 INDEX, MOST = 1.5, 1.002
 SHORT, LONG = 360.0, 830.0
@@ -130,7 +130,7 @@ def scattered(of, tables, wi, side, wavelength, rng, points, sheet=False):
     least = least_kappa(of, INDEX)
 
     def passed(row, column, kappa):
-        kappa = np.minimum(kappa, of.largest_kappa)
+        kappa = np.minimum(kappa, of.max_kappa)
         at = [
             of.table.powers_at(row, column, k) for k in (kappa, np.full(len(row), least), np.full(len(row), 2 * least))
         ]
@@ -156,7 +156,7 @@ def scattered(of, tables, wi, side, wavelength, rng, points, sheet=False):
                 _, node = np.nonzero(there)
                 u, m, cos_o = exact[there], lattice[there], np.sqrt(square[there])
                 kappa = 2 * np.pi * np.abs(v_z[there]) / wavelength
-                power = of.table.powers_at(row[node], column[node], np.minimum(kappa, of.largest_kappa))
+                power = of.table.powers_at(row[node], column[node], np.minimum(kappa, of.max_kappa))
                 cos_i, gain = np.full(len(u), wi[2]), 1.0
                 if by_order:
                     back = 1 - ((u + n_i * wi[:2] - m) ** 2).sum(-1) / n_i**2

@@ -11,7 +11,7 @@ from scipy.stats import qmc
 import mitsuba_diffraction as md
 from mitsuba_diffraction.energy.furnace import Furnace
 from mitsuba_diffraction.geometry import horizon_gain, k_g
-from mitsuba_diffraction.spectrum.spline_grid import SplineGrid, spline_integral
+from mitsuba_diffraction.spectrum.grids import SplineGrid, spline_integral
 
 MOST = 1.002
 SEEDS = range(5000, 5040)
@@ -62,7 +62,7 @@ def albedo(of, table, wi, wavelength, points, rng):
     q_x, q_y = (q.ravel() for q in np.meshgrid(*of.grid.frequencies()))
     row, column = (i.ravel() for i in np.indices(of.grid.shape))
     splines = isinstance(of.grid, SplineGrid)
-    radius = wavelength * (1.5 * np.hypot(*of.grid.spacing) if splines else of.reach * of.lobe_width)
+    radius = wavelength * (1.5 * np.hypot(*of.grid.spacing) if splines else of.cutoff_sigmas * of.lobe_width)
     distance = np.hypot(wi[0] + wavelength * q_x, wi[1] + wavelength * q_y)
     splines = isinstance(of.grid, SplineGrid)
     # Orders that are evaluated one by one propagate or not as a whole.
@@ -92,8 +92,8 @@ def albedo(of, table, wi, wavelength, points, rng):
             drawn = [np.interp(t, INTEGRAL, OFFSETS) * d for t, d in zip((x, y), of.grid.spacing, strict=True)]
         else:
             square = ((u / wavelength - q_x) ** 2 + (v / wavelength - q_y) ** 2) / of.lobe_width**2
-            cut = -np.expm1(-(of.reach**2) / 2)
-            share *= np.exp(-square / 2) / (2 * np.pi * of.lobe_width**2 * cut) * (square < of.reach**2)
+            cut = -np.expm1(-(of.cutoff_sigmas**2) / 2)
+            share *= np.exp(-square / 2) / (2 * np.pi * of.lobe_width**2 * cut) * (square < of.cutoff_sigmas**2)
             r = of.lobe_width * np.sqrt(-2 * np.log1p(-x * cut))
             drawn = [r * np.cos(2 * np.pi * y), r * np.sin(2 * np.pi * y)]
         u, v = np.where(near, u, wavelength * (q_x + drawn[0])), np.where(near, v, wavelength * (q_y + drawn[1]))
@@ -120,7 +120,7 @@ def albedo(of, table, wi, wavelength, points, rng):
             b *= np.clip(2 - 5 * np.maximum(wi[2], cos_o), 0, 1)
             factor = (1 - b) * k_g(wi[2], cos_o, (u**2 + v**2 + w**2) / 2)
             factor += b * horizon_gain(from_horizon(wi[:2])) * horizon_gain(from_horizon(out))
-        kappa = np.minimum(2 * np.pi * w / wavelength, of.largest_kappa)
+        kappa = np.minimum(2 * np.pi * w / wavelength, of.max_kappa)
         s = of.table.powers_at(row[node, 0], column[node, 0], kappa).astype(np.float64)
         e = 1.0 if table is None else np.minimum(table.at(wi[None], wavelength), table.at(out, wavelength))
         results.append((share[kept] * factor * s * e).sum() / points)

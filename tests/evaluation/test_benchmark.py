@@ -37,7 +37,7 @@ def test_accuracy_is_within_the_tolerance_and_follows_it(case):
 @pytest.mark.parametrize("case", [BLAZE, SKIN], ids=lambda case: case.name)
 def test_accuracy_sees_an_error_that_is_put_in(case):
     exact, spectrum = Exact(case, VISIBLE, kappas=2, points=400), case.spectrum("slices")
-    weaker = SliceTable(spectrum.table.largest_kappa, spectrum.table.values * np.float32(0.8))
+    weaker = SliceTable(spectrum.table.max_kappa, spectrum.table.values * np.float32(0.8))
     found = exact.accuracy(dataclasses.replace(spectrum, table=weaker))
     assert found.l1 == pytest.approx(0.2, abs=0.02)
     assert found.delta_e[1] > 1

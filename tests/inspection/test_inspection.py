@@ -319,7 +319,7 @@ def test_a_sample_is_reported_in_numbers(sample):
     (period, *_) = sample.periods
     assert period.period == pytest.approx(PERIOD, abs=4 * period.period_uncertainty + 0.01)
     assert abs(period.direction) < 1
-    assert sample.carried == pytest.approx(4.0)
+    assert sample.max_coherence_length == pytest.approx(4.0)
     told = json.loads(json.dumps(sample.as_json()))
     assert told["pixels"] == [100, 100]
     assert told["statistics"]["Sq"] == pytest.approx(DEPTH / np.sqrt(8), rel=0.03)

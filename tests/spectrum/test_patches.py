@@ -37,7 +37,7 @@ def test_the_spectrum_is_the_mean_of_theirs(recipe):
     # Lobes so narrow that the orders are not gathered on a lattice.
     spectrum = Recipe(recipe.surface, {"coherence_length": 60}).build()
     m_x, m_y = spectrum.grid.axes()
-    for kappa in np.array([0.0, 0.21, 0.47, 0.83, 1.0]) * spectrum.largest_kappa:
+    for kappa in np.array([0.0, 0.21, 0.47, 0.83, 1.0]) * spectrum.max_kappa:
         wanted = np.mean([order_powers(field, kappa)[np.ix_(m_y, m_x)] for field in fields], axis=0)
         assert np.abs(spectrum.powers(kappa) - wanted).sum() < spectrum.error < 1e-3
         # It is none of them, nor the spectrum of their mean height.

@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 import mitsuba_diffraction as md
 from mitsuba_diffraction import HeightField, precompute
 from mitsuba_diffraction.settings import lobe_width
-from mitsuba_diffraction.spectrum.spline_grid import SplineGrid
+from mitsuba_diffraction.spectrum.grids import SplineGrid
 
 REACHED = 2 / 0.36
 """cycles/µm: |q| ≤ 2/λ_min."""
@@ -342,10 +342,10 @@ def test_a_tile_is_read_from_a_lattice_where_its_lobes_overlap_widely(coherence_
 
 def test_the_orders_are_those_that_light_reaches():
     spectrum = precompute(md.gratings.blazed(2.5, 0.25))
-    assert spectrum.grid.largest == (13, 0)  # 13/2.5 = 5.2 ≤ 2/0.36 = 5.56 < 14/2.5
+    assert spectrum.grid.max_order == (13, 0)  # 13/2.5 = 5.2 ≤ 2/0.36 = 5.56 < 14/2.5
     spectrum = precompute(md.gratings.blazed(2.5, 0.25), wavelengths=(500.0, 600.0))
-    assert spectrum.grid.largest == (10, 0)
-    assert spectrum.largest_kappa == pytest.approx(4 * np.pi / 0.5)
+    assert spectrum.grid.max_order == (10, 0)
+    assert spectrum.max_kappa == pytest.approx(4 * np.pi / 0.5)
 
 
 @pytest.mark.parametrize(("pixel", "axis"), [((0.2, 0.05), "x"), ((0.05, 0.1), "y")])
@@ -355,7 +355,7 @@ def test_pixels_too_coarse_raise_a_warning(pixel, axis):
         spectrum = precompute(field)
     assert len(caught) == 1
     assert caught[0].filename == __file__
-    for size, count, largest in zip(field.pixel_size, (7, 6), spectrum.grid.largest, strict=True):
+    for size, count, largest in zip(field.pixel_size, (7, 6), spectrum.grid.max_order, strict=True):
         assert largest / (count * size) < 1 / (2 * size)
 
 
@@ -454,7 +454,7 @@ def test_the_unresolved_power_is_reported(field, arguments):
     t_x, t_y = field.tile_size
     worst = max(
         power_outside(field, kappa, lambda x, y: (np.abs(x / t_x) <= reach) & (np.abs(y / t_y) <= reach))
-        for kappa in np.linspace(0, spectrum.largest_kappa, 400)
+        for kappa in np.linspace(0, spectrum.max_kappa, 400)
     )
     assert spectrum.unresolved_power == pytest.approx(worst, rel=0.02, abs=1e-9)
 
@@ -473,7 +473,7 @@ def test_the_unresolved_power_is_reported(field, arguments):
 @pytest.mark.filterwarnings("ignore:pixels of")
 def test_weak_orders_are_dropped_and_their_power_is_reported(field, tolerance):
     spectrum = precompute(field, tolerance=tolerance)
-    m_x, m_y = spectrum.grid.largest
+    m_x, m_y = spectrum.grid.max_order
     assert m_x < min((field.shape[1] - 1) // 2, int(REACHED * field.tile_size[0]))  # there was something to drop
     kappas = np.linspace(0, LARGEST_KAPPA, 300)
     kept = [power_outside(field, kappa, lambda x, y: (np.abs(x) <= m_x) & (np.abs(y) <= m_y)) for kappa in kappas]
@@ -497,17 +497,17 @@ def test_a_narrower_scene_has_a_smaller_table_that_is_right(extent):
     angle = precompute(field, largest_angle=40.0, **arguments)
     longer = precompute(field, wavelengths=(500.0, 600.0), **arguments)
     rng = np.random.default_rng(9)
-    for narrow, reach, largest_kappa in [
+    for narrow, reach, max_kappa in [
         (angle, REACHED * np.sin(np.deg2rad(40)), LARGEST_KAPPA),
         (longer, 4.0, 4 * np.pi / 0.5),
     ]:
-        assert narrow.largest_kappa == pytest.approx(largest_kappa)
+        assert narrow.max_kappa == pytest.approx(max_kappa)
         assert narrow.megabytes < 0.8 * whole.megabytes
         assert narrow.unresolved_power > whole.unresolved_power
         # Random places out to the very edge: their mean error is the tolerance at most.
         q = rng.uniform(-reach, reach, (800, 2))
         q = q[np.hypot(*q.T) <= reach]
-        for kappa in (3.0, 0.6 * largest_kappa, largest_kappa):
+        for kappa in (3.0, 0.6 * max_kappa, max_kappa):
             exact = md.reference.power_spectrum(field, q, kappa, extent=extent, coherence_length=coherence_length)
             assert np.abs(narrow.evaluate(q, kappa) - exact).sum() <= 0.012 * max(exact.sum(), exact.mean() * 800)
 
@@ -609,7 +609,7 @@ def test_the_weak_frequencies_of_a_smooth_sample_are_dropped():
     field = HeightField(np.outer(np.hanning(40), np.hanning(44)) * 0.1, 0.08)
     spectrum = precompute(field, extent="sample", coherence_length=1.5, tolerance=0.01)
     grid, sigma = spectrum.grid, lobe_width(1.5)
-    ends = [m * d for m, d in zip(grid.largest, grid.spacing, strict=True)]
+    ends = [m * d for m, d in zip(grid.max_order, grid.spacing, strict=True)]
     assert max(ends) < 0.8 * REACHED
     axis = np.arange(-REACHED, REACHED, sigma / 2)
     q = np.stack(np.meshgrid(axis, axis), axis=-1)

@@ -8,9 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import mitsuba_diffraction as md
-from mitsuba_diffraction.settings import lobe_reach
-from mitsuba_diffraction.spectrum.orders import OrderGrid
-from mitsuba_diffraction.spectrum.spline_grid import SplineGrid, spline_integral
+from mitsuba_diffraction.settings import lobe_cutoff
+from mitsuba_diffraction.spectrum.grids import OrderGrid, SplineGrid, spline_integral
 from mitsuba_diffraction.spectrum.tables import (
     SeriesTable,
     SliceTable,
@@ -39,17 +38,17 @@ def as_it_is(values):
 @given(
     tile=st.tuples(st.floats(0.05, 100), st.floats(0.05, 100)),
     pixels=st.tuples(st.integers(1, 300), st.integers(1, 300)),
-    largest_frequency=st.floats(1.0, 20.0),
+    max_frequency=st.floats(1.0, 20.0),
 )
-def test_the_grid_holds_every_order_that_light_reaches_and_the_pixels_resolve(tile, pixels, largest_frequency):
-    grid = OrderGrid.reachable(tile, pixels, largest_frequency)
-    for size, count, largest in zip(tile, pixels, grid.largest, strict=True):
+def test_the_grid_holds_every_order_that_light_reaches_and_the_pixels_resolve(tile, pixels, max_frequency):
+    grid = OrderGrid.reachable(tile, pixels, max_frequency)
+    for size, count, largest in zip(tile, pixels, grid.max_order, strict=True):
         m = np.arange(300)
-        reached = (m / size <= largest_frequency * (1 - 1e-12)) & (m <= count / 2)
+        reached = (m / size <= max_frequency * (1 - 1e-12)) & (m <= count / 2)
         assert largest >= m[reached].max()
-        assert largest / size <= largest_frequency * (1 + 1e-12)
+        assert largest / size <= max_frequency * (1 + 1e-12)
         assert largest <= count / 2
-    assert grid.shape == (2 * grid.largest[1] + 1, 2 * grid.largest[0] + 1)
+    assert grid.shape == (2 * grid.max_order[1] + 1, 2 * grid.max_order[0] + 1)
 
 
 def test_axes_run_from_minus_to_plus_the_largest_order():
@@ -80,14 +79,14 @@ def test_the_nyquist_order_lies_half_on_each_side():
     "arguments", [((0.0, 1.0), (1, 1)), ((1.0, np.nan), (1, 1)), ((1.0, np.inf), (1, 1)), ((1.0, 1.0), (1, -1))]
 )
 def test_wrong_grids_are_refused(arguments):
-    with pytest.raises(ValueError, match=r"tile_size|largest order"):
+    with pytest.raises(ValueError, match=r"tile_size|max_order"):
         OrderGrid(*arguments)
 
 
 @given(share=st.floats(1e-7, 0.5))
-def test_the_share_that_lobe_reach_names_is_the_one_that_the_cut_moves(share):
+def test_the_share_that_lobe_cutoff_names_is_the_one_that_the_cut_moves(share):
     # One axis by the trapezoidal rule; cut off outside of the square, and added again by scaling what is inside.
-    rho = lobe_reach(share)
+    rho = lobe_cutoff(share)
     x = np.linspace(-rho, rho, 40001)
     inside = np.trapezoid(np.exp(-(x**2) / 2), x) / np.sqrt(2 * np.pi)
     assert 2 * (1 - inside**2) == pytest.approx(share, rel=1e-3, abs=1e-9)
@@ -99,8 +98,8 @@ def test_the_share_that_lobe_reach_names_is_the_one_that_the_cut_moves(share):
 def test_truncated_lobes_keep_their_power_and_the_tolerance(coherence_length, tolerance):
     spectrum = md.precompute(random_surface(0.1, (40, 50)), coherence_length=coherence_length, tolerance=tolerance)
     grid = OrderGrid(spectrum.pixel_size, (30, 40))  # many orders, whatever the grid of the spectrum is
-    grid = OrderGrid((4.0, 3.2), grid.largest)
-    sigma, reach = spectrum.lobe_width, spectrum.reach
+    grid = OrderGrid((4.0, 3.2), grid.max_order)
+    sigma, reach = spectrum.lobe_width, spectrum.cutoff_sigmas
     for axis, lobe in enumerate(grid.lobes(sigma, reach)):
         q = np.zeros((20001, 2))
         end = min(lobe.half_width, 9 * sigma) * 1.5
@@ -108,7 +107,7 @@ def test_truncated_lobes_keep_their_power_and_the_tolerance(coherence_length, to
         held = np.zeros(len(q))
         count = np.zeros(len(q), int)
         for row, column, weight in grid.around(q, sigma, reach):
-            of_mirror = (row == grid.largest[1]) & (column == grid.largest[0])
+            of_mirror = (row == grid.max_order[1]) & (column == grid.max_order[0])
             held += np.where(of_mirror, weight, 0)
             count += weight > 0
         other = grid.lobes(sigma, reach)[1 - axis]
@@ -172,7 +171,7 @@ def test_the_integral_of_a_spline_is_that_by_quadrature(x):
     ],
 )
 def test_wrong_lattices_are_refused(arguments):
-    with pytest.raises(ValueError, match=r"spacing|largest node|limit"):
+    with pytest.raises(ValueError, match=r"spacing|max_order|limit"):
         SplineGrid(*arguments)
 
 
@@ -363,7 +362,7 @@ def test_the_ends_of_the_range_are_inside(blaze):
     lobe = 2 * np.pi * blaze.lobe_width**2
     assert blaze.evaluate([0.0, 0.0], 0.0) * lobe == pytest.approx(1, abs=1e-4)
     wanted = np.sinc(1 - LARGEST_KAPPA * 0.25 / (2 * np.pi)) ** 2
-    assert blaze.evaluate([1 / 2.5, 0.0], blaze.largest_kappa) * lobe == pytest.approx(wanted, abs=2e-4)
+    assert blaze.evaluate([1 / 2.5, 0.0], blaze.max_kappa) * lobe == pytest.approx(wanted, abs=2e-4)
 
 
 def test_nothing_lies_far_from_the_orders(blaze):

@@ -20,7 +20,7 @@ from mitsuba_diffraction import GratingSpectrum
 from mitsuba_diffraction.energy.table import EnergyTable, Layout
 from mitsuba_diffraction.files import seal
 from mitsuba_diffraction.grating_spectrum import FORMAT_VERSION
-from mitsuba_diffraction.spectrum.spline_grid import SplineGrid
+from mitsuba_diffraction.spectrum.grids import SplineGrid
 from mitsuba_diffraction.spectrum.tables import SliceTable
 
 SHAPES = [(1, 1), (1, 8), (7, 1), (5, 5), (4, 6)]
@@ -94,7 +94,7 @@ def rewrite(path, header=(), channels=(), drop=()):
 
 
 def assert_the_same(back, spectrum):
-    for name in (*NUMBERS, "source", "source_digest", "extent", "representation", "grid", "largest_kappa"):
+    for name in (*NUMBERS, "source", "source_digest", "extent", "representation", "grid", "max_kappa"):
         assert getattr(back, name) == getattr(spectrum, name), name
     assert table_of(back).dtype == table_of(spectrum).dtype
     np.testing.assert_array_equal(table_of(back), table_of(spectrum))
@@ -192,7 +192,7 @@ def test_channels_are_float32_and_named_after_what_they_hold(tmp_path, represent
     heights = np.random.default_rng(5).random((4, 7)) * spectrum.height_range
     heights *= spectrum.height_range / np.ptp(heights)
     u = (heights.ravel()[:, None] - heights.ravel()).ravel()
-    centre = spectrum.largest_kappa / 2
+    centre = spectrum.max_kappa / 2
     wave = np.exp(1j * centre * u)
     # By the definition of each channel, its order zero: the mean over all pairs of pixels.
     if representation == "taylor":
@@ -220,7 +220,7 @@ def test_channels_are_float32_and_named_after_what_they_hold(tmp_path, represent
 def test_more_than_a_thousand_intervals_keep_their_order(tmp_path):
     powers = np.random.default_rng(2).random((1003, 4, 1, 3)).astype(np.float32)
     spectrum = make(shape=(1, 3))
-    spectrum = dataclasses.replace(spectrum, table=SliceTable(spectrum.largest_kappa, powers))
+    spectrum = dataclasses.replace(spectrum, table=SliceTable(spectrum.max_kappa, powers))
     spectrum.save(tmp_path / "deep.exr")
     np.testing.assert_array_equal(GratingSpectrum.load(tmp_path / "deep.exr").table.values, powers)
 

@@ -37,7 +37,7 @@ def test_the_standard_error_of_speckle_is_that_of_independent_windows(coherence_
     # The relative standard error is 1/√P_eff at every q, and Gaussian windows σ_s apart have P_eff = P/Σ_j e^{−j²/2}²…
     found = np.mean(
         [
-            standard_error(speckle(s), coherence_length=coherence_length, largest_kappa=KAPPA, max_frequency=np.inf)
+            standard_error(speckle(s), coherence_length=coherence_length, max_kappa=KAPPA, max_frequency=np.inf)
             for s in range(4)
         ]
     )
@@ -51,7 +51,7 @@ def test_the_standard_error_of_speckle_is_that_of_independent_windows(coherence_
 
 def test_a_flat_scan_has_no_standard_error():
     flat = md.HeightField(np.zeros((60, 50)), 0.05)
-    found = standard_error(flat, coherence_length=1.0, largest_kappa=KAPPA, max_frequency=REACH)
+    found = standard_error(flat, coherence_length=1.0, max_kappa=KAPPA, max_frequency=REACH)
     assert found == pytest.approx(0, abs=1e-12)
 
 
@@ -60,7 +60,7 @@ def test_a_uniform_axis_adds_no_standard_error():
     rng = np.random.default_rng(1)
     heights = rng.uniform(0, 7, (120, 120))
     row, square = (
-        standard_error(md.HeightField(h, 0.05), coherence_length=1.0, largest_kappa=KAPPA, max_frequency=np.inf)
+        standard_error(md.HeightField(h, 0.05), coherence_length=1.0, max_kappa=KAPPA, max_frequency=np.inf)
         for h in (heights[:1], heights)
     )
     assert row == pytest.approx(np.sqrt(square), rel=0.25)
@@ -77,7 +77,7 @@ def test_the_standard_error_of_a_skin_is_right_within_a_factor_of_1_3(name, size
         fields.append(md.HeightField(skin.heights[:rows, :columns], skin.pixel_size))
     truth = spread(fields, coherence_length, KAPPA)
     found = [
-        standard_error(field, coherence_length=coherence_length, largest_kappa=KAPPA, max_frequency=REACH)
+        standard_error(field, coherence_length=coherence_length, max_kappa=KAPPA, max_frequency=REACH)
         for field in fields
     ]
     assert truth / 1.3 < np.mean(found) < 1.3 * truth
@@ -108,7 +108,7 @@ def test_the_tolerance_of_a_sample_is_a_tenth_of_its_standard_error(rough):
     spectrum = md.precompute(rough, extent="sample", coherence_length=1.0)
     assert 1e-3 < spectrum.tolerance < 1e-2
     assert spectrum.tolerance == pytest.approx(spectrum.standard_error / 10)
-    at = {"coherence_length": 1.0, "largest_kappa": spectrum.largest_kappa, "max_frequency": 2 / 0.36}
+    at = {"coherence_length": 1.0, "max_kappa": spectrum.max_kappa, "max_frequency": 2 / 0.36}
     assert spectrum.standard_error == pytest.approx(standard_error(rough, **at), rel=1e-6)
     assert md.precompute(rough, extent="sample", coherence_length=1.0, tolerance=0.03).tolerance == 0.03
 
@@ -128,7 +128,7 @@ def test_the_standard_error_is_printed_and_stored(rough, tmp_path, command, monk
     )
     code, out, err = command("precompute noise.toml")
     assert code == 0, err
-    at = {"coherence_length": 1.0, "largest_kappa": 4 * np.pi / 0.36, "max_frequency": 2 / 0.36}
+    at = {"coherence_length": 1.0, "max_kappa": 4 * np.pi / 0.36, "max_frequency": 2 / 0.36}
     found = GratingSpectrum.load("noise.exr").standard_error
     assert found == pytest.approx(standard_error(rough, **at), rel=1e-6)
     wanted = f"standard error of one scan {found:.2g}"

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ...color import daylight, delta_E, spectrum_to_XYZ
 from ...grating_spectrum import GratingSpectrum
 from ...reference import power_spectrum
-from ...spectrum.orders import OrderGrid
+from ...spectrum.grids import OrderGrid
 from ...surface.heightfield import HeightField
 from ...testing import direction
 from ..validation.record import Record
@@ -27,8 +27,7 @@ def against_reference(height_field: HeightField, spectrum: GratingSpectrum) -> R
     """Compute ∫|ΔS| dq of the table, at three κ."""
     random = np.random.default_rng(5)
     errors = [
-        l1_error(spectrum, height_field, kappa, 400, random)
-        for kappa in random.uniform(0.2, 1, 3) * spectrum.largest_kappa
+        l1_error(spectrum, height_field, kappa, 400, random) for kappa in random.uniform(0.2, 1, 3) * spectrum.max_kappa
     ]
     note = "∫|ΔS| dq, 400 frequencies at each of three κ"
     return Record.worst(0.0, errors, spectrum.tolerance + spectrum.truncated_power, note)
@@ -50,7 +49,7 @@ def l1_error(
     q = _drawn(spectrum, np.maximum(shares, 0), count, random)
     reached = 2 * np.sin(np.deg2rad(spectrum.largest_angle)) / (spectrum.wavelengths[0] * 1e-3)
     lines = isinstance(spectrum.grid, OrderGrid)
-    margin = spectrum.reach * spectrum.lobe_width if lines else 0.0
+    margin = spectrum.cutoff_sigmas * spectrum.lobe_width if lines else 0.0
     q = q[np.hypot(*q.T) < reached - margin]
     approximate = spectrum.evaluate(q, kappa)
     exact = power_spectrum(height_field, q, kappa, extent=spectrum.extent, coherence_length=spectrum.coherence_length)

@@ -47,7 +47,7 @@ class Rays:
             table: of `blank(spectrum)`.
         """
         q_x, q_y = spectrum.grid.frequencies()
-        largest_x, largest_y = spectrum.grid.largest
+        largest_x, largest_y = spectrum.grid.max_order
         spacing_x, spacing_y = (mi.Float(float(q[1] - q[0]) if len(q) > 1 else 1.0) for q in (q_x, q_y))
         dr.make_opaque(spacing_x, spacing_y)
         rows, columns = spectrum.grid.shape

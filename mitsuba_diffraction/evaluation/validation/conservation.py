@@ -42,7 +42,7 @@ def _near_orders(spectrum: GratingSpectrum, wavelength: float, count: int) -> tu
 
 def parseval(spectrum: GratingSpectrum) -> Record:
     """Check the sum over all frequencies of the spectrum, with allowance for its stated truncated power."""
-    kappas = np.linspace(0.2, 1, 9) * spectrum.largest_kappa
+    kappas = np.linspace(0.2, 1, 9) * spectrum.max_kappa
     found = [spectrum.powers(kappa).sum(dtype=np.float64) for kappa in kappas]
     return Record.worst(
         1.0, found, spectrum.tolerance + spectrum.unresolved_power + spectrum.truncated_power, "Σ_m η_m, nine κ"

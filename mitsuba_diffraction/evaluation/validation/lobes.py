@@ -80,7 +80,7 @@ def lobe_powers(bsdf: mi.BSDF, spectrum: GratingSpectrum, wi: Array, q: ArrayLik
         (n,).
     """
     x, weights = np.polynomial.legendre.leggauss(_POINTS)
-    reach = spectrum.reach * spectrum.lobe_width
+    reach = spectrum.cutoff_sigmas * spectrum.lobe_width
     offset = reach * np.stack(np.meshgrid(x, x), axis=-1).reshape(-1, 2)
     points = np.asarray(q, np.float64)[:, None, :] + offset
     area = reach**2 * np.outer(weights, weights).ravel()
