@@ -108,14 +108,15 @@ class Recipe:
 
     def __post_init__(self) -> None:
         if ("profile" in self.surface) == ("scan" in self.surface):
-            raise RequestError(f"[surface]: got {_names(self.surface)}, wanted either a profile or a scan")
+            got = ", ".join(sorted(self.surface)) or "nothing"
+            raise RequestError(f"[surface]: got {got}, wanted either a profile or a scan")
         if "profile" in self.surface and self.surface["profile"] not in tuple(PROFILES):
             raise RequestError(f"profile: got {self.surface['profile']!r}, wanted one of {', '.join(PROFILES)}")
         if "profile" in self.surface and "patches" in self.surface:
             patches = self.surface["patches"]
             if isinstance(patches, bool) or not isinstance(patches, int) or patches < 1:
                 raise RequestError(f"patches: got {patches!r}, wanted a whole number of at least 1")
-            if not self._has_seed:
+            if "seed" not in inspect.signature(PROFILES[self.surface["profile"]]).parameters:
                 raise RequestError(
                     f"patches: got {patches!r} of the profile {self.surface['profile']!r}, wanted a profile with a seed"
                 )
@@ -166,10 +167,6 @@ class Recipe:
     def files(self) -> list[Path]:
         """The files that the recipe names: its scan, or none."""
         return [self.folder / self.surface["scan"]] if "scan" in self.surface else []
-
-    @property
-    def _has_seed(self) -> bool:
-        return "seed" in inspect.signature(PROFILES[self.surface["profile"]]).parameters
 
     @property
     def patches(self) -> int:
@@ -306,7 +303,3 @@ def _refuse_unknown(where: str, table: Mapping[str, Any], known: frozenset[str])
 def _is_plain(value: object) -> bool:
     # TOML integers have 64 bits; Python also parses larger ones, which overflow a float.
     return isinstance(value, float | str) or (isinstance(value, int) and -(2**63) <= value < 2**63)
-
-
-def _names(table: Mapping[str, Any]) -> str:
-    return ", ".join(sorted(table)) or "nothing"

@@ -179,7 +179,7 @@ def changes(
     """
     orders = [m for m in ORDERS if order_angle(m, main.period, GREEN) is not None]
     before = _View(spectrum, main.period)
-    sides = {m: _brighter_side(before, main, m) for m in orders}
+    sides = {m: max((m, -m), key=lambda side: _XYZ(before, main, side, main.period)[1]) for m in orders}
     shares = {m: _share(before, main, m) for m in orders}
     colours = {m: _XYZ(before, main, sides[m], main.period) for m in orders}
     brightest = max((XYZ[1] for XYZ in colours.values()), default=1.0)
@@ -226,10 +226,6 @@ def _XYZ(view: _View, main: Period, order: int, period: float) -> Array:
     """Return non-negative XYZ at normal incidence in the direction to which `period` diffracts 550 nm."""
     light = radiance(view.spectrum, main.direction, 0.0, order_angle(order, period, GREEN), **view.scale)
     return np.maximum(spectrum_to_XYZ(light, WAVELENGTHS), 0)
-
-
-def _brighter_side(view: _View, main: Period, order: int) -> int:
-    return max((order, -order), key=lambda m: _XYZ(view, main, m, main.period)[1])
 
 
 _HALVINGS = 12

@@ -13,10 +13,10 @@ from mitsuba_diffraction.evaluation.finite_tiles import finite_tiles_spectrum, t
 from mitsuba_diffraction.evaluation.realtime_shader import tristimulus
 from mitsuba_diffraction.evaluation.realtime_shader.evaluate import VARIANTS, colour, relative_radiance, shader_for
 from mitsuba_diffraction.evaluation.realtime_shader.picture import Emission, decode, encode
+from mitsuba_diffraction.evaluation.realtime_shader.pq import tile_factor as tile_factor_drjit
+from mitsuba_diffraction.evaluation.realtime_shader.pq import tiling_power
 from mitsuba_diffraction.evaluation.realtime_shader.quirks import Quirks
 from mitsuba_diffraction.evaluation.realtime_shader.taylor_textures import taylor_transforms
-from mitsuba_diffraction.evaluation.realtime_shader.tiling import tile_factor as tile_factor_drjit
-from mitsuba_diffraction.evaluation.realtime_shader.tiling import tiling_power
 from mitsuba_diffraction.render.scene import root_cause
 from mitsuba_diffraction.testing import array, vectors
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import time
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -24,9 +24,62 @@ from ...render.scene import channel_wavelengths, emitters_of, load_spectral_scen
 from ..realtime_shader.base import Shader
 from ..realtime_shader.evaluate import VARIANTS
 from ..realtime_shader.flss import FLSS
+from ..realtime_shader.lights import lights_of
 from ..realtime_shader.quirks import Quirks
 from ..realtime_shader.tristimulus import EMISSION, primary_spectra
-from .integrators import same_light, without_gratings
+
+
+def _integrator(radiance: Callable[..., tuple[mi.Spectrum, mi.Bool]]) -> mi.SamplingIntegrator:
+    """Return an integrator of radiance(scene, ray, active), which also tells where a surface was hit."""
+
+    class Part(mi.SamplingIntegrator):
+        def sample(
+            self,
+            scene: mi.Scene,
+            sampler: mi.Sampler,
+            ray: mi.RayDifferential3f,
+            medium: mi.Medium | None = None,
+            active: mi.Bool = True,
+        ) -> tuple[mi.Spectrum, mi.Bool, list[mi.Float]]:
+            return *radiance(scene, ray, active), []
+
+    return Part(mi.Properties("part"))
+
+
+def same_light(scene: mi.Scene) -> mi.SamplingIntegrator:
+    """Return an integrator of the scene's own BSDFs under the lights that the shader supports.
+
+    Only direct light of directional and point lights, with shadows: no sky, no other lights, no interreflection.
+
+    Raises:
+        ValueError: if the scene has no such light.
+    """
+    lights = lights_of(scene)
+
+    def radiance(scene: mi.Scene, ray: mi.RayDifferential3f, active: mi.Bool) -> tuple[mi.Spectrum, mi.Bool]:
+        si = scene.ray_intersect(ray, active)
+        active = active & si.is_valid()
+        bsdf = si.bsdf(ray)
+        result = mi.Spectrum(0)
+        for light in lights:
+            ds, _, irradiance = light.sample(si, active)
+            lit = active & (scene.ray_test(si.spawn_ray_to(ds.p), active) ^ True)
+            value = bsdf.eval(mi.BSDFContext(), si, si.to_local(ds.d), lit)
+            result += dr.select(lit, value * irradiance, 0)
+        return result, active
+
+    return _integrator(radiance)
+
+
+def without_gratings(shader: mi.SamplingIntegrator) -> mi.SamplingIntegrator:
+    """Return an integrator of a `diffraction_shader` without gratings: other BSDFs, and those below gratings."""
+
+    def radiance(scene: mi.Scene, ray: mi.RayDifferential3f, active: mi.Bool) -> tuple[mi.Spectrum, mi.Bool]:
+        _, value, active = shader.shade(scene, ray, active)
+        return mi.depolarizer(value), active
+
+    return _integrator(radiance)
+
 
 NO_SHADOWS = "no_shadows"
 

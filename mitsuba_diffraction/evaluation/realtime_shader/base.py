@@ -1,4 +1,4 @@
-"""Base classes of the variants of the shader."""
+"""Base classes of the variants of the shader, the gain (eq. 3.10) and the contribution of each wavelength to XYZ."""
 
 from __future__ import annotations
 
@@ -12,15 +12,100 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...bsdf.tables import opaque
+from ...bsdf.geometry import Geometry
+from ...bsdf.tables import PacketTable, opaque
 from ...errors import RequestError
 from ...settings import SUN_COHERENCE_LENGTH, lobe_width
 from ...surface.heightfield import HeightField
-from .gain import PUBLISHED_R0, Gain, fresnel_ratio
 from .quirks import Quirks
-from .spectral_weights import SpectralWeights
 from .taylor_textures import PUBLISHED_TERMS, TaylorTextures, taylor_transforms
-from .tristimulus import SHORTEST, STEP, WAVELENGTH_COUNT, rgb_matrix
+from .tristimulus import LONGEST, SHORTEST, STEP, WAVELENGTH_COUNT, d65_weights, light_weights, rgb_matrix, wavelengths
+
+PUBLISHED_R0 = 0.04  # an index of 1.5, close to that of snake skin
+
+
+def schlick_falloff(cos_half: mi.Float) -> mi.Float:
+    """Return (1 − ω_o·h)⁵ (Schlick 1994; eq. B.1): F = R₀ + (1 − R₀)(1 − ω_o·h)⁵."""
+    away = 1 - cos_half
+    return dr.square(dr.square(away)) * away
+
+
+def fresnel_ratio(r_0: mi.Float, falloff: mi.Float, squared: bool) -> mi.Float:
+    """Return F(ω_o·h)/F(1), or its square."""
+    ratio = (r_0 + (1 - r_0) * falloff) / r_0
+    return dr.square(ratio) if squared else ratio
+
+
+class Gain:
+    """C(ω_i, ω_o) without F and with shadowing: the factors independent of wavelength.
+
+    Relative to a flat mirror at normal incidence,
+
+        C = F(ω_i·h)/F(1) · (1 + ω_i·ω_o)²/((cos θ_i + cos θ_o)² cos θ_o),
+
+    which is K cos θ_i of the BRDF (`bsdf/geometry.py`), and G = min(1, 2(n·h)(n·ω_o)/(ω_o·h), 2(n·h)(n·ω_i)/(ω_o·h))
+    (Torrance and Sparrow 1967).
+
+    Attributes:
+        falloff: `schlick_falloff`.
+        factor: K G cos θ_i; zero below the horizon.
+        active: both directions are in the upper hemisphere.
+    """
+
+    def __init__(self, wi: mi.Vector3f, wo: mi.Vector3f, shadowing: bool, active: mi.Bool) -> None:
+        # K and G are symmetric: exchanging the directions turns K G cos θ_o into K G cos θ_i.
+        geometry = Geometry.of(wo, wi, shadowing=shadowing)
+        self.active = active & geometry.reflects()
+        self.falloff = schlick_falloff(geometry.cos_half())
+        self.factor = dr.select(self.active, geometry.k_g() * geometry.cos_o, 0)
+        (self.u, self.v), self.w = geometry.tangent, geometry.w
+
+
+class SpectralWeights:
+    """A table of (X, Y, Z, R₀) with one entry per nm, read with linear interpolation (algorithm 4.3, line 5)."""
+
+    def __init__(
+        self,
+        quirks: Quirks,
+        peak: float,
+        *,
+        r_0: ArrayLike = PUBLISHED_R0,
+        light: ArrayLike | None = None,
+    ) -> None:
+        """Build the table.
+
+        For the irradiance E(λ) per nm and the relative radiance ρ(λ), the colour is ∫ ρ E (x̄, ȳ, z̄) dλ / ∫ȳ dλ.
+        Absolute radiance has the additional factor R₀ S(0)/λ², where S(0) is the density of a flat surface at q = 0.
+
+        Args:
+            quirks: `fixed_index`, `d65_light` and `relative` apply.
+            peak: S(0) of a flat surface, µm².
+            r_0: power reflectance at normal incidence, one number or (401,) at `tristimulus.wavelengths`.
+            light: spectrum of the light, (401,); default: D65 with Y = 1.
+        """
+        weights = d65_weights() if light is None else light_weights(light)
+        self.luminance = 1.0 if light is None else float(np.trapezoid(weights[:, 1]))
+        if quirks.d65_light:
+            weights = d65_weights() * self.luminance
+        r_0 = PUBLISHED_R0 if quirks.fixed_index else r_0
+        r_0 = np.broadcast_to(np.asarray(r_0, np.float64), wavelengths().shape)
+        if not quirks.relative:
+            weights = weights * (r_0 * peak / (wavelengths() * 1e-3) ** 2)[:, None]
+        self.table = PacketTable(np.concatenate([weights, r_0[:, None]], axis=1))
+
+    def __call__(self, wavelength: mi.Float, active: mi.Bool) -> tuple[mi.Color3f, mi.Float]:
+        """Return (X, Y, Z) per nm, and R₀, at a wavelength in nm; zero outside 380 to 780 nm."""
+        active = active & (wavelength >= SHORTEST - 1e-3) & (wavelength <= LONGEST + 1e-3)
+        value = interpolated(self.table, wavelength - SHORTEST, int(LONGEST - SHORTEST), active)
+        return mi.Color3f(value.x, value.y, value.z), value.w
+
+
+def interpolated(table: PacketTable, place: mi.Float, last: int, active: mi.Bool) -> mi.Vector4f:
+    """Return packets 0 … `last` of a table, linear at `place`, constant beyond the ends, and zero if not `active`."""
+    place = dr.clip(place, 0, last)
+    index = mi.UInt32(dr.minimum(place, last - 1))
+    below, above = table(index, active), table(index + 1, active)
+    return below + (place - mi.Float(index)) * (above - below)
 
 
 class Shader:

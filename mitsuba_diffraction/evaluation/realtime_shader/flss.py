@@ -8,8 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .base import TextureShader
-from .gain import Gain
+from .base import Gain, TextureShader
 
 REACH = 1  # texels on each side: a neighbourhood of 3 × 3
 

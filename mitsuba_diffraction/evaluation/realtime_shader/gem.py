@@ -11,9 +11,8 @@ import scipy.fft
 
 from ...errors import RequestError
 from ...surface.heightfield import HeightField
-from .base import Shader
+from .base import Shader, SpectralWeights
 from .quirks import Quirks
-from .spectral_weights import SpectralWeights
 
 ORDERS = 7
 _RAINBOW = (0.75, 0.5, 0.25)  # peaks of red, green and blue

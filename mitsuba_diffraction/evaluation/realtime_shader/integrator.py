@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 from ...bsdf.layers import Layers
 from ...errors import RequestError
 from ...manual import Parameter, listed
-from .base import Shader
+from .base import Shader, SpectralWeights
 from .evaluate import VARIANTS
 from .lights import Light, lights_of, spectrum_of
 from .picture import Emission, decode, encode
 from .quirks import Quirks
-from .spectral_weights import SpectralWeights
 from .surfaces import Surface, along_pattern, heights_of, surfaces_of, transmitted
 
 PARAMETERS = (

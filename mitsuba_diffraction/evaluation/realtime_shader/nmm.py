@@ -8,10 +8,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .base import trapezoid
+from .base import Gain, SpectralWeights, trapezoid
 from .flss import FLSS, REACH
-from .gain import Gain
-from .spectral_weights import SpectralWeights
 from .tristimulus import LONGEST, SHORTEST, STEP, WAVELENGTH_COUNT
 
 _FAR = 4.0  # σ_f, at which the power of a line has fallen to e^{−4²} = 1e-7

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from ...bsdf.tables import PacketTable
-from .spectral_weights import interpolated
+from .base import interpolated
 from .tristimulus import EMISSION, primary_spectra
 
 
