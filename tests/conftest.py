@@ -23,7 +23,7 @@ from mitsuba_diffraction.render import passes
 
 # One example may be the first to import or to compile something.
 settings.register_profile("tests", deadline=None, max_examples=30)
-settings.register_profile("slow", deadline=None)
+settings.register_profile("slow", deadline=None, max_examples=200)
 
 MEASURED = Path(__file__).parents[1] / "precompute" / "measured"
 _HEIGHT_RANGE = {"elaphe": 0.375, "xenopeltis": 0.819}

@@ -4,7 +4,7 @@ from math import factorial, lgamma
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.special import jv
 
@@ -176,7 +176,6 @@ def test_nodes_resolve_the_wave_to_the_tolerance(x, tolerance):
 @pytest.mark.few(1)
 @pytest.mark.parametrize(("terms", "divisor"), [(3, 192), (4, 3072)])
 @given(height=st.floats(-5, 5), intervals=st.integers(1, 400), phase=st.floats(0, 2 * np.pi), share=st.floats(0.0, 1.0))
-@settings(max_examples=50)
 def test_polynomials_through_chebyshev_points_keep_their_bound(terms, divisor, height, intervals, phase, share):
     table = SliceTable.build(
         intervals, terms, LARGEST_KAPPA, lambda kappa: np.cos(kappa * height + phase).reshape(1, 1), lambda v: v, ignore

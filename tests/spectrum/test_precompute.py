@@ -5,7 +5,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 from scipy.special import jv
 from threadpoolctl import threadpool_info, threadpool_limits
@@ -86,7 +86,6 @@ def surfaces(draw, depths):
     return HeightField(heights * draw(st.sampled_from(depths)), pixel)
 
 
-@settings(max_examples=60)
 @given(
     field=surfaces([0.0, 0.02, 0.3, 1.0, 5.0]),
     representation=st.sampled_from(["chebyshev", "svd", "slices"]),
@@ -101,7 +100,6 @@ def test_any_tolerance_is_kept_on_any_surface(field, representation, tolerance, 
     assert worst_error(spectrum, field, random_kappas(seed)) <= tolerance
 
 
-@settings(max_examples=40)
 @given(field=surfaces([0.0, 0.02, 0.1, 0.3]), tolerance=st.sampled_from(TOLERANCES), seed=st.integers(0, 2**32 - 1))
 def test_taylor_keeps_any_tolerance_on_a_shallow_surface(field, tolerance, seed):
     spectrum = precompute(field, representation="taylor", tolerance=tolerance, coherence_length=200.0)

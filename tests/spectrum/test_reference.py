@@ -94,7 +94,6 @@ def test_amplitudes_carry_the_phase_of_the_sign_convention():
 # ---------------------------------------------------------------- S(q; κ)
 
 
-@settings(max_examples=40)
 @given(
     shape=shapes,
     pixel=st.sampled_from([(0.1, 0.1), (0.05, 0.3), (2.0, 0.07)]),

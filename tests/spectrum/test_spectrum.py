@@ -92,7 +92,7 @@ def test_the_share_that_lobe_cutoff_names_is_the_one_that_the_cut_moves(share):
     assert 2 * (1 - inside**2) == pytest.approx(share, rel=1e-3, abs=1e-9)
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("coherence_length", [1.0, 5.0, 20.0, 65.0])
 @pytest.mark.parametrize("tolerance", [1e-2, 1e-3])
 def test_truncated_lobes_keep_their_power_and_the_tolerance(coherence_length, tolerance):

@@ -76,6 +76,7 @@ def test_a_great_offset_costs_no_digits():
     np.testing.assert_allclose(filled, heights, rtol=0, atol=2 * np.spacing(offset))
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("pixel_size", [(1.0, 1.0), (1.0, 2.0)])
 def test_the_fill_is_that_of_a_relaxation(pixel_size):
     generator = np.random.default_rng(1)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
@@ -297,7 +297,6 @@ def test_a_smooth_surface_is_turned_about_its_middle(degrees, shape):
     np.testing.assert_allclose(after.heights, expected, atol=5e-6)
 
 
-@settings(max_examples=60)
 @given(width=st.floats(1, 30), height=st.floats(1, 30), degrees=st.floats(0.1, 89.9))
 def test_the_rectangle_fits_and_none_of_its_shape_is_greater(width, height, degrees):
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))

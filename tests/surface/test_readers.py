@@ -257,7 +257,6 @@ def test_empty_foreign_and_cut_files_are_refused(tmp_path, refuse, name):
     refuse(name, name)
 
 
-@settings(max_examples=150, deadline=None)
 @given(name=st.sampled_from(["scan.npy", "scan.npz", "scan.png", "scan.tif"]), data=st.data())
 def test_a_changed_byte_gives_heights_or_one_line(tmp_path_factory, name, data):
     path = tmp_path_factory.mktemp("changed") / name
@@ -686,7 +685,6 @@ def test_every_cut_of_a_binary_file_is_refused(tmp_path, refuse, name):
         refuse(name, name, unit="m")
 
 
-@settings(max_examples=200, deadline=None)
 @given(name=st.sampled_from(["scan.gwy", "scan.gsf", "scan.xyz", "scan.asc"]), data=st.data())
 def test_changed_bytes_give_heights_or_one_line(tmp_path_factory, name, data):
     path = tmp_path_factory.mktemp("changed") / name
