@@ -7,8 +7,8 @@ from numpy.typing import ArrayLike, NDArray
 
 SHADOWING = ("v_cavity", "none")
 
+# Coefficients of a least-squares fit to (g(x) − 1)/t², t = 1 − x/4.
 HORIZON_GAIN = (-0.04034151, 0.81494507, -5.03522703, 10.57318562, -9.23048089, 3.5662365)
-"""Coefficients of a least-squares fit to (g(x) − 1)/t², t = 1 − x/4."""
 
 
 def k_g(cos_i: ArrayLike, cos_o: ArrayLike, d: ArrayLike, shadowing: bool = True) -> NDArray[np.floating]:

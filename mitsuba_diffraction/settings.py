@@ -11,8 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from .errors import RequestError, is_number
 
-VISIBLE = (360.0, 830.0)
-"""nm: the range of the CIE 1931 observer, from which Mitsuba draws wavelengths."""
+VISIBLE = (360.0, 830.0)  # nm: the range of the CIE 1931 observer, from which Mitsuba draws wavelengths
 
 
 # Angular diameter 0.53°.
@@ -27,8 +26,8 @@ REPRESENTATIONS = ("auto", "taylor", "chebyshev", "svd", "slices")
 LEAST_TOLERANCE = 1e-5
 
 
+# What becomes of the light that enters a dielectric: it is lost, goes on in it, or leaves through a plane below.
 TRANSMISSIONS = ("none", "interface", "sheet")
-"""What becomes of the light that enters a dielectric: it is lost, goes on in it, or leaves through a plane below."""
 
 
 @dataclass(frozen=True)

@@ -24,9 +24,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-INCIDENCES = (0.0, 30.0, 60.0)
-"""Degrees, of the rows of predicted colours."""
-
+INCIDENCES = (0.0, 30.0, 60.0)  # degrees, of the rows of predicted colours
 _CELLS = 181  # of the spectrum along an axis, at most
 _ANGLES = np.arange(-89.75, 89.8, 0.5)
 _HIGHEST_FREQUENCY = 5.0  # cycles/µm, about what visible light reaches

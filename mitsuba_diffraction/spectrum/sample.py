@@ -37,8 +37,7 @@ class WindowAxis(NamedTuple):
     starts: NDArray[np.int64]
 
 
-UNIFORM = WindowAxis(np.ones(1), np.zeros(1, np.int64))
-"""The window along an axis of one pixel."""
+UNIFORM = WindowAxis(np.ones(1), np.zeros(1, np.int64))  # the window along an axis of one pixel
 
 
 def effective_coherence_length(height_field: HeightField, asked: float) -> float:

@@ -339,8 +339,7 @@ class SliceTable:
         return result
 
 
-HALF_SCALE = 2.0**14
-"""Of numbers in half precision: the largest are just under 4, the least 4e-9."""
+HALF_SCALE = 2.0**14  # of numbers in half precision: the largest are just under 4, the least 4e-9
 
 
 def halved(values: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -354,8 +353,8 @@ def halved(values: NDArray[np.float32]) -> NDArray[np.float32]:
     return half.astype(np.float32) / np.float32(HALF_SCALE)
 
 
+# Of numbers that share an exponent: whole numbers up to 255 times 2⁻³⁶ to 2⁻⁶.
 MANTISSA, LEAST_EXPONENT, EXPONENTS = 255, -36, 31
-"""Of numbers that share an exponent: whole numbers up to 255 times 2⁻³⁶ to 2⁻⁶."""
 
 
 def packed(values: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -62,8 +62,8 @@ def _load_array(file: BinaryIO) -> NDArray:
         raise RequestError(f"not an array that can be read ({error})") from None
 
 
+# Largest share of coloured pixels in a grey picture: a scale bar or lettering on it. More is a colour map.
 MOST_ANNOTATION = 0.25
-"""Largest share of coloured pixels in a grey picture: a scale bar or lettering on it. More is a colour map."""
 
 
 def read(path: Path) -> Scan:
