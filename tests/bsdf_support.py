@@ -42,7 +42,7 @@ def made_up(coherence_length=65.0):
     """A table of η that no solver knows, symmetric in P and R, of a grating with many orders; Σ η_m < 1."""
     axes = Axes(1.7, (0.36, 0.83), 8, 5)
     values = np.empty((axes.planes, axes.nodes), np.float32)
-    for m in range(-axes.largest, axes.largest + 1):
+    for m in range(-axes.max_order, axes.max_order + 1):
         side, start = axes.side(m), axes.offset(m)
         x = np.sin(0.2 * np.arange(side) + m) ** 2
         square = (1 + np.add.outer(x, x)) * np.linspace(1, 2, axes.planes)[:, None, None] / (60 + 5 * m)
@@ -106,8 +106,11 @@ def draw(bsdf, wi, count, ctx=None, seed=1, uv=(0.0, 0.0), wavelengths=WAVELENGT
     return bs, weights.T
 
 
-def check_chi_square(bsdf, wi, wavelengths=WAVELENGTHS, ctx=None, cases=1):
-    """Mitsuba's chi² test of what is drawn, without mirrors, against the density; `cases` share the level of 0.01."""
+def check_chi_square(bsdf, wi, wavelengths=WAVELENGTHS, ctx=None, cases=1, side=1):
+    """Mitsuba's chi² test of what is drawn, without mirrors, against the density; `cases` share the level of 0.01.
+
+    All is drawn above the surface, or below with `side` −1.
+    """
     ctx = ctx or mi.BSDFContext()
 
     # In the plane of direction cosines, where lobes have one width everywhere: dω = dx dy / cos θ.
@@ -116,12 +119,12 @@ def check_chi_square(bsdf, wi, wavelengths=WAVELENGTHS, ctx=None, cases=1):
         bs, _ = bsdf.sample(ctx, si, points.x, mi.Point2f(points.y, points.z))
         keep = (bs.pdf > 0) & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         # The plane does not tell what is above the surface from what is below.
-        assert not dr.any(keep & (bs.wo.z <= 0))
+        assert not dr.any(keep & (bs.wo.z * side <= 0))
         return dr.select(keep, mi.Vector2f(bs.wo.x, bs.wo.y), 0), dr.select(keep, mi.Float(1), 0)
 
     def density(p):
         z = dr.safe_sqrt(1 - dr.squared_norm(p))
-        pdf = bsdf.pdf(ctx, interaction(wi, wavelengths, dr.width(p)), mi.Vector3f(p.x, p.y, z))
+        pdf = bsdf.pdf(ctx, interaction(wi, wavelengths, dr.width(p)), mi.Vector3f(p.x, p.y, side * z))
         return dr.select(z > 0, pdf / z, 0)
 
     domain = mi.chi2.PlanarDomain()

@@ -31,12 +31,12 @@ class CellAxis:
 
     Attributes:
         spacing: Δ in cycles/µm, a whole part of the spacing of the nodes.
-        largest: M, |m| ≤ M.
+        max_cell: M, |m| ≤ M.
         shares: (2 M + 1, nodes), the integral of the lobe or spline of each node over each cell.
     """
 
     spacing: float
-    largest: int
+    max_cell: int
     shares: NDArray[np.float64]
 
     @classmethod
@@ -49,13 +49,13 @@ class CellAxis:
         else:
             between, side = grid.spacing[axis], 1.5 * grid.spacing[axis]
         spacing = between / np.ceil(between / min(widest * sigma, FINEST))
-        largest = int(np.ceil((nodes[-1] + side) / spacing - 0.5))
-        ends = (np.arange(-largest, largest + 2) - 0.5) * spacing
+        max_cell = int(np.ceil((nodes[-1] + side) / spacing - 0.5))
+        ends = (np.arange(-max_cell, max_cell + 2) - 0.5) * spacing
         if isinstance(grid, OrderGrid):
             below = ndtr((ends[:, None] - nodes) / sigma)
         else:
             below = spline_integral((ends[:, None] - nodes) / between)
-        return cls(spacing, largest, np.diff(below, axis=0))
+        return cls(spacing, max_cell, np.diff(below, axis=0))
 
 
 _STEP = 0.02  # between the s that stand for a border
@@ -94,9 +94,9 @@ class HorizonBins:
         """Return the bin of one wavelength and where it comes from; beyond the ends, the nearest."""
         wi, bins = incidence.wi, self.resolution
         cosine = _cell(incidence.cosine * bins.cosines, bins.cosines)
-        azimuth = _cell((_azimuth(wi.x, wi.y) + 2) * (bins.azimuths / 4), bins.azimuths)
+        turn = _cell((azimuth(wi.x, wi.y) + 2) * (bins.azimuths / 4), bins.azimuths)
         frequency = _cell((incidence.radius - self.first) * self.per_frequency, bins.frequencies)
-        return (frequency * bins.cosines + cosine) * bins.azimuths + azimuth
+        return (frequency * bins.cosines + cosine) * bins.azimuths + turn
 
     def columns(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the interval of q_x that propagates for some q_y of a row, low ≤ q_y ≤ high (rows,), all in cycles/µm.
@@ -105,17 +105,17 @@ class HorizonBins:
             (bins, rows, 2), the first and last q_x; where there are none, the first is larger.
         """
         bins = self.resolution
-        largest = np.linspace(self._first, self._last, bins.frequencies + 1)[1:, None]
-        largest, low, high = (np.asarray(x, np.float32) for x in (largest, low, high))
+        frequency = np.linspace(self._first, self._last, bins.frequencies + 1)[1:, None]
+        frequency, low, high = (np.asarray(x, np.float32) for x in (frequency, low, high))
         result = np.empty((bins.frequencies, bins.cosines, bins.azimuths, len(low), 2))
         # The border is represented by points: each disc is enlarged to cover those up to half a step away.
         square = (1 + _STEP / 2 + _BEYOND) ** 2
         for cosine, azimuth in np.ndindex(bins.cosines, bins.azimuths):
             s_x, s_y = (self._farthest * s[:, None, None].astype(np.float32) for s in _border(bins, cosine, azimuth))
-            y = np.clip(0, low / largest + s_y, high / largest + s_y)
+            y = np.clip(0, low / frequency + s_y, high / frequency + s_y)
             half = np.where(y**2 < square, np.sqrt(np.maximum(square - y**2, 0)), -np.inf)
-            result[:, cosine, azimuth, :, 0] = largest * (-s_x - half).min(axis=0)
-            result[:, cosine, azimuth, :, 1] = largest * (half - s_x).max(axis=0)
+            result[:, cosine, azimuth, :, 0] = frequency * (-s_x - half).min(axis=0)
+            result[:, cosine, azimuth, :, 1] = frequency * (half - s_x).max(axis=0)
         return result.reshape(-1, len(low), 2)
 
 
@@ -123,10 +123,16 @@ def _cell(x: mi.Float, count: int) -> mi.UInt32:
     return mi.UInt32(limited(x, 0, count - 1))
 
 
-def _azimuth(x: mi.Float, y: mi.Float) -> mi.Float:
+def azimuth(x: mi.Float, y: mi.Float) -> mi.Float:
     """Return −2 to 2, instead of −π to π: the place on a square |x| + |y| = 1, which needs no arc tangent."""
     along = x / larger(dr.abs(x) + dr.abs(y), 1e-12)
     return dr.select(y >= 0, 1 - along, along - 1)
+
+
+def of_azimuth(place: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the angle whose `azimuth` it is."""
+    along = 1 - np.abs(place)
+    return np.arctan2(np.sign(place) * (1 - np.abs(along)), along)
 
 
 def _border(bins: _Resolution, cosine: int, azimuth: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -134,9 +140,7 @@ def _border(bins: _Resolution, cosine: int, azimuth: int) -> tuple[NDArray[np.fl
     radius = np.sqrt(1 - (np.array([cosine + 1, cosine]) / bins.cosines) ** 2)
     # No arc is longer than twice its part of the square.
     ends = (azimuth + np.linspace(0, 1, int(np.ceil(8 / bins.azimuths / _STEP)) + 1)) / (bins.azimuths / 4) - 2
-    # The inverse of `_azimuth`.
-    along = 1 - np.abs(ends)
-    angle = np.arctan2(np.sign(ends) * (1 - np.abs(along)), along)
+    angle = of_azimuth(ends)
     sides = np.linspace(*radius, int(np.ceil((radius[1] - radius[0]) / _STEP)) + 1)
     r = np.concatenate([np.repeat(radius, len(angle)), sides, sides])
     a = np.concatenate([angle, angle, np.repeat(angle[[0, -1]], len(sides))])
@@ -162,7 +166,7 @@ class CellSampler:
         shares = np.moveaxis(along_y.shares @ averages(spectrum, self.cells) @ along_x.shares.T, 0, -1)
         # Coefficients of splines may be below zero.
         shares = np.maximum(shares, 0)
-        spacing, largest = (along_x.spacing, along_y.spacing), (along_x.largest, along_y.largest)
+        spacing, max_cell = (along_x.spacing, along_y.spacing), (along_x.max_cell, along_y.max_cell)
         self.spacing_x, self.spacing_y = (opaque(s) for s in spacing)
         self.per_q_x, self.per_q_y = (opaque(1 / s) for s in spacing)
         self.edge_x, self.edge_y = (
@@ -172,7 +176,7 @@ class CellSampler:
         self.shares = ShareTable(np.pad(shares, pad))
         shares = np.float64(self.shares.values)
         self.rows, self.columns = shares.shape[:2]
-        self.largest_x, self.largest_y = largest
+        self.max_cell_x, self.max_cell_y = max_cell
         self.area = opaque(spacing[0] * spacing[1])
         blocks = shares.reshape(self.rows // self.edge_y, self.edge_y, self.columns // self.edge_x, self.edge_x, CELLS)
         blocks = blocks.swapaxes(1, 2).reshape(*blocks.shape[:3:2], -1, CELLS)
@@ -182,9 +186,9 @@ class CellSampler:
         self.before_x = SumTable(before_x)
 
         self.horizon = HorizonBins(spectrum.wavelengths, self.blocks_y, farthest)
-        edge = (np.arange(self.blocks_y + 1) * self.edge_y - largest[1] - 0.5) * spacing[1]
+        edge = (np.arange(self.blocks_y + 1) * self.edge_y - max_cell[1] - 0.5) * spacing[1]
         ends = self.horizon.columns(edge[:-1], edge[1:])
-        ends = ends / (spacing[0] * self.edge_x) + (largest[0] + 0.5) / self.edge_x
+        ends = ends / (spacing[0] * self.edge_x) + (max_cell[0] + 0.5) / self.edge_x
         first = np.clip(np.floor(ends[..., 0]), 0, self.blocks_x).astype(np.int64)
         end = np.maximum(np.clip(np.ceil(ends[..., 1]), 0, self.blocks_x).astype(np.int64), first)
         row = np.arange(self.blocks_y)
@@ -197,8 +201,8 @@ class CellSampler:
     def density(self, q: mi.Vector2f, incidence: Incidence, active: mi.Bool) -> mi.Float:
         """Return p(q) in µm², q in cycles/µm, for one wavelength; of a q that propagates."""
         m_x, m_y = mi.Int32(dr.round(q.x * self.per_q_x)), mi.Int32(dr.round(q.y * self.per_q_y))
-        active = active & (dr.abs(m_x) <= self.largest_x) & (dr.abs(m_y) <= self.largest_y)
-        cell = mi.UInt32((m_y + self.largest_y) * self.columns + m_x + self.largest_x)
+        active = active & (dr.abs(m_x) <= self.max_cell_x) & (dr.abs(m_y) <= self.max_cell_y)
+        cell = mi.UInt32((m_y + self.max_cell_y) * self.columns + m_x + self.max_cell_x)
         weights = self.cells.weights(incidence)
         total = self.area * dr.dot(weights, self.masses(self.horizon.bin(incidence), active))
         return dr.dot(self.shares(cell, active), weights) * dr.rcp(larger(total, 1e-20))
@@ -223,6 +227,6 @@ class CellSampler:
             block = mi.UInt32(row * self.blocks_x + column)
             mass = self.before_cell.before(block, kappa_cell, mi.Int32(self.in_block), active)
             cell, _ = self.before_cell.search(block, kappa_cell, none, mass, u, active)
-        m_x = mi.Float(column * self.edge_x + cell % self.edge_x - self.largest_x)
-        m_y = mi.Float(row * self.edge_y + cell // self.edge_x - self.largest_y)
+        m_x = mi.Float(column * self.edge_x + cell % self.edge_x - self.max_cell_x)
+        m_y = mi.Float(row * self.edge_y + cell // self.edge_x - self.max_cell_y)
         return mi.Point2f((m_x + x - 0.5) * self.spacing_x, (m_y + v.y - 0.5) * self.spacing_y)

@@ -79,34 +79,30 @@ class Energy:
     def __str__(self) -> str:
         return "bounds the albedo by one, and loses {:.2g} in the mean, {:.2g} at most".format(*self.loss)
 
-    def factor(
-        self,
-        wi: mi.Vector3f,
-        wo: mi.Vector3f,
-        wavelengths: mi.UnpolarizedSpectrum,
-        height_scale: mi.Float,
-        lateral_scale: mi.Float | None,
-    ) -> mi.UnpolarizedSpectrum:
-        """Return E of each wavelength.
+    def places(
+        self, wi: mi.Vector3f, wo: mi.Vector3f, height_scale: mi.Float, lateral_scale: mi.Float | None
+    ) -> tuple[Place, Place]:
+        """Return the places of a pair of directions.
 
         Args:
             wi, wo: along the pattern's axes, each inside the medium that it is in, z < 0 below.
-            wavelengths: µm, in the medium above.
             height_scale: of the heights at the point; of effect where there are tables for it.
             lateral_scale: likewise; None for one.
         """
-        there, back = self.place(wi), self.place(wo)
+        places = self.place(wi), self.place(wo)
         if self.edges is not None:
             lateral_scale = mi.Float(1.0) if lateral_scale is None else dr.detach(lateral_scale)
             ratio = dr.detach(height_scale) / lateral_scale
-            there.ratio = back.ratio = sum((dr.select(ratio > e, mi.UInt32(1), 0) for e in self.edges), mi.UInt32(0))
-            wavelengths = wavelengths / lateral_scale
-        passes = wi.z * wo.z < 0
-        result = mi.UnpolarizedSpectrum(1.0)
-        for channel in range(len(result)):
-            frequency = dr.rcp(wavelengths[channel])
-            result[channel] = smaller(self.bound(there, frequency, passes), self.bound(back, frequency, passes))
-        return result
+            number = sum((dr.select(ratio > e, mi.UInt32(1), 0) for e in self.edges), mi.UInt32(0))
+            for place in places:
+                place.ratio, place.u, place.v = number, place.u * lateral_scale, place.v * lateral_scale
+        return places
+
+    def factor(self, places: tuple[Place, Place], frequency: mi.Float) -> mi.Float:
+        """Return E of one wavelength; `frequency` is 1/λ in 1/µm, λ in the medium above."""
+        there, back = places
+        passes = there.under != back.under
+        return smaller(self.bound(there, frequency, passes), self.bound(back, frequency, passes))
 
     def place(self, omega: mi.Vector3f) -> Place:
         """Return the place of ω, along the pattern's axes."""

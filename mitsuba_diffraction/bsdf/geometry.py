@@ -19,6 +19,7 @@ class Incidence:
 
     Attributes:
         wi: ω_i along the axes of the pattern, outside of a coat.
+        wavelength: λ in µm, outside of a coat.
         frequency: 1/λ in cycles/µm, outside of a coat.
         lateral_frequency: 1/λ times the lateral scale: q of the table per λq.
         index: n of the coat relative to the outside; one without.
@@ -27,6 +28,7 @@ class Incidence:
     """
 
     wi: mi.Vector3f
+    wavelength: mi.Float
     frequency: mi.Float
     lateral_frequency: mi.Float
     index: mi.Float
@@ -53,20 +55,27 @@ class Incidence:
         """Return whether the order at (u, v) = λq propagates."""
         return cos_square(self.wi, tangent) > 0
 
+    def at(self, wavelength: mi.Float) -> Incidence:
+        """Return that at another wavelength (µm), from that at 1 µm."""
+        wavelength = dr.detach(wavelength)
+        frequency = dr.rcp(wavelength)
+        lateral, least, span = (x * frequency for x in (self.lateral_frequency, self.least_kappa, self.kappa_span))
+        return Incidence(self.wi, wavelength, frequency, lateral, self.index, least, span)
+
     @classmethod
     def of(
         cls,
         wi: mi.Vector3f,
-        frequency: mi.Float,
         height_scale: mi.Float,
         coat: Coat | None = None,
         lateral_scale: mi.Float | None = None,
     ) -> Incidence:
-        """κ = 2π (cos θ_i + cos θ_o)/λ times the scale of the heights; under a coat, with what holds inside of it.
+        """Return that at a wavelength of 1 µm; under a coat, with what holds inside of it.
 
-        Without gradients: directions are drawn, and what is drawn does not follow the parameters.
+        κ = 2π (cos θ_i + cos θ_o)/λ times the scale of the heights. Without gradients: directions are drawn, and what
+        is drawn does not follow the parameters.
         """
-        kappa_per_cosine = dr.two_pi * frequency * height_scale
+        kappa_per_cosine = mi.Float(dr.two_pi * height_scale)
         least, span = kappa_per_cosine * wi.z, kappa_per_cosine
         index = mi.Float(1.0) if coat is None else coat.eta
         if coat is not None:
@@ -74,8 +83,9 @@ class Incidence:
             kappa_per_cosine *= coat.relative
             least = kappa_per_cosine * (coat.refracted(wi).z + critical)
             span = kappa_per_cosine * (1 - critical)
-        lateral = scaled(frequency, lateral_scale)
-        return cls(*(dr.detach(value) for value in (wi, frequency, lateral, index, least, span)))
+        lateral = mi.Float(1.0) if lateral_scale is None else lateral_scale
+        values = wi, mi.Float(1.0), mi.Float(1.0), lateral, index, least, span
+        return cls(*(dr.detach(value) for value in values))
 
 
 # Not frozen: Dr.Jit rebuilds what enters a branch field by field.
@@ -157,19 +167,19 @@ class Geometry:
         """Return cos θ_i and cos θ_o, inside of a coat."""
         return self.cos_i, self.cos_o
 
-    def order_factor(self, tangent: mi.Vector2f, frequency: mi.Float, per_width: mi.Float) -> mi.Float:
+    def order_factor(self, tangent: mi.Vector2f, incidence: Incidence, per_width: mi.Float) -> mi.Float:
         """Return K G cos θ_o of an order, times the gain of its lobe.
 
         Args:
             tangent: (u, v) = λq of the order.
-            frequency: 1/λ, outside of a coat.
+            incidence: the wavelength.
             per_width: 1/σ_q.
         """
-        cos_i, cos_o, gain = self.of_order(tangent, frequency * per_width)
+        cos_i, cos_o, gain = self.of_order(tangent, incidence.frequency * per_width)
         square = dr.squared_norm(tangent) / dr.square(self.index)
         return k_g(cos_i, cos_o, square, self.shadowing) * gain * self.cos_o
 
-    def continuum_factor(self, frequency: mi.Float, per_width: mi.Float) -> mi.Float:
+    def continuum_factor(self, incidence: Incidence, per_width: mi.Float) -> mi.Float:
         """Return K G cos θ_o and gain where orders overlap, so that no single one is known.
 
         At grazing incidence the mirror order has nearly all of the power, and K grows without bound within its lobe.
@@ -177,7 +187,7 @@ class Geometry:
         cos θ = 0.4 up, and from 5 σ_q on, K and G are those at q, and what lobes lose below the horizon they get from
         those beyond.
         """
-        per_width = frequency * per_width
+        per_width = incidence.frequency * per_width
         mirror = limited((25 - dr.squared_norm(self.tangent) * dr.square(per_width)) / 9, 0, 1)
         mirror *= limited(2 - 5 * larger(self.wi.z, self.wo.z), 0, 1)
         *_, gain = self.of_order(mi.Vector2f(0), per_width)

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..errors import RequestError
 from ..rigorous.spectrum import RigorousSpectrum
+from .energy import Place
 from .geometry import Geometry, Incidence, turned
 from .media import Media
 from .polarisation import reflected, through_layer
@@ -39,7 +40,7 @@ class Grating:
     def __init__(self, props: mi.Properties, media: Media) -> None:
         self.media, self.coat = media, media.coat
         self.scales = Scales(props)
-        self.spectrum, self.recipe = surface_from(props, media, self.scales.largest)
+        self.spectrum, self.recipe = surface_from(props, media, self.scales.max_scale)
         rigorous = isinstance(self.spectrum, RigorousSpectrum)
         if not rigorous:
             warn_of_range(self.spectrum)
@@ -69,7 +70,7 @@ class Grating:
     ) -> tuple[mi.UnpolarizedSpectrum, mi.Float]:
         """Evaluate f cos θ_o of light from ω_o, and the density of `sample`.
 
-        Under a coat, without the transmittances of its front face; of a sheet, without those of its flat face.
+        Under a coat, without the transmittances of its front face.
 
         Args:
             si: the point, with ω_i.
@@ -90,12 +91,17 @@ class Grating:
             side_share = dr.select(i.sign == o.sign, 1 - passing, passing)
         covered, count = self._covered(si)
         value, density = mi.UnpolarizedSpectrum(0.0), mi.Float(0.0)
-        # Most directions lie between the orders of a grating at all wavelengths: unless drawn, they skip what follows.
-        skips = self.scattering.resolved and not wo_is_sample
         height_scale, lateral_scale = self.scales.at(si, active)
-        needed = active & self._meets(si, u, v, lateral_scale) if skips else True
+        near = mi.UInt32(0)
+        for channel, seen in enumerate(covered):
+            if self.scattering.resolved:
+                frequency = dr.rcp(self._wavelength(si, channel))
+                seen &= self.scattering.meets(u * frequency, v * frequency, *_given(lateral_scale))
+            near |= dr.select(active & seen, mi.UInt32(1 << channel), 0)
+        # Most directions lie between the orders of a grating at all wavelengths: unless drawn, they skip what follows.
+        needed = near != 0 if self.scattering.resolved and not wo_is_sample else True
         # What has no derivative is bound here: Dr.Jit carries all other state through the branch.
-        diffracted = functools.partial(self._diffracted, si, covered, active, wo_is_sample)
+        diffracted = functools.partial(self._diffracted, si, near, active)
         if needed:
             value, density = diffracted(wi, wo, height_scale, lateral_scale)
         # The mean over the covered wavelengths: any of them may have chosen the direction.
@@ -103,55 +109,93 @@ class Grating:
         density = (1 - uniform) * density * outside / larger(count, 1)
         return value, side_share * dr.fma(uniform, dr.inv_two_pi, density)
 
-    def _frequency(self, si: mi.SurfaceInteraction3f, channel: int) -> mi.Float:
-        """Return 1/λ in the medium above, cycles/µm."""
-        return 1e3 * self.media.outside / si.wavelengths[channel]
-
-    def _meets(self, si: mi.SurfaceInteraction3f, u: mi.Float, v: mi.Float, lateral_scale: mi.Float | None) -> mi.Bool:
-        """Return whether (u, v) = λq lies in the lobe of an order at any wavelength."""
-        result = mi.Bool(False)
-        for channel in range(len(si.wavelengths)):
-            frequency = self._frequency(si, channel)
-            result |= self.scattering.meets(u * frequency, v * frequency, *_given(lateral_scale))
-        return result
+    def _wavelength(self, si: mi.SurfaceInteraction3f, channel: int) -> mi.Float:
+        """Return λ in the medium above, µm."""
+        return si.wavelengths[channel] * (1e-3 / self.media.outside)
 
     def _diffracted(
         self,
         si: mi.SurfaceInteraction3f,
-        covered: list[mi.Bool],
+        near: mi.UInt32,
         active: mi.Bool,
-        wo_is_sample: bool,
         wi: mi.Vector3f,
         wo: mi.Vector3f,
         height_scale: mi.Float,
         lateral_scale: mi.Float | None,
     ) -> tuple[mi.UnpolarizedSpectrum, mi.Float]:
-        """Return f cos θ_o, and the sum over the wavelengths of the densities; directions along the pattern's axes."""
-        interface, shadowing = self.theory.interface, self.theory.shadowing
+        """Return f cos θ_o, and the sum over the wavelengths of the densities; directions along the pattern's axes.
+
+        `near` has a bit for each wavelength that is covered; where orders are resolved, only if ω_o lies in the lobe of
+        one.
+        """
+        interface, shadowing, energy = self.theory.interface, self.theory.shadowing, self.theory.energy
         if interface is None:
             geometry = Geometry.of(wi, wo, self.coat, height_scale, shadowing, lateral_scale)
+            incidence = Incidence.of(wi, height_scale, self.coat, lateral_scale)
         else:
             sides = interface.side(wi), interface.side(wo)
             least = interface.least_kappa(height_scale)
-            geometry = Crossing(*sides, mi.Float(height_scale), shadowing, least, lateral_scale)
+            geometry = Crossing.of(*sides, mi.Float(height_scale), shadowing, least, lateral_scale)
+            incidence = CrossingIncidence.of(*sides, interface, height_scale, geometry.flip, lateral_scale)
+        places = energy and energy.places(*geometry.inside(), geometry.height_scale, lateral_scale)
+        value, density = self._of_wavelengths(si, incidence, near, geometry, places)
         # Directions beyond the largest angle are black, but they are drawn: they have a density.
         within = smaller(*geometry.cosines()) >= self.least_cosine
-        value, density = mi.UnpolarizedSpectrum(0.0), mi.Float(0.0)
-        for channel in range(len(value)):
-            frequency = self._frequency(si, channel)
-            if interface is None:
-                incidence = Incidence.of(wi, frequency, height_scale, self.coat, lateral_scale)
-            else:
-                flip = geometry.flip
-                incidence = CrossingIncidence.of(*sides, interface, frequency, height_scale, flip, lateral_scale)
-            power, share = self.scattering.evaluate(geometry, incidence, active & covered[channel], wo_is_sample)
-            value[channel] = dr.select(within, power * dr.square(frequency), 0)
-            density = dr.fma(share, dr.square(frequency), density)
-        value = self.theory.weighted(value, si, geometry, active)
+        value = dr.select(within, self.theory.weighted(value, si, geometry, active), 0)
+        if interface is not None and interface.has_flat_face:
+            value *= interface.flat(wi) * interface.flat(wo)
         if self.coat is not None:
             # The solid angle inside the coat is smaller: cos θ'_o dω'_o = cos θ_o dω_o/n².
             value *= wo.z / larger(geometry.cos_o, 1e-7)
         return value, density
+
+    @dr.syntax
+    def _of_wavelengths(
+        self,
+        si: mi.SurfaceInteraction3f,
+        incidence: Incidence | CrossingIncidence,
+        near: mi.UInt32,
+        geometry: Geometry | Crossing,
+        places: tuple[Place, Place] | None,
+    ) -> tuple[mi.UnpolarizedSpectrum, mi.Float]:
+        """Return f cos θ_o without R of the wavelengths that `near` has, and the sum of their densities.
+
+        Few rays have several in `near`: the first of each are evaluated together, then the second ones. A loop, whose
+        code fits into the cache of instructions; derivatives cannot pass through it.
+        """
+        value, density = mi.UnpolarizedSpectrum(0.0), mi.Float(0.0)
+        add_first = functools.partial(self._add_first, si, incidence)
+        if dr.hint(dr.grad_enabled(geometry), mode="scalar"):
+            for _ in range(len(value)):
+                near, value, density = add_first(geometry, places, near, value, density)
+        else:
+            while near != 0:
+                near, value, density = add_first(geometry, places, near, value, density)
+        return value, density
+
+    def _add_first(
+        self,
+        si: mi.SurfaceInteraction3f,
+        incidence: Incidence | CrossingIncidence,
+        geometry: Geometry | Crossing,
+        places: tuple[Place, Place] | None,
+        near: mi.UInt32,
+        value: mi.UnpolarizedSpectrum,
+        density: mi.Float,
+    ) -> tuple[mi.UInt32, mi.UnpolarizedSpectrum, mi.Float]:
+        """Return `near` without its first wavelength, and the sums with that."""
+        first, wavelength = near & (0 - near), self._wavelength(si, 0)
+        chosen = [first == (1 << channel) for channel in range(len(value))]
+        for channel in range(1, len(value)):
+            wavelength = dr.select(chosen[channel], self._wavelength(si, channel), wavelength)
+        incidence = incidence.at(wavelength)
+        power, share = self.scattering.evaluate(geometry, incidence, near != 0)
+        if places is not None:
+            power *= self.theory.energy.factor(places, incidence.frequency * geometry.index)
+        square = dr.square(incidence.frequency)
+        power *= square
+        value += mi.UnpolarizedSpectrum([dr.select(c, power, 0) for c in chosen])
+        return near - first, value, dr.fma(share, square, density)
 
     def mueller(
         self,
@@ -170,8 +214,6 @@ class Grating:
             # Radiance is compressed along with the solid angle.
             i, o = interface.side(si.wi), interface.side(wo)
             value *= dr.square(i.outside / o.outside)
-        if interface is not None and interface.has_flat_face:
-            value *= interface.flat(si.wi) * interface.flat(wo)
         if self.coat is None:
             if not mi.is_polarized:
                 return value
@@ -221,18 +263,17 @@ class Grating:
         # Only wavelengths that the spectrum covers draw directions.
         chosen = smaller(dr.floor(u * count), larger(count - 1, 0))
         rest = limited(u * count - chosen, 0, BELOW_ONE)
-        frequency, before = self._frequency(si, 0), mi.Float(0.0)
+        wavelength, before = self._wavelength(si, 0), mi.Float(0.0)
         for channel, use in enumerate(covered):
-            frequency = dr.select(use & (before == chosen), self._frequency(si, channel), frequency)
+            wavelength = dr.select(use & (before == chosen), self._wavelength(si, channel), wavelength)
             before += dr.select(use, 1, 0)
-        frequency = dr.detach(frequency)
-        wavelength = dr.rcp(frequency)
+        wavelength = dr.detach(wavelength)
         sin, cos = (dr.detach(x) for x in self.frame(si, active))
         wi = turned(si.wi, sin, cos)
         height_scale, lateral_scale = (None if s is None else dr.detach(s) for s in self.scales.at(si, active))
         arguments = rest, v, active & diffracted, *_given(lateral_scale)
         if interface is None:
-            incidence = Incidence.of(wi, frequency, height_scale, self.coat, lateral_scale)
+            incidence = Incidence.of(wi, height_scale, self.coat, lateral_scale).at(wavelength)
             q, propagates = self.scattering.sample(incidence, *arguments)
             x = -wavelength * (cos * q.x - sin * q.y) - si.wi.x
             y = -wavelength * (sin * q.x + cos * q.y) - si.wi.y
@@ -240,12 +281,12 @@ class Grating:
             return dr.select(uniform, mi.warp.square_to_uniform_hemisphere(v), mi.Vector3f(x, y, z))
         i = interface.side(wi)
         o = interface.other(i, u_side >= passing)
-        incidence = CrossingIncidence.of(i, o, interface, frequency, height_scale, None, lateral_scale)
+        incidence = CrossingIncidence.of(i, o, interface, height_scale, None, lateral_scale).at(wavelength)
         q, propagates = self.scattering.sample(incidence, *arguments)
-        drawn = turned(mi.Vector3f(*(o.tangent - wavelength * incidence.mirrored * q), 0), -sin, cos) / o.outside
-        z = dr.select(propagates, dr.safe_sqrt(1 - dr.square(drawn.x) - dr.square(drawn.y)), 0)
-        drawn = dr.select(uniform, mi.warp.square_to_uniform_hemisphere(v), mi.Vector3f(drawn.x, drawn.y, z))
-        return dr.detach(mi.Vector3f(drawn.x, drawn.y, o.sign * drawn.z))
+        wo = turned(mi.Vector3f(*(o.tangent - wavelength * incidence.mirrored * q), 0), -sin, cos) / o.outside
+        wo.z = dr.select(propagates, dr.safe_sqrt(1 - dr.square(wo.x) - dr.square(wo.y)), 0)
+        wo = dr.select(uniform, mi.warp.square_to_uniform_hemisphere(v), wo)
+        return dr.detach(mi.Vector3f(wo.x, wo.y, o.sign * wo.z))
 
     def __str__(self) -> str:
         lines = [

@@ -38,8 +38,6 @@ class KappaCells:
             ends = np.append(np.linspace(0, min(most, 0.75 * max_kappa), CELLS), max_kappa)
         self.ends = ends
         self.inner = [opaque(end) for end in ends[1:-1]]
-        self.squares = mi.Vector4f(*(float(end**2) for end in ends[1:]))
-        dr.make_opaque(self.squares)
 
     def weights(self, incidence: Incidence) -> mi.Vector4f:
         """Return w_j for one wavelength."""

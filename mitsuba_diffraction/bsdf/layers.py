@@ -9,13 +9,13 @@ import mitsuba as mi
 
 from ..errors import RequestError
 from .base import base_from
+from .geometry import turned
 from .grating import Grating
 from .media import Media
 from .polarisation import of_plane, reflected
 from .tables import BELOW_ONE, smaller
 
 LEAST_SHARE = 0.1  # of the samples, for the grating and for its base: what each reflects is only estimated
-LEAST_SIDE = 0.2  # of the samples, for either side of a rigorous grating: fine ones are far from a plane
 
 
 @dataclass(frozen=True)
@@ -89,16 +89,10 @@ class Layers:
         )
 
     def _passing(self, si: mi.SurfaceInteraction3f, asked: Asked) -> mi.Float:
-        """Return the share of the grating's samples on the other side, about as much as passes a plane."""
+        """Return the share of the grating's samples on the other side, about as much as is transmitted."""
         if not asked.passed or not asked.reflected:
             return mi.Float(1.0 if asked.passed else 0.0)
-        eta = dr.detach(self.interface.eta)
-        reflected = mi.fresnel(mi.Frame3f.cos_theta(si.wi), eta)[0]
-        if self.interface.is_sheet:
-            # Inside there is no total reflection.
-            reflected = mi.fresnel(dr.abs(mi.Frame3f.cos_theta(si.wi)), eta)[0]
-        least = LEAST_SIDE if self.interface.kappas is None else LEAST_SHARE
-        return dr.clip(1 - reflected, least, 1 - least)
+        return dr.detach(self.interface.transmitted(turned(si.wi, *self.grating.frame(si, True))))
 
     def _share(
         self, si: mi.SurfaceInteraction3f, asked: Asked, entering: mi.UnpolarizedSpectrum | None, active: mi.Bool
@@ -234,21 +228,21 @@ class Layers:
                 bs.eta = dr.select(passes, dr.select(cos_i > 0, eta, dr.rcp(eta)), 1)
         if below is not None:
             rest = smaller((sample1 - share) / (1 - share), BELOW_ONE)
-            drawn, weight = self.base.bsdf.sample(below, si, rest, sample2, of_base)
-            bs.wo = dr.select(of_base, drawn.wo, bs.wo)
-            bs.sampled_type = dr.select(of_base, drawn.sampled_type, bs.sampled_type)
-            bs.sampled_component = dr.select(of_base, drawn.sampled_component + 1, 0)
+            below_sample, weight = self.base.bsdf.sample(below, si, rest, sample2, of_base)
+            bs.wo = dr.select(of_base, below_sample.wo, bs.wo)
+            bs.sampled_type = dr.select(of_base, below_sample.sampled_type, bs.sampled_type)
+            bs.sampled_component = dr.select(of_base, below_sample.sampled_component + 1, 0)
         value, bs.pdf = self.evaluate(ctx, si, bs.wo, active, wo_is_sample=True)
         valid = active & (bs.pdf > 0)
         # The direction does not follow the parameters, so its density must not either.
         result = dr.select(valid, value / dr.detach(dr.select(valid, bs.pdf, 1)), 0)
         if below is not None and self.base.has_delta:
-            mirror = of_base & mi.has_flag(drawn.sampled_type, mi.BSDFFlags.Delta)
-            cos_o = mi.Frame3f.cos_theta(drawn.wo)
+            mirror = of_base & mi.has_flag(below_sample.sampled_type, mi.BSDFFlags.Delta)
+            cos_o = mi.Frame3f.cos_theta(below_sample.wo)
             own = part * (1 - share)
             through = entering * self.grating.entering(si, cos_o, mirror) / own
             above = cos_o > 0
-            bs.pdf = dr.select(mirror, dr.select(above, own * drawn.pdf, 0), bs.pdf)
+            bs.pdf = dr.select(mirror, dr.select(above, own * below_sample.pdf, 0), bs.pdf)
             result = dr.select(mirror, dr.select(above, _attenuated(through, weight), 0), result)
         return bs, result
 

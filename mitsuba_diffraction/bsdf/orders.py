@@ -9,7 +9,6 @@ the sum of A_jm over the rectangle. A one-row grating has the exact interval: wi
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
 
 import drjit as dr
@@ -252,7 +251,7 @@ def _weights(table: SeriesTable) -> np.ndarray:
 FLOOR = 0.05  # the share of each κ cell that all orders have alike
 STEPS = 256  # over κ, in the table of the undiffracted order
 WHOLE = 2**24  # a float32 holds whole numbers up to here
-LARGEST_TABLE = 2**19  # packets (8 MB); where the sums over rectangles take more, all orders can be drawn
+MAX_TABLE = 2**19  # packets (8 MB); where the sums over rectangles take more, all orders can be drawn
 
 
 class OrderSampler:
@@ -261,23 +260,24 @@ class OrderSampler:
     The A_jm are whole numbers of units 2⁻²⁴, so that sums over rectangles are exact: the probability of what is drawn
     is the probability that is reported.
 
-    Where light passes the grating, the undiffracted order is drawn apart, as κ of that order is known; the others with
+    Where light passes the grating, the undiffracted order is drawn by itself, as its κ is known; the others with
     `diffracted_averages`, w_j times the sum over the orders and κ_0²/κ_j² of transmitted light.
     """
 
     def __init__(self, spectrum: GratingSpectrum, most: float | None = None) -> None:
         self.cells = KappaCells(spectrum.max_kappa, most)
         self.rows, self.columns = spectrum.grid.shape
-        self.largest_x, self.largest_y = spectrum.grid.max_order
+        self.max_order_x, self.max_order_y = spectrum.grid.max_order
         self.tile_x, self.tile_y = (opaque(t) for t in spectrum.grid.tile_size)
-        self.restricted = (self.largest_x + 1) ** 2 * (self.rows + 1) <= LARGEST_TABLE
+        self.restricted = (self.max_order_x + 1) ** 2 * (self.rows + 1) <= MAX_TABLE
         self.undiffracted = None
         if most is None:
             shares = averages(spectrum, self.cells, FLOOR)
         else:
             shares, sums = diffracted_averages(spectrum, self.cells, FLOOR)
-            self.sums = mi.Vector4f(*map(float, sums / WHOLE))
-            dr.make_opaque(self.sums)
+            squares = self.cells.ends[1:] ** 2
+            self.sums, self.raised_sums = (mi.Vector4f(*map(float, s / WHOLE)) for s in (sums, sums / squares))
+            dr.make_opaque(self.sums, self.raised_sums)
             kappas = np.linspace(0, spectrum.max_kappa, STEPS + 1)
             middle = tuple(n // 2 for n in spectrum.grid.shape)
             self.undiffracted = FloatTable(np.array([max(spectrum.powers(kappa)[middle], 0) for kappa in kappas]))
@@ -289,7 +289,7 @@ class OrderSampler:
         before_x[:, 1:] = units.cumsum(axis=1)
         self.before_x = PacketTable(before_x)
         # The sums of A_j over the rows before y, for each first column and each end of the columns.
-        first, end = np.arange(self.largest_x + 1), np.arange(self.largest_x + 1, self.columns + 1)
+        first, end = np.arange(self.max_order_x + 1), np.arange(self.max_order_x + 1, self.columns + 1)
         if not self.restricted:
             first, end = first[:1], end[-1:]
         before_y = np.zeros((len(first), len(end), self.rows + 1, CELLS), np.int64)
@@ -303,15 +303,15 @@ class OrderSampler:
             return mi.Int32(0), mi.Int32(self.rows), mi.Int32(0), mi.Int32(self.columns)
         frequency = incidence.lateral_frequency
         s_x, s_y = incidence.wi.x * frequency, incidence.wi.y * frequency
-        rows = self._interval(s_y, s_x, self.columns, incidence.radius, self.tile_y, self.largest_y)
-        columns = self._interval(s_x, s_y, self.rows, incidence.radius, self.tile_x, self.largest_x)
+        rows = self._interval(s_y, s_x, self.columns, incidence.radius, self.tile_y, self.max_order_y)
+        columns = self._interval(s_x, s_y, self.rows, incidence.radius, self.tile_x, self.max_order_x)
         return *rows, *columns
 
     def _interval(
-        self, along: mi.Float, across: mi.Float, lines: int, radius: mi.Float, tile: mi.Float, largest: int
+        self, along: mi.Float, across: mi.Float, lines: int, radius: mi.Float, tile: mi.Float, max_order: int
     ) -> tuple[mi.Int32, mi.Int32]:
         """Return the orders |m/T + s/λ| ≤ ρ along one axis, of which there are `lines` side by side: first and end."""
-        if largest == 0:
+        if max_order == 0:
             return mi.Int32(0), mi.Int32(1)
         half = radius
         if lines == 1:
@@ -319,18 +319,18 @@ class OrderSampler:
         first = mi.Int32(dr.ceil((-along - half) * tile))
         last = mi.Int32(dr.floor((half - along) * tile))
         # The mirror order m = 0 is always among them.
-        return dr.clip(first, -largest, 0) + largest, dr.clip(last, 0, largest) + (largest + 1)
+        return dr.clip(first, -max_order, 0) + max_order, dr.clip(last, 0, max_order) + (max_order + 1)
 
     def _weights(self, incidence: Incidence, active: mi.Bool) -> tuple[mi.Vector4f, mi.Float]:
-        """Return w_j and the power of the undiffracted order where it is drawn apart, else zero; not normalised."""
+        """Return w_j and the power of the undiffracted order where it is drawn by itself, else zero; not normalised."""
         weights = self.cells.weights(incidence)
         if self.undiffracted is None:
             return weights, mi.Float(0.0)
-        kappa = incidence.kappas[0]
+        kappa = incidence.undiffracted
         step = dr.minimum(mi.UInt32(dr.fma(kappa, self.per_kappa, 0.5)), STEPS)
-        raised = dr.select(incidence.reflects, 1, dr.square(kappa) / self.cells.squares)
+        sums = dr.select(incidence.reflects, self.sums, dr.square(kappa) * self.raised_sums)
         undiffracted = dr.select(incidence.square > 0, larger(self.undiffracted(step, active), 1e-3), 0)
-        return weights * self.sums * raised, undiffracted
+        return weights * sums, undiffracted
 
     def weights(self, incidence: Incidence, active: mi.Bool) -> tuple[mi.Vector4f, mi.Float]:
         """Return w_j / (P_0 + Σ_j w_j M_j) and P_0 / (P_0 + Σ_j w_j M_j) for one wavelength.
@@ -349,7 +349,7 @@ class OrderSampler:
         """Return where the sums over the rows begin in their table."""
         if not self.restricted:
             return mi.Int32(0)
-        return (left * (self.largest_x + 1) + right - (self.largest_x + 1)) * (self.rows + 1)
+        return (left * (self.max_order_x + 1) + right - (self.max_order_x + 1)) * (self.rows + 1)
 
     def _masses(self, bottom: mi.Int32, top: mi.Int32, start: mi.Int32, active: mi.Bool) -> mi.Vector4f:
         """Return M_j in units."""
@@ -361,7 +361,7 @@ class OrderSampler:
         share = dr.dot(self.shares(order, active), weights[0])
         if self.undiffracted is None:
             return share
-        return share + dr.select(order == self.largest_y * self.columns + self.largest_x, weights[1], 0)
+        return share + dr.select(order == self.max_order_y * self.columns + self.max_order_x, weights[1], 0)
 
     def sample(
         self,
@@ -383,9 +383,9 @@ class OrderSampler:
         weights, undiffracted = self._weights(incidence, active)
         shares = weights * masses
         if self.undiffracted is not None:
-            apart = undiffracted / larger(undiffracted + dr.sum(shares), 1e-7)
-            is_undiffracted = u < apart
-            u = limited((u - apart) / larger(1 - apart, 1e-7), 0, BELOW_ONE)
+            share = undiffracted / larger(undiffracted + dr.sum(shares), 1e-7)
+            is_undiffracted = u < share
+            u = limited((u - share) / larger(1 - share, 1e-7), 0, BELOW_ONE)
         cell, u = choose(shares, u)
 
         def before_y(y: mi.Int32) -> mi.Float:
@@ -402,8 +402,8 @@ class OrderSampler:
             column, rest = search(before_x, left, right, self.columns, v.x)
             v = mi.Point2f(rest if self.undiffracted is None else dr.select(is_undiffracted, v.x, rest), v.y)
         if self.undiffracted is not None:
-            row = dr.select(is_undiffracted, self.largest_y, row)
-            column = dr.select(is_undiffracted, self.largest_x, column)
+            row = dr.select(is_undiffracted, self.max_order_y, row)
+            column = dr.select(is_undiffracted, self.max_order_x, column)
         return row, column, v
 
 
@@ -436,13 +436,17 @@ class LineSampler:
     def __init__(self, spectrum: GratingSpectrum, most: float | None = None) -> None:
         self.along_x = spectrum.grid.shape[0] == 1
         axis = CellAxis.of(spectrum, 0 if self.along_x else 1, WIDEST)
-        self.cells, self.largest, self.count = KappaCells(spectrum.max_kappa, most), axis.largest, len(axis.shares)
+        self.cells, self.max_cell, self.count = (
+            KappaCells(spectrum.max_kappa, most),
+            axis.max_cell,
+            len(axis.shares),
+        )
         shares = axis.shares @ averages(spectrum, self.cells, FLOOR).reshape(CELLS, -1).T
         self.shares = ShareTable(np.maximum(shares, 0))
         # The sums of A_j over the cells before each.
         self.before = PacketTable(sums_before(np.float64(self.shares.values)))
         self.spacing, self.per_q = opaque(axis.spacing), opaque(1 / axis.spacing)
-        self.reach, self.limit = opaque(LOBE * spectrum.lobe_width), _cumulative(LOBE / SCALE)
+        self.half_width, self.limit = opaque(LOBE * spectrum.lobe_width), _cumulative(LOBE / SCALE)
         per_scale = 1 / (SCALE * spectrum.lobe_width)
         self.per_scale, self.per_area = opaque(per_scale), opaque(per_scale / axis.spacing)
 
@@ -450,8 +454,8 @@ class LineSampler:
         """Return p(q) in µm², q in cycles/µm, for one wavelength; of a q that propagates."""
         along, across = self._axes(q.x, q.y)
         m = mi.Int32(dr.round(along * self.per_q))
-        active = active & (dr.abs(m) <= self.largest) & (dr.abs(across) <= self.reach)
-        cell = mi.UInt32(m + self.largest)
+        active = active & (dr.abs(m) <= self.max_cell) & (dr.abs(across) <= self.half_width)
+        cell = mi.UInt32(m + self.max_cell)
         weights = self.cells.weights(incidence)
         first, end = self._interval(incidence)
         total = dr.dot(weights, self._masses(first, end, active))
@@ -474,7 +478,7 @@ class LineSampler:
             return self.before.entry(mi.UInt32(cell), kappa_cell, active)
 
         cell, place = search(before, first, end, self.count, v.x)
-        along = (mi.Float(cell - self.largest) + place - 0.5) * self.spacing
+        along = (mi.Float(cell - self.max_cell) + place - 0.5) * self.spacing
         low, high = self._across(along, incidence)
         t = 2 * dr.sin(dr.asin(1.5 * dr.fma(v.y, high - low, low)) / 3)
         return mi.Point2f(*self._axes(along, t * dr.rsqrt(1 - dr.square(t)) / self.per_scale))
@@ -487,11 +491,11 @@ class LineSampler:
         """Return the first cell in which something propagates, and the end of them."""
         frequency = incidence.frequency
         along, across = (s * frequency for s in self._axes(incidence.wi.x, incidence.wi.y))
-        half = dr.safe_sqrt(dr.square(incidence.radius) - dr.square(larger(dr.abs(across) - self.reach, 0)))
+        half = dr.safe_sqrt(dr.square(incidence.radius) - dr.square(larger(dr.abs(across) - self.half_width, 0)))
         first = mi.Int32(dr.floor(dr.fma(-along - half, self.per_q, 0.5)))
         end = mi.Int32(dr.ceil(dr.fma(half - along, self.per_q, 0.5)))
         # The mirror direction m = 0 is always among them.
-        return dr.clip(first, -self.largest, 0) + self.largest, dr.clip(end, 1, self.largest + 1) + self.largest
+        return dr.clip(first, -self.max_cell, 0) + self.max_cell, dr.clip(end, 1, self.max_cell + 1) + self.max_cell
 
     def _masses(self, first: mi.Int32, end: mi.Int32, active: mi.Bool) -> mi.Vector4f:
         """Return M_j."""
@@ -519,19 +523,19 @@ NARROW = 0.03
 class OrderSpectrum:
     """S(q; κ) = Σ_m η_m(κ) N(q − m/T; σ_q² I), and the density from which q is drawn.
 
-    N ends as `OrderGrid.lobes` says. Orders that stand apart need one of them, so that one evaluation reads
+    N ends as `OrderGrid.lobes` says. Resolved orders need one of them, so that one evaluation reads
     `order_power` once; a tile as large as the coherence length needs 4 × 4. The density is Σ_m P_m N(q − m/T) with the
     P_m of `OrderSampler`; where orders overlap, that of `CellSampler`. For a line grating whose orders overlap or are
     wide, it is that of `LineSampler`.
 
-    With a lateral scale s, orders that stand apart lie at m/(sT), with lobes as wide: tables are read at sq.
+    With a lateral scale s, resolved orders lie at m/(sT), with lobes as wide: tables are read at sq.
     """
 
     def __init__(self, spectrum: GratingSpectrum, most: float | None = None, farthest: float = 1.0) -> None:
         grid, sigma = spectrum.grid, spectrum.lobe_width
         self.axes = tuple(
-            _Axis(lobe, size, largest, sigma)
-            for lobe, size, largest in zip(spectrum.lobes, grid.tile_size, grid.max_order, strict=True)
+            _Axis(lobe, size, max_order, sigma)
+            for lobe, size, max_order in zip(spectrum.lobes, grid.tile_size, grid.max_order, strict=True)
         )
         line = 1 in grid.shape
         self.resolved = all(axis.count == 1 for axis in self.axes) and not (line and sigma > NARROW)
@@ -545,12 +549,12 @@ class OrderSpectrum:
 
     @property
     def max_scale(self) -> float | None:
-        """The lateral scale up to which orders stand apart; None where they do not."""
-        scales = (axis.max_scale for axis in self.axes if axis.largest)
+        """The lateral scale up to which orders are resolved; None where they are not."""
+        scales = (axis.max_scale for axis in self.axes if axis.max_order)
         return min(scales, default=np.inf) if self.resolved else None
 
     def meets(self, q_x: mi.Float, q_y: mi.Float, scale: mi.Float | None = None) -> mi.Bool:
-        """Return whether q (cycles/µm) lies in the lobe of an order, where they stand apart; `scale` is lateral."""
+        """Return whether q (cycles/µm) lies in the lobe of an order, where they are resolved; `scale` is lateral."""
         along_x, along_y = self.axes
         q_x, q_y = scaled(q_x, scale), scaled(q_y, scale)
         return along_x.holds(along_x.first(q_x), q_x, scale) & along_y.holds(along_y.first(q_y), q_y, scale)
@@ -560,7 +564,6 @@ class OrderSpectrum:
         geometry: Geometry,
         incidence: Incidence,
         active: mi.Bool,
-        wo_is_sample: bool,
     ) -> tuple[mi.Float, mi.Float]:
         """Evaluate K G S(q; κ) cos θ_o and the density of q, both in µm², for one wavelength.
 
@@ -569,11 +572,10 @@ class OrderSpectrum:
         Args:
             geometry: of the pair of directions.
             incidence: the wavelength and where it comes from.
-            active: mask.
-            wo_is_sample: whether ω_o was drawn, so that nearly always it lies in the lobe of an order.
+            active: mask; where orders are resolved, q lies in the lobe of one (`meets`).
         """
         if self.resolved:
-            power, density = self._resolved(geometry, incidence, active, wo_is_sample)
+            power, density = self._of_order(geometry, incidence, active)
         else:
             q, kappa = geometry.tangent * incidence.frequency, geometry.kappa(incidence.frequency)
             m_x, m_y = (axis.first(q) for axis, q in zip(self.axes, q, strict=True))
@@ -582,7 +584,7 @@ class OrderSpectrum:
             if self.line:
                 lobes_x, lobes_y = self._weighted(m_x, m_y, lobes_x, lobes_y, geometry, incidence)
             else:
-                factor = geometry.continuum_factor(incidence.frequency, self.per_width)
+                factor = geometry.continuum_factor(incidence, self.per_width)
             power = factor * self._power(m_x, m_y, lobes_x, lobes_y, kappa, geometry.small(), active)
             density = self.cells.density(q if incidence.mirrored is None else incidence.mirrored * q, incidence, active)
         # Interpolation may dip below zero by its error.
@@ -600,17 +602,18 @@ class OrderSpectrum:
         """Return the lobes of a line grating's orders from (m_x, m_y) on, times K G cos θ_o and gain of each."""
 
         def factor(x: int, y: int) -> mi.Float:
-            tangent = self._tangent(m_x + x, m_y + y, incidence.frequency)
-            return geometry.order_factor(tangent, incidence.frequency, self.per_width)
+            tangent = self._tangent(m_x + x, m_y + y, incidence.wavelength)
+            return geometry.order_factor(tangent, incidence, self.per_width)
 
         if len(lobes_x) > 1:
             return [lobe * factor(step, 0) for step, lobe in enumerate(lobes_x)], lobes_y
         return lobes_x, [lobe * factor(0, step) for step, lobe in enumerate(lobes_y)]
 
-    def _tangent(self, m_x: mi.Int32, m_y: mi.Int32, frequency: mi.Float) -> mi.Vector2f:
-        """Return λq of an order; `frequency` is 1/λ times the lateral scale."""
+    def _tangent(self, m_x: mi.Int32, m_y: mi.Int32, wavelength: mi.Float) -> mi.Vector2f:
+        """Return λq of an order; `wavelength` is λ over the lateral scale."""
         pitches = (axis.pitch for axis in self.axes)
-        return mi.Vector2f(*(mi.Float(m) * p for m, p in zip((m_x, m_y), pitches, strict=True))) / frequency
+        orders = zip((m_x, m_y), pitches, strict=True)
+        return mi.Vector2f(*(mi.Float(m) * pitch for m, pitch in orders)) * wavelength
 
     def _power(
         self,
@@ -624,40 +627,23 @@ class OrderSpectrum:
     ) -> mi.Float:
         """Return Σ_m η_m(κ) N(q − m/T; σ_q² I) over the orders from (m_x, m_y) on."""
         at = self.power.at(kappa, active, small)
-        row, column = (m + (axis.largest + axis.rim) for m, axis in zip((m_y, m_x), self.axes[::-1], strict=True))
+        row, column = (m + (axis.max_order + axis.rim) for m, axis in zip((m_y, m_x), self.axes[::-1], strict=True))
         return self.power.window(row, column, lobes_x, lobes_y, at, active)
 
-    @dr.syntax
-    def _resolved(
-        self, geometry: Geometry, incidence: Incidence, active: mi.Bool, wo_is_sample: bool
-    ) -> tuple[mi.Float, mi.Float]:
-        """Evaluate the one order in whose lobe q may lie.
-
-        Most directions lie between the orders of a grating: unless ω_o is a sample, they skip all that reads tables.
-        """
-        q = geometry.tangent * incidence.frequency
-        near = active & self.meets(q.x, q.y, geometry.lateral_scale)
-        power, density, needed = mi.Float(0.0), mi.Float(0.0), wo_is_sample or near
-        # What has no derivative is bound here: Dr.Jit carries all other state through the branch.
-        read = functools.partial(self._read, incidence, near)
-        if needed:
-            power, density = read(geometry)
-        return power, density
-
-    def _read(self, incidence: Incidence, near: mi.Bool, geometry: Geometry) -> tuple[mi.Float, mi.Float]:
-        """Return what `_resolved` does, where `near`; else zero."""
+    def _of_order(self, geometry: Geometry, incidence: Incidence, near: mi.Bool) -> tuple[mi.Float, mi.Float]:
+        """Evaluate the one order in whose lobe q lies where `near`."""
         scale = geometry.lateral_scale
         frequency = scaled(incidence.frequency, scale)
         q = geometry.tangent * frequency
         m_x, m_y = (axis.first(q) for axis, q in zip(self.axes, q, strict=True))
         lobes_x, lobes_y = self.axes[0].lobes(m_x, q.x, scale), self.axes[1].lobes(m_y, q.y, scale)
         power = self._power(m_x, m_y, lobes_x, lobes_y, geometry.kappa(incidence.frequency), geometry.small(), near)
-        tangent = self._tangent(m_x, m_y, frequency)
-        power *= geometry.order_factor(tangent, incidence.frequency, self.per_width)
+        tangent = self._tangent(m_x, m_y, incidence.wavelength if scale is None else incidence.wavelength / scale)
+        power *= geometry.order_factor(tangent, incidence, self.per_width)
         if incidence.mirrored is not None:
             m_x, m_y = (mi.Int32(incidence.mirrored) * m for m in (m_x, m_y))
             tangent = incidence.mirrored * tangent
-        order = mi.UInt32((m_y + self.axes[1].largest) * self.columns + m_x + self.axes[0].largest)
+        order = mi.UInt32((m_y + self.axes[1].max_order) * self.columns + m_x + self.axes[0].max_order)
         share = self.orders.share(order, self.orders.weights(incidence, near), near)
         # An order that does not propagate is not drawn.
         there = incidence.propagates(tangent)
@@ -675,8 +661,8 @@ class OrderSpectrum:
         if self.cells is not None:
             return self.cells.sample(incidence, u, v, active), active
         row, column, v = self.orders.sample(incidence, u, v, active)
-        m_x, m_y = column - self.axes[0].largest, row - self.axes[1].largest
-        tangent = self._tangent(m_x, m_y, incidence.lateral_frequency)
+        m_x, m_y = column - self.axes[0].max_order, row - self.axes[1].max_order
+        tangent = self._tangent(m_x, m_y, incidence.wavelength if scale is None else incidence.wavelength / scale)
         q = mi.Point2f(self.axes[0].place(column, v.x, scale), self.axes[1].place(row, v.y, scale))
         return q, incidence.propagates(tangent)
 
@@ -684,8 +670,8 @@ class OrderSpectrum:
 class _Axis:
     """The orders along one axis, and the lobe's factor there."""
 
-    def __init__(self, lobe: LobeAxis, size: float, largest: int, sigma: float) -> None:
-        self.count, self.largest = lobe.count, largest
+    def __init__(self, lobe: LobeAxis, size: float, max_order: int, sigma: float) -> None:
+        self.count, self.max_order = lobe.count, max_order
         self.all = np.isinf(lobe.half_width)
         # A window that lies beyond the grid reads zeros only.
         self.rim = 0 if self.all else self.count
@@ -700,12 +686,12 @@ class _Axis:
 
     def first(self, q: mi.Float) -> mi.Int32:
         """Return the first of the `count` orders that contribute at q (cycles/µm)."""
-        return mi.Int32(-self.largest) if self.all else mi.Int32(dr.ceil(q * self.size - 0.5 * self.count))
+        return mi.Int32(-self.max_order) if self.all else mi.Int32(dr.ceil(q * self.size - 0.5 * self.count))
 
     def holds(self, m: mi.Int32, q: mi.Float, scale: mi.Float | None = None) -> mi.Bool:
         """Return whether there is an order m, and q, times the lateral scale, lies in its lobe."""
         offset = dr.fma(-self.pitch, mi.Float(m), q)
-        return (dr.abs(m) <= self.largest) & (dr.abs(offset) <= scaled(self.half_width, scale))
+        return (dr.abs(m) <= self.max_order) & (dr.abs(offset) <= scaled(self.half_width, scale))
 
     def lobes(self, first: mi.Int32, q: mi.Float, scale: mi.Float | None = None) -> list[mi.Float]:
         """Return N(q − m/T; σ_q²) of each of these orders, µm; zero beyond the half width.
@@ -731,4 +717,4 @@ class _Axis:
     def place(self, node: mi.Int32, u: mi.Float, scale: mi.Float | None = None) -> mi.Float:
         """Return the q in the lobe of the order at a row or column with the share `u` of it below, cycles/µm."""
         pitch = self.pitch if scale is None else self.pitch / scale
-        return dr.fma(pitch, mi.Float(node) - self.largest, truncated_gaussian(u, self.inside, self.spread))
+        return dr.fma(pitch, mi.Float(node) - self.max_order, truncated_gaussian(u, self.inside, self.spread))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import itertools
 import math
 from dataclasses import dataclass
@@ -46,7 +45,7 @@ class _Pair:
         shift: D.
         longest: the side of order 0.
         steps: by how much that of the next order is less.
-        largest: M.
+        max_order: M.
         before: where order 0 starts.
     """
 
@@ -62,7 +61,7 @@ class _Pair:
     shift: mi.Float | int
     longest: mi.Int32 | int
     steps: mi.Int32 | int
-    largest: mi.Int32 | int
+    max_order: mi.Int32 | int
     before: mi.Int32 | int
 
 
@@ -93,12 +92,12 @@ class RigorousOrders:
         starts = itertools.accumulate((a.nodes for a in all_axes), initial=0)
         # Of each table what `_Pair` has of it.
         self.layouts = [
-            (a.shift, a.side(0), a.side(0) - a.side(1), a.largest, start + a.offset(0))
+            (a.shift, a.side(0), a.side(0) - a.side(1), a.max_order, start + a.offset(0))
             for a, start in zip(all_axes, starts, strict=False)
         ]
-        self.largest = max(a.largest for a in all_axes)
+        self.max_order = max(a.max_order for a in all_axes)
         if self.transmits:
-            self.beyond, self.excess = opaque(axes.beyond * (1 - 1e-6)), opaque(axes.index**2 - 1)
+            self.max_decay, self.excess = opaque(axes.max_decay * (1 - 1e-6)), opaque(axes.index**2 - 1)
             self.cells = math.gcd(CELLS_BOTH, axes.steps)
             units = _units(*_shares_of_sides(spectrum, self.cells))
         else:
@@ -124,33 +123,42 @@ class RigorousOrders:
         """The first order whose lobe may hold q_x."""
         return mi.Int32(dr.ceil((q_x - self.half_width) * self.period))
 
-    @dr.syntax
     def evaluate(
-        self,
-        geometry: Geometry | Crossing,
-        incidence: Incidence | CrossingIncidence,
-        active: mi.Bool,
-        wo_is_sample: bool,
+        self, geometry: Geometry | Crossing, incidence: Incidence | CrossingIncidence, active: mi.Bool
     ) -> tuple[mi.Float, mi.Float]:
-        """n_o² cos θ_o Σ_m η_m N and the density of q, both in µm², for one wavelength.
+        """Return n_o² cos θ_o Σ_m η_m N and the density of q, both in µm², for one wavelength.
 
         The lobe of each order keeps its power at the horizon (`Geometry.of_order`).
 
         Args:
             geometry: of the pair of directions, along the pattern's axes.
             incidence: the wavelength and where it comes from.
-            active: mask.
-            wo_is_sample: whether ω_o was drawn, so that nearly always it lies in the lobe of an order.
+            active: mask; q lies in the lobe of an order (`meets`).
         """
-        q = geometry.tangent * incidence.frequency
-        near = active & self.meets(q.x, q.y)
-        power, density, needed = mi.Float(0.0), mi.Float(0.0), wo_is_sample or near
-        # Most directions lie between the orders: unless ω_o is a sample, they skip all that reads tables.
-        # What has no derivative is bound here: Dr.Jit carries all other state through the branch.
-        read = functools.partial(self._read, incidence, near)
-        if needed:
-            power, density = read(geometry)
-        return power, density
+        frequency = incidence.frequency
+        if self.transmits:
+            i, o = geometry.i, geometry.o
+            pair = self._pair(i.tangent, o.tangent, frequency, (i.sign > 0, o.sign > 0))
+        else:
+            # Its tables are those inside of a coat.
+            pair = self._pair(*geometry.inside(), geometry.index * frequency, None)
+        q_x, q_y = pair.q_x, pair.q_y
+        cell = self._cell(incidence)
+        first = self._first(q_x)
+        power, density = mi.Float(0.0), mi.Float(0.0)
+        for step in range(self.count):
+            m = first + step
+            offset = dr.fma(-self.pitch, mi.Float(m), q_x)
+            there = active & (dr.abs(offset) <= self.half_width) & (dr.abs(m) <= pair.max_order)
+            square = dr.square(offset) + dr.square(q_y)
+            lobe = dr.select(there, self.peak * dr.exp(self.falloff * square), 0)
+            tangent = mi.Vector2f(mi.Float(m) * self.pitch * incidence.wavelength, 0)
+            *_, gain = geometry.of_order(tangent, frequency * self.per_width)
+            power += lobe * gain * self._efficiency(m, pair, there)
+            # An order that does not propagate is not drawn.
+            there &= incidence.propagates(tangent)
+            density += dr.select(there, lobe, 0) * self.orders(mi.UInt32(dr.select(there, cell + m, 0)), there).y
+        return power * (geometry.outgoing if self.transmits else geometry.cos_o), density / WHOLE
 
     def _pair(
         self,
@@ -191,35 +199,6 @@ class RigorousOrders:
         q_x, q_y = -(k_i.x + k_o.x) * frequency, -(k_i.y + k_o.y) * frequency
         return _Pair(q_x, q_y, k_y, c, g, self._z(g, frequency), reflects, upwards, squares, *layout)
 
-    def _read(
-        self, incidence: Incidence | CrossingIncidence, near: mi.Bool, geometry: Geometry | Crossing
-    ) -> tuple[mi.Float, mi.Float]:
-        """As `evaluate`, where `near`; else zero."""
-        frequency = incidence.frequency
-        if self.transmits:
-            i, o = geometry.i, geometry.o
-            pair = self._pair(i.tangent, o.tangent, frequency, (i.sign > 0, o.sign > 0))
-        else:
-            # Its tables are those inside of a coat.
-            pair = self._pair(*geometry.inside(), geometry.index * frequency, None)
-        q_x, q_y = pair.q_x, pair.q_y
-        cell = self._cell(incidence)
-        first = self._first(q_x)
-        power, density = mi.Float(0.0), mi.Float(0.0)
-        for step in range(self.count):
-            m = first + step
-            offset = dr.fma(-self.pitch, mi.Float(m), q_x)
-            there = near & (dr.abs(offset) <= self.half_width) & (dr.abs(m) <= pair.largest)
-            square = dr.square(offset) + dr.square(q_y)
-            lobe = dr.select(there, self.peak * dr.exp(self.falloff * square), 0)
-            tangent = mi.Vector2f(mi.Float(m) * self.pitch / frequency, 0)
-            *_, gain = geometry.of_order(tangent, frequency * self.per_width)
-            power += lobe * gain * self._efficiency(m, pair, there)
-            # An order that does not propagate is not drawn.
-            there &= incidence.propagates(tangent)
-            density += dr.select(there, lobe, 0) * self.orders(mi.UInt32(dr.select(there, cell + m, 0)), there).y
-        return power * (geometry.outgoing if self.transmits else geometry.cos_o), density / WHOLE
-
     def mueller(
         self,
         source: mi.Vector2f | mi.Vector3f,
@@ -244,7 +223,7 @@ class RigorousOrders:
             m = first + step
             offset = dr.fma(-self.pitch, mi.Float(m), q_x)
             there = active & (dr.abs(offset) <= self.half_width) & (dr.abs(q_y) <= self.half_width)
-            there &= dr.abs(m) <= pair.largest
+            there &= dr.abs(m) <= pair.max_order
             lobe = dr.select(there, dr.exp(self.falloff * (dr.square(offset) + dr.square(q_y))), 0)
             for row, found in enumerate(self._matrix(m, pair, there)):
                 rows[row] += lobe * found
@@ -285,21 +264,21 @@ class RigorousOrders:
         The order comes from `u`, its place in the lobe from `v`.
         """
         middle = self._cell(incidence)
-        largest = self.largest
+        max_order = self.max_order
 
         def before(m: mi.Int32) -> mi.Float:
             return self.orders(mi.UInt32(middle + m), active).x
 
-        m, _ = search(before, mi.Int32(-largest), mi.Int32(largest + 1), 2 * largest + 1, u)
+        m, _ = search(before, mi.Int32(-max_order), mi.Int32(max_order + 1), 2 * max_order + 1, u)
         x, y = (truncated_gaussian(number, self.inside, self.spread) for number in v)
-        tangent = mi.Vector2f(mi.Float(m) * self.pitch / incidence.frequency, 0)
+        tangent = mi.Vector2f(mi.Float(m) * self.pitch * incidence.wavelength, 0)
         return mi.Point2f(dr.fma(self.pitch, mi.Float(m), x), y), incidence.propagates(tangent)
 
     def _z(self, g: mi.Float, frequency: mi.Float) -> mi.Float:
         """Z / (K − 1), from 0 to 1."""
         most = self.period / larger(g, 1e-6)
         if self.interface:
-            most = dr.select(g < 0, self.period * self.beyond / larger(-g, 1e-6), most)
+            most = dr.select(g < 0, self.period * self.max_decay / larger(-g, 1e-6), most)
         first, last = smaller(self.shortest, most), smaller(self.longest, most)
         return limited((dr.rcp(frequency) - first) / larger(last - first, 1e-6), 0, 1)
 
@@ -372,8 +351,8 @@ class RigorousOrders:
         if self.transmits:
             side = dr.select(incidence.above, 0, 2 * self.sampler_planes)
             z += side + dr.select(incidence.reflects, 0, self.sampler_planes)
-        width = 2 * self.largest + 2
-        return ((z * self.cells_across + p) * self.cells_across + r) * width + self.largest
+        width = 2 * self.max_order + 2
+        return ((z * self.cells_across + p) * self.cells_across + r) * width + self.max_order
 
 
 def _split(x: mi.Float, count: mi.UInt32) -> tuple[mi.UInt32, mi.Float]:
@@ -416,7 +395,7 @@ def _shares(spectrum: RigorousSpectrum, cells: int) -> NDArray[np.float64]:
     ends = -np.arange(whole)  # of the cells below P = 0
     ends = ends // cells + np.sin(np.pi / 2 * (ends % cells) / cells) ** 2
     beyond = int((ends > -margin).sum())
-    shares = np.zeros((planes, whole, whole, 2 * axes.largest + 1))
+    shares = np.zeros((planes, whole, whole, 2 * axes.max_order + 1))
     for column, m in enumerate(axes.orders):
         units = axes.units(m) * cells
         average = _averaged(_averaged(_averaged(axes.square(spectrum.values, m), 0, planes), 1, units), 2, units)
@@ -438,8 +417,8 @@ def _shares_of_sides(spectrum: RigorousSpectrum, cells: int) -> tuple[NDArray[np
     axes = spectrum.axes
     planes = math.gcd(PLANES, axes.planes - 1)
     nu = axes.period / axes.wavelengths[0]
-    largest = max(table.axes.largest for table in spectrum.tables)
-    m = np.arange(-largest, largest + 1)
+    max_order = max(table.axes.max_order for table in spectrum.tables)
+    m = np.arange(-max_order, max_order + 1)
     across = int(np.ceil(2 * max(spectrum.indices) * nu)) * cells
     shares = np.zeros((4, planes, across, across, len(m)))
     possible = np.zeros(shares.shape, bool)

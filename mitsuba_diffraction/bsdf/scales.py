@@ -105,7 +105,7 @@ class Scales:
         return iter([self.height] if self.lateral is None else [self.height, self.lateral])
 
     @property
-    def largest(self) -> float:
+    def max_scale(self) -> float:
         """By how much shorter wavelengths the spectrum must reach than without scales."""
         return max(1.0, *(float(scale.values[-1]) for scale in self))
 

@@ -13,18 +13,23 @@ from numpy.typing import NDArray
 
 from ..energy.furnace import Furnace
 from ..energy.table import EnergyTable, Stretched, between, corners
+from ..grating_spectrum import GratingSpectrum
 from ..precomputation import Spectrum
 from ..rigorous.spectrum import RigorousSpectrum
 from ..settings import VISIBLE
 from ..spectrum.grids import OrderGrid
+from .cell_sampler import of_azimuth
 from .energy import Energy
 from .orders import OrderSpectrum
 from .rigorous_orders import RigorousOrders
 from .spline_spectrum import SplineSpectrum
+from .tables import FloatTable
+from .transmission import AZIMUTHS, COSINES
 
 STEP = 1e-3  # of height_scale, for the derivative of the energy table
 TURN = 0.25  # radians between tables over the ratio of scales
 PARTS = 16  # of an interval of ratios, at most
+AVERAGED = (0.45, 0.6)  # µm, of the share of transmitted light
 
 _making = threading.Lock()
 _shared: weakref.WeakValueDictionary[tuple[str, str, float | None], SharedTables] = weakref.WeakValueDictionary()
@@ -35,6 +40,7 @@ class SharedTables:
 
     Attributes:
         scattering: S(q; κ) and its sampler.
+        transmitted: `Interface.shares`.
     """
 
     def __init__(self, spectrum: Spectrum, eta: float | None) -> None:
@@ -44,6 +50,7 @@ class SharedTables:
             represented = OrderSpectrum if isinstance(spectrum.grid, OrderGrid) else SplineSpectrum
             self.scattering = represented(spectrum, *([] if eta is None else passing(eta)))
         self._spectrum, self._eta = spectrum, eta
+        self.transmitted = None if eta is None else FloatTable(transmitted_shares(spectrum, eta))
         self._last: tuple[float, Energy | None] | None = None
         self._lock = threading.Lock()
 
@@ -123,6 +130,20 @@ class SharedTables:
         sides = ((1, tables[0]),) if self._eta is None else ((1, tables[0]), (-1, tables[-1]))
         furnaces = [(Furnace.of(self._spectrum, height_scale, self._eta, side), table) for side, table in sides]
         return np.concatenate([corners(furnace, table.layout)[0] for furnace, table in furnaces])
+
+
+def transmitted_shares(spectrum: GratingSpectrum, eta: float) -> NDArray[np.float64]:
+    """Return T/(R + T) of light from above and from below, the mean over wavelengths, as of `Interface.shares`."""
+    cos, place, length = np.meshgrid(
+        (np.arange(COSINES) + 0.5) / COSINES, (np.arange(AZIMUTHS) + 0.5) * 4 / AZIMUTHS - 2, AVERAGED, indexing="ij"
+    )
+    angle, sin, result = of_azimuth(place), np.sqrt(1 - cos**2), []
+    omega = np.stack([sin * np.cos(angle), sin * np.sin(angle), cos], -1).reshape(-1, 3)
+    for side, n in ((1, 1.0), (-1, eta)):
+        found = Furnace.of(spectrum, 1.0, eta, side).albedo(omega, length.ravel() / n)
+        found = found.reshape(2, COSINES, AZIMUTHS, -1).mean(-1)
+        result.append(found[1] / np.maximum(found.sum(0), 1e-9))
+    return np.array(result)
 
 
 def passing(eta: float) -> tuple[float, float]:

@@ -26,7 +26,7 @@ class SplineSpectrum:
     def __init__(self, spectrum: GratingSpectrum, most: float | None = None, farthest: float = 1.0) -> None:
         grid = spectrum.grid
         self.power = order_power(spectrum.table, (RIM, RIM))
-        self.largest_x, self.largest_y = grid.max_order
+        self.max_node_x, self.max_node_y = grid.max_order
         self.per_q_x, self.per_q_y = (opaque(1 / d) for d in grid.spacing)
         self.per_area = opaque(1 / (grid.spacing[0] * grid.spacing[1]))
         self.limit_x, self.limit_y = (opaque(limit) for limit in grid.limit)
@@ -38,15 +38,14 @@ class SplineSpectrum:
         geometry: Geometry,
         incidence: Incidence,
         active: mi.Bool,
-        wo_is_sample: bool,
     ) -> tuple[mi.Float, mi.Float]:
         """Evaluate K G S(q; κ) cos θ_o and the density of q; as `OrderSpectrum`, but all directions cost the same."""
         q = geometry.tangent * incidence.frequency
         x, y = q.x * self.per_q_x, q.y * self.per_q_y
         m_x, m_y = mi.Int32(dr.round(x)), mi.Int32(dr.round(y))
         power = self.power.window(
-            m_y + (self.largest_y + RIM - 1),
-            m_x + (self.largest_x + RIM - 1),
+            m_y + (self.max_node_y + RIM - 1),
+            m_x + (self.max_node_x + RIM - 1),
             spline_weights(x - mi.Float(m_x)),
             spline_weights(y - mi.Float(m_y)),
             self.power.at(geometry.kappa(incidence.frequency), active, geometry.small()),
@@ -54,9 +53,9 @@ class SplineSpectrum:
         )
         inside = active & (dr.abs(q.x) <= self.limit_x) & (dr.abs(q.y) <= self.limit_y)
         # Interpolation may dip below zero by its error.
-        power = larger(power, 0) * self.per_area * geometry.continuum_factor(incidence.frequency, self.per_width)
-        drawn = q if incidence.mirrored is None else incidence.mirrored * q
-        return dr.select(inside, power, 0), self.cells.density(drawn, incidence, active)
+        power = larger(power, 0) * self.per_area * geometry.continuum_factor(incidence, self.per_width)
+        q_drawn = q if incidence.mirrored is None else incidence.mirrored * q
+        return dr.select(inside, power, 0), self.cells.density(q_drawn, incidence, active)
 
     def sample(
         self,

@@ -25,7 +25,7 @@ from .theories import check_transmission, settings_from, settings_of_medium
 _log = logging.getLogger(__name__)
 _per_cent = functools.partial(progress_bar, unit="%")
 _PREFIX = "handed over: "
-_told: set[str] = set()  # warnings, each of which is given once
+_warned: set[str] = set()  # warnings, each of which is given once
 _handed_over: weakref.WeakValueDictionary[str, Spectrum] = weakref.WeakValueDictionary()
 
 
@@ -76,10 +76,10 @@ def surface_from(props: mi.Properties, media: Media, scale: float = 1.0) -> tupl
 
 def warn_of_range(spectrum: GratingSpectrum) -> None:
     """Say in Mitsuba's log, once for each surface, if scalar theory is not to be trusted there."""
-    told = f"diffraction_grating, {spectrum.source}: {spectrum.warning}"
-    if spectrum.warning and told not in _told:
-        _told.add(told)
-        _log.warning("%s", told)
+    message = f"diffraction_grating, {spectrum.source}: {spectrum.warning}"
+    if spectrum.warning and message not in _warned:
+        _warned.add(message)
+        _log.warning("%s", message)
 
 
 def _inside(media: Media, scale: float, recipe: Recipe) -> Recipe:

@@ -89,8 +89,8 @@ class ScalarTheory:
             ValueError: if the spectrum does not cover the scales, or the wavelengths inside a coat.
         """
         shortest = VISIBLE[0] / self.media.index
-        largest = shortest / self.spectrum.wavelengths[0]
-        if self.media.index > 1 and largest < 1 - 1e-6:
+        max_scale = shortest / self.spectrum.wavelengths[0]
+        if self.media.index > 1 and max_scale < 1 - 1e-6:
             name, place = "int_ior", "the material"
             if self.media.eta is None:
                 name, place = ("ext_ior", "it") if self.media.coat is None else ("coat_ior", "the coat")
@@ -108,7 +108,9 @@ class ScalarTheory:
         self.interface = None
         if self.media.eta is not None:
             kappas = tuple(opaque(kappa) for kappa in small_kappas(self.spectrum, self.media.eta))
-            self.interface = Interface(self.material.eta, self.media.transmission == "sheet", kappas)
+            is_sheet = self.media.transmission == "sheet"
+            shares = None if is_sheet else self.tables.transmitted
+            self.interface = Interface(self.material.eta, is_sheet, kappas, shares)
 
     def parameters_changed(self, keys: list[str]) -> None:
         """Recompute what depends on the parameters `keys`; on all of them if none is named."""
@@ -118,6 +120,8 @@ class ScalarTheory:
         if changed:
             self.update()
         self.material.update()
+        if self.interface is not None:
+            self.interface.update()
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         for scale in self.scales:
@@ -127,11 +131,7 @@ class ScalarTheory:
     def weighted(
         self, value: mi.UnpolarizedSpectrum, si: mi.SurfaceInteraction3f, geometry: Geometry, active: mi.Bool
     ) -> mi.UnpolarizedSpectrum:
-        """Return `value` times R E."""
-        if self.energy is not None:
-            wavelengths = mi.UnpolarizedSpectrum(si.wavelengths) * (1e-3 / self.media.outside / geometry.index)
-            scales = geometry.height_scale, geometry.lateral_scale
-            value *= self.energy.factor(*geometry.inside(), wavelengths, *scales)
+        """Return `value` times R."""
         reflected = self.material(si, geometry.cos_half(), active)
         if self.media.eta is not None:
             reflected = dr.select(geometry.reflects, reflected, 1 - reflected)
@@ -169,7 +169,7 @@ class RigorousTheory:
         interface: the media on both sides where light passes, else None.
     """
 
-    shadowing = True  # of no effect
+    shadowing, energy = True, None  # in the efficiencies
 
     def __init__(self, props: mi.Properties, spectrum: RigorousSpectrum, media: Media) -> None:
         self.coat = coat = media.coat
@@ -180,7 +180,7 @@ class RigorousTheory:
         self.scattering = SharedTables.of(spectrum).scattering
         self.interface = None
         if media.eta is not None:
-            self.interface = Interface(opaque(spectrum.int_ior.real), media.transmission == "sheet", None)
+            self.interface = Interface(opaque(spectrum.int_ior.real), media.transmission == "sheet")
 
     def parameters_changed(self, keys: list[str]) -> None:
         """Do nothing: a table of efficiencies has no parameters."""

@@ -23,13 +23,15 @@ those outside, normal components those inside.
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 
-from .geometry import horizon_gain, k_g, scaled
-from .tables import larger, limited, smaller
+from .cell_sampler import azimuth
+from .geometry import horizon_gain
+from .tables import FloatTable, larger, limited, smaller
 
 
 # Not frozen: Dr.Jit rebuilds what enters a branch field by field.
@@ -42,6 +44,8 @@ class Side:
         square: k_z² outside.
         outside: n outside.
         inside: n next to the relief; they differ below a sheet.
+        per_inside: 1/n there.
+        excess: n² there less n² outside.
         sign: 1 above, −1 below.
     """
 
@@ -49,17 +53,25 @@ class Side:
     square: mi.Float
     outside: mi.Float
     inside: mi.Float
+    per_inside: mi.Float
+    excess: mi.Float
     sign: mi.Float
 
     def normal(self, square: mi.Float) -> mi.Float:
         """Return |k_z| next to the relief, from k_z² outside."""
         # Above zero, where the root has a derivative.
-        return dr.sqrt(larger(square + dr.square(self.inside) - dr.square(self.outside), 1e-12))
+        return dr.sqrt(larger(square + self.excess, 1e-12))
 
     @property
     def z(self) -> mi.Float:
         """k_z next to the relief, with its sign."""
         return self.sign * self.normal(self.square)
+
+
+# Of the samples, on either side: where the share is estimated; where it is that of a plane; of rigorous theory, as fine
+# gratings are far from a plane.
+LEAST_INTERFACE, LEAST_SHEET, LEAST_RIGOROUS = 0.05, 0.1, 0.2
+COSINES, AZIMUTHS = 32, 8  # cells of directions for which the share is estimated
 
 
 class Interface:
@@ -71,10 +83,23 @@ class Interface:
         kappas: a quarter of the table's first interval of κ, where its error weighs as little as that of the line, and
             the least κ of the undiffracted order of the heights as they are; rad/µm. None of rigorous theory, whose
             tables are read at q whatever the sign of κ, and hold the flat face of a sheet.
+        shares: T/(R + T) of light from above and from below, in cells of cos θ_i and azimuth, (2, `COSINES`,
+            `AZIMUTHS`); None where that of a plane serves, as of a sheet, which keeps much of what is reflected inside.
     """
 
-    def __init__(self, eta: mi.Float, is_sheet: bool, kappas: tuple[mi.Float, mi.Float] | None) -> None:
-        self.eta, self.is_sheet, self.kappas = eta, is_sheet, kappas
+    def __init__(
+        self,
+        eta: mi.Float,
+        is_sheet: bool,
+        kappas: tuple[mi.Float, mi.Float] | None = None,
+        shares: FloatTable | None = None,
+    ) -> None:
+        self.eta, self.is_sheet, self.kappas, self.shares = eta, is_sheet, kappas, shares
+        self.update()
+
+    def update(self) -> None:
+        """Recompute what depends on the index."""
+        self.per_eta, self.excess = dr.rcp(self.eta), dr.square(self.eta) - 1
 
     def least_kappa(self, height_scale: mi.Float) -> mi.Float | None:
         """Return κ₁ in rad/µm: of the undiffracted order κ is larger at all wavelengths; None of rigorous theory."""
@@ -91,21 +116,30 @@ class Interface:
     def side(self, omega: mi.Vector3f) -> Side:
         """Return the side on which ω lies."""
         above = omega.z > 0
-        inside = dr.select(above, 1, self.eta)
+        outside = mi.Float(1.0) if self.is_sheet else dr.select(above, 1, self.eta)
+        return self._side(above, mi.Vector2f(omega.x, omega.y) * outside, dr.square(omega.z * outside))
+
+    def _side(self, above: mi.Bool, tangent: mi.Vector2f, square: mi.Float) -> Side:
+        inside, per_inside = dr.select(above, 1, self.eta), dr.select(above, 1, self.per_eta)
         outside = mi.Float(1.0) if self.is_sheet else inside
-        return Side(
-            mi.Vector2f(omega.x, omega.y) * outside,
-            dr.square(omega.z * outside),
-            outside,
-            inside,
-            dr.select(above, mi.Float(1), -1),
-        )
+        excess = dr.select(above, 0, self.excess) if self.is_sheet else mi.Float(0.0)
+        return Side(tangent, square, outside, inside, per_inside, excess, dr.select(above, mi.Float(1), -1))
 
     def other(self, side: Side, reflects: mi.Bool) -> Side:
         """Return where light from `side` goes, without the direction."""
-        sign = dr.select(reflects, side.sign, -side.sign)
-        inside = dr.select(sign > 0, 1, self.eta)
-        return Side(-side.tangent, side.square, mi.Float(1.0) if self.is_sheet else inside, inside, sign)
+        return self._side((side.sign > 0) == reflects, -side.tangent, side.square)
+
+    def transmitted(self, omega: mi.Vector3f) -> mi.Float:
+        """Estimate which share of scattered light is transmitted, for samples; ω along the pattern's axes."""
+        if self.shares is None:
+            # Inside of a sheet there is no total reflection.
+            reflected = mi.fresnel(dr.abs(omega.z) if self.is_sheet else omega.z, self.eta)[0]
+            least = LEAST_RIGOROUS if self.kappas is None else LEAST_SHEET
+            return limited(1 - reflected, least, 1 - least)
+        cell = mi.UInt32(smaller(dr.abs(omega.z) * COSINES, COSINES - 1))
+        cell = dr.select(omega.z > 0, cell, cell + COSINES)
+        around = mi.UInt32(smaller((azimuth(omega.x, omega.y) + 2) * (AZIMUTHS / 4), AZIMUTHS - 1))
+        return limited(self.shares(cell * AZIMUTHS + around, True), LEAST_INTERFACE, 1 - LEAST_INTERFACE)
 
     def flat(self, omega: mi.Vector3f) -> mi.Float:
         """Return the transmittance of the flat face of a sheet, one above."""
@@ -119,6 +153,11 @@ class Crossing:
 
     Attributes:
         i, o: the sides of ω_i and ω_o.
+        reflects: whether both directions lie on one side.
+        w: v_z.
+        flip: the sign of κ, or one where it does not matter.
+        tangent: λq where κ > 0, else −λq: where the table is read.
+        outgoing: n_o² |cos θ_o| outside.
         height_scale: times the heights.
         shadowing: whether G is a factor.
         least_kappa: κ₁ in rad/µm, or None, as of `Interface`.
@@ -127,34 +166,33 @@ class Crossing:
 
     i: Side
     o: Side
+    reflects: mi.Bool
+    w: mi.Float
+    flip: mi.Float
+    tangent: mi.Vector2f
+    outgoing: mi.Float
     height_scale: mi.Float
     shadowing: bool
     least_kappa: mi.Float | None
-    lateral_scale: mi.Float | None = None
+    lateral_scale: mi.Float | None
 
     index = 1.0  # of the wavelengths that are handed to E, those above
 
-    @property
-    def reflects(self) -> mi.Bool:
-        """Both directions lie on one side."""
-        return self.i.sign == self.o.sign
-
-    @property
-    def w(self) -> mi.Float:
-        """v_z."""
-        return self.i.z + self.o.z
-
-    @property
-    def flip(self) -> mi.Float:
-        """The sign of κ, or one where it does not matter."""
-        if self.least_kappa is None:
-            return mi.Float(1.0)
-        return dr.select(self.w < 0, mi.Float(-1), 1)
-
-    @property
-    def tangent(self) -> mi.Vector2f:
-        """λq where κ > 0, else −λq: where the table is read."""
-        return -self.flip * (self.i.tangent + self.o.tangent)
+    @classmethod
+    def of(
+        cls,
+        i: Side,
+        o: Side,
+        height_scale: mi.Float,
+        shadowing: bool,
+        least_kappa: mi.Float | None,
+        lateral_scale: mi.Float | None = None,
+    ) -> Crossing:
+        """Return that of directions on two sides."""
+        w, along = i.z + o.z, i.tangent + o.tangent
+        flip = mi.Float(1.0) if least_kappa is None else dr.select(w < 0, mi.Float(-1), 1)
+        values = i.sign == o.sign, w, flip, -flip * along, o.outside * dr.sqrt(o.square)
+        return cls(i, o, *values, height_scale, shadowing, least_kappa, lateral_scale)
 
     def kappa(self, frequency: mi.Float) -> mi.Float:
         """Return |κ| in rad/µm; `frequency` is 1/λ above."""
@@ -166,44 +204,39 @@ class Crossing:
 
     def cosines(self) -> tuple[mi.Float, mi.Float]:
         """Return |cos θ_i| and |cos θ_o| next to the relief."""
-        return self.i.normal(self.i.square) / self.i.inside, self.o.normal(self.o.square) / self.o.inside
+        return tuple(side.normal(side.square) * side.per_inside for side in (self.i, self.o))
 
     def cos_half(self) -> mi.Float:
         """Return ω_i·h, negative from below, as `mi.fresnel` takes it."""
-        square = dr.squared_norm(self.i.tangent + self.o.tangent) + dr.square(self.w)
+        square = dr.squared_norm(self.tangent) + dr.square(self.w)
         along = 0.5 * (square + dr.square(self.i.inside) - dr.square(self.o.inside))
-        cos = dr.abs(along) * dr.rsqrt(larger(square, 1e-12)) / self.i.inside
+        cos = dr.abs(along) * dr.rsqrt(larger(square, 1e-12)) * self.i.per_inside
         return self.i.sign * smaller(cos, 1)
 
     def inside(self) -> tuple[mi.Vector3f, mi.Vector3f]:
         """Return ω_i and ω_o next to the relief."""
-        return tuple(mi.Vector3f(*(side.tangent / side.inside), side.z / side.inside) for side in (self.i, self.o))
+        return tuple(mi.Vector3f(*side.tangent, side.z) * side.per_inside for side in (self.i, self.o))
 
-    def order_factor(self, tangent: mi.Vector2f, frequency: mi.Float, per_width: mi.Float) -> mi.Float:
+    def order_factor(self, tangent: mi.Vector2f, incidence: CrossingIncidence, per_width: mi.Float) -> mi.Float:
         """Return n_o² K G |cos θ_o| of an order, times the gain of its lobe, as `Geometry.order_factor`.
 
         Args:
             tangent: λq of the order where κ > 0, else −λq.
-            frequency: 1/λ above.
+            incidence: the wavelength.
             per_width: 1/σ_q.
         """
-        squares, gain = self.of_order(self.flip * tangent, frequency * per_width)
-        return self._k_g(*squares, dr.squared_norm(tangent), frequency) * gain * self.outgoing
+        squares, gain = self.of_order(self.flip * tangent, incidence.frequency * per_width)
+        return self._k_g(*squares, dr.squared_norm(tangent), incidence) * gain * self.outgoing
 
-    def continuum_factor(self, frequency: mi.Float, per_width: mi.Float) -> mi.Float:
+    def continuum_factor(self, incidence: CrossingIncidence, per_width: mi.Float) -> mi.Float:
         """Return n_o² K G |cos θ_o| and gain where orders overlap, as `Geometry.continuum_factor`."""
-        square, per_width = dr.squared_norm(self.tangent), frequency * per_width
+        square, per_width = dr.squared_norm(self.tangent), incidence.frequency * per_width
         mirror = limited((25 - square * dr.square(per_width)) / 9, 0, 1)
         most = larger(self.i.square, self.o.square)
         mirror *= dr.select(self.reflects, limited(2 - 5 * dr.sqrt(larger(most, 1e-12)), 0, 1), 0)
         _, gain = self.of_order(mi.Vector2f(0), per_width)
-        of_pair = self._k_g(self.i.square, self.o.square, square, frequency)
+        of_pair = self._k_g(self.i.square, self.o.square, square, incidence)
         return dr.lerp(of_pair, gain, mirror) * self.outgoing
-
-    @property
-    def outgoing(self) -> mi.Float:
-        """n_o² |cos θ_o| outside."""
-        return self.o.outside * dr.sqrt(self.o.square)
 
     def of_order(self, change: mi.Vector2f, per_width: mi.Float) -> tuple[tuple[mi.Float, mi.Float], mi.Float]:
         """Return k_z² of both sides in the middle of the lobe, and its gain, as `Geometry.of_order`.
@@ -221,22 +254,21 @@ class Crossing:
         gain = dr.select(smaller(sent_i, sent_o) > 0, horizon_gain(x_i) * horizon_gain(x_o), 0)
         return (0.5 * (i.square + sent_i), 0.5 * (o.square + sent_o)), gain
 
-    def _k_g(self, square_i: mi.Float, square_o: mi.Float, along: mi.Float, frequency: mi.Float) -> mi.Float:
+    def _k_g(self, square_i: mi.Float, square_o: mi.Float, along: mi.Float, incidence: CrossingIncidence) -> mi.Float:
         """Return K G from k_z² of both sides outside, and |v_∥|²."""
         z_i, z_o = self.i.normal(square_i), self.o.normal(square_o)
-        reflected = k_g(z_i, z_o, along, self.shadowing)
-        w = dr.square(z_i - z_o)
+        w = dr.abs(dr.select(self.reflects, z_i + z_o, z_i - z_o))
         between = dr.square(self.i.inside) - dr.square(self.o.inside)
-        length = along + w
+        length = along + dr.square(w)
         along_i, along_o = 0.5 * dr.abs(length + between), 0.5 * dr.abs(length - between)
-        least = self.least_kappa / (dr.two_pi * frequency * larger(self.height_scale, 1e-6))
-        z_i, z_o = larger(z_i, 1e-7), larger(z_o, 1e-7)
-        passed = along_i * along_o / (z_i * z_o * larger(w, dr.square(least)))
+        product = along_i * along_o
+        least = self.least_kappa * incidence.per_kappa
+        result = product * dr.rcp(z_i * z_o * dr.square(dr.select(self.reflects, w, larger(w, least))))
         if self.shadowing:
-            ratio = smaller(z_i / larger(along_i, 1e-9), z_o / larger(along_o, 1e-9))
-            passed *= smaller(1, 4 * length * dr.square(ratio))
-        refracted = length < dr.abs(between)
-        return dr.select(self.reflects, reflected, dr.select(refracted, passed, 0))
+            # 2 h_z cos θ/|ω·h| of reflected light, (2 cos θ/|ω·h|)² of transmitted.
+            ratio = 2 * smaller(z_i * along_o, z_o * along_i) * dr.rcp(larger(product, 1e-18))
+            result *= smaller(1, ratio * dr.select(self.reflects, w, length * ratio))
+        return dr.select(self.reflects | (length < dr.abs(between)), result, 0)
 
 
 @dataclass(eq=False)
@@ -248,6 +280,7 @@ class CrossingIncidence:
 
     Attributes:
         wi: k_i,∥, or its opposite where −q is drawn; z is not used.
+        wavelength: λ above, µm.
         frequency: 1/λ above.
         lateral_frequency: 1/λ times the lateral scale: q of the table per λq.
         above: whether it comes from above.
@@ -256,14 +289,16 @@ class CrossingIncidence:
         cosine: √(1 − |k_i,∥|²/(n_o R)²), R the largest of |k_i,∥|/n_o.
         mirrored: what takes the q that is read to the one that was drawn, 1 or −1.
         square: n_o² − |k_i,∥|².
-        kappas: |κ| of the undiffracted order, and of light that leaves with 0.7 of its k_z, rad/µm.
         per_kappa: |v_z| for one rad/µm.
+        undiffracted: κ of the undiffracted order, rad/µm.
+        near: the least |v_z| of light that leaves with 0.7 to 1 of the k_z of that order, and what is 1 over the range.
         come: |k_i,z|.
-        leaves: |k_o,z| of light along the horizon and along the normal.
+        leaves: |k_o,z| of light along the horizon and along the normal, and what is 1 over that range.
         reflects: whether it is reflected.
     """
 
     wi: mi.Vector3f
+    wavelength: mi.Float
     frequency: mi.Float
     lateral_frequency: mi.Float
     above: mi.Bool
@@ -273,10 +308,25 @@ class CrossingIncidence:
     mirrored: mi.Float
     square: mi.Float
     per_kappa: mi.Float
+    undiffracted: mi.Float
+    near: tuple[mi.Float, mi.Float]
     come: mi.Float
-    leaves: list[mi.Float]
-    kappas: list[mi.Float]
+    leaves: tuple[mi.Float, mi.Float, mi.Float]
     reflects: mi.Bool
+
+    def at(self, wavelength: mi.Float) -> CrossingIncidence:
+        """Return that at another wavelength (µm), from that at 1 µm."""
+        wavelength = dr.detach(wavelength)
+        frequency = dr.rcp(wavelength)
+        return dataclasses.replace(
+            self,
+            wavelength=wavelength,
+            frequency=frequency,
+            lateral_frequency=self.lateral_frequency * frequency,
+            radius=self.radius * frequency,
+            per_kappa=self.per_kappa * wavelength,
+            undiffracted=self.undiffracted * frequency,
+        )
 
     @classmethod
     def of(
@@ -284,12 +334,11 @@ class CrossingIncidence:
         i: Side,
         o: Side,
         interface: Interface,
-        frequency: mi.Float,
         height_scale: mi.Float,
         flip: mi.Float | None,
         lateral_scale: mi.Float | None = None,
     ) -> CrossingIncidence:
-        """Return that of light from the side `i` to the side `o`.
+        """Return that of light from the side `i` to the side `o`, at a wavelength of 1 µm.
 
         `flip` is the sign of κ of a pair that is evaluated; None where a direction is drawn.
         """
@@ -299,16 +348,18 @@ class CrossingIncidence:
             assumed = mi.Float(1.0)
         square = dr.square(o.outside) - dr.square(i.outside) + i.square
         radius = o.outside
-        largest = mi.Float(1.0) if interface.is_sheet else larger(interface.eta, dr.rcp(interface.eta))
-        across = dr.squared_norm(i.tangent) / dr.square(radius * largest)
-        per = dr.two_pi * frequency * height_scale
-        z_i, snell = i.z, o.normal(larger(square, 0))
-        kappas = [dr.detach(per * dr.abs(z_i + o.sign * z)) for z in (snell, 0.7 * snell)]
-        leaves = [dr.detach(z) for z in (o.normal(mi.Float(0)), o.inside)]
-        lateral = scaled(frequency, lateral_scale)
+        max_index = mi.Float(1.0) if interface.is_sheet else larger(interface.eta, dr.rcp(interface.eta))
+        across = dr.squared_norm(i.tangent) / dr.square(radius * max_index)
+        snell = o.normal(larger(square, 0))
+        undiffracted, steep = (dr.abs(i.z + o.sign * z) for z in (snell, 0.7 * snell))
+        near = smaller(undiffracted, steep), dr.rcp(larger(dr.abs(undiffracted - steep), 1e-4))
+        horizon, normal = o.normal(mi.Float(0)), o.inside
+        lateral = mi.Float(1.0) if lateral_scale is None else lateral_scale
+        per_v = larger(dr.two_pi * height_scale, 1e-6)
         values = (
             mi.Vector3f(assumed * i.tangent.x, assumed * i.tangent.y, 0),
-            frequency,
+            mi.Float(1.0),
+            mi.Float(1.0),
             lateral,
             i.sign > 0,
             i.outside,
@@ -316,18 +367,20 @@ class CrossingIncidence:
             dr.safe_sqrt(1 - across),
             assumed if flip is None else assumed * flip,
             square,
-            dr.rcp(larger(per, 1e-6)),
-            dr.abs(z_i),
+            dr.rcp(per_v),
+            undiffracted * per_v,
+            near,
+            dr.abs(i.z),
+            (horizon, normal, dr.rcp(larger(normal - horizon, 1e-3))),
+            reflects,
         )
-        return cls(*(dr.detach(value) for value in values), leaves, kappas, reflects)
+        return cls(*(dr.detach(value) for value in values))
 
     def below(self, kappa: mi.Float) -> mi.Float:
         """Return the share of light with less than κ: half of it near the undiffracted order, half at any k_o,z."""
-        first, second = self.kappas
-        low, high = smaller(first, second), larger(first, second)
-        near = limited((kappa - low) / larger(high - low, 1e-3), 0, 1)
-        v_z, (horizon, normal) = kappa * self.per_kappa, self.leaves
-        per = dr.rcp(larger(normal - horizon, 1e-3))
+        v_z, (horizon, normal, per) = kappa * self.per_kappa, self.leaves
+        low, per_near = self.near
+        near = limited((v_z - low) * per_near, 0, 1)
         back = limited((v_z - self.come - horizon) * per, 0, 1)
         most, least = smaller(self.come + v_z, normal), larger(self.come - v_z, horizon)
         on = limited((most - least) * per, 0, 1)

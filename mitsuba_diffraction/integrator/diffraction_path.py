@@ -67,21 +67,10 @@ def define() -> type:
             self.path = nested_plugin("path", max_depth=self.max_depth, rr_depth=self.rr_depth)
 
         def parts(self, scene: mi.Scene, sensor: mi.Sensor) -> tuple[mi.SamplingIntegrator, LightPaths | None]:
-            """Return the tracers of paths from the eye and from the light; None where there are no such paths.
-
-            Raises:
-                ValueError: if the film takes samples beyond its edge.
-            """
-            if 0 <= self.max_depth < 3 or mi.is_polarized or not _connects(sensor):
+            """Return the tracers of paths from the eye and from the light; None where there are no such paths."""
+            gratings = _lit_gratings(scene, sensor, self.max_depth)
+            if gratings is None:
                 return self.path, None
-            gratings = Gratings(scene)
-            if not gratings.shapes or not scene.emitters():
-                return self.path, None
-            film = sensor.film()
-            if film.sample_border() and film.rfilter().border_size() > 0:
-                raise RequestError(
-                    "sample_border: got true, wanted false: points beyond the film's edge cannot be connected to it"
-                )
             light = LightPaths(scene, sensor, gratings, self.max_depth, self.rr_depth)
             return eye_class(gratings, self.max_depth, self.rr_depth), light
 
@@ -111,15 +100,8 @@ def define() -> type:
             if light is None:
                 return eye.render(scene, sensor, seed, spp, develop, evaluate)
             eye.render(scene, sensor, seed, spp, False, evaluate)
-            film = sensor.film()
-            # Scaled by the samples that the film is divided by.
-            spp = sensor.sampler().sample_count()
-            block = film.create_block()
-            corner = mi.Vector2f(film.crop_offset())
-            for splats in light.splats(seed, light.count(spp)):
-                put(film, block, splats.position + corner, splats.wavelengths, splats.value * spp)
-            film.put_block(block)
-            return film.develop() if develop else mi.TensorXf()
+            _add_light_paths(sensor, light, seed)
+            return sensor.film().develop() if develop else mi.TensorXf()
 
         # Dr.Jit does not differentiate splats: derivatives are those of `path`, which has the same expectation. `prb`
         # gives them backward; forward it fails in spectral variants of Mitsuba 3.9.1, where that of `path` does not.
@@ -145,6 +127,37 @@ def define() -> type:
             return f"DiffractionPath[\n  max_depth = {self.max_depth},\n  rr_depth = {self.rr_depth}\n]"
 
     return DiffractionPath
+
+
+def _lit_gratings(scene: mi.Scene, sensor: mi.Sensor, max_depth: int) -> Gratings | None:
+    """Return the gratings from which light is traced; None where all paths are those of `path`.
+
+    Raises:
+        ValueError: if the film takes samples beyond its edge.
+    """
+    if 0 <= max_depth < 3 or mi.is_polarized or not _connects(sensor):
+        return None
+    gratings = Gratings(scene)
+    if not gratings.shapes or not scene.emitters():
+        return None
+    film = sensor.film()
+    if film.sample_border() and film.rfilter().border_size() > 0:
+        raise RequestError(
+            "sample_border: got true, wanted false: points beyond the film's edge cannot be connected to it"
+        )
+    return gratings
+
+
+def _add_light_paths(sensor: mi.Sensor, light: LightPaths, seed: mi.UInt32 | int) -> None:
+    """Add paths from the light to the film of a sensor, which holds those from the eye."""
+    film = sensor.film()
+    # Scaled by the samples that the film is divided by.
+    spp = sensor.sampler().sample_count()
+    block = film.create_block()
+    corner = mi.Vector2f(film.crop_offset())
+    for splats in light.splats(seed, light.count(spp)):
+        put(film, block, splats.position + corner, splats.wavelengths, splats.value * spp)
+    film.put_block(block)
 
 
 def put(

@@ -137,7 +137,7 @@ def define() -> type:
                 met |= on_grating ^ True
                 active &= dr.any(throughput != 0)
                 ray = si.spawn_ray(si.to_world(bs.wo))
-                ray.wavelengths = carried(ray.wavelengths, throughput)
+                ray.wavelengths = surviving_wavelengths(ray.wavelengths, throughput)
                 following = scene.ray_intersect(ray, active)
                 ds = mi.DirectionSample3f(scene, following, si)
                 pdf = _density(scene, si, ds, active)
@@ -159,7 +159,7 @@ def define() -> type:
     return EyePaths
 
 
-def carried(wavelengths: mi.Spectrum, throughput: mi.Spectrum) -> mi.Spectrum:
+def surviving_wavelengths(wavelengths: mi.Spectrum, throughput: mi.Spectrum) -> mi.Spectrum:
     """Return wavelengths for the rest of a path: the strongest replaces those without throughput.
 
     A grating diffracts the wavelengths into different directions. At the next one a direction would be drawn for any of

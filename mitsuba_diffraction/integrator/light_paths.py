@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .eye_paths import Gratings, carried, ratio
+from .eye_paths import Gratings, ratio, surviving_wavelengths
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +152,7 @@ class LightPaths:
             buffer.add(Splats(position, ray.wavelengths, value * power * throughput), path, depth, reached)
             ray, weight, _ = self._scatter(si, bsdf, rng, active)
             throughput *= weight
-            ray.wavelengths = carried(ray.wavelengths, power * throughput)
+            ray.wavelengths = surviving_wavelengths(ray.wavelengths, power * throughput)
             depth += 1
             gambles = depth >= self.rr_depth
             # As of `path`, without the indices passed: unlike radiance, power does not change with them.
@@ -192,7 +192,7 @@ class LightPaths:
             candidate += 1
         power = response * received * (total / (own * _CANDIDATES))
 
-        wavelengths = carried(wavelengths, power)
+        wavelengths = surviving_wavelengths(wavelengths, power)
         # All of the surface at that point, with its tangents, as a ray along the normal meets it.
         off = mi.math.RayEpsilon * (1 + dr.max(dr.abs(point)))
         si = self.scene.ray_intersect(mi.Ray3f(point + normal * off, -normal, 2 * off, time, wavelengths), total > 0)
@@ -205,7 +205,7 @@ class LightPaths:
         power *= dr.abs(dr.dot(direction, si.n))
         ray, weight, mirrored = self._scatter(si, si.bsdf(), rng, active)
         power *= weight
-        ray.wavelengths = carried(ray.wavelengths, power)
+        ray.wavelengths = surviving_wavelengths(ray.wavelengths, power)
         # `path` does not see a light without extent in a mirror.
         active &= dr.any(power != 0) & ((mirrored & delta) ^ True)
         return ray, power, active

@@ -26,7 +26,7 @@ class Axes:
         k_y = (ω_o,y − ω_i,y) ν / 2,    g = √(ν² − k_y²),    c = (ω_o,x − ω_i,x) ν / 2.
 
     In units of 2π/T, g is the wave number across the grooves; light of order m comes in with k_x = c + m/2 and leaves
-    with c − m/2. Order n of the same light passes off where |c + m/2 − n| = g, which is where
+    with c − m/2. Order n of the same light has its Rayleigh anomaly where |c + m/2 − n| = g, which is where
 
         P = g + c − |m|/2    or    R = g − c − |m|/2
 
@@ -74,29 +74,26 @@ class Axes:
         return dataclasses.replace(self, steps=self.steps // STORED)
 
     @property
-    def reach(self) -> float:
-        """The sum of g of the media of both ways, of the shortest wavelength: the largest order is below."""
-        return sum((1.0, self.index)[side] for side in self.way) * self.period / self.wavelengths[0]
-
-    @property
-    def beyond(self) -> float:
+    def max_decay(self) -> float:
         """√(n² − 1), or 0: g > −√(n² − 1) ν."""
         return float(np.sqrt(max(self.index**2 - 1, 0.0)))
 
     @property
     def shift(self) -> int:
         """D, at least g' − g."""
-        return int(np.ceil(np.sqrt(2) * self.beyond * self.period / self.wavelengths[0])) if self.way == (1, 1) else 0
+        return (
+            int(np.ceil(np.sqrt(2) * self.max_decay * self.period / self.wavelengths[0])) if self.way == (1, 1) else 0
+        )
 
     @property
-    def largest(self) -> int:
+    def max_order(self) -> int:
         """M, the largest order that any pair of directions reaches."""
-        return int(np.ceil(self.reach)) - 1
+        return int(np.ceil(sum((1.0, self.index)[side] for side in self.way) * self.period / self.wavelengths[0])) - 1
 
     @property
     def orders(self) -> range:
         """−M … M."""
-        return range(-self.largest, self.largest + 1)
+        return range(-self.max_order, self.max_order + 1)
 
     def least(self, m: NDArray[np.int64] | int) -> tuple[NDArray[np.int64] | int, NDArray[np.int64] | int]:
         """By how much P and R of order m are less than D + g + k_x and D + g − k_x of the incident light."""
@@ -127,7 +124,7 @@ class Axes:
 
     def offset(self, m: int) -> int:
         """Return where the nodes of order m start in a plane: [P, R] of order −M first."""
-        return sum(self.side(k) ** 2 for k in range(-self.largest, m))
+        return sum(self.side(k) ** 2 for k in range(-self.max_order, m))
 
     def square(self, values: NDArray[np.float32], m: int) -> NDArray[np.float32]:
         """Of `values` (K, nodes), those of order m: (K, P, R)."""
@@ -137,7 +134,7 @@ class Axes:
     @property
     def nodes(self) -> int:
         """In a plane."""
-        return self.offset(self.largest + 1)
+        return self.offset(self.max_order + 1)
 
     def nodes_at(self, count: int) -> Real:
         """Return P at X = 0 … count − 1."""
@@ -151,5 +148,5 @@ class Axes:
 
     def range(self, g: Real) -> tuple[Real, Real]:
         """Return λ₀ and λ₁ at g, µm."""
-        longest = self.period * np.where(g < 0, self.beyond * (1 - 1e-6), 1.0) / np.maximum(np.abs(g), 1e-12)
+        longest = self.period * np.where(g < 0, self.max_decay * (1 - 1e-6), 1.0) / np.maximum(np.abs(g), 1e-12)
         return tuple(np.minimum(w, longest) for w in self.wavelengths)

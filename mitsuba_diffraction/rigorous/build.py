@@ -32,7 +32,7 @@ from .spectrum import RigorousSpectrum, Table, axes_of
 Real = NDArray[np.float64]
 # n of the orders in and out, and their matrices, (orders out, orders in, 4, 4).
 _Orders = tuple[NDArray[np.int64], NDArray[np.int64], Real]
-# α, g, λ, whether an order is about to pass off, and (from, to) → m and M_ij of the orders, (n, 4, 4).
+# α, g, λ, whether an order is near its Rayleigh anomaly, and (from, to) → m and M_ij of the orders, (n, 4, 4).
 _Checked = tuple[float, float, float, bool, dict[tuple[int, int], tuple[NDArray[np.int64], Real]]]
 
 # Steps to a unit that are solved, one after the other until the error is kept.
@@ -82,7 +82,6 @@ def build_spectrum(
     tolerance = 1e-2 if settings.tolerance is None else settings.tolerance
     wavelengths = settings.wavelengths
     int_ior, material, ext_ior, polarised = settings.int_ior, settings.material, settings.ext_ior, settings.polarised
-    transmission = settings.transmission
     period, longest = height_field.tile_size[0], LARGEST_PERIOD * wavelengths[0] * 1e-3
     if period > longest:
         raise RequestError(
@@ -96,11 +95,11 @@ def build_spectrum(
             lambda wavelength: refractive_index(wavelength * ext_ior, int_ior=int_ior, material=material) / ext_ior,
             tolerance,
             repr((int_ior, material, ext_ior, polarised)),
-            transmission,
+            settings.transmission,
         )
         checks = surface.checks()
         error, done = np.inf, 0
-        steps = _SOLVED_BOTH if transmission == "interface" else _SOLVED
+        steps = _SOLVED_BOTH if settings.transmission == "interface" else _SOLVED
         for solved in steps:
             # Twice the steps cost four times as much and leave an eighth of the error: which table will be the last?
             begin, done = done, 95 if error <= 8 * tolerance or solved == steps[-1] else done + 20
@@ -108,22 +107,7 @@ def build_spectrum(
             tables = _Build(surface, axes, solved, polarised).tables(
                 lambda row, rows, a=begin, b=done: progress(a + (b - a) * row // rows, 100), checkpoints
             )
-            spectrum = RigorousSpectrum(
-                tables=tables,
-                transmission=transmission,
-                material=material or "",
-                int_ior=complex(int_ior or 0),
-                ext_ior=float(ext_ior),
-                coherence_length=float(settings.coherence_length),
-                tolerance=float(tolerance),
-                harmonics=surface.harmonics,
-                source=height_field.source,
-                source_digest=height_field.digest,
-                error=np.nan,
-                worst=np.nan,
-                worst_near=np.nan,
-            )
-            spectrum = dataclasses.replace(spectrum, **_errors(spectrum, checks))
+            spectrum = _spectrum(tables, surface, height_field, settings, checks)
             # NaN: there are no matrices.
             if spectrum.error <= tolerance and not spectrum.polarisation_error > MATRICES * tolerance:
                 progress(100, 100)
@@ -139,6 +123,32 @@ def build_spectrum(
         stacklevel=4,
     )
     return spectrum
+
+
+def _spectrum(
+    tables: tuple[Table, ...],
+    surface: _Surface,
+    height_field: HeightField,
+    settings: Settings,
+    checks: list[_Checked],
+) -> RigorousSpectrum:
+    """Return the spectrum of the tables, with its measured errors."""
+    spectrum = RigorousSpectrum(
+        tables=tables,
+        transmission=settings.transmission,
+        material=settings.material or "",
+        int_ior=complex(settings.int_ior or 0),
+        ext_ior=float(settings.ext_ior),
+        coherence_length=float(settings.coherence_length),
+        tolerance=float(surface.tolerance),
+        harmonics=surface.harmonics,
+        source=height_field.source,
+        source_digest=height_field.digest,
+        error=np.nan,
+        max_error=np.nan,
+        max_error_near=np.nan,
+    )
+    return dataclasses.replace(spectrum, **_errors(spectrum, checks))
 
 
 class _Surface:
@@ -257,7 +267,7 @@ class _Surface:
 
 
 def _errors(spectrum: RigorousSpectrum, checks: list[_Checked]) -> dict[str, float]:
-    """Return `error`, `worst`, `worst_near` and `polarisation_error` of a table."""
+    """Return `error`, `max_error`, `max_error_near` and `polarisation_error` of a table."""
     error, split = [], []
     for alpha, g, wavelength, _, orders in checks:
         total, difference, matrices_differ = 0.0, 0.0, 0.0
@@ -273,8 +283,8 @@ def _errors(spectrum: RigorousSpectrum, checks: list[_Checked]) -> dict[str, flo
     error, near = np.array(error), np.array([check[3] for check in checks])
     return {
         "error": float(error.mean()),
-        "worst": float(error[~near].max(initial=0)),
-        "worst_near": float(error[near].max(initial=0)),
+        "max_error": float(error[~near].max(initial=0)),
+        "max_error_near": float(error[near].max(initial=0)),
         "polarisation_error": float("nan") if spectrum.mueller is None else float(np.mean(split)),
     }
 
@@ -297,7 +307,7 @@ class _Build:
         # Where the orders of each table begin among all of a job.
         self.first = np.cumsum([0, *(len(axes.orders) for axes in self.axes)])
         # p less its whole units, and the units of p + r; below zero no light travels above.
-        below = int(np.ceil(2 * self.axes[0].beyond * axes.period / axes.wavelengths[0])) + 1 if self.local else 0
+        below = int(np.ceil(2 * self.axes[0].max_decay * axes.period / axes.wavelengths[0])) + 1 if self.local else 0
         self.shift = max(axes.shift for axes in self.axes)
         self.jobs = [(part, units) for part in range(steps) for units in range(-below, axes.units(0) + 2)]
 
@@ -334,7 +344,7 @@ class _Build:
             p, r = self.parts[part] + middle, self.parts[other] + units - middle
             g = (p + r) / 2
             if g < 1e-4:
-                if not self.local or g < -axes.beyond * nu - 1:
+                if not self.local or g < -axes.max_decay * nu - 1:
                     continue
                 g = min(g, -1e-4)  # fields that neither travel nor decay have no admittance
             shortest, longest = axes.range(g)
@@ -346,7 +356,7 @@ class _Build:
             nodes = np.full((count, *shape, entries, entries), np.nan)
             if self.local:
                 nodes[:] = 0
-                nodes[:, self.first[0] + self.axes[0].largest] = nodes[:, self.first[1] + self.axes[1].largest] = (
+                nodes[:, self.first[0] + self.axes[0].max_order] = nodes[:, self.first[1] + self.axes[1].max_order] = (
                     np.eye(entries)
                 )
             for node, solved in enumerate(self.surface.solve((p - r) / 2, g, wavelengths)):
@@ -355,8 +365,8 @@ class _Build:
                     of_in, of_out, matrices = ways[table.way]
                     m = of_in - of_out[:, None]
                     unit = np.broadcast_to(of_in + middle + shift, m.shape)
-                    kept = (np.abs(m) <= table.largest) & (unit >= 0) & (unit < shape[1])
-                    nodes[node, start + table.largest + m[kept], unit[kept]] = matrices[kept][:, :entries, :entries]
+                    kept = (np.abs(m) <= table.max_order) & (unit >= 0) & (unit < shape[1])
+                    nodes[node, start + table.max_order + m[kept], unit[kept]] = matrices[kept][:, :entries, :entries]
             found[other] = np.einsum("kw,wmu...->muk...", weights, nodes)
         return found
 
@@ -374,7 +384,7 @@ class _Build:
                 for unit in range(units + 2 * axes.shift + 1):
                     p, r = unit * steps + part, (units + 2 * axes.shift - unit) * steps
                     if p < count and r < count:
-                        of_order = solved[:, self.first[table] + m + axes.largest]
+                        of_order = solved[:, self.first[table] + m + axes.max_order]
                         of_light[p, r : r + steps] = of_order[:, unit + self.shift - axes.shift]
             p, r = (less * steps for less in axes.least(m))
             found = of_light[p : p + side, r : r + side].astype(float)

@@ -227,9 +227,9 @@ def wave_numbers(curve: Curve, k_0: float, index: complex, omega: Real) -> tuple
     says: below it, the efficiencies of deep profiles have nothing to do with their limit; above it, they converge
     exponentially.
     """
-    largest = k_0 * np.sqrt(max(1.0, (index**2).real))
+    max_wave_number = k_0 * np.sqrt(max(1.0, (index**2).real))
     k_x = k_0 * abs(omega[0]) * (1 if omega[2] >= 0 else index.real)
-    return int(np.ceil(largest + k_x)), int(np.ceil(largest * np.hypot(*curve.tangent).max()))
+    return int(np.ceil(max_wave_number + k_x)), int(np.ceil(max_wave_number * np.hypot(*curve.tangent).max()))
 
 
 def solve(curve: Curve, omega: Real, k_0: float, index: complex, harmonics: int) -> Efficiencies:

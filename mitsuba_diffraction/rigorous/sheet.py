@@ -31,16 +31,16 @@ def through_sheet(solved: Scattered, index: float) -> dict[tuple[int, int], Real
         (from, to) → matrices, (orders out, orders in, 4, 4), orders those above.
     """
     outside, inside = solved.orders
-    grating = [[_together(matrices_of(solved, i, o)) for o in (ABOVE, BELOW)] for i in (ABOVE, BELOW)]
+    grating = [[_as_matrix(matrices_of(solved, i, o)) for o in (ABOVE, BELOW)] for i in (ABOVE, BELOW)]
     k_y, k_0, k = solved.k_y, solved.k_0, index * solved.k_0
     into, plane = _plane(solved.alpha[ABOVE], k_y, k_0, k, upwards=True)
     out_of, mirror = _plane(solved.alpha[BELOW], k_y, k, k_0, upwards=False)
     # Orders that propagate on both sides of the plane.
     travel = np.equal.outer(inside, outside)
-    into = _together(travel[..., None, None] * into[None])
-    out_of = _together(travel.T[..., None, None] * out_of[None])
-    mirror = _together(np.eye(len(inside))[..., None, None] * mirror[:, None])
-    plane = _together(np.eye(len(outside))[..., None, None] * plane[:, None])
+    into = _as_matrix(travel[..., None, None] * into[None])
+    out_of = _as_matrix(travel.T[..., None, None] * out_of[None])
+    mirror = _as_matrix(np.eye(len(inside))[..., None, None] * mirror[:, None])
+    plane = _as_matrix(np.eye(len(outside))[..., None, None] * plane[:, None])
     sources = np.hstack([grating[ABOVE][BELOW], grating[BELOW][BELOW] @ into])
     bounce = (1 - _LOSS) * grating[BELOW][BELOW] @ mirror
     down = np.linalg.solve(np.eye(len(bounce)) - bounce, sources)
@@ -51,7 +51,7 @@ def through_sheet(solved: Scattered, index: float) -> dict[tuple[int, int], Real
         (ABOVE, BELOW): out_of @ from_above,
         (BELOW, ABOVE): grating[BELOW][ABOVE] @ (into + mirror @ from_below),
     }
-    return {way: _apart(matrix) for way, matrix in found.items()}
+    return {way: _as_blocks(matrix) for way, matrix in found.items()}
 
 
 def _plane(alpha: Real, k_y: float, k: float, other: float, upwards: bool) -> tuple[Real, Real]:
@@ -59,14 +59,14 @@ def _plane(alpha: Real, k_y: float, k: float, other: float, upwards: bool) -> tu
 
     Args:
         alpha, k_y: along the plane.
-        k, other: wave numbers of the medium in which the light is, and beyond.
+        k, other: wave numbers of the medium in which the light is, and beyond the plane.
         upwards: whether the light goes up.
     """
-    beta, beyond = (np.sqrt(w**2 - k_y**2 - alpha**2 + 0j) for w in (k, other))
+    beta, beta_other = (np.sqrt(w**2 - k_y**2 - alpha**2 + 0j) for w in (k, other))
     square = (k / other) ** 2
-    r_s, r_p = (beta - beyond) / (beta + beyond), (beta - square * beyond) / (beta + square * beyond)
-    root = 2 * np.sqrt(beta * beyond)
-    t_s, t_p = root / (beta + beyond), root * (k / other) / (beta + square * beyond)
+    r_s, r_p = (beta - beta_other) / (beta + beta_other), (beta - square * beta_other) / (beta + square * beta_other)
+    root = 2 * np.sqrt(beta * beta_other)
+    t_s, t_p = root / (beta + beta_other), root * (k / other) / (beta + square * beta_other)
     sign = 1 if upwards else -1
 
     def basis(height: Real, w: float) -> Real:
@@ -76,19 +76,19 @@ def _plane(alpha: Real, k_y: float, k: float, other: float, upwards: bool) -> tu
         from_ = basis(sign * beta.real, k).transpose(0, 2, 1)
         return mueller(to @ (np.stack([s, p], axis=1)[..., None] * from_))
 
-    travels = beyond.imag == 0
-    height = np.where(travels, beyond.real, 0.0)
+    travels = beta_other.imag == 0
+    height = np.where(travels, beta_other.real, 0.0)
     transmitted = matrices(basis(sign * height, other), t_s, t_p)
     return np.where(travels[:, None, None], transmitted, 0), matrices(basis(-sign * beta.real, k), r_s, r_p)
 
 
-def _together(matrices: Real) -> Real:
+def _as_matrix(matrices: Real) -> Real:
     """Return (n, k, 4, 4) as one matrix, (4n, 4k)."""
     n, k = matrices.shape[:2]
     return matrices.transpose(0, 2, 1, 3).reshape(4 * n, 4 * k)
 
 
-def _apart(matrix: Real) -> Real:
+def _as_blocks(matrix: Real) -> Real:
     """Return (4n, 4k) as (n, k, 4, 4)."""
     n, k = (size // 4 for size in matrix.shape)
     return matrix.reshape(n, 4, k, 4).transpose(0, 2, 1, 3)

@@ -31,7 +31,16 @@ Real = NDArray[np.float64]
 FORMAT = "mitsuba_diffraction rigorous spectrum"
 FORMAT_VERSION = 3
 
-_NUMBERS = ("ext_ior", "coherence_length", "tolerance", "error", "worst", "worst_near", "polarisation_error")
+# Attributes, and their names in files.
+_NUMBERS = {
+    "ext_ior": "extIor",
+    "coherence_length": "coherenceLength",
+    "tolerance": "tolerance",
+    "error": "error",
+    "max_error": "worst",
+    "max_error_near": "worstNear",
+    "polarisation_error": "polarisationError",
+}
 _TEXTS = ("material", "transmission", "source", "source_digest")
 
 
@@ -76,8 +85,8 @@ class Table:
         axes = self.axes
         p, r, there = axes.coordinates(m, c, g, wavelength)
         p, r, order = (np.where(there, v, 0) for v in (p, r, m))
-        side = np.array([axes.side(k) for k in axes.orders])[order + axes.largest]
-        offset = np.array([axes.offset(k) for k in axes.orders])[order + axes.largest]
+        side = np.array([axes.side(k) for k in axes.orders])[order + axes.max_order]
+        offset = np.array([axes.offset(k) for k in axes.orders])[order + axes.max_order]
         first, last = axes.range(g)
         z = np.clip((wavelength - first) / np.maximum(last - first, 1e-9), 0, 1) * (axes.planes - 1)
         result = np.zeros((*m.shape, *table.shape[2:]))
@@ -110,8 +119,8 @@ class RigorousSpectrum:
         error: what was measured at directions (uniform over the hemisphere) and wavelengths that were not used to build
             the tables: the mean of Σ|Δη_m| / Σ η_m, the sum over all orders that leave, on either side; with
             transmission, light comes from either side.
-        worst: the largest of these, away from the lines where an order passes off (P or R within 0.02 of an integer).
-        worst_near: the largest of these near such a line.
+        max_error: the largest of these, away from the lines of Rayleigh anomalies (P or R within 0.02 of an integer).
+        max_error_near: the largest of these near such a line.
         harmonics: N of the solver.
         source: where the heights came from.
         source_digest: SHA-256 of the height field.
@@ -125,8 +134,8 @@ class RigorousSpectrum:
     coherence_length: float
     tolerance: float
     error: float
-    worst: float
-    worst_near: float
+    max_error: float
+    max_error_near: float
     harmonics: int
     source: str
     source_digest: str = field(repr=False)
@@ -176,7 +185,7 @@ class RigorousSpectrum:
     @property
     def grid(self) -> OrderGrid:
         """The orders m that any pair of directions reaches."""
-        return OrderGrid((self.axes.period, self.axes.period), (self.axes.largest, 0))
+        return OrderGrid((self.axes.period, self.axes.period), (self.axes.max_order, 0))
 
     @property
     def material_name(self) -> str:
@@ -207,9 +216,11 @@ class RigorousSpectrum:
     def digest(self) -> str:
         """SHA-256 of what a renderer needs of it: spectra that have one show the same."""
         axes = [table.axes for table in self.tables]
-        told = repr((axes, self.material, self.int_ior, self.coherence_length, self.tolerance, self.ext_ior))
+        description = repr((axes, self.material, self.int_ior, self.coherence_length, self.tolerance, self.ext_ior))
         arrays = [a for table in self.tables for a in (table.values, table.mueller) if a is not None]
-        return hashlib.sha256((told + self.transmission).encode() + b"".join(a.tobytes() for a in arrays)).hexdigest()
+        return hashlib.sha256(
+            (description + self.transmission).encode() + b"".join(a.tobytes() for a in arrays)
+        ).hexdigest()
 
     def evaluate(
         self,
@@ -300,7 +311,7 @@ class RigorousSpectrum:
             "harmonics": self.harmonics,
             "polarised": int(self.mueller is not None),
             "intIor": doubles(index.real, index.imag),
-            **{_camel(name): doubles(getattr(self, name)) for name in _NUMBERS},
+            **{key: doubles(getattr(self, name)) for name, key in _NUMBERS.items()},
             **{_camel(name): getattr(self, name) for name in _TEXTS},
             "units": "lengths and wavelengths in micrometres",
         }
@@ -339,7 +350,7 @@ class RigorousSpectrum:
                 tables=tuple(tables),
                 int_ior=index,
                 harmonics=header["harmonics"],
-                **{name: header[_camel(name)].item() for name in _NUMBERS},
+                **{name: header[key].item() for name, key in _NUMBERS.items()},
                 **{name: header[_camel(name)] for name in _TEXTS},
             )
         except KeyError as error:

@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from bsdf_support import direction, interaction, random_directions, use, vectors
+from bsdf_support import check_chi_square, direction, interaction, random_directions, use, vectors
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction import gratings
@@ -135,24 +135,7 @@ def test_samples_follow_the_density_on_both_sides(glass, side, component):
     bsdf, wi = plugin(glass), towards(35, 20, side)
     ctx = mi.BSDFContext()
     ctx.component = component
-    goes = side if component == 0 else -side
-
-    def sample(points):
-        si = interaction(wi, WAVELENGTHS, dr.width(points))
-        bs, _ = bsdf.sample(ctx, si, points.x, mi.Point2f(points.y, points.z))
-        keep = bs.pdf > 0
-        assert not dr.any(keep & (bs.wo.z * goes <= 0))
-        return dr.select(keep, mi.Vector2f(bs.wo.x, bs.wo.y), 0), dr.select(keep, mi.Float(1), 0)
-
-    def density(p):
-        z = dr.safe_sqrt(1 - dr.squared_norm(p))
-        pdf = bsdf.pdf(ctx, interaction(wi, WAVELENGTHS, dr.width(p)), mi.Vector3f(p.x, p.y, goes * z))
-        return dr.select(z > 0, pdf / z, 0)
-
-    test = mi.chi2.ChiSquareTest(
-        mi.chi2.PlanarDomain(), sample, density, sample_dim=3, sample_count=400_000, res=41, ires=64
-    )
-    assert test.run(significance_level=0.01, test_count=8, quiet=True), test.messages
+    check_chi_square(bsdf, wi, WAVELENGTHS, ctx, cases=8, side=side if component == 0 else -side)
 
 
 @pytest.mark.few(4)

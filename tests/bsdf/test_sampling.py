@@ -291,14 +291,14 @@ def test_cells_are_drawn_with_their_density_and_few_that_do_not_propagate(llvm, 
     spectrum, count, wavelength = blurred(name), 1 << 20, 0.5
     sampler = CellSampler(spectrum)
     s = direction(theta, phi)
-    incidence = Incidence.of(vectors(s), floats(1 / wavelength), mi.Float(1.0), None)
+    incidence = Incidence.of(vectors(s), mi.Float(1.0)).at(floats(wavelength))
     q = sampler.sample(incidence, *points(numbers(count)), True)
     dr.eval(q)
     q = [np.array(x) for x in q]
     spacing = [float(np.array(x).item()) for x in (sampler.spacing_x, sampler.spacing_y)]
 
     # The density at the middles of all cells; those outside of the region are told by no q that propagates.
-    middles = [np.arange(-m, m + 1) * d for m, d in zip((sampler.largest_x, sampler.largest_y), spacing, strict=True)]
+    middles = [np.arange(-m, m + 1) * d for m, d in zip((sampler.max_cell_x, sampler.max_cell_y), spacing, strict=True)]
     x, y = (axis.ravel() for axis in np.meshgrid(*middles))
     density = np.array(sampler.density(mi.Vector2f(floats(x), floats(y)), incidence, mi.Bool(True)), np.float64)
     corners = [
@@ -328,7 +328,7 @@ def test_cells_are_drawn_with_their_density_and_few_that_do_not_propagate(llvm, 
 def test_orders_are_drawn_with_their_shares_and_only_those_that_propagate(llvm, name, theta, phi):
     spectrum, count = md.precompute(SMALL[name]()), 1 << 20
     sampler = OrderSampler(spectrum)
-    incidence = Incidence.of(vectors(direction(theta, phi)), floats(1 / 0.5), mi.Float(1.0), None)
+    incidence = Incidence.of(vectors(direction(theta, phi)), mi.Float(1.0)).at(floats(0.5))
     row, column, _ = sampler.sample(incidence, *points(numbers(count)), True)
     dr.eval(row, column)
     rows, columns = spectrum.grid.shape
@@ -376,7 +376,7 @@ def test_the_probabilities_of_many_orders_sum_to_one(llvm):
     spectrum = md.precompute(md.gratings.xenopeltis(16.0))
     sampler = OrderSampler(spectrum)
     assert not sampler.restricted
-    incidence = Incidence.of(vectors((0.6, 0.0, 0.8)), floats(2.0), mi.Float(1.0), None)
+    incidence = Incidence.of(vectors((0.6, 0.0, 0.8)), mi.Float(1.0)).at(floats(0.5))
     weights = sampler.weights(incidence, mi.Bool(True))
     order = dr.arange(mi.UInt32, spectrum.grid.shape[0] * spectrum.grid.shape[1])
     np.testing.assert_allclose(dr.sum(sampler.share(order, weights, mi.Bool(True))), 1, rtol=1e-4)
@@ -392,7 +392,7 @@ def test_orders_are_drawn_where_their_lobes_are_narrow_and_apart(llvm):
 @pytest.mark.parametrize(("theta", "phi"), [(0, 0), (60, 90), (85, 250)])
 def test_nearly_all_samples_of_a_line_grating_propagate(llvm, name, theta, phi):
     s, wavelength = direction(theta, phi), 0.5
-    incidence = Incidence.of(vectors(s), floats(1 / wavelength), mi.Float(1.0), None)
+    incidence = Incidence.of(vectors(s), mi.Float(1.0)).at(floats(wavelength))
     sampler = LineSampler(blurred(name))
     q = np.array(sampler.sample(incidence, *points(numbers(1 << 16)), mi.Bool(True)))
     assert (np.hypot(*(wavelength * q + np.array(s)[:2, None])) < 1).mean() > 0.9

@@ -242,5 +242,5 @@ def test_the_renderer_reads_the_table_of_each_side():
     e = [of[side][1].at(omega[:1], wavelengths[:1] / n)[0] for side, n in ((1, 1), (-1, INDEX))]
     there, back = vectors(omega[:1]), vectors(omega[:1] * [1, 1, -1])
     for wi, wo in ((there, back), (back, there)):
-        found = energy.factor(wi, wo, mi.UnpolarizedSpectrum(float(wavelengths[0])), mi.Float(1.0), None)
+        found = energy.factor(energy.places(wi, wo, mi.Float(1.0), None), mi.Float(1 / float(wavelengths[0])))
         np.testing.assert_allclose(np.array(found).ravel(), min(e), atol=5e-4)

@@ -109,7 +109,7 @@ def test_theories_are_compared_on_one_grating(llvm):
     scalar, rigorous = compare_theories(fine, tolerance=0.5, count=1 << 10, repetitions=1)
     assert (scalar.theory, rigorous.theory) == ("scalar", "rigorous")
     assert rigorous.error < 0.05 < 0.2 < scalar.error
-    assert rigorous.worst >= rigorous.error
+    assert rigorous.max_error >= rigorous.error
     for cost in (scalar, rigorous):
         assert min(cost.build_seconds, cost.megabytes, cost.evaluate_ratio, cost.lobe_ratio, cost.sample_ratio) > 0
     assert report.cells(COLUMNS, rigorous)[0] == "rigorous"

@@ -86,6 +86,36 @@ def test_conical_incidence_agrees_with_scatmech(case):
             assert difference(ours, wanted) < bound
 
 
+@pytest.mark.parametrize(("angle", "turned", "side"), [(35, 0, 1), (35, 50, 1), (25, 0, -1), (35, 50, -1)])
+def test_transmitted_orders_of_a_lamellar_grating_agree_with_meent(angle, turned, side):
+    """Its modes are exact for vertical walls; in the plane across the grooves and conical, from both sides."""
+    meent = pytest.importorskip("meent")
+    indices, transmitted = (1.0, 1.5)[::side], []
+    for polarisation in (0.0, 1.0):
+        solver = meent.call_mee(
+            backend=0,
+            pol=polarisation,
+            n_top=indices[0],
+            n_bot=indices[1],
+            theta=np.deg2rad(angle),
+            phi=np.deg2rad(turned) if turned else None,
+            period=[1.0, 1.0],
+            wavelength=0.55,
+            thickness=[0.2],
+            ucell=np.where(np.arange(1000) < 400, 1.5, 1.0)[None, None],
+            fto=[30, 0],
+            fourier_type=0,
+        )
+        transmitted.append(solver.conv_solve().res.de_ti.ravel())
+    wanted = np.mean(transmitted, axis=0)
+    surface = gratings.lamellar(1.0, 0.2, duty=0.4, samples=4000)
+    found = rigorous.efficiencies(surface, light(angle, turned) * [1, 1, side], 0.55, int_ior=1.5, tolerance=1e-3)
+    ours = (np.abs(found.transmitted_amplitudes) ** 2).sum(axis=1).mean(axis=1)
+    assert len(ours) == (wanted > 1e-9).sum() >= 3
+    # Its order m is our −m.
+    assert difference(ours, wanted[30 - found.transmitted_orders]) < 2e-3
+
+
 SURFACES = {
     "sinusoidal": lambda: gratings.sinusoidal(0.9, 0.3),
     "blazed": lambda: gratings.blazed(0.9, 0.3),

@@ -34,7 +34,7 @@ def hemisphere(count, seed):
 
 def test_the_axes_are_symmetric_and_whole_where_orders_pass_off():
     axes = Axes(0.9, (0.36, 0.83), 8, 5)
-    assert axes.largest == 4
+    assert axes.max_order == 4
     np.testing.assert_allclose(axes.position(axes.nodes_at(17)), np.arange(17), atol=1e-6)
     assert axes.offset(-4) == 0
     assert axes.nodes == sum((int(np.ceil(5 - abs(m))) * 8 + 1) ** 2 for m in range(-4, 5))
@@ -132,7 +132,7 @@ def test_light_is_reflected_or_transmitted(glass, cosine, turn, side, wavelength
     sine = np.sqrt(1 - cosine**2)
     omega = sine * np.cos(turn), sine * np.sin(turn), side * cosine
     total = sum(glass.efficiencies(omega, wavelength, transmitted)[1].sum() for transmitted in (False, True))
-    assert total == pytest.approx(1, abs=2 * max(glass.worst, glass.worst_near))
+    assert total == pytest.approx(1, abs=2 * max(glass.max_error, glass.max_error_near))
 
 
 @settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
@@ -217,14 +217,14 @@ def test_progress_is_one_count_in_per_cent(monkeypatch):
     """Also where finer tables follow."""
     monkeypatch.setattr("mitsuba_diffraction.rigorous.build._SOLVED", (4, 5, 6))
     monkeypatch.setattr("mitsuba_diffraction.rigorous.build._CHECKS", 2)
-    told = []
+    description = []
     with pytest.warns(UserWarning, match="with 6 steps to a unit"):
         build_spectrum(
             gratings.sinusoidal(0.15, 0.03, samples=32),
             replace(REQUEST, tolerance=1e-4),
-            progress=lambda done, total: told.append((done, total)),
+            progress=lambda done, total: description.append((done, total)),
         )
-    done, total = np.transpose(told)
+    done, total = np.transpose(description)
     assert (np.diff(done) >= 0).all()
     assert len(set(done)) > 10
     assert set(total) == {100}
