@@ -20,7 +20,7 @@ from ..errors import RequestError
 _SAMPLES = 16  # per pixel, of the guides
 _RGB = (610.0, 550.0, 465.0)  # nm, at which the albedo is evaluated
 _STEPS = 100  # of the integral of the autocorrelation, per pixel
-_SMALLEST = 0.1  # √R, of filters that remove a frequency altogether
+_MIN_RESPONSE = 0.1  # √R, of filters that remove a frequency altogether
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +81,7 @@ def _response(kernel: mi.ReconstructionFilter, size: int) -> NDArray[np.float64]
     autocorrelation = np.array([h @ np.interp(x + shift, x, h, 0, 0) for shift in shifts])
     autocorrelation[1:] *= 2
     power = np.cos(np.pi * np.arange(size)[:, None] / size * shifts) @ autocorrelation
-    return np.sqrt(np.maximum(power / power[0], _SMALLEST**2))
+    return np.sqrt(np.maximum(power / power[0], _MIN_RESPONSE**2))
 
 
 def denoised(XYZ: NDArray[np.floating], guide: Guides) -> NDArray[np.float64]:
@@ -94,12 +94,10 @@ def denoised(XYZ: NDArray[np.floating], guide: Guides) -> NDArray[np.float64]:
     Returns:
         XYZ, likewise.
     """
-    import colour
     import pyoidn
 
-    # ACES primaries enclose the visible colours: no channel is negative but for noise.
-    space = colour.RGB_COLOURSPACES["ACES2065-1"]
-    white = fft.idctn(fft.dctn(XYZ @ space.matrix_XYZ_to_RGB.T, axes=(0, 1)) / guide.response, axes=(0, 1))
-    rgb = pyoidn.denoise(np.ascontiguousarray(white, np.float32), albedo=guide.albedo, normal=guide.normals, hdr=True)
-    rgb = fft.idctn(fft.dctn(rgb.astype(np.float64), axes=(0, 1)) * guide.response, axes=(0, 1))
-    return rgb @ space.matrix_RGB_to_XYZ.T
+    # No visible colour has a negative X, Y or Z. In RGB that holds them all, the luminance of violet light is a small
+    # difference of channels, which denoising loses: black pixels.
+    white = fft.idctn(fft.dctn(XYZ, axes=(0, 1)) / guide.response, axes=(0, 1))
+    found = pyoidn.denoise(np.ascontiguousarray(white, np.float32), albedo=guide.albedo, normal=guide.normals, hdr=True)
+    return fft.idctn(fft.dctn(found.astype(np.float64), axes=(0, 1)) * guide.response, axes=(0, 1))

@@ -10,6 +10,7 @@ from bsdf_support import grating, uniform, use
 from PIL import Image
 
 import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a variant is set)
+from mitsuba_diffraction.color import XYZ_to_linear_sRGB, into_gamut, matching_functions
 from mitsuba_diffraction.render.denoise import Guides, denoised, guides
 
 SCENE = """<scene version="3.0.0"><integrator type="direct"/>
@@ -72,6 +73,24 @@ def test_the_noise_of_any_reconstruction_filter_goes(rfilter, llvm):
     clean = denoised(noisy, Guides(plain, plain * np.float32([0, 0, 1]), response))
     assert np.abs(clean.mean() - 1) < 0.02
     assert (clean - 1).std() < 0.2 * (noisy - 1).std()
+
+
+@pytest.mark.parametrize("wavelength", [405.0, 435.8, 460.0, 660.0])
+def test_the_light_of_a_line_keeps_its_luminance(wavelength):
+    """Bright lines on a dim screen, in samples that are exponentially distributed, as of a lamp seen by few paths."""
+    size, samples, width = 96, 16, 8
+    rng = np.random.default_rng(1)
+    in_line = np.arange(size) // width % 3 == 0
+    line, grey = matching_functions([wavelength])[0], 1e-3 * np.ones(3)
+    brightness = np.where(in_line, rng.exponential(size=(samples, size, size)).mean(0), 0)[..., None]
+    noisy = brightness * line + rng.exponential(size=(samples, size, size)).mean(0)[..., None] * grey
+    plain = np.ones((size, size, 3), np.float32)
+    clean = denoised(noisy, Guides(plain, plain * np.float32([0, 0, 1]), np.ones((size, size, 1))))
+    shown = into_gamut(XYZ_to_linear_sRGB(clean)) @ [0.2126, 0.7152, 0.0722]
+    inside = np.roll(in_line, 2) & np.roll(in_line, -2)
+    expected = line[1] + grey[1]
+    assert shown[:, inside].min() > 0.5 * expected
+    assert shown[:, inside].mean() == pytest.approx(expected, rel=0.05)
 
 
 @pytest.mark.slow
