@@ -150,8 +150,8 @@ def into_gamut(rgb: NDArray[np.floating]) -> NDArray[np.float64]:
     rgb = np.where(np.isfinite(rgb).all(axis=-1, keepdims=True), rgb, 0.0)
     luminance = rgb @ colour.RGB_COLOURSPACES["sRGB"].matrix_RGB_to_XYZ[1]
     luminance = np.maximum(luminance, 0.0)[..., None]
-    lowest = np.minimum(rgb.min(axis=-1, keepdims=True), 0.0)
-    span = luminance - lowest
+    min_value = np.minimum(rgb.min(axis=-1, keepdims=True), 0.0)
+    span = luminance - min_value
     share = np.divide(luminance, span, out=np.zeros_like(span), where=span > 0)
     return np.maximum(luminance + share * (rgb - luminance), 0.0)
 
@@ -175,8 +175,8 @@ def roll_off(rgb: NDArray[np.floating]) -> NDArray[np.float64]:
     """
     peak = rgb.max(axis=-1, keepdims=True)
     d = 1 - _SHOULDER_START
-    beyond = np.maximum(peak - _SHOULDER_START, 0.0)
-    shown = np.where(beyond > 0, 1 - d * d / (beyond + d), peak)
+    excess = np.maximum(peak - _SHOULDER_START, 0.0)
+    shown = np.where(excess > 0, 1 - d * d / (excess + d), peak)
     scaled = rgb * np.divide(shown, peak, out=np.ones_like(peak), where=peak > 0)
     white = 1 - 1 / (_WHITENING * (peak - shown) + 1)
     return scaled + white * (shown - scaled)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -12,6 +12,9 @@ from ..errors import RequestError
 from ..outputs import free_name
 from .arguments import Define, Overwrite, Variant, check_suffix, claim, materials_of, scene_parameters
 from .console import Stopped, progress_bar, tell
+
+if TYPE_CHECKING:
+    from ..render.spectral_image import SpectralImage
 
 
 def render(
@@ -59,106 +62,120 @@ def render(
     import mitsuba as mi
 
     from ..llvm import choose_variant
-    from ..render.denoise import guides as guides_of
-    from ..render.passes import Interrupted, checkpoint_path, trace_here
-    from ..render.passes import render as trace
-    from ..render.preview import save_preview
-    from ..render.scene import files_of_scene, load_spectral_scene, named_sample_count
-    from ..render.spectral_image import SpectralImage
-    from ..render.turntable import frame_path, save_animation
+    from ..render.cluster import trace_on
+    from ..render.passes import checkpoint_path, trace_here
+    from ..render.scene import files_of_scene, named_sample_count
     from ..render.turntable import orbit as motions_of_orbit
+    from ..render.turntable import save_animation
 
     if output is not None:
         check_suffix("-o", output, ".exr")
     if (frames is not None) != orbit:
         raise RequestError("--frames N and --orbit go together")
-    parameters = scene_parameters(define)
-    materials = materials_of(material)
-    reads = files_of_scene(scene, parameters, materials)
-
-    def pictures(target: Path) -> list[Path]:
-        return [target] if frames is None else [frame_path(target, frame, frames) for frame in range(frames)]
-
-    def written(target: Path) -> list[Path]:
-        previews = [path.with_suffix(".png") for path in pictures(target)]
-        return [*pictures(target), *previews, *([] if frames is None else [target.with_suffix(".webp")])]
-
-    target = output or Path(free_name(scene.stem, lambda stem: written(Path(f"{stem}.exr")), reads) + ".exr")
-    targets, animation = pictures(target), target.with_suffix(".webp")
-    claim(context, reads, [("-o", path) for path in written(target)])
-    for path in targets:
-        if checkpoint_path(path).exists() and not resume:
-            raise RequestError(
-                f"{checkpoint_path(path)} is of an unfinished rendering: --resume continues it; remove it to start over"
-            )
-    mi.set_variant(choose_variant(variant))
-    if spp is None:
-        spp = named_sample_count(scene, parameters) or 64
-    tracer = trace_here
-    if dask is not None:
-        from ..render.cluster import trace_on
-
-        tracer = trace_on(dask)
-    motions = [None] if frames is None else motions_of_orbit(scene, frames, parameters, materials)
-
-    where = {"width": width, "height": height, "parameters": parameters, "materials": materials}
-    exposure = None
-    for number, (path, motion) in enumerate(zip(targets, motions, strict=True)):
-        start = time.perf_counter()
-        waiting = checkpoint_path(path)
-        label = scene.name if frames is None else f"{scene.name} {number + 1}/{frames}"
-        earlier = SpectralImage.load(path) if resume and path.is_file() and not waiting.exists() else None
-        guides, interrupted = None, False
-        if denoise:
-            guides = guides_of(load_spectral_scene(scene, **where, motion=motion))
-        try:
-            with progress_bar(label, "spp", "loading and compiling") as progress:
-                image = trace(
-                    scene,
-                    spp=spp,
-                    **where,
-                    seed=seed,
-                    motion=motion,
-                    until_error=until_error,
-                    checkpoint=waiting,
-                    seconds=checkpoint,
-                    finished=earlier,
-                    tracer=tracer,
-                    progress=progress,
-                )
-        except Interrupted as error:
-            image, interrupted = error.image, True
-        except KeyboardInterrupt:
-            if waiting.exists():
-                kept = f"{waiting} holds the samples so far"
-            elif number:
-                kept = f"{number} of {frames} pictures are complete"
-            else:
-                raise
-            raise Stopped(f"{kept}; the same command with --resume continues") from None
-        preview = path.with_suffix(".png")
-        try:
-            if image is not earlier:
-                image.save(path, half=half)
-            exposure = save_preview(image, preview, exposure, guides)
-        except (OSError, RuntimeError) as error:
-            kept = f"; {waiting} is kept, and --resume continues from it" if waiting.exists() else ""
-            raise RuntimeError(f"{path} or its preview cannot be written ({error}){kept}") from error
-        if interrupted:
-            spp = image.attributes["spp"]
-            raise Stopped(f"{path} holds {spp} samples per pixel; the same command with --resume continues")
-        waiting.unlink(missing_ok=True)
-        rows, columns, bins = image.radiance.shape
-        done = f"{image.attributes['spp']} samples per pixel"
-        if "error" in image.attributes:
-            done += f", relative error of luminance at most {image.attributes['error']:.2g} in 90 % of the pixels"
-            if until_error is not None and image.attributes["error"] > until_error:
-                done += f" (above {until_error:g}: increase --spp)"
-        tell(
-            f"{path}: {columns} × {rows} pixels, {bins} wavelengths, {done}, {mi.variant()}, "
-            f"{time.perf_counter() - start:.1f} s, {path.stat().st_size / 1e6:.3g} MB\n"
-            f"{preview}: preview, radiance times {exposure:.4g} (exposure)"
+    where: dict[str, Any] = {"parameters": scene_parameters(define), "materials": materials_of(material)}
+    reads = files_of_scene(scene, **where)
+    target = output or Path(free_name(scene.stem, lambda stem: _written(Path(f"{stem}.exr"), frames), reads) + ".exr")
+    claim(context, reads, [("-o", path) for path in _written(target, frames)])
+    if waiting := [path for path in map(checkpoint_path, _pictures(target, frames)) if path.exists() and not resume]:
+        raise RequestError(
+            f"{waiting[0]} is of an unfinished rendering: --resume continues it; remove it to start over"
         )
+    mi.set_variant(choose_variant(variant))
+    spp = spp or named_sample_count(scene, where["parameters"]) or 64
+    tracer = trace_here if dask is None else trace_on(dask)
+    motions = [None] if frames is None else motions_of_orbit(scene, frames, **where)
+    where |= {"width": width, "height": height}
+    request = {"spp": spp, "seed": seed, "until_error": until_error, "seconds": checkpoint, "tracer": tracer}
+    exposure = None
+    for number, (path, motion) in enumerate(zip(_pictures(target, frames), motions, strict=True)):
+        label = scene.name if frames is None else f"{scene.name} {number + 1}/{frames}"
+        complete = f"{number} of {frames} pictures are complete" if number else None
+        files = {"resume": resume, "half": half, "denoise": denoise, "complete": complete}
+        exposure = _picture(scene, path, label, exposure, where={**where, "motion": motion}, request=request, **files)
     if frames is not None:
-        save_animation([path.with_suffix(".png") for path in targets], animation)
+        animation = target.with_suffix(".webp")
+        save_animation([path.with_suffix(".png") for path in _pictures(target, frames)], animation)
         tell(f"{animation}: animated preview, {frames} frames")
+
+
+def _pictures(target: Path, frames: int | None) -> list[Path]:
+    """Return the paths of the spectral pictures: `target`, or those of its frames."""
+    from ..render.turntable import frame_path
+
+    return [target] if frames is None else [frame_path(target, frame, frames) for frame in range(frames)]
+
+
+def _written(target: Path, frames: int | None) -> list[Path]:
+    """Return everything that the command writes."""
+    pictures = _pictures(target, frames)
+    return [*pictures, *(p.with_suffix(".png") for p in pictures), *([target.with_suffix(".webp")] if frames else [])]
+
+
+def _picture(
+    scene: Path,
+    path: Path,
+    label: str,
+    exposure: float | None,
+    *,
+    where: dict[str, Any],
+    request: dict[str, Any],
+    resume: bool,
+    half: bool,
+    denoise: bool,
+    complete: str | None,
+) -> float:
+    """Render, save and report one picture; return the exposure of its preview, which None leaves to be chosen.
+
+    `where` goes to `load_spectral_scene`, and with `request` to `passes.render`; `complete` names pictures before it.
+    """
+    from ..render.denoise import guides
+    from ..render.passes import Interrupted, checkpoint_path
+    from ..render.passes import render as trace
+    from ..render.preview import save_preview
+    from ..render.scene import load_spectral_scene
+    from ..render.spectral_image import SpectralImage
+
+    start = time.perf_counter()
+    waiting, preview = checkpoint_path(path), path.with_suffix(".png")
+    earlier = SpectralImage.load(path) if resume and path.is_file() and not waiting.exists() else None
+    guide = guides(load_spectral_scene(scene, **where)) if denoise else None
+    interrupted = False
+    try:
+        with progress_bar(label, "spp", "loading and compiling") as progress:
+            image = trace(scene, **where, **request, checkpoint=waiting, finished=earlier, progress=progress)
+    except Interrupted as error:
+        image, interrupted = error.image, True
+    except KeyboardInterrupt:
+        if waiting.exists():
+            complete = f"{waiting} holds the samples so far"
+        if complete is None:
+            raise
+        raise Stopped(f"{complete}; the same command with --resume continues") from None
+    try:
+        if image is not earlier:
+            image.save(path, half=half)
+        exposure = save_preview(image, preview, exposure, guide)
+    except (OSError, RuntimeError) as error:
+        kept = f"; {waiting} is kept, and --resume continues from it" if waiting.exists() else ""
+        raise RuntimeError(f"{path} or its preview cannot be written ({error}){kept}") from error
+    if interrupted:
+        spp = image.attributes["spp"]
+        raise Stopped(f"{path} holds {spp} samples per pixel; the same command with --resume continues")
+    waiting.unlink(missing_ok=True)
+    tell(
+        f"{path}: {_summary(image, request['until_error'])}, "
+        f"{time.perf_counter() - start:.1f} s, {path.stat().st_size / 1e6:.3g} MB\n"
+        f"{preview}: preview, radiance times {exposure:.4g} (exposure)"
+    )
+    return exposure
+
+
+def _summary(image: SpectralImage, until_error: float | None) -> str:
+    """Return size, samples and noise of a picture."""
+    rows, columns, bins = image.radiance.shape
+    told = f"{columns} × {rows} pixels, {bins} wavelengths, {image.attributes['spp']} samples per pixel"
+    if "error" in image.attributes:
+        told += f", relative error of luminance at most {image.attributes['error']:.2g} in 90 % of the pixels"
+        if until_error is not None and image.attributes["error"] > until_error:
+            told += f" (above {until_error:g}: increase --spp)"
+    return f"{told}, {image.attributes['variant']}"

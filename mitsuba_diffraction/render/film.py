@@ -80,8 +80,8 @@ def samples_drawn(scene: mi.Scene, spp: int) -> int:
 def trace_with_mitsubas_film(scene: mi.Scene, integrator: mi.Integrator, spp: int, seed: int) -> NDArray[np.float32]:
     recorded = np.array(mi.render(scene, integrator=integrator, spp=spp, seed=seed))
     picture = recorded / channel_weights().astype(np.float32)
-    drawn = np.float32(samples_drawn(scene, spp))
-    return np.concatenate([picture * drawn, np.full((*picture.shape[:2], 1), drawn)], axis=-1)
+    count = np.float32(samples_drawn(scene, spp))
+    return np.concatenate([picture * count, np.full((*picture.shape[:2], 1), count)], axis=-1)
 
 
 def _trace(scene: mi.Scene, integrator: mi.SamplingIntegrator, spp: int, seed: int) -> NDArray[np.float32]:
@@ -180,9 +180,9 @@ def collect(rfilter, position, channel, value, size, border, samples, channels):
     result holds as many channels as asked for and then the filter sum of each pixel. Samples also lie in the `border`.
     """
     rows, columns = size
-    reach = int(np.ceil(rfilter.radius() - 0.5))
+    kernel_radius = int(np.ceil(rfilter.radius() - 0.5))
     box = rfilter.is_box_filter()
-    width = 2 * reach + 1
+    width = 2 * kernel_radius + 1
     pixel = dr.arange(mi.UInt32, rows * columns)
     across = dr.opaque(mi.UInt32, columns)
     y = mi.Int32(pixel // across)
@@ -195,8 +195,8 @@ def collect(rfilter, position, channel, value, size, border, samples, channels):
     weight = dr.zeros(mi.Float, rows * columns)
     tap = mi.UInt32(0)
     while tap < width * width:
-        source_y = y + mi.Int32(tap // width) - reach
-        source_x = x + mi.Int32(tap % width) - reach
+        source_y = y + mi.Int32(tap // width) - kernel_radius
+        source_x = x + mi.Int32(tap % width) - kernel_radius
         inside = (source_x >= -border) & (source_y >= -border) & (source_x < last_x) & (source_y < last_y)
         at, end = samples(mi.UInt32((source_y + border) * stride + source_x + border), inside)
         while at < end:

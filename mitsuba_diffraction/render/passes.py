@@ -20,6 +20,7 @@ from dataclasses import asdict, dataclass, fields
 from importlib import metadata
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 from zipfile import BadZipFile, ZipFile
 
 import mitsuba as mi
@@ -299,36 +300,13 @@ def render(
         Interrupted: at the end of the current pass on the first Ctrl-C, with the picture so far, after a checkpoint.
         KeyboardInterrupt: at once on the second Ctrl-C, or if no pass has been completed.
     """
-    if spp < 1:
-        raise RequestError(f"spp: got {spp}, wanted a positive number of samples per pixel")
-    if seed < 0:
-        raise RequestError(f"seed: got {seed}, wanted an integer that is not negative")
-    if until_error is not None and not 0 < until_error < 1:
-        raise RequestError(f"until_error: got {until_error}, wanted a relative error between 0 and 1, such as 0.01")
     content = {"parameters": dict(parameters or {}), "materials": dict(materials or {})}
-    scene = load_spectral_scene(scene_path, width=width, height=height, **content, motion=motion)
-    columns, rows = (int(size) for size in scene.sensors()[0].film().crop_size())
-    job = Job(
-        scene=str(Path(scene_path).resolve()),
-        width=width,
-        height=height,
-        parameters=tuple(sorted(content["parameters"].items())),
-        materials=tuple(sorted((name, tuple(values.items())) for name, values in content["materials"].items())),
-        motion=motion,
-        variant=mi.variant(),
-        seed=seed,
-        samples=split(scene, spp, 1 if until_error is None else _LEAST_PASSES_TO_CONVERGE),
-        until_error=until_error,
-        content=scene_digest(scene_path, **content),
-        versions=versions(),
-    )
+    job, scene = _job(scene_path, spp, seed, until_error, {"width": width, "height": height, "motion": motion}, content)
     if finished is not None and finished.attributes.get("digest") == job.digest():
         return finished
 
-    sums = None if checkpoint is None else load_checkpoint(checkpoint, job.digest())
-    saved = 0 if sums is None else sums.samples
-    if sums is None:
-        sums = Accumulation.empty(rows, columns, channel_wavelengths())
+    sums = _sums_so_far(checkpoint, job, scene)
+    saved = sums.samples
     ends = _judge(sums, job, progress)
     last, wait = time.monotonic(), seconds
     with _deferred_interrupt() as interrupted, closing(tracer(job, scene, sums.passes)) as traced:
@@ -343,12 +321,59 @@ def render(
                 wait = max(seconds, CHECKPOINT_SHARE * (time.monotonic() - last))
     if not sums.passes:
         raise KeyboardInterrupt
-    attributes = {"scene": Path(scene_path).name, "variant": job.variant, "spp": sums.samples, "seed": str(seed)}
+    image = _image(sums, job, Path(scene_path).name, complete=ends)
+    if not ends:
+        raise Interrupted(image)
+    return image
+
+
+def _job(
+    scene_path: str | os.PathLike[str],
+    spp: int,
+    seed: int,
+    until_error: float | None,
+    view: dict[str, Any],
+    content: dict[str, Any],
+) -> tuple[Job, mi.Scene]:
+    """Check the arguments of `render`; return its job and the scene."""
+    if spp < 1:
+        raise RequestError(f"spp: got {spp}, wanted a positive number of samples per pixel")
+    if seed < 0:
+        raise RequestError(f"seed: got {seed}, wanted an integer that is not negative")
+    if until_error is not None and not 0 < until_error < 1:
+        raise RequestError(f"until_error: got {until_error}, wanted a relative error between 0 and 1, such as 0.01")
+    scene = load_spectral_scene(scene_path, **view, **content)
+    job = Job(
+        scene=str(Path(scene_path).resolve()),
+        **view,
+        parameters=tuple(sorted(content["parameters"].items())),
+        materials=tuple(sorted((name, tuple(values.items())) for name, values in content["materials"].items())),
+        variant=mi.variant(),
+        seed=seed,
+        samples=split(scene, spp, 1 if until_error is None else _LEAST_PASSES_TO_CONVERGE),
+        until_error=until_error,
+        content=scene_digest(scene_path, **content),
+        versions=versions(),
+    )
+    return job, scene
+
+
+def _sums_so_far(checkpoint: str | os.PathLike[str] | None, job: Job, scene: mi.Scene) -> Accumulation:
+    """Return the sums of the checkpoint, or of zero passes if there is none."""
+    if checkpoint is not None and (sums := load_checkpoint(checkpoint, job.digest())) is not None:
+        return sums
+    columns, rows = (int(size) for size in scene.sensors()[0].film().crop_size())
+    return Accumulation.empty(rows, columns, channel_wavelengths())
+
+
+def _image(sums: Accumulation, job: Job, scene: str, complete: bool) -> SpectralImage:
+    """Return the picture so far; the digest of the request is that of a complete one only."""
+    attributes = {"scene": scene, "variant": job.variant, "spp": sums.samples, "seed": str(job.seed)}
     if sums.passes >= _PASSES_TO_JUDGE:
         attributes["error"] = sums.error()
-    if not ends:
-        raise Interrupted(SpectralImage(sums.wavelengths, sums.radiance(), attributes))
-    return SpectralImage(sums.wavelengths, sums.radiance(), {**attributes, "digest": job.digest()})
+    if complete:
+        attributes["digest"] = job.digest()
+    return SpectralImage(sums.wavelengths, sums.radiance(), attributes)
 
 
 def split(scene: mi.Scene, spp: int, least: int = 1) -> tuple[int, ...]:

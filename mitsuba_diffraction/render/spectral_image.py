@@ -92,9 +92,9 @@ class SpectralImage:
 
         kind = np.float16 if half else np.float32
         rgb = spectrum_to_linear_sRGB(self.radiance, self.wavelengths).astype(np.float32)
-        largest = max(float(np.abs(self.radiance).max()), float(np.abs(rgb).max()))
-        if half and largest > float(np.finfo(np.float16).max):
-            raise RequestError(f"half: got radiances up to {largest:.4g}, wanted at most 65504; float32 holds them")
+        max_value = max(float(np.abs(self.radiance).max()), float(np.abs(rgb).max()))
+        if half and max_value > float(np.finfo(np.float16).max):
+            raise RequestError(f"half: got radiances up to {max_value:.4g}, wanted at most 65504; float32 holds them")
         channels = {name: np.ascontiguousarray(rgb[..., i], kind) for i, name in enumerate("RGB")}
         for i, wavelength in enumerate(self.wavelengths):
             number = f"{wavelength:.6f}".replace(".", ",")
