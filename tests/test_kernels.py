@@ -1,0 +1,165 @@
+"""The kernels that Dr.Jit traces from the plugins: their precision and number, loops, frozen functions."""
+
+from __future__ import annotations
+
+import functools
+import re
+from collections.abc import Callable
+from itertools import pairwise
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from bsdf_support import WAVELENGTHS, made_up, of_spectrum, random_directions, spectrum, uniform
+
+import mitsuba_diffraction as md
+from mitsuba_diffraction.testing import array, direction, floats, interaction, vectors
+
+pytestmark = pytest.mark.usefixtures("llvm")
+WI = direction(25.0, 40.0)
+BLAZE = {"type": "diffraction_grating", "profile": "blazed", "period": 2.5, "depth": 0.25}
+
+
+@functools.cache
+def sample() -> md.GratingSpectrum:
+    return md.precompute(md.gratings.elaphe(8), extent="sample", coherence_length=1.5)
+
+
+GRATINGS = {
+    "tile": lambda: {**BLAZE, "material": "Al", "coat_ior": 1.5},
+    "two axes": lambda: of_spectrum(spectrum("corner"), int_ior=1.5, base={"type": "diffuse"}),
+    "sample": lambda: of_spectrum(sample()),
+    "rigorous": lambda: of_spectrum(made_up(), material="Al"),
+    "sheet": lambda: {**BLAZE, "int_ior": 1.5, "transmission": "sheet"},
+    "interface": lambda: {**BLAZE, "int_ior": 1.5, "transmission": "interface"},
+}
+
+
+def kernels(action: Callable[[], object]) -> list[dict]:
+    """The kernels that an action launches."""
+    dr.kernel_history_clear()
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        action()
+        return dr.kernel_history((dr.KernelType.JIT,))
+
+
+def both(bsdf: mi.BSDF, count: int = 256) -> tuple[np.ndarray, ...]:
+    """What is sampled; value and density of these directions."""
+    si = interaction(np.tile(WI, (count, 1)), WAVELENGTHS)
+    u = [floats(u) for u in np.random.default_rng(0).random((3, count))]
+    sampled, weight = bsdf.sample(mi.BSDFContext(), si, u[0], mi.Point2f(u[1], u[2]))
+    value, density = bsdf.eval_pdf(mi.BSDFContext(), si, sampled.wo)
+    dr.eval(sampled, weight, value, density)
+    return tuple(array(x) for x in (value, density, sampled.wo, sampled.pdf, weight))
+
+
+def scene(bsdf: dict, integrator: str = "path") -> mi.Scene:
+    """A grating under an even sky and beside a lamp, 8 × 8 pixels."""
+    look = mi.ScalarTransform4f().look_at([0, -3, 3], [0, 0, 0], [0, 0, 1])
+    lamp = {"type": "sphere", "center": [1, 1, 2], "radius": 0.3}
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": integrator, "max_depth": 3},
+            "sensor": {
+                "type": "perspective",
+                "fov": 40,
+                "to_world": look,
+                "film": {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}},
+            },
+            "sky": {"type": "constant", "radiance": uniform(1.0)},
+            "lamp": {**lamp, "emitter": {"type": "area", "radiance": uniform(5.0)}},
+            "plate": {"type": "rectangle", "bsdf": {**bsdf, "id": "grating"}},
+        }
+    )
+
+
+def without_double(history: list[dict]) -> bool:
+    code = "\n".join(kernel["ir"].getvalue() for kernel in history)
+    assert "float" in code
+    return not re.search(r"\bdouble\b", code)
+
+
+def test_double_precision_is_found_in_a_kernel():
+    x = dr.arange(mi.Float, 3)
+    assert not without_double(kernels(lambda: dr.eval(mi.Float(dr.sqrt(mi.Float64(x))))))
+
+
+@pytest.mark.few(2)
+@pytest.mark.parametrize("name", GRATINGS)
+def test_a_bsdf_computes_in_single_precision(name):
+    bsdf = mi.load_dict(GRATINGS[name]())
+    assert without_double(kernels(lambda: both(bsdf)))
+
+
+@pytest.mark.few(1)
+@pytest.mark.parametrize("integrator", ["diffraction_path", "path"])
+def test_an_integrator_computes_in_single_precision(integrator):
+    built = scene(BLAZE, integrator)
+    assert without_double(kernels(lambda: dr.eval(mi.render(built, spp=1))))
+
+
+def test_loading_a_scene_again_compiles_nothing():
+    """Nor does it add kernels, although each instance of a BSDF is another target of virtual calls."""
+    launched, compiled = [], []
+    for orientation in range(20):
+        built = scene({**BLAZE, "orientation": float(orientation), "conserve_energy": False})
+        history = kernels(lambda: dr.eval(mi.render(built, spp=1)))  # noqa: B023
+        launched.append(len(history))
+        compiled.append(sum(not kernel["cache_hit"] for kernel in history))
+    assert len(set(launched[10:])) == 1, launched
+    # Dr.Jit writes the same program in a few orders, also where nothing has changed: one for each load were ten.
+    assert sum(compiled[10:]) <= 5, compiled
+
+
+@pytest.mark.few(2)
+@pytest.mark.parametrize("name", GRATINGS)
+def test_symbolic_and_evaluated_loops_give_the_same(name):
+    bsdf = mi.load_dict(GRATINGS[name]())
+    symbolic = both(bsdf)
+    with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, False):
+        evaluated = both(bsdf)
+    assert (symbolic[0].max(axis=0) > 0).mean() > 0.9
+    for found, expected in zip(evaluated, symbolic, strict=True):
+        np.testing.assert_allclose(found, expected, rtol=2e-5, atol=1e-6 * np.abs(expected).max())
+
+
+def state_of(value: object) -> list:
+    """The arrays of Dr.Jit and the plugins that an object holds, its members' included.
+
+    `dr.freeze` looks for them in data classes and collections only, and refuses what it has not found.
+    """
+    if isinstance(value, type):
+        return []
+    if isinstance(value, dict | list | tuple):
+        return [found for item in (value.values() if isinstance(value, dict) else value) for found in state_of(item)]
+    if type(value).__module__.startswith("mitsuba_diffraction"):
+        return state_of(list(vars(value).values()) if hasattr(value, "__dict__") else [])
+    return [value] if dr.is_array_v(value) or isinstance(value, mi.Object) else []
+
+
+@pytest.mark.few(1)
+@pytest.mark.parametrize("name", ["two axes", "tile", "sample"])
+def test_a_frozen_evaluation_follows_the_parameters(name):
+    """The kernels that `dr.freeze` records have tables and numbers of the plugin among their inputs."""
+    bsdf = mi.load_dict(GRATINGS[name]())
+    parameters = mi.traverse(bsdf)
+    wo = random_directions(np.random.default_rng(2), 2000)
+    si, wo = interaction(np.tile(WI, (2000, 1)), WAVELENGTHS), vectors(wo)
+
+    @dr.freeze(state_fn=lambda bsdf, si, wo: state_of(bsdf))
+    def frozen(bsdf: mi.BSDF, si: mi.SurfaceInteraction3f, wo: mi.Vector3f) -> tuple:
+        return bsdf.eval_pdf(mi.BSDFContext(), si, wo)
+
+    values = []
+    for key, value in (("height_scale", 1.0), ("height_scale", 0.8), ("orientation.value", 90.0)):
+        parameters[key] = value
+        parameters.update()
+        found, expected = frozen(bsdf, si, wo), bsdf.eval_pdf(mi.BSDFContext(), si, wo)
+        for a, b in zip(found, expected, strict=True):
+            np.testing.assert_allclose(np.array(a), np.array(b), rtol=1e-5, atol=1e-7)
+        values.append(np.array(found[0]))
+    assert frozen.n_recordings <= 2
+    for before, after in pairwise(values):
+        assert np.abs(after - before).max() > 0.01 * before.max()
