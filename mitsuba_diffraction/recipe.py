@@ -78,6 +78,8 @@ _SCAN_KEYS = frozenset({"scan", "pixel_size", "height_range", "fill_missing", "c
 _SPECTRUM_KEYS = frozenset(f.name for f in fields(Settings))
 # Incremented when the same input gives a different result, to invalidate the cache.
 _BUILD_VERSION = 5
+# Spectra that the package brings (precompute/ready_spectra.py), named as in the cache.
+READY_SPECTRA = Path(__file__).parent / "data" / "spectra"
 _OF_HEIGHTS = 0.3  # the share of the time that the heights of many patches take, roughly
 # Mitsuba constructs plugins in parallel; two with the same recipe must not both compute its spectrum.
 _building = threading.Lock()
@@ -252,7 +254,7 @@ class Recipe:
         return content.hexdigest()
 
     def cached(self, progress: Callable[[str], AbstractContextManager[Progress]] = no_progress) -> Spectrum:
-        """Return the spectrum from the cache, or compute and cache it, within the context progress(label).
+        """Return the spectrum from the package or the cache, or compute and cache it, within progress(label).
 
         The cache is a folder of spectra named by `digest`: $MITSUBA_DIFFRACTION_CACHE, or the user's cache folder. A
         damaged entry, or one of another recipe, is replaced.
@@ -269,8 +271,9 @@ class Recipe:
 
     def _from_cache(self, digest: str, progress: Callable[[str], AbstractContextManager[Progress]]) -> Spectrum:
         path = cache_folder() / f"{digest}.exr"
-        with suppress(RequestError, OSError):
-            return load_spectrum(path, recipe=digest)
+        for known in (READY_SPECTRA / path.name, path):
+            with suppress(RequestError, OSError):
+                return load_spectrum(known, recipe=digest)
         with progress(f"spectrum of {self.surface.get('scan') or self.surface['profile']}") as report:
             return self._built(path, digest, report)
 

@@ -1,0 +1,47 @@
+"""The spectra that the package brings are those that their recipes give, and scenes take them."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mitsuba_diffraction.precomputation import load_spectrum
+from mitsuba_diffraction.recipe import READY_SPECTRA, Recipe
+from mitsuba_diffraction.render.scene import load_spectral_scene
+
+ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT / "precompute"))
+
+import ready_spectra  # noqa: E402
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name == "elaphe_afm" else pytest.mark.slow) for name in ready_spectra.NAMES]
+)
+def test_a_spectrum_of_the_package_is_what_its_recipe_gives(name, tmp_path):
+    recipe = Recipe.load(ROOT / "precompute" / f"{name}.toml")
+    kept = load_spectrum(READY_SPECTRA / f"{recipe.digest()}.exr", recipe=recipe.digest())
+    recipe.build().save(tmp_path / "built.exr")  # with its table of E
+    built = load_spectrum(tmp_path / "built.exr")
+    assert (kept.source, kept.warning) == (built.source, built.warning)
+    assert kept.error == pytest.approx(built.error, rel=1e-3)
+    q = np.random.default_rng(0).uniform(-1.5, 1.5, (4000, 2))
+    for kappa in (8.0, 15.0, 22.0):
+        found, expected = (spectrum.evaluate(q, kappa) for spectrum in (kept, built))
+        assert np.abs(found - expected).sum() < 1e-4 * expected.sum()
+    assert kept.energy.least == pytest.approx(built.energy.least, rel=1e-4)
+    assert np.abs(kept.energy.steps.astype(int) - built.energy.steps).max() <= 1
+
+
+def test_no_other_spectrum_is_in_the_package():
+    digests = {Recipe.load(ROOT / "precompute" / f"{name}.toml").digest() for name in ready_spectra.NAMES}
+    assert {path.stem for path in READY_SPECTRA.iterdir()} == digests
+
+
+@pytest.mark.parametrize("scene", ["elaphe", "xenopeltis"])
+def test_first_pictures_compute_no_spectrum(scene, tmp_path, monkeypatch, llvm):
+    monkeypatch.setenv("MITSUBA_DIFFRACTION_CACHE", str(tmp_path))
+    monkeypatch.setattr(Recipe, "build", lambda *_: pytest.fail("a spectrum was computed"))
+    load_spectral_scene(ROOT / "scenes" / f"{scene}.xml", width=4, height=4)
+    assert not list(tmp_path.iterdir())
