@@ -1,4 +1,4 @@
-"""A coiled snake, as meshes and textures for snake.xml: `python scenes/snake.py`; with `--small`, for xenopeltis.xml.
+"""A coiled snake, as meshes and textures: `python scenes/snake.py` for snake.xml, with `--small` for both coils.
 
 1. Body: a chain of nodes along the body's centre, laid down in a coil with the head on top, and let settle: it sinks,
    and nodes that are closer than their thickness push each other apart, and the body around them. A spline through the
@@ -377,8 +377,15 @@ def make(folder: Path, columns: int = 5120) -> None:
 
 
 def small(folder: Path) -> None:
-    """Writes what xenopeltis.xml reads, few triangles and texels: snake.ply, xenopeltis_normals.exr, …_turn.exr."""
-    scales(folder, "xenopeltis", body(folder / "snake.ply", 800, 28), 2560)
+    """Write what xenopeltis.xml and elaphe.xml read, few triangles and texels: files as of `make`, without eyes.
+
+    The pigment of Xenopeltis is one colour, in its scene.
+    """
+    sweep = body(folder / "snake.ply", 800, 28)
+    for name in SKINS:
+        texture = scales(folder, name, sweep, 2560)
+        if name == "elaphe":
+            write_colours(folder / "elaphe_pigment.png", pigment(name, texture)[::2, ::2])
 
 
 def body(path: Path, along: int, around: int) -> Sweep:

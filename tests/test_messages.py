@@ -55,7 +55,7 @@ def test_messages_name_what_is_available(body, parameters, words, tmp_path, llvm
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("compare scenes/elaphe.xml", "shader knows no other; choose -D light=bulb or -D light=parallel"),
+        ("compare scenes/xenopeltis_sphere.xml", "shader knows no other; choose -D light=bulb or -D light=parallel"),
         ("convergence scenes/blaze.xml -o out.png", "shader knows no other; choose -D light=bulb or -D light=parallel"),
         (
             "render scenes/rainbow.xml",
