@@ -35,8 +35,8 @@ def test_no_sample_at_grazing_incidence_weighs_more_than_twenty(theta, phi):
     assert ((weight**2).mean(1) < 3 * weight.mean(1) ** 2).all()
 
 
-@pytest.mark.few(2)
-@pytest.mark.parametrize("theta", [25, 60, 85, 88])
+@pytest.mark.few(1)
+@pytest.mark.parametrize("theta", [88, 25, 60, 85])
 def test_rigorous_grating_reflects_what_the_solver_says(theta):
     profile, wi = md.gratings.sinusoidal(0.6, 0.2), direction(theta, 0)
     spectrum = md.precompute(profile, theory="rigorous", material="Al", coherence_length=30.0, tolerance=0.02)
