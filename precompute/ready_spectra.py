@@ -1,4 +1,4 @@
-"""Computes the spectra of skins that the package brings: python precompute/ready_spectra.py
+"""Compute the spectra of skins that the package brings: python precompute/ready_spectra.py
 
 Recipes find them by their digest, as in the cache. To be repeated when a recipe or what is computed from it changes.
 """
@@ -11,15 +11,16 @@ NAMES = ("xenopeltis", "elaphe", "elaphe_afm")
 
 
 def main() -> None:
-    """Replaces the files."""
+    """Compute the files, and remove others."""
     READY_SPECTRA.mkdir(exist_ok=True)
     recipes = [Recipe.load(Path(__file__).with_name(f"{name}.toml")) for name in NAMES]
-    for old in READY_SPECTRA.glob("*.exr"):
-        old.unlink()
     for name, recipe in zip(NAMES, recipes, strict=True):
         path = READY_SPECTRA / f"{recipe.digest()}.exr"
         recipe.build().save(path, recipe=recipe.digest())
         print(f"{name}: {path.name}, {path.stat().st_size / 1e6:.2g} MB")
+    for other in READY_SPECTRA.glob("*.exr"):
+        if other.stem not in {recipe.digest() for recipe in recipes}:
+            other.unlink()
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mitsuba_diffraction.energy.table import EnergyTable
 from mitsuba_diffraction.precomputation import load_spectrum
 from mitsuba_diffraction.recipe import READY_SPECTRA, Recipe
 from mitsuba_diffraction.render.scene import load_spectral_scene
@@ -43,5 +44,6 @@ def test_no_other_spectrum_is_in_the_package():
 def test_first_pictures_compute_no_spectrum(scene, tmp_path, monkeypatch, llvm):
     monkeypatch.setenv("MITSUBA_DIFFRACTION_CACHE", str(tmp_path))
     monkeypatch.setattr(Recipe, "build", lambda *_: pytest.fail("a spectrum was computed"))
+    monkeypatch.setattr(EnergyTable, "of", lambda *_: pytest.fail("a table of E was computed"))
     load_spectral_scene(ROOT / "scenes" / f"{scene}.xml", width=4, height=4)
     assert not list(tmp_path.iterdir())

@@ -39,7 +39,7 @@ PARAMETERS = (
     Parameter(
         "lateral_scale",
         "float or texture",
-        "scales the lengths along the surface, but not the lobes, of orders that stand apart",
+        "scales the lengths along the surface, but not the lobes, of orders that do not overlap",
         "1",
     ),
     Parameter("shadowing", "string", "v_cavity or none", "v_cavity"),

@@ -141,7 +141,7 @@ class Grating:
         value, density = self._of_wavelengths(si, incidence, near, geometry, places)
         # Directions beyond the largest angle are black, but they are drawn: they have a density.
         within = smaller(*geometry.cosines()) >= self.least_cosine
-        value = dr.select(within, self.theory.weighted(value, si, geometry, active), 0)
+        value = dr.select(within, self.theory.times_reflectance(value, si, geometry, active), 0)
         if interface is not None and interface.has_flat_face:
             value *= interface.flat(wi) * interface.flat(wo)
         if self.coat is not None:
@@ -160,8 +160,8 @@ class Grating:
     ) -> tuple[mi.UnpolarizedSpectrum, mi.Float]:
         """Return f cos θ_o without R of the wavelengths that `near` has, and the sum of their densities.
 
-        Few rays have several in `near`: the first of each are evaluated together, then the second ones. A loop, whose
-        code fits into the cache of instructions; derivatives cannot pass through it.
+        Each pass evaluates one wavelength of each ray; few rays have several in `near`. A loop keeps the kernel small;
+        as Dr.Jit cannot differentiate it backwards, it is unrolled where there are gradients.
         """
         value, density = mi.UnpolarizedSpectrum(0.0), mi.Float(0.0)
         add_first = functools.partial(self._add_first, si, incidence)

@@ -139,7 +139,7 @@ class Scales:
         Args:
             wavelengths: shortest and longest of the spectrum, nm.
             index: the largest index next to the relief.
-            most: the lateral scale up to which orders stand apart; None if they do not.
+            most: the lateral scale up to which orders do not overlap; None if they do.
 
         Raises:
             ValueError: naming the wavelengths from which to build.
@@ -163,6 +163,6 @@ class Scales:
             raise RequestError(
                 f"lateral_scale: got {self.lateral}, wanted 1"
                 + ("" if most is None else f" or less than {most:.4g}")
-                + ": only of orders that stand apart the lobes keep their width (not of samples, of tiles as large as "
-                "the coherence length, nor of line gratings with a coherence length below 15 um)"
+                + ": only of orders that do not overlap the lobes keep their width (not of samples, of tiles as large "
+                "as the coherence length, nor of line gratings with a coherence length below 15 um)"
             )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import threading
 import weakref
 from collections.abc import Sequence
@@ -40,7 +41,6 @@ class SharedTables:
 
     Attributes:
         scattering: S(q; κ) and its sampler.
-        transmitted: `Interface.shares`.
     """
 
     def __init__(self, spectrum: Spectrum, eta: float | None) -> None:
@@ -50,9 +50,13 @@ class SharedTables:
             represented = OrderSpectrum if isinstance(spectrum.grid, OrderGrid) else SplineSpectrum
             self.scattering = represented(spectrum, *([] if eta is None else passing(eta)))
         self._spectrum, self._eta = spectrum, eta
-        self.transmitted = None if eta is None else FloatTable(transmitted_shares(spectrum, eta))
         self._last: tuple[float, Energy | None] | None = None
         self._lock = threading.Lock()
+
+    @functools.cached_property
+    def transmitted(self) -> FloatTable:
+        """`Interface.shares`."""
+        return FloatTable(transmitted_shares(self._spectrum, self._eta))
 
     @classmethod
     def of(cls, spectrum: Spectrum, eta: float | None = None) -> SharedTables:
@@ -133,7 +137,10 @@ class SharedTables:
 
 
 def transmitted_shares(spectrum: GratingSpectrum, eta: float) -> NDArray[np.float64]:
-    """Return T/(R + T) of light from above and from below, the mean over wavelengths, as of `Interface.shares`."""
+    """Return T/(R + T) of light from above and from below, the mean over wavelengths, as of `Interface.shares`.
+
+    Without E, and of the heights and the index that the scene begins with: another share costs noise, but no light.
+    """
     cos, place, length = np.meshgrid(
         (np.arange(COSINES) + 0.5) / COSINES, (np.arange(AZIMUTHS) + 0.5) * 4 / AZIMUTHS - 2, AVERAGED, indexing="ij"
     )

@@ -128,7 +128,7 @@ class ScalarTheory:
             scale.put(callback)
         self.material.traverse(callback)
 
-    def weighted(
+    def times_reflectance(
         self, value: mi.UnpolarizedSpectrum, si: mi.SurfaceInteraction3f, geometry: Geometry, active: mi.Bool
     ) -> mi.UnpolarizedSpectrum:
         """Return `value` times R."""
@@ -169,7 +169,7 @@ class RigorousTheory:
         interface: the media on both sides where light passes, else None.
     """
 
-    shadowing, energy = True, None  # in the efficiencies
+    shadowing, energy = True, None  # of no effect: they are in the efficiencies
 
     def __init__(self, props: mi.Properties, spectrum: RigorousSpectrum, media: Media) -> None:
         self.coat = coat = media.coat
@@ -188,7 +188,7 @@ class RigorousTheory:
     def traverse(self, callback: mi.TraversalCallback) -> None:
         """Show no parameters."""
 
-    def weighted(
+    def times_reflectance(
         self, value: mi.UnpolarizedSpectrum, si: mi.SurfaceInteraction3f, geometry: Geometry, active: mi.Bool
     ) -> mi.UnpolarizedSpectrum:
         """Return `value`."""

@@ -94,7 +94,7 @@ def _table(spectrum: Spectrum) -> str:
         return (
             f"rigorous, {spectrum.material_name}, {size}, mean error {spectrum.error:.1e} {asked}\n"
             f"worst error {spectrum.max_error:.1e} of the reflected light, {spectrum.max_error_near:.1e} beside an "
-            "order that passes off"
+            "order at its Rayleigh anomaly"
             + ("" if spectrum.mueller is None else f"; Mueller matrices, mean {spectrum.polarisation_error:.1e}")
         )
     scatter = f", standard error of one scan {spectrum.standard_error:.2g}" if spectrum.extent == "sample" else ""
@@ -114,13 +114,13 @@ def _seam(source: Path, recipe: Recipe) -> str:
     if source.suffix.lower() == ".toml" or "extent" in recipe.spectrum:
         return ""
     steps = seam_steps(recipe.height_field())
-    description = " and ".join(
+    seam = " and ".join(
         f"{across * 1e3:.3g} nm along {axis} ({inside * 1e3:.3g} inside)" for axis, (across, inside) in steps.items()
     )
     if seam_matters(steps):
         raise RequestError(
-            f"--extent: got none, and {source} does not tile without a seam: r.m.s. steps of {description}; wanted "
+            f"--extent: got none, and {source} does not tile without a seam: r.m.s. steps of {seam}; wanted "
             "--extent sample (a sample of an irregular surface), --extent tile (periodic, in spite of the seam), or "
             "--prepare crop_periods (a grating, cropped to whole periods)"
         )
-    return f"\nrepeated as a tile; r.m.s. steps at the seam {description}" if description else ""
+    return f"\nrepeated as a tile; r.m.s. steps at the seam {seam}" if seam else ""

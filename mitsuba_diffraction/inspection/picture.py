@@ -214,7 +214,7 @@ def _facts(axes: Axes, inspection: Inspection) -> None:
     if not inspection.periods:
         lines.append(("period", "none stands out"))
     if inspection.extent == "sample":
-        lines.append(("carries coherence of", f"{inspection.max_coherence_length:.3g} µm"))
+        lines.append(("coherence length at most", f"{inspection.max_coherence_length:.3g} µm"))
     y = 0.95
     for name, value in lines:
         axes.text(0.0, y, name, fontsize=11.5, color="0.3", va="center", transform=axes.transAxes)

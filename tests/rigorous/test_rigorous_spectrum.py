@@ -217,14 +217,14 @@ def test_progress_is_one_count_in_per_cent(monkeypatch):
     """Also where finer tables follow."""
     monkeypatch.setattr("mitsuba_diffraction.rigorous.build._SOLVED", (4, 5, 6))
     monkeypatch.setattr("mitsuba_diffraction.rigorous.build._CHECKS", 2)
-    description = []
+    reports = []
     with pytest.warns(UserWarning, match="with 6 steps to a unit"):
         build_spectrum(
             gratings.sinusoidal(0.15, 0.03, samples=32),
             replace(REQUEST, tolerance=1e-4),
-            progress=lambda done, total: description.append((done, total)),
+            progress=lambda done, total: reports.append((done, total)),
         )
-    done, total = np.transpose(description)
+    done, total = np.transpose(reports)
     assert (np.diff(done) >= 0).all()
     assert len(set(done)) > 10
     assert set(total) == {100}
