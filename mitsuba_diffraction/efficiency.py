@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from . import rigorous
-from .errors import RequestError
+from .errors import RequestError, is_number
 from .files import whole_file
 from .outputs import made_for, metadata
 from .progress import Progress, silent
@@ -220,11 +220,13 @@ def efficiencies(
     Warns:
         UserWarning: as `rigorous.efficiencies`.
     """
+    if not isinstance(height_field, HeightField):
+        raise RequestError(f"height_field: got {type(height_field).__name__}, wanted a HeightField")
     angles = _numbers("angles", angles, "degrees above −90 and below 90", -90.0, 90.0)
     wavelengths = _numbers("wavelengths", wavelengths, "nm from 10 to 100000 (100 µm)", 9.999, 100_000.001)
     if theory not in THEORIES:
         raise RequestError(f"theory: got {theory!r}, wanted one of {', '.join(THEORIES)}")
-    if not np.isfinite(azimuth):
+    if not is_number(azimuth) or not np.isfinite(azimuth):
         raise RequestError(f"azimuth: got {azimuth!r}, wanted degrees")
     if material is None and int_ior is None:
         int_ior = 1.5
@@ -236,7 +238,7 @@ def efficiencies(
     for step, (a, w) in enumerate(np.ndindex(len(angles), len(wavelengths)), 1):
         wavelength, index = float(wavelengths[w]) * 1e-3, complex("inf")
         if theory == "rigorous" or material != "none" or int_ior is not None:
-            index = refractive_index(wavelength, int_ior=int_ior, material=material)
+            index = refractive_index(wavelength, int_ior=int_ior, material=material, known=True)
         for m, *pair in zip(*solve(float(angles[a]), wavelength, index), strict=True):
             of_order = found.setdefault(tuple(np.atleast_1d(m).tolist()), np.zeros((len(angles), len(wavelengths), 2)))
             of_order[a, w] = pair

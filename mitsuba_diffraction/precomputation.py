@@ -80,12 +80,14 @@ def precompute(
         transmission=transmission,
     )
     patches = (height_field,) if isinstance(height_field, HeightField) else tuple(height_field)
+    if not all(isinstance(patch, HeightField) for patch in patches):
+        raise RequestError(f"height_field: got {type(height_field).__name__}, wanted a HeightField or several")
     _check_patches(patches, extent)
     height_range = max(patch.height_range for patch in patches)
     if height_range > largest_height_range:
         raise RequestError(
             f"heights: got a range of {height_range:.4g} µm, wanted at most {largest_height_range:g}: are "
-            "these nanometres? If the surface is so deep, raise largest_height_range"
+            "these nanometres? If the surface is so deep, raise largest_height_range of `precompute`"
         )
     if theory == "scalar":
         return GratingSpectrum(**vars(scalar.build_spectrum(patches, settings, progress)))

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from .errors import RequestError, is_number
 
+SHORTEST_WAVELENGTH = 50.0  # nm, of a spectrum
 VISIBLE = (360.0, 830.0)  # nm: the range of the CIE 1931 observer, from which Mitsuba draws wavelengths
 
 
@@ -92,9 +93,10 @@ class Settings:
             shortest, longest = (float(w) for w in self.wavelengths)
         except (TypeError, ValueError, OverflowError):
             raise RequestError(f"wavelengths: got {self.wavelengths!r}, wanted (shortest, longest) in nm") from None
-        if not 50 <= shortest < longest < math.inf:
+        if not SHORTEST_WAVELENGTH <= shortest < longest < math.inf:
             raise RequestError(
-                f"wavelengths: got {self.wavelengths!r}, wanted (shortest, longest) in nm, at least 50 nm"
+                f"wavelengths: got {self.wavelengths!r}, wanted (shortest, longest) in nm, at least "
+                f"{SHORTEST_WAVELENGTH:g} nm"
             )
         object.__setattr__(self, "wavelengths", (shortest, longest))
         if not 0 < self.largest_angle <= 90:

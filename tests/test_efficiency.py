@@ -111,6 +111,9 @@ def test_axes_name_what_values_hold():
         ({"material": "Al", "int_ior": 1.5}, "wanted one of the two"),
         ({"height_field": md.HeightField(np.eye(64), 0.5)}, "about 20106 orders of a tile of 32 × 32 µm at 400 nm"),
         ({"azimuth": float("nan")}, "azimuth: got nan"),
+        ({"azimuth": "x"}, "azimuth: got 'x'"),
+        ({"material": "Al", "wavelengths": 1550}, "got 'Al' at 1550 nm, wanted a wavelength from 298.8 to 885.6 nm"),
+        ({"height_field": np.eye(4)}, "height_field: got ndarray, wanted a HeightField"),
     ],
 )
 def test_a_wrong_request_is_refused(arguments, message):

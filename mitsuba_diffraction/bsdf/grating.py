@@ -14,7 +14,7 @@ from .energy import Place
 from .geometry import Geometry, Incidence, turned
 from .media import Media
 from .polarisation import reflected, through_layer
-from .scales import Scales
+from .scales import Scales, check_texture
 from .surface import surface_from, warn_of_range
 from .tables import BELOW_ONE, larger, limited, opaque, smaller
 from .theories import RigorousTheory, ScalarTheory
@@ -53,6 +53,7 @@ class Grating:
         if isinstance(angle, float) and not np.isfinite(angle):
             raise RequestError(f"orientation: got {angle}, wanted degrees or a texture")
         self.orientation = props.get_texture("orientation", 0.0)
+        check_texture("orientation", self.orientation)
         # The spectrum says nothing beyond its largest angle: there the grating is black.
         self.least_cosine = opaque(np.cos(np.deg2rad(self.spectrum.largest_angle)) * (1 - 1e-6))
 

@@ -47,6 +47,7 @@ class Scale:
         """
         found = [self.value]
         if self.varies:
+            check_texture(self.name, self.value)
             parameters = mi.traverse(self.value)
             found = [parameters[key] for key in parameters.keys() if key.split(".")[-1] != "to_uv"]  # noqa: SIM118
             known = all(key.split(".")[-1] in ("data", "value", "to_uv") for key in parameters.keys())  # noqa: SIM118
@@ -87,6 +88,23 @@ class Scale:
     def __str__(self) -> str:
         low, high = self.values[[0, -1]]
         return f"{low:.6g} to {high:.6g}" if self.varies else str(self.value)
+
+
+def check_texture(name: str, texture: mi.Texture) -> None:
+    """Check the values of a bitmap that stands for a number.
+
+    Raises:
+        ValueError: if some are not finite, or they are colours.
+    """
+    parameters = mi.traverse(texture)
+    if "data" not in parameters:
+        return
+    if not np.isfinite(np.array(dr.detach(parameters["data"]))).all():
+        raise RequestError(f"{name}: got values that are not finite, wanted numbers")
+    try:
+        texture.eval_1(dr.zeros(mi.SurfaceInteraction3f))
+    except RuntimeError:
+        raise RequestError(f"{name}: got a picture in colour, wanted numbers: set its parameter raw to true") from None
 
 
 class Scales:

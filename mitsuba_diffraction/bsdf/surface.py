@@ -17,10 +17,10 @@ from ..precomputation import Spectrum, load_spectrum
 from ..progress import progress_bar
 from ..recipe import Recipe
 from ..rigorous.spectrum import RigorousSpectrum
-from ..settings import THEORIES, VISIBLE
+from ..settings import SHORTEST_WAVELENGTH, THEORIES, VISIBLE
 from ..surface.gratings import COHERENCE_LENGTHS, PROFILES
 from .media import Media
-from .theories import check_transmission, settings_from, settings_of_medium
+from .theories import check_transmission, refuse_scalar_only, settings_from, settings_of_medium
 
 _log = logging.getLogger(__name__)
 _per_cent = functools.partial(progress_bar, unit="%")
@@ -69,6 +69,8 @@ def surface_from(props: mi.Properties, media: Media, scale: float = 1.0) -> tupl
     settings = {"coherence_length": COHERENCE_LENGTHS[name]} if name in COHERENCE_LENGTHS else {}
     settings |= {key: props[key] for key in ("coherence_length", "tolerance", "largest_height_range") if key in props}
     if theory == "rigorous":
+        # Before the table is computed, which takes minutes.
+        refuse_scalar_only(props)
         settings |= {"theory": theory, **settings_from(props, media.coat)}
     recipe = _inside(media, scale, Recipe(surface, settings))
     return recipe.cached(_per_cent), recipe
@@ -88,6 +90,9 @@ def _inside(media: Media, scale: float, recipe: Recipe) -> Recipe:
     A larger `scale` of lengths needs shorter ones, too.
     """
     inside = {}
+    if VISIBLE[0] / (media.index * scale) < SHORTEST_WAVELENGTH:
+        most = VISIBLE[0] / (media.index * SHORTEST_WAVELENGTH)
+        raise RequestError(f"height_scale, lateral_scale: got up to {scale:g}, wanted at most {most:.3g}")
     rigorous = recipe.spectrum.get("theory") == "rigorous"
     if media.index * scale > 1 and "wavelengths" not in recipe.spectrum and not (rigorous and media.coat is None):
         inside["wavelengths"] = [VISIBLE[0] / (media.index * scale), VISIBLE[1] / media.index]

@@ -232,6 +232,19 @@ def check_transmission(of_spectrum: str, media: Media) -> None:
         )
 
 
+def refuse_scalar_only(props: mi.Properties) -> None:
+    """Refuse parameters that rigorous theory does not have.
+
+    Raises:
+        ValueError: if one is given.
+    """
+    for name, advice in _SCALAR_ONLY.items():
+        if name in props:
+            texture = isinstance(props[name], mi.Texture)
+            got = "a BSDF" if name == "base" else "a texture" if texture else repr(props[name])
+            raise RequestError(f"{name}: got {got}, wanted none with theory=rigorous: {advice}")
+
+
 def check_parameters(props: mi.Properties, spectrum: RigorousSpectrum, coat: Coat | None) -> InEfficiencies:
     """What a scene says beside a rigorous spectrum.
 
@@ -244,16 +257,7 @@ def check_parameters(props: mi.Properties, spectrum: RigorousSpectrum, coat: Coa
             f"theory: got a rigorous spectrum of unpolarised light in the variant {mi.variant()}, wanted one that was "
             "built with polarised=True"
         )
-    for name, advice in _SCALAR_ONLY.items():
-        if name in props:
-            got = (
-                "a BSDF"
-                if name == "base"
-                else "a texture"
-                if isinstance(props[name], mi.Texture)
-                else repr(props[name])
-            )
-            raise RequestError(f"{name}: got {got}, wanted none with theory=rigorous: {advice}")
+    refuse_scalar_only(props)
     medium = 1.0 if coat is None else coat.relative
     if abs(spectrum.ext_ior - medium) > 1e-3 * medium:
         raise RequestError(

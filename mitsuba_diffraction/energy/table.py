@@ -391,7 +391,8 @@ def _line_corners(furnace: Furnace, layout: Layout) -> tuple[NDArray[np.float64]
         share = np.minimum(share, np.where(at(inside, j, i), at(e, j, i) / np.maximum(got, 1e-30), 1))
     result = result * share[..., None]
     lost = (1 - result.mean(-1) / at(e, 1, 1))[:, at(inside, 1, 1)]
-    return result[None], [(float(lost.mean()), float(lost.max()))]
+    # So short a period has no cell: the only order is the mirror direction's.
+    return result[None], [(float(lost.mean()), float(lost.max())) if lost.size else (0.0, 0.0)]
 
 
 def _general_corners(furnace: Furnace, layout: Layout) -> tuple[NDArray[np.float64], list[tuple[float, float]]]:

@@ -172,7 +172,7 @@ def efficiencies(
     """
     if not (np.isfinite(wavelength) and 0.01 <= wavelength <= 100):
         raise RequestError(f"wavelength: got {wavelength!r}, wanted µm, from 0.01 to 100")
-    index = refractive_index(wavelength, int_ior=int_ior, material=material)
+    index = refractive_index(wavelength, int_ior=int_ior, material=material, known=True)
     omega = np.asarray(direction, np.float64)
     length = np.linalg.norm(omega)
     if omega.shape != (3,) or not (np.isfinite(length) and length > 0 and omega[2] != 0):

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RequestError
+from ..settings import VISIBLE
 
 _SYMBOLS = {
     **{"aluminium": "Al", "aluminum": "Al", "beryllium": "Be", "chrome": "Cr", "chromium": "Cr", "copper": "Cu"},
@@ -20,7 +21,9 @@ _SYMBOLS = {
 }
 
 
-def refractive_index(wavelength: float, *, int_ior: complex | None = None, material: str | None = None) -> complex:
+def refractive_index(
+    wavelength: float, *, int_ior: complex | None = None, material: str | None = None, known: bool = False
+) -> complex:
     """Return n + ik of what lies below a surface.
 
     Args:
@@ -28,6 +31,7 @@ def refractive_index(wavelength: float, *, int_ior: complex | None = None, mater
         int_ior: of a dielectric, or n + ik.
         material: a conductor by Mitsuba's name ("Al", "Au", …): the tables that come with Mitsuba, linear between their
             wavelengths and constant beyond them, are read without loading it.
+        known: refuse infrared and ultraviolet wavelengths beyond a table.
 
     Raises:
         ValueError: if not exactly one of `int_ior` and `material` is given, or it is unknown or out of range.
@@ -41,6 +45,12 @@ def refractive_index(wavelength: float, *, int_ior: complex | None = None, mater
         return number
     data = Path(str(metadata.distribution("mitsuba").locate_file("mitsuba/data/ior")))
     wavelengths, n, k = conductor(material, data)
+    shortest, longest = min(wavelengths[0], VISIBLE[0] * 1e-3), max(wavelengths[-1], VISIBLE[1] * 1e-3)
+    if known and not shortest * (1 - 1e-6) <= wavelength <= longest * (1 + 1e-6):
+        raise RequestError(
+            f"material: got {material!r} at {wavelength * 1e3:g} nm, wanted a wavelength from {shortest * 1e3:.4g} to "
+            f"{longest * 1e3:.4g} nm: there its index is known; elsewhere give n + ik as int_ior"
+        )
     return complex(np.interp(wavelength, wavelengths, n), np.interp(wavelength, wavelengths, k))
 
 

@@ -224,6 +224,11 @@ def test_variant_without_wavelengths_is_refused():
         mi.load_dict({"type": "diffraction_grating", "profile": "blazed", "period": 2.5, "depth": 0.25})
 
 
+def bitmap(values):
+    """A texture; of numbers if it has one channel."""
+    return {"type": "bitmap", "bitmap": mi.Bitmap(np.float32(values)), "raw": values.shape[2] == 1}
+
+
 @pytest.mark.parametrize(
     ("parameters", "text"),
     [
@@ -239,11 +244,29 @@ def test_variant_without_wavelengths_is_refused():
         ({"int_ior": np.nan}, "int_ior: got nan"),
         ({"ext_ior": np.inf}, "ext_ior: got inf"),
         ({"orientation": np.nan}, "orientation: got nan"),
+        ({"orientation": np.full((8, 8, 1), np.nan)}, "orientation: got values that are not finite"),
+        ({"orientation": np.full((8, 8, 3), 0.5)}, "orientation: got a picture in colour"),
+        ({"height_scale": np.full((8, 8, 3), 0.5)}, "height_scale: got a picture in colour"),
     ],
 )
 def test_mistakes_are_refused(llvm, parameters, text):
+    parameters = {name: bitmap(value) if isinstance(value, np.ndarray) else value for name, value in parameters.items()}
     with pytest.raises((RuntimeError, ValueError), match=text):
         mi.load_dict({"type": "diffraction_grating", "spectrum": spectrum("blazed"), **parameters})
+
+
+def test_what_rigorous_theory_lacks_is_refused_before_a_table_is_computed(llvm, monkeypatch):
+    monkeypatch.setattr("mitsuba_diffraction.recipe.Recipe.cached", lambda *_: pytest.fail("a table was computed"))
+    with pytest.raises(RuntimeError, match=r"height_scale: got 0\.5, wanted none with theory=rigorous"):
+        mi.load_dict(
+            {"type": "diffraction_grating", "profile": "blazed", "theory": "rigorous", "material": "Al"}
+            | {"height_scale": 0.5}
+        )
+
+
+def test_scales_beyond_any_spectrum_are_named(llvm):
+    with pytest.raises(RuntimeError, match=r"height_scale, lateral_scale: got up to 1000, wanted at most 7\.2"):
+        mi.load_dict({"type": "diffraction_grating", "profile": "blazed", "height_scale": 1000.0})
 
 
 def test_constructors_leave_the_file_resolver_alone(llvm, monkeypatch):

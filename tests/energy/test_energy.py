@@ -206,6 +206,13 @@ def test_a_flat_surface_is_unchanged_away_from_the_horizon():
         assert e.min() > 0.985
 
 
+def test_a_period_far_below_the_wavelength_needs_no_energy_factor():
+    relief = 0.1 * np.sin(np.linspace(0, 2 * np.pi, 64, endpoint=False))
+    table = md.precompute(md.HeightField(relief[None], 1e-6)).energy_table()
+    assert table.least > 0.99
+    assert table.loss == (0, 0)
+
+
 @pytest.mark.few(1)
 @pytest.mark.parametrize("name", ["deep blazed", "crossed"])
 def test_the_energy_factor_is_reciprocal(name):
