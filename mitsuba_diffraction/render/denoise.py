@@ -94,10 +94,15 @@ def denoised(XYZ: NDArray[np.floating], guide: Guides) -> NDArray[np.float64]:
     Returns:
         XYZ, likewise.
     """
+    import colour
     import pyoidn
 
     # No visible colour has a negative X, Y or Z. In RGB that holds them all, the luminance of violet light is a small
     # difference of channels, which denoising loses: black pixels.
-    white = fft.idctn(fft.dctn(XYZ, axes=(0, 1)) / guide.response, axes=(0, 1))
-    found = pyoidn.denoise(np.ascontiguousarray(white, np.float32), albedo=guide.albedo, normal=guide.normals, hdr=True)
-    return fft.idctn(fft.dctn(found.astype(np.float64), axes=(0, 1)) * guide.response, axes=(0, 1))
+    to_XYZ = colour.RGB_COLOURSPACES["sRGB"].matrix_RGB_to_XYZ
+    white = to_XYZ.sum(1)  # so that grey has equal channels
+    albedo = np.ascontiguousarray(guide.albedo @ (to_XYZ.T / white), np.float32)
+    uncorrelated = fft.idctn(fft.dctn(XYZ / white, axes=(0, 1)) / guide.response, axes=(0, 1))
+    noisy = np.ascontiguousarray(uncorrelated, np.float32)
+    found = pyoidn.denoise(noisy, albedo=albedo, normal=guide.normals, hdr=True)
+    return fft.idctn(fft.dctn(found.astype(np.float64), axes=(0, 1)) * guide.response, axes=(0, 1)) * white
