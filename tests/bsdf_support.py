@@ -153,3 +153,9 @@ def through(cosine, index=1.5):
     t = np.sqrt(1 - (1 - cosine**2) / index**2)
     s, p = (cosine - index * t) / (cosine + index * t), (index * cosine - t) / (index * cosine + t)
     return 1 - (s**2 + p**2) / 2
+
+
+def bitmap(values, **parameters):
+    """A texture with these values as they are: 32 bits, not 16, and numbers, not colours."""
+    exact = {"raw": True, "format": "variant"}
+    return {"type": "bitmap", "bitmap": mi.Bitmap(np.atleast_3d(np.float32(values))), **exact, **parameters}

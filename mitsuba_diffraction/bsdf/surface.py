@@ -54,9 +54,7 @@ def surface_from(props: mi.Properties, media: Media, scale: float = 1.0) -> tupl
         if given == ["spectrum"]:
             spectrum, recipe = _taken_over(props["spectrum"]), None
         else:
-            spectrum, recipe = _from_file(
-                Path(str(mi.file_resolver().resolve(str(props["filename"])))), media, scale, props.get("tolerance")
-            )
+            spectrum, recipe = _from_file(props, media, scale)
         found = "rigorous" if isinstance(spectrum, RigorousSpectrum) else "scalar"
         if props.get("theory", found) != found:
             raise RequestError(f"theory: got {theory!r} with a spectrum of {found} theory, wanted one built for it")
@@ -69,10 +67,8 @@ def surface_from(props: mi.Properties, media: Media, scale: float = 1.0) -> tupl
     settings = {"coherence_length": COHERENCE_LENGTHS[name]} if name in COHERENCE_LENGTHS else {}
     settings |= {key: props[key] for key in ("coherence_length", "tolerance", "largest_height_range") if key in props}
     if theory == "rigorous":
-        # Before the table is computed, which takes minutes.
-        refuse_scalar_only(props)
         settings |= {"theory": theory, **settings_from(props, media.coat)}
-    recipe = _inside(media, scale, Recipe(surface, settings))
+    recipe = _inside(props, media, scale, Recipe(surface, settings))
     return recipe.cached(_per_cent), recipe
 
 
@@ -84,10 +80,11 @@ def warn_of_range(spectrum: GratingSpectrum) -> None:
         _log.warning("%s", message)
 
 
-def _inside(media: Media, scale: float, recipe: Recipe) -> Recipe:
+def _inside(props: mi.Properties, media: Media, scale: float, recipe: Recipe) -> Recipe:
     """Return the recipe for the wavelengths next to the relief, and, of rigorous theory, for the variant.
 
-    A larger `scale` of lengths needs shorter ones, too.
+    A larger `scale` of lengths needs shorter ones, too. What the scene must not say is refused here, before a table is
+    computed.
     """
     inside = {}
     if VISIBLE[0] / (media.index * scale) < SHORTEST_WAVELENGTH:
@@ -97,12 +94,14 @@ def _inside(media: Media, scale: float, recipe: Recipe) -> Recipe:
     if media.index * scale > 1 and "wavelengths" not in recipe.spectrum and not (rigorous and media.coat is None):
         inside["wavelengths"] = [VISIBLE[0] / (media.index * scale), VISIBLE[1] / media.index]
     if rigorous:
+        refuse_scalar_only(props)
         check_transmission(recipe.spectrum.get("transmission", media.transmission), media)
         inside |= settings_of_medium(media)
     return Recipe(recipe.surface, {**recipe.spectrum, **inside}, recipe.folder) if inside else recipe
 
 
-def _from_file(path: Path, media: Media, scale: float, tolerance: float | None) -> tuple[Spectrum, Recipe | None]:
+def _from_file(props: mi.Properties, media: Media, scale: float) -> tuple[Spectrum, Recipe | None]:
+    path, tolerance = Path(str(mi.file_resolver().resolve(str(props["filename"])))), props.get("tolerance")
     suffix = path.suffix.lower()
     if suffix in (".toml", ".exr") and not path.is_file():
         # What is not found stays relative; the folder of a scene is searched first.
@@ -110,7 +109,7 @@ def _from_file(path: Path, media: Media, scale: float, tolerance: float | None) 
         there = sorted(other.name for other in folder.glob("*") if other.suffix.lower() in (".exr", ".toml"))
         raise FileNotFoundError(f"{path}: no such file; {folder} holds {', '.join(there) or 'no spectrum'}")
     if suffix == ".toml":
-        recipe = _inside(media, scale, Recipe.load(path))
+        recipe = _inside(props, media, scale, Recipe.load(path))
         if tolerance is not None:
             recipe = dataclasses.replace(recipe, spectrum={**recipe.spectrum, "tolerance": tolerance})
         return recipe.cached(_per_cent), recipe

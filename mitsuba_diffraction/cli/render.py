@@ -173,9 +173,9 @@ def _picture(
 def _summary(image: SpectralImage, until_error: float | None) -> str:
     """Return size, samples and noise of a picture."""
     rows, columns, bins = image.radiance.shape
-    told = f"{columns} × {rows} pixels, {bins} wavelengths, {image.attributes['spp']} samples per pixel"
+    text = f"{columns} × {rows} pixels, {bins} wavelengths, {image.attributes['spp']} samples per pixel"
     if "error" in image.attributes:
-        told += f", relative error of luminance at most {image.attributes['error']:.2g} in 90 % of the pixels"
+        text += f", relative error of luminance at most {image.attributes['error']:.2g} in 90 % of the pixels"
         if until_error is not None and image.attributes["error"] > until_error:
-            told += f" (above {until_error:g}: increase --spp)"
-    return f"{told}, {image.attributes['variant']}"
+            text += f" (above {until_error:g}: increase --spp)"
+    return f"{text}, {image.attributes['variant']}"

@@ -8,6 +8,7 @@ from bsdf_support import (
     WAVELENGTHS,
     albedo,
     array,
+    bitmap,
     check_chi_square,
     direction,
     draw,
@@ -30,14 +31,14 @@ SMOOTH = {
         "type": "diffuse",
         "reflectance": {"type": "checkerboard", "color0": uniform(0.1), "color1": uniform(0.9)},
     },
-    "bitmap": lambda: {"type": "diffuse", "reflectance": bitmap(np.random.default_rng(1).random((4, 4, 3)))},
+    "bitmap": lambda: {"type": "diffuse", "reflectance": bitmap(np.random.default_rng(1).random((4, 4, 3)), raw=False)},
     "roughplastic": lambda: {"type": "roughplastic", "alpha": 0.2, "diffuse_reflectance": uniform(0.4)},
     "principled": lambda: {"type": "principled", "base_color": uniform(0.6), "roughness": 0.4, "metallic": 0.3},
     "roughconductor": lambda: ROUGH,
     "blendbsdf": lambda: {"type": "blendbsdf", "weight": 0.3, "first": DIFFUSE, "second": ROUGH},
     "bumpmap": lambda: {
         "type": "bumpmap",
-        "texture": bitmap(np.random.default_rng(2).random((8, 8, 1)), raw=True),
+        "texture": bitmap(np.random.default_rng(2).random((8, 8, 1))),
         "scale": 0.05,
         "nested": DIFFUSE,
     },
@@ -48,10 +49,6 @@ MIRRORS = {
     "conductor": lambda: {"type": "conductor", "material": "Al"},
     "plastic": lambda: {"type": "plastic", "diffuse_reflectance": uniform(0.5)},
 }
-
-
-def bitmap(values, raw=False):
-    return {"type": "bitmap", "bitmap": mi.Bitmap(values.astype(np.float32)), "raw": raw}
 
 
 def over(base, name="blazed", coherence_length=3.0):

@@ -6,7 +6,17 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from bsdf_support import WAVELENGTHS, check_chi_square, direction, floats, interaction, plugin, random_directions, use
+from bsdf_support import (
+    WAVELENGTHS,
+    bitmap,
+    check_chi_square,
+    direction,
+    floats,
+    interaction,
+    plugin,
+    random_directions,
+    use,
+)
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction.settings import lobe_width
@@ -224,11 +234,6 @@ def test_variant_without_wavelengths_is_refused():
         mi.load_dict({"type": "diffraction_grating", "profile": "blazed", "period": 2.5, "depth": 0.25})
 
 
-def bitmap(values):
-    """A texture; of numbers if it has one channel."""
-    return {"type": "bitmap", "bitmap": mi.Bitmap(np.float32(values)), "raw": values.shape[2] == 1}
-
-
 @pytest.mark.parametrize(
     ("parameters", "text"),
     [
@@ -250,18 +255,23 @@ def bitmap(values):
     ],
 )
 def test_mistakes_are_refused(llvm, parameters, text):
-    parameters = {name: bitmap(value) if isinstance(value, np.ndarray) else value for name, value in parameters.items()}
+    parameters = {
+        name: bitmap(value, raw=value.shape[2] == 1) if isinstance(value, np.ndarray) else value
+        for name, value in parameters.items()
+    }
     with pytest.raises((RuntimeError, ValueError), match=text):
         mi.load_dict({"type": "diffraction_grating", "spectrum": spectrum("blazed"), **parameters})
 
 
-def test_what_rigorous_theory_lacks_is_refused_before_a_table_is_computed(llvm, monkeypatch):
+@pytest.mark.parametrize("source", ["profile", "recipe"])
+def test_what_rigorous_theory_lacks_is_refused_before_a_table_is_computed(llvm, monkeypatch, tmp_path, source):
     monkeypatch.setattr("mitsuba_diffraction.recipe.Recipe.cached", lambda *_: pytest.fail("a table was computed"))
+    recipe = tmp_path / "blazed.toml"
+    recipe.write_text('[surface]\nprofile = "blazed"\n[spectrum]\ntheory = "rigorous"\nmaterial = "Al"\n')
+    of = {"profile": "blazed", "theory": "rigorous", "material": "Al"}
+    of = of if source == "profile" else {"filename": str(recipe), "material": "Al"}
     with pytest.raises(RuntimeError, match=r"height_scale: got 0\.5, wanted none with theory=rigorous"):
-        mi.load_dict(
-            {"type": "diffraction_grating", "profile": "blazed", "theory": "rigorous", "material": "Al"}
-            | {"height_scale": 0.5}
-        )
+        mi.load_dict({"type": "diffraction_grating", "height_scale": 0.5, **of})
 
 
 def test_scales_beyond_any_spectrum_are_named(llvm):

@@ -4,7 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from bsdf_support import array, direction, floats, grating, hemisphere, interaction, towards, uniform, vectors
+from bsdf_support import array, bitmap, direction, floats, grating, hemisphere, interaction, towards, uniform, vectors
 
 from mitsuba_diffraction.bsdf import energy, shared
 
@@ -13,11 +13,6 @@ WI = direction(20, 30)
 
 
 pytestmark = pytest.mark.usefixtures("llvm")
-
-
-def bitmap(values):
-    bitmap = mi.Bitmap(np.asarray(values, np.float32))
-    return {"type": "bitmap", "bitmap": bitmap, "raw": True, "format": "variant"}
 
 
 def near_orders():

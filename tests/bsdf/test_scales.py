@@ -9,6 +9,7 @@ from bsdf_support import (
     SURFACES,
     albedo,
     array,
+    bitmap,
     check_chi_square,
     direction,
     draw,
@@ -41,21 +42,14 @@ def stretched(surface, lateral, heights):
     return md.HeightField(surface.heights * heights, np.multiply(surface.pixel_size, lateral))
 
 
+def steps(values):
+    """A texture of scales without interpolation."""
+    return bitmap(values, filter_type="nearest")
+
+
 def for_scales(surface, largest, **settings):
     """A spectrum that covers scales up to the largest."""
     return md.precompute(surface, wavelengths=(360 / largest, 830), **settings)
-
-
-def bitmap(values, **parameters):
-    values = np.asarray(values, np.float32)
-    return {
-        "type": "bitmap",
-        "bitmap": mi.Bitmap(values.reshape(*values.shape[:2], 1)),
-        "raw": True,
-        "format": "variant",
-        "filter_type": "nearest",
-        **parameters,
-    }
 
 
 def near_orders(lateral, orders, wi=WI):
@@ -119,7 +113,7 @@ def test_samples_of_scaled_gratings_are_unbiased(llvm, surface, parameters, late
 def test_textures_of_scales_are_read_at_the_point(llvm):
     of = for_scales(SURFACES["blazed"](), 1.5)
     laterals, heights = np.array([[0.7, 1.0], [1.2, 1.5]]), np.array([[0.4, 0.8, 1.1]])
-    textured = plugin(of, lateral_scale=bitmap(laterals), height_scale=bitmap(heights), conserve_energy=False)
+    textured = plugin(of, lateral_scale=steps(laterals), height_scale=steps(heights), conserve_energy=False)
     for v, row in enumerate(laterals):
         for u, lateral in enumerate(row):
             for column, height in enumerate(heights[0]):
@@ -144,7 +138,7 @@ def test_scales_in_other_variants(variant):
 
     def evaluated(name):
         use(name)
-        scales = {"lateral_scale": bitmap([[0.7, 1.3]]), "height_scale": bitmap([[0.5, 0.9]]), "conserve_energy": False}
+        scales = {"lateral_scale": steps([[0.7, 1.3]]), "height_scale": steps([[0.5, 0.9]]), "conserve_energy": False}
         return evaluate(plugin(of, **scales), WI, wo, uv=uv)
 
     wanted, found = evaluated("llvm_ad_spectral"), evaluated(variant)
@@ -162,7 +156,7 @@ def difference(function, at, step):
 @pytest.mark.parametrize(("name", "step"), [("height_scale", 0.01), ("lateral_scale", 1e-3)])
 def test_derivatives_by_texels_are_those_of_differences(llvm, name, step, parameters):
     start = np.random.default_rng(3).uniform(0.85, 0.95, (2, 3, 1)).astype(np.float32)
-    scales = {"lateral_scale": 0.9, name: bitmap(start, filter_type="bilinear")}
+    scales = {"lateral_scale": 0.9, name: bitmap(start)}
     settings = {"conserve_energy": False, **scales, **parameters}
     bsdf = plugin(for_scales(SURFACES["sinusoidal"](), 1.5, coherence_length=20), **settings)
     scene, key = mi.traverse(bsdf), f"{name}.data"
@@ -195,7 +189,7 @@ def test_derivatives_by_texels_are_those_of_differences(llvm, name, step, parame
 
 def test_recipes_and_profiles_are_built_for_the_scales(llvm):
     parameters = {"type": "diffraction_grating", "profile": "blazed", "period": PERIOD, "depth": 0.2}
-    bsdf = mi.load_dict(parameters | {"lateral_scale": bitmap([[0.5, 1.5]]), "height_scale": 1.2})
+    bsdf = mi.load_dict(parameters | {"lateral_scale": steps([[0.5, 1.5]]), "height_scale": 1.2})
     assert bsdf.spectrum.wavelengths == pytest.approx((240, 830))
     assert bsdf.layers.components[0] & +mi.BSDFFlags.SpatiallyVarying
     bsdf = mi.load_dict(parameters | {"height_scale": 2.0, "coat_ior": 1.5})
@@ -221,7 +215,7 @@ def test_recipes_and_profiles_are_built_for_the_scales(llvm):
 )
 def test_scales_that_the_spectrum_does_not_cover_are_refused(llvm, parameters, message):
     """In one line, which says what to build."""
-    parameters = {name: bitmap(v) if isinstance(v, list) else v for name, v in parameters.items()}
+    parameters = {name: steps(v) if isinstance(v, list) else v for name, v in parameters.items()}
     if "theory" in parameters:
         of, parameters = made_up(), {"material": "Al", "lateral_scale": parameters["lateral_scale"]}
     else:
@@ -276,7 +270,7 @@ def test_no_albedo_above_one_at_random_scales(llvm, name, pairs):
     if pairs < 20:
         # An interval of few tables.
         laterals, heights = (rng.uniform(0.8, 0.9, (side, side)) for _ in range(2))
-    bsdf = plugin(of, lateral_scale=bitmap(laterals), height_scale=bitmap(heights))
+    bsdf = plugin(of, lateral_scale=steps(laterals), height_scale=steps(heights))
     found = [
         albedo_of_orders(
             bsdf, of, wi, rng.uniform(360, 830), laterals[place], ((place[1] + 0.5) / side, (place[0] + 0.5) / side)
@@ -291,7 +285,7 @@ def test_no_albedo_above_one_at_random_scales(llvm, name, pairs):
 def test_few_scales_lose_no_more_than_one_grating(llvm, name):
     """E of each of three pitches is that of a grating built with it."""
     of, laterals = for_scales(SCALED[name](), 1.5, coherence_length=65), (0.8, 1.0, 1.4)
-    bsdf = plugin(of, lateral_scale=bitmap([laterals]))
+    bsdf = plugin(of, lateral_scale=steps([laterals]))
     rng = np.random.default_rng(6)
     for k, lateral in enumerate(laterals):
         alone = plugin(for_scales(stretched(SCALED[name](), lateral, 1), 1.5, coherence_length=65))

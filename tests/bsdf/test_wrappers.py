@@ -5,6 +5,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from bsdf_support import (
+    bitmap,
     direction,
     draw,
     evaluate,
@@ -23,13 +24,6 @@ TILT = np.array([0.25, -0.15, 1.0]) / np.linalg.norm([0.25, -0.15, 1.0])
 pytestmark = pytest.mark.usefixtures("llvm")
 
 
-def bitmap(values, **parameters):
-    bitmap = mi.Bitmap(np.asarray(values, np.float32))
-    # As they are: 32 bits, not 16, and without interpolation.
-    exact = {"raw": True, "format": "variant", "filter_type": "nearest"}
-    return {"type": "bitmap", "bitmap": bitmap, **exact, **parameters}
-
-
 def wide(**parameters):
     """Lobes wide enough for quadrature on a coarse grid; without E, which would take longer than all else."""
     return grating("corner", 3.0, conserve_energy=False, **parameters)
@@ -38,11 +32,11 @@ def wide(**parameters):
 def slope(tangent):
     """A displacement that grows by `tangent` per unit of u: n' ∝ (−tangent, 0, 1) where dp_du = x."""
     values = np.tile((np.arange(64) + 0.5) / 64 * tangent, (64, 1))[..., None]
-    return bitmap(values, filter_type="bilinear")
+    return bitmap(values)
 
 
 def constant(value):
-    return bitmap(np.tile(value, (2, 2, 1)))
+    return bitmap(np.tile(value, (2, 2, 1)), filter_type="nearest")
 
 
 UNSHADOWED = {"use_shadowing_function": False}
@@ -138,7 +132,7 @@ def test_twosided_takes_another_grating_for_its_back():
 
 @pytest.mark.slow
 def test_a_blend_follows_its_texture():
-    weights = bitmap([[[0.1], [0.8]], [[0.1], [0.8]]])
+    weights = bitmap([[[0.1], [0.8]], [[0.1], [0.8]]], filter_type="nearest")
     bsdf = mi.load_dict({"type": "blendbsdf", "weight": weights, "first": wide(), "second": DIFFUSE})
     wi, wo = direction(20, 10), random_directions(np.random.default_rng(4), 100)
     plain, diffuse = (evaluate(mi.load_dict(x), wi, wo)[0] for x in (wide(), DIFFUSE))
@@ -149,7 +143,7 @@ def test_a_blend_follows_its_texture():
 
 TURNS = {
     # texture, and the angle at u = 1/4 and u = 3/4
-    "bitmap": (lambda: bitmap([[[20.0], [110.0]], [[20.0], [110.0]]]), (20.0, 110.0)),
+    "bitmap": (lambda: bitmap([[[20.0], [110.0]], [[20.0], [110.0]]], filter_type="nearest"), (20.0, 110.0)),
     "checkerboard": (
         lambda: {"type": "checkerboard", "color0": uniform(10.0), "color1": uniform(40.0)},
         (40.0, 10.0),
