@@ -82,8 +82,8 @@ class SplatBuffer:
 
 _PATHS_AT_ONCE = 2**20  # some 150 MB
 _CANDIDATES = 4
-# For each sample of the film: they cost about as much, and there must be time for both.
-_PATHS_PER_SAMPLE = 0.125
+# For each sample of the film, which costs more. A path reaches one pixel or none, so that walls are grainy with fewer.
+_PATHS_PER_SAMPLE = 0.5
 
 
 class LightPaths:
@@ -99,8 +99,8 @@ class LightPaths:
     BSDF gives f_j |cos θ'_j|/p with the angle θ' of ω'_j, so that the correction is |cos θ_j/cos θ'_j|; where BSDFs
     turn the normal themselves it is the ratio of their values both ways.
 
-    y₁ and ω₁ are one of four candidates, chosen in proportion to what it receives (resampling, Talbot 2005), before
-    anything is traced.
+    y₁ and ω₁ are one of four candidates, chosen in proportion to what it receives, shadows included (resampling, Talbot
+    2005): where most of a grating is in the shadow, most paths begin in the light all the same.
     """
 
     def __init__(self, scene: mi.Scene, sensor: mi.Sensor, gratings: Gratings, max_depth: int, rr_depth: int) -> None:
@@ -171,7 +171,7 @@ class LightPaths:
             time += _next_1d(rng) * self.sensor.shutter_open_time()
         wavelengths, response = self.sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), _next_1d(rng))
 
-        point, normal, light, direction = mi.Point3f(0), mi.Normal3f(0), mi.Point3f(0), mi.Vector3f(0)
+        point, normal, direction = mi.Point3f(0), mi.Normal3f(0), mi.Vector3f(0)
         received, delta = mi.Spectrum(0), mi.Bool(False)
         total, own = mi.Float(0), mi.Float(1)
         candidate = mi.UInt32(0)
@@ -179,14 +179,14 @@ class LightPaths:
             ps = self.gratings.sample(time, _next_1d(rng), _next_2d(rng))
             place = mi.SurfaceInteraction3f(ps, wavelengths)
             place.time = time
-            ds, radiance = self.scene.sample_emitter_direction(place, _next_2d(rng), False)
+            ds, radiance = self.scene.sample_emitter_direction(place, _next_2d(rng), True)
             radiance *= ratio(1, ps.pdf)
             # Not zero at grazing incidence, where the shading normal may still see the light.
             weight = dr.mean(radiance) * (dr.abs(dr.dot(ps.n, ds.d)) + 0.1)
             total += weight
             takes = (weight > 0) & (_next_1d(rng) * total < weight)
             point, normal = dr.select(takes, ps.p, point), dr.select(takes, ps.n, normal)
-            light, direction = dr.select(takes, ds.p, light), dr.select(takes, ds.d, direction)
+            direction = dr.select(takes, ds.d, direction)
             received, delta = dr.select(takes, radiance, received), dr.select(takes, ds.delta, delta)
             own = dr.select(takes, weight, own)
             candidate += 1
@@ -200,7 +200,6 @@ class LightPaths:
         if dr.hint(not dr.is_jit_v(mi.Float) and not active, mode="scalar"):
             return mi.Ray3f(), power, active
         active &= self.gratings.hold(si, active)
-        active &= self.scene.ray_test(si.spawn_ray_to(light), active) ^ True
         si.wi = si.to_local(direction)
         power *= dr.abs(dr.dot(direction, si.n))
         ray, weight, mirrored = self._scatter(si, si.bsdf(), rng, active)

@@ -199,6 +199,19 @@ def test_light_cast_by_a_grating_is_far_less_noisy(grating, where, llvm):
     assert noise["path"] > 50 * noise["diffraction_path"], noise
 
 
+def test_light_paths_begin_where_gratings_are_lit(llvm):
+    """Three of four plates lie in the shadow; one of four candidates is lit with a probability of 1 − (3/4)⁴."""
+    roof = plate({"type": "twosided", "bsdf": diffuse(0.5)}, height=1.0)
+    roof["to_world"] = at(0, 0, 1.0).scale([3, 1, 1])
+    places = [at(x, 0.75, 0.1).scale(0.3) for x in (-2, -1, 1)] + [at(0, -2.5, 0.1).scale(0.3)]
+    plates = {f"plate{k}": {"type": "rectangle", "to_world": to, "bsdf": blaze()} for k, to in enumerate(places)}
+    built = scene(roof=roof, sun=SUN, **plates)
+    _, light = mi.load_dict({"type": "diffraction_path", "max_depth": 3}).parts(built, built.sensors()[0])
+    _, power, starts = light._start(mi.PCG32(size=2**14))
+    assert dr.mean(mi.Float(starts))[0] == pytest.approx(1 - 0.75**4, abs=0.02)
+    assert dr.all(dr.any(power != 0) | ~starts)
+
+
 def test_a_grating_seen_in_another_is_less_noisy_than_with_path(llvm):
     narrow = blaze(26.0, material="Al")
     ball = {"type": "sphere", "center": [0, 0, 0.8], "radius": 0.8, "bsdf": narrow}
