@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ..efficiency import efficiencies
 from ..errors import RequestError
 from ..recipe import Recipe
+from ..surface.gratings import PROFILES
 from .arguments import Overwrite, check_suffix, claim, surface_of
 from .console import progress_bar, tell
 
@@ -47,6 +48,8 @@ def efficiency(
     if Path(name).suffix.lower() == ".toml":
         recipe = Recipe.load(name)
         recipe = Recipe({**recipe.surface, **values}, recipe.spectrum, recipe.folder)
+    elif name not in PROFILES and (Path(name).suffix or Path(name).exists()):
+        raise RequestError(f"{name}: got a file, wanted a recipe (.toml) or the name of a profile, such as blazed")
     else:
         recipe = Recipe({"profile": name, **values})
     if recipe.spectrum.get("extent", "tile") != "tile":

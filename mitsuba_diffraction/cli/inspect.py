@@ -11,6 +11,7 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
+from ..errors import RequestError
 from ..inspection import Inspection, save_picture
 from ..inspection import inspect as look
 from ..inspection.colours import GREEN
@@ -61,6 +62,8 @@ def inspect(
     check_suffix("-o", picture, ".png", ".pdf", ".svg")
     claim(context, reads, [("-o", picture), *([("--json", json)] if json else [])])
     height_field = recipe.height_field()
+    if height_field.heights.size == 1:
+        raise RequestError(f"{source}: got a surface of 1 × 1 pixel, wanted more: one height has no spectrum")
     with progress_bar(f"spectra of {source.name}") as progress:
         inspection = look(
             height_field,

@@ -12,7 +12,7 @@ from ..grating_spectrum import GratingSpectrum
 from ..precomputation import Spectrum
 from ..recipe import Recipe
 from ..rigorous.spectrum import RigorousSpectrum
-from ..settings import REPRESENTATIONS, THEORIES
+from ..settings import REPRESENTATIONS, SUN_COHERENCE_LENGTH, THEORIES
 from ..surface.prepare import seam_matters, seam_steps
 from .arguments import Overwrite, check_suffix, claim
 from .console import progress_bar, tell
@@ -72,6 +72,12 @@ def precompute(
     targets = [output or Path(source.name or "spectrum").with_suffix(".exr") for source in sources]
     for target in targets:
         check_suffix("-o", target, ".exr")
+    longest = SUN_COHERENCE_LENGTH if coherence_length is None else coherence_length
+    if pixel_size is not None and pixel_size > longest:
+        raise RequestError(
+            f"--pixel-size: got {pixel_size:g} µm, wanted at most the coherence length, {longest:g} µm: light that "
+            "interferes would meet a single height"
+        )
     recipes = [recipe_of(source, options_of_scan(context), settings_of(context)) for source in sources]
     reads = [*sources, *(file for recipe in recipes for file in recipe.files)]
     claim(context, reads, [("-o" if output else f"spectrum of {s}", t) for s, t in zip(sources, targets, strict=True)])

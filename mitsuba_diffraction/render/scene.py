@@ -100,6 +100,7 @@ def load_spectral_scene(
         if size is not None and size < 1:
             raise RequestError(f"{name}: got {size}, wanted a positive number of pixels")
     with _parsed(path, parameters, materials) as (config, state):
+        _warn_of_unused_materials(state, materials or {})
         _replace_films(state, width, height)
         _take_radiance_alone(state)
         if motion is not None:
@@ -118,6 +119,27 @@ def load_spectral_scene(
     _warn_of_missing_uvs(scene)
     _warn_of_light_from_below(scene)
     return scene
+
+
+def _warn_of_unused_materials(state: mi.parser.ParserState, materials: Materials) -> None:
+    """Log a line for each grating that takes the place of a BSDF that nothing in the scene refers to."""
+    # From all objects of the scene but its BSDFs.
+    used = {k for k in _children(state.root.props).values() if state.nodes[k].type != mi.ObjectType.BSDF}
+    waiting = list(used)
+    while waiting:
+        for _, value in state.nodes[waiting.pop()].props.items():
+            if isinstance(value, mi.Properties.ResolvedReference):
+                child = value.index()
+            elif isinstance(value, mi.Properties.Reference):
+                child = state.id_to_index.get(value.id())
+            else:
+                continue
+            if child is not None and child not in used:
+                used.add(child)
+                waiting.append(child)
+    for name in materials:
+        if state.id_to_index[name] not in used:
+            _log.warning("material %s: no shape has the BSDF of that id, and the picture is as without it", name)
 
 
 def _warn_of_light_from_below(scene: mi.Scene) -> None:
@@ -218,7 +240,9 @@ def named_sample_count(path: str | os.PathLike[str], parameters: Mapping[str, st
                 for child in _children(node.props).values():
                     props = state.nodes[child].props
                     if state.nodes[child].type == mi.ObjectType.Sampler and "sample_count" in props:
-                        return int(props["sample_count"])
+                        if (count := props["sample_count"]) < 1:
+                            raise RequestError(f"sample_count: got {count}, wanted a positive number of samples")
+                        return int(count)
                 return None
     return None
 

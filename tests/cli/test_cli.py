@@ -43,6 +43,7 @@ def folder(tmp_path, monkeypatch):
     holed = np.load("scan.npy")
     holed[2, 3] = np.nan
     np.save("holed.npy", holed)
+    np.save("pixel.npy", np.ones((1, 1)))
     np.save("counts.npy", np.arange(48, dtype=np.uint8).reshape(6, 8))
     return tmp_path
 
@@ -84,7 +85,15 @@ def files():
         ("precompute counts.npy", "pixel_size, height_range: both missing"),
         ("render scene.xml -D a=1 -D a=2", "-D a: got it twice"),
         ("precompute scan.npy --pixel-size 0", "pixel_size: got 0"),
+        ("precompute scan.npy --pixel-size 1e6", "got 1e+06 µm, wanted at most the coherence length, 65 µm"),
+        (
+            "precompute scan.npy --pixel-size 30 --coherence-length 20",
+            "--pixel-size: got 30 µm, wanted at most the coherence length, 20 µm",
+        ),
         ("precompute scan.npy --pixel-size 0.05 --height-range 1", "height_range"),
+        ("inspect pixel.npy --pixel-size 0.05", "pixel.npy: got a surface of 1 × 1 pixel, wanted more"),
+        ("efficiency scan.npy", "scan.npy: got a file, wanted a recipe (.toml) or the name of a profile"),
+        ("efficiency gone.exr", "gone.exr: got a file, wanted a recipe (.toml) or the name of a profile"),
         ("precompute counts.npy --pixel-size 0.05", "height_range: missing"),
         ("render", "Missing argument"),
         ("render gone.xml", "gone.xml"),
@@ -382,6 +391,17 @@ def test_help_exits_with_zero(command):
     assert code == 0
     assert "precompute" in out
     assert "render" in out
+
+
+@pytest.mark.parametrize("count", [0, -4])
+def test_a_scene_without_samples_is_refused(command, count):
+    sampler = '<sampler type="independent"><integer name="sample_count" value="$spp"/></sampler><film'
+    Path("scene.xml").write_text(SCENE.replace("<film", sampler))
+    code, out, err = command(f"render scene.xml -D spp={count}")
+    assert (code, out) == (2, "")
+    assert err == (
+        f"mitsuba-diffraction: error: scene.xml: sample_count: got {count}, wanted a positive number of samples\n"
+    )
 
 
 def test_render_takes_the_samples_of_the_scene_and_writes_half_precision(command):

@@ -115,6 +115,15 @@ def test_an_unknown_id_is_refused_with_those_that_there_are(exported):
         load_spectral_scene(exported(), materials={"Disc": MIRROR})
 
 
+def test_a_material_that_no_shape_has_is_told(exported, caplog):
+    path = exported()
+    path.write_text(path.read_text().replace("</scene>", '<bsdf type="diffuse" id="mat-Spare"/></scene>'))
+    with caplog.at_level(logging.WARNING, "mitsuba_diffraction"):
+        load_spectral_scene(path, materials={"mat-Disc": MIRROR, "mat-Spare": MIRROR})
+    told = [record.getMessage() for record in caplog.records if "no shape" in record.getMessage()]
+    assert told == ["material mat-Spare: no shape has the BSDF of that id, and the picture is as without it"]
+
+
 @pytest.mark.parametrize("uvs", [True, False])
 def test_a_grating_on_a_mesh_without_uvs_is_told(exported, uvs, caplog):
     with caplog.at_level(logging.WARNING, "mitsuba_diffraction"):
