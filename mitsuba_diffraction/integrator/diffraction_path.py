@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from ..bsdf.base import nested_plugin
 from ..errors import RequestError
@@ -71,8 +72,10 @@ def define() -> type:
             gratings = _lit_gratings(scene, sensor, self.max_depth)
             if gratings is None:
                 return self.path, None
-            light = LightPaths(scene, sensor, gratings, self.max_depth, self.rr_depth)
-            return eye_class(gratings, self.max_depth, self.rr_depth), light
+            eye = eye_class(gratings, self.max_depth, self.rr_depth)
+            if all(shape in gratings or _is_black(shape.bsdf()) for shape in scene.shapes()):
+                return eye, None
+            return eye, LightPaths(scene, sensor, gratings, self.max_depth, self.rr_depth)
 
         def sample(
             self,
@@ -146,6 +149,13 @@ def _lit_gratings(scene: mi.Scene, sensor: mi.Sensor, max_depth: int) -> Grating
             "sample_border: got true, wanted false: points beyond the film's edge cannot be connected to it"
         )
     return gratings
+
+
+def _is_black(bsdf: mi.BSDF | None) -> bool:
+    """Return whether a surface reflects nothing, as lamps do by default: no path from the light is seen there."""
+    return bsdf is None or (
+        bsdf.class_name() == "SmoothDiffuse" and all(not np.any(value) for _, value in mi.traverse(bsdf))
+    )
 
 
 def _add_light_paths(sensor: mi.Sensor, light: LightPaths, seed: mi.UInt32 | int) -> None:

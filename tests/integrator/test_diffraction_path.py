@@ -212,6 +212,15 @@ def test_light_paths_begin_where_gratings_are_lit(llvm):
     assert dr.all(dr.any(power != 0) | ~starts)
 
 
+@pytest.mark.parametrize(("reflectance", "traces"), [(0.0, False), (0.1, True)])
+def test_light_paths_are_traced_only_where_something_can_show_them(reflectance, traces, llvm):
+    lamp = {**plate(diffuse(reflectance), height=2.0), "emitter": {"type": "area", "radiance": uniform(1.0)}}
+    built = scene(floor=plate(blaze(), 4, 0), wall=plate(blaze(), 0.5), lamp=lamp)
+    eye, light = mi.load_dict({"type": "diffraction_path", "max_depth": 3}).parts(built, built.sensors()[0])
+    assert type(eye).__name__ == "EyePaths"
+    assert (light is not None) == traces
+
+
 def test_a_grating_seen_in_another_is_less_noisy_than_with_path(llvm):
     narrow = blaze(26.0, material="Al")
     ball = {"type": "sphere", "center": [0, 0, 0.8], "radius": 0.8, "bsdf": narrow}
