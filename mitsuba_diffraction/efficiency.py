@@ -17,7 +17,7 @@ from .files import whole_file
 from .outputs import made_for, metadata
 from .progress import Progress, silent
 from .rigorous import refractive_index
-from .rigorous.curve import is_profile
+from .rigorous.coordinate_transformation import is_profile
 from .scalar_theory import profile_powers, scalar_orders, tile_powers
 from .settings import THEORIES
 from .surface.heightfield import HeightField

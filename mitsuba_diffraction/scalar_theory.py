@@ -22,9 +22,9 @@ from scipy.special import jv
 from .errors import RequestError
 from .geometry import k_g, transmitted
 from .reference import amplitudes
-from .rigorous.axes import LARGEST_PERIOD
-from .rigorous.curve import curve_of, is_profile
+from .rigorous.coordinate_transformation import curve_of, is_profile
 from .rigorous.efficiencies import converge
+from .rigorous.spectrum import LARGEST_PERIOD
 from .settings import VISIBLE
 from .spectrum.grids import OrderGrid
 from .surface.heightfield import HeightField

@@ -9,8 +9,7 @@ import pytest
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction import testing
-from mitsuba_diffraction.rigorous.axes import Axes
-from mitsuba_diffraction.rigorous.spectrum import RigorousSpectrum, Table
+from mitsuba_diffraction.rigorous.spectrum import Axes, RigorousSpectrum, Table
 
 array, direction, floats, vectors = testing.array, testing.direction, testing.floats, testing.vectors
 WAVELENGTHS = (400.0, 500.0, 600.0, 700.0)

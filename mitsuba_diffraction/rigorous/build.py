@@ -7,7 +7,7 @@ import hashlib
 import itertools
 import os
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
@@ -21,13 +21,10 @@ from ..files import whole_file
 from ..progress import Progress, silent
 from ..settings import Settings
 from ..surface.heightfield import HeightField
-from .axes import LARGEST_PERIOD, STORED, Axes
-from .coordinate_transformation import ABOVE, BELOW, Grating, Scattered, half_space, scatter
-from .curve import Curve, curve_of
-from .efficiencies import REVERSED, converge, matrices_of, one_thread, solve, wave_numbers
+from .coordinate_transformation import ABOVE, BELOW, Curve, Grating, Scattered, curve_of, half_space, scatter
+from .efficiencies import REVERSED, converge, matrices_of, one_thread, solve, through_sheet, wave_numbers
 from .materials import refractive_index
-from .sheet import through_sheet
-from .spectrum import RigorousSpectrum, Table, axes_of
+from .spectrum import LARGEST_PERIOD, STORED, Axes, RigorousSpectrum, Table, axes_of
 
 Real = NDArray[np.float64]
 # n of the orders in and out, and their matrices, (orders out, orders in, 4, 4).
@@ -80,23 +77,14 @@ def build_spectrum(
             times that; `error` and `polarisation_error` say by how much.
     """
     tolerance = 1e-2 if settings.tolerance is None else settings.tolerance
-    wavelengths = settings.wavelengths
-    int_ior, material, ext_ior, polarised = settings.int_ior, settings.material, settings.ext_ior, settings.polarised
-    period, longest = height_field.tile_size[0], LARGEST_PERIOD * wavelengths[0] * 1e-3
+    period, longest = height_field.tile_size[0], LARGEST_PERIOD * settings.wavelengths[0] * 1e-3
     if period > longest:
         raise RequestError(
             f"period: got {period:.4g} µm, wanted at most {longest:.4g} µm with theory=rigorous, "
             f"{LARGEST_PERIOD:g} times the shortest wavelength; use theory=scalar"
         )
     with one_thread():
-        surface = _Surface(
-            height_field,
-            (wavelengths[0] * 1e-3, wavelengths[1] * 1e-3),
-            lambda wavelength: refractive_index(wavelength * ext_ior, int_ior=int_ior, material=material) / ext_ior,
-            tolerance,
-            repr((int_ior, material, ext_ior, polarised)),
-            settings.transmission,
-        )
+        surface = _Surface(height_field, settings, tolerance)
         checks = surface.checks()
         error, done = np.inf, 0
         steps = _SOLVED_BOTH if settings.transmission == "interface" else _SOLVED
@@ -104,10 +92,23 @@ def build_spectrum(
             # Twice the steps cost four times as much and leave an eighth of the error: which table will be the last?
             begin, done = done, 95 if error <= 8 * tolerance or solved == steps[-1] else done + 20
             axes = Axes(surface.period, surface.wavelengths, STORED * solved, PLANES)
-            tables = _Build(surface, axes, solved, polarised).tables(
+            tables = _Build(surface, axes, solved, settings.polarised).tables(
                 lambda row, rows, a=begin, b=done: progress(a + (b - a) * row // rows, 100), checkpoints
             )
-            spectrum = _spectrum(tables, surface, height_field, settings, checks)
+            spectrum = RigorousSpectrum(
+                tables=tables,
+                transmission=settings.transmission,
+                material=settings.material or "",
+                int_ior=complex(settings.int_ior or 0),
+                ext_ior=float(settings.ext_ior),
+                coherence_length=float(settings.coherence_length),
+                tolerance=float(tolerance),
+                harmonics=surface.harmonics,
+                source=height_field.source,
+                source_digest=height_field.digest,
+                **dict.fromkeys(("error", "max_error", "max_error_near"), np.nan),
+            )
+            spectrum = dataclasses.replace(spectrum, **_errors(spectrum, checks))
             # NaN: there are no matrices.
             if spectrum.error <= tolerance and not spectrum.polarisation_error > MATRICES * tolerance:
                 progress(100, 100)
@@ -115,7 +116,7 @@ def build_spectrum(
             error = spectrum.error
     progress(100, 100)
     got, wanted = f"{spectrum.error:.2g}", f"{tolerance:.2g}"
-    if polarised:
+    if settings.polarised:
         got += f" and {spectrum.polarisation_error:.2g} of the Mueller matrices"
         wanted += f" and {MATRICES * tolerance:.2g}"
     warnings.warn(
@@ -125,32 +126,6 @@ def build_spectrum(
     return spectrum
 
 
-def _spectrum(
-    tables: tuple[Table, ...],
-    surface: _Surface,
-    height_field: HeightField,
-    settings: Settings,
-    checks: list[_Checked],
-) -> RigorousSpectrum:
-    """Return the spectrum of the tables, with its measured errors."""
-    spectrum = RigorousSpectrum(
-        tables=tables,
-        transmission=settings.transmission,
-        material=settings.material or "",
-        int_ior=complex(settings.int_ior or 0),
-        ext_ior=float(settings.ext_ior),
-        coherence_length=float(settings.coherence_length),
-        tolerance=float(surface.tolerance),
-        harmonics=surface.harmonics,
-        source=height_field.source,
-        source_digest=height_field.digest,
-        error=np.nan,
-        max_error=np.nan,
-        max_error_near=np.nan,
-    )
-    return dataclasses.replace(spectrum, **_errors(spectrum, checks))
-
-
 class _Surface:
     """A surface and its material, ready to be solved.
 
@@ -158,27 +133,23 @@ class _Surface:
         harmonics: N, enough for a tenth of the tolerance at the shortest wavelength.
     """
 
-    def __init__(
-        self,
-        height_field: HeightField,
-        wavelengths: tuple[float, float],
-        index: Callable[[float], complex],
-        tolerance: float,
-        named: str,
-        transmission: str,
-    ) -> None:
+    def __init__(self, height_field: HeightField, settings: Settings, tolerance: float) -> None:
         self.period = height_field.tile_size[0]
-        self.wavelengths = wavelengths
-        self.index = index
+        self.wavelengths = settings.wavelengths[0] * 1e-3, settings.wavelengths[1] * 1e-3
+        self.material = settings.int_ior, settings.material, settings.ext_ior
         self.tolerance = tolerance
-        self.transmission = transmission
+        self.transmission = settings.transmission
         curve = curve_of(height_field)
         self.harmonics = max(self._harmonics(curve, np.array(d) / np.linalg.norm(d)) for d in _HARD)
         # The table takes the first; the others are for light that needs more, and for what it is compared with.
         self.gratings = [Grating(curve, int(1.4**k * self.harmonics)) for k in range(5)]
-        self.digest = hashlib.sha256(
-            repr((height_field.digest, wavelengths, named, transmission, self.harmonics, BUILD_VERSION)).encode()
-        ).hexdigest()
+        request = height_field.digest, self.wavelengths, self.material, settings.polarised, self.transmission
+        self.digest = hashlib.sha256(repr((request, self.harmonics, BUILD_VERSION)).encode()).hexdigest()
+
+    def index(self, wavelength: float) -> complex:
+        """Return n + ik below, relative to the medium above, where the wavelength is in µm."""
+        int_ior, material, ext_ior = self.material
+        return refractive_index(wavelength * ext_ior, int_ior=int_ior, material=material) / ext_ior
 
     def _harmonics(self, curve: Curve, omega: Real) -> int:
         """Return the fewest harmonics that are right to a tenth of the tolerance, at the shortest wavelength."""
@@ -351,7 +322,7 @@ class _Build:
             count = 1
             if longest > shortest:
                 count = next((count for limit, count in _CONES if abs(g) < limit * nu), _CONES[-1][1])
-            at, weights = _between(count, axes.planes) if self.local else _chebyshev(count, axes.planes)
+            at, weights = _nodes(count, axes.planes, self.local)
             wavelengths = shortest + at * (longest - shortest)
             nodes = np.full((count, *shape, entries, entries), np.nan)
             if self.local:
@@ -406,17 +377,16 @@ class _Build:
         return Table(axes, values, matrices if entries == 4 else None)
 
 
-def _between(count: int, planes: int) -> tuple[Real, Real]:
-    """As `_chebyshev`, at equal steps and by cubic polynomials of four neighbours: kinks stay where they are."""
+def _nodes(count: int, planes: int, local: bool) -> tuple[Real, Real]:
+    """Return points in 0 … 1, (count,), and the weights (planes, count) of their values at equal steps.
+
+    Chebyshev–Lobatto points; or, if local, points at equal steps and cubic polynomials of four neighbours: kinks stay
+    where they are.
+    """
     if count == 1:
         return np.zeros(1), np.ones((planes, 1))
-    return np.linspace(0, 1, count), _cubic(1, count - 1, planes - 1)
-
-
-def _chebyshev(count: int, planes: int) -> tuple[Real, Real]:
-    """Chebyshev–Lobatto points in 0 … 1, (count,), and the weights (planes, count) of their values at equal steps."""
-    if count == 1:
-        return np.zeros(1), np.ones((planes, 1))
+    if local:
+        return np.linspace(0, 1, count), _cubic(1, count - 1, planes - 1)
     at = (1 - np.cos(np.pi * np.arange(count) / (count - 1))) / 2
     return at, _lagrange(np.linspace(0, 1, planes), at)
 

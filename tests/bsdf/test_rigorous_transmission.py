@@ -10,9 +10,8 @@ from bsdf_support import check_chi_square, direction, interaction, random_direct
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction import gratings
-from mitsuba_diffraction.rigorous.axes import Axes
 from mitsuba_diffraction.rigorous.build import build_spectrum
-from mitsuba_diffraction.rigorous.spectrum import RigorousSpectrum, Table, axes_of
+from mitsuba_diffraction.rigorous.spectrum import Axes, RigorousSpectrum, Table, axes_of
 from mitsuba_diffraction.settings import Settings
 
 PERIOD, ETA, WAVELENGTH = 0.3, 1.5, 0.45
