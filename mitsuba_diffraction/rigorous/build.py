@@ -48,7 +48,7 @@ _NEAR = 0.02
 _CHECKS = 200
 # Light at which the harmonics are chosen: near the normal, and oblique from both sides.
 _HARD = ((0.1, 0, 1), (0.8, 0.3, 0.5), (-0.8, 0.3, 0.5))
-BUILD_VERSION = 4  # raised when tables of equal requests change
+BUILD_VERSION = 5  # raised when tables of equal requests change
 MATRICES = 3.0
 """Bound of `polarisation_error`, in tolerances: matrices vary faster than η."""
 
@@ -265,7 +265,8 @@ class _Build:
 
     Light from (p, r) = (g + α, g − α) has order m at P = p − max(m, 0), R = r + min(m, 0): whole units away, so that
     one lattice serves all orders. And lights whose p and r differ by whole units, p + r being equal, are orders of each
-    other: they are solved together, from both sides.
+    other: they are solved together, from both sides. Reversed light has p and r exchanged, so that half of the lattice
+    is solved: r less its units at most p less its units.
     """
 
     def __init__(self, surface: _Surface, axes: Axes, steps: int, polarised: bool) -> None:
@@ -275,12 +276,16 @@ class _Build:
         self.local = surface.transmission == "interface"
         self.parts = np.sin(np.pi / 2 * np.arange(steps) / steps) ** 2
         self.parts[0] = _OFF
-        # Where the orders of each table begin among all of a job.
-        self.first = np.cumsum([0, *(len(axes.orders) for axes in self.axes)])
+        # Of light that crosses, also what is solved from below, as reversed light.
+        self.solved = [(axes, axes.way) for axes in self.axes] + [(axes, (BELOW, ABOVE)) for axes in self.axes[2:]]
+        # Where the orders of each begin among all of a job.
+        self.first = np.cumsum([0, *(len(axes.orders) for axes, _ in self.solved)])
+        self.signs = np.outer(REVERSED, REVERSED)[: self.entries, : self.entries]
         # p less its whole units, and the units of p + r; below zero no light travels above.
         below = int(np.ceil(2 * self.axes[0].max_decay * axes.period / axes.wavelengths[0])) + 1 if self.local else 0
         self.shift = max(axes.shift for axes in self.axes)
-        self.jobs = [(part, units) for part in range(steps) for units in range(-below, axes.units(0) + 2)]
+        units = range(-below, axes.units(0) + 2)
+        self.jobs = [(part, unit) for part in reversed(range(steps)) for unit in units]  # the longest first
 
     def tables(self, progress: Progress, checkpoints: Path | None) -> tuple[Table, ...]:
         """Return those of `RigorousSpectrum`."""
@@ -300,14 +305,17 @@ class _Build:
         return tuple(tables)
 
     def _job(self, job: int) -> NDArray[np.float32]:
-        """M of light: (r less its units, orders of all tables, units of p + D, K, i, j); NaN where there is none."""
+        """M of light: (r less its units, orders of all tables, units of p + D, K, i, j); NaN where there is none.
+
+        Of reversed light: (p less its units, …).
+        """
         part, units = self.jobs[job]
         axes, entries, shift = self.axes[0], self.entries, self.shift
         nu = axes.period / axes.wavelengths[0]
         shape = self.first[-1], max(units + 2 * shift + 1, 0)
-        found = np.full((self.steps, *shape, axes.planes, entries, entries), np.nan, np.float32)
+        found = np.full((part + 1, *shape, axes.planes, entries, entries), np.nan, np.float32)
         middle = (units + 1) // 2
-        for other in range(self.steps):
+        for other in range(part + 1):
             # A node at the end of a unit belongs to that unit. The units that the table reaches are solved whole, for
             # polynomials across them.
             if not units - (part == 0) - (other == 0) < axes.units(0):
@@ -332,20 +340,22 @@ class _Build:
                 )
             for node, solved in enumerate(self.surface.solve((p - r) / 2, g, wavelengths)):
                 ways = self.surface.matrices(solved)
-                for table, start in zip(self.axes, self.first[:-1], strict=True):
-                    of_in, of_out, matrices = ways[table.way]
-                    m = of_in - of_out[:, None]
+                for (table, way), start in zip(self.solved, self.first[:-1], strict=True):
+                    of_in, of_out, matrices = ways[way]
+                    m, matrices = of_in - of_out[:, None], matrices[..., :entries, :entries]
                     unit = np.broadcast_to(of_in + middle + shift, m.shape)
+                    if way != table.way:
+                        unit = np.broadcast_to(units - middle - of_out[:, None] + shift, m.shape)
+                        matrices = self.signs * matrices.swapaxes(-1, -2)
                     kept = (np.abs(m) <= table.max_order) & (unit >= 0) & (unit < shape[1])
-                    nodes[node, start + table.max_order + m[kept], unit[kept]] = matrices[kept][:, :entries, :entries]
+                    nodes[node, start + table.max_order + m[kept], unit[kept]] = matrices[kept]
             found[other] = np.einsum("kw,wmu...->muk...", weights, nodes)
         return found
 
     def _stored(self, table: int, done: dict[int, NDArray[np.float32]]) -> Table:
-        """What was solved, of reflected light the mean of light and reversed light, at the nodes that are stored."""
+        """Return what was solved at the nodes that are stored; the other half of the lattice is reversed light."""
         axes, lattice, steps, entries = self.axes[table], self.axes[table].solved, self.steps, self.entries
         matrices = np.zeros((axes.planes, axes.nodes, entries, entries), np.float32)
-        signs = np.outer(REVERSED, REVERSED)[:entries, :entries]
         count, reflected = lattice.side(0), axes.way[0] == axes.way[1]
         for m in axes.orders:
             side, start = lattice.side(m), axes.offset(m)
@@ -353,17 +363,20 @@ class _Build:
             for job, solved in done.items():
                 part, units = self.jobs[job]
                 for unit in range(units + 2 * axes.shift + 1):
-                    p, r = unit * steps + part, (units + 2 * axes.shift - unit) * steps
+                    p, r = unit * steps, (units + 2 * axes.shift - unit) * steps
                     if p < count and r < count:
-                        of_order = solved[:, self.first[table] + m + axes.max_order]
-                        of_light[p, r : r + steps] = of_order[:, unit + self.shift - axes.shift]
+                        of_unit = solved[:, :, unit + self.shift - axes.shift]
+                        if not reflected:
+                            of_light[p : p + part + 1, r + part] = of_unit[:, self.first[3] + m + axes.max_order]
+                        of_light[p + part, r : r + part + 1] = of_unit[:, self.first[table] + m + axes.max_order]
             p, r = (less * steps for less in axes.least(m))
             found = of_light[p : p + side, r : r + side].astype(float)
             if not axes.shift:
                 # At grazing exit or incidence all is mirrored.
                 found[0], found[:, 0] = (float(m == 0 and reflected) * np.eye(entries),) * 2
             if reflected:
-                back = signs * found.transpose(1, 0, 2, 4, 3)
+                # Where p and r have the same fraction, both were solved.
+                back = self.signs * found.transpose(1, 0, 2, 4, 3)
                 found = np.where(np.isnan(found), back, np.where(np.isnan(back), found, (found + back) / 2))
             found = np.nan_to_num(found)  # units that light does not reach
             refine = _cubic(axes.units(m), steps, axes.steps)
