@@ -287,11 +287,7 @@ def _rigorous(height_field: HeightField, azimuth: float, shortest: float) -> _So
 
 
 def _numbers(name: str, values: ArrayLike, wanted: str, low: float, high: float) -> Array:
-    """Return one number or several as (n,).
-
-    Raises:
-        ValueError: unless they are above `low` and below `high`.
-    """
+    """Return one number or several, all above `low` and below `high`, as (n,)."""
     try:
         array = np.atleast_1d(np.asarray(values, np.float64))
     except (TypeError, ValueError):

@@ -112,11 +112,7 @@ def _remove_what_a_kill_left(target: Path) -> None:
 
 
 def refuse_unwritable(path: str | os.PathLike[str]) -> None:
-    """Raise if `path` cannot be written, to be called before long computations.
-
-    Raises:
-        ValueError: with the reason.
-    """
+    """Raise if `path` cannot be written, to be called before long computations."""
     try:
         with whole_file(path):
             raise _Writable
@@ -137,11 +133,7 @@ def cache_folder() -> Path:
 
 
 def refuse_special(path: str | os.PathLike[str]) -> None:
-    """Raise if `path` is a pipe or a device, which may be endless.
-
-    Raises:
-        ValueError: if so.
-    """
+    """Raise if `path` is a pipe or a device, which may be endless."""
     if os.path.exists(path) and not (os.path.isfile(path) or os.path.isdir(path)):
         raise RequestError(f"{os.fspath(path)}: a pipe or a device, wanted an ordinary file")
 
@@ -155,11 +147,7 @@ UNSEALED = _BEFORE_DIGEST + _ZEROS
 
 
 def seal(path: str | os.PathLike[str]) -> None:
-    """Replace the placeholder `UNSEALED`, or an earlier digest, by the SHA-256 of the file.
-
-    Raises:
-        ValueError: if the file has no placeholder.
-    """
+    """Replace the placeholder `UNSEALED`, or an earlier digest, by the SHA-256 of the file."""
     with open(path, "r+b") as stream:
         if (found := _digest(stream)) is None:
             raise RequestError(f"{os.fspath(path)}: has no place for its digest")

@@ -16,6 +16,7 @@ import threading
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -28,6 +29,19 @@ from .spectrum.tables import Series, SeriesTable, SliceTable, chebyshev, taylor
 
 FORMAT = "mitsuba_diffraction grating spectrum"
 FORMAT_VERSION = 6
+
+# Numbers and texts, and their names in files.
+_NUMBERS = {
+    "height_range": "heightRange",
+    "coherence_length": "coherenceLength",
+    "tolerance": "tolerance",
+    "error": "error",
+    "largest_angle": "largestAngle",
+    "truncated_power": "dropped",
+    "unresolved_power": "beyond",
+}
+_PAIRS = {"pixel_size": "pixelSize", "wavelengths": "wavelengths"}
+_OTHERS = {"extent": "extent", "patches": "patches", "source": "source", "source_digest": "sourceSha256"}
 
 _computing = threading.Lock()
 
@@ -59,23 +73,13 @@ class GratingSpectrum(PowerSpectrum):
         Raises:
             OSError: if the file cannot be written.
         """
-        header = {
+        header: dict[str, Any] = {
             "representation": self.representation,
-            "extent": self.extent,
-            "heightRange": doubles(self.height_range),
-            "pixelSize": doubles(*self.pixel_size),
             **_grid_header(self.grid),
-            "coherenceLength": doubles(self.coherence_length),
-            "wavelengths": doubles(*self.wavelengths),
-            "tolerance": doubles(self.tolerance),
-            "error": doubles(self.error),
-            "largestAngle": doubles(self.largest_angle),
-            "dropped": doubles(self.truncated_power),
-            "beyond": doubles(self.unresolved_power),
-            "patches": self.patches,
+            **{key: doubles(getattr(self, name)) for name, key in _NUMBERS.items()},
+            **{key: doubles(*getattr(self, name)) for name, key in _PAIRS.items()},
+            **{key: getattr(self, name) for name, key in _OTHERS.items()},
             **({} if self.standard_error is None else {"standardError": doubles(self.standard_error)}),
-            "source": self.source,
-            "sourceSha256": self.source_digest,
             "units": "lengths in micrometres, wavelengths in nanometres",
             **({"warning": self.warning} if self.warning else {}),
         }
@@ -105,30 +109,20 @@ class GratingSpectrum(PowerSpectrum):
             pixels = {name: channel.pixels for name, channel in channels.items()}
             if halves := [name for name, values in pixels.items() if values.dtype != np.float32]:
                 raise RequestError(f"{halves[0]} is not of type float")
-            wavelengths = _pair(header["wavelengths"])
-            table = _table(header, pixels, 4 * np.pi / (wavelengths[0] * 1e-3))
+            table = _table(header, pixels, 4 * np.pi / (_pair(header["wavelengths"])[0] * 1e-3))
             names = _channels(table).keys()
             if pixels.keys() != names or len(names) != header["channelCount"]:
                 unknown = ", ".join(sorted(pixels.keys() - names)) or "none unknown"
                 raise RequestError(
                     f"got {len(pixels)} channels ({unknown}), wanted {header['channelCount']} of known names"
                 )
+            entries: dict[str, Any] = {name: header[key] for name, key in _OTHERS.items()}
+            entries |= {name: _single(header[key]) for name, key in _NUMBERS.items()}
+            entries |= {name: _pair(header[key]) for name, key in _PAIRS.items()}
             return cls(
                 table=table,
                 grid=_grid(header, table.shape),
-                extent=header["extent"],
-                pixel_size=_pair(header["pixelSize"]),
-                height_range=_single(header["heightRange"]),
-                coherence_length=_single(header["coherenceLength"]),
-                wavelengths=wavelengths,
-                tolerance=_single(header["tolerance"]),
-                error=_single(header["error"]),
-                source=header["source"],
-                source_digest=header["sourceSha256"],
-                largest_angle=_single(header["largestAngle"]),
-                truncated_power=_single(header["dropped"]),
-                unresolved_power=_single(header["beyond"]),
-                patches=header["patches"],
+                **entries,
                 standard_error=_single(header["standardError"]) if header["extent"] == "sample" else None,
                 energy=EnergyTable.from_plain(json.loads(header["energy"])),
                 warning=header.get("warning", ""),

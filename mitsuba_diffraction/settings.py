@@ -165,11 +165,7 @@ def lobe_cutoff(share: float) -> float:
 
 
 def matching(q: ArrayLike, kappa: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return q (..., 2) and κ (...) as float64 arrays, broadcast against each other.
-
-    Raises:
-        ValueError: if q does not end in a pair or is not finite, or the shapes do not broadcast.
-    """
+    """Return q (..., 2) and κ (...) as float64 arrays, broadcast against each other."""
     q = np.asarray(q, np.float64)
     kappa = np.asarray(kappa, np.float64)
     if q.ndim == 0 or q.shape[-1] != 2:

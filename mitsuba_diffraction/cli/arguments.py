@@ -17,11 +17,7 @@ Value = bool | int | float | str
 
 
 def scene_parameters(define: Sequence[str] | None) -> dict[str, str]:
-    """Return the scene parameters from the options -D NAME=VALUE.
-
-    Raises:
-        ValueError: if one is not of this form, not UTF-8, or given twice.
-    """
+    """Return the scene parameters from the options -D NAME=VALUE."""
     parameters = {}
     for item in define or []:
         name, equals, value = item.partition("=")
@@ -74,11 +70,7 @@ def check_suffix(option: str, path: Path, *suffixes: str) -> None:
 
 
 def surface_of(text: str) -> tuple[str, dict[str, Value]]:
-    """Return the parts of RECIPE|PROFILE[,name=value…]; numbers, true and false are read as such.
-
-    Raises:
-        ValueError: if it is not of this form, or a name is given twice.
-    """
+    """Return the parts of RECIPE|PROFILE[,name=value…]; numbers, true and false are read as such."""
     source, *items = text.split(",")
     values: dict[str, Value] = {}
     for name, equals, value in (item.strip().partition("=") for item in items):
@@ -96,12 +88,7 @@ def _read(text: str) -> Value:
 
 
 def materials_of(texts: Sequence[str] | None) -> dict[str, dict[str, Value]]:
-    """Return the parameters of the gratings that take the place of BSDFs, from the options --material ID=….
-
-    Raises:
-        ValueError: if one is not of the form ID=RECIPE|PROFILE[,name=value…], or an id is given twice.
-        FileNotFoundError: if there is no such recipe.
-    """
+    """Return the parameters of the gratings that take the place of BSDFs, from the options --material ID=…."""
     materials: dict[str, dict[str, Value]] = {}
     for text in texts or []:
         name, equals, rest = text.partition("=")

@@ -55,11 +55,7 @@ def _given(context: typer.Context, names: Iterable[str]) -> dict[str, Any]:
 
 
 def recipe_of(source: Path, of_scan: dict[str, object], settings: dict[str, object]) -> Recipe:
-    """Return the recipe in a file, or the one equivalent to a scan and its options; `settings` override its spectrum.
-
-    Raises:
-        ValueError: if options of a scan are given for a recipe, or something in either is wrong.
-    """
+    """Return the recipe in a file, or the one equivalent to a scan; `settings` take the place of those of a file."""
     if source.suffix.lower() != ".toml":
         return Recipe({"scan": source.name, **of_scan}, settings, source.parent)
     if of_scan:

@@ -179,9 +179,6 @@ class _Surface:
 
         Args:
             g: above, signed as in `Axes`.
-
-        Raises:
-            ValueError: if the largest number of harmonics does not conserve energy either.
         """
         wavelengths, square = list(wavelengths), g * abs(g)
         for grating in self.gratings[finer:]:

@@ -101,9 +101,6 @@ def curve_of(height_field: HeightField) -> Curve:
     edges the length of the curve grows at a rate of 1 − η (4 cos 2πτ + cos 4πτ)/5: slowly near the edges, where fields
     are singular (Granet 1999), and evenly away from them, where a fast run makes for short waves. Smooth bends count as
     length (`_BEND`), so that sharp crests are resolved.
-
-    Raises:
-        ValueError: if the rows of the height field differ.
     """
     rows = height_field.centred
     if not is_profile(height_field):

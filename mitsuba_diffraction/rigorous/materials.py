@@ -66,11 +66,7 @@ def _near(name: str, known: list[str]) -> list[str]:
 
 @functools.cache
 def conductor(material: str, folder: Path) -> tuple[NDArray[np.float64], ...]:
-    """Return the table of a conductor in Mitsuba's folder of indices: wavelengths in µm, n and k there, (J,) each.
-
-    Raises:
-        ValueError: if there is none of that name.
-    """
+    """Return the table of a conductor in Mitsuba's folder of indices: wavelengths in µm, n and k there, (J,) each."""
     known = sorted(path.name.removesuffix(".eta.spd") for path in folder.glob("*.eta.spd"))
     if material not in known:
         wanted = f"one of {', '.join(known) or 'none: no tables found'}"

@@ -51,11 +51,7 @@ def write(
     channels: Mapping[str, np.ndarray],
     recipe: str,
 ) -> None:
-    """Write a spectrum of the format `kind` atomically; `recipe` is the digest of its recipe.
-
-    Raises:
-        OSError: if the file cannot be written.
-    """
+    """Write a spectrum of the format `kind` atomically; `recipe` is the digest of its recipe."""
     header = {
         "type": OpenEXR.scanlineimage,
         "compression": OpenEXR.ZIP_COMPRESSION,
@@ -73,12 +69,7 @@ def write(
 
 
 def read(path: Path, kind: str, version: int, recipe: str | None) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Read header and channels of a file that `write` wrote.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if it is not of this format and version, is damaged, or, if `recipe` is given, of another recipe.
-    """
+    """Read header and channels of a file that `write` wrote."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
     try:

@@ -103,11 +103,7 @@ class PowerSpectrum:
 
     @property
     def lobes(self) -> tuple[LobeAxis, LobeAxis]:
-        """The truncation of the orders' lobes along x and y.
-
-        Raises:
-            RequestError: of a lattice of splines.
-        """
+        """The truncation of the orders' lobes along x and y."""
         if not isinstance(self.grid, OrderGrid):
             raise RequestError("lobes: got a lattice of splines, wanted a grid of orders")
         return self.grid.lobes(self.lobe_width, self.cutoff_sigmas)

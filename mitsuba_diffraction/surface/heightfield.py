@@ -15,11 +15,7 @@ from ..errors import RequestError
 
 
 def as_pixel_size(value: float | tuple[float, float]) -> tuple[float, float]:
-    """Return one number or (x, y), in µm, as a pair of positive floats.
-
-    Raises:
-        ValueError: if the value is neither, or not positive and finite.
-    """
+    """Return one number or (x, y), in µm, as a pair of positive floats."""
     try:
         if isinstance(value, str | bool):
             raise TypeError
@@ -111,11 +107,7 @@ class HeightField:
 
     @property
     def height_range(self) -> float:
-        """Highest minus lowest point, µm.
-
-        Raises:
-            ValueError: if pixels are missing.
-        """
+        """Highest minus lowest point, µm."""
         self._refuse_gaps()
         return float(np.ptp(self.heights))
 
@@ -130,11 +122,7 @@ class HeightField:
 
     @property
     def centred(self) -> NDArray[np.float64]:
-        """Heights relative to the centre of their range, (N_y, N_x) µm. An offset only changes the phase of e^{iκh}.
-
-        Raises:
-            ValueError: if pixels are missing.
-        """
+        """Heights relative to the centre of their range, (N_y, N_x) µm. An offset only changes the phase of e^{iκh}."""
         self._refuse_gaps()
         return self.heights - (self.heights.min() + self.heights.max()) / 2
 
@@ -167,11 +155,7 @@ def _refusal(gaps: NDArray[np.bool_]) -> str:
 
 
 def as_heights(heights: ArrayLike) -> NDArray[np.float64]:
-    """Return heights as an array, (N_y, N_x) µm, NaN where masked; copied only if necessary.
-
-    Raises:
-        ValueError: if it is not a two-dimensional array of real numbers with at least one pixel.
-    """
+    """Return heights as an array, (N_y, N_x) µm, NaN where masked; copied only if necessary."""
     try:
         if np.iscomplexobj(heights):
             raise RequestError

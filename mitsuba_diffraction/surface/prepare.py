@@ -127,7 +127,7 @@ def despike(height_field: HeightField, threshold: float = 5.0) -> HeightField:
     Raises:
         ValueError: if the threshold is not positive.
     """
-    _check_positive("despike", threshold, "a number of standard deviations")
+    _check("despike", threshold)
     gaps = height_field.gaps
     whole = harmonic_fill(height_field.heights, height_field.pixel_size)
     # The surface is extended with its slope beyond the edges; a spike at the very corner is not detected.
@@ -167,7 +167,7 @@ def trim_edges(height_field: HeightField, width: float) -> HeightField:
     Raises:
         ValueError: if the width is not positive, or nothing would be left.
     """
-    _check_positive("trim_edges", width, "a width in µm")
+    _check("trim_edges", width)
     rows, columns = height_field.shape
     cuts = [
         int(np.ceil(min(width / size, n) - 1e-9)) if n > 1 else 0  # a profile has no edges along its single pixel
@@ -191,8 +191,7 @@ def rotate(height_field: HeightField, degrees: float) -> HeightField:
     Raises:
         ValueError: if the angle is not a finite number, or no pixel fits into the rotated patch.
     """
-    if not is_number(degrees):
-        raise RequestError(f"rotate: got {degrees!r}, wanted an angle in degrees")
+    _check("rotate", degrees)
     quarters = degrees / 90
     if quarters == np.rint(quarters):
         turns = int(np.rint(quarters)) % 4
@@ -250,8 +249,7 @@ def crop_periods(height_field: HeightField, axes: str = "xy") -> HeightField:
     Raises:
         ValueError: if pixels are missing, no period is found, or less than one fits into the patch.
     """
-    if axes not in ("x", "y", "xy"):
-        raise RequestError(f"crop_periods: got {axes!r}, wanted 'x', 'y' or 'xy'")
+    _check("crop_periods", axes)
     if height_field.gaps.any():
         raise RequestError(f"crop_periods: {height_field.gaps.sum()} pixels are missing, wanted fill_missing before it")
     found = [period for period in find_periods(height_field) if not period.width]
@@ -317,42 +315,44 @@ def _component(wave: Period, axis: str) -> tuple[float, float]:
 
 # ---------------------------------------------------------------- recipes
 
-_STEPS: dict[str, tuple[Callable[..., HeightField], type | None, bool]] = {
-    "level_plane": (level_plane, None, False),
-    "level_quadratic": (level_quadratic, None, False),
-    "align_lines": (align_lines, None, False),
-    "despike": (despike, float, False),
-    "fill_missing": (fill_missing, None, False),
-    "rotate": (rotate, float, True),
-    "crop_periods": (crop_periods, str, False),
-    "trim_edges": (trim_edges, float, True),
-}
-"""Name → function, type of its argument (None: no argument), and whether it is required."""
 
+def _is_positive(value: object) -> bool:
+    return is_number(value) and value > 0
+
+
+_WITHOUT = (lambda argument: False), "no argument"
+_STEPS: dict[str, tuple[Callable[..., HeightField], Callable[[object], bool], str]] = {
+    "level_plane": (level_plane, *_WITHOUT),
+    "level_quadratic": (level_quadratic, *_WITHOUT),
+    "align_lines": (align_lines, *_WITHOUT),
+    "despike": (despike, _is_positive, "a positive number of standard deviations"),
+    "fill_missing": (fill_missing, *_WITHOUT),
+    "rotate": (rotate, is_number, "a number of degrees"),
+    "crop_periods": (crop_periods, ("x", "y", "xy").__contains__, "'x', 'y' or 'xy'"),
+    "trim_edges": (trim_edges, _is_positive, "a positive number of µm"),
+}
+"""Name → function, whether an argument is right, and what is wanted."""
 
 STEP_NAMES = tuple(_STEPS)
+_WITH_ARGUMENT = ("rotate", "trim_edges")  # the others have none, or a default
+
+
+def _check(name: str, argument: object, where: str = "") -> None:
+    _, is_right, wanted = _STEPS[name]
+    if not is_right(argument):
+        raise RequestError(f"{where}{name}: got {argument!r}, wanted {wanted}")
 
 
 def check_steps(steps: object) -> None:
-    """Check a list of steps, each a name or {name: argument}, without a height field.
-
-    Raises:
-        ValueError: if a name or an argument is wrong.
-    """
+    """Check a list of steps, each a name or {name: argument}, without a height field."""
     if not isinstance(steps, list | tuple):
         raise RequestError(f"prepare: got {steps!r}, wanted a list of steps")
     for step in steps:
         name, argument = _parts(step)
-        _, kind, required = _STEPS[name]
-        if argument is None:
-            if required:
-                raise RequestError(f"prepare: {name}: missing its argument, wanted {{ {name} = … }}")
-        elif kind is None:
-            raise RequestError(f"prepare: {name}: got {argument!r}, wanted no argument")
-        elif kind is float and not is_number(argument):
-            raise RequestError(f"prepare: {name}: got {argument!r}, wanted a number")
-        elif kind is str and argument not in ("x", "y", "xy"):
-            raise RequestError(f"prepare: {name}: got {argument!r}, wanted 'x', 'y' or 'xy'")
+        if argument is not None:
+            _check(name, argument, "prepare: ")
+        elif name in _WITH_ARGUMENT:
+            raise RequestError(f"prepare: {name}: missing its argument, wanted {{ {name} = … }}")
 
 
 def apply_steps(height_field: HeightField, steps: Sequence[Step]) -> HeightField:
@@ -399,11 +399,6 @@ def _after(
     source = f"{height_field.source}; {description}"
     size, filled = pixel_size or height_field.pixel_size, height_field.filled + filled
     return HeightField(heights, size, source, keep_missing=True, filled=filled)
-
-
-def _check_positive(name: str, value: object, wanted: str) -> None:
-    if not (is_number(value) and value > 0):
-        raise RequestError(f"{name}: got {value!r}, wanted {wanted}, positive")
 
 
 def _check_any(name: str, heights: NDArray[np.float64]) -> None:

@@ -32,11 +32,7 @@ _LONGEST_HEADER = 2**20
 
 
 def read(path: Path, unit: str | tuple[str, str] | None, channel: str | int | None) -> Scan:
-    """Read one data field of a .gwy file; the top row of its image is row 0. Masks are ignored.
-
-    Raises:
-        ValueError: if it is not a Gwyddion file, is truncated, or has no such channel.
-    """
+    """Read one data field of a .gwy file; the top row of its image is row 0. Masks are ignored."""
     if path.stat().st_size > MOST_BYTES:
         raise RequestError(f"got {path.stat().st_size} bytes, wanted at most {MOST_BYTES}")
     data = path.read_bytes()
@@ -145,11 +141,7 @@ class _Bytes:
 
 
 def read_simple_field(path: Path, unit: str | tuple[str, str] | None) -> Scan:
-    """Read the field of a .gsf file; the top row of its image is row 0.
-
-    Raises:
-        ValueError: if it is not in this format, or truncated.
-    """
+    """Read the field of a .gsf file; the top row of its image is row 0."""
     with path.open("rb") as file:
         head = file.read(_LONGEST_HEADER)
         if not head.startswith(_SIMPLE):

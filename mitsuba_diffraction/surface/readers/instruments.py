@@ -61,11 +61,7 @@ def format_of(extension: str) -> str | None:
 
 
 def read(path: Path, unit: str | tuple[str, str] | None, channel: str | int | None) -> Scan:
-    """Read one channel of an instrument file; the top row of its image is row 0.
-
-    Raises:
-        ValueError: if SurfaceTopography is not installed, cannot read the file, or finds no such channel.
-    """
+    """Read one channel of an instrument file; the top row of its image is row 0."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of the library, on optional dependencies and metadata
         try:

@@ -33,22 +33,14 @@ def is_length(unit: str) -> bool:
 
 
 def micrometres(unit: str, what: str) -> float:
-    """Return the length of one `unit` in µm.
-
-    Raises:
-        ValueError: if it is not a unit of length.
-    """
+    """Return the length of one `unit` in µm."""
     if not (isinstance(unit, str) and is_length(unit)):
         raise RequestError(f"{what}: got the unit {unit!r}, wanted a length ({UNITS})")
     return _MICROMETRES[unit.strip()]
 
 
 def scale(own: str, given: str, what: str) -> float:
-    """Return the unit of a file, or else the given one, in µm.
-
-    Raises:
-        ValueError: if there is neither, or it is not a unit of length.
-    """
+    """Return the unit of a file, or else the given one, in µm."""
     if not (own or given):
         raise RequestError(
             f"unit: the file names none for {what}, wanted one of {UNITS} (or two: along the surface, of the heights)"
@@ -57,11 +49,7 @@ def scale(own: str, given: str, what: str) -> float:
 
 
 def pair(unit: str | tuple[str, str] | None) -> tuple[str, str]:
-    """Return the given units of lateral lengths and heights; empty if none.
-
-    Raises:
-        ValueError: if it is neither one unit of length nor two.
-    """
+    """Return the given units of lateral lengths and heights; empty if none."""
     if unit is None:
         return "", ""
     units = (unit, unit) if isinstance(unit, str) else unit
@@ -112,10 +100,6 @@ def choose(channels: Sequence[Channel], wanted: str | int | None) -> Channel:
     Args:
         wanted: number, name or unique part of a name (case-insensitive). None selects the only channel of lengths, or
             the first of those named as heights.
-
-    Raises:
-        ValueError: if there is no such channel, the name is ambiguous, or it does not hold lengths; lists the
-            channels.
     """
     if wanted is None:
         lengths = [channel for channel in channels if channel.is_length]

@@ -42,11 +42,7 @@ _ESRI = ("ncols", "nrows", "xllcorner", "yllcorner", "xllcenter", "yllcenter", "
 
 
 def read_points(path: Path, unit: str | tuple[str, str] | None) -> Scan:
-    """Read points x y z on a regular grid.
-
-    Raises:
-        ValueError: if a line does not have three numbers, no unit is given, or the points are not on a grid.
-    """
+    """Read points x y z on a regular grid."""
     points = _table(_text(path))
     if points.shape[1] != 3:
         raise RequestError(f"got {points.shape[1]} numbers in a line, wanted three: x y z")
@@ -66,11 +62,7 @@ def read_points(path: Path, unit: str | tuple[str, str] | None) -> Scan:
 
 
 def read_table(path: Path, unit: str | tuple[str, str] | None) -> Scan:
-    """Read a table of heights.
-
-    Raises:
-        ValueError: if it is not a table, could be a list of points, or has no known unit.
-    """
+    """Read a table of heights."""
     text = _text(path)
     if text.lstrip()[:5].lower() == "ncols":
         return _esri(text, unit)
