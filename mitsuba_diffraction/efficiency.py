@@ -123,11 +123,7 @@ class OrderEfficiencies:
     def plot(self, path: str | os.PathLike[str] | None = None) -> Figure:
         """Plot the strongest orders; lines over the wavelength or the angle, or if both vary, a map for each order.
 
-        Args:
-            path: where to write, if given: PNG, PDF or SVG.
-
-        Returns:
-            The figure.
+        The figure is returned and, if there is a path, written: PNG, PDF or SVG.
         """
         from matplotlib.figure import Figure
 

@@ -33,18 +33,12 @@ def final_path(path: str | os.PathLike[str]) -> Path:
 
 @contextmanager
 def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Yield a temporary path next to `path` and renames it to `path` if the block succeeds.
+    """Yield a temporary path next to `path`, and rename it to `path` if the block succeeds.
 
     A reader sees either the old or the new file, whichever process writes it, and after the block the new file is on
     disk (fsync). If the block raises, including KeyboardInterrupt, the temporary file is removed and `path` is left
     unchanged. The temporary name has the suffix of `path`, by which writers choose the format. It is locked while it
-    is being written; unlocked ones, left by a killed process, are removed here.
-
-    Args:
-        path: the final path; symbolic links are followed.
-
-    Yields:
-        The path to write to, in the same folder: a rename across file systems is not atomic.
+    is being written; unlocked ones, left by a killed process, are removed here. Symbolic links are followed.
 
     Raises:
         FileNotFoundError: if the folder does not exist.

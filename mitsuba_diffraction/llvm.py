@@ -107,10 +107,7 @@ def spectral_variants() -> list[str]:
 
 
 def choose_variant(requested: str | None = None) -> str:
-    """Choose the variant to render with: the requested one, or the fastest that runs on this machine.
-
-    Args:
-        requested: a spectral variant, or None for ``cuda_ad_spectral`` with a GPU and ``llvm_ad_spectral`` without.
+    """Choose the variant to render with: the requested one, or ``cuda_ad_spectral`` with a GPU, else LLVM's.
 
     Raises:
         ValueError: ``requested`` is not a spectral variant.

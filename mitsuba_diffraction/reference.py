@@ -23,10 +23,6 @@ CHUNK = 2**20  # complex numbers in one intermediate array, 16 MiB
 def amplitudes(height_field: HeightField, kappa: float) -> NDArray[np.complex128]:
     """Compute F_m(κ), the Fourier coefficients of e^{iκh} on the tile: fft2 / (N_x N_y), heights centred.
 
-    Args:
-        height_field: the tile.
-        kappa: κ in rad/µm.
-
     Returns:
         (N_y, N_x), orders as in `scipy.fft.fftfreq`; Σ|F_m|² = 1.
     """

@@ -172,14 +172,8 @@ def transmitted_orders(
 ) -> tuple[NDArray[np.int64], Array]:
     """Compute K_t G_t (1 − F) η_m(κ_m), the transmitted orders of the BSDF in the limit of narrow lobes.
 
-    Args:
-        powers: of the profile.
-        period: µm.
-        wavelength: µm.
-        angle: in air, degrees: of incidence, or, from below, of light that a plane would refract to it.
-        index: n of the dielectric.
-        turn: of the plane of incidence, degrees, as in `scalar_orders`.
-        from_below: whether the light comes from inside.
+    Arguments are those of `scalar_orders`, of a profile of a dielectric. The angle is that in air: of incidence or, if
+    the light comes from inside, of light that a plane would refract to it.
 
     Returns:
         The orders that propagate on the other side, ascending, and their efficiencies, at most one together.
@@ -335,15 +329,11 @@ class ScalarError:
 
 
 def scalar_error(height_field: HeightField, extent: str = "tile") -> ScalarError:
-    """Determine the error of scalar theory for a surface.
+    """Determine the error of scalar theory for a surface; a "sample" is levelled first.
 
     A profile that repeats and for which rigorous theory is offered is solved. For any other surface, the map is
     averaged over the waves in the spectrum of its heights, each weighted by its share of the variance, at the depth of
     the sinusoid of equal roughness. Periods outside the map take the value at its boundary.
-
-    Args:
-        height_field: the surface.
-        extent: "tile": it repeats; "sample": a piece of a larger surface, levelled first.
     """
     lengths, power, rms_height = height_spectrum(height_field, extent)
     depth = equivalent_depth(rms_height)

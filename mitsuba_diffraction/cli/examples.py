@@ -27,7 +27,11 @@ def examples(
     if _SOURCE is None:
         raise RuntimeError(f"{_PACKAGE}: the package was installed without its scenes and recipes")
     contents = {folder / path: (_SOURCE / path).read_bytes() for path in _files(_SOURCE)}
-    new = {target: content for target, content in contents.items() if not _holds(target, content)}
+    new = {
+        target: content
+        for target, content in contents.items()
+        if not target.is_file() or target.read_bytes() != content
+    }
     for target in new:
         if target.exists() and not overwrite:
             raise RequestError(f"{target} exists and is another file; --overwrite replaces it")
@@ -45,8 +49,3 @@ def _files(root: Path) -> list[Path]:
     # Beside scenes and recipes lie earlier renderings and spectra; deeper down, textures.
     left |= {path for path in found if path.suffix == ".exr" and len(path.parts) == 2}
     return [path for path in found if path not in left and (root / path).is_file()]
-
-
-def _holds(path: Path, content: bytes) -> bool:
-    """Return whether a file is there and has this content."""
-    return path.is_file() and path.read_bytes() == content

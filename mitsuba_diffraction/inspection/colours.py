@@ -94,11 +94,8 @@ def order_share(
     """Return the share of the reflected power about one order and its opposite, at normal incidence (R = 1, K G = 1).
 
     S is integrated over the cells of the lattice of orders, squares of side 1/period about q = ±m e/period, at the κ of
-    the order. An irregular surface spreads its orders over these cells; a grating has them in the middle.
-
-    Args:
-        period: of the surface, µm, as it is after scaling.
-        wavelength: µm.
+    the order. An irregular surface spreads its orders over these cells; a grating has them in the middle. Period and
+    wavelength are in µm, the period as it is after scaling.
     """
     angle = order_angle(order, period, wavelength)
     if angle is None:
@@ -161,21 +158,14 @@ def changes(
     measured: bool,
     build: Callable[[HeightField], GratingSpectrum],
 ) -> tuple[Change, ...]:
-    """Compute two changes of each kind, + and −; of the tip only if the surface is a scan.
+    """Compute two changes of each kind, + and −; of the tip only if the surface was measured.
 
     A blunter and a sharper tip have equal effects on a surface that is equal to its negative, such as a sinusoid or a
     sawtooth: one widens the ridges, the other the grooves, and h and −h have the same powers.
 
     Height scale and pixel size scale the arguments of the one spectrum (`radiance`); the tip makes another surface,
-    whose periods and spectrum are computed anew.
-
-    Args:
-        height_field: the surface.
-        spectrum: of it, for wavelengths from 360 nm divided by 1.05.
-        main: its main period.
-        extent: "tile" or "sample".
-        measured: whether it is a scan.
-        build: builds a spectrum with the same settings.
+    whose periods and spectrum are computed anew, by `build`, with the same settings. The spectrum holds for wavelengths
+    from 360 nm divided by 1.05.
     """
     orders = [m for m in ORDERS if order_angle(m, main.period, GREEN) is not None]
     before = _View(spectrum, main.period)
@@ -232,20 +222,14 @@ _HALVINGS = 12
 
 
 def scanned(height_field: HeightField, radius: float, *, extent: str = "sample") -> HeightField:
-    """Return the surface as a tip of this radius records it or, for a negative radius, as it was before.
+    """Return the surface as a tip of this radius, µm, records it or, for a negative radius, as it was before.
 
     The lowest place that a paraboloid ρ²/2r can reach over each point is the dilation of the heights by it; erosion by
     the same gives back all that the tip touched (Villarrubia 1997, J. Res. NIST 102, 425–454):
 
         h_r(x) = max_ρ [h(x + ρ) − ρ²/2r],    h_{−r}(x) = min_ρ [h(x + ρ) + ρ²/2r]
 
-    Args:
-        height_field: the surface.
-        radius: r at the apex, µm.
-        extent: a "tile" is continued by itself, a "sample" by its edge.
-
-    Returns:
-        Heights on the same pixels.
+    A "tile" is continued by itself, a "sample" by its edge.
     """
     heights = height_field.heights
     mode = "wrap" if extent == "tile" else "nearest"

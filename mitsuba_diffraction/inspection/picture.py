@@ -32,12 +32,7 @@ _DECADES = 5
 
 
 def save_picture(inspection: Inspection, path: str | os.PathLike[str], *, title: str | None = None) -> None:
-    """Write a slide, 16 : 9, as PNG, PDF or SVG.
-
-    Args:
-        inspection: what to draw.
-        path: where to write.
-        title: of the slide; what the heights come from, if left out.
+    """Write a slide, 16 : 9, as PNG, PDF or SVG; its title is what the heights come from, if none is given.
 
     Raises:
         ValueError: if matplotlib knows no format of that ending.
@@ -75,13 +70,10 @@ def _short(text: str, length: int) -> str:
 def _headline(inspection: Inspection) -> str:
     x, y = inspection.height_field.tile_size
     rows, columns = inspection.height_field.shape
-    pixel = _both(*(p * 1e3 for p in inspection.height_field.pixel_size))
+    d_x, d_y = (p * 1e3 for p in inspection.height_field.pixel_size)
+    pixel = f"{d_x:.4g}" if np.isclose(d_x, d_y, rtol=1e-3) else f"{d_x:.4g} × {d_y:.4g}"
     kind = "one tile of a surface that repeats, " if inspection.extent == "tile" else ""
     return f"{kind}{x:.3g} × {y:.3g} µm, {columns} × {rows} pixels of {pixel} nm"
-
-
-def _both(x: float, y: float) -> str:
-    return f"{x:.4g}" if np.isclose(x, y, rtol=1e-3) else f"{x:.4g} × {y:.4g}"
 
 
 def _height_map(axes: Axes, field: HeightField, extent: str) -> None:
@@ -240,7 +232,9 @@ def _colours(rows: list[Axes], inspection: Inspection) -> None:
     """Plot one strip for each angle of incidence, its specular direction marked."""
     light = radiance(inspection.spectrum, inspection.direction, np.array(INCIDENCES)[:, None], _ANGLES)
     rgb = into_gamut(spectrum_to_linear_sRGB(light, WAVELENGTHS))
-    shown = on_screen(rgb * _exposure(rgb))
+    # The specular direction would make the rest black.
+    aside = [strip[np.abs(_ANGLES - incidence) > 5] for strip, incidence in zip(rgb, INCIDENCES, strict=True)]
+    shown = on_screen(rgb * auto_exposure(np.concatenate(aside)))
     for axes, strip, incidence in zip(rows, shown, INCIDENCES, strict=True):
         axes.imshow(strip[None], extent=(-90, 90, 0, 1), aspect="auto", interpolation="bilinear")
         axes.set_yticks([])
@@ -261,9 +255,3 @@ def _colours(rows: list[Axes], inspection: Inspection) -> None:
         loc="left",
         pad=9,
     )
-
-
-def _exposure(rgb: Array) -> float:
-    """Return the exposure of all but the specular direction, which would make the rest black."""
-    aside = [strip[np.abs(_ANGLES - incidence) > 5] for strip, incidence in zip(rgb, INCIDENCES, strict=True)]
-    return auto_exposure(np.concatenate(aside))

@@ -256,12 +256,8 @@ def concerns(
 ) -> tuple[str, ...]:
     """Return concerns about the surface as sentences; none if all is well.
 
-    Args:
-        height_field: the surface.
-        numbers: its statistics.
-        coherence_length: of the light, limited to what the surface supports, µm.
-        measured: whether it is a scan; a formula has neither tilt nor steps of its own.
-        scalar: the error of scalar theory.
+    The coherence length, µm, is limited to what the surface supports. What is not measured, a formula, has neither tilt
+    nor steps of its own.
     """
     found = []
     axes = zip(height_field.pixel_size, height_field.shape[::-1], strict=True)

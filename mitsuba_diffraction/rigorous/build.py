@@ -175,10 +175,7 @@ class _Surface:
         """Return Light of all orders from either side, k_x = α of order 0, at each wavelength; α and g times period/2π.
 
         The harmonics, those of `gratings[finer]`, are raised where R + T is not one within the tolerance, or where R is
-        above one if the material absorbs.
-
-        Args:
-            g: above, signed as in `Axes`.
+        above one if the material absorbs. g is that above, signed as in `Axes`.
         """
         wavelengths, square = list(wavelengths), g * abs(g)
         for grating in self.gratings[finer:]:

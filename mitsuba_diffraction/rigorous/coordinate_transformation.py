@@ -288,8 +288,7 @@ class Scattered:
 def scatter(alpha: Real, above: HalfSpace, below: HalfSpace, k_y: float, index: complex) -> Scattered:
     """Solve for light of this k_y (times period / 2π), with air above and a medium of the index n + ik below.
 
-    Args:
-        alpha: α_m of all harmonics, (n,), those of both half-spaces.
+    α_m of all harmonics, (n,), are those of both half-spaces.
     """
     k_0 = np.sqrt(above.square + k_y**2)
     # ψ_E and ψ_H on the curve, from E_t and H_t, which are continuous. −iG = Yψ + rise on either side.

@@ -213,13 +213,7 @@ class Table:
                 raise RequestError(f"mueller: got {self.mueller.shape}, wanted {matrices} of float32")
 
     def evaluate(self, m: ArrayLike, c: ArrayLike, g: ArrayLike, wavelength: ArrayLike, mueller: bool = False) -> Real:
-        """Return η_m, or M_ij (…, 4, 4), linear between the nodes; 0 for an order that does not propagate.
-
-        Args:
-            m: orders, broadcast against the others.
-            c, g, wavelength: as in `Axes`, µm in the medium above.
-            mueller: whether to return the matrices of light with k_y ≥ 0.
-        """
+        """Return η_m, or M_ij (…, 4, 4), at c, g and λ of `Axes`; other arguments as of `RigorousSpectrum.evaluate`."""
         table: NDArray[np.float32] = self.mueller if mueller and self.mueller is not None else self.values
         m, c, g, wavelength = np.broadcast_arrays(np.asarray(m, np.int64), c, g, wavelength)
         axes = self.axes

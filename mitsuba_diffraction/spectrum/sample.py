@@ -197,13 +197,7 @@ class SamplePowers:
         return self.grid.within(powers, self._reached)
 
     def error(self, kept: OrderGrid | SplineGrid, powers: NDArray[np.float32], kappa: float) -> float:
-        """Compute ∫|S_approx − S_exact| dq where light reaches, by the rectangle rule on a shifted lattice.
-
-        Args:
-            kept: the smaller grid of the approximation.
-            powers: c_m on it; zero outside.
-            kappa: κ in rad/µm.
-        """
+        """Return ∫|S_approx − S_exact| dq where light reaches; arguments as of `TilePowers.error`."""
         shift = self._random.uniform(-0.5, 0.5, 2)
         ramp = [np.exp(-2j * np.pi * s * lags.lags / lags.count) for s, lags in zip(shift, self._lags, strict=True)]
         exact = self._transform(self._autocorrelation(kappa) * ramp[1][:, None] * ramp[0][self._lags[0].lags >= 0])

@@ -38,7 +38,8 @@ class TilePowers:
 
     def __call__(self, kappa: float) -> NDArray[np.float64]:
         """Compute η_m(κ), (rows, columns); κ in rad/µm."""
-        return self.grid.take(_powers(self._height_field, kappa))
+        transform = scipy.fft.fft2(np.exp(1j * kappa * self._height_field.centred), norm="forward", overwrite_x=True)
+        return self.grid.take(transform.real**2 + transform.imag**2)
 
     def reached(self, powers: NDArray[np.float64]) -> float:
         """Return the share of the power in orders that light reaches; takes η_m of the grid."""
@@ -104,12 +105,6 @@ class MeanPowers(TilePowers):
         """Compute the mean of η_m(κ), (rows, columns); κ in rad/µm."""
         values = chebyshev_polynomials(position(np.array([kappa]), self._max_kappa), self._nodes)
         return (values @ self._coefficients).reshape(self.grid.shape)
-
-
-def _powers(height_field: HeightField, kappa: float) -> NDArray[np.float64]:
-    """Compute η_m(κ) = |F_m|² of all orders, (N_y, N_x), as in `scipy.fft.fftfreq`."""
-    transform = scipy.fft.fft2(np.exp(1j * kappa * height_field.centred), norm="forward", overwrite_x=True)
-    return transform.real**2 + transform.imag**2
 
 
 def _powers_float32(heights: NDArray[np.float32], kappa: float) -> NDArray[np.float32]:

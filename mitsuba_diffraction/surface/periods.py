@@ -270,11 +270,7 @@ def find_periods(height_field: HeightField, count: int = 2, *, extent: str = "sa
 
 
 def height_spectrum(height_field: HeightField, extent: str) -> tuple[Array, Array, float]:
-    """Compute the power spectrum of the heights.
-
-    Args:
-        height_field: the surface.
-        extent: "tile": as it is; "sample": levelled to second order, under a Hann window.
+    """Compute the power spectrum of the heights: of a tile as it is, of a sample levelled and under a Hann window.
 
     Returns:
         |q| in cycles/µm and the power |FFT|², both (N_y, N_x), and the r.m.s. height, µm. The power is zero where

@@ -235,16 +235,13 @@ def largest_rectangle(width: float, height: float, cos: float, sin: float) -> tu
 
 
 def crop_periods(height_field: HeightField, axes: str = "xy") -> HeightField:
-    """Crop to a whole number of periods, so that the patch tiles without a seam.
+    """Crop along "x", "y" or "xy" to a whole number of periods, so that the patch tiles without a seam.
 
     The periods are those of `find_periods`, at most two. Along each axis the strongest wave with a period along it sets
     the length: of the multiples of its period that keep at least half of the patch, the one closest to a multiple of
     the other period, or else the largest. As the length is not a whole number of pixels, a remainder of up to half a
     pixel would be a seam, which diffracts into spurious orders. The heights are therefore resampled by cubic splines to
     the nearest number of pixels.
-
-    Args:
-        axes: "x", "y" or "xy".
 
     Raises:
         ValueError: if pixels are missing, no period is found, or less than one fits into the patch.

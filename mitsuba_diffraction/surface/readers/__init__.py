@@ -8,13 +8,12 @@ explicit y (.xyz, ESRI grids) keep theirs.
 from __future__ import annotations
 
 import os
-from numbers import Real
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import RequestError
+from ...errors import RequestError, is_number
 from ...files import refuse_special
 from ..heightfield import HeightField
 from . import gwyddion, instruments, pictures, text
@@ -150,9 +149,7 @@ def _as_micrometres(numbers: NDArray, height_range: float | None) -> NDArray[np.
         raise RequestError(
             f"height_range: missing for {numbers.dtype} heights, wanted the height in µm from black to white"
         )
-    if isinstance(height_range, bool) or not isinstance(height_range, float | Real):
-        raise RequestError(f"height_range: got {height_range!r}, wanted a number in µm")
-    if not (np.isfinite(height_range) and height_range > 0):
+    if not (is_number(height_range) and height_range > 0):
         raise RequestError(f"height_range: got {height_range!r}, wanted a positive number in µm")
     scale = np.iinfo(numbers.dtype)
     least, greatest = int(numbers.min()), int(numbers.max())
