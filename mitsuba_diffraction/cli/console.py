@@ -41,7 +41,7 @@ class Log(logging.Handler):
 
 
 def table(columns: Iterable[str], rows: Iterable[Sequence[str]], texts: int = 1) -> Table:
-    """For a terminal; the first `texts` columns hold texts, the others numbers."""
+    """Return a table for a terminal; the first `texts` columns hold texts, the others numbers."""
     shown = Table(box=None, pad_edge=False)
     for index, column in enumerate(columns):
         shown.add_column(column, justify="left" if index < texts else "right", no_wrap=True)

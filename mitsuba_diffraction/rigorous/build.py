@@ -172,7 +172,7 @@ class _Surface:
         return count
 
     def solve(self, alpha: float, g: float, wavelengths: Iterable[float], finer: int = 0) -> list[Scattered]:
-        """Return Light of all orders from either side, k_x = α of order 0, at each wavelength; α and g times period/2π.
+        """Solve for light of all orders from either side, at each wavelength; α of order 0 and g times period/2π.
 
         The harmonics, those of `gratings[finer]`, are raised where R + T is not one within the tolerance, or where R is
         above one if the material absorbs. g is that above, signed as in `Axes`.
@@ -209,7 +209,7 @@ class _Surface:
         return {(i, o): (solved.orders[i], solved.orders[o], matrices_of(solved, i, o)) for i, o in ways}
 
     def checks(self) -> list[_Checked]:
-        """Return Light at random places, directions uniform over the hemispheres, wavelengths over the range."""
+        """Return light at random places, directions uniform over the hemispheres, wavelengths over the range."""
         rng = np.random.default_rng(0)
         checks = []
         for number, (cosine, turn, share) in enumerate(rng.random((_CHECKS, 3))):
@@ -299,7 +299,7 @@ class _Build:
         return tuple(tables)
 
     def _job(self, job: int) -> NDArray[np.float32]:
-        """M of light: (r less its units, orders of all tables, units of p + D, K, i, j); NaN where there is none.
+        """Return M: (r less its units, orders of all tables, units of p + D, K, i, j); NaN where there is no light.
 
         Of reversed light: (p less its units, …).
         """

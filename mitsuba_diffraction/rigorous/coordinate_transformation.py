@@ -173,7 +173,7 @@ class Grating:
         return toeplitz(c[:n], c[-np.arange(n)])
 
     def bounded(self, alpha: Real, gamma2: complex, upwards: bool, count: int) -> tuple[Complex, Complex]:
-        """ψ and −iG along the curve, (n, count) each, of fields that span those decaying fastest in one direction."""
+        """Return ψ and −iG along the curve, (n, count) each, of fields that span those decaying fastest one way."""
         n = len(alpha)
         # −iG is stored in this unit, so that both halves of a vector weigh the same.
         unit = np.sqrt(np.abs(gamma2) + n**2)
@@ -190,7 +190,7 @@ class Grating:
         return basis[:n], basis[n:] * unit
 
     def rayleigh(self, alpha: Real, orders: NDArray[np.int64], beta: Real) -> tuple[tuple[Complex, Complex], ...]:
-        """ψ and −iG of the plane waves e^{i(α_m x ± β z)} along the curve as columns, (n, orders) each; + and −."""
+        """Return ψ and −iG of the plane waves e^{i(α_m x ± β z)} along the curve, (n, orders) each; + and −."""
         # Without e^{iα_0 t}, which all harmonics share.
         alpha_0 = alpha[self.harmonics]
         along_x = np.exp(1j * (alpha_0 * (self.x - self.t) + orders[:, None] * self.x))
@@ -228,7 +228,7 @@ class HalfSpace:
     rise: Complex
 
     def amplitudes(self, psi: Complex) -> Complex:
-        """Of the Rayleigh waves in a sum of outgoing fields ψ (n, …), (p, …)."""
+        """Return those of the Rayleigh waves, (p, …), in a sum of outgoing fields ψ (n, …)."""
         return lu_solve(self.factors, psi, check_finite=False)[: len(self.orders)]
 
 
@@ -280,7 +280,7 @@ class Scattered:
     k_0: float
 
     def of_light(self, order: int, side: int) -> tuple[Complex, Complex]:
-        """Amplitudes of the orders above and below, (p, 2, 2) and (r, 2, 2), of light of this order from one side."""
+        """Return the orders above and below, (p, 2, 2) and (r, 2, 2), of light of this order from one side."""
         j = int(np.flatnonzero(self.orders[side] == order)[0])
         return tuple(block[:, :, j] for block in self.amplitudes[side])
 

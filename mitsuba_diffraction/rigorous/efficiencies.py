@@ -149,7 +149,7 @@ def efficiencies(
     tolerance: float = 1e-3,
     harmonics: int | None = None,
 ) -> Efficiencies:
-    """Rigorous efficiencies of a surface of one row, h(x), in air; conical incidence included.
+    """Compute the rigorous efficiencies of a surface of one row, h(x), in air; conical incidence included.
 
     Args:
         height_field: one period (rows that differ are refused); straight lines join the pixels (`curve_of`).
@@ -280,7 +280,7 @@ def _change(before: Efficiencies, after: Efficiencies) -> float:
 
 
 def frames(k: Real) -> Real:
-    """(n, 2, 2): ŝ and p̂ (columns) of waves along k (n, 3) in terms of ê and k̂ × ê (rows), as in `Scattered`."""
+    """Return ŝ and p̂ (columns) of waves along k (n, 3) in terms of ê and k̂ × ê (rows) of `Scattered`, (n, 2, 2)."""
     across = np.hypot(k[:, 0], k[:, 1])
     s = np.stack([-k[:, 1], k[:, 0], np.zeros(len(k))], axis=1)
     s = np.where(across[:, None] < 1e-12, [0.0, 1.0, 0.0], s / np.maximum(across, 1e-12)[:, None])
@@ -335,7 +335,7 @@ def through_sheet(solved: Scattered, index: float) -> dict[tuple[int, int], Real
 
 
 def _plane(alpha: Real, k_y: float, k: float, other: float, upwards: bool) -> tuple[Real, Real]:
-    """Mueller matrices of light that meets a plane, transmitted and reflected, (n, 4, 4) each.
+    """Return the Mueller matrices of light that meets a plane, transmitted and reflected, (n, 4, 4) each.
 
     Args:
         alpha, k_y: along the plane.

@@ -132,7 +132,7 @@ class Axes:
         return range(-self.max_order, self.max_order + 1)
 
     def least(self, m: NDArray[np.int64] | int) -> tuple[NDArray[np.int64] | int, NDArray[np.int64] | int]:
-        """By how much P and R of order m are less than D + g + k_x and D + g − k_x of the incident light."""
+        """Return by how much P and R of order m are less than D + g + k_x and D + g − k_x of the incident light."""
         enters = self.way == (0, 1) and self.index != 1
         return (0 * m, 0 * m) if enters else (np.maximum(m, 0), np.maximum(-m, 0))
 
@@ -155,7 +155,7 @@ class Axes:
         return int(np.ceil(self.shift + longest - sum(self.least(m))))
 
     def side(self, m: int) -> int:
-        """Nodes of order m along P, and along R."""
+        """Return how many nodes order m has along P, and along R."""
         return self.units(m) * self.steps + 1
 
     def offset(self, m: int) -> int:
@@ -163,7 +163,7 @@ class Axes:
         return sum(self.side(k) ** 2 for k in range(-self.max_order, m))
 
     def square(self, values: NDArray[np.float32], m: int) -> NDArray[np.float32]:
-        """Of `values` (K, nodes), those of order m: (K, P, R)."""
+        """Return those of order m, (K, P, R), of `values` (K, nodes)."""
         side, start = self.side(m), self.offset(m)
         return values[:, start : start + side**2].reshape(-1, side, side)
 
@@ -400,7 +400,7 @@ class RigorousSpectrum:
     def efficiencies(
         self, direction: ArrayLike, wavelength: float, transmitted: bool = False
     ) -> tuple[NDArray[np.int64], Real]:
-        """The orders that propagate, ascending, and η_m of unpolarised light, as `rigorous.efficiencies` has them.
+        """Return the orders that propagate, ascending, and η_m of unpolarised light, as `rigorous.efficiencies`.
 
         Args:
             direction: ω_i, (3,), to the light; from below if ω_i,z < 0.
