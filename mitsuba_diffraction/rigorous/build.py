@@ -27,6 +27,8 @@ from .materials import refractive_index
 from .spectrum import LARGEST_PERIOD, STORED, Axes, RigorousSpectrum, Table, axes_of
 
 Real = NDArray[np.float64]
+# The part of a unit and the units of p + r → M of that light, as `_Build._job` has it.
+_Lattice = dict[tuple[int, int], NDArray[np.float32]]
 # n of the orders in and out, and their matrices, (orders out, orders in, 4, 4).
 _Orders = tuple[NDArray[np.int64], NDArray[np.int64], Real]
 # α, g, λ, whether an order is near its Rayleigh anomaly, and (from, to) → m and M_ij of the orders, (n, 4, 4).
@@ -86,13 +88,14 @@ def build_spectrum(
     with one_thread():
         surface = _Surface(height_field, settings, tolerance)
         checks = surface.checks()
-        error, done = np.inf, 0
+        error, done, lattice = np.inf, 0, {}
         steps = _SOLVED_BOTH if settings.transmission == "interface" else _SOLVED
         for solved in steps:
             # Twice the steps cost four times as much and leave an eighth of the error: which table will be the last?
             begin, done = done, 95 if error <= 8 * tolerance or solved == steps[-1] else done + 20
             axes = Axes(surface.period, surface.wavelengths, STORED * solved, PLANES)
-            tables = _Build(surface, axes, solved, settings.polarised).tables(
+            build = _Build(surface, axes, solved, settings.polarised, lattice)
+            tables, lattice = build.tables(
                 lambda row, rows, a=begin, b=done: progress(a + (b - a) * row // rows, 100), checkpoints
             )
             spectrum = RigorousSpectrum(
@@ -263,8 +266,8 @@ class _Build:
     is solved: r less its units at most p less its units.
     """
 
-    def __init__(self, surface: _Surface, axes: Axes, steps: int, polarised: bool) -> None:
-        self.surface, self.steps = surface, steps
+    def __init__(self, surface: _Surface, axes: Axes, steps: int, polarised: bool, coarser: _Lattice) -> None:
+        self.surface, self.steps, self.coarser = surface, steps, coarser
         self.entries = 4 if polarised else 1  # rows and columns of the matrices that are kept
         self.axes = axes_of(axes, surface.transmission, surface.index(surface.wavelengths[0]).real)
         self.local = surface.transmission == "interface"
@@ -281,8 +284,8 @@ class _Build:
         units = range(-below, axes.units(0) + 2)
         self.jobs = [(part, unit) for part in reversed(range(steps)) for unit in units]  # the longest first
 
-    def tables(self, progress: Progress, checkpoints: Path | None) -> tuple[Table, ...]:
-        """Return those of `RigorousSpectrum`."""
+    def tables(self, progress: Progress, checkpoints: Path | None) -> tuple[tuple[Table, ...], _Lattice]:
+        """Return those of `RigorousSpectrum`, and the lattice, a quarter of that of twice the steps."""
         done = _Checkpoint(checkpoints, f"{self.surface.digest}-{self.steps}")
         left = [job for job in range(len(self.jobs)) if job not in done.done]
         with ThreadPoolExecutor(os.cpu_count()) as pool:
@@ -296,7 +299,7 @@ class _Build:
                 raise
         tables = [self._stored(table, done.done) for table in range(len(self.axes))]
         done.remove()
-        return tuple(tables)
+        return tuple(tables), {self.jobs[job]: solved for job, solved in done.done.items()}
 
     def _job(self, job: int) -> NDArray[np.float32]:
         """Return M: (r less its units, orders of all tables, units of p + D, K, i, j); NaN where there is no light.
@@ -309,7 +312,11 @@ class _Build:
         shape = self.first[-1], max(units + 2 * shift + 1, 0)
         found = np.full((part + 1, *shape, axes.planes, entries, entries), np.nan, np.float32)
         middle = (units + 1) // 2
+        known = self.coarser.get((part // 2, units)) if part % 2 == 0 else None
         for other in range(part + 1):
+            if known is not None and other % 2 == 0:
+                found[other] = known[other // 2]
+                continue
             # A node at the end of a unit belongs to that unit. The units that the table reaches are solved whole, for
             # polynomials across them.
             if not units - (part == 0) - (other == 0) < axes.units(0):
