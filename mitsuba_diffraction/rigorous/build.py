@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 import itertools
 import os
+import time
 import warnings
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
@@ -34,7 +35,7 @@ _Orders = tuple[NDArray[np.int64], NDArray[np.int64], Real]
 # α, g, λ, whether an order is near its Rayleigh anomaly, and (from, to) → m and M_ij of the orders, (n, 4, 4).
 _Checked = tuple[float, float, float, bool, dict[tuple[int, int], tuple[NDArray[np.int64], Real]]]
 
-# Steps to a unit that are solved, one after the other until the error is kept.
+# Steps to a unit that are solved, one after the other until the error is kept; each twice those before, which it holds.
 _SOLVED = (8, 16, 32)
 # Of an interface, whose light from below is less smooth. 600 lines/mm in glass have a mean error of 0.0106 with eight.
 _SOLVED_BOTH = (10, 20, 40)
@@ -48,6 +49,7 @@ _ROUNDED = 2.0**-16
 _OFF = 1e-8
 _NEAR = 0.02
 _CHECKS = 200
+_SECONDS = 20.0  # between checkpoints, each of which is written whole
 # Light at which the harmonics are chosen: near the normal, and oblique from both sides.
 _HARD = ((0.1, 0, 1), (0.8, 0.3, 0.5), (-0.8, 0.3, 0.5))
 BUILD_VERSION = 5  # raised when tables of equal requests change
@@ -433,7 +435,7 @@ class _Checkpoint:
     def __init__(self, folder: Path | None, name: str) -> None:
         self.path = folder / f"rigorous-{name}.npz" if folder else None
         self.done: dict[int, NDArray[np.float32]] = {}
-        self._unwritten = 0
+        self._written = time.monotonic()
         if self.path and self.path.is_file():
             try:
                 with open(self.path, "rb") as stream, np.load(stream) as file:
@@ -443,8 +445,7 @@ class _Checkpoint:
 
     def add(self, row: int, values: NDArray[np.float32]) -> None:
         self.done[row] = values
-        self._unwritten += 1
-        if self._unwritten >= 8:
+        if time.monotonic() > self._written + _SECONDS:
             self.write()
 
     def write(self) -> None:
@@ -454,7 +455,7 @@ class _Checkpoint:
                 self.path.parent.mkdir(parents=True, exist_ok=True)
                 with whole_file(self.path) as temporary, open(temporary, "wb") as file:
                     np.savez(file, **{str(row): values for row, values in self.done.items()})
-        self._unwritten = 0
+        self._written = time.monotonic()
 
     def remove(self) -> None:
         with suppress(OSError):

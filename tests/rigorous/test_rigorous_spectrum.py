@@ -208,17 +208,17 @@ def test_an_interrupted_build_goes_on(tmp_path):
     again = build_spectrum(
         small, REQUEST, progress=lambda done, total: steps.append((done, total)), checkpoints=tmp_path
     )
-    assert steps[0][0] > 5
+    assert steps[0][0] >= 5
     np.testing.assert_array_equal(again.values, build_spectrum(small, REQUEST).values)
     assert not list(tmp_path.iterdir())
 
 
 def test_progress_is_one_count_in_per_cent(monkeypatch):
     """Also where finer tables follow."""
-    monkeypatch.setattr("mitsuba_diffraction.rigorous.build._SOLVED", (4, 5, 6))
+    monkeypatch.setattr("mitsuba_diffraction.rigorous.build._SOLVED", (4, 8, 16))
     monkeypatch.setattr("mitsuba_diffraction.rigorous.build._CHECKS", 2)
     reports = []
-    with pytest.warns(UserWarning, match="with 6 steps to a unit"):
+    with pytest.warns(UserWarning, match="with 16 steps to a unit"):
         build_spectrum(
             gratings.sinusoidal(0.15, 0.03, samples=32),
             replace(REQUEST, tolerance=1e-4),
