@@ -231,6 +231,21 @@ def test_progress_is_one_count_in_per_cent(monkeypatch):
     assert done[-1] == 100
 
 
+def test_light_of_a_coarser_lattice_is_not_solved_again(monkeypatch):
+    monkeypatch.setattr(build, "_CHECKS", 2)
+    scatter, counts, values = build.scatter, [], []
+    for steps in ((4, 8), (8,)):
+        solved = []
+        monkeypatch.setattr(build, "scatter", lambda *light, solved=solved: solved.append(1) or scatter(*light))
+        monkeypatch.setattr(build, "_SOLVED", steps)
+        with pytest.warns(UserWarning, match="with 8 steps to a unit"):
+            found = build_spectrum(gratings.blazed(0.15, 0.03, samples=32), replace(REQUEST, tolerance=1e-4))
+        counts.append(len(solved))
+        values.append(found.values)
+    assert counts[0] == counts[1]
+    np.testing.assert_array_equal(*values)
+
+
 def test_a_checkpoint_is_no_reason_to_fail(tmp_path):
     """In a folder that cannot be written to, and where a checkpoint is damaged."""
     small = gratings.sinusoidal(0.15, 0.03, samples=32)
