@@ -5,9 +5,10 @@ With R = 1 and E = 1 the BSDF reflects
     a(ω_i, λ) = ∫ K G S(q; κ) W dq    over the q whose ω_o is above the surface (du dv = cos θ_o dω_o = λ² dq)
 
 a is summed over components of S: the orders of a grating, or, where orders overlap and of a sample, the cells of a
-lattice in which S is gathered, each represented by a Gaussian as wide as the cell. An order is represented by the
-centre of its lobe, which keeps its power, and so is a cell whose ω_o stays away from the horizon, as K G and κ hardly
-change within it; other cells, and the lobe of the mirror direction, by points that are evenly spaced in cos θ_o.
+lattice in which S is gathered, each represented by a Gaussian as wide as the cell. An order both of whose directions
+stay away from the horizon is represented by the centre of its lobe, as K G and κ hardly change within it, and so is a
+cell whose ω_o does; the others, and the lobe of the mirror direction, by points that are evenly spaced in cos θ_o, or,
+of an order, in the cosine of the direction that is nearer to the horizon.
 
 K, G and W are those of the BSDF. With s_i = ω_i,t, s_o = ω_o,t, w = cos θ_i + cos θ_o, d(s) = (1 − |s|²)/2λσ_q and
 g the `horizon_gain`, an order m that is evaluated by itself has
@@ -51,14 +52,16 @@ COARSER = 1.6  # cells, where there are three ways for light to go
 CELL, CELLS = 0.2, 500  # width of a gathered cell in direction cosines at the shortest wavelength; cells at least
 MIRROR_CELL = 0.75  # the same in the lobe of the mirror direction, in σ_q, at most
 FAR_CELL = 20  # cos² θ_o in λσ from which a cell is represented by its centre
+FAR_ORDER = 6  # cos² of either direction in λσ from which an order is; there the gain is one
 TURN = 0.5  # radians by which the phase of the deepest point may change within such a cell
 REACH = 4.2  # standard deviations to which a component is integrated
 FLAT = 0.5  # cos θ_o down to which no phase of a narrow order may turn so far
 NARROW = 0.02  # λσ up to which a lobe is integrated along the radius alone
 RADIAL, AZIMUTHAL = 9, 13  # points of a lobe
-RADIAL_CELL = 3  # of a cell
+RADIAL_POINTS, RADIAL_POINTS_OF_CELL = leggauss(RADIAL), leggauss(3)
 BLUR = 0.05  # a cell of a table in three dimensions, as a share of the largest κ
-POINTS = 6000  # drawn by power among the nodes of a spectrum
+ROBERTS = np.array([0.7548776662466927, 0.5698402909980532])  # steps of a sequence of low discrepancy in the plane
+POINTS = 12000  # drawn by power among the nodes of a spectrum
 CHUNK = 1 << 16  # pairs (direction, component) at once, so that they stay in the cache
 
 
@@ -223,29 +226,34 @@ class Furnace:
         lowest = 0.0 if self.by_order else -2 * REACH / index * np.multiply.outer(length, self.widths[reached])
         i, j = np.nonzero(square > lowest)
         square, j = square[i, j], reached[j]
-        far = self._far(square, length[i] * self.widths[j] / index, length[i], way)
+        # Of an order the direction that is nearer to the horizon counts.
+        nearest = np.minimum(square, cos_i[i] ** 2) if self.by_order else square
+        far = self._far(nearest, length[i] * self.widths[j] / index, length[i], way)
         if way:
             # What goes the other way at its centre does so.
             kept = ~far | (way * (cos_i[i] - index * np.sqrt(np.maximum(square, 0))) > 0)
             i, j, square, far = i[kept], j[kept], square[kept], far[kept]
-        at, component, cos_o = i[far], j[far], np.sqrt(square[far])
-        tangent = length[at] ** 2 * (q[component] ** 2).sum(-1)
+        at, component = i[far], j[far]
+        # Of a cell the means of cos² θ_o and |λq|².
+        spread = 0.0 if self.by_order else 2 * (length[at] * self.widths[component]) ** 2
+        cos_o = np.sqrt(square[far] - spread / index**2)
+        tangent = length[at] ** 2 * (q**2).sum(-1)[component] + spread
         value = self._factor(cos_i[at], cos_o, length[at], tangent, way)
         value = value * self._power(partial(self.power, component, way=way), cos_i[at], cos_o, length[at], way)
-        i, j = i[~far], j[~far]
-        near = self._lobes(s[i], cos_i[i], length[i], j, way)
-        return np.bincount(np.append(at, i), np.append(value, near), len(s)).astype(np.float64)
+        near = self._lobes(s, cos_i, length, i[~far], j[~far], square[~far], way)
+        return np.bincount(np.append(at, i[~far]), np.append(value, near), len(s)).astype(np.float64)
 
     def _far(
         self, square: NDArray[np.float64], sigma: NDArray[np.float64], length: NDArray[np.float64], way: int
     ) -> NDArray[np.bool_]:
-        """Return whether a component is represented by its centre; cos² θ_o, the width in ω_o and λ of each."""
-        # The lobe of an order keeps its power at the horizon, with K and G of the order, and of transmitted light with
-        # its κ: that of reflected light alone may change.
-        if self.by_order and (way or not self.turning):
+        """Return whether a component is represented by its centre; its cos² θ_o, width in ω_o and λ."""
+        # A transmitted order keeps its power at the horizon, with K_t, G_t and κ of the order.
+        if self.by_order and way:
             return np.ones(square.shape, bool)
         turn = 2 * np.pi * self.height_range * sigma / (length * TURN)
-        return (square > turn**2) & (self.by_order | (square > FAR_CELL * sigma))
+        if self.by_order:
+            return (square > turn**2) & (square > FAR_ORDER * sigma)
+        return (square > turn**2) & ((square > FAR_CELL * sigma) | (square > 1 - 3 * sigma**2))
 
     def _factor(
         self,
@@ -287,18 +295,27 @@ class Furnace:
         s: NDArray[np.float64],
         cos_i: NDArray[np.float64],
         length: NDArray[np.float64],
+        place: NDArray[np.int64],
         component: NDArray[np.int64],
+        square: NDArray[np.float64],
         way: int,
     ) -> NDArray[np.float64]:
-        """Integrate over lobes and cells in which K, G or κ change, (n,)."""
+        """Integrate over lobes and cells in which K, G or κ change, (n,), of pairs (place, component)."""
+        s, cos_i, length = s[place], cos_i[place], length[place]
+        offset, back = length[:, None] * self.q[component] * (way or 1), np.zeros(len(place), bool)
+        if self.by_order:
+            # What changes is the direction that is nearer to the horizon: of a pair either may be ω_i.
+            back = cos_i**2 < square
+            s[back], cos_i[back] = (s + offset)[back], np.sqrt(square[back])
+            offset[back] *= -1
         result = np.empty(len(s))
         lobe = (self.q[component] == 0).all(-1) | self.by_order
-        wide = lobe & (length * self.widths[component] > NARROW) & (not self.by_order)
+        wide = lobe & (length * self.widths[component] > NARROW)
         for those, count in ((~lobe, 1), (wide, AZIMUTHAL), (lobe & ~wide, 1)):
             some = np.flatnonzero(those)
             for part in np.array_split(some, 1 + len(some) * RADIAL * count // CHUNK):
                 if len(part):
-                    arguments = s[part], cos_i[part], length[part], component[part]
+                    arguments = s[part], cos_i[part], length[part], offset[part], component[part], back[part]
                     result[part] = self._lobe(*arguments, way, count, bool(lobe[part[0]]))
         return result
 
@@ -307,7 +324,9 @@ class Furnace:
         s: NDArray[np.float64],
         cos_i: NDArray[np.float64],
         length: NDArray[np.float64],
+        offset: NDArray[np.float64],
         component: NDArray[np.int64],
+        back: NDArray[np.bool_],
         way: int,
         azimuths: int,
         lobes: bool,
@@ -316,17 +335,19 @@ class Furnace:
 
         In polar coordinates of −ω_o,t = r (cos φ, sin φ), r² = 1 − cos² θ_o and r dr = −cos θ_o dcos θ_o.
         """
-        s, cos_i, length = s[:, None, None], cos_i[:, None, None], length[:, None, None]
-        index, sign = (way and self.index) or 1.0, way or 1
-        sigma, offset = length * self.widths[component, None, None], length[..., None] * self.q[component, None, None]
-        sigma, t = sigma / index, (s + sign * offset) / index
+        s, cos_i, length, offset = s[:, None, None], cos_i[:, None, None], length[:, None, None], offset[:, None, None]
+        index, component = (way and self.index) or 1.0, component[:, None, None]
+        sigma, t = length * self.widths[component] / index, (s + offset) / index
         rho = np.hypot(t[..., 0], t[..., 1])
+        ahead = t / np.maximum(rho, 1e-12)[..., None]
         reach = (REACH if lobes else np.sqrt(3)) * sigma
         nearest, farthest = np.maximum(rho - reach, 0), rho + reach
-        highest, lowest = np.sqrt(1 - np.minimum(nearest, 1) ** 2), np.sqrt(1 - np.minimum(farthest, 1) ** 2)
-        nodes, weights = leggauss(RADIAL if lobes else RADIAL_CELL)
+        # The variance of a cell across the radius.
+        across = 0.0 if lobes else sigma**2
+        highest, lowest = (np.sqrt(np.maximum(1 - x**2 - across, 0)) for x in (nearest, farthest))
+        nodes, weights = RADIAL_POINTS if lobes else RADIAL_POINTS_OF_CELL
         cos_o = np.maximum(lowest + (highest - lowest) * ((1 + nodes) / 2)[:, None], 1e-6)
-        r = np.sqrt(1 - cos_o**2)
+        r = np.sqrt(np.maximum(1 - cos_o**2 - across, 0))
         weight = (highest - lowest) * (weights / 2)[:, None] * cos_o
         opening = np.where(rho > reach, np.arcsin(np.minimum(reach / np.maximum(rho, 1e-12), 1)), np.pi)
         phi = opening * ((np.arange(azimuths) + 0.5) * (2 / azimuths) - 1)
@@ -341,17 +362,21 @@ class Furnace:
         else:
             square = (r - rho) ** 2 + 4 * r * rho * np.sin(phi / 2) ** 2
             weight = weight * (2 / azimuths) * opening * np.exp(-square / (2 * sigma**2)) / (2 * np.pi * sigma**2)
-        power = weight * self._power(partial(self.power, component[:, None, None], way=way), cos_i, cos_o, length, way)
-        if self.by_order:
-            # Of the order, K and G; its lobe keeps its power.
-            value = self._factor(cos_i, np.sqrt(1 - rho**2), length, (offset**2).sum(-1), way)
-            return (value * power.sum(1, keepdims=True) / weight.sum(1, keepdims=True))[:, 0, 0]
-        ahead = t / np.maximum(rho, 1e-12)[..., None]
-        cosine, sine = r * np.cos(phi), r * np.sin(phi)
-        out = np.stack(
-            [ahead[..., 0] * cosine - ahead[..., 1] * sine, ahead[..., 1] * cosine + ahead[..., 0] * sine], -1
-        )  # −ω_o,t
-        return (power * self._factor(cos_i, cos_o, length, ((index * out - s) ** 2).sum(-1), way)).sum((1, 2))
+        powers, x, y = partial(self.power, component, way=way), r * np.cos(phi), r * np.sin(phi)
+        # −ω_o,t
+        out_x, out_y = ahead[..., 0] * x - ahead[..., 1] * y, ahead[..., 1] * x + ahead[..., 0] * y
+        if not self.by_order:
+            tangent = (index * out_x - s[..., 0]) ** 2 + (index * out_y - s[..., 1]) ** 2 + index**2 * across
+            power = weight * self._power(powers, cos_i, cos_o, length, way)
+            return (power * self._factor(cos_i, cos_o, length, tangent, way)).sum((1, 2))
+        # cos² of t_i and t_o; where ω_i changes, κ is that of the order.
+        t_i, t_o = 1 - rho**2, 1 - (out_x - offset[..., 0]) ** 2 - (out_y - offset[..., 1]) ** 2
+        in_, of = (np.sqrt(np.maximum(square, 1e-12) / 2) for square in (cos_i**2 + t_o, cos_o**2 + t_i))
+        value = weight * (t_o > 0) * self._factor(in_, of, length, (offset**2).sum(-1), way)
+        for square in (np.minimum(cos_i**2, t_i), np.minimum(cos_o**2, t_o)):
+            value *= horizon_gain(np.maximum(square, 0) / (2 * sigma))
+        cos_o = np.where(back[:, None, None], np.sqrt(np.maximum(t_i, 0)), cos_o)
+        return (value * self._power(powers, cos_i, cos_o, length, way)).sum((1, 2))
 
     def albedo_of_nodes(
         self,
@@ -360,6 +385,7 @@ class Furnace:
         wavelengths: NDArray[np.float64],
         bounds: Sequence[Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]],
         seed: int = 0,
+        pairs: bool = True,
     ) -> NDArray[np.float64]:
         """Compute the albedo with E from the stored spectrum, nothing gathered and lobes as wide as they are.
 
@@ -373,56 +399,56 @@ class Furnace:
             bounds: e(ω, λ) of reflected and of transmitted light, for directions (m, 3) and wavelengths (m,) on the
                 side of ω_i.
             seed: of the points.
+            pairs: if not, reflected light, too, has e of the incident direction, which takes half of the time.
 
         Returns:
             (n,).
         """
-        rng, grid, sigma = np.random.default_rng(seed), spectrum.grid, spectrum.lobe_width
-        q = np.stack(np.meshgrid(*grid.frequencies()), -1).reshape(-1, 2) * self.side
+        grid, sigma = spectrum.grid, spectrum.lobe_width
+        q = np.stack(np.meshgrid(*grid.frequencies()), -1).reshape(-1, 2)
+        kappas = np.array([0, 0.03, 0.1, 0.4, 0.7, 1]) * spectrum.max_kappa
+        strength = np.stack([np.maximum(spectrum.powers(kappa), 0).ravel() for kappa in kappas]).sum(0)
+        # Evenly along the sum of strengths, from a random start.
+        rng, share = np.random.default_rng(seed), strength / strength.sum()
+        node = np.searchsorted(share.cumsum(), (np.arange(POINTS) + rng.random()) / POINTS).clip(max=len(q) - 1)
+        weight = 1 / (POINTS * share[node])
+        # Points of one node follow each other in a sequence of low discrepancy (Roberts 2018).
+        t = (rng.random(2) + np.arange(POINTS)[:, None] * ROBERTS) % 1
         # A node is a Gaussian, or a B-spline that ends at the Nyquist limit.
-        lines, spacing, limit = isinstance(grid, OrderGrid), np.full(2, sigma), np.full(2, np.inf)
-        if not isinstance(grid, OrderGrid):
-            spacing, limit = np.array(grid.spacing), np.array(grid.limit)
-        extent = 4 * sigma if lines else 1.5 * np.hypot(*spacing)
-        strength = np.sum(
-            [np.maximum(spectrum.powers(x * spectrum.max_kappa), 0).ravel() for x in (0.1, 0.4, 0.7, 1.0)], axis=0
-        )
-        offsets = np.linspace(-1.5, 1.5, 1025, dtype=np.float64)
-        integral = spline_integral(offsets)
-        result = np.zeros(len(directions))
+        if isinstance(grid, OrderGrid):
+            points = q[node] + sigma * ndtri(t)
+        else:
+            offsets = np.linspace(-1.5, 1.5, 1025, dtype=np.float64)
+            points = q[node] + np.interp(t, spline_integral(offsets), offsets) * grid.spacing
+            kept = (np.abs(points) < grid.limit).all(-1)
+            points, node, weight = points[kept], node[kept], weight[kept]
+        (p_x, p_y), (q_x, q_y) = self.side * points.T, self.side * q.T
+        result, own = np.zeros(len(directions)), [bound(directions, wavelengths) for bound in bounds]
         for place, way in np.ndindex(len(directions), len(self.ways)):
-            way, s, cos_i, length = self.ways[way], directions[place, :2], directions[place, 2], wavelengths[place]
-            index, sent = (way and self.index) or 1.0, q * (way or 1)
-            reached = np.flatnonzero(np.hypot(*(s + length * sent).T) < index + length * extent)
-            if not len(reached):
-                continue
-            count = 1 + (POINTS * strength[reached] / strength[reached].sum()).astype(np.int64)
-            node, weight = np.repeat(reached, count), np.repeat(1 / count, count)
-            # Points of one node follow each other in a sequence of low discrepancy (Roberts 2018).
-            t = (rng.random(2) + np.arange(len(node))[:, None] * [0.7548776662466927, 0.5698402909980532]) % 1
-            spread = (ndtri(t) if lines else np.interp(t, integral, offsets)) * spacing
-            u = length * (sent[node] + spread)
-            square = 1 - ((s + u) ** 2).sum(-1) / index**2
-            lit = (square > 0) & (np.abs(u) < length * limit).all(-1)
-            u, node, weight, cos_o = u[lit], node[lit], weight[lit], np.sqrt(square[lit])
+            way, (s_x, s_y, cos_i), length = self.ways[way], directions[place], wavelengths[place]
+            index, sent = (way and self.index) or 1.0, length * (way or 1)
+            square = 1 - ((s_x + sent * p_x) ** 2 + (s_y + sent * p_y) ** 2) / index**2
+            lit = np.flatnonzero(square > 0)
+            u_x, u_y, at, cos_o = sent * p_x[lit], sent * p_y[lit], node[lit], np.sqrt(square[lit])
             kappa_of = cos_i, cos_o
             if self.by_order:
-                order = length * sent[node]
-                cos_i2, cos_o2 = 1 - ((s + u - order) ** 2).sum(-1), 1 - ((s + order) ** 2).sum(-1) / index**2
+                m_x, m_y = sent * q_x[at], sent * q_y[at]
+                cos_i2 = 1 - (s_x + u_x - m_x) ** 2 - (s_y + u_y - m_y) ** 2
+                cos_o2 = 1 - ((s_x + m_x) ** 2 + (s_y + m_y) ** 2) / index**2
                 in_, out = (np.sqrt(np.maximum(x, 1e-12) / 2) for x in (cos_i**2 + cos_i2, cos_o**2 + cos_o2))
-                value = self._factor(in_, out, length, (order**2).sum(-1), way) * ((cos_i2 > 0) & (cos_o2 > 0))
+                value = self._factor(in_, out, length, m_x**2 + m_y**2, way) * ((cos_i2 > 0) & (cos_o2 > 0))
                 # Transmitted light has κ of the order, with which K_t changes as fast.
                 kappa_of = (in_, out) if way else kappa_of
                 for x in (np.minimum(cos_i**2, index * cos_o2), np.minimum(index * cos_o**2, cos_i2)):
                     value *= horizon_gain(np.maximum(x, 0) / (2 * length * sigma))
             else:
-                value = self._factor(cos_i, cos_o, length, (u**2).sum(-1), way)
-            power = self._power(partial(self._power_of_nodes, spectrum, node, way), *kappa_of, length, way)
-            e = bounds[abs(way)](directions[place, None], wavelengths[place, None])
-            if not way:
-                out = np.concatenate([-s - u, cos_o[:, None]], -1)
+                value = self._factor(cos_i, cos_o, length, u_x**2 + u_y**2, way)
+            power = self._power(partial(self._power_of_nodes, spectrum, at, way), *kappa_of, length, way)
+            e = own[abs(way)][place]
+            if pairs and not way:
+                out = np.stack([-s_x - u_x, -s_y - u_y, cos_o], -1)
                 e = np.minimum(e, bounds[0](out, np.full(len(out), length)))
-            result[place] += (value * weight * power * e).sum()
+            result[place] += (value * weight[lit] * power * e).sum()
         return result
 
     def _power_of_nodes(

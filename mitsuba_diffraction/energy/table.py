@@ -41,10 +41,11 @@ from .furnace import Furnace, PowerSpectrum
 
 SLACK = 1e-3
 """What an albedo may exceed one by."""
-GATHERED = 5e-3  # by which the albedo of gathered cells may err where it is not seen
-CHECKED = 40  # random places, at least, at which a table is held against the spectrum itself
+CHECKED, CHECKS = 150, 3  # random places at which a table is held against the spectrum itself, and how often
+CANDIDATES, TIGHT = 15, 0.9  # so many places for one that is checked: there the furnace finds at least this albedo
+ABOUT = 3, 5, 5  # slices, rows and columns that are lowered about such a place
 GENERAL, FINEST = (17, 22), 3  # slices, and cells along u and v, of other tables; finer by this, at most
-PLACES = 1.5e5  # nodes of the table of a line grating, at most
+PLACES = 1.5e5  # nodes of the table of a line grating, at most; of wide lobes, which take longer, a quarter
 ROUNDS, PAIRS = (1, 32), 5e6  # random places in each cell, at least and at most; about so many pairs with components
 STEEP = 0.98  # e is lowered so far inside of a cell or its neighbours, where more places are tried
 STRIDE = np.array([0.8191725, 0.6710436, 0.5497005])  # of places in a cell, so that few rounds cover it (Roberts 2018)
@@ -106,7 +107,7 @@ class Layout:
             return cls(shortest / 2, 1, side, 1, slices, frequencies, False)
         turned = grid.shape[1] == 1 and grid.shape[0] > 1
         # So many places that the work is about the same for all gratings.
-        side = np.sqrt(2 * min(PLACES, PAIRS / max(len(furnace.q) / 2, 1)))
+        side = np.sqrt(2 * min(PLACES / (4 if furnace.wide else 1), PAIRS / max(len(furnace.q) / 2, 1)))
         first = int(np.clip(side / 8, 4, 24))
         period, rest = grid.tile_size[int(turned)], (side - 2 * first - 1) / 3
         period /= max(np.ceil(2 * period / shortest / max(rest, 2)), 1)
@@ -132,6 +133,20 @@ class Layout:
             y = y / (1 + c)
             row = (1 - np.copysign(1 - _equidistant(1 - np.abs(y)), -y)) / 2 * (self.slices - 1)
         return row, v, u
+
+    def cells_of(self, directions: NDArray[np.float64], wavelengths: ArrayLike) -> tuple[NDArray[np.int64], ...]:
+        """Return the cells of ω (n, 3) and λ (µm), as an index of slices, rows and columns."""
+        places = self.places(directions, wavelengths)
+        return tuple(np.clip(x.astype(np.int64), 0, n - 1) for x, n in zip(places, self.shape[:3], strict=True))
+
+    def random_places(self, count: int, seed: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return `count` directions (n, 3), two thirds of them beyond 60°, one beyond 85°, and λ in µm, (n,)."""
+        rng = np.random.default_rng(seed)
+        theta = np.deg2rad(rng.uniform(rng.choice([0, 60, 85], count), 89.9))
+        phi = rng.uniform(0, 2 * np.pi, count)
+        x, y = np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi)
+        omega = np.stack([y, x, np.cos(theta)] if self.turned else [x, y, np.cos(theta)], -1)
+        return omega, rng.uniform(1 / self.frequencies[1], 1 / self.frequencies[0], count)
 
     def _place(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
         square = np.minimum(np.floor(u), self.squares - 1)
@@ -163,7 +178,7 @@ class EnergyTable:
         steps: uint8 (slices, rows, columns, 4): e = `least` + (1 − `least`)/255 · step at (u, v), (u⁺, v), (u, v⁺) and
             (u⁺, v⁺).
         least: the smallest e.
-        loss: (mean, largest) 1 − e max(1, a) in the middle of the cells.
+        loss: (mean, largest) share of e that is less than the furnace allows, at random places, most of them slanted.
     """
 
     layout: Layout
@@ -198,26 +213,45 @@ class EnergyTable:
 
     @classmethod
     def _of_side(cls, spectrum: PowerSpectrum, furnace: Furnace) -> list[EnergyTable]:
+        """Make the tables of one side: e at the corners of cells, lowered where an albedo at random places exceeds one.
+
+        Where the furnace is not exact, the albedo of the spectrum itself counts, too: first cells about such places are
+        lowered, at last all.
+        """
         layout = Layout.of(spectrum, furnace)
-        e, losses = corners(furnace, layout)
-        tables = [cls.packed(layout, *of) for of in zip(e, losses, strict=True)]
-        if not any(table.needed for table in tables) or (furnace.by_order and not furnace.wide and not furnace.turning):
-            return tables
-        # Against the spectrum itself: cells were gathered, and orders represented by the centres of their lobes.
-        places = random_places(
-            layout.frequencies, int(np.clip(2e5 / np.prod(spectrum.grid.shape) / len(furnace.ways), CHECKED, 150))
-        )
-        # Of two estimates the smaller: what both exceed is no noise.
-        bounds = [table.at for table in tables]
-        found = [furnace.albedo_of_nodes(spectrum, *places, bounds, seed) for seed in (0, 1)]
-        excess = max(float(np.minimum(*found).max()) - 1, 0.0 if furnace.by_order else GATHERED)
-        return [
-            cls.packed(layout, of / (1 + excess), (loss[0] + excess, loss[1] + excess))
-            for of, loss in zip(e, losses, strict=True)
-        ]
+        e = corners(furnace, layout)
+        losses = [(0.0, 0.0)] * len(e)
+        exact = furnace.by_order and not (furnace.wide or furnace.turning)
+        count = CHECKED // len(furnace.ways)
+        for check in range(CHECKS if e.min() < 1 else 0):
+            bounds = [cls.packed(layout, of).at for of in e]
+            omega, lengths = layout.random_places(CANDIDATES * count, check)
+            cells, a = layout.cells_of(omega, lengths), furnace.albedo(omega, lengths)
+            got, share = np.stack([at(omega, lengths) for at in bounds]), np.ones(layout.shape[:3])
+            highest = (got * a).sum(0)
+            lower = 1 / np.maximum(highest, 1)
+            if not exact:
+                tried = np.flatnonzero(highest > TIGHT)[:count]
+                albedo = furnace.albedo_of_nodes(spectrum, omega[tried], lengths[tried], bounds, pairs=False)
+                tried = tried[albedo > 1]
+                # Of two estimates the smaller: what both exceed is no noise.
+                both = [furnace.albedo_of_nodes(spectrum, omega[tried], lengths[tried], bounds, k) for k in (0, 1)]
+                # Beyond what the furnace finds, unless phases turn: by that the cell itself is lowered.
+                albedo = np.minimum(*both) * (1.0 if furnace.turning else lower[tried])
+                np.minimum.at(share, tuple(of[tried] for of in cells), 1 / np.maximum(albedo, 1))
+            # Places that were not tried may exceed by as much again.
+            everywhere = share.min() ** 2 if check == CHECKS - 1 else 1.0
+            if layout.lines:
+                np.minimum.at(share, cells, lower)
+            share = np.minimum(minimum_filter(share, ABOUT), everywhere)
+            np.minimum.at(share, cells, lower)
+            e = e * share[..., None]
+            lost = 1 - np.minimum(got * share[cells] / bounds_of(a, furnace.index), 1)
+            losses = [(float(of.mean()), float(of.max())) for of in lost]
+        return [cls.packed(layout, *of) for of in zip(e, losses, strict=True)]
 
     @classmethod
-    def packed(cls, layout: Layout, e: NDArray[np.float64], loss: tuple[float, float]) -> EnergyTable:
+    def packed(cls, layout: Layout, e: NDArray[np.float64], loss: tuple[float, float] = (0.0, 0.0)) -> EnergyTable:
         """Round e at the corners of cells to bytes, so that it exceeds the numbers by no more than `SLACK`."""
         least = float(e.min())
         steps = np.floor(np.minimum((e * (1 + SLACK) - least) / max(1 - least, 1e-9), 1) * 255)
@@ -310,18 +344,6 @@ def between(below: EnergyTable, middle: EnergyTable, above: EnergyTable) -> Ener
     return EnergyTable.packed(middle.layout, e / (1 + SLACK), loss)
 
 
-def random_places(frequencies: tuple[float, float], count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return `count` directions (n, 3), two thirds of them beyond 60°, one beyond 85°, and λ in µm, (n,).
-
-    `frequencies` are the least and the largest 1/λ, in 1/µm.
-    """
-    rng = np.random.default_rng(0)
-    theta = np.deg2rad(rng.uniform(rng.choice([0, 60, 85], count), 89.9))
-    phi = rng.uniform(0, 2 * np.pi, count)
-    directions = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1)
-    return directions, rng.uniform(1 / frequencies[1], 1 / frequencies[0], count)
-
-
 def bounds_of(albedo: NDArray[np.float64], index: float | None) -> NDArray[np.float64]:
     """Return e from what the furnace finds.
 
@@ -344,17 +366,16 @@ def bounds_of(albedo: NDArray[np.float64], index: float | None) -> NDArray[np.fl
     return np.stack([np.minimum(1, (1 - e_t * t) / np.maximum(r, 1e-9)), e_t])
 
 
-def corners(furnace: Furnace, layout: Layout) -> tuple[NDArray[np.float64], list[tuple[float, float]]]:
+def corners(furnace: Furnace, layout: Layout) -> NDArray[np.float64]:
     """Compute e at the corners of all cells, a lower bound of `bounds_of` between them.
 
     Returns:
-        e of reflected, and of an interface of transmitted light, (1 or 2, *layout.shape), and of each (mean, largest)
-        of what is lost in the middle of the cells.
+        e of reflected, and of an interface of transmitted light, (1 or 2, *layout.shape).
     """
     return (_line_corners if layout.lines else _general_corners)(furnace, layout)
 
 
-def _line_corners(furnace: Furnace, layout: Layout) -> tuple[NDArray[np.float64], list[tuple[float, float]]]:
+def _line_corners(furnace: Furnace, layout: Layout) -> NDArray[np.float64]:
     """Compute `corners` of a line grating."""
     last = layout.frequencies[1]
     nodes = [layout.nodes(square) for square in range(layout.squares)]
@@ -368,13 +389,9 @@ def _line_corners(furnace: Furnace, layout: Layout) -> tuple[NDArray[np.float64]
         furnace = dataclasses.replace(furnace, q=furnace.q[:, ::-1])
     x = ((v - u) / (u + v))[reached]
     omega = np.stack([x, np.zeros(len(x)), np.sqrt(1 - x**2)], -1)
-    # Where phases turn within lobes a depends on c, too: seen in the scale of c, lobes are 1/c as wide. At grazing
-    # incidence, where K changes within wide lobes, their centres come nearer.
-    furnaces = [furnace]
-    if furnace.turning:
-        furnaces = [dataclasses.replace(furnace, widths=furnace.widths / c) for c in TURNED]
-        furnaces.append(dataclasses.replace(furnace, turning=False))
-    a = [one.albedo(omega, 1 / nu[reached])[0] for one in furnaces]
+    # Where phases turn within lobes a depends on c, too: seen in the scale of c, lobes are 1/c as wide.
+    scales = TURNED if furnace.turning else (1.0,)
+    a = [dataclasses.replace(furnace, widths=furnace.widths / c).albedo(omega, 1 / nu[reached])[0] for c in scales]
     e[0, reached] = 1 / np.maximum(np.max(a, axis=0), 1)
     inside = reached & (nu <= last)
     # The cells: each second node but the last of a unit square.
@@ -389,13 +406,10 @@ def _line_corners(furnace: Furnace, layout: Layout) -> tuple[NDArray[np.float64]
     for j, i in ((1, 1), (0, 1), (1, 0), (2, 1), (1, 2)):
         got = result @ _bilinear(np.float64(i / 2), np.float64(j / 2))
         share = np.minimum(share, np.where(at(inside, j, i), at(e, j, i) / np.maximum(got, 1e-30), 1))
-    result = result * share[..., None]
-    lost = (1 - result.mean(-1) / at(e, 1, 1))[:, at(inside, 1, 1)]
-    # So short a period has no cell: the only order is the mirror direction's.
-    return result[None], [(float(lost.mean()), float(lost.max())) if lost.size else (0.0, 0.0)]
+    return (result * share[..., None])[None]
 
 
-def _general_corners(furnace: Furnace, layout: Layout) -> tuple[NDArray[np.float64], list[tuple[float, float]]]:
+def _general_corners(furnace: Furnace, layout: Layout) -> NDArray[np.float64]:
     """Compute `corners` of orders in two dimensions and of samples: lowered at random places in the cells."""
     side, (first, last) = layout.first, layout.frequencies
     cells = np.indices((layout.slices - 1, side, side)).reshape(3, -1).T
@@ -444,8 +458,6 @@ def _general_corners(furnace: Furnace, layout: Layout) -> tuple[NDArray[np.float
             wanted, there = bound(cells[some] + inside)
             weights = np.prod(np.where(eight, inside[:, None], 1 - inside[:, None]), -1)
             got = (weights * e[:, some]).sum(-1)
-            if not steep:
-                lost = np.clip(1 - got / np.maximum(wanted, 1e-30), 0, 1)[:, there]
             share = np.where(there, np.minimum(wanted / np.maximum(got, 1e-30), 1), 1)
             e[:, some] *= share[..., None]
             lowered[:, some] *= share
@@ -459,7 +471,7 @@ def _general_corners(furnace: Furnace, layout: Layout) -> tuple[NDArray[np.float
     for of, to in zip(e, full, strict=True):
         for k, (above, j, i) in enumerate(eight):
             np.minimum.at(to, (cells[:, 0] + above, cells[:, 1], cells[:, 2], 2 * j + i), np.maximum(of[:, k], 0))
-    return full, [(float(one.mean()), float(one.max())) for one in lost]
+    return full
 
 
 def _bilinear(x: NDArray[np.float64] | np.float64, y: NDArray[np.float64] | np.float64) -> NDArray[np.float64]:
