@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import math
 import os
 import signal
@@ -30,9 +31,11 @@ from numpy.typing import NDArray
 from ..color import spectrum_to_XYZ
 from ..errors import RequestError
 from ..files import UNSEALED, is_intact, seal, whole_file
-from .film import pass_seed, samples_drawn, trace_pass
+from .film import is_independent, pass_seed, samples_drawn, takes_mitsubas_film, trace_pass
 from .scene import Materials, channel_wavelengths, load_spectral_scene, scene_digest
 from .spectral_image import SpectralImage
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(eq=False)
@@ -343,6 +346,13 @@ def _job(
     if until_error is not None and not 0 < until_error < 1:
         raise RequestError(f"until_error: got {until_error}, wanted a relative error between 0 and 1, such as 0.01")
     scene = load_spectral_scene(scene_path, **view, **content)
+    sampler = scene.sensors()[0].sampler()
+    if takes_mitsubas_film(scene.integrator()) and not is_independent(sampler):
+        _log.warning(
+            "sampler: got %s, wanted independent: with this integrator or in this variant its samples are not uniform, "
+            "and colours may be wrong by some per cent",
+            sampler.class_name(),
+        )
     job = Job(
         scene=str(Path(scene_path).resolve()),
         **view,

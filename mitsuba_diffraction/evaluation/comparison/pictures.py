@@ -18,7 +18,7 @@ from ...color import spectrum_to_XYZ
 from ...errors import RequestError
 from ...progress import Progress, silent
 from ...render import SpectralImage
-from ...render.film import collect, evenly, pass_seed, trace_pass
+from ...render.film import collect, evenly, pass_seed, rotated, trace_pass
 from ...render.passes import Accumulation, ratio, split
 from ...render.scene import channel_wavelengths, emitters_of, load_spectral_scene
 from ..realtime_shader.base import Shader
@@ -279,8 +279,10 @@ class Pictures:
         sampler = mi.load_dict({"type": "multijitter", "sample_count": samples})
         samples = sampler.sample_count()  # the next product of two like numbers
         sampler.set_samples_per_wavefront(samples)
-        sampler.seed(pass_seed(self.seed, first), count * samples)
+        seed = pass_seed(self.seed, first)
+        sampler.seed(seed, count * samples)
         pixel = dr.opaque(mi.UInt32, first) + dr.arange(mi.UInt32, count * samples) // samples
+        sampler = rotated(sampler, seed, pixel)
         position = mi.Point2f(mi.Float(pixel % columns), mi.Float(pixel // columns)) + sampler.next_2d()
         # Time and aperture; a shader needs no wavelengths.
         size = mi.Vector2f(columns, rows)
