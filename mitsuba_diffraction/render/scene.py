@@ -100,7 +100,8 @@ def load_spectral_scene(
         if size is not None and size < 1:
             raise RequestError(f"{name}: got {size}, wanted a positive number of pixels")
     with _parsed(path, parameters, materials) as (config, state):
-        _warn_of_unused_materials(state, materials or {})
+        if materials:
+            _warn_of_unused_materials(state, materials)
         _replace_films(state, width, height)
         _take_radiance_alone(state)
         if motion is not None:
@@ -127,7 +128,9 @@ def _warn_of_unused_materials(state: mi.parser.ParserState, materials: Materials
     used = {k for k in _children(state.root.props).values() if state.nodes[k].type != mi.ObjectType.BSDF}
     waiting = list(used)
     while waiting:
-        for _, value in state.nodes[waiting.pop()].props.items():
+        props = state.nodes[waiting.pop()].props
+        unread = props.unqueried()
+        for _, value in props.items():
             if isinstance(value, mi.Properties.ResolvedReference):
                 child = value.index()
             elif isinstance(value, mi.Properties.Reference):
@@ -137,6 +140,9 @@ def _warn_of_unused_materials(state: mi.parser.ParserState, materials: Materials
             if child is not None and child not in used:
                 used.add(child)
                 waiting.append(child)
+        # Mitsuba refuses what no plugin reads.
+        for name in unread:
+            props.mark_queried(name, False)
     for name in materials:
         if state.id_to_index[name] not in used:
             _log.warning("material %s: no shape has the BSDF of that id, and the picture is as without it", name)

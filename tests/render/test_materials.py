@@ -124,6 +124,15 @@ def test_a_material_that_no_shape_has_is_told(exported, caplog):
     assert told == ["material mat-Spare: no shape has the BSDF of that id, and the picture is as without it"]
 
 
+def test_a_misspelt_parameter_is_refused_with_a_material_too(exported):
+    path = exported()
+    path.write_text(
+        path.read_text().replace("</scene>", '<shape type="sphere"><float name="radiu" value="1"/></shape></scene>')
+    )
+    with pytest.raises(ValueError, match="radiu"):
+        load_spectral_scene(path, materials={"mat-Disc": MIRROR})
+
+
 @pytest.mark.parametrize("uvs", [True, False])
 def test_a_grating_on_a_mesh_without_uvs_is_told(exported, uvs, caplog):
     with caplog.at_level(logging.WARNING, "mitsuba_diffraction"):
