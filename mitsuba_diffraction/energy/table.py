@@ -45,7 +45,7 @@ CHECKED, CHECKS = 150, 3  # random places at which a table is held against the s
 CANDIDATES, TIGHT = 15, 0.9  # so many places for one that is checked: there the furnace finds at least this albedo
 ABOUT = 3, 5, 5  # slices, rows and columns that are lowered about such a place
 GENERAL, FINEST = (17, 22), 3  # slices, and cells along u and v, of other tables; finer by this, at most
-PLACES = 1.5e5  # nodes of the table of a line grating, at most; of wide lobes, which take longer, a quarter
+PLACES = 1.5e5  # nodes of the table of a line grating, at most; a quarter if lobes are wide, which takes longer
 ROUNDS, PAIRS = (1, 32), 5e6  # random places in each cell, at least and at most; about so many pairs with components
 STEEP = 0.98  # e is lowered so far inside of a cell or its neighbours, where more places are tried
 STRIDE = np.array([0.8191725, 0.6710436, 0.5497005])  # of places in a cell, so that few rounds cover it (Roberts 2018)
@@ -107,7 +107,9 @@ class Layout:
             return cls(shortest / 2, 1, side, 1, slices, frequencies, False)
         turned = grid.shape[1] == 1 and grid.shape[0] > 1
         # So many places that the work is about the same for all gratings.
-        side = np.sqrt(2 * min(PLACES / (4 if furnace.wide else 1), PAIRS / max(len(furnace.q) / 2, 1)))
+        # Where no phase turns within lobes, two thirds lose as little.
+        nodes = PLACES / (4 if furnace.wide else 1 if furnace.turning else 1.5)
+        side = np.sqrt(2 * min(nodes, PAIRS / max(len(furnace.q) / 2, 1)))
         first = int(np.clip(side / 8, 4, 24))
         period, rest = grid.tile_size[int(turned)], (side - 2 * first - 1) / 3
         period /= max(np.ceil(2 * period / shortest / max(rest, 2)), 1)
