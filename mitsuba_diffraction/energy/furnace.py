@@ -253,7 +253,9 @@ class Furnace:
         turn = 2 * np.pi * self.height_range * sigma / (length * TURN)
         if self.by_order:
             return (square > turn**2) & (square > FAR_ORDER * sigma)
-        return (square > turn**2) & ((square > FAR_CELL * sigma) | (square > 1 - 3 * sigma**2))
+        # Or around the pole, as long as a cell is far from reaching the horizon.
+        around = square > np.maximum(1 - 3 * sigma**2, 4 * sigma**2)
+        return (square > turn**2) & ((square > FAR_CELL * sigma) | around)
 
     def _factor(
         self,

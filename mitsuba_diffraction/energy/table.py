@@ -106,8 +106,8 @@ class Layout:
             slices, side = 1 + 2 * int(GENERAL[0] * finer / 2), int(GENERAL[1] * finer)
             return cls(shortest / 2, 1, side, 1, slices, frequencies, False)
         turned = grid.shape[1] == 1 and grid.shape[0] > 1
-        # So many places that the work is about the same for all gratings.
-        # Where no phase turns within lobes, two thirds lose as little.
+        # So many places that the work is about the same for all gratings; where no phase turns within lobes, two thirds
+        # lose as little.
         nodes = PLACES / (4 if furnace.wide else 1 if furnace.turning else 1.5)
         side = np.sqrt(2 * min(nodes, PAIRS / max(len(furnace.q) / 2, 1)))
         first = int(np.clip(side / 8, 4, 24))
@@ -136,9 +136,8 @@ class Layout:
             row = (1 - np.copysign(1 - _equidistant(1 - np.abs(y)), -y)) / 2 * (self.slices - 1)
         return row, v, u
 
-    def cells_of(self, directions: NDArray[np.float64], wavelengths: ArrayLike) -> tuple[NDArray[np.int64], ...]:
-        """Return the cells of ω (n, 3) and λ (µm), as an index of slices, rows and columns."""
-        places = self.places(directions, wavelengths)
+    def cells_of(self, *places: NDArray[np.float64]) -> tuple[NDArray[np.int64], ...]:
+        """Return the cells of places (slice, row, column), as an index of the first three axes of `shape`."""
         return tuple(np.clip(x.astype(np.int64), 0, n - 1) for x, n in zip(places, self.shape[:3], strict=True))
 
     def random_places(self, count: int, seed: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -228,7 +227,7 @@ class EnergyTable:
         for check in range(CHECKS if e.min() < 1 else 0):
             bounds = [cls.packed(layout, of).at for of in e]
             omega, lengths = layout.random_places(CANDIDATES * count, check)
-            cells, a = layout.cells_of(omega, lengths), furnace.albedo(omega, lengths)
+            cells, a = layout.cells_of(*layout.places(omega, lengths)), furnace.albedo(omega, lengths)
             got, share = np.stack([at(omega, lengths) for at in bounds]), np.ones(layout.shape[:3])
             highest = (got * a).sum(0)
             lower = 1 / np.maximum(highest, 1)
@@ -266,10 +265,9 @@ class EnergyTable:
 
     def at(self, directions: NDArray[np.float64], wavelengths: ArrayLike) -> NDArray[np.float64]:
         """Return e(ω, λ) as the renderer has it, (n,), for ω (n, 3) along the pattern's axes and λ in µm."""
-        slices, *places = self.layout.places(directions, wavelengths)
-        row, column = (np.clip(place.astype(np.int64), 0, self.steps.shape[1] - 1) for place in places)
-        weights = _bilinear(places[1] - column, places[0] - row)
-        below = np.minimum(slices.astype(np.int64), self.steps.shape[0] - 1)
+        slices, rows, columns = places = self.layout.places(directions, wavelengths)
+        below, row, column = self.layout.cells_of(*places)
+        weights = _bilinear(columns - column, rows - row)
         steps = (self.steps[below, row, column] * weights).sum(-1)
         if not self.layout.lines:
             above = (self.steps[np.minimum(below + 1, self.steps.shape[0] - 1), row, column] * weights).sum(-1)

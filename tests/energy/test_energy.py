@@ -206,6 +206,14 @@ def test_a_flat_surface_is_unchanged_away_from_the_horizon():
         assert e.min() > 0.985
 
 
+def test_lobes_wider_than_the_hemisphere_have_a_table():
+    heights = 0.05 * np.random.default_rng(0).random((32, 32))
+    with pytest.warns(UserWarning, match="hold no frequency beyond"):
+        table = md.precompute(md.HeightField(heights, 0.1), coherence_length=0.08).energy_table()
+    assert 0 < table.least <= 1
+    assert np.isfinite(table.loss).all()
+
+
 def test_a_period_far_below_the_wavelength_needs_no_energy_factor():
     relief = 0.1 * np.sin(np.linspace(0, 2 * np.pi, 64, endpoint=False))
     table = md.precompute(md.HeightField(relief[None], 1e-6)).energy_table()
