@@ -17,9 +17,10 @@ from .files import whole_file
 from .outputs import made_for, metadata
 from .progress import Progress, silent
 from .rigorous import refractive_index
-from .rigorous.coordinate_transformation import is_profile
-from .scalar_theory import profile_powers, scalar_orders, tile_powers
-from .settings import THEORIES
+from .rigorous.coordinate_transformation import curve_of, is_profile
+from .rigorous.efficiencies import sheet_orders
+from .scalar_theory import profile_powers, scalar_orders, tile_powers, transmitted_orders
+from .settings import THEORIES, TRANSMISSIONS
 from .surface.heightfield import HeightField
 
 if TYPE_CHECKING:
@@ -35,7 +36,7 @@ _LINES, _MAPS = 7, 6  # of a plot
 
 @dataclass(frozen=True, eq=False)
 class OrderEfficiencies:
-    """The share of the incident light that each order of a grating reflects.
+    """The share of the incident light that goes to each order of a grating.
 
     Attributes:
         values: (order, angle, wavelength, polarisation), that of s- before that of p-polarised incident light; 0 where
@@ -186,18 +187,19 @@ def efficiencies(
     theory: str = "scalar",
     material: str | None = None,
     int_ior: complex | None = None,
+    transmission: str = "none",
     azimuth: float = 0.0,
     progress: Progress = silent,
 ) -> OrderEfficiencies:
-    """Compute the efficiencies of the reflected orders of a grating in air.
+    """Compute the efficiencies of the reflected or transmitted orders of a grating in air.
 
-    Light at the angle θ_i comes from −x. An order at θ_m, positive on the side of the light too, has
+    Light at the angle θ_i comes from above, from −x. An order at θ_m, positive towards −x, in a medium of index n_o has
 
-        sin θ_i + sin θ_m = m λ/T    (azimuth 0).
+        sin θ_i + n_o sin θ_m = m λ/T    (azimuth 0).
 
-    In scalar theory the efficiencies are those of the BSDF in the limit of narrow lobes, R K G E η_m(κ_m), in float64
-    without tables (`scalar_theory.scalar_orders`); in rigorous theory they are those of Maxwell's equations
-    (`rigorous.efficiencies`).
+    In scalar theory the efficiencies are those of the BSDF in the limit of narrow lobes, R K G E η_m(κ_m) or
+    K_t G_t (1 − F) E η_m(κ_m), in float64 without tables (`scalar_theory`); in rigorous theory they are those of
+    Maxwell's equations (`rigorous.efficiencies`).
 
     Args:
         height_field: one period of a surface that repeats; of rigorous theory a profile, h(x).
@@ -206,6 +208,8 @@ def efficiencies(
         theory: "scalar" or "rigorous".
         material: a conductor by Mitsuba's name, "Al"; or "none", the perfect mirror R = 1, in scalar theory.
         int_ior: or an index of refraction, or n + ik; 1.5 if neither is given, as in a scene.
+        transmission: "none", the reflected orders; "interface", those that enter the dielectric; "sheet", those that
+            leave a film of it through its flat face, n_o = 1: in rigorous theory with all bounces inside.
         azimuth: of the plane of incidence, degrees from the x axis; 90: along the grooves (conical incidence).
         progress: called with (steps done, steps in all).
 
@@ -226,10 +230,17 @@ def efficiencies(
         raise RequestError(f"azimuth: got {azimuth!r}, wanted degrees")
     if material is None and int_ior is None:
         int_ior = 1.5
+    if transmission not in TRANSMISSIONS:
+        raise RequestError(f"transmission: got {transmission!r}, wanted one of {', '.join(TRANSMISSIONS)}")
+    if transmission != "none" and (material is not None or np.imag(int_ior or 1)):
+        absorbing = f"material {material!r}" if material is not None else f"int_ior {int_ior}"
+        raise RequestError(f"transmission: got {transmission!r} with {absorbing}, wanted a dielectric: int_ior, real")
     profile = is_profile(height_field)
     if profile:
         height_field = HeightField(height_field.heights[:1], height_field.pixel_size, height_field.source)
-    solve = (_scalar if theory == "scalar" else _rigorous)(height_field, azimuth, wavelengths.min() * 1e-3)
+    # The largest |q| is (n_i + n_o)/λ.
+    shortest = wavelengths.min() * 1e-3 * (1.0 if transmission == "none" else 2 / (1 + max(np.real(int_ior or 1), 1)))
+    solve = (_scalar if theory == "scalar" else _rigorous)(height_field, azimuth, shortest, transmission)
     found: dict[tuple[int, ...], Array] = {}
     for step, (a, w) in enumerate(np.ndindex(len(angles), len(wavelengths)), 1):
         wavelength, index = float(wavelengths[w]) * 1e-3, complex("inf")
@@ -242,20 +253,23 @@ def efficiencies(
     orders = sorted(found)
     what = material if material is not None else f"n = {int_ior:g}"
     plane = f", plane of incidence at {azimuth:g}°" if azimuth else ""
+    passed = {"none": "", "interface": ", transmitted orders inside", "sheet": ", transmitted by a sheet"}[transmission]
     return OrderEfficiencies(
         np.stack([found[m] for m in orders]),
         np.array(orders)[:, 0] if profile else np.array(orders),
         angles,
         wavelengths,
-        f"{height_field.source}; {what}, {theory} theory{plane}",
+        f"{height_field.source}; {what}, {theory} theory{passed}{plane}",
     )
 
 
-_Solve = Callable[[float, float, complex], tuple[NDArray[np.int64], Array, Array]]
-"""(angle in degrees, wavelength in µm, index) → orders, their efficiencies of s- and of p-polarised light."""
+_Found = tuple[NDArray[np.int64], Array, Array]
+"""Orders, their efficiencies of s- and of p-polarised light."""
+_Solve = Callable[[float, float, complex], _Found]
+"""(angle in degrees, wavelength in µm, index) → what is found."""
 
 
-def _scalar(height_field: HeightField, azimuth: float, shortest: float) -> _Solve:
+def _scalar(height_field: HeightField, azimuth: float, shortest: float, transmission: str) -> _Solve:
     x, y = height_field.tile_size
     profile = height_field.shape[0] == 1
     if (count := 2 * x / shortest if profile else np.pi * x * y / shortest**2) > _MOST_ORDERS:
@@ -264,20 +278,31 @@ def _scalar(height_field: HeightField, azimuth: float, shortest: float) -> _Solv
             f"wanted at most {_MOST_ORDERS}: one period of a grating"
         )
     powers = profile_powers(height_field) if profile else tile_powers(height_field, shortest)
+    period = x if profile else (x, y)
 
-    def solve(angle: float, wavelength: float, index: complex) -> tuple[NDArray[np.int64], Array, Array]:
-        found = scalar_orders(powers, x if profile else (x, y), wavelength, angle, index, azimuth)
+    def solve(angle: float, wavelength: float, index: complex) -> _Found:
+        if transmission == "none":
+            found = scalar_orders(powers, period, wavelength, angle, index, azimuth)
+            return found.m, found.s, found.p
+        is_sheet = transmission == "sheet"
+        found = transmitted_orders(powers, period, wavelength, angle, index.real, azimuth, sheet=is_sheet)
         return found.m, found.s, found.p
 
     return solve
 
 
-def _rigorous(height_field: HeightField, azimuth: float, shortest: float) -> _Solve:
-    def solve(angle: float, wavelength: float, index: complex) -> tuple[NDArray[np.int64], Array, Array]:
+def _rigorous(height_field: HeightField, azimuth: float, shortest: float, transmission: str) -> _Solve:
+    def solve(angle: float, wavelength: float, index: complex) -> _Found:
         theta, phi = np.deg2rad((angle, azimuth))
         direction = -np.sin(theta) * np.cos(phi), -np.sin(theta) * np.sin(phi), np.cos(theta)
         found = rigorous.efficiencies(height_field, direction, wavelength, int_ior=index)
-        return found.orders, found.s, found.p
+        if transmission == "none":
+            return found.orders, found.s, found.p
+        if transmission == "interface":
+            return found.transmitted_orders, *(np.abs(found.transmitted_amplitudes) ** 2).sum(axis=1).T
+        k_0 = height_field.tile_size[0] / wavelength
+        orders, sent = sheet_orders(curve_of(height_field), np.array(direction), k_0, index.real, found.harmonics)
+        return orders, *sent.T
 
     return solve
 

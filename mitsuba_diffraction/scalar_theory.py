@@ -163,31 +163,51 @@ def scalar_orders(
 
 def transmitted_orders(
     powers: OrderPowers,
-    period: float,
+    period: float | tuple[float, float],
     wavelength: float,
     angle: float,
     index: float,
     turn: float = 0.0,
     from_below: bool = False,
-) -> tuple[NDArray[np.int64], Array]:
+    sheet: bool = False,
+) -> Orders:
     """Compute K_t G_t (1 − F) η_m(κ_m), the transmitted orders of the BSDF in the limit of narrow lobes.
 
-    Arguments are those of `scalar_orders`, of a profile of a dielectric. The angle is that in air: of incidence or, if
-    the light comes from inside, of light that a plane would refract to it.
-
-    Returns:
-        The orders that propagate on the other side, ascending, and their efficiencies, at most one together.
+    Arguments are those of `scalar_orders`, of a dielectric. The angle is that in air: of incidence or, if the light
+    comes from inside, of light that a plane would refract to it. The efficiencies are at most one together. Of a sheet,
+    of light from above, they are those outside, times 1 − F of the flat face.
     """
     n_i, n_o, side = (index, 1.0, -1) if from_below else (1.0, index, 1)
-    sine, pitch = -np.sin(np.deg2rad(angle)), wavelength / period
-    k_x, k_y = sine * np.cos(np.deg2rad(turn)), sine * np.sin(np.deg2rad(turn))
-    m = np.arange(-int((n_i + n_o) / pitch) - 1, int((n_i + n_o) / pitch) + 2)
-    square = n_o**2 - (k_x + m * pitch) ** 2 - k_y**2
-    m, z_o = m[square > 0], np.sqrt(square[square > 0])
-    z_i = np.sqrt(n_i**2 - sine**2)
-    kappa = 2 * np.pi * side * (z_i - z_o) / wavelength
-    efficiency = transmitted(z_i / n_i, z_o / n_o, (m * pitch / n_i) ** 2, n_o / n_i) * powers(m, kappa)
-    return m, efficiency / max(1.0, efficiency.sum())
+    turn, angle = np.deg2rad((turn, angle))
+    light = -np.sin(angle) * np.array([np.cos(turn), np.sin(turn)])
+    m, steps = _lattice(wavelength / np.atleast_1d(period), n_i + n_o)
+    square = n_o**2 - ((light + steps) ** 2).sum(axis=-1)
+    m, tangent, z_o = m[square > 0], (steps[square > 0] ** 2).sum(axis=-1), np.sqrt(square[square > 0])
+    z_i = np.sqrt(n_i**2 - light @ light)
+    # κ and q change their signs together.
+    kappa, sign = 2 * np.pi * np.abs(z_i - z_o) / wavelength, np.where(side * (z_i - z_o) < 0, -1, 1)
+    cosines, relative = (z_i / n_i, z_o / n_o), n_o / n_i
+    sent = transmitted(*cosines, tangent / n_i**2, relative) * powers((m.T * sign).T, kappa)
+    sent = sent / max(1.0, sent.sum())
+    if sheet:
+        cos_out = np.sqrt(np.maximum(1 - n_o**2 + z_o**2, 0))
+        sent = sent * (1 - np.mean(fresnel(cos_out, index), axis=0))
+    # |ω_i·h|
+    half = tangent / n_i**2 + (cosines[0] - relative * cosines[1]) ** 2
+    half = np.minimum(np.abs(half + 1 - relative**2) / (2 * np.sqrt(np.maximum(half, 1e-18))), 1)
+    s, p = (1 - reflected for reflected in fresnel(half, relative))
+    mean = np.maximum((s + p) / 2, 1e-12)
+    kept = cos_out > 0 if sheet else slice(None)
+    return Orders(m[kept], (sent * s / mean)[kept], (sent * p / mean)[kept])
+
+
+def _lattice(pitch: Array, reach: float) -> tuple[NDArray[np.int64], Array]:
+    """Return m up to |m| λ/T = `reach`, (n,) of a profile or (n, 2), and m λ/T along x and y, (n, 2)."""
+    m = np.stack(np.meshgrid(*(np.arange(-int(reach / p) - 1, int(reach / p) + 2) for p in pitch), indexing="ij"), -1)
+    m = m.reshape(-1, len(pitch))
+    steps = np.zeros((len(m), 2))
+    steps[:, : len(pitch)] = m * pitch
+    return m if len(pitch) == 2 else m[:, 0], steps
 
 
 def _mirror_orders(
@@ -198,18 +218,14 @@ def _mirror_orders(
     m, (n,) or (n, 2), and for each pair of light and order the tangential part of ω_o, (d, n, 2), K G η_m for R = 1 (−1
     where evanescent), and ω_i·h, (d, n).
     """
-    m = np.stack(np.meshgrid(*(np.arange(-int(2 / p) - 1, int(2 / p) + 2) for p in pitch), indexing="ij"), axis=-1)
-    m = m.reshape(-1, len(pitch))
-    steps = np.zeros((len(m), 2))
-    steps[:, : len(pitch)] = m * pitch
+    m, steps = _lattice(pitch, 2.0)
     leaving = -steps - light[:, None]
     square_i, square_o = (light**2).sum(axis=-1)[:, None], (leaving**2).sum(axis=-1)
     there = square_o < 1
     cos_i, cos_o = np.broadcast_arrays(np.sqrt(1 - square_i), np.sqrt(np.where(there, 1 - square_o, 1)))
     w = cos_i + cos_o
     d = ((steps**2).sum(axis=-1) + w**2) / 2  # 1 + ω_i·ω_o
-    of_pairs = np.broadcast_to(m, (*there.shape, len(pitch)))[there]
-    m, of_pairs = (m, of_pairs) if len(pitch) == 2 else (m[:, 0], of_pairs[:, 0])
+    of_pairs = np.broadcast_to(m, (*there.shape, *m.shape[1:]))[there]
     factor = np.full(there.shape, -1.0)
     factor[there] = k_g(cos_i[there], cos_o[there], d[there]) * powers(of_pairs, 2 * np.pi * w[there] / wavelength)
     return m, leaving, factor, np.sqrt(d / 2)
@@ -367,9 +383,9 @@ def _solved_error(profile: HeightField) -> tuple[float, float]:
             if not exact.error <= _CONVERGED:
                 return float("nan"), float("nan")
             scalar = scalar_orders(powers, period, wavelength, angle, INDEX)
-            _, passed = transmitted_orders(powers, period, wavelength, angle, INDEX)
-            reflected = difference(scalar.unpolarised, exact.unpolarised)
-            errors.append((reflected, difference(passed, exact.transmitted_unpolarised)))
+            passed = transmitted_orders(powers, period, wavelength, angle, INDEX)
+            pairs = (scalar, exact.unpolarised), (passed, exact.transmitted_unpolarised)
+            errors.append([difference(found.unpolarised, wanted) for found, wanted in pairs])
     of_reflected, of_transmitted = np.mean(errors, axis=0)
     return float(of_reflected), float(of_transmitted)
 

@@ -48,14 +48,14 @@ def solved(job: tuple[str, tuple[int, int], float, float]) -> tuple[float, float
     surface = gratings.sinusoidal(period, depth, samples=SAMPLES)
     found = rigorous.efficiencies(surface, light, 1.0, int_ior=index, tolerance=TOLERANCE)
     if passes:
-        orders, efficiencies = transmitted_orders(sinusoid_powers(depth), period, 1.0, angle, index.real, turn, below)
+        scalar = transmitted_orders(sinusoid_powers(depth), period, 1.0, angle, index.real, turn, below)
         wanted, exact = found.transmitted_orders, found.transmitted_unpolarised
     else:
         scalar = scalar_orders(sinusoid_powers(depth), period, 1.0, angle, index, turn)
-        orders, efficiencies, wanted, exact = scalar.m, scalar.unpolarised, found.orders, found.unpolarised
-    if not np.array_equal(wanted, orders):
-        raise RuntimeError(f"{job}: got the orders {orders}, wanted {wanted}")
-    return difference(efficiencies, exact), found.error
+        wanted, exact = found.orders, found.unpolarised
+    if not np.array_equal(wanted, scalar.m):
+        raise RuntimeError(f"{job}: got the orders {scalar.m}, wanted {wanted}")
+    return difference(scalar.unpolarised, exact), found.error
 
 
 def make(path: Path) -> None:

@@ -21,6 +21,53 @@ def test_a_flat_surface_reflects_as_fresnel_says(theory):
     np.testing.assert_allclose(found.values.sum(axis=0), found.order(0), atol=1e-9)
 
 
+@pytest.mark.parametrize("azimuth", [0, 37])
+@pytest.mark.parametrize("theory", ["scalar", "rigorous"])
+def test_a_flat_film_transmits_as_fresnel_says(theory, azimuth):
+    flat, angles = md.HeightField(np.zeros((1, 32)), (0.05, 1.0), "flat"), [0, 40, 56.3]
+    reflected = np.stack(fresnel(np.cos(np.deg2rad(angles)), 1.5), axis=-1)
+
+    def found(transmission):
+        of = md.efficiencies(flat, angles, 500, theory=theory, transmission=transmission, azimuth=azimuth)
+        np.testing.assert_allclose(of.values.sum(axis=0), of.order(0), atol=1e-9)
+        return of.order(0)[:, 0]
+
+    np.testing.assert_allclose(found("interface"), 1 - reflected, atol=1e-9)
+    if theory == "rigorous":
+        # (1 − R)² (1 + R² + R⁴ + …)
+        np.testing.assert_allclose(found("sheet"), (1 - reflected) / (1 + reflected), atol=1e-6)
+    else:
+        mean = 1 - reflected.mean(axis=1, keepdims=True)
+        np.testing.assert_allclose(found("sheet"), (1 - reflected) * mean, atol=1e-9)
+
+
+@pytest.mark.parametrize("transmission", ["interface", "sheet"])
+def test_both_theories_agree_on_light_that_passes_a_shallow_grating(transmission):
+    shallow = md.gratings.sinusoidal(3.35, 0.3)
+    scalar, rigorous = (
+        md.efficiencies(shallow, [0, 30], 500, theory=theory, transmission=transmission)
+        for theory in ("scalar", "rigorous")
+    )
+    np.testing.assert_array_equal(scalar.orders, rigorous.orders)
+    # Away from the normal the sign of an order matters.
+    assert np.abs(rigorous.order(1) - rigorous.order(-1))[1].min() > 0.03
+    assert np.abs(scalar.unpolarised - rigorous.unpolarised).sum(axis=0).max() < 0.02
+
+
+def test_the_orders_that_pass_a_film_are_products():
+    # Two sinusoids of amplitude 0.19 µm at right angles; along the normal, κ = 2π (1 − n cos θ_o)/λ.
+    found = md.efficiencies(md.gratings.film(), 0, 550, transmission="interface")
+    for m in ((0, 0), (1, 0), (0, -1), (1, -1)):
+        cosine = np.sqrt(1 - (m[0] ** 2 + m[1] ** 2) * (0.53 * 0.55 / 1.5) ** 2)
+        kappa, sine = 2 * np.pi * (1.5 * cosine - 1) / 0.55, np.sqrt(1 - cosine**2)
+        v = np.array([1.5 * sine, 1 - 1.5 * cosine])
+        i, o = np.abs(v[1]) / np.hypot(*v), np.abs(1.5 * sine * sine - v[1] * cosine) / np.hypot(*v)
+        k = i * o * (v @ v) / (cosine * v[1] ** 2)
+        powers = (jv(m[0], 0.19 * kappa) * jv(m[1], 0.19 * kappa)) ** 2
+        expected = k * (1 - np.mean(fresnel(i, 1.5))) * powers
+        assert found.order(*m).mean() == pytest.approx(expected, rel=1e-4)
+
+
 def test_a_sinusoid_of_a_perfect_mirror_is_the_closed_form():
     period, depth, angle, wavelength = 4.0, 0.1, 25.0, 0.5
     found = md.efficiencies(md.gratings.sinusoidal(period, depth), angle, 500, material="none")
@@ -109,6 +156,9 @@ def test_axes_name_what_values_hold():
         ({"wavelengths": "blue"}, "wavelengths: got 'blue', wanted nm"),
         ({"theory": "exact"}, "theory: got 'exact', wanted one of"),
         ({"material": "Al", "int_ior": 1.5}, "wanted one of the two"),
+        ({"transmission": "film"}, "transmission: got 'film', wanted one of none, interface, sheet"),
+        ({"transmission": "sheet", "material": "Al"}, "got 'sheet' with material 'Al', wanted a dielectric"),
+        ({"transmission": "interface", "int_ior": 1.5 + 0.1j}, "got 'interface' with int_ior"),
         ({"height_field": md.HeightField(np.eye(64), 0.5)}, "about 20106 orders of a tile of 32 × 32 µm at 400 nm"),
         ({"azimuth": float("nan")}, "azimuth: got nan"),
         ({"azimuth": "x"}, "azimuth: got 'x'"),
@@ -191,4 +241,9 @@ def test_the_command_takes_theory_and_material_of_a_recipe(command):
     code, said, error = command("efficiency", f"{recipe},depth=0", "--wavelength", "600", "--int-ior", "1.5")
     assert (code, error) == (0, "")
     head, row = (line.split() for line in said.splitlines()[-2:])
+    passed = recipe.with_name("transmission_600.toml")
+    _, of_recipe, _ = command("efficiency", str(passed), "--wavelength", "600")
+    assert "rigorous theory, transmitted by a sheet" in of_recipe
+    _, inside, _ = command("efficiency", str(passed), "--wavelength", "600", "--transmission", "interface")
+    assert "rigorous theory, transmitted orders inside" in inside
     assert row[head.index("0") + 1] == row[-1] == "4.000"  # the unit of the wavelength is a word, too

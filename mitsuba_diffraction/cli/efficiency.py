@@ -35,6 +35,10 @@ def efficiency(
         str | None, typer.Option(help="a conductor, as Mitsuba names it; default: that of the recipe, or n = 1.5")
     ] = None,
     int_ior: Annotated[float | None, typer.Option(help="or the index of a dielectric")] = None,
+    transmission: Annotated[
+        str | None,
+        typer.Option(help="none, interface or sheet: the transmitted orders; default: that of the recipe, or none"),
+    ] = None,
     azimuth: Annotated[
         float, typer.Option(help="of the plane of incidence, degrees from x; 90: along the grooves")
     ] = 0,
@@ -72,6 +76,7 @@ def efficiency(
             wavelengths,
             theory=theory or recipe.spectrum.get("theory", "scalar"),
             **own,
+            transmission=transmission or recipe.spectrum.get("transmission", "none"),
             azimuth=azimuth,
             progress=progress,
         )

@@ -236,12 +236,7 @@ def solve(curve: Curve, omega: Real, k_0: float, index: complex, harmonics: int)
     side = ABOVE if omega[2] > 0 else BELOW
     k = k_0, k_0 * index.real
     alpha, k_y = -omega[:2] * k[side]
-    with one_thread():
-        grating = Grating(curve, harmonics)
-        alphas = alpha + grating.n
-        above = half_space(grating, alphas, k_0**2 - k_y**2, True)
-        square = k_0**2 * (index.real**2 if index.imag == 0 else index**2) - k_y**2
-        solved = scatter(alphas, above, half_space(grating, alphas, square, False), k_y, index)
+    solved = scattered(curve, omega, k_0, index, harmonics)
     light = frames(-omega[None])
 
     def inframes(orders: NDArray[np.int64], amplitudes: Complex, to: int) -> Complex:
@@ -262,6 +257,29 @@ def solve(curve: Curve, omega: Real, k_0: float, index: complex, harmonics: int)
         harmonics=harmonics,
         error=float("inf"),
     )
+
+
+@one_thread()
+def scattered(curve: Curve, omega: Real, k_0: float, index: complex, harmonics: int) -> Scattered:
+    """Solve for light from ω_i and of all orders that it is diffracted into."""
+    grating = Grating(curve, harmonics)
+    alpha, k_y = -omega[:2] * k_0 * (1 if omega[2] > 0 else index.real)
+    alphas = alpha + grating.n
+    above = half_space(grating, alphas, k_0**2 - k_y**2, True)
+    square = k_0**2 * (index.real**2 if index.imag == 0 else index**2) - k_y**2
+    return scatter(alphas, above, half_space(grating, alphas, square, False), k_y, index)
+
+
+def sheet_orders(curve: Curve, omega: Real, k_0: float, index: float, harmonics: int) -> tuple[NDArray[np.int64], Real]:
+    """Return the orders that leave the flat face of a sheet, ascending, and η_m of s and of p light, (n, 2).
+
+    Arguments are those of `solve`, of light from above.
+    """
+    solved = scattered(curve, omega, k_0, index, harmonics)
+    matrices = through_sheet(solved, index)[ABOVE, BELOW][:, list(solved.orders[ABOVE]).index(0), 0]
+    light = frames(-omega[None])[0]
+    stokes = np.einsum("as,iab,bs->is", light, _PAULI, light).real
+    return -solved.orders[ABOVE][::-1], (matrices @ stokes)[::-1]
 
 
 def _powers(amplitudes: Complex) -> Real:
