@@ -80,8 +80,7 @@ def small(words: Sequence[str], seed: int, target: Path) -> list[str]:
         if option in words:
             place = words.index(option)
             del words[place : place + 2]
-    if "--denoise" in words:
-        words.remove("--denoise")
+    words = [word for word in words if word != "--denoise"] + ["--no-denoise"]
     size = ["--width", str(SIZE[0]), "--height", str(SIZE[1]), "--spp", str(SAMPLES)]
     return [*words, *size, "--seed", str(seed), "-o", str(target)]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -15,6 +16,8 @@ from .console import Stopped, progress_bar, tell
 
 if TYPE_CHECKING:
     from ..render.spectral_image import SpectralImage
+
+_log = logging.getLogger(__name__)
 
 
 def render(
@@ -49,8 +52,11 @@ def render(
         bool, typer.Option("--half", help="write float16: half the size, radiance rounded by up to 0.05 %")
     ] = False,
     denoise: Annotated[
-        bool, typer.Option("--denoise", help="denoise the preview, but not the spectral picture (extra: denoise)")
-    ] = False,
+        bool | None,
+        typer.Option(
+            help="denoise the preview, but not the spectral picture (extra: denoise); default: as the scene says, or no"
+        ),
+    ] = None,
     dask: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="distribute the passes over a Dask cluster (tcp://HOST:PORT)")
     ] = None,
@@ -81,6 +87,8 @@ def render(
             f"{waiting[0]} is of an unfinished rendering: --resume continues it; remove it to start over"
         )
     mi.set_variant(choose_variant(variant))
+    if denoise is None:
+        denoise = _denoises(scene)
     spp = spp or named_sample_count(scene, where["parameters"]) or 64
     tracer = trace_here if dask is None else trace_on(dask)
     motions = [None] if frames is None else motions_of_orbit(scene, frames, **where)
@@ -96,6 +104,20 @@ def render(
         animation = target.with_suffix(".webp")
         save_animation([path.with_suffix(".png") for path in _pictures(target, frames)], animation)
         tell(f"{animation}: animated preview, {frames} frames")
+
+
+def _denoises(scene: Path) -> bool:
+    """Return whether a scene says that its preview is denoised, and it can be; else log a line."""
+    from ..render.denoise import check_requirements, is_asked_for
+
+    if not is_asked_for(scene):
+        return False
+    try:
+        check_requirements()
+    except RequestError as error:
+        _log.warning("%s; the scene asks for a denoised preview, this one is not", error)
+        return False
+    return True
 
 
 def _pictures(target: Path, frames: int | None) -> list[Path]:

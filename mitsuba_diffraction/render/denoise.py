@@ -7,7 +7,9 @@ divided by √R in the frequency domain, denoised, and multiplied by √R again.
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
+from xml.etree import ElementTree
 
 import drjit as dr
 import mitsuba as mi
@@ -38,8 +40,17 @@ class Guides:
     response: NDArray[np.float64]
 
 
-def guides(scene: mi.Scene) -> Guides:
-    """Render the guides of a scene.
+def is_asked_for(scene: str | os.PathLike[str]) -> bool:
+    """Return whether an XML scene has `<default name="denoise" value="true"/>`, of which Mitsuba takes no notice."""
+    defaults = {each.get("name"): each.get("value") for each in ElementTree.parse(scene).iter("default")}
+    value = defaults.get("denoise", "false")
+    if value not in ("true", "false"):
+        raise RequestError(f"{os.fspath(scene)}: denoise: got {value!r}, wanted true or false")
+    return value == "true"
+
+
+def check_requirements() -> None:
+    """Check that previews can be denoised.
 
     Raises:
         ValueError: if the variant is a scalar one, or pyoidn is not installed.
@@ -50,6 +61,11 @@ def guides(scene: mi.Scene) -> Guides:
         import pyoidn  # noqa: F401
     except ModuleNotFoundError:
         raise RequestError("--denoise: pyoidn is not installed; pip install 'mitsuba_diffraction[denoise]'") from None
+
+
+def guides(scene: mi.Scene) -> Guides:
+    """Render the guides of a scene; errors as of `check_requirements`."""
+    check_requirements()
     sensor = scene.sensors()[0]
     columns, rows = (int(size) for size in sensor.film().crop_size())
     sampler = mi.load_dict({"type": "independent"})

@@ -118,3 +118,39 @@ def test_missing_requirements_are_reported_before_the_work(command, tmp_path, mo
     assert (code, err.count("\n")) == (2, 1)
     assert "pip install 'mitsuba_diffraction[denoise]'" in err
     assert sorted(p.name for p in tmp_path.iterdir()) == ["scene.xml"]
+
+
+ASKS = SCENE.replace('<integrator type="direct"/>', '<default name="denoise" value="true"/><integrator type="direct"/>')
+
+
+@pytest.mark.slow
+def test_a_scene_asks_for_a_denoised_preview(command, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("plain.xml").write_text(SCENE)
+    Path("asks.xml").write_text(ASKS)
+    pictures = {}
+    for line in ("plain.xml", "plain.xml --denoise", "asks.xml", "asks.xml --no-denoise"):
+        code, _, err = command(f"render {line} --variant llvm_ad_spectral --spp 4 -o picture.exr --overwrite")
+        assert code == 0, err
+        pictures[line] = np.array(Image.open("picture.png"), int)
+    np.testing.assert_array_equal(pictures["asks.xml"], pictures["plain.xml --denoise"])
+    np.testing.assert_array_equal(pictures["asks.xml --no-denoise"], pictures["plain.xml"])
+    assert np.abs(pictures["asks.xml"] - pictures["plain.xml"]).max() > 5
+
+
+def test_a_scene_that_asks_for_it_renders_without_the_denoiser(command, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("scene.xml").write_text(ASKS)
+    monkeypatch.setitem(sys.modules, "pyoidn", None)
+    code, _, err = command("render scene.xml --variant llvm_ad_spectral --spp 1 -o picture.exr")
+    assert code == 0
+    assert "pip install 'mitsuba_diffraction[denoise]'; the scene asks for a denoised preview" in err
+    assert Path("picture.png").is_file()
+
+
+def test_a_value_other_than_true_or_false_is_refused(command, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("scene.xml").write_text(ASKS.replace('value="true"', 'value="yes"'))
+    code, _, err = command("render scene.xml --variant llvm_ad_spectral")
+    assert (code, err.count("\n")) == (2, 1)
+    assert "denoise: got 'yes', wanted true or false" in err
