@@ -22,14 +22,19 @@ from .tables import FloatTable, NumberTable, PacketTable, larger, limited, opaqu
 
 @dataclass
 class Place:
-    """c − ω_x and c + ω_x of a direction, where it lies among the slices (the one below, and how far from it),
-    whether it is under the surface, and where its ratio of scales lies among those of tables."""
+    """Where a direction lies in a table.
+
+    Attributes:
+        u, v: c − ω_x and c + ω_x, of a line grating; else columns and rows in cells.
+        under: under the surface.
+        lateral: s.
+        ratio: where the ratio of scales lies among those of tables.
+    """
 
     u: mi.Float
     v: mi.Float
-    below: mi.UInt32
-    beyond: mi.Float
     under: mi.Bool
+    lateral: mi.Float | float = 1.0
     ratio: mi.UInt32 | None = None
 
 
@@ -37,7 +42,7 @@ class Energy:
     """e(ω, λ) from a table, linear between the corners of a cell.
 
     The four corners of a cell are packed as bytes into one number, so that a direction and a wavelength cost one read
-    of four bytes, or two where e is linear between slices: reads cost more than the arithmetic.
+    of four bytes, or two where e is linear between wavelengths: reads cost more than the arithmetic.
     """
 
     def __init__(
@@ -71,9 +76,9 @@ class Energy:
         self.edges = None if edges is None else [opaque(edge) for edge in edges]
         self.slope = None if slopes is None else PacketTable(slopes)
         self.change = change
-        # Wavelengths are those above.
-        self.periods = [opaque(tables[k].layout.period * n) for k, n in ((0, 1), (-1, index))]
-        self.squares = opaque(layout.squares - 1)
+        # Of an interface wavelengths below have the same place among the slices of their table as those above.
+        self.frequencies = [opaque(nu) for nu in layout.frequencies]
+        self.period, self.squares = opaque(layout.period), opaque(layout.squares - 1)
         self.cells, self.first_cells = opaque(layout.cells), opaque(layout.first)
 
     def __str__(self) -> str:
@@ -95,7 +100,7 @@ class Energy:
             ratio = dr.detach(height_scale) / lateral_scale
             number = sum((dr.select(ratio > e, mi.UInt32(1), 0) for e in self.edges), mi.UInt32(0))
             for place in places:
-                place.ratio, place.u, place.v = number, place.u * lateral_scale, place.v * lateral_scale
+                place.ratio, place.lateral = number, lateral_scale
         return places
 
     def factor(self, places: tuple[Place, Place], frequency: mi.Float) -> mi.Float:
@@ -107,27 +112,25 @@ class Energy:
     def place(self, omega: mi.Vector3f) -> Place:
         """Return the place of ω, along the pattern's axes."""
         x, y = (omega.y, omega.x) if self.layout.turned else (omega.x, omega.y)
-        square = dr.square(omega.z if self.two_sided else larger(omega.z, 0))
-        c = dr.sqrt(dr.square(x) + square)
-        longer = c + dr.abs(x)
-        # c − |x| without cancellation.
-        shorter = square / larger(longer, 1e-12)
-        u, v = dr.select(x > 0, shorter, longer), dr.select(x > 0, longer, shorter)
-        place = Place(u, v, mi.UInt32(0), mi.Float(0), omega.z < 0)
-        if not self.layout.lines:
-            y = y / (1 + c)
-            row = 0.5 * (self.slices - 1) * (1 + dr.copysign(1 - _equidistant(1 - dr.abs(y)), y))
-            place.below, place.beyond = _cell(row, self.slices - 1)
-        return place
+        z = dr.abs(omega.z) if self.two_sided else larger(omega.z, 0)
+        if self.layout.lines:
+            longer = dr.sqrt(dr.square(x) + dr.square(z)) + dr.abs(x)
+            # c − |x| without cancellation.
+            shorter = dr.square(z) / larger(longer, 1e-12)
+            u, v = dr.select(x > 0, shorter, longer), dr.select(x > 0, longer, shorter)
+        else:
+            t = dr.sqrt(limited(1 - dr.sqrt(larger(1 - z, 0)), 0, 1))
+            along = (1 - t) / larger(dr.abs(x) + dr.abs(y), 1e-12)
+            u, v = (0.5 * self.first_cells * (1 + along * of) for of in (x + y, x - y))
+        return Place(u, v, omega.z < 0)
 
     def bound(self, place: Place, frequency: mi.Float, passes: mi.Bool | None = None) -> mi.Float:
         """Return e of reflected light, or of light that passes, of the direction at `place`.
 
         `frequency` is 1/λ in 1/µm, λ in the medium above.
         """
-        period, number = self.periods[0], place.ratio
+        frequency, number = frequency * place.lateral, place.ratio
         if self.two_sided:
-            period = dr.select(place.under, self.periods[1], period)
             number = dr.select(place.under, mi.UInt32(2), 0) + dr.select(passes, mi.UInt32(1), 0)
             number = number if place.ratio is None else 4 * place.ratio + number
         if place.ratio is not None:
@@ -137,15 +140,21 @@ class Energy:
             step = dr.select(place.under, below, above)
         else:
             step = self.steps[0]
-        (column, x), (row, y) = (self._column(u * (period * frequency)) for u in (place.u, place.v))
-        index = (place.below * self.side + row) * self.side + column
+        if self.layout.lines:
+            (column, x), (row, y) = (self._column(u * (self.period * frequency)) for u in (place.u, place.v))
+            index = row * self.side + column
+        else:
+            (column, x), (row, y) = (_cell(u, self.first_cells) for u in (place.u, place.v))
+            first, last = self.frequencies
+            below, beyond = _cell((frequency - first) / (last - first) * (self.slices - 1), self.slices - 1)
+            index = (below * self.side + row) * self.side + column
         if number is not None:
             index += number * self.cells_of_table
 
         def between(corners: Callable[[mi.UInt32], mi.Vector4f]) -> mi.Float:
             values = corners(index)
             if not self.layout.lines:
-                values = dr.lerp(values, corners(index + self.side * self.side), place.beyond)
+                values = dr.lerp(values, corners(index + self.side * self.side), beyond)
             return dr.lerp(dr.lerp(values[0], values[1], x), dr.lerp(values[2], values[3], x), y)
 
         # From above, so that one stays one.

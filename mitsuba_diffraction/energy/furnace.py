@@ -59,7 +59,8 @@ FLAT = 0.5  # cos θ_o down to which no phase of a narrow order may turn so far
 NARROW = 0.02  # λσ up to which a lobe is integrated along the radius alone
 RADIAL, AZIMUTHAL = 9, 13  # points of a lobe
 RADIAL_POINTS, RADIAL_POINTS_OF_CELL = leggauss(RADIAL), leggauss(3)
-BLUR = 0.05  # a cell of a table in three dimensions, as a share of the largest κ
+BLUR = 0.05  # what a cell of a table in three dimensions may span, as a share of the largest κ
+PHASE = 4  # radians by which the phase of the deepest point changes from slice to slice, if 16 are enough
 ROBERTS = np.array([0.7548776662466927, 0.5698402909980532])  # steps of a sequence of low discrepancy in the plane
 POINTS = 12000  # drawn by power among the nodes of a spectrum
 CHUNK = 1 << 16  # pairs (direction, component) at once, so that they stay in the cache
@@ -136,11 +137,6 @@ class Furnace:
         else:
             own = spectrum.lobe_width if isinstance(grid, OrderGrid) else np.array(grid.spacing) / 2
             q, widths, powers = _gathered(spectrum, kappas, own, 1.0 if index is None else COARSER)
-        # In deep surfaces phases turn faster than a table in three dimensions follows: where few nodes make up a
-        # component, its power is the largest near.
-        deep = max_kappa * spectrum.height_range * height_scale * BLUR > 1
-        if deep and 1 not in grid.shape and 16 * len(q) > np.prod(grid.shape):
-            powers = maximum_filter1d(powers, 1 + int(BLUR * len(kappas)), axis=1)
         kept = powers.max(-1) > 1e-7
         seen = None if index is None else float(index) ** side
         sigma, depth = spectrum.lobe_width, spectrum.height_range * height_scale
@@ -152,6 +148,12 @@ class Furnace:
             at_least = [np.array([np.interp(n * least, kappas, row) for row in powers[kept]]) for n in (1, 2)]
             small = small_kappa(kappas, least, powers[kept], *(at[:, None] for at in at_least))
             passed = np.ascontiguousarray(np.maximum(small, 0), np.float32)
+        # Of the deepest surfaces phases turn faster than the slices of a table follow: where few nodes make up a
+        # component, its power is the largest near. κ of transmitted light is smaller by a factor of four or so.
+        if max_kappa * depth * BLUR > PHASE and 1 not in grid.shape and 16 * len(q) > np.prod(grid.shape):
+            powers = maximum_filter1d(powers, 1 + int(BLUR * len(kappas)), axis=1)
+            if passed is not None:
+                passed = maximum_filter1d(passed, 1 + int(BLUR / 4 * len(kappas)), axis=1)
         return cls(
             side * q[kept],
             widths[kept],
@@ -313,6 +315,10 @@ class Furnace:
         result = np.empty(len(s))
         lobe = (self.q[component] == 0).all(-1) | self.by_order
         wide = lobe & (length * self.widths[component] > NARROW)
+        # Where ω_i changes, phases turn in another direction than the cosine that is integrated over.
+        wide |= back & (
+            (2 * np.pi * self.height_range * self.widths[component] / TURN) ** 2 * (1 - cos_i**2) > cos_i**2
+        )
         for those, count in ((~lobe, 1), (wide, AZIMUTHAL), (lobe & ~wide, 1)):
             some = np.flatnonzero(those)
             for part in np.array_split(some, 1 + len(some) * RADIAL * count // CHUNK):
@@ -377,7 +383,11 @@ class Furnace:
         value = weight * (t_o > 0) * self._factor(in_, of, length, (offset**2).sum(-1), way)
         for square in (np.minimum(cos_i**2, t_i), np.minimum(cos_o**2, t_o)):
             value *= horizon_gain(np.maximum(square, 0) / (2 * sigma))
-        cos_o = np.where(back[:, None, None], np.sqrt(np.maximum(t_i, 0)), cos_o)
+        # Of κ: where ω_i changes instead, it is the fixed one, and ω_o that which is sent on.
+        back = back[:, None, None]
+        cos_i, cos_o = (
+            np.where(back, np.sqrt(np.maximum(square, 0)), cos) for square, cos in ((t_i, cos_i), (t_o, cos_o))
+        )
         return (value * self._power(powers, cos_i, cos_o, length, way)).sum((1, 2))
 
     def albedo_of_nodes(

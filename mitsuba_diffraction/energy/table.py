@@ -16,9 +16,13 @@ between. So each unit square of (u, v) is divided into cells by itself, finest n
 just emerged; at u = 0 and v = 0 ω itself is at the horizon. With f the fraction of u, nodes are equidistant in √f, as
 cos θ_o of that order is. a depends on u and v alone: the table has one slice.
 
-Of surfaces with orders in two dimensions, and of samples, T is so short that one square holds all directions, and
-slices are equidistant in the same function of the fraction 1 − |y|, y = ω_y/(1 + c). So it is of an interface, where
-transmitted orders emerge elsewhere; it has one table for the light of each side.
+Of surfaces with orders in two dimensions, of samples and of interfaces the hemisphere is a square, its middle the
+normal and its edge the horizon,
+
+    (ω_x − ω_y, ω_x + ω_y) (1 − t)/(|ω_x| + |ω_y|),    cos θ = 1 − (1 − t²)²
+
+with nodes that are equidistant along its sides and, the slices, in 1/λ: there e is smooth but for its kinks. An
+interface has tables for the light of each side.
 """
 
 from __future__ import annotations
@@ -37,20 +41,20 @@ from scipy.ndimage import minimum_filter
 
 from ..errors import RequestError
 from ..spectrum.grids import OrderGrid
-from .furnace import Furnace, PowerSpectrum
+from .furnace import PHASE, Furnace, PowerSpectrum
 
 SLACK = 1e-3
 """What an albedo may exceed one by."""
 CHECKED, CHECKS = 150, 3  # random places at which a table is held against the spectrum itself, and how often
-CANDIDATES, TIGHT = 15, 0.9  # so many places for one that is checked: there the furnace finds at least this albedo
+CANDIDATES, TIGHT = 15, 0.9  # so many places, at most, for one that is checked: there the furnace finds this albedo
 ABOUT = 3, 5, 5  # slices, rows and columns that are lowered about such a place
-GENERAL, FINEST = (17, 22), 3  # slices, and cells along u and v, of other tables; finer by this, at most
+NODES, FINEST = 3500, 12  # nodes of other tables; times this, at most
 PLACES = 1.5e5  # nodes of the table of a line grating, at most; a quarter if lobes are wide, which takes longer
-ROUNDS, PAIRS = (1, 32), 5e6  # random places in each cell, at least and at most; about so many pairs with components
+ROUNDS, PAIRS = 32, 5e6  # places in a cell, at most; about so many pairs with components
 STEEP = 0.98  # e is lowered so far inside of a cell or its neighbours, where more places are tried
 STRIDE = np.array([0.8191725, 0.6710436, 0.5497005])  # of places in a cell, so that few rounds cover it (Roberts 2018)
 TURNED = 1.0, 0.5  # c for which a is computed, where it matters
-LEAST, HORIZON = 1e-7, 1e-4  # the least fraction of u and v, and of y
+LEAST, HORIZON = 1e-7, 0.01  # the least fraction of u and v, and the least t
 
 
 @dataclass(frozen=True)
@@ -58,13 +62,12 @@ class Layout:
     """Where the cells of a table lie.
 
     Attributes:
-        period: T in µm.
-        squares: unit squares of (u, v) along each.
-        first: cells along u or v from 0 to 1, where ω is near the horizon.
+        period: T in µm of a line grating; 0, of another surface.
+        squares: unit squares of (u, v) along each; or the one of all directions.
+        first: cells along u or v from 0 to 1, where ω is near the horizon; or along the sides of the one square.
         cells: along the side of the other unit squares.
-        slices: one, or nodes of y.
+        slices: one, or nodes of 1/λ.
         frequencies: (smallest, largest) 1/λ in 1/µm.
-        lines: of a line grating.
         turned: the grating is periodic along y: x and y change places.
     """
 
@@ -74,16 +77,20 @@ class Layout:
     cells: int
     slices: int
     frequencies: tuple[float, float]
-    lines: bool
     turned: bool = False
 
     def __post_init__(self) -> None:
-        if not (0 < self.period < np.inf and 0 < self.frequencies[0] < self.frequencies[1] < np.inf):
-            raise RequestError(f"energy table: got period {self.period}, frequencies {self.frequencies}, wanted > 0")
+        if not (0 <= self.period < np.inf and 0 < self.frequencies[0] < self.frequencies[1] < np.inf):
+            raise RequestError(f"energy table: got period {self.period}, frequencies {self.frequencies}")
         if min(self.squares, self.first, self.cells, self.slices - (not self.lines)) < 1:
             raise RequestError(
                 f"energy table: got {self.squares}, {self.first}, {self.cells}, {self.slices}, wanted at least one"
             )
+
+    @property
+    def lines(self) -> bool:
+        """Whether it is of a line grating."""
+        return self.period > 0
 
     @property
     def shape(self) -> tuple[int, int, int, int]:
@@ -100,11 +107,10 @@ class Layout:
         grid = spectrum.grid
         if furnace.index is not None or not (isinstance(grid, OrderGrid) and 1 in grid.shape):
             # As fine as the work allows, which is about the same for all.
-            places = GENERAL[0] * GENERAL[1] ** 2
-            finest = 1 if furnace.index is None else FINEST
-            finer = np.clip(np.cbrt(PAIRS / (furnace.work * places)), 1, finest)
-            slices, side = 1 + 2 * int(GENERAL[0] * finer / 2), int(GENERAL[1] * finer)
-            return cls(shortest / 2, 1, side, 1, slices, frequencies, False)
+            nodes = NODES * float(np.clip(PAIRS / 2 / (furnace.work * NODES), 1, 1 if furnace.index else FINEST))
+            turn = 4 * np.pi * furnace.height_range * (frequencies[1] - frequencies[0])
+            slices = int(np.clip(4 + turn / PHASE, 4, 16) * np.cbrt(nodes / NODES))
+            return cls(0.0, 1, int(np.sqrt(nodes / min(slices, 8))), 1, slices, frequencies)
         turned = grid.shape[1] == 1 and grid.shape[0] > 1
         # So many places that the work is about the same for all gratings; where no phase turns within lobes, two thirds
         # lose as little.
@@ -114,31 +120,54 @@ class Layout:
         period, rest = grid.tile_size[int(turned)], (side - 2 * first - 1) / 3
         period /= max(np.ceil(2 * period / shortest / max(rest, 2)), 1)
         squares = int(np.ceil(2 * period / shortest))
-        cells = int(np.clip((3 * rest / max(squares - 1, 1) - 1) / 2, 1, 24))
-        return cls(float(period), squares, first, cells, 1, frequencies, True, turned)
+        cells = int(np.clip((3 * rest / max(squares - 1, 1) - 1) / 2, 1, 48 if furnace.turning else 24))
+        return cls(float(period), squares, first, cells, 1, frequencies, turned)
 
     def places(
         self, directions: NDArray[np.float64], wavelengths: ArrayLike
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Return slice, row and column of ω (n, 3) and λ (µm), in cells: each (n,)."""
         x, y, z = directions.T
+        if not self.lines:
+            t = np.sqrt(1 - np.sqrt(np.maximum(1 - z, 0)))
+            along = (1 - t) / np.maximum(np.abs(x) + np.abs(y), 1e-12)
+            first, last = self.frequencies
+            place = np.clip((1 / np.broadcast_to(wavelengths, x.shape) - first) / (last - first), 0, 1)
+            return place * (self.slices - 1), *(self.first / 2 * (1 + along * of) for of in (x - y, x + y))
         if self.turned:
             x, y = y, x
-        c = np.sqrt(x**2 + z**2)
-        longer = c + np.abs(x)
+        longer = np.sqrt(x**2 + z**2) + np.abs(x)
         shorter = z**2 / np.maximum(longer, 1e-12)
         per_length = self.period / np.asarray(wavelengths)
         u, v = (self._place(np.where(x * sign > 0, shorter, longer) * per_length) for sign in (1, -1))
-        if self.lines:
-            row = np.zeros(len(x))
-        else:
-            y = y / (1 + c)
-            row = (1 - np.copysign(1 - _equidistant(1 - np.abs(y)), -y)) / 2 * (self.slices - 1)
-        return row, v, u
+        return np.zeros(len(x)), v, u
+
+    def directions(self, places: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the inverse of `places` but for line gratings: of (n, 3), ω (n, 3) and λ (n,)."""
+        first, last = self.frequencies
+        row, column = (2 * places[:, k] / self.first - 1 for k in (1, 2))
+        x, y = (column + row) / 2, (column - row) / 2
+        t = np.maximum(1 - np.abs(x) - np.abs(y), HORIZON)
+        z = 1 - (1 - t**2) ** 2
+        along = np.sqrt(1 - z**2) / np.maximum(np.hypot(x, y), 1e-12)
+        return np.stack([along * x, along * y, z], -1), 1 / (first + places[:, 0] / (self.slices - 1) * (last - first))
+
+    @property
+    def cell_counts(self) -> tuple[int, int, int]:
+        """Cells along slices, v and u."""
+        return max(self.slices - 1, 1), *self.shape[1:3]
 
     def cells_of(self, *places: NDArray[np.float64]) -> tuple[NDArray[np.int64], ...]:
         """Return the cells of places (slice, row, column), as an index of the first three axes of `shape`."""
-        return tuple(np.clip(x.astype(np.int64), 0, n - 1) for x, n in zip(places, self.shape[:3], strict=True))
+        return tuple(np.clip(x.astype(np.int64), 0, n - 1) for x, n in zip(places, self.cell_counts, strict=True))
+
+    def lowered(self, e: NDArray[np.float64], share: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return e at corners (..., *shape) times a share of each cell, (..., slices − 1 or 1, rows, columns)."""
+        if not self.lines:
+            # Two cells share a slice.
+            n = self.slices - 1
+            share = np.minimum(share[..., np.r_[0, :n], :, :], share[..., np.r_[:n, n - 1], :, :])
+        return e * share[..., None]
 
     def random_places(self, count: int, seed: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return `count` directions (n, 3), two thirds of them beyond 60°, one beyond 85°, and λ in µm, (n,)."""
@@ -226,19 +255,20 @@ class EnergyTable:
         count = CHECKED // len(furnace.ways)
         for check in range(CHECKS if e.min() < 1 else 0):
             bounds = [cls.packed(layout, of).at for of in e]
-            omega, lengths = layout.random_places(CANDIDATES * count, check)
+            candidates = int(np.clip(PAIRS / (16 * furnace.work), count, CANDIDATES * count))
+            omega, lengths = layout.random_places(candidates, check)
             cells, a = layout.cells_of(*layout.places(omega, lengths)), furnace.albedo(omega, lengths)
-            got, share = np.stack([at(omega, lengths) for at in bounds]), np.ones(layout.shape[:3])
+            got, share = np.stack([at(omega, lengths) for at in bounds]), np.ones(layout.cell_counts)
             highest = (got * a).sum(0)
             lower = 1 / np.maximum(highest, 1)
             if not exact:
                 tried = np.flatnonzero(highest > TIGHT)[:count]
                 albedo = furnace.albedo_of_nodes(spectrum, omega[tried], lengths[tried], bounds, pairs=False)
                 tried = tried[albedo > 1]
-                # Of two estimates the smaller: what both exceed is no noise.
+                # Of two estimates the smaller: what both exceed by more than `SLACK` is no noise.
                 both = [furnace.albedo_of_nodes(spectrum, omega[tried], lengths[tried], bounds, k) for k in (0, 1)]
                 # Beyond what the furnace finds, unless phases turn: by that the cell itself is lowered.
-                albedo = np.minimum(*both) * (1.0 if furnace.turning else lower[tried])
+                albedo = np.minimum(*both) / (1 + SLACK) * (1.0 if furnace.turning else lower[tried])
                 np.minimum.at(share, tuple(of[tried] for of in cells), 1 / np.maximum(albedo, 1))
             # Places that were not tried may exceed by as much again.
             everywhere = share.min() ** 2 if check == CHECKS - 1 else 1.0
@@ -246,7 +276,7 @@ class EnergyTable:
                 np.minimum.at(share, cells, lower)
             share = np.minimum(minimum_filter(share, ABOUT), everywhere)
             np.minimum.at(share, cells, lower)
-            e = e * share[..., None]
+            e = layout.lowered(e, share)
             lost = 1 - np.minimum(got * share[cells] / bounds_of(a, furnace.index), 1)
             losses = [(float(of.mean()), float(of.max())) for of in lost]
         return [cls.packed(layout, *of) for of in zip(e, losses, strict=True)]
@@ -270,7 +300,7 @@ class EnergyTable:
         weights = _bilinear(columns - column, rows - row)
         steps = (self.steps[below, row, column] * weights).sum(-1)
         if not self.layout.lines:
-            above = (self.steps[np.minimum(below + 1, self.steps.shape[0] - 1), row, column] * weights).sum(-1)
+            above = (self.steps[below + 1, row, column] * weights).sum(-1)
             steps += (slices - below) * (above - steps)
         return self.least + (1 - self.least) / 255 * steps
 
@@ -410,68 +440,34 @@ def _line_corners(furnace: Furnace, layout: Layout) -> NDArray[np.float64]:
 
 
 def _general_corners(furnace: Furnace, layout: Layout) -> NDArray[np.float64]:
-    """Compute `corners` of orders in two dimensions and of samples: lowered at random places in the cells."""
-    side, (first, last) = layout.first, layout.frequencies
-    cells = np.indices((layout.slices - 1, side, side)).reshape(3, -1).T
+    """Compute `corners` of other surfaces: lowered in the middle of cells, and elsewhere in those that are steep."""
 
-    def latitude(slices: NDArray[np.float64]) -> NDArray[np.float64]:
-        place = 2 * slices / (layout.slices - 1) - 1
-        return np.copysign(1 - np.maximum(_fraction(1 - np.abs(place)), HORIZON), place)
+    def bound(places: NDArray[np.float64]) -> NDArray[np.float64]:
+        return bounds_of(furnace.albedo(*layout.directions(places)), furnace.index)
 
-    def bound(places: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Return `bounds_of` at places (slice, row, column), (n, 3), and whether there is light there."""
-        y = latitude(places[:, 0])
-        u, v = (np.maximum(_fraction(p / side), LEAST) for p in (places[:, 2], places[:, 1]))
-        c, nu = (1 - y**2) / (1 + y**2), (u + v) / (2 * layout.period)
-        lengths = c / nu
-        there = (lengths >= 1 / last) & (lengths <= 1 / first)
-        directions = np.stack([c * (v - u) / (u + v), 2 * y / (1 + y**2), c * 2 * np.sqrt(u * v) / (u + v)], -1)
-        a = furnace.albedo(directions, np.clip(lengths, 1 / last, 1 / first))
-        return bounds_of(a, furnace.index), there
-
-    # Cells that light reaches at some wavelength.
-    y = latitude(cells[:, :1] + [0, 0.5, 1])
-    c = (1 - y**2) / (1 + y**2)
-    low, high = (_fraction((cells[:, 1] + k) / side) + _fraction((cells[:, 2] + k) / side) for k in (0, 1))
-    per = 2 * layout.period
-    cells = cells[(low <= per * last * c.max(-1)) & (high >= per * first * c.min(-1))]
-    # Nodes, each of them once.
-    eight = np.array(list(np.ndindex(2, 2, 2)))
-    nodes, corner = np.unique((cells[:, None] + eight).reshape(-1, 3), axis=0, return_inverse=True)
-    e = bound(nodes.astype(np.float64))[0][:, corner.reshape(-1, 8)]
-    start, lowered = np.random.default_rng(0).random((len(cells), 3)), np.ones((len(e), len(cells)))
-
-    def of_neighbours() -> NDArray[np.float64]:
-        near = np.ones((len(e), *np.add(layout.shape[:3], (-1, 0, 0))))
-        near[(slice(None), *cells.T)] = lowered
-        return minimum_filter(near, (1, 3, 3, 3))[(slice(None), *cells.T)]
-
-    some, done = np.arange(len(cells)), 0
-    # All cells, and again those that are steep.
-    jumps = furnace.by_order and furnace.index is not None
-    for steep in (False, True)[: 1 + jumps]:
-        if steep:
-            some = np.flatnonzero(of_neighbours().min(0) < STEEP)
-        rounds = int(np.clip(PAIRS / max(len(some) * furnace.work, 1), *ROUNDS)) if len(some) else 0
-        for index in range(done, done + rounds):
-            inside = (start[some] + index * STRIDE) % 1
-            wanted, there = bound(cells[some] + inside)
-            weights = np.prod(np.where(eight, inside[:, None], 1 - inside[:, None]), -1)
-            got = (weights * e[:, some]).sum(-1)
-            share = np.where(there, np.minimum(wanted / np.maximum(got, 1e-30), 1), 1)
-            e[:, some] *= share[..., None]
-            lowered[:, some] *= share
-        done += rounds
-    if jumps:
-        # What few places show in one cell may lie between those in its neighbours.
-        e *= (of_neighbours() / np.maximum(lowered, 1e-30))[..., None]
-        e[e < 1] *= 1 - 2 * SLACK
-    # Two cells share a corner (slice, row, column, corner).
-    full = np.ones((len(e), *layout.shape))
-    for of, to in zip(e, full, strict=True):
-        for k, (above, j, i) in enumerate(eight):
-            np.minimum.at(to, (cells[:, 0] + above, cells[:, 1], cells[:, 2], 2 * j + i), np.maximum(of[:, k], 0))
-    return full
+    slices, side = layout.shape[:2]
+    nodes = np.indices((slices, side + 1, side + 1), np.float64)
+    of_nodes = bound(nodes.reshape(3, -1).T).reshape(-1, *nodes.shape[1:])
+    e = np.stack([of_nodes[..., j : j + side, i : i + side] for j, i in np.ndindex(2, 2)], -1)
+    lowered = np.ones((len(e), slices - 1, side, side))
+    # The middle of all cells, and more places in those that are steep.
+    some, rounds, index = np.ones(lowered.shape[1:], bool), 1, 0
+    while index < rounds:
+        inside = (0.5 + index * STRIDE) % 1
+        got = e @ _bilinear(inside[2], inside[1])
+        got = (1 - inside[0]) * got[:, :-1] + inside[0] * got[:, 1:]
+        share = np.ones_like(lowered)
+        share[:, some] = np.minimum(bound(np.argwhere(some) + inside) / np.maximum(got[:, some], 1e-30), 1)
+        if index == rounds - 1 > 0:
+            # Other places may exceed as much as the last ones of a cell and its neighbours; where transmitted orders
+            # emerge within cells, as any of these.
+            so_far = lowered if furnace.by_order and furnace.index is not None else 1.0
+            share = minimum_filter(so_far * share, (1, 3, 3, 3)) / np.maximum(so_far, 1e-30)
+        e, lowered, index = layout.lowered(e, share), lowered * share, index + 1
+        if index == 1:
+            some = minimum_filter(lowered, (1, 3, 3, 3)).min(0) < STEEP
+            rounds = int(min(PAIRS / (some.sum() * furnace.work), ROUNDS)) if some.any() else 1
+    return np.maximum(e, 0)
 
 
 def _bilinear(x: NDArray[np.float64] | np.float64, y: NDArray[np.float64] | np.float64) -> NDArray[np.float64]:

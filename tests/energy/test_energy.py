@@ -323,9 +323,9 @@ def slanted(rng, count, steepest):
     return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1)
 
 
-@pytest.mark.parametrize("name", [*ONE_ROW[:4], "crossed"])
-def test_the_furnace_is_the_sum_over_the_orders(name):
-    of, rng = spectrum(name), np.random.default_rng(3)
+@pytest.mark.parametrize(("name", "length"), [*((n, 65.0) for n in [*ONE_ROW[:4], "crossed"]), ("deep blazed", 5.0)])
+def test_the_furnace_is_the_sum_over_the_orders(name, length):
+    of, rng = spectrum(name, length), np.random.default_rng(3)
     omega, wavelengths = slanted(rng, 6, 89), rng.uniform(0.36, 0.83, 6)
     wanted = [order_albedo(of, *pair) for pair in zip(omega, wavelengths, strict=True)]
     np.testing.assert_allclose(Furnace.of(of).albedo(omega, wavelengths)[0], wanted, rtol=0.01)

@@ -106,6 +106,28 @@ def test_the_furnace_of_an_interface_is_the_closed_form(name, side):
         assert total[near].mean() > 0.97
 
 
+@pytest.mark.parametrize("theta", [0, 20, 40])
+def test_a_deep_film_keeps_the_light_that_the_closed_form_transmits(theta):
+    period, amplitude, wavelength = 2.0, 0.2, 0.55
+    of = md.precompute(
+        md.gratings.crossed(period, 2 * amplitude, samples=40),
+        wavelengths=(SHORT / INDEX, LONG / INDEX),
+        coherence_length=2000,
+    )
+    theta = np.deg2rad(theta)
+    wi = np.array([0.8 * np.sin(theta), 0.6 * np.sin(theta), np.cos(theta)])
+    wanted = 0.0
+    for m, n in np.ndindex(25, 25):
+        t = -(wavelength / period * (np.array([m, n]) - 12) + wi[:2]) / INDEX
+        if t @ t < 1:
+            wo = np.array([*t, -np.sqrt(1 - t @ t)])
+            x = 2 * np.pi * (wi[2] + INDEX * wo[2]) / wavelength * amplitude
+            wanted += pair(wi, wo, 1.0, INDEX) * (jv(m - 12, x) * jv(n - 12, x)) ** 2
+    place = wi[None], np.array([wavelength])
+    assert Furnace.of(of, 1.0, INDEX).albedo(*place)[1, 0] == pytest.approx(wanted, abs=5e-3)
+    assert EnergyTable.of_interface(of, INDEX)[1].at(*place)[0] > 0.98
+
+
 def scattered(of, tables, wi, side, wavelength, rng, points, sheet=False):
     """R + T by a sum over the nodes of the stored spectrum, of light from `side`, and its standard error.
 
