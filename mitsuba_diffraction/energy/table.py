@@ -110,7 +110,9 @@ class Layout:
             nodes = NODES * float(np.clip(PAIRS / 2 / (furnace.work * NODES), 1, 1 if furnace.index else FINEST))
             turn = 4 * np.pi * furnace.height_range * (frequencies[1] - frequencies[0])
             slices = int(np.clip(4 + turn / PHASE, 4, 16) * np.cbrt(nodes / NODES))
-            return cls(0.0, 1, int(np.sqrt(nodes / min(slices, 8))), 1, slices, frequencies)
+            # Of deep surfaces more: but orders that are evaluated by themselves need the time for places within cells.
+            per_slice = nodes / (slices if furnace.by_order else min(slices, 8))
+            return cls(0.0, 1, int(np.sqrt(per_slice)), 1, slices, frequencies)
         turned = grid.shape[1] == 1 and grid.shape[0] > 1
         # So many places that the work is about the same for all gratings; where no phase turns within lobes, two thirds
         # lose as little.
