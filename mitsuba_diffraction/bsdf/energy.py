@@ -78,6 +78,9 @@ class Energy:
         self.change = change
         # Of an interface wavelengths below have the same place among the slices of their table as those above.
         self.frequencies = [opaque(nu) for nu in layout.frequencies]
+        if edges is not None:
+            of_ratio = tables[:: len(tables) // (1 + len(edges))]
+            self.frequencies = [FloatTable(np.array([of.layout.frequencies[k] for of in of_ratio])) for k in (0, 1)]
         self.period, self.squares = opaque(layout.period), opaque(layout.squares - 1)
         self.cells, self.first_cells = opaque(layout.cells), opaque(layout.first)
 
@@ -145,7 +148,9 @@ class Energy:
             index = row * self.side + column
         else:
             (column, x), (row, y) = (_cell(u, self.first_cells) for u in (place.u, place.v))
-            first, last = self.frequencies
+            first, last = (
+                self.frequencies if place.ratio is None else [nu(place.ratio, True) for nu in self.frequencies]
+            )
             below, beyond = _cell((frequency - first) / (last - first) * (self.slices - 1), self.slices - 1)
             index = (below * self.side + row) * self.side + column
         if number is not None:

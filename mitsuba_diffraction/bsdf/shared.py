@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import threading
 import weakref
@@ -13,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..energy.furnace import Furnace
-from ..energy.table import EnergyTable, Stretched, between, corners
+from ..energy.table import EnergyTable, Layout, Stretched, between, corners, layouts_of
 from ..grating_spectrum import GratingSpectrum
 from ..precomputation import Spectrum
 from ..rigorous.spectrum import RigorousSpectrum
@@ -77,14 +78,14 @@ class SharedTables:
         """Return the factor E, or None if it is one for all directions and wavelengths.
 
         Where a gradient is tracked through `height_scale`, the entries of the table carry theirs, from a central
-        difference.
+        difference; not those of an interface, whose steps from cell to cell would be in the difference.
         """
         scale, index = float(np.max(height_scale)), self._eta or 1.0
-        if dr.grad_enabled(height_scale):
+        if dr.grad_enabled(height_scale) and self._eta is None:
             tables, lower, upper = self.energy_tables(scale), max(scale - STEP, 0.0), scale + STEP
-            above, below = (self.corners(tables, s) for s in (upper, lower))
+            above, below = (self.corners(tables[0], s) for s in (upper, lower))
             slopes = (above - below) / (upper - lower)
-            return Energy(tables, slopes, height_scale - dr.detach(height_scale), index)
+            return Energy(tables, slopes, height_scale - dr.detach(height_scale))
         with self._lock:
             if self._last is None or self._last[0] != scale:
                 tables = self.energy_tables(scale)
@@ -106,10 +107,16 @@ class SharedTables:
             turn = 0.5 * spectrum.max_kappa * spectrum.height_range * (high - low)
             ratios = np.linspace(low, high, 2 * int(np.clip(turn / (2 * TURN), 1, PARTS)) + 1)
             laterals = np.repeat(laterals[:1], len(ratios))
-        found = [
-            self.energy_tables(float(ratio), Stretched(spectrum, float(lateral)))
-            for ratio, lateral in zip(ratios, laterals, strict=True)
-        ]
+        found, most = [], float(np.max(ratios))
+        shape = layouts_of(spectrum, self._eta, most)[0]
+        for ratio, lateral in zip(ratios, laterals, strict=True):
+            stretched = Stretched(spectrum, float(lateral))
+            # Tables of all ratios are read alike, but for their wavelengths.
+            layouts = [
+                dataclasses.replace(shape, frequencies=own.frequencies)
+                for own in layouts_of(stretched, self._eta, most)
+            ]
+            found.append(self.energy_tables(float(ratio), stretched, layouts))
         edges = (ratios[1:] + ratios[:-1]) / 2
         if not complete:
             found = [[between(*of) for of in zip(*found[k : k + 3], strict=True)] for k in range(0, len(ratios) - 2, 2)]
@@ -118,22 +125,22 @@ class SharedTables:
         needed = any(table.needed for table in tables)
         return Energy(tables, index=self._eta or 1.0, edges=edges.tolist()) if needed else None
 
-    def energy_tables(self, height_scale: float, stretched: Stretched | None = None) -> list[EnergyTable]:
+    def energy_tables(
+        self, height_scale: float, stretched: Stretched | None = None, layouts: Sequence[Layout] | None = None
+    ) -> list[EnergyTable]:
         """Return the spectrum's own, or those made for other heights, or for both sides where light passes.
 
-        With a lateral scale they are of the stretched spectrum.
+        With a lateral scale they are of the stretched spectrum, and have the layouts that are given.
         """
         spectrum = stretched or self._spectrum
         if self._eta is not None:
-            return EnergyTable.of_interface(spectrum, self._eta, height_scale)
+            return EnergyTable.of_interface(spectrum, self._eta, height_scale, layouts)
         own = height_scale == 1 and stretched is None
-        return [self._spectrum.energy_table() if own else EnergyTable.of(spectrum, height_scale)]
+        return [self._spectrum.energy_table() if own else EnergyTable.of(spectrum, height_scale, layouts)]
 
-    def corners(self, tables: Sequence[EnergyTable], height_scale: float) -> np.ndarray:
-        """Return e at the corners of the cells of `tables`, not rounded, for other heights."""
-        sides = ((1, tables[0]),) if self._eta is None else ((1, tables[0]), (-1, tables[-1]))
-        furnaces = [(Furnace.of(self._spectrum, height_scale, self._eta, side), table) for side, table in sides]
-        return np.concatenate([corners(furnace, table.layout)[0] for furnace, table in furnaces])
+    def corners(self, table: EnergyTable, height_scale: float) -> np.ndarray:
+        """Return e at the corners of the cells of `table`, not rounded, for other heights."""
+        return corners(Furnace.of(self._spectrum, height_scale), table.layout)[0]
 
 
 def transmitted_shares(spectrum: GratingSpectrum, eta: float) -> NDArray[np.float64]:

@@ -31,7 +31,7 @@ import base64
 import binascii
 import dataclasses
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -108,7 +108,8 @@ class Layout:
         if furnace.index is not None or not (isinstance(grid, OrderGrid) and 1 in grid.shape):
             # As fine as the work allows, which is about the same for all.
             nodes = NODES * float(np.clip(PAIRS / 2 / (furnace.work * NODES), 1, 1 if furnace.index else FINEST))
-            turn = 4 * np.pi * furnace.height_range * (frequencies[1] - frequencies[0])
+            # In the denser medium, as both sides have equally many slices.
+            turn = 4e3 * np.pi * furnace.height_range * (1 / spectrum.wavelengths[0] - 1 / spectrum.wavelengths[1])
             slices = int(np.clip(4 + turn / PHASE, 4, 16) * np.cbrt(nodes / NODES))
             # Of deep surfaces more: but orders that are evaluated by themselves need the time for places within cells.
             per_slice = nodes / (slices if furnace.by_order else min(slices, 8))
@@ -227,30 +228,41 @@ class EnergyTable:
         got.setflags(write=False)
 
     @classmethod
-    def of(cls, spectrum: PowerSpectrum, height_scale: float = 1.0) -> EnergyTable:
-        """Make the table of `spectrum`, with its heights scaled by `height_scale`."""
-        return cls._of_side(spectrum, Furnace.of(spectrum, height_scale))[0]
+    def of(
+        cls, spectrum: PowerSpectrum, height_scale: float = 1.0, layouts: Sequence[Layout] | None = None
+    ) -> EnergyTable:
+        """Make the table of `spectrum`, with its heights scaled by `height_scale`; `layouts` as of `layouts_of`."""
+        furnace = Furnace.of(spectrum, height_scale)
+        return cls._of_side(spectrum, furnace, layouts[0] if layouts else Layout.of(spectrum, furnace))[0]
 
     @classmethod
-    def of_interface(cls, spectrum: PowerSpectrum, index: float, height_scale: float = 1.0) -> list[EnergyTable]:
+    def of_interface(
+        cls,
+        spectrum: PowerSpectrum,
+        index: float,
+        height_scale: float = 1.0,
+        layouts: Sequence[Layout] | None = None,
+    ) -> list[EnergyTable]:
         """Make the tables of an interface: reflected and transmitted light from above, and the same from below.
 
         Args:
             spectrum: it holds wavelengths in the denser medium.
             index: of the medium below relative to that above.
             height_scale: times the heights.
+            layouts: as of `layouts_of`.
         """
         furnaces = [Furnace.of(spectrum, height_scale, index, side) for side in (1, -1)]
-        return [table for furnace in furnaces for table in cls._of_side(spectrum, furnace)]
+        layouts = layouts or layouts_of(spectrum, index, height_scale)
+        pairs = zip(furnaces, layouts, strict=True)
+        return [table for furnace, layout in pairs for table in cls._of_side(spectrum, furnace, layout)]
 
     @classmethod
-    def _of_side(cls, spectrum: PowerSpectrum, furnace: Furnace) -> list[EnergyTable]:
+    def _of_side(cls, spectrum: PowerSpectrum, furnace: Furnace, layout: Layout) -> list[EnergyTable]:
         """Make the tables of one side: e at the corners of cells, lowered where an albedo at random places exceeds one.
 
         Where the furnace is not exact, the albedo of the spectrum itself counts, too: first cells about such places are
         lowered, at last all.
         """
-        layout = Layout.of(spectrum, furnace)
         e = corners(furnace, layout)
         losses = [(0.0, 0.0)] * len(e)
         exact = furnace.by_order and not (furnace.wide or furnace.turning)
@@ -361,6 +373,15 @@ class Stretched:
         """λ/s in nm, from the shortest that the spectrum covers."""
         shortest, longest = self.spectrum.wavelengths
         return shortest, longest / self.least
+
+
+def layouts_of(spectrum: PowerSpectrum, index: float | None, height_scale: float) -> list[Layout]:
+    """Return the layout of the table of a spectrum, or, of an interface, of the tables of both sides.
+
+    Tables of smaller heights and of larger lateral scales can have the same, so that they are read alike.
+    """
+    sides = (1,) if index is None else (1, -1)
+    return [Layout.of(spectrum, Furnace.of(spectrum, height_scale, index, side)) for side in sides]
 
 
 def between(below: EnergyTable, middle: EnergyTable, above: EnergyTable) -> EnergyTable:

@@ -99,7 +99,7 @@ def energy_near(of, at, height_scale):
     """
     tables = shared.SharedTables.of(of)
     of_heights = tables.energy_tables(at)
-    here, there = (tables.corners(of_heights, scale) for scale in (at, height_scale))
+    here, there = (tables.corners(of_heights[0], scale) for scale in (at, height_scale))
     return energy.Energy(of_heights, there - here, mi.Float(1.0))
 
 
