@@ -1,6 +1,7 @@
 """What the tests of the BSDF share: surfaces, directions, interactions."""
 
 import functools
+import itertools
 
 import drjit as dr
 import mitsuba as mi
@@ -9,7 +10,7 @@ import pytest
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction import testing
-from mitsuba_diffraction.rigorous.spectrum import Axes, RigorousSpectrum, Table
+from mitsuba_diffraction.rigorous.spectrum import Axes, RigorousSpectrum
 
 array, direction, floats, vectors = testing.array, testing.direction, testing.floats, testing.vectors
 WAVELENGTHS = (400.0, 500.0, 600.0, 700.0)
@@ -38,15 +39,17 @@ def spectrum(name, coherence_length=65.0):
 
 
 def made_up(coherence_length=65.0):
-    """A table of η that no solver knows, symmetric in P and R, of a grating with many orders; Σ η_m < 1."""
-    axes = Axes(1.7, (0.36, 0.83), 8, 5)
-    values = np.empty((axes.planes, axes.nodes), np.float32)
-    for m in range(-axes.max_order, axes.max_order + 1):
-        side, start = axes.side(m), axes.offset(m)
-        x = np.sin(0.2 * np.arange(side) + m) ** 2
-        square = (1 + np.add.outer(x, x)) * np.linspace(1, 2, axes.planes)[:, None, None] / (60 + 5 * m)
-        values[:, start : start + side**2] = square.reshape(axes.planes, -1)
-    return RigorousSpectrum((Table(axes, values),), "Al", 0j, coherence_length, 0.01, 0, 0, 0, 1, "made up", "")
+    """A table of η that no solver knows, symmetric in k_x of ω_i and −k_x of ω_o, of many orders; Σ η_m < 1."""
+    axes = Axes(1.7, (0.36, 0.83), (8, 10, 4))
+    values = np.empty(axes.shape, np.float32)
+    a = np.sin(np.pi / 2 * np.linspace(0, 1, axes.shape[1])) ** 2 / 2
+    wavelengths = np.linspace(1, 2, axes.shape[3])
+    for (count, _), start in axes.blocks.items():
+        n = [order // 2 if order % 2 == 0 else -(order + 1) // 2 for order in range(count)]
+        for row, (come, leave) in enumerate(itertools.product(n, n)):
+            eta = 1 + np.sin(0.6 * (come + a) + 1) ** 2 + np.sin(1 - 0.6 * (leave + a)) ** 2
+            values[start + row] = np.multiply.outer(eta, wavelengths)[:, None] / (80 + 5 * (come - leave))
+    return RigorousSpectrum(axes, values, None, "Al", 0j, coherence_length, 0.01, 0, 0, 0, 1, "made up", "")
 
 
 def use(variant):

@@ -11,12 +11,12 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..rigorous.efficiencies import MIRRORED, REVERSED
+from ..rigorous.efficiencies import ODD, REVERSED
 from ..rigorous.spectrum import RigorousSpectrum
 from .geometry import Geometry, Incidence
 from .inversion import search, truncated_gaussian
 from .orders import WHOLE
-from .tables import PacketTable, larger, limited, opaque, smaller
+from .tables import NumberTable, PacketTable, larger, limited, opaque, smaller
 from .transmission import Crossing, CrossingIncidence
 
 CELLS = 8  # of the sampler to each unit of P and R
@@ -31,38 +31,43 @@ FLOOR = 0.05  # the share that all orders of a cell have alike, for those that v
 
 @dataclass(eq=False)
 class _Pair:
-    """A pair of directions in the coordinates of `Axes`, and where the table of its way stands.
+    """A pair of directions in the coordinates of `Axes`.
 
     Attributes:
         q_x, q_y: cycles/µm.
         k_y: as of `Axes`, in units of 2π/T.
-        c: as of `Axes`, of the reversed light where `upwards`.
-        g: as of `Axes`.
-        z: Z / (K − 1).
-        reflects: whether light leaves on its own side; None without transmission.
-        upwards: whether it crosses from below.
-        squares: of an interface, the square of g on the side where the table's light comes from and where it leaves.
-        shift: D.
-        longest: the side of order 0.
-        steps: by how much that of the next order is less.
-        max_order: M.
-        before: where order 0 starts.
+        c: as of `Axes`.
+        square: γ².
+        inside: γ'²; zero if Z is the wavelength.
+        z: Z, if it is the wavelength.
+        above: whether light comes from above and whether it leaves there; None without transmission.
     """
 
     q_x: mi.Float
     q_y: mi.Float
     k_y: mi.Float
     c: mi.Float
-    g: mi.Float
+    square: mi.Float
+    inside: mi.Float
     z: mi.Float
-    reflects: mi.Bool | None
-    upwards: mi.Bool | None
-    squares: tuple[mi.Float, mi.Float] | None
-    shift: mi.Float | int
-    longest: mi.Int32 | int
-    steps: mi.Int32 | int
-    max_order: mi.Int32 | int
-    before: mi.Int32 | int
+    above: tuple[mi.Bool, mi.Bool] | None
+
+
+@dataclass(eq=False)
+class _Place:
+    """Where an order of a pair stands in the table.
+
+    Attributes:
+        active: whether it propagates.
+        back: whether the light of the table is reversed.
+        row: of the table.
+        nodes: of F, X and Z: the node before, and how far the order is beyond it.
+    """
+
+    active: mi.Bool
+    back: mi.Bool
+    row: mi.UInt32
+    nodes: list[tuple[mi.UInt32, mi.Float]]
 
 
 class RigorousOrders:
@@ -83,26 +88,16 @@ class RigorousOrders:
         axes = spectrum.axes
         self.axes = axes
         self.count = int(2 * spectrum.cutoff_sigmas * spectrum.lobe_width * axes.period) + 1  # lobes that overlap
-        self.table = PacketTable(_packets(spectrum))
+        self.table = PacketTable(_packets(spectrum.values))
         if mi.is_polarized:
-            self.matrices = PacketTable(np.concatenate([np.moveaxis(t.mueller, 0, 1) for t in spectrum.tables]))
-        self.transmits = len(spectrum.tables) > 1
+            self.matrices = PacketTable(spectrum.mueller)
+        self.transmits = spectrum.transmission != "none"
         self.interface = spectrum.transmission == "interface"
-        all_axes = [table.axes for table in spectrum.tables]
-        starts = itertools.accumulate((a.nodes for a in all_axes), initial=0)
-        # Of each table what `_Pair` has of it.
-        self.layouts = [
-            (a.shift, a.side(0), a.side(0) - a.side(1), a.max_order, start + a.offset(0))
-            for a, start in zip(all_axes, starts, strict=False)
-        ]
-        self.max_order = max(a.max_order for a in all_axes)
-        if self.transmits:
-            self.max_decay, self.excess = opaque(axes.max_decay * (1 - 1e-6)), opaque(axes.index**2 - 1)
-            self.cells = math.gcd(CELLS_BOTH, axes.steps)
-            units = _units(*_shares_of_sides(spectrum, self.cells))
-        else:
-            self.cells = math.gcd(CELLS, axes.steps)
-            units = _units(_shares(spectrum, self.cells))
+        self.max_order = axes.max_order
+        self.starts = NumberTable(axes.starts.astype(np.uint32))
+        self.excess, self.top = opaque(axes.excess), opaque(axes.excess * axes.largest**2)
+        self.cells = CELLS_BOTH if self.transmits else CELLS
+        units = _units(*_shares(spectrum, self.cells))
         self.sampler_planes, self.cells_across = units.shape[-4], units.shape[-2]
         before = np.zeros((*units.shape[:-1], units.shape[-1] + 1))
         before[..., 1:] = units.cumsum(axis=-1)
@@ -149,7 +144,7 @@ class RigorousOrders:
         for step in range(self.count):
             m = first + step
             offset = dr.fma(-self.pitch, mi.Float(m), q_x)
-            there = active & (dr.abs(offset) <= self.half_width) & (dr.abs(m) <= pair.max_order)
+            there = active & (dr.abs(offset) <= self.half_width) & (dr.abs(m) <= self.max_order)
             square = dr.square(offset) + dr.square(q_y)
             lobe = dr.select(there, self.peak * dr.exp(self.falloff * square), 0)
             tangent = mi.Vector2f(mi.Float(m) * self.pitch * incidence.wavelength, 0)
@@ -177,27 +172,15 @@ class RigorousOrders:
         nu = self.period * frequency
         k_y, c = 0.5 * nu * (k_o.y - k_i.y), 0.5 * nu * (k_o.x - k_i.x)
         square = dr.square(nu) - dr.square(k_y)
-        reflects = upwards = squares = None
-        layout = self.layouts[0]
-        if self.interface:
-            g = dr.sqrt(larger(dr.abs(square), 1e-12))
-            g = dr.select(square < 0, -g, g)
-        else:
-            g = dr.sqrt(larger(square, 0))
+        inside, z = mi.Float(0.0), mi.Float(0.0)
         if self.transmits:
-            reflects = above[0] == above[1]
-            layout = [
-                one if one == two == three else dr.select(reflects, dr.select(above[0], one, two), three)
-                for one, two, three in zip(*self.layouts, strict=True)
-            ]
-            upwards = dr.select(reflects, mi.Bool(False), above[1])
-            c = dr.select(upwards, -c, c)
-        if self.interface:
-            inside = dr.fma(self.excess, dr.square(nu), square)
-            own = dr.select(above[0], square, inside)
-            squares = dr.select(reflects, own, square), dr.select(reflects, own, inside)
+            inside = larger(dr.fma(self.excess, dr.square(nu), square), 0)
+        else:
+            z = self._z(dr.sqrt(larger(square, 0)), frequency)
+        if not self.interface:
+            square = larger(square, 0)
         q_x, q_y = -(k_i.x + k_o.x) * frequency, -(k_i.y + k_o.y) * frequency
-        return _Pair(q_x, q_y, k_y, c, g, self._z(g, frequency), reflects, upwards, squares, *layout)
+        return _Pair(q_x, q_y, k_y, c, square, inside, z, above)
 
     def mueller(
         self,
@@ -223,38 +206,31 @@ class RigorousOrders:
             m = first + step
             offset = dr.fma(-self.pitch, mi.Float(m), q_x)
             there = active & (dr.abs(offset) <= self.half_width) & (dr.abs(q_y) <= self.half_width)
-            there &= dr.abs(m) <= pair.max_order
+            there &= dr.abs(m) <= self.max_order
             lobe = dr.select(there, dr.exp(self.falloff * (dr.square(offset) + dr.square(q_y))), 0)
             for row, found in enumerate(self._matrix(m, pair, there)):
                 rows[row] += lobe * found
         bright = rows[0].x > 0
-        if self.transmits:
-            back = [mi.Vector4f(*(float(REVERSED[i] * REVERSED[j]) * rows[j][i] for j in range(4))) for i in range(4)]
-            rows = [dr.select(pair.upwards, other, row) for row, other in zip(rows, back, strict=True)]
-        mirrored, changed = dr.select(pair.k_y < 0, mi.Float(-1), mi.Float(1)), np.not_equal.outer(MIRRORED, MIRRORED)
+        across = pair.k_y / (self.period * frequency)
         scale = dr.rcp(dr.select(bright, rows[0].x, mi.Float(1)))
         return [
-            [
-                dr.select(bright, rows[i][j] * scale * (mirrored if changed[i, j] else 1), mi.Float(i == j))
-                for j in range(4)
-            ]
+            [dr.select(bright, rows[i][j] * scale * (across if ODD[i, j] else 1), mi.Float(i == j)) for j in range(4)]
             for i in range(4)
         ]
 
     def _matrix(self, m: mi.Int32, pair: _Pair, active: mi.Bool) -> list[mi.Vector4f]:
         """The rows of M of order m, linear between the nodes."""
-        active, start, side, places = self._place(m, pair, active)
-        places = [*places, _split(pair.z * (self.axes.planes - 1), mi.UInt32(self.axes.planes))]
+        place = self._place(m, pair, active)
         rows = [mi.Vector4f(0.0) for _ in range(4)]
-        for i, j, k in np.ndindex(2, 2, 2):
-            node = start + (places[0][0] + i) * side + places[1][0] + j
-            weight = mi.Float(1)
-            for (_, share), up in zip(places, (i, j, k), strict=True):
+        for corner in np.ndindex(2, 2, 2):
+            node, weight = place.row, mi.Float(1)
+            for (low, share), up, steps in zip(place.nodes, corner, self.axes.steps, strict=True):
+                node = node * (steps + 1) + low + up
                 weight *= share if up else 1 - share
             for row in range(4):
-                packet = self.matrices(((node * self.axes.planes) + places[2][0] + k) * 4 + row, active)
-                rows[row] += weight * packet
-        return rows
+                rows[row] += weight * self.matrices(node * 4 + row, place.active)
+        back = [mi.Vector4f(*(float(REVERSED[i] * REVERSED[j]) * rows[j][i] for j in range(4))) for i in range(4)]
+        return [dr.select(place.back, other, row) for row, other in zip(rows, back, strict=True)]
 
     def sample(
         self, incidence: Incidence | CrossingIncidence, u: mi.Float, v: mi.Point2f, active: mi.Bool
@@ -275,64 +251,57 @@ class RigorousOrders:
         return mi.Point2f(dr.fma(self.pitch, mi.Float(m), x), y), incidence.propagates(tangent)
 
     def _z(self, g: mi.Float, frequency: mi.Float) -> mi.Float:
-        """Z / (K − 1), from 0 to 1."""
+        """Z of the wavelength, from 0 to 1."""
         most = self.period / larger(g, 1e-6)
-        if self.interface:
-            most = dr.select(g < 0, self.period * self.max_decay / larger(-g, 1e-6), most)
         first, last = smaller(self.shortest, most), smaller(self.longest, most)
         return limited((dr.rcp(frequency) - first) / larger(last - first, 1e-6), 0, 1)
 
-    def _position(self, p: mi.Float) -> mi.Float:
-        """X / s of P ≥ 0."""
-        whole = dr.floor(p)
-        part = p - whole
-        near = smaller(part, 1 - part)
-        # Above zero, where the root has a derivative.
-        root = dr.sqrt(larger(near, 1e-12))
-        value = mi.Float(_ARC_SINE[-1])
-        for coefficient in _ARC_SINE[-2::-1]:
-            value = dr.fma(value, near, coefficient)
-        value *= root
-        return whole + dr.select(part < 0.5, value, 1 - value)
-
     def _efficiency(self, m: mi.Int32, pair: _Pair, active: mi.Bool) -> mi.Float:
-        """η_m(P, R, Z), linear between the nodes; 0 for an order that does not propagate."""
-        active, start, side, ((i, f), (j, h)) = self._place(m, pair, active)
-        k, w = _split(pair.z * (self.axes.planes - 1), mi.UInt32(self.axes.planes))
-        packet = self.table((start + i * side + j) * (self.axes.planes - 1) + k, active)
-        # Along Z the lower and the upper half of each word; then along R, then along P.
+        """η_m, linear between the nodes; 0 for an order that does not propagate."""
+        place = self._place(m, pair, active)
+        (i, f), (j, h), (k, w) = place.nodes
+        _, x_steps, z_steps = self.axes.steps
+        packet = self.table(((place.row * self.axes.steps[0] + i) * x_steps + j) * z_steps + k, place.active)
+        # Along Z the lower and the upper half of each word; then along X, then along F.
         along_z = [dr.lerp(mi.Float(word & 0xFFFF), mi.Float(word >> 16), w) for word in packet]
         found = dr.lerp(dr.lerp(along_z[0], along_z[1], h), dr.lerp(along_z[2], along_z[3], h), f)
-        return dr.select(active, found * (1 / STEPS), 0)
+        return dr.select(place.active, found * (1 / STEPS), 0)
 
-    def _place(
-        self, m: mi.Int32, pair: _Pair, active: mi.Bool
-    ) -> tuple[mi.Bool, mi.UInt32, mi.UInt32, list[tuple[mi.UInt32, mi.Float]]]:
-        """Whether order m propagates, where its nodes start, their side, the nodes along P and R and the rest."""
-        half = 0.5 * mi.Float(dr.abs(m))
-        c, g = pair.c, pair.g
-        if self.interface:
-            k_x, (come, leave) = c + 0.5 * mi.Float(m), pair.squares
-            active = active & (dr.square(k_x) < come) & (dr.square(k_x - mi.Float(m)) < leave)
-            g, c, half = g + pair.shift, dr.select(pair.reflects, c, k_x), dr.select(pair.reflects, half, 0)
-        p, r = g + c - half, g - c - half
-        active = active & (p > 0) & (r > 0)
-        start, side = self._layout(dr.select(active, m, 0), pair)
-        places = [_split(self._position(dr.select(active, x, 0)) * self.axes.steps, side) for x in (p, r)]
-        return active, start, side, places
-
-    def _layout(self, m: mi.Int32, pair: _Pair) -> tuple[mi.UInt32, mi.UInt32]:
-        """Where order m starts in a plane, and its side, as `Axes.offset` and `Axes.side` have them.
-
-        The side of order k is A − s |k|; of the orders 1 … n the squares add up to n A² − A s n (n + 1)
-        + s² n (n + 1)(2n + 1)/6.
-        """
-        steps, longest, n = pair.steps, pair.longest, dr.abs(m)
-        whole = longest * longest
-        before = n * whole - longest * steps * n * (n + 1) + steps * steps * (n * (n + 1) * (2 * n + 1) // 6)
-        side = longest - steps * n
-        start = dr.select(m > 0, pair.before + whole + before - side * side, pair.before - before)
-        return mi.UInt32(start), mi.UInt32(side)
+    def _place(self, m: mi.Int32, pair: _Pair, active: mi.Bool) -> _Place:
+        """The place of order m."""
+        k_x = pair.c + 0.5 * mi.Float(m)
+        whole = dr.round(k_x)
+        n, a = mi.Int32(whole), dr.abs(k_x - whole)
+        back = k_x < whole
+        # Light that comes and that leaves.
+        orders = dr.select(back, m - n, n), dr.select(back, -n, n - m)
+        cell, low, high = _cell_of(pair.square, a)
+        inner, inside = mi.UInt32(0), pair.z
+        if self.transmits:
+            inner, low_inside, high_inside = _cell_of(pair.inside, a)
+            if self.interface:
+                low = dr.select(cell == 0, pair.inside - self.top, low)
+                low_inside = dr.select(inner == 0, pair.square + self.top, low_inside)
+            inside = _arc(limited((pair.inside - low_inside) / larger(high_inside - low_inside, 1e-7), 0, 1))
+        near, far = dr.sqrt(larger(pair.square - low, 1e-12)), dr.sqrt(larger(high - pair.square, 1e-12))
+        places = _arc(2 * a), near / (near + far), inside
+        nodes = [_split(x * steps, steps) for x, steps in zip(places, self.axes.steps, strict=True)]
+        cells, inner_cells = self.axes.starts.shape
+        start = self.starts(dr.minimum(cell, cells - 1) * inner_cells + dr.minimum(inner, inner_cells - 1))
+        active = active & (start < 0x80000000) & (cell < cells) & (inner < inner_cells)
+        count, channels = cell, []
+        if self.transmits:
+            count_below = inner if self.interface else cell
+            count = cell + count_below
+        for number, order in enumerate(orders):
+            place, most, before = mi.UInt32(dr.select(order >= 0, 2 * order, -2 * order - 1)), cell, 0
+            if self.transmits:
+                above = dr.select(back, pair.above[1 - number], pair.above[number])
+                most, before = dr.select(above, cell, count_below), dr.select(above, 0, cell)
+            active &= place < most
+            channels.append(place + before)
+        row = dr.select(active, start + channels[0] * count + channels[1], 0)
+        return _Place(active, back, row, nodes)
 
     def _cell(self, incidence: Incidence | CrossingIncidence) -> mi.Int32:
         """Where order 0 of the sampler's cell stands in its table."""
@@ -341,7 +310,7 @@ class RigorousOrders:
         frequency = incidence.index * incidence.frequency
         g = dr.safe_sqrt(dr.square(self.period * frequency) - dr.square(across))
         p, r = (
-            dr.clip(mi.Int32(self.cells * self._position(larger(x, 0))), 0, self.cells_across - 1)
+            dr.clip(mi.Int32(self.cells * _position(larger(x, 0))), 0, self.cells_across - 1)
             for x in (g - along, g + along)
         )
         if self.transmits:
@@ -355,72 +324,69 @@ class RigorousOrders:
         return ((z * self.cells_across + p) * self.cells_across + r) * width + self.max_order
 
 
-def _split(x: mi.Float, count: mi.UInt32) -> tuple[mi.UInt32, mi.Float]:
+def _split(x: mi.Float, steps: int) -> tuple[mi.UInt32, mi.Float]:
     """The node below x, at most the last but one, and how far x is beyond it."""
-    low = dr.minimum(mi.UInt32(x), count - 2)
+    low = dr.minimum(mi.UInt32(x), steps - 1)
     return low, x - mi.Float(low)
 
 
-def _packets(spectrum: RigorousSpectrum) -> NDArray[np.uint32]:
-    """η_m at the eight nodes about each cell, in steps of 1/65535: (nodes of all tables, K − 1, 4).
+def _arc(share: mi.Float) -> mi.Float:
+    """2/π asin √t, t from 0 to 1."""
+    near = smaller(share, 1 - share)
+    # Above zero, where the root has a derivative.
+    root = dr.sqrt(larger(near, 1e-12))
+    value = mi.Float(_ARC_SINE[-1])
+    for coefficient in _ARC_SINE[-2::-1]:
+        value = dr.fma(value, near, coefficient)
+    value *= root
+    return dr.select(share < 0.5, value, 1 - value)
 
-    Node (i, j, k) has the words of (i, j), (i, j + 1), (i + 1, j), (i + 1, j + 1), each with k in its lower half and
-    k + 1 in its upper one: a single read of 16 bytes for an efficiency. Between the nodes that were solved the table
-    may dip below zero, or exceed one, by its error.
+
+def _position(p: mi.Float) -> mi.Float:
+    """p ≥ 0 in units that are steps of arcs."""
+    whole = dr.floor(p)
+    return whole + _arc(p - whole)
+
+
+def _cell_of(square: mi.Float, a: mi.Float) -> tuple[mi.UInt32, mi.Float, mi.Float]:
+    """The cell of γ², and h² where it begins (but of cell 0) and ends."""
+    root = dr.sqrt(larger(square, 0))
+    whole = dr.floor(root)
+    part = root - whole
+    far = part >= 1 - a
+    within = (part >= a) & (part < 1 - a)
+    middle = whole + dr.select(far, mi.Float(1), dr.select(within, mi.Float(0.5), mi.Float(0)))
+    half = dr.select(within, 0.5 - a, a)
+    return mi.UInt32(2 * middle), dr.square(middle - half), dr.square(middle + half)
+
+
+def _packets(values: NDArray[np.float32]) -> NDArray[np.uint32]:
+    """η at the eight nodes about each cell, in steps of 1/65535: (rows, F, X, Z, 4), one less than nodes of each.
+
+    Cell (i, j, k) has the words of (i, j), (i, j + 1), (i + 1, j), (i + 1, j + 1), each with k in its lower half and
+    k + 1 in its upper one: a single read of 16 bytes for an efficiency.
     """
-    nodes, first = sum(table.axes.nodes for table in spectrum.tables), 0
-    packets = np.empty((nodes, spectrum.axes.planes - 1, 4), np.uint32)
-    for table in spectrum.tables:
-        axes = table.axes
-        for m in axes.orders:
-            square = np.moveaxis(axes.square(table.values, m), 0, -1)
-            side, start = square.shape[0], first + axes.offset(m)
-            steps = np.rint(np.clip(square, 0, 1).astype(np.float64) * STEPS).astype(np.uint32)
-            words = np.pad(steps[..., :-1] | steps[..., 1:] << 16, [(0, 1), (0, 1), (0, 0)], mode="edge")
-            corners = [words[i : side + i, j : side + j] for i, j in np.ndindex(2, 2)]
-            packets[start : start + side**2] = np.stack(corners, axis=-1).reshape(side**2, -1, 4)
-        first += axes.nodes
+    rows, f, x, z = values.shape
+    packets = np.empty((rows, f - 1, x - 1, z - 1, 4), np.uint32)
+    for row in range(rows):
+        steps = np.rint(values[row].astype(np.float64) * STEPS).astype(np.uint32)
+        words = steps[..., :-1] | steps[..., 1:] << 16
+        for corner, (i, j) in enumerate(np.ndindex(2, 2)):
+            packets[row, ..., corner] = words[i : f - 1 + i, j : x - 1 + j]
     return packets
 
 
-def _shares(spectrum: RigorousSpectrum, cells: int) -> NDArray[np.float64]:
-    """η_m averaged over the sampler's cells, (Z, p, r, orders); `cells` of them to each unit.
+def _shares(spectrum: RigorousSpectrum, cells: int) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Return η_m in the sampler's cells, and whether m may propagate, (ways, Z, p, r, orders); `cells` to each unit.
 
-    An order that is evanescent by less than the reach of its lobe has half of what it has where it begins to propagate.
+    The ways are above → above and, where light passes, above → below, below → below, below → above.
     """
     axes = spectrum.axes
-    planes = math.gcd(PLANES, axes.planes - 1)
-    margin = spectrum.cutoff_sigmas * spectrum.lobe_width * axes.period
-    whole = axes.units(0) * cells
-    ends = -np.arange(whole)  # of the cells below P = 0
-    ends = ends // cells + np.sin(np.pi / 2 * (ends % cells) / cells) ** 2
-    beyond = int((ends > -margin).sum())
-    shares = np.zeros((planes, whole, whole, 2 * axes.max_order + 1))
-    for column, m in enumerate(axes.orders):
-        units = axes.units(m) * cells
-        average = _averaged(_averaged(_averaged(axes.square(spectrum.values, m), 0, planes), 1, units), 2, units)
-        padded = np.pad(average, [(0, 0), (beyond, 0), (beyond, 0)], mode="edge")
-        padded[:, :beyond] *= 0.5
-        padded[:, :, :beyond] *= 0.5
-        start = [max(m, 0) * cells - beyond, max(-m, 0) * cells - beyond]
-        from_ = [max(s, 0) for s in start]
-        to = [s + beyond + units for s in start]
-        shares[:, from_[0] : to[0], from_[1] : to[1], column] = padded[:, from_[0] - start[0] :, from_[1] - start[1] :]
-    return shares
-
-
-def _shares_of_sides(spectrum: RigorousSpectrum, cells: int) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Return η_m in the cells of light that passes, and whether m may propagate, (4 ways, Z, p, r, orders).
-
-    The ways are above → above, above → below, below → below, below → above.
-    """
-    axes = spectrum.axes
-    planes = math.gcd(PLANES, axes.planes - 1)
-    nu = axes.period / axes.wavelengths[0]
-    max_order = max(table.axes.max_order for table in spectrum.tables)
+    nu, max_order = axes.largest, axes.max_order
+    ways = [(0, 0)] if spectrum.transmission == "none" else [(0, 0), (0, 1), (1, 1), (1, 0)]
     m = np.arange(-max_order, max_order + 1)
     across = int(np.ceil(2 * max(spectrum.indices) * nu)) * cells
-    shares = np.zeros((4, planes, across, across, len(m)))
+    shares = np.zeros((len(ways), PLANES, across, across, len(m)))
     possible = np.zeros(shares.shape, bool)
     ends = np.arange(across + 1)
     ends = ends // cells + np.sin(np.pi / 2 * (ends % cells) / cells) ** 2
@@ -432,14 +398,14 @@ def _shares_of_sides(spectrum: RigorousSpectrum, cells: int) -> tuple[NDArray[np
         first, last = (np.minimum(w, n * axes.period / np.maximum(g, 1e-9)) for w in axes.wavelengths)
         return first + share * (last - first)
 
-    for way, (side, to) in enumerate(((0, 0), (0, 1), (1, 1), (1, 0))):
+    for way, (side, to) in enumerate(ways):
         n_i, n_o = (spectrum.indices[s] for s in (side, to))
         # The cells that some light has.
         p, r = np.nonzero(np.add.outer(ends[:-1], ends[:-1]) < 2 * n_i * nu)
-        z, p, r = np.repeat(np.arange(planes), len(p)), np.tile(p, planes), np.tile(r, planes)
+        z, p, r = np.repeat(np.arange(PLANES), len(p)), np.tile(p, PLANES), np.tile(r, PLANES)
         g_most = np.minimum((ends[p + 1] + ends[r + 1]) / 2, n_i * nu)
-        shortest = wavelengths(g_most, n_i, z / planes)
-        longest = wavelengths((ends[p] + ends[r]) / 2, n_i, (z + 1) / planes)
+        shortest = wavelengths(g_most, n_i, z / PLANES)
+        longest = wavelengths((ends[p] + ends[r]) / 2, n_i, (z + 1) / PLANES)
         change = (n_o**2 - n_i**2) * (axes.period / (shortest if n_o > n_i else longest)) ** 2
         g_out = np.sqrt(np.maximum(g_most**2 + change, 0))
         low, high = (ends[p] - ends[r + 1]) / 2, (ends[p + 1] - ends[r]) / 2
@@ -450,7 +416,7 @@ def _shares_of_sides(spectrum: RigorousSpectrum, cells: int) -> tuple[NDArray[np
         for t, u, v in _POINTS:
             x, y = placed(u)[p], placed(v)[r]
             g, alpha = (x + y) / 2, (x - y) / 2
-            wavelength = wavelengths(g, n_i, (z + t) / planes)
+            wavelength = wavelengths(g, n_i, (z + t) / PLANES)
             square = g**2 - (n_i**2 - 1) * (axes.period / wavelength) ** 2
             g = np.sign(square) * np.sqrt(np.abs(square))
             eta = spectrum.evaluate(of_order, alpha[cell] - of_order / 2, g[cell], wavelength[cell], (side, to))
@@ -460,21 +426,12 @@ def _shares_of_sides(spectrum: RigorousSpectrum, cells: int) -> tuple[NDArray[np
     return shares, possible
 
 
-def _averaged(values: NDArray, axis: int, cells: int) -> NDArray[np.float64]:
-    """The mean over each of so many cells along one axis, of what is linear between the nodes."""
-    values = np.moveaxis(np.asarray(values, np.float64), axis, 0)
-    middle = (values[1:] + values[:-1]) / 2
-    return np.moveaxis(middle.reshape(cells, -1, *middle.shape[1:]).mean(axis=1), 0, axis)
-
-
-def _units(shares: NDArray[np.float64], possible: NDArray[np.bool_] | None = None) -> NDArray[np.int64]:
+def _units(shares: NDArray[np.float64], possible: NDArray[np.bool_]) -> NDArray[np.int64]:
     """P_m of every cell in units of 2⁻²⁴, 2²⁴ together, so that sums in float32 are exact.
 
-    Orders have a floor where they are `possible`: where their share is not zero, unless it is given.
+    Orders have a floor where they are `possible`.
     """
     mirror = shares.shape[-1] // 2
-    shares = np.maximum(shares, 0)  # interpolation may dip below
-    possible = shares > 0 if possible is None else possible
     possible[..., mirror] = True  # order 0 propagates always
     shares = shares / np.maximum(shares.sum(axis=-1, keepdims=True), 1e-30)
     shares = (1 - FLOOR) * shares + FLOOR * possible / possible.sum(axis=-1, keepdims=True)

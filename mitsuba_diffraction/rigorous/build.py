@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import itertools
 import os
 import time
 import warnings
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
@@ -22,37 +24,38 @@ from ..files import whole_file
 from ..progress import Progress, silent
 from ..settings import Settings
 from ..surface.heightfield import HeightField
-from .coordinate_transformation import ABOVE, BELOW, Curve, Grating, Scattered, curve_of, half_space, scatter
-from .efficiencies import REVERSED, converge, matrices_of, one_thread, solve, through_sheet, wave_numbers
+from .coordinate_transformation import ABOVE, BELOW, Curve, Grating, HalfSpace, Scattered, curve_of, half_space, scatter
+from .efficiencies import ODD, converge, matrices_of, one_thread, solve, through_sheet, unpolarised, wave_numbers
 from .materials import refractive_index
-from .spectrum import LARGEST_PERIOD, STORED, Axes, RigorousSpectrum, Table, axes_of
+from .spectrum import LARGEST_PERIOD, Axes, RigorousSpectrum, edges_of, rank, shares_at
 
 Real = NDArray[np.float64]
-# The part of a unit and the units of p + r → M of that light, as `_Build._job` has it.
-_Lattice = dict[tuple[int, int], NDArray[np.float32]]
 # n of the orders in and out, and their matrices, (orders out, orders in, 4, 4).
 _Orders = tuple[NDArray[np.int64], NDArray[np.int64], Real]
 # α, g, λ, whether an order is near its Rayleigh anomaly, and (from, to) → m and M_ij of the orders, (n, 4, 4).
 _Checked = tuple[float, float, float, bool, dict[tuple[int, int], tuple[NDArray[np.int64], Real]]]
 
-# Steps to a unit that are solved, one after the other until the error is kept; each twice those before, which it holds.
-_SOLVED = (8, 16, 32)
-# Of an interface, whose light from below is less smooth. 600 lines/mm in glass have a mean error of 0.0106 with eight.
-_SOLVED_BOTH = (10, 20, 40)
+# Steps of F, X and (with transmission) Z that are solved, one after the other until the error is kept. Most along X, on
+# which depends by how much light that grazes the surface enters it.
+_SOLVED = ((6, 10, 6), (9, 15, 9), (12, 20, 12))
+# Steps that are stored to each of these, by cubic polynomials: linear look-ups need more nodes.
+_STORED = 2
 PLANES = 17
 # Wavelengths that are solved, by the least g λ / T (the cosine of the cone angle) of these: metals in light along the
 # grooves show narrow lines that move with the wavelength.
 _CONES = ((0.45, 17), (0.7, 9), (1.0, 5))
 # η is stored in steps of this: files are half as large.
 _ROUNDED = 2.0**-16
-# An order at exactly grazing exit has no Rayleigh wave.
-_OFF = 1e-8
+# An order at exactly grazing exit has no Rayleigh wave. sin² at the first and the last node.
+_OFF = 1e-12
+_STILL = 1e-8  # γ²
+_LEAST_K_Y = 1e-4  # matrices are divided by k_y
 _NEAR = 0.02
 _CHECKS = 200
 _SECONDS = 20.0  # between checkpoints, each of which is written whole
 # Light at which the harmonics are chosen: near the normal, and oblique from both sides.
 _HARD = ((0.1, 0, 1), (0.8, 0.3, 0.5), (-0.8, 0.3, 0.5))
-BUILD_VERSION = 5  # raised when tables of equal requests change
+BUILD_VERSION = 6  # raised when tables of equal requests change
 MATRICES = 3.0
 """Bound of `polarisation_error`, in tolerances: matrices vary faster than η."""
 
@@ -90,19 +93,18 @@ def build_spectrum(
     with one_thread():
         surface = _Surface(height_field, settings, tolerance)
         checks = surface.checks()
-        error, done, lattice = np.inf, 0, {}
-        steps = _SOLVED_BOTH if settings.transmission == "interface" else _SOLVED
-        for solved in steps:
-            # Twice the steps cost four times as much and leave an eighth of the error: which table will be the last?
-            begin, done = done, 95 if error <= 8 * tolerance or solved == steps[-1] else done + 20
-            axes = Axes(surface.period, surface.wavelengths, STORED * solved, PLANES)
-            build = _Build(surface, axes, solved, settings.polarised, lattice)
-            tables, lattice = build.tables(
+        error, done = np.inf, 0
+        for solved in _SOLVED:
+            # Half as many steps again leave less than half of the error: which table will be the last?
+            begin, done = done, 95 if error <= 2 * tolerance or solved == _SOLVED[-1] else done + 20
+            build = _Build(surface, solved, settings.polarised)
+            values, mueller = build.table(
                 lambda row, rows, a=begin, b=done: progress(a + (b - a) * row // rows, 100), checkpoints
             )
             spectrum = RigorousSpectrum(
-                tables=tables,
-                transmission=settings.transmission,
+                axes=build.axes,
+                values=values,
+                mueller=mueller,
                 material=settings.material or "",
                 int_ior=complex(settings.int_ior or 0),
                 ext_ior=float(settings.ext_ior),
@@ -125,7 +127,7 @@ def build_spectrum(
         got += f" and {spectrum.polarisation_error:.2g} of the Mueller matrices"
         wanted += f" and {MATRICES * tolerance:.2g}"
     warnings.warn(
-        f"rigorous table: got a mean error of {got} with {steps[-1]} steps to a unit, wanted at most {wanted}",
+        f"rigorous table: got a mean error of {got} with {max(_SOLVED[-1])} steps to a cell, wanted at most {wanted}",
         stacklevel=4,
     )
     return spectrum
@@ -176,42 +178,60 @@ class _Surface:
             count = int(np.ceil(1.1 * count))
         return count
 
-    def solve(self, alpha: float, g: float, wavelengths: Iterable[float], finer: int = 0) -> list[Scattered]:
-        """Solve for light of all orders from either side, at each wavelength; α of order 0 and g times period/2π.
+    def light(self, square: float, wavelength: float) -> tuple[float, complex]:
+        """Return ν² and γ'² of light of γ²."""
+        nu2, index = (self.period / wavelength) ** 2, self.index(wavelength)
+        return nu2, square + nu2 * ((index.real**2 if index.imag == 0 else index**2) - 1)
+
+    def solve(
+        self,
+        alpha: float,
+        square: float,
+        lights: Iterable[tuple[float, complex]],
+        finer: int = 0,
+        fields: Callable[[Grating, float, complex, bool], HalfSpace] | None = None,
+    ) -> list[Scattered]:
+        """Solve for light of all orders from either side, for each (ν², γ'²); α of order 0 and γ² in (2π/T)².
 
         The harmonics, those of `gratings[finer]`, are raised where R + T is not one within the tolerance, or where R is
-        above one if the material absorbs. g is that above, signed as in `Axes`.
+        above one if the material absorbs. `fields` is `fields_of`, or what remembers its results.
         """
-        wavelengths, square = list(wavelengths), g * abs(g)
+        lights, fields = list(lights), fields or fields_of
         for grating in self.gratings[finer:]:
-            alphas, found, excess = alpha + grating.n, [], 0.0
-            above = half_space(grating, alphas, square, True)
-            for wavelength in wavelengths:
-                k_0, index = self.period / wavelength, self.index(wavelength)
-                k_y = np.sqrt(max(k_0**2 - square, 0))
-                gamma2 = square + k_0**2 * ((index.real**2 if index.imag == 0 else index**2) - 1)
-                solved = scatter(alphas, above, half_space(grating, alphas, gamma2, False), k_y, index)
+            found, excess = [], 0.0
+            above = fields(grating, alpha, square, True)
+            for nu2, inside in lights:
+                index = self.index(self.period / np.sqrt(nu2))
+                k_y = np.emath.sqrt(nu2 - square)
+                k_y = k_y if abs(k_y) > _LEAST_K_Y else _LEAST_K_Y
+                solved = scatter(alpha + grating.n, above, fields(grating, alpha, inside, False), k_y, index)
                 for of_light in solved.amplitudes:
-                    beyond = np.asarray(sum((np.abs(a) ** 2).sum(axis=(0, 1)) for a in of_light)) - 1
+                    beyond = np.asarray(sum(solved.powers(a).sum(axis=(0, 1)) for a in of_light)) - 1
                     excess = max(excess, np.max(np.abs(beyond) if index.imag == 0 else beyond, initial=0))
                 found.append(solved)
             if excess <= self.tolerance:
                 return found
+        shortest, longest = (1e3 * self.period / np.sqrt(end(nu2 for nu2, _ in lights)) for end in (max, min))
         raise RequestError(
             f"height field: got an excess of {excess:.2g} of the incident light with {grating.harmonics} harmonics at "
-            f"{1e3 * wavelengths[0]:.4g} to {1e3 * wavelengths[-1]:.4g} nm, wanted at most {self.tolerance:.2g}; "
-            "it is too deep for its period with theory=rigorous"
+            f"{shortest:.4g} to {longest:.4g} nm, wanted at most {self.tolerance:.2g}; it is too deep for its period "
+            "with theory=rigorous"
         )
 
-    def matrices(self, solved: Scattered) -> dict[tuple[int, int], _Orders]:
-        """Return (from, to) → n of the orders in and of those out, and M_ij, (orders out, orders in, 4, 4)."""
+    def matrices(self, solved: Scattered, entries: int = 4) -> dict[tuple[int, int], _Orders]:
+        """Return (from, to) → n of the orders in and of those out, and M_ij, (orders out, orders in, entries, entries).
+
+        With one entry it is η. Where k_y is imaginary, elements that are odd in k_y are so, too.
+        """
+        orders = solved.orders
         if self.transmission == "sheet":
-            of_air = solved.orders[ABOVE], solved.orders[ABOVE]
+            orders = orders[ABOVE], orders[ABOVE]
             found = through_sheet(solved, self.index(self.wavelengths[0]).real)
-            return {way: (*of_air, matrices) for way, matrices in found.items()}
-        sides = (ABOVE,) if self.transmission == "none" else (ABOVE, BELOW)
-        ways = itertools.product(sides, sides)
-        return {(i, o): (solved.orders[i], solved.orders[o], matrices_of(solved, i, o)) for i, o in ways}
+        else:
+            sides = (ABOVE,) if self.transmission == "none" else (ABOVE, BELOW)
+            of_way = unpolarised if entries == 1 else matrices_of
+            found = {(i, o): of_way(solved, i, o) for i, o in itertools.product(sides, sides)}
+        return {(i, o): (orders[i], orders[o], m[..., :entries, :entries]) for (i, o), m in found.items()}
 
     def checks(self) -> list[_Checked]:
         """Return light at random places, directions uniform over the hemispheres, wavelengths over the range."""
@@ -225,9 +245,10 @@ class _Surface:
             k = np.sqrt(1 - cosine**2) * n * nu
             alpha, k_y = k * np.cos(2 * np.pi * turn), k * np.sin(2 * np.pi * turn)
             g = np.sign(nu - abs(k_y)) * np.sqrt(abs(nu**2 - k_y**2))
-            (solved,) = self.solve(alpha, g, [wavelength], finer=1)
+            square = g * abs(g)
+            (solved,) = self.solve(alpha, square, [self.light(square, wavelength)], finer=1)
             orders = {
-                way: (-of_out, matrices[:, of_in == 0][:, 0])
+                way: (-of_out, matrices[:, of_in == 0][:, 0].real)
                 for way, (of_in, of_out, matrices) in self.matrices(solved).items()
                 if way[0] == side
             }
@@ -260,149 +281,138 @@ def _errors(spectrum: RigorousSpectrum, checks: list[_Checked]) -> dict[str, flo
 
 
 class _Build:
-    """A lattice of light to be solved, and the way from there to the nodes of `Axes`.
+    """The nodes of `Axes`, of which every so many are solved, all orders of light from both sides together.
 
-    Light from (p, r) = (g + α, g − α) has order m at P = p − max(m, 0), R = r + min(m, 0): whole units away, so that
-    one lattice serves all orders. And lights whose p and r differ by whole units, p + r being equal, are orders of each
-    other: they are solved together, from both sides. Reversed light has p and r exchanged, so that half of the lattice
-    is solved: r less its units at most p less its units.
+    Fields above depend on a and γ alone, those below on a and γ': each is the solution of one eigenproblem, and most of
+    the time goes there. With transmission a lattice of γ and one of γ' serve all of their pairs.
     """
 
-    def __init__(self, surface: _Surface, axes: Axes, steps: int, polarised: bool, coarser: _Lattice) -> None:
-        self.surface, self.steps, self.coarser = surface, steps, coarser
+    def __init__(self, surface: _Surface, steps: tuple[int, int, int], polarised: bool) -> None:
+        self.surface, self.steps = surface, steps
         self.entries = 4 if polarised else 1  # rows and columns of the matrices that are kept
-        self.axes = axes_of(axes, surface.transmission, surface.index(surface.wavelengths[0]).real)
-        self.local = surface.transmission == "interface"
-        self.parts = np.sin(np.pi / 2 * np.arange(steps) / steps) ** 2
-        self.parts[0] = _OFF
-        # Of light that crosses, also what is solved from below, as reversed light.
-        self.solved = [(axes, axes.way) for axes in self.axes] + [(axes, (BELOW, ABOVE)) for axes in self.axes[2:]]
-        # Where the orders of each begin among all of a job.
-        self.first = np.cumsum([0, *(len(axes.orders) for axes, _ in self.solved)])
-        self.signs = np.outer(REVERSED, REVERSED)[: self.entries, : self.entries]
-        # p less its whole units, and the units of p + r; below zero no light travels above.
-        below = int(np.ceil(2 * self.axes[0].max_decay * axes.period / axes.wavelengths[0])) + 1 if self.local else 0
-        self.shift = max(axes.shift for axes in self.axes)
-        units = range(-below, axes.units(0) + 2)
-        self.jobs = [(part, unit) for part in reversed(range(steps)) for unit in units]  # the longest first
+        self.passes = surface.transmission != "none"
+        f, x, z = (_STORED * count for count in steps)
+        index = surface.index(surface.wavelengths[0]).real if self.passes else 0.0
+        self.axes = Axes(
+            surface.period, surface.wavelengths, (f, x, z if self.passes else PLANES - 1), index, surface.transmission
+        )
+        self.shares = [np.clip(shares, _OFF, 1 - _OFF) for shares in shares_at(steps)]
+        self.jobs = [(share, cells) for share in self.shares[0] / 2 for cells in self.axes.blocks]
+        self.fields = None
+        if self.passes:
+            # Those of two a: one thread may be ahead.
+            self.fields = functools.lru_cache(maxsize=2 * int(np.dot(self.axes.starts.shape, steps[1:])))(fields_of)
 
-    def tables(self, progress: Progress, checkpoints: Path | None) -> tuple[tuple[Table, ...], _Lattice]:
-        """Return those of `RigorousSpectrum`, and the lattice, a quarter of that of twice the steps."""
-        done = _Checkpoint(checkpoints, f"{self.surface.digest}-{self.steps}")
+    def table(self, progress: Progress, checkpoints: Path | None) -> tuple[NDArray[np.float32], Any]:
+        """Return `values` and `mueller` of `RigorousSpectrum`."""
+        done = _Checkpoint(checkpoints, f"{self.surface.digest}-{max(self.steps)}")
         left = [job for job in range(len(self.jobs)) if job not in done.done]
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             try:
-                for job, solved in zip(left, pool.map(self._job, left), strict=True):
+                for job, solved in zip(left, pool.map(self._job if self.passes else self._planes, left), strict=True):
                     done.add(job, solved)
                     progress(len(done.done), len(self.jobs))
             except BaseException:
                 pool.shutdown(cancel_futures=True)
                 done.write()
                 raise
-        tables = [self._stored(table, done.done) for table in range(len(self.axes))]
+        stored = self._stored(done.done)
         done.remove()
-        return tuple(tables), {self.jobs[job]: solved for job, solved in done.done.items()}
+        return stored
 
     def _job(self, job: int) -> NDArray[np.float32]:
-        """Return M: (r less its units, orders of all tables, units of p + D, K, i, j); NaN where there is no light.
+        """Return M at one a in one block: (orders in, orders out, X, Z, i, j); 0 where there is no light."""
+        a, (cell, inside) = self.jobs[job]
+        axes, surface = self.axes, self.surface
+        counts, top = axes.counts(cell, inside), axes.excess * axes.largest**2
+        nodes = [len(shares) for shares in self.shares[1:]]
+        found = np.zeros((sum(counts), sum(counts), *nodes, self.entries, self.entries))
+        # Where a cell is but a point its nodes are one.
+        known: dict[tuple[float, float], NDArray] = {}
+        for (x, of_x), (z, of_z) in itertools.product(*(enumerate(shares) for shares in self.shares[1:])):
+            if cell:
+                square = _inside(cell, a, of_x, 0.0)
+                below = _inside(inside, a, of_z, square + top)
+            else:
+                below = _inside(inside, a, of_z, 0.0)
+                square = _inside(cell, a, of_x, below - top)
+            nu2 = (below - square) / axes.excess
+            # Beyond the light that there is, as far as polynomials reach.
+            if nu2 < max((axes.period / axes.wavelengths[1]) ** 2, square) / 4:
+                continue
+            key = square, below
+            if key not in known:
+                (solved,) = surface.solve(a, square, [(nu2, below)], fields=self.fields)
+                known[key] = self._matrices(solved, counts)
+            found[:, :, x, z] = known[key]
+        return found.astype(np.float32)
 
-        Of reversed light: (p less its units, …).
-        """
-        part, units = self.jobs[job]
-        axes, entries, shift = self.axes[0], self.entries, self.shift
-        nu = axes.period / axes.wavelengths[0]
-        shape = self.first[-1], max(units + 2 * shift + 1, 0)
-        found = np.full((part + 1, *shape, axes.planes, entries, entries), np.nan, np.float32)
-        middle = (units + 1) // 2
-        known = self.coarser.get((part // 2, units)) if part % 2 == 0 else None
-        for other in range(part + 1):
-            if known is not None and other % 2 == 0:
-                found[other] = known[other // 2]
+    def _planes(self, job: int) -> NDArray[np.float32]:
+        """Return what `_job` does, Z being the wavelength."""
+        a, (cell, _) = self.jobs[job]
+        axes, surface, planes = self.axes, self.surface, []
+        squares = [_inside(cell, a, of_x, 0.0) for of_x in self.shares[1]]
+        for square, before in zip(squares, [None, *squares], strict=False):
+            if square == before:
+                planes.append(planes[-1])
                 continue
-            # A node at the end of a unit belongs to that unit. The units that the table reaches are solved whole, for
-            # polynomials across them.
-            if not units - (part == 0) - (other == 0) < axes.units(0):
-                continue
-            p, r = self.parts[part] + middle, self.parts[other] + units - middle
-            g = (p + r) / 2
-            if g < 1e-4:
-                if not self.local or g < -axes.max_decay * nu - 1:
-                    continue
-                g = min(g, -1e-4)  # fields that neither travel nor decay have no admittance
+            g = np.sqrt(square)
             shortest, longest = axes.range(g)
             count = 1
             if longest > shortest:
-                count = next((count for limit, count in _CONES if abs(g) < limit * nu), _CONES[-1][1])
-            at, weights = _nodes(count, axes.planes, self.local)
-            wavelengths = shortest + at * (longest - shortest)
-            nodes = np.full((count, *shape, entries, entries), np.nan)
-            if self.local:
-                nodes[:] = 0
-                nodes[:, self.first[0] + self.axes[0].max_order] = nodes[:, self.first[1] + self.axes[1].max_order] = (
-                    np.eye(entries)
-                )
-            for node, solved in enumerate(self.surface.solve((p - r) / 2, g, wavelengths)):
-                ways = self.surface.matrices(solved)
-                for (table, way), start in zip(self.solved, self.first[:-1], strict=True):
-                    of_in, of_out, matrices = ways[way]
-                    m, matrices = of_in - of_out[:, None], matrices[..., :entries, :entries]
-                    unit = np.broadcast_to(of_in + middle + shift, m.shape)
-                    if way != table.way:
-                        unit = np.broadcast_to(units - middle - of_out[:, None] + shift, m.shape)
-                        matrices = self.signs * matrices.swapaxes(-1, -2)
-                    kept = (np.abs(m) <= table.max_order) & (unit >= 0) & (unit < shape[1])
-                    nodes[node, start + table.max_order + m[kept], unit[kept]] = matrices[kept]
-            found[other] = np.einsum("kw,wmu...->muk...", weights, nodes)
+                count = next((count for limit, count in _CONES if g < limit * axes.largest), _CONES[-1][1])
+            at, weights = _nodes(count, PLANES)
+            lights = [surface.light(square, wavelength) for wavelength in shortest + at * (longest - shortest)]
+            solved = [self._matrices(light, axes.counts(cell, 0)) for light in surface.solve(a, square, lights)]
+            planes.append(np.einsum("kw,wnm...->nmk...", weights, solved))
+        return np.stack(planes, axis=2).astype(np.float32)
+
+    def _matrices(self, solved: Scattered, counts: tuple[int, int]) -> Real:
+        """Return M, odd elements per k_y/ν, (orders in, orders out, i, j), in the order of the rows of `Axes`."""
+        found = np.zeros((sum(counts),) * 2 + (self.entries,) * 2)
+        for (from_, to), (of_in, of_out, matrices) in self.surface.matrices(solved, self.entries).items():
+            if self.entries > 1:
+                matrices = matrices / np.where(ODD, solved.k_y / solved.k_0, 1)
+            of_in, of_out = rank(of_in), rank(of_out)
+            came, left = of_in < counts[from_], of_out < counts[to]
+            rows, columns = of_in[came] + from_ * counts[0], of_out[left] + to * counts[0]
+            found[np.ix_(rows, columns)] = matrices[np.ix_(left, came)].swapaxes(0, 1).real
         return found
 
-    def _stored(self, table: int, done: dict[int, NDArray[np.float32]]) -> Table:
-        """Return what was solved at the nodes that are stored; the other half of the lattice is reversed light."""
-        axes, lattice, steps, entries = self.axes[table], self.axes[table].solved, self.steps, self.entries
-        matrices = np.zeros((axes.planes, axes.nodes, entries, entries), np.float32)
-        count, reflected = lattice.side(0), axes.way[0] == axes.way[1]
-        for m in axes.orders:
-            side, start = lattice.side(m), axes.offset(m)
-            of_light = np.full((count + steps, count + steps, axes.planes, entries, entries), np.nan, np.float32)
-            for job, solved in done.items():
-                part, units = self.jobs[job]
-                for unit in range(units + 2 * axes.shift + 1):
-                    p, r = unit * steps, (units + 2 * axes.shift - unit) * steps
-                    if p < count and r < count:
-                        of_unit = solved[:, :, unit + self.shift - axes.shift]
-                        if not reflected:
-                            of_light[p : p + part + 1, r + part] = of_unit[:, self.first[3] + m + axes.max_order]
-                        of_light[p + part, r : r + part + 1] = of_unit[:, self.first[table] + m + axes.max_order]
-            p, r = (less * steps for less in axes.least(m))
-            found = of_light[p : p + side, r : r + side].astype(float)
-            if not axes.shift:
-                # At grazing exit or incidence all is mirrored.
-                found[0], found[:, 0] = (float(m == 0 and reflected) * np.eye(entries),) * 2
-            if reflected:
-                # Where p and r have the same fraction, both were solved.
-                back = self.signs * found.transpose(1, 0, 2, 4, 3)
-                found = np.where(np.isnan(found), back, np.where(np.isnan(back), found, (found + back) / 2))
-            found = np.nan_to_num(found)  # units that light does not reach
-            refine = _cubic(axes.units(m), steps, axes.steps)
-            block = np.einsum("ai,bj,ijkxy->kabxy", refine, refine, found, optimize=True)
-            matrices[:, start : start + axes.side(m) ** 2] = block.reshape(axes.planes, -1, entries, entries)
-        # Beside a kink the polynomials overshoot.
-        eta = matrices[..., :1, :1]
-        matrices *= np.divide(np.clip(eta, 0, 1), eta, out=np.zeros_like(eta), where=eta != 0)
-        matrices = np.round(matrices / _ROUNDED) * np.float32(_ROUNDED)
-        values = np.ascontiguousarray(matrices[..., 0, 0])
-        return Table(axes, values, matrices if entries == 4 else None)
+    def _stored(self, done: dict[int, NDArray[np.float32]]) -> tuple[NDArray[np.float32], Any]:
+        """Return what was solved at the nodes that are stored."""
+        axes, entries, blocks = self.axes, self.entries, len(self.axes.blocks)
+        matrices = np.empty((*axes.shape, entries, entries), np.float32)
+        f, x, z = self.steps
+        refine = _cubic(f), _cubic(x), _cubic(z) if self.passes else np.eye(PLANES)
+        for block, row in enumerate(axes.blocks.values()):
+            solved = np.stack([done[job] for job in range(block, len(self.jobs), blocks)])
+            found = np.einsum("ax,by,cz,xnmyz...->nmabc...", *refine, solved, optimize=True)
+            # Beside a kink the polynomials overshoot.
+            eta = found[..., :1, :1]
+            found *= np.divide(np.clip(eta, 0, 1), eta, out=np.zeros_like(eta), where=eta != 0)
+            count = found.shape[0] ** 2
+            matrices[row : row + count] = (np.round(found / _ROUNDED) * _ROUNDED).reshape(count, *matrices.shape[1:])
+        return np.ascontiguousarray(matrices[..., 0, 0]), matrices if entries == 4 else None
 
 
-def _nodes(count: int, planes: int, local: bool) -> tuple[Real, Real]:
-    """Return points in 0 … 1, (count,), and the weights (planes, count) of their values at equal steps.
+def fields_of(grating: Grating, alpha: float, gamma2: complex, upwards: bool) -> HalfSpace:
+    """Return `half_space` for α of order 0."""
+    return half_space(grating, alpha + grating.n, gamma2, upwards)
 
-    Chebyshev–Lobatto points; or, if local, points at equal steps and cubic polynomials of four neighbours: kinks stay
-    where they are.
-    """
+
+def _inside(cell: int, a: float, share: float, least: float) -> float:
+    """Return γ² in a cell; the same for all shares if it is but a point."""
+    low, high = (float(x) for x in edges_of(cell, a, least))
+    square = low + (high - low) * (share if high - low > 1e-6 else 0.5)
+    # Fields that neither travel nor decay have no admittance.
+    return square if abs(square) > _STILL else _STILL if cell else -_STILL
+
+
+def _nodes(count: int, planes: int) -> tuple[Real, Real]:
+    """Return Chebyshev–Lobatto points in 0 … 1, (count,), and the weights (planes, count) of values at equal steps."""
     if count == 1:
         return np.zeros(1), np.ones((planes, 1))
-    if local:
-        return np.linspace(0, 1, count), _cubic(1, count - 1, planes - 1)
     at = (1 - np.cos(np.pi * np.arange(count) / (count - 1))) / 2
     return at, _lagrange(np.linspace(0, 1, planes), at)
 
@@ -416,16 +426,12 @@ def _lagrange(x: Real, nodes: Real) -> Real:
     return ratio
 
 
-def _cubic(units: int, steps: int, finer: int) -> Real:
-    """Return (finer nodes, nodes): cubic interpolation between nodes, of each unit by its own."""
-    matrix = np.zeros((units * finer + 1, units * steps + 1))
-    for unit in range(units):
-        for fine in range(finer + 1):
-            x = fine * steps / finer
-            low = int(np.clip(np.floor(x) - 1, 0, steps - 3))
-            row = matrix[unit * finer + fine]
-            row[:] = 0
-            row[unit * steps + low : unit * steps + low + 4] = _lagrange(np.array([x]), np.arange(low, low + 4.0))[0]
+def _cubic(steps: int) -> Real:
+    """Return (nodes stored, nodes solved): cubic interpolation between four neighbours."""
+    matrix = np.zeros((_STORED * steps + 1, steps + 1))
+    for fine, row in enumerate(matrix):
+        low = int(np.clip(fine // _STORED - 1, 0, steps - 3))
+        row[low : low + 4] = _lagrange(np.array([fine / _STORED]), np.arange(low, low + 4.0))[0]
     return matrix
 
 

@@ -213,7 +213,7 @@ class HalfSpace:
         square: γ².
         orders: that propagate, (p,); none in an absorbing medium.
         beta: β_m of these, positive, (p,).
-        factors: LU of the matrix whose columns are ψ of the outgoing fields, (n, n); the first p are Rayleigh waves.
+        waves: amplitudes of the outgoing Rayleigh waves in a sum of outgoing fields, waves @ ψ, (p, n).
         admittance: Y, −iG = Yψ for each sum ψ of outgoing fields, (n, n).
         psi: ψ of the incoming Rayleigh wave of each order, along the curve, (n, p).
         rise: −iG of these less Yψ, (n, p).
@@ -222,14 +222,10 @@ class HalfSpace:
     square: complex
     orders: NDArray[np.int64]
     beta: Real
-    factors: tuple[Complex, NDArray[np.int32]]
+    waves: Complex
     admittance: Complex
     psi: Complex
     rise: Complex
-
-    def amplitudes(self, psi: Complex) -> Complex:
-        """Return those of the Rayleigh waves, (p, …), in a sum of outgoing fields ψ (n, …)."""
-        return lu_solve(self.factors, psi, check_finite=False)[: len(self.orders)]
 
 
 def half_space(grating: Grating, alpha: Real, gamma2: complex, upwards: bool) -> HalfSpace:
@@ -249,12 +245,15 @@ def half_space(grating: Grating, alpha: Real, gamma2: complex, upwards: bool) ->
     outgoing, incoming = (up, down) if upwards else (down, up)
     psi, flux = (np.hstack(both) for both in zip(outgoing, modes, strict=True))
     factors = lu_factor(psi, check_finite=False)
-    admittance = lu_solve(factors, flux.T.conj(), trans=2, check_finite=False).conj().T
+    # Y and, of ψ⁻¹, the rows of Rayleigh waves: those of [flux; 1] ψ⁻¹.
+    rows = np.vstack([flux, np.eye(len(orders), len(alpha))]).T.conj()
+    admittance, waves = np.split(lu_solve(factors, rows, trans=2, check_finite=False).conj().T, [len(alpha)])
     psi, flux = incoming
-    return HalfSpace(gamma2, orders, beta, factors, admittance, psi, flux - admittance @ psi)
+    return HalfSpace(gamma2, orders, beta, waves, admittance, psi, flux - admittance @ psi)
 
 
 ABOVE, BELOW = 0, 1
+_EVEN = np.array([[1.0, -1.0], [-1.0, 1.0]])  # in k_y, E_y and H_y
 
 
 @dataclass(frozen=True, eq=False)
@@ -270,14 +269,26 @@ class Scattered:
             i, 2), [order, polarisation, incident order, its polarisation], so scaled that |·|² is a share of the
             incident power.
         alpha: α of the orders above, (p,), and below, (r,).
-        k_y, k_0: of all of this light, k_0 in the medium above, times period / 2π.
+        k_y, k_0: of all of this light, k_0 in the medium above, times period / 2π; k_y may be imaginary.
     """
 
     orders: tuple[NDArray[np.int64], NDArray[np.int64]]
     amplitudes: tuple[tuple[Complex, Complex], tuple[Complex, Complex]]
     alpha: tuple[Real, Real]
-    k_y: float
+    k_y: complex
     k_0: float
+
+    def conjugate(self, amplitudes: Complex) -> Complex:
+        """Return J(k_y*), (…, 2, 2) like J(k_y): amplitudes between E_y and H_y are odd in k_y, the others even.
+
+        With it |J|², as J J(k_y*)*, is analytic in k_y²: a table that ends at k_y = 0 can be solved on both sides.
+        """
+        return amplitudes * _EVEN if np.imag(self.k_y) else amplitudes
+
+    def powers(self, amplitudes: Complex) -> Real:
+        """Return |·|² of amplitudes [order, polarisation, …, its polarisation]; negative where odd, k_y imaginary."""
+        powers = np.abs(amplitudes) ** 2
+        return powers * _EVEN[:, None] if np.imag(self.k_y) else powers
 
     def of_light(self, order: int, side: int) -> tuple[Complex, Complex]:
         """Return the orders above and below, (p, 2, 2) and (r, 2, 2), of light of this order from one side."""
@@ -285,12 +296,12 @@ class Scattered:
         return tuple(block[:, :, j] for block in self.amplitudes[side])
 
 
-def scatter(alpha: Real, above: HalfSpace, below: HalfSpace, k_y: float, index: complex) -> Scattered:
+def scatter(alpha: Real, above: HalfSpace, below: HalfSpace, k_y: complex, index: complex) -> Scattered:
     """Solve for light of this k_y (times period / 2π), with air above and a medium of the index n + ik below.
 
     α_m of all harmonics, (n,), are those of both half-spaces.
     """
-    k_0 = np.sqrt(above.square + k_y**2)
+    k_0 = np.sqrt((above.square + k_y**2).real)
     # ψ_E and ψ_H on the curve, from E_t and H_t, which are continuous. −iG = Yψ + rise on either side.
     #   k_y α ψ_E (1/γ₁² − 1/γ₂²) − k_0 (Y₁/γ₁² − Y₂/γ₂²) ψ_H = k_0 (rise_H1/γ₁² − rise_H2/γ₂²)
     #   k_y α ψ_H (1/γ₁² − 1/γ₂²) + k_0 (Y₁/γ₁² − n² Y₂/γ₂²) ψ_E = −k_0 (rise_E1/γ₁² − n² rise_E2/γ₂²)
@@ -314,7 +325,7 @@ def scatter(alpha: Real, above: HalfSpace, below: HalfSpace, k_y: float, index: 
         of_side = []
         for other, to in enumerate((above, below)):
             found = np.stack(
-                [to.amplitudes(field.reshape(len(alpha), -1)) for field in (total if other != side else scattered)]
+                [to.waves @ field.reshape(len(alpha), -1) for field in (total if other != side else scattered)]
             )
             found = found.reshape(2, len(to.orders), 2, len(half.orders)).transpose(1, 0, 2, 3)
             found = units[other].T[:, :, None, None] * found / units[side]

@@ -18,27 +18,42 @@ from ..surface.heightfield import HeightField
 from .coordinate_transformation import ABOVE, BELOW, Curve, Grating, Scattered, curve_of, half_space, scatter
 from .materials import refractive_index
 
+Real = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
 # S_i = E† σ_i E, in the order of Stokes parameters; the sign of the last is Mitsuba's, with n + ik for metals.
 _PAULI = np.array([[[1, 0], [0, 1]], [[1, 0], [0, -1]], [[0, 1], [1, 0]], [[0, 1j], [-1j, 0]]])
 
 REVERSED = np.array([1, 1, 1, -1])
 """s: light that runs through an order backwards, mirrored so that k_y has the same sign, has s_i s_j M_ji."""
 
-MIRRORED = np.array([1, 1, -1, -1])
-"""s: light of the opposite k_y has s_i s_j M_ij."""
+ODD = np.not_equal.outer([1, 1, -1, -1], [1, 1, -1, -1])
+"""Which M_ij are odd in k_y."""
 
 
-def mueller(amplitudes: NDArray[np.complex128]) -> NDArray[np.float64]:
-    """Return M_ij = Tr(σ_i J σ_j J†) / 2 of amplitudes J, (…, 2, 2) → (…, 4, 4).
+_KERNEL = np.einsum("iab,jcd->bcadij", _PAULI, _PAULI).reshape(16, 16) / 2
 
-    Polarised waves are written in (ê, k̂ × ê), as in `coordinate_transformation.Scattered`.
+
+def mueller(amplitudes: Complex, of_conjugate: Complex | None = None) -> Complex:
+    """Return M_ij = Tr(σ_i J σ_j J(k_y*)†) / 2 of amplitudes J, (…, 2, 2) → (…, 4, 4).
+
+    Polarised waves are written in (ê, k̂ × ê), as in `coordinate_transformation.Scattered`. Elements are real; where k_y
+    is imaginary, with J(k_y*) as `of_conjugate`, those that are odd in k_y are imaginary.
     """
-    return np.einsum("iab,...bc,jcd,...ad->...ij", _PAULI, amplitudes, _PAULI, amplitudes.conj()).real / 2
+    conjugate = (amplitudes if of_conjugate is None else of_conjugate).conj()
+    pairs = amplitudes[..., None, None] * conjugate[..., None, None, :, :]
+    return (pairs.reshape(-1, 16) @ _KERNEL).reshape(*amplitudes.shape[:-2], 4, 4)
 
 
-def matrices_of(solved: Scattered, side: int, to: int) -> NDArray[np.float64]:
+def matrices_of(solved: Scattered, side: int, to: int) -> Complex:
     """Return the Mueller matrices of light from a side to a side, (orders out, orders in, 4, 4)."""
-    return mueller(solved.amplitudes[side][to].transpose(0, 2, 1, 3))
+    amplitudes = solved.amplitudes[side][to].transpose(0, 2, 1, 3)
+    return mueller(amplitudes, solved.conjugate(amplitudes))
+
+
+def unpolarised(solved: Scattered, side: int, to: int) -> NDArray[np.float64]:
+    """Return η alone of `matrices_of`, (orders out, orders in, 1, 1)."""
+    return solved.powers(solved.amplitudes[side][to]).sum(axis=(1, 3))[..., None, None] / 2
 
 
 @functools.cache
@@ -56,9 +71,6 @@ def one_thread() -> Iterator[None]:
     with _controller().limit(limits=1, user_api="blas"):
         yield
 
-
-Real = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 
 MOST_HARMONICS = 80
 # A solution with as many takes half a minute.
@@ -298,12 +310,16 @@ def _change(before: Efficiencies, after: Efficiencies) -> float:
 
 
 def frames(k: Real) -> Real:
-    """Return ŝ and p̂ (columns) of waves along k (n, 3) in terms of ê and k̂ × ê (rows) of `Scattered`, (n, 2, 2)."""
-    across = np.hypot(k[:, 0], k[:, 1])
+    """Return ŝ and p̂ (columns) of waves along k (n, 3) in terms of ê and k̂ × ê (rows) of `Scattered`, (n, 2, 2).
+
+    k_y may be imaginary: the matrix is orthogonal, not unitary.
+    """
+    across = np.emath.sqrt((k[:, 0] ** 2 + k[:, 1] ** 2).real)
     s = np.stack([-k[:, 1], k[:, 0], np.zeros(len(k))], axis=1)
-    s = np.where(across[:, None] < 1e-12, [0.0, 1.0, 0.0], s / np.maximum(across, 1e-12)[:, None])
+    along_normal = np.abs(across)[:, None] < 1e-12
+    s = np.where(along_normal, [0.0, 1.0, 0.0], s / np.where(along_normal, 1, across[:, None]))
     # ê·ŝ = s_y/√(1 − k_y²), and (k̂ × ê)·ŝ = −ê·(k̂ × ŝ) = −ê·p̂.
-    scale = np.sqrt(np.maximum(1 - k[:, 1] ** 2, 1e-30))
+    scale = np.sqrt(np.maximum((1 - k[:, 1] ** 2).real, 1e-30))
     cos, sin = s[:, 1] / scale, np.cross(k, s)[:, 1] / scale
     return np.array([[cos, sin], [-sin, cos]]).transpose(2, 0, 1)
 
@@ -312,7 +328,7 @@ def frames(k: Real) -> Real:
 _LOSS = 1e-9
 
 
-def through_sheet(solved: Scattered, index: float) -> dict[tuple[int, int], Real]:
+def through_sheet(solved: Scattered, index: float) -> dict[tuple[int, int], Complex]:
     """Compute what a sheet does to light, all bounces inside summed incoherently.
 
     The plane is far from the grating: powers add up, order by order, as Stokes vectors. With the Mueller matrices of
@@ -330,9 +346,9 @@ def through_sheet(solved: Scattered, index: float) -> dict[tuple[int, int], Real
     """
     outside, inside = solved.orders
     grating = [[_as_matrix(matrices_of(solved, i, o)) for o in (ABOVE, BELOW)] for i in (ABOVE, BELOW)]
-    k_y, k_0, k = solved.k_y, solved.k_0, index * solved.k_0
-    into, plane = _plane(solved.alpha[ABOVE], k_y, k_0, k, upwards=True)
-    out_of, mirror = _plane(solved.alpha[BELOW], k_y, k, k_0, upwards=False)
+    k_0, k = solved.k_0, index * solved.k_0
+    into, plane = _plane(solved, solved.alpha[ABOVE], k_0, k, upwards=True)
+    out_of, mirror = _plane(solved, solved.alpha[BELOW], k, k_0, upwards=False)
     # Orders that propagate on both sides of the plane.
     travel = np.equal.outer(inside, outside)
     into = _as_matrix(travel[..., None, None] * into[None])
@@ -352,15 +368,17 @@ def through_sheet(solved: Scattered, index: float) -> dict[tuple[int, int], Real
     return {way: _as_blocks(matrix) for way, matrix in found.items()}
 
 
-def _plane(alpha: Real, k_y: float, k: float, other: float, upwards: bool) -> tuple[Real, Real]:
+def _plane(solved: Scattered, alpha: Real, k: float, other: float, upwards: bool) -> tuple[Complex, Complex]:
     """Return the Mueller matrices of light that meets a plane, transmitted and reflected, (n, 4, 4) each.
 
     Args:
-        alpha, k_y: along the plane.
+        solved: of the grating, for k_y.
+        alpha: along the plane.
         k, other: wave numbers of the medium in which the light is, and beyond the plane.
         upwards: whether the light goes up.
     """
-    beta, beta_other = (np.sqrt(w**2 - k_y**2 - alpha**2 + 0j) for w in (k, other))
+    k_y = solved.k_y
+    beta, beta_other = (np.sqrt((w**2 - k_y**2 - alpha**2).real + 0j) for w in (k, other))
     square = (k / other) ** 2
     r_s, r_p = (beta - beta_other) / (beta + beta_other), (beta - square * beta_other) / (beta + square * beta_other)
     root = 2 * np.sqrt(beta * beta_other)
@@ -368,11 +386,12 @@ def _plane(alpha: Real, k_y: float, k: float, other: float, upwards: bool) -> tu
     sign = 1 if upwards else -1
 
     def basis(height: Real, w: float) -> Real:
-        return frames(np.stack([alpha, np.full_like(alpha, k_y), height], axis=1) / w)
+        return frames(np.stack(np.broadcast_arrays(alpha, k_y, height), axis=1) / w)
 
-    def matrices(to: Real, s: Complex, p: Complex) -> Real:
+    def matrices(to: Real, s: Complex, p: Complex) -> Complex:
         from_ = basis(sign * beta.real, k).transpose(0, 2, 1)
-        return mueller(to @ (np.stack([s, p], axis=1)[..., None] * from_))
+        amplitudes = to @ (np.stack([s, p], axis=1)[..., None] * from_)
+        return mueller(amplitudes, solved.conjugate(amplitudes))
 
     travels = beta_other.imag == 0
     height = np.where(travels, beta_other.real, 0.0)
@@ -380,13 +399,13 @@ def _plane(alpha: Real, k_y: float, k: float, other: float, upwards: bool) -> tu
     return np.where(travels[:, None, None], transmitted, 0), matrices(basis(-sign * beta.real, k), r_s, r_p)
 
 
-def _as_matrix(matrices: Real) -> Real:
+def _as_matrix(matrices: Complex) -> Complex:
     """Return (n, k, 4, 4) as one matrix, (4n, 4k)."""
     n, k = matrices.shape[:2]
     return matrices.transpose(0, 2, 1, 3).reshape(4 * n, 4 * k)
 
 
-def _as_blocks(matrix: Real) -> Real:
+def _as_blocks(matrix: Complex) -> Complex:
     """Return (4n, 4k) as (n, k, 4, 4)."""
     n, k = (size // 4 for size in matrix.shape)
     return matrix.reshape(n, 4, k, 4).transpose(0, 2, 1, 3)

@@ -2,19 +2,18 @@
 
 A rigorous spectrum as an OpenEXR file: float32, ZIP, one part.
 
-Channel `eta(07)` holds plane 7 of each table (`Axes`), one below the other: the squares [P, R] of the orders −M … M
-from top to bottom, each at the left; below them, if the table is polarised, the Mueller matrices of this plane, one
-after the other. Numbers in the header are double precision.
+Line r of the channel `eta` holds row r of the table (`Axes`), its nodes of F, X and Z one after the other; if the table
+is polarised, `m(ij)` holds M_ij likewise. Numbers in the header are double precision.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import os
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,12 +22,12 @@ from ..errors import RequestError
 from ..settings import TRANSMISSIONS, lobe_cutoff, lobe_width
 from ..spectrum.exr import doubles, one_line, read, write
 from ..spectrum.grids import OrderGrid
-from .efficiencies import REVERSED
+from .efficiencies import ODD, REVERSED
 
 Real = NDArray[np.float64]
 
 FORMAT = "mitsuba_diffraction rigorous spectrum"
-FORMAT_VERSION = 3
+FORMAT_VERSION = 4
 
 # Attributes, and their names in files.
 _NUMBERS = {
@@ -40,212 +39,214 @@ _NUMBERS = {
     "max_error_near": "worstNear",
     "polarisation_error": "polarisationError",
 }
-_TEXTS = ("material", "transmission", "source", "source_digest")
+_TEXTS = ("material", "source", "source_digest")
+_STEPS = ("stepsF", "stepsX", "stepsZ")
 
-
-WAYS = ((0, 0), (1, 1), (0, 1))
-"""From which side to which the light of each of `RigorousSpectrum.tables` goes."""
 
 LARGEST_PERIOD = 10.0
 """In units of the shortest wavelength: the table grows with the cube of the period, the time to build it faster."""
 
-STORED = 2
-"""Steps to a unit to each that is solved, by cubic polynomials: linear look-ups need more nodes."""
-
 
 @dataclass(frozen=True)
 class Axes:
-    """The coordinates of the table: such that η is smooth in them, and the same for light and for reversed light.
+    """The coordinates of the table: such that η is smooth between whole numbers, and the same for reversed light.
 
     With ν = T/λ, directions enter by three numbers, symmetric under exchange of ω_i and ω_o but for the sign of c:
 
-        k_y = (ω_o,y − ω_i,y) ν / 2,    g = √(ν² − k_y²),    c = (ω_o,x − ω_i,x) ν / 2.
+        k_y = (ω_o,y − ω_i,y) ν / 2,    γ² = ν² − k_y²,    c = (ω_o,x − ω_i,x) ν / 2.
 
-    In units of 2π/T, g is the wave number across the grooves; light of order m comes in with k_x = c + m/2 and leaves
-    with c − m/2. Order n of the same light has its Rayleigh anomaly where |c + m/2 − n| = g, which is where
+    In units of 2π/T, γ is the wave number across the grooves, and γ'² = γ² + (n² − 1) ν² that below. Light of order m
+    comes in with k_x = c + m/2 and leaves with c − m/2, n + α and n − m + α with a whole n and |α| ≤ 1/2. With
+    α < 0 it is reversed, −c for c: a = |α| is left. Where an order passes off (Rayleigh anomaly) η has a square root,
+    on either side: where γ or γ' is one of
 
-        P = g + c − |m|/2    or    R = g − c − |m|/2
+        h₀ = a,  h₁ = 1 − a,  h₂ = 1 + a,  h₃ = 2 − a,  …,
 
-    is an integer. Both are above zero if order m propagates; reversed light exchanges them, and η_m(P, R) = η_m(R, P)
-    by reciprocity. Beside such a line η goes as a square root, so that along P and R the nodes lie at
+    the |n + a| of n = 0, −1, 1, −2, … In cell j, from h_{j−1} to h_j, the first j of these propagate. Within it η is
+    smooth in X, and with F instead of a also where cells end in a point,
 
-        P = i + sin²(π f / 2 s),    f = 0 … s,    X = i s + f,
+        X / (1 − X) = √(t / (1 − t)),    t = (γ² − h_{j−1}²) / (h_j² − h_{j−1}²),    sin²(π F / 2) = 2 a,
 
-    s steps to each unit: η is smooth in X from one whole P to the next. The third coordinate is the wavelength, from
-    the shortest to the longest that g admits (k_y² ≥ 0):
+    from 0 to 1, X steeper at its ends: light that grazes the surface above enters the denser medium within few degrees.
+    Of γ' likewise sin²(π Z / 2) = t'. Cell 0 above, where light travels below only, begins at the least γ² that the
+    shortest wavelength admits, γ'² − (n² − 1) ν². Without transmission (index 0) Z is the wavelength, from
+    the shortest to the longest that γ admits (k_y² ≥ 0):
 
-        λ = λ₀ + (λ₁ − λ₀) Z / (K − 1),    λ₀ = min(λ_min, T/g),    λ₁ = min(λ_max, T/g).
+        λ = λ₀ + (λ₁ − λ₀) Z,    λ₀ = min(λ_min, T/γ),    λ₁ = min(λ_max, T/γ).
 
-    Of an interface to a dielectric of index n (relative to the medium above), g and λ are those above for all light; g
-    is signed, g = −√(k_y² − ν²) where no light travels above. Inside, g'² = g|g| + (n² − 1) ν². Light that enters comes
-    in with k_x = c + m/2 again; its coordinates are those of the incident direction alone, the same for all m,
-
-        P = g + c + m/2,    R = g − c − m/2.
-
-    Light that is reflected inside has lines where an order becomes totally reflected, at the same whole numbers:
-
-        P = D + g + c − |m|/2,    R = D + g − c − |m|/2,
-
-    the whole number D large enough that both are above zero for all of it.
+    A block of the table is a pair of cells of γ and γ'; it has a row for each pair of orders that come in and leave,
+    those above before those below, and the nodes of a row are at equal steps of F, X and Z.
 
     Attributes:
         period: T in µm.
         wavelengths: (shortest, longest) in µm.
-        steps: s.
-        planes: K.
-        index: n of the medium below, relative to that above.
-        way: sides from which and to which the light goes, 0 above and 1 below.
+        steps: of F, X and Z.
+        index: n of the medium below, relative to that above; 0 if Z is the wavelength.
+        transmission: one of `TRANSMISSIONS`; a sheet has air below.
     """
 
     period: float
     wavelengths: tuple[float, float]
-    steps: int
-    planes: int
-    index: float = 1.0
-    way: tuple[int, int] = (0, 0)
+    steps: tuple[int, int, int]
+    index: float = 0.0
+    transmission: str = "none"
 
     @property
-    def solved(self) -> Axes:
-        """The coarser nodes at which η was solved."""
-        return dataclasses.replace(self, steps=self.steps // STORED)
+    def excess(self) -> float:
+        """n² − 1, or 0."""
+        return self.index**2 - 1 if self.index else 0.0
 
     @property
-    def max_decay(self) -> float:
-        """√(n² − 1), or 0: g > −√(n² − 1) ν."""
-        return float(np.sqrt(max(self.index**2 - 1, 0.0)))
-
-    @property
-    def shift(self) -> int:
-        """D, at least g' − g."""
-        return (
-            int(np.ceil(np.sqrt(2) * self.max_decay * self.period / self.wavelengths[0])) if self.way == (1, 1) else 0
-        )
+    def largest(self) -> float:
+        """The largest ν."""
+        return self.period / self.wavelengths[0]
 
     @property
     def max_order(self) -> int:
         """M, the largest order that any pair of directions reaches."""
-        return int(np.ceil(sum((1.0, self.index)[side] for side in self.way) * self.period / self.wavelengths[0])) - 1
+        return int(np.ceil(2 * self.largest * (max(1.0, self.index) if self.transmission == "interface" else 1.0))) - 1
+
+    def counts(self, cell: NDArray[np.int64] | int, inside: NDArray[np.int64] | int) -> tuple[Any, Any]:
+        """Return how many orders leave above and below, from the cells of γ and γ'."""
+        return cell, {"none": 0 * cell, "sheet": cell, "interface": inside}[self.transmission]
+
+    @cached_property
+    def blocks(self) -> dict[tuple[int, int], int]:
+        """The cells of γ and γ' that light has → the first row of their block; γ' has cell 0 if Z is the wavelength."""
+        # Between two of these a, edges of cells are monotonous.
+        a = np.linspace(0, 0.5, 65)
+        top = self.largest**2
+        least = min(-self.excess * top, 0.0) if self.transmission == "interface" else 0.0
+        cells = [self._edges(j, a, least) for j in range(int(2 * self.largest) + 3)]
+        inner = cells
+        if self.index:
+            inner = [self._edges(j, a, -top) for j in range(int(2 * max(1, self.index) * self.largest) + 3)]
+        found, row = {}, 0
+        for j, (low, high) in enumerate(cells):
+            if j == 0 and least == 0:
+                continue
+            ends = []
+            for square in (low, np.minimum(high, top)):
+                shortest = np.maximum((self.period / self.wavelengths[1]) ** 2, square)
+                ends.append(square + np.sort([self.excess * shortest, np.full_like(square, self.excess * top)], axis=0))
+            for k, (low_inside, high_inside) in enumerate(inner):
+                there = (low < top) & (ends[0][0] < high_inside) & (ends[1][1] > low_inside)
+                if (there if self.index else (low < top) & (k == 0)).any() and sum(self.counts(j, k)):
+                    found[j, k] = row
+                    row += sum(self.counts(j, k)) ** 2
+        return found
+
+    @staticmethod
+    def _edges(cell: int, a: Real, least: float) -> tuple[Real, Real]:
+        """Return bounds of γ² in a cell, from each a to the next."""
+        low, high = edges_of(cell, a, least)
+        return np.minimum(low[:-1], low[1:]), np.maximum(high[:-1], high[1:])
+
+    @cached_property
+    def starts(self) -> NDArray[np.int64]:
+        """The first row of each block, [cell of γ, cell of γ'], −1 where there is none."""
+        found = np.full(np.max(list(self.blocks), axis=0) + 1, -1)
+        for cells, row in self.blocks.items():
+            found[cells] = row
+        return found
 
     @property
-    def orders(self) -> range:
-        """−M … M."""
-        return range(-self.max_order, self.max_order + 1)
-
-    def least(self, m: NDArray[np.int64] | int) -> tuple[NDArray[np.int64] | int, NDArray[np.int64] | int]:
-        """Return by how much P and R of order m are less than D + g + k_x and D + g − k_x of the incident light."""
-        enters = self.way == (0, 1) and self.index != 1
-        return (0 * m, 0 * m) if enters else (np.maximum(m, 0), np.maximum(-m, 0))
-
-    def coordinates(
-        self, m: NDArray[np.int64], c: Real, g: Real, wavelength: Real
-    ) -> tuple[Real, Real, NDArray[np.bool_]]:
-        """Return P and R, and whether order m propagates."""
-        less = self.least(m)
-        p, r = self.shift + g + c + m / 2 - less[0], self.shift + g - c - m / 2 - less[1]
-        inside = g * np.abs(g) + (self.index**2 - 1) * (self.period / wavelength) ** 2
-        there = (p > 0) & (r > 0) & (g <= self.period / self.wavelengths[0] * (1 + 1e-9))
-        for side, k_x in zip(self.way, (c + m / 2, c - m / 2), strict=True):
-            there &= k_x**2 < (inside if side else g * np.abs(g))
-        return p, r, there
-
-    def units(self, m: int) -> int:
-        """Return how many units P and R of order m cover."""
-        # The largest g + |k_x| of the incident light.
-        longest = (1 + (1.0, self.index)[self.way[0]]) * self.period / self.wavelengths[0]
-        return int(np.ceil(self.shift + longest - sum(self.least(m))))
-
-    def side(self, m: int) -> int:
-        """Return how many nodes order m has along P, and along R."""
-        return self.units(m) * self.steps + 1
-
-    def offset(self, m: int) -> int:
-        """Return where the nodes of order m start in a plane: [P, R] of order −M first."""
-        return sum(self.side(k) ** 2 for k in range(-self.max_order, m))
-
-    def square(self, values: NDArray[np.float32], m: int) -> NDArray[np.float32]:
-        """Return those of order m, (K, P, R), of `values` (K, nodes)."""
-        side, start = self.side(m), self.offset(m)
-        return values[:, start : start + side**2].reshape(-1, side, side)
+    def rows(self) -> int:
+        """Pairs of orders in all blocks."""
+        return max(row + sum(self.counts(*cells)) ** 2 for cells, row in self.blocks.items())
 
     @property
-    def nodes(self) -> int:
-        """In a plane."""
-        return self.offset(self.max_order + 1)
+    def shape(self) -> tuple[int, int, int, int]:
+        """Of the table: rows and nodes of F, X and Z."""
+        f, x, z = self.steps
+        return self.rows, f + 1, x + 1, z + 1
 
-    def nodes_at(self, count: int) -> Real:
-        """Return P at X = 0 … count − 1."""
-        i, f = np.divmod(np.arange(count), self.steps)
-        return i + np.sin(np.pi / 2 * f / self.steps) ** 2
-
-    def position(self, p: Real) -> Real:
-        """Return X of P ≥ 0."""
-        i = np.floor(p)
-        return self.steps * (i + 2 / np.pi * np.arcsin(np.sqrt(p - i)))
+    def locate(
+        self, m: NDArray[np.int64], c: Real, g: Real, wavelength: Real, sides: tuple[int, int]
+    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.int64], list[Real]]:
+        """Return whether order m propagates, whether it is reversed light, its row, and F, X and Z; g = ±√|γ²|."""
+        nu = self.period / wavelength
+        square = g * np.abs(g)
+        inside = square + self.excess * nu**2
+        k_x = c + m / 2
+        n = np.rint(k_x).astype(np.int64)
+        back = k_x < n
+        a = np.abs(k_x - n)
+        cell, cell_inside = cell_of(square, a), cell_of(inside, a) if self.index else np.zeros_like(n)
+        cells = [np.minimum(x, size - 1) for x, size in zip((cell, cell_inside), self.starts.shape, strict=True)]
+        row, counts, channels = self.starts[tuple(cells)], self.counts(*cells), []
+        there = (row >= 0) & (self.largest * (1 + 1e-9) >= nu) & (nu * (1 + 1e-9) >= self.period / self.wavelengths[1])
+        for there_side, back_side, order in (
+            (*sides, np.where(back, m - n, n)),
+            (*sides[::-1], np.where(back, -n, n - m)),
+        ):
+            side = np.where(back, back_side, there_side)
+            there &= rank(order) < np.where(side, counts[1], counts[0])
+            channels.append(rank(order) + np.where(side, counts[0], 0))
+        row = row + channels[0] * (counts[0] + counts[1]) + channels[1]
+        top = self.excess * self.largest**2
+        t = share_of(square, *edges_of(cell, a, inside - top))
+        places = [arc(2 * a), np.sqrt(t) / (np.sqrt(t) + np.sqrt(1 - t))]
+        if self.index:
+            places.append(arc(share_of(inside, *edges_of(cell_inside, a, square + top))))
+        else:
+            first, last = self.range(g)
+            places.append(np.clip((wavelength - first) / np.maximum(last - first, 1e-9), 0, 1))
+        return there, back, row, places
 
     def range(self, g: Real) -> tuple[Real, Real]:
-        """Return λ₀ and λ₁ at g, µm."""
-        longest = self.period * np.where(g < 0, self.max_decay * (1 - 1e-6), 1.0) / np.maximum(np.abs(g), 1e-12)
+        """Return λ₀ and λ₁ at γ = g, µm."""
+        longest = self.period / np.maximum(g, 1e-12)
         return np.minimum(self.wavelengths[0], longest), np.minimum(self.wavelengths[1], longest)
 
 
-@dataclass(frozen=True, eq=False)
-class Table:
-    """η_m of unpolarised light over `Axes`.
+def rank(n: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the place of n in 0, −1, 1, −2, …: j of h_j = |n + a|."""
+    return np.where(n >= 0, 2 * n, -2 * n - 1)
 
-    Attributes:
-        axes: what the table stands over.
-        values: (K, nodes) float32, η at the nodes of `axes`; of order m, side² values from offset(m), [P, R].
-        mueller: (K, nodes, 4, 4) float32, the Mueller matrices of the orders for k_y ≥ 0, between
-            waves in (ê, k̂ × ê), ê the direction of ŷ − (ŷ·k̂)k̂; or None.
-    """
 
-    axes: Axes
-    values: NDArray[np.float32] = field(repr=False)
-    mueller: NDArray[np.float32] | None = field(default=None, repr=False)
+def edges_of(cell: Any, a: Real, least: Any) -> tuple[Real, Real]:
+    """Return h² at the beginning and at the end of a cell; cell 0 begins at `least`."""
+    half = np.where(cell % 2, 0.5 - a, a)
+    return np.where(cell > 0, (cell / 2 - half) ** 2, least), (cell / 2 + half) ** 2
 
-    def __post_init__(self) -> None:
-        wanted = self.axes.planes, self.axes.nodes
-        if self.values.shape != wanted or self.values.dtype != np.float32:
-            raise RequestError(f"values: got {self.values.shape} of {self.values.dtype}, wanted {wanted} of float32")
-        if self.mueller is not None:
-            matrices = (*wanted, 4, 4)
-            if self.mueller.shape != matrices or self.mueller.dtype != np.float32:
-                raise RequestError(f"mueller: got {self.mueller.shape}, wanted {matrices} of float32")
 
-    def evaluate(self, m: ArrayLike, c: ArrayLike, g: ArrayLike, wavelength: ArrayLike, mueller: bool = False) -> Real:
-        """Return η_m, or M_ij (…, 4, 4), at c, g and λ of `Axes`; other arguments as of `RigorousSpectrum.evaluate`."""
-        table: NDArray[np.float32] = self.mueller if mueller and self.mueller is not None else self.values
-        m, c, g, wavelength = np.broadcast_arrays(np.asarray(m, np.int64), c, g, wavelength)
-        axes = self.axes
-        p, r, there = axes.coordinates(m, c, g, wavelength)
-        p, r, order = (np.where(there, v, 0) for v in (p, r, m))
-        side = np.array([axes.side(k) for k in axes.orders])[order + axes.max_order]
-        offset = np.array([axes.offset(k) for k in axes.orders])[order + axes.max_order]
-        first, last = axes.range(g)
-        z = np.clip((wavelength - first) / np.maximum(last - first, 1e-9), 0, 1) * (axes.planes - 1)
-        result = np.zeros((*m.shape, *table.shape[2:]))
-        wide = (..., *[None] * (table.ndim - 2))
-        places = [_split(axes.position(p), side), _split(axes.position(r), side), _split(z, axes.planes)]
-        for corner in np.ndindex(2, 2, 2):
-            (i, j, k), weights = zip(
-                *((low + up, f if up else 1 - f) for (low, f), up in zip(places, corner, strict=True)), strict=True
-            )
-            result += np.prod(weights, axis=0)[wide] * table[k, offset + i * side + j]
-        return np.where(there[wide], result, 0)
+def cell_of(square: Real, a: Real) -> NDArray[np.int64]:
+    """Return in which cell γ² lies."""
+    whole, part = np.divmod(np.sqrt(np.maximum(square, 0)), 1)
+    return (2 * whole + (part >= a) + (part >= 1 - a)).astype(np.int64)
+
+
+def share_of(square: Real, low: Real, high: Real) -> Real:
+    """Return t of γ² in a cell."""
+    share: Real = np.clip((square - low) / np.maximum(high - low, 1e-30), 0, 1)
+    return share
+
+
+def arc(share: Real) -> Real:
+    """Return Z of t, or F of 2 a."""
+    angle: Real = 2 / np.pi * np.arcsin(np.sqrt(share))
+    return angle
+
+
+def shares_at(steps: tuple[int, int, int]) -> tuple[Real, Real, Real]:
+    """Return 2 a, t of γ² and t of γ'² at equal steps of F, X and Z."""
+    f, x, z = (np.arange(count + 1) / count for count in steps)
+    return np.sin(np.pi / 2 * f) ** 2, x**2 / (x**2 + (1 - x) ** 2), np.sin(np.pi / 2 * z) ** 2
 
 
 @dataclass(frozen=True, eq=False)
 class RigorousSpectrum:
-    """η_m of unpolarised light as tables, and what else a BSDF needs: f = Σ_m η_m N(q − m/T; σ_q² I) n_o² / λ².
+    """η_m of unpolarised light as a table, and what else a BSDF needs: f = Σ_m η_m N(q − m/T; σ_q² I) n_o² / λ².
 
     Side 0 is above, side 1 below. With transmission "interface" the medium of `int_ior` is below; of a "sheet" it is
-    air. The sides' light is one reciprocal set, of which `tables` holds three: what is reflected above, what is
-    reflected below, and what crosses from above to below. Light that crosses from below is the reverse of the last.
+    air. The sides' light is one reciprocal set.
 
     Attributes:
-        tables: of reflected light alone, (above → above,); with transmission (above → above, below → below,
-            above → below).
-        transmission: one of `TRANSMISSIONS`.
+        axes: of the table.
+        values: η at the nodes, (rows, F, X, Z).
+        mueller: M_ij there, (rows, F, X, Z, 4, 4), or None. Elements that are odd in k_y are divided by k_y/ν: all are
+            smooth where k_y = 0.
         material: a conductor by Mitsuba's name, or "" for a dielectric.
         int_ior: n + ik if there is no material.
         coherence_length: L_c in µm; it sets the width σ_q of each order.
@@ -262,7 +263,9 @@ class RigorousSpectrum:
         polarisation_error: of the matrices, as `error`: the mean of Σ_m max_ij |ΔM_ij| / Σ η_m; NaN if there are none.
     """
 
-    tables: tuple[Table, ...]
+    axes: Axes
+    values: NDArray[np.float32]
+    mueller: NDArray[np.float32] | None
     material: str
     int_ior: complex
     coherence_length: float
@@ -274,31 +277,21 @@ class RigorousSpectrum:
     source: str
     source_digest: str = field(repr=False)
     ext_ior: float = 1.0
-    transmission: str = "none"
     polarisation_error: float = float("nan")
 
     def __post_init__(self) -> None:
         if self.transmission not in TRANSMISSIONS:
             raise RequestError(f"transmission: got {self.transmission!r}, wanted one of {', '.join(TRANSMISSIONS)}")
-        wanted = 1 if self.transmission == "none" else 3
-        if len(self.tables) != wanted:
-            raise RequestError(f"tables: got {len(self.tables)}, wanted {wanted} for transmission {self.transmission}")
+        for name, wanted in (("values", self.axes.shape), ("mueller", (*self.axes.shape, 4, 4))):
+            table = getattr(self, name)
+            if table is not None and (table.shape != wanted or table.dtype != np.float32):
+                raise RequestError(f"{name}: got {table.shape} of {table.dtype}, wanted {wanted} of float32")
         lobe_width(self.coherence_length)
 
     @property
-    def axes(self) -> Axes:
-        """Of the light that is reflected above."""
-        return self.tables[0].axes
-
-    @property
-    def values(self) -> NDArray[np.float32]:
-        """Of the light that is reflected above."""
-        return self.tables[0].values
-
-    @property
-    def mueller(self) -> NDArray[np.float32] | None:
-        """Of the light that is reflected above."""
-        return self.tables[0].mueller
+    def transmission(self) -> str:
+        """One of `TRANSMISSIONS`."""
+        return self.axes.transmission
 
     @property
     def indices(self) -> tuple[float, float]:
@@ -332,9 +325,8 @@ class RigorousSpectrum:
 
     @property
     def megabytes(self) -> float:
-        """Size of the tables in memory."""
-        arrays = [a for table in self.tables for a in (table.values, table.mueller) if a is not None]
-        return sum(a.nbytes for a in arrays) / 1e6
+        """Size of the table in memory."""
+        return (self.values.nbytes + (0 if self.mueller is None else self.mueller.nbytes)) / 1e6
 
     @property
     def lobe_width(self) -> float:
@@ -349,12 +341,11 @@ class RigorousSpectrum:
     @cached_property
     def digest(self) -> str:
         """SHA-256 of what a renderer needs of it: spectra that have one show the same."""
-        axes = [table.axes for table in self.tables]
-        description = repr((axes, self.material, self.int_ior, self.coherence_length, self.tolerance, self.ext_ior))
-        arrays = [a for table in self.tables for a in (table.values, table.mueller) if a is not None]
-        return hashlib.sha256(
-            (description + self.transmission).encode() + b"".join(a.tobytes() for a in arrays)
-        ).hexdigest()
+        description = repr(
+            (self.axes, self.material, self.int_ior, self.coherence_length, self.tolerance, self.ext_ior)
+        )
+        arrays = [a for a in (self.values, self.mueller) if a is not None]
+        return hashlib.sha256(description.encode() + b"".join(a.tobytes() for a in arrays)).hexdigest()
 
     def evaluate(
         self,
@@ -365,13 +356,13 @@ class RigorousSpectrum:
         sides: tuple[int, int] = (0, 0),
         mueller: bool = False,
     ) -> Real:
-        """Return η_m of light from a side to a side, from the tables, or its Mueller matrix, linear between the nodes.
+        """Return η_m of light from a side to a side, or its Mueller matrix, linear between the nodes.
 
         With n_i and n_o the `indices` of the sides of ω_i and ω_o, and ν = T/λ,
 
             c = (n_o ω_o,x − n_i ω_i,x) ν / 2,    k_y = (n_o ω_o,y − n_i ω_i,y) ν / 2,    g = ± √|ν² − k_y²|,
 
-        g of the sign of ν² − k_y². Light that crosses upwards is evaluated as the reversed light, with −c.
+        g of the sign of ν² − k_y².
 
         Args:
             m: orders, broadcast against the others.
@@ -386,16 +377,28 @@ class RigorousSpectrum:
         Raises:
             ValueError: if there is no such table.
         """
-        if len(self.tables) == 1 and sides != (0, 0):
+        if self.transmission == "none" and sides != (0, 0):
             raise RequestError(f"sides: got {sides!r} of a table with transmission none, wanted (0, 0)")
         if mueller and self.mueller is None:
             raise RequestError("mueller: got a table of unpolarised light, wanted one built with polarised=True")
-        table = self.tables[WAYS.index((min(sides), max(sides)))]
-        upwards = sides == (1, 0)
-        found = table.evaluate(m, np.negative(c) if upwards else c, g, wavelength, mueller)
-        if mueller and upwards:
-            found = np.outer(REVERSED, REVERSED) * np.swapaxes(found, -1, -2)
-        return found
+        table: NDArray[np.float32] = self.mueller if mueller and self.mueller is not None else self.values
+        m, c, g, wavelength = np.broadcast_arrays(np.asarray(m, np.int64), c, g, wavelength)
+        there, back, row, places = self.axes.locate(m, c, g, wavelength, sides)
+        row = np.where(there, row, 0)
+        result = np.zeros((*m.shape, *table.shape[4:]))
+        wide = (..., *[None] * (table.ndim - 4))
+        nodes = [_split(x * steps, steps) for x, steps in zip(places, self.axes.steps, strict=True)]
+        for corner in np.ndindex(2, 2, 2):
+            place, weights = zip(
+                *((low + up, f if up else 1 - f) for (low, f), up in zip(nodes, corner, strict=True)), strict=True
+            )
+            result += np.prod(weights, axis=0)[wide] * table[(row, *place)]
+        if mueller:
+            reversed_light = np.outer(REVERSED, REVERSED) * np.swapaxes(result, -1, -2)
+            result = np.where(back[wide], reversed_light, result)
+            across = np.sqrt(np.maximum(1 - g * np.abs(g) * (wavelength / self.axes.period) ** 2, 0))
+            result *= np.where(ODD, across[wide], 1)
+        return np.where(there[wide], result, 0)
 
     def efficiencies(
         self, direction: ArrayLike, wavelength: float, transmitted: bool = False
@@ -425,31 +428,26 @@ class RigorousSpectrum:
         Raises:
             OSError: if the file cannot be written.
         """
-        axes, width = self.axes, max(table.axes.side(0) for table in self.tables)
-        rows = []
-        for table in self.tables:
-            for m in table.axes.orders:
-                square = table.axes.square(table.values, m)
-                rows.append(np.pad(square, [(0, 0), (0, 0), (0, width - square.shape[2])]))
-            if table.mueller is not None:
-                matrices = table.mueller.reshape(axes.planes, -1)
-                matrices = np.pad(matrices, [(0, 0), (0, -matrices.shape[1] % width)])
-                rows.append(matrices.reshape(axes.planes, -1, width))
-        sheet = np.concatenate(rows, axis=1)
+        axes = self.axes
         index = complex(self.int_ior)
+        arrays = {"eta": self.values.reshape(axes.rows, -1)}
+        if self.mueller is not None:
+            matrices = self.mueller.reshape(axes.rows, -1, 4, 4)
+            arrays |= {_channel(i, j): np.ascontiguousarray(matrices[..., i, j]) for i, j in np.ndindex(4, 4)}
         header = {
             "period": doubles(axes.period),
             "wavelengths": doubles(*axes.wavelengths),
-            "steps": axes.steps,
-            "planes": axes.planes,
+            **dict(zip(_STEPS, axes.steps, strict=True)),
+            "index": doubles(axes.index),
             "harmonics": self.harmonics,
             "polarised": int(self.mueller is not None),
             "intIor": doubles(index.real, index.imag),
             **{key: doubles(getattr(self, name)) for name, key in _NUMBERS.items()},
+            "transmission": self.transmission,
             **{_camel(name): getattr(self, name) for name in _TEXTS},
             "units": "lengths and wavelengths in micrometres",
         }
-        write(path, FORMAT, FORMAT_VERSION, header, {_channel(k): plane for k, plane in enumerate(sheet)}, recipe)
+        write(path, FORMAT, FORMAT_VERSION, header, arrays, recipe)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], recipe: str | None = None) -> RigorousSpectrum:
@@ -462,27 +460,18 @@ class RigorousSpectrum:
         path = Path(path)
         header, channels = read(path, FORMAT, FORMAT_VERSION, recipe)
         try:
-            (period,), (shortest, longest) = header["period"], header["wavelengths"]
-            first = Axes(float(period), (float(shortest), float(longest)), header["steps"], header["planes"])
-            index = complex(*(float(x) for x in header["intIor"]))
-            sheet, top, tables = np.stack([channels[_channel(k)].pixels for k in range(first.planes)]), 0, []
-            for axes in axes_of(first, header["transmission"], index.real):
-                squares = []
-                for m in axes.orders:
-                    side = axes.side(m)
-                    squares.append(sheet[:, top : top + side, :side].reshape(axes.planes, side**2))
-                    top += side
-                mueller = None
-                if header["polarised"]:
-                    count = 16 * axes.nodes
-                    more = -(-count // sheet.shape[2])
-                    flat = sheet[:, top : top + more].reshape(axes.planes, -1)[:, :count]
-                    mueller = np.ascontiguousarray(flat.reshape(axes.planes, axes.nodes, 4, 4))
-                    top += more
-                tables.append(Table(axes, np.ascontiguousarray(np.concatenate(squares, axis=1)), mueller))
+            (period,), (shortest, longest), (index,) = header["period"], header["wavelengths"], header["index"]
+            steps = tuple(header[name] for name in _STEPS)
+            axes = Axes(float(period), (float(shortest), float(longest)), steps, float(index), header["transmission"])
+            mueller = None
+            if header["polarised"]:
+                found = [channels[_channel(i, j)].pixels for i, j in np.ndindex(4, 4)]
+                mueller = np.stack(found, axis=-1).reshape(*axes.shape, 4, 4)
             return cls(
-                tables=tuple(tables),
-                int_ior=index,
+                axes=axes,
+                values=np.ascontiguousarray(channels["eta"].pixels.reshape(axes.shape)),
+                mueller=mueller,
+                int_ior=complex(*(float(x) for x in header["intIor"])),
                 harmonics=header["harmonics"],
                 **{name: header[key].item() for name, key in _NUMBERS.items()},
                 **{name: header[_camel(name)] for name in _TEXTS},
@@ -493,21 +482,14 @@ class RigorousSpectrum:
             raise RequestError(f"{path}: a damaged spectrum ({one_line(error)})") from None
 
 
-def _split(x: Real, count: NDArray[np.int64] | int) -> tuple[NDArray[np.int64], Real]:
+def _split(x: Real, steps: int) -> tuple[NDArray[np.int64], Real]:
     """Return the node below x, at most the last but one, and how far x is beyond it."""
-    low = np.clip(np.floor(x).astype(np.int64), 0, np.maximum(np.asarray(count) - 2, 0))
+    low = np.clip(np.floor(x).astype(np.int64), 0, steps - 1)
     return low, x - low
 
 
-def axes_of(axes: Axes, transmission: str, index: float) -> tuple[Axes, ...]:
-    """Return those of `RigorousSpectrum.tables`, from those of the light that is reflected above."""
-    index = index if transmission == "interface" else 1.0
-    ways = WAYS[:1] if transmission == "none" else WAYS
-    return tuple(dataclasses.replace(axes, index=index, way=way) for way in ways)
-
-
-def _channel(plane: int) -> str:
-    return f"eta({plane:02d})"
+def _channel(i: int, j: int) -> str:
+    return f"m({i}{j})"
 
 
 def _camel(name: str) -> str:

@@ -17,7 +17,7 @@ from mitsuba_diffraction.rigorous.spectrum import RigorousSpectrum
 from mitsuba_diffraction.scalar_theory import fresnel
 
 SURFACE = {"profile": "blazed", "period": 0.3, "depth": 0.05, "samples": 64}
-SETTINGS = {"theory": "rigorous", "int_ior": 1.5, "wavelengths": [400.0, 500.0], "tolerance": 0.03, "polarised": True}
+SETTINGS = {"theory": "rigorous", "int_ior": 1.5, "wavelengths": [400.0, 500.0], "tolerance": 0.02, "polarised": True}
 WAVELENGTHS = (405.0, 440.0, 470.0, 498.0)
 
 

@@ -12,7 +12,7 @@ import mitsuba_diffraction as md
 from mitsuba_diffraction import gratings, rigorous
 from mitsuba_diffraction.rigorous import build
 from mitsuba_diffraction.rigorous.build import build_spectrum
-from mitsuba_diffraction.rigorous.spectrum import Axes, RigorousSpectrum
+from mitsuba_diffraction.rigorous.spectrum import Axes, RigorousSpectrum, cell_of, edges_of
 from mitsuba_diffraction.scalar_theory import fresnel
 from mitsuba_diffraction.settings import Settings
 
@@ -32,12 +32,17 @@ def hemisphere(count, seed):
 
 
 def test_the_axes_are_symmetric_and_whole_where_orders_pass_off():
-    axes = Axes(0.9, (0.36, 0.83), 8, 5)
+    axes = Axes(0.9, (0.36, 0.83), (8, 8, 4))
     assert axes.max_order == 4
-    unit, step = np.divmod(np.arange(17), 8)
-    np.testing.assert_allclose(axes.position(unit + np.sin(np.pi / 16 * step) ** 2), np.arange(17), atol=1e-6)
-    assert axes.offset(-4) == 0
-    assert axes.nodes == sum((int(np.ceil(5 - abs(m))) * 8 + 1) ** 2 for m in range(-4, 5))
+    assert axes.blocks == {(1, 0): 0, (2, 0): 1, (3, 0): 5, (4, 0): 14, (5, 0): 30}
+    a, count = np.random.default_rng(0).random((2, 99)) * [[0.5], [5.0]]
+    n = np.arange(-6, 7)
+    orders = (np.abs(n + a[:, None]) < count[:, None]).sum(axis=1)
+    np.testing.assert_array_equal(cell_of(count**2, a), orders)
+    for cell in range(1, 5):
+        begins, ends = np.sqrt(edges_of(cell, a, 0.0))
+        for edge in (begins, ends):
+            np.testing.assert_allclose(np.abs(np.abs(n[:, None] + a) - edge).min(axis=0), 0, atol=1e-9)
 
 
 @pytest.mark.slow
@@ -70,7 +75,7 @@ def test_grazing_light_is_mirrored(spectrum):
 )
 def test_a_coarse_table_holds_no_more_light_than_came(depth, material, monkeypatch):
     """Few harmonics are enough for most light, not for all."""
-    monkeypatch.setattr("mitsuba_diffraction.rigorous.build._SOLVED", (4,))
+    monkeypatch.setattr("mitsuba_diffraction.rigorous.build._SOLVED", ((3, 4, 3),))
     monkeypatch.setattr("mitsuba_diffraction.rigorous.build._CHECKS", 2)
     surface = gratings.blazed(0.5, depth, samples=256)
     with warnings.catch_warnings():
@@ -93,9 +98,7 @@ def test_a_profile_that_does_not_converge_is_refused():
 def test_a_spectrum_survives_its_file(spectrum, tmp_path):
     spectrum.save(tmp_path / "table.exr")
     loaded = RigorousSpectrum.load(tmp_path / "table.exr")
-    for ours, theirs in zip(loaded.tables, spectrum.tables, strict=True):
-        assert ours.axes == theirs.axes
-        np.testing.assert_array_equal(ours.values, theirs.values)
+    np.testing.assert_array_equal(loaded.values, spectrum.values)
     for name in ("axes", "material", "int_ior", "coherence_length", "error", "harmonics", "source", "source_digest"):
         assert getattr(loaded, name) == getattr(spectrum, name)
 
@@ -105,8 +108,7 @@ def glass(request):
     """A coarse table of light that passes, with its matrices."""
     with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        for steps in ("_SOLVED", "_SOLVED_BOTH"):
-            patch.setattr(f"mitsuba_diffraction.rigorous.build.{steps}", (4,))
+        patch.setattr("mitsuba_diffraction.rigorous.build._SOLVED", ((6, 10, 6),))
         patch.setattr("mitsuba_diffraction.rigorous.build._CHECKS", 40)
         return build_spectrum(SURFACE, replace(REQUEST, polarised=True, transmission=request.param))
 
@@ -115,10 +117,9 @@ def test_a_table_of_glass_survives_its_file(glass, tmp_path):
     glass.save(tmp_path / "glass.exr")
     loaded = RigorousSpectrum.load(tmp_path / "glass.exr")
     assert loaded.transmission == glass.transmission
-    for ours, theirs in zip(loaded.tables, glass.tables, strict=True):
-        assert ours.axes == theirs.axes
-        np.testing.assert_array_equal(ours.values, theirs.values)
-        np.testing.assert_array_equal(ours.mueller, theirs.mueller)
+    assert loaded.axes == glass.axes
+    np.testing.assert_array_equal(loaded.values, glass.values)
+    np.testing.assert_array_equal(loaded.mueller, glass.mueller)
 
 
 @settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
@@ -172,7 +173,8 @@ def test_a_sheet_with_a_flat_grating_is_a_plate():
     """All bounces: T = (1 − R)/(1 + R) of each polarisation, and R + T = 1."""
     flat = build._Surface(gratings.blazed(0.3, 0.0, samples=64), replace(REQUEST, transmission="sheet"), 0.01)
     k_0, alpha, k_y = 0.3 / 0.45, 0.3, 0.35
-    (solved,) = flat.solve(alpha, np.sqrt(k_0**2 - k_y**2), [0.45])
+    square = k_0**2 - k_y**2
+    (solved,) = flat.solve(alpha, square, [flat.light(square, 0.45)])
     ways = flat.matrices(solved)
     reflectance = np.array(fresnel(np.sqrt(1 - (alpha**2 + k_y**2) / k_0**2), 1.5))
     wanted = np.mean((1 - reflectance) / (1 + reflectance))
@@ -180,6 +182,42 @@ def test_a_sheet_with_a_flat_grating_is_a_plate():
         (place,) = np.flatnonzero(of_in == 0)
         assert (of_in == of_out).all()
         assert matrices[place, place, 0, 0] == pytest.approx(wanted if way[0] != way[1] else 1 - wanted, abs=1e-7)
+
+
+@pytest.mark.parametrize("transmission", ["interface", "sheet"])
+def test_light_beyond_k_y_zero_continues_that_of_fresnel(transmission):
+    """Nodes of γ > ν, k_y imaginary: Fresnel's formulas of β alone, real there, too; so for a plate."""
+    flat = build._Surface(gratings.blazed(0.3, 0.0, samples=64), replace(REQUEST, transmission=transmission), 0.01)
+    nu2, square, alpha = 0.4, 0.7, 0.5
+    inside = square + 1.25 * nu2
+    (solved,) = flat.solve(alpha, square, [(nu2, inside)])
+    beta, beta_inside = np.sqrt(square - alpha**2), np.sqrt(inside - alpha**2)
+    powers = np.array([((n * beta - beta_inside) / (n * beta + beta_inside)) ** 2 for n in (1, 1.5**2)])
+    wanted = np.mean(powers if transmission == "interface" else 2 * powers / (1 + powers))
+    of_in, _, matrices = flat.matrices(solved)[0, 0]
+    (place,) = np.flatnonzero(of_in == 0)
+    assert matrices[place, place, 0, 0] == pytest.approx(wanted, rel=1e-6)
+
+
+def test_light_that_is_totally_reflected_is_that_of_the_solver():
+    """Along the grooves, where none travels above: orders pass off inside only."""
+    surface, rng = gratings.blazed(0.6, 0.1, samples=64), np.random.default_rng(4)
+    request = replace(REQUEST, transmission="interface", wavelengths=(400.0, 700.0))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(build, "_CHECKS", 2)
+        table = build_spectrum(surface, request)
+    errors = []
+    for y, x, wavelength in zip(
+        rng.uniform(0.68, 0.95, 20), rng.uniform(-1, 1, 20), rng.uniform(0.4, 0.7, 20), strict=True
+    ):
+        x *= np.sqrt(1 - y**2)
+        omega = x, y, -np.sqrt(1 - x**2 - y**2)
+        exact = rigorous.efficiencies(surface, omega, wavelength, int_ior=1.5)
+        m, eta = table.efficiencies(omega, wavelength)
+        np.testing.assert_array_equal(m, exact.orders)
+        errors.append(np.abs(eta - exact.unpolarised).sum())
+    assert np.mean(errors) < 0.02
+    assert max(errors) < 0.06
 
 
 def test_a_scalar_spectrum_is_refused(spectrum, tmp_path):
@@ -215,10 +253,10 @@ def test_an_interrupted_build_goes_on(tmp_path):
 
 def test_progress_is_one_count_in_per_cent(monkeypatch):
     """Also where finer tables follow."""
-    monkeypatch.setattr("mitsuba_diffraction.rigorous.build._SOLVED", (4, 8, 16))
+    monkeypatch.setattr("mitsuba_diffraction.rigorous.build._SOLVED", ((3, 3, 3), (4, 4, 4), (5, 5, 5)))
     monkeypatch.setattr("mitsuba_diffraction.rigorous.build._CHECKS", 2)
     reports = []
-    with pytest.warns(UserWarning, match="with 16 steps to a unit"):
+    with pytest.warns(UserWarning, match="with 5 steps to a cell"):
         build_spectrum(
             gratings.sinusoidal(0.15, 0.03, samples=32),
             replace(REQUEST, tolerance=1e-4),
@@ -229,21 +267,6 @@ def test_progress_is_one_count_in_per_cent(monkeypatch):
     assert len(set(done)) > 10
     assert set(total) == {100}
     assert done[-1] == 100
-
-
-def test_light_of_a_coarser_lattice_is_not_solved_again(monkeypatch):
-    monkeypatch.setattr(build, "_CHECKS", 2)
-    scatter, counts, values = build.scatter, [], []
-    for steps in ((4, 8), (8,)):
-        solved = []
-        monkeypatch.setattr(build, "scatter", lambda *light, solved=solved: solved.append(1) or scatter(*light))
-        monkeypatch.setattr(build, "_SOLVED", steps)
-        with pytest.warns(UserWarning, match="with 8 steps to a unit"):
-            found = build_spectrum(gratings.blazed(0.15, 0.03, samples=32), replace(REQUEST, tolerance=1e-4))
-        counts.append(len(solved))
-        values.append(found.values)
-    assert counts[0] == counts[1]
-    np.testing.assert_array_equal(*values)
 
 
 def test_a_checkpoint_is_no_reason_to_fail(tmp_path):
