@@ -76,7 +76,7 @@ class RigorousOrders:
     η_m is that of the pair (ω_i, ω_o), in the coordinates of `Axes`: symmetric under exchange. N is cut off at `reach`
     standard deviations along each axis and scaled up. P_m follows η_m of light from ω_i, averaged over cells of
 
-        p = g + α = P + max(m, 0),    r = g − α = R − min(m, 0),    α = −ω_i,x ν,    g = ν √(1 − ω_i,y²),
+        p = g + α,    r = g − α,    α = −ω_i,x ν,    g = ν √(1 − ω_i,y²),
 
     and of the wavelength: in p and r the orders of one direction share one cell. Where light passes, α and g are those
     of the medium of ω_i, and each side has cells for reflected and for transmitted light.

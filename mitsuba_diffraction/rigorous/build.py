@@ -25,7 +25,17 @@ from ..progress import Progress, silent
 from ..settings import Settings
 from ..surface.heightfield import HeightField
 from .coordinate_transformation import ABOVE, BELOW, Curve, Grating, HalfSpace, Scattered, curve_of, half_space, scatter
-from .efficiencies import ODD, converge, matrices_of, one_thread, solve, through_sheet, unpolarised, wave_numbers
+from .efficiencies import (
+    ODD,
+    REVERSED,
+    converge,
+    matrices_of,
+    one_thread,
+    solve,
+    through_sheet,
+    unpolarised,
+    wave_numbers,
+)
 from .materials import refractive_index
 from .spectrum import LARGEST_PERIOD, Axes, RigorousSpectrum, edges_of, rank, shares_at
 
@@ -38,6 +48,8 @@ _Checked = tuple[float, float, float, bool, dict[tuple[int, int], tuple[NDArray[
 # Steps of F, X and (with transmission) Z that are solved, one after the other until the error is kept. Most along X, on
 # which depends by how much light that grazes the surface enters it.
 _SOLVED = ((6, 10, 6), (9, 15, 9), (12, 20, 12))
+# Where light passes. Of large periods the first are enough.
+_SOLVED_BOTH = ((4, 6, 4), *_SOLVED)
 # Steps that are stored to each of these, by cubic polynomials: linear look-ups need more nodes.
 _STORED = 2
 PLANES = 17
@@ -94,9 +106,10 @@ def build_spectrum(
         surface = _Surface(height_field, settings, tolerance)
         checks = surface.checks()
         error, done = np.inf, 0
-        for solved in _SOLVED:
+        steps = _SOLVED if settings.transmission == "none" else _SOLVED_BOTH
+        for solved in steps:
             # Half as many steps again leave less than half of the error: which table will be the last?
-            begin, done = done, 95 if error <= 2 * tolerance or solved == _SOLVED[-1] else done + 20
+            begin, done = done, 95 if error <= 2 * tolerance or solved == steps[-1] else done + 20
             build = _Build(surface, solved, settings.polarised)
             values, mueller = build.table(
                 lambda row, rows, a=begin, b=done: progress(a + (b - a) * row // rows, 100), checkpoints
@@ -127,7 +140,7 @@ def build_spectrum(
         got += f" and {spectrum.polarisation_error:.2g} of the Mueller matrices"
         wanted += f" and {MATRICES * tolerance:.2g}"
     warnings.warn(
-        f"rigorous table: got a mean error of {got} with {max(_SOLVED[-1])} steps to a cell, wanted at most {wanted}",
+        f"rigorous table: got a mean error of {got} with {max(steps[-1])} steps to a cell, wanted at most {wanted}",
         stacklevel=4,
     )
     return spectrum
@@ -385,8 +398,20 @@ class _Build:
         matrices = np.empty((*axes.shape, entries, entries), np.float32)
         f, x, z = self.steps
         refine = _cubic(f), _cubic(x), _cubic(z) if self.passes else np.eye(PLANES)
-        for block, row in enumerate(axes.blocks.values()):
+        signs = np.outer(REVERSED, REVERSED)[:entries, :entries]
+        for block, (cells, row) in enumerate(axes.blocks.items()):
             solved = np.stack([done[job] for job in range(block, len(self.jobs), blocks)])
+            for of_a, shift in ((0, 1), (-1, 0)):
+                # At a = 0 and 1/2 light and reversed light are both of the table, orders n and −n, or −n − 1.
+                orders, before = [], 0
+                for count in axes.counts(*cells):
+                    mirrored = np.maximum(((np.arange(count) + shift) ^ 1) - shift, 0)
+                    orders.append(np.where(mirrored < count, mirrored + before, -1))
+                    before += count
+                order = np.concatenate(orders)
+                back = signs * solved[of_a][np.ix_(order, order)].transpose(1, 0, 2, 3, 5, 4)
+                both = np.logical_and.outer(order >= 0, order >= 0)[..., None, None, None, None]
+                solved[of_a] = np.where(both, (solved[of_a] + back) / 2, solved[of_a])
             found = np.einsum("ax,by,cz,xnmyz...->nmabc...", *refine, solved, optimize=True)
             # Beside a kink the polynomials overshoot.
             eta = found[..., :1, :1]

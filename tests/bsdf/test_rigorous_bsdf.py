@@ -194,7 +194,7 @@ def test_surfaces_of_several_rows_are_refused(llvm):
 
 def test_the_rigorous_recipes_are_of_one_row():
     found = sorted((Path(__file__).parents[2] / "precompute" / "rigorous").glob("*.toml"))
-    assert len(found) == 5
+    assert len(found) == 6
     for recipe in map(md.Recipe.load, found):
         assert recipe.height_field().shape[0] == 1
         assert recipe.spectrum["theory"] == "rigorous"

@@ -33,7 +33,7 @@ def glass(request):
     )
     with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        patch.setattr("mitsuba_diffraction.rigorous.build._SOLVED", ((3, 4, 3),))
+        patch.setattr("mitsuba_diffraction.rigorous.build._SOLVED_BOTH", ((3, 4, 3),))
         patch.setattr("mitsuba_diffraction.rigorous.build._CHECKS", 40)
         return build_spectrum(gratings.blazed(PERIOD, 0.05, samples=64), settings)
 
