@@ -490,6 +490,8 @@ def _general_corners(furnace: Furnace, layout: Layout) -> NDArray[np.float64]:
         if index == 1:
             some = minimum_filter(lowered, (1, 3, 3, 3)).min(0) < STEEP
             rounds = int(min(PAIRS / (some.sum() * furnace.work), ROUNDS)) if some.any() else 1
+    # For what lies between the places that were tried.
+    e[e < 1] *= 1 - 2 * SLACK
     return np.maximum(e, 0)
 
 
