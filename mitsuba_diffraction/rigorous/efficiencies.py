@@ -288,7 +288,7 @@ def sheet_orders(curve: Curve, omega: Real, k_0: float, index: float, harmonics:
     Arguments are those of `solve`, of light from above.
     """
     solved = scattered(curve, omega, k_0, index, harmonics)
-    matrices = through_sheet(solved, index)[ABOVE, BELOW][:, list(solved.orders[ABOVE]).index(0), 0]
+    matrices = through_sheet(solved, index)[ABOVE, BELOW][:, list(solved.orders[ABOVE]).index(0), 0].real
     light = frames(-omega[None])[0]
     stokes = np.einsum("as,iab,bs->is", light, _PAULI, light).real
     return -solved.orders[ABOVE][::-1], (matrices @ stokes)[::-1]
