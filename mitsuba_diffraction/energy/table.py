@@ -41,7 +41,7 @@ from scipy.ndimage import minimum_filter
 
 from ..errors import RequestError
 from ..spectrum.grids import OrderGrid
-from .furnace import PHASE, Furnace, PowerSpectrum
+from .furnace import BLUR, PHASE, Furnace, PowerSpectrum
 
 SLACK = 1e-3
 """What an albedo may exceed one by."""
@@ -482,9 +482,10 @@ def _general_corners(furnace: Furnace, layout: Layout) -> NDArray[np.float64]:
         share = np.ones_like(lowered)
         share[:, some] = np.minimum(bound(np.argwhere(some) + inside) / np.maximum(got[:, some], 1e-30), 1)
         if index == rounds - 1 > 0:
-            # Other places may exceed as much as the last ones of a cell and its neighbours; where transmitted orders
-            # emerge within cells, as any of these.
-            so_far = lowered if furnace.by_order and furnace.index is not None else 1.0
+            # Other places may exceed as much as the last ones of a cell and its neighbours; where strong orders emerge
+            # within cells, transmitted ones or those of deep surfaces, as any of these.
+            deep = furnace.max_kappa * furnace.height_range * BLUR > 1
+            so_far = lowered if furnace.by_order and (deep or furnace.index is not None) else 1.0
             share = minimum_filter(so_far * share, (1, 3, 3, 3)) / np.maximum(so_far, 1e-30)
         e, lowered, index = layout.lowered(e, share), lowered * share, index + 1
         if index == 1:
