@@ -8,8 +8,9 @@ divided by √R in the frequency domain, denoised, and multiplied by √R again.
 from __future__ import annotations
 
 import os
+import re
 from dataclasses import dataclass
-from xml.etree import ElementTree
+from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
@@ -42,8 +43,10 @@ class Guides:
 
 def is_asked_for(scene: str | os.PathLike[str]) -> bool:
     """Return whether an XML scene has `<default name="denoise" value="true"/>`, of which Mitsuba takes no notice."""
-    defaults = {each.get("name"): each.get("value") for each in ElementTree.parse(scene).iter("default")}
-    value = defaults.get("denoise", "false")
+    # Mitsuba reads scenes that XML parsers refuse, such as those with "--" in a comment.
+    text = re.sub(r"<!--.*?-->", "", Path(scene).read_text(encoding="utf-8", errors="replace"), flags=re.DOTALL)
+    tags = (dict(re.findall(r"""(\w+)\s*=\s*["'](.*?)["']""", tag)) for tag in re.findall(r"<default\b([^>]*)>", text))
+    value = {tag.get("name"): tag.get("value") for tag in tags}.get("denoise", "false")
     if value not in ("true", "false"):
         raise RequestError(f"{os.fspath(scene)}: denoise: got {value!r}, wanted true or false")
     return value == "true"
