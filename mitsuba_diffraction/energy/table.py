@@ -252,7 +252,7 @@ class EnergyTable:
             layouts: as of `layouts_of`.
         """
         furnaces = [Furnace.of(spectrum, height_scale, index, side) for side in (1, -1)]
-        layouts = layouts or layouts_of(spectrum, index, height_scale)
+        layouts = layouts or [Layout.of(spectrum, furnace) for furnace in furnaces]
         pairs = zip(furnaces, layouts, strict=True)
         return [table for furnace, layout in pairs for table in cls._of_side(spectrum, furnace, layout)]
 
