@@ -17,6 +17,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..energy.table import EnergyTable
+from .geometry import cell_of, on_square
 from .tables import FloatTable, NumberTable, PacketTable, larger, limited, opaque, smaller
 
 
@@ -114,17 +115,15 @@ class Energy:
 
     def place(self, omega: mi.Vector3f) -> Place:
         """Return the place of ω, along the pattern's axes."""
-        x, y = (omega.y, omega.x) if self.layout.turned else (omega.x, omega.y)
         z = dr.abs(omega.z) if self.two_sided else larger(omega.z, 0)
         if self.layout.lines:
+            x = omega.y if self.layout.turned else omega.x
             longer = dr.sqrt(dr.square(x) + dr.square(z)) + dr.abs(x)
             # c − |x| without cancellation.
             shorter = dr.square(z) / larger(longer, 1e-12)
             u, v = dr.select(x > 0, shorter, longer), dr.select(x > 0, longer, shorter)
         else:
-            t = dr.sqrt(limited(1 - dr.sqrt(larger(1 - z, 0)), 0, 1))
-            along = (1 - t) / larger(dr.abs(x) + dr.abs(y), 1e-12)
-            u, v = (0.5 * self.first_cells * (1 + along * of) for of in (x + y, x - y))
+            u, v = (self.first_cells * place for place in on_square(mi.Vector3f(omega.x, omega.y, z)))
         return Place(u, v, omega.z < 0)
 
     def bound(self, place: Place, frequency: mi.Float, passes: mi.Bool | None = None) -> mi.Float:
@@ -147,11 +146,11 @@ class Energy:
             (column, x), (row, y) = (self._column(u * (self.period * frequency)) for u in (place.u, place.v))
             index = row * self.side + column
         else:
-            (column, x), (row, y) = (_cell(u, self.first_cells) for u in (place.u, place.v))
+            (column, x), (row, y) = (cell_of(u, self.first_cells) for u in (place.u, place.v))
             first, last = (
                 self.frequencies if place.ratio is None else [nu(place.ratio, True) for nu in self.frequencies]
             )
-            below, beyond = _cell((frequency - first) / (last - first) * (self.slices - 1), self.slices - 1)
+            below, beyond = cell_of((frequency - first) / (last - first) * (self.slices - 1), self.slices - 1)
             index = (below * self.side + row) * self.side + column
         if number is not None:
             index += number * self.cells_of_table
@@ -173,7 +172,7 @@ class Energy:
         square = smaller(dr.floor(u), self.squares)
         inner = square > 0
         cells = dr.select(inner, self.cells, self.first_cells)
-        cell, x = _cell(_equidistant(u - square) * cells, cells)
+        cell, x = cell_of(_equidistant(u - square) * cells, cells)
         start = dr.select(inner, dr.fma(square - 1, self.cells, self.first_cells), 0)
         return cell + mi.UInt32(start), x
 
@@ -185,10 +184,3 @@ def _equidistant(f: mi.Float) -> mi.Float:
 
 def _bytes(number: mi.UInt32) -> mi.Vector4f:
     return mi.Vector4f(*(mi.Float(mi.Int32((number >> shift) & 255)) for shift in range(0, 32, 8)))
-
-
-def _cell(x: mi.Float, count: mi.Float | int) -> tuple[mi.UInt32, mi.Float]:
-    """Return the cell of x, 0 ≤ x ≤ count, and the place in it; outside, the nearest."""
-    x = limited(x, 0, count)
-    cell = dr.minimum(mi.UInt32(x), mi.UInt32(count) - 1)
-    return cell, x - mi.Float(cell)

@@ -230,6 +230,20 @@ def turned(omega: mi.Vector3f, sin: mi.Float, cos: mi.Float) -> mi.Vector3f:
     return mi.Vector3f(cos * omega.x + sin * omega.y, cos * omega.y - sin * omega.x, omega.z)
 
 
+def on_square(omega: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
+    """Return column and row of ω on the square of `energy/table.py`, from 0 to 1, on whichever side it is."""
+    t = dr.sqrt(limited(1 - dr.sqrt(larger(1 - dr.abs(omega.z), 0)), 0, 1))
+    along = (1 - t) / larger(dr.abs(omega.x) + dr.abs(omega.y), 1e-12)
+    return tuple(0.5 * (1 + along * of) for of in (omega.x + omega.y, omega.x - omega.y))
+
+
+def cell_of(x: mi.Float, count: mi.Float | int) -> tuple[mi.UInt32, mi.Float]:
+    """Return the cell of x, 0 ≤ x ≤ count, and the place in it; outside, the nearest."""
+    x = limited(x, 0, count)
+    cell = dr.minimum(mi.UInt32(x), mi.UInt32(count) - 1)
+    return cell, x - mi.Float(cell)
+
+
 def _d(square: mi.Float, w: mi.Float) -> mi.Float:
     """Return D = 1 + ω_i·ω_o = (u² + v² + w²)/2, from u² + v².
 

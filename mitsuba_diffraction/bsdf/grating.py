@@ -13,8 +13,11 @@ from ..rigorous.spectrum import RigorousSpectrum
 from .energy import Place
 from .geometry import Geometry, Incidence, turned
 from .media import Media
+from .orders import OrderSpectrum
 from .polarisation import reflected, through_layer
+from .rigorous_orders import RigorousOrders
 from .scales import Scales, check_texture
+from .spline_spectrum import SplineSpectrum
 from .surface import surface_from, warn_of_range
 from .tables import BELOW_ONE, larger, limited, opaque, smaller
 from .theories import RigorousTheory, ScalarTheory
@@ -48,7 +51,6 @@ class Grating:
             self.theory = RigorousTheory(props, self.spectrum, media)
         else:
             self.theory = ScalarTheory(props, self.spectrum, media, self.scales)
-        self.scattering = self.theory.scattering
         angle = props.get("orientation", 0.0)
         if isinstance(angle, float) and not np.isfinite(angle):
             raise RequestError(f"orientation: got {angle}, wanted degrees or a texture")
@@ -56,6 +58,11 @@ class Grating:
         check_texture("orientation", self.orientation)
         # The spectrum says nothing beyond its largest angle: there the grating is black.
         self.least_cosine = opaque(np.cos(np.deg2rad(self.spectrum.largest_angle)) * (1 - 1e-6))
+
+    @property
+    def scattering(self) -> OrderSpectrum | SplineSpectrum | RigorousOrders:
+        """K G S cos θ_o and its sampler."""
+        return self.theory.scattering
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         callback.put("orientation", self.orientation, mi.ParamFlags.Differentiable)

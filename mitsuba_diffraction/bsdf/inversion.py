@@ -54,31 +54,12 @@ def averages(spectrum: GratingSpectrum, cells: KappaCells, floor: float = 0.0) -
     return (1 - floor) * means + floor / means[0].size
 
 
-def diffracted_averages(
-    spectrum: GratingSpectrum, cells: KappaCells, floor: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return as `averages` the means of κ_j²/κ² c_m over each cell, κ_j its end, without m = 0; and their sums.
-
-    K of transmitted light varies as 1/κ² with the direction into which an order goes, so that in the last cell, where
-    reflected light has its κ, the factor is left out.
-    """
-    means, middle = [], tuple(n // 2 for n in spectrum.grid.shape)
-    for cell, ends in enumerate(zip(cells.ends[:-1], cells.ends[1:], strict=True)):
-        mean = _average(spectrum, *ends, 0 if cell == CELLS - 1 else 2, scaled=False)
-        mean[middle] = 0
-        means.append(np.maximum(mean, 0))
-    sums = np.maximum([mean.sum() for mean in means], 1e-6)
-    return np.stack([(1 - floor) * m / s + floor / m.size for m, s in zip(means, sums, strict=True)]), sums
-
-
-def _average(
-    spectrum: GratingSpectrum, first: float, end: float, power: int = 0, scaled: bool = True
-) -> NDArray[np.float64]:
+def _average(spectrum: GratingSpectrum, first: float, end: float) -> NDArray[np.float64]:
     # The powers oscillate in κ with the angular frequency of the height range at most.
     points = int(np.ceil((end - first) * spectrum.height_range)) + 2
     nodes = first + (np.arange(points) + 0.5) / points * (end - first)
-    total = sum((end / kappa) ** power * spectrum.powers(kappa).astype(np.float64) for kappa in nodes)
-    return total / (total.sum() if scaled else points)
+    total = sum(spectrum.powers(kappa).astype(np.float64) for kappa in nodes)
+    return total / total.sum()
 
 
 def choose(shares: mi.Vector4f, u: mi.Float) -> tuple[mi.UInt32, mi.Float]:

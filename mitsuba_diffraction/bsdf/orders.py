@@ -9,6 +9,7 @@ the sum of A_jm over the rectangle. A one-row grating has the exact interval: wi
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 
 import drjit as dr
@@ -21,10 +22,9 @@ from ..spectrum.grids import LobeAxis
 from ..spectrum.tables import HALF_SCALE, SeriesTable, SliceTable, shared_exponents
 from .cell_sampler import LOBE, CellAxis, CellSampler
 from .geometry import Geometry, Incidence, scaled
-from .inversion import CELLS, KappaCells, averages, choose, diffracted_averages, search, sums_before, truncated_gaussian
+from .inversion import CELLS, KappaCells, averages, choose, search, sums_before, truncated_gaussian
+from .order_table import OrderTable
 from .tables import (
-    BELOW_ONE,
-    FloatTable,
     HalfTable,
     PacketTable,
     SharedExponentTable,
@@ -249,7 +249,6 @@ def _weights(table: SeriesTable) -> np.ndarray:
 
 
 FLOOR = 0.05  # the share of each κ cell that all orders have alike
-STEPS = 256  # over κ, in the table of the undiffracted order
 WHOLE = 2**24  # a float32 holds whole numbers up to here
 MAX_TABLE = 2**19  # packets (8 MB); where the sums over rectangles take more, all orders can be drawn
 
@@ -259,30 +258,15 @@ class OrderSampler:
 
     The A_jm are whole numbers of units 2⁻²⁴, so that sums over rectangles are exact: the probability of what is drawn
     is the probability that is reported.
-
-    Where light passes the grating, the undiffracted order is drawn by itself, as its κ is known; the others with
-    `diffracted_averages`, w_j times the sum over the orders and κ_0²/κ_j² of transmitted light.
     """
 
-    def __init__(self, spectrum: GratingSpectrum, most: float | None = None) -> None:
-        self.cells = KappaCells(spectrum.max_kappa, most)
+    def __init__(self, spectrum: GratingSpectrum) -> None:
+        self.cells = KappaCells(spectrum.max_kappa)
         self.rows, self.columns = spectrum.grid.shape
         self.max_order_x, self.max_order_y = spectrum.grid.max_order
         self.tile_x, self.tile_y = (opaque(t) for t in spectrum.grid.tile_size)
         self.restricted = (self.max_order_x + 1) ** 2 * (self.rows + 1) <= MAX_TABLE
-        self.undiffracted = None
-        if most is None:
-            shares = averages(spectrum, self.cells, FLOOR)
-        else:
-            shares, sums = diffracted_averages(spectrum, self.cells, FLOOR)
-            squares = self.cells.ends[1:] ** 2
-            self.sums, self.raised_sums = (mi.Vector4f(*map(float, s / WHOLE)) for s in (sums, sums / squares))
-            dr.make_opaque(self.sums, self.raised_sums)
-            kappas = np.linspace(0, spectrum.max_kappa, STEPS + 1)
-            middle = tuple(n // 2 for n in spectrum.grid.shape)
-            self.undiffracted = FloatTable(np.array([max(spectrum.powers(kappa)[middle], 0) for kappa in kappas]))
-            self.per_kappa = opaque(STEPS / spectrum.max_kappa)
-        units = np.stack([_units(average) for average in shares], axis=-1)
+        units = np.stack([_units(average) for average in averages(spectrum, self.cells, FLOOR)], axis=-1)
         self.shares = PacketTable(units)
         # The sums of A_j over the columns before x, for each row.
         before_x = np.zeros((self.rows, self.columns + 1, CELLS), np.int64)
@@ -321,30 +305,6 @@ class OrderSampler:
         # The mirror order m = 0 is always among them.
         return dr.clip(first, -max_order, 0) + max_order, dr.clip(last, 0, max_order) + (max_order + 1)
 
-    def _weights(self, incidence: Incidence, active: mi.Bool) -> tuple[mi.Vector4f, mi.Float]:
-        """Return w_j and the power of the undiffracted order where it is drawn by itself, else zero; not normalised."""
-        weights = self.cells.weights(incidence)
-        if self.undiffracted is None:
-            return weights, mi.Float(0.0)
-        kappa = incidence.undiffracted
-        step = dr.minimum(mi.UInt32(dr.fma(kappa, self.per_kappa, 0.5)), STEPS)
-        sums = dr.select(incidence.reflects, self.sums, dr.square(kappa) * self.raised_sums)
-        undiffracted = dr.select(incidence.square > 0, larger(self.undiffracted(step, active), 1e-3), 0)
-        return weights * sums, undiffracted
-
-    def weights(self, incidence: Incidence, active: mi.Bool) -> tuple[mi.Vector4f, mi.Float]:
-        """Return w_j / (P_0 + Σ_j w_j M_j) and P_0 / (P_0 + Σ_j w_j M_j) for one wavelength.
-
-        Args:
-            incidence: the wavelength and where it comes from.
-            active: mask.
-        """
-        weights, undiffracted = self._weights(incidence, active)
-        bottom, top, left, right = self.rectangle(incidence)
-        total = undiffracted + dr.dot(weights, self._masses(bottom, top, self._start(left, right), active))
-        per = dr.rcp(larger(total, 1e-7))
-        return weights * per, undiffracted * per
-
     def _start(self, left: mi.Int32, right: mi.Int32) -> mi.Int32:
         """Return where the sums over the rows begin in their table."""
         if not self.restricted:
@@ -356,12 +316,13 @@ class OrderSampler:
         masses = self.before_y(mi.UInt32(start + top), active)
         return masses - self.before_y(mi.UInt32(start + bottom), active) if self.rows > 1 else masses
 
-    def share(self, order: mi.UInt32, weights: tuple[mi.Vector4f, mi.Float], active: mi.Bool) -> mi.Float:
-        """Return P_m of the order with flat index `order`, which is among those of the rectangle."""
-        share = dr.dot(self.shares(order, active), weights[0])
-        if self.undiffracted is None:
-            return share
-        return share + dr.select(order == self.max_order_y * self.columns + self.max_order_x, weights[1], 0)
+    def share(self, m_x: mi.Int32, m_y: mi.Int32, incidence: Incidence, active: mi.Bool) -> mi.Float:
+        """Return P_m of an order that is among those of the rectangle, for one wavelength."""
+        bottom, top, left, right = self.rectangle(incidence)
+        weights = self.cells.weights(incidence)
+        total = dr.dot(weights, self._masses(bottom, top, self._start(left, right), active))
+        order = mi.UInt32((m_y + self.max_order_y) * self.columns + m_x + self.max_order_x)
+        return dr.dot(self.shares(order, active), weights) * dr.rcp(larger(total, 1e-7))
 
     def sample(
         self,
@@ -370,23 +331,16 @@ class OrderSampler:
         v: mi.Point2f,
         active: mi.Bool,
     ) -> tuple[mi.Int32, mi.Int32, mi.Point2f]:
-        """Draw an order for one wavelength; the arguments are those of `weights`.
+        """Draw an order for one wavelength.
 
         κ cell and row come from `u`, the column from `v` where there are several rows.
 
         Returns:
-            Its row and column, and what is left of `v`: two numbers uniform in [0, 1).
+            The order, and what is left of `v`: two numbers uniform in [0, 1).
         """
         bottom, top, left, right = self.rectangle(incidence)
         start = self._start(left, right)
-        masses = self._masses(bottom, top, start, active)
-        weights, undiffracted = self._weights(incidence, active)
-        shares = weights * masses
-        if self.undiffracted is not None:
-            share = undiffracted / larger(undiffracted + dr.sum(shares), 1e-7)
-            is_undiffracted = u < share
-            u = limited((u - share) / larger(1 - share, 1e-7), 0, BELOW_ONE)
-        cell, u = choose(shares, u)
+        cell, u = choose(self.cells.weights(incidence) * self._masses(bottom, top, start, active), u)
 
         def before_y(y: mi.Int32) -> mi.Float:
             return self.before_y.entry(mi.UInt32(start + y), cell, active)
@@ -400,11 +354,8 @@ class OrderSampler:
         else:
             row, _ = search(before_y, bottom, top, self.rows, u)
             column, rest = search(before_x, left, right, self.columns, v.x)
-            v = mi.Point2f(rest if self.undiffracted is None else dr.select(is_undiffracted, v.x, rest), v.y)
-        if self.undiffracted is not None:
-            row = dr.select(is_undiffracted, self.max_order_y, row)
-            column = dr.select(is_undiffracted, self.max_order_x, column)
-        return row, column, v
+            v = mi.Point2f(rest, v.y)
+        return column - self.max_order_x, row - self.max_order_y, v
 
 
 def _units(average: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -543,9 +494,16 @@ class OrderSpectrum:
         self.cells = None
         if not self.resolved:
             self.cells = LineSampler(spectrum, most) if line else CellSampler(spectrum, most, farthest)
-        self.orders = OrderSampler(spectrum, most) if self.resolved else None
-        self.columns, self.line = grid.shape[1], line
+        # Where light passes, orders are drawn from an `OrderTable`, which needs the scales of a scene.
+        self.orders = OrderSampler(spectrum) if self.resolved and most is None else None
+        self.line = line
         self.per_width = opaque(1 / sigma)
+
+    def drawn_from(self, orders: OrderTable) -> OrderSpectrum:
+        """Return the same spectrum, of which orders are drawn from a table."""
+        result = copy.copy(self)
+        result.orders = orders
+        return result
 
     @property
     def max_scale(self) -> float | None:
@@ -643,8 +601,7 @@ class OrderSpectrum:
         if incidence.mirrored is not None:
             m_x, m_y = (mi.Int32(incidence.mirrored) * m for m in (m_x, m_y))
             tangent = incidence.mirrored * tangent
-        order = mi.UInt32((m_y + self.axes[1].max_order) * self.columns + m_x + self.axes[0].max_order)
-        share = self.orders.share(order, self.orders.weights(incidence, near), near)
+        share = self.orders.share(m_x, m_y, incidence, near)
         # An order that does not propagate is not drawn.
         there = incidence.propagates(tangent)
         return power, dr.select(there, share * lobes_x[0] * lobes_y[0], 0)
@@ -660,10 +617,9 @@ class OrderSpectrum:
         """Draw q in cycles/µm, for one wavelength, and tell whether the order of q propagates; `scale` is lateral."""
         if self.cells is not None:
             return self.cells.sample(incidence, u, v, active), active
-        row, column, v = self.orders.sample(incidence, u, v, active)
-        m_x, m_y = column - self.axes[0].max_order, row - self.axes[1].max_order
+        m_x, m_y, v = self.orders.sample(incidence, u, v, active)
         tangent = self._tangent(m_x, m_y, incidence.wavelength if scale is None else incidence.wavelength / scale)
-        q = mi.Point2f(self.axes[0].place(column, v.x, scale), self.axes[1].place(row, v.y, scale))
+        q = mi.Point2f(self.axes[0].place(m_x, v.x, scale), self.axes[1].place(m_y, v.y, scale))
         return q, incidence.propagates(tangent)
 
 
@@ -714,7 +670,7 @@ class _Axis:
             lobes.append(lobe * step)
         return lobes
 
-    def place(self, node: mi.Int32, u: mi.Float, scale: mi.Float | None = None) -> mi.Float:
-        """Return the q in the lobe of the order at a row or column with the share `u` of it below, cycles/µm."""
+    def place(self, m: mi.Int32, u: mi.Float, scale: mi.Float | None = None) -> mi.Float:
+        """Return the q in the lobe of an order with the share `u` of it below, cycles/µm."""
         pitch = self.pitch if scale is None else self.pitch / scale
-        return dr.fma(pitch, mi.Float(node) - self.max_order, truncated_gaussian(u, self.inside, self.spread))
+        return dr.fma(pitch, mi.Float(m), truncated_gaussian(u, self.inside, self.spread))

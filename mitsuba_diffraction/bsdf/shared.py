@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import threading
 import weakref
 from collections.abc import Sequence
@@ -15,23 +14,21 @@ from numpy.typing import NDArray
 
 from ..energy.furnace import Furnace
 from ..energy.table import EnergyTable, Layout, Stretched, between, corners, layouts_of
-from ..grating_spectrum import GratingSpectrum
 from ..precomputation import Spectrum
 from ..rigorous.spectrum import RigorousSpectrum
 from ..settings import VISIBLE
 from ..spectrum.grids import OrderGrid
-from .cell_sampler import of_azimuth
 from .energy import Energy
+from .order_table import OrderTable
 from .orders import OrderSpectrum
 from .rigorous_orders import RigorousOrders
+from .scales import Scales
 from .spline_spectrum import SplineSpectrum
-from .tables import FloatTable
-from .transmission import AZIMUTHS, COSINES
 
 STEP = 1e-3  # of height_scale, for the derivative of the energy table
 TURN = 0.25  # radians between tables over the ratio of scales
+RATIOS = 3  # of scales that vary, for which orders are drawn
 PARTS = 16  # of an interval of ratios, at most
-AVERAGED = (0.45, 0.6)  # µm, of the share of transmitted light
 
 _making = threading.Lock()
 _shared: weakref.WeakValueDictionary[tuple[str, str, float | None], SharedTables] = weakref.WeakValueDictionary()
@@ -52,12 +49,8 @@ class SharedTables:
             self.scattering = represented(spectrum, *([] if eta is None else passing(eta)))
         self._spectrum, self._eta = spectrum, eta
         self._last: tuple[float, Energy | None] | None = None
+        self._orders: tuple[tuple, OrderTable] | None = None
         self._lock = threading.Lock()
-
-    @functools.cached_property
-    def transmitted(self) -> FloatTable:
-        """`Interface.shares`."""
-        return FloatTable(transmitted_shares(self._spectrum, self._eta))
 
     @classmethod
     def of(cls, spectrum: Spectrum, eta: float | None = None) -> SharedTables:
@@ -73,6 +66,19 @@ class SharedTables:
             if tables is None:
                 tables = _shared[key] = cls(spectrum, eta)
             return tables
+
+    def order_table(self, is_sheet: bool, scales: Scales) -> OrderTable | None:
+        """Return the table from which orders are drawn where light passes; None where they overlap."""
+        if not self.scattering.resolved:
+            return None
+        ratios, laterals, complete = scales.ratios()
+        if not complete:
+            ratios = np.linspace(*ratios, RATIOS)
+        key = is_sheet, ratios.tolist(), float(laterals.min())
+        with self._lock:
+            if self._orders is None or self._orders[0] != key:
+                self._orders = key, OrderTable(self._spectrum, self._eta, *key)
+            return self._orders[1]
 
     def energy(self, height_scale: mi.Float) -> Energy | None:
         """Return the factor E, or None if it is one for all directions and wavelengths.
@@ -141,23 +147,6 @@ class SharedTables:
     def corners(self, table: EnergyTable, height_scale: float) -> np.ndarray:
         """Return e at the corners of the cells of `table`, not rounded, for other heights."""
         return corners(Furnace.of(self._spectrum, height_scale), table.layout)[0]
-
-
-def transmitted_shares(spectrum: GratingSpectrum, eta: float) -> NDArray[np.float64]:
-    """Return T/(R + T) of light from above and from below, the mean over wavelengths, as of `Interface.shares`.
-
-    Without E, and of the heights and the index that the scene begins with: another share costs noise, but no light.
-    """
-    cos, place, length = np.meshgrid(
-        (np.arange(COSINES) + 0.5) / COSINES, (np.arange(AZIMUTHS) + 0.5) * 4 / AZIMUTHS - 2, AVERAGED, indexing="ij"
-    )
-    angle, sin, result = of_azimuth(place), np.sqrt(1 - cos**2), []
-    omega = np.stack([sin * np.cos(angle), sin * np.sin(angle), cos], -1).reshape(-1, 3)
-    for side, n in ((1, 1.0), (-1, eta)):
-        found = Furnace.of(spectrum, 1.0, eta, side).albedo(omega, length.ravel() / n)
-        found = found.reshape(2, COSINES, AZIMUTHS, -1).mean(-1)
-        result.append(found[1] / np.maximum(found.sum(0), 1e-9))
-    return np.array(result)
 
 
 def passing(eta: float) -> tuple[float, float]:

@@ -109,8 +109,10 @@ class ScalarTheory:
         if self.media.eta is not None:
             kappas = tuple(opaque(kappa) for kappa in small_kappas(self.spectrum, self.media.eta))
             is_sheet = self.media.transmission == "sheet"
-            shares = None if is_sheet else self.tables.transmitted
-            self.interface = Interface(self.material.eta, is_sheet, kappas, shares)
+            share, orders = None, self.tables.order_table(is_sheet, scales)
+            if orders is not None:
+                self.scattering, share = self.tables.scattering.drawn_from(orders), orders.transmitted
+            self.interface = Interface(self.material.eta, is_sheet, kappas, share)
 
     def parameters_changed(self, keys: list[str]) -> None:
         """Recompute what depends on the parameters `keys`; on all of them if none is named."""

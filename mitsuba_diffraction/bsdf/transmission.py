@@ -24,14 +24,14 @@ those outside, normal components those inside.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 
-from .cell_sampler import azimuth
 from .geometry import horizon_gain
-from .tables import FloatTable, larger, limited, smaller
+from .tables import larger, limited, smaller
 
 
 # Not frozen: Dr.Jit rebuilds what enters a branch field by field.
@@ -68,10 +68,9 @@ class Side:
         return self.sign * self.normal(self.square)
 
 
-# Of the samples, on either side: where the share is estimated; where it is that of a plane; of rigorous theory, as fine
+# Of the samples, on either side: where the share is tabulated; where it is that of a plane; of rigorous theory, as fine
 # gratings are far from a plane.
-LEAST_INTERFACE, LEAST_SHEET, LEAST_RIGOROUS = 0.05, 0.1, 0.2
-COSINES, AZIMUTHS = 32, 8  # cells of directions for which the share is estimated
+LEAST_TABULATED, LEAST_PLANE, LEAST_RIGOROUS = 0.05, 0.1, 0.2
 
 
 class Interface:
@@ -83,8 +82,8 @@ class Interface:
         kappas: a quarter of the table's first interval of κ, where its error weighs as little as that of the line, and
             the least κ of the undiffracted order of the heights as they are; rad/µm. None of rigorous theory, whose
             tables are read at q whatever the sign of κ, and hold the flat face of a sheet.
-        shares: T/(R + T) of light from above and from below, in cells of cos θ_i and azimuth, (2, `COSINES`,
-            `AZIMUTHS`); None where that of a plane serves, as of a sheet, which keeps much of what is reflected inside.
+        share: of samples that pass, for a direction along the pattern's axes, where orders are drawn from an
+            `OrderTable`; None of rigorous theory and where orders overlap, for which that of a plane serves.
     """
 
     def __init__(
@@ -92,9 +91,9 @@ class Interface:
         eta: mi.Float,
         is_sheet: bool,
         kappas: tuple[mi.Float, mi.Float] | None = None,
-        shares: FloatTable | None = None,
+        share: Callable[[mi.Vector3f], mi.Float] | None = None,
     ) -> None:
-        self.eta, self.is_sheet, self.kappas, self.shares = eta, is_sheet, kappas, shares
+        self.eta, self.is_sheet, self.kappas, self.share = eta, is_sheet, kappas, share
         self.update()
 
     def update(self) -> None:
@@ -107,6 +106,11 @@ class Interface:
             return None
         first, undiffracted = self.kappas
         return smaller(first, larger(undiffracted * dr.detach(height_scale), 1e-6))
+
+    @property
+    def mirrors(self) -> bool:
+        """Whether −q is drawn where κ is taken for negative: where orders overlap."""
+        return self.kappas is not None and self.share is None
 
     @property
     def has_flat_face(self) -> bool:
@@ -131,15 +135,12 @@ class Interface:
 
     def transmitted(self, omega: mi.Vector3f) -> mi.Float:
         """Estimate which share of scattered light is transmitted, for samples; ω along the pattern's axes."""
-        if self.shares is None:
-            # Inside of a sheet there is no total reflection.
-            reflected = mi.fresnel(dr.abs(omega.z) if self.is_sheet else omega.z, self.eta)[0]
-            least = LEAST_RIGOROUS if self.kappas is None else LEAST_SHEET
-            return limited(1 - reflected, least, 1 - least)
-        cell = mi.UInt32(smaller(dr.abs(omega.z) * COSINES, COSINES - 1))
-        cell = dr.select(omega.z > 0, cell, cell + COSINES)
-        around = mi.UInt32(smaller((azimuth(omega.x, omega.y) + 2) * (AZIMUTHS / 4), AZIMUTHS - 1))
-        return limited(self.shares(cell * AZIMUTHS + around, True), LEAST_INTERFACE, 1 - LEAST_INTERFACE)
+        if self.share is not None:
+            return limited(self.share(omega), LEAST_TABULATED, 1 - LEAST_TABULATED)
+        # Inside of a sheet there is no total reflection.
+        reflected = mi.fresnel(dr.abs(omega.z) if self.is_sheet else omega.z, self.eta)[0]
+        least = LEAST_RIGOROUS if self.kappas is None else LEAST_PLANE
+        return limited(1 - reflected, least, 1 - least)
 
     def flat(self, omega: mi.Vector3f) -> mi.Float:
         """Return the transmittance of the flat face of a sheet, one above."""
@@ -276,10 +277,10 @@ class CrossingIncidence:
     """One wavelength from one direction that is reflected or passes; with what samplers ask of `geometry.Incidence`.
 
     κ of reflected light is positive above and negative below; that of transmitted light is taken for negative, as it
-    is of all but steeply diffracted light. Where it is negative, −q is drawn; not of rigorous theory.
+    is of all but steeply diffracted light. Where it is negative and orders overlap, −q is drawn.
 
     Attributes:
-        wi: k_i,∥, or its opposite where −q is drawn; z is not used.
+        wi: k_i,∥, or its opposite where −q is drawn; |cos θ_i| outside.
         wavelength: λ above, µm.
         frequency: 1/λ above.
         lateral_frequency: 1/λ times the lateral scale: q of the table per λq.
@@ -290,7 +291,6 @@ class CrossingIncidence:
         mirrored: what takes the q that is read to the one that was drawn, 1 or −1.
         square: n_o² − |k_i,∥|².
         per_kappa: |v_z| for one rad/µm.
-        undiffracted: κ of the undiffracted order, rad/µm.
         near: the least |v_z| of light that leaves with 0.7 to 1 of the k_z of that order, and what is 1 over the range.
         come: |k_i,z|.
         leaves: |k_o,z| of light along the horizon and along the normal, and what is 1 over that range.
@@ -308,7 +308,6 @@ class CrossingIncidence:
     mirrored: mi.Float
     square: mi.Float
     per_kappa: mi.Float
-    undiffracted: mi.Float
     near: tuple[mi.Float, mi.Float]
     come: mi.Float
     leaves: tuple[mi.Float, mi.Float, mi.Float]
@@ -325,7 +324,6 @@ class CrossingIncidence:
             lateral_frequency=self.lateral_frequency * frequency,
             radius=self.radius * frequency,
             per_kappa=self.per_kappa * wavelength,
-            undiffracted=self.undiffracted * frequency,
         )
 
     @classmethod
@@ -344,7 +342,7 @@ class CrossingIncidence:
         """
         reflects = i.sign == o.sign
         assumed = dr.select(reflects & (i.sign > 0), mi.Float(1), -1)
-        if interface.kappas is None:
+        if not interface.mirrors:
             assumed = mi.Float(1.0)
         square = dr.square(o.outside) - dr.square(i.outside) + i.square
         radius = o.outside
@@ -357,7 +355,7 @@ class CrossingIncidence:
         lateral = mi.Float(1.0) if lateral_scale is None else lateral_scale
         per_v = larger(dr.two_pi * height_scale, 1e-6)
         values = (
-            mi.Vector3f(assumed * i.tangent.x, assumed * i.tangent.y, 0),
+            mi.Vector3f(assumed * i.tangent.x, assumed * i.tangent.y, dr.sqrt(i.square) / i.outside),
             mi.Float(1.0),
             mi.Float(1.0),
             lateral,
@@ -368,7 +366,6 @@ class CrossingIncidence:
             assumed if flip is None else assumed * flip,
             square,
             dr.rcp(per_v),
-            undiffracted * per_v,
             near,
             dr.abs(i.z),
             (horizon, normal, dr.rcp(larger(normal - horizon, 1e-3))),

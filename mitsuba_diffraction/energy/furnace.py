@@ -195,8 +195,8 @@ class Furnace:
         # Neighbours reach about the same components.
         for some in np.array_split(np.arange(len(directions)), 1 + len(directions) * len(self.q) // (8 * CHUNK)):
             for way in self.ways:
-                sent = self._sent(directions[some, :2], np.abs(directions[some, 2]), wavelengths[some], way)
-                result[abs(way), some] += sent
+                place, _, value = self.sent(directions[some], wavelengths[some], way)
+                result[abs(way), some] += np.bincount(place, value, len(some))
         return result
 
     @property
@@ -211,10 +211,14 @@ class Furnace:
         """0, light is reflected; ±1, it is transmitted with that sign of v_z, where there is a medium below."""
         return (0,) if self.index is None else (0, 1, -1)
 
-    def _sent(
-        self, s: NDArray[np.float64], cos_i: NDArray[np.float64], length: NDArray[np.float64], way: int
-    ) -> NDArray[np.float64]:
-        """Compute the part of a that goes one way."""
+    def sent(
+        self, directions: NDArray[np.float64], length: NDArray[np.float64], way: int
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+        """Compute what components add to `albedo` where light goes one way: place, component and value of each.
+
+        Component j sends light from ω to −ω_t − λ q_j, or, with the way −1, to −ω_t + λ q_j, in units of n_i.
+        """
+        s, cos_i = directions[:, :2], np.abs(directions[:, 2])
         q, index = self.q * (way or 1), (way and self.index) or 1.0
         edge = 0.0 if self.by_order else REACH * self.widths
         middle, mean = s.mean(0), (length.min() + length.max()) / 2
@@ -243,7 +247,7 @@ class Furnace:
         value = self._factor(cos_i[at], cos_o, length[at], tangent, way)
         value = value * self._power(partial(self.power, component, way=way), cos_i[at], cos_o, length[at], way)
         near = self._lobes(s, cos_i, length, i[~far], j[~far], square[~far], way)
-        return np.bincount(np.append(at, i[~far]), np.append(value, near), len(s)).astype(np.float64)
+        return np.append(at, i[~far]), np.append(component, j[~far]), np.append(value, near).astype(np.float64)
 
     def _far(
         self, square: NDArray[np.float64], sigma: NDArray[np.float64], length: NDArray[np.float64], way: int

@@ -329,18 +329,19 @@ def test_orders_are_drawn_with_their_shares_and_only_those_that_propagate(llvm, 
     spectrum, count = md.precompute(SMALL[name]()), 1 << 20
     sampler = OrderSampler(spectrum)
     incidence = Incidence.of(vectors(direction(theta, phi)), mi.Float(1.0)).at(floats(0.5))
-    row, column, _ = sampler.sample(incidence, *points(numbers(count)), True)
-    dr.eval(row, column)
+    drawn_x, drawn_y, _ = sampler.sample(incidence, *points(numbers(count)), True)
+    dr.eval(drawn_x, drawn_y)
     rows, columns = spectrum.grid.shape
-    order = dr.arange(mi.UInt32, rows * columns)
-    weights = sampler.weights(incidence, mi.Bool(True))
-    share = np.array(sampler.share(order, weights, mi.Bool(True))).reshape(rows, columns)
+    orders = [mi.Int32(m.ravel()) for m in np.meshgrid(*spectrum.grid.axes())]
+    share = np.array(sampler.share(*orders, incidence, mi.Bool(True))).reshape(rows, columns)
     bottom, top, left, right = (int(x[0]) for x in map(mi.Int32, sampler.rectangle(incidence)))
     inside = np.zeros((rows, columns), bool)
     inside[bottom:top, left:right] = True
     np.testing.assert_allclose(share[inside].sum(), 1, rtol=1e-5)
 
-    row, column = (np.array(x) + np.zeros(count, int) for x in (row, column))
+    column, row = (
+        np.array(x) + np.zeros(count, int) + m for x, m in zip((drawn_x, drawn_y), spectrum.grid.max_order, strict=True)
+    )
     found = np.bincount(row * columns + column, minlength=rows * columns).reshape(rows, columns)
     assert found[~inside].sum() == 0
     wanted = share[inside] * count
@@ -377,9 +378,8 @@ def test_the_probabilities_of_many_orders_sum_to_one(llvm):
     sampler = OrderSampler(spectrum)
     assert not sampler.restricted
     incidence = Incidence.of(vectors((0.6, 0.0, 0.8)), mi.Float(1.0)).at(floats(0.5))
-    weights = sampler.weights(incidence, mi.Bool(True))
-    order = dr.arange(mi.UInt32, spectrum.grid.shape[0] * spectrum.grid.shape[1])
-    np.testing.assert_allclose(dr.sum(sampler.share(order, weights, mi.Bool(True))), 1, rtol=1e-4)
+    orders = [mi.Int32(m.ravel()) for m in np.meshgrid(*spectrum.grid.axes())]
+    np.testing.assert_allclose(dr.sum(sampler.share(*orders, incidence, mi.Bool(True))), 1, rtol=1e-4)
 
 
 def test_orders_are_drawn_where_their_lobes_are_narrow_and_apart(llvm):

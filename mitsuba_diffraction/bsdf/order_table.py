@@ -1,0 +1,235 @@
+"""An order of light that is reflected by an interface or passes it, drawn from a table over ω_i and 1/λ.
+
+From direction to direction orders of transmitted light differ by far more than those of a mirror: κ is small, K varies
+as 1/κ², and 1 − F falls to zero where facets reflect totally. So P_m of each cell follows the powers of the orders that
+`energy/furnace.py` finds at places in the cell,
+
+    P_m ∝ √⟨η_m²⟩
+
+the density for which the variance of what is drawn is least. Directions have the square of `energy/table.py`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from ..energy.furnace import Furnace
+from ..energy.table import Layout, bounds_of
+from ..geometry import fresnel
+from ..grating_spectrum import GratingSpectrum
+from .geometry import cell_of, on_square
+from .inversion import search
+from .tables import FloatTable, PacketTable, larger, opaque
+from .transmission import CrossingIncidence
+
+WHOLE = 2**24  # a float32 holds whole numbers up to here
+FLOOR = 0.02  # the share of each cell that all its orders have alike
+ENTRIES = 4e5  # of the table, about: more would fill the cache
+# Radians by which the phase of the deepest point may change within a cell, by reflection from above: of line gratings,
+# which have few orders, and of others; and between the places in a cell, for either kind of light.
+TURN_LINES, TURN, STEP = 2.0, 4.0, 2.5
+SLICES = 4, 12  # cells of 1/λ, at least and at most
+SIDES = 4, 48  # cells along the square of directions, likewise
+
+
+class OrderTable:
+    """P_m of light from either side to either side, in cells: (from, to, 1/λ, row, column of ω_i).
+
+    Attributes:
+        before: Σ P of the orders before each of the rectangle that propagates in a cell, in units of 2⁻²⁴.
+        cells: of each the start in `before`, first column and row among all orders, and columns + 2¹⁶ rows.
+        most: orders of a cell.
+        shares: T e_T/(R e_R + T e_T) at the nodes of directions, from above and from below.
+    """
+
+    def __init__(
+        self,
+        spectrum: GratingSpectrum,
+        eta: float,
+        is_sheet: bool,
+        height_scales: Sequence[float] = (1.0,),
+        lateral_scale: float = 1.0,
+    ) -> None:
+        """Make the table.
+
+        Args:
+            spectrum: its wavelengths are those in the denser medium.
+            eta: index below relative to that above.
+            is_sheet: there is a flat face below, and beyond it the medium above once more.
+            height_scales: times the heights; of several P_m serves all.
+            lateral_scale: times the lengths along the surface, the least.
+        """
+        grid = spectrum.grid
+        self.eta, self.is_sheet = eta, is_sheet
+        self.tile, self.max_order = np.array(grid.tile_size), np.array(grid.max_order)
+        shortest, longest = (w * 1e-3 * max(eta, 1) for w in spectrum.wavelengths)
+        first, last = frequencies = min(lateral_scale, 1) / longest, 1 / shortest
+        turn = 4 * np.pi * spectrum.height_range * max(height_scales) * (last - first)
+        self.slices = int(np.clip(turn / (TURN_LINES if 0 in grid.max_order else TURN), *SLICES))
+        orders = np.minimum((1 + eta) * self.tile * (first + last) / 2, 2 * self.max_order) + 1
+        self.side = int(np.clip(np.sqrt(ENTRIES / (4 * self.slices * orders.prod())), *SIDES))
+        self.layout = Layout(0.0, 1, self.side, 1, self.slices + 1, frequencies)
+        sums, cells, shares, start, self.most = [], [], [], 0, 1
+        for above in (True, False):
+            furnaces = [Furnace.of(spectrum, scale, eta, 1 if above else -1) for scale in height_scales]
+            sent = []
+            for reflects in (True, False):
+                index = self._indices(above)[0] if reflects else abs(eta - 1)
+                steps = 1 + int(turn * index / (self.slices * STEP))
+                places = [k / steps for k in range(self.slices * steps + 1)]
+                squares = [self._squares(furnaces, above, reflects, place) for place in places]
+                sent.append(np.sqrt(np.mean(squares, axis=0)).sum((-1, -2)).ravel())
+                for slice_ in range(self.slices):
+                    within = sum(squares[slice_ * steps : (slice_ + 1) * steps + 1])
+                    corner, size = self._rectangles(above, reflects, slice_)
+                    of_cells, starts = _packed(_of_corners(within), corner, size)
+                    sums.append(of_cells)
+                    cells.append(np.stack([start + starts, *corner.T, size[:, 0] + (size[:, 1] << 16)], -1))
+                    start += len(of_cells)
+                    self.most = max(self.most, int(size.prod(1).max()))
+            # E of a wavelength in the middle.
+            omega, wavelengths = self._nodes(self.slices / 2)
+            albedo = furnaces[0].albedo(self._inside(omega, above), wavelengths / self._indices(above)[0])
+            reflected, passed = np.array(sent) * bounds_of(albedo, furnaces[0].index)
+            shares.append(passed / np.maximum(reflected + passed, 1e-30))
+        self.before, self.shares = FloatTable(np.concatenate(sums)), FloatTable(np.array(shares))
+        packed = np.concatenate(cells)
+        self.cells = PacketTable(packed.astype(np.uint32))
+        self.first, self.per_slice = opaque(first), opaque(self.slices / (last - first))
+
+    def _indices(self, above: bool) -> tuple[float, float]:
+        """Return n next to the relief and outside, on one side of it."""
+        return (1.0, 1.0) if above else (self.eta, 1.0 if self.is_sheet else self.eta)
+
+    def _nodes(self, place: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the directions at the nodes of the square, outside, and λ above in µm, at a place along the slices."""
+        nodes = np.indices((1, self.side + 1, self.side + 1)).reshape(3, -1).T.astype(np.float64)
+        nodes[:, 0] = place
+        return self.layout.directions(nodes)
+
+    def _inside(self, omega: NDArray[np.float64], above: bool) -> NDArray[np.float64]:
+        """Return next to the relief the directions outside of it."""
+        inside, outside = self._indices(above)
+        tangent = omega[:, :2] * (outside / inside)
+        return np.column_stack([tangent, np.sqrt(np.maximum(1 - (tangent**2).sum(-1), 1e-12))])
+
+    def _squares(self, furnaces: Sequence[Furnace], above: bool, reflects: bool, place: float) -> NDArray[np.floating]:
+        """Compute η_m² at the nodes of directions, the mean over scales of heights: (rows, columns, orders, orders)."""
+        (inside, outside), goes_below = self._indices(above), above != reflects
+        omega, wavelengths = self._nodes(place)
+        result = np.zeros((len(omega), *(2 * self.max_order[::-1] + 1)), np.float32)
+        for furnace in furnaces:
+            powers = np.zeros_like(result)
+            for way in furnace.ways[:1] if reflects else furnace.ways[1:]:
+                node, component, power = furnace.sent(self._inside(omega, above), wavelengths / inside, way)
+                m = np.rint((way or 1) * furnace.q[component] * self.tile).astype(np.int64)
+                if self.is_sheet:
+                    tangent = outside * omega[node, :2] + wavelengths[node, None] * m / self.tile
+                    square = 1 - (tangent**2).sum(-1)
+                    power = power * (square > 0)
+                    if goes_below:
+                        power *= 1 - fresnel(np.sqrt(np.maximum(square, 0)), self.eta)
+                column, row = (m + self.max_order).T
+                powers[node, row, column] += power
+            result += powers**2 / len(furnaces)
+        return result.reshape(self.side + 1, self.side + 1, *result.shape[1:])
+
+    def _rectangles(self, above: bool, reflects: bool, slice_: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return first column and row of the orders that propagate in each cell of a slice, and how many: (cells, 2).
+
+        From the borders of the cells: |m/T + k_i,∥/λ| ≤ n_o/λ.
+        """
+        along = np.linspace(0, 1, 5)
+        border = np.stack(np.meshgrid([0, 1], along, along, indexing="ij"), -1).reshape(-1, 3)
+        corner = np.indices((1, self.side, self.side)).reshape(3, -1).T
+        corner[:, 0] = slice_
+        omega, wavelengths = self.layout.directions((corner[:, None] + border).reshape(-1, 3))
+        per_wavelength = self.tile / wavelengths[:, None]
+        middle = -self._indices(above)[1] * omega[:, :2] * per_wavelength
+        # More, as borders are curved.
+        half = self._indices(above == reflects)[1] * per_wavelength + 1e-3 * (1 + per_wavelength.max())
+        first, last = (x.reshape(len(corner), -1, 2) for x in (middle - half, middle + half))
+        first = np.clip(np.ceil(first.min(1)), -self.max_order, self.max_order).astype(np.int64)
+        last = np.clip(np.floor(last.max(1)), -self.max_order, self.max_order).astype(np.int64)
+        return first + self.max_order, last - first + 1
+
+    def _direction(self, omega: mi.Vector3f) -> list[tuple[mi.UInt32, mi.Float]]:
+        """Return column and row of ω on the square, and the place in that cell."""
+        return [cell_of(self.side * place, self.side) for place in on_square(omega)]
+
+    def _cell(
+        self, incidence: CrossingIncidence, active: mi.Bool
+    ) -> tuple[mi.UInt32, mi.Int32, mi.Int32, mi.Int32, mi.Int32]:
+        """Return where the sums of a cell begin, its first order along x and y, and its columns and rows."""
+        max_x, max_y = map(int, self.max_order)
+        wi, per_index = incidence.wi, dr.rcp(incidence.index)
+        (column, _), (row, _) = self._direction(mi.Vector3f(wi.x * per_index, wi.y * per_index, wi.z))
+        slice_, _ = cell_of((incidence.lateral_frequency - self.first) * self.per_slice, self.slices)
+        way = dr.select(incidence.above, mi.UInt32(0), 2) + dr.select(incidence.reflects, mi.UInt32(0), 1)
+        cell = ((way * self.slices + slice_) * self.side + row) * self.side + column
+        start, x, y, size = self.cells(cell, active)
+        return start, mi.Int32(x) - max_x, mi.Int32(y) - max_y, mi.Int32(size & 0xFFFF), mi.Int32(size >> 16)
+
+    def share(self, m_x: mi.Int32, m_y: mi.Int32, incidence: CrossingIncidence, active: mi.Bool) -> mi.Float:
+        """Return P_m for one wavelength."""
+        start, first_x, first_y, columns, rows = self._cell(incidence, active)
+        column, row = m_x - first_x, m_y - first_y
+        active = active & (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
+        order = start + mi.UInt32(row * columns + column)
+        return (self.before(order + 1, active) - self.before(order, active)) * (1 / WHOLE)
+
+    def sample(
+        self, incidence: CrossingIncidence, u: mi.Float, v: mi.Point2f, active: mi.Bool
+    ) -> tuple[mi.Int32, mi.Int32, mi.Point2f]:
+        """Draw an order for one wavelength, as `orders.OrderSampler`, from `u` alone."""
+        start, first_x, first_y, columns, rows = self._cell(incidence, active)
+
+        def before(place: mi.Int32) -> mi.Float:
+            return self.before(start + mi.UInt32(place), active)
+
+        place, _ = search(before, mi.Int32(0), columns * rows, self.most, u)
+        # In masked lanes there are no columns.
+        row = mi.Int32((mi.Float(place) + 0.5) / larger(mi.Float(columns), 1))
+        return first_x + place - row * columns, first_y + row, v
+
+    def transmitted(self, omega: mi.Vector3f) -> mi.Float:
+        """Return the share of samples that pass, ω along the pattern's axes; linear between nodes."""
+        (column, x), (row, y) = self._direction(omega)
+        line = self.side + 1
+        node = (dr.select(omega.z > 0, mi.UInt32(0), line) + row) * line + column
+        low, high = (dr.lerp(self.shares(node + k, True), self.shares(node + k + 1, True), x) for k in (0, line))
+        return dr.lerp(low, high, y)
+
+
+def _of_corners(at_nodes: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return the root of the sum of the four corners of each cell, (rows + 1, columns + 1, …) → (cells, …)."""
+    rows, columns = (n - 1 for n in at_nodes.shape[:2])
+    total = sum(at_nodes[j : j + rows, i : i + columns] for j, i in np.ndindex(2, 2))
+    return np.sqrt(total.reshape(rows * columns, *at_nodes.shape[2:]))
+
+
+def _packed(
+    p: NDArray[np.floating], first: NDArray[np.int64], size: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return the sums before the orders of all rectangles, with `FLOOR` and one after the other; and each start.
+
+    Args:
+        p: in proportion to P_m, (cells, orders, orders); zero outside of the rectangles.
+        first: column and row where a rectangle begins, (cells, 2).
+        size: its columns and rows, (cells, 2).
+    """
+    of_x, of_y = (
+        (np.arange(n) >= begin[:, None]) & (np.arange(n) < (begin + count)[:, None])
+        for n, begin, count in zip(p.shape[:0:-1], first.T, size.T, strict=True)
+    )
+    inside = (of_y[:, :, None] & of_x[:, None]).reshape(len(p), -1)
+    p = p.reshape(len(p), -1).astype(np.float64)
+    p = (1 - FLOOR) * p / np.maximum(p.sum(1, keepdims=True), 1e-30) + FLOOR * inside / inside.sum(1, keepdims=True)
+    sums = np.rint(WHOLE * p.cumsum(1) / p.sum(1, keepdims=True))
+    count = size.prod(1) + 1
+    return np.insert(sums, 0, 0, 1)[np.insert(inside, 0, True, 1)], count.cumsum() - count
