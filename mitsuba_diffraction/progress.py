@@ -1,21 +1,23 @@
-"""Progress of long computations: a bar in a terminal, a line in a notebook, occasional lines in a log."""
+"""What commands print, and progress: a bar in a terminal, a line in a notebook, occasional lines in a log."""
 
 from __future__ import annotations
 
 import math
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 
-from rich.console import Console
+from rich.console import Console, RenderableType
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.progress import Progress as Bars
+from rich.table import Table
 
 NAME = "mitsuba-diffraction"
 
 Progress = Callable[[int, int], None]  # called with how much is done, and how much there is
 
+out = Console(highlight=False, soft_wrap=True)
 err = Console(stderr=True, highlight=False, soft_wrap=True)
 
 _SHORT = 2.0  # seconds of work of which neither a log nor a notebook says anything
@@ -41,6 +43,31 @@ def part(whole: Progress, begin: float, end: float) -> Progress:
 def say(kind: str, message: object) -> None:
     """Print a message on stderr, in one line."""
     err.print(f"{NAME}: {kind}: {' '.join(str(message).split())}", markup=False, emoji=False)
+
+
+def tell(text: str) -> None:
+    """Print the result of a command."""
+    # File names are not markup.
+    out.print(text, markup=False, emoji=False)
+
+
+def show(*tables: RenderableType, width: int) -> None:
+    """Print tables with a line between them, on `width` characters or more, so that no column is ever cut."""
+    console = Console(highlight=False, width=max(out.width, width))
+    for index, table in enumerate(tables):
+        if index:
+            console.print()
+        console.print(table)
+
+
+def table(columns: Iterable[str], rows: Iterable[Sequence[str]], texts: int = 1) -> Table:
+    """Return a table for a terminal; the first `texts` columns hold texts, the others numbers."""
+    shown = Table(box=None, pad_edge=False)
+    for index, column in enumerate(columns):
+        shown.add_column(column, justify="left" if index < texts else "right", no_wrap=True)
+    for row in rows:
+        shown.add_row(*row)
+    return shown
 
 
 def _count(done: int, total: int, unit: str) -> str:

@@ -19,12 +19,12 @@ import typer
 from typer.core import TyperCommand
 
 from ..errors import Bug, RequestError, is_bug
-from .console import NAME, Log, Stopped, say, tell
+from ..progress import NAME, say, tell
 from .efficiency import efficiency
 from .examples import examples
 from .inspect import inspect
 from .precompute import precompute
-from .render import render
+from .render import Stopped, render
 
 # Click's, or that of the copy of Click which newer versions of Typer carry.
 _UsageError = typer.BadParameter.__base__
@@ -75,13 +75,20 @@ class _CtrlC:
         raise KeyboardInterrupt
 
 
+class _Log(logging.Handler):
+    """Shows what the package logs as the command's own messages."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        say(record.levelname.lower(), record.getMessage())
+
+
 def main() -> None:
     """Entry point of `mitsuba-diffraction`."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # neither file names nor terminals need be UTF-8
             stream.reconfigure(errors="backslashreplace")
     warnings.showwarning = lambda message, *args, **kwargs: say("warning", message)
-    log, logger = Log(), logging.getLogger(__package__.partition(".")[0])
+    log, logger = _Log(), logging.getLogger(__package__.partition(".")[0])
     logger.addHandler(log)
     options: dict[str, bool] = {}
     ctrl_c, before = _CtrlC(), signal.getsignal(signal.SIGINT)

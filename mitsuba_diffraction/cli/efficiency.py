@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from ..efficiency import efficiencies
 from ..errors import RequestError
+from ..progress import progress_bar, tell
 from ..recipe import Recipe
 from ..surface.gratings import PROFILES
 from .arguments import Overwrite, check_suffix, claim, surface_of
-from .console import progress_bar, tell
 
 _MOST = 10_000
 

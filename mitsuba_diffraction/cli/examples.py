@@ -9,8 +9,8 @@ import typer
 
 from ..errors import RequestError
 from ..files import whole_file
+from ..progress import tell
 from .arguments import Overwrite
-from .console import tell
 
 _PACKAGE = Path(__file__).parents[1]
 # In a checkout the folders lie beside the package; setup.py copies them into it.

@@ -17,18 +17,20 @@ from ..inspection import inspect as look
 from ..inspection.colours import GREEN
 from ..inspection.picture import with_uncertainty
 from ..outputs import free_name, save_json
+from ..progress import progress_bar, show, table, tell
 from ..settings import SUN_COHERENCE_LENGTH, lobe_width
-from .arguments import Overwrite, check_suffix, claim
-from .console import progress_bar, show, table, tell
-from .scan import (
+from .arguments import (
     Channel,
     CoherenceLength,
     Extent,
     FillMissing,
     HeightRange,
+    Overwrite,
     PixelSize,
     Prepare,
     Unit,
+    check_suffix,
+    claim,
     options_of_scan,
     recipe_of,
     settings_of,

@@ -10,21 +10,23 @@ import typer
 from ..errors import RequestError
 from ..grating_spectrum import GratingSpectrum
 from ..precomputation import Spectrum
+from ..progress import progress_bar, tell
 from ..recipe import Recipe
 from ..rigorous.spectrum import RigorousSpectrum
 from ..settings import REPRESENTATIONS, SUN_COHERENCE_LENGTH, THEORIES
 from ..surface.prepare import seam_matters, seam_steps
-from .arguments import Overwrite, check_suffix, claim
-from .console import progress_bar, tell
-from .scan import (
+from .arguments import (
     Channel,
     CoherenceLength,
     Extent,
     FillMissing,
     HeightRange,
+    Overwrite,
     PixelSize,
     Prepare,
     Unit,
+    check_suffix,
+    claim,
     options_of_scan,
     recipe_of,
     settings_of,

@@ -11,13 +11,17 @@ import typer
 
 from ..errors import RequestError
 from ..outputs import free_name
+from ..progress import progress_bar, tell
 from .arguments import Define, Overwrite, Variant, check_suffix, claim, materials_of, scene_parameters
-from .console import Stopped, progress_bar, tell
 
 if TYPE_CHECKING:
     from ..render.spectral_image import SpectralImage
 
 _log = logging.getLogger(__name__)
+
+
+class Stopped(Exception):
+    """Ctrl-C after something has been saved; the text says what."""
 
 
 def render(

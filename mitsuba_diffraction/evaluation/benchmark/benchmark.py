@@ -12,11 +12,11 @@ import mitsuba as mi
 from rich.table import Table
 
 from ... import outputs
-from ...cli.console import table
 from ...errors import RequestError
 from ...files import whole_file
 from ...grating_spectrum import GratingSpectrum
 from ...outputs import metadata
+from ...progress import table
 from ...settings import VISIBLE, Settings
 from ...spectrum.tables import SliceTable
 from .. import report

@@ -8,10 +8,9 @@ from typing import Annotated
 import typer
 
 from ... import outputs
-from ...cli.arguments import Overwrite, Variant, check_suffix, claim
-from ...cli.console import progress_bar, show, table
-from ...cli.scan import HeightRange, PixelSize
+from ...cli.arguments import HeightRange, Overwrite, PixelSize, Variant, check_suffix, claim
 from ...errors import RequestError
+from ...progress import progress_bar, show, table
 from ...surface.readers import read_height_field
 
 

@@ -10,9 +10,9 @@ from typing import Annotated
 import typer
 
 from ...cli.arguments import Define, Overwrite, Variant, claim, scene_parameters
-from ...cli.console import progress_bar, show, tell
 from ...files import whole_file
 from ...outputs import free_name
+from ...progress import progress_bar, show, tell
 
 _PICTURES = {"-path.exr": "path_traced", "-published.exr": "published", "-corrected.exr": "corrected"}
 """Suffix → picture."""

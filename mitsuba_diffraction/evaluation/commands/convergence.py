@@ -10,7 +10,7 @@ import typer
 
 from ... import outputs
 from ...cli.arguments import Define, Overwrite, Variant, check_suffix, claim, scene_parameters
-from ...cli.console import progress_bar, show, table, tell
+from ...progress import progress_bar, show, table, tell
 
 
 def convergence(

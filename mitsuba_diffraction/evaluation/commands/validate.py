@@ -8,21 +8,23 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ... import outputs
-from ...cli.arguments import Overwrite, Variant, claim
-from ...cli.console import progress_bar, show, tell
-from ...cli.scan import (
+from ...cli.arguments import (
     Channel,
     FillMissing,
     HeightRange,
+    Overwrite,
     PixelSize,
     Prepare,
     Unit,
+    Variant,
+    claim,
     options_of_scan,
     recipe_of,
     settings_of,
 )
 from ...errors import RequestError
 from ...outputs import save_markdown
+from ...progress import progress_bar, show, tell
 
 if TYPE_CHECKING:
     from ...recipe import Recipe

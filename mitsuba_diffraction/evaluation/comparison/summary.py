@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from rich.table import Table
 
 from ... import outputs
-from ...cli.console import table
 from ...color import XYZ_to_linear_sRGB, into_gamut, on_screen
 from ...files import whole_file
 from ...outputs import metadata
+from ...progress import table
 from .. import report
 from .comparison import Comparison
 from .difference import Difference
