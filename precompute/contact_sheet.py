@@ -17,7 +17,7 @@ from PIL import Image
 from mitsuba_diffraction.files import whole_file
 from mitsuba_diffraction.llvm import choose_variant
 from mitsuba_diffraction.render import render
-from mitsuba_diffraction.render.preview import save_preview
+from mitsuba_diffraction.render.spectral_image import save_preview
 
 HERE = Path(__file__).parent
 DISCS = {"compact_disc", "dvd"}

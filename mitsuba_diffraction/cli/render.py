@@ -157,9 +157,8 @@ def _picture(
     from ..render.denoise import guides
     from ..render.passes import Interrupted, checkpoint_path
     from ..render.passes import render as trace
-    from ..render.preview import save_preview
     from ..render.scene import load_spectral_scene
-    from ..render.spectral_image import SpectralImage
+    from ..render.spectral_image import SpectralImage, save_preview
 
     start = time.perf_counter()
     waiting, preview = checkpoint_path(path), path.with_suffix(".png")

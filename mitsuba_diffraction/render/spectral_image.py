@@ -1,4 +1,4 @@
-"""Spectral images and their OpenEXR files."""
+"""Spectral images, their OpenEXR files and their 8-bit previews."""
 
 from __future__ import annotations
 
@@ -7,15 +7,26 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..color import spectrum_to_linear_sRGB
+from ..color import (
+    XYZ_to_linear_sRGB,
+    auto_exposure,
+    into_gamut,
+    on_screen,
+    spectrum_to_linear_sRGB,
+    spectrum_to_XYZ,
+)
 from ..errors import RequestError
 from ..files import whole_file
-from ..outputs import made_for
+from ..outputs import made_for, png_text
 from ..spectrum.exr import one_line, silence
+
+if TYPE_CHECKING:
+    from .denoise import Guides
 
 _LAYOUT_VERSION = "1.0"
 # Radiance per nm, the unit in the channel names: the authors of the layout and pbrt-v4 omit the nm⁻¹, and
@@ -148,3 +159,37 @@ class SpectralImage:
             if name not in _RESERVED and isinstance(value, str | int | float)
         }
         return cls(np.array([wavelength for wavelength, _ in found]), radiance, attributes)
+
+
+def save_preview(
+    image: SpectralImage, path: str | os.PathLike[str], exposure: float | None = None, guides: Guides | None = None
+) -> float:
+    """Write an 8-bit sRGB preview of a spectral image, in the format given by the suffix of `path`.
+
+    Spectra → XYZ → linear sRGB → `into_gamut` → × exposure → `roll_off` → sRGB's transfer function.
+
+    Args:
+        image: the spectral image.
+        path: the file, such as `picture.png`.
+        exposure: the factor for linear sRGB; by default `auto_exposure`.
+        guides: of the same pixels (`denoise.guides`), to denoise the preview.
+
+    Returns:
+        The exposure.
+
+    Raises:
+        ValueError: if Pillow does not support the suffix.
+    """
+    from PIL import Image
+
+    XYZ = spectrum_to_XYZ(image.radiance, image.wavelengths)
+    if guides is not None:
+        from .denoise import denoised
+
+        XYZ = denoised(XYZ, guides)
+    rgb = into_gamut(XYZ_to_linear_sRGB(XYZ))
+    if exposure is None:
+        exposure = auto_exposure(rgb)
+    with whole_file(path) as temporary:
+        Image.fromarray(on_screen(rgb * exposure)).save(temporary, pnginfo=png_text(path))
+    return exposure

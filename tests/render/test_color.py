@@ -4,8 +4,7 @@ import pytest
 from PIL import Image
 
 from mitsuba_diffraction.color import auto_exposure, into_gamut, roll_off, spectrum_to_linear_sRGB, spectrum_to_XYZ
-from mitsuba_diffraction.render.preview import save_preview
-from mitsuba_diffraction.render.spectral_image import SpectralImage
+from mitsuba_diffraction.render.spectral_image import SpectralImage, save_preview
 
 GRID = np.arange(365.0, 830.0, 5.0)
 FINE = np.arange(360.0, 831.0)
