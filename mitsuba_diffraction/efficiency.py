@@ -283,9 +283,9 @@ def _scalar(height_field: HeightField, azimuth: float, shortest: float, transmis
     def solve(angle: float, wavelength: float, index: complex) -> _Found:
         if transmission == "none":
             found = scalar_orders(powers, period, wavelength, angle, index, azimuth)
-            return found.m, found.s, found.p
-        is_sheet = transmission == "sheet"
-        found = transmitted_orders(powers, period, wavelength, angle, index.real, azimuth, sheet=is_sheet)
+        else:
+            is_sheet = transmission == "sheet"
+            found = transmitted_orders(powers, period, wavelength, angle, index.real, azimuth, sheet=is_sheet)
         return found.m, found.s, found.p
 
     return solve

@@ -147,11 +147,9 @@ def _spectrum(axes: Axes, inspection: Inspection) -> None:
     axes.set_title("Its spectrum: spots are regular waves", fontsize=12, loc="left")
     # Labels at opposite sides, so that they do not meet.
     for period, colour, spot in zip(inspection.periods, ("cyan", "lime"), (1, -1), strict=False):
-        along = np.deg2rad(period.direction)
-        q = np.array([np.cos(along), np.sin(along)]) / period.period
         for sign in (1, -1):
-            axes.plot(*(sign * q), "o", ms=13, mfc="none", mec=colour, mew=1.8, zorder=4)  # above all labels
-        x, y = spot * q
+            axes.plot(*(sign * period.q), "o", ms=13, mfc="none", mec=colour, mew=1.8, zorder=4)  # above all labels
+        x, y = spot * period.q
         # Outwards, but for the rim.
         side = (-1 if x < -0.02 * limit else 1) * (-1 if abs(x) > 0.6 * limit else 1)
         axes.annotate(

@@ -273,22 +273,11 @@ def collect(rfilter, position, channel, value, size, border, samples, channels):
                 lower = dr.floor(where)
                 upper_share = where - lower
                 k = mi.Int32(lower)
-                dr.scatter_reduce(
-                    dr.ReduceOp.Add,
-                    sums,
-                    what * (1 - upper_share),
-                    base + mi.UInt32(k),
-                    inside & (k >= 0) & (k < channels),
-                    dr.ReduceMode.NoConflicts,
-                )
-                dr.scatter_reduce(
-                    dr.ReduceOp.Add,
-                    sums,
-                    what * upper_share,
-                    base + mi.UInt32(k + 1),
-                    inside & (k >= -1) & (k < channels - 1),
-                    dr.ReduceMode.NoConflicts,
-                )
+                for neighbour, part in ((k, what * (1 - upper_share)), (k + 1, what * upper_share)):
+                    there = inside & (neighbour >= 0) & (neighbour < channels)
+                    dr.scatter_reduce(
+                        dr.ReduceOp.Add, sums, part, base + mi.UInt32(neighbour), there, dr.ReduceMode.NoConflicts
+                    )
             weight += dr.select(inside, share, 0)
             at += 1
         tap += 1

@@ -18,35 +18,10 @@ from .scan import MOST_BYTES, Channel, Scan, choose
 
 EXTRA = "pip install 'mitsuba_diffraction[instruments]'"
 
-FORMATS = {
-    ".al3d": "al3d",
-    ".bcr": "bcr",
-    ".bcrf": "bcr",
-    ".ezd": "ezd",
-    ".frt": "frt",
-    ".ibw": "ibw",
-    ".jpk": "jpk",
-    ".lext": "lext",
-    ".mdt": "mdt",
-    ".mi": "mi",
-    ".mnt": "mnt",
-    ".nid": "ezd",
-    ".nms": "nms",
-    ".opd": "opd",
-    ".opdx": "opdx",
-    ".os3d": "os3d",
-    ".plu": "plu",
-    ".plux": "plux",
-    ".sdf": "sdf",
-    ".spm": "di",
-    ".sur": "sur",
-    ".tmd": "tmd",
-    ".vk4": "vk",
-    ".vk6": "vk",
-    ".vk7": "vk",
-    ".x3p": "x3p",
-    ".zon": "zon",
-}
+# Formats that SurfaceTopography names by their extension, and others.
+_NAMED_ALIKE = "al3d bcr ezd frt ibw jpk lext mdt mi mnt nms opd opdx os3d plu plux sdf sur tmd x3p zon"
+_NAMED_OTHERWISE = {".bcrf": "bcr", ".nid": "ezd", ".spm": "di", ".vk4": "vk", ".vk6": "vk", ".vk7": "vk"}
+FORMATS = {f".{name}": name for name in _NAMED_ALIKE.split()} | _NAMED_OTHERWISE
 """Extension → SurfaceTopography's name of the format, in addition to Nanoscope's numbers (.000, .001, …)."""
 
 NAMES = (
