@@ -9,9 +9,7 @@ import numpy as np
 from ..bsdf.base import nested_plugin
 from ..errors import RequestError
 from ..manual import Parameter, listed
-from . import eye_paths
-from .eye_paths import Gratings
-from .light_paths import LightPaths
+from .paths import Gratings, LightPaths, define_eye_paths
 
 PARAMETERS = (
     Parameter("max_depth", "integer", "as in `path`: 2 is direct light, 3 a rainbow on a wall; −1 is no limit", "−1"),
@@ -55,7 +53,7 @@ Gradients are those of `path` (forward) and `prb` (backward), and single rays (`
 
 def define() -> type:
     """Define the plugin class for the current variant, to which its base class belongs."""
-    eye_class = eye_paths.define()
+    eye_class = define_eye_paths()
 
     class DiffractionPath(mi.SamplingIntegrator):
         __doc__ = MANUAL
@@ -165,19 +163,14 @@ def _add_light_paths(sensor: mi.Sensor, light: LightPaths, seed: mi.UInt32 | int
     spp = sensor.sampler().sample_count()
     block = film.create_block()
     corner = mi.Vector2f(film.crop_offset())
+    # Without adding to the weights of the block.
     for splats in light.splats(seed, light.count(spp)):
-        put(film, block, splats.position + corner, splats.wavelengths, splats.value * spp)
+        position, value = splats.position + corner, splats.value * spp
+        if mi.has_flag(film.flags(), mi.FilmFlags.Special):
+            block.put(position, film.prepare_sample(value, splats.wavelengths, block.channel_count(), 0.0, 0.0))
+        else:
+            block.put(position, splats.wavelengths, value, 0.0, 0.0)
     film.put_block(block)
-
-
-def put(
-    film: mi.Film, block: mi.ImageBlock, position: mi.Point2f, wavelengths: mi.Spectrum, value: mi.Spectrum
-) -> None:
-    """Add to a block without adding to its weight."""
-    if mi.has_flag(film.flags(), mi.FilmFlags.Special):
-        block.put(position, film.prepare_sample(value, wavelengths, block.channel_count(), 0.0, 0.0))
-    else:
-        block.put(position, wavelengths, value, 0.0, 0.0)
 
 
 def _connects(sensor: mi.Sensor) -> bool:

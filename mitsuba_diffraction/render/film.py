@@ -20,7 +20,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..integrator.light_paths import Splats
+from ..integrator.paths import Splats
 from .scene import channel_wavelengths, channel_weights, root_cause
 
 # A pixel, row by row, and a mask → the first of its samples, which stand together, and the one after the last.
