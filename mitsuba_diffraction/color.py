@@ -24,13 +24,9 @@ _OBSERVER = "CIE 1931 2 Degree Standard Observer"
 
 
 def matching_functions(wavelengths: ArrayLike) -> NDArray[np.float64]:
-    """Return x̄, ȳ, z̄ of the CIE 1931 2° observer, linear between its wavelengths and constant beyond them.
+    """Return x̄, ȳ, z̄ of the CIE 1931 2° observer at wavelengths (n,) in nm: (n, 3).
 
-    Args:
-        wavelengths: (n,), nm.
-
-    Returns:
-        (n, 3).
+    They are linear between its wavelengths and constant beyond them.
     """
     import colour
 
@@ -103,12 +99,7 @@ def XYZ_to_linear_sRGB(XYZ: NDArray[np.floating]) -> NDArray[np.float64]:
 def delta_E(XYZ_1: ArrayLike, XYZ_2: ArrayLike) -> NDArray[np.float64]:
     """Compute the colour difference CIEDE2000 (CIE 142, ISO/CIE 11664-6) relative to D65 with Y = 1.
 
-    Args:
-        XYZ_1: (..., 3).
-        XYZ_2: likewise.
-
-    Returns:
-        (...).
+    Both colours are (..., 3), the result is (...).
     """
     import colour
 
@@ -117,14 +108,7 @@ def delta_E(XYZ_1: ArrayLike, XYZ_2: ArrayLike) -> NDArray[np.float64]:
 
 
 def daylight(wavelengths: ArrayLike) -> NDArray[np.float64]:
-    """Return the illuminant D65 (CIE 15:2018) relative to its value at 560 nm, linearly interpolated.
-
-    Args:
-        wavelengths: (n,), nm.
-
-    Returns:
-        (n,).
-    """
+    """Return the illuminant D65 (CIE 15:2018) relative to its value at 560 nm, linearly interpolated: (n,), nm."""
     import colour
 
     table = colour.SDS_ILLUMINANTS["D65"]
@@ -136,13 +120,7 @@ def into_gamut(rgb: NDArray[np.floating]) -> NDArray[np.float64]:
 
     c' = Y + t (c − Y), with the largest t ≤ 1 for which min(c') ≥ 0. Luminance is preserved, and so is the dominant
     wavelength. Clamping each channel at zero would instead brighten spectral colours, above all cyan and violet. The
-    result is black where the luminance is not positive or a value is not finite.
-
-    Args:
-        rgb: (..., 3), linear sRGB.
-
-    Returns:
-        (..., 3), linear sRGB, not negative.
+    result is black where the luminance is not positive or a value is not finite. Both are linear sRGB, (..., 3).
     """
     import colour
 
@@ -165,13 +143,8 @@ def roll_off(rgb: NDArray[np.floating]) -> NDArray[np.float64]:
 
     The brightest channel p of a pixel is unchanged up to 0.8 and beyond follows 1 − d²/(p + d − 0.8), d = 0.2, which is
     smooth and tends to 1; the other channels are scaled equally. Very bright pixels are then desaturated. This is the
-    Khronos PBR Neutral tone mapper (Khronos Group, 2024) without its toe, which applies to dielectric surfaces.
-
-    Args:
-        rgb: (..., 3), linear sRGB, not negative.
-
-    Returns:
-        (..., 3), linear sRGB in [0, 1].
+    Khronos PBR Neutral tone mapper (Khronos Group, 2024) without its toe, which applies to dielectric surfaces. Both
+    are linear sRGB, (..., 3), not negative.
     """
     peak = rgb.max(axis=-1, keepdims=True)
     d = 1 - _SHOULDER_START
@@ -183,17 +156,12 @@ def roll_off(rgb: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def auto_exposure(rgb: NDArray[np.floating]) -> float:
-    """Compute an automatic exposure.
+    """Compute an automatic exposure, the factor for linear radiance, from linear sRGB (..., 3) that is not negative.
 
     Scales the 97th percentile of the brightest channel over the lit pixels to one. A pixel is lit if it exceeds a
     thousandth of the 99th percentile, which makes the result robust against a black background, visible lamps and
-    fireflies. The brightest channel is used because the luminance of saturated blue and red is small.
-
-    Args:
-        rgb: (..., 3), linear sRGB, not negative.
-
-    Returns:
-        The factor for linear radiance; 1 for a black picture.
+    fireflies. The brightest channel is used because the luminance of saturated blue and red is small. The exposure of a
+    black picture is 1.
     """
     peak = rgb.max(axis=-1)
     peak = peak[peak > 0]

@@ -20,15 +20,9 @@ def direction(theta: ArrayLike, phi: ArrayLike = 0.0) -> Array:
 
 
 def towards(wi: Array, q: ArrayLike, wavelength: ArrayLike) -> Array:
-    """Return ω_o = (−λq − ω_i,t, z) of frequencies.
+    """Return ω_o = (−λq − ω_i,t, z), (..., 3), of ω_i (..., 3), q (..., 2) in cycles/µm and wavelengths (...) in nm.
 
-    Args:
-        wi: ω_i, (..., 3).
-        q: (..., 2) cycles/µm.
-        wavelength: (...) in nm; all three broadcast.
-
-    Returns:
-        (..., 3); z is NaN where the frequency is evanescent.
+    All three broadcast; z is NaN where the frequency is evanescent.
     """
     across = -1e-3 * np.asarray(wavelength, np.float64)[..., None] * q - wi[..., :2]
     with np.errstate(invalid="ignore"):

@@ -104,15 +104,7 @@ def _response(kernel: mi.ReconstructionFilter, size: int) -> NDArray[np.float64]
 
 
 def denoised(XYZ: NDArray[np.floating], guide: Guides) -> NDArray[np.float64]:
-    """Denoise a picture.
-
-    Args:
-        XYZ: (rows, columns, 3), of any scale.
-        guide: of the same pixels.
-
-    Returns:
-        XYZ, likewise.
-    """
+    """Denoise a picture, XYZ of any scale, (rows, columns, 3), by guides of the same pixels."""
     import colour
     import pyoidn
 

@@ -135,14 +135,7 @@ def save_checkpoint(path: str | os.PathLike[str], digest: str, sums: Accumulatio
 
 
 def load_checkpoint(path: str | os.PathLike[str], digest: str) -> Accumulation | None:
-    """Read a checkpoint.
-
-    Args:
-        path: the file.
-        digest: of the request.
-
-    Returns:
-        The sums, or None if there is no such file.
+    """Return the sums of the checkpoint of a request with this digest; None if there is no such file.
 
     Raises:
         ValueError: if it is damaged, not a checkpoint, or one of another request.

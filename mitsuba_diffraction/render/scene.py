@@ -264,11 +264,7 @@ def scene_digest(
 ) -> str:
     """Return the SHA-256 of a valid scene: its XML after substitution of parameters, and the files it references.
 
-    Files enter by content, not by path; a recipe includes the scan it references.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if the scene is wrong.
+    Files enter by content, not by path; a recipe includes the scan it references. Errors as `named_sample_count`.
     """
     content = hashlib.sha256(Path(path).read_bytes())
     with _parsed(path, parameters, materials) as (_, state):

@@ -91,7 +91,6 @@ class SpectralImage:
         viewers.
 
         Args:
-            path: the file.
             half: write float16 instead of float32, in about half the size or less. Radiance from 6.1e-5 to 65504 is
                 then rounded by at most 2⁻¹¹ (0.05 %), smaller radiance by at most 3e-8.
 
@@ -169,13 +168,8 @@ def save_preview(
     Spectra → XYZ → linear sRGB → `into_gamut` → × exposure → `roll_off` → sRGB's transfer function.
 
     Args:
-        image: the spectral image.
-        path: the file, such as `picture.png`.
-        exposure: the factor for linear sRGB; by default `auto_exposure`.
+        exposure: the factor for linear sRGB; by default `auto_exposure`. It is returned.
         guides: of the same pixels (`denoise.guides`), to denoise the preview.
-
-    Returns:
-        The exposure.
 
     Raises:
         ValueError: if Pillow does not support the suffix.

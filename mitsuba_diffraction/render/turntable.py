@@ -29,16 +29,8 @@ def orbit(
     """Return the motions of the first camera for one orbit, counterclockwise as seen from above.
 
     Frame k rotates it by 360° k/`frames` about the coordinate axis closest to its up vector, through the point on its
-    line of sight that is closest to the centre of the scene's bounding box.
-
-    Args:
-        scene_path: the scene.
-        frames: number of frames, at least two.
-        parameters: values for the scene's `$name` parameters.
-        materials: see `load_spectral_scene`.
-
-    Returns:
-        One affine map of world space per frame, for `load_spectral_scene`; the first is the identity.
+    line of sight that is closest to the centre of the scene's bounding box. Each motion is an affine map of world
+    space; the first is the identity. `load_spectral_scene` takes them, and explains `parameters` and `materials`.
 
     Raises:
         ValueError: if there are fewer than two frames or more than 3600, or as for `load_spectral_scene`.

@@ -67,12 +67,9 @@ class OrderGrid(_Rectangle):
 
     @classmethod
     def reachable(cls, tile_size: tuple[float, float], pixels: tuple[int, int], max_frequency: float) -> OrderGrid:
-        """Return the orders up to `max_frequency` (cycles/µm), as far as the pixels resolve them.
+        """Return the orders up to `max_frequency`, the largest |q| that a pair of directions reaches, in cycles/µm.
 
-        Args:
-            tile_size: (T_x, T_y) in µm.
-            pixels: (N_x, N_y); there is nothing beyond the Nyquist order N/2.
-            max_frequency: the largest |q| that a pair of directions reaches, cycles/µm.
+        There is nothing beyond the Nyquist order N/2 of the `pixels`, (N_x, N_y).
         """
         max_order = tuple(min(int(np.floor(t * max_frequency)), n // 2) for t, n in zip(tile_size, pixels, strict=True))
         return cls(tile_size, max_order)
@@ -86,14 +83,9 @@ class OrderGrid(_Rectangle):
         return tuple(m / size for m, size in zip(self.axes(), self.tile_size, strict=True))
 
     def take(self, powers: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Select the kept orders from the powers of all.
+        """Select the kept orders, in the order of `axes`, from the powers of all, (N_y, N_x), as of `scipy.fft.fft2`.
 
-        Args:
-            powers: (N_y, N_x), in the order of `scipy.fft.fft2`.
-
-        Returns:
-            (2 M_y + 1, 2 M_x + 1), in the order of `axes`. The Nyquist order of an even N has no sign: half of its
-            power goes to each.
+        The Nyquist order of an even N has no sign: half of its power goes to each.
         """
         m_x, m_y = self.axes()
         taken = powers[np.ix_(m_y % powers.shape[0], m_x % powers.shape[1])]
