@@ -61,14 +61,12 @@ def efficiency(
     own = {key: recipe.spectrum.get(key) for key in ("material", "int_ior")}
     if material is not None or int_ior is not None:
         own = {"material": material, "int_ior": int_ior}
-    for option, path, suffixes in (("--csv", csv, [".csv"]), ("--plot", plot, [".png", ".pdf", ".svg"])):
-        if path is not None:
-            check_suffix(option, path, *suffixes)
-    claim(
-        context,
-        [Path(name), *recipe.files],
-        [(option, path) for option, path in (("--csv", csv), ("--plot", plot)) if path],
-    )
+    if csv is not None:
+        check_suffix("--csv", csv, ".csv")
+    if plot is not None:
+        check_suffix("--plot", plot, ".png", ".pdf", ".svg")
+    writes = [(option, path) for option, path in (("--csv", csv), ("--plot", plot)) if path is not None]
+    claim(context, [Path(name), *recipe.files], writes)
     with progress_bar(f"efficiencies of {name}") as progress:
         found = efficiencies(
             recipe.height_field(),

@@ -22,7 +22,6 @@ from .colours import LONGEST_COHERENCE, SHARE, Change, changes
 Array = NDArray[np.float64]
 
 _TOLERANCE = 0.02
-_MOST_TIMES = 8
 
 
 @dataclass(frozen=True)
@@ -148,7 +147,7 @@ def inspect(
         else (),
         concerns=concerns(height_field, numbers, used, measured=measured, scalar=scalar),
         spectrum=spectrum,
-        shown=_widened(repeated(height_field, _MOST_TIMES) if extent == "tile" else height_field),
+        shown=_widened(repeated(height_field) if extent == "tile" else height_field),
     )
     progress(4, 4)
     return result

@@ -576,7 +576,7 @@ def _on_lattice(period: Period, tile: HeightField) -> Period:
     return Period.of(order / tile.tile_size, np.zeros((2, 2)), period.strength)
 
 
-def repeated(tile: HeightField, times: int) -> HeightField:
+def repeated(tile: HeightField, times: int = _MOST_TIMES) -> HeightField:
     """Repeat a tile so many times along each axis, or fewer times where that would be many pixels."""
     while tile.heights.size * times**2 > _MOST_PIXELS and times > 1:
         times //= 2
