@@ -9,7 +9,7 @@ import numpy as np
 from ..bsdf.base import nested_plugin
 from ..errors import RequestError
 from ..manual import Parameter, listed
-from .paths import Gratings, LightPaths, define_eye_paths
+from .paths import Gratings, LightPaths, define_eye_paths, implements
 
 PARAMETERS = (
     Parameter("max_depth", "integer", "as in `path`: 2 is direct light, 3 a rainbow on a wall; −1 is no limit", "−1"),
@@ -136,7 +136,10 @@ def _lit_gratings(scene: mi.Scene, sensor: mi.Sensor, max_depth: int) -> Grating
     Raises:
         ValueError: if the film takes samples beyond its edge.
     """
-    if 0 <= max_depth < 3 or mi.is_polarized or not _connects(sensor):
+    if 0 <= max_depth < 3 or mi.is_polarized:
+        return None
+    # Points of the scene can be connected to `perspective` and `thinlens`.
+    if not implements(sensor.sample_direction, dr.zeros(mi.SurfaceInteraction3f), mi.Point2f(0.5)):
         return None
     gratings = Gratings(scene)
     if not gratings.shapes or not scene.emitters():
@@ -171,14 +174,3 @@ def _add_light_paths(sensor: mi.Sensor, light: LightPaths, seed: mi.UInt32 | int
         else:
             block.put(position, splats.wavelengths, value, 0.0, 0.0)
     film.put_block(block)
-
-
-def _connects(sensor: mi.Sensor) -> bool:
-    """Return whether points of the scene can be connected to a sensor: `perspective` and `thinlens`."""
-    try:
-        sensor.sample_direction(dr.zeros(mi.SurfaceInteraction3f), mi.Point2f(0.5))
-    except RuntimeError as error:
-        if "not implemented" not in str(error):
-            raise
-        return False
-    return True

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import drjit as dr
@@ -72,15 +72,22 @@ class Gratings:
         return point
 
 
-def _area(shape: mi.Shape) -> float:
-    """Return the area of a shape, zero where Mitsuba draws no points."""
+def implements(method: Callable[..., object], *arguments: object) -> bool:
+    """Return whether a plugin implements a method, which Mitsuba tells only when it is called."""
     try:
-        shape.sample_position(0.0, mi.Point2f(0.5))
-        area = shape.surface_area()
+        method(*arguments)
     except RuntimeError as error:
         if "not implemented" not in str(error):
             raise
+        return False
+    return True
+
+
+def _area(shape: mi.Shape) -> float:
+    """Return the area of a shape, zero where Mitsuba draws no points."""
+    if not (implements(shape.sample_position, 0.0, mi.Point2f(0.5)) and implements(shape.surface_area)):
         return 0.0
+    area = shape.surface_area()
     return float(area[0] if dr.is_jit_v(mi.Float) else area)
 
 

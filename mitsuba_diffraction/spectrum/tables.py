@@ -11,9 +11,8 @@ B_n(q) = Σ_j projection_nj S(q; κ_j). A shorter sum takes the first of both.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import ClassVar
 
@@ -23,13 +22,13 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import RequestError
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Series:
     """The functions g_n(κ) = Σ_k modes_nk T_k(t), n < N, of a representation; modes (N, K), κ_max in rad/µm."""
 
     name: str
     max_kappa: float
-    modes: NDArray[np.float64] = dataclasses.field(repr=False)
+    modes: NDArray[np.float64] = field(repr=False)
 
     def __post_init__(self) -> None:
         if self.modes.ndim != 2 or 0 in self.modes.shape or not np.isfinite(self.modes).all():
@@ -49,7 +48,7 @@ class Series:
         """Return the first functions only, without the degrees that none of them contains."""
         modes = self.modes[:terms]
         degrees = 1 + max(np.flatnonzero(modes.any(axis=0)), default=0)
-        return dataclasses.replace(self, modes=modes[:, :degrees].copy())
+        return replace(self, modes=modes[:, :degrees].copy())
 
 
 def taylor(max_kappa: float, nodes: int) -> tuple[Series, NDArray[np.float64]]:
