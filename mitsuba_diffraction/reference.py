@@ -49,7 +49,7 @@ def power_spectrum(
         S(q; κ) = Σ_m η_m(κ) N(q − m/T; σ_q² I),     ∫ S dq = 1.
 
     A "sample" of a larger, irregular surface is averaged over P positions x_p of a window a inside the scan (Welch
-    1967, see `welch`):
+    1967, see `spectrum.sample`):
 
         S(q; κ) = (d_x d_y/P) Σ_p |Σ_n a(x_n − x_p) e^{iκh_n} e^{−2πi q·x_n}|² / Σ_n a².
 
