@@ -54,7 +54,6 @@ def radiance(
     length is scaled as well.
 
     Args:
-        spectrum: of the surface.
         direction: of the wave vector e, degrees from +x.
         theta_i, theta_o: (...), degrees, broadcast against each other.
         height_scale, lateral_scale: of the heights, and of the lengths in the surface.

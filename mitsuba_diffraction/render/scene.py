@@ -75,7 +75,6 @@ def load_spectral_scene(
     reconstruction filter are those of the scene. File names in the scene are relative to its folder.
 
     Args:
-        path: the scene.
         width: of the full film in pixels; the crop window is scaled with it. If only one of width and height is given,
             the aspect ratio is preserved.
         height: likewise.
@@ -84,9 +83,6 @@ def load_spectral_scene(
             what is in it is replaced, unless the grating transmits light.
         motion: of the first sensor: an affine map of world space, 16 numbers in row-major order, applied after its
             `to_world`.
-
-    Returns:
-        The scene.
 
     Raises:
         FileNotFoundError: if there is no such file.
