@@ -314,13 +314,13 @@ def frames(k: Real) -> Real:
 
     k_y may be imaginary: the matrix is orthogonal, not unitary.
     """
-    across = np.emath.sqrt((k[:, 0] ** 2 + k[:, 1] ** 2).real)
-    s = np.stack([-k[:, 1], k[:, 0], np.zeros(len(k))], axis=1)
-    along_normal = np.abs(across)[:, None] < 1e-12
-    s = np.where(along_normal, [0.0, 1.0, 0.0], s / np.where(along_normal, 1, across[:, None]))
-    # ê·ŝ = s_y/√(1 − k_y²), and (k̂ × ê)·ŝ = −ê·(k̂ × ŝ) = −ê·p̂.
-    scale = np.sqrt(np.maximum((1 - k[:, 1] ** 2).real, 1e-30))
-    cos, sin = s[:, 1] / scale, np.cross(k, s)[:, 1] / scale
+    # ê·ŝ = s_y/√(1 − k_y²), and (k̂ × ê)·ŝ = −ê·(k̂ × ŝ) = −ê·p̂, with ŝ = (−k_y, k_x, 0)/√(k_x² + k_y²).
+    k_x, k_y, k_z = k.T
+    across = np.emath.sqrt((k_x**2 + k_y**2).real)
+    scale = np.sqrt(np.maximum((1 - k_y**2).real, 1e-30))
+    along_normal = np.abs(across) < 1e-12
+    across = np.where(along_normal, 1, across)
+    cos, sin = np.where(along_normal, 1, k_x / across) / scale, -k_y * k_z / (across * scale)
     return np.array([[cos, sin], [-sin, cos]]).transpose(2, 0, 1)
 
 
