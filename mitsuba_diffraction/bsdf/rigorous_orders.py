@@ -95,7 +95,7 @@ class RigorousOrders:
         self.interface = spectrum.transmission == "interface"
         self.max_order = axes.max_order
         self.starts = NumberTable(axes.starts.astype(np.uint32))
-        self.excess, self.top = opaque(axes.excess), opaque(axes.excess * axes.largest**2)
+        self.excess, self.top = opaque(axes.excess), opaque(axes.top)
         self.cells = CELLS_BOTH if self.transmits else CELLS
         units = _units(*_shares(spectrum, self.cells))
         self.sampler_planes, self.cells_across = units.shape[-4], units.shape[-2]
@@ -280,8 +280,10 @@ class RigorousOrders:
         if self.transmits:
             inner, low_inside, high_inside = _cell_of(pair.inside, a)
             if self.interface:
-                low = dr.select(cell == 0, pair.inside - self.top, low)
-                low_inside = dr.select(inner == 0, pair.square + self.top, low_inside)
+                low, low_inside = (
+                    dr.select(cell == 0, low_inside - self.top, low),
+                    dr.select(inner == 0, low + self.top, low_inside),
+                )
             inside = _arc(limited((pair.inside - low_inside) / larger(high_inside - low_inside, 1e-7), 0, 1))
         near, far = dr.sqrt(larger(pair.square - low, 1e-12)), dr.sqrt(larger(high - pair.square, 1e-12))
         places = _arc(2 * a), near / (near + far), inside

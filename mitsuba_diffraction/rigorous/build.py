@@ -46,13 +46,12 @@ _Orders = tuple[NDArray[np.int64], NDArray[np.int64], Real]
 _Checked = tuple[float, float, float, bool, dict[tuple[int, int], tuple[NDArray[np.int64], Real]]]
 
 # Steps of F, X and (with transmission) Z that are solved, one after the other until the error is kept. Most along X, on
-# which depends by how much light that grazes the surface enters it.
-_SOLVED = ((6, 10, 6), (9, 15, 9), (12, 20, 12))
-# Where light passes. Of large periods the first are enough.
-_SOLVED_BOTH = ((4, 6, 4), *_SOLVED)
-# Steps that are stored to each of these, by cubic polynomials: linear look-ups need more nodes.
-_STORED = 2
+# which depends by how much light that grazes the surface enters it; along F, plasmons of metals are narrow.
+_SOLVED = ((12, 15, 12), (18, 24, 18))
+# Where light passes: a third more steps are stored, by cubic polynomials, as most of the time goes into solutions.
+_SOLVED_BOTH = ((6, 9, 6), (9, 15, 9), (12, 18, 12))
 PLANES = 17
+_PLACES = 20  # to each step that is stored, where a table is fitted to its polynomials
 # Wavelengths that are solved, by the least g λ / T (the cosine of the cone angle) of these: metals in light along the
 # grooves show narrow lines that move with the wavelength.
 _CONES = ((0.45, 17), (0.7, 9), (1.0, 5))
@@ -67,7 +66,7 @@ _CHECKS = 200
 _SECONDS = 20.0  # between checkpoints, each of which is written whole
 # Light at which the harmonics are chosen: near the normal, and oblique from both sides.
 _HARD = ((0.1, 0, 1), (0.8, 0.3, 0.5), (-0.8, 0.3, 0.5))
-BUILD_VERSION = 6  # raised when tables of equal requests change
+BUILD_VERSION = 7  # raised when tables of equal requests change
 MATRICES = 3.0
 """Bound of `polarisation_error`, in tolerances: matrices vary faster than η."""
 
@@ -304,7 +303,7 @@ class _Build:
         self.surface, self.steps = surface, steps
         self.entries = 4 if polarised else 1  # rows and columns of the matrices that are kept
         self.passes = surface.transmission != "none"
-        f, x, z = (_STORED * count for count in steps)
+        f, x, z = (4 * count // 3 for count in steps) if self.passes else steps
         index = surface.index(surface.wavelengths[0]).real if self.passes else 0.0
         self.axes = Axes(
             surface.period, surface.wavelengths, (f, x, z if self.passes else PLANES - 1), index, surface.transmission
@@ -337,21 +336,17 @@ class _Build:
         """Return M at one a in one block: (orders in, orders out, X, Z, i, j); 0 where there is no light."""
         a, (cell, inside) = self.jobs[job]
         axes, surface = self.axes, self.surface
-        counts, top = axes.counts(cell, inside), axes.excess * axes.largest**2
+        counts = axes.counts(cell, inside)
+        low, low_inside = (float(edges_of(j, a, 0.0)[0]) for j in (cell, inside))
         nodes = [len(shares) for shares in self.shares[1:]]
         found = np.zeros((sum(counts), sum(counts), *nodes, self.entries, self.entries))
         # Where a cell is but a point its nodes are one.
         known: dict[tuple[float, float], NDArray] = {}
         for (x, of_x), (z, of_z) in itertools.product(*(enumerate(shares) for shares in self.shares[1:])):
-            if cell:
-                square = _inside(cell, a, of_x, 0.0)
-                below = _inside(inside, a, of_z, square + top)
-            else:
-                below = _inside(inside, a, of_z, 0.0)
-                square = _inside(cell, a, of_x, below - top)
+            square, below = _inside(cell, a, of_x, low_inside - axes.top), _inside(inside, a, of_z, low + axes.top)
             nu2 = (below - square) / axes.excess
-            # Beyond the light that there is, as far as polynomials reach.
-            if nu2 < max((axes.period / axes.wavelengths[1]) ** 2, square) / 4:
+            # Beyond the light that there is, too: where nodes are left out, polynomials of their neighbours err.
+            if nu2 < max((axes.period / axes.wavelengths[1]) ** 2, square) / 64:
                 continue
             key = square, below
             if key not in known:
@@ -374,7 +369,7 @@ class _Build:
             count = 1
             if longest > shortest:
                 count = next((count for limit, count in _CONES if g < limit * axes.largest), _CONES[-1][1])
-            at, weights = _nodes(count, PLANES)
+            at, weights = _nodes(count)
             lights = [surface.light(square, wavelength) for wavelength in shortest + at * (longest - shortest)]
             solved = [self._matrices(light, axes.counts(cell, 0)) for light in surface.solve(a, square, lights)]
             planes.append(np.einsum("kw,wnm...->nmk...", weights, solved))
@@ -396,8 +391,10 @@ class _Build:
         """Return what was solved at the nodes that are stored."""
         axes, entries, blocks = self.axes, self.entries, len(self.axes.blocks)
         matrices = np.empty((*axes.shape, entries, entries), np.float32)
-        f, x, z = self.steps
-        refine = _cubic(f), _cubic(x), _cubic(z) if self.passes else np.eye(PLANES)
+        steps = zip(self.steps, axes.steps, strict=True)
+        refine = [_fitted(functools.partial(_cubic, solved), stored) for solved, stored in steps]
+        # The wavelength is done.
+        refine[2] = refine[2] if self.passes else np.eye(PLANES)
         signs = np.outer(REVERSED, REVERSED)[:entries, :entries]
         for block, (cells, row) in enumerate(axes.blocks.items()):
             solved = np.stack([done[job] for job in range(block, len(self.jobs), blocks)])
@@ -434,30 +431,39 @@ def _inside(cell: int, a: float, share: float, least: float) -> float:
     return square if abs(square) > _STILL else _STILL if cell else -_STILL
 
 
-def _nodes(count: int, planes: int) -> tuple[Real, Real]:
+@functools.cache
+def _nodes(count: int) -> tuple[Real, Real]:
     """Return Chebyshev–Lobatto points in 0 … 1, (count,), and the weights (planes, count) of values at equal steps."""
-    if count == 1:
-        return np.zeros(1), np.ones((planes, 1))
-    at = (1 - np.cos(np.pi * np.arange(count) / (count - 1))) / 2
-    return at, _lagrange(np.linspace(0, 1, planes), at)
+    at = (1 - np.cos(np.pi * np.arange(count) / max(count - 1, 1))) / 2
+    return at, _fitted(lambda x: _lagrange(x, at), PLANES - 1)
 
 
 def _lagrange(x: Real, nodes: Real) -> Real:
     """Return (x, nodes): weights of values at the nodes in the polynomial through them."""
-    ratio = np.ones((len(x), len(nodes)))
-    for j, node in enumerate(nodes):
-        others = np.delete(nodes, j)
-        ratio[:, j] = np.prod((x[:, None] - others) / (node - others), axis=1)
-    return ratio
+    others = [np.delete(nodes, j) for j in range(len(nodes))]
+    factors = [(x[:, None] - other) / (node - other) for node, other in zip(nodes, others, strict=True)]
+    return np.stack([factor.prod(axis=1) for factor in factors], axis=1)
 
 
-def _cubic(steps: int) -> Real:
-    """Return (nodes stored, nodes solved): cubic interpolation between four neighbours."""
-    matrix = np.zeros((_STORED * steps + 1, steps + 1))
-    for fine, row in enumerate(matrix):
-        low = int(np.clip(fine // _STORED - 1, 0, steps - 3))
-        row[low : low + 4] = _lagrange(np.array([fine / _STORED]), np.arange(low, low + 4.0))[0]
+def _cubic(steps: int, x: Real) -> Real:
+    """Return (x, nodes solved): weights in cubic interpolation between four neighbours, x from 0 to 1."""
+    low = np.clip((x * steps).astype(int) - 1, 0, steps - 3)
+    matrix = np.zeros((len(x), steps + 1))
+    matrix[np.arange(len(x))[:, None], low[:, None] + np.arange(4)] = _lagrange(x * steps - low, np.arange(4.0))
     return matrix
+
+
+def _fitted(polynomials: Callable[[Real], Real], steps: int) -> Real:
+    """Return (steps + 1, nodes solved): weights of values at equal steps between which linear look-ups fit polynomials.
+
+    Of the rms error of values on a polynomial, h² |f''| / √120 with steps h, least squares leave 1/√6. Values at the
+    ends are on it: tables of neighbouring cells meet there.
+    """
+    x = (np.arange(_PLACES * steps) + 0.5) / (_PLACES * steps)
+    hats = np.maximum(1 - np.abs(steps * x[:, None] - np.arange(steps + 1)), 0)
+    ends = polynomials(np.array([0.0, 1.0]))
+    rest = polynomials(x) - hats[:, [0, -1]] @ ends
+    return np.vstack([ends[:1], np.linalg.lstsq(hats[:, 1:-1], rest, rcond=None)[0], ends[1:]])
 
 
 class _Checkpoint:

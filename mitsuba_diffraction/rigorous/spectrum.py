@@ -27,7 +27,7 @@ from .efficiencies import ODD, REVERSED
 Real = NDArray[np.float64]
 
 FORMAT = "mitsuba_diffraction rigorous spectrum"
-FORMAT_VERSION = 4
+FORMAT_VERSION = 5
 
 # Attributes, and their names in files.
 _NUMBERS = {
@@ -43,6 +43,7 @@ _TEXTS = ("material", "source", "source_digest")
 _STEPS = ("stepsF", "stepsX", "stepsZ")
 
 
+_MARGIN = 0.25
 LARGEST_PERIOD = 10.0
 """In units of the shortest wavelength: the table grows with the cube of the period, the time to build it faster."""
 
@@ -69,8 +70,8 @@ class Axes:
 
     from 0 to 1, X steeper at its ends: light that grazes the surface above enters the denser medium within few degrees.
     Of γ' likewise sin²(π Z / 2) = t'. Cell 0 above, where light travels below only, begins at the least γ² that the
-    shortest wavelength admits, γ'² − (n² − 1) ν². Without transmission (index 0) Z is the wavelength, from
-    the shortest to the longest that γ admits (k_y² ≥ 0):
+    shortest wavelength admits in the cell of γ', h'_{j−1}² − `top`. Without transmission (index 0) Z is the wavelength,
+    from the shortest to the longest that γ admits (k_y² ≥ 0):
 
         λ = λ₀ + (λ₁ − λ₀) Z,    λ₀ = min(λ_min, T/γ),    λ₁ = min(λ_max, T/γ).
 
@@ -95,6 +96,11 @@ class Axes:
     def excess(self) -> float:
         """n² − 1, or 0."""
         return self.index**2 - 1 if self.index else 0.0
+
+    @property
+    def top(self) -> float:
+        """The largest (n² − 1) ν², and a margin, so that a cell 0 in which there is light does not end in a point."""
+        return self.excess * self.largest**2 + np.sign(self.excess) * _MARGIN
 
     @property
     def largest(self) -> float:
@@ -184,11 +190,11 @@ class Axes:
             there &= rank(order) < np.where(side, counts[1], counts[0])
             channels.append(rank(order) + np.where(side, counts[0], 0))
         row = row + channels[0] * (counts[0] + counts[1]) + channels[1]
-        top = self.excess * self.largest**2
-        t = share_of(square, *edges_of(cell, a, inside - top))
+        low, low_inside = (edges_of(x, a, 0.0)[0] for x in (cell, cell_inside))
+        t = share_of(square, *edges_of(cell, a, low_inside - self.top))
         places = [arc(2 * a), np.sqrt(t) / (np.sqrt(t) + np.sqrt(1 - t))]
         if self.index:
-            places.append(arc(share_of(inside, *edges_of(cell_inside, a, square + top))))
+            places.append(arc(share_of(inside, *edges_of(cell_inside, a, low + self.top))))
         else:
             first, last = self.range(g)
             places.append(np.clip((wavelength - first) / np.maximum(last - first, 1e-9), 0, 1))
