@@ -28,7 +28,7 @@ from .spectrum.power_spectrum import PowerSpectrum
 from .spectrum.tables import Series, SeriesTable, SliceTable, chebyshev, taylor
 
 FORMAT = "mitsuba_diffraction grating spectrum"
-FORMAT_VERSION = 7
+FORMAT_VERSION = 8
 
 # Numbers and texts, and their names in files.
 _NUMBERS = {

@@ -77,7 +77,7 @@ else:
 _SCAN_KEYS = frozenset({"scan", "pixel_size", "height_range", "fill_missing", "channel", "unit", "prepare"})
 _SPECTRUM_KEYS = frozenset(f.name for f in fields(Settings))
 # Incremented when the same input gives a different result, to invalidate the cache.
-_BUILD_VERSION = 7
+_BUILD_VERSION = 8
 # Spectra that the package brings (precompute/ready_spectra.py), named as in the cache.
 READY_SPECTRA = Path(__file__).parent / "data" / "spectra"
 _OF_HEIGHTS = 0.3  # the share of the time that the heights of many patches take, roughly

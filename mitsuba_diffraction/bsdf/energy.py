@@ -16,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..energy.table import EnergyTable
+from ..energy.table import LARGEST, EnergyTable
 from .geometry import cell_of, on_square
 from .tables import FloatTable, NumberTable, PacketTable, larger, limited, opaque, smaller
 
@@ -72,7 +72,7 @@ class Energy:
         self.two_sided = len(tables) > 1 + len(edges or ())
         steps = np.concatenate([of.steps for of in tables])
         self.table = NumberTable(steps @ (np.uint32(1) << np.arange(0, 32, 8, dtype=np.uint32)))
-        heights = [(1 - of.least) / 255 for of in tables]
+        heights = [(LARGEST - of.least) / 255 for of in tables]
         self.steps = [opaque(height) for height in heights] if edges is None else FloatTable(np.array(heights))
         self.edges = None if edges is None else [opaque(edge) for edge in edges]
         self.slope = None if slopes is None else PacketTable(slopes)
@@ -161,11 +161,10 @@ class Energy:
                 values = dr.lerp(values, corners(index + self.side * self.side), beyond)
             return dr.lerp(dr.lerp(values[0], values[1], x), dr.lerp(values[2], values[3], x), y)
 
-        # From above, so that one stays one.
-        e = 1 - (255 - between(lambda i: _bytes(self.table(i)))) * step
+        e = LARGEST - (255 - between(lambda i: _bytes(self.table(i)))) * step
         if self.slope is not None:
             e += between(lambda i: self.slope(i, True)) * self.change
-        return e
+        return smaller(e, 1)
 
     def _column(self, u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
         """Return the cell of u along one axis, and the place in it."""

@@ -95,7 +95,7 @@ class OrderTable:
             # E of a wavelength in the middle.
             omega, wavelengths = self._nodes(self.slices / 2)
             albedo = furnaces[0].albedo(self._inside(omega, above), wavelengths / self._indices(above)[0])
-            reflected, passed = np.array(sent) * bounds_of(albedo, furnaces[0].index)
+            reflected, passed = np.array(sent) * np.minimum(bounds_of(albedo, furnaces[0].index), 1)
             shares.append(passed / np.maximum(reflected + passed, 1e-30))
         self.before, self.shares = FloatTable(np.concatenate(sums)), FloatTable(np.array(shares))
         packed = np.concatenate(cells)

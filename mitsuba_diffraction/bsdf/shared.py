@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..energy.furnace import Furnace
-from ..energy.table import EnergyTable, Layout, Stretched, between, corners, layouts_of
+from ..energy.table import EnergyTable, Layout, Stretched, between, corners, frequencies_of
 from ..precomputation import Spectrum
 from ..rigorous.spectrum import RigorousSpectrum
 from ..settings import VISIBLE
@@ -114,14 +114,12 @@ class SharedTables:
             ratios = np.linspace(low, high, 2 * int(np.clip(turn / (2 * TURN), 1, PARTS)) + 1)
             laterals = np.repeat(laterals[:1], len(ratios))
         found, most = [], float(np.max(ratios))
-        shape = layouts_of(spectrum, self._eta, most)[0]
+        shape = Layout.of(spectrum, Furnace.of(spectrum, most, self._eta))
+        indices = [None] if self._eta is None else [self._eta, 1 / self._eta]
         for ratio, lateral in zip(ratios, laterals, strict=True):
             stretched = Stretched(spectrum, float(lateral))
             # Tables of all ratios are read alike, but for their wavelengths.
-            layouts = [
-                dataclasses.replace(shape, frequencies=own.frequencies)
-                for own in layouts_of(stretched, self._eta, most)
-            ]
+            layouts = [dataclasses.replace(shape, frequencies=frequencies_of(stretched, index)) for index in indices]
             found.append(self.energy_tables(float(ratio), stretched, layouts))
         edges = (ratios[1:] + ratios[:-1]) / 2
         if not complete:

@@ -317,8 +317,10 @@ class Furnace:
             s[back], cos_i[back] = (s + offset)[back], np.sqrt(square[back])
             offset[back] *= -1
         result = np.empty(len(s))
-        lobe = (self.q[component] == 0).all(-1) | self.by_order
-        wide = lobe & (length * self.widths[component] > NARROW)
+        narrow = length * self.widths[component] < NARROW
+        # Of the cells those of wide lobes, most of whose power may be near the mirror direction.
+        lobe = (self.q[component] == 0).all(-1) | (narrow & self.wide) | self.by_order
+        wide = lobe & ~narrow
         # Where ω_i changes, phases turn in another direction than the cosine that is integrated over.
         wide |= back & (
             (2 * np.pi * self.height_range * self.widths[component] / TURN) ** 2 * (1 - cos_i**2) > cos_i**2

@@ -14,7 +14,8 @@ Of a grating with the period T, c = √(1 − ω_y²) and
 the order m > 0 propagates if m < u, and m < 0 if −m < v: e jumps where u or v is a whole number, and is continuous
 between. So each unit square of (u, v) is divided into cells by itself, finest near its lower edges, where an order has
 just emerged; at u = 0 and v = 0 ω itself is at the horizon. With f the fraction of u, nodes are equidistant in √f, as
-cos θ_o of that order is. a depends on u and v alone: the table has one slice.
+cos θ_o of that order is. a depends on u and v alone, but for lobes that reach the horizon: seen in units of c, they are
+1/c as wide, and e holds for all c = (u + v) λ/2T of the spectrum. The table has one slice.
 
 Of surfaces with orders in two dimensions, of samples and of interfaces the hemisphere is a square, its middle the
 normal and its edge the horizon,
@@ -22,7 +23,8 @@ normal and its edge the horizon,
     (ω_x − ω_y, ω_x + ω_y) (1 − t)/(|ω_x| + |ω_y|),    cos θ = 1 − (1 − t²)²
 
 with nodes that are equidistant along its sides and, the slices, in 1/λ: there e is smooth but for its kinks. An
-interface has tables for the light of each side.
+interface has tables for the light of each side. That of e = 1 is not among the kinks: the tables hold 1/a also where it
+is a little more than one.
 """
 
 from __future__ import annotations
@@ -45,15 +47,17 @@ from .furnace import BLUR, PHASE, Furnace, PowerSpectrum
 
 SLACK = 1e-3
 """What an albedo may exceed one by."""
+LARGEST = 1.05
+"""Of what is stored: e is one where that is more, so that it has its kink where a = 1 within a cell."""
 CHECKED, CHECKS = 150, 3  # random places at which a table is held against the spectrum itself, and how often
 CANDIDATES, TIGHT = 15, 0.9  # so many places, at most, for one that is checked: there the furnace finds this albedo
 ABOUT = 3, 5, 5  # slices, rows and columns that are lowered about such a place
-NODES, FINEST = 3500, 12  # nodes of other tables; times this, at most
-PLACES = 1.5e5  # nodes of the table of a line grating, at most; a quarter if lobes are wide, which takes longer
+NODES, FINEST = 3200, 12  # nodes of other tables; times this, at most
+PLACES = 1.2e5  # cells of the table of a line grating, about; a quarter if lobes are wide, which takes longer
 ROUNDS, PAIRS = 32, 5e6  # places in a cell, at most; about so many pairs with components
 STEEP = 0.98  # e is lowered so far inside of a cell or its neighbours, where more places are tried
 STRIDE = np.array([0.8191725, 0.6710436, 0.5497005])  # of places in a cell, so that few rounds cover it (Roberts 2018)
-TURNED = 1.0, 0.5  # c for which a is computed, where it matters
+NEAR = 3  # of an order emerging at u = m within u − m < 3σ_q T/c a lobe reaches the horizon
 LEAST, HORIZON = 1e-7, 0.01  # the least fraction of u and v, and the least t
 
 
@@ -101,10 +105,7 @@ class Layout:
     @classmethod
     def of(cls, spectrum: PowerSpectrum, furnace: Furnace) -> Layout:
         """Choose the layout for `spectrum`: as fine as the work allows."""
-        # Those of the spectrum are in the denser medium.
-        shortest, longest = (w * 1e-3 * max(furnace.index or 1, 1) for w in spectrum.wavelengths)
-        frequencies = 1 / longest, 1 / shortest
-        grid = spectrum.grid
+        frequencies, grid = frequencies_of(spectrum, furnace.index), spectrum.grid
         if furnace.index is not None or not (isinstance(grid, OrderGrid) and 1 in grid.shape):
             # As fine as the work allows, which is about the same for all.
             nodes = NODES * float(np.clip(PAIRS / 2 / (furnace.work * NODES), 1, 1 if furnace.index else FINEST))
@@ -121,9 +122,9 @@ class Layout:
         side = np.sqrt(2 * min(nodes, PAIRS / max(len(furnace.q) / 2, 1)))
         first = int(np.clip(side / 8, 4, 24))
         period, rest = grid.tile_size[int(turned)], (side - 2 * first - 1) / 3
-        period /= max(np.ceil(2 * period / shortest / max(rest, 2)), 1)
-        squares = int(np.ceil(2 * period / shortest))
-        cells = int(np.clip((3 * rest / max(squares - 1, 1) - 1) / 2, 1, 48 if furnace.turning else 24))
+        period /= max(np.ceil(2 * period * frequencies[1] / max(rest, 2)), 1)
+        squares = int(np.ceil(2 * period * frequencies[1]))
+        cells = int(np.clip((3 * rest / max(squares - 1, 1) - 1) / 2, 1, 48))
         return cls(float(period), squares, first, cells, 1, frequencies, turned)
 
     def places(
@@ -145,15 +146,46 @@ class Layout:
         u, v = (self._place(np.where(x * sign > 0, shorter, longer) * per_length) for sign in (1, -1))
         return np.zeros(len(x)), v, u
 
-    def directions(self, places: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the inverse of `places` but for line gratings: of (n, 3), ω (n, 3) and λ (n,)."""
+    def directions(
+        self, cells: NDArray[np.int64], inside: NDArray[np.float64], frequency: float = np.inf
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the inverse of `places`, ω (n, 3) and λ (n,), of places `inside` cells, both (n, 3).
+
+        Many directions of a line grating have the same u and v: of those in the range of the spectrum the one is
+        returned whose 1/λ is the closest to `frequency`; with zero, that with c = 1 in any case.
+        """
         first, last = self.frequencies
-        row, column = (2 * places[:, k] / self.first - 1 for k in (1, 2))
+        if self.lines:
+            v, u = (square + fraction for square, fraction in self.fractions(cells, inside))
+            nu = (u + v) / (2 * self.period)
+            c = np.minimum(nu / np.clip(frequency, first, last), 1) if frequency else np.ones_like(nu)
+            x = (v - u) / (u + v)
+            x, y, z = c * x, np.sqrt(1 - c**2), c * np.sqrt(1 - x**2)
+            return np.stack([y, x, z] if self.turned else [x, y, z], -1), c / nu
+        nu, row, column = (cells + inside).T
+        row, column = (2 * x / self.first - 1 for x in (row, column))
         x, y = (column + row) / 2, (column - row) / 2
         t = np.maximum(1 - np.abs(x) - np.abs(y), HORIZON)
         z = 1 - (1 - t**2) ** 2
         along = np.sqrt(1 - z**2) / np.maximum(np.hypot(x, y), 1e-12)
-        return np.stack([along * x, along * y, z], -1), 1 / (first + places[:, 0] / (self.slices - 1) * (last - first))
+        return np.stack([along * x, along * y, z], -1), 1 / (first + nu / (self.slices - 1) * (last - first))
+
+    def fractions(
+        self, cells: NDArray[np.int64], inside: NDArray[np.float64]
+    ) -> list[tuple[NDArray[np.int64], NDArray[np.float64]]]:
+        """Return the whole number below v and that below u, (n,), each with what remains, of a line grating."""
+        result = []
+        for cell, x in zip(cells.T[1:], inside.T[1:], strict=True):
+            square = self.squares_of_cells[cell]
+            start = np.where(square > 0, self.first + (square - 1) * self.cells, 0)
+            f = _fraction((cell - start + x) / np.where(square > 0, self.cells, self.first))
+            result.append((square, np.clip(f, LEAST, 1 - LEAST)))
+        return result
+
+    @property
+    def squares_of_cells(self) -> NDArray[np.int64]:
+        """The unit square of each cell along u or v."""
+        return np.repeat(np.arange(self.squares), [self.first] + [self.cells] * (self.squares - 1))
 
     @property
     def cell_counts(self) -> tuple[int, int, int]:
@@ -186,11 +218,6 @@ class Layout:
         start = np.where(square > 0, self.first + (square - 1) * self.cells, 0)
         return start + _equidistant(u - square) * np.where(square > 0, self.cells, self.first)
 
-    def nodes(self, square: int) -> NDArray[np.float64]:
-        """Return u at the nodes of a unit square and in the middle between them."""
-        count = 2 * (self.first if square == 0 else self.cells)
-        return square + np.clip(_fraction(np.arange(count + 1) / count), LEAST, 1 - LEAST)
-
 
 def _equidistant(f: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return √f; below 0 and above 1, of the nearest."""
@@ -208,8 +235,8 @@ class EnergyTable:
 
     Attributes:
         layout: where the cells lie.
-        steps: uint8 (slices, rows, columns, 4): e = `least` + (1 − `least`)/255 · step at (u, v), (u⁺, v), (u, v⁺) and
-            (u⁺, v⁺).
+        steps: uint8 (slices, rows, columns, 4): e = min(1, `least` + (`LARGEST` − `least`)/255 · step), with the step
+            linear between (u, v), (u⁺, v), (u, v⁺) and (u⁺, v⁺).
         least: the smallest e.
         loss: (mean, largest) share of e that is less than the furnace allows, at random places, most of them slanted.
     """
@@ -231,7 +258,7 @@ class EnergyTable:
     def of(
         cls, spectrum: PowerSpectrum, height_scale: float = 1.0, layouts: Sequence[Layout] | None = None
     ) -> EnergyTable:
-        """Make the table of `spectrum`, with its heights scaled by `height_scale`; `layouts` as of `layouts_of`."""
+        """Make the table of `spectrum`, with its heights scaled by `height_scale`; it has the first of `layouts`."""
         furnace = Furnace.of(spectrum, height_scale)
         return cls._of_side(spectrum, furnace, layouts[0] if layouts else Layout.of(spectrum, furnace))[0]
 
@@ -249,7 +276,7 @@ class EnergyTable:
             spectrum: it holds wavelengths in the denser medium.
             index: of the medium below relative to that above.
             height_scale: times the heights.
-            layouts: as of `layouts_of`.
+            layouts: of both sides; those of `Layout.of` if there are none.
         """
         furnaces = [Furnace.of(spectrum, height_scale, index, side) for side in (1, -1)]
         layouts = layouts or [Layout.of(spectrum, furnace) for furnace in furnaces]
@@ -286,20 +313,20 @@ class EnergyTable:
                 np.minimum.at(share, tuple(of[tried] for of in cells), 1 / np.maximum(albedo, 1))
             # Places that were not tried may exceed by as much again.
             everywhere = share.min() ** 2 if check == CHECKS - 1 else 1.0
-            if layout.lines:
+            if layout.lines and not exact:
                 np.minimum.at(share, cells, lower)
             share = np.minimum(minimum_filter(share, ABOUT), everywhere)
             np.minimum.at(share, cells, lower)
             e = layout.lowered(e, share)
-            lost = 1 - np.minimum(got * share[cells] / bounds_of(a, furnace.index), 1)
+            lost = 1 - np.minimum(got * share[cells] / np.minimum(bounds_of(a, furnace.index), 1), 1)
             losses = [(float(of.mean()), float(of.max())) for of in lost]
         return [cls.packed(layout, *of) for of in zip(e, losses, strict=True)]
 
     @classmethod
     def packed(cls, layout: Layout, e: NDArray[np.float64], loss: tuple[float, float] = (0.0, 0.0)) -> EnergyTable:
         """Round e at the corners of cells to bytes, so that it exceeds the numbers by no more than `SLACK`."""
-        least = float(e.min())
-        steps = np.floor(np.minimum((e * (1 + SLACK) - least) / max(1 - least, 1e-9), 1) * 255)
+        least = min(float(e.min()), 1.0)
+        steps = np.floor(np.minimum((e * (1 + SLACK) - least) / (LARGEST - least), 1) * 255)
         return cls(layout, np.maximum(steps, 0).astype(np.uint8), least, loss)
 
     @property
@@ -316,7 +343,7 @@ class EnergyTable:
         if not self.layout.lines:
             above = (self.steps[below + 1, row, column] * weights).sum(-1)
             steps += (slices - below) * (above - steps)
-        return self.least + (1 - self.least) / 255 * steps
+        return np.minimum(self.least + (LARGEST - self.least) / 255 * steps, 1)
 
     def as_plain(self) -> dict[str, Any]:
         """Return the table as numbers and texts, for JSON."""
@@ -375,13 +402,11 @@ class Stretched:
         return shortest, longest / self.least
 
 
-def layouts_of(spectrum: PowerSpectrum, index: float | None, height_scale: float) -> list[Layout]:
-    """Return the layout of the table of a spectrum, or, of an interface, of the tables of both sides.
-
-    Tables of smaller heights and of larger lateral scales can have the same, so that they are read alike.
-    """
-    sides = (1,) if index is None else (1, -1)
-    return [Layout.of(spectrum, Furnace.of(spectrum, height_scale, index, side)) for side in sides]
+def frequencies_of(spectrum: PowerSpectrum, index: float | None) -> tuple[float, float]:
+    """Return (smallest, largest) 1/λ in 1/µm of a table; `index` is η as of `Furnace`."""
+    # Those of the spectrum are in the denser medium.
+    shortest, longest = (w * 1e-3 * max(index or 1, 1) for w in spectrum.wavelengths)
+    return 1 / longest, 1 / shortest
 
 
 def between(below: EnergyTable, middle: EnergyTable, above: EnergyTable) -> EnergyTable:
@@ -389,10 +414,12 @@ def between(below: EnergyTable, middle: EnergyTable, above: EnergyTable) -> Ener
 
     A parabola through three equidistant values exceeds them by no more than an eighth of its second difference.
     """
-    first, second, third = (t.least + (1 - t.least) / 255 * t.steps.astype(np.float64) for t in (below, middle, above))
+    first, second, third = (
+        t.least + (LARGEST - t.least) / 255 * t.steps.astype(np.float64) for t in (below, middle, above)
+    )
     lowest = np.minimum(np.minimum(first, second), third)
     e = np.maximum(lowest - np.abs(first - 2 * second + third) / 8, 0)
-    lost = e / np.maximum(second, 1e-9)
+    lost = np.minimum(e, 1) / np.clip(second, 1e-9, 1)
     loss = below.loss[0] + float(1 - lost.mean()), below.loss[1] + float(1 - lost.min())
     return EnergyTable.packed(middle.layout, e / (1 + SLACK), loss)
 
@@ -413,10 +440,11 @@ def bounds_of(albedo: NDArray[np.float64], index: float | None) -> NDArray[np.fl
         As `albedo`.
     """
     if index is None:
-        return 1 / np.maximum(albedo, 1)
+        return np.minimum(1 / np.maximum(albedo, 1e-9), LARGEST)
     r, t = albedo
-    e_t = np.minimum(1, (1 - np.minimum(r, ((index - 1) / (index + 1)) ** 2)) / np.maximum(t, 1e-9))
-    return np.stack([np.minimum(1, (1 - e_t * t) / np.maximum(r, 1e-9)), e_t])
+    e_t = (1 - np.minimum(r, ((index - 1) / (index + 1)) ** 2)) / np.maximum(t, 1e-9)
+    e_r = (1 - np.minimum(e_t, 1) * t) / np.maximum(r, 1e-9)
+    return np.minimum([e_r, e_t], LARGEST)
 
 
 def corners(furnace: Furnace, layout: Layout) -> NDArray[np.float64]:
@@ -425,74 +453,63 @@ def corners(furnace: Furnace, layout: Layout) -> NDArray[np.float64]:
     Returns:
         e of reflected, and of an interface of transmitted light, (1 or 2, *layout.shape).
     """
-    return (_line_corners if layout.lines else _general_corners)(furnace, layout)
-
-
-def _line_corners(furnace: Furnace, layout: Layout) -> NDArray[np.float64]:
-    """Compute `corners` of a line grating."""
-    last = layout.frequencies[1]
-    nodes = [layout.nodes(square) for square in range(layout.squares)]
-    lattice = np.concatenate(nodes)
-    square = np.repeat(np.arange(layout.squares), [len(n) for n in nodes])
-    v, u = np.meshgrid(lattice, lattice, indexing="ij")
-    nu = (u + v) / (2 * layout.period)
-    reached = np.add.outer(square, square) < 2 * layout.period * last
-    e = np.ones((1, *nu.shape))
-    if layout.turned:
-        furnace = dataclasses.replace(furnace, q=furnace.q[:, ::-1])
-    x = ((v - u) / (u + v))[reached]
-    omega = np.stack([x, np.zeros(len(x)), np.sqrt(1 - x**2)], -1)
-    # Where phases turn within lobes a depends on c, too: seen in the scale of c, lobes are 1/c as wide.
-    scales = TURNED if furnace.turning else (1.0,)
-    a = [dataclasses.replace(furnace, widths=furnace.widths / c).albedo(omega, 1 / nu[reached])[0] for c in scales]
-    e[0, reached] = 1 / np.maximum(np.max(a, axis=0), 1)
-    inside = reached & (nu <= last)
-    # The cells: each second node but the last of a unit square.
-    start = np.concatenate([np.arange(0, len(n) - 1, 2) + np.flatnonzero(square == k)[0] for k, n in enumerate(nodes)])
-
-    def at(values: NDArray, j: int, i: int) -> NDArray:
-        return values[..., start[:, None] + j, start + i]
-
-    result = np.stack([at(e, j, i) for j in (0, 2) for i in (0, 2)], -1)
-    # In the middle of the cells and of their edges.
-    share = np.ones(result.shape[:-1])
-    for j, i in ((1, 1), (0, 1), (1, 0), (2, 1), (1, 2)):
-        got = result @ _bilinear(np.float64(i / 2), np.float64(j / 2))
-        share = np.minimum(share, np.where(at(inside, j, i), at(e, j, i) / np.maximum(got, 1e-30), 1))
-    return (result * share[..., None])[None]
-
-
-def _general_corners(furnace: Furnace, layout: Layout) -> NDArray[np.float64]:
-    """Compute `corners` of other surfaces: lowered in the middle of cells, and elsewhere in those that are steep."""
-
-    def bound(places: NDArray[np.float64]) -> NDArray[np.float64]:
-        return bounds_of(furnace.albedo(*layout.directions(places)), furnace.index)
-
     slices, side = layout.shape[:2]
-    nodes = np.indices((slices, side + 1, side + 1), np.float64)
-    of_nodes = bound(nodes.reshape(3, -1).T).reshape(-1, *nodes.shape[1:])
-    e = np.stack([of_nodes[..., j : j + side, i : i + side] for j, i in np.ndindex(2, 2)], -1)
-    lowered = np.ones((len(e), slices - 1, side, side))
+
+    def bound(cells: NDArray[np.int64], inside: NDArray[np.float64]) -> NDArray[np.float64]:
+        omega, lengths = layout.directions(cells, inside)
+        a = furnace.albedo(omega, lengths)
+        if layout.lines:
+            # Lobes are 1/c as wide, which matters where one reaches the horizon or phases turn within it.
+            c = np.sqrt(1 - omega[:, 0 if layout.turned else 1] ** 2)
+            least = np.min([f for _, f in layout.fractions(cells, inside)], axis=0)
+            near = (c < 1) & (furnace.turning | (c * least < NEAR * furnace.lobe_width * layout.period))
+            # Phases turn least within the narrowest lobes.
+            for frequency in (layout.frequencies[0], 0.0)[: 1 + furnace.turning if near.any() else 0]:
+                omega, lengths = layout.directions(cells[near], inside[near], frequency)
+                a[:, near] = np.maximum(a[:, near], furnace.albedo(omega, lengths))
+        return bounds_of(a, furnace.index)
+
+    # Unit squares have nodes of their own: cells begin at `start`.
+    squares = layout.squares_of_cells
+    start = np.arange(side) + squares
+    of_node = np.repeat(np.arange(side), 1 + np.diff(squares, append=layout.squares))
+    at_end = np.diff(of_node, prepend=-1) == 0
+    if layout.lines:
+        reached = np.add.outer(squares, squares)[None] < 2 * layout.period * layout.frequencies[1]
+    else:
+        reached = np.ones(layout.cell_counts, bool)
+    nodes = np.indices((slices, len(of_node), len(of_node))).reshape(3, -1)
+    cells, inside = (np.stack([nodes[0] * k, of[nodes[1]], of[nodes[2]]], -1) for k, of in ((1, of_node), (0, at_end)))
+    some = reached[0][cells[:, 1], cells[:, 2]]
+    of_nodes = np.ones((len(furnace.ways[:2]), len(some)))
+    of_nodes[:, some] = bound(cells[some], inside[some])
+    at = of_nodes.reshape(-1, slices, len(of_node), len(of_node))
+    e = np.stack([at[..., start[:, None] + j, start + i] for j, i in np.ndindex(2, 2)], -1)
+    lowered = np.ones((len(e), *layout.cell_counts))
     # The middle of all cells, and more places in those that are steep.
-    some, rounds, index = np.ones(lowered.shape[1:], bool), 1, 0
+    deep, emerging = furnace.max_kappa * furnace.height_range * BLUR > 1, furnace.by_order and not layout.lines
+    least = 3 if layout.lines else 8 if emerging and deep and furnace.index is None else 1
+    some, rounds, index = reached, 1, 0
     while index < rounds:
         inside = (0.5 + index * STRIDE) % 1
         got = e @ _bilinear(inside[2], inside[1])
-        got = (1 - inside[0]) * got[:, :-1] + inside[0] * got[:, 1:]
-        share = np.ones_like(lowered)
-        share[:, some] = np.minimum(bound(np.argwhere(some) + inside) / np.maximum(got[:, some], 1e-30), 1)
+        if not layout.lines:
+            got = (1 - inside[0]) * got[:, :-1] + inside[0] * got[:, 1:]
+        share, cells = np.ones_like(lowered), np.argwhere(some)
+        wanted, found = bound(cells, np.broadcast_to(inside, cells.shape)), np.maximum(got[:, some], 1e-30)
+        share[:, some] = np.where(wanted < np.minimum(found, 1), wanted / found, 1)
         if index == rounds - 1 > 0:
             # Other places may exceed as much as the last ones of a cell and its neighbours; where strong orders emerge
             # within cells, transmitted ones or those of deep surfaces, as any of these.
-            deep = furnace.max_kappa * furnace.height_range * BLUR > 1
-            so_far = lowered if furnace.by_order and (deep or furnace.index is not None) else 1.0
+            so_far = lowered if emerging and (deep or furnace.index is not None) else 1.0
             share = minimum_filter(so_far * share, (1, 3, 3, 3)) / np.maximum(so_far, 1e-30)
         e, lowered, index = layout.lowered(e, share), lowered * share, index + 1
         if index == 1:
-            some = minimum_filter(lowered, (1, 3, 3, 3)).min(0) < STEEP
-            rounds = int(min(PAIRS / (some.sum() * furnace.work), ROUNDS)) if some.any() else 1
-    # For what lies between the places that were tried.
-    e[e < 1] *= 1 - 2 * SLACK
+            some = reached & (minimum_filter(lowered, (1, 3, 3, 3)).min(0) < STEEP)
+            rounds = int(np.clip(PAIRS / (max(some.sum(), 1) * furnace.work), least, ROUNDS)) if some.any() else 1
+    if not layout.lines:
+        # For what lies between the places that were tried.
+        e[(e < 1).any(-1)] *= 1 - 2 * SLACK
     return np.maximum(e, 0)
 
 
