@@ -21,6 +21,7 @@ from mitsuba_diffraction.geometry import horizon_gain, k_g
 MAKE = {
     "flat": lambda: md.HeightField(np.zeros((1, 4)), 0.05),
     "blazed": lambda: md.gratings.blazed(2.5, 0.25),
+    "fine blazed": lambda: md.gratings.blazed(0.8333, 0.25),
     "deep blazed": lambda: md.gratings.blazed(2.5, 0.8),
     "sinusoidal": lambda: md.gratings.sinusoidal(2.5, 0.3),
     "deep sinusoidal": lambda: md.gratings.sinusoidal(2.5, 1.0),
@@ -333,7 +334,8 @@ def test_the_furnace_is_the_sum_over_the_orders(name, length):
 
 # Of a coat with n = 1.5 the wavelengths inside, which begin at 240 nm.
 TIGHT = {
-    "blazed": (2e-3, 0.03),
+    "blazed": (3e-4, 0.015),
+    "fine blazed": (1e-3, 0.03),
     "sinusoidal": (3e-3, 0.05),
     "lamellar": (2e-3, 0.05),
     "crossed": (1e-2, 0.1),

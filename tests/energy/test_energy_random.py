@@ -179,6 +179,8 @@ def anywhere(rng, count):
         pytest.param(103, id="tile of 7 pixels, 1.8 µm deep"),
         pytest.param(2025, id="grating of 64 pixels, 8 µm deep"),
         pytest.param(5382, id="grating of 18 pixels, 3 µm deep"),
+        pytest.param(5489, id="crossed grating of 13 × 11 orders, 3.5 µm deep"),
+        pytest.param(5150, id="23 × 25 nodes with wide lobes"),
         pytest.param(5216, id="tile of 7 × 4 pixels, 0.6 µm deep"),
         *SEEDS,
     ],
