@@ -17,9 +17,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
 
 from ..energy.furnace import Furnace
-from ..energy.table import Layout, bounds_of
+from ..energy.table import Layout, bounds_of, frequencies_of
 from ..geometry import fresnel
 from ..grating_spectrum import GratingSpectrum
 from .geometry import cell_of, on_square
@@ -35,6 +36,7 @@ ENTRIES = 4e5  # of the table, about: more would fill the cache
 TURN_LINES, TURN, STEP = 2.0, 4.0, 2.5
 SLICES = 4, 12  # cells of 1/λ, at least and at most
 SIDES = 4, 48  # cells along the square of directions, likewise
+FINE = 64  # of the share that passes
 
 
 class OrderTable:
@@ -44,7 +46,7 @@ class OrderTable:
         before: Σ P of the orders before each of the rectangle that propagates in a cell, in units of 2⁻²⁴.
         cells: of each the start in `before`, first column and row among all orders, and columns + 2¹⁶ rows.
         most: orders of a cell.
-        shares: T e_T/(R e_R + T e_T) at the nodes of directions, from above and from below.
+        shares: T e_T/(R e_R + T e_T) in finer cells of directions, from above and from below.
     """
 
     def __init__(
@@ -67,13 +69,13 @@ class OrderTable:
         grid = spectrum.grid
         self.eta, self.is_sheet = eta, is_sheet
         self.tile, self.max_order = np.array(grid.tile_size), np.array(grid.max_order)
-        shortest, longest = (w * 1e-3 * max(eta, 1) for w in spectrum.wavelengths)
-        first, last = frequencies = min(lateral_scale, 1) / longest, 1 / shortest
+        first, last = frequencies_of(spectrum, eta)
+        first *= min(lateral_scale, 1)
         turn = 4 * np.pi * spectrum.height_range * max(height_scales) * (last - first)
         self.slices = int(np.clip(turn / (TURN_LINES if 0 in grid.max_order else TURN), *SLICES))
         orders = np.minimum((1 + eta) * self.tile * (first + last) / 2, 2 * self.max_order) + 1
         self.side = int(np.clip(np.sqrt(ENTRIES / (4 * self.slices * orders.prod())), *SIDES))
-        self.layout = Layout(0.0, 1, self.side, 1, self.slices + 1, frequencies)
+        self.layout = Layout(0.0, 1, self.side, 1, self.slices + 1, (first, last))
         sums, cells, shares, start, self.most = [], [], [], 0, 1
         for above in (True, False):
             furnaces = [Furnace.of(spectrum, scale, eta, 1 if above else -1) for scale in height_scales]
@@ -96,7 +98,8 @@ class OrderTable:
             omega, wavelengths = self._nodes(self.slices / 2)
             albedo = furnaces[0].albedo(self._inside(omega, above), wavelengths / self._indices(above)[0])
             reflected, passed = np.array(sent) * np.minimum(bounds_of(albedo, furnaces[0].index), 1)
-            shares.append(passed / np.maximum(reflected + passed, 1e-30))
+            share = (passed / np.maximum(reflected + passed, 1e-30)).reshape(self.side + 1, -1)
+            shares.append(map_coordinates(share, (np.indices((FINE, FINE)) + 0.5) * (self.side / FINE), order=1))
         self.before, self.shares = FloatTable(np.concatenate(sums)), FloatTable(np.array(shares))
         packed = np.concatenate(cells)
         self.cells = PacketTable(packed.astype(np.uint32))
@@ -110,7 +113,7 @@ class OrderTable:
         """Return the directions at the nodes of the square, outside, and λ above in µm, at a place along the slices."""
         nodes = np.indices((1, self.side + 1, self.side + 1)).reshape(3, -1).T.astype(np.float64)
         nodes[:, 0] = place
-        return self.layout.directions(nodes)
+        return self.layout.directions(nodes, np.zeros(3))
 
     def _inside(self, omega: NDArray[np.float64], above: bool) -> NDArray[np.float64]:
         """Return next to the relief the directions outside of it."""
@@ -148,7 +151,9 @@ class OrderTable:
         border = np.stack(np.meshgrid([0, 1], along, along, indexing="ij"), -1).reshape(-1, 3)
         corner = np.indices((1, self.side, self.side)).reshape(3, -1).T
         corner[:, 0] = slice_
-        omega, wavelengths = self.layout.directions((corner[:, None] + border).reshape(-1, 3))
+        omega, wavelengths = self.layout.directions(
+            np.repeat(corner, len(border), 0), np.tile(border, (len(corner), 1))
+        )
         per_wavelength = self.tile / wavelengths[:, None]
         middle = -self._indices(above)[1] * omega[:, :2] * per_wavelength
         # More, as borders are curved.
@@ -158,17 +163,13 @@ class OrderTable:
         last = np.clip(np.floor(last.max(1)), -self.max_order, self.max_order).astype(np.int64)
         return first + self.max_order, last - first + 1
 
-    def _direction(self, omega: mi.Vector3f) -> list[tuple[mi.UInt32, mi.Float]]:
-        """Return column and row of ω on the square, and the place in that cell."""
-        return [cell_of(self.side * place, self.side) for place in on_square(omega)]
-
     def _cell(
         self, incidence: CrossingIncidence, active: mi.Bool
     ) -> tuple[mi.UInt32, mi.Int32, mi.Int32, mi.Int32, mi.Int32]:
         """Return where the sums of a cell begin, its first order along x and y, and its columns and rows."""
         max_x, max_y = map(int, self.max_order)
         wi, per_index = incidence.wi, dr.rcp(incidence.index)
-        (column, _), (row, _) = self._direction(mi.Vector3f(wi.x * per_index, wi.y * per_index, wi.z))
+        column, row = _direction(mi.Vector3f(wi.x * per_index, wi.y * per_index, wi.z), self.side)
         slice_, _ = cell_of((incidence.lateral_frequency - self.first) * self.per_slice, self.slices)
         way = dr.select(incidence.above, mi.UInt32(0), 2) + dr.select(incidence.reflects, mi.UInt32(0), 1)
         cell = ((way * self.slices + slice_) * self.side + row) * self.side + column
@@ -198,12 +199,14 @@ class OrderTable:
         return first_x + place - row * columns, first_y + row, v
 
     def transmitted(self, omega: mi.Vector3f) -> mi.Float:
-        """Return the share of samples that pass, ω along the pattern's axes; linear between nodes."""
-        (column, x), (row, y) = self._direction(omega)
-        line = self.side + 1
-        node = (dr.select(omega.z > 0, mi.UInt32(0), line) + row) * line + column
-        low, high = (dr.lerp(self.shares(node + k, True), self.shares(node + k + 1, True), x) for k in (0, line))
-        return dr.lerp(low, high, y)
+        """Return the share of samples that pass, ω along the pattern's axes."""
+        column, row = _direction(omega, FINE)
+        return self.shares((dr.select(omega.z > 0, mi.UInt32(0), FINE) + row) * FINE + column, True)
+
+
+def _direction(omega: mi.Vector3f, side: int) -> list[mi.UInt32]:
+    """Return column and row of ω among the cells of the square."""
+    return [cell_of(side * place, side)[0] for place in on_square(omega)]
 
 
 def _of_corners(at_nodes: NDArray[np.floating]) -> NDArray[np.floating]:
