@@ -37,6 +37,7 @@ TURN_LINES, TURN, STEP = 2.0, 4.0, 2.5
 SLICES = 4, 12  # cells of 1/λ, at least and at most
 SIDES = 4, 48  # cells along the square of directions, likewise
 FINE = 64  # of the share that passes
+CHANGE = 0.01  # of the index, relative, for which a table serves
 
 
 class OrderTable:
@@ -105,6 +106,10 @@ class OrderTable:
         self.cells = PacketTable(packed.astype(np.uint32))
         self.first, self.per_slice = opaque(first), opaque(self.slices / (last - first))
 
+    def serves(self, eta: float) -> bool:
+        """Return whether orders that propagate for another index can be drawn, too."""
+        return abs(eta / self.eta - 1) <= CHANGE
+
     def _indices(self, above: bool) -> tuple[float, float]:
         """Return n next to the relief and outside, on one side of it."""
         return (1.0, 1.0) if above else (self.eta, 1.0 if self.is_sheet else self.eta)
@@ -156,8 +161,9 @@ class OrderTable:
         )
         per_wavelength = self.tile / wavelengths[:, None]
         middle = -self._indices(above)[1] * omega[:, :2] * per_wavelength
-        # More, as borders are curved.
-        half = self._indices(above == reflects)[1] * per_wavelength + 1e-3 * (1 + per_wavelength.max())
+        # More, as borders are curved and the index may change (`serves`).
+        half = self._indices(above == reflects)[1] * per_wavelength + 1e-3
+        half += (1e-3 + 2 * CHANGE * max(self.eta, 1)) * per_wavelength.max()
         first, last = (x.reshape(len(corner), -1, 2) for x in (middle - half, middle + half))
         first = np.clip(np.ceil(first.min(1)), -self.max_order, self.max_order).astype(np.int64)
         last = np.clip(np.floor(last.max(1)), -self.max_order, self.max_order).astype(np.int64)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from ..energy.furnace import small_kappas
 from ..errors import RequestError
@@ -108,8 +109,8 @@ class ScalarTheory:
         self.interface = None
         if self.media.eta is not None:
             kappas = tuple(opaque(kappa) for kappa in small_kappas(self.spectrum, self.media.eta))
-            is_sheet = self.media.transmission == "sheet"
-            share, orders = None, self.tables.order_table(is_sheet, scales)
+            eta, is_sheet = float(np.max(dr.detach(self.material.eta))), self.media.transmission == "sheet"
+            share, orders = None, self.tables.order_table(eta, is_sheet, scales)
             if orders is not None:
                 self.scattering, share = self.tables.scattering.drawn_from(orders), orders.transmitted
             self.interface = Interface(self.material.eta, is_sheet, kappas, share)
@@ -119,11 +120,9 @@ class ScalarTheory:
         changed = [scale for scale in self.scales if not keys or scale.name in keys]
         for scale in changed:
             scale.read()
-        if changed:
-            self.update()
         self.material.update()
-        if self.interface is not None:
-            self.interface.update()
+        if changed or self.interface is not None:
+            self.update()
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         for scale in self.scales:

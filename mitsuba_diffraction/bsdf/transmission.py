@@ -94,11 +94,7 @@ class Interface:
         share: Callable[[mi.Vector3f], mi.Float] | None = None,
     ) -> None:
         self.eta, self.is_sheet, self.kappas, self.share = eta, is_sheet, kappas, share
-        self.update()
-
-    def update(self) -> None:
-        """Recompute what depends on the index."""
-        self.per_eta, self.excess = dr.rcp(self.eta), dr.square(self.eta) - 1
+        self.per_eta, self.excess = dr.rcp(eta), dr.square(eta) - 1
 
     def least_kappa(self, height_scale: mi.Float) -> mi.Float | None:
         """Return κ₁ in rad/µm: of the undiffracted order κ is larger at all wavelengths; None of rigorous theory."""

@@ -225,6 +225,28 @@ def test_orders_on_either_side_are_drawn_with_their_shares(profile, theta, is_sh
     assert (share[propagates] > 0).all()
 
 
+@pytest.mark.parametrize(("name", "value"), [("eta", 1.75), ("height_scale", 0.5), ("height_scale", 0.0)])
+def test_samples_follow_an_index_and_heights_that_change(name, value):
+    # Orders that propagate with the new index only are drawn, too.
+    changed = passing("interface", conserve_energy=False)
+    parameters = mi.traverse(changed)
+    parameters[name] = value
+    parameters.update()
+    given = {"int_ior": 1.75} if name == "eta" else {name: value}
+    fresh = passing("interface", conserve_energy=False, **given)
+    u = np.random.default_rng(1).random((3, 1 << 16)).astype(np.float32)
+    for side in (1, -1):
+        si = interaction(towards(40, 10, side), (540.0, 560.0, 600.0, 650.0), u.shape[1])
+        weights = [
+            np.array(bsdf.sample(mi.BSDFContext(IMPORTANCE), si, mi.Float(u[0]), mi.Point2f(u[1:]))[1])
+            for bsdf in (changed, fresh)
+        ]
+        there, wanted = (weight.mean(1) for weight in weights)
+        error = np.hypot(*(weight.std(1) / np.sqrt(u.shape[1]) for weight in weights))
+        np.testing.assert_array_less(np.abs(there - wanted), 4 * error + 1e-3)
+        assert (weights[0].mean(0) > 0).mean() > 0.5
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_samples_name_their_component_and_index(kind):
     bsdf = passing(kind)
