@@ -67,8 +67,10 @@ class Energy:
         """
         first, layout = tables[0], tables[0].layout
         self.loss = np.max([table.loss for table in tables], axis=0)
-        self.slices, self.side = first.steps.shape[:2]
-        self.layout, self.cells_of_table = layout, first.steps.size // 4
+        # Arrays, as tables of other heights have other numbers of cells.
+        slices, side, _, corners = first.steps.shape
+        self.layout, self.last_slice, self.side = layout, opaque(slices - 1), opaque(side)
+        self.cells_of_table = opaque(first.steps.size // corners)
         self.two_sided = len(tables) > 1 + len(edges or ())
         steps = np.concatenate([of.steps for of in tables])
         self.table = NumberTable(steps @ (np.uint32(1) << np.arange(0, 32, 8, dtype=np.uint32)))
@@ -131,7 +133,7 @@ class Energy:
 
         `frequency` is 1/λ in 1/µm, λ in the medium above.
         """
-        frequency, number = frequency * place.lateral, place.ratio
+        frequency, number, side = frequency * place.lateral, place.ratio, mi.UInt32(self.side)
         if self.two_sided:
             number = dr.select(place.under, mi.UInt32(2), 0) + dr.select(passes, mi.UInt32(1), 0)
             number = number if place.ratio is None else 4 * place.ratio + number
@@ -144,21 +146,21 @@ class Energy:
             step = self.steps[0]
         if self.layout.lines:
             (column, x), (row, y) = (self._column(u * (self.period * frequency)) for u in (place.u, place.v))
-            index = row * self.side + column
+            index = row * side + column
         else:
             (column, x), (row, y) = (cell_of(u, self.first_cells) for u in (place.u, place.v))
             first, last = (
                 self.frequencies if place.ratio is None else [nu(place.ratio, True) for nu in self.frequencies]
             )
-            below, beyond = cell_of((frequency - first) / (last - first) * (self.slices - 1), self.slices - 1)
-            index = (below * self.side + row) * self.side + column
+            below, beyond = cell_of((frequency - first) / (last - first) * self.last_slice, self.last_slice)
+            index = (below * side + row) * side + column
         if number is not None:
-            index += number * self.cells_of_table
+            index += number * mi.UInt32(self.cells_of_table)
 
         def between(corners: Callable[[mi.UInt32], mi.Vector4f]) -> mi.Float:
             values = corners(index)
             if not self.layout.lines:
-                values = dr.lerp(values, corners(index + self.side * self.side), beyond)
+                values = dr.lerp(values, corners(index + side * side), beyond)
             return dr.lerp(dr.lerp(values[0], values[1], x), dr.lerp(values[2], values[3], x), y)
 
         e = LARGEST - (255 - between(lambda i: _bytes(self.table(i)))) * step

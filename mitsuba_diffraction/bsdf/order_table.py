@@ -46,7 +46,7 @@ class OrderTable:
     Attributes:
         before: Σ P of the orders before each of the rectangle that propagates in a cell, in units of 2⁻²⁴.
         cells: of each the start in `before`, first column and row among all orders, and columns + 2¹⁶ rows.
-        most: orders of a cell.
+        lines: cells along the slices and along the square, as arrays: tables of other heights have others.
         shares: T e_T/(R e_R + T e_T) in finer cells of directions, from above and from below.
     """
 
@@ -77,7 +77,7 @@ class OrderTable:
         orders = np.minimum((1 + eta) * self.tile * (first + last) / 2, 2 * self.max_order) + 1
         self.side = int(np.clip(np.sqrt(ENTRIES / (4 * self.slices * orders.prod())), *SIDES))
         self.layout = Layout(0.0, 1, self.side, 1, self.slices + 1, (first, last))
-        sums, cells, shares, start, self.most = [], [], [], 0, 1
+        sums, cells, shares, start = [], [], [], 0
         for above in (True, False):
             furnaces = [Furnace.of(spectrum, scale, eta, 1 if above else -1) for scale in height_scales]
             sent = []
@@ -94,7 +94,6 @@ class OrderTable:
                     sums.append(of_cells)
                     cells.append(np.stack([start + starts, *corner.T, size[:, 0] + (size[:, 1] << 16)], -1))
                     start += len(of_cells)
-                    self.most = max(self.most, int(size.prod(1).max()))
             # E of a wavelength in the middle.
             omega, wavelengths = self._nodes(self.slices / 2)
             albedo = furnaces[0].albedo(self._inside(omega, above), wavelengths / self._indices(above)[0])
@@ -102,8 +101,8 @@ class OrderTable:
             share = (passed / np.maximum(reflected + passed, 1e-30)).reshape(self.side + 1, -1)
             shares.append(map_coordinates(share, (np.indices((FINE, FINE)) + 0.5) * (self.side / FINE), order=1))
         self.before, self.shares = FloatTable(np.concatenate(sums)), FloatTable(np.array(shares))
-        packed = np.concatenate(cells)
-        self.cells = PacketTable(packed.astype(np.uint32))
+        self.cells = PacketTable(np.concatenate(cells).astype(np.uint32))
+        self.lines = opaque(self.slices), opaque(self.side)
         self.first, self.per_slice = opaque(first), opaque(self.slices / (last - first))
 
     def serves(self, eta: float) -> bool:
@@ -175,10 +174,11 @@ class OrderTable:
         """Return where the sums of a cell begin, its first order along x and y, and its columns and rows."""
         max_x, max_y = map(int, self.max_order)
         wi, per_index = incidence.wi, dr.rcp(incidence.index)
-        column, row = _direction(mi.Vector3f(wi.x * per_index, wi.y * per_index, wi.z), self.side)
-        slice_, _ = cell_of((incidence.lateral_frequency - self.first) * self.per_slice, self.slices)
+        slices, side = self.lines
+        column, row = _direction(mi.Vector3f(wi.x * per_index, wi.y * per_index, wi.z), side)
+        slice_, _ = cell_of((incidence.lateral_frequency - self.first) * self.per_slice, slices)
         way = dr.select(incidence.above, mi.UInt32(0), 2) + dr.select(incidence.reflects, mi.UInt32(0), 1)
-        cell = ((way * self.slices + slice_) * self.side + row) * self.side + column
+        cell = ((way * mi.UInt32(slices) + slice_) * mi.UInt32(side) + row) * mi.UInt32(side) + column
         start, x, y, size = self.cells(cell, active)
         return start, mi.Int32(x) - max_x, mi.Int32(y) - max_y, mi.Int32(size & 0xFFFF), mi.Int32(size >> 16)
 
@@ -199,7 +199,7 @@ class OrderTable:
         def before(place: mi.Int32) -> mi.Float:
             return self.before(start + mi.UInt32(place), active)
 
-        place, _ = search(before, mi.Int32(0), columns * rows, self.most, u)
+        place, _ = search(before, mi.Int32(0), columns * rows, int(np.prod(2 * self.max_order + 1)), u)
         # In masked lanes there are no columns.
         row = mi.Int32((mi.Float(place) + 0.5) / larger(mi.Float(columns), 1))
         return first_x + place - row * columns, first_y + row, v
@@ -210,7 +210,7 @@ class OrderTable:
         return self.shares((dr.select(omega.z > 0, mi.UInt32(0), FINE) + row) * FINE + column, True)
 
 
-def _direction(omega: mi.Vector3f, side: int) -> list[mi.UInt32]:
+def _direction(omega: mi.Vector3f, side: mi.Float | int) -> list[mi.UInt32]:
     """Return column and row of ω among the cells of the square."""
     return [cell_of(side * place, side)[0] for place in on_square(omega)]
 
