@@ -14,6 +14,7 @@ from .grating import Grating
 from .media import Media
 from .polarisation import of_plane, reflected
 from .tables import BELOW_ONE, smaller
+from .transmission import Interface
 
 LEAST_SHARE = 0.1  # of the samples, for the grating and for its base: what each reflects is only estimated
 
@@ -54,7 +55,6 @@ class Layers:
         media = Media.of(props)
         self.coat = media.coat
         self.grating = Grating(props, media)
-        self.interface = self.grating.theory.interface
         self.base = base_from(props)
         if self.base is not None and not self.grating.theory.material.transparent:
             raise RequestError("base: got a BSDF below a conductor or a perfect mirror, which let no light through")
@@ -74,6 +74,11 @@ class Layers:
         self.face = len(self.components)
         if face:
             self.components.append(mi.BSDFFlags.DeltaReflection | face)
+
+    @property
+    def interface(self) -> Interface | None:
+        """The media where light passes, as the parameters are now."""
+        return self.grating.theory.interface
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         self.grating.traverse(callback)

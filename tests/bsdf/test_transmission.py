@@ -225,22 +225,23 @@ def test_orders_on_either_side_are_drawn_with_their_shares(profile, theta, is_sh
     assert (share[propagates] > 0).all()
 
 
-@pytest.mark.parametrize(("name", "value"), [("eta", 1.75), ("height_scale", 0.5), ("height_scale", 0.0)])
-def test_samples_follow_an_index_and_heights_that_change(name, value):
+@pytest.mark.parametrize(("height_scale", "eta"), [(1.0, 1.75), (0.5, 1.5), (0.0, 1.5), (0.5, 1.75)])
+def test_samples_follow_an_index_and_heights_that_change(height_scale, eta):
     # Orders that propagate with the new index only are drawn, too.
     changed = passing("interface", conserve_energy=False)
     parameters = mi.traverse(changed)
-    parameters[name] = value
-    parameters.update()
-    given = {"int_ior": 1.75} if name == "eta" else {name: value}
-    fresh = passing("interface", conserve_energy=False, **given)
+    for name, value in (("height_scale", height_scale), ("eta", eta)):
+        parameters[name] = value
+        parameters.update()
+    fresh = passing("interface", conserve_energy=False, height_scale=height_scale, int_ior=eta)
     u = np.random.default_rng(1).random((3, 1 << 16)).astype(np.float32)
     for side in (1, -1):
         si = interaction(towards(40, 10, side), (540.0, 560.0, 600.0, 650.0), u.shape[1])
-        weights = [
-            np.array(bsdf.sample(mi.BSDFContext(IMPORTANCE), si, mi.Float(u[0]), mi.Point2f(u[1:]))[1])
-            for bsdf in (changed, fresh)
+        found = [
+            bsdf.sample(mi.BSDFContext(IMPORTANCE), si, mi.Float(u[0]), mi.Point2f(u[1:])) for bsdf in (changed, fresh)
         ]
+        (etas, _), weights = ([np.unique(np.array(bs.eta)) for bs, _ in found], [np.array(w) for _, w in found])
+        np.testing.assert_allclose(etas, np.sort([1, eta**side]), rtol=1e-6)
         there, wanted = (weight.mean(1) for weight in weights)
         error = np.hypot(*(weight.std(1) / np.sqrt(u.shape[1]) for weight in weights))
         np.testing.assert_array_less(np.abs(there - wanted), 4 * error + 1e-3)
