@@ -11,6 +11,7 @@ the density for which the variance of what is drawn is least. Directions have th
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 import drjit as dr
@@ -34,14 +35,14 @@ ENTRIES = 4e5  # of the table, about: more would fill the cache
 # Radians by which the phase of the deepest point may change within a cell, by reflection from above: of line gratings,
 # which have few orders, and of others; and between the places in a cell, for either kind of light.
 TURN_LINES, TURN, STEP = 2.0, 4.0, 2.5
-SLICES = 4, 12  # cells of 1/λ, at least and at most
+SLICES = 4, 10  # cells of 1/λ, at least and at most
 SIDES = 4, 48  # cells along the square of directions, likewise
 FINE = 64  # of the share that passes
 CHANGE = 0.01  # of the index, relative, for which a table serves
 
 
 class OrderTable:
-    """P_m of light from either side to either side, in cells: (from, to, 1/λ, row, column of ω_i).
+    """P_m of light from either side to either side, in cells: (scale of heights, from, to, 1/λ, row, column of ω_i).
 
     Attributes:
         before: Σ P of the orders before each of the rectangle that propagates in a cell, in units of 2⁻²⁴.
@@ -64,22 +65,23 @@ class OrderTable:
             spectrum: its wavelengths are those in the denser medium.
             eta: index below relative to that above.
             is_sheet: there is a flat face below, and beyond it the medium above once more.
-            height_scales: times the heights; of several P_m serves all.
-            lateral_scale: times the lengths along the surface, the least.
+            height_scales: times the heights, ascending; there are cells between one and the next.
+            lateral_scale: times the lengths along the surface, the least, of which heights are in units.
         """
         grid = spectrum.grid
         self.eta, self.is_sheet = eta, is_sheet
         self.tile, self.max_order = np.array(grid.tile_size), np.array(grid.max_order)
         first, last = frequencies_of(spectrum, eta)
         first *= min(lateral_scale, 1)
-        turn = 4 * np.pi * spectrum.height_range * max(height_scales) * (last - first)
+        turn = 4 * np.pi * spectrum.height_range * float(np.mean(height_scales)) * (last - first)
         self.slices = int(np.clip(turn / (TURN_LINES if 0 in grid.max_order else TURN), *SLICES))
         orders = np.minimum((1 + eta) * self.tile * (first + last) / 2, 2 * self.max_order) + 1
-        self.side = int(np.clip(np.sqrt(ENTRIES / (4 * self.slices * orders.prod())), *SIDES))
+        ranges = list(itertools.pairwise(height_scales)) or [tuple(height_scales)]
+        self.side = int(np.clip(np.sqrt(ENTRIES / (4 * np.sqrt(len(ranges)) * self.slices * orders.prod())), *SIDES))
         self.layout = Layout(0.0, 1, self.side, 1, self.slices + 1, (first, last))
         sums, cells, shares, start = [], [], [], 0
-        for above in (True, False):
-            furnaces = [Furnace.of(spectrum, scale, eta, 1 if above else -1) for scale in height_scales]
+        for scales, above in itertools.product(ranges, (True, False)):
+            furnaces = [Furnace.of(spectrum, scale, eta, 1 if above else -1) for scale in scales]
             sent = []
             for reflects in (True, False):
                 index = self._indices(above)[0] if reflects else abs(eta - 1)
@@ -100,9 +102,11 @@ class OrderTable:
             reflected, passed = np.array(sent) * np.minimum(bounds_of(albedo, furnaces[0].index), 1)
             share = (passed / np.maximum(reflected + passed, 1e-30)).reshape(self.side + 1, -1)
             shares.append(map_coordinates(share, (np.indices((FINE, FINE)) + 0.5) * (self.side / FINE), order=1))
-        self.before, self.shares = FloatTable(np.concatenate(sums)), FloatTable(np.array(shares))
+        shares = np.mean(np.reshape(shares, (len(ranges), 2, FINE, FINE)), axis=0)
+        self.before, self.shares = FloatTable(np.concatenate(sums)), FloatTable(shares)
         self.cells = PacketTable(np.concatenate(cells).astype(np.uint32))
         self.lines = opaque(self.slices), opaque(self.side)
+        self.edges = [opaque(scale) for scale in height_scales[1:-1]]
         self.first, self.per_slice = opaque(first), opaque(self.slices / (last - first))
 
     def serves(self, eta: float) -> bool:
@@ -178,6 +182,10 @@ class OrderTable:
         column, row = _direction(mi.Vector3f(wi.x * per_index, wi.y * per_index, wi.z), side)
         slice_, _ = cell_of((incidence.lateral_frequency - self.first) * self.per_slice, slices)
         way = dr.select(incidence.above, mi.UInt32(0), 2) + dr.select(incidence.reflects, mi.UInt32(0), 1)
+        if self.edges:
+            # Heights in units of the lateral scale.
+            height_scale = dr.rcp(dr.two_pi * incidence.per_kappa * incidence.lateral_frequency)
+            way += sum(dr.select(height_scale > edge, mi.UInt32(4), 0) for edge in self.edges)
         cell = ((way * mi.UInt32(slices) + slice_) * mi.UInt32(side) + row) * mi.UInt32(side) + column
         start, x, y, size = self.cells(cell, active)
         return start, mi.Int32(x) - max_x, mi.Int32(y) - max_y, mi.Int32(size & 0xFFFF), mi.Int32(size >> 16)

@@ -27,7 +27,7 @@ from .spline_spectrum import SplineSpectrum
 
 STEP = 1e-3  # of height_scale, for the derivative of the energy table
 TURN = 0.25  # radians between tables over the ratio of scales
-RATIOS = 3  # of scales that vary, for which orders are drawn
+RATIOS = 7  # of scales that vary, between which there are cells of orders
 PARTS = 16  # of an interval of ratios, at most
 
 _making = threading.Lock()
