@@ -99,7 +99,7 @@ class OrderTable:
             # E of a wavelength in the middle.
             omega, wavelengths = self._nodes(self.slices / 2)
             albedo = furnaces[0].albedo(self._inside(omega, above), wavelengths / self._indices(above)[0])
-            reflected, passed = np.array(sent) * np.minimum(bounds_of(albedo, furnaces[0].index), 1)
+            reflected, passed = np.array(sent) * bounds_of(albedo, furnaces[0].index)
             share = (passed / np.maximum(reflected + passed, 1e-30)).reshape(self.side + 1, -1)
             shares.append(map_coordinates(share, (np.indices((FINE, FINE)) + 0.5) * (self.side / FINE), order=1))
         shares = np.mean(np.reshape(shares, (len(ranges), 2, FINE, FINE)), axis=0)

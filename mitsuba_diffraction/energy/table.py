@@ -442,9 +442,9 @@ def bounds_of(albedo: NDArray[np.float64], index: float | None) -> NDArray[np.fl
     if index is None:
         return np.minimum(1 / np.maximum(albedo, 1e-9), LARGEST)
     r, t = albedo
-    e_t = (1 - np.minimum(r, ((index - 1) / (index + 1)) ** 2)) / np.maximum(t, 1e-9)
-    e_r = (1 - np.minimum(e_t, 1) * t) / np.maximum(r, 1e-9)
-    return np.minimum([e_r, e_t], LARGEST)
+    # No more than one: e_R is so steep there that what lies between corners would lower them by more.
+    e_t = np.minimum(1, (1 - np.minimum(r, ((index - 1) / (index + 1)) ** 2)) / np.maximum(t, 1e-9))
+    return np.stack([np.minimum(1, (1 - e_t * t) / np.maximum(r, 1e-9)), e_t])
 
 
 def corners(furnace: Furnace, layout: Layout) -> NDArray[np.float64]:

@@ -48,8 +48,10 @@ _Checked = tuple[float, float, float, bool, dict[tuple[int, int], tuple[NDArray[
 # Steps of F, X and (with transmission) Z that are solved, one after the other until the error is kept. Most along X, on
 # which depends by how much light that grazes the surface enters it; along F, plasmons of metals are narrow.
 _SOLVED = ((12, 15, 12), (18, 24, 18))
-# Where light passes: a third more steps are stored, by cubic polynomials, as most of the time goes into solutions.
-_SOLVED_BOTH = ((6, 9, 6), (9, 15, 9), (12, 18, 12))
+# Where light passes a third more steps are stored, and at least these, by cubic polynomials, as most of the time goes
+# into solutions; of large periods the first of them are enough.
+_SOLVED_BOTH = ((4, 6, 4), (6, 9, 6), (9, 15, 9), (12, 18, 12))
+_LEAST_STORED = 8, 12, 8
 PLANES = 17
 _PLACES = 20  # to each step that is stored, where a table is fitted to its polynomials
 # Wavelengths that are solved, by the least g λ / T (the cosine of the cone angle) of these: metals in light along the
@@ -303,7 +305,9 @@ class _Build:
         self.surface, self.steps = surface, steps
         self.entries = 4 if polarised else 1  # rows and columns of the matrices that are kept
         self.passes = surface.transmission != "none"
-        f, x, z = (4 * count // 3 for count in steps) if self.passes else steps
+        f, x, z = steps
+        if self.passes:
+            f, x, z = (max(4 * count // 3, least) for count, least in zip(steps, _LEAST_STORED, strict=True))
         index = surface.index(surface.wavelengths[0]).real if self.passes else 0.0
         self.axes = Axes(
             surface.period, surface.wavelengths, (f, x, z if self.passes else PLANES - 1), index, surface.transmission
