@@ -17,9 +17,9 @@ from scipy.special import ndtr
 
 from ..grating_spectrum import GratingSpectrum
 from ..spectrum.grids import OrderGrid, spline_integral
-from .geometry import Incidence
+from .geometry import Incidence, cell_of
 from .inversion import CELLS, KappaCells, SumTable, averages, choose, sums_before
-from .tables import NumberTable, PacketTable, ShareTable, larger, limited, opaque
+from .tables import NumberTable, PacketTable, ShareTable, larger, opaque
 
 FINEST = 0.06  # cycles/µm: cells are no wider, to follow the horizon
 LOBE = 4.0  # σ_q: how far the lobes of orders are followed
@@ -93,9 +93,9 @@ class HorizonBins:
     def bin(self, incidence: Incidence) -> mi.UInt32:
         """Return the bin of one wavelength and where it comes from; beyond the ends, the nearest."""
         wi, bins = incidence.wi, self.resolution
-        cosine = _cell(incidence.cosine * bins.cosines, bins.cosines)
-        turn = _cell((azimuth(wi.x, wi.y) + 2) * (bins.azimuths / 4), bins.azimuths)
-        frequency = _cell((incidence.radius - self.first) * self.per_frequency, bins.frequencies)
+        cosine, _ = cell_of(incidence.cosine * bins.cosines, bins.cosines)
+        turn, _ = cell_of((azimuth(wi.x, wi.y) + 2) * (bins.azimuths / 4), bins.azimuths)
+        frequency, _ = cell_of((incidence.radius - self.first) * self.per_frequency, bins.frequencies)
         return (frequency * bins.cosines + cosine) * bins.azimuths + turn
 
     def columns(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -117,10 +117,6 @@ class HorizonBins:
             result[:, cosine, azimuth, :, 0] = frequency * (-s_x - half).min(axis=0)
             result[:, cosine, azimuth, :, 1] = frequency * (half - s_x).max(axis=0)
         return result.reshape(-1, len(low), 2)
-
-
-def _cell(x: mi.Float, count: int) -> mi.UInt32:
-    return mi.UInt32(limited(x, 0, count - 1))
 
 
 def azimuth(x: mi.Float, y: mi.Float) -> mi.Float:

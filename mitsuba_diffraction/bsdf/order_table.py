@@ -47,7 +47,7 @@ class OrderTable:
     Attributes:
         before: Σ P of the orders before each of the rectangle that propagates in a cell, in units of 2⁻²⁴.
         cells: of each the start in `before`, first column and row among all orders, and columns + 2¹⁶ rows.
-        lines: cells along the slices and along the square, as arrays: tables of other heights have others.
+        counts: cells along the slices and along the square, as arrays: tables of other heights have others.
         shares: T e_T/(R e_R + T e_T) in finer cells of directions, from above and from below.
     """
 
@@ -105,7 +105,7 @@ class OrderTable:
         shares = np.mean(np.reshape(shares, (len(ranges), 2, FINE, FINE)), axis=0)
         self.before, self.shares = FloatTable(np.concatenate(sums)), FloatTable(shares)
         self.cells = PacketTable(np.concatenate(cells).astype(np.uint32))
-        self.lines = opaque(self.slices), opaque(self.side)
+        self.counts = opaque(self.slices), opaque(self.side)
         self.edges = [opaque(scale) for scale in height_scales[1:-1]]
         self.first, self.per_slice = opaque(first), opaque(self.slices / (last - first))
 
@@ -178,7 +178,7 @@ class OrderTable:
         """Return where the sums of a cell begin, its first order along x and y, and its columns and rows."""
         max_x, max_y = map(int, self.max_order)
         wi, per_index = incidence.wi, dr.rcp(incidence.index)
-        slices, side = self.lines
+        slices, side = self.counts
         column, row = _direction(mi.Vector3f(wi.x * per_index, wi.y * per_index, wi.z), side)
         slice_, _ = cell_of((incidence.lateral_frequency - self.first) * self.per_slice, slices)
         way = dr.select(incidence.above, mi.UInt32(0), 2) + dr.select(incidence.reflects, mi.UInt32(0), 1)

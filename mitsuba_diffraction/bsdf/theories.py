@@ -106,14 +106,18 @@ class ScalarTheory:
         if self.conserve_energy and self.shadowing:
             of_number = self.tables.energy
             self.energy = self.tables.scaled_energy(*scales.ratios()) if scales.vary else of_number(scales.height.value)
-        self.interface = None
-        if self.media.eta is not None:
-            kappas = tuple(opaque(kappa) for kappa in small_kappas(self.spectrum, self.media.eta))
-            eta, is_sheet = float(np.max(dr.detach(self.material.eta))), self.media.transmission == "sheet"
-            share, orders = None, self.tables.order_table(eta, is_sheet, scales)
-            if orders is not None:
-                self.scattering, share = self.tables.scattering.drawn_from(orders), orders.transmitted
-            self.interface = Interface(self.material.eta, is_sheet, kappas, share)
+        self.interface = self._interface()
+
+    def _interface(self) -> Interface | None:
+        """Return the media on both sides, with orders drawn for the scales and the index as they are."""
+        if self.media.eta is None:
+            return None
+        kappas = tuple(opaque(kappa) for kappa in small_kappas(self.spectrum, self.media.eta))
+        eta, is_sheet = float(np.max(dr.detach(self.material.eta))), self.media.transmission == "sheet"
+        share, orders = None, self.tables.order_table(eta, is_sheet, self.scales)
+        if orders is not None:
+            self.scattering, share = self.tables.scattering.drawn_from(orders), orders.transmitted
+        return Interface(self.material.eta, is_sheet, kappas, share)
 
     def parameters_changed(self, keys: list[str]) -> None:
         """Recompute what depends on the parameters `keys`; on all of them if none is named."""
@@ -121,8 +125,10 @@ class ScalarTheory:
         for scale in changed:
             scale.read()
         self.material.update()
-        if changed or self.interface is not None:
+        if changed:
             self.update()
+        else:
+            self.interface = self._interface()
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         for scale in self.scales:

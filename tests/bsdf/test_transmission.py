@@ -12,6 +12,7 @@ from bsdf_support import check_chi_square, direction, interaction, use, vectors
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction.bsdf.order_table import OrderTable
+from mitsuba_diffraction.bsdf.shared import SharedTables
 from mitsuba_diffraction.bsdf.transmission import Crossing, CrossingIncidence, Interface
 
 PERIOD, ETA, WAVELENGTH = 3.35, 1.5, 0.5
@@ -246,6 +247,15 @@ def test_samples_follow_an_index_and_heights_that_change(height_scale, eta):
         error = np.hypot(*(weight.std(1) / np.sqrt(u.shape[1]) for weight in weights))
         np.testing.assert_array_less(np.abs(there - wanted), 4 * error + 1e-3)
         assert (weights[0].mean(0) > 0).mean() > 0.5
+
+
+def test_other_parameters_leave_tables_of_varying_scales(monkeypatch):
+    heights = {"type": "checkerboard", "color0": 0.5, "color1": 1.0}
+    parameters = mi.traverse(passing("interface", height_scale=heights))
+    monkeypatch.setattr(SharedTables, "scaled_energy", None)
+    monkeypatch.setattr("mitsuba_diffraction.bsdf.shared.OrderTable", None)
+    parameters["orientation.value"] = 30.0
+    parameters.update()
 
 
 @pytest.mark.parametrize("kind", KINDS)
