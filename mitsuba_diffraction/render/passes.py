@@ -32,7 +32,7 @@ from ..color import spectrum_to_XYZ
 from ..errors import RequestError
 from ..files import UNSEALED, is_intact, seal, whole_file
 from .film import is_independent, pass_seed, samples_drawn, takes_mitsubas_film, trace_pass
-from .scene import Materials, channel_wavelengths, load_spectral_scene, scene_digest
+from .scene import Materials, channel_wavelengths, load_spectral_scene, scene_digest, warn_of_gratings
 from .spectral_image import SpectralImage
 
 _log = logging.getLogger(__name__)
@@ -339,6 +339,7 @@ def _job(
     if until_error is not None and not 0 < until_error < 1:
         raise RequestError(f"until_error: got {until_error}, wanted a relative error between 0 and 1, such as 0.01")
     scene = load_spectral_scene(scene_path, **view, **content)
+    warn_of_gratings(scene)
     sampler = scene.sensors()[0].sampler()
     if takes_mitsubas_film(scene.integrator()) and not is_independent(sampler):
         _log.warning(

@@ -113,9 +113,16 @@ def load_spectral_scene(
     if scene.integrator().aov_names():
         raise RequestError(f"{path}: the integrator gives {scene.integrator().aov_names()}, wanted radiance alone")
     _draw_wavelengths_of_lights(scene)
+    return scene
+
+
+def warn_of_gratings(scene: mi.Scene) -> None:
+    """Say in the log which gratings lie on meshes without UVs, and which are black as light reaches them from below.
+
+    Apart from `load_spectral_scene`, since a rendering may load its scene again, on workers too.
+    """
     _warn_of_missing_uvs(scene)
     _warn_of_light_from_below(scene)
-    return scene
 
 
 def _warn_of_unused_materials(state: mi.parser.ParserState, materials: Materials) -> None:

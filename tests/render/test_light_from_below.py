@@ -1,11 +1,12 @@
 """A grating that is black because it is opaque and lit, or seen, from below is named in the log."""
 
 import logging
+from pathlib import Path
 
 import mitsuba as mi
 import pytest
 
-from mitsuba_diffraction.render.scene import load_spectral_scene
+from mitsuba_diffraction.render.scene import load_spectral_scene, warn_of_gratings
 
 SCENE = """<scene version="3.0.0"><integrator type="path"/>
 <sensor type="perspective"><transform name="to_world"><lookat origin="0,0,{eye}" target="0,0,0" up="0,1,0"/></transform>
@@ -30,7 +31,14 @@ def test_an_opaque_grating_in_the_dark_is_told(tmp_path, caplog, eye, light, kin
     mi.set_variant("llvm_ad_spectral")
     (tmp_path / "s.xml").write_text(SCENE.format(eye=eye, light=light, kind=kind))
     with caplog.at_level(logging.WARNING, logger="mitsuba_diffraction.render.scene"):
-        load_spectral_scene(tmp_path / "s.xml", width=8, height=8)
+        warn_of_gratings(load_spectral_scene(tmp_path / "s.xml", width=8, height=8))
     messages = [record.getMessage() for record in caplog.records]
     assert len(messages) == bool(told)
     assert all(told in message and "transmission=sheet" in message for message in messages)
+
+
+def test_a_denoised_rendering_which_loads_its_scene_twice_tells_it_once(tmp_path, monkeypatch, command):
+    monkeypatch.chdir(tmp_path)
+    Path("s.xml").write_text(SCENE.format(eye=4, light=-5, kind="none"))
+    code, _, err = command("render s.xml --denoise --spp 1 --width 8 --height 8 --variant llvm_ad_spectral")
+    assert (code, err.count("is lit from below only")) == (0, 1)

@@ -9,7 +9,7 @@ import pytest
 
 from mitsuba_diffraction.cli.arguments import materials_of
 from mitsuba_diffraction.render import render
-from mitsuba_diffraction.render.scene import load_spectral_scene, scene_digest
+from mitsuba_diffraction.render.scene import load_spectral_scene, scene_digest, warn_of_gratings
 
 MIRROR = {"profile": "blazed", "period": 2.0, "depth": 0.2, "material": "none", "conserve_energy": False}
 PLAIN = "".join(
@@ -136,7 +136,7 @@ def test_a_misspelt_parameter_is_refused_with_a_material_too(exported):
 @pytest.mark.parametrize("uvs", [True, False])
 def test_a_grating_on_a_mesh_without_uvs_is_told(exported, uvs, caplog):
     with caplog.at_level(logging.WARNING, "mitsuba_diffraction"):
-        load_spectral_scene(exported(uvs=uvs), materials={"mat-Disc": MIRROR})
+        warn_of_gratings(load_spectral_scene(exported(uvs=uvs), materials={"mat-Disc": MIRROR}))
     told = [record.getMessage() for record in caplog.records if "UVs" in record.getMessage()]
     assert len(told) == (0 if uvs else 1)
     assert all(line.startswith("mat-Disc: on a mesh without UVs") for line in told)
