@@ -35,13 +35,13 @@ class Grating:
         spectrum: of the surface.
         recipe: behind the spectrum; None for a saved one.
         theory: R, E and what else multiplies the powers of orders.
-        media: about the grating; `coat` is that of them.
+        coat: over the grating, or None.
         scales: of heights and of lengths along the surface; of rigorous theory one.
         orientation: degrees from the tangent to the pattern's x axis.
     """
 
     def __init__(self, props: mi.Properties, media: Media) -> None:
-        self.media, self.coat = media, media.coat
+        self.coat = media.coat
         self.scales = Scales(props)
         self.spectrum, self.recipe = surface_from(props, media, self.scales.max_scale)
         rigorous = isinstance(self.spectrum, RigorousSpectrum)
@@ -119,7 +119,7 @@ class Grating:
 
     def _wavelength(self, si: mi.SurfaceInteraction3f, channel: int) -> mi.Float:
         """Return λ in the medium above, µm."""
-        return si.wavelengths[channel] * (1e-3 / self.media.outside)
+        return si.wavelengths[channel] * (1e-3 / self.theory.media.outside)
 
     def _diffracted(
         self,
@@ -237,7 +237,7 @@ class Grating:
 
     def _covered(self, si: mi.SurfaceInteraction3f) -> tuple[list[mi.Bool], mi.Float]:
         """Return which of the wavelengths the spectrum covers, and how many: at the others the grating is black."""
-        index = 1 if isinstance(self.theory, RigorousTheory) and self.coat is None else self.media.index
+        index = 1 if isinstance(self.theory, RigorousTheory) and self.coat is None else self.theory.media.index
         shortest, longest = (
             w * index * d for w, d in zip(self.spectrum.wavelengths, (1 - 1e-6, 1 + 1e-6), strict=True)
         )

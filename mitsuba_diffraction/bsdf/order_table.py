@@ -38,7 +38,7 @@ TURN_LINES, TURN, STEP = 2.0, 4.0, 2.5
 SLICES = 4, 10  # cells of 1/λ, at least and at most
 SIDES = 4, 48  # cells along the square of directions, likewise
 FINE = 64  # of the share that passes
-CHANGE = 0.01  # of the index, relative, for which a table serves
+CHANGE = 0.01  # of η, relative to η − 1, for which a table serves
 
 
 class OrderTable:
@@ -109,10 +109,6 @@ class OrderTable:
         self.edges = [opaque(scale) for scale in height_scales[1:-1]]
         self.first, self.per_slice = opaque(first), opaque(self.slices / (last - first))
 
-    def serves(self, eta: float) -> bool:
-        """Return whether orders that propagate for another index can be drawn, too."""
-        return abs(eta / self.eta - 1) <= CHANGE
-
     def _indices(self, above: bool) -> tuple[float, float]:
         """Return n next to the relief and outside, on one side of it."""
         return (1.0, 1.0) if above else (self.eta, 1.0 if self.is_sheet else self.eta)
@@ -164,7 +160,7 @@ class OrderTable:
         )
         per_wavelength = self.tile / wavelengths[:, None]
         middle = -self._indices(above)[1] * omega[:, :2] * per_wavelength
-        # More, as borders are curved and the index may change (`serves`).
+        # More, as borders are curved and the index may change by `CHANGE`.
         half = self._indices(above == reflects)[1] * per_wavelength + 1e-3
         half += (1e-3 + 2 * CHANGE * max(self.eta, 1)) * per_wavelength.max()
         first, last = (x.reshape(len(corner), -1, 2) for x in (middle - half, middle + half))

@@ -67,11 +67,8 @@ class SharedTables:
                 tables = _shared[key] = cls(spectrum, eta)
             return tables
 
-    def order_table(self, eta: float, is_sheet: bool, scales: Scales) -> OrderTable | None:
-        """Return the table from which orders are drawn where light passes; None where they overlap.
-
-        One for nearly the same index serves, so that a scene in which it is a variable is not slowed down.
-        """
+    def order_table(self, is_sheet: bool, scales: Scales) -> OrderTable | None:
+        """Return the table from which orders are drawn where light passes; None where they overlap."""
         if not self.scattering.resolved:
             return None
         ratios, laterals, complete = scales.ratios()
@@ -79,8 +76,8 @@ class SharedTables:
             ratios = np.linspace(*ratios, RATIOS)
         key = is_sheet, ratios.tolist(), float(laterals.min())
         with self._lock:
-            if self._orders is None or self._orders[0] != key or not self._orders[1].serves(eta):
-                self._orders = key, OrderTable(self._spectrum, eta, *key)
+            if self._orders is None or self._orders[0] != key:
+                self._orders = key, OrderTable(self._spectrum, self._eta, *key)
             return self._orders[1]
 
     def energy(self, height_scale: mi.Float) -> Energy | None:

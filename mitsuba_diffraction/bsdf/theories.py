@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -15,6 +17,7 @@ from ..settings import VISIBLE
 from .coat import Coat
 from .geometry import Geometry, turned
 from .media import Media
+from .order_table import CHANGE
 from .polarisation import Split, of_interface, of_orders, of_plane, unpolarised
 from .reflectance import Conductor, PerfectMirror, reflectance_from
 from .scales import Scales
@@ -61,6 +64,7 @@ class ScalarTheory:
     Attributes:
         scattering: K G S cos θ_o and its sampler.
         material: R.
+        media: about the grating, with an index that tables are for.
         scales: of heights and of lengths along the surface.
         shadowing: whether G is a factor.
         energy: E, or None where it is one.
@@ -113,8 +117,8 @@ class ScalarTheory:
         if self.media.eta is None:
             return None
         kappas = tuple(opaque(kappa) for kappa in small_kappas(self.spectrum, self.media.eta))
-        eta, is_sheet = float(np.max(dr.detach(self.material.eta))), self.media.transmission == "sheet"
-        share, orders = None, self.tables.order_table(eta, is_sheet, self.scales)
+        is_sheet = self.media.transmission == "sheet"
+        share, orders = None, self.tables.order_table(is_sheet, self.scales)
         if orders is not None:
             self.scattering, share = self.tables.scattering.drawn_from(orders), orders.transmitted
         return Interface(self.material.eta, is_sheet, kappas, share)
@@ -125,7 +129,16 @@ class ScalarTheory:
         for scale in changed:
             scale.read()
         self.material.update()
-        if changed:
+        other_index = False
+        if self.media.eta is not None:
+            # Tables serve for nearly the same index, so that a scene in which it varies smoothly is not slowed down.
+            eta, before = float(np.max(dr.detach(self.material.eta))), self.media.eta
+            other_index = abs(eta - before) > CHANGE * abs(before - 1)
+            if other_index:
+                self.media = dataclasses.replace(self.media, eta=eta)
+                self.tables = SharedTables.of(self.spectrum, eta)
+                self.scattering = self.tables.scattering
+        if changed or other_index:
             self.update()
         else:
             self.interface = self._interface()
@@ -179,7 +192,7 @@ class RigorousTheory:
     shadowing, energy = True, None  # of no effect: they are in the efficiencies
 
     def __init__(self, props: mi.Properties, spectrum: RigorousSpectrum, media: Media) -> None:
-        self.coat = coat = media.coat
+        self.media, coat = media, media.coat
         if media.outside > 1 and coat is None:
             raise RequestError(f"ext_ior: got {media.outside:g} with theory=rigorous, wanted air or a coat")
         check_transmission(spectrum.transmission, media)
@@ -210,7 +223,7 @@ class RigorousTheory:
     ) -> Split:
         """Return how the grating splits `value` into s and p."""
         sin, cos = frame
-        relative = 1e3 if self.coat is None else 1e3 * self.coat.relative
+        relative = 1e3 if self.media.coat is None else 1e3 * self.media.coat.relative
 
         def entries(channel: int, source: mi.Vector3f, exit_: mi.Vector3f) -> list[list[mi.Float]]:
             frequency = relative / si.wavelengths[channel]

@@ -228,13 +228,7 @@ def test_orders_on_either_side_are_drawn_with_their_shares(profile, theta, is_sh
 
 @pytest.mark.parametrize(("height_scale", "eta"), [(1.0, 1.75), (0.5, 1.5), (0.0, 1.5), (0.5, 1.75)])
 def test_samples_follow_an_index_and_heights_that_change(height_scale, eta):
-    # Orders that propagate with the new index only are drawn, too.
-    changed = passing("interface", conserve_energy=False)
-    parameters = mi.traverse(changed)
-    for name, value in (("height_scale", height_scale), ("eta", eta)):
-        parameters[name] = value
-        parameters.update()
-    fresh = passing("interface", conserve_energy=False, height_scale=height_scale, int_ior=eta)
+    changed, fresh = changed_and_fresh(height_scale, eta)
     u = np.random.default_rng(1).random((3, 1 << 16)).astype(np.float32)
     for side in (1, -1):
         si = interaction(towards(40, 10, side), (540.0, 560.0, 600.0, 650.0), u.shape[1])
@@ -247,6 +241,41 @@ def test_samples_follow_an_index_and_heights_that_change(height_scale, eta):
         error = np.hypot(*(weight.std(1) / np.sqrt(u.shape[1]) for weight in weights))
         np.testing.assert_array_less(np.abs(there - wanted), 4 * error + 1e-3)
         assert (weights[0].mean(0) > 0).mean() > 0.5
+
+
+def changed_and_fresh(height_scale, eta):
+    """A plugin whose parameters were changed, and one that was loaded with them; of a spectrum to 360 nm at n = 1.8."""
+    spectrum = md.precompute(md.gratings.blazed(PERIOD, 0.8), wavelengths=(200.0, 830.0 / 1.2), tolerance=1e-2)
+    scene = {"type": "diffraction_grating", "spectrum": spectrum, "transmission": "interface", "ext_ior": 1.0}
+    changed = mi.load_dict({**scene, "int_ior": ETA})
+    parameters = mi.traverse(changed)
+    for name, value in (("height_scale", height_scale), ("eta", eta)):
+        parameters[name] = value
+        parameters.update()
+    return changed, mi.load_dict({**scene, "height_scale": height_scale, "int_ior": eta})
+
+
+@pytest.mark.parametrize("eta", [1.25, 1.75])
+def test_an_index_that_changes_has_its_own_e_and_orders(eta):
+    changed, fresh = changed_and_fresh(1.0, eta)
+    rng = np.random.default_rng(3)
+    wi, wo = rng.normal(size=(2, 1 << 14, 3))
+    wi, wo = (omega / np.linalg.norm(omega, axis=1, keepdims=True) for omega in (wi, wo))
+    si = interaction(wi, (365.0, 450.0, 550.0, 700.0), len(wi))
+    # Whatever is drawn by either can be evaluated by the other.
+    for bsdf, other in ((changed, fresh), (fresh, changed)):
+        bs, _ = bsdf.sample(mi.BSDFContext(), si, mi.Float(rng.random(len(wi))), mi.Point2f(rng.random((2, len(wi)))))
+        value, pdf = (np.array(x) for x in bsdf.eval_pdf(mi.BSDFContext(), si, bs.wo))
+        of_other, pdf_of_other = (np.array(x) for x in other.eval_pdf(mi.BSDFContext(), si, bs.wo))
+        np.testing.assert_allclose(of_other, value, rtol=1e-4, atol=1e-3)
+        np.testing.assert_allclose(pdf_of_other, pdf, rtol=1e-4, atol=1e-3)
+
+
+def test_an_index_is_refused_for_which_the_spectrum_has_no_wavelengths():
+    parameters = mi.traverse(passing("interface"))
+    parameters["eta"] = 1.6
+    with pytest.raises(ValueError, match=r"int_ior: got 1\.6, and a spectrum for wavelengths from 240 nm"):
+        parameters.update()
 
 
 def test_other_parameters_leave_tables_of_varying_scales(monkeypatch):
