@@ -150,15 +150,12 @@ def scalar_orders(
     """
     pitch = wavelength / np.atleast_1d(period)
     turn, angle = np.deg2rad((turn, angle))
-    light = -np.sin(angle) * np.array([[np.cos(turn), np.sin(turn)]])
+    light = -np.sin(angle) * np.array([np.cos(turn), np.sin(turn)])
     m, leaving, factor, cos_half = _mirror_orders(powers, pitch, wavelength, light)
-    kept = factor[0] > -1
-    leaving, factor, cos_half = leaving[0, kept], factor[0, kept], cos_half[0, kept]
-    # One direction at a time, since a tile has hundreds.
-    albedo = [np.maximum(_mirror_orders(powers, pitch, wavelength, one[None])[2], 0).sum() for one in leaving]
+    albedo = [_mirror_orders(powers, pitch, wavelength, one)[2].sum() for one in leaving]
     reflected = factor / np.maximum(1, np.maximum(factor.sum(), albedo))
     s, p = (1.0, 1.0) if np.isinf(index) else fresnel(cos_half, index)
-    return Orders(m[kept], s * reflected, p * reflected)
+    return Orders(m, s * reflected, p * reflected)
 
 
 def transmitted_orders(
@@ -213,22 +210,22 @@ def _lattice(pitch: Array, reach: float) -> tuple[NDArray[np.int64], Array]:
 def _mirror_orders(
     powers: OrderPowers, pitch: Array, wavelength: float, light: Array
 ) -> tuple[NDArray[np.int64], Array, Array, Array]:
-    """Return the specular orders for tangential parts of ω_i, (d, 2); pitch is λ/T, (1,) of a profile, (2,) of a tile.
+    """Return the orders that R = 1 reflects, for the tangential part of ω_i, (2,).
 
-    m, (n,) or (n, 2), and for each pair of light and order the tangential part of ω_o, (d, n, 2), K G η_m for R = 1 (−1
-    where evanescent), and ω_i·h, (d, n).
+    Args:
+        pitch: λ/T, (1,) of a profile, (2,) of a tile.
+
+    Returns:
+        Of those that propagate: m, (n,) or (n, 2), the tangential part of ω_o, (n, 2), K G η_m and ω_i·h, (n,).
     """
     m, steps = _lattice(pitch, 2.0)
-    leaving = -steps - light[:, None]
-    square_i, square_o = (light**2).sum(axis=-1)[:, None], (leaving**2).sum(axis=-1)
-    there = square_o < 1
-    cos_i, cos_o = np.broadcast_arrays(np.sqrt(1 - square_i), np.sqrt(np.where(there, 1 - square_o, 1)))
+    leaving = -steps - light
+    square_o = (leaving**2).sum(axis=-1)
+    m, steps, leaving, square_o = (values[square_o < 1] for values in (m, steps, leaving, square_o))
+    cos_i, cos_o = np.sqrt(1 - (light**2).sum()), np.sqrt(1 - square_o)
     w = cos_i + cos_o
     d = ((steps**2).sum(axis=-1) + w**2) / 2  # 1 + ω_i·ω_o
-    of_pairs = np.broadcast_to(m, (*there.shape, *m.shape[1:]))[there]
-    factor = np.full(there.shape, -1.0)
-    factor[there] = k_g(cos_i[there], cos_o[there], d[there]) * powers(of_pairs, 2 * np.pi * w[there] / wavelength)
-    return m, leaving, factor, np.sqrt(d / 2)
+    return m, leaving, k_g(cos_i, cos_o, d) * powers(m, 2 * np.pi * w / wavelength), np.sqrt(d / 2)
 
 
 def difference(scalar: ArrayLike, rigorous: ArrayLike) -> float:
