@@ -15,7 +15,7 @@ from ..errors import RequestError
 from ..files import whole_file
 from ..outputs import metadata
 from ..surface.heightfield import HeightField
-from ..surface.periods import hann
+from ..surface.periods import hann, repeated
 from .colours import WAVELENGTHS, radiance
 from .report import Inspection, reference_plane
 
@@ -103,9 +103,23 @@ def _height_map(axes: Axes, field: HeightField, extent: str) -> None:
     axes.text(size_x * 0.05, y - size_y * 0.04, f"{length:g} µm", color="white", fontsize=11, va="bottom", bbox=box)
 
 
+def _shown(inspection: Inspection) -> HeightField:
+    """Return the surface, a tile repeated, and a profile extended along its axis of one pixel to a square."""
+    field = inspection.height_field
+    if inspection.extent == "tile":
+        field = repeated(field)
+    for axis in (0, 1):
+        if field.shape[axis] == 1 < field.shape[1 - axis]:
+            count = min(field.shape[1 - axis], 256)
+            sizes = list(field.pixel_size)
+            sizes[1 - axis] = field.tile_size[axis] / count
+            return HeightField(np.repeat(field.heights, count, axis), (sizes[0], sizes[1]), field.source)
+    return field
+
+
 def piece_shown(inspection: Inspection) -> HeightField:
     """Return a piece of a periodic surface: a dozen of the shortest periods, but at least four of the longest."""
-    field = inspection.shown
+    field = _shown(inspection)
     if inspection.extent == "sample" or not inspection.periods:
         return field
     lengths = [period.period for period in inspection.periods]
@@ -131,7 +145,7 @@ def _round_length(length: float) -> float:
 
 def _spectrum(axes: Axes, inspection: Inspection) -> None:
     """Plot the power spectrum of the heights, where a wave is a pair of bright spots."""
-    q_x, q_y, power = _height_spectrum(inspection.shown, inspection.extent)
+    q_x, q_y, power = _height_spectrum(_shown(inspection), inspection.extent)
     limit = min(_HIGHEST_FREQUENCY, max(q_x.max(), q_y.max()))
     if inspection.periods:
         limit = min(limit, 4.5 / min(period.period for period in inspection.periods[:1]))

@@ -16,7 +16,7 @@ from ..scalar_theory import ScalarError, scalar_error
 from ..settings import SUN_COHERENCE_LENGTH, VISIBLE, Settings, lobe_width
 from ..spectrum.sample import effective_coherence_length, standard_error
 from ..surface.heightfield import HeightField
-from ..surface.periods import Period, find_periods, hann, repeated
+from ..surface.periods import Period, find_periods, hann
 from .colours import LONGEST_COHERENCE, SHARE, Change, changes
 
 Array = NDArray[np.float64]
@@ -40,7 +40,6 @@ class Inspection:
         changes: effects of ±5 % of height scale, pixel size and, for a scan, tip broadening; empty without a period.
         concerns: reasons to distrust a picture.
         spectrum: of at most `LONGEST_COHERENCE`, for predicted colours.
-        shown: the height field; a small tile is repeated, a profile extended to a square.
     """
 
     height_field: HeightField
@@ -54,7 +53,6 @@ class Inspection:
     changes: tuple[Change, ...]
     concerns: tuple[str, ...]
     spectrum: GratingSpectrum = field(repr=False)
-    shown: HeightField = field(repr=False)
 
     @property
     def direction(self) -> float:
@@ -147,21 +145,9 @@ def inspect(
         else (),
         concerns=concerns(height_field, numbers, used, measured=measured, scalar=scalar),
         spectrum=spectrum,
-        shown=_widened(repeated(height_field) if extent == "tile" else height_field),
     )
     progress(4, 4)
     return result
-
-
-def _widened(field: HeightField) -> HeightField:
-    """Extend a profile along its axis of one pixel to a square."""
-    for axis in (0, 1):
-        if field.shape[axis] == 1 < field.shape[1 - axis]:
-            count = min(field.shape[1 - axis], 256)
-            sizes = list(field.pixel_size)
-            sizes[1 - axis] = field.tile_size[axis] / count
-            return HeightField(np.repeat(field.heights, count, axis), (sizes[0], sizes[1]), field.source)
-    return field
 
 
 @dataclass(frozen=True)
