@@ -77,76 +77,6 @@ class Band:
         return bool((np.abs(offset) <= 3 * self.width).all())
 
 
-def fit_band(power: Array, background: Array, q: tuple[Array, Array], size: Array, peak: Array) -> Band:
-    """Fit the band about a peak.
-
-    Args:
-        power: |FFT|² of the heights under a Hann window, (N_y, N_x).
-        background: B, (N_y, N_x); infinite at one or both of q and −q where it is unknown.
-        q: frequencies along x, (N_x,), and along y, (N_y,), cycles/µm.
-        size: of the patch along x and y, µm.
-        peak: (2,) starting point, cycles/µm.
-    """
-    q_x, q_y = np.meshgrid(*q)
-    rho_0, phi_0 = np.hypot(*peak), np.arctan2(peak[1], peak[0])
-    rho, phi = np.hypot(q_x, q_y), np.arctan2(q_y, q_x)
-    background = np.minimum(background, np.roll(background[::-1, ::-1], (1, 1), (0, 1)))
-    phi = _axis_difference(phi, phi_0)
-    about = (
-        (np.abs(phi) < _SECTOR)
-        & (rho > rho_0 / _FREQUENCY_RATIO)
-        & (rho < rho_0 * _FREQUENCY_RATIO)
-        & np.isfinite(background)
-    )
-    about &= q_x * peak[0] + q_y * peak[1] > 0  # one of q and −q
-    values, rho, phi = power[about], rho[about], phi[about]
-    background = np.maximum(background[about], 1e-9 * values.max())
-    long = np.array(power.shape[::-1]) > 1
-    bin_width = 1 / size[long].min()
-
-    def model(theta: Array) -> tuple[Array, Array, Array]:
-        """Return the Gaussian, P, and ∂ln P/∂θ, for θ = (ln A, ρ₀, ln σ_ρ, φ₀, ln σ_φ, ln b)."""
-        sigma_rho, sigma_phi = np.exp(theta[[2, 4]])
-        s, t = (rho - theta[1]) / sigma_rho, (phi - theta[3]) / sigma_phi
-        gaussian = np.exp(theta[0] - (s**2 + t**2) / 2)
-        total = gaussian + np.exp(theta[5]) * background
-        slopes = np.array([np.ones_like(s), s / sigma_rho, s**2, t / sigma_phi, t**2]) * gaussian / total
-        return gaussian, total, np.vstack([slopes, 1 - gaussian / total])
-
-    def cost(theta: Array) -> tuple[float, Array]:
-        _, total, slopes = model(theta)
-        return float(np.sum(np.log(total) + values / total)), slopes @ (1 - values / total)
-
-    bounds = [
-        (np.log(1e-6 * values.max()), np.log(10 * values.max())),
-        (rho_0 / _CENTRE_RATIO, rho_0 * _CENTRE_RATIO),
-        (np.log(bin_width / 3), np.log(max(rho_0 / 4, bin_width))),
-        (-_SECTOR, _SECTOR),
-        (np.log(bin_width / rho_0 / 3), np.log(max(_SECTOR, bin_width / rho_0))),
-        (np.log(1e-3), np.log(1e3)),
-    ]
-    # A broad band, unless a bin stands out of it: its noise may well be fitted by a narrow peak on a high background.
-    found = []
-    for width in (0.15, 0.03):
-        start = [np.log(values.max() / 3), rho_0, np.log(width * rho_0), 0.0, np.log(width), 0.0]
-        start = np.clip(start, *np.array(bounds).T)
-        found.append(minimize(cost, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 100}))
-        if (values <= np.log(len(values) / _BAND_FALSE_ALARM) * model(found[0].x)[1]).all():
-            break
-    theta = min(found, key=lambda result: result.fun).x
-    gaussian, _, slopes = model(theta)
-    covariance = _CORRELATED ** long.sum() * np.linalg.pinv(slopes @ slopes.T, rcond=1e-10, hermitian=True)
-    width = np.exp(theta[[2, 4]])
-    width = np.sqrt(np.maximum(width**2 - _BAND_LOBE * bin_width**2 / np.array([1, theta[1] ** 2]), 0))
-    return Band(
-        centre=np.array([theta[1], phi_0 + theta[3]]),
-        width=width,
-        covariance=covariance[np.ix_([1, 3], [1, 3])],
-        share=float(min(2 * gaussian.sum() / power.sum(), 1.0)),
-        sharp=bool(width[0] <= max(_NARROW * bin_width, 2 * np.sqrt(covariance[1, 1]))),
-    )
-
-
 def _axis_difference(phi: Array, phi_0: float) -> Array:
     """Return φ − φ₀ of axes, in [−π/2, π/2)."""
     return (phi - phi_0 + np.pi / 2) % np.pi - np.pi / 2
@@ -191,20 +121,6 @@ class Period:
             period_uncertainty=float(np.sqrt(along @ spread @ along)) / length**2,
             direction_uncertainty=float(np.degrees(np.sqrt(across @ spread @ across) / length)),
             strength=strength,
-        )
-
-    @classmethod
-    def of_band(cls, band: Band, spread: Array) -> Period:
-        """Make a period from a band and the covariance (2, 2) of its centre (ρ₀, φ₀)."""
-        length, phi = band.centre
-        return cls(
-            period=float(1 / length),
-            direction=_as_direction(phi),
-            period_uncertainty=float(np.sqrt(spread[0, 0]) / length**2),
-            direction_uncertainty=float(np.degrees(np.sqrt(spread[1, 1]))),
-            strength=band.share,
-            width=float(band.width[0] / length**2),
-            direction_width=float(np.degrees(band.width[1])),
         )
 
 
@@ -321,7 +237,7 @@ class _Spectrum:
             q = self._frequency(row, column)
             if known(q):
                 continue
-            band = None if self._isolated(q) else fit_band(self._power, self._rings, self._q, self._size, q)
+            band = None if self._isolated(q) else self._fit_band(q)
             if band is not None and not band.sharp:
                 bands.append(band)
             elif not known(q := self._fundamental(q)):
@@ -434,15 +350,84 @@ class _Spectrum:
         found = [Period.of(*wave) for wave in zip(q, covariance, np.minimum(strength, 1.0).tolist(), strict=True)]
         return [period for period in found if period.strength >= _LEAST_STRENGTH]
 
+    def _fit_band(self, peak: Array) -> Band:
+        """Fit the band about a peak, (2,) cycles/µm."""
+        q_x, q_y = np.meshgrid(*self._q)
+        rho_0, phi_0 = np.hypot(*peak), np.arctan2(peak[1], peak[0])
+        rho, phi = np.hypot(q_x, q_y), _axis_difference(np.arctan2(q_y, q_x), phi_0)
+        # The background is infinite at one of q and −q, or at both where it is unknown.
+        background = np.minimum(self._rings, np.roll(self._rings[::-1, ::-1], (1, 1), (0, 1)))
+        about = (
+            (np.abs(phi) < _SECTOR)
+            & (rho > rho_0 / _FREQUENCY_RATIO)
+            & (rho < rho_0 * _FREQUENCY_RATIO)
+            & np.isfinite(background)
+        )
+        about &= q_x * peak[0] + q_y * peak[1] > 0  # one of q and −q
+        values, rho, phi = self._power[about], rho[about], phi[about]
+        background = np.maximum(background[about], 1e-9 * values.max())
+        long = np.array(self._power.shape[::-1]) > 1
+        bin_width = 1 / self._size[long].min()
+
+        def model(theta: Array) -> tuple[Array, Array, Array]:
+            """Return the Gaussian, P, and ∂ln P/∂θ, for θ = (ln A, ρ₀, ln σ_ρ, φ₀, ln σ_φ, ln b)."""
+            sigma_rho, sigma_phi = np.exp(theta[[2, 4]])
+            s, t = (rho - theta[1]) / sigma_rho, (phi - theta[3]) / sigma_phi
+            gaussian = np.exp(theta[0] - (s**2 + t**2) / 2)
+            total = gaussian + np.exp(theta[5]) * background
+            slopes = np.array([np.ones_like(s), s / sigma_rho, s**2, t / sigma_phi, t**2]) * gaussian / total
+            return gaussian, total, np.vstack([slopes, 1 - gaussian / total])
+
+        def cost(theta: Array) -> tuple[float, Array]:
+            _, total, slopes = model(theta)
+            return float(np.sum(np.log(total) + values / total)), slopes @ (1 - values / total)
+
+        bounds = [
+            (np.log(1e-6 * values.max()), np.log(10 * values.max())),
+            (rho_0 / _CENTRE_RATIO, rho_0 * _CENTRE_RATIO),
+            (np.log(bin_width / 3), np.log(max(rho_0 / 4, bin_width))),
+            (-_SECTOR, _SECTOR),
+            (np.log(bin_width / rho_0 / 3), np.log(max(_SECTOR, bin_width / rho_0))),
+            (np.log(1e-3), np.log(1e3)),
+        ]
+        # A broad band, unless a bin stands out of it: its noise may well be fitted by a narrow peak on much background.
+        found = []
+        for width in (0.15, 0.03):
+            start = [np.log(values.max() / 3), rho_0, np.log(width * rho_0), 0.0, np.log(width), 0.0]
+            start = np.clip(start, *np.array(bounds).T)
+            found.append(minimize(cost, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 100}))
+            if (values <= np.log(len(values) / _BAND_FALSE_ALARM) * model(found[0].x)[1]).all():
+                break
+        theta = min(found, key=lambda result: result.fun).x
+        gaussian, _, slopes = model(theta)
+        covariance = _CORRELATED ** long.sum() * np.linalg.pinv(slopes @ slopes.T, rcond=1e-10, hermitian=True)
+        width = np.exp(theta[[2, 4]])
+        width = np.sqrt(np.maximum(width**2 - _BAND_LOBE * bin_width**2 / np.array([1, theta[1] ** 2]), 0))
+        return Band(
+            centre=np.array([theta[1], phi_0 + theta[3]]),
+            width=width,
+            covariance=covariance[np.ix_([1, 3], [1, 3])],
+            share=float(min(2 * gaussian.sum() / self._power.sum(), 1.0)),
+            sharp=bool(width[0] <= max(_NARROW * bin_width, 2 * np.sqrt(covariance[1, 1]))),
+        )
+
     def band(self, band: Band) -> Period:
         """Return the period of a band; its uncertainty includes the excess scatter of the quarters."""
-        q, quarters = band.centre[0] * _unit(band.centre[1]), []
-        for part in self._parts():
-            spectrum = _Spectrum(self._heights[part], self._pixel_size)
-            quarters.append(fit_band(spectrum._power, spectrum._rings, spectrum._q, spectrum._size, q))
+        length, phi = band.centre
+        parts = (_Spectrum(self._heights[part], self._pixel_size) for part in self._parts())
+        quarters = [part._fit_band(length * _unit(phi)) for part in parts]
         centres = np.array([quarter.centre for quarter in quarters])
         noise = np.mean([quarter.covariance for quarter in quarters], axis=0)
-        return Period.of_band(band, band.covariance + _excess_covariance(centres, noise))
+        spread = band.covariance + _excess_covariance(centres, noise)
+        return Period(
+            period=float(1 / length),
+            direction=_as_direction(phi),
+            period_uncertainty=float(np.sqrt(spread[0, 0]) / length**2),
+            direction_uncertainty=float(np.degrees(np.sqrt(spread[1, 1]))),
+            strength=band.share,
+            width=float(band.width[0] / length**2),
+            direction_width=float(np.degrees(band.width[1])),
+        )
 
     def _drift(self, q: Array, noise: Array) -> Array:
         """Return the covariance of the frequency over the halves or quarters of the patch, in excess of noise."""
