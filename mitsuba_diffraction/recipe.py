@@ -23,20 +23,9 @@ prepare = [                      # steps of surface/prepare.py, in this order
 ]
 fill_missing = true              # interpolate missing pixels; default: refuse them
 
-[spectrum]                       # all optional
+[spectrum]                       # the parameters of settings.Settings, all optional
 extent = "tile"
-coherence_length = 65.0          # µm
 wavelengths = [360.0, 830.0]     # nm
-largest_angle = 90.0             # degrees from the normal
-representation = "auto"
-tolerance = 1e-3                 # of a sample by default a tenth of its standard error, 1e-3 to 1e-2
-largest_height_range = 20.0      # µm; deeper surfaces are refused
-theory = "scalar"                # or "rigorous", of one row and of one material:
-material = "Al"                  # a conductor by Mitsuba's name,
-int_ior = 1.5                    # or an index of refraction;
-ext_ior = 1.0                    # of the medium above, that of a coat
-polarised = false                # with Mueller matrices, for polarised variants
-transmission = "none"            # or, of a dielectric, "interface" or "sheet": what is transmitted, too
 """
 
 from __future__ import annotations
