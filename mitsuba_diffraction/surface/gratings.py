@@ -16,13 +16,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from numbers import Integral, Real
+from numbers import Integral
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
-from ..errors import RequestError
+from ..errors import RequestError, is_number
 from .heightfield import HeightField, as_pixel_size
 
 MOST_PIXELS = 2**26
@@ -41,7 +41,7 @@ def check_pixels(columns: float, rows: float) -> None:
 
 
 def check_positive(name: str, value: float, unit: str = "in µm") -> None:
-    if not (isinstance(value, Real) and np.isfinite(value) and value > 0):
+    if not (is_number(value) and value > 0):
         raise RequestError(f"{name}: got {value!r}, wanted a positive number {unit}")
 
 
@@ -56,7 +56,7 @@ def check_period(name: str, value: float) -> None:
 
 def check_profile(period: float, depth: float, samples: int = 2) -> None:
     check_period("period", period)
-    if not (isinstance(depth, Real) and np.isfinite(depth) and depth >= 0):
+    if not (is_number(depth) and depth >= 0):
         raise RequestError(f"depth: got {depth!r}, wanted a number in µm, zero or more")
     if not (isinstance(samples, Integral) and samples >= 2):
         raise RequestError(f"samples: got {samples!r}, wanted a whole number of at least 2")
@@ -119,7 +119,7 @@ def right_angled(period: float, facet_angle: float, *, samples: int = 512) -> He
     The wider one rises along +x, by `facet_angle` in degrees, above 0 and at most 45.
     """
     check_profile(period, 0.0, samples)
-    if not (isinstance(facet_angle, Real) and 0 < facet_angle <= 45):
+    if not (is_number(facet_angle) and 0 < facet_angle <= 45):
         raise RequestError(f"facet_angle: got {facet_angle!r}, wanted degrees above 0 and at most 45")
     slope = np.tan(np.deg2rad(facet_angle))
     x = phase(samples)
@@ -154,7 +154,7 @@ def lamellar(period: float, depth: float, *, duty: float = 0.5, samples: int = 5
     `duty`, the width of the ridges relative to the period, is rounded to whole pixels.
     """
     check_profile(period, depth, samples)
-    if not (isinstance(duty, Real) and 0 < duty < 1):
+    if not (is_number(duty) and 0 < duty < 1):
         raise RequestError(f"duty: got {duty!r}, wanted a fraction above 0 and below 1")
     high = round(duty * samples)
     if not 0 < high < samples:
@@ -633,7 +633,7 @@ def xenopeltis(
     meander = 0.11 * row_pitch * canvas.noise(rng, 6.0, 1.3)
     faults = _faults(canvas, rng)
     rows = [(x, None) for x in canvas.places(0)] + [(fault.x, fault) for fault in faults if fault.extra]
-    grooves, tips = [], []
+    fingers = []
     for x, own in rows:
         # Every row has a phase of its own, and a finger more or less than its neighbours where there are many.
         count = canvas.count[1] + round(rng.normal(0, 0.012 * canvas.count[1]))
@@ -644,13 +644,11 @@ def xenopeltis(
                 continue
             x_0 = x + _fault_shift(faults, x, y, canvas)
             x_0 += canvas.at(meander, x_0, y)
-            length = row_pitch * (1 + rng.normal(0, 0.05))
-            tips.append((x_0, y, length))
-            grooves.append((x_0, y + pitch / 2, length))
-    for x_0, y_0, length in tips:
+            fingers.append((x_0, y, row_pitch * (1 + rng.normal(0, 0.05))))
+    for x_0, y_0, length in fingers:
         _xenopeltis_finger(canvas, rng, x_0, y_0, length)
-    for x_0, y_0, length in grooves:
-        _xenopeltis_pit(canvas, rng, x_0, y_0, length)
+    for x_0, y_0, length in fingers:
+        _xenopeltis_pit(canvas, rng, x_0, y_0 + pitch / 2, length)
     canvas.heights += 0.005 * canvas.noise(rng, 0.07, 0.04) + 0.006 * canvas.noise(rng, 1.0, 1.0)
     return canvas.height_field(
         rng,

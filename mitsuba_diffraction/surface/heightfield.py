@@ -66,8 +66,6 @@ class HeightField:
         for name, value in (("fill_missing", fill_missing), ("keep_missing", keep_missing)):
             if not isinstance(value, bool | np.bool_):
                 raise RequestError(f"{name}: got {value!r}, wanted True or False")
-        if not (isinstance(filled, int) and filled >= 0):
-            raise RequestError(f"filled: got {filled!r}, wanted a number of pixels")
         array = np.array(as_heights(heights), order="C")
         pixel_size = as_pixel_size(pixel_size)
         gaps = ~np.isfinite(array)

@@ -301,13 +301,9 @@ def _crop(
 
 def _component(wave: Period, axis: str) -> tuple[float, float]:
     """Return |q| along an axis in cycles/µm, and its standard uncertainty."""
-    angle = np.radians(wave.direction)
-    along, across = (np.cos(angle), np.sin(angle)) if axis == "x" else (np.sin(angle), np.cos(angle))
-    spread = (
-        along * wave.period_uncertainty / wave.period**2,
-        across * np.radians(wave.direction_uncertainty) / wave.period,
-    )
-    return abs(float(along)) / wave.period, float(np.hypot(*spread))
+    along, across = wave.q if axis == "x" else wave.q[::-1]
+    spread = along * wave.period_uncertainty / wave.period, across * np.radians(wave.direction_uncertainty)
+    return abs(float(along)), float(np.hypot(*spread))
 
 
 # ---------------------------------------------------------------- recipes
