@@ -29,12 +29,6 @@ def k_g(cos_i: ArrayLike, cos_o: ArrayLike, d: ArrayLike, shadowing: bool = True
     return k * np.minimum(1, 2 * w * np.minimum(cos_i, cos_o) / d) if shadowing else k
 
 
-def k_g_between(wi: ArrayLike, wo: ArrayLike, shadowing: bool = True) -> NDArray[np.float64]:
-    """Compute K G of unit vectors (..., 3) in the upper hemisphere; shapes broadcast."""
-    wi, wo = np.asarray(wi, np.float64), np.asarray(wo, np.float64)
-    return k_g(wi[..., 2], wo[..., 2], ((wi + wo) ** 2).sum(axis=-1) / 2, shadowing)
-
-
 def fresnel(cosine: ArrayLike, index: float) -> NDArray[np.float64]:
     """Return F, the reflectance of unpolarised light, of an interface with the relative index n_o/n_i.
 

@@ -7,7 +7,7 @@ from bsdf_support import floats, random_directions, use, vectors
 
 from mitsuba_diffraction import testing
 from mitsuba_diffraction.bsdf.geometry import Geometry
-from mitsuba_diffraction.geometry import k_g_between
+from mitsuba_diffraction.evaluation.validation.lobes import k_g_between
 
 COPPER = {"type": "roughconductor", "material": "Cu", "alpha": 0.3}
 WAVELENGTHS = np.array([400.0, 450.0, 500.0, 550.0, 600.0, 650.0])

@@ -8,10 +8,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...geometry import k_g_between
 from ...testing import vectors
 from ..realtime_shader.evaluate import shader_for
 from ..realtime_shader.quirks import Quirks
+from ..validation.lobes import k_g_between
 from .accuracy import Exact, patch_difference, patch_directions
 from .cases import Case
 from .speed import Rays, seconds

@@ -11,13 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import jv
 
-from ...geometry import k_g_between
 from ...settings import lobe_width
 from ...surface import gratings
 from ...surface.heightfield import HeightField
 from ...testing import direction
 from .conservation import parseval
-from .lobes import brdf, density, grating, order_powers, orders_above, spectrum_of, towards
+from .lobes import brdf, density, grating, k_g_between, order_powers, orders_above, spectrum_of, towards
 from .record import Check, Record
 
 Array = NDArray[np.float64]

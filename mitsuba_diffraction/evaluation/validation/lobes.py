@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ... import testing
-from ...geometry import k_g_between
+from ...geometry import k_g
 from ...grating_spectrum import GratingSpectrum
 from ...precomputation import precompute
 from ...surface.heightfield import HeightField
@@ -45,6 +45,12 @@ def _built(height_field: HeightField, settings: tuple[tuple[str, Any], ...]) -> 
 def spectrum_of(height_field: HeightField, **settings: Any) -> GratingSpectrum:
     """Precompute a spectrum, to 1e-5 by default; cached for the next check of the same surface."""
     return _built(height_field, tuple(sorted({"tolerance": TOLERANCE, **settings}.items())))
+
+
+def k_g_between(wi: ArrayLike, wo: ArrayLike, shadowing: bool = True) -> Array:
+    """Compute K G of unit vectors (..., 3) in the upper hemisphere; shapes broadcast."""
+    wi, wo = np.asarray(wi, np.float64), np.asarray(wo, np.float64)
+    return k_g(wi[..., 2], wo[..., 2], ((wi + wo) ** 2).sum(axis=-1) / 2, shadowing)
 
 
 def towards(wi: Array, q: ArrayLike, wavelength: float) -> Array:
