@@ -264,11 +264,7 @@ class Recipe:
             with suppress(RequestError, OSError):
                 return load_spectrum(known, recipe=digest)
         with progress(f"spectrum of {self.surface.get('scan') or self.surface['profile']}") as report:
-            return self._built(path, digest, report)
-
-    def _built(self, path: Path, digest: str, progress: Progress) -> Spectrum:
-        """Compute the spectrum and write it to the cache."""
-        spectrum = self.build(progress)
+            spectrum = self.build(report)
         # A scene holds its recipes, and needs their heights no more.
         self.__dict__.pop("_height_field", None)
         try:
