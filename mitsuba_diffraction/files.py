@@ -108,10 +108,8 @@ def _remove_what_a_kill_left(target: Path) -> None:
 def refuse_unwritable(path: str | os.PathLike[str]) -> None:
     """Raise if `path` cannot be written, to be called before long computations."""
     try:
-        with whole_file(path):
+        with suppress(_Writable), whole_file(path):
             raise _Writable
-    except _Writable:
-        pass
     except OSError as error:
         raise RequestError(f"cannot write {os.fspath(path)!r}: {error.strerror}" if error.strerror else error) from None
 

@@ -148,7 +148,7 @@ def _spectrum(axes: Axes, inspection: Inspection) -> None:
     q_x, q_y, power = _height_spectrum(_shown(inspection), inspection.extent)
     limit = min(_HIGHEST_FREQUENCY, max(q_x.max(), q_y.max()))
     if inspection.periods:
-        limit = min(limit, 4.5 / min(period.period for period in inspection.periods[:1]))
+        limit = min(limit, 4.5 / inspection.periods[0].period)
     near_x, near_y = np.abs(q_x) <= limit, np.abs(q_y) <= limit
     q_x, q_y, power = _strongest(q_x[near_x], q_y[near_y], power[np.ix_(near_y, near_x)])
     top = power.max()

@@ -293,9 +293,5 @@ def _share_at_limit(height_field: HeightField) -> float:
     """Return the share of the phase's power at 450 nm and normal incidence beyond 0.8 of the Nyquist limit."""
     phase = np.exp(1j * 4 * np.pi / _BLUE * height_field.centred)
     power = np.abs(np.fft.fft2(phase * hann(phase.shape))) ** 2
-    outside = np.zeros(power.shape, bool)
-    for axis, count in enumerate(power.shape):
-        if count > 1:
-            far = np.abs(np.fft.fftfreq(count)) > 0.4
-            outside |= far[:, None] if axis == 0 else far
-    return float(power[outside].sum() / power.sum())
+    far_y, far_x = (np.abs(np.fft.fftfreq(count)) > 0.4 for count in power.shape)
+    return float(power[far_y[:, None] | far_x].sum() / power.sum())

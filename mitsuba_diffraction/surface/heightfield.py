@@ -78,8 +78,8 @@ class HeightField:
             if gaps.all():
                 raise RequestError(f"heights: all {gaps.size} pixels are missing, wanted at least one height in µm")
             array[gaps] = np.nan
-        elif gaps.any():
-            raise RequestError(_refusal(gaps))
+        else:
+            _refuse(gaps)
         array.setflags(write=False)
         object.__setattr__(self, "heights", array)
         object.__setattr__(self, "pixel_size", pixel_size)
@@ -106,12 +106,8 @@ class HeightField:
     @property
     def height_range(self) -> float:
         """Highest minus lowest point, µm."""
-        self._refuse_gaps()
+        _refuse(self.gaps)
         return float(np.ptp(self.heights))
-
-    def _refuse_gaps(self) -> None:
-        if (gaps := self.gaps).any():
-            raise RequestError(_refusal(gaps))
 
     @property
     def half_range(self) -> float:
@@ -121,7 +117,7 @@ class HeightField:
     @property
     def centred(self) -> NDArray[np.float64]:
         """Heights relative to the centre of their range, (N_y, N_x) µm. An offset only changes the phase of e^{iκh}."""
-        self._refuse_gaps()
+        _refuse(self.gaps)
         return self.heights - (self.heights.min() + self.heights.max()) / 2
 
     @property
@@ -143,13 +139,14 @@ class HeightField:
         )
 
 
-def _refusal(gaps: NDArray[np.bool_]) -> str:
-    row, column = np.argwhere(gaps)[0]
-    return (
-        f"heights: {gaps.sum()} of {gaps.size} pixels are missing or not finite, "
-        f"the first at row {row}, column {column}; wanted finite heights in µm "
-        "(fill_missing=True, or --fill-missing, fills them from their surroundings)"
-    )
+def _refuse(gaps: NDArray[np.bool_]) -> None:
+    if gaps.any():
+        row, column = np.argwhere(gaps)[0]
+        raise RequestError(
+            f"heights: {gaps.sum()} of {gaps.size} pixels are missing or not finite, "
+            f"the first at row {row}, column {column}; wanted finite heights in µm "
+            "(fill_missing=True, or --fill-missing, fills them from their surroundings)"
+        )
 
 
 def as_heights(heights: ArrayLike) -> NDArray[np.float64]:
