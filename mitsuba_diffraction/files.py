@@ -125,8 +125,10 @@ def cache_folder() -> Path:
 
 
 def refuse_special(path: str | os.PathLike[str]) -> None:
-    """Raise if `path` is a pipe or a device, which may be endless."""
-    if os.path.exists(path) and not (os.path.isfile(path) or os.path.isdir(path)):
+    """Raise if `path` is not there, or is a pipe or a device, which may be endless."""
+    if not os.path.exists(path):
+        raise FileNotFoundError(f"{os.fspath(path)}: no such file")
+    if not (os.path.isfile(path) or os.path.isdir(path)):
         raise RequestError(f"{os.fspath(path)}: a pipe or a device, wanted an ordinary file")
 
 

@@ -139,8 +139,6 @@ class Recipe:
         try:
             with open(path, "rb") as file:
                 content = tomllib.load(file)
-        except FileNotFoundError:
-            raise FileNotFoundError(f"{path}: no such file") from None
         # Syntax or encoding errors; numbers of too many digits; deeply nested brackets.
         except (ValueError, RecursionError) as error:
             raise RequestError(f"{path}: not a TOML file ({error})") from None
@@ -165,12 +163,6 @@ class Recipe:
         if "patches" in self.surface:
             return int(self.surface["patches"])
         return PATCHES.get(self.surface.get("profile", ""), 1) if self.spectrum.get("extent", "tile") == "tile" else 1
-
-    def of_one_patch(self) -> Recipe:
-        """Return the recipe without the mean over seeds: its spectrum is that of `height_field`."""
-        if self.patches == 1:
-            return self
-        return Recipe({**self.surface, "patches": 1}, self.spectrum, self.folder)
 
     def height_fields(self, progress: Progress = silent) -> tuple[HeightField, ...]:
         """Return the patches: seed, seed + 1, …; one where nothing is drawn at random."""
@@ -234,10 +226,7 @@ class Recipe:
         surface = {name: value for name, value in self.surface.items() if name != "scan"}
         for scan in self.files:
             refuse_special(scan)
-            try:
-                content.update(scan.read_bytes())
-            except FileNotFoundError:
-                raise FileNotFoundError(f"{scan}: no such file") from None
+            content.update(scan.read_bytes())
             content.update(scan.suffix.lower().encode())
         content.update(json.dumps([surface, self.patches, dict(self.spectrum)], sort_keys=True).encode())
         return content.hexdigest()

@@ -315,7 +315,8 @@ def test_a_recipe_of_a_measured_skin_has_its_heights(tmp_path, scan_file, scan):
 )
 def test_the_recipes_of_this_repository_build(path):
     recipe = Recipe.load(path)
-    spectrum = Recipe(recipe.surface, {**recipe.spectrum, "tolerance": 0.2}, recipe.folder).of_one_patch().build()
+    one = {"patches": 1} if recipe.patches > 1 else {}
+    spectrum = Recipe({**recipe.surface, **one}, {**recipe.spectrum, "tolerance": 0.2}, recipe.folder).build()
     assert spectrum.error <= 0.2
     if "depth" in recipe.surface:  # of a ruled grating it follows from its blaze
         depth = recipe.surface["depth"] * recipe.surface.get("index", 1.0)

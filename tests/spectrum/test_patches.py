@@ -66,7 +66,7 @@ def test_another_number_of_patches_is_another_spectrum(recipe):
     assert Recipe(SURFACE).patches == PATCHES["elaphe"]
     assert Recipe(SURFACE, {"extent": "sample"}).patches == 1
     assert Recipe({"profile": "blazed"}).patches == Recipe({"scan": "a.png"}).patches == 1
-    assert recipe.of_one_patch().height_fields()[0].digest == recipe.height_field().digest
+    assert Recipe({**SURFACE, "patches": 1}).height_fields()[0].digest == Recipe(SURFACE).height_field().digest
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -102,7 +103,9 @@ def validate(
 def _recipe(path: Path, of_scan: dict[str, object], settings: dict[str, object]) -> Recipe:
     if path.suffix.lower() != ".toml":
         settings = {"extent": "sample", **settings}
-    recipe = recipe_of(path, of_scan, settings).of_one_patch()
+    recipe = recipe_of(path, of_scan, settings)
+    if recipe.patches > 1:
+        recipe = replace(recipe, surface={**recipe.surface, "patches": 1})
     if recipe.spectrum.get("theory") == "rigorous":
         raise RequestError(f"{path}: got theory = 'rigorous', wanted scalar; precompute prints the measured errors")
     return recipe

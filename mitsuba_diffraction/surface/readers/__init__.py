@@ -102,8 +102,6 @@ def read_height_field(
             raise RequestError("pixel_size: the file has none, wanted one number or (x, y) in µm")
         source = f"{path.name}, {scan.channel}" if scan.channel else path.name
         return HeightField(heights, pixel_size, source, fill_missing=fill_missing, keep_missing=keep_missing)
-    except FileNotFoundError:
-        raise
     # Pillow raises OSError for a damaged image, the system for unreadable paths (a folder, permissions);
     # UnicodeDecodeError comes from a damaged text.
     except (RequestError, UnicodeDecodeError, OSError, MemoryError) as error:
