@@ -114,7 +114,7 @@ class SharedTables:
             ratios = np.linspace(low, high, 2 * int(np.clip(turn / (2 * TURN), 1, PARTS)) + 1)
             laterals = np.repeat(laterals[:1], len(ratios))
         found, most = [], float(np.max(ratios))
-        shape = Layout.of(spectrum, Furnace.of(spectrum, most, self._eta))
+        shape = Layout.of(Furnace.of(spectrum, most, self._eta))
         indices = [None] if self._eta is None else [self._eta, 1 / self._eta]
         for ratio, lateral in zip(ratios, laterals, strict=True):
             stretched = Stretched(spectrum, float(lateral))

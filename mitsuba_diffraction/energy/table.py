@@ -43,7 +43,8 @@ from scipy.ndimage import minimum_filter
 
 from ..errors import RequestError
 from ..spectrum.grids import OrderGrid
-from .furnace import BLUR, PHASE, Furnace, PowerSpectrum
+from ..spectrum.power_spectrum import PowerSpectrum
+from .furnace import BLUR, PHASE, Furnace, Indices, Real
 
 SLACK = 1e-3
 """What an albedo may exceed one by."""
@@ -103,14 +104,15 @@ class Layout:
         return self.slices, side, side, 4
 
     @classmethod
-    def of(cls, spectrum: PowerSpectrum, furnace: Furnace) -> Layout:
-        """Choose the layout for `spectrum`: as fine as the work allows."""
-        frequencies, grid = frequencies_of(spectrum, furnace.index), spectrum.grid
+    def of(cls, furnace: Furnace) -> Layout:
+        """Choose the layout: as fine as the work allows."""
+        spectrum, grid = furnace.spectrum, furnace.spectrum.grid
+        frequencies = frequencies_of(spectrum, furnace.index)
         if furnace.index is not None or not (isinstance(grid, OrderGrid) and 1 in grid.shape):
             # As fine as the work allows, which is about the same for all.
             nodes = NODES * float(np.clip(PAIRS / 2 / (furnace.work * NODES), 1, 1 if furnace.index else FINEST))
             # In the denser medium, as both sides have equally many slices.
-            turn = 4e3 * np.pi * furnace.height_range * (1 / spectrum.wavelengths[0] - 1 / spectrum.wavelengths[1])
+            turn = 4e3 * np.pi * furnace.depth * (1 / spectrum.wavelengths[0] - 1 / spectrum.wavelengths[1])
             slices = int(np.clip(4 + turn / PHASE, 4, 16) * np.cbrt(nodes / NODES))
             # Of deep surfaces more: but orders that are evaluated by themselves need the time for places within cells.
             per_slice = nodes / (slices if furnace.by_order else min(slices, 8))
@@ -127,9 +129,7 @@ class Layout:
         cells = int(np.clip((3 * rest / max(squares - 1, 1) - 1) / 2, 1, 48))
         return cls(float(period), squares, first, cells, 1, frequencies, turned)
 
-    def places(
-        self, directions: NDArray[np.float64], wavelengths: ArrayLike
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    def places(self, directions: Real, wavelengths: ArrayLike) -> tuple[Real, Real, Real]:
         """Return slice, row and column of ω (n, 3) and λ (µm), in cells: each (n,)."""
         x, y, z = directions.T
         if not self.lines:
@@ -146,9 +146,7 @@ class Layout:
         u, v = (self._place(np.where(x * sign > 0, shorter, longer) * per_length) for sign in (1, -1))
         return np.zeros(len(x)), v, u
 
-    def directions(
-        self, cells: NDArray[np.int64], inside: NDArray[np.float64], frequency: float = np.inf
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def directions(self, cells: Indices, inside: Real, frequency: float = np.inf) -> tuple[Real, Real]:
         """Return the inverse of `places`, ω (n, 3) and λ (n,), of places `inside` cells, both (n, 3).
 
         Many directions of a line grating have the same u and v: of those in the range of the spectrum the one is
@@ -170,20 +168,17 @@ class Layout:
         along = np.sqrt(1 - z**2) / np.maximum(np.hypot(x, y), 1e-12)
         return np.stack([along * x, along * y, z], -1), 1 / (first + nu / (self.slices - 1) * (last - first))
 
-    def fractions(
-        self, cells: NDArray[np.int64], inside: NDArray[np.float64]
-    ) -> list[tuple[NDArray[np.int64], NDArray[np.float64]]]:
+    def fractions(self, cells: Indices, inside: Real) -> list[tuple[Indices, Real]]:
         """Return the whole number below v and that below u, (n,), each with what remains, of a line grating."""
         result = []
         for cell, x in zip(cells.T[1:], inside.T[1:], strict=True):
             square = self.squares_of_cells[cell]
-            start = np.where(square > 0, self.first + (square - 1) * self.cells, 0)
-            f = _fraction((cell - start + x) / np.where(square > 0, self.cells, self.first))
-            result.append((square, np.clip(f, LEAST, 1 - LEAST)))
+            start, count = self._span(square)
+            result.append((square, np.clip(((cell - start + x) / count) ** 2, LEAST, 1 - LEAST)))
         return result
 
     @property
-    def squares_of_cells(self) -> NDArray[np.int64]:
+    def squares_of_cells(self) -> Indices:
         """The unit square of each cell along u or v."""
         return np.repeat(np.arange(self.squares), [self.first] + [self.cells] * (self.squares - 1))
 
@@ -192,11 +187,11 @@ class Layout:
         """Cells along slices, v and u."""
         return max(self.slices - 1, 1), *self.shape[1:3]
 
-    def cells_of(self, *places: NDArray[np.float64]) -> tuple[NDArray[np.int64], ...]:
+    def cells_of(self, *places: Real) -> tuple[Indices, ...]:
         """Return the cells of places (slice, row, column), as an index of the first three axes of `shape`."""
         return tuple(np.clip(x.astype(np.int64), 0, n - 1) for x, n in zip(places, self.cell_counts, strict=True))
 
-    def lowered(self, e: NDArray[np.float64], share: NDArray[np.float64]) -> NDArray[np.float64]:
+    def lowered(self, e: Real, share: Real) -> Real:
         """Return e at corners (..., *shape) times a share of each cell, (..., slices − 1 or 1, rows, columns)."""
         if not self.lines:
             # Two cells share a slice.
@@ -204,7 +199,7 @@ class Layout:
             share = np.minimum(share[..., np.r_[0, :n], :, :], share[..., np.r_[:n, n - 1], :, :])
         return e * share[..., None]
 
-    def random_places(self, count: int, seed: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def random_places(self, count: int, seed: int) -> tuple[Real, Real]:
         """Return `count` directions (n, 3), two thirds of them beyond 60°, one beyond 85°, and λ in µm, (n,)."""
         rng = np.random.default_rng(seed)
         theta = np.deg2rad(rng.uniform(rng.choice([0, 60, 85], count), 89.9))
@@ -213,20 +208,15 @@ class Layout:
         omega = np.stack([y, x, np.cos(theta)] if self.turned else [x, y, np.cos(theta)], -1)
         return omega, rng.uniform(1 / self.frequencies[1], 1 / self.frequencies[0], count)
 
-    def _place(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _place(self, u: Real) -> Real:
         square = np.minimum(np.floor(u), self.squares - 1)
-        start = np.where(square > 0, self.first + (square - 1) * self.cells, 0)
-        return start + _equidistant(u - square) * np.where(square > 0, self.cells, self.first)
+        start, count = self._span(square)
+        return start + np.sqrt(np.clip(u - square, 0, 1)) * count
 
-
-def _equidistant(f: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return √f; below 0 and above 1, of the nearest."""
-    return np.sqrt(np.clip(f, 0, 1))
-
-
-def _fraction(h: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the inverse of `_equidistant`."""
-    return h**2
+    def _span(self, square: NDArray) -> tuple[NDArray, NDArray]:
+        """Return the first cell of a unit square, and how many it has."""
+        inner = square > 0
+        return np.where(inner, self.first + (square - 1) * self.cells, 0), np.where(inner, self.cells, self.first)
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,7 +250,7 @@ class EnergyTable:
     ) -> EnergyTable:
         """Make the table of `spectrum`, with its heights scaled by `height_scale`; it has the first of `layouts`."""
         furnace = Furnace.of(spectrum, height_scale)
-        return cls._of_side(spectrum, furnace, layouts[0] if layouts else Layout.of(spectrum, furnace))[0]
+        return cls._of_side(furnace, layouts[0] if layouts else Layout.of(furnace))[0]
 
     @classmethod
     def of_interface(
@@ -279,12 +269,12 @@ class EnergyTable:
             layouts: of both sides; those of `Layout.of` if there are none.
         """
         furnaces = [Furnace.of(spectrum, height_scale, index, side) for side in (1, -1)]
-        layouts = layouts or [Layout.of(spectrum, furnace) for furnace in furnaces]
+        layouts = layouts or [Layout.of(furnace) for furnace in furnaces]
         pairs = zip(furnaces, layouts, strict=True)
-        return [table for furnace, layout in pairs for table in cls._of_side(spectrum, furnace, layout)]
+        return [table for furnace, layout in pairs for table in cls._of_side(furnace, layout)]
 
     @classmethod
-    def _of_side(cls, spectrum: PowerSpectrum, furnace: Furnace, layout: Layout) -> list[EnergyTable]:
+    def _of_side(cls, furnace: Furnace, layout: Layout) -> list[EnergyTable]:
         """Make the tables of one side: e at the corners of cells, lowered where an albedo at random places exceeds one.
 
         Where the furnace is not exact, the albedo of the spectrum itself counts, too: first cells about such places are
@@ -304,10 +294,10 @@ class EnergyTable:
             lower = 1 / np.maximum(highest, 1)
             if not exact:
                 tried = np.flatnonzero(highest > TIGHT)[:count]
-                albedo = furnace.albedo_of_nodes(spectrum, omega[tried], lengths[tried], bounds, pairs=False)
+                albedo = furnace.albedo_of_nodes(omega[tried], lengths[tried], bounds, pairs=False)
                 tried = tried[albedo > 1]
                 # Of two estimates the smaller: what both exceed by more than `SLACK` is no noise.
-                both = [furnace.albedo_of_nodes(spectrum, omega[tried], lengths[tried], bounds, k) for k in (0, 1)]
+                both = [furnace.albedo_of_nodes(omega[tried], lengths[tried], bounds, k) for k in (0, 1)]
                 # Beyond what the furnace finds, unless phases turn: by that the cell itself is lowered.
                 albedo = np.minimum(*both) / (1 + SLACK) * (1.0 if furnace.turning else lower[tried])
                 np.minimum.at(share, tuple(of[tried] for of in cells), 1 / np.maximum(albedo, 1))
@@ -323,7 +313,7 @@ class EnergyTable:
         return [cls.packed(layout, *of) for of in zip(e, losses, strict=True)]
 
     @classmethod
-    def packed(cls, layout: Layout, e: NDArray[np.float64], loss: tuple[float, float] = (0.0, 0.0)) -> EnergyTable:
+    def packed(cls, layout: Layout, e: Real, loss: tuple[float, float] = (0.0, 0.0)) -> EnergyTable:
         """Round e at the corners of cells to bytes, so that it exceeds the numbers by no more than `SLACK`."""
         least = min(float(e.min()), 1.0)
         steps = np.floor(np.minimum((e * (1 + SLACK) - least) / (LARGEST - least), 1) * 255)
@@ -334,7 +324,7 @@ class EnergyTable:
         """Return whether some direction would reflect more than it receives."""
         return self.least < 1
 
-    def at(self, directions: NDArray[np.float64], wavelengths: ArrayLike) -> NDArray[np.float64]:
+    def at(self, directions: Real, wavelengths: ArrayLike) -> Real:
         """Return e(ω, λ) as the renderer has it, (n,), for ω (n, 3) along the pattern's axes and λ in µm."""
         slices, rows, columns = places = self.layout.places(directions, wavelengths)
         below, row, column = self.layout.cells_of(*places)
@@ -424,7 +414,7 @@ def between(below: EnergyTable, middle: EnergyTable, above: EnergyTable) -> Ener
     return EnergyTable.packed(middle.layout, e / (1 + SLACK), loss)
 
 
-def bounds_of(albedo: NDArray[np.float64], index: float | None) -> NDArray[np.float64]:
+def bounds_of(albedo: Real, index: float | None) -> Real:
     """Return e from what the furnace finds.
 
     Reflected light alone has e = 1/max(1, a). Of an interface transmitted light comes first, as scalar theory sends all
@@ -447,7 +437,7 @@ def bounds_of(albedo: NDArray[np.float64], index: float | None) -> NDArray[np.fl
     return np.stack([np.minimum(1, (1 - e_t * t) / np.maximum(r, 1e-9)), e_t])
 
 
-def corners(furnace: Furnace, layout: Layout) -> NDArray[np.float64]:
+def corners(furnace: Furnace, layout: Layout) -> Real:
     """Compute e at the corners of all cells, a lower bound of `bounds_of` between them.
 
     Returns:
@@ -455,14 +445,14 @@ def corners(furnace: Furnace, layout: Layout) -> NDArray[np.float64]:
     """
     slices, side = layout.shape[:2]
 
-    def bound(cells: NDArray[np.int64], inside: NDArray[np.float64]) -> NDArray[np.float64]:
+    def bound(cells: Indices, inside: Real) -> Real:
         omega, lengths = layout.directions(cells, inside)
         a = furnace.albedo(omega, lengths)
         if layout.lines:
             # Lobes are 1/c as wide, which matters where one reaches the horizon or phases turn within it.
             c = np.sqrt(1 - omega[:, 0 if layout.turned else 1] ** 2)
             least = np.min([f for _, f in layout.fractions(cells, inside)], axis=0)
-            near = (c < 1) & (furnace.turning | (c * least < NEAR * furnace.lobe_width * layout.period))
+            near = (c < 1) & (furnace.turning | (c * least < NEAR * furnace.spectrum.lobe_width * layout.period))
             # Phases turn least within the narrowest lobes.
             for frequency in (layout.frequencies[0], 0.0)[: 1 + furnace.turning if near.any() else 0]:
                 omega, lengths = layout.directions(cells[near], inside[near], frequency)
@@ -487,7 +477,7 @@ def corners(furnace: Furnace, layout: Layout) -> NDArray[np.float64]:
     e = np.stack([at[..., start[:, None] + j, start + i] for j, i in np.ndindex(2, 2)], -1)
     lowered = np.ones((len(e), *layout.cell_counts))
     # The middle of all cells, and more places in those that are steep.
-    deep, emerging = furnace.max_kappa * furnace.height_range * BLUR > 1, furnace.by_order and not layout.lines
+    deep, emerging = furnace.spectrum.max_kappa * furnace.depth * BLUR > 1, furnace.by_order and not layout.lines
     least = 3 if layout.lines else 8 if emerging and deep and furnace.index is None else 1
     some, rounds, index = reached, 1, 0
     while index < rounds:
@@ -513,5 +503,5 @@ def corners(furnace: Furnace, layout: Layout) -> NDArray[np.float64]:
     return np.maximum(e, 0)
 
 
-def _bilinear(x: NDArray[np.float64] | np.float64, y: NDArray[np.float64] | np.float64) -> NDArray[np.float64]:
+def _bilinear(x: Real | np.float64, y: Real | np.float64) -> Real:
     return np.stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y], -1)
