@@ -203,14 +203,14 @@ class _Surface:
         square: float,
         lights: Iterable[tuple[float, complex]],
         finer: int = 0,
-        fields: Callable[[Grating, float, complex, bool], HalfSpace] | None = None,
+        fields: Callable[[Grating, float, complex, bool], HalfSpace] = half_space,
     ) -> list[Scattered]:
         """Solve for light of all orders from either side, for each (ν², γ'²); α of order 0 and γ² in (2π/T)².
 
         The harmonics, those of `gratings[finer]`, are raised where R + T is not one within the tolerance, or where R is
-        above one if the material absorbs. `fields` is `fields_of`, or what remembers its results.
+        above one if the material absorbs. `fields` may remember results of `half_space`.
         """
-        lights, fields = list(lights), fields or fields_of
+        lights = list(lights)
         for grating in self.gratings[finer:]:
             found, excess = [], 0.0
             above = fields(grating, alpha, square, True)
@@ -314,10 +314,8 @@ class _Build:
         )
         self.shares = [np.clip(shares, _OFF, 1 - _OFF) for shares in shares_at(steps)]
         self.jobs = [(share, cells) for share in self.shares[0] / 2 for cells in self.axes.blocks]
-        self.fields = None
-        if self.passes:
-            # Those of two a: one thread may be ahead.
-            self.fields = functools.lru_cache(maxsize=2 * int(np.dot(self.axes.starts.shape, steps[1:])))(fields_of)
+        # Those of two a: one thread may be ahead.
+        self.fields = functools.lru_cache(maxsize=2 * int(np.dot(self.axes.starts.shape, steps[1:])))(half_space)
 
     def table(self, progress: Progress, checkpoints: Path | None) -> tuple[NDArray[np.float32], Any]:
         """Return `values` and `mueller` of `RigorousSpectrum`."""
@@ -420,11 +418,6 @@ class _Build:
             count = found.shape[0] ** 2
             matrices[row : row + count] = (np.round(found / _ROUNDED) * _ROUNDED).reshape(count, *matrices.shape[1:])
         return np.ascontiguousarray(matrices[..., 0, 0]), matrices if entries == 4 else None
-
-
-def fields_of(grating: Grating, alpha: float, gamma2: complex, upwards: bool) -> HalfSpace:
-    """Return `half_space` for α of order 0."""
-    return half_space(grating, alpha + grating.n, gamma2, upwards)
 
 
 def _inside(cell: int, a: float, share: float, least: float) -> float:

@@ -189,10 +189,9 @@ class Grating:
         basis = ztrsen(first, triangle, basis, job="N", lwork=1)[1][:, :count]
         return basis[:n], basis[n:] * unit
 
-    def rayleigh(self, alpha: Real, orders: NDArray[np.int64], beta: Real) -> tuple[tuple[Complex, Complex], ...]:
+    def rayleigh(self, alpha_0: float, orders: NDArray[np.int64], beta: Real) -> tuple[tuple[Complex, Complex], ...]:
         """Return ψ and −iG of the plane waves e^{i(α_m x ± β z)} along the curve, (n, orders) each; + and −."""
         # Without e^{iα_0 t}, which all harmonics share.
-        alpha_0 = alpha[self.harmonics]
         along_x = np.exp(1j * (alpha_0 * (self.x - self.t) + orders[:, None] * self.x))
         along_z = np.exp(1j * beta[:, None] * self.z)
         cos, sin = np.cos(self.tilt), np.sin(self.tilt)
@@ -228,20 +227,21 @@ class HalfSpace:
     rise: Complex
 
 
-def half_space(grating: Grating, alpha: Real, gamma2: complex, upwards: bool) -> HalfSpace:
+def half_space(grating: Grating, alpha_0: float, gamma2: complex, upwards: bool) -> HalfSpace:
     """Return the fields with ∇²ψ + γ²ψ = 0 above a curve, or below it.
 
     Args:
-        alpha: α_m of all harmonics, (n,).
+        alpha_0: α of order 0.
         gamma2: γ², of positive imaginary part or real.
         upwards: whether outgoing is up.
     """
+    alpha = alpha_0 + grating.n
     square = gamma2 - alpha**2
     propagates = (square.real > 0) & (np.imag(gamma2) == 0)
     orders, beta = grating.n[propagates], np.sqrt(square[propagates].real)
     # Of the solutions without loss, 2p travel; the others are pairs, one of which is bounded on this side.
     modes = grating.bounded(alpha, gamma2, upwards, len(alpha) - len(orders))
-    up, down = grating.rayleigh(alpha, orders, beta)
+    up, down = grating.rayleigh(alpha_0, orders, beta)
     outgoing, incoming = (up, down) if upwards else (down, up)
     psi, flux = (np.hstack(both) for both in zip(outgoing, modes, strict=True))
     factors = lu_factor(psi, check_finite=False)
@@ -264,7 +264,7 @@ class Scattered:
     field lies along the grooves as far as it can, comes before its orthogonal.
 
     Attributes:
-        orders: n of the orders that propagate above, (p,), and below, (r,); their α is α_0 + n.
+        orders: n of the orders that propagate above, (p,), and below, (r,).
         amplitudes: amplitudes[i][o] of light that comes in on side i and leaves on side o, (orders of o, 2, orders of
             i, 2), [order, polarisation, incident order, its polarisation], so scaled that |·|² is a share of the
             incident power.
@@ -289,11 +289,6 @@ class Scattered:
         """Return |·|² of amplitudes [order, polarisation, …, its polarisation]; negative where odd, k_y imaginary."""
         powers = np.abs(amplitudes) ** 2
         return powers * _EVEN[:, None] if np.imag(self.k_y) else powers
-
-    def of_light(self, order: int, side: int) -> tuple[Complex, Complex]:
-        """Return the orders above and below, (p, 2, 2) and (r, 2, 2), of light of this order from one side."""
-        j = int(np.flatnonzero(self.orders[side] == order)[0])
-        return tuple(block[:, :, j] for block in self.amplitudes[side])
 
 
 def scatter(alpha: Real, above: HalfSpace, below: HalfSpace, k_y: complex, index: complex) -> Scattered:

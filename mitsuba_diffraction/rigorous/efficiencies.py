@@ -258,8 +258,10 @@ def solve(curve: Curve, omega: Real, k_0: float, index: complex, harmonics: int)
         # Orders count along the change of k_x there, and along q = −(ω_i + ω_o)_∥/λ here.
         return (of_orders.transpose(0, 2, 1) @ amplitudes @ light)[::-1]
 
-    of_sides = solved.of_light(0, side)
-    amplitudes, transmitted = (inframes(solved.orders[to], of_sides[to], to) for to in (side, 1 - side))
+    order_0 = solved.orders[side].tolist().index(0)
+    amplitudes, transmitted = (
+        inframes(solved.orders[to], solved.amplitudes[side][to][:, :, order_0], to) for to in (side, 1 - side)
+    )
     return Efficiencies(
         orders=-solved.orders[side][::-1],
         amplitudes=amplitudes,
@@ -276,10 +278,9 @@ def scattered(curve: Curve, omega: Real, k_0: float, index: complex, harmonics: 
     """Solve for light from ω_i and of all orders that it is diffracted into."""
     grating = Grating(curve, harmonics)
     alpha, k_y = -omega[:2] * k_0 * (1 if omega[2] > 0 else index.real)
-    alphas = alpha + grating.n
-    above = half_space(grating, alphas, k_0**2 - k_y**2, True)
+    above = half_space(grating, alpha, k_0**2 - k_y**2, True)
     square = k_0**2 * (index.real**2 if index.imag == 0 else index**2) - k_y**2
-    return scatter(alphas, above, half_space(grating, alphas, square, False), k_y, index)
+    return scatter(alpha + grating.n, above, half_space(grating, alpha, square, False), k_y, index)
 
 
 def sheet_orders(curve: Curve, omega: Real, k_0: float, index: float, harmonics: int) -> tuple[NDArray[np.int64], Real]:

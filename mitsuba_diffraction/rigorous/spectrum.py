@@ -39,7 +39,7 @@ _NUMBERS = {
     "max_error_near": "worstNear",
     "polarisation_error": "polarisationError",
 }
-_TEXTS = ("material", "source", "source_digest")
+_TEXTS = {"material": "material", "source": "source", "source_digest": "sourceDigest"}
 _STEPS = ("stepsF", "stepsX", "stepsZ")
 
 
@@ -450,7 +450,7 @@ class RigorousSpectrum:
             "intIor": doubles(index.real, index.imag),
             **{key: doubles(getattr(self, name)) for name, key in _NUMBERS.items()},
             "transmission": self.transmission,
-            **{_camel(name): getattr(self, name) for name in _TEXTS},
+            **{key: getattr(self, name) for name, key in _TEXTS.items()},
             "units": "lengths and wavelengths in micrometres",
         }
         write(path, FORMAT, FORMAT_VERSION, header, arrays, recipe)
@@ -480,7 +480,7 @@ class RigorousSpectrum:
                 int_ior=complex(*(float(x) for x in header["intIor"])),
                 harmonics=header["harmonics"],
                 **{name: header[key].item() for name, key in _NUMBERS.items()},
-                **{name: header[_camel(name)] for name in _TEXTS},
+                **{name: header[key] for name, key in _TEXTS.items()},
             )
         except KeyError as error:
             raise RequestError(f"{path}: a damaged spectrum, {error} is missing") from None
@@ -496,8 +496,3 @@ def _split(x: Real, steps: int) -> tuple[NDArray[np.int64], Real]:
 
 def _channel(i: int, j: int) -> str:
     return f"m({i}{j})"
-
-
-def _camel(name: str) -> str:
-    first, *others = name.split("_")
-    return first + "".join(word.capitalize() for word in others)
