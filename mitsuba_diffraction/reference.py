@@ -16,6 +16,8 @@ from .settings import SUN_COHERENCE_LENGTH, Settings, lobe_width, matching
 from .spectrum.sample import UNIFORM, WindowAxis, effective_coherence_length, window_axes
 from .surface.heightfield import HeightField
 
+Real = NDArray[np.float64]
+
 _FAR = 9.0  # standard deviations; e^{−9²/2} is under 3e-18
 CHUNK = 2**20  # complex numbers in one intermediate array, 16 MiB
 
@@ -29,7 +31,7 @@ def amplitudes(height_field: HeightField, kappa: float) -> NDArray[np.complex128
     return scipy.fft.fft2(np.exp(1j * kappa * height_field.centred), norm="forward")
 
 
-def order_powers(height_field: HeightField, kappa: float) -> NDArray[np.float64]:
+def order_powers(height_field: HeightField, kappa: float) -> Real:
     """Compute η_m(κ) = |F_m|², the fraction of the reflected power in each order; layout as `amplitudes`."""
     return np.abs(amplitudes(height_field, kappa)) ** 2
 
@@ -41,7 +43,7 @@ def power_spectrum(
     *,
     extent: str = "tile",
     coherence_length: float = SUN_COHERENCE_LENGTH,
-) -> NDArray[np.float64]:
+) -> Real:
     """Compute S(q; κ), the power reflected by a patch per unit area of the frequency plane.
 
     A "tile" is periodic and has a line spectrum:
@@ -80,9 +82,7 @@ def power_spectrum(
     return evaluate(height_field, q.reshape(-1, 2), kappa.ravel(), coherence_length).reshape(kappa.shape)
 
 
-def _tile_spectrum(
-    height_field: HeightField, q: NDArray[np.float64], kappa: NDArray[np.float64], coherence_length: float
-) -> NDArray[np.float64]:
+def _tile_spectrum(height_field: HeightField, q: Real, kappa: Real, coherence_length: float) -> Real:
     """Compute Σ_m η_m(κ) N(q − m/T; σ_q² I) for q (M, 2) and κ (M,): (M,) µm²."""
     sigma = lobe_width(coherence_length)
     result = np.zeros(kappa.shape)
@@ -105,9 +105,7 @@ def _tile_spectrum(
     return result
 
 
-def _sample_spectrum(
-    height_field: HeightField, q: NDArray[np.float64], kappa: NDArray[np.float64], coherence_length: float
-) -> NDArray[np.float64]:
+def _sample_spectrum(height_field: HeightField, q: Real, kappa: Real, coherence_length: float) -> Real:
     """Compute Welch's estimate of S for q (M, 2) and κ (M,): (M,) µm²."""
     effective = effective_coherence_length(height_field, coherence_length)
     windows = window_axes(height_field, effective)
@@ -120,12 +118,7 @@ def _sample_spectrum(
     return result
 
 
-def mean_periodograms(
-    height_field: HeightField,
-    q: NDArray[np.float64],
-    kappa: NDArray[np.float64],
-    axes: tuple[WindowAxis, ...],
-) -> NDArray[np.float64]:
+def mean_periodograms(height_field: HeightField, q: Real, kappa: Real, axes: tuple[WindowAxis, ...]) -> Real:
     """Average |Σ_n a(x_n − x_p) e^{iκh_n} e^{−2πi q·x_n}|² over the places x_p for q (M, 2) and κ (M,): (M,).
 
     Window and wave are separable: first the sums over y, for all columns at once, then those over x.
@@ -150,29 +143,29 @@ def mean_periodograms(
     return result / (len(along_x.starts) * len(along_y.starts))
 
 
-def _waves(q: NDArray[np.float64], count: int, pixel: float) -> NDArray[np.complex128]:
+def _waves(q: Real, count: int, pixel: float) -> NDArray[np.complex128]:
     """Return e^{−2πiqx} at x = 0, d, 2d, …: (M, count) for q (M,)."""
     return np.exp(-2j * np.pi * np.outer(q, np.arange(count) * pixel))
 
 
-def nyquist_density(q: NDArray[np.float64], pixel: float) -> NDArray[np.float64]:
+def nyquist_density(q: Real, pixel: float) -> Real:
     """Return d for |q| ≤ 1/2d, else zero: (M,) µm; integrates to one."""
     # Tolerates rounding of q at the limit itself.
     return np.where(np.abs(q) * 2 * pixel <= 1 + 1e-12, pixel, 0.0)
 
 
-def _gaussian(q: NDArray[np.float64], sigma: float) -> NDArray[np.float64]:
+def _gaussian(q: Real, sigma: float) -> Real:
     """Return N(q; σ²) along one axis, µm."""
     return np.exp(-(q**2) / (2 * sigma**2)) / (np.sqrt(2 * np.pi) * sigma)
 
 
-def _by_kappa(kappa: NDArray[np.float64]) -> Iterator[tuple[float, NDArray[np.int64]]]:
+def _by_kappa(kappa: Real) -> Iterator[tuple[float, NDArray[np.int64]]]:
     """Yield each distinct value in κ (M,), with its indices."""
     for value in np.unique(kappa):
         yield value, np.flatnonzero(kappa == value)
 
 
-def checked(q: ArrayLike, kappa: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def checked(q: ArrayLike, kappa: ArrayLike) -> tuple[Real, Real]:
     """Broadcast q and κ as `matching` does, and raise ValueError unless κ is finite."""
     q, kappa = matching(q, kappa)
     if not np.isfinite(kappa).all():

@@ -329,13 +329,11 @@ class _Build:
         kappas, interpolate = self._between()
         terms = projection @ self._pilot
         weights = series.weights(kappas)
-        error = np.abs(interpolate @ self._pilot).sum(axis=1)
         remainder = interpolate @ self._pilot
         for n in range(series.terms):
-            if error.max() <= allowed:
+            if np.abs(remainder).sum(axis=1).max() <= allowed:
                 return max(n, 1)
             remainder -= np.outer(weights[:, n], terms[n])
-            error = np.abs(remainder).sum(axis=1)
         return series.terms
 
     def _intervals(self, allowed: float, terms: int) -> int:

@@ -114,11 +114,6 @@ class PowerSpectrum:
         return (self.lobes[0].count, self.lobes[1].count) if isinstance(self.grid, OrderGrid) else (3, 3)
 
     @property
-    def words_per_evaluation(self) -> int:
-        """The number of 32-bit words of the table that one evaluation of S reads."""
-        return self.neighbours[0] * self.neighbours[1] * self.table.words_per_node
-
-    @property
     def megabytes(self) -> float:
         """Size of the table in memory."""
         return self.table.nbytes / 1e6

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import mitsuba as mi
+import numpy as np
 from rich.table import Table
 
 from ... import outputs
@@ -161,7 +162,7 @@ def _measured(
     return {
         name: {
             "terms": table.intervals if isinstance(table := spectrum.table, SliceTable) else table.series.terms,
-            "words": spectrum.words_per_evaluation,
+            "words": int(np.prod(spectrum.neighbours)) * table.words_per_node,
             "megabytes": spectrum.megabytes,
             "build_seconds": build_seconds,
             "evaluations": rays.count / taken[name, "evaluate"],
