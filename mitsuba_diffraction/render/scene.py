@@ -97,7 +97,7 @@ def load_spectral_scene(
             raise RequestError(f"{name}: got {size}, wanted a positive number of pixels")
     with _parsed(path, parameters, materials) as (config, state):
         if materials:
-            _warn_of_unused_materials(state, materials)
+            _warn_of_unused_materials(config, state, materials)
         _replace_films(state, width, height)
         _take_radiance_alone(state)
         if motion is not None:
@@ -125,27 +125,17 @@ def warn_of_gratings(scene: mi.Scene) -> None:
     _warn_of_light_from_below(scene)
 
 
-def _warn_of_unused_materials(state: mi.parser.ParserState, materials: Materials) -> None:
+def _warn_of_unused_materials(
+    config: mi.parser.ParserConfig, state: mi.parser.ParserState, materials: Materials
+) -> None:
     """Log a line for each grating that takes the place of a BSDF that nothing in the scene refers to."""
+    mi.parser.transform_resolve(config, state)
     # From all objects of the scene but its BSDFs.
-    used = {k for k in _children(state.root.props).values() if state.nodes[k].type != mi.ObjectType.BSDF}
-    waiting = list(used)
+    waiting = [k for k in _children(state, state.root.props) if state.nodes[k].type != mi.ObjectType.BSDF]
+    used = set()
     while waiting:
-        props = state.nodes[waiting.pop()].props
-        unread = props.unqueried()
-        for _, value in props.items():
-            if isinstance(value, mi.Properties.ResolvedReference):
-                child = value.index()
-            elif isinstance(value, mi.Properties.Reference):
-                child = state.id_to_index.get(value.id())
-            else:
-                continue
-            if child is not None and child not in used:
-                used.add(child)
-                waiting.append(child)
-        # Mitsuba refuses what no plugin reads.
-        for name in unread:
-            props.mark_queried(name, False)
+        used.add(node := waiting.pop())
+        waiting += [child for child in _children(state, state.nodes[node].props) if child not in used]
     for name in materials:
         if state.id_to_index[name] not in used:
             _log.warning("material %s: no shape has the BSDF of that id, and the picture is as without it", name)
@@ -244,15 +234,12 @@ def named_sample_count(path: str | os.PathLike[str], parameters: Mapping[str, st
         ValueError: if the scene is wrong.
     """
     with _parsed(path, parameters) as (_, state):
-        for node in state.nodes:
-            if node.type == mi.ObjectType.Sensor:
-                for child in _children(node.props).values():
-                    props = state.nodes[child].props
-                    if state.nodes[child].type == mi.ObjectType.Sampler and "sample_count" in props:
-                        if (count := props["sample_count"]) < 1:
-                            raise RequestError(f"sample_count: got {count}, wanted a positive number of samples")
-                        return int(count)
-                return None
+        sensor = next((node for node in state.nodes if node.type == mi.ObjectType.Sensor), None)
+        for sampler in _children(state, sensor.props, mi.ObjectType.Sampler) if sensor else ():
+            if (count := state.nodes[sampler].props.get("sample_count")) is not None:
+                if count < 1:
+                    raise RequestError(f"sample_count: got {count}, wanted a positive number of samples")
+                return int(count)
     return None
 
 
@@ -274,7 +261,7 @@ def scene_digest(
         for node in state.nodes:
             content.update(f"{node.props.plugin_name()}\n".encode())
             for name, value in node.props.items():
-                named = Path(str(mi.file_resolver().resolve(value))) if name == "filename" else None
+                named = _resolved(value) if name == "filename" else None
                 if named is None or not named.is_file():
                     content.update(f"{name}={_in_full(value)}\n".encode())
                 elif named.suffix.lower() == ".toml":
@@ -284,6 +271,11 @@ def scene_digest(
                         while block := stream.read(2**24):
                             content.update(block)
     return content.hexdigest()
+
+
+def _resolved(name: object) -> Path:
+    """Return the path of a file that a scene names."""
+    return Path(str(mi.file_resolver().resolve(str(name))))
 
 
 def _in_full(value: object) -> str:
@@ -355,13 +347,8 @@ def files_of_scene(
         ValueError: if the scene or a recipe is wrong.
     """
     with _parsed(path, parameters, materials) as (_, state):
-        texts = [
-            node.props[key]
-            for node in state.nodes
-            for key in node.props.keys()  # noqa: SIM118 (no mapping)
-            if node.props.type(key) == mi.Properties.Type.String
-        ]
-        named = [Path(str(mi.file_resolver().resolve(str(name)))) for name in [*state.files, *texts]]
+        texts = [value for node in state.nodes for _, value in node.props.items() if isinstance(value, str)]
+        named = [_resolved(name) for name in [*state.files, *texts]]
     found = [file for file in named if file.is_file()]
     return [*found, *(scan for file in found if file.suffix.lower() == ".toml" for scan in Recipe.load(file).files)]
 
@@ -372,11 +359,11 @@ def _refuse_missing_files(path: Path, state: mi.parser.ParserState) -> None:
     The message quotes the command that a comment of the scene gives for them: "… made by: python scenes/disc.py".
     """
     for node in state.nodes:
-        name = node.props.get("filename") if "filename" in node.props else None
+        name = node.props.get("filename")
         # The grating tells which spectra there are instead.
         if not isinstance(name, str) or node.props.plugin_name() == "diffraction_grating":
             continue
-        if not Path(str(mi.file_resolver().resolve(name))).is_file():
+        if not _resolved(name).is_file():
             text = path.read_text(encoding="utf-8", errors="replace")
             made = re.search(r"made by:\s+(python \S+\.py(?: && python \S+\.py)*)", text)
             raise RequestError(f"{name}: no such file" + (f"; it is made by: {made[1]}" if made else ""))
@@ -385,10 +372,9 @@ def _refuse_missing_files(path: Path, state: mi.parser.ParserState) -> None:
 def _take_radiance_alone(state: mi.parser.ParserState) -> None:
     """Replace integrators that add other quantities to radiance by the one inside of them."""
     for node in state.nodes:
-        if node.type == mi.ObjectType.Integrator and node.props.plugin_name() in ("aov", "moment"):
-            inner = [state.nodes[child] for child in _children(node.props).values()]
-            if inner := [child for child in inner if child.type == mi.ObjectType.Integrator]:
-                node.props = mi.Properties(inner[0].props)
+        adds_others = node.type == mi.ObjectType.Integrator and node.props.plugin_name() in ("aov", "moment")
+        if adds_others and (inner := list(_children(state, node.props, mi.ObjectType.Integrator))):
+            node.props = mi.Properties(state.nodes[inner[0]].props)
 
 
 def _move_first_sensor(state: mi.parser.ParserState, motion: tuple[float, ...]) -> None:
@@ -411,14 +397,20 @@ def _replace_films(state: mi.parser.ParserState, width: int | None, height: int 
         props = mi.Properties(state.nodes[index].props)
         if kind == mi.ObjectType.Film:
             state.nodes[index].props = _spectral_film(state, props, width, height)
-        elif kind == mi.ObjectType.Sensor and all(kinds[c] != mi.ObjectType.Film for c in _children(props).values()):
+        elif kind == mi.ObjectType.Sensor and not _children(state, props, mi.ObjectType.Film):
             props["film"] = _add(state, mi.ObjectType.Film, _spectral_film(state, mi.Properties(), width, height))
             state.nodes[index].props = props
 
 
-def _children(props: mi.Properties) -> dict[str, int]:
-    """Return name → index in the parser's list of the children of a node."""
-    return {name: value.index() for name, value in props.items() if isinstance(value, mi.Properties.ResolvedReference)}
+def _children(state: mi.parser.ParserState, props: mi.Properties, kind: mi.ObjectType | None = None) -> dict[int, str]:
+    """Return index in the parser's list → name of the children of a node; of one kind, if it is given."""
+    # Of a copy: Mitsuba refuses what no plugin reads, and this counts as reading.
+    references = [
+        (value.index(), name)
+        for name, value in mi.Properties(props).items()
+        if isinstance(value, mi.Properties.ResolvedReference)
+    ]
+    return {index: name for index, name in references if kind in (None, state.nodes[index].type)}
 
 
 def _add(state: mi.parser.ParserState, kind: mi.ObjectType, props: mi.Properties) -> mi.Properties.ResolvedReference:
@@ -464,9 +456,8 @@ def _spectral_film(
         )
     if "sample_border" in old:
         film["sample_border"] = old["sample_border"]
-    for name, index in _children(old).items():
-        if state.nodes[index].type == mi.ObjectType.ReconstructionFilter:
-            film[name] = mi.Properties.ResolvedReference(index)
+    for index, name in _children(state, old, mi.ObjectType.ReconstructionFilter).items():
+        film[name] = mi.Properties.ResolvedReference(index)
     triangle = 1 - np.abs(np.linspace(-1, 1, round(2 * _STEP / _DENSITY_STEP) + 1))
     for number, (centre, weight) in enumerate(zip(channel_wavelengths(), channel_weights(), strict=True)):
         hat = mi.Properties("regular")
