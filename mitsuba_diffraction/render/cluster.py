@@ -124,7 +124,7 @@ def _trace_there(job: Job, index: int) -> NDArray[np.float32]:
 def scene_of(job: Job) -> mi.Scene:
     try:
         scene = job.load()
-        content = scene_digest(job.scene, dict(job.parameters), dict(job.materials))
+        content = scene_digest(job.scene, job.where["parameters"], job.where["materials"])
     except (RequestError, OSError) as error:
         raise RuntimeError(f"a worker cannot load the scene: {error}") from None
     if content != job.content:

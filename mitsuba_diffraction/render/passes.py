@@ -46,15 +46,13 @@ class Accumulation:
     in the order of their indices.
 
     Attributes:
-        wavelengths: (n,) float64, nm.
-        sums: (height, width, n + 1) float64, Σ_p of the results of `trace_pass`.
+        sums: (height, width, n + 1) float64, Σ_p of the results of `trace_pass`, at `channel_wavelengths()`.
         luminance: (height, width) float64, Σ_p n_p y_p.
         squares: (height, width) float64, Σ_p n_p y_p².
         passes: P.
         samples: N = Σ_p n_p.
     """
 
-    wavelengths: NDArray[np.float64]
     sums: NDArray[np.float64]
     luminance: NDArray[np.float64]
     squares: NDArray[np.float64]
@@ -62,19 +60,15 @@ class Accumulation:
     samples: int = 0
 
     @classmethod
-    def empty(cls, rows: int, columns: int, wavelengths: NDArray[np.float64]) -> Accumulation:
+    def empty(cls, rows: int, columns: int) -> Accumulation:
         """Return the sums of zero passes."""
-        return cls(
-            wavelengths,
-            np.zeros((rows, columns, wavelengths.size + 1)),
-            np.zeros((rows, columns)),
-            np.zeros((rows, columns)),
-        )
+        return cls(np.zeros((rows, columns, channel_wavelengths().size + 1)), *np.zeros((2, rows, columns)))
 
     def add(self, traced: NDArray[np.float32], samples: int) -> None:
         """Add the result of `trace_pass` with that many samples per pixel."""
         # einsum adds in a fixed order; a matrix product may be multithreaded.
-        weights = spectrum_to_XYZ(np.eye(self.wavelengths.size), self.wavelengths)[:, 1].astype(np.float32)
+        wavelengths = channel_wavelengths()
+        weights = spectrum_to_XYZ(np.eye(wavelengths.size), wavelengths)[:, 1].astype(np.float32)
         luminance = np.einsum("yxi,i->yx", traced[..., :-1], weights).astype(np.float64)
         luminance = ratio(luminance, traced[..., -1])
         self.sums += traced
@@ -180,7 +174,7 @@ class Job:
 
     Attributes:
         scene: absolute path of the XML file.
-        width, height, parameters, materials, motion: see `load_spectral_scene`.
+        where: width, height, parameters, materials and motion, see `load_spectral_scene`.
         variant: Mitsuba variant.
         seed: random seed.
         samples: samples per pixel of each pass.
@@ -190,11 +184,7 @@ class Job:
     """
 
     scene: str
-    width: int | None
-    height: int | None
-    parameters: tuple[tuple[str, str], ...]
-    materials: tuple[tuple[str, tuple[tuple[str, bool | float | str], ...]], ...]
-    motion: tuple[float, ...] | None
+    where: dict[str, Any]
     variant: str
     seed: int
     samples: tuple[int, ...]
@@ -207,12 +197,12 @@ class Job:
         told = {name: value for name, value in asdict(self).items() if name != "scene"}
         return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
 
+    def __hash__(self) -> int:
+        return hash(self.digest())
+
     def load(self) -> mi.Scene:
         """Load the scene; errors as of `load_spectral_scene`."""
-        where = {"width": self.width, "height": self.height, "motion": self.motion}
-        return load_spectral_scene(
-            self.scene, **where, parameters=dict(self.parameters), materials=dict(self.materials)
-        )
+        return load_spectral_scene(self.scene, **self.where)
 
 
 # Yields the passes `first`, `first` + 1, … of a job in order; see `trace_here`.
@@ -296,8 +286,9 @@ def render(
         Interrupted: at the end of the current pass on the first Ctrl-C, with the picture so far, after a checkpoint.
         KeyboardInterrupt: at once on the second Ctrl-C, or if no pass has been completed.
     """
-    content = {"parameters": dict(parameters or {}), "materials": dict(materials or {})}
-    job, scene = _job(scene_path, spp, seed, until_error, {"width": width, "height": height, "motion": motion}, content)
+    where = {"width": width, "height": height, "motion": motion}
+    where |= {"parameters": parameters or {}, "materials": materials or {}}
+    job, scene = _job(scene_path, where, spp, seed, until_error)
     if finished is not None and finished.attributes.get("digest") == job.digest():
         return finished
 
@@ -324,12 +315,7 @@ def render(
 
 
 def _job(
-    scene_path: str | os.PathLike[str],
-    spp: int,
-    seed: int,
-    until_error: float | None,
-    view: dict[str, Any],
-    content: dict[str, Any],
+    scene_path: str | os.PathLike[str], where: dict[str, Any], spp: int, seed: int, until_error: float | None
 ) -> tuple[Job, mi.Scene]:
     """Check the arguments of `render`; return its job and the scene."""
     if spp < 1:
@@ -338,7 +324,7 @@ def _job(
         raise RequestError(f"seed: got {seed}, wanted an integer that is not negative")
     if until_error is not None and not 0 < until_error < 1:
         raise RequestError(f"until_error: got {until_error}, wanted a relative error between 0 and 1, such as 0.01")
-    scene = load_spectral_scene(scene_path, **view, **content)
+    scene = load_spectral_scene(scene_path, **where)
     warn_of_gratings(scene)
     sampler = scene.sensors()[0].sampler()
     if takes_mitsubas_film(scene.integrator()) and not is_independent(sampler):
@@ -349,14 +335,12 @@ def _job(
         )
     job = Job(
         scene=str(Path(scene_path).resolve()),
-        **view,
-        parameters=tuple(sorted(content["parameters"].items())),
-        materials=tuple(sorted((name, tuple(values.items())) for name, values in content["materials"].items())),
+        where=where,
         variant=mi.variant(),
         seed=seed,
         samples=split(scene, spp, 1 if until_error is None else _LEAST_PASSES_TO_CONVERGE),
         until_error=until_error,
-        content=scene_digest(scene_path, **content),
+        content=scene_digest(scene_path, where["parameters"], where["materials"]),
         versions=versions(),
     )
     return job, scene
@@ -367,7 +351,7 @@ def _sums_so_far(checkpoint: str | os.PathLike[str] | None, job: Job, scene: mi.
     if checkpoint is not None and (sums := load_checkpoint(checkpoint, job.digest())) is not None:
         return sums
     columns, rows = (int(size) for size in scene.sensors()[0].film().crop_size())
-    return Accumulation.empty(rows, columns, channel_wavelengths())
+    return Accumulation.empty(rows, columns)
 
 
 def _image(sums: Accumulation, job: Job, scene: str, complete: bool) -> SpectralImage:
@@ -377,7 +361,7 @@ def _image(sums: Accumulation, job: Job, scene: str, complete: bool) -> Spectral
         attributes["error"] = sums.error()
     if complete:
         attributes["digest"] = job.digest()
-    return SpectralImage(sums.wavelengths, sums.radiance(), attributes)
+    return SpectralImage(channel_wavelengths(), sums.radiance(), attributes)
 
 
 def split(scene: mi.Scene, spp: int, least: int = 1) -> tuple[int, ...]:

@@ -86,7 +86,7 @@ def test_error_is_the_scatter_of_whole_pictures():
     wavelengths = channel_wavelengths()
     scatter = rng.uniform(0.2, 2.0, (40, 50))
     scatter[3:5] = 50.0  # some pixels never converge, and do not decide
-    sums = Accumulation.empty(40, 50, wavelengths)
+    sums = Accumulation.empty(40, 50)
     assert np.isnan(sums.error())
     for number in range(400):
         samples = 2 + number % 3
@@ -260,7 +260,7 @@ def test_the_digest_depends_on_the_content_of_a_scene_and_its_files(tmp_path):
 
 @pytest.mark.parametrize("damage", ["cut", "changed", "encrypted", "text", "empty", "other", "incomplete", "edited"])
 def test_damaged_checkpoints_are_refused(damage):
-    sums = Accumulation.empty(3, 4, channel_wavelengths())
+    sums = Accumulation.empty(3, 4)
     save_checkpoint("c", "abc", sums)
     assert load_checkpoint("c", "abc").samples == 0
     whole = Path("c").read_bytes()
@@ -458,7 +458,7 @@ def test_a_folder_that_cannot_be_written_to_is_refused_before_the_work(command, 
 
 
 def test_a_checkpoint_is_the_old_one_until_the_new_one_is_whole(monkeypatch):
-    sums = Accumulation.empty(3, 4, channel_wavelengths())
+    sums = Accumulation.empty(3, 4)
     save_checkpoint("c", "first", sums)
     whole = Path("c").read_bytes()
 

@@ -233,17 +233,17 @@ class Pictures:
         rows, columns = self.surface.shape
         passes = split(self.scene, samples, 2 if halves else 1)
         trace_pass(self.scene, 1, self.seed, integrator)  # compiles the kernels
-        sums = Accumulation.empty(rows, columns, channel_wavelengths())
+        sums = Accumulation.empty(rows, columns)
         pair = np.zeros((2, rows, columns, 4))  # sums of XYZ and of the filter, of every other pass
         begin = time.perf_counter()
         for index, some in enumerate(passes):
             traced = trace_pass(self.scene, some, pass_seed(self.seed, index), integrator)
             sums.add(traced, some)
-            pair[index % 2, ..., :3] += spectrum_to_XYZ(traced[..., :-1], sums.wavelengths)
+            pair[index % 2, ..., :3] += spectrum_to_XYZ(traced[..., :-1], channel_wavelengths())
             pair[index % 2, ..., 3] += traced[..., -1]
             progress(sums.samples, sum(passes))
         seconds = time.perf_counter() - begin
-        image = SpectralImage(sums.wavelengths, sums.radiance())
+        image = SpectralImage(channel_wavelengths(), sums.radiance())
         in_halves = ratio(pair[..., :3], pair[..., 3:]) if halves and len(passes) > 1 else None
         return Picture(image, sums.samples, seconds, in_halves)
 
