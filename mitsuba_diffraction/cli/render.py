@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import time
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -65,6 +64,7 @@ def render(
     dask: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="distribute the passes over a Dask cluster (tcp://HOST:PORT)")
     ] = None,
+    # At most a tenth of a degree apart, five minutes.
     frames: Annotated[int | None, typer.Option(min=2, max=3600, metavar="N", help="frames of an orbit")] = None,
     orbit: Annotated[bool, typer.Option("--orbit", help="orbit the scene once")] = False,
     overwrite: Overwrite = False,
@@ -99,15 +99,23 @@ def render(
     motions = [None] if frames is None else motions_of_orbit(scene, frames, **where)
     where |= {"width": width, "height": height}
     request = {"spp": spp, "seed": seed, "until_error": until_error, "seconds": checkpoint, "tracer": tracer}
-    rendering = _Rendering(scene, where, request, resume, half, denoise)
-    exposure = None
-    for number, (path, motion) in enumerate(zip(_pictures(target, frames), motions, strict=True)):
-        label = scene.name if frames is None else f"{scene.name} {number + 1}/{frames}"
-        complete = f"{number} of {frames} pictures are complete" if number else None
-        exposure = rendering.picture(path, motion, label, exposure, complete)
+    pictures, exposure = _pictures(target, frames), None
+    for number, (path, motion) in enumerate(zip(pictures, motions, strict=True)):
+        exposure = _picture(
+            scene,
+            path,
+            {**where, "motion": motion},
+            request,
+            resume=resume,
+            half=half,
+            denoise=denoise,
+            label=scene.name if frames is None else f"{scene.name} {number + 1}/{frames}",
+            exposure=exposure,
+            complete=f"{number} of {frames} pictures are complete" if number else None,
+        )
     if frames is not None:
         animation = target.with_suffix(".webp")
-        save_animation([path.with_suffix(".png") for path in _pictures(target, frames)], animation)
+        save_animation([path.with_suffix(".png") for path in pictures], animation)
         tell(f"{animation}: animated preview, {frames} frames")
 
 
@@ -126,10 +134,11 @@ def _denoises(scene: Path) -> bool:
 
 
 def _pictures(target: Path, frames: int | None) -> list[Path]:
-    """Return the paths of the spectral pictures: `target`, or those of its frames."""
-    from ..render.turntable import frame_path
-
-    return [target] if frames is None else [frame_path(target, frame, frames) for frame in range(frames)]
+    """Return the paths of the spectral pictures: `target`, or those of its frames, `target_007.exr`."""
+    if frames is None:
+        return [target]
+    digits = max(3, len(str(frames - 1)))
+    return [target.with_name(f"{target.stem}_{frame:0{digits}d}{target.suffix}") for frame in range(frames)]
 
 
 def _written(target: Path, frames: int | None) -> list[Path]:
@@ -138,77 +147,65 @@ def _written(target: Path, frames: int | None) -> list[Path]:
     return [*pictures, *(p.with_suffix(".png") for p in pictures), *([target.with_suffix(".webp")] if frames else [])]
 
 
-@dataclass(frozen=True)
-class _Rendering:
-    """What the pictures of one command have in common.
+def _picture(
+    scene: Path,
+    path: Path,
+    where: dict[str, Any],
+    request: dict[str, Any],
+    *,
+    resume: bool,
+    half: bool,
+    denoise: bool,
+    label: str,
+    exposure: float | None,
+    complete: str | None,
+) -> float:
+    """Render, save and report one picture; return the exposure of its preview, which None leaves to be chosen.
 
-    Attributes:
-        scene: the XML file.
-        where: its parameters, materials and size, for `load_spectral_scene`.
+    Args:
+        where: parameters, materials, size and motion, for `load_spectral_scene`.
         request: the other arguments of `passes.render`.
-        resume, half, denoise: the options of the command.
+        complete: which pictures there are already, should Ctrl-C interrupt this one.
     """
+    from ..render.denoise import guides
+    from ..render.passes import Interrupted, checkpoint_path
+    from ..render.passes import render as trace
+    from ..render.scene import load_spectral_scene
+    from ..render.spectral_image import SpectralImage, save_preview
 
-    scene: Path
-    where: dict[str, Any]
-    request: dict[str, Any]
-    resume: bool
-    half: bool
-    denoise: bool
-
-    def picture(
-        self,
-        path: Path,
-        motion: tuple[float, ...] | None,
-        label: str,
-        exposure: float | None,
-        complete: str | None,
-    ) -> float:
-        """Render, save and report one picture; return the exposure of its preview, which None leaves to be chosen.
-
-        `complete` says which pictures there are already, should Ctrl-C interrupt this one.
-        """
-        from ..render.denoise import guides
-        from ..render.passes import Interrupted, checkpoint_path
-        from ..render.passes import render as trace
-        from ..render.scene import load_spectral_scene
-        from ..render.spectral_image import SpectralImage, save_preview
-
-        start = time.perf_counter()
-        where = {**self.where, "motion": motion}
-        waiting, preview = checkpoint_path(path), path.with_suffix(".png")
-        earlier = SpectralImage.load(path) if self.resume and path.is_file() and not waiting.exists() else None
-        guide = guides(load_spectral_scene(self.scene, **where)) if self.denoise else None
-        interrupted = False
-        try:
-            with progress_bar(label, "spp", "loading and compiling") as progress:
-                options = {**where, **self.request, "checkpoint": waiting, "finished": earlier}
-                image = trace(self.scene, **options, progress=progress)
-        except Interrupted as error:
-            image, interrupted = error.image, True
-        except KeyboardInterrupt:
-            if waiting.exists():
-                complete = f"{waiting} holds the samples so far"
-            if complete is None:
-                raise
-            raise Stopped(f"{complete}; the same command with --resume continues") from None
-        try:
-            if image is not earlier:
-                image.save(path, half=self.half)
-            exposure = save_preview(image, preview, exposure, guide)
-        except (OSError, RuntimeError) as error:
-            kept = f"; {waiting} is kept, and --resume continues from it" if waiting.exists() else ""
-            raise RuntimeError(f"{path} or its preview cannot be written ({error}){kept}") from error
-        if interrupted:
-            spp = image.attributes["spp"]
-            raise Stopped(f"{path} holds {spp} samples per pixel; the same command with --resume continues")
-        waiting.unlink(missing_ok=True)
-        tell(
-            f"{path}: {_summary(image, self.request['until_error'])}, "
-            f"{time.perf_counter() - start:.1f} s, {path.stat().st_size / 1e6:.3g} MB\n"
-            f"{preview}: preview, radiance times {exposure:.4g} (exposure)"
-        )
-        return exposure
+    start = time.perf_counter()
+    waiting, preview = checkpoint_path(path), path.with_suffix(".png")
+    earlier = SpectralImage.load(path) if resume and path.is_file() and not waiting.exists() else None
+    guide = guides(load_spectral_scene(scene, **where)) if denoise else None
+    interrupted = False
+    try:
+        with progress_bar(label, "spp", "loading and compiling") as progress:
+            image = trace(scene, **where, **request, checkpoint=waiting, finished=earlier, progress=progress)
+    except Interrupted as error:
+        image, interrupted = error.image, True
+    except KeyboardInterrupt:
+        if waiting.exists():
+            complete = f"{waiting} holds the samples so far"
+        if complete is None:
+            raise
+        raise Stopped(f"{complete}; the same command with --resume continues") from None
+    try:
+        if image is not earlier:
+            image.save(path, half=half)
+        exposure = save_preview(image, preview, exposure, guide)
+    except (OSError, RuntimeError) as error:
+        kept = f"; {waiting} is kept, and --resume continues from it" if waiting.exists() else ""
+        raise RuntimeError(f"{path} or its preview cannot be written ({error}){kept}") from error
+    if interrupted:
+        spp = image.attributes["spp"]
+        raise Stopped(f"{path} holds {spp} samples per pixel; the same command with --resume continues")
+    waiting.unlink(missing_ok=True)
+    tell(
+        f"{path}: {_summary(image, request['until_error'])}, "
+        f"{time.perf_counter() - start:.1f} s, {path.stat().st_size / 1e6:.3g} MB\n"
+        f"{preview}: preview, radiance times {exposure:.4g} (exposure)"
+    )
+    return exposure
 
 
 def _summary(image: SpectralImage, until_error: float | None) -> str:

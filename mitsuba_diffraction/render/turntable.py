@@ -11,13 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ..errors import RequestError
 from ..files import whole_file
 from ..outputs import made_for
 from .scene import Materials, load_spectral_scene
 
 _FRAMES_PER_SECOND = 12
-MOST_FRAMES = 3600  # a tenth of a degree apart, five minutes
 
 
 def orbit(
@@ -30,14 +28,8 @@ def orbit(
 
     Frame k rotates it by 360° k/`frames` about the coordinate axis closest to its up vector, through the point on its
     line of sight that is closest to the centre of the scene's bounding box. Each motion is an affine map of world
-    space; the first is the identity. `load_spectral_scene` takes them, and explains `parameters` and `materials`.
-
-    Raises:
-        ValueError: if there are fewer than two frames or more than 3600, or as for `load_spectral_scene`.
-        FileNotFoundError: if there is no such scene.
+    space; the first is the identity. `load_spectral_scene` takes them; parameters, materials and errors are its own.
     """
-    if not 2 <= frames <= MOST_FRAMES:
-        raise RequestError(f"frames: got {frames}, wanted 2 to {MOST_FRAMES}")
     scene = load_spectral_scene(scene_path, width=1, height=1, parameters=parameters, materials=materials)
     centre, up = _view(scene)
     motions = []
@@ -58,12 +50,6 @@ def _view(scene: mi.Scene) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     up = np.zeros(3)
     up[axis] = np.sign(own_up[axis])
     return origin + forward * (forward @ (middle - origin)), up
-
-
-def frame_path(picture: Path, frame: int, frames: int) -> Path:
-    """Return the path of a frame: `picture.exr` → `picture_007.exr`."""
-    digits = max(3, len(str(frames - 1)))
-    return picture.with_name(f"{picture.stem}_{frame:0{digits}d}{picture.suffix}")
 
 
 def save_animation(previews: Iterable[Path], path: str | os.PathLike[str]) -> None:
