@@ -95,7 +95,7 @@ def load_spectral_scene(
     for name, size in (("width", width), ("height", height)):
         if size is not None and size < 1:
             raise RequestError(f"{name}: got {size}, wanted a positive number of pixels")
-    with _parsed(path, parameters, materials) as (config, state):
+    with parsed(path, parameters, materials) as (config, state):
         if materials:
             _warn_of_unused_materials(config, state, materials)
         _replace_films(state, width, height)
@@ -233,7 +233,7 @@ def named_sample_count(path: str | os.PathLike[str], parameters: Mapping[str, st
         FileNotFoundError: if there is no such file.
         ValueError: if the scene is wrong.
     """
-    with _parsed(path, parameters) as (_, state):
+    with parsed(path, parameters) as (_, state):
         sensor = next((node for node in state.nodes if node.type == mi.ObjectType.Sensor), None)
         for sampler in _children(state, sensor.props, mi.ObjectType.Sampler) if sensor else ():
             if (count := state.nodes[sampler].props.get("sample_count")) is not None:
@@ -241,12 +241,6 @@ def named_sample_count(path: str | os.PathLike[str], parameters: Mapping[str, st
                     raise RequestError(f"sample_count: got {count}, wanted a positive number of samples")
                 return int(count)
     return None
-
-
-def emitters_of(path: str | os.PathLike[str], parameters: Mapping[str, str] | None = None) -> set[str]:
-    """Return the plugin names of the emitters of a scene, without loading it; errors as `named_sample_count`."""
-    with _parsed(path, parameters) as (_, state):
-        return {node.props.plugin_name() for node in state.nodes if node.type == mi.ObjectType.Emitter}
 
 
 def scene_digest(
@@ -257,7 +251,7 @@ def scene_digest(
     Files enter by content, not by path; a recipe includes the scan it references. Errors as `named_sample_count`.
     """
     content = hashlib.sha256(Path(path).read_bytes())
-    with _parsed(path, parameters, materials) as (_, state):
+    with parsed(path, parameters, materials) as (_, state):
         for node in state.nodes:
             content.update(f"{node.props.plugin_name()}\n".encode())
             for name, value in node.props.items():
@@ -288,7 +282,7 @@ def _in_full(value: object) -> str:
 
 
 @contextmanager
-def _parsed(
+def parsed(
     path: str | os.PathLike[str], parameters: Mapping[str, str] | None, materials: Materials | None = None
 ) -> Iterator[tuple[mi.parser.ParserConfig, mi.parser.ParserState]]:
     """Parse a scene; in the block, Mitsuba searches the folder of the scene first.
@@ -346,8 +340,13 @@ def files_of_scene(
         FileNotFoundError: if there is no such scene, or a mesh or a texture is missing.
         ValueError: if the scene or a recipe is wrong.
     """
-    with _parsed(path, parameters, materials) as (_, state):
-        texts = [value for node in state.nodes for _, value in node.props.items() if isinstance(value, str)]
+    with parsed(path, parameters, materials) as (_, state):
+        texts = [
+            node.props[key]
+            for node in state.nodes
+            for key in node.props.keys()  # noqa: SIM118 (no mapping; items() fails before a variant is set)
+            if node.props.type(key) == mi.Properties.Type.String
+        ]
         named = [_resolved(name) for name in [*state.files, *texts]]
     found = [file for file in named if file.is_file()]
     return [*found, *(scan for file in found if file.suffix.lower() == ".toml" for scan in Recipe.load(file).files)]

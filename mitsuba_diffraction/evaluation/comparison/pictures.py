@@ -20,7 +20,7 @@ from ...progress import Progress, silent
 from ...render import SpectralImage
 from ...render.film import collect, evenly, pass_seed, rotated, trace_pass
 from ...render.passes import Accumulation, ratio, split
-from ...render.scene import channel_wavelengths, emitters_of, load_spectral_scene
+from ...render.scene import channel_wavelengths, load_spectral_scene, parsed
 from ..realtime_shader.base import Shader
 from ..realtime_shader.evaluate import VARIANTS
 from ..realtime_shader.flss import FLSS
@@ -294,7 +294,9 @@ class Pictures:
 
 def _check_lights(scene: Path, parameters: Mapping[str, str] | None) -> None:
     """Raise RequestError if the shader supports none of a scene's lights, before any spectrum is computed."""
-    if emitters_of(scene, parameters) & {"directional", "point"}:
+    with parsed(scene, parameters) as (_, state):
+        emitters = {node.props.plugin_name() for node in state.nodes if node.type == mi.ObjectType.Emitter}
+    if emitters & {"directional", "point"}:
         return
     text, advice = scene.read_text(encoding="utf-8", errors="replace"), ""
     if "lights/$light.xml" in text:
