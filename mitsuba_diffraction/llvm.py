@@ -99,13 +99,6 @@ def is_spectral(name: str) -> bool:
     return "spectral" in name.split("_")
 
 
-def spectral_variants() -> list[str]:
-    """Return the spectral variants of the installed Mitsuba."""
-    import mitsuba as mi
-
-    return [name for name in mi.variants() if is_spectral(name)]
-
-
 def choose_variant(requested: str | None = None) -> str:
     """Choose the variant to render with: the requested one, or ``cuda_ad_spectral`` with a GPU, else LLVM's.
 
@@ -114,25 +107,21 @@ def choose_variant(requested: str | None = None) -> str:
         RuntimeError: the variant cannot run on this machine; the message names what to install.
     """
     import drjit as dr
+    import mitsuba as mi
 
-    available = spectral_variants()
+    available = [name for name in mi.variants() if is_spectral(name)]
+    has_gpu = dr.has_backend(dr.JitBackend.CUDA)
     if requested is None:
-        if "cuda_ad_spectral" in available and dr.has_backend(dr.JitBackend.CUDA):
+        if has_gpu and "cuda_ad_spectral" in available:
             return "cuda_ad_spectral"
-        if "llvm_ad_spectral" not in available:
-            raise RuntimeError(
-                f"this Mitsuba has neither cuda_ad_spectral nor llvm_ad_spectral, only {', '.join(available)}"
-            )
         if message := problem():
             raise RuntimeError(f"{message}. `--variant scalar_spectral` works without it, much more slowly")
         return "llvm_ad_spectral"
 
     if requested not in available:
-        import mitsuba as mi
-
         reason = "is not spectral" if requested in mi.variants() else "is unknown"
         raise RequestError(f"variant {requested!r} {reason}; use one of {', '.join(available)}")
-    if requested.startswith("cuda") and not dr.has_backend(dr.JitBackend.CUDA):
+    if requested.startswith("cuda") and not has_gpu:
         raise RuntimeError(f"variant {requested!r} needs an NVIDIA GPU with a recent driver, and Dr.Jit found none")
     if requested.startswith("llvm") and (message := problem()):
         raise RuntimeError(f"variant {requested!r} cannot be used: {message}")
