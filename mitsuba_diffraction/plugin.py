@@ -38,23 +38,16 @@ def register(variant: str) -> None:
             )
         elif variant.startswith("llvm"):
             reason = llvm.problem()
-        getattr(mi, function)(name, _refusal(reason) if reason else define())
+        getattr(mi, function)(name, functools.partial(_refuse, reason) if reason else define())
 
 
-def _refusal(reason: str) -> Callable[[mi.Properties], mi.Object]:
-    def refuse(props: mi.Properties) -> mi.Object:
-        raise RuntimeError(reason)
-
-    return refuse
-
-
-def _wrap_loaders() -> None:
-    """Make mi.load_dict accept a GratingSpectrum, and all loaders report in one line what a plugin refuses."""
-    for name in ("load_dict", "load_file", "load_string"):
-        setattr(mi, name, _telling(getattr(mi, name)))
+def _refuse(reason: str, props: mi.Properties) -> mi.Object:
+    raise RuntimeError(reason)
 
 
 def _telling(load: Callable[..., mi.Object]) -> Callable[..., mi.Object]:
+    """Return a loader that accepts a GratingSpectrum in a dict, and reports in one line what a plugin refuses."""
+
     @functools.wraps(load)
     def loader(scene: dict | str, *args: object, **kwargs: object) -> mi.Object:
         try:
@@ -73,7 +66,8 @@ def _telling(load: Callable[..., mi.Object]) -> Callable[..., mi.Object]:
 
 # A reload must not do this twice.
 if not getattr(mi, "_mitsuba_diffraction_registered", False):
-    _wrap_loaders()
+    for name in ("load_dict", "load_file", "load_string"):
+        setattr(mi, name, _telling(getattr(mi, name)))
     mi._mitsuba_diffraction_registered = True
     # With one thread, on a machine of one core, Mitsuba 3.9.1 waits for ever where it reads or writes an EXR picture.
     if dr.thread_count() < 2:
