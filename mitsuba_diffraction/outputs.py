@@ -115,13 +115,6 @@ def plain(value: object) -> object:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def save_markdown(text: str, path: str | os.PathLike[str]) -> None:
-    """Write a Markdown file, whole or not at all."""
-    request = made_for(path)
-    with whole_file(path) as temporary:
-        temporary.write_text(text if request is None else f"{text}\n<!-- {request} -->\n", encoding="utf-8")
-
-
 def free_name(stem: str, files_of: Callable[[str], Iterable[Path]], reads: Iterable[str | os.PathLike[str]]) -> str:
     """Return a default name: the first of `stem`, `stem`_2, … none of whose files (`files_of`) is an input."""
     reads = list(reads)

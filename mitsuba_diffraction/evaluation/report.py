@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Mapping, Sequence
 
 from rich.table import Table
 from rich.text import Text
 
+from ..files import whole_file
+from ..outputs import made_for
 from .validation.record import Record
 
 RECORD_COLUMNS = ("check", "expected", "found", "difference", "bound", "")
@@ -22,6 +25,13 @@ def markdown(columns: Sequence[str], rows: Iterable[Sequence[str]], texts: int =
     ruler = ["---" if index < texts else "---:" for index in range(len(columns))]
     lines = ([cell.replace("|", "\\|") for cell in line] for line in (columns, ruler, *rows))
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+def save_markdown(text: str, path: str | os.PathLike[str]) -> None:
+    """Write a Markdown file, whole or not at all."""
+    request = made_for(path)
+    with whole_file(path) as temporary:
+        temporary.write_text(text if request is None else f"{text}\n<!-- {request} -->\n", encoding="utf-8")
 
 
 def record_cells(record: Record) -> list[str]:

@@ -197,7 +197,9 @@ def test_every_format_carries_its_request(name):
         if name == "a.json":
             outputs.save_json({"a": 1}, name)
         elif name == "a.md":
-            outputs.save_markdown("# a\n", name)
+            from mitsuba_diffraction.evaluation.report import save_markdown
+
+            save_markdown("# a\n", name)
         elif name == "a.webp":
             from mitsuba_diffraction.render.turntable import save_animation
 

@@ -24,7 +24,6 @@ from ...cli.arguments import (
     settings_of,
 )
 from ...errors import RequestError
-from ...outputs import save_markdown
 from ...progress import progress_bar, show, tell
 
 if TYPE_CHECKING:
@@ -92,7 +91,7 @@ def validate(
     if json is not None:
         outputs.save_json({"checks": report.record_dicts(results)}, json)
     if markdown is not None:
-        save_markdown(report.record_markdown(results), markdown)
+        report.save_markdown(report.record_markdown(results), markdown)
     if figures is not None:
         with progress_bar("figures") as progress:
             save_figures(figures, progress=progress)

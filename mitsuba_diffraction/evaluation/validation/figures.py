@@ -13,9 +13,9 @@ import numpy as np
 
 from ...errors import RequestError
 from ...files import whole_file
-from ...outputs import made_for, png_text, save_markdown
+from ...outputs import made_for, png_text
 from ..realtime_shader.quirks import Quirks
-from ..report import markdown
+from ..report import markdown, save_markdown
 from .brdf_map import MAP_METHODS, PROJECTIONS, BRDFMap, brdf_map
 from .published_surfaces import SURFACES, PublishedSurface
 from .viewing_angle import (
