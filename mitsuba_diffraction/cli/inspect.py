@@ -131,13 +131,10 @@ def _light(inspection: Inspection) -> list[tuple[str, str]]:
         one = " (for a single period of a grating: --extent tile)" if inspection.extent == "sample" else ""
         lines.append(("period", f"none stands out{one}"))
     else:
-        angles = []
-        for order in range(1, 4):
-            sine = order * GREEN / inspection.periods[0].period
-            if sine < 1:
-                angles.append(f"{math.degrees(math.asin(sine)):.1f}°")
-        where = ", ".join(angles) or "no angle: the period is shorter than the wavelength"
-        lines.append(("550 nm goes to", f"{where} (orders 1, 2, … at normal incidence)" if angles else where))
+        sines = [order * GREEN / inspection.periods[0].period for order in range(1, 4)]
+        angles = ", ".join(f"{math.degrees(math.asin(sine)):.1f}°" for sine in sines if sine < 1)
+        where = f"{angles} (orders 1, 2, … at normal incidence)"
+        lines.append(("550 nm goes to", where if angles else "no angle: the period is shorter than the wavelength"))
     lobe = math.degrees(GREEN * lobe_width(inspection.coherence_length))
     length = f"{inspection.coherence_length:.3g} µm"
     if inspection.extent == "sample":

@@ -20,8 +20,9 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import root_cause
 from ..integrator.paths import Splats
-from .scene import channel_wavelengths, channel_weights, root_cause
+from .scene import channel_wavelengths, channel_weights
 
 # A pixel, row by row, and a mask → the first of its samples, which stand together, and the one after the last.
 Samples = Callable[["mi.UInt32", "mi.Bool"], tuple["mi.UInt32", "mi.UInt32"]]
