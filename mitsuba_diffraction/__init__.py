@@ -27,10 +27,12 @@ _HOME = {
     "HeightField": "surface.heightfield",
     "Recipe": "recipe",
     "efficiencies": "efficiency",
+    "gratings": "surface.gratings",
     "precompute": "precomputation",
     "read_height_field": "surface.readers",
+    "reference": "reference",
+    "rigorous": "rigorous",
 }
-_MODULES = {"gratings": "surface.gratings", "reference": "reference", "rigorous": "rigorous"}
 
 __all__ = [
     "GratingSpectrum",
@@ -47,13 +49,10 @@ __all__ = [
 
 def __getattr__(name: str) -> object:
     """Import a public name on its first use (PEP 562)."""
-    if name in _HOME:
-        value = getattr(importlib.import_module(f".{_HOME[name]}", __name__), name)
-    elif name in _MODULES:
-        value = importlib.import_module(f".{_MODULES[name]}", __name__)
-    else:
+    if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    globals()[name] = value
+    module = importlib.import_module(f".{_HOME[name]}", __name__)
+    globals()[name] = value = getattr(module, name, module)  # some are modules themselves
     return value
 
 
