@@ -30,7 +30,7 @@ _RUNTIME_LIBRARIES = ("libunwind.so.1", "libc++abi.so.1", "libc++.so.1")
 def choose() -> None:
     """Point ``DRJIT_LIBLLVM_PATH`` to the wheel's library unless it names a suitable one. Call before Dr.Jit loads."""
     given = os.environ.get(_PATH_VARIABLE)
-    if given and _usable(_library_version(given)):
+    if given and _library_version(given) >= MINIMUM_VERSION:
         return
     if path := _wheel_library():
         if given and given != path:
@@ -43,8 +43,8 @@ def problem() -> str | None:
     """Return None if Dr.Jit has a suitable LLVM, otherwise one line with the problem and its remedy."""
     import drjit as dr
 
-    version = tuple(dr.detail.llvm_version()) if dr.has_backend(dr.JitBackend.LLVM) else None
-    if _usable(version):
+    version = tuple(dr.detail.llvm_version()) if dr.has_backend(dr.JitBackend.LLVM) else ()
+    if version >= MINIMUM_VERSION:
         return None
     found = f"found {'.'.join(map(str, version))}" if version else "none found"
     advice = f"install LLVM {MINIMUM_VERSION[0]} or later, or set {_PATH_VARIABLE} to its libLLVM"
@@ -55,10 +55,6 @@ def problem() -> str | None:
     return f"Dr.Jit's CPU backend needs LLVM {MINIMUM_VERSION[0]} or later ({found}): {advice}"
 
 
-def _usable(version: tuple[int, ...] | None) -> bool:
-    return version is not None and version >= MINIMUM_VERSION
-
-
 def _load(path: str | Path) -> ctypes.CDLL | None:
     try:
         return ctypes.CDLL(str(path))
@@ -66,11 +62,11 @@ def _load(path: str | Path) -> ctypes.CDLL | None:
         return None
 
 
-def _library_version(path: str | Path) -> tuple[int, ...] | None:
-    """Return the version of the libLLVM at ``path``, or None if it does not load or is older than LLVM 16."""
+def _library_version(path: str | Path) -> tuple[int, ...]:
+    """Return the version of the libLLVM at ``path``, () if it does not load or is older than LLVM 16."""
     library = _load(path)
-    if library is None or not hasattr(library, "LLVMGetVersion"):
-        return None
+    if not hasattr(library, "LLVMGetVersion"):
+        return ()
     numbers = [ctypes.c_uint() for _ in range(3)]
     library.LLVMGetVersion(*map(ctypes.byref, numbers))
     return tuple(number.value for number in numbers)
@@ -89,7 +85,7 @@ def _wheel_library() -> str | None:
                 if file.name.startswith(name):
                     _load(file)
         for file in files:
-            if file.name.startswith("libLLVM") and _usable(_library_version(file)):
+            if file.name.startswith("libLLVM") and _library_version(file) >= MINIMUM_VERSION:
                 return str(file)
     return None
 
