@@ -13,7 +13,7 @@ import itertools
 import json
 import math
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -30,8 +30,8 @@ _claims: dict[Path, str] = {}
 
 def claim(
     request: Mapping[str, object],
-    reads: Iterable[str | os.PathLike[str]],
-    writes: Iterable[tuple[str, str | os.PathLike[str]]],
+    reads: Sequence[str | os.PathLike[str]],
+    writes: Sequence[tuple[str, str | os.PathLike[str]]],
     *,
     overwrite: bool = False,
 ) -> None:
@@ -48,7 +48,6 @@ def claim(
         ValueError: if an output is also an input, is named twice, exists and was not made for this request, or cannot
             be written.
     """
-    reads, writes = list(reads), list(writes)
     planned: dict[str, str] = {}
     for option, path in writes:
         if read := next((read for read in reads if _is_same(path, read)), None):
@@ -115,9 +114,8 @@ def plain(value: object) -> object:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def free_name(stem: str, files_of: Callable[[str], Iterable[Path]], reads: Iterable[str | os.PathLike[str]]) -> str:
+def free_name(stem: str, files_of: Callable[[str], Iterable[Path]], reads: Sequence[str | os.PathLike[str]]) -> str:
     """Return a default name: the first of `stem`, `stem`_2, … none of whose files (`files_of`) is an input."""
-    reads = list(reads)
     names = (stem if number == 1 else f"{stem}_{number}" for number in itertools.count(1))
     return next(name for name in names if not any(_is_same(path, read) for path in files_of(name) for read in reads))
 

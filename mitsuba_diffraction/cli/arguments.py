@@ -46,13 +46,12 @@ _NOT_OF_THE_REQUEST = frozenset(
 )
 
 
-def claim(context: typer.Context, reads: Iterable[Path], writes: Iterable[tuple[str, Path]]) -> None:
+def claim(context: typer.Context, reads: Sequence[Path], writes: Sequence[tuple[str, Path]]) -> None:
     """Claim the outputs of a command (`outputs.claim`); the request is its command line without defaults.
 
     Raises:
         ValueError: as `outputs.claim`, or if a file name is not UTF-8, which OpenEXR and Mitsuba require.
     """
-    reads, writes = list(reads), list(writes)
     for path in [*reads, *(path for _, path in writes)]:
         _refuse_other_than_utf8(os.path.realpath(path))
     request = {
