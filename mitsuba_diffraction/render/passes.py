@@ -115,11 +115,7 @@ def checkpoint_path(picture: Path) -> Path:
 
 
 def save_checkpoint(path: str | os.PathLike[str], digest: str, sums: Accumulation) -> None:
-    """Write a checkpoint atomically: after a kill or a power cut, `path` is either the old or the new one.
-
-    Raises:
-        OSError: if it cannot be written; the old one is kept.
-    """
+    """Write a checkpoint atomically: after a kill, a power cut or an OSError, `path` is the old or the new one."""
     with whole_file(path) as temporary:
         with open(temporary, "wb") as stream:
             np.savez(stream, digest=digest, **vars(sums))
@@ -141,9 +137,8 @@ def load_checkpoint(path: str | os.PathLike[str], digest: str) -> Accumulation |
             if not is_intact(path):
                 raise RequestError("its contents do not match its digest")
             with np.load(stream) as content:
-                found = content["digest"].item()
-                if found == digest:
-                    read = {name: content[name] for name in (field.name for field in fields(Accumulation))}
+                if content["digest"].item() == digest:
+                    read = {field.name: content[field.name] for field in fields(Accumulation)}
                     return Accumulation(**{name: value if value.ndim else value.item() for name, value in read.items()})
         # Raised by NumPy and zipfile for damaged files.
         except (ValueError, KeyError, TypeError, EOFError, AttributeError, RuntimeError, OSError, BadZipFile) as error:
@@ -292,7 +287,10 @@ def render(
     if finished is not None and finished.attributes.get("digest") == job.digest():
         return finished
 
-    sums = _sums_so_far(checkpoint, job, scene)
+    sums = None if checkpoint is None else load_checkpoint(checkpoint, job.digest())
+    if sums is None:
+        columns, rows = (int(size) for size in scene.sensors()[0].film().crop_size())
+        sums = Accumulation.empty(rows, columns)
     saved = sums.samples
     ends = _judge(sums, job, progress)
     last, wait = time.monotonic(), seconds
@@ -344,14 +342,6 @@ def _job(
         versions=versions(),
     )
     return job, scene
-
-
-def _sums_so_far(checkpoint: str | os.PathLike[str] | None, job: Job, scene: mi.Scene) -> Accumulation:
-    """Return the sums of the checkpoint, or of zero passes if there is none."""
-    if checkpoint is not None and (sums := load_checkpoint(checkpoint, job.digest())) is not None:
-        return sums
-    columns, rows = (int(size) for size in scene.sensors()[0].film().crop_size())
-    return Accumulation.empty(rows, columns)
 
 
 def _image(sums: Accumulation, job: Job, scene: str, complete: bool) -> SpectralImage:

@@ -227,12 +227,7 @@ def _emission(emitter: mi.Emitter) -> NDArray[np.float64]:
 
 
 def named_sample_count(path: str | os.PathLike[str], parameters: Mapping[str, str] | None = None) -> int | None:
-    """Return the sample_count of the sampler of a scene's first sensor, None if unspecified.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if the scene is wrong.
-    """
+    """Return the sample_count of the sampler of a scene's first sensor, None if unspecified; errors as of `parsed`."""
     with parsed(path, parameters) as (_, state):
         sensor = next((node for node in state.nodes if node.type == mi.ObjectType.Sensor), None)
         for sampler in _children(state, sensor.props, mi.ObjectType.Sampler) if sensor else ():
@@ -248,7 +243,7 @@ def scene_digest(
 ) -> str:
     """Return the SHA-256 of a valid scene: its XML after substitution of parameters, and the files it references.
 
-    Files enter by content, not by path; a recipe includes the scan it references. Errors as `named_sample_count`.
+    Files enter by content, not by path; a recipe includes the scan it references. Errors as of `parsed`.
     """
     content = hashlib.sha256(Path(path).read_bytes())
     with parsed(path, parameters, materials) as (_, state):
@@ -335,10 +330,7 @@ def files_of_scene(
     """Return the files that a scene names: itself, what it includes, files of its plugins, scans of its recipes.
 
     Tables of spectra (`<spectrum filename="…"/>`) are not among them: of these the parser keeps the values alone.
-
-    Raises:
-        FileNotFoundError: if there is no such scene, or a mesh or a texture is missing.
-        ValueError: if the scene or a recipe is wrong.
+    Errors as of `parsed`, or if a recipe is wrong.
     """
     with parsed(path, parameters, materials) as (_, state):
         texts = [
