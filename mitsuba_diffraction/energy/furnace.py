@@ -50,6 +50,7 @@ Real = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 KAPPA_STEP = 0.1  # radians of the fastest oscillation over κ, between which powers are linear
+BELOW_LEAST, MOST_KAPPAS = 8, 1000  # such values of κ up to κ₁, where light passes; so many at most for their sake
 COARSER = 1.6  # cells, where there are three ways for light to go
 CELL, CELLS = 0.2, 500  # width of a gathered cell in direction cosines at the shortest wavelength; cells at least
 MIRROR_CELL = 0.75  # the same in the lobe of the mirror direction, in σ_q, at most
@@ -80,10 +81,10 @@ class Furnace:
         by_order: components are orders, each evaluated by itself: of line gratings, and if none overlap.
         q: (n, 2) cycles/µm, the centres of components.
         widths: (n,) cycles/µm, their standard deviations.
-        powers: p_j of reflected and, if there is any, of transmitted light, with κ₁²/κ² p_j below κ₁ as `small_kappa`
-            gives it: float32 (n, K) each, at K equidistant κ from 0 to that of the spectrum, for the heights as they
-            are.
+        powers: p_j of reflected and, if there is any, of transmitted light, float32 (n, K) each, at K equidistant κ
+            from 0 to that of the spectrum, for the heights as they are.
         least_kappa: κ₁ in rad/µm of the heights as they are.
+        at_least: p_j of transmitted light at κ₁ and 2κ₁, (n,) each.
     """
 
     spectrum: PowerSpectrum = field(repr=False)
@@ -95,6 +96,7 @@ class Furnace:
     widths: Real = field(repr=False)
     powers: list[NDArray[np.float32]] = field(repr=False)
     least_kappa: float
+    at_least: list[Real] = field(repr=False)
 
     @classmethod
     def of(
@@ -103,7 +105,11 @@ class Furnace:
         """Return the components of `spectrum`; `index` is n below relative to n above, if light is transmitted."""
         grid, max_kappa = spectrum.grid, spectrum.max_kappa
         by_order = isinstance(grid, OrderGrid) and (1 in grid.shape or all(lobe.count == 1 for lobe in spectrum.lobes))
-        kappas = np.linspace(0, max_kappa, int(max_kappa * spectrum.height_range / KAPPA_STEP) + 3, dtype=np.float64)
+        count = max_kappa * spectrum.height_range / KAPPA_STEP
+        if index is not None:
+            # Below κ₁ p_j is about a parabola, which transmitted light weighs by 1/κ².
+            count = max(count, min(BELOW_LEAST * max_kappa / least_kappa(spectrum, index), MOST_KAPPAS))
+        kappas = np.linspace(0, max_kappa, int(count) + 3, dtype=np.float64)
         powers: NDArray[np.floating]
         if by_order:
             powers = np.stack([spectrum.powers(kappa).ravel() for kappa in kappas], 1)
@@ -118,19 +124,18 @@ class Furnace:
         deep = max_kappa * spectrum.height_range * height_scale * BLUR > PHASE
         blurred = deep and 1 not in grid.shape and 16 * len(q) > np.prod(grid.shape)
         kept = powers.max(-1) > 1e-7
-        tables, least = [powers[kept]], 0.0
+        powers = np.ascontiguousarray(np.maximum(powers[kept], 0), np.float32)
+        tables, least, at_least = [powers], 0.0, []
         if index is not None:
-            least = least_kappa(spectrum, index, height_scale)
-            at_least = [np.array([np.interp(n * least, kappas, row) for row in tables[0]])[:, None] for n in (1, 2)]
-            tables.append(small_kappa(kappas, least, tables[0], *at_least))
-        found = [np.ascontiguousarray(np.maximum(table, 0), np.float32) for table in tables]
+            tables, least = [powers, powers], least_kappa(spectrum, index, height_scale)
+            at_least = [np.array([np.interp(n * least, kappas, row) for row in powers]) for n in (1, 2)]
         if blurred:
-            found = [
+            tables = [
                 maximum_filter1d(table, 1 + int(share * len(kappas)), axis=1)
-                for table, share in zip(found, (BLUR, BLUR / 4), strict=False)
+                for table, share in zip(tables, (BLUR, BLUR / 4), strict=False)
             ]
         seen = None if index is None else float(index) ** side
-        return cls(spectrum, height_scale, seen, side, by_order, side * q[kept], widths[kept], found, least)
+        return cls(spectrum, height_scale, seen, side, by_order, side * q[kept], widths[kept], tables, least, at_least)
 
     @property
     def depth(self) -> float:
@@ -254,7 +259,10 @@ class Furnace:
         flat, index = table.ravel(), component * table.shape[1] + cell
         below = flat[index]
         power = below + (place - cell) * (flat[index + 1] - below)
-        return power * (kappa > 0) if way else power
+        if not way:
+            return power
+        at_least = (of[component] for of in self.at_least)
+        return small_kappa(kappa * self.height_scale, self.least_kappa, power, *at_least) * (kappa > 0)
 
     def _lobes(
         self, s: Real, cos_i: Real, length: Real, place: Indices, component: Indices, square: Real, way: int
@@ -375,7 +383,8 @@ class Furnace:
         """
         spectrum, grid, q = self.spectrum, self.spectrum.grid, _nodes(self.spectrum)
         kappas = np.array([0, 0.03, 0.1, 0.4, 0.7, 1]) * spectrum.max_kappa
-        strength = np.stack([np.maximum(spectrum.powers(kappa), 0).ravel() for kappa in kappas]).sum(0)
+        powers = [np.maximum(spectrum.powers(kappa).ravel(), 0) for kappa in kappas]
+        strength = np.sum(powers, 0, np.float64)
         # Evenly along the sum of strengths, from a random start.
         rng, share = np.random.default_rng(seed), strength / strength.sum()
         node = np.searchsorted(share.cumsum(), (np.arange(POINTS) + rng.random()) / POINTS).clip(max=len(q) - 1)
@@ -427,7 +436,7 @@ class Furnace:
 def least_kappa(spectrum: PowerSpectrum, index: float, height_scale: float = 1.0) -> float:
     """Return κ₁, below which c_m/κ² of transmitted light is a line, in rad/µm of the heights as they are."""
     first, undiffracted = small_kappas(spectrum, index)
-    return min(first, max(undiffracted * height_scale, 1e-6))
+    return min(first, undiffracted * height_scale)
 
 
 def small_kappas(spectrum: PowerSpectrum, index: float) -> tuple[float, float]:
@@ -443,8 +452,8 @@ def small_kappas(spectrum: PowerSpectrum, index: float) -> tuple[float, float]:
 
 def small_kappa(kappa: Real, least: float, power: NDArray, first: NDArray, second: NDArray) -> Real:
     """Return κ₁²/κ² c_m(κ) below κ₁ = `least`, the line through c_m/κ² at κ₁ and 2κ₁; `power`, c_m(κ), above."""
-    x = kappa / least
-    return np.where(x < 1, (2 - x) * first + 0.25 * (x - 1) * second, power)
+    x = kappa / max(least, 1e-30)
+    return np.where(kappa < least, (2 - x) * first + 0.25 * (x - 1) * second, power)
 
 
 def mirrored(square: Real, cos_i: Real, cos_o: Real) -> Real:
