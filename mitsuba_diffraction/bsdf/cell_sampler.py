@@ -192,7 +192,7 @@ class CellSampler:
         before_y = sums_before(np.float64(before_x[row, end]) - before_x[row, first])
         self.before_y = SumTable(before_y)
         self.masses = PacketTable(before_y[:, -1])
-        self.ends = NumberTable(first | end << 16)
+        self.ends = NumberTable((first | end << 16).astype(np.uint32))
 
     def density(self, q: mi.Vector2f, incidence: Incidence, active: mi.Bool) -> mi.Float:
         """Return p(q) in µm², q in cycles/µm, for one wavelength; of a q that propagates."""

@@ -18,7 +18,7 @@ import numpy as np
 
 from ..energy.table import LARGEST, EnergyTable
 from .geometry import cell_of, on_square
-from .tables import FloatTable, NumberTable, PacketTable, larger, limited, opaque, smaller
+from .tables import NumberTable, PacketTable, larger, limited, opaque, smaller
 
 
 @dataclass
@@ -51,7 +51,6 @@ class Energy:
         tables: Sequence[EnergyTable],
         slopes: np.ndarray | None = None,
         change: mi.Float | None = None,
-        index: float = 1.0,
         edges: Sequence[float] | None = None,
     ) -> None:
         """Pack the tables.
@@ -61,7 +60,6 @@ class Energy:
                 same from below.
             slopes: times `change`, are added to the tables; those of one after the other.
             change: zero but for its gradient.
-            index: n below relative to n above.
             edges: where scales vary, the ratios between that of one and that of the next; tables of one ratio follow
                 those of the one before.
         """
@@ -75,7 +73,7 @@ class Energy:
         steps = np.concatenate([of.steps for of in tables])
         self.table = NumberTable(steps @ (np.uint32(1) << np.arange(0, 32, 8, dtype=np.uint32)))
         heights = [(LARGEST - of.least) / 255 for of in tables]
-        self.steps = [opaque(height) for height in heights] if edges is None else FloatTable(np.array(heights))
+        self.steps = [opaque(height) for height in heights] if edges is None else NumberTable(np.array(heights))
         self.edges = None if edges is None else [opaque(edge) for edge in edges]
         self.slope = None if slopes is None else PacketTable(slopes)
         self.change = change
@@ -83,7 +81,7 @@ class Energy:
         self.frequencies = [opaque(nu) for nu in layout.frequencies]
         if edges is not None:
             of_ratio = tables[:: len(tables) // (1 + len(edges))]
-            self.frequencies = [FloatTable(np.array([of.layout.frequencies[k] for of in of_ratio])) for k in (0, 1)]
+            self.frequencies = [NumberTable(np.array([of.layout.frequencies[k] for of in of_ratio])) for k in (0, 1)]
         self.period, self.squares = opaque(layout.period), opaque(layout.squares - 1)
         self.cells, self.first_cells = opaque(layout.cells), opaque(layout.first)
 
@@ -138,7 +136,7 @@ class Energy:
             number = dr.select(place.under, mi.UInt32(2), 0) + dr.select(passes, mi.UInt32(1), 0)
             number = number if place.ratio is None else 4 * place.ratio + number
         if place.ratio is not None:
-            step = self.steps(number, True)
+            step = self.steps(number)
         elif self.two_sided:
             above, below = (dr.select(passes, self.steps[k + 1], self.steps[k]) for k in (0, 2))
             step = dr.select(place.under, below, above)
@@ -149,9 +147,7 @@ class Energy:
             index = row * side + column
         else:
             (column, x), (row, y) = (cell_of(u, self.first_cells) for u in (place.u, place.v))
-            first, last = (
-                self.frequencies if place.ratio is None else [nu(place.ratio, True) for nu in self.frequencies]
-            )
+            first, last = self.frequencies if place.ratio is None else [nu(place.ratio) for nu in self.frequencies]
             below, beyond = cell_of((frequency - first) / (last - first) * self.last_slice, self.last_slice)
             index = (below * side + row) * side + column
         if number is not None:
@@ -173,14 +169,9 @@ class Energy:
         square = smaller(dr.floor(u), self.squares)
         inner = square > 0
         cells = dr.select(inner, self.cells, self.first_cells)
-        cell, x = cell_of(_equidistant(u - square) * cells, cells)
+        cell, x = cell_of(dr.sqrt(limited(u - square, 0, 1)) * cells, cells)
         start = dr.select(inner, dr.fma(square - 1, self.cells, self.first_cells), 0)
         return cell + mi.UInt32(start), x
-
-
-def _equidistant(f: mi.Float) -> mi.Float:
-    """Return √f, from 0 to 1."""
-    return dr.sqrt(limited(f, 0, 1))
 
 
 def _bytes(number: mi.UInt32) -> mi.Vector4f:

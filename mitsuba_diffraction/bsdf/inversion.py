@@ -11,6 +11,7 @@ The averages of a few wide cells serve: where S changes fast with κ, the mixtur
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 
 import drjit as dr
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 
 from ..grating_spectrum import GratingSpectrum
 from .geometry import Incidence
-from .tables import BELOW_ONE, FloatTable, larger, limited, opaque
+from .tables import BELOW_ONE, NumberTable, larger, limited, opaque
 
 CELLS = 4  # one packet
 
@@ -50,7 +51,7 @@ def averages(spectrum: GratingSpectrum, cells: KappaCells, floor: float = 0.0) -
 
     Of each, all orders have the share `floor` alike, for those that are strong at some κ only.
     """
-    means = np.stack([_average(spectrum, *ends) for ends in zip(cells.ends[:-1], cells.ends[1:], strict=True)])
+    means = np.stack([_average(spectrum, *ends) for ends in itertools.pairwise(cells.ends)])
     return (1 - floor) * means + floor / means[0].size
 
 
@@ -120,8 +121,8 @@ class SumTable:
             lines = _in_groups(lines, self.GROUP)
             self.groups = lines.shape[-1] // self.GROUP
             coarse = _in_groups(lines[..., :: self.GROUP], self.GROUP)
-            self.coarse_stride, self.coarse = coarse.shape[-1], FloatTable(coarse)
-        self.stride, self.fine = lines.shape[-1], FloatTable(lines)
+            self.coarse_stride, self.coarse = coarse.shape[-1], NumberTable(coarse)
+        self.stride, self.fine = lines.shape[-1], NumberTable(lines)
 
     def before(self, line: mi.UInt32, kappa_cell: mi.UInt32, i: mi.Int32, active: mi.Bool) -> mi.Float:
         """Return F(i), 0 ≤ i ≤ n."""

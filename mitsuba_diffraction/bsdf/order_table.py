@@ -26,7 +26,7 @@ from ..geometry import fresnel
 from ..grating_spectrum import GratingSpectrum
 from .geometry import cell_of, on_square
 from .inversion import search
-from .tables import FloatTable, PacketTable, larger, opaque
+from .tables import NumberTable, PacketTable, larger, opaque
 from .transmission import CrossingIncidence
 
 WHOLE = 2**24  # a float32 holds whole numbers up to here
@@ -103,7 +103,7 @@ class OrderTable:
             share = (passed / np.maximum(reflected + passed, 1e-30)).reshape(self.side + 1, -1)
             shares.append(map_coordinates(share, (np.indices((FINE, FINE)) + 0.5) * (self.side / FINE), order=1))
         shares = np.mean(np.reshape(shares, (len(ranges), 2, FINE, FINE)), axis=0)
-        self.before, self.shares = FloatTable(np.concatenate(sums)), FloatTable(shares)
+        self.before, self.shares = NumberTable(np.concatenate(sums)), NumberTable(shares)
         self.cells = PacketTable(np.concatenate(cells).astype(np.uint32))
         self.counts = opaque(self.slices), opaque(self.side)
         self.edges = [opaque(scale) for scale in height_scales[1:-1]]
@@ -211,7 +211,7 @@ class OrderTable:
     def transmitted(self, omega: mi.Vector3f) -> mi.Float:
         """Return the share of samples that pass, ω along the pattern's axes."""
         column, row = _direction(omega, FINE)
-        return self.shares((dr.select(omega.z > 0, mi.UInt32(0), FINE) + row) * FINE + column, True)
+        return self.shares((dr.select(omega.z > 0, mi.UInt32(0), FINE) + row) * FINE + column)
 
 
 def _direction(omega: mi.Vector3f, side: mi.Float | int) -> list[mi.UInt32]:

@@ -86,7 +86,7 @@ class SharedTables:
         Where a gradient is tracked through `height_scale`, the entries of the table carry theirs, from a central
         difference; not those of an interface, whose steps from cell to cell would be in the difference.
         """
-        scale, index = float(np.max(height_scale)), self._eta or 1.0
+        scale = float(np.max(height_scale))
         if dr.grad_enabled(height_scale) and self._eta is None:
             tables, lower, upper = self.energy_tables(scale), max(scale - STEP, 0.0), scale + STEP
             above, below = (self.corners(tables[0], s) for s in (upper, lower))
@@ -96,7 +96,7 @@ class SharedTables:
             if self._last is None or self._last[0] != scale:
                 tables = self.energy_tables(scale)
                 needed = any(table.needed for table in tables)
-                self._last = scale, Energy(tables, index=index) if needed else None
+                self._last = scale, Energy(tables) if needed else None
             return self._last[1]
 
     def scaled_energy(
@@ -127,7 +127,7 @@ class SharedTables:
             edges = ratios[2:-1:2]
         tables = [table for of_ratio in found for table in of_ratio]
         needed = any(table.needed for table in tables)
-        return Energy(tables, index=self._eta or 1.0, edges=edges.tolist()) if needed else None
+        return Energy(tables, edges=edges.tolist()) if needed else None
 
     def energy_tables(
         self, height_scale: float, stretched: Stretched | None = None, layouts: Sequence[Layout] | None = None

@@ -38,37 +38,35 @@ def opaque(value: float) -> mi.Float:
 BELOW_ONE = 1 - 2.0**-24  # the largest float32 under one, in every variant
 
 
-class FloatTable:
-    """A flat table of floats."""
+class NumberTable:
+    """A flat table of numbers."""
 
     def __init__(self, numbers: np.ndarray) -> None:
-        """Take an array of any shape."""
-        flat = aligned(np.asarray(numbers, np.float32).ravel())
+        """Take an array of any shape; uint32 stays so, all else becomes float32."""
+        whole = numbers.dtype == np.uint32
+        self.number = mi.UInt32 if whole else mi.Float
+        flat = aligned(numbers.ravel() if whole else np.asarray(numbers, np.float32).ravel())
         # Scalar variants have no gather.
-        self.values = mi.Float(flat) if dr.is_jit_v(mi.Float) else flat
+        self.values = self.number(flat) if dr.is_jit_v(mi.Float) else flat
 
-    def __call__(self, index: mi.UInt32, active: mi.Bool) -> mi.Float:
-        """Return the floats at `index`; zero where not `active`."""
+    def __call__(self, index: mi.UInt32, active: mi.Bool = True) -> mi.Float | mi.UInt32:
+        """Return the numbers at `index`; zero where not `active`."""
         if dr.is_jit_v(mi.Float):
-            return dr.gather(mi.Float, self.values, index, active)
-        return float(self.values[index]) if active else 0.0
+            return dr.gather(self.number, self.values, index, active)
+        return self.values[index].item() if active else self.number(0)
 
 
-class PacketTable(FloatTable):
-    """A flat table of packets of two or four numbers; one packet is one read of 8 or 16 bytes."""
+class PacketTable(NumberTable):
+    """A flat table of packets of two or four floats, or four uint32; one packet is one read of 8 or 16 bytes."""
 
     unit = 1.0
 
     def __init__(self, packets: np.ndarray, width: int = 4) -> None:
-        """Take the packets one after the other, of any shape; uint32 in fours stays so, all else becomes float32."""
+        """Take the packets one after the other, of any shape."""
+        super().__init__(packets)
         self.width = width
-        if packets.dtype == np.uint32:
-            flat = aligned(packets.ravel())
-            self.values = mi.UInt32(flat) if dr.is_jit_v(mi.Float) else flat
-            self.packet = mi.Vector4u
-        else:
-            super().__init__(packets)
-            self.packet = {2: mi.Vector2f, 4: mi.Vector4f}[width]
+        floats = {2: mi.Vector2f, 4: mi.Vector4f}[width]
+        self.packet = mi.Vector4u if packets.dtype == np.uint32 else floats
 
     def __call__(self, index: mi.UInt32, active: mi.Bool) -> mi.Vector2f | mi.Vector4f | mi.Vector4u:
         """Return the packets at `index`; zero where not `active`."""
@@ -87,22 +85,8 @@ class PacketTable(FloatTable):
         return super().__call__(self.width * index + place, active)
 
 
-class NumberTable:
-    """A flat table of 32-bit numbers."""
-
-    def __init__(self, numbers: np.ndarray) -> None:
-        """Take an array of any shape."""
-        flat = aligned(np.asarray(numbers, np.uint32).ravel())
-        # Scalar variants have no gather.
-        self.values = mi.UInt32(flat) if dr.is_jit_v(mi.Float) else flat
-
-    def __call__(self, index: mi.UInt32) -> mi.UInt32:
-        """Return the number at `index`."""
-        return dr.gather(mi.UInt32, self.values, index) if dr.is_jit_v(mi.Float) else int(self.values[index])
-
-
 def aligned(values: np.ndarray) -> np.ndarray:
-    """Return Flat float32 or uint32 at an address that is a multiple of 64 bytes.
+    """Return flat float32 or uint32 at an address that is a multiple of 64 bytes.
 
     Dr.Jit uses the memory of NumPy's arrays as it is, and reads a packet at once only where it is aligned so: else the
     kernel would be slower, and another one from one allocation to the next.

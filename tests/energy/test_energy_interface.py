@@ -255,7 +255,7 @@ def test_no_interface_and_no_sheet_sends_out_more_than_came(seed):
 @pytest.mark.usefixtures("llvm")
 def test_the_renderer_reads_the_table_of_each_side():
     of = tables("sawtooth")
-    energy = Energy([*of[1], *of[-1]], index=INDEX)
+    energy = Energy([*of[1], *of[-1]])
     omega, wavelengths = anywhere(np.random.default_rng(3), 400)
     for side, n in ((1, 1), (-1, INDEX)):
         for passes in (False, True):
@@ -265,5 +265,5 @@ def test_the_renderer_reads_the_table_of_each_side():
     e = [of[side][1].at(omega[:1], wavelengths[:1] / n)[0] for side, n in ((1, 1), (-1, INDEX))]
     there, back = vectors(omega[:1]), vectors(omega[:1] * [1, 1, -1])
     for wi, wo in ((there, back), (back, there)):
-        found = energy.factor(energy.places(wi, wo, mi.Float(1.0), None), mi.Float(1 / float(wavelengths[0])))
+        found = energy.factor(energy.places(wi, wo, mi.Float(1.0), 1.0), mi.Float(1 / float(wavelengths[0])))
         np.testing.assert_allclose(np.array(found).ravel(), min(e), atol=5e-4)
