@@ -89,18 +89,18 @@ class Energy:
         return "bounds the albedo by one, and loses {:.2g} in the mean, {:.2g} at most".format(*self.loss)
 
     def places(
-        self, wi: mi.Vector3f, wo: mi.Vector3f, height_scale: mi.Float, lateral_scale: mi.Float | None
+        self, wi: mi.Vector3f, wo: mi.Vector3f, height_scale: mi.Float, lateral_scale: mi.Float | float
     ) -> tuple[Place, Place]:
         """Return the places of a pair of directions.
 
         Args:
             wi, wo: along the pattern's axes, each inside the medium that it is in, z < 0 below.
             height_scale: of the heights at the point; of effect where there are tables for it.
-            lateral_scale: likewise; None for one.
+            lateral_scale: likewise.
         """
         places = self.place(wi), self.place(wo)
         if self.edges is not None:
-            lateral_scale = mi.Float(1.0) if lateral_scale is None else dr.detach(lateral_scale)
+            lateral_scale = dr.detach(lateral_scale)
             ratio = dr.detach(height_scale) / lateral_scale
             number = sum((dr.select(ratio > e, mi.UInt32(1), 0) for e in self.edges), mi.UInt32(0))
             for place in places:

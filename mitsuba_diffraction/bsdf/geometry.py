@@ -21,7 +21,7 @@ class Incidence:
         wi: ω_i along the axes of the pattern, outside of a coat.
         wavelength: λ in µm, outside of a coat.
         frequency: 1/λ in cycles/µm, outside of a coat.
-        lateral_frequency: 1/λ times the lateral scale: q of the table per λq.
+        lateral_scale: times the lengths along the surface.
         index: n of the coat relative to the outside; one without.
         least_kappa: κ of light that leaves along the horizon, rad/µm.
         kappa_span: by how much κ is larger for light that leaves along the normal, rad/µm.
@@ -30,12 +30,17 @@ class Incidence:
     wi: mi.Vector3f
     wavelength: mi.Float
     frequency: mi.Float
-    lateral_frequency: mi.Float
+    lateral_scale: mi.Float | float
     index: mi.Float
     least_kappa: mi.Float
     kappa_span: mi.Float
 
-    mirrored = None  # q is drawn as it is read
+    mirrored = 1  # q is drawn as it is read
+
+    @property
+    def lateral_frequency(self) -> mi.Float:
+        """q of the table per λq."""
+        return self.frequency * self.lateral_scale
 
     @property
     def radius(self) -> mi.Float:
@@ -59,8 +64,8 @@ class Incidence:
         """Return that at another wavelength (µm), from that at 1 µm."""
         wavelength = dr.detach(wavelength)
         frequency = dr.rcp(wavelength)
-        lateral, least, span = (x * frequency for x in (self.lateral_frequency, self.least_kappa, self.kappa_span))
-        return Incidence(self.wi, wavelength, frequency, lateral, self.index, least, span)
+        least, span = self.least_kappa * frequency, self.kappa_span * frequency
+        return Incidence(self.wi, wavelength, frequency, self.lateral_scale, self.index, least, span)
 
     @classmethod
     def of(
@@ -68,7 +73,7 @@ class Incidence:
         wi: mi.Vector3f,
         height_scale: mi.Float,
         coat: Coat | None = None,
-        lateral_scale: mi.Float | None = None,
+        lateral_scale: mi.Float | float = 1.0,
     ) -> Incidence:
         """Return that at a wavelength of 1 µm; under a coat, with what holds inside of it.
 
@@ -83,8 +88,7 @@ class Incidence:
             kappa_per_cosine *= coat.relative
             least = kappa_per_cosine * (coat.refracted(wi).z + critical)
             span = kappa_per_cosine * (1 - critical)
-        lateral = mi.Float(1.0) if lateral_scale is None else lateral_scale
-        values = wi, mi.Float(1.0), mi.Float(1.0), lateral, index, least, span
+        values = wi, mi.Float(1.0), mi.Float(1.0), lateral_scale, index, least, span
         return cls(*(dr.detach(value) for value in values))
 
 
@@ -101,7 +105,7 @@ class Geometry:
         index: n of the coat relative to the outside; one without.
         height_scale: times the heights.
         shadowing: whether G is a factor.
-        lateral_scale: times the lengths along the surface; None for one.
+        lateral_scale: times the lengths along the surface.
     """
 
     wi: mi.Vector3f
@@ -111,7 +115,7 @@ class Geometry:
     index: mi.Float
     height_scale: mi.Float
     shadowing: bool
-    lateral_scale: mi.Float | None = None
+    lateral_scale: mi.Float | float
 
     @classmethod
     def of(
@@ -121,7 +125,7 @@ class Geometry:
         coat: Coat | None = None,
         height_scale: mi.Float | float = 1.0,
         shadowing: bool = True,
-        lateral_scale: mi.Float | None = None,
+        lateral_scale: mi.Float | float = 1.0,
     ) -> Geometry:
         """Return that of ω_i and ω_o, along the pattern's axes and outside of the coat."""
         cosines = (omega.z if coat is None else coat.refracted(omega).z for omega in (wi, wo))
@@ -142,10 +146,6 @@ class Geometry:
         """Return ω_i and ω_o inside of the coat."""
         pairs = (self.wi, self.cos_i), (self.wo, self.cos_o)
         return tuple(mi.Vector3f(omega.x / self.index, omega.y / self.index, cos) for omega, cos in pairs)
-
-    def reflects(self) -> mi.Bool:
-        """Return whether both directions are above the surface."""
-        return (self.cos_i > 0) & (self.cos_o > 0)
 
     def kappa(self, frequency: mi.Float) -> mi.Float:
         """Return κ = 2π n (cos θ_i + cos θ_o)/λ times the scale of the heights; `frequency` is 1/λ outside."""
@@ -218,11 +218,6 @@ class Geometry:
         # Where the order does not propagate the root would have no derivative.
         per = dr.rcp(dr.square(self.index))
         return *(dr.sqrt(larger(dr.fma(x, per, 1 - per), 1e-12)) for x in outside), gain
-
-
-def scaled(frequency: mi.Float, lateral_scale: mi.Float | None) -> mi.Float:
-    """Return a frequency times the lateral scale; None is one, and costs nothing."""
-    return frequency if lateral_scale is None else frequency * lateral_scale
 
 
 def turned(omega: mi.Vector3f, sin: mi.Float, cos: mi.Float) -> mi.Vector3f:

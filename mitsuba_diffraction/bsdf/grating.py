@@ -44,12 +44,10 @@ class Grating:
         self.coat = media.coat
         self.scales = Scales(props)
         self.spectrum, self.recipe = surface_from(props, media, self.scales.max_scale)
-        rigorous = isinstance(self.spectrum, RigorousSpectrum)
-        if not rigorous:
-            warn_of_range(self.spectrum)
-        if rigorous:
+        if isinstance(self.spectrum, RigorousSpectrum):
             self.theory = RigorousTheory(props, self.spectrum, media)
         else:
+            warn_of_range(self.spectrum)
             self.theory = ScalarTheory(props, self.spectrum, media, self.scales)
         angle = props.get("orientation", 0.0)
         if isinstance(angle, float) and not np.isfinite(angle):
@@ -104,7 +102,7 @@ class Grating:
         for channel, seen in enumerate(covered):
             if self.scattering.resolved:
                 frequency = dr.rcp(self._wavelength(si, channel))
-                seen &= self.scattering.meets(u * frequency, v * frequency, *_given(lateral_scale))
+                seen &= self.scattering.meets(u * frequency, v * frequency, lateral_scale)
             near |= dr.select(active & seen, mi.UInt32(1 << channel), 0)
         # Most directions lie between the orders of a grating at all wavelengths: unless drawn, they skip what follows.
         needed = near != 0 if self.scattering.resolved and not wo_is_sample else True
@@ -129,7 +127,7 @@ class Grating:
         wi: mi.Vector3f,
         wo: mi.Vector3f,
         height_scale: mi.Float,
-        lateral_scale: mi.Float | None,
+        lateral_scale: mi.Float | float,
     ) -> tuple[mi.UnpolarizedSpectrum, mi.Float]:
         """Return f cos θ_o, and the sum over the wavelengths of the densities; directions along the pattern's axes.
 
@@ -278,8 +276,8 @@ class Grating:
         wavelength = dr.detach(wavelength)
         sin, cos = (dr.detach(x) for x in self.frame(si, active))
         wi = turned(si.wi, sin, cos)
-        height_scale, lateral_scale = (None if s is None else dr.detach(s) for s in self.scales.at(si, active))
-        arguments = rest, v, active & diffracted, *_given(lateral_scale)
+        height_scale, lateral_scale = (dr.detach(s) for s in self.scales.at(si, active))
+        arguments = rest, v, active & diffracted
         if interface is None:
             incidence = Incidence.of(wi, height_scale, self.coat, lateral_scale).at(wavelength)
             q, propagates = self.scattering.sample(incidence, *arguments)
@@ -289,7 +287,7 @@ class Grating:
             return dr.select(uniform, mi.warp.square_to_uniform_hemisphere(v), mi.Vector3f(x, y, z))
         i = interface.side(wi)
         o = interface.other(i, u_side >= passing)
-        incidence = CrossingIncidence.of(i, o, interface, height_scale, None, lateral_scale).at(wavelength)
+        incidence = CrossingIncidence.of(i, o, interface, height_scale, lateral_scale=lateral_scale).at(wavelength)
         q, propagates = self.scattering.sample(incidence, *arguments)
         wo = turned(mi.Vector3f(*(o.tangent - wavelength * incidence.mirrored * q), 0), -sin, cos) / o.outside
         wo.z = dr.select(propagates, dr.safe_sqrt(1 - dr.square(wo.x) - dr.square(wo.y)), 0)
@@ -307,11 +305,6 @@ class Grating:
             str(self.theory),
         ]
         return "\n".join(lines)
-
-
-def _given(lateral_scale: mi.Float | None) -> list[mi.Float]:
-    """Return a lateral scale as an argument of spectra that can have one."""
-    return [] if lateral_scale is None else [lateral_scale]
 
 
 def _uniform_share(covered: mi.Float) -> mi.Float:

@@ -21,7 +21,7 @@ from ..grating_spectrum import GratingSpectrum
 from ..spectrum.grids import LobeAxis
 from ..spectrum.tables import HALF_SCALE, SeriesTable, SliceTable, shared_exponents
 from .cell_sampler import LOBE, CellAxis, CellSampler
-from .geometry import Geometry, Incidence, scaled
+from .geometry import Geometry, Incidence
 from .inversion import CELLS, KappaCells, averages, choose, search, sums_before, truncated_gaussian
 from .order_table import OrderTable
 from .tables import (
@@ -511,10 +511,10 @@ class OrderSpectrum:
         scales = (axis.max_scale for axis in self.axes if axis.max_order)
         return min(scales, default=np.inf) if self.resolved else None
 
-    def meets(self, q_x: mi.Float, q_y: mi.Float, scale: mi.Float | None = None) -> mi.Bool:
+    def meets(self, q_x: mi.Float, q_y: mi.Float, scale: mi.Float | float) -> mi.Bool:
         """Return whether q (cycles/µm) lies in the lobe of an order, where they are resolved; `scale` is lateral."""
         along_x, along_y = self.axes
-        q_x, q_y = scaled(q_x, scale), scaled(q_y, scale)
+        q_x, q_y = q_x * scale, q_y * scale
         return along_x.holds(along_x.first(q_x), q_x, scale) & along_y.holds(along_y.first(q_y), q_y, scale)
 
     def evaluate(
@@ -532,79 +532,44 @@ class OrderSpectrum:
             incidence: the wavelength and where it comes from.
             active: mask; where orders are resolved, q lies in the lobe of one (`meets`).
         """
+        # Of lengths along the surface; one where orders overlap.
+        scale = geometry.lateral_scale
+        q = geometry.tangent * (incidence.frequency * scale)
+        m_x, m_y = (axis.first(q) for axis, q in zip(self.axes, q, strict=True))
+        lobes_x, lobes_y = self.axes[0].lobes(m_x, q.x, scale), self.axes[1].lobes(m_y, q.y, scale)
+        mirrored, factor = incidence.mirrored, 1
         if self.resolved:
-            power, density = self._of_order(geometry, incidence, active)
+            tangent = self._tangent(m_x, m_y, incidence.wavelength / scale)
+            factor = geometry.order_factor(tangent, incidence, self.per_width)
+            share = self.orders.share(mi.Int32(mirrored) * m_x, mi.Int32(mirrored) * m_y, incidence, active)
+            # An order that does not propagate is not drawn.
+            there = incidence.propagates(mirrored * tangent)
+            density = dr.select(there, share * lobes_x[0] * lobes_y[0], 0)
         else:
-            q, kappa = geometry.tangent * incidence.frequency, geometry.kappa(incidence.frequency)
-            m_x, m_y = (axis.first(q) for axis, q in zip(self.axes, q, strict=True))
-            lobes_x, lobes_y = self.axes[0].lobes(m_x, q.x), self.axes[1].lobes(m_y, q.y)
-            factor = 1
+            density = self.cells.density(mirrored * q, incidence, active)
             if self.line:
-                lobes_x, lobes_y = self._weighted(m_x, m_y, lobes_x, lobes_y, geometry, incidence)
+                factors = [
+                    geometry.order_factor(
+                        self._tangent(m_x + x, m_y + y, incidence.wavelength), incidence, self.per_width
+                    )
+                    for x, y in np.ndindex(len(lobes_x), len(lobes_y))
+                ]
+                if len(lobes_x) > 1:
+                    lobes_x = [lobe * factor for lobe, factor in zip(lobes_x, factors, strict=True)]
+                else:
+                    lobes_y = [lobe * factor for lobe, factor in zip(lobes_y, factors, strict=True)]
             else:
                 factor = geometry.continuum_factor(incidence, self.per_width)
-            power = factor * self._power(m_x, m_y, lobes_x, lobes_y, kappa, geometry.small(), active)
-            density = self.cells.density(q if incidence.mirrored is None else incidence.mirrored * q, incidence, active)
+        row, column = (m + (axis.max_order + axis.rim) for m, axis in zip((m_y, m_x), self.axes[::-1], strict=True))
+        at = self.power.at(geometry.kappa(incidence.frequency), active, geometry.small())
+        power = factor * self.power.window(row, column, lobes_x, lobes_y, at, active)
         # Interpolation may dip below zero by its error.
         return dr.select(active, larger(power, 0), 0), density
 
-    def _weighted(
-        self,
-        m_x: mi.Int32,
-        m_y: mi.Int32,
-        lobes_x: list[mi.Float],
-        lobes_y: list[mi.Float],
-        geometry: Geometry,
-        incidence: Incidence,
-    ) -> tuple[list[mi.Float], list[mi.Float]]:
-        """Return the lobes of a line grating's orders from (m_x, m_y) on, times K G cos θ_o and gain of each."""
-
-        def factor(x: int, y: int) -> mi.Float:
-            tangent = self._tangent(m_x + x, m_y + y, incidence.wavelength)
-            return geometry.order_factor(tangent, incidence, self.per_width)
-
-        if len(lobes_x) > 1:
-            return [lobe * factor(step, 0) for step, lobe in enumerate(lobes_x)], lobes_y
-        return lobes_x, [lobe * factor(0, step) for step, lobe in enumerate(lobes_y)]
-
     def _tangent(self, m_x: mi.Int32, m_y: mi.Int32, wavelength: mi.Float) -> mi.Vector2f:
         """Return λq of an order; `wavelength` is λ over the lateral scale."""
-        pitches = (axis.pitch for axis in self.axes)
-        orders = zip((m_x, m_y), pitches, strict=True)
-        return mi.Vector2f(*(mi.Float(m) * pitch for m, pitch in orders)) * wavelength
-
-    def _power(
-        self,
-        m_x: mi.Int32,
-        m_y: mi.Int32,
-        lobes_x: list[mi.Float],
-        lobes_y: list[mi.Float],
-        kappa: mi.Float,
-        small: Small | None,
-        active: mi.Bool,
-    ) -> mi.Float:
-        """Return Σ_m η_m(κ) N(q − m/T; σ_q² I) over the orders from (m_x, m_y) on."""
-        at = self.power.at(kappa, active, small)
-        row, column = (m + (axis.max_order + axis.rim) for m, axis in zip((m_y, m_x), self.axes[::-1], strict=True))
-        return self.power.window(row, column, lobes_x, lobes_y, at, active)
-
-    def _of_order(self, geometry: Geometry, incidence: Incidence, near: mi.Bool) -> tuple[mi.Float, mi.Float]:
-        """Evaluate the one order in whose lobe q lies where `near`."""
-        scale = geometry.lateral_scale
-        frequency = scaled(incidence.frequency, scale)
-        q = geometry.tangent * frequency
-        m_x, m_y = (axis.first(q) for axis, q in zip(self.axes, q, strict=True))
-        lobes_x, lobes_y = self.axes[0].lobes(m_x, q.x, scale), self.axes[1].lobes(m_y, q.y, scale)
-        power = self._power(m_x, m_y, lobes_x, lobes_y, geometry.kappa(incidence.frequency), geometry.small(), near)
-        tangent = self._tangent(m_x, m_y, incidence.wavelength if scale is None else incidence.wavelength / scale)
-        power *= geometry.order_factor(tangent, incidence, self.per_width)
-        if incidence.mirrored is not None:
-            m_x, m_y = (mi.Int32(incidence.mirrored) * m for m in (m_x, m_y))
-            tangent = incidence.mirrored * tangent
-        share = self.orders.share(m_x, m_y, incidence, near)
-        # An order that does not propagate is not drawn.
-        there = incidence.propagates(tangent)
-        return power, dr.select(there, share * lobes_x[0] * lobes_y[0], 0)
+        along_x, along_y = self.axes
+        return mi.Vector2f(mi.Float(m_x) * along_x.pitch, mi.Float(m_y) * along_y.pitch) * wavelength
 
     def sample(
         self,
@@ -612,13 +577,13 @@ class OrderSpectrum:
         u: mi.Float,
         v: mi.Point2f,
         active: mi.Bool,
-        scale: mi.Float | None = None,
     ) -> tuple[mi.Point2f, mi.Bool]:
-        """Draw q in cycles/µm, for one wavelength, and tell whether the order of q propagates; `scale` is lateral."""
+        """Draw q in cycles/µm, for one wavelength, and tell whether the order of q propagates."""
         if self.cells is not None:
             return self.cells.sample(incidence, u, v, active), active
         m_x, m_y, v = self.orders.sample(incidence, u, v, active)
-        tangent = self._tangent(m_x, m_y, incidence.wavelength if scale is None else incidence.wavelength / scale)
+        scale = incidence.lateral_scale
+        tangent = self._tangent(m_x, m_y, incidence.wavelength / scale)
         q = mi.Point2f(self.axes[0].place(m_x, v.x, scale), self.axes[1].place(m_y, v.y, scale))
         return q, incidence.propagates(tangent)
 
@@ -644,19 +609,17 @@ class _Axis:
         """Return the first of the `count` orders that contribute at q (cycles/µm)."""
         return mi.Int32(-self.max_order) if self.all else mi.Int32(dr.ceil(q * self.size - 0.5 * self.count))
 
-    def holds(self, m: mi.Int32, q: mi.Float, scale: mi.Float | None = None) -> mi.Bool:
+    def holds(self, m: mi.Int32, q: mi.Float, scale: mi.Float | float) -> mi.Bool:
         """Return whether there is an order m, and q, times the lateral scale, lies in its lobe."""
         offset = dr.fma(-self.pitch, mi.Float(m), q)
-        return (dr.abs(m) <= self.max_order) & (dr.abs(offset) <= scaled(self.half_width, scale))
+        return (dr.abs(m) <= self.max_order) & (dr.abs(offset) <= self.half_width * scale)
 
-    def lobes(self, first: mi.Int32, q: mi.Float, scale: mi.Float | None = None) -> list[mi.Float]:
+    def lobes(self, first: mi.Int32, q: mi.Float, scale: mi.Float | float = 1.0) -> list[mi.Float]:
         """Return N(q − m/T; σ_q²) of each of these orders, µm; zero beyond the half width.
 
         With a lateral scale s, `q` is s times the frequency, and there is one order: N(q/s − m/(sT); σ_q²).
         """
-        offset = dr.fma(-self.pitch, mi.Float(first), q)
-        if scale is not None:
-            offset = offset / scale
+        offset = dr.fma(-self.pitch, mi.Float(first), q) / scale
         if self.all:
             offsets = [dr.fma(-self.pitch, step, offset) for step in range(self.count)]
             return [self.peak * dr.exp(self.falloff * dr.square(offset)) for offset in offsets]
@@ -670,7 +633,6 @@ class _Axis:
             lobes.append(lobe * step)
         return lobes
 
-    def place(self, m: mi.Int32, u: mi.Float, scale: mi.Float | None = None) -> mi.Float:
+    def place(self, m: mi.Int32, u: mi.Float, scale: mi.Float | float) -> mi.Float:
         """Return the q in the lobe of an order with the share `u` of it below, cycles/µm."""
-        pitch = self.pitch if scale is None else self.pitch / scale
-        return dr.fma(pitch, mi.Float(m), truncated_gaussian(u, self.inside, self.spread))
+        return dr.fma(self.pitch / scale, mi.Float(m), truncated_gaussian(u, self.inside, self.spread))

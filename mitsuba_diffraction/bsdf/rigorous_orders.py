@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import drjit as dr
@@ -110,13 +111,22 @@ class RigorousOrders:
         self.period, self.pitch = opaque(axes.period), opaque(1 / axes.period)
         self.shortest, self.longest = (opaque(w) for w in axes.wavelengths)
 
-    def meets(self, q_x: mi.Float, q_y: mi.Float) -> mi.Bool:
-        """Whether q lies in the lobe of an order; q in cycles/µm."""
+    def meets(self, q_x: mi.Float, q_y: mi.Float, scale: float = 1.0) -> mi.Bool:
+        """Whether q lies in the lobe of an order; q in cycles/µm, the lateral scale is one."""
         return (mi.Float(self._first(q_x)) * self.pitch - q_x <= self.half_width) & (dr.abs(q_y) <= self.half_width)
 
     def _first(self, q_x: mi.Float) -> mi.Int32:
         """The first order whose lobe may hold q_x."""
         return mi.Int32(dr.ceil((q_x - self.half_width) * self.period))
+
+    def _near(self, pair: _Pair, active: mi.Bool) -> Iterator[tuple[mi.Int32, mi.Float, mi.Bool]]:
+        """The orders whose lobes may hold q: m, |q − m/T|², and where they do along x."""
+        first = self._first(pair.q_x)
+        for step in range(self.count):
+            m = first + step
+            offset = dr.fma(-self.pitch, mi.Float(m), pair.q_x)
+            there = active & (dr.abs(offset) <= self.half_width) & (dr.abs(m) <= self.max_order)
+            yield m, dr.square(offset) + dr.square(pair.q_y), there
 
     def evaluate(
         self, geometry: Geometry | Crossing, incidence: Incidence | CrossingIncidence, active: mi.Bool
@@ -137,15 +147,9 @@ class RigorousOrders:
         else:
             # Its tables are those inside of a coat.
             pair = self._pair(*geometry.inside(), geometry.index * frequency, None)
-        q_x, q_y = pair.q_x, pair.q_y
         cell = self._cell(incidence)
-        first = self._first(q_x)
         power, density = mi.Float(0.0), mi.Float(0.0)
-        for step in range(self.count):
-            m = first + step
-            offset = dr.fma(-self.pitch, mi.Float(m), q_x)
-            there = active & (dr.abs(offset) <= self.half_width) & (dr.abs(m) <= self.max_order)
-            square = dr.square(offset) + dr.square(q_y)
+        for m, square, there in self._near(pair, active):
             lobe = dr.select(there, self.peak * dr.exp(self.falloff * square), 0)
             tangent = mi.Vector2f(mi.Float(m) * self.pitch * incidence.wavelength, 0)
             *_, gain = geometry.of_order(tangent, frequency * self.per_width)
@@ -199,15 +203,9 @@ class RigorousOrders:
             above: whether each is above; None without transmission.
         """
         pair = self._pair(source, exit_, frequency, above)
-        q_x, q_y = pair.q_x, pair.q_y
-        first = self._first(q_x)
         rows = [mi.Vector4f(0.0) for _ in range(4)]
-        for step in range(self.count):
-            m = first + step
-            offset = dr.fma(-self.pitch, mi.Float(m), q_x)
-            there = active & (dr.abs(offset) <= self.half_width) & (dr.abs(q_y) <= self.half_width)
-            there &= dr.abs(m) <= self.max_order
-            lobe = dr.select(there, dr.exp(self.falloff * (dr.square(offset) + dr.square(q_y))), 0)
+        for m, square, there in self._near(pair, active & (dr.abs(pair.q_y) <= self.half_width)):
+            lobe = dr.select(there, dr.exp(self.falloff * square), 0)
             for row, found in enumerate(self._matrix(m, pair, there)):
                 rows[row] += lobe * found
         bright = rows[0].x > 0

@@ -127,9 +127,9 @@ class Scales:
         """By how much shorter wavelengths the spectrum must reach than without scales."""
         return max(1.0, *(float(scale.values[-1]) for scale in self))
 
-    def at(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> tuple[mi.Float, mi.Float | None]:
-        """Evaluate the height scale and the lateral one, None for 1, at a point."""
-        return self.height.at(si, active), None if self.lateral is None else self.lateral.at(si, active)
+    def at(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> tuple[mi.Float, mi.Float | float]:
+        """Evaluate the height scale and the lateral one at a point."""
+        return self.height.at(si, active), 1.0 if self.lateral is None else self.lateral.at(si, active)
 
     @property
     def vary(self) -> bool:

@@ -158,7 +158,7 @@ class Crossing:
         height_scale: times the heights.
         shadowing: whether G is a factor.
         least_kappa: κ₁ in rad/µm, or None, as of `Interface`.
-        lateral_scale: times the lengths along the surface; None for one.
+        lateral_scale: times the lengths along the surface.
     """
 
     i: Side
@@ -171,7 +171,7 @@ class Crossing:
     height_scale: mi.Float
     shadowing: bool
     least_kappa: mi.Float | None
-    lateral_scale: mi.Float | None
+    lateral_scale: mi.Float | float
 
     index = 1.0  # of the wavelengths that are handed to E, those above
 
@@ -183,7 +183,7 @@ class Crossing:
         height_scale: mi.Float,
         shadowing: bool,
         least_kappa: mi.Float | None,
-        lateral_scale: mi.Float | None = None,
+        lateral_scale: mi.Float | float = 1.0,
     ) -> Crossing:
         """Return that of directions on two sides."""
         w, along = i.z + o.z, i.tangent + o.tangent
@@ -279,7 +279,7 @@ class CrossingIncidence:
         wi: k_i,∥, or its opposite where −q is drawn; |cos θ_i| outside.
         wavelength: λ above, µm.
         frequency: 1/λ above.
-        lateral_frequency: 1/λ times the lateral scale: q of the table per λq.
+        lateral_scale: times the lengths along the surface.
         above: whether it comes from above.
         index: n_i outside.
         radius: n_o times that, to which |q| of the table extends around that of −k_i,∥ where light propagates.
@@ -296,7 +296,7 @@ class CrossingIncidence:
     wi: mi.Vector3f
     wavelength: mi.Float
     frequency: mi.Float
-    lateral_frequency: mi.Float
+    lateral_scale: mi.Float | float
     above: mi.Bool
     index: mi.Float
     radius: mi.Float
@@ -309,6 +309,11 @@ class CrossingIncidence:
     leaves: tuple[mi.Float, mi.Float, mi.Float]
     reflects: mi.Bool
 
+    @property
+    def lateral_frequency(self) -> mi.Float:
+        """q of the table per λq."""
+        return self.frequency * self.lateral_scale
+
     def at(self, wavelength: mi.Float) -> CrossingIncidence:
         """Return that at another wavelength (µm), from that at 1 µm."""
         wavelength = dr.detach(wavelength)
@@ -317,7 +322,6 @@ class CrossingIncidence:
             self,
             wavelength=wavelength,
             frequency=frequency,
-            lateral_frequency=self.lateral_frequency * frequency,
             radius=self.radius * frequency,
             per_kappa=self.per_kappa * wavelength,
         )
@@ -329,12 +333,12 @@ class CrossingIncidence:
         o: Side,
         interface: Interface,
         height_scale: mi.Float,
-        flip: mi.Float | None,
-        lateral_scale: mi.Float | None = None,
+        flip: mi.Float | float = 1.0,
+        lateral_scale: mi.Float | float = 1.0,
     ) -> CrossingIncidence:
         """Return that of light from the side `i` to the side `o`, at a wavelength of 1 µm.
 
-        `flip` is the sign of κ of a pair that is evaluated; None where a direction is drawn.
+        `flip` is the sign of κ of a pair that is evaluated; one where a direction is drawn.
         """
         reflects = i.sign == o.sign
         assumed = dr.select(reflects & (i.sign > 0), mi.Float(1), -1)
@@ -348,18 +352,17 @@ class CrossingIncidence:
         undiffracted, steep = (dr.abs(i.z + o.sign * z) for z in (snell, 0.7 * snell))
         near = smaller(undiffracted, steep), dr.rcp(larger(dr.abs(undiffracted - steep), 1e-4))
         horizon, normal = o.normal(mi.Float(0)), o.inside
-        lateral = mi.Float(1.0) if lateral_scale is None else lateral_scale
         per_v = larger(dr.two_pi * height_scale, 1e-6)
         values = (
             mi.Vector3f(assumed * i.tangent.x, assumed * i.tangent.y, dr.sqrt(i.square) / i.outside),
             mi.Float(1.0),
             mi.Float(1.0),
-            lateral,
+            lateral_scale,
             i.sign > 0,
             i.outside,
-            radius * lateral,
+            radius * lateral_scale,
             dr.safe_sqrt(1 - across),
-            assumed if flip is None else assumed * flip,
+            assumed * flip,
             square,
             dr.rcp(per_v),
             near,

@@ -307,7 +307,7 @@ def test_the_energy_of_very_different_heights_is_that_of_each(llvm, parameters):
 
     def found(bsdf, height, under):
         energy = bsdf.layers.grating.theory.energy
-        places = energy.places(vectors(wi * [1, 1, under]), vectors(wo), mi.Float(height), None)
+        places = energy.places(vectors(wi * [1, 1, under]), vectors(wo), mi.Float(height), 1.0)
         return np.array(energy.factor(places, floats(np.full(count, 1 / 0.55))))
 
     for height in heights:

@@ -207,7 +207,7 @@ def test_orders_on_either_side_are_drawn_with_their_shares(profile, theta, is_sh
     interface = Interface(mi.Float(ETA), is_sheet, (mi.Float(1.0), mi.Float(1.0)), table.transmitted)
     i = interface.side(vectors(towards(theta, 20, 1 if above else -1)))
     o = interface.other(i, mi.Bool(reflects))
-    incidence = CrossingIncidence.of(i, o, interface, mi.Float(1.0), None).at(mi.Float(WAVELENGTH))
+    incidence = CrossingIncidence.of(i, o, interface, mi.Float(1.0)).at(mi.Float(WAVELENGTH))
     m_x, m_y = np.meshgrid(*spectrum.grid.axes())
     share = np.array(table.share(mi.Int32(m_x.ravel()), mi.Int32(m_y.ravel()), incidence, mi.Bool(True)), np.float64)
     assert share.sum() == pytest.approx(1, abs=1e-6)

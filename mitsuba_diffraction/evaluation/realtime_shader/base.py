@@ -55,7 +55,7 @@ class Gain:
     def __init__(self, wi: mi.Vector3f, wo: mi.Vector3f, shadowing: bool, active: mi.Bool) -> None:
         # K and G are symmetric: exchanging the directions turns K G cos θ_o into K G cos θ_i.
         geometry = Geometry.of(wo, wi, shadowing=shadowing)
-        self.active = active & geometry.reflects()
+        self.active = active & (geometry.cos_i > 0) & (geometry.cos_o > 0)
         self.falloff = schlick_falloff(geometry.cos_half())
         self.factor = dr.select(self.active, geometry.k_g() * geometry.cos_o, 0)
         (self.u, self.v), self.w = geometry.tangent, geometry.w
