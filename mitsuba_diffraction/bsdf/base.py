@@ -97,19 +97,18 @@ class Base:
         self.has_delta = bool(flags & +mi.BSDFFlags.DeltaReflection)
         self._is_diffuse = bool(flags & +mi.BSDFFlags.DiffuseReflection)
 
-    def context(self, ctx: mi.BSDFContext, before: int) -> mi.BSDFContext | None:
-        """The same request to the nested BSDF, `before` components of others before its own; None if it has no part."""
-        if not any(self._asked(ctx, flags, before + i) for i, flags in enumerate(self.components)):
+    def context(self, ctx: mi.BSDFContext) -> mi.BSDFContext | None:
+        """The same request to the nested BSDF, whose components follow that of the grating; None if it has no part."""
+        if not any(
+            flags & +mi.BSDFFlags.FrontSide and flags & +kind and ctx.is_enabled(kind, component)
+            for component, flags in enumerate(self.components, 1)
+            for kind in REFLECTS
+        ):
             return None
         inner = mi.BSDFContext(ctx.mode)
         inner.type_mask = ctx.type_mask
-        inner.component = ctx.component if ctx.component == mi.BSDFContext().component else ctx.component - before
+        inner.component = ctx.component if ctx.component == mi.BSDFContext().component else ctx.component - 1
         return inner
-
-    @staticmethod
-    def _asked(ctx: mi.BSDFContext, flags: int, component: int) -> bool:
-        front = flags & +mi.BSDFFlags.FrontSide
-        return bool(front) and any(flags & +kind and ctx.is_enabled(kind, component) for kind in REFLECTS)
 
     def albedo(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Float:
         """Estimate the albedo, averaged over the wavelengths, to divide samples by."""

@@ -148,7 +148,7 @@ def define() -> type:
             return self.layers.sample(ctx, si, sample1, sample2, active)
 
         def to_string(self) -> str:
-            lines = "\n".join(f"  {line}," for line in str(self.layers).splitlines())
+            lines = "\n".join(f"  {line}," for line in str(self.layers.grating).splitlines())
             return f"DiffractionGrating[\n{lines}\n]"
 
     return DiffractionGrating

@@ -90,7 +90,7 @@ class Layers:
             ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0),
             self.interface is not None and ctx.is_enabled(mi.BSDFFlags.GlossyTransmission, 1),
             len(self.components) > self.face and ctx.is_enabled(mi.BSDFFlags.DeltaReflection, self.face),
-            None if self.base is None else self.base.context(ctx, before=1),
+            None if self.base is None else self.base.context(ctx),
         )
 
     def _passing(self, si: mi.SurfaceInteraction3f, asked: Asked) -> mi.Float:
@@ -250,9 +250,6 @@ class Layers:
             bs.pdf = dr.select(mirror, dr.select(above, own * below_sample.pdf, 0), bs.pdf)
             result = dr.select(mirror, dr.select(above, _attenuated(through, weight), 0), result)
         return bs, result
-
-    def __str__(self) -> str:
-        return str(self.grating)
 
 
 def _attenuated(factor: mi.UnpolarizedSpectrum, value: mi.Spectrum) -> mi.Spectrum:

@@ -49,6 +49,9 @@ class PerfectMirror:
 
     transparent = False
 
+    def __init__(self, name: str = "none (R = 1)") -> None:
+        self.name = name
+
     def __call__(self, si: mi.SurfaceInteraction3f, cos_half: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
         return mi.UnpolarizedSpectrum(1.0)
 
@@ -62,7 +65,7 @@ class PerfectMirror:
         pass
 
     def __repr__(self) -> str:
-        return "none (R = 1)"
+        return self.name
 
 
 class Dielectric:

@@ -46,7 +46,7 @@ def settings_from(props: mi.Properties, coat: Coat | None) -> dict[str, str | fl
     if isinstance(found, PerfectMirror):
         raise RequestError("material: got 'none', wanted a real one for theory=rigorous, such as 'Al'")
     # As many digits as a float32 has.
-    eta = float(found.eta[0] if hasattr(found.eta, "__len__") else found.eta) * (1 if coat is None else coat.relative)
+    eta = float(np.max(found.eta)) * (1 if coat is None else coat.relative)
     return {"int_ior": float(f"{eta:.6g}")}
 
 
@@ -265,8 +265,8 @@ def refuse_scalar_only(props: mi.Properties) -> None:
             raise RequestError(f"{name}: got {got}, wanted none with theory=rigorous: {advice}")
 
 
-def check_parameters(props: mi.Properties, spectrum: RigorousSpectrum, coat: Coat | None) -> InEfficiencies:
-    """What a scene says beside a rigorous spectrum.
+def check_parameters(props: mi.Properties, spectrum: RigorousSpectrum, coat: Coat | None) -> PerfectMirror:
+    """Return R = 1 beside a rigorous spectrum, whose efficiencies are those of the material.
 
     Raises:
         ValueError: if it is of another material, medium or kind of light, or says something that rigorous theory does
@@ -292,22 +292,9 @@ def check_parameters(props: mi.Properties, spectrum: RigorousSpectrum, coat: Coa
         else:
             same = not spectrum.material and abs(wanted["int_ior"] - spectrum.int_ior) < 1e-3 * abs(spectrum.int_ior)
         if not same:
+            got = " ".join(f"{name} {value}" for name, value in wanted.items())
             raise RequestError(
-                f"material: got {_named(wanted)}, but the rigorous spectrum is of {spectrum.material_name}: "
+                f"material: got {got}, but the rigorous spectrum is of {spectrum.material_name}: "
                 "leave it out, or build the spectrum for this material"
             )
-    return InEfficiencies(spectrum.material_name)
-
-
-def _named(material: dict[str, str | float]) -> str:
-    return " ".join(f"{name} {value}" for name, value in material.items())
-
-
-class InEfficiencies(PerfectMirror):
-    """R = 1 beside efficiencies that are those of the material."""
-
-    def __init__(self, name: str) -> None:
-        self.name = name
-
-    def __repr__(self) -> str:
-        return f"{self.name}, in the efficiencies"
+    return PerfectMirror(f"{spectrum.material_name}, in the efficiencies")
