@@ -179,6 +179,10 @@ class Geometry:
         square = dr.squared_norm(tangent) / dr.square(self.index)
         return k_g(cos_i, cos_o, square, self.shadowing) * gain * self.cos_o
 
+    def order_kappa(self, tangent: mi.Vector2f, incidence: Incidence) -> mi.Float:
+        """Return κ in rad/µm of the pair, whatever the order."""
+        return self.kappa(incidence.frequency)
+
     def continuum_factor(self, incidence: Incidence, per_width: mi.Float) -> mi.Float:
         """Return K G cos θ_o and gain where orders overlap, so that no single one is known.
 

@@ -72,9 +72,9 @@ def small_kappa(
         factors, first, second: at κ, κ₁ and 2κ₁.
     """
     least, where = small
-    x = kappa / least
+    x = kappa / larger(least, 1e-30)
     line = (2 - x) * first + 0.25 * (x - 1) * second
-    return dr.select(where & (x < 1), line, factors)
+    return dr.select(where & (kappa < least), line, factors)
 
 
 class _Power:
@@ -537,10 +537,13 @@ class OrderSpectrum:
         q = geometry.tangent * (incidence.frequency * scale)
         m_x, m_y = (axis.first(q) for axis, q in zip(self.axes, q, strict=True))
         lobes_x, lobes_y = self.axes[0].lobes(m_x, q.x, scale), self.axes[1].lobes(m_y, q.y, scale)
-        mirrored, factor = incidence.mirrored, 1
+        mirrored, factor, kappa = incidence.mirrored, 1, geometry.kappa(incidence.frequency)
+        # Orders that are read at one κ: first column and row, lobes, κ.
+        windows = [(0, 0, lobes_x, lobes_y, kappa)]
         if self.resolved:
             tangent = self._tangent(m_x, m_y, incidence.wavelength / scale)
             factor = geometry.order_factor(tangent, incidence, self.per_width)
+            windows = [(0, 0, lobes_x, lobes_y, geometry.order_kappa(tangent, incidence))]
             share = self.orders.share(mi.Int32(mirrored) * m_x, mi.Int32(mirrored) * m_y, incidence, active)
             # An order that does not propagate is not drawn.
             there = incidence.propagates(mirrored * tangent)
@@ -548,21 +551,18 @@ class OrderSpectrum:
         else:
             density = self.cells.density(mirrored * q, incidence, active)
             if self.line:
-                factors = [
-                    geometry.order_factor(
-                        self._tangent(m_x + x, m_y + y, incidence.wavelength), incidence, self.per_width
-                    )
-                    for x, y in np.ndindex(len(lobes_x), len(lobes_y))
-                ]
-                if len(lobes_x) > 1:
-                    lobes_x = [lobe * factor for lobe, factor in zip(lobes_x, factors, strict=True)]
-                else:
-                    lobes_y = [lobe * factor for lobe, factor in zip(lobes_y, factors, strict=True)]
+                windows = []
+                for x, y in np.ndindex(len(lobes_x), len(lobes_y)):
+                    tangent = self._tangent(m_x + x, m_y + y, incidence.wavelength)
+                    lobe = geometry.order_factor(tangent, incidence, self.per_width) * lobes_x[x]
+                    windows.append((x, y, [lobe], [lobes_y[y]], geometry.order_kappa(tangent, incidence)))
             else:
                 factor = geometry.continuum_factor(incidence, self.per_width)
         row, column = (m + (axis.max_order + axis.rim) for m, axis in zip((m_y, m_x), self.axes[::-1], strict=True))
-        at = self.power.at(geometry.kappa(incidence.frequency), active, geometry.small())
-        power = factor * self.power.window(row, column, lobes_x, lobes_y, at, active)
+        power = 0
+        for x, y, of_x, of_y, kappa in windows:
+            at = self.power.at(kappa, active, geometry.small())
+            power += factor * self.power.window(row + y, column + x, of_x, of_y, at, active)
         # Interpolation may dip below zero by its error.
         return dr.select(active, larger(power, 0), 0), density
 

@@ -14,7 +14,7 @@ from ..geometry import SHADOWING
 from ..grating_spectrum import GratingSpectrum
 from ..rigorous.spectrum import RigorousSpectrum
 from ..settings import VISIBLE
-from .coat import Coat
+from .coat import SAME_INDEX, Coat
 from .geometry import Geometry, turned
 from .media import Media
 from .order_table import CHANGE
@@ -133,6 +133,8 @@ class ScalarTheory:
         if self.media.eta is not None:
             # Tables serve for nearly the same index, so that a scene in which it varies smoothly is not slowed down.
             eta, before = float(np.max(dr.detach(self.material.eta))), self.media.eta
+            if not 0 < eta < np.inf or abs(eta - 1) < SAME_INDEX:
+                raise RequestError(f"eta: got {eta:g}, wanted a positive relative index other than one: light passes")
             other_index = abs(eta - before) > CHANGE * abs(before - 1)
             if other_index:
                 self.media = dataclasses.replace(self.media, eta=eta)

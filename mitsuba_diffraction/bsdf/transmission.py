@@ -101,7 +101,7 @@ class Interface:
         if self.kappas is None:
             return None
         first, undiffracted = self.kappas
-        return smaller(first, larger(undiffracted * dr.detach(height_scale), 1e-6))
+        return smaller(first, undiffracted * dr.detach(height_scale))
 
     @property
     def mirrors(self) -> bool:
@@ -225,6 +225,15 @@ class Crossing:
         squares, gain = self.of_order(self.flip * tangent, incidence.frequency * per_width)
         return self._k_g(*squares, dr.squared_norm(tangent), incidence) * gain * self.outgoing
 
+    def order_kappa(self, tangent: mi.Vector2f, incidence: CrossingIncidence) -> mi.Float:
+        """Return |κ| in rad/µm: the pair's of reflected light, and the order's, as K is, of light that passes.
+
+        K grows as 1/v_z² and the power falls as κ²: both have the same v_z.
+        """
+        (square_i, square_o), _ = self.of_order(self.flip * tangent, incidence.frequency)
+        v_z = dr.select(self.reflects, self.w, self.i.normal(square_i) - self.o.normal(square_o))
+        return dr.abs(v_z) * dr.two_pi * incidence.frequency * self.height_scale
+
     def continuum_factor(self, incidence: CrossingIncidence, per_width: mi.Float) -> mi.Float:
         """Return n_o² K G |cos θ_o| and gain where orders overlap, as `Geometry.continuum_factor`."""
         square, per_width = dr.squared_norm(self.tangent), incidence.frequency * per_width
@@ -246,8 +255,8 @@ class Crossing:
         between = dr.square(o.outside) - dr.square(i.outside)
         sent_o = between + i.square - dr.dot(change, 2 * i.tangent + change)
         sent_i = o.square - between - dr.dot(change, 2 * o.tangent + change)
-        x_i = 0.5 * per_width * smaller(i.square, sent_i) / i.outside
-        x_o = 0.5 * per_width * smaller(o.square, sent_o) / o.outside
+        x_i = 0.5 * per_width * smaller(i.square / i.outside, sent_o / o.outside)
+        x_o = 0.5 * per_width * smaller(o.square / o.outside, sent_i / i.outside)
         gain = dr.select(smaller(sent_i, sent_o) > 0, horizon_gain(x_i) * horizon_gain(x_o), 0)
         return (0.5 * (i.square + sent_i), 0.5 * (o.square + sent_o)), gain
 
@@ -259,7 +268,8 @@ class Crossing:
         length = along + dr.square(w)
         along_i, along_o = 0.5 * dr.abs(length + between), 0.5 * dr.abs(length - between)
         product = along_i * along_o
-        least = self.least_kappa * incidence.per_kappa
+        # Without heights there is no diffracted light, even where v_z = 0.
+        least = larger(self.least_kappa * incidence.per_kappa, 1e-6)
         result = product * dr.rcp(z_i * z_o * dr.square(dr.select(self.reflects, w, larger(w, least))))
         if self.shadowing:
             # 2 h_z cos θ/|ω·h| of reflected light, (2 cos θ/|ω·h|)² of transmitted.
@@ -352,7 +362,7 @@ class CrossingIncidence:
         undiffracted, steep = (dr.abs(i.z + o.sign * z) for z in (snell, 0.7 * snell))
         near = smaller(undiffracted, steep), dr.rcp(larger(dr.abs(undiffracted - steep), 1e-4))
         horizon, normal = o.normal(mi.Float(0)), o.inside
-        per_v = larger(dr.two_pi * height_scale, 1e-6)
+        per_v = larger(dr.two_pi * height_scale, 1e-30)
         values = (
             mi.Vector3f(assumed * i.tangent.x, assumed * i.tangent.y, dr.sqrt(i.square) / i.outside),
             mi.Float(1.0),

@@ -463,3 +463,92 @@ def test_a_picture_of_large_smooth_facets_is_that_of_roughdielectric(side):
     assert difference.max() < 0.07
     # Without facets it is another one.
     assert np.abs(picture(type="dielectric") - wanted).mean() / wanted.mean() > 0.08
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_reflected_light_is_that_of_an_opaque_grating(kind):
+    """Near the horizon, too, where the directions of a pair differ in height."""
+    rng = np.random.default_rng(8)
+    count = 1 << 14
+    cos, phi = 10 ** rng.uniform(-3, 0, count), rng.uniform(0, 2 * np.pi, count)
+    sin = np.sqrt(1 - cos**2)
+    wi = np.stack([sin * np.cos(phi), sin * np.sin(phi), cos], -1)
+    k = -wi[:, :2] + rng.normal(size=(count, 2)) * 2e-3
+    k[:, 0] -= rng.integers(-4, 5, count) * WAVELENGTH / PERIOD
+    square = 1 - (k**2).sum(-1)
+    wi, wo = wi[square > 0], np.column_stack([k, np.sqrt(np.maximum(square, 0))])[square > 0]
+    si = interaction(wi, (WAVELENGTH * 1e3,) * 4, len(wi))
+    spectrum = md.precompute(md.gratings.sinusoidal(PERIOD, 0.5), wavelengths=(360.0 / ETA, 830.0))
+    scene = {"type": "diffraction_grating", "spectrum": spectrum, "int_ior": ETA, "ext_ior": 1.0}
+    found, wanted = (
+        np.array(
+            mi.load_dict({**scene, "transmission": of, "conserve_energy": False}).eval(
+                mi.BSDFContext(), si, vectors(wo)
+            )
+        )[0]
+        for of in (kind, "none")
+    )
+    assert (wanted > 0).sum() > 4000
+    assert (np.minimum(wi[:, 2], wo[:, 2])[wanted > 0] < 0.05).sum() > 500
+    np.testing.assert_allclose(found, wanted, rtol=1e-3, atol=1e-4)
+
+
+def reflected_and_transmitted(bsdf, wi, wavelength, count=1 << 16):
+    """R and T by samples, and the standard error of their sum."""
+    u = np.random.default_rng(1).random((3, count)).astype(np.float32)
+    si = interaction(wi, (wavelength * 1e3,) * 4, count)
+    bs, weight = bsdf.sample(mi.BSDFContext(IMPORTANCE), si, mi.Float(u[0]), mi.Point2f(u[1:]))
+    weight, passes = np.array(weight)[0], np.array(bs.wo)[2] * wi[2] < 0
+    return weight[~passes].sum() / count, weight[passes].sum() / count, weight.std() / np.sqrt(count)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("relief", [{"depth": 0.0}, {"height_scale": 0.0}, {"height_scale": 1e-8}, {"depth": 0.004}])
+def test_a_relief_without_height_is_a_plane(kind, relief):
+    bsdf = passing(kind, **{"depth": 0.5, **relief})
+    for theta, side in ((0, 1), (0, -1), (50, 1), (50, -1)):
+        wi = towards(theta, 20, side)
+        n_i, n_o = (1, ETA) if side > 0 or kind == "sheet" else (ETA, 1)
+        f = fresnel(
+            np.cos(np.deg2rad(theta)), np.emath.sqrt(1 - (n_i / n_o * np.sin(np.deg2rad(theta))) ** 2), n_i, n_o
+        )
+        f = 1.0 if np.iscomplex(f) else float(np.real(f))
+        r, t, _ = reflected_and_transmitted(bsdf, wi, 0.55)
+        if kind == "sheet":
+            # From below the flat face is met first; light between both faces is left out.
+            wanted = (f, (1 - f) ** 2) if side > 0 else (f + (1 - f) ** 2 * f, (1 - f) ** 2)
+        else:
+            wanted = f, 1 - f
+        np.testing.assert_allclose((r, t), wanted, atol=0.015)
+
+
+@pytest.mark.parametrize(
+    ("wi", "wavelength", "relief"),
+    [
+        pytest.param([0, 1, -0.01], 0.6, {"depth": 0.3}, id="inside, along the horizon"),
+        pytest.param([0.87, 0.5, 0.01], 0.6, {"depth": 0.3}, id="along the horizon"),
+        pytest.param(
+            [0.766, 0.557, 0.321], 0.49, {"profile": "blazed", "period": 10.0, "depth": 10.0}, id="10 µm deep"
+        ),
+        pytest.param([0.809, 0.559, 0.182], 0.4763, {"profile": "blazed", "period": 5.0, "depth": 5.0}, id="5 µm deep"),
+        pytest.param(
+            [-0.979, -0.206, 0.01], 0.621, {"profile": "blazed", "depth": 0.4, "coherence_length": 10.0}, id="wide"
+        ),
+        pytest.param(
+            [-0.979, -0.206, 0.01], 0.621, {"profile": "blazed", "depth": 0.4, "coherence_length": 2.0}, id="wider"
+        ),
+    ],
+)
+def test_samples_carry_no_more_light_than_came(wi, wavelength, relief):
+    r, t, error = reflected_and_transmitted(
+        passing("interface", **relief), np.divide(wi, np.linalg.norm(wi)), wavelength
+    )
+    assert r + t <= 1.002 + 3 * error
+
+
+@pytest.mark.parametrize("eta", [1.0, 0.0, -1.5, np.nan])
+def test_an_index_that_is_none_is_refused(eta):
+    parameters = mi.traverse(passing("interface"))
+    parameters["eta"] = mi.Float(eta)
+    with pytest.raises(ValueError, match="eta: got"):
+        parameters.update()
