@@ -23,7 +23,7 @@ from ..spectrum.tables import HALF_SCALE, SeriesTable, SliceTable, shared_expone
 from .cell_sampler import LOBE, CellAxis, CellSampler
 from .geometry import Geometry, Incidence
 from .inversion import CELLS, KappaCells, averages, choose, search, sums_before, truncated_gaussian
-from .order_table import OrderTable
+from .order_table import WHOLE, OrderTable
 from .tables import (
     HalfTable,
     PacketTable,
@@ -249,7 +249,6 @@ def _weights(table: SeriesTable) -> np.ndarray:
 
 
 FLOOR = 0.05  # the share of each κ cell that all orders have alike
-WHOLE = 2**24  # a float32 holds whole numbers up to here
 MAX_TABLE = 2**19  # packets (8 MB); where the sums over rectangles take more, all orders can be drawn
 
 
@@ -476,8 +475,8 @@ class OrderSpectrum:
 
     N ends as `OrderGrid.lobes` says. Resolved orders need one of them, so that one evaluation reads
     `order_power` once; a tile as large as the coherence length needs 4 × 4. The density is Σ_m P_m N(q − m/T) with the
-    P_m of `OrderSampler`; where orders overlap, that of `CellSampler`. For a line grating whose orders overlap or are
-    wide, it is that of `LineSampler`.
+    P_m of `OrderSampler` or, where light passes, of an `OrderTable`; where orders overlap, that of `CellSampler`. For a
+    line grating whose orders overlap or are wide, it is that of `LineSampler`.
 
     With a lateral scale s, resolved orders lie at m/(sT), with lobes as wide: tables are read at sq.
     """

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from ..rigorous.efficiencies import ODD, REVERSED
 from ..rigorous.spectrum import RigorousSpectrum
-from .geometry import Geometry, Incidence
+from .geometry import Geometry, Incidence, cell_of
 from .inversion import search, truncated_gaussian
-from .orders import WHOLE
+from .order_table import WHOLE
 from .tables import NumberTable, PacketTable, larger, limited, opaque, smaller
 from .transmission import Crossing, CrossingIncidence
 
@@ -285,7 +285,7 @@ class RigorousOrders:
             inside = _arc(limited((pair.inside - low_inside) / larger(high_inside - low_inside, 1e-7), 0, 1))
         near, far = dr.sqrt(larger(pair.square - low, 1e-12)), dr.sqrt(larger(high - pair.square, 1e-12))
         places = _arc(2 * a), near / (near + far), inside
-        nodes = [_split(x * steps, steps) for x, steps in zip(places, self.axes.steps, strict=True)]
+        nodes = [cell_of(x * steps, steps) for x, steps in zip(places, self.axes.steps, strict=True)]
         cells, inner_cells = self.axes.starts.shape
         start = self.starts(dr.minimum(cell, cells - 1) * inner_cells + dr.minimum(inner, inner_cells - 1))
         active = active & (start < 0x80000000) & (cell < cells) & (inner < inner_cells)
@@ -322,12 +322,6 @@ class RigorousOrders:
             z += side + dr.select(incidence.reflects, 0, self.sampler_planes)
         width = 2 * self.max_order + 2
         return ((z * self.cells_across + p) * self.cells_across + r) * width + self.max_order
-
-
-def _split(x: mi.Float, steps: int) -> tuple[mi.UInt32, mi.Float]:
-    """The node below x, at most the last but one, and how far x is beyond it."""
-    low = dr.minimum(mi.UInt32(x), steps - 1)
-    return low, x - mi.Float(low)
 
 
 def _arc(share: mi.Float) -> mi.Float:

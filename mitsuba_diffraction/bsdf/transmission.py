@@ -297,7 +297,8 @@ class CrossingIncidence:
         mirrored: what takes the q that is read to the one that was drawn, 1 or −1.
         square: n_o² − |k_i,∥|².
         per_kappa: |v_z| for one rad/µm.
-        near: the least |v_z| of light that leaves with 0.7 to 1 of the k_z of that order, and what is 1 over the range.
+        near: the least |v_z| of light that leaves with 0.7 to 1 of the k_z of the undiffracted order, and what is 1
+            over the range.
         come: |k_i,z|.
         leaves: |k_o,z| of light along the horizon and along the normal, and what is 1 over that range.
         reflects: whether it is reflected.

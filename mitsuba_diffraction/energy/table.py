@@ -15,7 +15,7 @@ the order m > 0 propagates if m < u, and m < 0 if −m < v: e jumps where u or v
 between. So each unit square of (u, v) is divided into cells by itself, finest near its lower edges, where an order has
 just emerged; at u = 0 and v = 0 ω itself is at the horizon. With f the fraction of u, nodes are equidistant in √f, as
 cos θ_o of that order is. a depends on u and v alone, but for lobes that reach the horizon: seen in units of c, they are
-1/c as wide, and e holds for all c = (u + v) λ/2T of the spectrum. The table has one slice.
+1/c as wide, and e is the smaller of those at both ends of the range of c = (u + v) λ/2T. The table has one slice.
 
 Of surfaces with orders in two dimensions, of samples and of interfaces the hemisphere is a square, its middle the
 normal and its edge the horizon,
@@ -286,7 +286,9 @@ class EnergyTable:
         count = CHECKED // len(furnace.ways)
         for check in range(CHECKS if e.min() < 1 else 0):
             bounds = [cls.packed(layout, of).at for of in e]
-            candidates = int(np.clip(PAIRS / (16 * furnace.work), count, CANDIDATES * count))
+            # Where phases turn within lobes, albedos change the most within a cell.
+            most = (8 if furnace.turning else 1) * CANDIDATES
+            candidates = int(np.clip(most * PAIRS / (240 * furnace.work), count, most * count))
             omega, lengths = layout.random_places(candidates, check)
             cells, a = layout.cells_of(*layout.places(omega, lengths)), furnace.albedo(omega, lengths)
             got, share = np.stack([at(omega, lengths) for at in bounds]), np.ones(layout.cell_counts)
@@ -307,7 +309,8 @@ class EnergyTable:
                 np.minimum.at(share, cells, lower)
             share = np.minimum(minimum_filter(share, ABOUT), everywhere)
             np.minimum.at(share, cells, lower)
-            e = layout.lowered(e, share)
+            # What is beyond one is no part of e where it is lowered.
+            e = np.where(layout.lowered(np.ones_like(e), share) < 1, layout.lowered(np.minimum(e, 1), share), e)
             lost = 1 - np.minimum(got * share[cells] / np.minimum(bounds_of(a, furnace.index), 1), 1)
             losses = [(float(of.mean()), float(of.max())) for of in lost]
         return [cls.packed(layout, *of) for of in zip(e, losses, strict=True)]

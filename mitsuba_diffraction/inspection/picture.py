@@ -105,15 +105,16 @@ def _height_map(axes: Axes, field: HeightField, extent: str) -> None:
 
 def _shown(inspection: Inspection) -> HeightField:
     """Return the surface, a tile repeated, and a profile extended along its axis of one pixel to a square."""
-    field = inspection.height_field
+    field, shape = inspection.height_field, inspection.height_field.shape
     if inspection.extent == "tile":
         field = repeated(field)
     for axis in (0, 1):
-        if field.shape[axis] == 1 < field.shape[1 - axis]:
+        if shape[axis] == 1 < shape[1 - axis]:
             count = min(field.shape[1 - axis], 256)
             sizes = list(field.pixel_size)
             sizes[1 - axis] = field.tile_size[axis] / count
-            return HeightField(np.repeat(field.heights, count, axis), (sizes[0], sizes[1]), field.source)
+            profile = np.take(field.heights, [0], axis)
+            return HeightField(np.repeat(profile, count, axis), (sizes[0], sizes[1]), field.source)
     return field
 
 

@@ -73,7 +73,7 @@ def trace_on(address: str) -> Tracer:
                     del traced
             except (distributed.TimeoutError, TimeoutError):
                 raise RuntimeError(f"the Dask scheduler at {address} has no workers") from None
-            except (asyncio.CancelledError, futures.CancelledError):
+            except (asyncio.CancelledError, futures.CancelledError, distributed.comm.CommClosedError):
                 raise RuntimeError(f"the Dask scheduler at {address} is gone") from None
             except distributed.KilledWorker as error:
                 raise RuntimeError(f"workers of {address} die while tracing: {error}") from None

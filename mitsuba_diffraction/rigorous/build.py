@@ -393,10 +393,10 @@ class _Build:
         """Return what was solved at the nodes that are stored."""
         axes, entries, blocks = self.axes, self.entries, len(self.axes.blocks)
         matrices = np.empty((*axes.shape, entries, entries), np.float32)
-        steps = zip(self.steps, axes.steps, strict=True)
+        # The wavelength, where it is an axis, is done.
+        steps = list(zip(self.steps, axes.steps, strict=True))[: 3 if self.passes else 2]
         refine = [_fitted(functools.partial(_cubic, solved), stored) for solved, stored in steps]
-        # The wavelength is done.
-        refine[2] = refine[2] if self.passes else np.eye(PLANES)
+        refine += [] if self.passes else [np.eye(PLANES)]
         signs = np.outer(REVERSED, REVERSED)[:entries, :entries]
         for block, (cells, row) in enumerate(axes.blocks.items()):
             solved = np.stack([done[job] for job in range(block, len(self.jobs), blocks)])

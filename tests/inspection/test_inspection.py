@@ -465,6 +465,14 @@ def test_the_slide_of_a_large_tile_shows_a_dozen_periods():
     assert piece.tile_size == pytest.approx((24.0, 24.0))
 
 
+def test_the_slide_of_one_row_shows_whole_periods():
+    """Whose pixels are square, so that the tile is much longer than wide."""
+    row = md.HeightField(md.gratings.sinusoidal(PERIOD, DEPTH, samples=64).heights, PERIOD / 64)
+    piece = piece_shown(inspect(row, extent="tile", coherence_length=5.0))
+    assert min(piece.tile_size) >= 4 * PERIOD - 1e-6
+    assert np.ptp(piece.heights) == pytest.approx(DEPTH, rel=0.01)
+
+
 @pytest.mark.slow
 def test_inspect_takes_a_recipe(folder, command):
     code, out, err = command("inspect foil.toml -o slide.pdf")

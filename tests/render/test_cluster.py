@@ -203,7 +203,7 @@ def test_a_killed_scheduler_is_one_line():
             process.kill()
             process.wait()
     assert rendering.returncode == 1
-    lines = [text for text in err.splitlines() if " %," not in text]
+    lines = [text for text in err.splitlines() if " spp, " not in text]
     assert lines == [f"mitsuba-diffraction: error: the Dask scheduler at {address} is gone"]
 
 
