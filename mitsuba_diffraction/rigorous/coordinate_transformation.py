@@ -236,6 +236,9 @@ def half_space(grating: Grating, alpha_0: float, gamma2: complex, upwards: bool)
         upwards: whether outgoing is up.
     """
     alpha = alpha_0 + grating.n
+    # Exactly along the horizon both Rayleigh waves of an order are the same.
+    if np.abs(gamma2 - alpha**2).min() < 1e-14 * abs(gamma2):
+        gamma2 *= 1 - 1e-12
     square = gamma2 - alpha**2
     propagates = (square.real > 0) & (np.imag(gamma2) == 0)
     orders, beta = grating.n[propagates], np.sqrt(square[propagates].real)

@@ -358,3 +358,14 @@ def test_what_is_out_of_range_is_refused(change, message):
     arguments = {"height_field": gratings.blazed(), "direction": (0, 0, 1), "wavelength": 0.55, "int_ior": 1.5}
     with pytest.raises(ValueError, match=message):
         rigorous.efficiencies(**(arguments | change))
+
+
+@pytest.mark.parametrize("height", [0.0, 0.1])
+@pytest.mark.parametrize("omega", [(0, 0, 1), (0, 0, -1), (0.5, 0, 0.75**0.5)])
+@pytest.mark.parametrize("wavelength", [0.25, 0.5])
+def test_an_order_exactly_along_the_horizon_is_the_limit_of_those_beside_it(height, omega, wavelength):
+    surface = gratings.sinusoidal(1.0, height)
+    at, beside = (rigorous.efficiencies(surface, omega, λ, int_ior=1.5) for λ in (wavelength, wavelength * (1 + 1e-9)))
+    shared = np.isin(at.orders, beside.orders)
+    assert at.error < 1e-3
+    np.testing.assert_allclose(at.unpolarised[shared], beside.unpolarised, atol=1e-4)
