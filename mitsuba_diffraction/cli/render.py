@@ -99,24 +99,35 @@ def render(
     motions = [None] if frames is None else motions_of_orbit(scene, frames, **where)
     where |= {"width": width, "height": height}
     request = {"spp": spp, "seed": seed, "until_error": until_error, "seconds": checkpoint, "tracer": tracer}
-    pictures, exposure = _pictures(target, frames), None
+    pictures = _pictures(target, frames)
+    _render(scene, pictures, motions, where, request, resume=resume, half=half, denoise=denoise)
+    if frames is not None:
+        animation = target.with_suffix(".webp")
+        save_animation([path.with_suffix(".png") for path in pictures], animation)
+        tell(f"{animation}: animated preview, {frames} frames")
+
+
+def _render(
+    scene: Path,
+    pictures: list[Path],
+    motions: list[tuple[float, ...]] | list[None],
+    where: dict[str, Any],
+    request: dict[str, Any],
+    **options: bool,
+) -> None:
+    """Render a picture for each motion of the camera, all with the exposure of the first."""
+    exposure = None
     for number, (path, motion) in enumerate(zip(pictures, motions, strict=True)):
         exposure = _picture(
             scene,
             path,
             {**where, "motion": motion},
             request,
-            resume=resume,
-            half=half,
-            denoise=denoise,
-            label=scene.name if frames is None else f"{scene.name} {number + 1}/{frames}",
+            label=scene.name if len(pictures) == 1 else f"{scene.name} {number + 1}/{len(pictures)}",
             exposure=exposure,
-            complete=f"{number} of {frames} pictures are complete" if number else None,
+            complete=f"{number} of {len(pictures)} pictures are complete" if number else None,
+            **options,
         )
-    if frames is not None:
-        animation = target.with_suffix(".webp")
-        save_animation([path.with_suffix(".png") for path in pictures], animation)
-        tell(f"{animation}: animated preview, {frames} frames")
 
 
 def _denoises(scene: Path) -> bool:

@@ -291,8 +291,26 @@ def render(
     if sums is None:
         columns, rows = (int(size) for size in scene.sensors()[0].film().crop_size())
         sums = Accumulation.empty(rows, columns)
-    saved = sums.samples
-    ends = _judge(sums, job, progress)
+    ends = _trace(job, scene, sums, checkpoint, seconds, tracer, progress)
+    if not sums.passes:
+        raise KeyboardInterrupt
+    image = _image(sums, job, Path(scene_path).name, complete=ends)
+    if not ends:
+        raise Interrupted(image)
+    return image
+
+
+def _trace(
+    job: Job,
+    scene: mi.Scene,
+    sums: Accumulation,
+    checkpoint: str | os.PathLike[str] | None,
+    seconds: float,
+    tracer: Tracer,
+    progress: Callable[[int, int, float], None],
+) -> bool:
+    """Add passes to the sums until the picture is complete or Ctrl-C was pressed; return whether it is complete."""
+    saved, ends = sums.samples, _judge(sums, job, progress)
     last, wait = time.monotonic(), seconds
     with _deferred_interrupt() as interrupted, closing(tracer(job, scene, sums.passes)) as traced:
         while not (ends or interrupted()):
@@ -304,12 +322,7 @@ def render(
                 _save(checkpoint, job, sums, saved)
                 saved = sums.samples
                 wait = max(seconds, CHECKPOINT_SHARE * (time.monotonic() - last))
-    if not sums.passes:
-        raise KeyboardInterrupt
-    image = _image(sums, job, Path(scene_path).name, complete=ends)
-    if not ends:
-        raise Interrupted(image)
-    return image
+    return ends
 
 
 def _job(
