@@ -8,7 +8,7 @@ import pytest
 
 from mitsuba_diffraction import HeightField, gratings, rigorous
 from mitsuba_diffraction.evaluation.validation.coupled_waves import PROFILES, cases
-from mitsuba_diffraction.scalar_theory import fresnel, profile_powers, scalar_orders
+from mitsuba_diffraction.scalar_theory import fresnel, profile_powers, scalar_error, scalar_orders
 
 SCATMECH = json.loads((Path(__file__).parents[1] / "data" / "scatmech.json").read_text(encoding="utf-8"))
 CONICAL = np.array([-0.3, 0.35, 0.887])
@@ -369,3 +369,10 @@ def test_an_order_exactly_along_the_horizon_is_the_limit_of_those_beside_it(heig
     shared = np.isin(at.orders, beside.orders)
     assert at.error < 1e-3
     np.testing.assert_allclose(at.unpolarised[shared], beside.unpolarised, atol=1e-4)
+
+
+def test_the_error_of_scalar_theory_is_found_where_orders_lie_along_the_horizon():
+    """Order 8 of 2.4 µm, at 450 nm and normal incidence, inside of n = 1.5."""
+    beside, at = (scalar_error(gratings.sinusoidal(period, 0.1)) for period in (2.4003, 2.4))
+    assert at.share == pytest.approx(beside.share, rel=0.02)
+    assert at.transmitted == pytest.approx(beside.transmitted, rel=0.02)
