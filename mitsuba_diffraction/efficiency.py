@@ -228,15 +228,13 @@ def efficiencies(
         raise RequestError(f"theory: got {theory!r}, wanted one of {', '.join(THEORIES)}")
     if not is_number(azimuth) or not np.isfinite(azimuth):
         raise RequestError(f"azimuth: got {azimuth!r}, wanted degrees")
-    if material is None and int_ior is None:
-        int_ior = 1.5
+    int_ior = 1.5 if material is None and int_ior is None else int_ior
     if transmission not in TRANSMISSIONS:
         raise RequestError(f"transmission: got {transmission!r}, wanted one of {', '.join(TRANSMISSIONS)}")
     if transmission != "none" and (material is not None or np.imag(int_ior or 1)):
         absorbing = f"material {material!r}" if material is not None else f"int_ior {int_ior}"
         raise RequestError(f"transmission: got {transmission!r} with {absorbing}, wanted a dielectric: int_ior, real")
-    profile = is_profile(height_field)
-    if profile:
+    if profile := is_profile(height_field):
         height_field = HeightField(height_field.heights[:1], height_field.pixel_size, height_field.source)
     # The largest |q| is (n_i + n_o)/λ.
     shortest = wavelengths.min() * 1e-3 * (1.0 if transmission == "none" else 2 / (1 + max(np.real(int_ior or 1), 1)))
