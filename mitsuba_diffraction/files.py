@@ -94,6 +94,12 @@ def _locked_temporary(target: Path) -> tuple[Path, int]:
         os.close(opened)
 
 
+def discard(path: str | os.PathLike[str]) -> None:
+    """Remove a file, if it is there, and what killed processes left of it."""
+    Path(path).unlink(missing_ok=True)
+    _remove_what_a_kill_left(Path(path))
+
+
 def _remove_what_a_kill_left(target: Path) -> None:
     if fcntl is None:
         return

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ..errors import RequestError
+from ..files import discard
 from ..outputs import free_name
 from ..progress import progress_bar, tell
 from .arguments import Define, Overwrite, Variant, check_suffix, claim, materials_of, scene_parameters
@@ -210,7 +211,7 @@ def _picture(
     if interrupted:
         spp = image.attributes["spp"]
         raise Stopped(f"{path} holds {spp} samples per pixel; the same command with --resume continues")
-    waiting.unlink(missing_ok=True)
+    discard(waiting)
     tell(
         f"{path}: {_summary(image, request['until_error'])}, "
         f"{time.perf_counter() - start:.1f} s, {path.stat().st_size / 1e6:.3g} MB\n"

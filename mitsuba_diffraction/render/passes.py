@@ -417,7 +417,6 @@ def _deferred_interrupt() -> Iterator[Callable[[], bool]]:
         asked.set()
 
     def note(number: int, frame: object) -> None:
-        _log.warning("interrupted: the current pass is finished first; Ctrl-C again stops at once")
         asked.set()
         signal.signal(signal.SIGINT, before)
 

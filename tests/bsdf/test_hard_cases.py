@@ -266,10 +266,15 @@ def test_hard_surfaces_are_rendered_right(name, representation):
     peak = 1 / (2 * np.pi * sigma**2)
     digits = 1e-4 + 2e-6 / sigma
     largest = np.maximum(expected(field, np.ones(kappa.shape), wi, wo, wavelengths, sigma, line), 1) if not line else 4
+    there = 1.0
+    if isinstance(spectrum.grid, OrderGrid) and all(lobe.count == 1 for lobe in spectrum.lobes):
+        # Of an order that does not propagate there is no light, though part of its lobe is above the horizon.
+        tangent = np.asarray(wavelengths)[:, None] * 1e-3 * np.rint(q * field.tile_size) / field.tile_size
+        there = np.prod([((omega[:, None, :2] + tangent) ** 2).sum(-1) < 1 for omega in (wi, wo)], axis=0)
     if not line:
-        table = expected(field, spectrum.evaluate(q, kappa), wi, wo, wavelengths, sigma, line)
+        table = there * expected(field, spectrum.evaluate(q, kappa), wi, wo, wavelengths, sigma, line)
         assert (np.abs(got - table) <= largest * digits * peak + digits * table).all()
-    wanted = expected(field, exact, wi, wo, wavelengths, sigma, line)
+    wanted = there * expected(field, exact, wi, wo, wavelengths, sigma, line)
     assert (np.abs(got - wanted) <= largest * (1.5e-3 + digits) * peak).all()
 
 

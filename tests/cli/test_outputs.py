@@ -162,7 +162,7 @@ def test_one_output_is_not_written_over_another(command, line, name):
     [
         (f"{RENDER} -o a.exr", "--seed 1", "a.exr"),
         ("precompute blaze.toml -o a.exr", "--tolerance 0.05", "a.exr"),
-        ("inspect blaze.toml -o a.png --json a.json", "--pixel-size 1", "a.png"),
+        ("inspect blaze.toml -o a.png --json a.json", "--coherence-length 5", "a.png"),
     ],
 )
 def test_a_command_knows_what_it_made(command, line, other, name):

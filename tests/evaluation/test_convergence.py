@@ -75,7 +75,7 @@ def test_noise_falls_with_time_and_a_coarse_table_stops(llvm, tmp_path):
 def test_the_command_writes_a_plot_and_numbers(command, llvm, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write(Path("scene.xml"), SUN, WITH_TOLERANCE)
-    line = "convergence scene.xml -o plot.png --json numbers.json --width 8 --spp 1 --spp 2 --reference-spp 4"
+    line = "convergence scene.xml -o plot.png --json numbers.json --width 16 --spp 1 --spp 2 --reference-spp 4"
     code, out, err = command(f"{line} --tolerance 0.1 --variant llvm_ad_spectral")
     assert (code, err) == (0, "")
     assert "pq, corrected: " in out

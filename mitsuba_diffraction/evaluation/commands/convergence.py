@@ -39,7 +39,7 @@ def convergence(
     parameters = scene_parameters(define)
     check_suffix("-o", plot, ".png")
     written = [("-o", plot), *([("--json", json)] if json is not None else [])]
-    claim(context, files_of_scene(scene, parameters), written)
+    claim(context, files_of_scene(scene, {**parameters, "tolerance": "0.1"}), written)
     mi.set_variant(choose_variant(variant))
     found = study.convergence(
         scene,

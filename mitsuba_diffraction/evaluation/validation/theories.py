@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import drjit as dr
@@ -12,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from ...precomputation import Spectrum, precompute
+from ...progress import Progress, silent
 from ...rigorous import efficiencies, refractive_index
 from ...rigorous.spectrum import RigorousSpectrum
 from ...scalar_theory import difference, profile_powers, scalar_orders
@@ -23,7 +23,7 @@ COLUMNS = {
     "build\nCPU s": "{.build_seconds:.2g}",
     "MB": "{.megabytes:.3g}",
     "error to the solver\nmean": "{.error:.1%}",
-    "\nworst": "{.worst:.1%}",
+    "\nworst": "{.max_error:.1%}",
     "eval_pdf\nratio": "{.evaluate_ratio:.2f}",
     "in the\nlobes": "{.lobe_ratio:.2f}",
     "sample\nratio": "{.sample_ratio:.2f}",
@@ -39,7 +39,7 @@ class TheoryCost:
         theory: "scalar" or "rigorous".
         build_seconds: of processor time, of `precompute`.
         megabytes: of the table.
-        error, worst: Σ|Δη_m| / Σ η_m against the solver, that of the theory and that of the table, the mean and the
+        error, max_error: Σ|Δη_m| / Σ η_m against the solver, that of the theory and that of the table, the mean and the
             largest over directions, uniform over the hemisphere, and wavelengths from 400 to 700 nm; unpolarised.
         evaluate_ratio: speed of eval_pdf to that of roughconductor (Al), random directions, the same run.
         lobe_ratio: the same for pairs of directions of which one was drawn by the grating.
@@ -50,7 +50,7 @@ class TheoryCost:
     build_seconds: float
     megabytes: float
     error: float
-    worst: float
+    max_error: float
     evaluate_ratio: float
     lobe_ratio: float
     sample_ratio: float
@@ -63,7 +63,7 @@ def compare_theories(
     tolerance: float = 1e-2,
     count: int = 1 << 19,
     repetitions: int = 5,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress = silent,
 ) -> list[TheoryCost]:
     """Compare scalar, then rigorous theory of a surface of one row, under the current variant of Mitsuba.
 
