@@ -31,12 +31,14 @@ from .transmission import CrossingIncidence
 
 WHOLE = 2**24  # a float32 holds whole numbers up to here
 FLOOR = 0.02  # the share of each cell that all its orders have alike
-ENTRIES = 4e5  # of the table, about: more would fill the cache
+# Of the table, about, times √ranges of heights: of a sheet, where more would only fill the cache, and of an interface,
+# since from inside, where waves are shorter, orders change faster with direction.
+ENTRIES_SHEET, ENTRIES = 4e5, 1e6
 # Radians by which the phase of the deepest point may change within a cell, by reflection from above: of line gratings,
 # which have few orders, and of others; and between the places in a cell, for either kind of light.
 TURN_LINES, TURN, STEP = 2.0, 4.0, 2.5
 SLICES = 4, 10  # cells of 1/λ, at least and at most
-SIDES = 4, 48  # cells along the square of directions, likewise
+SIDES = 4, 96  # cells along the square of directions, likewise
 FINE = 64  # of the share that passes
 CHANGE = 0.01  # of η, relative to η − 1, for which a table serves
 
@@ -77,7 +79,8 @@ class OrderTable:
         self.slices = int(np.clip(turn / (TURN_LINES if 0 in grid.max_order else TURN), *SLICES))
         orders = np.minimum((1 + eta) * self.tile * (first + last) / 2, 2 * self.max_order) + 1
         ranges = list(itertools.pairwise(height_scales)) or [tuple(height_scales)]
-        self.side = int(np.clip(np.sqrt(ENTRIES / (4 * np.sqrt(len(ranges)) * self.slices * orders.prod())), *SIDES))
+        entries = (ENTRIES_SHEET if is_sheet else ENTRIES) / (4 * np.sqrt(len(ranges)) * self.slices * orders.prod())
+        self.side = int(np.clip(np.sqrt(entries), *SIDES))
         self.layout = Layout(0.0, 1, self.side, 1, self.slices + 1, (first, last))
         sums, cells, shares, start = [], [], [], 0
         for scales, above in itertools.product(ranges, (True, False)):
