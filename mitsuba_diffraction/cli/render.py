@@ -32,8 +32,7 @@ def render(
     spp: Annotated[
         int | None,
         typer.Option(
-            min=1,
-            help="samples per pixel, the maximum with --until-error; default: sample_count of the scene, or 64",
+            min=1, help="samples per pixel, the maximum with --until-error; default: sample_count of the scene, or 64"
         ),
     ] = None,
     width: Annotated[int | None, typer.Option(min=1, help="pixels; default: that of the scene")] = None,
