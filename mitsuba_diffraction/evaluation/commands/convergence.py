@@ -36,14 +36,15 @@ def convergence(
     from ...render.scene import files_of_scene
     from ..comparison import convergence as study
 
-    parameters = scene_parameters(define)
+    parameters, tolerances = scene_parameters(define), sorted(tolerance or study.TOLERANCES, reverse=True)
     check_suffix("-o", plot, ".png")
     written = [("-o", plot), *([("--json", json)] if json is not None else [])]
-    claim(context, files_of_scene(scene, {**parameters, "tolerance": "0.1"}), written)
+    study.check_tolerances(tolerances)
+    claim(context, files_of_scene(scene, {**parameters, "tolerance": f"{tolerances[0]:g}"}), written)
     mi.set_variant(choose_variant(variant))
     found = study.convergence(
         scene,
-        tolerances=sorted(tolerance or study.TOLERANCES, reverse=True),
+        tolerances=tolerances,
         samples=sorted(spp or study.SAMPLES),
         reference_samples=reference_spp,
         width=width,

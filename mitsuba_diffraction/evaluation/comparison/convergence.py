@@ -106,6 +106,15 @@ class Convergence:
         return float(min(times, default=np.nan))
 
 
+def check_tolerances(tolerances: Sequence[float]) -> None:
+    """Raise if the reference cannot be three times as fine as the finest."""
+    if not min(tolerances) / 3 >= LEAST_TOLERANCE:
+        raise RequestError(
+            f"tolerance: got {min(tolerances):g}, wanted at least {3 * LEAST_TOLERANCE:g}: "
+            "the reference takes a third of the finest"
+        )
+
+
 def convergence(
     scene_path: str | os.PathLike[str],
     *,
@@ -136,11 +145,7 @@ def convergence(
         FileNotFoundError: if there is no such scene.
         ValueError: if the request is wrong, or a shader cannot show the scene.
     """
-    if not min(tolerances) / 3 >= LEAST_TOLERANCE:
-        raise RequestError(
-            f"tolerance: got {min(tolerances):g}, wanted at least {3 * LEAST_TOLERANCE:g}: "
-            "the reference takes a third of the finest"
-        )
+    check_tolerances(tolerances)
 
     def pictures(tolerance: float, shader: str = SHADERS[0], seed: int = 0) -> Pictures:
         chosen = {**(parameters or {}), "tolerance": f"{tolerance:g}"}
