@@ -182,6 +182,8 @@ def anywhere(rng, count):
         pytest.param(5489, id="crossed grating of 13 × 11 orders, 3.5 µm deep"),
         pytest.param(5150, id="23 × 25 nodes with wide lobes"),
         pytest.param(5216, id="tile of 7 × 4 pixels, 0.6 µm deep"),
+        pytest.param(5221, id="grating of 4 pixels, 6.4 µm deep"),
+        pytest.param(5448, id="grating of 14 pixels, 1.7 µm deep, with wide lobes"),
         *SEEDS,
     ],
 )
