@@ -536,9 +536,8 @@ class OrderSpectrum:
         q = geometry.tangent * (incidence.frequency * scale)
         m_x, m_y = (axis.first(q) for axis, q in zip(self.axes, q, strict=True))
         lobes_x, lobes_y = self.axes[0].lobes(m_x, q.x, scale), self.axes[1].lobes(m_y, q.y, scale)
-        mirrored, factor, kappa = incidence.mirrored, 1, geometry.kappa(incidence.frequency)
-        # Orders that are read at one κ: first column and row, lobes, κ.
-        windows = [(0, 0, lobes_x, lobes_y, kappa)]
+        mirrored, factor = incidence.mirrored, 1
+        # `windows`: orders that are read at one κ, by first column and row, lobes, κ.
         if self.resolved:
             tangent = self._tangent(m_x, m_y, incidence.wavelength / scale)
             factor = geometry.order_factor(tangent, incidence, self.per_width)
@@ -557,6 +556,7 @@ class OrderSpectrum:
                     windows.append((x, y, [lobe], [lobes_y[y]], geometry.order_kappa(tangent, incidence)))
             else:
                 factor = geometry.continuum_factor(incidence, self.per_width)
+                windows = [(0, 0, lobes_x, lobes_y, geometry.kappa(incidence.frequency))]
         row, column = (m + (axis.max_order + axis.rim) for m, axis in zip((m_y, m_x), self.axes[::-1], strict=True))
         power = 0
         for x, y, of_x, of_y, kappa in windows:
