@@ -1,4 +1,4 @@
-"""Speed against error: every case, every representation, a ladder of tolerances."""
+"""Speed against error: every case, a ladder of tolerances."""
 
 from __future__ import annotations
 
@@ -13,13 +13,11 @@ import numpy as np
 from rich.table import Table
 
 from ... import outputs
-from ...errors import RequestError
 from ...files import whole_file
 from ...grating_spectrum import GratingSpectrum
 from ...outputs import metadata
 from ...progress import table
 from ...settings import VISIBLE, Settings
-from ...spectrum.tables import SliceTable
 from .. import report
 from . import sampling, shader_speed
 from .accuracy import Accuracy, Exact
@@ -28,14 +26,12 @@ from .sampling import Sampling
 from .shader_speed import ShaderSpeed, shader_speeds
 from .speed import Rays, blank, seconds
 
-REPRESENTATIONS = ("slices", "svd", "chebyshev", "taylor")
 TOLERANCES = (1e-2, 1e-3)
 
 COLUMNS = {
     "surface": "{.surface}",
-    "represen-\ntation": "{.representation}",
     "toler-\nance": "{.tolerance:g}",
-    "terms": "{.terms}",
+    "inter-\nvals": "{.intervals}",
     "words\nread": "{.words}",
     "MB": "{.megabytes:.3g}",
     "build\ns": "{.build_seconds:.2g}",
@@ -51,15 +47,13 @@ COLUMNS = {
 
 @dataclass(frozen=True)
 class Result:
-    """A representation of a surface.
+    """A spectrum of a surface.
 
     Attributes:
         surface: name of the case.
         extent: "tile" or "sample".
-        representation: "taylor", "chebyshev", "svd" or "slices".
         tolerance: the requested one.
-        refused: the reason why there is no such spectrum; the rest is then None.
-        terms: of the series, or intervals of the slices.
+        intervals: of κ in the table.
         words: of 32 bits that one evaluation of S reads from the table.
         megabytes: of the table.
         build_seconds: of `precompute`.
@@ -72,18 +66,16 @@ class Result:
 
     surface: str
     extent: str
-    representation: str
     tolerance: float
-    refused: str | None = None
-    terms: int | None = None
-    words: int | None = None
-    megabytes: float | None = None
-    build_seconds: float | None = None
-    evaluations: float | None = None
-    read_ratio: float | None = None
-    evaluate_ratio: float | None = None
-    sample_ratio: float | None = None
-    accuracy: Accuracy | None = None
+    intervals: int
+    words: int
+    megabytes: float
+    build_seconds: float
+    evaluations: float
+    read_ratio: float
+    evaluate_ratio: float
+    sample_ratio: float
+    accuracy: Accuracy
 
     @property
     def millions(self) -> float:
@@ -94,7 +86,6 @@ class Result:
 def run(
     cases: Iterable[Case],
     *,
-    representations: Sequence[str] = REPRESENTATIONS,
     tolerances: Sequence[float] = TOLERANCES,
     count: int = 1 << 19,
     shading_points: int = 1 << 14,
@@ -105,8 +96,7 @@ def run(
 
     Args:
         cases: surfaces.
-        representations: names as in `precompute`.
-        tolerances: likewise.
+        tolerances: of their spectra.
         count: rays at once.
         shading_points: of the real-time shaders at once.
         repetitions: of each timing, interleaved.
@@ -116,12 +106,12 @@ def run(
         A result for every combination, in order; and the real-time shaders on the tiles.
 
     Raises:
-        ValueError: if a tolerance is out of range.
+        ValueError: if a tolerance is out of range, or a surface too large for it.
     """
     for tolerance in tolerances:
         Settings(tolerance=tolerance)
     cases = list(cases)
-    results, shaders, total = [], [], len(cases) * len(tolerances) * len(representations)
+    results, shaders, total = [], [], len(cases) * len(tolerances)
     progress(0, total)
     rays = Rays(count)
     for case in cases:
@@ -129,64 +119,44 @@ def run(
         if case.extent == "tile":
             shaders += shader_speeds(case, exact, count=shading_points, repetitions=min(repetitions, 3))
         for tolerance in tolerances:
-            built: dict[str, tuple[GratingSpectrum, float]] = {}
-            refused: dict[str, str] = {}
-            for representation in representations:
-                start = time.perf_counter()
-                try:
-                    spectrum = case.spectrum(representation, tolerance)
-                    built[representation] = spectrum, time.perf_counter() - start
-                except RequestError as error:
-                    refused[representation] = str(error)
-                progress(len(results) + len(built) + len(refused), total)
-            measured = _measured(built, exact, rays, repetitions)
-            for representation in representations:
-                head = case.name, case.extent, representation, tolerance
-                found = measured.get(representation, {"refused": refused.get(representation)})
-                results.append(Result(*head, **found))
+            start = time.perf_counter()
+            spectrum = case.spectrum(tolerance)
+            build_seconds = time.perf_counter() - start
+            results.append(_measured(case, spectrum, build_seconds, exact, rays, repetitions))
+            progress(len(results), total)
     return results, shaders
 
 
 def _measured(
-    built: dict[str, tuple[GratingSpectrum, float]], exact: Exact, rays: Rays, repetitions: int
-) -> dict[str, dict[str, object]]:
-    bsdfs = {"rough": mi.load_dict({"type": "roughconductor", "material": "Al"})}
-    work = {}
-    for name, (spectrum, _) in built.items():
-        bsdfs[name] = mi.load_dict({"type": "diffraction_grating", "spectrum": spectrum, "material": "Al"})
-        work[name, "read"] = functools.partial(rays.read, spectrum, blank(spectrum))
-    for name, bsdf in bsdfs.items():
+    case: Case, spectrum: GratingSpectrum, build_seconds: float, exact: Exact, rays: Rays, repetitions: int
+) -> Result:
+    rough = mi.load_dict({"type": "roughconductor", "material": "Al"})
+    grating = mi.load_dict({"type": "diffraction_grating", "spectrum": spectrum, "material": "Al"})
+    work = {"read": functools.partial(rays.read, spectrum, blank(spectrum))}
+    for name, bsdf in (("rough", rough), ("grating", grating)):
         work[name, "evaluate"] = functools.partial(rays.evaluate, bsdf)
         work[name, "sample"] = functools.partial(rays.sample, bsdf)
     taken = seconds(work, repetitions)
-    return {
-        name: {
-            "terms": table.intervals if isinstance(table := spectrum.table, SliceTable) else table.series.terms,
-            "words": int(np.prod(spectrum.neighbours)) * table.words_per_node,
-            "megabytes": spectrum.megabytes,
-            "build_seconds": build_seconds,
-            "evaluations": rays.count / taken[name, "evaluate"],
-            "read_ratio": taken["rough", "evaluate"] / taken[name, "read"],
-            "evaluate_ratio": taken["rough", "evaluate"] / taken[name, "evaluate"],
-            "sample_ratio": taken["rough", "sample"] / taken[name, "sample"],
-            "accuracy": exact.accuracy(spectrum),
-        }
-        for name, (spectrum, build_seconds) in built.items()
-    }
-
-
-def cells(result: Result) -> list[str]:
-    """Return the values of `COLUMNS` as texts."""
-    if result.refused is None:
-        return report.cells(COLUMNS, result)
-    head = [text.format(result) for text in list(COLUMNS.values())[:3]]
-    return [*head, "refused", *[""] * (len(COLUMNS) - len(head) - 1)]
+    return Result(
+        surface=case.name,
+        extent=case.extent,
+        tolerance=spectrum.tolerance,
+        intervals=spectrum.table.intervals,
+        words=int(np.prod(spectrum.neighbours)) * spectrum.table.words_per_node,
+        megabytes=spectrum.megabytes,
+        build_seconds=build_seconds,
+        evaluations=rays.count / taken["grating", "evaluate"],
+        read_ratio=taken["rough", "evaluate"] / taken["read"],
+        evaluate_ratio=taken["rough", "evaluate"] / taken["grating", "evaluate"],
+        sample_ratio=taken["rough", "sample"] / taken["grating", "sample"],
+        accuracy=exact.accuracy(spectrum),
+    )
 
 
 def tables(results: Sequence[Result], shaders: Sequence[ShaderSpeed], sampled: Sequence[Sampling]) -> list[Table]:
     """Return tables of speed and error, of the real-time shaders and of sampling, for a terminal."""
     return [
-        table(COLUMNS, map(cells, results), texts=2),
+        table(COLUMNS, (report.cells(COLUMNS, result) for result in results)),
         table(shader_speed.COLUMNS, (report.cells(shader_speed.COLUMNS, row) for row in shaders), texts=2),
         table(sampling.COLUMNS, (report.cells(sampling.COLUMNS, row) for row in sampled)),
     ]
@@ -203,38 +173,26 @@ def save_json(
 
 
 def save_plot(results: Sequence[Result], path: str | os.PathLike[str]) -> None:
-    """Plot error against speed, one panel for each surface: right is faster, down is more accurate."""
+    """Plot error against speed, a line for each surface: right is faster, down is more accurate."""
     from matplotlib.figure import Figure
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-    surfaces = list(dict.fromkeys(result.surface for result in results))
-    columns = min(3, len(surfaces))
-    rows = -(-len(surfaces) // columns)
-    figure = Figure(figsize=(max(6.5, 3.2 * columns), 2.6 * rows + 1), layout="constrained")
-    axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
-    representations = list(dict.fromkeys(result.representation for result in results))
-    for panel, surface in zip(axes.flat, surfaces, strict=False):
-        for index, representation in enumerate(representations):
-            some = [
-                r for r in results
-                if (r.surface, r.representation) == (surface, representation) and r.refused is None
-            ]  # fmt: skip
-            panel.loglog(
-                [r.evaluate_ratio for r in some], [r.accuracy.l1 for r in some],
-                marker="osD^"[index % 4], markersize=4, linewidth=1, label=representation,
-            )  # fmt: skip
-        panel.axvline(1, color="0.6", linewidth=0.8, linestyle=":")
-        panel.set_title(surface, fontsize="medium")
-        panel.grid(alpha=0.25)
+    figure = Figure(figsize=(6.5, 4), layout="constrained")
+    axes = figure.subplots()
+    for index, surface in enumerate(dict.fromkeys(result.surface for result in results)):
+        some = [result for result in results if result.surface == surface]
+        axes.loglog(
+            [r.evaluate_ratio for r in some], [r.accuracy.l1 for r in some],
+            marker="osD^"[index % 4], markersize=4, linewidth=1, label=surface,
+        )  # fmt: skip
+    axes.axvline(1, color="0.6", linewidth=0.8, linestyle=":")
+    axes.grid(alpha=0.25)
     # Speeds span less than two decades: 1, 2 and 5 in each, as plain numbers.
-    axes.flat[0].xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    axes.flat[0].xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
-    axes.flat[0].xaxis.set_minor_formatter(NullFormatter())
-    for panel in axes.flat[len(surfaces) :]:
-        panel.set_axis_off()
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
     figure.supxlabel("evaluations per second, as a multiple of Mitsuba's roughconductor (Al)")
     figure.supylabel("error ∫|ΔS| dq")
-    handles, labels = axes.flat[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), frameon=False)
+    figure.legend(loc="outside right upper", frameon=False)
     with whole_file(path) as temporary:
         figure.savefig(temporary, format="png", dpi=130, metadata=metadata(path))

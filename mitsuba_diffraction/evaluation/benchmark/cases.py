@@ -29,7 +29,7 @@ class Case:
     extent: str
     coherence_length: float
 
-    def spectrum(self, representation: str = "auto", tolerance: float = 1e-3) -> GratingSpectrum:
+    def spectrum(self, tolerance: float = 1e-3) -> GratingSpectrum:
         """Compute the spectrum of the surface; arguments and errors as of `precompute`."""
         with warnings.catch_warnings():
             # That pixels are coarse is known.
@@ -38,7 +38,6 @@ class Case:
                 self.height_field,
                 extent=self.extent,
                 coherence_length=self.coherence_length,
-                representation=representation,
                 tolerance=tolerance,
             )
 

@@ -29,7 +29,7 @@ def benchmark(
     plot: Annotated[Path | None, typer.Option(help="plot error against speed (.png)")] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Measure error and speed of every representation, relative to Mitsuba's roughconductor."""
+    """Measure error and speed of the tables, relative to Mitsuba's roughconductor."""
     import mitsuba as mi
 
     from ...llvm import choose_variant
