@@ -2,8 +2,7 @@
 
 The file is OpenEXR: float32, ZIP, one part, one pixel per diffraction order or node.
 
-Channels are named after what they hold. Series: `B{t^003}` (taylor), `B{T_003}` (chebyshev), `B{mode 003}` (svd), the
-terms B_n of S = Σ g_n(κ) B_n; "slices": `S(012.2)`, the coefficient of t² on interval 12 of κ. Rows are orders m_y,
+Channels are named after what they hold: `S(012.2)` is the coefficient of t² on interval 12 of κ. Rows are orders m_y,
 columns m_x, from −M to M. Numbers in the header are double precision. `energy` is JSON: the table of `energy/table.py`.
 `contentSha256` covers every byte of the file and reveals damage.
 """
@@ -25,7 +24,7 @@ from .errors import RequestError
 from .spectrum.exr import doubles, one_line, read, write
 from .spectrum.grids import OrderGrid, SplineGrid
 from .spectrum.power_spectrum import PowerSpectrum
-from .spectrum.tables import Series, SeriesTable, SliceTable, chebyshev, taylor
+from .spectrum.tables import SliceTable
 
 FORMAT = "mitsuba_diffraction grating spectrum"
 FORMAT_VERSION = 8
@@ -83,9 +82,6 @@ class GratingSpectrum(PowerSpectrum):
             "units": "lengths in micrometres, wavelengths in nanometres",
             **({"warning": self.warning} if self.warning else {}),
         }
-        if isinstance(self.table, SeriesTable) and self.representation == "svd":
-            # repr of a float is exact.
-            header["modes"] = json.dumps(self.table.series.modes.tolist())
         header["energy"] = json.dumps(self.energy_table().as_plain())
         channels = _channels(self.table)
         header["channelCount"] = len(channels)
@@ -102,9 +98,8 @@ class GratingSpectrum(PowerSpectrum):
         """
         path = Path(path)
         header, channels = read(path, FORMAT, FORMAT_VERSION, recipe)
-        if header.get("representation") not in _REPRESENTATIONS:
-            got = header.get("representation")
-            raise RequestError(f"{path}: got representation {got!r}, wanted one of {', '.join(_REPRESENTATIONS)}")
+        if (got := header.get("representation")) != SliceTable.representation:
+            raise RequestError(f"{path}: got representation {got!r}, wanted {SliceTable.representation!r}")
         try:
             pixels = {name: channel.pixels for name, channel in channels.items()}
             if halves := [name for name, values in pixels.items() if values.dtype != np.float32]:
@@ -146,28 +141,15 @@ def _grid(header: dict, shape: tuple[int, int]) -> OrderGrid | SplineGrid:
     return SplineGrid(_pair(header["spacing"]), largest, _pair(header["limit"]))
 
 
-_TERM_NAMES = {"taylor": "B{{t^{:03d}}}", "chebyshev": "B{{T_{:03d}}}", "svd": "B{{mode {:03d}}}"}
-_REPRESENTATIONS = (*_TERM_NAMES, SliceTable.representation)
+def _channels(table: SliceTable) -> dict[str, np.ndarray]:
+    return {f"S({k:03d}.{p})": table.values[k, p] for k, p in np.ndindex(table.intervals, table.terms)}
 
 
-def _channels(table: SeriesTable | SliceTable) -> dict[str, np.ndarray]:
-    if isinstance(table, SliceTable):
-        return {f"S({k:03d}.{p})": table.values[k, p] for k, p in np.ndindex(table.intervals, table.terms)}
-    return {_TERM_NAMES[table.representation].format(n): term for n, term in enumerate(table.terms)}
-
-
-def _table(header: dict, pixels: dict[str, np.ndarray], max_kappa: float) -> SeriesTable | SliceTable:
-    kind, count = header["representation"], header["channelCount"]
-    if kind == SliceTable.representation:
-        powers = 4 if "S(000.3)" in pixels else 3
-        values = [[pixels[f"S({k:03d}.{p})"] for p in range(powers)] for k in range(count // powers)]
-        return SliceTable(max_kappa, np.array(values, np.float32))
-    terms = np.stack([pixels[_TERM_NAMES[kind].format(n)] for n in range(count)])
-    if kind == "svd":
-        series = Series(kind, max_kappa, np.array(json.loads(header["modes"]), np.float64))
-    else:
-        series, _ = (taylor if kind == "taylor" else chebyshev)(max_kappa, count)
-    return SeriesTable(series, terms)
+def _table(header: dict, pixels: dict[str, np.ndarray], max_kappa: float) -> SliceTable:
+    terms = 4 if "S(000.3)" in pixels else 3
+    intervals = header["channelCount"] // terms
+    values = [[pixels[f"S({k:03d}.{p})"] for p in range(terms)] for k in range(intervals)]
+    return SliceTable(max_kappa, np.array(values, np.float32))
 
 
 def _single(value: np.ndarray) -> float:

@@ -58,7 +58,7 @@ def precompute(
 
     Raises:
         ValueError: if an argument is out of range, the surface is deeper than `largest_height_range`, or the tolerance
-            cannot be kept: in float32 by a Taylor series for so deep a surface, or within a table of 4 GB.
+            cannot be kept in float32 or within a table of 4 GB.
 
     Warns:
         UserWarning: if the pixels are too coarse to hold all the frequencies that the shortest wavelength can reach, or

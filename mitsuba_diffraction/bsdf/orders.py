@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from ..grating_spectrum import GratingSpectrum
 from ..spectrum.grids import LobeAxis
-from ..spectrum.tables import HALF_SCALE, SeriesTable, SliceTable, shared_exponents
+from ..spectrum.tables import HALF_SCALE, SliceTable, shared_exponents
 from .cell_sampler import LOBE, CellAxis, CellSampler
 from .geometry import Geometry, Incidence
 from .inversion import CELLS, KappaCells, averages, choose, search, sums_before, truncated_gaussian
@@ -34,25 +34,8 @@ from .tables import (
     opaque,
 )
 
-# Linear interpolation of g_n(κ) errs by less than this share of its largest value.
-_WEIGHT_ERROR = 1e-5
-
-
 # Nodes lie in squares of 4 × 4, so that those of a window lie in few lines of the cache: one word each, in one to four.
 _SQUARE = 4
-
-
-def order_power(
-    table: SeriesTable | SliceTable, rim: tuple[int, int] = (0, 0), windows: bool = True
-) -> SeriesPower | SlicePower:
-    """Return the evaluation that fits the table.
-
-    Args:
-        table: of a spectrum.
-        rim: nodes of zero that are put on each side, (x, y).
-        windows: whether several nodes are read at a time.
-    """
-    return (SlicePower if isinstance(table, SliceTable) else SeriesPower)(table, rim, _SQUARE if windows else 1)
 
 
 Small = tuple["mi.Float", "mi.Bool"]
@@ -77,8 +60,8 @@ def small_kappa(
     return dr.select(where & (kappa < least), line, factors)
 
 
-class _Power:
-    """What both have in common.
+class SlicePower:
+    """c_m(κ) = Σ_p a_p t^p, −1 ≤ t ≤ 1 on the interval of κ. A node is one packet of one, two or four words.
 
     Attributes:
         table: packets of numbers, square after square of nodes.
@@ -88,10 +71,29 @@ class _Power:
         nodes: those of all squares.
     """
 
-    def __init__(self, rows: int, columns: int, square: int) -> None:
-        self.rows, self.columns, self.square = rows, columns, square
-        self.row = -(-columns // square) * square**2  # nodes of a row of squares
-        self.nodes = -(-rows // square) * self.row
+    def __init__(self, table: SliceTable, rim: tuple[int, int] = (0, 0), windows: bool = True) -> None:
+        """Arrange a table with `rim` nodes of zero on each side, (x, y); with `windows` for reads of several nodes."""
+        self.square = square = _SQUARE if windows else 1
+        values = np.pad(table.values, ((0, 0), (0, 0), (rim[1], rim[1]), (rim[0], rim[0])))
+        self.rows, self.columns = values.shape[2:]
+        self.row = -(-self.columns // square) * square**2  # nodes of a row of squares
+        self.nodes = -(-self.rows // square) * self.row
+        values = self._arranged(values)
+        words = table.words_per_node if dr.is_jit_v(mi.Float) else 4
+        scale = 1.0
+        if words == 1:
+            mantissas, exponents = shared_exponents(values)
+            packets = SharedExponentTable(np.moveaxis(mantissas, 1, -1), exponents)
+        elif words == 2:
+            scale = HALF_SCALE
+            packets = HalfTable(np.moveaxis(values, 1, -1) * np.float32(scale))
+        else:
+            padded = np.pad(values, ((0, 0), (0, 4 - table.terms), (0, 0)))
+            packets = PacketTable(np.moveaxis(padded, 1, -1))
+        self.table, self.unit = packets, packets.unit / scale
+        self.packet = mi.Vector3f if words == 1 else mi.Vector4f
+        self.intervals = table.intervals
+        self.per_kappa = opaque(table.intervals / table.max_kappa)
 
     def _arranged(self, packets: np.ndarray) -> np.ndarray:
         """Return (..., rows, columns) → (..., nodes)."""
@@ -115,7 +117,7 @@ class _Power:
         column: mi.Int32,
         weights_x: Sequence[mi.Float],
         weights_y: Sequence[mi.Float],
-        at: list[tuple[mi.UInt32, mi.Vector4f]],
+        at: tuple[mi.UInt32, mi.Vector3f | mi.Vector4f],
         active: mi.Bool,
     ) -> mi.Float:
         """Return Σ_ij w_x,i w_y,j c of the nodes from (row, column) on.
@@ -133,45 +135,17 @@ class _Power:
         rows = self._places(row, len(weights_y), self.row, self.square)
         columns = self._places(column, len(weights_x), self.square**2, 1)
         weights_x = [weight * self.unit for weight in weights_x]
-        total = mi.Float(0.0)
-        for offset, factors in at:
-            packet = type(factors)(0.0)
-            for weight, r in zip(weights_y, rows, strict=True):
-                line = type(factors)(0.0)
-                for w, c in zip(weights_x, columns, strict=True):
-                    line = self.table.add(line, w, offset + r + c, active)
-                packet = dr.fma(weight, line, packet)
-            total += dr.dot(packet, factors)
-        return total
+        offset, factors = at
+        packet = type(factors)(0.0)
+        for weight, r in zip(weights_y, rows, strict=True):
+            line = type(factors)(0.0)
+            for w, c in zip(weights_x, columns, strict=True):
+                line = self.table.add(line, w, offset + r + c, active)
+            packet = dr.fma(weight, line, packet)
+        return dr.dot(packet, factors)
 
-
-class SlicePower(_Power):
-    """c_m(κ) = Σ_p a_p t^p, −1 ≤ t ≤ 1 on the interval of κ. A node is one packet of one, two or four words."""
-
-    def __init__(self, table: SliceTable, rim: tuple[int, int], square: int) -> None:
-        values = _rimmed(table.values, rim)
-        super().__init__(*values.shape[2:], square)
-        values = self._arranged(values)
-        words = table.words_per_node if dr.is_jit_v(mi.Float) else 4
-        scale = 1.0
-        if words == 1:
-            mantissas, exponents = shared_exponents(values)
-            packets = SharedExponentTable(np.moveaxis(mantissas, 1, -1), exponents)
-        elif words == 2:
-            scale = HALF_SCALE
-            packets = HalfTable(np.moveaxis(values, 1, -1) * np.float32(scale))
-        else:
-            padded = np.pad(values, ((0, 0), (0, 4 - table.terms), (0, 0)))
-            packets = PacketTable(np.moveaxis(padded, 1, -1))
-        self.table, self.unit = packets, packets.unit / scale
-        self.packet = mi.Vector3f if words == 1 else mi.Vector4f
-        self.intervals = table.intervals
-        self.per_kappa = opaque(table.intervals / table.max_kappa)
-
-    def at(
-        self, kappa: mi.Float, active: mi.Bool, small: Small | None = None
-    ) -> list[tuple[mi.UInt32, mi.Vector3f | mi.Vector4f]]:
-        """Return where the packets of node 0 lie at κ (rad/µm), and the factors of their numbers.
+    def at(self, kappa: mi.Float, small: Small | None = None) -> tuple[mi.UInt32, mi.Vector3f | mi.Vector4f]:
+        """Return the index of node 0 at κ (rad/µm), and the factors of the numbers of a packet.
 
         `small` as of `small_kappa`; κ₁ is at most half of the first interval.
         """
@@ -181,71 +155,11 @@ class SlicePower(_Power):
         if small is not None:
             first, second = (self._factors(2 * n * small[0] * self.per_kappa - 1) for n in (1, 2))
             factors = small_kappa(kappa, small, factors, first, second)
-        return [(interval * self.nodes, factors)]
+        return interval * self.nodes, factors
 
     def _factors(self, t: mi.Float) -> mi.Vector3f | mi.Vector4f:
         """Return the powers of t."""
         return self.packet([1, t, dr.square(t), dr.square(t) * t][: len(self.packet(0))])
-
-
-class SeriesPower(_Power):
-    """c_m(κ) = Σ_n g_n(κ) B_nm. A node is ⌈N/4⌉ packets of four floats; the g_n come from a small table over κ."""
-
-    unit = 1.0
-
-    def __init__(self, table: SeriesTable, rim: tuple[int, int], square: int) -> None:
-        terms, rows, columns = table.terms.shape
-        self.packets = (terms + 3) // 4
-        packets = np.zeros((self.packets, 4, rows, columns), np.float32)
-        packets.reshape(-1, rows, columns)[:terms] = table.terms
-        packets = _rimmed(packets, rim)
-        super().__init__(*packets.shape[2:], square)
-        self.table = PacketTable(np.moveaxis(self._arranged(packets), 1, -1))
-        weights = _weights(table)
-        self.steps = len(weights) - 1
-        padded = np.zeros((len(weights), self.packets * 4), np.float32)
-        padded[:, :terms] = weights
-        self.weights = PacketTable(padded.reshape(-1, self.packets, 4))
-        self.per_kappa = opaque(self.steps / table.max_kappa)
-
-    def at(self, kappa: mi.Float, active: mi.Bool, small: Small | None = None) -> list[tuple[mi.UInt32, mi.Vector4f]]:
-        """Return where the packets of node 0 lie at κ (rad/µm), and the factors of their four floats.
-
-        `small` as of `small_kappa`.
-        """
-        result = []
-        for packet in range(self.packets):
-            factors = self._factors(kappa, packet, active)
-            if small is not None:
-                first, second = (self._factors(n * small[0], packet, active) for n in (1, 2))
-                factors = small_kappa(kappa, small, factors, first, second)
-            result.append((mi.UInt32(packet * self.nodes), factors))
-        return result
-
-    def _factors(self, kappa: mi.Float, packet: int, active: mi.Bool) -> mi.Vector4f:
-        """Return g_n(κ)."""
-        x = kappa * self.per_kappa
-        step = dr.minimum(mi.UInt32(x), self.steps - 1)
-        low = self.weights(step * self.packets + packet, active)
-        high = self.weights((step + 1) * self.packets + packet, active)
-        return dr.fma(x - mi.Float(step), high - low, low)
-
-
-def _rimmed(values: np.ndarray, rim: tuple[int, int]) -> np.ndarray:
-    """Return (..., rows, columns) with nodes of zero around them."""
-    return np.pad(values, ((0, 0), (0, 0), (rim[1], rim[1]), (rim[0], rim[0])))
-
-
-def _weights(table: SeriesTable) -> np.ndarray:
-    """Return g_n at steps in κ so small that straight lines between them serve: (steps + 1, N)."""
-    steps = 64
-    while True:
-        kappas = np.linspace(0, table.max_kappa, 2 * steps + 1)
-        weights = table.series.weights(kappas)
-        error = np.abs(weights[1::2] - (weights[:-1:2] + weights[2::2]) / 2).max(axis=0)
-        if (error <= _WEIGHT_ERROR * np.abs(weights).max(axis=0)).all() or steps >= 1 << 14:
-            return weights[::2]
-        steps *= 2
 
 
 FLOOR = 0.05  # the share of each κ cell that all orders have alike
@@ -474,7 +388,7 @@ class OrderSpectrum:
     """S(q; κ) = Σ_m η_m(κ) N(q − m/T; σ_q² I), and the density from which q is drawn.
 
     N ends as `OrderGrid.lobes` says. Resolved orders need one of them, so that one evaluation reads
-    `order_power` once; a tile as large as the coherence length needs 4 × 4. The density is Σ_m P_m N(q − m/T) with the
+    `SlicePower` once; a tile as large as the coherence length needs 4 × 4. The density is Σ_m P_m N(q − m/T) with the
     P_m of `OrderSampler` or, where light passes, of an `OrderTable`; where orders overlap, that of `CellSampler`. For a
     line grating whose orders overlap or are wide, it is that of `LineSampler`.
 
@@ -489,7 +403,7 @@ class OrderSpectrum:
         )
         line = 1 in grid.shape
         self.resolved = all(axis.count == 1 for axis in self.axes) and not (line and sigma > NARROW)
-        self.power = order_power(spectrum.table, tuple(axis.rim for axis in self.axes), windows=not self.resolved)
+        self.power = SlicePower(spectrum.table, tuple(axis.rim for axis in self.axes), windows=not self.resolved)
         self.cells = None
         if not self.resolved:
             self.cells = LineSampler(spectrum, most) if line else CellSampler(spectrum, most, farthest)
@@ -560,7 +474,7 @@ class OrderSpectrum:
         row, column = (m + (axis.max_order + axis.rim) for m, axis in zip((m_y, m_x), self.axes[::-1], strict=True))
         power = 0
         for x, y, of_x, of_y, kappa in windows:
-            at = self.power.at(kappa, active, geometry.small())
+            at = self.power.at(kappa, geometry.small())
             power += factor * self.power.window(row + y, column + x, of_x, of_y, at, active)
         # Interpolation may dip below zero by its error.
         return dr.select(active, larger(power, 0), 0), density

@@ -9,7 +9,7 @@ from ..grating_spectrum import GratingSpectrum
 from ..spectrum.grids import spline_weights
 from .cell_sampler import CellSampler
 from .geometry import Geometry, Incidence
-from .orders import order_power
+from .orders import SlicePower
 from .tables import larger, opaque
 
 RIM = 3  # rings of zeros, so many as are read in a row
@@ -25,7 +25,7 @@ class SplineSpectrum:
 
     def __init__(self, spectrum: GratingSpectrum, most: float | None = None, farthest: float = 1.0) -> None:
         grid = spectrum.grid
-        self.power = order_power(spectrum.table, (RIM, RIM))
+        self.power = SlicePower(spectrum.table, (RIM, RIM))
         self.max_node_x, self.max_node_y = grid.max_order
         self.per_q_x, self.per_q_y = (opaque(1 / d) for d in grid.spacing)
         self.per_area = opaque(1 / (grid.spacing[0] * grid.spacing[1]))
@@ -48,7 +48,7 @@ class SplineSpectrum:
             m_x + (self.max_node_x + RIM - 1),
             spline_weights(x - mi.Float(m_x)),
             spline_weights(y - mi.Float(m_y)),
-            self.power.at(geometry.kappa(incidence.frequency), active, geometry.small()),
+            self.power.at(geometry.kappa(incidence.frequency), geometry.small()),
             active,
         )
         inside = active & (dr.abs(q.x) <= self.limit_x) & (dr.abs(q.y) <= self.limit_y)

@@ -19,10 +19,7 @@ from .grids import LobeAxis, inner
 from .power_spectrum import TAIL_SHARE, PowerSpectrum
 from .sample import SamplePowers, effective_coherence_length, standard_error
 from .tables import (
-    Series,
-    SeriesTable,
     SliceTable,
-    chebyshev,
     chebyshev_nodes,
     chebyshev_polynomials,
     chebyshev_transform,
@@ -31,8 +28,6 @@ from .tables import (
     packed,
     place,
     position,
-    svd,
-    taylor,
     to_polynomial,
 )
 from .tile import MeanPowers, TilePowers, TileSplines
@@ -55,7 +50,6 @@ _OF_MEAN = 0.7  # the share of the time that the mean of many patches takes, rou
 
 Splines = SamplePowers | TileSplines
 Lattice = TypeVar("Lattice", SamplePowers, TileSplines)
-Table = SeriesTable | SliceTable
 
 
 def build_spectrum(patches: Sequence[HeightField], settings: Settings, progress: Progress) -> PowerSpectrum:
@@ -103,7 +97,7 @@ def build_spectrum(patches: Sequence[HeightField], settings: Settings, progress:
             tolerance,
         )
     build = _Build(powers, height_range, max_kappa, allowed, progress)
-    table, error = build(SliceTable.representation if settings.representation == "auto" else settings.representation)
+    table, error = build()
     source, source_digest = height_field.source, height_field.digest
     if len(patches) > 1:
         source = f"mean of {len(patches)} patches: {source}, …"
@@ -264,15 +258,13 @@ class _Build:
 
         return part(forward, begin, end)
 
-    def __call__(self, representation: str) -> tuple[Table, float]:
-        """Return the cheapest table of this representation, and its measured error."""
-        packs = representation == SliceTable.representation and np.prod(self.kept.shape) > _SMALL
-        storages = _STORAGES if packs else _STORAGES[-1:]
-        for storage in storages:
+    def __call__(self) -> tuple[SliceTable, float]:
+        """Return the cheapest table, and its measured error."""
+        for storage in _STORAGES if np.prod(self.kept.shape) > _SMALL else _STORAGES[-1:]:
             refine, refusal = storage.interpolation, None
             while self._allowed >= storage.least:
                 try:
-                    table = self._build(representation, storage, _MARGIN * self._allowed * refine)
+                    table = self._build(storage, _MARGIN * self._allowed * refine)
                 except _TooLargeError as too_large:
                     # Another storage may need fewer intervals.
                     refusal = too_large
@@ -283,38 +275,17 @@ class _Build:
                 if refine < storage.finest:
                     break
                 refine /= max(2.0, error / self._allowed)
-        raise refusal or RequestError(self._refusal(representation, error))
+        raise refusal or RequestError(
+            f"tolerance: got {self._allowed:.2g} with a surface of height range {self._range:.3g} µm, wanted one that "
+            f"float32 keeps up to κ = {self._max_kappa:.1f} rad/µm (measured error {error:.2g})"
+        )
 
-    def _build(self, representation: str, storage: _Storage, allowed: float) -> Table:
-        if representation == SliceTable.representation:
-            intervals = self._intervals(allowed, storage.terms)
-            _check_size(self.kept.shape, intervals * storage.terms)
-            # What is measured is what is stored.
-            return SliceTable.build(
-                intervals, storage.terms, self._max_kappa, self._powers, storage.rounded, self._phase(0.3, 0.8)
-            )
-        if representation == "taylor":
-            if 2.0**-24 * np.exp(min(self._x, 80.0)) > 20 * self._allowed:
-                # Each term is good to 2^-24 of its size, and their sizes add up to e^x; the bound is generous by 20.
-                raise RequestError(self._refusal(representation, None))
-            series, projection = taylor(self._max_kappa, self._nodes)
-        elif representation == "chebyshev":
-            series, projection = chebyshev(self._max_kappa, self._nodes)
-        else:
-            series, projection = svd(self._max_kappa, self._pilot)
-        terms = self._terms(series, projection, allowed)
-        _check_size(self.kept.shape, terms)
-        return SeriesTable.build(series.first(terms), projection[:terms], self._powers, self._phase(0.3, 0.8))
-
-    def _refusal(self, representation: str, error: float | None) -> str:
-        if representation == "taylor":
-            why = f"the terms of the series grow to e^{self._x:.1f} and cancel; representation 'slices' keeps it"
-        else:
-            why = "rounding does not allow it"
-        measured = f" (measured error {error:.2g})" if error is not None else ""
-        return (
-            f"{representation}: a surface of height range {self._range:.3g} µm cannot be kept to {self._allowed:.2g} "
-            f"in float32 up to κ = {self._max_kappa:.1f} rad/µm: {why}{measured}"
+    def _build(self, storage: _Storage, allowed: float) -> SliceTable:
+        intervals = self._intervals(allowed, storage.terms)
+        _check_size(self.kept.shape, intervals * storage.terms)
+        # What is measured is what is stored.
+        return SliceTable.build(
+            intervals, storage.terms, self._max_kappa, self._powers, storage.rounded, self._phase(0.3, 0.8)
         )
 
     def _between(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -322,19 +293,6 @@ class _Build:
         kappas = np.linspace(0, self._max_kappa, 16 + int(np.ceil(4 * self._x)), dtype=np.float64)
         vander = chebyshev_polynomials(position(kappas, self._max_kappa), self._nodes)
         return kappas, vander @ chebyshev_transform(self._nodes)
-
-    def _terms(self, series: Series, projection: NDArray[np.float64], allowed: float) -> int:
-        """Return the fewest terms with which the pilot is kept at every κ."""
-        allowed *= self._pilot_share
-        kappas, interpolate = self._between()
-        terms = projection @ self._pilot
-        weights = series.weights(kappas)
-        remainder = interpolate @ self._pilot
-        for n in range(series.terms):
-            if np.abs(remainder).sum(axis=1).max() <= allowed:
-                return max(n, 1)
-            remainder -= np.outer(weights[:, n], terms[n])
-        return series.terms
 
     def _intervals(self, allowed: float, terms: int) -> int:
         """Return the fewest intervals with which the pilot is kept at every κ."""
@@ -355,7 +313,7 @@ class _Build:
                 return intervals
             intervals = max(intervals + 1, int(intervals * min(2.0, 0.95 * (error / allowed) ** (1 / terms))))
 
-    def _measured(self, table: Table) -> float:
+    def _measured(self, table: SliceTable) -> float:
         """Return the largest error of S over held-out κ: both ends, and others between, four to an oscillation."""
         count = 12 + int(np.ceil(2 * self._x))
         golden = (np.sqrt(5) - 1) / 2

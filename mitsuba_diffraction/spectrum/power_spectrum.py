@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import RequestError
 from ..settings import Settings, lobe_cutoff, lobe_width, matching
 from .grids import LobeAxis, OrderGrid, SplineGrid
-from .tables import SeriesTable, SliceTable
+from .tables import SliceTable
 
 # The part of the tolerance that is spent on the tails of the lobes.
 TAIL_SHARE = 0.4
@@ -23,7 +23,7 @@ class PowerSpectrum:
     """S(q; κ): Σ_m η_m(κ) N(q − m/T; σ_q² I) of a tile, or, of a sample and where many lobes overlap, B-splines.
 
     Attributes:
-        table: η_m(κ), or the coefficients of the splines, in one of the representations.
+        table: η_m(κ), or the coefficients of the splines.
         grid: the diffraction orders m, or the nodes, that are kept.
         extent: "tile": the patch repeats for ever; "sample": it is a piece of a larger, irregular surface.
         pixel_size: (x, y) of the height field, µm.
@@ -43,7 +43,7 @@ class PowerSpectrum:
             reflected power that is comparable to `error`; None of a tile, which is known exactly.
     """
 
-    table: SeriesTable | SliceTable
+    table: SliceTable
     grid: OrderGrid | SplineGrid
     extent: str
     pixel_size: tuple[float, float]
@@ -83,7 +83,7 @@ class PowerSpectrum:
 
     @property
     def representation(self) -> str:
-        """The storage of the powers: "taylor", "chebyshev", "svd" or "slices"."""
+        """The storage of the powers, "slices"."""
         return self.table.representation
 
     @property

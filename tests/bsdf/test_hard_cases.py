@@ -17,10 +17,6 @@ from mitsuba_diffraction.spectrum.grids import OrderGrid
 
 LARGEST_KAPPA = 4 * np.pi / 0.36
 REACHED = 2 / 0.36
-KINDS = ["taylor", "chebyshev", "svd", "slices"]
-DEEP = ["chebyshev", "svd", "slices"]
-# Those between are tested on other surfaces; here, too, when slow tests are asked for.
-SLOW = [pytest.param(kind, marks=pytest.mark.slow) for kind in ("taylor", "chebyshev")]
 
 
 def noise(shape, depth):
@@ -67,9 +63,6 @@ FIVE_MICROMETRES = {
     "deep spike, a sample": (field_of(spike((10, 9), 5.0)), "sample", 0.38),
     "deep noise, a sample": (field_of(noise((9, 10), 5.0)), "sample", 0.38),
 }
-CASES = [(name, kind) for name in SHALLOW for kind in ("svd", "slices")]
-CASES += [pytest.param(name, *kind.values, marks=kind.marks) for name in SHALLOW for kind in SLOW]
-CASES += [(name, kind) for name in FIVE_MICROMETRES for kind in DEEP]
 
 
 def axis_of(count, pixel, extent, sigma, reach=REACHED):
@@ -103,13 +96,11 @@ def case(name):
     return {**SHALLOW, **FIVE_MICROMETRES}[name]
 
 
-@pytest.mark.few(27)
-@pytest.mark.parametrize(("name", "representation"), CASES)
-def test_hard_surfaces_are_right_to_the_tolerance(name, representation):
+@pytest.mark.few(14)
+@pytest.mark.parametrize("name", [*SHALLOW, *FIVE_MICROMETRES])
+def test_hard_surfaces_are_right_to_the_tolerance(name):
     field, extent, coherence_length = case(name)
-    spectrum = md.precompute(
-        field, extent=extent, coherence_length=coherence_length, representation=representation, tolerance=1e-3
-    )
+    spectrum = md.precompute(field, extent=extent, coherence_length=coherence_length, tolerance=1e-3)
     assert spectrum.error <= 1e-3
     for kappa in (19.3, LARGEST_KAPPA):
         difference, power = error(spectrum, field, extent, coherence_length, kappa)
@@ -117,14 +108,11 @@ def test_hard_surfaces_are_right_to_the_tolerance(name, representation):
         assert power > 5e-3  # there is something to compare
 
 
-@pytest.mark.few(36)
+@pytest.mark.few(18)
 @pytest.mark.parametrize("name", SHALLOW)
-@pytest.mark.parametrize("representation", ["svd", "slices", *SLOW])
-def test_at_q_zero_and_small_kappa_every_surface_is_a_mirror(name, representation):
+def test_at_q_zero_and_small_kappa_every_surface_is_a_mirror(name):
     field, extent, coherence_length = SHALLOW[name]
-    spectrum = md.precompute(
-        field, extent=extent, coherence_length=coherence_length, representation=representation, tolerance=1e-3
-    )
+    spectrum = md.precompute(field, extent=extent, coherence_length=coherence_length, tolerance=1e-3)
     exact = md.reference.power_spectrum(field, [0.0, 0.0], 0.0, extent=extent, coherence_length=coherence_length)
     for kappa in (0.0, 1e-30, 1e-6, 1e-3):
         assert spectrum.evaluate([0.0, 0.0], kappa) == pytest.approx(exact, rel=5e-3)
@@ -137,20 +125,17 @@ def test_at_q_zero_and_small_kappa_every_surface_is_a_mirror(name, representatio
 @given(
     depth=st.sampled_from([0.0, 1e-9, 0.05, 0.3, 2.0, 5.0]),
     shape=st.sampled_from([(1, 13), (11, 1), (9, 9), (9, 13)]),
-    kind=st.sampled_from(DEEP),
     extent=st.sampled_from(["tile", "sample"]),
     share=st.floats(0, 1),
     seed=st.integers(0, 2**32 - 1),
 )
-@example(depth=5.0, shape=(9, 9), kind="svd", extent="sample", share=1.0, seed=0)
+@example(depth=5.0, shape=(9, 9), extent="sample", share=1.0, seed=0)
 # Regression: the splines of nodes beyond the Nyquist limit were missing.
-@example(depth=0.3, shape=(1, 13), kind="slices", extent="sample", share=0.9, seed=0)
-def test_any_surface_is_right_at_any_kappa(depth, shape, kind, extent, share, seed):
+@example(depth=0.3, shape=(1, 13), extent="sample", share=0.9, seed=0)
+def test_any_surface_is_right_at_any_kappa(depth, shape, extent, share, seed):
     field = field_of(np.random.default_rng(seed).random(shape) * depth)
     coherence_length = 0.38
-    spectrum = md.precompute(
-        field, extent=extent, coherence_length=coherence_length, representation=kind, tolerance=1e-2
-    )
+    spectrum = md.precompute(field, extent=extent, coherence_length=coherence_length, tolerance=1e-2)
     assert spectrum.error <= 1e-2
     assert error(spectrum, field, extent, coherence_length, share * LARGEST_KAPPA)[0] <= 1.05e-2
 
@@ -236,23 +221,12 @@ def directions(field, extent, sigma, wavelengths, count=200):
     return wi[keep], wo[keep]
 
 
-RENDERED = [
-    *[(name, "slices") for name in SHALLOW],
-    *[(name, "svd") for name in ("flat tile", "odd tile", "even sample", "row sample", "one order")],
-    *[(name, kind) for name in ("rectangular pixels of a sample", "row tile") for kind in ("taylor", "chebyshev")],
-    *[("deep noise", kind) for kind in DEEP],
-    *[("deep spike, a sample", kind) for kind in ("svd", "slices")],
-]
-
-
-@pytest.mark.few(8)
-@pytest.mark.parametrize(("name", "representation"), RENDERED)
+@pytest.mark.few(6)
+@pytest.mark.parametrize("name", [*SHALLOW, "deep noise", "deep spike, a sample"])
 @pytest.mark.usefixtures("llvm")
-def test_hard_surfaces_are_rendered_right(name, representation):
+def test_hard_surfaces_are_rendered_right(name):
     field, extent, coherence_length = case(name)
-    spectrum = md.precompute(
-        field, extent=extent, coherence_length=coherence_length, representation=representation, tolerance=1e-3
-    )
+    spectrum = md.precompute(field, extent=extent, coherence_length=coherence_length, tolerance=1e-3)
     sigma, wavelengths = lobe_width(coherence_length), [360.0, 500.0, 620.0, 830.0]
     wi, wo = directions(field, extent, sigma, wavelengths)
     q, kappa = asked(wi, wo, wavelengths)
@@ -278,16 +252,12 @@ def test_hard_surfaces_are_rendered_right(name, representation):
     assert (np.abs(got - wanted) <= largest * (1.5e-3 + digits) * peak).all()
 
 
-@pytest.mark.few(1)
-@pytest.mark.parametrize("representation", KINDS)
 @pytest.mark.usefixtures("llvm")
-def test_a_sample_is_rendered_right_to_its_rim_and_black_beyond(representation):
+def test_a_sample_is_rendered_right_to_its_rim_and_black_beyond():
     field = field_of(noise((12, 20), 0.2), 0.16)
     limit = 1 / (2 * 0.16)
     with pytest.warns(UserWarning, match="pixels of 160 nm"):
-        spectrum = md.precompute(
-            field, extent="sample", coherence_length=0.9, tolerance=1e-3, representation=representation
-        )
+        spectrum = md.precompute(field, extent="sample", coherence_length=0.9, tolerance=1e-3)
     wavelengths = [400.0] * 4
     q_x = limit * np.array([0.9, 0.97, 0.99, 0.999, 0.9999, 1.0001, 1.001, 1.01, 1.05, 1.2])
     for axis in ([1, 0], [0, 1], [-1, 0], [0, -1]):
@@ -328,10 +298,9 @@ def test_the_ends_of_the_wavelengths_are_right_and_beyond_them_it_is_black(exten
     assert (got[:, 2:] == 0).all()
 
 
-@pytest.mark.parametrize("representation", DEEP)
 @pytest.mark.usefixtures("llvm")
-def test_five_micrometres_are_rendered_with_bessel_orders(representation):
-    spectrum = md.precompute(md.gratings.sinusoidal(2.5, 5.0), representation=representation)
+def test_five_micrometres_are_rendered_with_bessel_orders():
+    spectrum = md.precompute(md.gratings.sinusoidal(2.5, 5.0))
     wavelengths = [450.0] * 4
     for theta in (0.0, 0.6):
         orders = np.arange(-9, 10)

@@ -70,7 +70,7 @@ def files():
         ("precompute blaze.toml --extent ribbon", "extent: got 'ribbon', wanted 'tile' or 'sample'"),
         ("precompute blaze.toml --largest-angle 91", "largest_angle: got 91"),
         ("precompute blaze.toml --largest-angle steep", "--largest-angle"),
-        ("precompute deep.toml --representation taylor", "taylor: a surface of height range 4.92 µm"),
+        ("precompute deep.toml --representation taylor", "representation: got 'taylor', wanted one of auto, slices"),
         ("precompute scan.npy --pixel-size 0.05 --extent sample", "wanted at least 4 pixels (0.2 µm)"),
         ("precompute blaze.toml --pixel-size 0.1", "--pixel-size"),
         ("precompute blaze.toml --fill-missing", "--fill-missing go with a scan; the recipe blaze.toml"),
@@ -178,12 +178,10 @@ def test_precompute_writes_the_file_that_it_names_and_prints_its_error(command):
     assert f"{spectrum.unresolved_power:.1e} at frequencies that no direction reaches" in out
 
 
-@pytest.mark.few(1)
-@pytest.mark.parametrize("representation", ["taylor", "chebyshev", "svd", "slices"])
-def test_precompute_takes_a_sample_by_options(command, representation):
+def test_precompute_takes_a_sample_by_options(command):
     code, out, err = command(
         "precompute wide.npy --pixel-size 0.09 --extent sample --largest-angle 60 --tolerance 0.02 -o out.exr "
-        f"--representation {representation}"
+        "--representation slices"
     )
     assert code == 0
     told = err.splitlines()
@@ -191,7 +189,7 @@ def test_precompute_takes_a_sample_by_options(command, representation):
     assert told[0].startswith("mitsuba-diffraction: warning: coherence_length: a scan of 2.16 × 1.8 µm carries 0.9 µm")
     spectrum = md.GratingSpectrum.load("out.exr")
     assert (spectrum.extent, spectrum.largest_angle, spectrum.tolerance) == ("sample", 60.0, 0.02)
-    assert spectrum.representation == representation
+    assert spectrum.representation == "slices"
     rows, columns = spectrum.grid.shape
     for part in (f"sample, {columns} × {rows} frequencies", "cycles/µm apart", "coherence length 0.9 µm", "truncated"):
         assert part in out
@@ -207,13 +205,11 @@ def test_a_smaller_angle_takes_fewer_orders(command):
 
 
 def test_options_override_the_recipe(command):
-    Path("blaze.toml").write_text(BLAZE + '[spectrum]\ntolerance = 0.1\nrepresentation = "slices"\n')
-    code, _, _ = command(
-        "precompute blaze.toml -o out.exr --tolerance 0.02 --representation taylor --coherence-length 20"
-    )
+    Path("blaze.toml").write_text(BLAZE + "[spectrum]\ntolerance = 0.1\ncoherence_length = 30\n")
+    code, _, _ = command("precompute blaze.toml -o out.exr --tolerance 0.02 --coherence-length 20")
     assert code == 0
     spectrum = md.GratingSpectrum.load("out.exr")
-    assert (spectrum.tolerance, spectrum.representation, spectrum.coherence_length) == (0.02, "taylor", 20.0)
+    assert (spectrum.tolerance, spectrum.coherence_length) == (0.02, 20.0)
 
 
 def test_scans_are_read_with_their_scale(command):

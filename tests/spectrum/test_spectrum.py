@@ -10,16 +10,7 @@ from hypothesis import strategies as st
 import mitsuba_diffraction as md
 from mitsuba_diffraction.settings import lobe_cutoff
 from mitsuba_diffraction.spectrum.grids import OrderGrid, SplineGrid, spline_integral
-from mitsuba_diffraction.spectrum.tables import (
-    SeriesTable,
-    SliceTable,
-    chebyshev,
-    halved,
-    nodes_for,
-    packed,
-    svd,
-    taylor,
-)
+from mitsuba_diffraction.spectrum.tables import SliceTable, halved, packed
 
 LARGEST_KAPPA = 4 * np.pi / 0.36
 
@@ -177,8 +168,6 @@ def test_wrong_lattices_are_refused(arguments):
 
 # ---------------------------------------------------------------- tables
 
-KINDS = ["taylor", "chebyshev", "svd", "slices"]
-
 
 def random_surface(depth, shape=(5, 7)):
     return md.HeightField(np.random.default_rng(3).random(shape) * depth, 0.08)
@@ -194,25 +183,14 @@ def powers_of(field):
     return lambda kappa: grid.take(md.reference.order_powers(field, kappa))
 
 
-def build(kind, field):
-    powers = powers_of(field)
-    if kind == "slices":
-        return SliceTable.build(40, 4, LARGEST_KAPPA, powers, as_it_is, ignore)
-    nodes = nodes_for(LARGEST_KAPPA * field.half_range, 1e-7)
-    if kind == "svd":
-        kappas = (1 - np.cos(np.pi * (np.arange(nodes) + 0.5) / nodes)) / 2 * LARGEST_KAPPA
-        series, projection = svd(LARGEST_KAPPA, np.array([powers(kappa).ravel() for kappa in kappas]))
-    else:
-        series, projection = {"taylor": taylor, "chebyshev": chebyshev}[kind](LARGEST_KAPPA, nodes)
-    return SeriesTable.build(series, projection, powers, ignore)
+def build(field):
+    return SliceTable.build(40, 4, LARGEST_KAPPA, powers_of(field), as_it_is, ignore)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_tables_hold_the_powers_of_the_orders_where_they_belong(kind):
+def test_tables_hold_the_powers_of_the_orders_where_they_belong():
     # An asymmetric surface: rows, columns and signs cannot be exchanged unseen.
     field = random_surface(0.2)
-    table = build(kind, field)
-    assert table.representation == kind
+    table = build(field)
     m_x, m_y = every_order(field).axes()
     for kappa in (0.0, 1.0, 20.0, LARGEST_KAPPA):
         phase = np.exp(1j * kappa * field.heights)
@@ -227,15 +205,13 @@ def test_tables_hold_the_powers_of_the_orders_where_they_belong(kind):
         np.testing.assert_allclose(one_by_one, got, atol=2e-6)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_tables_cannot_be_written(kind):
-    table = build(kind, random_surface(0.1))
-    numbers = table.values if kind == "slices" else table.terms
+def test_tables_cannot_be_written():
+    table = build(random_surface(0.1))
     with pytest.raises(ValueError, match="read-only"):
-        numbers[...] = 0
-    assert table.nbytes == numbers.nbytes
+        table.values[...] = 0
+    assert table.nbytes == table.values.nbytes
     assert table.shape == (5, 7)
-    assert table.words_per_node == (4 if kind == "slices" else 4 * ((len(numbers) + 3) // 4))
+    assert table.words_per_node == 4
 
 
 @pytest.mark.parametrize("terms", [3, 4])
@@ -286,30 +262,14 @@ def test_numbers_too_large_to_be_rounded_are_not_finite():
     assert not np.isfinite(halved(values)).any()
 
 
-@pytest.mark.parametrize("representation", KINDS)
 @pytest.mark.parametrize("extent", ["tile", "sample"])
-def test_no_density_is_negative(extent, representation):
+def test_no_density_is_negative(extent):
     field = random_surface(0.4, (16, 18))
-    spectrum = md.precompute(field, extent=extent, representation=representation, tolerance=0.05, coherence_length=0.5)
+    spectrum = md.precompute(field, extent=extent, tolerance=0.05, coherence_length=0.5)
     q = np.random.default_rng(0).uniform(-6, 6, (300, 2))
     shares = [spectrum.powers(kappa).min() for kappa in np.linspace(0, LARGEST_KAPPA, 30)]
     assert min(shares) < 0  # they may dip by the error
     assert spectrum.evaluate(q, np.linspace(0, LARGEST_KAPPA, 300)).min() >= 0
-
-
-@pytest.mark.parametrize(
-    "terms",
-    [
-        np.zeros((3, 2), np.float32),
-        np.zeros((2, 3, 3), np.float32),
-        np.zeros((3, 3, 3)),
-        np.full((3, 1, 1), np.nan, np.float32),
-    ],
-    ids=["flat", "terms", "type", "nan"],
-)
-def test_series_tables_check_their_numbers(terms):
-    with pytest.raises(ValueError, match="terms: got"):
-        SeriesTable(taylor(0.1, 3)[0], terms)
 
 
 @pytest.mark.parametrize(
@@ -369,14 +329,13 @@ def test_nothing_lies_far_from_the_orders(blaze):
     np.testing.assert_array_equal(blaze.evaluate([[1e6, 0.0], [0.0, -1e6], [0.2, 0.0]], 20.0), 0)
 
 
-@pytest.mark.few(7)
+@pytest.mark.few(3)
 @pytest.mark.parametrize("coherence_length", [0.3, 1.0, 2.0, 5.0, 9.0])
-@pytest.mark.parametrize("representation", KINDS)
-def test_lobes_wider_than_the_grid_of_orders_keep_all_orders(coherence_length, representation):
+def test_lobes_wider_than_the_grid_of_orders_keep_all_orders(coherence_length):
     # Regression: where lobes reached beyond the last order, the count of neighbours began outside of the grid and
     # missed the orders on the other side; a grating of one row, whose only order along y is zero, gave S = 0.
     field = md.gratings.blazed(period=2.5, depth=0.25, samples=64)
-    spectrum = md.precompute(field, coherence_length=coherence_length, representation=representation)
+    spectrum = md.precompute(field, coherence_length=coherence_length)
     sigma = 1 / (2 * np.sqrt(2) * np.pi * coherence_length / 4)
     q = np.stack(np.meshgrid(np.linspace(-4, 4, 9), [-0.7 * sigma, 0, 0.3 * sigma], indexing="ij"), axis=-1)
     m = np.arange(-32, 32)
