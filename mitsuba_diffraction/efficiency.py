@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from . import rigorous
 from .errors import RequestError, is_number
 from .files import whole_file
-from .outputs import made_for, metadata
+from .outputs import MARK, METADATA
 from .progress import Progress, silent
 from .rigorous import refractive_index
 from .rigorous.coordinate_transformation import curve_of, is_profile
@@ -109,7 +109,6 @@ class OrderEfficiencies:
         Raises:
             FileNotFoundError: if the folder is not there.
         """
-        request = made_for(path)
         with whole_file(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as stream:
             rows = csv.writer(stream)
             names = ["order"] if self.orders.ndim == 1 else ["order_x", "order_y"]
@@ -118,8 +117,7 @@ class OrderEfficiencies:
                 pair = self.values[order, a, w]
                 numbers = self.angles[a], self.wavelengths[w], *pair, pair.mean()
                 rows.writerow([*np.atleast_1d(self.orders[order]), *(f"{number:.9g}" for number in numbers)])
-            if request is not None:
-                stream.write(f"# {request}\n")
+            stream.write(f"# {MARK}\n")
 
     def plot(self, path: str | os.PathLike[str] | None = None) -> Figure:
         """Plot the strongest orders; lines over the wavelength or the angle, or if both vary, a map for each order.
@@ -133,7 +131,7 @@ class OrderEfficiencies:
         figure.suptitle(self.source, fontsize=10)
         if path is not None:
             with whole_file(path) as temporary:
-                figure.savefig(temporary, metadata=metadata(path))
+                figure.savefig(temporary, metadata=METADATA)
         return figure
 
     def _plot_lines(self, figure: Figure) -> None:

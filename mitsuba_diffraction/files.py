@@ -21,14 +21,7 @@ try:
 except ImportError:  # Windows, where a temporary file in use cannot be recognised
     fcntl = None
 
-# Temporary path → final path.
-_being_written: dict[str, Path] = {}
-
-
-def final_path(path: str | os.PathLike[str]) -> Path:
-    """Return the real path of a file; the final path of a temporary file from `whole_file`."""
-    real = os.path.realpath(path)
-    return _being_written.get(real, Path(real))
+_being_written: set[str] = set()  # temporary paths
 
 
 @contextmanager
@@ -55,7 +48,7 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
         raise RequestError(f"cannot write {os.fspath(path)!r}: it is there and is not an ordinary file")
     _remove_what_a_kill_left(target)
     temporary, opened = _locked_temporary(target)
-    _being_written[str(temporary)] = target
+    _being_written.add(str(temporary))
     try:
         try:
             yield temporary
@@ -69,7 +62,7 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
             temporary.unlink(missing_ok=True)
         raise
     finally:
-        del _being_written[str(temporary)]
+        _being_written.remove(str(temporary))
         if fcntl is not None:
             os.close(opened)
     if hasattr(os, "O_DIRECTORY"):  # makes the rename itself durable, where supported
@@ -122,6 +115,14 @@ def refuse_unwritable(path: str | os.PathLike[str]) -> None:
 
 class _Writable(Exception):
     """`path` can be written; discards the temporary file."""
+
+
+def refuse_other_than_utf8(text: str) -> None:
+    """Raise if a file name, or a text that holds one, is not UTF-8."""
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        raise RequestError(f"{text}: wanted names of files and folders in UTF-8") from None
 
 
 def cache_folder() -> Path:

@@ -11,8 +11,8 @@ from typing import Annotated, Any
 
 import typer
 
-from .. import outputs
 from ..errors import RequestError
+from ..files import refuse_other_than_utf8
 from ..recipe import Recipe
 from ..settings import SUN_COHERENCE_LENGTH, Settings
 from ..surface.prepare import STEP_NAMES, step_of
@@ -27,7 +27,7 @@ def scene_parameters(define: Sequence[str] | None) -> dict[str, str]:
         name, equals, value = item.partition("=")
         if not (name and equals):
             raise RequestError(f"-D: got {item!r}, wanted NAME=VALUE")
-        _refuse_other_than_utf8(item)
+        refuse_other_than_utf8(item)
         if name in parameters:
             raise RequestError(f"-D {name}: got it twice, wanted one value")
         # File names on the command line are relative to the current folder. A bare word or number is not a file name,
@@ -38,31 +38,8 @@ def scene_parameters(define: Sequence[str] | None) -> dict[str, str]:
 
 
 Define = Annotated[list[str] | None, typer.Option("-D", metavar="NAME=VALUE", help="set a parameter of the scene")]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="replace existing files, but never inputs")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="replace foreign files, too, but never inputs")]
 Variant = Annotated[str | None, typer.Option(help="Mitsuba variant; default: the fastest spectral one")]
-# Options that affect where and how files are written, but not their content.
-_NOT_OF_THE_REQUEST = frozenset(
-    {"output", "json", "csv", "plot", "markdown", "figures", "overwrite", "resume", "checkpoint", "dask"}
-)
-
-
-def claim(context: typer.Context, reads: Sequence[Path], writes: Sequence[tuple[str, Path]]) -> None:
-    """Claim the outputs of a command (`outputs.claim`); the request is its command line without defaults.
-
-    Raises:
-        ValueError: as `outputs.claim`, or if a file name is not UTF-8, which OpenEXR and Mitsuba require.
-    """
-    for path in [*reads, *(path for _, path in writes)]:
-        _refuse_other_than_utf8(os.path.realpath(path))
-    request = {
-        parameter.name: context.params[parameter.name]
-        for parameter in context.command.params
-        if parameter.name not in _NOT_OF_THE_REQUEST and context.params.get(parameter.name) != parameter.default
-    }
-    if "define" in request:
-        request["define"] = scene_parameters(request["define"])
-    request["command"] = context.command.name
-    outputs.claim(request, reads, writes, overwrite=context.params["overwrite"])
 
 
 def check_suffix(option: str, path: Path, *suffixes: str) -> None:
@@ -106,13 +83,6 @@ def materials_of(texts: Sequence[str] | None) -> dict[str, dict[str, Value]]:
         # The scene has a folder of its own, to which its file names are relative.
         materials[name] = {**({"filename": os.path.abspath(source)} if is_file else {"profile": source}), **values}
     return materials
-
-
-def _refuse_other_than_utf8(text: str) -> None:
-    try:
-        text.encode()
-    except UnicodeEncodeError:
-        raise RequestError(f"{text}: wanted names of files and folders in UTF-8") from None
 
 
 PixelSize = Annotated[float | None, typer.Option(help="pixel size of the scan, µm")]

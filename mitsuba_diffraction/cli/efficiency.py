@@ -11,16 +11,16 @@ from numpy.typing import NDArray
 
 from ..efficiency import efficiencies
 from ..errors import RequestError
+from ..outputs import check_outputs
 from ..progress import progress_bar, tell
 from ..recipe import Recipe
 from ..surface.gratings import PROFILES
-from .arguments import Overwrite, check_suffix, claim, surface_of
+from .arguments import Overwrite, check_suffix, surface_of
 
 _MOST = 10_000
 
 
 def efficiency(
-    context: typer.Context,
     source: Annotated[
         str, typer.Argument(metavar="RECIPE|PROFILE[,name=value…]", help="a recipe (.toml), or a profile")
     ],
@@ -66,7 +66,7 @@ def efficiency(
     if plot is not None:
         check_suffix("--plot", plot, ".png", ".pdf", ".svg")
     writes = [(option, path) for option, path in (("--csv", csv), ("--plot", plot)) if path is not None]
-    claim(context, [Path(name), *recipe.files], writes)
+    check_outputs([Path(name), *recipe.files], writes, overwrite=overwrite)
     with progress_bar(f"efficiencies of {name}") as progress:
         found = efficiencies(
             recipe.height_field(),

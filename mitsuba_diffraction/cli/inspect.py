@@ -16,7 +16,7 @@ from ..inspection import Inspection, save_picture
 from ..inspection import inspect as look
 from ..inspection.colours import GREEN
 from ..inspection.picture import with_uncertainty
-from ..outputs import free_name, save_json
+from ..outputs import check_outputs, free_name, save_json
 from ..progress import progress_bar, show, table, tell
 from ..settings import SUN_COHERENCE_LENGTH, lobe_width
 from .arguments import (
@@ -30,7 +30,6 @@ from .arguments import (
     Prepare,
     Unit,
     check_suffix,
-    claim,
     options_of_scan,
     recipe_of,
     settings_of,
@@ -62,7 +61,7 @@ def inspect(
     by_default = free_name(f"{source.stem}_inspect", lambda stem: [Path(f"{stem}.png")], reads)
     picture = output or Path(f"{by_default}.png")
     check_suffix("-o", picture, ".png", ".pdf", ".svg")
-    claim(context, reads, [("-o", picture), *([("--json", json)] if json else [])])
+    check_outputs(reads, [("-o", picture), *([("--json", json)] if json else [])], overwrite=overwrite)
     height_field = recipe.height_field()
     if height_field.heights.size == 1:
         raise RequestError(f"{source}: got a surface of 1 × 1 pixel, wanted more: one height has no spectrum")

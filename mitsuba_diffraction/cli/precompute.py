@@ -9,6 +9,7 @@ import typer
 
 from ..errors import RequestError
 from ..grating_spectrum import GratingSpectrum
+from ..outputs import check_outputs
 from ..precomputation import Spectrum
 from ..progress import progress_bar, tell
 from ..recipe import Recipe
@@ -26,7 +27,6 @@ from .arguments import (
     Prepare,
     Unit,
     check_suffix,
-    claim,
     options_of_scan,
     recipe_of,
     settings_of,
@@ -82,7 +82,8 @@ def precompute(
         )
     recipes = [recipe_of(source, options_of_scan(context), settings_of(context)) for source in sources]
     reads = [*sources, *(file for recipe in recipes for file in recipe.files)]
-    claim(context, reads, [("-o" if output else f"spectrum of {s}", t) for s, t in zip(sources, targets, strict=True)])
+    writes = [("-o" if output else f"spectrum of {s}", t) for s, t in zip(sources, targets, strict=True)]
+    check_outputs(reads, writes, overwrite=overwrite)
     seams = [_seam(source, recipe) for source, recipe in zip(sources, recipes, strict=True)]
     for source, recipe, target, seam in zip(sources, recipes, targets, seams, strict=True):
         with progress_bar(f"spectrum of {source.name}", "%") as progress:

@@ -11,9 +11,9 @@ import typer
 
 from ..errors import RequestError
 from ..files import discard
-from ..outputs import free_name
+from ..outputs import check_outputs, free_name
 from ..progress import progress_bar, tell
-from .arguments import Define, Overwrite, Variant, check_suffix, claim, materials_of, scene_parameters
+from .arguments import Define, Overwrite, Variant, check_suffix, materials_of, scene_parameters
 
 if TYPE_CHECKING:
     from ..render.spectral_image import SpectralImage
@@ -26,7 +26,6 @@ class Stopped(Exception):
 
 
 def render(
-    context: typer.Context,
     scene: Annotated[Path, typer.Argument(metavar="SCENE.xml")],
     output: Annotated[Path | None, typer.Option("-o", "--output", help="spectral picture (.exr)")] = None,
     spp: Annotated[
@@ -86,7 +85,7 @@ def render(
     where: dict[str, Any] = {"parameters": scene_parameters(define), "materials": materials_of(material)}
     reads = files_of_scene(scene, **where)
     target = output or Path(free_name(scene.stem, lambda stem: _written(Path(f"{stem}.exr"), frames), reads) + ".exr")
-    claim(context, reads, [("-o", path) for path in _written(target, frames)])
+    check_outputs(reads, [("-o", path) for path in _written(target, frames)], overwrite=overwrite)
     if waiting := [path for path in map(checkpoint_path, _pictures(target, frames)) if path.exists() and not resume]:
         raise RequestError(
             f"{waiting[0]} is of an unfinished rendering: --resume continues it; remove it to start over"

@@ -9,7 +9,7 @@ from rich.table import Table
 from rich.text import Text
 
 from ..files import whole_file
-from ..outputs import made_for
+from ..outputs import MARK
 from .validation.record import Record
 
 RECORD_COLUMNS = ("check", "expected", "found", "difference", "bound", "")
@@ -29,9 +29,8 @@ def markdown(columns: Sequence[str], rows: Iterable[Sequence[str]], texts: int =
 
 def save_markdown(text: str, path: str | os.PathLike[str]) -> None:
     """Write a Markdown file, whole or not at all."""
-    request = made_for(path)
     with whole_file(path) as temporary:
-        temporary.write_text(text if request is None else f"{text}\n<!-- {request} -->\n", encoding="utf-8")
+        temporary.write_text(f"{text}\n<!-- {MARK} -->\n", encoding="utf-8")
 
 
 def record_cells(record: Record) -> list[str]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..color import auto_exposure, into_gamut, on_screen, spectrum_to_linear_sRGB
 from ..errors import RequestError
 from ..files import whole_file
-from ..outputs import metadata
+from ..outputs import METADATA
 from ..surface.heightfield import HeightField
 from ..surface.periods import hann, repeated
 from .colours import WAVELENGTHS, radiance
@@ -60,7 +60,7 @@ def save_picture(inspection: Inspection, path: str | os.PathLike[str], *, title:
     _facts(figure.add_subplot(right), inspection)
     _colours([figure.add_subplot(row) for row in lower], inspection)
     with whole_file(path) as temporary:
-        figure.savefig(temporary, metadata=metadata(path))
+        figure.savefig(temporary, metadata=METADATA)
 
 
 def _short(text: str, length: int) -> str:

@@ -22,7 +22,7 @@ from ..color import (
 )
 from ..errors import RequestError
 from ..files import whole_file
-from ..outputs import made_for, png_text
+from ..outputs import MARK, png_text
 from ..spectrum.exr import one_line, silence
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ _RESERVED = frozenset(
     (
         *("channels", "chunkCount", "compression", "dataWindow", "displayWindow", "lineOrder", "name"),
         *("pixelAspectRatio", "screenWindowCenter", "screenWindowWidth", "tiles", "type", "version", "view"),
-        *("spectralLayoutVersion", "emissiveUnits", "madeFor"),
+        *("spectralLayoutVersion", "emissiveUnits", "writtenBy"),
     )
 )
 
@@ -115,9 +115,8 @@ class SpectralImage:
             "type": OpenEXR.scanlineimage,
             "spectralLayoutVersion": _LAYOUT_VERSION,
             "emissiveUnits": _UNITS,
+            "writtenBy": MARK,
         }
-        if (request := made_for(path)) is not None:
-            header["madeFor"] = request
         with whole_file(path) as temporary:
             OpenEXR.File(header, channels).write(str(temporary))
 
@@ -185,5 +184,5 @@ def save_preview(
     if exposure is None:
         exposure = auto_exposure(rgb)
     with whole_file(path) as temporary:
-        Image.fromarray(on_screen(rgb * exposure)).save(temporary, pnginfo=png_text(path))
+        Image.fromarray(on_screen(rgb * exposure)).save(temporary, pnginfo=png_text())
     return exposure

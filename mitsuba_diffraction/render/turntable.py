@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ..files import whole_file
-from ..outputs import made_for
+from ..outputs import MARK
 from .scene import Materials, load_spectral_scene
 
 _FRAMES_PER_SECOND = 12
@@ -57,7 +57,6 @@ def save_animation(previews: Iterable[Path], path: str | os.PathLike[str]) -> No
     from PIL import Image
 
     first, *others = (Image.open(preview).convert("RGB") for preview in previews)
-    request = made_for(path)
     with whole_file(path) as temporary:
         first.save(
             temporary,
@@ -66,5 +65,5 @@ def save_animation(previews: Iterable[Path], path: str | os.PathLike[str]) -> No
             duration=1000 // _FRAMES_PER_SECOND,
             loop=0,
             quality=85,
-            xmp=b"" if request is None else request.encode(),
+            xmp=MARK.encode(),
         )

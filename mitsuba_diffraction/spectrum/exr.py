@@ -16,7 +16,7 @@ import OpenEXR
 
 from ..errors import RequestError
 from ..files import UNSEALED, is_intact, seal, whole_file
-from ..outputs import made_for
+from ..outputs import MARK
 
 # Streams belong to the whole process, and Mitsuba loads plugins on several threads.
 _silencing = threading.Lock()
@@ -60,9 +60,8 @@ def write(
         **header,
         "recipeSha256": recipe,
         "contentSha256": UNSEALED,
+        "writtenBy": MARK,
     }
-    if (request := made_for(path)) is not None:
-        header["madeFor"] = request
     with whole_file(path) as temporary:
         OpenEXR.File(header, dict(channels)).write(str(temporary))
         seal(temporary)

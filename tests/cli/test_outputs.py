@@ -1,4 +1,4 @@
-"""No command writes over what it reads, nor over what another command made; and what a kill leaves is cleared."""
+"""No command writes over an input, nor over a foreign file without `--overwrite`; and what a kill leaves is cleared."""
 
 import functools
 import json
@@ -16,7 +16,7 @@ from PIL import Image
 import mitsuba_diffraction as md
 from mitsuba_diffraction import outputs
 from mitsuba_diffraction.files import is_intact, refuse_unwritable, seal, whole_file
-from mitsuba_diffraction.outputs import claim, made_for
+from mitsuba_diffraction.outputs import check_outputs
 from mitsuba_diffraction.render.scene import files_of_scene
 
 BLAZE = """[surface]
@@ -165,12 +165,13 @@ def test_one_output_is_not_written_over_another(command, line, name):
         ("inspect blaze.toml -o a.png --json a.json", "--coherence-length 5", "a.png"),
     ],
 )
-def test_a_command_knows_what_it_made(command, line, other, name):
+def test_own_files_are_written_over_and_foreign_files_only_with_the_option(command, line, other, name):
     assert command(line)[0] == 0
-    assert command(line)[0] == 0
-    assert "--overwrite" in refused(command, f"{line} {other}", name)
+    before = Path(name).read_bytes()
+    assert command(f"{line} {other}")[0] == 0
+    assert Path(name).read_bytes() != before
     Path(name).write_text("a year's work")
-    refused(command, line, name)
+    assert "--overwrite" in refused(command, line, name)
     assert command(f"{line} --overwrite")[0] == 0
     assert command(line)[0] == 0
 
@@ -178,54 +179,66 @@ def test_a_command_knows_what_it_made(command, line, other, name):
 @pytest.mark.parametrize(
     ("line", "name"), [(f"{RENDER} -o a.exr", "a.png"), ("compare u.xml --json sky.spd -o b", "sky.spd")]
 )
-def test_what_another_made_is_not_replaced(command, line, name):
+def test_foreign_files_are_not_replaced(command, line, name):
     Path("a.png").write_text("a year's work")
     refused(command, line, name)
 
 
-def test_a_folder_may_move(command):
-    Path("here").mkdir()
-    Path("blaze.toml").rename("here/blaze.toml")
-    assert command("precompute here/blaze.toml -o here/a.exr")[0] == 0
-    Path("here").rename("there")
-    assert command("precompute there/blaze.toml -o there/a.exr")[0] == 0
+@pytest.mark.parametrize("text", ["", "mitsuba_diffraction", "made with the command mitsuba-diffraction render u.xml"])
+def test_a_file_that_names_the_package_is_foreign(command, text):
+    Path("a.png").write_text(text)
+    refused(command, "inspect blaze.toml -o a.png", "a.png")
 
 
-@pytest.mark.parametrize("name", ["a.json", "a.md", "a.png", "a.pdf", "a.svg", "a.webp", "a.exr", "spectrum.exr"])
-def test_every_format_carries_its_request(name):
-    def write():
-        if name == "a.json":
-            outputs.save_json({"a": 1}, name)
-        elif name == "a.md":
-            from mitsuba_diffraction.evaluation.report import save_markdown
+@pytest.mark.parametrize(
+    ("line", "name", "text"),
+    [
+        (RENDER, "u.xml", SCENE.replace("</shape>", "")),
+        (RENDER, "u.exr", "no spectrum"),
+        (RENDER, "tex.png", "no picture"),
+        ("precompute blaze.toml", "blaze.toml", BLAZE.replace("period", "perod")),
+        ("inspect scan.toml", "scan.png", "no picture"),
+    ],
+)
+def test_bad_input_leaves_own_files_as_they_are(command, line, name, text):
+    suffix = "png" if line.startswith("inspect") else "exr"
+    spectrum().save("a.exr")
+    Image.new("L", (2, 2)).save("a.png", pnginfo=outputs.png_text())
+    Path(name).write_text(text)
+    before = contents()
+    code, _, err = command(f"{line} -o a.{suffix}")
+    assert code == 2, err
+    assert contents() == before
 
-            save_markdown("# a\n", name)
-        elif name == "a.webp":
-            from mitsuba_diffraction.render.turntable import save_animation
 
-            save_animation([Path("tex.png"), Path("scan.png")], name)
-        elif name == "a.exr":
-            from mitsuba_diffraction.render import SpectralImage
-
-            SpectralImage([500.0, 600.0], np.zeros((2, 2, 2), np.float32)).save(name)
-        elif name == "spectrum.exr":
-            md.GratingSpectrum.load("u.exr").save(name)
-        else:
-            from matplotlib.figure import Figure
-
-            Figure(figsize=(1, 1)).savefig(name, metadata=outputs.metadata(name))
-
-    for seed in (1, 1):
-        claim({"seed": seed}, [], [("-o", name)])
-        assert made_for(name)
-        write()
-    with pytest.raises(ValueError, match="--overwrite"):
-        claim({"seed": 2}, [], [("-o", name)])
-    claim({"seed": 2}, [], [("-o", name)], overwrite=True)
-    write()
-    claim({"seed": 2}, [], [("-o", name)])
-    if name.endswith("json"):
+@pytest.mark.parametrize("name", ["a.json", "a.md", "a.csv", "a.png", "a.pdf", "a.svg", "a.webp", "a.exr", "u.exr"])
+def test_every_format_carries_the_mark(name):
+    if name == "a.json":
+        outputs.save_json({"a": 1}, name)
         assert json.loads(Path(name).read_text())["a"] == 1
+    elif name == "a.md":
+        from mitsuba_diffraction.evaluation.report import save_markdown
+
+        save_markdown("# a\n", name)
+    elif name == "a.csv":
+        md.efficiencies(md.gratings.blazed(2.5, 0.25), [0], [500]).save_csv(name)
+    elif name == "a.webp":
+        from mitsuba_diffraction.render.turntable import save_animation
+
+        save_animation([Path("tex.png"), Path("scan.png")], name)
+    elif name == "a.exr":
+        from mitsuba_diffraction.render import SpectralImage
+
+        SpectralImage([500.0, 600.0], np.zeros((2, 2, 2), np.float32)).save(name)
+    elif name != "u.exr":
+        from matplotlib.figure import Figure
+
+        Figure(figsize=(1, 1)).savefig(name, metadata=outputs.METADATA)
+    check_outputs([], [("-o", name)])
+    Path(name).write_bytes(Path(name).read_bytes().replace(outputs.MARK.encode(), b""))
+    with pytest.raises(ValueError, match="--overwrite"):
+        check_outputs([], [("-o", name)])
+    check_outputs([], [("-o", name)], overwrite=True)
 
 
 # --- several at once, and kills ---

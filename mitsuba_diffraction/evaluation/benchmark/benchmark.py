@@ -15,7 +15,7 @@ from rich.table import Table
 from ... import outputs
 from ...files import whole_file
 from ...grating_spectrum import GratingSpectrum
-from ...outputs import metadata
+from ...outputs import METADATA
 from ...progress import table
 from ...settings import VISIBLE, Settings
 from .. import report
@@ -195,4 +195,4 @@ def save_plot(results: Sequence[Result], path: str | os.PathLike[str]) -> None:
     figure.supylabel("error ∫|ΔS| dq")
     figure.legend(loc="outside right upper", frameon=False)
     with whole_file(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=130, metadata=metadata(path))
+        figure.savefig(temporary, format="png", dpi=130, metadata=METADATA)

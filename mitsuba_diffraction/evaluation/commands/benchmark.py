@@ -8,14 +8,13 @@ from typing import Annotated
 import typer
 
 from ... import outputs
-from ...cli.arguments import HeightRange, Overwrite, PixelSize, Variant, check_suffix, claim
+from ...cli.arguments import HeightRange, Overwrite, PixelSize, Variant, check_suffix
 from ...errors import RequestError
 from ...progress import progress_bar, show, table
 from ...surface.readers import read_height_field
 
 
 def benchmark(
-    context: typer.Context,
     scan: Annotated[Path | None, typer.Argument(metavar="[SCAN]", help="a scan to include")] = None,
     pixel_size: PixelSize = None,
     height_range: HeightRange = None,
@@ -43,7 +42,7 @@ def benchmark(
     if plot is not None:
         check_suffix("--plot", plot, ".png")
     writes = [(option, path) for option, path in (("--json", json), ("--plot", plot)) if path is not None]
-    claim(context, [] if scan is None else [scan], writes)
+    outputs.check_outputs([] if scan is None else [scan], writes, overwrite=overwrite)
     cases = bundled_cases()
     names = [case.name for case in cases]
     if unknown := set(surface or []) - set(names):

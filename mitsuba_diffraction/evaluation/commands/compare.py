@@ -9,9 +9,9 @@ from typing import Annotated
 
 import typer
 
-from ...cli.arguments import Define, Overwrite, Variant, claim, scene_parameters
+from ...cli.arguments import Define, Overwrite, Variant, scene_parameters
 from ...files import whole_file
-from ...outputs import free_name
+from ...outputs import check_outputs, free_name
 from ...progress import progress_bar, show, tell
 
 _PICTURES = {"-path.exr": "path_traced", "-published.exr": "published", "-corrected.exr": "corrected"}
@@ -19,7 +19,6 @@ _PICTURES = {"-path.exr": "path_traced", "-published.exr": "published", "-correc
 
 
 def compare(
-    context: typer.Context,
     scene: Annotated[Path, typer.Argument(metavar="SCENE.xml")],
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="prefix of the output files, or a folder")
@@ -55,7 +54,7 @@ def compare(
     images = {f"{prefix}{end}": picture for end, picture in _PICTURES.items()}
     written = [("-o", Path(target)) for target in (*images, f"{prefix}.png")]
     written += [("--json", json)] if json is not None else []
-    claim(context, reads, written)
+    check_outputs(reads, written, overwrite=overwrite)
     mi.set_variant(choose_variant(variant))
     start = time.perf_counter()
     found = run(

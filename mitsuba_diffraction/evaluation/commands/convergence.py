@@ -9,12 +9,11 @@ from typing import Annotated
 import typer
 
 from ... import outputs
-from ...cli.arguments import Define, Overwrite, Variant, check_suffix, claim, scene_parameters
+from ...cli.arguments import Define, Overwrite, Variant, check_suffix, scene_parameters
 from ...progress import progress_bar, show, table, tell
 
 
 def convergence(
-    context: typer.Context,
     scene: Annotated[Path, typer.Argument(metavar="SCENE.xml")],
     plot: Annotated[Path, typer.Option("-o", "--output", help="plot of error against time (.png)")],
     tolerance: Annotated[list[float] | None, typer.Option(help="of the spectra; default: 0.1, 0.01 and 0.001")] = None,
@@ -40,7 +39,8 @@ def convergence(
     check_suffix("-o", plot, ".png")
     written = [("-o", plot), *([("--json", json)] if json is not None else [])]
     study.check_tolerances(tolerances)
-    claim(context, files_of_scene(scene, {**parameters, "tolerance": f"{tolerances[0]:g}"}), written)
+    reads = files_of_scene(scene, {**parameters, "tolerance": f"{tolerances[0]:g}"})
+    outputs.check_outputs(reads, written, overwrite=overwrite)
     mi.set_variant(choose_variant(variant))
     found = study.convergence(
         scene,

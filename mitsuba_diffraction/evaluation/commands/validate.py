@@ -18,7 +18,6 @@ from ...cli.arguments import (
     Prepare,
     Unit,
     Variant,
-    claim,
     options_of_scan,
     recipe_of,
     settings_of,
@@ -73,7 +72,7 @@ def validate(
 
         figures.mkdir(parents=True, exist_ok=True)
         writes += [("--figures", figures / name) for name in figure_names()]
-    claim(context, reads, writes)
+    outputs.check_outputs(reads, writes, overwrite=overwrite)
     mi.set_variant(chosen)
     these = checks() if recipe is None else _of_surface(recipe)
     results = []

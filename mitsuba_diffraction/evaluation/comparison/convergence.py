@@ -15,7 +15,7 @@ import numpy as np
 
 from ...errors import RequestError
 from ...files import whole_file
-from ...outputs import metadata
+from ...outputs import METADATA
 from ...progress import Progress, no_progress
 from ...settings import LEAST_TOLERANCE
 from ..report import cells
@@ -226,4 +226,4 @@ def save_plot(found: Convergence, path: str | os.PathLike[str]) -> None:
         f"{found.scene}, {width} × {height} pixels; × where the path tracer overtakes a shader", fontsize=10
     )
     with whole_file(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=130, metadata=metadata(path))
+        figure.savefig(temporary, format="png", dpi=130, metadata=METADATA)

@@ -12,7 +12,7 @@ from rich.table import Table
 from ... import outputs
 from ...color import XYZ_to_linear_sRGB, into_gamut, on_screen
 from ...files import whole_file
-from ...outputs import metadata
+from ...outputs import METADATA
 from ...progress import table
 from .. import report
 from .comparison import Comparison
@@ -228,4 +228,4 @@ def _bars(panel: Axes, against: AgainstReference) -> None:
 def save_figure(comparison: Comparison, path: str | os.PathLike[str], dpi: float = 150) -> None:
     """Write `figure` as PNG, atomically."""
     with whole_file(path) as temporary:
-        figure(comparison).savefig(temporary, format="png", dpi=dpi, metadata=metadata(path))
+        figure(comparison).savefig(temporary, format="png", dpi=dpi, metadata=METADATA)

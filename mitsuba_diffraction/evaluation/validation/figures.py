@@ -13,7 +13,7 @@ import numpy as np
 
 from ...errors import RequestError
 from ...files import whole_file
-from ...outputs import made_for, png_text
+from ...outputs import MARK, png_text
 from ..realtime_shader.quirks import Quirks
 from ..report import markdown, save_markdown
 from .brdf_map import MAP_METHODS, PROJECTIONS, BRDFMap, brdf_map
@@ -251,7 +251,7 @@ def save_figures(
 
     def save(drawn: Figure, name: str) -> None:
         with whole_file(folder / name) as temporary:
-            temporary.write_bytes(png(drawn, pnginfo=png_text(folder / name)))
+            temporary.write_bytes(png(drawn, pnginfo=png_text()))
         files.append(folder / name)
         progress(len(files), 2 * len(surfaces))
 
@@ -270,6 +270,5 @@ def save_figures(
     save_markdown(markdown(PERIOD_COLUMNS, rows, texts=2), tables[0])
     with whole_file(tables[1]) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
         csv.writer(file).writerows([PERIOD_COLUMNS, *rows])
-        if (request := made_for(tables[1])) is not None:
-            file.write(f"# {request}\n")
+        file.write(f"# {MARK}\n")
     return [*files, *tables]
