@@ -118,6 +118,8 @@ def _tell(error: BaseException, debug: bool = False) -> int:
         return 2
     if debug:
         traceback.print_exception(error)
+    while error.__cause__ is not None and "(see above)" in str(error):  # Dr.Jit's message does not name the cause
+        error = error.__cause__
     if isinstance(error, RequestError | FileNotFoundError | IsADirectoryError | NotADirectoryError):
         named = isinstance(error, OSError) and error.filename and error.strerror
         say("error", f"{error.filename}: {error.strerror.lower()}" if named else error)

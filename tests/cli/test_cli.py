@@ -17,6 +17,7 @@ import pytest
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction.cli.arguments import scene_parameters
+from mitsuba_diffraction.errors import RequestError
 from mitsuba_diffraction.progress import log_lines
 from mitsuba_diffraction.render import passes
 from mitsuba_diffraction.render.spectral_image import SpectralImage
@@ -373,6 +374,28 @@ def test_a_bug_while_rendering_is_reported_as_such(command, monkeypatch):
     code, out, err = command("render scene.xml --variant scalar_spectral --spp 1 -o out.exr")
     assert (code, out) == (1, "")
     assert err.startswith(f"{BUG}ValueError: ")
+
+
+@pytest.mark.parametrize(
+    ("raised", "code", "words"),
+    [
+        (RuntimeError, 1, "error: the order is zero"),
+        (RequestError, 2, "error: the order is zero"),
+        (ZeroDivisionError, 1, "this is a bug in mitsuba_diffraction (ZeroDivisionError: the order is zero)"),
+    ],
+)
+def test_an_error_in_a_loop_of_drjit_shows_its_cause(command, monkeypatch, llvm, raised, code, words):
+    def compare(*arguments, **named):
+        def body(count):
+            raise raised("the order is zero")
+
+        dr.while_loop((dr.arange(mi.UInt32, 4),), lambda count: count < 3, body)
+
+    monkeypatch.setattr("mitsuba_diffraction.evaluation.comparison.compare", compare)
+    Path("scene.xml").write_text(SCENE)
+    found, out, err = command("compare scene.xml --variant llvm_ad_spectral")
+    assert (found, out, len(err.splitlines())) == (code, "", 1)
+    assert words in err
 
 
 def test_debug_shows_where_a_request_is_refused(command):
