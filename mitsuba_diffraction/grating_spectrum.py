@@ -21,6 +21,7 @@ import numpy as np
 
 from .energy.table import EnergyTable
 from .errors import RequestError
+from .settings import Settings
 from .spectrum.exr import doubles, one_line, read, write
 from .spectrum.grids import OrderGrid, SplineGrid
 from .spectrum.power_spectrum import PowerSpectrum
@@ -32,15 +33,11 @@ FORMAT_VERSION = 8
 # Numbers and texts, and their names in files.
 _NUMBERS = {
     "height_range": "heightRange",
-    "coherence_length": "coherenceLength",
-    "tolerance": "tolerance",
     "error": "error",
-    "largest_angle": "largestAngle",
     "truncated_power": "dropped",
     "unresolved_power": "beyond",
 }
-_PAIRS = {"pixel_size": "pixelSize", "wavelengths": "wavelengths"}
-_OTHERS = {"extent": "extent", "patches": "patches", "source": "source", "source_digest": "sourceSha256"}
+_OTHERS = {"patches": "patches", "source": "source", "source_digest": "sourceSha256"}
 
 _computing = threading.Lock()
 
@@ -74,9 +71,14 @@ class GratingSpectrum(PowerSpectrum):
         """
         header: dict[str, Any] = {
             "representation": self.representation,
+            "extent": self.extent,
+            "coherenceLength": doubles(self.coherence_length),
+            "wavelengths": doubles(*self.wavelengths),
+            "largestAngle": doubles(self.largest_angle),
+            "tolerance": doubles(self.tolerance),
+            "pixelSize": doubles(*self.pixel_size),
             **_grid_header(self.grid),
             **{key: doubles(getattr(self, name)) for name, key in _NUMBERS.items()},
-            **{key: doubles(*getattr(self, name)) for name, key in _PAIRS.items()},
             **{key: getattr(self, name) for name, key in _OTHERS.items()},
             **({} if self.standard_error is None else {"standardError": doubles(self.standard_error)}),
             "units": "lengths in micrometres, wavelengths in nanometres",
@@ -111,14 +113,23 @@ class GratingSpectrum(PowerSpectrum):
                 raise RequestError(
                     f"got {len(pixels)} channels ({unknown}), wanted {header['channelCount']} of known names"
                 )
+            settings = Settings(
+                header["extent"],
+                _single(header["coherenceLength"]),
+                _pair(header["wavelengths"]),
+                _single(header["largestAngle"]),
+                header["representation"],
+                _single(header["tolerance"]),
+            )
             entries: dict[str, Any] = {name: header[key] for name, key in _OTHERS.items()}
             entries |= {name: _single(header[key]) for name, key in _NUMBERS.items()}
-            entries |= {name: _pair(header[key]) for name, key in _PAIRS.items()}
             return cls(
                 table=table,
                 grid=_grid(header, table.shape),
+                settings=settings,
+                pixel_size=_pair(header["pixelSize"]),
                 **entries,
-                standard_error=_single(header["standardError"]) if header["extent"] == "sample" else None,
+                standard_error=_single(header["standardError"]) if settings.extent == "sample" else None,
                 energy=EnergyTable.from_plain(json.loads(header["energy"])),
                 warning=header.get("warning", ""),
             )

@@ -24,7 +24,6 @@ Spectrum = GratingSpectrum | RigorousSpectrum
 _HEADER = 2**16  # bytes, which hold the name of the format
 
 
-@one_thread()
 def precompute(
     height_field: HeightField | Sequence[HeightField],
     *,
@@ -82,15 +81,21 @@ def precompute(
     patches = (height_field,) if isinstance(height_field, HeightField) else tuple(height_field)
     if not all(isinstance(patch, HeightField) for patch in patches):
         raise RequestError(f"height_field: got {type(height_field).__name__}, wanted a HeightField or several")
-    _check_patches(patches, extent)
+    return build_spectrum(patches, settings, progress)
+
+
+def build_spectrum(patches: Sequence[HeightField], settings: Settings, progress: Progress = silent) -> Spectrum:
+    """Compute what `precompute` does, of patches and settings."""
+    _check_patches(patches, settings.extent)
     height_range = max(patch.height_range for patch in patches)
-    if height_range > largest_height_range:
+    if height_range > settings.largest_height_range:
         raise RequestError(
-            f"heights: got a range of {height_range:.4g} µm, wanted at most {largest_height_range:g}: are "
+            f"heights: got a range of {height_range:.4g} µm, wanted at most {settings.largest_height_range:g}: are "
             "these nanometres? If the surface is so deep, raise largest_height_range of `precompute`"
         )
-    if theory == "scalar":
-        return GratingSpectrum(**vars(scalar.build_spectrum(patches, settings, progress)))
+    if settings.theory == "scalar":
+        with one_thread():
+            return GratingSpectrum(**vars(scalar.build_spectrum(patches, settings, progress)))
     if len(patches) > 1:
         raise RequestError(
             f"theory: got rigorous and {len(patches)} patches ({patches[0].source}, …), wanted one, of one row"

@@ -48,7 +48,7 @@ from typing import Any
 from .errors import RequestError
 from .files import cache_folder, refuse_special
 from .grating_spectrum import FORMAT_VERSION, GratingSpectrum
-from .precomputation import Spectrum, load_spectrum, precompute
+from .precomputation import Spectrum, build_spectrum, load_spectrum
 from .progress import Progress, no_progress, part, silent
 from .rigorous import build as rigorous
 from .scalar_theory import scalar_error
@@ -86,7 +86,7 @@ class Recipe:
 
     Attributes:
         surface: name and parameters of a profile, or a scan with its scale; see the docstring of this module.
-        spectrum: arguments of `precompute`.
+        settings: the parameters of its spectrum.
         folder: base of relative file names.
 
     Raises:
@@ -94,10 +94,11 @@ class Recipe:
     """
 
     surface: Mapping[str, Any]
-    spectrum: Mapping[str, Any] = field(default_factory=dict)
+    settings: Settings = field(default_factory=Settings)
     folder: Path = Path()
 
     def __post_init__(self) -> None:
+        plain = dict(self.surface)
         if ("profile" in self.surface) == ("scan" in self.surface):
             got = ", ".join(sorted(self.surface)) or "nothing"
             raise RequestError(f"[surface]: got {got}, wanted either a profile or a scan")
@@ -115,20 +116,12 @@ class Recipe:
             _refuse_unknown("[surface]", self.surface, _SCAN_KEYS)
             if not isinstance(self.surface["scan"], str):
                 raise RequestError(f"scan: got {self.surface['scan']!r}, wanted a file name")
-            check_steps(self.surface.get("prepare", []))
-        _refuse_unknown("[spectrum]", self.spectrum, _SPECTRUM_KEYS)
-        for name, value in [*self.surface.items(), *self.spectrum.items()]:
-            if name == "prepare" and "scan" in self.surface:
-                continue  # checked above
-            if isinstance(value, bool) and name not in ("fill_missing", "polarised"):
-                raise RequestError(f"{name}: got {value!r}, wanted a number or a text")
-            if not (_is_plain(value) or (isinstance(value, list | tuple) and all(_is_plain(v) for v in value))):
-                raise RequestError(f"{name}: got {value!r}, wanted a number, a text, or a list of them")
-        Settings(**self.spectrum)
+            check_steps(plain.pop("prepare", []))
+        _refuse_other_values(plain)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], **settings: Any) -> Recipe:
-        """Read a recipe; `settings` take the place of its own, under `[spectrum]`.
+        """Read a recipe; `settings`, by their names in `Settings`, take the place of its own, under `[spectrum]`.
 
         Raises:
             FileNotFoundError: if there is no such file.
@@ -147,7 +140,10 @@ class Recipe:
             surface, spectrum = content.get("surface", {}), content.get("spectrum", {})
             if not (isinstance(surface, dict) and isinstance(spectrum, dict)):
                 raise RequestError("wanted the tables [surface] and [spectrum]")
-            return cls(surface, {**spectrum, **settings}, path.parent)
+            spectrum = {**spectrum, **settings}
+            _refuse_unknown("[spectrum]", spectrum, _SPECTRUM_KEYS)
+            _refuse_other_values(spectrum)
+            return cls(surface, Settings(**spectrum), path.parent)
         except RequestError as error:
             of_file = str(error).partition(":")[0] not in settings
             raise RequestError(f"{path}: {error}" if of_file else str(error)) from None
@@ -162,7 +158,7 @@ class Recipe:
         """Return over how many seeds the spectrum is averaged: one of a sample, and of what is not drawn at random."""
         if "patches" in self.surface:
             return int(self.surface["patches"])
-        return PATCHES.get(self.surface.get("profile", ""), 1) if self.spectrum.get("extent", "tile") == "tile" else 1
+        return PATCHES.get(self.surface.get("profile", ""), 1) if self.settings.extent == "tile" else 1
 
     def height_fields(self, progress: Progress = silent) -> tuple[HeightField, ...]:
         """Return the patches: seed, seed + 1, …; one where nothing is drawn at random."""
@@ -212,7 +208,7 @@ class Recipe:
         """Compute the spectrum; `progress` is called with (steps done, steps in all)."""
         patches = self.height_fields(part(progress, 0, _OF_HEIGHTS))
         report = part(progress, _OF_HEIGHTS if len(patches) > 1 else 0, 1)
-        spectrum = precompute(patches, progress=report, **self.spectrum)
+        spectrum = build_spectrum(patches, self.settings, report)
         if isinstance(spectrum, GratingSpectrum):
             spectrum = replace(spectrum, warning=scalar_error(patches[0], spectrum.extent).warning)
         return spectrum
@@ -220,7 +216,7 @@ class Recipe:
     def digest(self) -> str:
         """Return the SHA-256 of everything that determines the spectrum: the recipe and the contents of the scan."""
         versions = [FORMAT_VERSION, _BUILD_VERSION]
-        if self.spectrum.get("theory") == "rigorous":
+        if self.settings.theory == "rigorous":
             versions.append(rigorous.BUILD_VERSION)
         content = hashlib.sha256(".".join(map(str, versions)).encode())
         surface = {name: value for name, value in self.surface.items() if name != "scan"}
@@ -228,7 +224,8 @@ class Recipe:
             refuse_special(scan)
             content.update(scan.read_bytes())
             content.update(scan.suffix.lower().encode())
-        content.update(json.dumps([surface, self.patches, dict(self.spectrum)], sort_keys=True).encode())
+        request = surface, self.patches, self.settings.chosen
+        content.update(json.dumps(request, sort_keys=True, default=str).encode())
         return content.hexdigest()
 
     def cached(self, progress: Callable[[str], AbstractContextManager[Progress]] = no_progress) -> Spectrum:
@@ -275,6 +272,14 @@ def _refuse_unknown(where: str, table: Mapping[str, Any], known: frozenset[str])
         raise RequestError(
             f"{where}: got the unknown name {', '.join(unknown)}, wanted among {', '.join(sorted(known))}"
         )
+
+
+def _refuse_other_values(table: Mapping[str, Any]) -> None:
+    for name, value in table.items():
+        if isinstance(value, bool) and name not in ("fill_missing", "polarised"):
+            raise RequestError(f"{name}: got {value!r}, wanted a number or a text")
+        if not (_is_plain(value) or (isinstance(value, list | tuple) and all(_is_plain(v) for v in value))):
+            raise RequestError(f"{name}: got {value!r}, wanted a number, a text, or a list of them")
 
 
 def _is_plain(value: object) -> bool:

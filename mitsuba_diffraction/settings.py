@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 import scipy.special
@@ -38,7 +39,8 @@ class Settings:
     Attributes:
         extent: "tile": the patch repeats for ever; "sample": it is a piece of a larger, irregular surface.
         coherence_length: L_c in µm.
-        wavelengths: (shortest, longest) in nm.
+        wavelengths: (shortest, longest) in nm; in a scene the default is divided by the index next to the relief
+            (`wavelengths_inside`).
         largest_angle: of incidence and exit that the scene has, degrees from the normal; less than 90 keeps fewer
             frequencies.
         representation: "slices", which "auto" is, too.
@@ -136,6 +138,27 @@ class Settings:
                 raise RequestError(
                     f"transmission: got {self.transmission} and ext_ior {self.ext_ior!r}, wanted no coat"
                 )
+
+    @property
+    def chosen(self) -> dict[str, Any]:
+        """The parameters that are not the defaults, by name."""
+        return {f.name: value for f in fields(self) if (value := getattr(self, f.name)) != f.default}
+
+
+def wavelengths_inside(index: float, scale: float = 1.0) -> tuple[float, float]:
+    """Return (shortest, longest) of visible light next to a relief, in nm: λ/n, and λ/(n s) for larger lengths.
+
+    Args:
+        index: n, the largest absolute index next to the relief.
+        scale: s, the largest factor of heights or lengths, which is equivalent to wavelengths that are shorter by s.
+
+    Raises:
+        ValueError: if a table cannot have so short a wavelength.
+    """
+    shortest, max_scale = VISIBLE[0] / (index * scale), VISIBLE[0] / (index * SHORTEST_WAVELENGTH)
+    if scale > max_scale:
+        raise RequestError(f"height_scale, lateral_scale: got up to {scale:g}, wanted at most {max_scale:.3g}")
+    return shortest, VISIBLE[1] / index
 
 
 def lobe_width(coherence_length: float) -> float:

@@ -12,6 +12,7 @@ from rich.console import Console
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction import progress
+from mitsuba_diffraction.settings import Settings
 
 RUBBED = {"profile": "xenopeltis", "size": 5.0, "patches": 3}
 
@@ -28,7 +29,7 @@ def test_a_log_reports_in_one_line_that_a_spectrum_is_computed(llvm, capfd, monk
 
 def test_progress_begins_with_the_heights_and_does_not_go_back():
     told = []
-    md.Recipe(RUBBED, {"coherence_length": 3.0, "tolerance": 0.05}).build(lambda *numbers: told.append(numbers))
+    md.Recipe(RUBBED, Settings(coherence_length=3.0, tolerance=0.05)).build(lambda *numbers: told.append(numbers))
     done, total = zip(*told, strict=True)
     assert set(total) == {100}
     assert list(done) == sorted(done)

@@ -2,6 +2,7 @@
 
 import shutil
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,8 @@ import pytest
 import mitsuba_diffraction as md
 from mitsuba_diffraction import GratingSpectrum, Recipe
 from mitsuba_diffraction import recipe as recipe_module
+from mitsuba_diffraction.precomputation import build_spectrum
+from mitsuba_diffraction.settings import Settings
 from mitsuba_diffraction.surface.readers import read_height_field
 
 SLOW = {"compact_disc", "dvd", "elaphe", "morpho_ridges", "xenopeltis", "xenopeltis_afm"}
@@ -54,11 +57,11 @@ def builds(monkeypatch):
     """The surfaces that were computed, not read from the cache, since the test began."""
     computed = []
 
-    def spy(height_field, **arguments):
-        computed.append(height_field[0].digest)
-        return md.precompute(height_field, **arguments)
+    def spy(patches, *arguments):
+        computed.append(patches[0].digest)
+        return build_spectrum(patches, *arguments)
 
-    monkeypatch.setattr(recipe_module, "precompute", spy)
+    monkeypatch.setattr(recipe_module, "build_spectrum", spy)
     return computed
 
 
@@ -148,7 +151,7 @@ def test_values_of_the_spectrum_that_cannot_be_are_refused_by_name(tmp_path, ent
 def test_options_take_the_place_of_a_recipes_values(tmp_path):
     path = write(tmp_path, BLAZE + '[spectrum]\ntolerance = 2\nmaterial = "Al"\n')
     recipe = Recipe.load(path, tolerance=0.1, theory="rigorous")
-    assert recipe.spectrum == {"tolerance": 0.1, "material": "Al", "theory": "rigorous"}
+    assert recipe.settings == Settings(tolerance=0.1, material="Al", theory="rigorous")
     with pytest.raises(ValueError, match=r"^tolerance: got 7"):  # not a mistake of the file
         Recipe.load(path, tolerance=7, theory="rigorous")
 
@@ -251,12 +254,12 @@ def test_a_recipe_of_a_sample_builds_its_spectrum(tmp_path, own_cache):
 
 def test_a_spectrum_keeps_the_warning_of_scalar_theory(tmp_path):
     surface = {"profile": "sinusoidal", "period": 0.71, "depth": 0.3, "samples": 64}
-    spectrum = Recipe(surface, FAST).build()
+    spectrum = Recipe(surface, Settings(**FAST)).build()
     assert spectrum.warning.startswith("scalar theory: errs by 63% of the reflected light")
     spectrum.save(tmp_path / "fine.exr")
     assert GratingSpectrum.load(tmp_path / "fine.exr").warning == spectrum.warning
     assert spectrum.digest == md.precompute(md.gratings.sinusoidal(0.71, 0.3, samples=64), **FAST).digest
-    assert Recipe({**surface, "period": 3.0, "depth": 0.05}, FAST).build().warning == ""
+    assert Recipe({**surface, "period": 3.0, "depth": 0.05}, Settings(**FAST)).build().warning == ""
 
 
 def test_a_recipe_reports_the_coherence_length_that_its_scan_supports(tmp_path):
@@ -315,12 +318,12 @@ def test_a_recipe_of_a_measured_skin_has_its_heights(tmp_path, scan_file, scan):
 def test_the_recipes_of_this_repository_build(path):
     recipe = Recipe.load(path)
     one = {"patches": 1} if recipe.patches > 1 else {}
-    spectrum = Recipe({**recipe.surface, **one}, {**recipe.spectrum, "tolerance": 0.2}, recipe.folder).build()
+    spectrum = Recipe({**recipe.surface, **one}, replace(recipe.settings, tolerance=0.2), recipe.folder).build()
     assert spectrum.error <= 0.2
     if "depth" in recipe.surface:  # of a ruled grating it follows from its blaze
         depth = recipe.surface["depth"] * recipe.surface.get("index", 1.0)
         assert spectrum.height_range == pytest.approx(depth, rel=0.01)
-    assert spectrum.coherence_length == recipe.spectrum.get("coherence_length", 65.0)
+    assert spectrum.coherence_length == recipe.settings.coherence_length
 
 
 def test_there_are_recipes_in_this_repository():
@@ -331,7 +334,7 @@ def test_there_are_recipes_in_this_repository():
 
 
 def test_the_cache_is_read_the_second_time(own_cache, builds):
-    recipe = Recipe(CROSSED, FAST)
+    recipe = Recipe(CROSSED, Settings(**FAST))
     first, second = (contents(recipe.cached()) for _ in range(2))
     assert len(builds) == 1
     assert [path.name for path in own_cache.iterdir()] == [f"{recipe.digest()}.exr"]
@@ -340,7 +343,7 @@ def test_the_cache_is_read_the_second_time(own_cache, builds):
 
 
 def test_a_spectrum_in_use_is_neither_built_nor_read_again(own_cache, builds):
-    recipe = Recipe(CROSSED, FAST)
+    recipe = Recipe(CROSSED, Settings(**FAST))
     first = recipe.cached()
     assert not any(isinstance(value, md.HeightField) for value in vars(recipe).values())
     shutil.rmtree(own_cache)
@@ -362,7 +365,7 @@ def test_a_spectrum_in_use_is_neither_built_nor_read_again(own_cache, builds):
     ],
 )
 def test_another_parameter_is_another_spectrum(own_cache, builds, surface, spectrum):
-    one, other = Recipe(CROSSED, FAST), Recipe({**CROSSED, **surface}, {**FAST, **spectrum})
+    one, other = Recipe(CROSSED, Settings(**FAST)), Recipe({**CROSSED, **surface}, Settings(**{**FAST, **spectrum}))
     assert one.digest() != other.digest()
     one.cached()
     got = other.cached()
@@ -400,7 +403,7 @@ def test_the_cache_knows_a_scan_by_its_bytes(tmp_path, own_cache, builds):
 @pytest.mark.few(1)
 @pytest.mark.parametrize("damage", [b"", b"not a picture", None])
 def test_a_damaged_entry_is_built_anew(own_cache, builds, damage):
-    recipe = Recipe(CROSSED, FAST)
+    recipe = Recipe(CROSSED, Settings(**FAST))
     whole = powers(recipe.cached())
     (path,) = own_cache.iterdir()
     path.write_bytes(path.read_bytes()[:-20] if damage is None else damage)
@@ -411,10 +414,10 @@ def test_a_damaged_entry_is_built_anew(own_cache, builds, damage):
 
 
 def test_an_interrupted_build_leaves_nothing(own_cache, monkeypatch):
-    def interrupted(height_field, **arguments):
+    def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(recipe_module, "precompute", interrupted)
+    monkeypatch.setattr(recipe_module, "build_spectrum", interrupted)
     with pytest.raises(KeyboardInterrupt):
         Recipe({"profile": "blazed", "period": 2.5, "depth": 0.25}).cached()
     assert not own_cache.exists() or not list(own_cache.iterdir())
@@ -423,6 +426,11 @@ def test_an_interrupted_build_leaves_nothing(own_cache, monkeypatch):
 def test_digest_does_not_depend_on_the_order_of_the_words():
     one = Recipe({"profile": "blazed", "period": 2.5, "depth": 0.25})
     assert one.digest() == Recipe({"depth": 0.25, "profile": "blazed", "period": 2.5}).digest()
+
+
+def test_digest_does_not_depend_on_stated_defaults():
+    stated = Settings(extent="tile", wavelengths=(360, 830), theory="scalar", **FAST)
+    assert Recipe(CROSSED, stated).digest() == Recipe(CROSSED, Settings(**FAST)).digest()
 
 
 def test_the_cache_is_the_users_unless_named(monkeypatch, tmp_path):
@@ -550,7 +558,7 @@ def test_the_command_takes_the_same_options_of_a_scan(tmp_path, command, monkeyp
 @pytest.mark.parametrize("damage", ["folder", "dangling link", "folder is a file", "folder is a dangling link"])
 def test_without_a_cache_there_is_a_warning(own_cache, builds, damage):
     # Regression: the render was refused.
-    recipe = Recipe(CROSSED, FAST)
+    recipe = Recipe(CROSSED, Settings(**FAST))
     entry = own_cache / f"{recipe.digest()}.exr"
     own_cache.parent.mkdir()
     if damage == "folder is a file":
@@ -577,13 +585,13 @@ def test_one_warning_for_many_surfaces(own_cache):
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("default")
         for period in (1.0, 1.1, 1.2):
-            Recipe({**CROSSED, "period": period}, FAST).cached()
+            Recipe({**CROSSED, "period": period}, Settings(**FAST)).cached()
     assert len(told) == 1
 
 
 @pytest.mark.slow
 def test_a_spectrum_of_another_surface_under_a_name_of_the_cache_is_not_used(own_cache, builds):
-    one, other = (Recipe({**CROSSED, "period": period}, FAST) for period in (1.0, 1.1))
+    one, other = (Recipe({**CROSSED, "period": period}, Settings(**FAST)) for period in (1.0, 1.1))
     one.cached()
     entry = own_cache / f"{one.digest()}.exr"
     shutil.copy(entry, own_cache / f"{other.digest()}.exr")

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import inspect
 import logging
 import weakref
+from dataclasses import replace
 from pathlib import Path
 
 import mitsuba as mi
@@ -17,7 +17,7 @@ from ..precomputation import Spectrum, load_spectrum
 from ..progress import progress_bar
 from ..recipe import Recipe
 from ..rigorous.spectrum import RigorousSpectrum
-from ..settings import SHORTEST_WAVELENGTH, THEORIES, VISIBLE
+from ..settings import THEORIES, VISIBLE, Settings, wavelengths_inside
 from ..surface.gratings import COHERENCE_LENGTHS, PROFILES
 from .media import Media
 from .theories import check_transmission, refuse_scalar_only, settings_from, settings_of_medium
@@ -68,7 +68,7 @@ def surface_from(props: mi.Properties, media: Media, scale: float = 1.0) -> tupl
     settings |= {key: props[key] for key in ("coherence_length", "tolerance", "largest_height_range") if key in props}
     if theory == "rigorous":
         settings |= {"theory": theory, **settings_from(props, media.coat)}
-    recipe = _inside(props, media, scale, Recipe(surface, settings))
+    recipe = _inside(props, media, scale, Recipe(surface, Settings(**settings)))
     return recipe.cached(_per_cent), recipe
 
 
@@ -86,18 +86,18 @@ def _inside(props: mi.Properties, media: Media, scale: float, recipe: Recipe) ->
     A larger `scale` of lengths needs shorter ones, too. What the scene must not say is refused here, before a table is
     computed.
     """
-    inside = {}
-    if VISIBLE[0] / (media.index * scale) < SHORTEST_WAVELENGTH:
-        most = VISIBLE[0] / (media.index * SHORTEST_WAVELENGTH)
-        raise RequestError(f"height_scale, lateral_scale: got up to {scale:g}, wanted at most {most:.3g}")
-    rigorous = recipe.spectrum.get("theory") == "rigorous"
-    if media.index * scale > 1 and "wavelengths" not in recipe.spectrum and not (rigorous and media.coat is None):
-        inside["wavelengths"] = [VISIBLE[0] / (media.index * scale), VISIBLE[1] / media.index]
-    if rigorous:
+    settings, inside = recipe.settings, {}
+    wavelengths = wavelengths_inside(media.index, scale)
+    if settings.theory == "rigorous":
         refuse_scalar_only(props)
-        check_transmission(recipe.spectrum.get("transmission", media.transmission), media)
-        inside |= settings_of_medium(media)
-    return Recipe(recipe.surface, {**recipe.spectrum, **inside}, recipe.folder) if inside else recipe
+        if settings.transmission != "none":
+            check_transmission(settings.transmission, media)
+        inside = settings_of_medium(media)
+    # Rigorous tables of a bare surface are for the wavelengths above it.
+    shorter = media.index * scale > 1 and (settings.theory == "scalar" or media.coat is not None)
+    if shorter and settings.wavelengths == VISIBLE:
+        inside["wavelengths"] = wavelengths
+    return replace(recipe, settings=replace(settings, **inside))
 
 
 def _from_file(props: mi.Properties, media: Media, scale: float) -> tuple[Spectrum, Recipe | None]:
@@ -109,9 +109,8 @@ def _from_file(props: mi.Properties, media: Media, scale: float) -> tuple[Spectr
         there = sorted(other.name for other in folder.glob("*") if other.suffix.lower() in (".exr", ".toml"))
         raise FileNotFoundError(f"{path}: no such file; {folder} holds {', '.join(there) or 'no spectrum'}")
     if suffix == ".toml":
-        recipe = _inside(props, media, scale, Recipe.load(path))
-        if tolerance is not None:
-            recipe = dataclasses.replace(recipe, spectrum={**recipe.spectrum, "tolerance": tolerance})
+        own = Recipe.load(path, **({} if tolerance is None else {"tolerance": tolerance}))
+        recipe = _inside(props, media, scale, own)
         return recipe.cached(_per_cent), recipe
     if suffix == ".exr":
         if tolerance is not None:

@@ -115,7 +115,7 @@ def options_of_scan(context: typer.Context) -> dict[str, object]:
     return {**given, "prepare": [step_of(text) for text in steps]} if steps else given
 
 
-def settings_of(context: typer.Context) -> dict[str, object]:
+def settings_of(context: typer.Context) -> dict[str, Any]:
     """Return the options of the spectrum that the command was given, under their names in `Settings`."""
     return _given(context, [field.name for field in fields(Settings)])
 
@@ -125,10 +125,10 @@ def _given(context: typer.Context, names: Iterable[str]) -> dict[str, Any]:
     return {n: value for n in names if (value := context.params.get(n)) not in (None, ()) and value is not False}
 
 
-def recipe_of(source: Path, of_scan: dict[str, object], settings: dict[str, object]) -> Recipe:
+def recipe_of(source: Path, of_scan: dict[str, Any], settings: dict[str, Any]) -> Recipe:
     """Return the recipe in a file, or the one equivalent to a scan; `settings` take the place of those of a file."""
     if source.suffix.lower() != ".toml":
-        return Recipe({"scan": source.name, **of_scan}, settings, source.parent)
+        return Recipe({"scan": source.name, **of_scan}, Settings(**settings), source.parent)
     if of_scan:
         names = ", ".join(f"--{name.replace('_', '-')}" for name in of_scan)
         raise RequestError(f"{names} go with a scan; the recipe {source} has its own")

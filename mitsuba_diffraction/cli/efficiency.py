@@ -51,16 +51,16 @@ def efficiency(
     name, values = surface_of(source)
     if Path(name).suffix.lower() == ".toml":
         recipe = Recipe.load(name)
-        recipe = Recipe({**recipe.surface, **values}, recipe.spectrum, recipe.folder)
+        recipe = Recipe({**recipe.surface, **values}, recipe.settings, recipe.folder)
     elif name not in PROFILES and (Path(name).suffix or Path(name).exists()):
         raise RequestError(f"{name}: got a file, wanted a recipe (.toml) or the name of a profile, such as blazed")
     else:
         recipe = Recipe({"profile": name, **values})
-    if recipe.spectrum.get("extent", "tile") != "tile":
+    settings = recipe.settings
+    if settings.extent != "tile":
         raise RequestError(f"{name}: got a sample of an irregular surface, wanted a grating that repeats")
-    own = {key: recipe.spectrum.get(key) for key in ("material", "int_ior")}
-    if material is not None or int_ior is not None:
-        own = {"material": material, "int_ior": int_ior}
+    if material is None and int_ior is None:
+        material, int_ior = settings.material, settings.int_ior
     if csv is not None:
         check_suffix("--csv", csv, ".csv")
     if plot is not None:
@@ -72,9 +72,10 @@ def efficiency(
             recipe.height_field(),
             angles,
             wavelengths,
-            theory=theory or recipe.spectrum.get("theory", "scalar"),
-            **own,
-            transmission=transmission or recipe.spectrum.get("transmission", "none"),
+            theory=theory or settings.theory,
+            material=material,
+            int_ior=int_ior,
+            transmission=transmission or settings.transmission,
             azimuth=azimuth,
             progress=progress,
         )

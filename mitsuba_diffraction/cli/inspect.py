@@ -56,7 +56,10 @@ def inspect(
     overwrite: Overwrite = False,
 ) -> None:
     """Report and plot the statistics, periods and predicted colours of a surface, and their reliability."""
-    recipe = recipe_of(source, options_of_scan(context), settings_of(context))
+    settings = settings_of(context)
+    if source.suffix.lower() != ".toml":
+        settings.setdefault("extent", "sample")
+    recipe = recipe_of(source, options_of_scan(context), settings)
     reads = [source, *recipe.files]
     by_default = free_name(f"{source.stem}_inspect", lambda stem: [Path(f"{stem}.png")], reads)
     picture = output or Path(f"{by_default}.png")
@@ -68,8 +71,8 @@ def inspect(
     with progress_bar(f"spectra of {source.name}") as progress:
         inspection = look(
             height_field,
-            extent=recipe.spectrum.get("extent", "tile" if source.suffix.lower() == ".toml" else "sample"),
-            coherence_length=recipe.spectrum.get("coherence_length", SUN_COHERENCE_LENGTH),
+            extent=recipe.settings.extent,
+            coherence_length=recipe.settings.coherence_length,
             measured="scan" in recipe.surface,
             progress=progress,
         )

@@ -84,7 +84,7 @@ def precompute(
     reads = [*sources, *(file for recipe in recipes for file in recipe.files)]
     writes = [("-o" if output else f"spectrum of {s}", t) for s, t in zip(sources, targets, strict=True)]
     check_outputs(reads, writes, overwrite=overwrite)
-    seams = [_seam(source, recipe) for source, recipe in zip(sources, recipes, strict=True)]
+    seams = [_seam(source, recipe) if extent is None else "" for source, recipe in zip(sources, recipes, strict=True)]
     for source, recipe, target, seam in zip(sources, recipes, targets, seams, strict=True):
         with progress_bar(f"spectrum of {source.name}", "%") as progress:
             spectrum = recipe.build(progress)
@@ -115,12 +115,12 @@ def _table(spectrum: Spectrum) -> str:
 
 
 def _seam(source: Path, recipe: Recipe) -> str:
-    """Return a line on the seam of a scan for which no extent is given.
+    """Return a line on the seam of a scan that is repeated as a tile; "" for a recipe.
 
     Raises:
         ValueError: if the seam would be visible.
     """
-    if source.suffix.lower() == ".toml" or "extent" in recipe.spectrum:
+    if source.suffix.lower() == ".toml":
         return ""
     steps = seam_steps(recipe.height_field())
     seam = " and ".join(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass, field, fields
 from functools import cached_property
+from typing import cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,16 +26,13 @@ class PowerSpectrum:
     Attributes:
         table: η_m(κ), or the coefficients of the splines.
         grid: the diffraction orders m, or the nodes, that are kept.
-        extent: "tile": the patch repeats for ever; "sample": it is a piece of a larger, irregular surface.
+        settings: the parameters that it was built with; of a sample the coherence length is at most what the scan
+            supports, and the tolerance is a number.
         pixel_size: (x, y) of the height field, µm.
         height_range: of the height field, µm.
-        coherence_length: L_c in µm; it sets the width σ_q of each order. Of a sample: at most what the scan supports.
-        wavelengths: (shortest, longest) in nm for which the table holds.
-        tolerance: the requested bound.
         error: the measured one: max over κ of ∫|S_approx − S_exact| dq over the frequencies that light can reach.
         source: origin of the heights.
         source_digest: SHA-256 of the height field.
-        largest_angle: in degrees from the normal, of both directions, for which the table holds.
         truncated_power: the largest share of the power, over κ, at weak frequencies that are left out; part of `error`.
         unresolved_power: the largest share of the power, over κ, at frequencies that no pair of directions reaches, or
             that the pixels do not resolve.
@@ -45,23 +43,18 @@ class PowerSpectrum:
 
     table: SliceTable
     grid: OrderGrid | SplineGrid
-    extent: str
+    settings: Settings
     pixel_size: tuple[float, float]
     height_range: float
-    coherence_length: float
-    wavelengths: tuple[float, float]
-    tolerance: float
     error: float
     source: str
     source_digest: str = field(repr=False)
-    largest_angle: float = 90.0
     truncated_power: float = 0.0
     unresolved_power: float = 0.0
     patches: int = 1
     standard_error: float | None = None
 
     def __post_init__(self) -> None:
-        Settings(self.extent, self.coherence_length, self.wavelengths, self.largest_angle, tolerance=self.tolerance)
         if self.table.shape != self.grid.shape:
             raise RequestError(f"table: got {self.table.shape} nodes, wanted {self.grid.shape}")
         if not all(np.isfinite(p) and p > 0 for p in self.pixel_size):
@@ -82,9 +75,34 @@ class PowerSpectrum:
             raise RequestError(f"standard_error: got {found} of a {self.extent}, wanted a number ≥ 0 of a sample only")
 
     @property
+    def extent(self) -> str:
+        """ "tile": the patch repeats for ever; "sample": it is a piece of a larger, irregular surface."""
+        return self.settings.extent
+
+    @property
+    def coherence_length(self) -> float:
+        """L_c in µm, which sets the width σ_q of each order."""
+        return self.settings.coherence_length
+
+    @property
+    def wavelengths(self) -> tuple[float, float]:
+        """(shortest, longest) in nm for which the table holds."""
+        return self.settings.wavelengths
+
+    @property
+    def largest_angle(self) -> float:
+        """Degrees from the normal, of both directions, for which the table holds."""
+        return self.settings.largest_angle
+
+    @property
+    def tolerance(self) -> float:
+        """The requested bound of the error."""
+        return cast(float, self.settings.tolerance)
+
+    @property
     def representation(self) -> str:
         """The storage of the powers, "slices"."""
-        return self.table.representation
+        return self.settings.representation
 
     @property
     def max_kappa(self) -> float:

@@ -197,7 +197,7 @@ def test_the_rigorous_recipes_are_of_one_row():
     assert len(found) == 6
     for recipe in map(md.Recipe.load, found):
         assert recipe.height_field().shape[0] == 1
-        assert recipe.spectrum["theory"] == "rigorous"
+        assert recipe.settings.theory == "rigorous"
 
 
 @pytest.mark.slow
@@ -387,12 +387,12 @@ def test_a_grating_is_built_for_the_coat_and_the_variant_of_the_scene(monkeypatc
     """What is asked for; the table would take minutes."""
     use("llvm_ad_spectral_polarized")
     asked = []
-    monkeypatch.setattr(md.Recipe, "cached", lambda recipe, *_: asked.append(dict(recipe.spectrum)) or made_up())
+    monkeypatch.setattr(md.Recipe, "cached", lambda recipe, *_: asked.append(recipe.settings.chosen) or made_up())
     scene = {"type": "diffraction_grating", "profile": "sinusoidal", "period": 0.3, "depth": 0.05, "theory": "rigorous"}
     for material in ({"material": "Al"}, {"int_ior": 1.8}):
         with pytest.raises(RuntimeError, match="polarised=True"):
             mi.load_dict({**scene, "coat_ior": 1.5, "ext_ior": 1.0, **material})
-    assert [settings.pop("wavelengths") for settings in asked] == [[240.0, pytest.approx(830 / 1.5)]] * 2
+    assert [settings.pop("wavelengths") for settings in asked] == [(240.0, pytest.approx(830 / 1.5))] * 2
     assert asked == [
         {"theory": "rigorous", "material": "Al", "ext_ior": 1.5, "polarised": True},
         {"theory": "rigorous", "int_ior": 1.8, "ext_ior": 1.5, "polarised": True},

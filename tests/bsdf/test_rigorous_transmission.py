@@ -257,7 +257,7 @@ def test_other_light_than_that_of_the_table_is_refused(glass, parameters, text):
 def test_scenes_build_tables_of_light_that_passes(glass, monkeypatch, tmp_path):
     """A profile and a recipe ask for the light of the scene."""
     asked = []
-    monkeypatch.setattr(md.Recipe, "cached", lambda recipe, *_: asked.append(dict(recipe.spectrum)) or glass)
+    monkeypatch.setattr(md.Recipe, "cached", lambda recipe, *_: asked.append(recipe.settings) or glass)
     scene = {"type": "diffraction_grating", "int_ior": ETA, "ext_ior": 1.0, "transmission": glass.transmission}
     recipe = tmp_path / "glass.toml"
     recipe.write_text(
@@ -266,7 +266,7 @@ def test_scenes_build_tables_of_light_that_passes(glass, monkeypatch, tmp_path):
     )
     mi.load_dict({**scene, "profile": "blazed", "period": 0.3, "depth": 0.05, "theory": "rigorous"})
     mi.load_dict({**scene, "filename": str(recipe)})
-    assert [settings["transmission"] for settings in asked] == [glass.transmission] * 2
+    assert [settings.transmission for settings in asked] == [glass.transmission] * 2
     recipe.write_text(recipe.read_text() + 'transmission = "sheet"\n', encoding="utf-8")
     with pytest.raises(RuntimeError, match="transmission: got 'none', but the rigorous spectrum is of"):
         mi.load_dict({**scene, "filename": str(recipe), "transmission": "none"})

@@ -112,7 +112,7 @@ def test_the_bundled_surfaces_are_those_of_the_recipes():
     cases = {case.name: case for case in bundled_cases()}
     for name in ("elaphe", "xenopeltis"):
         recipe = md.Recipe.load(f"precompute/{name}.toml")
-        assert cases[name].coherence_length == recipe.spectrum["coherence_length"]
+        assert cases[name].coherence_length == recipe.settings.coherence_length
         assert cases[name].height_field.digest == recipe.height_field().digest
 
 

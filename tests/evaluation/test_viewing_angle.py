@@ -26,6 +26,7 @@ from mitsuba_diffraction.evaluation.validation.viewing_angle import (
     viewing_angles,
     wavelengths,
 )
+from mitsuba_diffraction.settings import Settings
 
 BLAZE = SURFACES["blaze"]
 COARSE = wavelengths(40.0)
@@ -37,7 +38,8 @@ SKINS = {"elaphe": (1, 1.144), "xenopeltis": (0, 1.552)}
 def small_skin(name):
     axis, period = SKINS[name]
     surface = {"profile": name, "size": 12.0, "pixel_size": 0.085, "seed": 1}
-    return PublishedSurface(name, md.Recipe(surface, {"coherence_length": 10.0}), axis, period, (1e3 * period, 0.0))
+    recipe = md.Recipe(surface, Settings(coherence_length=10.0))
+    return PublishedSurface(name, recipe, axis, period, (1e3 * period, 0.0))
 
 
 # ---------------------------------------------------------------- the model at directions

@@ -303,7 +303,7 @@ def test_the_comb_of_a_drawn_tile_is_blurred(name):
 @pytest.mark.parametrize("name", sorted(COHERENCE_LENGTHS))
 def test_a_recipe_and_a_scene_agree_on_coherence_length_and_patches(name):
     recipe = Recipe.load(RECIPES / f"{name}.toml")
-    assert recipe.spectrum["coherence_length"] == COHERENCE_LENGTHS[name]
+    assert recipe.settings.coherence_length == COHERENCE_LENGTHS[name]
     assert recipe.surface["patches"] == PATCHES[name]
 
 

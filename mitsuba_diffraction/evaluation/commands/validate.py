@@ -104,7 +104,7 @@ def _recipe(path: Path, of_scan: dict[str, object], settings: dict[str, object])
     recipe = recipe_of(path, of_scan, settings)
     if recipe.patches > 1:
         recipe = replace(recipe, surface={**recipe.surface, "patches": 1})
-    if recipe.spectrum.get("theory") == "rigorous":
+    if recipe.settings.theory == "rigorous":
         raise RequestError(f"{path}: got theory = 'rigorous', wanted scalar; precompute prints the measured errors")
     return recipe
 

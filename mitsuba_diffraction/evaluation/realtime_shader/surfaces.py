@@ -12,7 +12,6 @@ from ...bsdf.geometry import turned
 from ...bsdf.layers import Layers
 from ...bsdf.theories import RigorousTheory
 from ...errors import RequestError
-from ...settings import SUN_COHERENCE_LENGTH
 from ...surface.heightfield import HeightField
 
 
@@ -81,7 +80,7 @@ def heights_of(layers: Layers) -> tuple[HeightField, float]:
             "diffraction_shader: it needs heights, and a saved spectrum does not hold them; give the grating a "
             "recipe (filename=….toml) or a profile"
         )
-    return recipe.height_field(), float(recipe.spectrum.get("coherence_length", SUN_COHERENCE_LENGTH))
+    return recipe.height_field(), float(recipe.settings.coherence_length)
 
 
 def along_pattern(layers: Layers, si: mi.SurfaceInteraction3f, omega: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from ...errors import RequestError
 from ...grating_spectrum import GratingSpectrum
 from ...recipe import Recipe
-from ...settings import SUN_COHERENCE_LENGTH
+from ...settings import Settings
 from ...surface.heightfield import HeightField
 
 
@@ -55,7 +55,7 @@ class PublishedSurface:
     @property
     def coherence_length(self) -> float:
         """L_c in µm."""
-        return float(self.recipe.spectrum.get("coherence_length", SUN_COHERENCE_LENGTH))
+        return float(self.recipe.settings.coherence_length)
 
     def direction(self, angle: ArrayLike) -> NDArray[np.float64]:
         """Return unit vectors (..., 3) at angles (...) in degrees from the normal, in the plane of the surface."""
@@ -66,14 +66,14 @@ class PublishedSurface:
 
     def coherent_over(self, coherence_length: float) -> PublishedSurface:
         """Return the same surface in light of another coherence length, µm."""
-        recipe = Recipe(self.recipe.surface, {**self.recipe.spectrum, "coherence_length": coherence_length})
+        recipe = replace(self.recipe, settings=replace(self.recipe.settings, coherence_length=coherence_length))
         return PublishedSurface(self.name, recipe, self.axis, self.period, self.published)
 
 
 def _skin(profile: str, depth: float) -> Recipe:
     """Return the surface of precompute/elaphe.toml or xenopeltis.toml."""
     return Recipe(
-        {"profile": profile, "size": 32.0, "depth": depth, "seed": 1, "patches": 1}, {"coherence_length": 26.0}
+        {"profile": profile, "size": 32.0, "depth": depth, "seed": 1, "patches": 1}, Settings(coherence_length=26.0)
     )
 
 
