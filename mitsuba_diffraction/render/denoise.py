@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from ..errors import RequestError
+from .film import check_memory
 
 _SAMPLES = 16  # per pixel, of the guides
 _RGB = (610.0, 550.0, 465.0)  # nm, at which the albedo is evaluated
@@ -69,6 +70,7 @@ def check_requirements() -> None:
 def guides(scene: mi.Scene) -> Guides:
     """Render the guides of a scene; errors as of `check_requirements`."""
     check_requirements()
+    check_memory(scene, 1)  # of the picture: the guides take a fifth of it
     sensor = scene.sensors()[0]
     columns, rows = (int(size) for size in sensor.film().crop_size())
     sampler = mi.load_dict({"type": "independent"})

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from ..color import spectrum_to_XYZ
 from ..errors import RequestError
 from ..files import UNSEALED, is_intact, seal, whole_file
-from .film import is_independent, pass_seed, samples_drawn, takes_mitsubas_film, trace_pass
+from .film import check_memory, is_independent, pass_seed, samples_drawn, takes_mitsubas_film, trace_pass
 from .scene import Materials, channel_wavelengths, load_spectral_scene, scene_digest, warn_of_gratings
 from .spectral_image import SpectralImage
 
@@ -275,7 +275,8 @@ def render(
 
     Raises:
         FileNotFoundError: if there is no such scene.
-        ValueError: as `load_spectral_scene`, or if a number is out of range or the checkpoint is of another rendering.
+        ValueError: as `load_spectral_scene`, or if a number is out of range, the picture needs more memory than is
+            available, or the checkpoint is of another rendering.
         RuntimeError: if rendering failed, with the cause on one line.
         OSError: if a checkpoint cannot be written; the previous one is kept.
         Interrupted: at the end of the current pass on the first Ctrl-C, with the picture so far, after a checkpoint.
@@ -336,7 +337,6 @@ def _job(
     if until_error is not None and not 0 < until_error < 1:
         raise RequestError(f"until_error: got {until_error}, wanted a relative error between 0 and 1, such as 0.01")
     scene = load_spectral_scene(scene_path, **where)
-    warn_of_gratings(scene)
     sampler = scene.sensors()[0].sampler()
     if takes_mitsubas_film(scene.integrator()) and not is_independent(sampler):
         _log.warning(
@@ -344,12 +344,15 @@ def _job(
             "and colours may be wrong by some per cent",
             sampler.class_name(),
         )
+    samples = split(scene, spp, 1 if until_error is None else _LEAST_PASSES_TO_CONVERGE)
+    check_memory(scene, max(samples))
+    warn_of_gratings(scene)
     job = Job(
         scene=str(Path(scene_path).resolve()),
         where=where,
         variant=mi.variant(),
         seed=seed,
-        samples=split(scene, spp, 1 if until_error is None else _LEAST_PASSES_TO_CONVERGE),
+        samples=samples,
         until_error=until_error,
         content=scene_digest(scene_path, where["parameters"], where["materials"]),
         versions=versions(),

@@ -39,7 +39,7 @@ Materials = Mapping[str, Mapping[str, bool | float | str]]
 """Id of a BSDF → parameters of the grating that takes its place."""
 
 _RAYS_FROM_BELOW = 4096  # to find out whether gratings are seen and lit from above
-_MOST_PIXELS = 2**25  # above 7680 × 4320; sums take 750 bytes per pixel
+_MOST_PIXELS = 2**25  # above 7680 × 4320; see also `film.check_memory`
 _DEFAULT_SIZE = (768, 576)  # that of Mitsuba's films
 
 

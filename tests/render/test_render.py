@@ -1,4 +1,5 @@
 import gc
+import os
 from itertools import combinations
 from pathlib import Path
 
@@ -13,7 +14,7 @@ import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a va
 from mitsuba_diffraction.bsdf.tables import PacketTable
 from mitsuba_diffraction.color import spectrum_to_linear_sRGB, spectrum_to_XYZ
 from mitsuba_diffraction.errors import Bug, RequestError
-from mitsuba_diffraction.render import passes, render
+from mitsuba_diffraction.render import film, passes, render
 from mitsuba_diffraction.render.film import trace_pass
 from mitsuba_diffraction.render.scene import channel_wavelengths, channel_weights, load_spectral_scene
 
@@ -433,6 +434,26 @@ def test_wrong_requests_are_refused(llvm, tmp_path):
     mi.set_variant("scalar_rgb")
     with pytest.raises(ValueError, match="got 'scalar_rgb', wanted a spectral one"):
         render(path, spp=1)
+
+
+def test_a_picture_that_does_not_fit_into_memory_is_refused_before_it_is_traced(llvm, tmp_path, monkeypatch):
+    path = write_scene(tmp_path, CONSTANT)
+    monkeypatch.setattr(passes, "trace_pass", None)
+    monkeypatch.setattr(film, "_available_memory", lambda: 20 * 10**9)
+    # The peak of 1024 × 1024 pixels was measured as 2593 bytes per pixel above the start, of 512 × 512 as 2612.
+    with pytest.raises(
+        ValueError, match=r"3840 × 2160 pixels, which take 21\.7 GB of memory, .* the 20 GB"
+    ):
+        render(path, spp=8, width=3840, height=2160)
+    monkeypatch.setattr(film, "_available_memory", lambda: None)
+    with pytest.raises(TypeError, match="not callable"):
+        render(path, spp=8, width=3840, height=2160)
+
+
+@pytest.mark.skipif(not Path("/proc/meminfo").exists(), reason="Linux alone reports it")
+def test_the_available_memory_is_that_of_the_system():
+    pages = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    assert 0.5 * pages < film._available_memory()
 
 
 def test_of_integrators_with_other_channels_the_radiance_is_taken(llvm, tmp_path):

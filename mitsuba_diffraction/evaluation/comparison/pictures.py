@@ -18,7 +18,7 @@ from ...color import spectrum_to_XYZ
 from ...errors import RequestError
 from ...progress import Progress, silent
 from ...render import SpectralImage
-from ...render.film import collect, evenly, pass_seed, rotated, trace_pass
+from ...render.film import check_memory, collect, evenly, pass_seed, rotated, trace_pass
 from ...render.passes import Accumulation, ratio, split
 from ...render.scene import channel_wavelengths, load_spectral_scene, parsed
 from ..realtime_shader.base import Shader
@@ -232,6 +232,7 @@ class Pictures:
     def _traced(self, integrator: mi.Integrator, samples: int, progress: Progress, halves: bool = True) -> Picture:
         rows, columns = self.surface.shape
         passes = split(self.scene, samples, 2 if halves else 1)
+        check_memory(self.scene, max(passes))
         trace_pass(self.scene, 1, self.seed, integrator)  # compiles the kernels
         sums = Accumulation.empty(rows, columns)
         pair = np.zeros((2, rows, columns, 4))  # sums of XYZ and of the filter, of every other pass
