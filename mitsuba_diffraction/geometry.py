@@ -1,6 +1,17 @@
-"""K G in NumPy, and the normalisation of lobes at the horizon; `bsdf/geometry.py` is the same in Dr.Jit."""
+"""K, G and the gain of lobes at the horizon: the factors of a pair of directions, for arrays of NumPy and of Dr.Jit.
+
+Media of index n_i, where ω_i lies, and n_o, where ω_o lies, both directions away from the surface, k = n ω their wave
+vectors in units of 2π/λ and v = k_i + k_o. Then q = −v_∥/λ, κ = 2π v_z/λ and
+
+    k_i·v = (|v|² + n_i² − n_o²)/2,    k_o·v = (|v|² − n_i² + n_o²)/2,    K = |k_i·v| |k_o·v| / (|k_iz| |k_oz| v_z²)
+
+for reflection (n_i = n_o; Stam 1999) and for transmission alike (cf. Walter et al. 2007).
+"""
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -10,23 +21,71 @@ SHADOWING = ("v_cavity", "none")
 # Coefficients of a least-squares fit to (g(x) − 1)/t², t = 1 − x/4.
 HORIZON_GAIN = (-0.04034151, 0.81494507, -5.03522703, 10.57318562, -9.23048089, 3.5662365)
 
+Array = Any
+"""An array of NumPy or of Dr.Jit, as `select` is of one or the other."""
 
-def k_g(cos_i: ArrayLike, cos_o: ArrayLike, d: ArrayLike, shadowing: bool = True) -> NDArray[np.floating]:
-    """Compute K G of pairs of directions; shapes broadcast, float32 is preserved.
 
-    With D = 1 + ω_i·ω_o and w = cos θ_i + cos θ_o,
+def k_g(
+    k_iz: Array,
+    k_oz: Array,
+    tangent_square: Array,
+    excess: Array = 0.0,
+    reflects: Array = True,
+    shadowing: bool = True,
+    min_v_z: Array = 0.0,
+    select: Callable[..., Any] = np.where,
+) -> Array:
+    """Return K G of a pair of directions; shapes broadcast, float32 is preserved.
 
-        K = D²/(cos θ_i cos θ_o w²)    (Stam 1999),
-        G = min(1, 2w cos θ_i/D, 2w cos θ_o/D)    (Torrance and Sparrow 1967).
+    With A_i = |k_i·v|/|k_iz| and A_o = |k_o·v|/|k_oz|, K = A_i A_o/v_z². Reflected light has the shadowing of
+    V-cavities (Torrance and Sparrow 1967), min(1, 2 h_z cos θ_i/|ω_i·h|, 2 h_z cos θ_o/|ω_o·h|) with h = v/|v|;
+    transmitted light
+
+        G = min(1, 2 cos θ_i/|ω_i·h|, 2 cos θ_o/|ω_o·h|)² = min(1, 4 |v|²/max(A_i, A_o)²)
+
+    so that an order vanishes as cos θ towards the horizon, as rigorous orders do: h_z in it would remove light where
+    v_z is small. Where |v|² > |n_i² − n_o²| no facet refracts ω_i into ω_o, and nothing is transmitted.
 
     Args:
-        cos_i, cos_o: cos θ_i and cos θ_o, positive.
-        d: D. Near grazing incidence compute it as (|ω_i,t + ω_o,t|² + w²)/2, which avoids cancellation.
+        k_iz, k_oz: |k_iz| and |k_oz|, positive.
+        tangent_square: |v_∥|² = |λq|².
+        excess: n_i² − n_o².
+        reflects: whether both directions lie on one side.
         shadowing: if false, K alone.
+        min_v_z: |v_z| in K is not less, of transmitted light.
+        select: `numpy.where` or `drjit.select`.
     """
-    w = np.add(cos_i, cos_o)
-    k = np.square(d) / (cos_i * cos_o * w**2)
-    return k * np.minimum(1, 2 * w * np.minimum(cos_i, cos_o) / d) if shadowing else k
+    v_z = select(reflects, k_iz + k_oz, abs(k_iz - k_oz))
+    square = tangent_square + v_z * v_z
+    a_i, a_o = abs(square + excess) / (2 * k_iz), abs(square - excess) / (2 * k_oz)
+    per_v_z = 1 / select(reflects, v_z, select(v_z > min_v_z, v_z, min_v_z))
+    k = a_i * per_v_z * (a_o * per_v_z)
+    result = k
+    if shadowing:
+        smaller, larger = select(a_i < a_o, a_i, a_o), select(a_i < a_o, a_o, a_i)
+        in_v_cavity = 2 * smaller * per_v_z
+        square_ratio = 4 * square / (larger * larger)
+        transmitted = select(square_ratio < 1, k * square_ratio, k)
+        result = select(reflects, select(k < in_v_cavity, k, in_v_cavity), transmitted)
+    return select(reflects | (square < abs(excess)), result, 0)
+
+
+def horizon_gain(x: Array, select: Callable[..., Any] = np.where) -> Array:
+    """Return g(x), which compensates the power of a Gaussian lobe below the horizon; x ≥ 0 in standard deviations.
+
+    Of lobes centred at x and cut off at 0, g(x) g(y) φ(x − y) is symmetric and integrates to one:
+
+        g(x) ∫₀^∞ φ(x − y) g(y) dy = 1,    φ the standard normal density
+
+    (Sinkhorn 1964: the symmetric scaling of a kernel). g(0) = √e, and g = 1 from 4 on. The polynomial errs by at most
+    4.1e-4.
+    """
+    t = 1 - x * 0.25
+    t = select(t > 0, t, 0)
+    result = HORIZON_GAIN[-1]
+    for coefficient in HORIZON_GAIN[-2::-1]:
+        result = result * t + coefficient
+    return 1 + t * t * result
 
 
 def fresnel(cosine: ArrayLike, index: float) -> NDArray[np.float64]:
@@ -48,42 +107,20 @@ def _fresnel(cos_i: ArrayLike, cos_o: ArrayLike, index: float) -> NDArray[np.flo
 
 
 def transmitted(
-    cos_i: ArrayLike, cos_o: ArrayLike, tangent: ArrayLike, index: float, least: ArrayLike = 0.0
+    cos_i: ArrayLike, cos_o: ArrayLike, tangent_square: ArrayLike, index: float, min_v_z: ArrayLike = 0.0
 ) -> NDArray[np.float64]:
-    """Return K_t G_t (1 − F) of a pair of directions on both sides of an interface; shapes broadcast.
-
-    With v = ω_i + η ω_o, h = v/|v| and lengths in units of n_i (K_t as in Walter et al. 2007),
-
-        K_t = |ω_i·v| |ω_o·v| / (cos θ_i cos θ_o v_z²),    G_t = min(1, 2 cos θ_i/|ω_i·h|, 2 cos θ_o/|ω_o·h|)²
-
-    so that an order vanishes as cos θ towards the horizon, as rigorous orders do. Where |v|² > |1 − η²| no facet
-    refracts ω_i into ω_o, and nothing is transmitted; at the limit F = 1.
+    """Return K G (1 − F) of transmitted light; shapes broadcast, lengths in units of n_i.
 
     Args:
         cos_i, cos_o: |cos θ_i| and |cos θ_o|, positive.
-        tangent: |ω_i,t + η ω_o,t|² = |λq|², λ in the medium of ω_i.
+        tangent_square: |ω_i,t + η ω_o,t|² = |λq|², λ in the medium of ω_i.
         index: η = n_o/n_i.
-        least: |v_z| at least, in K_t.
+        min_v_z: |v_z| in K is not less.
     """
-    v_z = np.abs(cos_i - index * cos_o)
-    square = tangent + v_z**2
-    # |ω_i·v| and |ω_o·v|
-    i, o = np.abs(square + 1 - index**2) / 2, np.abs(square - 1 + index**2) / (2 * index)
-    length = np.sqrt(square)
-    g = np.minimum(1, 2 * length * np.minimum(cos_i / np.maximum(i, 1e-12), cos_o / np.maximum(o, 1e-12))) ** 2
-    k = i * o / np.maximum(cos_i * cos_o * np.maximum(v_z, least) ** 2, 1e-12)
-    return k * g * (square < np.abs(1 - index**2)) * (1 - _fresnel(i, o, index))
-
-
-def horizon_gain(x: ArrayLike) -> NDArray[np.float64]:
-    """Return g(x), which compensates the power of a Gaussian lobe below the horizon; x ≥ 0 in standard deviations.
-
-    Of lobes centred at x and cut off at 0, g(x) g(y) φ(x − y) is symmetric and integrates to one:
-
-        g(x) ∫₀^∞ φ(x − y) g(y) dy = 1,    φ the standard normal density
-
-    (Sinkhorn 1964: the symmetric scaling of a kernel). g(0) = √e, and g = 1 from 4 on. The polynomial errs by at most
-    4.1e-4.
-    """
-    t = np.maximum(1 - np.asarray(x, np.float64) / 4, 0)
-    return 1 + t**2 * np.polynomial.polynomial.polyval(t, HORIZON_GAIN)
+    square = tangent_square + (cos_i - index * np.asarray(cos_o)) ** 2
+    # F depends on the ratio of ω_i·h and ω_o·h alone.
+    along_i, along_o = np.abs(square + 1 - index**2) / 2, np.abs(square - 1 + index**2) / (2 * index)
+    factor = k_g(
+        cos_i, index * np.asarray(cos_o), tangent_square, 1 - index**2, False, min_v_z=np.maximum(min_v_z, 1e-6)
+    )
+    return factor * (1 - _fresnel(along_i, along_o, index))

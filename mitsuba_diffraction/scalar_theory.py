@@ -224,8 +224,9 @@ def _mirror_orders(
     m, steps, leaving, square_o = (values[square_o < 1] for values in (m, steps, leaving, square_o))
     cos_i, cos_o = np.sqrt(1 - (light**2).sum()), np.sqrt(1 - square_o)
     w = cos_i + cos_o
-    d = ((steps**2).sum(axis=-1) + w**2) / 2  # 1 + ω_i·ω_o
-    return m, leaving, k_g(cos_i, cos_o, d) * powers(m, 2 * np.pi * w / wavelength), np.sqrt(d / 2)
+    square = (steps**2).sum(axis=-1)
+    half = np.sqrt(square + w**2) / 2
+    return m, leaving, k_g(cos_i, cos_o, square) * powers(m, 2 * np.pi * w / wavelength), half
 
 
 def difference(scalar: ArrayLike, rigorous: ArrayLike) -> float:

@@ -92,9 +92,9 @@ class HorizonBins:
 
     def bin(self, incidence: Incidence) -> mi.UInt32:
         """Return the bin of one wavelength and where it comes from; beyond the ends, the nearest."""
-        wi, bins = incidence.wi, self.resolution
+        tangent, bins = incidence.tangent, self.resolution
         cosine, _ = cell_of(incidence.cosine * bins.cosines, bins.cosines)
-        turn, _ = cell_of((azimuth(wi.x, wi.y) + 2) * (bins.azimuths / 4), bins.azimuths)
+        turn, _ = cell_of((azimuth(tangent.x, tangent.y) + 2) * (bins.azimuths / 4), bins.azimuths)
         frequency, _ = cell_of((incidence.radius - self.first) * self.per_frequency, bins.frequencies)
         return (frequency * bins.cosines + cosine) * bins.azimuths + turn
 

@@ -9,6 +9,7 @@ With lengths along the surface times s and heights times h, a relief is at λ wh
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -88,32 +89,16 @@ class Energy:
     def __str__(self) -> str:
         return "bounds the albedo by one, and loses {:.2g} in the mean, {:.2g} at most".format(*self.loss)
 
-    def places(
-        self, wi: mi.Vector3f, wo: mi.Vector3f, height_scale: mi.Float, lateral_scale: mi.Float | float
-    ) -> tuple[Place, Place]:
-        """Return the places of a pair of directions.
-
-        Args:
-            wi, wo: along the pattern's axes, each inside the medium that it is in, z < 0 below.
-            height_scale: of the heights at the point; of effect where there are tables for it.
-            lateral_scale: likewise.
-        """
-        places = self.place(wi), self.place(wo)
-        if self.edges is not None:
-            lateral_scale = dr.detach(lateral_scale)
-            ratio = dr.detach(height_scale) / lateral_scale
-            number = sum((dr.select(ratio > e, mi.UInt32(1), 0) for e in self.edges), mi.UInt32(0))
-            for place in places:
-                place.ratio, place.lateral = number, lateral_scale
-        return places
-
-    def factor(self, places: tuple[Place, Place], frequency: mi.Float) -> mi.Float:
+    def factor(self, places: tuple[Place, Place], frequency: mi.Float, ratio: mi.Float) -> mi.Float:
         """Return E of one wavelength; `frequency` is 1/λ in 1/µm, λ in the medium above."""
         there, back = places
+        if self.edges is not None:
+            number = sum((dr.select(dr.detach(ratio) > e, mi.UInt32(1), 0) for e in self.edges), mi.UInt32(0))
+            there, back = (dataclasses.replace(place, ratio=number) for place in places)
         passes = there.under != back.under
         return smaller(self.bound(there, frequency, passes), self.bound(back, frequency, passes))
 
-    def place(self, omega: mi.Vector3f) -> Place:
+    def coordinates(self, omega: mi.Vector3f) -> Place:
         """Return the place of ω, along the pattern's axes."""
         z = dr.abs(omega.z) if self.two_sided else larger(omega.z, 0)
         if self.layout.lines:

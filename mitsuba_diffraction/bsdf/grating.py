@@ -9,23 +9,17 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import RequestError
-from ..rigorous.spectrum import RigorousSpectrum
-from .energy import Place
-from .geometry import Geometry, Incidence, turned
+from .geometry import Geometry, Incidence, Interface, turned
 from .media import Media
-from .orders import OrderSpectrum
 from .polarisation import reflected, through_layer
-from .rigorous_orders import RigorousOrders
 from .scales import Scales, check_texture
-from .spline_spectrum import SplineSpectrum
-from .surface import surface_from, warn_of_range
+from .surface import surface_from
 from .tables import BELOW_ONE, larger, limited, opaque, smaller
-from .theories import RigorousTheory, ScalarTheory
-from .transmission import Crossing, CrossingIncidence
+from .theory import Scattering, theory_of
 
-# The share of samples that are uniform, for lobes that the sampler's averages miss; where both directions graze, K G
-# grows faster than samples that follow the cosine could bear.
-DEFENSIVE = 0.02
+# The probability of uniform samples, for lobes that the sampler's averages miss; where both directions graze, K G grows
+# faster than samples that follow the cosine could bear.
+UNIFORM_PROBABILITY = 0.02
 
 
 class Grating:
@@ -44,23 +38,24 @@ class Grating:
         self.coat = media.coat
         self.scales = Scales(props)
         self.spectrum, self.recipe = surface_from(props, media, self.scales.max_scale)
-        if isinstance(self.spectrum, RigorousSpectrum):
-            self.theory = RigorousTheory(props, self.spectrum, media)
-        else:
-            warn_of_range(self.spectrum)
-            self.theory = ScalarTheory(props, self.spectrum, media, self.scales)
+        self.theory = theory_of(props, self.spectrum, media, self.scales)
         angle = props.get("orientation", 0.0)
         if isinstance(angle, float) and not np.isfinite(angle):
             raise RequestError(f"orientation: got {angle}, wanted degrees or a texture")
         self.orientation = props.get_texture("orientation", 0.0)
         check_texture("orientation", self.orientation)
-        # The spectrum says nothing beyond its largest angle: there the grating is black.
-        self.least_cosine = opaque(np.cos(np.deg2rad(self.spectrum.largest_angle)) * (1 - 1e-6))
+        # The spectrum says nothing outside of its largest angle: there the grating is black.
+        self.min_cosine = opaque(np.cos(np.deg2rad(self.spectrum.largest_angle)) * (1 - 1e-6))
 
     @property
-    def scattering(self) -> OrderSpectrum | SplineSpectrum | RigorousOrders:
+    def scattering(self) -> Scattering:
         """K G S cos θ_o and its sampler."""
         return self.theory.scattering
+
+    @property
+    def interface(self) -> Interface:
+        """The media above and below, as the parameters are now."""
+        return self.theory.interface
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         callback.put("orientation", self.orientation, mi.ParamFlags.Differentiable)
@@ -72,7 +67,12 @@ class Grating:
 
     @dr.syntax
     def evaluate(
-        self, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool, wo_is_sample: bool, passing: mi.Float
+        self,
+        si: mi.SurfaceInteraction3f,
+        wo: mi.Vector3f,
+        active: mi.Bool,
+        wo_is_sample: bool,
+        transmission_probability: mi.Float,
     ) -> tuple[mi.UnpolarizedSpectrum, mi.Float]:
         """Evaluate f cos θ_o of light from ω_o, and the density of `sample`.
 
@@ -81,27 +81,25 @@ class Grating:
         Args:
             si: the point, with ω_i.
             wo: ω_o.
-            active: mask; both directions lie above the surface, or light passes it.
+            active: mask; both directions lie above the surface, or light is transmitted.
             wo_is_sample: whether ω_o was drawn, so that nearly always it lies in the lobe of an order.
-            passing: the share of samples on the other side.
+            transmission_probability: of samples.
         """
         sin, cos = self.frame(si, active)
         # From here on along the pattern's axes.
-        wi, wo, outside = turned(si.wi, sin, cos), turned(wo, sin, cos), mi.Frame3f.cos_theta(wo)
-        u, v, interface = -wi.x - wo.x, -wi.y - wo.y, self.theory.interface
-        side_share = mi.Float(1.0)
-        if interface is not None:
-            i, o = interface.side(wi), interface.side(wo)
-            u, v = -i.tangent - o.tangent
-            outside = dr.abs(outside) * dr.square(o.outside)
-            side_share = dr.select(i.sign == o.sign, 1 - passing, passing)
-        covered, count = self._covered(si)
+        wi, wo = turned(si.wi, sin, cos), turned(wo, sin, cos)
+        k_i, k_o = self.interface.wave_vector(wi), self.interface.wave_vector(wo)
+        u, v = -k_i.tangent - k_o.tangent
+        outside = dr.abs(mi.Frame3f.cos_theta(wo)) * dr.square(k_o.index)
+        of_side = dr.select(k_i.sign == k_o.sign, 1 - transmission_probability, transmission_probability)
+        covered, si = self._covered(si)
+        count = _count(covered)
         value, density = mi.UnpolarizedSpectrum(0.0), mi.Float(0.0)
         height_scale, lateral_scale = self.scales.at(si, active)
         near = mi.UInt32(0)
         for channel, seen in enumerate(covered):
             if self.scattering.resolved:
-                frequency = dr.rcp(self._wavelength(si, channel))
+                frequency = lateral_scale * dr.rcp(self._wavelength(si, channel))
                 seen &= self.scattering.meets(u * frequency, v * frequency, lateral_scale)
             near |= dr.select(active & seen, mi.UInt32(1 << channel), 0)
         # Most directions lie between the orders of a grating at all wavelengths: unless drawn, they skip what follows.
@@ -111,9 +109,9 @@ class Grating:
         if needed:
             value, density = diffracted(wi, wo, height_scale, lateral_scale)
         # The mean over the covered wavelengths: any of them may have chosen the direction.
-        uniform = _uniform_share(count)
+        uniform = _uniform_probability(count)
         density = (1 - uniform) * density * outside / larger(count, 1)
-        return value, side_share * dr.fma(uniform, dr.inv_two_pi, density)
+        return value, of_side * dr.fma(uniform, dr.inv_two_pi, density)
 
     def _wavelength(self, si: mi.SurfaceInteraction3f, channel: int) -> mi.Float:
         """Return λ in the medium above, µm."""
@@ -127,42 +125,35 @@ class Grating:
         wi: mi.Vector3f,
         wo: mi.Vector3f,
         height_scale: mi.Float,
-        lateral_scale: mi.Float | float,
+        lateral_scale: mi.Float,
     ) -> tuple[mi.UnpolarizedSpectrum, mi.Float]:
         """Return f cos θ_o, and the sum over the wavelengths of the densities; directions along the pattern's axes.
 
         `near` has a bit for each wavelength that is covered; where orders are resolved, only if ω_o lies in the lobe of
         one.
         """
-        interface, shadowing, energy = self.theory.interface, self.theory.shadowing, self.theory.energy
-        if interface is None:
-            geometry = Geometry.of(wi, wo, self.coat, height_scale, shadowing, lateral_scale)
-            incidence = Incidence.of(wi, height_scale, self.coat, lateral_scale)
-        else:
-            sides = interface.side(wi), interface.side(wo)
-            least = interface.least_kappa(height_scale)
-            geometry = Crossing.of(*sides, mi.Float(height_scale), shadowing, least, lateral_scale)
-            incidence = CrossingIncidence.of(*sides, interface, height_scale, geometry.flip, lateral_scale)
-        places = energy and energy.places(*geometry.inside(), geometry.height_scale, lateral_scale)
-        value, density = self._of_wavelengths(si, incidence, near, geometry, places)
-        # Directions beyond the largest angle are black, but they are drawn: they have a density.
-        within = smaller(*geometry.cosines()) >= self.least_cosine
-        value = dr.select(within, self.theory.times_reflectance(value, si, geometry, active), 0)
-        if interface is not None and interface.has_flat_face:
+        interface = self.interface
+        k_i, k_o = interface.wave_vector(wi), interface.wave_vector(wo)
+        geometry = Geometry.of(k_i, k_o, interface, height_scale, self.theory.shadowing)
+        incidence = Incidence.of(k_i, k_o, interface, height_scale, lateral_scale, geometry.flip)
+        pair = self.theory.coordinates(geometry)
+        value, density = self._of_wavelengths(si, incidence, near, geometry, pair, lateral_scale)
+        # Directions outside of the largest angle are black, but they are drawn: they have a density.
+        within = smaller(*geometry.cosines()) >= self.min_cosine
+        value = dr.select(within, value * self.theory.reflectance(si, geometry, active), 0)
+        if interface.has_flat_face:
             value *= interface.flat(wi) * interface.flat(wo)
-        if self.coat is not None:
-            # The solid angle inside the coat is smaller: cos θ'_o dω'_o = cos θ_o dω_o/n².
-            value *= wo.z / larger(geometry.cos_o, 1e-7)
         return value, density
 
     @dr.syntax
     def _of_wavelengths(
         self,
         si: mi.SurfaceInteraction3f,
-        incidence: Incidence | CrossingIncidence,
+        incidence: Incidence,
         near: mi.UInt32,
-        geometry: Geometry | Crossing,
-        places: tuple[Place, Place] | None,
+        geometry: Geometry,
+        pair: tuple | None,
+        lateral_scale: mi.Float,
     ) -> tuple[mi.UnpolarizedSpectrum, mi.Float]:
         """Return f cos θ_o without R of the wavelengths that `near` has, and the sum of their densities.
 
@@ -171,20 +162,21 @@ class Grating:
         """
         value, density = mi.UnpolarizedSpectrum(0.0), mi.Float(0.0)
         add_first = functools.partial(self._add_first, si, incidence)
-        if dr.hint(dr.grad_enabled(geometry), mode="scalar"):
+        if dr.hint(dr.grad_enabled(geometry, lateral_scale), mode="scalar"):
             for _ in range(len(value)):
-                near, value, density = add_first(geometry, places, near, value, density)
+                near, value, density = add_first(geometry, pair, lateral_scale, near, value, density)
         else:
             while near != 0:
-                near, value, density = add_first(geometry, places, near, value, density)
+                near, value, density = add_first(geometry, pair, lateral_scale, near, value, density)
         return value, density
 
     def _add_first(
         self,
         si: mi.SurfaceInteraction3f,
-        incidence: Incidence | CrossingIncidence,
-        geometry: Geometry | Crossing,
-        places: tuple[Place, Place] | None,
+        incidence: Incidence,
+        geometry: Geometry,
+        pair: tuple | None,
+        lateral_scale: mi.Float,
         near: mi.UInt32,
         value: mi.UnpolarizedSpectrum,
         density: mi.Float,
@@ -194,14 +186,12 @@ class Grating:
         chosen = [first == (1 << channel) for channel in range(len(value))]
         for channel in range(1, len(value)):
             wavelength = dr.select(chosen[channel], self._wavelength(si, channel), wavelength)
-        incidence = incidence.at(wavelength)
-        power, share = self.scattering.evaluate(geometry, incidence, near != 0)
-        if places is not None:
-            power *= self.theory.energy.factor(places, incidence.frequency * geometry.index)
+        incidence = incidence.at(wavelength / lateral_scale)
+        power, probability = self.theory.evaluate(geometry, incidence, pair, near != 0)
         square = dr.square(incidence.frequency)
         power *= square
         value += mi.UnpolarizedSpectrum([dr.select(c, power, 0) for c in chosen])
-        return near - first, value, dr.fma(share, square, density)
+        return near - first, value, dr.fma(probability, square, density)
 
     def mueller(
         self,
@@ -215,11 +205,12 @@ class Grating:
 
         Under a coat, after both passes through it, T_i T_o.
         """
-        directions, interface = (si.wi, wo), self.theory.interface
-        if interface is not None and not interface.is_sheet and ctx.mode == mi.TransportMode.Radiance:
+        _, si = self._covered(si)
+        directions, interface = (si.wi, wo), self.interface
+        if interface.transmits and not interface.is_sheet and ctx.mode == mi.TransportMode.Radiance:
             # Radiance is compressed along with the solid angle.
-            i, o = interface.side(si.wi), interface.side(wo)
-            value *= dr.square(i.outside / o.outside)
+            k_i, k_o = interface.wave_vector(si.wi), interface.wave_vector(wo)
+            value *= dr.square(k_i.index / k_o.index)
         if self.coat is None:
             if not mi.is_polarized:
                 return value
@@ -233,39 +224,48 @@ class Grating:
             value *= self.coat.transmittance(omega.z, refracted.z)
         return value
 
-    def _covered(self, si: mi.SurfaceInteraction3f) -> tuple[list[mi.Bool], mi.Float]:
-        """Return which of the wavelengths the spectrum covers, and how many: at the others the grating is black."""
-        index = 1 if isinstance(self.theory, RigorousTheory) and self.coat is None else self.theory.media.index
-        shortest, longest = (
-            w * index * d for w, d in zip(self.spectrum.wavelengths, (1 - 1e-6, 1 + 1e-6), strict=True)
-        )
-        covered = [(wavelength >= shortest) & (wavelength <= longest) for wavelength in si.wavelengths]
-        return covered, sum(dr.select(c, mi.Float(1), 0) for c in covered)
+    def _covered(self, si: mi.SurfaceInteraction3f) -> tuple[list[mi.Bool], mi.SurfaceInteraction3f]:
+        """Return which of the wavelengths are covered: at the others the grating is black.
+
+        And the point with the shortest wavelength instead of those, at which a metal may be no number.
+        """
+        limits = np.array(self.spectrum.wavelengths) * self.theory.covered_index
+        shortest, longest = np.clip(limits, *self.theory.material.wavelengths)
+        known = mi.SurfaceInteraction3f(si)
+        covered = [(w >= shortest * (1 - 1e-6)) & (w <= longest * (1 + 1e-6)) for w in si.wavelengths]
+        for channel, keep in enumerate(covered):
+            known.wavelengths[channel] = dr.select(keep, si.wavelengths[channel], shortest)
+        return covered, known
 
     def entering(self, si: mi.SurfaceInteraction3f, cos: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
         """Return 1 − R, times T of the coat, at the cosine of an angle outside."""
-        if self.coat is None:
-            return 1 - self.theory.material(si, cos, active)
-        inside = self.coat.cos_inside(cos)
-        return self.coat.transmittance(cos, inside) * (1 - self.theory.material(si, inside, active))
+        through = 1 - self.reflectance(si, cos, active)
+        return through if self.coat is None else self.coat.transmittance(cos, self.coat.cos_inside(cos)) * through
+
+    def reflectance(self, si: mi.SurfaceInteraction3f, cos: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
+        """Return R of a plane below the coat, at the cosine of an angle outside."""
+        _, si = self._covered(si)
+        return self.theory.material(si, cos if self.coat is None else self.coat.cos_inside(cos), active)
 
     def sample(
-        self, si: mi.SurfaceInteraction3f, u: mi.Float, v: mi.Point2f, active: mi.Bool, passing: mi.Float
+        self,
+        si: mi.SurfaceInteraction3f,
+        u: mi.Float,
+        v: mi.Point2f,
+        active: mi.Bool,
+        transmission_probability: mi.Float,
     ) -> mi.Vector3f:
-        """Draw a direction for one of the wavelengths; along the horizon (z = 0) where its order is evanescent.
-
-        The share `passing` of the samples lies on the other side.
-        """
-        covered, count = self._covered(si)
-        interface = self.theory.interface
-        if interface is not None:
-            u_side, passes = u, u < passing
-            u = dr.select(passes, u / larger(passing, 1e-7), (u - passing) / larger(1 - passing, 1e-7))
+        """Draw a direction for one of the wavelengths; along the horizon (z = 0) where its order is evanescent."""
+        covered, si = self._covered(si)
+        count = _count(covered)
+        interface, reflects = self.interface, mi.Bool(True)
+        if interface.transmits:
+            reflects, p = u >= transmission_probability, transmission_probability
+            u = dr.select(reflects, (u - p) / larger(1 - p, 1e-7), u / larger(p, 1e-7))
             u = limited(u, 0, BELOW_ONE)
-        share = _uniform_share(count)
-        # In scalar variants these are Python's, for which ~ is no negation.
-        uniform, diffracted = u < share, u >= share
-        u = (u - share) / larger(1 - share, DEFENSIVE)
+        uniform_probability = _uniform_probability(count)
+        uniform = u < uniform_probability
+        u = (u - uniform_probability) / larger(1 - uniform_probability, UNIFORM_PROBABILITY)
         # Only wavelengths that the spectrum covers draw directions.
         chosen = smaller(dr.floor(u * count), larger(count - 1, 0))
         rest = limited(u * count - chosen, 0, BELOW_ONE)
@@ -273,26 +273,18 @@ class Grating:
         for channel, use in enumerate(covered):
             wavelength = dr.select(use & (before == chosen), self._wavelength(si, channel), wavelength)
             before += dr.select(use, 1, 0)
-        wavelength = dr.detach(wavelength)
-        sin, cos = (dr.detach(x) for x in self.frame(si, active))
-        wi = turned(si.wi, sin, cos)
-        height_scale, lateral_scale = (dr.detach(s) for s in self.scales.at(si, active))
-        arguments = rest, v, active & diffracted
-        if interface is None:
-            incidence = Incidence.of(wi, height_scale, self.coat, lateral_scale).at(wavelength)
-            q, propagates = self.scattering.sample(incidence, *arguments)
-            x = -wavelength * (cos * q.x - sin * q.y) - si.wi.x
-            y = -wavelength * (sin * q.x + cos * q.y) - si.wi.y
-            z = dr.select(propagates, dr.safe_sqrt(1 - dr.square(x) - dr.square(y)), 0)
-            return dr.select(uniform, mi.warp.square_to_uniform_hemisphere(v), mi.Vector3f(x, y, z))
-        i = interface.side(wi)
-        o = interface.other(i, u_side >= passing)
-        incidence = CrossingIncidence.of(i, o, interface, height_scale, lateral_scale=lateral_scale).at(wavelength)
-        q, propagates = self.scattering.sample(incidence, *arguments)
-        wo = turned(mi.Vector3f(*(o.tangent - wavelength * incidence.mirrored * q), 0), -sin, cos) / o.outside
+        sin, cos = self.frame(si, active)
+        height_scale, lateral_scale = self.scales.at(si, active)
+        k_i = interface.wave_vector(turned(si.wi, sin, cos))
+        k_o = interface.scattered(k_i, reflects)
+        incidence = Incidence.of(k_i, k_o, interface, height_scale, lateral_scale)
+        incidence = incidence.at(dr.detach(wavelength / lateral_scale))
+        q, propagates = self.scattering.sample(incidence, rest, v, active & ~uniform)
+        tangent = k_o.tangent - incidence.wavelength * incidence.mirrored * q
+        wo = turned(mi.Vector3f(*tangent, 0), -sin, cos) / k_o.index
         wo.z = dr.select(propagates, dr.safe_sqrt(1 - dr.square(wo.x) - dr.square(wo.y)), 0)
         wo = dr.select(uniform, mi.warp.square_to_uniform_hemisphere(v), wo)
-        return dr.detach(mi.Vector3f(wo.x, wo.y, o.sign * wo.z))
+        return dr.detach(mi.Vector3f(wo.x, wo.y, k_o.sign * wo.z))
 
     def __str__(self) -> str:
         lines = [
@@ -307,6 +299,11 @@ class Grating:
         return "\n".join(lines)
 
 
-def _uniform_share(covered: mi.Float) -> mi.Float:
-    """Return the share of samples that are uniform: all of them where no wavelength is covered."""
-    return dr.select(covered > 0, mi.Float(DEFENSIVE), 1)
+def _count(covered: list[mi.Bool]) -> mi.Float:
+    """Return how many wavelengths are covered."""
+    return sum(dr.select(c, mi.Float(1), 0) for c in covered)
+
+
+def _uniform_probability(covered: mi.Float) -> mi.Float:
+    """Return the probability of uniform samples: one where no wavelength is covered."""
+    return dr.select(covered > 0, mi.Float(UNIFORM_PROBABILITY), 1)

@@ -1,4 +1,4 @@
-"""The layers of the material: the face of a coat, the grating, and its base; each gets a share of the samples."""
+"""The layers of the material: the face of a coat, the grating, and its base; each is sampled with a probability."""
 
 from __future__ import annotations
 
@@ -9,35 +9,34 @@ import mitsuba as mi
 
 from ..errors import RequestError
 from .base import base_from
-from .geometry import turned
+from .geometry import Interface, turned
 from .grating import Grating
 from .media import Media
 from .polarisation import of_plane, reflected
 from .tables import BELOW_ONE, smaller
-from .transmission import Interface
 
-LEAST_SHARE = 0.1  # of the samples, for the grating and for its base: what each reflects is only estimated
+MIN_PROBABILITY = 0.1  # of samples of the grating and of its base: what each reflects is only estimated
 
 
 @dataclass(frozen=True)
-class Asked:
-    """What a request is for.
+class Request:
+    """The components that a context requests.
 
     Attributes:
-        reflected, passed: light of the grating on its own side and on the other one.
+        reflection, transmission: of the grating.
         face: the coat's front face or the flat face of a sheet.
-        below: what it asks of the base.
+        base: the context for the base; None if it is not requested.
     """
 
-    reflected: bool
-    passed: bool
+    reflection: bool
+    transmission: bool
     face: bool
-    below: mi.BSDFContext | None
+    base: mi.BSDFContext | None
 
     @property
     def grating(self) -> bool:
-        """Whether it is for any light of the grating."""
-        return self.reflected or self.passed
+        """Whether any light of the grating is requested."""
+        return self.reflection or self.transmission
 
 
 class Layers:
@@ -47,8 +46,8 @@ class Layers:
         coat: or None.
         grating: component 0.
         base: or None; its components follow that of the grating.
-        components: the flags of all components: the grating, light that passes it, those of the base, and, as the last
-            one, the front face of a coat or the flat face of a sheet.
+        components: the flags of all components: reflection and transmission of the grating, those of the base, and, as
+            the last one, the front face of a coat or the flat face of a sheet.
     """
 
     def __init__(self, props: mi.Properties) -> None:
@@ -63,10 +62,10 @@ class Layers:
             flags = flags | mi.BSDFFlags.SpatiallyVarying
         self.components = [+flags, *(self.base.components if self.base is not None else [])]
         face = self.coat and mi.BSDFFlags.FrontSide
-        if self.interface is not None:
+        if self.interface.transmits:
             both = mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide
-            passes = (flags & ~+mi.BSDFFlags.GlossyReflection) | mi.BSDFFlags.GlossyTransmission | both
-            self.components = [+(flags | both), +passes]
+            transmission = (flags & ~+mi.BSDFFlags.GlossyReflection) | mi.BSDFFlags.GlossyTransmission | both
+            self.components = [+(flags | both), +transmission]
             if self.interface.has_flat_face:
                 face = mi.BSDFFlags.BackSide
             if not self.interface.is_sheet:
@@ -76,52 +75,56 @@ class Layers:
             self.components.append(mi.BSDFFlags.DeltaReflection | face)
 
     @property
-    def interface(self) -> Interface | None:
-        """The media where light passes, as the parameters are now."""
-        return self.grating.theory.interface
+    def interface(self) -> Interface:
+        """The media above and below the relief, as the parameters are now."""
+        return self.grating.interface
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         self.grating.traverse(callback)
         if self.base is not None:
             callback.put("base", self.base.bsdf, mi.ParamFlags.Differentiable)
 
-    def _asked(self, ctx: mi.BSDFContext) -> Asked:
-        return Asked(
+    def _request(self, ctx: mi.BSDFContext) -> Request:
+        return Request(
             ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0),
-            self.interface is not None and ctx.is_enabled(mi.BSDFFlags.GlossyTransmission, 1),
+            self.interface.transmits and ctx.is_enabled(mi.BSDFFlags.GlossyTransmission, 1),
             len(self.components) > self.face and ctx.is_enabled(mi.BSDFFlags.DeltaReflection, self.face),
             None if self.base is None else self.base.context(ctx),
         )
 
-    def _passing(self, si: mi.SurfaceInteraction3f, asked: Asked) -> mi.Float:
-        """Return the share of the grating's samples on the other side, about as much as is transmitted."""
-        if not asked.passed or not asked.reflected:
-            return mi.Float(1.0 if asked.passed else 0.0)
-        return dr.detach(self.interface.transmitted(turned(si.wi, *self.grating.frame(si, True))))
+    def _transmission_probability(self, si: mi.SurfaceInteraction3f, request: Request) -> mi.Float:
+        """Return the probability that a sample of the grating is transmitted, about the fraction of its light."""
+        if not request.transmission or not request.reflection:
+            return mi.Float(1.0 if request.transmission else 0.0)
+        return dr.detach(self.interface.transmission_probability(turned(si.wi, *self.grating.frame(si, True))))
 
-    def _share(
-        self, si: mi.SurfaceInteraction3f, asked: Asked, entering: mi.UnpolarizedSpectrum | None, active: mi.Bool
+    def _grating_probability(
+        self,
+        si: mi.SurfaceInteraction3f,
+        request: Request,
+        entering: mi.UnpolarizedSpectrum | None,
+        active: mi.Bool,
     ) -> mi.Float:
-        """Return the share of samples that the grating gets; that of the base is the rest. About as they reflect."""
-        if not asked.grating or asked.below is None:
-            return mi.Float(1.0 if asked.grating else 0.0)
+        """Return the probability of sampling the grating, the rest being that of the base: about as they reflect."""
+        if not request.grating or request.base is None:
+            return mi.Float(1.0 if request.grating else 0.0)
         entered = dr.mean(entering)
         reflected = 1 - entered
         returned = entered * self.base.albedo(si, active)
-        return dr.detach(dr.clip(reflected / (reflected + returned), LEAST_SHARE, 1 - LEAST_SHARE))
+        return dr.detach(dr.clip(reflected / (reflected + returned), MIN_PROBABILITY, 1 - MIN_PROBABILITY))
 
-    def _face_share(self, si: mi.SurfaceInteraction3f, asked: Asked, active: mi.Bool) -> mi.Float:
-        """Return the share of samples that a smooth face gets, about as it reflects beside all below."""
-        if not asked.face:
+    def _face_probability(self, si: mi.SurfaceInteraction3f, request: Request, active: mi.Bool) -> mi.Float:
+        """Return the probability of sampling a smooth face, about as it reflects beside all below."""
+        if not request.face:
             return mi.Float(0.0)
         cos = mi.Frame3f.cos_theta(si.wi)
-        rest = asked.grating or asked.below is not None
+        rest = request.grating or request.base is not None
         if self.coat is None:
             return dr.select(cos < 0, dr.detach(self._face(si)) if rest else mi.Float(1.0), 0)
         if not rest:
             return mi.Float(1.0)
-        reflected = self.grating.theory.material(si, self.coat.cos_inside(cos), active)
-        if asked.below is not None:
+        reflected = self.grating.reflectance(si, cos, active)
+        if request.base is not None:
             reflected += (1 - reflected) * self.base.albedo(si, active)
         return self.coat.share(cos, dr.mean(reflected))
 
@@ -129,10 +132,6 @@ class Layers:
         """Return F of the smooth face."""
         cos = mi.Frame3f.cos_theta(si.wi)
         return mi.fresnel(dr.abs(cos), self.interface.eta)[0] if self.coat is None else self.coat.reflectance(cos)
-
-    def _above(self, cos: mi.Float) -> mi.Bool:
-        """Return whether a direction is one from which light is scattered."""
-        return cos > 0 if self.interface is None else cos != 0
 
     def evaluate(
         self,
@@ -144,22 +143,22 @@ class Layers:
     ) -> tuple[mi.Spectrum, mi.Float]:
         """Evaluate f cos θ_o and the density, as `mi.BSDF.eval_pdf`; `wo_is_sample` as of `Grating.evaluate`."""
         cos_i, cos_o = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(wo)
-        asked = self._asked(ctx)
-        active = active & self._above(cos_i) & self._above(cos_o)
-        if asked.reflected != asked.passed and self.interface is not None:
-            active = active & ((cos_i * cos_o > 0) == asked.reflected)
+        request = self._request(ctx)
+        active = active & self.interface.is_incident(cos_i) & self.interface.is_incident(cos_o)
+        if request.reflection != request.transmission and self.interface.transmits:
+            active = active & ((cos_i * cos_o > 0) == request.reflection)
         value, pdf = mi.Spectrum(0.0), mi.Float(0.0)
-        if asked.grating:
-            passing = self._passing(si, asked)
-            of_grating, pdf = self.grating.evaluate(si, wo, active, wo_is_sample, passing)
+        if request.grating:
+            p_transmission = self._transmission_probability(si, request)
+            of_grating, pdf = self.grating.evaluate(si, wo, active, wo_is_sample, p_transmission)
             value = self.grating.mueller(of_grating, ctx, si, wo, active)
-        if asked.below is not None:
+        if request.base is not None:
             entering = self.grating.entering(si, cos_i, active)
-            share = self._share(si, asked, entering, active)
-            of_base, density = self.base.bsdf.eval_pdf(asked.below, si, wo, active)
+            p_grating = self._grating_probability(si, request, entering, active)
+            of_base, density = self.base.bsdf.eval_pdf(request.base, si, wo, active)
             value += _attenuated(entering * self.grating.entering(si, cos_o, active), of_base)
-            pdf = share * pdf + (1 - share) * density
-        pdf *= 1 - self._face_share(si, asked, active)
+            pdf = p_grating * pdf + (1 - p_grating) * density
+        pdf *= 1 - self._face_probability(si, request, active)
         return dr.select(active, value, 0), dr.select(active, pdf, 0)
 
     def sample(
@@ -171,26 +170,24 @@ class Layers:
         active: mi.Bool,
     ) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
         """Draw a direction, as `mi.BSDF.sample`."""
-        active = active & self._above(mi.Frame3f.cos_theta(si.wi))
-        asked = self._asked(ctx)
+        active = active & self.interface.is_incident(mi.Frame3f.cos_theta(si.wi))
+        request = self._request(ctx)
         bs, result = dr.zeros(mi.BSDFSample3f), mi.Spectrum(0.0)
         bs.eta = 1.0
-        face_share = self._face_share(si, asked, active)
-        of_face = active & (sample1 < face_share)
-        if asked.grating or asked.below is not None:
+        p_face = self._face_probability(si, request, active)
+        of_face = active & (sample1 < p_face)
+        if request.grating or request.base is not None:
             # From behind and along the horizon the face reflects all; Python's numbers cannot be divided by zero.
-            below_face = dr.select(face_share < 1, 1 - face_share, 1)
-            rest = smaller((sample1 - face_share) / below_face, BELOW_ONE)
-            bs, result = self._sample_below(
-                ctx, si, asked, 1 - face_share, rest, sample2, active & (sample1 >= face_share)
-            )
-        if asked.face:
+            below_face = dr.select(p_face < 1, 1 - p_face, 1)
+            rest = smaller((sample1 - p_face) / below_face, BELOW_ONE)
+            bs, result = self._sample_below(ctx, si, request, 1 - p_face, rest, sample2, active & (sample1 >= p_face))
+        if request.face:
             bs.wo = dr.select(of_face, mi.reflect(si.wi), bs.wo)
-            bs.pdf = dr.select(of_face, face_share, bs.pdf)
+            bs.pdf = dr.select(of_face, p_face, bs.pdf)
             bs.eta = dr.select(of_face, 1, bs.eta)
             bs.sampled_type = dr.select(of_face, mi.UInt32(+mi.BSDFFlags.DeltaReflection), bs.sampled_type)
             bs.sampled_component = dr.select(of_face, self.face, bs.sampled_component)
-            mirrored = self._mirrored(si, ctx) / dr.select(of_face, face_share, 1)
+            mirrored = self._mirrored(si, ctx) / dr.select(of_face, p_face, 1)
             result = dr.select(of_face, mirrored, result)
         return bs, result
 
@@ -207,32 +204,34 @@ class Layers:
         self,
         ctx: mi.BSDFContext,
         si: mi.SurfaceInteraction3f,
-        asked: Asked,
+        request: Request,
         part: mi.Float,
         sample1: mi.Float,
         sample2: mi.Point2f,
         active: mi.Bool,
     ) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
-        """Draw a direction from the grating or its base, which get `part` of all samples."""
-        cos_i, below = mi.Frame3f.cos_theta(si.wi), asked.below
+        """Draw a direction from the grating or its base, which are sampled with the probability `part`."""
+        cos_i, below = mi.Frame3f.cos_theta(si.wi), request.base
         bs = dr.zeros(mi.BSDFSample3f)
         bs.eta = 1.0
         bs.sampled_type = mi.UInt32(+mi.BSDFFlags.GlossyReflection)
         entering = self.grating.entering(si, cos_i, active) if below is not None else None
-        share = self._share(si, asked, entering, active)
-        of_base = active & (sample1 >= share)
-        if asked.grating:
-            passing = self._passing(si, asked)
-            bs.wo = self.grating.sample(si, sample1 / share, sample2, active & (sample1 < share), passing)
-        if asked.passed:
-            passes = bs.wo.z * cos_i < 0
-            bs.sampled_type = dr.select(passes, mi.UInt32(+mi.BSDFFlags.GlossyTransmission), bs.sampled_type)
-            bs.sampled_component = dr.select(passes, mi.UInt32(1), 0)
+        p_grating = self._grating_probability(si, request, entering, active)
+        of_base = active & (sample1 >= p_grating)
+        if request.grating:
+            p_transmission = self._transmission_probability(si, request)
+            bs.wo = self.grating.sample(
+                si, sample1 / p_grating, sample2, active & (sample1 < p_grating), p_transmission
+            )
+        if request.transmission:
+            transmitted = bs.wo.z * cos_i < 0
+            bs.sampled_type = dr.select(transmitted, mi.UInt32(+mi.BSDFFlags.GlossyTransmission), bs.sampled_type)
+            bs.sampled_component = dr.select(transmitted, mi.UInt32(1), 0)
             if not self.interface.is_sheet:
                 eta = dr.detach(self.interface.eta)
-                bs.eta = dr.select(passes, dr.select(cos_i > 0, eta, dr.rcp(eta)), 1)
+                bs.eta = dr.select(transmitted, dr.select(cos_i > 0, eta, dr.rcp(eta)), 1)
         if below is not None:
-            rest = smaller((sample1 - share) / (1 - share), BELOW_ONE)
+            rest = smaller((sample1 - p_grating) / (1 - p_grating), BELOW_ONE)
             below_sample, weight = self.base.bsdf.sample(below, si, rest, sample2, of_base)
             bs.wo = dr.select(of_base, below_sample.wo, bs.wo)
             bs.sampled_type = dr.select(of_base, below_sample.sampled_type, bs.sampled_type)
@@ -244,7 +243,7 @@ class Layers:
         if below is not None and self.base.has_delta:
             mirror = of_base & mi.has_flag(below_sample.sampled_type, mi.BSDFFlags.Delta)
             cos_o = mi.Frame3f.cos_theta(below_sample.wo)
-            own = part * (1 - share)
+            own = part * (1 - p_grating)
             through = entering * self.grating.entering(si, cos_o, mirror) / own
             above = cos_o > 0
             bs.pdf = dr.select(mirror, dr.select(above, own * below_sample.pdf, 0), bs.pdf)

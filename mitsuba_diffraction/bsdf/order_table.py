@@ -24,10 +24,9 @@ from ..energy.furnace import Furnace
 from ..energy.table import Layout, bounds_of, frequencies_of
 from ..geometry import fresnel
 from ..grating_spectrum import GratingSpectrum
-from .geometry import cell_of, on_square
+from .geometry import Incidence, cell_of, on_square
 from .inversion import search
 from .tables import NumberTable, PacketTable, larger, opaque
-from .transmission import CrossingIncidence
 
 WHOLE = 2**24  # a float32 holds whole numbers up to here
 FLOOR = 0.02  # the share of each cell that all its orders have alike
@@ -171,25 +170,21 @@ class OrderTable:
         last = np.clip(np.floor(last.max(1)), -self.max_order, self.max_order).astype(np.int64)
         return first + self.max_order, last - first + 1
 
-    def _cell(
-        self, incidence: CrossingIncidence, active: mi.Bool
-    ) -> tuple[mi.UInt32, mi.Int32, mi.Int32, mi.Int32, mi.Int32]:
+    def _cell(self, incidence: Incidence, active: mi.Bool) -> tuple[mi.UInt32, mi.Int32, mi.Int32, mi.Int32, mi.Int32]:
         """Return where the sums of a cell begin, its first order along x and y, and its columns and rows."""
         max_x, max_y = map(int, self.max_order)
-        wi, per_index = incidence.wi, dr.rcp(incidence.index)
         slices, side = self.counts
-        column, row = _direction(mi.Vector3f(wi.x * per_index, wi.y * per_index, wi.z), side)
-        slice_, _ = cell_of((incidence.lateral_frequency - self.first) * self.per_slice, slices)
+        tangent = incidence.tangent / incidence.index
+        column, row = _direction(mi.Vector3f(*tangent, dr.safe_sqrt(1 - dr.squared_norm(tangent))), side)
+        slice_, _ = cell_of((incidence.frequency - self.first) * self.per_slice, slices)
         way = dr.select(incidence.above, mi.UInt32(0), 2) + dr.select(incidence.reflects, mi.UInt32(0), 1)
         if self.edges:
-            # Heights in units of the lateral scale.
-            height_scale = dr.rcp(dr.two_pi * incidence.per_kappa * incidence.lateral_frequency)
-            way += sum(dr.select(height_scale > edge, mi.UInt32(4), 0) for edge in self.edges)
+            way += sum(dr.select(incidence.height_scale > edge, mi.UInt32(4), 0) for edge in self.edges)
         cell = ((way * mi.UInt32(slices) + slice_) * mi.UInt32(side) + row) * mi.UInt32(side) + column
         start, x, y, size = self.cells(cell, active)
         return start, mi.Int32(x) - max_x, mi.Int32(y) - max_y, mi.Int32(size & 0xFFFF), mi.Int32(size >> 16)
 
-    def share(self, m_x: mi.Int32, m_y: mi.Int32, incidence: CrossingIncidence, active: mi.Bool) -> mi.Float:
+    def share(self, m_x: mi.Int32, m_y: mi.Int32, incidence: Incidence, active: mi.Bool) -> mi.Float:
         """Return P_m for one wavelength."""
         start, first_x, first_y, columns, rows = self._cell(incidence, active)
         column, row = m_x - first_x, m_y - first_y
@@ -198,7 +193,7 @@ class OrderTable:
         return (self.before(order + 1, active) - self.before(order, active)) * (1 / WHOLE)
 
     def sample(
-        self, incidence: CrossingIncidence, u: mi.Float, v: mi.Point2f, active: mi.Bool
+        self, incidence: Incidence, u: mi.Float, v: mi.Point2f, active: mi.Bool
     ) -> tuple[mi.Int32, mi.Int32, mi.Point2f]:
         """Draw an order for one wavelength, as `orders.OrderSampler`, from `u` alone."""
         start, first_x, first_y, columns, rows = self._cell(incidence, active)

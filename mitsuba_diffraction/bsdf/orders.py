@@ -79,7 +79,7 @@ class SlicePower:
         self.row = -(-self.columns // square) * square**2  # nodes of a row of squares
         self.nodes = -(-self.rows // square) * self.row
         values = self._arranged(values)
-        words = table.words_per_node if dr.is_jit_v(mi.Float) else 4
+        words = table.words_per_node
         scale = 1.0
         if words == 1:
             mantissas, exponents = shared_exponents(values)
@@ -144,7 +144,7 @@ class SlicePower:
             packet = dr.fma(weight, line, packet)
         return dr.dot(packet, factors)
 
-    def at(self, kappa: mi.Float, small: Small | None = None) -> tuple[mi.UInt32, mi.Vector3f | mi.Vector4f]:
+    def at(self, kappa: mi.Float, small: Small) -> tuple[mi.UInt32, mi.Vector3f | mi.Vector4f]:
         """Return the index of node 0 at κ (rad/µm), and the factors of the numbers of a packet.
 
         `small` as of `small_kappa`; κ₁ is at most half of the first interval.
@@ -152,9 +152,8 @@ class SlicePower:
         x = kappa * self.per_kappa
         interval = dr.minimum(mi.UInt32(x), self.intervals - 1)
         factors = self._factors(2 * (x - mi.Float(interval)) - 1)
-        if small is not None:
-            first, second = (self._factors(2 * n * small[0] * self.per_kappa - 1) for n in (1, 2))
-            factors = small_kappa(kappa, small, factors, first, second)
+        first, second = (self._factors(2 * n * small[0] * self.per_kappa - 1) for n in (1, 2))
+        factors = small_kappa(kappa, small, factors, first, second)
         return interval * self.nodes, factors
 
     def _factors(self, t: mi.Float) -> mi.Vector3f | mi.Vector4f:
@@ -198,8 +197,7 @@ class OrderSampler:
         """Return the first row, the end of the rows, the first column, the end of the columns."""
         if not self.restricted:
             return mi.Int32(0), mi.Int32(self.rows), mi.Int32(0), mi.Int32(self.columns)
-        frequency = incidence.lateral_frequency
-        s_x, s_y = incidence.wi.x * frequency, incidence.wi.y * frequency
+        s_x, s_y = incidence.tangent * incidence.frequency
         rows = self._interval(s_y, s_x, self.columns, incidence.radius, self.tile_y, self.max_order_y)
         columns = self._interval(s_x, s_y, self.rows, incidence.radius, self.tile_x, self.max_order_x)
         return *rows, *columns
@@ -354,7 +352,7 @@ class LineSampler:
     def _interval(self, incidence: Incidence) -> tuple[mi.Int32, mi.Int32]:
         """Return the first cell in which something propagates, and the end of them."""
         frequency = incidence.frequency
-        along, across = (s * frequency for s in self._axes(incidence.wi.x, incidence.wi.y))
+        along, across = (s * frequency for s in self._axes(*incidence.tangent))
         half = dr.safe_sqrt(dr.square(incidence.radius) - dr.square(larger(dr.abs(across) - self.half_width, 0)))
         first = mi.Int32(dr.floor(dr.fma(-along - half, self.per_q, 0.5)))
         end = mi.Int32(dr.ceil(dr.fma(half - along, self.per_q, 0.5)))
@@ -368,7 +366,7 @@ class LineSampler:
     def _across(self, along: mi.Float, incidence: Incidence) -> tuple[mi.Float, mi.Float]:
         """Return F(a) and F(b)."""
         frequency = incidence.frequency
-        s_along, s_across = (s * frequency for s in self._axes(incidence.wi.x, incidence.wi.y))
+        s_along, s_across = (s * frequency for s in self._axes(*incidence.tangent))
         half = dr.safe_sqrt(dr.square(incidence.radius) - dr.square(along + s_along))
         low, high = (_cumulative((end - s_across) * self.per_scale) for end in (-half, half))
         return limited(low, -self.limit, self.limit), limited(high, -self.limit, self.limit)
@@ -392,7 +390,7 @@ class OrderSpectrum:
     P_m of `OrderSampler` or, where light passes, of an `OrderTable`; where orders overlap, that of `CellSampler`. For a
     line grating whose orders overlap or are wide, it is that of `LineSampler`.
 
-    With a lateral scale s, resolved orders lie at m/(sT), with lobes as wide: tables are read at sq.
+    Lobes of resolved orders may be scaled.
     """
 
     def __init__(self, spectrum: GratingSpectrum, most: float | None = None, farthest: float = 1.0) -> None:
@@ -425,9 +423,8 @@ class OrderSpectrum:
         return min(scales, default=np.inf) if self.resolved else None
 
     def meets(self, q_x: mi.Float, q_y: mi.Float, scale: mi.Float | float) -> mi.Bool:
-        """Return whether q (cycles/µm) lies in the lobe of an order, where they are resolved; `scale` is lateral."""
+        """Return whether q (cycles/µm) lies in the lobe of an order, where they are resolved; `scale` is of lobes."""
         along_x, along_y = self.axes
-        q_x, q_y = q_x * scale, q_y * scale
         return along_x.holds(along_x.first(q_x), q_x, scale) & along_y.holds(along_y.first(q_y), q_y, scale)
 
     def evaluate(
@@ -445,16 +442,16 @@ class OrderSpectrum:
             incidence: the wavelength and where it comes from.
             active: mask; where orders are resolved, q lies in the lobe of one (`meets`).
         """
-        # Of lengths along the surface; one where orders overlap.
-        scale = geometry.lateral_scale
-        q = geometry.tangent * (incidence.frequency * scale)
+        scale = incidence.lobe_scale
+        q = geometry.tangent * incidence.frequency
+        per_width = incidence.frequency / scale * self.per_width
         m_x, m_y = (axis.first(q) for axis, q in zip(self.axes, q, strict=True))
         lobes_x, lobes_y = self.axes[0].lobes(m_x, q.x, scale), self.axes[1].lobes(m_y, q.y, scale)
         mirrored, factor = incidence.mirrored, 1
         # `windows`: orders that are read at one κ, by first column and row, lobes, κ.
         if self.resolved:
-            tangent = self._tangent(m_x, m_y, incidence.wavelength / scale)
-            factor = geometry.order_factor(tangent, incidence, self.per_width)
+            tangent = self._tangent(m_x, m_y, incidence.wavelength)
+            factor = geometry.order_factor(tangent, incidence, per_width)
             windows = [(0, 0, lobes_x, lobes_y, geometry.order_kappa(tangent, incidence))]
             share = self.orders.share(mi.Int32(mirrored) * m_x, mi.Int32(mirrored) * m_y, incidence, active)
             # An order that does not propagate is not drawn.
@@ -466,10 +463,10 @@ class OrderSpectrum:
                 windows = []
                 for x, y in np.ndindex(len(lobes_x), len(lobes_y)):
                     tangent = self._tangent(m_x + x, m_y + y, incidence.wavelength)
-                    lobe = geometry.order_factor(tangent, incidence, self.per_width) * lobes_x[x]
+                    lobe = geometry.order_factor(tangent, incidence, per_width) * lobes_x[x]
                     windows.append((x, y, [lobe], [lobes_y[y]], geometry.order_kappa(tangent, incidence)))
             else:
-                factor = geometry.continuum_factor(incidence, self.per_width)
+                factor = geometry.continuum_factor(incidence, per_width)
                 windows = [(0, 0, lobes_x, lobes_y, geometry.kappa(incidence.frequency))]
         row, column = (m + (axis.max_order + axis.rim) for m, axis in zip((m_y, m_x), self.axes[::-1], strict=True))
         power = 0
@@ -480,7 +477,7 @@ class OrderSpectrum:
         return dr.select(active, larger(power, 0), 0), density
 
     def _tangent(self, m_x: mi.Int32, m_y: mi.Int32, wavelength: mi.Float) -> mi.Vector2f:
-        """Return λq of an order; `wavelength` is λ over the lateral scale."""
+        """Return λq of an order."""
         along_x, along_y = self.axes
         return mi.Vector2f(mi.Float(m_x) * along_x.pitch, mi.Float(m_y) * along_y.pitch) * wavelength
 
@@ -495,8 +492,8 @@ class OrderSpectrum:
         if self.cells is not None:
             return self.cells.sample(incidence, u, v, active), active
         m_x, m_y, v = self.orders.sample(incidence, u, v, active)
-        scale = incidence.lateral_scale
-        tangent = self._tangent(m_x, m_y, incidence.wavelength / scale)
+        tangent = self._tangent(m_x, m_y, incidence.wavelength)
+        scale = incidence.lobe_scale
         q = mi.Point2f(self.axes[0].place(m_x, v.x, scale), self.axes[1].place(m_y, v.y, scale))
         return q, incidence.propagates(tangent)
 
@@ -523,20 +520,20 @@ class _Axis:
         return mi.Int32(-self.max_order) if self.all else mi.Int32(dr.ceil(q * self.size - 0.5 * self.count))
 
     def holds(self, m: mi.Int32, q: mi.Float, scale: mi.Float | float) -> mi.Bool:
-        """Return whether there is an order m, and q, times the lateral scale, lies in its lobe."""
+        """Return whether there is an order m, and q lies in its lobe; `scale` is of lobes."""
         offset = dr.fma(-self.pitch, mi.Float(m), q)
         return (dr.abs(m) <= self.max_order) & (dr.abs(offset) <= self.half_width * scale)
 
     def lobes(self, first: mi.Int32, q: mi.Float, scale: mi.Float | float = 1.0) -> list[mi.Float]:
-        """Return N(q − m/T; σ_q²) of each of these orders, µm; zero beyond the half width.
+        """Return N(q − m/T; s² σ_q²) of each of these orders, µm; zero outside of the half width.
 
-        With a lateral scale s, `q` is s times the frequency, and there is one order: N(q/s − m/(sT); σ_q²).
+        s is the scale of the lobe; one where there are several orders.
         """
         offset = dr.fma(-self.pitch, mi.Float(first), q) / scale
         if self.all:
             offsets = [dr.fma(-self.pitch, step, offset) for step in range(self.count)]
             return [self.peak * dr.exp(self.falloff * dr.square(offset)) for offset in offsets]
-        lobe = self.peak * dr.exp(self.falloff * dr.square(offset))
+        lobe = self.peak / scale * dr.exp(self.falloff * dr.square(offset))
         if self.count == 1:
             return [dr.select(dr.abs(offset) <= self.half_width, lobe, 0)]
         # exp(−(x − k/T)²/2σ²) = exp(−x²/2σ²) exp(x/Tσ²)^k exp(−k²/2T²σ²): an exponential for all together.
@@ -547,5 +544,5 @@ class _Axis:
         return lobes
 
     def place(self, m: mi.Int32, u: mi.Float, scale: mi.Float | float) -> mi.Float:
-        """Return the q in the lobe of an order with the share `u` of it below, cycles/µm."""
-        return dr.fma(self.pitch / scale, mi.Float(m), truncated_gaussian(u, self.inside, self.spread))
+        """Return the q in the lobe of an order with the fraction `u` of it below, cycles/µm; `scale` is of the lobe."""
+        return dr.fma(self.pitch, mi.Float(m), scale * truncated_gaussian(u, self.inside, self.spread))

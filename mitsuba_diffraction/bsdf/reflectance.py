@@ -47,7 +47,7 @@ def reflectance_from(props: mi.Properties, coat: Coat | None) -> PerfectMirror |
 class PerfectMirror:
     """R = 1."""
 
-    transparent = False
+    transparent, wavelengths = False, (0.0, np.inf)
 
     def __init__(self, name: str = "none (R = 1)") -> None:
         self.name = name
@@ -71,7 +71,7 @@ class PerfectMirror:
 class Dielectric:
     """A dielectric of relative index η, seen from outside; no absorption, no dispersion (as Mitsuba's `dielectric`)."""
 
-    transparent = True
+    transparent, wavelengths = True, (0.0, np.inf)
 
     def __init__(self, int_ior: float | str, ext_ior: float | str, model: str) -> None:
         self.eta = mi.Float(absolute_index("int_ior", int_ior) / absolute_index("ext_ior", ext_ior))
@@ -101,7 +101,7 @@ class Dielectric:
 class Conductor:
     """A metal of complex index η + ik, by the names of Mitsuba's `conductor`; under a coat, relative to its index."""
 
-    transparent = False
+    transparent, wavelengths = False, VISIBLE
 
     def __init__(self, material: str, model: str, outside: float) -> None:
         data = Path(str(mi.file_resolver().resolve("data/ior/Al.eta.spd"))).parent

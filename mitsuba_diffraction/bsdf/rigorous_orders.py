@@ -18,7 +18,6 @@ from .geometry import Geometry, Incidence, cell_of
 from .inversion import search, truncated_gaussian
 from .order_table import WHOLE
 from .tables import NumberTable, PacketTable, larger, limited, opaque, smaller
-from .transmission import Crossing, CrossingIncidence
 
 CELLS = 8  # of the sampler to each unit of P and R
 CELLS_BOTH = 4  # where light passes, too
@@ -128,9 +127,7 @@ class RigorousOrders:
             there = active & (dr.abs(offset) <= self.half_width) & (dr.abs(m) <= self.max_order)
             yield m, dr.square(offset) + dr.square(pair.q_y), there
 
-    def evaluate(
-        self, geometry: Geometry | Crossing, incidence: Incidence | CrossingIncidence, active: mi.Bool
-    ) -> tuple[mi.Float, mi.Float]:
+    def evaluate(self, geometry: Geometry, incidence: Incidence, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
         """Return n_o² cos θ_o Σ_m η_m N and the density of q, both in µm², for one wavelength.
 
         The lobe of each order keeps its power at the horizon (`Geometry.of_order`).
@@ -141,12 +138,10 @@ class RigorousOrders:
             active: mask; q lies in the lobe of an order (`meets`).
         """
         frequency = incidence.frequency
-        if self.transmits:
-            i, o = geometry.i, geometry.o
-            pair = self._pair(i.tangent, o.tangent, frequency, (i.sign > 0, o.sign > 0))
-        else:
-            # Its tables are those inside of a coat.
-            pair = self._pair(*geometry.inside(), geometry.index * frequency, None)
+        # Under a coat tables are those inside of it.
+        k_i, k_o, index = geometry.incident, geometry.outgoing, geometry.coat_index
+        above = (k_i.sign > 0, k_o.sign > 0) if self.transmits else None
+        pair = self._pair(k_i.tangent / index, k_o.tangent / index, index * frequency, above)
         cell = self._cell(incidence)
         power, density = mi.Float(0.0), mi.Float(0.0)
         for m, square, there in self._near(pair, active):
@@ -157,7 +152,7 @@ class RigorousOrders:
             # An order that does not propagate is not drawn.
             there &= incidence.propagates(tangent)
             density += dr.select(there, lobe, 0) * self.orders(mi.UInt32(dr.select(there, cell + m, 0)), there).y
-        return power * (geometry.outgoing if self.transmits else geometry.cos_o), density / WHOLE
+        return power * geometry.factor, density / WHOLE
 
     def _pair(
         self,
@@ -230,9 +225,7 @@ class RigorousOrders:
         back = [mi.Vector4f(*(float(REVERSED[i] * REVERSED[j]) * rows[j][i] for j in range(4))) for i in range(4)]
         return [dr.select(place.back, other, row) for row, other in zip(rows, back, strict=True)]
 
-    def sample(
-        self, incidence: Incidence | CrossingIncidence, u: mi.Float, v: mi.Point2f, active: mi.Bool
-    ) -> tuple[mi.Point2f, mi.Bool]:
+    def sample(self, incidence: Incidence, u: mi.Float, v: mi.Point2f, active: mi.Bool) -> tuple[mi.Point2f, mi.Bool]:
         """Draw q in cycles/µm, for one wavelength, and tell whether the order of q propagates.
 
         The order comes from `u`, its place in the lobe from `v`.
@@ -303,20 +296,18 @@ class RigorousOrders:
         row = dr.select(active, start + channels[0] * count + channels[1], 0)
         return _Place(active, back, row, nodes)
 
-    def _cell(self, incidence: Incidence | CrossingIncidence) -> mi.Int32:
+    def _cell(self, incidence: Incidence) -> mi.Int32:
         """Where order 0 of the sampler's cell stands in its table."""
         # Tangential components are the same inside of a coat.
-        along, across = (self.period * incidence.frequency * s for s in (incidence.wi.x, incidence.wi.y))
-        frequency = incidence.index * incidence.frequency
-        g = dr.safe_sqrt(dr.square(self.period * frequency) - dr.square(across))
+        along, across = self.period * incidence.frequency * incidence.tangent
+        frequency = incidence.coat_index * incidence.frequency
+        g = dr.safe_sqrt(dr.square(self.period * incidence.index * frequency) - dr.square(across))
         p, r = (
             dr.clip(mi.Int32(self.cells * _position(larger(x, 0))), 0, self.cells_across - 1)
             for x in (g - along, g + along)
         )
-        if self.transmits:
-            # In the medium of ω_i.
-            g, frequency = g / incidence.index, incidence.frequency
-        z = dr.clip(mi.Int32(self._z(g, frequency) * self.sampler_planes), 0, self.sampler_planes - 1)
+        # λ is that above, g that of the medium of ω_i.
+        z = dr.clip(mi.Int32(self._z(g / incidence.index, frequency) * self.sampler_planes), 0, self.sampler_planes - 1)
         if self.transmits:
             side = dr.select(incidence.above, 0, 2 * self.sampler_planes)
             z += side + dr.select(incidence.reflects, 0, self.sampler_planes)

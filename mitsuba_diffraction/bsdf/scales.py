@@ -71,8 +71,6 @@ class Scale:
         parameters = mi.traverse(self.value)
         if "data" not in parameters:
             return not any(key.endswith("data") for key in parameters.keys())  # noqa: SIM118 (not a dict)
-        if not dr.is_jit_v(mi.Float):
-            return False
         # Between the centres of texels.
         rows, columns = parameters["data"].shape[:2]
         v, u = ((x.ravel() + 0.75) / n for x, n in zip(np.mgrid[:rows, :columns], (rows, columns), strict=True))
@@ -127,9 +125,17 @@ class Scales:
         """By how much shorter wavelengths the spectrum must reach than without scales."""
         return max(1.0, *(float(scale.values[-1]) for scale in self))
 
-    def at(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> tuple[mi.Float, mi.Float | float]:
-        """Evaluate the height scale and the lateral one at a point."""
-        return self.height.at(si, active), 1.0 if self.lateral is None else self.lateral.at(si, active)
+    def at(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
+        """Return h/s and s at a point, h of the heights and s of lengths along the surface.
+
+        Scaling lengths by s and heights by h is equivalent to scaling heights by h/s, at the wavelength λ/s and with
+        lobes of the width s σ_q: nothing else knows of scales.
+        """
+        height = self.height.at(si, active)
+        if self.lateral is None:
+            return height, mi.Float(1.0)
+        lateral = self.lateral.at(si, active)
+        return height / lateral, lateral
 
     @property
     def vary(self) -> bool:

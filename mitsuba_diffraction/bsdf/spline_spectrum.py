@@ -53,7 +53,11 @@ class SplineSpectrum:
         )
         inside = active & (dr.abs(q.x) <= self.limit_x) & (dr.abs(q.y) <= self.limit_y)
         # Interpolation may dip below zero by its error.
-        power = larger(power, 0) * self.per_area * geometry.continuum_factor(incidence, self.per_width)
+        power = (
+            larger(power, 0)
+            * self.per_area
+            * geometry.continuum_factor(incidence, incidence.frequency * self.per_width)
+        )
         return dr.select(inside, power, 0), self.cells.density(incidence.mirrored * q, incidence, active)
 
     def sample(

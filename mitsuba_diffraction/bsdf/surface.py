@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import inspect
-import logging
 import weakref
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +11,6 @@ from pathlib import Path
 import mitsuba as mi
 
 from ..errors import RequestError
-from ..grating_spectrum import GratingSpectrum
 from ..precomputation import Spectrum, load_spectrum
 from ..progress import progress_bar
 from ..recipe import Recipe
@@ -20,12 +18,10 @@ from ..rigorous.spectrum import RigorousSpectrum
 from ..settings import THEORIES, VISIBLE, Settings, wavelengths_inside
 from ..surface.gratings import COHERENCE_LENGTHS, PROFILES
 from .media import Media
-from .theories import check_transmission, refuse_scalar_only, settings_from, settings_of_medium
+from .theory import check_transmission, refuse_scalar_only, settings_from, settings_of_medium
 
-_log = logging.getLogger(__name__)
 _per_cent = functools.partial(progress_bar, unit="%")
 _PREFIX = "handed over: "
-_warned: set[str] = set()  # warnings, each of which is given once
 _handed_over: weakref.WeakValueDictionary[str, Spectrum] = weakref.WeakValueDictionary()
 
 
@@ -70,14 +66,6 @@ def surface_from(props: mi.Properties, media: Media, scale: float = 1.0) -> tupl
         settings |= {"theory": theory, **settings_from(props, media.coat)}
     recipe = _inside(props, media, scale, Recipe(surface, Settings(**settings)))
     return recipe.cached(_per_cent), recipe
-
-
-def warn_of_range(spectrum: GratingSpectrum) -> None:
-    """Say in Mitsuba's log, once for each surface, if scalar theory is not to be trusted there."""
-    message = f"diffraction_grating, {spectrum.source}: {spectrum.warning}"
-    if spectrum.warning and message not in _warned:
-        _warned.add(message)
-        _log.warning("%s", message)
 
 
 def _inside(props: mi.Properties, media: Media, scale: float, recipe: Recipe) -> Recipe:

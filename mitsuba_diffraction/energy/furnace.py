@@ -236,7 +236,7 @@ class Furnace:
             least = self.least_kappa / max(self.height_scale, 1e-9) * length / (2 * np.pi)
             return transmitted(cos_i, cos_o, tangent, self.index or 1.0, least)
         square = tangent + (cos_i + cos_o) ** 2
-        value = k_g(cos_i, cos_o, square / 2)
+        value = k_g(cos_i, cos_o, tangent)
         if not self.by_order:
             width = length * self.spectrum.lobe_width
             b = mirrored(tangent / width**2, cos_i, cos_o)

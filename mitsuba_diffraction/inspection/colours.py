@@ -69,8 +69,7 @@ def radiance(
     along = np.deg2rad(direction)
     vector = lateral_scale * q[..., None] * np.array([np.cos(along), np.sin(along)])
     density = lateral_scale**2 * spectrum.evaluate(vector, height_scale * kappa)
-    # The light comes from −θ_i.
-    factor = k_g(cos_i, cos_o, 1 + np.cos(theta_i + theta_o)[..., None])
+    factor = k_g(cos_i, cos_o, (q * wavelengths) ** 2)
     return illumination() * factor * density / wavelengths**2 * cos_i
 
 

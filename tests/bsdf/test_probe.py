@@ -6,7 +6,6 @@ import pytest
 from bsdf_support import floats, random_directions, use, vectors
 
 from mitsuba_diffraction import testing
-from mitsuba_diffraction.bsdf.geometry import Geometry
 from mitsuba_diffraction.evaluation.validation.lobes import k_g_between
 
 COPPER = {"type": "roughconductor", "material": "Cu", "alpha": 0.3}
@@ -14,7 +13,7 @@ WAVELENGTHS = np.array([400.0, 450.0, 500.0, 550.0, 600.0, 650.0])
 DIRECTIONS = random_directions(np.random.default_rng(1), 5, 0.2)
 
 
-@pytest.mark.parametrize("variant", ["llvm_ad_spectral", "scalar_spectral", "llvm_ad_spectral_polarized"])
+@pytest.mark.parametrize("variant", ["llvm_ad_spectral", "llvm_ad_spectral_polarized"])
 def test_values_are_those_of_single_calls(variant):
     use(variant)
     bsdf, wi = mi.load_dict(COPPER), testing.direction(30, 20)
@@ -53,7 +52,9 @@ def test_shapes_that_do_not_fit_are_refused(llvm):
 
 
 @pytest.mark.parametrize("shadowing", [True, False])
-def test_k_g_is_that_of_the_bsdf(llvm, shadowing):
+def test_k_g_is_that_of_stam_and_of_torrance_and_sparrow(shadowing):
     wi, wo = (random_directions(np.random.default_rng(seed), 200, 0.01) for seed in (1, 2))
-    found = np.array(Geometry.of(testing.vectors(wi), testing.vectors(wo), shadowing=shadowing).k_g())
-    np.testing.assert_allclose(k_g_between(wi, wo, shadowing), found, rtol=1e-4)
+    d, w = 1 + (wi * wo).sum(-1), wi[:, 2] + wo[:, 2]
+    k = d**2 / (wi[:, 2] * wo[:, 2] * w**2)
+    g = np.minimum(1, 2 * w * np.minimum(wi[:, 2], wo[:, 2]) / d) if shadowing else 1
+    np.testing.assert_allclose(k_g_between(wi, wo, shadowing), k * g, rtol=1e-9)

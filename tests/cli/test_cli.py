@@ -107,9 +107,10 @@ def files():
         ("render scene.xml --width 0", "--width"),
         ("render scene.xml --seed -1", "--seed"),
         ("render scene.xml --variant scalar_rgb", "scalar_rgb"),
+        ("render scene.xml --variant scalar_spectral", "is scalar"),
         ("render scene.xml --variant scalar_rgbx", "unknown"),
-        ("render scene.xml --variant scalar_spectral --spp 1 -D spectrum=gone.exr", "gone.exr"),
-        ("render scene.xml --variant scalar_spectral --spp 1 -D spectre=blaze.toml", "spectre"),
+        ("render scene.xml --spp 1 -D spectrum=gone.exr", "gone.exr"),
+        ("render scene.xml --spp 1 -D spectre=blaze.toml", "spectre"),
     ],
 )
 def test_a_mistake_is_one_line_and_exit_code_2(command, arguments, words):
@@ -150,7 +151,7 @@ def test_a_spectrum_cut_short_is_one_line(command):
     command("precompute", "blaze.toml")
     content = Path("blaze.exr").read_bytes()
     Path("blaze.exr").write_bytes(content[: len(content) * 3 // 4])
-    code, out, err = command("render scene.xml --variant scalar_spectral --spp 1 -D spectrum=blaze.exr")
+    code, out, err = command("render scene.xml --spp 1 -D spectrum=blaze.exr")
     assert (code, out) == (2, "")
     assert len(err.splitlines()) == 1, err
     assert "blaze.exr" in err
@@ -357,13 +358,13 @@ def test_a_bug_is_reported_as_such(command, monkeypatch):
 
 def test_a_bug_inside_a_plugin_is_not_blamed_on_the_scene(command, monkeypatch):
     Path("scene.xml").write_text(SCENE)
-    monkeypatch.setattr("mitsuba_diffraction.bsdf.theories.reflectance_from", broadcast)
-    code, _, err = command("render scene.xml --variant scalar_spectral --spp 1 -o out.exr")
+    monkeypatch.setattr("mitsuba_diffraction.bsdf.theory.reflectance_from", broadcast)
+    code, _, err = command("render scene.xml --spp 1 -o out.exr")
     assert code == 1
     assert len(err.splitlines()) == 1, err
     assert err.startswith(f"{BUG}ValueError: ")
     assert BROADCAST.strip() in err
-    code, _, err = command("--debug render scene.xml --variant scalar_spectral --spp 1 -o out.exr")
+    code, _, err = command("--debug render scene.xml --spp 1 -o out.exr")
     assert code == 1
     assert "in broadcast" in err
 
@@ -371,7 +372,7 @@ def test_a_bug_inside_a_plugin_is_not_blamed_on_the_scene(command, monkeypatch):
 def test_a_bug_while_rendering_is_reported_as_such(command, monkeypatch):
     Path("scene.xml").write_text(SCENE)
     monkeypatch.setattr("mitsuba_diffraction.render.film.trace_with_mitsubas_film", broadcast)
-    code, out, err = command("render scene.xml --variant scalar_spectral --spp 1 -o out.exr")
+    code, out, err = command("render scene.xml --spp 1 -o out.exr")
     assert (code, out) == (1, "")
     assert err.startswith(f"{BUG}ValueError: ")
 
@@ -502,7 +503,7 @@ def test_benchmark_refuses_a_tolerance_before_it_measures(command):
 def test_an_interrupt_inside_a_plugin_is_not_blamed_on_the_scene(command):
     """Mitsuba makes a RuntimeError of whatever a constructor raises."""
 
-    mi.set_variant("scalar_spectral")
+    mi.set_variant("llvm_ad_spectral")
 
     class Pressing(mi.BSDF):
         def __init__(self, props):
@@ -515,7 +516,7 @@ def test_an_interrupt_inside_a_plugin_is_not_blamed_on_the_scene(command):
     mi.register_bsdf("pressing", Pressing)
     Path("scene.xml").write_text(SCENE.replace("diffraction_grating", "pressing"))
     before = signal.getsignal(signal.SIGINT)
-    code, out, err = command("render scene.xml --variant scalar_spectral --spp 1")
+    code, out, err = command("render scene.xml --spp 1")
     assert (code, out) == (130, "")
     assert err.strip() == "mitsuba-diffraction: interrupted: nothing was written"
     assert signal.getsignal(signal.SIGINT) is before

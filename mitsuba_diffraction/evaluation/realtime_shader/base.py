@@ -12,9 +12,9 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...bsdf.geometry import Geometry
-from ...bsdf.tables import PacketTable, opaque
+from ...bsdf.tables import PacketTable, larger, opaque
 from ...errors import RequestError
+from ...geometry import k_g
 from ...settings import SUN_COHERENCE_LENGTH, lobe_width
 from ...surface.heightfield import HeightField
 from .quirks import Quirks
@@ -43,7 +43,7 @@ class Gain:
 
         C = F(ω_i·h)/F(1) · (1 + ω_i·ω_o)²/((cos θ_i + cos θ_o)² cos θ_o),
 
-    which is K cos θ_i of the BRDF (`bsdf/geometry.py`), and G = min(1, 2(n·h)(n·ω_o)/(ω_o·h), 2(n·h)(n·ω_i)/(ω_o·h))
+    which is K cos θ_i of the BRDF (`geometry.py`), and G = min(1, 2(n·h)(n·ω_o)/(ω_o·h), 2(n·h)(n·ω_i)/(ω_o·h))
     (Torrance and Sparrow 1967).
 
     Attributes:
@@ -53,12 +53,14 @@ class Gain:
     """
 
     def __init__(self, wi: mi.Vector3f, wo: mi.Vector3f, shadowing: bool, active: mi.Bool) -> None:
-        # K and G are symmetric: exchanging the directions turns K G cos θ_o into K G cos θ_i.
-        geometry = Geometry.of(wo, wi, shadowing=shadowing)
-        self.active = active & (geometry.cos_i > 0) & (geometry.cos_o > 0)
-        self.falloff = schlick_falloff(geometry.cos_half())
-        self.factor = dr.select(self.active, geometry.k_g() * geometry.cos_o, 0)
-        (self.u, self.v), self.w = geometry.tangent, geometry.w
+        self.active = active & (wi.z > 0) & (wo.z > 0)
+        cos_i, cos_o = larger(wi.z, 1e-7), larger(wo.z, 1e-7)
+        self.u, self.v, self.w = -wi - wo
+        square = dr.square(self.u) + dr.square(self.v)
+        self.falloff = schlick_falloff(0.5 * dr.sqrt(square + dr.square(self.w)))
+        self.factor = dr.select(
+            self.active, k_g(cos_i, cos_o, square, shadowing=shadowing, select=dr.select) * cos_i, 0
+        )
 
 
 class SpectralWeights:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import drjit as dr
 import mitsuba as mi
 
 from ...bsdf.base import contains_grating, is_grating, nested
 from ...bsdf.geometry import turned
 from ...bsdf.layers import Layers
-from ...bsdf.theories import RigorousTheory
 from ...errors import RequestError
+from ...rigorous.spectrum import RigorousSpectrum
 from ...surface.heightfield import HeightField
 
 
@@ -31,7 +30,7 @@ class Surface:
 
     def is_of(self, bsdf: mi.BSDF) -> mi.Bool:
         """Return whether a point has the BSDF of this surface."""
-        return bsdf == mi.BSDFPtr(self.bsdf) if dr.is_jit_v(mi.Float) else mi.Bool(bsdf is self.bsdf)
+        return bsdf == mi.BSDFPtr(self.bsdf)
 
     def holds(self, bsdf: mi.BSDF, wo: mi.Vector3f) -> mi.Bool:
         """Return whether a point with this BSDF, seen from ω_o, lies on this side of this surface."""
@@ -63,7 +62,7 @@ def surfaces_of(scene: mi.Scene) -> list[Surface]:
                 f"diffraction_shader: a diffraction_grating stands inside {bsdf.class_name()}, wanted on a shape or "
                 "inside twosided"
             )
-    if any(isinstance(surface.layers.grating.theory, RigorousTheory) for surface in found):
+    if any(isinstance(surface.layers.grating.spectrum, RigorousSpectrum) for surface in found):
         raise RequestError("diffraction_shader: got a grating with theory=rigorous, wanted one of scalar theory")
     return found
 

@@ -50,7 +50,7 @@ def spectrum_of(height_field: HeightField, **settings: Any) -> GratingSpectrum:
 def k_g_between(wi: ArrayLike, wo: ArrayLike, shadowing: bool = True) -> Array:
     """Compute K G of unit vectors (..., 3) in the upper hemisphere; shapes broadcast."""
     wi, wo = np.asarray(wi, np.float64), np.asarray(wo, np.float64)
-    return k_g(wi[..., 2], wo[..., 2], ((wi + wo) ** 2).sum(axis=-1) / 2, shadowing)
+    return k_g(wi[..., 2], wo[..., 2], ((wi + wo)[..., :2] ** 2).sum(axis=-1), shadowing=shadowing)
 
 
 def towards(wi: Array, q: ArrayLike, wavelength: float) -> Array:

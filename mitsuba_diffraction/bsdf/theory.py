@@ -1,8 +1,10 @@
-"""What each theory adds to the powers of orders: parameters, material, the factors R and E, polarisation."""
+"""The two theories of diffraction, and what the BSDF asks of either: value, density, samples, R, polarisation."""
 
 from __future__ import annotations
 
 import dataclasses
+import logging
+from typing import Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -12,19 +14,22 @@ from ..energy.furnace import small_kappas
 from ..errors import RequestError
 from ..geometry import SHADOWING
 from ..grating_spectrum import GratingSpectrum
+from ..precomputation import Spectrum
 from ..rigorous.spectrum import RigorousSpectrum
 from ..settings import VISIBLE
 from .coat import SAME_INDEX, Coat
-from .geometry import Geometry, turned
+from .energy import Place
+from .geometry import Geometry, Incidence, Interface, turned
 from .media import Media
 from .order_table import CHANGE
 from .polarisation import Split, of_interface, of_orders, of_plane, unpolarised
-from .reflectance import Conductor, PerfectMirror, reflectance_from
+from .reflectance import Conductor, Dielectric, PerfectMirror, reflectance_from
 from .scales import Scales
 from .shared import SharedTables
 from .tables import opaque
-from .transmission import Interface
 
+_log = logging.getLogger(__name__)
+_warned: set[str] = set()  # warnings, each of which is given once
 _SCALAR_ONLY = {
     "height_scale": "build the spectrum of the other depth",
     "lateral_scale": "build the spectrum of the other period",
@@ -58,6 +63,107 @@ def settings_of_medium(media: Media) -> dict[str, str | float | bool]:
     return {**medium, "polarised": True} if mi.is_polarized else medium
 
 
+def _warn_of_range(spectrum: GratingSpectrum) -> None:
+    """Say in Mitsuba's log, once for each surface, if scalar theory is not to be trusted there."""
+    message = f"diffraction_grating, {spectrum.source}: {spectrum.warning}"
+    if spectrum.warning and message not in _warned:
+        _warned.add(message)
+        _log.warning("%s", message)
+
+
+class Scattering(Protocol):
+    """The powers of orders or of a continuum, and the density from which q is drawn.
+
+    Attributes:
+        resolved: whether orders do not overlap, so that most directions lie in the lobe of none.
+    """
+
+    resolved: bool
+
+    def meets(self, q_x: mi.Float, q_y: mi.Float, scale: mi.Float) -> mi.Bool:
+        """Return whether q (cycles/µm) lies in the lobe of an order, if they are resolved; `scale` is of lobes."""
+
+    def evaluate(self, geometry: Geometry, incidence: Incidence, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
+        """Return n_o² K G S |cos θ_o|, or n_o² Σ_m η_m N |cos θ_o|, and the density of q, both in µm².
+
+        For one wavelength of a pair of directions; where orders are resolved, q lies in the lobe of one.
+        """
+
+    def sample(self, incidence: Incidence, u: mi.Float, v: mi.Point2f, active: mi.Bool) -> tuple[mi.Point2f, mi.Bool]:
+        """Draw q in cycles/µm for one wavelength, and tell whether its order propagates."""
+
+
+class Theory(Protocol):
+    """What a theory of diffraction provides.
+
+    Attributes:
+        scattering: the powers, and their sampler.
+        material: R of a plane.
+        interface: the media above and below.
+        shadowing: whether G is a factor.
+        covered_index: n by which wavelengths outside are divided where the spectrum covers them.
+    """
+
+    @property
+    def scattering(self) -> Scattering: ...
+
+    @property
+    def material(self) -> PerfectMirror | Dielectric | Conductor: ...
+
+    @property
+    def interface(self) -> Interface: ...
+
+    @property
+    def shadowing(self) -> bool: ...
+
+    @property
+    def covered_index(self) -> float: ...
+
+    def traverse(self, callback: mi.TraversalCallback) -> None:
+        """Show the parameters of the theory and of its material."""
+
+    def parameters_changed(self, keys: list[str]) -> None:
+        """Recompute what depends on the parameters `keys`; on all of them if none is named."""
+
+    def coordinates(self, geometry: Geometry) -> tuple[Place, Place] | None:
+        """Return what `evaluate` needs of a pair of directions at all wavelengths."""
+
+    def evaluate(
+        self, geometry: Geometry, incidence: Incidence, pair: tuple[Place, Place] | None, active: mi.Bool
+    ) -> tuple[mi.Float, mi.Float]:
+        """Return f |cos θ_o| λ² without R, and the density of q, both in µm², for one wavelength.
+
+        Args:
+            geometry: of the pair of directions.
+            incidence: the wavelength of the light from ω_i.
+            pair: from `coordinates`.
+            active: mask; where orders are resolved, q lies in the lobe of one.
+        """
+
+    def reflectance(self, si: mi.SurfaceInteraction3f, geometry: Geometry, active: mi.Bool) -> mi.UnpolarizedSpectrum:
+        """Return R at the half vector, or 1 − R of transmitted light; one where it is part of the efficiencies."""
+
+    def split(
+        self,
+        value: mi.UnpolarizedSpectrum,
+        si: mi.SurfaceInteraction3f,
+        frame: tuple[mi.Float, mi.Float],
+        active: mi.Bool,
+    ) -> Split:
+        """Return how the grating splits `value` into s and p."""
+
+
+def theory_of(props: mi.Properties, spectrum: Spectrum, media: Media, scales: Scales) -> Theory:
+    """Return the theory that a spectrum is of.
+
+    Raises:
+        ValueError: if a parameter is wrong, or does not fit the spectrum.
+    """
+    if isinstance(spectrum, RigorousSpectrum):
+        return RigorousTheory(props, spectrum, media)
+    return ScalarTheory(props, spectrum, media, scales)
+
+
 class ScalarTheory:
     """f cos θ_o = R · K · G · S(q; κ)/λ² · E cos θ_o.
 
@@ -68,10 +174,11 @@ class ScalarTheory:
         scales: of heights and of lengths along the surface.
         shadowing: whether G is a factor.
         energy: E, or None where it is one.
-        interface: the media on both sides where light passes, else None.
+        interface: the media above and below.
     """
 
     def __init__(self, props: mi.Properties, spectrum: GratingSpectrum, media: Media, scales: Scales) -> None:
+        _warn_of_range(spectrum)
         self.spectrum, self.media, self.scales = spectrum, media, scales
         self.material = reflectance_from(props, media.coat)
         if media.eta is not None and self.material.model == "schlick":
@@ -112,16 +219,21 @@ class ScalarTheory:
             self.energy = self.tables.scaled_energy(*scales.ratios()) if scales.vary else of_number(scales.height.value)
         self.interface = self._interface()
 
-    def _interface(self) -> Interface | None:
-        """Return the media on both sides, with orders drawn for the scales and the index as they are."""
+    @property
+    def covered_index(self) -> float:
+        """n by which wavelengths are divided where the spectrum covers them."""
+        return self.media.index
+
+    def _interface(self) -> Interface:
+        """Return the media above and below, with orders drawn for the scales and the index as they are."""
         if self.media.eta is None:
-            return None
+            return Interface(1.0 if self.media.coat is None else self.media.coat.eta)
         kappas = tuple(opaque(kappa) for kappa in small_kappas(self.spectrum, self.media.eta))
         is_sheet = self.media.transmission == "sheet"
         share, orders = None, self.tables.order_table(is_sheet, self.scales)
         if orders is not None:
             self.scattering, share = self.tables.scattering.drawn_from(orders), orders.transmitted
-        return Interface(self.material.eta, is_sheet, kappas, share)
+        return Interface(eta=self.material.eta, is_sheet=is_sheet, kappas=kappas, fraction=share)
 
     def parameters_changed(self, keys: list[str]) -> None:
         """Recompute what depends on the parameters `keys`; on all of them if none is named."""
@@ -150,14 +262,26 @@ class ScalarTheory:
             scale.put(callback)
         self.material.traverse(callback)
 
-    def times_reflectance(
-        self, value: mi.UnpolarizedSpectrum, si: mi.SurfaceInteraction3f, geometry: Geometry, active: mi.Bool
-    ) -> mi.UnpolarizedSpectrum:
-        """Return `value` times R."""
+    def coordinates(self, geometry: Geometry) -> tuple[Place, Place] | None:
+        """Return those of both directions in the table of E."""
+        if self.energy is None:
+            return None
+        return tuple(self.energy.coordinates(k.inner()) for k in (geometry.incident, geometry.outgoing))
+
+    def evaluate(
+        self, geometry: Geometry, incidence: Incidence, pair: tuple[Place, Place] | None, active: mi.Bool
+    ) -> tuple[mi.Float, mi.Float]:
+        """Return K G S E n_o² |cos θ_o| and the density of q."""
+        power, density = self.scattering.evaluate(geometry, incidence, active)
+        if pair is not None:
+            frequency = incidence.frequency * geometry.coat_index
+            power *= self.energy.factor(pair, frequency, geometry.height_scale)
+        return power, density
+
+    def reflectance(self, si: mi.SurfaceInteraction3f, geometry: Geometry, active: mi.Bool) -> mi.UnpolarizedSpectrum:
+        """Return R at the half vector, or 1 − R."""
         reflected = self.material(si, geometry.cos_half(), active)
-        if self.media.eta is not None:
-            reflected = dr.select(geometry.reflects, reflected, 1 - reflected)
-        return value * reflected
+        return dr.select(geometry.reflects, reflected, 1 - reflected)
 
     def split(
         self,
@@ -188,10 +312,10 @@ class RigorousTheory:
     Attributes:
         scattering: Σ_m η_m N n_o² cos θ_o and its sampler.
         material: R = 1 beside the efficiencies.
-        interface: the media on both sides where light passes, else None.
+        interface: the media above and below.
     """
 
-    shadowing, energy = True, None  # of no effect: they are in the efficiencies
+    shadowing = True  # of no effect: it is in the efficiencies
 
     def __init__(self, props: mi.Properties, spectrum: RigorousSpectrum, media: Media) -> None:
         self.media, coat = media, media.coat
@@ -200,9 +324,11 @@ class RigorousTheory:
         check_transmission(spectrum.transmission, media)
         self.material = check_parameters(props, spectrum, coat)
         self.scattering = SharedTables.of(spectrum).scattering
-        self.interface = None
-        if media.eta is not None:
-            self.interface = Interface(opaque(spectrum.int_ior.real), media.transmission == "sheet")
+        if media.eta is None:
+            self.interface = Interface(1.0 if coat is None else coat.eta)
+        else:
+            self.interface = Interface(eta=opaque(spectrum.int_ior.real), is_sheet=media.transmission == "sheet")
+        self.covered_index = 1 if coat is None else media.index
 
     def parameters_changed(self, keys: list[str]) -> None:
         """Do nothing: a table of efficiencies has no parameters."""
@@ -210,11 +336,18 @@ class RigorousTheory:
     def traverse(self, callback: mi.TraversalCallback) -> None:
         """Show no parameters."""
 
-    def times_reflectance(
-        self, value: mi.UnpolarizedSpectrum, si: mi.SurfaceInteraction3f, geometry: Geometry, active: mi.Bool
-    ) -> mi.UnpolarizedSpectrum:
-        """Return `value`."""
-        return value
+    def coordinates(self, geometry: Geometry) -> None:
+        """Return None: nothing is needed."""
+
+    def evaluate(
+        self, geometry: Geometry, incidence: Incidence, pair: None, active: mi.Bool
+    ) -> tuple[mi.Float, mi.Float]:
+        """Return n_o² Σ_m η_m N |cos θ_o| and the density of q."""
+        return self.scattering.evaluate(geometry, incidence, active)
+
+    def reflectance(self, si: mi.SurfaceInteraction3f, geometry: Geometry, active: mi.Bool) -> mi.UnpolarizedSpectrum:
+        """Return one."""
+        return mi.UnpolarizedSpectrum(1.0)
 
     def split(
         self,
@@ -229,10 +362,11 @@ class RigorousTheory:
 
         def entries(channel: int, source: mi.Vector3f, exit_: mi.Vector3f) -> list[list[mi.Float]]:
             frequency = relative / si.wavelengths[channel]
+            # Under a coat both are directions inside of it, and so is the wavelength.
             pair, above = [turned(omega, sin, cos) for omega in (source, exit_)], None
-            if self.interface is not None:
-                sides = [self.interface.side(omega) for omega in pair]
-                pair, above = [side.tangent for side in sides], [side.sign > 0 for side in sides]
+            if self.interface.transmits:
+                vectors = [self.interface.wave_vector(omega) for omega in pair]
+                pair, above = [k.tangent for k in vectors], [k.sign > 0 for k in vectors]
             return self.scattering.mueller(*pair, frequency, active, above)
 
         return of_orders(value, entries, mi.Vector3f(-sin, cos, 0))
