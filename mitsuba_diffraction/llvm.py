@@ -90,32 +90,38 @@ def _wheel_library() -> str | None:
     return None
 
 
-def is_spectral(name: str) -> bool:
-    """Return whether a variant is spectral, e.g. ``llvm_ad_spectral`` or ``scalar_spectral_polarized``."""
-    return "spectral" in name.split("_")
+def is_supported(name: str | None) -> bool:
+    """Return whether a variant is spectral and compiles kernels: ``llvm_ad_spectral``, ``cuda_ad_spectral_polarized``.
+
+    Scalar variants would run the plugin's Python code for each sample, a thousand times slower.
+    """
+    parts = (name or "").split("_")
+    return "spectral" in parts and "scalar" not in parts
 
 
 def choose_variant(requested: str | None = None) -> str:
     """Choose the variant to render with: the requested one, or ``cuda_ad_spectral`` with a GPU, else LLVM's.
 
     Raises:
-        ValueError: ``requested`` is not a spectral variant.
+        ValueError: ``requested`` is not a spectral variant, or a scalar one.
         RuntimeError: the variant cannot run on this machine; the message names what to install.
     """
     import drjit as dr
     import mitsuba as mi
 
-    available = [name for name in mi.variants() if is_spectral(name)]
+    available = [name for name in mi.variants() if is_supported(name)]
     has_gpu = dr.has_backend(dr.JitBackend.CUDA)
     if requested is None:
         if has_gpu and "cuda_ad_spectral" in available:
             return "cuda_ad_spectral"
         if message := problem():
-            raise RuntimeError(f"{message}. `--variant scalar_spectral` works without it, much more slowly")
+            raise RuntimeError(message)
         return "llvm_ad_spectral"
 
     if requested not in available:
-        reason = "is not spectral" if requested in mi.variants() else "is unknown"
+        reason = "is unknown"
+        if requested in mi.variants():
+            reason = "is scalar" if "spectral" in requested else "is not spectral"
         raise RequestError(f"variant {requested!r} {reason}; use one of {', '.join(available)}")
     if requested.startswith("cuda") and not has_gpu:
         raise RuntimeError(f"variant {requested!r} needs an NVIDIA GPU with a recent driver, and Dr.Jit found none")

@@ -16,7 +16,7 @@ import mitsuba as mi
 from . import llvm
 from .bsdf.surface import hand_over
 from .errors import Bug, root_cause
-from .llvm import is_spectral
+from .llvm import is_supported
 
 # Name, registration function of Mitsuba, and the module whose `define` makes the class for the current variant.
 PLUGINS = (
@@ -31,10 +31,11 @@ def register(variant: str) -> None:
     for name, function, module in PLUGINS:
         define = importlib.import_module(f".{module}", __package__).define
         reason = None
-        if not is_spectral(variant):
+        if not is_supported(variant):
+            lacks = "vectorised kernels" if "spectral" in variant else "the wavelength of light"
             reason = (
-                f"{name} needs the wavelength of light, which the variant {variant} does not have: use a spectral "
-                "variant, such as llvm_ad_spectral, cuda_ad_spectral or scalar_spectral"
+                f"{name} needs {lacks}, which the variant {variant} does not have: use llvm_ad_spectral, "
+                "cuda_ad_spectral or their polarised forms"
             )
         elif variant.startswith("llvm"):
             reason = llvm.problem()

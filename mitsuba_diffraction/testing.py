@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from .bsdf.tables import aligned
 from .errors import RequestError
+from .llvm import is_supported
 
 Array = NDArray[np.float64]
 
@@ -30,19 +31,16 @@ def towards(wi: Array, q: ArrayLike, wavelength: ArrayLike) -> Array:
 
 
 def vectors(omega: ArrayLike) -> mi.Vector3f:
-    """Convert (n, 3) or (3,) to vectors of Mitsuba; n = 1 in scalar variants."""
+    """Convert (n, 3) or (3,) to vectors of Mitsuba."""
     return _components(mi.Vector3f, omega)
 
 
 def floats(values: ArrayLike) -> mi.Float:
-    """Convert (n,) or a number to floats of Mitsuba; n = 1 in scalar variants.
+    """Convert (n,) or a number to floats of Mitsuba.
 
     The copy is neither a literal nor NumPy's own memory, so that the next call reuses the kernel.
     """
-    values = np.atleast_1d(np.asarray(values, np.float32))
-    if not dr.is_jit_v(mi.Float):
-        return float(values[0])
-    result = mi.Float(aligned(values))
+    result = mi.Float(aligned(np.atleast_1d(np.asarray(values, np.float32))))
     dr.make_opaque(result)
     return result
 
@@ -60,7 +58,7 @@ def interaction(wi: ArrayLike, wavelengths: ArrayLike, uv: ArrayLike = (0.0, 0.0
     """Return points of the plane z = 0, with tangents along x and y.
 
     Args:
-        wi: ω_i, (n, 3) or (3,); n = 1 in scalar variants.
+        wi: ω_i, (n, 3) or (3,).
         wavelengths: (n, c) or (c,) in nm, c as many as a ray of the variant has.
         uv: (n, 2) or (2,).
     """
@@ -87,7 +85,7 @@ def evaluate_pdf(
     As many wavelengths are evaluated at once as a ray has (four); the last group is filled up by repetition.
 
     Args:
-        bsdf: of the current variant, which is a spectral one.
+        bsdf: of the current variant.
         wi, wo: ω_i and ω_o, (..., 3) along dp_du, dp_dv and the normal.
         wavelengths: (..., c) in nm.
         context: the components of the BSDF; all by default.
@@ -106,7 +104,7 @@ def evaluate_pdf(
             f"wi, wo, wavelengths: got shapes {wi.shape}, {wo.shape}, {wavelengths.shape}, "
             "wanted (..., 3), (..., 3), (..., c)"
         )
-    if not mi.variant() or not mi.is_spectral:
+    if not is_supported(mi.variant()):
         raise RequestError(f"variant: Mitsuba's is {mi.variant()}, wanted a spectral one such as llvm_ad_spectral")
     shape = np.broadcast_shapes(wi.shape[:-1], wo.shape[:-1], wavelengths.shape[:-1])
     count, channels = wavelengths.shape[-1], _channels()
@@ -117,17 +115,9 @@ def evaluate_pdf(
         for values, size in ((wi, 3), (wo, 3), (uv, 2))
     )
     context = context or mi.BSDFContext()
-    if dr.is_jit_v(mi.Float):
-        value, pdf = bsdf.eval_pdf(context, interaction(wi, wavelengths, uv), vectors(wo))
-        dr.eval(value, pdf)  # in one kernel
-        value, pdf = _spectrum(value, len(wo)), array(pdf, np.float64)
-    else:
-        found = [
-            bsdf.eval_pdf(context, interaction(one, nanometres, place), vectors(other))
-            for one, other, nanometres, place in zip(wi, wo, wavelengths, uv, strict=True)
-        ]
-        value = np.concatenate([_spectrum(value, 1) for value, _ in found])
-        pdf = np.array([pdf for _, pdf in found], np.float64)
+    value, pdf = bsdf.eval_pdf(context, interaction(wi, wavelengths, uv), vectors(wo))
+    dr.eval(value, pdf)  # in one kernel
+    value, pdf = _spectrum(value, len(wo)), array(pdf, np.float64)
     value = value.reshape(*shape, groups.size)[..., :count]
     return value, np.broadcast_to(pdf, len(wo)).reshape(*shape, len(groups))
 
@@ -145,7 +135,7 @@ def sample(
     context: mi.BSDFContext | None = None,
     uv: ArrayLike = (0.0, 0.0),
 ) -> tuple[Array, Array, mi.BSDFSample3f]:
-    """Sample a BSDF in vectorised variants.
+    """Sample a BSDF.
 
     Args:
         bsdf: of the current variant.

@@ -53,7 +53,7 @@ def metal_index(name: str, wavelength: float) -> complex:
     import mitsuba as mi
 
     if not mi.variant():
-        mi.set_variant("scalar_spectral")
+        mi.set_variant("llvm_ad_spectral")
     metal = mi.traverse(mi.load_dict({"type": "conductor", "material": name}))
     n, k = (np.interp(wavelength * 1e3, metal[f"{x}.wavelengths"], metal[f"{x}.values"]) for x in ("eta", "k"))
     return complex(n, k)

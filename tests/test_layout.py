@@ -119,14 +119,14 @@ print(*({{"mitsuba", "drjit"}} & set(sys.modules)))
 @pytest.mark.parametrize(
     "lines",
     [
-        ("import mitsuba", "mitsuba.set_variant('scalar_spectral')", "import mitsuba_diffraction"),
-        ("import mitsuba_diffraction", "import mitsuba", "mitsuba.set_variant('scalar_spectral')"),
-        ("import mitsuba", "import mitsuba_diffraction", "mitsuba.set_variant('scalar_spectral')"),
+        ("import mitsuba", "mitsuba.set_variant('llvm_ad_spectral')", "import mitsuba_diffraction"),
+        ("import mitsuba_diffraction", "import mitsuba", "mitsuba.set_variant('llvm_ad_spectral')"),
+        ("import mitsuba", "import mitsuba_diffraction", "mitsuba.set_variant('llvm_ad_spectral')"),
         (
             "import importlib.util, mitsuba_diffraction",
             "importlib.util.find_spec('mitsuba')",
             "import mitsuba",
-            "mitsuba.set_variant('scalar_spectral')",
+            "mitsuba.set_variant('llvm_ad_spectral')",
         ),
     ],
     ids=["last", "first", "between", "after it was looked for"],

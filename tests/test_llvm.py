@@ -120,7 +120,7 @@ def test_a_wheel_without_its_links_is_used(tmp_path: Path) -> None:
 
 @pytest.mark.few(1)
 @pytest.mark.parametrize("first", ["", "import mitsuba"])
-def test_without_any_llvm_only_scalar_variants_run(first: str) -> None:
+def test_without_any_llvm_the_message_says_what_is_missing(first: str) -> None:
     process = run(
         "from importlib import metadata; metadata.distributions = lambda **arguments: []",
         first,
@@ -128,7 +128,6 @@ def test_without_any_llvm_only_scalar_variants_run(first: str) -> None:
         "print(llvm.problem())",
         "mi.set_variant('scalar_spectral'); mi.load_dict({'type': 'diffuse'})",
         "from mitsuba_diffraction.llvm import choose_variant",
-        "assert choose_variant('scalar_spectral') == 'scalar_spectral'",
         "try: choose_variant('llvm_ad_spectral')",
         "except RuntimeError as error: print(error)",
         library="/nonexistent",

@@ -623,8 +623,8 @@ tolerance = 0.05
         ("precompute scan.npy --pixel-size 0.05 --tolerance 0.05", 1),
         ("precompute scan.toml", 1),
         ("inspect scan.toml", 1),
-        ("render scene.xml --spp 1 --width 4 --variant scalar_spectral --overwrite", 1),
-        ("render scene.xml --spp 1 --width 4 --variant scalar_spectral --overwrite", 0),  # from the cache
+        ("render scene.xml --spp 1 --width 4 --overwrite", 1),
+        ("render scene.xml --spp 1 --width 4 --overwrite", 0),  # from the cache
     ],
     ids=["precompute", "recipe", "inspect", "render", "render again"],
 )

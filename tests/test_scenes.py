@@ -62,11 +62,6 @@ def test_scene_of_a_scan_renders(llvm, tmp_path):
     check(render(SCENES / "scan.xml", spp=4, width=16, height=16, parameters={"spectrum": str(path)}), 16, 16)
 
 
-def test_blaze_renders_in_the_scalar_variant():
-    mi.set_variant("scalar_spectral")
-    check(render(SCENES / "blaze.xml", spp=1, width=4, height=4), 4, 4)
-
-
 ON_ONE_CORE = """
 import os
 os.sched_setaffinity(0, list(os.sched_getaffinity(0))[:1])

@@ -45,15 +45,11 @@ class NumberTable:
         """Take an array of any shape; uint32 stays so, all else becomes float32."""
         whole = numbers.dtype == np.uint32
         self.number = mi.UInt32 if whole else mi.Float
-        flat = aligned(numbers.ravel() if whole else np.asarray(numbers, np.float32).ravel())
-        # Scalar variants have no gather.
-        self.values = self.number(flat) if dr.is_jit_v(mi.Float) else flat
+        self.values = self.number(aligned(numbers.ravel() if whole else np.asarray(numbers, np.float32).ravel()))
 
     def __call__(self, index: mi.UInt32, active: mi.Bool = True) -> mi.Float | mi.UInt32:
         """Return the numbers at `index`; zero where not `active`."""
-        if dr.is_jit_v(mi.Float):
-            return dr.gather(self.number, self.values, index, active)
-        return self.values[index].item() if active else self.number(0)
+        return dr.gather(self.number, self.values, index, active)
 
 
 class PacketTable(NumberTable):
@@ -70,11 +66,7 @@ class PacketTable(NumberTable):
 
     def __call__(self, index: mi.UInt32, active: mi.Bool) -> mi.Vector2f | mi.Vector4f | mi.Vector4u:
         """Return the packets at `index`; zero where not `active`."""
-        if dr.is_jit_v(mi.Float):
-            return dr.gather(self.packet, self.values, index, active)
-        if not active:
-            return self.packet(0)
-        return self.packet(*self.values[self.width * index : self.width * (index + 1)].tolist())
+        return dr.gather(self.packet, self.values, index, active)
 
     def add(self, packet: mi.Vector4f, weight: mi.Float, index: mi.UInt32, active: mi.Bool) -> mi.Vector4f:
         """Return `packet` + `weight` times what is at `index`."""
@@ -99,7 +91,7 @@ def aligned(values: np.ndarray) -> np.ndarray:
 
 
 class HalfTable:
-    """A flat table of packets of four numbers in half precision, two in a word of 32 bits; not in scalar variants.
+    """A flat table of packets of four numbers in half precision, two in a word of 32 bits.
 
     A read costs two gathers of a word. Whole packets would have to be transposed: measured, that takes longer than the
     memory. The bits of a half, moved to where a float32 has them, are its number times `1/unit`; what is read is left
@@ -125,7 +117,7 @@ class HalfTable:
 class SharedExponentTable:
     """A flat table of packets of three numbers in a word of 32 bits: nine bits for each and five for one exponent.
 
-    As the pixels of RGB9E5 pictures, but with signs. What is read is left times `1/unit`. Not in scalar variants.
+    As the pixels of RGB9E5 pictures, but with signs. What is read is left times `1/unit`.
     """
 
     unit = 2.0 ** (126 + LEAST_EXPONENT)  # the exponent 1 is 2⁻¹²⁶ in a float32
@@ -160,17 +152,12 @@ class ShareTable:
         exponents = np.maximum(exponents, -100)
         mantissas = np.ceil(np.ldexp(packets, -exponents[..., None])) * (packets > 1e-30)
         self.values = np.ldexp(mantissas, exponents[..., None]).astype(np.float32)
-        if dr.is_jit_v(mi.Float):
-            m = mantissas.astype(np.int64)
-            words = (m[..., 0] << 26) | (m[..., 1] << 20) | (m[..., 2] << 14) | (m[..., 3] << 8) | (exponents + 127)
-            self.words = mi.UInt32(words.astype(np.uint32).ravel())
-        else:
-            self.words = PacketTable(self.values)
+        m = mantissas.astype(np.int64)
+        words = (m[..., 0] << 26) | (m[..., 1] << 20) | (m[..., 2] << 14) | (m[..., 3] << 8) | (exponents + 127)
+        self.words = mi.UInt32(words.astype(np.uint32).ravel())
 
     def __call__(self, index: mi.UInt32, active: mi.Bool) -> mi.Vector4f:
         """Return the packets at `index`; zero where not `active`."""
-        if not dr.is_jit_v(mi.Float):
-            return self.words(index, active)
         word = dr.gather(mi.UInt32, self.words, index, active)
         exponent = dr.reinterpret_array(mi.Float, (word & 255) << 23)
         return exponent * mi.Vector4f(*(mi.Float((word >> shift) & 63) for shift in (26, 20, 14, 8)))

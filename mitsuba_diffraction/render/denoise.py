@@ -57,10 +57,8 @@ def check_requirements() -> None:
     """Check that previews can be denoised.
 
     Raises:
-        ValueError: if the variant is a scalar one, or pyoidn is not installed.
+        ValueError: if pyoidn is not installed.
     """
-    if not dr.is_jit_v(mi.Float):
-        raise RequestError(f"--denoise: got the variant {mi.variant()}, wanted a vectorised one")
     try:
         import pyoidn  # noqa: F401
     except ModuleNotFoundError:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ..bsdf.base import is_grating
 from ..errors import RequestError, root_cause
-from ..llvm import is_spectral
+from ..llvm import is_supported
 from ..recipe import Recipe
 from ..settings import VISIBLE
 
@@ -89,9 +89,8 @@ def load_spectral_scene(
         ValueError: if no spectral variant is set, a size is not positive, a parameter is unknown to the scene, no BSDF
             has one of the ids, or the scene is wrong.
     """
-    variant = mi.variant()
-    if variant is None or not is_spectral(variant):
-        raise RequestError(f"variant: got {variant!r}, wanted a spectral one, such as 'llvm_ad_spectral'")
+    if not is_supported(mi.variant()):
+        raise RequestError(f"variant: got {mi.variant()!r}, wanted a spectral one, such as 'llvm_ad_spectral'")
     for name, size in (("width", width), ("height", height)):
         if size is not None and size < 1:
             raise RequestError(f"{name}: got {size}, wanted a positive number of pixels")
@@ -142,12 +141,13 @@ def _warn_of_unused_materials(
 
 
 def _warn_of_light_from_below(scene: mi.Scene) -> None:
-    """Say in the log which gratings are black because they are seen, or lit, from below only and let no light pass.
+    """Say in the log which gratings are black because they are seen, or lit, from below only and transmit nothing.
 
-    By rays of the first sensor, one light of each; scalar variants are spared it.
+    By rays of the first sensor, one light of each.
     """
-    opaque = [shape for shape in scene.shapes() if is_grating(shape.bsdf()) and shape.bsdf().layers.interface is None]
-    if not opaque or not dr.is_jit_v(mi.Float) or not scene.sensors():
+    gratings = [shape for shape in scene.shapes() if is_grating(shape.bsdf())]
+    opaque = [shape for shape in gratings if not shape.bsdf().layers.interface.transmits]
+    if not opaque or not scene.sensors():
         return
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(0, _RAYS_FROM_BELOW)
@@ -218,10 +218,10 @@ def _emission(emitter: mi.Emitter) -> NDArray[np.float64]:
     place = dr.zeros(mi.SurfaceInteraction3f)
     place.wi = mi.Vector3f(0, 0, -1)
     numbers = (np.arange(_DRAWS_PER_LIGHT, dtype=np.float32) + 0.5) / _DRAWS_PER_LIGHT
-    batches = [mi.Float(numbers)] if dr.is_jit_v(mi.Float) else numbers.tolist()
-    drawn = [emitter.sample_wavelengths(place, batch) for batch in batches]
-    pairs = [np.broadcast_arrays(wavelengths, mi.unpolarized_spectrum(weights)) for wavelengths, weights in drawn]
-    wavelengths, weights = np.concatenate(pairs, axis=-1).reshape(2, -1)
+    wavelengths, weights = emitter.sample_wavelengths(place, mi.Float(numbers))
+    wavelengths, weights = (
+        x.ravel() for x in np.broadcast_arrays(np.array(wavelengths), np.array(mi.unpolarized_spectrum(weights)))
+    )
     edges = np.arange(VISIBLE[0] - _DENSITY_STEP / 2, VISIBLE[1] + _DENSITY_STEP, _DENSITY_STEP)
     return np.histogram(wavelengths, edges, weights=weights)[0]
 

@@ -5,7 +5,6 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from bsdf_support import (
-    WAVELENGTHS,
     albedo,
     array,
     bitmap,
@@ -284,31 +283,6 @@ def test_polarised_variants_agree_with_the_unpolarised(base):
     if base == "conductor":
         of_mirror = np.array(bs.sampled_component) == 1
         assert np.abs(np.array(weight).reshape(16, 4, 16)[1:][..., of_mirror]).max() > 0.1
-
-
-@pytest.mark.parametrize("base", OTHERS)
-def test_scalar_variants_agree_with_the_vectorised(base):
-    wi = direction(40, 30)
-    values, pdfs, *samples = values_and_samples(base, wi)
-    use("scalar_spectral")
-    bsdf, ctx = over_or_alone(base), mi.BSDFContext()
-    si = dr.zeros(mi.SurfaceInteraction3f)
-    si.wi, si.wavelengths = mi.Vector3f(*map(float, wi)), type(si.wavelengths)(*WAVELENGTHS)
-    for o, value, pdf in zip(some_directions(wi), values, pdfs, strict=True):
-        found, density = bsdf.eval_pdf(ctx, si, mi.Vector3f(*map(float, o)))
-        np.testing.assert_allclose(np.array(found).ravel(), value, rtol=2e-3, atol=1e-6)
-        np.testing.assert_allclose(density, pdf, rtol=2e-3)
-    u = np.random.default_rng(1).random((3, 16)).astype(np.float32)
-    for numbers, wo, pdf, weight, component in zip(u.T, *samples, strict=True):
-        one = [float(x) for x in numbers]
-        bs, found = bsdf.sample(ctx, si, one[0], mi.Point2f(*one[1:]))
-        if pdf == 0:
-            assert bs.pdf == 0
-            continue
-        np.testing.assert_allclose(np.array(bs.wo).ravel(), wo, atol=2e-4)
-        np.testing.assert_allclose(bs.pdf, pdf, rtol=5e-3)
-        np.testing.assert_allclose(np.array(found).ravel(), weight, rtol=5e-3, atol=1e-4)
-        assert bs.sampled_component == component
 
 
 def test_base_is_dark_from_behind():

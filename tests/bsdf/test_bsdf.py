@@ -327,7 +327,7 @@ def test_unknown_profile_is_refused(llvm):
         mi.load_dict({"type": "diffraction_grating", "profile": "triangle", "period": 2.5, "depth": 0.25})
 
 
-@pytest.mark.parametrize("variant", ["scalar_spectral", "llvm_ad_spectral_polarized"])
+@pytest.mark.parametrize("variant", ["llvm_ad_spectral_polarized"])
 def test_other_variants_give_the_same_values(variant):
     wi = direction(30, 20)
     wo = towards(wi, np.array([[m / 2.5, 0] for m in (-1, 0, 1)]), 500)

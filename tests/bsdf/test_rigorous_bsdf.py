@@ -86,10 +86,8 @@ def pairs(spectrum, wavelength, count=400):
 
 
 @pytest.mark.few(4)
-@pytest.mark.parametrize("variant", ["llvm_ad_spectral", "scalar_spectral"])
-def test_f_is_the_sum_over_the_orders(variant, spectrum):
-    use(variant)
-    wi, wo = pairs(spectrum, 0.47, 400 if variant.startswith("llvm") else 40)
+def test_f_is_the_sum_over_the_orders(llvm, spectrum):
+    wi, wo = pairs(spectrum, 0.47, 400)
     value, _ = testing.evaluate_pdf(plugin(spectrum), wi, wo, (470.0,) * 4)
     wanted = expected(spectrum, wi, wo, 0.47) * wo[:, 2]
     assert wanted.max() > 0
@@ -238,7 +236,7 @@ def between_stokes_axes(matrix, source, exit_):
 
 def test_mueller_matrices_of_a_plane_are_mitsubas():
     """The signs of circular polarisation, too."""
-    use("scalar_spectral_polarized")
+    use("llvm_ad_spectral_polarized")
     cosine, index = 0.6, 0.8 + 6j
     omega = np.sqrt(1 - cosine**2), 0, cosine
     found = md.rigorous.efficiencies(md.gratings.sinusoidal(0.3, 0.0, samples=64), omega, 0.45, int_ior=index)
@@ -269,7 +267,7 @@ def test_polarised_light_is_split_as_by_the_solver(solved):
     assert max(differences) < 0.06
 
 
-@pytest.mark.parametrize("variant", ["llvm_ad_spectral_polarized", "scalar_spectral_polarized"])
+@pytest.mark.parametrize("variant", ["llvm_ad_spectral_polarized"])
 def test_unpolarised_light_is_that_of_variants_without_polarisation(variant, solved):
     wi, wo = (omega[:6] for omega in pairs(solved, 0.47, 60))
     use("llvm_ad_spectral")

@@ -194,7 +194,7 @@ def between_stokes_axes(matrix, source, exit_):
     return entries(mi.mueller.rotate_mueller_basis(full, *turned[0], *turned[1]))
 
 
-@pytest.mark.parametrize("variant", ["llvm_ad_spectral_polarized", "scalar_spectral_polarized"])
+@pytest.mark.parametrize("variant", ["llvm_ad_spectral_polarized"])
 def test_mueller_matrices_are_those_of_the_table(glass, variant):
     use(variant)
     bsdf, seen = plugin(glass), 0
@@ -219,7 +219,7 @@ def test_mueller_matrices_are_those_of_the_table(glass, variant):
     assert seen >= 7
 
 
-@pytest.mark.parametrize("variant", ["scalar_spectral", "llvm_ad_spectral_polarized"])
+@pytest.mark.parametrize("variant", ["llvm_ad_spectral_polarized"])
 def test_other_variants_pass_the_same_light(glass, variant):
     directions = np.array([towards(20, 30, 1), towards(50, 250, -1)])
     u = [(0.05, 0.4, 0.6), (0.3, 0.2, 0.7), (0.8, 0.9, 0.1)]

@@ -131,7 +131,7 @@ def test_a_lateral_scale_of_one_is_none(llvm):
     assert "lateral_scale" not in mi.traverse(bsdf)
 
 
-@pytest.mark.parametrize("variant", ["scalar_spectral", "llvm_ad_spectral_polarized"])
+@pytest.mark.parametrize("variant", ["llvm_ad_spectral_polarized"])
 def test_scales_in_other_variants(variant):
     of = for_scales(SURFACES["blazed"](), 1.5)
     uv, wo = (0.9, 0.5), near_orders(1.3, [(m, 0) for m in range(-2, 3)])[:10]

@@ -78,7 +78,7 @@ def refused(command, line, name):
     return err
 
 
-RENDER = "render u.xml --spp 1 --width 2 --variant scalar_spectral"
+RENDER = "render u.xml --spp 1 --width 2"
 
 
 # --- what is read ---

@@ -244,7 +244,7 @@ def test_the_energy_factor_is_reciprocal(name):
     np.testing.assert_allclose(there[some], back[some], rtol=1e-4, atol=1e-6 * np.median(there[some]))
 
 
-@pytest.mark.parametrize("variant", ["scalar_spectral", "llvm_ad_spectral_polarized"])
+@pytest.mark.parametrize("variant", ["llvm_ad_spectral_polarized"])
 def test_other_variants_give_the_same_values(variant):
     wi = np.array([np.sin(np.deg2rad(17)), 0, np.cos(np.deg2rad(17))])
     orders = np.arange(-2, 4)[:, None] / 2.5 * [1, 0]

@@ -624,19 +624,18 @@ def test_a_saved_spectrum_holds_no_heights(tmp_path):
     assert "needs heights, and a saved spectrum does not hold them" in root_cause(caught.value)
 
 
-def test_other_spectral_variants_show_the_same():
+def test_the_polarised_variant_shows_the_same():
     settings = dict(height_field=BLAZE, quirks=CORRECTED, terms=4)
     wi, wo = ([float(x) for x in unit(s)] for s in (0.2, -0.42))
     values = []
-    for name in ("llvm_ad_spectral", "scalar_spectral", "llvm_ad_spectral_polarized"):
+    for name in ("llvm_ad_spectral", "llvm_ad_spectral_polarized"):
         mi.set_variant(name)
         for kind in ("flss", "nmm", "pq"):
             built = VARIANTS[kind](**settings)
             values.append(np.array(built.rgb(mi.Vector3f(*wi), mi.Vector3f(*wo), built.weights())).ravel())
-    values = np.array(values).reshape(3, 3, 3)
+    values = np.array(values).reshape(2, 3, 3)
     assert values[0].any()
-    np.testing.assert_allclose(values[1], values[0], rtol=2e-3, atol=1e-4 * np.abs(values).max())
-    np.testing.assert_allclose(values[2], values[0], rtol=1e-5)
+    np.testing.assert_allclose(values[1], values[0], rtol=1e-5)
     image = picture(shader(terms=4))
     assert np.isfinite(image).all()
     assert image.any()

@@ -347,7 +347,7 @@ NAMED = {
 @pytest.mark.few(1)
 @pytest.mark.parametrize("name", sorted(NAMED))
 def test_a_ready_surface_is_used_in_a_scene_by_its_name(name):
-    mi.set_variant("scalar_spectral")
+    mi.set_variant("llvm_ad_spectral")
     numbers = "".join(
         f'<{"integer" if isinstance(value, int) else "float"} name="{key}" value="{value}"/>'
         for key, value in NAMED[name].items()
@@ -364,7 +364,7 @@ def test_a_ready_surface_is_used_in_a_scene_by_its_name(name):
 @pytest.mark.few(1)
 @pytest.mark.parametrize("name", ["blazed", "ruled", "foil", "film", "transmission_300"])
 def test_gratings_are_ready_without_any_number(name):
-    mi.set_variant("scalar_spectral")
+    mi.set_variant("llvm_ad_spectral")
     bsdf = mi.load_dict({"type": "diffraction_grating", "profile": name})
     assert bsdf.spectrum.source == PROFILES[name]().source
 

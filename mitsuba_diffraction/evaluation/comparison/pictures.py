@@ -151,8 +151,6 @@ class Pictures:
             raise RequestError(f"shader: got {shader!r}, wanted one of {', '.join(VARIANTS)}")
         if seed < 0:
             raise RequestError(f"seed: got {seed}, wanted an integer that is not negative")
-        if not dr.is_jit_v(mi.Float):
-            raise RequestError(f"variant: got {mi.variant()!r}, wanted a vectorised one, such as 'llvm_ad_spectral'")
         _check_lights(Path(scene_path), parameters)
         self.scene = load_spectral_scene(scene_path, width=width, height=height, parameters=parameters)
         if hasattr(self.scene.integrator(), "quirks"):

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ...errors import RequestError
+from ...llvm import is_supported
 from ...surface.heightfield import HeightField
 from ...testing import array, vectors
 from .base import Shader
@@ -28,7 +28,7 @@ def shader_for(height_field: HeightField, variant: str, quirks: Quirks, **settin
     """
     if variant not in VARIANTS:
         raise RequestError(f"variant: got {variant!r}, wanted one of {', '.join(VARIANTS)}")
-    if mi.variant() is None or not dr.is_jit_v(mi.Float) or not mi.is_spectral:
+    if not is_supported(mi.variant()):
         raise RequestError(f"variant: Mitsuba's is {mi.variant()}, wanted a spectral one such as llvm_ad_spectral")
     return VARIANTS[variant](height_field, quirks, **settings)
 

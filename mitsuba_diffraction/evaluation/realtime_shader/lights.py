@@ -18,11 +18,8 @@ def spectrum_of(evaluate: Callable[[mi.SurfaceInteraction3f], mi.UnpolarizedSpec
     """Evaluate a spectral function of a SurfaceInteraction3f at `tristimulus.wavelengths`: (401,)."""
     nanometres, channels = wavelengths(), len(mi.UnpolarizedSpectrum(0))
     groups = np.resize(nanometres, (-(-nanometres.size // channels), channels))
-    found = []
-    for group in [groups] if dr.is_jit_v(mi.Float) else groups[:, None]:
-        values = array(evaluate(interaction((0, 0, 1), group)), np.float64).reshape(channels, -1)
-        found.append(np.broadcast_to(values, (channels, len(group))))
-    return np.concatenate(found, axis=1).T.ravel()[: nanometres.size]
+    values = array(evaluate(interaction((0, 0, 1), groups)), np.float64).reshape(channels, -1)
+    return np.broadcast_to(values, (channels, len(groups))).T.ravel()[: nanometres.size]
 
 
 class Light:

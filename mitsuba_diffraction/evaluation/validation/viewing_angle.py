@@ -12,7 +12,6 @@ from __future__ import annotations
 import functools
 from dataclasses import dataclass
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from ... import testing
 from ...errors import RequestError
 from ...grating_spectrum import GratingSpectrum
+from ...llvm import is_supported
 from ..realtime_shader.evaluate import relative_radiance
 from ..realtime_shader.quirks import Quirks
 from .published_surfaces import SURFACES, PublishedSurface
@@ -59,7 +59,7 @@ def relative_reflectance(spectrum: GratingSpectrum, wi: ArrayLike, wo: ArrayLike
     Raises:
         ValueError: if shapes do not match, or Mitsuba has no vectorised spectral variant set.
     """
-    if mi.variant() is None or not dr.is_jit_v(mi.Float) or not mi.is_spectral:
+    if not is_supported(mi.variant()):
         raise RequestError(f"variant: Mitsuba's is {mi.variant()}, wanted a spectral one such as llvm_ad_spectral")
     bsdf = mi.load_dict({"type": "diffraction_grating", "spectrum": spectrum, "int_ior": _INDEX})
     wi, wo, wavelengths = (np.asarray(values, np.float64) for values in (wi, wo, wavelengths))
