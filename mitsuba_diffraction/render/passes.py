@@ -32,7 +32,14 @@ from ..color import spectrum_to_XYZ
 from ..errors import RequestError
 from ..files import UNSEALED, is_intact, seal, whole_file
 from .film import check_memory, is_independent, pass_seed, samples_drawn, takes_mitsubas_film, trace_pass
-from .scene import Materials, channel_wavelengths, load_spectral_scene, scene_digest, warn_of_gratings
+from .scene import (
+    Materials,
+    channel_wavelengths,
+    load_spectral_scene,
+    max_plausible_luminance,
+    scene_digest,
+    warn_of_gratings,
+)
 from .spectral_image import SpectralImage
 
 _log = logging.getLogger(__name__)
@@ -295,6 +302,7 @@ def render(
     ends = _trace(job, scene, sums, checkpoint, seconds, tracer, progress)
     if not sums.passes:
         raise KeyboardInterrupt
+    _warn_of_wrong_pixels(sums, max_plausible_luminance(scene))
     image = _image(sums, job, Path(scene_path).name, complete=ends)
     if not ends:
         raise Interrupted(image)
@@ -368,6 +376,16 @@ def _image(sums: Accumulation, job: Job, scene: str, complete: bool) -> Spectral
     if complete:
         attributes["digest"] = job.digest()
     return SpectralImage(channel_wavelengths(), sums.radiance(), attributes)
+
+
+def _warn_of_wrong_pixels(sums: Accumulation, limit: float) -> None:
+    """Log a line that names a pixel whose luminance is not finite, or else the brightest one above the limit."""
+    luminance = np.abs(sums.luminance) / sums.samples
+    if count := np.count_nonzero(~(luminance <= limit) | np.isinf(luminance)):
+        row, column = np.unravel_index(np.argmax(luminance), luminance.shape)  # NaN counts as the maximum
+        value = luminance[row, column]
+        what = f"is {value:.2g}, far above the lights of the scene" if np.isfinite(value) else "is not finite"
+        _log.warning("luminance %s at pixel x = %d, y = %d (from the top left): %d in all", what, column, row, count)
 
 
 def split(scene: mi.Scene, spp: int, least: int = 1) -> tuple[int, ...]:

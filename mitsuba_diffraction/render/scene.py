@@ -38,7 +38,9 @@ _DRAWS_PER_LIGHT = 2**14  # of four wavelengths, to learn its spectrum
 Materials = Mapping[str, Mapping[str, bool | float | str]]
 """Id of a BSDF → parameters of the grating that takes its place."""
 
-_RAYS_FROM_BELOW = 4096  # to find out whether gratings are seen and lit from above
+_RAYS_OF_SENSOR = 4096  # to find out what is seen, and how it is lit
+_PEAK_OF_LOBES = 1e4  # of a BSDF, 1/sr
+_OF_NOISE = 1e4
 _MOST_PIXELS = 2**25  # above 7680 × 4320; see also `film.check_memory`
 _DEFAULT_SIZE = (768, 576)  # that of Mitsuba's films
 
@@ -150,7 +152,7 @@ def _warn_of_light_from_below(scene: mi.Scene) -> None:
     if not opaque or not scene.sensors():
         return
     sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(0, _RAYS_FROM_BELOW)
+    sampler.seed(0, _RAYS_OF_SENSOR)
     ray, _ = scene.sensors()[0].sample_ray(0, sampler.next_1d(), sampler.next_2d(), sampler.next_2d())
     si = scene.ray_intersect(mi.Ray3f(ray))
     light, weight = scene.sample_emitter_direction(si, sampler.next_2d(), False, si.is_valid())
@@ -167,6 +169,26 @@ def _warn_of_light_from_below(scene: mi.Scene) -> None:
                 shape.id(),
                 side,
             )
+
+
+def max_plausible_luminance(scene: mi.Scene) -> float:
+    """Return a luminance that no pixel exceeds by noise: 10⁴ times that of the brightest light, as sampled.
+
+    The light that the first sensor sees, or that is sampled from the surfaces that it sees, has a radiance L. Point and
+    directional lights have an irradiance E instead, and narrow lobes reflect up to some 10⁴ E: they count as L = 10⁴ E.
+    It is infinite in scalar variants and where no light was found.
+    """
+    if not dr.is_jit_v(mi.Float):
+        return np.inf
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(0, _RAYS_OF_SENSOR)
+    ray, _ = scene.sensors()[0].sample_ray(0, sampler.next_1d(), sampler.next_2d(), sampler.next_2d())
+    si = scene.ray_intersect(mi.Ray3f(ray))
+    light, weight = scene.sample_emitter_direction(si, sampler.next_2d(), False, si.is_valid())
+    sampled = mi.unpolarized_spectrum(weight) * light.pdf * dr.select(light.delta, _PEAK_OF_LOBES, 1)
+    found = np.array([*sampled, *mi.unpolarized_spectrum(si.emitter(scene).eval(si))])
+    brightest = found[np.isfinite(found)].max(initial=0)
+    return float(brightest) * _OF_NOISE if brightest > 0 else np.inf
 
 
 def _warn_of_missing_uvs(scene: mi.Scene) -> None:

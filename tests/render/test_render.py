@@ -454,6 +454,27 @@ def test_the_available_memory_is_that_of_the_system():
     assert 0.5 * pages < film._available_memory()
 
 
+DIRECTIONAL = '<emitter type="directional"><vector name="direction" x="0" y="0" z="-1"/></emitter>'
+
+
+@pytest.mark.parametrize("light", [CONSTANT, DIRECTIONAL])
+@pytest.mark.parametrize(("value", "words"), [(np.nan, "not finite"), (np.inf, "not finite"), (1e14, "is 1e+14, far")])
+def test_a_wrong_pixel_is_a_warning_that_names_it(llvm, tmp_path, monkeypatch, caplog, light, value, words):
+    def traced(*arguments):
+        sums = trace_pass(*arguments)
+        sums[2, 5, :-1] = value * sums[2, 5, -1:]
+        return sums
+
+    path = write_scene(tmp_path, SPHERE + light)
+    render(path, spp=4)
+    assert not caplog.text
+    monkeypatch.setattr(passes, "trace_pass", traced)
+    render(path, spp=4)
+    (record,) = caplog.records
+    assert words in record.getMessage()
+    assert "x = 5, y = 2" in record.getMessage()
+
+
 def test_of_integrators_with_other_channels_the_radiance_is_taken(llvm, tmp_path):
     path = write_scene(tmp_path, SPHERE + CONSTANT)
     plain = '<integrator type="path"/>'
