@@ -41,9 +41,10 @@ are traced from the light if the vertex next to E scatters otherwise than as a p
 
 What is seen in a grating is left to the eye, as the lobes of a grating reach a pinhole as seldom as a mirror does.
 Points on gratings are drawn by area, a light is drawn from there, one of four such pairs is taken in proportion to what
-it receives, shadows included, and the path goes on by `sample` of the BSDFs, with the correction for shading normals;
-each X is connected to the sensor. There is one path from the light for two samples of the film. As in `path`, a light
-without extent is not seen in a mirror: it is left out where the grating next to it scatters by a delta component.
+it receives, shadows included, and the path goes on by `sample` of the BSDFs, with the correction for shading normals
+and for BSDFs that are not reciprocal; each X is connected to the sensor. There is one path from the light for two
+samples of the film. As in `path`, a light without extent is not seen in a mirror: it is left out where the grating next
+to it scatters by a delta component.
 
 Without a grating, with max_depth below 3, in polarised variants, and for sensors that points cannot be connected to
 (all but `perspective` and `thinlens`), this is `path`. Instances and curves count as X. It works inside of `aov`.

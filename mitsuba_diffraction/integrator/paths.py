@@ -13,13 +13,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..bsdf.base import contains_grating, nested
+from ..bsdf.base import contains_grating, is_grating, nested
 
 
 def ratio(a: mi.Float, b: mi.Float) -> mi.Float:
-    """Return a/b, and zero where b is zero: scalar variants raise there."""
-    divides = b != 0
-    return dr.select(divides, a / dr.select(divides, b, 1), 0)
+    """Return a/b, and zero where b is zero."""
+    return dr.select(b != 0, a / b, 0)
 
 
 class Gratings:
@@ -30,45 +29,41 @@ class Gratings:
 
     Attributes:
         shapes: of the scene.
-        perturbed: whether the scene has a BSDF that perturbs the shading normal: a normal or a bump map.
     """
 
     def __init__(self, scene: mi.Scene) -> None:
         surfaces = [(shape, shape.bsdf()) for shape in scene.shapes()]
-        surfaces = [(shape, bsdf) for shape, bsdf in surfaces if bsdf is not None]
-        self.perturbed = any(_perturbs(bsdf) for _, bsdf in surfaces)
-        areas = [(shape, _area(shape)) for shape, bsdf in surfaces if contains_grating(bsdf)]
+        areas = [(shape, _area(shape)) for shape, bsdf in surfaces if bsdf is not None and contains_grating(bsdf)]
         areas = [(shape, area) for shape, area in areas if area > 0]
         self.shapes = [shape for shape, _ in areas]
         if not self.shapes:
             return
         self._choice = mi.DiscreteDistribution([area for _, area in areas])
-        if dr.is_jit_v(mi.Float):
-            numbers = [dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0] for shape in self.shapes]
-            self._size = dr.opaque(mi.UInt32, max(numbers) + 1)
-            self._table = dr.zeros(mi.UInt32, max(numbers) + 1)
-            dr.scatter(self._table, mi.UInt32(1), mi.UInt32(numbers))
-            self._pointers = dr.reinterpret_array(mi.ShapePtr, mi.UInt32(numbers))
-            dr.eval(self._table, self._pointers)
+        numbers = [dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0] for shape in self.shapes]
+        kinds = [2 if _is_alone(shape.bsdf()) else 1 for shape in self.shapes]
+        self._size = dr.opaque(mi.UInt32, max(numbers) + 1)
+        self._table = dr.zeros(mi.UInt32, max(numbers) + 1)
+        dr.scatter(self._table, mi.UInt32(kinds), mi.UInt32(numbers))
+        dr.eval(self._table)
 
     def __contains__(self, shape: mi.Shape) -> bool:
         return any(shape is one for one in self.shapes)
 
-    def hold(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Bool:
-        """Return whether a point lies on one of the shapes."""
-        if not dr.is_jit_v(mi.Float):
-            return si.shape in self
+    def hold(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> tuple[mi.Bool, mi.Bool]:
+        """Return whether a point lies on one of the shapes, and whether its BSDF is a grating alone.
+
+        Alone, or on both sides of `twosided`, it is reciprocal, and no other BSDF sees its wavelengths.
+        """
         number = dr.reinterpret_array(mi.UInt32, si.shape)
-        return dr.gather(mi.UInt32, self._table, number, active & (number < self._size)) == 1
+        kind = dr.gather(mi.UInt32, self._table, number, active & (number < self._size))
+        return kind > 0, kind == 2
 
     def sample(self, time: mi.Float, u: mi.Float, v: mi.Point2f) -> mi.PositionSample3f:
         """Sample a point on the shapes, uniform by area; `pdf` is the density in area."""
-        index, share = self._choice.sample_pmf(u)
-        if dr.is_jit_v(mi.Float):
-            point = dr.gather(mi.ShapePtr, self._pointers, index).sample_position(time, v)
-        else:
-            point = self.shapes[index].sample_position(time, v)
-        point.pdf *= share
+        index, probability = self._choice.sample_pmf(u)
+        # A call by mi.ShapePtr would record this for every shape, also for those that do not implement it.
+        point = dr.switch(index, [shape.sample_position for shape in self.shapes], time, v)
+        point.pdf *= probability
         return point
 
 
@@ -87,12 +82,12 @@ def _area(shape: mi.Shape) -> float:
     """Return the area of a shape, zero where Mitsuba draws no points."""
     if not (implements(shape.sample_position, 0.0, mi.Point2f(0.5)) and implements(shape.surface_area)):
         return 0.0
-    area = shape.surface_area()
-    return float(area[0] if dr.is_jit_v(mi.Float) else area)
+    return float(shape.surface_area()[0])
 
 
-def _perturbs(bsdf: mi.BSDF) -> bool:
-    return bsdf.class_name() in ("NormalMap", "BumpMap") or any(map(_perturbs, nested(bsdf)))
+def _is_alone(bsdf: mi.BSDF) -> bool:
+    sides = nested(bsdf)
+    return not sides if is_grating(bsdf) else bsdf.class_name() == "TwoSidedBRDF" and all(map(_is_alone, sides))
 
 
 def define_eye_paths() -> type:
@@ -120,7 +115,7 @@ def define_eye_paths() -> type:
             ctx = mi.BSDFContext()
             si = scene.ray_intersect(ray, active)
             seen = si.is_valid() & active
-            result = _emitted(si.emitter(scene), si, mi.Bool(active))
+            result = si.emitter(scene).eval(si, active)
             ray = mi.Ray3f(ray)
             throughput, eta = mi.Spectrum(1.0), mi.Float(1.0)
             depth = mi.UInt32(1)
@@ -129,7 +124,8 @@ def define_eye_paths() -> type:
             met, mirrored = mi.Bool(False), mi.Bool(False)
             while active:
                 bsdf = si.bsdf(ray)
-                on_grating = self.gratings.hold(si, active)
+                on_grating, alone = self.gratings.hold(si, active)
+                at = with_surviving_wavelengths(si, throughput, alone)
                 from_light = on_grating & met & (mirrored ^ True)
 
                 # A light is looked for.
@@ -139,12 +135,12 @@ def define_eye_paths() -> type:
                 ds, emitted = scene.sample_emitter_direction(si, point, True, looks)
                 looks &= ds.pdf != 0
                 wo = si.to_local(ds.d)
-                value, pdf = bsdf.eval_pdf(ctx, si, wo, looks)
+                value, pdf = bsdf.eval_pdf(ctx, at, wo, looks)
                 share = dr.select(ds.delta, 1, _power_heuristic(ds.pdf, pdf))
                 result += dr.select(looks, throughput * value * emitted * share, 0)
 
                 # The path goes on, and may meet a light.
-                bs, weight = bsdf.sample(ctx, si, sampler.next_1d(active), sampler.next_2d(active), active)
+                bs, weight = bsdf.sample(ctx, at, sampler.next_1d(active), sampler.next_2d(active), active)
                 throughput *= weight
                 eta *= bs.eta
                 delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
@@ -152,14 +148,13 @@ def define_eye_paths() -> type:
                 met |= on_grating ^ True
                 active &= dr.any(throughput != 0)
                 ray = si.spawn_ray(si.to_world(bs.wo))
-                ray.wavelengths = surviving_wavelengths(ray.wavelengths, throughput)
                 following = scene.ray_intersect(ray, active)
                 ds = mi.DirectionSample3f(scene, following, si)
-                pdf = _density(scene, si, ds, active)
+                pdf = scene.pdf_emitter_direction(si, ds, active)
                 # A light that is never looked for is found only from here.
                 found = active & ((from_light & (pdf > 0)) ^ True)
                 share = _power_heuristic(bs.pdf, dr.select(delta, 0, pdf))
-                result += dr.select(found, throughput * _emitted(ds.emitter, following, found) * share, 0)
+                result += dr.select(found, throughput * ds.emitter.eval(following, found) * share, 0)
 
                 si = following
                 depth += 1
@@ -174,27 +169,20 @@ def define_eye_paths() -> type:
     return EyePaths
 
 
-def surviving_wavelengths(wavelengths: mi.Spectrum, throughput: mi.Spectrum) -> mi.Spectrum:
-    """Return wavelengths for the rest of a path: the strongest replaces those without throughput.
+def with_surviving_wavelengths(
+    si: mi.SurfaceInteraction3f, throughput: mi.Spectrum, active: mi.Bool
+) -> mi.SurfaceInteraction3f:
+    """Return an interaction in which the strongest wavelength replaces those without throughput.
 
     A grating diffracts the wavelengths into different directions. At the next one a direction would be drawn for any of
     the four, and three of four paths would end. A replaced wavelength has no throughput and adds nothing.
     """
-    strongest, most = wavelengths[0], throughput[0]
-    for wavelength, power in zip(wavelengths, throughput, strict=True):
-        strongest, most = dr.select(power > most, wavelength, strongest), dr.maximum(power, most)
-    return dr.select(throughput > 0, wavelengths, strongest)
-
-
-# Scalar variants have None where there is no emitter.
-
-
-def _density(scene: mi.Scene, si: mi.SurfaceInteraction3f, ds: mi.DirectionSample3f, active: mi.Bool) -> mi.Float:
-    return mi.Float(0.0) if ds.emitter is None else scene.pdf_emitter_direction(si, ds, active)
-
-
-def _emitted(emitter: mi.Emitter, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Spectrum:
-    return mi.Spectrum(0.0) if emitter is None else emitter.eval(si, active)
+    strongest, maximum = si.wavelengths[0], throughput[0]
+    for wavelength, power in zip(si.wavelengths, throughput, strict=True):
+        strongest, maximum = dr.select(power > maximum, wavelength, strongest), dr.maximum(power, maximum)
+    replaced = mi.SurfaceInteraction3f(si)
+    replaced.wavelengths = dr.select(active & (throughput <= 0), strongest, si.wavelengths)
+    return replaced
 
 
 def _power_heuristic(a: mi.Float, b: mi.Float) -> mi.Float:
@@ -231,19 +219,13 @@ class SplatBuffer:
 
     def __init__(self, capacity: int) -> None:
         self.capacity = capacity
-        self._scalar: list[Splats] = []
-        if dr.is_jit_v(mi.Float):
-            self._count = dr.zeros(mi.UInt32, 1)
-            self._columns = [dr.empty(mi.Float, capacity) for _ in range(2 + 2 * dr.size_v(mi.Spectrum))]
-            self._path, self._vertex = dr.empty(mi.UInt32, capacity), dr.empty(mi.UInt32, capacity)
-            dr.make_opaque(self._count)
+        self._count = dr.zeros(mi.UInt32, 1)
+        self._columns = [dr.empty(mi.Float, capacity) for _ in range(2 + 2 * dr.size_v(mi.Spectrum))]
+        self._path, self._vertex = dr.empty(mi.UInt32, capacity), dr.empty(mi.UInt32, capacity)
+        dr.make_opaque(self._count)
 
     def add(self, splats: Splats, path: mi.UInt32, vertex: mi.UInt32, active: mi.Bool) -> None:
         """Add the contribution of a path at one of its vertices."""
-        if not dr.is_jit_v(mi.Float):
-            if active:
-                self._scalar.append(splats)
-            return
         slot = dr.scatter_inc(self._count, mi.UInt32(0), active)
         active = active & (slot < dr.opaque(mi.UInt32, self.capacity))
         values = (*splats.position, *splats.wavelengths, *splats.value)
@@ -254,16 +236,14 @@ class SplatBuffer:
 
     def count(self) -> int:
         """Return how many contributions were added; evaluates the recorded loop."""
-        if not dr.is_jit_v(mi.Float):
-            return len(self._scalar)
         dr.eval(self._count, self._columns, self._path, self._vertex)
         return int(self._count[0])
 
     def content(self) -> list[Splats]:
         """Return all contributions, if there are no more than `capacity`."""
         count = self.count()
-        if not dr.is_jit_v(mi.Float) or count == 0:
-            return self._scalar
+        if count == 0:
+            return []
         order = np.lexsort((np.array(self._vertex)[:count], np.array(self._path)[:count]))
         columns = [dr.gather(mi.Float, column, mi.UInt32(order)) for column in self._columns]
         channels = dr.size_v(mi.Spectrum)
@@ -286,9 +266,10 @@ class LightPaths:
         T₁ = L(ω₁) |ω₁·n₁| / (p(y₁) p(ω₁)),    T_{j+1} = T_j f_j(ω_j, ω'_j) |cos θ_j| |ω'_j·n_j| / (p(ω'_j) |ω_j·n_j|)
 
     from y_j to y_{j+1}: ω_j points back to where light comes from, ω'_j on to y_{j+1}, n is the geometric normal, and θ
-    the angle between ω_j and the *shading* normal, as a path tracer has it (Veach 1997, section 5.3). `sample` of the
-    BSDF gives f_j |cos θ'_j|/p with the angle θ' of ω'_j, so that the correction is |cos θ_j/cos θ'_j|; where BSDFs
-    turn the normal themselves it is the ratio of their values both ways.
+    the angle between ω_j and the *shading* normal, as a path tracer has it (Veach 1997, section 5.3). f_j is `eval`
+    from ω'_j to ω_j, as of a path from the eye. Where the BSDF is reciprocal, `sample` gives f_j |cos θ'_j|/p with the
+    angle θ' of ω'_j, so that the correction is |cos θ_j/cos θ'_j|; at a mirror or clear glass these are the angles to
+    the normal that takes ω_j to ω'_j.
 
     y₁ and ω₁ are one of four candidates, chosen in proportion to what it receives, shadows included (resampling, Talbot
     2005): where most of a grating is in the shadow, most paths begin in the light all the same.
@@ -307,23 +288,22 @@ class LightPaths:
 
     def splats(self, seed: mi.UInt32 | int, count: int) -> Iterator[Splats]:
         """Trace `count` paths. The contributions and their order depend on the seed and the count alone."""
-        step = _PATHS_AT_ONCE if dr.is_jit_v(mi.Float) else 1
-        capacity = min(step, count)
-        for first in range(0, count, step):
+        capacity = min(_PATHS_AT_ONCE, count)
+        for first in range(0, count, _PATHS_AT_ONCE):
+            paths = min(_PATHS_AT_ONCE, count - first)
             buffer = SplatBuffer(capacity)
-            self._trace(seed, first, min(step, count - first), self.pixels / count, buffer)
+            self._trace(seed, first, paths, self.pixels / count, buffer)
             if buffer.count() > capacity:
                 # Once more, with the same random numbers.
                 capacity = buffer.count()
                 buffer = SplatBuffer(capacity)
-                self._trace(seed, first, min(step, count - first), self.pixels / count, buffer)
+                self._trace(seed, first, paths, self.pixels / count, buffer)
             yield from buffer.content()
 
     @dr.syntax
     def _trace(self, seed: mi.UInt32 | int, first: int, count: int, scale: float, buffer: SplatBuffer) -> None:
         """Trace the paths from the number `first` on, and add their contributions to the sensor to `buffer`."""
-        path = dr.arange(mi.UInt32, count) if dr.is_jit_v(mi.Float) else 0
-        path += dr.opaque(mi.UInt32, first)
+        path = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, first)
         rng = mi.PCG32()
         # Other numbers than the sampler draws from the same seed.
         key = mi.UInt32(seed) ^ 0x9E3779B9
@@ -338,12 +318,12 @@ class LightPaths:
         throughput = mi.Spectrum(1)
         while active:
             bsdf = si.bsdf(ray)
-            plain = active & (self.gratings.hold(si, active) ^ True)
+            on_grating, alone = self.gratings.hold(si, active)
+            plain = active & (on_grating ^ True)
             position, value, reached = self._connect(si, bsdf, _next_2d(rng), plain)
             buffer.add(Splats(position, ray.wavelengths, value * power * throughput), path, depth, reached)
-            ray, weight, _ = self._scatter(si, bsdf, rng, active)
+            ray, weight, _ = self._scatter(si, bsdf, power * throughput, alone, rng, active)
             throughput *= weight
-            ray.wavelengths = surviving_wavelengths(ray.wavelengths, power * throughput)
             depth += 1
             gambles = depth >= self.rr_depth
             # As of `path`, without the indices passed: unlike radiance, power does not change with them.
@@ -374,6 +354,8 @@ class LightPaths:
             radiance *= ratio(1, ps.pdf)
             # Not zero at grazing incidence, where the shading normal may still see the light.
             weight = dr.mean(radiance) * (dr.abs(dr.dot(ps.n, ds.d)) + 0.1)
+            # The direction to a point of the same shape may be NaN.
+            weight = dr.select(weight > 0, weight, 0)
             total += weight
             takes = (weight > 0) & (_next_1d(rng) * total < weight)
             point, normal = dr.select(takes, ps.p, point), dr.select(takes, ps.n, normal)
@@ -383,38 +365,47 @@ class LightPaths:
             candidate += 1
         power = response * received * (total / (own * _CANDIDATES))
 
-        wavelengths = surviving_wavelengths(wavelengths, power)
         # All of the surface at that point, with its tangents, as a ray along the normal meets it.
         off = mi.math.RayEpsilon * (1 + dr.max(dr.abs(point)))
         si = self.scene.ray_intersect(mi.Ray3f(point + normal * off, -normal, 2 * off, time, wavelengths), total > 0)
         active = si.is_valid()
-        if dr.hint(not dr.is_jit_v(mi.Float) and not active, mode="scalar"):
-            return mi.Ray3f(), power, active
-        active &= self.gratings.hold(si, active)
+        on_grating, alone = self.gratings.hold(si, active)
+        active &= on_grating
         si.wi = si.to_local(direction)
         power *= dr.abs(dr.dot(direction, si.n))
-        ray, weight, mirrored = self._scatter(si, si.bsdf(), rng, active)
+        ray, weight, mirrored = self._scatter(si, si.bsdf(), power, alone, rng, active)
         power *= weight
-        ray.wavelengths = surviving_wavelengths(ray.wavelengths, power)
         # `path` does not see a light without extent in a mirror.
         active &= dr.any(power != 0) & ((mirrored & delta) ^ True)
         return ray, power, active
 
     def _scatter(
-        self, si: mi.SurfaceInteraction3f, bsdf: mi.BSDF, rng: mi.PCG32, active: mi.Bool
+        self,
+        si: mi.SurfaceInteraction3f,
+        bsdf: mi.BSDF,
+        power: mi.Spectrum,
+        reciprocal: mi.Bool,
+        rng: mi.PCG32,
+        active: mi.Bool,
     ) -> tuple[mi.Ray3f, mi.Spectrum, mi.Bool]:
         """Sample the next ray; return it, T_{j+1}/T_j, and whether it was specular."""
         ctx = mi.BSDFContext(mi.TransportMode.Importance)
-        bs, weight = bsdf.sample(ctx, si, _next_1d(rng), _next_2d(rng), active)
+        at = with_surviving_wavelengths(si, power, reciprocal)
+        bs, weight = bsdf.sample(ctx, at, _next_1d(rng), _next_2d(rng), active)
         mirrored = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         ray = si.spawn_ray(si.to_world(bs.wo))
-        turn = dr.abs(ratio(mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(bs.wo)))
-        if self.gratings.perturbed:
-            forth = dr.sum(bsdf.eval(ctx, si, bs.wo, active & (mirrored ^ True)))
-            back = dr.sum(bsdf.eval(mi.BSDFContext(), _from(si, bs.wo), si.wi, active & (mirrored ^ True)))
-            turn = dr.select(mirrored, turn, ratio(back, forth))
-        turn *= dr.abs(ratio(dr.dot(ray.d, si.n), dr.dot(si.to_world(si.wi), si.n)))
-        return ray, dr.select(active, weight * turn, 0), mirrored
+        # The normal that refracts ω_j into ω'_j; light that is not refracted goes straight on.
+        normal = si.wi + bs.eta * bs.wo
+        bends = dr.squared_norm(normal) > 1e-8
+        turn = dr.select(bends, dr.abs(ratio(dr.dot(si.wi, normal), dr.dot(bs.wo, normal))), 1)
+        turn = dr.select(mirrored, turn, dr.abs(ratio(mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(bs.wo))))
+        weight *= turn
+        # Other BSDFs need not be reciprocal, or turn the normal themselves.
+        reverses = active & ((mirrored | reciprocal) ^ True)
+        value = bsdf.eval(mi.BSDFContext(), _from(si, bs.wo), si.wi, reverses)
+        weight = dr.select(reverses, value * ratio(1, bsdf.pdf(ctx, si, bs.wo, reverses)), weight)
+        weight *= dr.abs(ratio(dr.dot(ray.d, si.n), dr.dot(si.to_world(si.wi), si.n)))
+        return ray, dr.select(active, weight, 0), mirrored
 
     def _connect(
         self, si: mi.SurfaceInteraction3f, bsdf: mi.BSDF, lens: mi.Point2f, active: mi.Bool

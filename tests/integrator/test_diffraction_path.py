@@ -7,7 +7,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from bsdf_support import grating, uniform, use
+from bsdf_support import bitmap, grating, uniform, use
 
 import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a variant is set)
 from mitsuba_diffraction.render import scene as scene_module
@@ -87,18 +87,64 @@ def lamp_and_spot():
     )
 
 
+def tilted_normals(degrees):
+    """A texture for `normalmap` that tilts the normal by the same angle everywhere."""
+    angle = np.deg2rad(degrees)
+    return bitmap(np.tile((np.array([np.sin(angle), 0, np.cos(angle)]) + 1) / 2, (2, 2, 1)))
+
+
+def ramp():
+    """A texture for `bumpmap`: a plane that rises along u and v, with a step at its edge."""
+    u = (np.arange(8) + 0.5) / 8
+    return bitmap(0.7 * u[None, :] + 0.3 * u[:, None], filter_type="bilinear", wrap_mode="clamp")
+
+
 def blend_under_a_point():
     """A grating blended with a mirror, on a normal map, which turns the normal by 15°."""
-    tilt = np.array([np.sin(np.deg2rad(15)), 0, np.cos(np.deg2rad(15))])
-    normals = {
-        **{"type": "bitmap", "raw": True},
-        "bitmap": mi.Bitmap(np.tile((tilt + 1) / 2, (2, 2, 1)).astype(np.float32)),
-    }
     blend = {"type": "blendbsdf", "weight": 0.3, "grating": blaze()}
     blend["mirror"] = {"type": "roughconductor", "material": "Al", "alpha": 0.4}
-    tilted = {"type": "normalmap", "normalmap": normals, "bsdf": blend}
+    tilted = {"type": "normalmap", "normalmap": tilted_normals(15), "bsdf": blend}
     light = {"type": "point", "position": [0, -1, 3], "intensity": uniform(5.0)}
     return scene(plate=plate({"type": "twosided", "bsdf": tilted}), light=light, sky=SKY)
+
+
+def perturbed(kind, flips, shadows, **coat):
+    """Sunlight at 60° on a grating with a perturbed normal, bare or under a coat that reflects as a mirror does."""
+    sun = {"type": "directional", "direction": [0.8, 0.3, -0.5], "irradiance": uniform(1.0)}
+    bsdf = {
+        **{"normalmap": {"normalmap": tilted_normals(15)}, "bumpmap": {"texture": ramp(), "scale": 0.3}}[kind],
+        **{"type": kind, "flip_invalid_normals": flips, "use_shadowing_function": shadows},
+        "bsdf": {"type": "diffraction_grating", "profile": "blazed", "coherence_length": 1.5, "material": "Al", **coat},
+    }
+    return scene(plate=plate({"type": "twosided", "bsdf": bsdf}, height=0.4), sun=sun, sky=SKY)
+
+
+def lamp_that_is_a_grating():
+    """A sphere that glows faintly, under a spot light."""
+    glow = {"type": "area", "radiance": uniform(0.02)}
+    ball = {"type": "sphere", "center": [0.1, 0.2, 0.8], "radius": 0.5, "bsdf": blaze(material="Al"), "emitter": glow}
+    to_world = mi.ScalarTransform4f().look_at([0.1, -1.5, 3], [0.1, 0.2, 0.8], [0, 1, 0])
+    spot = {"type": "spot", "intensity": uniform(2.0), "cutoff_angle": 9, "to_world": to_world}
+    return scene(ball=ball, spot=spot)
+
+
+def group_of_gratings(**parts):
+    """An instance of a grating and a white ball."""
+    ball = {"type": "sphere", "center": [0, 0, 0.6], "radius": 0.3, "bsdf": diffuse(0.5)}
+    group = {"type": "shapegroup", "grating": plate(blaze(material="Al"), 0.5), "ball": ball}
+    instance = {"type": "instance", "to_world": at(1, 0, 0.2), "group": {"type": "ref", "id": "group"}}
+    return scene(group=group, instance=instance, sun=SUN, sky=SKY, **parts)
+
+
+def instance_beside_a_grating():
+    return group_of_gratings(plate=plate(blaze(material="Al"), 0.5, 0.4))
+
+
+def curve_beside_a_grating(tmp_path):
+    path = tmp_path / "curve.txt"
+    path.write_text("-1 0 0.5 0.1\n0 0 0.8 0.1\n0.5 0.5 0.6 0.1\n1 0.5 0.5 0.1\n1.5 0.7 0.5 0.1\n")
+    curve = {"type": "bsplinecurve", "filename": str(path), "bsdf": blaze(material="Al")}
+    return scene(curve=curve, plate=plate(blaze(material="Al"), 0.5, 0.4), sun=SUN, sky=SKY)
 
 
 def film(kind, facing=1, **parameters):
@@ -116,10 +162,8 @@ def window(kind, facing=1):
 
 def films_between_lamps(kind="sheet"):
     """A film on a normal map with a lamp of some extent and a point light below it, and a film of which it is seen."""
-    tilt = (np.array([np.sin(0.2), 0, np.cos(0.2)]) + 1) / 2
-    normals = {**{"type": "bitmap", "raw": True}, "bitmap": mi.Bitmap(np.tile(tilt, (2, 2, 1)).astype(np.float32))}
     tilted = film(kind)
-    tilted["bsdf"] = {"type": "normalmap", "normalmap": normals, "bsdf": tilted["bsdf"]}
+    tilted["bsdf"] = {"type": "normalmap", "normalmap": tilted_normals(11.5), "bsdf": tilted["bsdf"]}
     return scene(
         tilted=tilted,
         upright={**film(kind), "to_world": at(1.2, -0.3, 1).rotate([1, 0, 0], 70).scale(0.6)},
@@ -168,6 +212,8 @@ def assert_agree(built, depth, spp, **parameters):
         pytest.param(sun_and_sky, 4, 1024, marks=pytest.mark.slow),
         pytest.param(lamp_and_spot, 5, 2048, marks=pytest.mark.slow),
         pytest.param(blend_under_a_point, -1, 1024, marks=pytest.mark.slow),
+        (lamp_that_is_a_grating, 3, 512),
+        (instance_beside_a_grating, 4, 1024),
     ],
 )
 def test_converges_to_what_path_converges_to(build, depth, spp, llvm):
@@ -175,9 +221,16 @@ def test_converges_to_what_path_converges_to(build, depth, spp, llvm):
 
 
 @pytest.mark.slow
-def test_converges_in_a_scalar_variant():
-    use("scalar_spectral")
-    assert_agree(scene(plate=plate(blaze()), sun=SUN, film={"width": 4, "height": 4}), 3, 16)
+def test_converges_beside_a_curve(llvm, tmp_path):
+    assert_agree(curve_beside_a_grating(tmp_path), 4, 1024)
+
+
+@pytest.mark.few(1)
+@pytest.mark.parametrize("shadows", [True, False], ids=["shadowing", "no shadowing"])
+@pytest.mark.parametrize("flips", [True, False], ids=["flips", "no flips"])
+@pytest.mark.parametrize(("kind", "coat"), [("normalmap", {}), ("normalmap", {"coat_ior": 1.5}), ("bumpmap", {})])
+def test_converges_with_perturbed_normals(kind, coat, flips, shadows, llvm):
+    assert_agree(perturbed(kind, flips, shadows, **coat), 4, 1024)
 
 
 @pytest.mark.slow

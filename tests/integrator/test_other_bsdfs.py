@@ -1,0 +1,97 @@
+"""The integrator `diffraction_path` beside the BSDFs that Mitsuba ships: it converges to what `path` converges to."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from bsdf_support import bitmap
+from test_diffraction_path import SKY, SUN, assert_agree, blaze, plate, region_means, scene, tilted_normals
+
+
+def colors():
+    """A texture of saturated colors."""
+    rgb = [[[0.9, 0.1, 0.1], [0.1, 0.8, 0.2]], [[0.1, 0.2, 0.9], [0.8, 0.7, 0.1]]]
+    return {"type": "bitmap", "bitmap": mi.Bitmap(np.float32(rgb))}
+
+
+def numbers(low, high):
+    return bitmap([[low, high], [high, low]])
+
+
+def rgb(*value):
+    return {"type": "rgb", "value": value}
+
+
+def glossy():
+    return {"type": "roughconductor", "material": "Cu", "alpha_u": 0.2, "alpha_v": 0.4}
+
+
+BSDFS = {
+    "principled": lambda: {
+        **{"type": "principled", "base_color": colors(), "roughness": numbers(0.2, 0.6), "metallic": numbers(0.1, 0.5)},
+        **{"spec_tint": 1.0, "specular": 0.5, "sheen": 0.5, "sheen_tint": 1.0, "clearcoat": 0.5, "anisotropic": 0.5},
+        **{"clearcoat_gloss": 0.5, "flatness": 0.5},
+    },
+    "principled glass": lambda: {
+        **{"type": "principled", "base_color": colors(), "roughness": 0.4, "spec_trans": 0.7, "eta": 1.4},
+        "spec_tint": 1.0,
+    },
+    "principledthin": lambda: {
+        **{"type": "principledthin", "base_color": colors(), "roughness": 0.4, "spec_trans": 0.4, "diff_trans": 0.6},
+        **{"spec_tint": 1.0, "sheen": 0.5, "sheen_tint": 1.0, "eta": 1.4},
+    },
+    "diffuse": lambda: {"type": "diffuse", "reflectance": colors()},
+    "plastic": lambda: {"type": "plastic", "diffuse_reflectance": colors(), "nonlinear": True},
+    "roughplastic": lambda: {
+        **{"type": "roughplastic", "diffuse_reflectance": colors(), "specular_reflectance": rgb(0.9, 0.5, 0.2)},
+        **{"nonlinear": True, "alpha": 0.3},
+    },
+    "pplastic": lambda: {"type": "pplastic", "diffuse_reflectance": colors(), "alpha": 0.3},
+    "conductor": lambda: {"type": "conductor", "material": "Cu"},
+    "roughconductor": glossy,
+    "dielectric": lambda: {"type": "dielectric", "specular_transmittance": rgb(0.9, 0.5, 0.2)},
+    "thindielectric": lambda: {"type": "thindielectric", "specular_reflectance": colors()},
+    "roughdielectric": lambda: {"type": "roughdielectric", "alpha": numbers(0.2, 0.5)},
+    "null": lambda: {"type": "null"},
+    "polarizer": lambda: {"type": "polarizer"},
+    "circular": lambda: {"type": "circular"},
+    "retarder": lambda: {"type": "retarder"},
+    "mask": lambda: {"type": "mask", "opacity": numbers(0.3, 0.8), "nested": glossy()},
+    "blendbsdf": lambda: {
+        **{"type": "blendbsdf", "weight": numbers(0.2, 0.8)},
+        **{"first": glossy(), "second": {"type": "plastic", "diffuse_reflectance": colors()}},
+    },
+    "twosided": lambda: {"type": "twosided", "front": {"type": "diffuse", "reflectance": colors()}, "back": glossy()},
+    "bumpmap": lambda: {
+        **{"type": "bumpmap", "scale": 0.5, "nested": {"type": "roughplastic", "diffuse_reflectance": colors()}},
+        "height": bitmap(np.random.default_rng(1).random((4, 4))),
+    },
+    "normalmap": lambda: {"type": "normalmap", "normalmap": tilted_normals(30), "nested": {"type": "conductor"}},
+    "normalmap of glass": lambda: {
+        "type": "normalmap",
+        "normalmap": tilted_normals(30),
+        "bsdf": {"type": "dielectric"},
+    },
+    "hair": lambda: {"type": "hair", "int_ior": 1.55},
+}
+
+
+def above(bsdf, coherence_length):
+    """A grating above a floor, in the sun."""
+    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(4), "bsdf": bsdf}
+    return scene(plate=plate(blaze(coherence_length, material="Al"), height=0.4), floor=floor, sun=SUN, sky=SKY)
+
+
+@pytest.mark.few(1)
+@pytest.mark.parametrize("name", BSDFS)
+def test_every_bsdf_of_mitsuba_converges_to_what_path_converges_to(name, llvm):
+    assert_agree(above(BSDFS[name](), 1.5), 12, 1024)
+
+
+def test_a_tinted_bsdf_is_no_noisier_than_with_path(llvm):
+    """Its color is a quotient by the mean over the four wavelengths, which are not replaced there."""
+    tinted = {"type": "principled", "base_color": rgb(0.8, 0.05, 0.02), "specular": 0.5, "spec_tint": 1.0}
+    built = above(tinted, 26.0)
+    integrators = [mi.load_dict({"type": name, "max_depth": 12}) for name in ("path", "diffraction_path")]
+    (wanted, its_error), (found, error) = (region_means(built, each, 256) for each in integrators)
+    np.testing.assert_array_less(np.abs(found - wanted), 4 * np.hypot(its_error, error))
+    assert error.max() < its_error.max()
