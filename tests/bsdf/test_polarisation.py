@@ -18,7 +18,7 @@ def polarised():
 
 def grating(**parameters):
     # Lobes as wide as the facets': light everywhere.
-    spectrum = md.precompute(md.gratings.sinusoidal(2.5, 0.3), coherence_length=2.0)
+    spectrum = md.precompute(md.gratings.sinusoidal(2.5, 0.3), coherence_length=2.0, wavelengths=(239.0, 830.0))
     return mi.load_dict({"type": "diffraction_grating", "spectrum": spectrum, "conserve_energy": False, **parameters})
 
 
@@ -93,3 +93,24 @@ def test_retroreflection_has_a_finite_matrix(polarised):
 def test_indices_that_match_reflect_nothing(polarised):
     m = matrices(grating(int_ior=1.0, ext_ior=1.0), *directions(20))
     assert (m == 0).all()
+
+
+@pytest.mark.few(2)
+@pytest.mark.parametrize("parameters", [{"material": "Au"}, {"int_ior": 1.5, "transmission": "sheet"}])
+def test_light_on_the_same_way_back_has_the_transposed_matrix(polarised, parameters):
+    bsdf = grating(orientation=37.0, **parameters)
+    wi, wo = directions()
+    if "transmission" in parameters:
+        wo[2, ::2] *= -1
+    back = matrices(bsdf, wo, wi).swapaxes(0, 1) / np.abs(wi[2])
+    # An observer who looks the other way sees the plane of polarisation mirrored.
+    back[2] *= -1
+    back[:, 2] *= -1
+    there = matrices(bsdf, wi, wo) / np.abs(wo[2])
+    assert there[0, 0].max() > 0
+    np.testing.assert_allclose(there, back, rtol=1e-4, atol=1e-5 * there[0, 0].max())
+    # No light leaves more than wholly polarised, whatever the light that comes.
+    stokes = np.random.default_rng(6).normal(size=(3, 50))
+    stokes = np.concatenate([np.ones((1, 50)), stokes / np.linalg.norm(stokes, axis=0)])
+    sent = np.einsum("ij...,jk->i...k", there, stokes)
+    assert (np.linalg.norm(sent[1:], axis=0) <= sent[0] + 1e-5 * there[0, 0].max()).all()
