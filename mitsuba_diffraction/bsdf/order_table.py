@@ -119,7 +119,7 @@ class OrderTable:
         """Return the directions at the nodes of the square, outside, and λ above in µm, at a place along the slices."""
         nodes = np.indices((1, self.side + 1, self.side + 1)).reshape(3, -1).T.astype(np.float64)
         nodes[:, 0] = place
-        return self.layout.directions(nodes, np.zeros(3))
+        return self.layout.directions(nodes)
 
     def _inside(self, omega: NDArray[np.float64], above: bool) -> NDArray[np.float64]:
         """Return next to the relief the directions outside of it."""
@@ -158,7 +158,7 @@ class OrderTable:
         corner = np.indices((1, self.side, self.side)).reshape(3, -1).T
         corner[:, 0] = slice_
         omega, wavelengths = self.layout.directions(
-            np.repeat(corner, len(border), 0), np.tile(border, (len(corner), 1))
+            np.repeat(corner, len(border), 0) + np.tile(border, (len(corner), 1))
         )
         per_wavelength = self.tile / wavelengths[:, None]
         middle = -self._indices(above)[1] * omega[:, :2] * per_wavelength

@@ -5,12 +5,9 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import RequestError, is_number
 from ..settings import VISIBLE
-
-MOST_RATIOS = 16  # of height and lateral scale, for which there is a table of E each
 
 
 class Scale:
@@ -63,21 +60,6 @@ class Scale:
     def at(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Float:
         """Evaluate it at a point."""
         return self.value.eval_1(si, active) if self.varies else self.value
-
-    def only_values(self) -> bool:
-        """Return whether the surface has no other values than `values`: nothing interpolates between texels."""
-        if not self.varies:
-            return True
-        parameters = mi.traverse(self.value)
-        if "data" not in parameters:
-            return not any(key.endswith("data") for key in parameters.keys())  # noqa: SIM118 (not a dict)
-        # Between the centres of texels.
-        rows, columns = parameters["data"].shape[:2]
-        v, u = ((x.ravel() + 0.75) / n for x, n in zip(np.mgrid[:rows, :columns], (rows, columns), strict=True))
-        matrix = np.linalg.inv(np.array(parameters["to_uv"].matrix, np.float64).reshape(3, 3))
-        si = dr.zeros(mi.SurfaceInteraction3f, rows * columns)
-        si.uv = mi.Point2f(*(mi.Float(row[0] * u + row[1] * v + row[2]) for row in matrix[:2]))
-        return bool(np.isin(np.array(self.value.eval_1(si)), np.float32(self.values)).all())
 
     def put(self, callback: mi.TraversalCallback) -> None:
         """Show it among the parameters of the scene."""
@@ -138,24 +120,15 @@ class Scales:
         return height / lateral, lateral
 
     @property
-    def vary(self) -> bool:
-        """Whether E needs tables for them: a texture, or a lateral scale."""
-        return self.lateral is not None or self.height.varies
+    def min_lateral(self) -> float:
+        """The smallest lateral scale."""
+        return 1.0 if self.lateral is None else float(self.lateral.values[0])
 
-    def ratios(self) -> tuple[NDArray[np.float64], NDArray[np.float64], bool]:
-        """Return height over lateral scale: few that are all there are, or the limits of an interval.
-
-        Returns:
-            The ratios (n,), ascending; the least lateral scale of each, (n,); and whether there are no others.
-        """
-        heights, laterals = self.height.values, np.ones(1) if self.lateral is None else self.lateral.values
-        if len(heights) * len(laterals) <= MOST_RATIOS**2 and all(scale.only_values() for scale in self):
-            pairs = np.stack(np.meshgrid(heights, laterals), -1).reshape(-1, 2)
-            found, index = np.unique(np.round(pairs[:, 0] / pairs[:, 1], 5), return_inverse=True)
-            if len(found) <= MOST_RATIOS:
-                return found, np.array([pairs[index.ravel() == k, 1].min() for k in range(len(found))]), True
-        limits = np.array([heights[0] / laterals[-1], heights[-1] / laterals[0]])
-        return limits, np.repeat(laterals[:1], 2), False
+    def ratios(self) -> tuple[float, float]:
+        """Return the smallest and the largest height over lateral scale."""
+        low, high = self.height.values[[0, -1]]
+        max_lateral = 1.0 if self.lateral is None else self.lateral.values[-1]
+        return float(low / max_lateral), float(high / self.min_lateral)
 
     def check(self, wavelengths: tuple[float, float], index: float, most: float | None) -> None:
         """Check the values against what a spectrum covers.

@@ -18,7 +18,7 @@ from ..precomputation import Spectrum
 from ..rigorous.spectrum import RigorousSpectrum
 from ..settings import VISIBLE
 from .coat import SAME_INDEX, Coat
-from .energy import Place
+from .energy import Coordinates
 from .geometry import Geometry, Incidence, Interface, turned
 from .media import Media
 from .order_table import CHANGE
@@ -125,11 +125,11 @@ class Theory(Protocol):
     def parameters_changed(self, keys: list[str]) -> None:
         """Recompute what depends on the parameters `keys`; on all of them if none is named."""
 
-    def coordinates(self, geometry: Geometry) -> tuple[Place, Place] | None:
+    def coordinates(self, geometry: Geometry) -> tuple[Coordinates, Coordinates] | None:
         """Return what `evaluate` needs of a pair of directions at all wavelengths."""
 
     def evaluate(
-        self, geometry: Geometry, incidence: Incidence, pair: tuple[Place, Place] | None, active: mi.Bool
+        self, geometry: Geometry, incidence: Incidence, pair: tuple[Coordinates, Coordinates] | None, active: mi.Bool
     ) -> tuple[mi.Float, mi.Float]:
         """Return f |cos θ_o| λ² without R, and the density of q, both in µm², for one wavelength.
 
@@ -215,8 +215,7 @@ class ScalarTheory:
         scales.check(self.spectrum.wavelengths, self.media.index, getattr(self.scattering, "max_scale", None))
         self.energy = None
         if self.conserve_energy and self.shadowing:
-            of_number = self.tables.energy
-            self.energy = self.tables.scaled_energy(*scales.ratios()) if scales.vary else of_number(scales.height.value)
+            self.energy = self.tables.energy(scales)
         self.interface = self._interface()
 
     @property
@@ -262,14 +261,14 @@ class ScalarTheory:
             scale.put(callback)
         self.material.traverse(callback)
 
-    def coordinates(self, geometry: Geometry) -> tuple[Place, Place] | None:
+    def coordinates(self, geometry: Geometry) -> tuple[Coordinates, Coordinates] | None:
         """Return those of both directions in the table of E."""
         if self.energy is None:
             return None
         return tuple(self.energy.coordinates(k.inner()) for k in (geometry.incident, geometry.outgoing))
 
     def evaluate(
-        self, geometry: Geometry, incidence: Incidence, pair: tuple[Place, Place] | None, active: mi.Bool
+        self, geometry: Geometry, incidence: Incidence, pair: tuple[Coordinates, Coordinates] | None, active: mi.Bool
     ) -> tuple[mi.Float, mi.Float]:
         """Return K G S E n_o² |cos θ_o| and the density of q."""
         power, density = self.scattering.evaluate(geometry, incidence, active)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from bsdf_support import array, bitmap, direction, floats, grating, hemisphere, interaction, towards, uniform, vectors
 
-from mitsuba_diffraction.bsdf import energy, shared
+from mitsuba_diffraction.bsdf import shared
 
 ORDERS = [(a, 0) for a in range(-3, 4)]
 WI = direction(20, 30)
@@ -75,7 +75,7 @@ def test_the_derivative_by_a_number_is_that_of_differences(case, mode):
     key, at, step, parameters = NUMBERS[case]
     total = Total(key, **parameters)
     if key in ("height_scale", "lateral_scale"):
-        # With E, whose table is coarse, in the test below.
+        # With E, whose table is coarse, in tests/energy.
         total.theory.update = lambda: None
         total.theory.energy = None
     wanted = difference(total.number, at, step)
@@ -90,46 +90,6 @@ def test_the_derivative_by_a_number_is_that_of_differences(case, mode):
         found = dr.grad(x)[0]
     assert abs(wanted) > 1e-3
     np.testing.assert_allclose(found, wanted, rtol=0.01)
-
-
-def energy_near(of, at, height_scale):
-    """E of the heights `at`, as the renderer has it, plus what the table changes by up to `height_scale`.
-
-    The table itself is rounded, which differences would show.
-    """
-    tables = shared.SharedTables.of(of)
-    of_heights = tables.energy_tables(at)
-    here, there = (tables.corners(of_heights[0], scale) for scale in (at, height_scale))
-    return energy.Energy(of_heights, there - here, mi.Float(1.0))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("at", [0.6, 0.8])
-def test_the_derivative_by_height_includes_the_energy_factor(at):
-    total = Total("height_scale", name="deep blazed")
-
-    def exact(value):
-        total.theory.update = lambda: setattr(total.theory, "energy", energy_near(total.bsdf.spectrum, at, value))
-        return total.number(value)
-
-    wanted = (exact(at + shared.STEP) - exact(at - shared.STEP)) / (2 * shared.STEP)
-    del total.theory.update
-
-    def slope(change_of_table):
-        x = mi.Float(at)
-        dr.enable_grad(x)
-        total.parameters["height_scale"] = x
-        total.parameters.update()
-        total.theory.energy.change *= change_of_table
-        f = total.bsdf.eval(mi.BSDFContext(), total.si, vectors(total.wo))[1]
-        dr.backward(dr.sum(f * floats(total.weights)))
-        return dr.grad(x)[0]
-
-    # The derivatives of S and of E may cancel to a hundredth and less; float32 keeps 1e-4 of each.
-    without = slope(0.0)
-    np.testing.assert_allclose(slope(1.0), wanted, rtol=0.01, atol=1e-4 * abs(without))
-    # Without the derivative of E it would be another number.
-    assert abs(without - wanted) > 0.05 * abs(wanted)
 
 
 @pytest.mark.parametrize("key", ["eta.values", "k.values"])

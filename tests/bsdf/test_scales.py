@@ -307,8 +307,8 @@ def test_the_energy_of_very_different_heights_is_that_of_each(llvm, parameters):
 
     def found(bsdf, height, under):
         energy = bsdf.layers.grating.theory.energy
-        places = energy.places(vectors(wi * [1, 1, under]), vectors(wo), mi.Float(height), 1.0)
-        return np.array(energy.factor(places, floats(np.full(count, 1 / 0.55))))
+        pair = [energy.coordinates(vectors(omega)) for omega in (wi * [1, 1, under], wo)]
+        return np.array(energy.factor(pair, floats(np.full(count, 1 / 0.55)), mi.Float(height)))
 
     for height in heights:
         alone = plugin(of, height_scale=height, **parameters)

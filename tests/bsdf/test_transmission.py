@@ -13,7 +13,6 @@ from bsdf_support import check_chi_square, direction, interaction, use, vectors
 import mitsuba_diffraction as md
 from mitsuba_diffraction.bsdf.geometry import Geometry, Incidence, Interface
 from mitsuba_diffraction.bsdf.order_table import OrderTable
-from mitsuba_diffraction.bsdf.shared import SharedTables
 
 PERIOD, ETA, WAVELENGTH = 3.35, 1.5, 0.5
 IMPORTANCE = mi.TransportMode.Importance
@@ -282,7 +281,7 @@ def test_an_index_is_refused_for_which_the_spectrum_has_no_wavelengths():
 def test_other_parameters_leave_tables_of_varying_scales(monkeypatch):
     heights = {"type": "checkerboard", "color0": 0.5, "color1": 1.0}
     parameters = mi.traverse(passing("interface", height_scale=heights))
-    monkeypatch.setattr(SharedTables, "scaled_energy", None)
+    monkeypatch.setattr("mitsuba_diffraction.bsdf.shared.EnergyTable.of", None)
     monkeypatch.setattr("mitsuba_diffraction.bsdf.shared.OrderTable", None)
     parameters["orientation.value"] = 30.0
     parameters.update()

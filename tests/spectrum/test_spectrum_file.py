@@ -28,7 +28,7 @@ NUMBERS = (
 )
 # Random numbers, which tell a table that was read from one that was made.
 _LAYOUT = Layout(0.18, 1, 4, 1, 3, (1.2, 1 / 0.36), False)
-ENERGY = EnergyTable(_LAYOUT, np.random.default_rng(0).integers(0, 256, _LAYOUT.shape, np.uint8), 0.3, (0.01, 0.1))
+ENERGY = EnergyTable(_LAYOUT, np.random.default_rng(0).integers(0, 256, (1, 1, *_LAYOUT.shape), np.uint8))
 
 
 def make(shape=(4, 7), depth=0.2, source="by hand", **arguments):
