@@ -28,7 +28,7 @@ from .spectrum.power_spectrum import PowerSpectrum
 from .spectrum.tables import SliceTable
 
 FORMAT = "mitsuba_diffraction grating spectrum"
-FORMAT_VERSION = 8
+FORMAT_VERSION = 9
 
 # Numbers and texts, and their names in files.
 _NUMBERS = {

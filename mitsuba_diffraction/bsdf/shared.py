@@ -82,7 +82,8 @@ class SharedTables:
         spectrum, (low, high) = self._spectrum, scales.ratios()
         per_step = spectrum.max_kappa * spectrum.height_range / RATIO_STEP
         if low == high and not scales.height.varies and dr.grad_enabled(scales.height.value):
-            half = 0.25 / max(per_step, 1)
+            # Wide enough for values of a byte.
+            half = 0.5 / max(per_step, 5)
             low, high = max(low - half, 0.0), low + half
         count = 1 if low == high else int(np.clip(np.ceil((high - low) * per_step), 1, MAX_RATIOS - 1)) + 1
         key = np.linspace(low, high, count).tolist(), min(scales.min_lateral, 1.0)

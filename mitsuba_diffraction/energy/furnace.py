@@ -322,7 +322,7 @@ def _gathered(spectrum: PowerSpectrum, kappas: Real, coarser: float) -> tuple[Re
     )
     # Smaller cells where b is not zero.
     near = np.hypot(*q.T) < 6 * sigma
-    parts: list[tuple[Real, ...]] = []
+    parts: list[tuple[NDArray, ...]] = []
     for some, size in ((near, min(width, MIRROR_CELL_WIDTH * sigma)), (~near, width)):
         # A node as points of a Gaussian, if it is wider than half a cell.
         count = 0 if size > 2 * own else int(min(np.ceil(3 * own / size), MAX_POINTS))
