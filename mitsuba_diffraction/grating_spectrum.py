@@ -2,9 +2,10 @@
 
 The file is OpenEXR: float32, ZIP, one part, one pixel per diffraction order or node.
 
-Channels are named after what they hold: `S(012.2)` is the coefficient of t² on interval 12 of κ. Rows are orders m_y,
-columns m_x, from −M to M. Numbers in the header are double precision. `energy` is JSON: the table of `energy/table.py`.
-`contentSha256` covers every byte of the file and reveals damage.
+Channels are named after what they hold: `S(012.2)` is the coefficient of t² on interval 12 of κ. Those of a series of
+the amplitude are `F{u^003}.re` and `.im` (taylor) or `F{T_003}.re` (chebyshev), F_n with u = h/`heightScale`. Rows are
+orders m_y, columns m_x, from −M to M. Numbers in the header are double precision. `energy` is JSON: the table of
+`energy/table.py`. `contentSha256` covers every byte of the file and reveals damage.
 """
 
 from __future__ import annotations
@@ -21,11 +22,11 @@ import numpy as np
 
 from .energy.table import EnergyTable
 from .errors import RequestError
-from .settings import Settings
+from .settings import REPRESENTATIONS, Settings
 from .spectrum.exr import doubles, one_line, read, write
 from .spectrum.grids import OrderGrid, SplineGrid
 from .spectrum.power_spectrum import PowerSpectrum
-from .spectrum.tables import SliceTable
+from .spectrum.tables import AmplitudeTable, SliceTable
 
 FORMAT = "mitsuba_diffraction grating spectrum"
 FORMAT_VERSION = 9
@@ -81,6 +82,7 @@ class GratingSpectrum(PowerSpectrum):
             **{key: doubles(getattr(self, name)) for name, key in _NUMBERS.items()},
             **{key: getattr(self, name) for name, key in _OTHERS.items()},
             **({} if self.standard_error is None else {"standardError": doubles(self.standard_error)}),
+            **_series_header(self),
             "units": "lengths in micrometres, wavelengths in nanometres",
             **({"warning": self.warning} if self.warning else {}),
         }
@@ -100,8 +102,8 @@ class GratingSpectrum(PowerSpectrum):
         """
         path = Path(path)
         header, channels = read(path, FORMAT, FORMAT_VERSION, recipe)
-        if (got := header.get("representation")) != SliceTable.representation:
-            raise RequestError(f"{path}: got representation {got!r}, wanted {SliceTable.representation!r}")
+        if (got := header.get("representation")) not in REPRESENTATIONS[1:]:
+            raise RequestError(f"{path}: got representation {got!r}, wanted one of {', '.join(REPRESENTATIONS[1:])}")
         try:
             pixels = {name: channel.pixels for name, channel in channels.items()}
             if halves := [name for name, values in pixels.items() if values.dtype != np.float32]:
@@ -120,6 +122,7 @@ class GratingSpectrum(PowerSpectrum):
                 _single(header["largestAngle"]),
                 header["representation"],
                 _single(header["tolerance"]),
+                **_series_settings(header),
             )
             entries: dict[str, Any] = {name: header[key] for name, key in _OTHERS.items()}
             entries |= {name: _single(header[key]) for name, key in _NUMBERS.items()}
@@ -152,15 +155,38 @@ def _grid(header: dict, shape: tuple[int, int]) -> OrderGrid | SplineGrid:
     return SplineGrid(_pair(header["spacing"]), largest, _pair(header["limit"]))
 
 
-def _channels(table: SliceTable) -> dict[str, np.ndarray]:
-    return {f"S({k:03d}.{p})": table.values[k, p] for k, p in np.ndindex(table.intervals, table.terms)}
+_FUNCTIONS = {"taylor": "F{{u^{:03d}}}", "chebyshev": "F{{T_{:03d}}}"}
 
 
-def _table(header: dict, pixels: dict[str, np.ndarray], max_kappa: float) -> SliceTable:
-    terms = 4 if "S(000.3)" in pixels else 3
-    intervals = header["channelCount"] // terms
-    values = [[pixels[f"S({k:03d}.{p})"] for p in range(terms)] for k in range(intervals)]
-    return SliceTable(max_kappa, np.array(values, np.float32))
+def _series_header(spectrum: GratingSpectrum) -> dict[str, Any]:
+    if isinstance(spectrum.table, SliceTable):
+        return {}
+    return {"heightScale": doubles(spectrum.table.height), "heightsFrom": spectrum.settings.heights_from}
+
+
+def _series_settings(header: dict) -> dict[str, Any]:
+    if header["representation"] == SliceTable.representation:
+        return {}
+    return {"terms": header["channelCount"] // 2, "heights_from": header["heightsFrom"]}
+
+
+def _channels(table: SliceTable | AmplitudeTable) -> dict[str, np.ndarray]:
+    if isinstance(table, SliceTable):
+        return {f"S({k:03d}.{p})": table.values[k, p] for k, p in np.ndindex(table.intervals, table.terms)}
+    names = [_FUNCTIONS[table.representation].format(n) for n in range(len(table.terms))]
+    parts = (("re", table.terms.real), ("im", table.terms.imag))
+    return {f"{name}.{part}": np.ascontiguousarray(v) for part, vs in parts for name, v in zip(names, vs, strict=True)}
+
+
+def _table(header: dict, pixels: dict[str, np.ndarray], max_kappa: float) -> SliceTable | AmplitudeTable:
+    kind, count = header["representation"], header["channelCount"]
+    if kind == SliceTable.representation:
+        terms = 4 if "S(000.3)" in pixels else 3
+        values = [[pixels[f"S({k:03d}.{p})"] for p in range(terms)] for k in range(count // terms)]
+        return SliceTable(max_kappa, np.array(values, np.float32))
+    names = [_FUNCTIONS[kind].format(n) for n in range(count // 2)]
+    parts = np.stack([[pixels[f"{name}.{part}"] for name in names] for part in ("re", "im")], axis=-1)
+    return AmplitudeTable(kind, max_kappa, _single(header["heightScale"]), parts.view(np.complex64)[..., 0])
 
 
 def _single(value: np.ndarray) -> float:

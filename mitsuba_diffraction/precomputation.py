@@ -15,7 +15,7 @@ from .rigorous import build as rigorous
 from .rigorous.efficiencies import one_thread
 from .rigorous.spectrum import FORMAT as RIGOROUS_FORMAT
 from .rigorous.spectrum import RigorousSpectrum
-from .settings import SUN_COHERENCE_LENGTH, VISIBLE, Settings
+from .settings import SERIES, SUN_COHERENCE_LENGTH, VISIBLE, Settings
 from .spectrum import build as scalar
 from .surface.heightfield import HeightField
 
@@ -34,6 +34,8 @@ def precompute(
     representation: str = "auto",
     tolerance: float | None = None,
     largest_height_range: float = 20.0,
+    terms: int | None = None,
+    heights_from: str = "mean",
     progress: Progress = silent,
     theory: str = "scalar",
     int_ior: complex | None = None,
@@ -60,8 +62,8 @@ def precompute(
             cannot be kept in float32 or within a table of 4 GB.
 
     Warns:
-        UserWarning: if the pixels are too coarse to hold all the frequencies that the shortest wavelength can reach, or
-            a sample is too small for the coherence length.
+        UserWarning: if the pixels are too coarse to hold all the frequencies that the shortest wavelength can reach, a
+            sample is too small for the coherence length, or `terms` are too few for the tolerance.
     """
     settings = Settings(
         extent=extent,
@@ -71,6 +73,8 @@ def precompute(
         representation=representation,
         tolerance=tolerance,
         largest_height_range=largest_height_range,
+        terms=terms,
+        heights_from=heights_from,
         theory=theory,
         int_ior=int_ior,
         material=material,
@@ -86,7 +90,7 @@ def precompute(
 
 def build_spectrum(patches: Sequence[HeightField], settings: Settings, progress: Progress = silent) -> Spectrum:
     """Compute what `precompute` does, of patches and settings."""
-    _check_patches(patches, settings.extent)
+    _check_patches(patches, settings)
     height_range = max(patch.height_range for patch in patches)
     if height_range > settings.largest_height_range:
         raise RequestError(
@@ -103,12 +107,19 @@ def build_spectrum(patches: Sequence[HeightField], settings: Settings, progress:
     return rigorous.build_spectrum(patches[0], settings, progress, cache_folder())
 
 
-def _check_patches(height_fields: Sequence[HeightField], extent: str) -> None:
+def _check_patches(height_fields: Sequence[HeightField], settings: Settings) -> None:
     """Raise RequestError unless there is one patch, or several of one size that repeat."""
     if not height_fields:
         raise RequestError("patches: got none, wanted at least one")
-    if len(height_fields) > 1 and extent != "tile":
-        raise RequestError(f"patches: got {len(height_fields)} with extent {extent!r}, wanted 1, or extent 'tile'")
+    if len(height_fields) > 1 and settings.extent != "tile":
+        raise RequestError(
+            f"patches: got {len(height_fields)} with extent {settings.extent!r}, wanted 1, or extent 'tile'"
+        )
+    if len(height_fields) > 1 and settings.representation in SERIES:
+        raise RequestError(
+            f"representation: got {settings.representation!r} with {len(height_fields)} patches, wanted 'slices', or "
+            "patches = 1: an average has no amplitude"
+        )
     first = height_fields[0]
     for field in height_fields[1:]:
         if field.shape != first.shape or not np.allclose(field.tile_size, first.tile_size, rtol=1e-9):

@@ -24,7 +24,11 @@ SHORTEST, LONGEST = 1e-3, 1e6
 
 EXTENTS = ("tile", "sample")
 THEORIES = ("scalar", "rigorous")
-REPRESENTATIONS = ("auto", "slices")
+# "auto" is "slices"; the others are series of the amplitude.
+SERIES = ("taylor", "chebyshev")
+REPRESENTATIONS = ("auto", "slices", *SERIES)
+ORIGINS = ("mean", "lowest")
+MAX_TERMS = 999
 LEAST_TOLERANCE = 1e-5
 
 
@@ -43,12 +47,15 @@ class Settings:
             (`wavelengths_inside`).
         largest_angle: of incidence and exit that the scene has, degrees from the normal; less than 90 keeps fewer
             frequencies.
-        representation: "slices", which "auto" is, too.
+        representation: "slices": powers, as "auto"; or a series of the amplitudes of one tile, "taylor" (Stam 1999) or
+            "chebyshev" (Dhillon and Ghosh 2016).
         tolerance: bound of max over κ of ∫|S_approx(q; κ) − S_exact(q; κ)| dq, a share of the reflected power; by
             default 1e-3, and of a sample a tenth of its `standard_error`, at least 1e-3 and at most 1e-2. Of rigorous
             theory the bound of `RigorousSpectrum.error`, by default 1e-2.
         largest_height_range: in µm; a deeper surface is refused, as one whose heights are in nm. Time and memory grow
             with the height range.
+        terms: of a series, N, whatever its error; by default as many as the tolerance needs.
+        heights_from: of a series, the level of h = 0: "mean" or "lowest".
         theory: "scalar", or "rigorous": Maxwell's equations, for a tile of one row and one material only.
         int_ior: of rigorous theory, index of refraction of a dielectric, or n + ik.
         material: of rigorous theory, or a conductor by the name that Mitsuba has for it.
@@ -69,6 +76,8 @@ class Settings:
     representation: str = "auto"
     tolerance: float | None = None
     largest_height_range: float = 20.0
+    terms: int | None = None
+    heights_from: str = "mean"
     theory: str = "scalar"
     int_ior: complex | None = None
     material: str | None = None
@@ -82,6 +91,7 @@ class Settings:
         for name, known in (
             ("theory", THEORIES),
             ("representation", REPRESENTATIONS),
+            ("heights_from", ORIGINS),
             ("transmission", TRANSMISSIONS),
         ):
             if (value := getattr(self, name)) not in known:
@@ -105,6 +115,7 @@ class Settings:
             raise RequestError(
                 f"largest_angle: got {self.largest_angle!r}, wanted degrees from the normal, above 0, at most 90"
             )
+        self._check_series()
         least = LEAST_TOLERANCE if self.theory == "scalar" else 1e-4
         if self.tolerance is not None and not least <= self.tolerance < 1:
             raise RequestError(
@@ -138,6 +149,26 @@ class Settings:
                 raise RequestError(
                     f"transmission: got {self.transmission} and ext_ior {self.ext_ior!r}, wanted no coat"
                 )
+
+    def _check_series(self) -> None:
+        """Raise RequestError unless the parameters of a series are of one."""
+        if self.representation not in SERIES:
+            for name, value, default in (("terms", self.terms, None), ("heights_from", self.heights_from, "mean")):
+                if value != default:
+                    raise RequestError(
+                        f"{name}: got {value!r} with representation {self.representation!r}, wanted it with a series, "
+                        f"{' or '.join(SERIES)}"
+                    )
+        elif self.extent != "tile":
+            raise RequestError(
+                f"representation: got {self.representation!r} with extent {self.extent!r}, wanted 'slices': an average "
+                "has no amplitude"
+            )
+        count = self.terms
+        if count is not None and not (
+            isinstance(count, int) and not isinstance(count, bool) and 1 <= count <= MAX_TERMS
+        ):
+            raise RequestError(f"terms: got {count!r}, wanted a whole number from 1 to {MAX_TERMS}")
 
     @property
     def chosen(self) -> dict[str, Any]:

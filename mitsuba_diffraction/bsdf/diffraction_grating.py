@@ -22,6 +22,13 @@ PARAMETERS = (
     ),
     Parameter("tolerance", "float", "of a profile or instead of that of a recipe, as in `precompute`"),
     Parameter(
+        "representation",
+        "string",
+        "likewise: slices (default), or, of the orders of one tile, a series of amplitudes, taylor or chebyshev",
+    ),
+    Parameter("terms", "integer", "of a series; by default as many as the tolerance needs"),
+    Parameter("heights_from", "string", "of a series, the level of h = 0: mean (default) or lowest"),
+    Parameter(
         "theory",
         "string",
         "of a profile: scalar, or rigorous, Maxwell's equations for the material that is given and for gratings of one "

@@ -15,11 +15,12 @@ from collections.abc import Sequence
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import scipy.special
 from numpy.typing import NDArray
 
 from ..grating_spectrum import GratingSpectrum
 from ..spectrum.grids import LobeAxis
-from ..spectrum.tables import HALF_SCALE, SliceTable, shared_exponents
+from ..spectrum.tables import HALF_SCALE, AmplitudeTable, SliceTable, shared_exponents
 from .cell_sampler import LOBE, CellAxis, CellSampler
 from .geometry import Geometry, Incidence
 from .inversion import CELLS, KappaCells, averages, choose, search, sums_before, truncated_gaussian
@@ -36,6 +37,9 @@ from .tables import (
 
 # Nodes lie in squares of 4 × 4, so that those of a window lie in few lines of the cache: one word each, in one to four.
 _SQUARE = 4
+
+# Steps of x between which cubics interpolate the Bessel functions of a series, to _STEP⁴/384.
+_STEP = 0.1
 
 
 Small = tuple["mi.Float", "mi.Bool"]
@@ -60,25 +64,55 @@ def small_kappa(
     return dr.select(where & (kappa < least), line, factors)
 
 
-class SlicePower:
-    """c_m(κ) = Σ_p a_p t^p, −1 ≤ t ≤ 1 on the interval of κ. A node is one packet of one, two or four words.
+class _NodeTable:
+    """Base class of table look-ups.
 
     Attributes:
-        table: packets of numbers, square after square of nodes.
         rows: of nodes, with the rim.
         columns: of nodes, with the rim.
         square: nodes along the side of a square.
         nodes: those of all squares.
     """
 
+    def __init__(self, shape: tuple[int, int], rim: tuple[int, int], windows: bool) -> None:
+        """Take the shape of a table, the nodes of zero on each side, (x, y), and whether several nodes are read."""
+        self.rim, self.square = rim, _SQUARE if windows else 1
+        self.rows, self.columns = shape[0] + 2 * rim[1], shape[1] + 2 * rim[0]
+        self.row = -(-self.columns // self.square) * self.square**2  # nodes of a row of squares
+        self.nodes = -(-self.rows // self.square) * self.row
+
+    def _arranged(self, packets: np.ndarray) -> np.ndarray:
+        """Return (..., rows, columns) → (..., nodes), with the rim."""
+        square, (x, y) = self.square, self.rim
+        pad = [(0, 0)] * (packets.ndim - 2) + [(y, y + -self.rows % square), (x, x + -self.columns % square)]
+        padded = np.pad(packets, pad)
+        rows, columns = (n // square for n in padded.shape[-2:])
+        squares = padded.reshape(*packets.shape[:-2], rows, square, columns, square)
+        return squares.swapaxes(-2, -3).reshape(*packets.shape[:-2], -1)
+
+    def _places(self, first: mi.Int32, count: int, before: int, beside: int) -> list[mi.UInt32]:
+        """What each of `count` rows or columns adds to the index: `before` for a square, `beside` for a node in it."""
+        places = [mi.UInt32(first + step) for step in range(count)]
+        if self.square == 1:
+            return [place * before for place in places]
+        return [place // self.square * before + place % self.square * beside for place in places]
+
+    def _window(
+        self, row: mi.Int32, column: mi.Int32, height: int, width: int
+    ) -> tuple[list[mi.UInt32], list[mi.UInt32]]:
+        """Return what each row and column of a window from (row, column) on adds to the index of node 0."""
+        row = dr.clip(row, 0, self.rows - height)
+        column = dr.clip(column, 0, self.columns - width)
+        return self._places(row, height, self.row, self.square), self._places(column, width, self.square**2, 1)
+
+
+class SlicePower(_NodeTable):
+    """c_m(κ) = Σ_p a_p t^p, −1 ≤ t ≤ 1 on the interval of κ. A node is one packet of one, two or four words."""
+
     def __init__(self, table: SliceTable, rim: tuple[int, int] = (0, 0), windows: bool = True) -> None:
         """Arrange a table with `rim` nodes of zero on each side, (x, y); with `windows` for reads of several nodes."""
-        self.square = square = _SQUARE if windows else 1
-        values = np.pad(table.values, ((0, 0), (0, 0), (rim[1], rim[1]), (rim[0], rim[0])))
-        self.rows, self.columns = values.shape[2:]
-        self.row = -(-self.columns // square) * square**2  # nodes of a row of squares
-        self.nodes = -(-self.rows // square) * self.row
-        values = self._arranged(values)
+        super().__init__(table.shape, rim, windows)
+        values = self._arranged(table.values)
         words = table.words_per_node
         scale = 1.0
         if words == 1:
@@ -94,22 +128,6 @@ class SlicePower:
         self.packet = mi.Vector3f if words == 1 else mi.Vector4f
         self.intervals = table.intervals
         self.per_kappa = opaque(table.intervals / table.max_kappa)
-
-    def _arranged(self, packets: np.ndarray) -> np.ndarray:
-        """Return (..., rows, columns) → (..., nodes)."""
-        square, (rows, columns) = self.square, packets.shape[-2:]
-        pad = [(0, 0)] * (packets.ndim - 2) + [(0, -rows % square), (0, -columns % square)]
-        padded = np.pad(packets, pad)
-        rows, columns = (n // square for n in padded.shape[-2:])
-        squares = padded.reshape(*packets.shape[:-2], rows, square, columns, square)
-        return squares.swapaxes(-2, -3).reshape(*packets.shape[:-2], -1)
-
-    def _places(self, first: mi.Int32, count: int, before: int, beside: int) -> list[mi.UInt32]:
-        """What each of `count` rows or columns adds to the index: `before` for a square, `beside` for a node in it."""
-        places = [mi.UInt32(first + step) for step in range(count)]
-        if self.square == 1:
-            return [place * before for place in places]
-        return [place // self.square * before + place % self.square * beside for place in places]
 
     def window(
         self,
@@ -130,10 +148,7 @@ class SlicePower:
             at: what the method `at` gave for κ.
             active: mask.
         """
-        row = dr.clip(row, 0, self.rows - len(weights_y))
-        column = dr.clip(column, 0, self.columns - len(weights_x))
-        rows = self._places(row, len(weights_y), self.row, self.square)
-        columns = self._places(column, len(weights_x), self.square**2, 1)
+        rows, columns = self._window(row, column, len(weights_y), len(weights_x))
         weights_x = [weight * self.unit for weight in weights_x]
         offset, factors = at
         packet = type(factors)(0.0)
@@ -159,6 +174,107 @@ class SlicePower:
     def _factors(self, t: mi.Float) -> mi.Vector3f | mi.Vector4f:
         """Return the powers of t."""
         return self.packet([1, t, dr.square(t), dr.square(t) * t][: len(self.packet(0))])
+
+
+class AmplitudePower(_NodeTable):
+    """η_m(κ) = |Σ_n c_n(κL) F_nm|² of `AmplitudeTable`, by a recorded loop over n, two terms in a packet.
+
+    The magnitudes of c_n are had by recurrence (taylor) or read from a table over κ (chebyshev); their phases are iⁿ.
+    """
+
+    def __init__(self, table: AmplitudeTable, rim: tuple[int, int] = (0, 0), windows: bool = True) -> None:
+        """Arrange a table as `SlicePower` does."""
+        super().__init__(table.shape, rim, windows)
+        count = len(table.terms)
+        self.pairs = -(-count // 2)
+        terms = np.zeros((2 * self.pairs, 2, *table.shape), np.float32)
+        terms[:count, 0], terms[:count, 1] = table.terms.real, table.terms.imag
+        packets = self._arranged(terms.reshape(self.pairs, 4, *table.shape))
+        self.table = PacketTable(np.moveaxis(packets, 1, -1))
+        self.height, self.factors = opaque(table.height), None
+        if table.representation == "chebyshev":
+            largest, n = table.max_kappa * table.height, np.arange(2 * self.pairs)
+            self.steps = 1 + int(largest / _STEP)
+            x = np.linspace(0, largest, self.steps + 1)[:, None]
+            self.per_x = opaque(self.steps / max(largest, 1e-30))
+            values = [function(n, x).reshape(-1, self.pairs, 2) for function in (scipy.special.jv, scipy.special.jvp)]
+            packets = np.concatenate([values[0], values[1] * largest / self.steps], axis=-1)
+            packets[:, 1:] *= 2
+            packets[:, 0, 1::2] *= 2
+            self.factors = PacketTable(packets)
+
+    def at(self, kappa: mi.Float, small: Small) -> tuple[mi.Float, mi.Float]:
+        """Return κ, and a factor of the power: κ₁²/κ² where `small` holds and κ < κ₁; a series needs no other care."""
+        least, where = small
+        where = where & (kappa < least)
+        # Below a hundredth of κ₁ the ratio of the power to κ² is constant.
+        kappa = dr.select(where, larger(kappa, 0.01 * least), kappa)
+        return kappa, dr.select(where, dr.square(least / larger(kappa, 1e-30)), 1)
+
+    def window(
+        self,
+        row: mi.Int32,
+        column: mi.Int32,
+        weights_x: Sequence[mi.Float],
+        weights_y: Sequence[mi.Float],
+        at: tuple[mi.Float, mi.Float],
+        active: mi.Bool,
+    ) -> mi.Float:
+        """Return Σ_ij w_x,i w_y,j η of the orders from (row, column) on; arguments as of `SlicePower.window`."""
+        rows, columns = self._window(row, column, len(weights_y), len(weights_x))
+        kappa, factor = at
+        weights = [y * x for y in weights_y for x in weights_x]
+        amplitudes = self._amplitudes([r + c for r in rows for c in columns], kappa * self.height, active)
+        powers = [re * re + im * im for re, im in amplitudes]
+        return factor * sum(weight * power for weight, power in zip(weights, powers, strict=True))
+
+    def _amplitudes(self, nodes: list[mi.UInt32], x: mi.Float, active: mi.Bool) -> list[tuple[mi.Float, mi.Float]]:
+        """Return F_m of the orders, real and imaginary; derivatives by x are summed in the same loop if needed."""
+        differentiate = dr.grad_enabled(x)
+        at = dr.detach(x)
+        if self.factors is not None:
+            coordinate = at * self.per_x
+            step = dr.minimum(mi.UInt32(coordinate), self.steps - 1)
+            coordinate -= mi.Float(step)
+
+        def body(
+            pair: mi.UInt32, sign: mi.Float, term: mi.Float, before: mi.Float, *sums: mi.Float
+        ) -> tuple[mi.UInt32 | mi.Float, ...]:
+            if self.factors is None:
+                # xⁿ/n!, whose derivative is the one before.
+                n = mi.Float(2 * pair)
+                odd = term * at / (n + 1)
+                factors = [(term, odd), (before, term)]
+                term, before = odd * at / (n + 2), odd
+            else:
+                low, high = (self.factors((step + k) * self.pairs + pair, active) for k in (0, 1))
+                both = [_hermite(low[k], high[k], low[k + 2], high[k + 2], coordinate) for k in (0, 1)]
+                factors = [[value for value, _ in both], [slope * self.per_x for _, slope in both]]
+            parts = []
+            for node in nodes:
+                f = sign * self.table(pair * self.nodes + node, active)
+                for even, odd in factors[: 1 + differentiate]:
+                    # The odd term is i times the even one.
+                    parts.append(dr.fma(even, f[0], dr.fma(-odd, f[3], sums[len(parts)])))
+                    parts.append(dr.fma(even, f[1], dr.fma(odd, f[2], sums[len(parts)])))
+            return pair + 1, -sign, term, before, *parts
+
+        count = len(nodes) * (4 if differentiate else 2)
+        start = mi.UInt32(0), mi.Float(1), mi.Float(1), mi.Float(0), *(mi.Float(0) for _ in range(count))
+        sums = dr.while_loop(start, lambda pair, *_: pair < self.pairs, body)[4:]
+        if not differentiate:
+            return list(zip(sums[::2], sums[1::2], strict=True))
+        parts = zip(sums[::4], sums[1::4], sums[2::4], sums[3::4], strict=True)
+        return [(dr.replace_grad(re, by_re * x), dr.replace_grad(im, by_im * x)) for re, im, by_re, by_im in parts]
+
+
+def _hermite(
+    low: mi.Float, high: mi.Float, low_slope: mi.Float, high_slope: mi.Float, t: mi.Float
+) -> tuple[mi.Float, mi.Float]:
+    """Return the cubic through values and slopes at 0 and 1, and its derivative, at t."""
+    rise = high - low
+    square, cube = 3 * rise - 2 * low_slope - high_slope, low_slope + high_slope - 2 * rise
+    return low + t * (low_slope + t * (square + t * cube)), low_slope + t * (2 * square + t * 3 * cube)
 
 
 FLOOR = 0.05  # the share of each κ cell that all orders have alike
@@ -401,7 +517,8 @@ class OrderSpectrum:
         )
         line = 1 in grid.shape
         self.resolved = all(axis.count == 1 for axis in self.axes) and not (line and sigma > NARROW)
-        self.power = SlicePower(spectrum.table, tuple(axis.rim for axis in self.axes), windows=not self.resolved)
+        power = AmplitudePower if isinstance(spectrum.table, AmplitudeTable) else SlicePower
+        self.power = power(spectrum.table, tuple(axis.rim for axis in self.axes), windows=not self.resolved)
         self.cells = None
         if not self.resolved:
             self.cells = LineSampler(spectrum, most) if line else CellSampler(spectrum, most, farthest)

@@ -22,6 +22,7 @@ from .theory import check_transmission, refuse_scalar_only, settings_from, setti
 
 _per_cent = functools.partial(progress_bar, unit="%")
 _PREFIX = "handed over: "
+_OF_SPECTRUM = "representation", "terms", "heights_from", "tolerance"  # of a profile, or in the place of a recipe's own
 _handed_over: weakref.WeakValueDictionary[str, Spectrum] = weakref.WeakValueDictionary()
 
 
@@ -61,7 +62,7 @@ def surface_from(props: mi.Properties, media: Media, scale: float = 1.0) -> tupl
     known = inspect.signature(PROFILES[name]).parameters
     surface = {"profile": name, **{key: props[key] for key in (*known, "patches") if key in props}}
     settings = {"coherence_length": COHERENCE_LENGTHS[name]} if name in COHERENCE_LENGTHS else {}
-    settings |= {key: props[key] for key in ("coherence_length", "tolerance", "largest_height_range") if key in props}
+    settings |= {key: props[key] for key in ("coherence_length", "largest_height_range", *_OF_SPECTRUM) if key in props}
     if theory == "rigorous":
         settings |= {"theory": theory, **settings_from(props, media.coat)}
     recipe = _inside(props, media, scale, Recipe(surface, Settings(**settings)))
@@ -89,7 +90,8 @@ def _inside(props: mi.Properties, media: Media, scale: float, recipe: Recipe) ->
 
 
 def _from_file(props: mi.Properties, media: Media, scale: float) -> tuple[Spectrum, Recipe | None]:
-    path, tolerance = Path(str(mi.file_resolver().resolve(str(props["filename"])))), props.get("tolerance")
+    path = Path(str(mi.file_resolver().resolve(str(props["filename"]))))
+    given = {name: props[name] for name in _OF_SPECTRUM if name in props}
     suffix = path.suffix.lower()
     if suffix in (".toml", ".exr") and not path.is_file():
         # What is not found stays relative; the folder of a scene is searched first.
@@ -97,12 +99,11 @@ def _from_file(props: mi.Properties, media: Media, scale: float) -> tuple[Spectr
         there = sorted(other.name for other in folder.glob("*") if other.suffix.lower() in (".exr", ".toml"))
         raise FileNotFoundError(f"{path}: no such file; {folder} holds {', '.join(there) or 'no spectrum'}")
     if suffix == ".toml":
-        own = Recipe.load(path, **({} if tolerance is None else {"tolerance": tolerance}))
-        recipe = _inside(props, media, scale, own)
+        recipe = _inside(props, media, scale, Recipe.load(path, **given))
         return recipe.cached(_per_cent), recipe
     if suffix == ".exr":
-        if tolerance is not None:
-            raise RequestError(f"tolerance: got {tolerance} with {path}, wanted it when the spectrum is computed")
+        for name, value in given.items():
+            raise RequestError(f"{name}: got {value} with {path}, wanted it when the spectrum is computed")
         return load_spectrum(path), None
     raise RequestError(
         f"filename: got {path}, wanted a saved spectrum (.exr) or a recipe (.toml); "

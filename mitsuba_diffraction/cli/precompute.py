@@ -14,7 +14,7 @@ from ..precomputation import Spectrum
 from ..progress import progress_bar, tell
 from ..recipe import Recipe
 from ..rigorous.spectrum import RigorousSpectrum
-from ..settings import REPRESENTATIONS, SUN_COHERENCE_LENGTH, THEORIES
+from ..settings import ORIGINS, REPRESENTATIONS, SUN_COHERENCE_LENGTH, THEORIES
 from ..surface.prepare import seam_matters, seam_steps
 from .arguments import (
     Channel,
@@ -51,6 +51,10 @@ def precompute(
         typer.Option(
             help="largest error, a fraction of the power; default: 0.001, of samples up to 0.01, rigorous 0.01"
         ),
+    ] = None,
+    terms: Annotated[int | None, typer.Option(help="of taylor or chebyshev; default: as the tolerance needs")] = None,
+    heights_from: Annotated[
+        str | None, typer.Option(help=f"of taylor or chebyshev: {', '.join(ORIGINS)}; default: mean")
     ] = None,
     theory: Annotated[
         str | None,

@@ -176,10 +176,8 @@ def max_plausible_luminance(scene: mi.Scene) -> float:
 
     The light that the first sensor sees, or that is sampled from the surfaces that it sees, has a radiance L. Point and
     directional lights have an irradiance E instead, and narrow lobes reflect up to some 10⁴ E: they count as L = 10⁴ E.
-    It is infinite in scalar variants and where no light was found.
+    It is infinite where no light was found.
     """
-    if not dr.is_jit_v(mi.Float):
-        return np.inf
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(0, _RAYS_OF_SENSOR)
     ray, _ = scene.sensors()[0].sample_ray(0, sampler.next_1d(), sampler.next_2d(), sampler.next_2d())

@@ -6,19 +6,20 @@ import dataclasses
 import hashlib
 import warnings
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RequestError
 from ..progress import Progress, part
-from ..settings import Settings, lobe_cutoff, lobe_width
+from ..settings import SERIES, Settings, lobe_cutoff, lobe_width
 from ..surface.heightfield import HeightField
-from .grids import LobeAxis, inner
+from .grids import LobeAxis, OrderGrid, inner
 from .power_spectrum import TAIL_SHARE, PowerSpectrum
 from .sample import SamplePowers, effective_coherence_length, standard_error
 from .tables import (
+    AmplitudeTable,
     SliceTable,
     chebyshev_nodes,
     chebyshev_polynomials,
@@ -28,6 +29,8 @@ from .tables import (
     packed,
     place,
     position,
+    series_function,
+    series_weights,
     to_polynomial,
 )
 from .tile import MeanPowers, TilePowers, TileSplines
@@ -63,6 +66,7 @@ def build_spectrum(patches: Sequence[HeightField], settings: Settings, progress:
     _check_resolution(height_field, max_frequency)
     effective, found_error, tail = float(coherence_length), None, 0.0
     powers: TilePowers | Splines | None
+    series = settings.representation in SERIES
     if settings.extent == "tile":
         allowed = tolerance = _FINEST if tolerance is None else tolerance
         sigma, rho = lobe_width(effective), lobe_cutoff(TAIL_SHARE * tolerance)
@@ -71,7 +75,7 @@ def build_spectrum(patches: Sequence[HeightField], settings: Settings, progress:
             of_mean, progress = part(progress, 0, _OF_MEAN), part(progress, _OF_MEAN, 1)
             orders = MeanPowers(patches, max_frequency, rho * sigma, max_kappa, (1 - TAIL_SHARE) * tolerance, of_mean)
         lobes = orders.grid.lobes(sigma, rho)
-        powers = _tile_splines(orders, lobes, sigma, max_frequency, max_kappa, tolerance)
+        powers = None if series else _tile_splines(orders, lobes, sigma, max_frequency, max_kappa, tolerance)
         if powers is None:
             powers, tail = orders, 2 * (1 - lobes[0].inside * lobes[1].inside)
             allowed -= tail
@@ -97,7 +101,8 @@ def build_spectrum(patches: Sequence[HeightField], settings: Settings, progress:
             tolerance,
         )
     build = _Build(powers, height_range, max_kappa, allowed, progress)
-    table, error = build()
+    table: SliceTable | AmplitudeTable
+    table, error = build.series(height_field.heights, settings) if series else build()
     source, source_digest = height_field.source, height_field.digest
     if len(patches) > 1:
         source = f"mean of {len(patches)} patches: {source}, …"
@@ -113,6 +118,8 @@ def build_spectrum(patches: Sequence[HeightField], settings: Settings, progress:
             float(settings.largest_angle),
             table.representation,
             float(tolerance),
+            terms=len(table.terms) if isinstance(table, AmplitudeTable) else None,
+            heights_from=settings.heights_from,
         ),
         pixel_size=height_field.pixel_size,
         height_range=height_range,
@@ -284,6 +291,31 @@ class _Build:
             f"float32 keeps up to κ = {self._max_kappa:.1f} rad/µm (measured error {error:.2g})"
         )
 
+    def series(self, heights: NDArray[np.float64], settings: Settings) -> tuple[AmplitudeTable, float]:
+        """Return the series of the amplitudes of a tile, with the terms that are requested or needed, and its error."""
+        kind, origin = settings.representation, settings.heights_from
+        heights = heights - (heights.min() if origin == "lowest" else heights.mean())
+        x = self._max_kappa * float(np.abs(heights).max())
+        count = settings.terms or _terms_needed(kind, heights, self._max_kappa, self._allowed)
+        _check_size(self.kept.shape, 2 * count)
+        grid = cast(OrderGrid, self.kept)
+        table = AmplitudeTable.build(
+            kind, heights, count, self._max_kappa, lambda a: grid.take(a, 0.5**0.5), self._phase(0.3, 0.8)
+        )
+        with np.errstate(over="ignore", invalid="ignore"):
+            error = self._measured(table)
+        found = (
+            f"{kind}: {count} terms of heights from the {origin}, of a range of {self._range:.3g} µm, err by "
+            f"{error:.2g} of the power, more than the tolerance {self._allowed:.2g}"
+        )
+        if not np.isfinite(error) or (error > self._allowed and settings.terms is None):
+            raise RequestError(
+                f"{found}: in float32 they grow to e^{x:.1f} and cancel; wanted 'chebyshev', or 'slices'"
+            )
+        if error > self._allowed:
+            warnings.warn(found, stacklevel=5)
+        return table, error
+
     def _build(self, storage: _Storage, allowed: float) -> SliceTable:
         intervals = self._intervals(allowed, storage.terms)
         _check_size(self.kept.shape, intervals * storage.terms)
@@ -317,16 +349,35 @@ class _Build:
                 return intervals
             intervals = max(intervals + 1, int(intervals * min(2.0, 0.95 * (error / allowed) ** (1 / terms))))
 
-    def _measured(self, table: SliceTable) -> float:
+    def _measured(self, table: SliceTable | AmplitudeTable) -> float:
         """Return the largest error of S over held-out κ: both ends, and others between, four to an oscillation."""
         count = 12 + int(np.ceil(2 * self._x))
         golden = (np.sqrt(5) - 1) / 2
         held_out = self._max_kappa * np.concatenate([[0.0, 1.0], np.sqrt((np.arange(1, count) * golden) % 1)])
         max_error, report = 0.0, self._phase(0.8, 1.0)
         for number, kappa in enumerate(held_out, 1):
-            max_error = max(max_error, self._exact.error(self.kept, table.powers(kappa), kappa))
+            # NaN is the largest.
+            max_error = float(np.maximum(max_error, self._exact.error(self.kept, table.powers(kappa), kappa)))
             report(number, len(held_out))
         return max_error
+
+
+def _terms_needed(kind: str, heights: NDArray[np.float64], max_kappa: float, allowed: float) -> int:
+    """Return how many terms keep Σ|Δη_m| at κ_max, where the remainder is largest.
+
+    With ΔF the amplitudes of the remainder, Σ|Δη| ≤ 2‖ΔF‖ + ‖ΔF‖², and ‖ΔF‖² is its mean square over the tile.
+    """
+    height = float(np.abs(heights).max())
+    x, u = max_kappa * height, heights / (height or 1.0)
+    limit = 40 + int(3 * x)
+    weights, remainder = series_weights(kind, limit, x), np.exp(1j * x * u)
+    for n in range(limit):
+        size = np.sqrt(np.mean(np.abs(remainder) ** 2))
+        if n and size * (2 + size) <= _MARGIN * (1 - _TRUNCATED_SHARE) * allowed:
+            return n
+        remainder -= weights[n] * series_function(kind, n, u)
+    # Rounding errors of double precision are above it.
+    return limit
 
 
 def _rim(profile: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -82,15 +82,15 @@ class OrderGrid(_Rectangle):
         """Return q_x of the columns and q_y of the rows, cycles/µm."""
         return tuple(m / size for m, size in zip(self.axes(), self.tile_size, strict=True))
 
-    def take(self, powers: NDArray[np.float64]) -> NDArray[np.float64]:
+    def take(self, powers: NDArray, half: float = 0.5) -> NDArray:
         """Select the kept orders, in the order of `axes`, from the powers of all, (N_y, N_x), as of `scipy.fft.fft2`.
 
-        The Nyquist order of an even N has no sign: half of its power goes to each.
+        The Nyquist order of an even N has no sign: each gets `half` of it, of amplitudes √½.
         """
         m_x, m_y = self.axes()
         taken = powers[np.ix_(m_y % powers.shape[0], m_x % powers.shape[1])]
         for lines, m, count in ((taken, m_y, powers.shape[0]), (taken.T, m_x, powers.shape[1])):
-            lines[2 * np.abs(m) == count] *= 0.5
+            lines[2 * np.abs(m) == count] *= half
         return taken
 
     def around(

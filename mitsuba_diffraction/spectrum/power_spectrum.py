@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import RequestError
 from ..settings import Settings, lobe_cutoff, lobe_width, matching
 from .grids import LobeAxis, OrderGrid, SplineGrid
-from .tables import SliceTable
+from .tables import AmplitudeTable, SliceTable
 
 # The part of the tolerance that is spent on the tails of the lobes.
 TAIL_SHARE = 0.4
@@ -41,7 +41,7 @@ class PowerSpectrum:
             reflected power that is comparable to `error`; None of a tile, which is known exactly.
     """
 
-    table: SliceTable
+    table: SliceTable | AmplitudeTable
     grid: OrderGrid | SplineGrid
     settings: Settings
     pixel_size: tuple[float, float]
@@ -101,7 +101,7 @@ class PowerSpectrum:
 
     @property
     def representation(self) -> str:
-        """The storage of the powers, "slices"."""
+        """The storage of the powers: "slices", "taylor" or "chebyshev"."""
         return self.settings.representation
 
     @property

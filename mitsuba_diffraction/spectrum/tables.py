@@ -1,4 +1,4 @@
-"""The powers of all nodes as a function of κ: polynomials on equal intervals, and their rounding."""
+"""The powers of all nodes as a function of κ: polynomials on equal intervals, and their rounding; amplitude series."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
+import scipy.fft
+import scipy.special
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import RequestError
@@ -157,6 +159,113 @@ class SliceTable:
         for power in reversed(range(self.terms)):
             result = result * t + self.values[interval, power, row, column]
         return result
+
+
+@dataclass(frozen=True, eq=False)
+class AmplitudeTable:
+    """η_m(κ) = |Σ_{n<N} c_n(κL) F_nm|², a series of the amplitude e^{iκh} of one tile; F_n = F{p_n(h/L)}, |h| ≤ L.
+
+    - taylor: p_n(u) = uⁿ, c_n(x) = (ix)ⁿ/n!. As the derivatives of e^{ix} have modulus one, the remainder is at most
+      x^N/N! (Lagrange). The terms grow to about e^x before they shrink, and so do rounding errors.
+    - chebyshev: p_n = T_n, c_n(x) = ε_n iⁿ J_n(x) (Jacobi–Anger; ε_0 = 1, else 2). No term is above two; they fall off
+      faster than any power once n > x.
+
+    Attributes:
+        representation: "taylor" or "chebyshev".
+        max_kappa: κ_max in rad/µm.
+        height: L in µm.
+        terms: F_nm, complex64 (N, rows, columns), on the grid.
+    """
+
+    representation: str
+    max_kappa: float
+    height: float
+    terms: NDArray[np.complex64] = field(repr=False)
+
+    def __post_init__(self) -> None:
+        got = self.terms
+        if got.ndim != 3 or 0 in got.shape or got.dtype != np.complex64 or not np.isfinite(got).all():
+            raise RequestError(f"terms: got {got.dtype} {got.shape}, wanted finite complex64 (N, rows, columns)")
+        if not (np.isfinite(self.height) and self.height >= 0):
+            raise RequestError(f"height: got {self.height}, wanted a length ≥ 0 in µm")
+        got.setflags(write=False)
+
+    @classmethod
+    def build(
+        cls,
+        representation: str,
+        heights: NDArray[np.float64],
+        terms: int,
+        max_kappa: float,
+        take: Callable[[NDArray[np.complex128]], NDArray[np.complex128]],
+        progress: Callable[[int, int], None],
+    ) -> AmplitudeTable:
+        """Transform `terms` functions of the heights h, (N_y, N_x) µm; `take` selects the orders of a grid."""
+        height, found = float(np.abs(heights).max()), []
+        for n in range(terms):
+            function = series_function(representation, n, heights / (height or 1.0))
+            found.append(take(scipy.fft.fft2(function, norm="forward")).astype(np.complex64))
+            progress(n + 1, terms)
+        return cls(representation, max_kappa, height, np.stack(found))
+
+    @property
+    def first_interval(self) -> float:
+        """The length of the interval from κ = 0 in which η_m/κ² of m ≠ 0 is nearly a line, rad/µm."""
+        return min(self.max_kappa / 16, 0.5 / max(self.height, 1e-30))
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(rows, columns) of the grid."""
+        return self.terms.shape[1:]
+
+    def content(self) -> list[NDArray]:
+        """Return all that distinguishes the table, as C-contiguous arrays."""
+        return [np.array([self.height]), np.ascontiguousarray(self.terms)]
+
+    @property
+    def nbytes(self) -> int:
+        """Size in memory."""
+        return self.terms.nbytes
+
+    @property
+    def words_per_node(self) -> int:
+        """Words of 32 bits that a renderer reads of a node at one κ: packets of two terms."""
+        return 4 * -(-len(self.terms) // 2)
+
+    def weights(self, kappa: ArrayLike) -> NDArray[np.complex64]:
+        """Return c_n of κ (...) in rad/µm, (..., N)."""
+        x = np.asarray(kappa, np.float64) * self.height
+        return series_weights(self.representation, len(self.terms), x).astype(np.complex64)
+
+    def powers(self, kappa: float) -> NDArray[np.float32]:
+        """Evaluate η_m(κ) of all orders, (rows, columns), in float32 as a renderer computes them; κ in rad/µm."""
+        return _square(np.einsum("n,nyx->yx", self.weights(kappa), self.terms))
+
+    def powers_at(
+        self, row: NDArray[np.int64], column: NDArray[np.int64], kappa: NDArray[np.float64]
+    ) -> NDArray[np.float32]:
+        """Evaluate η_m(κ) of one order and one κ each; all arguments and the result of one shape (...)."""
+        return _square(np.einsum("...n,n...->...", self.weights(kappa), self.terms[:, row, column]))
+
+
+def _square(amplitude: NDArray[np.complex64]) -> NDArray[np.float32]:
+    return amplitude.real**2 + amplitude.imag**2
+
+
+def series_function(representation: str, n: int, u: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Evaluate p_n(u), |u| ≤ 1: uⁿ or T_n."""
+    return u**n if representation == "taylor" else np.cos(n * np.arccos(np.clip(u, -1, 1)))
+
+
+def series_weights(representation: str, terms: int, x: ArrayLike) -> NDArray[np.complex128]:
+    """Evaluate c_n(x), (..., N), for x (...) ≥ 0."""
+    n = np.arange(terms)
+    x = np.asarray(x, np.float64)[..., None]
+    if representation == "taylor":
+        size = np.cumprod(np.where(n == 0, 1.0, x / np.maximum(n, 1)), axis=-1)
+    else:
+        size = np.where(n == 0, 1, 2) * scipy.special.jv(n, x)
+    return size * np.array([1, 1j, -1, -1j])[n % 4]
 
 
 HALF_SCALE = 2.0**14  # of numbers in half precision: the largest are just under 4, the least 4e-9

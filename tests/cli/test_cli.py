@@ -71,7 +71,9 @@ def files():
         ("precompute blaze.toml --extent ribbon", "extent: got 'ribbon', wanted 'tile' or 'sample'"),
         ("precompute blaze.toml --largest-angle 91", "largest_angle: got 91"),
         ("precompute blaze.toml --largest-angle steep", "--largest-angle"),
-        ("precompute deep.toml --representation taylor", "representation: got 'taylor', wanted one of auto, slices"),
+        ("precompute deep.toml --representation taylor", "of a range of 4.92 µm"),
+        ("precompute blaze.toml --terms 20", "terms: got 20 with representation 'auto', wanted it with a series"),
+        ("precompute blaze.toml --representation taylor --terms 20.5", "--terms"),
         ("precompute scan.npy --pixel-size 0.05 --extent sample", "wanted at least 4 pixels (0.2 µm)"),
         ("precompute blaze.toml --pixel-size 0.1", "--pixel-size"),
         ("precompute blaze.toml --fill-missing", "--fill-missing go with a scan; the recipe blaze.toml"),
@@ -212,6 +214,15 @@ def test_options_override_the_recipe(command):
     assert code == 0
     spectrum = md.GratingSpectrum.load("out.exr")
     assert (spectrum.tolerance, spectrum.coherence_length) == (0.02, 20.0)
+
+
+def test_precompute_takes_a_series_by_options(command):
+    code, out, err = command("precompute blaze.toml -o out.exr --representation taylor --terms 6 --heights-from lowest")
+    assert code == 0
+    assert err.startswith("mitsuba-diffraction: warning: taylor: 6 terms of heights from the lowest")
+    settings = md.GratingSpectrum.load("out.exr").settings
+    assert (settings.representation, settings.terms, settings.heights_from) == ("taylor", 6, "lowest")
+    assert "taylor" in out
 
 
 def test_scans_are_read_with_their_scale(command):

@@ -62,8 +62,8 @@ def closed_form(power, period, omega, wavelength, side):
             wo = np.array([*t, sign * np.sqrt(1 - t @ t)])
             kappa = 2 * np.pi * (n_i * wi[2] + n * wo[2]) / wavelength
             if sign == side:
-                d = 1 + wi @ wo
-                factor = k_g(abs(wi[2]), abs(wo[2]), (tangent @ tangent) / n_i**2) * reflectance(np.sqrt(d / 2), n_o / n_i)
+                factor = k_g(abs(wi[2]), abs(wo[2]), (tangent @ tangent) / n_i**2)
+                factor *= reflectance(np.sqrt((1 + wi @ wo) / 2), n_o / n_i)
             else:
                 factor = pair(wi, wo, n_i, n_o)
             total[int(sign != side)] += factor * power(m, kappa)

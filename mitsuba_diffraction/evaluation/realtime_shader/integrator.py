@@ -121,10 +121,9 @@ def define() -> type:
             medium: mi.Medium | None = None,
             active: mi.Bool = True,
         ) -> tuple[mi.Spectrum, mi.Bool, list[mi.Float]]:
-            # In vectorised variants this runs once per picture: lights and materials may have changed since the last.
+            # This runs once per picture: lights and materials may have changed since the last.
             # (Overriding `render` and calling that of Mitsuba would leave its Ctrl-C handler installed.)
-            if dr.is_jit_v(mi.Float):
-                self.prepare(scene)
+            self.prepare(scene)
             rgb, radiance, active = self.shade(scene, ray, active)
             radiance += self.emission(rgb, ray.wavelengths, active)
             return mi.depolarizer(radiance), active, []
