@@ -78,7 +78,7 @@ class Interface:
             the smallest κ of the undiffracted order of the heights as they are; rad/µm. None of rigorous theory, whose
             tables are read at q whatever the sign of κ, and hold the flat face of a sheet; and in reflection.
         fraction: of light that is transmitted, for a direction along the pattern's axes, where orders are drawn from an
-            `OrderTable`; None of rigorous theory and where orders overlap, for which that of a plane serves.
+            `OrderSampler`; None of rigorous theory and where orders overlap, for which that of a plane serves.
     """
 
     def __init__(

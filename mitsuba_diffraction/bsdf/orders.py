@@ -1,11 +1,4 @@
-"""S(q; κ) of a tile at run time: the few orders near q, their powers and lobes, and how an order is drawn.
-
-P_m = Σ_j w_j A_jm / Σ_j w_j M_j is a mixture over κ (`KappaCells`), restricted to the rectangle of orders around those
-that propagate: light on other orders goes nowhere, and at grazing incidence most of the mixture would lie there. M_j is
-the sum of A_jm over the rectangle. A one-row grating has the exact interval: with s the direction of incidence,
-
-    |m_x/T_x + s_x/λ| ≤ √(1/λ² − s_y²/λ²)
-"""
+"""S(q; κ) of a tile at run time: the few orders near q, their powers and lobes, and how q is drawn."""
 
 from __future__ import annotations
 
@@ -16,7 +9,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import scipy.special
-from numpy.typing import NDArray
 
 from ..grating_spectrum import GratingSpectrum
 from ..spectrum.grids import LobeAxis
@@ -24,7 +16,7 @@ from ..spectrum.tables import HALF_SCALE, AmplitudeTable, SliceTable, shared_exp
 from .cell_sampler import LOBE, CellAxis, CellSampler
 from .geometry import Geometry, Incidence
 from .inversion import CELLS, KappaCells, averages, choose, search, sums_before, truncated_gaussian
-from .order_table import WHOLE, OrderTable
+from .order_sampler import OrderSampler
 from .tables import (
     HalfTable,
     PacketTable,
@@ -277,119 +269,7 @@ def _hermite(
     return low + t * (low_slope + t * (square + t * cube)), low_slope + t * (2 * square + t * 3 * cube)
 
 
-FLOOR = 0.05  # the share of each κ cell that all orders have alike
-MAX_TABLE = 2**19  # packets (8 MB); where the sums over rectangles take more, all orders can be drawn
-
-
-class OrderSampler:
-    """Draws orders by two binary searches; P_m of a given order reads one packet of four floats.
-
-    The A_jm are whole numbers of units 2⁻²⁴, so that sums over rectangles are exact: the probability of what is drawn
-    is the probability that is reported.
-    """
-
-    def __init__(self, spectrum: GratingSpectrum) -> None:
-        self.cells = KappaCells(spectrum.max_kappa)
-        self.rows, self.columns = spectrum.grid.shape
-        self.max_order_x, self.max_order_y = spectrum.grid.max_order
-        self.tile_x, self.tile_y = (opaque(t) for t in spectrum.grid.tile_size)
-        self.restricted = (self.max_order_x + 1) ** 2 * (self.rows + 1) <= MAX_TABLE
-        units = np.stack([_units(average) for average in averages(spectrum, self.cells, FLOOR)], axis=-1)
-        self.shares = PacketTable(units)
-        # The sums of A_j over the columns before x, for each row.
-        before_x = np.zeros((self.rows, self.columns + 1, CELLS), np.int64)
-        before_x[:, 1:] = units.cumsum(axis=1)
-        self.before_x = PacketTable(before_x)
-        # The sums of A_j over the rows before y, for each first column and each end of the columns.
-        first, end = np.arange(self.max_order_x + 1), np.arange(self.max_order_x + 1, self.columns + 1)
-        if not self.restricted:
-            first, end = first[:1], end[-1:]
-        before_y = np.zeros((len(first), len(end), self.rows + 1, CELLS), np.int64)
-        for index, column in enumerate(first):
-            before_y[index, :, 1:] = np.moveaxis((before_x[:, end] - before_x[:, [column]]).cumsum(axis=0), 1, 0)
-        self.before_y = PacketTable(before_y)
-
-    def rectangle(self, incidence: Incidence) -> tuple[mi.Int32, mi.Int32, mi.Int32, mi.Int32]:
-        """Return the first row, the end of the rows, the first column, the end of the columns."""
-        if not self.restricted:
-            return mi.Int32(0), mi.Int32(self.rows), mi.Int32(0), mi.Int32(self.columns)
-        s_x, s_y = incidence.tangent * incidence.frequency
-        rows = self._interval(s_y, s_x, self.columns, incidence.radius, self.tile_y, self.max_order_y)
-        columns = self._interval(s_x, s_y, self.rows, incidence.radius, self.tile_x, self.max_order_x)
-        return *rows, *columns
-
-    def _interval(
-        self, along: mi.Float, across: mi.Float, lines: int, radius: mi.Float, tile: mi.Float, max_order: int
-    ) -> tuple[mi.Int32, mi.Int32]:
-        """Return the orders |m/T + s/λ| ≤ ρ along one axis, of which there are `lines` side by side: first and end."""
-        if max_order == 0:
-            return mi.Int32(0), mi.Int32(1)
-        half = radius
-        if lines == 1:
-            half = dr.safe_sqrt(dr.square(radius) - dr.square(across))
-        first = mi.Int32(dr.ceil((-along - half) * tile))
-        last = mi.Int32(dr.floor((half - along) * tile))
-        # The mirror order m = 0 is always among them.
-        return dr.clip(first, -max_order, 0) + max_order, dr.clip(last, 0, max_order) + (max_order + 1)
-
-    def _start(self, left: mi.Int32, right: mi.Int32) -> mi.Int32:
-        """Return where the sums over the rows begin in their table."""
-        if not self.restricted:
-            return mi.Int32(0)
-        return (left * (self.max_order_x + 1) + right - (self.max_order_x + 1)) * (self.rows + 1)
-
-    def _masses(self, bottom: mi.Int32, top: mi.Int32, start: mi.Int32, active: mi.Bool) -> mi.Vector4f:
-        """Return M_j in units."""
-        masses = self.before_y(mi.UInt32(start + top), active)
-        return masses - self.before_y(mi.UInt32(start + bottom), active) if self.rows > 1 else masses
-
-    def share(self, m_x: mi.Int32, m_y: mi.Int32, incidence: Incidence, active: mi.Bool) -> mi.Float:
-        """Return P_m of an order that is among those of the rectangle, for one wavelength."""
-        bottom, top, left, right = self.rectangle(incidence)
-        weights = self.cells.weights(incidence)
-        total = dr.dot(weights, self._masses(bottom, top, self._start(left, right), active))
-        order = mi.UInt32((m_y + self.max_order_y) * self.columns + m_x + self.max_order_x)
-        return dr.dot(self.shares(order, active), weights) * dr.rcp(larger(total, 1e-7))
-
-    def sample(
-        self,
-        incidence: Incidence,
-        u: mi.Float,
-        v: mi.Point2f,
-        active: mi.Bool,
-    ) -> tuple[mi.Int32, mi.Int32, mi.Point2f]:
-        """Draw an order for one wavelength.
-
-        κ cell and row come from `u`, the column from `v` where there are several rows.
-
-        Returns:
-            The order, and what is left of `v`: two numbers uniform in [0, 1).
-        """
-        bottom, top, left, right = self.rectangle(incidence)
-        start = self._start(left, right)
-        cell, u = choose(self.cells.weights(incidence) * self._masses(bottom, top, start, active), u)
-
-        def before_y(y: mi.Int32) -> mi.Float:
-            return self.before_y.entry(mi.UInt32(start + y), cell, active)
-
-        def before_x(x: mi.Int32) -> mi.Float:
-            return self.before_x.entry(mi.UInt32(row * (self.columns + 1) + x), cell, active)
-
-        if self.rows == 1:
-            row = mi.Int32(0)
-            column, _ = search(before_x, left, right, self.columns, u)
-        else:
-            row, _ = search(before_y, bottom, top, self.rows, u)
-            column, rest = search(before_x, left, right, self.columns, v.x)
-            v = mi.Point2f(rest, v.y)
-        return column - self.max_order_x, row - self.max_order_y, v
-
-
-def _units(average: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return A_jm of one κ cell in units of 2⁻²⁴: at least one, no more than 2²⁴ together."""
-    return 1 + np.floor(average * (WHOLE - average.size)).astype(np.int64)
-
-
+UNIFORM_FRACTION = 0.05  # of each κ cell of a line grating, that all orders have alike
 WIDEST = 0.5  # σ_q: cells are no wider
 SCALE = 1.7  # τ in σ_q: ∫ N²/F′ dq is least, 1.04
 
@@ -419,7 +299,7 @@ class LineSampler:
             axis.max_cell,
             len(axis.shares),
         )
-        shares = axis.shares @ averages(spectrum, self.cells, FLOOR).reshape(CELLS, -1).T
+        shares = axis.shares @ averages(spectrum, self.cells, UNIFORM_FRACTION).reshape(CELLS, -1).T
         self.shares = ShareTable(np.maximum(shares, 0))
         # The sums of A_j over the cells before each.
         self.before = PacketTable(sums_before(np.float64(self.shares.values)))
@@ -503,8 +383,8 @@ class OrderSpectrum:
 
     N ends as `OrderGrid.lobes` says. Resolved orders need one of them, so that one evaluation reads
     `SlicePower` once; a tile as large as the coherence length needs 4 × 4. The density is Σ_m P_m N(q − m/T) with the
-    P_m of `OrderSampler` or, where light passes, of an `OrderTable`; where orders overlap, that of `CellSampler`. For a
-    line grating whose orders overlap or are wide, it is that of `LineSampler`.
+    P_m of an `OrderSampler`, which needs the media and scales of a scene; where orders overlap, that of `CellSampler`.
+    For a line grating whose orders overlap or are wide, it is that of `LineSampler`.
 
     Lobes of resolved orders may be scaled.
     """
@@ -522,12 +402,11 @@ class OrderSpectrum:
         self.cells = None
         if not self.resolved:
             self.cells = LineSampler(spectrum, most) if line else CellSampler(spectrum, most, farthest)
-        # Where light passes, orders are drawn from an `OrderTable`, which needs the scales of a scene.
-        self.orders = OrderSampler(spectrum) if self.resolved and most is None else None
+        self.orders: OrderSampler | None = None
         self.line = line
         self.per_width = opaque(1 / sigma)
 
-    def drawn_from(self, orders: OrderTable) -> OrderSpectrum:
+    def drawn_from(self, orders: OrderSampler) -> OrderSpectrum:
         """Return the same spectrum, of which orders are drawn from a table."""
         result = copy.copy(self)
         result.orders = orders
@@ -570,10 +449,11 @@ class OrderSpectrum:
             tangent = self._tangent(m_x, m_y, incidence.wavelength)
             factor = geometry.order_factor(tangent, incidence, per_width)
             windows = [(0, 0, lobes_x, lobes_y, geometry.order_kappa(tangent, incidence))]
-            share = self.orders.share(mi.Int32(mirrored) * m_x, mi.Int32(mirrored) * m_y, incidence, active)
+            m = (mi.Int32(mirrored) * m_x, mi.Int32(mirrored) * m_y)
+            probability = self.orders.probability(*m, incidence, active)
             # An order that does not propagate is not drawn.
             there = incidence.propagates(mirrored * tangent)
-            density = dr.select(there, share * lobes_x[0] * lobes_y[0], 0)
+            density = dr.select(there, probability * lobes_x[0] * lobes_y[0], 0)
         else:
             density = self.cells.density(mirrored * q, incidence, active)
             if self.line:

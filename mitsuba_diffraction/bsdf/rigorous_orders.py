@@ -16,7 +16,7 @@ from ..rigorous.efficiencies import ODD, REVERSED
 from ..rigorous.spectrum import RigorousSpectrum
 from .geometry import Geometry, Incidence, cell_of
 from .inversion import search, truncated_gaussian
-from .order_table import WHOLE
+from .order_sampler import WHOLE
 from .tables import NumberTable, PacketTable, larger, limited, opaque, smaller
 
 CELLS = 8  # of the sampler to each unit of P and R

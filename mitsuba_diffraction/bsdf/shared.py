@@ -15,7 +15,7 @@ from ..rigorous.spectrum import RigorousSpectrum
 from ..settings import VISIBLE
 from ..spectrum.grids import OrderGrid
 from .energy import Energy
-from .order_table import OrderTable
+from .order_sampler import OrderSampler
 from .orders import OrderSpectrum
 from .rigorous_orders import RigorousOrders
 from .scales import Scales
@@ -44,7 +44,7 @@ class SharedTables:
             self.scattering = represented(spectrum, *([] if eta is None else passing(eta)))
         self._spectrum, self._eta = spectrum, eta
         self._last: tuple[tuple, Energy | None] | None = None
-        self._orders: tuple[tuple, OrderTable] | None = None
+        self._orders: tuple[tuple, OrderSampler] | None = None
         self._lock = threading.Lock()
 
     @classmethod
@@ -62,16 +62,16 @@ class SharedTables:
                 tables = _shared[key] = cls(spectrum, eta)
             return tables
 
-    def order_table(self, is_sheet: bool, scales: Scales) -> OrderTable | None:
-        """Return the table from which orders are drawn where light passes; None where they overlap."""
+    def order_sampler(self, scales: Scales, is_sheet: bool = False, coat_index: float = 1.0) -> OrderSampler | None:
+        """Return the sampler of orders for the media and scales of a scene; None where orders overlap."""
         if not self.scattering.resolved:
             return None
         low, high = scales.ratios()
         ratios = np.linspace(low, high, 1 if low == high else SAMPLED_RATIOS)
-        key = is_sheet, ratios.tolist(), scales.min_lateral
+        key = is_sheet, coat_index, ratios.tolist(), scales.min_lateral
         with self._lock:
             if self._orders is None or self._orders[0] != key:
-                self._orders = key, OrderTable(self._spectrum, self._eta, *key)
+                self._orders = key, OrderSampler(self._spectrum, self._eta, *key)
             return self._orders[1]
 
     def energy(self, scales: Scales) -> Energy | None:

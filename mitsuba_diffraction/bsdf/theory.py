@@ -21,7 +21,7 @@ from .coat import SAME_INDEX, Coat
 from .energy import Coordinates
 from .geometry import Geometry, Incidence, Interface, turned
 from .media import Media
-from .order_table import CHANGE
+from .order_sampler import CHANGE
 from .polarisation import Split, of_interface, of_orders, of_plane, unpolarised
 from .reflectance import Conductor, Dielectric, PerfectMirror, reflectance_from
 from .scales import Scales
@@ -225,14 +225,14 @@ class ScalarTheory:
 
     def _interface(self) -> Interface:
         """Return the media above and below, with orders drawn for the scales and the index as they are."""
-        if self.media.eta is None:
-            return Interface(1.0 if self.media.coat is None else self.media.coat.eta)
-        kappas = tuple(opaque(kappa) for kappa in small_kappas(self.spectrum, self.media.eta))
-        is_sheet = self.media.transmission == "sheet"
-        share, orders = None, self.tables.order_table(is_sheet, self.scales)
-        if orders is not None:
-            self.scattering, share = self.tables.scattering.drawn_from(orders), orders.transmitted
-        return Interface(eta=self.material.eta, is_sheet=is_sheet, kappas=kappas, fraction=share)
+        coat, eta, is_sheet = self.media.coat, self.media.eta, self.media.transmission == "sheet"
+        sampler = self.tables.order_sampler(self.scales, is_sheet, 1.0 if coat is None else coat.relative)
+        if sampler is not None:
+            self.scattering = self.tables.scattering.drawn_from(sampler)
+        if eta is None:
+            return Interface(1.0 if coat is None else coat.eta)
+        kappas = tuple(opaque(kappa) for kappa in small_kappas(self.spectrum, eta))
+        return Interface(1.0, self.material.eta, is_sheet, kappas, sampler and sampler.transmitted)
 
     def parameters_changed(self, keys: list[str]) -> None:
         """Recompute what depends on the parameters `keys`; on all of them if none is named."""

@@ -12,7 +12,7 @@ from bsdf_support import check_chi_square, direction, interaction, use, vectors
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction.bsdf.geometry import Geometry, Incidence, Interface
-from mitsuba_diffraction.bsdf.order_table import OrderTable
+from mitsuba_diffraction.bsdf.order_sampler import OrderSampler
 
 PERIOD, ETA, WAVELENGTH = 3.35, 1.5, 0.5
 IMPORTANCE = mi.TransportMode.Importance
@@ -202,14 +202,16 @@ def test_samples_of_light_from_above_have_weights_alike(profile, kind, theta):
 @pytest.mark.parametrize("profile", ["film", "transmission_300"])
 def test_orders_on_either_side_are_drawn_with_their_shares(profile, theta, is_sheet, above, reflects):
     spectrum = md.precompute(md.gratings.PROFILES[profile](), wavelengths=(240.0, 830.0), tolerance=0.01)
-    table = OrderTable(spectrum, ETA, is_sheet)
+    table = OrderSampler(spectrum, ETA, is_sheet)
     kappas = mi.Float(1.0), mi.Float(1.0)
     interface = Interface(eta=mi.Float(ETA), is_sheet=is_sheet, kappas=kappas, fraction=table.transmitted)
     k_i = interface.wave_vector(vectors(towards(theta, 20, 1 if above else -1)))
     k_o = interface.scattered(k_i, mi.Bool(reflects))
     incidence = Incidence.of(k_i, k_o, interface).at(mi.Float(WAVELENGTH))
     m_x, m_y = np.meshgrid(*spectrum.grid.axes())
-    share = np.array(table.share(mi.Int32(m_x.ravel()), mi.Int32(m_y.ravel()), incidence, mi.Bool(True)), np.float64)
+    share = np.array(
+        table.probability(mi.Int32(m_x.ravel()), mi.Int32(m_y.ravel()), incidence, mi.Bool(True)), np.float64
+    )
     assert share.sum() == pytest.approx(1, abs=1e-6)
     count = 1 << 18
     u = mi.Float(np.random.default_rng(2).random(count).astype(np.float32))
@@ -282,7 +284,7 @@ def test_other_parameters_leave_tables_of_varying_scales(monkeypatch):
     heights = {"type": "checkerboard", "color0": 0.5, "color1": 1.0}
     parameters = mi.traverse(passing("interface", height_scale=heights))
     monkeypatch.setattr("mitsuba_diffraction.bsdf.shared.EnergyTable.of", None)
-    monkeypatch.setattr("mitsuba_diffraction.bsdf.shared.OrderTable", None)
+    monkeypatch.setattr("mitsuba_diffraction.bsdf.shared.OrderSampler", None)
     parameters["orientation.value"] = 30.0
     parameters.update()
 

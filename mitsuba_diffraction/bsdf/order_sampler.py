@@ -1,12 +1,10 @@
-"""An order of light that is reflected by an interface or passes it, drawn from a table over ω_i and 1/λ.
+"""An order drawn from a table over ω_i and 1/λ, where orders do not overlap.
 
-From direction to direction orders of transmitted light differ by far more than those of a mirror: κ is small, K varies
-as 1/κ², and 1 − F falls to zero where facets reflect totally. So P_m of each cell follows the powers of the orders that
-`energy/furnace.py` finds at places in the cell,
+In each bin the probability P_m follows the powers of the orders that `energy/furnace.py` finds at points of the bin,
 
     P_m ∝ √⟨η_m²⟩
 
-the density for which the variance of what is drawn is least. Directions have the square of `energy/table.py`.
+the density for which the variance of a sample is least. Directions have the square of `energy/table.py`.
 """
 
 from __future__ import annotations
@@ -29,96 +27,105 @@ from .inversion import search
 from .tables import NumberTable, PacketTable, larger, opaque
 
 WHOLE = 2**24  # a float32 holds whole numbers up to here
-FLOOR = 0.02  # the share of each cell that all its orders have alike
-# Of the table, about, times √ranges of heights: of a sheet, where more would only fill the cache, and of an interface,
-# since from inside, where waves are shorter, orders change faster with direction.
-ENTRIES_SHEET, ENTRIES = 4e5, 1e6
-# Radians by which the phase of the deepest point may change within a cell, by reflection from above: of line gratings,
-# which have few orders, and of others; and between the places in a cell, for either kind of light.
-TURN_LINES, TURN, STEP = 2.0, 4.0, 2.5
-SLICES = 4, 10  # cells of 1/λ, at least and at most
-SIDES = 4, 96  # cells along the square of directions, likewise
-FINE = 64  # of the share that passes
+UNIFORM_FRACTION = 0.05  # of the probability in a bin, that all its orders have alike
+# Numbers of a table, about, times √ranges of heights and for each way of light: more would only fill the cache; of an
+# interface more, since from inside, where waves are shorter, orders change faster with direction.
+ENTRIES, ENTRIES_OF_INTERFACE = 1e5, 2.5e5
+# Radians by which the phase of the deepest point may change within a bin, by reflection from above: of line gratings,
+# which have few orders, and of others; and between the points of a bin.
+MAX_PHASE_OF_LINES, MAX_PHASE, MAX_PHASE_OF_POINTS = 2.0, 4.0, 2.5
+SLICES = 4, 10  # bins of 1/λ: minimum and maximum
+SIDES = 4, 96  # bins along the square of directions, likewise
+FRACTION_BINS = 64  # of the transmitted fraction, along the square
 CHANGE = 0.01  # of η, relative to η − 1, for which a table serves
 
 
-class OrderTable:
-    """P_m of light from either side to either side, in cells: (scale of heights, from, to, 1/λ, row, column of ω_i).
+class OrderSampler:
+    """P_m of light from either side to either side, in bins: (scale of heights, from, to, 1/λ, row, column of ω_i).
 
     Attributes:
-        before: Σ P of the orders before each of the rectangle that propagates in a cell, in units of 2⁻²⁴.
-        cells: of each the start in `before`, first column and row among all orders, and columns + 2¹⁶ rows.
-        counts: cells along the slices and along the square, as arrays: tables of other heights have others.
-        shares: T e_T/(R e_R + T e_T) in finer cells of directions, from above and from below.
+        before: Σ P of the orders before each of the rectangle that propagates in a bin, in units of 2⁻²⁴.
+        bins: of each the start in `before`, first column and row among all orders, and columns + 2¹⁶ rows.
+        counts: bins along the slices and along the square, as arrays: tables of other heights have others.
+        fractions: T e_T/(R e_R + T e_T) in finer bins of directions, from above and from below.
     """
 
     def __init__(
         self,
         spectrum: GratingSpectrum,
-        eta: float,
-        is_sheet: bool,
+        eta: float | None = None,
+        is_sheet: bool = False,
+        coat_index: float = 1.0,
         height_scales: Sequence[float] = (1.0,),
-        lateral_scale: float = 1.0,
+        min_lateral_scale: float = 1.0,
     ) -> None:
         """Make the table.
 
         Args:
-            spectrum: its wavelengths are those in the denser medium.
-            eta: index below relative to that above.
-            is_sheet: there is a flat face below, and beyond it the medium above once more.
-            height_scales: times the heights, ascending; there are cells between one and the next.
-            lateral_scale: times the lengths along the surface, the least, of which heights are in units.
+            spectrum: its wavelengths are those in the densest medium next to the relief.
+            eta: index below relative to that above; None if nothing is transmitted.
+            is_sheet: there is a flat face below, with the upper medium below it.
+            coat_index: of a layer over the relief, relative to the outside.
+            height_scales: times the heights, ascending; there are bins between one and the next.
+            min_lateral_scale: times the lengths along the surface, of which heights are in units.
         """
         grid = spectrum.grid
-        self.eta, self.is_sheet = eta, is_sheet
+        self.transmits, self.is_sheet = eta is not None, is_sheet
+        self.eta, self.coat_index = eta or 1.0, coat_index
         self.tile, self.max_order = np.array(grid.tile_size), np.array(grid.max_order)
-        first, last = frequencies_of(spectrum, eta)
-        first *= min(lateral_scale, 1)
+        first, last = (frequency / coat_index for frequency in frequencies_of(spectrum, eta))
+        first *= min(min_lateral_scale, 1)
+        sides = (True, False) if self.transmits else (True,)
         turn = 4 * np.pi * spectrum.height_range * float(np.mean(height_scales)) * (last - first)
-        self.slices = int(np.clip(turn / (TURN_LINES if 0 in grid.max_order else TURN), *SLICES))
-        orders = np.minimum((1 + eta) * self.tile * (first + last) / 2, 2 * self.max_order) + 1
+        max_phase = MAX_PHASE_OF_LINES if 0 in grid.max_order else MAX_PHASE
+        self.slices = int(np.clip(turn * coat_index / max_phase, *SLICES))
+        orders = np.minimum((1 + self.eta) * self.tile * (first + last) / 2, 2 * self.max_order) + 1
         ranges = list(itertools.pairwise(height_scales)) or [tuple(height_scales)]
-        entries = (ENTRIES_SHEET if is_sheet else ENTRIES) / (4 * np.sqrt(len(ranges)) * self.slices * orders.prod())
-        self.side = int(np.clip(np.sqrt(entries), *SIDES))
+        entries = ENTRIES_OF_INTERFACE if self.transmits and not is_sheet else ENTRIES
+        self.side = int(np.clip(np.sqrt(entries / (np.sqrt(len(ranges)) * self.slices * orders.prod())), *SIDES))
         self.layout = Layout(0.0, 1, self.side, 1, self.slices + 1, (first, last))
-        sums, cells, shares, start = [], [], [], 0
-        for scales, above in itertools.product(ranges, (True, False)):
+        sums, bins, fractions, start = [], [], [], 0
+        for scales, above in itertools.product(ranges, sides):
             furnaces = [Furnace.of(spectrum, scale, eta, 1 if above else -1) for scale in scales]
             sent = []
-            for reflects in (True, False):
-                index = self._indices(above)[0] if reflects else abs(eta - 1)
-                steps = 1 + int(turn * index / (self.slices * STEP))
-                places = [k / steps for k in range(self.slices * steps + 1)]
-                squares = [self._squares(furnaces, above, reflects, place) for place in places]
+            for reflects in sides:
+                index = self._indices(above)[0] if reflects else abs(self.eta - 1)
+                steps = 1 + int(turn * index / (self.slices * MAX_PHASE_OF_POINTS))
+                points = [k / steps for k in range(self.slices * steps + 1)]
+                squares = [self._squares(furnaces, above, reflects, point) for point in points]
                 sent.append(np.sqrt(np.mean(squares, axis=0)).sum((-1, -2)).ravel())
                 for slice_ in range(self.slices):
                     within = sum(squares[slice_ * steps : (slice_ + 1) * steps + 1])
                     corner, size = self._rectangles(above, reflects, slice_)
-                    of_cells, starts = _packed(_of_corners(within), corner, size)
-                    sums.append(of_cells)
-                    cells.append(np.stack([start + starts, *corner.T, size[:, 0] + (size[:, 1] << 16)], -1))
-                    start += len(of_cells)
+                    of_bins, starts = _packed(_of_corners(within), corner, size)
+                    sums.append(of_bins)
+                    bins.append(np.stack([start + starts, *corner.T, size[:, 0] + (size[:, 1] << 16)], -1))
+                    start += len(of_bins)
+            if not self.transmits:
+                continue
             # E of a wavelength in the middle.
             omega, wavelengths = self._nodes(self.slices / 2)
             albedo = furnaces[0].albedo(self._inside(omega, above), wavelengths / self._indices(above)[0])
-            reflected, passed = np.array(sent) * bounds_of(albedo, furnaces[0].index)
-            share = (passed / np.maximum(reflected + passed, 1e-30)).reshape(self.side + 1, -1)
-            shares.append(map_coordinates(share, (np.indices((FINE, FINE)) + 0.5) * (self.side / FINE), order=1))
-        shares = np.mean(np.reshape(shares, (len(ranges), 2, FINE, FINE)), axis=0)
-        self.before, self.shares = NumberTable(np.concatenate(sums)), NumberTable(shares)
-        self.cells = PacketTable(np.concatenate(cells).astype(np.uint32))
+            reflected, transmitted = np.array(sent) * bounds_of(albedo, furnaces[0].index)
+            fraction = (transmitted / np.maximum(reflected + transmitted, 1e-30)).reshape(self.side + 1, -1)
+            middles = (np.indices((FRACTION_BINS, FRACTION_BINS)) + 0.5) * (self.side / FRACTION_BINS)
+            fractions.append(map_coordinates(fraction, middles, order=1))
+        self.before = NumberTable(np.concatenate(sums))
+        self.bins = PacketTable(np.concatenate(bins).astype(np.uint32))
+        if self.transmits:
+            self.fractions = NumberTable(np.reshape(fractions, (len(ranges), 2, *middles.shape[1:])).mean(axis=0))
         self.counts = opaque(self.slices), opaque(self.side)
         self.edges = [opaque(scale) for scale in height_scales[1:-1]]
         self.first, self.per_slice = opaque(first), opaque(self.slices / (last - first))
 
     def _indices(self, above: bool) -> tuple[float, float]:
         """Return n next to the relief and outside, on one side of it."""
-        return (1.0, 1.0) if above else (self.eta, 1.0 if self.is_sheet else self.eta)
+        return (self.coat_index, 1.0) if above else (self.eta, 1.0 if self.is_sheet else self.eta)
 
-    def _nodes(self, place: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the directions at the nodes of the square, outside, and λ above in µm, at a place along the slices."""
+    def _nodes(self, slice_: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the directions at the nodes of the square, outside, and λ above in µm, at a coordinate of slices."""
         nodes = np.indices((1, self.side + 1, self.side + 1)).reshape(3, -1).T.astype(np.float64)
-        nodes[:, 0] = place
+        nodes[:, 0] = slice_
         return self.layout.directions(nodes)
 
     def _inside(self, omega: NDArray[np.float64], above: bool) -> NDArray[np.float64]:
@@ -127,10 +134,10 @@ class OrderTable:
         tangent = omega[:, :2] * (outside / inside)
         return np.column_stack([tangent, np.sqrt(np.maximum(1 - (tangent**2).sum(-1), 1e-12))])
 
-    def _squares(self, furnaces: Sequence[Furnace], above: bool, reflects: bool, place: float) -> NDArray[np.floating]:
+    def _squares(self, furnaces: Sequence[Furnace], above: bool, reflects: bool, slice_: float) -> NDArray[np.floating]:
         """Compute η_m² at the nodes of directions, the mean over scales of heights: (rows, columns, orders, orders)."""
         (inside, outside), goes_below = self._indices(above), above != reflects
-        omega, wavelengths = self._nodes(place)
+        omega, wavelengths = self._nodes(slice_)
         result = np.zeros((len(omega), *(2 * self.max_order[::-1] + 1)), np.float32)
         for furnace in furnaces:
             powers = np.zeros_like(result)
@@ -170,23 +177,25 @@ class OrderTable:
         last = np.clip(np.floor(last.max(1)), -self.max_order, self.max_order).astype(np.int64)
         return first + self.max_order, last - first + 1
 
-    def _cell(self, incidence: Incidence, active: mi.Bool) -> tuple[mi.UInt32, mi.Int32, mi.Int32, mi.Int32, mi.Int32]:
-        """Return where the sums of a cell begin, its first order along x and y, and its columns and rows."""
+    def _bin(self, incidence: Incidence, active: mi.Bool) -> tuple[mi.UInt32, mi.Int32, mi.Int32, mi.Int32, mi.Int32]:
+        """Return where the sums of a bin begin, its first order along x and y, and its columns and rows."""
         max_x, max_y = map(int, self.max_order)
         slices, side = self.counts
         tangent = incidence.tangent / incidence.index
         column, row = _direction(mi.Vector3f(*tangent, dr.safe_sqrt(1 - dr.squared_norm(tangent))), side)
         slice_, _ = cell_of((incidence.frequency - self.first) * self.per_slice, slices)
-        way = dr.select(incidence.above, mi.UInt32(0), 2) + dr.select(incidence.reflects, mi.UInt32(0), 1)
+        way, ways = mi.UInt32(0), 4 if self.transmits else 1
+        if self.transmits:
+            way = dr.select(incidence.above, mi.UInt32(0), 2) + dr.select(incidence.reflects, mi.UInt32(0), 1)
         if self.edges:
-            way += sum(dr.select(incidence.height_scale > edge, mi.UInt32(4), 0) for edge in self.edges)
-        cell = ((way * mi.UInt32(slices) + slice_) * mi.UInt32(side) + row) * mi.UInt32(side) + column
-        start, x, y, size = self.cells(cell, active)
+            way += sum(dr.select(incidence.height_scale > edge, mi.UInt32(ways), 0) for edge in self.edges)
+        index = ((way * mi.UInt32(slices) + slice_) * mi.UInt32(side) + row) * mi.UInt32(side) + column
+        start, x, y, size = self.bins(index, active)
         return start, mi.Int32(x) - max_x, mi.Int32(y) - max_y, mi.Int32(size & 0xFFFF), mi.Int32(size >> 16)
 
-    def share(self, m_x: mi.Int32, m_y: mi.Int32, incidence: Incidence, active: mi.Bool) -> mi.Float:
+    def probability(self, m_x: mi.Int32, m_y: mi.Int32, incidence: Incidence, active: mi.Bool) -> mi.Float:
         """Return P_m for one wavelength."""
-        start, first_x, first_y, columns, rows = self._cell(incidence, active)
+        start, first_x, first_y, columns, rows = self._bin(incidence, active)
         column, row = m_x - first_x, m_y - first_y
         active = active & (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
         order = start + mi.UInt32(row * columns + column)
@@ -195,8 +204,8 @@ class OrderTable:
     def sample(
         self, incidence: Incidence, u: mi.Float, v: mi.Point2f, active: mi.Bool
     ) -> tuple[mi.Int32, mi.Int32, mi.Point2f]:
-        """Draw an order for one wavelength, as `orders.OrderSampler`, from `u` alone."""
-        start, first_x, first_y, columns, rows = self._cell(incidence, active)
+        """Draw an order for one wavelength from `u`; return it and `v`."""
+        start, first_x, first_y, columns, rows = self._bin(incidence, active)
 
         def before(place: mi.Int32) -> mi.Float:
             return self.before(start + mi.UInt32(place), active)
@@ -207,13 +216,13 @@ class OrderTable:
         return first_x + place - row * columns, first_y + row, v
 
     def transmitted(self, omega: mi.Vector3f) -> mi.Float:
-        """Return the share of samples that pass, ω along the pattern's axes."""
-        column, row = _direction(omega, FINE)
-        return self.shares((dr.select(omega.z > 0, mi.UInt32(0), FINE) + row) * FINE + column)
+        """Return the fraction of light that is transmitted, ω along the pattern's axes."""
+        column, row = _direction(omega, FRACTION_BINS)
+        return self.fractions((dr.select(omega.z > 0, mi.UInt32(0), FRACTION_BINS) + row) * FRACTION_BINS + column)
 
 
 def _direction(omega: mi.Vector3f, side: mi.Float | int) -> list[mi.UInt32]:
-    """Return column and row of ω among the cells of the square."""
+    """Return column and row of ω among the bins of the square."""
     return [cell_of(side * place, side)[0] for place in on_square(omega)]
 
 
@@ -227,7 +236,7 @@ def _of_corners(at_nodes: NDArray[np.floating]) -> NDArray[np.floating]:
 def _packed(
     p: NDArray[np.floating], first: NDArray[np.int64], size: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return the sums before the orders of all rectangles, with `FLOOR` and one after the other; and each start.
+    """Return the sums before the orders of all rectangles, one after the other, and where each begins.
 
     Args:
         p: in proportion to P_m, (cells, orders, orders); zero outside of the rectangles.
@@ -240,7 +249,9 @@ def _packed(
     )
     inside = (of_y[:, :, None] & of_x[:, None]).reshape(len(p), -1)
     p = p.reshape(len(p), -1).astype(np.float64)
-    p = (1 - FLOOR) * p / np.maximum(p.sum(1, keepdims=True), 1e-30) + FLOOR * inside / inside.sum(1, keepdims=True)
+    p = (1 - UNIFORM_FRACTION) * p / np.maximum(
+        p.sum(1, keepdims=True), 1e-30
+    ) + UNIFORM_FRACTION * inside / inside.sum(1, keepdims=True)
     sums = np.rint(WHOLE * p.cumsum(1) / p.sum(1, keepdims=True))
     count = size.prod(1) + 1
     return np.insert(sums, 0, 0, 1)[np.insert(inside, 0, True, 1)], count.cumsum() - count
