@@ -83,7 +83,7 @@ class SharedTables:
         per_step = spectrum.max_kappa * spectrum.height_range / RATIO_STEP
         if low == high and not scales.height.varies and dr.grad_enabled(scales.height.value):
             # Wide enough for values of a byte.
-            half = 0.5 / max(per_step, 5)
+            half = 1 / max(per_step, 10)
             low, high = max(low - half, 0.0), low + half
         count = 1 if low == high else int(np.clip(np.ceil((high - low) * per_step), 1, MAX_RATIOS - 1)) + 1
         key = np.linspace(low, high, count).tolist(), min(scales.min_lateral, 1.0)
