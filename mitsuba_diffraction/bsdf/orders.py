@@ -171,7 +171,7 @@ class SlicePower(_NodeTable):
 class AmplitudePower(_NodeTable):
     """η_m(κ) = |Σ_n c_n(κL) F_nm|² of `AmplitudeTable`, by a recorded loop over n, two terms in a packet.
 
-    The magnitudes of c_n are had by recurrence (taylor) or read from a table over κ (chebyshev); their phases are iⁿ.
+    The c_n but for their phases iⁿ follow by recurrence (taylor), or from cubics in κL (chebyshev).
     """
 
     def __init__(self, table: AmplitudeTable, rim: tuple[int, int] = (0, 0), windows: bool = True) -> None:
