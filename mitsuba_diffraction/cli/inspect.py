@@ -124,11 +124,8 @@ def _light(inspection: Inspection) -> list[tuple[str, str]]:
     for number, period in enumerate(inspection.periods):
         where = f"{with_uncertainty(period.direction, period.direction_uncertainty)}° from x"
         name = "period" if number == 0 else "another period"
-        what = f"{with_uncertainty(period.period, period.period_uncertainty)} µm along {where}; "
-        if period.width:
-            name = "band of periods"
-            what += f"± {period.width:.2g} µm and ± {period.direction_width:.2g}° wide (1 σ), "
-        lines.append((name, f"{what}{period.strength:.1%} of the variance"))
+        what = f"{with_uncertainty(period.period, period.period_uncertainty)} µm along {where}"
+        lines.append((name, f"{what}; {period.strength:.1%} of the variance"))
     if not inspection.periods:
         one = " (for a single period of a grating: --extent tile)" if inspection.extent == "sample" else ""
         lines.append(("period", f"none stands out{one}"))

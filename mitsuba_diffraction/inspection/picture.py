@@ -168,7 +168,7 @@ def _spectrum(axes: Axes, inspection: Inspection) -> None:
         # Outwards, but for the rim.
         side = (-1 if x < -0.02 * limit else 1) * (-1 if abs(x) > 0.6 * limit else 1)
         axes.annotate(
-            f"{period.period:.3g} µm" + (", band" if period.width else ""),
+            f"{period.period:.3g} µm",
             (x, y),
             xytext=(side * 10, 10 if y <= 0 else -20),
             textcoords="offset points",
@@ -211,7 +211,7 @@ def _facts(axes: Axes, inspection: Inspection) -> None:
     for number, period in enumerate(inspection.periods):
         lines.append(
             (
-                "band of periods" if period.width else "period" if number == 0 else "second period",
+                "period" if number == 0 else "second period",
                 with_uncertainty(period.period, period.period_uncertainty) + " µm",
             )
         )

@@ -32,7 +32,7 @@ class Inspection:
         height_field: the surface.
         extent: "tile" or "sample".
         statistics: heights, slopes, tilt.
-        periods: as of `find_periods`: single ones, then bands; empty if none is significant.
+        periods: as of `find_periods`, strongest first; empty if none is significant.
         max_coherence_length: what a scan supports, µm, at most that of sunlight; a tile supports any.
         coherence_length: the requested one, limited to `max_coherence_length`, µm.
         standard_error: of a sample's spectrum at that coherence length, a share of the reflected power; None of a tile.

@@ -249,7 +249,7 @@ def crop_periods(height_field: HeightField, axes: str = "xy") -> HeightField:
     _check("crop_periods", axes)
     if height_field.gaps.any():
         raise RequestError(f"crop_periods: {height_field.gaps.sum()} pixels are missing, wanted fill_missing before it")
-    found = [period for period in find_periods(height_field) if not period.width]
+    found = find_periods(height_field)
     waves = [wave for wave in found if wave.strength >= _LEAST_STRENGTH * found[0].strength]
     if not waves:
         raise RequestError("crop_periods: no period stands out of the spectrum of the heights")
