@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 from . import llvm
-from .bsdf.surface import hand_over
+from .bsdf.parameters import hand_over
 from .errors import Bug, root_cause
 from .llvm import is_supported
 

@@ -10,10 +10,8 @@ import numpy as np
 
 from ..errors import RequestError
 from .geometry import Geometry, Incidence, Interface, turned
-from .media import Media
+from .parameters import Media, Scales, check_texture, surface_from
 from .polarisation import reflected, through_layer
-from .scales import Scales, check_texture
-from .surface import surface_from
 from .tables import BELOW_ONE, larger, limited, opaque, smaller
 from .theory import Scattering, theory_of
 

@@ -11,7 +11,7 @@ from ..errors import RequestError
 from .base import base_from
 from .geometry import Interface, turned
 from .grating import Grating
-from .media import Media
+from .parameters import Media
 from .polarisation import of_plane, reflected
 from .tables import BELOW_ONE, smaller
 

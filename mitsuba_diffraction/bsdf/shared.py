@@ -14,12 +14,12 @@ from ..precomputation import Spectrum
 from ..rigorous.spectrum import RigorousSpectrum
 from ..settings import VISIBLE
 from ..spectrum.grids import OrderGrid
+from .continuum import SplineSpectrum
 from .energy import Energy
 from .order_sampler import OrderSampler
 from .orders import OrderSpectrum
+from .parameters import Scales
 from .rigorous_orders import RigorousOrders
-from .scales import Scales
-from .spline_spectrum import SplineSpectrum
 
 RATIO_STEP = 0.5  # radians of the phase of the deepest point between nodes of the ratio of scales in a table of E
 MAX_RATIOS = 16  # such nodes

@@ -17,50 +17,18 @@ from ..grating_spectrum import GratingSpectrum
 from ..precomputation import Spectrum
 from ..rigorous.spectrum import RigorousSpectrum
 from ..settings import VISIBLE
-from .coat import SAME_INDEX, Coat
+from .coat import SAME_INDEX
 from .energy import Coordinates
+from .fresnel import Conductor, Dielectric, PerfectMirror, reflectance_from
 from .geometry import Geometry, Incidence, Interface, turned
-from .media import Media
 from .order_sampler import CHANGE
+from .parameters import Media, Scales, check_parameters, check_transmission
 from .polarisation import Split, of_interface, of_orders, of_plane, unpolarised
-from .reflectance import Conductor, Dielectric, PerfectMirror, reflectance_from
-from .scales import Scales
 from .shared import SharedTables
 from .tables import opaque
 
 _log = logging.getLogger(__name__)
 _warned: set[str] = set()  # warnings, each of which is given once
-_SCALAR_ONLY = {
-    "height_scale": "build the spectrum of the other depth",
-    "lateral_scale": "build the spectrum of the other period",
-    "base": "what passes the surface is not computed; leave it out",
-    "shadowing": "it is part of the efficiencies; leave it out",
-    "fresnel": "it is part of the efficiencies; leave it out",
-}
-
-
-def settings_from(props: mi.Properties, coat: Coat | None) -> dict[str, str | float]:
-    """`material` or `int_ior` as `precompute` takes them, by Mitsuba's names; an index relative to the outside.
-
-    Raises:
-        ValueError: if they are unknown, or the material is the perfect mirror.
-    """
-    found = reflectance_from(props, coat)
-    if isinstance(found, Conductor):
-        return {"material": found.material}
-    if isinstance(found, PerfectMirror):
-        raise RequestError("material: got 'none', wanted a real one for theory=rigorous, such as 'Al'")
-    # As many digits as a float32 has.
-    eta = float(np.max(found.eta)) * (1 if coat is None else coat.relative)
-    return {"int_ior": float(f"{eta:.6g}")}
-
-
-def settings_of_medium(media: Media) -> dict[str, str | float | bool]:
-    """What `precompute` needs to know of the coat, of light that passes and of the variant."""
-    medium = {} if media.coat is None else {"ext_ior": float(f"{media.coat.relative:.6g}")}
-    if media.transmission != "none":
-        medium["transmission"] = media.transmission
-    return {**medium, "polarised": True} if mi.is_polarized else medium
 
 
 def _warn_of_range(spectrum: GratingSpectrum) -> None:
@@ -372,64 +340,3 @@ class RigorousTheory:
 
     def __str__(self) -> str:
         return f"reflectance = {self.material}"
-
-
-def check_transmission(of_spectrum: str, media: Media) -> None:
-    """Refuse a rigorous spectrum of other light than the scene asks for.
-
-    Raises:
-        ValueError: if `transmission` of both differs.
-    """
-    if of_spectrum != media.transmission:
-        raise RequestError(
-            f"transmission: got {media.transmission!r}, but the rigorous spectrum is of transmission={of_spectrum}: "
-            "say the same, or build the spectrum for it"
-        )
-
-
-def refuse_scalar_only(props: mi.Properties) -> None:
-    """Refuse parameters that rigorous theory does not have.
-
-    Raises:
-        ValueError: if one is given.
-    """
-    for name, advice in _SCALAR_ONLY.items():
-        if name in props:
-            texture = isinstance(props[name], mi.Texture)
-            got = "a BSDF" if name == "base" else "a texture" if texture else repr(props[name])
-            raise RequestError(f"{name}: got {got}, wanted none with theory=rigorous: {advice}")
-
-
-def check_parameters(props: mi.Properties, spectrum: RigorousSpectrum, coat: Coat | None) -> PerfectMirror:
-    """Return R = 1 beside a rigorous spectrum, whose efficiencies are those of the material.
-
-    Raises:
-        ValueError: if it is of another material, medium or kind of light, or says something that rigorous theory does
-            not have.
-    """
-    if mi.is_polarized and spectrum.mueller is None:
-        raise RequestError(
-            f"theory: got a rigorous spectrum of unpolarised light in the variant {mi.variant()}, wanted one that was "
-            "built with polarised=True"
-        )
-    refuse_scalar_only(props)
-    medium = 1.0 if coat is None else coat.relative
-    if abs(spectrum.ext_ior - medium) > 1e-3 * medium:
-        raise RequestError(
-            f"coat_ior: got {'none' if coat is None else f'{coat.index:g}'}, but the rigorous spectrum is of a grating "
-            f"below a medium of index {spectrum.ext_ior:g}: build it with ext_ior={medium:.4g}"
-        )
-    # Over a coat, ext_ior is what lies above it.
-    if any(name in props for name in ("material", "int_ior", *(["ext_ior"] if coat is None else []))):
-        wanted = settings_from(props, coat)
-        if "material" in wanted:
-            same = wanted["material"] == spectrum.material
-        else:
-            same = not spectrum.material and abs(wanted["int_ior"] - spectrum.int_ior) < 1e-3 * abs(spectrum.int_ior)
-        if not same:
-            got = " ".join(f"{name} {value}" for name, value in wanted.items())
-            raise RequestError(
-                f"material: got {got}, but the rigorous spectrum is of {spectrum.material_name}: "
-                "leave it out, or build the spectrum for this material"
-            )
-    return PerfectMirror(f"{spectrum.material_name}, in the efficiencies")

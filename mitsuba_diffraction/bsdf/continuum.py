@@ -7,7 +7,7 @@ import mitsuba as mi
 
 from ..grating_spectrum import GratingSpectrum
 from ..spectrum.grids import spline_weights
-from .cell_sampler import CellSampler
+from .continuum_sampler import CellSampler
 from .geometry import Geometry, Incidence
 from .orders import SlicePower
 from .tables import larger, opaque

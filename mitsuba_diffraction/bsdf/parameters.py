@@ -1,0 +1,428 @@
+"""What a scene asks for, read and checked: the surface, the media about it, its scales."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import weakref
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..errors import RequestError, is_number
+from ..precomputation import Spectrum, load_spectrum
+from ..progress import progress_bar
+from ..recipe import Recipe
+from ..rigorous.spectrum import RigorousSpectrum
+from ..settings import THEORIES, TRANSMISSIONS, VISIBLE, Settings, wavelengths_inside
+from ..surface.gratings import COHERENCE_LENGTHS, PROFILES
+from .coat import SAME_INDEX, Coat, absolute_index, coat_from
+from .fresnel import Conductor, PerfectMirror, reflectance_from
+
+_per_cent = functools.partial(progress_bar, unit="%")
+_PREFIX = "handed over: "
+_OF_SPECTRUM = "representation", "terms", "heights_from", "tolerance"  # of a profile, or in the place of a recipe's own
+_handed_over: weakref.WeakValueDictionary[str, Spectrum] = weakref.WeakValueDictionary()
+_SCALAR_ONLY = {
+    "height_scale": "build the spectrum of the other depth",
+    "lateral_scale": "build the spectrum of the other period",
+    "base": "what passes the surface is not computed; leave it out",
+    "shadowing": "it is part of the efficiencies; leave it out",
+    "fresnel": "it is part of the efficiencies; leave it out",
+}
+
+
+@dataclass(frozen=True)
+class Media:
+    """What `ext_ior`, `coat_ior` and `transmission` of a scene say.
+
+    Attributes:
+        outside: absolute index of the medium above everything; one of air and vacuum.
+        coat: the layer over the relief.
+        transmission: "none", "interface" or "sheet".
+        eta: index of the transparent material relative to the outside; None where no light passes.
+    """
+
+    outside: float
+    coat: Coat | None
+    transmission: str
+    eta: float | None
+
+    @classmethod
+    def of(cls, props: mi.Properties) -> Media:
+        """Return the media of a scene's parameters.
+
+        Raises:
+            RequestError: if an index is out of range, or light cannot pass.
+        """
+        coat = coat_from(props)
+        exterior = absolute_index("ext_ior", props.get("ext_ior", "air"))
+        outside = 1.0 if abs(exterior - 1) < SAME_INDEX else exterior
+        kind = props.get("transmission", TRANSMISSIONS[0])
+        if kind not in TRANSMISSIONS:
+            raise RequestError(f"transmission: got {kind!r}, wanted one of {', '.join(TRANSMISSIONS)}")
+        if kind == "none":
+            return cls(outside, coat, kind, None)
+        for name in ("material", "base", "coat_ior"):
+            if name in props:
+                got = repr(props[name]) if isinstance(props[name], str | float | int) else "a BSDF"
+                raise RequestError(f"{name}: got {got} with transmission={kind}, wanted a dielectric (int_ior) alone")
+        # As of `Dielectric`, in whose reflectance and in E it stands, too.
+        eta = absolute_index("int_ior", props.get("int_ior", 1.5)) / exterior
+        if abs(eta - 1) < SAME_INDEX:
+            raise RequestError(f"int_ior: got that of the outside with transmission={kind}, wanted another one")
+        return cls(outside, coat, kind, eta)
+
+    @property
+    def index(self) -> float:
+        """The largest absolute index next to the relief, by which wavelengths are divided there."""
+        return self.outside * (self.coat.relative if self.coat is not None else max(1.0, self.eta or 1.0))
+
+
+class Scale:
+    """A factor of lengths that may vary over the surface.
+
+    Attributes:
+        name: of the parameter.
+        value: a number, or a texture of numbers.
+        values: all of a texture, each once, ascending; interpolation stays between them.
+    """
+
+    def __init__(self, props: mi.Properties, name: str) -> None:
+        """Read the parameter `name`.
+
+        Raises:
+            ValueError: if it is neither a number nor a texture whose values are known.
+        """
+        self.name, value = name, props.get(name, 1.0)
+        if not is_number(value) and not isinstance(value, mi.Texture):
+            raise RequestError(f"{name}: got {value!r}, wanted a number or a texture")
+        self.value = value if isinstance(value, mi.Texture) else mi.Float(value)
+        self.read()
+
+    @property
+    def varies(self) -> bool:
+        """Whether it is a texture."""
+        return isinstance(self.value, mi.Texture)
+
+    def read(self) -> None:
+        """Read the values, which the user may have changed.
+
+        Raises:
+            ValueError: if they cannot be known, as those of a mesh attribute, or are not finite.
+        """
+        found = [self.value]
+        if self.varies:
+            check_texture(self.name, self.value)
+            parameters = mi.traverse(self.value)
+            found = [parameters[key] for key in parameters.keys() if key.split(".")[-1] != "to_uv"]  # noqa: SIM118
+            known = all(key.split(".")[-1] in ("data", "value", "to_uv") for key in parameters.keys())  # noqa: SIM118
+            if not found or not known:
+                raise RequestError(
+                    f"{self.name}: got a {self.value.class_name()}, whose range is not known, wanted a number, bitmap "
+                    "or checkerboard"
+                )
+        self.values = np.unique(np.concatenate([np.ravel(np.array(dr.detach(v), np.float64)) for v in found]))
+        if not np.isfinite(self.values).all():
+            raise RequestError(f"{self.name}: got values that are not finite, wanted numbers")
+
+    def at(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Float:
+        """Evaluate it at a point."""
+        return self.value.eval_1(si, active) if self.varies else self.value
+
+    def put(self, callback: mi.TraversalCallback) -> None:
+        """Show it among the parameters of the scene."""
+        callback.put(self.name, self.value, mi.ParamFlags.Differentiable)
+
+    def __str__(self) -> str:
+        low, high = self.values[[0, -1]]
+        return f"{low:.6g} to {high:.6g}" if self.varies else str(self.value)
+
+
+def check_texture(name: str, texture: mi.Texture) -> None:
+    """Check the values of a bitmap that stands for a number.
+
+    Raises:
+        ValueError: if some are not finite, or they are colours.
+    """
+    parameters = mi.traverse(texture)
+    if "data" not in parameters:
+        return
+    if not np.isfinite(np.array(dr.detach(parameters["data"]))).all():
+        raise RequestError(f"{name}: got values that are not finite, wanted numbers")
+    try:
+        texture.eval_1(dr.zeros(mi.SurfaceInteraction3f))
+    except RuntimeError:
+        raise RequestError(f"{name}: got a picture in colour, wanted numbers: set its parameter raw to true") from None
+
+
+class Scales:
+    """Both scales of a scene.
+
+    Attributes:
+        height: of the heights.
+        lateral: of the lengths along the surface; None where it is the number 1, which costs nothing.
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        self.height, lateral = Scale(props, "height_scale"), Scale(props, "lateral_scale")
+        self.lateral = lateral if lateral.varies or lateral.values[0] != 1 else None
+
+    def __iter__(self):
+        return iter([self.height] if self.lateral is None else [self.height, self.lateral])
+
+    @property
+    def max_scale(self) -> float:
+        """By how much shorter wavelengths the spectrum must reach than without scales."""
+        return max(1.0, *(float(scale.values[-1]) for scale in self))
+
+    def at(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
+        """Return h/s and s at a point, h of the heights and s of lengths along the surface.
+
+        Scaling lengths by s and heights by h is equivalent to scaling heights by h/s, at the wavelength λ/s and with
+        lobes of the width s σ_q: nothing else knows of scales.
+        """
+        height = self.height.at(si, active)
+        if self.lateral is None:
+            return height, mi.Float(1.0)
+        lateral = self.lateral.at(si, active)
+        return height / lateral, lateral
+
+    @property
+    def min_lateral(self) -> float:
+        """The smallest lateral scale."""
+        return 1.0 if self.lateral is None else float(self.lateral.values[0])
+
+    def ratios(self) -> tuple[float, float]:
+        """Return the smallest and the largest height over lateral scale."""
+        low, high = self.height.values[[0, -1]]
+        max_lateral = 1.0 if self.lateral is None else self.lateral.values[-1]
+        return float(low / max_lateral), float(high / self.min_lateral)
+
+    def check(self, wavelengths: tuple[float, float], index: float, most: float | None) -> None:
+        """Check the values against what a spectrum covers.
+
+        Args:
+            wavelengths: shortest and longest of the spectrum, nm.
+            index: the largest index next to the relief.
+            most: the lateral scale up to which orders do not overlap; None if they do.
+
+        Raises:
+            ValueError: naming the wavelengths from which to build.
+        """
+        shortest = VISIBLE[0] / index
+        # At wavelengths that the spectrum does not cover the grating is black; κ and q are less at the others.
+        covered = max(shortest / wavelengths[0], 1.0)
+        for scale in self:
+            if not scale.varies:
+                dr.make_opaque(scale.value)
+            low, high = scale.values[[0, -1]]
+            if low < 0 or high > covered * (1 + 1e-6) or (low == 0 and scale is self.lateral):
+                bad = low if low <= 0 else high
+                raise RequestError(
+                    f"{scale.name}: got {bad:.6g}, wanted {'0' if scale is self.height else 'more than 0 and up'} to "
+                    f"{covered:.4g}: the spectrum was built for wavelengths from {wavelengths[0]:g} nm; for larger "
+                    f"scales build it from {shortest:.4g} nm divided by the scale"
+                    + (f", here {shortest / high:.4g} nm" if high > covered else "")
+                )
+        if self.lateral is not None and (most is None or self.lateral.values[-1] > most):
+            raise RequestError(
+                f"lateral_scale: got {self.lateral}, wanted 1"
+                + ("" if most is None else f" or less than {most:.4g}")
+                + ": only of orders that do not overlap the lobes keep their width (not of samples, of tiles as large "
+                "as the coherence length, nor of line gratings with a coherence length below 15 um)"
+            )
+
+
+def surface_from(props: mi.Properties, media: Media, scale: float = 1.0) -> tuple[Spectrum, Recipe | None]:
+    """The spectrum that the parameters `filename`, `spectrum`, or `profile` with its own parameters name.
+
+    Wavelengths are shorter inside a coat or a dielectric: what is built here is built for λ/n, and for the largest
+    `scale` of lengths, as if wavelengths were shorter by it.
+
+    Returns:
+        The spectrum, and the recipe behind it. A saved spectrum has none: it does not say which heights it is of.
+
+    Raises:
+        ValueError: unless exactly one of them is given, or if what it names cannot be had.
+    """
+    given = [name for name in ("filename", "spectrum", "profile") if name in props]
+    theory = props.get("theory", "scalar")
+    if theory not in THEORIES:
+        raise RequestError(f"theory: got {theory!r}, wanted one of {', '.join(THEORIES)}")
+    if len(given) != 1:
+        raise RequestError(
+            f"surface: got {' and '.join(given) or 'nothing'}, wanted one of filename (a saved spectrum or a recipe), "
+            f"profile ({', '.join(PROFILES)}) or, from Python, spectrum"
+        )
+    if given != ["profile"]:
+        if given == ["spectrum"]:
+            spectrum, recipe = _taken_over(props["spectrum"]), None
+        else:
+            spectrum, recipe = _from_file(props, media, scale)
+        found = "rigorous" if isinstance(spectrum, RigorousSpectrum) else "scalar"
+        if props.get("theory", found) != found:
+            raise RequestError(f"theory: got {theory!r} with a spectrum of {found} theory, wanted one built for it")
+        return spectrum, recipe
+    name = props["profile"]
+    if name not in PROFILES:
+        raise RequestError(f"profile: got {name!r}, wanted one of {', '.join(PROFILES)}")
+    known = inspect.signature(PROFILES[name]).parameters
+    surface = {"profile": name, **{key: props[key] for key in (*known, "patches") if key in props}}
+    settings = {"coherence_length": COHERENCE_LENGTHS[name]} if name in COHERENCE_LENGTHS else {}
+    settings |= {key: props[key] for key in ("coherence_length", "largest_height_range", *_OF_SPECTRUM) if key in props}
+    if theory == "rigorous":
+        settings |= {"theory": theory, **settings_from(props, media.coat)}
+    recipe = _inside(props, media, scale, Recipe(surface, Settings(**settings)))
+    return recipe.cached(_per_cent), recipe
+
+
+def _inside(props: mi.Properties, media: Media, scale: float, recipe: Recipe) -> Recipe:
+    """Return the recipe for the wavelengths next to the relief, and, of rigorous theory, for the variant.
+
+    A larger `scale` of lengths needs shorter ones, too. What the scene must not say is refused here, before a table is
+    computed.
+    """
+    settings, inside = recipe.settings, {}
+    wavelengths = wavelengths_inside(media.index, scale)
+    if settings.theory == "rigorous":
+        refuse_scalar_only(props)
+        if settings.transmission != "none":
+            check_transmission(settings.transmission, media)
+        inside = settings_of_medium(media)
+    # Rigorous tables of a bare surface are for the wavelengths above it.
+    shorter = media.index * scale > 1 and (settings.theory == "scalar" or media.coat is not None)
+    if shorter and settings.wavelengths == VISIBLE:
+        inside["wavelengths"] = wavelengths
+    return replace(recipe, settings=replace(settings, **inside))
+
+
+def _from_file(props: mi.Properties, media: Media, scale: float) -> tuple[Spectrum, Recipe | None]:
+    path = Path(str(mi.file_resolver().resolve(str(props["filename"]))))
+    given = {name: props[name] for name in _OF_SPECTRUM if name in props}
+    suffix = path.suffix.lower()
+    if suffix in (".toml", ".exr") and not path.is_file():
+        # What is not found stays relative; the folder of a scene is searched first.
+        folder = Path(str(mi.file_resolver()[0])) / path.parent
+        there = sorted(other.name for other in folder.glob("*") if other.suffix.lower() in (".exr", ".toml"))
+        raise FileNotFoundError(f"{path}: no such file; {folder} holds {', '.join(there) or 'no spectrum'}")
+    if suffix == ".toml":
+        recipe = _inside(props, media, scale, Recipe.load(path, **given))
+        return recipe.cached(_per_cent), recipe
+    if suffix == ".exr":
+        for name, value in given.items():
+            raise RequestError(f"{name}: got {value} with {path}, wanted it when the spectrum is computed")
+        return load_spectrum(path), None
+    raise RequestError(
+        f"filename: got {path}, wanted a saved spectrum (.exr) or a recipe (.toml); "
+        "a scan is turned into a spectrum by `mitsuba-diffraction precompute`, or named by a recipe"
+    )
+
+
+def _taken_over(handle: str) -> Spectrum:
+    spectrum = _handed_over.get(handle)
+    if spectrum is None:
+        raise RequestError(f"spectrum: got {handle!r}, wanted a spectrum in Python's load_dict; XML takes a filename")
+    return spectrum
+
+
+def hand_over(value: object) -> object:
+    """A scene dictionary in which every spectrum is replaced by a handle.
+
+    Mitsuba's load_dict accepts only types bound in C++, so an object of ours travels by name.
+    """
+    if isinstance(value, Spectrum):
+        handle = f"{_PREFIX}{id(value)}"
+        _handed_over[handle] = value
+        return handle
+    if isinstance(value, dict):
+        return {key: hand_over(item) for key, item in value.items()}
+    return value
+
+
+def settings_from(props: mi.Properties, coat: Coat | None) -> dict[str, str | float]:
+    """`material` or `int_ior` as `precompute` takes them, by Mitsuba's names; an index relative to the outside.
+
+    Raises:
+        ValueError: if they are unknown, or the material is the perfect mirror.
+    """
+    found = reflectance_from(props, coat)
+    if isinstance(found, Conductor):
+        return {"material": found.material}
+    if isinstance(found, PerfectMirror):
+        raise RequestError("material: got 'none', wanted a real one for theory=rigorous, such as 'Al'")
+    # As many digits as a float32 has.
+    eta = float(np.max(found.eta)) * (1 if coat is None else coat.relative)
+    return {"int_ior": float(f"{eta:.6g}")}
+
+
+def settings_of_medium(media: Media) -> dict[str, str | float | bool]:
+    """What `precompute` needs to know of the coat, of light that passes and of the variant."""
+    medium = {} if media.coat is None else {"ext_ior": float(f"{media.coat.relative:.6g}")}
+    if media.transmission != "none":
+        medium["transmission"] = media.transmission
+    return {**medium, "polarised": True} if mi.is_polarized else medium
+
+
+def check_transmission(of_spectrum: str, media: Media) -> None:
+    """Refuse a rigorous spectrum of other light than the scene asks for.
+
+    Raises:
+        ValueError: if `transmission` of both differs.
+    """
+    if of_spectrum != media.transmission:
+        raise RequestError(
+            f"transmission: got {media.transmission!r}, but the rigorous spectrum is of transmission={of_spectrum}: "
+            "say the same, or build the spectrum for it"
+        )
+
+
+def refuse_scalar_only(props: mi.Properties) -> None:
+    """Refuse parameters that rigorous theory does not have.
+
+    Raises:
+        ValueError: if one is given.
+    """
+    for name, advice in _SCALAR_ONLY.items():
+        if name in props:
+            texture = isinstance(props[name], mi.Texture)
+            got = "a BSDF" if name == "base" else "a texture" if texture else repr(props[name])
+            raise RequestError(f"{name}: got {got}, wanted none with theory=rigorous: {advice}")
+
+
+def check_parameters(props: mi.Properties, spectrum: RigorousSpectrum, coat: Coat | None) -> PerfectMirror:
+    """Return R = 1 beside a rigorous spectrum, whose efficiencies are those of the material.
+
+    Raises:
+        ValueError: if it is of another material, medium or kind of light, or says something that rigorous theory does
+            not have.
+    """
+    if mi.is_polarized and spectrum.mueller is None:
+        raise RequestError(
+            f"theory: got a rigorous spectrum of unpolarised light in the variant {mi.variant()}, wanted one that was "
+            "built with polarised=True"
+        )
+    refuse_scalar_only(props)
+    medium = 1.0 if coat is None else coat.relative
+    if abs(spectrum.ext_ior - medium) > 1e-3 * medium:
+        raise RequestError(
+            f"coat_ior: got {'none' if coat is None else f'{coat.index:g}'}, but the rigorous spectrum is of a grating "
+            f"below a medium of index {spectrum.ext_ior:g}: build it with ext_ior={medium:.4g}"
+        )
+    # Over a coat, ext_ior is what lies above it.
+    if any(name in props for name in ("material", "int_ior", *(["ext_ior"] if coat is None else []))):
+        wanted = settings_from(props, coat)
+        if "material" in wanted:
+            same = wanted["material"] == spectrum.material
+        else:
+            same = not spectrum.material and abs(wanted["int_ior"] - spectrum.int_ior) < 1e-3 * abs(spectrum.int_ior)
+        if not same:
+            got = " ".join(f"{name} {value}" for name, value in wanted.items())
+            raise RequestError(
+                f"material: got {got}, but the rigorous spectrum is of {spectrum.material_name}: "
+                "leave it out, or build the spectrum for this material"
+            )
+    return PerfectMirror(f"{spectrum.material_name}, in the efficiencies")
