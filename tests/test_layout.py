@@ -3,6 +3,7 @@
 import ast
 import functools
 import graphlib
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -81,6 +82,23 @@ def test_no_room_imports_a_higher_one():
         if found != "mitsuba_diffraction" and level(found) > level(module)
     ]
     assert not wrong, wrong
+
+
+@pytest.mark.quick
+def test_the_figure_of_the_manual_shows_the_rooms_in_their_order():
+    """By the first column of its lines."""
+    manual = (Path(__file__).parents[1] / "docs" / "architecture.md").read_text(encoding="utf-8")
+    figure = manual.partition("## The rooms")[2].split("```")[1]
+    names = {name for names in ROOMS.values() for name in names.split()} - {"__main__"}
+    lines = [(line, line.lstrip(" │├─▲")) for line in figure.splitlines()]
+    columns = [re.split(r"\s{3,}", text)[0] for line, text in lines if len(line) - len(text) < 10]
+    shown = [word for column in columns for word in re.findall(r"\w+", column) if word in names]
+    order = [LEVELS[word] for word in dict.fromkeys(shown)]
+    assert set(shown) == names
+    assert order == sorted(order)
+    files = {path.stem for path in (PACKAGE / "bsdf").glob("*.py")} - {"__init__"}
+    room = figure.partition(" bsdf/")[2].partition("integrator/")[0]
+    assert files <= set(re.findall(r"\w+", room))
 
 
 def test_nothing_depends_on_what_judges_the_product():

@@ -87,7 +87,7 @@ rotate it without reflecting it; the back of a `twosided` shows its mirror image
 first edge of each triangle and is discontinuous: such a mesh needs UVs. Where dp_du vanishes Mitsuba picks an axis.
 
 The BRDF is R · K · G · S(q; κ)/λ² · E: R the power reflectance at the half vector, K and G as in `geometry.py`, S as in
-`orders.py` (orders) or `spline_spectrum.py` (a lattice), with q = −(ω_i + ω_o)/λ along the pattern's axes
+`orders.py` (orders) or `continuum.py` (a lattice), with q = −(ω_i + ω_o)/λ along the pattern's axes
 and κ = 2π (cos θ_i + cos θ_o)/λ. E, as in `energy.py`, bounds the albedo by one; it is one where the albedo is
 below one without it. Without shadowing K diverges as 1/cos θ near the horizon, and there is no E.
 
@@ -96,7 +96,7 @@ Where light passes, the sum has the factor n_o², n_o the index of the medium of
 all of its light: what its flat face reflects is a lobe of order 0, where scalar theory has a mirror, and light that is
 reflected back and forth inside leaves in the orders into which it is diffracted.
 
-With a transmission (`transmission.py`), light passes the grating from either side: q and κ as above with the indices of
+With a transmission (`geometry.py`), light passes the grating from either side: q and κ as above with the indices of
 both media, 1 − R for R, and the K and G of `geometry.transmitted`. From below, a sheet's flat face is a mirror.
 
 Under a coat (`coat.py`) all this holds inside of it, where wavelengths are shorter and directions steeper; the front

@@ -1,6 +1,6 @@
 """Directions in their media, pairs of them, and one direction at one wavelength; the formulas are in `geometry.py`.
 
-All lengths are in units that make the lateral scale of the relief one (`scales.py`).
+All lengths are in units that make the lateral scale of the relief one (`Scales` in `parameters.py`).
 
 A coat and the flat face of a sheet are plane layers: they keep the tangential component of k = n ω and change the
 normal one, so that what holds next to the relief follows from what holds outside. κ has a sign:
