@@ -29,7 +29,7 @@ from .spectrum.power_spectrum import PowerSpectrum
 from .spectrum.tables import AmplitudeTable, SliceTable
 
 FORMAT = "mitsuba_diffraction grating spectrum"
-FORMAT_VERSION = 9
+FORMAT_VERSION = 10
 
 # Numbers and texts, and their names in files.
 _NUMBERS = {
