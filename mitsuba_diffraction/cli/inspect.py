@@ -68,7 +68,7 @@ def inspect(
     height_field = recipe.height_field()
     if height_field.heights.size == 1:
         raise RequestError(f"{source}: got a surface of 1 × 1 pixel, wanted more: one height has no spectrum")
-    with progress_bar(f"spectra of {source.name}") as progress:
+    with progress_bar(f"inspection of {source.name}", "%") as progress:
         inspection = look(
             height_field,
             extent=recipe.settings.extent,
@@ -143,6 +143,10 @@ def _light(inspection: Inspection) -> list[tuple[str, str]]:
         known = f"{inspection.standard_error:.2g} of the reflected power, as the scatter within this one scan tells"
         lines.append(("standard error", known))
     lines.append(("scalar theory", str(inspection.scalar_error)))
+    if inspection.piece is not inspection.height_field:
+        x, y = inspection.piece.tile_size
+        length = inspection.spectrum.coherence_length
+        lines.append(("colours", f"of the middle {x:.3g} × {y:.3g} µm, at a coherence length of {length:.3g} µm"))
     return lines
 
 

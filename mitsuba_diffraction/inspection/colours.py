@@ -191,19 +191,19 @@ def changes(
             other, radius = broadened(height_field, by, extent=extent)
         except RequestError:
             continue  # steps from one pixel to the next: no tip is that sharp
-        period = _same_period(find_periods(other, extent=extent), main)
+        period = same_period(find_periods(other, extent=extent), main).period
         found.append(change("tip broadening", by, _View(build(other), period), radius))
     return tuple(found)
 
 
-def _same_period(found: tuple[Period, ...], main: Period) -> float:
-    """Return the period nearest to the main one in direction, else the main one itself."""
+def same_period(found: tuple[Period, ...], main: Period) -> Period:
+    """Return the period nearest to the main one in direction, within 10°, else the main one itself."""
 
     def angle(other: Period) -> float:
         return abs((other.direction - main.direction + 90) % 180 - 90)
 
     nearest = min(found, key=angle, default=main)
-    return nearest.period if angle(nearest) < 10 else main.period
+    return nearest if angle(nearest) < 10 else main
 
 
 def _share(view: _View, main: Period, order: int) -> float:

@@ -11,17 +11,19 @@ from numpy.typing import NDArray
 from ..grating_spectrum import GratingSpectrum
 from ..outputs import plain
 from ..precomputation import precompute
-from ..progress import Progress, silent
+from ..progress import Progress, part, silent
 from ..scalar_theory import ScalarError, scalar_error
 from ..settings import SUN_COHERENCE_LENGTH, VISIBLE, Settings, lobe_width
 from ..spectrum.sample import effective_coherence_length, standard_error
 from ..surface.heightfield import HeightField
 from ..surface.periods import Period, find_periods, hann
-from .colours import LONGEST_COHERENCE, SHARE, Change, changes
+from .colours import LONGEST_COHERENCE, SHARE, Change, changes, same_period
 
 Array = NDArray[np.float64]
 
 _TOLERANCE = 0.02
+_PIECE = 20.0  # µm, side of the part of a large scan from which colours are predicted
+_FINE = 0.04  # µm, pixels of that part, of which smaller ones are averaged; light wants 0.09 µm
 
 
 @dataclass(frozen=True)
@@ -39,7 +41,8 @@ class Inspection:
         scalar_error: of scalar theory for this surface.
         changes: effects of ±5 % of height scale, pixel size and, for a scan, tip broadening; empty without a period.
         concerns: reasons to distrust a picture.
-        spectrum: of at most `LONGEST_COHERENCE`, for predicted colours.
+        piece: that part of the surface from which colours and changes are predicted, the middle of a large scan.
+        spectrum: of `piece`, of at most `LONGEST_COHERENCE`, for predicted colours.
     """
 
     height_field: HeightField
@@ -52,6 +55,7 @@ class Inspection:
     scalar_error: ScalarError
     changes: tuple[Change, ...]
     concerns: tuple[str, ...]
+    piece: HeightField = field(repr=False)
     spectrum: GratingSpectrum = field(repr=False)
 
     @property
@@ -78,6 +82,7 @@ class Inspection:
                 "scalar_error": self.scalar_error,
                 "changes": self.changes,
                 "concerns": self.concerns,
+                "size_of_colours": self.piece.tile_size,
             }
         )
 
@@ -97,7 +102,7 @@ def inspect(
         extent: "sample": a piece of a larger, irregular surface; "tile": it repeats.
         coherence_length: the requested one, µm.
         measured: whether it is a scan; tilt, steps of the heights and the tip matter only for scans.
-        progress: called with (steps done, steps in all).
+        progress: called with (per cent done, 100).
 
     Raises:
         ValueError: on an unknown extent, a coherence length that is not positive, or a sample of too few pixels.
@@ -106,7 +111,12 @@ def inspect(
     sun = SUN_COHERENCE_LENGTH
     limit = effective_coherence_length(height_field, sun) if extent == "sample" else max(sun, coherence_length)
     used = min(float(coherence_length), limit)
-    step = iter(range(1, 5))
+    piece = _middle(height_field) if extent == "sample" else height_field
+    colours_length = min(used, LONGEST_COHERENCE)
+    if extent == "sample":
+        colours_length = effective_coherence_length(piece, colours_length)
+    # The tip makes two more surfaces of a scan.
+    spectra = iter([(0.15, 0.4), (0.4, 0.7), (0.7, 1.0)] if measured else [(0.15, 1.0)])
 
     def build(surface: HeightField) -> GratingSpectrum:
         with warnings.catch_warnings():
@@ -114,19 +124,28 @@ def inspect(
             spectrum = precompute(
                 surface,
                 extent=extent,
-                coherence_length=min(used, LONGEST_COHERENCE),
+                coherence_length=colours_length,
                 # Heights may be scaled up by the share that is tried.
                 wavelengths=(VISIBLE[0] / (1 + SHARE), VISIBLE[1]),
                 tolerance=_TOLERANCE,
+                progress=part(progress, *next(spectra)),
             )
-        progress(next(step), 4)
         return spectrum
 
     numbers = statistics(height_field, extent=extent)
     shortest = VISIBLE[0] * 1e-3
+    progress(1, 100)
     periods = find_periods(height_field, extent=extent)
-    spectrum = build(height_field)
+    progress(5, 100)
+    scatter = (
+        standard_error(height_field, coherence_length=used, max_kappa=4 * np.pi / shortest, max_frequency=2 / shortest)
+        if extent == "sample"
+        else None
+    )
+    progress(15, 100)
+    spectrum = build(piece)
     scalar = scalar_error(height_field, extent)
+    main = [same_period(find_periods(piece, extent=extent), one) for one in periods[:1]]
     result = Inspection(
         height_field=height_field,
         extent=extent,
@@ -134,20 +153,30 @@ def inspect(
         periods=periods,
         max_coherence_length=limit,
         coherence_length=used,
-        standard_error=standard_error(
-            height_field, coherence_length=used, max_kappa=4 * np.pi / shortest, max_frequency=2 / shortest
-        )
-        if extent == "sample"
-        else None,
+        standard_error=scatter,
         scalar_error=scalar,
-        changes=changes(height_field, spectrum, periods[0], extent=extent, measured=measured, build=build)
-        if periods
-        else (),
+        changes=changes(piece, spectrum, main[0], extent=extent, measured=measured, build=build) if main else (),
         concerns=concerns(height_field, numbers, used, measured=measured, scalar=scalar),
+        piece=piece,
         spectrum=spectrum,
     )
-    progress(4, 4)
+    progress(100, 100)
     return result
+
+
+def _middle(scan: HeightField) -> HeightField:
+    """Return the middle of a scan, at most `_PIECE` long and wide; its pixels are averaged to about `_FINE`."""
+    counts = [min(n, round(_PIECE / size)) for n, size in zip(scan.shape, scan.pixel_size[::-1], strict=True)]
+    if 1 in scan.shape or (tuple(counts) == scan.shape and scan.heights.size <= (_PIECE / _FINE) ** 2):
+        return scan
+    rows, columns = (slice((n - count) // 2, (n + count) // 2) for n, count in zip(scan.shape, counts, strict=True))
+    y, x = (
+        min(max(1, int(_FINE / size)), count // 4) for size, count in zip(scan.pixel_size[::-1], counts, strict=True)
+    )
+    heights = scan.heights[rows, columns]
+    heights = heights[: len(heights) // y * y, : heights.shape[1] // x * x]
+    means = heights.reshape(len(heights) // y, y, -1, x).mean(axis=(1, 3))
+    return HeightField(means, (scan.pixel_size[0] * x, scan.pixel_size[1] * y), scan.source)
 
 
 @dataclass(frozen=True)

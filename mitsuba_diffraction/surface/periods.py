@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -125,14 +126,15 @@ def find_periods(height_field: HeightField, count: int = 2, *, extent: str = "sa
     corners = [
         _Periodogram([part], pixel_size, variance) for row in (parts[0], parts[-1]) for part in (row[0], row[-1])
     ]
-    peaks = list(whole.peaks())
+    peaks = whole.peaks()
     if quarters.excess > _WANDERING * whole.excess:
-        long = [(q, strength) for q, strength in peaks if np.hypot(*(q * quarters.size)) < _MIN_WAVES]
-        peaks = [*quarters.peaks(), *long]
+        peaks = chain(quarters.peaks(), whole.peaks(2 * _MIN_WAVES))
     found: list[Period] = []
     for q, strength in peaks:
-        if len(found) < count and not any(_same_wave(q, other.q) for other in found):
+        if not any(_same_wave(q, other.q) for other in found):
             found.append(_period(q, strength, corners))
+        if len(found) == count:
+            break
     return tuple(sorted(found, key=lambda period: -period.strength))
 
 
@@ -213,10 +215,12 @@ class _Periodogram:
         """The largest power of a peak relative to what is significant; 0 without a peak."""
         return max(self._candidates.values(), default=0.0)
 
-    def peaks(self) -> Iterator[tuple[Array, float]]:
-        """Yield the frequencies, cycles/µm, and strengths of the peaks, highest first."""
+    def peaks(self, max_waves: float = np.inf) -> Iterator[tuple[Array, float]]:
+        """Yield the frequencies, cycles/µm, and strengths of peaks of at most so many waves, highest first."""
         for at in self._candidates:
             waves = self._fundamental(at)
+            if np.hypot(*waves) >= max_waves:
+                continue
             # The highest maximum of a wave that varies need not be the one that stands out of its row and column.
             waves = next(
                 (other for other in self._maxima if _same_wave(waves / self.size, other / self.size, 1)), waves

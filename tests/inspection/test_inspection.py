@@ -508,6 +508,29 @@ def test_a_measured_skin_has_its_period_and_raises_no_concern(scan):
     assert seen.concerns == ()
 
 
+def test_colours_of_a_large_scan_are_those_of_its_middle_and_progress_moves():
+    x = 0.1 * (np.arange(300) + 0.5)
+    field = md.HeightField(0.05 * np.sin(2 * np.pi * x / 1.5) + np.zeros((300, 1)), 0.1)
+    shown = []
+    seen = inspect(field, measured=False, progress=lambda done, total: shown.append(done / total))
+    assert seen.coherence_length == pytest.approx(15)
+    assert (seen.piece.tile_size, seen.spectrum.coherence_length) == (pytest.approx((20, 20)), pytest.approx(10))
+    np.testing.assert_array_equal(seen.piece.heights, field.heights[50:250, 50:250])
+    assert seen.periods[0].period == pytest.approx(1.5, rel=1e-3)
+    assert shown == sorted(shown)
+    assert len(set(shown)) > 10
+    assert shown[-1] == 1
+
+
+def test_fine_pixels_of_a_scan_are_averaged_for_its_colours():
+    x = 0.01 * (np.arange(600) + 0.5)
+    field = md.HeightField(0.05 * np.sin(2 * np.pi * x / 1.5) + np.zeros((600, 1)), 0.01)
+    piece = inspect(field, measured=False).piece
+    assert piece.pixel_size == pytest.approx((0.04, 0.04))
+    assert piece.tile_size == pytest.approx(field.tile_size)
+    assert piece.heights.mean() == pytest.approx(field.heights.mean(), abs=1e-12)
+
+
 # ---------------------------------------------------------------- what people read
 
 

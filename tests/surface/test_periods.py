@@ -1,5 +1,7 @@
 """Periods found from the spectrum: sinusoids within their stated uncertainty, gratings, noise."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import assume, example, given, settings
@@ -9,6 +11,7 @@ import mitsuba_diffraction as md
 from mitsuba_diffraction.surface.heightfield import HeightField
 from mitsuba_diffraction.surface.periods import Period, find_periods
 
+ROOT = Path(__file__).parents[2]
 PIXEL = (0.05, 0.07)
 """µm, (x, y)"""
 
@@ -351,6 +354,21 @@ def test_crops_confirm_the_uncertainty_of_the_fingers(panel):
         crop = find_periods(HeightField(panel.heights[i : i + 277, j : j + 277], panel.pixel_size))
         for one, other in zip(whole, sorted(crop, key=lambda period: -period.period), strict=True):
             assert abs(one.period - other.period) < 2.5 * np.hypot(one.period_uncertainty, other.period_uncertainty)
+
+
+@pytest.mark.parametrize(
+    ("name", "height_range", "periods", "direction"),
+    # The highest peaks of the plain periodogram of Elaphe; rows and fingers of Xenopeltis, by eye and periodogram.
+    [("elaphe", 0.4347, (1.18, 1.03), 0.0), ("xenopeltis", 0.4435, (1.5, 0.55), -87.0)],
+)
+def test_scans_of_65_um_have_their_periods(name, height_range, periods, direction):
+    path = ROOT / "precompute" / "measured" / f"{name}_afm_65um.png"
+    found = find_periods(md.read_height_field(path, pixel_size=65 / 1332, height_range=height_range))
+    assert [one.period for one in found] == pytest.approx(periods, rel=0.04)
+    for one, period in zip(found, periods, strict=True):
+        assert one.period == pytest.approx(period, abs=1.5 * one.period_uncertainty)
+        assert one.period_uncertainty < 0.04
+    assert turned(found[0].direction, direction) == pytest.approx(0, abs=2)
 
 
 def test_half_a_wave_is_no_period():
