@@ -224,11 +224,11 @@ class Furnace:
             below = flat[start + cell]
             return below + (x - cell) * (flat[start + cell + 1] - below)
 
-        kappa = kappa * self.height_scale
+        forward, kappa = kappa > 0, kappa * self.height_scale
         if not way:
             return at(kappa)
         first = self._min_kappa
-        return small_kappa(kappa, first, at(kappa), at(first), at(2 * first)) * (kappa > 0)
+        return small_kappa(kappa, first, at(kappa), at(first), at(2 * first)) * forward
 
 
 def min_kappa(spectrum: PowerSpectrum, index: float, height_scale: float = 1.0) -> float:
