@@ -80,7 +80,7 @@ def horizon_gain(x: Array, select: Callable[..., Any] = np.where) -> Array:
     (Sinkhorn 1964: the symmetric scaling of a kernel). g(0) = √e, and g = 1 from 4 on. The polynomial errs by at most
     4.1e-4.
     """
-    t = 1 - x * 0.25
+    t = 1 - 0.25 * x
     t = select(t > 0, t, 0)
     result = HORIZON_GAIN[-1]
     for coefficient in HORIZON_GAIN[-2::-1]:

@@ -17,4 +17,4 @@ def test_lobes_cut_by_the_horizon_keep_their_power():
 
 
 def test_gain_at_the_horizon_and_far_from_it():
-    np.testing.assert_allclose(horizon_gain([0.0, 4.0, 100.0]), [np.sqrt(np.e), 1, 1], atol=4.1e-4)
+    np.testing.assert_allclose(horizon_gain(np.array([0.0, 4.0, 100.0])), [np.sqrt(np.e), 1, 1], atol=4.1e-4)

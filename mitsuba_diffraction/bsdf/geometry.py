@@ -360,13 +360,14 @@ class Incidence:
     k_iz: mi.Float
     k_oz: tuple[mi.Float, mi.Float, mi.Float]
 
-    def at(self, wavelength: mi.Float) -> Incidence:
-        """Return that at another wavelength (µm), from that at 1 µm."""
+    def at(self, wavelength: mi.Float, lobe_scale: mi.Float | float = 1.0) -> Incidence:
+        """Return that at another wavelength (µm) and with scaled lobes, from that at 1 µm."""
         frequency = dr.rcp(wavelength)
         return dataclasses.replace(
             self,
             wavelength=wavelength,
             frequency=frequency,
+            lobe_scale=lobe_scale,
             radius=self.radius * frequency,
             per_kappa=self.per_kappa * wavelength,
         )
@@ -378,7 +379,6 @@ class Incidence:
         k_o: WaveVector,
         interface: Interface,
         height_scale: mi.Float | float = 1.0,
-        lobe_scale: mi.Float | float = 1.0,
         flip: mi.Float | float = 1.0,
     ) -> Incidence:
         """Return that of k_i at a wavelength of 1 µm.
@@ -390,7 +390,6 @@ class Incidence:
             k_o: of the medium into which it is scattered, whatever its direction.
             interface: between the media.
             height_scale: times the heights.
-            lobe_scale: times the widths of lobes.
             flip: the sign of κ of a pair that is evaluated; one where a direction is drawn.
         """
         reflects = k_i.sign == k_o.sign
@@ -408,7 +407,7 @@ class Incidence:
             assumed * k_i.tangent,
             mi.Float(1.0),
             mi.Float(1.0),
-            mi.Float(lobe_scale),
+            mi.Float(1.0),
             interface.coat_index,
             k_i.sign > 0,
             reflects,

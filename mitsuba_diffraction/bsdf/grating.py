@@ -133,7 +133,7 @@ class Grating:
         interface = self.interface
         k_i, k_o = interface.wave_vector(wi), interface.wave_vector(wo)
         geometry = Geometry.of(k_i, k_o, interface, height_scale, self.theory.shadowing)
-        incidence = Incidence.of(k_i, k_o, interface, height_scale, lateral_scale, geometry.flip)
+        incidence = Incidence.of(k_i, k_o, interface, height_scale, geometry.flip)
         pair = self.theory.coordinates(geometry)
         value, density = self._of_wavelengths(si, incidence, near, geometry, pair, lateral_scale)
         # Directions outside of the largest angle are black, but they are drawn: they have a density.
@@ -184,7 +184,7 @@ class Grating:
         chosen = [first == (1 << channel) for channel in range(len(value))]
         for channel in range(1, len(value)):
             wavelength = dr.select(chosen[channel], self._wavelength(si, channel), wavelength)
-        incidence = incidence.at(wavelength / lateral_scale)
+        incidence = incidence.at(wavelength / lateral_scale, lateral_scale)
         power, probability = self.theory.evaluate(geometry, incidence, pair, near != 0)
         square = dr.square(incidence.frequency)
         power *= square
@@ -275,8 +275,8 @@ class Grating:
         height_scale, lateral_scale = self.scales.at(si, active)
         k_i = interface.wave_vector(turned(si.wi, sin, cos))
         k_o = interface.scattered(k_i, reflects)
-        incidence = Incidence.of(k_i, k_o, interface, height_scale, lateral_scale)
-        incidence = incidence.at(dr.detach(wavelength / lateral_scale))
+        incidence = Incidence.of(k_i, k_o, interface, height_scale)
+        incidence = incidence.at(dr.detach(wavelength / lateral_scale), dr.detach(lateral_scale))
         q, propagates = self.scattering.sample(incidence, rest, v, active & ~uniform)
         tangent = k_o.tangent - incidence.wavelength * incidence.mirrored * q
         wo = turned(mi.Vector3f(*tangent, 0), -sin, cos) / k_o.index

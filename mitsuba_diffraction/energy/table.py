@@ -42,6 +42,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import minimum_filter
 
 from ..errors import RequestError
 from ..spectrum.grids import OrderGrid
@@ -52,12 +53,9 @@ MAX_E = 1.05
 """Of what is stored: e is one where that is more, so that it has its kink where a = 1 within a cell."""
 LINE_NODES = 1.2e5  # of the table of a line grating, about
 MAX_NODES = 100000  # of another table
-
-
 PAIRS = 3e7  # of a node and a component, of a table with one ratio
-SLICE_PHASE = (
-    4  # radians by which the phase of the deepest point changes from slice to slice after eight, if 16 are enough
-)
+MIN_SLICES, MAX_SLICES = 8, 16  # nodes of 1/λ
+SLICE_PHASE = 4  # radians of the phase of the deepest point, for each further slice
 MIN_FRACTION, MIN_T = 1e-7, 0.01  # of u and v at nodes, and of t
 
 
@@ -114,9 +112,7 @@ class Layout:
         frequencies = lowest * min(min_lateral_scale, 1), highest
         if furnace.index is not None or not (isinstance(grid, OrderGrid) and 1 in grid.shape):
             nodes = min(PAIRS / (len(furnace.q) * (1 if furnace.index is None else 6)), MAX_NODES)
-            # In the denser medium, as both sides have equally many slices.
-            phase = 4 * np.pi * spectrum.height_range * furnace.height_scale * (frequencies[1] - frequencies[0])
-            slices = int(min(8 + phase * max(furnace.index or 1, 1) / SLICE_PHASE, 16))
+            slices = int(min(MIN_SLICES + _phase(furnace, frequencies) / SLICE_PHASE, MAX_SLICES))
             return cls(0.0, 1, max(int(np.sqrt(nodes / slices)) - 1, 8), 1, slices, frequencies)
         turned = grid.shape[1] == 1 and grid.shape[0] > 1
         # About half of the squares have light.
@@ -218,8 +214,12 @@ class EnergyTable:
                 for side, n in zip(sides, (1.0, index or 1.0), strict=False)
             ]
             e[k, :, lit] = np.concatenate(found).T
+        e = e.reshape(*e.shape[:2], *layout.shape)
+        if _phase(sides[0], layout.frequencies) > (MAX_SLICES - MIN_SLICES) * SLICE_PHASE:
+            # Of a relief so deep e has no smooth course from node to node: each gets the smallest of its neighbours.
+            e = minimum_filter(e, (1, 1, 3, 3, 3))
         values = np.rint(np.minimum(e, MAX_E) * (255 / MAX_E)).astype(np.uint8)
-        return cls(layout, values.reshape(*e.shape[:2], *layout.shape), tuple(ratios))
+        return cls(layout, values, tuple(ratios))
 
     @property
     def needed(self) -> bool:
@@ -255,6 +255,12 @@ class EnergyTable:
         if not 0 < size < 1 << 26 or len(content) != size:
             raise RequestError(f"energy table: got {len(content)} bytes, wanted {size}")
         return cls(layout, np.frombuffer(content, np.uint8).reshape(1, 1, *layout.shape))
+
+
+def _phase(furnace: Furnace, frequencies: tuple[float, float]) -> float:
+    """Return by how much the phase of the deepest point differs between two 1/λ, in the denser medium, in radians."""
+    height = furnace.spectrum.height_range * furnace.height_scale * max(furnace.index or 1, 1)
+    return 4 * np.pi * height * (frequencies[1] - frequencies[0])
 
 
 def frequencies_of(spectrum: PowerSpectrum, index: float | None) -> tuple[float, float]:

@@ -184,7 +184,8 @@ def max_plausible_luminance(scene: mi.Scene) -> float:
     si = scene.ray_intersect(mi.Ray3f(ray))
     light, weight = scene.sample_emitter_direction(si, sampler.next_2d(), False, si.is_valid())
     sampled = mi.unpolarized_spectrum(weight) * light.pdf * dr.select(light.delta, _PEAK_OF_LOBES, 1)
-    found = np.array([*sampled, *mi.unpolarized_spectrum(si.emitter(scene).eval(si))])
+    seen = mi.unpolarized_spectrum(si.emitter(scene).eval(si))
+    found = np.concatenate([np.ravel(values) for values in (*sampled, *seen)])
     brightest = found[np.isfinite(found)].max(initial=0)
     return float(brightest) * _OF_NOISE if brightest > 0 else np.inf
 
@@ -239,9 +240,7 @@ def _emission(emitter: mi.Emitter) -> NDArray[np.float64]:
     place.wi = mi.Vector3f(0, 0, -1)
     numbers = (np.arange(_DRAWS_PER_LIGHT, dtype=np.float32) + 0.5) / _DRAWS_PER_LIGHT
     wavelengths, weights = emitter.sample_wavelengths(place, mi.Float(numbers))
-    wavelengths, weights = (
-        x.ravel() for x in np.broadcast_arrays(np.array(wavelengths), np.array(mi.unpolarized_spectrum(weights)))
-    )
+    wavelengths, weights = (x.ravel() for x in np.broadcast_arrays(wavelengths, mi.unpolarized_spectrum(weights)))
     edges = np.arange(VISIBLE[0] - _DENSITY_STEP / 2, VISIBLE[1] + _DENSITY_STEP, _DENSITY_STEP)
     return np.histogram(wavelengths, edges, weights=weights)[0]
 

@@ -216,7 +216,7 @@ def test_samples_are_split_in_proportion_to_power(theta, reflectance):
 
     bsdf = over({"type": "diffuse", "reflectance": uniform(reflectance)}, "blazed", 65.0)
     found = fraction(bsdf)
-    bsdf.layers._share = lambda *_: mi.Float(0.5)
+    bsdf.layers._grating_probability = lambda *_: mi.Float(0.5)
     assert found > fraction(bsdf) + 0.04
     if reflectance == 0.5 and theta <= 60:
         assert found > 0.93

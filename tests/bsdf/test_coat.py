@@ -39,8 +39,8 @@ def transmittance(cosine):
 @pytest.mark.parametrize("theta", [0.0, 25.0, 50.0])
 def test_orders_inside_the_coat_have_the_powers_of_the_closed_form(llvm, theta):
     wavelength, wi = 0.5, direction(theta)
-    bsdf = coated("lamellar", coherence_length=200.0)
-    sigma, energy = bsdf.spectrum.lobe_width, bsdf.spectrum.energy_table()
+    bsdf = coated("lamellar", coherence_length=200.0, conserve_energy=False)
+    sigma = bsdf.spectrum.lobe_width
     offsets = np.linspace(-6, 6, 61) * sigma
     cell = (offsets[1] - offsets[0]) ** 2
     checked = 0
@@ -55,8 +55,7 @@ def test_orders_inside_the_coat_have_the_powers_of_the_closed_form(llvm, theta):
         kappa = 2 * np.pi * RELATIVE * (i[2] + o[2]) / wavelength
         eta = np.cos(kappa * 0.05) ** 2 if m == 0 else (2 / (np.pi * m) * np.sin(kappa * 0.05)) ** 2
         geometry = k_g(i[2], o[2], ((i + o)[:2] ** 2).sum())
-        bound = energy.at(np.stack([i, o]), np.full(2, wavelength / RELATIVE)).min()
-        expected = transmittance(wi[2]) * transmittance(centre[2]) * geometry * eta * bound
+        expected = transmittance(wi[2]) * transmittance(centre[2]) * geometry * eta
         assert power == pytest.approx(expected, abs=1e-3)
         checked += 1
     assert checked >= 3

@@ -121,8 +121,9 @@ def test_textures_of_scales_are_read_at_the_point(llvm):
                 height = heights[0, int(uv[0] * 3)]
                 wo = near_orders(lateral, LINE)
                 alone = plugin(of, lateral_scale=lateral, height_scale=height, conserve_energy=False)
-                for found, wanted in zip(evaluate(textured, WI, wo, uv=uv), evaluate(alone, WI, wo), strict=True):
-                    np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-4 * wanted.max())
+                # Their densities differ: orders are drawn by tables for ranges of heights.
+                found, wanted = evaluate(textured, WI, wo, uv=uv)[0], evaluate(alone, WI, wo)[0]
+                np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-4 * wanted.max())
 
 
 def test_a_lateral_scale_of_one_is_none(llvm):

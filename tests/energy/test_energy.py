@@ -225,7 +225,7 @@ def test_a_grating_of_one_column_is_that_of_one_row_turned():
 def test_the_table_is_stored_with_the_spectrum(tmp_path, monkeypatch):
     of = spectrum("deep blazed")
     of.save(tmp_path / "s.exr")
-    monkeypatch.setattr(Furnace, "of", lambda *_: pytest.fail("made again"))
+    monkeypatch.setattr(EnergyTable, "of", lambda *_: pytest.fail("made again"))
     loaded = md.GratingSpectrum.load(tmp_path / "s.exr")
     assert loaded.digest == of.digest
     there, here = loaded.energy_table(), of.energy_table()

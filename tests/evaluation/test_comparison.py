@@ -130,8 +130,10 @@ def test_each_shader_names_the_quirks_that_change_it(kind):
         shader = VARIANTS[kind](surface, quirks, **more)
         light = np.linspace(0.5, 1.5, 401)
         weights = shader.weights(0.1, light)
-        wo = [mi.Vector3f(x, y, np.sqrt(1 - x * x - y * y)) for x, y in ((-0.61, 0.33), (0.42, -0.27), (0.1, 0.7))]
-        return np.array([shader.rgb(mi.Vector3f(0.3, 0.2, np.sqrt(0.87)), w, weights) for w in wo]).ravel()
+        wo = [
+            mi.Vector3f(x, y, float(np.sqrt(1 - x * x - y * y))) for x, y in ((-0.61, 0.33), (0.42, -0.27), (0.1, 0.7))
+        ]
+        return np.array([shader.rgb(mi.Vector3f(0.3, 0.2, float(np.sqrt(0.87))), w, weights) for w in wo]).ravel()
 
     plain = colours(Quirks.corrected())
     changing = [

@@ -12,6 +12,7 @@ from PIL import Image
 from scipy.special import jv
 
 import mitsuba_diffraction as md
+from mitsuba_diffraction import testing
 from mitsuba_diffraction.color import into_gamut, spectrum_to_linear_sRGB, spectrum_to_XYZ
 from mitsuba_diffraction.inspection import inspect, save_picture
 from mitsuba_diffraction.inspection.colours import (
@@ -100,15 +101,8 @@ def test_radiance_is_that_of_the_bsdf(theta_i, theta_o):
     grating = {"type": "diffraction_grating", "spectrum": spectrum, "material": "none", "conserve_energy": False}
     bsdf = mi.load_dict(grating)
 
-    def towards(theta):
-        return mi.Vector3f(np.sin(np.deg2rad(theta)), 0, np.cos(np.deg2rad(theta)))
-
-    si = mi.SurfaceInteraction3f()
-    si.sh_frame, si.wi = mi.Frame3f([0, 0, 1]), towards(-theta_i)
-    wavelengths = [400.0, 500.0, 600.0, 700.0]
-    si.wavelengths = wavelengths
-    cos_o = np.cos(np.deg2rad(theta_o))
-    f = np.array(bsdf.eval(mi.BSDFContext(), si, towards(theta_o))) / cos_o
+    wavelengths, directions = [400.0, 500.0, 600.0, 700.0], (testing.direction(-theta_i), testing.direction(theta_o))
+    f = testing.evaluate(bsdf, *directions, wavelengths) / np.cos(np.deg2rad(theta_o))
     at = np.searchsorted(WAVELENGTHS, wavelengths)
     got = (radiance(spectrum, 0.0, theta_i, theta_o) / illumination())[at]
     share = f * np.cos(np.deg2rad(theta_i)) / got

@@ -386,7 +386,7 @@ def test_gradients_are_finite_differences(llvm, mode):
     params = mi.traverse(built)
 
     def brightness(reflectance):
-        params["wall.bsdf.fresnel.value"] = reflectance
+        params["wall.bsdf.reflectance.value"] = reflectance
         params.update()
         return dr.mean(mi.render(built, params, integrator=integrator, seed=7, spp=1024), axis=None)
 
