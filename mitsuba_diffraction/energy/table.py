@@ -216,9 +216,10 @@ class EnergyTable:
             e[k, :, lit] = np.concatenate(found).T
         e = e.reshape(*e.shape[:2], *layout.shape)
         if _phase(sides[0], layout.frequencies) > (MAX_SLICES - MIN_SLICES) * SLICE_PHASE:
-            # Of a relief so deep e has no smooth course from node to node: each gets the smallest of its neighbours.
-            e = minimum_filter(e, (1, 1, 3, 3, 3))
-        values = np.rint(np.minimum(e, MAX_E) * (255 / MAX_E)).astype(np.uint8)
+            # Of a relief so deep e has no smooth course from node to node: each gets the smallest of its neighbours,
+            # rounded down.
+            e = minimum_filter(e, (1, 1, 3, 3, 3)) - 0.5 * MAX_E / 255
+        values = np.rint(np.clip(e, 0, MAX_E) * (255 / MAX_E)).astype(np.uint8)
         return cls(layout, values, tuple(ratios))
 
     @property
