@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -18,11 +19,43 @@ from .coat import Coat, absolute_index
 MODELS = ("exact", "schlick")
 
 
-def reflectance_from(props: mi.Properties, coat: Coat | None) -> PerfectMirror | Dielectric | Conductor:
-    """The material that the parameters `int_ior`, `ext_ior`, `material` and `fresnel` name, seen from inside a coat.
+class Material(Protocol):
+    """The reflectance of a material.
+
+    Attributes:
+        transparent: whether transmitted light is not absorbed.
+        wavelengths: range in which the reflectance is known, nm.
+        model: one of `MODELS`.
+        eta: relative index of refraction; of a metal its real part, as a texture.
+    """
+
+    transparent: bool
+    wavelengths: tuple[float, float]
+
+    @property
+    def model(self) -> str: ...
+
+    @property
+    def eta(self) -> mi.Float | mi.Texture | None: ...
+
+    def __call__(self, si: mi.SurfaceInteraction3f, cos_half: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
+        """Return R at the cosine ω_i·h."""
+
+    def index(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> list[mi.Complex2f] | None:
+        """Return n + ik of each wavelength; None if the model has no polarisation."""
+
+    def update(self) -> None:
+        """Recompute what depends on the parameters."""
+
+    def traverse(self, callback: mi.TraversalCallback) -> None:
+        """Show the parameters."""
+
+
+def reflectance_from(props: mi.Properties, coat: Coat | None) -> Material:
+    """Return the material given by `int_ior`, `ext_ior`, `material` and `fresnel`, relative to a coat if there is one.
 
     Raises:
-        ValueError: if they contradict each other or name something unknown.
+        RequestError: if they contradict each other or are unknown.
     """
     model = props.get("fresnel", "exact")
     if model not in MODELS:
@@ -39,7 +72,7 @@ def reflectance_from(props: mi.Properties, coat: Coat | None) -> PerfectMirror |
         raise RequestError(f"material: got {material!r}, wanted the name of a conductor, such as 'Al', or 'none'")
     if material == "none":
         return PerfectMirror()
-    # A coat that has the index of the outside is none.
+    # There is no coat if its index is that of the outside.
     outside = coat.index if coat is not None else absolute_index("ext_ior", props.get("ext_ior", 1.0))
     return Conductor(material, model, outside)
 
@@ -47,7 +80,7 @@ def reflectance_from(props: mi.Properties, coat: Coat | None) -> PerfectMirror |
 class PerfectMirror:
     """R = 1."""
 
-    transparent, wavelengths = False, (0.0, np.inf)
+    transparent, wavelengths, model, eta = False, (0.0, np.inf), "exact", None
 
     def __init__(self, name: str = "none (R = 1)") -> None:
         self.name = name
@@ -56,7 +89,7 @@ class PerfectMirror:
         return mi.UnpolarizedSpectrum(1.0)
 
     def index(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> None:
-        """Return None: a constant reflectance has no index."""
+        """Return None: a perfect mirror has no index."""
 
     def update(self) -> None:
         pass
@@ -69,7 +102,7 @@ class PerfectMirror:
 
 
 class Dielectric:
-    """A dielectric of relative index η, seen from outside; no absorption, no dispersion (as Mitsuba's `dielectric`)."""
+    """A dielectric of relative index η without absorption or dispersion, as Mitsuba's `dielectric`."""
 
     transparent, wavelengths = True, (0.0, np.inf)
 
@@ -79,7 +112,7 @@ class Dielectric:
         self.update()
 
     def update(self) -> None:
-        """Keep the index an array: a number from Python would be compiled into the kernels."""
+        """Make the index an opaque array: Dr.Jit would compile a literal into its kernels."""
         dr.make_opaque(self.eta)
 
     def __call__(self, si: mi.SurfaceInteraction3f, cos_half: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
@@ -88,7 +121,7 @@ class Dielectric:
         return mi.UnpolarizedSpectrum(_schlick(dr.square((self.eta - 1) / (self.eta + 1)), cos_half))
 
     def index(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> list[mi.Complex2f] | None:
-        """Return n + ik of every wavelength; Schlick's formula knows no polarisation."""
+        """Return n + ik of each wavelength; None with Schlick's formula, which has no polarisation."""
         return None if self.model == "schlick" else [mi.Complex2f(self.eta, 0)] * len(mi.UnpolarizedSpectrum(0.0))
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
@@ -99,7 +132,7 @@ class Dielectric:
 
 
 class Conductor:
-    """A metal of complex index η + ik, by the names of Mitsuba's `conductor`; under a coat, relative to its index."""
+    """A metal of index η + ik, named as in Mitsuba's `conductor`; under a coat, relative to the index of the coat."""
 
     transparent, wavelengths = False, VISIBLE
 
@@ -116,7 +149,7 @@ class Conductor:
     @staticmethod
     def _spectrum(wavelengths: NDArray[np.float64], values: NDArray[np.float64]) -> mi.Texture:
         """Make a texture from the values at wavelengths in µm."""
-        # A regular table is read at once; in an irregular one every look-up searches, which took half of all time.
+        # A look-up in an irregular table is a search, which took half of the rendering time.
         nanometres = np.arange(VISIBLE[0], VISIBLE[1] + 1)
         text = ", ".join(repr(float(value)) for value in np.interp(nanometres * 1e-3, wavelengths, values))
         return nested_plugin("regular", wavelength_min=VISIBLE[0], wavelength_max=VISIBLE[1], values=text)
@@ -132,7 +165,7 @@ class Conductor:
         return _schlick(normal, cos_half)
 
     def index(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> list[mi.Complex2f] | None:
-        """Return n + ik of every wavelength; Schlick's formula knows no polarisation."""
+        """Return n + ik of each wavelength; None with Schlick's formula, which has no polarisation."""
         if self.model == "schlick":
             return None
         eta, k = self.eta.eval(si, active), self.k.eval(si, active)
@@ -150,6 +183,6 @@ class Conductor:
 
 
 def _schlick(normal: mi.UnpolarizedSpectrum, cos_half: mi.Float) -> mi.UnpolarizedSpectrum:
-    """Return R₀ + (1 − R₀)(1 − cos)⁵ (Schlick 1994); R₀ is a power already and is not squared."""
-    away = 1 - cos_half
-    return normal + (1 - normal) * dr.square(dr.square(away)) * away
+    """Return R₀ + (1 − R₀)(1 − cos)⁵ (Schlick 1994), R₀ the power reflectance at normal incidence."""
+    complement = 1 - cos_half
+    return normal + (1 - normal) * dr.square(dr.square(complement)) * complement

@@ -96,9 +96,8 @@ class Grating:
         height_scale, lateral_scale = self.scales.at(si, active)
         near = mi.UInt32(0)
         for channel, seen in enumerate(covered):
-            if self.scattering.resolved:
-                frequency = lateral_scale * dr.rcp(self._wavelength(si, channel))
-                seen &= self.scattering.meets(u * frequency, v * frequency, lateral_scale)
+            frequency = lateral_scale * dr.rcp(self._wavelength(si, channel))
+            seen &= self.scattering.meets(u * frequency, v * frequency, lateral_scale)
             near |= dr.select(active & seen, mi.UInt32(1 << channel), 0)
         # Most directions lie between the orders of a grating at all wavelengths: unless drawn, they skip what follows.
         needed = near != 0 if self.scattering.resolved and not wo_is_sample else True

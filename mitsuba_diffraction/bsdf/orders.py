@@ -312,7 +312,9 @@ class OrderSpectrum:
         return min(scales, default=np.inf) if self.resolved else None
 
     def meets(self, q_x: mi.Float, q_y: mi.Float, scale: mi.Float | float) -> mi.Bool:
-        """Return whether q (cycles/µm) lies in the lobe of an order, where they are resolved; `scale` is of lobes."""
+        """Return whether q (cycles/µm) lies in the lobe of an order; true where they overlap. `scale` is of lobes."""
+        if not self.resolved:
+            return mi.Bool(True)
         along_x, along_y = self.axes
         return along_x.holds(along_x.first(q_x), q_x, scale) & along_y.holds(along_y.first(q_y), q_y, scale)
 

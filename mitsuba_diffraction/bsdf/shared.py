@@ -37,6 +37,7 @@ class SharedTables:
     """
 
     def __init__(self, spectrum: Spectrum, eta: float | None) -> None:
+        self.scattering: OrderSpectrum | SplineSpectrum | RigorousOrders
         if isinstance(spectrum, RigorousSpectrum):
             self.scattering = RigorousOrders(spectrum)
         else:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-from typing import Protocol
+from typing import Protocol, cast
 
 import drjit as dr
 import mitsuba as mi
@@ -18,12 +18,14 @@ from ..precomputation import Spectrum
 from ..rigorous.spectrum import RigorousSpectrum
 from ..settings import VISIBLE
 from .coat import SAME_INDEX
-from .energy import Coordinates
-from .fresnel import Conductor, Dielectric, PerfectMirror, reflectance_from
+from .energy import Coordinates, Energy
+from .fresnel import Material, reflectance_from
 from .geometry import Geometry, Incidence, Interface, turned
 from .order_sampler import CHANGE
+from .orders import OrderSpectrum
 from .parameters import Media, Scales, check_parameters, check_transmission
 from .polarisation import Split, of_interface, of_orders, of_plane, unpolarised
+from .rigorous_orders import RigorousOrders
 from .shared import SharedTables
 from .tables import opaque
 
@@ -49,7 +51,7 @@ class Scattering(Protocol):
     resolved: bool
 
     def meets(self, q_x: mi.Float, q_y: mi.Float, scale: mi.Float) -> mi.Bool:
-        """Return whether q (cycles/µm) lies in the lobe of an order, if they are resolved; `scale` is of lobes."""
+        """Return whether q (cycles/µm) lies in the lobe of an order; true where they overlap. `scale` is of lobes."""
 
     def evaluate(self, geometry: Geometry, incidence: Incidence, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
         """Return n_o² K G S |cos θ_o|, or n_o² Σ_m η_m N |cos θ_o|, and the density of q, both in µm².
@@ -76,7 +78,7 @@ class Theory(Protocol):
     def scattering(self) -> Scattering: ...
 
     @property
-    def material(self) -> PerfectMirror | Dielectric | Conductor: ...
+    def material(self) -> Material: ...
 
     @property
     def interface(self) -> Interface: ...
@@ -181,7 +183,7 @@ class ScalarTheory:
             )
         scales = self.scales
         scales.check(self.spectrum.wavelengths, self.media.index, getattr(self.scattering, "max_scale", None))
-        self.energy = None
+        self.energy: Energy | None = None
         if self.conserve_energy and self.shadowing:
             self.energy = self.tables.energy(scales)
         self.interface = self._interface()
@@ -195,12 +197,14 @@ class ScalarTheory:
         """Return the media above and below, with orders drawn for the scales and the index as they are."""
         coat, eta, is_sheet = self.media.coat, self.media.eta, self.media.transmission == "sheet"
         sampler = self.tables.order_sampler(self.scales, is_sheet, 1.0 if coat is None else coat.relative)
-        if sampler is not None:
-            self.scattering = self.tables.scattering.drawn_from(sampler)
+        scattering = self.tables.scattering
+        if sampler is not None and isinstance(scattering, OrderSpectrum):
+            self.scattering = scattering.drawn_from(sampler)
         if eta is None:
             return Interface(1.0 if coat is None else coat.eta)
         kappas = tuple(opaque(kappa) for kappa in small_kappas(self.spectrum, eta))
-        return Interface(1.0, self.material.eta, is_sheet, kappas, sampler and sampler.transmitted)
+        fraction = None if sampler is None else sampler.transmitted
+        return Interface(1.0, self.material.eta, is_sheet, kappas, fraction)
 
     def parameters_changed(self, keys: list[str]) -> None:
         """Recompute what depends on the parameters `keys`; on all of them if none is named."""
@@ -233,14 +237,15 @@ class ScalarTheory:
         """Return those of both directions in the table of E."""
         if self.energy is None:
             return None
-        return tuple(self.energy.coordinates(k.inner()) for k in (geometry.incident, geometry.outgoing))
+        incident, outgoing = geometry.incident.inner(), geometry.outgoing.inner()
+        return self.energy.coordinates(incident), self.energy.coordinates(outgoing)
 
     def evaluate(
         self, geometry: Geometry, incidence: Incidence, pair: tuple[Coordinates, Coordinates] | None, active: mi.Bool
     ) -> tuple[mi.Float, mi.Float]:
         """Return K G S E n_o² |cos θ_o| and the density of q."""
         power, density = self.scattering.evaluate(geometry, incidence, active)
-        if pair is not None:
+        if pair is not None and self.energy is not None:
             frequency = incidence.frequency * geometry.coat_index
             power *= self.energy.factor(pair, frequency, geometry.height_scale)
         return power, density
@@ -290,7 +295,7 @@ class RigorousTheory:
             raise RequestError(f"ext_ior: got {media.outside:g} with theory=rigorous, wanted air or a coat")
         check_transmission(spectrum.transmission, media)
         self.material = check_parameters(props, spectrum, coat)
-        self.scattering = SharedTables.of(spectrum).scattering
+        self.scattering = cast(RigorousOrders, SharedTables.of(spectrum).scattering)
         if media.eta is None:
             self.interface = Interface(1.0 if coat is None else coat.eta)
         else:
@@ -307,7 +312,7 @@ class RigorousTheory:
         """Return None: nothing is needed."""
 
     def evaluate(
-        self, geometry: Geometry, incidence: Incidence, pair: None, active: mi.Bool
+        self, geometry: Geometry, incidence: Incidence, pair: tuple[Coordinates, Coordinates] | None, active: mi.Bool
     ) -> tuple[mi.Float, mi.Float]:
         """Return n_o² Σ_m η_m N |cos θ_o| and the density of q."""
         return self.scattering.evaluate(geometry, incidence, active)
@@ -330,11 +335,11 @@ class RigorousTheory:
         def entries(channel: int, source: mi.Vector3f, exit_: mi.Vector3f) -> list[list[mi.Float]]:
             frequency = relative / si.wavelengths[channel]
             # Under a coat both are directions inside of it, and so is the wavelength.
-            pair, above = [turned(omega, sin, cos) for omega in (source, exit_)], None
-            if self.interface.transmits:
-                vectors = [self.interface.wave_vector(omega) for omega in pair]
-                pair, above = [k.tangent for k in vectors], [k.sign > 0 for k in vectors]
-            return self.scattering.mueller(*pair, frequency, active, above)
+            k_i, k_o = turned(source, sin, cos), turned(exit_, sin, cos)
+            if not self.interface.transmits:
+                return self.scattering.mueller(k_i, k_o, frequency, active, None)
+            k_i, k_o = self.interface.wave_vector(k_i), self.interface.wave_vector(k_o)
+            return self.scattering.mueller(k_i.tangent, k_o.tangent, frequency, active, (k_i.sign > 0, k_o.sign > 0))
 
         return of_orders(value, entries, mi.Vector3f(-sin, cos, 0))
 
