@@ -1,4 +1,4 @@
-"""What lies under the surface, a nested BSDF that reflects; plugins made by the constructors of other plugins."""
+"""The base under the surface, a nested BSDF; and construction of nested plugins."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from ..errors import RequestError
 def nested_plugin(kind: str, **parameters: object) -> mi.Object:
     """Make a plugin without children.
 
-    Unlike mi.load_dict, this leaves Mitsuba's file resolver alone. mi.load_dict exchanges it for the time of the call,
-    and other plugins of the scene, which Mitsuba instantiates at the same time on other threads, may ask for it then.
+    mi.load_dict replaces Mitsuba's file resolver during the call, while other threads construct plugins that may use
+    it.
     """
     props = mi.Properties(kind)
     for name, value in parameters.items():
@@ -31,7 +31,7 @@ def contains_grating(bsdf: mi.BSDF) -> bool:
 
 
 def nested(bsdf: mi.BSDF) -> list[mi.BSDF]:
-    """Return the BSDFs that a BSDF holds, such as the two sides of a `twosided`."""
+    """Return the BSDFs nested in a BSDF, such as both of a `twosided`."""
 
     class Children(mi.TraversalCallback):
         def __init__(self) -> None:
@@ -57,10 +57,10 @@ REFLECTS = mi.BSDFFlags.DiffuseReflection, mi.BSDFFlags.GlossyReflection, mi.BSD
 
 
 def base_from(props: mi.Properties) -> Base | None:
-    """Return the nested BSDF that the parameter `base` holds, if there is one.
+    """Return the nested BSDF of the parameter `base`, or None.
 
     Raises:
-        ValueError: if it is not a BSDF that reflects and lets nothing through, or has another name.
+        RequestError: if it is not a BSDF that reflects and does not transmit, or has another name.
     """
     others = [name for name, value in props.objects() if name != "base" and isinstance(value, mi.BSDF)]
     if others:
@@ -76,12 +76,12 @@ def base_from(props: mi.Properties) -> Base | None:
 
 
 class Base:
-    """A BSDF whose light passes the surface twice.
+    """A BSDF below the surface, which transmits its light twice.
 
     Attributes:
         bsdf: the BSDF itself.
         components: the flags of its components, as seen from the front.
-        has_delta: it reflects some light as a mirror does, which `eval` cannot show.
+        has_delta: whether it has specular reflection, which `eval` does not include.
     """
 
     def __init__(self, bsdf: mi.BSDF) -> None:
@@ -98,7 +98,7 @@ class Base:
         self._is_diffuse = bool(flags & +mi.BSDFFlags.DiffuseReflection)
 
     def context(self, ctx: mi.BSDFContext) -> mi.BSDFContext | None:
-        """The same request to the nested BSDF, whose components follow that of the grating; None if it has no part."""
+        """Return the context for the nested BSDF, whose components follow the grating's; None if none is requested."""
         if not any(
             flags & +mi.BSDFFlags.FrontSide and flags & +kind and ctx.is_enabled(kind, component)
             for component, flags in enumerate(self.components, 1)
@@ -111,7 +111,7 @@ class Base:
         return inner
 
     def albedo(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Float:
-        """Estimate the albedo, averaged over the wavelengths, to divide samples by."""
+        """Estimate the albedo, averaged over the wavelengths, for the choice of samples."""
         if not self._is_diffuse:
             return mi.Float(1.0)
         value = mi.unpolarized_spectrum(self.bsdf.eval_diffuse_reflectance(si, active))

@@ -1,13 +1,13 @@
 """A clear plane layer over the grating: polycarbonate over a disc's metal, lacquer over foil.
 
-A plane layer of index n keeps tangential components, so that q = −(ω_i + ω_o)/λ along the surface is what it is
-without the layer. Inside, sin θ' = sin θ/n and the wavelength is λ/n, hence κ' = 2πn (cos θ'_i + cos θ'_o)/λ and
+A plane layer of index n preserves tangential components, and with them q = −(ω_i + ω_o)_t/λ. Inside,
+sin θ' = sin θ/n and the wavelength is λ/n, hence κ' = 2πn (cos θ'_i + cos θ'_o)/λ and
 
     f = T_i T_o R' K' G' E' S(q; κ')/λ²,    T = (1 − F(θ)) e^{−σd/cos θ'}
 
-with F the power reflectance of the layer's front face, R' relative to n, primes for quantities inside, absorption σ and
-thickness d. Light that the grating sends beyond the critical angle, and what the front face returns to the grating, is
-lost; the front face itself reflects F as a mirror.
+with F the power reflectance of the front face, R' relative to n, primes for quantities inside, absorption σ and
+thickness d. The front face also reflects F specularly. Light that the grating diffracts beyond the critical angle, or
+that the front face reflects back to the grating, is lost.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from ..errors import RequestError, is_number
 from .base import nested_plugin
 from .tables import opaque
 
-SAME_INDEX = 1e-3  # indices of refraction that differ by less, such as those of air and vacuum, are the same
+SAME_INDEX = 1e-3  # indices of refraction that differ by less, as those of air and vacuum, are taken as equal
 _log = logging.getLogger(__name__)
 
 
 def coat_from(props: mi.Properties) -> Coat | None:
-    """Return the layer that `coat_ior`, `coat_absorption` and `coat_thickness` describe, if there is one.
+    """Return the layer given by `coat_ior`, `coat_absorption` and `coat_thickness`, or None.
 
-    One that has the index of the outside and does not absorb is none.
+    A layer that has the index of the outside and does not absorb is ignored.
 
     Raises:
         RequestError: if its index is below one or below that of the outside, or a parameter is out of range.
@@ -52,7 +52,7 @@ def coat_from(props: mi.Properties) -> Coat | None:
 
 
 def absolute_index(name: str, index: float | str) -> float:
-    """Return an index of refraction, given by a number or by a preset's name as in Mitsuba's `dielectric`.
+    """Return an index of refraction from a number or the name of a preset, as in Mitsuba's `dielectric`.
 
     Raises:
         RequestError: if it is neither.
@@ -68,7 +68,7 @@ def absolute_index(name: str, index: float | str) -> float:
 
 
 class Coat:
-    """The layer.
+    """A clear plane layer.
 
     Attributes:
         index: n, absolute.
@@ -86,7 +86,7 @@ class Coat:
         self.absorbs = depth > 0
 
     def refracted(self, omega: mi.Vector3f) -> mi.Vector3f:
-        """Return the direction inside, away from the grating, of light that is outside in the direction ω."""
+        """Return the direction inside the layer that is refracted to or from ω outside."""
         x, y = omega.x / self.eta, omega.y / self.eta
         return mi.Vector3f(x, y, dr.safe_sqrt(1 - dr.square(x) - dr.square(y)))
 
@@ -106,10 +106,10 @@ class Coat:
         """Return T."""
         return (1 - self.reflectance(cos)) * self.absorption(cos_inside)
 
-    def share(self, cos: mi.Float, below: mi.Float) -> mi.Float:
-        """Return the share of samples that the front face gets, where what is below reflects `below`."""
+    def sampling_probability(self, cos: mi.Float, albedo: mi.Float) -> mi.Float:
+        """Return the probability of sampling the front face, from the albedo of the layers below it."""
         front = self.reflectance(cos)
-        return dr.detach(dr.clip(front / (front + dr.square(1 - front) * below), 0, 1))
+        return dr.detach(dr.clip(front / (front + dr.square(1 - front) * albedo), 0, 1))
 
     def __repr__(self) -> str:
         return f"n = {self.index:g}" + (f", optical depth {self.depth}" if self.absorbs else "")

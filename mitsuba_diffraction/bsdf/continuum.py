@@ -1,4 +1,4 @@
-"""S(q; κ) on a lattice of quadratic B-splines at run time: of a sample, and of a tile whose orders overlap."""
+"""S(q; κ) on a lattice of quadratic B-splines at run time, for samples and for tiles whose orders overlap."""
 
 from __future__ import annotations
 
@@ -7,23 +7,25 @@ import mitsuba as mi
 
 from ..grating_spectrum import GratingSpectrum
 from ..spectrum.grids import spline_weights
-from .continuum_sampler import CellSampler
+from .continuum_sampler import BinSampler
 from .geometry import Geometry, Incidence
 from .orders import SlicePower
 from .tables import larger, opaque
 
-RIM = 3  # rings of zeros, so many as are read in a row
+RIM = 3  # nodes of zero on each side, as many as a spline covers
 
 
 class SplineSpectrum:
     """S(q; κ) = Σ_m c_m(κ) B(q/Δ − m)/(Δ_x Δ_y) (`SplineGrid`), and the density from which q is drawn.
 
-    One evaluation reads three by three nodes and one packet for the density.
+    An evaluation reads three by three nodes, and one word and one packet for the density.
     """
 
     resolved = False
 
-    def __init__(self, spectrum: GratingSpectrum, most: float | None = None, farthest: float = 1.0) -> None:
+    def __init__(
+        self, spectrum: GratingSpectrum, typical_max_kappa: float | None = None, max_tangent: float = 1.0
+    ) -> None:
         grid = spectrum.grid
         self.power = SlicePower(spectrum.table, (RIM, RIM))
         self.max_node_x, self.max_node_y = grid.max_order
@@ -31,7 +33,7 @@ class SplineSpectrum:
         self.per_area = opaque(1 / (grid.spacing[0] * grid.spacing[1]))
         self.limit_x, self.limit_y = (opaque(limit) for limit in grid.limit)
         self.per_width = opaque(1 / spectrum.lobe_width)
-        self.cells = CellSampler(spectrum, most, farthest)
+        self.q_sampler = BinSampler(spectrum, typical_max_kappa, max_tangent)
 
     def meets(self, q_x: mi.Float, q_y: mi.Float, scale: mi.Float | float) -> mi.Bool:
         """Return true: a continuum has no gaps."""
@@ -43,7 +45,7 @@ class SplineSpectrum:
         incidence: Incidence,
         active: mi.Bool,
     ) -> tuple[mi.Float, mi.Float]:
-        """Evaluate K G S(q; κ) cos θ_o and the density of q; as `OrderSpectrum`, but all directions cost the same."""
+        """Evaluate n_o² K G S(q; κ) |cos θ_o| and the density of q, both in µm², as `Scattering.evaluate`."""
         q = geometry.tangent * incidence.frequency
         x, y = q.x * self.per_q_x, q.y * self.per_q_y
         m_x, m_y = mi.Int32(dr.round(x)), mi.Int32(dr.round(y))
@@ -56,13 +58,13 @@ class SplineSpectrum:
             active,
         )
         inside = active & (dr.abs(q.x) <= self.limit_x) & (dr.abs(q.y) <= self.limit_y)
-        # Interpolation may dip below zero by its error.
+        # Interpolated powers may be slightly negative.
         power = (
             larger(power, 0)
             * self.per_area
             * geometry.continuum_factor(incidence, incidence.frequency * self.per_width)
         )
-        return dr.select(inside, power, 0), self.cells.density(incidence.mirrored * q, incidence, active)
+        return dr.select(inside, power, 0), self.q_sampler.density(incidence.q_sign * q, incidence, active)
 
     def sample(
         self,
@@ -71,5 +73,5 @@ class SplineSpectrum:
         v: mi.Point2f,
         active: mi.Bool,
     ) -> tuple[mi.Point2f, mi.Bool]:
-        """Draw q in cycles/µm, for one wavelength; no single order would not propagate."""
-        return self.cells.sample(incidence, u, v, active), active
+        """Draw q in cycles/µm, for one wavelength; as no order is chosen, none is evanescent."""
+        return self.q_sampler.sample(incidence, u, v, active), active

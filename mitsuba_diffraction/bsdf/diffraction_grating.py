@@ -20,7 +20,7 @@ PARAMETERS = (
         "`mitsuba_diffraction.gratings`, all lengths in µm, and coherence_length and largest_height_range as in "
         "`precompute`",
     ),
-    Parameter("tolerance", "float", "of a profile or instead of that of a recipe, as in `precompute`"),
+    Parameter("tolerance", "float", "for a profile, or to override a recipe, as in `precompute`"),
     Parameter(
         "representation",
         "string",
@@ -31,9 +31,9 @@ PARAMETERS = (
     Parameter(
         "theory",
         "string",
-        "of a profile: scalar, or rigorous, Maxwell's equations for the material that is given and for gratings of one "
-        "row; files and spectra say which they are. Rigorous efficiencies exclude height_scale, lateral_scale, "
-        "shadowing, fresnel and base",
+        "for a profile: scalar, or rigorous, Maxwell's equations for the given material and gratings of one row; files "
+        "and spectra have their theory. Rigorous efficiencies exclude height_scale, lateral_scale, shadowing, fresnel "
+        "and base",
         "scalar",
     ),
     Parameter("int_ior, ext_ior", "float or string", "a dielectric, as in Mitsuba's `dielectric`", "1.5, air"),
@@ -46,7 +46,7 @@ PARAMETERS = (
     Parameter(
         "lateral_scale",
         "float or texture",
-        "scales the lengths along the surface, but not the lobes, of orders that do not overlap",
+        "scales the lengths along the surface, but not the widths of lobes; for orders that do not overlap",
         "1",
     ),
     Parameter("shadowing", "string", "v_cavity or none", "v_cavity"),
@@ -54,7 +54,7 @@ PARAMETERS = (
     Parameter(
         "coat_ior",
         "float or string",
-        "index of a clear plane layer over the grating, as for int_ior; that of the outside is no layer",
+        "index of a clear plane layer over the grating, as for int_ior; with that of the outside there is no layer",
         "none",
     ),
     Parameter("coat_absorption", "float", "of the layer, 1/µm", "0"),
@@ -62,16 +62,16 @@ PARAMETERS = (
     Parameter(
         "transmission",
         "string",
-        "light that enters a dielectric: none, it is absorbed or reaches the base; interface, it enters the medium of "
-        "int_ior, as in `roughdielectric`; sheet, it passes a film with one flat face, below, and ext_ior on both "
-        "sides. A rigorous spectrum must be built for it",
+        "of a dielectric: none, transmitted light is absorbed or reaches the base; interface, there is the medium of "
+        "int_ior below, as in `roughdielectric`; sheet, a film with a flat lower face and ext_ior on both sides. A "
+        "rigorous spectrum must be built for it",
         "none",
     ),
     Parameter(
         "base",
         "BSDF",
-        "what lies under a dielectric surface (pigment): any BSDF that reflects and lets nothing through. Its value "
-        "is multiplied by (1 − R_i)(1 − R_o), R at the angles of ω_i and ω_o to the surface",
+        "what lies under a dielectric surface (pigment): any BSDF that only reflects. Its value is multiplied by "
+        "(1 − R_i)(1 − R_o), R at the angles of ω_i and ω_o to the surface",
         "none",
     ),
 )
@@ -91,13 +91,14 @@ The BRDF is R · K · G · S(q; κ)/λ² · E: R the power reflectance at the ha
 and κ = 2π (cos θ_i + cos θ_o)/λ. E, as in `energy.py`, bounds the albedo by one; it is one where the albedo is
 below one without it. Without shadowing K diverges as 1/cos θ near the horizon, and there is no E.
 
-Of rigorous theory the BRDF is Σ_m η_m N(q − m/T; σ_q² I)/λ², as in `rigorous_orders.py`: R, K, G and E are in η_m.
-Where light passes, the sum has the factor n_o², n_o the index of the medium of ω_o. The efficiencies of a sheet hold
-all of its light: what its flat face reflects is a lobe of order 0, where scalar theory has a mirror, and light that is
-reflected back and forth inside leaves in the orders into which it is diffracted.
+For rigorous theory the BRDF is Σ_m η_m N(q − m/T; σ_q² I)/λ², as in `rigorous_orders.py`: η_m includes R, K, G and
+E. With a transmission the sum has the factor n_o², n_o the index of the medium of ω_o. The efficiencies of a sheet
+include all of its light: the reflection by its flat face is a lobe of order 0, where scalar theory has a mirror, and
+multiple reflections inside contribute to the orders.
 
-With a transmission (`geometry.py`), light passes the grating from either side: q and κ as above with the indices of
-both media, 1 − R for R, and the K and G of `geometry.transmitted`. From below, a sheet's flat face is a mirror.
+With a transmission (`geometry.py`), light is incident from above or below: q and κ have the indices of both media,
+transmitted light has 1 − R instead of R, and K and G are those of `geometry.transmitted`. From below, the flat face
+of a sheet is a mirror.
 
 Under a coat (`coat.py`) all this holds inside of it, where wavelengths are shorter and directions steeper; the front
 face of the coat is a mirror. A saved spectrum must cover the shorter wavelengths; one built from a recipe or a profile
@@ -115,8 +116,8 @@ def define() -> type:
         __doc__ = MANUAL
 
         def __init__(self, props: mi.Properties) -> None:
-            # Mitsuba registers an object when its base class is initialised, and Dr.Jit then calls it in every scene as
-            # long as anything holds it, be it a traceback: all that may fail comes first.
+            # The initialiser of the base class registers the object, which Dr.Jit then calls in all scenes as long as
+            # it exists, even if only a traceback refers to it: therefore errors must occur before.
             self.layers = Layers(props)
             self.spectrum = self.layers.grating.spectrum
             mi.BSDF.__init__(self, props)

@@ -1,7 +1,7 @@
-"""E(ω_i, ω_o, λ) at run time: what keeps the grating from sending out more light than it receives.
+"""E(ω_i, ω_o, λ) at run time, the factor that bounds the albedo by about one.
 
-E = min(e(ω_i, λ), e(ω_o, λ)), e as in `energy/table.py`; of an interface, e of each side and of reflected or
-transmitted light.
+E = min(e(ω_i, λ), e(ω_o, λ)), e as in `energy/table.py`; an interface has separate e above and below, and for reflected
+and transmitted light.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from .tables import NumberTable, larger, limited, opaque, smaller
 
 @dataclass
 class Coordinates:
-    """A direction in the table.
+    """The coordinates of a direction in the table.
 
     Attributes:
-        u, v: c − ω_x and c + ω_x, of a line grating; else columns and rows in cells.
-        below: below the surface.
+        u, v: c − ω_x and c + ω_x for a line grating; else column and row in grid cells.
+        below: whether the direction is below the surface.
     """
 
     u: mi.Float
@@ -32,19 +32,18 @@ class Coordinates:
 
 
 class Energy:
-    """e(ω, λ) from a table, linear between the corners of a cell.
+    """e(ω, λ) from a table, linear between the corners of a grid cell.
 
-    The four corners of a cell are packed as bytes into one number, so that a direction and a wavelength cost one read
-    of four bytes, twice as many where e is linear between wavelengths, or ratios of scales: reads cost more than the
-    arithmetic.
+    The four corners of a cell are packed as bytes into a word, as reads cost more than arithmetic: one read for a
+    direction and a wavelength, twice as many for each linear interpolation between wavelengths or ratios of scales.
     """
 
     def __init__(self, table: EnergyTable) -> None:
-        """Pack the table."""
+        """Pack a table."""
         self.layout = layout = table.layout
         self.two_sided, self.ratios = table.values.shape[1] > 1, table.ratios
         self.table = NumberTable(table.corners() @ (np.uint32(1) << np.arange(0, 32, 8, dtype=np.uint32)))
-        # Arrays, as tables of other heights have other numbers of cells.
+        # Opaque, as the numbers of cells depend on the surface.
         self.last_slice, self.side = opaque(layout.slices - 1), opaque(layout.side)
         self.first_frequency, span = opaque(layout.frequencies[0]), layout.frequencies[1] - layout.frequencies[0]
         self.slices_per_frequency = opaque((layout.slices - 1) / span)
@@ -59,7 +58,7 @@ class Energy:
         return "bounds the albedo by about one"
 
     def coordinates(self, omega: mi.Vector3f) -> Coordinates:
-        """Return those of ω, a unit vector along the pattern's axes in the medium next to the relief, z < 0 below."""
+        """Return the coordinates of ω, a unit vector along the pattern's axes next to the relief, z < 0 below."""
         z = dr.abs(omega.z) if self.two_sided else larger(omega.z, 0)
         if self.layout.lines:
             x = omega.y if self.layout.turned else omega.x
@@ -78,25 +77,25 @@ class Energy:
 
         Args:
             pair: the coordinates of both directions.
-            frequency: s/λ in 1/µm, λ in the medium above next to the relief and s the scale of lengths.
-            ratio: h/s, h the scale of heights; of no effect where the table has one.
+            frequency: s/λ in 1/µm, λ in the upper medium next to the relief and s the scale of lengths.
+            ratio: h/s, h the scale of heights; ignored if the table has a single one.
         """
         i, o = pair
-        crosses = i.below != o.below
-        return smaller(self.bound(i, frequency, crosses, ratio), self.bound(o, frequency, crosses, ratio))
+        transmitted = i.below != o.below
+        return smaller(self.bound(i, frequency, transmitted, ratio), self.bound(o, frequency, transmitted, ratio))
 
     def bound(
-        self, at: Coordinates, frequency: mi.Float, crosses: mi.Bool | bool = False, ratio: mi.Float | float = 1.0
+        self, at: Coordinates, frequency: mi.Float, transmitted: mi.Bool | bool = False, ratio: mi.Float | float = 1.0
     ) -> mi.Float:
-        """Return e of one direction; `crosses`, of transmitted light. Other arguments as of `factor`."""
+        """Return e of one direction, for transmitted or reflected light; other arguments as of `factor`."""
         side, slices, weights = mi.UInt32(self.side), mi.UInt32(self.last_slice) + 1, []
-        index, ways = mi.UInt32(0), 4 if self.two_sided else 1
+        index, tables = mi.UInt32(0), 4 if self.two_sided else 1
         if self.two_sided:
-            index += dr.select(at.below, mi.UInt32(2), 0) + dr.select(crosses, mi.UInt32(1), 0)
+            index += dr.select(at.below, mi.UInt32(2), 0) + dr.select(transmitted, mi.UInt32(1), 0)
         if len(self.ratios) > 1:
             cell, weight = cell_of((ratio - self.first_ratio) * self.per_ratio, self.last_ratio)
-            index += ways * cell
-            weights.append((weight, ways * slices * side * side))
+            index += tables * cell
+            weights.append((weight, tables * slices * side * side))
         index *= slices
         if self.layout.lines:
             (column, x), (row, y) = (self._column(u * (self.period * frequency)) for u in (at.u, at.v))
@@ -107,19 +106,19 @@ class Energy:
             weights.append((weight, side * side))
         index = (index * side + row) * side + column
 
-        def between(index: mi.UInt32, weights: list[tuple[mi.Float, mi.UInt32]]) -> mi.Vector4f:
+        def interpolate(index: mi.UInt32, weights: list[tuple[mi.Float, mi.UInt32]]) -> mi.Vector4f:
             if not weights:
                 number = self.table(index)
                 return mi.Vector4f(*(mi.Float(mi.Int32((number >> shift) & 255)) for shift in range(0, 32, 8)))
-            (weight, step), *others = weights
-            return dr.lerp(between(index, others), between(index + step, others), weight)
+            (weight, step), *remaining = weights
+            return dr.lerp(interpolate(index, remaining), interpolate(index + step, remaining), weight)
 
-        values = between(index, weights)
+        values = interpolate(index, weights)
         value = dr.lerp(dr.lerp(values[0], values[1], x), dr.lerp(values[2], values[3], x), y)
         return smaller(value * (MAX_E / 255), 1)
 
     def _column(self, u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
-        """Return the cell of u along one axis, and the coordinate in it."""
+        """Return the grid cell of u along one axis, and the coordinate in it."""
         square = smaller(dr.floor(u), self.last_square)
         inner = square > 0
         cells = dr.select(inner, self.cells, self.first_cells)

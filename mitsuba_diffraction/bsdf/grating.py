@@ -1,4 +1,4 @@
-"""The light that a grating diffracts, at the wavelengths of a ray: its value, its density, its samples."""
+"""The light diffracted by a grating at the wavelengths of a ray: value, density, samples."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import RequestError
-from .geometry import Geometry, Incidence, Interface, turned
+from .geometry import Geometry, Incidence, Interface, rotated
 from .parameters import Media, Scales, check_texture, surface_from
 from .polarisation import reflected, through_layer
 from .tables import BELOW_ONE, larger, limited, opaque, smaller
 from .theory import Scattering, theory_of
 
-# The probability of uniform samples, for lobes that the sampler's averages miss; where both directions graze, K G grows
-# faster than samples that follow the cosine could bear.
+# Of samples, for lobes that the averages of the sampler miss. They are uniform in solid angle: where both directions
+# are grazing, K G grows so fast that samples in proportion to the cosine would have large weights.
 UNIFORM_PROBABILITY = 0.02
 
 
@@ -25,10 +25,10 @@ class Grating:
 
     Attributes:
         spectrum: of the surface.
-        recipe: behind the spectrum; None for a saved one.
-        theory: R, E and what else multiplies the powers of orders.
+        recipe: from which the spectrum was built; None for a saved one.
+        theory: the powers of orders, and R, E and other factors.
         coat: over the grating, or None.
-        scales: of heights and of lengths along the surface; of rigorous theory one.
+        scales: of heights and of lengths along the surface; one for rigorous theory.
         orientation: degrees from the tangent to the pattern's x axis.
     """
 
@@ -42,7 +42,7 @@ class Grating:
             raise RequestError(f"orientation: got {angle}, wanted degrees or a texture")
         self.orientation = props.get_texture("orientation", 0.0)
         check_texture("orientation", self.orientation)
-        # The spectrum says nothing outside of its largest angle: there the grating is black.
+        # The grating is black at angles that the spectrum does not cover.
         self.min_cosine = opaque(np.cos(np.deg2rad(self.spectrum.largest_angle)) * (1 - 1e-6))
 
     @property
@@ -52,7 +52,7 @@ class Grating:
 
     @property
     def interface(self) -> Interface:
-        """The media above and below, as the parameters are now."""
+        """The media above and below, for the current parameters."""
         return self.theory.interface
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
@@ -72,43 +72,43 @@ class Grating:
         wo_is_sample: bool,
         transmission_probability: mi.Float,
     ) -> tuple[mi.UnpolarizedSpectrum, mi.Float]:
-        """Evaluate f cos θ_o of light from ω_o, and the density of `sample`.
+        """Evaluate f cos θ_o and the density of `sample`.
 
         Under a coat, without the transmittances of its front face.
 
         Args:
             si: the point, with ω_i.
             wo: ω_o.
-            active: mask; both directions lie above the surface, or light is transmitted.
-            wo_is_sample: whether ω_o was drawn, so that nearly always it lies in the lobe of an order.
+            active: mask; without transmission both directions are above the surface.
+            wo_is_sample: whether ω_o was drawn, and therefore nearly always lies in the lobe of an order.
             transmission_probability: of samples.
         """
         sin, cos = self.frame(si, active)
         # From here on along the pattern's axes.
-        wi, wo = turned(si.wi, sin, cos), turned(wo, sin, cos)
+        wi, wo = rotated(si.wi, sin, cos), rotated(wo, sin, cos)
         k_i, k_o = self.interface.wave_vector(wi), self.interface.wave_vector(wo)
         u, v = -k_i.tangent - k_o.tangent
         outside = dr.abs(mi.Frame3f.cos_theta(wo)) * dr.square(k_o.index)
-        of_side = dr.select(k_i.sign == k_o.sign, 1 - transmission_probability, transmission_probability)
+        side_probability = dr.select(k_i.sign == k_o.sign, 1 - transmission_probability, transmission_probability)
         covered, si = self._covered(si)
         count = _count(covered)
         value, density = mi.UnpolarizedSpectrum(0.0), mi.Float(0.0)
         height_scale, lateral_scale = self.scales.at(si, active)
-        near = mi.UInt32(0)
-        for channel, seen in enumerate(covered):
+        pending = mi.UInt32(0)
+        for channel, in_lobe in enumerate(covered):
             frequency = lateral_scale * dr.rcp(self._wavelength(si, channel))
-            seen &= self.scattering.meets(u * frequency, v * frequency, lateral_scale)
-            near |= dr.select(active & seen, mi.UInt32(1 << channel), 0)
-        # Most directions lie between the orders of a grating at all wavelengths: unless drawn, they skip what follows.
-        needed = near != 0 if self.scattering.resolved and not wo_is_sample else True
-        # What has no derivative is bound here: Dr.Jit carries all other state through the branch.
-        diffracted = functools.partial(self._diffracted, si, near, active)
+            in_lobe &= self.scattering.meets(u * frequency, v * frequency, lateral_scale)
+            pending |= dr.select(active & in_lobe, mi.UInt32(1 << channel), 0)
+        # Most directions lie outside of all lobes at all wavelengths; unless drawn, they skip the branch.
+        needed = pending != 0 if self.scattering.resolved and not wo_is_sample else True
+        # Arguments without derivatives are bound here: Dr.Jit passes all other state through the branch.
+        diffracted = functools.partial(self._diffracted, si, pending, active)
         if needed:
             value, density = diffracted(wi, wo, height_scale, lateral_scale)
-        # The mean over the covered wavelengths: any of them may have chosen the direction.
+        # The mean over the covered wavelengths, as each of them is chosen with the same probability.
         uniform = _uniform_probability(count)
         density = (1 - uniform) * density * outside / larger(count, 1)
-        return value, of_side * dr.fma(uniform, dr.inv_two_pi, density)
+        return value, side_probability * dr.fma(uniform, dr.inv_two_pi, density)
 
     def _wavelength(self, si: mi.SurfaceInteraction3f, channel: int) -> mi.Float:
         """Return λ in the medium above, µm."""
@@ -117,29 +117,28 @@ class Grating:
     def _diffracted(
         self,
         si: mi.SurfaceInteraction3f,
-        near: mi.UInt32,
+        pending: mi.UInt32,
         active: mi.Bool,
         wi: mi.Vector3f,
         wo: mi.Vector3f,
         height_scale: mi.Float,
         lateral_scale: mi.Float,
     ) -> tuple[mi.UnpolarizedSpectrum, mi.Float]:
-        """Return f cos θ_o, and the sum over the wavelengths of the densities; directions along the pattern's axes.
+        """Return f cos θ_o, and the sum of the densities over the wavelengths; directions along the pattern's axes.
 
-        `near` has a bit for each wavelength that is covered; where orders are resolved, only if ω_o lies in the lobe of
-        one.
+        `pending` has a bit for each covered wavelength at which ω_o lies in the lobe of an order or orders overlap.
         """
         interface = self.interface
         k_i, k_o = interface.wave_vector(wi), interface.wave_vector(wo)
         geometry = Geometry.of(k_i, k_o, interface, height_scale, self.theory.shadowing)
-        incidence = Incidence.of(k_i, k_o, interface, height_scale, geometry.flip)
+        incidence = Incidence.of(k_i, k_o, interface, height_scale, geometry.kappa_sign)
         pair = self.theory.coordinates(geometry)
-        value, density = self._of_wavelengths(si, incidence, near, geometry, pair, lateral_scale)
-        # Directions outside of the largest angle are black, but they are drawn: they have a density.
+        value, density = self._of_wavelengths(si, incidence, pending, geometry, pair, lateral_scale)
+        # Directions at angles that are not covered are black, but have a density, as they are drawn.
         within = smaller(*geometry.cosines()) >= self.min_cosine
         value = dr.select(within, value * self.theory.reflectance(si, geometry, active), 0)
         if interface.has_flat_face:
-            value *= interface.flat(wi) * interface.flat(wo)
+            value *= interface.flat_face_transmittance(wi) * interface.flat_face_transmittance(wo)
         return value, density
 
     @dr.syntax
@@ -147,48 +146,48 @@ class Grating:
         self,
         si: mi.SurfaceInteraction3f,
         incidence: Incidence,
-        near: mi.UInt32,
+        pending: mi.UInt32,
         geometry: Geometry,
         pair: tuple | None,
         lateral_scale: mi.Float,
     ) -> tuple[mi.UnpolarizedSpectrum, mi.Float]:
-        """Return f cos θ_o without R of the wavelengths that `near` has, and the sum of their densities.
+        """Return f cos θ_o without R at the wavelengths in `pending`, and the sum of their densities.
 
-        Each pass evaluates one wavelength of each ray; few rays have several in `near`. A loop keeps the kernel small;
-        as Dr.Jit cannot differentiate it backwards, it is unrolled where there are gradients.
+        Each iteration evaluates one wavelength of each ray; few rays have several. A loop keeps the kernel small; with
+        gradients it is unrolled, as Dr.Jit cannot differentiate it in reverse mode.
         """
         value, density = mi.UnpolarizedSpectrum(0.0), mi.Float(0.0)
-        add_first = functools.partial(self._add_first, si, incidence)
+        add_wavelength = functools.partial(self._add_wavelength, si, incidence)
         if dr.hint(dr.grad_enabled(geometry, lateral_scale), mode="scalar"):
             for _ in range(len(value)):
-                near, value, density = add_first(geometry, pair, lateral_scale, near, value, density)
+                pending, value, density = add_wavelength(geometry, pair, lateral_scale, pending, value, density)
         else:
-            while near != 0:
-                near, value, density = add_first(geometry, pair, lateral_scale, near, value, density)
+            while pending != 0:
+                pending, value, density = add_wavelength(geometry, pair, lateral_scale, pending, value, density)
         return value, density
 
-    def _add_first(
+    def _add_wavelength(
         self,
         si: mi.SurfaceInteraction3f,
         incidence: Incidence,
         geometry: Geometry,
         pair: tuple | None,
         lateral_scale: mi.Float,
-        near: mi.UInt32,
+        pending: mi.UInt32,
         value: mi.UnpolarizedSpectrum,
         density: mi.Float,
     ) -> tuple[mi.UInt32, mi.UnpolarizedSpectrum, mi.Float]:
-        """Return `near` without its first wavelength, and the sums with that."""
-        first, wavelength = near & (0 - near), self._wavelength(si, 0)
-        chosen = [first == (1 << channel) for channel in range(len(value))]
+        """Evaluate the first wavelength in `pending`; return `pending` without it, and the sums including it."""
+        first_bit, wavelength = pending & (0 - pending), self._wavelength(si, 0)
+        chosen = [first_bit == (1 << channel) for channel in range(len(value))]
         for channel in range(1, len(value)):
             wavelength = dr.select(chosen[channel], self._wavelength(si, channel), wavelength)
         incidence = incidence.at(wavelength / lateral_scale, lateral_scale)
-        power, probability = self.theory.evaluate(geometry, incidence, pair, near != 0)
+        power, probability = self.theory.evaluate(geometry, incidence, pair, pending != 0)
         square = dr.square(incidence.frequency)
         power *= square
         value += mi.UnpolarizedSpectrum([dr.select(c, power, 0) for c in chosen])
-        return near - first, value, dr.fma(probability, square, density)
+        return pending - first_bit, value, dr.fma(probability, square, density)
 
     def mueller(
         self,
@@ -198,14 +197,14 @@ class Grating:
         wo: mi.Vector3f,
         active: mi.Bool,
     ) -> mi.Spectrum:
-        """Return `value` as light that is split into s and p where the variant and the material know them.
+        """Return `value` as a Mueller matrix in polarised variants, with T_i T_o under a coat.
 
-        Under a coat, after both passes through it, T_i T_o.
+        It is the spectrum itself in other variants, and depolarises for materials without polarisation.
         """
         _, si = self._covered(si)
         directions, interface = (si.wi, wo), self.interface
         if interface.transmits and not interface.is_sheet and ctx.mode == mi.TransportMode.Radiance:
-            # Radiance is compressed along with the solid angle.
+            # Radiance scales with n².
             k_i, k_o = interface.wave_vector(si.wi), interface.wave_vector(wo)
             value *= dr.square(k_i.index / k_o.index)
         if self.coat is None:
@@ -222,22 +221,24 @@ class Grating:
         return value
 
     def _covered(self, si: mi.SurfaceInteraction3f) -> tuple[list[mi.Bool], mi.SurfaceInteraction3f]:
-        """Return which of the wavelengths are covered: at the others the grating is black.
+        """Return which of the wavelengths are covered, and the point with covered ones only.
 
-        And the point with the shortest wavelength instead of those, at which a metal may be no number.
+        At the others the grating is black, and the index of a metal may be NaN: the shortest covered one replaces them.
         """
         limits = np.array(self.spectrum.wavelengths) * self.theory.covered_index
         shortest, longest = np.clip(limits, *self.theory.material.wavelengths)
-        known = mi.SurfaceInteraction3f(si)
+        replaced = mi.SurfaceInteraction3f(si)
         covered = [(w >= shortest * (1 - 1e-6)) & (w <= longest * (1 + 1e-6)) for w in si.wavelengths]
-        for channel, keep in enumerate(covered):
-            known.wavelengths[channel] = dr.select(keep, si.wavelengths[channel], shortest)
-        return covered, known
+        for channel, is_covered in enumerate(covered):
+            replaced.wavelengths[channel] = dr.select(is_covered, si.wavelengths[channel], shortest)
+        return covered, replaced
 
-    def entering(self, si: mi.SurfaceInteraction3f, cos: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
+    def transmittance(self, si: mi.SurfaceInteraction3f, cos: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
         """Return 1 − R, times T of the coat, at the cosine of an angle outside."""
-        through = 1 - self.reflectance(si, cos, active)
-        return through if self.coat is None else self.coat.transmittance(cos, self.coat.cos_inside(cos)) * through
+        transmitted = 1 - self.reflectance(si, cos, active)
+        if self.coat is None:
+            return transmitted
+        return self.coat.transmittance(cos, self.coat.cos_inside(cos)) * transmitted
 
     def reflectance(self, si: mi.SurfaceInteraction3f, cos: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
         """Return R of a plane below the coat, at the cosine of an angle outside."""
@@ -252,7 +253,7 @@ class Grating:
         active: mi.Bool,
         transmission_probability: mi.Float,
     ) -> mi.Vector3f:
-        """Draw a direction for one of the wavelengths; along the horizon (z = 0) where its order is evanescent."""
+        """Draw a direction for one of the wavelengths; z = 0 where its order is evanescent."""
         covered, si = self._covered(si)
         count = _count(covered)
         interface, reflects = self.interface, mi.Bool(True)
@@ -263,22 +264,22 @@ class Grating:
         uniform_probability = _uniform_probability(count)
         uniform = u < uniform_probability
         u = (u - uniform_probability) / larger(1 - uniform_probability, UNIFORM_PROBABILITY)
-        # Only wavelengths that the spectrum covers draw directions.
+        # Only covered wavelengths are chosen.
         chosen = smaller(dr.floor(u * count), larger(count - 1, 0))
         rest = limited(u * count - chosen, 0, BELOW_ONE)
-        wavelength, before = self._wavelength(si, 0), mi.Float(0.0)
-        for channel, use in enumerate(covered):
-            wavelength = dr.select(use & (before == chosen), self._wavelength(si, channel), wavelength)
-            before += dr.select(use, 1, 0)
+        wavelength, rank = self._wavelength(si, 0), mi.Float(0.0)
+        for channel, is_covered in enumerate(covered):
+            wavelength = dr.select(is_covered & (rank == chosen), self._wavelength(si, channel), wavelength)
+            rank += dr.select(is_covered, 1, 0)
         sin, cos = self.frame(si, active)
         height_scale, lateral_scale = self.scales.at(si, active)
-        k_i = interface.wave_vector(turned(si.wi, sin, cos))
+        k_i = interface.wave_vector(rotated(si.wi, sin, cos))
         k_o = interface.scattered(k_i, reflects)
         incidence = Incidence.of(k_i, k_o, interface, height_scale)
         incidence = incidence.at(dr.detach(wavelength / lateral_scale), dr.detach(lateral_scale))
         q, propagates = self.scattering.sample(incidence, rest, v, active & ~uniform)
-        tangent = k_o.tangent - incidence.wavelength * incidence.mirrored * q
-        wo = turned(mi.Vector3f(*tangent, 0), -sin, cos) / k_o.index
+        tangent = k_o.tangent - incidence.wavelength * incidence.q_sign * q
+        wo = rotated(mi.Vector3f(*tangent, 0), -sin, cos) / k_o.index
         wo.z = dr.select(propagates, dr.safe_sqrt(1 - dr.square(wo.x) - dr.square(wo.y)), 0)
         wo = dr.select(uniform, mi.warp.square_to_uniform_hemisphere(v), wo)
         return dr.detach(mi.Vector3f(wo.x, wo.y, k_o.sign * wo.z))

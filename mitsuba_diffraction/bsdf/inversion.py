@@ -1,12 +1,12 @@
-"""What samplers share: a mixture of a few cells of κ, and inversion of cumulative sums.
+"""Common parts of the samplers: a mixture over a few bins of κ, and inversion of cumulative sums.
 
-The best choice of a frequency q would follow S(q; κ), but κ = k (cos θ_i + cos θ_o) is known only when q is. The κ of
-all directions lie in k cos θ_i ≤ κ ≤ k (1 + cos θ_i); weighting cos θ_o by 2 cos θ_o, as a diffuse surface would, gives
-the cell κ_j ≤ κ ≤ κ_{j+1} the weight
+The optimal density of q is proportional to S(q; κ), but κ = k (cos θ_i + cos θ_o) is known only when q is. For all
+outgoing directions k cos θ_i ≤ κ ≤ k (1 + cos θ_i). With the density 2 cos θ_o of cos θ_o, that of a diffuse surface,
+the bin κ_j ≤ κ ≤ κ_{j+1} has the weight
 
     w_j = e_{j+1}² − e_j²,    e_j = clip(κ_j/k − cos θ_i, 0, 1),    Σ_j w_j = 1
 
-The averages of a few wide cells serve: where S changes fast with κ, the mixture must cover its range, not follow it.
+A few wide bins suffice: where S varies fast with κ, the mixture must cover the range of S, not follow it.
 """
 
 from __future__ import annotations
@@ -23,97 +23,96 @@ from ..grating_spectrum import GratingSpectrum
 from .geometry import Incidence
 from .tables import BELOW_ONE, NumberTable, larger, limited, opaque
 
-CELLS = 4  # one packet
+KAPPA_BINS = 4  # the components of a packet
 
 
-class KappaCells:
-    """Cells of 0 ≤ κ ≤ `max_kappa` (rad/µm); the last one takes what lies beyond, too.
+class KappaBins:
+    """Bins of 0 ≤ κ ≤ `max_kappa` (rad/µm); the last one includes larger κ.
 
-    They are equal, or three equal ones up to `most` and one beyond, where most light has less than `most`.
+    The bins are equal; with `typical_max_kappa`, below which nearly all light has its κ, three equal ones end there.
     """
 
-    def __init__(self, max_kappa: float, most: float | None = None) -> None:
-        if most is None:
-            ends = np.linspace(0, max_kappa, CELLS + 1)
+    def __init__(self, max_kappa: float, typical_max_kappa: float | None = None) -> None:
+        if typical_max_kappa is None:
+            ends = np.linspace(0, max_kappa, KAPPA_BINS + 1)
         else:
-            ends = np.append(np.linspace(0, min(most, 0.75 * max_kappa), CELLS), max_kappa)
+            ends = np.append(np.linspace(0, min(typical_max_kappa, 0.75 * max_kappa), KAPPA_BINS), max_kappa)
         self.ends = ends
         self.inner = [opaque(end) for end in ends[1:-1]]
 
     def weights(self, incidence: Incidence) -> mi.Vector4f:
         """Return w_j for one wavelength."""
-        below = [0.0, *map(incidence.below, self.inner), 1.0]
-        return mi.Vector4f(*(below[cell + 1] - below[cell] for cell in range(CELLS)))
+        fractions = [0.0, *map(incidence.fraction_below, self.inner), 1.0]
+        return mi.Vector4f(*(fractions[bin_ + 1] - fractions[bin_] for bin_ in range(KAPPA_BINS)))
 
 
-def averages(spectrum: GratingSpectrum, cells: KappaCells, floor: float = 0.0) -> NDArray[np.float64]:
-    """Return A_jm, (CELLS, rows, columns): the mean of the powers over each cell, scaled to the sum one.
+def mean_powers(spectrum: GratingSpectrum, kappa_bins: KappaBins, uniform_fraction: float = 0.0) -> NDArray[np.float64]:
+    """Return A_jm, (KAPPA_BINS, rows, columns): the powers averaged over each bin of κ and normalised to the sum one.
 
-    Of each, all orders have the share `floor` alike, for those that are strong at some κ only.
+    `uniform_fraction` of the sum is divided equally among the orders, for those that are strong at few κ only.
     """
-    means = np.stack([_average(spectrum, *ends) for ends in itertools.pairwise(cells.ends)])
-    return (1 - floor) * means + floor / means[0].size
+    means = np.stack([_mean_power(spectrum, *ends) for ends in itertools.pairwise(kappa_bins.ends)])
+    return (1 - uniform_fraction) * means + uniform_fraction / means[0].size
 
 
-def _average(spectrum: GratingSpectrum, first: float, end: float) -> NDArray[np.float64]:
-    # The powers oscillate in κ with the angular frequency of the height range at most.
+def _mean_power(spectrum: GratingSpectrum, first: float, end: float) -> NDArray[np.float64]:
+    # As a function of κ the powers have angular frequencies up to the height range.
     points = int(np.ceil((end - first) * spectrum.height_range)) + 2
     nodes = first + (np.arange(points) + 0.5) / points * (end - first)
     total = sum(spectrum.powers(kappa).astype(np.float64) for kappa in nodes)
     return total / total.sum()
 
 
-def choose(shares: mi.Vector4f, u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
-    """Choose a cell with probability proportional to its share.
+def choose(weights: mi.Vector4f, u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
+    """Choose a bin with probability proportional to its weight.
 
     Returns:
-        Its index, and what is left of `u`: a number uniform in [0, 1).
+        Its index, and `u` rescaled to a number uniform in [0, 1).
     """
-    ends = [shares[0]]
-    for cell in range(1, CELLS):
-        ends.append(ends[-1] + shares[cell])
+    ends = [weights[0]]
+    for bin_ in range(1, KAPPA_BINS):
+        ends.append(ends[-1] + weights[bin_])
     x = u * ends[-1]
     chosen, start, end = mi.UInt32(0), mi.Float(0.0), ends[0]
-    for cell in range(1, CELLS):
-        past = x >= ends[cell - 1]
-        chosen = dr.select(past, mi.UInt32(cell), chosen)
-        start, end = dr.select(past, ends[cell - 1], start), dr.select(past, ends[cell], end)
-    # Where nothing is drawn, in a masked lane, all shares are zero.
+    for bin_ in range(1, KAPPA_BINS):
+        past = x >= ends[bin_ - 1]
+        chosen = dr.select(past, mi.UInt32(bin_), chosen)
+        start, end = dr.select(past, ends[bin_ - 1], start), dr.select(past, ends[bin_], end)
+    # In a masked lane all weights are zero.
     return chosen, limited((x - start) / larger(end - start, 1e-30), 0, BELOW_ONE)
 
 
 def search(
-    before: Callable[[mi.Int32], mi.Float], first: mi.Int32, end: mi.Int32, count: int, u: mi.Float
+    cumulative: Callable[[mi.Int32], mi.Float], first: mi.Int32, end: mi.Int32, count: int, u: mi.Float
 ) -> tuple[mi.Int32, mi.Float]:
     """Find the index i with F(i) ≤ F(first) + u (F(end) − F(first)) < F(i + 1), first ≤ i < end.
 
     Args:
-        before: F, which does not fall.
-        first: where the search begins.
-        end: where it ends.
-        count: end − first at most.
+        cumulative: F, which does not decrease.
+        first, end: the range of the search.
+        count: upper bound of end − first.
         u: in [0, 1).
 
     Returns:
-        i, and the place between F(i) and F(i + 1), in [0, 1).
+        i, and the position of the number between F(i) and F(i + 1), in [0, 1).
     """
-    low, high = before(first), before(end)
-    target = _between(low, high, u)
-    index, low, high = _locate(before, first, end, count, target, low, high)
-    return index, _place(target, low, high)
+    low, high = cumulative(first), cumulative(end)
+    target = _interpolated(low, high, u)
+    index, low, high = _locate(cumulative, first, end, count, target, low, high)
+    return index, _relative_position(target, low, high)
 
 
-class SumTable:
-    """F for lines of n numbers, and for each κ cell.
+class CumulativeTable:
+    """Cumulative sums F of lines of n numbers, for each bin of κ.
 
-    A search takes two steps, in every sixteenth sum and in those between. Either are sixteen floats, one line of the
-    cache: what a search costs is the lines that it reads.
+    A search has two steps: in every sixteenth sum, then in those between. Each step reads sixteen floats, which are one
+    cache line: cache misses dominate the cost.
     """
 
     GROUP = 16
 
     def __init__(self, sums: NDArray[np.float32]) -> None:
-        """Take F (..., n + 1, κ cells)."""
+        """Arrange F, (..., n + 1, κ bins)."""
         lines = sums.swapaxes(-1, -2)
         self.count = lines.shape[-1] - 1
         self.groups = 1
@@ -124,24 +123,23 @@ class SumTable:
             self.coarse_stride, self.coarse = coarse.shape[-1], NumberTable(coarse)
         self.stride, self.fine = lines.shape[-1], NumberTable(lines)
 
-    def before(self, line: mi.UInt32, kappa_cell: mi.UInt32, i: mi.Int32, active: mi.Bool) -> mi.Float:
+    def cumulative(self, line: mi.UInt32, kappa_bin: mi.UInt32, i: mi.Int32, active: mi.Bool) -> mi.Float:
         """Return F(i), 0 ≤ i ≤ n."""
-        return self.fine((line * CELLS + kappa_cell) * self.stride + mi.UInt32(i), active)
+        return self.fine((line * KAPPA_BINS + kappa_bin) * self.stride + mi.UInt32(i), active)
 
     def search(
-        self, line: mi.UInt32, kappa_cell: mi.UInt32, low: mi.Float, high: mi.Float, u: mi.Float, active: mi.Bool
+        self, line: mi.UInt32, kappa_bin: mi.UInt32, low: mi.Float, high: mi.Float, u: mi.Float, active: mi.Bool
     ) -> tuple[mi.Int32, mi.Float]:
-        """Return the index i with F(i) ≤ low + u (high − low) < F(i + 1), and the place between, as `search` has them.
+        """Return the index i with F(i) ≤ low + u (high − low) < F(i + 1), and the position between them, as `search`.
 
         Args:
-            line: which of the lines.
-            kappa_cell: which κ cell.
-            low: one of the F.
-            high: a later one of them.
+            line: index of the line.
+            kappa_bin: index of the bin of κ.
+            low, high: two values of F in this line.
             u: in [0, 1).
             active: mask.
         """
-        line = line * CELLS + kappa_cell
+        line = line * KAPPA_BINS + kappa_bin
 
         def fine(i: mi.Int32) -> mi.Float:
             return self.fine(line * self.stride + mi.UInt32(i), active)
@@ -149,50 +147,50 @@ class SumTable:
         def coarse(i: mi.Int32) -> mi.Float:
             return self.coarse(line * self.coarse_stride + mi.UInt32(i), active)
 
-        target = _between(low, high, u)
+        target = _interpolated(low, high, u)
         first, low = mi.Int32(0), mi.Float(0.0)
         if self.groups > 1:
             group, low, high = _locate(coarse, first, mi.Int32(self.groups - 1), self.groups, target, low, high)
             first = self.GROUP * group
         size = min(self.GROUP, self.count)
         index, low, high = _locate(fine, first, first + size, size, target, low, high)
-        # Where nothing is drawn, in a masked lane, all are zero.
-        return dr.minimum(index, self.count - 1), _place(target, low, high)
+        # In a masked lane all sums are zero.
+        return dr.minimum(index, self.count - 1), _relative_position(target, low, high)
 
 
 def truncated_gaussian(u: mi.Float, inside: mi.Float, spread: mi.Float) -> mi.Float:
-    """Return √2 σ erf⁻¹(I (2u − 1)), a Gaussian truncated alike on both sides, as lobes are.
+    """Return √2 σ erf⁻¹(I (2u − 1)), a sample of a symmetrically truncated Gaussian, as lobes are.
 
     Args:
         u: in [0, 1).
-        inside: I, the share of the Gaussian that is left.
+        inside: I, the fraction of the Gaussian inside of the cutoff.
         spread: √2 σ.
     """
     return spread * dr.erfinv(inside * (2 * u - 1))
 
 
-def sums_before(shares: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Return (..., n, κ cells) → (..., n + 1, κ cells): the sums of those before each, as they are read."""
-    result = np.zeros((*shares.shape[:-2], shares.shape[-2] + 1, shares.shape[-1]), np.float32)
-    result[..., 1:, :] = shares.cumsum(axis=-2)
+def cumulative_sums(weights: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Return cumulative sums in float32, beginning with zero: (..., n, κ bins) → (..., n + 1, κ bins)."""
+    result = np.zeros((*weights.shape[:-2], weights.shape[-2] + 1, weights.shape[-1]), np.float32)
+    result[..., 1:, :] = weights.cumsum(axis=-2)
     return result
 
 
 def _in_groups(lines: NDArray[np.float32], group: int) -> NDArray[np.float32]:
-    """Return (..., n) → (..., whole groups), continued with the last number of each line."""
+    """Pad lines to whole groups with their last number: (..., n) → (..., padded n)."""
     pad = [(0, 0)] * (lines.ndim - 1) + [(0, -lines.shape[-1] % group)]
     return np.pad(lines, pad, mode="edge")
 
 
-def _between(low: mi.Float, high: mi.Float, u: mi.Float) -> mi.Float:
+def _interpolated(low: mi.Float, high: mi.Float, u: mi.Float) -> mi.Float:
     """Return low + u (high − low), less than high."""
     target = dr.fma(u, high - low, low)
-    # The sum may round up to the end.
+    # Rounding may give `high`.
     return dr.select(target < high, target, low)
 
 
 def _locate(
-    before: Callable[[mi.Int32], mi.Float],
+    cumulative: Callable[[mi.Int32], mi.Float],
     first: mi.Int32,
     end: mi.Int32,
     count: int,
@@ -202,17 +200,18 @@ def _locate(
 ) -> tuple[mi.Int32, mi.Float, mi.Float]:
     """Return the index i with F(i) ≤ `target` < F(i + 1), F(i), F(i + 1).
 
-    `low` is F(first) and `high` what F(i + 1) is if it was not met on the way.
+    `low` is F(first); `high` is F(i + 1) where the search does not evaluate it.
     """
     index = first
     for bit in reversed(range((count - 1).bit_length())):
         trial = dr.minimum(index + (1 << bit), end)
-        value = before(trial)
-        further = value <= target
-        index = dr.select(further, trial, index)
-        low, high = dr.select(further, value, low), dr.select(further, high, value)
+        value = cumulative(trial)
+        is_past = value <= target
+        index = dr.select(is_past, trial, index)
+        low, high = dr.select(is_past, value, low), dr.select(is_past, high, value)
     return index, low, high
 
 
-def _place(target: mi.Float, low: mi.Float, high: mi.Float) -> mi.Float:
+def _relative_position(target: mi.Float, low: mi.Float, high: mi.Float) -> mi.Float:
+    """Return the position of `target` between `low` and `high`, in [0, 1)."""
     return limited((target - low) / larger(high - low, 1e-30), 0, BELOW_ONE)

@@ -1,4 +1,4 @@
-"""The layers of the material: the face of a coat, the grating, and its base; each is sampled with a probability."""
+"""The layers of a surface: the face of a coat, the grating, and its base; a sample is drawn from one of them."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ import mitsuba as mi
 
 from ..errors import RequestError
 from .base import base_from
-from .geometry import Interface, turned
+from .geometry import Interface, rotated
 from .grating import Grating
 from .parameters import Media
 from .polarisation import of_plane, reflected
 from .tables import BELOW_ONE, smaller
 
-MIN_PROBABILITY = 0.1  # of samples of the grating and of its base: what each reflects is only estimated
+MIN_LAYER_PROBABILITY = 0.1  # of samples of the grating and of its base, whose powers are only estimated
 
 
 @dataclass(frozen=True)
 class Request:
-    """The components that a context requests.
+    """The components requested by a context.
 
     Attributes:
         reflection, transmission: of the grating.
@@ -35,7 +35,7 @@ class Request:
 
     @property
     def grating(self) -> bool:
-        """Whether any light of the grating is requested."""
+        """Whether a component of the grating is requested."""
         return self.reflection or self.transmission
 
 
@@ -56,7 +56,7 @@ class Layers:
         self.grating = Grating(props, media)
         self.base = base_from(props)
         if self.base is not None and not self.grating.theory.material.transparent:
-            raise RequestError("base: got a BSDF below a conductor or a perfect mirror, which let no light through")
+            raise RequestError("base: got a BSDF below a conductor or a perfect mirror, which transmit no light")
         flags = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.Anisotropic | mi.BSDFFlags.FrontSide
         if self.grating.orientation.is_spatially_varying() or any(scale.varies for scale in self.grating.scales):
             flags = flags | mi.BSDFFlags.SpatiallyVarying
@@ -76,7 +76,7 @@ class Layers:
 
     @property
     def interface(self) -> Interface:
-        """The media above and below the relief, as the parameters are now."""
+        """The media above and below the relief, for the current parameters."""
         return self.grating.interface
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
@@ -93,28 +93,28 @@ class Layers:
         )
 
     def _transmission_probability(self, si: mi.SurfaceInteraction3f, request: Request) -> mi.Float:
-        """Return the probability that a sample of the grating is transmitted, about the fraction of its light."""
+        """Return the probability that a sample of the grating is transmitted, about its transmitted fraction."""
         if not request.transmission or not request.reflection:
             return mi.Float(1.0 if request.transmission else 0.0)
-        return dr.detach(self.interface.transmission_probability(turned(si.wi, *self.grating.frame(si, True))))
+        return dr.detach(self.interface.transmission_probability(rotated(si.wi, *self.grating.frame(si, True))))
 
     def _grating_probability(
         self,
         si: mi.SurfaceInteraction3f,
         request: Request,
-        entering: mi.UnpolarizedSpectrum | None,
+        transmittance: mi.UnpolarizedSpectrum | None,
         active: mi.Bool,
     ) -> mi.Float:
-        """Return the probability of sampling the grating, the rest being that of the base: about as they reflect."""
+        """Return the probability of sampling the grating instead of the base, about its fraction of the power."""
         if not request.grating or request.base is None:
             return mi.Float(1.0 if request.grating else 0.0)
-        entered = dr.mean(entering)
+        entered = dr.mean(transmittance)
         reflected = 1 - entered
         returned = entered * self.base.albedo(si, active)
-        return dr.detach(dr.clip(reflected / (reflected + returned), MIN_PROBABILITY, 1 - MIN_PROBABILITY))
+        return dr.detach(dr.clip(reflected / (reflected + returned), MIN_LAYER_PROBABILITY, 1 - MIN_LAYER_PROBABILITY))
 
     def _face_probability(self, si: mi.SurfaceInteraction3f, request: Request, active: mi.Bool) -> mi.Float:
-        """Return the probability of sampling a smooth face, about as it reflects beside all below."""
+        """Return the probability of sampling the smooth face, about its fraction of the power."""
         if not request.face:
             return mi.Float(0.0)
         cos = mi.Frame3f.cos_theta(si.wi)
@@ -126,7 +126,7 @@ class Layers:
         reflected = self.grating.reflectance(si, cos, active)
         if request.base is not None:
             reflected += (1 - reflected) * self.base.albedo(si, active)
-        return self.coat.share(cos, dr.mean(reflected))
+        return self.coat.sampling_probability(cos, dr.mean(reflected))
 
     def _face(self, si: mi.SurfaceInteraction3f) -> mi.Float:
         """Return F of the smooth face."""
@@ -153,10 +153,10 @@ class Layers:
             of_grating, pdf = self.grating.evaluate(si, wo, active, wo_is_sample, p_transmission)
             value = self.grating.mueller(of_grating, ctx, si, wo, active)
         if request.base is not None:
-            entering = self.grating.entering(si, cos_i, active)
-            p_grating = self._grating_probability(si, request, entering, active)
+            transmittance = self.grating.transmittance(si, cos_i, active)
+            p_grating = self._grating_probability(si, request, transmittance, active)
             of_base, density = self.base.bsdf.eval_pdf(request.base, si, wo, active)
-            value += _attenuated(entering * self.grating.entering(si, cos_o, active), of_base)
+            value += _attenuated(transmittance * self.grating.transmittance(si, cos_o, active), of_base)
             pdf = p_grating * pdf + (1 - p_grating) * density
         pdf *= 1 - self._face_probability(si, request, active)
         return dr.select(active, value, 0), dr.select(active, pdf, 0)
@@ -177,9 +177,9 @@ class Layers:
         p_face = self._face_probability(si, request, active)
         of_face = active & (sample1 < p_face)
         if request.grating or request.base is not None:
-            # From behind and along the horizon the face reflects all; Python's numbers cannot be divided by zero.
-            below_face = dr.select(p_face < 1, 1 - p_face, 1)
-            rest = smaller((sample1 - p_face) / below_face, BELOW_ONE)
+            # The face reflects all light from below and at the horizon.
+            complement = dr.select(p_face < 1, 1 - p_face, 1)
+            rest = smaller((sample1 - p_face) / complement, BELOW_ONE)
             bs, result = self._sample_below(ctx, si, request, 1 - p_face, rest, sample2, active & (sample1 >= p_face))
         if request.face:
             bs.wo = dr.select(of_face, mi.reflect(si.wi), bs.wo)
@@ -187,12 +187,12 @@ class Layers:
             bs.eta = dr.select(of_face, 1, bs.eta)
             bs.sampled_type = dr.select(of_face, mi.UInt32(+mi.BSDFFlags.DeltaReflection), bs.sampled_type)
             bs.sampled_component = dr.select(of_face, self.face, bs.sampled_component)
-            mirrored = self._mirrored(si, ctx) / dr.select(of_face, p_face, 1)
-            result = dr.select(of_face, mirrored, result)
+            weight_of_face = self._face_matrix(si, ctx) / dr.select(of_face, p_face, 1)
+            result = dr.select(of_face, weight_of_face, result)
         return bs, result
 
-    def _mirrored(self, si: mi.SurfaceInteraction3f, ctx: mi.BSDFContext) -> mi.Spectrum:
-        """Return what the smooth face reflects."""
+    def _face_matrix(self, si: mi.SurfaceInteraction3f, ctx: mi.BSDFContext) -> mi.Spectrum:
+        """Return the specular reflectance of the smooth face, a Mueller matrix in polarised variants."""
         value = mi.UnpolarizedSpectrum(self._face(si))
         if not mi.is_polarized:
             return value
@@ -205,18 +205,18 @@ class Layers:
         ctx: mi.BSDFContext,
         si: mi.SurfaceInteraction3f,
         request: Request,
-        part: mi.Float,
+        probability: mi.Float,
         sample1: mi.Float,
         sample2: mi.Point2f,
         active: mi.Bool,
     ) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
-        """Draw a direction from the grating or its base, which are sampled with the probability `part`."""
-        cos_i, below = mi.Frame3f.cos_theta(si.wi), request.base
+        """Draw a direction from the grating or its base; `probability` is that of not sampling the face."""
+        cos_i, base_context = mi.Frame3f.cos_theta(si.wi), request.base
         bs = dr.zeros(mi.BSDFSample3f)
         bs.eta = 1.0
         bs.sampled_type = mi.UInt32(+mi.BSDFFlags.GlossyReflection)
-        entering = self.grating.entering(si, cos_i, active) if below is not None else None
-        p_grating = self._grating_probability(si, request, entering, active)
+        transmittance = self.grating.transmittance(si, cos_i, active) if base_context is not None else None
+        p_grating = self._grating_probability(si, request, transmittance, active)
         of_base = active & (sample1 >= p_grating)
         if request.grating:
             p_transmission = self._transmission_probability(si, request)
@@ -230,24 +230,24 @@ class Layers:
             if not self.interface.is_sheet:
                 eta = dr.detach(self.interface.eta)
                 bs.eta = dr.select(transmitted, dr.select(cos_i > 0, eta, dr.rcp(eta)), 1)
-        if below is not None:
+        if base_context is not None:
             rest = smaller((sample1 - p_grating) / (1 - p_grating), BELOW_ONE)
-            below_sample, weight = self.base.bsdf.sample(below, si, rest, sample2, of_base)
-            bs.wo = dr.select(of_base, below_sample.wo, bs.wo)
-            bs.sampled_type = dr.select(of_base, below_sample.sampled_type, bs.sampled_type)
-            bs.sampled_component = dr.select(of_base, below_sample.sampled_component + 1, 0)
+            base_sample, weight = self.base.bsdf.sample(base_context, si, rest, sample2, of_base)
+            bs.wo = dr.select(of_base, base_sample.wo, bs.wo)
+            bs.sampled_type = dr.select(of_base, base_sample.sampled_type, bs.sampled_type)
+            bs.sampled_component = dr.select(of_base, base_sample.sampled_component + 1, 0)
         value, bs.pdf = self.evaluate(ctx, si, bs.wo, active, wo_is_sample=True)
         valid = active & (bs.pdf > 0)
-        # The direction does not follow the parameters, so its density must not either.
+        # Neither the direction nor its density is differentiated by the parameters.
         result = dr.select(valid, value / dr.detach(dr.select(valid, bs.pdf, 1)), 0)
-        if below is not None and self.base.has_delta:
-            mirror = of_base & mi.has_flag(below_sample.sampled_type, mi.BSDFFlags.Delta)
-            cos_o = mi.Frame3f.cos_theta(below_sample.wo)
-            own = part * (1 - p_grating)
-            through = entering * self.grating.entering(si, cos_o, mirror) / own
+        if base_context is not None and self.base.has_delta:
+            is_delta = of_base & mi.has_flag(base_sample.sampled_type, mi.BSDFFlags.Delta)
+            cos_o = mi.Frame3f.cos_theta(base_sample.wo)
+            base_probability = probability * (1 - p_grating)
+            throughput = transmittance * self.grating.transmittance(si, cos_o, is_delta) / base_probability
             above = cos_o > 0
-            bs.pdf = dr.select(mirror, dr.select(above, own * below_sample.pdf, 0), bs.pdf)
-            result = dr.select(mirror, dr.select(above, _attenuated(through, weight), 0), result)
+            bs.pdf = dr.select(is_delta, dr.select(above, base_probability * base_sample.pdf, 0), bs.pdf)
+            result = dr.select(is_delta, dr.select(above, _attenuated(throughput, weight), 0), result)
         return bs, result
 
 

@@ -1,10 +1,11 @@
-"""An order drawn from a table over ω_i and 1/λ, where orders do not overlap.
+"""A sampler of orders that do not overlap, from tables over ω_i and 1/λ.
 
-In each bin the probability P_m follows the powers of the orders that `energy/furnace.py` finds at points of the bin,
+In each bin the probability of an order,
 
-    P_m ∝ √⟨η_m²⟩
+    P_m ∝ √⟨η_m²⟩,
 
-the density for which the variance of a sample is least. Directions have the square of `energy/table.py`.
+minimises the variance of a sample; the powers η_m are those of `energy/furnace.py` at points of the bin. Directions are
+mapped to the square of `energy/table.py`.
 """
 
 from __future__ import annotations
@@ -26,27 +27,27 @@ from .geometry import Incidence, cell_of, on_square
 from .inversion import search
 from .tables import NumberTable, PacketTable, larger, opaque
 
-WHOLE = 2**24  # a float32 holds whole numbers up to here
-UNIFORM_FRACTION = 0.05  # of the probability in a bin, that all its orders have alike
-# Numbers of a table, about, times √ranges of heights and for each way of light: more would only fill the cache; of an
-# interface more, since from inside, where waves are shorter, orders change faster with direction.
-ENTRIES, ENTRIES_OF_INTERFACE = 1e5, 2.5e5
-# Radians by which the phase of the deepest point may change within a bin, by reflection from above: of line gratings,
-# which have few orders, and of others; and between the points of a bin.
-MAX_PHASE_OF_LINES, MAX_PHASE, MAX_PHASE_OF_POINTS = 2.0, 4.0, 2.5
-SLICES = 4, 10  # bins of 1/λ: minimum and maximum
-SIDES = 4, 96  # bins along the square of directions, likewise
-FRACTION_BINS = 64  # of the transmitted fraction, along the square
-CHANGE = 0.01  # of η, relative to η − 1, for which a table serves
+PROBABILITY_UNITS = 2**24  # to the probability one; float32 represents integers exactly up to it
+UNIFORM_FRACTION = 0.05  # of the probability in a bin, divided equally among its orders
+# Of a table, about, for each combination of incident and outgoing side, divided by √(ranges of heights); larger tables
+# do not fit the cache. Interfaces have more, since orders vary faster with the direction in the denser medium.
+MAX_ENTRIES, MAX_INTERFACE_ENTRIES = 1e5, 2.5e5
+# Radians, of the change of the phase of the deepest point at normal reflection from above: within a bin, of line
+# gratings, which have few orders, and of others; and between the points of a bin.
+MAX_LINE_PHASE, MAX_PHASE, MAX_POINT_PHASE = 2.0, 4.0, 2.5
+MIN_SLICES, MAX_SLICES = 4, 10  # bins of 1/λ
+MIN_SIDE_BINS, MAX_SIDE_BINS = 4, 96  # along a side of the square of directions
+FRACTION_SIDE_BINS = 64  # likewise, of the transmitted fraction
+MAX_INDEX_CHANGE = 0.01  # of η, relative to η − 1, up to which a table is reused
 
 
 class OrderSampler:
-    """P_m of light from either side to either side, in bins: (scale of heights, from, to, 1/λ, row, column of ω_i).
+    """P_m in bins of (scale of heights, incident side, outgoing side, 1/λ, row and column of ω_i).
 
     Attributes:
-        before: Σ P of the orders before each of the rectangle that propagates in a bin, in units of 2⁻²⁴.
-        bins: of each the start in `before`, first column and row among all orders, and columns + 2¹⁶ rows.
-        counts: bins along the slices and along the square, as arrays: tables of other heights have others.
+        cumulative: cumulative sums of P over the rectangle of orders that propagate in a bin, in units of 2⁻²⁴.
+        bins: for each bin the start in `cumulative`, first column and row among all orders, and columns + 2¹⁶ rows.
+        counts: numbers of bins of 1/λ and along a side of the square; opaque, as they depend on the surface.
         fractions: T e_T/(R e_R + T e_T) in finer bins of directions, from above and from below.
     """
 
@@ -62,12 +63,12 @@ class OrderSampler:
         """Make the table.
 
         Args:
-            spectrum: its wavelengths are those in the densest medium next to the relief.
-            eta: index below relative to that above; None if nothing is transmitted.
-            is_sheet: there is a flat face below, with the upper medium below it.
+            spectrum: with the wavelengths in the densest medium next to the relief.
+            eta: index below relative to that above; None without transmission.
+            is_sheet: whether there is a flat lower face, with the upper medium below it.
             coat_index: of a layer over the relief, relative to the outside.
-            height_scales: times the heights, ascending; there are bins between one and the next.
-            min_lateral_scale: times the lengths along the surface, of which heights are in units.
+            height_scales: factors of the heights, ascending; each interval between two has its bins.
+            min_lateral_scale: minimum factor of the lengths along the surface, by which heights are divided.
         """
         grid = spectrum.grid
         self.transmits, self.is_sheet = eta is not None, is_sheet
@@ -76,67 +77,72 @@ class OrderSampler:
         first, last = (frequency / coat_index for frequency in frequencies_of(spectrum, eta))
         first *= min(min_lateral_scale, 1)
         sides = (True, False) if self.transmits else (True,)
-        turn = 4 * np.pi * spectrum.height_range * float(np.mean(height_scales)) * (last - first)
-        max_phase = MAX_PHASE_OF_LINES if 0 in grid.max_order else MAX_PHASE
-        self.slices = int(np.clip(turn * coat_index / max_phase, *SLICES))
+        phase = 4 * np.pi * spectrum.height_range * float(np.mean(height_scales)) * (last - first)
+        max_phase = MAX_LINE_PHASE if 0 in grid.max_order else MAX_PHASE
+        self.slices = int(np.clip(phase * coat_index / max_phase, MIN_SLICES, MAX_SLICES))
         orders = np.minimum((1 + self.eta) * self.tile * (first + last) / 2, 2 * self.max_order) + 1
         ranges = list(itertools.pairwise(height_scales)) or [tuple(height_scales)]
-        entries = ENTRIES_OF_INTERFACE if self.transmits and not is_sheet else ENTRIES
-        self.side = int(np.clip(np.sqrt(entries / (np.sqrt(len(ranges)) * self.slices * orders.prod())), *SIDES))
-        self.layout = Layout(0.0, 1, self.side, 1, self.slices + 1, (first, last))
+        entries = MAX_INTERFACE_ENTRIES if self.transmits and not is_sheet else MAX_ENTRIES
+        side_bins = np.sqrt(entries / (np.sqrt(len(ranges)) * self.slices * orders.prod()))
+        self.side_bins = int(np.clip(side_bins, MIN_SIDE_BINS, MAX_SIDE_BINS))
+        self.layout = Layout(0.0, 1, self.side_bins, 1, self.slices + 1, (first, last))
         sums, bins, fractions, start = [], [], [], 0
         for scales, above in itertools.product(ranges, sides):
             furnaces = [Furnace.of(spectrum, scale, eta, 1 if above else -1) for scale in scales]
-            sent = []
+            powers_of_sides = []
             for reflects in sides:
                 index = self._indices(above)[0] if reflects else abs(self.eta - 1)
-                steps = 1 + int(turn * index / (self.slices * MAX_PHASE_OF_POINTS))
+                steps = 1 + int(phase * index / (self.slices * MAX_POINT_PHASE))
                 points = [k / steps for k in range(self.slices * steps + 1)]
-                squares = [self._squares(furnaces, above, reflects, point) for point in points]
-                sent.append(np.sqrt(np.mean(squares, axis=0)).sum((-1, -2)).ravel())
+                squares = [self._squared_powers(furnaces, above, reflects, point) for point in points]
+                powers_of_sides.append(np.sqrt(np.mean(squares, axis=0)).sum((-1, -2)).ravel())
                 for slice_ in range(self.slices):
                     within = sum(squares[slice_ * steps : (slice_ + 1) * steps + 1])
-                    corner, size = self._rectangles(above, reflects, slice_)
-                    of_bins, starts = _packed(_of_corners(within), corner, size)
+                    corner, size = self._order_ranges(above, reflects, slice_)
+                    of_bins, starts = _packed_cumulative(_root_corner_sum(within), corner, size)
                     sums.append(of_bins)
                     bins.append(np.stack([start + starts, *corner.T, size[:, 0] + (size[:, 1] << 16)], -1))
                     start += len(of_bins)
             if not self.transmits:
                 continue
-            # E of a wavelength in the middle.
+            # With E at the central wavelength.
             omega, wavelengths = self._nodes(self.slices / 2)
             albedo = furnaces[0].albedo(self._inside(omega, above), wavelengths / self._indices(above)[0])
-            reflected, transmitted = np.array(sent) * bounds_of(albedo, furnaces[0].index)
-            fraction = (transmitted / np.maximum(reflected + transmitted, 1e-30)).reshape(self.side + 1, -1)
-            middles = (np.indices((FRACTION_BINS, FRACTION_BINS)) + 0.5) * (self.side / FRACTION_BINS)
+            reflected, transmitted = np.array(powers_of_sides) * bounds_of(albedo, furnaces[0].index)
+            fraction = (transmitted / np.maximum(reflected + transmitted, 1e-30)).reshape(self.side_bins + 1, -1)
+            middles = (np.indices((FRACTION_SIDE_BINS, FRACTION_SIDE_BINS)) + 0.5) * (
+                self.side_bins / FRACTION_SIDE_BINS
+            )
             fractions.append(map_coordinates(fraction, middles, order=1))
-        self.before = NumberTable(np.concatenate(sums))
+        self.cumulative = NumberTable(np.concatenate(sums))
         self.bins = PacketTable(np.concatenate(bins).astype(np.uint32))
         if self.transmits:
             self.fractions = NumberTable(np.reshape(fractions, (len(ranges), 2, *middles.shape[1:])).mean(axis=0))
-        self.counts = opaque(self.slices), opaque(self.side)
+        self.counts = opaque(self.slices), opaque(self.side_bins)
         self.edges = [opaque(scale) for scale in height_scales[1:-1]]
         self.first, self.per_slice = opaque(first), opaque(self.slices / (last - first))
 
     def _indices(self, above: bool) -> tuple[float, float]:
-        """Return n next to the relief and outside, on one side of it."""
+        """Return n next to the relief and outside, above or below."""
         return (self.coat_index, 1.0) if above else (self.eta, 1.0 if self.is_sheet else self.eta)
 
     def _nodes(self, slice_: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the directions at the nodes of the square, outside, and λ above in µm, at a coordinate of slices."""
-        nodes = np.indices((1, self.side + 1, self.side + 1)).reshape(3, -1).T.astype(np.float64)
+        """Return outside directions at the nodes of the square, and λ above in µm, at a coordinate along 1/λ."""
+        nodes = np.indices((1, self.side_bins + 1, self.side_bins + 1)).reshape(3, -1).T.astype(np.float64)
         nodes[:, 0] = slice_
         return self.layout.directions(nodes)
 
     def _inside(self, omega: NDArray[np.float64], above: bool) -> NDArray[np.float64]:
-        """Return next to the relief the directions outside of it."""
+        """Return the directions next to the relief from those outside."""
         inside, outside = self._indices(above)
         tangent = omega[:, :2] * (outside / inside)
         return np.column_stack([tangent, np.sqrt(np.maximum(1 - (tangent**2).sum(-1), 1e-12))])
 
-    def _squares(self, furnaces: Sequence[Furnace], above: bool, reflects: bool, slice_: float) -> NDArray[np.floating]:
-        """Compute η_m² at the nodes of directions, the mean over scales of heights: (rows, columns, orders, orders)."""
-        (inside, outside), goes_below = self._indices(above), above != reflects
+    def _squared_powers(
+        self, furnaces: Sequence[Furnace], above: bool, reflects: bool, slice_: float
+    ) -> NDArray[np.floating]:
+        """Return η_m² at the nodes of directions, averaged over scales of heights: (rows, columns, orders, orders)."""
+        (inside, outside), outgoing_below = self._indices(above), above != reflects
         omega, wavelengths = self._nodes(slice_)
         result = np.zeros((len(omega), *(2 * self.max_order[::-1] + 1)), np.float32)
         for furnace in furnaces:
@@ -148,48 +154,48 @@ class OrderSampler:
                     tangent = outside * omega[node, :2] + wavelengths[node, None] * m / self.tile
                     square = 1 - (tangent**2).sum(-1)
                     power = power * (square > 0)
-                    if goes_below:
+                    if outgoing_below:
                         power *= 1 - fresnel(np.sqrt(np.maximum(square, 0)), self.eta)
                 column, row = (m + self.max_order).T
                 powers[node, row, column] += power
             result += powers**2 / len(furnaces)
-        return result.reshape(self.side + 1, self.side + 1, *result.shape[1:])
+        return result.reshape(self.side_bins + 1, self.side_bins + 1, *result.shape[1:])
 
-    def _rectangles(self, above: bool, reflects: bool, slice_: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return first column and row of the orders that propagate in each cell of a slice, and how many: (cells, 2).
+    def _order_ranges(self, above: bool, reflects: bool, slice_: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return first column and row of the propagating orders of each bin of a slice, and their numbers: (bins, 2).
 
-        From the borders of the cells: |m/T + k_i,∥/λ| ≤ n_o/λ.
+        They follow from the borders of the bins by |m/T + k_i,∥/λ| ≤ n_o/λ.
         """
         along = np.linspace(0, 1, 5)
         border = np.stack(np.meshgrid([0, 1], along, along, indexing="ij"), -1).reshape(-1, 3)
-        corner = np.indices((1, self.side, self.side)).reshape(3, -1).T
+        corner = np.indices((1, self.side_bins, self.side_bins)).reshape(3, -1).T
         corner[:, 0] = slice_
         omega, wavelengths = self.layout.directions(
             np.repeat(corner, len(border), 0) + np.tile(border, (len(corner), 1))
         )
         per_wavelength = self.tile / wavelengths[:, None]
         middle = -self._indices(above)[1] * omega[:, :2] * per_wavelength
-        # More, as borders are curved and the index may change by `CHANGE`.
+        # With a margin for curved borders and for an index that changes by `MAX_INDEX_CHANGE`.
         half = self._indices(above == reflects)[1] * per_wavelength + 1e-3
-        half += (1e-3 + 2 * CHANGE * max(self.eta, 1)) * per_wavelength.max()
+        half += (1e-3 + 2 * MAX_INDEX_CHANGE * max(self.eta, 1)) * per_wavelength.max()
         first, last = (x.reshape(len(corner), -1, 2) for x in (middle - half, middle + half))
         first = np.clip(np.ceil(first.min(1)), -self.max_order, self.max_order).astype(np.int64)
         last = np.clip(np.floor(last.max(1)), -self.max_order, self.max_order).astype(np.int64)
         return first + self.max_order, last - first + 1
 
     def _bin(self, incidence: Incidence, active: mi.Bool) -> tuple[mi.UInt32, mi.Int32, mi.Int32, mi.Int32, mi.Int32]:
-        """Return where the sums of a bin begin, its first order along x and y, and its columns and rows."""
+        """Return the start of a bin in the table, its first order along x and y, its numbers of columns and rows."""
         max_x, max_y = map(int, self.max_order)
-        slices, side = self.counts
+        slices, side_bins = self.counts
         tangent = incidence.tangent / incidence.index
-        column, row = _direction(mi.Vector3f(*tangent, dr.safe_sqrt(1 - dr.squared_norm(tangent))), side)
+        column, row = _direction_bin(mi.Vector3f(*tangent, dr.safe_sqrt(1 - dr.squared_norm(tangent))), side_bins)
         slice_, _ = cell_of((incidence.frequency - self.first) * self.per_slice, slices)
-        way, ways = mi.UInt32(0), 4 if self.transmits else 1
+        table, tables = mi.UInt32(0), 4 if self.transmits else 1
         if self.transmits:
-            way = dr.select(incidence.above, mi.UInt32(0), 2) + dr.select(incidence.reflects, mi.UInt32(0), 1)
+            table = dr.select(incidence.above, mi.UInt32(0), 2) + dr.select(incidence.reflects, mi.UInt32(0), 1)
         if self.edges:
-            way += sum(dr.select(incidence.height_scale > edge, mi.UInt32(ways), 0) for edge in self.edges)
-        index = ((way * mi.UInt32(slices) + slice_) * mi.UInt32(side) + row) * mi.UInt32(side) + column
+            table += sum(dr.select(incidence.height_scale > edge, mi.UInt32(tables), 0) for edge in self.edges)
+        index = ((table * mi.UInt32(slices) + slice_) * mi.UInt32(side_bins) + row) * mi.UInt32(side_bins) + column
         start, x, y, size = self.bins(index, active)
         return start, mi.Int32(x) - max_x, mi.Int32(y) - max_y, mi.Int32(size & 0xFFFF), mi.Int32(size >> 16)
 
@@ -199,49 +205,51 @@ class OrderSampler:
         column, row = m_x - first_x, m_y - first_y
         active = active & (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
         order = start + mi.UInt32(row * columns + column)
-        return (self.before(order + 1, active) - self.before(order, active)) * (1 / WHOLE)
+        return (self.cumulative(order + 1, active) - self.cumulative(order, active)) * (1 / PROBABILITY_UNITS)
 
     def sample(
         self, incidence: Incidence, u: mi.Float, v: mi.Point2f, active: mi.Bool
     ) -> tuple[mi.Int32, mi.Int32, mi.Point2f]:
-        """Draw an order for one wavelength from `u`; return it and `v`."""
+        """Draw an order for one wavelength from `u`; return it and `v`, which is unused."""
         start, first_x, first_y, columns, rows = self._bin(incidence, active)
 
-        def before(place: mi.Int32) -> mi.Float:
-            return self.before(start + mi.UInt32(place), active)
+        def cumulative(index: mi.Int32) -> mi.Float:
+            return self.cumulative(start + mi.UInt32(index), active)
 
-        place, _ = search(before, mi.Int32(0), columns * rows, int(np.prod(2 * self.max_order + 1)), u)
-        # In masked lanes there are no columns.
-        row = mi.Int32((mi.Float(place) + 0.5) / larger(mi.Float(columns), 1))
-        return first_x + place - row * columns, first_y + row, v
+        index, _ = search(cumulative, mi.Int32(0), columns * rows, int(np.prod(2 * self.max_order + 1)), u)
+        # In masked lanes the number of columns is zero.
+        row = mi.Int32((mi.Float(index) + 0.5) / larger(mi.Float(columns), 1))
+        return first_x + index - row * columns, first_y + row, v
 
-    def transmitted(self, omega: mi.Vector3f) -> mi.Float:
-        """Return the fraction of light that is transmitted, ω along the pattern's axes."""
-        column, row = _direction(omega, FRACTION_BINS)
-        return self.fractions((dr.select(omega.z > 0, mi.UInt32(0), FRACTION_BINS) + row) * FRACTION_BINS + column)
-
-
-def _direction(omega: mi.Vector3f, side: mi.Float | int) -> list[mi.UInt32]:
-    """Return column and row of ω among the bins of the square."""
-    return [cell_of(side * place, side)[0] for place in on_square(omega)]
+    def transmitted_fraction(self, omega: mi.Vector3f) -> mi.Float:
+        """Return the transmitted fraction of power, ω along the pattern's axes."""
+        column, row = _direction_bin(omega, FRACTION_SIDE_BINS)
+        return self.fractions(
+            (dr.select(omega.z > 0, mi.UInt32(0), FRACTION_SIDE_BINS) + row) * FRACTION_SIDE_BINS + column
+        )
 
 
-def _of_corners(at_nodes: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Return the root of the sum of the four corners of each cell, (rows + 1, columns + 1, …) → (cells, …)."""
+def _direction_bin(omega: mi.Vector3f, side_bins: mi.Float | int) -> list[mi.UInt32]:
+    """Return the column and row of the bin of ω on the square."""
+    return [cell_of(side_bins * coordinate, side_bins)[0] for coordinate in on_square(omega)]
+
+
+def _root_corner_sum(at_nodes: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return the root of the sum over the four corners of each bin, (rows + 1, columns + 1, …) → (bins, …)."""
     rows, columns = (n - 1 for n in at_nodes.shape[:2])
     total = sum(at_nodes[j : j + rows, i : i + columns] for j, i in np.ndindex(2, 2))
     return np.sqrt(total.reshape(rows * columns, *at_nodes.shape[2:]))
 
 
-def _packed(
+def _packed_cumulative(
     p: NDArray[np.floating], first: NDArray[np.int64], size: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return the sums before the orders of all rectangles, one after the other, and where each begins.
+    """Return the cumulative sums of P over the rectangles of all bins, concatenated, and the start of each.
 
     Args:
-        p: in proportion to P_m, (cells, orders, orders); zero outside of the rectangles.
-        first: column and row where a rectangle begins, (cells, 2).
-        size: its columns and rows, (cells, 2).
+        p: proportional to P_m, (bins, orders, orders); zero outside of the rectangles.
+        first: first column and row of the rectangles, (bins, 2).
+        size: their numbers of columns and rows, (bins, 2).
     """
     of_x, of_y = (
         (np.arange(n) >= begin[:, None]) & (np.arange(n) < (begin + count)[:, None])
@@ -252,6 +260,6 @@ def _packed(
     p = (1 - UNIFORM_FRACTION) * p / np.maximum(
         p.sum(1, keepdims=True), 1e-30
     ) + UNIFORM_FRACTION * inside / inside.sum(1, keepdims=True)
-    sums = np.rint(WHOLE * p.cumsum(1) / p.sum(1, keepdims=True))
+    sums = np.rint(PROBABILITY_UNITS * p.cumsum(1) / p.sum(1, keepdims=True))
     count = size.prod(1) + 1
     return np.insert(sums, 0, 0, 1)[np.insert(inside, 0, True, 1)], count.cumsum() - count

@@ -1,4 +1,4 @@
-"""S(q; κ) of a tile at run time: the few orders near q, their powers and lobes, and how q is drawn."""
+"""S(q; κ) of a tile at run time: the orders near q, their powers and lobes, and samples of q."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import scipy.special
 from ..grating_spectrum import GratingSpectrum
 from ..spectrum.grids import LobeAxis
 from ..spectrum.tables import HALF_SCALE, AmplitudeTable, SliceTable, shared_exponents
-from .continuum_sampler import CellSampler, LineSampler
+from .continuum_sampler import BinSampler, LineSampler
 from .geometry import Geometry, Incidence
 from .inversion import truncated_gaussian
 from .order_sampler import OrderSampler
@@ -25,54 +25,60 @@ from .tables import (
     opaque,
 )
 
-# Nodes lie in squares of 4 × 4, so that those of a window lie in few lines of the cache: one word each, in one to four.
-_SQUARE = 4
+# Nodes are stored in squares of 4 × 4, so that a window of nodes of one word lies in one to four cache lines.
+_SQUARE_SIDE = 4
 
-# Steps of x between which cubics interpolate the Bessel functions of a series, to _STEP⁴/384.
-_STEP = 0.1
+# Of x, between nodes of the Bessel functions of a series; cubics interpolate these with an error up to step⁴/384.
+_MAX_BESSEL_STEP = 0.1
 
 
 Small = tuple["mi.Float", "mi.Bool"]
+"""κ₁ in rad/µm, and the pairs of directions to which `small_kappa` applies."""
 
 
 def small_kappa(
     kappa: mi.Float, small: Small, factors: mi.Vector4f, first: mi.Vector4f, second: mi.Vector4f
 ) -> mi.Vector4f:
-    """Return the factors that give κ₁²/κ² c_m(κ) where κ < κ₁, the others unchanged.
+    """Return the factors of κ₁²/κ² c_m(κ) where κ < κ₁, elsewhere those of c_m(κ).
 
-    c_m of m ≠ 0 falls as κ², which an absolute error of the table would hide: c_m/κ² is the line through its values at
-    κ₁ and 2κ₁.
+    c_m of m ≠ 0 falls as κ² towards zero, below the absolute error of the table; therefore c_m/κ² is extrapolated
+    linearly from its values at κ₁ and 2κ₁.
 
     Args:
         kappa: κ in rad/µm.
-        small: κ₁, and the directions for which this holds.
+        small: κ₁, and the pairs of directions to which this applies.
         factors, first, second: at κ, κ₁ and 2κ₁.
     """
-    least, where = small
-    x = kappa / larger(least, 1e-30)
+    kappa_1, where = small
+    x = kappa / larger(kappa_1, 1e-30)
     line = (2 - x) * first + 0.25 * (x - 1) * second
-    return dr.select(where & (kappa < least), line, factors)
+    return dr.select(where & (kappa < kappa_1), line, factors)
 
 
 class _NodeTable:
     """Base class of table look-ups.
 
     Attributes:
-        rows: of nodes, with the rim.
-        columns: of nodes, with the rim.
-        square: nodes along the side of a square.
-        nodes: those of all squares.
+        rows, columns: numbers of nodes, including the rim.
+        square: number of nodes along the side of a square.
+        nodes: number of nodes of all squares.
     """
 
     def __init__(self, shape: tuple[int, int], rim: tuple[int, int], windows: bool) -> None:
-        """Take the shape of a table, the nodes of zero on each side, (x, y), and whether several nodes are read."""
-        self.rim, self.square = rim, _SQUARE if windows else 1
+        """Compute the layout.
+
+        Args:
+            shape: rows and columns of the table.
+            rim: number of nodes of zero on each side, (x, y).
+            windows: whether several nodes are read at once.
+        """
+        self.rim, self.square = rim, _SQUARE_SIDE if windows else 1
         self.rows, self.columns = shape[0] + 2 * rim[1], shape[1] + 2 * rim[0]
         self.row = -(-self.columns // self.square) * self.square**2  # nodes of a row of squares
         self.nodes = -(-self.rows // self.square) * self.row
 
     def _arranged(self, packets: np.ndarray) -> np.ndarray:
-        """Return (..., rows, columns) → (..., nodes), with the rim."""
+        """Add the rim and arrange the nodes in squares: (..., rows, columns) → (..., nodes)."""
         square, (x, y) = self.square, self.rim
         pad = [(0, 0)] * (packets.ndim - 2) + [(y, y + -self.rows % square), (x, x + -self.columns % square)]
         padded = np.pad(packets, pad)
@@ -80,27 +86,29 @@ class _NodeTable:
         squares = padded.reshape(*packets.shape[:-2], rows, square, columns, square)
         return squares.swapaxes(-2, -3).reshape(*packets.shape[:-2], -1)
 
-    def _places(self, first: mi.Int32, count: int, before: int, beside: int) -> list[mi.UInt32]:
-        """What each of `count` rows or columns adds to the index: `before` for a square, `beside` for a node in it."""
-        places = [mi.UInt32(first + step) for step in range(count)]
+    def _offsets(self, first: mi.Int32, count: int, square_stride: int, node_stride: int) -> list[mi.UInt32]:
+        """Return the index offsets of `count` rows or columns, from the strides of squares and of the nodes in one."""
+        positions = [mi.UInt32(first + step) for step in range(count)]
         if self.square == 1:
-            return [place * before for place in places]
-        return [place // self.square * before + place % self.square * beside for place in places]
+            return [position * square_stride for position in positions]
+        return [
+            position // self.square * square_stride + position % self.square * node_stride for position in positions
+        ]
 
     def _window(
         self, row: mi.Int32, column: mi.Int32, height: int, width: int
     ) -> tuple[list[mi.UInt32], list[mi.UInt32]]:
-        """Return what each row and column of a window from (row, column) on adds to the index of node 0."""
+        """Return the index offsets of the rows and columns of a window that begins at (row, column)."""
         row = dr.clip(row, 0, self.rows - height)
         column = dr.clip(column, 0, self.columns - width)
-        return self._places(row, height, self.row, self.square), self._places(column, width, self.square**2, 1)
+        return self._offsets(row, height, self.row, self.square), self._offsets(column, width, self.square**2, 1)
 
 
 class SlicePower(_NodeTable):
-    """c_m(κ) = Σ_p a_p t^p, −1 ≤ t ≤ 1 on the interval of κ. A node is one packet of one, two or four words."""
+    """c_m(κ) = Σ_p a_p t^p, −1 ≤ t ≤ 1 on an interval of κ, from packets of one, two or four words."""
 
     def __init__(self, table: SliceTable, rim: tuple[int, int] = (0, 0), windows: bool = True) -> None:
-        """Arrange a table with `rim` nodes of zero on each side, (x, y); with `windows` for reads of several nodes."""
+        """Arrange a table; `rim` and `windows` as of `_NodeTable`."""
         super().__init__(table.shape, rim, windows)
         values = self._arranged(table.values)
         words = table.words_per_node
@@ -128,14 +136,12 @@ class SlicePower(_NodeTable):
         at: tuple[mi.UInt32, mi.Vector3f | mi.Vector4f],
         active: mi.Bool,
     ) -> mi.Float:
-        """Return Σ_ij w_x,i w_y,j c of the nodes from (row, column) on.
+        """Return Σ_ij w_x,i w_y,j c_ij over a window of nodes.
 
         Args:
-            row: of the first node, the rim included; beyond the table, where a window holds zeros only, the nearest.
-            column: likewise.
-            weights_x: w_x,i.
-            weights_y: w_y,j.
-            at: what the method `at` gave for κ.
+            row, column: of the first node, including the rim; clipped to the table, whose rim is zero.
+            weights_x, weights_y: w_x,i and w_y,j.
+            at: returned by the method `at` for κ.
             active: mask.
         """
         rows, columns = self._window(row, column, len(weights_y), len(weights_x))
@@ -143,14 +149,14 @@ class SlicePower(_NodeTable):
         offset, factors = at
         packet = type(factors)(0.0)
         for weight, r in zip(weights_y, rows, strict=True):
-            line = type(factors)(0.0)
+            row_sum = type(factors)(0.0)
             for w, c in zip(weights_x, columns, strict=True):
-                line = self.table.add(line, w, offset + r + c, active)
-            packet = dr.fma(weight, line, packet)
+                row_sum = self.table.add(row_sum, w, offset + r + c, active)
+            packet = dr.fma(weight, row_sum, packet)
         return dr.dot(packet, factors)
 
     def at(self, kappa: mi.Float, small: Small) -> tuple[mi.UInt32, mi.Vector3f | mi.Vector4f]:
-        """Return the index of node 0 at κ (rad/µm), and the factors of the numbers of a packet.
+        """Return the index of node 0 at κ (rad/µm), and the factors of the components of a packet.
 
         `small` as of `small_kappa`; κ₁ is at most half of the first interval.
         """
@@ -167,13 +173,13 @@ class SlicePower(_NodeTable):
 
 
 class AmplitudePower(_NodeTable):
-    """η_m(κ) = |Σ_n c_n(κL) F_nm|² of `AmplitudeTable`, by a recorded loop over n, two terms in a packet.
+    """η_m(κ) = |Σ_n c_n(κL) F_nm|² of `AmplitudeTable`, by a loop over n with two terms in a packet.
 
-    The c_n but for their phases iⁿ follow by recurrence (taylor), or from cubics in κL (chebyshev).
+    Apart from their phases iⁿ, the c_n follow from a recurrence (taylor) or from cubics in κL (chebyshev).
     """
 
     def __init__(self, table: AmplitudeTable, rim: tuple[int, int] = (0, 0), windows: bool = True) -> None:
-        """Arrange a table as `SlicePower` does."""
+        """Arrange a table; `rim` and `windows` as of `_NodeTable`."""
         super().__init__(table.shape, rim, windows)
         count = len(table.terms)
         self.pairs = -(-count // 2)
@@ -183,23 +189,23 @@ class AmplitudePower(_NodeTable):
         self.table = PacketTable(np.moveaxis(packets, 1, -1))
         self.height, self.factors = opaque(table.height), None
         if table.representation == "chebyshev":
-            largest, n = table.max_kappa * table.height, np.arange(2 * self.pairs)
-            self.steps = 1 + int(largest / _STEP)
-            x = np.linspace(0, largest, self.steps + 1)[:, None]
-            self.per_x = opaque(self.steps / max(largest, 1e-30))
+            max_x, n = table.max_kappa * table.height, np.arange(2 * self.pairs)
+            self.steps = 1 + int(max_x / _MAX_BESSEL_STEP)
+            x = np.linspace(0, max_x, self.steps + 1)[:, None]
+            self.per_x = opaque(self.steps / max(max_x, 1e-30))
             values = [function(n, x).reshape(-1, self.pairs, 2) for function in (scipy.special.jv, scipy.special.jvp)]
-            packets = np.concatenate([values[0], values[1] * largest / self.steps], axis=-1)
+            packets = np.concatenate([values[0], values[1] * max_x / self.steps], axis=-1)
             packets[:, 1:] *= 2
             packets[:, 0, 1::2] *= 2
             self.factors = PacketTable(packets)
 
     def at(self, kappa: mi.Float, small: Small) -> tuple[mi.Float, mi.Float]:
-        """Return κ, and a factor of the power: κ₁²/κ² where `small` holds and κ < κ₁; a series needs no other care."""
-        least, where = small
-        where = where & (kappa < least)
-        # Below a hundredth of κ₁ the ratio of the power to κ² is constant.
-        kappa = dr.select(where, larger(kappa, 0.01 * least), kappa)
-        return kappa, dr.select(where, dr.square(least / larger(kappa, 1e-30)), 1)
+        """Return κ, and the factor of the power: κ₁²/κ² where `small` applies and κ < κ₁; a series is exact there."""
+        kappa_1, where = small
+        where = where & (kappa < kappa_1)
+        # Below κ₁/100 the ratio of the power to κ² is constant.
+        kappa = dr.select(where, larger(kappa, 0.01 * kappa_1), kappa)
+        return kappa, dr.select(where, dr.square(kappa_1 / larger(kappa, 1e-30)), 1)
 
     def window(
         self,
@@ -210,7 +216,7 @@ class AmplitudePower(_NodeTable):
         at: tuple[mi.Float, mi.Float],
         active: mi.Bool,
     ) -> mi.Float:
-        """Return Σ_ij w_x,i w_y,j η of the orders from (row, column) on; arguments as of `SlicePower.window`."""
+        """Return Σ_ij w_x,i w_y,j η_ij over a window of orders; arguments as of `SlicePower.window`."""
         rows, columns = self._window(row, column, len(weights_y), len(weights_x))
         kappa, factor = at
         weights = [y * x for y in weights_y for x in weights_x]
@@ -219,7 +225,7 @@ class AmplitudePower(_NodeTable):
         return factor * sum(weight * power for weight, power in zip(weights, powers, strict=True))
 
     def _amplitudes(self, nodes: list[mi.UInt32], x: mi.Float, active: mi.Bool) -> list[tuple[mi.Float, mi.Float]]:
-        """Return F_m of the orders, real and imaginary; derivatives by x are summed in the same loop if needed."""
+        """Return real and imaginary parts of F_m; the same loop sums their derivatives by x if needed."""
         differentiate = dr.grad_enabled(x)
         at = dr.detach(x)
         if self.factors is not None:
@@ -231,7 +237,7 @@ class AmplitudePower(_NodeTable):
             pair: mi.UInt32, sign: mi.Float, term: mi.Float, before: mi.Float, *sums: mi.Float
         ) -> tuple[mi.UInt32 | mi.Float, ...]:
             if self.factors is None:
-                # xⁿ/n!, whose derivative is the one before.
+                # The derivative of xⁿ/n! is the previous term.
                 n = mi.Float(2 * pair)
                 odd = term * at / (n + 1)
                 factors = [(term, odd), (before, term)]
@@ -244,7 +250,7 @@ class AmplitudePower(_NodeTable):
             for node in nodes:
                 f = sign * self.table(pair * self.nodes + node, active)
                 for even, odd in factors[: 1 + differentiate]:
-                    # The odd term is i times the even one.
+                    # Odd terms have the additional phase i.
                     parts.append(dr.fma(even, f[0], dr.fma(-odd, f[3], sums[len(parts)])))
                     parts.append(dr.fma(even, f[1], dr.fma(odd, f[2], sums[len(parts)])))
             return pair + 1, -sign, term, before, *parts
@@ -267,47 +273,53 @@ def _hermite(
     return low + t * (low_slope + t * (square + t * cube)), low_slope + t * (2 * square + t * 3 * cube)
 
 
-# cycles/µm: of a line grating with wider lobes, which the horizon cuts through, q is drawn instead of an order.
-NARROW = 0.03
+# cycles/µm, of a line grating whose orders are drawn: the horizon truncates wider lobes, of which q is drawn.
+MAX_DRAWN_LOBE_WIDTH = 0.03
 
 
 class OrderSpectrum:
     """S(q; κ) = Σ_m η_m(κ) N(q − m/T; σ_q² I), and the density from which q is drawn.
 
-    N ends as `OrderGrid.lobes` says. Resolved orders need one of them, so that one evaluation reads
-    `SlicePower` once; a tile as large as the coherence length needs 4 × 4. The density is Σ_m P_m N(q − m/T) with the
-    P_m of an `OrderSampler`, which needs the media and scales of a scene; where orders overlap, that of `CellSampler`.
-    For a line grating whose orders overlap or are wide, it is that of `LineSampler`.
+    N is truncated as in `OrderGrid.lobes`. At most one resolved order contributes at q; of a tile as large as the
+    coherence length, 4 × 4 orders do. The density is Σ_m P_m N(q − m/T), with the P_m of an `OrderSampler`, which
+    depends on the media and scales of a scene; where orders overlap, that of `BinSampler`; for a line grating whose
+    orders overlap or are wide, that of `LineSampler`.
 
     Lobes of resolved orders may be scaled.
     """
 
-    def __init__(self, spectrum: GratingSpectrum, most: float | None = None, farthest: float = 1.0) -> None:
+    def __init__(
+        self, spectrum: GratingSpectrum, typical_max_kappa: float | None = None, max_tangent: float = 1.0
+    ) -> None:
         grid, sigma = spectrum.grid, spectrum.lobe_width
         self.axes = tuple(
             _Axis(lobe, size, max_order, sigma)
             for lobe, size, max_order in zip(spectrum.lobes, grid.tile_size, grid.max_order, strict=True)
         )
-        line = 1 in grid.shape
-        self.resolved = all(axis.count == 1 for axis in self.axes) and not (line and sigma > NARROW)
+        is_line = 1 in grid.shape
+        self.resolved = all(axis.count == 1 for axis in self.axes) and not (is_line and sigma > MAX_DRAWN_LOBE_WIDTH)
         power = AmplitudePower if isinstance(spectrum.table, AmplitudeTable) else SlicePower
         self.power = power(spectrum.table, tuple(axis.rim for axis in self.axes), windows=not self.resolved)
-        self.cells = None
+        self.q_sampler = None
         if not self.resolved:
-            self.cells = LineSampler(spectrum, most) if line else CellSampler(spectrum, most, farthest)
-        self.orders: OrderSampler | None = None
-        self.line = line
+            self.q_sampler = (
+                LineSampler(spectrum, typical_max_kappa)
+                if is_line
+                else BinSampler(spectrum, typical_max_kappa, max_tangent)
+            )
+        self.order_sampler: OrderSampler | None = None
+        self.is_line = is_line
         self.per_width = opaque(1 / sigma)
 
-    def drawn_from(self, orders: OrderSampler) -> OrderSpectrum:
-        """Return the same spectrum, of which orders are drawn from a table."""
+    def with_order_sampler(self, order_sampler: OrderSampler) -> OrderSpectrum:
+        """Return the same spectrum with orders drawn by a sampler."""
         result = copy.copy(self)
-        result.orders = orders
+        result.order_sampler = order_sampler
         return result
 
     @property
     def max_scale(self) -> float | None:
-        """The lateral scale up to which orders are resolved; None where they are not."""
+        """The maximum lateral scale for which orders are resolved; None if they overlap without scaling."""
         scales = (axis.max_scale for axis in self.axes if axis.max_order)
         return min(scales, default=np.inf) if self.resolved else None
 
@@ -316,7 +328,7 @@ class OrderSpectrum:
         if not self.resolved:
             return mi.Bool(True)
         along_x, along_y = self.axes
-        return along_x.holds(along_x.first(q_x), q_x, scale) & along_y.holds(along_y.first(q_y), q_y, scale)
+        return along_x.contains(along_x.first(q_x), q_x, scale) & along_y.contains(along_y.first(q_y), q_y, scale)
 
     def evaluate(
         self,
@@ -324,13 +336,14 @@ class OrderSpectrum:
         incidence: Incidence,
         active: mi.Bool,
     ) -> tuple[mi.Float, mi.Float]:
-        """Evaluate K G S(q; κ) cos θ_o and the density of q, both in µm², for one wavelength.
+        """Evaluate n_o² K G S(q; κ) |cos θ_o| and the density of q, both in µm², for one wavelength.
 
-        K and G are those of each order, and its lobe keeps its power at the horizon (`Geometry.of_order`).
+        Where orders are known, K and G are those of each order, with the gain of its lobe
+        (`Geometry.order_squares_and_gain`).
 
         Args:
             geometry: of the pair of directions.
-            incidence: the wavelength and where it comes from.
+            incidence: the wavelength and the incident direction.
             active: mask; where orders are resolved, q lies in the lobe of one (`meets`).
         """
         scale = incidence.lobe_scale
@@ -338,20 +351,20 @@ class OrderSpectrum:
         per_width = incidence.frequency / scale * self.per_width
         m_x, m_y = (axis.first(q) for axis, q in zip(self.axes, q, strict=True))
         lobes_x, lobes_y = self.axes[0].lobes(m_x, q.x, scale), self.axes[1].lobes(m_y, q.y, scale)
-        mirrored, factor = incidence.mirrored, 1
-        # `windows`: orders that are read at one κ, by first column and row, lobes, κ.
+        q_sign, factor = incidence.q_sign, 1
+        # Each window of orders is read at one κ: offsets of its column and row, lobes along x and y, κ.
         if self.resolved:
             tangent = self._tangent(m_x, m_y, incidence.wavelength)
             factor = geometry.order_factor(tangent, incidence, per_width)
             windows = [(0, 0, lobes_x, lobes_y, geometry.order_kappa(tangent, incidence))]
-            m = (mi.Int32(mirrored) * m_x, mi.Int32(mirrored) * m_y)
-            probability = self.orders.probability(*m, incidence, active)
-            # An order that does not propagate is not drawn.
-            there = incidence.propagates(mirrored * tangent)
-            density = dr.select(there, probability * lobes_x[0] * lobes_y[0], 0)
+            m = (mi.Int32(q_sign) * m_x, mi.Int32(q_sign) * m_y)
+            probability = self.order_sampler.probability(*m, incidence, active)
+            # Evanescent orders are not drawn.
+            propagates = incidence.propagates(q_sign * tangent)
+            density = dr.select(propagates, probability * lobes_x[0] * lobes_y[0], 0)
         else:
-            density = self.cells.density(mirrored * q, incidence, active)
-            if self.line:
+            density = self.q_sampler.density(q_sign * q, incidence, active)
+            if self.is_line:
                 windows = []
                 for x, y in np.ndindex(len(lobes_x), len(lobes_y)):
                     tangent = self._tangent(m_x + x, m_y + y, incidence.wavelength)
@@ -365,7 +378,7 @@ class OrderSpectrum:
         for x, y, of_x, of_y, kappa in windows:
             at = self.power.at(kappa, geometry.small())
             power += factor * self.power.window(row + y, column + x, of_x, of_y, at, active)
-        # Interpolation may dip below zero by its error.
+        # Interpolated powers may be slightly negative.
         return dr.select(active, larger(power, 0), 0), density
 
     def _tangent(self, m_x: mi.Int32, m_y: mi.Int32, wavelength: mi.Float) -> mi.Vector2f:
@@ -380,24 +393,24 @@ class OrderSpectrum:
         v: mi.Point2f,
         active: mi.Bool,
     ) -> tuple[mi.Point2f, mi.Bool]:
-        """Draw q in cycles/µm, for one wavelength, and tell whether the order of q propagates."""
-        if self.cells is not None:
-            return self.cells.sample(incidence, u, v, active), active
-        m_x, m_y, v = self.orders.sample(incidence, u, v, active)
+        """Draw q in cycles/µm, for one wavelength; return it and whether its order propagates."""
+        if self.q_sampler is not None:
+            return self.q_sampler.sample(incidence, u, v, active), active
+        m_x, m_y, v = self.order_sampler.sample(incidence, u, v, active)
         tangent = self._tangent(m_x, m_y, incidence.wavelength)
         scale = incidence.lobe_scale
-        q = mi.Point2f(self.axes[0].place(m_x, v.x, scale), self.axes[1].place(m_y, v.y, scale))
+        q = mi.Point2f(self.axes[0].quantile(m_x, v.x, scale), self.axes[1].quantile(m_y, v.y, scale))
         return q, incidence.propagates(tangent)
 
 
 class _Axis:
-    """The orders along one axis, and the lobe's factor there."""
+    """The orders along one axis, and the factor of their lobes."""
 
     def __init__(self, lobe: LobeAxis, size: float, max_order: int, sigma: float) -> None:
         self.count, self.max_order = lobe.count, max_order
-        self.all = np.isinf(lobe.half_width)
-        # A window that lies beyond the grid reads zeros only.
-        self.rim = 0 if self.all else self.count
+        self.reads_all = np.isinf(lobe.half_width)
+        # A window outside of the grid reads zeros only.
+        self.rim = 0 if self.reads_all else self.count
         self.size, self.pitch = opaque(size), opaque(1 / size)
         self.half_width = opaque(min(lobe.half_width, 1e30))
         self.max_scale = (1 + 1e-6) / (2 * lobe.half_width * size)
@@ -405,36 +418,38 @@ class _Axis:
         self.inside, self.spread = opaque(lobe.inside), opaque(np.sqrt(2) * sigma)
         self.peak = opaque(1 / (np.sqrt(2 * np.pi) * sigma * lobe.inside))
         self.slope = opaque(1 / (size * sigma**2))
-        self.steps = [opaque(np.exp(-0.5 * (k / (size * sigma)) ** 2)) for k in range(1, 0 if self.all else self.count)]
+        self.steps = [
+            opaque(np.exp(-0.5 * (k / (size * sigma)) ** 2)) for k in range(1, 0 if self.reads_all else self.count)
+        ]
 
     def first(self, q: mi.Float) -> mi.Int32:
         """Return the first of the `count` orders that contribute at q (cycles/µm)."""
-        return mi.Int32(-self.max_order) if self.all else mi.Int32(dr.ceil(q * self.size - 0.5 * self.count))
+        return mi.Int32(-self.max_order) if self.reads_all else mi.Int32(dr.ceil(q * self.size - 0.5 * self.count))
 
-    def holds(self, m: mi.Int32, q: mi.Float, scale: mi.Float | float) -> mi.Bool:
-        """Return whether there is an order m, and q lies in its lobe; `scale` is of lobes."""
+    def contains(self, m: mi.Int32, q: mi.Float, scale: mi.Float | float) -> mi.Bool:
+        """Return whether the order m exists and q lies in its lobe; `scale` is of lobes."""
         offset = dr.fma(-self.pitch, mi.Float(m), q)
         return (dr.abs(m) <= self.max_order) & (dr.abs(offset) <= self.half_width * scale)
 
     def lobes(self, first: mi.Int32, q: mi.Float, scale: mi.Float | float = 1.0) -> list[mi.Float]:
-        """Return N(q − m/T; s² σ_q²) of each of these orders, µm; zero outside of the half width.
+        """Return N(q − m/T; s² σ_q²) of the `count` orders from `first` on, µm; zero outside of the half width.
 
-        s is the scale of the lobe; one where there are several orders.
+        s is the scale of lobes; it is one where several orders contribute.
         """
         offset = dr.fma(-self.pitch, mi.Float(first), q) / scale
-        if self.all:
+        if self.reads_all:
             offsets = [dr.fma(-self.pitch, step, offset) for step in range(self.count)]
             return [self.peak * dr.exp(self.falloff * dr.square(offset)) for offset in offsets]
         lobe = self.peak / scale * dr.exp(self.falloff * dr.square(offset))
         if self.count == 1:
             return [dr.select(dr.abs(offset) <= self.half_width, lobe, 0)]
-        # exp(−(x − k/T)²/2σ²) = exp(−x²/2σ²) exp(x/Tσ²)^k exp(−k²/2T²σ²): an exponential for all together.
+        # exp(−(x − k/T)²/2σ²) = exp(−x²/2σ²) exp(x/Tσ²)^k exp(−k²/2T²σ²): one exponential for all orders.
         ratio, lobes = dr.exp(self.slope * offset), [lobe]
         for step in self.steps:
             lobe = lobe * ratio
             lobes.append(lobe * step)
         return lobes
 
-    def place(self, m: mi.Int32, u: mi.Float, scale: mi.Float | float) -> mi.Float:
-        """Return the q in the lobe of an order with the fraction `u` of it below, cycles/µm; `scale` is of the lobe."""
+    def quantile(self, m: mi.Int32, u: mi.Float, scale: mi.Float | float) -> mi.Float:
+        """Return the quantile `u` of the lobe of order m, q in cycles/µm; `scale` is of the lobe."""
         return dr.fma(self.pitch, mi.Float(m), scale * truncated_gaussian(u, self.inside, self.spread))

@@ -1,4 +1,4 @@
-"""What a scene asks for, read and checked: the surface, the media about it, its scales."""
+"""The parameters of a scene, read and checked: the surface, the media around it, its scales."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from .fresnel import Conductor, PerfectMirror, reflectance_from
 
 _per_cent = functools.partial(progress_bar, unit="%")
 _PREFIX = "handed over: "
-_OF_SPECTRUM = "representation", "terms", "heights_from", "tolerance"  # of a profile, or in the place of a recipe's own
+_OF_SPECTRUM = "representation", "terms", "heights_from", "tolerance"  # for a profile, or to override a recipe
 _handed_over: weakref.WeakValueDictionary[str, Spectrum] = weakref.WeakValueDictionary()
 _SCALAR_ONLY = {
     "height_scale": "build the spectrum of the other depth",
     "lateral_scale": "build the spectrum of the other period",
-    "base": "what passes the surface is not computed; leave it out",
+    "base": "transmitted light is not computed; leave it out",
     "shadowing": "it is part of the efficiencies; leave it out",
     "fresnel": "it is part of the efficiencies; leave it out",
 }
@@ -37,13 +37,13 @@ _SCALAR_ONLY = {
 
 @dataclass(frozen=True)
 class Media:
-    """What `ext_ior`, `coat_ior` and `transmission` of a scene say.
+    """The media of a scene, from `ext_ior`, `coat_ior`, `int_ior` and `transmission`.
 
     Attributes:
-        outside: absolute index of the medium above everything; one of air and vacuum.
+        outside: absolute index of the uppermost medium; one for air and vacuum.
         coat: the layer over the relief.
         transmission: "none", "interface" or "sheet".
-        eta: index of the transparent material relative to the outside; None where no light passes.
+        eta: index of the transparent material relative to the outside; None without transmission.
     """
 
     outside: float
@@ -53,10 +53,10 @@ class Media:
 
     @classmethod
     def of(cls, props: mi.Properties) -> Media:
-        """Return the media of a scene's parameters.
+        """Return the media from the parameters of a scene.
 
         Raises:
-            RequestError: if an index is out of range, or light cannot pass.
+            RequestError: if an index is out of range, or the material does not transmit.
         """
         coat = coat_from(props)
         exterior = absolute_index("ext_ior", props.get("ext_ior", "air"))
@@ -70,7 +70,7 @@ class Media:
             if name in props:
                 got = repr(props[name]) if isinstance(props[name], str | float | int) else "a BSDF"
                 raise RequestError(f"{name}: got {got} with transmission={kind}, wanted a dielectric (int_ior) alone")
-        # As of `Dielectric`, in whose reflectance and in E it stands, too.
+        # Computed as by `Dielectric`, so that both are equal.
         eta = absolute_index("int_ior", props.get("int_ior", 1.5)) / exterior
         if abs(eta - 1) < SAME_INDEX:
             raise RequestError(f"int_ior: got that of the outside with transmission={kind}, wanted another one")
@@ -78,7 +78,7 @@ class Media:
 
     @property
     def index(self) -> float:
-        """The largest absolute index next to the relief, by which wavelengths are divided there."""
+        """The maximum absolute index next to the relief, by which wavelengths are divided there."""
         return self.outside * (self.coat.relative if self.coat is not None else max(1.0, self.eta or 1.0))
 
 
@@ -88,14 +88,14 @@ class Scale:
     Attributes:
         name: of the parameter.
         value: a number, or a texture of numbers.
-        values: all of a texture, each once, ascending; interpolation stays between them.
+        values: the distinct values of a texture, ascending; interpolated ones lie between them.
     """
 
     def __init__(self, props: mi.Properties, name: str) -> None:
         """Read the parameter `name`.
 
         Raises:
-            ValueError: if it is neither a number nor a texture whose values are known.
+            RequestError: if it is neither a number nor a texture whose values are known.
         """
         self.name, value = name, props.get(name, 1.0)
         if not is_number(value) and not isinstance(value, mi.Texture):
@@ -109,10 +109,10 @@ class Scale:
         return isinstance(self.value, mi.Texture)
 
     def read(self) -> None:
-        """Read the values, which the user may have changed.
+        """Read the values again, as the user may have changed them.
 
         Raises:
-            ValueError: if they cannot be known, as those of a mesh attribute, or are not finite.
+            RequestError: if they are unknown, as those of a mesh attribute, or not finite.
         """
         found = [self.value]
         if self.varies:
@@ -130,11 +130,11 @@ class Scale:
             raise RequestError(f"{self.name}: got values that are not finite, wanted numbers")
 
     def at(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Float:
-        """Evaluate it at a point."""
+        """Evaluate the scale at a point."""
         return self.value.eval_1(si, active) if self.varies else self.value
 
     def put(self, callback: mi.TraversalCallback) -> None:
-        """Show it among the parameters of the scene."""
+        """Add the scale to the parameters of the scene."""
         callback.put(self.name, self.value, mi.ParamFlags.Differentiable)
 
     def __str__(self) -> str:
@@ -143,10 +143,10 @@ class Scale:
 
 
 def check_texture(name: str, texture: mi.Texture) -> None:
-    """Check the values of a bitmap that stands for a number.
+    """Check the values of a bitmap in the place of a number.
 
     Raises:
-        ValueError: if some are not finite, or they are colours.
+        RequestError: if some are not finite, or the bitmap has colours.
     """
     parameters = mi.traverse(texture)
     if "data" not in parameters:
@@ -160,11 +160,11 @@ def check_texture(name: str, texture: mi.Texture) -> None:
 
 
 class Scales:
-    """Both scales of a scene.
+    """The scales of heights and lengths of a scene.
 
     Attributes:
         height: of the heights.
-        lateral: of the lengths along the surface; None where it is the number 1, which costs nothing.
+        lateral: of the lengths along the surface; None if it is the number 1.
     """
 
     def __init__(self, props: mi.Properties) -> None:
@@ -176,14 +176,14 @@ class Scales:
 
     @property
     def max_scale(self) -> float:
-        """By how much shorter wavelengths the spectrum must reach than without scales."""
+        """The factor by which the minimum wavelength of the spectrum must be smaller than without scales."""
         return max(1.0, *(float(scale.values[-1]) for scale in self))
 
     def at(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
         """Return h/s and s at a point, h of the heights and s of lengths along the surface.
 
         Scaling lengths by s and heights by h is equivalent to scaling heights by h/s, at the wavelength λ/s and with
-        lobes of the width s σ_q: nothing else knows of scales.
+        lobes of the width s σ_q.
         """
         height = self.height.at(si, active)
         if self.lateral is None:
@@ -193,28 +193,28 @@ class Scales:
 
     @property
     def min_lateral(self) -> float:
-        """The smallest lateral scale."""
+        """The minimum lateral scale."""
         return 1.0 if self.lateral is None else float(self.lateral.values[0])
 
     def ratios(self) -> tuple[float, float]:
-        """Return the smallest and the largest height over lateral scale."""
+        """Return bounds of the ratio of height scale to lateral scale."""
         low, high = self.height.values[[0, -1]]
         max_lateral = 1.0 if self.lateral is None else self.lateral.values[-1]
         return float(low / max_lateral), float(high / self.min_lateral)
 
-    def check(self, wavelengths: tuple[float, float], index: float, most: float | None) -> None:
-        """Check the values against what a spectrum covers.
+    def check(self, wavelengths: tuple[float, float], index: float, max_resolved: float | None) -> None:
+        """Check the values against the range of a spectrum.
 
         Args:
             wavelengths: shortest and longest of the spectrum, nm.
-            index: the largest index next to the relief.
-            most: the lateral scale up to which orders do not overlap; None if they do.
+            index: the maximum index next to the relief.
+            max_resolved: the maximum lateral scale for which orders do not overlap; None if they overlap.
 
         Raises:
-            ValueError: naming the wavelengths from which to build.
+            RequestError: with the wavelengths for which to build the spectrum.
         """
         shortest = VISIBLE[0] / index
-        # At wavelengths that the spectrum does not cover the grating is black; κ and q are less at the others.
+        # The grating is black at wavelengths that are not covered; at the others κ and q are smaller.
         covered = max(shortest / wavelengths[0], 1.0)
         for scale in self:
             if not scale.varies:
@@ -228,26 +228,27 @@ class Scales:
                     f"scales build it from {shortest:.4g} nm divided by the scale"
                     + (f", here {shortest / high:.4g} nm" if high > covered else "")
                 )
-        if self.lateral is not None and (most is None or self.lateral.values[-1] > most):
+        if self.lateral is not None and (max_resolved is None or self.lateral.values[-1] > max_resolved):
             raise RequestError(
                 f"lateral_scale: got {self.lateral}, wanted 1"
-                + ("" if most is None else f" or less than {most:.4g}")
+                + ("" if max_resolved is None else f" or less than {max_resolved:.4g}")
                 + ": only of orders that do not overlap the lobes keep their width (not of samples, of tiles as large "
                 "as the coherence length, nor of line gratings with a coherence length below 15 um)"
             )
 
 
 def surface_from(props: mi.Properties, media: Media, scale: float = 1.0) -> tuple[Spectrum, Recipe | None]:
-    """The spectrum that the parameters `filename`, `spectrum`, or `profile` with its own parameters name.
+    """Return the spectrum given by `filename`, `spectrum`, or `profile` with its parameters.
 
-    Wavelengths are shorter inside a coat or a dielectric: what is built here is built for λ/n, and for the largest
-    `scale` of lengths, as if wavelengths were shorter by it.
+    A spectrum that is built here is built for the wavelengths λ/n in a coat or a dielectric, divided by the maximum
+    `scale`.
 
     Returns:
-        The spectrum, and the recipe behind it. A saved spectrum has none: it does not say which heights it is of.
+        The spectrum, and its recipe; None for a saved spectrum, which has no heights.
 
     Raises:
-        ValueError: unless exactly one of them is given, or if what it names cannot be had.
+        RequestError: unless exactly one of them is given and valid.
+        FileNotFoundError: if there is no such file.
     """
     given = [name for name in ("filename", "spectrum", "profile") if name in props]
     theory = props.get("theory", "scalar")
@@ -260,7 +261,7 @@ def surface_from(props: mi.Properties, media: Media, scale: float = 1.0) -> tupl
         )
     if given != ["profile"]:
         if given == ["spectrum"]:
-            spectrum, recipe = _taken_over(props["spectrum"]), None
+            spectrum, recipe = _by_handle(props["spectrum"]), None
         else:
             spectrum, recipe = _from_file(props, media, scale)
         found = "rigorous" if isinstance(spectrum, RigorousSpectrum) else "scalar"
@@ -281,34 +282,34 @@ def surface_from(props: mi.Properties, media: Media, scale: float = 1.0) -> tupl
 
 
 def _inside(props: mi.Properties, media: Media, scale: float, recipe: Recipe) -> Recipe:
-    """Return the recipe for the wavelengths next to the relief, and, of rigorous theory, for the variant.
+    """Return the recipe with the wavelengths next to the relief, divided by `scale`, and, if rigorous, the media.
 
-    A larger `scale` of lengths needs shorter ones, too. What the scene must not say is refused here, before a table is
-    computed.
+    Parameters that do not match the recipe are refused here, before a table is computed.
     """
-    settings, inside = recipe.settings, {}
+    settings, overrides = recipe.settings, {}
     wavelengths = wavelengths_inside(media.index, scale)
     if settings.theory == "rigorous":
         refuse_scalar_only(props)
         if settings.transmission != "none":
             check_transmission(settings.transmission, media)
-        inside = settings_of_medium(media)
+        overrides = settings_of_medium(media)
     # Rigorous tables of a bare surface are for the wavelengths above it.
     shorter = media.index * scale > 1 and (settings.theory == "scalar" or media.coat is not None)
     if shorter and settings.wavelengths == VISIBLE:
-        inside["wavelengths"] = wavelengths
-    return replace(recipe, settings=replace(settings, **inside))
+        overrides["wavelengths"] = wavelengths
+    return replace(recipe, settings=replace(settings, **overrides))
 
 
 def _from_file(props: mi.Properties, media: Media, scale: float) -> tuple[Spectrum, Recipe | None]:
+    """Return the spectrum of a file or of a recipe, and the recipe."""
     path = Path(str(mi.file_resolver().resolve(str(props["filename"]))))
     given = {name: props[name] for name in _OF_SPECTRUM if name in props}
     suffix = path.suffix.lower()
     if suffix in (".toml", ".exr") and not path.is_file():
-        # What is not found stays relative; the folder of a scene is searched first.
+        # An unresolved path is relative; the resolver begins with the folder of the scene.
         folder = Path(str(mi.file_resolver()[0])) / path.parent
-        there = sorted(other.name for other in folder.glob("*") if other.suffix.lower() in (".exr", ".toml"))
-        raise FileNotFoundError(f"{path}: no such file; {folder} holds {', '.join(there) or 'no spectrum'}")
+        available = sorted(other.name for other in folder.glob("*") if other.suffix.lower() in (".exr", ".toml"))
+        raise FileNotFoundError(f"{path}: no such file; {folder} holds {', '.join(available) or 'no spectrum'}")
     if suffix == ".toml":
         recipe = _inside(props, media, scale, Recipe.load(path, **given))
         return recipe.cached(_per_cent), recipe
@@ -322,7 +323,8 @@ def _from_file(props: mi.Properties, media: Media, scale: float) -> tuple[Spectr
     )
 
 
-def _taken_over(handle: str) -> Spectrum:
+def _by_handle(handle: str) -> Spectrum:
+    """Return the spectrum of a handle that `hand_over` made."""
     spectrum = _handed_over.get(handle)
     if spectrum is None:
         raise RequestError(f"spectrum: got {handle!r}, wanted a spectrum in Python's load_dict; XML takes a filename")
@@ -330,9 +332,9 @@ def _taken_over(handle: str) -> Spectrum:
 
 
 def hand_over(value: object) -> object:
-    """A scene dictionary in which every spectrum is replaced by a handle.
+    """Return a scene dictionary in which each spectrum is replaced by a handle.
 
-    Mitsuba's load_dict accepts only types bound in C++, so an object of ours travels by name.
+    mi.load_dict accepts only types bound in C++, therefore spectra are passed by name.
     """
     if isinstance(value, Spectrum):
         handle = f"{_PREFIX}{id(value)}"
@@ -344,23 +346,23 @@ def hand_over(value: object) -> object:
 
 
 def settings_from(props: mi.Properties, coat: Coat | None) -> dict[str, str | float]:
-    """`material` or `int_ior` as `precompute` takes them, by Mitsuba's names; an index relative to the outside.
+    """Return `material` or `int_ior` for `precompute`, the index relative to the outside.
 
     Raises:
-        ValueError: if they are unknown, or the material is the perfect mirror.
+        RequestError: if they are unknown, or the material is the perfect mirror.
     """
     found = reflectance_from(props, coat)
     if isinstance(found, Conductor):
         return {"material": found.material}
     if isinstance(found, PerfectMirror):
         raise RequestError("material: got 'none', wanted a real one for theory=rigorous, such as 'Al'")
-    # As many digits as a float32 has.
+    # Rounded to the digits of a float32.
     eta = float(np.max(found.eta)) * (1 if coat is None else coat.relative)
     return {"int_ior": float(f"{eta:.6g}")}
 
 
 def settings_of_medium(media: Media) -> dict[str, str | float | bool]:
-    """What `precompute` needs to know of the coat, of light that passes and of the variant."""
+    """Return the settings for `precompute` that follow from the coat, the transmission and the variant."""
     medium = {} if media.coat is None else {"ext_ior": float(f"{media.coat.relative:.6g}")}
     if media.transmission != "none":
         medium["transmission"] = media.transmission
@@ -368,23 +370,23 @@ def settings_of_medium(media: Media) -> dict[str, str | float | bool]:
 
 
 def check_transmission(of_spectrum: str, media: Media) -> None:
-    """Refuse a rigorous spectrum of other light than the scene asks for.
+    """Check `transmission` of a rigorous spectrum.
 
     Raises:
-        ValueError: if `transmission` of both differs.
+        RequestError: if it differs from that of the scene.
     """
     if of_spectrum != media.transmission:
         raise RequestError(
             f"transmission: got {media.transmission!r}, but the rigorous spectrum is of transmission={of_spectrum}: "
-            "say the same, or build the spectrum for it"
+            "set the same, or build the spectrum for it"
         )
 
 
 def refuse_scalar_only(props: mi.Properties) -> None:
-    """Refuse parameters that rigorous theory does not have.
+    """Check that no parameter of scalar theory alone is given.
 
     Raises:
-        ValueError: if one is given.
+        RequestError: if one is.
     """
     for name, advice in _SCALAR_ONLY.items():
         if name in props:
@@ -394,11 +396,10 @@ def refuse_scalar_only(props: mi.Properties) -> None:
 
 
 def check_parameters(props: mi.Properties, spectrum: RigorousSpectrum, coat: Coat | None) -> PerfectMirror:
-    """Return R = 1 beside a rigorous spectrum, whose efficiencies are those of the material.
+    """Return R = 1, as the efficiencies of a rigorous spectrum include the material.
 
     Raises:
-        ValueError: if it is of another material, medium or kind of light, or says something that rigorous theory does
-            not have.
+        RequestError: if the scene has another material, medium or polarisation, or parameters of scalar theory alone.
     """
     if mi.is_polarized and spectrum.mueller is None:
         raise RequestError(
@@ -412,7 +413,7 @@ def check_parameters(props: mi.Properties, spectrum: RigorousSpectrum, coat: Coa
             f"coat_ior: got {'none' if coat is None else f'{coat.index:g}'}, but the rigorous spectrum is of a grating "
             f"below a medium of index {spectrum.ext_ior:g}: build it with ext_ior={medium:.4g}"
         )
-    # Over a coat, ext_ior is what lies above it.
+    # With a coat, `ext_ior` is that above the coat.
     if any(name in props for name in ("material", "int_ior", *(["ext_ior"] if coat is None else []))):
         wanted = settings_from(props, coat)
         if "material" in wanted:

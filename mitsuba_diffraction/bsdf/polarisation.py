@@ -1,6 +1,6 @@
-"""s and p light of a grating: of scalar theory as a plane at the half vector splits them, of rigorous theory exactly.
+"""Mueller matrices of a grating: for scalar theory those of a plane at the half vector, for rigorous theory exact.
 
-docs/validation.md tells how far the former is from rigorous results, and why it is worth having.
+docs/validation.md compares the former with rigorous results.
 """
 
 from __future__ import annotations
@@ -11,16 +11,16 @@ import drjit as dr
 import mitsuba as mi
 
 Split = Callable[..., "mi.Spectrum"]
-"""The Mueller matrix of a grating, from (source, exit, source's x axis, exit's x axis)."""
+"""A function that returns the Mueller matrix of a grating from (source, exit, x axis of source, x axis of exit)."""
 
 
 def reflected(split: Split, wi: mi.Vector3f, wo: mi.Vector3f, mode: mi.TransportMode) -> mi.Spectrum:
-    """The Mueller matrix of a grating between Mitsuba's own axes.
+    """Return the Mueller matrix of a grating between Mitsuba's own axes.
 
     Args:
         split: of the grating.
-        wi, wo: towards the light and away from the surface, in the shading frame, above the surface.
-        mode: of the transport; it tells which of the two the light comes from.
+        wi, wo: directions away from the surface, in the shading frame.
+        mode: of the transport, on which depends from which of the two light is incident.
     """
     source, exit_ = (wi, wo) if mode == mi.TransportMode.Importance else (wo, wi)
     return split(source, exit_, mi.mueller.stokes_basis(-source), mi.mueller.stokes_basis(exit_))
@@ -29,7 +29,7 @@ def reflected(split: Split, wi: mi.Vector3f, wo: mi.Vector3f, mode: mi.Transport
 def through_layer(
     split: Split, eta: mi.Float, outside: Sequence[mi.Vector3f], inside: Sequence[mi.Vector3f], mode: mi.TransportMode
 ) -> mi.Spectrum:
-    """The Mueller matrix of a grating under a plane layer: refraction in, the grating inside, refraction out.
+    """Return the Mueller matrix of a grating under a plane layer, with refraction into and out of the layer.
 
     Args:
         split: of the grating alone, without the transmittances of the layer's face.
@@ -38,12 +38,16 @@ def through_layer(
         mode: of the transport.
     """
     first, last = (0, 1) if mode == mi.TransportMode.Importance else (1, 0)
-    # The plane of refraction is spanned by the normal and the direction, inside and outside.
+    # Directions inside and outside have the same plane of refraction, and therefore the same s axis.
     across = [_across(outside[which]) for which in (first, last)]
     grating = split(inside[first], inside[last], *across)
-    enter = mi.mueller.specular_transmission(mi.UnpolarizedSpectrum(outside[first].z), mi.UnpolarizedSpectrum(eta))
-    leave = mi.mueller.specular_transmission(mi.UnpolarizedSpectrum(inside[last].z), mi.UnpolarizedSpectrum(1 / eta))
-    matrix = leave @ grating @ enter
+    entrance_face = mi.mueller.specular_transmission(
+        mi.UnpolarizedSpectrum(outside[first].z), mi.UnpolarizedSpectrum(eta)
+    )
+    exit_face = mi.mueller.specular_transmission(
+        mi.UnpolarizedSpectrum(inside[last].z), mi.UnpolarizedSpectrum(1 / eta)
+    )
+    matrix = exit_face @ grating @ entrance_face
     source, exit_ = outside[first], outside[last]
     return mi.mueller.rotate_mueller_basis(
         matrix,
@@ -57,12 +61,12 @@ def through_layer(
 
 
 def unpolarised(value: mi.UnpolarizedSpectrum) -> Split:
-    """A grating that depolarises light."""
+    """Return the matrix of a depolarising grating."""
     return lambda *_: mi.depolarizer(value)
 
 
 def of_plane(value: mi.UnpolarizedSpectrum, index: list[mi.Complex2f]) -> Split:
-    """As a plane across h, scaled to `value` for unpolarised light.
+    """Return the matrix of a plane perpendicular to h, scaled to `value` for unpolarised light.
 
     Args:
         value: R K G E S/λ² cos θ_o, R the mean of R_s and R_p at the half vector.
@@ -73,25 +77,25 @@ def of_plane(value: mi.UnpolarizedSpectrum, index: list[mi.Complex2f]) -> Split:
         half = dr.normalize(source + exit_)
         cos_half = dr.dot(source, half)
         planes = [mi.mueller.specular_reflection(cos_half, eta) for eta in index]
-        # Where nothing is reflected (indices that match) `value` is zero, and so is every entry.
-        brightness = [dr.select(plane[0, 0] > 0, plane[0, 0], 1) for plane in planes]
+        # For equal indices all entries and `value` are zero.
+        intensities = [dr.select(plane[0, 0] > 0, plane[0, 0], 1) for plane in planes]
         entries = [
-            [[plane[i, j] / bright for j in range(4)] for i in range(4)]
-            for plane, bright in zip(planes, brightness, strict=True)
+            [[plane[i, j] / intensity for j in range(4)] for i in range(4)]
+            for plane, intensity in zip(planes, intensities, strict=True)
         ]
         matrix = _matrix(value, entries)
-        # The s axes lie across the plane of reflection; of light that returns to its source any axis across it will do.
+        # The s axes are perpendicular to the plane of reflection; for retroreflection, to h.
         axes = [dr.cross(half, -source), dr.cross(half, exit_)]
-        returns = dr.squared_norm(axes[0]) < 1e-12
+        is_retroreflected = dr.squared_norm(axes[0]) < 1e-12
         across = mi.coordinate_system(half)[0]
-        axes = [dr.select(returns, across, dr.normalize(axis)) for axis in axes]
+        axes = [dr.select(is_retroreflected, across, dr.normalize(axis)) for axis in axes]
         return mi.mueller.rotate_mueller_basis(matrix, -source, axes[0], source_axis, exit_, axes[1], exit_axis)
 
     return split
 
 
 def of_interface(value: mi.UnpolarizedSpectrum, eta: mi.Float) -> Split:
-    """Return the split by a plane perpendicular to h, the normal of the facet that refracts or reflects the pair.
+    """Return the matrix of a plane perpendicular to h, the normal of the facet that refracts or reflects the pair.
 
     Args:
         value: as of `of_plane`, or that of transmitted light.
@@ -104,17 +108,20 @@ def of_interface(value: mi.UnpolarizedSpectrum, eta: mi.Float) -> Split:
         half = dr.normalize(n_i * source + n_o * exit_)
         cos_half = dr.abs(dr.dot(source, half))
         other = dr.select(reflects, dr.select(source.z > 0, eta, dr.rcp(eta)), n_o / n_i)
-        back = mi.mueller.specular_reflection(cos_half, mi.Complex2f(other, 0))
-        on = mi.mueller.specular_transmission(cos_half, other)
-        bright = dr.select(reflects, back[0, 0], on[0, 0])
-        per = dr.rcp(dr.select(bright > 0, bright, 1))
-        entries = [[dr.select(reflects, back[i, j], on[i, j]) * per for j in range(4)] for i in range(4)]
+        reflection = mi.mueller.specular_reflection(cos_half, mi.Complex2f(other, 0))
+        transmission = mi.mueller.specular_transmission(cos_half, other)
+        intensity = dr.select(reflects, reflection[0, 0], transmission[0, 0])
+        per_intensity = dr.rcp(dr.select(intensity > 0, intensity, 1))
+        entries = [
+            [dr.select(reflects, reflection[i, j], transmission[i, j]) * per_intensity for j in range(4)]
+            for i in range(4)
+        ]
         matrix = _matrix(value, [entries] * len(value))
         across = mi.coordinate_system(half)[0]
         axes = [dr.cross(half, -source), dr.cross(half, exit_)]
         axes[1] *= dr.select(reflects | (dr.dot(axes[0], axes[1]) > 0), mi.Float(1), -1)
-        returns = dr.squared_norm(axes[0]) < 1e-12
-        axes = [dr.select(returns, across, dr.normalize(axis)) for axis in axes]
+        is_retroreflected = dr.squared_norm(axes[0]) < 1e-12
+        axes = [dr.select(is_retroreflected, across, dr.normalize(axis)) for axis in axes]
         return mi.mueller.rotate_mueller_basis(matrix, -source, axes[0], source_axis, exit_, axes[1], exit_axis)
 
     return split
@@ -125,12 +132,12 @@ def of_orders(
     entries: Callable[[int, mi.Vector3f, mi.Vector3f], list[list[mi.Float]]],
     grooves: mi.Vector3f,
 ) -> Split:
-    """As rigorous theory has it, scaled to `value` for unpolarised light.
+    """Return the matrix of rigorous theory, scaled to `value` for unpolarised light.
 
     Args:
         value: Σ_m η_m N/λ² cos θ_o.
-        entries: M_ij / M_00 for (channel, source, exit), between waves whose x axis is the part of the grooves across
-            their direction.
+        entries: M_ij / M_00 for (channel, source, exit), between waves whose x axis is the component of the grooves
+            perpendicular to their direction.
         grooves: ŷ of the pattern.
     """
 
@@ -143,7 +150,7 @@ def of_orders(
 
 
 def _matrix(value: mi.UnpolarizedSpectrum, entries: list[list[list[mi.Float]]]) -> mi.Spectrum:
-    """`value` times M_ij of every channel: `entries[channel][i][j]`."""
+    """Return `value` times M_ij of each channel, `entries[channel][i][j]`."""
     matrix = mi.Spectrum(0.0)
     for row in range(4):
         for column in range(4):
@@ -155,12 +162,12 @@ def _matrix(value: mi.UnpolarizedSpectrum, entries: list[list[list[mi.Float]]]) 
 
 
 def _projected(axis: mi.Vector3f, omega: mi.Vector3f) -> mi.Vector3f:
-    """The direction of a unit vector's part across ω."""
+    """Return the normalised component of a vector perpendicular to ω."""
     return dr.normalize(axis - dr.dot(axis, omega) * omega)
 
 
 def _across(omega: mi.Vector3f) -> mi.Vector3f:
-    """The s axis of refraction: across the direction and the surface's normal."""
+    """Return the s axis of refraction, perpendicular to ω and to the surface normal."""
     length = dr.sqrt(dr.square(omega.x) + dr.square(omega.y))
     oblique = length > 1e-6
     scale = dr.rcp(dr.select(oblique, length, 1))

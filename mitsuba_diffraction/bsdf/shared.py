@@ -1,4 +1,4 @@
-"""What BSDFs of one surface share: its tables at run time."""
+"""The tables of a surface at run time, which its BSDFs share."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from .orders import OrderSpectrum
 from .parameters import Scales
 from .rigorous_orders import RigorousOrders
 
-RATIO_STEP = 0.5  # radians of the phase of the deepest point between nodes of the ratio of scales in a table of E
-MAX_RATIOS = 16  # such nodes
-SAMPLED_RATIOS = 7  # of scales that vary, between which there are cells of orders
+MAX_PHASE_STEP = 0.5  # radians at the deepest point, between nodes of the ratio of scales in a table of E
+MAX_RATIOS = 16  # number of these nodes
+SAMPLER_RATIOS = 7  # of scales that vary: the number of values between which `OrderSampler` has its bins
 
 _making = threading.Lock()
 _shared: weakref.WeakValueDictionary[tuple[str, str, float | None], SharedTables] = weakref.WeakValueDictionary()
 
 
 class SharedTables:
-    """The tables of one spectrum for every BSDF that shows it, in one variant of Mitsuba.
+    """The tables of one spectrum for all BSDFs that have it, in one variant of Mitsuba.
 
     Attributes:
         scattering: S(q; κ) and its sampler.
@@ -42,19 +42,19 @@ class SharedTables:
             self.scattering = RigorousOrders(spectrum)
         else:
             represented = OrderSpectrum if isinstance(spectrum.grid, OrderGrid) else SplineSpectrum
-            self.scattering = represented(spectrum, *([] if eta is None else passing(eta)))
+            self.scattering = represented(spectrum, *([] if eta is None else transmission_bounds(eta)))
         self._spectrum, self._eta = spectrum, eta
-        self._last: tuple[tuple, Energy | None] | None = None
+        self._energy: tuple[tuple, Energy | None] | None = None
         self._orders: tuple[tuple, OrderSampler] | None = None
         self._lock = threading.Lock()
 
     @classmethod
     def of(cls, spectrum: Spectrum, eta: float | None = None) -> SharedTables:
-        """Return those of an equal spectrum, while some BSDF has them; else new ones.
+        """Return the tables of an equal spectrum if a BSDF holds them, else new ones.
 
-        `eta` is the relative index where light passes the grating, too.
+        `eta` is the relative index of a transmitting grating.
 
-        Mitsuba constructs plugins on several threads: one of them makes the tables, the others wait.
+        Mitsuba constructs plugins on several threads: one of them makes the tables while the others wait.
         """
         key = mi.variant(), spectrum.digest, eta
         with _making:
@@ -68,7 +68,7 @@ class SharedTables:
         if not self.scattering.resolved:
             return None
         low, high = scales.ratios()
-        ratios = np.linspace(low, high, 1 if low == high else SAMPLED_RATIOS)
+        ratios = np.linspace(low, high, 1 if low == high else SAMPLER_RATIOS)
         key = is_sheet, coat_index, ratios.tolist(), scales.min_lateral
         with self._lock:
             if self._orders is None or self._orders[0] != key:
@@ -78,28 +78,28 @@ class SharedTables:
     def energy(self, scales: Scales) -> Energy | None:
         """Return the factor E, or None if it is one for all directions and wavelengths.
 
-        Where the ratio of scales varies, or a gradient is tracked through the only one, E is linear between nodes.
+        E is linear between nodes of the ratio of scales where that varies or has a gradient.
         """
         spectrum, (low, high) = self._spectrum, scales.ratios()
-        per_step = spectrum.max_kappa * spectrum.height_range / RATIO_STEP
+        per_step = spectrum.max_kappa * spectrum.height_range / MAX_PHASE_STEP
         if low == high and not scales.height.varies and dr.grad_enabled(scales.height.value):
-            # Wide enough for values of a byte.
+            # Wide enough for differences of values that are stored as bytes.
             half = 1 / max(per_step, 10)
             low, high = max(low - half, 0.0), low + half
         count = 1 if low == high else int(np.clip(np.ceil((high - low) * per_step), 1, MAX_RATIOS - 1)) + 1
         key = np.linspace(low, high, count).tolist(), min(scales.min_lateral, 1.0)
         with self._lock:
-            if self._last is None or self._last[0] != key:
+            if self._energy is None or self._energy[0] != key:
                 if key == ([1.0], 1.0) and self._eta is None:
                     table = spectrum.energy_table()
                 else:
                     table = EnergyTable.of(spectrum, key[0], self._eta, key[1])
-                self._last = key, Energy(table) if table.needed else None
-            return self._last[1]
+                self._energy = key, Energy(table) if table.needed else None
+            return self._energy[1]
 
 
-def passing(eta: float) -> tuple[float, float]:
-    """Return what samplers need for light that passes: κ below which nearly all of it lies, and the largest |k_∥|/n_o.
+def transmission_bounds(eta: float) -> tuple[float, float]:
+    """Return κ below which nearly all transmitted light lies, and the maximum of |k_i,∥|/n_o.
 
     Undiffracted light along the normal has κ = 2π |η − 1|/λ.
     """

@@ -1,4 +1,4 @@
-"""The two theories of diffraction, and what the BSDF asks of either: value, density, samples, R, polarisation."""
+"""The two theories of diffraction, and the interface of both: value, density, samples, R, polarisation."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from ..settings import VISIBLE
 from .coat import SAME_INDEX
 from .energy import Coordinates, Energy
 from .fresnel import Material, reflectance_from
-from .geometry import Geometry, Incidence, Interface, turned
-from .order_sampler import CHANGE
+from .geometry import Geometry, Incidence, Interface, rotated
+from .order_sampler import MAX_INDEX_CHANGE
 from .orders import OrderSpectrum
 from .parameters import Media, Scales, check_parameters, check_transmission
 from .polarisation import Split, of_interface, of_orders, of_plane, unpolarised
@@ -30,11 +30,11 @@ from .shared import SharedTables
 from .tables import opaque
 
 _log = logging.getLogger(__name__)
-_warned: set[str] = set()  # warnings, each of which is given once
+_warned: set[str] = set()  # warnings that were logged, each once
 
 
 def _warn_of_range(spectrum: GratingSpectrum) -> None:
-    """Say in Mitsuba's log, once for each surface, if scalar theory is not to be trusted there."""
+    """Log a warning, once for each surface, if scalar theory is inaccurate for it."""
     message = f"diffraction_grating, {spectrum.source}: {spectrum.warning}"
     if spectrum.warning and message not in _warned:
         _warned.add(message)
@@ -45,7 +45,7 @@ class Scattering(Protocol):
     """The powers of orders or of a continuum, and the density from which q is drawn.
 
     Attributes:
-        resolved: whether orders do not overlap, so that most directions lie in the lobe of none.
+        resolved: whether orders do not overlap, so that most directions lie outside of all lobes.
     """
 
     resolved: bool
@@ -60,18 +60,18 @@ class Scattering(Protocol):
         """
 
     def sample(self, incidence: Incidence, u: mi.Float, v: mi.Point2f, active: mi.Bool) -> tuple[mi.Point2f, mi.Bool]:
-        """Draw q in cycles/µm for one wavelength, and tell whether its order propagates."""
+        """Draw q in cycles/µm for one wavelength; return it and whether its order propagates."""
 
 
 class Theory(Protocol):
-    """What a theory of diffraction provides.
+    """A theory of diffraction.
 
     Attributes:
         scattering: the powers, and their sampler.
         material: R of a plane.
         interface: the media above and below.
         shadowing: whether G is a factor.
-        covered_index: n by which wavelengths outside are divided where the spectrum covers them.
+        covered_index: index by which wavelengths outside are divided to compare them with those of the spectrum.
     """
 
     @property
@@ -96,7 +96,7 @@ class Theory(Protocol):
         """Recompute what depends on the parameters `keys`; on all of them if none is named."""
 
     def coordinates(self, geometry: Geometry) -> tuple[Coordinates, Coordinates] | None:
-        """Return what `evaluate` needs of a pair of directions at all wavelengths."""
+        """Return the coordinates of both directions in the table of E, for `evaluate` at all wavelengths."""
 
     def evaluate(
         self, geometry: Geometry, incidence: Incidence, pair: tuple[Coordinates, Coordinates] | None, active: mi.Bool
@@ -120,14 +120,14 @@ class Theory(Protocol):
         frame: tuple[mi.Float, mi.Float],
         active: mi.Bool,
     ) -> Split:
-        """Return how the grating splits `value` into s and p."""
+        """Return the Mueller matrix of the grating as a function of directions and axes, scaled to `value`."""
 
 
 def theory_of(props: mi.Properties, spectrum: Spectrum, media: Media, scales: Scales) -> Theory:
-    """Return the theory that a spectrum is of.
+    """Return the theory of a spectrum.
 
     Raises:
-        ValueError: if a parameter is wrong, or does not fit the spectrum.
+        RequestError: if a parameter is wrong, or does not match the spectrum.
     """
     if isinstance(spectrum, RigorousSpectrum):
         return RigorousTheory(props, spectrum, media)
@@ -140,7 +140,7 @@ class ScalarTheory:
     Attributes:
         scattering: K G S cos θ_o and its sampler.
         material: R.
-        media: about the grating, with an index that tables are for.
+        media: around the grating; its index is the one for which the tables were made.
         scales: of heights and of lengths along the surface.
         shadowing: whether G is a factor.
         energy: E, or None where it is one.
@@ -168,17 +168,17 @@ class ScalarTheory:
         """Check the parameters that can change, and recompute what depends on them.
 
         Raises:
-            ValueError: if the spectrum does not cover the scales, or the wavelengths inside a coat.
+            RequestError: if the spectrum does not cover the scales, or the wavelengths inside a coat.
         """
         shortest = VISIBLE[0] / self.media.index
         max_scale = shortest / self.spectrum.wavelengths[0]
         if self.media.index > 1 and max_scale < 1 - 1e-6:
-            name, place = "int_ior", "the material"
+            name, medium = "int_ior", "the material"
             if self.media.eta is None:
-                name, place = ("ext_ior", "it") if self.media.coat is None else ("coat_ior", "the coat")
+                name, medium = ("ext_ior", "it") if self.media.coat is None else ("coat_ior", "the coat")
             raise RequestError(
                 f"{name}: got {self.media.index:g}, and a spectrum for wavelengths from "
-                f"{self.spectrum.wavelengths[0]:g} nm; inside {place} they are shorter: build it from "
+                f"{self.spectrum.wavelengths[0]:g} nm; inside {medium} they are shorter: build it from "
                 f"{shortest:.4g} nm"
             )
         scales = self.scales
@@ -190,20 +190,20 @@ class ScalarTheory:
 
     @property
     def covered_index(self) -> float:
-        """n by which wavelengths are divided where the spectrum covers them."""
+        """The maximum index next to the relief, for which the tables are made."""
         return self.media.index
 
     def _interface(self) -> Interface:
-        """Return the media above and below, with orders drawn for the scales and the index as they are."""
+        """Return the media above and below, and set the sampler of orders for the current scales and index."""
         coat, eta, is_sheet = self.media.coat, self.media.eta, self.media.transmission == "sheet"
         sampler = self.tables.order_sampler(self.scales, is_sheet, 1.0 if coat is None else coat.relative)
         scattering = self.tables.scattering
         if sampler is not None and isinstance(scattering, OrderSpectrum):
-            self.scattering = scattering.drawn_from(sampler)
+            self.scattering = scattering.with_order_sampler(sampler)
         if eta is None:
             return Interface(1.0 if coat is None else coat.eta)
         kappas = tuple(opaque(kappa) for kappa in small_kappas(self.spectrum, eta))
-        fraction = None if sampler is None else sampler.transmitted
+        fraction = None if sampler is None else sampler.transmitted_fraction
         return Interface(1.0, self.material.eta, is_sheet, kappas, fraction)
 
     def parameters_changed(self, keys: list[str]) -> None:
@@ -214,11 +214,13 @@ class ScalarTheory:
         self.material.update()
         other_index = False
         if self.media.eta is not None:
-            # Tables serve for nearly the same index, so that a scene in which it varies smoothly is not slowed down.
+            # Tables are reused for nearly the same index, for the speed of scenes in which it varies smoothly.
             eta, before = float(np.max(dr.detach(self.material.eta))), self.media.eta
             if not 0 < eta < np.inf or abs(eta - 1) < SAME_INDEX:
-                raise RequestError(f"eta: got {eta:g}, wanted a positive relative index other than one: light passes")
-            other_index = abs(eta - before) > CHANGE * abs(before - 1)
+                raise RequestError(
+                    f"eta: got {eta:g}, wanted a positive relative index other than one, as light is transmitted"
+                )
+            other_index = abs(eta - before) > MAX_INDEX_CHANGE * abs(before - 1)
             if other_index:
                 self.media = dataclasses.replace(self.media, eta=eta)
                 self.tables = SharedTables.of(self.spectrum, eta)
@@ -234,7 +236,7 @@ class ScalarTheory:
         self.material.traverse(callback)
 
     def coordinates(self, geometry: Geometry) -> tuple[Coordinates, Coordinates] | None:
-        """Return those of both directions in the table of E."""
+        """Return the coordinates of both directions in the table of E; None where E is one."""
         if self.energy is None:
             return None
         incident, outgoing = geometry.incident.inner(), geometry.outgoing.inner()
@@ -262,7 +264,7 @@ class ScalarTheory:
         frame: tuple[mi.Float, mi.Float],
         active: mi.Bool,
     ) -> Split:
-        """Return how the grating splits `value` into s and p."""
+        """Return the Mueller matrix of the grating as a function of directions and axes, scaled to `value`."""
         index = self.material.index(si, active)
         if index is None:
             return unpolarised(value)
@@ -279,7 +281,7 @@ class ScalarTheory:
 
 
 class RigorousTheory:
-    """f cos θ_o = Σ_m η_m N(q − m/T; σ_q² I)/λ² cos θ_o: R, K, G and E are in the efficiencies η_m.
+    """f cos θ_o = Σ_m η_m N(q − m/T; σ_q² I)/λ² cos θ_o: the efficiencies η_m include R, K, G and E.
 
     Attributes:
         scattering: Σ_m η_m N n_o² cos θ_o and its sampler.
@@ -287,7 +289,7 @@ class RigorousTheory:
         interface: the media above and below.
     """
 
-    shadowing = True  # of no effect: it is in the efficiencies
+    shadowing = True  # has no effect: it is part of the efficiencies
 
     def __init__(self, props: mi.Properties, spectrum: RigorousSpectrum, media: Media) -> None:
         self.media, coat = media, media.coat
@@ -309,7 +311,7 @@ class RigorousTheory:
         """Show no parameters."""
 
     def coordinates(self, geometry: Geometry) -> None:
-        """Return None: nothing is needed."""
+        """Return None: there is no table of E."""
 
     def evaluate(
         self, geometry: Geometry, incidence: Incidence, pair: tuple[Coordinates, Coordinates] | None, active: mi.Bool
@@ -328,14 +330,14 @@ class RigorousTheory:
         frame: tuple[mi.Float, mi.Float],
         active: mi.Bool,
     ) -> Split:
-        """Return how the grating splits `value` into s and p."""
+        """Return the Mueller matrix of the grating as a function of directions and axes, scaled to `value`."""
         sin, cos = frame
         relative = 1e3 if self.media.coat is None else 1e3 * self.media.coat.relative
 
         def entries(channel: int, source: mi.Vector3f, exit_: mi.Vector3f) -> list[list[mi.Float]]:
             frequency = relative / si.wavelengths[channel]
-            # Under a coat both are directions inside of it, and so is the wavelength.
-            k_i, k_o = turned(source, sin, cos), turned(exit_, sin, cos)
+            # Under a coat, directions and wavelength are those inside of it.
+            k_i, k_o = rotated(source, sin, cos), rotated(exit_, sin, cos)
             if not self.interface.transmits:
                 return self.scattering.mueller(k_i, k_o, frequency, active, None)
             k_i, k_o = self.interface.wave_vector(k_i), self.interface.wave_vector(k_o)

@@ -1,4 +1,4 @@
-"""What lies under the grating: any BSDF that reflects, its part of the light and of the samples."""
+"""The base under the grating: values, samples and components with any BSDF that reflects."""
 
 import drjit as dr
 import mitsuba as mi
@@ -114,14 +114,14 @@ def test_samples_pass_the_chi_square_test(base, theta):
 
 @pytest.mark.few(1)
 @pytest.mark.parametrize("name", sorted(MIRRORS))
-def test_mirror_lobes_pass_the_surface_twice(name):
+def test_specular_base_is_attenuated_by_both_transmittances(name):
     wi, count = direction(50, 70), 1 << 16
     bsdf, base = over(MIRRORS[name]()), mi.load_dict(MIRRORS[name]())
     bs, weight = draw(bsdf, wi, count)
     mirror = np.array(mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta))
     assert 0.02 < mirror.mean() < 0.95
     np.testing.assert_allclose(np.array(bs.wo).T[mirror], np.tile(wi * [-1, -1, 1], (mirror.sum(), 1)), atol=1e-6)
-    # pdf is the share of the samples.
+    # pdf is the fraction of these samples.
     share = np.array(bs.pdf)[mirror]
     np.testing.assert_allclose(share, mirror.mean(), atol=4 * np.sqrt(0.25 / count))
     # What the mirror returns, and with it the whole.
@@ -173,7 +173,7 @@ def test_flags_and_components_are_those_of_grating_and_base():
 
 
 def contexts():
-    """What asks for the grating alone, and what asks for the base alone."""
+    """Return contexts of the grating alone and of the base alone."""
     result = []
     for index in (0, 1):
         result.append(mi.BSDFContext())

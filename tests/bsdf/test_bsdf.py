@@ -1,4 +1,4 @@
-"""The plugin against the formulas in float64, against itself turned about, and against its own samples."""
+"""The plugin against the formulas in float64, under rotation, and against its own samples."""
 
 import functools
 
@@ -44,32 +44,32 @@ def spectrum(name, coherence_length=65.0):
 
 
 def raw_plugin(of, **parameters):
-    """The plugin without E, which tests/energy/test_energy.py examines."""
+    """Return the plugin without E, which tests/energy/test_energy.py tests."""
     return plugin(of, conserve_energy=False, **parameters)
 
 
 def towards(wi, q, wavelength):
-    """ω_o of the frequencies q (..., 2) at one wavelength (nm), NaN where evanescent."""
+    """Return ω_o for the frequencies q (..., 2) at one wavelength (nm), NaN where evanescent."""
     t = -wavelength * 1e-3 * np.asarray(q) - wi[..., :2]
     with np.errstate(invalid="ignore"):
         return np.concatenate([t, np.sqrt(1 - (t**2).sum(-1, keepdims=True))], -1)
 
 
 def evaluate(bsdf, wi, wo, wavelengths=WAVELENGTHS):
-    """f cos θ_o (n, 4) and pdf (n,) in an LLVM variant."""
+    """Return f cos θ_o (n, 4) and pdf (n,) in an LLVM variant."""
     value, pdf = evaluate_pdf(bsdf, wi, np.atleast_2d(wo), wavelengths)
     return value, pdf[:, 0]
 
 
 def k_g(wi, wo):
-    """K·G in float64."""
+    """Return K G in float64."""
     w = wi[..., 2] + wo[..., 2]
     d = 1 + (wi * wo).sum(-1)
     return d**2 / (wi[..., 2] * wo[..., 2] * w**2) * np.minimum(1, 2 * w * np.minimum(wi[..., 2], wo[..., 2]) / d)
 
 
 def expected(height_field, wi, wo, wavelengths=WAVELENGTHS, coherence_length=65.0):
-    """f cos θ_o for R = 1, (n, wavelengths)."""
+    """Return f cos θ_o for R = 1, (n, wavelengths)."""
     wo = np.atleast_2d(wo)
     wi = np.broadcast_to(wi, wo.shape)
     um = np.asarray(wavelengths) * 1e-3
@@ -108,7 +108,7 @@ def test_orders_have_their_powers_and_the_gaps_are_dark(llvm, name, theta, phi):
 
 
 @pytest.mark.quick
-def test_a_blaze_reflects_to_the_side_of_its_facets(llvm):
+def test_a_blaze_reflects_into_the_mirror_direction_of_its_facets(llvm):
     wi = direction(0)
     wo = towards(wi, np.array([[0.4, 0], [-0.4, 0]]), 500)
     assert wo[0, 0] < 0
@@ -187,7 +187,7 @@ def test_values_are_finite_for_any_directions(llvm, name):
 
 
 def albedo(height_field, wi, wavelength):
-    """The sum over the orders of a one-row grating, each integrated over its lobe, R = 1."""
+    """Return the sum over the orders of a one-row grating, each integrated over its lobe, R = 1."""
     period, h = height_field.tile_size[0], height_field.centred[0]
     x = (np.arange(h.size) + 0.5) / h.size
     nodes, weights = np.polynomial.hermite_e.hermegauss(7)
@@ -263,7 +263,7 @@ def test_mistakes_are_refused(llvm, parameters, text):
 
 
 @pytest.mark.parametrize("source", ["profile", "recipe"])
-def test_what_rigorous_theory_lacks_is_refused_before_a_table_is_computed(llvm, monkeypatch, tmp_path, source):
+def test_parameters_of_scalar_theory_are_refused_before_a_table_is_computed(llvm, monkeypatch, tmp_path, source):
     monkeypatch.setattr("mitsuba_diffraction.recipe.Recipe.cached", lambda *_: pytest.fail("a table was computed"))
     recipe = tmp_path / "blazed.toml"
     recipe.write_text('[surface]\nprofile = "blazed"\n[spectrum]\ntheory = "rigorous"\nmaterial = "Al"\n')
@@ -273,13 +273,13 @@ def test_what_rigorous_theory_lacks_is_refused_before_a_table_is_computed(llvm, 
         mi.load_dict({"type": "diffraction_grating", "height_scale": 0.5, **of})
 
 
-def test_scales_beyond_any_spectrum_are_named(llvm):
+def test_scales_too_large_for_any_spectrum_are_refused(llvm):
     with pytest.raises(RuntimeError, match=r"height_scale, lateral_scale: got up to 1000, wanted at most 7\.2"):
         mi.load_dict({"type": "diffraction_grating", "profile": "blazed", "height_scale": 1000.0})
 
 
 def test_constructors_leave_the_file_resolver_alone(llvm, monkeypatch):
-    """mi.load_dict exchanges it, while Mitsuba's other threads load plugins that ask for it: sunsky failed at times."""
+    """mi.load_dict replaces it while other threads load plugins that need it: sunsky failed at times."""
     load = mi.load_dict
     path = load({"type": "path"})
     monkeypatch.setattr(mi, "load_dict", None)
@@ -301,7 +301,7 @@ def test_constructors_leave_the_file_resolver_alone(llvm, monkeypatch):
     ],
 )
 def test_a_refused_plugin_disturbs_no_other(llvm, kind, parameters):
-    """Dr.Jit calls whatever is registered, also a half-built object that a traceback keeps alive."""
+    """Dr.Jit calls all registered objects, also an incomplete one to which a traceback refers."""
     grating = {"type": "diffraction_grating", "profile": "blazed", "period": 2.5, "depth": 0.25}
     film = {"type": "specfilm", "width": 8, "height": 8, "green": {"type": "regular", "wavelength_min": 500.0}}
     film["green"].update(wavelength_max=600.0, values="1, 1")

@@ -25,13 +25,13 @@ def coated(profile="blazed", **parameters):
 
 
 def inside(omega):
-    """Directions in the layer, by Snell's law."""
+    """Return directions in the layer, by Snell's law."""
     across = omega[..., :2] / RELATIVE
     return np.concatenate([across, np.sqrt(1 - (across**2).sum(-1, keepdims=True))], -1)
 
 
 def transmittance(cosine):
-    """Of unpolarised light through the front face."""
+    """Return the transmittance of the front face for unpolarised light."""
     return 1 - np.mean(fresnel(cosine, RELATIVE), axis=0)
 
 
@@ -93,7 +93,7 @@ def test_the_front_face_follows_fresnel_and_no_light_is_gained(llvm, theta, turn
     np.testing.assert_allclose(wo[mirrored], np.broadcast_to(wi[0] * [-1, -1, 1], (mirrored.sum(), 3)), atol=1e-6)
     assert np.unique(np.array(bs.sampled_component)[mirrored]) == [1]
     front = np.mean(fresnel(wi[0, 2], RELATIVE))
-    # The share of the front face times the weight of its samples is exact.
+    # The probability of the front face times the weight of its samples is exact.
     np.testing.assert_allclose(np.array(bs.pdf)[mirrored] * weight[mirrored, 0], front, rtol=1e-4)
     albedo = weight[:, 0].mean()
     assert front < albedo < 1 + 4 * weight[:, 0].std() / np.sqrt(len(weight))
@@ -106,7 +106,7 @@ def test_samples_pass_the_chi_square_test(llvm, theta):
     check_chi_square(coated(conserve_energy=False), direction(theta, 20), ctx=context)
 
 
-def test_an_absorbing_layer_attenuates_both_passes(llvm):
+def test_an_absorbing_layer_attenuates_incident_and_outgoing_light(llvm):
     wi, wo = direction(30.0), direction([10.0, 40.0, 60.0], 180)
     clear = testing.evaluate(coated(), wi, wo, [550])
     dyed = testing.evaluate(coated(coat_absorption=0.004, coat_thickness=100.0), wi, wo, [550])
@@ -114,7 +114,7 @@ def test_an_absorbing_layer_attenuates_both_passes(llvm):
     np.testing.assert_allclose(dyed[:, 0], clear[:, 0] * np.exp(-0.4 * (1 / cosines[0] + 1 / cosines[1])), rtol=1e-4)
 
 
-def test_a_pigmented_base_is_seen_through_the_layer(llvm):
+def test_a_pigmented_base_has_the_transmittances_of_the_layer(llvm):
     base = {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.5}}
     wi, wo = direction(20.0), direction(65.0, 90)
     context = mi.BSDFContext()
@@ -131,12 +131,12 @@ def test_the_polarised_variant_agrees():
     for variant in ("llvm_ad_spectral", "llvm_ad_spectral_polarized"):
         use(variant)
         found.append(testing.evaluate(coated(material="Al"), wi, wo, [450, 550, 650, 750]))
-    # Off the normal s and p pass the front face unequally: a little more or less passes twice.
+    # At oblique incidence the front face polarises, which changes the second transmittance a little.
     np.testing.assert_allclose(found[1], found[0], rtol=1e-2)
 
 
 def test_s_polarised_light_stays_s_polarised():
-    """At oblique incidence in the plane of the grooves' normal s light stays s light."""
+    """At oblique incidence in the plane perpendicular to the grooves, s light stays s light."""
     use("llvm_ad_spectral_polarized")
     wi = direction(56.0)
     wo = wi * [-1, 1, 1]
@@ -144,7 +144,7 @@ def test_s_polarised_light_stays_s_polarised():
     si = interaction(wi)
     matrix = array(bsdf.eval(mi.BSDFContext(), si, vectors(wo)))[..., 0, 0]
     s, p = 1 - np.array(fresnel(wi[2], RELATIVE)).ravel()
-    # The stokes basis of either direction lies along s or p: both passes leave (s² + p²)/2 and ±(s² − p²)/2.
+    # The stokes basis of either direction lies along s or p: both transmissions give (s² + p²)/2 and ±(s² − p²)/2.
     assert abs(matrix[0, 1] / matrix[0, 0]) == pytest.approx(abs(s - p) / (s + p), rel=0.02)
 
 

@@ -31,7 +31,7 @@ COUNT = 300
 
 
 def seen(bsdf, wi, wo, u, wavelengths):
-    """The arrays of `eval_pdf` and of `sample`, spectra as (…, wavelengths, n)."""
+    """Return the arrays of `eval_pdf` and of `sample`, spectra as (…, wavelengths, n)."""
     si = interaction(wi, wavelengths, len(wi))
     numbers = floats(u[0]), mi.Point2f(*map(floats, u[1:]))
     bs, weight = bsdf.sample(mi.BSDFContext(), si, *numbers)
@@ -40,7 +40,7 @@ def seen(bsdf, wi, wo, u, wavelengths):
 
 
 def directions(bsdf):
-    """Pairs on both sides, of them the retroreflection, at which a metal without an index is 0/0, and samples."""
+    """Return pairs above and below, including retroreflection, where a metal without index is 0/0; and samples."""
     rng = np.random.default_rng(5)
     wi, wo = (random_directions(rng, COUNT, 1e-3) * rng.choice([1, -1], (COUNT, 1)) for _ in range(2))
     wi[0], wo[: COUNT // 4] = [0, 0, 1], wi[: COUNT // 4]

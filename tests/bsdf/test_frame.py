@@ -1,4 +1,4 @@
-"""Which way the pattern lies in the world: the side to which a blazed corner sends its light."""
+"""The orientation of the pattern in the world, from the direction into which a blazed corner reflects."""
 
 import drjit as dr
 import mitsuba as mi
@@ -19,12 +19,12 @@ def scale(*factors):
 
 
 def corner(**parameters):
-    """Without E, which says nothing of frames and would take longer than all else."""
+    """Return the plugin without E, which does not depend on frames and takes long."""
     return grating("corner", conserve_energy=False, **parameters)
 
 
 def mesh(uv=None):
-    """The unit square of two triangles, (0 1 2) and (0 2 3), with or without UVs."""
+    """Return the unit square of two triangles, (0 1 2) and (0 2 3), with or without UVs."""
     result = mi.Mesh("square", 4, 2, has_vertex_texcoords=uv is not None)
     parameters = mi.traverse(result)
     corners = np.concatenate([SQUARE, np.zeros((4, 1))], 1)
@@ -37,14 +37,14 @@ def mesh(uv=None):
 
 
 def bent(uv, to_world, folder):
-    """The same from a file, moved by `to_world`."""
+    """Return the same from a file, transformed by `to_world`."""
     path = folder / "square.ply"
     mesh(uv).write_ply(str(path))
     return {"type": "ply", "filename": str(path), "face_normals": True, "to_world": to_world}
 
 
 def hit(shape, origin, towards, bsdf):
-    """The interaction of a ray with the shape, which must show `bsdf`."""
+    """Return the interaction of a ray with the shape, which must have `bsdf`."""
     if isinstance(shape, dict):
         shape = {**shape, "bsdf": bsdf}
     scene = mi.load_dict({"type": "scene", "shape": shape})
@@ -58,12 +58,12 @@ def hit(shape, origin, towards, bsdf):
 
 
 def world(si, bsdf, omega):
-    """f cos θ_o at 500 nm for directions (n, 3) in the world."""
+    """Return f cos θ_o at 500 nm for directions (n, 3) in the world."""
     return array(bsdf.eval(mi.BSDFContext(), si, si.to_local(vectors(omega))))[1]
 
 
 def orders(mirror, x, y, n):
-    """The directions of the orders (1, 1), (1, −1), (−1, 1), (−1, −1) at 500 nm, in the world."""
+    """Return the directions of the orders (1, 1), (1, −1), (−1, 1), (−1, −1) at 500 nm, in the world."""
     step = 0.5 / PERIOD
     tangent = mirror - n * (mirror @ n)
     result = []
@@ -74,7 +74,7 @@ def orders(mirror, x, y, n):
 
 
 def check(shape, origin, towards, n, x, y, orientation=0.0, wrap=lambda nested: nested):
-    """The order (1, 1) of the corner, and it alone, must shine to −x −y."""
+    """Check that the order (1, 1) of the corner, and it alone, is bright, towards −x −y."""
     bsdf = mi.load_dict(wrap(corner(orientation=orientation)))
     plain = mi.load_dict(corner())
     n, x, y, d = (np.asarray(v, float) for v in (n, x, y, towards))
@@ -144,7 +144,7 @@ def test_mesh_of_one_uv_for_all_has_one_frame():
 
 @pytest.mark.parametrize("factors", [(-1, 1, 1), (1, -1, 1), (-2, 3, 1)])
 def test_mirrored_mesh_keeps_its_handedness(tmp_path, factors):
-    """The normal of a mesh turns with its triangles: a mirrored one is seen from below, with u along ±x."""
+    """The normal of a mesh follows its triangles: a mirrored one is seen from below, with u along ±x."""
     shape = bent(SQUARE, scale(*factors), tmp_path)
     x = np.array([np.sign(factors[0]), 0, 0.0])
     place = np.array([0.4 * factors[0], 0.2 * factors[1], 0])
@@ -194,8 +194,8 @@ def test_back_of_a_twosided_surface_is_the_mirror_image():
     check({"type": "rectangle"}, (0.4, 0.2, -2), (0.2, 0.1, 1), (0, 0, -1), x, y, 30.0, twosided)
 
 
-def test_interpolated_normals_carry_the_tangent_along(tmp_path):
-    """x is dp_du less its part along the shading normal, not the geometric one."""
+def test_x_is_perpendicular_to_interpolated_normals(tmp_path):
+    """x is dp_du minus its component along the shading normal, not the geometric one."""
     result = mi.Mesh("square", 4, 2, has_vertex_texcoords=True, has_vertex_normals=True)
     parameters = mi.traverse(result)
     n = np.array([0.3, 0.1, 1]) / np.linalg.norm([0.3, 0.1, 1])

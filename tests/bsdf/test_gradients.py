@@ -1,4 +1,4 @@
-"""Derivatives through eval and through a rendering against differences, and what a changed parameter costs."""
+"""Derivatives of eval and of a rendering against differences; what is recomputed for a changed parameter."""
 
 import drjit as dr
 import mitsuba as mi
@@ -16,7 +16,7 @@ pytestmark = pytest.mark.usefixtures("llvm")
 
 
 def near_orders():
-    """Directions on the slopes of the lobes of 500 nm, and weights, so that no derivative cancels in the sum."""
+    """Return directions on the slopes of the lobes of 500 nm, and weights that prevent cancellation."""
     wo = towards(WI, np.add(ORDERS, [0.03, 0.05]), 500)
     return wo, np.random.default_rng(1).uniform(0.5, 1.5, len(wo))
 
@@ -41,7 +41,7 @@ class Total:
         return dr.sum(f[1] * floats(self.weights))
 
     def number(self, value):
-        """In float64, for differences."""
+        """Return the sum in float64, for differences."""
         self.parameters[self.key] = floats(value) if np.isscalar(value) else value
         self.parameters.update()
         f = self.bsdf.eval(mi.BSDFContext(), self.si, vectors(self.wo))
@@ -49,7 +49,7 @@ class Total:
 
 
 def difference(total, at, step):
-    """Central, of fourth order: (8(f₁ − f₋₁) − (f₂ − f₋₂))/12 h."""
+    """Return the central difference of fourth order, (8(f₁ − f₋₁) − (f₂ − f₋₂))/12 h."""
     f = [total(at + k * step) for k in (-2, -1, 1, 2)]
     return (8 * (f[2] - f[1]) - (f[3] - f[0])) / (12 * step)
 
@@ -147,8 +147,8 @@ def test_derivatives_are_finite_where_orders_vanish_and_at_the_horizon():
     ("key", "at"),
     [pytest.param("height_scale", 0.8, marks=pytest.mark.slow), ("eta", 1.5), ("orientation.value", 10.0)],
 )
-def test_weights_of_samples_carry_the_derivative_of_the_value(key, at):
-    """The direction stays where it was drawn, so its density must not be differentiated."""
+def test_weights_of_samples_have_the_derivative_of_the_value(key, at):
+    """The sampled direction is fixed, so its density must not be differentiated."""
     base = {"type": "diffuse", "reflectance": uniform(0.5)}
     bsdf = mi.load_dict(grating("sinusoidal", 10.0, int_ior=1.5, base=base))
     parameters = mi.traverse(bsdf)
@@ -237,7 +237,7 @@ def test_the_derivative_of_a_rendering_is_that_of_differences(key, at, step):
 
 
 class Count:
-    """How often a function of a module was called."""
+    """A counter of the calls of a function of a module."""
 
     def __init__(self, patch, module, name):
         self.calls, original = 0, getattr(module, name)
@@ -275,7 +275,7 @@ def test_changes_rebuild_only_what_depends_on_them(monkeypatch):
 
 
 def compiled(action):
-    """How many kernels an action launched, and how many of them had to be compiled."""
+    """Return how many kernels an action launched, and how many of them were compiled."""
     dr.kernel_history_clear()
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         action()

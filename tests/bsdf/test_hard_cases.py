@@ -1,7 +1,4 @@
-"""Surfaces and directions on which a formula may break: each right to the tolerance, in float32 tables and as rendered.
-
-What they are measured against is `md.reference`, in float64.
-"""
+"""Extreme surfaces and directions: tables and BSDF are right to the tolerance, compared with `md.reference`."""
 
 import numpy as np
 import pytest
@@ -66,7 +63,7 @@ FIVE_MICROMETRES = {
 
 
 def axis_of(count, pixel, extent, sigma, reach=REACHED):
-    """Frequencies along one axis and the length that each stands for, so that sums over them are integrals."""
+    """Return frequencies along one axis and their quadrature weights."""
     if extent == "sample":
         end = 7 * sigma if count == 1 else 1 / (2 * pixel) + 2 * sigma
         step = sigma / 2
@@ -81,7 +78,7 @@ def axis_of(count, pixel, extent, sigma, reach=REACHED):
 
 
 def error(spectrum, field, extent, coherence_length, kappa):
-    """∫|S_approx − S_exact| dq over |q| ≤ 2/λ_min, and ∫ S_exact dq, by the rule of rectangles."""
+    """Return ∫|S_approx − S_exact| dq over |q| ≤ 2/λ_min, and ∫ S_exact dq, by the rectangle rule."""
     sigma = lobe_width(coherence_length)
     (q_x, d_x), (q_y, d_y) = (
         axis_of(n, d, extent, sigma) for n, d in zip(field.shape[::-1], field.pixel_size, strict=True)
@@ -130,7 +127,7 @@ def test_at_q_zero_and_small_kappa_every_surface_is_a_mirror(name):
     seed=st.integers(0, 2**32 - 1),
 )
 @example(depth=5.0, shape=(9, 9), extent="sample", share=1.0, seed=0)
-# Regression: the splines of nodes beyond the Nyquist limit were missing.
+# Regression: the splines of nodes outside of the Nyquist limit were missing.
 @example(depth=0.3, shape=(1, 13), extent="sample", share=0.9, seed=0)
 def test_any_surface_is_right_at_any_kappa(depth, shape, extent, share, seed):
     field = field_of(np.random.default_rng(seed).random(shape) * depth)
@@ -154,13 +151,13 @@ def test_heights_far_from_zero_lose_no_digits():
 
 
 def seen(spectrum, wi, wo, wavelengths):
-    """K G S of each direction and wavelength, out of the BSDF in single precision: (n, 4) µm²."""
+    """Return K G S of the BSDF in single precision for each direction and wavelength, (n, 4) µm²."""
     value = evaluate(raw_plugin(spectrum), wi, wo, wavelengths)[0]
     return value * (np.asarray(wavelengths) * 1e-3) ** 2 / wo[:, 2, None]
 
 
 def factor_of_order(wi, wo, tangent, width):
-    """K G g(x_i) g(x_o) of an order at λq (n, 4, 2) whose lobe has the width λσ_q; zero where it does not propagate."""
+    """Return K G Γ(x_i) Γ(x_o) of an order at λq (n, 4, 2), lobe width λσ_q; zero where it does not propagate."""
     come = [omega[:, None, 2] ** 2 for omega in (wi, wo)]
     sent = [1 - ((omega[:, None, :2] + tangent) ** 2).sum(-1) for omega in (wi, wo)]
     x = [np.minimum(s, c) / (2 * width) for s, c in zip(sent, come, strict=True)]
@@ -172,8 +169,8 @@ def factor_of_order(wi, wo, tangent, width):
 
 
 def expected(field, power_spectrum, wi, wo, wavelengths, sigma, line):
-    """K G S (n, 4), from S or, of a line grating, order by order from the Fourier transform of e^{iκh}."""
-    q, kappa = asked(wi, wo, wavelengths)
+    """Return K G S (n, 4), from S or, for a line grating, by orders from the Fourier transform of e^{iκh}."""
+    q, kappa = q_and_kappa(wi, wo, wavelengths)
     um = np.asarray(wavelengths) * 1e-3
     if not line:
         square = ((um[:, None] * q) ** 2).sum(-1)
@@ -195,15 +192,15 @@ def expected(field, power_spectrum, wi, wo, wavelengths, sigma, line):
     return total
 
 
-def asked(wi, wo, wavelengths):
-    """q (n, 4, 2) and κ (n, 4) of directions."""
+def q_and_kappa(wi, wo, wavelengths):
+    """Return q (n, 4, 2) and κ (n, 4) of directions."""
     um = np.asarray(wavelengths)[:, None] * 1e-3
     both = wi[:, None] + wo[:, None]
     return -both[..., :2] / um, 2 * np.pi * both[..., 2] / um[:, 0]
 
 
 def directions(field, extent, sigma, wavelengths, count=200):
-    """Pairs of directions that see something: of a tile, places within the lobe of an order for some wavelength."""
+    """Return pairs of directions with nonzero values; of a tile, in the lobe of an order at some wavelength."""
     rng = np.random.default_rng(6)
     count = 80 if extent == "sample" else count
     wi = random_directions(rng, count, 0.3)
@@ -229,7 +226,7 @@ def test_hard_surfaces_are_rendered_right(name):
     spectrum = md.precompute(field, extent=extent, coherence_length=coherence_length, tolerance=1e-3)
     sigma, wavelengths = lobe_width(coherence_length), [360.0, 500.0, 620.0, 830.0]
     wi, wo = directions(field, extent, sigma, wavelengths)
-    q, kappa = asked(wi, wo, wavelengths)
+    q, kappa = q_and_kappa(wi, wo, wavelengths)
     got = seen(spectrum, wi, wo, wavelengths)
     exact = md.reference.power_spectrum(field, q, kappa, extent=extent, coherence_length=coherence_length)
     line = isinstance(spectrum.grid, OrderGrid) and 1 in field.heights.shape
@@ -253,7 +250,7 @@ def test_hard_surfaces_are_rendered_right(name):
 
 
 @pytest.mark.usefixtures("llvm")
-def test_a_sample_is_rendered_right_to_its_rim_and_black_beyond():
+def test_a_sample_is_rendered_right_up_to_its_nyquist_limit_and_black_outside():
     field = field_of(noise((12, 20), 0.2), 0.16)
     limit = 1 / (2 * 0.16)
     with pytest.warns(UserWarning, match="pixels of 160 nm"):
@@ -267,7 +264,7 @@ def test_a_sample_is_rendered_right_to_its_rim_and_black_beyond():
         wo = towards(wi, q, 400)
         got = seen(spectrum, wi, wo, wavelengths)[:, 0]
         got = got / k_g(wi, wo)
-        q, kappa = (a[:, 0] for a in asked(wi, wo, wavelengths))
+        q, kappa = (a[:, 0] for a in q_and_kappa(wi, wo, wavelengths))
         exact = md.reference.power_spectrum(field, q, kappa, extent="sample", coherence_length=0.9)
         assert (exact[:5] > 0).all()
         assert (got[5:] == 0).all()
@@ -280,7 +277,7 @@ def test_a_sample_is_rendered_right_to_its_rim_and_black_beyond():
 @pytest.mark.few(1)
 @pytest.mark.parametrize("extent", ["tile", "sample"])
 @pytest.mark.usefixtures("llvm")
-def test_the_ends_of_the_wavelengths_are_right_and_beyond_them_it_is_black(extent):
+def test_extreme_wavelengths_are_right_and_others_are_black(extent):
     field = field_of(noise((12, 20), 0.2))
     coherence_length = {"tile": 2.0, "sample": 0.5}[extent]
     spectrum = md.precompute(field, extent=extent, coherence_length=coherence_length, tolerance=1e-3)
@@ -288,7 +285,7 @@ def test_the_ends_of_the_wavelengths_are_right_and_beyond_them_it_is_black(exten
     wo = random_directions(np.random.default_rng(2), 300, 0.2)
     wavelengths = np.array([360.0, 830.0, 359.0, 831.0])
     got = seen(spectrum, wi, wo, wavelengths)
-    q, kappa = asked(wi, wo, wavelengths)
+    q, kappa = q_and_kappa(wi, wo, wavelengths)
     exact = md.reference.power_spectrum(field, q[:, :2], kappa[:, :2], extent=extent, coherence_length=coherence_length)
     sigma = spectrum.lobe_width
     peak = 1 / (2 * np.pi * sigma**2)
@@ -308,7 +305,7 @@ def test_five_micrometres_are_rendered_with_bessel_orders():
         wo = towards(wi, np.stack([orders / 2.5, 0 * orders], axis=-1), 450)
         keep = wo[:, 2] > 0.05
         wi, wo, orders = wi[keep], wo[keep], orders[keep]
-        kappa = asked(wi, wo, wavelengths)[1][:, 0]
+        kappa = q_and_kappa(wi, wo, wavelengths)[1][:, 0]
         got = seen(spectrum, wi, wo, wavelengths)[:, 0] / k_g(wi, wo) * 2 * np.pi * spectrum.lobe_width**2
         # κ in single precision, times 2.5 µm.
         np.testing.assert_allclose(got, jv(orders, kappa * 2.5) ** 2, atol=1e-3)

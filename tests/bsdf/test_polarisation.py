@@ -1,4 +1,4 @@
-"""The Mueller matrix of the grating against that of Mitsuba's rough conductor, whose facets are planes as well."""
+"""The Mueller matrix of the grating against that of Mitsuba's rough conductor, which has plane facets, too."""
 
 import drjit as dr
 import mitsuba as mi
@@ -30,7 +30,7 @@ def directions(count=200):
 
 
 def matrices(bsdf, wi, wo, mode=None):
-    """(4, 4, wavelengths, n)"""
+    """Return Mueller matrices, (4, 4, wavelengths, n)."""
     si = dr.zeros(mi.SurfaceInteraction3f, wi.shape[1])
     si.wi = vectors(wi.T)
     si.wavelengths = type(si.wavelengths)(*WAVELENGTHS)
@@ -67,7 +67,7 @@ def test_light_reflected_at_brewsters_angle_is_s_light(polarised):
 
 
 @pytest.mark.slow
-def test_unpolarised_light_is_as_bright_as_in_the_other_variants(polarised):
+def test_unpolarised_values_equal_those_of_unpolarised_variants(polarised):
     wi, wo = directions(50)
     brightness = matrices(grating(int_ior=1.5), wi, wo)[0, 0]
     mi.set_variant("llvm_ad_spectral")
@@ -76,7 +76,7 @@ def test_unpolarised_light_is_as_bright_as_in_the_other_variants(polarised):
 
 @pytest.mark.few(1)
 @pytest.mark.parametrize("parameters", [{"material": "none"}, {"int_ior": 1.5, "fresnel": "schlick"}])
-def test_without_an_index_light_leaves_unpolarised(polarised, parameters):
+def test_a_material_without_index_depolarises(polarised, parameters):
     m = matrices(grating(**parameters), *directions(20))
     assert (m[0, 0] > 0).any()
     m[0, 0] = 0
@@ -90,14 +90,14 @@ def test_retroreflection_has_a_finite_matrix(polarised):
 
 
 @pytest.mark.slow
-def test_indices_that_match_reflect_nothing(polarised):
+def test_equal_indices_reflect_nothing(polarised):
     m = matrices(grating(int_ior=1.0, ext_ior=1.0), *directions(20))
     assert (m == 0).all()
 
 
 @pytest.mark.few(2)
 @pytest.mark.parametrize("parameters", [{"material": "Au"}, {"int_ior": 1.5, "transmission": "sheet"}])
-def test_light_on_the_same_way_back_has_the_transposed_matrix(polarised, parameters):
+def test_the_reverse_direction_has_the_transposed_matrix(polarised, parameters):
     bsdf = grating(orientation=37.0, **parameters)
     wi, wo = directions()
     if "transmission" in parameters:

@@ -1,4 +1,4 @@
-"""Arrays of directions and wavelengths through a BSDF, and K G offline against K G at run time."""
+"""`testing` evaluates a BSDF for arrays of directions and wavelengths; K G against its published forms."""
 
 import mitsuba as mi
 import numpy as np

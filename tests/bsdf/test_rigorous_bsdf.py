@@ -1,4 +1,4 @@
-"""The BSDF of rigorous efficiencies: against its table in float64, and against the solver."""
+"""The BSDF of rigorous efficiencies, against its table in float64 and against the solver."""
 
 import dataclasses
 from pathlib import Path
@@ -27,7 +27,7 @@ def toml(value):
 
 @pytest.fixture(scope="module")
 def recipe_file(tmp_path_factory):
-    """A recipe of a grating of 0.3 µm; at its wavelengths it has the orders −1, 0 and 1."""
+    """Return a recipe of a grating of 0.3 µm, which has the orders −1, 0 and 1."""
     path = tmp_path_factory.mktemp("rigorous") / "fine.toml"
     tables = {"surface": SURFACE, "spectrum": SETTINGS}
     lines = [
@@ -55,7 +55,7 @@ def plugin(spectrum, **parameters):
 
 
 def expected(spectrum, wi, wo, wavelength):
-    """f = Σ_m η_m N(q − m/T; σ_q² I)/λ², lobes normalised at the horizon, in float64; wi, wo (n, 3), λ in µm."""
+    """Return f = Σ_m η_m N(q − m/T; σ_q² I)/λ² in float64, with gains; wi, wo (n, 3), λ in µm."""
     axes, sigma = spectrum.axes, spectrum.lobe_width
     nu = axes.period / wavelength
     k_y, c = ((wo - wi)[:, i] * nu / 2 for i in (1, 0))
@@ -74,7 +74,7 @@ def expected(spectrum, wi, wo, wavelength):
 
 
 def pairs(spectrum, wavelength, count=400):
-    """Pairs of directions in the lobes of propagating orders."""
+    """Return pairs of directions in the lobes of propagating orders."""
     rng = np.random.default_rng(7)
     wi = random_directions(rng, count)
     m = rng.integers(-spectrum.axes.max_order, spectrum.axes.max_order + 1, count)
@@ -111,7 +111,7 @@ def test_samples_have_even_weights_that_average_to_the_efficiencies(llvm, spectr
         weights = weights[:, 0]
         albedo = weights.mean()
         _, eta = spectrum.efficiencies(wi, wavelength * 1e-3)
-        # Wide lobes reach beyond the horizon: what is drawn there is lost.
+        # Wide lobes extend below the horizon, where samples are lost.
         if spectrum.coherence_length > 10 and theta <= 75:
             assert albedo == pytest.approx(np.maximum(eta, 0).sum(), rel=0.03)
             assert albedo**2 / (weights**2).mean() >= 0.7
@@ -134,7 +134,7 @@ def test_polarised_samples_pass_the_chi_square_test(solved, theta):
 
 
 def test_the_albedo_is_that_of_the_solver(llvm, solved):
-    """By samples, of directions and wavelengths that are not nodes."""
+    """Computed by samples, at directions and wavelengths that are not nodes."""
     for theta, phi, wavelength in ((10, 20, 412.0), (50, 70, 450.0), (70, 0, 490.0)):
         wi = direction(theta, phi)
         _, weights, _ = testing.sample(plugin(solved), np.broadcast_to(wi, (40_000, 3)), (wavelength,) * 4, 2)
@@ -143,7 +143,7 @@ def test_the_albedo_is_that_of_the_solver(llvm, solved):
 
 
 def test_a_profile_by_formula_is_built_in_the_scene(llvm):
-    """A table of a few nodes, as coarse as it may be."""
+    """The table has few nodes: the tolerance is the maximum."""
     fine = {"type": "diffraction_grating", "profile": "sinusoidal", "period": 0.2, "depth": 0.05, "samples": 32}
     bsdf = mi.load_dict({**fine, "theory": "rigorous", "int_ior": 1.5, "ext_ior": 1.0, "tolerance": 0.9})
     wi = direction(30, 20)
@@ -153,7 +153,7 @@ def test_a_profile_by_formula_is_built_in_the_scene(llvm):
     assert "rigorous" in str(bsdf)
 
 
-def test_files_recipes_and_profiles_give_the_same(llvm, solved, recipe_file, tmp_path):
+def test_files_recipes_and_profiles_have_equal_values(llvm, solved, recipe_file, tmp_path):
     saved = tmp_path / "fine.exr"
     solved.save(saved)
     wi, wo = direction(30, 10), -direction(30, 10) * [1, 1, -1]
@@ -201,7 +201,7 @@ def test_the_rigorous_recipes_are_of_one_row():
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["dvd_grooves", "foil_one_direction", "ruled_1200"])
 def test_a_rigorous_recipe_keeps_its_tolerance(name):
-    """Minutes each. `ruled_600` takes half an hour: what its table errs by is in precompute/README.md."""
+    """Each takes minutes; `ruled_600` takes half an hour, its error is in precompute/README.md."""
     spectrum = md.Recipe.load(Path(__file__).parents[2] / "precompute" / "rigorous" / f"{name}.toml").build()
     assert spectrum.error <= spectrum.tolerance == 1e-2
 
@@ -210,18 +210,18 @@ def test_a_rigorous_recipe_keeps_its_tolerance(name):
 
 
 def entries(matrix):
-    """Of the first wavelength, (4, 4)."""
+    """Return the matrix at the first wavelength, (4, 4)."""
     dr.eval(matrix)  # in one kernel
     return np.array([[np.ravel(matrix[i, j][0])[0] for j in range(4)] for i in range(4)])
 
 
 def mueller_of(bsdf, source, exit_, wavelength):
-    """The Mueller matrix, (4, 4), for light from `source` to `exit_`, in nm."""
+    """Return the Mueller matrix, (4, 4), for light from `source` to `exit_`, wavelength in nm."""
     return entries(bsdf.eval(mi.BSDFContext(), interaction(exit_, (wavelength,) * 4, 1), vectors(source)))
 
 
 def between_stokes_axes(matrix, source, exit_):
-    """A matrix between waves in (ŝ, k̂ × ŝ), ŝ = ẑ × k̂, as one between Mitsuba's axes."""
+    """Return a matrix between Mitsuba's axes from one between (ŝ, k̂ × ŝ), ŝ = ẑ × k̂."""
     full = mi.Spectrum(0.0)
     for i, j in np.ndindex(4, 4):
         full[i, j] = mi.UnpolarizedSpectrum(float(matrix[i, j]))
@@ -235,7 +235,7 @@ def between_stokes_axes(matrix, source, exit_):
 
 
 def test_mueller_matrices_of_a_plane_are_mitsubas():
-    """The signs of circular polarisation, too."""
+    """Including the signs of circular polarisation."""
     use("llvm_ad_spectral_polarized")
     cosine, index = 0.6, 0.8 + 6j
     omega = np.sqrt(1 - cosine**2), 0, cosine
@@ -247,7 +247,7 @@ def test_mueller_matrices_of_a_plane_are_mitsubas():
 
 @pytest.mark.slow
 def test_polarised_light_is_split_as_by_the_solver(solved):
-    """Conical incidence from all sides, of a pattern that is turned."""
+    """Conical incidence at all azimuths, on a rotated pattern."""
     use("llvm_ad_spectral_polarized")
     surface, bsdf = md.gratings.blazed(0.3, 0.05, samples=64), plugin(solved, orientation=25.0)
     sin, cos = np.sin(np.deg2rad(25)), np.cos(np.deg2rad(25))
@@ -295,7 +295,7 @@ def test_a_table_of_unpolarised_light_is_refused_in_polarised_variants():
 
 @pytest.fixture(scope="module")
 def coated():
-    """The spectrum of a grating of 0.3 µm in aluminium under a coat of index 1.5, for 405 to 495 nm outside."""
+    """Return the spectrum of a grating of 0.3 µm in aluminium under a coat of index 1.5, for 405 to 495 nm outside."""
     return md.precompute(
         md.gratings.blazed(0.3, 0.05, samples=64),
         theory="rigorous",
@@ -311,8 +311,8 @@ def under_coat(coated):
     return plugin(coated, coat_ior=1.5, ext_ior=1.0)
 
 
-def passed(theta, phi, wavelength):
-    """F, and what leaves a grating under a coat of 1.5: Σ_m T_i T_o η_m by the solver; wavelength in µm."""
+def diffracted_under_coat(theta, phi, wavelength):
+    """Return F, and Σ_m T_i T_o η_m by the solver, under a coat of index 1.5; wavelength in µm."""
     wi = direction(theta, phi)
     inside = np.array([*wi[:2] / 1.5, np.sqrt(1 - (wi[:2] @ wi[:2]) / 2.25)])
     index = md.rigorous.refractive_index(wavelength, material="Al") / 1.5
@@ -329,7 +329,7 @@ def passed(theta, phi, wavelength):
 @pytest.mark.parametrize(("theta", "phi", "wavelength"), [(10, 20, 0.412), (50, 70, 0.45), (65, 0, 0.48)])
 def test_a_coat_transmits_the_efficiencies_of_the_solver(llvm, coated, theta, phi, wavelength):
     wi = np.broadcast_to(direction(theta, phi), (40_000, 3))
-    front, below = passed(theta, phi, wavelength)
+    front, below = diffracted_under_coat(theta, phi, wavelength)
     _, weights, _ = testing.sample(under_coat(coated), wi, (wavelength * 1e3,) * 4, 2)
     assert weights[:, 0].mean() == pytest.approx(front + below, rel=0.03)
     assert weights[:, 0].mean() < 1
@@ -356,8 +356,8 @@ def test_a_grating_under_a_coat_is_reciprocal(llvm, coated):
     np.testing.assert_allclose(there, back, rtol=2e-4, atol=1e-5 * there.max())
 
 
-def test_polarised_light_passes_a_coat(coated):
-    """Unpolarised light leaves polarised by both faces and by the grating."""
+def test_unpolarised_light_is_polarised_under_a_coat(coated):
+    """Against the product of the matrices of both refractions and of the grating."""
     use("llvm_ad_spectral_polarized")
     wi = direction(50, 70)
     wo = wi * [-1, -1, 1]
@@ -382,23 +382,23 @@ def test_a_spectrum_for_another_coat_is_refused(llvm, coated, parameters, text):
 
 
 def test_a_grating_is_built_for_the_coat_and_the_variant_of_the_scene(monkeypatch):
-    """What is asked for; the table would take minutes."""
+    """Checks the requested settings, as the table would take minutes."""
     use("llvm_ad_spectral_polarized")
-    asked = []
-    monkeypatch.setattr(md.Recipe, "cached", lambda recipe, *_: asked.append(recipe.settings.chosen) or made_up())
+    requested = []
+    monkeypatch.setattr(md.Recipe, "cached", lambda recipe, *_: requested.append(recipe.settings.chosen) or made_up())
     scene = {"type": "diffraction_grating", "profile": "sinusoidal", "period": 0.3, "depth": 0.05, "theory": "rigorous"}
     for material in ({"material": "Al"}, {"int_ior": 1.8}):
         with pytest.raises(RuntimeError, match="polarised=True"):
             mi.load_dict({**scene, "coat_ior": 1.5, "ext_ior": 1.0, **material})
-    assert [settings.pop("wavelengths") for settings in asked] == [(240.0, pytest.approx(830 / 1.5))] * 2
-    assert asked == [
+    assert [settings.pop("wavelengths") for settings in requested] == [(240.0, pytest.approx(830 / 1.5))] * 2
+    assert requested == [
         {"theory": "rigorous", "material": "Al", "ext_ior": 1.5, "polarised": True},
         {"theory": "rigorous", "int_ior": 1.8, "ext_ior": 1.5, "polarised": True},
     ]
 
 
 @pytest.mark.slow
-def test_the_log_says_once_where_scalar_theory_fails(llvm, caplog):
+def test_inaccurate_scalar_theory_is_logged_once(llvm, caplog):
     fine = {"type": "diffraction_grating", "profile": "sinusoidal", "period": 0.71, "depth": 0.3, "samples": 64}
     for _ in range(2):
         mi.load_dict({**fine, "material": "Al"})
@@ -408,7 +408,7 @@ def test_the_log_says_once_where_scalar_theory_fails(llvm, caplog):
     assert "theory=rigorous has it right" in said
 
 
-def test_precompute_says_where_scalar_theory_fails(command, tmp_path):
+def test_precompute_warns_of_inaccurate_scalar_theory(command, tmp_path):
     recipe = tmp_path / "fine.toml"
     recipe.write_text('[surface]\nprofile = "sinusoidal"\nperiod = 0.71\ndepth = 0.3\nsamples = 64\n')
     code, out, _ = command("precompute", str(recipe), "-o", str(tmp_path / "fine.exr"))

@@ -1,4 +1,4 @@
-"""Light that passes a grating by rigorous theory: the BSDF against its tables in float64."""
+"""Transmission by rigorous theory: the BSDF against its tables in float64."""
 
 import warnings
 
@@ -22,7 +22,7 @@ IMPORTANCE = mi.TransportMode.Importance
 
 @pytest.fixture(scope="module", params=["interface", "sheet"])
 def glass(request):
-    """A coarse table of light that passes, with its matrices."""
+    """Return a coarse table of reflected and transmitted light, with Mueller matrices."""
     settings = Settings(
         theory="rigorous",
         int_ior=ETA,
@@ -54,12 +54,12 @@ def towards(theta, phi, side):
 
 
 def index(spectrum, omega):
-    """n outside, of directions (…, 3)."""
+    """Return n outside, for directions (…, 3)."""
     return np.where(np.asarray(omega)[..., 2] < 0, spectrum.indices[1], 1.0)
 
 
 def exit_of(spectrum, wi, m, transmitted, wavelength=WAVELENGTH):
-    """The direction of order m; None near the horizon."""
+    """Return the direction of order m; None near the horizon."""
     side = -np.sign(wi[2]) if transmitted else np.sign(wi[2])
     n = index(spectrum, [0, 0, side])
     k = -index(spectrum, wi) * wi[:2] - [m * wavelength / PERIOD, 0]
@@ -67,7 +67,7 @@ def exit_of(spectrum, wi, m, transmitted, wavelength=WAVELENGTH):
 
 
 def lobe_of(spectrum, wo):
-    """Directions around ω_o, (n, 3), where they exist, offsets in σ_q, (n, 2), and dk² = n² cos θ dω of each."""
+    """Return directions around ω_o, (n, 3), where they exist, offsets in σ_q, (n, 2), and dk² = n² cos θ dω."""
     step = np.linspace(-4, 4, 33)
     offsets = np.stack(np.meshgrid(step, step), -1).reshape(-1, 2)
     n, sigma = index(spectrum, wo), spectrum.lobe_width * WAVELENGTH
@@ -77,7 +77,7 @@ def lobe_of(spectrum, wo):
 
 
 def power_of_order(bsdf, wi, wo):
-    """The power in the lobe around ω_o, by quadrature."""
+    """Return the power in the lobe around ω_o, by quadrature."""
     omega, _, area = lobe_of(bsdf.spectrum, wo)
     si = interaction(wi, (WAVELENGTH * 1e3,) * 4, len(omega))
     value = np.array(bsdf.eval(mi.BSDFContext(IMPORTANCE), si, vectors(omega)))[0]
@@ -85,7 +85,7 @@ def power_of_order(bsdf, wi, wo):
 
 
 def power_in_table(spectrum, wi, wo, m):
-    """∫ η N dq over the lobe by the same quadrature, η of pairs of directions."""
+    """Return ∫ η N dq over the lobe by the same quadrature, η of pairs of directions."""
     omega, offsets, area = lobe_of(spectrum, wo)
     c, k_y = ((index(spectrum, wo) * omega - index(spectrum, wi) * wi)[:, :2] * PERIOD / (2 * WAVELENGTH)).T
     square = (PERIOD / WAVELENGTH) ** 2 - k_y**2
@@ -112,7 +112,7 @@ def test_orders_have_the_powers_of_the_table(glass, theta, phi, side):
 
 
 def pairs(spectrum, count=4096):
-    """Pairs of directions near orders, on the same and on both sides."""
+    """Return pairs of directions near reflected and transmitted orders."""
     rng = np.random.default_rng(4)
     wi = rng.normal(size=(count, 3))
     wi /= np.linalg.norm(wi, axis=1, keepdims=True)
@@ -126,7 +126,7 @@ def pairs(spectrum, count=4096):
     return wi[keep], wo[keep]
 
 
-def test_light_of_both_sides_is_reciprocal(glass):
+def test_transmission_and_reflection_are_reciprocal(glass):
     bsdf = plugin(glass)
     wi, wo = pairs(glass)
     n_i, n_o = index(glass, wi), index(glass, wo)
@@ -156,20 +156,20 @@ def test_samples_follow_the_density_on_both_sides(glass, side, component):
 @pytest.mark.few(4)
 @pytest.mark.parametrize("theta", [0, 40, 75])
 @pytest.mark.parametrize("side", [1, -1])
-def test_samples_have_the_light_of_the_table(glass, theta, side):
+def test_weights_average_to_the_efficiencies(glass, theta, side):
     bsdf, wi, count = plugin(glass), towards(theta, 10, side), 1 << 16
     u = np.random.default_rng(1).random((3, count)).astype(np.float32)
     si = interaction(wi, (WAVELENGTH * 1e3,) * 4, count)
     bs, weight = bsdf.sample(mi.BSDFContext(IMPORTANCE), si, mi.Float(u[0]), mi.Point2f(u[1:]))
-    weight, passes = np.array(weight)[0], np.array(bs.wo)[2] * wi[2] < 0
+    weight, is_transmitted = np.array(weight)[0], np.array(bs.wo)[2] * wi[2] < 0
     for transmitted in (False, True):
         wanted = glass.efficiencies(wi, WAVELENGTH, transmitted)[1].sum()
-        assert weight[passes == transmitted].sum() / count == pytest.approx(wanted, abs=0.02)
+        assert weight[is_transmitted == transmitted].sum() / count == pytest.approx(wanted, abs=0.02)
     assert weight.mean() ** 2 / (weight**2).mean() > 0.5
     drawn = np.array(bs.pdf) > 0
     pdf = np.array(bsdf.pdf(mi.BSDFContext(IMPORTANCE), si, bs.wo))
     np.testing.assert_allclose(pdf[drawn], np.array(bs.pdf)[drawn], rtol=1e-3)
-    names = np.where(passes, int(mi.BSDFFlags.GlossyTransmission), int(mi.BSDFFlags.GlossyReflection))
+    names = np.where(is_transmitted, int(mi.BSDFFlags.GlossyTransmission), int(mi.BSDFFlags.GlossyReflection))
     np.testing.assert_array_equal(np.array(bs.sampled_type)[drawn], names[drawn])
 
 
@@ -178,13 +178,13 @@ def test_a_sheet_has_no_second_flat_face(glass):
 
 
 def entries(matrix):
-    """Of the first wavelength, (4, 4)."""
+    """Return the matrix at the first wavelength, (4, 4)."""
     dr.eval(matrix)  # in one kernel
     return np.array([[np.ravel(matrix[i, j][0])[0] for j in range(4)] for i in range(4)])
 
 
 def between_stokes_axes(matrix, source, exit_):
-    """A matrix between waves in (ê, k̂ × ê), ê the part of ŷ across k̂, as one between Mitsuba's axes."""
+    """Return a matrix between Mitsuba's axes from one between (ê, k̂ × ê), ê the component of ŷ perpendicular to k̂."""
     full = mi.Spectrum(0.0)
     for i, j in np.ndindex(4, 4):
         full[i, j] = mi.UnpolarizedSpectrum(float(matrix[i, j]))
@@ -220,7 +220,7 @@ def test_mueller_matrices_are_those_of_the_table(glass, variant):
 
 
 @pytest.mark.parametrize("variant", ["llvm_ad_spectral_polarized"])
-def test_other_variants_pass_the_same_light(glass, variant):
+def test_other_variants_have_equal_values(glass, variant):
     directions = np.array([towards(20, 30, 1), towards(50, 250, -1)])
     u = [(0.05, 0.4, 0.6), (0.3, 0.2, 0.7), (0.8, 0.9, 0.1)]
 
@@ -249,15 +249,15 @@ def test_other_variants_pass_the_same_light(glass, variant):
         ({"height_scale": 0.5}, "height_scale: got 0.5, wanted none with theory=rigorous"),
     ],
 )
-def test_other_light_than_that_of_the_table_is_refused(glass, parameters, text):
+def test_another_transmission_than_that_of_the_table_is_refused(glass, parameters, text):
     with pytest.raises(RuntimeError, match=text.format(glass.transmission)):
         plugin(glass, **parameters)
 
 
-def test_scenes_build_tables_of_light_that_passes(glass, monkeypatch, tmp_path):
-    """A profile and a recipe ask for the light of the scene."""
-    asked = []
-    monkeypatch.setattr(md.Recipe, "cached", lambda recipe, *_: asked.append(recipe.settings) or glass)
+def test_scenes_build_tables_with_their_transmission(glass, monkeypatch, tmp_path):
+    """Profiles and recipes request the transmission of the scene."""
+    requested = []
+    monkeypatch.setattr(md.Recipe, "cached", lambda recipe, *_: requested.append(recipe.settings) or glass)
     scene = {"type": "diffraction_grating", "int_ior": ETA, "ext_ior": 1.0, "transmission": glass.transmission}
     recipe = tmp_path / "glass.toml"
     recipe.write_text(
@@ -266,17 +266,17 @@ def test_scenes_build_tables_of_light_that_passes(glass, monkeypatch, tmp_path):
     )
     mi.load_dict({**scene, "profile": "blazed", "period": 0.3, "depth": 0.05, "theory": "rigorous"})
     mi.load_dict({**scene, "filename": str(recipe)})
-    assert [settings.transmission for settings in asked] == [glass.transmission] * 2
+    assert [settings.transmission for settings in requested] == [glass.transmission] * 2
     recipe.write_text(recipe.read_text() + 'transmission = "sheet"\n', encoding="utf-8")
     with pytest.raises(RuntimeError, match="transmission: got 'none', but the rigorous spectrum is of"):
         mi.load_dict({**scene, "filename": str(recipe), "transmission": "none"})
-    assert len(asked) == 2  # nothing was built
+    assert len(requested) == 2  # nothing was built
 
 
 @pytest.mark.parametrize("glass", ["sheet"], indirect=True)
 @pytest.mark.parametrize("side", [1, -1])
-def test_a_sheet_before_a_uniform_sky_has_the_light_of_the_table(glass, side):
-    """Rendered by `path`: reflected and transmitted light together, nothing twice."""
+def test_a_sheet_in_a_uniform_sky_has_the_radiance_of_the_table(glass, side):
+    """Rendered by `path`, with reflected and transmitted light."""
     scene = mi.load_dict(
         {
             "type": "scene",
@@ -297,8 +297,8 @@ def test_a_sheet_before_a_uniform_sky_has_the_light_of_the_table(glass, side):
 
 
 @pytest.mark.parametrize("side", [1, -1])
-def test_orders_that_emerge_within_a_cell_of_the_sampler_are_drawn(side):
-    """All orders are alike: an order that the cells miss would have a large weight."""
+def test_orders_with_a_rayleigh_anomaly_in_a_bin_are_drawn(side):
+    """All orders have equal efficiencies, so that an order missing in a bin would have a large weight."""
     axes = Axes(1.7, (0.36, 0.83), (1, 1, 1), ETA, "interface")
     values = np.full(axes.shape, 0.01, np.float32)
     alike = RigorousSpectrum(axes, values, None, "", ETA + 0j, 65.0, 0.01, 0, 0, 0, 1, "made up", "")

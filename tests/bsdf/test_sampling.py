@@ -1,4 +1,4 @@
-"""Samples against their density, the density against the sphere, and how much work a sample does."""
+"""Samples against their density, the integral of the density, and the effective fraction of samples."""
 
 import functools
 
@@ -23,7 +23,7 @@ from bsdf_support import (
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction import testing
-from mitsuba_diffraction.bsdf.continuum_sampler import CellSampler
+from mitsuba_diffraction.bsdf.continuum_sampler import BinSampler
 from mitsuba_diffraction.bsdf.geometry import Incidence, Interface
 from mitsuba_diffraction.bsdf.order_sampler import OrderSampler
 from mitsuba_diffraction.bsdf.orders import LineSampler, OrderSpectrum
@@ -52,9 +52,9 @@ WIDE = {
         0.4 * np.interp(np.arange(96) / 96, [0, 0.7, 1], [0, 1, 0])[None], (1.9 / 96, 1.9)
     ),
 }
-"""With few rows of orders; their lobes are as wide as the horizon is near at a coherence length of 5 µm."""
+"""With few rows of orders; at a coherence length of 5 µm the horizon truncates their lobes."""
 RECIPE_COHERENCE = {"elaphe": 26.0, "xenopeltis": 26.0}
-"""µm, as in precompute/*.toml; 65 otherwise."""
+"""Coherence lengths of precompute/*.toml, µm; 65 for others."""
 
 
 @functools.cache
@@ -64,7 +64,7 @@ def bundled(name):
 
 @functools.cache
 def blurred(name):
-    """With lobes so wide that the bins of a chi² test resolve them."""
+    """Return a spectrum whose lobes are wide enough for the bins of a chi² test."""
     if name == "sample":
         return md.precompute(SMALL[name](), extent="sample", coherence_length=4.0)
     return md.precompute(SMALL[name](), coherence_length=6.0 if name in RECIPE_COHERENCE else 3.0)
@@ -75,20 +75,20 @@ def numbers(count, seed=0):
 
 
 def points(u):
-    """(3, count) as `sample` takes them."""
+    """Convert (3, count) to the arguments of `sample`."""
     first, *second = map(floats, u)
     return first, mi.Point2f(*second)
 
 
 def incidence_of(omega, wavelength):
-    """Light from ω that is reflected; λ in µm."""
+    """Return light incident from ω that is reflected; λ in µm."""
     interface = Interface()
     k_i = interface.wave_vector(vectors(omega))
     return Incidence.of(k_i, interface.scattered(k_i, mi.Bool(True)), interface).at(floats(wavelength))
 
 
 def sampled(bsdf, wi, wavelengths, count, seed=0):
-    """The sample of Mitsuba, and its weights (4, count) in float64."""
+    """Return the sample of Mitsuba, and its weights (4, count) in float64."""
     bs, weight = bsdf.sample(mi.BSDFContext(), interaction(wi, wavelengths, count), *points(numbers(count, seed)))
     dr.eval(bs, weight)
     return bs, np.array(weight, np.float64)
@@ -139,7 +139,7 @@ def test_samples_of_a_real_scan_pass_the_chi_square_test(llvm, scan, name, exten
 
 @pytest.mark.few(2)
 @pytest.mark.parametrize("name", ["blazed", "column", "crossed", "elaphe", "sample"])
-def test_density_integrates_to_the_share_of_samples_above_the_horizon(llvm, name):
+def test_density_integrates_to_the_fraction_of_samples_above_the_horizon(llvm, name):
     bsdf, wi, count = plugin(blurred(name), conserve_energy=False), direction(70, 40), 1 << 19
     bs, _ = sampled(bsdf, wi, WAVELENGTHS, count)
     above = np.array(bs.pdf) > 0
@@ -170,7 +170,7 @@ def test_mean_weight_is_the_albedo(llvm, name, theta):
 
 @pytest.mark.few(1)
 @pytest.mark.parametrize("longest", [700.0, 600.0, 390.0])
-def test_wavelengths_that_are_not_covered_take_no_part_in_the_sampling(llvm, longest):
+def test_wavelengths_that_are_not_covered_are_not_sampled(llvm, longest):
     heights = md.gratings.sinusoidal(2.5, 0.25)
     spectrum = md.precompute(heights, wavelengths=(360.0, longest), coherence_length=3.0)
     bsdf = plugin(spectrum, conserve_energy=False)
@@ -204,7 +204,7 @@ def test_a_spectrum_need_not_begin_at_the_shortest_wavelength(llvm):
 
 
 @pytest.mark.slow
-def test_beyond_the_largest_angle_only_the_base_reflects(llvm):
+def test_above_the_maximum_angle_only_the_base_reflects(llvm):
     of = md.precompute(md.gratings.sinusoidal(2.5, 0.25), largest_angle=60.0, coherence_length=3.0)
     bsdf = plugin(of, int_ior=1.5, base={"type": "diffuse"}, conserve_energy=False)
     for theta in (40, 70):
@@ -218,12 +218,12 @@ def test_beyond_the_largest_angle_only_the_base_reflects(llvm):
 
 
 def shifted(u):
-    """Four wavelengths as Mitsuba's path tracer samples them: equally spaced over 360–830 nm, shifted by `u`."""
+    """Return four wavelengths as in Mitsuba's path tracer: equally spaced over 360–830 nm, shifted by `u`."""
     return 360 + 470 * ((u + np.arange(4) / 4) % 1)
 
 
 def effective_fraction(bsdf, theta, phi, draws, count):
-    """E[w]²/E[w²] of the weight w averaged over the wavelengths, averaged over draws of them; and max w / E[w]."""
+    """Return E[w]²/E[w²] of the weight w, averaged over wavelengths, then over draws of them; and max w / E[w]."""
     fractions, largest = [], 0.0
     for seed in range(draws):
         _, weight = sampled(bsdf, direction(theta, phi), shifted((seed + 0.5) / draws / 4), count, seed=seed)
@@ -256,7 +256,7 @@ def test_the_effective_sample_fraction_is_above_its_bound(llvm, name, theta, lea
 @pytest.mark.parametrize("phi", [90, 0, 30, 210])
 @pytest.mark.parametrize("theta", [75, 85, 60, 30, 0])
 @pytest.mark.parametrize("name", WIDE)
-def test_lobes_that_the_horizon_cuts_are_drawn_where_they_propagate(llvm, name, theta, phi):
+def test_lobes_truncated_by_the_horizon_are_drawn_above_it(llvm, name, theta, phi):
     # Regression: 0.33 to 0.48 for light that comes in along the grooves, at 75° and more.
     bsdf = plugin(md.precompute(WIDE[name](), coherence_length=5.0, tolerance=1e-2))
     fractions = []
@@ -284,7 +284,7 @@ def test_weights_are_finite_and_pdf_is_that_of_the_sample(llvm, name, theta):
         np.testing.assert_allclose(pdf[some], again[some], rtol=1e-3)
 
 
-def test_height_scale_reaches_the_sampler(llvm):
+def test_the_sampler_follows_the_height_scale(llvm):
     bsdf = plugin(bundled("blazed"), height_scale=0.5, conserve_energy=False)
     assert effective_fraction(bsdf, 60, 30, draws=4, count=1 << 15)[0] > 0.5
 
@@ -295,9 +295,9 @@ def test_height_scale_reaches_the_sampler(llvm):
 @pytest.mark.few(3)
 @pytest.mark.parametrize("name", ["crossed", "sample", pytest.param("elaphe", marks=pytest.mark.slow)])
 @pytest.mark.parametrize(("theta", "phi"), [(0, 0), (40, 130), (85, 250)])
-def test_cells_are_drawn_with_their_density_and_few_that_do_not_propagate(llvm, name, theta, phi):
+def test_bins_are_drawn_with_their_density_and_few_samples_are_evanescent(llvm, name, theta, phi):
     spectrum, count, wavelength = blurred(name), 1 << 20, 0.5
-    sampler = CellSampler(spectrum)
+    sampler = BinSampler(spectrum)
     s = direction(theta, phi)
     incidence = incidence_of(s, wavelength)
     q = sampler.sample(incidence, *points(numbers(count)), True)
@@ -305,8 +305,10 @@ def test_cells_are_drawn_with_their_density_and_few_that_do_not_propagate(llvm, 
     q = [np.array(x) for x in q]
     spacing = [float(np.array(x).item()) for x in (sampler.spacing_x, sampler.spacing_y)]
 
-    # The density at the middles of all cells; those outside of the region are told by no q that propagates.
-    middles = [np.arange(-m, m + 1) * d for m, d in zip((sampler.max_cell_x, sampler.max_cell_y), spacing, strict=True)]
+    # The density at the centres of all bins; those outside of the region contain no propagating q.
+    middles = [
+        np.arange(-m, m + 1) * d for m, d in zip((sampler.max_index_x, sampler.max_index_y), spacing, strict=True)
+    ]
     x, y = (axis.ravel() for axis in np.meshgrid(*middles))
     density = np.array(sampler.density(mi.Vector2f(floats(x), floats(y)), incidence, mi.Bool(True)), np.float64)
     corners = [
@@ -316,7 +318,7 @@ def test_cells_are_drawn_with_their_density_and_few_that_do_not_propagate(llvm, 
     ]
     propagates = np.min(corners, axis=0) < 1
 
-    # Each cell cut into 2 × 2, so that the place in the cell is tested as well.
+    # Each bin is divided into 2 × 2, which tests the position in the bin as well.
     ends = [np.linspace(m[0] - d / 2, m[-1] + d / 2, 2 * len(m) + 1) for m, d in zip(middles, spacing, strict=True)]
     found, _, _ = np.histogram2d(q[1], q[0], bins=ends[::-1])
     assert found.sum() == count
@@ -364,11 +366,11 @@ def test_orders_are_drawn_with_their_probabilities(llvm, name, theta, phi):
 
 
 @pytest.mark.parametrize("theta", [0, 40])
-def test_no_wavelength_is_sampled_beyond_its_own_lobe(llvm, theta):
+def test_no_wavelength_is_sampled_outside_of_its_lobe(llvm, theta):
     # Regression: lobes were drawn whole and evaluated truncated. What a short wavelength drew beyond its lobe of the
     # mirror order counted for longer ones: 800 nm reflected 5.8 % too much.
     spectrum = md.precompute(md.gratings.sinusoidal(2.5, 0.02), coherence_length=16.0, tolerance=0.1)
-    assert OrderSpectrum(spectrum).cells is None
+    assert OrderSpectrum(spectrum).q_sampler is None
     bsdf = plugin(spectrum, conserve_energy=False)
     wi, wavelengths = direction(theta, 20), (400.0, 410.0, 420.0, 800.0)
     _, weight = draw(bsdf, wi, 1 << 18, wavelengths=wavelengths)
@@ -378,9 +380,9 @@ def test_no_wavelength_is_sampled_beyond_its_own_lobe(llvm, theta):
 
 
 def test_orders_are_drawn_where_their_lobes_are_narrow_and_apart(llvm):
-    assert isinstance(OrderSpectrum(md.precompute(SMALL["elaphe"](), coherence_length=26.0)).cells, CellSampler)
-    assert isinstance(OrderSpectrum(blurred("blazed")).cells, LineSampler)
-    assert OrderSpectrum(bundled("blazed")).cells is None
+    assert isinstance(OrderSpectrum(md.precompute(SMALL["elaphe"](), coherence_length=26.0)).q_sampler, BinSampler)
+    assert isinstance(OrderSpectrum(blurred("blazed")).q_sampler, LineSampler)
+    assert OrderSpectrum(bundled("blazed")).q_sampler is None
 
 
 @pytest.mark.parametrize("name", ["blazed", "column"])

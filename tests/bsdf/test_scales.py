@@ -1,4 +1,4 @@
-"""Scales of the relief, numbers and textures, against gratings whose heights and lengths are what they say."""
+"""Scales of the relief, numbers and textures, against gratings with scaled heights and lengths."""
 
 import drjit as dr
 import mitsuba as mi
@@ -32,28 +32,28 @@ PASSES = {"int_ior": 1.5, "transmission": "interface"}
 
 
 def corner():
-    """As `corner_blaze`, on as many pixels as its orders at the shortest wavelengths need."""
+    """Return `corner_blaze` with enough pixels for its orders at the shortest wavelengths."""
     along_x = md.gratings.blazed(PERIOD, 0.2, samples=96).heights[0]
     return md.HeightField(along_x[None, :] + along_x[:, None], PERIOD / 96)
 
 
-def stretched(surface, lateral, heights):
-    """The surface with its lengths and heights scaled."""
+def scaled(surface, lateral, heights):
+    """Return the surface with its lengths and heights scaled."""
     return md.HeightField(surface.heights * heights, np.multiply(surface.pixel_size, lateral))
 
 
 def steps(values):
-    """A texture of scales without interpolation."""
+    """Return a texture of scales without interpolation."""
     return bitmap(values, filter_type="nearest")
 
 
 def for_scales(surface, largest, **settings):
-    """A spectrum that covers scales up to the largest."""
+    """Return a spectrum that covers scales up to `largest`."""
     return md.precompute(surface, wavelengths=(360 / largest, 830), **settings)
 
 
 def near_orders(lateral, orders, wi=WI):
-    """Directions of the orders at 500 nm, of their slopes, and anywhere."""
+    """Return directions of the orders at 500 nm, on the slopes of their lobes, and random ones."""
     wo = [towards(wi, np.add(orders, by), 500, 1 / (PERIOD * lateral)) for by in ([0, 0], [0.02, 0.01])]
     return np.concatenate([*wo, random_directions(np.random.default_rng(0), 500)])
 
@@ -76,11 +76,11 @@ SQUARE = [(m, n) for m in range(-4, 5) for n in range(-4, 5)]
     ids=["line", "crossed", "coat", "interface", "sheet"],
 )
 def test_constant_scales_equal_a_grating_built_with_them(llvm, surface, orders, parameters, lateral, heights):
-    """Orders, lobes, K, G, gains and layers alike; densities differ, for they average over other intervals of κ."""
+    """Densities may differ, as their averages are over other intervals of κ."""
     parameters = {"conserve_energy": False, **parameters}
     largest = 1.5 * (1.5 if len(parameters) > 1 else 1)
     of_table = plugin(for_scales(surface(), largest), lateral_scale=lateral, height_scale=heights, **parameters)
-    built = plugin(for_scales(stretched(surface(), lateral, heights), largest), **parameters)
+    built = plugin(for_scales(scaled(surface(), lateral, heights), largest), **parameters)
     wo = near_orders(lateral, orders)
     if "transmission" in parameters:
         below = near_orders(lateral, orders, WI)
@@ -126,7 +126,7 @@ def test_textures_of_scales_are_read_at_the_point(llvm):
                 np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-4 * wanted.max())
 
 
-def test_a_lateral_scale_of_one_is_none(llvm):
+def test_a_lateral_scale_of_one_is_ignored(llvm):
     bsdf = plugin(for_scales(SURFACES["blazed"](), 1), lateral_scale=1.0)
     assert bsdf.layers.grating.scales.lateral is None
     assert "lateral_scale" not in mi.traverse(bsdf)
@@ -148,7 +148,7 @@ def test_scales_in_other_variants(variant):
 
 
 def difference(function, at, step):
-    """Central, of fourth order."""
+    """Return the central difference of fourth order."""
     f = [function(at + k * step) for k in (-2, -1, 1, 2)]
     return (8 * (f[2] - f[1]) - (f[3] - f[0])) / (12 * step)
 
@@ -215,7 +215,7 @@ def test_recipes_and_profiles_are_built_for_the_scales(llvm):
     ],
 )
 def test_scales_that_the_spectrum_does_not_cover_are_refused(llvm, parameters, message):
-    """In one line, which says what to build."""
+    """The message is one line with the spectrum to build."""
     parameters = {name: steps(v) if isinstance(v, list) else v for name, v in parameters.items()}
     if "theory" in parameters:
         of, parameters = made_up(), {"material": "Al", "lateral_scale": parameters["lateral_scale"]}
@@ -233,7 +233,7 @@ def test_scales_that_let_orders_overlap_are_refused(llvm):
 
 
 def albedo_of_orders(bsdf, of, wi, wavelength, lateral, uv):
-    """∫ f cos θ_o dω_o = ∫ f du dv of one wavelength (nm), by the sum over points in the lobes of all orders."""
+    """Return ∫ f cos θ_o dω_o = ∫ f du dv at one wavelength (nm), by quadrature over the lobes of all orders."""
     # The horizon cuts lobes near it.
     half = 10 if wi[2] > 0.1 else 40
     offsets = 3.2 / half * of.lobe_width * np.arange(-half, half + 1)
@@ -246,7 +246,7 @@ def albedo_of_orders(bsdf, of, wi, wavelength, lateral, uv):
 
 
 def grazing(rng, count):
-    """Directions, half of them uniform in solid angle, half in the polar angle, to 89.5°."""
+    """Return directions up to 89.5°, half of them uniform in solid angle, half in the polar angle."""
     uniform = random_directions(rng, count, 0.01)
     polar = direction(rng.uniform(0, 89.5, count), rng.uniform(0, 360, count))
     return np.where(rng.random(count)[:, None] < 0.5, uniform, polar)
@@ -263,8 +263,8 @@ SCALED = {
     ("name", "pairs"),
     [("sinusoidal", 8), *(pytest.param(name, 100, marks=pytest.mark.slow) for name in sorted(SCALED))],
 )
-def test_no_albedo_above_one_at_random_scales(llvm, name, pairs):
-    """Of scales that are too many for a table each."""
+def test_the_albedo_is_at_most_one_at_random_scales(llvm, name, pairs):
+    """With more scales than the table has nodes for."""
     rng, side = np.random.default_rng(5), int(np.ceil(np.sqrt(pairs)))
     of = for_scales(SCALED[name](), 1.6, coherence_length=65)
     laterals, heights = rng.uniform(0.6, 1.6, (side, side)), rng.uniform(0, 1.6, (side, side))
@@ -283,24 +283,24 @@ def test_no_albedo_above_one_at_random_scales(llvm, name, pairs):
 
 
 @pytest.mark.parametrize("name", ["sinusoidal", pytest.param("foil", marks=pytest.mark.slow)])
-def test_few_scales_lose_no_more_than_one_grating(llvm, name):
-    """E of each of three pitches is that of a grating built with it."""
+def test_e_of_few_scales_is_that_of_separate_gratings(llvm, name):
+    """E of each of three pitches is that of a grating built with that pitch."""
     of, laterals = for_scales(SCALED[name](), 1.5, coherence_length=65), (0.8, 1.0, 1.4)
     bsdf = plugin(of, lateral_scale=steps([laterals]))
     rng = np.random.default_rng(6)
     for k, lateral in enumerate(laterals):
-        alone = plugin(for_scales(stretched(SCALED[name](), lateral, 1), 1.5, coherence_length=65))
+        alone = plugin(for_scales(scaled(SCALED[name](), lateral, 1), 1.5, coherence_length=65))
         place = (k + 0.5) / 3, 0.5
         pairs = [[albedo_of_orders(b, of, wi, 450.0, lateral, place) for b in (bsdf, alone)] for wi in grazing(rng, 8)]
         assert np.max(pairs) <= 1.002
-        # The cells of both tables differ, and with them the loss from place to place.
+        # The grid cells of both tables differ, and with them the local loss.
         found, wanted = np.mean(pairs, axis=0)
         assert found > wanted - 0.01
 
 
 @pytest.mark.parametrize("parameters", [{"material": "none"}, PASSES], ids=["reflected", "passing"])
-def test_the_energy_of_very_different_heights_is_that_of_each(llvm, parameters):
-    """Deep and shallow tables are read alike, from both sides of an interface."""
+def test_e_of_very_different_heights_is_that_of_each(llvm, parameters):
+    """For deep and shallow reliefs, from both sides of an interface."""
     index, heights, count = parameters.get("int_ior", 1.0), (0.1, 1.0), 200
     of = md.precompute(md.gratings.foil(1.5, 0.6, directions=2), wavelengths=(360 / index, 830 / index))
     both = plugin(of, height_scale=steps([heights]), **parameters)

@@ -1,4 +1,4 @@
-"""The series of amplitudes in the BSDF: values against direct sums, samples, derivatives, scenes."""
+"""Amplitude series in the BSDF: values against direct sums, samples, derivatives, scenes."""
 
 import functools
 

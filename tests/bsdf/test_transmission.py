@@ -1,4 +1,4 @@
-"""Light that passes a dielectric relief, against closed forms, Mitsuba's own interfaces and quadrature."""
+"""Transmission by a dielectric relief, against closed forms, Mitsuba's own interfaces and quadrature."""
 
 import itertools
 
@@ -24,7 +24,7 @@ def llvm():
     use("llvm_ad_spectral")
 
 
-def passing(kind, profile="sinusoidal", depth=0.5, **parameters):
+def transmitting(kind, profile="sinusoidal", depth=0.5, **parameters):
     return mi.load_dict(
         {
             "type": "diffraction_grating",
@@ -48,7 +48,7 @@ def outside(kind, side):
 
 
 def order_power(profile, depth, m, kappa):
-    """c_m(κ) of a profile of full depth `depth`."""
+    """Return c_m(κ) of a profile of full depth `depth`."""
     if profile == "sinusoidal":
         return scipy.special.jv(m, kappa * depth / 2) ** 2
     return np.sinc(kappa * depth / (2 * np.pi) - m) ** 2
@@ -61,7 +61,7 @@ def fresnel(cos_i, cos_o, n_i, n_o):
 
 
 def closed_form(kind, profile, depth, wi, m):
-    """K (1 − F) c_m of transmitted light, and the direction of the order; None where it does not propagate."""
+    """Return K (1 − F) c_m of a transmitted order, and its direction; None where it does not propagate."""
     side = np.sign(wi[2])
     k_i = outside(kind, side) * wi[:2]
     k_o = -k_i - [m * WAVELENGTH / PERIOD, 0]
@@ -85,7 +85,7 @@ def closed_form(kind, profile, depth, wi, m):
 
 
 def power_of_order(bsdf, kind, wi, wo):
-    """The power in the lobe around ω_o, by quadrature."""
+    """Return the power in the lobe around ω_o, by quadrature."""
     sigma = bsdf.spectrum.lobe_width
     step = np.linspace(-4, 4, 33) * sigma * WAVELENGTH
     u, v = (x.ravel() for x in np.meshgrid(step, step))
@@ -104,7 +104,7 @@ def power_of_order(bsdf, kind, wi, wo):
 @pytest.mark.parametrize(("profile", "depth"), [("sinusoidal", 0.5), ("blazed", 0.5), ("blazed", 0.8)])
 @pytest.mark.parametrize(("theta", "phi"), [(0, 0), (25, 40), (50, 200)])
 def test_orders_have_the_powers_of_the_closed_form(kind, profile, depth, theta, phi):
-    bsdf = passing(kind, profile, depth, shadowing="none")
+    bsdf = transmitting(kind, profile, depth, shadowing="none")
     for side in (1, -1):
         wi = towards(theta, phi, side)
         found, wanted = [], []
@@ -119,7 +119,7 @@ def test_orders_have_the_powers_of_the_closed_form(kind, profile, depth, theta, 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("profile", ["sinusoidal", "blazed"])
 def test_transmission_is_reciprocal(kind, profile):
-    bsdf = passing(kind, profile)
+    bsdf = transmitting(kind, profile)
     rng = np.random.default_rng(4)
     count = 4096
     wi = rng.normal(size=(count, 3))
@@ -152,7 +152,7 @@ def test_transmission_is_reciprocal(kind, profile):
 @pytest.mark.parametrize("side", [1, -1])
 @pytest.mark.parametrize("component", [0, 1])
 def test_samples_follow_the_density_on_both_sides(kind, side, component):
-    bsdf = passing(kind, "sinusoidal", 0.4, coherence_length=6.0)
+    bsdf = transmitting(kind, "sinusoidal", 0.4, coherence_length=6.0)
     wi, wavelengths = towards(35, 20, side), (450.0, 500.0, 550.0, 650.0)
     ctx = mi.BSDFContext()
     ctx.component = component
@@ -163,8 +163,8 @@ def test_samples_follow_the_density_on_both_sides(kind, side, component):
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("theta", [0, 40, 50, 75])
 @pytest.mark.parametrize("side", [1, -1])
-def test_few_samples_do_for_all_light(kind, theta, side):
-    bsdf = passing(kind, "sinusoidal", 0.25)
+def test_sample_weights_have_a_small_variance(kind, theta, side):
+    bsdf = transmitting(kind, "sinusoidal", 0.25)
     count = 1 << 17
     u = np.random.default_rng(1).random((3, count)).astype(np.float32)
     si = interaction(towards(theta, 10, side), (450.0, 500.0, 550.0, 650.0), count)
@@ -181,7 +181,7 @@ def test_few_samples_do_for_all_light(kind, theta, side):
 @pytest.mark.parametrize("theta", [75, 0, 40, 60])
 @pytest.mark.parametrize("profile", ["film", "transmission_300"])
 @pytest.mark.parametrize("kind", ["sheet", "interface"])
-def test_samples_of_light_from_above_have_weights_alike(profile, kind, theta):
+def test_samples_from_above_have_similar_weights(profile, kind, theta):
     # Regression: 0.23 of a sheet of film at 75°, 0.12 of an interface of 300 lines/mm; 0.41 is of a sheet of these.
     bsdf = mi.load_dict({"type": "diffraction_grating", "profile": profile, "transmission": kind})
     count, fractions = 1 << 14, []
@@ -200,11 +200,13 @@ def test_samples_of_light_from_above_have_weights_alike(profile, kind, theta):
 @pytest.mark.parametrize("is_sheet", [False, True])
 @pytest.mark.parametrize("theta", [50, 0, 85])
 @pytest.mark.parametrize("profile", ["film", "transmission_300"])
-def test_orders_on_either_side_are_drawn_with_their_shares(profile, theta, is_sheet, above, reflects):
+def test_reflected_and_transmitted_orders_are_drawn_with_their_probabilities(profile, theta, is_sheet, above, reflects):
     spectrum = md.precompute(md.gratings.PROFILES[profile](), wavelengths=(240.0, 830.0), tolerance=0.01)
     table = OrderSampler(spectrum, ETA, is_sheet)
     kappas = mi.Float(1.0), mi.Float(1.0)
-    interface = Interface(eta=mi.Float(ETA), is_sheet=is_sheet, kappas=kappas, fraction=table.transmitted)
+    interface = Interface(
+        eta=mi.Float(ETA), is_sheet=is_sheet, kappas=kappas, transmitted_fraction=table.transmitted_fraction
+    )
     k_i = interface.wave_vector(vectors(towards(theta, 20, 1 if above else -1)))
     k_o = interface.scattered(k_i, mi.Bool(reflects))
     incidence = Incidence.of(k_i, k_o, interface).at(mi.Float(WAVELENGTH))
@@ -246,7 +248,7 @@ def test_samples_follow_an_index_and_heights_that_change(height_scale, eta):
 
 
 def changed_and_fresh(height_scale, eta):
-    """A plugin whose parameters were changed, and one that was loaded with them; of a spectrum to 360 nm at n = 1.8."""
+    """Return a plugin with changed parameters, and one loaded with them; the spectrum is for 360 nm at n = 1.8."""
     spectrum = md.precompute(md.gratings.blazed(PERIOD, 0.8), wavelengths=(200.0, 830.0 / 1.2), tolerance=1e-2)
     scene = {"type": "diffraction_grating", "spectrum": spectrum, "transmission": "interface", "ext_ior": 1.0}
     changed = mi.load_dict({**scene, "int_ior": ETA})
@@ -274,7 +276,7 @@ def test_an_index_that_changes_has_its_own_e_and_orders(eta):
 
 
 def test_an_index_is_refused_for_which_the_spectrum_has_no_wavelengths():
-    parameters = mi.traverse(passing("interface"))
+    parameters = mi.traverse(transmitting("interface"))
     parameters["eta"] = 1.6
     with pytest.raises(ValueError, match=r"int_ior: got 1\.6, and a spectrum for wavelengths from 240 nm"):
         parameters.update()
@@ -282,7 +284,7 @@ def test_an_index_is_refused_for_which_the_spectrum_has_no_wavelengths():
 
 def test_other_parameters_leave_tables_of_varying_scales(monkeypatch):
     heights = {"type": "checkerboard", "color0": 0.5, "color1": 1.0}
-    parameters = mi.traverse(passing("interface", height_scale=heights))
+    parameters = mi.traverse(transmitting("interface", height_scale=heights))
     monkeypatch.setattr("mitsuba_diffraction.bsdf.shared.EnergyTable.of", None)
     monkeypatch.setattr("mitsuba_diffraction.bsdf.shared.OrderSampler", None)
     parameters["orientation.value"] = 30.0
@@ -290,8 +292,8 @@ def test_other_parameters_leave_tables_of_varying_scales(monkeypatch):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_samples_name_their_component_and_index(kind):
-    bsdf = passing(kind)
+def test_samples_have_their_component_and_index(kind):
+    bsdf = transmitting(kind)
     assert bsdf.component_count() == (3 if kind == "sheet" else 2)
     assert mi.has_flag(bsdf.flags(), mi.BSDFFlags.GlossyTransmission)
     count = 4096
@@ -299,18 +301,18 @@ def test_samples_name_their_component_and_index(kind):
     for side in (1, -1):
         wi = towards(30, 10, side)
         bs, _ = bsdf.sample(mi.BSDFContext(), interaction(wi, count=count), mi.Float(u[0]), mi.Point2f(u[1:]))
-        passes = np.array(bs.wo)[2] * wi[2] < 0
-        assert 0.5 < passes.mean() < 0.99
-        names = np.where(passes, int(mi.BSDFFlags.GlossyTransmission), int(mi.BSDFFlags.GlossyReflection))
+        is_transmitted = np.array(bs.wo)[2] * wi[2] < 0
+        assert 0.5 < is_transmitted.mean() < 0.99
+        names = np.where(is_transmitted, int(mi.BSDFFlags.GlossyTransmission), int(mi.BSDFFlags.GlossyReflection))
         drawn = (np.array(bs.pdf) > 0) & (np.array(bs.sampled_type) != int(mi.BSDFFlags.DeltaReflection))
         np.testing.assert_array_equal(np.array(bs.sampled_type)[drawn], names[drawn])
-        np.testing.assert_array_equal(np.array(bs.sampled_component)[drawn], passes[drawn])
-        eta = np.where(passes, outside(kind, -side) / outside(kind, side), 1)
+        np.testing.assert_array_equal(np.array(bs.sampled_component)[drawn], is_transmitted[drawn])
+        eta = np.where(is_transmitted, outside(kind, -side) / outside(kind, side), 1)
         np.testing.assert_allclose(np.array(bs.eta)[drawn], eta[drawn], rtol=1e-6)
 
 
 def test_the_flat_face_of_a_sheet_is_a_mirror():
-    bsdf, plane = passing("sheet"), mi.load_dict({"type": "dielectric", "int_ior": ETA, "ext_ior": 1.0})
+    bsdf, plane = transmitting("sheet"), mi.load_dict({"type": "dielectric", "int_ior": ETA, "ext_ior": 1.0})
     ctx = mi.BSDFContext()
     ctx.component = 2
     wi = towards(60, 20, -1)
@@ -333,7 +335,7 @@ def test_the_flat_face_of_a_sheet_is_a_mirror():
         ({"transmission": "interface", "fresnel": "schlick"}, "fresnel: got 'schlick'"),
     ],
 )
-def test_what_light_cannot_pass_is_refused(parameters, named):
+def test_opaque_materials_and_layers_are_refused(parameters, named):
     with pytest.raises(RuntimeError, match=named.replace("(", "\\(")):
         mi.load_dict({"type": "diffraction_grating", "profile": "blazed", "period": 2.5, "depth": 0.2, **parameters})
 
@@ -355,12 +357,12 @@ def test_a_spectrum_without_the_short_wavelengths_inside_is_refused():
 @pytest.mark.few(2)
 @pytest.mark.parametrize("variant", ["llvm_ad_spectral_polarized"])
 @pytest.mark.parametrize("kind", KINDS)
-def test_other_variants_pass_the_same_light(variant, kind):
+def test_other_variants_have_equal_values(variant, kind):
     directions = np.array([towards(20, 30, 1), towards(50, 250, -1)])
     u = [(0.05, 0.4, 0.6), (0.3, 0.2, 0.7), (0.8, 0.9, 0.1)]
 
     def drawn():
-        bsdf, found = passing(kind, "blazed"), []
+        bsdf, found = transmitting(kind, "blazed"), []
         for wi in directions:
             for one, *two in u:
                 bs, weight = bsdf.sample(mi.BSDFContext(), interaction(wi), one, mi.Point2f(*two))
@@ -400,7 +402,7 @@ def test_water_shortens_wavelengths_outside():
 @pytest.mark.parametrize("side", [1, -1])
 @pytest.mark.parametrize("theta", [0, 30])
 def test_large_smooth_facets_are_those_of_roughdielectric(theta, side):
-    """S(q; κ) dq is the density of slopes s = −v_∥/v_z there, so that S = P(s) λ²/v_z²."""
+    """For these, S(q; κ) dq is the density of slopes s = −v_∥/v_z, so that S = P(s) λ²/v_z²."""
     alpha = 0.05
     facets = mi.load_dict(
         {"type": "roughdielectric", "distribution": "beckmann", "alpha": alpha, "int_ior": ETA, "ext_ior": 1.0}
@@ -420,7 +422,7 @@ def test_large_smooth_facets_are_those_of_roughdielectric(theta, side):
     material = mi.Float(ETA)
     interface = Interface(eta=material, kappas=(mi.Float(1e-6), mi.Float(1e-6)))
     pair = Geometry.of(*(interface.wave_vector(vectors(omega)) for omega in (wi, wo)), interface)
-    incidence = Incidence.of(pair.incident, pair.outgoing, interface, flip=pair.flip).at(mi.Float(0.5))
+    incidence = Incidence.of(pair.incident, pair.outgoing, interface, kappa_sign=pair.kappa_sign).at(mi.Float(0.5))
     factor = pair.order_factor(pair.tangent, incidence, mi.Float(2e6)) * (1 - mi.fresnel(pair.cos_half(), material)[0])
     density = np.exp(-(slope**2).sum(-1) / alpha**2) / (np.pi * alpha**2)
     np.testing.assert_allclose(np.array(factor / dr.square(pair.v_z)) * density, wanted, rtol=5e-3)
@@ -429,7 +431,7 @@ def test_large_smooth_facets_are_those_of_roughdielectric(theta, side):
 @pytest.mark.slow
 @pytest.mark.parametrize("side", [1, -1])
 def test_a_picture_of_large_smooth_facets_is_that_of_roughdielectric(side):
-    """Facets whose slopes along x are distributed as those of Beckmann, under a striped sky."""
+    """Slopes along x have Beckmann's distribution; the sky is striped."""
     alpha, period, count = 0.1, 80.0, 1600
     slopes = alpha / np.sqrt(2) * scipy.stats.norm.ppf((np.arange(count // 2) + 0.5) / (count // 2))
     heights = np.cumsum(np.append(slopes, slopes[::-1])) * period / count
@@ -469,7 +471,7 @@ def test_a_picture_of_large_smooth_facets_is_that_of_roughdielectric(side):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_reflected_light_is_that_of_an_opaque_grating(kind):
-    """Near the horizon, too, where the directions of a pair differ in height."""
+    """Including pairs near the horizon with different polar angles."""
     rng = np.random.default_rng(8)
     count = 1 << 14
     cos, phi = 10 ** rng.uniform(-3, 0, count), rng.uniform(0, 2 * np.pi, count)
@@ -496,18 +498,18 @@ def test_reflected_light_is_that_of_an_opaque_grating(kind):
 
 
 def reflected_and_transmitted(bsdf, wi, wavelength, count=1 << 16):
-    """R and T by samples, and the standard error of their sum."""
+    """Return R and T by samples, and the standard error of their sum."""
     u = np.random.default_rng(1).random((3, count)).astype(np.float32)
     si = interaction(wi, (wavelength * 1e3,) * 4, count)
     bs, weight = bsdf.sample(mi.BSDFContext(IMPORTANCE), si, mi.Float(u[0]), mi.Point2f(u[1:]))
-    weight, passes = np.array(weight)[0], np.array(bs.wo)[2] * wi[2] < 0
-    return weight[~passes].sum() / count, weight[passes].sum() / count, weight.std() / np.sqrt(count)
+    weight, is_transmitted = np.array(weight)[0], np.array(bs.wo)[2] * wi[2] < 0
+    return weight[~is_transmitted].sum() / count, weight[is_transmitted].sum() / count, weight.std() / np.sqrt(count)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("relief", [{"depth": 0.0}, {"height_scale": 0.0}, {"height_scale": 1e-8}, {"depth": 0.004}])
 def test_a_relief_without_height_is_a_plane(kind, relief):
-    bsdf = passing(kind, **{"depth": 0.5, **relief})
+    bsdf = transmitting(kind, **{"depth": 0.5, **relief})
     for theta, side in ((0, 1), (0, -1), (50, 1), (50, -1)):
         wi = towards(theta, 20, side)
         n_i, n_o = (1, ETA) if side > 0 or kind == "sheet" else (ETA, 1)
@@ -541,17 +543,17 @@ def test_a_relief_without_height_is_a_plane(kind, relief):
         ),
     ],
 )
-def test_samples_carry_no_more_light_than_came(wi, wavelength, relief):
+def test_the_albedo_of_samples_is_at_most_one(wi, wavelength, relief):
     r, t, error = reflected_and_transmitted(
-        passing("interface", **relief), np.divide(wi, np.linalg.norm(wi)), wavelength
+        transmitting("interface", **relief), np.divide(wi, np.linalg.norm(wi)), wavelength
     )
     # E is linear between the nodes of a table: R + T is at most 1.02.
     assert r + t <= 1.02 + 3 * error
 
 
 @pytest.mark.parametrize("eta", [1.0, 0.0, -1.5, np.nan])
-def test_an_index_that_is_none_is_refused(eta):
-    parameters = mi.traverse(passing("interface"))
+def test_an_invalid_index_is_refused(eta):
+    parameters = mi.traverse(transmitting("interface"))
     parameters["eta"] = mi.Float(eta)
     with pytest.raises(ValueError, match="eta: got"):
         parameters.update()

@@ -1,4 +1,4 @@
-"""The grating inside Mitsuba's own wrappers, and textures that turn it."""
+"""The grating inside Mitsuba's own wrappers, and with textures of orientations."""
 
 import drjit as dr
 import mitsuba as mi
@@ -25,12 +25,12 @@ pytestmark = pytest.mark.usefixtures("llvm")
 
 
 def wide(**parameters):
-    """Lobes wide enough for quadrature on a coarse grid; without E, which would take longer than all else."""
+    """Return a plugin with lobes wide enough for quadrature on a coarse grid; without E, which takes long."""
     return grating("corner", 3.0, conserve_energy=False, **parameters)
 
 
 def slope(tangent):
-    """A displacement that grows by `tangent` per unit of u: n' ∝ (−tangent, 0, 1) where dp_du = x."""
+    """Return a displacement that increases by `tangent` per unit of u: n' ∝ (−tangent, 0, 1) where dp_du = x."""
     values = np.tile((np.arange(64) + 0.5) / 64 * tangent, (64, 1))[..., None]
     return bitmap(values)
 
@@ -50,14 +50,14 @@ WRAPPERS = {
 
 
 def tilted(normal, omega):
-    """ω in the frame of `normal`, whose x axis is x less its part along the normal."""
+    """Return ω in the frame of `normal`, whose x axis is x minus its component along the normal."""
     x = np.array([1.0, 0, 0]) - normal * normal[0]
     x /= np.linalg.norm(x)
     return omega @ np.stack([x, np.cross(normal, x), normal]).T
 
 
 def expected(name, wi, wo):
-    """f cos θ_o of a wrapper from that of the grating alone."""
+    """Return f cos θ_o of a wrapper from that of the grating alone."""
     plain = mi.load_dict(wide())
     if name == "twosided":
         return evaluate(plain, wi, wo)[0]
@@ -88,7 +88,7 @@ def test_value_is_that_of_the_grating_inside(name):
 
 @pytest.mark.few(1)
 @pytest.mark.parametrize("name", sorted(WRAPPERS))
-def test_samples_carry_the_albedo(name):
+def test_weights_average_to_the_albedo(name):
     bsdf, wi, count = mi.load_dict(WRAPPERS[name]()), direction(25, 40), 1 << 17
     bs, weight = draw(bsdf, wi, count, uv=UV)
     null = np.array(mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)) & np.ones(count, bool)
@@ -108,7 +108,7 @@ def test_samples_carry_the_albedo(name):
 
 
 @pytest.mark.slow
-def test_back_of_twosided_is_that_of_the_front_with_z_turned():
+def test_back_of_twosided_is_the_front_with_z_reversed():
     bsdf, rng = mi.load_dict(WRAPPERS["twosided"]()), np.random.default_rng(2)
     wi, wo = random_directions(rng, 300), random_directions(rng, 300)
     back = evaluate(bsdf, wi * [1, 1, -1], wo * [1, 1, -1])

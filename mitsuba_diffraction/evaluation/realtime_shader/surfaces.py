@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import mitsuba as mi
 
 from ...bsdf.base import contains_grating, is_grating, nested
-from ...bsdf.geometry import turned
+from ...bsdf.geometry import rotated
 from ...bsdf.layers import Layers
 from ...errors import RequestError
 from ...rigorous.spectrum import RigorousSpectrum
@@ -84,12 +84,12 @@ def heights_of(layers: Layers) -> tuple[HeightField, float]:
 
 def along_pattern(layers: Layers, si: mi.SurfaceInteraction3f, omega: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:
     """Return a direction of the shading frame along the pattern's axes."""
-    return turned(omega, *layers.grating.frame(si, active))
+    return rotated(omega, *layers.grating.frame(si, active))
 
 
 def transmitted(
     layers: Layers, si: mi.SurfaceInteraction3f, cos_o: mi.Float, active: mi.Bool
 ) -> mi.UnpolarizedSpectrum:
     """Return (1 − R_i)(1 − R_o), what the surface lets through to the base and back."""
-    entering = layers.grating.entering
-    return entering(si, mi.Frame3f.cos_theta(si.wi), active) * entering(si, cos_o, active)
+    transmittance = layers.grating.transmittance
+    return transmittance(si, mi.Frame3f.cos_theta(si.wi), active) * transmittance(si, cos_o, active)
