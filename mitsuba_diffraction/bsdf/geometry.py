@@ -26,7 +26,7 @@ from .tables import larger, limited, smaller
 # Not frozen: Dr.Jit rebuilds what enters a branch field by field.
 @dataclass(eq=False)
 class WaveVector:
-    """k = n ω of a direction away from the relief, in units of 2π/λ, λ in the medium above everything.
+    """k = n ω of a direction away from the relief, in units of 2π/λ, λ in the uppermost medium.
 
     Attributes:
         tangent: k_∥, outside and next to the relief.

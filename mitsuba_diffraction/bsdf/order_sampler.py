@@ -29,8 +29,9 @@ from .tables import NumberTable, PacketTable, larger, opaque
 
 PROBABILITY_UNITS = 2**24  # to the probability one; float32 represents integers exactly up to it
 UNIFORM_FRACTION = 0.05  # of the probability in a bin, divided equally among its orders
-# Of a table, about, for each combination of incident and outgoing side, divided by √(ranges of heights); larger tables
-# do not fit the cache. Interfaces have more, since orders vary faster with the direction in the denser medium.
+# About, of the table for one range of heights and one pair of incident and outgoing side, divided by the root of the
+# number of ranges; larger tables do not fit the cache. Interfaces have more, since orders vary faster with the
+# direction in the denser medium.
 MAX_ENTRIES, MAX_INTERFACE_ENTRIES = 1e5, 2.5e5
 # Radians, of the change of the phase of the deepest point at normal reflection from above: within a bin, of line
 # gratings, which have few orders, and of others; and between the points of a bin.

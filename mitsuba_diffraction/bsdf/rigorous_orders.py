@@ -405,8 +405,8 @@ def _bin_efficiencies(spectrum: RigorousSpectrum, bins_per_unit: int) -> tuple[N
         low, high = (ends[p] - ends[r + 1]) / 2, (ends[p + 1] - ends[r]) / 2
         may = np.maximum(low[:, None] - m, m - high[:, None]) < g_out[:, None]
         possible[way, z, p, r] = may
-        cell, order = np.nonzero(may)
-        found, of_order = np.zeros((2, len(cell))), m[order]
+        index, order = np.nonzero(may)
+        found, of_order = np.zeros((2, len(index))), m[order]
         for t, u, v in _BIN_POINTS:
             x, y = inside_bins(u)[p], inside_bins(v)[r]
             g, alpha = (x + y) / 2, (x - y) / 2
@@ -414,11 +414,11 @@ def _bin_efficiencies(spectrum: RigorousSpectrum, bins_per_unit: int) -> tuple[N
             square = g**2 - (n_i**2 - 1) * (axes.period / wavelength) ** 2
             g = np.sign(square) * np.sqrt(np.abs(square))
             eta = spectrum.evaluate(
-                of_order, alpha[cell] - of_order / 2, g[cell], wavelength[cell], (incident, outgoing)
+                of_order, alpha[index] - of_order / 2, g[index], wavelength[index], (incident, outgoing)
             )
             found += eta, eta > 0
         # The mean over the points at which the order propagates, as the horizon may cross a bin.
-        efficiencies[way, z[cell], p[cell], r[cell], order] = found[0] / np.maximum(found[1], 1)
+        efficiencies[way, z[index], p[index], r[index], order] = found[0] / np.maximum(found[1], 1)
     return efficiencies, possible
 
 
