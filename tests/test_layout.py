@@ -19,8 +19,8 @@ MODULES = {
 }
 
 
-ROOMS = {
-    # The lowest first: a room imports from those above it in this list, and from itself.
+LEVELS = {
+    # The lowest first: modules of a level import from the levels above it in this list, and from their own.
     "base": "color errors files geometry llvm manual outputs progress settings",
     "surface": "surface",
     "spectrum": "spectrum",
@@ -35,7 +35,7 @@ ROOMS = {
     "cli": "cli __main__",
     "evaluation": "evaluation",
 }
-LEVELS = {name: level for level, names in enumerate(ROOMS.values()) for name in names.split()}
+LEVEL_OF = {name: level for level, names in enumerate(LEVELS.values()) for name in names.split()}
 
 
 @functools.cache
@@ -71,9 +71,9 @@ def test_no_module_imports_itself_by_way_of_others():
 
 
 @pytest.mark.quick
-def test_no_room_imports_a_higher_one():
+def test_no_module_imports_from_a_higher_level():
     def level(module):
-        return LEVELS[module.split(".")[1]]
+        return LEVEL_OF[module.split(".")[1]]
 
     wrong = [
         f"{module} imports {found}"
@@ -85,20 +85,20 @@ def test_no_room_imports_a_higher_one():
 
 
 @pytest.mark.quick
-def test_the_figure_of_the_manual_shows_the_rooms_in_their_order():
+def test_the_figure_of_the_manual_shows_the_levels_in_their_order():
     """By the first column of its lines."""
     manual = (Path(__file__).parents[1] / "docs" / "architecture.md").read_text(encoding="utf-8")
-    figure = manual.partition("## The rooms")[2].split("```")[1]
-    names = {name for names in ROOMS.values() for name in names.split()} - {"__main__"}
+    figure = manual.partition("## Levels of the package")[2].split("```")[1]
+    names = {name for names in LEVELS.values() for name in names.split()} - {"__main__"}
     lines = [(line, line.lstrip(" │├─▲")) for line in figure.splitlines()]
     columns = [re.split(r"\s{3,}", text)[0] for line, text in lines if len(line) - len(text) < 10]
     shown = [word for column in columns for word in re.findall(r"\w+", column) if word in names]
-    order = [LEVELS[word] for word in dict.fromkeys(shown)]
+    order = [LEVEL_OF[word] for word in dict.fromkeys(shown)]
     assert set(shown) == names
     assert order == sorted(order)
     files = {path.stem for path in (PACKAGE / "bsdf").glob("*.py")} - {"__init__"}
-    room = figure.partition(" bsdf/")[2].partition("integrator/")[0]
-    assert files <= set(re.findall(r"\w+", room))
+    of_bsdf = figure.partition(" bsdf/")[2].partition("integrator/")[0]
+    assert files <= set(re.findall(r"\w+", of_bsdf))
 
 
 def test_nothing_depends_on_what_judges_the_product():
