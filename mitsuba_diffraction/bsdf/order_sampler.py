@@ -148,8 +148,8 @@ class OrderSampler:
         result = np.zeros((len(omega), *(2 * self.max_order[::-1] + 1)), np.float32)
         for furnace in furnaces:
             powers = np.zeros_like(result)
-            for way in furnace.ways[:1] if reflects else furnace.ways[1:]:
-                node, component, power = furnace.sent(self._inside(omega, above), wavelengths / inside, way)
+            for way in furnace.branches[:1] if reflects else furnace.branches[1:]:
+                node, component, power = furnace.terms(self._inside(omega, above), wavelengths / inside, way)
                 m = np.rint((way or 1) * furnace.q[component] * self.tile).astype(np.int64)
                 if self.is_sheet:
                     tangent = outside * omega[node, :2] + wavelengths[node, None] * m / self.tile

@@ -1,33 +1,34 @@
 """The factor e(ω, λ) that bounds the albedo by one, as a table.
 
-With R = 1 the BSDF without E has an albedo a(ω_i, λ) (`furnace.py`) that exceeds one for some directions. It multiplies
-by
+With R = 1 the BSDF without E has an albedo a(ω_i, λ) (`furnace.py`) that exceeds one for some directions. The BSDF is
+multiplied by
 
     E = min(e(ω_i, λ), e(ω_o, λ)),    e = 1/max(1, a)
 
-which is reciprocal, and one where neither direction reflects more than it receives. The table has e at nodes, and e is
-linear between them: E is a safeguard of the model, which bounds the albedo of a perfect mirror to about a per cent.
+which is reciprocal, and one where a ≤ 1 for both directions. The table holds e at nodes and is linear between them.
+E is a safeguard of the model: it keeps the albedo of a perfect mirror below one to within about a per cent.
 
-Of a grating with the period T, c = √(1 − ω_y²) and
+For a line grating of period T, with c = √(1 − ω_y²) and
 
     u = (c − ω_x) T/λ,    v = (c + ω_x) T/λ
 
-the order m > 0 propagates if m < u, and m < 0 if −m < v: e jumps where u or v is a whole number, and is continuous
-between. So each unit square of (u, v) is divided into cells by itself, finest near its lower edges, where an order has
-just emerged; at u = 0 and v = 0 ω itself is at the horizon. With f the fraction of u, nodes are equidistant in √f, as
-cos θ_o of that order is. a depends on u and v alone, but for lobes that reach the horizon: seen in units of c, they are
-1/c as wide. The table has one slice.
+the order m > 0 propagates if m < u, and the order m < 0 if −m < v: e jumps where u or v is a whole number, and is
+continuous between. So each unit square of (u, v) is divided into grid cells separately, finest near its lower edges,
+where an order has just emerged; at u = 0 and v = 0 ω itself is at the horizon. With f the fractional part of u, nodes
+are equidistant in √f, which is proportional to cos θ_o of that order. a depends on u and v alone, except where lobes
+meet the horizon: in units of c, their width is proportional to 1/c. The table has one slice.
 
-Of surfaces with orders in two dimensions, of samples and of interfaces the hemisphere is a square, its middle the
-normal and its edge the horizon,
+For surfaces with orders in two dimensions, for samples and for interfaces the hemisphere is mapped to a square, with
+the normal at its centre and the horizon at its edge,
 
     (ω_x − ω_y, ω_x + ω_y) (1 − t)/(|ω_x| + |ω_y|),    cos θ = 1 − (1 − t²)²
 
-with nodes that are equidistant along its sides and, the slices, in 1/λ. An interface has tables for the light of each
-side. That of e = 1 is not among the kinks: the tables hold 1/a also where it is a little more than one.
+Its nodes are equidistant along the sides, and its slices are equidistant in 1/λ. An interface has tables for light from
+above and from below. The tables of reflected light hold 1/a up to `MAX_E`, so that interpolation does not smooth the
+kink of e at a = 1.
 
 Scaling lengths by s and heights by h is equivalent to scaling heights by r = h/s at the wavelength λ/s: where scales
-vary, there are nodes of r.
+vary, the table has nodes in r.
 """
 
 from __future__ import annotations
@@ -50,13 +51,14 @@ from ..spectrum.power_spectrum import PowerSpectrum
 from .furnace import Furnace, Real
 
 MAX_E = 1.05
-"""Of what is stored: e is one where that is more, so that it has its kink where a = 1 within a cell."""
-LINE_NODES = 1.2e5  # of the table of a line grating, about
-MAX_NODES = 100000  # of another table
-PAIRS = 3e7  # of a node and a component, of a table with one ratio
+"""Largest stored 1/a; e is one where the interpolated value is larger, so that its kink lies at a = 1."""
+MAX_LINE_NODES = 1.2e5  # nodes of the table of a line grating, about
+MAX_NODES = 100000  # nodes of any other table
+MAX_NODE_COMPONENT_PAIRS = 3e7  # evaluations for a table with one ratio
 MIN_SLICES, MAX_SLICES = 8, 16  # nodes of 1/λ
-SLICE_PHASE = 4  # radians of the phase of the deepest point, for each further slice
-MIN_FRACTION, MIN_T = 1e-7, 0.01  # of u and v at nodes, and of t
+SLICE_PHASE = 4  # radians of the phase of the deepest point, for each of which there is one slice more than the minimum
+MIN_FRACTION = 1e-7  # distance of nodes from whole u and v
+MIN_T = 0.01  # t of nodes at the horizon
 
 
 @dataclass(frozen=True)
@@ -64,13 +66,13 @@ class Layout:
     """The nodes of a table.
 
     Attributes:
-        period: T in µm of a line grating; 0, of another surface.
-        squares: unit squares of (u, v) along each; or the one of all directions.
-        first: cells along u or v from 0 to 1, where ω is near the horizon; or along the sides of the one square.
-        cells: along the side of the other unit squares.
-        slices: one, or nodes of 1/λ.
+        period: T in µm of a line grating; 0 for any other surface.
+        squares: number of unit squares of (u, v) along u and along v; 1 for the square of all directions.
+        first: number of grid cells from u or v = 0 to 1, where ω is near the horizon; or along a side of the square.
+        cells: number of grid cells along a side of each other unit square.
+        slices: 1, or the number of nodes in 1/λ.
         frequencies: (smallest, largest) 1/λ in 1/µm.
-        turned: the grating is periodic along y: x and y change places.
+        turned: whether the grating is periodic along y, so that x and y are exchanged.
     """
 
     period: float
@@ -86,51 +88,51 @@ class Layout:
             raise RequestError(f"energy table: got period {self.period}, frequencies {self.frequencies}")
         if min(self.squares, self.first, self.cells, self.slices - (not self.lines)) < 1:
             raise RequestError(
-                f"energy table: got {self.squares}, {self.first}, {self.cells}, {self.slices}, wanted at least one"
+                f"energy table: got {self.squares}, {self.first}, {self.cells}, {self.slices}, wanted at least one each"
             )
 
     @property
     def lines(self) -> bool:
-        """Whether it is of a line grating."""
+        """Whether the table is that of a line grating."""
         return self.period > 0
 
     @property
     def side(self) -> int:
-        """Cells along u or v, or along a side of the square."""
+        """Number of grid cells along u or v, or along a side of the square."""
         return self.first + (self.squares - 1) * self.cells
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """Slices, nodes along v and u: a unit square has its own."""
+        """(slices, nodes along v, nodes along u); unit squares share no nodes."""
         return self.slices, self.side + self.squares, self.side + self.squares
 
     @classmethod
     def of(cls, furnace: Furnace, min_lateral_scale: float = 1.0) -> Layout:
-        """Choose the layout: as fine as the work allows."""
+        """Choose the layout: as fine as `MAX_NODES` and `MAX_NODE_COMPONENT_PAIRS` allow."""
         spectrum, grid = furnace.spectrum, furnace.spectrum.grid
-        lowest, highest = frequencies_of(spectrum, furnace.index)
-        frequencies = lowest * min(min_lateral_scale, 1), highest
+        min_frequency, max_frequency = frequencies_of(spectrum, furnace.index)
+        frequencies = min_frequency * min(min_lateral_scale, 1), max_frequency
         if furnace.index is not None or not (isinstance(grid, OrderGrid) and 1 in grid.shape):
-            nodes = min(PAIRS / (len(furnace.q) * (1 if furnace.index is None else 6)), MAX_NODES)
+            nodes = min(MAX_NODE_COMPONENT_PAIRS / (len(furnace.q) * (1 if furnace.index is None else 6)), MAX_NODES)
             slices = int(min(MIN_SLICES + _phase(furnace, frequencies) / SLICE_PHASE, MAX_SLICES))
             return cls(0.0, 1, max(int(np.sqrt(nodes / slices)) - 1, 8), 1, slices, frequencies)
         turned = grid.shape[1] == 1 and grid.shape[0] > 1
-        # About half of the squares have light.
-        side = np.sqrt(2 * min(LINE_NODES, PAIRS / max(len(furnace.q) / 2, 1)))
+        # In about half of the unit squares 1/λ is in range.
+        side = np.sqrt(2 * min(MAX_LINE_NODES, MAX_NODE_COMPONENT_PAIRS / max(len(furnace.q) / 2, 1)))
         first = int(np.clip(side / 8, 4, 24))
         period, rest = grid.tile_size[int(turned)], (side - 2 * first - 1) / 3
-        period /= max(np.ceil(2 * period * highest / max(rest, 2)), 1)
-        squares = int(np.ceil(2 * period * highest))
+        period /= max(np.ceil(2 * period * max_frequency / max(rest, 2)), 1)
+        squares = int(np.ceil(2 * period * max_frequency))
         cells = int(np.clip((3 * rest / max(squares - 1, 1) - 1) / 2, 1, 48))
         return cls(float(period), squares, first, cells, 1, frequencies, turned)
 
     @property
     def squares_of_cells(self) -> NDArray[np.int64]:
-        """The unit square of each cell along u or v: the cell k has the nodes k + this number and the next."""
+        """The index s_k of the unit square of each grid cell k along u or v; its nodes are k + s_k and k + s_k + 1."""
         return np.repeat(np.arange(self.squares), [self.first] + [self.cells] * (self.squares - 1))
 
     def nodes(self) -> Real:
-        """Return the coordinates of all nodes, (n, 3), in the order of `shape`, as `directions` takes them."""
+        """Return the coordinates of all nodes, (n, 3), in the order of `shape`, for `directions`."""
         axis: Real = np.arange(self.shape[1], dtype=np.float64)
         if self.lines:
             counts = [self.first] + [self.cells] * (self.squares - 1)
@@ -140,10 +142,10 @@ class Layout:
         return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
 
     def directions(self, coordinates: Real, frequency: float = np.inf) -> tuple[Real, Real]:
-        """Return ω (n, 3) and λ in µm (n,) of coordinates (n, 3): slice, row and column in cells; or 0, v and u.
+        """Return ω (n, 3) and λ in µm (n,) at coordinates (n, 3): slice, row and column in grid cells; or 0, v and u.
 
-        Many directions of a line grating have the same u and v: of those in the range of the table the one is returned
-        whose 1/λ is the closest to `frequency`.
+        Many directions of a line grating have the same u and v. Of those whose 1/λ is in the range of the table, the
+        one with 1/λ closest to `frequency` is returned.
         """
         first, last = self.frequencies
         nu, row, column = coordinates.T
@@ -163,13 +165,13 @@ class Layout:
 
 @dataclass(frozen=True, eq=False)
 class EnergyTable:
-    """e at nodes, linear between them.
+    """The bound e at nodes, linear between them.
 
     Attributes:
         layout: the nodes of directions and wavelengths.
         ratios: the nodes of h/s, equidistant.
-        values: uint8 (ratios, ways, *layout.shape): e = min(1, `MAX_E`/255 · value). The ways are one, or, of an
-            interface, reflected and transmitted light from above, and the same from below.
+        values: uint8 (ratios, channels, *layout.shape): e = min(1, `MAX_E`/255 · value). There is one channel; or for
+            an interface four: light from above, reflected and transmitted, and light from below, likewise.
     """
 
     layout: Layout
@@ -190,12 +192,12 @@ class EnergyTable:
         index: float | None = None,
         min_lateral_scale: float = 1.0,
     ) -> EnergyTable:
-        """Make the table of `spectrum`.
+        """Compute the table of `spectrum`.
 
         Args:
-            spectrum: S(q; κ); of an interface for wavelengths in the denser medium.
+            spectrum: S(q; κ); for an interface, of wavelengths in the denser medium.
             ratios: the nodes of h/s, equidistant.
-            index: of the medium below relative to that above, if light is transmitted.
+            index: n below relative to n above, if light is transmitted.
             min_lateral_scale: the smallest s.
         """
         sides = [Furnace.of(spectrum, max(ratios), index, side) for side in ((1,) if index is None else (1, -1))]
@@ -203,17 +205,17 @@ class EnergyTable:
         nodes = layout.nodes()
         if layout.lines:
             # u + v = 2cT/λ
-            lit = np.floor(nodes[:, 1:]).sum(-1) < 2 * layout.period * layout.frequencies[1]
+            used = np.floor(nodes[:, 1:]).sum(-1) < 2 * layout.period * layout.frequencies[1]
         else:
-            lit = np.ones(len(nodes), bool)
-        omega, wavelengths = layout.directions(nodes[lit], float(np.mean(layout.frequencies)))
+            used = np.ones(len(nodes), bool)
+        omega, wavelengths = layout.directions(nodes[used], float(np.mean(layout.frequencies)))
         e = np.ones((len(ratios), 1 if index is None else 4, len(nodes)))
         for k, ratio in enumerate(ratios):
-            found = [
+            bounds = [
                 bounds_of(dataclasses.replace(side, height_scale=ratio).albedo(omega, wavelengths / n), side.index)
                 for side, n in zip(sides, (1.0, index or 1.0), strict=False)
             ]
-            e[k, :, lit] = np.concatenate(found).T
+            e[k, :, used] = np.concatenate(bounds).T
         e = e.reshape(*e.shape[:2], *layout.shape)
         if _phase(sides[0], layout.frequencies) > (MAX_SLICES - MIN_SLICES) * SLICE_PHASE:
             # Of a relief so deep e has no smooth course from node to node: each gets the smallest of its neighbours,
@@ -224,16 +226,20 @@ class EnergyTable:
 
     @property
     def needed(self) -> bool:
-        """Whether some direction would reflect more than it receives."""
+        """Whether the albedo exceeds one for any direction."""
         return bool(self.values.min() * (MAX_E / 255) < 1)
 
     def corners(self) -> NDArray[np.uint8]:
-        """Return the values at (u, v), (u⁺, v), (u, v⁺), (u⁺, v⁺) of cells, (ratios, ways, slices, side, side, 4)."""
+        """Return the values at the corners (u, v), (u⁺, v), (u, v⁺), (u⁺, v⁺) of grid cells.
+
+        Returns:
+            (ratios, channels, slices, side, side, 4).
+        """
         start = np.arange(self.layout.side) + self.layout.squares_of_cells
         return np.stack([self.values[..., start[:, None] + j, start + i] for j, i in np.ndindex(2, 2)], -1)
 
     def as_plain(self) -> dict[str, Any]:
-        """Return the table, of reflected light and one ratio, as numbers and texts, for JSON."""
+        """Return a table of one channel and one ratio as numbers and strings, for JSON."""
         packed = base64.b64encode(zlib.compress(self.values.tobytes(), 9)).decode("ascii")
         return {"layout": dataclasses.asdict(self.layout), "values": packed}
 
@@ -249,7 +255,7 @@ class EnergyTable:
         layout = Layout(**{**plain["layout"], "frequencies": tuple(plain["layout"]["frequencies"])})
         size = int(np.prod(layout.shape, dtype=np.int64))
         try:
-            # No more than there should be: a damaged file may hold a long row of zeros.
+            # A limit, as a damaged file may expand without end.
             content = zlib.decompressobj().decompress(base64.b64decode(plain["values"]), size + 1)
         except (zlib.error, binascii.Error) as error:
             raise RequestError(f"energy table: {error}") from None
@@ -265,30 +271,31 @@ def _phase(furnace: Furnace, frequencies: tuple[float, float]) -> float:
 
 
 def frequencies_of(spectrum: PowerSpectrum, index: float | None) -> tuple[float, float]:
-    """Return (smallest, largest) 1/λ in 1/µm of a table; `index` is η as of `Furnace`."""
-    # Those of the spectrum are in the denser medium.
+    """Return (smallest, largest) 1/λ in 1/µm of a table; `index` is η of `Furnace`."""
+    # The wavelengths of the spectrum are in the denser medium.
     shortest, longest = (w * 1e-3 * max(index or 1, 1) for w in spectrum.wavelengths)
     return 1 / longest, 1 / shortest
 
 
 def bounds_of(albedo: Real, index: float | None) -> Real:
-    """Return e from what the furnace finds.
+    """Return e from the albedo that the furnace finds.
 
-    Reflected light alone has e = 1/max(1, a). Of an interface transmitted light comes first, as scalar theory sends all
-    of it on where steep facets reflect it totally, but for what a plane reflects at normal incidence, F₀:
+    Reflected light alone has e = 1/max(1, a). For an interface transmitted light has priority over all reflected light
+    except F₀, the reflectance of a plane at normal incidence, since scalar theory transmits light that steep facets
+    reflect totally:
 
         e_T = min(1, (1 − min(R, F₀))/T),    e_R = min(1, (1 − e_T T)/R),    e_R R + e_T T = min(1, R + T)
 
     Args:
         albedo: (1, n), or R and T (2, n).
-        index: η; None of reflected light alone.
+        index: η; None for reflected light alone.
 
     Returns:
-        As `albedo`; of reflected light alone up to `MAX_E`.
+        Shape of `albedo`; for reflected light alone up to `MAX_E`.
     """
     if index is None:
         return np.minimum(1 / np.maximum(albedo, 1e-9), MAX_E)
     r, t = albedo
-    # No more than one: e_R is so steep there that what lies between nodes would lower them by more.
+    # At most one: e_R is so steep at its kink that larger values would err by more between nodes.
     e_t = np.minimum(1, (1 - np.minimum(r, ((index - 1) / (index + 1)) ** 2)) / np.maximum(t, 1e-9))
     return np.stack([np.minimum(1, (1 - e_t * t) / np.maximum(r, 1e-9)), e_t])

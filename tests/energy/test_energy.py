@@ -1,4 +1,4 @@
-"""The albedo of a perfect mirror is about one at most, and E is one where the model conserves energy by itself."""
+"""The albedo of a perfect mirror is at most about one, and E is one where the model conserves energy by itself."""
 
 import functools
 import gc
@@ -40,7 +40,7 @@ def spectrum(name, coherence_length=65.0):
 
 
 def random_surface(seed):
-    """A random height field, and what to precompute it with.
+    """A random height field and settings of its spectrum.
 
     Heights to 10 µm, sides from 0.5 to 30 µm of at most 64 pixels, coherence lengths from 0.3 to 300 µm; rough, smooth
     or uniform along y: line and crossed gratings, overlapping orders and samples.
@@ -61,16 +61,16 @@ def random_surface(seed):
     return md.HeightField(h, pixel), {"extent": extent, "coherence_length": coherence_length}
 
 
-def anywhere(rng, count, steepest=89.9):
+def random_directions(rng, count, max_angle=89.9):
     """Directions, half of them beyond 70°, and λ in nm."""
-    theta = np.deg2rad(rng.uniform(np.where(rng.random(count) < 0.5, 0, min(70, steepest)), steepest))
+    theta = np.deg2rad(rng.uniform(np.where(rng.random(count) < 0.5, 0, min(70, max_angle)), max_angle))
     phi = rng.uniform(0, 2 * np.pi, count)
     omega = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1)
     return omega, rng.uniform(360, 830, count)
 
 
 def albedos(bsdf, omega, wavelengths, samples, seed=0):
-    """Means of what is reflected and transmitted, and their standard errors, (n,), by the BSDF's own samples."""
+    """Albedo by the BSDF's own samples, reflected and transmitted together, and its standard error, (n,)."""
     rng = np.random.default_rng(seed)
     wavelengths = np.repeat(wavelengths[:, None], 4, 1)
     si = testing.interaction(np.repeat(omega, samples, 0), np.repeat(wavelengths, samples, 0))
@@ -99,33 +99,33 @@ def test_no_albedo_of_a_random_surface_is_above_one(seed):
     except ValueError as refusal:
         pytest.skip(str(refusal))
     bsdf = plugin(of, **KINDS[kind])
-    omega, wavelengths = anywhere(np.random.default_rng(seed), 16)
+    omega, wavelengths = random_directions(np.random.default_rng(seed), 16)
     if kind in ("interface", "sheet"):
         omega[1::2, 2] *= -1
     mean, error = albedos(bsdf, omega, wavelengths, 1 << 12)
-    # What seems to exceed one is measured again, independently and more exactly.
+    # Where the albedo seems to exceed one it is measured again, independently and with more samples.
     again = np.flatnonzero(mean > 1.0)
     if len(again):
         mean[again], error[again] = albedos(bsdf, omega[again], wavelengths[again], 1 << 16, 1)
-    certain = mean - 3 * error
+    lower_bound = mean - 3 * error
     if of.height_range > 1:
-        assert (certain > 1.02).mean() <= 0.25
+        assert (lower_bound > 1.02).mean() <= 0.25
     else:
-        assert certain.max() <= 1.02
-        assert (certain > 1.01).sum() <= 1
+        assert lower_bound.max() <= 1.02
+        assert (lower_bound > 1.01).sum() <= 1
 
 
 @pytest.mark.few(1)
 @pytest.mark.parametrize("name", ["deep blazed", "crossed", "xenopeltis"])
 def test_no_albedo_of_a_named_surface_is_above_one(name):
-    omega, wavelengths = anywhere(np.random.default_rng(5), 24)
+    omega, wavelengths = random_directions(np.random.default_rng(5), 24)
     mean, error = albedos(plugin(spectrum(name)), omega, wavelengths, 1 << 14)
     assert (mean - 3 * error).max() <= 1.01
 
 
 @pytest.mark.parametrize("height_scale", [0.3, 0.7])
 def test_no_albedo_above_one_for_scaled_heights(height_scale):
-    omega, wavelengths = anywhere(np.random.default_rng(2), 12)
+    omega, wavelengths = random_directions(np.random.default_rng(2), 12)
     mean, error = albedos(plugin(spectrum("deep blazed"), height_scale=height_scale), omega, wavelengths, 1 << 14)
     assert (mean - 3 * error).max() <= 1.01
 
@@ -138,14 +138,14 @@ def energies(bsdf, omega, wavelength):
 
 @pytest.mark.parametrize("name", ["blazed", "crossed"])
 def test_e_is_one_where_the_albedo_is_less(name):
-    of, (omega, _) = spectrum(name), anywhere(np.random.default_rng(6), 2000, 80)
+    of, (omega, _) = spectrum(name), random_directions(np.random.default_rng(6), 2000, 80)
     a = Furnace.of(of).albedo(omega, np.full(len(omega), 0.5))[0]
     e = energies(plugin(of), omega, 500)
     assert (e[a < 0.9] == 1).mean() > 0.98
-    # Both as the furnace has them, on average.
-    lost = 1 - e * np.maximum(a, 1)
-    assert lost[lost > 0].sum() < 0.005 * len(lost)
-    assert lost.min() > -0.05
+    # The table agrees with the furnace on average.
+    loss = 1 - e * np.maximum(a, 1)
+    assert loss[loss > 0].sum() < 0.005 * len(loss)
+    assert loss.min() > -0.05
 
 
 def test_a_flat_surface_is_unchanged_away_from_the_horizon():
@@ -159,12 +159,12 @@ def test_a_flat_surface_is_unchanged_away_from_the_horizon():
 @pytest.mark.parametrize("name", ["deep blazed", "crossed"])
 def test_the_energy_factor_is_reciprocal(name):
     energy, rng = plugin(spectrum(name)).layers.grating.theory.energy, np.random.default_rng(8)
-    (i, wavelengths), (o, _) = anywhere(rng, 1000), anywhere(rng, 1000)
+    (i, wavelengths), (o, _) = random_directions(rng, 1000), random_directions(rng, 1000)
     pair = [energy.coordinates(vectors(omega)) for omega in (i, o)]
     frequency = floats(1e3 / wavelengths)
-    there, back = (np.array(energy.factor(p, frequency)) for p in (pair, pair[::-1]))
-    np.testing.assert_array_equal(there, back)
-    assert there.min() < 0.95
+    forward, reverse = (np.array(energy.factor(p, frequency)) for p in (pair, pair[::-1]))
+    np.testing.assert_array_equal(forward, reverse)
+    assert forward.min() < 0.95
 
 
 def test_lobes_wider_than_the_hemisphere_have_a_table():
@@ -181,7 +181,7 @@ def test_a_period_far_below_the_wavelength_needs_no_energy_factor():
 
 
 def test_the_derivative_by_height_includes_that_of_the_energy_factor():
-    of, (omega, _) = spectrum("deep blazed"), anywhere(np.random.default_rng(9), 300)
+    of, (omega, _) = spectrum("deep blazed"), random_directions(np.random.default_rng(9), 300)
 
     def exact(scale):
         return 1 / np.maximum(1, Furnace.of(of, scale).albedo(omega, np.full(300, 0.5))[0])
@@ -199,8 +199,8 @@ def test_the_derivative_by_height_includes_that_of_the_energy_factor():
     assert np.corrcoef(np.array(dr.grad(e)), wanted)[0, 1] > 0.98
 
 
-def test_where_heights_vary_e_is_that_of_each():
-    of, (omega, _) = spectrum("deep blazed"), anywhere(np.random.default_rng(10), 300)
+def test_e_of_textured_heights_is_that_of_each_uniform_height():
+    of, (omega, _) = spectrum("deep blazed"), random_directions(np.random.default_rng(10), 300)
     texture = {"type": "checkerboard", "color0": 0.5, "color1": 0.9}
     energy = plugin(of, height_scale=texture).layers.grating.theory.energy
     coordinates, frequency = energy.coordinates(vectors(omega)), floats(np.full(300, 2.0))
@@ -214,10 +214,10 @@ def test_without_shadowing_there_is_no_bound():
     assert plugin(spectrum("blazed"), shadowing="none").layers.grating.theory.energy is None
 
 
-def test_a_grating_of_one_column_is_that_of_one_row_turned():
+def test_a_grating_of_one_column_is_a_rotated_grating_of_one_row():
     blaze = MAKE["deep blazed"]()
     turned = md.precompute(md.HeightField(np.ascontiguousarray(blaze.heights.T), blaze.pixel_size[::-1]))
-    omega, _ = anywhere(np.random.default_rng(12), 500)
+    omega, _ = random_directions(np.random.default_rng(12), 500)
     along = energies(plugin(spectrum("deep blazed")), omega, 500)
     np.testing.assert_allclose(energies(plugin(turned), omega[:, [1, 0, 2]], 500), along, atol=0.01)
 
@@ -225,13 +225,13 @@ def test_a_grating_of_one_column_is_that_of_one_row_turned():
 def test_the_table_is_stored_with_the_spectrum(tmp_path, monkeypatch):
     of = spectrum("deep blazed")
     of.save(tmp_path / "s.exr")
-    monkeypatch.setattr(EnergyTable, "of", lambda *_: pytest.fail("made again"))
+    monkeypatch.setattr(EnergyTable, "of", lambda *_: pytest.fail("computed again"))
     loaded = md.GratingSpectrum.load(tmp_path / "s.exr")
     assert loaded.digest == of.digest
-    there, here = loaded.energy_table(), of.energy_table()
-    np.testing.assert_array_equal(there.values, here.values)
-    assert (there.layout, there.ratios) == (here.layout, here.ratios)
-    assert here.values.nbytes < 4e5
+    found, wanted = loaded.energy_table(), of.energy_table()
+    np.testing.assert_array_equal(found.values, wanted.values)
+    assert (found.layout, found.ratios) == (wanted.layout, wanted.ratios)
+    assert wanted.values.nbytes < 4e5
     bsdf = mi.load_dict({"type": "diffraction_grating", "filename": str(tmp_path / "s.exr")})
     assert bsdf.layers.grating.theory.energy is not None
 

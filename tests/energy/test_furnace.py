@@ -1,4 +1,4 @@
-"""The furnace against closed forms: reflected orders one by one, and what an interface reflects and transmits."""
+"""The furnace against closed forms: reflected orders one by one, and reflection and transmission of an interface."""
 
 import functools
 
@@ -23,9 +23,9 @@ def spectrum(name, **settings):
     return md.precompute(PROFILES[name][0], wavelengths=(SHORT / INDEX, LONG / INDEX), **settings)
 
 
-def slanted(rng, count, steepest):
-    """Directions uniform in the polar angle, up to `steepest` degrees."""
-    theta, phi = np.deg2rad(rng.uniform(0, steepest, count)), rng.uniform(0, 2 * np.pi, count)
+def oblique(rng, count, max_angle):
+    """Directions uniform in the polar angle, up to `max_angle` degrees."""
+    theta, phi = np.deg2rad(rng.uniform(0, max_angle, count)), rng.uniform(0, 2 * np.pi, count)
     return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1)
 
 
@@ -49,7 +49,7 @@ def pair(wi, wo, n_i, n_o):
 
 
 def closed_form(power, period, omega, wavelength, side):
-    """R and T by the orders; ω with its z > 0 on the side it comes from, λ in µm in vacuum."""
+    """R and T by the orders; ω has z > 0 on its own side, λ is in µm in vacuum."""
     n_i, n_o = (1.0, INDEX) if side > 0 else (INDEX, 1.0)
     wi = omega * [1, 1, side]
     total = np.zeros(2)
@@ -72,11 +72,11 @@ def closed_form(power, period, omega, wavelength, side):
 
 @pytest.mark.parametrize("side", [1, -1])
 @pytest.mark.parametrize("name", PROFILES)
-def test_the_furnace_of_an_interface_is_the_closed_form(name, side):
+def test_the_furnace_of_an_interface_agrees_with_the_closed_form(name, side):
     rng = np.random.default_rng(1)
-    omega, wavelengths = slanted(rng, 40, 88), rng.uniform(SHORT, LONG, 40) * 1e-3
+    omega, wavelengths = oblique(rng, 40, 88), rng.uniform(SHORT, LONG, 40) * 1e-3
     wanted = np.array([closed_form(PROFILES[name][1], 2.5, *at, side) for at in zip(omega, wavelengths, strict=True)]).T
-    # Of lobes so narrow that none meets the horizon.
+    # Lobes so narrow that none meets the horizon.
     furnace = Furnace.of(spectrum(name, coherence_length=5000), 1.0, INDEX, side)
     found = furnace.albedo(omega, wavelengths / (1 if side > 0 else INDEX))
     np.testing.assert_allclose(found, wanted, atol=4e-3)
@@ -84,7 +84,7 @@ def test_the_furnace_of_an_interface_is_the_closed_form(name, side):
 
 
 @pytest.mark.parametrize("theta", [0, 20, 40])
-def test_a_deep_film_keeps_the_light_that_the_closed_form_transmits(theta):
+def test_transmission_of_a_deep_film_agrees_with_the_closed_form(theta):
     period, amplitude, wavelength = 2.0, 0.2, 0.55
     of = md.precompute(
         md.gratings.crossed(period, 2 * amplitude, samples=40),
@@ -120,16 +120,16 @@ def order_albedo(of, omega, wavelength, steps=161):
             continue
         s_o = np.stack([-t_i[0] - width * x, -t_i[1] - width * y], -1)
         t_o, square = s_o + offset, 1 - (s_o**2).sum(-1)
-        seen = (square > 0) & ((t_o**2).sum(-1) < 1)
-        d = [(1 - (t[..., :2] ** 2).sum(-1)) / (2 * width) for t in (omega[:2], t_i, s_o[seen], t_o[seen])]
-        cos_o = np.sqrt(square[seen])
+        kept = (square > 0) & ((t_o**2).sum(-1) < 1)
+        d = [(1 - (t[..., :2] ** 2).sum(-1)) / (2 * width) for t in (omega[:2], t_i, s_o[kept], t_o[kept])]
+        cos_o = np.sqrt(square[kept])
         w = omega[2] + cos_o
         gain = horizon_gain(min(d[0], d[1])) * horizon_gain(np.minimum(d[2], d[3]))
         kappa = np.minimum(2 * np.pi * w / wavelength, of.max_kappa)
         power = of.table.powers_at(np.full(w.shape, row[m]), np.full(w.shape, column[m]), kappa)
-        c_i = np.sqrt((omega[2] ** 2 + 1 - (t_o[seen] ** 2).sum(-1)) / 2)
+        c_i = np.sqrt((omega[2] ** 2 + 1 - (t_o[kept] ** 2).sum(-1)) / 2)
         c_o = np.sqrt((cos_o**2 + 1 - t_i @ t_i) / 2)
-        total += (weight[seen] * gain * k_g(c_i, c_o, offset @ offset) * power).sum()
+        total += (weight[kept] * gain * k_g(c_i, c_o, offset @ offset) * power).sum()
     return total
 
 
@@ -137,7 +137,7 @@ def order_albedo(of, omega, wavelength, steps=161):
 @pytest.mark.parametrize("coherence_length", [65.0, 20.0])
 def test_the_furnace_is_the_integral_over_the_lobes_of_orders(depth, coherence_length):
     of, rng = md.precompute(md.gratings.blazed(2.5, depth), coherence_length=coherence_length), np.random.default_rng(3)
-    omega, wavelengths = slanted(rng, 8, 89), rng.uniform(0.36, 0.83, 8)
+    omega, wavelengths = oblique(rng, 8, 89), rng.uniform(0.36, 0.83, 8)
     wanted = [order_albedo(of, *at) for at in zip(omega, wavelengths, strict=True)]
     np.testing.assert_allclose(Furnace.of(of).albedo(omega, wavelengths)[0], wanted, rtol=0.02)
 
@@ -145,7 +145,7 @@ def test_the_furnace_is_the_integral_over_the_lobes_of_orders(depth, coherence_l
 def test_the_mean_cosine_of_a_lobe_far_from_the_horizon_is_that_of_its_centre():
     square, sigma = np.array([0.2, 0.5, 1.0]), 0.003
     np.testing.assert_allclose(mean_cosine(square, sigma), np.sqrt(square), rtol=1e-4)
-    # At the horizon: g(0) = √e, and of a lobe cut in half half is seen.
+    # At the horizon: g(0) = √e, for a lobe that the horizon cuts in half.
     y = np.linspace(0, 20, 20001)
     density = np.sqrt(np.e) * horizon_gain(y) * np.exp(-(y**2) / 2) / np.sqrt(2 * np.pi)
     expected = np.trapezoid(density * np.sqrt(y / 2), y) * np.sqrt(2 * sigma)
