@@ -24,7 +24,7 @@ from .geometry import k_g, transmitted
 from .reference import amplitudes
 from .rigorous.coordinate_transformation import curve_of, is_profile
 from .rigorous.efficiencies import converge
-from .rigorous.spectrum import LARGEST_PERIOD
+from .rigorous.spectrum import MAX_PERIOD_IN_WAVELENGTHS
 from .settings import VISIBLE
 from .spectrum.grids import OrderGrid
 from .surface.heightfield import HeightField
@@ -351,7 +351,7 @@ def scalar_error(height_field: HeightField, extent: str = "tile") -> ScalarError
     """
     lengths, power, rms_height = height_spectrum(height_field, extent)
     depth = equivalent_depth(rms_height)
-    longest = LARGEST_PERIOD * VISIBLE[0] * 1e-3
+    longest = MAX_PERIOD_IN_WAVELENGTHS * VISIBLE[0] * 1e-3
     solved = float("nan"), float("nan")
     if not (extent == "tile" and is_profile(height_field)):
         remedy = "no rigorous theory is offered for a surface that varies along y"

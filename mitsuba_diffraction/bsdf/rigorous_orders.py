@@ -95,7 +95,7 @@ class RigorousOrders:
         self.interface = spectrum.transmission == "interface"
         self.max_order = axes.max_order
         self.starts = NumberTable(axes.starts.astype(np.uint32))
-        self.excess, self.top = opaque(axes.excess), opaque(axes.top)
+        self.excess, self.top = opaque(axes.excess), opaque(axes.excess_limit)
         self.bins_per_unit = TRANSMISSION_BINS_PER_UNIT if self.transmits else BINS_PER_UNIT
         units = _probability_units(*_bin_efficiencies(spectrum, self.bins_per_unit))
         self.wavelength_bins, self.bins_across = units.shape[-4], units.shape[-2]
@@ -375,7 +375,7 @@ def _bin_efficiencies(spectrum: RigorousSpectrum, bins_per_unit: int) -> tuple[N
     The ways are above → above and, with transmission, above → below, below → below, below → above.
     """
     axes = spectrum.axes
-    nu, max_order = axes.largest, axes.max_order
+    nu, max_order = axes.max_nu, axes.max_order
     ways = [(0, 0)] if spectrum.transmission == "none" else [(0, 0), (0, 1), (1, 1), (1, 0)]
     m = np.arange(-max_order, max_order + 1)
     across = int(np.ceil(2 * max(spectrum.indices) * nu)) * bins_per_unit

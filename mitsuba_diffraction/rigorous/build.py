@@ -37,39 +37,39 @@ from .efficiencies import (
     wave_numbers,
 )
 from .materials import refractive_index
-from .spectrum import LARGEST_PERIOD, Axes, RigorousSpectrum, edges_of, rank, shares_at
+from .spectrum import MAX_PERIOD_IN_WAVELENGTHS, Axes, RigorousSpectrum, fractions_at_nodes, interval_bounds, rank
 
 Real = NDArray[np.float64]
-# n of the orders in and out, and their matrices, (orders out, orders in, 4, 4).
+# n of the incident and of the outgoing orders, and their matrices, (outgoing orders, incident orders, 4, 4).
 _Orders = tuple[NDArray[np.int64], NDArray[np.int64], Real]
-# α, g, λ, whether an order is near its Rayleigh anomaly, and (from, to) → m and M_ij of the orders, (n, 4, 4).
-_Checked = tuple[float, float, float, bool, dict[tuple[int, int], tuple[NDArray[np.int64], Real]]]
+# α, g, λ, whether an order is near its Rayleigh anomaly, and (side of incidence, side of exit) → m and M_ij, (n, 4, 4).
+_Check = tuple[float, float, float, bool, dict[tuple[int, int], tuple[NDArray[np.int64], Real]]]
 
-# Steps of F, X and (with transmission) Z that are solved, one after the other until the error is kept. Most along X, on
-# which depends by how much light that grazes the surface enters it; along F, plasmons of metals are narrow.
-_SOLVED = ((12, 15, 12), (18, 24, 18))
-# Where light passes a third more steps are stored, and at least these, by cubic polynomials, as most of the time goes
-# into solutions; of large periods the first of them are enough.
-_SOLVED_BOTH = ((4, 6, 4), (6, 9, 6), (9, 15, 9), (12, 18, 12))
-_LEAST_STORED = 8, 12, 8
-PLANES = 17
-_PLACES = 20  # to each step that is stored, where a table is fitted to its polynomials
-# Wavelengths that are solved, by the least g λ / T (the cosine of the cone angle) of these: metals in light along the
-# grooves show narrow lines that move with the wavelength.
-_CONES = ((0.45, 17), (0.7, 9), (1.0, 5))
-# η is stored in steps of this: files are half as large.
-_ROUNDED = 2.0**-16
-# An order at exactly grazing exit has no Rayleigh wave. sin² at the first and the last node.
-_OFF = 1e-12
-_STILL = 1e-8  # γ²
-_LEAST_K_Y = 1e-4  # matrices are divided by k_y
-_NEAR = 0.02
-_CHECKS = 200
-_SECONDS = 20.0  # between checkpoints, each of which is written whole
-# Light at which the harmonics are chosen: near the normal, and oblique from both sides.
-_HARD = ((0.1, 0, 1), (0.8, 0.3, 0.5), (-0.8, 0.3, 0.5))
+# Steps of F, X and (with transmission) Z at which Maxwell's equations are solved; the first that keeps the tolerance is
+# taken. X needs most, as it resolves transmission at grazing incidence; F resolves the narrow plasmons of metals.
+_SOLVED_STEPS = ((12, 15, 12), (18, 24, 18))
+# With transmission, solutions take most of the time: the table stores a third more steps, and at least these, of cubic
+# polynomials. For large periods the first entry is enough.
+_SOLVED_STEPS_TRANSMISSION = ((4, 6, 4), (6, 9, 6), (9, 15, 9), (12, 18, 12))
+_MIN_STORED_STEPS = 8, 12, 8
+WAVELENGTH_NODES = 17
+_FIT_POINTS = 20  # per stored step, of the least-squares fit of a table to its polynomials
+# (largest g λ / T, number of solved wavelengths). g λ / T is the cosine of the cone angle: with incidence along the
+# grooves, metals show narrow lines that move with the wavelength.
+_SOLVED_WAVELENGTHS = ((0.45, 17), (0.7, 9), (1.0, 5))
+# η is stored as multiples of this, which halves the size of files.
+_ETA_STEP = 2.0**-16
+# Distance of the first and the last node from 0 and 1, in sin²: an order at exactly grazing exit has no Rayleigh wave.
+_MIN_FRACTION = 1e-12
+_MIN_SQUARE = 1e-8  # |γ²|
+_MIN_K_Y = 1e-4  # matrices are divided by k_y
+_MAX_ANOMALY_DISTANCE = 0.02  # of P or R from an integer, near a Rayleigh anomaly
+_CHECK_COUNT = 200
+_CHECKPOINT_SECONDS = 20.0  # between checkpoints, each of which is written as a whole
+# Directions for which the harmonics are chosen: near the normal, and oblique from both sides.
+_HARMONICS_DIRECTIONS = ((0.1, 0, 1), (0.8, 0.3, 0.5), (-0.8, 0.3, 0.5))
 BUILD_VERSION = 7  # raised when tables of equal requests change
-MATRICES = 3.0
+MAX_POLARISATION_ERROR = 3.0
 """Bound of `polarisation_error`, in tolerances: matrices vary faster than η."""
 
 
@@ -85,31 +85,31 @@ def build_spectrum(
         height_field: the surface; rows that differ are refused.
         settings: of rigorous theory. The tolerance bounds `RigorousSpectrum.error`, the mean of Σ|Δη_m| / Σ η_m over
             directions and wavelengths, and a third of `polarisation_error`.
-        progress: called with (per cent done, 100); it never counts back.
-        checkpoints: a folder for what is done so far; an interrupted build goes on from there.
+        progress: called with (per cent done, 100), never decreasing.
+        checkpoints: a folder for intermediate results, from which an interrupted build resumes.
 
     Raises:
-        ValueError: if the material is unknown, the period is above ten of the shortest wavelength, or the profile is
+        ValueError: if the material is unknown, the period exceeds ten times the shortest wavelength, or the profile is
             too deep for efficiencies that converge and conserve energy within the tolerance.
 
     Warns:
-        UserWarning: if the finest table errs by more than the tolerance, or its Mueller matrices by more than three
-            times that; `error` and `polarisation_error` say by how much.
+        UserWarning: if `error` of the finest table exceeds the tolerance, or `polarisation_error` three times that.
     """
     tolerance = 1e-2 if settings.tolerance is None else settings.tolerance
-    period, longest = height_field.tile_size[0], LARGEST_PERIOD * settings.wavelengths[0] * 1e-3
-    if period > longest:
+    period = height_field.tile_size[0]
+    max_period = MAX_PERIOD_IN_WAVELENGTHS * settings.wavelengths[0] * 1e-3
+    if period > max_period:
         raise RequestError(
-            f"period: got {period:.4g} µm, wanted at most {longest:.4g} µm with theory=rigorous, "
-            f"{LARGEST_PERIOD:g} times the shortest wavelength; use theory=scalar"
+            f"period: got {period:.4g} µm, wanted at most {max_period:.4g} µm with theory=rigorous, "
+            f"{MAX_PERIOD_IN_WAVELENGTHS:g} times the shortest wavelength; use theory=scalar"
         )
     with one_thread():
         surface = _Surface(height_field, settings, tolerance)
         checks = surface.checks()
         error, done = np.inf, 0
-        steps = _SOLVED if settings.transmission == "none" else _SOLVED_BOTH
+        steps = _SOLVED_STEPS if settings.transmission == "none" else _SOLVED_STEPS_TRANSMISSION
         for solved in steps:
-            # Half as many steps again leave less than half of the error: which table will be the last?
+            # Half as many steps again more than halve the error: an error of two tolerances predicts the last table.
             begin, done = done, 95 if error <= 2 * tolerance or solved == steps[-1] else done + 20
             build = _Build(surface, solved, settings.polarised)
             values, mueller = build.table(
@@ -130,8 +130,8 @@ def build_spectrum(
                 **dict.fromkeys(("error", "max_error", "max_error_near"), np.nan),
             )
             spectrum = dataclasses.replace(spectrum, **_errors(spectrum, checks))
-            # NaN: there are no matrices.
-            if spectrum.error <= tolerance and not spectrum.polarisation_error > MATRICES * tolerance:
+            # `polarisation_error` is NaN without matrices.
+            if spectrum.error <= tolerance and not spectrum.polarisation_error > MAX_POLARISATION_ERROR * tolerance:
                 progress(100, 100)
                 return spectrum
             error = spectrum.error
@@ -139,19 +139,19 @@ def build_spectrum(
     got, wanted = f"{spectrum.error:.2g}", f"{tolerance:.2g}"
     if settings.polarised:
         got += f" and {spectrum.polarisation_error:.2g} of the Mueller matrices"
-        wanted += f" and {MATRICES * tolerance:.2g}"
+        wanted += f" and {MAX_POLARISATION_ERROR * tolerance:.2g}"
     warnings.warn(
-        f"rigorous table: got a mean error of {got} with {max(steps[-1])} steps to a cell, wanted at most {wanted}",
+        f"rigorous table: got a mean error of {got} with {max(steps[-1])} steps per interval, wanted at most {wanted}",
         stacklevel=4,
     )
     return spectrum
 
 
 class _Surface:
-    """A surface and its material, ready to be solved.
+    """A surface, its material and the solver for them.
 
     Attributes:
-        harmonics: N, enough for a tenth of the tolerance at the shortest wavelength.
+        harmonics: N, which keeps a tenth of the tolerance at the shortest wavelength.
     """
 
     def __init__(self, height_field: HeightField, settings: Settings, tolerance: float) -> None:
@@ -161,19 +161,19 @@ class _Surface:
         self.tolerance = tolerance
         self.transmission = settings.transmission
         curve = curve_of(height_field)
-        self.harmonics = max(self._harmonics(curve, np.array(d) / np.linalg.norm(d)) for d in _HARD)
-        # The table takes the first; the others are for light that needs more, and for what it is compared with.
+        self.harmonics = max(self._harmonics(curve, np.array(d) / np.linalg.norm(d)) for d in _HARMONICS_DIRECTIONS)
+        # The table uses the first. The others serve light that needs more harmonics, and the checks.
         self.gratings = [Grating(curve, int(1.4**k * self.harmonics)) for k in range(5)]
         request = height_field.digest, self.wavelengths, self.material, settings.polarised, self.transmission
         self.digest = hashlib.sha256(repr((request, self.harmonics, BUILD_VERSION)).encode()).hexdigest()
 
     def index(self, wavelength: float) -> complex:
-        """Return n + ik below, relative to the medium above, where the wavelength is in µm."""
+        """Return n + ik below, relative to the medium above, for a wavelength in µm in the medium above."""
         int_ior, material, ext_ior = self.material
         return refractive_index(wavelength * ext_ior, int_ior=int_ior, material=material) / ext_ior
 
     def _harmonics(self, curve: Curve, omega: Real) -> int:
-        """Return the fewest harmonics that are right to a tenth of the tolerance, at the shortest wavelength."""
+        """Return the smallest N that keeps a tenth of the tolerance at the shortest wavelength."""
         index, k_0 = self.index(self.wavelengths[0]), self.period / self.wavelengths[0]
         exact = converge(curve, omega, k_0, index, self.tolerance / 20)
         if exact.error > self.tolerance:
@@ -182,7 +182,7 @@ class _Surface:
                 f"{1e3 * self.wavelengths[0]:.4g} nm, wanted at most {self.tolerance:.2g}; it is too deep for its "
                 "period with theory=rigorous"
             )
-        # At grazing incidence there are orders up to 2 T/λ.
+        # At grazing incidence orders propagate up to 2 T/λ.
         count, _ = wave_numbers(curve, k_0, index, np.array([1.0, 0.0, 0.0]))
         while count < exact.harmonics:
             found = solve(curve, omega, k_0, index, count)
@@ -193,7 +193,7 @@ class _Surface:
         return count
 
     def light(self, square: float, wavelength: float) -> tuple[float, complex]:
-        """Return ν² and γ'² of light of γ²."""
+        """Return ν² and γ'² for γ² = `square`."""
         nu2, index = (self.period / wavelength) ** 2, self.index(wavelength)
         return nu2, square + nu2 * ((index.real**2 if index.imag == 0 else index**2) - 1)
 
@@ -205,27 +205,34 @@ class _Surface:
         finer: int = 0,
         fields: Callable[[Grating, float, complex, bool], HalfSpace] = half_space,
     ) -> list[Scattered]:
-        """Solve for light of all orders from either side, for each (ν², γ'²); α of order 0 and γ² in (2π/T)².
+        """Solve for light of all orders from above and below, for each (ν², γ'²).
 
-        The harmonics, those of `gratings[finer]`, are raised where R + T is not one within the tolerance, or where R is
-        above one if the material absorbs. `fields` may remember results of `half_space`.
+        The harmonics are raised, from those of `gratings[finer]`, while R + T differs from one by more than the
+        tolerance, or R exceeds one if the material absorbs.
+
+        Args:
+            alpha: α of order 0, in units of 2π/T.
+            square: γ², in units of (2π/T)².
+            lights: pairs of ν² and γ'².
+            finer: index of the first of `gratings` to try.
+            fields: `half_space`, or a cached form of it.
         """
         lights = list(lights)
         for grating in self.gratings[finer:]:
             found, excess = [], 0.0
             above = fields(grating, alpha, square, True)
-            for nu2, inside in lights:
+            for nu2, square_below in lights:
                 index = self.index(self.period / np.sqrt(nu2))
                 k_y = np.emath.sqrt(nu2 - square)
-                k_y = k_y if abs(k_y) > _LEAST_K_Y else _LEAST_K_Y
-                solved = scatter(alpha + grating.n, above, fields(grating, alpha, inside, False), k_y, index)
-                for of_light in solved.amplitudes:
-                    beyond = np.asarray(sum(solved.powers(a).sum(axis=(0, 1)) for a in of_light)) - 1
-                    excess = max(excess, np.max(np.abs(beyond) if index.imag == 0 else beyond, initial=0))
+                k_y = k_y if abs(k_y) > _MIN_K_Y else _MIN_K_Y
+                solved = scatter(alpha + grating.n, above, fields(grating, alpha, square_below, False), k_y, index)
+                for of_side in solved.amplitudes:
+                    imbalance = np.asarray(sum(solved.powers(a).sum(axis=(0, 1)) for a in of_side)) - 1
+                    excess = max(excess, np.max(np.abs(imbalance) if index.imag == 0 else imbalance, initial=0))
                 found.append(solved)
             if excess <= self.tolerance:
                 return found
-        shortest, longest = (1e3 * self.period / np.sqrt(end(nu2 for nu2, _ in lights)) for end in (max, min))
+        shortest, longest = (1e3 * self.period / np.sqrt(limit(nu2 for nu2, _ in lights)) for limit in (max, min))
         raise RequestError(
             f"height field: got an excess of {excess:.2g} of the incident light with {grating.harmonics} harmonics at "
             f"{shortest:.4g} to {longest:.4g} nm, wanted at most {self.tolerance:.2g}; it is too deep for its period "
@@ -233,9 +240,11 @@ class _Surface:
         )
 
     def matrices(self, solved: Scattered, entries: int = 4) -> dict[tuple[int, int], _Orders]:
-        """Return (from, to) → n of the orders in and of those out, and M_ij, (orders out, orders in, entries, entries).
+        """Return the orders and their matrices by (side of incidence, side of exit).
 
-        With one entry it is η. Where k_y is imaginary, elements that are odd in k_y are so, too.
+        Returns:
+            n of the incident orders, n of the outgoing ones, and M_ij, (outgoing, incident, entries, entries); with one
+            entry η. Where k_y is imaginary, the elements that are odd in k_y are imaginary, too.
         """
         orders = solved.orders
         if self.transmission == "sheet":
@@ -243,87 +252,88 @@ class _Surface:
             found = through_sheet(solved, self.index(self.wavelengths[0]).real)
         else:
             sides = (ABOVE,) if self.transmission == "none" else (ABOVE, BELOW)
-            of_way = unpolarised if entries == 1 else matrices_of
-            found = {(i, o): of_way(solved, i, o) for i, o in itertools.product(sides, sides)}
+            compute = unpolarised if entries == 1 else matrices_of
+            found = {(i, o): compute(solved, i, o) for i, o in itertools.product(sides, sides)}
         return {(i, o): (orders[i], orders[o], m[..., :entries, :entries]) for (i, o), m in found.items()}
 
-    def checks(self) -> list[_Checked]:
-        """Return light at random places, directions uniform over the hemispheres, wavelengths over the range."""
+    def checks(self) -> list[_Check]:
+        """Solve at random directions, uniform over the hemispheres, and wavelengths, uniform over the range."""
         rng = np.random.default_rng(0)
         checks = []
-        for number, (cosine, turn, share) in enumerate(rng.random((_CHECKS, 3))):
-            wavelength = self.wavelengths[0] + share * (self.wavelengths[1] - self.wavelengths[0])
+        for number, (cosine, turn, fraction) in enumerate(rng.random((_CHECK_COUNT, 3))):
+            wavelength = self.wavelengths[0] + fraction * (self.wavelengths[1] - self.wavelengths[0])
             side = BELOW if self.transmission != "none" and number % 2 else ABOVE
-            inside = side == BELOW and self.transmission == "interface"
-            nu, n = self.period / wavelength, self.index(wavelength).real if inside else 1.0
+            in_medium = side == BELOW and self.transmission == "interface"
+            nu, n = self.period / wavelength, self.index(wavelength).real if in_medium else 1.0
             k = np.sqrt(1 - cosine**2) * n * nu
             alpha, k_y = k * np.cos(2 * np.pi * turn), k * np.sin(2 * np.pi * turn)
             g = np.sign(nu - abs(k_y)) * np.sqrt(abs(nu**2 - k_y**2))
             square = g * abs(g)
             (solved,) = self.solve(alpha, square, [self.light(square, wavelength)], finer=1)
             orders = {
-                way: (-of_out, matrices[:, of_in == 0][:, 0].real)
-                for way, (of_in, of_out, matrices) in self.matrices(solved).items()
-                if way[0] == side
+                sides: (-outgoing, matrices[:, incident == 0][:, 0].real)
+                for sides, (incident, outgoing, matrices) in self.matrices(solved).items()
+                if sides[0] == side
             }
-            near = g > 0 and min(abs(x - round(x)) for x in (g + alpha, g - alpha)) < _NEAR
+            near = g > 0 and min(abs(x - round(x)) for x in (g + alpha, g - alpha)) < _MAX_ANOMALY_DISTANCE
             checks.append((alpha, g, wavelength, bool(near), orders))
         return checks
 
 
-def _errors(spectrum: RigorousSpectrum, checks: list[_Checked]) -> dict[str, float]:
+def _errors(spectrum: RigorousSpectrum, checks: list[_Check]) -> dict[str, float]:
     """Return `error`, `max_error`, `max_error_near` and `polarisation_error` of a table."""
-    error, split = [], []
+    error, polarisation_error = [], []
     for alpha, g, wavelength, _, orders in checks:
-        total, difference, matrices_differ = 0.0, 0.0, 0.0
+        total, difference, matrix_difference = 0.0, 0.0, 0.0
         for sides, (m, matrices) in orders.items():
-            place = m, alpha - m / 2, g, wavelength, sides
+            arguments = m, alpha - m / 2, g, wavelength, sides
             eta = matrices[:, 0, 0]
             total += eta.sum()
-            difference += np.abs(spectrum.evaluate(*place) - eta).sum()
+            difference += np.abs(spectrum.evaluate(*arguments) - eta).sum()
             if spectrum.mueller is not None:
-                matrices_differ += np.abs(spectrum.evaluate(*place, mueller=True) - matrices).max(axis=(1, 2)).sum()
+                difference_ij = spectrum.evaluate(*arguments, mueller=True) - matrices
+                matrix_difference += np.abs(difference_ij).max(axis=(1, 2)).sum()
         error.append(difference / total)
-        split.append(matrices_differ / total)
+        polarisation_error.append(matrix_difference / total)
     error, near = np.array(error), np.array([check[3] for check in checks])
     return {
         "error": float(error.mean()),
         "max_error": float(error[~near].max(initial=0)),
         "max_error_near": float(error[near].max(initial=0)),
-        "polarisation_error": float("nan") if spectrum.mueller is None else float(np.mean(split)),
+        "polarisation_error": float("nan") if spectrum.mueller is None else float(np.mean(polarisation_error)),
     }
 
 
 class _Build:
-    """The nodes of `Axes`, of which every so many are solved, all orders of light from both sides together.
+    """Solver on a coarser grid than that of `Axes`, for all orders of light from above and below together.
 
-    Fields above depend on a and γ alone, those below on a and γ': each is the solution of one eigenproblem, and most of
-    the time goes there. With transmission a lattice of γ and one of γ' serve all of their pairs.
+    The fields above depend on a and γ alone, those below on a and γ'. Each is the solution of one eigenproblem, which
+    takes most of the time. With transmission a lattice of γ and one of γ' serve all of their pairs.
     """
 
     def __init__(self, surface: _Surface, steps: tuple[int, int, int], polarised: bool) -> None:
         self.surface, self.steps = surface, steps
         self.entries = 4 if polarised else 1  # rows and columns of the matrices that are kept
-        self.passes = surface.transmission != "none"
+        self.transmits = surface.transmission != "none"
         f, x, z = steps
-        if self.passes:
-            f, x, z = (max(4 * count // 3, least) for count, least in zip(steps, _LEAST_STORED, strict=True))
-        index = surface.index(surface.wavelengths[0]).real if self.passes else 0.0
-        self.axes = Axes(
-            surface.period, surface.wavelengths, (f, x, z if self.passes else PLANES - 1), index, surface.transmission
-        )
-        self.shares = [np.clip(shares, _OFF, 1 - _OFF) for shares in shares_at(steps)]
-        self.jobs = [(share, cells) for share in self.shares[0] / 2 for cells in self.axes.blocks]
-        # Those of two a: one thread may be ahead.
+        if self.transmits:
+            f, x, z = (max(4 * n // 3, min_steps) for n, min_steps in zip(steps, _MIN_STORED_STEPS, strict=True))
+        index = surface.index(surface.wavelengths[0]).real if self.transmits else 0.0
+        stored_steps = f, x, z if self.transmits else WAVELENGTH_NODES - 1
+        self.axes = Axes(surface.period, surface.wavelengths, stored_steps, index, surface.transmission)
+        self.fractions = [np.clip(t, _MIN_FRACTION, 1 - _MIN_FRACTION) for t in fractions_at_nodes(steps)]
+        self.jobs = [(a, intervals) for a in self.fractions[0] / 2 for intervals in self.axes.blocks]
+        # Holds the fields of two values of a, as one thread may be ahead of the others.
         self.fields = functools.lru_cache(maxsize=2 * int(np.dot(self.axes.starts.shape, steps[1:])))(half_space)
 
     def table(self, progress: Progress, checkpoints: Path | None) -> tuple[NDArray[np.float32], Any]:
         """Return `values` and `mueller` of `RigorousSpectrum`."""
         done = _Checkpoint(checkpoints, f"{self.surface.digest}-{max(self.steps)}")
-        left = [job for job in range(len(self.jobs)) if job not in done.done]
+        remaining = [job for job in range(len(self.jobs)) if job not in done.done]
+        solve = self._job if self.transmits else self._planes
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             try:
-                for job, solved in zip(left, pool.map(self._job if self.passes else self._planes, left), strict=True):
+                for job, solved in zip(remaining, pool.map(solve, remaining), strict=True):
                     done.add(job, solved)
                     progress(len(done.done), len(self.jobs))
             except BaseException:
@@ -335,115 +345,117 @@ class _Build:
         return stored
 
     def _job(self, job: int) -> NDArray[np.float32]:
-        """Return M at one a in one block: (orders in, orders out, X, Z, i, j); 0 where there is no light."""
-        a, (cell, inside) = self.jobs[job]
+        """Return M at one a in one block, (incident, outgoing, X, Z, i, j); 0 at nodes that are not solved."""
+        a, (above, below) = self.jobs[job]
         axes, surface = self.axes, self.surface
-        counts = axes.counts(cell, inside)
-        low, low_inside = (float(edges_of(j, a, 0.0)[0]) for j in (cell, inside))
-        nodes = [len(shares) for shares in self.shares[1:]]
+        counts = axes.counts(above, below)
+        low, low_below = (float(interval_bounds(j, a, 0.0)[0]) for j in (above, below))
+        nodes = [len(fractions) for fractions in self.fractions[1:]]
         found = np.zeros((sum(counts), sum(counts), *nodes, self.entries, self.entries))
-        # Where a cell is but a point its nodes are one.
+        # All nodes of an interval that shrinks to a point coincide.
         known: dict[tuple[float, float], NDArray] = {}
-        for (x, of_x), (z, of_z) in itertools.product(*(enumerate(shares) for shares in self.shares[1:])):
-            square, below = _inside(cell, a, of_x, low_inside - axes.top), _inside(inside, a, of_z, low + axes.top)
-            nu2 = (below - square) / axes.excess
-            # Beyond the light that there is, too: where nodes are left out, polynomials of their neighbours err.
+        for (x, t_x), (z, t_z) in itertools.product(*(enumerate(fractions) for fractions in self.fractions[1:])):
+            square = _square_in(above, a, t_x, low_below - axes.excess_limit)
+            square_below = _square_in(below, a, t_z, low + axes.excess_limit)
+            nu2 = (square_below - square) / axes.excess
+            # Nodes outside the range of light are solved, too: without them the polynomials of their neighbours err.
             if nu2 < max((axes.period / axes.wavelengths[1]) ** 2, square) / 64:
                 continue
-            key = square, below
+            key = square, square_below
             if key not in known:
-                (solved,) = surface.solve(a, square, [(nu2, below)], fields=self.fields)
+                (solved,) = surface.solve(a, square, [(nu2, square_below)], fields=self.fields)
                 known[key] = self._matrices(solved, counts)
             found[:, :, x, z] = known[key]
         return found.astype(np.float32)
 
     def _planes(self, job: int) -> NDArray[np.float32]:
-        """Return what `_job` does, Z being the wavelength."""
-        a, (cell, _) = self.jobs[job]
+        """Return the result of `_job` where Z is the wavelength."""
+        a, (above, _) = self.jobs[job]
         axes, surface, planes = self.axes, self.surface, []
-        squares = [_inside(cell, a, of_x, 0.0) for of_x in self.shares[1]]
-        for square, before in zip(squares, [None, *squares], strict=False):
-            if square == before:
+        squares = [_square_in(above, a, t_x, 0.0) for t_x in self.fractions[1]]
+        for square, previous in zip(squares, [None, *squares], strict=False):
+            if square == previous:
                 planes.append(planes[-1])
                 continue
             g = np.sqrt(square)
             shortest, longest = axes.range(g)
             count = 1
             if longest > shortest:
-                count = next((count for limit, count in _CONES if g < limit * axes.largest), _CONES[-1][1])
+                counts = (count for limit, count in _SOLVED_WAVELENGTHS if g < limit * axes.max_nu)
+                count = next(counts, _SOLVED_WAVELENGTHS[-1][1])
             at, weights = _nodes(count)
             lights = [surface.light(square, wavelength) for wavelength in shortest + at * (longest - shortest)]
-            solved = [self._matrices(light, axes.counts(cell, 0)) for light in surface.solve(a, square, lights)]
+            solved = [self._matrices(found, axes.counts(above, 0)) for found in surface.solve(a, square, lights)]
             planes.append(np.einsum("kw,wnm...->nmk...", weights, solved))
         return np.stack(planes, axis=2).astype(np.float32)
 
     def _matrices(self, solved: Scattered, counts: tuple[int, int]) -> Real:
-        """Return M, odd elements per k_y/ν, (orders in, orders out, i, j), in the order of the rows of `Axes`."""
+        """Return M, odd elements divided by k_y/ν, (incident, outgoing, i, j), in the order of the rows of `Axes`."""
         found = np.zeros((sum(counts),) * 2 + (self.entries,) * 2)
-        for (from_, to), (of_in, of_out, matrices) in self.surface.matrices(solved, self.entries).items():
+        for (side_i, side_o), (incident, outgoing, matrices) in self.surface.matrices(solved, self.entries).items():
             if self.entries > 1:
                 matrices = matrices / np.where(ODD, solved.k_y / solved.k_0, 1)
-            of_in, of_out = rank(of_in), rank(of_out)
-            came, left = of_in < counts[from_], of_out < counts[to]
-            rows, columns = of_in[came] + from_ * counts[0], of_out[left] + to * counts[0]
-            found[np.ix_(rows, columns)] = matrices[np.ix_(left, came)].swapaxes(0, 1).real
+            incident, outgoing = rank(incident), rank(outgoing)
+            kept_i, kept_o = incident < counts[side_i], outgoing < counts[side_o]
+            rows, columns = incident[kept_i] + side_i * counts[0], outgoing[kept_o] + side_o * counts[0]
+            found[np.ix_(rows, columns)] = matrices[np.ix_(kept_o, kept_i)].swapaxes(0, 1).real
         return found
 
     def _stored(self, done: dict[int, NDArray[np.float32]]) -> tuple[NDArray[np.float32], Any]:
-        """Return what was solved at the nodes that are stored."""
+        """Return the solutions interpolated to the nodes of the table."""
         axes, entries, blocks = self.axes, self.entries, len(self.axes.blocks)
         matrices = np.empty((*axes.shape, entries, entries), np.float32)
-        # The wavelength, where it is an axis, is done.
-        steps = list(zip(self.steps, axes.steps, strict=True))[: 3 if self.passes else 2]
+        # A wavelength axis already has its final nodes.
+        steps = list(zip(self.steps, axes.steps, strict=True))[: 3 if self.transmits else 2]
         refine = [_fitted(functools.partial(_cubic, solved), stored) for solved, stored in steps]
-        refine += [] if self.passes else [np.eye(PLANES)]
+        refine += [] if self.transmits else [np.eye(WAVELENGTH_NODES)]
         signs = np.outer(REVERSED, REVERSED)[:entries, :entries]
-        for block, (cells, row) in enumerate(axes.blocks.items()):
+        for block, (intervals, row) in enumerate(axes.blocks.items()):
             solved = np.stack([done[job] for job in range(block, len(self.jobs), blocks)])
-            for of_a, shift in ((0, 1), (-1, 0)):
-                # At a = 0 and 1/2 light and reversed light are both of the table, orders n and −n, or −n − 1.
-                orders, before = [], 0
-                for count in axes.counts(*cells):
+            for index_a, shift in ((0, 1), (-1, 0)):
+                # At a = 0 and a = 1/2 the table holds light and reversed light: orders n and −n, or n and −n − 1.
+                orders, offset = [], 0
+                for count in axes.counts(*intervals):
                     mirrored = np.maximum(((np.arange(count) + shift) ^ 1) - shift, 0)
-                    orders.append(np.where(mirrored < count, mirrored + before, -1))
-                    before += count
+                    orders.append(np.where(mirrored < count, mirrored + offset, -1))
+                    offset += count
                 order = np.concatenate(orders)
-                back = signs * solved[of_a][np.ix_(order, order)].transpose(1, 0, 2, 3, 5, 4)
+                reverse = signs * solved[index_a][np.ix_(order, order)].transpose(1, 0, 2, 3, 5, 4)
                 both = np.logical_and.outer(order >= 0, order >= 0)[..., None, None, None, None]
-                solved[of_a] = np.where(both, (solved[of_a] + back) / 2, solved[of_a])
+                solved[index_a] = np.where(both, (solved[index_a] + reverse) / 2, solved[index_a])
             found = np.einsum("ax,by,cz,xnmyz...->nmabc...", *refine, solved, optimize=True)
-            # Beside a kink the polynomials overshoot.
+            # Polynomials overshoot beside a kink.
             eta = found[..., :1, :1]
             found *= np.divide(np.clip(eta, 0, 1), eta, out=np.zeros_like(eta), where=eta != 0)
             count = found.shape[0] ** 2
-            matrices[row : row + count] = (np.round(found / _ROUNDED) * _ROUNDED).reshape(count, *matrices.shape[1:])
+            matrices[row : row + count] = (np.round(found / _ETA_STEP) * _ETA_STEP).reshape(count, *matrices.shape[1:])
         return np.ascontiguousarray(matrices[..., 0, 0]), matrices if entries == 4 else None
 
 
-def _inside(cell: int, a: float, share: float, least: float) -> float:
-    """Return γ² in a cell; the same for all shares if it is but a point."""
-    low, high = (float(x) for x in edges_of(cell, a, least))
-    square = low + (high - low) * (share if high - low > 1e-6 else 0.5)
-    # Fields that neither travel nor decay have no admittance.
-    return square if abs(square) > _STILL else _STILL if cell else -_STILL
+def _square_in(interval: int, a: float, t: float, min_square: float) -> float:
+    """Return γ² at the fraction t of an interval; the same for all t if the interval is a point."""
+    low, high = (float(x) for x in interval_bounds(interval, a, min_square))
+    square = low + (high - low) * (t if high - low > 1e-6 else 0.5)
+    # A field that neither propagates nor decays has no admittance.
+    return square if abs(square) > _MIN_SQUARE else _MIN_SQUARE if interval else -_MIN_SQUARE
 
 
 @functools.cache
 def _nodes(count: int) -> tuple[Real, Real]:
-    """Return Chebyshev–Lobatto points in 0 … 1, (count,), and the weights (planes, count) of values at equal steps."""
+    """Return Chebyshev–Lobatto points in [0, 1], (count,), and weights from these to equal steps, (nodes, count)."""
     at = (1 - np.cos(np.pi * np.arange(count) / max(count - 1, 1))) / 2
-    return at, _fitted(lambda x: _lagrange(x, at), PLANES - 1)
+    return at, _fitted(lambda x: _lagrange(x, at), WAVELENGTH_NODES - 1)
 
 
 def _lagrange(x: Real, nodes: Real) -> Real:
-    """Return (x, nodes): weights of values at the nodes in the polynomial through them."""
+    """Return the weights, (x, nodes), of values at the nodes in the polynomial through them."""
     others = [np.delete(nodes, j) for j in range(len(nodes))]
     factors = [(x[:, None] - other) / (node - other) for node, other in zip(nodes, others, strict=True)]
     return np.stack([factor.prod(axis=1) for factor in factors], axis=1)
 
 
 def _cubic(steps: int, x: Real) -> Real:
-    """Return (x, nodes solved): weights in cubic interpolation between four neighbours, x from 0 to 1."""
+    """Return the weights, (x, steps + 1), of cubic interpolation between four neighbours, x from 0 to 1."""
     low = np.clip((x * steps).astype(int) - 1, 0, steps - 3)
     matrix = np.zeros((len(x), steps + 1))
     matrix[np.arange(len(x))[:, None], low[:, None] + np.arange(4)] = _lagrange(x * steps - low, np.arange(4.0))
@@ -451,12 +463,12 @@ def _cubic(steps: int, x: Real) -> Real:
 
 
 def _fitted(polynomials: Callable[[Real], Real], steps: int) -> Real:
-    """Return (steps + 1, nodes solved): weights of values at equal steps between which linear look-ups fit polynomials.
+    """Return the weights, (steps + 1, solved nodes), of the least-squares fit of a linear table to polynomials.
 
-    Of the rms error of values on a polynomial, h² |f''| / √120 with steps h, least squares leave 1/√6. Values at the
-    ends are on it: tables of neighbouring cells meet there.
+    Linear interpolation between values of a polynomial has the r.m.s. error h² |f''| / √120 with steps h; the fit has
+    1/√6 of that. It is exact at the ends, where tables of adjacent intervals meet.
     """
-    x = (np.arange(_PLACES * steps) + 0.5) / (_PLACES * steps)
+    x = (np.arange(_FIT_POINTS * steps) + 0.5) / (_FIT_POINTS * steps)
     hats = np.maximum(1 - np.abs(steps * x[:, None] - np.arange(steps + 1)), 0)
     ends = polynomials(np.array([0.0, 1.0]))
     rest = polynomials(x) - hats[:, [0, -1]] @ ends
@@ -464,7 +476,7 @@ def _fitted(polynomials: Callable[[Real], Real], steps: int) -> Real:
 
 
 class _Checkpoint:
-    """Rows that are done, in memory and, now and then, in a file of that name."""
+    """Finished jobs, in memory and, at intervals, in a file."""
 
     def __init__(self, folder: Path | None, name: str) -> None:
         self.path = folder / f"rigorous-{name}.npz" if folder else None
@@ -479,11 +491,11 @@ class _Checkpoint:
 
     def add(self, row: int, values: NDArray[np.float32]) -> None:
         self.done[row] = values
-        if time.monotonic() > self._written + _SECONDS:
+        if time.monotonic() > self._written + _CHECKPOINT_SECONDS:
             self.write()
 
     def write(self) -> None:
-        # A checkpoint only saves time: a folder that cannot be written to is no reason to stop.
+        # A checkpoint only saves time: failure to write it does not stop the build.
         with suppress(OSError):
             if self.path:
                 self.path.parent.mkdir(parents=True, exist_ok=True)

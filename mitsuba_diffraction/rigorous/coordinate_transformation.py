@@ -5,8 +5,8 @@ the curve along one direction (sin ζ, cos ζ):
 
     x = x(t) + u sin ζ,    z = h(t) + u cos ζ.
 
-With ζ = 0 and t = x these are Chandezon's coordinates. A tilt ζ admits a vertical facet (Li et al. 1999); t in step
-with the length of the curve, and dense at edges, gives steep facets and edges the harmonics that they need (Granet
+With ζ = 0 and t = x these are Chandezon's coordinates. A tilt ζ admits a vertical facet (Li et al. 1999). Where t grows
+with the length of the curve, and is denser at edges, steep facets and edges get the harmonics that they need (Granet
 1999). With J = ẋ cos ζ − ḣ sin ζ > 0 and M = ẋ sin ζ + ḣ cos ζ, the tangent in the tilted frame, and w, v the
 derivatives of ψ across and along the direction of u, the equation ∇²ψ + γ²ψ = 0 becomes
 
@@ -23,10 +23,10 @@ one eigenproblem of twice the harmonics for each medium, which with S = (J + M J
     ρ ⎡ ψ  ⎤ = ⎡ SC          S   ⎤ ⎡ ψ  ⎤
       ⎣ −iG⎦   ⎣ γ²J − αSα   C†S ⎦ ⎣ −iG⎦.
 
-Half of its solutions are outgoing upwards, half downwards. The eigenvectors of deep profiles are all but parallel: of
-the fields e^{−|β|z} one is e^{|β| depth} times as strong in the valleys as on the ridges. The spaces that they span are
-well separated; Schur vectors, the eigenvalues of one space first, are an orthonormal basis of it. Where a medium has no
-loss, solutions that travel are replaced by the Rayleigh waves e^{i(α_m x + β_m z)}, which are exact.
+Half of its solutions are outgoing upwards, half downwards. The eigenvectors of deep profiles are almost parallel: a
+field e^{−|β|z} is e^{|β| depth} times as strong in the valleys as on the ridges. The two spaces that they span are well
+separated; Schur vectors, ordered with the eigenvalues of one space first, are an orthonormal basis of it. In a medium
+without loss, propagating solutions are replaced by the Rayleigh waves e^{i(α_m x + β_m z)}, which are exact.
 
 Conical incidence (Plumey et al. 1995): with e^{i k_y y}, both E_y and H_y (H in units of E) obey the equation above
 with γ² = k² − k_y², and along the curve
@@ -52,24 +52,25 @@ Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 SAMPLES = 4096
-# An edge turns the curve by more than this (rad) and by more than so many times the median turn of nine pixels.
-_EDGE, _OF_MEDIAN, _MOST_EDGES = 0.1, 8.0, 8
-# At an edge the curve runs as slowly in t as 1 − this of its mean; a piece of the length l has a share l^_SHARE of t.
-# Of those tried, 0.8 … 0.95 and 0.35 … 1 on blazes, ruled and lamellar gratings, these need the fewest harmonics.
-_GRADING, _SHARE = 0.9, 0.65
-# A bend of one radian takes as much of t as this share of the whole length. Of 0 … 0.32, this needs the fewest
-# harmonics: a sinusoid of silver eight times as deep as wide 56, without it more than 140.
-_BEND = 0.04
+# At an edge the angle of the curve changes by more than both: radians, and multiples of the median over nine pixels.
+_MIN_EDGE_ANGLE, _MIN_EDGE_RATIO, _MAX_EDGES = 0.1, 8.0, 8
+# The speed of the curve in t at an edge is 1 − _GRADING of its mean; a piece of length l takes a fraction of t that is
+# proportional to l^_LENGTH_EXPONENT. Of the values 0.8 … 0.95 and 0.35 … 1, tried on blazed, ruled and lamellar
+# gratings, these need the fewest harmonics.
+_GRADING, _LENGTH_EXPONENT = 0.9, 0.65
+# A bend of one radian counts as this fraction of the whole length. Of the values 0 … 0.32 this needs the fewest
+# harmonics: for a sinusoid of silver eight times as deep as wide 56, and more than 140 without it.
+_BEND_LENGTH = 0.04
 
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """One period of a profile, lengths in periods, at t = 0, 1/n, … 1.
+    """One period of a profile at t = 0, 1/n, … 1; lengths are in periods.
 
     Attributes:
-        x, z: (n + 1,), x rising by 1 from the first to the last.
-        tilt: ζ, the angle from z to the direction in which the curve is moved: half way between those to which the
-            steepest rise and the steepest fall are equally steep.
+        x, z: (n + 1,); x increases by 1 from the first to the last.
+        tilt: ζ, the angle from z to the direction of u, towards which the steepest rise and the steepest fall of the
+            profile are equally steep.
     """
 
     x: Real
@@ -95,30 +96,31 @@ def is_profile(height_field: HeightField) -> bool:
 
 
 def curve_of(height_field: HeightField) -> Curve:
-    """Return the curve of a surface of one row: straight lines from pixel to pixel, round the end of the tile.
+    """Return the curve of a surface of one row: straight lines from pixel to pixel, continued across the tile boundary.
 
-    The facet that leads back in a sawtooth is thus one pixel wide, and so is the wall of a lamellar grating. Between
-    edges the length of the curve grows at a rate of 1 − η (4 cos 2πτ + cos 4πτ)/5: slowly near the edges, where fields
-    are singular (Granet 1999), and evenly away from them, where a fast run makes for short waves. Smooth bends count as
-    length (`_BEND`), so that sharp crests are resolved.
+    The steep facet of a sawtooth is thus one pixel wide, and so is the wall of a lamellar grating. Between edges the
+    length of the curve grows at a rate of 1 − η (4 cos 2πτ + cos 4πτ)/5: slowly near the edges, where fields are
+    singular (Granet 1999), and evenly away from them, as waves are short where the rate is high. Smooth bends count as
+    length (`_BEND_LENGTH`), so that sharp crests are resolved.
     """
     rows = height_field.centred
     if not is_profile(height_field):
         raise RequestError(
-            f"height field: got {len(rows)} rows that differ, wanted a surface that does not change along y; "
-            "rigorous theory is offered for such only"
+            f"height field: got {len(rows)} rows that differ, wanted a surface that does not change along y, "
+            "as rigorous theory requires"
         )
     period = height_field.tile_size[0]
     n = rows.shape[1]
     x = (np.arange(n + 1) + 0.5) / n
     z = np.append(rows[0], rows[0, 0]) / period
     angles = np.arctan2(np.diff(z), np.diff(x))
-    turns = np.abs(angles - np.roll(angles, 1))
-    edges = np.flatnonzero(turns > np.maximum(_EDGE, _OF_MEDIAN * median_filter(turns, 9, mode="wrap")))
-    edges = np.sort(edges[np.argsort(-turns[edges])[:_MOST_EDGES]])
-    turns[edges] = 0
+    bends = np.abs(angles - np.roll(angles, 1))
+    min_angles = np.maximum(_MIN_EDGE_ANGLE, _MIN_EDGE_RATIO * median_filter(bends, 9, mode="wrap"))
+    edges = np.flatnonzero(bends > min_angles)
+    edges = np.sort(edges[np.argsort(-bends[edges])[:_MAX_EDGES]])
+    bends[edges] = 0
     steps = np.hypot(np.diff(x), np.diff(z))
-    steps = steps / steps.sum() + _BEND / 2 * (turns + np.roll(turns, -1))
+    steps = steps / steps.sum() + _BEND_LENGTH / 2 * (bends + np.roll(bends, -1))
     if len(edges):
         # Begin at an edge.
         x, z = (np.append(np.roll(c[:-1], -edges[0]), 0) for c in (x, z))
@@ -134,8 +136,8 @@ def curve_of(height_field: HeightField) -> Curve:
 def _graded(edges: Real, length: float) -> Real:
     """Return s at t = 0, 1/n, … 1, with a whole number of steps between edges."""
     ends = np.append(edges, length)
-    shares = np.cumsum(np.diff(ends) ** _SHARE)
-    steps = np.append(0, np.round(shares / shares[-1] * SAMPLES)).astype(int)
+    weights = np.cumsum(np.diff(ends) ** _LENGTH_EXPONENT)
+    steps = np.append(0, np.round(weights / weights[-1] * SAMPLES)).astype(int)
     at = [np.zeros(1)]
     for (a, b), n in zip(itertools.pairwise(ends), np.diff(steps), strict=True):
         t = np.arange(1, n + 1) / max(n, 1)
@@ -144,7 +146,7 @@ def _graded(edges: Real, length: float) -> Real:
 
 
 class Grating:
-    """What the eigenproblems of a curve share. Lengths are in units of period / 2π.
+    """Matrices common to all eigenproblems of a curve. Lengths are in units of period / 2π.
 
     Attributes:
         n: the harmonics −N … N.
@@ -173,9 +175,16 @@ class Grating:
         return toeplitz(c[:n], c[-np.arange(n)])
 
     def bounded(self, alpha: Real, gamma2: complex, upwards: bool, count: int) -> tuple[Complex, Complex]:
-        """Return ψ and −iG along the curve, (n, count) each, of fields that span those decaying fastest one way."""
+        """Return ψ and −iG along the curve, (n, count) each, of a basis of the fields that decay fastest up or down.
+
+        Args:
+            alpha: α_m, (n,).
+            gamma2: γ².
+            upwards: whether fields decay upwards.
+            count: dimension of the space.
+        """
         n = len(alpha)
-        # −iG is stored in this unit, so that both halves of a vector weigh the same.
+        # −iG is divided by this unit, so that both halves of a vector have similar magnitude.
         unit = np.sqrt(np.abs(gamma2) + n**2)
         matrix = np.empty((2 * n, 2 * n), complex)
         matrix[:n, :n] = self.sm * alpha[None, :]
@@ -190,8 +199,8 @@ class Grating:
         return basis[:n], basis[n:] * unit
 
     def rayleigh(self, alpha_0: float, orders: NDArray[np.int64], beta: Real) -> tuple[tuple[Complex, Complex], ...]:
-        """Return ψ and −iG of the plane waves e^{i(α_m x ± β z)} along the curve, (n, orders) each; + and −."""
-        # Without e^{iα_0 t}, which all harmonics share.
+        """Return ψ and −iG of the plane waves e^{i(α_m x ± β z)} along the curve, (n, orders) each, for + and for −."""
+        # Without the factor e^{iα_0 t}, which is common to all harmonics.
         along_x = np.exp(1j * (alpha_0 * (self.x - self.t) + orders[:, None] * self.x))
         along_z = np.exp(1j * beta[:, None] * self.z)
         cos, sin = np.cos(self.tilt), np.sin(self.tilt)
@@ -206,16 +215,16 @@ class Grating:
 
 @dataclass(frozen=True, eq=False)
 class HalfSpace:
-    """Bounded and outgoing fields on one side of a curve, and the light that may come in there.
+    """Bounded and outgoing fields on one side of a curve, and the waves incident from that side.
 
     Attributes:
         square: γ².
-        orders: that propagate, (p,); none in an absorbing medium.
+        orders: the propagating orders, (p,); none in an absorbing medium.
         beta: β_m of these, positive, (p,).
-        waves: amplitudes of the outgoing Rayleigh waves in a sum of outgoing fields, waves @ ψ, (p, n).
-        admittance: Y, −iG = Yψ for each sum ψ of outgoing fields, (n, n).
-        psi: ψ of the incoming Rayleigh wave of each order, along the curve, (n, p).
-        rise: −iG of these less Yψ, (n, p).
+        waves: (p, n); waves @ ψ are the amplitudes of the outgoing Rayleigh waves in a sum ψ of outgoing fields.
+        admittance: Y, (n, n), with −iG = Yψ for each sum ψ of outgoing fields.
+        psi: ψ of the incident Rayleigh wave of each order, along the curve, (n, p).
+        source: −iG − Yψ of these, (n, p).
     """
 
     square: complex
@@ -224,55 +233,55 @@ class HalfSpace:
     waves: Complex
     admittance: Complex
     psi: Complex
-    rise: Complex
+    source: Complex
 
 
 def half_space(grating: Grating, alpha_0: float, gamma2: complex, upwards: bool) -> HalfSpace:
-    """Return the fields with ∇²ψ + γ²ψ = 0 above a curve, or below it.
+    """Compute the fields with ∇²ψ + γ²ψ = 0 above a curve, or below it.
 
     Args:
+        grating: the curve.
         alpha_0: α of order 0.
         gamma2: γ², of positive imaginary part or real.
-        upwards: whether outgoing is up.
+        upwards: whether outgoing fields propagate upwards, that is, the half-space is above.
     """
     alpha = alpha_0 + grating.n
-    # Exactly along the horizon both Rayleigh waves of an order are the same.
+    # At exactly grazing exit both Rayleigh waves of an order coincide.
     if np.abs(gamma2 - alpha**2).min() < 1e-14 * abs(gamma2):
         gamma2 *= 1 - 1e-12
     square = gamma2 - alpha**2
     propagates = (square.real > 0) & (np.imag(gamma2) == 0)
     orders, beta = grating.n[propagates], np.sqrt(square[propagates].real)
-    # Of the solutions without loss, 2p travel; the others are pairs, one of which is bounded on this side.
+    # Without loss, 2p solutions propagate; the others form pairs, one of each being bounded on this side.
     modes = grating.bounded(alpha, gamma2, upwards, len(alpha) - len(orders))
     up, down = grating.rayleigh(alpha_0, orders, beta)
-    outgoing, incoming = (up, down) if upwards else (down, up)
+    outgoing, incident = (up, down) if upwards else (down, up)
     psi, flux = (np.hstack(both) for both in zip(outgoing, modes, strict=True))
     factors = lu_factor(psi, check_finite=False)
-    # Y and, of ψ⁻¹, the rows of Rayleigh waves: those of [flux; 1] ψ⁻¹.
+    # Y and the rows of ψ⁻¹ that belong to Rayleigh waves: [flux; 1] ψ⁻¹.
     rows = np.vstack([flux, np.eye(len(orders), len(alpha))]).T.conj()
     admittance, waves = np.split(lu_solve(factors, rows, trans=2, check_finite=False).conj().T, [len(alpha)])
-    psi, flux = incoming
+    psi, flux = incident
     return HalfSpace(gamma2, orders, beta, waves, admittance, psi, flux - admittance @ psi)
 
 
 ABOVE, BELOW = 0, 1
-_EVEN = np.array([[1.0, -1.0], [-1.0, 1.0]])  # in k_y, E_y and H_y
+_PARITY = np.array([[1.0, -1.0], [-1.0, 1.0]])  # of amplitudes in k_y, [E_y or H_y, E_y or H_y]
 
 
 @dataclass(frozen=True, eq=False)
 class Scattered:
-    """What becomes of light of any order from either side.
+    """Amplitudes of all orders for incident light of any order, from above and from below.
 
-    A wave that travels along k̂ is polarised as (ê, k̂ × ê), ê the direction of ŷ − (ŷ·k̂)k̂: "y" light, whose electric
-    field lies along the grooves as far as it can, comes before its orthogonal.
+    The polarisation of a wave that travels along k̂ is given in the basis (ê, k̂ × ê), with ê the direction of
+    ŷ − (ŷ·k̂)k̂: the first component has its electric field as nearly along the grooves as possible.
 
     Attributes:
-        orders: n of the orders that propagate above, (p,), and below, (r,).
-        amplitudes: amplitudes[i][o] of light that comes in on side i and leaves on side o, (orders of o, 2, orders of
-            i, 2), [order, polarisation, incident order, its polarisation], so scaled that |·|² is a share of the
-            incident power.
+        orders: n of the propagating orders above, (p,), and below, (r,).
+        amplitudes: amplitudes[i][o] of light incident from side i and outgoing on side o, (orders of o, 2, orders of i,
+            2), [order, polarisation, incident order, its polarisation]; |·|² is a fraction of the incident power.
         alpha: α of the orders above, (p,), and below, (r,).
-        k_y, k_0: of all of this light, k_0 in the medium above, times period / 2π; k_y may be imaginary.
+        k_y, k_0: common to all of these waves, k_0 in the medium above, times period / 2π; k_y may be imaginary.
     """
 
     orders: tuple[NDArray[np.int64], NDArray[np.int64]]
@@ -282,42 +291,47 @@ class Scattered:
     k_0: float
 
     def conjugate(self, amplitudes: Complex) -> Complex:
-        """Return J(k_y*), (…, 2, 2) like J(k_y): amplitudes between E_y and H_y are odd in k_y, the others even.
+        """Return J(k_y*), (…, 2, 2), from J(k_y): amplitudes between E_y and H_y are odd in k_y, the others even.
 
-        With it |J|², as J J(k_y*)*, is analytic in k_y²: a table that ends at k_y = 0 can be solved on both sides.
+        J(k_y) J(k_y*)*, which is |J|² for real k_y, is analytic in k_y², so that a table up to k_y = 0 can be solved
+        beyond it, too.
         """
-        return amplitudes * _EVEN if np.imag(self.k_y) else amplitudes
+        return amplitudes * _PARITY if np.imag(self.k_y) else amplitudes
 
     def powers(self, amplitudes: Complex) -> Real:
-        """Return |·|² of amplitudes [order, polarisation, …, its polarisation]; negative where odd, k_y imaginary."""
+        """Return |·|² of amplitudes [order, polarisation, …, polarisation]; negative where odd if k_y is imaginary."""
         powers = np.abs(amplitudes) ** 2
-        return powers * _EVEN[:, None] if np.imag(self.k_y) else powers
+        return powers * _PARITY[:, None] if np.imag(self.k_y) else powers
 
 
 def scatter(alpha: Real, above: HalfSpace, below: HalfSpace, k_y: complex, index: complex) -> Scattered:
-    """Solve for light of this k_y (times period / 2π), with air above and a medium of the index n + ik below.
+    """Solve for the amplitudes of all orders, with air above and a medium of index n + ik below.
 
-    α_m of all harmonics, (n,), are those of both half-spaces.
+    Args:
+        alpha: α_m of all harmonics, (n,), common to both half-spaces.
+        above, below: the half-spaces.
+        k_y: times period / 2π.
+        index: n + ik below.
     """
     k_0 = np.sqrt((above.square + k_y**2).real)
-    # ψ_E and ψ_H on the curve, from E_t and H_t, which are continuous. −iG = Yψ + rise on either side.
-    #   k_y α ψ_E (1/γ₁² − 1/γ₂²) − k_0 (Y₁/γ₁² − Y₂/γ₂²) ψ_H = k_0 (rise_H1/γ₁² − rise_H2/γ₂²)
-    #   k_y α ψ_H (1/γ₁² − 1/γ₂²) + k_0 (Y₁/γ₁² − n² Y₂/γ₂²) ψ_E = −k_0 (rise_E1/γ₁² − n² rise_E2/γ₂²)
+    # Continuity of E_t and H_t gives ψ_E and ψ_H on the curve, with −iG = Yψ + source on both sides.
+    #   k_y α ψ_E (1/γ₁² − 1/γ₂²) − k_0 (Y₁/γ₁² − Y₂/γ₂²) ψ_H = k_0 (source_H1/γ₁² − source_H2/γ₂²)
+    #   k_y α ψ_H (1/γ₁² − 1/γ₂²) + k_0 (Y₁/γ₁² − n² Y₂/γ₂²) ψ_E = −k_0 (source_E1/γ₁² − n² source_E2/γ₂²)
     coupling = np.diag(k_y * alpha * (1 / above.square - 1 / below.square))
     upper, lower = k_0 / above.square * above.admittance, k_0 / below.square * below.admittance
     matrix = np.block([[coupling, lower - upper], [upper - index**2 * lower, coupling]])
     factors = lu_factor(matrix, check_finite=False)
-    # Of unit waves, E_y = γ/k and H_y = −n γ/k, and the power is as β.
+    # A wave of unit amplitude has E_y = γ/k and H_y = −n γ/k; its power is proportional to β.
     units = [
         np.sqrt(half.beta) * (k_0 / np.sqrt(np.abs(half.square))) * np.array([[n], [-1]])
         for half, n in ((above, 1.0), (below, index))
     ]
     blocks = []
     for side, (half, n) in enumerate(((above, 1.0), (below, index))):
-        sign, zero = (1, -1)[side], np.zeros_like(half.rise)
-        rise = sign * k_0 / half.square * half.rise
-        right = np.block([[zero, rise], [-(n**2) * rise, zero]])
-        # [ψ_E or ψ_H, harmonic, light in E_y or in H_y, its order].
+        sign, zero = (1, -1)[side], np.zeros_like(half.source)
+        source = sign * k_0 / half.square * half.source
+        right = np.block([[zero, source], [-(n**2) * source, zero]])
+        # [ψ_E or ψ_H, harmonic, incident E_y or H_y, incident order].
         total = lu_solve(factors, right, check_finite=False).reshape(2, len(alpha), 2, -1)
         scattered = total - np.eye(2)[:, None, :, None] * half.psi[:, None]
         of_side = []

@@ -1,4 +1,4 @@
-"""The efficiencies of the orders of a grating, by Maxwell's equations: how far they converged, and Mueller matrices."""
+"""The efficiencies of the orders of a grating by Maxwell's equations, their convergence, and Mueller matrices."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ Complex = NDArray[np.complex128]
 _PAULI = np.array([[[1, 0], [0, 1]], [[1, 0], [0, -1]], [[0, 1], [1, 0]], [[0, 1j], [-1j, 0]]])
 
 REVERSED = np.array([1, 1, 1, -1])
-"""s: light that runs through an order backwards, mirrored so that k_y has the same sign, has s_i s_j M_ji."""
+"""s: light reversed through an order, mirrored so that k_y has the same sign, has the Mueller matrix s_i s_j M_ji."""
 
 ODD = np.not_equal.outer([1, 1, -1, -1], [1, 1, -1, -1])
-"""Which M_ij are odd in k_y."""
+"""Whether M_ij is odd in k_y."""
 
 
 _KERNEL = np.einsum("iab,jcd->bcadij", _PAULI, _PAULI).reshape(16, 16) / 2
@@ -37,7 +37,7 @@ _KERNEL = np.einsum("iab,jcd->bcadij", _PAULI, _PAULI).reshape(16, 16) / 2
 def mueller(amplitudes: Complex, of_conjugate: Complex | None = None) -> Complex:
     """Return M_ij = Tr(σ_i J σ_j J(k_y*)†) / 2 of amplitudes J, (…, 2, 2) → (…, 4, 4).
 
-    Polarised waves are written in (ê, k̂ × ê), as in `coordinate_transformation.Scattered`. Elements are real; where k_y
+    Amplitudes refer to the basis (ê, k̂ × ê), as in `coordinate_transformation.Scattered`. Elements are real; where k_y
     is imaginary, with J(k_y*) as `of_conjugate`, those that are odd in k_y are imaginary.
     """
     conjugate = (amplitudes if of_conjugate is None else of_conjugate).conj()
@@ -45,15 +45,15 @@ def mueller(amplitudes: Complex, of_conjugate: Complex | None = None) -> Complex
     return (pairs.reshape(-1, 16) @ _KERNEL).reshape(*amplitudes.shape[:-2], 4, 4)
 
 
-def matrices_of(solved: Scattered, side: int, to: int) -> Complex:
-    """Return the Mueller matrices of light from a side to a side, (orders out, orders in, 4, 4)."""
-    amplitudes = solved.amplitudes[side][to].transpose(0, 2, 1, 3)
+def matrices_of(solved: Scattered, side_i: int, side_o: int) -> Complex:
+    """Return the Mueller matrices of light from one side to a side, (outgoing orders, incident orders, 4, 4)."""
+    amplitudes = solved.amplitudes[side_i][side_o].transpose(0, 2, 1, 3)
     return mueller(amplitudes, solved.conjugate(amplitudes))
 
 
-def unpolarised(solved: Scattered, side: int, to: int) -> NDArray[np.float64]:
-    """Return η alone of `matrices_of`, (orders out, orders in, 1, 1)."""
-    return solved.powers(solved.amplitudes[side][to]).sum(axis=(1, 3))[..., None, None] / 2
+def unpolarised(solved: Scattered, side_i: int, side_o: int) -> NDArray[np.float64]:
+    """Return η, the first element of `matrices_of`, (outgoing orders, incident orders, 1, 1)."""
+    return solved.powers(solved.amplitudes[side_i][side_o]).sum(axis=(1, 3))[..., None, None] / 2
 
 
 @functools.cache
@@ -65,39 +65,37 @@ def _controller() -> ThreadpoolController:
 def one_thread() -> Iterator[None]:
     """Run BLAS on one thread in the block, or in the function that this decorates.
 
-    On matrices of some hundred rows several threads wait for each other: the spectrum of a tile of 26 × 36 pixels whose
-    lobes overlap took 5 s instead of 0.7 s on two idle cores, and up to thirteen times as long on busy ones.
+    With matrices of a few hundred rows, threads mostly wait for each other: the spectrum of a tile of 26 × 36 pixels
+    whose lobes overlap took 5 s instead of 0.7 s on two idle cores, and up to thirteen times as long on busy ones.
     """
     with _controller().limit(limits=1, user_api="blas"):
         yield
 
 
-MOST_HARMONICS = 80
-# A solution with as many takes half a minute.
-_FOR_DEEP_PROFILES = 300
+MAX_HARMONICS = 80
+# One solution with this number takes half a minute.
+_MAX_HARMONICS_DEEP = 300
 
 
 @dataclass(frozen=True, eq=False)
 class Efficiencies:
-    """What a grating reflects of light from one direction.
+    """Efficiencies and amplitudes of the orders of a grating for light from one direction.
 
     The polarisation of a wave that travels along k̂ is given in the basis ŝ = ẑ × k̂ / |ẑ × k̂| (ŷ along the
     normal) and p̂ = k̂ × ŝ; k̂ = −ω_i of the incident light, and k̂ = ω_o of an order.
 
     Attributes:
-        orders: m of the orders that propagate on the side of the light, ascending, (n,); q_x = m / period; on either
-            side n_o ω_o,x = −λ m / period − n_i ω_i,x, with the indices of the media of ω_o and ω_i.
-        amplitudes: (n, 2, 2), [order, polarisation of the order, of the incident light], s before p; |·|² is a share of
-            the incident power.
-        transmitted_orders: m of the orders that propagate on the other side, ascending, (k,); none if the material
-            absorbs, or beyond the critical angle.
+        orders: m of the propagating reflected orders, ascending, (n,); q_x = m / period. For reflected and transmitted
+            orders n_o ω_o,x = −λ m / period − n_i ω_i,x, with the indices of the media of ω_o and ω_i.
+        amplitudes: (n, 2, 2), [order, polarisation of the order, of the incident light], s before p; |·|² is a fraction
+            of the incident power.
+        transmitted_orders: m of the propagating transmitted orders, ascending, (k,); none if the material absorbs, or
+            beyond the critical angle.
         transmitted_amplitudes: (k, 2, 2), as `amplitudes`, k̂ along the transmitted wave.
-        transmitted: the share of the incident power that is transmitted, (2,), of s and p light; NaN if the material
-            absorbs.
+        transmitted: the transmitted fraction of incident s and p light, (2,); NaN if the material absorbs.
         harmonics: N; fields are sums of 2N + 1 waves.
-        error: the largest, of s and of p light, of three numbers: by how much the efficiencies of the reflected orders
-            changed at the last raise of N, as a share of the reflected light, Σ|Δη_m| / Σ η_m; the same of those
-            transmitted; and `imbalance`. If N was given it is `imbalance` alone.
+        error: the largest, over s and p light, of three numbers: the change Σ|Δη_m| / Σ η_m of the reflected orders at
+            the last increase of N, that of the transmitted orders, and `imbalance`. If N was given, `imbalance` alone.
     """
 
     orders: NDArray[np.int64]
@@ -130,7 +128,7 @@ class Efficiencies:
 
     @property
     def imbalance(self) -> float:
-        """|R + T − 1|, of s or p light, the larger; if the material absorbs, the excess of R over one."""
+        """The larger |R + T − 1| of s and p light; if the material absorbs, the excess of R over one."""
         reflected = _powers(self.amplitudes).sum(axis=0)
         if np.isnan(self.transmitted).any():
             return float(np.maximum(reflected - 1, 0).max())
@@ -165,18 +163,18 @@ def efficiencies(
 
     Args:
         height_field: one period (rows that differ are refused); straight lines join the pixels (`curve_of`).
-        direction: ω_i, (3,), to the light, in the local frame; it is normalised. ω_i,z < 0: the light comes from below,
-            ω_i is its direction inside of the dielectric.
+        direction: ω_i, (3,), to the light, in the local frame; it is normalised. If ω_i,z < 0, light is incident from
+            below, and ω_i is the direction inside the dielectric.
         wavelength: µm, in vacuum.
         int_ior: index of refraction of a dielectric, or n + ik.
         material: or a conductor by Mitsuba's name, "Al".
-        tolerance: harmonics are raised until `Efficiencies.error` is below, or until their number reaches the largest
-            of 80, twice the largest order, and one and a half times the waves that the profile is long (at most 300).
-        harmonics: N, to take this number as it is; at least the largest |m| that propagates, above or below.
+        tolerance: bound of `Efficiencies.error`, to which harmonics are added; their number is at most the maximum of
+            80, twice the largest order, and 1.5 times the length of the profile in waves (the last at most 300).
+        harmonics: N, instead of a tolerance; at least the largest |m| that propagates, above or below.
 
     Raises:
-        ValueError: if an argument is out of range, or if more light leaves than came, by more than the tolerance: the
-            profile is too deep for the wavelength.
+        ValueError: if an argument is out of range, or if the outgoing power exceeds the incident power by more than the
+            tolerance, as the profile is too deep for the wavelength.
 
     Warns:
         UserWarning: if `Efficiencies.error` is above the tolerance.
@@ -192,20 +190,20 @@ def efficiencies(
         raise RequestError(f"direction: got {direction!r}, light from inside of an absorbing material, wanted it above")
     omega = omega / length
     if not 0 < tolerance < 1:
-        raise RequestError(f"tolerance: got {tolerance!r}, wanted a share of the reflected light between 0 and 1")
+        raise RequestError(f"tolerance: got {tolerance!r}, wanted a fraction of the reflected light between 0 and 1")
     curve, k_0 = curve_of(height_field), height_field.tile_size[0] / wavelength
     if harmonics is None:
         found = converge(curve, omega, k_0, index, tolerance)
     else:
-        fewest, _ = wave_numbers(curve, k_0, index, omega)
-        if not fewest <= harmonics <= 500:
-            raise RequestError(f"harmonics: got {harmonics!r}, wanted a number from {fewest} to 500")
+        max_order, _ = wave_numbers(curve, k_0, index, omega)
+        if not max_order <= harmonics <= 500:
+            raise RequestError(f"harmonics: got {harmonics!r}, wanted a number from {max_order} to 500")
         found = solve(curve, omega, k_0, index, harmonics)
         found = dataclasses.replace(found, error=found.imbalance)
-    exceeding = max(found.s.sum(), found.p.sum(), *np.nan_to_num(found.transmitted))
-    if not exceeding <= 1 + tolerance:
+    max_power = max(found.s.sum(), found.p.sum(), *np.nan_to_num(found.transmitted))
+    if not max_power <= 1 + tolerance:
         raise RequestError(
-            f"height field: got orders with {exceeding:.3g} of the incident light, with {found.harmonics} harmonics, "
+            f"height field: got orders with {max_power:.3g} of the incident light, with {found.harmonics} harmonics, "
             f"wanted at most 1; {np.ptp(height_field.heights):.3g} µm are too deep for a period of "
             f"{height_field.tile_size[0]:.3g} µm and a wavelength of {wavelength:.3g} µm"
         )
@@ -219,23 +217,23 @@ def efficiencies(
 
 
 def converge(curve: Curve, omega: Real, k_0: float, index: complex, tolerance: float) -> Efficiencies:
-    """Raise the harmonics as `efficiencies` says, whatever error is reached; k_0 = period / wavelength."""
-    fewest, waves = wave_numbers(curve, k_0, index, omega)
-    most = max(MOST_HARMONICS, 2 * fewest, min(int(1.5 * waves), _FOR_DEEP_PROFILES))
-    count = min(max(fewest + 6, waves), int(0.8 * most))
+    """Add harmonics as described for `efficiencies`, whatever error is reached; k_0 = period / wavelength."""
+    max_order, waves = wave_numbers(curve, k_0, index, omega)
+    max_count = max(MAX_HARMONICS, 2 * max_order, min(int(1.5 * waves), _MAX_HARMONICS_DEEP))
+    count = min(max(max_order + 6, waves), int(0.8 * max_count))
     found = solve(curve, omega, k_0, index, count)
-    while found.error > tolerance and found.harmonics < most:
-        count = min(int(np.ceil(1.25 * count)) + 1, most)
-        before, found = found, solve(curve, omega, k_0, index, count)
-        found = dataclasses.replace(found, error=max(_change(before, found), found.imbalance))
+    while found.error > tolerance and found.harmonics < max_count:
+        count = min(int(np.ceil(1.25 * count)) + 1, max_count)
+        previous, found = found, solve(curve, omega, k_0, index, count)
+        found = dataclasses.replace(found, error=max(_change(previous, found), found.imbalance))
     return found
 
 
 def wave_numbers(curve: Curve, k_0: float, index: complex, omega: Real) -> tuple[int, int]:
-    """Return the largest order that propagates, above or below, and the waves that a profile is long.
+    """Return the largest propagating order, above or below, and the length of a profile in waves.
 
-    Light that travels along the curve has, where t runs fastest, as many waves to a unit of t as the second number
-    says: below it, the efficiencies of deep profiles have nothing to do with their limit; above it, they converge
+    The latter is the number of waves per unit of t of light that propagates along the curve, where t varies fastest.
+    With fewer harmonics, the efficiencies of deep profiles are far from their limit; with more, they converge
     exponentially.
     """
     max_wave_number = k_0 * np.sqrt(max(1.0, (index**2).real))
@@ -244,23 +242,23 @@ def wave_numbers(curve: Curve, k_0: float, index: complex, omega: Real) -> tuple
 
 
 def solve(curve: Curve, omega: Real, k_0: float, index: complex, harmonics: int) -> Efficiencies:
-    """Solve with this number of harmonics; the error is unknown, ∞."""
+    """Solve with a number of harmonics; `error`, which is unknown, is ∞."""
     side = ABOVE if omega[2] > 0 else BELOW
     k = k_0, k_0 * index.real
     alpha, k_y = -omega[:2] * k[side]
     solved = scattered(curve, omega, k_0, index, harmonics)
-    light = frames(-omega[None])
+    incident_frame = frames(-omega[None])
 
-    def inframes(orders: NDArray[np.int64], amplitudes: Complex, to: int) -> Complex:
+    def in_s_and_p(orders: NDArray[np.int64], amplitudes: Complex, to: int) -> Complex:
         alphas = alpha + orders
-        heights = (1, -1)[to] * np.sqrt(k[to] ** 2 - k_y**2 - alphas**2)
-        of_orders = frames(np.stack([alphas, np.full_like(alphas, k_y), heights], axis=1) / k[to])
-        # Orders count along the change of k_x there, and along q = −(ω_i + ω_o)_∥/λ here.
-        return (of_orders.transpose(0, 2, 1) @ amplitudes @ light)[::-1]
+        k_z = (1, -1)[to] * np.sqrt(k[to] ** 2 - k_y**2 - alphas**2)
+        outgoing_frames = frames(np.stack([alphas, np.full_like(alphas, k_y), k_z], axis=1) / k[to])
+        # `Scattered` numbers orders by the change of k_x, `Efficiencies` by q = −(ω_i + ω_o)_∥/λ.
+        return (outgoing_frames.transpose(0, 2, 1) @ amplitudes @ incident_frame)[::-1]
 
     order_0 = solved.orders[side].tolist().index(0)
     amplitudes, transmitted = (
-        inframes(solved.orders[to], solved.amplitudes[side][to][:, :, order_0], to) for to in (side, 1 - side)
+        in_s_and_p(solved.orders[to], solved.amplitudes[side][to][:, :, order_0], to) for to in (side, 1 - side)
     )
     return Efficiencies(
         orders=-solved.orders[side][::-1],
@@ -275,7 +273,7 @@ def solve(curve: Curve, omega: Real, k_0: float, index: complex, harmonics: int)
 
 @one_thread()
 def scattered(curve: Curve, omega: Real, k_0: float, index: complex, harmonics: int) -> Scattered:
-    """Solve for light from ω_i and of all orders that it is diffracted into."""
+    """Solve for light of the tangential wave vector of ω_i and of all orders that it is diffracted into."""
     grating = Grating(curve, harmonics)
     alpha, k_y = -omega[:2] * k_0 * (1 if omega[2] > 0 else index.real)
     above = half_space(grating, alpha, k_0**2 - k_y**2, True)
@@ -284,14 +282,14 @@ def scattered(curve: Curve, omega: Real, k_0: float, index: complex, harmonics: 
 
 
 def sheet_orders(curve: Curve, omega: Real, k_0: float, index: float, harmonics: int) -> tuple[NDArray[np.int64], Real]:
-    """Return the orders that leave the flat face of a sheet, ascending, and η_m of s and of p light, (n, 2).
+    """Return the orders transmitted by a sheet, ascending, and η_m of s and of p light, (n, 2).
 
-    Arguments are those of `solve`, of light from above.
+    Arguments are those of `solve`, for light from above.
     """
     solved = scattered(curve, omega, k_0, index, harmonics)
     matrices = through_sheet(solved, index)[ABOVE, BELOW][:, list(solved.orders[ABOVE]).index(0), 0].real
-    light = frames(-omega[None])[0]
-    stokes = np.einsum("as,iab,bs->is", light, _PAULI, light).real
+    frame = frames(-omega[None])[0]
+    stokes = np.einsum("as,iab,bs->is", frame, _PAULI, frame).real
     return -solved.orders[ABOVE][::-1], (matrices @ stokes)[::-1]
 
 
@@ -300,11 +298,11 @@ def _powers(amplitudes: Complex) -> Real:
     return (np.abs(amplitudes) ** 2).sum(axis=1)
 
 
-def _change(before: Efficiencies, after: Efficiencies) -> float:
-    """Return Σ|Δη_m| / Σ η_m, of reflected or transmitted orders, of s or p light, the largest."""
+def _change(previous: Efficiencies, current: Efficiencies) -> float:
+    """Return the largest Σ|Δη_m| / Σ η_m of reflected or transmitted orders, for s or p light."""
     pairs = (
-        (before.amplitudes, after.amplitudes),
-        (before.transmitted_amplitudes, after.transmitted_amplitudes),
+        (previous.amplitudes, current.amplitudes),
+        (previous.transmitted_amplitudes, current.transmitted_amplitudes),
     )
     changes = [np.abs(a - b).sum(axis=0) / b.sum(axis=0) for a, b in (map(_powers, pair) for pair in pairs) if len(b)]
     return float(np.max(changes))
@@ -317,24 +315,25 @@ def frames(k: Real) -> Real:
     """
     # ê·ŝ = s_y/√(1 − k_y²), and (k̂ × ê)·ŝ = −ê·(k̂ × ŝ) = −ê·p̂, with ŝ = (−k_y, k_x, 0)/√(k_x² + k_y²).
     k_x, k_y, k_z = k.T
-    across = np.emath.sqrt((k_x**2 + k_y**2).real)
+    tangential = np.emath.sqrt((k_x**2 + k_y**2).real)
     scale = np.sqrt(np.maximum((1 - k_y**2).real, 1e-30))
-    along_normal = np.abs(across) < 1e-12
-    across = np.where(along_normal, 1, across)
-    cos, sin = np.where(along_normal, 1, k_x / across) / scale, -k_y * k_z / (across * scale)
+    along_normal = np.abs(tangential) < 1e-12
+    tangential = np.where(along_normal, 1, tangential)
+    cos, sin = np.where(along_normal, 1, k_x / tangential) / scale, -k_y * k_z / (tangential * scale)
     return np.array([[cos, sin], [-sin, cos]]).transpose(2, 0, 1)
 
 
-# What a bounce inside loses: light that a shallow grating keeps in the sheet would never end.
-_LOSS = 1e-9
+# Loss at each internal reflection, for convergence: light trapped in a sheet with a shallow grating would never leave.
+_BOUNCE_LOSS = 1e-9
 
 
 def through_sheet(solved: Scattered, index: float) -> dict[tuple[int, int], Complex]:
-    """Compute what a sheet does to light, all bounces inside summed incoherently.
+    """Compute the Mueller matrices of a sheet, with all internal reflections summed incoherently.
 
-    The plane is far from the grating: powers add up, order by order, as Stokes vectors. With the Mueller matrices of
-    all orders together, G those of the grating and F, T those of the plane, each order by itself, light inside that
-    travels downwards is D = (1 − G F)⁻¹ G × what enters, through the grating or, T, through the plane, and
+    The plane is far from the grating, so that the Stokes vectors of each order add up. With the Mueller matrices of all
+    orders together, G those of the grating and F, T those of reflection and refraction at the plane (diagonal in the
+    orders), light that travels downwards inside is D = (1 − G F)⁻¹ G times the incident light, which enters through the
+    grating or, by T, through the plane, and
 
         above → above: G + G F D,    below → below: F + T D T,    above → below: T D,    below → above: G (1 + F D) T.
 
@@ -343,40 +342,40 @@ def through_sheet(solved: Scattered, index: float) -> dict[tuple[int, int], Comp
         index: of the dielectric.
 
     Returns:
-        (from, to) → matrices, (orders out, orders in, 4, 4), orders those above.
+        (side of incidence, side of exit) → matrices, (outgoing, incident, 4, 4); orders are those above.
     """
     outside, inside = solved.orders
     grating = [[_as_matrix(matrices_of(solved, i, o)) for o in (ABOVE, BELOW)] for i in (ABOVE, BELOW)]
     k_0, k = solved.k_0, index * solved.k_0
-    into, plane = _plane(solved, solved.alpha[ABOVE], k_0, k, upwards=True)
-    out_of, mirror = _plane(solved, solved.alpha[BELOW], k, k_0, upwards=False)
-    # Orders that propagate on both sides of the plane.
-    travel = np.equal.outer(inside, outside)
-    into = _as_matrix(travel[..., None, None] * into[None])
-    out_of = _as_matrix(travel.T[..., None, None] * out_of[None])
+    enter, plane = _plane(solved, solved.alpha[ABOVE], k_0, k, upwards=True)
+    leave, mirror = _plane(solved, solved.alpha[BELOW], k, k_0, upwards=False)
+    # Only orders that propagate on both sides of the plane cross it.
+    crosses = np.equal.outer(inside, outside)
+    enter = _as_matrix(crosses[..., None, None] * enter[None])
+    leave = _as_matrix(crosses.T[..., None, None] * leave[None])
     mirror = _as_matrix(np.eye(len(inside))[..., None, None] * mirror[:, None])
     plane = _as_matrix(np.eye(len(outside))[..., None, None] * plane[:, None])
-    sources = np.hstack([grating[ABOVE][BELOW], grating[BELOW][BELOW] @ into])
-    bounce = (1 - _LOSS) * grating[BELOW][BELOW] @ mirror
+    sources = np.hstack([grating[ABOVE][BELOW], grating[BELOW][BELOW] @ enter])
+    bounce = (1 - _BOUNCE_LOSS) * grating[BELOW][BELOW] @ mirror
     down = np.linalg.solve(np.eye(len(bounce)) - bounce, sources)
     from_above, from_below = down[:, : 4 * len(outside)], down[:, 4 * len(outside) :]
     found = {
         (ABOVE, ABOVE): grating[ABOVE][ABOVE] + grating[BELOW][ABOVE] @ mirror @ from_above,
-        (BELOW, BELOW): plane + out_of @ from_below,
-        (ABOVE, BELOW): out_of @ from_above,
-        (BELOW, ABOVE): grating[BELOW][ABOVE] @ (into + mirror @ from_below),
+        (BELOW, BELOW): plane + leave @ from_below,
+        (ABOVE, BELOW): leave @ from_above,
+        (BELOW, ABOVE): grating[BELOW][ABOVE] @ (enter + mirror @ from_below),
     }
-    return {way: _as_blocks(matrix) for way, matrix in found.items()}
+    return {sides: _as_blocks(matrix) for sides, matrix in found.items()}
 
 
 def _plane(solved: Scattered, alpha: Real, k: float, other: float, upwards: bool) -> tuple[Complex, Complex]:
-    """Return the Mueller matrices of light that meets a plane, transmitted and reflected, (n, 4, 4) each.
+    """Return the Mueller matrices of refraction and of reflection at a plane, (n, 4, 4) each.
 
     Args:
         solved: of the grating, for k_y.
-        alpha: along the plane.
-        k, other: wave numbers of the medium in which the light is, and beyond the plane.
-        upwards: whether the light goes up.
+        alpha: α of the incident waves, (n,).
+        k, other: wave numbers in the medium of the incident light, and on the other side of the plane.
+        upwards: whether the incident light travels upwards.
     """
     k_y = solved.k_y
     beta, beta_other = (np.sqrt((w**2 - k_y**2 - alpha**2).real + 0j) for w in (k, other))
@@ -386,18 +385,18 @@ def _plane(solved: Scattered, alpha: Real, k: float, other: float, upwards: bool
     t_s, t_p = root / (beta + beta_other), root * (k / other) / (beta + square * beta_other)
     sign = 1 if upwards else -1
 
-    def basis(height: Real, w: float) -> Real:
-        return frames(np.stack(np.broadcast_arrays(alpha, k_y, height), axis=1) / w)
+    def basis(k_z: Real, w: float) -> Real:
+        return frames(np.stack(np.broadcast_arrays(alpha, k_y, k_z), axis=1) / w)
 
-    def matrices(to: Real, s: Complex, p: Complex) -> Complex:
-        from_ = basis(sign * beta.real, k).transpose(0, 2, 1)
-        amplitudes = to @ (np.stack([s, p], axis=1)[..., None] * from_)
+    def matrices(outgoing: Real, s: Complex, p: Complex) -> Complex:
+        incident = basis(sign * beta.real, k).transpose(0, 2, 1)
+        amplitudes = outgoing @ (np.stack([s, p], axis=1)[..., None] * incident)
         return mueller(amplitudes, solved.conjugate(amplitudes))
 
-    travels = beta_other.imag == 0
-    height = np.where(travels, beta_other.real, 0.0)
-    transmitted = matrices(basis(sign * height, other), t_s, t_p)
-    return np.where(travels[:, None, None], transmitted, 0), matrices(basis(-sign * beta.real, k), r_s, r_p)
+    propagates = beta_other.imag == 0
+    k_z = np.where(propagates, beta_other.real, 0.0)
+    transmitted = matrices(basis(sign * k_z, other), t_s, t_p)
+    return np.where(propagates[:, None, None], transmitted, 0), matrices(basis(-sign * beta.real, k), r_s, r_p)
 
 
 def _as_matrix(matrices: Complex) -> Complex:

@@ -1,4 +1,4 @@
-"""Refractive indices n + ik, as Mitsuba's `conductor` has them."""
+"""Refractive indices n + ik, from the tables of Mitsuba's `conductor`."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ _SYMBOLS = {
 def refractive_index(
     wavelength: float, *, int_ior: complex | None = None, material: str | None = None, known: bool = False
 ) -> complex:
-    """Return n + ik of what lies below a surface.
+    """Return n + ik of the medium below a surface.
 
     Args:
         wavelength: µm, in vacuum.
         int_ior: of a dielectric, or n + ik.
-        material: a conductor by Mitsuba's name ("Al", "Au", …): the tables that come with Mitsuba, linear between their
-            wavelengths and constant beyond them, are read without loading it.
-        known: refuse infrared and ultraviolet wavelengths beyond a table.
+        material: a conductor by Mitsuba's name ("Al", "Au", …). The tables that come with Mitsuba, linear between their
+            wavelengths and constant outside, are read without loading Mitsuba.
+        known: whether to refuse infrared and ultraviolet wavelengths outside the table.
 
     Raises:
         ValueError: if not exactly one of `int_ior` and `material` is given, or it is unknown or out of range.
@@ -45,17 +45,18 @@ def refractive_index(
         return number
     data = Path(str(metadata.distribution("mitsuba").locate_file("mitsuba/data/ior")))
     wavelengths, n, k = conductor(material, data)
-    shortest, longest = min(wavelengths[0], VISIBLE[0] * 1e-3), max(wavelengths[-1], VISIBLE[1] * 1e-3)
-    if known and not shortest * (1 - 1e-6) <= wavelength <= longest * (1 + 1e-6):
+    min_wavelength, max_wavelength = min(wavelengths[0], VISIBLE[0] * 1e-3), max(wavelengths[-1], VISIBLE[1] * 1e-3)
+    if known and not min_wavelength * (1 - 1e-6) <= wavelength <= max_wavelength * (1 + 1e-6):
         raise RequestError(
-            f"material: got {material!r} at {wavelength * 1e3:g} nm, wanted a wavelength from {shortest * 1e3:.4g} to "
-            f"{longest * 1e3:.4g} nm: there its index is known; elsewhere give n + ik as int_ior"
+            f"material: got {material!r} at {wavelength * 1e3:g} nm, wanted a wavelength from "
+            f"{min_wavelength * 1e3:.4g} to {max_wavelength * 1e3:.4g} nm, where its index is known; elsewhere give "
+            "n + ik as int_ior"
         )
     return complex(np.interp(wavelength, wavelengths, n), np.interp(wavelength, wavelengths, k))
 
 
 def _near(name: str, known: list[str]) -> list[str]:
-    """Return those of `known` that `name` may stand for: of that element, of that beginning, or spelt much like it."""
+    """Return the names in `known` that may be meant: those of the same element or beginning, or of similar spelling."""
     lower = name.lower()
     if lower in _SYMBOLS:
         return [other for other in known if other.partition("_")[0] == _SYMBOLS[lower]]
@@ -66,7 +67,7 @@ def _near(name: str, known: list[str]) -> list[str]:
 
 @functools.cache
 def conductor(material: str, folder: Path) -> tuple[NDArray[np.float64], ...]:
-    """Return the table of a conductor in Mitsuba's folder of indices: wavelengths in µm, n and k there, (J,) each."""
+    """Return the table of a conductor from Mitsuba's folder of indices: wavelengths in µm, n and k, (J,) each."""
     known = sorted(path.name.removesuffix(".eta.spd") for path in folder.glob("*.eta.spd"))
     if material not in known:
         wanted = f"one of {', '.join(known) or 'none: no tables found'}"

@@ -34,8 +34,8 @@ def glass(request):
     )
     with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        patch.setattr("mitsuba_diffraction.rigorous.build._SOLVED_BOTH", ((3, 4, 3),))
-        patch.setattr("mitsuba_diffraction.rigorous.build._CHECKS", 40)
+        patch.setattr("mitsuba_diffraction.rigorous.build._SOLVED_STEPS_TRANSMISSION", ((3, 4, 3),))
+        patch.setattr("mitsuba_diffraction.rigorous.build._CHECK_COUNT", 40)
         return build_spectrum(gratings.blazed(PERIOD, 0.05, samples=64), settings)
 
 

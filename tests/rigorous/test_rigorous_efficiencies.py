@@ -15,7 +15,7 @@ CONICAL = np.array([-0.3, 0.35, 0.887])
 
 
 def light(degrees, turned=0.0):
-    """From −x, turned towards +y."""
+    """ω_i at an angle from the normal, from −x, with the plane of incidence rotated towards +y."""
     angle, azimuth = np.deg2rad([degrees, turned])
     return np.array([-np.sin(angle) * np.cos(azimuth), np.sin(angle) * np.sin(azimuth), np.cos(angle)])
 
@@ -58,7 +58,7 @@ def test_in_plane_incidence_agrees_with_meent(case):
     )
     np.testing.assert_array_equal(found.orders, case.orders)
     assert difference(found.s, case.te) < 1.5e-3
-    # In p light a staircase of metal does not converge; the lamellar grating below is the one to compare with.
+    # For p light a staircase of metal does not converge; it is compared with a lamellar grating below.
     if case.material == "dielectric":
         assert difference(found.p, case.tm) < 4e-3
 
@@ -77,7 +77,7 @@ def test_conical_incidence_agrees_with_scatmech(case):
     reflected = case["type"] in (0, 2)
     orders = found.orders if reflected else found.transmitted_orders
     powers = (np.abs(found.amplitudes if reflected else found.transmitted_amplitudes) ** 2).sum(axis=1)
-    # Inside, its staircases of 150 steps err by 2e-3.
+    # For light inside, the staircases of SCATMECH, of 150 steps, err by 2e-3.
     bound = 5e-3 if index.imag else 3e-3 if case["type"] == 2 and case["profile"] != "lamellar" else 1e-3
     for name, ours in (("unpolarised", powers.mean(axis=1)), ("s", powers[:, 0])):
         if name in case:
@@ -112,7 +112,7 @@ def test_transmitted_orders_of_a_lamellar_grating_agree_with_meent(angle, turned
     found = rigorous.efficiencies(surface, light(angle, turned) * [1, 1, side], 0.55, int_ior=1.5, tolerance=1e-3)
     ours = (np.abs(found.transmitted_amplitudes) ** 2).sum(axis=1).mean(axis=1)
     assert len(ours) == (wanted > 1e-9).sum() >= 3
-    # Its order m is our −m.
+    # Meent's order m is −m here.
     assert difference(ours, wanted[30 - found.transmitted_orders]) < 2e-3
 
 
@@ -124,7 +124,7 @@ SURFACES = {
 
 
 @pytest.mark.parametrize("profile", SURFACES)
-def test_a_dielectric_reflects_and_transmits_everything(profile):
+def test_reflected_and_transmitted_power_of_a_dielectric_sum_to_one(profile):
     found = rigorous.efficiencies(SURFACES[profile](), CONICAL, 0.55, int_ior=1.5, harmonics=32)
     assert found.s.sum() + found.transmitted[0] == pytest.approx(1, abs=1e-6)
     assert found.p.sum() + found.transmitted[1] == pytest.approx(1, abs=1e-6)
@@ -132,8 +132,8 @@ def test_a_dielectric_reflects_and_transmits_everything(profile):
 
 @pytest.mark.parametrize("omega", [-CONICAL, (0.75, 0.2, -0.6), (0.1, 0.8, -0.6)])
 @pytest.mark.parametrize("profile", SURFACES)
-def test_light_from_inside_is_all_reflected_or_transmitted(profile, omega):
-    """Also beyond the critical angle, where order 0 stays inside, and where all orders do."""
+def test_power_is_conserved_for_light_from_inside(profile, omega):
+    """Also beyond the critical angle, where order 0 or all orders are reflected totally."""
     found = rigorous.efficiencies(SURFACES[profile](), omega, 0.55, int_ior=1.5, harmonics=40)
     np.testing.assert_allclose(np.add([found.s.sum(), found.p.sum()], found.transmitted), 1, atol=1e-6)
 
@@ -154,18 +154,18 @@ def test_a_flat_surface_follows_fresnel_from_inside(direction):
 
 
 @pytest.mark.parametrize("profile", SURFACES)
-def test_light_goes_back_through_a_surface_as_it_came(profile):
-    """T from ω_i into order m is T of the reversed pair, also of amplitudes."""
+def test_transmission_is_reciprocal(profile):
+    """T from ω_i into order m is T of the reversed pair of directions, and so for amplitudes."""
     found = rigorous.efficiencies(SURFACES[profile](), CONICAL, 0.55, int_ior=1.5, harmonics=40)
     omega_i = CONICAL / np.linalg.norm(CONICAL)
     assert len(found.transmitted_orders) > 2
     for m, amplitudes in zip(found.transmitted_orders, found.transmitted_amplitudes, strict=True):
         x, y = (-omega_i[:2] - [0.55 * m / 0.9, 0]) / 1.5
-        back = rigorous.efficiencies(
+        reverse = rigorous.efficiencies(
             SURFACES[profile](), (x, y, -np.sqrt(1 - x**2 - y**2)), 0.55, int_ior=1.5, harmonics=40
         )
-        other = back.transmitted_amplitudes[list(back.transmitted_orders).index(m)]
-        # ŝ and p̂ of reversed light are of the opposite sign, and the same.
+        other = reverse.transmitted_amplitudes[list(reverse.transmitted_orders).index(m)]
+        # For reversed light ŝ has the opposite sign, p̂ the same.
         np.testing.assert_allclose(amplitudes, [[1, -1], [-1, 1]] * other.T, atol=2e-5)
         assert (np.abs(amplitudes) ** 2).sum() == pytest.approx((np.abs(other) ** 2).sum(), abs=2e-6)
 
@@ -178,18 +178,18 @@ def test_a_dielectric_as_deep_as_its_period_conserves_energy():
 @pytest.mark.few(2)
 @pytest.mark.parametrize("profile", SURFACES)
 @pytest.mark.parametrize("index", [1.5, 0.9 + 6j])
-def test_reversed_light_goes_the_same_way_back(profile, index):
+def test_reflection_is_reciprocal(profile, index):
     found = rigorous.efficiencies(SURFACES[profile](), CONICAL, 0.55, int_ior=index, harmonics=40)
     omega_i = CONICAL / np.linalg.norm(CONICAL)
     assert len(found.orders) == 4
     for m, amplitudes in zip(found.orders[::2], found.amplitudes[::2], strict=True):
-        back = -omega_i[:2] - [0.55 * m / 0.9, 0]
-        reversed_ = rigorous.efficiencies(
-            SURFACES[profile](), [*back, np.sqrt(1 - back @ back)], 0.55, int_ior=index, harmonics=40
+        tangential = -omega_i[:2] - [0.55 * m / 0.9, 0]
+        reverse = rigorous.efficiencies(
+            SURFACES[profile](), [*tangential, np.sqrt(1 - tangential @ tangential)], 0.55, int_ior=index, harmonics=40
         )
-        other = reversed_.amplitudes[list(reversed_.orders).index(m)]
+        other = reverse.amplitudes[list(reverse.orders).index(m)]
         assert (np.abs(amplitudes) ** 2).sum() == pytest.approx((np.abs(other) ** 2).sum(), abs=2e-6)
-        # ŝ keeps its sign only along with p̂: s to p of one way is p to s of the other.
+        # s to p in one direction is p to s in the other, up to signs.
         np.testing.assert_allclose(np.abs(amplitudes), np.abs(other.T), atol=1e-3)
 
 
@@ -201,7 +201,7 @@ def test_scalar_theory_holds_for_a_wide_period():
     assert difference(scalar.unpolarised, found.unpolarised) < 5e-3
 
 
-def test_a_sawtooth_blazes_to_the_side_that_scalar_theory_blazes_to():
+def test_a_sawtooth_is_blazed_into_the_same_order_as_in_scalar_theory():
     # 2 depth / λ = 1: the facet's mirror direction is that of m = 1, towards −x.
     found = rigorous.efficiencies(gratings.blazed(5.0, 0.25), (0, 0, 1), 0.5, material="Al")
     assert found.orders[np.argmax(found.unpolarised)] == 1
@@ -230,15 +230,15 @@ def test_the_reported_error_is_the_actual_one(surface, index, goal):
         assert difference(one, other) <= goal
 
 
-def test_light_of_a_denser_medium_is_conserved():
-    """Under a coat the grating may be less dense than what is above: some orders are reflected totally."""
+def test_power_is_conserved_under_a_denser_coat():
+    """The coat may be denser than the grating, so that some orders are reflected totally."""
     found = rigorous.efficiencies(asymmetric(0.5, 0.1, 0.7), CONICAL, 0.3, int_ior=1.3 / 1.58)
     assert found.s.sum() + found.transmitted[0] == pytest.approx(1, abs=1e-6)
     assert found.p.sum() + found.transmitted[1] == pytest.approx(1, abs=1e-6)
 
 
 def test_all_orders_of_a_coarse_grating_are_found():
-    """Beside the horizon the last order is farther away than the period has wavelengths."""
+    """At oblique incidence the largest |m| exceeds the period in wavelengths."""
     found = rigorous.efficiencies(gratings.sinusoidal(13.7, 0.05, samples=256), light(60), 1.0, int_ior=1.5)
     sine = np.sin(np.deg2rad(60))
     np.testing.assert_array_equal(found.orders, np.arange(np.ceil(-13.7 * (1 - sine)), np.floor(13.7 * (1 + sine)) + 1))
@@ -304,20 +304,20 @@ def test_deep_gold_at_grazing_incidence_converges():
 
 def test_too_few_harmonics_raise_a_warning():
     surface = gratings.sinusoidal(0.5, 4.0)
-    with pytest.warns(UserWarning, match=r"error of 0\.\d+ with 80 harmonics, wanted at most 1e-09") as told:
+    with pytest.warns(UserWarning, match=r"error of 0\.\d+ with 80 harmonics, wanted at most 1e-09") as warnings:
         found = rigorous.efficiencies(surface, CONICAL, 0.55, material="Ag", tolerance=1e-9)
-    assert len(told) == 1
+    assert len(warnings) == 1
     assert found.harmonics == 80
     assert found.error > 1e-9
 
 
-def test_more_light_than_came_is_refused():
+def test_outgoing_power_above_the_incident_power_is_refused():
     deep = gratings.sinusoidal(5.0, 10.0)
     with pytest.raises(ValueError, match="wanted at most 1; 10 µm are too deep for a period of 5 µm"):
         rigorous.efficiencies(deep, CONICAL, 0.55, int_ior=3.0, harmonics=60)
 
 
-def test_light_along_the_grooves_and_grazing_light_stay_finite():
+def test_amplitudes_are_finite_along_the_grooves_and_at_grazing_incidence():
     for direction in ((0, 0.999, 0.04), (0.9999, 0, 0.01), (-0.7, 0.71, 0.01)):
         found = rigorous.efficiencies(gratings.blazed(0.8, 0.2), direction, 0.55, material="Al")
         assert np.isfinite(found.amplitudes).all()
@@ -325,7 +325,7 @@ def test_light_along_the_grooves_and_grazing_light_stay_finite():
         assert found.p.sum() <= 1 + 1e-6
 
 
-def test_metals_are_those_of_mitsuba():
+def test_indices_of_metals_agree_with_mitsuba():
     mi = pytest.importorskip("mitsuba")
     mi.set_variant("scalar_spectral")
     for metal in ("Al", "Au", "Cr"):
@@ -354,7 +354,7 @@ def test_metals_are_those_of_mitsuba():
         ({"height_field": gratings.crossed(2.0, 0.2, samples=8)}, "rows that differ"),
     ],
 )
-def test_what_is_out_of_range_is_refused(change, message):
+def test_arguments_out_of_range_are_refused(change, message):
     arguments = {"height_field": gratings.blazed(), "direction": (0, 0, 1), "wavelength": 0.55, "int_ior": 1.5}
     with pytest.raises(ValueError, match=message):
         rigorous.efficiencies(**(arguments | change))
@@ -363,16 +363,16 @@ def test_what_is_out_of_range_is_refused(change, message):
 @pytest.mark.parametrize("height", [0.0, 0.1])
 @pytest.mark.parametrize("omega", [(0, 0, 1), (0, 0, -1), (0.5, 0, 0.75**0.5)])
 @pytest.mark.parametrize("wavelength", [0.25, 0.5])
-def test_an_order_exactly_along_the_horizon_is_the_limit_of_those_beside_it(height, omega, wavelength):
+def test_an_order_exactly_at_the_horizon_is_the_limit_of_nearby_wavelengths(height, omega, wavelength):
     surface = gratings.sinusoidal(1.0, height)
-    at, beside = (rigorous.efficiencies(surface, omega, λ, int_ior=1.5) for λ in (wavelength, wavelength * (1 + 1e-9)))
-    shared = np.isin(at.orders, beside.orders)
+    at, near = (rigorous.efficiencies(surface, omega, λ, int_ior=1.5) for λ in (wavelength, wavelength * (1 + 1e-9)))
+    shared = np.isin(at.orders, near.orders)
     assert at.error < 1e-3
-    np.testing.assert_allclose(at.unpolarised[shared], beside.unpolarised, atol=1e-4)
+    np.testing.assert_allclose(at.unpolarised[shared], near.unpolarised, atol=1e-4)
 
 
-def test_the_error_of_scalar_theory_is_found_where_orders_lie_along_the_horizon():
-    """Order 8 of 2.4 µm, at 450 nm and normal incidence, inside of n = 1.5."""
-    beside, at = (scalar_error(gratings.sinusoidal(period, 0.1)) for period in (2.4003, 2.4))
-    assert at.share == pytest.approx(beside.share, rel=0.02)
-    assert at.transmitted == pytest.approx(beside.transmitted, rel=0.02)
+def test_the_error_of_scalar_theory_is_found_with_an_order_at_the_horizon():
+    """Order 8 of 2.4 µm, at 450 nm and normal incidence, inside n = 1.5."""
+    near, at = (scalar_error(gratings.sinusoidal(period, 0.1)) for period in (2.4003, 2.4))
+    assert at.share == pytest.approx(near.share, rel=0.02)
+    assert at.transmitted == pytest.approx(near.transmitted, rel=0.02)

@@ -12,7 +12,7 @@ import mitsuba_diffraction as md
 from mitsuba_diffraction import gratings, rigorous
 from mitsuba_diffraction.rigorous import build
 from mitsuba_diffraction.rigorous.build import build_spectrum
-from mitsuba_diffraction.rigorous.spectrum import Axes, RigorousSpectrum, cell_of, edges_of
+from mitsuba_diffraction.rigorous.spectrum import Axes, RigorousSpectrum, interval_bounds, interval_of
 from mitsuba_diffraction.scalar_theory import fresnel
 from mitsuba_diffraction.settings import Settings
 
@@ -31,18 +31,17 @@ def hemisphere(count, seed):
     return np.stack([np.sqrt(1 - z**2) * f(2 * np.pi * turn) for f in (np.cos, np.sin)] + [z], axis=-1)
 
 
-def test_the_axes_are_symmetric_and_whole_where_orders_pass_off():
+def test_intervals_end_at_rayleigh_anomalies():
     axes = Axes(0.9, (0.36, 0.83), (8, 8, 4))
     assert axes.max_order == 4
     assert axes.blocks == {(1, 0): 0, (2, 0): 1, (3, 0): 5, (4, 0): 14, (5, 0): 30}
     a, count = np.random.default_rng(0).random((2, 99)) * [[0.5], [5.0]]
     n = np.arange(-6, 7)
     orders = (np.abs(n + a[:, None]) < count[:, None]).sum(axis=1)
-    np.testing.assert_array_equal(cell_of(count**2, a), orders)
-    for cell in range(1, 5):
-        begins, ends = np.sqrt(edges_of(cell, a, 0.0))
-        for edge in (begins, ends):
-            np.testing.assert_allclose(np.abs(np.abs(n[:, None] + a) - edge).min(axis=0), 0, atol=1e-9)
+    np.testing.assert_array_equal(interval_of(count**2, a), orders)
+    for interval in range(1, 5):
+        for bound in np.sqrt(interval_bounds(interval, a, 0.0)):
+            np.testing.assert_allclose(np.abs(np.abs(n[:, None] + a) - bound).min(axis=0), 0, atol=1e-9)
 
 
 @pytest.mark.slow
@@ -60,11 +59,11 @@ def test_the_table_has_the_efficiencies_of_the_solver(spectrum):
 def test_the_table_is_reciprocal(spectrum):
     c, g = np.random.default_rng(2).random((2, 100)) * [[0.3], [0.75]]
     for m in (-1, 0, 1):
-        there, back = (spectrum.evaluate(m, sign * c, g, 0.45) for sign in (1, -1))
-        np.testing.assert_allclose(there, back, atol=1e-6)
+        forward, reverse = (spectrum.evaluate(m, sign * c, g, 0.45) for sign in (1, -1))
+        np.testing.assert_allclose(forward, reverse, atol=1e-6)
 
 
-def test_grazing_light_is_mirrored(spectrum):
+def test_light_at_grazing_incidence_is_reflected_into_order_zero(spectrum):
     m, eta = spectrum.efficiencies((1 - 1e-9, 0, 1e-6), 0.45)
     assert eta[list(m).index(0)] == pytest.approx(1, abs=1e-3)
     assert eta.sum() <= 1 + 1e-3
@@ -73,10 +72,10 @@ def test_grazing_light_is_mirrored(spectrum):
 @pytest.mark.parametrize(
     ("depth", "material"), [(0.15, {"material": "Al"}), (0.05, {"int_ior": 1.5, "ext_ior": 1.6})], ids=["metal", "coat"]
 )
-def test_a_coarse_table_holds_no_more_light_than_came(depth, material, monkeypatch):
-    """Few harmonics are enough for most light, not for all."""
-    monkeypatch.setattr("mitsuba_diffraction.rigorous.build._SOLVED", ((3, 4, 3),))
-    monkeypatch.setattr("mitsuba_diffraction.rigorous.build._CHECKS", 2)
+def test_no_efficiency_of_a_coarse_table_exceeds_one(depth, material, monkeypatch):
+    """The harmonics of the table suffice for most directions, not for all."""
+    monkeypatch.setattr("mitsuba_diffraction.rigorous.build._SOLVED_STEPS", ((3, 4, 3),))
+    monkeypatch.setattr("mitsuba_diffraction.rigorous.build._CHECK_COUNT", 2)
     surface = gratings.blazed(0.5, depth, samples=256)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -95,7 +94,7 @@ def test_a_profile_that_does_not_converge_is_refused():
         )
 
 
-def test_a_spectrum_survives_its_file(spectrum, tmp_path):
+def test_a_spectrum_is_unchanged_by_saving_and_loading(spectrum, tmp_path):
     spectrum.save(tmp_path / "table.exr")
     loaded = RigorousSpectrum.load(tmp_path / "table.exr")
     np.testing.assert_array_equal(loaded.values, spectrum.values)
@@ -105,15 +104,15 @@ def test_a_spectrum_survives_its_file(spectrum, tmp_path):
 
 @pytest.fixture(scope="module", params=["interface", "sheet"])
 def glass(request):
-    """A coarse table of light that passes, with its matrices."""
+    """A coarse table with transmission and Mueller matrices."""
     with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        patch.setattr("mitsuba_diffraction.rigorous.build._SOLVED_BOTH", ((6, 10, 6),))
-        patch.setattr("mitsuba_diffraction.rigorous.build._CHECKS", 40)
+        patch.setattr("mitsuba_diffraction.rigorous.build._SOLVED_STEPS_TRANSMISSION", ((6, 10, 6),))
+        patch.setattr("mitsuba_diffraction.rigorous.build._CHECK_COUNT", 40)
         return build_spectrum(SURFACE, replace(REQUEST, polarised=True, transmission=request.param))
 
 
-def test_a_table_of_glass_survives_its_file(glass, tmp_path):
+def test_a_table_with_transmission_is_unchanged_by_saving_and_loading(glass, tmp_path):
     glass.save(tmp_path / "glass.exr")
     loaded = RigorousSpectrum.load(tmp_path / "glass.exr")
     assert loaded.transmission == glass.transmission
@@ -129,25 +128,25 @@ def test_a_table_of_glass_survives_its_file(glass, tmp_path):
     side=st.sampled_from([1, -1]),
     wavelength=st.floats(0.4, 0.5),
 )
-def test_light_is_reflected_or_transmitted(glass, cosine, turn, side, wavelength):
+def test_reflected_and_transmitted_efficiencies_sum_to_one(glass, cosine, turn, side, wavelength):
     sine = np.sqrt(1 - cosine**2)
     omega = sine * np.cos(turn), sine * np.sin(turn), side * cosine
     total = sum(glass.efficiencies(omega, wavelength, transmitted)[1].sum() for transmitted in (False, True))
     assert total == pytest.approx(1, abs=2 * max(glass.max_error, glass.max_error_near))
 
 
-def test_no_light_is_lost_where_little_of_a_cell_has_light(glass):
-    """Where the shortest wavelength ends a cell, R + T was off by up to 0.39."""
+def test_energy_is_conserved_where_the_shortest_wavelength_truncates_an_interval(glass):
+    """R + T was off by up to 0.39 there."""
     sums = []
     for omega, wavelength, side in zip(hemisphere(600, 7), np.linspace(0.401, 0.499, 600), [1, -1] * 300, strict=True):
         if omega[2] > 0.02:
-            ways = (glass.efficiencies(omega * [1, 1, side], wavelength, way)[1].sum() for way in (False, True))
-            sums.append(sum(ways))
+            omega_i = omega * [1, 1, side]
+            sums.append(sum(glass.efficiencies(omega_i, wavelength, is_t)[1].sum() for is_t in (False, True)))
     assert np.abs(np.array(sums) - 1).max() < 0.08
     assert np.abs(np.array(sums) - 1).mean() < 0.01
 
 
-def test_a_table_of_a_parabola_errs_least_in_the_mean_square():
+def test_the_fit_to_a_parabola_has_the_least_mean_square_error():
     """h² f''/√720 between the ends, instead of h² f''/√120 with values of the parabola."""
     weights = build._fitted(lambda x: build._cubic(6, x), 12)
     x = np.linspace(0.25, 0.75, 1201)
@@ -163,21 +162,21 @@ def test_a_table_of_a_parabola_errs_least_in_the_mean_square():
     side=st.sampled_from([1, -1]),
     wavelength=st.floats(0.4, 0.5),
 )
-def test_reversed_light_goes_back_as_it_came(glass, cosine, turn, side, wavelength):
-    """Through the interface or the sheet and back: n_o ω_o,x = −λ m/T − n_i ω_i,x."""
+def test_transmitted_efficiencies_are_reciprocal(glass, cosine, turn, side, wavelength):
+    """Through the interface or the sheet in both directions: n_o ω_o,x = −λ m/T − n_i ω_i,x."""
     sine = np.sqrt(1 - cosine**2)
     omega = np.array([sine * np.cos(turn), sine * np.sin(turn), side * cosine])
     n_i, n_o = glass.indices[::side]
     for m, eta in zip(*glass.efficiencies(omega, wavelength, transmitted=True), strict=True):
         x, y = (-n_i * omega[:2] - [wavelength * m / 0.3, 0]) / n_o
         if x**2 + y**2 < 0.999:
-            orders, back = glass.efficiencies((x, y, -side * np.sqrt(1 - x**2 - y**2)), wavelength, transmitted=True)
-            assert back[list(orders).index(m)] == pytest.approx(eta, abs=1e-6)
+            orders, reverse = glass.efficiencies((x, y, -side * np.sqrt(1 - x**2 - y**2)), wavelength, transmitted=True)
+            assert reverse[list(orders).index(m)] == pytest.approx(eta, abs=1e-6)
 
 
-def test_the_matrices_of_reversed_light_are_those_of_the_solver(glass, monkeypatch):
-    """From below to above nothing is stored; the sheet has its own closed sum for it."""
-    monkeypatch.setattr("mitsuba_diffraction.rigorous.build._CHECKS", 30)
+def test_matrices_of_reversed_light_agree_with_the_solver(glass, monkeypatch):
+    """The table does not store light from below to above; the sheet has its own closed sum for it."""
+    monkeypatch.setattr("mitsuba_diffraction.rigorous.build._CHECK_COUNT", 30)
     surface = build._Surface(SURFACE, replace(REQUEST, transmission=glass.transmission), 0.2)
     errors = []
     for alpha, g, wavelength, near, orders in surface.checks():
@@ -190,45 +189,45 @@ def test_the_matrices_of_reversed_light_are_those_of_the_solver(glass, monkeypat
 
 
 def test_a_sheet_with_a_flat_grating_is_a_plate():
-    """All bounces: T = (1 − R)/(1 + R) of each polarisation, and R + T = 1."""
+    """With all internal reflections T = (1 − R)/(1 + R) for each polarisation, and R + T = 1."""
     flat = build._Surface(gratings.blazed(0.3, 0.0, samples=64), replace(REQUEST, transmission="sheet"), 0.01)
     k_0, alpha, k_y = 0.3 / 0.45, 0.3, 0.35
     square = k_0**2 - k_y**2
     (solved,) = flat.solve(alpha, square, [flat.light(square, 0.45)])
-    ways = flat.matrices(solved)
+    matrices_by_sides = flat.matrices(solved)
     reflectance = np.array(fresnel(np.sqrt(1 - (alpha**2 + k_y**2) / k_0**2), 1.5))
     wanted = np.mean((1 - reflectance) / (1 + reflectance))
-    for way, (of_in, of_out, matrices) in ways.items():
-        (place,) = np.flatnonzero(of_in == 0)
-        assert (of_in == of_out).all()
-        assert matrices[place, place, 0, 0] == pytest.approx(wanted if way[0] != way[1] else 1 - wanted, abs=1e-7)
+    for (side_i, side_o), (incident, outgoing, matrices) in matrices_by_sides.items():
+        (index,) = np.flatnonzero(incident == 0)
+        assert (incident == outgoing).all()
+        assert matrices[index, index, 0, 0] == pytest.approx(wanted if side_i != side_o else 1 - wanted, abs=1e-7)
 
 
 @pytest.mark.parametrize("transmission", ["interface", "sheet"])
-def test_light_beyond_k_y_zero_continues_that_of_fresnel(transmission):
-    """Nodes of γ > ν, k_y imaginary: Fresnel's formulas of β alone, real there, too; so for a plate."""
+def test_nodes_of_imaginary_k_y_continue_fresnels_formulas(transmission):
+    """Where γ > ν: Fresnel's formulas in β alone, which are real there, too; likewise for a plate."""
     flat = build._Surface(gratings.blazed(0.3, 0.0, samples=64), replace(REQUEST, transmission=transmission), 0.01)
     nu2, square, alpha = 0.4, 0.7, 0.5
-    inside = square + 1.25 * nu2
-    (solved,) = flat.solve(alpha, square, [(nu2, inside)])
-    beta, beta_inside = np.sqrt(square - alpha**2), np.sqrt(inside - alpha**2)
-    powers = np.array([((n * beta - beta_inside) / (n * beta + beta_inside)) ** 2 for n in (1, 1.5**2)])
+    square_below = square + 1.25 * nu2
+    (solved,) = flat.solve(alpha, square, [(nu2, square_below)])
+    beta, beta_below = np.sqrt(square - alpha**2), np.sqrt(square_below - alpha**2)
+    powers = np.array([((n * beta - beta_below) / (n * beta + beta_below)) ** 2 for n in (1, 1.5**2)])
     wanted = np.mean(powers if transmission == "interface" else 2 * powers / (1 + powers))
-    of_in, _, matrices = flat.matrices(solved)[0, 0]
-    (place,) = np.flatnonzero(of_in == 0)
-    assert matrices[place, place, 0, 0] == pytest.approx(wanted, rel=1e-6)
+    incident, _, matrices = flat.matrices(solved)[0, 0]
+    (index,) = np.flatnonzero(incident == 0)
+    assert matrices[index, index, 0, 0] == pytest.approx(wanted, rel=1e-6)
 
 
 @pytest.mark.slow
-def test_light_from_inside_of_a_ruled_glass_is_that_of_the_solver():
-    """Orders pass off on either side, and where none travels above."""
+def test_the_table_of_a_ruled_glass_agrees_with_the_solver_for_light_from_inside():
+    """With Rayleigh anomalies above and below, also where no order propagates above."""
     surface = gratings.transmission_600()
     table = md.precompute(surface, theory="rigorous", int_ior=1.52, transmission="interface")
     errors = []
     for omega, wavelength in zip(hemisphere(40, 3) * [1, 1, -1], np.linspace(0.365, 0.825, 40), strict=True):
         exact = rigorous.efficiencies(surface, omega, wavelength, int_ior=1.52)
-        of_way = ((False, exact.unpolarised), (True, exact.transmitted_unpolarised))
-        errors.append(sum(np.abs(table.efficiencies(omega, wavelength, way)[1] - eta).sum() for way, eta in of_way))
+        wanted = ((False, exact.unpolarised), (True, exact.transmitted_unpolarised))
+        errors.append(sum(np.abs(table.efficiencies(omega, wavelength, is_t)[1] - eta).sum() for is_t, eta in wanted))
     assert np.mean(errors) < 0.01
     assert max(errors) < 0.03
 
@@ -243,7 +242,7 @@ def test_a_scalar_spectrum_is_refused(spectrum, tmp_path):
 
 
 @pytest.mark.slow
-def test_an_interrupted_build_goes_on(tmp_path):
+def test_an_interrupted_build_resumes(tmp_path):
     class Enough(Exception):
         pass
 
@@ -264,12 +263,12 @@ def test_an_interrupted_build_goes_on(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_progress_is_one_count_in_per_cent(monkeypatch):
-    """Also where finer tables follow."""
-    monkeypatch.setattr("mitsuba_diffraction.rigorous.build._SOLVED", ((3, 3, 3), (4, 4, 4), (5, 5, 5)))
-    monkeypatch.setattr("mitsuba_diffraction.rigorous.build._CHECKS", 2)
+def test_progress_in_per_cent_never_decreases(monkeypatch):
+    """Also if finer tables are needed."""
+    monkeypatch.setattr("mitsuba_diffraction.rigorous.build._SOLVED_STEPS", ((3, 3, 3), (4, 4, 4), (5, 5, 5)))
+    monkeypatch.setattr("mitsuba_diffraction.rigorous.build._CHECK_COUNT", 2)
     reports = []
-    with pytest.warns(UserWarning, match="with 5 steps to a cell"):
+    with pytest.warns(UserWarning, match="with 5 steps per interval"):
         build_spectrum(
             gratings.sinusoidal(0.15, 0.03, samples=32),
             replace(REQUEST, tolerance=1e-4),
@@ -282,8 +281,8 @@ def test_progress_is_one_count_in_per_cent(monkeypatch):
     assert done[-1] == 100
 
 
-def test_a_checkpoint_is_no_reason_to_fail(tmp_path):
-    """In a folder that cannot be written to, and where a checkpoint is damaged."""
+def test_a_build_succeeds_without_a_usable_checkpoint(tmp_path):
+    """The folder cannot be written to, or the checkpoint is damaged."""
     small = gratings.sinusoidal(0.15, 0.03, samples=32)
     wanted = build_spectrum(small, REQUEST, checkpoints=tmp_path / "good").values
     (tmp_path / "file").write_text("")
@@ -316,7 +315,7 @@ def test_a_checkpoint_is_no_reason_to_fail(tmp_path):
         ({"largest_height_range": 0.04}, r"heights: got a range of 0\.049\d* µm, wanted at most 0\.04"),
     ],
 )
-def test_what_is_out_of_range_is_refused(change, message):
+def test_arguments_out_of_range_are_refused(change, message):
     arguments = {"height_field": SURFACE, "theory": "rigorous", "int_ior": 1.5} | change
     with pytest.raises(ValueError, match=message):
         md.precompute(**arguments)
