@@ -164,8 +164,8 @@ class Furnace:
         mean_cos_i = mean_cosine(cos_i**2, sigma)
         value = weight * self._factor(mean_cos_i, cos_o, length, length**2 * (q[j] ** 2).sum(-1), branch)
         # κ of reflected light is that of the pair of directions, κ of transmitted light that of the order.
-        cosines = (mean_cos_i, cos_o) if branch else (cos_i, cos_exit)
-        return i, j, value * self._power(j, self._kappa(*cosines, length, branch), branch)
+        kappa = self._kappa(mean_cos_i if branch else cos_i, cos_o if branch else cos_exit, length, branch)
+        return i, j, value * self._power(j, kappa, branch)
 
     def _bin_terms(
         self, i: Indices, j: Indices, rho: Real, cos_i: Real, length: Real, branch: int
