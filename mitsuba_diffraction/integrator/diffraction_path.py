@@ -16,44 +16,44 @@ PARAMETERS = (
     Parameter("rr_depth", "integer", "as in `path`: depth at which Russian roulette begins", "5"),
 )
 
-MANUAL = f"""A path tracer that also finds the light that gratings cast onto other surfaces.
+MANUAL = f"""Path tracer that also samples the light that gratings cast onto other surfaces.
 
 Parameters (XML or dictionary):
 {listed(PARAMETERS)}
 
 The picture converges to that of `path` with the same parameters. A path tracer hits a small or distant light via a
-grating only by chance, so that the light that gratings cast onto a wall appears as white specks. Those paths are traced
+grating only by chance, so that the light that gratings cast onto a wall appears as fireflies. Those paths are traced
 from the light here, and all others from the eye.
 
-With L a light, G a vertex on a surface whose BSDF is or holds a `diffraction_grating` (whichever component of it
-reflects light or lets it through: both sides of `twosided` and of a film, all of a blend, the base), X a vertex on any
+With L a light, G a vertex on a surface whose BSDF is or contains a `diffraction_grating` (whichever component of it
+reflects or transmits the light: both sides of `twosided` and of a film, all of a blend, the base), X a vertex on any
 other surface, and E the eye, the paths
 
     L G⁺ X E    and    L G⁺ X (G | X)* X E
 
-are traced from the light if the vertex next to E scatters otherwise than as a perfect mirror or refraction does. So
+are traced from the light unless the vertex next to E is specular (perfect reflection or refraction). Thus
 
     L G E, L G G E              from the eye: gratings alone, a lamp seen through a film
     L G X E, L G G X E          from the light: what they cast onto a wall, a film in a window onto the floor
     L G X X E, L G M X E        from the light: that wall lights another one; M is a mirror or a pane of glass
     L G X G E, L G X M E        from the eye: that wall seen in a grating or a mirror
-    L X G X E, L M G X E        from the eye: light that met another surface before the grating
+    L X G X E, L M G X E        from the eye: light scattered by another surface before the grating
 
-What is seen in a grating is left to the eye, as the lobes of a grating reach a pinhole as seldom as a mirror does.
-Points on gratings are drawn by area, a light is drawn from there, one of four such pairs is taken in proportion to what
-it receives, shadows included, and the path goes on by `sample` of the BSDFs, with the correction for shading normals
-and for BSDFs that are not reciprocal; each X is connected to the sensor. There is one path from the light for two
-samples of the film. As in `path`, a light without extent is not seen in a mirror: it is left out where the grating next
-to it scatters by a delta component.
+Light that a grating scatters to the eye is traced from the eye, as the narrow lobes of a grating seldom include the
+direction to a pinhole. A point on a grating is drawn by area, and a light is drawn from that point; one of four such
+pairs is chosen with a probability proportional to the radiance it receives, shadows included. The path is continued by
+`sample` of the BSDFs, with the correction for shading normals and for BSDFs that are not reciprocal; each X is
+connected to the sensor. There is one path from the light for two samples of the film. As in `path`, a light without
+extent is not seen in a mirror: it is omitted where the grating next to it scatters by a delta component.
 
 Without a grating, with max_depth below 3, in polarised variants, and for sensors that points cannot be connected to
-(all but `perspective` and `thinlens`), this is `path`. Instances and curves count as X. It works inside of `aov`.
+(all but `perspective` and `thinlens`), this is `path`. Instances and curves count as X. It can be nested in `aov`.
 Gradients are those of `path` (forward) and `prb` (backward), and single rays (`sample`) those of `path`.
 """
 
 
 def define() -> type:
-    """Define the plugin class for the current variant, to which its base class belongs."""
+    """Define the plugin class for the current variant, as its base class depends on the variant."""
     eye_class = define_eye_paths()
 
     class DiffractionPath(mi.SamplingIntegrator):
@@ -67,7 +67,7 @@ def define() -> type:
             self.path = nested_plugin("path", max_depth=self.max_depth, rr_depth=self.rr_depth)
 
         def parts(self, scene: mi.Scene, sensor: mi.Sensor) -> tuple[mi.SamplingIntegrator, LightPaths | None]:
-            """Return the tracers of paths from the eye and from the light; None where there are no such paths."""
+            """Return the tracers of paths from the eye and from the light, the latter None if there are none."""
             gratings = _lit_gratings(scene, sensor, self.max_depth)
             if gratings is None:
                 return self.path, None
@@ -84,7 +84,7 @@ def define() -> type:
             medium: mi.Medium | None = None,
             active: mi.Bool = True,
         ) -> tuple[mi.Spectrum, mi.Bool, list[mi.Float]]:
-            # Along one ray, with no film at hand, all light is traced from the eye.
+            # A single ray has no film to splat to: all light is traced from the eye.
             return self.path.sample(scene, sampler, ray, medium, active)
 
         def render(
@@ -132,10 +132,10 @@ def define() -> type:
 
 
 def _lit_gratings(scene: mi.Scene, sensor: mi.Sensor, max_depth: int) -> Gratings | None:
-    """Return the gratings from which light is traced; None where all paths are those of `path`.
+    """Return the gratings from which light is traced; None if all paths are those of `path`.
 
     Raises:
-        ValueError: if the film takes samples beyond its edge.
+        ValueError: if the film takes samples outside its edge (`sample_border`).
     """
     if 0 <= max_depth < 3 or mi.is_polarized:
         return None
@@ -148,26 +148,25 @@ def _lit_gratings(scene: mi.Scene, sensor: mi.Sensor, max_depth: int) -> Grating
     film = sensor.film()
     if film.sample_border() and film.rfilter().border_size() > 0:
         raise RequestError(
-            "sample_border: got true, wanted false: points beyond the film's edge cannot be connected to it"
+            "sample_border: got true, wanted false: points outside the film's edge cannot be connected to it"
         )
     return gratings
 
 
 def _is_black(bsdf: mi.BSDF | None) -> bool:
-    """Return whether a surface reflects nothing, as lamps do by default: no path from the light is seen there."""
+    """Return whether a surface reflects nothing, as lamps do by default, and shows no light cast by gratings."""
     return bsdf is None or (
         bsdf.class_name() == "SmoothDiffuse" and all(not np.any(value) for _, value in mi.traverse(bsdf))
     )
 
 
 def _add_light_paths(sensor: mi.Sensor, light: LightPaths, seed: mi.UInt32 | int) -> None:
-    """Add paths from the light to the film of a sensor, which holds those from the eye."""
+    """Add paths from the light to the film of a sensor, which contains those from the eye."""
     film = sensor.film()
-    # Scaled by the samples that the film is divided by.
+    # The film divides by its sum of weights, to which splats add zero: their values are multiplied by spp instead.
     spp = sensor.sampler().sample_count()
     block = film.create_block()
     corner = mi.Vector2f(film.crop_offset())
-    # Without adding to the weights of the block.
     for splats in light.splats(seed, light.count(spp)):
         position, value = splats.position + corner, splats.value * spp
         if mi.has_flag(film.flags(), mi.FilmFlags.Special):
