@@ -73,7 +73,7 @@ def render(
 
     from ..llvm import choose_variant
     from ..render.cluster import trace_on
-    from ..render.passes import checkpoint_path, trace_here
+    from ..render.passes import checkpoint_path, trace_locally
     from ..render.scene import files_of_scene, named_sample_count
     from ..render.turntable import orbit as motions_of_orbit
     from ..render.turntable import save_animation
@@ -94,7 +94,7 @@ def render(
     if denoise is None:
         denoise = _denoises(scene)
     spp = spp or named_sample_count(scene, where["parameters"]) or 64
-    tracer = trace_here if dask is None else trace_on(dask)
+    tracer = trace_locally if dask is None else trace_on(dask)
     motions = [None] if frames is None else motions_of_orbit(scene, frames, **where)
     where |= {"width": width, "height": height}
     request = {"spp": spp, "seed": seed, "until_error": until_error, "seconds": checkpoint, "tracer": tracer}
@@ -131,9 +131,9 @@ def _render(
 
 def _denoises(scene: Path) -> bool:
     """Return whether a scene says that its preview is denoised, and it can be; else log a line."""
-    from ..render.denoise import check_requirements, is_asked_for
+    from ..render.denoise import check_requirements, is_requested
 
-    if not is_asked_for(scene):
+    if not is_requested(scene):
         return False
     try:
         check_requirements()

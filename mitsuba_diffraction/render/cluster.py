@@ -26,16 +26,17 @@ from .film import pass_seed, trace_pass
 from .passes import Job, Tracer, versions
 from .scene import scene_digest
 
-# A pass uses all threads of Dr.Jit; two at a time would only need more memory.
-one_pass = threading.Lock()
-SECONDS_TO_CONNECT = 30
+# Held while a pass is traced: it uses all threads of Dr.Jit, and two at a time would only need more memory.
+pass_lock = threading.Lock()
+CONNECT_TIMEOUT = 30  # seconds
+MAX_PASSES_PER_WORKER = 2  # in flight
 
 
 def trace_on(address: str) -> Tracer:
     """Return a tracer for `render` that uses the workers of a Dask cluster.
 
     All workers need the same versions, the scene and its files under the same path (a shared disk) and, for identical
-    bits, the same kind of processor.
+    bits, the same type of processor.
 
     Args:
         address: of the scheduler, such as `tcp://10.0.0.1:8786`.
@@ -54,18 +55,18 @@ def trace_on(address: str) -> Tracer:
     def trace(job: Job, scene: mi.Scene, first: int) -> Iterator[NDArray[np.float32]]:
         try:
             distributed.comm.parse_address(address, strict=True)
-            asyncio.run(_greet(address))
-            client = distributed.Client(address, timeout=SECONDS_TO_CONNECT, set_as_default=False)
+            asyncio.run(_check_scheduler(address))
+            client = distributed.Client(address, timeout=CONNECT_TIMEOUT, set_as_default=False)
         except (OSError, ValueError, TimeoutError, asyncio.TimeoutError) as error:
             raise RuntimeError(f"no Dask scheduler at {address}: {str(error) or 'it does not answer'}") from error
-        with _errors_are_told_here(), client:
+        with _silent_client_log(), client:
             waiting: deque[distributed.Future] = deque()
             try:
-                client.wait_for_workers(1, timeout=SECONDS_TO_CONNECT)
-                ahead = 2 * len(client.nthreads())
+                client.wait_for_workers(1, timeout=CONNECT_TIMEOUT)
+                max_waiting = MAX_PASSES_PER_WORKER * len(client.nthreads())
                 for index in range(first, len(job.samples)):
-                    while len(waiting) < ahead and index + len(waiting) < len(job.samples):
-                        task = client.submit(_trace_there, job, index + len(waiting), pure=False)
+                    while len(waiting) < max_waiting and index + len(waiting) < len(job.samples):
+                        task = client.submit(_trace_on_worker, job, index + len(waiting), pure=False)
                         waiting.append(task)
                     traced = waiting[0].result()
                     waiting.popleft()
@@ -87,8 +88,8 @@ def trace_on(address: str) -> Tracer:
 
 
 @contextmanager
-def _errors_are_told_here() -> Iterator[None]:
-    """Silence the log of Dask's client, which repeats what it raises, with its traceback."""
+def _silent_client_log() -> Iterator[None]:
+    """Silence the log of Dask's client, which repeats each exception that it raises, with a traceback."""
     logger = logging.getLogger("distributed.client")
     before = logger.level
     logger.setLevel(logging.CRITICAL + 1)
@@ -98,21 +99,21 @@ def _errors_are_told_here() -> Iterator[None]:
         logger.setLevel(before)
 
 
-async def _greet(address: str) -> None:
-    """Shake hands with a scheduler; a client would wait for minutes on a port that accepts but stays silent."""
+async def _check_scheduler(address: str) -> None:
+    """Connect to a scheduler once; a client would wait for minutes for a port that accepts but does not answer."""
     import distributed
 
-    comm = await asyncio.wait_for(distributed.comm.connect(address), SECONDS_TO_CONNECT)
+    comm = await asyncio.wait_for(distributed.comm.connect(address), CONNECT_TIMEOUT)
     await comm.close()
 
 
-def _trace_there(job: Job, index: int) -> NDArray[np.float32]:
+def _trace_on_worker(job: Job, index: int) -> NDArray[np.float32]:
     """Trace one pass on a worker."""
     import distributed
 
     if versions() != job.versions:
         raise RuntimeError(f"a worker has {', '.join(versions())}; wanted {', '.join(job.versions)}")
-    with one_pass:
+    with pass_lock:
         mi.set_variant(job.variant)
         threads = distributed.get_worker().state.nthreads
         if dr.thread_count() != threads:
@@ -122,11 +123,12 @@ def _trace_there(job: Job, index: int) -> NDArray[np.float32]:
 
 @lru_cache(maxsize=1)
 def scene_of(job: Job) -> mi.Scene:
+    """Load the scene of a job, once; raise RuntimeError if it or its files differ from those of the job."""
     try:
         scene = job.load()
         content = scene_digest(job.scene, job.where["parameters"], job.where["materials"])
     except (RequestError, OSError) as error:
         raise RuntimeError(f"a worker cannot load the scene: {error}") from None
     if content != job.content:
-        raise RuntimeError(f"{job.scene}: a worker finds another scene there, or other files that it references")
+        raise RuntimeError(f"{job.scene}: on a worker, the scene or a file that it references is different")
     return scene

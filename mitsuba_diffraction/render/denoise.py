@@ -2,7 +2,7 @@
 
 The denoiser expects noise that is independent from pixel to pixel. The reconstruction filter h of a film correlates it,
 with the autocorrelation r = h ⋆ h and hence the power spectrum R(f) = Σ_n r(n) e^{2πi n f}. The picture is therefore
-divided by √R in the frequency domain, denoised, and multiplied by √R again.
+divided by √R in the frequency domain, denoised, and multiplied by √R.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from scipy import fft
 from ..errors import RequestError
 from .film import check_memory
 
-_SAMPLES = 16  # per pixel, of the guides
-_RGB = (610.0, 550.0, 465.0)  # nm, at which the albedo is evaluated
-_STEPS = 100  # of the integral of the autocorrelation, per pixel
-_MIN_RESPONSE = 0.1  # √R, of filters that remove a frequency altogether
+_SAMPLES_OF_GUIDES = 16  # per pixel
+_ALBEDO_WAVELENGTHS = (610.0, 550.0, 465.0)  # nm: red, green, blue
+_STEPS_PER_PIXEL = 100  # of the numerical autocorrelation
+_MIN_RESPONSE = 0.1  # lower bound of √R, for filters that remove a frequency
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +32,7 @@ class Guides:
     """Auxiliary pictures for the denoiser, for the first sensor.
 
     Attributes:
-        albedo: float32 (rows, columns, 3), 0 to 1: of diffuse surfaces seen first, else one.
+        albedo: float32 (rows, columns, 3), 0 to 1: of the first surface hit if it is diffuse, else one.
         normals: float32 (rows, columns, 3): shading normals in world space; zero for the background.
         response: √R of the reconstruction filter at the frequencies of a discrete cosine transform, (rows, columns, 1).
     """
@@ -42,9 +42,9 @@ class Guides:
     response: NDArray[np.float64]
 
 
-def is_asked_for(scene: str | os.PathLike[str]) -> bool:
-    """Return whether an XML scene has `<default name="denoise" value="true"/>`, of which Mitsuba takes no notice."""
-    # Mitsuba reads scenes that XML parsers refuse, such as those with "--" in a comment.
+def is_requested(scene: str | os.PathLike[str]) -> bool:
+    """Return whether an XML scene contains `<default name="denoise" value="true"/>`, which Mitsuba ignores."""
+    # By regular expressions: Mitsuba reads scenes that XML parsers refuse, such as those with "--" in a comment.
     text = re.sub(r"<!--.*?-->", "", Path(scene).read_text(encoding="utf-8", errors="replace"), flags=re.DOTALL)
     tags = (dict(re.findall(r"""(\w+)\s*=\s*["'](.*?)["']""", tag)) for tag in re.findall(r"<default\b([^>]*)>", text))
     value = {tag.get("name"): tag.get("value") for tag in tags}.get("denoise", "false")
@@ -68,15 +68,15 @@ def check_requirements() -> None:
 def guides(scene: mi.Scene) -> Guides:
     """Render the guides of a scene; errors as of `check_requirements`."""
     check_requirements()
-    check_memory(scene, 1)  # of the picture: the guides take a fifth of it
+    check_memory(scene, 1)  # of the picture; the guides need a fifth of it
     sensor = scene.sensors()[0]
     columns, rows = (int(size) for size in sensor.film().crop_size())
     sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(0, rows * columns * _SAMPLES)
-    pixel = dr.arange(mi.UInt32, rows * columns * _SAMPLES) // _SAMPLES
+    sampler.seed(0, rows * columns * _SAMPLES_OF_GUIDES)
+    pixel = dr.arange(mi.UInt32, rows * columns * _SAMPLES_OF_GUIDES) // _SAMPLES_OF_GUIDES
     position = (mi.Point2f(pixel % columns, pixel // columns) + sampler.next_2d()) / mi.Point2f(columns, rows)
     ray, _ = sensor.sample_ray(0.0, sampler.next_1d(), position, sampler.next_2d())
-    ray.wavelengths = type(ray.wavelengths)(*_RGB, _RGB[1])
+    ray.wavelengths = type(ray.wavelengths)(*_ALBEDO_WAVELENGTHS, _ALBEDO_WAVELENGTHS[1])
     hit = scene.ray_intersect(ray)
     bsdf = hit.bsdf(ray)
     diffuse = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Diffuse)
@@ -84,7 +84,7 @@ def guides(scene: mi.Scene) -> Guides:
     albedo = dr.select(diffuse, dr.clip(albedo, 0, 1), 1)
 
     def mean(*channels: mi.Float) -> NDArray[np.float32]:
-        values = [np.array(x).reshape(rows, columns, _SAMPLES).mean(-1) for x in channels]
+        values = [np.array(x).reshape(rows, columns, _SAMPLES_OF_GUIDES).mean(-1) for x in channels]
         return np.stack(values, -1).astype(np.float32)
 
     normal = dr.select(hit.is_valid(), hit.sh_frame.n, 0)
@@ -95,7 +95,7 @@ def guides(scene: mi.Scene) -> Guides:
 def _response(kernel: mi.ReconstructionFilter, size: int) -> NDArray[np.float64]:
     """Return √R at the frequencies of a discrete cosine transform of `size` numbers, one at f = 0; (size,)."""
     shifts = np.arange(int(np.ceil(2 * kernel.radius())) + 1)
-    x = np.arange(-kernel.radius(), kernel.radius(), 1 / _STEPS) + 0.5 / _STEPS
+    x = np.arange(-kernel.radius(), kernel.radius(), 1 / _STEPS_PER_PIXEL) + 0.5 / _STEPS_PER_PIXEL
     h = np.array(kernel.eval(mi.Float(x)))
     autocorrelation = np.array([h @ np.interp(x + shift, x, h, 0, 0) for shift in shifts])
     autocorrelation[1:] *= 2
@@ -108,12 +108,12 @@ def denoised(XYZ: NDArray[np.floating], guide: Guides) -> NDArray[np.float64]:
     import colour
     import pyoidn
 
-    # No visible colour has a negative X, Y or Z. In RGB that holds them all, the luminance of violet light is a small
-    # difference of channels, which denoising loses: black pixels.
+    # Denoised in XYZ, where no visible colour has a negative component. In an RGB space that contains all of them, the
+    # luminance of violet light is a small difference of channels, which denoising loses: its pixels become black.
     to_XYZ = colour.RGB_COLOURSPACES["sRGB"].matrix_RGB_to_XYZ
-    white = to_XYZ.sum(1)  # so that grey has equal channels
+    white = to_XYZ.sum(1)  # divisor of XYZ, so that grey has equal channels
     albedo = np.ascontiguousarray(guide.albedo @ (to_XYZ.T / white), np.float32)
     uncorrelated = fft.idctn(fft.dctn(XYZ / white, axes=(0, 1)) / guide.response, axes=(0, 1))
     noisy = np.ascontiguousarray(uncorrelated, np.float32)
-    found = pyoidn.denoise(noisy, albedo=albedo, normal=guide.normals, hdr=True)
-    return fft.idctn(fft.dctn(found.astype(np.float64), axes=(0, 1)) * guide.response, axes=(0, 1)) * white
+    result = pyoidn.denoise(noisy, albedo=albedo, normal=guide.normals, hdr=True)
+    return fft.idctn(fft.dctn(result.astype(np.float64), axes=(0, 1)) * guide.response, axes=(0, 1)) * white

@@ -24,8 +24,8 @@ from ..errors import RequestError, root_cause
 from ..integrator.paths import Splats
 from .scene import channel_wavelengths, channel_weights
 
-# A pixel, row by row, and a mask → the first of its samples, which stand together, and the one after the last.
-Samples = Callable[["mi.UInt32", "mi.Bool"], tuple["mi.UInt32", "mi.UInt32"]]
+# Index of a pixel (row by row), mask → index of its first sample and one past its last; they are contiguous.
+SampleRange = Callable[["mi.UInt32", "mi.Bool"], tuple["mi.UInt32", "mi.UInt32"]]
 
 
 def pass_seed(seed: int, index: int) -> int:
@@ -44,13 +44,13 @@ def trace_pass(scene: mi.Scene, spp: int, seed: int, integrator: mi.Integrator |
     their ratio is radiance per nm. The sums of passes are additive. Samplers that correlate samples are rotated
     (`rotated`), so that the expectation of any pass is that of independent samples.
 
-    The result is determined, bit for bit, by the seed, the scene, the versions of Mitsuba and Dr.Jit and the kind of
+    The result is determined, bit for bit, by the seed, the scene, the versions of Mitsuba and Dr.Jit and the type of
     processor, not by the number of threads. Scalar variants and Mitsuba's differentiable integrators (`prb`, ...) use
     Mitsuba's film and are not reproducible in the last bits.
 
     Args:
         scene: from `load_spectral_scene`.
-        spp: samples per pixel; the scene's sampler may take more (`samples_drawn`).
+        spp: samples per pixel; the scene's sampler may draw more (`samples_drawn`).
         seed: 32 bits.
         integrator: replaces that of the scene.
 
@@ -62,14 +62,14 @@ def trace_pass(scene: mi.Scene, spp: int, seed: int, integrator: mi.Integrator |
     """
     integrator = scene.integrator() if integrator is None else integrator
     try:
-        trace = trace_with_mitsubas_film if takes_mitsubas_film(integrator) else _trace
+        trace = trace_with_mitsubas_film if needs_mitsubas_film(integrator) else _trace
         return trace(scene, integrator, spp, seed)
     except Exception as error:
         raise RuntimeError(f"rendering failed: {root_cause(error)}") from error
 
 
-def takes_mitsubas_film(integrator: mi.Integrator) -> bool:
-    """Return whether an integrator renders only as a whole, with Mitsuba's film and the sampler as it is."""
+def needs_mitsubas_film(integrator: mi.Integrator) -> bool:
+    """Return whether an integrator can only render whole pictures, with Mitsuba's film and the scene's sampler."""
     return (
         mi.variant().startswith("scalar")
         or not isinstance(integrator, mi.SamplingIntegrator)
@@ -80,9 +80,9 @@ def takes_mitsubas_film(integrator: mi.Integrator) -> bool:
 def check_memory(scene: mi.Scene, spp: int) -> None:
     """Check that a picture fits into the available memory, where the system reports it (Linux).
 
-    At the peak, a pixel of n channels has 24 n + 68 bytes (sums in float64, the result of a pass and copies of it, and
-    the picture in float32), and a sample of a pass has 40 (position on the film, channels and values of four
-    wavelengths). With Mitsuba's film they were measured as 14 n and 24 n.
+    The peak memory is 24 n + 68 bytes per pixel of n channels (sums in float64, the result of a pass and copies of it,
+    and the picture in float32) and 40 bytes per sample of a pass (position on the film, channels and values of four
+    wavelengths). With Mitsuba's film it was measured as 14 n and 24 n.
 
     Args:
         scene: from `load_spectral_scene`.
@@ -93,8 +93,8 @@ def check_memory(scene: mi.Scene, spp: int) -> None:
     """
     columns, rows = (int(size) for size in scene.sensors()[0].film().crop_size())
     n = channel_wavelengths().size
-    of_pixel, of_sample = (14 * n, 24 * n) if takes_mitsubas_film(scene.integrator()) else (24 * n + 68, 40)
-    needed = rows * columns * (of_pixel + of_sample * spp)
+    pixel_bytes, sample_bytes = (14 * n, 24 * n) if needs_mitsubas_film(scene.integrator()) else (24 * n + 68, 40)
+    needed = rows * columns * (pixel_bytes + sample_bytes * spp)
     dr.flush_malloc_cache()
     if (available := _available_memory()) is not None and needed > available:
         raise RequestError(
@@ -104,7 +104,7 @@ def check_memory(scene: mi.Scene, spp: int) -> None:
 
 
 def _available_memory() -> int | None:
-    """Return how many bytes processes can allocate, swap included; None where that is unknown."""
+    """Return the number of bytes that processes can allocate, swap included; None if unknown."""
     try:
         entries = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
         return 1024 * sum(int(entries[name].split()[0]) for name in ("MemAvailable", "SwapFree"))
@@ -113,7 +113,7 @@ def _available_memory() -> int | None:
 
 
 def samples_drawn(scene: mi.Scene, spp: int) -> int:
-    """Return the samples per pixel that the sampler takes for `spp`; some round up to a square or a power of two."""
+    """Return the samples per pixel that the sampler draws for `spp`; some round up to a square or a power of two."""
     sampler = scene.sensors()[0].sampler().clone()
     sampler.set_sample_count(spp)
     return sampler.sample_count()
@@ -125,30 +125,31 @@ def is_independent(sampler: mi.Sampler) -> bool:
 
 
 def rotated(sampler: mi.Sampler, seed: int, pixel: mi.UInt32) -> mi.Sampler:
-    """Return a seeded sampler whose samples are uniform in all dimensions; itself if it is `independent`.
+    """Return a seeded sampler whose samples are uniform in all dimensions; the same sampler if it is `independent`.
 
     In Mitsuba's stratifying samplers, pairs of dimensions are not uniform, whatever the seed: with eight samples per
     pixel, sixteenths of the unit square receive up to 24 % (`multijitter`) or 17 % (`stratified`) too much or too
-    little, and 34 % at any number with `ldsampler`; pictures then have wrong colours. Here a random number of the pixel
-    and dimension is added to each number, modulo one (Cranley and Patterson, 1976): each sample is uniform, and those
-    of a pixel keep their strata.
+    little, and 34 % for any number of samples with `ldsampler`; pictures then have wrong colours. Here a random shift
+    per pixel and dimension is added to each number, modulo one (Cranley and Patterson, 1976): each sample is uniform,
+    and those of a pixel remain stratified.
 
-    The sampler is seeded for as many samples as `pixel`, to which they belong, has entries.
+    Args:
+        pixel: index of the pixel of each sample; its width is the number of samples for which the sampler is seeded.
     """
     return sampler if is_independent(sampler) else _rotated_sampler(mi.variant())(sampler, seed, pixel)
 
 
 @functools.cache
 def _rotated_sampler(variant: str) -> type:
-    """Define the sampler for a variant, to which its base class belongs."""
+    """Define the sampler for a variant, as its base class depends on the variant."""
 
     class RotatedSampler(mi.Sampler):
-        """See `rotated`."""
+        """Sampler whose numbers are shifted at random for each pixel and dimension, see `rotated`."""
 
         def __init__(self, sampler: mi.Sampler, seed: int, pixel: mi.UInt32) -> None:
             mi.Sampler.__init__(self, mi.Properties())
             self.sampler = sampler
-            # Other numbers than the sampler draws from the same seed.
+            # Independent of the numbers that the sampler draws from the same seed.
             key = mi.UInt32(seed) ^ 0x7F4A7C15
             dr.make_opaque(key)
             state, sequence = mi.sample_tea_32(pixel, key)
@@ -215,7 +216,7 @@ def _trace(scene: mi.Scene, integrator: mi.SamplingIntegrator, spp: int, seed: i
     channels = channel_wavelengths().size
     channel, value = _on_channels(film, ray.wavelengths, weight * traced)
     dr.eval(position, channel, value)
-    sums = np.array(collect(rfilter, position, channel, value, (rows, columns), border, evenly(count), channels))
+    sums = np.array(collect(rfilter, position, channel, value, (rows, columns), border, equal_ranges(count), channels))
     sums = sums.reshape(rows, columns, -1)
     if light is not None:
         _add_light(sums, film, light.splats(seed, light.count(spp)), spp)
@@ -223,25 +224,25 @@ def _trace(scene: mi.Scene, integrator: mi.SamplingIntegrator, spp: int, seed: i
 
 
 def _on_channels(film: mi.Film, wavelengths: mi.Spectrum, value: mi.Spectrum) -> tuple[list[mi.Float], list[mi.Float]]:
-    """Return positions of the wavelengths among the channels, and their contributions; `value` as of the sensor."""
-    # It holds the response of the film, by whose density wavelengths are drawn.
-    seen = dr.zeros(mi.SurfaceInteraction3f)
-    seen.wavelengths = wavelengths
-    response = film.sensor_response_function().eval(seen)
+    """Return the fractional channel of each wavelength, and its contribution; `value` is weighted as by the sensor."""
+    # The weight of the sensor contains the response of the film, in proportion to which wavelengths are drawn.
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    si.wavelengths = wavelengths
+    response = film.sensor_response_function().eval(si)
     radiance = mi.unpolarized_spectrum(value) * dr.select(response > 0, dr.rcp(response), 0)
     centres = channel_wavelengths()
     step = float(centres[1] - centres[0])
     return list((wavelengths - float(centres[0])) / step), list(radiance / (len(radiance) * step))
 
 
-def _add_light(sums: NDArray[np.float32], film: mi.Film, found: Iterable[Splats], spp: int) -> None:
-    """Add the contribution of paths from the light, which have no weight of their own.
+def _add_light(sums: NDArray[np.float32], film: mi.Film, splat_batches: Iterable[Splats], spp: int) -> None:
+    """Add the contributions of paths from the light, without adding to the sums of filter weights.
 
-    They are sorted by pixel, those of a pixel in the order in which they were traced.
+    They are sorted by pixel, and those of a pixel by the order of tracing.
     """
     rows, columns, channels = sums.shape
     parts = []
-    for splats in found:
+    for splats in splat_batches:
         channel, value = _on_channels(film, splats.wavelengths, splats.value * dr.opaque(mi.Float, spp))
         dr.eval(channel, value)
         parts.append([np.array(column) for column in (*splats.position, *channel, *value)])
@@ -253,17 +254,17 @@ def _add_light(sums: NDArray[np.float32], film: mi.Film, found: Iterable[Splats]
     x, y, *rest = (mi.Float(column[order]) for column in (x, y, *rest))
     starts = mi.UInt32(np.concatenate([[0], np.bincount(pixel, minlength=rows * columns).cumsum()]))
 
-    def of_pixel(index: mi.UInt32, active: mi.Bool) -> tuple[mi.UInt32, mi.UInt32]:
+    def range_of_pixel(index: mi.UInt32, active: mi.Bool) -> tuple[mi.UInt32, mi.UInt32]:
         return dr.gather(mi.UInt32, starts, index, active), dr.gather(mi.UInt32, starts, index + 1, active)
 
     half = len(rest) // 2
     position, channel, value = mi.Point2f(x, y), rest[:half], rest[half:]
-    added = collect(film.rfilter(), position, channel, value, (rows, columns), 0, of_pixel, channels - 1)
+    added = collect(film.rfilter(), position, channel, value, (rows, columns), 0, range_of_pixel, channels - 1)
     sums[..., :-1] += np.array(added).reshape(sums.shape)[..., :-1]
 
 
-def evenly(count: mi.UInt32) -> Samples:
-    """Return the index range of a pixel's samples, where all pixels have equally many."""
+def equal_ranges(count: mi.UInt32) -> SampleRange:
+    """Return the function that gives the index range of a pixel's samples if every pixel has `count` samples."""
     return lambda pixel, active: (pixel * count, pixel * count + count)
 
 
@@ -271,8 +272,9 @@ def evenly(count: mi.UInt32) -> Samples:
 def collect(rfilter, position, channel, value, size, border, samples, channels):
     """Gather the samples under the filter of each pixel, row by row, in one lane per pixel.
 
-    `channel` and `value` are lists; a fractional channel splits the value linearly between its two neighbours. The
-    result holds as many channels as asked for and then the filter sum of each pixel. Samples also lie in the `border`.
+    `channel` and `value` are lists; the value at a fractional channel is divided linearly between the two nearest
+    channels. The result has `channels` sums and then the sum of filter weights of each pixel. There are also samples in
+    the `border`.
     """
     rows, columns = size
     kernel_radius = int(np.ceil(rfilter.radius() - 0.5))
@@ -293,26 +295,26 @@ def collect(rfilter, position, channel, value, size, border, samples, channels):
         source_y = y + mi.Int32(tap // width) - kernel_radius
         source_x = x + mi.Int32(tap % width) - kernel_radius
         inside = (source_x >= -border) & (source_y >= -border) & (source_x < last_x) & (source_y < last_y)
-        at, end = samples(mi.UInt32((source_y + border) * stride + source_x + border), inside)
-        while at < end:
-            share = mi.Float(1)
+        index, end = samples(mi.UInt32((source_y + border) * stride + source_x + border), inside)
+        while index < end:
+            filter_weight = mi.Float(1)
             if dr.hint(not box, mode="scalar"):
-                away_x = mi.Float(x) + 0.5 - dr.gather(mi.Float, position.x, at, inside)
-                away_y = mi.Float(y) + 0.5 - dr.gather(mi.Float, position.y, at, inside)
-                share = rfilter.eval(away_x, inside) * rfilter.eval(away_y, inside)
+                offset_x = mi.Float(x) + 0.5 - dr.gather(mi.Float, position.x, index, inside)
+                offset_y = mi.Float(y) + 0.5 - dr.gather(mi.Float, position.y, index, inside)
+                filter_weight = rfilter.eval(offset_x, inside) * rfilter.eval(offset_y, inside)
             for i in range(len(channel)):
-                where = dr.gather(mi.Float, channel[i], at, inside)
-                what = dr.gather(mi.Float, value[i], at, inside) * share
-                lower = dr.floor(where)
-                upper_share = where - lower
+                fractional = dr.gather(mi.Float, channel[i], index, inside)
+                weighted = dr.gather(mi.Float, value[i], index, inside) * filter_weight
+                lower = dr.floor(fractional)
+                upper_weight = fractional - lower
                 k = mi.Int32(lower)
-                for neighbour, part in ((k, what * (1 - upper_share)), (k + 1, what * upper_share)):
-                    there = inside & (neighbour >= 0) & (neighbour < channels)
+                for target, part in ((k, weighted * (1 - upper_weight)), (k + 1, weighted * upper_weight)):
+                    exists = inside & (target >= 0) & (target < channels)
                     dr.scatter_reduce(
-                        dr.ReduceOp.Add, sums, part, base + mi.UInt32(neighbour), there, dr.ReduceMode.NoConflicts
+                        dr.ReduceOp.Add, sums, part, base + mi.UInt32(target), exists, dr.ReduceMode.NoConflicts
                     )
-            weight += dr.select(inside, share, 0)
-            at += 1
+            weight += dr.select(inside, filter_weight, 0)
+            index += 1
         tap += 1
     dr.scatter(sums, weight, base + channels)
     return sums

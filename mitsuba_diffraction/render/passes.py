@@ -2,7 +2,7 @@
 
 A checkpoint is an uncompressed `.npz` file (noise does not compress) with the fields of `Accumulation` and the `digest`
 of the request (`passes.Job`). The comment of the archive is the SHA-256 of the file (`files.seal`). It takes 8 bytes
-per pixel and channel, 710 MB for 1280 × 720 pixels, and twice that while it is being replaced.
+per pixel and channel, 710 MB for 1280 × 720 pixels, and twice as much while it is being replaced.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from ..color import spectrum_to_XYZ
 from ..errors import RequestError
 from ..files import UNSEALED, is_intact, seal, whole_file
-from .film import check_memory, is_independent, pass_seed, samples_drawn, takes_mitsubas_film, trace_pass
+from .film import check_memory, is_independent, needs_mitsubas_film, pass_seed, samples_drawn, trace_pass
 from .scene import (
     Materials,
     channel_wavelengths,
@@ -96,8 +96,8 @@ class Accumulation:
 
             s² = (Σ_p n_p y_p² − (Σ_p n_p y_p)²/N) / (P − 1),
 
-        and the relative error of a pixel is (s/√N) / (Σ_p n_p y_p/N). The mean square over all pixels is not useful
-        where a lamp is seen via two gratings: it is dominated by fireflies and does not fall for hours. With few
+        and the relative error of a pixel is (s/√N) / (Σ_p n_p y_p/N). The mean square over all pixels is not used:
+        where a lamp is seen via two gratings it is dominated by fireflies, and does not decrease for hours. With few
         passes the percentile is biased upwards by the variance of s².
 
         Returns:
@@ -112,7 +112,7 @@ class Accumulation:
 
 
 def ratio(sums: NDArray, weights: NDArray) -> NDArray:
-    """Return sums/weights, zero where the filter covers no sample."""
+    """Return sums/weights, zero where there are no samples under the filter."""
     return np.divide(sums, weights, out=np.zeros_like(sums), where=weights != 0)
 
 
@@ -145,8 +145,8 @@ def load_checkpoint(path: str | os.PathLike[str], digest: str) -> Accumulation |
                 raise RequestError("its contents do not match its digest")
             with np.load(stream) as content:
                 if content["digest"].item() == digest:
-                    read = {field.name: content[field.name] for field in fields(Accumulation)}
-                    return Accumulation(**{name: value if value.ndim else value.item() for name, value in read.items()})
+                    stored = {field.name: content[field.name] for field in fields(Accumulation)}
+                    return Accumulation(**{name: x if x.ndim else x.item() for name, x in stored.items()})
         # Raised by NumPy and zipfile for damaged files.
         except (ValueError, KeyError, TypeError, EOFError, AttributeError, RuntimeError, OSError, BadZipFile) as error:
             raise RequestError(f"{os.fspath(path)}: not a checkpoint, or a damaged one ({error})") from None
@@ -156,18 +156,16 @@ def load_checkpoint(path: str | os.PathLike[str], digest: str) -> Accumulation |
     )
 
 
-# Two million samples take some seconds on two cores, which keeps progress and interrupts responsive. Passes
-# of large pictures take up to eight samples per pixel, as adding a pass to the sum takes one core as long as a third of
-# a sample.
+# Two million samples take some seconds on two cores, so that progress and interrupts are responsive. Passes of large
+# pictures have up to eight samples per pixel, as adding a pass to the sum takes one core as long as tracing a third of
+# a sample per pixel.
 SAMPLES_PER_PASS = 2**21
 SAMPLES_PER_PIXEL_OF_LARGE_PICTURES = 8
-# The stopping criterion estimates the noise from four passes on, and needs at least sixteen in all.
-_PASSES_TO_JUDGE = 4
-_LEAST_PASSES_TO_CONVERGE = 16
-# Of some seconds each: weeks.
-_MOST_PASSES = 10**6
-# At most a twentieth of the time is spent on checkpoints.
-CHECKPOINT_SHARE = 20
+# The error is estimated from four passes on; a rendering with `until_error` is split into at least sixteen.
+_MIN_PASSES_FOR_ERROR = 4
+_MIN_PASSES_UNTIL_ERROR = 16
+_MAX_PASSES = 10**6  # weeks, at some seconds each
+MIN_CHECKPOINT_INTERVAL = 20  # in units of the time that writing a checkpoint takes
 
 
 @dataclass(frozen=True)
@@ -176,7 +174,7 @@ class Job:
 
     Attributes:
         scene: absolute path of the XML file.
-        where: width, height, parameters, materials and motion, see `load_spectral_scene`.
+        where: the arguments width, height, parameters, materials and motion of `load_spectral_scene`.
         variant: Mitsuba variant.
         seed: random seed.
         samples: samples per pixel of each pass.
@@ -196,8 +194,8 @@ class Job:
 
     def digest(self) -> str:
         """Return the SHA-256 of everything but the path of the scene."""
-        told = {name: value for name, value in asdict(self).items() if name != "scene"}
-        return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
+        request = {name: value for name, value in asdict(self).items() if name != "scene"}
+        return hashlib.sha256(json.dumps(request, sort_keys=True).encode()).hexdigest()
 
     def __hash__(self) -> int:
         return hash(self.digest())
@@ -207,12 +205,12 @@ class Job:
         return load_spectral_scene(self.scene, **self.where)
 
 
-# Yields the passes `first`, `first` + 1, … of a job in order; see `trace_here`.
+# Yields the passes `first`, `first` + 1, … of a job in order; see `trace_locally`.
 Tracer = Callable[[Job, "mi.Scene", int], Iterator[NDArray[np.float32]]]
 
 
 class Interrupted(KeyboardInterrupt):
-    """Ctrl-C between two passes.
+    """Interruption by Ctrl-C between two passes.
 
     Attributes:
         image: the picture from the passes completed.
@@ -223,7 +221,7 @@ class Interrupted(KeyboardInterrupt):
         self.image = image
 
 
-def trace_here(job: Job, scene: mi.Scene, first: int) -> Iterator[NDArray[np.float32]]:
+def trace_locally(job: Job, scene: mi.Scene, first: int) -> Iterator[NDArray[np.float32]]:
     """Trace the passes of a job from `first` on in this process; see `trace_pass`."""
     for index in range(first, len(job.samples)):
         yield trace_pass(scene, job.samples[index], pass_seed(job.seed, index))
@@ -248,7 +246,7 @@ def render(
     checkpoint: str | os.PathLike[str] | None = None,
     seconds: float = 60.0,
     finished: SpectralImage | None = None,
-    tracer: Tracer = trace_here,
+    tracer: Tracer = trace_locally,
     progress: Callable[[int, int, float], None] = lambda done, total, error: None,
 ) -> SpectralImage:
     """Render the first sensor of a scene spectrally, with its own integrator, in the current variant.
@@ -264,13 +262,13 @@ def render(
         height: likewise.
         seed: random seed, not negative.
         parameters: values for the scene's `$name` parameters.
-        materials: gratings in the place of BSDFs, see `load_spectral_scene`.
+        materials: gratings that replace BSDFs, see `load_spectral_scene`.
         motion: of the camera, see `load_spectral_scene`.
         until_error: stop when the relative error of the picture (`Accumulation.error`) is at most this; spp is then the
             maximum.
         checkpoint: file in which the sums are saved periodically. If it exists, rendering resumes from it. The caller
             removes it after saving the picture.
-        seconds: interval between checkpoints, or twenty times as long as writing one takes, if that is longer.
+        seconds: interval between checkpoints, or twenty times the time that writing one takes, if that is longer.
         finished: a picture of an earlier run, returned without rendering if it satisfies this request.
         tracer: traces the passes; default: this process, see also `cluster.trace_on`.
         progress: called at the start and after each pass with the samples per pixel done, in total (with `until_error`,
@@ -287,7 +285,7 @@ def render(
         RuntimeError: if rendering failed, with the cause on one line.
         OSError: if a checkpoint cannot be written; the previous one is kept.
         Interrupted: at the end of the current pass on the first Ctrl-C, with the picture so far, after a checkpoint.
-        KeyboardInterrupt: at once on the second Ctrl-C, or if no pass has been completed.
+        KeyboardInterrupt: immediately on the second Ctrl-C, or if no pass has been completed.
     """
     where = {"width": width, "height": height, "motion": motion}
     where |= {"parameters": parameters or {}, "materials": materials or {}}
@@ -299,12 +297,12 @@ def render(
     if sums is None:
         columns, rows = (int(size) for size in scene.sensors()[0].film().crop_size())
         sums = Accumulation.empty(rows, columns)
-    ends = _trace(job, scene, sums, checkpoint, seconds, tracer, progress)
+    complete = _trace(job, scene, sums, checkpoint, seconds, tracer, progress)
     if not sums.passes:
         raise KeyboardInterrupt
-    _warn_of_wrong_pixels(sums, max_plausible_luminance(scene))
-    image = _image(sums, job, Path(scene_path).name, complete=ends)
-    if not ends:
+    _warn_of_implausible_pixels(sums, max_plausible_luminance(scene))
+    image = _image(sums, job, Path(scene_path).name, complete=complete)
+    if not complete:
         raise Interrupted(image)
     return image
 
@@ -319,19 +317,19 @@ def _trace(
     progress: Callable[[int, int, float], None],
 ) -> bool:
     """Add passes to the sums until the picture is complete or Ctrl-C was pressed; return whether it is complete."""
-    saved, ends = sums.samples, _judge(sums, job, progress)
-    last, wait = time.monotonic(), seconds
+    saved, complete = sums.samples, _is_complete(sums, job, progress)
+    last_checkpoint, interval = time.monotonic(), seconds
     with _deferred_interrupt() as interrupted, closing(tracer(job, scene, sums.passes)) as traced:
-        while not (ends or interrupted()):
+        while not (complete or interrupted()):
             sums.add(next(traced), job.samples[sums.passes])
-            ends = _judge(sums, job, progress)
-            due = interrupted() or time.monotonic() - last >= wait
-            if checkpoint is not None and due and not ends:
-                last = time.monotonic()
+            complete = _is_complete(sums, job, progress)
+            due = interrupted() or time.monotonic() - last_checkpoint >= interval
+            if checkpoint is not None and due and not complete:
+                last_checkpoint = time.monotonic()
                 _save(checkpoint, job, sums, saved)
                 saved = sums.samples
-                wait = max(seconds, CHECKPOINT_SHARE * (time.monotonic() - last))
-    return ends
+                interval = max(seconds, MIN_CHECKPOINT_INTERVAL * (time.monotonic() - last_checkpoint))
+    return complete
 
 
 def _job(
@@ -346,13 +344,13 @@ def _job(
         raise RequestError(f"until_error: got {until_error}, wanted a relative error between 0 and 1, such as 0.01")
     scene = load_spectral_scene(scene_path, **where)
     sampler = scene.sensors()[0].sampler()
-    if takes_mitsubas_film(scene.integrator()) and not is_independent(sampler):
+    if needs_mitsubas_film(scene.integrator()) and not is_independent(sampler):
         _log.warning(
             "sampler: got %s, wanted independent: with this integrator or in this variant its samples are not uniform, "
             "and colours may be wrong by some per cent",
             sampler.class_name(),
         )
-    samples = split(scene, spp, 1 if until_error is None else _LEAST_PASSES_TO_CONVERGE)
+    samples = split(scene, spp, 1 if until_error is None else _MIN_PASSES_UNTIL_ERROR)
     check_memory(scene, max(samples))
     warn_of_gratings(scene)
     job = Job(
@@ -369,42 +367,44 @@ def _job(
 
 
 def _image(sums: Accumulation, job: Job, scene: str, complete: bool) -> SpectralImage:
-    """Return the picture so far; the digest of the request is that of a complete one only."""
+    """Return the picture so far; only a complete one has the digest of the request."""
     attributes = {"scene": scene, "variant": job.variant, "spp": sums.samples, "seed": str(job.seed)}
-    if sums.passes >= _PASSES_TO_JUDGE:
+    if sums.passes >= _MIN_PASSES_FOR_ERROR:
         attributes["error"] = sums.error()
     if complete:
         attributes["digest"] = job.digest()
     return SpectralImage(channel_wavelengths(), sums.radiance(), attributes)
 
 
-def _warn_of_wrong_pixels(sums: Accumulation, limit: float) -> None:
-    """Log a line that names a pixel whose luminance is not finite, or else the brightest one above the limit."""
+def _warn_of_implausible_pixels(sums: Accumulation, limit: float) -> None:
+    """Log a warning that names a pixel whose luminance is not finite, or else the brightest one above the limit."""
     luminance = np.abs(sums.luminance) / sums.samples
     if count := np.count_nonzero(~(luminance <= limit) | np.isinf(luminance)):
         row, column = np.unravel_index(np.argmax(luminance), luminance.shape)  # NaN counts as the maximum
         value = luminance[row, column]
-        what = f"is {value:.2g}, far above the lights of the scene" if np.isfinite(value) else "is not finite"
-        _log.warning("luminance %s at pixel x = %d, y = %d (from the top left): %d in all", what, column, row, count)
+        problem = f"is {value:.2g}, far above the lights of the scene" if np.isfinite(value) else "is not finite"
+        _log.warning(
+            "luminance %s at pixel x = %d, y = %d (from the top left): %d such pixels", problem, column, row, count
+        )
 
 
-def split(scene: mi.Scene, spp: int, least: int = 1) -> tuple[int, ...]:
-    """Return the samples per pixel of each pass; at least `least` passes, if there are enough samples.
+def split(scene: mi.Scene, spp: int, min_passes: int = 1) -> tuple[int, ...]:
+    """Return the samples per pixel of each pass; at least `min_passes` passes, if there are enough samples.
 
-    Determined by the request alone, so that an interruption does not change the passes.
+    They are determined by the request only, so that an interruption does not change the passes.
     """
     pixels = math.prod(scene.sensors()[0].film().crop_size())
     passes = -(-spp * pixels // max(SAMPLES_PER_PASS, SAMPLES_PER_PIXEL_OF_LARGE_PICTURES * pixels))
-    if passes > _MOST_PASSES:
-        raise RequestError(f"spp: got {spp}, wanted at most {_MOST_PASSES * spp // passes:.2g} for so large a picture")
-    passes = min(max(passes, least), spp)
+    if passes > _MAX_PASSES:
+        raise RequestError(f"spp: got {spp}, wanted at most {_MAX_PASSES * spp // passes:.2g} for so large a picture")
+    passes = min(max(passes, min_passes), spp)
     ends = [spp * index // passes for index in range(passes + 1)]
     return tuple(samples_drawn(scene, end - start) for start, end in pairwise(ends))
 
 
-def _judge(sums: Accumulation, job: Job, progress: Callable[[int, int, float], None]) -> bool:
+def _is_complete(sums: Accumulation, job: Job, progress: Callable[[int, int, float], None]) -> bool:
     """Report progress and return whether the picture is complete."""
-    error = sums.error() if sums.passes >= _PASSES_TO_JUDGE else math.nan
+    error = sums.error() if sums.passes >= _MIN_PASSES_FOR_ERROR else math.nan
     expected = total = sum(job.samples)
     if job.until_error is not None and not math.isnan(error):
         # The error falls with the square root of the number of samples.
@@ -417,32 +417,33 @@ def _save(checkpoint: str | os.PathLike[str], job: Job, sums: Accumulation, save
     try:
         save_checkpoint(checkpoint, job.digest(), sums)
     except OSError as error:
-        left = f"the last one, of {saved} samples per pixel, is kept" if saved else "there is none yet"
-        raise OSError(f"{os.fspath(checkpoint)}: cannot be written ({error.strerror or error}); {left}") from error
+        kept = f"the last one, of {saved} samples per pixel, is kept" if saved else "there is none yet"
+        raise OSError(f"{os.fspath(checkpoint)}: cannot be written ({error.strerror or error}); {kept}") from error
 
 
 @contextmanager
 def _deferred_interrupt() -> Iterator[Callable[[], bool]]:
     """Yield a function that returns whether Ctrl-C was pressed; a second one interrupts at once.
 
-    An exception between two statements could make the sums inconsistent with their count. Python handles signals in the
-    main thread only. Ctrl-C stays ignored where it is, as in background jobs of a script.
+    An exception between two statements could make the sums inconsistent with their count. Python handles signals only
+    in the main thread. If SIGINT is ignored, as in background jobs of a script, it stays ignored.
     """
     before = signal.getsignal(signal.SIGINT)
     if threading.current_thread() is not threading.main_thread() or before in (signal.SIG_IGN, None):
         yield lambda: False
         return
-    asked = threading.Event()
-    # The command line's handler has raised an exception already, and something on its way out has swallowed it.
+    pressed = threading.Event()
+    # The handler of the command line has already raised an exception, which other code has suppressed.
     if getattr(before, "pressed", False):
-        asked.set()
+        pressed.set()
 
-    def note(number: int, frame: object) -> None:
-        asked.set()
+    def on_first_press(number: int, frame: object) -> None:
+        pressed.set()
         signal.signal(signal.SIGINT, before)
 
-    signal.signal(signal.SIGINT, note)
+    signal.signal(signal.SIGINT, on_first_press)
     try:
-        yield asked.is_set
+        yield pressed.is_set
+
     finally:
         signal.signal(signal.SIGINT, before)

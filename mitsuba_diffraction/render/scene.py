@@ -24,39 +24,40 @@ from ..settings import VISIBLE
 
 _log = logging.getLogger(__name__)
 
-# The spacing of the channels, nm.
+# Spacing of the channels, nm.
 #
-# With 5 nm, colours differ from the exact ones by ΔE₂₀₀₀ ≤ 0.05 for lines 5 nm wide and by 0.6 for the worst laser line
+# With 5 nm, colours differ from the exact ones by ΔE₂₀₀₀ ≤ 0.05 for lines 5 nm wide and by at most 0.6 for laser lines
 # (10 nm: 1.3 and 3.2; 23.5 nm: 90), and the orders of a grating, 5–20 nm wide at a coherence length of 65 µm, are
 # resolved. The spacing affects memory but not time, as `film` adds a sample to at most eight channels.
-_STEP = 5.0
+_CHANNEL_STEP = 5.0
 
-# Wavelengths are drawn from a density on a grid as fine as this, nm, which is less than a lamp's lines are wide.
+# Grid spacing of the density from which wavelengths are drawn, nm: less than the width of a lamp's lines.
 _DENSITY_STEP = 0.25
-_DRAWS_PER_LIGHT = 2**14  # of four wavelengths, to learn its spectrum
+_DRAWS_PER_LIGHT = 2**14  # of four wavelengths, to estimate the spectrum of the light
 
 Materials = Mapping[str, Mapping[str, bool | float | str]]
-"""Id of a BSDF → parameters of the grating that takes its place."""
+"""Id of a BSDF → parameters of the grating that replaces it."""
 
-_RAYS_OF_SENSOR = 4096  # to find out what is seen, and how it is lit
-_PEAK_OF_LOBES = 1e4  # of a BSDF, 1/sr
-_OF_NOISE = 1e4
-_MOST_PIXELS = 2**25  # above 7680 × 4320; see also `film.check_memory`
-_DEFAULT_SIZE = (768, 576)  # that of Mitsuba's films
+_RAYS_OF_SENSOR = 4096  # to sample the visible surfaces and their lights
+_MAX_LOBE_VALUE = 1e4  # of a BSDF with narrow lobes, 1/sr
+_MAX_NOISE_FACTOR = 1e4  # of the luminance of a pixel over that of the brightest light
+_MAX_PIXELS = 2**25  # above 7680 × 4320; see also `film.check_memory`
+_DEFAULT_SIZE = (768, 576)  # width and height of Mitsuba's films
 
 
 def channel_wavelengths() -> NDArray[np.float64]:
-    """Return the centres of the film's channels, (n,), nm; their hats lie inside the range of Mitsuba's spectra."""
-    return np.arange(VISIBLE[0] + _STEP, VISIBLE[1] - _STEP / 2, _STEP)
+    """Return the centres of the film's channels, (n,), nm; the hat functions lie inside Mitsuba's spectral range."""
+    return np.arange(VISIBLE[0] + _CHANNEL_STEP, VISIBLE[1] - _CHANNEL_STEP / 2, _CHANNEL_STEP)
 
 
 def channel_weights() -> NDArray[np.float64]:
     """Return the area of the response of each channel, (n,); the recorded value divided by it is radiance.
 
-    Mitsuba samples wavelengths in proportion to the sum of the responses of the film. Hats of unit area would spend
-    half of the samples where the eye is insensitive; these weights follow the density of Mitsuba's RGB film,
-    sech²(0.0072 (λ − 538 nm)) (Radziszewski, Boryczko and Alda 2009), which reduces colour noise by a quarter, like 1.8
-    times the samples. The lower bound of one quarter limits the noise of a channel to twice that of the best one.
+    Mitsuba samples wavelengths in proportion to the sum of the responses of the film. With hats of unit area, half of
+    the samples would have wavelengths to which the eye is insensitive; these weights follow the density of Mitsuba's
+    RGB film, sech²(0.0072 (λ − 538 nm)) (Radziszewski, Boryczko and Alda 2009), which reduces colour noise by a
+    quarter, as much as 1.8 times the samples would. The lower bound of one quarter limits the noise of a channel to
+    twice that of the best one.
     """
     return np.maximum(np.cosh(0.0072 * (channel_wavelengths() - 538)) ** -2, 0.25)
 
@@ -81,8 +82,8 @@ def load_spectral_scene(
             the aspect ratio is preserved.
         height: likewise.
         parameters: values for the scene's `$name` parameters (`-Dname=value` of Mitsuba's command line).
-        materials: id of a BSDF → parameters of the `diffraction_grating` that takes its place. A `twosided` stays, and
-            what is in it is replaced, unless the grating transmits light.
+        materials: id of a BSDF → parameters of the `diffraction_grating` that replaces it. In a `twosided` the nested
+            BSDF is replaced, unless the grating transmits light.
         motion: of the first sensor: an affine map of world space, 16 numbers in row-major order, applied after its
             `to_world`.
 
@@ -100,7 +101,7 @@ def load_spectral_scene(
         if materials:
             _warn_of_unused_materials(config, state, materials)
         _replace_films(state, width, height)
-        _take_radiance_alone(state)
+        _unwrap_integrators(state)
         if motion is not None:
             _move_first_sensor(state, motion)
         mi.parser.transform_all(config, state)
@@ -112,15 +113,15 @@ def load_spectral_scene(
     if scene.integrator() is None:
         raise RequestError(f'{path}: the scene has no integrator, wanted one, such as <integrator type="path"/>')
     if scene.integrator().aov_names():
-        raise RequestError(f"{path}: the integrator gives {scene.integrator().aov_names()}, wanted radiance alone")
+        raise RequestError(f"{path}: the integrator gives {scene.integrator().aov_names()}, wanted radiance only")
     _draw_wavelengths_of_lights(scene)
     return scene
 
 
 def warn_of_gratings(scene: mi.Scene) -> None:
-    """Say in the log which gratings lie on meshes without UVs, and which are black as light reaches them from below.
+    """Log a warning for gratings on meshes without UVs, and for gratings that are black as they are lit from below.
 
-    Apart from `load_spectral_scene`, since a rendering may load its scene again, on workers too.
+    Not part of `load_spectral_scene`, since a rendering may load its scene again, also on workers.
     """
     _warn_of_missing_uvs(scene)
     _warn_of_light_from_below(scene)
@@ -129,9 +130,9 @@ def warn_of_gratings(scene: mi.Scene) -> None:
 def _warn_of_unused_materials(
     config: mi.parser.ParserConfig, state: mi.parser.ParserState, materials: Materials
 ) -> None:
-    """Log a line for each grating that takes the place of a BSDF that nothing in the scene refers to."""
+    """Log a warning for each grating that replaces a BSDF to which nothing in the scene refers."""
     mi.parser.transform_resolve(config, state)
-    # From all objects of the scene but its BSDFs.
+    # Follow references from all objects of the scene except its BSDFs.
     waiting = [k for k in _children(state, state.root.props) if state.nodes[k].type != mi.ObjectType.BSDF]
     used = set()
     while waiting:
@@ -139,13 +140,13 @@ def _warn_of_unused_materials(
         waiting += [child for child in _children(state, state.nodes[node].props) if child not in used]
     for name in materials:
         if state.id_to_index[name] not in used:
-            _log.warning("material %s: no shape has the BSDF of that id, and the picture is as without it", name)
+            _log.warning("material %s: no shape uses the BSDF with that id, so the picture is unaffected", name)
 
 
 def _warn_of_light_from_below(scene: mi.Scene) -> None:
-    """Say in the log which gratings are black because they are seen, or lit, from below only and transmit nothing.
+    """Log a warning for gratings without transmission that are seen or lit only from below, and therefore black.
 
-    By rays of the first sensor, one light of each.
+    Rays of the first sensor are traced, and one light is sampled from each point that they hit.
     """
     gratings = [shape for shape in scene.shapes() if is_grating(shape.bsdf())]
     opaque = [shape for shape in gratings if not shape.bsdf().layers.interface.transmits]
@@ -159,43 +160,43 @@ def _warn_of_light_from_below(scene: mi.Scene) -> None:
     lit = dr.any(mi.unpolarized_spectrum(weight) != 0)
     seen_above, lit_above = si.wi.z > 0, lit & (mi.Frame3f.cos_theta(si.to_local(light.d)) > 0)
     for shape in opaque:
-        here = si.is_valid() & (si.shape == mi.ShapePtr(shape))
+        on_shape = si.is_valid() & (si.shape == mi.ShapePtr(shape))
         bright = seen_above & lit_above
-        if dr.count(here & lit)[0] > 0 and dr.count(here & bright)[0] == 0:
-            side = "lit" if dr.count(here & seen_above)[0] > 0 else "seen"
+        if dr.count(on_shape & lit)[0] > 0 and dr.count(on_shape & bright)[0] == 0:
+            cause = "lit" if dr.count(on_shape & seen_above)[0] > 0 else "seen"
             _log.warning(
                 "diffraction_grating of shape %s is %s from below only, where it is black: transmission=sheet or "
-                "interface lets light pass, twosided puts a second relief there",
+                "interface transmits light, twosided adds a grating below",
                 shape.id(),
-                side,
+                cause,
             )
 
 
 def max_plausible_luminance(scene: mi.Scene) -> float:
-    """Return a luminance that no pixel exceeds by noise: 10⁴ times that of the brightest light, as sampled.
+    """Return a luminance that no pixel should exceed by noise: 10⁴ times that of the brightest light found.
 
-    The light that the first sensor sees, or that is sampled from the surfaces that it sees, has a radiance L. Point and
-    directional lights have an irradiance E instead, and narrow lobes reflect up to some 10⁴ E: they count as L = 10⁴ E.
-    It is infinite where no light was found.
+    Lights are found by rays of the first sensor, and sampled from the surfaces that these hit. Point and directional
+    lights have an irradiance E instead of a radiance L, and narrow lobes reflect up to some 10⁴ E: they count as
+    L = 10⁴ E. The result is infinite if no light is found.
     """
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(0, _RAYS_OF_SENSOR)
     ray, _ = scene.sensors()[0].sample_ray(0, sampler.next_1d(), sampler.next_2d(), sampler.next_2d())
     si = scene.ray_intersect(mi.Ray3f(ray))
     light, weight = scene.sample_emitter_direction(si, sampler.next_2d(), False, si.is_valid())
-    sampled = mi.unpolarized_spectrum(weight) * light.pdf * dr.select(light.delta, _PEAK_OF_LOBES, 1)
+    sampled = mi.unpolarized_spectrum(weight) * light.pdf * dr.select(light.delta, _MAX_LOBE_VALUE, 1)
     seen = mi.unpolarized_spectrum(si.emitter(scene).eval(si))
     found = np.concatenate([np.ravel(values) for values in (*sampled, *seen)])
     brightest = found[np.isfinite(found)].max(initial=0)
-    return float(brightest) * _OF_NOISE if brightest > 0 else np.inf
+    return float(brightest) * _MAX_NOISE_FACTOR if brightest > 0 else np.inf
 
 
 def _warn_of_missing_uvs(scene: mi.Scene) -> None:
-    """Log a line if gratings lie on meshes without texture coordinates; meshes lose their ids when they are merged."""
+    """Log a warning if gratings are on meshes without texture coordinates; named by BSDF, as merged meshes lose ids."""
     bsdfs = [shape.bsdf() for shape in scene.shapes() if shape.is_mesh() and not shape.has_vertex_texcoords()]
     if names := sorted({bsdf.id() or "a BSDF" for bsdf in bsdfs if "DiffractionGrating[" in str(bsdf)}):
         _log.warning(
-            "%s: on a mesh without UVs, where the grating changes its direction from triangle to triangle; "
+            "%s: on a mesh without UVs, where the direction of the grating differs from triangle to triangle; "
             "wanted a mesh with UVs",
             ", ".join(names),
         )
@@ -204,42 +205,44 @@ def _warn_of_missing_uvs(scene: mi.Scene) -> None:
 def _draw_wavelengths_of_lights(scene: mi.Scene) -> None:
     """Make the sensors draw a quarter of the wavelengths, one of a ray's four, in the spectral lines of the lights.
 
-    Mitsuba draws them in proportion to the response r(λ) of the film: one in some hundred meets a line of 1 nm, and
-    counts a hundredfold. With s_e(λ) the spectrum of the light e and ∫ r dλ = ∫ r s_e dλ = 1, they are drawn here from
+    Mitsuba draws them in proportion to the response r(λ) of the film: about one in a hundred falls into a line of 1 nm,
+    with a weight of a hundred. With s_l(λ) the spectrum of light l and ∫ r dλ = ∫ r s_l dλ = 1, they are drawn here
+    from
 
-        p ∝ r (1 + e/(3 max(1, ∫ r e dλ))),    e(λ) = max(0, max_e s_e(λ) − 4).
+        p ∝ r (1 + e/(3 max(1, ∫ r e dλ))),    e(λ) = max(0, max_l s_l(λ) − 4).
 
-    Daylight and incandescent lamps leave p = r. How strong the lights are does not enter, as it says little of what
-    arrives at a pixel. The film divides by p, and p > 0 where r > 0: every channel keeps its expectation.
+    For daylight and incandescent lamps p = r. The power of a light is disregarded, as it does not determine how much of
+    its light arrives at a pixel. The film divides by p, and p > 0 where r > 0: the expectation of each channel is
+    unchanged.
     """
     emissions = [_emission(emitter) for emitter in scene.emitters()]
     for sensor in scene.sensors():
-        # Sensor and film share this object.
-        drawn_from = mi.traverse(sensor.film().sensor_response_function())
-        response = np.array(drawn_from["values"], np.float64)
+        # The sensor draws wavelengths from this object of the film.
+        distribution = mi.traverse(sensor.film().sensor_response_function())
+        response = np.array(distribution["values"], np.float64)
         response /= response.sum()
         lines = np.zeros_like(response)
         for emission in emissions:
-            seen = response * emission
-            lines = np.maximum(lines, seen / (seen.sum() or 1) - 4 * response)
+            recorded = response * emission
+            lines = np.maximum(lines, recorded / (recorded.sum() or 1) - 4 * response)
         if lines.any():
             density = response + lines / (3 * max(1, lines.sum()))
-            # Whole numbers, whose sums are exact in single precision: Mitsuba adds them up to invert their sum.
+            # Integers, so that Mitsuba's cumulative sums of them are exact in single precision.
             density = np.ceil(density * (2**23 / density.sum()))
-            drawn_from["values"] = type(drawn_from["values"])(density.astype(np.float32))
-            drawn_from.update()
+            distribution["values"] = type(distribution["values"])(density.astype(np.float32))
+            distribution.update()
 
 
 def _emission(emitter: mi.Emitter) -> NDArray[np.float64]:
     """Return the spectrum of a light on the grid of the density, (n,), up to a factor.
 
-    It is a histogram of wavelengths that the light draws itself, so that no line is too narrow. A light that is not the
-    same everywhere is seen at one place or in one direction.
+    It is a histogram of wavelengths sampled by the light itself, so that narrow lines are not missed. A light whose
+    spectrum varies over positions or directions is sampled at a single one.
     """
-    place = dr.zeros(mi.SurfaceInteraction3f)
-    place.wi = mi.Vector3f(0, 0, -1)
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    si.wi = mi.Vector3f(0, 0, -1)
     numbers = (np.arange(_DRAWS_PER_LIGHT, dtype=np.float32) + 0.5) / _DRAWS_PER_LIGHT
-    wavelengths, weights = emitter.sample_wavelengths(place, mi.Float(numbers))
+    wavelengths, weights = emitter.sample_wavelengths(si, mi.Float(numbers))
     wavelengths, weights = (x.ravel() for x in np.broadcast_arrays(wavelengths, mi.unpolarized_spectrum(weights)))
     edges = np.arange(VISIBLE[0] - _DENSITY_STEP / 2, VISIBLE[1] + _DENSITY_STEP, _DENSITY_STEP)
     return np.histogram(wavelengths, edges, weights=weights)[0]
@@ -271,7 +274,7 @@ def scene_digest(
             for name, value in node.props.items():
                 named = _resolved(value) if name == "filename" else None
                 if named is None or not named.is_file():
-                    content.update(f"{name}={_in_full(value)}\n".encode())
+                    content.update(f"{name}={_exact_text(value)}\n".encode())
                 elif named.suffix.lower() == ".toml":
                     content.update(Recipe.load(named).digest().encode())
                 else:
@@ -286,7 +289,7 @@ def _resolved(name: object) -> Path:
     return Path(str(mi.file_resolver().resolve(str(name))))
 
 
-def _in_full(value: object) -> str:
+def _exact_text(value: object) -> str:
     """Format a property as text without loss; Mitsuba's own abbreviates spectra and rounds."""
     if dr.is_array_v(value):
         return str(list(value))
@@ -319,13 +322,13 @@ def parsed(
         _refuse_missing_files(path, state)
         yield config, state
     except Exception as error:
-        raise RequestError(f"{path}: {root_cause(error)}{_what_there_is(path, str(error))}") from error
+        raise RequestError(f"{path}: {root_cause(error)}{_alternatives(path, str(error))}") from error
     finally:
         mi.set_file_resolver(resolver)
 
 
 def _replace_materials(state: mi.parser.ParserState, materials: Materials) -> None:
-    """Put gratings in the place of BSDFs; see `load_spectral_scene`."""
+    """Replace BSDFs by gratings; see `load_spectral_scene`."""
     bsdfs = {node.props.id(): k for k, node in enumerate(state.nodes) if node.type == mi.ObjectType.BSDF}
     for name, values in materials.items():
         if name not in bsdfs:
@@ -346,10 +349,10 @@ def _replace_materials(state: mi.parser.ParserState, materials: Materials) -> No
 def files_of_scene(
     path: str | os.PathLike[str], parameters: Mapping[str, str] | None = None, materials: Materials | None = None
 ) -> list[Path]:
-    """Return the files that a scene names: itself, what it includes, files of its plugins, scans of its recipes.
+    """Return the files that a scene names: itself, included files, files of its plugins, scans of its recipes.
 
-    Tables of spectra (`<spectrum filename="…"/>`) are not among them: of these the parser keeps the values alone.
-    Errors as of `parsed`, or if a recipe is wrong.
+    Tables of spectra (`<spectrum filename="…"/>`) are not included, as the parser keeps only their values. Errors as of
+    `parsed`, or if a recipe is wrong.
     """
     with parsed(path, parameters, materials) as (_, state):
         texts = [
@@ -370,7 +373,7 @@ def _refuse_missing_files(path: Path, state: mi.parser.ParserState) -> None:
     """
     for node in state.nodes:
         name = node.props.get("filename")
-        # The grating tells which spectra there are instead.
+        # The error of the grating lists the available spectra.
         if not isinstance(name, str) or node.props.plugin_name() == "diffraction_grating":
             continue
         if not _resolved(name).is_file():
@@ -379,11 +382,11 @@ def _refuse_missing_files(path: Path, state: mi.parser.ParserState) -> None:
             raise RequestError(f"{name}: no such file" + (f"; it is made by: {made[1]}" if made else ""))
 
 
-def _take_radiance_alone(state: mi.parser.ParserState) -> None:
-    """Replace integrators that add other quantities to radiance by the one inside of them."""
+def _unwrap_integrators(state: mi.parser.ParserState) -> None:
+    """Replace integrators that add other quantities to radiance by the integrator nested in them."""
     for node in state.nodes:
-        adds_others = node.type == mi.ObjectType.Integrator and node.props.plugin_name() in ("aov", "moment")
-        if adds_others and (inner := list(_children(state, node.props, mi.ObjectType.Integrator))):
+        is_wrapper = node.type == mi.ObjectType.Integrator and node.props.plugin_name() in ("aov", "moment")
+        if is_wrapper and (inner := list(_children(state, node.props, mi.ObjectType.Integrator))):
             node.props = mi.Properties(state.nodes[inner[0]].props)
 
 
@@ -402,8 +405,8 @@ def _replace_films(state: mi.parser.ParserState, width: int | None, height: int 
     if mi.ObjectType.Sensor not in kinds:
         raise RequestError("the scene has no sensor")
     for index, kind in enumerate(kinds):
-        # Each film adds nodes, which may reallocate the list and invalidate references into it: properties are read as
-        # a copy and written by index.
+        # Each film adds nodes, which may reallocate the list and invalidate references to its elements: properties are
+        # read as a copy and written by index.
         props = mi.Properties(state.nodes[index].props)
         if kind == mi.ObjectType.Film:
             state.nodes[index].props = _spectral_film(state, props, width, height)
@@ -413,8 +416,8 @@ def _replace_films(state: mi.parser.ParserState, width: int | None, height: int 
 
 
 def _children(state: mi.parser.ParserState, props: mi.Properties, kind: mi.ObjectType | None = None) -> dict[int, str]:
-    """Return index in the parser's list → name of the children of a node; of one kind, if it is given."""
-    # Of a copy: Mitsuba refuses what no plugin reads, and this counts as reading.
+    """Return index in the parser's list → name of the children of a node; only those of `kind`, if it is given."""
+    # Of a copy: reading marks a property as used, and Mitsuba reports unused ones as errors.
     references = [
         (value.index(), name)
         for name, value in mi.Properties(props).items()
@@ -432,7 +435,7 @@ def _add(state: mi.parser.ParserState, kind: mi.ObjectType, props: mi.Properties
     return mi.Properties.ResolvedReference(len(state.nodes) - 1)
 
 
-def _whole(film: mi.Properties, name: str, default: int) -> int:
+def _integer(film: mi.Properties, name: str, default: int) -> int:
     value = film.get(name, default)
     if not isinstance(value, int):
         raise RequestError(f"film: {name} is {value!r}, wanted a whole number of pixels")
@@ -443,7 +446,7 @@ def _spectral_film(
     state: mi.parser.ParserState, old: mi.Properties, width: int | None, height: int | None
 ) -> mi.Properties:
     """Return the properties of a spectral film with the crop window of `old`."""
-    old_size = tuple(_whole(old, name, size) for name, size in zip(("width", "height"), _DEFAULT_SIZE, strict=True))
+    old_size = tuple(_integer(old, name, size) for name, size in zip(("width", "height"), _DEFAULT_SIZE, strict=True))
     if width is None:
         width = old_size[0] if height is None else max(1, round(height * old_size[0] / old_size[1]))
     if height is None:
@@ -453,37 +456,37 @@ def _spectral_film(
     film.set_id(old.id())
     film["width"], film["height"] = width, height
     film["component_format"] = "float32"
-    for axis, new, was in (("x", width, old_size[0]), ("y", height, old_size[1])):
+    for axis, new, old_extent in (("x", width, old_size[0]), ("y", height, old_size[1])):
         extent = "width" if axis == "x" else "height"
-        offset = _whole(old, f"crop_offset_{axis}", 0)
-        size = _whole(old, f"crop_{extent}", was - offset)
-        start = min(round(offset * new / was), new - 1)
-        end = min(max(round((offset + size) * new / was), start + 1), new)
+        offset = _integer(old, f"crop_offset_{axis}", 0)
+        size = _integer(old, f"crop_{extent}", old_extent - offset)
+        start = min(round(offset * new / old_extent), new - 1)
+        end = min(max(round((offset + size) * new / old_extent), start + 1), new)
         film[f"crop_offset_{axis}"], film[f"crop_{extent}"] = start, end - start
-    if film["crop_width"] * film["crop_height"] > _MOST_PIXELS:
+    if film["crop_width"] * film["crop_height"] > _MAX_PIXELS:
         raise RequestError(
-            f"film: got {film['crop_width']} × {film['crop_height']} pixels, wanted at most {_MOST_PIXELS} in all"
+            f"film: got {film['crop_width']} × {film['crop_height']} pixels, wanted at most {_MAX_PIXELS} in all"
         )
     if "sample_border" in old:
         film["sample_border"] = old["sample_border"]
     for index, name in _children(state, old, mi.ObjectType.ReconstructionFilter).items():
         film[name] = mi.Properties.ResolvedReference(index)
-    triangle = 1 - np.abs(np.linspace(-1, 1, round(2 * _STEP / _DENSITY_STEP) + 1))
+    triangle = 1 - np.abs(np.linspace(-1, 1, round(2 * _CHANNEL_STEP / _DENSITY_STEP) + 1))
     for number, (centre, weight) in enumerate(zip(channel_wavelengths(), channel_weights(), strict=True)):
         hat = mi.Properties("regular")
-        hat["wavelength_min"], hat["wavelength_max"] = float(centre - _STEP), float(centre + _STEP)
-        hat["values"] = ", ".join(f"{weight / _STEP * share:.17g}" for share in triangle)
-        # Channels are numbered, as the parser refuses names with a dot; films keep the order of names.
+        hat["wavelength_min"], hat["wavelength_max"] = float(centre - _CHANNEL_STEP), float(centre + _CHANNEL_STEP)
+        hat["values"] = ", ".join(f"{weight / _CHANNEL_STEP * value:.17g}" for value in triangle)
+        # Channels are numbered, as the parser refuses names with a dot; films order channels by name.
         film[f"channel_{number:03d}"] = _add(state, mi.ObjectType.Texture, hat)
     return film
 
 
-def _what_there_is(scene: Path, error: str) -> str:
-    """Return what is available in place of a missing include or an unknown parameter, to end a message."""
+def _alternatives(scene: Path, error: str) -> str:
+    """Return the alternatives to a missing include or an unknown parameter, as the end of a message."""
     if (missing := re.search(r'included file "(.+?)" not found', error)) is not None:
         folder = scene.resolve().parent / Path(missing[1]).parent
-        there = sorted(path.stem for path in folder.glob("*.xml"))
-        return f"; {Path(missing[1]).parent} holds {', '.join(there) or 'none'}"
+        available = sorted(path.stem for path in folder.glob("*.xml"))
+        return f"; {Path(missing[1]).parent} holds {', '.join(available) or 'none'}"
     if (missing := re.search(r"undefined parameter: \$(\w+)", error)) is not None:
         return f"; set it by -D {missing[1]}=…"
     if "unused parameters" in error:

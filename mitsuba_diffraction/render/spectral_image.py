@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from .denoise import Guides
 
 _LAYOUT_VERSION = "1.0"
-# Radiance per nm, the unit in the channel names: the authors of the layout and pbrt-v4 omit the nm⁻¹, and
+# Radiance is per nm, the unit in the channel names: the authors of the layout and pbrt-v4 omit the nm⁻¹, and
 # colour-science integrates the channels over wavelength.
 _UNITS = "W.m^-2.sr^-1"
 _CHANNEL = re.compile(r"S0\.(\d+(?:,\d+)?)nm")

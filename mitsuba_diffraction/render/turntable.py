@@ -28,15 +28,15 @@ def orbit(
 
     Frame k rotates it by 360° k/`frames` about the coordinate axis closest to its up vector, through the point on its
     line of sight that is closest to the centre of the scene's bounding box. Each motion is an affine map of world
-    space; the first is the identity. `load_spectral_scene` takes them; parameters, materials and errors are its own.
+    space; the first is the identity. `load_spectral_scene` takes them; parameters, materials and errors are as there.
     """
     scene = load_spectral_scene(scene_path, width=1, height=1, parameters=parameters, materials=materials)
-    centre, up = _view(scene)
+    target, up = _view(scene)
     motions = []
     for k in range(frames):
         motion = np.eye(4)
         motion[:3, :3] = Rotation.from_rotvec(2 * np.pi * k / frames * up).as_matrix()
-        motion[:3, 3] = centre - motion[:3, :3] @ centre
+        motion[:3, 3] = target - motion[:3, :3] @ target
         motions.append(tuple(motion.ravel().tolist()))
     return motions
 
@@ -45,11 +45,11 @@ def _view(scene: mi.Scene) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the point the first camera looks at, and the coordinate axis closest to its up vector."""
     to_world = np.array(scene.sensors()[0].world_transform().matrix, np.float64).reshape(4, 4)
     origin, forward, own_up = to_world[:3, 3], to_world[:3, 2] / np.linalg.norm(to_world[:3, 2]), to_world[:3, 1]
-    middle = np.ravel(np.array(scene.bbox().center(), np.float64))
+    centre = np.ravel(np.array(scene.bbox().center(), np.float64))
     axis = int(np.argmax(np.abs(own_up)))
     up = np.zeros(3)
     up[axis] = np.sign(own_up[axis])
-    return origin + forward * (forward @ (middle - origin)), up
+    return origin + forward * (forward @ (centre - origin)), up
 
 
 def save_animation(previews: Iterable[Path], path: str | os.PathLike[str]) -> None:

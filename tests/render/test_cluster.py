@@ -104,7 +104,7 @@ def test_results_that_come_out_of_order_are_added_in_order(threads_of_this_proce
     in_order = ended.copy()
     ended.clear()
     monkeypatch.setattr(cluster, "trace_pass", invented)
-    monkeypatch.setattr(cluster, "one_pass", contextlib.nullcontext())
+    monkeypatch.setattr(cluster, "pass_lock", contextlib.nullcontext())
     there = render("scene.xml", spp=16, tracer=trace_on(threads_of_this_process))
     assert sorted(ended) == sorted(in_order)
     assert ended != in_order
@@ -135,14 +135,14 @@ def test_failures_of_a_worker_are_one_line(threads_of_this_process, monkeypatch,
     cluster.scene_of.cache_clear()
     code, out, err = command(line)
     assert (code, out) == (1, "")
-    assert "scene.xml: a worker finds another scene there" in err.splitlines()[-1]
+    assert "scene.xml: on a worker, the scene or a file that it references is different" in err.splitlines()[-1]
     monkeypatch.setattr(cluster, "versions", lambda: ("mitsuba 2.0",))
     code, out, err = command(line)
     assert "a worker has mitsuba 2.0; wanted mitsuba 3" in err.splitlines()[-1]
 
 
 def test_an_unreachable_scheduler_is_one_line(command, monkeypatch):
-    monkeypatch.setattr(cluster, "SECONDS_TO_CONNECT", 0.5)
+    monkeypatch.setattr(cluster, "CONNECT_TIMEOUT", 0.5)
     line = "render scene.xml --spp 9 --variant llvm_ad_spectral --dask"
     for address in ("tcp://127.0.0.1:1", "nonsense://x"):
         code, out, err = command(f"{line} {address}")
@@ -155,7 +155,7 @@ def test_an_unreachable_scheduler_is_one_line(command, monkeypatch):
 
 
 def test_a_port_that_is_silent_is_no_scheduler(command, monkeypatch):
-    monkeypatch.setattr(cluster, "SECONDS_TO_CONNECT", 0.5)
+    monkeypatch.setattr(cluster, "CONNECT_TIMEOUT", 0.5)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
         code, out, err = command(f"render scene.xml --spp 9 --variant llvm_ad_spectral --dask {address}")

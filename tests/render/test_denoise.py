@@ -11,7 +11,7 @@ from PIL import Image
 
 import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a variant is set)
 from mitsuba_diffraction.color import XYZ_to_linear_sRGB, into_gamut, matching_functions
-from mitsuba_diffraction.render.denoise import Guides, denoised, guides, is_asked_for
+from mitsuba_diffraction.render.denoise import Guides, denoised, guides, is_requested
 
 SCENE = """<scene version="3.0.0"><integrator type="direct"/>
 <sensor type="perspective"><transform name="to_world"><lookat origin="0,-4,2" target="0,0,0.5" up="0,0,1"/></transform>
@@ -158,12 +158,12 @@ def test_what_a_scene_asks_for_is_read_as_leniently_as_mitsuba_reads_scenes(tmp_
     comment = '<!-- python x.py --small; <default name="denoise" value="false"/> -->'
     path.write_text(ASKS.replace("<integrator", comment + "<integrator"))
     mi.load_file(str(path))
-    assert is_asked_for(path)
+    assert is_requested(path)
     path.write_text(SCENE.replace("<integrator", comment.replace("false", "true") + "<integrator"))
-    assert not is_asked_for(path)
+    assert not is_requested(path)
 
 
 def test_the_scenes_that_ask_are_those_that_the_documentation_names():
     scenes = Path(__file__).parents[2] / "scenes"
-    asking = {path.name for path in scenes.glob("*.xml") if is_asked_for(path)}
+    asking = {path.name for path in scenes.glob("*.xml") if is_requested(path)}
     assert asking == {f"{name}.xml" for name in ("glasses", "window", "rainbow", "compact_disc", "hologram", "blaze")}

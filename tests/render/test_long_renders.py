@@ -47,7 +47,7 @@ def stop_after(count):
     """A tracer of passes that presses Ctrl-C while it traces the last of `count`."""
 
     def trace(job, scene, first):
-        for number, traced in enumerate(passes.trace_here(job, scene, first), 1):
+        for number, traced in enumerate(passes.trace_locally(job, scene, first), 1):
             if number == count:
                 signal.raise_signal(signal.SIGINT)
             yield traced
@@ -427,7 +427,7 @@ def small_disk(tmp_path):
 
 
 def test_a_disk_that_the_picture_fills_is_one_line(command, small_disk, monkeypatch):
-    monkeypatch.setattr(passes, "CHECKPOINT_SHARE", 0)  # after each pass, however long a checkpoint takes
+    monkeypatch.setattr(passes, "MIN_CHECKPOINT_INTERVAL", 0)  # after each pass, however long a checkpoint takes
     # A checkpoint is 200 kB, two of them do not fit; a larger picture does not fit at all.
     code, out, err = command(f"{RENDER} --spp 6 -o disk/out.exr --checkpoint 0")
     assert (code, out) == (1, "")

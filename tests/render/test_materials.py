@@ -121,7 +121,7 @@ def test_a_material_that_no_shape_has_is_told(exported, caplog):
     with caplog.at_level(logging.WARNING, "mitsuba_diffraction"):
         load_spectral_scene(path, materials={"mat-Disc": MIRROR, "mat-Spare": MIRROR})
     told = [record.getMessage() for record in caplog.records if "no shape" in record.getMessage()]
-    assert told == ["material mat-Spare: no shape has the BSDF of that id, and the picture is as without it"]
+    assert told == ["material mat-Spare: no shape uses the BSDF with that id, so the picture is unaffected"]
 
 
 def test_a_misspelt_parameter_is_refused_with_a_material_too(exported):

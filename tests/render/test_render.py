@@ -483,7 +483,7 @@ def test_of_integrators_with_other_channels_the_radiance_is_taken(llvm, tmp_path
     path.write_text(path.read_text().replace(plain, aov))
     np.testing.assert_array_equal(render(path, spp=1).radiance, expected)
     path.write_text(path.read_text().replace(aov, aov.replace(plain, "")))
-    with pytest.raises(ValueError, match="wanted radiance alone"):
+    with pytest.raises(ValueError, match="wanted radiance only"):
         render(path, spp=1)
 
 

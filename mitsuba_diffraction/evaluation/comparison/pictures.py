@@ -18,7 +18,7 @@ from ...color import spectrum_to_XYZ
 from ...errors import RequestError
 from ...progress import Progress, silent
 from ...render import SpectralImage
-from ...render.film import check_memory, collect, evenly, pass_seed, rotated, trace_pass
+from ...render.film import check_memory, collect, equal_ranges, pass_seed, rotated, trace_pass
 from ...render.passes import Accumulation, ratio, split
 from ...render.scene import channel_wavelengths, load_spectral_scene, parsed
 from ..realtime_shader.base import Shader
@@ -267,7 +267,7 @@ class Pictures:
         channels = [dr.opaque(mi.Float, channel, shape=len(x)) for channel in range(3)]
         rfilter = self.scene.sensors()[0].film().rfilter()
         count = dr.opaque(mi.UInt32, len(x) // (rows * columns))
-        sums = collect(rfilter, mi.Point2f(x, y), channels, rgb, (rows, columns), 0, evenly(count), 3)
+        sums = collect(rfilter, mi.Point2f(x, y), channels, rgb, (rows, columns), 0, equal_ranges(count), 3)
         values = np.array(sums, np.float64).reshape(rows, columns, 4)
         return ratio(values[..., :3], values[..., 3:])
 
