@@ -73,6 +73,29 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
             os.close(folder)
 
 
+@contextmanager
+def exclusive(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Let no other process into the same block for `path`: it holds a lock file next to it meanwhile.
+
+    Raises:
+        RequestError: if another process is in it.
+    """
+    path = Path(path)
+    lock = path.with_name(f".{path.name}.lock")
+    with lock.open("wb") as stream:
+        if fcntl is not None:
+            try:
+                fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise RequestError(f"{path}: another process is writing it, wanted one at a time") from None
+            except OSError:  # a file system without locks
+                pass
+        try:
+            yield
+        finally:
+            lock.unlink(missing_ok=True)
+
+
 def _locked_temporary(target: Path) -> tuple[Path, int]:
     """Return a new file next to `target`, and the descriptor that holds its lock."""
     while True:

@@ -16,7 +16,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, nullcontext
 from dataclasses import asdict, dataclass, fields
 from importlib import metadata
 from itertools import pairwise
@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from ..color import spectrum_to_XYZ
 from ..errors import RequestError
-from ..files import UNSEALED, is_intact, seal, whole_file
+from ..files import UNSEALED, exclusive, is_intact, seal, whole_file
 from .film import check_memory, is_independent, needs_mitsubas_film, pass_seed, samples_drawn, trace_pass
 from .scene import (
     Materials,
@@ -281,7 +281,7 @@ def render(
     Raises:
         FileNotFoundError: if there is no such scene.
         ValueError: as `load_spectral_scene`, or if a number is out of range, the picture needs more memory than is
-            available, or the checkpoint is of another rendering.
+            available, or the checkpoint is of another rendering, or one that another process writes.
         RuntimeError: if rendering failed, with the cause on one line.
         OSError: if a checkpoint cannot be written; the previous one is kept.
         Interrupted: at the end of the current pass on the first Ctrl-C, with the picture so far, after a checkpoint.
@@ -293,11 +293,12 @@ def render(
     if finished is not None and finished.attributes.get("digest") == job.digest():
         return finished
 
-    sums = None if checkpoint is None else load_checkpoint(checkpoint, job.digest())
-    if sums is None:
-        columns, rows = (int(size) for size in scene.sensors()[0].film().crop_size())
-        sums = Accumulation.empty(rows, columns)
-    complete = _trace(job, scene, sums, checkpoint, seconds, tracer, progress)
+    with nullcontext() if checkpoint is None else exclusive(checkpoint):
+        sums = None if checkpoint is None else load_checkpoint(checkpoint, job.digest())
+        if sums is None:
+            columns, rows = (int(size) for size in scene.sensors()[0].film().crop_size())
+            sums = Accumulation.empty(rows, columns)
+        complete = _trace(job, scene, sums, checkpoint, seconds, tracer, progress)
     if not sums.passes:
         raise KeyboardInterrupt
     _warn_of_implausible_pixels(sums, max_plausible_luminance(scene))

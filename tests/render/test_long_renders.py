@@ -15,6 +15,7 @@ from PIL import Image
 
 import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a variant is set)
 from mitsuba_diffraction.color import spectrum_to_XYZ
+from mitsuba_diffraction.files import exclusive
 from mitsuba_diffraction.render import SpectralImage, passes, render
 from mitsuba_diffraction.render.passes import Accumulation, Interrupted, load_checkpoint, save_checkpoint
 from mitsuba_diffraction.render.scene import channel_wavelengths, load_spectral_scene, scene_digest
@@ -191,6 +192,12 @@ def test_checkpoints_are_written_every_so_often(monkeypatch):
     render("scene.xml", spp=60, checkpoint="c", seconds=10)
     # After three looks; then twenty times the four seconds that one took to write, counted from its beginning.
     assert written == [3, 22, 41]
+
+
+def test_a_checkpoint_that_another_process_writes_is_refused():
+    with exclusive("c"), pytest.raises(ValueError, match="c: another process is writing it"):
+        render("scene.xml", spp=4, checkpoint="c")
+    assert not list(Path().glob(".c*"))
 
 
 @pytest.mark.parametrize(
