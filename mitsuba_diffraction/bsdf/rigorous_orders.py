@@ -210,8 +210,12 @@ class RigorousOrders:
         bright = rows[0].x > 0
         across = pair.k_y / (self.period * frequency)
         scale = dr.rcp(dr.select(bright, rows[0].x, mi.Float(1)))
+        matrix = [[rows[i][j] * scale * (across if ODD[i, j] else 1) for j in range(4)] for i in range(4)]
+        # Between nodes light could become more than polarised: then all but M_00 is less.
+        polarised = [sum(dr.square(m) for m in line[1:]) for line in (matrix[0], [row[0] for row in matrix])]
+        limit = dr.rsqrt(larger(larger(*polarised), 1))
         return [
-            [dr.select(bright, rows[i][j] * scale * (across if ODD[i, j] else 1), mi.Float(i == j)) for j in range(4)]
+            [dr.select(bright, matrix[i][j] * (limit if i or j else 1), mi.Float(i == j)) for j in range(4)]
             for i in range(4)
         ]
 

@@ -284,6 +284,16 @@ def test_unpolarised_light_is_that_of_variants_without_polarisation(variant, sol
             assert (np.linalg.norm(out[:, 1:], axis=1) <= (1 + 2 * solved.polarisation_error) * out[:, 0]).all()
 
 
+def test_unpolarised_light_is_at_most_polarised_between_the_nodes_of_a_table(solved):
+    use("llvm_ad_spectral_polarized")
+    wi, wo = pairs(solved, 0.47, 2000)
+    si = interaction(wi, (470.0,) * 4, len(wi))
+    value = plugin(solved).eval(mi.BSDFContext(), si, vectors(wo))
+    column = np.array([np.broadcast_to(np.array(value[i, 0])[0], len(wi)) for i in range(4)])
+    bright = column[0] > 1e-6 * column[0].max()
+    assert (np.linalg.norm(column[1:], axis=0)[bright] <= (1 + 1e-4) * column[0][bright]).all()
+
+
 def test_a_table_of_unpolarised_light_is_refused_in_polarised_variants():
     use("llvm_ad_spectral_polarized")
     with pytest.raises(RuntimeError, match="wanted one that was built with polarised=True"):
