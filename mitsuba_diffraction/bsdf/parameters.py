@@ -378,7 +378,7 @@ def check_transmission(of_spectrum: str, media: Media) -> None:
     if of_spectrum != media.transmission:
         raise RequestError(
             f"transmission: got {media.transmission!r}, but the rigorous spectrum is of transmission={of_spectrum}: "
-            "set the same, or build the spectrum for it"
+            "say the same, or build the spectrum for it"
         )
 
 
