@@ -19,7 +19,7 @@ from .surface.heightfield import HeightField
 Real = NDArray[np.float64]
 
 _FAR = 9.0  # standard deviations; e^{−9²/2} is under 3e-18
-CHUNK = 2**20  # complex numbers in one intermediate array, 16 MiB
+MAX_CHUNK = 2**20  # complex numbers in one intermediate array, 16 MiB
 
 
 def amplitudes(height_field: HeightField, kappa: float) -> NDArray[np.complex128]:
@@ -125,7 +125,7 @@ def mean_periodograms(height_field: HeightField, q: Real, kappa: Real, axes: tup
     """
     along_x, along_y = axes
     width, height = len(along_x.window), len(along_y.window)
-    chunk = max(1, CHUNK // max(height_field.shape))
+    chunk = max(1, MAX_CHUNK // max(height_field.shape))
     result = np.zeros(kappa.shape)
     for value, indices in _by_kappa(kappa):
         phase = np.exp(1j * value * height_field.centred)

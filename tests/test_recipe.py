@@ -268,7 +268,7 @@ def test_a_recipe_reports_the_coherence_length_that_its_scan_supports(tmp_path):
         tmp_path,
         '[surface]\nscan = "scan.npy"\npixel_size = 0.09\n[spectrum]\nextent = "sample"\ntolerance = 0.02\n',
     )
-    with pytest.warns(UserWarning, match=r"2.16 × 1.8 µm carries 0.9 µm of the 65 µm asked for"):
+    with pytest.warns(UserWarning, match=r"2.16 × 1.8 µm supports 0.9 µm of the requested 65 µm"):
         spectrum = Recipe.load(path).build()
     assert spectrum.coherence_length == pytest.approx(0.9)
 

@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..spectrum.tables import LEAST_EXPONENT
+from ..spectrum.tables import MIN_EXPONENT
 
 
 def larger(a: mi.Float, b: mi.Float) -> mi.Float:
@@ -119,12 +119,12 @@ class SharedExponentTable:
     The format is RGB9E5 with signs. Values are read times `1/unit`.
     """
 
-    unit = 2.0 ** (126 + LEAST_EXPONENT)  # the exponent 1 is 2⁻¹²⁶ in a float32
+    unit = 2.0 ** (126 + MIN_EXPONENT)  # the exponent 1 is 2⁻¹²⁶ in a float32
 
     def __init__(self, mantissas: np.ndarray, exponents: np.ndarray) -> None:
         """Pack the numbers m 2^e, m (..., 3) and e (...)."""
         m = mantissas.astype(np.int64) & 511
-        words = (m[..., 0] << 23) | (m[..., 1] << 14) | (m[..., 2] << 5) | (exponents - LEAST_EXPONENT + 1)
+        words = (m[..., 0] << 23) | (m[..., 1] << 14) | (m[..., 2] << 5) | (exponents - MIN_EXPONENT + 1)
         self.words = mi.UInt32(aligned(words.astype(np.uint32).ravel()))
 
     def add(self, packet: mi.Vector3f, weight: mi.Float, index: mi.UInt32, active: mi.Bool) -> mi.Vector3f:

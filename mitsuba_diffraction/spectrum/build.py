@@ -1,4 +1,4 @@
-"""From a height field to its power spectrum, to a tolerance."""
+"""From a height field to its power spectrum, within a tolerance."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ..progress import Progress, part
 from ..settings import SERIES, Settings, lobe_cutoff, lobe_width
 from ..surface.heightfield import HeightField
 from .grids import LobeAxis, OrderGrid, inner
-from .power_spectrum import TAIL_SHARE, PowerSpectrum
+from .power_spectrum import TAIL_FRACTION, PowerSpectrum
 from .sample import SamplePowers, effective_coherence_length, standard_error
 from .tables import (
     AmplitudeTable,
@@ -25,9 +25,9 @@ from .tables import (
     chebyshev_polynomials,
     chebyshev_transform,
     halved,
+    locate,
     nodes_for,
     packed,
-    place,
     position,
     series_function,
     series_weights,
@@ -35,21 +35,22 @@ from .tables import (
 )
 from .tile import MeanPowers, TilePowers, TileSplines
 
-# Shares of the tolerance.
-_TRUNCATED_SHARE = 0.1  # weak frequencies
-_SPLINE_SHARE = 0.4  # what lies between the nodes in q
-# What is chosen by the strongest frequencies, and measured at a few κ, is held to this part of what is allowed.
-_MARGIN = 0.7
-_WIDEST_SPACING = 0.74  # lattice of splines, in σ_q
-_PILOT = 8_000  # frequencies
-_SMALL = 2_000  # nodes of one κ that the nearest cache holds as they are: unpacking would take longer than reading
-_LARGEST_TABLE = 4e9  # bytes
-# Where none is asked for: the tolerances that measurements and pictures need, and in between, of a sample, a share of
-# its standard error. A table exact to 1e-3 of what is known to 25 % is waste.
-_FINEST, _COARSEST = 1e-3, 1e-2
-_STANDARD_ERROR_SHARE = 0.1
+# Fractions of the tolerance.
+_TRUNCATION_FRACTION = 0.1  # for weak frequencies that are left out
+_SPLINE_FRACTION = 0.4  # for interpolation between the nodes in q
+# Intervals are chosen by the strongest frequencies, and errors are measured at a few κ: both keep this fraction of the
+# allowed error.
+_SAFETY_FRACTION = 0.7
+_MAX_SPACING = 0.74  # of the lattice of splines, in σ_q
+_MAX_PILOT = 8_000  # strongest frequencies by which intervals are chosen
+_MAX_UNPACKED_NODES = 2_000  # up to which the nodes of one κ fit unpacked into the first-level cache
+_MAX_TABLE_BYTES = 4e9
+# Default tolerances: of a tile the smaller; of a sample a fraction of its standard error between the two, as the table
+# need not be exact to 1e-3 where the spectrum is known to 25 %.
+_MIN_DEFAULT_TOLERANCE, _MAX_DEFAULT_TOLERANCE = 1e-3, 1e-2
+_STANDARD_ERROR_FRACTION = 0.1
 
-_OF_MEAN = 0.7  # the share of the time that the mean of many patches takes, roughly
+_MEAN_TIME_FRACTION = 0.7  # of the build, spent on the mean of several patches, roughly
 
 Splines = SamplePowers | TileSplines
 Lattice = TypeVar("Lattice", SamplePowers, TileSplines)
@@ -68,12 +69,13 @@ def build_spectrum(patches: Sequence[HeightField], settings: Settings, progress:
     powers: TilePowers | Splines | None
     series = settings.representation in SERIES
     if settings.extent == "tile":
-        allowed = tolerance = _FINEST if tolerance is None else tolerance
-        sigma, rho = lobe_width(effective), lobe_cutoff(TAIL_SHARE * tolerance)
+        allowed = tolerance = _MIN_DEFAULT_TOLERANCE if tolerance is None else tolerance
+        sigma, rho = lobe_width(effective), lobe_cutoff(TAIL_FRACTION * tolerance)
         orders = TilePowers(height_field, max_frequency, rho * sigma)
         if len(patches) > 1:
-            of_mean, progress = part(progress, 0, _OF_MEAN), part(progress, _OF_MEAN, 1)
-            orders = MeanPowers(patches, max_frequency, rho * sigma, max_kappa, (1 - TAIL_SHARE) * tolerance, of_mean)
+            mean_tolerance = (1 - TAIL_FRACTION) * tolerance
+            mean_progress, progress = part(progress, 0, _MEAN_TIME_FRACTION), part(progress, _MEAN_TIME_FRACTION, 1)
+            orders = MeanPowers(patches, max_frequency, rho * sigma, max_kappa, mean_tolerance, mean_progress)
         lobes = orders.grid.lobes(sigma, rho)
         powers = None if series else _tile_splines(orders, lobes, sigma, max_frequency, max_kappa, tolerance)
         if powers is None:
@@ -85,13 +87,14 @@ def build_spectrum(patches: Sequence[HeightField], settings: Settings, progress:
             height_field, coherence_length=effective, max_kappa=max_kappa, max_frequency=max_frequency
         )
         if tolerance is None:
-            tolerance = float(np.clip(_STANDARD_ERROR_SHARE * found_error, _FINEST, _COARSEST))
+            wanted = _STANDARD_ERROR_FRACTION * found_error
+            tolerance = float(np.clip(wanted, _MIN_DEFAULT_TOLERANCE, _MAX_DEFAULT_TOLERANCE))
         allowed = tolerance
         if effective < coherence_length * (1 - 1e-9):
             x, y = height_field.tile_size
             warnings.warn(
-                f"coherence_length: a scan of {x:.4g} × {y:.4g} µm carries {effective:.4g} µm of the "
-                f"{coherence_length:.4g} µm asked for; the lobes are as wide as the scan allows",
+                f"coherence_length: a scan of {x:.4g} × {y:.4g} µm supports {effective:.4g} µm of the requested "
+                f"{coherence_length:.4g} µm; the lobes are as wide as the scan allows",
                 stacklevel=4,
             )
         powers = _refined(
@@ -110,7 +113,7 @@ def build_spectrum(patches: Sequence[HeightField], settings: Settings, progress:
     return PowerSpectrum(
         table=table,
         grid=build.kept,
-        # What does not change the table is left out, as it is of files.
+        # Settings that do not affect the table are left at their defaults, as in files.
         settings=Settings(
             settings.extent,
             effective,
@@ -141,12 +144,12 @@ def _tile_splines(
     max_kappa: float,
     tolerance: float,
 ) -> TileSplines | None:
-    """Return a tile's lattice of splines, if it is read faster than its orders."""
+    """Return the lattice of splines of a tile, or None if reading it is no faster than reading the orders."""
     cost = _cost(lobes[0].count * lobes[1].count, orders.grid.shape)
 
     def lattice(spacing: float) -> TileSplines:
         splines = TileSplines(orders, sigma, spacing, max_frequency)
-        # A finer one would be read slower still.
+        # A finer lattice would be slower still.
         if _cost(9, splines.grid.shape) >= cost:
             raise _TooLargeError(f"{splines.grid}: read no faster than the orders")
         return splines
@@ -158,17 +161,17 @@ def _tile_splines(
 
 
 def _cost(packets: int, shape: tuple[int, int]) -> float:
-    """Return the cost of an evaluation that reads so many packets of a table of (rows, columns) nodes.
+    """Return the cost of an evaluation that reads `packets` nodes of (rows, columns), in reads of a small table.
 
-    In reads of a small table. On a CPU they take the same time while the nodes of one κ, at 8 bytes, fill less than
-    1 MB, beyond it longer with the square root.
+    On a CPU reads take the same time while the nodes of one κ, at 8 bytes, fill less than 1 MB; beyond, the time grows
+    with the square root of the size.
     """
     return packets * max(1.0, shape[0] * shape[1] * 8e-6) ** 0.5
 
 
 def _refined(lattice: Callable[[float], Lattice], sigma: float, max_kappa: float, tolerance: float) -> Lattice:
-    """Return the coarsest lattice, a function of its spacing, that keeps its share of the tolerance between nodes."""
-    allowed, spacing = _SPLINE_SHARE * tolerance, _WIDEST_SPACING * sigma
+    """Return the coarsest lattice, made by `lattice` for a spacing, that keeps `_SPLINE_FRACTION` of the tolerance."""
+    allowed, spacing = _SPLINE_FRACTION * tolerance, _MAX_SPACING * sigma
     while True:
         powers = lattice(spacing)
         _check_size(powers.grid.shape, 4)
@@ -183,16 +186,16 @@ def _refined(lattice: Callable[[float], Lattice], sigma: float, max_kappa: float
 
 
 class _Storage(NamedTuple):
-    """How slices are stored."""
+    """Number format of slices."""
 
     terms: int  # of the polynomial in κ
-    rounded: Callable[[NDArray[np.float32]], NDArray[np.float32]]  # the values as they are read
-    least: float  # allowed error from which on rounding may leave enough
-    interpolation: float  # the share of it that interpolation gets at first
-    finest: float  # the share below which finer intervals are given up
+    rounded: Callable[[NDArray[np.float32]], NDArray[np.float32]]  # rounds values to the format
+    min_allowed: float  # smallest allowed error for which the format is tried
+    interpolation: float  # fraction of the allowed error that interpolation takes in the first attempt
+    min_interpolation: float  # fraction below which the format is abandoned
 
 
-# From the fastest to the most exact.
+# From the fastest to the most accurate.
 _STORAGES = (
     _Storage(3, packed, 2.0**-9, 0.7, 0.3),
     _Storage(4, halved, 2.0**-11, 0.8, 0.3),
@@ -201,12 +204,12 @@ _STORAGES = (
 
 
 class _Build:
-    """One way from the exact powers to a table that keeps the tolerance.
+    """Builder of a table that keeps the tolerance, from exact powers.
 
     Attributes:
-        kept: the grid without the weak frequencies at its rim.
-        truncated_power: the largest share of the power outside of it, at most.
-        unresolved_power: the largest share of the power that the whole grid does not reach.
+        kept: the grid without the weak frequencies at its edges.
+        truncated_power: an upper bound, over κ, of the fraction of the power outside `kept`.
+        unresolved_power: the largest fraction of the power, over κ, that is outside the whole grid.
     """
 
     def __init__(
@@ -230,38 +233,38 @@ class _Build:
         return self._exact(kappa)[inner(self._exact.grid, self.kept)]
 
     def _survey(self) -> None:
-        """Find, over the Chebyshev nodes in κ, where the power lies, and a pilot: the strongest frequencies."""
+        """Find the extent of the power and the strongest frequencies (the pilot), over the Chebyshev nodes in κ."""
         kappas = (1 + chebyshev_nodes(self._nodes)) / 2 * self._max_kappa
         grid, report = self._exact.grid, self._phase(0.0, 0.3)
-        rims: tuple[list[NDArray[np.float64]], list[NDArray[np.float64]]] = ([], [])
+        outer: tuple[list[NDArray[np.float64]], list[NDArray[np.float64]]] = ([], [])
         missing, total, strongest = [], 0.0, None
-        pilot = np.empty((self._nodes, min(_PILOT, int(np.prod(grid.shape)))))
+        pilot = np.empty((self._nodes, min(_MAX_PILOT, int(np.prod(grid.shape)))))
         for j, kappa in enumerate(kappas):
             power = self._exact(kappa)
             missing.append(1 - self._exact.reached(power))
             size = np.abs(power)
             total += size.sum()
             for axis in (0, 1):
-                rims[axis].append(_rim(size.sum(axis=axis)))
+                outer[axis].append(_outer_sums(size.sum(axis=axis)))
             if strongest is None:
                 strongest = np.sort(np.argpartition(-size, pilot.shape[1] - 1, axis=None)[: pilot.shape[1]])
             pilot[j] = power.ravel()[strongest]
             report(j + 1, self._nodes)
-        # Between the nodes more may be missing, or lie at the rim.
+        # Between the nodes the fractions may be larger: interpolate in κ.
         between = self._between()[1]
         self.unresolved_power = float(np.clip((between @ missing).max(), 0, 1))
         max_order, self.truncated_power = [], 0.0
-        for whole, rim in zip(grid.max_order, rims, strict=True):
-            outside = (between @ np.array(rim)).max(axis=0)
-            max_order.append(int(np.argmax(outside <= _TRUNCATED_SHARE / 2 * self._allowed)) if whole else 0)
+        for whole, sums in zip(grid.max_order, outer, strict=True):
+            outside = (between @ np.array(sums)).max(axis=0)
+            max_order.append(int(np.argmax(outside <= _TRUNCATION_FRACTION / 2 * self._allowed)) if whole else 0)
             self.truncated_power += float(np.clip(outside[max_order[-1]], 0, 1))
         self.kept = dataclasses.replace(grid, max_order=(max_order[0], max_order[1]))
         self._pilot = pilot
-        # The others are taken to err as much for their power.
-        self._pilot_share = float(np.abs(pilot).sum() / total)
+        # The other frequencies are assumed to have the same error relative to their power.
+        self._pilot_fraction = float(np.abs(pilot).sum() / total)
 
     def _phase(self, begin: float, end: float) -> Progress:
-        """Return what reports a part of the whole, in per cent; what is done again does not count back."""
+        """Return a function that reports progress of a part of the whole, in per cent, which never decreases."""
 
         def forward(done: int, total: int) -> None:
             self._done = max(self._done, done)
@@ -270,20 +273,20 @@ class _Build:
         return part(forward, begin, end)
 
     def __call__(self) -> tuple[SliceTable, float]:
-        """Return the cheapest table, and its measured error."""
-        for storage in _STORAGES if np.prod(self.kept.shape) > _SMALL else _STORAGES[-1:]:
+        """Return the cheapest table and its measured error."""
+        for storage in _STORAGES if np.prod(self.kept.shape) > _MAX_UNPACKED_NODES else _STORAGES[-1:]:
             refine, refusal = storage.interpolation, None
-            while self._allowed >= storage.least:
+            while self._allowed >= storage.min_allowed:
                 try:
-                    table = self._build(storage, _MARGIN * self._allowed * refine)
+                    table = self._build(storage, _SAFETY_FRACTION * self._allowed * refine)
                 except _TooLargeError as too_large:
-                    # Another storage may need fewer intervals.
+                    # Another format may need fewer intervals.
                     refusal = too_large
                     break
-                error = self._measured(table) / _MARGIN
+                error = self._measured(table) / _SAFETY_FRACTION
                 if error <= self._allowed:
                     return table, error
-                if refine < storage.finest:
+                if refine < storage.min_interpolation:
                     break
                 refine /= max(2.0, error / self._allowed)
         raise refusal or RequestError(
@@ -292,7 +295,7 @@ class _Build:
         )
 
     def series(self, heights: NDArray[np.float64], settings: Settings) -> tuple[AmplitudeTable, float]:
-        """Return the series of the amplitudes of a tile, with the terms that are requested or needed, and its error."""
+        """Return the amplitude series of a tile, with the requested or required number of terms, and its error."""
         kind, origin = settings.representation, settings.heights_from
         heights = heights - (heights.min() if origin == "lowest" else heights.mean())
         x = self._max_kappa * float(np.abs(heights).max())
@@ -319,20 +322,20 @@ class _Build:
     def _build(self, storage: _Storage, allowed: float) -> SliceTable:
         intervals = self._intervals(allowed, storage.terms)
         _check_size(self.kept.shape, intervals * storage.terms)
-        # What is measured is what is stored.
+        # Values are rounded as stored, so that the measured error includes rounding.
         return SliceTable.build(
             intervals, storage.terms, self._max_kappa, self._powers, storage.rounded, self._phase(0.3, 0.8)
         )
 
     def _between(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return many κ, four to an oscillation, and the matrix, (κ, n), that interpolates from the Chebyshev nodes."""
+        """Return κ, four per oscillation, and the matrix, (κ, n), that interpolates to them from Chebyshev nodes."""
         kappas = np.linspace(0, self._max_kappa, 16 + int(np.ceil(4 * self._x)), dtype=np.float64)
         vander = chebyshev_polynomials(position(kappas, self._max_kappa), self._nodes)
         return kappas, vander @ chebyshev_transform(self._nodes)
 
     def _intervals(self, allowed: float, terms: int) -> int:
-        """Return the fewest intervals with which the pilot is kept at every κ."""
-        allowed *= self._pilot_share
+        """Return the smallest number of intervals that keeps the allowed error of the pilot at every κ."""
+        allowed *= self._pilot_fraction
         kappas, interpolate = self._between()
         exact = interpolate @ self._pilot
         coefficients = chebyshev_transform(self._nodes) @ self._pilot
@@ -341,29 +344,29 @@ class _Build:
             at = (np.arange(intervals)[:, None] + (1 + chebyshev_nodes(terms)) / 2) / intervals * self._max_kappa
             vander = chebyshev_polynomials(position(at.ravel(), self._max_kappa), self._nodes)
             values = (vander @ coefficients).reshape(*at.shape, -1)
-            interval, t = place(kappas, self._max_kappa, intervals)
+            interval, t = locate(kappas, self._max_kappa, intervals)
             weights = t[:, None] ** np.arange(terms) @ to_polynomial(terms)
-            # One κ after the other: all at once would take more memory than the table.
+            # For one κ after the other, as all at once would take more memory than the table.
             error = max(np.abs(w @ values[k] - e).sum() for k, w, e in zip(interval, weights, exact, strict=True))
             if error <= allowed:
                 return intervals
             intervals = max(intervals + 1, int(intervals * min(2.0, 0.95 * (error / allowed) ** (1 / terms))))
 
     def _measured(self, table: SliceTable | AmplitudeTable) -> float:
-        """Return the largest error of S over held-out κ: both ends, and others between, four to an oscillation."""
+        """Return the largest error of S over held-out κ: both ends, and others between, four per oscillation."""
         count = 12 + int(np.ceil(2 * self._x))
         golden = (np.sqrt(5) - 1) / 2
         held_out = self._max_kappa * np.concatenate([[0.0, 1.0], np.sqrt((np.arange(1, count) * golden) % 1)])
         max_error, report = 0.0, self._phase(0.8, 1.0)
         for number, kappa in enumerate(held_out, 1):
-            # NaN is the largest.
+            # np.maximum keeps NaN.
             max_error = float(np.maximum(max_error, self._exact.error(self.kept, table.powers(kappa), kappa)))
             report(number, len(held_out))
         return max_error
 
 
 def _terms_needed(kind: str, heights: NDArray[np.float64], max_kappa: float, allowed: float) -> int:
-    """Return how many terms keep Σ|Δη_m| at κ_max, where the remainder is largest.
+    """Return the number of terms that keeps Σ|Δη_m| within the allowed error at κ_max, where the remainder is largest.
 
     With ΔF the amplitudes of the remainder, Σ|Δη| ≤ 2‖ΔF‖ + ‖ΔF‖², and ‖ΔF‖² is its mean square over the tile.
     """
@@ -373,15 +376,15 @@ def _terms_needed(kind: str, heights: NDArray[np.float64], max_kappa: float, all
     weights, remainder = series_weights(kind, limit, x), np.exp(1j * x * u)
     for n in range(limit):
         size = np.sqrt(np.mean(np.abs(remainder) ** 2))
-        if n and size * (2 + size) <= _MARGIN * (1 - _TRUNCATED_SHARE) * allowed:
+        if n and size * (2 + size) <= _SAFETY_FRACTION * (1 - _TRUNCATION_FRACTION) * allowed:
             return n
         remainder -= weights[n] * series_function(kind, n, u)
-    # Rounding errors of double precision are above it.
+    # Rounding errors of double precision exceed the allowed error.
     return limit
 
 
-def _rim(profile: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the sum of a profile over −M…M outside of each |m|: (M + 1,)."""
+def _outer_sums(profile: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the sums of a profile over −M…M outside each |m|: (M + 1,)."""
     half = len(profile) // 2
     folded = profile[half:] + profile[half::-1]
     folded[0] /= 2
@@ -389,12 +392,12 @@ def _rim(profile: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 class _TooLargeError(RequestError):
-    """A table would need too much memory, or a lattice take longer to read than the orders."""
+    """A table that would need too much memory, or a lattice that would take longer to read than the orders."""
 
 
 def _check_size(shape: tuple[int, int], floats: int) -> None:
-    """Refuse a table of so many floats a node before memory is asked for it."""
-    if 4.0 * np.prod(shape, dtype=float) * floats > _LARGEST_TABLE:
+    """Refuse a table of `floats` numbers per node before its memory is allocated."""
+    if 4.0 * np.prod(shape, dtype=float) * floats > _MAX_TABLE_BYTES:
         raise _TooLargeError(
             f"tolerance: needs {' × '.join(map(str, shape))} frequencies of {floats} numbers, more than a table of "
             "4 GB; take a larger tolerance, a smaller patch or, of a sample, a shorter coherence length"
@@ -405,7 +408,7 @@ def _check_resolution(height_field: HeightField, max_frequency: float) -> None:
     for axis, size, count in zip("xy", height_field.pixel_size, height_field.shape[::-1], strict=True):
         if count > 1 and 1 / (2 * size) < max_frequency * (1 - 1e-9):
             warnings.warn(
-                f"pixels of {size * 1e3:.4g} nm along {axis} hold no frequency beyond {1 / (2 * size):.3g} cycles/µm, "
-                f"but light reaches {max_frequency:.3g}: what lies between is missing",
+                f"pixels of {size * 1e3:.4g} nm along {axis} resolve frequencies up to {1 / (2 * size):.3g} cycles/µm, "
+                f"but light reaches {max_frequency:.3g}: those between are missing",
                 stacklevel=5,
             )

@@ -24,18 +24,18 @@ _silencing = threading.Lock()
 
 @contextlib.contextmanager
 def silence() -> Iterator[None]:
-    """Silence the library's own messages about a broken file, from Python and from C."""
+    """Silence the messages of the OpenEXR library about a damaged file, from Python and from C."""
     with _silencing:
         sys.stderr.flush()
-        kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+        saved, null = os.dup(2), os.open(os.devnull, os.O_WRONLY)
         try:
-            os.dup2(nowhere, 2)
+            os.dup2(null, 2)
             with contextlib.redirect_stdout(io.StringIO()):
                 yield
         finally:
-            os.dup2(kept, 2)
-            os.close(kept)
-            os.close(nowhere)
+            os.dup2(saved, 2)
+            os.close(saved)
+            os.close(null)
 
 
 def doubles(*values: float) -> np.ndarray:
@@ -74,7 +74,7 @@ def read(path: Path, kind: str, version: int, recipe: str | None) -> tuple[dict[
     try:
         intact = is_intact(path)
         if intact is False:
-            # Before OpenEXR sees it: a size that is wrong could take all memory.
+            # Checked before OpenEXR reads it: a wrong size in the header could exhaust memory.
             raise RequestError("damaged: its bytes are not those that were written")
         with silence():
             file = OpenEXR.File(str(path), separate_channels=True)

@@ -1,4 +1,4 @@
-"""Where a spectrum has its nodes: the diffraction orders of a tile, or a lattice of B-splines without sharp lines."""
+"""The nodes of a spectrum: the diffraction orders of a tile, or a lattice of B-splines for a smooth spectrum."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class LobeAxis:
     Attributes:
         count: number of lobes that contribute at one q.
         half_width: |q − m/T| up to which the order m contributes, cycles/µm; infinite if all contribute everywhere.
-        inside: the share of the Gaussian within `half_width`, by which it is divided.
+        inside: the fraction of the Gaussian within `half_width`, by which the lobe is divided.
     """
 
     count: int
@@ -69,7 +69,7 @@ class OrderGrid(_Rectangle):
     def reachable(cls, tile_size: tuple[float, float], pixels: tuple[int, int], max_frequency: float) -> OrderGrid:
         """Return the orders up to `max_frequency`, the largest |q| that a pair of directions reaches, in cycles/µm.
 
-        There is nothing beyond the Nyquist order N/2 of the `pixels`, (N_x, N_y).
+        No orders exceed the Nyquist order N/2 of the `pixels`, (N_x, N_y).
         """
         max_order = tuple(min(int(np.floor(t * max_frequency)), n // 2) for t, n in zip(tile_size, pixels, strict=True))
         return cls(tile_size, max_order)
@@ -85,7 +85,7 @@ class OrderGrid(_Rectangle):
     def take(self, powers: NDArray, half: float = 0.5) -> NDArray:
         """Select the kept orders, in the order of `axes`, from the powers of all, (N_y, N_x), as of `scipy.fft.fft2`.
 
-        The Nyquist order of an even N has no sign: each gets `half` of it, of amplitudes √½.
+        The Nyquist order of an even N has no sign: both signs get the factor `half`, for amplitudes √½.
         """
         m_x, m_y = self.axes()
         taken = powers[np.ix_(m_y % powers.shape[0], m_x % powers.shape[1])]
@@ -96,9 +96,9 @@ class OrderGrid(_Rectangle):
     def around(
         self, q: NDArray[np.float64], lobe_width: float, cutoff_sigmas: float
     ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]]:
-        """Yield the orders whose lobes hold q (..., 2): row, column and N(q − m/T; σ_q² I), one neighbour at a time.
+        """Yield the orders whose lobes contain q (..., 2): row, column and N(q − m/T; σ_q² I), one neighbour at a time.
 
-        The lobe is cut off as `lobes` says and scaled to the integral one; it is 0 beyond, and beyond the grid.
+        The lobe is truncated by `lobes` and scaled to the integral one; it is 0 outside, and outside the grid.
         """
         tile, max_order = np.array(self.tile_size), np.array(self.max_order)
         lobes = self.lobes(lobe_width, cutoff_sigmas)
@@ -136,8 +136,8 @@ class OrderGrid(_Rectangle):
 class SplineGrid(_Rectangle):
     """S(q; κ) = Σ_m c_m(κ) B(q_x/Δ_x − m_x) B(q_y/Δ_y − m_y)/(Δ_x Δ_y), B the centred quadratic B-spline, ∫B = 1.
 
-    B(x) = ¾ − x² for |x| ≤ ½, ½(3/2 − |x|)² for ½ ≤ |x| ≤ 3/2, else 0. Three by three nodes hold at any q. Beyond the
-    Nyquist limit S is zero; the nodes there serve the splines that reach back inside.
+    B(x) = ¾ − x² for |x| ≤ ½, ½(3/2 − |x|)² for ½ ≤ |x| ≤ 3/2, else 0. Three by three nodes contribute at any q. S is
+    zero outside the Nyquist limit; the nodes there belong to splines that overlap the inside.
 
     Attributes:
         spacing: (Δ_x, Δ_y) in cycles/µm.
@@ -167,12 +167,12 @@ class SplineGrid(_Rectangle):
     def around(
         self, q: NDArray[np.float64]
     ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]]:
-        """Yield the nodes about q (..., 2): row, column and weight, one of nine at a time; weight 0 beyond the grid."""
-        place = q / np.array(self.spacing)
-        nearest = np.rint(place).astype(np.int64)
-        weights = spline_weights(place - nearest)
+        """Yield the nodes about q (..., 2): row, column and weight, one of nine at a time; 0 outside the grid."""
+        position = q / np.array(self.spacing)
+        nearest = np.rint(position).astype(np.int64)
+        weights = spline_weights(position - nearest)
         area = self.spacing[0] * self.spacing[1]
-        # Rounding in the q of the caller must not cut off the limit itself.
+        # Rounding of the caller's q must not exclude the limit itself.
         inside = (np.abs(q) <= np.array(self.limit) * (1 + 1e-12)).all(axis=-1)
         for i, j in np.ndindex(3, 3):
             m = nearest + (np.array([i, j]) - 1)
@@ -180,10 +180,10 @@ class SplineGrid(_Rectangle):
             column, row = np.moveaxis(np.where(kept[..., None], m + self.max_order, 0), -1, 0)
             yield row, column, np.where(kept, weights[i][..., 0] * weights[j][..., 1] / area, 0)
 
-    def within(self, coefficients: NDArray[np.float64], reached: tuple[float, float]) -> float:
-        """Compute ∫ Σ c B B/(Δ_x Δ_y) over |q_x| and |q_y| up to `reached` (cycles/µm)."""
+    def within(self, coefficients: NDArray[np.float64], max_q: tuple[float, float]) -> float:
+        """Compute ∫ Σ c B B/(Δ_x Δ_y) over |q_x| and |q_y| up to `max_q` (cycles/µm)."""
         inside = []
-        for m, spacing, end in zip(self.axes(), self.spacing, reached, strict=True):
+        for m, spacing, end in zip(self.axes(), self.spacing, max_q, strict=True):
             inside.append(spline_integral(end / spacing - m) - spline_integral(-end / spacing - m))
         return float(inside[1] @ coefficients @ inside[0])
 
@@ -193,16 +193,16 @@ class SplineGrid(_Rectangle):
         coefficients: NDArray[np.float32],
         exact: NDArray[np.float64],
         shift: NDArray[np.float64],
-        reached: tuple[float, float],
+        max_q: tuple[float, float],
     ) -> float:
-        """Compute ∫|S_approx − S_exact| dq up to `reached`, by the rectangle rule on the lattice shifted by `shift` Δ.
+        """Compute ∫|S_approx − S_exact| dq up to `max_q`, by the rectangle rule on the lattice shifted by `shift` Δ.
 
         Args:
             kept: the smaller grid of the approximation.
             coefficients: c_m on it; zero outside.
             exact: S Δ_x Δ_y on the shifted lattice, of the shape of this grid.
             shift: (x, y), each within ±½.
-            reached: (x, y) in cycles/µm.
+            max_q: (x, y) in cycles/µm.
         """
         weights_x, weights_y = (np.array(spline_weights(s)) for s in shift)
         approximate = np.zeros(self.shape)
@@ -211,7 +211,7 @@ class SplineGrid(_Rectangle):
         approximate = scipy.ndimage.correlate1d(approximate, weights_y, axis=0, mode="constant")
         inside_x, inside_y = (
             np.abs(m + s) * spacing <= end
-            for m, spacing, s, end in zip(self.axes(), self.spacing, shift, reached, strict=True)
+            for m, spacing, s, end in zip(self.axes(), self.spacing, shift, max_q, strict=True)
         )
         return float(inside_y @ np.abs(np.maximum(approximate, 0) - exact) @ inside_x)
 

@@ -15,30 +15,30 @@ from ..settings import Settings, lobe_cutoff, lobe_width, matching
 from .grids import LobeAxis, OrderGrid, SplineGrid
 from .tables import AmplitudeTable, SliceTable
 
-# The part of the tolerance that is spent on the tails of the lobes.
-TAIL_SHARE = 0.4
+TAIL_FRACTION = 0.4  # of the tolerance, for the truncated tails of the lobes
 
 
 @dataclass(frozen=True, eq=False)
 class PowerSpectrum:
-    """S(q; κ): Σ_m η_m(κ) N(q − m/T; σ_q² I) of a tile, or, of a sample and where many lobes overlap, B-splines.
+    """S(q; κ): Σ_m η_m(κ) N(q − m/T; σ_q² I) for a tile; B-splines for a sample, and where many lobes overlap.
 
     Attributes:
         table: η_m(κ), or the coefficients of the splines.
-        grid: the diffraction orders m, or the nodes, that are kept.
-        settings: the parameters that it was built with; of a sample the coherence length is at most what the scan
-            supports, and the tolerance is a number.
+        grid: the diffraction orders m, or the nodes of the splines, that are kept.
+        settings: the parameters it was built with. The coherence length of a sample is at most what the scan supports,
+            and the tolerance is a number.
         pixel_size: (x, y) of the height field, µm.
         height_range: of the height field, µm.
-        error: the measured one: max over κ of ∫|S_approx − S_exact| dq over the frequencies that light can reach.
+        error: the measured maximum over κ of ∫|S_approx − S_exact| dq over the frequencies that light can reach.
         source: origin of the heights.
         source_digest: SHA-256 of the height field.
-        truncated_power: the largest share of the power, over κ, at weak frequencies that are left out; part of `error`.
-        unresolved_power: the largest share of the power, over κ, at frequencies that no pair of directions reaches, or
-            that the pixels do not resolve.
-        patches: number of draws of an irregular surface that are averaged.
-        standard_error: of a sample, ∫ of the standard error of Welch's estimate over q at the worst κ, a share of the
-            reflected power that is comparable to `error`; None of a tile, which is known exactly.
+        truncated_power: the largest fraction of the power, over κ, at weak frequencies that are left out; part of
+            `error`.
+        unresolved_power: the largest fraction of the power, over κ, at frequencies that no pair of directions reaches,
+            or that the pixels do not resolve.
+        patches: number of random patches of an irregular surface that are averaged.
+        standard_error: for a sample, the maximum over κ of ∫ dq of the standard error of Welch's estimate, a fraction
+            of the reflected power, comparable to `error`; None for a tile, which is known exactly.
     """
 
     table: SliceTable | AmplitudeTable
@@ -62,12 +62,12 @@ class PowerSpectrum:
         if not (np.isfinite(self.height_range) and self.height_range >= 0):
             raise RequestError(f"height_range: got {self.height_range}, wanted a length ≥ 0 in µm")
         if not 0 <= self.error < np.inf:
-            raise RequestError(f"error: got {self.error}, wanted a share of the power")
+            raise RequestError(f"error: got {self.error}, wanted a fraction of the power")
         if not (isinstance(self.source, str) and isinstance(self.source_digest, str)):
             raise RequestError(f"source: got {self.source!r}, {self.source_digest!r}, wanted texts")
         if not (0 <= self.truncated_power <= 1 and 0 <= self.unresolved_power <= 1):
-            shares = f"{self.truncated_power}, {self.unresolved_power}"
-            raise RequestError(f"truncated_power, unresolved_power: got {shares}, wanted shares of the power")
+            got = f"{self.truncated_power}, {self.unresolved_power}"
+            raise RequestError(f"truncated_power, unresolved_power: got {got}, wanted fractions of the power")
         if not (isinstance(self.patches, int) and self.patches >= 1):
             raise RequestError(f"patches: got {self.patches!r}, wanted a whole number of at least 1")
         found = self.standard_error
@@ -76,7 +76,7 @@ class PowerSpectrum:
 
     @property
     def extent(self) -> str:
-        """ "tile": the patch repeats for ever; "sample": it is a piece of a larger, irregular surface."""
+        """ "tile": the patch repeats periodically; "sample": it is a piece of a larger, irregular surface."""
         return self.settings.extent
 
     @property
@@ -86,12 +86,12 @@ class PowerSpectrum:
 
     @property
     def wavelengths(self) -> tuple[float, float]:
-        """(shortest, longest) in nm for which the table holds."""
+        """(shortest, longest) in nm for which the table is valid."""
         return self.settings.wavelengths
 
     @property
     def largest_angle(self) -> float:
-        """Degrees from the normal, of both directions, for which the table holds."""
+        """Degrees from the normal, of both directions, for which the table is valid."""
         return self.settings.largest_angle
 
     @property
@@ -116,8 +116,8 @@ class PowerSpectrum:
 
     @property
     def cutoff_sigmas(self) -> float:
-        """The least truncation of the lobes of orders, in standard deviations σ_q."""
-        return lobe_cutoff(TAIL_SHARE * self.tolerance)
+        """The smallest half width of a truncated lobe, in standard deviations σ_q."""
+        return lobe_cutoff(TAIL_FRACTION * self.tolerance)
 
     @property
     def lobes(self) -> tuple[LobeAxis, LobeAxis]:
@@ -137,12 +137,12 @@ class PowerSpectrum:
         return self.table.nbytes / 1e6
 
     def powers(self, kappa: float) -> NDArray[np.float32]:
-        """Return the share of the reflected power of each node, (2 M_y + 1, 2 M_x + 1), in float32 as a renderer does.
+        """Return the fraction of the reflected power of each node, (2 M_y + 1, 2 M_x + 1), in float32 as in rendering.
 
-        Of orders, η_m(κ). Shares may be below zero: by the error, and as coefficients of splines.
+        For orders this is η_m(κ). Values may be negative, by the error, and as coefficients of splines.
 
         Raises:
-            ValueError: if κ (rad/µm) is outside of what the table holds.
+            ValueError: if κ (rad/µm) is outside the range of the table.
         """
         return self.table.powers(float(self._checked(np.asarray(kappa, np.float64))))
 
@@ -157,7 +157,7 @@ class PowerSpectrum:
             (...) µm².
 
         Raises:
-            ValueError: if shapes do not match or κ is outside of what the table holds.
+            ValueError: if shapes do not match or κ is outside the range of the table.
         """
         q, kappa = matching(q, kappa)
         self._checked(kappa)
@@ -166,7 +166,7 @@ class PowerSpectrum:
         around = grid.around(q, self.lobe_width, self.cutoff_sigmas) if isinstance(grid, OrderGrid) else grid.around(q)
         for row, column, weight in around:
             result += weight * self.table.powers_at(row, column, kappa)
-        # Interpolation may dip below zero by its error.
+        # Interpolation may be negative within its error.
         return np.maximum(result, 0)
 
     def _checked(self, kappa: NDArray[np.float64]) -> NDArray[np.float64]:

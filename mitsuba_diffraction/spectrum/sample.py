@@ -4,7 +4,7 @@ Its power spectrum is estimated from windowed segments,
 
     S(q; κ) = (d_x d_y/P) Σ_p |Σ_n a(x_n − x_p) e^{iκh_n} e^{−2πi q·x_n}|² / Σ_n a²            [µm²]
 
-averaged over P positions x_p; d is the pixel size. No window extends beyond the edge or wraps around.
+averaged over P positions x_p; d is the pixel size. All windows lie inside the scan, without wrapping around.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from .grids import OrderGrid, SplineGrid
 
 # Windows are truncated at ±3 σ_s, where their amplitude is e^{−9/2}, 1 %.
 _SUPPORT = 6.0
-# Windows of three quarters of the scan leave room for three positions along each axis, σ_s apart.
-_LARGEST = 0.5
-_FEWEST_PIXELS = 4
-# Segments are transformed in batches of about this many numbers.
-_BATCH = 1 << 17
+# Largest coherence length relative to the scan: the window is then three quarters of the scan, with three positions σ_s
+# apart along each axis.
+_MAX_COHERENCE_FRACTION = 0.5
+_MIN_PIXELS = 4
+_MAX_BATCH_SIZE = 1 << 17  # numbers that are transformed at once
 
 
 class WindowAxis(NamedTuple):
-    """The windows along one axis: a sampled at the pixels, (W,), Σ a² = 1, and the first pixel of each position."""
+    """The window along one axis, a at the pixels, (W,), Σ a² = 1, and its positions: the first pixel of each, (P,)."""
 
     window: NDArray[np.float64]
     starts: NDArray[np.int64]
@@ -40,22 +40,22 @@ class WindowAxis(NamedTuple):
 UNIFORM = WindowAxis(np.ones(1), np.zeros(1, np.int64))  # the window along an axis of one pixel
 
 
-def effective_coherence_length(height_field: HeightField, asked: float) -> float:
-    """Return the coherence length in µm that a scan supports: `asked`, but at most half of its shorter side.
+def effective_coherence_length(height_field: HeightField, requested: float) -> float:
+    """Return the coherence length in µm that a scan supports: `requested`, but at most half of its shorter side.
 
     An axis of one pixel imposes no limit: the surface is uniform along it.
 
     Raises:
         ValueError: if it is below four pixels, too short for a window.
     """
-    lobe_width(asked)
+    lobe_width(requested)
     axes = list(zip(height_field.tile_size, height_field.pixel_size, height_field.shape[::-1], strict=True))
-    effective = min([float(asked), *(_LARGEST * size for size, _, count in axes if count > 1)])
+    effective = min([float(requested), *(_MAX_COHERENCE_FRACTION * size for size, _, count in axes if count > 1)])
     for _, pixel, count in axes:
-        if count > 1 and effective < _FEWEST_PIXELS * pixel * (1 - 1e-9):
+        if count > 1 and effective < _MIN_PIXELS * pixel * (1 - 1e-9):
             raise RequestError(
-                f"coherence_length: got {asked:g} µm, of which the scan of {axes[0][0]:.4g} × {axes[1][0]:.4g} µm "
-                f"carries {effective:.4g}; wanted at least {_FEWEST_PIXELS} pixels ({_FEWEST_PIXELS * pixel:.4g} µm)"
+                f"coherence_length: got {requested:g} µm, of which the scan of {axes[0][0]:.4g} × {axes[1][0]:.4g} µm "
+                f"supports {effective:.4g}; wanted at least {_MIN_PIXELS} pixels ({_MIN_PIXELS * pixel:.4g} µm)"
             )
     return effective
 
@@ -81,21 +81,21 @@ def mean_periodogram(
     """
     window = np.outer(y.window, x.window)
     segments = np.lib.stride_tricks.sliding_window_view(wave, window.shape)
-    places = np.array([(row, column) for row in y.starts for column in x.starts])
-    total, step = np.zeros(shape), max(1, _BATCH // (shape[0] * shape[1]))
-    for first in range(0, len(places), step):
-        row, column = places[first : first + step].T
+    positions = np.array([(row, column) for row in y.starts for column in x.starts])
+    total, step = np.zeros(shape), max(1, _MAX_BATCH_SIZE // (shape[0] * shape[1]))
+    for first in range(0, len(positions), step):
+        row, column = positions[first : first + step].T
         transform = scipy.fft.fft2(segments[row, column] * window, shape, overwrite_x=True, workers=2)
         total += (transform.real**2 + transform.imag**2).sum(axis=0)
-    return total / len(places)
+    return total / len(positions)
 
 
 def _axis(count: int, pixel: float, sigma: float) -> WindowAxis:
-    width = min(count, max(_FEWEST_PIXELS, _rounded_up(_SUPPORT * sigma / pixel)))
+    width = min(count, max(_MIN_PIXELS, _rounded_up(_SUPPORT * sigma / pixel)))
     x = (np.arange(width) - (width - 1) / 2) * pixel
     window = np.exp(-(x**2) / (2 * sigma**2))
-    places = _rounded_up((count - width) * pixel / sigma) + 1
-    return WindowAxis(window / np.linalg.norm(window), np.rint(np.linspace(0, count - width, places)).astype(np.int64))
+    positions = np.rint(np.linspace(0, count - width, _rounded_up((count - width) * pixel / sigma) + 1))
+    return WindowAxis(window / np.linalg.norm(window), positions.astype(np.int64))
 
 
 def _rounded_up(value: float) -> int:
@@ -103,12 +103,11 @@ def _rounded_up(value: float) -> int:
     return int(np.ceil(value * (1 - 1e-9)))
 
 
-# Along an axis on which the surface is uniform the lobe is followed to this many σ_q.
-_UNIFORM_SIGMAS = 6.0
+_UNIFORM_SIGMAS = 6.0  # half width of the lobe along an axis on which the surface is uniform, in σ_q
 
 
 class _Lags:
-    """One axis: the lags τ of the autocorrelation, and the frequency lattice that its transform falls on."""
+    """One axis: the lags τ of the autocorrelation, and the frequency lattice of its transform."""
 
     def __init__(
         self, axis: WindowAxis | None, pixel: float, coherence_length: float, spacing: float, max_frequency: float
@@ -124,15 +123,15 @@ class _Lags:
         self.count = scipy.fft.next_fast_len(max(int(np.ceil(1 / (spacing * pixel))), 2 * lags + 1), real=True)
         self.spacing = 1 / (self.count * pixel)
         self.limit = np.inf if axis is None else 1 / (2 * pixel)
-        self.reached = min(max_frequency, self.limit)
-        # Three nodes hold at the last frequency, too. Beyond the Nyquist limit S repeats.
-        self.max_order = int(np.rint(self.reached / self.spacing)) + 1
+        self.max_q = min(max_frequency, self.limit)
+        # At the last frequency, too, three nodes contribute.
+        self.max_order = int(np.rint(self.max_q / self.spacing)) + 1
         self.lags = np.arange(-lags, lags + 1)
         self.pixel = pixel
-        # The transform of B, and of Σ_k B(x − k) times itself: dividing projects on the splines in the least squares.
+        # The least-squares projection on splines: the transform of B over that of its autocorrelation at integers.
         x = self.lags / self.count
         self.projection = np.sinc(x) ** 3 * 60 / (33 + 26 * np.cos(2 * np.pi * x) + np.cos(4 * np.pi * x))
-        # Of a uniform axis, the autocorrelation of the window itself.
+        # The autocorrelation of the window, for a uniform axis.
         tau = self.lags * pixel
         self.uniform = np.exp(-(tau**2) / (4 * (coherence_length / 4) ** 2))
 
@@ -140,8 +139,8 @@ class _Lags:
 class SamplePowers:
     """The B-spline coefficients c_m(κ) of S(q; κ).
 
-    S is band-limited: it is the transform of an autocorrelation that ends at the windows' width. So the coefficients
-    come from one transform of it, and S itself can be had at any other lattice exactly, which measures their error.
+    S is band-limited: it is the transform of an autocorrelation that is zero beyond the width of the window. One
+    transform gives the coefficients, and another S itself on any other lattice, from which their error follows.
 
     Attributes:
         grid: all nodes whose splines overlap the frequencies that light reaches and the pixels resolve.
@@ -158,11 +157,11 @@ class SamplePowers:
         ]
         x, y = self._lags
         self.grid = SplineGrid((x.spacing, y.spacing), (x.max_order, y.max_order), (x.limit, y.limit))
-        self._reached = x.reached, y.reached
+        self._max_q = x.max_q, y.max_q
         self._random = np.random.default_rng(0)
 
     def _autocorrelation(self, kappa: float) -> NDArray[np.complex128]:
-        """Compute ρ(τ) of the windowed phase, averaged over the places: (lags τ_y, lags τ_x ≥ 0); ρ(0) = 1."""
+        """Compute ρ(τ) of the windowed phase, averaged over positions: (lags τ_y, lags τ_x ≥ 0); ρ(0) = 1."""
         axis_x, axis_y = (lags.axis or UNIFORM for lags in self._lags)
         width, height = len(axis_x.window), len(axis_y.window)
         # Padded with zeros, so that the lags do not wrap around.
@@ -171,7 +170,7 @@ class SamplePowers:
         half = np.conj(scipy.fft.rfft2(power, norm="forward"))
         half = half[np.arange(-height + 1, height) % shape[0], :width]
         x, y = self._lags
-        # Along a uniform axis the only row, or column, is drawn out by the window's own autocorrelation.
+        # Along a uniform axis the single row or column is extended by the autocorrelation of the window.
         if y.axis is None:
             half = half * y.uniform[:, None]
         if x.axis is None:
@@ -179,7 +178,7 @@ class SamplePowers:
         return half
 
     def _transform(self, half: NDArray[np.complex128]) -> NDArray[np.float64]:
-        """Transform from lags to the nodes of the grid, times the area of a cell: shares of the power."""
+        """Transform from lags to the nodes of the grid, times Δ_x Δ_y: fractions of the power."""
         x, y = self._lags
         padded = np.zeros((y.count, x.count // 2 + 1), np.complex128)
         padded[y.lags % y.count, : half.shape[1]] = half
@@ -193,26 +192,26 @@ class SamplePowers:
         return self._transform(self._autocorrelation(kappa) * y.projection[:, None] * x.projection[x.lags >= 0])
 
     def reached(self, powers: NDArray[np.float64]) -> float:
-        """Return the share of the power at frequencies that light reaches and pixels resolve; takes c_m of the grid."""
-        return self.grid.within(powers, self._reached)
+        """Return the fraction of the power at frequencies that light reaches and pixels resolve, from c_m."""
+        return self.grid.within(powers, self._max_q)
 
     def error(self, kept: OrderGrid | SplineGrid, powers: NDArray[np.float32], kappa: float) -> float:
-        """Return ∫|S_approx − S_exact| dq where light reaches; arguments as of `TilePowers.error`."""
+        """Return ∫|S_approx − S_exact| dq over the frequencies that light reaches; arguments of `TilePowers.error`."""
         shift = self._random.uniform(-0.5, 0.5, 2)
         ramp = [np.exp(-2j * np.pi * s * lags.lags / lags.count) for s, lags in zip(shift, self._lags, strict=True)]
         exact = self._transform(self._autocorrelation(kappa) * ramp[1][:, None] * ramp[0][self._lags[0].lags >= 0])
-        return self.grid.error(kept, powers, exact, shift, self._reached)
+        return self.grid.error(kept, powers, exact, shift, self._max_q)
 
 
-# Correlation of a surface beyond the width of a window is seen between batches of segments, not between segments.
-_BATCHES = 4  # along each axis
-_KAPPAS = 4
+# Batches of segments, unlike segments, reveal correlation of a surface over more than the width of a window.
+_BATCH_COUNT = 4  # along each axis
+_KAPPA_COUNT = 4
 
 
 def standard_error(
     height_field: HeightField, *, coherence_length: float, max_kappa: float, max_frequency: float
 ) -> float:
-    """Return ∫ of the standard error of S(q; κ) over q, at the worst of four κ: a share of the reflected power.
+    """Return ∫ dq of the standard error of S(q; κ), a fraction of the reflected power; the maximum over four κ.
 
     Welch's estimate Ŝ is the mean of P periodograms S_p. Those of overlapping windows are correlated; where the
     phase is that of many independent features (Welch 1967, eq. 10 and 11; a is the window, Σ a² = 1),
@@ -220,12 +219,13 @@ def standard_error(
         ρ_ij = (Σ_n a(x_n − x_i) a(x_n − x_j))²,     var Ŝ(q) = σ²(q)/P_eff,     1/P_eff = Σ_ij ρ_ij/P²,
 
     with σ² the variance of one periodogram. It follows from the scatter of the means S_b of at most four batches of
-    neighbouring places along each axis, ⟨·⟩ weighted by their places, r_b the mean of ρ within batch b:
+    neighbouring positions along each axis; ⟨·⟩ is weighted by their number, r_b is the mean of ρ within batch b:
 
         ⟨(S_b − Ŝ)²⟩ = σ² (⟨r_b⟩ − 1/P_eff).
 
     The variance is averaged over three by three frequencies 1/6σ_s apart, about one lobe, before its root is taken.
-    As `GratingSpectrum.error`, it is compared with ∫|ΔS| dq; of normal errors that is √(2/π) = 0.8 of it.
+    For normally distributed errors the mean of ∫|ΔS| dq, the measure of `GratingSpectrum.error`, is √(2/π) = 0.8 of
+    it.
 
     Args:
         height_field: the scan.
@@ -236,9 +236,9 @@ def standard_error(
     axes = [axis or UNIFORM for axis in window_axes(height_field, coherence_length)]
     correlation, within = 1.0, 1.0
     for axis in axes:
-        rho, share = _correlation(axis), _batches(axis)
+        rho = _correlation(axis)
         correlation *= rho.mean()
-        within *= sum(rho[np.ix_(batch, batch)].sum() / len(batch) for batch in share) / len(axis.starts)
+        within *= sum(rho[np.ix_(batch, batch)].sum() / len(batch) for batch in _batches(axis)) / len(axis.starts)
     if within - correlation < 1e-12:
         return 0.0  # a single pixel
     inside = [
@@ -248,7 +248,7 @@ def standard_error(
         for axis, pixel in zip(axes, height_field.pixel_size, strict=True)
     ]
     errors = []
-    for kappa in max_kappa * np.arange(1, _KAPPAS + 1) / _KAPPAS:
+    for kappa in max_kappa * np.arange(1, _KAPPA_COUNT + 1) / _KAPPA_COUNT:
         variance = (
             _batch_variance(np.exp(1j * kappa * height_field.centred), axes) * correlation / (within - correlation)
         )
@@ -258,7 +258,7 @@ def standard_error(
 
 
 def _correlation(axis: WindowAxis) -> NDArray[np.float64]:
-    """Compute ρ of the places along one axis, (P, P)."""
+    """Compute ρ_ij of the positions along one axis, (P, P)."""
     width = len(axis.window)
     overlap = np.correlate(axis.window, axis.window, "full")[width - 1 :]
     distance = np.abs(axis.starts[:, None] - axis.starts)
@@ -266,12 +266,12 @@ def _correlation(axis: WindowAxis) -> NDArray[np.float64]:
 
 
 def _batches(axis: WindowAxis) -> list[NDArray[np.int64]]:
-    places = np.arange(len(axis.starts))
-    return np.array_split(places, min(_BATCHES, len(places)))
+    positions = np.arange(len(axis.starts))
+    return np.array_split(positions, min(_BATCH_COUNT, len(positions)))
 
 
 def _batch_variance(wave: NDArray[np.complex128], axes: list[WindowAxis]) -> NDArray[np.float64]:
-    """Compute ⟨(S_b − Ŝ)²⟩ at the frequencies of the window's own transform, shares of the power: (W_y, W_x)."""
+    """Compute ⟨(S_b − Ŝ)²⟩ at the frequencies of the transform of the window, (W_y, W_x), S times Δ_x Δ_y."""
     x, y = axes
     shape = len(y.window), len(x.window)
     means, weights = [], []

@@ -40,13 +40,13 @@ def chebyshev_transform(count: int) -> NDArray[np.float64]:
 
 
 def nodes_for(x: float, tolerance: float) -> int:
-    """Return how many Chebyshev nodes resolve e^{ixt} on −1 ≤ t ≤ 1 to `tolerance`.
+    """Return the number of Chebyshev nodes that resolves e^{ixt} on −1 ≤ t ≤ 1 to `tolerance`.
 
     Jacobi–Anger: the coefficient of T_n is 2 iⁿ J_n(x), and |J_n(x)| ≤ (x/2)ⁿ/n!.
     """
     if x == 0:
         return 1
-    # In logarithms: the bound itself grows to e^{x/2} before it falls, which no float holds beyond x = 1400.
+    # In logarithms, as the bound grows to e^{x/2} before it falls, which overflows for x > 1400.
     count, bound = 1, np.log(4 / tolerance)
     while bound > 0 or count < x / 2:
         bound += np.log(x) - np.log(2 * count)
@@ -59,9 +59,9 @@ class SliceTable:
     """c_m as a polynomial on each of K equal intervals of 0 ≤ κ ≤ κ_max, through its values at Chebyshev points.
 
     c_m(κ) = Σ_jl F*… e^{iκ(h_j − h_l)} is band-limited: its fastest oscillation in κ has the angular frequency R, the
-    height range. A cubic through Chebyshev points of an interval Δκ errs by at most (RΔκ)⁴/3072 of its amplitude, a
-    parabola by (RΔκ)³/192, so about 1.3 and 0.6 rad per interval keep 1e-3; deep surfaces need more intervals but lose
-    no digits.
+    height range. On an interval Δκ the error of a cubic through Chebyshev points is at most (RΔκ)⁴/3072 of the
+    amplitude, that of a parabola (RΔκ)³/192, so that intervals of about 1.3 and 0.6 rad keep 1e-3. Deep surfaces need
+    more intervals but lose no digits.
 
     Attributes:
         max_kappa: κ_max in rad/µm.
@@ -94,10 +94,10 @@ class SliceTable:
         rounded: Callable[[NDArray[np.float32]], NDArray[np.float32]],
         progress: Callable[[int, int], None],
     ) -> SliceTable:
-        """Build from c_m = powers(κ) at one κ after the other, to hold little more than the result in memory.
+        """Build from c_m = powers(κ), one κ after the other, so that memory holds little more than the result.
 
-        `rounded` gives the values (K, terms, ...) as they are read, `packed` or `halved`; an interval with values too
-        large for it stays as it is.
+        `rounded` rounds values (K, terms, ...) to a number format (`packed`, `halved`); an interval with values too
+        large for the format is not rounded.
         """
         values, nodes, polynomial = None, chebyshev_nodes(terms), to_polynomial(terms)
         for interval, node in np.ndindex(intervals, terms):
@@ -134,7 +134,7 @@ class SliceTable:
     def words_per_node(self) -> int:
         """Words of 32 bits that a renderer reads of a node at one κ: 1 if `packed`, 2 if `halved`, else 4."""
         for terms, words, rounded in ((3, 1, packed), (4, 2, halved)):
-            # One interval after the other: all at once would take several times the memory of the table.
+            # For one interval after the other, as all at once would take several times the memory of the table.
             if self.terms == terms and all(np.array_equal(rounded(v), v) for v in self.values[:, None]):
                 return words
         return 4
@@ -146,7 +146,7 @@ class SliceTable:
 
     def powers(self, kappa: float) -> NDArray[np.float32]:
         """Evaluate c_m(κ) of all nodes, (rows, columns), in float32 as a renderer computes them; κ in rad/µm."""
-        interval, t = place(kappa, self.max_kappa, self.intervals)
+        interval, t = locate(kappa, self.max_kappa, self.intervals)
         # The last bits of BLAS depend on the number of cores.
         return np.einsum("n,nyx->yx", t ** np.arange(self.terms, dtype=np.float32), self.values[interval])
 
@@ -154,7 +154,7 @@ class SliceTable:
         self, row: NDArray[np.int64], column: NDArray[np.int64], kappa: NDArray[np.float64]
     ) -> NDArray[np.float32]:
         """Evaluate c_m(κ) at one node and one κ each; all arguments and the result of one shape (...)."""
-        interval, t = place(kappa, self.max_kappa, self.intervals)
+        interval, t = locate(kappa, self.max_kappa, self.intervals)
         result = np.float32(0)
         for power in reversed(range(self.terms)):
             result = result * t + self.values[interval, power, row, column]
@@ -166,9 +166,9 @@ class AmplitudeTable:
     """η_m(κ) = |Σ_{n<N} c_n(κL) F_nm|², a series of the amplitude e^{iκh} of one tile; F_n = F{p_n(h/L)}, |h| ≤ L.
 
     - taylor: p_n(u) = uⁿ, c_n(x) = (ix)ⁿ/n!. As the derivatives of e^{ix} have modulus one, the remainder is at most
-      x^N/N! (Lagrange). The terms grow to about e^x before they shrink, and so do rounding errors.
-    - chebyshev: p_n = T_n, c_n(x) = ε_n iⁿ J_n(x) (Jacobi–Anger; ε_0 = 1, else 2). No term is above two; they fall off
-      faster than any power once n > x.
+      x^N/N! (Lagrange). The terms grow to about e^x before they shrink, and rounding errors grow with them.
+    - chebyshev: p_n = T_n, c_n(x) = ε_n iⁿ J_n(x) (Jacobi–Anger; ε_0 = 1, else 2). Terms are at most two and decrease
+      faster than any power for n > x.
 
     Attributes:
         representation: "taylor" or "chebyshev".
@@ -210,7 +210,7 @@ class AmplitudeTable:
 
     @property
     def first_interval(self) -> float:
-        """The length of the interval from κ = 0 in which η_m/κ² of m ≠ 0 is nearly a line, rad/µm."""
+        """The length of the interval from κ = 0 in which η_m/κ² of m ≠ 0 is nearly linear, rad/µm."""
         return min(self.max_kappa / 16, 0.5 / max(self.height, 1e-30))
 
     @property
@@ -268,26 +268,23 @@ def series_weights(representation: str, terms: int, x: ArrayLike) -> NDArray[np.
     return size * np.array([1, 1j, -1, -1j])[n % 4]
 
 
-HALF_SCALE = 2.0**14  # of numbers in half precision: the largest are just under 4, the least 4e-9
+HALF_SCALE = 2.0**14  # factor of numbers in half precision, which then range from 4e-9 to just under 4
 
 
 def halved(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Round `values` to half precision after scaling.
-
-    Those too small for its full precision become zero, those too large infinite.
-    """
+    """Round `values` to half precision after scaling; subnormal numbers become zero, too large ones infinite."""
     with np.errstate(over="ignore"):
         half = (values * np.float32(HALF_SCALE)).astype(np.float16)
     half[np.abs(half) < np.finfo(np.float16).smallest_normal] = 0
     return half.astype(np.float32) / np.float32(HALF_SCALE)
 
 
-# Of numbers that share an exponent: whole numbers up to 255 times 2⁻³⁶ to 2⁻⁶.
-MANTISSA, LEAST_EXPONENT, EXPONENTS = 255, -36, 31
+# Format of numbers with a common exponent: whole numbers up to 255 times 2⁻³⁶ to 2⁻⁶.
+MAX_MANTISSA, MIN_EXPONENT, EXPONENT_COUNT = 255, -36, 31
 
 
 def packed(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Round `values` (K, 3, ...) to three whole numbers and one exponent for each node and interval."""
+    """Round `values` (K, 3, ...) to three whole numbers and one common exponent for each node and interval."""
     mantissas, exponents = shared_exponents(values)
     return np.ldexp(mantissas, exponents[:, None]).astype(np.float32)
 
@@ -295,10 +292,11 @@ def packed(values: NDArray[np.float32]) -> NDArray[np.float32]:
 def shared_exponents(values: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
     """Return whole numbers m (K, 3, ...) and exponents e (K, ...), `values` ≈ m 2^e; infinite m for those too large."""
     peak = np.abs(values).max(axis=1)
-    exponents = np.frexp(peak / np.float32(MANTISSA + 0.5))[1]
-    exponents = np.where(peak > 0, np.maximum(exponents, LEAST_EXPONENT), LEAST_EXPONENT)
+    exponents = np.frexp(peak / np.float32(MAX_MANTISSA + 0.5))[1]
+    exponents = np.where(peak > 0, np.maximum(exponents, MIN_EXPONENT), MIN_EXPONENT)
     mantissas = np.rint(np.ldexp(values, -exponents[:, None]))
-    mantissas[np.broadcast_to((exponents >= LEAST_EXPONENT + EXPONENTS)[:, None], mantissas.shape)] = np.inf
+    too_large = exponents >= MIN_EXPONENT + EXPONENT_COUNT
+    mantissas[np.broadcast_to(too_large[:, None], mantissas.shape)] = np.inf
     return mantissas, exponents
 
 
@@ -307,8 +305,8 @@ def to_polynomial(terms: int) -> NDArray[np.float64]:
     return np.linalg.inv(np.vander(chebyshev_nodes(terms), increasing=True))
 
 
-def place(kappa: ArrayLike, max_kappa: float, intervals: int) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Return the interval of κ (...), and the place t in it, −1 to 1."""
+def locate(kappa: ArrayLike, max_kappa: float, intervals: int) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Return the index of the interval of κ (...) and the coordinate t in it, −1 to 1."""
     x = np.asarray(kappa, np.float64) / max_kappa * intervals
     interval = np.clip(np.floor(x), 0, intervals - 1).astype(np.int64)
     return interval, (2 * (x - interval) - 1).astype(np.float32)

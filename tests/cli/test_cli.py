@@ -190,7 +190,7 @@ def test_precompute_takes_a_sample_by_options(command):
     assert code == 0
     told = err.splitlines()
     assert len(told) == 1
-    assert told[0].startswith("mitsuba-diffraction: warning: coherence_length: a scan of 2.16 × 1.8 µm carries 0.9 µm")
+    assert told[0].startswith("mitsuba-diffraction: warning: coherence_length: a scan of 2.16 × 1.8 µm supports 0.9 µm")
     spectrum = md.GratingSpectrum.load("out.exr")
     assert (spectrum.extent, spectrum.largest_angle, spectrum.tolerance) == ("sample", 60.0, 0.02)
     assert spectrum.representation == "slices"

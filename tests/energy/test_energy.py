@@ -169,7 +169,7 @@ def test_the_energy_factor_is_reciprocal(name):
 
 def test_lobes_wider_than_the_hemisphere_have_a_table():
     heights = 0.05 * np.random.default_rng(0).random((32, 32))
-    with pytest.warns(UserWarning, match="hold no frequency beyond"):
+    with pytest.warns(UserWarning, match="resolve frequencies up to"):
         table = md.precompute(md.HeightField(heights, 0.1), coherence_length=0.08).energy_table()
     assert table.values.min() > 0
 

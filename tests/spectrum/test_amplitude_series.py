@@ -64,7 +64,7 @@ def test_terms_are_transforms_of_powers_or_chebyshev_polynomials(kind, heights_f
         np.testing.assert_allclose(table.terms[n], wave_y @ function @ wave_x, atol=1e-7)
 
 
-def test_weights_are_those_of_taylor_and_of_jacobi_and_anger():
+def test_weights_are_those_of_the_taylor_and_jacobi_anger_series():
     kappa, height, n = np.array([0.0, 3.0, 17.0]), 0.2, np.arange(7)
     x = (kappa * height)[:, None]
     terms = np.zeros((7, 1, 1), np.complex64)
@@ -76,7 +76,7 @@ def test_weights_are_those_of_taylor_and_of_jacobi_and_anger():
 
 @EACH
 @given(terms=st.integers(1, 25), depth=st.sampled_from([0.05, 0.15, 0.3]), seed=st.integers(0, 99))
-def test_the_remainder_is_bounded_by_lagrange_or_by_the_bessel_functions_left_out(kind, terms, depth, seed):
+def test_the_remainder_is_within_the_lagrange_or_bessel_bound(kind, terms, depth, seed):
     field = rough((4, 6), depth, seed)
     spectrum = quietly(field, representation=kind, terms=terms, tolerance=0.5)
     x = MAX_KAPPA * np.abs(origin(field, "mean")).max()
@@ -93,7 +93,7 @@ def test_the_remainder_is_bounded_by_lagrange_or_by_the_bessel_functions_left_ou
         *[("chebyshev", 0.15, 8), ("chebyshev", 0.5, 16), ("chebyshev", 1.0, 26)],
     ],
 )
-def test_a_sinusoid_takes_the_terms_of_an_independent_count(kind, depth, terms):
+def test_the_number_of_terms_of_a_sinusoid_agrees_with_an_independent_count(kind, depth, terms):
     # The count was made for 1e-3 of the amplitude; a tolerance of the power, with its margin, takes up to two more.
     spectrum = precompute(md.gratings.sinusoidal(2.5, depth), representation=kind)
     assert terms <= len(spectrum.table.terms) <= terms + 2
@@ -130,18 +130,18 @@ def test_overlapping_lobes_of_a_tile_are_within_the_stored_error(kind):
         assert np.abs(spectrum.evaluate(q, kappa) - exact).mean() * 36 <= spectrum.error <= 1e-2
 
 
-def test_too_few_terms_are_kept_with_their_error_and_one_warning():
+def test_too_few_terms_raise_one_warning_and_record_their_error():
     field = md.gratings.sinusoidal(2.5, 0.375)
     with pytest.warns(UserWarning, match="taylor: 20 terms of heights from the lowest") as caught:
         spectrum = precompute(field, representation="taylor", terms=20, heights_from="lowest")
     assert len(caught) == 1
     assert caught[0].filename == __file__
-    worst = max(
+    max_error = max(
         np.abs(spectrum.powers(kappa) - exact_powers(spectrum, field, kappa)).sum()
         for kappa in np.linspace(0, MAX_KAPPA, 60)
     )
-    assert worst <= spectrum.error <= 1.01 * worst
-    assert worst > 1e-3
+    assert max_error <= spectrum.error <= 1.01 * max_error
+    assert max_error > 1e-3
 
 
 @pytest.mark.parametrize(("depth", "heights_from"), [(1.0, "mean"), (0.6, "lowest"), (20.0, "mean")])
@@ -198,7 +198,7 @@ def test_a_mean_of_patches_is_refused_in_favour_of_slices(kind):
 
 @pytest.mark.parametrize(("kind", "name"), [("taylor", "F{u^003}"), ("chebyshev", "F{T_003}")])
 @pytest.mark.parametrize("heights_from", ["mean", "lowest"])
-def test_a_series_is_read_as_it_was_saved(tmp_path, kind, name, heights_from):
+def test_a_series_is_unchanged_by_saving_and_loading(tmp_path, kind, name, heights_from):
     spectrum = precompute(rough((4, 7), 0.2), representation=kind, heights_from=heights_from)
     spectrum.save(tmp_path / "saved.exr")
     back = GratingSpectrum.load(tmp_path / "saved.exr")
@@ -215,6 +215,6 @@ def test_a_series_is_read_as_it_was_saved(tmp_path, kind, name, heights_from):
 @pytest.mark.parametrize(
     "terms", [np.zeros((3, 2), np.complex64), np.zeros((2, 1, 1)), np.full((2, 1, 1), np.nan, np.complex64)]
 )
-def test_tables_check_their_numbers(terms):
+def test_invalid_tables_are_refused(terms):
     with pytest.raises(ValueError, match="terms: got"):
         AmplitudeTable("taylor", 1.0, 0.1, terms)

@@ -31,12 +31,14 @@ def test_nodes_resolve_the_wave_to_the_tolerance(x, tolerance):
 
 @pytest.mark.few(1)
 @pytest.mark.parametrize(("terms", "divisor"), [(3, 192), (4, 3072)])
-@given(height=st.floats(-5, 5), intervals=st.integers(1, 400), phase=st.floats(0, 2 * np.pi), share=st.floats(0.0, 1.0))
-def test_polynomials_through_chebyshev_points_keep_their_bound(terms, divisor, height, intervals, phase, share):
+@given(
+    height=st.floats(-5, 5), intervals=st.integers(1, 400), phase=st.floats(0, 2 * np.pi), fraction=st.floats(0.0, 1.0)
+)
+def test_polynomials_through_chebyshev_points_keep_their_bound(terms, divisor, height, intervals, phase, fraction):
     table = SliceTable.build(
         intervals, terms, LARGEST_KAPPA, lambda kappa: np.cos(kappa * height + phase).reshape(1, 1), lambda v: v, ignore
     )
-    kappas = LARGEST_KAPPA * (np.arange(0, intervals, max(1, intervals // 20)) + share) / intervals
+    kappas = LARGEST_KAPPA * (np.arange(0, intervals, max(1, intervals // 20)) + fraction) / intervals
     got = np.array([table.powers(kappa)[0, 0] for kappa in kappas])
     bound = (abs(height) * LARGEST_KAPPA / intervals) ** terms / divisor
     assert np.abs(got - np.cos(kappas * height + phase)).max() <= bound + 3e-6  # float32

@@ -26,13 +26,13 @@ def spectrum(recipe):
     return recipe.build()
 
 
-def test_the_patches_are_those_of_the_seeds_in_turn(recipe):
+def test_patches_have_consecutive_seeds(recipe):
     wanted = [PROFILES["elaphe"](7.0, seed=seed).digest for seed in (3, 4, 5)]
     assert [field.digest for field in recipe.height_fields()] == wanted
     assert recipe.height_field().digest == wanted[0]
 
 
-def test_the_spectrum_is_the_mean_of_theirs(recipe):
+def test_the_spectrum_is_the_mean_over_patches(recipe):
     fields = recipe.height_fields()
     # Lobes so narrow that the orders are not gathered on a lattice.
     spectrum = Recipe(recipe.surface, Settings(coherence_length=60)).build()
@@ -44,7 +44,7 @@ def test_the_spectrum_is_the_mean_of_theirs(recipe):
         assert kappa == 0 or np.abs(order_powers(fields[0], kappa)[np.ix_(m_y, m_x)] - wanted).sum() > 0.03
 
 
-def test_the_spectrum_between_the_orders_is_the_mean_of_theirs(recipe, spectrum):
+def test_the_spectrum_between_orders_is_the_mean_over_patches(recipe, spectrum):
     rng = np.random.default_rng(0)
     q, kappa = rng.uniform(-1.5, 1.5, (300, 2)), np.full(300, GREEN)
     of_each = [power_spectrum(field, q, kappa, coherence_length=5.6) for field in recipe.height_fields()]
@@ -53,7 +53,7 @@ def test_the_spectrum_between_the_orders_is_the_mean_of_theirs(recipe, spectrum)
 
 
 @pytest.mark.slow
-def test_a_saved_spectrum_says_how_many(spectrum, tmp_path):
+def test_a_saved_spectrum_records_the_number_of_patches(spectrum, tmp_path):
     spectrum.save(tmp_path / "mean.exr")
     again = GratingSpectrum.load(tmp_path / "mean.exr")
     assert again.patches == spectrum.patches == 3
@@ -123,7 +123,7 @@ def seen(fields, sigma):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(PATCHES))
-def test_by_default_other_seeds_give_the_same_to_eight_per_cent(name):
+def test_default_patches_agree_for_other_seeds_to_eight_per_cent(name):
     sigma = lobe_width(COHERENCE_LENGTHS[name])
     default = seen(Recipe({"profile": name}).height_fields(), sigma)
     others = seen([PROFILES[name](seed=1000 + k) for k in range(63)], sigma)

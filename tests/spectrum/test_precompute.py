@@ -21,16 +21,16 @@ TOLERANCES = [1e-2, 1e-3, 1e-4]
 LARGEST_KAPPA = 4 * np.pi / 0.36
 
 
-def reached_orders(size, count, beyond=1.0):
+def reached_orders(size, count, factor=1.0):
     """The orders that light of 360 nm reaches, up to the Nyquist limit, one array per axis."""
     m = np.arange(-(count // 2), count // 2 + 1)
-    return m[(np.abs(m) / size <= beyond * REACHED * (1 + 1e-12)) & (np.abs(m) <= count / 2)]
+    return m[(np.abs(m) / size <= factor * REACHED * (1 + 1e-12)) & (np.abs(m) <= count / 2)]
 
 
-def exact_powers(field, kappa, beyond=1.0):
-    """η_m by the sum over the pixels, in float64, for the reached orders, or so many times beyond: (m_y, m_x, η)."""
+def exact_powers(field, kappa, factor=1.0):
+    """η_m by the sum over the pixels, in float64, of orders up to `factor` times the reached ones: (m_y, m_x, η)."""
     (rows, columns), (t_x, t_y) = field.shape, field.tile_size
-    m_x, m_y = reached_orders(t_x, columns, beyond), reached_orders(t_y, rows, beyond)
+    m_x, m_y = reached_orders(t_x, columns, factor), reached_orders(t_y, rows, factor)
     wave_y = np.exp(-2j * np.pi * np.outer(m_y, np.arange(rows)) / rows)
     wave_x = np.exp(-2j * np.pi * np.outer(np.arange(columns), m_x) / columns)
     eta = np.abs(wave_y @ np.exp(1j * kappa * field.heights) @ wave_x / (rows * columns)) ** 2
@@ -53,7 +53,7 @@ def random_kappas(seed, count=8):
     return [0.0, *np.random.default_rng(seed).uniform(0, LARGEST_KAPPA, count), LARGEST_KAPPA]
 
 
-def worst_error(spectrum, field, kappas, inside=1.0):
+def max_error(spectrum, field, kappas, inside=1.0):
     return max(isolated_error(spectrum, field, kappa, inside) for kappa in kappas)
 
 
@@ -92,10 +92,10 @@ def surfaces(draw, depths):
 )
 @example(field=HeightField([[0.0, 5.0]], 0.09), tolerance=1e-4, seed=0)
 def test_any_tolerance_is_kept_on_any_surface(field, tolerance, seed):
-    # Lobes that stand apart: coherent over far more than the largest of the tiles.
+    # Separate lobes: the coherence length far exceeds the tiles.
     spectrum = precompute(field, tolerance=tolerance, coherence_length=200.0)
     assert spectrum.error <= tolerance
-    assert worst_error(spectrum, field, random_kappas(seed)) <= tolerance
+    assert max_error(spectrum, field, random_kappas(seed)) <= tolerance
 
 
 @pytest.mark.few(2)
@@ -105,7 +105,7 @@ def test_measured_skins_keep_the_tolerance(scan, name, tolerance):
     field = scan(name)
     spectrum = precompute(field, tolerance=tolerance)
     assert spectrum.error <= tolerance
-    assert worst_error(spectrum, field, random_kappas(6, 4)) <= tolerance
+    assert max_error(spectrum, field, random_kappas(6, 4)) <= tolerance
 
 
 @pytest.mark.few(3)
@@ -123,8 +123,8 @@ def test_measured_skins_keep_the_tolerance(scan, name, tolerance):
 def test_the_reported_error_holds_for_every_kappa(field, tolerance):
     # Regression: a dozen values of κ at which the error was measured missed its peaks by up to 40 %.
     spectrum = precompute(field, tolerance=tolerance, coherence_length=200.0)
-    worst = worst_error(spectrum, field, np.linspace(0, LARGEST_KAPPA, 401))
-    assert worst <= spectrum.error <= tolerance
+    error = max_error(spectrum, field, np.linspace(0, LARGEST_KAPPA, 401))
+    assert error <= spectrum.error <= tolerance
 
 
 @pytest.mark.parametrize("tolerance", TOLERANCES)
@@ -133,9 +133,9 @@ def test_the_reported_error_is_no_more_than_the_actual_one(tolerance):
     spectrum = precompute(field, tolerance=tolerance)
     # ∫|S_approx − S_exact| over the truncated lobes of S_approx, and what of S_exact lies outside of them.
     kappas, inside = np.linspace(0, LARGEST_KAPPA, 301), np.prod([lobe.inside for lobe in spectrum.lobes])
-    assert inside * worst_error(spectrum, field, kappas) + 1 - inside <= spectrum.error <= tolerance
-    # The table's share of it alone; truncation and renormalisation move 1 − inside each.
-    of_table = worst_error(spectrum, field, kappas, inside)
+    assert inside * max_error(spectrum, field, kappas) + 1 - inside <= spectrum.error <= tolerance
+    # The error of the table alone; truncation and renormalisation add 1 − inside each.
+    of_table = max_error(spectrum, field, kappas, inside)
     assert spectrum.error <= 1.5 * of_table + 2 * (1 - inside)
 
 
@@ -177,13 +177,13 @@ def test_overlapping_lobes_keep_the_tolerance(shape, coherence_length, tolerance
         assert overlapping_error(field, spectrum, kappa, coherence_length) <= tolerance
 
 
-def error_where_light_reaches(spectrum, field, kappa, reach, coherence_length):
-    """∫|S_approx − S_exact| over |q_x| ≤ reach, of a grating along x whose lobes along y stand alone."""
+def error_where_light_reaches(spectrum, field, kappa, max_q, coherence_length):
+    """∫|S_approx − S_exact| over |q_x| ≤ max_q, of a grating along x whose lobes along y stand alone."""
     sigma = lobe_width(coherence_length)
     step = sigma / 16
-    q_x = np.arange(-np.floor(reach / step), np.floor(reach / step) + 1) * step
+    q_x = np.arange(-np.floor(max_q / step), np.floor(max_q / step) + 1) * step
     q = np.stack([q_x, np.zeros_like(q_x)], axis=-1)
-    _, m, eta = exact_powers(field, kappa, beyond=2.0)
+    _, m, eta = exact_powers(field, kappa, factor=2.0)
     lobes = np.exp(-((q_x[:, None] - m / field.tile_size[0]) ** 2) / (2 * sigma**2)) / (np.sqrt(2 * np.pi) * sigma)
     along_x = spectrum.evaluate(q, kappa) * np.sqrt(2 * np.pi) * sigma
     return np.abs(along_x - lobes @ eta[0]).sum() * step
@@ -195,16 +195,16 @@ def error_where_light_reaches(spectrum, field, kappa, reach, coherence_length):
     ("period", "coherence_length", "largest_angle"),
     [(2.519, 65.0, 30.0), (2.5, 10.0, 90.0), (2.5, 3.0, 90.0), (2.519, 3.0, 30.0), (2.5, 3.0, 60.0)],
 )
-def test_lobes_whose_middle_lies_beyond_the_reach_are_not_lost(period, coherence_length, largest_angle, tolerance):
-    # Regression: the flanks of the first orders beyond 2 sin θ/λ, which lie where light reaches, were missing.
+def test_lobes_centred_outside_the_reached_frequencies_are_kept(period, coherence_length, largest_angle, tolerance):
+    # Regression: the reached flanks of the first orders outside 2 sin θ/λ were missing.
     ramp = md.gratings.blazed(period=period, depth=5.0, samples=64)
     field = HeightField(ramp.heights, (ramp.pixel_size[0], 0.05))
     spectrum = precompute(field, coherence_length=coherence_length, largest_angle=largest_angle, tolerance=tolerance)
-    reach = REACHED * np.sin(np.deg2rad(largest_angle))
+    max_q = REACHED * np.sin(np.deg2rad(largest_angle))
     # The depth that blazes into the first order beyond it.
-    blazed = 2 * np.pi / 5.0 * np.ceil(reach * period)
+    blazed = 2 * np.pi / 5.0 * np.ceil(max_q * period)
     for kappa in (blazed, 0.97 * blazed, 1.03 * blazed, 0.7 * LARGEST_KAPPA):
-        assert error_where_light_reaches(spectrum, field, kappa, reach, coherence_length) <= 1.1 * tolerance
+        assert error_where_light_reaches(spectrum, field, kappa, max_q, coherence_length) <= 1.1 * tolerance
 
 
 # ---------------------------------------------------------------- analytic gratings, all the way
@@ -226,7 +226,7 @@ def test_a_sinusoid_has_bessel_orders(depth):
         assert np.abs(got - jv(ORDERS, kappa * depth / 2) ** 2).sum() <= 1.1e-4
 
 
-def test_a_blaze_has_sinc_orders_on_the_side_to_which_it_rises():
+def test_a_blaze_has_sinc_orders_of_the_sign_of_its_slope():
     spectrum = precompute(md.gratings.blazed(2.5, 0.25), tolerance=1e-4)
     for kappa in random_kappas(2):
         wanted = np.sinc(ORDERS - kappa * 0.25 / (2 * np.pi)) ** 2
@@ -276,7 +276,7 @@ def test_deep_surfaces_keep_the_tolerance(depth):
 
 
 @pytest.mark.parametrize(("tolerance", "words"), [(1e-2, 1), (1e-3, 2), (1e-4, 4)])
-def test_slices_are_stored_in_as_few_bits_as_the_tolerance_allows(tolerance, words):
+def test_slices_have_the_smallest_format_that_keeps_the_tolerance(tolerance, words):
     spectrum = precompute(md.gratings.xenopeltis(8.0), tolerance=tolerance)
     assert spectrum.table.words_per_node == words
     assert spectrum.error <= tolerance
@@ -296,7 +296,7 @@ def test_a_tile_is_read_from_a_lattice_where_its_lobes_overlap_widely(coherence_
         assert np.abs(spectrum.evaluate(q, kappa) - exact).mean() * 36 <= 1e-2
 
 
-# ---------------------------------------------------------------- the grid, and what is told
+# ---------------------------------------------------------------- the grid, warnings and progress
 
 
 def test_the_orders_are_those_that_light_reaches():
@@ -310,12 +310,12 @@ def test_the_orders_are_those_that_light_reaches():
 @pytest.mark.parametrize(("pixel", "axis"), [((0.2, 0.05), "x"), ((0.05, 0.1), "y")])
 def test_pixels_too_coarse_raise_a_warning(pixel, axis):
     field = HeightField(np.random.default_rng(1).random((6, 7)) * 0.1, pixel)
-    with pytest.warns(UserWarning, match=rf"nm along {axis} hold no frequency beyond .* light reaches 5.56") as caught:
+    with pytest.warns(UserWarning, match=rf"nm along {axis} resolve frequencies up to .* light reaches 5.56") as caught:
         spectrum = precompute(field)
     assert len(caught) == 1
     assert caught[0].filename == __file__
-    for size, count, largest in zip(field.pixel_size, (7, 6), spectrum.grid.max_order, strict=True):
-        assert largest / (count * size) < 1 / (2 * size)
+    for size, count, max_order in zip(field.pixel_size, (7, 6), spectrum.grid.max_order, strict=True):
+        assert max_order / (count * size) < 1 / (2 * size)
 
 
 def test_an_axis_of_one_pixel_raises_no_warning():
@@ -339,14 +339,14 @@ def test_small_matrices_are_multiplied_on_one_thread(monkeypatch):
     assert all(threads == {1} for threads in limited)
 
 
-def test_progress_counts_up_to_the_whole():
+def test_progress_ends_at_the_total():
     steps = []
     precompute(md.gratings.blazed(2.5, 0.25, samples=64), progress=lambda *step: steps.append(step))
     assert steps[-1][0] == steps[-1][1] > 0
     assert all(0 < done <= total for done, total in steps)
 
 
-def test_the_spectrum_knows_where_it_came_from():
+def test_the_spectrum_records_its_source():
     field = HeightField([[0.0, 0.1, 0.0]], (0.05, 0.07), source="by hand")
     spectrum = precompute(field, coherence_length=12, wavelengths=[400, 700], tolerance=0.01)
     assert (spectrum.source, spectrum.source_digest) == ("by hand", field.digest)
@@ -404,13 +404,13 @@ def power_outside(field, kappa, inside):
 def test_the_unresolved_power_is_reported(field, arguments):
     spectrum = precompute(field, **arguments)
     angle = np.deg2rad(arguments.get("largest_angle", 90.0))
-    reach = 2 * np.sin(angle) / arguments.get("wavelengths", (360.0,))[0] * 1e3
+    max_q = 2 * np.sin(angle) / arguments.get("wavelengths", (360.0,))[0] * 1e3
     t_x, t_y = field.tile_size
-    worst = max(
-        power_outside(field, kappa, lambda x, y: (np.abs(x / t_x) <= reach) & (np.abs(y / t_y) <= reach))
+    wanted = max(
+        power_outside(field, kappa, lambda x, y: (np.abs(x / t_x) <= max_q) & (np.abs(y / t_y) <= max_q))
         for kappa in np.linspace(0, spectrum.max_kappa, 400)
     )
-    assert spectrum.unresolved_power == pytest.approx(worst, rel=0.02, abs=1e-9)
+    assert spectrum.unresolved_power == pytest.approx(wanted, rel=0.02, abs=1e-9)
 
 
 @pytest.mark.few(3)
@@ -425,7 +425,7 @@ def test_the_unresolved_power_is_reported(field, arguments):
     ids=["shallow", "deep", "bump"],
 )
 @pytest.mark.filterwarnings("ignore:pixels of")
-def test_weak_orders_are_dropped_and_their_power_is_reported(field, tolerance):
+def test_weak_orders_are_left_out_and_their_power_is_reported(field, tolerance):
     spectrum = precompute(field, tolerance=tolerance)
     m_x, m_y = spectrum.grid.max_order
     assert m_x < min((field.shape[1] - 1) // 2, int(REACHED * field.tile_size[0]))  # there was something to drop
@@ -443,7 +443,7 @@ def test_weak_orders_are_dropped_and_their_power_is_reported(field, tolerance):
 
 @pytest.mark.parametrize("extent", ["tile", "sample"])
 @pytest.mark.filterwarnings("ignore:pixels of")
-def test_a_narrower_scene_has_a_smaller_table_that_is_right(extent):
+def test_a_smaller_angle_gives_a_smaller_correct_table(extent):
     field = HeightField(np.random.default_rng(3).random((24, 25)) * 0.3, 0.09)
     coherence_length = {"tile": 5.0, "sample": 1.0}[extent]
     arguments = {"extent": extent, "coherence_length": coherence_length, "tolerance": 0.01}
@@ -451,16 +451,16 @@ def test_a_narrower_scene_has_a_smaller_table_that_is_right(extent):
     angle = precompute(field, largest_angle=40.0, **arguments)
     longer = precompute(field, wavelengths=(500.0, 600.0), **arguments)
     rng = np.random.default_rng(9)
-    for narrow, reach, max_kappa in [
+    for narrow, max_q, max_kappa in [
         (angle, REACHED * np.sin(np.deg2rad(40)), LARGEST_KAPPA),
         (longer, 4.0, 4 * np.pi / 0.5),
     ]:
         assert narrow.max_kappa == pytest.approx(max_kappa)
         assert narrow.megabytes < 0.8 * whole.megabytes
         assert narrow.unresolved_power > whole.unresolved_power
-        # Random places out to the very edge: their mean error is the tolerance at most.
-        q = rng.uniform(-reach, reach, (800, 2))
-        q = q[np.hypot(*q.T) <= reach]
+        # At random q up to the limit the mean error is at most the tolerance.
+        q = rng.uniform(-max_q, max_q, (800, 2))
+        q = q[np.hypot(*q.T) <= max_q]
         for kappa in (3.0, 0.6 * max_kappa, max_kappa):
             exact = md.reference.power_spectrum(field, q, kappa, extent=extent, coherence_length=coherence_length)
             assert np.abs(narrow.evaluate(q, kappa) - exact).sum() <= 0.012 * max(exact.sum(), exact.mean() * 800)
@@ -469,14 +469,14 @@ def test_a_narrower_scene_has_a_smaller_table_that_is_right(extent):
 # ---------------------------------------------------------------- samples
 
 
-def sample_error(spectrum, field, kappa, coherence_length, seed, reach=REACHED):
-    """∫|S_approx − S_exact| dq over |q| ≤ reach by the rule of rectangles, on a lattice of its own."""
+def sample_error(spectrum, field, kappa, coherence_length, seed, max_q=REACHED):
+    """∫|S_approx − S_exact| dq over |q| ≤ max_q by the rule of rectangles, on a lattice of its own."""
     step = lobe_width(spectrum.coherence_length) / 3
     axes = [
-        (np.arange(-half, half + 1) + place) * step
-        for half, place in zip(
+        (np.arange(-half, half + 1) + shift) * step
+        for half, shift in zip(
             [
-                int(min(reach, (1 / (2 * d) if n > 1 else 8 * lobe_width(spectrum.coherence_length)) + 4 * step) / step)
+                int(min(max_q, (1 / (2 * d) if n > 1 else 8 * lobe_width(spectrum.coherence_length)) + 4 * step) / step)
                 for n, d in zip(field.shape[::-1], field.pixel_size, strict=True)
             ],
             np.random.default_rng(seed).uniform(-0.5, 0.5, 2),
@@ -484,7 +484,7 @@ def sample_error(spectrum, field, kappa, coherence_length, seed, reach=REACHED):
         )
     ]
     q = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
-    q = q[np.hypot(*q.T) <= reach]
+    q = q[np.hypot(*q.T) <= max_q]
     exact = md.reference.power_spectrum(field, q, kappa, extent="sample", coherence_length=coherence_length)
     return np.abs(spectrum.evaluate(q, kappa) - exact).sum() * step**2
 
@@ -513,7 +513,7 @@ SAMPLES = {
 @pytest.mark.parametrize("name", SAMPLES)
 @pytest.mark.filterwarnings("ignore:pixels of")
 def test_a_sample_keeps_the_tolerance(name, tolerance):
-    # Regression: at the rim, the Nyquist limit, splines of nodes beyond it were missing (a scan of one row, 1e-2, had
+    # Regression: at the Nyquist limit, splines of nodes outside it were missing (a scan of one row, 1e-2, had
     # the error 1.9e-2), and lattices were made far finer than they need be to make up for it.
     field, coherence_length = SAMPLES[name]
     spectrum = precompute(
@@ -538,19 +538,19 @@ def test_a_deep_sample_keeps_the_tolerance():
 def test_the_unresolved_power_of_a_sample_is_reported():
     field = scan_of((20, 22), 0.3, 0.06)
     spectrum = precompute(field, extent="sample", coherence_length=0.55, largest_angle=40.0, tolerance=0.01)
-    reach = REACHED * np.sin(np.deg2rad(40))
-    # The middles of equal cells, many of which make up the square |q_x|, |q_y| ≤ reach: power inside of it.
+    max_q = REACHED * np.sin(np.deg2rad(40))
+    # The middles of equal cells, many of which make up the square |q_x|, |q_y| ≤ max_q: power inside of it.
     cells = 80
-    middles = ((np.arange(cells) + 0.5) / cells * 2 - 1) * reach
+    middles = ((np.arange(cells) + 0.5) / cells * 2 - 1) * max_q
     q = np.stack(np.meshgrid(middles, middles), axis=-1)
     inside = [
-        md.reference.power_spectrum(field, q, kappa, extent="sample", coherence_length=0.55).mean() * (2 * reach) ** 2
+        md.reference.power_spectrum(field, q, kappa, extent="sample", coherence_length=0.55).mean() * (2 * max_q) ** 2
         for kappa in np.linspace(0, LARGEST_KAPPA, 40)
     ]
     assert spectrum.unresolved_power == pytest.approx(1 - min(inside), abs=3e-3)
 
 
-def test_the_weak_frequencies_of_a_smooth_sample_are_dropped():
+def test_weak_frequencies_of_a_smooth_sample_are_left_out():
     field = HeightField(np.outer(np.hanning(40), np.hanning(44)) * 0.1, 0.08)
     spectrum = precompute(field, extent="sample", coherence_length=1.5, tolerance=0.01)
     grid, sigma = spectrum.grid, lobe_width(1.5)
@@ -571,7 +571,7 @@ def test_the_coherence_length_that_a_scan_supports_is_reported():
     with pytest.warns(UserWarning, match="coherence_length: ") as caught:
         spectrum = precompute(field, extent="sample", tolerance=0.05)
     assert [str(warning.message) for warning in caught] == [
-        "coherence_length: a scan of 2.7 × 1.62 µm carries 0.81 µm of the 65 µm asked for; "
+        "coherence_length: a scan of 2.7 × 1.62 µm supports 0.81 µm of the requested 65 µm; "
         "the lobes are as wide as the scan allows"
     ]
     assert caught[0].filename == __file__
@@ -590,7 +590,7 @@ def test_a_coherence_of_less_than_four_pixels_is_refused():
     precompute(field, coherence_length=0.35, tolerance=0.1)
 
 
-def test_a_flat_sample_shows_the_window_alone():
+def test_a_flat_sample_has_the_spectrum_of_the_window():
     field = HeightField(np.full((40, 40), 1.0), 0.09)
     spectrum = precompute(field, extent="sample", coherence_length=1.2, tolerance=1e-3)
     # Its Gaussian is cut off at three σ_s, so that it is not quite N(q; σ_q²).
@@ -602,7 +602,7 @@ def test_a_flat_sample_shows_the_window_alone():
 
 @pytest.mark.parametrize("extent", ["tile", "sample"])
 def test_too_large_a_table_is_refused(monkeypatch, extent):
-    monkeypatch.setattr(importlib.import_module("mitsuba_diffraction.spectrum.build"), "_LARGEST_TABLE", 2e3)
+    monkeypatch.setattr(importlib.import_module("mitsuba_diffraction.spectrum.build"), "_MAX_TABLE_BYTES", 2e3)
     field, coherence_length = SAMPLES["odd"]
     with pytest.raises(
         ValueError, match=r"tolerance: needs .*more than a table of .*larger tolerance, a smaller patch"
@@ -610,13 +610,13 @@ def test_too_large_a_table_is_refused(monkeypatch, extent):
         precompute(field, extent=extent, coherence_length=coherence_length)
 
 
-def test_a_table_too_large_in_one_storage_takes_the_next(monkeypatch):
+def test_a_table_too_large_in_one_format_takes_the_next(monkeypatch):
     field = md.gratings.xenopeltis(8.0)
     first = precompute(field, tolerance=1e-2).table
     assert first.words_per_node == 1
     module = importlib.import_module("mitsuba_diffraction.spectrum.build")
     # Six intervals of three terms are refused, three of four terms are not.
-    monkeypatch.setattr(module, "_LARGEST_TABLE", 4 * first.values.size - 1)
+    monkeypatch.setattr(module, "_MAX_TABLE_BYTES", 4 * first.values.size - 1)
     spectrum = precompute(field, tolerance=1e-2)
     assert spectrum.table.words_per_node == 2
     assert spectrum.error <= 1e-2

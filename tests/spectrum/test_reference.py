@@ -74,7 +74,7 @@ def test_a_common_offset_of_the_heights_changes_nothing(kappa, offset):
 
 @given(kappa=kappas, depth=st.floats(0, 5))
 def test_one_spike_on_a_flat_surface_has_the_orders_of_the_closed_form(kappa, depth):
-    # 1 − (1 − e^{iκd})/N in order zero, a share of |1 − e^{iκd}|²/N² in every other one.
+    # 1 − (1 − e^{iκd})/N in order zero, |1 − e^{iκd}|²/N² in every other one.
     heights = np.zeros((3, 5))
     heights[1, 2] = depth
     eta = order_powers(HeightField(heights, 0.1), kappa)
@@ -105,10 +105,10 @@ def test_the_spectrum_is_the_sum_of_the_lobes(shape, pixel, kappa, coherence_len
     rng = np.random.default_rng(seed)
     field = HeightField(rng.random(shape), pixel)
     sigma = sigma_of(coherence_length)
-    # At random places, and near orders, where narrow lobes are.
+    # At random q, and near orders, where narrow lobes are.
     near = (rng.integers(-2, 3, (4, 2)) / field.tile_size) + rng.normal(0, sigma, (4, 2))
     q = np.concatenate([rng.uniform(-6, 6, (3, 2)), near, [[0, 0]]])
-    wanted = [direct_spectrum(field, place, kappa, sigma) for place in q]
+    wanted = [direct_spectrum(field, one, kappa, sigma) for one in q]
     got = power_spectrum(field, q, kappa, coherence_length=coherence_length)
     np.testing.assert_allclose(got, wanted, rtol=1e-9, atol=1e-12 / sigma**2)
 
@@ -136,8 +136,8 @@ def windowed_powers(heights, kappa, period, coherence_length, q):
     sigma_s = coherence_length / 4
     x = np.arange(-9 * sigma_s, 9 * sigma_s, 0.01)
     window = np.exp(-(x**2) / (2 * sigma_s**2))
-    places = np.arange(64) / 64 * period
-    phase = np.exp(1j * kappa * heights(x + places[:, None]))
+    shifts = np.arange(64) / 64 * period
+    phase = np.exp(1j * kappa * heights(x + shifts[:, None]))
     return np.abs((window * phase) @ np.exp(-2j * np.pi * np.outer(x, q)) * 0.01) ** 2 / (window**2).sum() / 0.01
 
 
@@ -161,7 +161,7 @@ def test_the_spectrum_is_its_definition(kappa, coherence_length):
     got = power_spectrum(field, grid, np.full(grid.shape[:2], kappa), coherence_length=coherence_length)
     np.testing.assert_allclose(got, wanted, rtol=1e-9, atol=1e-10 * wanted.max())
     if coherence_length < 2 and kappa > 10:
-        # At one place alone the orders do interfere: the average it is that makes the cross terms vanish.
+        # At a single position the orders interfere; the cross terms vanish on average.
         assert np.abs(along_x[0] - along_x.mean(axis=0)).max() > 0.05 * along_x.max()
 
 
@@ -309,8 +309,8 @@ def test_the_spectrum_of_one_row_or_column_integrates_to_one(shape):
 
 @pytest.mark.parametrize("pixel", [0.02, 0.05])
 def test_a_flat_sample_reflects_a_gaussian_lobe(pixel):
-    # The window ends at 3σ_s. It lacks the share t = erfc(3/√2) of its integral and e = erfc(3) of its power, so that
-    # along each axis its lobe is off by at most (1 + t)²/(1 − e) − 1 of the peak.
+    # The window ends at 3σ_s. It lacks t = erfc(3/√2) of its integral and e = erfc(3) of its power, so that along each
+    # axis its lobe is off by at most (1 + t)²/(1 − e) − 1 of the peak.
     field = HeightField(np.zeros((60, 60)), pixel)
     coherence_length = 60 * pixel / 2
     sigma = sigma_of(coherence_length)
@@ -350,7 +350,7 @@ def test_the_seam_of_a_sample_has_no_effect():
         power_spectrum(field, q, kappa, extent=extent, coherence_length=3.2) for extent in ("tile", "sample")
     )
     peak = gauss(0, sigma_of(3.2)) ** 2
-    # What is left of a lobe beyond 6σ_q where the window ends at 3σ_s: under 1e-5.
+    # The power of a lobe outside 6σ_q, with a window truncated at 3σ_s: under 1e-5.
     assert as_sample.max() < 1e-5 * peak
     assert as_tile.min() > 1e-4 * peak
 
@@ -378,8 +378,8 @@ def test_a_sampled_sinusoid_has_bessel_lobes(kappa):
 
 def test_white_noise_has_a_white_spectrum():
     # Phases of all sizes alike, independent from pixel to pixel: the expectation is d_x d_y at every q. Periodograms of
-    # places δ apart correlate as |∫ a(x) a(x − δ)|²/(∫ a²)² = exp(−δ²/2σ_s²); three places σ_s apart along each axis
-    # leave fluctuations of (3 + 4 exp(−1/2) + 2 exp(−2))/9 = 0.633 of the expectation, where one place has 1.
+    # positions δ apart correlate as |∫ a(x) a(x − δ)|²/(∫ a²)² = exp(−δ²/2σ_s²); three positions σ_s apart along each
+    # axis leave fluctuations of (3 + 4 exp(−1/2) + 2 exp(−2))/9 = 0.633 of the expectation, where one position has 1.
     rng = np.random.default_rng(11)
     q = rng.uniform(-0.5, 0.5, (40, 2)) / (0.1, 0.2)
     scans = [HeightField(rng.random((24, 48)) * 2 * np.pi, (0.1, 0.2)) for _ in range(300)]
@@ -408,16 +408,16 @@ def test_a_uniform_axis_has_the_lobe_of_the_other_axis():
     np.testing.assert_allclose(got / got[0], gauss(across, sigma_of(3.0)) / gauss(0, sigma_of(3.0)), rtol=1e-12)
 
 
-def test_there_is_nothing_beyond_the_nyquist_limit():
+def test_the_spectrum_is_zero_outside_the_nyquist_limit():
     field = HeightField(np.random.default_rng(9).random((20, 24)), (0.1, 0.2))
     limit = np.array([5.0, 2.5])
     assert (power_spectrum(field, limit * [[1, 1], [-1, 1], [0.999, -1]], 15.0, extent="sample") > 0).all()
-    beyond = limit * [[1.001, 0], [0, -1.001], [-2, 0.1], [3, 3]]
-    np.testing.assert_array_equal(power_spectrum(field, beyond, 15.0, extent="sample"), 0)
-    np.testing.assert_array_equal(finite_tiles_spectrum(field, beyond, 15.0, tiles=(2, 3)), 0)
+    outside = limit * [[1.001, 0], [0, -1.001], [-2, 0.1], [3, 3]]
+    np.testing.assert_array_equal(power_spectrum(field, outside, 15.0, extent="sample"), 0)
+    np.testing.assert_array_equal(finite_tiles_spectrum(field, outside, 15.0, tiles=(2, 3)), 0)
 
 
-def test_rounding_does_not_take_the_nyquist_limit_itself_away():
+def test_rounding_does_not_exclude_the_nyquist_limit():
     limit = np.fft.fftfreq(26, 0.3).min()
     assert limit < -1 / 0.6  # by one unit in the last place
     field = HeightField(np.random.default_rng(9).random((26, 26)), 0.3)
@@ -425,14 +425,14 @@ def test_rounding_does_not_take_the_nyquist_limit_itself_away():
     assert finite_tiles_spectrum(field, [limit, 0.0], 15.0, tiles=(1, 1)) > 0
 
 
-@pytest.mark.parametrize("largest", [1, 100, 2**20])
-def test_the_size_of_chunks_does_not_matter(largest, monkeypatch):
+@pytest.mark.parametrize("max_count", [1, 100, 2**20])
+def test_the_size_of_chunks_does_not_matter(max_count, monkeypatch):
     field = HeightField(np.random.default_rng(10).random((12, 9)), 0.1)
     q = np.random.default_rng(11).uniform(-5, 5, (5, 3, 2))
-    q[1] = q[0]  # the same places again
+    q[1] = q[0]  # the same q again
     kappa = np.array([4.0, 20.0, 4.0])
     wanted = [[power_spectrum(field, q[i, j], kappa[j], extent="sample") for j in range(3)] for i in range(5)]
-    monkeypatch.setattr("mitsuba_diffraction.reference.CHUNK", largest)
+    monkeypatch.setattr("mitsuba_diffraction.reference.MAX_CHUNK", max_count)
     np.testing.assert_allclose(power_spectrum(field, q, kappa, extent="sample"), wanted, rtol=1e-10)
 
 
@@ -469,7 +469,7 @@ def test_finite_tiles_are_the_transform_of_all_of_them(shape, pixel, tiles):
     wanted = np.abs(np.fft.fft2(phase)) ** 2 * scale
     got = finite_tiles_spectrum(field, np.stack([q_x, q_y], axis=-1), 19.0, tiles=tiles)
     np.testing.assert_allclose(got, wanted, atol=1e-12 * wanted.max())
-    # And places between them, far from them and next to them.
+    # And q between the orders, far from them and next to them.
     rng = np.random.default_rng(13)
     m = rng.integers(0, np.maximum(shape[::-1], 2) // 2, (20, 2)) / field.tile_size
     q = np.concatenate([rng.uniform(-0.5, 0.5, (40, 2)) / pixel, m + 1e-9, m + 1e-5])

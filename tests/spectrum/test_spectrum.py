@@ -33,12 +33,12 @@ def as_it_is(values):
 )
 def test_the_grid_holds_every_order_that_light_reaches_and_the_pixels_resolve(tile, pixels, max_frequency):
     grid = OrderGrid.reachable(tile, pixels, max_frequency)
-    for size, count, largest in zip(tile, pixels, grid.max_order, strict=True):
+    for size, count, max_order in zip(tile, pixels, grid.max_order, strict=True):
         m = np.arange(300)
         reached = (m / size <= max_frequency * (1 - 1e-12)) & (m <= count / 2)
-        assert largest >= m[reached].max()
-        assert largest / size <= max_frequency * (1 + 1e-12)
-        assert largest <= count / 2
+        assert max_order >= m[reached].max()
+        assert max_order / size <= max_frequency * (1 + 1e-12)
+        assert max_order <= count / 2
     assert grid.shape == (2 * grid.max_order[1] + 1, 2 * grid.max_order[0] + 1)
 
 
@@ -60,7 +60,7 @@ def test_take_selects_the_power_of_each_order(shape):
             assert np.abs(kept).sum() == pytest.approx(1, abs=1e-10)
 
 
-def test_the_nyquist_order_lies_half_on_each_side():
+def test_the_nyquist_order_is_divided_equally_between_both_signs():
     grid = OrderGrid((1.0, 1.0), (2, 1))
     np.testing.assert_array_equal(grid.take(np.arange(12.0).reshape(3, 4))[1], [1.0, 3.0, 0.0, 1.0, 1.0])
     assert grid.take(np.ones((3, 4))).sum() == 12
@@ -74,13 +74,13 @@ def test_wrong_grids_are_refused(arguments):
         OrderGrid(*arguments)
 
 
-@given(share=st.floats(1e-7, 0.5))
-def test_the_share_that_lobe_cutoff_names_is_the_one_that_the_cut_moves(share):
+@given(change=st.floats(1e-7, 0.5))
+def test_truncation_at_lobe_cutoff_changes_the_lobe_by_the_given_fraction(change):
     # One axis by the trapezoidal rule; cut off outside of the square, and added again by scaling what is inside.
-    rho = lobe_cutoff(share)
+    rho = lobe_cutoff(change)
     x = np.linspace(-rho, rho, 40001)
     inside = np.trapezoid(np.exp(-(x**2) / 2), x) / np.sqrt(2 * np.pi)
-    assert 2 * (1 - inside**2) == pytest.approx(share, rel=1e-3, abs=1e-9)
+    assert 2 * (1 - inside**2) == pytest.approx(change, rel=1e-3, abs=1e-9)
 
 
 @pytest.mark.few(2)
@@ -90,18 +90,18 @@ def test_truncated_lobes_keep_their_power_and_the_tolerance(coherence_length, to
     spectrum = md.precompute(random_surface(0.1, (40, 50)), coherence_length=coherence_length, tolerance=tolerance)
     grid = OrderGrid(spectrum.pixel_size, (30, 40))  # many orders, whatever the grid of the spectrum is
     grid = OrderGrid((4.0, 3.2), grid.max_order)
-    sigma, reach = spectrum.lobe_width, spectrum.cutoff_sigmas
-    for axis, lobe in enumerate(grid.lobes(sigma, reach)):
+    sigma, cutoff = spectrum.lobe_width, spectrum.cutoff_sigmas
+    for axis, lobe in enumerate(grid.lobes(sigma, cutoff)):
         q = np.zeros((20001, 2))
         end = min(lobe.half_width, 9 * sigma) * 1.5
         q[:, axis] = np.linspace(-end, end, len(q))
         held = np.zeros(len(q))
         count = np.zeros(len(q), int)
-        for row, column, weight in grid.around(q, sigma, reach):
+        for row, column, weight in grid.around(q, sigma, cutoff):
             of_mirror = (row == grid.max_order[1]) & (column == grid.max_order[0])
             held += np.where(of_mirror, weight, 0)
             count += weight > 0
-        other = grid.lobes(sigma, reach)[1 - axis]
+        other = grid.lobes(sigma, cutoff)[1 - axis]
         across = 1 / (np.sqrt(2 * np.pi) * sigma * other.inside)
         assert np.trapezoid(held, q[:, axis]) / across == pytest.approx(1, abs=1e-3)
         exact = np.exp(-(q[:, axis] ** 2) / (2 * sigma**2)) / (np.sqrt(2 * np.pi) * sigma)
@@ -129,12 +129,12 @@ def test_only_three_by_three_nodes_contribute(seed):
     rng = np.random.default_rng(seed)
     grid = SplineGrid((0.3, 0.11), (3, 5), (np.inf, np.inf))
     coefficients = rng.normal(size=grid.shape)
-    q = rng.uniform(-1, 1, (40, 2)) * (1.6, 0.9)  # … and beyond the grid
+    q = rng.uniform(-1, 1, (40, 2)) * (1.6, 0.9)  # … and outside the grid
     got = sum(weight * coefficients[row, column] for row, column, weight in grid.around(q))
     np.testing.assert_allclose(got, surface_of(grid, coefficients, q), atol=1e-10)
 
 
-def test_beyond_the_limit_a_sample_is_black():
+def test_a_sample_is_black_outside_the_nyquist_limit():
     grid = SplineGrid((0.3, 0.11), (4, 6), (0.7, 0.5))
     q = np.array([[0.7, 0.0], [0.70001, 0.0], [0.0, -0.5], [0.0, -0.50001], [-0.7, 0.5], [-0.71, 0.51]])
     total = sum(weight for _, _, weight in grid.around(q))
@@ -187,7 +187,7 @@ def build(field):
     return SliceTable.build(40, 4, LARGEST_KAPPA, powers_of(field), as_it_is, ignore)
 
 
-def test_tables_hold_the_powers_of_the_orders_where_they_belong():
+def test_tables_hold_each_order_at_its_node():
     # An asymmetric surface: rows, columns and signs cannot be exchanged unseen.
     field = random_surface(0.2)
     table = build(field)
@@ -221,19 +221,19 @@ def test_slices_interpolate_polynomials_of_their_degree_exactly(terms):
 
     table = SliceTable.build(3, terms, LARGEST_KAPPA, powers, as_it_is, ignore)
     assert (table.terms, table.intervals, table.shape) == (terms, 3, (1, 2))
-    for share in (0.0, 0.1, 1 / 3, 0.5, 0.9, 1.0):
-        np.testing.assert_allclose(table.powers(share * LARGEST_KAPPA), powers(share * LARGEST_KAPPA), atol=1e-6)
+    for kappa in LARGEST_KAPPA * np.array([0.0, 0.1, 1 / 3, 0.5, 0.9, 1.0]):
+        np.testing.assert_allclose(table.powers(kappa), powers(kappa), atol=1e-6)
 
 
 @given(seed=st.integers(0, 2**32 - 1), decades=st.integers(0, 12))
-def test_rounded_numbers_are_as_near_as_their_bits_allow(seed, decades):
+def test_rounding_errs_by_at_most_half_a_unit(seed, decades):
     values = np.random.default_rng(seed).normal(size=(2, 3, 4, 5)).astype(np.float32) * np.float32(10.0**-decades)
     values = np.clip(values, -3.9, 3.9)
     values[0, :, 0, 0] = 0
-    largest = np.abs(values).max(axis=1, keepdims=True)
+    peak = np.abs(values).max(axis=1, keepdims=True)
     error = np.abs(packed(values) - values)
     # Half a unit; with 255 or less in it, a unit is at most 1/127 of the largest, but no less than 2⁻³⁶.
-    assert (error <= np.maximum(largest / 254, 2.0**-37)).all()
+    assert (error <= np.maximum(peak / 254, 2.0**-37)).all()
     error = np.abs(halved(values) - values)
     assert (error <= np.maximum(np.abs(values) * 2.0**-11, 2.0**-28)).all()
     for rounded in (packed, halved):
@@ -244,7 +244,7 @@ def test_rounded_numbers_are_as_near_as_their_bits_allow(seed, decades):
 
 
 @pytest.mark.parametrize(("terms", "rounded"), [(3, packed), (4, halved)])
-def test_slices_are_stored_rounded_but_where_they_are_too_large(terms, rounded):
+def test_slices_are_rounded_except_intervals_with_too_large_values(terms, rounded):
     def powers(kappa):
         return np.array([[0.1 if kappa < LARGEST_KAPPA / 2 else 10.1]])
 
@@ -267,8 +267,8 @@ def test_no_density_is_negative(extent):
     field = random_surface(0.4, (16, 18))
     spectrum = md.precompute(field, extent=extent, tolerance=0.05, coherence_length=0.5)
     q = np.random.default_rng(0).uniform(-6, 6, (300, 2))
-    shares = [spectrum.powers(kappa).min() for kappa in np.linspace(0, LARGEST_KAPPA, 30)]
-    assert min(shares) < 0  # they may dip by the error
+    minima = [spectrum.powers(kappa).min() for kappa in np.linspace(0, LARGEST_KAPPA, 30)]
+    assert min(minima) < 0  # within the error
     assert spectrum.evaluate(q, np.linspace(0, LARGEST_KAPPA, 300)).min() >= 0
 
 
@@ -282,7 +282,7 @@ def test_no_density_is_negative(extent):
     ],
     ids=["flat", "nodes", "type", "infinite"],
 )
-def test_slice_tables_check_their_numbers(powers):
+def test_invalid_slice_tables_are_refused(powers):
     with pytest.raises(ValueError, match="values: got"):
         SliceTable(1.0, powers)
 
@@ -311,21 +311,21 @@ def test_a_q_that_is_no_pair_is_refused(blaze, q):
 
 
 @pytest.mark.parametrize("kappa", [-1e-9, 35.0, np.inf, np.nan])
-def test_kappa_beyond_the_wavelengths_is_refused(blaze, kappa):
+def test_kappa_outside_the_range_is_refused(blaze, kappa):
     with pytest.raises(ValueError, match=r"kappa: got .* wavelengths from 360 nm"):
         blaze.evaluate([0.0, 0.0], kappa)
     with pytest.raises(ValueError, match="kappa: got"):
         blaze.powers(kappa)
 
 
-def test_the_ends_of_the_range_are_inside(blaze):
+def test_the_ends_of_the_range_are_accepted(blaze):
     lobe = 2 * np.pi * blaze.lobe_width**2
     assert blaze.evaluate([0.0, 0.0], 0.0) * lobe == pytest.approx(1, abs=1e-4)
     wanted = np.sinc(1 - LARGEST_KAPPA * 0.25 / (2 * np.pi)) ** 2
     assert blaze.evaluate([1 / 2.5, 0.0], blaze.max_kappa) * lobe == pytest.approx(wanted, abs=2e-4)
 
 
-def test_nothing_lies_far_from_the_orders(blaze):
+def test_the_spectrum_is_zero_far_from_the_orders(blaze):
     np.testing.assert_array_equal(blaze.evaluate([[1e6, 0.0], [0.0, -1e6], [0.2, 0.0]], 20.0), 0)
 
 

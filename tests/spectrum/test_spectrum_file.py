@@ -38,7 +38,7 @@ def make(shape=(4, 7), depth=0.2, source="by hand", **arguments):
 
 
 def make_sample(shape=(10, 9), depth=0.2, source="by hand", **arguments):
-    # Four pixels of 0.07 µm: the shortest coherence that a scan of any size here carries.
+    # Four pixels of 0.07 µm: the shortest coherence length that a scan of any size supports.
     arguments = {"extent": "sample", "coherence_length": 0.2801, "tolerance": 0.05, **arguments}
     return make(shape, depth, source, **arguments)
 
@@ -56,7 +56,7 @@ def saved(request, tmp_path):
 
 
 @pytest.mark.parametrize("coherence_length", [65.0, 0.8])
-def test_a_read_spectrum_shares_the_tables_of_the_built_one(tmp_path, coherence_length):
+def test_a_loaded_spectrum_shares_the_tables_of_the_built_one(tmp_path, coherence_length):
     spectrum = make(shape=(16, 16), tolerance=0.05, coherence_length=coherence_length)
     assert isinstance(spectrum.grid, SplineGrid) == (coherence_length < 1)
     spectrum.save(tmp_path / "saved.exr")
@@ -105,7 +105,7 @@ def assert_the_same(back, spectrum):
     largest_angle=st.sampled_from([90.0, 60, 100 / 3]),
     source=st.sampled_from(["", "scan.png", "gräben [µm]", "two\nlines", "x" * 400]),
 )
-def test_a_spectrum_comes_back_bit_for_bit(
+def test_a_spectrum_is_loaded_bit_for_bit(
     tmp_path_factory, shape, depth, coherence_length, shortest, largest_angle, source
 ):
     path = tmp_path_factory.mktemp("round") / "trip.exr"
@@ -122,7 +122,7 @@ def test_a_spectrum_comes_back_bit_for_bit(
 
 
 @pytest.mark.parametrize("shape", [(1, 9), (10, 1), (10, 9), (1, 1)])
-def test_a_sample_comes_back_bit_for_bit(tmp_path, shape):
+def test_a_sample_is_loaded_bit_for_bit(tmp_path, shape):
     # An axis of one pixel has no end: its limit is infinite, in the file as well.
     spectrum = make_sample(shape)
     assert [limit == np.inf for limit in spectrum.grid.limit] == [n == 1 for n in shape[::-1]]
@@ -164,7 +164,7 @@ def test_the_header_names_all_that_a_reader_needs(tmp_path, way):
     assert header["type"] == OpenEXR.scanlineimage
 
 
-def test_channels_are_float32_and_named_after_what_they_hold(tmp_path):
+def test_channels_are_float32_with_documented_names(tmp_path):
     spectrum = make(depth=0.02)
     spectrum.save(tmp_path / "saved.exr")
     file = OpenEXR.File(str(tmp_path / "saved.exr"), separate_channels=True)
@@ -334,15 +334,15 @@ def test_files_are_read_on_several_threads(saved, capfd):
     assert capfd.readouterr() == ("", "told")
 
 
-def test_any_bit_that_flips_is_refused(saved):
+def test_any_flipped_bit_is_refused(saved):
     # Regression: of twelve flipped bits, four gave another picture without a word.
     content = saved[1].read_bytes()
     rng = np.random.default_rng(4)
-    for place in [0, len(content) - 1, *rng.integers(len(content), size=100)]:
+    for offset in [0, len(content) - 1, *rng.integers(len(content), size=100)]:
         damaged = bytearray(content)
-        damaged[place] ^= 1 << rng.integers(8)
+        damaged[offset] ^= 1 << rng.integers(8)
         saved[1].write_bytes(damaged)
-        refusal(saved[1], change=f"byte {place} was another")
+        refusal(saved[1], change=f"byte {offset} changed")
 
 
 def test_a_spectrum_without_its_digest_is_refused(saved):

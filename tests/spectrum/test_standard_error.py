@@ -42,8 +42,8 @@ def test_the_standard_error_of_speckle_is_that_of_independent_windows(coherence_
         ]
     )
     sigma = coherence_length / 4
-    places = int(np.ceil((8 - 6 * sigma) / sigma * (1 - 1e-9))) + 1
-    along = np.linspace(0, 8 - 6 * sigma, places)
+    count = int(np.ceil((8 - 6 * sigma) / sigma * (1 - 1e-9))) + 1
+    along = np.linspace(0, 8 - 6 * sigma, count)
     correlation = np.exp(-((along[:, None] - along) ** 2) / (2 * sigma**2))
     # … which both axes share.
     assert found == pytest.approx(correlation.mean(), rel=0.12)
@@ -56,7 +56,7 @@ def test_a_flat_scan_has_no_standard_error():
 
 
 def test_a_uniform_axis_adds_no_standard_error():
-    # A row of pixels: all scatter is along it, and more of it than of a square, which has more places.
+    # A row of pixels scatters more than a square, which has more positions of the window.
     rng = np.random.default_rng(1)
     heights = rng.uniform(0, 7, (120, 120))
     row, square = (
@@ -98,7 +98,7 @@ def rough():
         (np.random.default_rng(0).uniform(0, 0.5, (60, 60)), 2.4, 1e-2),
     ],
 )
-def test_the_tolerance_of_a_sample_follows_it(heights, coherence_length, tolerance):
+def test_the_default_tolerance_of_a_sample_follows_its_standard_error(heights, coherence_length, tolerance):
     spectrum = md.precompute(md.HeightField(heights, 0.08), extent="sample", coherence_length=coherence_length)
     assert spectrum.tolerance == tolerance
     assert spectrum.error <= tolerance

@@ -14,47 +14,52 @@ def flat(rows, columns, pixel):
 
 
 @pytest.mark.parametrize(
-    ("rows", "columns", "pixel", "asked", "wanted"),
+    ("rows", "columns", "pixel", "requested", "wanted"),
     [
         (100, 100, 0.0586, 65.0, 2.93),  # half of the scan
         (100, 60, 0.1, 65.0, 3.0),  # the shorter side, along x
         (60, 100, 0.1, 65.0, 3.0),  # and along y
         (100, 100, (0.1, 0.3), 65.0, 5.0),  # in micrometres, not in pixels
-        (100, 100, 0.1, 2.0, 2.0),  # what is asked for, where the scan carries it
+        (100, 100, 0.1, 2.0, 2.0),  # the requested length, if the scan supports it
         (1, 100, 0.1, 65.0, 5.0),  # an axis of one pixel sets no limit
         (100, 1, 0.1, 65.0, 5.0),
         (1, 1, 0.1, 65.0, 65.0),
         (8, 8, 0.25, 65.0, 1.0),  # four pixels are just enough
     ],
 )
-def test_a_scan_supports_half_of_its_shorter_side(rows, columns, pixel, asked, wanted):
-    assert effective_coherence_length(flat(rows, columns, pixel), asked) == pytest.approx(wanted, rel=1e-12)
+def test_a_scan_supports_half_of_its_shorter_side(rows, columns, pixel, requested, wanted):
+    assert effective_coherence_length(flat(rows, columns, pixel), requested) == pytest.approx(wanted, rel=1e-12)
 
 
 @pytest.mark.parametrize(
-    ("rows", "columns", "asked", "message"),
+    ("rows", "columns", "requested", "message"),
     [
-        (100, 7, 65.0, "coherence_length: got 65 µm, of which the scan of 0.7 × 10 µm carries 0.35; wanted at least 4"),
-        (7, 100, 65.0, "carries 0.35"),
+        (
+            100,
+            7,
+            65.0,
+            "coherence_length: got 65 µm, of which the scan of 0.7 × 10 µm supports 0.35; wanted at least 4",
+        ),
+        (7, 100, 65.0, "supports 0.35"),
         (100, 100, 0.3, r"got 0.3 µm.* wanted at least 4 pixels \(0.4 µm\)"),
-        (2, 100, 65.0, "carries 0.1"),
+        (2, 100, 65.0, "supports 0.1"),
         (1, 1, 0.0, "coherence_length: got 0.0"),
         (100, 100, np.nan, "coherence_length: got nan"),
     ],
 )
-def test_too_few_pixels_for_a_window_are_refused(rows, columns, asked, message):
+def test_too_few_pixels_for_a_window_are_refused(rows, columns, requested, message):
     with pytest.raises(ValueError, match=message):
-        effective_coherence_length(flat(rows, columns, 0.1), asked)
+        effective_coherence_length(flat(rows, columns, 0.1), requested)
 
 
 @given(
     count=st.integers(8, 300),
     pixel=st.sampled_from([0.0586, 0.1, 0.07, 1 / 3, 0.013, 2.0]),
-    share=st.floats(0.0, 1.0),
+    fraction=st.floats(0.0, 1.0),
 )
-def test_windows_are_gaussian_and_cover_the_scan(count, pixel, share):
+def test_windows_are_gaussian_and_cover_the_scan(count, pixel, fraction):
     # From four pixels to half of the scan.
-    coherence_length = (4 + share * (count / 2 - 4)) * pixel
+    coherence_length = (4 + fraction * (count / 2 - 4)) * pixel
     sigma = coherence_length / 4 / pixel  # pixels
     axis, none = window_axes(flat(1, count, (pixel, 1.0)), coherence_length)
     assert none is None
@@ -77,7 +82,7 @@ def test_windows_are_gaussian_and_cover_the_scan(count, pixel, share):
 
 
 @given(count=st.integers(8, 400), pixel=st.sampled_from([0.0586, 0.1, 0.07, 1 / 3, 0.013, 0.3]))
-def test_the_widest_windows_have_three_places(count, pixel):
+def test_the_widest_windows_have_three_positions(count, pixel):
     # Whatever rounding makes of sizes that divide evenly.
     field = flat(count, count, pixel)
     for axis in window_axes(field, effective_coherence_length(field, 65 * count)):
@@ -101,7 +106,7 @@ def test_periodograms_are_those_of_direct_sums(shape, monkeypatch):
     x, y = WindowAxis(rng.random(5), np.array([0, 2, 6])), WindowAxis(rng.random(4), np.array([0, 5]))
     # In batches of one, and of all segments at once.
     several = [mean_periodogram(wave, x, y, shape)]
-    monkeypatch.setattr("mitsuba_diffraction.spectrum.sample._BATCH", 1)
+    monkeypatch.setattr("mitsuba_diffraction.spectrum.sample._MAX_BATCH_SIZE", 1)
     several.append(mean_periodogram(wave, x, y, shape))
     rows, columns = np.arange(shape[0]), np.arange(shape[1])
     wanted = np.zeros(shape)
