@@ -1,4 +1,5 @@
-"""The command line: one file per command, which parses arguments, calls the package and prints the result.
+"""Command line: one file per command, which parses arguments, calls the package and prints the result.
+
 
 Exit codes: 0 done; 1 the work failed; 2 the request was wrong; 130 interrupted.
 """
@@ -31,7 +32,7 @@ _UsageError = typer.BadParameter.__base__
 
 
 class _Command(TyperCommand):
-    """Refuses an option that is given twice; of a list of values it may be."""
+    """Command that refuses an option given twice, unless the option takes a list of values."""
 
     def parse_args(self, context: typer.Context, arguments: list[str]) -> list[str]:
         _, _, order = self.make_parser(context).parse_args(list(arguments))
@@ -42,15 +43,17 @@ class _Command(TyperCommand):
 
 
 app = typer.Typer(add_completion=False, no_args_is_help=False, help="Diffraction gratings for Mitsuba 3.")
-# What judges the product is looked up by name: nothing depends on it.
-_JUDGES = ("compare", "convergence", "validate", "benchmark")
-_judges = (getattr(importlib.import_module(f"..evaluation.commands.{n}", __name__), n) for n in _JUDGES)
-for _command in (inspect, precompute, render, efficiency, examples, *_judges):
+# Imported by name, as no module of the product may depend on `evaluation`.
+_EVALUATION_COMMANDS = ("compare", "convergence", "validate", "benchmark")
+_evaluation = (
+    getattr(importlib.import_module(f"..evaluation.commands.{n}", __name__), n) for n in _EVALUATION_COMMANDS
+)
+for _command in (inspect, precompute, render, efficiency, examples, *_evaluation):
     app.command(cls=_Command)(_command)
 
 
-def _say_version(wanted: bool) -> None:
-    if wanted:
+def _print_version(requested: bool) -> None:
+    if requested:
         tell(f"{NAME} {metadata.version('mitsuba_diffraction')}, Mitsuba {metadata.version('mitsuba')}")
         raise typer.Exit
 
@@ -58,7 +61,7 @@ def _say_version(wanted: bool) -> None:
 @app.callback()
 def _commands(
     context: typer.Context,
-    version: Annotated[bool, typer.Option("--version", callback=_say_version, is_eager=True)] = False,
+    version: Annotated[bool, typer.Option("--version", callback=_print_version, is_eager=True)] = False,
     debug: Annotated[bool, typer.Option("--debug", help="show where an error was raised")] = False,
 ) -> None:
     """Diffraction gratings for Mitsuba 3."""
@@ -66,7 +69,10 @@ def _commands(
 
 
 class _CtrlC:
-    """Raises KeyboardInterrupt and records it: Mitsuba converts exceptions raised in a plugin into scene errors."""
+    """Handler of SIGINT that raises KeyboardInterrupt and records it.
+
+    The record is needed as Mitsuba converts exceptions raised in a plugin into errors of the scene.
+    """
 
     pressed = False
 
@@ -76,14 +82,14 @@ class _CtrlC:
 
 
 class _Log(logging.Handler):
-    """Shows what the package logs as the command's own messages."""
+    """Log handler that prints records of the package as messages of the command."""
 
     def emit(self, record: logging.LogRecord) -> None:
         say(record.levelname.lower(), record.getMessage())
 
 
 def main() -> None:
-    """Entry point of `mitsuba-diffraction`."""
+    """Run `mitsuba-diffraction`: parse the arguments, run the command, report errors and exit."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # neither file names nor terminals need be UTF-8
             stream.reconfigure(errors="backslashreplace")
@@ -92,7 +98,7 @@ def main() -> None:
     logger.addHandler(log)
     options: dict[str, bool] = {}
     ctrl_c, before = _CtrlC(), signal.getsignal(signal.SIGINT)
-    # Ctrl-C stays ignored where it is, as in background jobs of a script.
+    # If SIGINT is ignored, as in background jobs of a script, it stays ignored.
     if before is not signal.SIG_IGN:
         signal.signal(signal.SIGINT, ctrl_c)
     try:
@@ -100,16 +106,16 @@ def main() -> None:
         if code == 130:  # newer versions of Typer return this code on Ctrl-C
             raise KeyboardInterrupt
     except (Exception, KeyboardInterrupt) as error:
-        lost = ctrl_c.pressed and not isinstance(error, Stopped)
-        code = _tell(KeyboardInterrupt() if lost else error, **options)
+        converted = ctrl_c.pressed and not isinstance(error, Stopped)
+        code = _report(KeyboardInterrupt() if converted else error, **options)
     finally:
         signal.signal(signal.SIGINT, before)
         logger.removeHandler(log)
     sys.exit(code)
 
 
-def _tell(error: BaseException, debug: bool = False) -> int:
-    """Report an error on one line, after the traceback if `debug`, and returns the exit code."""
+def _report(error: BaseException, debug: bool = False) -> int:
+    """Report an error on one line, after the traceback if `debug`; return the exit code."""
     if isinstance(error, Stopped | KeyboardInterrupt | typer.Abort):
         say("interrupted", error if isinstance(error, Stopped) else "nothing was written")
         return 130
@@ -121,8 +127,8 @@ def _tell(error: BaseException, debug: bool = False) -> int:
     while error.__cause__ is not None and "(see above)" in str(error):  # Dr.Jit's message does not name the cause
         error = error.__cause__
     if isinstance(error, RequestError | FileNotFoundError | IsADirectoryError | NotADirectoryError):
-        named = isinstance(error, OSError) and error.filename and error.strerror
-        say("error", f"{error.filename}: {error.strerror.lower()}" if named else error)
+        from_system = isinstance(error, OSError) and error.filename and error.strerror
+        say("error", f"{error.filename}: {error.strerror.lower()}" if from_system else error)
         return 2
     if is_bug(type(error)):
         text = error if isinstance(error, Bug) else f"{type(error).__name__}: {error}"

@@ -1,4 +1,4 @@
-"""Arguments shared by several commands: of scenes, of outputs, of scans and the recipes equivalent to them."""
+"""Arguments shared by several commands: of scenes, of outputs, of scans and of the equivalent recipes."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ def scene_parameters(define: Sequence[str] | None) -> dict[str, str]:
             raise RequestError(f"-D {name}: got it twice, wanted one value")
         # File names on the command line are relative to the current folder. A bare word or number is not a file name,
         # even if a file of that name exists.
-        named = os.path.isfile(value) and (os.path.dirname(value) or Path(value).suffix[1:2].isalpha())
-        parameters[name] = str(Path(value).resolve()) if named else value
+        is_file = os.path.isfile(value) and (os.path.dirname(value) or Path(value).suffix[1:2].isalpha())
+        parameters[name] = str(Path(value).resolve()) if is_file else value
     return parameters
 
 
@@ -43,24 +43,24 @@ Variant = Annotated[str | None, typer.Option(help="Mitsuba variant; default: the
 
 
 def check_suffix(option: str, path: Path, *suffixes: str) -> None:
-    """Raise ValueError unless the name of an output ends in one of these."""
+    """Raise RequestError unless the name of an output ends in one of the suffixes."""
     if path.suffix.lower() not in suffixes:
         wanted = " or ".join(filter(None, [", ".join(suffixes[:-1]), suffixes[-1]]))
         raise RequestError(f"{option}: got {path}, wanted a file name that ends in {wanted}")
 
 
 def surface_of(text: str) -> tuple[str, dict[str, Value]]:
-    """Return the parts of RECIPE|PROFILE[,name=value…]; numbers, true and false are read as such."""
+    """Return source and parameters from RECIPE|PROFILE[,name=value…]; numbers, true and false are converted."""
     source, *items = text.split(",")
     values: dict[str, Value] = {}
     for name, equals, value in (item.strip().partition("=") for item in items):
         if not (name and equals and value) or name in values:
             raise RequestError(f"{text}: got {name + equals + value!r}, wanted name=value, each name once")
-        values[name] = _read(value)
+        values[name] = _converted(value)
     return source, values
 
 
-def _read(text: str) -> Value:
+def _converted(text: str) -> Value:
     for kind in (int, float):
         with suppress(ValueError):
             return kind(text)
@@ -68,7 +68,7 @@ def _read(text: str) -> Value:
 
 
 def materials_of(texts: Sequence[str] | None) -> dict[str, dict[str, Value]]:
-    """Return the parameters of the gratings that take the place of BSDFs, from the options --material ID=…."""
+    """Return the parameters of the gratings that replace BSDFs, by id, from the options --material ID=…."""
     materials: dict[str, dict[str, Value]] = {}
     for text in texts or []:
         name, equals, rest = text.partition("=")
@@ -80,7 +80,7 @@ def materials_of(texts: Sequence[str] | None) -> dict[str, dict[str, Value]]:
         is_file = Path(source).suffix.lower() in (".toml", ".exr")
         if is_file and not os.path.isfile(source):
             raise FileNotFoundError(f"{source}: no such file")
-        # The scene has a folder of its own, to which its file names are relative.
+        # Absolute, as file names in a scene are relative to the folder of the scene.
         materials[name] = {**({"filename": os.path.abspath(source)} if is_file else {"profile": source}), **values}
     return materials
 
@@ -107,7 +107,7 @@ CoherenceLength = Annotated[
 
 
 def options_of_scan(context: typer.Context) -> dict[str, object]:
-    """Return the options of a scan that the command was given, under their names in recipes."""
+    """Return the given options of a scan, under their names in recipes."""
     given = _given(context, ("pixel_size", "height_range", "fill_missing", "channel", "unit", "prepare"))
     if len(unit := given.get("unit", ())) == 1:
         given["unit"] = unit[0]
@@ -116,17 +116,18 @@ def options_of_scan(context: typer.Context) -> dict[str, object]:
 
 
 def settings_of(context: typer.Context) -> dict[str, Any]:
-    """Return the options of the spectrum that the command was given, under their names in `Settings`."""
+    """Return the given options of the spectrum, under their names in `Settings`."""
     return _given(context, [field.name for field in fields(Settings)])
 
 
 def _given(context: typer.Context, names: Iterable[str]) -> dict[str, Any]:
-    # A number may be zero, which is refused elsewhere.
+    # Zero counts as given: it is checked where it is used.
     return {n: value for n in names if (value := context.params.get(n)) not in (None, ()) and value is not False}
 
 
 def recipe_of(source: Path, of_scan: dict[str, Any], settings: dict[str, Any]) -> Recipe:
-    """Return the recipe in a file, or the one equivalent to a scan; `settings` take the place of those of a file."""
+    """Return the recipe in a file, or the one equivalent to a scan; `settings` override those of a file."""
+
     if source.suffix.lower() != ".toml":
         return Recipe({"scan": source.name, **of_scan}, Settings(**settings), source.parent)
     if of_scan:

@@ -17,7 +17,7 @@ from ..recipe import Recipe
 from ..surface.gratings import PROFILES
 from .arguments import Overwrite, check_suffix, surface_of
 
-_MOST = 10_000
+_MAX_VALUES = 10_000  # of a range first:last:step
 
 
 def efficiency(
@@ -89,17 +89,18 @@ def efficiency(
 
 
 def _numbers(option: str, text: str) -> NDArray[np.float64]:
-    """Return the numbers of "30", "0,30,60" or "0:60:5", the last included, (n,).
+    """Return the numbers in "30", "0,30,60" or "0:60:5" (60 included), (n,).
 
     Raises:
-        ValueError: if the text is none of these, or has more than 10,000 numbers.
+        ValueError: if the text has another form, or more than 10,000 numbers.
+
     """
     try:
         if ":" not in text:
             return np.array([float(part) for part in text.split(",")])
         first, last, step = (float(part) for part in text.split(":"))
         count = (last - first) / step
-        if not 0 <= count < _MOST:
+        if not 0 <= count < _MAX_VALUES:
             raise ValueError
         return first + step * np.arange(int(count + 1e-9) + 1)
     except (ValueError, ZeroDivisionError):

@@ -13,14 +13,14 @@ from ..progress import tell
 from .arguments import Overwrite
 
 _PACKAGE = Path(__file__).parents[1]
-# In a checkout the folders lie beside the package; setup.py copies them into it.
+# In a checkout the folders are beside the package; setup.py copies them into it.
 _SOURCE = next((root for root in (_PACKAGE / "examples", _PACKAGE.parent) if (root / "scenes").is_dir()), None)
-_LEFT = {"models", "out", "__pycache__"}
-"""Folders with what scripts and renderings left in a checkout."""
+_OUTPUT_FOLDERS = {"models", "out", "__pycache__"}
+"""Folders in a checkout that hold outputs of scripts and renderings."""
 
 
 def examples(
-    folder: Annotated[Path, typer.Argument(metavar="[DIR]", help="where to; made if it is not there")] = Path(),
+    folder: Annotated[Path, typer.Argument(metavar="[DIR]", help="target folder; created if missing")] = Path(),
     overwrite: Overwrite = False,
 ) -> None:
     """Copy the scenes, recipes and measured skins that the package brings."""
@@ -45,7 +45,7 @@ def examples(
 def _files(root: Path) -> list[Path]:
     """Return the files of the examples, relative to `root`."""
     found = [path.relative_to(root) for name in ("scenes", "precompute") for path in sorted((root / name).rglob("*"))]
-    left = {path for path in found if _LEFT & set(path.parts) or path.name.startswith(".")}
-    # Beside scenes and recipes lie earlier renderings and spectra; deeper down, textures.
-    left |= {path for path in found if path.suffix == ".exr" and len(path.parts) == 2}
-    return [path for path in found if path not in left and (root / path).is_file()]
+    excluded = {path for path in found if _OUTPUT_FOLDERS & set(path.parts) or path.name.startswith(".")}
+    # .exr files beside scenes and recipes are renderings and spectra; those in subfolders are textures.
+    excluded |= {path for path in found if path.suffix == ".exr" and len(path.parts) == 2}
+    return [path for path in found if path not in excluded and (root / path).is_file()]

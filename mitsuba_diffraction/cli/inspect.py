@@ -61,8 +61,8 @@ def inspect(
         settings.setdefault("extent", "sample")
     recipe = recipe_of(source, options_of_scan(context), settings)
     reads = [source, *recipe.files]
-    by_default = free_name(f"{source.stem}_inspect", lambda stem: [Path(f"{stem}.png")], reads)
-    picture = output or Path(f"{by_default}.png")
+    default_name = free_name(f"{source.stem}_inspect", lambda stem: [Path(f"{stem}.png")], reads)
+    picture = output or Path(f"{default_name}.png")
     check_suffix("-o", picture, ".png", ".pdf", ".svg")
     check_outputs(reads, [("-o", picture), *([("--json", json)] if json else [])], overwrite=overwrite)
     height_field = recipe.height_field()
@@ -88,15 +88,15 @@ def inspect(
 
 
 def _table(inspection: Inspection) -> Table:
-    shown = Table(box=None, show_header=False, pad_edge=False)
-    shown.add_column(style="bold", no_wrap=True)
-    shown.add_column()
-    for name, value in [*_surface(inspection), *_light(inspection)]:
-        shown.add_row(name, Text(value))  # file names are not markup
-    return shown
+    rows = Table(box=None, show_header=False, pad_edge=False)
+    rows.add_column(style="bold", no_wrap=True)
+    rows.add_column()
+    for name, value in [*_surface_lines(inspection), *_diffraction_lines(inspection)]:
+        rows.add_row(name, Text(value))  # Text: file names are not markup
+    return rows
 
 
-def _surface(inspection: Inspection) -> list[tuple[str, str]]:
+def _surface_lines(inspection: Inspection) -> list[tuple[str, str]]:
     field, numbers = inspection.height_field, inspection.statistics
     rows, columns = field.shape
     kind = "periodic tile" if inspection.extent == "tile" else "sample of a larger surface"
@@ -119,29 +119,29 @@ def _surface(inspection: Inspection) -> list[tuple[str, str]]:
     ]
 
 
-def _light(inspection: Inspection) -> list[tuple[str, str]]:
+def _diffraction_lines(inspection: Inspection) -> list[tuple[str, str]]:
     lines = []
     for number, period in enumerate(inspection.periods):
-        where = f"{with_uncertainty(period.direction, period.direction_uncertainty)}° from x"
+        direction = f"{with_uncertainty(period.direction, period.direction_uncertainty)}° from x"
         name = "period" if number == 0 else "another period"
-        what = f"{with_uncertainty(period.period, period.period_uncertainty)} µm along {where}"
-        lines.append((name, f"{what}; {period.strength:.1%} of the variance"))
+        length = f"{with_uncertainty(period.period, period.period_uncertainty)} µm along {direction}"
+        lines.append((name, f"{length}; {period.strength:.1%} of the variance"))
     if not inspection.periods:
-        one = " (for a single period of a grating: --extent tile)" if inspection.extent == "sample" else ""
-        lines.append(("period", f"none stands out{one}"))
+        hint = " (for a single period of a grating: --extent tile)" if inspection.extent == "sample" else ""
+        lines.append(("period", f"none stands out{hint}"))
     else:
         sines = [order * GREEN / inspection.periods[0].period for order in range(1, 4)]
         angles = ", ".join(f"{math.degrees(math.asin(sine)):.1f}°" for sine in sines if sine < 1)
-        where = f"{angles} (orders 1, 2, … at normal incidence)"
-        lines.append(("550 nm goes to", where if angles else "no angle: the period is shorter than the wavelength"))
+        orders = f"{angles} (orders 1, 2, … at normal incidence)"
+        lines.append(("550 nm goes to", orders if angles else "no angle: the period is shorter than the wavelength"))
     lobe = math.degrees(GREEN * lobe_width(inspection.coherence_length))
     length = f"{inspection.coherence_length:.3g} µm"
     if inspection.extent == "sample":
         length += f" (largest for this scan: {inspection.max_coherence_length:.3g}; sunlight: {SUN_COHERENCE_LENGTH:g})"
     lines.append(("coherence length", f"{length}: at 550 nm an order is ±{lobe:.2g}° wide (1 σ)"))
     if inspection.standard_error is not None:
-        known = f"{inspection.standard_error:.2g} of the reflected power, as the scatter within this one scan tells"
-        lines.append(("standard error", known))
+        error = f"{inspection.standard_error:.2g} of the reflected power, estimated from the scatter within this scan"
+        lines.append(("standard error", error))
     lines.append(("scalar theory", str(inspection.scalar_error)))
     if inspection.piece is not inspection.height_field:
         x, y = inspection.piece.tile_size
@@ -153,8 +153,8 @@ def _light(inspection: Inspection) -> list[tuple[str, str]]:
 def _changes_table(inspection: Inspection) -> Table:
     before = inspection.changes[0].before
     columns = ["5 % more or less of", "period"]
-    for order, share in before.items():
-        columns += [f"power in orders\n±{order}, {share:.3g}", "their colour"]
+    for order, fraction in before.items():
+        columns += [f"power in orders\n±{order}, {fraction:.3g}", "their colour"]
     rows = []
     for change in inspection.changes:
         name = f"{change.what} {change.by:+.0%}"
@@ -162,9 +162,9 @@ def _changes_table(inspection: Inspection) -> Table:
             kind = "blunter" if change.tip_radius > 0 else "sharper"
             name += f" (tip {kind} by {abs(change.tip_radius) * 1e3:.0f} nm)"
         row = [name, f"{change.period:+.1%}"]
-        for order, share in before.items():
+        for order, fraction in before.items():
             row += [
-                f"{change.after[order] / share - 1:+.1%}" if share > 0 else "",
+                f"{change.after[order] / fraction - 1:+.1%}" if fraction > 0 else "",
                 f"ΔE00 {change.colour[order]:.1f}",
             ]
         rows.append(row)

@@ -78,11 +78,11 @@ def precompute(
     targets = [output or Path(source.name or "spectrum").with_suffix(".exr") for source in sources]
     for target in targets:
         check_suffix("-o", target, ".exr")
-    longest = SUN_COHERENCE_LENGTH if coherence_length is None else coherence_length
-    if pixel_size is not None and pixel_size > longest:
+    max_pixel_size = SUN_COHERENCE_LENGTH if coherence_length is None else coherence_length
+    if pixel_size is not None and pixel_size > max_pixel_size:
         raise RequestError(
-            f"--pixel-size: got {pixel_size:g} µm, wanted at most the coherence length, {longest:g} µm: light that "
-            "interferes would meet a single height"
+            f"--pixel-size: got {pixel_size:g} µm, wanted at most the coherence length, {max_pixel_size:g} µm: with "
+            "larger pixels there is a single height within the coherence length, and no diffraction"
         )
     recipes = [recipe_of(source, options_of_scan(context), settings_of(context)) for source in sources]
     reads = [*sources, *(file for recipe in recipes for file in recipe.files)]
@@ -95,24 +95,24 @@ def precompute(
             spectrum.save(target)
         tell(
             f"{target}: {spectrum.source}; {spectrum.extent}, {spectrum.grid}; coherence length "
-            f"{spectrum.coherence_length:.4g} µm; {_table(spectrum)}{seam}"
+            f"{spectrum.coherence_length:.4g} µm; {_table_summary(spectrum)}{seam}"
         )
         if isinstance(spectrum, GratingSpectrum) and spectrum.warning:
             tell(f"! {spectrum.warning}")
 
 
-def _table(spectrum: Spectrum) -> str:
-    size, asked = f"{spectrum.megabytes:.3g} MB", f"(tolerance {spectrum.tolerance:.3g})"
+def _table_summary(spectrum: Spectrum) -> str:
+    size, tolerance = f"{spectrum.megabytes:.3g} MB", f"(tolerance {spectrum.tolerance:.3g})"
     if isinstance(spectrum, RigorousSpectrum):
         return (
-            f"rigorous, {spectrum.material_name}, {size}, mean error {spectrum.error:.1e} {asked}\n"
-            f"worst error {spectrum.max_error:.1e} of the reflected light, {spectrum.max_error_near:.1e} beside an "
-            "order at its Rayleigh anomaly"
+            f"rigorous, {spectrum.material_name}, {size}, mean error {spectrum.error:.1e} {tolerance}\n"
+            f"maximum error {spectrum.max_error:.1e} of the reflected light, {spectrum.max_error_near:.1e} near a "
+            "Rayleigh anomaly"
             + ("" if spectrum.mueller is None else f"; Mueller matrices, mean {spectrum.polarisation_error:.1e}")
         )
     scatter = f", standard error of one scan {spectrum.standard_error:.2g}" if spectrum.extent == "sample" else ""
     return (
-        f"{spectrum.representation}, {size}, error {spectrum.error:.1e} {asked}{scatter}\n"
+        f"{spectrum.representation}, {size}, error {spectrum.error:.1e} {tolerance}{scatter}\n"
         f"truncated, at most: {spectrum.truncated_power:.1e} of the power at weak frequencies; "
         f"{spectrum.unresolved_power:.1e} at frequencies that no direction reaches or no pixel resolves"
     )

@@ -22,7 +22,7 @@ _log = logging.getLogger(__name__)
 
 
 class Stopped(Exception):
-    """Ctrl-C after something has been saved; the text says what."""
+    """Interruption by Ctrl-C after something has been saved; the text names it."""
 
 
 def render(
@@ -43,7 +43,7 @@ def render(
         list[str] | None,
         typer.Option(
             metavar="ID=RECIPE|PROFILE[,name=value…]",
-            help="put a grating in the place of the BSDF of that id; name=value: its parameters",
+            help="replace the BSDF with that id by a grating; name=value: its parameters",
         ),
     ] = None,
     until_error: Annotated[
@@ -57,13 +57,13 @@ def render(
     denoise: Annotated[
         bool | None,
         typer.Option(
-            help="denoise the preview, but not the spectral picture (extra: denoise); default: as the scene says, or no"
+            help="denoise the preview, but not the spectral picture (extra: denoise); default: as in the scene, or no"
         ),
     ] = None,
     dask: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="distribute the passes over a Dask cluster (tcp://HOST:PORT)")
     ] = None,
-    # At most a tenth of a degree apart, five minutes.
+    # 3600 frames are a tenth of a degree apart, and last five minutes.
     frames: Annotated[int | None, typer.Option(min=2, max=3600, metavar="N", help="frames of an orbit")] = None,
     orbit: Annotated[bool, typer.Option("--orbit", help="orbit the scene once")] = False,
     overwrite: Overwrite = False,
@@ -84,15 +84,16 @@ def render(
         raise RequestError("--frames N and --orbit go together")
     where: dict[str, Any] = {"parameters": scene_parameters(define), "materials": materials_of(material)}
     reads = files_of_scene(scene, **where)
-    target = output or Path(free_name(scene.stem, lambda stem: _written(Path(f"{stem}.exr"), frames), reads) + ".exr")
-    check_outputs(reads, [("-o", path) for path in _written(target, frames)], overwrite=overwrite)
-    if waiting := [path for path in map(checkpoint_path, _pictures(target, frames)) if path.exists() and not resume]:
+    target = output or Path(free_name(scene.stem, lambda stem: _outputs(Path(f"{stem}.exr"), frames), reads) + ".exr")
+    check_outputs(reads, [("-o", path) for path in _outputs(target, frames)], overwrite=overwrite)
+    checkpoints = [path for path in map(checkpoint_path, _pictures(target, frames)) if path.exists()]
+    if checkpoints and not resume:
         raise RequestError(
-            f"{waiting[0]} is of an unfinished rendering: --resume continues it; remove it to start over"
+            f"{checkpoints[0]} is of an unfinished rendering: --resume continues it; remove it to start over"
         )
     mi.set_variant(choose_variant(variant))
     if denoise is None:
-        denoise = _denoises(scene)
+        denoise = _requests_denoising(scene)
     spp = spp or named_sample_count(scene, where["parameters"]) or 64
     tracer = trace_locally if dask is None else trace_on(dask)
     motions = [None] if frames is None else motions_of_orbit(scene, frames, **where)
@@ -129,8 +130,8 @@ def _render(
         )
 
 
-def _denoises(scene: Path) -> bool:
-    """Return whether a scene says that its preview is denoised, and it can be; else log a line."""
+def _requests_denoising(scene: Path) -> bool:
+    """Return whether a scene requests a denoised preview; if it cannot be denoised, log a warning and return False."""
     from ..render.denoise import check_requirements, is_requested
 
     if not is_requested(scene):
@@ -138,7 +139,7 @@ def _denoises(scene: Path) -> bool:
     try:
         check_requirements()
     except RequestError as error:
-        _log.warning("%s; the scene asks for a denoised preview, this one is not", error)
+        _log.warning("%s; the scene requests a denoised preview, but this one is not denoised", error)
         return False
     return True
 
@@ -151,8 +152,8 @@ def _pictures(target: Path, frames: int | None) -> list[Path]:
     return [target.with_name(f"{target.stem}_{frame:0{digits}d}{target.suffix}") for frame in range(frames)]
 
 
-def _written(target: Path, frames: int | None) -> list[Path]:
-    """Return everything that the command writes."""
+def _outputs(target: Path, frames: int | None) -> list[Path]:
+    """Return all files that the command writes."""
     pictures = _pictures(target, frames)
     return [*pictures, *(p.with_suffix(".png") for p in pictures), *([target.with_suffix(".webp")] if frames else [])]
 
@@ -170,12 +171,13 @@ def _picture(
     exposure: float | None,
     complete: str | None,
 ) -> float:
-    """Render, save and report one picture; return the exposure of its preview, which None leaves to be chosen.
+    """Render, save and report one picture; return the exposure of its preview.
 
     Args:
         where: parameters, materials, size and motion, for `load_spectral_scene`.
         request: the other arguments of `passes.render`.
-        complete: which pictures there are already, should Ctrl-C interrupt this one.
+        exposure: of the preview; None: `auto_exposure`.
+        complete: number of completed pictures, as text to report if Ctrl-C interrupts this one.
     """
     from ..render.denoise import guides
     from ..render.passes import Interrupted, checkpoint_path
@@ -184,18 +186,18 @@ def _picture(
     from ..render.spectral_image import SpectralImage, save_preview
 
     start = time.perf_counter()
-    waiting, preview = checkpoint_path(path), path.with_suffix(".png")
-    earlier = SpectralImage.load(path) if resume and path.is_file() and not waiting.exists() else None
+    checkpoint, preview = checkpoint_path(path), path.with_suffix(".png")
+    earlier = SpectralImage.load(path) if resume and path.is_file() and not checkpoint.exists() else None
     guide = guides(load_spectral_scene(scene, **where)) if denoise else None
     interrupted = False
     try:
         with progress_bar(label, "spp", "loading and compiling") as progress:
-            image = trace(scene, **where, **request, checkpoint=waiting, finished=earlier, progress=progress)
+            image = trace(scene, **where, **request, checkpoint=checkpoint, finished=earlier, progress=progress)
     except Interrupted as error:
         image, interrupted = error.image, True
     except KeyboardInterrupt:
-        if waiting.exists():
-            complete = f"{waiting} holds the samples so far"
+        if checkpoint.exists():
+            complete = f"{checkpoint} holds the samples so far"
         if complete is None:
             raise
         raise Stopped(f"{complete}; the same command with --resume continues") from None
@@ -204,12 +206,12 @@ def _picture(
             image.save(path, half=half)
         exposure = save_preview(image, preview, exposure, guide)
     except (OSError, RuntimeError) as error:
-        kept = f"; {waiting} is kept, and --resume continues from it" if waiting.exists() else ""
+        kept = f"; {checkpoint} is kept, and --resume continues from it" if checkpoint.exists() else ""
         raise RuntimeError(f"{path} or its preview cannot be written ({error}){kept}") from error
     if interrupted:
         spp = image.attributes["spp"]
         raise Stopped(f"{path} holds {spp} samples per pixel; the same command with --resume continues")
-    discard(waiting)
+    discard(checkpoint)
     tell(
         f"{path}: {_summary(image, request['until_error'])}, "
         f"{time.perf_counter() - start:.1f} s, {path.stat().st_size / 1e6:.3g} MB\n"
@@ -220,8 +222,8 @@ def _picture(
 
 def _summary(image: SpectralImage, until_error: float | None) -> str:
     """Return size, samples and noise of a picture."""
-    rows, columns, bins = image.radiance.shape
-    text = f"{columns} × {rows} pixels, {bins} wavelengths, {image.attributes['spp']} samples per pixel"
+    rows, columns, channels = image.radiance.shape
+    text = f"{columns} × {rows} pixels, {channels} wavelengths, {image.attributes['spp']} samples per pixel"
     if "error" in image.attributes:
         text += f", relative error of luminance at most {image.attributes['error']:.2g} in 90 % of the pixels"
         if until_error is not None and image.attributes["error"] > until_error:

@@ -141,7 +141,7 @@ def test_a_scene_that_asks_for_it_renders_without_the_denoiser(command, tmp_path
     monkeypatch.setitem(sys.modules, "pyoidn", None)
     code, _, err = command("render scene.xml --variant llvm_ad_spectral --spp 1 -o picture.exr")
     assert code == 0
-    assert "pip install 'mitsuba_diffraction[denoise]'; the scene asks for a denoised preview" in err
+    assert "pip install 'mitsuba_diffraction[denoise]'; the scene requests a denoised preview" in err
     assert Path("picture.png").is_file()
 
 
