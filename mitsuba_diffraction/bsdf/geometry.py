@@ -279,7 +279,7 @@ class Geometry:
 
         The gain compensates the part of the lobe below the horizon, and is zero where the order does not propagate.
         With σ the width of the lobe in direction cosines, x = cos² θ/2σ is the distance from the horizon in standard
-        deviations. The gain is Γ(x_i) Γ(x_o) (`geometry.horizon_gain`), x_i the minimum over ω_i and the order of
+        deviations. The gain is g(x_i) g(x_o) (g: `geometry.horizon_gain`), x_i the minimum over ω_i and the order of
         ω_i, x_o likewise: it is reciprocal, and an order has its full power from its Rayleigh anomaly on.
 
         Args:
