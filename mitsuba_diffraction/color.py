@@ -26,7 +26,7 @@ _OBSERVER = "CIE 1931 2 Degree Standard Observer"
 def matching_functions(wavelengths: ArrayLike) -> NDArray[np.float64]:
     """Return x̄, ȳ, z̄ of the CIE 1931 2° observer at wavelengths (n,) in nm: (n, 3).
 
-    They are linear between its wavelengths and constant beyond them.
+    They are interpolated linearly between the wavelengths of the observer and constant outside.
     """
     import colour
 
@@ -130,8 +130,8 @@ def into_gamut(rgb: NDArray[np.floating]) -> NDArray[np.float64]:
     luminance = np.maximum(luminance, 0.0)[..., None]
     min_value = np.minimum(rgb.min(axis=-1, keepdims=True), 0.0)
     span = luminance - min_value
-    share = np.divide(luminance, span, out=np.zeros_like(span), where=span > 0)
-    return np.maximum(luminance + share * (rgb - luminance), 0.0)
+    t = np.divide(luminance, span, out=np.zeros_like(span), where=span > 0)
+    return np.maximum(luminance + t * (rgb - luminance), 0.0)
 
 
 _SHOULDER_START = 0.8
@@ -141,7 +141,7 @@ _WHITENING = 0.15  # a pixel ten times too bright is desaturated by 58 %
 def roll_off(rgb: NDArray[np.floating]) -> NDArray[np.float64]:
     """Compress highlights into [0, 1] without a shift of hue.
 
-    The brightest channel p of a pixel is unchanged up to 0.8 and beyond follows 1 − d²/(p + d − 0.8), d = 0.2, which is
+    The brightest channel p of a pixel is unchanged up to 0.8 and becomes 1 − d²/(p + d − 0.8) above, d = 0.2, which is
     smooth and tends to 1; the other channels are scaled equally. Very bright pixels are then desaturated. This is the
     Khronos PBR Neutral tone mapper (Khronos Group, 2024) without its toe, which applies to dielectric surfaces. Both
     are linear sRGB, (..., 3), not negative.

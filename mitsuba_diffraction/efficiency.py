@@ -1,4 +1,4 @@
-"""The efficiencies of the orders of a grating over angles and wavelengths, in either theory, as arrays and a plot."""
+"""The efficiencies of the orders of a grating over angles and wavelengths, by either theory, as arrays and plots."""
 
 from __future__ import annotations
 
@@ -29,22 +29,22 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 POLARISATIONS = ("s", "p")
-_MOST_ORDERS = 1000  # scalar theory compares each with all others, for E
-_ROWS, _COLUMNS = 24, 8  # of a table that is printed
-_LINES, _MAPS = 7, 6  # of a plot
+_MAX_ORDERS = 1000  # in scalar theory, which evaluates all pairs of orders for E
+_MAX_ROWS, _MAX_COLUMNS = 24, 8  # of a printed table
+_MAX_LINES, _MAX_MAPS = 7, 6  # of a plot
 
 
 @dataclass(frozen=True, eq=False)
 class OrderEfficiencies:
-    """The share of the incident light that goes to each order of a grating.
+    """The fraction of the incident power in each order of a grating.
 
     Attributes:
-        values: (order, angle, wavelength, polarisation), that of s- before that of p-polarised incident light; 0 where
-            an order does not propagate.
+        values: (order, angle, wavelength, polarisation), s- before p-polarised incident light; 0 where an order does
+            not propagate.
         orders: m, (n,), ascending; of a tile that varies along x and y (m_x, m_y), (n, 2).
         angles: of incidence, degrees, (a,).
         wavelengths: nm, in vacuum, (w,).
-        source: what was computed, as text.
+        source: description of the surface, material and theory.
     """
 
     values: Array
@@ -72,7 +72,7 @@ class OrderEfficiencies:
         """Return the efficiencies of one order, (angle, wavelength, polarisation).
 
         Raises:
-            ValueError: if it propagates nowhere, or a tile that varies along x and y is not asked for (m_x, m_y).
+            ValueError: if it propagates nowhere, or is one number for a tile that varies along x and y.
         """
         orders = self.axes["order"]
         wanted = m[0] if len(m) == 1 else m
@@ -81,8 +81,8 @@ class OrderEfficiencies:
         return self.values[orders.index(wanted)]
 
     def __str__(self) -> str:
-        """Return a table of unpolarised light: a row for each angle and wavelength, a column for each strong order."""
-        kept = np.sort(self._strongest(_COLUMNS))
+        """Return a table for unpolarised light: a row for each angle and wavelength, a column for each strong order."""
+        kept = np.sort(self._strongest(_MAX_COLUMNS))
         names = [_name(self.axes["order"][index]) for index in kept]
         width = max(8, *(len(name) + 2 for name in names))
         rows = [
@@ -90,11 +90,13 @@ class OrderEfficiencies:
             for angle, of_angle in zip(self.angles, np.moveaxis(self.unpolarised, 0, -1), strict=True)
             for wavelength, of_all in zip(self.wavelengths, of_angle, strict=True)
         ]
-        lines = ["".join(f"{cell:>{width}}" for cell in row) for row in [["angle", "λ", *names, "sum"], *rows[:_ROWS]]]
-        if len(rows) > _ROWS:
+        lines = [
+            "".join(f"{cell:>{width}}" for cell in row) for row in [["angle", "λ", *names, "sum"], *rows[:_MAX_ROWS]]
+        ]
+        if len(rows) > _MAX_ROWS:
             lines.append(f"… {len(rows)} rows")
-        if len(self.orders) > _COLUMNS:
-            lines.append(f"the {_COLUMNS} strongest of {len(self.orders)} orders; the sum is of all")
+        if len(self.orders) > _MAX_COLUMNS:
+            lines.append(f"the {_MAX_COLUMNS} strongest of {len(self.orders)} orders; the sum is of all")
         return "\n".join([f"{self.source}; unpolarised, % of the incident light", *lines])
 
     __repr__ = __str__
@@ -107,7 +109,7 @@ class OrderEfficiencies:
         """Write a row for each order, angle and wavelength.
 
         Raises:
-            FileNotFoundError: if the folder is not there.
+            FileNotFoundError: if the folder does not exist.
         """
         with whole_file(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as stream:
             rows = csv.writer(stream)
@@ -122,7 +124,7 @@ class OrderEfficiencies:
     def plot(self, path: str | os.PathLike[str] | None = None) -> Figure:
         """Plot the strongest orders; lines over the wavelength or the angle, or if both vary, a map for each order.
 
-        The figure is returned and, if there is a path, written: PNG, PDF or SVG.
+        Returns the figure, and writes it as PNG, PDF or SVG if a path is given.
         """
         from matplotlib.figure import Figure
 
@@ -139,7 +141,7 @@ class OrderEfficiencies:
         x = self.wavelengths if over_wavelengths else self.angles
         values = self.values[:, 0] if over_wavelengths else self.values[:, :, 0]
         axes = figure.add_subplot()
-        for number, index in enumerate(self._strongest(_LINES)):
+        for number, index in enumerate(self._strongest(_MAX_LINES)):
             own = {"color": f"C{number}", "marker": "." if len(x) < 30 else None}
             axes.plot(x, values[index].mean(axis=-1), **own, label=f"order {_name(self.axes['order'][index])}")
             axes.plot(x, values[index, :, 0], "--", color=own["color"], lw=0.8)
@@ -155,10 +157,10 @@ class OrderEfficiencies:
     def _plot_maps(self, figure: Figure) -> None:
         from matplotlib.colors import PowerNorm
 
-        kept = self._strongest(_MAPS)
+        kept = self._strongest(_MAX_MAPS)
         columns = min(3, len(kept))
         grid = np.ravel(figure.subplots(-(-len(kept) // columns), columns, sharex=True, sharey=True, squeeze=False))
-        scale = PowerNorm(0.5, 0, self.unpolarised[kept].max() or 1.0)  # weak orders can be seen, too
+        scale = PowerNorm(0.5, 0, self.unpolarised[kept].max() or 1.0)  # shows weak orders, too
         for axes, index in zip(grid, kept, strict=False):
             of_order = self.unpolarised[index]
             shown = axes.pcolormesh(self.wavelengths, self.angles, of_order, norm=scale, shading="nearest")
@@ -191,7 +193,8 @@ def efficiencies(
 ) -> OrderEfficiencies:
     """Compute the efficiencies of the reflected or transmitted orders of a grating in air.
 
-    Light at the angle θ_i comes from above, from −x. An order at θ_m, positive towards −x, in a medium of index n_o has
+    Light is incident from above at the angle θ_i, from −x. An order at θ_m, positive towards −x, in a medium of index
+    n_o has
 
         sin θ_i + n_o sin θ_m = m λ/T    (azimuth 0).
 
@@ -200,20 +203,20 @@ def efficiencies(
     Maxwell's equations (`rigorous.efficiencies`).
 
     Args:
-        height_field: one period of a surface that repeats; of rigorous theory a profile, h(x).
+        height_field: one period of a periodic surface; for rigorous theory a profile, h(x).
         angles: of incidence, degrees, one or (a,), above −90 and below 90.
         wavelengths: nm, in vacuum, one or (w,).
         theory: "scalar" or "rigorous".
         material: a conductor by Mitsuba's name, "Al"; or "none", the perfect mirror R = 1, in scalar theory.
         int_ior: or an index of refraction, or n + ik; 1.5 if neither is given, as in a scene.
-        transmission: "none", the reflected orders; "interface", those that enter the dielectric; "sheet", those that
-            leave a film of it through its flat face, n_o = 1: in rigorous theory with all bounces inside.
+        transmission: "none": reflected orders; "interface": orders transmitted into the dielectric; "sheet": orders
+            transmitted by a film with a flat lower face, n_o = 1, in rigorous theory with all internal reflections.
         azimuth: of the plane of incidence, degrees from the x axis; 90: along the grooves (conical incidence).
         progress: called with (steps done, steps in all).
 
     Raises:
-        ValueError: if an argument is out of range; of scalar theory if more than 1000 orders propagate; of rigorous
-            theory as `rigorous.efficiencies`.
+        ValueError: if an argument is out of range; in scalar theory, if more than 1000 orders propagate; in rigorous
+            theory, as `rigorous.efficiencies`.
 
     Warns:
         UserWarning: as `rigorous.efficiencies`.
@@ -249,29 +252,31 @@ def efficiencies(
     orders = sorted(found)
     what = material if material is not None else f"n = {int_ior:g}"
     plane = f", plane of incidence at {azimuth:g}°" if azimuth else ""
-    passed = {"none": "", "interface": ", transmitted orders inside", "sheet": ", transmitted by a sheet"}[transmission]
+    transmitted = {"none": "", "interface": ", transmitted orders inside", "sheet": ", transmitted by a sheet"}[
+        transmission
+    ]
     return OrderEfficiencies(
         np.stack([found[m] for m in orders]),
         np.array(orders)[:, 0] if profile else np.array(orders),
         angles,
         wavelengths,
-        f"{height_field.source}; {what}, {theory} theory{passed}{plane}",
+        f"{height_field.source}; {what}, {theory} theory{transmitted}{plane}",
     )
 
 
 _Found = tuple[NDArray[np.int64], Array, Array]
 """Orders, their efficiencies of s- and of p-polarised light."""
 _Solve = Callable[[float, float, complex], _Found]
-"""(angle in degrees, wavelength in µm, index) → what is found."""
+"""(angle in degrees, wavelength in µm, index) → orders and efficiencies."""
 
 
 def _scalar(height_field: HeightField, azimuth: float, shortest: float, transmission: str) -> _Solve:
     x, y = height_field.tile_size
     profile = height_field.shape[0] == 1
-    if (count := 2 * x / shortest if profile else np.pi * x * y / shortest**2) > _MOST_ORDERS:
+    if (count := 2 * x / shortest if profile else np.pi * x * y / shortest**2) > _MAX_ORDERS:
         raise RequestError(
             f"height field: got about {count:.0f} orders of a tile of {x:.4g} × {y:.4g} µm at {1e3 * shortest:g} nm, "
-            f"wanted at most {_MOST_ORDERS}: one period of a grating"
+            f"wanted at most {_MAX_ORDERS}: one period of a grating"
         )
     powers = profile_powers(height_field) if profile else tile_powers(height_field, shortest)
     period = x if profile else (x, y)
@@ -297,8 +302,8 @@ def _rigorous(height_field: HeightField, azimuth: float, shortest: float, transm
         if transmission == "interface":
             return found.transmitted_orders, *(np.abs(found.transmitted_amplitudes) ** 2).sum(axis=1).T
         k_0 = height_field.tile_size[0] / wavelength
-        orders, sent = sheet_orders(curve_of(height_field), np.array(direction), k_0, index.real, found.harmonics)
-        return orders, *sent.T
+        orders, powers = sheet_orders(curve_of(height_field), np.array(direction), k_0, index.real, found.harmonics)
+        return orders, *powers.T
 
     return solve
 

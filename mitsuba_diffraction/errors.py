@@ -7,10 +7,10 @@ import re
 import sys
 from numbers import Real
 
-# An exception in a Python plugin comes as text: where the scene names the plugin, lines that are indented, then the
-# class of the exception and its message.
+# Mitsuba reports an exception of a Python plugin as text: the location of the plugin in the scene, indented lines of
+# the traceback, then the class of the exception and its message.
 _OF_PLUGIN = re.compile(
-    r'(?:At (?P<place>.+): failed to instantiate .+ plugin of type "(?P<plugin>\w+)": )?'
+    r'(?:At (?P<location>.+): failed to instantiate .+ plugin of type "(?P<plugin>\w+)": )?'
     r"Traceback \(most recent call last\):\n(?:\s+.*\n)*(?:\w+\.)*(?P<kind>\w+)(?:: )?"
 )
 
@@ -25,8 +25,8 @@ class Bug(Exception):
 
 def is_bug(kind: type[BaseException]) -> bool:
     """Return whether exceptions of this class are bugs: neither a wrong request nor a failure of the environment."""
-    foreseen = RequestError, RuntimeError, OSError, MemoryError, ImportError
-    return not issubclass(kind, foreseen) or issubclass(kind, NotImplementedError | RecursionError)
+    expected = RequestError, RuntimeError, OSError, MemoryError, ImportError
+    return not issubclass(kind, expected) or issubclass(kind, NotImplementedError | RecursionError)
 
 
 def is_number(value: object) -> bool:
@@ -51,8 +51,8 @@ def root_cause(error: BaseException) -> str:
     kind, text = type(error), re.sub(r"\[\w+\.(cpp|h):\d+\] ?", "", str(error))
     if (match := _OF_PLUGIN.search(text)) is not None:
         kind = {"RequestError": RequestError}.get(match["kind"]) or getattr(builtins, match["kind"], Exception)
-        place = f"{match['plugin']} at {match['place']}: " if match["plugin"] else ""
-        text = text[: match.start()] + place + text[match.end() :]
+        location = f"{match['plugin']} at {match['location']}: " if match["plugin"] else ""
+        text = text[: match.start()] + location + text[match.end() :]
     if kind is KeyboardInterrupt:
         raise KeyboardInterrupt from error
     text = " ".join(text.split()) or kind.__name__

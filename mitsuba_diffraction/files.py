@@ -18,7 +18,7 @@ from .errors import RequestError
 
 try:
     import fcntl
-except ImportError:  # Windows, where a temporary file in use cannot be recognised
+except ImportError:  # Windows, where temporary files in use cannot be recognised
     fcntl = None
 
 _being_written: set[str] = set()  # temporary paths
@@ -31,7 +31,7 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     A reader sees either the old or the new file, whichever process writes it, and after the block the new file is on
     disk (fsync). If the block raises, including KeyboardInterrupt, the temporary file is removed and `path` is left
     unchanged. The temporary name has the suffix of `path`, by which writers choose the format. It is locked while it
-    is being written; unlocked ones, left by a killed process, are removed here. Symbolic links are followed.
+    is being written; unlocked ones, left by killed processes, are removed here. Symbolic links are followed.
 
     Raises:
         FileNotFoundError: if the folder does not exist.
@@ -45,8 +45,8 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     if not target.parent.is_dir():
         raise FileNotFoundError(f"cannot write {os.fspath(path)!r}: its folder does not exist")
     if target.exists() and not target.is_file():
-        raise RequestError(f"cannot write {os.fspath(path)!r}: it is there and is not an ordinary file")
-    _remove_what_a_kill_left(target)
+        raise RequestError(f"cannot write {os.fspath(path)!r}: it exists and is not an ordinary file")
+    _remove_stale_temporaries(target)
     temporary, opened = _locked_temporary(target)
     _being_written.add(str(temporary))
     try:
@@ -111,12 +111,12 @@ def _locked_temporary(target: Path) -> tuple[Path, int]:
 
 
 def discard(path: str | os.PathLike[str]) -> None:
-    """Remove a file, if it is there, and what killed processes left of it."""
+    """Remove a file, if it exists, and temporary files that killed processes left beside it."""
     Path(path).unlink(missing_ok=True)
-    _remove_what_a_kill_left(Path(path))
+    _remove_stale_temporaries(Path(path))
 
 
-def _remove_what_a_kill_left(target: Path) -> None:
+def _remove_stale_temporaries(target: Path) -> None:
     if fcntl is None:
         return
     ours = re.compile(re.escape(f".{target.stem}-") + "[0-9a-f]{16}" + re.escape(target.suffix))
@@ -149,13 +149,13 @@ def refuse_other_than_utf8(text: str) -> None:
 
 
 def cache_folder() -> Path:
-    """Return where what took long to build is kept: $MITSUBA_DIFFRACTION_CACHE, or the user's cache folder."""
+    """Return the folder of cached results: $MITSUBA_DIFFRACTION_CACHE, or the user's cache folder."""
     named = os.environ.get("MITSUBA_DIFFRACTION_CACHE")
     return Path(named) if named else platformdirs.user_cache_path("mitsuba_diffraction")
 
 
 def refuse_special(path: str | os.PathLike[str]) -> None:
-    """Raise if `path` is not there, or is a pipe or a device, which may be endless."""
+    """Raise if `path` does not exist, or is a pipe or a device, which may be endless."""
     if not os.path.exists(path):
         raise FileNotFoundError(f"{os.fspath(path)}: no such file")
     if not (os.path.isfile(path) or os.path.isdir(path)):
@@ -174,9 +174,9 @@ def seal(path: str | os.PathLike[str]) -> None:
     """Replace the placeholder `UNSEALED`, or an earlier digest, by the SHA-256 of the file."""
     with open(path, "r+b") as stream:
         if (found := _digest(stream)) is None:
-            raise RequestError(f"{os.fspath(path)}: has no place for its digest")
-        place, digest = found
-        stream.seek(place)
+            raise RequestError(f"{os.fspath(path)}: has no placeholder for its digest")
+        offset, digest = found
+        stream.seek(offset)
         stream.write(digest)
 
 
@@ -185,22 +185,22 @@ def is_intact(path: str | os.PathLike[str]) -> bool | None:
     with open(path, "rb") as stream:
         if (found := _digest(stream)) is None:
             return None
-        place, digest = found
-        stream.seek(place)
+        offset, digest = found
+        stream.seek(offset)
         return stream.read(len(_ZEROS)) == digest
 
 
 def _digest(stream: BinaryIO) -> tuple[int, bytes] | None:
-    """Return where the digest of a file stands, and what it should be; None if there is no place for one."""
+    """Return the offset of the digest in a file and its expected value; None if there is no placeholder for one."""
     if not os.fstat(stream.fileno()).st_size:
         return None
     with mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as content:
         found = content.find(_BEFORE_DIGEST.encode())
         if found < 0:
             return None
-        place = found + len(_BEFORE_DIGEST)
-        with memoryview(content) as view, view[:place] as before, view[place + len(_ZEROS) :] as after:
+        offset = found + len(_BEFORE_DIGEST)
+        with memoryview(content) as view, view[:offset] as before, view[offset + len(_ZEROS) :] as after:
             digest = hashlib.sha256(before)
             digest.update(_ZEROS.encode())
             digest.update(after)
-        return place, digest.hexdigest().encode()
+        return offset, digest.hexdigest().encode()

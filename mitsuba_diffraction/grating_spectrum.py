@@ -31,7 +31,7 @@ from .spectrum.tables import AmplitudeTable, SliceTable
 FORMAT = "mitsuba_diffraction grating spectrum"
 FORMAT_VERSION = 10
 
-# Numbers and texts, and their names in files.
+# Attributes and their names in files.
 _NUMBERS = {
     "height_range": "heightRange",
     "error": "error",
@@ -40,7 +40,7 @@ _NUMBERS = {
 }
 _OTHERS = {"patches": "patches", "source": "source", "source_digest": "sourceSha256"}
 
-_computing = threading.Lock()
+_energy_lock = threading.Lock()
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,16 +48,16 @@ class GratingSpectrum(PowerSpectrum):
     """A power spectrum, the factor E that bounds the albedo by one, and its file.
 
     Attributes:
-        energy: the table of E, if it came with the file; else `energy_table` makes it.
-        warning: why scalar theory is not to be trusted for the surface of a recipe; "" where it is.
+        energy: the table of E, if read from the file; otherwise `energy_table` computes it.
+        warning: why scalar theory is inaccurate for the surface of a recipe, or "".
     """
 
     energy: EnergyTable | None = field(default=None, repr=False)
     warning: str = field(default="", repr=False)
 
     def energy_table(self) -> EnergyTable:
-        """Return the table of E, which bounds the albedo by one; made at the first call unless the file has it."""
-        with _computing:
+        """Return the table of E, which bounds the albedo by one; computed at the first call unless read from a file."""
+        with _energy_lock:
             return self._energy
 
     @cached_property
@@ -97,8 +97,8 @@ class GratingSpectrum(PowerSpectrum):
 
         Raises:
             FileNotFoundError: if there is no such file.
-            ValueError: if it is not a spectrum, is damaged (be it by a single bit), is of a version or representation
-                not known here, or was not built from that recipe.
+            ValueError: if it is not a spectrum, is damaged (even by a single bit), has an unknown version or
+                representation, or was not built from that recipe.
         """
         path = Path(path)
         header, channels = read(path, FORMAT, FORMAT_VERSION, recipe)
@@ -149,10 +149,10 @@ def _grid_header(grid: OrderGrid | SplineGrid) -> dict[str, np.ndarray]:
 
 
 def _grid(header: dict, shape: tuple[int, int]) -> OrderGrid | SplineGrid:
-    largest = ((shape[1] - 1) // 2, (shape[0] - 1) // 2)
+    max_order = ((shape[1] - 1) // 2, (shape[0] - 1) // 2)
     if "tileSize" in header:
-        return OrderGrid(_pair(header["tileSize"]), largest)
-    return SplineGrid(_pair(header["spacing"]), largest, _pair(header["limit"]))
+        return OrderGrid(_pair(header["tileSize"]), max_order)
+    return SplineGrid(_pair(header["spacing"]), max_order, _pair(header["limit"]))
 
 
 _FUNCTIONS = {"taylor": "F{{u^{:03d}}}", "chebyshev": "F{{T_{:03d}}}"}

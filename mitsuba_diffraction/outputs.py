@@ -1,6 +1,6 @@
-"""Outputs of commands: what may be written over, and the mark by which the package recognises its own files.
+"""Outputs of commands: which files may be overwritten, and the mark by which the package recognises its own files.
 
-Three rules: an input is never written over; a file with the mark may be; anything else needs `--overwrite`.
+Three rules: an input is never overwritten; a file with the mark may be; any other file needs `--overwrite`.
 
 All files that the package writes carry `MARK`: OpenEXR in the header, PNG in text chunks, PDF, SVG and WebP in their
 metadata, JSON as an entry, Markdown and CSV as a comment.
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 MARK = "mitsuba_diffraction output"
 METADATA = {"Keywords": MARK}
 """The mark as metadata for Matplotlib's `savefig`, under a key common to PNG, PDF and SVG."""
-_MEGABYTE = 2**20
+_MAX_MARK_DISTANCE = 2**20  # bytes from the beginning or the end of a file
 
 
 def check_outputs(
@@ -40,7 +40,7 @@ def check_outputs(
     Args:
         reads: input files.
         writes: (option, file) of each output.
-        overwrite: also write over files without the mark.
+        overwrite: whether files without the mark may be overwritten.
 
     Raises:
         ValueError: if an output is also an input, is named twice, exists without the mark, or cannot be written, or
@@ -76,9 +76,9 @@ def png_text() -> PngInfo:
 
 
 def save_json(content: object, path: str | os.PathLike[str]) -> None:
-    """Write a dataclass, or a dictionary of such and of sequences, as a JSON file, whole or not at all.
+    """Write a dataclass, or a dictionary of dataclasses and sequences, as a JSON file, atomically.
 
-    What is not finite becomes null.
+    Numbers that are not finite become null.
     """
     with whole_file(path) as temporary:
         marked = {**plain(content), "format": MARK}
@@ -86,7 +86,7 @@ def save_json(content: object, path: str | os.PathLike[str]) -> None:
 
 
 def plain(value: object) -> object:
-    """Convert to what JSON has: dataclasses become dictionaries, tuples lists, and floats that are not finite None."""
+    """Convert to JSON types: dataclasses become dictionaries, tuples lists, and floats that are not finite None."""
     if dataclasses.is_dataclass(value):
         value = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
     if isinstance(value, Mapping):
@@ -103,14 +103,14 @@ def free_name(stem: str, files_of: Callable[[str], Iterable[Path]], reads: Seque
 
 
 def _is_same(path: str | os.PathLike[str], other: str | os.PathLike[str]) -> bool:
-    """Return whether two names are of one file that exists, be it by a link."""
+    """Return whether two names refer to one existing file, possibly by a link."""
     return os.path.exists(path) and os.path.exists(other) and os.path.samefile(path, other)
 
 
 def _is_ours(path: str | os.PathLike[str]) -> bool:
     """Return whether a file carries the mark; all formats store it near the beginning or the end."""
     with open(path, "rb") as stream:
-        if MARK.encode() in stream.read(_MEGABYTE):
+        if MARK.encode() in stream.read(_MAX_MARK_DISTANCE):
             return True
-        stream.seek(max(0, stream.seek(0, os.SEEK_END) - _MEGABYTE))
+        stream.seek(max(0, stream.seek(0, os.SEEK_END) - _MAX_MARK_DISTANCE))
         return MARK.encode() in stream.read()

@@ -46,8 +46,8 @@ def _refuse(reason: str, props: mi.Properties) -> mi.Object:
     raise RuntimeError(reason)
 
 
-def _telling(load: Callable[..., mi.Object]) -> Callable[..., mi.Object]:
-    """Return a loader that accepts a GratingSpectrum in a dict, and reports in one line what a plugin refuses."""
+def _with_short_errors(load: Callable[..., mi.Object]) -> Callable[..., mi.Object]:
+    """Return a loader that accepts a GratingSpectrum in a dict, and reports errors of the plugins in one line."""
 
     @functools.wraps(load)
     def loader(scene: dict | str, *args: object, **kwargs: object) -> mi.Object:
@@ -59,7 +59,7 @@ def _telling(load: Callable[..., mi.Object]) -> Callable[..., mi.Object]:
             try:
                 line = root_cause(error)
             except Bug:
-                raise error from None  # whole, with the place in the code
+                raise error from None  # with its traceback
         raise RuntimeError(line)
 
     return loader
@@ -68,9 +68,9 @@ def _telling(load: Callable[..., mi.Object]) -> Callable[..., mi.Object]:
 # A reload must not do this twice.
 if not getattr(mi, "_mitsuba_diffraction_registered", False):
     for name in ("load_dict", "load_file", "load_string"):
-        setattr(mi, name, _telling(getattr(mi, name)))
+        setattr(mi, name, _with_short_errors(getattr(mi, name)))
     mi._mitsuba_diffraction_registered = True
-    # With one thread, on a machine of one core, Mitsuba 3.9.1 waits for ever where it reads or writes an EXR picture.
+    # With one thread, on a machine of one core, Mitsuba 3.9.1 hangs when it reads or writes an EXR picture.
     if dr.thread_count() < 2:
         dr.set_thread_count(2)
 if mi.variant() is not None:

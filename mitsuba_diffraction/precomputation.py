@@ -1,4 +1,4 @@
-"""From height fields to spectra, and from files to spectra: one door to scalar and to rigorous theory."""
+"""Computing and loading spectra, of scalar and of rigorous theory."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from .surface.heightfield import HeightField
 
 Spectrum = GratingSpectrum | RigorousSpectrum
 
-_HEADER = 2**16  # bytes, which hold the name of the format
+_MAX_HEADER_BYTES = 2**16  # which contain the name of the format
 
 
 def precompute(
@@ -47,22 +47,22 @@ def precompute(
     """Compute the spectrum of the phase e^{iκh}, or the table of rigorous efficiencies, its error at most `tolerance`.
 
     Args:
-        height_field: the surface; or several patches of one size that repeat (extent "tile"), drawn from one kind of
-            irregular surface: the spectrum is the mean of theirs.
-        progress: called with (steps done, steps in all). An interrupted build of rigorous theory goes on from what it
-            left in the cache folder.
+        height_field: the surface; or several periodic patches (extent "tile") of one size, random samples of an
+            irregular surface, whose spectra are averaged.
+        progress: called with (steps done, steps in all). An interrupted build of rigorous theory resumes from
+            intermediate results in the cache folder.
 
-    All others are those of `Settings`.
+    All other arguments are those of `Settings`.
 
     Returns:
-        The spectrum; its `error` is what was measured, at values of κ that were not used to build it.
+        The spectrum; its `error` is measured at values of κ that were not used to build it.
 
     Raises:
         ValueError: if an argument is out of range, the surface is deeper than `largest_height_range`, or the tolerance
             cannot be kept in float32 or within a table of 4 GB.
 
     Warns:
-        UserWarning: if the pixels are too coarse to hold all the frequencies that the shortest wavelength can reach, a
+        UserWarning: if the pixels are too coarse to resolve all frequencies that the shortest wavelength reaches, a
             sample is too small for the coherence length, or `terms` are too few for the tolerance.
     """
     settings = Settings(
@@ -89,7 +89,7 @@ def precompute(
 
 
 def build_spectrum(patches: Sequence[HeightField], settings: Settings, progress: Progress = silent) -> Spectrum:
-    """Compute what `precompute` does, of patches and settings."""
+    """Compute the spectrum as `precompute`, from patches and settings."""
     _check_patches(patches, settings)
     height_range = max(patch.height_range for patch in patches)
     if height_range > settings.largest_height_range:
@@ -108,7 +108,7 @@ def build_spectrum(patches: Sequence[HeightField], settings: Settings, progress:
 
 
 def _check_patches(height_fields: Sequence[HeightField], settings: Settings) -> None:
-    """Raise RequestError unless there is one patch, or several of one size that repeat."""
+    """Raise RequestError unless there is one patch, or several periodic ones of one size."""
     if not height_fields:
         raise RequestError("patches: got none, wanted at least one")
     if len(height_fields) > 1 and settings.extent != "tile":
@@ -137,8 +137,8 @@ def load_spectrum(path: str | os.PathLike[str], recipe: str | None = None) -> Sp
         FileNotFoundError: if there is no such file.
         ValueError: if it is not a spectrum, is damaged, of another version, or was not built from that recipe.
     """
-    of_rigorous = False
+    is_rigorous = False
     if os.path.isfile(path):
         with open(path, "rb") as stream:
-            of_rigorous = RIGOROUS_FORMAT.encode() in stream.read(_HEADER)
-    return (RigorousSpectrum if of_rigorous else GratingSpectrum).load(path, recipe)
+            is_rigorous = RIGOROUS_FORMAT.encode() in stream.read(_MAX_HEADER_BYTES)
+    return (RigorousSpectrum if is_rigorous else GratingSpectrum).load(path, recipe)

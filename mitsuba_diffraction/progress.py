@@ -1,4 +1,4 @@
-"""What commands print, and progress: a bar in a terminal, a line in a notebook, occasional lines in a log."""
+"""Printing, and progress: a bar in a terminal, a line in a notebook, occasional lines in a log."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from rich.table import Table
 
 NAME = "mitsuba-diffraction"
 
-Progress = Callable[[int, int], None]  # called with how much is done, and how much there is
+Progress = Callable[[int, int], None]  # called with the part done and the total
 
 out = Console(highlight=False, soft_wrap=True)
 err = Console(stderr=True, highlight=False, soft_wrap=True)
 
-_SHORT = 2.0  # seconds of work of which neither a log nor a notebook says anything
+_MIN_REPORTED_SECONDS = 2.0  # of work before a log or a notebook shows progress
 _lock = threading.Lock()
-_bars: list[Bars] = []  # the display that all bars share: rich shows one at a time
+_bars: list[Bars] = []  # the display common to all bars, as rich shows one at a time
 
 
 def silent(done: int, total: int) -> None:
@@ -71,11 +71,13 @@ def table(columns: Iterable[str], rows: Iterable[Sequence[str]], texts: int = 1)
 
 
 def _count(done: int, total: int, unit: str) -> str:
-    """Format how much is done."""
+    """Format the part done."""
     return f"{done} %" if unit == "%" else f"{done} of {total} {unit}".rstrip()
 
 
-def log_lines(label: str, unit: str = "", seconds: float = 30.0, first: float = _SHORT) -> Callable[..., None]:
+def log_lines(
+    label: str, unit: str = "", seconds: float = 30.0, first: float = _MIN_REPORTED_SECONDS
+) -> Callable[..., None]:
     """Report progress without a terminal: a line on stderr after `first` seconds, then every `seconds`."""
     start = time.monotonic()
     due = start + first
@@ -117,7 +119,7 @@ def progress_bar(label: str, unit: str = "", begin: str = "") -> Iterator[Callab
                 TimeElapsedColumn(),
                 TimeRemainingColumn(),
             )
-            # Passes of a large picture take longer than the usual half minute.
+            # Passes of a large picture take longer than the default period of half a minute.
             _bars.append(Bars(*columns, console=err, transient=True, speed_estimate_period=600))
             _bars[0].start()
         bars = _bars[0]
@@ -150,7 +152,7 @@ def _notebook_line(label: str, unit: str) -> Iterator[Callable[..., None]]:
         line = {"text/plain": f"{label}: {_count(done, total, unit)}, {seconds:.0f} s"}
         if handle is not None:
             handle.update(line, raw=True)
-        elif seconds >= _SHORT:
+        elif seconds >= _MIN_REPORTED_SECONDS:
             handle = display(line, raw=True, display_id=True)
 
     yield show

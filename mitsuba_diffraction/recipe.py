@@ -4,11 +4,11 @@
 profile = "blazed"               # a name in gratings.PROFILES, followed by its parameters
 period = 2.5                     # µm
 depth = 0.25                     # µm
-patches = 16                     # of a profile with a seed: the mean over so many seeds, from `seed` on
+patches = 16                     # of a profile with a seed: number of seeds to average, from `seed` on
 
 [surface]                        # … or a scan
 scan = "skin.png"                # relative to the recipe; formats: readers.read_height_field
-pixel_size = 0.0586              # µm, one number or [x, y]; if the file has none, or to override it
+pixel_size = 0.0586              # µm, one number or [x, y]; if the file has none, or to override that of the file
 height_range = 0.375             # µm, for integer images
 channel = "Height"               # name or number, in a file with several; default: that of the heights
 unit = "nm"                      # of a file without one; ["um", "nm"]: lateral, and of the heights
@@ -19,7 +19,7 @@ prepare = [                      # steps of surface/prepare.py, in this order
     "fill_missing",              # here, or with fill_missing = true after the last step
     { trim_edges = 0.5 },        # µm off each edge
     { rotate = -3.0 },           # degrees from +x towards +y
-    { crop_periods = "xy" },     # to whole periods along "x", "y" or both
+    { crop_periods = "xy" },     # to a whole number of periods along "x", "y" or both
 ]
 fill_missing = true              # interpolate missing pixels; default: refuse them
 
@@ -67,12 +67,12 @@ _SCAN_KEYS = frozenset({"scan", "pixel_size", "height_range", "fill_missing", "c
 _SPECTRUM_KEYS = frozenset(f.name for f in fields(Settings))
 # Incremented when the same input gives a different result, to invalidate the cache.
 _BUILD_VERSION = 8
-# Spectra that the package brings (precompute/ready_spectra.py), named as in the cache.
+# Spectra in the package (precompute/ready_spectra.py), named as in the cache.
 READY_SPECTRA = Path(__file__).parent / "data" / "spectra"
-_OF_HEIGHTS = 0.3  # the share of the time that the heights of many patches take, roughly
-# Mitsuba constructs plugins in parallel; two with the same recipe must not both compute its spectrum.
+_HEIGHTS_TIME_FRACTION = 0.3  # of the build, spent on the heights of several patches, roughly
+# Mitsuba constructs plugins in parallel; only one of those with the same recipe may compute its spectrum.
 _building = threading.Lock()
-# Spectra in use, by the digest of their recipe: many BSDFs of one recipe read its file once.
+# Spectra in use, by the digest of their recipe, so that all BSDFs of one recipe read its file once.
 _in_use: weakref.WeakValueDictionary[str, Spectrum] = weakref.WeakValueDictionary()
 
 
@@ -145,8 +145,8 @@ class Recipe:
             _refuse_other_values(spectrum)
             return cls(surface, Settings(**spectrum), path.parent)
         except RequestError as error:
-            of_file = str(error).partition(":")[0] not in settings
-            raise RequestError(f"{path}: {error}" if of_file else str(error)) from None
+            in_file = str(error).partition(":")[0] not in settings
+            raise RequestError(f"{path}: {error}" if in_file else str(error)) from None
 
     @property
     def files(self) -> list[Path]:
@@ -155,16 +155,16 @@ class Recipe:
 
     @property
     def patches(self) -> int:
-        """Return over how many seeds the spectrum is averaged: one of a sample, and of what is not drawn at random."""
+        """The number of seeds over which the spectrum is averaged; 1 for a sample and for a deterministic surface."""
         if "patches" in self.surface:
             return int(self.surface["patches"])
         return PATCHES.get(self.surface.get("profile", ""), 1) if self.settings.extent == "tile" else 1
 
     def height_fields(self, progress: Progress = silent) -> tuple[HeightField, ...]:
-        """Return the patches: seed, seed + 1, …; one where nothing is drawn at random."""
+        """Return the patches of seed, seed + 1, …; one for a deterministic surface."""
         if self.patches == 1:
             return (self.height_field(),)
-        patches = [self.height_field()]  # which refuses a wrong seed
+        patches = [self.height_field()]  # raises for an invalid seed
         for seed in range(self.surface.get("seed", 0) + 1, self.surface.get("seed", 0) + self.patches):
             patches.append(Recipe({**self.surface, "patches": 1, "seed": seed}).height_field())
             progress(len(patches), self.patches)
@@ -206,8 +206,8 @@ class Recipe:
 
     def build(self, progress: Progress = silent) -> Spectrum:
         """Compute the spectrum; `progress` is called with (steps done, steps in all)."""
-        patches = self.height_fields(part(progress, 0, _OF_HEIGHTS))
-        report = part(progress, _OF_HEIGHTS if len(patches) > 1 else 0, 1)
+        patches = self.height_fields(part(progress, 0, _HEIGHTS_TIME_FRACTION))
+        report = part(progress, _HEIGHTS_TIME_FRACTION if len(patches) > 1 else 0, 1)
         spectrum = build_spectrum(patches, self.settings, report)
         if isinstance(spectrum, GratingSpectrum):
             spectrum = replace(spectrum, warning=scalar_error(patches[0], spectrum.extent).warning)
@@ -251,7 +251,7 @@ class Recipe:
                 return load_spectrum(known, recipe=digest)
         with progress(f"spectrum of {self.surface.get('scan') or self.surface['profile']}") as report:
             spectrum = self.build(report)
-        # A scene holds its recipes, and needs their heights no more.
+        # A scene keeps its recipes, but no longer needs their heights.
         self.__dict__.pop("_height_field", None)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)

@@ -18,8 +18,8 @@ from .surface.heightfield import HeightField
 
 Real = NDArray[np.float64]
 
-_FAR = 9.0  # standard deviations; e^{−9²/2} is under 3e-18
-MAX_CHUNK = 2**20  # complex numbers in one intermediate array, 16 MiB
+_MAX_SIGMAS = 9.0  # radius of a lobe, standard deviations; e^{−9²/2} is under 3e-18
+MAX_CHUNK = 2**20  # complex numbers in an intermediate array, 16 MiB
 
 
 def amplitudes(height_field: HeightField, kappa: float) -> NDArray[np.complex128]:
@@ -59,7 +59,7 @@ def power_spectrum(
     window is given by the coherence length, limited by the size of the scan. Along an axis of one pixel the surface is
     uniform, and S has the factor N(q_j; σ_q²) of the same coherence length.
 
-    The spectrum is not continued periodically beyond the Nyquist limit: a tile has no orders there, only the tails of
+    The spectrum is not continued periodically outside the Nyquist limit: a tile has no orders there, only the tails of
     its last orders, and the spectrum of a sample is zero.
 
     Args:
@@ -89,15 +89,15 @@ def _tile_spectrum(height_field: HeightField, q: Real, kappa: Real, coherence_le
     rows, columns = height_field.shape
     tile = height_field.tile_size
     orders = [np.arange(-(n // 2), n // 2 + 1) for n in (columns, rows)]
-    # The Nyquist order of an even number of pixels is split evenly between both signs.
-    shares = [np.where(2 * np.abs(m) == n, 0.5, 1.0) for m, n in zip(orders, (columns, rows), strict=True)]
+    # The Nyquist order of an even number of pixels is divided equally between both signs.
+    factors = [np.where(2 * np.abs(m) == n, 0.5, 1.0) for m, n in zip(orders, (columns, rows), strict=True)]
     for value, indices in _by_kappa(kappa):
         eta = order_powers(height_field, value)[np.ix_(orders[1] % rows, orders[0] % columns)]
-        eta *= np.outer(shares[1], shares[0])
+        eta *= np.outer(factors[1], factors[0])
         for index in indices:
             lobes, spans = [], []
             for axis in (0, 1):
-                near = np.abs(q[index, axis] - orders[axis] / tile[axis]) <= _FAR * sigma
+                near = np.abs(q[index, axis] - orders[axis] / tile[axis]) <= _MAX_SIGMAS * sigma
                 span = slice(near.argmax(), near.argmax() + near.sum())
                 lobes.append(_gaussian(q[index, axis] - orders[axis][span] / tile[axis], sigma))
                 spans.append(span)
@@ -119,7 +119,7 @@ def _sample_spectrum(height_field: HeightField, q: Real, kappa: Real, coherence_
 
 
 def mean_periodograms(height_field: HeightField, q: Real, kappa: Real, axes: tuple[WindowAxis, ...]) -> Real:
-    """Average |Σ_n a(x_n − x_p) e^{iκh_n} e^{−2πi q·x_n}|² over the places x_p for q (M, 2) and κ (M,): (M,).
+    """Average |Σ_n a(x_n − x_p) e^{iκh_n} e^{−2πi q·x_n}|² over the positions x_p for q (M, 2) and κ (M,): (M,).
 
     Window and wave are separable: first the sums over y, for all columns at once, then those over x.
     """
@@ -130,9 +130,9 @@ def mean_periodograms(height_field: HeightField, q: Real, kappa: Real, axes: tup
     for value, indices in _by_kappa(kappa):
         phase = np.exp(1j * value * height_field.centred)
         for part in np.split(indices, range(chunk, len(indices), chunk)):
-            # On a grid, many q share the same q_y.
+            # On a grid, many q have the same q_y.
             q_y, which = np.unique(q[part, 1], return_inverse=True)
-            # Waves start at the window, whose position only affects the phase of the sum.
+            # Phases are relative to the window, whose position only changes the phase of the sum.
             wave_x = along_x.window * _waves(q[part, 0], width, height_field.pixel_size[0])
             wave_y = along_y.window * _waves(q_y, height, height_field.pixel_size[1])
             for row in along_y.starts:
@@ -150,7 +150,7 @@ def _waves(q: Real, count: int, pixel: float) -> NDArray[np.complex128]:
 
 def nyquist_density(q: Real, pixel: float) -> Real:
     """Return d for |q| ≤ 1/2d, else zero: (M,) µm; integrates to one."""
-    # Tolerates rounding of q at the limit itself.
+    # Tolerate rounding of q at the limit itself.
     return np.where(np.abs(q) * 2 * pixel <= 1 + 1e-12, pixel, 0.0)
 
 

@@ -28,7 +28,7 @@ def _watch(mitsuba: ModuleType) -> None:
 
 
 def _on_variant_change(old: str | None, new: str | None) -> None:
-    # No sooner: whoever imports Mitsuba may be a module that the plugins need.
+    # Imported only now, as the module that imports Mitsuba may be one that the plugins need.
     if new is None:
         return
     loaded = f"{__package__}.plugin" in sys.modules
@@ -41,23 +41,23 @@ def _on_variant_change(old: str | None, new: str | None) -> None:
 class _MitsubaFinder(importlib.abc.MetaPathFinder):
     """Selects LLVM before Dr.Jit is imported and registers the plugins after Mitsuba has been imported.
 
-    It stays until then: `importlib.util.find_spec` asks without importing.
+    It stays on `sys.meta_path` until then, as `importlib.util.find_spec` searches without importing.
     """
 
-    _asking = False
+    _searching = False
 
     def find_spec(self, name: str, path: Sequence[str] | None, target: ModuleType | None = None) -> ModuleSpec | None:
         if name in ("drjit", "mitsuba") and "drjit" not in sys.modules:
             from . import llvm
 
             llvm.choose()
-        if name != "mitsuba" or self._asking:
+        if name != "mitsuba" or self._searching:
             return None
-        self._asking = True
+        self._searching = True
         try:
             spec = importlib.util.find_spec(name)
         finally:
-            self._asking = False
+            self._searching = False
         if spec is None or spec.loader is None:
             return None
         execute = spec.loader.exec_module

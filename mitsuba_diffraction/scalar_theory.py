@@ -36,16 +36,16 @@ OrderPowers = Callable[[NDArray[np.int64], Array], Array]
 
 MAP = Path(__file__).parent / "data" / "scalar_error.json"
 
-# For which the error of a surface is reported; the map is the same for ±20°.
+# Conditions under which the error of a surface is reported; the map is the same for ±20°.
 INDEX = 1.5
 ANGLES = (0.0, 20.0, -20.0)  # of incidence, degrees
 WAVELENGTHS = (0.45, 0.55, 0.65)  # µm
-RANGE = "mean over 450–650 nm and 0–20°, n = 1.5"
+CONDITIONS = "mean over 450–650 nm and 0–20°, n = 1.5"
 
-TRUSTED = 0.1  # error above which a surface is considered outside the range of scalar theory
+MAX_TRUSTED_ERROR = 0.1  # above which a surface is considered outside the range of scalar theory
 # R.m.s. factor between the error estimated from the map and that of 48 solved profiles; docs/validation.md.
 ESTIMATE_FACTOR = 1.4
-_CONVERGED = 1e-2
+_MAX_SOLVER_ERROR = 1e-2
 
 
 def fresnel(cosine: ArrayLike, index: complex) -> tuple[Array, Array]:
@@ -58,7 +58,7 @@ def fresnel(cosine: ArrayLike, index: complex) -> tuple[Array, Array]:
 
 
 def equivalent_depth(rms_height: float) -> float:
-    """Return the peak-to-valley depth of the sinusoid of equal roughness: 2√2 times the r.m.s. height (any unit)."""
+    """Return the peak-to-valley depth of the sinusoid of equal r.m.s. height, 2√2 times that (any unit)."""
     return 2 * np.sqrt(2) * rms_height
 
 
@@ -84,8 +84,8 @@ def profile_powers(height_field: HeightField) -> OrderPowers:
 def tile_powers(height_field: HeightField, shortest: float) -> OrderPowers:
     """Compute η_m of a tile, for pairs of m = (m_x, m_y), (…, 2), and κ up to 4π/`shortest`, a wavelength in µm.
 
-    F_m(κ) is interpolated by Chebyshev polynomials in κ, exactly in float64: e^{iκh} varies no faster than e^{iκH}, and
-    the coefficients beyond the order κH/2 fall faster than exponentially.
+    F_m(κ) is interpolated by Chebyshev polynomials in κ, exactly in float64: e^{iκh} oscillates no faster than e^{iκH},
+    so that coefficients of orders above κH/2 decrease faster than exponentially.
     """
     max_kappa = 4 * np.pi / shortest
     degree = int(np.ceil(max_kappa * height_field.half_range / 2)) + 25
@@ -100,7 +100,7 @@ def tile_powers(height_field: HeightField, shortest: float) -> OrderPowers:
         columns, rows = np.moveaxis(np.where(inside[..., None], m + grid.max_order, 0), -1, 0)
         waves = chebyshev.chebvander(2 * kappa / max_kappa - 1, degree)
         amplitude = (waves * np.moveaxis(coefficients[:, rows * grid.shape[1] + columns], 0, -1)).sum(axis=-1)
-        # Those of the Nyquist frequency have no sign.
+        # Orders at the Nyquist frequency have no sign.
         inside &= (2 * np.abs(m) < height_field.shape[::-1]).all(axis=-1)
         return np.where(inside, np.abs(amplitude) ** 2, 0.0)
 
@@ -133,7 +133,7 @@ def scalar_orders(
     wavelength: float,
     angle: float,
     index: complex,
-    turn: float = 0.0,
+    azimuth: float = 0.0,
 ) -> Orders:
     """Compute R K G E η_m(κ_m), the efficiencies of the BSDF in float64 in the limit of narrow lobes.
 
@@ -144,15 +144,15 @@ def scalar_orders(
         powers: of the profile or tile.
         period: µm, of a profile; of a tile along x and y.
         wavelength: µm.
-        angle: of incidence, degrees; the light comes from −x.
+        angle: of incidence, degrees, from −x.
         index: n + ik of the material; ∞ of a perfect mirror.
-        turn: of the plane of incidence, degrees; 0: it is perpendicular to the grooves, 90: parallel (conical).
+        azimuth: of the plane of incidence, degrees; 0: perpendicular to the grooves, 90: parallel (conical).
     """
     pitch = wavelength / np.atleast_1d(period)
-    turn, angle = np.deg2rad((turn, angle))
-    light = -np.sin(angle) * np.array([np.cos(turn), np.sin(turn)])
-    m, leaving, factor, cos_half = _mirror_orders(powers, pitch, wavelength, light)
-    albedo = [_mirror_orders(powers, pitch, wavelength, one)[2].sum() for one in leaving]
+    azimuth, angle = np.deg2rad((azimuth, angle))
+    tangential_i = -np.sin(angle) * np.array([np.cos(azimuth), np.sin(azimuth)])
+    m, tangential_o, factor, cos_half = _mirror_orders(powers, pitch, wavelength, tangential_i)
+    albedo = [_mirror_orders(powers, pitch, wavelength, tangential)[2].sum() for tangential in tangential_o]
     reflected = factor / np.maximum(1, np.maximum(factor.sum(), albedo))
     s, p = (1.0, 1.0) if np.isinf(index) else fresnel(cos_half, index)
     return Orders(m, s * reflected, p * reflected)
@@ -164,43 +164,44 @@ def transmitted_orders(
     wavelength: float,
     angle: float,
     index: float,
-    turn: float = 0.0,
+    azimuth: float = 0.0,
     from_below: bool = False,
     sheet: bool = False,
 ) -> Orders:
     """Compute K_t G_t (1 − F) η_m(κ_m), the transmitted orders of the BSDF in the limit of narrow lobes.
 
-    Arguments are those of `scalar_orders`, of a dielectric. The angle is that in air: of incidence or, if the light
-    comes from inside, of light that a plane would refract to it. The efficiencies are at most one together. Of a sheet,
-    of light from above, they are those outside, times 1 − F of the flat face.
+    Arguments are those of `scalar_orders`, for a dielectric. The angle is that in air: of incidence, or for light from
+    below, of the direction into which a plane would refract it. The efficiencies sum to at most one. For a sheet, with
+    light from above, they include the transmittance 1 − F of the flat face.
     """
     n_i, n_o, side = (index, 1.0, -1) if from_below else (1.0, index, 1)
-    turn, angle = np.deg2rad((turn, angle))
-    light = -np.sin(angle) * np.array([np.cos(turn), np.sin(turn)])
+    azimuth, angle = np.deg2rad((azimuth, angle))
+    tangential_i = -np.sin(angle) * np.array([np.cos(azimuth), np.sin(azimuth)])
     m, steps = _lattice(wavelength / np.atleast_1d(period), n_i + n_o)
-    square = n_o**2 - ((light + steps) ** 2).sum(axis=-1)
-    m, tangent, z_o = m[square > 0], (steps[square > 0] ** 2).sum(axis=-1), np.sqrt(square[square > 0])
-    z_i = np.sqrt(n_i**2 - light @ light)
-    # κ and q change their signs together.
-    kappa, sign = 2 * np.pi * np.abs(z_i - z_o) / wavelength, np.where(side * (z_i - z_o) < 0, -1, 1)
-    cosines, relative = (z_i / n_i, z_o / n_o), n_o / n_i
-    sent = transmitted(*cosines, tangent / n_i**2, relative) * powers((m.T * sign).T, kappa)
-    sent = sent / max(1.0, sent.sum())
+    square = n_o**2 - ((tangential_i + steps) ** 2).sum(axis=-1)
+    m, tangent, k_oz = m[square > 0], (steps[square > 0] ** 2).sum(axis=-1), np.sqrt(square[square > 0])
+    k_iz = np.sqrt(n_i**2 - tangential_i @ tangential_i)
+    # S(q; −κ) = S(−q; κ)
+    kappa, sign = 2 * np.pi * np.abs(k_iz - k_oz) / wavelength, np.where(side * (k_iz - k_oz) < 0, -1, 1)
+    cosines, relative = (k_iz / n_i, k_oz / n_o), n_o / n_i
+    power = transmitted(*cosines, tangent / n_i**2, relative) * powers((m.T * sign).T, kappa)
+    power = power / max(1.0, power.sum())
     if sheet:
-        cos_out = np.sqrt(np.maximum(1 - n_o**2 + z_o**2, 0))
-        sent = sent * (1 - np.mean(fresnel(cos_out, index), axis=0))
+        cos_out = np.sqrt(np.maximum(1 - n_o**2 + k_oz**2, 0))
+        power = power * (1 - np.mean(fresnel(cos_out, index), axis=0))
     # |ω_i·h|
     half = tangent / n_i**2 + (cosines[0] - relative * cosines[1]) ** 2
     half = np.minimum(np.abs(half + 1 - relative**2) / (2 * np.sqrt(np.maximum(half, 1e-18))), 1)
     s, p = (1 - reflected for reflected in fresnel(half, relative))
     mean = np.maximum((s + p) / 2, 1e-12)
     kept = cos_out > 0 if sheet else slice(None)
-    return Orders(m[kept], (sent * s / mean)[kept], (sent * p / mean)[kept])
+    return Orders(m[kept], (power * s / mean)[kept], (power * p / mean)[kept])
 
 
-def _lattice(pitch: Array, reach: float) -> tuple[NDArray[np.int64], Array]:
-    """Return m up to |m| λ/T = `reach`, (n,) of a profile or (n, 2), and m λ/T along x and y, (n, 2)."""
-    m = np.stack(np.meshgrid(*(np.arange(-int(reach / p) - 1, int(reach / p) + 2) for p in pitch), indexing="ij"), -1)
+def _lattice(pitch: Array, cutoff: float) -> tuple[NDArray[np.int64], Array]:
+    """Return m up to |m| λ/T = `cutoff`, (n,) of a profile or (n, 2), and m λ/T along x and y, (n, 2)."""
+    axes = [np.arange(-int(cutoff / p) - 1, int(cutoff / p) + 2) for p in pitch]
+    m = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
     m = m.reshape(-1, len(pitch))
     steps = np.zeros((len(m), 2))
     steps[:, : len(pitch)] = m * pitch
@@ -208,25 +209,28 @@ def _lattice(pitch: Array, reach: float) -> tuple[NDArray[np.int64], Array]:
 
 
 def _mirror_orders(
-    powers: OrderPowers, pitch: Array, wavelength: float, light: Array
+    powers: OrderPowers, pitch: Array, wavelength: float, tangential_i: Array
 ) -> tuple[NDArray[np.int64], Array, Array, Array]:
-    """Return the orders that R = 1 reflects, for the tangential part of ω_i, (2,).
+    """Return the orders reflected by a perfect mirror, R = 1.
 
     Args:
+        powers: of the profile or tile.
         pitch: λ/T, (1,) of a profile, (2,) of a tile.
+        wavelength: µm.
+        tangential_i: the tangential part of ω_i, (2,).
 
     Returns:
-        Of those that propagate: m, (n,) or (n, 2), the tangential part of ω_o, (n, 2), K G η_m and ω_i·h, (n,).
+        For propagating orders: m, (n,) or (n, 2), the tangential part of ω_o, (n, 2), K G η_m and ω_i·h, (n,).
     """
     m, steps = _lattice(pitch, 2.0)
-    leaving = -steps - light
-    square_o = (leaving**2).sum(axis=-1)
-    m, steps, leaving, square_o = (values[square_o < 1] for values in (m, steps, leaving, square_o))
-    cos_i, cos_o = np.sqrt(1 - (light**2).sum()), np.sqrt(1 - square_o)
+    tangential_o = -steps - tangential_i
+    square_o = (tangential_o**2).sum(axis=-1)
+    m, steps, tangential_o, square_o = (values[square_o < 1] for values in (m, steps, tangential_o, square_o))
+    cos_i, cos_o = np.sqrt(1 - (tangential_i**2).sum()), np.sqrt(1 - square_o)
     w = cos_i + cos_o
     square = (steps**2).sum(axis=-1)
     half = np.sqrt(square + w**2) / 2
-    return m, leaving, k_g(cos_i, cos_o, square) * powers(m, 2 * np.pi * w / wavelength), half
+    return m, tangential_o, k_g(cos_i, cos_o, square) * powers(m, 2 * np.pi * w / wavelength), half
 
 
 def difference(scalar: ArrayLike, rigorous: ArrayLike) -> float:
@@ -240,12 +244,12 @@ def error_map(material: str = "dielectric") -> tuple[Array, Array, Array, Array]
     """Return the error of scalar theory for sinusoids in unpolarised light (`precompute/scalar_theory_map.py`).
 
     Args:
-        material: "dielectric", n = 1.5, or "Al", aluminium at 550 nm; "transmitted" and "transmitted from below", the
-            light that passes the dielectric, directions being those in air.
+        material: "dielectric", n = 1.5, or "Al", aluminium at 550 nm; "transmitted" and "transmitted from below": the
+            transmission of the dielectric, directions being those in air.
 
     Returns:
-        period/λ (n,), depth/λ (k,), directions (a, 2) in degrees, of incidence and of the plane of incidence from that
-        perpendicular to the grooves, and the error, (n, k, a).
+        period/λ (n,), depth/λ (k,), directions (a, 2) in degrees, which are the angle of incidence and the azimuth of its
+        plane (0: perpendicular to the grooves), and the error, (n, k, a).
     """
     content = json.loads(MAP.read_text(encoding="utf-8"))
     if material not in content["error"]:
@@ -258,8 +262,8 @@ def error_map(material: str = "dielectric") -> tuple[Array, Array, Array, Array]
 @functools.cache
 def _interpolated(material: str, largest_angle: float, mean: bool) -> RegularGridInterpolator:
     periods, depths, directions, errors = error_map(material)
-    those = errors[..., directions[:, 0] <= largest_angle]
-    error = those.mean(axis=2) if mean else those.max(axis=2)
+    errors = errors[..., directions[:, 0] <= largest_angle]
+    error = errors.mean(axis=2) if mean else errors.max(axis=2)
     return RegularGridInterpolator((np.log(periods), np.log(depths)), np.log(np.maximum(error, 1e-6)))
 
 
@@ -274,9 +278,9 @@ def expected_error(
 ) -> float:
     """Return the expected error of scalar theory for a surface at incidence up to some angle.
 
-    The largest of the stored errors at 0°, 20°, 40° and 60° up to `largest_angle`, at 40° and 60° conical incidence
-    among them, interpolated linearly in the logarithms. They are for sinusoids. Other surfaces are represented by their
-    main period and their `equivalent_depth`; edges increase the error.
+    The largest of the stored errors at 0°, 20°, 40° and 60° up to `largest_angle`, including conical incidence at 40°
+    and 60°, interpolated linearly in the logarithms. They are those of sinusoids. Other surfaces are represented by
+    their main period and their `equivalent_depth`; edges increase the error.
 
     Args:
         period: µm.
@@ -289,7 +293,7 @@ def expected_error(
     Returns:
         Σ|Δη_m| relative to the reflected, or transmitted, power. Above the largest stored period (20 λ) and below the
         smallest depth (λ/20), the value at the boundary, an upper bound. NaN for periods below λ or depths above 2 λ,
-        which are not stored and beyond scalar theory.
+        which are not stored and outside the range of scalar theory.
 
     Raises:
         ValueError: unless period and wavelength are positive and the depth is not negative, or for another material.
@@ -304,8 +308,8 @@ def expected_error(
     periods, depths, _, _ = error_map(material)
     if period < periods[0] * wavelength or depth > depths[-1] * wavelength:
         return float("nan")
-    place = np.minimum(period / wavelength, periods[-1]), np.maximum(depth / wavelength, depths[0])
-    return float(np.exp(_interpolated(material, float(largest_angle), mean)(np.log(place))).item())
+    point = np.minimum(period / wavelength, periods[-1]), np.maximum(depth / wavelength, depths[0])
+    return float(np.exp(_interpolated(material, float(largest_angle), mean)(np.log(point))).item())
 
 
 @dataclass(frozen=True)
@@ -313,9 +317,9 @@ class ScalarError:
     """The error of scalar theory for one surface: the mean over `ANGLES` and `WAVELENGTHS`, for n = 1.5.
 
     Attributes:
-        share: Σ|Δη_m| relative to the reflected power; infinite beyond the rigorous results (depths above 2 λ).
-        transmitted: the same of the transmitted light.
-        estimated: from the stored map, good to a factor of `ESTIMATE_FACTOR`; otherwise solved for the surface itself.
+        share: Σ|Δη_m| as a fraction of the reflected power; infinite outside the stored map (depths above 2 λ).
+        transmitted: the same for transmitted light.
+        estimated: whether it is from the stored map, within about `ESTIMATE_FACTOR`, instead of solved for the surface.
         remedy: the alternative to scalar theory for this surface.
     """
 
@@ -326,40 +330,40 @@ class ScalarError:
 
     @property
     def bound(self) -> float:
-        """The share above which the surface is outside the range of scalar theory."""
-        return TRUSTED * (ESTIMATE_FACTOR if self.estimated else 1)
+        """The error above which the surface is outside the range of scalar theory."""
+        return MAX_TRUSTED_ERROR * (ESTIMATE_FACTOR if self.estimated else 1)
 
     @property
     def warning(self) -> str:
-        """A sentence if the share is above the bound, else ""."""
+        """A sentence if the error exceeds the bound, otherwise ""."""
         return f"scalar theory: {self}; {self.remedy}" if self.share > self.bound else ""
 
     def __str__(self) -> str:
         if not np.isfinite(self.share):
             return "error unknown, the surface is deeper than two wavelengths"
         about = "about " if self.estimated else ""
-        reflected, passed = (f"{float(f'{100 * share:.2g}'):g}%" for share in (self.share, self.transmitted))
-        return f"errs by {about}{reflected} of the reflected light, {passed} of the transmitted ({RANGE})"
+        reflected, transmitted = (f"{float(f'{100 * error:.2g}'):g}%" for error in (self.share, self.transmitted))
+        return f"errs by {about}{reflected} of the reflected light, {transmitted} of the transmitted ({CONDITIONS})"
 
 
 def scalar_error(height_field: HeightField, extent: str = "tile") -> ScalarError:
     """Determine the error of scalar theory for a surface; a "sample" is levelled first.
 
-    A profile that repeats and for which rigorous theory is offered is solved. For any other surface, the map is
-    averaged over the waves in the spectrum of its heights, each weighted by its share of the variance, at the depth of
-    the sinusoid of equal roughness. Periods outside the map take the value at its boundary.
+    Periodic profiles to which rigorous theory applies are solved. For any other surface, the map is averaged over the
+    waves in the spectrum of its heights, each weighted by its fraction of the variance, at the depth of the sinusoid of
+    equal roughness. Periods outside the map take the value at its boundary.
     """
     lengths, power, rms_height = height_spectrum(height_field, extent)
     depth = equivalent_depth(rms_height)
-    longest = MAX_PERIOD_IN_WAVELENGTHS * VISIBLE[0] * 1e-3
+    max_period = MAX_PERIOD_IN_WAVELENGTHS * VISIBLE[0] * 1e-3
     solved = float("nan"), float("nan")
     if not (extent == "tile" and is_profile(height_field)):
         remedy = "no rigorous theory is offered for a surface that varies along y"
-    elif height_field.tile_size[0] > longest:
-        remedy = f"rigorous theory is offered for tiles of up to {longest:.2g} µm along x"
+    elif height_field.tile_size[0] > max_period:
+        remedy = f"rigorous theory is offered for tiles of up to {max_period:.2g} µm along x"
     else:
         remedy = "theory=rigorous has it right"
-        # Deeper profiles take long to solve, and are far outside of the range.
+        # Deeper profiles take long to solve, and are far outside the range.
         if depth <= WAVELENGTHS[0]:
             solved = _solved_error(height_field) if depth > 0 else (0.0, 0.0)
     if np.isfinite(solved[0]):
@@ -376,22 +380,22 @@ def _solved_error(profile: HeightField) -> tuple[float, float]:
     errors = []
     for wavelength in WAVELENGTHS:
         for angle in ANGLES:
-            light = np.array([-np.sin(np.deg2rad(angle)), 0.0, np.cos(np.deg2rad(angle))])
-            exact = converge(curve, light, period / wavelength, INDEX, _CONVERGED)
-            if not exact.error <= _CONVERGED:
+            omega_i = np.array([-np.sin(np.deg2rad(angle)), 0.0, np.cos(np.deg2rad(angle))])
+            exact = converge(curve, omega_i, period / wavelength, INDEX, _MAX_SOLVER_ERROR)
+            if not exact.error <= _MAX_SOLVER_ERROR:
                 return float("nan"), float("nan")
             scalar = scalar_orders(powers, period, wavelength, angle, INDEX)
-            passed = transmitted_orders(powers, period, wavelength, angle, INDEX)
-            of_exact = (exact.orders, exact.unpolarised), (exact.transmitted_orders, exact.transmitted_unpolarised)
-            # An order exactly along the horizon, which has no light, may be among those of one theory only.
+            scalar_transmitted = transmitted_orders(powers, period, wavelength, angle, INDEX)
+            wanted = (exact.orders, exact.unpolarised), (exact.transmitted_orders, exact.transmitted_unpolarised)
+            # Only one of the theories may include an order exactly at the horizon, which has no power.
             errors.append(
                 [
-                    difference(found.unpolarised[np.isin(found.m, m)], wanted[np.isin(m, found.m)])
-                    for found, (m, wanted) in zip((scalar, passed), of_exact, strict=True)
+                    difference(found.unpolarised[np.isin(found.m, m)], eta[np.isin(m, found.m)])
+                    for found, (m, eta) in zip((scalar, scalar_transmitted), wanted, strict=True)
                 ]
             )
-    of_reflected, of_transmitted = np.mean(errors, axis=0)
-    return float(of_reflected), float(of_transmitted)
+    reflected, transmitted_ = np.mean(errors, axis=0)
+    return float(reflected), float(transmitted_)
 
 
 def _estimated_error(lengths: Array, power: Array, depth: float, material: str) -> float:

@@ -12,15 +12,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from .errors import RequestError, is_number
 
-SHORTEST_WAVELENGTH = 50.0  # nm, of a spectrum
+MIN_WAVELENGTH = 50.0  # nm, of a spectrum
 VISIBLE = (360.0, 830.0)  # nm: the range of the CIE 1931 observer, from which Mitsuba draws wavelengths
 
-
-# Angular diameter 0.53°.
-SUN_COHERENCE_LENGTH = 65.0
-
-# 1 nm to 1 m, beyond which the lobes under- or overflow in floating point.
-SHORTEST, LONGEST = 1e-3, 1e6
+SUN_COHERENCE_LENGTH = 65.0  # µm, for the angular diameter of 0.53°
+# 1 nm to 1 m; outside, lobes under- or overflow in floating point.
+MIN_COHERENCE_LENGTH, MAX_COHERENCE_LENGTH = 1e-3, 1e6
 
 EXTENTS = ("tile", "sample")
 THEORIES = ("scalar", "rigorous")
@@ -29,10 +26,9 @@ SERIES = ("taylor", "chebyshev")
 REPRESENTATIONS = ("auto", "slices", *SERIES)
 ORIGINS = ("mean", "lowest")
 MAX_TERMS = 999
-LEAST_TOLERANCE = 1e-5
+MIN_TOLERANCE, MIN_RIGOROUS_TOLERANCE = 1e-5, 1e-4
 
-
-# What becomes of the light that enters a dielectric: it is lost, goes on in it, or leaves through a plane below.
+# Light that enters a dielectric is absorbed, stays in it, or is transmitted by a plane below.
 TRANSMISSIONS = ("none", "interface", "sheet")
 
 
@@ -41,29 +37,29 @@ class Settings:
     """The parameters of a spectrum, as recipes, scenes, the command line and `precompute` have them.
 
     Attributes:
-        extent: "tile": the patch repeats for ever; "sample": it is a piece of a larger, irregular surface.
+        extent: "tile": the patch repeats periodically; "sample": it is a piece of a larger, irregular surface.
         coherence_length: L_c in µm.
         wavelengths: (shortest, longest) in nm; in a scene the default is divided by the index next to the relief
             (`wavelengths_inside`).
-        largest_angle: of incidence and exit that the scene has, degrees from the normal; less than 90 keeps fewer
-            frequencies.
-        representation: "slices": powers, as "auto"; or a series of the amplitudes of one tile, "taylor" (Stam 1999) or
-            "chebyshev" (Dhillon and Ghosh 2016).
-        tolerance: bound of max over κ of ∫|S_approx(q; κ) − S_exact(q; κ)| dq, a share of the reflected power; by
-            default 1e-3, and of a sample a tenth of its `standard_error`, at least 1e-3 and at most 1e-2. Of rigorous
-            theory the bound of `RigorousSpectrum.error`, by default 1e-2.
-        largest_height_range: in µm; a deeper surface is refused, as one whose heights are in nm. Time and memory grow
+        largest_angle: largest angle of incidence and exit in the scene, degrees from the normal; below 90, fewer
+            frequencies are kept.
+        representation: "slices" (also chosen by "auto"): powers; or a series of the amplitudes of one tile, "taylor"
+            (Stam 1999) or "chebyshev" (Dhillon and Ghosh 2016).
+        tolerance: bound of max over κ of ∫|S_approx(q; κ) − S_exact(q; κ)| dq, a fraction of the reflected power; by
+            default 1e-3, and for a sample a tenth of its `standard_error`, limited to 1e-3 … 1e-2. In rigorous theory,
+            the bound of `RigorousSpectrum.error`, by default 1e-2.
+        largest_height_range: in µm; deeper surfaces are refused, since their heights may be in nm. Time and memory grow
             with the height range.
-        terms: of a series, N, whatever its error; by default as many as the tolerance needs.
-        heights_from: of a series, the level of h = 0: "mean" or "lowest".
+        terms: N of a series, whatever its error; by default the number that the tolerance requires.
+        heights_from: the level of h = 0 in a series: "mean" or "lowest".
         theory: "scalar", or "rigorous": Maxwell's equations, for a tile of one row and one material only.
-        int_ior: of rigorous theory, index of refraction of a dielectric, or n + ik.
-        material: of rigorous theory, or a conductor by the name that Mitsuba has for it.
-        ext_ior: of rigorous theory, index of the medium above relative to air, for a grating under a coat; wavelengths
-            are those there.
-        polarised: of rigorous theory, whether polarised variants can use the table, which is then seventeen times as
-            large.
-        transmission: of rigorous theory, "interface" or "sheet" for what a dielectric transmits, too.
+        int_ior: in rigorous theory, index of refraction of a dielectric, or n + ik.
+        material: or a conductor by Mitsuba's name.
+        ext_ior: in rigorous theory, index of the medium above relative to air, for a grating under a coat; wavelengths
+            are those in this medium.
+        polarised: in rigorous theory, whether to store Mueller matrices for polarised variants; the table is then
+            seventeen times as large.
+        transmission: in rigorous theory, "interface" or "sheet" to include the light that a dielectric transmits.
 
     Raises:
         ValueError: if one is out of range, or they contradict each other.
@@ -105,10 +101,10 @@ class Settings:
             shortest, longest = (float(w) for w in self.wavelengths)
         except (TypeError, ValueError, OverflowError):
             raise RequestError(f"wavelengths: got {self.wavelengths!r}, wanted (shortest, longest) in nm") from None
-        if not SHORTEST_WAVELENGTH <= shortest < longest < math.inf:
+        if not MIN_WAVELENGTH <= shortest < longest < math.inf:
             raise RequestError(
                 f"wavelengths: got {self.wavelengths!r}, wanted (shortest, longest) in nm, at least "
-                f"{SHORTEST_WAVELENGTH:g} nm"
+                f"{MIN_WAVELENGTH:g} nm"
             )
         object.__setattr__(self, "wavelengths", (shortest, longest))
         if not 0 < self.largest_angle <= 90:
@@ -116,10 +112,10 @@ class Settings:
                 f"largest_angle: got {self.largest_angle!r}, wanted degrees from the normal, above 0, at most 90"
             )
         self._check_series()
-        least = LEAST_TOLERANCE if self.theory == "scalar" else 1e-4
-        if self.tolerance is not None and not least <= self.tolerance < 1:
+        minimum = MIN_TOLERANCE if self.theory == "scalar" else MIN_RIGOROUS_TOLERANCE
+        if self.tolerance is not None and not minimum <= self.tolerance < 1:
             raise RequestError(
-                f"tolerance: got {self.tolerance!r}, wanted a share of the reflected power from {least:g} to 1"
+                f"tolerance: got {self.tolerance!r}, wanted a fraction of the reflected power from {minimum:g} to 1"
             )
         if not self.largest_height_range > 0:
             raise RequestError(
@@ -132,13 +128,13 @@ class Settings:
         if self.theory == "rigorous" and (self.extent, self.largest_angle, self.representation) != ("tile", 90, "auto"):
             raise RequestError(
                 f"theory: got rigorous with extent {self.extent!r}, largest_angle {self.largest_angle!r} and "
-                f"representation {self.representation!r}; it has its own table of a tile, for all directions"
+                f"representation {self.representation!r}; its table is always that of a tile, for all directions"
             )
         of_rigorous = self.int_ior, self.material, self.ext_ior, self.polarised, self.transmission
         if self.theory == "scalar" and of_rigorous != (None, None, 1, False, "none"):
             raise RequestError(
-                "int_ior, material, ext_ior, polarised, transmission: the spectrum of scalar theory is that of every "
-                "material; wanted none of them"
+                "int_ior, material, ext_ior, polarised, transmission: wanted none of them in scalar theory, whose "
+                "spectrum holds for every material"
             )
         if self.transmission != "none":
             if self.int_ior is None or np.imag(self.int_ior) != 0:
@@ -151,7 +147,7 @@ class Settings:
                 )
 
     def _check_series(self) -> None:
-        """Raise RequestError unless the parameters of a series are of one."""
+        """Raise RequestError if parameters of a series are invalid, or given without a series."""
         if self.representation not in SERIES:
             for name, value, default in (("terms", self.terms, None), ("heights_from", self.heights_from, "mean")):
                 if value != default:
@@ -172,21 +168,21 @@ class Settings:
 
     @property
     def chosen(self) -> dict[str, Any]:
-        """The parameters that are not the defaults, by name."""
+        """The parameters that differ from the defaults, by name."""
         return {f.name: value for f in fields(self) if (value := getattr(self, f.name)) != f.default}
 
 
 def wavelengths_inside(index: float, scale: float = 1.0) -> tuple[float, float]:
-    """Return (shortest, longest) of visible light next to a relief, in nm: λ/n, and λ/(n s) for larger lengths.
+    """Return (shortest, longest) wavelengths of visible light in a medium, in nm: λ/n, the shortest divided by s.
 
     Args:
-        index: n, the largest absolute index next to the relief.
+        index: n, the largest absolute index of the media beside the surface.
         scale: s, the largest factor of heights or lengths, which is equivalent to wavelengths that are shorter by s.
 
     Raises:
-        ValueError: if a table cannot have so short a wavelength.
+        ValueError: if the shortest wavelength is below `MIN_WAVELENGTH`.
     """
-    shortest, max_scale = VISIBLE[0] / (index * scale), VISIBLE[0] / (index * SHORTEST_WAVELENGTH)
+    shortest, max_scale = VISIBLE[0] / (index * scale), VISIBLE[0] / (index * MIN_WAVELENGTH)
     if scale > max_scale:
         raise RequestError(f"height_scale, lateral_scale: got up to {scale:g}, wanted at most {max_scale:.3g}")
     return shortest, VISIBLE[1] / index
@@ -201,21 +197,22 @@ def lobe_width(coherence_length: float) -> float:
     Raises:
         ValueError: if the coherence length is not 1 nm to 1 m.
     """
-    if not SHORTEST <= coherence_length <= LONGEST:
+    if not MIN_COHERENCE_LENGTH <= coherence_length <= MAX_COHERENCE_LENGTH:
         raise RequestError(
-            f"coherence_length: got {coherence_length!r}, wanted a positive number of µm, {SHORTEST:g} to {LONGEST:g}"
+            f"coherence_length: got {coherence_length!r}, wanted a positive number of µm, "
+            f"{MIN_COHERENCE_LENGTH:g} to {MAX_COHERENCE_LENGTH:g}"
         )
     return 1 / (2 * math.sqrt(2) * math.pi * (coherence_length / 4))
 
 
-def lobe_cutoff(share: float) -> float:
-    """Return half the side ρ of the square at which a lobe is truncated, in standard deviations; the rest is rescaled.
+def lobe_cutoff(change: float) -> float:
+    """Return half the side ρ of the square to which a lobe is truncated, in standard deviations.
 
     A two-dimensional Gaussian has the fraction 1 − erf(ρ/√2)² outside that square. Truncation and renormalisation
-    change it by twice that in the L1 norm, which is set equal to `share`.
+    change it by twice that in the L1 norm, which is set equal to `change`.
     """
-    # 1 − √(1 − s/2) without cancellation.
-    return float(-scipy.special.ndtri(-np.expm1(0.5 * np.log1p(-share / 2)) / 2))
+    # 1 − √(1 − change/2) without cancellation.
+    return float(-scipy.special.ndtri(-np.expm1(0.5 * np.log1p(-change / 2)) / 2))
 
 
 def matching(q: ArrayLike, kappa: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

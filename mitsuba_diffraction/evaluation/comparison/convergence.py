@@ -17,7 +17,7 @@ from ...errors import RequestError
 from ...files import whole_file
 from ...outputs import METADATA
 from ...progress import Progress, no_progress
-from ...settings import LEAST_TOLERANCE
+from ...settings import MIN_TOLERANCE
 from ..report import cells
 from .difference import as_shown, difference, noise, white_luminance
 from .pictures import Picture, Pictures
@@ -108,9 +108,9 @@ class Convergence:
 
 def check_tolerances(tolerances: Sequence[float]) -> None:
     """Raise if the reference cannot be three times as fine as the finest."""
-    if not min(tolerances) / 3 >= LEAST_TOLERANCE:
+    if not min(tolerances) / 3 >= MIN_TOLERANCE:
         raise RequestError(
-            f"tolerance: got {min(tolerances):g}, wanted at least {3 * LEAST_TOLERANCE:g}: "
+            f"tolerance: got {min(tolerances):g}, wanted at least {3 * MIN_TOLERANCE:g}: "
             "the reference takes a third of the finest"
         )
 
