@@ -248,8 +248,8 @@ def error_map(material: str = "dielectric") -> tuple[Array, Array, Array, Array]
             transmission of the dielectric, directions being those in air.
 
     Returns:
-        period/λ (n,), depth/λ (k,), directions (a, 2) in degrees, the angle of incidence and the azimuth of its
-        plane (0: perpendicular to the grooves), and the error, (n, k, a).
+        period/λ (n,), depth/λ (k,), directions (a, 2) in degrees, and the error, (n, k, a). Directions are the angle of
+        incidence and the azimuth of its plane, 0 if perpendicular to the grooves.
     """
     content = json.loads(MAP.read_text(encoding="utf-8"))
     if material not in content["error"]:

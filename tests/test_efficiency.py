@@ -14,7 +14,7 @@ ANGLES, WAVELENGTHS = [0.0, 20.0, -50.0], [450.0, 600.0]
 
 
 @pytest.mark.parametrize("theory", ["scalar", "rigorous"])
-def test_a_flat_surface_reflects_as_fresnel_says(theory):
+def test_a_flat_surface_reflects_by_fresnels_formulas(theory):
     flat = md.HeightField(np.zeros((1, 32)), (0.05, 1.0), "flat")
     found = md.efficiencies(flat, [0, 40, np.rad2deg(np.arctan(1.5))], 500, theory=theory, int_ior=1.5)
     np.testing.assert_allclose(found.order(0)[:, 0].T, fresnel(np.cos(np.deg2rad(found.angles)), 1.5), atol=1e-9)
@@ -23,7 +23,7 @@ def test_a_flat_surface_reflects_as_fresnel_says(theory):
 
 @pytest.mark.parametrize("azimuth", [0, 37])
 @pytest.mark.parametrize("theory", ["scalar", "rigorous"])
-def test_a_flat_film_transmits_as_fresnel_says(theory, azimuth):
+def test_a_flat_film_transmits_by_fresnels_formulas(theory, azimuth):
     flat, angles = md.HeightField(np.zeros((1, 32)), (0.05, 1.0), "flat"), [0, 40, 56.3]
     reflected = np.stack(fresnel(np.cos(np.deg2rad(angles)), 1.5), axis=-1)
 
@@ -42,7 +42,7 @@ def test_a_flat_film_transmits_as_fresnel_says(theory, azimuth):
 
 
 @pytest.mark.parametrize("transmission", ["interface", "sheet"])
-def test_both_theories_agree_on_light_that_passes_a_shallow_grating(transmission):
+def test_both_theories_agree_on_transmission_of_a_shallow_grating(transmission):
     shallow = md.gratings.sinusoidal(3.35, 0.3)
     scalar, rigorous = (
         md.efficiencies(shallow, [0, 30], 500, theory=theory, transmission=transmission)
@@ -54,7 +54,7 @@ def test_both_theories_agree_on_light_that_passes_a_shallow_grating(transmission
     assert np.abs(scalar.unpolarised - rigorous.unpolarised).sum(axis=0).max() < 0.02
 
 
-def test_the_orders_that_pass_a_film_are_products():
+def test_transmitted_orders_of_a_film_are_products():
     # Two sinusoids of amplitude 0.19 µm at right angles; along the normal, κ = 2π (1 − n cos θ_o)/λ.
     found = md.efficiencies(md.gratings.film(), 0, 550, transmission="interface")
     for m in ((0, 0), (1, 0), (0, -1), (1, -1)):
@@ -68,7 +68,7 @@ def test_the_orders_that_pass_a_film_are_products():
         assert found.order(*m).mean() == pytest.approx(expected, rel=1e-4)
 
 
-def test_a_sinusoid_of_a_perfect_mirror_is_the_closed_form():
+def test_a_sinusoid_of_a_perfect_mirror_agrees_with_the_closed_form():
     period, depth, angle, wavelength = 4.0, 0.1, 25.0, 0.5
     found = md.efficiencies(md.gratings.sinusoidal(period, depth), angle, 500, material="none")
     # The model as it is written in docs/theory.md; of so shallow a relief E is nearly one.
@@ -82,7 +82,7 @@ def test_a_sinusoid_of_a_perfect_mirror_is_the_closed_form():
     values = found.values[:, 0, 0, 0]
     assert (values <= expected + 1e-12).all()
     np.testing.assert_allclose(values[:-1], expected[:-1], rtol=1.5e-3)
-    np.testing.assert_allclose(values[-1], expected[-1], rtol=0.015)  # it leaves at grazing angle
+    np.testing.assert_allclose(values[-1], expected[-1], rtol=0.015)  # at grazing exit
 
 
 @pytest.mark.parametrize("m", [(0, 0), (1, 0), (-2, 1), (3, -3)])
@@ -104,7 +104,7 @@ def test_the_orders_of_a_tile_without_change_along_y_are_those_of_its_profile():
     assert np.abs(found.s[~along_x]).max() < 1e-20
 
 
-def test_the_orders_of_a_tile_turn_with_it():
+def test_the_orders_of_a_tile_rotate_with_it():
     # Turned by a quarter, x becomes y and y becomes −x.
     tile = md.HeightField(np.random.default_rng(1).random((16, 24)) * 0.1, 0.1)
     turned = md.HeightField(np.rot90(tile.heights, -1), 0.1)
@@ -115,30 +115,30 @@ def test_the_orders_of_a_tile_turn_with_it():
         np.testing.assert_allclose(found.order(x, y), other.order(-y, x), atol=1e-12)
 
 
-def test_values_are_those_of_one_direction_and_wavelength():
+def test_values_agree_with_those_of_one_direction_and_wavelength():
     blaze = md.gratings.blazed(2.0, 0.25)
     found = md.efficiencies(blaze, ANGLES, WAVELENGTHS, theory="rigorous", material="Al", azimuth=30)
     assert found.values.shape == (len(found.orders), 3, 2, 2)
     light = -np.sin(np.deg2rad(-50.0)) * np.array([np.cos(np.pi / 6), 0.5])
     one = md.rigorous.efficiencies(blaze, (*light, np.cos(np.deg2rad(50.0))), 0.6, material="Al")
-    there = np.isin(found.orders, one.orders)
-    np.testing.assert_allclose(found.values[there, 2, 1], np.stack([one.s, one.p], axis=1), atol=1e-12)
-    assert not found.values[~there, 2, 1].any()
+    propagates = np.isin(found.orders, one.orders)
+    np.testing.assert_allclose(found.values[propagates, 2, 1], np.stack([one.s, one.p], axis=1), atol=1e-12)
+    assert not found.values[~propagates, 2, 1].any()
 
 
 @pytest.mark.parametrize("theory", ["scalar", "rigorous"])
-def test_a_blaze_in_littrow_mount_sends_light_back_to_where_it_comes_from(theory):
+def test_a_blaze_in_littrow_mount_diffracts_light_back_to_its_source(theory):
     # sin θ = λ/2T; facets perpendicular to the light.
     period, wavelength = 5.0, 0.5
     angle = np.arcsin(wavelength / (2 * period))
     blaze = md.gratings.blazed(period, period * np.tan(angle))
     found = md.efficiencies(blaze, [np.rad2deg(angle), -np.rad2deg(angle)], 500, theory=theory, material="Al")
-    share = found.unpolarised[:, :, 0] / found.unpolarised[:, :, 0].sum(axis=0)
-    assert share[list(found.orders).index(1), 0] > 0.93
-    assert share[list(found.orders).index(-1), 1] < 0.02
+    fraction = found.unpolarised[:, :, 0] / found.unpolarised[:, :, 0].sum(axis=0)
+    assert fraction[list(found.orders).index(1), 0] > 0.93
+    assert fraction[list(found.orders).index(-1), 1] < 0.02
 
 
-def test_axes_name_what_values_hold():
+def test_axes_describe_the_values():
     found = md.efficiencies(md.gratings.blazed(1.0, 0.1), ANGLES, WAVELENGTHS)
     assert list(found.axes) == ["order", "angle", "wavelength", "polarisation"]
     assert tuple(map(len, found.axes.values())) == found.values.shape

@@ -6,7 +6,7 @@ from scipy.special import ndtr
 from mitsuba_diffraction.geometry import horizon_gain
 
 
-def test_lobes_cut_by_the_horizon_keep_their_power():
+def test_lobes_truncated_by_the_horizon_keep_their_power():
     """g(x) ∫₀^∞ φ(x − y) g(y) dy = 1."""
     y, weights = np.polynomial.legendre.leggauss(200)
     y, weights = 5 * (y + 1), 5 * weights

@@ -1,4 +1,4 @@
-"""What a wrong scene is told: not only what is missing, but what there is."""
+"""Error messages: they name what is missing or wrong, and what is available."""
 
 import ast
 import shutil
@@ -118,9 +118,9 @@ def test_a_bug_keeps_its_traceback(monkeypatch, llvm):
 def test_the_log_is_plain_text(caplog, capfd, llvm, command, tmp_path):
     """One line each, without colours and places in the code; Mitsuba's own log has both, in files too."""
     grating = {"type": "diffraction_grating", "profile": "blazed", "period": 2.5, "depth": 0.25, "coat_ior": 1.5}
-    told = "diffraction_grating: coat_thickness changes nothing: absorption needs coat_absorption and coat_thickness"
+    warning = "diffraction_grating: coat_thickness changes nothing: absorption needs coat_absorption and coat_thickness"
     mi.load_dict({**grating, "coat_thickness": 10.0})
-    assert told in [record.getMessage() for record in caplog.records]
+    assert warning in [record.getMessage() for record in caplog.records]
     assert "".join(capfd.readouterr()) == ""
     body = BLAZED + '<float name="coat_ior" value="1.5"/><float name="coat_thickness" value="10"/>'
     (tmp_path / "lights").mkdir()
@@ -130,12 +130,12 @@ def test_the_log_is_plain_text(caplog, capfd, llvm, command, tmp_path):
     output = tmp_path / "scene.exr"
     code, _, err = command("render", str(tmp_path / "scene.xml"), "-o", str(output), "--width", "4", "--spp", "1")
     assert code == 0, err
-    assert f"mitsuba-diffraction: warning: {told}\n" in err
+    assert f"mitsuba-diffraction: warning: {warning}\n" in err
     assert "\x1b" not in err
 
 
 def test_wrong_requests_have_a_class_of_their_own():
-    """A plain ValueError is told as a bug."""
+    """A plain ValueError is reported as a bug."""
     for path in Path(mitsuba_diffraction.__file__).parent.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call):

@@ -27,10 +27,10 @@ def test_a_log_reports_in_one_line_that_a_spectrum_is_computed(llvm, capfd, monk
     assert re.fullmatch(r"mitsuba-diffraction: spectrum of lamellar: \d+ %, 0 s\n", err)
 
 
-def test_progress_begins_with_the_heights_and_does_not_go_back():
-    told = []
-    md.Recipe(RUBBED, Settings(coherence_length=3.0, tolerance=0.05)).build(lambda *numbers: told.append(numbers))
-    done, total = zip(*told, strict=True)
+def test_progress_begins_with_the_heights_and_never_decreases():
+    reports = []
+    md.Recipe(RUBBED, Settings(coherence_length=3.0, tolerance=0.05)).build(lambda *numbers: reports.append(numbers))
+    done, total = zip(*reports, strict=True)
     assert set(total) == {100}
     assert list(done) == sorted(done)
     assert done[0] <= 20

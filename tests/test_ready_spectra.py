@@ -20,7 +20,7 @@ import ready_spectra  # noqa: E402
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=() if name == "elaphe_afm" else pytest.mark.slow) for name in ready_spectra.NAMES]
 )
-def test_a_spectrum_of_the_package_is_what_its_recipe_gives(name, tmp_path):
+def test_a_spectrum_of_the_package_is_that_of_its_recipe(name, tmp_path):
     recipe = Recipe.load(ROOT / "precompute" / f"{name}.toml")
     kept = load_spectrum(READY_SPECTRA / f"{recipe.digest()}.exr", recipe=recipe.digest())
     recipe.build().save(tmp_path / "built.exr")  # with its table of E

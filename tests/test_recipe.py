@@ -107,7 +107,7 @@ def test_bytes_that_are_no_text_are_refused(tmp_path):
         Recipe.load(tmp_path / "recipe.toml")
 
 
-def test_a_recipe_that_is_not_there_is_named(tmp_path):
+def test_a_missing_recipe_is_named(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"nothing\.toml: no such file"):
         Recipe.load(tmp_path / "nothing.toml")
     with pytest.raises(OSError, match=tmp_path.name):
@@ -141,14 +141,14 @@ def test_a_recipe_that_is_not_there_is_named(tmp_path):
         ("extent = 5", "extent"),
     ],
 )
-def test_values_of_the_spectrum_that_cannot_be_are_refused_by_name(tmp_path, entry, name):
+def test_invalid_values_of_the_spectrum_are_refused_by_name(tmp_path, entry, name):
     path = write(tmp_path, f"{BLAZE}[spectrum]\n{entry}\n")
     with pytest.raises(ValueError, match=f"recipe.toml: {name}: ") as caught:
         Recipe.load(path)
     assert "\n" not in str(caught.value)
 
 
-def test_options_take_the_place_of_a_recipes_values(tmp_path):
+def test_options_override_the_values_of_a_recipe(tmp_path):
     path = write(tmp_path, BLAZE + '[spectrum]\ntolerance = 2\nmaterial = "Al"\n')
     recipe = Recipe.load(path, tolerance=0.1, theory="rigorous")
     assert recipe.settings == Settings(tolerance=0.1, material="Al", theory="rigorous")
@@ -171,7 +171,7 @@ def test_options_take_the_place_of_a_recipes_values(tmp_path):
     ],
 )
 @pytest.mark.parametrize("way", ["build", "cached"])
-def test_values_of_a_profile_that_cannot_be_are_refused_by_name(tmp_path, entries, name, way):
+def test_invalid_values_of_a_profile_are_refused_by_name(tmp_path, entries, name, way):
     path = write(tmp_path, f'[surface]\nprofile = "lamellar"\n{entries}\n')
     with pytest.raises(ValueError, match=name):
         getattr(Recipe.load(path), way)()
@@ -194,7 +194,7 @@ def test_values_of_a_profile_that_cannot_be_are_refused_by_name(tmp_path, entrie
     ],
 )
 @pytest.mark.parametrize("way", ["build", "cached"])
-def test_values_of_a_scan_that_cannot_be_are_refused_by_name(tmp_path, own_cache, entries, name, way):
+def test_invalid_values_of_a_scan_are_refused_by_name(tmp_path, own_cache, entries, name, way):
     write_scan(tmp_path)
     path = write(tmp_path, f"[surface]\n{entries}\n")
     with pytest.raises(ValueError, match=name):
@@ -203,7 +203,7 @@ def test_values_of_a_scan_that_cannot_be_are_refused_by_name(tmp_path, own_cache
 
 
 @pytest.mark.parametrize("way", ["build", "cached", "digest"])
-def test_a_scan_that_is_not_there_is_named(tmp_path, way):
+def test_a_missing_scan_is_named(tmp_path, way):
     path = write(tmp_path, '[surface]\nscan = "gone.npy"\npixel_size = 0.05\n')
     with pytest.raises(FileNotFoundError, match=r"gone\.npy"):
         getattr(Recipe.load(path), way)()
@@ -212,7 +212,7 @@ def test_a_scan_that_is_not_there_is_named(tmp_path, way):
 # ---------------------------------------------------------------- what is built
 
 
-def test_a_recipe_builds_what_its_words_say(tmp_path):
+def test_a_recipe_builds_the_described_spectrum(tmp_path):
     path = write(
         tmp_path,
         BLAZE + 'samples = 64\n[spectrum]\nextent = "tile"\ncoherence_length = 30\nwavelengths = [400, 700.0]\n'
@@ -283,7 +283,7 @@ def test_a_scan_is_relative_to_its_recipe(tmp_path, monkeypatch):
     assert field.pixel_size == (0.05, 0.08)
 
 
-def test_a_scan_with_missing_pixels_is_filled_where_the_recipe_says_so(tmp_path, own_cache):
+def test_a_scan_with_missing_pixels_is_filled_if_the_recipe_requests_it(tmp_path, own_cache):
     heights = write_scan(tmp_path)
     heights[2, 3:5] = np.nan
     np.save(tmp_path / "scan.npy", heights)
@@ -379,22 +379,22 @@ def test_another_parameter_is_another_spectrum(own_cache, builds, surface, spect
 
 
 @pytest.mark.slow
-def test_the_cache_knows_a_scan_by_its_bytes(tmp_path, own_cache, builds):
+def test_the_cache_identifies_a_scan_by_its_bytes(tmp_path, own_cache, builds):
     text = '[surface]\nscan = "scan.npy"\npixel_size = 0.05\n[spectrum]\ntolerance = 0.01\n'
-    here, there = tmp_path / "here", tmp_path / "there"
-    for folder in (here, there):
+    folder_1, folder_2 = tmp_path / "first", tmp_path / "second"
+    for folder in (folder_1, folder_2):
         folder.mkdir()
         write_scan(folder, seed=0)
         write(folder, text)
-    first = Recipe.load(here / "recipe.toml").cached().source_digest
-    Recipe.load(there / "recipe.toml").cached()
+    first = Recipe.load(folder_1 / "recipe.toml").cached().source_digest
+    Recipe.load(folder_2 / "recipe.toml").cached()
     assert len(builds) == 1  # the same content in another folder
-    shutil.move(there / "scan.npy", there / "other.npy")
-    write(there, text.replace("scan.npy", "other.npy"))
-    Recipe.load(there / "recipe.toml").cached()
+    shutil.move(folder_2 / "scan.npy", folder_2 / "other.npy")
+    write(folder_2, text.replace("scan.npy", "other.npy"))
+    Recipe.load(folder_2 / "recipe.toml").cached()
     assert len(builds) == 1  # … and under another name
-    heights = write_scan(here, seed=1)
-    changed = Recipe.load(here / "recipe.toml").cached()
+    heights = write_scan(folder_1, seed=1)
+    changed = Recipe.load(folder_1 / "recipe.toml").cached()
     assert len(builds) == 2
     assert changed.source_digest != first
     assert changed.source_digest == md.HeightField(heights, 0.05).digest
@@ -402,7 +402,7 @@ def test_the_cache_knows_a_scan_by_its_bytes(tmp_path, own_cache, builds):
 
 @pytest.mark.few(1)
 @pytest.mark.parametrize("damage", [b"", b"not a picture", None])
-def test_a_damaged_entry_is_built_anew(own_cache, builds, damage):
+def test_a_damaged_entry_is_built_again(own_cache, builds, damage):
     recipe = Recipe(CROSSED, Settings(**FAST))
     whole = powers(recipe.cached())
     (path,) = own_cache.iterdir()
@@ -413,7 +413,7 @@ def test_a_damaged_entry_is_built_anew(own_cache, builds, damage):
     np.testing.assert_array_equal(powers(GratingSpectrum.load(path)), whole)
 
 
-def test_an_interrupted_build_leaves_nothing(own_cache, monkeypatch):
+def test_an_interrupted_build_leaves_no_entry(own_cache, monkeypatch):
     def interrupted(*_):
         raise KeyboardInterrupt
 
@@ -423,7 +423,7 @@ def test_an_interrupted_build_leaves_nothing(own_cache, monkeypatch):
     assert not own_cache.exists() or not list(own_cache.iterdir())
 
 
-def test_digest_does_not_depend_on_the_order_of_the_words():
+def test_digest_does_not_depend_on_the_order_of_entries():
     one = Recipe({"profile": "blazed", "period": 2.5, "depth": 0.25})
     assert one.digest() == Recipe({"depth": 0.25, "profile": "blazed", "period": 2.5}).digest()
 
@@ -461,15 +461,15 @@ prepare = ["level_plane", "align_lines", "fill_missing", { trim_edges = 0.1 }, {
 """
 
 
-def test_a_scan_is_prepared_and_the_spectrum_says_how(tmp_path):
+def test_a_scan_is_prepared_and_the_spectrum_records_the_steps(tmp_path):
     tilted(tmp_path)
     recipe = Recipe.load(write(tmp_path, PREPARED + "[spectrum]\ntolerance = 0.01\n"))
     spectrum = recipe.build()
     spectrum.save(tmp_path / "out.exr")
     source = GratingSpectrum.load(tmp_path / "out.exr").source
     assert source == recipe.height_field().source
-    told = [part.split(":")[0] for part in source.split("; ")]
-    assert told[:5] == ["scan.npy", "level_plane", "align_lines", "fill_missing", "trim_edges"]
+    steps = [part.split(":")[0] for part in source.split("; ")]
+    assert steps[:5] == ["scan.npy", "level_plane", "align_lines", "fill_missing", "trim_edges"]
     assert "level_plane: tilt 11" in source  # atan 0.2, but for the waves that the patch cuts
     assert "fill_missing: 1 of 2800 pixels" in source
     assert "crop_periods: 5 × 613" in source
@@ -488,7 +488,7 @@ def test_missing_pixels_are_filled_after_the_last_step(tmp_path):
         Recipe.load(write(tmp_path, text.replace('"level_plane"', "{ trim_edges = 9 }"))).height_field()
 
 
-def test_tables_of_rigorous_theory_are_built_anew_after_a_change_of_theirs(tmp_path, monkeypatch):
+def test_rigorous_tables_are_built_again_after_a_change_of_their_version(tmp_path, monkeypatch):
     scalar, rigorous = (
         Recipe.load(write(tmp_path, BLAZE + f"[spectrum]\ntheory = '{t}'\n")) for t in ("scalar", "rigorous")
     )
@@ -498,7 +498,7 @@ def test_tables_of_rigorous_theory_are_built_anew_after_a_change_of_theirs(tmp_p
     assert rigorous.digest() != before[1]
 
 
-def test_the_cache_knows_the_steps_and_their_order(tmp_path):
+def test_the_cache_distinguishes_steps_and_their_order(tmp_path):
     tilted(tmp_path)
     texts = [
         PREPARED,
@@ -582,11 +582,11 @@ def test_without_a_cache_there_is_a_warning(own_cache, builds, damage):
 def test_one_warning_for_many_surfaces(own_cache):
     own_cache.parent.mkdir()
     own_cache.write_text("")
-    with warnings.catch_warnings(record=True) as told:
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("default")
         for period in (1.0, 1.1, 1.2):
             Recipe({**CROSSED, "period": period}, Settings(**FAST)).cached()
-    assert len(told) == 1
+    assert len(caught) == 1
 
 
 @pytest.mark.slow

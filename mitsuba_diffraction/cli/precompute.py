@@ -15,7 +15,7 @@ from ..progress import progress_bar, tell
 from ..recipe import Recipe
 from ..rigorous.spectrum import RigorousSpectrum
 from ..settings import ORIGINS, REPRESENTATIONS, SUN_COHERENCE_LENGTH, THEORIES
-from ..surface.prepare import seam_matters, seam_steps
+from ..surface.prepare import is_seam_visible, seam_steps
 from .arguments import (
     Channel,
     CoherenceLength,
@@ -130,7 +130,7 @@ def _seam(source: Path, recipe: Recipe) -> str:
     seam = " and ".join(
         f"{across * 1e3:.3g} nm along {axis} ({inside * 1e3:.3g} inside)" for axis, (across, inside) in steps.items()
     )
-    if seam_matters(steps):
+    if is_seam_visible(steps):
         raise RequestError(
             f"--extent: got none, and {source} does not tile without a seam: r.m.s. steps of {seam}; wanted "
             "--extent sample (a sample of an irregular surface), --extent tile (periodic, in spite of the seam), or "

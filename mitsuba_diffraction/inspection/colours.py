@@ -29,7 +29,7 @@ from ..surface.periods import Period, find_periods
 
 Array = NDArray[np.float64]
 
-LONGEST_COHERENCE = 20.0  # µm; at 65 µm the orders of one wavelength are narrower than a pixel of the picture
+MAX_COLOUR_COHERENCE_LENGTH = 20.0  # µm; at 65 µm orders of one wavelength are narrower than a pixel of the picture
 WAVELENGTHS = np.arange(VISIBLE[0], VISIBLE[1] + 1, 2.0)  # nm; fine enough for these lobes
 
 
@@ -48,7 +48,7 @@ def radiance(
     height_scale: float = 1.0,
     lateral_scale: float = 1.0,
 ) -> Array:
-    """Compute L(λ), which the docstring of this module defines.
+    """Compute L(λ), defined in the docstring of this module.
 
     Heights scaled by s have the spectrum S(q; s κ). A surface stretched by s has s² S(s q; κ), where the coherence
     length is scaled as well.
@@ -79,7 +79,7 @@ def order_angle(order: int, period: float, wavelength: float) -> float | None:
     return float(np.degrees(np.arcsin(sine))) if abs(sine) < 1 else None
 
 
-def order_share(
+def order_fraction(
     spectrum: GratingSpectrum,
     direction: float,
     period: float,
@@ -89,11 +89,11 @@ def order_share(
     height_scale: float = 1.0,
     lateral_scale: float = 1.0,
 ) -> float:
-    """Return the share of the reflected power about one order and its opposite, at normal incidence (R = 1, K G = 1).
+    """Return the fraction of the reflected power in the orders ±m, at normal incidence (R = 1, K G = 1).
 
-    S is integrated over the cells of the lattice of orders, squares of side 1/period about q = ±m e/period, at the κ of
-    the order. An irregular surface spreads its orders over these cells; a grating has them in the middle. Period and
-    wavelength are in µm, the period as it is after scaling.
+    S is integrated over squares of side 1/period about q = ±m e/period, at the κ of the order. An irregular surface
+    spreads its orders over these squares; a grating has them at the centres. Period and wavelength are in µm, the
+    period after scaling.
     """
     angle = order_angle(order, period, wavelength)
     if angle is None:
@@ -111,23 +111,23 @@ def order_share(
     return float(total * lateral_scale**2 / period**2)
 
 
-SHARE = 0.05  # the change that is tried, both ways
+CHANGE = 0.05  # relative change of a property, up and down
 GREEN = 0.55  # µm, the wavelength for which orders are reported
 ORDERS = (1, 2)
 
 
 @dataclass(frozen=True)
 class Change:
-    """Change of period and orders with one property of the scan.
+    """Change of period, orders and colours with one property of the scan.
 
     Attributes:
         what: "height scale", "pixel size" or "tip broadening".
         by: the change, +0.05 or −0.05.
-        period: of the main period, a share of it.
-        before, after: m → share of the reflected light in the orders ±m, 550 nm at normal incidence.
-        colour: m → ΔE00 in the direction of the order m of 550 nm before the change, on its brighter side. Exposure
-            gives the brighter of the orders half of the luminance of a white sheet before the change.
-        tip_radius: of the tip that broadens the ridges so, µm; NaN for other changes.
+        period: relative change of the main period.
+        before, after: m → fraction of the reflected light in the orders ±m, at 550 nm and normal incidence.
+        colour: m → ΔE00 in the direction of the order m of 550 nm before the change, of the brighter sign. The exposure
+            gives the brightest order half the luminance of a white sheet before the change.
+        tip_radius: of the tip that causes the broadening, µm; NaN for other changes.
     """
 
     what: str
@@ -161,36 +161,36 @@ def changes(
     A blunter and a sharper tip have equal effects on a surface that is equal to its negative, such as a sinusoid or a
     sawtooth: one widens the ridges, the other the grooves, and h and −h have the same powers.
 
-    Height scale and pixel size scale the arguments of the one spectrum (`radiance`); the tip makes another surface,
-    whose periods and spectrum are computed anew, by `build`, with the same settings. The spectrum holds for wavelengths
-    from 360 nm divided by 1.05.
+    Height scale and pixel size scale the arguments of the spectrum (`radiance`). The tip changes the surface, whose
+    periods and spectrum are computed again, by `build`, with the same settings. The spectrum must be valid for
+    wavelengths from 360 nm/1.05.
     """
     orders = [m for m in ORDERS if order_angle(m, main.period, GREEN) is not None]
     before = _View(spectrum, main.period)
-    sides = {m: max((m, -m), key=lambda side: _XYZ(before, main, side, main.period)[1]) for m in orders}
-    shares = {m: _share(before, main, m) for m in orders}
-    colours = {m: _XYZ(before, main, sides[m], main.period) for m in orders}
+    brighter = {m: max((m, -m), key=lambda order: _XYZ(before, main, order, main.period)[1]) for m in orders}
+    fractions = {m: _fraction(before, main, m) for m in orders}
+    colours = {m: _XYZ(before, main, brighter[m], main.period) for m in orders}
     brightest = max((XYZ[1] for XYZ in colours.values()), default=1.0)
     exposure = 0.5 / brightest if brightest > 0 else 1.0
 
     def change(what: str, by: float, after: _View, tip_radius: float = float("nan")) -> Change:
-        after_shares = {m: _share(after, main, m) for m in orders}
+        new_fractions = {m: _fraction(after, main, m) for m in orders}
         colour = {
-            m: float(delta_E(exposure * colours[m], exposure * _XYZ(after, main, sides[m], main.period)))
+            m: float(delta_E(exposure * colours[m], exposure * _XYZ(after, main, brighter[m], main.period)))
             for m in orders
         }
-        return Change(what, by, after.period / main.period - 1, shares, after_shares, colour, tip_radius)
+        return Change(what, by, after.period / main.period - 1, fractions, new_fractions, colour, tip_radius)
 
     found = []
-    for by in (SHARE, -SHARE):
+    for by in (CHANGE, -CHANGE):
         found.append(change("height scale", by, _View(spectrum, main.period, {"height_scale": 1 + by})))
-    for by in (SHARE, -SHARE):
+    for by in (CHANGE, -CHANGE):
         found.append(change("pixel size", by, _View(spectrum, main.period * (1 + by), {"lateral_scale": 1 + by})))
-    for by in (SHARE, -SHARE) if measured else ():
+    for by in (CHANGE, -CHANGE) if measured else ():
         try:
             other, radius = broadened(height_field, by, extent=extent)
         except RequestError:
-            continue  # steps from one pixel to the next: no tip is that sharp
+            continue  # steps between adjacent pixels, which no tip explains
         period = same_period(find_periods(other, extent=extent), main).period
         found.append(change("tip broadening", by, _View(build(other), period), radius))
     return tuple(found)
@@ -206,28 +206,28 @@ def same_period(found: tuple[Period, ...], main: Period) -> Period:
     return nearest if angle(nearest) < 10 else main
 
 
-def _share(view: _View, main: Period, order: int) -> float:
-    return order_share(view.spectrum, main.direction, view.period, order, GREEN, **view.scale)
+def _fraction(view: _View, main: Period, order: int) -> float:
+    return order_fraction(view.spectrum, main.direction, view.period, order, GREEN, **view.scale)
 
 
 def _XYZ(view: _View, main: Period, order: int, period: float) -> Array:
     """Return non-negative XYZ at normal incidence in the direction to which `period` diffracts 550 nm."""
-    light = radiance(view.spectrum, main.direction, 0.0, order_angle(order, period, GREEN), **view.scale)
-    return np.maximum(spectrum_to_XYZ(light, WAVELENGTHS), 0)
+    spectra = radiance(view.spectrum, main.direction, 0.0, order_angle(order, period, GREEN), **view.scale)
+    return np.maximum(spectrum_to_XYZ(spectra, WAVELENGTHS), 0)
 
 
-_HALVINGS = 12
+_HALVINGS = 12  # of the interval of tip radii
 
 
 def scanned(height_field: HeightField, radius: float, *, extent: str = "sample") -> HeightField:
-    """Return the surface as a tip of this radius, µm, records it or, for a negative radius, as it was before.
+    """Return the surface as recorded by a tip of this radius, µm, or reconstructed from a record if it is negative.
 
-    The lowest place that a paraboloid ρ²/2r can reach over each point is the dilation of the heights by it; erosion by
-    the same gives back all that the tip touched (Villarrubia 1997, J. Res. NIST 102, 425–454):
+    The lowest position of a paraboloid ρ²/2r over each point is the dilation of the heights by it; erosion by the same
+    paraboloid restores all points that the tip touched (Villarrubia 1997, J. Res. NIST 102, 425–454):
 
         h_r(x) = max_ρ [h(x + ρ) − ρ²/2r],    h_{−r}(x) = min_ρ [h(x + ρ) + ρ²/2r]
 
-    A "tile" is continued by itself, a "sample" by its edge.
+    A "tile" is continued periodically, a "sample" by its edge.
     """
     heights = height_field.heights
     mode = "wrap" if extent == "tile" else "nearest"
@@ -241,14 +241,14 @@ def scanned(height_field: HeightField, radius: float, *, extent: str = "sample")
     return HeightField(heights, height_field.pixel_size, height_field.source)
 
 
-def broadened(height_field: HeightField, share: float, *, extent: str = "sample") -> tuple[HeightField, float]:
-    """Return the surface with ridges wider by `share`, and the radius (µm, signed) of the tip that widens them so.
+def broadened(height_field: HeightField, change: float, *, extent: str = "sample") -> tuple[HeightField, float]:
+    """Return the surface with ridges wider by the fraction `change`, and the signed radius (µm) of the tip required.
 
     The width of ridges is measured by the area above mid-height, half way between the mean of the heights above the
-    average and the mean of those below; a tip radius is sought for which it grows by `share` (shrinks, if negative).
+    average and the mean of those below. The tip radius is found for which it grows by `change` (shrinks, if negative).
 
     Raises:
-        ValueError: if no tip does that: a flat surface.
+        ValueError: if no tip has that effect, as for a flat surface.
     """
     heights = height_field.heights
     if height_field.height_range < 1e-12:
@@ -259,9 +259,9 @@ def broadened(height_field: HeightField, share: float, *, extent: str = "sample"
 
     def is_broadened(radius: float) -> bool:
         field = scanned(height_field, radius, extent=extent)
-        return abs(np.mean(field.heights > level) / above - 1) >= abs(share)
+        return abs(np.mean(field.heights > level) / above - 1) >= abs(change)
 
-    sign = float(np.sign(share))
+    sign = float(np.sign(change))
     low, high = 0.0, min(height_field.pixel_size) / 8
     max_radius = max(height_field.tile_size) ** 2 / height_field.height_range
     while not is_broadened(sign * high):

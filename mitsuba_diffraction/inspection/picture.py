@@ -1,4 +1,4 @@
-"""An inspection on one slide: the surface, its spectrum, and the colours that it will show."""
+"""An inspection on one slide: the surface, its spectrum, and its predicted colours."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 INCIDENCES = (0.0, 30.0, 60.0)  # degrees, of the rows of predicted colours
-_CELLS = 181  # of the spectrum along an axis, at most
+_MAX_BINS = 181  # of the spectrum along an axis
 _ANGLES = np.arange(-89.75, 89.8, 0.5)
-_HIGHEST_FREQUENCY = 5.0  # cycles/µm, about what visible light reaches
+_MAX_FREQUENCY = 5.0  # cycles/µm, about the limit of visible light
 _DECADES = 5
 
 
 def save_picture(inspection: Inspection, path: str | os.PathLike[str], *, title: str | None = None) -> None:
-    """Write a slide, 16 : 9, as PNG, PDF or SVG; its title is what the heights come from, if none is given.
+    """Write a slide, 16 : 9, as PNG, PDF or SVG; the default title is the source of the heights.
 
     Raises:
         ValueError: if matplotlib knows no format of that ending.
-        FileNotFoundError: if the folder is not there.
+        FileNotFoundError: if the folder does not exist.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -145,9 +145,9 @@ def _round_length(length: float) -> float:
 
 
 def _spectrum(axes: Axes, inspection: Inspection) -> None:
-    """Plot the power spectrum of the heights, where a wave is a pair of bright spots."""
+    """Plot the power spectrum of the heights, in which a wave is a pair of bright spots."""
     q_x, q_y, power = _height_spectrum(_shown(inspection), inspection.extent)
-    limit = min(_HIGHEST_FREQUENCY, max(q_x.max(), q_y.max()))
+    limit = min(_MAX_FREQUENCY, max(q_x.max(), q_y.max()))
     if inspection.periods:
         limit = min(limit, 4.5 / inspection.periods[0].period)
     near_x, near_y = np.abs(q_x) <= limit, np.abs(q_y) <= limit
@@ -160,12 +160,12 @@ def _spectrum(axes: Axes, inspection: Inspection) -> None:
     axes.set_ylabel("cycles/µm along y (down)", fontsize=10)
     axes.tick_params(labelsize=9)
     axes.set_title("Its spectrum: spots are regular waves", fontsize=12, loc="left")
-    # Labels at opposite sides, so that they do not meet.
+    # Labels are at spots of opposite sign, so that they do not overlap.
     for period, colour, spot in zip(inspection.periods, ("cyan", "lime"), (1, -1), strict=False):
         for sign in (1, -1):
             axes.plot(*(sign * period.q), "o", ms=13, mfc="none", mec=colour, mew=1.8, zorder=4)  # above all labels
         x, y = spot * period.q
-        # Outwards, but for the rim.
+        # Outwards, except near the edge of the plot.
         side = (-1 if x < -0.02 * limit else 1) * (-1 if abs(x) > 0.6 * limit else 1)
         axes.annotate(
             f"{period.period:.3g} µm",
@@ -184,18 +184,18 @@ def _height_spectrum(field: HeightField, extent: str) -> tuple[Array, Array, Arr
     level = field.heights - reference_plane(field, extent)[0]
     power = np.fft.fftshift(np.abs(np.fft.fft2(level * hann(level.shape))) ** 2)
     q_y, q_x = (np.fft.fftshift(np.fft.fftfreq(n, p)) for n, p in zip(level.shape, field.pixel_size[::-1], strict=True))
-    keep_x, keep_y = np.abs(q_x) <= _HIGHEST_FREQUENCY * 1.01, np.abs(q_y) <= _HIGHEST_FREQUENCY * 1.01
+    keep_x, keep_y = np.abs(q_x) <= _MAX_FREQUENCY * 1.01, np.abs(q_y) <= _MAX_FREQUENCY * 1.01
     return q_x[keep_x], q_y[keep_y], power[np.ix_(keep_y, keep_x)]
 
 
 def _strongest(q_x: Array, q_y: Array, power: Array) -> tuple[Array, Array, Array]:
-    """Return the largest power of each cell of a coarser grid: a single peak would be smaller than a pixel."""
-    cells = []
+    """Return the largest power in each bin of a coarser grid, as a single peak would be smaller than a pixel."""
+    bins = []
     for axis, q in enumerate((q_x, q_y)):
-        starts = np.unique(np.linspace(0, len(q), min(len(q), _CELLS), endpoint=False).astype(int))
-        cells.append(np.add.reduceat(q, starts) / np.diff([*starts, len(q)]))
+        starts = np.unique(np.linspace(0, len(q), min(len(q), _MAX_BINS), endpoint=False).astype(int))
+        bins.append(np.add.reduceat(q, starts) / np.diff([*starts, len(q)]))
         power = np.maximum.reduceat(power, starts, axis=1 - axis)
-    return *cells, power
+    return *bins, power
 
 
 def _facts(axes: Axes, inspection: Inspection) -> None:
@@ -227,27 +227,27 @@ def _facts(axes: Axes, inspection: Inspection) -> None:
         y -= 0.095
     text = (
         "A spot q cycles/µm from the centre sends light\nof wavelength λ to sin(out) = sin(in) ± q·λ:\n"
-        "red is turned most, blue least."
+        "red is deflected most, blue least."
     )
     axes.text(0.0, 0.0, text, fontsize=10.5, color="0.3", va="bottom", linespacing=1.4, transform=axes.transAxes)
 
 
 def with_uncertainty(value: float, uncertainty: float) -> str:
-    """Format as 1.144 ± 0.012: the uncertainty to two digits, the value to as many places."""
+    """Format as 1.144 ± 0.012: the uncertainty to two digits, the value to the same number of decimals."""
     if not (np.isfinite(uncertainty) and uncertainty > 0):
         return f"{value:.4g}"
-    places = int(np.clip(1 - np.floor(np.log10(uncertainty)), 0, 6))
-    # Adding zero takes the sign off a zero.
-    return f"{round(value, places) + 0.0:.{places}f} ± {uncertainty:.{places}f}".replace("-", "−")
+    decimals = int(np.clip(1 - np.floor(np.log10(uncertainty)), 0, 6))
+    # Adding zero removes the sign of −0.
+    return f"{round(value, decimals) + 0.0:.{decimals}f} ± {uncertainty:.{decimals}f}".replace("-", "−")
 
 
 def _colours(rows: list[Axes], inspection: Inspection) -> None:
     """Plot one strip for each angle of incidence, its specular direction marked."""
-    light = radiance(inspection.spectrum, inspection.direction, np.array(INCIDENCES)[:, None], _ANGLES)
-    rgb = into_gamut(spectrum_to_linear_sRGB(light, WAVELENGTHS))
-    # The specular direction would make the rest black.
-    aside = [strip[np.abs(_ANGLES - incidence) > 5] for strip, incidence in zip(rgb, INCIDENCES, strict=True)]
-    shown = on_screen(rgb * auto_exposure(np.concatenate(aside)))
+    spectra = radiance(inspection.spectrum, inspection.direction, np.array(INCIDENCES)[:, None], _ANGLES)
+    rgb = into_gamut(spectrum_to_linear_sRGB(spectra, WAVELENGTHS))
+    # Exposed without the specular direction, which would make the rest black.
+    off_specular = [strip[np.abs(_ANGLES - incidence) > 5] for strip, incidence in zip(rgb, INCIDENCES, strict=True)]
+    shown = on_screen(rgb * auto_exposure(np.concatenate(off_specular)))
     for axes, strip, incidence in zip(rows, shown, INCIDENCES, strict=True):
         axes.imshow(strip[None], extent=(-90, 90, 0, 1), aspect="auto", interpolation="bilinear")
         axes.set_yticks([])
@@ -258,12 +258,12 @@ def _colours(rows: list[Axes], inspection: Inspection) -> None:
     rows[-1].tick_params(labelsize=9.5)
     rows[-1].set_xticks(np.arange(-90, 91, 30), labels=[f"{angle}°".replace("-", "−") for angle in range(-90, 91, 30)])
     rows[-1].set_xlabel(
-        "viewing angle from the surface's normal, across the lines (positive: the side away from the light)",
+        "viewing angle from the surface's normal, across the lines (positive: opposite to the light)",
         fontsize=10,
     )
-    where = f"at {round(inspection.direction) + 0:d}° from x".replace("-", "−") if inspection.periods else "along x"
+    plane = f"at {round(inspection.direction) + 0:d}° from x".replace("-", "−") if inspection.periods else "along x"
     rows[0].set_title(
-        f"Colours that it will show in daylight, in the plane {where}   (▼ mirror direction)",
+        f"Predicted colours in daylight, in the plane {plane}   (▼ mirror direction)",
         fontsize=12,
         loc="left",
         pad=9,

@@ -1,4 +1,4 @@
-"""The report on a surface before it is rendered: statistics, periods, and reasons to distrust a picture."""
+"""The report on a surface before rendering: statistics, periods, and reasons to distrust a rendering."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from ..settings import SUN_COHERENCE_LENGTH, VISIBLE, Settings, lobe_width
 from ..spectrum.sample import effective_coherence_length, standard_error
 from ..surface.heightfield import HeightField
 from ..surface.periods import Period, find_periods, hann
-from .colours import LONGEST_COHERENCE, SHARE, Change, changes, same_period
+from .colours import CHANGE, MAX_COLOUR_COHERENCE_LENGTH, Change, changes, same_period
 
 Array = NDArray[np.float64]
 
 _TOLERANCE = 0.02
-_PIECE = 20.0  # µm, side of the part of a large scan from which colours are predicted
-_FINE = 0.04  # µm, pixels of that part, of which smaller ones are averaged; light wants 0.09 µm
+_MAX_PIECE_SIZE = 20.0  # µm, side of the part of a large scan from which colours are predicted
+_MIN_PIECE_PIXEL = 0.04  # µm, to which smaller pixels of that part are averaged; light requires 0.09 µm
 
 
 @dataclass(frozen=True)
@@ -37,12 +37,13 @@ class Inspection:
         periods: as of `find_periods`, strongest first; empty if none is significant.
         max_coherence_length: what a scan supports, µm, at most that of sunlight; a tile supports any.
         coherence_length: the requested one, limited to `max_coherence_length`, µm.
-        standard_error: of a sample's spectrum at that coherence length, a share of the reflected power; None of a tile.
+        standard_error: of the spectrum of a sample at that coherence length, a fraction of the reflected power; None of
+            a tile.
         scalar_error: of scalar theory for this surface.
         changes: effects of ±5 % of height scale, pixel size and, for a scan, tip broadening; empty without a period.
-        concerns: reasons to distrust a picture.
-        piece: that part of the surface from which colours and changes are predicted, the middle of a large scan.
-        spectrum: of `piece`, of at most `LONGEST_COHERENCE`, for predicted colours.
+        concerns: reasons to distrust a rendering.
+        piece: the part of the surface from which colours and changes are predicted, the middle of a large scan.
+        spectrum: of `piece`, with at most `MAX_COLOUR_COHERENCE_LENGTH`, for predicted colours.
     """
 
     height_field: HeightField
@@ -64,7 +65,7 @@ class Inspection:
         return self.periods[0].direction if self.periods else 0.0
 
     def as_json(self) -> dict[str, object]:
-        """Return all numbers by name, lengths in µm; what is not a number is None."""
+        """Return all numbers by name, lengths in µm; None for NaN and infinity."""
         rows, columns = self.height_field.shape
         return plain(
             {
@@ -99,7 +100,7 @@ def inspect(
 
     Args:
         height_field: the surface.
-        extent: "sample": a piece of a larger, irregular surface; "tile": it repeats.
+        extent: "sample": a piece of a larger, irregular surface; "tile": it repeats periodically.
         coherence_length: the requested one, µm.
         measured: whether it is a scan; tilt, steps of the heights and the tip matter only for scans.
         progress: called with (per cent done, 100).
@@ -112,21 +113,21 @@ def inspect(
     limit = effective_coherence_length(height_field, sun) if extent == "sample" else max(sun, coherence_length)
     used = min(float(coherence_length), limit)
     piece = _middle(height_field) if extent == "sample" else height_field
-    colours_length = min(used, LONGEST_COHERENCE)
+    colours_length = min(used, MAX_COLOUR_COHERENCE_LENGTH)
     if extent == "sample":
         colours_length = effective_coherence_length(piece, colours_length)
-    # The tip makes two more surfaces of a scan.
+    # The two changes of the tip need spectra of their own.
     spectra = iter([(0.15, 0.4), (0.4, 0.7), (0.7, 1.0)] if measured else [(0.15, 1.0)])
 
     def build(surface: HeightField) -> GratingSpectrum:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # of pixels and coherence `concerns` tells in its own words
+            warnings.simplefilter("ignore", UserWarning)  # on pixels and coherence, which `concerns` reports
             spectrum = precompute(
                 surface,
                 extent=extent,
                 coherence_length=colours_length,
-                # Heights may be scaled up by the share that is tried.
-                wavelengths=(VISIBLE[0] / (1 + SHARE), VISIBLE[1]),
+                # Scaling heights by 1 + CHANGE is equivalent to shorter wavelengths.
+                wavelengths=(VISIBLE[0] / (1 + CHANGE), VISIBLE[1]),
                 tolerance=_TOLERANCE,
                 progress=part(progress, *next(spectra)),
             )
@@ -165,13 +166,16 @@ def inspect(
 
 
 def _middle(scan: HeightField) -> HeightField:
-    """Return the middle of a scan, at most `_PIECE` long and wide; its pixels are averaged to about `_FINE`."""
-    counts = [min(n, round(_PIECE / size)) for n, size in zip(scan.shape, scan.pixel_size[::-1], strict=True)]
-    if 1 in scan.shape or (tuple(counts) == scan.shape and scan.heights.size <= (_PIECE / _FINE) ** 2):
+    """Return the middle of a scan, at most `_MAX_PIECE_SIZE` wide, its pixels averaged to about `_MIN_PIECE_PIXEL`."""
+    counts = [min(n, round(_MAX_PIECE_SIZE / size)) for n, size in zip(scan.shape, scan.pixel_size[::-1], strict=True)]
+    if 1 in scan.shape or (
+        tuple(counts) == scan.shape and scan.heights.size <= (_MAX_PIECE_SIZE / _MIN_PIECE_PIXEL) ** 2
+    ):
         return scan
     rows, columns = (slice((n - count) // 2, (n + count) // 2) for n, count in zip(scan.shape, counts, strict=True))
     y, x = (
-        min(max(1, int(_FINE / size)), count // 4) for size, count in zip(scan.pixel_size[::-1], counts, strict=True)
+        min(max(1, int(_MIN_PIECE_PIXEL / size)), count // 4)
+        for size, count in zip(scan.pixel_size[::-1], counts, strict=True)
     )
     heights = scan.heights[rows, columns]
     heights = heights[: len(heights) // y * y, : heights.shape[1] // x * x]
@@ -191,8 +195,8 @@ class Statistics:
         steepest: slope, in degrees, that one in a hundred of the pixels that are not flat exceeds.
         tilt: of the reference plane, degrees from level.
         tilt_height: height difference of the reference plane from corner to corner of the patch, µm.
-        levels: how many different heights there are.
-        step: smallest difference between two of them, µm; 0 where all are equal.
+        levels: number of different heights.
+        step: smallest difference between two of them, µm; 0 if all are equal.
     """
 
     Sa: float
@@ -216,10 +220,10 @@ def statistics(height_field: HeightField, *, extent: str = "sample") -> Statisti
         for axis, pixel in ((1, height_field.pixel_size[0]), (0, height_field.pixel_size[1]))
     ]
     slope = np.hypot(*gradients)
-    # Walls of few pixels between plateaus are slopes, too.
+    # Only sloping pixels, so that the walls of a binary grating count.
     sloping = slope[slope > 1e-9 * max(slope.max(), 1e-300)]
     values = np.unique(heights)
-    # What arithmetic makes of equal numbers is no difference.
+    # Differences by rounding do not count.
     steps = np.diff(values)
     steps = steps[steps > 1e-9 * max(np.abs(values).max(), 1e-300)]
     return Statistics(
@@ -236,14 +240,14 @@ def statistics(height_field: HeightField, *, extent: str = "sample") -> Statisti
 
 
 def reference_plane(height_field: HeightField, extent: str) -> tuple[Array, tuple[float, float]]:
-    """Return the plane to which heights refer, (N_y, N_x) µm, and its slopes along x and y.
+    """Return the reference plane of the heights, (N_y, N_x) µm, and its slopes along x and y.
 
     For a sample, the least-squares plane; for a tile, which is periodic, a level one.
     """
     rows, columns = height_field.shape
     if extent == "tile":
         return np.full((rows, columns), height_field.heights.mean()), (0.0, 0.0)
-    # On a full grid the three unknowns do not mix.
+    # On a full grid the three unknowns are independent.
     x = (np.arange(columns) - (columns - 1) / 2) * height_field.pixel_size[0]
     y = (np.arange(rows) - (rows - 1) / 2) * height_field.pixel_size[1]
     mean = height_field.heights.mean()
@@ -252,12 +256,12 @@ def reference_plane(height_field: HeightField, extent: str) -> tuple[Array, tupl
     return mean + slope_x * x + slope_y * y[:, None], (slope_x, slope_y)
 
 
-_COARSE = 0.09  # µm: a quarter of the shortest wavelength, as light of grazing incidence and exit wants
+_MAX_PIXEL_SIZE = 0.09  # µm: a quarter of the shortest wavelength, as grazing incidence and exit require
 _BLUE, _GREEN = 0.45, 0.55  # µm
-_LIMIT_SHARE = 0.02  # of the power beyond four fifths of the Nyquist limit
-_STEP_SHARE = 1e-3  # of the light that steps of the heights scatter
-_TURNED = 1.0  # degrees
-_STEEP = 45.0  # degrees: light is reflected twice
+_MAX_FRACTION_AT_LIMIT = 0.02  # of the power above four fifths of the Nyquist limit
+_MAX_STEP_SCATTER = 1e-3  # fraction of light scattered by the steps of the heights
+_MAX_DEFLECTION = 1.0  # degrees
+_MAX_SLOPE = 45.0  # degrees, above which light is reflected twice
 
 
 def concerns(
@@ -270,47 +274,47 @@ def concerns(
 ) -> tuple[str, ...]:
     """Return concerns about the surface as sentences; none if all is well.
 
-    The coherence length, µm, is limited to what the surface supports. What is not measured, a formula, has neither tilt
-    nor steps of its own.
+    The coherence length, µm, is limited to what the surface supports. Surfaces given by a formula (not `measured`) are
+    not checked for tilt and steps.
     """
     found = []
     axes = zip(height_field.pixel_size, height_field.shape[::-1], strict=True)
     coarsest = max([pixel for pixel, count in axes if count > 1], default=0.0)
-    if coarsest > _COARSE:
+    if coarsest > _MAX_PIXEL_SIZE:
         found.append(
-            f"Pixels of {coarsest * 1e3:.0f} nm are too coarse for light: orders beyond {1 / (2 * coarsest):.2g} "
+            f"Pixels of {coarsest * 1e3:.0f} nm are too coarse for light: orders above {1 / (2 * coarsest):.2g} "
             "cycles/µm are missing. Scan again with pixels of at most 90 nm."
         )
-    if beyond := scalar.warning:
-        found.append(f"{beyond[0].upper()}{beyond[1:]}.")
+    if warning := scalar.warning:
+        found.append(f"{warning[0].upper()}{warning[1:]}.")
     if not measured:
         return tuple(found)
-    # A slope s turns all light by 2s, q by 2s/λ; less than a lobe is not seen, but a degree is too much in any case.
+    # A slope s deflects all light by 2s and shifts q by 2s/λ. Less than a lobe is invisible, a degree always too much.
     shift = 2 * np.tan(np.deg2rad(numbers.tilt)) / _GREEN
-    if shift > lobe_width(coherence_length) or 2 * numbers.tilt > _TURNED:
+    if shift > lobe_width(coherence_length) or 2 * numbers.tilt > _MAX_DEFLECTION:
         found.append(
             f"The scan is tilted by {numbers.tilt:.2g}° ({numbers.tilt_height * 1e3:.0f} nm from corner to corner), "
-            f"which turns all reflected light by {2 * numbers.tilt:.2g}°. Level it: --prepare level_plane."
+            f"which deflects all reflected light by {2 * numbers.tilt:.2g}°. Level it: --prepare level_plane."
         )
-    at_limit = _share_at_limit(height_field)
-    if at_limit > _LIMIT_SHARE:
+    at_limit = _fraction_at_limit(height_field)
+    if at_limit > _MAX_FRACTION_AT_LIMIT:
         found.append(
-            f"{at_limit:.0%} of the light at 450 nm goes to detail of less than 2.5 pixels: noise, or detail too fine "
-            "for the pixels, which shows in wrong directions. Scan again with smaller pixels, or filter the noise."
+            f"{at_limit:.0%} of the light at 450 nm is diffracted by detail of less than 2.5 pixels: noise, or detail "
+            "too fine for the pixels, which appears in wrong directions. Scan again with smaller pixels, or filter the "
+            "noise."
         )
     # Rounding to steps is noise of variance step²/12 and scatters (κ step)²/12 of the light.
     scattered = (4 * np.pi / _BLUE * numbers.step) ** 2 / 12
-    if 16 <= numbers.levels <= 256 and scattered > _STEP_SHARE:
+    if 16 <= numbers.levels <= 256 and scattered > _MAX_STEP_SCATTER:
         found.append(
-            f"Heights stand on {numbers.levels} levels, {numbers.step * 1e3:.2g} nm apart (8 bit?): rounding scatters "
+            f"Heights have {numbers.levels} levels, {numbers.step * 1e3:.2g} nm apart (8 bit?): rounding scatters "
             f"{scattered:.1%} of blue light. Export 16 bit or floats."
         )
     if height_field.filled:
         found.append(
-            f"{height_field.filled} pixels of the scan were missing and are filled: where they remain, the heights are "
-            "a guess."
+            f"{height_field.filled} pixels of the scan were missing and are filled: the heights there are a guess."
         )
-    if numbers.steepest > _STEEP:
+    if numbers.steepest > _MAX_SLOPE:
         found.append(
             f"One sloping pixel in a hundred is steeper than {numbers.steepest:.0f}°: light is reflected more than "
             "once there, which is not computed, and a tip does not reach down such walls."
@@ -318,9 +322,9 @@ def concerns(
     return tuple(found)
 
 
-def _share_at_limit(height_field: HeightField) -> float:
-    """Return the share of the phase's power at 450 nm and normal incidence beyond 0.8 of the Nyquist limit."""
+def _fraction_at_limit(height_field: HeightField) -> float:
+    """Return the fraction of the power at 450 nm and normal incidence above 0.8 of the Nyquist limit."""
     phase = np.exp(1j * 4 * np.pi / _BLUE * height_field.centred)
     power = np.abs(np.fft.fft2(phase * hann(phase.shape))) ** 2
-    far_y, far_x = (np.abs(np.fft.fftfreq(count)) > 0.4 for count in power.shape)
-    return float(power[far_y[:, None] | far_x].sum() / power.sum())
+    outer_y, outer_x = (np.abs(np.fft.fftfreq(count)) > 0.4 for count in power.shape)
+    return float(power[outer_y[:, None] | outer_x].sum() / power.sum())

@@ -1,11 +1,11 @@
 """Analytic height fields: classical gratings, technical surfaces, and synthetic replicas of natural ones.
 
 Every profile returns exactly one period of a periodic surface (extent "tile" of the spectrum). `PROFILES` has their
-names in scenes and recipes; those with defaults for all parameters are ready-made surfaces.
+names in scenes and recipes; profiles with defaults for all parameters are ready-made surfaces.
 
 Lengths are in µm: `period` along x, `depth` from the lowest to the highest point; `samples` is the number of pixels per
-period. What is drawn at random takes a `seed`, the `size` of the patch, one number or (x, y), and a `pixel_size`, both
-adjusted so that the patch tiles seamlessly and has a whole number of pixels.
+period. Random surfaces take a `seed`, the `size` of the patch, one number or (x, y), and a `pixel_size`, both adjusted
+so that the patch tiles seamlessly and has a whole number of pixels.
 
 Raises:
     ValueError: if a length is not positive, the depth negative, or another argument out of the range that the message
@@ -25,19 +25,19 @@ from scipy.special import erf
 from ..errors import RequestError, is_number
 from .heightfield import HeightField, as_pixel_size
 
-MOST_PIXELS = 2**26
-"""Largest profile: half a gigabyte of heights."""
+MAX_PIXELS = 2**26
+"""Of a profile: half a gigabyte of heights."""
 
-LONGEST_PERIOD = 100.0
-"""µm. Orders of visible light are then 0.3° apart, about the width of the sun, and any period in nm is above it."""
+MAX_PERIOD = 100.0
+"""µm: orders of visible light are 0.3° apart, about the width of the sun. A period given in nm is larger."""
 
 Array = NDArray[np.float64]
 
 
 def check_pixels(columns: float, rows: float) -> None:
     """Refuse too large a patch before its memory is allocated."""
-    if not columns * rows <= MOST_PIXELS:
-        raise RequestError(f"got a patch of {columns:.4g} × {rows:.4g} pixels, wanted at most {MOST_PIXELS} in all")
+    if not columns * rows <= MAX_PIXELS:
+        raise RequestError(f"got a patch of {columns:.4g} × {rows:.4g} pixels, wanted at most {MAX_PIXELS} in all")
 
 
 def check_positive(name: str, value: float, unit: str = "in µm") -> None:
@@ -47,9 +47,9 @@ def check_positive(name: str, value: float, unit: str = "in µm") -> None:
 
 def check_period(name: str, value: float) -> None:
     check_positive(name, value)
-    if value > LONGEST_PERIOD:
+    if value > MAX_PERIOD:
         raise RequestError(
-            f"{name}: got {value!r} µm, wanted at most {LONGEST_PERIOD:g}; is it in nm ({value / 1e3:g} µm)? A grating "
+            f"{name}: got {value!r} µm, wanted at most {MAX_PERIOD:g}; is it in nm ({value / 1e3:g} µm)? A grating "
             "that is really that coarse may be given as an array of heights"
         )
 
@@ -128,7 +128,7 @@ def right_angled(period: float, facet_angle: float, *, samples: int = 512) -> He
 
 
 def transmission_300(*, facet_angle: float = 17.5, samples: int = 512) -> HeightField:
-    """Return a ruled transmission grating of 300 lines/mm, `right_angled`; of glass, light passes it as a sheet.
+    """Return a ruled transmission grating of 300 lines/mm, `right_angled`, for a sheet of glass.
 
     17.5° is the groove angle that Thorlabs states for its 300/mm grating for visible light (GT25-03, in B270 glass,
     n = 1.52). The wide facets deflect light as prisms do, at normal incidence to the first order of about 0.55 µm.
@@ -223,7 +223,7 @@ def foil(period: float = 1.0, depth: float = 0.15, *, directions: int = 2, sampl
 
 
 def film(period: float = 1 / 0.53, depth: float = 0.76, *, samples: int = 64) -> HeightField:
-    """Return the embossing of diffraction glasses, a `foil` with two directions; light passes it as a sheet.
+    """Return the embossing of diffraction glasses, a `foil` with two directions, for a transparent sheet.
 
     The film is sold as "double axis, 13,500 lines per inch", 530/mm. Its depth is not published; of two sinusoids, each
     of amplitude a = depth/4, the orders (±1, 0) and (0, ±1) have J_1(κa)² J_0(κa)² of the light, at most 11 % each
@@ -286,12 +286,12 @@ def draw_tracks(
     heights = np.empty((rows, columns))
     for number in range(tracks):
         starts, ends = _pits(rng, bits, runs)
-        # The axis of a pit, its round ends left off; the distance of each row from the nearest axis, round the torus.
+        # The axis of a pit without its round ends; the distance of each row from the nearest axis, on the closed track.
         first, last = starts * channel_bit + width / 2, ends * channel_bit - width / 2
-        place = (y - first[0]) % size[1] + first[0]
-        before = np.searchsorted(first, place, side="right") - 1
-        following = np.append(first[1:], first[0] + size[1])[before]
-        along = np.maximum(np.minimum(place - last[before], following - place), 0)
+        position = (y - first[0]) % size[1] + first[0]
+        previous = np.searchsorted(first, position, side="right") - 1
+        following = np.append(first[1:], first[0] + size[1])[previous]
+        along = np.maximum(np.minimum(position - last[previous], following - position), 0)
         mine = track == number
         radius = np.hypot(along[:, None], across[mine])
         heights[:, mine] = np.clip(0.5 + (width / 2 - radius) / _WALL, 0, 1)
@@ -316,9 +316,9 @@ def _pits(
         last = np.searchsorted(ends, bits)
         if ends[last] == bits and last % 2 == 1:
             break
-    turn = rng.uniform(0, bits)
+    shift = rng.uniform(0, bits)
     ends = ends[: last + 1].astype(np.float64)
-    return ends[::2] - drawn[: last + 1 : 2] + turn, ends[::2] + turn
+    return ends[::2] - drawn[: last + 1 : 2] + shift, ends[::2] + shift
 
 
 def compact_disc(
@@ -342,8 +342,8 @@ def compact_disc(
     0.126 µm at 780 nm maximises contrast, λ/8n the tracking signal). The lengths of pits and lands are random with the
     maximum-entropy distribution under that constraint.
 
-    The pits are those of the metal, as an instrument measures them once the polycarbonate is off. The disc as one holds
-    it has a layer of it: `coat_ior` = 1.55 of the plugin.
+    The pits are those of the metal, as an instrument measures them without the polycarbonate. For a complete disc, use
+    `coat_ior` = 1.55 of the plugin.
 
     Args:
         period: track pitch, µm.
@@ -380,7 +380,7 @@ def dvd(
 
     As `compact_disc`, with the numbers of ECMA-267 (one layer): a track pitch of 0.74 µm, channel bits of 133.3 nm,
     pits and lands of 3 to 11 of them and 14 in sync codes, so 0.40 to 1.87 µm, read at 650 nm (λ/4n = 0.105 µm). The
-    width of the pits is typical, not specified. What `compact_disc` says of the layer holds here, too. As the period is
+    width of the pits is typical, not specified. For the polycarbonate, see `compact_disc`. As the period is
     about a wavelength, the directions of the orders are exact, but their efficiencies approximate.
     """
     return draw_tracks("DVD", _RUNS, period, depth, width, channel_bit, tracks, length, pixel_size, seed)
@@ -414,7 +414,7 @@ def morpho_ridges(
     # The height differs between ridges and varies along each, where one lamella ends and the next begins.
     uneven = canvas.noise(rng, 0.0, 1.0)
     x = (np.arange(canvas.heights.shape[1]) + 0.5) * canvas.pixel[0]
-    for centre, offset in zip(canvas.places(0), rng.normal(0, 0.15, canvas.count[0]), strict=True):
+    for centre, offset in zip(canvas.centres(0), rng.normal(0, 0.15, canvas.count[0]), strict=True):
         column = int(centre / canvas.pixel[0]) % canvas.heights.shape[1]
         top = np.clip(1 + offset + 0.1 * uneven[:, column], 0.2, None)
         distance = np.abs((x - centre + canvas.size[0] / 2) % canvas.size[0] - canvas.size[0] / 2)
@@ -462,7 +462,7 @@ class Canvas:
         self.pixel = (self.size[0] / columns, self.size[1] / rows)
         self.heights = np.zeros((rows, columns))
 
-    def places(self, axis: int) -> Array:
+    def centres(self, axis: int) -> Array:
         """Return the centres of the pitches along x (0) or y (1), µm."""
         return (np.arange(self.count[axis], dtype=np.float64) + 0.5) * self.pitch[axis]
 
@@ -532,12 +532,12 @@ def elaphe(
     canvas = Canvas(size, pixel_size, pitch=(2.93 * period, period), axis=1)
     row_pitch, pitch = canvas.pitch
 
-    # The lattice of crotches: it drifts slowly, rows shift against each other, and every crotch has its own place.
+    # The lattice of crotches: it drifts slowly, rows shift against each other, and every crotch is displaced.
     drift_x = 0.08 * row_pitch * canvas.noise(rng, 8.0, 4.0)
     drift_y = 0.12 * pitch * canvas.noise(rng, 8.0, 8.0)
     granules = np.zeros_like(canvas.heights)
-    for x, row_shift in zip(canvas.places(0), rng.normal(0, 0.05 * pitch, canvas.count[0]), strict=True):
-        for y in canvas.places(1):
+    for x, row_shift in zip(canvas.centres(0), rng.normal(0, 0.05 * pitch, canvas.count[0]), strict=True):
+        for y in canvas.centres(1):
             x_0 = x + canvas.at(drift_x, x, y) + rng.normal(0, 0.04 * row_pitch)
             y_0 = y + canvas.at(drift_y, x, y) + row_shift + rng.normal(0, 0.035 * pitch)
             _elaphe_groove(canvas, rng, x_0, y_0)
@@ -632,7 +632,7 @@ def xenopeltis(
 
     meander = 0.11 * row_pitch * canvas.noise(rng, 6.0, 1.3)
     faults = _faults(canvas, rng)
-    rows = [(x, None) for x in canvas.places(0)] + [(fault.x, fault) for fault in faults if fault.extra]
+    rows = [(x, None) for x in canvas.centres(0)] + [(fault.x, fault) for fault in faults if fault.extra]
     fingers = []
     for x, own in rows:
         # Every row has a phase of its own, and a finger more or less than its neighbours where there are many.
@@ -693,7 +693,7 @@ def _faults(canvas: Canvas, rng: np.random.Generator) -> list[_Fault]:
         if len(faults) == wanted:
             break
         extra = len(faults) % 2 == 0
-        # A row more lies between two rows, a row less in the place of one.
+        # An added row lies between two rows, a missing row at the position of one.
         x = (rng.integers(canvas.count[0]) + (1.0 if extra else 0.5)) * row_pitch % canvas.size[0]
         fault = _Fault(x, rng.uniform(0, canvas.size[1]), rng.uniform(1.5, 3.0), extra)
         if all(
@@ -797,10 +797,10 @@ them into the smooth haze of an irregular surface.
 """
 
 PATCHES: dict[str, int] = {"compact_disc": 48, "dvd": 48, "elaphe": 16, "xenopeltis": 16, "morpho_ridges": 16}
-"""Name of a profile that is drawn at random → over how many seeds its spectrum is averaged by default.
+"""Name of a random profile → number of seeds over which its spectrum is averaged by default.
 
-At 550 nm and normal incidence ∫|ΔS| dq to the mean of as many other seeds as one likes is then below 0.08; of discs it
-is less, since the eye sees streaks in their faint fans.
+At 550 nm and normal incidence ∫|ΔS| dq relative to the mean over infinitely many other seeds is then below 0.08; for
+discs it is smaller, since streaks are visible in their faint fans.
 """
 
 __all__ = ["COHERENCE_LENGTHS", "PATCHES", "PROFILES", "right_angled", *PROFILES]

@@ -37,11 +37,11 @@ class HeightField:
         heights: (N_y, N_x) float64, µm; row ↔ +y, column ↔ +x.
         pixel_size: (x, y) in µm; one number for square pixels.
         source: origin of the heights (a file name, a formula) and processing steps, as text.
-        filled: how many missing pixels were filled, including those that were cut off since.
+        filled: number of missing pixels that were filled, including those cut off afterwards.
 
-    Missing pixels (NaN, infinite or masked) are refused. `fill_missing=True` interpolates them instead; see
-    `harmonic_fill`; they are added to `filled`. `keep_missing=True` keeps them as NaN for the steps of
-    `prepare`; such a height field has neither a height range nor a spectrum.
+    Missing pixels (NaN, infinite or masked) are refused. `fill_missing=True` interpolates them (`harmonic_fill`) and
+    adds their number to `filled`. `keep_missing=True` keeps them as NaN for the steps of `prepare`; such a height
+    field has neither a height range nor a spectrum.
 
     Raises:
         ValueError: if the heights are not a two-dimensional array of finite numbers with at least one pixel (with
@@ -199,8 +199,8 @@ def harmonic_fill(heights: ArrayLike, pixel_size: tuple[float, float] = (1.0, 1.
     if count == heights.size:
         raise RequestError(f"heights: all {count} pixels are missing, wanted at least one height in µm to fill from")
     known = heights[~missing]
-    lowest, highest = known.min(), known.max()
-    middle = lowest / 2 + highest / 2  # solved relative to it, to preserve digits
+    minimum, maximum = known.min(), known.max()
+    middle = minimum / 2 + maximum / 2  # solved relative to it, to preserve digits
     unknown = np.empty(heights.shape, np.int64)
     unknown[missing] = np.arange(count)
     weight_x, weight_y = (np.min(pixel_size) / np.asarray(pixel_size, np.float64)) ** 2
@@ -222,5 +222,5 @@ def harmonic_fill(heights: ArrayLike, pixel_size: tuple[float, float] = (1.0, 1.
     # Symmetric and positive definite (every hole borders on a known pixel): no pivoting needed.
     factors = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
     filled = heights.copy()
-    filled[missing] = np.clip(factors.solve(right_side) + middle, lowest, highest)
+    filled[missing] = np.clip(factors.solve(right_side) + middle, minimum, maximum)
     return filled

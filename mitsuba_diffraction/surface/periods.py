@@ -4,8 +4,8 @@ A periodogram is P(q) = |Σ_n w_n h_n e^{−2πi q·x_n}|²/Σ_n w_n² of height
 window; white noise has its variance as mean. A regular wave is sharpest in the periodogram of the whole scan. One that
 wanders is spread over many frequencies there, each with a random power, and stands out better from the mean of the
 periodograms of nine overlapping quarters (Welch 1967, "The use of fast Fourier transform for the estimation of power
-spectra", IEEE Transactions on Audio and Electroacoustics 15(2), 70–73). That one of the two comes first in which the
-strongest peak exceeds the significant power by the larger factor.
+spectra", IEEE Transactions on Audio and Electroacoustics 15(2), 70–73). Of the two, the one whose strongest peak
+exceeds the significant power by the larger factor is used first.
 """
 
 from __future__ import annotations
@@ -27,19 +27,20 @@ from .heightfield import HeightField, harmonic_fill
 
 Array = NDArray[np.float64]
 
-_MIN_WAVES = 2.5  # across the window, so that a peak does not meet its opposite
-_LOBE = 2.5  # radius of a peak, bins: a Hann window has no power further off
-_INDEPENDENT = 9 / (3 + 4 / 36)  # of three windows that overlap by half: their powers are correlated by 1/36
-_FALSE_ALARM = 1e-4  # probability of a false detection in noise
+_MIN_WAVES = 2.5  # across the window, so that the peaks at q and −q do not overlap
+_LOBE_RADIUS = 2.5  # of a peak, bins: a Hann window has no power further away
+_INDEPENDENT_WINDOWS = 9 / (3 + 4 / 36)  # equivalent to three that overlap by half, with powers correlated by 1/36
+_FALSE_ALARM_PROBABILITY = 1e-4  # of a detection in noise
 _MIN_STRENGTH = 1e-2  # fraction of the variance, to exclude hum of the instrument and uneven background
 _MIN_DENSITY = 1e-9  # of the background, relative to the variance: between waves without noise there is only rounding
-_RING = 24  # fewest frequencies from which a lower quartile is taken
-_HARMONIC = 0.1  # of the power of a wave; a wave of two or three times the period that has more is the period
-# Waves whose directions and lengths differ by less are one that varies over the surface.
-_SAME_ANGLE, _SAME_LENGTH = 30.0, 0.1  # degrees, fraction
-_WANDERING = 1.25  # a regular wave exceeds what is significant by equal factors in the whole and in its quarters
-_REPEATED = 8  # times that a tile is repeated along each axis
-_MAX_PIXELS = 2**22
+_MIN_RING_SIZE = 24  # frequencies from which a lower quartile is taken
+_MIN_FUNDAMENTAL = 0.1  # power relative to its harmonic, for a wave of two or three times the period to be the period
+# Waves that differ by less in direction and length count as one that varies over the surface.
+_MAX_SAME_ANGLE, _MAX_SAME_LENGTH = 30.0, 0.1  # degrees, fraction
+# Ratio of the excess in the quarters to that in the whole, above which a wave is irregular; 1 for a regular wave.
+_MIN_IRREGULAR_RATIO = 1.25
+_MAX_REPETITIONS = 8  # of a tile along each axis
+_MAX_REPEATED_PIXELS = 2**22
 _MAX_CANDIDATES = 200  # local maxima considered
 
 
@@ -89,8 +90,8 @@ def find_periods(height_field: HeightField, count: int = 2, *, extent: str = "sa
     A wave is detected where the periodogram exceeds the background by a factor that noise on an exactly known
     background would exceed in one of ten thousand height fields. The background follows from the largest of three lower
     quartiles: over frequencies of similar magnitude, and along the row and the column of the frequency, because of the
-    streaks of a scan. A wave of two or three times the period that is significant, too, is the period, and the first
-    wave its harmonic.
+    streaks of a scan. If a wave of two or three times the period is also significant, it is the period, and the first
+    wave is its harmonic.
 
     A parabola through the logarithm of the power gives the frequency of the peak, and the quarters of the scan,
     weighted by their powers there, its standard deviation: what another part of the surface, half as long and wide,
@@ -101,7 +102,7 @@ def find_periods(height_field: HeightField, count: int = 2, *, extent: str = "sa
     Args:
         height_field: need not be levelled; missing pixels are filled first.
         count: largest number of periods.
-        extent: "tile": the patch repeats for ever; "sample": it is a piece of a larger surface.
+        extent: "tile": the patch repeats periodically; "sample": it is a piece of a larger surface.
 
     Returns:
         Strongest first. Those less than 30° and 10 % apart, and harmonics, are one. Empty if none is significant
@@ -127,7 +128,7 @@ def find_periods(height_field: HeightField, count: int = 2, *, extent: str = "sa
         _Periodogram([part], pixel_size, variance) for row in (parts[0], parts[-1]) for part in (row[0], row[-1])
     ]
     peaks = whole.peaks()
-    if quarters.excess > _WANDERING * whole.excess:
+    if quarters.excess > _MIN_IRREGULAR_RATIO * whole.excess:
         peaks = chain(quarters.peaks(), whole.peaks(2 * _MIN_WAVES))
     found: list[Period] = []
     for q, strength in peaks:
@@ -175,7 +176,7 @@ class _Periodogram:
         self._positions = [np.arange(n) * p for n, p in zip(shape[::-1], pixel_size, strict=True)]
         self.size = np.array(shape[::-1]) * pixel_size
         self._floor = _MIN_DENSITY * variance
-        self._count = _INDEPENDENT ** round(np.log(len(parts)) / np.log(3))
+        self._count = _INDEPENDENT_WINDOWS ** round(np.log(len(parts)) / np.log(3))
         # Waves along x and y at each frequency.
         self._waves = np.array(np.meshgrid(*(np.rint(np.fft.fftfreq(n) * n) for n in shape[::-1])))
         x, y = self._waves
@@ -188,16 +189,16 @@ class _Periodogram:
 
     @cached_property
     def _candidates(self) -> dict[tuple[int, int], float]:
-        """The significant local maxima, highest first, and their powers relative to the least significant one."""
+        """The significant local maxima, highest first, and their powers relative to the threshold of significance."""
         power, found = self._power, {}
         if not self._usable.any():
             return {}
         rings = _background(np.hypot(*self._waves), power, self._count, 1 if min(power.shape) > 1 else 2)
         rings = np.maximum(rings, self._floor)
-        # The mean of K periodograms of noise has a gamma distribution. A streak is the same in windows side by side.
+        # The mean of K periodograms of noise has a gamma distribution. Adjacent windows contain the same streak.
         streaks = self._count**0.5
-        level = gammainccinv(self._count, _FALSE_ALARM / self._usable.sum()) / self._count
-        of_streak = gammainccinv(streaks, _FALSE_ALARM / max(power.shape)) / streaks
+        level = gammainccinv(self._count, _FALSE_ALARM_PROBABILITY / self._usable.sum()) / self._count
+        of_streak = gammainccinv(streaks, _FALSE_ALARM_PROBABILITY / max(power.shape)) / streaks
         maximum = self._usable & (power == ndimage.maximum_filter(power, 3, mode="wrap")) & (power > level * rings)
         highest = np.argwhere(maximum)[np.argsort(-power[maximum], kind="stable")][:_MAX_CANDIDATES]
         self._maxima = self._waves[(slice(None), *highest.T)].T
@@ -212,7 +213,7 @@ class _Periodogram:
 
     @property
     def excess(self) -> float:
-        """The largest power of a peak relative to what is significant; 0 without a peak."""
+        """The largest power of a peak relative to the threshold of significance; 0 without a peak."""
         return max(self._candidates.values(), default=0.0)
 
     def peaks(self, max_waves: float = np.inf) -> Iterator[tuple[Array, float]]:
@@ -221,7 +222,7 @@ class _Periodogram:
             waves = self._fundamental(at)
             if np.hypot(*waves) >= max_waves:
                 continue
-            # The highest maximum of a wave that varies need not be the one that stands out of its row and column.
+            # The highest maximum of an irregular wave may be hidden by the streaks of its row and column.
             waves = next(
                 (other for other in self._maxima if _same_wave(waves / self.size, other / self.size, 1)), waves
             )
@@ -232,7 +233,7 @@ class _Periodogram:
     def _fundamental(self, at: tuple[int, int]) -> Array:
         """Return the waves across the parts of the longest period with this peak as third or second harmonic."""
         waves = self._waves[:, at[0], at[1]]
-        near = [other for other in self._candidates if self._power[other] > _HARMONIC * self._power[at]]
+        near = [other for other in self._candidates if self._power[other] > _MIN_FUNDAMENTAL * self._power[at]]
         others = self._waves[(slice(None), *zip(*near, strict=True))].T
         others = others * np.sign(others @ waves + 0.5)[:, None]
         for order in (3, 2):
@@ -244,7 +245,7 @@ class _Periodogram:
     def _strength(self, q: Array) -> float:
         """Return the fraction of the power in the lobes about q and −q."""
         away = np.hypot(*(self._waves - (q * self.size)[:, None, None]))
-        return float(min(2 * self._power[away <= _LOBE].sum() / self._power.sum(), 1.0))
+        return float(min(2 * self._power[away <= _LOBE_RADIUS].sum() / self._power.sum(), 1.0))
 
     def summit(self, q: Array) -> tuple[Array, float]:
         """Return the maximum of the power near a frequency, at most one bin away, and the power there."""
@@ -265,8 +266,8 @@ class _Periodogram:
 
 
 def _periods_of_tile(tile: HeightField, count: int) -> tuple[Period, ...]:
-    # Of one period of a profile, harmonics stand out before the period does.
-    for times in (_REPEATED,) if 1 in tile.shape else (1, 2, 4, _REPEATED):
+    # In one period of a profile, harmonics are significant sooner than the period.
+    for times in (_MAX_REPETITIONS,) if 1 in tile.shape else (1, 2, 4, _MAX_REPETITIONS):
         if found := find_periods(repeated(tile, times), count):
             orders = [np.rint(period.q * tile.tile_size) for period in found]
             return tuple(
@@ -276,21 +277,21 @@ def _periods_of_tile(tile: HeightField, count: int) -> tuple[Period, ...]:
     return ()
 
 
-def repeated(tile: HeightField, times: int = _REPEATED) -> HeightField:
-    """Repeat a tile so many times along each axis, or fewer times where that would be many pixels."""
-    while tile.heights.size * times**2 > _MAX_PIXELS and times > 1:
+def repeated(tile: HeightField, times: int = _MAX_REPETITIONS) -> HeightField:
+    """Repeat a tile along each axis, `times` times or as often as `_MAX_REPEATED_PIXELS` allows."""
+    while tile.heights.size * times**2 > _MAX_REPEATED_PIXELS and times > 1:
         times //= 2
     return HeightField(np.tile(tile.heights, (times, times)), tile.pixel_size, tile.source)
 
 
 def _streak(line: Array, waves: Array, k: int, across: float, count: float) -> float:
-    """Return the mean power of the streak in a row or column of a periodogram near a place, outside of its lobe."""
-    # The band of a skin that wanders is as much wider as it is further from the centre.
-    lobe = int(np.ceil(_LOBE))
-    reached = min(max(_RING // 2, int(np.hypot(waves[k], across) / 2)), (len(line) - 1) // 2)
-    if reached <= 2 * lobe:
+    """Return the mean power of the streak in a row or column of a periodogram near index k, outside the lobe there."""
+    # The band of an irregular skin is the wider the further it is from the centre.
+    lobe = int(np.ceil(_LOBE_RADIUS))
+    radius = min(max(_MIN_RING_SIZE // 2, int(np.hypot(waves[k], across) / 2)), (len(line) - 1) // 2)
+    if radius <= 2 * lobe:
         return 0.0
-    away = (k + np.r_[-reached:-lobe, lobe + 1 : reached + 1]) % len(line)
+    away = (k + np.r_[-radius:-lobe, lobe + 1 : radius + 1]) % len(line)
     # White, if lines jump, or falling with the square of the frequency, if they drift.
     drift = np.minimum((waves[away] ** 2 + across**2) / (waves[k] ** 2 + across**2), 1.5**2)
     quartile = max(np.quantile(line[away], 0.25), np.quantile(line[away] * drift, 0.25))
@@ -303,7 +304,7 @@ def _background(waves: Array, power: Array, count: float, ratio: float) -> Array
     Args:
         waves: |q| in bins.
         power: mean of `count` independent periodograms.
-        ratio: of the ends of a ring of frequencies, at least; they hold 24 or more, over one bin or more.
+        ratio: smallest ratio of the ends of a ring of frequencies, which holds 24 or more and is one bin wide or more.
     """
     length, order = waves.ravel(), np.argsort(waves, axis=None, kind="stable")
     order = order[np.searchsorted(length[order], 0.5) :]
@@ -311,7 +312,7 @@ def _background(waves: Array, power: Array, count: float, ratio: float) -> Array
     edges = [0]
     while edges[-1] < len(order):
         end = max(sizes[edges[-1]] + 1, sizes[edges[-1]] * ratio)
-        edges.append(max(int(np.searchsorted(sizes, end)), edges[-1] + _RING))
+        edges.append(max(int(np.searchsorted(sizes, end)), edges[-1] + _MIN_RING_SIZE))
     rings = np.split(order, edges[1:-1])
     middle = np.array([np.log(length[ring]).mean() for ring in rings])
     level = np.zeros(power.size)
@@ -353,4 +354,4 @@ def _same_wave(one: Array, other: Array, orders: int = 1000) -> bool:
     short, long = sorted((np.hypot(*one), np.hypot(*other)))
     angle = np.degrees(np.arctan2(abs(one[0] * other[1] - one[1] * other[0]), abs(one @ other)))
     order = np.clip(np.rint(long / short), 1, orders)
-    return bool(angle < _SAME_ANGLE and abs(long / short / order - 1) < _SAME_LENGTH)
+    return bool(angle < _MAX_SAME_ANGLE and abs(long / short / order - 1) < _MAX_SAME_LENGTH)

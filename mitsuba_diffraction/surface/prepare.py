@@ -17,8 +17,8 @@ from ..errors import RequestError, is_number
 from .heightfield import HeightField, harmonic_fill
 from .periods import Period, find_periods
 
-_VISIBLE = 1.5  # ratio of steps above which a seam is visible
-_LEAST = 0.002  # µm; a step of 2 nm scatters (4π·0.002/0.45)² = 0.3 % of the blue light that falls on it
+_MIN_VISIBLE_RATIO = 1.5  # of the steps across a seam to those inside
+_MIN_VISIBLE_STEP = 0.002  # µm; a step of 2 nm scatters (4π·0.002/0.45)² = 0.3 % of incident blue light
 
 
 def seam_steps(height_field: HeightField) -> dict[str, tuple[float, float]]:
@@ -36,15 +36,15 @@ def seam_steps(height_field: HeightField) -> dict[str, tuple[float, float]]:
     return found
 
 
-def seam_matters(steps: dict[str, tuple[float, float]]) -> bool:
+def is_seam_visible(steps: dict[str, tuple[float, float]]) -> bool:
     """Return whether a seam is visible: the period of the tiling would then act as a grating."""
-    return any(across > max(_VISIBLE * inside, _LEAST) for across, inside in steps.values())
+    return any(across > max(_MIN_VISIBLE_RATIO * inside, _MIN_VISIBLE_STEP) for across, inside in steps.values())
 
 
-_SIDE = 5  # side of the neighbourhood of a pixel, pixels
-_STANDARD = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
-_MISFIT = 0.05  # largest misfit of a second wave at the seam, in periods
-_LEAST_STRENGTH = 0.1  # least strength of a second wave relative to the strongest; a weaker one is ignored
+_NEIGHBOURHOOD = 5  # side of the neighbourhood of a pixel, pixels
+_SIGMA_PER_MAD = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
+_MAX_MISFIT = 0.05  # of a second wave at the seam, in periods
+_MIN_RELATIVE_STRENGTH = 0.1  # of a second wave relative to the strongest; a weaker one is ignored
 Step = str | Mapping[str, object]
 """The name of a step, or {name: argument}."""
 
@@ -55,7 +55,7 @@ def level_plane(height_field: HeightField) -> HeightField:
 
 
 def level_quadratic(height_field: HeightField) -> HeightField:
-    """Subtract the least-squares quadratic: tilt, and the bow of a tube scanner."""
+    """Subtract the least-squares quadratic surface: the tilt, and the bow of a tube scanner."""
     return _level(height_field, 2)
 
 
@@ -65,14 +65,14 @@ def _level(height_field: HeightField, degree: int) -> HeightField:
     x, y = ((np.arange(n) - (n - 1) / 2) / max((n - 1) / 2, 1) for n in (columns, rows))  # [−1, 1]
     # A single row has no slope along y, and two rows have no bow.
     powers = [(i, j) for i in range(degree + 1) for j in range(degree + 1 - i) if i < columns and j < rows]
-    there = ~height_field.gaps
-    middle = heights[there].mean()
-    terms = np.array([(y[:, None] ** j * x**i)[there] for i, j in powers])
+    known = ~height_field.gaps
+    mean = heights[known].mean()
+    terms = np.array([(y[:, None] ** j * x**i)[known] for i, j in powers])
     coefficients = np.zeros(len(powers))
-    # By the normal equations, which are small; their second solution, of what is left, removes the error of the first.
+    # By the normal equations, which are small; a second solution, for the residual, removes the error of the first.
     for _ in range(2):
-        rest = heights[there] - middle - coefficients @ terms
-        coefficients += np.linalg.lstsq(terms @ terms.T, terms @ rest, rcond=1e-12)[0]
+        residual = heights[known] - mean - coefficients @ terms
+        coefficients += np.linalg.lstsq(terms @ terms.T, terms @ residual, rcond=1e-12)[0]
     surface = sum(c * y[:, None] ** j * x**i for c, (i, j) in zip(coefficients, powers, strict=True))
     found = dict(zip(powers, coefficients, strict=True))
     half = [max((n - 1) / 2, 1) * size for n, size in zip((columns, rows), height_field.pixel_size, strict=True)]
@@ -83,7 +83,7 @@ def _level(height_field: HeightField, degree: int) -> HeightField:
             f", bow {found.get((2, 0), 0.0) * 1e3:.3g} nm along x, {found.get((0, 2), 0.0) * 1e3:.3g} nm along y"
         )
     name = "level_plane" if degree == 1 else "level_quadratic"
-    return _after(height_field, heights - middle - surface, f"{name}: {description}")
+    return _after(height_field, heights - mean - surface, f"{name}: {description}")
 
 
 def align_lines(height_field: HeightField) -> HeightField:
@@ -96,13 +96,13 @@ def align_lines(height_field: HeightField) -> HeightField:
     heights = height_field.heights
     lines = np.flatnonzero(~height_field.gaps.all(axis=1))
     offsets = np.zeros(len(lines))
-    before = heights[lines[0]]
+    previous = heights[lines[0]]
     for k, line in enumerate(lines[1:], 1):
-        difference = heights[line] - before
+        difference = heights[line] - previous
         shared = difference[~np.isnan(difference)]
         offsets[k] = offsets[k - 1] + (np.median(shared) if len(shared) else 0.0)
         # Missing pixels are replaced by those of the line before.
-        before = np.where(np.isnan(heights[line]), before + offsets[k] - offsets[k - 1], heights[line])
+        previous = np.where(np.isnan(heights[line]), previous + offsets[k] - offsets[k - 1], heights[line])
     # The median slope of an oblique asymmetric profile is not zero, which accumulates to a tilt over the lines.
     offsets -= np.polyval(np.polyfit(lines, offsets, 1 if len(lines) > 1 else 0), lines)
     aligned = heights.copy()
@@ -130,13 +130,14 @@ def despike(height_field: HeightField, threshold: float = 5.0) -> HeightField:
     _check("despike", threshold)
     gaps = height_field.gaps
     whole = harmonic_fill(height_field.heights, height_field.pixel_size)
-    # The surface is extended with its slope beyond the edges; a spike at the very corner is not detected.
-    inside = slice(_SIDE // 2, -(_SIDE // 2))
-    padded = np.pad(whole, _SIDE // 2, mode="reflect", reflect_type="odd")
-    lowest, highest = (ndimage.rank_filter(padded, rank, _SIDE)[inside, inside] for rank in (_SIDE, -_SIDE - 1))
+    # The surface is extrapolated with its slope at the edges; a spike exactly in a corner is not detected.
+    inside = slice(_NEIGHBOURHOOD // 2, -(_NEIGHBOURHOOD // 2))
+    padded = np.pad(whole, _NEIGHBOURHOOD // 2, mode="reflect", reflect_type="odd")
+    ranks = _NEIGHBOURHOOD, -_NEIGHBOURHOOD - 1
+    low, high = (ndimage.rank_filter(padded, rank, _NEIGHBOURHOOD)[inside, inside] for rank in ranks)
     sigma = _noise(whole)
-    excess = np.maximum(whole - highest, lowest - whole)
-    spikes = ~gaps & (excess > threshold * sigma) & (excess > 2 * (highest - lowest))
+    excess = np.maximum(whole - high, low - whole)
+    spikes = ~gaps & (excess > threshold * sigma) & (excess > 2 * (high - low))
     cleaned = height_field.heights
     if spikes.any():
         cleaned = harmonic_fill(np.where(spikes, np.nan, whole), height_field.pixel_size)
@@ -151,7 +152,7 @@ def _noise(heights: NDArray[np.float64]) -> float:
     for dimension, count in enumerate(heights.shape):
         if count > 2:
             differences = np.diff(differences, 2, axis=dimension) / np.sqrt(6)  # 1² + 2² + 1²
-    return float(_STANDARD * np.median(np.abs(differences))) if differences is not heights else 0.0
+    return float(_SIGMA_PER_MAD * np.median(np.abs(differences))) if differences is not heights else 0.0
 
 
 def fill_missing(height_field: HeightField) -> HeightField:
@@ -162,7 +163,7 @@ def fill_missing(height_field: HeightField) -> HeightField:
 
 
 def trim_edges(height_field: HeightField, width: float) -> HeightField:
-    """Cut off at least `width` µm at each edge, where the tip turns round, in whole pixels.
+    """Cut off at least `width` µm at each edge, where the tip reverses, in whole pixels.
 
     Raises:
         ValueError: if the width is not positive, or nothing would be left.
@@ -170,7 +171,7 @@ def trim_edges(height_field: HeightField, width: float) -> HeightField:
     _check("trim_edges", width)
     rows, columns = height_field.shape
     cuts = [
-        int(np.ceil(min(width / size, n) - 1e-9)) if n > 1 else 0  # a profile has no edges along its single pixel
+        int(np.ceil(min(width / size, n) - 1e-9)) if n > 1 else 0  # a profile has no edges along its axis of one pixel
         for n, size in zip((columns, rows), height_field.pixel_size, strict=True)
     ]
     if 2 * cuts[0] >= columns or 2 * cuts[1] >= rows:
@@ -194,10 +195,10 @@ def rotate(height_field: HeightField, degrees: float) -> HeightField:
     _check("rotate", degrees)
     quarters = degrees / 90
     if quarters == np.rint(quarters):
-        turns = int(np.rint(quarters)) % 4
+        quarter_turns = int(np.rint(quarters)) % 4
         # rot90 rotates from +x (columns) towards −y (rows), but rows run along +y here.
-        size = height_field.pixel_size[:: -1 if turns % 2 else 1]
-        return _after(height_field, np.rot90(height_field.heights, -turns), f"rotate: {degrees:g}°", size)
+        size = height_field.pixel_size[:: -1 if quarter_turns % 2 else 1]
+        return _after(height_field, np.rot90(height_field.heights, -quarter_turns), f"rotate: {degrees:g}°", size)
     rows, columns = height_field.shape
     d_x, d_y = height_field.pixel_size
     cos, sin = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
@@ -205,19 +206,19 @@ def rotate(height_field: HeightField, degrees: float) -> HeightField:
     width, height = largest_rectangle((columns - 1) * d_x, (rows - 1) * d_y, abs(cos), abs(sin))
     count = [int(np.floor(length / d + 1e-9)) + 1 for length, d in ((width, d_x), (height, d_y))]
     if min(count) < 2:
-        raise RequestError(f"rotate: no pixels fit into {columns} × {rows} pixels turned by {degrees:g}°")
+        raise RequestError(f"rotate: no pixels fit into {columns} × {rows} pixels rotated by {degrees:g}°")
     x, y = ((np.arange(n) - (n - 1) / 2) * d for n, d in zip(count, (d_x, d_y), strict=True))
     x, y = np.meshgrid(x, y)
-    places = np.array([(cos * y - sin * x) / d_y + (rows - 1) / 2, (cos * x + sin * y) / d_x + (columns - 1) / 2])
+    positions = np.array([(cos * y - sin * x) / d_y + (rows - 1) / 2, (cos * x + sin * y) / d_x + (columns - 1) / 2])
     whole = harmonic_fill(height_field.heights, height_field.pixel_size)
     # Not ndimage's splines, whose slope vanishes at the edges.
     degree = [min(3, n - 1) for n in (rows, columns)]
     spline = RectBivariateSpline(np.arange(rows), np.arange(columns), whole, kx=degree[0], ky=degree[1])
-    turned = spline.ev(*places)
-    gaps = ndimage.map_coordinates(height_field.gaps.astype(float), places, order=1, mode="nearest") > 1e-9
-    turned[gaps] = np.nan
-    _check_any("rotate", turned)
-    return _after(height_field, turned, f"rotate: {degrees:g}°, {count[0]} × {count[1]} of {columns} × {rows} pixels")
+    rotated = spline.ev(*positions)
+    gaps = ndimage.map_coordinates(height_field.gaps.astype(float), positions, order=1, mode="nearest") > 1e-9
+    rotated[gaps] = np.nan
+    _check_any("rotate", rotated)
+    return _after(height_field, rotated, f"rotate: {degrees:g}°, {count[0]} × {count[1]} of {columns} × {rows} pixels")
 
 
 def largest_rectangle(width: float, height: float, cos: float, sin: float) -> tuple[float, float]:
@@ -250,16 +251,16 @@ def crop_periods(height_field: HeightField, axes: str = "xy") -> HeightField:
     if height_field.gaps.any():
         raise RequestError(f"crop_periods: {height_field.gaps.sum()} pixels are missing, wanted fill_missing before it")
     found = find_periods(height_field)
-    waves = [wave for wave in found if wave.strength >= _LEAST_STRENGTH * found[0].strength]
+    waves = [wave for wave in found if wave.strength >= _MIN_RELATIVE_STRENGTH * found[0].strength]
     if not waves:
         raise RequestError("crop_periods: no period stands out of the spectrum of the heights")
     description = []
     heights, sizes = height_field.heights, list(height_field.pixel_size)
     for axis in axes:
         k = "xy".index(axis)
-        heights, sizes[k], what = _crop(heights, 1 - k, sizes[k], waves, axis)
-        description.append(what)
-    if all("no period" in what for what in description):
+        heights, sizes[k], part = _crop(heights, 1 - k, sizes[k], waves, axis)
+        description.append(part)
+    if all("no period" in part for part in description):
         raise RequestError(f"crop_periods: {'; '.join(description)}")
     return _after(height_field, heights, f"crop_periods: {', '.join(description)}", (sizes[0], sizes[1]))
 
@@ -274,12 +275,13 @@ def _crop(
     if count == 1 or len(across) == 0:
         return heights, size, f"no period along {axis}"
     first = across[0]
-    most = int(np.floor(q[first] * count * size + 1e-6))
-    numbers = np.arange(most, most // 2 - 1 if most > 1 else 0, -1)
+    max_number = int(np.floor(q[first] * count * size + 1e-6))
+    numbers = np.arange(max_number, max_number // 2 - 1 if max_number > 1 else 0, -1)
     lengths = np.maximum(numbers, 1) / q[first]
     misfits = np.abs(q[:, None] * lengths - np.rint(q[:, None] * lengths))
     max_misfit = misfits.max(axis=0)
-    best = int(np.argmax(max_misfit <= _MISFIT)) if (max_misfit <= _MISFIT).any() else int(np.argmin(max_misfit))
+    fits = max_misfit <= _MAX_MISFIT
+    best = int(np.argmax(fits)) if fits.any() else int(np.argmin(max_misfit))
     length, misfit = lengths[best], np.delete(misfits[:, best], first)
     exact = length / size
     new = int(np.rint(exact))
@@ -313,26 +315,26 @@ def _is_positive(value: object) -> bool:
     return is_number(value) and value > 0
 
 
-_WITHOUT = (lambda argument: False), "no argument"
+_NO_ARGUMENT = (lambda argument: False), "no argument"
 _STEPS: dict[str, tuple[Callable[..., HeightField], Callable[[object], bool], str]] = {
-    "level_plane": (level_plane, *_WITHOUT),
-    "level_quadratic": (level_quadratic, *_WITHOUT),
-    "align_lines": (align_lines, *_WITHOUT),
+    "level_plane": (level_plane, *_NO_ARGUMENT),
+    "level_quadratic": (level_quadratic, *_NO_ARGUMENT),
+    "align_lines": (align_lines, *_NO_ARGUMENT),
     "despike": (despike, _is_positive, "a positive number of standard deviations"),
-    "fill_missing": (fill_missing, *_WITHOUT),
+    "fill_missing": (fill_missing, *_NO_ARGUMENT),
     "rotate": (rotate, is_number, "a number of degrees"),
     "crop_periods": (crop_periods, ("x", "y", "xy").__contains__, "'x', 'y' or 'xy'"),
     "trim_edges": (trim_edges, _is_positive, "a positive number of µm"),
 }
-"""Name → function, whether an argument is right, and what is wanted."""
+"""Name → function, check of an argument, and description of a valid argument."""
 
 STEP_NAMES = tuple(_STEPS)
-_WITH_ARGUMENT = ("rotate", "trim_edges")  # the others have none, or a default
+_ARGUMENT_REQUIRED = ("rotate", "trim_edges")  # the others have no argument, or a default
 
 
 def _check(name: str, argument: object, where: str = "") -> None:
-    _, is_right, wanted = _STEPS[name]
-    if not is_right(argument):
+    _, is_valid, wanted = _STEPS[name]
+    if not is_valid(argument):
         raise RequestError(f"{where}{name}: got {argument!r}, wanted {wanted}")
 
 
@@ -344,7 +346,7 @@ def check_steps(steps: object) -> None:
         name, argument = _parts(step)
         if argument is not None:
             _check(name, argument, "prepare: ")
-        elif name in _WITH_ARGUMENT:
+        elif name in _ARGUMENT_REQUIRED:
             raise RequestError(f"prepare: {name}: missing its argument, wanted {{ {name} = … }}")
 
 
@@ -396,4 +398,4 @@ def _after(
 
 def _check_any(name: str, heights: NDArray[np.float64]) -> None:
     if np.isnan(heights).all():
-        raise RequestError(f"{name}: all pixels that are left are missing")
+        raise RequestError(f"{name}: all remaining pixels are missing")

@@ -20,7 +20,7 @@ from mitsuba_diffraction.inspection.colours import (
     broadened,
     illumination,
     order_angle,
-    order_share,
+    order_fraction,
     radiance,
     scanned,
 )
@@ -48,7 +48,7 @@ def sinusoid(**arguments):
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.03])
-def test_statistics_of_a_sinusoid_are_those_of_the_formula(tilt):
+def test_statistics_of_a_sinusoid_agree_with_the_formula(tilt):
     numbers = statistics(waves(tilt=tilt))
     assert numbers.Sq == pytest.approx(DEPTH / np.sqrt(8), rel=0.01)
     assert numbers.Sa == pytest.approx(DEPTH / np.pi, rel=0.02)
@@ -66,7 +66,7 @@ def test_a_plane_has_tilt_and_nothing_else():
     assert numbers.Sz == pytest.approx(0, abs=1e-12)
 
 
-def test_a_tile_is_level_however_it_rises():
+def test_a_tile_has_a_level_reference_plane():
     numbers = statistics(md.gratings.blazed(2.5, 0.25), extent="tile")
     assert numbers.tilt == 0
     assert numbers.Sq == pytest.approx(0.25 / np.sqrt(12), rel=1e-3)
@@ -94,7 +94,7 @@ def test_a_flat_surface_mirrors_daylight():
 
 @pytest.mark.few(1)
 @pytest.mark.parametrize(("theta_i", "theta_o"), [(0.0, 16.0), (20.0, 45.0), (60.0, 20.0), (30.0, -10.0), (70.0, 60.0)])
-def test_radiance_is_that_of_the_bsdf(theta_i, theta_o):
+def test_radiance_agrees_with_the_bsdf(theta_i, theta_o):
     mi.set_variant("llvm_ad_spectral")
     # Broad lobes, so that something is seen at any angle; of a sample, whose K is that of the pair of directions.
     spectrum = md.precompute(waves(pixel=0.08), extent="sample", coherence_length=2.0, tolerance=0.01)
@@ -105,11 +105,11 @@ def test_radiance_is_that_of_the_bsdf(theta_i, theta_o):
     f = testing.evaluate(bsdf, *directions, wavelengths) / np.cos(np.deg2rad(theta_o))
     at = np.searchsorted(WAVELENGTHS, wavelengths)
     got = (radiance(spectrum, 0.0, theta_i, theta_o) / illumination())[at]
-    share = f * np.cos(np.deg2rad(theta_i)) / got
-    np.testing.assert_allclose(share, 1, atol=1e-3)
+    ratio = f * np.cos(np.deg2rad(theta_i)) / got
+    np.testing.assert_allclose(ratio, 1, atol=1e-3)
 
 
-def test_colours_go_where_the_grating_equation_sends_them():
+def test_colours_lie_at_the_angles_of_the_grating_equation():
     spectrum = sinusoid(coherence_length=20.0)
     for wavelength, channel in ((0.62, 0), (0.54, 1), (0.45, 2)):
         angle = order_angle(1, PERIOD, wavelength)
@@ -123,7 +123,7 @@ def test_colours_go_where_the_grating_equation_sends_them():
 @pytest.mark.few(1)
 @pytest.mark.parametrize("order", [1, 2])
 @pytest.mark.parametrize("extent", ["tile", "sample"])
-def test_orders_hold_what_bessel_says(order, extent):
+def test_orders_have_the_power_of_bessel_functions(order, extent):
     wavelength = 0.55
     if extent == "tile":
         spectrum = sinusoid()
@@ -131,10 +131,10 @@ def test_orders_hold_what_bessel_says(order, extent):
         spectrum = md.precompute(waves(pixel=0.08), extent="sample", coherence_length=8.0, tolerance=0.01)
     kappa = 2 * np.pi / wavelength * (1 + np.sqrt(1 - (order * wavelength / PERIOD) ** 2))
     expected = 2 * jv(order, kappa * DEPTH / 2) ** 2
-    assert order_share(spectrum, 0.0, PERIOD, order, wavelength) == pytest.approx(expected, rel=0.01, abs=2e-3)
+    assert order_fraction(spectrum, 0.0, PERIOD, order, wavelength) == pytest.approx(expected, rel=0.01, abs=2e-3)
 
 
-def test_scales_are_those_of_a_surface_that_is_built_anew():
+def test_scaling_the_spectrum_agrees_with_a_scaled_surface():
     spectrum = sinusoid(coherence_length=20.0)
     higher = md.precompute(md.gratings.sinusoidal(PERIOD, 1.05 * DEPTH), coherence_length=20.0)
     wider = md.precompute(md.gratings.sinusoidal(1.05 * PERIOD, DEPTH), coherence_length=21.0)
@@ -160,7 +160,7 @@ def test_a_scanned_spike_has_the_shape_of_the_tip():
     np.testing.assert_allclose(got, np.maximum(0.3 - (x**2 + y**2) / (2 * radius), 0), atol=1e-12)
 
 
-def test_erosion_gives_back_what_the_tip_touched():
+def test_erosion_restores_points_that_the_tip_touched():
     surface = waves(count=4)
     once = scanned(surface, 0.1)
     back = scanned(once, -0.1)
@@ -178,15 +178,15 @@ def test_a_tile_is_continued_periodically_under_the_tip():
     )
 
 
-@pytest.mark.parametrize("share", [0.05, -0.05])
-def test_a_tip_is_found_that_broadens_ridges_by_a_share(share):
+@pytest.mark.parametrize("fraction", [0.05, -0.05])
+def test_a_tip_is_found_that_broadens_ridges_by_a_fraction(fraction):
     surface = md.gratings.crossed(PERIOD, DEPTH, samples=128)
-    other, radius = broadened(surface, share, extent="tile")
-    assert np.sign(radius) == np.sign(share)
-    assert np.mean(other.heights > 0) / np.mean(surface.heights > 0) - 1 == pytest.approx(share, abs=0.01)
+    other, radius = broadened(surface, fraction, extent="tile")
+    assert np.sign(radius) == np.sign(fraction)
+    assert np.mean(other.heights > 0) / np.mean(surface.heights > 0) - 1 == pytest.approx(fraction, abs=0.01)
 
 
-def test_a_sawtooth_changes_alike_under_both_tips_and_round_ridges_do_not():
+def test_both_tips_have_equal_effects_on_a_sawtooth_but_not_on_round_ridges():
     """−h(−x) is the same sawtooth: what dilation does to one, erosion does to the other, and |F{e^iκh}| is equal."""
     x = (np.arange(256) + 0.5) / 256
     ridges = md.HeightField(DEPTH * np.abs(np.sin(np.pi * x))[None], (PERIOD / 256, PERIOD))
@@ -226,7 +226,7 @@ def grating():
     return inspect(md.gratings.sinusoidal(PERIOD, DEPTH, samples=128), extent="tile")
 
 
-def test_changes_are_those_of_the_closed_form(grating):
+def test_changes_agree_with_the_closed_form(grating):
     kappa = 2 * np.pi / 0.55 * (1 + np.cos(np.deg2rad(order_angle(1, PERIOD, 0.55))))
     by = {(change.what, round(change.by, 2)): change for change in grating.changes}
     assert set(by) == {(w, s) for w in ("height scale", "pixel size", "tip broadening") for s in (0.05, -0.05)}
@@ -290,7 +290,7 @@ def test_a_grating_too_fine_for_scalar_theory_is_a_concern():
     assert said.endswith("; theory=rigorous has it right.")
 
 
-def test_a_good_scan_raises_no_concern():
+def test_a_good_scan_has_no_concerns():
     assert about(waves()) == ()
     assert about(md.gratings.lamellar(2.5, 0.2), measured=False) == ()
 
@@ -309,15 +309,15 @@ def test_a_sample_is_reported_in_numbers(sample):
     assert period.period == pytest.approx(PERIOD, abs=4 * period.period_uncertainty + 0.01)
     assert abs(period.direction) < 1
     assert sample.max_coherence_length == pytest.approx(4.0)
-    told = json.loads(json.dumps(sample.as_json()))
-    assert told["pixels"] == [100, 100]
-    assert told["statistics"]["Sq"] == pytest.approx(DEPTH / np.sqrt(8), rel=0.03)
-    assert told["periods"][0]["period"] == period.period
-    assert told["changes"][0]["tip_radius"] is None
-    assert told["changes"][2]["period"] == pytest.approx(0.05)
+    numbers = json.loads(json.dumps(sample.as_json()))
+    assert numbers["pixels"] == [100, 100]
+    assert numbers["statistics"]["Sq"] == pytest.approx(DEPTH / np.sqrt(8), rel=0.03)
+    assert numbers["periods"][0]["period"] == period.period
+    assert numbers["changes"][0]["tip_radius"] is None
+    assert numbers["changes"][2]["period"] == pytest.approx(0.05)
 
 
-def test_a_surface_without_a_period_says_so(tmp_path):
+def test_a_surface_without_a_period_is_reported(tmp_path):
     noise = md.HeightField(np.random.default_rng(0).standard_normal((40, 40)) * 0.01, 0.08)
     seen = inspect(noise)
     assert (seen.periods, seen.changes) == ((), ())
@@ -441,10 +441,10 @@ def test_inspect_precompute_and_the_log_agree_on_the_error_of_scalar_theory(fold
     warned = [re.findall(r"[Ss]calar theory: (errs by .*right)", text) for text in said]
     assert warned[0] == warned[1] == warned[2]
     assert len(warned[0]) == 1
-    (told,) = re.findall(r"^scalar theory +(errs by .*\))", said[0], re.MULTILINE)
-    assert warned[0] == [f"{told}; theory=rigorous has it right"]
-    share = json.loads(Path("n.json").read_text())["scalar_error"]["share"]
-    assert told.startswith(f"errs by {100 * share:.0f}% ")
+    (printed,) = re.findall(r"^scalar theory +(errs by .*\))", said[0], re.MULTILINE)
+    assert warned[0] == [f"{printed}; theory=rigorous has it right"]
+    error = json.loads(Path("n.json").read_text())["scalar_error"]["share"]
+    assert printed.startswith(f"errs by {100 * error:.0f}% ")
 
 
 @pytest.mark.slow
@@ -495,7 +495,7 @@ def test_a_mistake_is_one_line_and_exit_code_2(folder, command, arguments, words
 
 
 @pytest.mark.slow
-def test_a_measured_skin_has_its_period_and_raises_no_concern(scan):
+def test_a_measured_skin_has_its_period_and_no_concerns(scan):
     seen = inspect(scan("elaphe"))
     assert seen.periods[0].period == pytest.approx(1.0, abs=0.05)
     assert abs(abs(seen.periods[0].direction) - 90) < 5

@@ -48,7 +48,7 @@ def test_blaze_has_sinc_orders(kappa, depth):
     np.testing.assert_allclose(measured, np.sinc(ORDERS - kappa * depth / (2 * np.pi)) ** 2, atol=1e-4)
 
 
-def test_blaze_rises_along_x_and_sends_light_to_the_positive_order_of_the_phase():
+def test_blaze_rises_along_x_and_diffracts_into_positive_orders():
     field = blazed(PERIOD, 0.25)
     slope = np.diff(field.heights[0]) / field.pixel_size[0]
     np.testing.assert_allclose(slope, 0.25 / PERIOD)
@@ -66,7 +66,7 @@ def test_lamellar_of_half_duty_and_phase_pi_has_odd_orders_only():
 
 
 @given(duty=st.floats(0.01, 0.99), kappa=st.floats(0.0, 35.0))
-def test_lamellar_of_any_duty_keeps_the_mirror_order(duty, kappa):
+def test_the_zeroth_order_of_lamellar_gratings_of_any_duty(duty, kappa):
     field = lamellar(PERIOD, 0.2, duty=duty)
     high = np.mean(field.heights > 0)
     assert high == pytest.approx(duty, abs=0.5 / 512 + 1e-9)
@@ -98,7 +98,7 @@ def test_a_line_grating_is_one_row_of_one_period(make):
 # ---------------------------------------------------------------- synthetic skins
 
 
-def test_a_skin_has_the_size_and_depth_asked_for(skin):
+def test_a_skin_has_the_requested_size_and_depth(skin):
     field, _, period, depth = skin
     assert field.tile_size == pytest.approx((20 * period, 20 * period))
     assert field.shape == (round(20 * period / 0.0625),) * 2
@@ -128,7 +128,7 @@ def test_a_skin_has_no_seams(skin):
 
 
 @pytest.mark.parametrize("name", sorted(SKINS))
-def test_a_seed_names_one_skin(name):
+def test_a_seed_determines_a_skin(name):
     make = SKINS[name][0]
     first, again, other = (make(10.0, seed=seed).heights for seed in (1, 1, 2))
     np.testing.assert_array_equal(first, again)
@@ -138,7 +138,7 @@ def test_a_seed_names_one_skin(name):
 @pytest.mark.few(1)
 @pytest.mark.parametrize("name", sorted(SKINS))
 @pytest.mark.parametrize("seed", [0, 7])
-def test_mean_period_of_a_skin_is_that_asked_for(name, seed):
+def test_a_skin_has_the_requested_mean_period(name, seed):
     make, axis, period, _ = SKINS[name]
     field = make(40 * period, pixel_size=0.1, seed=seed)
     heights = field.heights if axis == 0 else field.heights.T
@@ -203,7 +203,7 @@ def test_a_period_must_be_positive(name, period):
 
 
 @pytest.mark.parametrize("name", ["sinusoidal", "foil", "compact_disc", "elaphe"])
-def test_a_period_that_looks_like_nm_is_asked_about(name):
+def test_a_period_that_looks_like_nm_is_refused_with_a_question(name):
     given = {"depth": 0.1} if name == "sinusoidal" else {}
     with pytest.raises(ValueError, match=r"period: got 2000 µm, wanted at most 100; is it in nm \(2 µm\)\?"):
         PROFILES[name](period=2000, **given)
@@ -226,7 +226,7 @@ def test_samples_are_a_whole_number_of_two_or_more(make, samples):
 
 
 @pytest.mark.parametrize("duty", [0, 1, -0.2, 1.5, np.nan, "half", 1e-4, 0.9999])
-def test_a_duty_leaves_ridge_and_groove(duty):
+def test_a_duty_without_ridge_or_groove_is_refused(duty):
     with pytest.raises(ValueError, match=r"duty: got .*, wanted"):
         lamellar(PERIOD, 0.1, duty=duty)
 

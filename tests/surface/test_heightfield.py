@@ -27,7 +27,7 @@ def test_sizes_and_heights_follow_from_the_array(heights, x, y):
 
 
 @given(heights=arrays, place=st.data(), bad=st.sampled_from([np.nan, np.inf, -np.inf]))
-def test_missing_pixels_are_refused_with_their_number_and_the_first_place(heights, place, bad):
+def test_missing_pixels_are_refused_with_their_number_and_the_first_position(heights, place, bad):
     flat = place.draw(st.sets(st.integers(0, heights.size - 1), min_size=1))
     heights.ravel()[list(flat)] = bad
     row, column = np.unravel_index(min(flat), heights.shape)
@@ -67,7 +67,7 @@ def test_missing_pixels_are_filled_on_request_and_counted(heights, place, bad):
     )
 
 
-def test_the_fill_knows_the_shape_of_a_pixel():
+def test_the_fill_depends_on_the_shape_of_a_pixel():
     corner = [[np.nan, 1.0], [10.0, 0.0]]
     # Weights 1/d²: (4·1 + 10)/5 where pixels are twice as long along y.
     assert HeightField(corner, (0.1, 0.2), fill_missing=True).heights[0, 0] == pytest.approx(14 / 5)
@@ -83,7 +83,7 @@ def test_the_fill_knows_the_shape_of_a_pixel():
         (np.ma.masked_equal([[1, 7, 7, 7]], 7), "source='scan.npy (3 missing pixels filled)')"),
     ],
 )
-def test_the_source_and_repr_tell_how_many_were_filled(heights, text):
+def test_the_source_and_repr_state_the_number_of_filled_pixels(heights, text):
     assert text in repr(HeightField(heights, 0.1, source="scan.npy", fill_missing=True))
 
 
@@ -110,7 +110,7 @@ def test_fill_missing_is_true_or_false(answer):
     [1.0, [1.0, 2.0], np.zeros((2, 2, 2)), np.zeros((0, 3)), np.zeros((3, 0)), [[1j]], [["high"]], [[1, 2], [3]], None],
     ids=["number", "row", "cube", "no rows", "no columns", "complex", "text", "ragged", "nothing"],
 )
-def test_what_is_not_a_plane_of_heights_is_refused(heights):
+def test_arrays_that_are_not_two_dimensional_heights_are_refused(heights):
     with pytest.raises(ValueError, match="heights: got"):
         HeightField(heights, 0.1)
 

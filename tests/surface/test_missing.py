@@ -42,11 +42,11 @@ def by_relaxation(heights, weight_x, weight_y, sweeps=4000):
     rows, columns = heights.shape
     for _ in range(sweeps):
         padded = np.pad(filled, 1)
-        total, share = np.zeros(heights.shape), np.zeros(heights.shape)
+        total, weights = np.zeros(heights.shape), np.zeros(heights.shape)
         for row, column in ((0, 1), (1, 0), (1, 2), (2, 1)):
             total += weight[row, column] * padded[row : row + rows, column : column + columns]
-            share += weight[row, column] * inside[row : row + rows, column : column + columns]
-        filled = np.where(missing, total / share, filled)
+            weights += weight[row, column] * inside[row : row + rows, column : column + columns]
+        filled = np.where(missing, total / weights, filled)
     return filled
 
 
@@ -56,7 +56,7 @@ def by_relaxation(heights, weight_x, weight_y, sweeps=4000):
 @pytest.mark.parametrize("hole", INTERIOR.values(), ids=INTERIOR)
 @pytest.mark.parametrize("function", HARMONIC.values(), ids=HARMONIC)
 @pytest.mark.parametrize("pixel_size", [(1.0, 1.0), (0.05, 0.2), (3.0, 0.1)])
-def test_harmonic_functions_with_interior_holes_come_back(function, hole, pixel_size):
+def test_harmonic_functions_with_interior_holes_are_restored(function, hole, pixel_size):
     heights = function(X * pixel_size[0], Y * pixel_size[1])
     np.testing.assert_allclose(harmonic_fill(without(heights, hole), pixel_size), heights, rtol=1e-9, atol=1e-9)
 
@@ -100,7 +100,7 @@ def test_the_fill_is_that_of_a_relaxation(pixel_size):
     ],
     ids=["left", "right", "top", "bottom"],
 )
-def test_a_plane_that_slopes_along_the_edge_comes_back(plane, hole):
+def test_a_plane_that_slopes_along_the_edge_is_restored(plane, hole):
     np.testing.assert_allclose(harmonic_fill(without(plane, hole)), plane, atol=1e-9)
 
 
@@ -173,7 +173,7 @@ def test_holes_in_a_level_surface_are_level_to_the_bit():
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_what_is_not_finite_is_missing(value):
+def test_pixels_that_are_not_finite_are_missing(value):
     np.testing.assert_allclose(harmonic_fill([[1, value, 2]]), [[1, 1.5, 2]], rtol=1e-15)
 
 
@@ -186,14 +186,14 @@ def test_masked_pixels_are_missing_whatever_lies_under_the_mask(dtype):
     np.testing.assert_allclose(filled, [[1, 1.5, 2]], rtol=1e-15)
 
 
-def test_where_nothing_is_missing_the_heights_are_returned():
+def test_without_missing_pixels_the_heights_are_returned():
     heights = np.random.default_rng(2).random((3, 4))
     assert harmonic_fill(heights) is heights
     np.testing.assert_array_equal(harmonic_fill([[1, 2]]), [[1.0, 2.0]])
 
 
 @pytest.mark.parametrize("heights", [np.full((2, 3), np.nan), [[np.inf]], np.ma.masked_all((4, 5))])
-def test_where_all_are_missing_there_is_nothing_to_fill_from(heights):
+def test_heights_without_any_known_pixel_are_refused(heights):
     with pytest.raises(ValueError, match=f"all {np.size(heights)} pixels are missing"):
         harmonic_fill(heights)
 
@@ -201,7 +201,7 @@ def test_where_all_are_missing_there_is_nothing_to_fill_from(heights):
 @pytest.mark.parametrize(
     "heights", [[1.0, np.nan], np.zeros((0, 3)), [[1j, np.nan]], [["high"]], np.ma.masked_all((2, 2), complex)]
 )
-def test_what_is_not_a_plane_of_heights_is_refused(heights):
+def test_arrays_that_are_not_two_dimensional_heights_are_refused(heights):
     with pytest.raises(ValueError, match="heights: got"):
         harmonic_fill(heights)
 

@@ -16,14 +16,14 @@ PIXEL = (0.05, 0.07)
 """µm, (x, y)"""
 
 
-def places(shape, pixel=PIXEL):
+def coordinates(shape, pixel=PIXEL):
     """x and y of each pixel, µm."""
     y, x = np.mgrid[: shape[0], : shape[1]]
     return x * pixel[0], y * pixel[1]
 
 
 def wave(shape, period, direction, phase=0.0, pixel=PIXEL):
-    x, y = places(shape, pixel)
+    x, y = coordinates(shape, pixel)
     angle = np.radians(direction)
     return np.cos(2 * np.pi * (x * np.cos(angle) + y * np.sin(angle)) / period + phase)
 
@@ -60,7 +60,7 @@ shapes = st.tuples(st.integers(40, 70), st.integers(40, 70))
 @example(shape=(43, 40), period=1.0, direction=90.0, phase=0.0, tilt=0.0, bow=0.0)
 def test_a_sinusoid_on_a_bowed_plane_is_exact(shape, period, direction, phase, tilt, bow):
     assume(resolved(shape, period, direction))
-    x, y = places(shape)
+    x, y = coordinates(shape)
     heights = 0.1 * wave(shape, period, direction, phase) + tilt * x - 2 * y + bow * x * y + bow * y**2
     (found,) = find_periods(HeightField(heights, PIXEL))
     # The peak of −q is six bins away or more, where a Hann window has some thousandths of its amplitude.
@@ -70,7 +70,7 @@ def test_a_sinusoid_on_a_bowed_plane_is_exact(shape, period, direction, phase, t
     )
     assert np.abs(error * np.array(shape[::-1]) * PIXEL).max() < 0.03  # bins
     assert -90 < found.direction <= 90
-    # Over a broken number n of waves, the mean square of a cosine is 1/2 to a share of 1/(2πn); n > 3 here.
+    # Over a broken number n of waves, the mean square of a cosine is 1/2 within 1/(2πn); n > 3 here.
     assert found.strength == pytest.approx(1, abs=1 / (6 * np.pi))
 
 
@@ -145,7 +145,7 @@ def test_built_in_profiles_have_their_periods(name, periods):
     assert [period.period for period in found] == pytest.approx(periods, abs=1e-4)
 
 
-def test_two_waves_come_strongest_first():
+def test_the_stronger_of_two_waves_is_first():
     shape = (80, 70)
     heights = wave(shape, 0.61, 20) + 2 * wave(shape, 0.43, -75)
     first, second = find_periods(HeightField(heights, PIXEL))
@@ -198,7 +198,7 @@ def test_the_rows_of_a_synthetic_skin_are_a_period(name, directions):
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 2), (2, 1), (3, 3), (1, 300), (300, 1), (40, 57)])
 def test_a_flat_or_tilted_surface_has_no_period(shape):
-    x, y = places(shape)
+    x, y = coordinates(shape)
     assert find_periods(HeightField(np.full(shape, 0.3), PIXEL)) == ()
     assert find_periods(HeightField(0.3 + 0.1 * x - 0.02 * y, PIXEL)) == ()
 
@@ -246,7 +246,7 @@ def test_the_period_of_a_tile_is_an_order_of_its_lattice(periods):
     (found,) = find_periods(tile, extent="tile")
     assert (found.period, found.direction) == (pytest.approx(tile.tile_size[0] / periods, rel=1e-12), 0)
     assert found.period_uncertainty == found.direction_uncertainty == 0
-    # As a sample, a single wave is none that stands out, and several are known only so well.
+    # As a sample, a single wave is not significant, and several have an uncertainty.
     assert [round(one.period, 2) for one in find_periods(tile)] == [round(found.period, 2)] * (periods > 1)
 
 
@@ -312,7 +312,7 @@ def test_one_pitch_is_listed_once(seed, low, high, width):
     assert found.period == pytest.approx((low + high) / 2, rel=0.1)
 
 
-def test_uncertainty_is_what_another_part_would_give():
+def test_uncertainty_is_the_spread_between_parts():
     """Pitches of other parts of the same skin: synthetic replicas, and a pitch that varies from side to side."""
     found = [find_periods(drifting(seed, 0.89, 0.975, 0.06), 1)[0] for seed in range(8)]
     apart = [

@@ -15,7 +15,7 @@ PIXEL = (0.05, 0.08)
 """µm, (x, y)"""
 
 
-def places(shape, pixel=PIXEL):
+def coordinates(shape, pixel=PIXEL):
     y, x = np.mgrid[: shape[0], : shape[1]]
     return x * pixel[0], y * pixel[1]
 
@@ -24,15 +24,15 @@ def rough(shape, seed=0):
     return HeightField(0.1 * np.random.default_rng(seed).standard_normal(shape), PIXEL, "rough")
 
 
-def with_gaps(field, share=0.1, seed=1):
+def with_gaps(field, fraction=0.1, seed=1):
     heights = field.heights.copy()
-    heights[np.random.default_rng(seed).random(heights.shape) < share] = np.nan
+    heights[np.random.default_rng(seed).random(heights.shape) < fraction] = np.nan
     heights[0, 0] = 0.1  # there is always one
     return HeightField(heights, field.pixel_size, field.source, keep_missing=True)
 
 
 def grating(shape, period=0.6, direction=0.0, pixel=PIXEL):
-    x, y = places(shape, pixel)
+    x, y = coordinates(shape, pixel)
     angle = np.radians(direction)
     return 0.1 * np.cos(2 * np.pi * (x * np.cos(angle) + y * np.sin(angle)) / period)
 
@@ -62,7 +62,7 @@ def test_filled_pixels_are_counted_through_all_steps(step):
 
 
 @given(heights=fields, step=st.sampled_from(ALL))
-def test_a_step_is_pure_and_keeps_what_is_missing(heights, step):
+def test_a_step_is_pure_and_keeps_missing_pixels(heights, step):
     field = field_of(heights)
     before = field.heights.tobytes()
     after = prepare.apply_steps(field, [step])
@@ -75,8 +75,8 @@ def test_a_step_is_pure_and_keeps_what_is_missing(heights, step):
         assert np.isfinite(after.heights).sum() == np.isfinite(heights).sum()
 
 
-def test_steps_are_done_in_their_order_and_say_what_they_did():
-    x, y = places((40, 60))
+def test_steps_are_applied_in_order_and_recorded():
+    x, y = coordinates((40, 60))
     field = HeightField(np.tan(np.radians(2)) * x - np.tan(np.radians(0.5)) * y, PIXEL, "skin.gwy")
     after = prepare.apply_steps(field, [{"trim_edges": 0.1}, "level_plane", {"rotate": 90}])
     assert after.source == (
@@ -136,16 +136,16 @@ def test_a_height_field_with_missing_pixels_has_no_spectrum(extent):
 
 
 @given(heights=fields, a=slopes, b=slopes, c=slopes)
-def test_a_plane_makes_no_difference_to_level_plane(heights, a, b, c):
-    x, y = places(heights.shape)
+def test_level_plane_is_independent_of_an_added_plane(heights, a, b, c):
+    x, y = coordinates(heights.shape)
     one = prepare.level_plane(field_of(heights)).heights
     other = prepare.level_plane(field_of(heights + a * x + b * y + c)).heights
     np.testing.assert_allclose(other, one, atol=1e-12)
 
 
 @given(heights=fields, a=slopes, b=slopes, c=slopes, d=slopes)
-def test_a_surface_of_second_order_makes_no_difference_to_level_quadratic(heights, a, b, c, d):
-    x, y = places(heights.shape)
+def test_level_quadratic_is_independent_of_an_added_quadratic(heights, a, b, c, d):
+    x, y = coordinates(heights.shape)
     one = prepare.level_quadratic(field_of(heights)).heights
     other = prepare.level_quadratic(field_of(heights + a * x + b * y**2 + c * x * y + d * x**2)).heights
     np.testing.assert_allclose(other, one, atol=1e-11)
@@ -166,7 +166,7 @@ def test_levelling_twice_is_levelling_once(heights, step):
 
 def test_the_plane_is_that_of_least_squares():
     field = with_gaps(rough((13, 17)))
-    x, y = places(field.shape)
+    x, y = coordinates(field.shape)
     there = ~field.gaps
     design = np.stack([np.ones(there.sum()), x[there], y[there]], axis=1)
     solution = np.linalg.lstsq(design, field.heights[there], rcond=None)[0]
@@ -175,7 +175,7 @@ def test_the_plane_is_that_of_least_squares():
 
 
 def test_the_bow_is_reported_in_nanometres():
-    x, y = places((31, 41))
+    x, y = coordinates((31, 41))
     x, y = x / x.max() * 2 - 1, y / y.max() * 2 - 1
     after = prepare.level_quadratic(HeightField(0.012 * x**2 - 0.005 * y**2, PIXEL, "scan"))
     assert "bow 12 nm along x, -5 nm along y" in after.source
@@ -189,16 +189,16 @@ def test_the_bow_is_reported_in_nanometres():
     heights=npst.arrays(np.float64, (7, 9), elements=st.one_of(st.floats(-1, 1), st.just(np.nan))),
     offsets=npst.arrays(np.float64, (7, 1), elements=st.floats(-3, 3)),
 )
-def test_offsets_of_the_lines_make_no_difference_but_for_a_tilt(heights, offsets):
+def test_offsets_of_lines_are_removed_except_for_a_tilt(heights, offsets):
     heights[:, 4] = 0.25  # every line shares a pixel with the next
     steps = ["align_lines", "level_plane"]
     one = prepare.apply_steps(field_of(heights), steps).heights
     np.testing.assert_allclose(prepare.apply_steps(field_of(heights + offsets), steps).heights, one, atol=1e-12)
 
 
-def test_lines_across_a_grating_come_back():
+def test_lines_across_a_grating_are_restored():
     jumps = np.random.default_rng(0).standard_normal((50, 1)) * 0.05
-    clean = grating((50, 60)) + 0.02 * places((50, 60))[1]
+    clean = grating((50, 60)) + 0.02 * coordinates((50, 60))[1]
     after = prepare.align_lines(HeightField(clean + jumps, PIXEL, "scan"))
     left = after.heights - clean
     assert np.ptp(left - np.polyval(np.polyfit(np.arange(50), left[:, 0], 1), np.arange(50))[:, None]) < 1e-12
@@ -234,7 +234,7 @@ def test_spikes_and_a_streak_are_replaced_and_nothing_else(height):
 @pytest.mark.parametrize("direction", [0, 8, 45, 90])
 def test_grooves_are_no_spikes(direction):
     # V-shaped, each slope 40 standard deviations of the noise from pixel to pixel.
-    x, y = places((60, 60), (1, 1))
+    x, y = coordinates((60, 60), (1, 1))
     across = x * np.cos(np.radians(direction)) + y * np.sin(np.radians(direction))
     heights = 0.04 * np.abs((across + 0.3) % 11 - 5.5) + rough((60, 60)).heights * 0.01
     after = prepare.despike(HeightField(heights, 1.0))
@@ -242,7 +242,7 @@ def test_grooves_are_no_spikes(direction):
 
 
 def test_the_edges_of_structures_are_no_spikes():
-    x, y = places((60, 60), (1, 1))
+    x, y = coordinates((60, 60), (1, 1))
     heights = 0.5 * ((x % 12 < 6) & (y % 12 < 6)) + rough((60, 60)).heights * 0.02
     assert prepare.despike(HeightField(heights, 1.0)).heights.tobytes() == heights.tobytes()
 
@@ -269,7 +269,7 @@ def test_a_whole_turn_changes_nothing(heights):
         np.testing.assert_array_equal(prepare.rotate(field, degrees).heights, heights)
 
 
-def test_a_quarter_turns_x_to_y():
+def test_a_quarter_turn_maps_x_to_y():
     field = HeightField([[0.0, 1.0, 2.0], [3.0, 4.0, 5.0]], PIXEL)
     turned = prepare.rotate(field, 90)
     assert turned.shape == (3, 2)
@@ -281,12 +281,12 @@ def test_a_quarter_turns_x_to_y():
 
 @pytest.mark.parametrize("degrees", [3.0, -20.0, 45.0, 70.0, 133.0, 200.0])
 @pytest.mark.parametrize("shape", [(60, 50), (30, 90), (90, 30)])
-def test_a_smooth_surface_is_turned_about_its_middle(degrees, shape):
+def test_a_smooth_surface_is_rotated_about_its_centre(degrees, shape):
     def surface(x, y):
         return np.sin(1.1 * x + 0.3) * np.cos(0.7 * y) + 0.2 * x * y
 
     def middled(shape):
-        x, y = places(shape)
+        x, y = coordinates(shape)
         return x - x.mean(), y - y.mean()
 
     after = prepare.rotate(HeightField(surface(*middled(shape)), PIXEL), degrees)
@@ -298,7 +298,7 @@ def test_a_smooth_surface_is_turned_about_its_middle(degrees, shape):
 
 
 @given(width=st.floats(1, 30), height=st.floats(1, 30), degrees=st.floats(0.1, 89.9))
-def test_the_rectangle_fits_and_none_of_its_shape_is_greater(width, height, degrees):
+def test_the_rectangle_fits_and_is_the_largest(width, height, degrees):
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     w, h = prepare.largest_rectangle(width, height, c, s)
 
@@ -317,7 +317,7 @@ def test_the_rectangle_fits_and_none_of_its_shape_is_greater(width, height, degr
     assert w * h >= best * (1 - 1e-9)
 
 
-def test_a_grating_turned_has_the_direction_turned():
+def test_rotation_changes_the_direction_of_a_grating():
     field = HeightField(grating((90, 120), 0.45, 20), PIXEL)
     (found,) = find_periods(prepare.rotate(field, -50))
     assert found.direction == pytest.approx(-30, abs=0.05)
@@ -368,7 +368,7 @@ def test_a_grating_is_cropped_to_a_tile_without_a_seam(noise, period, direction)
     assert strong / power.sum() > 0.9995 - 20 * noise**2
 
 
-def test_the_pixels_stay_where_the_period_is_a_whole_number_of_them():
+def test_pixels_are_kept_if_the_period_is_a_whole_number_of_them():
     heights = grating((1, 100), 12 * 0.05)
     after = prepare.crop_periods(HeightField(heights, PIXEL), "x")
     assert after.pixel_size == PIXEL

@@ -67,7 +67,7 @@ def test_npy_keeps_the_heights(tmp_path_factory, heights, fortran):
 @pytest.mark.parametrize(
     ("own", "expected"), [(0.05, (0.05, 0.05)), ((0.05, 0.1), (0.05, 0.1)), ([0.05], (0.05, 0.05))]
 )
-def test_npz_brings_its_pixel_size(tmp_path, save, own, expected):
+def test_npz_provides_its_pixel_size(tmp_path, save, own, expected):
     save(tmp_path / "scan.npz", heights=HEIGHTS, pixel_size=own)
     field = read_height_field(tmp_path / "scan.npz")
     np.testing.assert_array_equal(field.heights, HEIGHTS)
@@ -99,13 +99,13 @@ def test_float_tiff_is_in_micrometres(tmp_path):
 
 
 @pytest.mark.parametrize("dtype", [np.int32, np.uint32, np.int64, np.uint64])
-def test_counts_that_are_flat_beside_the_range_of_their_type_are_refused(tmp_path, refuse, dtype):
+def test_integers_in_a_tiny_part_of_their_range_are_refused(tmp_path, refuse, dtype):
     np.save(tmp_path / "scan.npy", GREY.astype(dtype))
-    refuse("scan.npy", f"got {np.dtype(dtype)} heights from 0 to 255, flat", height_range=0.5)
+    refuse("scan.npy", f"got {np.dtype(dtype)} heights from 0 to 255, a tiny part", height_range=0.5)
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.int16, np.int32, np.uint64])
-def test_integers_run_over_the_range_of_their_type(tmp_path, dtype):
+def test_integers_are_scaled_by_the_range_of_their_type(tmp_path, dtype):
     scale = np.iinfo(dtype)
     np.save(tmp_path / "scan.npy", np.array([[scale.min, scale.max]], dtype=dtype))
     np.testing.assert_allclose(read_height_field(tmp_path / "scan.npy", 0.1, 0.5).heights, [[0.0, 0.5]])
@@ -157,7 +157,7 @@ def test_a_missing_file_is_a_missing_file(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["scan.txt", "scan", "scan.png.bak"])
-def test_an_unknown_extension_is_answered_with_the_known_ones(tmp_path, refuse, name):
+def test_an_unknown_extension_is_refused_with_the_known_ones(tmp_path, refuse, name):
     (tmp_path / name).write_bytes(b"1 2 3")
     refuse(name, r"wanted one of \.npy, \.npz, \.png, \.tif, \.tiff")
 
@@ -202,7 +202,7 @@ def test_floats_refuse_a_height_range(tmp_path, refuse, name):
         ),
     ],
 )
-def test_what_are_not_heights_is_refused(tmp_path, refuse, array, text):
+def test_arrays_that_are_not_heights_are_refused(tmp_path, refuse, array, text):
     np.save(tmp_path / "scan.npy", array)
     np.savez(tmp_path / "scan.npz", heights=array)
     refuse("scan.npy", text)
@@ -295,7 +295,7 @@ def test_a_picture_that_unpacks_to_too_much_is_refused(tmp_path, refuse, monkeyp
 
 def test_an_archive_that_unpacks_to_too_much_is_refused(tmp_path, refuse, monkeypatch):
     np.savez_compressed(tmp_path / "scan.npz", heights=np.zeros((100, 100)))
-    monkeypatch.setattr("mitsuba_diffraction.surface.readers.pictures.MOST_BYTES", 1000)
+    monkeypatch.setattr("mitsuba_diffraction.surface.readers.pictures.MAX_BYTES", 1000)
     refuse("scan.npz", "wanted at most 1000")
 
 
@@ -330,7 +330,7 @@ def test_colours_transparency_and_palettes_are_refused(tmp_path, refuse):
     refuse("key.png", "wanted opaque grey", height_range=1.0)
 
 
-def test_precision_is_never_lost_in_silence(tmp_path, refuse):
+def test_lost_precision_is_refused(tmp_path, refuse):
     # Pillow would halve the depth of these two, and take the next two for something else.
     (tmp_path / "rgb16.png").write_bytes(png(2, 1, 16, 2, b"\0" + b"\x12\x34" * 6))
     refuse("rgb16.png", "wanted opaque grey of 8 or 16 bit", height_range=1.0)
@@ -371,7 +371,7 @@ def gwy_bytes(inside, name=b"GwyContainer"):
     return b"GWYP" + name + b"\0" + struct.pack("<I", len(inside)) + inside
 
 
-def test_gwy_brings_its_scale_and_the_top_row_is_the_first(tmp_path):
+def test_gwy_provides_its_scale_and_the_top_row_is_the_first(tmp_path):
     write_gwy(tmp_path / "scan.gwy", {0: ("Height (measured)", gwy_field())})
     field = read_height_field(tmp_path / "scan.gwy")
     np.testing.assert_allclose(field.heights, HEIGHTS, rtol=1e-14)
@@ -407,7 +407,7 @@ def test_the_channel_is_that_of_the_heights_or_the_named_one(tmp_path, refuse):
     refuse("scan.npy", "channel: got 'Height' for .npy, which holds one only", channel="Height")
 
 
-def test_a_unit_that_is_missing_is_asked_for(tmp_path, refuse):
+def test_a_missing_unit_is_refused(tmp_path, refuse):
     write_gwy(tmp_path / "scan.gwy", {0: ("Height", gwy_field(HEIGHTS * 1e6, xy=None, z=None, xreal=3.0, yreal=4.0))})
     refuse("scan.gwy", "unit: the file names none for the heights")
     field = read_height_field(tmp_path / "scan.gwy", unit=("um", "nm"))
@@ -494,7 +494,7 @@ def test_gsf_is_read_at_every_padding(tmp_path, padding):
     assert field.source == "scan.gsf, Z"
 
 
-def test_gsf_without_a_scale_asks_for_it(tmp_path, refuse):
+def test_gsf_without_a_scale_is_refused(tmp_path, refuse):
     write_gsf(tmp_path / "scan.gsf", "Gwyddion Simple Field 1.0\nXRes = 3\nYRes = 2\n", HEIGHTS * 1e3)
     refuse("scan.gsf", "unit: the file names none for the heights")
     refuse("scan.gsf", "pixel_size: the file has none", pixel_size=None, unit="nm")
@@ -563,7 +563,7 @@ def test_absent_points_are_missing_pixels(tmp_path, refuse):
         ("0 0 1\n0 1\n", "not a table of numbers"),
         ("0 0 1\nNo Data\n", "not a table of numbers"),
         ("# nothing\n", "holds no numbers"),
-        ("0 0 1\n0 0 2\n1 0 1\n1 1 1", "two points at one place"),
+        ("0 0 1\n0 0 2\n1 0 1\n1 1 1", "two points at one position"),
         ("0 0 1\n1 0 2\n1.4 1 1\n3 1 1", "regular grid"),
         ("0 nan 1\n1 0 2\n", "without x or y"),
         (" ".join(map(str, [0, 0, 1])) + "\n100 100 1\n1 1 1\n2 2 1\n", "wanted a regular grid"),
@@ -610,7 +610,7 @@ def test_a_header_line_of_any_length_is_read_at_once(tmp_path, refuse, width):
     assert time.perf_counter() - start < 5
 
 
-def test_a_bare_table_asks_for_its_scale(tmp_path, refuse):
+def test_a_table_without_a_scale_is_refused(tmp_path, refuse):
     (tmp_path / "scan.asc").write_text(MATRIX)
     refuse("scan.asc", "unit: the file names none")
     refuse("scan.asc", "pixel_size: the file has none", pixel_size=None, unit="m")
@@ -625,7 +625,7 @@ def test_a_table_that_may_be_points_is_refused(tmp_path, refuse):
 ESRI = "ncols 3\nnrows 2\nxllcorner 10\nyllcorner 20\ncellsize 0.1\nNODATA_value -9999\n"
 
 
-def test_an_esri_grid_comes_from_the_top_down(tmp_path, refuse):
+def test_an_esri_grid_is_read_from_the_top_down(tmp_path, refuse):
     (tmp_path / "scan.asc").write_text(ESRI + "1 2 3\n4 -9999 6\n")
     field = read_height_field(tmp_path / "scan.asc", unit=("um", "nm"), keep_missing=True)
     np.testing.assert_allclose(field.heights, np.array([[4, np.nan, 6], [1, 2, 3]]) * 1e-3)
@@ -649,7 +649,7 @@ def test_an_esri_grid_comes_from_the_top_down(tmp_path, refuse):
         ("scan.asc", "0 inf 1\n1 nan 2\n", "2 of 6 pixels are missing or not finite"),
     ],
 )
-def test_numbers_beyond_those_of_a_float_are_refused_in_one_line(tmp_path, refuse, name, text, message):
+def test_numbers_outside_the_range_of_a_float_are_refused_in_one_line(tmp_path, refuse, name, text, message):
     (tmp_path / name).write_text(text)
     refuse(name, message, unit="m")
 

@@ -99,7 +99,7 @@ def test_an_impossible_facet_angle_is_refused(angle):
 # ---------------------------------------------------------------- foil and film
 
 
-def test_the_first_orders_of_the_film_are_as_bright_as_sinusoids_can_make_them():
+def test_the_first_orders_of_the_film_are_the_brightest_of_sinusoids():
     kappa = 2 * np.pi * 0.5 / 0.55
     first = [order_powers(film(depth=depth), kappa)[0, 1] for depth in (0.6, film().height_range, 0.9)]
     assert (
@@ -176,7 +176,7 @@ def test_pits_have_the_lengths_and_the_depth_of_the_standard(name):
     assert np.mean(np.isclose(field.heights, depth)) > 0.05
 
 
-def test_runs_are_of_the_greatest_information():
+def test_runs_have_maximum_entropy():
     probability = np.array(list(EIGHT_TO_FOURTEEN.values()))
     assert probability.sum() == pytest.approx(1, abs=1e-3)
     field = compact_disc(tracks=120, seed=5, pixel_size=0.05)
@@ -203,12 +203,12 @@ def test_the_strongest_orders_of_a_disc_are_those_of_its_tracks(name):
 
 
 @pytest.mark.parametrize("wavelength", [0.45, 0.55, 0.65])
-def test_the_first_order_of_a_disc_is_that_of_its_pits_share(wavelength):
+def test_the_first_order_of_a_disc_follows_from_the_area_of_its_pits(wavelength):
     field = compact_disc(seed=2)
     phase = kappa_of(wavelength) * 0.11
-    # The mean of the wave over y is 1 outside of the track and 1 + p(e^{iφ} − 1) on its width w, p the pits' share.
-    share = field.heights.mean() / 0.11 * 1.6 / 0.55
-    expected = abs(np.exp(1j * phase) - 1) ** 2 * (share * 0.55 / 1.6 * np.sinc(0.55 / 1.6)) ** 2
+    # The mean of the wave over y is 1 outside the track and 1 + p(e^{iφ} − 1) on its width w, p the fraction of pits.
+    area = field.heights.mean() / 0.11 * 1.6 / 0.55
+    expected = abs(np.exp(1j * phase) - 1) ** 2 * (area * 0.55 / 1.6 * np.sinc(0.55 / 1.6)) ** 2
     # Walls slope and ends are round.
     assert order_powers(field, kappa_of(wavelength))[0, 20] == pytest.approx(expected, rel=0.15)
 
@@ -256,7 +256,7 @@ def test_an_impossible_disc_is_refused(arguments, message):
         ("morpho_ridges", {"pixel_size": 1e-6}),
     ],
 )
-def test_a_patch_too_large_is_refused_before_memory_is_asked_for_it(name, arguments):
+def test_too_large_a_patch_is_refused_before_its_memory_is_allocated(name, arguments):
     with pytest.raises(ValueError, match="pixels, wanted at most"):
         PROFILES[name](**arguments)
 
@@ -265,9 +265,9 @@ def test_a_disc_of_one_long_track_takes_no_more_memory_than_its_heights():
     field = compact_disc(tracks=1, length=5000.0)
     assert field.shape == (100_000, 32)
     # Pits at both ends of the patch, as in its middle.
-    share = field.heights.mean(axis=1)
-    assert share[:8000].mean() == pytest.approx(share.mean(), rel=0.2)
-    assert share[-8000:].mean() == pytest.approx(share.mean(), rel=0.2)
+    mean = field.heights.mean(axis=1)
+    assert mean[:8000].mean() == pytest.approx(mean.mean(), rel=0.2)
+    assert mean[-8000:].mean() == pytest.approx(mean.mean(), rel=0.2)
 
 
 # ---------------------------------------------------------------- ridges
@@ -291,7 +291,7 @@ def test_ridges_keep_their_period_and_are_uneven():
 
 @pytest.mark.few(2)
 @pytest.mark.parametrize("name", sorted(COHERENCE_LENGTHS))
-def test_the_comb_of_a_drawn_tile_is_blurred(name):
+def test_the_comb_of_a_random_tile_is_blurred(name):
     tile = PROFILES[name]().tile_size
     sigma = lobe_width(COHERENCE_LENGTHS[name])
     for size in tile:
@@ -323,7 +323,7 @@ def test_recipes_of_gratings_are_small_and_keep_their_tolerance(name, megabytes)
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["compact_disc", "dvd", "morpho_ridges", "elaphe", "xenopeltis"])
-def test_recipes_of_drawn_surfaces_keep_their_tolerance_in_ten_megabytes(name):
+def test_recipes_of_random_surfaces_keep_their_tolerance_in_ten_megabytes(name):
     spectrum = Recipe.load(RECIPES / f"{name}.toml").build()
     assert spectrum.error <= spectrum.tolerance == 0.01
     assert spectrum.megabytes < 10
@@ -363,7 +363,7 @@ def test_a_ready_surface_is_used_in_a_scene_by_its_name(name):
 
 @pytest.mark.few(1)
 @pytest.mark.parametrize("name", ["blazed", "ruled", "foil", "film", "transmission_300"])
-def test_gratings_are_ready_without_any_number(name):
+def test_gratings_have_defaults_for_all_parameters(name):
     mi.set_variant("llvm_ad_spectral")
     bsdf = mi.load_dict({"type": "diffraction_grating", "profile": name})
     assert bsdf.spectrum.source == PROFILES[name]().source

@@ -21,7 +21,7 @@ from .scan import Scan
 
 __all__ = ["read_height_field"]
 
-_SHOWN = 300  # longest error text of a library to quote, characters: some quote a damaged header in full
+_MAX_QUOTE = 300  # characters of a library's error message, as some quote a damaged header in full
 _WITHOUT_UNIT = {
     ".npy": pictures.read_npy,
     ".npz": pictures.read_npz,
@@ -92,10 +92,10 @@ def read_height_field(
                 )
             heights = _as_micrometres(scan.numbers, height_range)
         if not (fill_missing or keep_missing) and scan.numbers.dtype.kind in "iu" and np.ma.is_masked(scan.numbers):
-            share = np.ma.getmaskarray(scan.numbers).mean()
+            fraction = np.ma.getmaskarray(scan.numbers).mean()
             raise RequestError(
-                f"{share:.2%} of the pixels are coloured, annotation on a grey picture; they can be "
-                "taken for missing and filled from their surroundings (fill_missing=True, or --fill-missing)"
+                f"{fraction:.2%} of the pixels are coloured, annotation on a grey picture; they can be "
+                "treated as missing and filled from their surroundings (fill_missing=True, or --fill-missing)"
             )
         pixel_size = scan.pixel_size if pixel_size is None else pixel_size
         if pixel_size is None:
@@ -105,7 +105,7 @@ def read_height_field(
     # Pillow raises OSError for a damaged image, the system for unreadable paths (a folder, permissions);
     # UnicodeDecodeError comes from a damaged text.
     except (RequestError, UnicodeDecodeError, OSError, MemoryError) as error:
-        raise RequestError(" ".join(f"{path}: {str(error)[:_SHOWN]}".split())) from error
+        raise RequestError(" ".join(f"{path}: {str(error)[:_MAX_QUOTE]}".split())) from error
 
 
 def _read(path: Path, channel: str | int | None, unit: str | tuple[str, str] | None) -> Scan:
@@ -150,10 +150,10 @@ def _as_micrometres(numbers: NDArray, height_range: float | None) -> NDArray[np.
     if not (is_number(height_range) and height_range > 0):
         raise RequestError(f"height_range: got {height_range!r}, wanted a positive number in µm")
     scale = np.iinfo(numbers.dtype)
-    least, greatest = int(numbers.min()), int(numbers.max())
-    if numbers.dtype.itemsize > 2 and 0 < (greatest - least) * 2**16 < scale.max - scale.min:
+    minimum, maximum = int(numbers.min()), int(numbers.max())
+    if numbers.dtype.itemsize > 2 and 0 < (maximum - minimum) * 2**16 < scale.max - scale.min:
         raise RequestError(
-            f"height_range: got {numbers.dtype} heights from {least} to {greatest}, flat beside the range of their "
-            "type; wanted floats in µm, or a type that they fill, such as uint16"
+            f"height_range: got {numbers.dtype} heights from {minimum} to {maximum}, a tiny part of the range of "
+            "their type; wanted floats in µm, or a type that they fill, such as uint16"
         )
     return (numbers.astype(np.float64) - scale.min) / (float(scale.max) - scale.min) * float(height_range)

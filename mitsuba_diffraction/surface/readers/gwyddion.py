@@ -1,4 +1,4 @@
-"""Gwyddion's own files: .gwy, a tree of named components in binary, and .gsf, a header of text and 32 bit floats.
+"""Files of Gwyddion: .gwy, a tree of named components in binary, and .gsf, a header of text and 32 bit floats.
 
 The formats: Gwyddion user guide, "Gwyddion native file format" and "Simple field files",
 http://gwyddion.net/documentation/user-guide-en/gwyfile-format.html and gsf.html.
@@ -20,21 +20,21 @@ from numpy.typing import NDArray
 
 from ...errors import RequestError
 from . import scan
-from .scan import MOST_BYTES, Channel, Scan, choose
+from .scan import MAX_BYTES, Channel, Scan, choose
 
 _NUMBERS = {"b": "<B", "c": "<B", "i": "<i", "q": "<q", "d": "<d"}
 _ARRAYS = {"C": 1, "I": 4, "Q": 8, "D": 8}  # bytes of an element
 _FIELD, _TITLE = re.compile(r"/(\d{1,9})/data"), re.compile(r"/(\d{1,9})/data/title")
-_LONGEST_NAME = 4096
+_MAX_NAME_LENGTH = 4096
 
 _SIMPLE = b"Gwyddion Simple Field 1.0\n"
-_LONGEST_HEADER = 2**20
+_MAX_HEADER_LENGTH = 2**20
 
 
 def read(path: Path, unit: str | tuple[str, str] | None, channel: str | int | None) -> Scan:
     """Read one data field of a .gwy file; the top row of its image is row 0. Masks are ignored."""
-    if path.stat().st_size > MOST_BYTES:
-        raise RequestError(f"got {path.stat().st_size} bytes, wanted at most {MOST_BYTES}")
+    if path.stat().st_size > MAX_BYTES:
+        raise RequestError(f"got {path.stat().st_size} bytes, wanted at most {MAX_BYTES}")
     data = path.read_bytes()
     if data[:4] != b"GWYP":
         raise RequestError("not a Gwyddion file, which begins with 'GWYP'")
@@ -91,7 +91,7 @@ class _Bytes:
 
     def object(self) -> tuple[str, _Bytes]:
         """Read the name and the content of an object here, and move past it."""
-        name = self._text(_LONGEST_NAME)
+        name = self._text(_MAX_NAME_LENGTH)
         size = self._number("<I")
         start = self._skip(size)
         return name, _Bytes(self._data, start, start + size)
@@ -99,7 +99,7 @@ class _Bytes:
     def components(self) -> Iterator[tuple[str, object]]:
         """Yield name and value of each component: (name, content) of an object, an array of doubles, or None."""
         while self._place < self._end:
-            yield self._text(_LONGEST_NAME), self._value()
+            yield self._text(_MAX_NAME_LENGTH), self._value()
 
     def _value(self) -> object:
         kind = chr(self._number("<B"))
@@ -143,7 +143,7 @@ class _Bytes:
 def read_simple_field(path: Path, unit: str | tuple[str, str] | None) -> Scan:
     """Read the field of a .gsf file; the top row of its image is row 0."""
     with path.open("rb") as file:
-        head = file.read(_LONGEST_HEADER)
+        head = file.read(_MAX_HEADER_LENGTH)
         if not head.startswith(_SIMPLE):
             raise RequestError("not a Gwyddion Simple Field, which begins with 'Gwyddion Simple Field 1.0'")
         end = head.find(b"\0")
@@ -151,8 +151,8 @@ def read_simple_field(path: Path, unit: str | tuple[str, str] | None) -> Scan:
             raise RequestError("the header does not end: a truncated file")
         fields = _fields(head[len(_SIMPLE) : end])
         columns, rows = (_count(fields, name) for name in ("XRes", "YRes"))
-        if 4 * rows * columns > MOST_BYTES:
-            raise RequestError(f"got {columns} × {rows} pixels, wanted at most {MOST_BYTES} bytes")
+        if 4 * rows * columns > MAX_BYTES:
+            raise RequestError(f"got {columns} × {rows} pixels, wanted at most {MAX_BYTES} bytes")
         start = end + 4 - end % 4
         size = path.stat().st_size
         if size != start + 4 * rows * columns:

@@ -14,7 +14,7 @@ import numpy as np
 
 from ...errors import RequestError
 from . import scan
-from .scan import MOST_BYTES, Channel, Scan, choose
+from .scan import MAX_BYTES, Channel, Scan, choose
 
 EXTRA = "pip install 'mitsuba_diffraction[instruments]'"
 
@@ -55,8 +55,8 @@ def read(path: Path, unit: str | tuple[str, str] | None, channel: str | int | No
             channel,
         )
         source = found[[c.index for c in found].index(chosen.number)]
-        if 8 * int(np.prod(source.nb_grid_pts, dtype=object)) > MOST_BYTES:
-            raise RequestError(f"got {source.nb_grid_pts} pixels, wanted at most {MOST_BYTES} bytes")
+        if 8 * int(np.prod(source.nb_grid_pts, dtype=object)) > MAX_BYTES:
+            raise RequestError(f"got {source.nb_grid_pts} pixels, wanted at most {MAX_BYTES} bytes")
         given, own = scan.pair(unit), source.unit or ""
         along, high = (scan.scale(own, one, "its lengths") for one in given)
         try:
@@ -78,8 +78,8 @@ def _refuse_bomb(path: Path) -> None:
                 unpacked = sum(member.file_size for member in archive.infolist())
         except (zipfile.BadZipFile, ValueError, NotImplementedError) as error:
             raise RequestError(f"a damaged archive ({error})") from None
-        if unpacked > MOST_BYTES:
-            raise RequestError(f"an archive of {unpacked} bytes, wanted at most {MOST_BYTES}")
+        if unpacked > MAX_BYTES:
+            raise RequestError(f"an archive of {unpacked} bytes, wanted at most {MAX_BYTES}")
 
 
 def _message(error: Exception) -> str:

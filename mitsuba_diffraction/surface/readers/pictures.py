@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from ...errors import RequestError
-from .scan import DAMAGED, MOST_BYTES, Scan
+from .scan import DAMAGED, MAX_BYTES, Scan
 
 
 def read_npy(path: Path) -> Scan:
@@ -28,8 +28,8 @@ def read_npz(path: Path) -> Scan:
     try:
         with zipfile.ZipFile(path) as archive:
             unpacked = max((member.file_size for member in archive.infolist()), default=0)
-            if unpacked > MOST_BYTES:
-                raise RequestError(f"got an array of {unpacked} bytes, wanted at most {MOST_BYTES}")
+            if unpacked > MAX_BYTES:
+                raise RequestError(f"got an array of {unpacked} bytes, wanted at most {MAX_BYTES}")
             names = [name.removesuffix(".npy") for name in archive.namelist()]
             if "heights" not in names:
                 raise RequestError(f"got the arrays {names}, wanted 'heights' and optionally 'pixel_size'")
@@ -62,8 +62,7 @@ def _load_array(file: BinaryIO) -> NDArray:
         raise RequestError(f"not an array that can be read ({error})") from None
 
 
-# Largest share of coloured pixels in a grey picture: a scale bar or lettering on it. More is a colour map.
-MOST_ANNOTATION = 0.25
+MAX_ANNOTATION_FRACTION = 0.25  # of pixels that are coloured, such as a scale bar; a colour map has more
 
 
 def read(path: Path) -> Scan:
@@ -115,7 +114,7 @@ def _grey(pixels: NDArray, mode: str) -> NDArray:
         raise RequestError("got a picture with transparent pixels, wanted an opaque grey one")
     colours = pixels[..., : len(mode.removesuffix("A"))]
     coloured = (colours != colours[..., :1]).any(axis=-1)
-    if coloured.mean() > MOST_ANNOTATION:
+    if coloured.mean() > MAX_ANNOTATION_FRACTION:
         raise RequestError(
             "got a colour picture, wanted a grey one: colours of a map are no heights; export the data itself (.gwy, "
             ".gsf, a .tif of 32 bit) or choose a grey palette"

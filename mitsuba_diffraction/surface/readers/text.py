@@ -32,10 +32,10 @@ from numpy.typing import NDArray
 
 from ...errors import RequestError
 from . import scan
-from .scan import MOST_BYTES, Scan
+from .scan import MAX_BYTES, Scan
 
-_OFF_GRID = 0.1  # largest deviation of a coordinate from the grid, in pixels, owing to rounding in text
-_FEWEST_POINTS = 0.25  # least fraction of grid positions with a point
+_MAX_GRID_DEVIATION = 0.1  # of a coordinate, in pixels, owing to rounding in text
+_MIN_POINT_FRACTION = 0.25  # of grid positions that have a point
 _GWYDDION = re.compile(r"#\s*(Channel|Width|Height|Value units):(.*)")
 _LENGTH = re.compile(r"([-+.\deE]*)(.*)")
 _ESRI = ("ncols", "nrows", "xllcorner", "yllcorner", "xllcenter", "yllcenter", "cellsize", "nodata_value")
@@ -50,11 +50,11 @@ def read_points(path: Path, unit: str | tuple[str, str] | None) -> Scan:
     if not np.isfinite(points[:, :2]).all():
         raise RequestError("got a point without x or y")
     (column, columns, d_x), (row, rows, d_y) = (_grid(points[:, axis], name) for axis, name in enumerate("xy"))
-    if columns * rows * _FEWEST_POINTS > len(points):
+    if columns * rows * _MIN_POINT_FRACTION > len(points):
         raise RequestError(f"{len(points)} points on a grid of {columns} × {rows}: wanted a regular grid along x and y")
     place = row * columns + column
     if len(np.unique(place)) != len(place):
-        raise RequestError("two points at one place: wanted a regular grid along x and y")
+        raise RequestError("two points at one position: wanted a regular grid along x and y")
     heights = np.full(rows * columns, np.nan)
     heights[place] = points[:, 2]
     pixel_size = (d_x * along, d_y * along) if d_x and d_y else None  # a single line determines only one of them
@@ -105,8 +105,8 @@ def _esri(text: str, unit: str | tuple[str, str] | None) -> Scan:
 
 
 def _text(path: Path) -> str:
-    if path.stat().st_size > MOST_BYTES:
-        raise RequestError(f"got {path.stat().st_size} bytes, wanted at most {MOST_BYTES}")
+    if path.stat().st_size > MAX_BYTES:
+        raise RequestError(f"got {path.stat().st_size} bytes, wanted at most {MAX_BYTES}")
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError:
@@ -139,7 +139,7 @@ def _grid(places: NDArray[np.float64], axis: str) -> tuple[NDArray[np.int64], in
     if not np.isfinite(gaps).all():
         raise RequestError(f"{axis} goes from {values[0]:g} to {values[-1]:g}: wanted a grid along x and y")
     # Coordinates closer than a tenth of the widest gap are equal up to rounding.
-    starts = np.concatenate([[0], np.flatnonzero(gaps > _OFF_GRID * gaps.max()) + 1])
+    starts = np.concatenate([[0], np.flatnonzero(gaps > _MAX_GRID_DEVIATION * gaps.max()) + 1])
     middles = np.add.reduceat(values, starts) / np.diff(np.append(starts, len(values)))
     # Step by step, to avoid accumulating rounding errors; across a column without points a step is two.
     steps = np.diff(middles)
@@ -149,7 +149,7 @@ def _grid(places: NDArray[np.float64], axis: str) -> tuple[NDArray[np.int64], in
     spacing, origin = np.polyfit(index, middles, 1)
     index = np.rint((places - origin) / spacing)
     off = np.abs(places - origin - index * spacing).max() / spacing
-    if not off <= _OFF_GRID:
+    if not off <= _MAX_GRID_DEVIATION:
         raise RequestError(f"{axis} lies up to {off:.2f} of a pixel off a regular grid: wanted a grid along x and y")
     return index.astype(np.int64), int(index.max()) + 1, float(spacing)
 
