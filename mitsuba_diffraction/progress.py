@@ -31,7 +31,7 @@ def silent(done: int, total: int) -> None:
 
 @contextmanager
 def no_progress(label: str) -> Iterator[Progress]:
-    """Yield a function that shows no progress, in place of `progress_bar`."""
+    """Yield a function that shows no progress, instead of `progress_bar`."""
     yield silent
 
 

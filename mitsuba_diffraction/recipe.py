@@ -15,7 +15,7 @@ unit = "nm"                      # of a file without one; ["um", "nm"]: lateral,
 prepare = [                      # steps of surface/prepare.py, in this order
     "level_plane",               # or "level_quadratic"
     "align_lines",               # remove offsets between rows
-    { despike = 5.0 },           # remove outliers beyond this many standard deviations of the noise
+    { despike = 5.0 },           # remove outliers by more than this many standard deviations of the noise
     "fill_missing",              # here, or with fill_missing = true after the last step
     { trim_edges = 0.5 },        # µm off each edge
     { rotate = -3.0 },           # degrees from +x towards +y
@@ -121,7 +121,7 @@ class Recipe:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], **settings: Any) -> Recipe:
-        """Read a recipe; `settings`, by their names in `Settings`, take the place of its own, under `[spectrum]`.
+        """Read a recipe; `settings`, by their names in `Settings`, override its own under `[spectrum]`.
 
         Raises:
             FileNotFoundError: if there is no such file.

@@ -1,4 +1,4 @@
-"""The parameters of a spectrum, checked in one place; the coherence length and its lobe, arguments q and κ."""
+"""The parameters of a spectrum and their checks; the lobe of a coherence length; checks of q and κ."""
 
 from __future__ import annotations
 

@@ -342,7 +342,7 @@ def _binned(spectrum: PowerSpectrum, kappas: Real, width_factor: float) -> tuple
         parts.append((points, np.column_stack([np.rint(points / size), spread]), node, weight, spread))
     q, bins, node, weight, spread = (np.concatenate(part) for part in zip(*parts, strict=True))
     if not isinstance(grid, OrderGrid):
-        # S is zero beyond the Nyquist limit.
+        # S is zero outside the Nyquist limit.
         weight *= (np.abs(q) <= grid.limit).all(-1)
     _, bins = np.unique(bins, axis=0, return_inverse=True)
     bins = bins.ravel()

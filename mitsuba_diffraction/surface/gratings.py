@@ -401,7 +401,8 @@ def morpho_ridges(
     represent; this surface only models the scattering perpendicular to the ridges. Their uneven heights weaken the
     orders of the grating and scatter the rest (Kinoshita, Yoshioka & Kawagoe 2002, Proc. R. Soc. B 269, 1417–1421: a
     regular stack on irregular ridges, about 0.7 µm apart and 0.3 µm wide). Modelled on that description, neither
-    measured nor of the real depth (about 2 µm, beyond scalar theory). For a blue butterfly, use a blue mirror.
+    measured nor of the real depth (about 2 µm, outside the range of scalar theory). For a blue butterfly, use a blue
+    mirror.
 
     `period` is the mean spacing of the ridges, `width` theirs, below it; size_x is rounded to whole periods.
     """
@@ -730,7 +731,7 @@ def _fault_shift(faults: list[_Fault], x: float, y: float, canvas: Canvas) -> fl
 
 
 def _xenopeltis_finger(canvas: Canvas, rng: np.random.Generator, x_0: float, y_0: float, length: float) -> None:
-    """Draw a finger that rises from its root at x_0 to a round tip; the higher of it and what is there stays."""
+    """Draw a finger that rises from its root at x_0 to a round tip; where shapes overlap, the higher one stays."""
     pitch = canvas.pitch[1]
     # Some are swollen and join their neighbour.
     swollen = rng.uniform() < 0.1

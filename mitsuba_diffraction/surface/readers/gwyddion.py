@@ -84,10 +84,10 @@ def _unit(field: dict[str, object], name: str) -> str:
 
 
 class _Bytes:
-    """A part of the file, from `place` to `end`."""
+    """A part of the file, from `offset` to `end`."""
 
-    def __init__(self, data: bytes, place: int, end: int) -> None:
-        self._data, self._place, self._end = data, place, end
+    def __init__(self, data: bytes, offset: int, end: int) -> None:
+        self._data, self._offset, self._end = data, offset, end
 
     def object(self) -> tuple[str, _Bytes]:
         """Read the name and the content of an object here, and move past it."""
@@ -98,7 +98,7 @@ class _Bytes:
 
     def components(self) -> Iterator[tuple[str, object]]:
         """Yield name and value of each component: (name, content) of an object, an array of doubles, or None."""
-        while self._place < self._end:
+        while self._offset < self._end:
             yield self._text(_MAX_NAME_LENGTH), self._value()
 
     def _value(self) -> object:
@@ -122,21 +122,21 @@ class _Bytes:
 
     def _skip(self, count: int) -> int:
         """Skip bytes and return where they begin."""
-        start = self._place
+        start = self._offset
         if count > self._end - start:
             raise RequestError("the file ends, or a part of it, before what it announces: truncated or damaged")
-        self._place += count
+        self._offset += count
         return start
 
     def _number(self, kind: str) -> int | float:
         return struct.unpack_from(kind, self._data, self._skip(struct.calcsize(kind)))[0]
 
     def _text(self, longest: int | None = None) -> str:
-        end = self._end if longest is None else min(self._end, self._place + longest)
-        zero = self._data.find(b"\0", self._place, end)
+        end = self._end if longest is None else min(self._end, self._offset + longest)
+        zero = self._data.find(b"\0", self._offset, end)
         if zero < 0:
             raise RequestError("a text without an end: truncated or damaged")
-        start = self._skip(zero + 1 - self._place)
+        start = self._skip(zero + 1 - self._offset)
         return self._data[start:zero].decode("utf-8")
 
 

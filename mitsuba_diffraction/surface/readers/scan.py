@@ -60,7 +60,7 @@ def pair(unit: str | tuple[str, str] | None) -> tuple[str, str]:
     return units[0], units[1]
 
 
-MAX_BYTES = 2**31  # largest array read from a file
+MAX_BYTES = 2**31  # of an array read from a file
 # Raised by Pillow and NumPy for damaged files, in addition to OSError and ValueError.
 DAMAGED = (SyntaxError, TypeError, KeyError, EOFError, IndexError, OverflowError, struct.error, UserWarning)
 # Names of the height channel in instrument files.

@@ -52,11 +52,11 @@ def read_points(path: Path, unit: str | tuple[str, str] | None) -> Scan:
     (column, columns, d_x), (row, rows, d_y) = (_grid(points[:, axis], name) for axis, name in enumerate("xy"))
     if columns * rows * _MIN_POINT_FRACTION > len(points):
         raise RequestError(f"{len(points)} points on a grid of {columns} × {rows}: wanted a regular grid along x and y")
-    place = row * columns + column
-    if len(np.unique(place)) != len(place):
+    position = row * columns + column
+    if len(np.unique(position)) != len(position):
         raise RequestError("two points at one position: wanted a regular grid along x and y")
     heights = np.full(rows * columns, np.nan)
-    heights[place] = points[:, 2]
+    heights[position] = points[:, 2]
     pixel_size = (d_x * along, d_y * along) if d_x and d_y else None  # a single line determines only one of them
     return Scan(heights.reshape(rows, columns) * high, pixel_size)
 
@@ -130,11 +130,11 @@ def _table(text: str) -> NDArray[np.float64]:
         raise RequestError(f"not a table of numbers ({error})") from None
 
 
-def _grid(places: NDArray[np.float64], axis: str) -> tuple[NDArray[np.int64], int, float]:
+def _grid(coordinates: NDArray[np.float64], axis: str) -> tuple[NDArray[np.int64], int, float]:
     """Return the index of each coordinate on its regular grid, the grid's length, and its spacing (0 for one point)."""
-    values = np.unique(places)
+    values = np.unique(coordinates)
     if values[-1] == values[0]:
-        return np.zeros(len(places), np.int64), 1, 0.0
+        return np.zeros(len(coordinates), np.int64), 1, 0.0
     gaps = np.diff(values)
     if not np.isfinite(gaps).all():
         raise RequestError(f"{axis} goes from {values[0]:g} to {values[-1]:g}: wanted a grid along x and y")
@@ -147,8 +147,8 @@ def _grid(places: NDArray[np.float64], axis: str) -> tuple[NDArray[np.int64], in
     if not (np.diff(index) > 0).all():
         raise RequestError(f"{axis} is not on a regular grid: wanted a grid along x and y")
     spacing, origin = np.polyfit(index, middles, 1)
-    index = np.rint((places - origin) / spacing)
-    off = np.abs(places - origin - index * spacing).max() / spacing
+    index = np.rint((coordinates - origin) / spacing)
+    off = np.abs(coordinates - origin - index * spacing).max() / spacing
     if not off <= _MAX_GRID_DEVIATION:
         raise RequestError(f"{axis} lies up to {off:.2f} of a pixel off a regular grid: wanted a grid along x and y")
     return index.astype(np.int64), int(index.max()) + 1, float(spacing)
