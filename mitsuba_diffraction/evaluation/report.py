@@ -28,7 +28,7 @@ def markdown(columns: Sequence[str], rows: Iterable[Sequence[str]], texts: int =
 
 
 def save_markdown(text: str, path: str | os.PathLike[str]) -> None:
-    """Write a Markdown file, whole or not at all."""
+    """Write a Markdown file atomically."""
     with whole_file(path) as temporary:
         temporary.write_text(f"{text}\n<!-- {MARK} -->\n", encoding="utf-8")
 
@@ -46,19 +46,19 @@ def _verdict(record: Record) -> str:
 
 def record_table(records: Sequence[Record]) -> Table:
     """Format records for a terminal, group by group."""
-    shown = Table(*RECORD_COLUMNS)
-    for column in shown.columns[1:5]:
+    result = Table(*RECORD_COLUMNS)
+    for column in result.columns[1:5]:
         column.justify = "right"
     group = None
     for record in records:
         if record.group != group:
             group = record.group
-            shown.add_section()
-            shown.add_row(Text(group, style="bold"))
+            result.add_section()
+            result.add_row(Text(group, style="bold"))
         *line, verdict = record_cells(record)
         style = {"ok": "green", "MISSED": "bold red"}.get(verdict, "dim")
-        shown.add_row(*map(Text, line), Text(verdict, style=style))
-    return shown
+        result.add_row(*map(Text, line), Text(verdict, style=style))
+    return result
 
 
 def record_markdown(records: Iterable[Record]) -> str:

@@ -91,7 +91,7 @@ def test_the_command_writes_a_plot_and_numbers(command, llvm, tmp_path, monkeypa
     ("arguments", "words"),
     [
         ("", "unused parameters: - $tolerance"),
-        ("--tolerance -1", "tolerance: got -1, wanted at least 3e-05: the reference takes a third of the finest"),
+        ("--tolerance -1", "tolerance: got -1, wanted at least 3e-05: the reference uses a third of the lowest"),
         ("--tolerance 0.1 --tolerance 2e-5", "tolerance: got 2e-05, wanted at least 3e-05"),
         ("-o plot.pdf", "-o: got plot.pdf, wanted a file name that ends in .png"),
         ("--spp 0", "--spp"),

@@ -136,8 +136,8 @@ def test_the_limit_of_the_neighbourhood_is_as_stated(ratio):
     wi, nanometres = np.broadcast_to(unit(0.1), wo.shape), np.full(300, 500.0)
     rho = relative_radiance(surface, wi, wo, nanometres, quirks=CORRECTED, coherence_length=coherence)
     expected = gain(wi, wo) * tile_spectrum(surface, wi, wo, nanometres, coherence)
-    left_out = np.exp(-((1.5 / (2 / (np.pi * coherence) * size)) ** 2))
-    assert np.abs(rho - expected).max() < (2 * left_out + 1e-5) * expected.max()
+    truncated_fraction = np.exp(-((1.5 / (2 / (np.pi * coherence) * size)) ** 2))
+    assert np.abs(rho - expected).max() < (2 * truncated_fraction + 1e-5) * expected.max()
 
 
 def test_corrected_flss_in_radiance_is_the_bsdf():
@@ -230,8 +230,8 @@ def test_pq_of_n_tiles_is_the_transform_of_their_surface(surface, tiles):
     q = -(wi + wo)[:, :2] / 0.6
     area = np.prod(surface.tile_size) * np.prod(tiles)
     s = finite_tiles_spectrum(surface, q, kappa_of(wi, wo, nanometres), tiles=tiles) / area
-    reach = max(surface.shape)
-    settings = dict(variant="pq", quirks=CORRECTED, tiles=tiles, reach=reach)
+    radius = max(surface.shape)
+    settings = dict(variant="pq", quirks=CORRECTED, tiles=tiles, radius=radius)
     rho = relative_radiance(surface, wi, wo, nanometres, **settings)
     np.testing.assert_allclose(rho, gain(wi, wo) * s, atol=3e-5 * (gain(wi, wo) * s).max())
     wrong = relative_radiance(surface, wi, wo, nanometres, **settings | {"quirks": only("wrong_product")})
@@ -249,14 +249,14 @@ def test_pq_interpolations_agree_at_the_orders_and_differ_between():
     wi, wo = unit(0.2), unit(-0.2 - orders * 0.2)
     rho = [
         relative_radiance(BLAZE, wi, wo, np.full(6, nanometres), variant="pq", quirks=CORRECTED, **s)
-        for s in ({}, {"interpolation": "linear"}, {"reach": 8})
+        for s in ({}, {"interpolation": "linear"}, {"radius": 8})
     ]
     np.testing.assert_allclose(rho[1], rho[0], rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(rho[2], rho[0], rtol=1e-4, atol=1e-6)
     between = unit(-0.2 - (orders + 0.5) * 0.2)
     one = dict(variant="pq", quirks=CORRECTED, tiles=(1, 1))
     linear = relative_radiance(BLAZE, wi, between, np.full(6, nanometres), interpolation="linear", **one)
-    exact = relative_radiance(BLAZE, wi, between, np.full(6, nanometres), reach=32, **one)
+    exact = relative_radiance(BLAZE, wi, between, np.full(6, nanometres), radius=32, **one)
     near = relative_radiance(BLAZE, wi, between, np.full(6, nanometres), **one)
     assert np.abs(near - exact).max() < np.abs(linear - exact).max()
 
@@ -604,7 +604,7 @@ def test_a_recipe_gives_the_heights(tmp_path):
         (
             {},
             {"bsdf": {"type": "mask", "inner": GRATING}},
-            "stands inside MaskBSDF, wanted on a shape or inside twosided",
+            "is nested in MaskBSDF, wanted on a shape or in twosided",
         ),
     ],
 )
@@ -621,7 +621,7 @@ def test_a_saved_spectrum_holds_no_heights(tmp_path):
     md.precompute(BLAZE).save(path)
     with pytest.raises(Exception) as caught:  # noqa: PT011
         picture(shader(), bsdf={"type": "diffraction_grating", "filename": str(path)})
-    assert "needs heights, and a saved spectrum does not hold them" in root_cause(caught.value)
+    assert "needs heights, which a saved spectrum does not contain" in root_cause(caught.value)
 
 
 def test_the_polarised_variant_shows_the_same():

@@ -48,14 +48,14 @@ def test_a_record_is_within_its_bound_or_not():
     assert not Record(12, 10, 0.19, relative=True).ok
     assert not Record(np.nan, 1, 0.1).ok
     assert Record(2, 1, None).ok
-    worst = Record.worst([1.0, 2.0, 3.0], [1.1, 2.5, 3.0], 0.1)
+    worst = Record.at_max_error([1.0, 2.0, 3.0], [1.1, 2.5, 3.0], 0.1)
     assert (worst.expected, worst.measured, worst.error) == (2.0, 2.5, 0.5)
     assert not worst.ok
-    assert not Record.worst([1.0, 2.0], [1.0, np.nan], 0.1).ok
+    assert not Record.at_max_error([1.0, 2.0], [1.0, np.nan], 0.1).ok
     # Each has a bound of its own.
-    worst = Record.worst([1.0, 2.0], [1.2, 2.5], [0.1, 1.0])
+    worst = Record.at_max_error([1.0, 2.0], [1.2, 2.5], [0.1, 1.0])
     assert (worst.measured, worst.bound, worst.ok) == (1.2, 0.1, False)
-    assert Record.worst([10.0, 1.0], [12.0, 1.3], 1.0, relative=True).error == pytest.approx(0.3)
+    assert Record.at_max_error([10.0, 1.0], [12.0, 1.3], 1.0, relative=True).error == pytest.approx(0.3)
 
 
 @pytest.mark.slow

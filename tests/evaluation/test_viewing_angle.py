@@ -201,20 +201,22 @@ def test_nmm_sees_only_the_orders_of_the_tile(llvm, incidence):
 @pytest.mark.few(1)
 @pytest.mark.parametrize("projection", PROJECTIONS)
 def test_an_order_is_where_the_map_says(llvm, projection):
-    found = brdf_map(BLAZE.coherent_over(6.5), projection=projection, side=120, incidence=(30.0, 20.0))
+    found = brdf_map(BLAZE.with_coherence_length(6.5), projection=projection, side=120, incidence=(30.0, 20.0))
     for nanometres, channel in ((450.0, 2), (650.0, 0)):
-        x, y = found.places_of_orders(np.float64(nanometres), np.int64(1))
+        x, y = found.positions_of_orders(np.float64(nanometres), np.int64(1))
         column, row = np.abs(found.x - x).argmin(), np.abs(found.y - y).argmin()
         colour = found.rgb[row, column]
         assert colour.argmax() == channel
         # Nothing beside it, and an order beyond the horizon has no place.
         assert found.rgb[(row + 30) % 120, column].max() < 1e-2 * colour.max()
-    assert np.isnan(found.places_of_orders(np.float64(650.0), np.int64(9))).all()
+    assert np.isnan(found.positions_of_orders(np.float64(650.0), np.int64(9))).all()
 
 
 def test_an_order_stands_still_in_the_plane_of_u_and_v(llvm):
     places = [
-        brdf_map(BLAZE, "gem", projection="uv", side=8, incidence=(theta, 10.0)).places_of_orders(550.0, np.int64(-1))
+        brdf_map(BLAZE, "gem", projection="uv", side=8, incidence=(theta, 10.0)).positions_of_orders(
+            550.0, np.int64(-1)
+        )
         for theta in (0.0, 20.0, 40.0)
     ]
     np.testing.assert_allclose(places, [(-0.55 / 2.5, 0)] * 3, atol=1e-12)
@@ -222,7 +224,7 @@ def test_an_order_stands_still_in_the_plane_of_u_and_v(llvm):
 
 @pytest.mark.parametrize("method", MAP_METHODS)
 def test_a_map_is_a_picture_of_the_hemisphere(llvm, method):
-    found = brdf_map(BLAZE.coherent_over(6.5), method, side=40)
+    found = brdf_map(BLAZE.with_coherence_length(6.5), method, side=40)
     inside = np.hypot(*np.meshgrid(found.x, found.y)) < 90
     np.testing.assert_array_equal(np.isfinite(found.rgb).all(axis=-1), inside)
     picture = found.picture

@@ -30,48 +30,48 @@ def against_reference(height_field: HeightField, spectrum: GratingSpectrum) -> R
         l1_error(spectrum, height_field, kappa, 400, random) for kappa in random.uniform(0.2, 1, 3) * spectrum.max_kappa
     ]
     note = "∫|ΔS| dq, 400 frequencies at each of three κ"
-    return Record.worst(0.0, errors, spectrum.tolerance + spectrum.truncated_power, note)
+    return Record.at_max_error(0.0, errors, spectrum.tolerance + spectrum.truncated_power, note)
 
 
 def l1_error(
     spectrum: GratingSpectrum, height_field: HeightField, kappa: float, count: int, random: np.random.Generator
 ) -> float:
-    """Estimate ∫|ΔS| dq at κ over the frequencies that light reaches, by importance sampling of S.
+    """Estimate ∫|ΔS| dq at κ over the frequencies of propagating light, by importance sampling of S.
 
     Args:
         spectrum: of the surface.
         height_field: the surface.
         kappa: rad/µm.
-        count: frequencies.
-        random: draws them.
+        count: number of frequencies drawn.
+        random: generator that draws them.
     """
-    shares = spectrum.powers(kappa)
-    q = _drawn(spectrum, np.maximum(shares, 0), count, random)
-    reached = 2 * np.sin(np.deg2rad(spectrum.largest_angle)) / (spectrum.wavelengths[0] * 1e-3)
+    powers = spectrum.powers(kappa)
+    q = _drawn(spectrum, np.maximum(powers, 0), count, random)
+    max_frequency = 2 * np.sin(np.deg2rad(spectrum.largest_angle)) / (spectrum.wavelengths[0] * 1e-3)
     lines = isinstance(spectrum.grid, OrderGrid)
     margin = spectrum.cutoff_sigmas * spectrum.lobe_width if lines else 0.0
-    q = q[np.hypot(*q.T) < reached - margin]
+    q = q[np.hypot(*q.T) < max_frequency - margin]
     approximate = spectrum.evaluate(q, kappa)
     exact = power_spectrum(height_field, q, kappa, extent=spectrum.extent, coherence_length=spectrum.coherence_length)
-    # q are drawn from S/∫S itself, as far as it is not negative; what is not a number stays.
+    # q are drawn from S/∫S where S is positive; NaN is kept.
     drawn = ~(approximate <= 0)
     error = np.abs(approximate - exact)[drawn] / approximate[drawn]
-    # What lies beyond the reach of the lobes is not drawn.
+    # Frequencies outside the cutoff of the lobes are not drawn.
     tail = 1 - np.prod([lobe.inside for lobe in spectrum.lobes]) if lines else 0.0
-    return float(error.sum() / count * shares.sum(dtype=np.float64) + spectrum.truncated_power + tail)
+    return float(error.sum() / count * powers.sum(dtype=np.float64) + spectrum.truncated_power + tail)
 
 
 def _drawn(
-    spectrum: GratingSpectrum, shares: NDArray[np.float32], count: int, random: np.random.Generator
+    spectrum: GratingSpectrum, powers: NDArray[np.float32], count: int, random: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Draw `count` frequencies q with the density S: a node, then a place in its lobe or spline."""
+    """Draw `count` frequencies q with the density S: a node, then an offset within its lobe or spline."""
     q_x, q_y = spectrum.grid.frequencies()
-    total = np.cumsum(shares.ravel(), dtype=np.float64)
+    total = np.cumsum(powers.ravel(), dtype=np.float64)
     # One random number in each of `count` equal steps: less noise than independent ones.
-    places = (np.arange(count) + random.random(count)) / count * total[-1]
-    row, column = np.unravel_index(np.minimum(np.searchsorted(total, places), total.size - 1), shares.shape)
+    cumulative = (np.arange(count) + random.random(count)) / count * total[-1]
+    row, column = np.unravel_index(np.minimum(np.searchsorted(total, cumulative), total.size - 1), powers.shape)
     if isinstance(spectrum.grid, OrderGrid):
-        # The lobes end at their half widths.
+        # Gaussian offsets, truncated at the half widths of the lobes.
         inside = np.array([lobe.inside for lobe in spectrum.lobes])
         offset = spectrum.lobe_width * scipy.special.ndtri(0.5 + inside * (random.random((count, 2)) - 0.5))
     else:
@@ -85,8 +85,8 @@ class Accuracy:
     """Errors of a spectrum.
 
     Attributes:
-        l1: max over κ of ∫|ΔS| dq, a share of the reflected power.
-        delta_e: (mean, largest) CIEDE2000 of twelve patches of colour.
+        l1: max over κ of ∫|ΔS| dq, a fraction of the reflected power.
+        delta_e: (mean, maximum) CIEDE2000 of twelve patches of colour.
     """
 
     l1: float
@@ -94,7 +94,7 @@ class Accuracy:
 
 
 class Exact:
-    """A case, and the parts of its reference that all of its spectra share."""
+    """Reference of a case, computed once for all of its spectra."""
 
     def __init__(self, case: Case, wavelengths: tuple[float, float], kappas: int = 4, points: int = 2000) -> None:
         self._case, self._points = case, points
@@ -107,7 +107,7 @@ class Exact:
             case.height_field, self._q, self._kappa, extent=case.extent, coherence_length=case.coherence_length
         )
         self.xyz = self._xyz(exact)
-        """(12, 3) of the patches' S/λ² under D65; without K, G and R, which patches do not share."""
+        """(12, 3) of the patches' S/λ² under D65; without K, G and R, which differ from patch to patch."""
 
     def _xyz(self, s: Array) -> Array:
         light = daylight(self._wavelengths) / (self._wavelengths * 1e-3) ** 2
@@ -123,7 +123,7 @@ class Exact:
 
 
 def patch_difference(exact: Array, approximate: Array) -> tuple[float, float]:
-    """Return mean and largest CIEDE2000 of XYZ (n, 3), exposed so that the brightest exact patch is a light grey."""
+    """Return mean and maximum CIEDE2000 of XYZ (n, 3), exposed so that the brightest exact patch is a light grey."""
     difference = delta_E(*(xyz * 0.5 / exact[:, 1].max() for xyz in (exact, approximate)))
     return float(difference.mean()), float(difference.max())
 

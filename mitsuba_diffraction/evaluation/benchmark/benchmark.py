@@ -1,4 +1,4 @@
-"""Speed against error: every case, a ladder of tolerances."""
+"""Speed against error: all cases at several tolerances."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Result:
         megabytes: of the table.
         build_seconds: of `precompute`.
         evaluations: of eval_pdf per second, four wavelengths each.
-        read_ratio: speed of reading the same words alone, an upper bound, to eval_pdf of roughconductor (Al).
+        read_ratio: speed of only reading the same words, an upper bound, to eval_pdf of roughconductor (Al).
         evaluate_ratio: speed of eval_pdf to that of roughconductor (Al) in the same run.
         sample_ratio: speed of sample to that of roughconductor (Al) in the same run.
         accuracy: against the float64 reference.
@@ -100,7 +100,7 @@ def run(
         count: rays at once.
         shading_points: of the real-time shaders at once.
         repetitions: of each timing, interleaved.
-        progress: called with (steps done, steps in all).
+        progress: called with (steps done, steps in total).
 
     Returns:
         A result for every combination, in order; and the real-time shaders on the tiles.
@@ -187,7 +187,7 @@ def save_plot(results: Sequence[Result], path: str | os.PathLike[str]) -> None:
         )  # fmt: skip
     axes.axvline(1, color="0.6", linewidth=0.8, linestyle=":")
     axes.grid(alpha=0.25)
-    # Speeds span less than two decades: 1, 2 and 5 in each, as plain numbers.
+    # Speeds span less than two decades: ticks at 1, 2 and 5 of each, as plain numbers.
     axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
     axes.xaxis.set_minor_formatter(NullFormatter())

@@ -32,7 +32,7 @@ class Case:
     def spectrum(self, tolerance: float = 1e-3) -> GratingSpectrum:
         """Compute the spectrum of the surface; arguments and errors as of `precompute`."""
         with warnings.catch_warnings():
-            # That pixels are coarse is known.
+            # The warning of coarse pixels does not matter here.
             warnings.simplefilter("ignore", UserWarning)
             return precompute(
                 self.height_field,

@@ -17,7 +17,7 @@ from .speed import seconds
 
 ANGLES = (0.0, 30.0, 60.0, 75.0, 85.0)
 _AZIMUTHS = (0.0, 30.0, 60.0, 90.0)
-_DRAWS = 4  # of the four wavelengths of a ray
+_WAVELENGTH_DRAWS = 4  # sets of four wavelengths
 
 COLUMNS = {
     "surface": "{.surface}",
@@ -34,9 +34,10 @@ class Sampling:
 
     Attributes:
         surface: name of the case.
-        fractions: E[w]²/E[w²] at each of `ANGLES`, the least over azimuths; R = 1.
-        largest_weight: of all samples drawn.
-        variance_ratio: of cosine sampling to the BSDF's own, under a uniform sky, at equal time; the least over angles.
+        fractions: E[w]²/E[w²] at each of `ANGLES`, the minimum over azimuths; R = 1.
+        largest_weight: maximum weight of all samples drawn.
+        variance_ratio: of cosine sampling to the BSDF's own, under a uniform sky, at equal time; the minimum
+            over angles.
         picture_ratio: seconds of a sphere under sun and sky, to the same with roughconductor (Al), at equal samples.
     """
 
@@ -66,13 +67,13 @@ def measure(
         size: of the picture, pixels.
         spp: of the picture, samples per pixel.
         repetitions: of each timing, interleaved.
-        progress: called with (steps done, steps in all).
+        progress: called with (steps done, steps in total).
     """
     results = []
     for case in cases:
         grating = {"type": "diffraction_grating", "spectrum": case.spectrum(tolerance=tolerance)}
         mirror = mi.load_dict({**grating, "material": "none"})
-        fractions, largest = zip(*(_fraction(mirror, angle, count) for angle in ANGLES), strict=True)
+        fractions, max_weights = zip(*(_fraction(mirror, angle, count) for angle in ANGLES), strict=True)
         pictures = {
             "grating": _sphere({**grating, "material": "Al"}, size),
             "rough": _sphere({"type": "roughconductor", "material": "Al"}, size),
@@ -83,7 +84,7 @@ def measure(
             Sampling(
                 surface=case.name,
                 fractions=fractions,
-                largest_weight=max(largest),
+                largest_weight=max(max_weights),
                 variance_ratio=min(_against_cosine(mirror, angle, count, repetitions) for angle in ANGLES),
                 picture_ratio=taken["grating"] / taken["rough"],
             )
@@ -98,12 +99,12 @@ def _wavelengths(shift: ArrayLike) -> NDArray[np.float64]:
 
 
 def _fraction(bsdf: mi.BSDF, angle: float, count: int) -> tuple[float, float]:
-    """Return the least E[w]²/E[w²] over azimuths, and the largest w; w, the weight, is a mean over four wavelengths.
+    """Return the minimum of E[w]²/E[w²] over azimuths, and the maximum w; the weight w is a mean over four wavelengths.
 
     The ratio is averaged over draws of wavelengths.
     """
-    drawn = _wavelengths((np.arange(_DRAWS)[:, None] + 0.5) / _DRAWS)
-    shape = len(_AZIMUTHS), _DRAWS, count
+    drawn = _wavelengths((np.arange(_WAVELENGTH_DRAWS)[:, None] + 0.5) / _WAVELENGTH_DRAWS)
+    shape = len(_AZIMUTHS), _WAVELENGTH_DRAWS, count
     wi = np.broadcast_to(testing.direction(angle, np.array(_AZIMUTHS))[:, None, None], (*shape, 3))
     wavelengths = np.broadcast_to(drawn[:, None], (*shape, 4))
     _, weights, _ = testing.sample(bsdf, wi.reshape(-1, 3), wavelengths.reshape(-1, 4))
@@ -127,9 +128,9 @@ def _against_cosine(bsdf: mi.BSDF, angle: float, count: int, repetitions: int) -
         value = dr.mean(mi.unpolarized_spectrum(bsdf.eval(mi.BSDFContext(), si, wo)))
         return value / mi.warp.square_to_cosine_hemisphere_pdf(wo)
 
-    ways = {"cosine": cosine, "own": own}
-    taken = seconds({name: lambda way=way: dr.eval(way()) for name, way in ways.items()}, repetitions)
-    costs = {name: np.array(way(), np.float64).var() * taken[name] for name, way in ways.items()}
+    samplers = {"cosine": cosine, "own": own}
+    times = seconds({name: lambda draw=draw: dr.eval(draw()) for name, draw in samplers.items()}, repetitions)
+    costs = {name: np.array(draw(), np.float64).var() * times[name] for name, draw in samplers.items()}
     return float(costs["cosine"] / costs["own"])
 
 

@@ -37,9 +37,9 @@ class ShaderSpeed:
         surface: name of the case.
         variant: "flss", "nmm" or "pq".
         as_published: with all published quirks, or with none.
-        texel_reads: the largest number for one shading point.
+        texel_reads: maximum number for one shading point.
         evaluate_ratio: shading points per second, to eval_pdf of roughconductor (Al) in the same run.
-        delta_e: (mean, largest) CIEDE2000 of the twelve patches against the exact model, after one factor of exposure.
+        delta_e: (mean, maximum) CIEDE2000 of the twelve patches against the exact model, after one factor of exposure.
     """
 
     surface: str

@@ -19,7 +19,7 @@ Name = TypeVar("Name", bound=Hashable)
 
 
 class Rays:
-    """Random directions, each with four random wavelengths, and random numbers to sample from."""
+    """Random pairs of directions, each with four random wavelengths, and random numbers for sampling."""
 
     def __init__(self, count: int, seed: int = 0) -> None:
         random = np.random.default_rng(seed)
@@ -40,14 +40,14 @@ class Rays:
         dr.eval(sample.wo, sample.pdf, weight)
 
     def read(self, spectrum: GratingSpectrum, table: mi.UInt32) -> None:
-        """Sum the words about each q: the minimum work of any evaluation.
+        """Sum the words of the nodes around each q: the minimum work of any evaluation.
 
         Args:
             spectrum: determines the nodes and the number of words.
             table: of `blank(spectrum)`.
         """
         q_x, q_y = spectrum.grid.frequencies()
-        largest_x, largest_y = spectrum.grid.max_order
+        max_x, max_y = spectrum.grid.max_order
         spacing_x, spacing_y = (mi.Float(float(q[1] - q[0]) if len(q) > 1 else 1.0) for q in (q_x, q_y))
         dr.make_opaque(spacing_x, spacing_y)
         rows, columns = spectrum.grid.shape
@@ -60,8 +60,8 @@ class Rays:
             wavelength = self.si.wavelengths[channel] * 1e-3
             m_x = mi.Int32(dr.round((wi.x + self.wo.x) / (wavelength * spacing_x)))
             m_y = mi.Int32(dr.round((wi.y + self.wo.y) / (wavelength * spacing_y)))
-            inside = (dr.abs(m_x) <= largest_x) & (dr.abs(m_y) <= largest_y)
-            node = mi.UInt32(dr.select(inside, (m_y + largest_y) * columns + m_x + largest_x, 0))
+            inside = (dr.abs(m_x) <= max_x) & (dr.abs(m_y) <= max_y)
+            node = mi.UInt32(dr.select(inside, (m_y + max_y) * columns + m_x + max_x, 0))
             total = packet(0)
             for i, j in np.ndindex(count_y, count_x):
                 near = dr.minimum(node + i * columns + j, rows * columns - 1)
@@ -78,7 +78,7 @@ def _directions(random: np.random.Generator, count: int) -> np.ndarray:
 
 
 def blank(spectrum: GratingSpectrum) -> mi.UInt32:
-    """Return as many zeros as a spectrum's table holds words for one κ at run time."""
+    """Return zeros, as many as the words of a spectrum's table for one κ at run time."""
     words = dr.zeros(mi.UInt32, int(np.prod(spectrum.grid.shape)) * spectrum.table.words_per_node)
     dr.make_opaque(words)
     return words
@@ -94,4 +94,4 @@ def seconds(work: Mapping[Name, Callable[[], None]], repetitions: int) -> dict[N
             dr.sync_thread()
             if repetition >= 0:
                 times[name].append(time.perf_counter() - start)
-    return {name: statistics.median(some) for name, some in times.items()}
+    return {name: statistics.median(values) for name, values in times.items()}

@@ -18,10 +18,10 @@ from .difference import Difference, difference, noise, white_luminance
 from .pictures import Picture, Pictures
 from .quirk_shares import QuirkShares, quirk_shares
 
-# The quirks are counted in small pictures, each of which is rendered well: 28 of them take about a minute on two cores.
-SHARES_SIDE = 96
-SHARES_SAMPLES = 256
-SHARES_POINTS = 9
+# The effect of quirks is measured in small pictures with little noise: 28 of them take about a minute on two cores.
+QUIRKS_MAX_SIDE = 96
+QUIRKS_SAMPLES = 256
+QUIRKS_SHADING_POINTS = 9
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,11 +40,11 @@ class Comparison:
         to_path_traced: difference of each other picture from the path-traced one.
         to_same_light: difference of the shader's pictures from "same_light".
         noise: the mean CIEDE2000 due to noise in the traced pictures; None for one sample per pixel.
-        shader_reads: texels (two numbers each) that one shading point of the shader reads, at most.
+        shader_reads: maximum number of texels (two numbers each) that one shading point of the shader reads.
         model_reads: packets (four numbers each) that one BRDF value of the project's model reads for a ray.
-        left_out: the largest share of a line's power outside of the shader's 3 × 3 texels; None without these.
+        truncated_fraction: maximum fraction of a line's power outside the shader's 3 × 3 texels; None if not used.
         coated: whether a grating has a coat, which the shader does not show.
-        shares: of the quirks; None if not requested.
+        shares: fractions of the difference due to each quirk; None if not requested.
     """
 
     scene: str
@@ -59,7 +59,7 @@ class Comparison:
     noise: Mapping[str, float | None]
     shader_reads: int
     model_reads: int
-    left_out: float | None
+    truncated_fraction: float | None
     coated: bool
     shares: QuirkShares | None
 
@@ -75,7 +75,7 @@ def compare(
     seed: int = 0,
     parameters: Mapping[str, str] | None = None,
     shares: bool = True,
-    shares_side: int = SHARES_SIDE,
+    shares_side: int = QUIRKS_MAX_SIDE,
     progress: Callable[[str], AbstractContextManager[Progress]] = no_progress,
 ) -> Comparison:
     """Render a scene with the path tracer and with the shader under the current variant, and compare.
@@ -89,8 +89,8 @@ def compare(
         shading_points: per pixel of the shader, each with its whole spectrum.
         seed: of the random numbers, not negative.
         parameters: values for the scene's `$name` parameters.
-        shares: measure the share of each quirk.
-        shares_side: the longer side, in pixels, of the pictures for that; never more than that of the picture.
+        shares: measure the fraction of the difference that is due to each quirk.
+        shares_side: the longer side, in pixels, of the pictures for `shares`; limited to that of the picture.
         progress: progress(label) is a context whose value is called with (done, total).
 
     Raises:
@@ -118,7 +118,7 @@ def compare(
         columns, rows = (max(1, round(size * scale)) for size in of.film_size)
         small = Pictures(scene_path, shader, width=columns, height=rows, seed=seed, parameters=parameters)
         with progress("quirks") as bar:
-            of_quirks = quirk_shares(small, SHARES_SAMPLES, SHARES_POINTS, bar)
+            of_quirks = quirk_shares(small, QUIRKS_SAMPLES, QUIRKS_SHADING_POINTS, bar)
     return Comparison(
         scene=Path(scene_path).name,
         shader=shader,
@@ -137,7 +137,7 @@ def compare(
         noise={name: noise(picture.halves, of.surface, white) for name, picture in pictures.items()},
         shader_reads=of.shader_reads,
         model_reads=of.model_reads,
-        left_out=of.left_out,
+        truncated_fraction=of.truncated_fraction,
         coated=of.has_coat,
         shares=of_quirks,
     )

@@ -1,7 +1,8 @@
-"""The error of a picture against the time that it took: the path tracer and the real-time shaders.
+"""Error of a picture against rendering time: the path tracer and the real-time shaders.
 
-All pictures of a scene are compared with one reference: the path tracer's, with many samples and a table a third as
-coarse as the finest. Noise and the tolerance of the spectrum tend to zero; the shaders stop at their bias.
+All pictures of a scene are compared with one reference: the path tracer's, with many samples and a third of the
+lowest tolerance. The error of the path tracer tends to zero with noise and tolerance; that of the shaders to their
+bias.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ SAMPLES = (1, 4, 16, 64, 256)
 REFERENCE_SAMPLES = 2048
 SHADERS = ("flss", "nmm", "pq")
 SHADING_POINTS = (1, 4, 16)
-OTHERS = 4  # samples of what is no grating, per shading point
+SAMPLES_OF_OTHERS_PER_POINT = 4  # samples of all BSDFs other than gratings, per shading point
 
 COLUMNS = {
     "picture": "{.name}",
@@ -40,7 +41,7 @@ COLUMNS = {
 
 @dataclass(frozen=True)
 class Point:
-    """A picture.
+    """Error and rendering time of a picture.
 
     Attributes:
         name: "tolerance 0.01" of the path tracer, or "flss, corrected".
@@ -62,7 +63,7 @@ class Point:
 
 @dataclass(frozen=True)
 class Convergence:
-    """The pictures of one scene.
+    """Errors and times of the pictures of one scene.
 
     Attributes:
         scene: file name and parameters.
@@ -82,7 +83,7 @@ class Convergence:
         return {name: [point for point in self.points if point.name == name] for name in names}
 
     def overtaken(self, name: str, error: str) -> float:
-        """Return the time at which the path tracer's error falls below the least error of a shader.
+        """Return the time at which the path tracer's error falls below the minimum error of a shader.
 
         Args:
             name: of the shader's curve.
@@ -107,11 +108,11 @@ class Convergence:
 
 
 def check_tolerances(tolerances: Sequence[float]) -> None:
-    """Raise if the reference cannot be three times as fine as the finest."""
+    """Raise RequestError if a third of the lowest tolerance, which the reference uses, is too low."""
     if not min(tolerances) / 3 >= MIN_TOLERANCE:
         raise RequestError(
             f"tolerance: got {min(tolerances):g}, wanted at least {3 * MIN_TOLERANCE:g}: "
-            "the reference takes a third of the finest"
+            "the reference uses a third of the lowest"
         )
 
 
@@ -127,7 +128,7 @@ def convergence(
     parameters: Mapping[str, str] | None = None,
     progress: Callable[[str], AbstractContextManager[Progress]] = no_progress,
 ) -> Convergence:
-    """Render a scene in many ways under the current variant.
+    """Render a scene with several tolerances, shaders and numbers of samples under the current variant.
 
     Args:
         scene_path: an XML scene with a parameter `tolerance` of its gratings, whose integrator is a path tracer, with a
@@ -176,7 +177,7 @@ def convergence(
         for name, quirks in (("as published", shaded.quirks), ("corrected", ())):
             with progress(f"{shader}, {name}") as bar:
                 for number, count in enumerate(shading_points, 1):
-                    add(f"{shader}, {name}", False, shaded.shaded(quirks, count, OTHERS * count))
+                    add(f"{shader}, {name}", False, shaded.shaded(quirks, count, SAMPLES_OF_OTHERS_PER_POINT * count))
                     bar(number, len(shading_points))
     scene = " ".join(
         [os.path.basename(scene_path), *(f"-D {key}={value}" for key, value in (parameters or {}).items())]
@@ -213,9 +214,9 @@ def save_plot(found: Convergence, path: str | os.PathLike[str]) -> None:
                 seconds, errors, "s--" if published else "D:", color=colour, markersize=5, linewidth=1,
                 markerfacecolor=colour if published else "white", label=name,
             )  # fmt: skip
-            when = found.overtaken(name, error)
-            if np.isfinite(when):
-                panel.plot(when, min(errors), "x", color=colour, markersize=7, markeredgewidth=1.8)
+            overtaken = found.overtaken(name, error)
+            if np.isfinite(overtaken):
+                panel.plot(overtaken, min(errors), "x", color=colour, markersize=7, markeredgewidth=1.8)
         panel.set_xlabel("seconds")
         panel.set_ylabel(label)
         panel.grid(alpha=0.25, which="both")

@@ -36,18 +36,18 @@ class Difference:
         return float(np.nanpercentile(self.delta_e, 95))
 
     @property
-    def largest(self) -> float:
-        """The largest CIEDE2000."""
+    def max(self) -> float:
+        """The maximum CIEDE2000."""
         return float(np.nanmax(self.delta_e))
 
 
 def as_shown(xyz: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Scale colours with Y > 1 to Y = 1 at equal chromaticity: CIEDE2000 is not defined beyond white."""
+    """Scale colours with Y > 1 to Y = 1 at equal chromaticity: CIEDE2000 is not defined above white."""
     return xyz / np.maximum(xyz[..., 1:2], 1)
 
 
 def white_luminance(xyz: NDArray[np.float64], where: NDArray[np.bool_]) -> float:
-    """Return the luminance that a preview of the picture shows as white (`auto_exposure` of the pixels that count)."""
+    """Return the luminance that a preview of the picture shows as white (`auto_exposure` of the pixels in `where`)."""
     return 1 / auto_exposure(into_gamut(XYZ_to_linear_sRGB(xyz[where])))
 
 
@@ -59,11 +59,11 @@ def difference(
     Args:
         reference: XYZ, (height, width, 3).
         xyz: of the other picture, likewise.
-        where: (height, width), the pixels that count.
+        where: (height, width), the pixels that are compared.
         white: the luminance of the reference that is shown as white.
 
     Raises:
-        ValueError: if nothing counts, or one picture is black there.
+        ValueError: if there are no such pixels, or one picture is black there.
     """
     sums = [float(picture[where][:, 1].sum()) for picture in (reference, xyz)]
     if not min(sums) > 0:
@@ -83,7 +83,7 @@ def noise(halves: NDArray[np.float64] | None, where: NDArray[np.bool_], white: f
 
     Args:
         halves: of `Picture`.
-        where: (height, width), the pixels that count.
+        where: (height, width), the pixels that are compared.
         white: the luminance that is shown as white.
     """
     if halves is None:

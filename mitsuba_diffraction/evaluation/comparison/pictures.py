@@ -30,9 +30,9 @@ from ..realtime_shader.tristimulus import EMISSION, primary_spectra
 
 
 def _integrator(radiance: Callable[..., tuple[mi.Spectrum, mi.Bool]]) -> mi.SamplingIntegrator:
-    """Return an integrator of radiance(scene, ray, active), which also tells where a surface was hit."""
+    """Return an integrator of radiance(scene, ray, active), which returns radiance and whether a surface was hit."""
 
-    class Part(mi.SamplingIntegrator):
+    class PartIntegrator(mi.SamplingIntegrator):
         def sample(
             self,
             scene: mi.Scene,
@@ -43,7 +43,7 @@ def _integrator(radiance: Callable[..., tuple[mi.Spectrum, mi.Bool]]) -> mi.Samp
         ) -> tuple[mi.Spectrum, mi.Bool, list[mi.Float]]:
             return *radiance(scene, ray, active), []
 
-    return Part(mi.Properties("part"))
+    return PartIntegrator(mi.Properties("part"))
 
 
 def same_light(scene: mi.Scene) -> mi.SamplingIntegrator:
@@ -72,7 +72,7 @@ def same_light(scene: mi.Scene) -> mi.SamplingIntegrator:
 
 
 def without_gratings(shader: mi.SamplingIntegrator) -> mi.SamplingIntegrator:
-    """Return an integrator of a `diffraction_shader` without gratings: other BSDFs, and those below gratings."""
+    """Return an integrator of a `diffraction_shader` without gratings: only other BSDFs, and BSDFs below gratings."""
 
     def radiance(scene: mi.Scene, ray: mi.RayDifferential3f, active: mi.Bool) -> tuple[mi.Spectrum, mi.Bool]:
         _, value, active = shader.shade(scene, ray, active)
@@ -83,8 +83,8 @@ def without_gratings(shader: mi.SamplingIntegrator) -> mi.SamplingIntegrator:
 
 NO_SHADOWS = "no_shadows"
 
-# Per dispatch, so that progress shows: some seconds of work on two cores.
-_SHADING_POINTS = 2**16
+# Some seconds of work on two cores, so that progress is shown.
+_MAX_POINTS_PER_DISPATCH = 2**16
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +96,7 @@ class Picture:
         samples: per pixel.
         seconds: of rendering, without loading the scene and compiling kernels.
         halves: XYZ (2, height, width, 3) of two independent pictures with half of the samples each; None for a
-            picture with next to no noise.
+            picture with negligible noise.
         xyz: (height, width, 3), CIE XYZ as `color` scales it.
     """
 
@@ -173,50 +173,50 @@ class Pictures:
 
     @property
     def quirks(self) -> tuple[str, ...]:
-        """`Quirks` that are as published and change something in this scene with this shader, and no cast shadows."""
+        """Names of the `Quirks` that affect this scene with this shader, and "no_shadows"."""
         of_integrator = ("power_gamma", *(("constant_blend",) if self.has_base else ()))
         own = (*self.shaders[0].own_quirks, *of_integrator)
         return (*(name for name in Quirks.names() if name in own), NO_SHADOWS)
 
     @property
     def shader_reads(self) -> int:
-        """The largest number of texels that one shading point of the shader reads."""
+        """Maximum number of texels that one shading point of the shader reads."""
         return max(shader.texel_reads for shader in self.shaders)
 
     @property
     def model_reads(self) -> int:
-        """The largest number of packets of at most 16 bytes that one BRDF value of the model reads for a ray."""
+        """Maximum number of packets of up to 16 bytes that one BRDF value of the model reads for a ray."""
         packets = [np.prod(s.neighbours) * -(-s.table.words_per_node // 4) for s in self.spectra]
         return len(mi.UnpolarizedSpectrum(0)) * int(max(packets))
 
     @property
-    def left_out(self) -> float | None:
-        """The most of a line's power that the shader's 3 × 3 texels leave out; None if it has no such neighbourhood."""
-        found = [shader.left_out for shader in self.shaders if isinstance(shader, FLSS)]
-        return max(found) if found else None
+    def truncated_fraction(self) -> float | None:
+        """Maximum fraction of a line's power outside the shader's 3 × 3 texels; None for other shaders."""
+        fractions = [shader.truncated_fraction for shader in self.shaders if isinstance(shader, FLSS)]
+        return max(fractions, default=None)
 
     def path_traced(self, samples: int, progress: Progress = silent) -> Picture:
         """Render by the scene's own integrator."""
         return self._traced(self.scene.integrator(), samples, progress)
 
     def same_light(self, samples: int, progress: Progress = silent) -> Picture:
-        """Render the scene's BSDFs under the lights that the shader supports; see `integrators.same_light`."""
+        """Render the scene's BSDFs under the lights that the shader supports; see `same_light` of this module."""
         return self._traced(same_light(self.scene), samples, progress)
 
     def shaded(self, quirks: Collection[str], samples: int, others: int, progress: Progress = silent) -> Picture:
-        """Render the limit of the shader's integrator, with far fewer samples.
+        """Render what the shader's integrator converges to, with far fewer samples.
 
         The integrator computes the colour of a shading point from 81 wavelengths, and shows it at the four
         wavelengths of a ray. Here the colours are averaged over a pixel, and the spectrum Σ_c RGB_c b_c(λ) follows from
-        the average. All other BSDFs, which are cheap, get samples of their own.
+        the average. All other BSDFs, which are cheap, are sampled separately.
 
         Args:
-            quirks: names among `quirks` that the shader has as published.
+            quirks: names of the quirks that are as published, others are corrected.
             samples: shading points per pixel.
-            others: samples per pixel of all but gratings.
+            others: samples per pixel of all BSDFs other than gratings.
             progress: called with (done, total).
         """
-        self._shader.take(Quirks(**{name: name in quirks for name in Quirks.names()}))
+        self._shader.set_quirks(Quirks(**{name: name in quirks for name in Quirks.names()}))
         self._shader.shadows = NO_SHADOWS not in quirks
         self._shader.prepare(self.scene)
         known = ("constant_blend" in quirks, self._shader.shadows, others)
@@ -249,9 +249,9 @@ class Pictures:
     def _colours(self, samples: int, progress: Progress) -> tuple[NDArray[np.float64], float]:
         """Return linear sRGB of the gratings, (height, width, 3), and seconds."""
         rows, columns = self.surface.shape
-        per_dispatch = max(1, _SHADING_POINTS // samples)
+        per_dispatch = max(1, _MAX_POINTS_PER_DISPATCH // samples)
         firsts = range(0, rows * columns, per_dispatch)
-        # Compiles the kernels. A single pixel may hold a single sample, for which Dr.Jit compiles others; hence two.
+        # Compiles the kernels. With two pixels, as Dr.Jit compiles other kernels for a single sample.
         self._averaged([self._shade(0, 2, samples)] * -(-rows * columns // 2))
         begin = time.perf_counter()
         points = []
@@ -276,14 +276,14 @@ class Pictures:
         sensor = self.scene.sensors()[0]
         columns, rows = (int(size) for size in sensor.film().crop_size())
         sampler = mi.load_dict({"type": "multijitter", "sample_count": samples})
-        samples = sampler.sample_count()  # the next product of two like numbers
+        samples = sampler.sample_count()  # rounded up to a product of two similar numbers
         sampler.set_samples_per_wavefront(samples)
         seed = pass_seed(self.seed, first)
         sampler.seed(seed, count * samples)
         pixel = dr.opaque(mi.UInt32, first) + dr.arange(mi.UInt32, count * samples) // samples
         sampler = rotated(sampler, seed, pixel)
         position = mi.Point2f(mi.Float(pixel % columns), mi.Float(pixel // columns)) + sampler.next_2d()
-        # Time and aperture; a shader needs no wavelengths.
+        # The shader needs no wavelengths: 0.5 is a dummy.
         size = mi.Vector2f(columns, rows)
         ray, _ = sensor.sample_ray(sampler.next_1d(), 0.5, position / size, sampler.next_2d())
         rgb, _, _ = self._shader.shade(self.scene, mi.RayDifferential3f(ray))
@@ -292,7 +292,7 @@ class Pictures:
 
 
 def _check_lights(scene: Path, parameters: Mapping[str, str] | None) -> None:
-    """Raise RequestError if the shader supports none of a scene's lights, before any spectrum is computed."""
+    """Raise RequestError if the shader supports no light of a scene, before any spectrum is computed."""
     with parsed(scene, parameters) as (_, state):
         emitters = {node.props.plugin_name() for node in state.nodes if node.type == mi.ObjectType.Emitter}
     if emitters & {"directional", "point"}:
@@ -313,7 +313,7 @@ def _check_lights(scene: Path, parameters: Mapping[str, str] | None) -> None:
 def _channel_spectra() -> NDArray[np.float64]:
     """Return b_c of `primary_spectra`, averaged over the hats of the film's channels: (n, 3).
 
-    b_c is linear between nodes that are the middles of the hats, so that the average is (b₋ + 4b + b₊)/6.
+    b_c is linear between nodes at the centres of the hats, so that the average is (b₋ + 4b + b₊)/6.
     """
     b = primary_spectra()
     averages = (b[:-2] + 4 * b[1:-1] + b[2:]) / 6
@@ -322,7 +322,7 @@ def _channel_spectra() -> NDArray[np.float64]:
 
 
 def _shows_surfaces(scene: mi.Scene) -> NDArray[np.bool_]:
-    """Return a mask of pixels of which all of 4 × 4 rays meet a surface, (height, width)."""
+    """Return a mask of the pixels in which all of 4 × 4 rays hit a surface, (height, width)."""
     sensor = scene.sensors()[0]
     columns, rows = sensor.film().crop_size()
     y, x = (np.mgrid[: 4 * rows, : 4 * columns].reshape(2, -1) + 0.5) / np.array([[4 * rows], [4 * columns]])

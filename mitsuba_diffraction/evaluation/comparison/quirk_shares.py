@@ -1,4 +1,4 @@
-"""The share of each quirk of the published shader in the difference."""
+"""Fraction of the difference to a reference that is due to each quirk of the published shader."""
 
 from __future__ import annotations
 
@@ -42,10 +42,11 @@ class AgainstReference:
 
 @dataclass(frozen=True)
 class QuirkShares:
-    """Shares of all quirks.
+    """Fractions of the difference due to each quirk.
 
-    `drop` is the effect of a quirk beside all others, `rise` its effect alone; a share takes the mean of both. Shares
-    do not add up to one, and may be negative: two quirks may cancel, or one may mask another.
+    `drop` is the effect of a quirk in the presence of all others, `rise` its effect alone; the fraction is the mean of
+    both, relative to the difference. Fractions do not add up to one, and may be negative: two quirks may cancel, or one
+    may mask another.
 
     Attributes:
         size: (width, height) of the pictures.
@@ -69,7 +70,7 @@ def quirk_shares(pictures: Pictures, samples: int, shading_points: int, progress
         pictures: of a small size.
         samples: per pixel of the references.
         shading_points: per pixel of the shader.
-        progress: called with (pictures done, pictures in all).
+        progress: called with (pictures done, pictures in total).
     """
     names = pictures.quirks
     done, total = 2, 2 * len(names) + 4

@@ -39,7 +39,7 @@ _TO_REFERENCE = {
     "exposure\nfactor": "{.exposure:.3g}",
     "ΔE00\nmean": "{.mean:.2f}",
     "ΔE00\n95 %": "{.percentile_95:.1f}",
-    "ΔE00\nmax": "{.largest:.1f}",
+    "ΔE00\nmax": "{.max:.1f}",
     "luminance\nerror": "{.luminance_error:.1%}",
 }
 
@@ -59,7 +59,7 @@ def picture_table(comparison: Comparison) -> Table:
 
 
 def quirk_table(comparison: Comparison) -> Table:
-    """Return a table of the quirks, the largest share first, for a terminal."""
+    """Return a table of the quirks, largest fraction first, for a terminal."""
     shares = comparison.shares
     columns = ("quirk", "path tracer\ndrop", "\nrise", "\nshare", "same light\ndrop", "\nrise", "\nshare")
     rows = []
@@ -67,7 +67,7 @@ def quirk_table(comparison: Comparison) -> Table:
         row = [name]
         for against in (shares.path_traced, shares.same_light):
             one = against.quirks[name]
-            # Adding zero takes the sign from a zero.
+            # Adding zero removes the sign of −0.
             row += [f"{round(value, 2) + 0.0:+.2f}" for value in (one.drop, one.rise)]
             row.append(f"{one.share:.0%}")
         rows.append(row)
@@ -75,30 +75,30 @@ def quirk_table(comparison: Comparison) -> Table:
 
 
 def ordered(against: AgainstReference) -> list[str]:
-    """Sort the quirks, the largest share first."""
+    """Sort the names of the quirks, largest fraction first."""
     return sorted(against.quirks, key=lambda name: against.quirks[name].share, reverse=True)
 
 
 def notes(comparison: Comparison) -> list[str]:
-    """Return what one must know to read the tables, one line each."""
+    """Return explanations of the tables, one line each."""
     rows, columns = comparison.surface.shape
     lines = [
-        f"compared: the {100 * comparison.surface.mean():.0f} % of {columns} × {rows} pixels that show surfaces alone; "
+        f"compared: the {100 * comparison.surface.mean():.0f} % of {columns} × {rows} pixels that show only surfaces; "
         f"Y = {comparison.white:.4g} is white; one exposure factor gives a picture the mean luminance of its reference",
-        "the shader's light: straight from directional and point lights; here with the shadows that surfaces cast",
+        "the shader's light: direct light of directional and point lights; here with the shadows that surfaces cast",
         "reads: texels of two numbers (shader), or packets of four for the wavelengths of a ray (this model)",
     ]
     noise = comparison.noise["path_traced"], comparison.noise["same_light"]
     if None not in noise:
         lines.append(
-            f"noise: makes a mean ΔE00 of {noise[0]:.2f} in the path-traced picture, {noise[1]:.2f} in the same light's"
+            f"noise: a mean ΔE00 of {noise[0]:.2f} in the path-traced picture, {noise[1]:.2f} in the same light's"
         )
     if comparison.coated:
         lines.append("coat: the shader shows coated gratings without their coat; it does not converge to this model")
-    elif comparison.left_out is not None:
+    elif comparison.truncated_fraction is not None:
         lines.append(
-            "limit: corrected, the shader converges to this model in the same light; its 3 × 3 texels leave out at "
-            f"most {100 * comparison.left_out:.2g} % of a line, and less the longer "
+            "limit: corrected, the shader converges to this model in the same light; its 3 × 3 texels omit at "
+            f"most {100 * comparison.truncated_fraction:.2g} % of a line, and less the longer "
             "the coherence length is relative to the tile"
         )
     if (shares := comparison.shares) is not None:
@@ -112,9 +112,9 @@ def notes(comparison: Comparison) -> list[str]:
                 + ("" if one.noise is None else f"; noise {one.noise:.2f}")
             )
         lines += [
-            "drop: what the published shader's mean ΔE00 loses with this quirk alone corrected",
-            "rise: what the corrected shader's mean ΔE00 gains with this quirk alone put in",
-            "share: the mean of both, of the published shader's mean ΔE00; shares do not add up",
+            "drop: decrease of the published shader's mean ΔE00 with this quirk alone corrected",
+            "rise: increase of the corrected shader's mean ΔE00 with this quirk alone added",
+            "share: the mean of both, as a fraction of the published shader's mean ΔE00; shares do not add up to one",
         ]
     return lines
 
@@ -124,7 +124,7 @@ def _difference(found: Difference) -> dict[str, float]:
         "exposure factor": found.exposure,
         "mean": found.mean,
         "95 %": found.percentile_95,
-        "max": found.largest,
+        "max": found.max,
         "luminance error": found.luminance_error,
     }
 
@@ -149,7 +149,7 @@ def as_dict(comparison: Comparison) -> dict[str, object]:
         "to same light": {name: _difference(found) for name, found in comparison.to_same_light.items()},
         "texel reads of the shader": comparison.shader_reads,
         "packet reads of this model": comparison.model_reads,
-        "left out by the neighbourhood": comparison.left_out,
+        "left out by the neighbourhood": comparison.truncated_fraction,
         "shares": shares
         and {
             "size": shares.size,
@@ -174,7 +174,7 @@ def shown(comparison: Comparison, name: str) -> NDArray[np.uint8]:
 
 
 def figure(comparison: Comparison) -> Figure:
-    """Plot the pictures side by side, below them their CIEDE2000 to the path tracer's, and the shares of the quirks."""
+    """Plot the pictures side by side, below them CIEDE2000 to the path tracer's, and the effects of the quirks."""
     from matplotlib.figure import Figure
 
     aspect = comparison.surface.shape[0] / comparison.surface.shape[1]
@@ -207,19 +207,19 @@ def figure(comparison: Comparison) -> Figure:
 def _bars(panel: Axes, against: AgainstReference) -> None:
     """Plot `rise` and `drop` of the quirks."""
     names = ordered(against)
-    places = np.arange(len(names))
+    positions = np.arange(len(names))
     for offset, attribute, colour, label in (
-        (-0.2, "rise", "C0", "put in alone"),
+        (-0.2, "rise", "C0", "added alone"),
         (0.2, "drop", "0.6", "corrected alone"),
     ):
         values = [getattr(against.quirks[name], attribute) for name in names]
-        panel.barh(places + offset, values, height=0.4, color=colour, label=label)
+        panel.barh(positions + offset, values, height=0.4, color=colour, label=label)
     panel.axvline(0, color="0.3", linewidth=0.8)
-    panel.set_yticks(places, [name.replace("_", " ") for name in names], fontsize="x-small")
+    panel.set_yticks(positions, [name.replace("_", " ") for name in names], fontsize="x-small")
     panel.invert_yaxis()
     panel.tick_params(axis="x", labelsize="x-small")
-    panel.set_xlabel("mean ΔE00 that a quirk makes", fontsize="small")
-    widest = max(1.0, *map(abs, panel.get_xlim()))  # noise is not to look like a finding
+    panel.set_xlabel("mean ΔE00 due to a quirk", fontsize="small")
+    widest = max(1.0, *map(abs, panel.get_xlim()))  # so that noise does not look like an effect
     panel.set_xlim(min(panel.get_xlim()[0], -0.1 * widest), max(panel.get_xlim()[1], widest))
     panel.legend(fontsize="x-small", frameon=False, loc="lower center", bbox_to_anchor=(0.4, 1), ncols=2)
     panel.spines[["top", "right"]].set_visible(False)

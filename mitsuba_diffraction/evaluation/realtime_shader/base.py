@@ -19,15 +19,24 @@ from ...settings import SUN_COHERENCE_LENGTH, lobe_width
 from ...surface.heightfield import HeightField
 from .quirks import Quirks
 from .taylor_textures import PUBLISHED_TERMS, TaylorTextures, taylor_transforms
-from .tristimulus import LONGEST, SHORTEST, STEP, WAVELENGTH_COUNT, d65_weights, light_weights, rgb_matrix, wavelengths
+from .tristimulus import (
+    MAX_WAVELENGTH,
+    MIN_WAVELENGTH,
+    WAVELENGTH_COUNT,
+    WAVELENGTH_STEP,
+    d65_weights,
+    light_weights,
+    rgb_matrix,
+    wavelengths,
+)
 
 PUBLISHED_R0 = 0.04  # an index of 1.5, close to that of snake skin
 
 
 def schlick_falloff(cos_half: mi.Float) -> mi.Float:
     """Return (1 − ω_o·h)⁵ (Schlick 1994; eq. B.1): F = R₀ + (1 − R₀)(1 − ω_o·h)⁵."""
-    away = 1 - cos_half
-    return dr.square(dr.square(away)) * away
+    x = 1 - cos_half
+    return dr.square(dr.square(x)) * x
 
 
 def fresnel_ratio(r_0: mi.Float, falloff: mi.Float, squared: bool) -> mi.Float:
@@ -64,7 +73,7 @@ class Gain:
 
 
 class SpectralWeights:
-    """A table of (X, Y, Z, R₀) with one entry per nm, read with linear interpolation (algorithm 4.3, line 5)."""
+    """Table of (X, Y, Z, R₀) with one entry per nm, read with linear interpolation (algorithm 4.3, line 5)."""
 
     def __init__(
         self,
@@ -97,21 +106,21 @@ class SpectralWeights:
 
     def __call__(self, wavelength: mi.Float, active: mi.Bool) -> tuple[mi.Color3f, mi.Float]:
         """Return (X, Y, Z) per nm, and R₀, at a wavelength in nm; zero outside 380 to 780 nm."""
-        active = active & (wavelength >= SHORTEST - 1e-3) & (wavelength <= LONGEST + 1e-3)
-        value = interpolated(self.table, wavelength - SHORTEST, int(LONGEST - SHORTEST), active)
+        active = active & (wavelength >= MIN_WAVELENGTH - 1e-3) & (wavelength <= MAX_WAVELENGTH + 1e-3)
+        value = interpolated(self.table, wavelength - MIN_WAVELENGTH, int(MAX_WAVELENGTH - MIN_WAVELENGTH), active)
         return mi.Color3f(value.x, value.y, value.z), value.w
 
 
-def interpolated(table: PacketTable, place: mi.Float, last: int, active: mi.Bool) -> mi.Vector4f:
-    """Return packets 0 … `last` of a table, linear at `place`, constant beyond the ends, and zero if not `active`."""
-    place = dr.clip(place, 0, last)
-    index = mi.UInt32(dr.minimum(place, last - 1))
+def interpolated(table: PacketTable, position: mi.Float, last: int, active: mi.Bool) -> mi.Vector4f:
+    """Return a table's packets 0 … `last`, interpolated linearly at `position` (clamped), and zero if not `active`."""
+    position = dr.clip(position, 0, last)
+    index = mi.UInt32(dr.minimum(position, last - 1))
     below, above = table(index, active), table(index + 1, active)
-    return below + (place - mi.Float(index)) * (above - below)
+    return below + (position - mi.Float(index)) * (above - below)
 
 
 class Shader:
-    """Shades a tile: directions → linear RGB.
+    """Base class of the shaders of a tile: directions → linear RGB.
 
     Directions are unit vectors in the frame of the tile, z being the normal, and point away from the surface: ω_i to
     the light, ω_o to the viewer. An instance is bound to the Mitsuba variant in which it was made.
@@ -144,7 +153,7 @@ class Shader:
 
     @property
     def texel_reads(self) -> int:
-        """The largest number of texels read for one shading point."""
+        """Maximum number of texels read for one shading point."""
         raise NotImplementedError
 
     def rgb(
@@ -168,7 +177,7 @@ class Shader:
 
 
 class TextureShader(Shader):
-    """A shader that sums Taylor textures, wavelength by wavelength, into XYZ.
+    """Shader that sums Taylor textures, wavelength by wavelength, into XYZ.
 
     The relative radiance of algorithm 4.3 is
 
@@ -293,17 +302,17 @@ def trapezoid(
     result = mi.Color3f(0)
     index = mi.UInt32(0)
     while active & (index < WAVELENGTH_COUNT):
-        wavelength = SHORTEST + STEP * mi.Float(index)
+        wavelength = MIN_WAVELENGTH + WAVELENGTH_STEP * mi.Float(index)
         weight, r_0 = weights(wavelength, active)
         at_end = (index == 0) | (index == WAVELENGTH_COUNT - 1)
-        share = dr.select(at_end, 0.5 * STEP, STEP) * shader.fresnel(r_0, gain)
-        result += weight * (share * power(gain, wavelength * 1e-3, height_scale, active))
+        width = dr.select(at_end, 0.5 * WAVELENGTH_STEP, WAVELENGTH_STEP) * shader.fresnel(r_0, gain)
+        result += weight * (width * power(gain, wavelength * 1e-3, height_scale, active))
         index += 1
     return result
 
 
-def check_whole(name: str, value: int, least: int) -> int:
-    """Return `value` as an int; raise ValueError unless it is a whole number ≥ `least`."""
-    if isinstance(value, bool) or not isinstance(value, Integral) or value < least:
-        raise RequestError(f"{name}: got {value!r}, wanted a whole number ≥ {least}")
+def check_integer(name: str, value: int, minimum: int) -> int:
+    """Return `value` as an int; raise RequestError unless it is a whole number ≥ `minimum`."""
+    if isinstance(value, bool) or not isinstance(value, Integral) or value < minimum:
+        raise RequestError(f"{name}: got {value!r}, wanted a whole number ≥ {minimum}")
     return int(value)

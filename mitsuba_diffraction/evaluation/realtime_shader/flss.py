@@ -10,7 +10,7 @@ import numpy as np
 
 from .base import Gain, TextureShader
 
-REACH = 1  # texels on each side: a neighbourhood of 3 × 3
+RADIUS = 1  # of the neighbourhood of 3 × 3 texels
 
 
 class FLSS(TextureShader):
@@ -30,10 +30,10 @@ class FLSS(TextureShader):
 
     @property
     def texels_per_term(self) -> int:
-        return (2 * REACH + 1) ** 2
+        return (2 * RADIUS + 1) ** 2
 
     @property
-    def left_out(self) -> float:
+    def truncated_fraction(self) -> float:
         """e^{−(3/2)²/(σ_f T)²} with the longer side T: bound of the truncated fraction of the power of a line."""
         return float(np.exp(-((1.5 / (self.sigma * max(self.tile_size))) ** 2)))
 
@@ -68,13 +68,13 @@ class FLSS(TextureShader):
         height_scale: mi.Float,
         window: Callable[[mi.Int32, mi.Int32], mi.Float],
         active: mi.Bool,
-        reach: int = REACH,
+        radius: int = RADIUS,
     ) -> mi.Float:
         """Return |Σ φ F|² or Σ φ² |F|² around the position (x, y)."""
         anchor = dr.floor if self.quirks.floor_anchor else dr.round
-        # Far outside the texture nothing is read; clamping keeps the conversion in range.
-        first = tuple(mi.Int32(dr.clip(anchor(c), -1e6, 1e6)) - reach for c in (x, y))
+        # Clamping keeps the conversion in range; far outside the texture nothing is read.
+        first = tuple(mi.Int32(dr.clip(anchor(c), -1e6, 1e6)) - radius for c in (x, y))
         kappa = -dr.two_pi * gain.w / wavelength * height_scale
-        size = (2 * reach + 1, 2 * reach + 1)
+        size = (2 * radius + 1, 2 * radius + 1)
         complex_sum, powers = self.textures.over(first, size, kappa, window, active)
         return complex_sum if self.quirks.complex_window_sum else powers

@@ -75,7 +75,7 @@ class GEM(Shader):
         start, width = (0.5, 0.5) if self.quirks.infrared_rainbow else (0.38, 0.4)  # µm
         for n in range(1, ORDERS + 1):
             y = (path / n - start) / width
-            result += mi.Color3f(*(dr.maximum(1 - dr.square(4 * (y - middle)), 0) for middle in _RAINBOW))
+            result += mi.Color3f(*(dr.maximum(1 - dr.square(4 * (y - peak)), 0) for peak in _RAINBOW))
         return dr.select(active, weights.luminance * result, 0)
 
 

@@ -21,45 +21,46 @@ from .surfaces import Surface, along_pattern, heights_of, surfaces_of, transmitt
 
 PARAMETERS = (
     Parameter("variant", "string", "flss, nmm, pq or gem", "flss"),
-    Parameter("as_published", "boolean", "with all of the published shader's peculiarities, or with none", "true"),
+    Parameter("as_published", "boolean", "with all peculiarities of the published shader, or with none", "true"),
     Parameter(
         "fresnel_squared, window_pi, …",
         "boolean",
-        "one peculiarity on or off, whatever as_published says; `Quirks` lists them",
+        "one peculiarity on or off, overriding as_published; `Quirks` lists them",
     ),
     Parameter("terms", "integer", "Taylor terms; not for gem", "37"),
     Parameter("interpolation", "string", "sinc or linear; for pq only", "sinc"),
     Parameter("spacing", "float", "the period d in µm, by default that of the strongest wave along x; for gem only"),
     Parameter("roughness", "float", "of the highlight, 1/µm; for gem only", "5"),
-    Parameter("shadows", "boolean", "test whether something stands before the light", "false"),
-    Parameter("diffuse_weight", "float", "the share of a BSDF below the grating; the thesis gives no number", "0.5"),
+    Parameter("shadows", "boolean", "test whether a surface blocks the light", "false"),
+    Parameter("diffuse_weight", "float", "weight of a BSDF below the grating; the thesis gives no number", "0.5"),
 )
 
-MANUAL = f"""The real-time shader of structural colour, on the same scene that a path tracer renders.
+MANUAL = f"""Real-time shader of structural colour, for the scenes that a path tracer renders.
 
 Parameters (XML or dictionary):
 {listed(PARAMETERS)}
 
 Gratings (`diffraction_grating`, also inside `twosided`) are shaded from their heights, which must come from a recipe or
-a profile. Rigorous theory is refused, and coats are ignored. All other BSDFs are shaded as they are. Light comes
-straight from directional and point lights; other lights, the background and reflections between surfaces are left out.
+a profile. Rigorous theory is refused, and coats are ignored. All other BSDFs are evaluated unchanged. Only direct light
+of directional and point lights is shaded; other lights, the background and interreflection are omitted.
 
-The shader gives RGB. The picture is light of that colour, as a spectrum (`Emission`), so that any film records it; a
-colour that sRGB cannot show has negative radiance at some wavelengths. Corrected, FLSS and NMM are in the scene's units
-and show the direct light of a path tracer with fresnel="schlick", without a coat and without the factor E of the BRDF.
+The shader computes RGB. It is converted to a spectrum of that colour (`Emission`), which any film can record; a
+colour outside the gamut of sRGB has negative radiance at some wavelengths. Corrected, FLSS and NMM are in the scene's
+units and show the direct light of a path tracer with fresnel="schlick", without a coat and without the factor E of the
+BRDF.
 """
 
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """The lights of a scene and, for each surface, its shader with one table per light."""
+    """Lights of a scene and, for each surface, its shader with one table per light."""
 
     lights: list[Light]
     surfaces: list[tuple[Surface, Shader, list[SpectralWeights]]]
 
 
 def define() -> type:
-    """Define the plugin class for the current variant, to which its base class belongs."""
+    """Define the plugin class for the current variant, as its base class depends on the variant."""
 
     class DiffractionShader(mi.SamplingIntegrator):
         __doc__ = MANUAL
@@ -81,7 +82,7 @@ def define() -> type:
             self._shaders: list[tuple[Layers, Shader]] = []
             self.prepared: Prepared | None = None
 
-        def take(self, quirks: Quirks) -> None:
+        def set_quirks(self, quirks: Quirks) -> None:
             """Set the quirks for the next `prepare`; existing textures are kept."""
             self.quirks = quirks
             self._shaders = [(grating, shader.with_quirks(quirks)) for grating, shader in self._shaders]
@@ -121,8 +122,8 @@ def define() -> type:
             medium: mi.Medium | None = None,
             active: mi.Bool = True,
         ) -> tuple[mi.Spectrum, mi.Bool, list[mi.Float]]:
-            # This runs once per picture: lights and materials may have changed since the last.
-            # (Overriding `render` and calling that of Mitsuba would leave its Ctrl-C handler installed.)
+            # Once per picture, as lights and materials may have changed. (Overriding `render` and calling Mitsuba's
+            # would leave its Ctrl-C handler installed.)
             self.prepare(scene)
             rgb, radiance, active = self.shade(scene, ray, active)
             radiance += self.emission(rgb, ray.wavelengths, active)
@@ -141,10 +142,10 @@ def define() -> type:
             si = scene.ray_intersect(ray, active)
             active = active & si.is_valid()
             bsdf = si.bsdf(ray)
-            places = [active & surface.holds(bsdf, si.wi) for surface, _, _ in prepared.surfaces]
-            plain = active
+            masks = [active & surface.contains(bsdf, si.wi) for surface, _, _ in prepared.surfaces]
+            on_other = active
             for surface, _, _ in prepared.surfaces:
-                plain = plain & (surface.is_of(bsdf) ^ True)
+                on_other = on_other & (surface.is_of(bsdf) ^ True)
             rgb, radiance = mi.Color3f(0), mi.UnpolarizedSpectrum(0)
             for index, light in enumerate(prepared.lights):
                 ds, falloff, irradiance = light.sample(si, active)
@@ -152,31 +153,31 @@ def define() -> type:
                 if self.shadows:
                     lit = scene.ray_test(si.spawn_ray_to(ds.p), active) ^ True
                 direction = si.to_local(ds.d)
-                value = mi.unpolarized_spectrum(bsdf.eval(mi.BSDFContext(), si, direction, plain & lit))
-                radiance += dr.select(plain & lit, value * irradiance, 0)
-                for (surface, shader, weights), here in zip(prepared.surfaces, places, strict=True):
-                    here = here & lit
+                value = mi.unpolarized_spectrum(bsdf.eval(mi.BSDFContext(), si, direction, on_other & lit))
+                radiance += dr.select(on_other & lit, value * irradiance, 0)
+                for (surface, shader, weights), mask in zip(prepared.surfaces, masks, strict=True):
+                    lit_mask = mask & lit
                     layers = surface.layers
-                    own = mi.SurfaceInteraction3f(si)
-                    own.wi = mi.Vector3f(si.wi.x, si.wi.y, surface.side * si.wi.z)
+                    local_si = mi.SurfaceInteraction3f(si)
+                    local_si.wi = mi.Vector3f(si.wi.x, si.wi.y, surface.side * si.wi.z)
                     wi = mi.Vector3f(direction.x, direction.y, surface.side * direction.z)
                     colour = shader.rgb(
-                        along_pattern(layers, own, wi, here),
-                        along_pattern(layers, own, own.wi, here),
+                        along_pattern(layers, local_si, wi, lit_mask),
+                        along_pattern(layers, local_si, local_si.wi, lit_mask),
                         weights[index],
-                        here,
+                        lit_mask,
                         layers.grating.scales.height.value,
                     )
-                    share = mi.Float(1)
+                    grating_weight = mi.Float(1)
                     if layers.base is not None:
-                        below = mi.unpolarized_spectrum(layers.base.bsdf.eval(mi.BSDFContext(), own, wi, here))
+                        below = mi.unpolarized_spectrum(layers.base.bsdf.eval(mi.BSDFContext(), local_si, wi, lit_mask))
                         if self.quirks.constant_blend:
-                            share = mi.Float(1 - self.diffuse_weight)
+                            grating_weight = mi.Float(1 - self.diffuse_weight)
                             below *= self.diffuse_weight
                         else:
-                            below *= transmitted(layers, own, mi.Frame3f.cos_theta(wi), here)
-                        radiance += dr.select(here, below * irradiance, 0)
-                    rgb += dr.select(here, share * falloff * colour, 0)
+                            below *= transmitted(layers, local_si, mi.Frame3f.cos_theta(wi), lit_mask)
+                        radiance += dr.select(lit_mask, below * irradiance, 0)
+                    rgb += dr.select(lit_mask, grating_weight * falloff * colour, 0)
             if self.quirks.power_gamma:
                 rgb = decode(encode(rgb, True))
             return dr.select(active, rgb, 0), radiance, active

@@ -36,10 +36,10 @@ class Light:
         self.emitter = emitter
         self.at_point = emitter.class_name() == "PointLight"
         # At distance one from a point light; directional light is uniform.
-        place = mi.Point3f(mi.traverse(emitter)["position"]) if self.at_point else mi.Point3f(0)
+        origin = mi.Point3f(mi.traverse(emitter)["position"]) if self.at_point else mi.Point3f(0)
 
         def irradiance(si: mi.SurfaceInteraction3f) -> mi.UnpolarizedSpectrum:
-            si.p = place + mi.Vector3f(0, 0, 1)
+            si.p = origin + mi.Vector3f(0, 0, 1)
             _, value = emitter.sample_direction(si, mi.Point2f(0.5), True)
             return mi.unpolarized_spectrum(value)
 
@@ -63,7 +63,7 @@ def lights_of(scene: mi.Scene) -> list[Light]:
     found = [Light(emitter) for emitter in scene.emitters() if emitter.class_name() in Light.KINDS]
     if not found:
         raise RequestError(
-            "diffraction_shader: the scene has no directional or point light, and it knows no other; in place of a "
-            "sun's disc give it a directional light"
+            "diffraction_shader: the scene has no directional or point light, and no others are supported; replace a "
+            "sun with a disc by a directional light"
         )
     return found

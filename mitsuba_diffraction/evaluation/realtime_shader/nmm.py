@@ -9,10 +9,10 @@ import mitsuba as mi
 import numpy as np
 
 from .base import Gain, SpectralWeights, trapezoid
-from .flss import FLSS, REACH
-from .tristimulus import LONGEST, SHORTEST, STEP, WAVELENGTH_COUNT
+from .flss import FLSS, RADIUS
+from .tristimulus import MAX_WAVELENGTH, MIN_WAVELENGTH, WAVELENGTH_COUNT, WAVELENGTH_STEP
 
-_FAR = 4.0  # σ_f, at which the power of a line has fallen to e^{−4²} = 1e-7
+_MAX_DISTANCE = 4.0  # from the centre of a line, in σ_f: its power is e^{−4²} = 1e-7 of the maximum there
 
 
 class NMM(FLSS):
@@ -36,71 +36,71 @@ class NMM(FLSS):
 
     @property
     def texel_reads(self) -> int:
-        """At |u| = 2, the maximum."""
-        longest = max(self.tile_size)
-        most = np.floor(2e3 * longest / SHORTEST) - np.ceil(2e3 * longest / LONGEST) + 1
-        return round(self.textures.terms * (WAVELENGTH_COUNT + most * self.texels_per_term))
+        """Maximum number of texels read for one shading point, at |u| = 2."""
+        max_path = 2e3 * max(self.tile_size)  # nm
+        max_orders = np.floor(max_path / MIN_WAVELENGTH) - np.ceil(max_path / MAX_WAVELENGTH) + 1
+        return round(self.textures.terms * (WAVELENGTH_COUNT + max_orders * self.texels_per_term))
 
     def integral(self, gain: Gain, weights: SpectralWeights, height_scale: mi.Float) -> mi.Color3f:
         slope = dr.sqrt(dr.square(gain.u) + dr.square(gain.v))
-        near = slope * (1e3 / LONGEST) < _FAR * self.sigma
+        near = slope * (1e3 / MAX_WAVELENGTH) < _MAX_DISTANCE * self.sigma
         zero = trapezoid(self, self._order_zero, gain, weights, height_scale, gain.active & near)
 
         along_x = dr.abs(gain.u) * self.tile_size[0] >= dr.abs(gain.v) * self.tile_size[1]
         path = dr.select(along_x, dr.abs(gain.u) * self.tile_size[0], dr.abs(gain.v) * self.tile_size[1]) * 1e3  # nm
-        first = dr.maximum(mi.Int32(dr.ceil(path / LONGEST)), 1)
-        last = mi.Int32(dr.floor(path / SHORTEST))
+        first = dr.maximum(mi.Int32(dr.ceil(path / MAX_WAVELENGTH)), 1)
+        last = mi.Int32(dr.floor(path / MIN_WAVELENGTH))
 
-        def share(n: mi.Int32) -> tuple[mi.Float, mi.Float]:
-            """Return λ_n in nm, and |P|² times the width in nm that it represents."""
+        def weighted_power(n: mi.Int32) -> tuple[mi.Float, mi.Float]:
+            """Return λ_n in nm, and |P|² times the width in nm that λ_n represents."""
             wavelength = path / mi.Float(n)
             x, y = self.position(gain, wavelength * 1e-3)
             if self.quirks.no_jacobian:
-                window, width = self.window(x, y), mi.Float(STEP)
+                window, width = self.window(x, y), mi.Float(WAVELENGTH_STEP)
             else:
                 # p is the distance perpendicular to (u, v). Other orders of the main axis have their own wavelengths
                 # and must not be counted twice.
-                window = self._own_line(x, y, along_x, dr.abs(dr.select(along_x, gain.u, gain.v)) / slope)
+                window = self._line_window(x, y, along_x, dr.abs(dr.select(along_x, gain.u, gain.v)) / slope)
                 width = float(np.sqrt(np.pi)) * self.sigma * dr.square(wavelength) * 1e-3 / slope
-            power = self.windowed(gain, x, y, wavelength * 1e-3, height_scale, window, gain.active, REACH)
+            power = self.windowed(gain, x, y, wavelength * 1e-3, height_scale, window, gain.active, RADIUS)
             return wavelength, power * width
 
-        return zero + _over_orders(self, first, last, share, gain, weights)
+        return zero + _sum_over_orders(self, first, last, weighted_power, gain, weights)
 
-    def _own_line(
+    def _line_window(
         self, x: mi.Float, y: mi.Float, along_x: mi.Bool, tilt: mi.Float
     ) -> Callable[[mi.Int32, mi.Int32], mi.Float]:
         """Return φ at the distance p, for the texels whose order along the main axis is the closest."""
         phi = self.window(x, y, dr.select(along_x, 0, tilt), dr.select(along_x, tilt, 0))
         main = dr.round(dr.select(along_x, x, y))
 
-        def own(m_x: mi.Int32, m_y: mi.Int32) -> mi.Float:
+        def line_window(m_x: mi.Int32, m_y: mi.Int32) -> mi.Float:
             return dr.select(mi.Float(dr.select(along_x, m_x, m_y)) == main, phi(m_x, m_y), 0)
 
-        return own
+        return line_window
 
     def _order_zero(self, gain: Gain, wavelength: mi.Float, height_scale: mi.Float, active: mi.Bool) -> mi.Float:
         """Return φ² |F_0|²."""
         x, y = self.position(gain, wavelength)
         zero = mi.Float(0)
-        return self.windowed(gain, zero, zero, wavelength, height_scale, self.window(x, y), active, reach=0)
+        return self.windowed(gain, zero, zero, wavelength, height_scale, self.window(x, y), active, radius=0)
 
 
 @dr.syntax
-def _over_orders(
+def _sum_over_orders(
     shader: NMM,
     first: mi.Int32,
     last: mi.Int32,
-    share: Callable[[mi.Int32], tuple[mi.Float, mi.Float]],
+    weighted_power: Callable[[mi.Int32], tuple[mi.Float, mi.Float]],
     gain: Gain,
     weights: SpectralWeights,
 ) -> mi.Color3f:
-    """Return Σ_n F/F₀ share(n) S (x̄, ȳ, z̄)(λ_n)."""
+    """Return Σ_n F/F₀ weighted_power(n) S (x̄, ȳ, z̄)(λ_n)."""
     result = mi.Color3f(0)
     n = mi.Int32(first)
     while gain.active & (n <= last):
-        wavelength, amount = share(n)
+        wavelength, power = weighted_power(n)
         weight, r_0 = weights(wavelength, gain.active)
-        result += weight * (amount * shader.fresnel(r_0, gain))
+        result += weight * (power * shader.fresnel(r_0, gain))
         n += 1
     return result

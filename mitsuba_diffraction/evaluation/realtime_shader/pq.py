@@ -9,7 +9,7 @@ import mitsuba as mi
 
 from ...errors import RequestError
 from ...surface.heightfield import HeightField
-from .base import Gain, TextureShader, check_whole
+from .base import Gain, TextureShader, check_integer
 from .quirks import Quirks
 
 _AT_INTEGER = 2.0**-13.5  # a quarter of √ε in float32
@@ -77,8 +77,8 @@ class PQ(TextureShader):
         D(t/N; N)/N = sin(πt)/(N sin(πt/N)),     t = q_j T_j − m_j,
 
     of a tile of N pixels, which is exact if summed over all texels and tends to sinc(t) for large N. The published
-    neighbourhood is 3 × 3. The origin is the centre of the tile, so that the kernel is real. Frequencies beyond the
-    Nyquist limit are zero. The thesis sums n = 0 … N, i.e. N + 1 tiles (eq. 3.33).
+    neighbourhood is 3 × 3. The origin is the centre of the tile, so that the kernel is real. The amplitude is
+    zero outside the Nyquist limit. The thesis sums n = 0 … N, i.e. N + 1 tiles (eq. 3.33).
     """
 
     own_quirks = (*TextureShader.own_quirks, "wrong_product")
@@ -91,7 +91,7 @@ class PQ(TextureShader):
         *,
         tiles: tuple[int, int] | None = None,
         interpolation: str = "sinc",
-        reach: int = 1,
+        radius: int = 1,
         **settings: object,
     ) -> None:
         """Set up the shader with the arguments of `TextureShader` and those below.
@@ -99,18 +99,18 @@ class PQ(TextureShader):
         Args:
             tiles: (P, Q); default: as many as the coherence length covers.
             interpolation: "sinc" or "linear".
-            reach: of the sinc kernel, in texels on each side.
+            radius: of the sinc kernel, in texels on each side.
         """
         super().__init__(height_field, quirks, **settings)
         if interpolation not in INTERPOLATIONS:
             raise RequestError(f"interpolation: got {interpolation!r}, wanted one of {', '.join(INTERPOLATIONS)}")
         if tiles is None:
             tiles = tuple(max(1, round(self.coherence_length / size)) for size in self.tile_size)
-        self.tiles = tuple(check_whole("tiles", count, 1) for count in tiles)
+        self.tiles = tuple(check_integer("tiles", count, 1) for count in tiles)
         if len(self.tiles) != 2:
             raise RequestError(f"tiles: got {tiles!r}, wanted two whole numbers ≥ 1, along x and y")
         self.interpolation = interpolation
-        self.reach = check_whole("reach", reach, 1)
+        self.radius = check_integer("radius", radius, 1)
 
     @property
     def peak(self) -> float:
@@ -119,7 +119,7 @@ class PQ(TextureShader):
 
     @property
     def texels_per_term(self) -> int:
-        return (2 if self.interpolation == "linear" else 2 * self.reach + 1) ** 2
+        return (2 if self.interpolation == "linear" else 2 * self.radius + 1) ** 2
 
     def power(self, gain: Gain, wavelength: mi.Float, height_scale: mi.Float, active: mi.Bool) -> mi.Float:
         x, y = gain.u * self.tile_size[0] / wavelength, gain.v * self.tile_size[1] / wavelength
@@ -129,7 +129,7 @@ class PQ(TextureShader):
             first, size = [dr.floor(c) for c in (x, y)], (2, 2)
         else:
             anchor = dr.floor if self.quirks.floor_anchor else dr.round
-            first, size = [anchor(c) - self.reach for c in (x, y)], (2 * self.reach + 1,) * 2
+            first, size = [anchor(c) - self.radius for c in (x, y)], (2 * self.radius + 1,) * 2
         corner = tuple(mi.Int32(dr.clip(c, -1e6, 1e6)) for c in first)
         kappa = -dr.two_pi * gain.w / wavelength * height_scale
         tile, _ = self.textures.over(corner, size, kappa, self._kernel(x, y), active)

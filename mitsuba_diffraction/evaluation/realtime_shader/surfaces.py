@@ -21,7 +21,7 @@ class Surface:
     Attributes:
         bsdf: the BSDF of the shape, the grating or a `twosided` around it.
         layers: of the `diffraction_grating`; the shader ignores a coat.
-        side: 1 for the front, −1 for the back.
+        side: 1 for the front face, −1 for the back face.
     """
 
     bsdf: mi.BSDF
@@ -32,7 +32,7 @@ class Surface:
         """Return whether a point has the BSDF of this surface."""
         return bsdf == mi.BSDFPtr(self.bsdf)
 
-    def holds(self, bsdf: mi.BSDF, wo: mi.Vector3f) -> mi.Bool:
+    def contains(self, bsdf: mi.BSDF, wo: mi.Vector3f) -> mi.Bool:
         """Return whether a point with this BSDF, seen from ω_o, lies on this side of this surface."""
         return self.is_of(bsdf) & (self.side * wo.z > 0)
 
@@ -59,8 +59,8 @@ def surfaces_of(scene: mi.Scene) -> list[Surface]:
             found += [Surface(bsdf, part.layers, side) for part, side in sides if is_grating(part)]
         elif any(map(contains_grating, parts)):
             raise RequestError(
-                f"diffraction_shader: a diffraction_grating stands inside {bsdf.class_name()}, wanted on a shape or "
-                "inside twosided"
+                f"diffraction_shader: a diffraction_grating is nested in {bsdf.class_name()}, wanted on a shape or "
+                "in twosided"
             )
     if any(isinstance(surface.layers.grating.spectrum, RigorousSpectrum) for surface in found):
         raise RequestError("diffraction_shader: got a grating with theory=rigorous, wanted one of scalar theory")
@@ -71,25 +71,25 @@ def heights_of(layers: Layers) -> tuple[HeightField, float]:
     """Return the height field and its coherence length in µm.
 
     Raises:
-        ValueError: for a saved spectrum, which does not hold heights.
+        ValueError: for a saved spectrum, which does not contain heights.
     """
     recipe = layers.grating.recipe
     if recipe is None:
         raise RequestError(
-            "diffraction_shader: it needs heights, and a saved spectrum does not hold them; give the grating a "
+            "diffraction_shader: it needs heights, which a saved spectrum does not contain; give the grating a "
             "recipe (filename=….toml) or a profile"
         )
     return recipe.height_field(), float(recipe.settings.coherence_length)
 
 
 def along_pattern(layers: Layers, si: mi.SurfaceInteraction3f, omega: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:
-    """Return a direction of the shading frame along the pattern's axes."""
+    """Return a direction, given in the shading frame, in the frame of the pattern."""
     return rotated(omega, *layers.grating.frame(si, active))
 
 
 def transmitted(
     layers: Layers, si: mi.SurfaceInteraction3f, cos_o: mi.Float, active: mi.Bool
 ) -> mi.UnpolarizedSpectrum:
-    """Return (1 − R_i)(1 − R_o), what the surface lets through to the base and back."""
+    """Return (1 − R_i)(1 − R_o), the transmittance of the surface to the base and out again."""
     transmittance = layers.grating.transmittance
     return transmittance(si, mi.Frame3f.cos_theta(si.wi), active) * transmittance(si, cos_o, active)

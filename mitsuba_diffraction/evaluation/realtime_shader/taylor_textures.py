@@ -1,4 +1,4 @@
-"""The Fourier transforms of the powers of a height field as textures (algorithm 4.1), and sums over their texels."""
+"""Fourier transforms of the powers of a height field as textures (algorithm 4.1), and sums over their texels."""
 
 from __future__ import annotations
 
@@ -72,9 +72,9 @@ class TaylorTextures:
     def amplitude(self, m_x: mi.Int32, m_y: mi.Int32, kappa: mi.Float, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
         """Return real and imaginary part of F_m(κ); zero where the order lies outside the texture."""
         column, row = m_x + self.columns // 2, m_y + self.rows // 2
-        held = active & (column >= 0) & (column < self.columns) & (row >= 0) & (row < self.rows)
-        first = mi.UInt32(dr.select(held, (row * self.columns + column) * self.terms, 0))
-        return _taylor_series(self.table, first, kappa * self.height, self.terms, held)
+        inside = active & (column >= 0) & (column < self.columns) & (row >= 0) & (row < self.rows)
+        first = mi.UInt32(dr.select(inside, (row * self.columns + column) * self.terms, 0))
+        return _taylor_series(self.table, first, kappa * self.height, self.terms, inside)
 
     def over(
         self,

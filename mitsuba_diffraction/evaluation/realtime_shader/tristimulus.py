@@ -11,7 +11,7 @@ from scipy.optimize import lsq_linear
 from ...color import daylight, matching_functions
 from ...settings import VISIBLE
 
-SHORTEST, LONGEST, STEP = 380.0, 780.0, 5.0  # nm
+MIN_WAVELENGTH, MAX_WAVELENGTH, WAVELENGTH_STEP = 380.0, 780.0, 5.0  # nm
 WAVELENGTH_COUNT = 81  # from the shortest to the longest, in such steps
 
 CIE_RGB = np.array([[0.41847, -0.15866, -0.082835], [-0.091169, 0.25243, 0.015708], [0.00092090, -0.0025498, 0.17860]])
@@ -23,7 +23,7 @@ FLAT = 106.857
 
 def wavelengths() -> NDArray[np.float64]:
     """Return the nodes of the tables below, 1 nm apart: (401,), nm."""
-    return np.arange(SHORTEST, LONGEST + 0.5)
+    return np.arange(MIN_WAVELENGTH, MAX_WAVELENGTH + 0.5)
 
 
 @lru_cache(maxsize=1)
@@ -33,7 +33,7 @@ def d65_weights() -> NDArray[np.float64]:
     Normalised to Y = 1 for the integral of the shader, the trapezoidal rule at 5 nm.
     """
     weights = daylight(wavelengths())[:, None] * matching_functions(wavelengths())
-    return weights / np.trapezoid(weights[:: int(STEP), 1], dx=STEP)
+    return weights / np.trapezoid(weights[:: int(WAVELENGTH_STEP), 1], dx=WAVELENGTH_STEP)
 
 
 def light_weights(spectrum: ArrayLike) -> NDArray[np.float64]:
@@ -43,7 +43,7 @@ def light_weights(spectrum: ArrayLike) -> NDArray[np.float64]:
 
 def d65_white() -> NDArray[np.float64]:
     """Return XYZ of D65 by the integral of the shader, Y = 1: (3,)."""
-    return np.trapezoid(d65_weights()[:: int(STEP)], dx=STEP, axis=0)
+    return np.trapezoid(d65_weights()[:: int(WAVELENGTH_STEP)], dx=WAVELENGTH_STEP, axis=0)
 
 
 def rgb_matrix(*, cie_rgb_matrix: bool, d65_twice: bool) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""Gratings of which scalar theory is known in closed form, evaluated through the BSDF.
+"""Gratings for which scalar theory has a closed form, evaluated through the BSDF.
 
 Directions of the orders (the grating equation), their powers, and energy conservation.
 """
@@ -21,19 +21,19 @@ from .record import Check, Record
 
 Array = NDArray[np.float64]
 
-BOUND = 1e-4
+MAX_ERROR = 1e-4
 WAVELENGTHS = (0.42, 0.55, 0.68)  # µm
 ANGLES = (0.0, 20.0, 50.0)  # degrees
 PERIOD = 2.5  # µm
-NARROW = {"coherence_length": 200.0}  # µm: η_m(κ), K and G change little over a lobe
+NARROW_LOBES = {"coherence_length": 200.0}  # µm: η_m(κ), K and G change little over a lobe
 
 
-# ---------------------------------------------------------------- where light leaves
+# ---------------------------------------------------------------- directions of the orders
 
 
 def compare_directions(height_field: HeightField, theta: float, phi: float) -> Record:
     """Compare peaks of the BSDF over the hemisphere with u = −ω_i,x − mλ/period, v = −ω_i,y; the period is 2.5 µm."""
-    spectrum = spectrum_of(height_field, **NARROW)
+    spectrum = spectrum_of(height_field, **NARROW_LOBES)
     bsdf = grating(spectrum, conserve=False)
     wi = direction(theta, phi)
     expected, found = [], []
@@ -42,7 +42,7 @@ def compare_directions(height_field: HeightField, theta: float, phi: float) -> R
             m = np.rint((-peak[0] - wi[0]) * PERIOD / wavelength)
             expected.append([-wi[0] - m * wavelength / PERIOD, -wi[1]])
             found.append(peak)
-    return Record.worst(expected, found, BOUND, f"{len(found)} orders, direction cosines")
+    return Record.at_max_error(expected, found, MAX_ERROR, f"{len(found)} orders, direction cosines")
 
 
 def _peaks(bsdf: object, wi: Array, wavelength: float, width: float) -> list[Array]:
@@ -51,35 +51,35 @@ def _peaks(bsdf: object, wi: Array, wavelength: float, width: float) -> list[Arr
     A centre is the mean of (u, v) weighted by f/(K G), which removes the variation of K G over a lobe.
     """
 
-    def look(u: Array, v: Array) -> Array:
+    def evaluate(u: Array, v: Array) -> Array:
         return density(bsdf, wi, np.stack([u, v, np.sqrt(1 - u**2 - v**2)], axis=-1), wavelength)
 
-    side = np.arange(-1, 1, 2 * width)
-    u, v = (axis.ravel() for axis in np.meshgrid(side, side))
+    axis = np.arange(-1, 1, 2 * width)
+    u, v = (grid.ravel() for grid in np.meshgrid(axis, axis))
     inside = np.hypot(u, v) < np.sin(np.deg2rad(70))
     u, v = u[inside], v[inside]
-    seen = look(u, v)
-    candidates = np.flatnonzero(seen > 0.02 * seen.max())
+    values = evaluate(u, v)
+    candidates = np.flatnonzero(values > 0.02 * values.max())
     peaks = []
     offset = np.linspace(-8, 8, 81) * width
     while len(candidates):
-        strongest = candidates[np.argmax(seen[candidates])]
+        strongest = candidates[np.argmax(values[candidates])]
         near = np.hypot(u[candidates] - u[strongest], v[candidates] - v[strongest]) < 12 * width
         candidates = candidates[~near]
         x, y = (axis.ravel() for axis in np.meshgrid(u[strongest] + offset, v[strongest] + offset))
-        weights = look(x, y)
+        weights = evaluate(x, y)
         peaks.append(np.array([x @ weights, y @ weights]) / weights.sum())
     return peaks
 
 
-# ---------------------------------------------------------------- how much of it
+# ---------------------------------------------------------------- powers of the orders
 
 
 def compare_orders(
     height_field: HeightField, closed_form: Callable[[Array, Array], Array], azimuth: float = 0.0
 ) -> Record:
     """Compare η_m of the orders at up to 80° with `closed_form`, which takes m (n, 2) and κ (n,)."""
-    spectrum = spectrum_of(height_field, **NARROW)
+    spectrum = spectrum_of(height_field, **NARROW_LOBES)
     bsdf = grating(spectrum, conserve=False)
     expected, found = [], []
     for angle in ANGLES:
@@ -90,34 +90,34 @@ def compare_orders(
             expected.append(closed_form(m, kappa))
             found.append(powers)
     expected, found = np.concatenate(expected), np.concatenate(found)
-    return Record.worst(expected, found, BOUND, f"{len(found)} orders, 0 to 50°, 420 to 680 nm")
+    return Record.at_max_error(expected, found, MAX_ERROR, f"{len(found)} orders, 0 to 50°, 420 to 680 nm")
 
 
 def _binary(m: Array, kappa: Array, depth: float) -> Array:
     """Return cos²(κd/2) for the specular order, (2/πm)² sin²(κd/2) for odd orders, zero for even ones; half duty."""
     odd = m[:, 0] % 2 == 1
     with np.errstate(divide="ignore"):
-        share = np.where(odd, (2 / (np.pi * m[:, 0])) ** 2, 0) * np.sin(kappa * depth / 2) ** 2
-    return np.where(m[:, 0] == 0, np.cos(kappa * depth / 2) ** 2, share)
+        odd_power = np.where(odd, (2 / (np.pi * m[:, 0])) ** 2, 0) * np.sin(kappa * depth / 2) ** 2
+    return np.where(m[:, 0] == 0, np.cos(kappa * depth / 2) ** 2, odd_power)
 
 
 def _literature() -> Record:
     """Compare orders of a binary grating of phase π, transmitted into n = 1.5, with published FDTD results."""
-    # n − 1 = 1/2 times 0.5 µm delays by half of 0.5 µm; in reflection at normal incidence a depth of λ/4 does.
+    # Transmitted light is delayed by (n − 1) · 0.5 µm = λ/2; in reflection a depth of λ/4 has the same effect.
     transmitted = 1 - 0.04
     published = np.array([0.3891, 0.0429, 0.0152, 0.0076]) / transmitted
-    spectrum = spectrum_of(gratings.lamellar(10.0, 0.125), **NARROW)
+    spectrum = spectrum_of(gratings.lamellar(10.0, 0.125), **NARROW_LOBES)
     bsdf = grating(spectrum, conserve=False)
     m = np.stack([[1, 3, 5, 7], [0, 0, 0, 0]], axis=-1)
     found, _ = order_powers(bsdf, spectrum, direction(0), m, 0.5)
-    return Record.worst(published, found, 1e-3, "orders 1, 3, 5, 7, shares of the light that enters (n = 1.5)")
+    return Record.at_max_error(published, found, 1e-3, "orders 1, 3, 5, 7, fractions of transmitted light (n = 1.5)")
 
 
 # ---------------------------------------------------------------- mirror, energy, reciprocity
 
 
 def _flat() -> Record:
-    """Compare a flat mirror with K N(q; σ_q²)/λ² as a share of its peak, out to 3 σ_q."""
+    """Compare a flat mirror with K N(q; σ_q²)/λ² as a fraction of its peak, up to 3 σ_q."""
     spectrum = spectrum_of(HeightField(np.zeros((1, 4)), 0.05, "flat mirror"))
     bsdf = grating(spectrum)
     sigma = lobe_width(spectrum.coherence_length)
@@ -130,7 +130,7 @@ def _flat() -> Record:
             peak = 1 / (wavelength**2 * 2 * np.pi * sigma**2)
             found.append(brdf(bsdf, wi, wo, wavelength) / peak)
             expected.append(k_g_between(wi, wo) * np.exp(-((offset / sigma) ** 2).sum(-1) / 2))
-    return Record.worst(expected, found, BOUND, "share of the peak")
+    return Record.at_max_error(expected, found, MAX_ERROR, "fraction of the peak")
 
 
 SINUSOID, BLAZE = gratings.sinusoidal(PERIOD, 0.3), gratings.blazed(PERIOD, 0.25, samples=2048)
@@ -163,7 +163,9 @@ CHECKS = (
         lambda: compare_directions(SINUSOID, 25, 0),
         "sin θ_o = sin θ_i + mλ/period",
     ),
-    _check("grating equation, conical incidence", lambda: compare_directions(SINUSOID, 40, 65), "conical form, v kept"),
+    _check(
+        "grating equation, conical incidence", lambda: compare_directions(SINUSOID, 40, 65), "conical form, v constant"
+    ),
     _check("sinusoid: orders J_m²(κ depth/2)", lambda: compare_orders(SINUSOID, sinusoid_orders), "Jacobi–Anger"),
     _check(
         "binary: orders (2/πm)² sin²(κ depth/2)",

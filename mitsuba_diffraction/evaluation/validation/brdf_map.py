@@ -1,4 +1,4 @@
-"""BRDF maps: the colours that a surface sends into all directions from one light, as a viewer would see them."""
+"""BRDF maps: the colours of a surface, lit from one direction, over all viewing directions."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ PROJECTIONS = ("hemisphere", "uv")
 
 @dataclass(frozen=True, eq=False)
 class BRDFMap:
-    """Colours over directions.
+    """Colours over viewing directions.
 
     Attributes:
-        surface: what was evaluated.
+        surface: the evaluated surface.
         method: one of `MAP_METHODS`.
         projection: "hemisphere": a disc, the radius θ_o and the angle φ_o of the direction to the viewer. "uv": the
             plane of (u, v), minus the sums of the direction cosines of light and viewer, where an order m of a tile
             lies at (u, v) = λ m/T for any direction of the light.
         incidence: (θ_i, φ_i) in degrees.
         x, y: (side,) centres of the pixels: θ_o cos φ_o and θ_o sin φ_o in degrees, or u and v.
-        rgb: (side, side, 3) linear sRGB, rows ↔ y; NaN where there is no direction above the surface.
+        rgb: (side, side, 3) linear sRGB, rows ↔ y; NaN where the direction is not above the surface.
         exposure: the factor of `picture`.
     """
 
@@ -51,8 +51,8 @@ class BRDFMap:
         """sRGB (side, side, 3) from 0 to 1; 0.5 grey outside."""
         return np.where(np.isnan(self.rgb), 0.5, on_screen(into_gamut(self.rgb) * self.exposure) / 255)
 
-    def places_of_orders(self, nanometres: Array, orders: Array) -> tuple[Array, Array]:
-        """Return the orders by the grating equation with the published period, in the map's x and y.
+    def positions_of_orders(self, nanometres: Array, orders: Array) -> tuple[Array, Array]:
+        """Return the positions of orders in the map, by the grating equation with the published period.
 
         The direction cosines of light and viewer along the diffracting axis add up to −nλ/d, across it to zero.
 
@@ -68,9 +68,9 @@ class BRDFMap:
         sums[..., self.surface.axis] = path
         out = -sums - direction(*self.incidence)[:2]
         radius = np.hypot(out[..., 0], out[..., 1])
-        place = sums if self.projection == "uv" else _over_angle(out, radius)
-        place = np.where((radius < 1)[..., None], place, np.nan)
-        return place[..., 0], place[..., 1]
+        position = sums if self.projection == "uv" else _in_degrees(out, radius)
+        position = np.where((radius < 1)[..., None], position, np.nan)
+        return position[..., 0], position[..., 1]
 
 
 def brdf_map(
@@ -132,7 +132,7 @@ def _linear_rgb(surface: PublishedSurface, method: str, wi: Array, wo: Array, qu
     return spectrum_to_linear_sRGB(values * daylight(nanometres), nanometres)
 
 
-def _over_angle(cosines: Array, radius: Array) -> Array:
+def _in_degrees(cosines: Array, radius: Array) -> Array:
     """Convert direction cosines (..., 2) of length `radius` to (θ cos φ, θ sin φ) in degrees."""
     theta = np.rad2deg(np.arcsin(np.minimum(radius, 1)))
     return cosines * np.divide(theta, radius, out=np.full_like(radius, np.rad2deg(1)), where=radius > 0)[..., None]

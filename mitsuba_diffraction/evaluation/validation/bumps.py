@@ -1,18 +1,19 @@
-"""Equal bumps on equal tracks: a compact disc, of which scalar theory is known in closed form (Stam 1999).
+"""Equal bumps on equal tracks: a compact disc, whose scalar theory has a closed form (Stam 1999).
 
-Pits of width a, length b and depth d lie on tracks a distance t apart, so that with c = e^{−iκd} − 1 the phase is one
-plus c in every pit. The transform of a pit is the one of a box, B(q) = ab sinc(a q_x) sinc(b q_y).
+Pits of width a, length b and depth d lie on tracks of pitch t, so that with c = e^{−iκd} − 1 the phase factor e^{iκh}
+is 1 outside the pits and 1 + c in them. The transform of a pit is that of a box, B(q) = ab sinc(a q_x) sinc(b q_y).
 
-Regular: one pit for every stretch s of a track. Then there are orders only,
+Regular: one pit per length s of a track. Then there are only orders,
 
     η_m = |δ_m + c B(m_x/t, m_y/s)/(ts)|².
 
-Random: along every track each stretch b holds a pit with the probability p. The mean field has the orders
-of the tracks alone; the variance scatters light along them, between the orders of the tracks:
+Random: each length b of a track has a pit with probability p. The mean field has only the orders of the tracks; the
+variance scatters light between these orders:
 
     S(q) = Σ_m |δ_m + cp · a/t · sinc(ma/t)|² δ(q_x − m/t) δ(q_y) + |c|² p(1 − p) |B(q)|²/(tb).
 
-p is that of the drawn data. On pixels of size s, integrals are sums: sinc(aq) becomes sinc(aq)/sinc(sq).
+p is the fraction of pits in the drawn data. On pixels of size Δ, integrals are sums: sinc(aq) becomes
+sinc(aq)/sinc(Δq).
 """
 
 from __future__ import annotations
@@ -32,57 +33,57 @@ from .record import Check, Record
 
 Array = NDArray[np.float64]
 
-TRACK, WIDTH, LENGTH, DEPTH = 1.6, 0.6, 0.8, 0.12  # µm: t, a, b, d
-STRETCH = 2.0  # µm: s
-FINE, COARSE = 0.00625, 0.2  # µm, pixels; whole numbers of them fill every length
-TRACKS, STRETCHES = 40, 80  # of the random disc
-COHERENCE = 15.0  # µm
-DEVIATIONS = 3.0
+TRACK_PITCH, PIT_WIDTH, PIT_LENGTH, PIT_DEPTH = 1.6, 0.6, 0.8, 0.12  # µm: t, a, b, d
+PIT_SPACING = 2.0  # µm: s
+FINE_PIXEL, COARSE_PIXEL = 0.00625, 0.2  # µm; all lengths are multiples
+TRACK_COUNT, PITS_PER_TRACK = 40, 80  # of the random disc
+COHERENCE_LENGTH = 15.0  # µm
+MAX_DEVIATIONS = 3.0
 
 
 def regular() -> HeightField:
     """Return the heights of one pit, (N_y, N_x)."""
-    columns, rows = round(TRACK / FINE), round(STRETCH / FINE)
+    columns, rows = round(TRACK_PITCH / FINE_PIXEL), round(PIT_SPACING / FINE_PIXEL)
     heights = np.zeros((rows, columns))
-    heights[: round(LENGTH / FINE), : round(WIDTH / FINE)] = -DEPTH
-    return HeightField(heights, FINE, "pits on a lattice")
+    heights[: round(PIT_LENGTH / FINE_PIXEL), : round(PIT_WIDTH / FINE_PIXEL)] = -PIT_DEPTH
+    return HeightField(heights, FINE_PIXEL, "pits on a lattice")
 
 
 @functools.cache
 def data(seed: int = 0) -> NDArray[np.bool_]:
-    """Draw the data: a mask of pits, (stretches, tracks)."""
-    return np.random.default_rng(seed).random((STRETCHES, TRACKS)) < 0.5
+    """Draw the data: a mask of pits, (pits per track, tracks)."""
+    return np.random.default_rng(seed).random((PITS_PER_TRACK, TRACK_COUNT)) < 0.5
 
 
 def random() -> HeightField:
     """Return a piece of a disc with random data."""
-    track = np.zeros(round(TRACK / COARSE))
-    track[: round(WIDTH / COARSE)] = -DEPTH
-    heights = np.kron(data(), np.ones((round(LENGTH / COARSE), 1)) * track)
-    return HeightField(heights, COARSE, "random pits on tracks")
+    track = np.zeros(round(TRACK_PITCH / COARSE_PIXEL))
+    track[: round(PIT_WIDTH / COARSE_PIXEL)] = -PIT_DEPTH
+    heights = np.kron(data(), np.ones((round(PIT_LENGTH / COARSE_PIXEL), 1)) * track)
+    return HeightField(heights, COARSE_PIXEL, "random pits on tracks")
 
 
 def _regular() -> Record:
     def closed_form(m: Array, kappa: Array) -> Array:
-        pit = WIDTH * LENGTH * np.sinc(WIDTH * m[:, 0] / TRACK) * np.sinc(LENGTH * m[:, 1] / STRETCH)
-        place = np.exp(-1j * np.pi * (m[:, 0] * WIDTH / TRACK + m[:, 1] * LENGTH / STRETCH))
-        return np.abs((m == 0).all(axis=1) + _contrast(kappa) * pit * place / (TRACK * STRETCH)) ** 2
+        x, y = m[:, 0] * PIT_WIDTH / TRACK_PITCH, m[:, 1] * PIT_LENGTH / PIT_SPACING
+        pit = PIT_WIDTH * PIT_LENGTH * np.sinc(x) * np.sinc(y) * np.exp(-1j * np.pi * (x + y))
+        return np.abs((m == 0).all(axis=1) + _contrast(kappa) * pit / (TRACK_PITCH * PIT_SPACING)) ** 2
 
     return compare_orders(regular(), closed_form, azimuth=20.0)
 
 
 def _contrast(kappa: Array) -> NDArray[np.complex128]:
     """Return c."""
-    return np.exp(-1j * kappa * DEPTH) - 1
+    return np.exp(-1j * kappa * PIT_DEPTH) - 1
 
 
 @functools.cache
 def _spectrum() -> GratingSpectrum:
-    return spectrum_of(random(), extent="sample", coherence_length=COHERENCE, tolerance=5e-3, largest_angle=26.0)
+    return spectrum_of(random(), extent="sample", coherence_length=COHERENCE_LENGTH, tolerance=5e-3, largest_angle=26.0)
 
 
-def _seen(q: Array, wavelength: float) -> tuple[Array, NDArray[np.complex128]]:
-    """Return S as the BSDF shows it at normal incidence, and c of κ there."""
+def _measured_density(q: Array, wavelength: float) -> tuple[Array, NDArray[np.complex128]]:
+    """Return S from the BSDF at normal incidence, and c at the same κ."""
     wi = direction(0)
     wo = towards(wi, q, wavelength)
     kappa = 2 * np.pi * (1 + wo[..., 2]) / wavelength
@@ -90,39 +91,39 @@ def _seen(q: Array, wavelength: float) -> tuple[Array, NDArray[np.complex128]]:
 
 
 def _box(size: float, q: Array) -> Array:
-    return size * np.sinc(size * q) / np.sinc(COARSE * q)
+    return size * np.sinc(size * q) / np.sinc(COARSE_PIXEL * q)
 
 
-def _between(q: Array, c: Array) -> Array:
-    pit = _box(WIDTH, q[..., 0]) * _box(LENGTH, q[..., 1])
-    return np.abs(c) ** 2 * data().mean() * (1 - data().mean()) * pit**2 / (TRACK * LENGTH)
+def _incoherent_density(q: Array, c: Array) -> Array:
+    pit = _box(PIT_WIDTH, q[..., 0]) * _box(PIT_LENGTH, q[..., 1])
+    return np.abs(c) ** 2 * data().mean() * (1 - data().mean()) * pit**2 / (TRACK_PITCH * PIT_LENGTH)
 
 
-def _size() -> float:
-    """Return the area (µm²) that Welch's windows weigh equally: their centres keep 3 σ_s from the edges."""
-    margin = 6 * COHERENCE / 4
-    return (TRACKS * TRACK - margin) * (STRETCHES * LENGTH - margin)
+def _effective_area() -> float:
+    """Return the area (µm²) over which Welch's windows have equal weight: their centres are 3 σ_s inside the edges."""
+    margin = 6 * COHERENCE_LENGTH / 4
+    return (TRACK_COUNT * TRACK_PITCH - margin) * (PITS_PER_TRACK * PIT_LENGTH - margin)
 
 
 def _tracks(m: int) -> Record:
     """Compare the power of an order of the tracks, within 5 σ_q of q = (m/t, 0), without the incoherent part."""
-    wavelength, sigma = 0.5, lobe_width(COHERENCE)
+    wavelength, sigma = 0.5, lobe_width(COHERENCE_LENGTH)
     axis = np.linspace(-5, 5, 41) * sigma
-    q = np.stack(np.meshgrid(m / TRACK + axis, axis), axis=-1)
-    s, c = _seen(q, wavelength)
+    q = np.stack(np.meshgrid(m / TRACK_PITCH + axis, axis), axis=-1)
+    s, c = _measured_density(q, wavelength)
     area = (axis[1] - axis[0]) ** 2
-    between = _between(q, c)
+    between = _incoherent_density(q, c)
     found = (s - between).sum() * area
-    middle = c[20, 20]
-    expected = np.abs((m == 0) + middle * data().mean() * _box(WIDTH, m / TRACK) / TRACK) ** 2
-    # The mean over the piece differs from the mean by a number of variance S/A; half of it is along the field. Of the
-    # incoherent part, a band B holds A·B independent speckles.
-    size = _size()
+    c_centre = c[20, 20]
+    expected = np.abs((m == 0) + c_centre * data().mean() * _box(PIT_WIDTH, m / TRACK_PITCH) / TRACK_PITCH) ** 2
+    # The mean field over an area A differs from its expectation by a random number of variance S/A, half of it in phase
+    # with the field. In a frequency band of area B, the incoherent part has A·B independent speckles.
+    size = _effective_area()
     noise = np.hypot(
         2 * np.sqrt(expected * between[20, 20] / 2 / size), between.sum() * area / np.sqrt(size * (10 * sigma) ** 2)
     )
-    bound = DEVIATIONS * noise + _spectrum().tolerance
-    return Record(found, expected, bound, note="share of the light")
+    bound = MAX_DEVIATIONS * noise + _spectrum().tolerance
+    return Record(found, expected, bound, note="fraction of the reflected power")
 
 
 def _between_tracks() -> Record:
@@ -130,12 +131,12 @@ def _between_tracks() -> Record:
     wavelength = 0.5
     x, y = np.linspace(0.2, 0.5, 31), np.linspace(-0.7, 0.7, 141)
     q = np.stack(np.meshgrid(x, y), axis=-1)
-    s, c = _seen(q, wavelength)
+    s, c = _measured_density(q, wavelength)
     area = (x[1] - x[0]) * (y[1] - y[0])
-    expected, found = _between(q, c).sum() * area, s.sum() * area
-    size = _size()
-    bound = DEVIATIONS * expected / np.sqrt(size * 0.3 * 1.4) + _spectrum().tolerance * expected
-    return Record(found, expected, bound, note="share of the light")
+    expected, found = _incoherent_density(q, c).sum() * area, s.sum() * area
+    size = _effective_area()
+    bound = MAX_DEVIATIONS * expected / np.sqrt(size * 0.3 * 1.4) + _spectrum().tolerance * expected
+    return Record(found, expected, bound, note="fraction of the reflected power")
 
 
 CHECKS = (

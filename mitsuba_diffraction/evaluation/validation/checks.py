@@ -1,4 +1,4 @@
-"""The lists of checks: of the product, and of a surface of one's own."""
+"""Lists of checks: of the package, and of a given surface."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ def checks() -> tuple[Check, ...]:
     """Return the checks of `mitsuba-diffraction validate`, group by group."""
     gratings = (measured_gratings, transmission_grating)
     modules = (analytic, bumps, viewing_angle, *gratings, rough_surface, conservation, coupled_waves)
-    every = [check for module in modules for check in module.CHECKS]
-    return tuple(sorted(every, key=lambda check: GROUPS.index(check.group)))
+    unsorted = [check for module in modules for check in module.CHECKS]
+    return tuple(sorted(unsorted, key=lambda check: GROUPS.index(check.group)))
 
 
 def surface_checks(height_field: HeightField, spectrum: GratingSpectrum) -> tuple[Check, ...]:

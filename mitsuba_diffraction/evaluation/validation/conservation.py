@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 WAVELENGTHS = (0.42, 0.55, 0.68)  # µm
 ANGLES = (0.0, 30.0, 60.0, 80.0)  # degrees
-DEVIATIONS = 4.0  # of averages of random samples
+MAX_DEVIATIONS = 4.0  # of averages of random samples
 SAMPLES = 1 << 17
 
 
@@ -41,33 +41,35 @@ def _near_orders(spectrum: GratingSpectrum, wavelength: float, count: int) -> tu
 
 
 def parseval(spectrum: GratingSpectrum) -> Record:
-    """Check the sum over all frequencies of the spectrum, with allowance for its stated truncated power."""
+    """Check the sum over all frequencies of the spectrum, with an allowance for its stated truncated power."""
     kappas = np.linspace(0.2, 1, 9) * spectrum.max_kappa
     found = [spectrum.powers(kappa).sum(dtype=np.float64) for kappa in kappas]
-    return Record.worst(
+    return Record.at_max_error(
         1.0, found, spectrum.tolerance + spectrum.unresolved_power + spectrum.truncated_power, "Σ_m η_m, nine κ"
     )
 
 
 def reciprocity(spectrum: GratingSpectrum) -> Record:
-    """Check f(ω_i, ω_o) = f(ω_o, ω_i), as a share of the larger."""
+    """Check f(ω_i, ω_o) = f(ω_o, ω_i), as the ratio of both."""
     bsdf = grating(spectrum, int_ior=1.5)
-    there, back = [], []
+    forward, reverse = [], []
     for wavelength in WAVELENGTHS:
         wi, wo = _near_orders(spectrum, wavelength, 4000)
-        there.append(brdf(bsdf, wi, wo, wavelength))
-        back.append(brdf(bsdf, wo, wi, wavelength))
-    there, back = np.concatenate(there), np.concatenate(back)
-    return Record.worst(1.0, back / there, 1e-4, f"f(ω_o, ω_i)/f(ω_i, ω_o), {len(there)} pairs that the BSDF draws")
+        forward.append(brdf(bsdf, wi, wo, wavelength))
+        reverse.append(brdf(bsdf, wo, wi, wavelength))
+    forward, reverse = np.concatenate(forward), np.concatenate(reverse)
+    return Record.at_max_error(
+        1.0, reverse / forward, 1e-4, f"f(ω_o, ω_i)/f(ω_i, ω_o), {len(forward)} pairs that the BSDF draws"
+    )
 
 
 def energy(spectrum: GratingSpectrum) -> Record:
-    """Return the excess over one of the largest albedo of a perfect mirror, by the BSDF's own samples."""
+    """Return the excess over one of the maximum albedo of a perfect mirror, from samples of the BSDF."""
     return excess(grating(spectrum))
 
 
 def excess(bsdf: mi.BSDF) -> Record:
-    """Return the excess over one of the largest albedo of any BSDF."""
+    """Return the excess over one of the maximum albedo of any BSDF."""
     found = []
     for wavelength in WAVELENGTHS:
         for angle in ANGLES:
@@ -75,10 +77,10 @@ def excess(bsdf: mi.BSDF) -> Record:
                 wi = np.broadcast_to(testing.direction(angle, phi), (SAMPLES, 3))
                 _, weight = _drawn(bsdf, wi, wavelength)
                 found.append((weight.mean(), weight.std() / np.sqrt(SAMPLES)))
-    # The first that is not a number, if one is: it counts as the largest.
-    largest, error = found[int(np.argmax([mean for mean, _ in found]))]
-    note = f"above one; largest albedo {largest:.5f} of 24 directions and wavelengths"
-    return Record(np.maximum(largest - 1, 0), 0.0, 1e-3 + DEVIATIONS * error, note=note)
+    # argmax returns the first NaN, if there is one.
+    max_albedo, error = found[int(np.argmax([mean for mean, _ in found]))]
+    note = f"above one; maximum albedo {max_albedo:.5f} of 24 directions and wavelengths"
+    return Record(np.maximum(max_albedo - 1, 0), 0.0, 1e-3 + MAX_DEVIATIONS * error, note=note)
 
 
 _SURFACES: dict[str, Callable[[], HeightField]] = {

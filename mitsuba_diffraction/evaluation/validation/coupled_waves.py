@@ -1,11 +1,11 @@
-"""The BSDF against the stored results of coupled-wave analysis, order by order.
+"""Comparison of the BSDF with the stored results of coupled-wave analysis, order by order.
 
-A difference is Σ_m |Δη_m| / Σ_m η_m: a share of the rigorously reflected power. The claimed bounds:
+A difference is Σ_m |Δη_m| / Σ_m η_m, a fraction of the rigorously reflected power. The claimed bounds:
 
 - sinusoids of period ≥ 5 λ and depth ≤ λ/2, light at up to 20°: 2 %;
 - blazes and triangles, which have edges, of depth ≤ λ/2, up to 20°: 10 %.
 
-Everything else is outside of the range of scalar theory: it is reported without a bound.
+All other cases are outside the range of scalar theory and reported without a bound.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ Array = NDArray[np.float64]
 
 STORED = Path(__file__).parents[2] / "data" / "rigorous.json"
 BOUNDS = {"sinusoidal": 0.02, "blazed": 0.1, "triangular": 0.1}
-SHORTEST_PERIOD, LARGEST_DEPTH, LARGEST_ANGLE = 5.0, 0.5, 20.0  # in wavelengths, degrees
+MIN_PERIOD, MAX_DEPTH, MAX_ANGLE = 5.0, 0.5, 20.0  # in wavelengths, degrees
 
 
 def triangular(period: float, depth: float, *, samples: int = 512) -> HeightField:
@@ -63,12 +63,12 @@ class RigorousResult:
     Attributes:
         profile: a name of `PROFILES`.
         period, depth, wavelength: µm.
-        angle: of incidence, degrees; the light comes from −x.
+        angle: of incidence, degrees; the light is incident from −x.
         material: "dielectric" (n = 1.5) or a metal by Mitsuba's name.
         index: n + ik.
         orders: those that propagate, (n,).
         te, tm: rigorous efficiencies, (n,).
-        change: of the efficiencies at the last refinement, as a share of the reflected power.
+        change: of the efficiencies at the last refinement, as a fraction of the reflected power.
     """
 
     profile: str
@@ -85,14 +85,14 @@ class RigorousResult:
 
     @property
     def unpolarised(self) -> Array:
-        """(n,)"""
+        """Mean of `te` and `tm`, (n,)."""
         return (self.te + self.tm) / 2
 
     @property
     def in_range(self) -> bool:
         """Whether a bound is claimed."""
-        fine = self.period >= SHORTEST_PERIOD * self.wavelength or self.profile != "sinusoidal"
-        return fine and self.depth <= LARGEST_DEPTH * self.wavelength and self.angle <= LARGEST_ANGLE
+        fine = self.period >= MIN_PERIOD * self.wavelength or self.profile != "sinusoidal"
+        return fine and self.depth <= MAX_DEPTH * self.wavelength and self.angle <= MAX_ANGLE
 
     def __str__(self) -> str:
         return (
@@ -141,47 +141,47 @@ def cases() -> tuple[RigorousResult, ...]:
     )
 
 
-def _worst(
+def _at_max_difference(
     those: list[RigorousResult],
     found: Callable[[RigorousResult], Array],
     rigorous: Callable[[RigorousResult], Array],
     bound: float | None,
 ) -> Record:
-    """Compare the grating that differs most, at its strongest order."""
+    """Return the record of the case with the maximum difference; its note quotes the strongest order."""
     differences = [difference(found(case), rigorous(case)) for case in those]
-    case = those[worst := int(np.argmax(differences))]
+    case = those[index := int(np.argmax(differences))]
     strongest = int(np.argmax(rigorous(case)))
     note = (
-        f"Σ|Δη|/Σ η, worst of {len(those)}: {case}; order {case.orders[strongest]} has {found(case)[strongest]:.4g}, "
+        f"Σ|Δη|/Σ η, maximum of {len(those)}: {case}; order {case.orders[strongest]} has {found(case)[strongest]:.4g}, "
         f"rigorous {rigorous(case)[strongest]:.4g}; converged to {max(c.change for c in those):.1e}"
     )
-    return Record(differences[worst], 0.0, bound, note=note)
+    return Record(differences[index], 0.0, bound, note=note)
 
 
 def _dielectric(profile: str, choose: Callable[[RigorousResult], bool]) -> Record:
     those = [case for case in cases() if case.profile == profile and case.material == "dielectric" and choose(case)]
     bound = BOUNDS[profile] if all(case.in_range for case in those) else None
-    return _worst(those, RigorousResult.found, lambda case: case.unpolarised, bound)
+    return _at_max_difference(those, RigorousResult.found, lambda case: case.unpolarised, bound)
 
 
 def _metal(profile: str, te: bool) -> Record:
     """Compare metals, for which no bound is claimed: see docs/validation.md."""
-    those = [c for c in cases() if c.profile == profile and c.material != "dielectric" and c.angle <= LARGEST_ANGLE]
+    those = [c for c in cases() if c.profile == profile and c.material != "dielectric" and c.angle <= MAX_ANGLE]
     if te:
-        return _worst(those, lambda case: case.scalar().s, lambda case: case.te, None)
-    return _worst(those, RigorousResult.found, lambda case: case.unpolarised, None)
+        return _at_max_difference(those, lambda case: case.scalar().s, lambda case: case.te, None)
+    return _at_max_difference(those, RigorousResult.found, lambda case: case.unpolarised, None)
 
 
 def formula(those: Iterable[RigorousResult]) -> Record:
     """Compare R K G E η_m in float64, on which the map is based, with the BSDF integrated lobe by lobe."""
     differences = [difference(case.scalar().unpolarised, case.found()) for case in those]
     # E is read from a table of lower bounds.
-    note = f"Σ|Δη|/Σ η, worst of {len(differences)}; mean {np.mean(differences):.1e}"
+    note = f"Σ|Δη|/Σ η, maximum of {len(differences)}; mean {np.mean(differences):.1e}"
     return Record(np.max(differences), 0.0, 2e-2, note=note)
 
 
-def polarised_shares(case: RigorousResult) -> tuple[Array, Array, Array]:
-    """Return η_te/(η_te + η_tm), rigorous and by R_s and R_p at the half vector, and the share of power per order."""
+def polarised_fractions(case: RigorousResult) -> tuple[Array, Array, Array]:
+    """Return η_te/(η_te + η_tm), rigorous and by R_s and R_p at the half vector, and the fraction of power in each."""
     orders = case.scalar()
     total = case.te + case.tm
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -190,36 +190,36 @@ def polarised_shares(case: RigorousResult) -> tuple[Array, Array, Array]:
 
 
 def _polarisation(split: bool) -> Record:
-    """Compare the power-weighted mean share of s light in the orders, for unpolarised light at under 40°."""
+    """Compare the power-weighted mean fraction of s-polarised light in the orders, for unpolarised light below 40°."""
     rows = []
     for case in cases():
         if case.material == "dielectric" and case.angle < 40:
-            rigorous, scalar, weight = polarised_shares(case)
+            rigorous, scalar, weight = polarised_fractions(case)
             rows.append((weight @ np.abs((scalar if split else 0.5) - rigorous), str(case)))
-    worst, case = max(rows)
-    note = f"mean |Δ| over orders, worst of {len(rows)}: {case}; mean {np.mean([row[0] for row in rows]):.3f}"
-    return Record(worst, 0.0, 0.1 if split else None, note=note)
+    max_difference, case = max(rows)
+    note = f"mean |Δ| over orders, maximum of {len(rows)}: {case}; mean {np.mean([row[0] for row in rows]):.3f}"
+    return Record(max_difference, 0.0, 0.1 if split else None, note=note)
 
 
-def _map(shortest: float, deepest: float, bound: float | None) -> Record:
-    """Return the largest error of the map, at its nodes and, between them, at the shortest period and largest depth."""
+def _map(min_period: float, max_depth: float, bound: float | None) -> Record:
+    """Return the maximum error of the map, at its nodes and, between them, at the minimum period and maximum depth."""
     periods, depths, _, _ = error_map()
-    places = itertools.product([shortest, *periods[periods > shortest]], [*depths[depths < deepest], deepest])
-    worst, period, depth = max((expected_error(period, depth, 1.0), period, depth) for period, depth in places)
-    return Record(worst, 0.0, bound, note=f"Σ|Δη|/Σ η, largest at {period:g} × {depth:g} λ")
+    points = itertools.product([min_period, *periods[periods > min_period]], [*depths[depths < max_depth], max_depth])
+    max_error, period, depth = max((expected_error(period, depth, 1.0), period, depth) for period, depth in points)
+    return Record(max_error, 0.0, bound, note=f"Σ|Δη|/Σ η, maximum at {period:g} × {depth:g} λ")
 
 
-def _map_again() -> Record:
+def _map_against_coupled_waves() -> Record:
     """Compare the map, of this package's rigorous efficiencies, with coupled waves at the same periods and depths."""
     periods, depths, directions, errors = error_map()
     found, expected = [], []
     for point in stored()["map"]:
-        place = point["period"], 1.0, point["angle"]
-        scalar = scalar_orders(sinusoid_powers(point["depth"]), *place, complex(stored()["map index"]))
+        arguments = point["period"], 1.0, point["angle"]
+        scalar = scalar_orders(sinusoid_powers(point["depth"]), *arguments, complex(stored()["map index"]))
         expected.append(difference(scalar.unpolarised, point["unpolarised"]))
         angle = np.flatnonzero((directions == [point["angle"], 0]).all(axis=1))[0]
         found.append(errors[np.searchsorted(periods, point["period"]), np.searchsorted(depths, point["depth"]), angle])
-    return Record.worst(np.array(expected), np.array(found), 0.01, f"{len(found)} sinusoids, 0° and 20°")
+    return Record.at_max_error(np.array(expected), np.array(found), 0.01, f"{len(found)} sinusoids, 0° and 20°")
 
 
 def _check(name: str, measure: Callable[[], Record], slow: bool = False) -> Check:
@@ -227,25 +227,29 @@ def _check(name: str, measure: Callable[[], Record], slow: bool = False) -> Chec
 
 
 def _of_profile(profile: str) -> tuple[Check, ...]:
-    near = f"≤ {LARGEST_ANGLE:g}°"
-    short = f", period ≥ {SHORTEST_PERIOD:g} λ" if profile == "sinusoidal" else ""
+    angle_range = f"≤ {MAX_ANGLE:g}°"
+    period_range = f", period ≥ {MIN_PERIOD:g} λ" if profile == "sinusoidal" else ""
 
     def dielectric(choose: Callable[[RigorousResult], bool]) -> Callable[[], Record]:
         return functools.partial(_dielectric, profile, choose)
 
     return (
-        _check(f"{profile}, n = 1.5, depth ≤ λ/2{short}, {near}", dielectric(lambda case: case.in_range), slow=True),
         _check(
-            f"{profile}, n = 1.5, {near}, outside of that",
-            dielectric(lambda case: not case.in_range and case.angle <= LARGEST_ANGLE),
+            f"{profile}, n = 1.5, depth ≤ λ/2{period_range}, {angle_range}",
+            dielectric(lambda case: case.in_range),
+            slow=True,
+        ),
+        _check(
+            f"{profile}, n = 1.5, {angle_range}, outside that range",
+            dielectric(lambda case: not case.in_range and case.angle <= MAX_ANGLE),
             slow=True,
         ),
         *(
             _check(f"{profile}, n = 1.5, {angle:g}°", dielectric(lambda case, a=angle: case.angle == a), slow=True)
             for angle in (40.0, 60.0)
         ),
-        _check(f"{profile}, Al, {near}, s", functools.partial(_metal, profile, True)),
-        _check(f"{profile}, Al, {near}, unpolarised", functools.partial(_metal, profile, False), slow=True),
+        _check(f"{profile}, Al, {angle_range}, s", functools.partial(_metal, profile, True)),
+        _check(f"{profile}, Al, {angle_range}, unpolarised", functools.partial(_metal, profile, False), slow=True),
     )
 
 
@@ -258,10 +262,10 @@ CHECKS = (
         slow=True,
     ),
     *(check for profile in PROFILES for check in _of_profile(profile)),
-    _check("map against coupled waves", _map_again),
+    _check("map against coupled waves", _map_against_coupled_waves),
     _check("map, period ≥ 5 λ, depth ≤ λ/2", lambda: _map(5.0, 0.5, 0.02)),
     _check("map, period ≥ 3.5 λ, depth ≤ λ/5", lambda: _map(3.5, 0.2, 0.02)),
     _check("map, period ≥ 3.5 λ, depth ≤ λ/2", lambda: _map(3.5, 0.5, None)),
-    _check("s share of the light, by R_s and R_p", lambda: _polarisation(True)),
-    _check("s share of the light, taken for 1/2", lambda: _polarisation(False)),
+    _check("fraction of s-polarised light, by R_s and R_p", lambda: _polarisation(True)),
+    _check("fraction of s-polarised light, assumed to be 1/2", lambda: _polarisation(False)),
 )

@@ -40,11 +40,11 @@ MAP_COHERENCE = {"blaze": 6.5}
 
 TITLES = {MODEL: "this model", "flss": "FLSS", "nmm": "NMM", "pq": "PQ", "gem": "GEM"}
 _PEAK = "#d62728"
-_DARKEST = 1e-3  # of the strongest reflectance outside of the specular peak
+_MIN_SHOWN = 1e-3  # of the maximum reflectance outside the specular peak
 
 
 def figure(width: float, height: float) -> Figure:
-    """Return an empty figure, in inches, that belongs to no window."""
+    """Return an empty figure, size in inches, that is not shown in a window."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height), layout="constrained")
@@ -69,7 +69,7 @@ def plot_reflectance(maps: Sequence[ReflectanceMap]) -> Figure:
     """Plot reflectance over wavelength and viewing angle, with the peak curve and the grating equation on top.
 
     One panel for each map; all maps are of one surface and one θ_i. Each panel has a logarithmic scale of three decades
-    below its largest reflectance outside of the specular peak.
+    below its maximum reflectance outside the specular peak.
     """
     drawn = figure(3.1 * len(maps) + 0.9, 4.4)
     axes = drawn.subplots(1, len(maps), sharex=True, sharey=True, squeeze=False)[0]
@@ -82,7 +82,7 @@ def plot_reflectance(maps: Sequence[ReflectanceMap]) -> Figure:
     surface, incidence = maps[0].surface, maps[0].incidence
     axes[0].set_ylabel("viewing angle θ$_r$ / °")
     bar = drawn.colorbar(image, ax=axes, pad=0.01)
-    bar.set_label("reflectance / strongest\noutside of the mirror direction")
+    bar.set_label("reflectance / maximum\noutside the mirror direction")
     drawn.suptitle(f"{surface.name}: light at θ$_i$ = {incidence:g}°, mirror direction at θ$_r$ = {-incidence:g}°")
     handles, labels = axes[0].get_legend_handles_labels()
     drawn.legend(handles, labels, loc="outside lower center", ncols=2, frameon=False)
@@ -93,14 +93,14 @@ def _draw_map(panel: Axes, found: ReflectanceMap) -> ScalarMappable:
     from matplotlib.collections import LineCollection
     from matplotlib.colors import LogNorm
 
-    strongest = np.nanmax(np.where(found.order > 0.5, found.reflectance, 0))
-    shown = np.clip(found.reflectance / strongest, _DARKEST, 1)
-    style = {"cmap": "viridis", "norm": LogNorm(_DARKEST, 1), "rasterized": True}
+    maximum = np.nanmax(np.where(found.order > 0.5, found.reflectance, 0))
+    shown = np.clip(found.reflectance / maximum, _MIN_SHOWN, 1)
+    style = {"cmap": "viridis", "norm": LogNorm(_MIN_SHOWN, 1), "rasterized": True}
     if found.discrete:
-        # A line for each order; between them there is nothing.
+        # A line for each order; nothing is evaluated between them.
         panel.set_facecolor("0.85")
-        places = np.stack([np.broadcast_to(found.wavelengths[:, None], shown.shape), found.angles], axis=-1)
-        steps = np.stack([places[:-1], places[1:]], axis=2).reshape(-1, 2, 2)
+        points = np.stack([np.broadcast_to(found.wavelengths[:, None], shown.shape), found.angles], axis=-1)
+        steps = np.stack([points[:-1], points[1:]], axis=2).reshape(-1, 2, 2)
         image = panel.add_collection(LineCollection(steps, array=shown[:-1].ravel(), linewidths=0.9, **style))
     else:
         image = panel.pcolormesh(found.wavelengths, found.angles, shown.T, shading="nearest", **style)
@@ -120,7 +120,7 @@ def _draw_map(panel: Axes, found: ReflectanceMap) -> ScalarMappable:
 def plot_brdf_maps(maps: Sequence[Sequence[BRDFMap]]) -> Figure:
     """Plot BRDF maps of one surface and one light, a row for each projection and a column for each method.
 
-    The ticks beside the diffracting axis are where the grating equation puts 450, 550 and 650 nm of the orders.
+    The ticks beside the diffracting axis mark the orders at 450, 550 and 650 nm by the grating equation.
     """
     drawn = figure(2.5 * len(maps[0]) + 0.3, 2.75 * len(maps) + 0.5)
     axes = drawn.subplots(len(maps), len(maps[0]), squeeze=False)
@@ -156,18 +156,18 @@ def _draw_brdf(panel: Axes, found: BRDFMap, labelled: bool) -> None:
 
 
 def _mark_orders(panel: Axes, found: BRDFMap) -> None:
-    """Mark the orders by ticks beside them, so that the ticks hide no light."""
+    """Mark the orders by ticks beside them, which do not cover the colours."""
     across = 1 - found.surface.axis
     size = found.x[-1] - found.x[0]
     for order in (-2, -1, 1, 2):
         for nanometres, tint in ((450.0, "#6677ff"), (550.0, "#33cc33"), (650.0, "#ff4433")):
-            place = np.array(found.places_of_orders(np.float64(nanometres), np.int64(order)))
-            ends = np.stack([place, place])
+            position = np.array(found.positions_of_orders(np.float64(nanometres), np.int64(order)))
+            ends = np.stack([position, position])
             ends[:, across] += np.array([0.08, 0.12]) * size
             panel.plot(*ends.T, color=tint, linewidth=1)
-            if nanometres == 550 and np.isfinite(place).all():
-                place[across] += 0.15 * size
-                panel.text(*place, f"{order}", color="0.7", size=7, ha="center", va="center")
+            if nanometres == 550 and np.isfinite(position).all():
+                position[across] += 0.15 * size
+                panel.text(*position, f"{order}", color="0.7", size=7, ha="center", va="center")
 
 
 PERIOD_COLUMNS = (
@@ -184,9 +184,9 @@ def period_rows(surface: PublishedSurface, maps: Iterable[ReflectanceMap], step:
     """Return the fits as rows of `PERIOD_COLUMNS`: available maps, the shader as published and corrected.
 
     Args:
-        surface: what the maps are of.
-        maps: as `reflectance_map` gives them.
-        step: between wavelengths of what is still to be evaluated, nm.
+        surface: of the maps.
+        maps: from `reflectance_map`.
+        step: between wavelengths of the maps of the corrected shader, which are evaluated here, nm.
     """
     rows = []
     for found in maps:
@@ -229,11 +229,11 @@ def save_figures(
     periods, `periods.md` and `periods.csv`.
 
     Args:
-        folder: where to write; made if it is not there.
+        folder: of the files; created if missing.
         surfaces: names among `published_surfaces.SURFACES`.
         step: between wavelengths, nm.
         side: pixels of a BRDF map.
-        progress: called with (steps done, steps in all).
+        progress: called with (steps done, steps in total).
 
     Returns:
         The files.
@@ -260,7 +260,7 @@ def save_figures(
         maps = [reflectance_map(surface, method, wavelengths=wavelengths(step)) for method in METHODS]
         rows += period_rows(surface, maps, step)
         save(plot_reflectance(maps), f"viewing_angle_{name}.png")
-        mapped = surface.coherent_over(MAP_COHERENCE[name]) if name in MAP_COHERENCE else surface
+        mapped = surface.with_coherence_length(MAP_COHERENCE[name]) if name in MAP_COHERENCE else surface
         brdf_maps = [
             [brdf_map(mapped, method, projection=projection, side=side) for method in MAP_METHODS]
             for projection in PROJECTIONS

@@ -1,4 +1,4 @@
-"""The lobes of a BSDF: the power that a grating reflects into each order, by quadrature over the plugin.
+"""Lobes of a BSDF: the power that a grating reflects into each order, by quadrature over the plugin.
 
 Wavelengths are in µm here, as in the closed forms.
 """
@@ -21,14 +21,14 @@ from ...surface.heightfield import HeightField
 Array = NDArray[np.float64]
 
 TOLERANCE = 1e-5
-"""Of the spectra: an analytic check to 1e-4 is to see the model, not its tables."""
-_POINTS = 16
+"""Of the spectra, so that an analytic check to 1e-4 measures the model, not its tables."""
+_QUADRATURE_POINTS = 16
 
 
 def grating(spectrum: GratingSpectrum, conserve: bool = True, **parameters: Any) -> mi.BSDF:
     """Load the plugin; a perfect mirror unless an index or a material is given.
 
-    `conserve=False` omits E, which closed forms do not include: R K G S/λ² alone.
+    `conserve=False` omits E, which closed forms do not include: only R K G S/λ² remains.
     """
     if not {"int_ior", "material"} & set(parameters):
         parameters["material"] = "none"
@@ -71,7 +71,7 @@ def density(bsdf: mi.BSDF, wi: Array, wo: Array, wavelength: float) -> Array:
 
 
 def lobe_powers(bsdf: mi.BSDF, spectrum: GratingSpectrum, wi: Array, q: ArrayLike, wavelength: float) -> Array:
-    """Integrate the share of the incident power reflected into the lobes about q: ∫ f cos θ_o dω_o = λ² ∫ f dq.
+    """Integrate the fraction of the incident power reflected into the lobes about q: ∫ f cos θ_o dω_o = λ² ∫ f dq.
 
     By Gauss–Legendre quadrature over the square to which a lobe is truncated.
 
@@ -85,26 +85,26 @@ def lobe_powers(bsdf: mi.BSDF, spectrum: GratingSpectrum, wi: Array, q: ArrayLik
     Returns:
         (n,).
     """
-    x, weights = np.polynomial.legendre.leggauss(_POINTS)
-    reach = spectrum.cutoff_sigmas * spectrum.lobe_width
-    offset = reach * np.stack(np.meshgrid(x, x), axis=-1).reshape(-1, 2)
+    x, weights = np.polynomial.legendre.leggauss(_QUADRATURE_POINTS)
+    cutoff = spectrum.cutoff_sigmas * spectrum.lobe_width
+    offset = cutoff * np.stack(np.meshgrid(x, x), axis=-1).reshape(-1, 2)
     points = np.asarray(q, np.float64)[:, None, :] + offset
-    area = reach**2 * np.outer(weights, weights).ravel()
+    area = cutoff**2 * np.outer(weights, weights).ravel()
     return brdf(bsdf, wi, towards(wi, points, wavelength), wavelength) @ area * wavelength**2
 
 
-def orders_above(spectrum: GratingSpectrum, wi: Array, wavelength: float, largest: float = 80.0) -> Array:
-    """Return the orders m (n, 2) of a tile at up to `largest` degrees from the normal."""
+def orders_above(spectrum: GratingSpectrum, wi: Array, wavelength: float, max_angle: float = 80.0) -> Array:
+    """Return the orders m (n, 2) of a tile at up to `max_angle` degrees from the normal."""
     m_x, m_y = np.meshgrid(*spectrum.grid.axes())
     m = np.stack([m_x.ravel(), m_y.ravel()], axis=-1)
-    across = -wavelength * m / spectrum.grid.tile_size - wi[:2]
-    return m[np.hypot(*across.T) < np.sin(np.deg2rad(largest))]
+    cosines = -wavelength * m / spectrum.grid.tile_size - wi[:2]
+    return m[np.hypot(*cosines.T) < np.sin(np.deg2rad(max_angle))]
 
 
 def order_powers(
     bsdf: mi.BSDF, spectrum: GratingSpectrum, wi: Array, m: Array, wavelength: float
 ) -> tuple[Array, Array]:
-    """Return η_m (n,) of the orders m (n, 2) by the BSDF, what their lobes reflect without K and G, and their κ."""
+    """Return η_m (n,) of the orders m (n, 2) by the BSDF (the power of their lobes without K and G), and their κ."""
     q = m / np.asarray(spectrum.grid.tile_size)
     wo = towards(wi, q, wavelength)
     kappa = 2 * np.pi * (wi[2] + wo[:, 2]) / wavelength

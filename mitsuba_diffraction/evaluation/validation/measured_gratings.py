@@ -1,6 +1,6 @@
 """Scalar and rigorous theory against the manufacturer's measured efficiencies of four ruled gratings.
 
-The facet angle alone is fitted (`ruled_fit`); `precompute/ruled_fits.py` stores the angles.
+Only the facet angle is fitted (`ruled_fit`); `precompute/ruled_fits.py` stores the angles.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from .ruled_fit import LINES_PER_MM, littrow_curve, measured, stored_angles
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-BOUND = 0.05
-"""Of the rms difference, rigorous theory; R150 exceeds it: see docs/validation.md."""
+MAX_RMS_DIFFERENCE = 0.05
+"""Of rigorous theory; R150 exceeds it: see docs/validation.md."""
 
-_BEYOND = ("R150",)
+_WITHOUT_BOUND = ("R150",)
 _COLOURS = {"rigorous": "#d95f02", "scalar": "#7570b3"}
 
 
@@ -30,7 +30,7 @@ def difference(name: str, theory: str) -> Record:
     found = littrow_curve(name, angle, wavelengths, theory == "rigorous")
     scale = found @ wanted / (found @ found)
     rms, scaled = (float(np.sqrt(((factor * found - wanted) ** 2).mean())) for factor in (1, scale))
-    bound = BOUND if theory == "rigorous" and name not in _BEYOND else None
+    bound = MAX_RMS_DIFFERENCE if theory == "rigorous" and name not in _WITHOUT_BOUND else None
     note = f"rms over {len(wanted)} wavelengths, facets of {angle:.2f}°; {scaled:.3f} if all are scaled by {scale:.3f}"
     return Record(rms, 0.0, bound, note=note)
 
@@ -57,10 +57,10 @@ def plot(step: float = 4.0) -> Figure:
         lines = LINES_PER_MM[name]
         for ratio in ("2/3", "2/5"):
             top, bottom = map(int, ratio.split("/"))
-            place = 1e6 / lines * top / bottom
-            if 1e3 * wavelengths[0] < place < 1e3 * wavelengths[-1]:
-                panel.axvline(place, color="0.75", linewidth=1, zorder=0)
-                panel.text(place, 0.985, f" λ/d = {ratio}", color="0.4", fontsize=8, va="top")
+            anomaly = 1e6 / lines * top / bottom
+            if 1e3 * wavelengths[0] < anomaly < 1e3 * wavelengths[-1]:
+                panel.axvline(anomaly, color="0.75", linewidth=1, zorder=0)
+                panel.text(anomaly, 0.985, f" λ/d = {ratio}", color="0.4", fontsize=8, va="top")
         panel.set_title(f"{name}: {lines:g} lines/mm", fontsize=10)
         panel.legend(frameon=False, fontsize=8, loc="lower right")
         panel.set_ylim(0, 1)

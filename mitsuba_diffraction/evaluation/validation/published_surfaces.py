@@ -1,4 +1,4 @@
-"""The surfaces of the thesis of 2014, chapter 5, and the plane of incidence of each."""
+"""Surfaces of the thesis of 2014, chapter 5, and the plane of incidence of each."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from ...surface.heightfield import HeightField
 class PublishedSurface:
     """A grating, and the published numbers about it.
 
-    Light and viewer are in the plane of the normal and the diffracting axis. Angles in it are positive on the side of
-    −x (−y): there the blaze direction is positive, and the grating equation d (sin θ_i + sin θ_r) = nλ has n > 0.
+    Light and viewer are in the plane of the normal and the diffracting axis. Angles are positive towards −x (−y): the
+    blaze direction is positive, and the grating equation d (sin θ_i + sin θ_r) = nλ has n > 0.
 
     Attributes:
         name: for titles.
-        recipe: the way to the heights and the spectrum.
+        recipe: of the heights and the spectrum.
         axis: the diffracting axis, 0 for x and 1 for y.
         period: d of the grating equation, µm, as published.
         published: (mean in nm, variance in nm²) of the period that the thesis fits (table 5.1).
@@ -64,8 +64,8 @@ class PublishedSurface:
         result[..., self.axis], result[..., 2] = -np.sin(angle), np.cos(angle)
         return result
 
-    def coherent_over(self, coherence_length: float) -> PublishedSurface:
-        """Return the same surface in light of another coherence length, µm."""
+    def with_coherence_length(self, coherence_length: float) -> PublishedSurface:
+        """Return the same surface with another coherence length, µm."""
         recipe = replace(self.recipe, settings=replace(self.recipe.settings, coherence_length=coherence_length))
         return PublishedSurface(self.name, recipe, self.axis, self.period, self.published)
 

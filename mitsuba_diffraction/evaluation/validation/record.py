@@ -14,10 +14,10 @@ GROUPS = ("analytic", "literature", "statistical", "energy", "rigorous", "surfac
 
 @dataclass(frozen=True)
 class Record:
-    """A measured number beside the expected one.
+    """A measured number and the expected one.
 
     Attributes:
-        measured, expected: of several numbers, the pair that differs most.
+        measured, expected: of several pairs, that with the maximum error relative to its bound.
         bound: on the error; None where none is claimed.
         relative: whether the error is relative to `expected`.
         note: further information for the reader.
@@ -42,7 +42,7 @@ class Record:
             object.__setattr__(self, "bound", float(self.bound))
 
     @classmethod
-    def worst(
+    def at_max_error(
         cls,
         expected: ArrayLike,
         measured: ArrayLike,
@@ -51,12 +51,12 @@ class Record:
         *,
         relative: bool = False,
     ) -> Record:
-        """Return the pair with the largest error as a multiple of its bound; NaN is the largest."""
+        """Return the record of the pair with the maximum error relative to its bound; NaN counts as the maximum."""
         limits = 1.0 if bound is None else bound
         expected, measured, limits = (np.ravel(x) for x in np.broadcast_arrays(expected, measured, limits))
         error = np.abs(measured - expected) / (np.abs(expected) if relative else 1) / limits
-        place = int(np.argmax(np.where(np.isnan(error), np.inf, error)))
-        return cls(measured[place], expected[place], None if bound is None else limits[place], relative, note)
+        index = int(np.argmax(np.where(np.isnan(error), np.inf, error)))
+        return cls(measured[index], expected[index], None if bound is None else limits[index], relative, note)
 
     @property
     def error(self) -> float:
@@ -66,13 +66,13 @@ class Record:
 
     @property
     def ok(self) -> bool:
-        """Within the bound; an error that is not a number is not."""
+        """Whether the error is within the bound; NaN is not."""
         return self.bound is None or self.error <= self.bound
 
 
 @dataclass(frozen=True)
 class Check:
-    """A function that makes a record: one line of the table, and one test.
+    """A function that returns a record: one row of the table, and one test.
 
     Attributes:
         group, name, source: as of `Record`.

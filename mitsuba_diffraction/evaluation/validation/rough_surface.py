@@ -1,4 +1,4 @@
-"""Random surfaces, of which scalar theory knows the mean: Gaussian heights with a Gaussian correlation.
+"""Random surfaces for which scalar theory has a closed-form mean: Gaussian heights with a Gaussian correlation.
 
 With g = κ²σ² and the correlation of heights σ² e^{−τ²/ℓ²} (Beckmann and Spizzichino 1963; Stam 1999), for a surface
 that is rough along x and uniform along y,
@@ -8,9 +8,10 @@ that is rough along x and uniform along y,
 the specular and the diffuse component, both convolved with the Gaussian lobe of the coherence length. For g ≫ 1 the
 density of slopes remains: Beckmann's microfacets.
 
-One realisation differs from the mean. With length A of the profile, the mean field over all of it has the variance
-V/A in its real part, V the terms of even n at q = 0, so that the specular share e^{−g} has the standard deviation
-2 e^{−g/2} √(V/A); a band of width B holds A·B independent speckles and has 1/√(A·B). Bounds are three of these.
+One realisation differs from the mean. With A the length of the profile and V the terms of even n at q = 0, the real
+part of the mean field over the profile has the variance V/A, so that the specular fraction e^{−g} has the standard
+deviation 2 e^{−g/2} √(V/A). A band of width B has A·B independent speckles and the relative standard deviation
+1/√(A·B). Bounds are three standard deviations.
 """
 
 from __future__ import annotations
@@ -32,18 +33,18 @@ from .record import Check, Record
 
 Array = NDArray[np.float64]
 
-LENGTH = 8_000.0  # µm of profile
-PIXEL = 0.135  # µm: holds all frequencies that the settings below reach
+PROFILE_LENGTH = 8_000.0  # µm of profile
+PIXEL = 0.135  # µm: resolves all frequencies at the angles of SETTINGS
 SETTINGS = {"largest_angle": 41.5}
-WEAK = (0.06, 0.8)  # rms height and correlation length, µm
-LARGE = (0.2, 2.7)
-COHERENCE = 20.0  # µm
-DEVIATIONS = 3.0  # standard deviations allowed
+SMALL_ROUGHNESS = (0.06, 0.8)  # rms height and correlation length, µm
+LARGE_ROUGHNESS = (0.2, 2.7)
+COHERENCE_LENGTH = 20.0  # µm
+MAX_DEVIATIONS = 3.0  # standard deviations allowed
 
 
 def random_profile(rms: float, correlation: float, seed: int = 0) -> HeightField:
     """Draw one row of Gaussian heights, correlated as σ² e^{−τ²/ℓ²}; lengths in µm."""
-    count = round(LENGTH / PIXEL)
+    count = round(PROFILE_LENGTH / PIXEL)
     q = np.fft.rfftfreq(count, PIXEL)
     amplitude = np.sqrt(rms**2 * correlation * np.sqrt(np.pi) / PIXEL) * np.exp(-((np.pi * q * correlation) ** 2) / 2)
     noise = np.fft.rfft(np.random.default_rng(seed).standard_normal(count))
@@ -64,36 +65,36 @@ def diffuse(q: Array, g: float, correlation: float, broadened: float = 0.0, even
 @functools.cache
 def _spectrum(rms: float, correlation: float) -> GratingSpectrum:
     surface = random_profile(rms, correlation)
-    return spectrum_of(surface, extent="sample", coherence_length=COHERENCE, tolerance=2e-3, **SETTINGS)
+    return spectrum_of(surface, extent="sample", coherence_length=COHERENCE_LENGTH, tolerance=2e-3, **SETTINGS)
 
 
 def _coherent(wavelength: float, angle: float) -> Record:
-    """Compare the power within 5 σ_q of the specular direction: e^{−g}, and a little of the diffuse component."""
-    rms, correlation = WEAK
+    """Compare the power within 5 σ_q of the specular direction: e^{−g}, and a small part of the diffuse component."""
+    rms, correlation = SMALL_ROUGHNESS
     spectrum = _spectrum(rms, correlation)
     wi = direction(angle)
     kappa = 4 * np.pi * wi[2] / wavelength
     g = (kappa * rms) ** 2
-    sigma = lobe_width(COHERENCE)
+    sigma = lobe_width(COHERENCE_LENGTH)
     axis = np.linspace(-5, 5, 51) * sigma
     step = axis[1] - axis[0]
     q = np.stack(np.meshgrid(axis, axis), axis=-1)
     found = density(grating(spectrum, conserve=False), wi, towards(wi, q, wavelength), wavelength).sum() * step**2
     near = diffuse(axis, g, correlation, sigma).sum() * step
     noise = np.hypot(
-        2 * np.exp(-g / 2) * np.sqrt(diffuse(np.zeros(1), g, correlation, even=True)[0] / LENGTH),
-        near / np.sqrt(LENGTH * 10 * sigma),
+        2 * np.exp(-g / 2) * np.sqrt(diffuse(np.zeros(1), g, correlation, even=True)[0] / PROFILE_LENGTH),
+        near / np.sqrt(PROFILE_LENGTH * 10 * sigma),
     )
-    return Record(found - near, np.exp(-g), DEVIATIONS * noise + spectrum.tolerance, note=f"κσ = {kappa * rms:.2f}")
+    return Record(found - near, np.exp(-g), MAX_DEVIATIONS * noise + spectrum.tolerance, note=f"κσ = {kappa * rms:.2f}")
 
 
 def _diffuse_bands() -> Record:
     """Compare the diffuse component in bands of q of width 1/ℓ with the series."""
-    rms, correlation = WEAK
+    rms, correlation = SMALL_ROUGHNESS
     spectrum = _spectrum(rms, correlation)
     wi, wavelength = direction(0), 0.5
     g = (4 * np.pi / wavelength * rms) ** 2
-    sigma = lobe_width(COHERENCE)
+    sigma = lobe_width(COHERENCE_LENGTH)
     y = np.linspace(-5, 5, 41) * sigma
     edges = np.arange(0.15, 1.01, 0.17)
     bsdf = grating(spectrum, conserve=False)
@@ -103,28 +104,29 @@ def _diffuse_bands() -> Record:
         q = np.stack(np.meshgrid(np.concatenate([-x, x]), y), axis=-1)
         wo = towards(wi, q, wavelength)
         kappa = 2 * np.pi * (1 + wo[..., 2]) / wavelength
-        # κ falls with the angle; the series takes it at every point.
+        # κ decreases with the angle: the series is evaluated with κ of each point.
         series = np.vectorize(lambda a, k: diffuse(a, (k * rms) ** 2, correlation, sigma))
         area = (x[1] - x[0]) * (y[1] - y[0])
         expected.append((series(q[..., 0], kappa) * np.exp(-((q[..., 1] / sigma) ** 2) / 2)).sum() * area)
         expected[-1] /= np.sqrt(2 * np.pi) * sigma
         found.append(density(bsdf, wi, wo, wavelength).sum() * area)
-        bounds.append(DEVIATIONS * expected[-1] / np.sqrt(LENGTH * 2 * (high - low)) + spectrum.tolerance)
-    return Record.worst(expected, found, bounds, f"worst of {len(found)} bands, g = {g:.2f}")
+        bounds.append(MAX_DEVIATIONS * expected[-1] / np.sqrt(PROFILE_LENGTH * 2 * (high - low)) + spectrum.tolerance)
+    return Record.at_max_error(expected, found, bounds, f"maximum of {len(found)} bands, g = {g:.2f}")
 
 
 def _microfacets(angle: float) -> Record:
     """Compare a rough profile with `roughconductor`, Beckmann distribution; K S/λ² is D/(4 cos θ_i cos θ_o) there.
 
-    In the plane of incidence, bands of the half vector's slope out to one and a half rms slopes, on both sides of the
-    specular direction. Both are perfect mirrors. No facet masks another there: G is one in both models; E is omitted.
+    In the plane of incidence, over bands of the half vector's slope up to one and a half rms slopes on either side of
+    the specular direction. Both are perfect mirrors. Facets do not mask each other there: G is one in both models; E is
+    omitted.
     Along y, `roughconductor` has the width of the lobe of the coherence length.
     """
-    rms, correlation = LARGE
+    rms, correlation = LARGE_ROUGHNESS
     spectrum = _spectrum(rms, correlation)
     wi, wavelength = direction(angle), 0.42
     slope = np.sqrt(2) * rms / correlation
-    sigma = lobe_width(COHERENCE)
+    sigma = lobe_width(COHERENCE_LENGTH)
     w = 2 * wi[2]
     broadened = np.hypot(slope, sigma * wavelength / w)
     facets = mi.load_dict(
@@ -146,19 +148,19 @@ def _microfacets(angle: float) -> Record:
         expected.append(brdf(facets, wi, wo, wavelength).mean())
         found.append(brdf(bsdf, wi, wo, wavelength).mean())
         # Facets of about a correlation length are bright or dark as a whole.
-        share = ndtr(high / broadened) - ndtr(low / broadened)
-        speckles = LENGTH * (high - low) * w / wavelength
-        noise = np.hypot(np.sqrt((1 - share) / share * correlation / LENGTH), 1 / np.sqrt(speckles))
-        bounds.append(DEVIATIONS * noise)
-    note = f"f [1/sr]; relative; κσ = {2 * np.pi * w / wavelength * rms:.0f}; worst of {len(found)} bands of slope"
-    return Record.worst(expected, found, bounds, note, relative=True)
+        probability = ndtr(high / broadened) - ndtr(low / broadened)
+        speckles = PROFILE_LENGTH * (high - low) * w / wavelength
+        noise = np.hypot(np.sqrt((1 - probability) / probability * correlation / PROFILE_LENGTH), 1 / np.sqrt(speckles))
+        bounds.append(MAX_DEVIATIONS * noise)
+    note = f"f [1/sr]; relative; κσ = {2 * np.pi * w / wavelength * rms:.0f}; maximum of {len(found)} bands of slope"
+    return Record.at_max_error(expected, found, bounds, note, relative=True)
 
 
 CHECKS = (
     *(
         Check(
             "statistical",
-            f"roughness: specular share e^{{−κ²σ²}}, {name}",
+            f"roughness: specular fraction e^{{−κ²σ²}}, {name}",
             functools.partial(_coherent, wavelength, angle),
             "Beckmann 1963",
             slow=True,

@@ -36,7 +36,7 @@ _EV_MICROMETRE = 1.239842
 def aluminium(wavelength: float) -> complex:
     """Return n + ik of aluminium at a wavelength in µm by the Lorentz–Drude model of Rakić et al. (1998).
 
-    The measurements reach farther into the infrared than Mitsuba's table does; where both hold they agree to 5 %.
+    The measurements extend further into the infrared than Mitsuba's table; where they overlap, both agree to 5 %.
     """
     energy = _EV_MICROMETRE / wavelength
     strength, damping = _INTRABAND
@@ -106,7 +106,7 @@ def stored_angles() -> dict[str, dict[str, float]]:
 def fit(name: str, rigorous: bool) -> Fit:
     """Fit the facet angle to a measured grating in the mean square, by rigorous or by scalar theory.
 
-    Rigorous: up to a minute.
+    With rigorous theory this takes up to a minute.
 
     Raises:
         ValueError: if there is no such grating.

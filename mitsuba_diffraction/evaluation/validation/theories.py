@@ -1,4 +1,4 @@
-"""Scalar and rigorous theory of one grating: their costs, and their deviations from the solver."""
+"""Scalar and rigorous theory of one grating: costs, and errors relative to the solver."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ COLUMNS = {
     "build\nCPU s": "{.build_seconds:.2g}",
     "MB": "{.megabytes:.3g}",
     "error to the solver\nmean": "{.error:.1%}",
-    "\nworst": "{.max_error:.1%}",
+    "\nmax": "{.max_error:.1%}",
     "eval_pdf\nratio": "{.evaluate_ratio:.2f}",
     "in the\nlobes": "{.lobe_ratio:.2f}",
     "sample\nratio": "{.sample_ratio:.2f}",
 }
-_PLACES = 60  # directions and wavelengths at which the solver is asked
+_SAMPLE_COUNT = 60  # directions and wavelengths at which the solver is evaluated
 
 
 @dataclass(frozen=True)
@@ -40,9 +40,9 @@ class TheoryCost:
         build_seconds: of processor time, of `precompute`.
         megabytes: of the table.
         error, max_error: Σ|Δη_m| / Σ η_m against the solver, that of the theory and that of the table, the mean and the
-            largest over directions, uniform over the hemisphere, and wavelengths from 400 to 700 nm; unpolarised.
+            maximum over directions, uniform over the hemisphere, and wavelengths from 400 to 700 nm; unpolarised.
         evaluate_ratio: speed of eval_pdf to that of roughconductor (Al), random directions, the same run.
-        lobe_ratio: the same for pairs of directions of which one was drawn by the grating.
+        lobe_ratio: the same with ω_o sampled by the grating.
         sample_ratio: of sample.
     """
 
@@ -73,7 +73,7 @@ def compare_theories(
         tolerance: of the rigorous table; minutes of work.
         count: rays at once.
         repetitions: of each timing, interleaved.
-        progress: of the table, called with (steps done, steps in all).
+        progress: of the table, called with (steps done, steps in total).
     """
     spectra, built = {}, {}
     for theory, settings in (("scalar", {}), ("rigorous", {"material": material, "tolerance": tolerance})):
@@ -96,16 +96,16 @@ def compare_theories(
 
 
 def _errors(height_field: HeightField, material: str, table: RigorousSpectrum) -> dict[str, list[float]]:
-    """Return the errors of both theories at the same places."""
+    """Return the errors of both theories at the same directions and wavelengths."""
     errors: dict[str, list[float]] = {"scalar": [], "rigorous": []}
     period, powers = height_field.tile_size[0], profile_powers(height_field)
-    for cosine, turn, share in np.random.default_rng(0).random((_PLACES, 3)):
-        angle, wavelength = np.arccos(cosine), 0.4 + 0.3 * share
+    for cosine, azimuth, u in np.random.default_rng(0).random((_SAMPLE_COUNT, 3)):
+        angle, wavelength = np.arccos(cosine), 0.4 + 0.3 * u
         sine = np.sin(angle)
-        omega = -sine * np.cos(2 * np.pi * turn), -sine * np.sin(2 * np.pi * turn), cosine
+        omega = -sine * np.cos(2 * np.pi * azimuth), -sine * np.sin(2 * np.pi * azimuth), cosine
         index = refractive_index(wavelength, material=material)
         exact = efficiencies(height_field, omega, wavelength, int_ior=index, tolerance=2e-3)
-        scalar = scalar_orders(powers, period, wavelength, np.rad2deg(angle), index, 360 * turn)
+        scalar = scalar_orders(powers, period, wavelength, np.rad2deg(angle), index, 360 * azimuth)
         errors["scalar"].append(difference(scalar.unpolarised, exact.unpolarised))
         errors["rigorous"].append(difference(table.efficiencies(omega, wavelength)[1], exact.unpolarised))
     return errors

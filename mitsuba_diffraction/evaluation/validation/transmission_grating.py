@@ -1,8 +1,8 @@
 """Scalar and rigorous theory against a measured transmission grating, T300: `data/gratings/README.md`.
 
-300 lines/mm, a replica on B270 glass, first order, at normal incidence; it is taken to be lit through its plane face.
-The groove angle and one factor are fitted: the factor stands for what the glass, the replica and scattering take.
-The ratio of the second order to the first needs no factor; estimates from star spectra stand beside it.
+300 lines/mm, a replica on B270 glass, first order, at normal incidence, assumed to be lit through its plane face.
+The groove angle and one factor are fitted: the factor represents losses by the glass, the replica and scattering. The
+ratio of the second order to the first needs no factor; it is compared with estimates from star spectra.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ Real = NDArray[np.float64]
 PERIOD = 1000 / 300
 GROOVES = ("right-angled", "vertical wall")
 THEORIES = ("scalar", "rigorous")
-BOUND = 0.02
-"""Of the rms difference, rigorous theory."""
+MAX_RMS_DIFFERENCE = 0.02
+"""Of rigorous theory."""
 
 # λ in µm → second order over first, from spectra of stars.
 RATIOS = {0.45: 0.27, 0.5: 0.10, 0.55: 0.03}
@@ -55,7 +55,7 @@ def groove(shape: str, angle: float) -> HeightField:
 
 
 def transmitted(surface: HeightField, wavelength: float, rigorous: bool) -> Real:
-    """Compute η of the orders 1 and 2 on the blazed side, unpolarised light at normal incidence through the plane face.
+    """Compute η of the blazed orders 1 and 2, unpolarised light at normal incidence through the plane face.
 
     Scalar theory: K_t (1 − F) η_m(κ), with v = n ω_i + ω_o, κ = 2π v_z/λ and F at the direction of v (docs/theory.md).
     """
@@ -72,9 +72,9 @@ def transmitted(surface: HeightField, wavelength: float, rigorous: bool) -> Real
     v = np.stack([sine, cosine - index])
     length = np.linalg.norm(v, axis=0)
     inside, outside = np.abs(v[1]) / length, np.abs(v[0] * sine + v[1] * cosine) / length
-    gain = inside * outside * length**2 / (cosine * v[1] ** 2)
-    passed = 1 - np.mean(fresnel(outside, index), axis=0)
-    return face * gain * passed * profile_powers(surface)(-_ORDERS, 2 * np.pi * v[1] / wavelength)
+    factor = inside * outside * length**2 / (cosine * v[1] ** 2)
+    transmittance = 1 - np.mean(fresnel(outside, index), axis=0)
+    return face * factor * transmittance * profile_powers(surface)(-_ORDERS, 2 * np.pi * v[1] / wavelength)
 
 
 @functools.cache
@@ -93,7 +93,7 @@ def curve(shape: str, angle: float, rigorous: bool, step: int = 1) -> Real:
 
 @dataclass(frozen=True)
 class Fit:
-    """Grooves and a factor, fitted to what was measured.
+    """Grooves and a factor, fitted to the measured efficiencies.
 
     Attributes:
         angle: of the facets, degrees.
@@ -107,7 +107,7 @@ class Fit:
 
 
 def scaled(found: Real, step: int = 1) -> tuple[float, float]:
-    """Return the factor that fits efficiencies to the measured ones best, and the rms difference that is left."""
+    """Return the factor that best fits efficiencies to the measured ones, and the remaining rms difference."""
     wanted = measured()[1][::step]
     factor = float(found @ wanted / (found @ found))
     return factor, float(np.sqrt(((factor * found - wanted) ** 2).mean()))
@@ -138,19 +138,19 @@ def difference(shape: str, theory: str) -> Record:
     factor, rms = scaled(found)
     raw = float(np.sqrt(((found - measured()[1]) ** 2).mean()))
     note = f"rms over {len(found)} wavelengths, facets of {angle:.2f}°, all scaled by {factor:.3f}; {raw:.3f} unscaled"
-    return Record(rms, 0.0, BOUND if theory == "rigorous" else None, note=note)
+    return Record(rms, 0.0, MAX_RMS_DIFFERENCE if theory == "rigorous" else None, note=note)
 
 
 def ratios(shape: str, theory: str) -> Record:
-    """Return the second order over the first at the wavelengths of `RATIOS`; the first of these is the number."""
+    """Return the second order over the first at the wavelengths of `RATIOS`; `measured` is at the first."""
     surface = groove(shape, stored_angles()[shape][theory])
     found = []
     for wavelength in RATIOS:
         first, second = transmitted(surface, wavelength, theory == "rigorous")
         found.append(second / first)
-    told = ", ".join(f"{value:.3f}" for value in found)
-    places = ", ".join(f"{1e3 * wavelength:g}" for wavelength in RATIOS)
-    return Record(found[0], next(iter(RATIOS.values())), None, note=f"{told} at {places} nm")
+    values = ", ".join(f"{value:.3f}" for value in found)
+    at = ", ".join(f"{1e3 * wavelength:g}" for wavelength in RATIOS)
+    return Record(found[0], next(iter(RATIOS.values())), None, note=f"{values} at {at} nm")
 
 
 def plot() -> Figure:

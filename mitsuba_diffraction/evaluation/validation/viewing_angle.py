@@ -1,7 +1,7 @@
 """Reflectance over viewing angle and wavelength, its peak curve, and the period fitted to the peaks.
 
 The evaluation of the thesis of 2014 (section 5.3): light at a fixed angle θ_i, every viewing angle θ_r in the plane of
-the diffracting axis, every wavelength. For each wavelength the viewing angle of the greatest reflectance gives a period
+the diffracting axis, every wavelength. For each wavelength the viewing angle of maximum reflectance gives a period
 by the grating equation of the first order,
 
     d (sin θ_i + sin θ_r) = λ.
@@ -29,13 +29,13 @@ Array = NDArray[np.float64]
 
 MODEL = "model"
 METHODS = (MODEL, "flss", "nmm", "pq")
-"""What can be evaluated: this project's model, and the variants of the shader that have a spectrum (gem has none)."""
+"""This project's model, and the variants of the shader that have a spectrum (gem has none)."""
 
 INCIDENCE = 75.0
 """θ_i of the thesis, degrees."""
 
 
-_INDEX = 1.5  # of skin; the published shader knows no other
+_INDEX = 1.5  # of skin; the only one of the published shader
 _R_0 = ((_INDEX - 1) / (_INDEX + 1)) ** 2
 
 
@@ -87,7 +87,7 @@ class ReflectanceMap:
     """Relative reflectance in one plane.
 
     Attributes:
-        surface: what was evaluated.
+        surface: the evaluated surface.
         method: one of `METHODS`.
         incidence: θ_i in degrees.
         wavelengths: (n,) nm.
@@ -133,17 +133,17 @@ def reflectance_map(
 ) -> ReflectanceMap:
     """Evaluate a surface over viewing angle and wavelength.
 
-    The model is that of the BSDF, averaged over the places that a pixel covers; the shader that of
-    `shader.evaluate.relative_radiance`. NMM has at a viewing angle only the wavelengths
-    λ_n = T (sin θ_i + sin θ_r)/n, T being the length of the tile; the other way round, a wavelength only at the angles
-    of the tile's orders, where it equals FLSS. These are the angles of its map.
+    The model is evaluated by `relative_reflectance`; the shader by
+    `realtime_shader.evaluate.relative_radiance`. At a viewing angle, NMM has only the wavelengths
+    λ_n = T (sin θ_i + sin θ_r)/n, T being the length of the tile. Conversely, it has a wavelength only at the angles of
+    the tile's orders, where it equals FLSS. These are the angles of its map.
 
     Args:
         surface: the surface.
         method: one of `METHODS`.
         incidence: θ_i in degrees.
-        wavelengths: (n,) nm; every 5 nm from 380 to 780 nm if there are none.
-        angles: (m,) viewing angles θ_r in degrees; every 0.1° if there are none. Not for nmm.
+        wavelengths: (n,) nm; default: every 5 nm from 380 to 780 nm.
+        angles: (m,) viewing angles θ_r in degrees; default: every 0.1°. Not for nmm.
         quirks: of the shader; as published if none are given.
 
     Raises:
@@ -177,37 +177,37 @@ def reflectance_map(
 
 
 def _order_angles(surface: PublishedSurface, incidence: float, nanometres: Array) -> Array:
-    """Return θ_r of the tile's orders but zero at each wavelength, (n, m) degrees; NaN beyond the horizon."""
+    """Return θ_r of the tile's orders, except order zero, at each wavelength, (n, m) degrees; NaN if evanescent."""
     tile = surface.height_field.tile_size[surface.axis] * 1e3
     sine = np.sin(np.deg2rad(incidence))
-    first, last = (int(tile * reach / nanometres.min()) for reach in (sine - 1, sine + 1))
+    first, last = (int(tile * sines / nanometres.min()) for sines in (sine - 1, sine + 1))
     orders = np.concatenate([np.arange(first, 0), np.arange(1, last + 1)])
     sines = orders * nanometres[:, None] / tile - sine
     return np.rad2deg(np.arcsin(np.where(np.abs(sines) < 1, sines, np.nan)))
 
 
 def peak_angles(found: ReflectanceMap) -> Array:
-    """Return θ_r of the greatest reflectance outside of the specular peak, for each wavelength.
+    """Return θ_r of the maximum reflectance outside the specular peak, for each wavelength.
 
     Outside means nearer to order one than to order zero of the published period: d (sin θ_i + sin θ_r) > λ/2. The
-    place of the peak between the samples is the vertex of a parabola in the direction cosine through the logarithms of
-    three samples, which is exact for a Gaussian lobe. A method with directions of its own is not interpolated.
+    position of the peak between the samples is the vertex of a parabola in the direction cosine through the logarithms
+    of three samples, which is exact for a Gaussian lobe. A method with directions of its own is not interpolated.
 
     Returns:
-        (n,) degrees; NaN where there is no light.
+        (n,) degrees; NaN where the reflectance is zero.
     """
     outside = np.nan_to_num(np.where(found.order > 0.5, found.reflectance, 0))
     cosine = np.sin(np.deg2rad(np.broadcast_to(found.angles, outside.shape)))
     rows = np.arange(len(outside))
     peak = outside.argmax(axis=1)
-    place = cosine[rows, peak]
+    position = cosine[rows, peak]
     if not found.discrete:
         inner = np.clip(peak, 1, outside.shape[1] - 2)
         samples = inner[:, None] + (-1, 0, 1)
         x, y = (np.take_along_axis(array, samples, axis=1) for array in (cosine, outside))
         usable = (inner == peak) & (y.min(axis=1) > 0)
-        place = np.where(usable, _vertex(x, np.log(np.where(y > 0, y, 1))), place)
-    return np.where(outside[rows, peak] > 0, np.rad2deg(np.arcsin(place)), np.nan)
+        position = np.where(usable, _vertex(x, np.log(np.where(y > 0, y, 1))), position)
+    return np.where(outside[rows, peak] > 0, np.rad2deg(np.arcsin(position)), np.nan)
 
 
 def _vertex(x: Array, y: Array) -> Array:
@@ -249,7 +249,7 @@ def fit_period(found: ReflectanceMap) -> PeriodFit:
     """Return mean and variance over the wavelengths of d = λ/(sin θ_i + sin θ_r) at the peaks (table 5.1).
 
     Raises:
-        ValueError: if there is no light outside of the specular peak at some wavelength.
+        ValueError: if the reflectance outside the specular peak is zero at some wavelength.
     """
     angles = peak_angles(found)
     if np.isnan(angles).any():
