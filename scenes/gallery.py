@@ -1,18 +1,18 @@
-"""Renders the gallery at low resolution and fails if a picture differs from its reference by more than noise.
+"""Render the gallery at low resolution and fail if a picture differs from its reference by more than noise.
 
     python scenes/gallery.py                 # every picture
     python scenes/gallery.py foil_sun        # some
     python scenes/gallery.py --write         # new references, after an intended change
-    python scenes/gallery.py --compress      # reduces the pictures in docs/gallery to less than 500 kB each
+    python scenes/gallery.py --compress      # reduce the pictures in docs/gallery to less than 500 kB each
 
-The commands are those of docs/gallery.md: first the scripts that generate the models, if there are none yet, then each
+The commands are those of docs/gallery.md: first the scripts that generate the models, if they are missing, then each
 `mitsuba-diffraction render … -o docs/gallery/NAME.exr`, at 160 × 90 pixels and 8 samples per pixel.
 
 Linear sRGB c is mapped to c/(c + m), where m is the mean of the reference, to limit the weight of fireflies, and
 averaged over squares of 10 and of 30 pixels and over the picture. The reference holds the mean and the standard
 deviation s of each average over n renderings with independent seeds. An average of a new picture that deviates by Δ has
-t = Δ/(s √(1 + 1/n)), with s no less than its root mean square over all squares of that size. A picture has changed if
-the probability of its largest |t| is below 0.001 (Student's t with n − 1 degrees of freedom, Šidák's correction (1967)
+t = Δ/(s √(1 + 1/n)), with s at least its root mean square over all squares of that size. A picture has changed if the
+probability of its maximum |t| is below 0.001 (Student's t with n − 1 degrees of freedom, Šidák's correction (1967)
 for the number of averages).
 """
 
@@ -46,13 +46,13 @@ REFERENCES = Path(__file__).with_name("gallery.npz")
 SIZE, SAMPLES, SQUARES = (160, 90), 8, (10, 30)
 SEEDS = 12  # of the references
 SIGNIFICANCE = 1e-3
-LARGEST_FILE = 500_000  # bytes
+MAX_FILE_SIZE = 500_000  # bytes
 
 Array = NDArray[np.float64]
 
 
 def commands(pages: Sequence[Path]) -> tuple[list[list[str]], dict[str, list[str]]]:
-    """The commands on the pages: those that generate models, and by picture those that render it.
+    """Return the commands on the pages: those that generate models, and by picture those that render it.
 
     Raises:
         ValueError: if two commands disagree about one picture.
@@ -74,26 +74,26 @@ def commands(pages: Sequence[Path]) -> tuple[list[list[str]], dict[str, list[str
 
 
 def small(words: Sequence[str], seed: int, target: Path) -> list[str]:
-    """The same command at low resolution, with a given seed, writing to `target`."""
+    """Return the same command at low resolution, with a given seed, writing to `target`."""
     words = [words[0], str(ROOT / words[1]), *words[2:]]
     for option in ("-o", "--spp", "--width", "--height", "--seed"):
         if option in words:
-            place = words.index(option)
-            del words[place : place + 2]
+            index = words.index(option)
+            del words[index : index + 2]
     words = [word for word in words if word != "--denoise"] + ["--no-denoise"]
     size = ["--width", str(SIZE[0]), "--height", str(SIZE[1]), "--spp", str(SAMPLES)]
     return [*words, *size, "--seed", str(seed), "-o", str(target)]
 
 
 def rendered(words: Sequence[str], seed: int) -> Array:
-    """The linear sRGB of a command's picture, reduced, (height, width, 3).
+    """Return the linear sRGB of a command's picture at low resolution, (height, width, 3).
 
     Raises:
-        ValueError: if the command does, for a scene that is wrong for example.
+        ValueError: if the command does, for example for a wrong scene.
     """
     with tempfile.TemporaryDirectory() as folder:
         target = Path(folder) / "picture.exr"
-        # In this process, so that kernels are compiled and models read by Dr.Jit's and Mitsuba's own caches once.
+        # In this process, so that Dr.Jit's kernel cache is shared by all pictures.
         with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
             app(small(words, seed, target), standalone_mode=False, obj={})
         image = SpectralImage.load(target)
@@ -102,12 +102,12 @@ def rendered(words: Sequence[str], seed: int) -> Array:
 
 @dataclass(frozen=True)
 class Reference:
-    """What pictures of one command look like.
+    """Statistics of the pictures of one command.
 
     Attributes:
         level: m, the mean of the pictures.
         mean, deviation: of the averages, (k,).
-        count: n, how many pictures.
+        count: n, the number of pictures.
     """
 
     level: float
@@ -117,25 +117,25 @@ class Reference:
 
     @classmethod
     def of(cls, pictures: Sequence[Array]) -> Reference:
-        """The reference that pictures with different seeds make."""
+        """Return the reference from pictures with different seeds."""
         level = float(np.mean(pictures))
         values = np.array([averages(picture, level) for picture in pictures])
         return cls(level, values.mean(0), values.std(0, ddof=1), len(pictures))
 
     def probability(self, picture: Array) -> float:
-        """That noise alone makes a picture differ so much."""
-        # A few pictures may miss the rare bright paths of a square: s is at least as large as it is on the whole.
+        """Return the probability that noise alone makes a picture differ as much."""
+        # A few pictures may miss the rare bright paths of a square: s is at least its root mean square.
         scale = scales(picture.shape)
-        usual = np.sqrt(np.bincount(scale, self.deviation**2) / np.bincount(scale))[scale]
-        # Where next to nothing is random, a 2000th would not be seen.
-        deviation = np.maximum(np.maximum(self.deviation, usual), 1 / 2000) * np.sqrt(1 + 1 / self.count)
+        rms = np.sqrt(np.bincount(scale, self.deviation**2) / np.bincount(scale))[scale]
+        # Where there is hardly any noise, differences of 1/2000 are invisible.
+        deviation = np.maximum(np.maximum(self.deviation, rms), 1 / 2000) * np.sqrt(1 + 1 / self.count)
         t = (averages(picture, self.level) - self.mean) / deviation
-        least = 2 * stats.t.sf(np.abs(t).max(), self.count - 1)
-        return float(-np.expm1(t.size * np.log1p(-least)))
+        p_value = 2 * stats.t.sf(np.abs(t).max(), self.count - 1)
+        return float(-np.expm1(t.size * np.log1p(-p_value)))
 
 
 def averages(picture: Array, level: float) -> Array:
-    """Means of c/(c + m) over squares and over the picture, (k,)."""
+    """Return the means of c/(c + m) over squares and over the picture, (k,)."""
     mapped = picture / (picture + level)
     parts = [mapped.mean((0, 1))]
     for side in SQUARES:
@@ -146,13 +146,13 @@ def averages(picture: Array, level: float) -> Array:
 
 
 def scales(shape: tuple[int, ...]) -> NDArray[np.int64]:
-    """Which of the averages of a picture are over squares of one size, (k,): 0 the picture, 1 and on `SQUARES`."""
+    """Return the index of the size of each average, (k,): 0 for the picture, from 1 on for `SQUARES`."""
     counts = [1, *((shape[0] // side) * (shape[1] // side) for side in SQUARES)]
     return np.repeat(np.arange(len(counts)), 3 * np.array(counts))
 
 
 def load(path: Path) -> dict[str, Reference]:
-    """The references in a file, by picture."""
+    """Return the references in a file, by picture."""
     with np.load(path) as file:
         names = sorted({key.split(".")[0] for key in file})
         return {
@@ -167,7 +167,7 @@ def load(path: Path) -> dict[str, Reference]:
 
 
 def save(references: Mapping[str, Reference], path: Path) -> None:
-    """Writes references, in single precision."""
+    """Write references, in single precision."""
     arrays = {}
     for name, reference in sorted(references.items()):
         arrays[f"{name}.level"], arrays[f"{name}.count"] = np.float64(reference.level), np.int64(reference.count)
@@ -178,12 +178,12 @@ def save(references: Mapping[str, Reference], path: Path) -> None:
 
 
 def compress(path: Path) -> int:
-    """Gives a picture of 500 kB or more a palette that brings it below; the number of its colours, 0 for a small one.
+    """Reduce a picture of 500 kB or more to a palette; return the number of colours, 0 for a smaller file.
 
     Raises:
         ValueError: if 32 colours are too many.
     """
-    if path.stat().st_size < LARGEST_FILE:
+    if path.stat().st_size < MAX_FILE_SIZE:
         return 0
     with Image.open(path) as picture:
         picture = picture.convert("RGB")
@@ -191,23 +191,23 @@ def compress(path: Path) -> int:
         stream = io.BytesIO()
         reduced = picture.quantize(palette=palette(picture, colours), dither=Image.Dither.FLOYDSTEINBERG)
         reduced.save(stream, "PNG", optimize=True)
-        if stream.tell() < LARGEST_FILE:
+        if stream.tell() < MAX_FILE_SIZE:
             with whole_file(path) as temporary:
                 temporary.write_bytes(stream.getvalue())
             return colours
-    raise ValueError(f"{path}: got more than {LARGEST_FILE // 1000} kB with 32 colours, wanted less noise")
+    raise ValueError(f"{path}: got more than {MAX_FILE_SIZE // 1000} kB with 32 colours, wanted less noise")
 
 
 def palette(picture: Image.Image, colours: int) -> Image.Image:
-    """The colours of a picture by k-means in Oklab.
+    """Return a palette for a picture by k-means in Oklab.
 
-    A colour counts by the 0.4th power of its pixels: what is seen of a grating are few pixels of rare colours.
+    The weight of a colour is the number of its pixels to the power 0.4: gratings show rare colours in few pixels.
     """
     found, counts = np.unique(np.asarray(picture).reshape(-1, 3) // 4, axis=0, return_counts=True)
     weights = counts**0.4
     drawn = found[np.random.default_rng(0).choice(len(found), 50_000, p=weights / weights.sum())]
-    places = colour.XYZ_to_Oklab(colour.sRGB_to_XYZ((4 * drawn + 2) / 255))
-    centres, _ = cluster.vq.kmeans2(places, colours, minit="++", rng=0)
+    points = colour.XYZ_to_Oklab(colour.sRGB_to_XYZ((4 * drawn + 2) / 255))
+    centres, _ = cluster.vq.kmeans2(points, colours, minit="++", rng=0)
     rgb = np.clip(colour.XYZ_to_sRGB(colour.Oklab_to_XYZ(centres)), 0, 1)
     result = Image.new("P", (1, 1))
     result.putpalette(np.round(255 * rgb).astype(np.uint8).ravel().tolist())
@@ -215,7 +215,7 @@ def palette(picture: Image.Image, colours: int) -> Image.Image:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the check; the exit code."""
+    """Run the check; return the exit code."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("names", nargs="*", metavar="NAME", help="pictures; all by default")
     parser.add_argument("--write", action="store_true", help="make new references")

@@ -1,4 +1,4 @@
-"""What the models stand on, as textures for the scenes: `python scenes/ground.py`.
+"""The ground of the scenes, as textures for the scenes: `python scenes/ground.py`.
 
 A slab of stone and a wooden table, made of periodic noise, so that they may be repeated. Lengths are cm.
 """
@@ -15,12 +15,12 @@ WOOD = (64.0, 32.0)
 
 
 def slopes(height: Array, pixel: float) -> tuple[Array, Array]:
-    """∂h/∂u and ∂h/∂v of a periodic height, cm, on square pixels."""
+    """Return ∂h/∂u and ∂h/∂v of a periodic height, cm, on square pixels."""
     return tuple((np.roll(height, -1, axis) - np.roll(height, 1, axis)) / (2 * pixel) for axis in (1, 0))
 
 
 def stone(rng: np.random.Generator, size: int) -> tuple[Array, Array]:
-    """Colours and normals of a rough grey slab."""
+    """Return colours and normals of a rough grey slab."""
     shape = (size, size)
     cloud, grain = noise(rng, shape, 1.5, 0.3), noise(rng, shape, 0.4)
     shade = 0.45 * (1 + 0.13 * cloud + 0.09 * grain)
@@ -30,12 +30,12 @@ def stone(rng: np.random.Generator, size: int) -> tuple[Array, Array]:
 
 
 def wood(rng: np.random.Generator, size: int) -> Array:
-    """Colours of boards along u: growth rings cut nearly along the trunk, and fibres."""
+    """Return colours of boards along u: growth rings cut nearly along the trunk, and fibres."""
     shape = (size // 2, size)
     boards, per_board = 4, shape[0] // 4
     rows = []
     for _ in range(boards):
-        # A trunk's rings are round: cut along, they are parabolas far out and lines beside them.
+        # A lengthwise cut through the round rings of a trunk shows parabolas, with nearly straight lines beside them.
         across = np.linspace(-1, 1, per_board)[:, None] + rng.uniform(-0.5, 0.5)
         bend = noise(rng, shape, 2.0, 0.7)[:per_board]
         ring = 7 * np.hypot(across + 0.16 * bend, 0.35 + 0.1 * noise(rng, shape, 2.2, 1.0)[:per_board])
@@ -44,15 +44,15 @@ def wood(rng: np.random.Generator, size: int) -> Array:
     # Fibres are long along the trunk.
     fibre = noise(rng, (shape[0], 64), 0.3).repeat(size // 64, 1)
     fibre = 0.5 * (fibre + np.roll(fibre, size // 128, 1)) + 0.7 * noise(rng, shape, 0.5)
-    place = np.arange(shape[0]) % per_board
-    gap = np.minimum(place, per_board - 1 - place)[:, None] < 2
+    row = np.arange(shape[0]) % per_board
+    gap = np.minimum(row, per_board - 1 - row)[:, None] < 2
     tone = np.clip(0.5 + 0.28 * (ring - 0.5) + 0.07 * fibre, 0, 1)[..., None]
     colour = (1 - tone) * np.array([0.33, 0.20, 0.12]) + tone * np.array([0.60, 0.41, 0.26])
     return np.where(gap[..., None], 0.25 * colour, colour)
 
 
 def make(folder: Path, size: int = 2048) -> None:
-    """Writes stone.png, stone_normals.exr and wood.png, `size` texels wide."""
+    """Write stone.png, stone_normals.exr and wood.png, `size` texels wide."""
     colour, normals = stone(np.random.default_rng(1), size)
     write_colours(folder / "stone.png", colour)
     write_numbers(folder / "stone_normals.exr", normals)

@@ -1,12 +1,13 @@
 """A picture as a hologram of dots, as textures for hologram.xml: `python scenes/hologram.py`, or with a PICTURE.
 
-Each pixel has three stripes, each a sinusoidal grating that sends red, green or blue from the lamp to the eye in its
-first order. With ω to the lamp and to the eye, each from the place of the stripe, the grating equation gives
+Each pixel has three stripes, each a sinusoidal grating that diffracts red, green or blue light of the lamp to the eye
+in its first order. With ω_i and ω_o the directions from the stripe to the lamp and to the eye, the grating equation is
 
     (cos φ, sin φ)/(s T) = −(ω_i + ω_o)_∥/λ
 
-that is `orientation` φ and `lateral_scale` s. The first order has the share J_1(κa)² of the light: the amplitude a of
-the groove, and so `height_scale`, sets how bright the stripe is. Lengths of the scene are cm, those of gratings µm.
+where φ is `orientation` and s `lateral_scale`. The first order has the fraction J_1(κa)² of the light: the amplitude a
+of the groove, and so `height_scale`, determines the brightness of the stripe. Lengths of the scene are cm, those of
+gratings µm.
 """
 
 from __future__ import annotations
@@ -26,23 +27,23 @@ PICTURE = Path(__file__).parents[1] / "docs" / "gallery" / "snake_xenopeltis_sun
 PERIOD, DEPTH = 1.5, 0.25  # µm, as in hologram.xml
 WIDTH = 16.0  # cm, of the hologram; its height is that of the picture
 WAVELENGTHS = np.array([0.620, 0.535, 0.460])  # µm, of the stripes
-BAND = 0.06  # of a wavelength, which the width of the lamp lets the eye see
+BAND = 0.06  # relative width of the band of wavelengths that reaches the eye, by the width of the lamp
 LIGHT, EYE = (-12.0, 22.0, 52.0), (0.0, -44.0, 44.0)  # of hologram.xml
-BRIGHTEST = 0.995  # the share of stripes that are no brighter than a grating can be
+WHITE_QUANTILE = 0.995  # of the stripes' brightness, shown with the maximum efficiency of a grating
 
 
-def amounts(linear: Array) -> Array:
-    """Return how bright the three stripes are, from 0 to 1, for linear sRGB (rows, columns, 3)."""
+def stripe_brightness(linear: Array) -> Array:
+    """Return the brightness of the three stripes, from 0 to 1, for linear sRGB (rows, columns, 3)."""
     wavelengths = np.arange(380, 781) * 1e-3
     bands = np.exp(-0.5 * ((wavelengths[:, None] / WAVELENGTHS - 1) / BAND) ** 2)
     stripes = np.maximum(linear @ np.linalg.inv(spectrum_to_linear_sRGB(bands.T, 1e3 * wavelengths)), 0)
-    return np.minimum(stripes / np.quantile(stripes.max(-1), BRIGHTEST), 1)
+    return np.minimum(stripes / np.quantile(stripes.max(-1), WHITE_QUANTILE), 1)
 
 
-def directions(places: Array, there: Array) -> Array:
-    """Return unit vectors (..., 3) from places to one place."""
-    away = there - places
-    return away / np.linalg.norm(away, axis=-1, keepdims=True)
+def directions(points: Array, target: Array) -> Array:
+    """Return unit vectors (..., 3) from points to one target."""
+    offset = target - points
+    return offset / np.linalg.norm(offset, axis=-1, keepdims=True)
 
 
 def gratings(brightness: Array, light: Array, eye: Array) -> tuple[Array, Array, Array]:
@@ -50,29 +51,29 @@ def gratings(brightness: Array, light: Array, eye: Array) -> tuple[Array, Array,
 
     Args:
         brightness: (rows, columns, 3) of red, green and blue; row 0 is at the top.
-        light, eye: where they are, from the middle of the hologram, cm.
+        light, eye: positions relative to the centre of the hologram, cm.
     """
     rows, columns = brightness.shape[0], 3 * brightness.shape[1]
     pixel = WIDTH / columns
     x, y = (np.arange(columns) + 0.5) * pixel - WIDTH / 2, (rows / 2 - np.arange(rows) - 0.5) * 3 * pixel
-    places = np.stack([*np.meshgrid(x, y), np.zeros((rows, columns))], -1)
-    across = -directions(places, light) - directions(places, eye)
+    points = np.stack([*np.meshgrid(x, y), np.zeros((rows, columns))], -1)
+    cosines = -directions(points, light) - directions(points, eye)
     wavelength = np.tile(WAVELENGTHS, columns // 3)
-    lateral = wavelength / np.hypot(across[..., 0], across[..., 1]) / PERIOD
-    # J_1(x)² up to its maximum; in Al and without a coat the rest hardly depends on the wavelength.
+    lateral = wavelength / np.hypot(cosines[..., 0], cosines[..., 1]) / PERIOD
+    # J_1(x)² up to its maximum; for Al without a coat, the other factors hardly depend on the wavelength.
     x = np.linspace(0, jnp_zeros(1, 1)[0], 500)
     phase = np.interp(brightness.reshape(rows, columns), (j1(x) / j1(x[-1])) ** 2, x)
-    heights = phase * wavelength / (-np.pi * across[..., 2]) / DEPTH
-    return lateral, heights, np.rad2deg(np.arctan2(across[..., 1], across[..., 0]))
+    heights = phase * wavelength / (-np.pi * cosines[..., 2]) / DEPTH
+    return lateral, heights, np.rad2deg(np.arctan2(cosines[..., 1], cosines[..., 0]))
 
 
 def make(folder: Path, picture: Path, light: Array, eye: Array, count: int) -> None:
-    """Writes hologram_lateral.exr, hologram_heights.exr and hologram_turn.exr, `count` pixels wide."""
+    """Write hologram_lateral.exr, hologram_heights.exr and hologram_turn.exr, `count` pixels wide."""
     with Image.open(picture) as image:
         size = count, round(count * image.height / image.width)
         srgb = np.asarray(image.convert("RGB").resize(size, Image.Resampling.LANCZOS), np.float64) / 255
     linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
-    found = gratings(amounts(linear), light, eye)
+    found = gratings(stripe_brightness(linear), light, eye)
     for name, values in zip(("lateral", "heights", "turn"), found, strict=True):
         write_numbers(folder / f"hologram_{name}.exr", values)
     print(f"periods {PERIOD * found[0].min():.2f} to {PERIOD * found[0].max():.2f} µm, ", end="")
@@ -80,10 +81,10 @@ def make(folder: Path, picture: Path, light: Array, eye: Array, count: int) -> N
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description="Turns a picture into the textures of hologram.xml.")
+    parser = argparse.ArgumentParser(description="Convert a picture to the textures of hologram.xml.")
     parser.add_argument("picture", nargs="?", type=Path, default=PICTURE, help="any RGB picture")
-    for name, place in (("light", LIGHT), ("eye", EYE)):
-        parser.add_argument(f"--{name}", nargs=3, type=float, default=place, metavar=("X", "Y", "Z"))
+    for name, position in (("light", LIGHT), ("eye", EYE)):
+        parser.add_argument(f"--{name}", nargs=3, type=float, default=position, metavar=("X", "Y", "Z"))
     parser.add_argument("--pixels", type=int, default=400, help="of the picture, across")
     options = parser.parse_args()
     settings = {"picture": options.picture, "light": np.array(options.light), "eye": np.array(options.eye)}

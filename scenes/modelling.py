@@ -1,7 +1,7 @@
-"""What the models of the scenes share: meshes and textures, written where the scenes look for them.
+"""Meshes and textures of the scenes: functions that the scripts of this folder share.
 
-Lengths are cm. A patch (u, v) → place becomes a mesh with normals and UVs; u and v must turn so that ∂u × ∂v points
-outwards. The meshes are swept or deformed sheets, so that everything follows from arrays of places.
+Lengths are cm. A patch (u, v) → point becomes a mesh with normals and UVs; ∂u × ∂v must point outwards. All meshes
+are swept or deformed sheets, given as arrays of points.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ MODELS = Path(__file__).parent / "models"
 
 
 def command(make: Callable[[Path], None], folder: Path = MODELS) -> None:
-    """Makes the files of one scene and says where and how long it took."""
+    """Write the files of one scene; print the folder and the time."""
     folder.mkdir(exist_ok=True)
     start = time.perf_counter()
     make(folder)
@@ -34,29 +34,29 @@ def command(make: Callable[[Path], None], folder: Path = MODELS) -> None:
 def write_sheets(
     path: Path, sheets: Sequence[tuple[Array, Array, Array]], uv: Callable[[Array], Array] | None = None
 ) -> None:
-    """Writes sheets as one mesh (.ply) with normals and UVs: two triangles for each cell.
+    """Write sheets as one mesh (.ply) with normals and UVs: two triangles for each quad of the grid.
 
     Args:
-        path: where to write.
-        sheets: (places, u, v) each, of shapes (n_v, n_u, 3), (n_u,) and (n_v,). Where the first and the last row or
-            column lie in one place the surface is closed there.
-        uv: UVs (n, 2) of places (n, 3), instead of u and v.
+        path: of the mesh.
+        sheets: (points, u, v) each, of shapes (n_v, n_u, 3), (n_u,) and (n_v,). Where the first and the last row
+            or column coincide, the surface is closed.
+        uv: UVs (n, 2) of points (n, 3), instead of u and v.
     """
     vertices, normals, uvs, faces, count = [], [], [], [], 0
-    for places, u, v in sheets:
-        rows, columns = places.shape[:2]
-        normal = np.cross(_difference(places, 1), _difference(places, 0))
+    for points, u, v in sheets:
+        rows, columns = points.shape[:2]
+        normal = np.cross(_difference(points, 1), _difference(points, 0))
         length = np.linalg.norm(normal, axis=-1, keepdims=True)
         normals.append(np.divide(normal, length, out=np.zeros_like(normal), where=length > 0).reshape(-1, 3))
-        vertices.append(places.reshape(-1, 3))
+        vertices.append(points.reshape(-1, 3))
         uvs.append(np.stack(np.meshgrid(u, v), -1).reshape(-1, 2) if uv is None else uv(vertices[-1]))
         corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel() + count
         faces += [corner, corner + 1, corner + columns + 1, corner, corner + columns + 1, corner + columns]
         count += rows * columns
     triangles = [np.stack(faces[i : i + 3], -1) for i in range(0, len(faces), 3)]
     mi.set_variant("scalar_rgb")
-    number = sum(len(part) for part in triangles)
-    mesh = mi.Mesh(path.stem, count, number, has_vertex_normals=True, has_vertex_texcoords=True)
+    triangle_count = sum(len(part) for part in triangles)
+    mesh = mi.Mesh(path.stem, count, triangle_count, has_vertex_normals=True, has_vertex_texcoords=True)
     parameters = mi.traverse(mesh)
     parameters["vertex_positions"] = np.concatenate(vertices).ravel()
     parameters["vertex_normals"] = np.concatenate(normals).ravel()
@@ -67,55 +67,55 @@ def write_sheets(
         mesh.write_ply(str(temporary))
 
 
-def _difference(places: Array, axis: int) -> Array:
-    """Central differences; across the seam where the first and the last place are the same."""
-    first, last = places.take(0, axis), places.take(-1, axis)
+def _difference(points: Array, axis: int) -> Array:
+    """Return central differences; periodic ones if the first and the last row or column coincide."""
+    first, last = points.take(0, axis), points.take(-1, axis)
     if np.allclose(first, last):
-        inner = places.take(range(places.shape[axis] - 1), axis)
+        inner = points.take(range(points.shape[axis] - 1), axis)
         difference = np.roll(inner, -1, axis) - np.roll(inner, 1, axis)
         return np.concatenate([difference, difference.take([0], axis)], axis)
-    return np.gradient(places, axis=axis)
+    return np.gradient(points, axis=axis)
 
 
 def write_colours(path: Path, srgb: Array) -> None:
-    """Writes a texture of colours (.png): sRGB in [0, 1], (rows, columns, 3); row 0 lies at v = 1, as Mitsuba reads."""
+    """Write a texture of colours (.png): sRGB in [0, 1], (rows, columns, 3); row 0 is at v = 1, as in Mitsuba."""
     with whole_file(path) as temporary:
         Image.fromarray(np.round(255 * np.clip(srgb, 0, 1)).astype(np.uint8)[::-1]).save(temporary)
 
 
 def write_numbers(path: Path, values: Array) -> None:
-    """Writes a texture of numbers (.exr, half): (rows, columns) or (rows, columns, 3); row 0 lies at v = 1.
+    """Write a texture of numbers (.exr, half): (rows, columns) or (rows, columns, 3); row 0 is at v = 1.
 
-    Eight bits would not do for normals: their steps of half a degree are as wide as the lobes of a grating.
+    Eight bits are too few for normals: their steps of half a degree are as wide as the lobes of a grating.
     """
     with whole_file(path) as temporary:
         mi.Bitmap(np.ascontiguousarray(values[::-1]).astype(np.float16)).write(str(temporary))
 
 
 def normals_from_slopes(slope_u: Array, slope_v: Array) -> Array:
-    """The texture of a normal map: (n + 1)/2 with n ∝ (−∂h/∂u, −∂h/∂v, 1), slopes per length along u and v."""
+    """Return the texture of a normal map: (n + 1)/2 with n ∝ (−∂h/∂u, −∂h/∂v, 1), slopes per length along u and v."""
     normal = np.stack([-slope_u, -slope_v, np.ones_like(slope_u)], -1)
     return (normal / np.linalg.norm(normal, axis=-1, keepdims=True) + 1) / 2
 
 
-def noise(rng: np.random.Generator, shape: tuple[int, int], exponent: float, largest: float = 1.0) -> Array:
-    """Periodic noise of mean 0 and standard deviation 1 whose amplitude falls as q^−exponent beyond q = 1/largest.
+def noise(rng: np.random.Generator, shape: tuple[int, int], exponent: float, max_length: float = 1.0) -> Array:
+    """Return periodic noise of mean 0 and standard deviation 1, its amplitude ∝ q^−exponent above q = 1/max_length.
 
     Args:
-        rng: of the random numbers.
+        rng: generator of the random numbers.
         shape: (rows, columns).
         exponent: 1 is cloudy, 2 smooth.
-        largest: the length above which nothing varies more, as a share of the sheet's width.
+        max_length: below the frequency 1/max_length the amplitude is constant; a fraction of the sheet's width.
     """
     rows, columns = shape
     q = np.hypot(np.fft.fftfreq(rows)[:, None] * columns, np.fft.rfftfreq(columns) * columns)
-    amplitude = np.maximum(q, 1 / largest) ** -exponent
+    amplitude = np.maximum(q, 1 / max_length) ** -exponent
     amplitude[0, 0] = 0
     field = np.fft.irfft2(np.fft.rfft2(rng.standard_normal(shape)) * amplitude, s=shape)
     return field / field.std()
 
 
 def smooth_step(x: Array, start: float, end: float) -> Array:
-    """0 before `start`, 1 after `end` (which may be the smaller), smooth between (Hermite)."""
+    """Return 0 before `start`, 1 after `end` (which may be the smaller), and a Hermite polynomial between them."""
     t = np.clip((x - start) / (end - start), 0, 1)
     return t * t * (3 - 2 * t)

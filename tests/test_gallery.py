@@ -93,7 +93,7 @@ def test_pictures_are_compressed(tmp_path):
     Image.fromarray((smooth + rng.normal(0, 8, smooth.shape)).astype(np.uint8)).save(path)
     assert path.stat().st_size > 1e6
     assert gallery.compress(path) >= 32
-    assert path.stat().st_size < gallery.LARGEST_FILE
+    assert path.stat().st_size < gallery.MAX_FILE_SIZE
     with Image.open(path) as picture:
         assert np.abs(np.asarray(picture.convert("RGB"), float) - smooth).mean() < 15
     assert gallery.compress(path) == 0
