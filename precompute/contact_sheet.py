@@ -1,7 +1,7 @@
-"""Renders every recipe of this folder into one picture: python precompute/contact_sheet.py docs/ready_surfaces.png
+"""Render every recipe of this folder into one picture: python precompute/contact_sheet.py docs/ready_surfaces.png
 
-Discs (compact_disc, dvd) are shown as discs, films and gratings that light passes as a pane before a small lamp,
-everything else on a sphere and a plate. The light is a sun at the left, a narrow lamp, and a dim sky.
+Discs (compact_disc, dvd) are shown as discs, films and transmission gratings as a pane in front of a small
+lamp, all others on a sphere and a plate. The light is a sun at the left, a narrow lamp, and a dim sky.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ SKINS = {"elaphe", "elaphe_afm", "xenopeltis", "xenopeltis_afm", "morpho_ridges"
 METAL = '<string name="material" value="Al"/>'
 SKIN = """<float name="int_ior" value="1.5"/>
     <bsdf type="diffuse" name="base"><rgb name="reflectance" value="0.02, 0.014, 0.01"/></bsdf>"""
-# On a disk x is the radius: tracks, which run along y, run round it.
+# On a disk x is the radius: tracks, which run along y, run around the disk.
 DISC = """<shape type="disk"><ref id="surface"/></shape>
 <shape type="disk"><transform name="to_world"><scale value="0.2"/><translate z="0.002"/></transform>
     <bsdf type="diffuse"><rgb name="reflectance" value="0.01"/></bsdf></shape>"""
@@ -56,7 +56,7 @@ SCENE = """<scene version="3.0.0"><integrator type="path"><integer name="max_dep
 
 
 def panel(recipe: Path, folder: Path, size: int, spp: int) -> Image.Image:
-    """The picture of one recipe."""
+    """Render the picture of one recipe."""
     scene, picture = folder / f"{recipe.stem}.xml", folder / f"{recipe.stem}.png"
     disc = recipe.stem in DISCS
     content = {"coat": METAL, "shapes": DISC if disc else SPHERE, "sun": 0.1, "lamp": 3, "sky": 0.0015, "fov": 22}

@@ -1,7 +1,7 @@
-"""Rigorous efficiencies of the orders that a grating reflects: coupled-wave analysis, by `meent` (NumPy).
+"""Rigorous efficiencies of the reflected orders of a grating by coupled-wave analysis with `meent` (NumPy).
 
-meent solves Maxwell's equations layer by layer (Moharam et al. 1995, with Li's factorisation for TM). What is ours is
-what goes in, exact Fourier coefficients of each layer, and when to stop: harmonics and layers are raised until the
+meent solves Maxwell's equations layer by layer (Moharam et al. 1995, with Li's factorisation for TM). This file
+adds exact Fourier coefficients of each layer and the stopping criterion: harmonics and layers are increased until the
 orders no longer change.
 """
 
@@ -16,8 +16,9 @@ from scipy.linalg import toeplitz
 
 Array = NDArray[np.float64]
 
-# Without any loss the sign of the root of an eigenvalue is up to rounding, and a wave may be taken for its reflection:
-# with many layers several per cent of the energy are lost. This index of absorption moves the efficiencies by 1e-7.
+# Without loss, rounding determines the sign of the root of an eigenvalue, and waves may be confused with their
+# reflections: with many layers several per cent of the energy are lost. This index of absorption changes the
+# efficiencies by 1e-7.
 _LOSS = 1e-8
 # A metal is a slab that lets 1e-9 through: of meent's substrates only those without loss conserve energy in TM.
 _SLAB = 10.0  # −ln of the amplitude
@@ -47,15 +48,15 @@ PROFILES = {
 
 @dataclass(frozen=True)
 class Efficiencies:
-    """What was found for one grating, one wavelength and one angle.
+    """Efficiencies of one grating at one wavelength and angle.
 
     Attributes:
         orders: m, those that propagate; q = m / period as everywhere in this package.
-        te, tm: share of the incident power in each order; TE: the electric field lies along the grooves (s).
+        te, tm: fraction of the incident power in each order; TE: the electric field is along the grooves (s).
         harmonics: M; the fields are sums of 2M + 1 waves.
-        layers: that the profile was cut into.
-        change: Σ|Δη| over Σ η at the last raising of the harmonics, or by taking off what the layers err; the larger.
-        lost: 1 − all that is reflected and transmitted, the larger of TE and TM; NaN for a metal.
+        layers: number of layers of the profile.
+        change: Σ|Δη|/Σ η at the last increase of the harmonics, or by extrapolation in the layers; the larger.
+        lost: |1 − R − T|, R + T being the reflected and transmitted power; the larger of TE and TM; NaN for a metal.
     """
 
     orders: NDArray[np.int64]
@@ -77,18 +78,18 @@ def solve(
     harmonics: int,
     layers: int,
 ) -> tuple[NDArray[np.int64], Array, Array]:
-    """One solution.
+    """Solve with given numbers of harmonics and layers.
 
     Args:
         profile: a name of `PROFILES`.
         period, depth, wavelength: µm.
-        angle: of incidence, degrees; the light comes from −x, in the plane across the grooves.
-        index: n + ik of what is below, k ≥ 0; air is above.
+        angle: of incidence, degrees; the light is incident from −x, in the plane across the grooves.
+        index: n + ik of the medium below, k ≥ 0; air is above.
         harmonics: M.
         layers: of equal thickness.
 
     Returns:
-        The orders that propagate (n,); their efficiencies (2, n), TE and TM; all that is reflected or transmitted (2,).
+        The orders that propagate (n,); their efficiencies (2, n), TE and TM; the reflected and transmitted power (2,).
     """
     from meent.on_numpy.emsolver.rcwa import RCWANumpy
 
@@ -120,14 +121,14 @@ def solve(
         total.append(found["de_ri"].sum() + found["de_ti"].sum())
     m = np.arange(-harmonics, harmonics + 1)
     propagates = np.abs(np.sin(np.deg2rad(angle)) + m * wavelength / period) < 1
-    # meent's order m leaves along kx = sin θ + mλ/period, ours along −mλ/period − ω_i,x.
+    # meent's order m has the outgoing k_x = sin θ + mλ/period; here it is −mλ/period − ω_i,x.
     return -m[propagates][::-1], np.array(efficiencies)[:, propagates][:, ::-1], np.array(total)
 
 
 def _convolution(
     left: Array, width: Array, inside: complex, outside: complex, harmonics: int
 ) -> NDArray[np.complex128]:
-    """(layers, 2M + 1, 2M + 1): Toeplitz matrices of the coefficients ∫ f(x) e^{2πinx} dx of two-valued functions."""
+    """Return Toeplitz matrices (layers, 2M + 1, 2M + 1) of ∫ f(x) e^{2πinx} dx of two-valued functions f."""
     n = np.arange(-2 * harmonics, 2 * harmonics + 1)
     left, width = left[:, None], width[:, None]
     box = width * np.sinc(n * width) * np.exp(2j * np.pi * n * (left + width / 2))
@@ -145,19 +146,19 @@ def converged(
     index: complex,
     *,
     tolerance: float,
-    most_harmonics: int = 70,
-    most_layers: int = 256,
+    max_harmonics: int = 70,
+    max_layers: int = 256,
 ) -> Efficiencies:
-    """Efficiencies whose last change is below `tolerance`, or, where that takes too long, what the limits allow.
+    """Return efficiencies whose last change is below `tolerance`, or those at the maximum harmonics and layers.
 
-    The harmonics are raised by two fifths at a time, with few layers; then the layers are doubled. Thinner layers err
-    by the square of their thickness, so that after the last doubling a third of the change is left; it is taken off
-    (Richardson's extrapolation).
+    The harmonics are increased by two fifths at a time, with few layers; then the layers are doubled. The error is
+    proportional to the square of their thickness, so that after the last doubling it is a third of the change, which is
+    subtracted (Richardson's extrapolation).
 
     Args:
         profile, period, depth, wavelength, angle, index: as in `solve`.
         tolerance: of Σ_m |Δη_m| / Σ_m η_m, the larger of TE and TM.
-        most_harmonics, most_layers: where raising ends.
+        max_harmonics, max_layers: upper bounds.
     """
 
     def change(old: Array, new: Array) -> float:
@@ -171,15 +172,15 @@ def converged(
         harmonics = int(np.ceil(1.4 * harmonics))
         _, new, _ = solve(*arguments, harmonics, layers)
         change_of_harmonics, old = change(old, new), new
-        if change_of_harmonics < tolerance or harmonics * 1.4 > most_harmonics:
+        if change_of_harmonics < tolerance or harmonics * 1.4 > max_harmonics:
             break
     while True:
         layers *= 2
         orders, new, total = solve(*arguments, harmonics, layers)
-        left = (new - old) / 3
-        old, change_of_layers = new, change(new, new + left)
-        if change_of_layers < tolerance or layers * 2 > most_layers:
+        correction = (new - old) / 3
+        old, change_of_layers = new, change(new, new + correction)
+        if change_of_layers < tolerance or layers * 2 > max_layers:
             break
-    found = np.maximum(new + left, 0)
+    found = np.maximum(new + correction, 0)
     lost = float("nan") if index.imag else float(np.abs(1 - total).max())
     return Efficiencies(orders, *found, harmonics, layers, max(change_of_harmonics, change_of_layers), lost)

@@ -1,6 +1,6 @@
-"""Compute the spectra of skins that the package brings: python precompute/ready_spectra.py
+"""Compute the spectra of skins that come with the package: python precompute/ready_spectra.py
 
-Recipes find them by their digest, as in the cache. To be repeated when a recipe or what is computed from it changes.
+Recipes find them by their digest, as in the cache. To be repeated when a recipe or the computation changes.
 """
 
 from pathlib import Path

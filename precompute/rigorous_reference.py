@@ -1,7 +1,7 @@
-"""Makes the stored rigorous results: `python precompute/rigorous_reference.py [OUT.json]`.
+"""Compute the stored rigorous results: `python precompute/rigorous_reference.py [OUT.json]`.
 
 Needs the extra "rigorous" (meent); about ten minutes on two cores. `scalar_theory.py` and `validation/coupled_waves.py`
-read what it writes.
+read them.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from mitsuba_diffraction.files import whole_file
 
 DIELECTRIC = 1.5
 TOLERANCE = 3e-3
-"""The orders' last change, as a share of the reflected power."""
+"""Change of the orders at the last refinement, as a fraction of the reflected power."""
 
-# The map. No multiples of λ or of λ/n: there an order grazes, and every method converges slowly.
+# Of the map. Multiples of λ and of λ/n are avoided: near a Rayleigh anomaly every method converges slowly.
 MAP_PERIODS = (0.97, 1.45, 2.05, 2.7, 3.5, 4.7, 6.7, 9.4, 13.7, 20.3)  # period/λ
 MAP_DEPTHS = (0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.4, 2.0)  # depth/λ
 MAP_ANGLES = (0.0, 20.0)
@@ -44,12 +44,12 @@ METAL_CASES = (
     ("blazed", (2.5,), (0.25,), (0.55,), (0.0, 20.0, 40.0)),
     ("triangular", (2.5,), (0.25,), (0.55,), (0.0, 20.0, 40.0)),
 )
-# Stairs of metal: TM converges slowly, whatever is spent.
-METAL_LIMITS = {"most_harmonics": 50, "most_layers": 64}
+# TM converges slowly for staircases of metal.
+METAL_LIMITS = {"max_harmonics": 50, "max_layers": 64}
 
 
 def metal_index(name: str, wavelength: float) -> complex:
-    """n + ik of a metal by Mitsuba's name at a wavelength in µm, as Mitsuba's `conductor` has it."""
+    """Return n + ik of a metal by Mitsuba's name at a wavelength in µm, as in Mitsuba's `conductor`."""
     import mitsuba as mi
 
     if not mi.variant():
@@ -60,11 +60,11 @@ def metal_index(name: str, wavelength: float) -> complex:
 
 
 def _numbers(values: np.ndarray) -> list[float]:
-    # Not converged beyond the fourth digit.
+    # Converged to about four digits.
     return [float(f"{value:.5g}") for value in values]
 
 
-def _made(found: Efficiencies) -> dict[str, Any]:
+def _convergence_of(found: Efficiencies) -> dict[str, Any]:
     return {
         "harmonics": found.harmonics,
         "layers": found.layers,
@@ -95,25 +95,25 @@ def _cases() -> list[dict[str, Any]]:
 
 
 def _solved(job: dict[str, Any]) -> dict[str, Any]:
-    """A case, or a point of the map, with what was found."""
+    """Return a case, or a point of the map, with its efficiencies."""
     if "profile" in job:
         geometry = (job[name] for name in ("profile", "period", "depth", "wavelength", "angle"))
         limits = {} if job["material"] == "dielectric" else METAL_LIMITS
         found = converged(*geometry, complex(*job["index"]), tolerance=TOLERANCE, **limits)
-        return job | _made(found) | {"te": _numbers(found.te), "tm": _numbers(found.tm)}
-    place = job["period"], job["depth"], 1.0, job["angle"]
-    found = converged("sinusoidal", *place, complex(DIELECTRIC), tolerance=TOLERANCE)
-    return job | _made(found) | {"unpolarised": _numbers((found.te + found.tm) / 2)}
+        return job | _convergence_of(found) | {"te": _numbers(found.te), "tm": _numbers(found.tm)}
+    arguments = job["period"], job["depth"], 1.0, job["angle"]
+    found = converged("sinusoidal", *arguments, complex(DIELECTRIC), tolerance=TOLERANCE)
+    return job | _convergence_of(found) | {"unpolarised": _numbers((found.te + found.tm) / 2)}
 
 
 def all_jobs() -> list[dict[str, Any]]:
-    """What is solved: the gratings, and the points of the map."""
+    """Return the gratings and the points of the map that are solved."""
     points = itertools.product(MAP_PERIODS, MAP_DEPTHS, MAP_ANGLES)
     return _cases() + [{"period": period, "depth": depth, "angle": angle} for period, depth, angle in points]
 
 
 def make(path: Path, jobs: list[dict[str, Any]], workers: int | None = None) -> None:
-    """Solves jobs on several cores and writes what was found, whole or not at all."""
+    """Solve jobs on several cores and write the results atomically."""
     # meent's matrices are small: one thread for each process is fastest.
     os.environ["OPENBLAS_NUM_THREADS"] = "1"
     with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
@@ -122,7 +122,7 @@ def make(path: Path, jobs: list[dict[str, Any]], workers: int | None = None) -> 
 
 
 def write(path: Path, results: list[dict[str, Any]]) -> None:
-    """The results as JSON, whole or not at all."""
+    """Write the results as JSON, atomically."""
     cases = [result for result in results if "profile" in result]
     table = [result for result in results if "profile" not in result]
     content = {

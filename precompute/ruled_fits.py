@@ -1,6 +1,6 @@
-"""Fits facet angles to measured gratings: `python precompute/ruled_fits.py [OUT.json]`; three minutes on one core.
+"""Fit facet angles to measured gratings: `python precompute/ruled_fits.py [OUT.json]`; three minutes on one core.
 
-`validation/measured_gratings.py` and `validation/transmission_grating.py` read what it writes.
+`validation/measured_gratings.py` and `validation/transmission_grating.py` read them.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from mitsuba_diffraction.files import whole_file
 
 
 def make(path: Path) -> None:
-    """Fit each grating by both theories and write the angles, whole or not at all."""
+    """Fit each grating by both theories and write the angles atomically."""
     angles = {
         name: {theory: round(fit(name, theory == "rigorous").facet_angle, 2) for theory in ("scalar", "rigorous")}
         for name in track(LINES_PER_MM, "facet angles")

@@ -1,8 +1,8 @@
-"""Makes the map of scalar theory: `python precompute/scalar_theory_map.py [OUT.json]`.
+"""Compute the map of errors of scalar theory: `python precompute/scalar_theory_map.py [OUT.json]`.
 
 For sinusoids of many periods and depths, in a dielectric and in aluminium, it compares scalar efficiencies with those
-of `mitsuba_diffraction.rigorous`, of reflected light and of light that passes the dielectric; eight minutes on two
-cores. `scalar_theory.py` reads what it writes.
+of `mitsuba_diffraction.rigorous`, of reflected and, in the dielectric, of transmitted light; eight minutes on two
+cores. `scalar_theory.py` reads it.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from mitsuba_diffraction import gratings, rigorous
 from mitsuba_diffraction.files import whole_file
 from mitsuba_diffraction.scalar_theory import MAP, difference, scalar_orders, sinusoid_powers, transmitted_orders
 
-# In wavelengths. No multiples of λ or of λ/n: there an order grazes, and the error is that of one narrow line.
+# In wavelengths. Multiples of λ and of λ/n are avoided: at a Rayleigh anomaly the error has a narrow peak.
 PERIODS = (0.97, 1.45, 2.05, 2.7, 3.5, 4.7, 6.7, 9.4, 13.7, 20.3)
 DEPTHS = (0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.4, 2.0)
 # Degrees: of incidence, and from the plane perpendicular to the grooves (90: light along the grooves).
@@ -39,19 +39,19 @@ SAMPLES = 512
 
 
 def solved(job: tuple[str, tuple[int, int], float, float]) -> tuple[float, float]:
-    """Error of scalar theory, and how far the rigorous efficiencies are from converged, for λ = 1 µm."""
-    material, (angle, turn), depth, period = job
-    index, passes, below = MATERIALS[material], material.startswith("transmitted"), material.endswith("below")
+    """Return the error of scalar theory, and that of the rigorous efficiencies, for λ = 1 µm."""
+    material, (angle, azimuth), depth, period = job
+    index, transmits, below = MATERIALS[material], material.startswith("transmitted"), material.endswith("below")
     sine = np.sin(np.deg2rad(angle)) / (index.real if below else 1)
     cosine = np.sqrt(1 - sine**2) * (-1 if below else 1)
-    light = -sine * np.cos(np.deg2rad(turn)), -sine * np.sin(np.deg2rad(turn)), cosine
+    light = -sine * np.cos(np.deg2rad(azimuth)), -sine * np.sin(np.deg2rad(azimuth)), cosine
     surface = gratings.sinusoidal(period, depth, samples=SAMPLES)
     found = rigorous.efficiencies(surface, light, 1.0, int_ior=index, tolerance=TOLERANCE)
-    if passes:
-        scalar = transmitted_orders(sinusoid_powers(depth), period, 1.0, angle, index.real, turn, below)
+    if transmits:
+        scalar = transmitted_orders(sinusoid_powers(depth), period, 1.0, angle, index.real, azimuth, below)
         wanted, exact = found.transmitted_orders, found.transmitted_unpolarised
     else:
-        scalar = scalar_orders(sinusoid_powers(depth), period, 1.0, angle, index, turn)
+        scalar = scalar_orders(sinusoid_powers(depth), period, 1.0, angle, index, azimuth)
         wanted, exact = found.orders, found.unpolarised
     if not np.array_equal(wanted, scalar.m):
         raise RuntimeError(f"{job}: got the orders {scalar.m}, wanted {wanted}")
@@ -59,7 +59,7 @@ def solved(job: tuple[str, tuple[int, int], float, float]) -> tuple[float, float
 
 
 def make(path: Path) -> None:
-    """Solve all of them and write the map, whole or not at all."""
+    """Solve all cases and write the map atomically."""
     jobs = list(itertools.product(MATERIALS, DIRECTIONS, DEPTHS, PERIODS))
     with ProcessPoolExecutor(os.cpu_count(), multiprocessing.get_context("spawn")) as pool:
         found = list(track(pool.map(solved, jobs, chunksize=4), "rigorous efficiencies", total=len(jobs)))
