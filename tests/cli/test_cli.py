@@ -22,7 +22,7 @@ from mitsuba_diffraction.progress import log_lines
 from mitsuba_diffraction.render import passes
 from mitsuba_diffraction.render.spectral_image import SpectralImage
 
-# So shallow that scalar theory holds: a warning would be told by whichever test is the first.
+# So shallow that scalar theory holds: a warning would appear in whichever test is the first.
 BLAZE = '[surface]\nprofile = "blazed"\nperiod = 2.5\ndepth = 0.2\nsamples = 64\n'
 # Lobes so wide that the energy table is a small one.
 QUICK = BLAZE + "[spectrum]\ncoherence_length = 20\n"
@@ -177,8 +177,8 @@ def test_precompute_writes_the_file_that_it_names_and_prints_its_error(command):
         np.abs(np.exp(1j * kappa * 0.25 * np.arange(64) / 64 - 2j * np.pi * m * np.arange(64) / 64).mean(axis=1)) ** 2
         for m in range(-13, 14)
     ]
-    told = float(out.split("frequencies; ")[1].split()[0])
-    assert told == pytest.approx(1 - np.sum(eta, axis=0).min(), rel=0.05)
+    reported = float(out.split("frequencies; ")[1].split()[0])
+    assert reported == pytest.approx(1 - np.sum(eta, axis=0).min(), rel=0.05)
     assert f"{spectrum.unresolved_power:.1e} at frequencies that no direction reaches" in out
 
 
@@ -188,9 +188,11 @@ def test_precompute_takes_a_sample_by_options(command):
         "--representation slices"
     )
     assert code == 0
-    told = err.splitlines()
-    assert len(told) == 1
-    assert told[0].startswith("mitsuba-diffraction: warning: coherence_length: a scan of 2.16 × 1.8 µm supports 0.9 µm")
+    messages = err.splitlines()
+    assert len(messages) == 1
+    assert messages[0].startswith(
+        "mitsuba-diffraction: warning: coherence_length: a scan of 2.16 × 1.8 µm supports 0.9 µm"
+    )
     spectrum = md.GratingSpectrum.load("out.exr")
     assert (spectrum.extent, spectrum.largest_angle, spectrum.tolerance) == ("sample", 60.0, 0.02)
     assert spectrum.representation == "slices"
@@ -278,7 +280,7 @@ def test_progress_without_a_terminal_is_printed_in_lines(capfd):
     show = log_lines("scene.xml", first=0)
     show(3, 7)
     assert re.fullmatch(r"mitsuba-diffraction: scene.xml: 3 of 7, 0 s\n", capfd.readouterr().err)
-    log_lines("scene.xml")(3, 7)  # short work says nothing
+    log_lines("scene.xml")(3, 7)  # short work prints nothing
     assert capfd.readouterr().err == ""
 
 
@@ -314,9 +316,9 @@ def test_a_warning_is_a_line_and_not_a_failure(command):
     code, out, err = command("precompute scan.npy --extent tile --pixel-size 0.2 -o out.exr")
     assert code == 0
     assert "out.exr" in out
-    told = [line for line in err.splitlines() if line]
-    assert len(told) == 2  # one for each axis
-    assert all(line.startswith("mitsuba-diffraction: warning: pixels of 200 nm along ") for line in told)
+    messages = [line for line in err.splitlines() if line]
+    assert len(messages) == 2  # one for each axis
+    assert all(line.startswith("mitsuba-diffraction: warning: pixels of 200 nm along ") for line in messages)
 
 
 @pytest.mark.parametrize("place", ["precompute", "save"])
@@ -482,7 +484,7 @@ def test_the_installed_command_ends_with_its_exit_code(folder):
     assert done.stderr == "mitsuba-diffraction: error: gone.toml: no such file\n"
 
 
-def test_precompute_refuses_where_it_cannot_write_before_the_work(command, monkeypatch):
+def test_precompute_refuses_an_unwritable_target_before_the_work(command, monkeypatch):
     monkeypatch.setattr("mitsuba_diffraction.recipe.build_spectrum", lambda *_, **__: pytest.fail("it went to work"))
     code, _, err = command("precompute blaze.toml -o nowhere/out.exr")
     assert (code, err.count("got nowhere/out.exr, but the folder nowhere is not there")) == (2, 1)
@@ -569,5 +571,5 @@ def test_an_interrupt_at_any_time_is_one_line(seconds):
     # Mitsuba's log goes there, of a grating too fine for scalar theory.
     assert all("scalar theory" in line for line in out.replace("\x1b[0m", "").splitlines() if line)
     # Beside lines of progress, from two seconds on.
-    (told,) = [line for line in err.splitlines() if " spp, " not in line]
-    assert told.startswith("mitsuba-diffraction: interrupted: ")
+    (message,) = [line for line in err.splitlines() if " spp, " not in line]
+    assert message.startswith("mitsuba-diffraction: interrupted: ")

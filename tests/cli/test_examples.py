@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 
-def test_examples_are_copied_with_what_they_reference(command, tmp_path):
+def test_examples_are_copied_with_the_files_they_reference(command, tmp_path):
     code, said, error = command("examples", str(tmp_path / "new" / "folder"))
     assert (code, error) == (0, "")
     copied = [path for path in (tmp_path / "new" / "folder").rglob("*") if path.is_file()]
@@ -41,7 +41,7 @@ def test_a_changed_example_is_not_written_over(command, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("where", ["file", "file/deeper"])
-def test_a_file_in_the_place_of_the_folder_is_one_line(command, where, tmp_path, monkeypatch):
+def test_a_file_instead_of_the_folder_is_one_line(command, where, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("file").touch()
     code, _, error = command("examples", where)

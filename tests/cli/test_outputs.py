@@ -1,4 +1,4 @@
-"""No command writes over an input, nor over a foreign file without `--overwrite`; and what a kill leaves is cleared."""
+"""Commands overwrite neither inputs nor, without `--overwrite`, foreign files; remains of killed ones are removed."""
 
 import functools
 import json
@@ -111,7 +111,7 @@ def test_a_scene_names_files(folder):
         ("benchmark scan.png --pixel-size 0.05 --height-range 0.3 --plot scan.png", "scan.png"),
     ],
 )
-def test_what_is_read_is_not_written_over(command, line, name):
+def test_inputs_are_not_overwritten(command, line, name):
     # Regression: the README's own way put the picture over the spectrum, and the preview over the scan.
     os.link("u.exr", "hard.exr")
     Path("soft.exr").symlink_to("u.exr")
@@ -122,7 +122,7 @@ def test_what_is_read_is_not_written_over(command, line, name):
     assert "is read" in refused(command, f"{line} --overwrite", name)
 
 
-def test_names_by_default_keep_clear_of_what_is_read(command):
+def test_default_names_differ_from_inputs(command):
     before = contents()
     line = RENDER.replace("u.xml", "u.xml -D spectrum=u.exr")
     for _ in range(2):  # the second time over its own files
@@ -149,11 +149,11 @@ def test_names_by_default_keep_clear_of_what_is_read(command):
         ("precompute blaze.toml lights/../blaze.toml", "blaze.exr"),
     ],
 )
-def test_one_output_is_not_written_over_another(command, line, name):
+def test_two_outputs_of_one_name_are_refused(command, line, name):
     assert "twice" in refused(command, f"{line} --overwrite", name)
 
 
-# --- what is there ---
+# --- existing files ---
 
 
 @pytest.mark.few(1)
@@ -165,7 +165,7 @@ def test_one_output_is_not_written_over_another(command, line, name):
         ("inspect blaze.toml -o a.png --json a.json", "--coherence-length 5", "a.png"),
     ],
 )
-def test_own_files_are_written_over_and_foreign_files_only_with_the_option(command, line, other, name):
+def test_own_files_are_overwritten_and_foreign_files_only_with_the_option(command, line, other, name):
     assert command(line)[0] == 0
     before = Path(name).read_bytes()
     assert command(f"{line} {other}")[0] == 0
@@ -265,10 +265,10 @@ def temporaries():
     return [path for path in Path().iterdir() if path.name.startswith(".target-")]
 
 
-def test_processes_that_write_one_file_do_not_meet():
+def test_two_processes_can_write_one_file():
     with write_elsewhere("a") as a, write_elsewhere("b") as b:
         assert len(temporaries()) == 2
-        with whole_file("target.bin") as temporary:  # it leaves those alone that are being written
+        with whole_file("target.bin") as temporary:  # files that are being written are kept
             temporary.write_bytes(b"c")
         assert Path("target.bin").read_bytes() == b"c"
         for writer, letter in ((a, b"a"), (b, b"b")):
@@ -278,7 +278,7 @@ def test_processes_that_write_one_file_do_not_meet():
     assert not temporaries()
 
 
-def test_what_a_kill_leaves_is_cleared_by_the_next():
+def test_temporary_files_of_a_killed_process_are_removed():
     with write_elsewhere("a") as process:
         process.send_signal(signal.SIGKILL)
     Path(".target-of-mine.bin").write_text("mine")

@@ -1,4 +1,4 @@
-"""The benchmark: that it measures errors that are there, and reports what it was asked."""
+"""The benchmark measures known errors, and reports the requested cases."""
 
 import dataclasses
 import json

@@ -99,7 +99,7 @@ def test_a_difference_has_the_known_numbers():
     each = delta_E(grey[:, 0], other[:, 0])
     assert (found.mean, found.max) == pytest.approx((each.mean(), each.max()))
     assert found.percentile_95 == pytest.approx(np.percentile(np.repeat(each, 50), 95))
-    # Beyond white nothing is brighter.
+    # Nothing is brighter than white.
     assert difference(grey, other, where, 1e-3).max < 0.1
 
 
@@ -162,7 +162,7 @@ def test_a_shader_with_changed_quirks_is_that_made_anew(kind):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("rfilter", ["gaussian", "box"])
-def test_the_shader_is_what_its_integrator_converges_to(llvm, tmp_path, rfilter):
+def test_the_integrator_converges_to_the_shader(llvm, tmp_path, rfilter):
     pictures = Pictures(write(tmp_path / "scene.xml", rfilter=rfilter), "gem")
     for quirks in (("power_gamma", "constant_blend", "infrared_rainbow", NO_SHADOWS), ()):
         found = pictures.shaded(quirks, 64, 256)
@@ -339,7 +339,7 @@ def test_the_same_seed_gives_the_same_numbers(llvm, folder):
     for one in numbers:
         del one["pictures"]  # seconds
     assert numbers[0] == numbers[1]
-    # Without the shares, too, there is a figure.
+    # There is a figure without the shares, too.
     summary.save_figure(found[0], "figure.png", dpi=40)
     with Image.open("figure.png") as picture:
         assert picture.width > 400

@@ -35,9 +35,9 @@ def test_the_path_tracer_overtakes_at_the_interpolated_time():
         ),
     )
     # Between 0.4 s and 1.6 s, where the error falls from 4 to 3; straight in logarithms.
-    share = np.log(4 / 3.5) / np.log(4 / 3)
+    fraction = np.log(4 / 3.5) / np.log(4 / 3)
     for error in ("delta_e", "relative_mse"):
-        assert found.overtaken("flss, corrected", error) == pytest.approx(0.4 * 4**share)
+        assert found.overtaken("flss, corrected", error) == pytest.approx(0.4 * 4**fraction)
         assert found.overtaken("nmm, as published", error) == pytest.approx(0.1)  # from the first picture on
         assert found.overtaken("pq, as published", error) == pytest.approx(4 * 4 ** (np.log(4 / 2.5) / np.log(2)))
         assert np.isnan(found.overtaken("pq, corrected", error))

@@ -31,8 +31,8 @@ def exact_factor(x, count):
 
 @given(x=st.floats(-3, 3), count=st.integers(1, 40))
 def test_the_factor_is_the_sum_of_the_waves(x, count):
-    places = np.arange(count) - (count - 1) / 2
-    wanted = np.exp(2j * np.pi * x * places).sum()
+    positions = np.arange(count) - (count - 1) / 2
+    wanted = np.exp(2j * np.pi * x * positions).sum()
     assert tile_factor(x, count) == pytest.approx(wanted.real, abs=1e-12 * count)
     assert wanted.imag == pytest.approx(0, abs=1e-12 * count)
 
@@ -42,7 +42,7 @@ def test_the_factor_is_the_sum_of_the_waves(x, count):
     offset=st.floats(2.0**-60, 0.5, width=32) | st.floats(-0.5, -(2.0**-60), width=32) | st.just(0.0),
     count=counts,
 )
-def test_the_factor_in_float32_is_right_to_the_last_places(whole, offset, count):
+def test_the_factor_in_float32_is_accurate_to_the_last_digits(whole, offset, count):
     x = np.float32(whole) + np.float32(offset)
     assert x.dtype == np.float32
     got, wanted = tile_factor(x, count), exact_factor(x, count)
@@ -52,15 +52,15 @@ def test_the_factor_in_float32_is_right_to_the_last_places(whole, offset, count)
 
 @pytest.mark.skipif(np.finfo(np.longdouble).eps > 1e-18, reason="long double has no more digits than float64 here")
 @given(whole=st.integers(-9, 9), power=st.integers(-50, -1), mantissa=st.floats(0.5, 1), count=st.integers(1, 200))
-def test_the_factor_in_float64_is_right_to_the_last_places(whole, power, mantissa, count):
+def test_the_factor_in_float64_is_accurate_to_the_last_digits(whole, power, mantissa, count):
     x = np.float64(whole) + mantissa * 2.0**power
     r = np.longdouble(x) - np.rint(np.longdouble(x))
     if abs(r) * count < 1e-9:
         wanted = np.longdouble(count)
     else:
         pi = np.longdouble(3.141592653589793) + np.longdouble(1.2246467991473531772e-16)
-        turns = r * count  # at most 53 + 8 digits: exact
-        wanted = (-1) ** int(np.rint(turns)) * np.sin(pi * (turns - np.rint(turns))) / np.sin(pi * r)
+        periods = r * count  # at most 53 + 8 digits: exact
+        wanted = (-1) ** int(np.rint(periods)) * np.sin(pi * (periods - np.rint(periods))) / np.sin(pi * r)
     wanted = wanted * (-1) ** (int(np.rint(x)) * (count - 1))
     # Up to four units of rounding.
     assert abs(tile_factor(x, count) - wanted) <= 4 * np.finfo(np.float64).eps * abs(wanted)
@@ -74,7 +74,7 @@ def test_the_factor_at_integers_is_the_number_of_tiles(dtype, count):
     assert got.dtype == dtype
     np.testing.assert_array_equal(got, count * (-1.0) ** (np.arange(-5, 6) * (count - 1)))
     # The neighbours in floating point, those of zero (the smallest numbers there are) among them: D falls by the share
-    # (πNr)²/6, r one unit in the last place of five.
+    # (πNr)²/6, r one unit in the last digit of five.
     rtol = (np.pi * count * np.spacing(dtype(5))) ** 2 / 6 + 4 * np.finfo(dtype).eps
     for side in (-np.inf, np.inf):
         np.testing.assert_allclose(tile_factor(np.nextafter(whole, dtype(side)), count), got, rtol=rtol)

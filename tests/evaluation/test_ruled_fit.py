@@ -34,7 +34,7 @@ def test_efficiencies_bend_at_rayleigh_anomalies():
 
 @pytest.mark.parametrize("theory", ["scalar", "rigorous"])
 def test_the_stored_angles_fit_best(theory):
-    """R831: half a degree to either side is worse."""
+    """R831: half a degree more or less is worse."""
     wavelengths, wanted = ruled_fit.measured("R831")
     angle = ruled_fit.stored_angles()["R831"][theory]
     best, *others = (
@@ -59,7 +59,7 @@ def test_measured_gratings_are_plotted_with_both_theories(llvm):
 
 
 @pytest.mark.slow
-def test_rigorous_theory_fits_what_was_measured_where_scalar_theory_does_not():
+def test_rigorous_theory_fits_measurements_that_scalar_theory_does_not():
     exact, scalar = (ruled_fit.fit("R831", theory) for theory in (True, False))
     assert exact.rms < 0.02
     assert scalar.rms > 0.06

@@ -114,7 +114,7 @@ def test_flss_at_the_centre_of_an_order_is_that_texel_of_the_taylor_series(quirk
 
 @pytest.mark.parametrize("surface", [BLAZE, ROUGH], ids=["blaze", "rough"])
 def test_corrected_flss_is_the_projects_model(surface):
-    # Everywhere between the orders too; what the 3 × 3 texels leave out is e^{−(3/2)²/(σ_f T)²}, nothing for T ≪ L_c.
+    # Everywhere between the orders too; the 3 × 3 texels omit e^{−(3/2)²/(σ_f T)²}, nothing for T ≪ L_c.
     rng = np.random.default_rng(2)
     wi, wo = (unit(*rng.uniform(-0.6, 0.6, (2, 500))) for _ in range(2))
     near = -wi[:250, 0] - rng.integers(-2, 3, 250) * 0.2 + rng.normal(0, 0.01, 250)
@@ -312,22 +312,22 @@ def test_a_flat_mirror_gives_one_unless_the_window_has_the_height_pi():
     assert relative_radiance(FLAT, up, up, [550.0], quirks=only("window_pi")) == pytest.approx(np.pi**2, rel=1e-6)
 
 
-def test_the_average_over_places_is_the_sum_of_powers():
-    """Rolling the tile moves x₀; the mean of |Σ φ F|² over all places is Σ φ² |F|²."""
+def test_the_average_over_positions_is_the_sum_of_powers():
+    """Rolling the tile moves x₀; the mean of |Σ φ F|² over all positions is Σ φ² |F|²."""
     heights = ROUGH.heights[:1]
     wo = unit(np.linspace(-0.5, 0.5, 40))
     settings = dict(wavelengths=np.full(40, 500.0), coherence_length=1.0)
-    places = [
+    powers = [
         relative_radiance(md.HeightField(np.roll(heights, n), 0.1), unit(0.0), wo, quirks=only("complex_window_sum"),
                           **settings)
         for n in range(16)
     ]  # fmt: skip
     right = relative_radiance(md.HeightField(heights, 0.1), unit(0.0), wo, quirks=CORRECTED, **settings)
-    np.testing.assert_allclose(np.mean(places, axis=0), right, rtol=1e-4, atol=1e-6)
-    assert np.abs(places[0] - right).max() > 0.1 * right.max()
+    np.testing.assert_allclose(np.mean(powers, axis=0), right, rtol=1e-4, atol=1e-6)
+    assert np.abs(powers[0] - right).max() > 0.1 * right.max()
 
 
-def test_the_floor_leaves_out_a_neighbour():
+def test_the_floor_omits_a_neighbour():
     surface = md.HeightField(ROUGH.heights[:1], 0.1)
     wo = unit(np.linspace(-0.6, 0.6, 200))
     wi, at = np.broadcast_to(unit(0.1), wo.shape), np.full(200, 500.0)
@@ -504,7 +504,7 @@ def viewing_cosines(built):
 @pytest.mark.few(3)
 @pytest.mark.parametrize("as_published", [True, False])
 @pytest.mark.parametrize("variant", ["flss", "nmm", "pq"])
-def test_bright_pixels_are_where_the_grating_equation_says(variant, as_published):
+def test_bright_pixels_are_where_the_grating_equation_predicts(variant, as_published):
     # u = mλ/T: order 1 of T = 1 µm lies at 0.38 < u < 0.78; the second is out of sight.
     bsdf = dict(GRATING, period=1.0, depth=0.25, coherence_length=20.0)
     built = scene(shader(variant, as_published=as_published, terms=28), bsdf)
@@ -518,7 +518,7 @@ def test_bright_pixels_are_where_the_grating_equation_says(variant, as_published
     on = (np.abs(v) < 0.1) & (zero | one)
     # A finite number of tiles has side lobes, 1/x².
     assert luminance[~on].max() < (0.2 if variant == "pq" else 2e-3) * luminance.max()
-    # The facets mirror 2 depth/λ = 1, and green most of all to the eye.
+    # The facets mirror 2 depth/λ = 1, and mostly green to the eye.
     row = image[7:9].mean(0)[:, 1]
     u = u[7:9].mean(0)
     assert (row[(u > 0.45) & (u < 0.64)] > 0.05 * row.max()).all()
@@ -527,7 +527,7 @@ def test_bright_pixels_are_where_the_grating_equation_says(variant, as_published
 
 
 @pytest.mark.slow
-def test_the_corrected_integrator_shows_what_the_path_tracer_does():
+def test_the_corrected_integrator_agrees_with_the_path_tracer():
     # A rougher lobe, so that 16 × 16 pixels resolve it.
     base = {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.4}}
     bsdf = dict(GRATING, fresnel="schlick", conserve_energy=False, base=base)
@@ -608,7 +608,7 @@ def test_a_recipe_gives_the_heights(tmp_path):
         ),
     ],
 )
-def test_what_the_integrator_cannot_show_is_refused_in_one_line(parameters, of, message):
+def test_unsupported_scenes_are_refused_in_one_line(parameters, of, message):
     with pytest.raises(Exception) as caught:  # noqa: PT011 (Mitsuba's own types, by where it happens)
         picture({"type": "diffraction_shader", **parameters}, **of)
     line = root_cause(caught.value)
@@ -649,7 +649,7 @@ def test_variants_without_wavelengths_are_refused():
         colour(BLAZE, unit(0.1), unit(0.1))
 
 
-def test_a_picture_follows_its_light_and_leaves_ctrl_c_alone():
+def test_a_picture_follows_its_light_and_the_handler_of_ctrl_c_is_kept():
     light = {"type": "directional", "direction": [0, 0, -1], "irradiance": {"type": "uniform", "value": 1.0}}
     built = scene({"type": "diffraction_shader"}, light=light)
     handler = signal.signal(signal.SIGINT, signal.default_int_handler)

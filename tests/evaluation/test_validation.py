@@ -48,13 +48,13 @@ def test_a_record_is_within_its_bound_or_not():
     assert not Record(12, 10, 0.19, relative=True).ok
     assert not Record(np.nan, 1, 0.1).ok
     assert Record(2, 1, None).ok
-    worst = Record.at_max_error([1.0, 2.0, 3.0], [1.1, 2.5, 3.0], 0.1)
-    assert (worst.expected, worst.measured, worst.error) == (2.0, 2.5, 0.5)
-    assert not worst.ok
+    record = Record.at_max_error([1.0, 2.0, 3.0], [1.1, 2.5, 3.0], 0.1)
+    assert (record.expected, record.measured, record.error) == (2.0, 2.5, 0.5)
+    assert not record.ok
     assert not Record.at_max_error([1.0, 2.0], [1.0, np.nan], 0.1).ok
     # Each has a bound of its own.
-    worst = Record.at_max_error([1.0, 2.0], [1.2, 2.5], [0.1, 1.0])
-    assert (worst.measured, worst.bound, worst.ok) == (1.2, 0.1, False)
+    record = Record.at_max_error([1.0, 2.0], [1.2, 2.5], [0.1, 1.0])
+    assert (record.measured, record.bound, record.ok) == (1.2, 0.1, False)
     assert Record.at_max_error([10.0, 1.0], [12.0, 1.3], 1.0, relative=True).error == pytest.approx(0.3)
 
 
@@ -137,17 +137,17 @@ def test_expected_error_is_that_of_the_stored_results():
 
 @pytest.mark.parametrize("material", ["dielectric", "Al"])
 def test_the_map_is_that_of_the_solver(material):
-    """Places of the map, conical ones among them, solved with another sampling of the sinusoid."""
+    """Points of the map, conical ones among them, solved with another sampling of the sinusoid."""
     periods, depths, directions, errors = scalar_theory.error_map(material)
     index = 1.5 if material == "dielectric" else rigorous.refractive_index(0.55, material="Al")
     for i, j, k in ((1, 1, 2), (3, 3, 5), (4, 2, 7), (2, 4, 0)):
-        period, depth, (angle, turn) = periods[i], depths[j], directions[k]
-        theta, phi = np.deg2rad([angle, 180 + turn])
+        period, depth, (angle, azimuth) = periods[i], depths[j], directions[k]
+        theta, phi = np.deg2rad([angle, 180 + azimuth])
         light = np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)
         surface = md.gratings.sinusoidal(period, depth, samples=300)
         exact = rigorous.efficiencies(surface, light, 1.0, int_ior=index)
         powers = scalar_theory.profile_powers(surface)
-        scalar = scalar_theory.scalar_orders(powers, period, 1.0, angle, index, turn)
+        scalar = scalar_theory.scalar_orders(powers, period, 1.0, angle, index, azimuth)
         np.testing.assert_array_equal(scalar.m, exact.orders)
         found = scalar_theory.difference(scalar.unpolarised, exact.unpolarised)
         assert found == pytest.approx(errors[i, j, k], rel=0.03, abs=0.003)
@@ -155,7 +155,7 @@ def test_the_map_is_that_of_the_solver(material):
 
 @pytest.mark.parametrize("way", ["transmitted", "transmitted from below"])
 @pytest.mark.parametrize(("period", "depth", "angle"), [(6.7, 1.0, 0), (6.7, 1.0, 20), (2.7, 0.2, 40)])
-def test_the_map_of_transmitted_light_is_what_the_solver_finds(way, period, depth, angle):
+def test_the_map_of_transmitted_light_agrees_with_the_solver(way, period, depth, angle):
     periods, depths, directions, errors = scalar_theory.error_map(way)
     stored = errors[list(periods).index(period), list(depths).index(depth), directions.tolist().index([angle, 0])]
     below = way.endswith("below")
@@ -191,7 +191,7 @@ def test_a_surface_outside_the_range_of_scalar_theory_is_reported():
 @pytest.mark.parametrize("name", ["sinusoidal", "blazed"])
 @pytest.mark.parametrize("period", [3.25, 3.7, 8.0])
 def test_no_surface_within_the_promised_range_is_warned_of(name, period):
-    # Period ≥ 5 λ and depth ≤ λ/2 from 450 to 650 nm: within 2 % (sinusoids) and 8 % (blazes), says the README.
+    # Period ≥ 5 λ and depth ≤ λ/2 from 450 to 650 nm: within 2 % (sinusoids) and 8 % (blazes), as in the README.
     found = scalar_theory.scalar_error(md.gratings.PROFILES[name](period, 0.225))
     assert found.share < {"sinusoidal": 0.02, "blazed": 0.08}[name]
     assert found.warning == ""
@@ -249,7 +249,7 @@ def test_estimated_error_is_near_the_solved_one(count):
     assert np.exp(np.abs(factors).max()) < 3
 
 
-def test_the_expected_error_is_nan_where_it_does_not_hold():
+def test_the_expected_error_is_nan_outside_its_range():
     good = scalar_theory.expected_error(10.0, 0.05, 0.55)
     bad = scalar_theory.expected_error(0.8, 0.4, 0.55)
     assert good < 0.02 < 0.1 < bad

@@ -49,7 +49,7 @@ def test_a_flat_mirror_has_the_relative_reflectance_one(llvm):
     flat = md.precompute(md.HeightField(np.zeros((8, 8)), 0.05))
     found = relative_reflectance(flat, [0, 0, 1], [[0, 0, 1]], COARSE)
     assert found.shape == (1, COARSE.size)
-    np.testing.assert_allclose(found, 1, atol=2e-3)  # what cutting off the lobes and the bytes of E leave
+    np.testing.assert_allclose(found, 1, atol=2e-3)  # truncation of the lobes, and E in bytes
 
 
 @pytest.mark.few(1)
@@ -58,7 +58,7 @@ def test_orders_of_a_shallow_blaze_are_the_analytic_ones(llvm, order):
     depth, period, incidence = 0.02, 2.5, np.deg2rad(20.0)
     spectrum = md.precompute(md.gratings.blazed(period, depth), tolerance=1e-4)
     for nanometres in (400.0, 550.0, 777.0):
-        # Light comes from −x; the order m of the phase leaves to −λm/T − ω_i.
+        # Light is incident from −x; order m of the phase has the outgoing direction −λm/T − ω_i.
         x = np.sin(incidence) - nanometres * 1e-3 * order / period
         wi, wo = np.array([-np.sin(incidence), 0, np.cos(incidence)]), np.array([x, 0, np.sqrt(1 - x**2)])
         cosines = wi[2] + wo[2]
@@ -116,9 +116,9 @@ def test_the_fit_reveals_periods_that_vary_with_the_wavelength():
         BLAZE, "flss", 75.0, found.wavelengths, found.angles, np.where(half[:, None], found.reflectance, other)
     )
     fit = fit_period(mixed)
-    share = half.mean()
-    assert fit.mean == pytest.approx(2450 + 50 * share, abs=0.01)
-    assert fit.variance == pytest.approx(2500 * share * (1 - share), rel=1e-3)
+    fraction = half.mean()
+    assert fit.mean == pytest.approx(2450 + 50 * fraction, abs=0.01)
+    assert fit.variance == pytest.approx(2500 * fraction * (1 - fraction), rel=1e-3)
 
 
 def test_the_peaks_lie_on_the_grating_equation():
@@ -200,26 +200,26 @@ def test_nmm_sees_only_the_orders_of_the_tile(llvm, incidence):
 
 @pytest.mark.few(1)
 @pytest.mark.parametrize("projection", PROJECTIONS)
-def test_an_order_is_where_the_map_says(llvm, projection):
+def test_positions_of_orders_are_maxima_of_the_map(llvm, projection):
     found = brdf_map(BLAZE.with_coherence_length(6.5), projection=projection, side=120, incidence=(30.0, 20.0))
     for nanometres, channel in ((450.0, 2), (650.0, 0)):
         x, y = found.positions_of_orders(np.float64(nanometres), np.int64(1))
         column, row = np.abs(found.x - x).argmin(), np.abs(found.y - y).argmin()
         colour = found.rgb[row, column]
         assert colour.argmax() == channel
-        # Nothing beside it, and an order beyond the horizon has no place.
+        # It is dark beside the order; an evanescent order has no position.
         assert found.rgb[(row + 30) % 120, column].max() < 1e-2 * colour.max()
     assert np.isnan(found.positions_of_orders(np.float64(650.0), np.int64(9))).all()
 
 
-def test_an_order_stands_still_in_the_plane_of_u_and_v(llvm):
-    places = [
+def test_orders_do_not_move_in_the_plane_of_u_and_v(llvm):
+    positions = [
         brdf_map(BLAZE, "gem", projection="uv", side=8, incidence=(theta, 10.0)).positions_of_orders(
             550.0, np.int64(-1)
         )
         for theta in (0.0, 20.0, 40.0)
     ]
-    np.testing.assert_allclose(places, [(-0.55 / 2.5, 0)] * 3, atol=1e-12)
+    np.testing.assert_allclose(positions, [(-0.55 / 2.5, 0)] * 3, atol=1e-12)
 
 
 @pytest.mark.parametrize("method", MAP_METHODS)

@@ -1,4 +1,4 @@
-"""The integrator `diffraction_path` beside Mitsuba's `path`."""
+"""The integrator `diffraction_path` compared with Mitsuba's `path`."""
 
 import signal
 from functools import partial
@@ -23,8 +23,8 @@ def blaze(coherence_length=1.5, **parameters):
     return grating("blazed", coherence_length, conserve_energy=False, **parameters)
 
 
-def at(*place):
-    return mi.ScalarTransform4f().translate(place)
+def at(*position):
+    return mi.ScalarTransform4f().translate(position)
 
 
 def diffuse(reflectance):
@@ -65,15 +65,15 @@ def sun_and_sky():
 
 
 def lamp_and_spot():
-    """Two gratings, one with a direction that changes from place to place, a mirror, and a camera with a lens."""
-    turn = {
+    """Two gratings, one with a direction that varies over the plate, a mirror, and a camera with a lens."""
+    orientation = {
         **{"type": "bitmap", "raw": True, "filter_type": "nearest"},
         "bitmap": mi.Bitmap(np.array([[0, 90], [45, 120]], np.float32)[..., None]),
     }
     mirror = {"type": "conductor", "material": "none"}
     return scene(
         sensor={"type": "thinlens", "aperture_radius": 0.2, "focus_distance": 4.0},
-        plate=plate(blaze(material="Al", orientation=turn)),
+        plate=plate(blaze(material="Al", orientation=orientation)),
         ball={"type": "sphere", "center": [-1, 0.3, 0.5], "radius": 0.4, "bsdf": blaze(material="Al")},
         mirror={"type": "rectangle", "to_world": at(2.2, 0.5, 1).rotate([0, 1, 0], -90), "bsdf": mirror},
         lamp={
@@ -100,7 +100,7 @@ def ramp():
 
 
 def blend_under_a_point():
-    """A grating blended with a mirror, on a normal map, which turns the normal by 15°."""
+    """A grating blended with a mirror, on a normal map, which tilts the normal by 15°."""
     blend = {"type": "blendbsdf", "weight": 0.3, "grating": blaze()}
     blend["mirror"] = {"type": "roughconductor", "material": "Al", "alpha": 0.4}
     tilted = {"type": "normalmap", "normalmap": tilted_normals(15), "bsdf": blend}
@@ -156,12 +156,12 @@ def film(kind, facing=1, **parameters):
 
 
 def window(kind, facing=1):
-    """Sunlight that passes a film on its way to the floor."""
+    """Sunlight transmitted to the floor by a film."""
     return scene(pane=film(kind, facing), sun=SUN)
 
 
 def films_between_lamps(kind="sheet"):
-    """A film on a normal map with a lamp of some extent and a point light below it, and a film of which it is seen."""
+    """A film on a normal map between an area light and a point light below it, and an upright film."""
     tilted = film(kind)
     tilted["bsdf"] = {"type": "normalmap", "normalmap": tilted_normals(11.5), "bsdf": tilted["bsdf"]}
     return scene(
@@ -192,7 +192,7 @@ def assert_agree(built, depth, spp, **parameters):
     integrators = [mi.load_dict({"type": name, "max_depth": depth, **parameters}) for name in names]
     (wanted, its_error), (found, error) = (region_means(built, each, spp) for each in integrators)
     np.testing.assert_array_less(np.abs(found - wanted), 4 * np.hypot(its_error, error))
-    # Without the light's part the check would fail.
+    # Without the paths from the light the check would fail.
     eye, light = integrators[1].parts(built, built.sensors()[0])
     left, _ = region_means(built, eye, spp)
     assert light is not None
@@ -216,7 +216,7 @@ def assert_agree(built, depth, spp, **parameters):
         (instance_beside_a_grating, 4, 1024),
     ],
 )
-def test_converges_to_what_path_converges_to(build, depth, spp, llvm):
+def test_converges_to_the_limit_of_path(build, depth, spp, llvm):
     assert_agree(build(), depth, spp, rr_depth=3)
 
 
@@ -242,7 +242,7 @@ def test_converges_with_perturbed_normals(kind, coat, flips, shadows, llvm):
     ],
     ids=["onto a wall", "through a film onto the floor"],
 )
-def test_light_cast_by_a_grating_is_far_less_noisy(grating, where, llvm):
+def test_light_cast_by_a_grating_is_far_less_noisy_than_with_path(grating, where, llvm):
     built = scene(grating=grating(), sun=SUN)
     noise = {}
     for name in ("path", "diffraction_path"):
@@ -256,8 +256,8 @@ def test_light_paths_begin_where_gratings_are_lit(llvm):
     """Three of four plates lie in the shadow; one of four candidates is lit with a probability of 1 − (3/4)⁴."""
     roof = plate({"type": "twosided", "bsdf": diffuse(0.5)}, height=1.0)
     roof["to_world"] = at(0, 0, 1.0).scale([3, 1, 1])
-    places = [at(x, 0.75, 0.1).scale(0.3) for x in (-2, -1, 1)] + [at(0, -2.5, 0.1).scale(0.3)]
-    plates = {f"plate{k}": {"type": "rectangle", "to_world": to, "bsdf": blaze()} for k, to in enumerate(places)}
+    transforms = [at(x, 0.75, 0.1).scale(0.3) for x in (-2, -1, 1)] + [at(0, -2.5, 0.1).scale(0.3)]
+    plates = {f"plate{k}": {"type": "rectangle", "to_world": to, "bsdf": blaze()} for k, to in enumerate(transforms)}
     built = scene(roof=roof, sun=SUN, **plates)
     _, light = mi.load_dict({"type": "diffraction_path", "max_depth": 3}).parts(built, built.sensors()[0])
     _, power, starts = light._start(mi.PCG32(size=2**14))
@@ -266,7 +266,7 @@ def test_light_paths_begin_where_gratings_are_lit(llvm):
 
 
 @pytest.mark.parametrize(("reflectance", "traces"), [(0.0, False), (0.1, True)])
-def test_light_paths_are_traced_only_where_something_can_show_them(reflectance, traces, llvm):
+def test_light_paths_are_traced_only_if_a_surface_reflects_them(reflectance, traces, llvm):
     lamp = {**plate(diffuse(reflectance), height=2.0), "emitter": {"type": "area", "radiance": uniform(1.0)}}
     built = scene(floor=plate(blaze(), 4, 0), wall=plate(blaze(), 0.5), lamp=lamp)
     eye, light = mi.load_dict({"type": "diffraction_path", "max_depth": 3}).parts(built, built.sensors()[0])
@@ -321,9 +321,9 @@ def test_wrong_parameters_are_refused(parameters, message, llvm):
         mi.load_dict({"type": "diffraction_path", **parameters})
 
 
-def test_samples_beyond_the_edge_are_refused(llvm):
-    beyond = {"sample_border": True, "rfilter": {"type": "gaussian"}}
-    built = scene(plate=plate(blaze()), sun=SUN, film=beyond)
+def test_samples_outside_the_edge_are_refused(llvm):
+    with_border = {"sample_border": True, "rfilter": {"type": "gaussian"}}
+    built = scene(plate=plate(blaze()), sun=SUN, film=with_border)
     with pytest.raises(ValueError, match="sample_border: got true"):
         mi.load_dict({"type": "diffraction_path"}).render(built)
 
@@ -390,7 +390,7 @@ def test_gradients_are_finite_differences(llvm, mode):
         params.update()
         return dr.mean(mi.render(built, params, integrator=integrator, seed=7, spp=1024), axis=None)
 
-    # Light that meets the wall twice is beyond max_depth, so that the brightness is a linear function.
+    # Light scattered twice by the wall exceeds max_depth, so that the brightness is a linear function.
     finite = (brightness(mi.Float(0.9)) - brightness(mi.Float(0.7))) / 0.2
     reflectance = mi.Float(0.8)
     dr.enable_grad(reflectance)

@@ -1,4 +1,4 @@
-"""The integrator `diffraction_path` beside the BSDFs that Mitsuba ships: it converges to what `path` converges to."""
+"""The integrator `diffraction_path` with the BSDFs of Mitsuba: it converges to the limit of `path`."""
 
 import mitsuba as mi
 import numpy as np
@@ -83,7 +83,7 @@ def above(bsdf, coherence_length):
 
 @pytest.mark.few(1)
 @pytest.mark.parametrize("name", BSDFS)
-def test_every_bsdf_of_mitsuba_converges_to_what_path_converges_to(name, llvm):
+def test_every_bsdf_of_mitsuba_converges_to_the_limit_of_path(name, llvm):
     assert_agree(above(BSDFS[name](), 1.5), 12, 1024)
 
 

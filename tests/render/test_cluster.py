@@ -89,7 +89,7 @@ def test_a_cluster_gives_the_bits_of_one_machine(scene, two_processes, command):
     np.testing.assert_array_equal(resumed.radiance, here.radiance)
 
 
-def test_results_that_come_out_of_order_are_added_in_order(threads_of_this_process, monkeypatch):
+def test_results_that_arrive_out_of_order_are_added_in_order(threads_of_this_process, monkeypatch):
     ended = []
 
     def invented(scene, spp, seed):
@@ -100,15 +100,15 @@ def test_results_that_come_out_of_order_are_added_in_order(threads_of_this_proce
         return (rng.normal(size=(SIZE, SIZE, 94)) * 10 ** rng.uniform(-9, 9)).astype(np.float32)
 
     monkeypatch.setattr(passes, "trace_pass", invented)
-    here = render("scene.xml", spp=16)
+    local = render("scene.xml", spp=16)
     in_order = ended.copy()
     ended.clear()
     monkeypatch.setattr(cluster, "trace_pass", invented)
     monkeypatch.setattr(cluster, "pass_lock", contextlib.nullcontext())
-    there = render("scene.xml", spp=16, tracer=trace_on(threads_of_this_process))
+    remote = render("scene.xml", spp=16, tracer=trace_on(threads_of_this_process))
     assert sorted(ended) == sorted(in_order)
     assert ended != in_order
-    np.testing.assert_array_equal(there.radiance, here.radiance)
+    np.testing.assert_array_equal(remote.radiance, local.radiance)
 
 
 def test_failures_of_a_worker_are_one_line(threads_of_this_process, monkeypatch, command):
@@ -164,7 +164,7 @@ def test_a_port_that_is_silent_is_no_scheduler(command, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_scheduler_that_stops_leaves_the_checkpoint():
+def test_the_checkpoint_survives_a_stop_of_the_scheduler():
     local = start(n_workers=1, processes=False, protocol="tcp")
 
     def close(done, total, error):

@@ -64,7 +64,7 @@ def test_disagreeing_shapes_are_refused():
         spectrum_to_XYZ(np.ones((2, 5)), GRID)
 
 
-def test_into_gamut_keeps_luminance_and_what_is_inside():
+def test_into_gamut_keeps_luminance_and_colors_inside():
     spectral = spectrum_to_linear_sRGB(np.eye(GRID.size)[10:60], GRID)
     assert (spectral.min(axis=-1) < 0).all()
     shown = into_gamut(spectral)
@@ -75,7 +75,7 @@ def test_into_gamut_keeps_luminance_and_what_is_inside():
 
 
 @pytest.mark.parametrize("bad", [(np.nan, 1, 1), (-1, -2, -3), (0, 0, 0), (np.inf, -np.inf, 0)])
-def test_into_gamut_shows_what_is_no_color_as_black(bad):
+def test_into_gamut_maps_invalid_colors_to_black(bad):
     assert (into_gamut(np.array([bad])) == 0).all()
 
 
@@ -123,7 +123,7 @@ def test_a_preview_shows_dark_and_red_pixels_as_such(tmp_path):
     assert pixels.max() > 200
 
 
-def test_preview_of_unknown_format_leaves_nothing(tmp_path):
+def test_preview_of_unknown_format_writes_nothing(tmp_path):
     with pytest.raises(ValueError, match=r"\.nonsense"):
         save_preview(SpectralImage(GRID, np.ones((2, 2, GRID.size))), tmp_path / "a.nonsense")
     assert list(tmp_path.iterdir()) == []

@@ -25,7 +25,7 @@ SCENE = """<scene version="3.0.0"><integrator type="direct"/>
 
 
 @pytest.mark.slow
-def test_guides_are_of_what_is_seen_first(llvm):
+def test_guides_are_of_the_first_surface_hit(llvm):
     look = mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0])
     film = {"type": "hdrfilm", "width": 30, "height": 20, "rfilter": {"type": "box"}}
     painted = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.1, 0.4, 0.8]}}
@@ -63,9 +63,9 @@ def test_the_noise_of_any_reconstruction_filter_goes(rfilter, llvm):
     response = guides(mi.load_dict({"type": "scene", "sensor": sensor})).response
     rng = np.random.default_rng(0)
     block = mi.ImageBlock((size, size), (0, 0), 4, film.rfilter(), border=True)
-    places = mi.Point2f(rng.random((2, samples * size**2)) * size)
+    positions = mi.Point2f(rng.random((2, samples * size**2)) * size)
     values = rng.exponential(size=(3, samples * size**2))
-    block.put(places, [*(mi.Float(v) for v in values), mi.Float(np.ones(samples * size**2))])
+    block.put(positions, [*(mi.Float(v) for v in values), mi.Float(np.ones(samples * size**2))])
     border = block.border_size()
     picture = np.array(block.tensor())[border : border + size, border : border + size]
     noisy = picture[..., :3] / picture[..., 3:]
@@ -153,7 +153,7 @@ def test_a_value_other_than_true_or_false_is_refused(command, tmp_path, monkeypa
     assert "denoise: got 'yes', wanted true or false" in err
 
 
-def test_what_a_scene_asks_for_is_read_as_leniently_as_mitsuba_reads_scenes(tmp_path):
+def test_a_requested_denoiser_is_read_as_leniently_as_mitsuba_reads_scenes(tmp_path):
     path = tmp_path / "scene.xml"
     comment = '<!-- python x.py --small; <default name="denoise" value="false"/> -->'
     path.write_text(ASKS.replace("<integrator", comment + "<integrator"))
@@ -163,7 +163,9 @@ def test_what_a_scene_asks_for_is_read_as_leniently_as_mitsuba_reads_scenes(tmp_
     assert not is_requested(path)
 
 
-def test_the_scenes_that_ask_are_those_that_the_documentation_names():
+def test_the_documentation_names_the_scenes_that_request_denoising():
     scenes = Path(__file__).parents[2] / "scenes"
-    asking = {path.name for path in scenes.glob("*.xml") if is_requested(path)}
-    assert asking == {f"{name}.xml" for name in ("glasses", "window", "rainbow", "compact_disc", "hologram", "blaze")}
+    requesting = {path.name for path in scenes.glob("*.xml") if is_requested(path)}
+    assert requesting == {
+        f"{name}.xml" for name in ("glasses", "window", "rainbow", "compact_disc", "hologram", "blaze")
+    }

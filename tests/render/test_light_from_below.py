@@ -19,7 +19,7 @@ SCENE = """<scene version="3.0.0"><integrator type="path"/>
 
 
 @pytest.mark.parametrize(
-    ("eye", "light", "kind", "told"),
+    ("eye", "light", "kind", "message"),
     [
         (4, -5, "none", "of shape film is lit from below only"),
         (-4, 5, "none", "of shape film is seen from below only"),
@@ -27,17 +27,17 @@ SCENE = """<scene version="3.0.0"><integrator type="path"/>
         (4, -5, "sheet", ""),
     ],
 )
-def test_an_opaque_grating_in_the_dark_is_told(tmp_path, caplog, eye, light, kind, told):
+def test_an_opaque_grating_lit_or_seen_from_below_is_logged(tmp_path, caplog, eye, light, kind, message):
     mi.set_variant("llvm_ad_spectral")
     (tmp_path / "s.xml").write_text(SCENE.format(eye=eye, light=light, kind=kind))
     with caplog.at_level(logging.WARNING, logger="mitsuba_diffraction.render.scene"):
         warn_of_gratings(load_spectral_scene(tmp_path / "s.xml", width=8, height=8))
     messages = [record.getMessage() for record in caplog.records]
-    assert len(messages) == bool(told)
-    assert all(told in message and "transmission=sheet" in message for message in messages)
+    assert len(messages) == bool(message)
+    assert all(message in logged and "transmission=sheet" in logged for logged in messages)
 
 
-def test_a_denoised_rendering_which_loads_its_scene_twice_tells_it_once(tmp_path, monkeypatch, command):
+def test_a_denoised_rendering_logs_it_once(tmp_path, monkeypatch, command):
     monkeypatch.chdir(tmp_path)
     Path("s.xml").write_text(SCENE.format(eye=4, light=-5, kind="none"))
     code, _, err = command("render s.xml --denoise --spp 1 --width 8 --height 8 --variant llvm_ad_spectral")

@@ -1,4 +1,4 @@
-"""Renderings that take long: noise that tells when to stop, kills, Ctrl-C, full disks, and the turntable."""
+"""Long renderings: stopping by noise, kills, Ctrl-C, full disks, and the turntable."""
 
 import itertools
 import os
@@ -124,8 +124,8 @@ def test_until_error_stops_at_the_requested_noise():
     others = [render("scene.xml", spp=done, seed=seed) for seed in range(1, 9)]
     others = np.stack([spectrum_to_XYZ(other.radiance, other.wavelengths)[..., 1] for other in others])
     lit = others.mean(axis=0) > 0
-    told = np.percentile(others.std(axis=0, ddof=1)[lit] / others.mean(axis=0)[lit], 90)
-    assert told == pytest.approx(0.05, rel=0.8)
+    spread = np.percentile(others.std(axis=0, ddof=1)[lit] / others.mean(axis=0)[lit], 90)
+    assert spread == pytest.approx(0.05, rel=0.8)
 
     with pytest.raises(Interrupted):
         render("scene.xml", spp=4096, until_error=0.05, checkpoint="c", tracer=stop_after(done // 2))
@@ -144,7 +144,7 @@ def test_errors_out_of_range_are_refused(error):
 
 
 @pytest.mark.slow
-def test_ctrl_c_gives_what_there_is_and_resuming_gives_the_same_bits():
+def test_ctrl_c_saves_the_picture_so_far_and_resuming_gives_the_same_bits():
     whole = render("scene.xml", spp=7)
     with pytest.raises(Interrupted) as caught:
         render("scene.xml", spp=7, checkpoint="c", tracer=stop_after(3))
@@ -174,7 +174,7 @@ def test_a_second_ctrl_c_does_not_wait():
     assert files() == {"scene.xml"}
 
 
-def test_ctrl_c_stays_ignored_where_it_was():
+def test_ctrl_c_stays_ignored_if_it_was():
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         assert render("scene.xml", spp=3, tracer=stop_after(2)).attributes["spp"] == 3
@@ -313,8 +313,8 @@ def test_killed_renderings_go_on_and_give_the_same_bits(command, kills, rfilter)
             time.sleep(0.001)
         time.sleep(rng.uniform(0, 0.15))
         process.kill()
-        _, told = process.communicate()
-        assert process.returncode == -signal.SIGKILL, told
+        _, messages = process.communicate()
+        assert process.returncode == -signal.SIGKILL, messages
         now = samples_in(checkpoint)
         assert reached < now < spp
         reached = now
@@ -369,7 +369,7 @@ def test_the_command_is_interrupted_and_goes_on(command, monkeypatch):
     assert Path("out.exr").stat().st_mtime_ns == written
 
 
-def test_the_command_stops_at_an_error_and_says_if_it_is_not_reached(command):
+def test_the_command_stops_at_an_error_and_reports_if_it_is_not_reached(command):
     code, out, err = command(f"{RENDER} -o out.exr --spp 4096 --until-error 0.2")
     assert (code, err) == (0, "")
     picture = SpectralImage.load("out.exr")
@@ -394,7 +394,7 @@ def test_an_interrupt_before_the_first_pass_writes_nothing(command, monkeypatch)
 
 
 @pytest.mark.slow
-def test_a_full_disk_is_one_line_and_leaves_the_last_checkpoint(command, monkeypatch):
+def test_a_full_disk_is_one_line_and_keeps_the_last_checkpoint(command, monkeypatch):
     def limited(line):
         # Not even the superuser writes more than this; a disk that is full raises another number.
         soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -543,7 +543,7 @@ def test_a_turntable_writes_frames_and_an_animation_and_resumes(command, monkeyp
             assert np.abs(np.asarray(animation.convert("RGB"), dtype=float) - still).mean() < 25
 
 
-def test_a_second_ctrl_c_in_a_turntable_says_what_is_there(command, monkeypatch):
+def test_a_second_ctrl_c_in_a_turntable_reports_completed_pictures(command, monkeypatch):
     original, number = passes.trace_pass, itertools.count(1)
 
     def trace_pass(*arguments):

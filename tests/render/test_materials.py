@@ -1,4 +1,4 @@
-"""Gratings in the place of BSDFs in scenes that other programs exported."""
+"""Gratings that replace BSDFs in scenes exported by other programs."""
 
 import logging
 from pathlib import Path
@@ -99,29 +99,29 @@ def test_a_replaced_material_renders_as_if_the_scene_had_the_grating(exported):
 )
 def test_a_material_is_replaced_wherever_it_is(exported, disc, name, kept):
     shapes = load_spectral_scene(exported(disc), materials={name: MIRROR}).shapes()
-    (told,) = [told for told in (str(shape.bsdf()) for shape in shapes) if "DiffractionGrating[" in told]
-    assert kept in told
+    (grating,) = [text for text in (str(shape.bsdf()) for shape in shapes) if "DiffractionGrating[" in text]
+    assert kept in grating
 
 
-def test_a_transmitting_grating_takes_the_place_of_a_twosided(exported):
+def test_a_transmitting_grating_replaces_a_twosided(exported):
     glass = {**MIRROR, "transmission": "interface", "int_ior": 1.5}
     del glass["material"]
     scene = load_spectral_scene(exported(), materials={"mat-Disc": glass})
     assert any(str(shape.bsdf()).startswith("DiffractionGrating[") for shape in scene.shapes())
 
 
-def test_an_unknown_id_is_refused_with_those_that_there_are(exported):
+def test_an_unknown_id_is_refused_with_the_known_ids(exported):
     with pytest.raises(ValueError, match=r"got the id 'Disc', the ids of BSDFs in the scene are mat-Disc, mat-Floor"):
         load_spectral_scene(exported(), materials={"Disc": MIRROR})
 
 
-def test_a_material_that_no_shape_has_is_told(exported, caplog):
+def test_a_material_that_no_shape_has_is_logged(exported, caplog):
     path = exported()
     path.write_text(path.read_text().replace("</scene>", '<bsdf type="diffuse" id="mat-Spare"/></scene>'))
     with caplog.at_level(logging.WARNING, "mitsuba_diffraction"):
         load_spectral_scene(path, materials={"mat-Disc": MIRROR, "mat-Spare": MIRROR})
-    told = [record.getMessage() for record in caplog.records if "no shape" in record.getMessage()]
-    assert told == ["material mat-Spare: no shape uses the BSDF with that id, so the picture is unaffected"]
+    messages = [record.getMessage() for record in caplog.records if "no shape" in record.getMessage()]
+    assert messages == ["material mat-Spare: no shape uses the BSDF with that id, so the picture is unaffected"]
 
 
 def test_a_misspelt_parameter_is_refused_with_a_material_too(exported):
@@ -134,12 +134,12 @@ def test_a_misspelt_parameter_is_refused_with_a_material_too(exported):
 
 
 @pytest.mark.parametrize("uvs", [True, False])
-def test_a_grating_on_a_mesh_without_uvs_is_told(exported, uvs, caplog):
+def test_a_grating_on_a_mesh_without_uvs_is_logged(exported, uvs, caplog):
     with caplog.at_level(logging.WARNING, "mitsuba_diffraction"):
         warn_of_gratings(load_spectral_scene(exported(uvs=uvs), materials={"mat-Disc": MIRROR}))
-    told = [record.getMessage() for record in caplog.records if "UVs" in record.getMessage()]
-    assert len(told) == (0 if uvs else 1)
-    assert all(line.startswith("mat-Disc: on a mesh without UVs") for line in told)
+    messages = [record.getMessage() for record in caplog.records if "UVs" in record.getMessage()]
+    assert len(messages) == (0 if uvs else 1)
+    assert all(line.startswith("mat-Disc: on a mesh without UVs") for line in messages)
 
 
 def test_the_digest_of_a_scene_is_that_of_its_materials(exported):

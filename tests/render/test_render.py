@@ -92,7 +92,7 @@ def test_line_of_a_lamp_and_daylight_have_the_radiance_of_the_closed_form(llvm, 
     np.testing.assert_allclose(channel.mean(), expected, rtol=0.003)
     # A pixel of 64 samples: 1.3 times the mean if wavelengths are drawn by the film's response alone.
     assert channel.std() < 0.05 * expected
-    # Beside it, a sky of radiance one, in all channels.
+    # Besides, a sky of radiance one, in all channels.
     both = render(write_scene(tmp_path, WALL + LINE + CONSTANT), spp=4096).radiance.mean((0, 1))
     wanted = 0.5 + 0.5 / np.pi * np.interp(546, [540, 545, 550], [0, 0.2, 0]) * (np.abs(GRID - 545) < 1)
     wanted[np.argmin(np.abs(GRID - 550))] += 0.5 / np.pi * np.interp(546, [545, 550], [0, 0.2])
@@ -111,8 +111,8 @@ def test_the_four_wavelengths_of_a_ray_are_spread_over_line_and_film(llvm, tmp_p
     rest = drawn.T[one][~in_line.T[one]].reshape(-1, 3)
     fine = np.linspace(360, 830, 4701)
     response = np.interp(fine, [360, *GRID, 830], [0, *channel_weights(), 0])
-    share = np.interp(rest, fine, response.cumsum() / response.sum())
-    np.testing.assert_allclose(np.diff(share, axis=1), 1 / 3, atol=0.02)
+    fraction = np.interp(rest, fine, response.cumsum() / response.sum())
+    np.testing.assert_allclose(np.diff(fraction, axis=1), 1 / 3, atol=0.02)
 
 
 @pytest.mark.parametrize("light", ['<emitter type="constant"/>', '<emitter type="sunsky"/>', CONSTANT])
@@ -181,7 +181,7 @@ def test_rendering_a_scene_again_compiles_nothing(llvm, tmp_path):
 
 
 @pytest.mark.parametrize("offset", [4, 16, 32])
-def test_kernels_do_not_depend_on_where_numpy_puts_a_table(llvm, offset):
+def test_kernels_do_not_depend_on_the_address_of_a_table(llvm, offset):
     # Regression: Dr.Jit read packets out of NumPy's own memory, each number alone where that was not aligned.
     memory = np.zeros(64 * 17, np.uint8)
     start = (offset - memory.ctypes.data) % 64
@@ -201,7 +201,7 @@ def test_kernels_do_not_depend_on_where_numpy_puts_a_table(llvm, offset):
 
 
 def test_uneven_passes_add_up_to_all_samples(llvm, tmp_path, monkeypatch):
-    monkeypatch.setattr(passes, "SAMPLES_PER_PASS", 1)  # a large picture, so to say
+    monkeypatch.setattr(passes, "SAMPLES_PER_PASS", 1)  # as for a large picture
     monkeypatch.setattr(passes, "SAMPLES_PER_PIXEL_OF_LARGE_PICTURES", 4)
     calls = []
     path = write_scene(tmp_path, CONSTANT)
@@ -225,7 +225,7 @@ def test_samplers_that_round_up_are_counted(llvm, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("kind", ["multijitter", "stratified"])
 def test_all_numbers_of_a_sample_are_uniform_in_pairs(llvm, tmp_path, kind):
-    # Mitsuba's samplers by themselves: up to 24 % (multijitter) and 17 % (stratified) too many or too few in a cell.
+    # Mitsuba's samplers by themselves: up to 24 % (multijitter) and 17 % (stratified) too many or too few in a bin.
     drawn = []
 
     class Recorder(mi.SamplingIntegrator):
@@ -261,7 +261,7 @@ def test_colours_of_a_picture_in_passes_are_those_of_independent_samples(llvm, t
 
 
 @pytest.mark.slow
-def test_samplers_that_are_left_biased_are_told(llvm, tmp_path, caplog):
+def test_samplers_that_stay_biased_are_logged(llvm, tmp_path, caplog):
     path = write_scene(tmp_path, SPHERE + CONSTANT, sensor=SENSOR.replace("independent", "multijitter"))
     render(path, spp=1)
     assert not caplog.text

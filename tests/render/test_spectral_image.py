@@ -18,16 +18,16 @@ def image():
     return SpectralImage(GRID, radiance, {"scene": "a.xml", "spp": 16, "height_scale": 0.5})
 
 
-def test_a_saved_image_comes_back_unchanged(image, tmp_path):
+def test_a_saved_image_is_loaded_unchanged(image, tmp_path):
     image.save(tmp_path / "a.exr")
-    back = SpectralImage.load(tmp_path / "a.exr")
-    np.testing.assert_array_equal(back.radiance, image.radiance)
-    np.testing.assert_array_equal(back.wavelengths, image.wavelengths)
-    assert back.attributes == image.attributes
+    loaded = SpectralImage.load(tmp_path / "a.exr")
+    np.testing.assert_array_equal(loaded.radiance, image.radiance)
+    np.testing.assert_array_equal(loaded.wavelengths, image.wavelengths)
+    assert loaded.attributes == image.attributes
     assert [path.name for path in tmp_path.iterdir()] == ["a.exr"]
 
 
-def test_fractional_wavelengths_come_back_unchanged(tmp_path):
+def test_fractional_wavelengths_are_loaded_unchanged(tmp_path):
     image = SpectralImage([404.5, 412.25], np.ones((1, 1, 2)))
     image.save(tmp_path / "a.exr")
     np.testing.assert_array_equal(SpectralImage.load(tmp_path / "a.exr").wavelengths, [404.5, 412.25])
@@ -123,7 +123,7 @@ def test_unreadable_files_are_refused(image, tmp_path, capfd):
 
 
 @pytest.mark.parametrize("error", [OSError("disk full"), KeyboardInterrupt()])
-def test_failed_save_leaves_the_old_file(image, tmp_path, monkeypatch, error):
+def test_failed_save_keeps_the_old_file(image, tmp_path, monkeypatch, error):
     (tmp_path / "a.exr").write_text("old")
 
     class Failing(OpenEXR.File):
@@ -153,7 +153,7 @@ def test_a_whole_file_appears_at_the_end_only(tmp_path):
     assert stat.S_IMODE(target.stat().st_mode) == stat.S_IMODE(beside.stat().st_mode)
 
 
-def test_whole_file_refuses_other_places(tmp_path):
+def test_whole_file_refuses_a_folder_and_a_missing_folder(tmp_path):
     with pytest.raises(FileNotFoundError, match="folder"), whole_file(tmp_path / "none" / "a.txt"):
         pass
     with pytest.raises(ValueError, match="not an ordinary file"), whole_file(tmp_path):
@@ -170,7 +170,7 @@ def test_whole_file_follows_links(tmp_path):
     assert (tmp_path / "target.txt").read_text() == "new"
 
 
-def test_half_precision_refuses_what_it_cannot_hold(tmp_path):
+def test_half_precision_refuses_values_out_of_range(tmp_path):
     image = SpectralImage([500.0, 505.0], np.full((1, 1, 2), 7e4))
     with pytest.raises(ValueError, match=r"half: got radiances up to .*float32"):
         image.save(tmp_path / "a.exr", half=True)
