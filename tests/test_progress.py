@@ -55,7 +55,7 @@ def test_a_terminal_shows_a_bar_below_another(monkeypatch):
 def test_a_notebook_shows_a_line():
     source = """
 from mitsuba_diffraction import progress
-progress._SHORT = 0
+progress._MIN_REPORTED_SECONDS = 0
 with progress.progress_bar("spectrum of elaphe") as show:
     show(3, 7)
 """

@@ -211,7 +211,11 @@ def test_mueller_matrices_are_those_of_the_table(glass, variant):
                 wanted = glass.evaluate(m, alpha - m / 2, g, WAVELENGTH, ways, mueller=True)
                 # Light of the opposite k_y is mirrored at the plane of incidence.
                 signs = np.array([1, 1, -1, -1]) if k_y < 0 else np.ones(4)
-                wanted = between_stokes_axes(np.outer(signs, signs) * wanted / wanted[0, 0], wi, wo)
+                wanted = np.outer(signs, signs) * wanted / wanted[0, 0]
+                # The table is coarse: unpolarised light would become more than polarised.
+                wanted /= np.sqrt(max((wanted[0, 1:] ** 2).sum(), (wanted[1:, 0] ** 2).sum(), 1))
+                wanted[0, 0] = 1
+                wanted = between_stokes_axes(wanted, wi, wo)
                 si = interaction(wi, (WAVELENGTH * 1e3,) * 4)
                 found = entries(bsdf.eval(mi.BSDFContext(IMPORTANCE), si, vectors(wo)))
                 np.testing.assert_allclose(found / found[0, 0], wanted, atol=2e-3)
