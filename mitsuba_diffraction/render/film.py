@@ -70,11 +70,7 @@ def trace_pass(scene: mi.Scene, spp: int, seed: int, integrator: mi.Integrator |
 
 def needs_mitsubas_film(integrator: mi.Integrator) -> bool:
     """Return whether an integrator can only render whole pictures, with Mitsuba's film and the scene's sampler."""
-    return (
-        mi.variant().startswith("scalar")
-        or not isinstance(integrator, mi.SamplingIntegrator)
-        or isinstance(integrator, mi.CppADIntegrator)
-    )
+    return not isinstance(integrator, mi.SamplingIntegrator) or isinstance(integrator, mi.CppADIntegrator)
 
 
 def check_memory(scene: mi.Scene, spp: int) -> None:
