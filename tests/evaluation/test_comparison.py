@@ -195,9 +195,10 @@ def test_the_same_light_is_direct_light(llvm, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize(("ratio", "agrees"), [(0.45, False), (1.5, True)])
 def test_corrected_the_shader_converges_to_the_model_within_the_limit(llvm, tmp_path, ratio, agrees):
-    # Coherence length over tile. Without E, which the shader lacks.
+    # Coherence length over tile. Without E, which the shader lacks. K and G are those of an order in the BSDF and those
+    # of the pair in the shader: within a lobe they differ by a few per cent if the period is 3 µm, and less if longer.
     without = '<boolean name="conserve_energy" value="false"/>'
-    of = {"base": without, "profile": "sinusoidal", "period": 3.0, "coherence": 3.0 * ratio}
+    of = {"base": without, "profile": "sinusoidal", "period": 5.0, "coherence": 5.0 * ratio}
     scene = write(tmp_path / "scene.xml", MIRRORED, shapes=PLATE, **of)
     pictures = Pictures(scene, "flss", width=8)
     assert pictures.truncated_fraction == pytest.approx(np.exp(-((1.5 * np.pi * ratio / 2) ** 2)))
@@ -261,8 +262,10 @@ def test_the_share_of_a_quirk_is_that_of_renderings_without_it(llvm, tmp_path):
     assert one.share == pytest.approx((one.drop + one.rise) / 2 / mean(*names))
     # The sky is none of the shader's.
     assert found.path_traced.corrected > against.corrected
-    # A plate without shadows is no picture of a plate with one.
-    assert found.same_light.quirks[NO_SHADOWS].rise > 1
+    # The sphere casts a shadow on the plate.
+    shadow = found.same_light.quirks[NO_SHADOWS]
+    assert shadow.rise == pytest.approx(mean(NO_SHADOWS) - mean())
+    assert shadow.rise > 0
 
 
 def test_the_reads_per_point_are_those_of_the_tables(llvm, tmp_path):
