@@ -26,7 +26,10 @@ GRATINGS = {
 }
 POLARISED = [name for name in GRATINGS if name != "rigorous"]  # the table that is made up has no Mueller matrices
 CASES = [("llvm_ad_spectral", name) for name in GRATINGS]
-CASES += [("llvm_ad_spectral_polarized", name) for name in POLARISED]
+CASES += [
+    pytest.param(("llvm_ad_spectral_polarized", name), marks=[pytest.mark.slow] * (name not in ("line", "interface")))
+    for name in POLARISED
+]
 COUNT = 300
 
 

@@ -298,6 +298,7 @@ def test_e_of_few_scales_is_that_of_separate_gratings(llvm, name):
         assert found > wanted - 0.01
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("parameters", [{"material": "none"}, PASSES], ids=["reflected", "passing"])
 def test_e_of_very_different_heights_is_that_of_each(llvm, parameters):
     """For deep and shallow reliefs, from both sides of an interface."""

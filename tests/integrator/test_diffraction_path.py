@@ -203,7 +203,7 @@ def assert_agree(built, depth, spp, **parameters):
     ("build", "depth", "spp"),
     [
         (sun_alone, 3, 1024),
-        pytest.param(partial(window, "interface"), 3, 1024, id="enters"),
+        pytest.param(partial(window, "interface"), 3, 1024, marks=pytest.mark.slow, id="enters"),
         pytest.param(partial(window, "interface", -1), 3, 1024, marks=pytest.mark.slow, id="leaves"),
         pytest.param(partial(window, "sheet"), 3, 1024, marks=pytest.mark.slow, id="relief first"),
         pytest.param(partial(window, "sheet", -1), 3, 1024, id="flat face first"),
@@ -213,7 +213,7 @@ def assert_agree(built, depth, spp, **parameters):
         pytest.param(lamp_and_spot, 5, 2048, marks=pytest.mark.slow),
         pytest.param(blend_under_a_point, -1, 1024, marks=pytest.mark.slow),
         (lamp_that_is_a_grating, 3, 512),
-        (instance_beside_a_grating, 4, 1024),
+        pytest.param(instance_beside_a_grating, 4, 1024, marks=pytest.mark.slow),
     ],
 )
 def test_converges_to_the_limit_of_path(build, depth, spp, llvm):
@@ -225,7 +225,7 @@ def test_converges_beside_a_curve(llvm, tmp_path):
     assert_agree(curve_beside_a_grating(tmp_path), 4, 1024)
 
 
-@pytest.mark.few(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("shadows", [True, False], ids=["shadowing", "no shadowing"])
 @pytest.mark.parametrize("flips", [True, False], ids=["flips", "no flips"])
 @pytest.mark.parametrize(("kind", "coat"), [("normalmap", {}), ("normalmap", {"coat_ior": 1.5}), ("bumpmap", {})])
@@ -379,6 +379,7 @@ def test_aov_around_it_gives_its_picture(llvm):
     np.testing.assert_allclose(channels[..., :3], own[..., :3], rtol=1e-4)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("mode", ["forward", "backward"])
 def test_gradients_are_finite_differences(llvm, mode):
     built = sun_alone()
