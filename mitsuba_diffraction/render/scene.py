@@ -193,13 +193,18 @@ def max_plausible_luminance(scene: mi.Scene) -> float:
 
 def _warn_of_missing_uvs(scene: mi.Scene) -> None:
     """Log a warning if gratings are on meshes without texture coordinates; named by BSDF, as merged meshes lose ids."""
-    bsdfs = [shape.bsdf() for shape in scene.shapes() if shape.is_mesh() and not shape.has_vertex_texcoords()]
+    bsdfs = [shape.bsdf() for shape in scene.shapes() if shape.is_mesh() and not has_uvs(shape)]
     if names := sorted({bsdf.id() or "a BSDF" for bsdf in bsdfs if "DiffractionGrating[" in str(bsdf)}):
         _log.warning(
             "%s: on a mesh without UVs, where the direction of the grating differs from triangle to triangle; "
             "wanted a mesh with UVs",
             ", ".join(names),
         )
+
+
+def has_uvs(mesh: mi.Shape) -> bool:
+    """Return whether a mesh has UVs; Mitsuba 3.10 renames the method."""
+    return mesh.has_texcoords() if hasattr(mesh, "has_texcoords") else mesh.has_vertex_texcoords()
 
 
 def _draw_wavelengths_of_lights(scene: mi.Scene) -> None:

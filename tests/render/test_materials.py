@@ -2,6 +2,7 @@
 
 import logging
 from pathlib import Path
+from types import SimpleNamespace
 
 import mitsuba as mi
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 
 from mitsuba_diffraction.cli.arguments import materials_of
 from mitsuba_diffraction.render import render
-from mitsuba_diffraction.render.scene import load_spectral_scene, scene_digest, warn_of_gratings
+from mitsuba_diffraction.render.scene import has_uvs, load_spectral_scene, scene_digest, warn_of_gratings
 
 MIRROR = {"profile": "blazed", "period": 2.0, "depth": 0.2, "material": "none", "conserve_energy": False}
 PLAIN = "".join(
@@ -140,6 +141,12 @@ def test_a_grating_on_a_mesh_without_uvs_is_logged(exported, uvs, caplog):
     messages = [record.getMessage() for record in caplog.records if "UVs" in record.getMessage()]
     assert len(messages) == (0 if uvs else 1)
     assert all(line.startswith("mat-Disc: on a mesh without UVs") for line in messages)
+
+
+@pytest.mark.parametrize("name", ["has_texcoords", "has_vertex_texcoords"])
+def test_uvs_are_found_by_the_name_of_either_mitsuba(name):
+    assert not has_uvs(SimpleNamespace(**{name: lambda: False}))
+    assert has_uvs(SimpleNamespace(**{name: lambda: True}))
 
 
 def test_the_digest_of_a_scene_is_that_of_its_materials(exported):
