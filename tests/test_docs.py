@@ -12,12 +12,15 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 import pytest
+from markdown.extensions.toc import slugify
 from mkdocs.commands.build import build
 from mkdocs.config import load_config
 
 import mitsuba_diffraction as md
+from mitsuba_diffraction.evaluation.realtime_shader.quirks import Quirks
 
 ROOT = Path(__file__).parents[1]
+PACKAGE = Path(md.__file__).parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 SLOW = {"compare", "long_renders", "own_grating", "own_scan", "plugin", "reading_exr", "tolerance"}
 """Pages whose code takes long."""
@@ -209,6 +212,30 @@ def test_the_files_that_the_readme_names_exist():
     assert len(named) >= 5
     for name in named:
         assert (ROOT / name).is_file(), name
+
+
+def test_what_the_page_on_the_thesis_names_exists(command):
+    text = (ROOT / "docs" / "thesis.md").read_text(encoding="utf-8")
+    named = re.findall(r"`([\w./]+\.(?:py|md|toml|xml|ipynb|png))`", text)
+    assert len(named) > 40
+    for name in named:
+        assert (ROOT / name).is_file() or (PACKAGE / name).is_file(), name
+    for name, member in re.findall(r"`([\w/]+\.py)` \(`(\w+)`\)", text):
+        assert re.search(rf"^ *(?:def|class) {member}\b", (PACKAGE / name).read_text(), re.MULTILINE), (name, member)
+    for page, anchor in re.findall(r"\]\(([\w./]*)#?([\w-]*)\)", text):
+        headings = re.findall(r"^#+ (.*)$", (ROOT / "docs" / (page or "thesis.md")).read_text(), re.MULTILINE)
+        assert not anchor or anchor in {slugify(heading.replace("`", ""), "-") for heading in headings}, (page, anchor)
+    for name, *words in map(str.split, re.findall(r"`mitsuba-diffraction ([^`]*)`", text)):
+        code, offered, _ = command(name, "--help")
+        assert code == 0
+        assert all(word in offered for word in words if word.startswith("--")), (name, words)
+        assert all((ROOT / word).is_file() for word in words if word.startswith("scenes/")), (name, words)
+
+
+def test_the_page_on_the_thesis_describes_all_quirks():
+    table = (ROOT / "docs" / "thesis.md").read_text(encoding="utf-8").partition("## Quirks")[2]
+    named = re.findall(r"`(\w+)`", " ".join(line.split(" | ")[0] for line in table.splitlines() if line[:3] == "| `"))
+    assert sorted(named) == sorted(Quirks.names())
 
 
 @pytest.mark.slow
