@@ -13,8 +13,6 @@ from ..progress import tell
 from .arguments import Overwrite
 
 _PACKAGE = Path(__file__).parents[1]
-# In a checkout the folders are beside the package; setup.py copies them into it.
-_SOURCE = next((root for root in (_PACKAGE / "examples", _PACKAGE.parent) if (root / "scenes").is_dir()), None)
 _OUTPUT_FOLDERS = {"models", "out", "__pycache__"}
 """Folders in a checkout that hold outputs of scripts and renderings."""
 
@@ -24,9 +22,8 @@ def examples(
     overwrite: Overwrite = False,
 ) -> None:
     """Copy the scenes, recipes and measured skins that the package brings."""
-    if _SOURCE is None:
-        raise RuntimeError(f"{_PACKAGE}: the package was installed without its scenes and recipes")
-    contents = {folder / path: (_SOURCE / path).read_bytes() for path in _files(_SOURCE)}
+    root = source()
+    contents = {folder / path: (root / path).read_bytes() for path in _files(root)}
     new = {
         target: content
         for target, content in contents.items()
@@ -40,6 +37,17 @@ def examples(
         with whole_file(target) as temporary:
             temporary.write_bytes(content)
     tell(f"{folder}: {len(contents)} files, described in scenes/README.md and precompute/README.md")
+
+
+def source() -> Path:
+    """Return the folder that holds the scenes and recipes of the package.
+
+    In a checkout they are beside the package; setup.py copies them into it.
+    """
+    for root in (_PACKAGE / "examples", _PACKAGE.parent):
+        if (root / "scenes").is_dir():
+            return root
+    raise RuntimeError(f"{_PACKAGE}: the package was installed without its scenes and recipes")
 
 
 def _files(root: Path) -> list[Path]:

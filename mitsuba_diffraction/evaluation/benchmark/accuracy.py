@@ -118,8 +118,12 @@ class Exact:
         field, random = self._case.height_field, np.random.default_rng(2)
         return Accuracy(
             l1=float(np.max([l1_error(spectrum, field, kappa, self._points, random) for kappa in self._kappas])),
-            delta_e=patch_difference(self.xyz, self._xyz(spectrum.evaluate(self._q, self._kappa))),
+            delta_e=self.delta_e(spectrum),
         )
+
+    def delta_e(self, spectrum: GratingSpectrum) -> tuple[float, float]:
+        """Return mean and maximum CIEDE2000 of the patches, for a spectrum of the same case."""
+        return patch_difference(self.xyz, self._xyz(spectrum.evaluate(self._q, self._kappa)))
 
 
 def patch_difference(exact: Array, approximate: Array) -> tuple[float, float]:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass
 
+from ...cli.examples import source
 from ...grating_spectrum import GratingSpectrum
 from ...precomputation import precompute
 from ...settings import SUN_COHERENCE_LENGTH
 from ...spectrum.sample import effective_coherence_length
 from ...surface import gratings
 from ...surface.heightfield import HeightField
+from ...surface.readers import read_height_field
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,16 +31,20 @@ class Case:
     extent: str
     coherence_length: float
 
-    def spectrum(self, tolerance: float = 1e-3) -> GratingSpectrum:
+    def spectrum(
+        self, tolerance: float = 1e-3, representation: str = "auto", terms: int | None = None
+    ) -> GratingSpectrum:
         """Compute the spectrum of the surface; arguments and errors as of `precompute`."""
         with warnings.catch_warnings():
-            # The warning of coarse pixels does not matter here.
+            # The warnings of coarse pixels and of few terms do not matter here.
             warnings.simplefilter("ignore", UserWarning)
             return precompute(
                 self.height_field,
                 extent=self.extent,
                 coherence_length=self.coherence_length,
                 tolerance=tolerance,
+                representation=representation,
+                terms=terms,
             )
 
 
@@ -57,6 +63,32 @@ def bundled_cases() -> list[Case]:
         Case("65 µm tile", large, "tile", sun),
         Case("65 µm sample", large, "sample", effective_coherence_length(large, sun)),
     ]
+
+
+MEASURED = {"elaphe": 0.4347, "xenopeltis": 0.4435}
+"""µm from black to white, of the scans of 65 µm in precompute/measured."""
+_CROP = slice(333, 999)  # of 1332 rows and columns: the central 32.5 µm
+
+TIMED_TILES = ("synthetic, 0.375 µm", "measured Elaphe", "measured Xenopeltis")
+"""Of `tiles`."""
+
+
+def tiles() -> list[Case]:
+    """Return synthetic skins of three depths, and the centres of both measured skins, as tiles in sunlight.
+
+    The heights of the measured skins are those of the pictures, without any preparation; at the edges of a tile they
+    jump.
+    """
+    cases = [
+        Case(f"synthetic, {depth:g} µm", gratings.elaphe(8.0, depth=depth, seed=1), "tile", SUN_COHERENCE_LENGTH)
+        for depth in (0.15, 0.375, 0.6)
+    ]
+    for name, height_range in MEASURED.items():
+        file = source() / "precompute" / "measured" / f"{name}_afm_65um.png"
+        scan = read_height_field(file, pixel_size=65 / 1332, height_range=height_range)
+        field = HeightField(scan.heights[_CROP, _CROP], scan.pixel_size, source=f"centre of {scan.source}")
+        cases.append(Case(f"measured {name.capitalize()}", field, "tile", SUN_COHERENCE_LENGTH))
+    return cases
 
 
 def scan_case(height_field: HeightField) -> Case:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import drjit as dr
@@ -9,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from ...testing import vectors
+from ..realtime_shader.base import Shader
 from ..realtime_shader.evaluate import shader_for
 from ..realtime_shader.quirks import Quirks
 from ..validation.lobes import k_g_between
@@ -64,33 +66,48 @@ def shader_speeds(case: Case, exact: Exact, *, count: int = 1 << 14, repetitions
         count: shading points at once.
         repetitions: of each timing, interleaved.
     """
-    import colour
-
     rays = Rays(count)
     rough = mi.load_dict({"type": "roughconductor", "material": "Al"})
+    shaders = shaders_of(case)
+    work = {"rough": lambda: rays.evaluate(rough)}
+    work |= {name: shading(rays, shader) for name, shader in shaders.items()}
+    taken = seconds(work, repetitions)
+    return [
+        ShaderSpeed(
+            surface=case.name,
+            variant=variant,
+            as_published=published,
+            texel_reads=shader.texel_reads,
+            evaluate_ratio=taken["rough"] / taken[variant, published],
+            delta_e=shader_difference(shader, exact),
+        )
+        for (variant, published), shader in shaders.items()
+    ]
+
+
+def shaders_of(case: Case) -> dict[tuple[str, bool], Shader]:
+    """Return shaders of a tile by variant and whether they are as published."""
+    return {
+        (variant, published): shader_for(
+            case.height_field, variant, Quirks.as_published() if published else Quirks.corrected()
+        )
+        for variant, published in _SHADERS
+    }
+
+
+def shading(rays: Rays, shader: Shader) -> Callable[[], None]:
+    """Return a function that evaluates a shader for all rays."""
+    weights = shader.weights(_R_0)
+    return lambda: dr.eval(shader.rgb(rays.si.wi, rays.wo, weights))
+
+
+def shader_difference(shader: Shader, exact: Exact) -> tuple[float, float]:
+    """Return mean and maximum CIEDE2000 of the patches against the exact model, after one factor of exposure."""
+    import colour
+
     wi, wo = patch_directions()
     cos_half = np.sqrt((1 + (wi * wo).sum(axis=-1)) / 2)
     wanted = exact.xyz * ((_R_0 + (1 - _R_0) * (1 - cos_half) ** 5) * k_g_between(wi, wo))[:, None]
-    shaders, work = {}, {"rough": lambda: rays.evaluate(rough)}
-    for variant, published in _SHADERS:
-        shader = shader_for(case.height_field, variant, Quirks.as_published() if published else Quirks.corrected())
-        weights = shader.weights(_R_0)
-        shaders[variant, published] = shader, weights
-        work[variant, published] = lambda s=shader, w=weights: dr.eval(s.rgb(rays.si.wi, rays.wo, w))
-    taken = seconds(work, repetitions)
-    results = []
-    for (variant, published), (shader, weights) in shaders.items():
-        rgb = np.array(shader.rgb(vectors(wi), vectors(wo), weights), np.float64).T
-        xyz = rgb @ colour.RGB_COLOURSPACES["sRGB"].matrix_RGB_to_XYZ.T
-        xyz *= wanted[:, 1].sum() / xyz[:, 1].sum()
-        results.append(
-            ShaderSpeed(
-                surface=case.name,
-                variant=variant,
-                as_published=published,
-                texel_reads=shader.texel_reads,
-                evaluate_ratio=taken["rough"] / taken[variant, published],
-                delta_e=patch_difference(wanted, xyz),
-            )
-        )
-    return results
+    rgb = np.array(shader.rgb(vectors(wi), vectors(wo), shader.weights(_R_0)), np.float64).T
+    xyz = rgb @ colour.RGB_COLOURSPACES["sRGB"].matrix_RGB_to_XYZ.T
+    return patch_difference(wanted, xyz * (wanted[:, 1].sum() / xyz[:, 1].sum()))

@@ -24,6 +24,9 @@ def benchmark(
     rigorous: Annotated[
         bool, typer.Option("--rigorous", help="compare the theories on 1200 lines/mm in aluminium instead; minutes")
     ] = False,
+    terms: Annotated[
+        bool, typer.Option("--terms", help="measure the amplitude series by number of terms instead; minutes")
+    ] = False,
     json: Annotated[Path | None, typer.Option(help="save the results (.json)")] = None,
     plot: Annotated[Path | None, typer.Option(help="plot error against speed (.png)")] = None,
     overwrite: Overwrite = False,
@@ -43,6 +46,11 @@ def benchmark(
         check_suffix("--plot", plot, ".png")
     writes = [(option, path) for option, path in (("--json", json), ("--plot", plot)) if path is not None]
     outputs.check_outputs([] if scan is None else [scan], writes, overwrite=overwrite)
+    for option, given, own in (("--rigorous", rigorous, "one grating"), ("--terms", terms, "tiles")):
+        if given and (scan is not None or surface or tolerance or (rigorous and (terms or plot is not None))):
+            raise RequestError(
+                f"{option}: got other surfaces, tolerances, a plot or a study, too; it has {own} of its own"
+            )
     cases = bundled_cases()
     names = [case.name for case in cases]
     if unknown := set(surface or []) - set(names):
@@ -51,11 +59,10 @@ def benchmark(
     if scan is not None:
         cases.append(scan_case(read_height_field(scan, pixel_size=pixel_size, height_range=height_range)))
     mi.set_variant(choose_variant(variant))
+    if terms:
+        _measure_terms(json, plot)
+        return
     if rigorous:
-        if scan is not None or surface or tolerance or plot is not None:
-            raise RequestError(
-                "--rigorous: got other surfaces, tolerances or a plot, too; it has one grating of its own"
-            )
         with progress_bar("rigorous efficiencies") as progress:
             costs = compare_theories(ruled(1200), progress=progress)
         show(table(COLUMNS, (report.cells(COLUMNS, cost) for cost in costs)), width=140)
@@ -72,3 +79,16 @@ def benchmark(
         save_json(results, shaders, sampling, json)
     if plot is not None:
         save_plot(results, plot)
+
+
+def _measure_terms(json: Path | None, plot: Path | None) -> None:
+    from ..benchmark import terms
+    from ..benchmark.cases import TIMED_TILES, tiles
+
+    with progress_bar("number of terms") as progress:
+        found = terms.run(tiles(), TIMED_TILES, progress=progress)
+    show(*terms.tables(found), width=190)
+    if json is not None:
+        outputs.save_json(found, json)
+    if plot is not None:
+        terms.save_plot(found, plot)
