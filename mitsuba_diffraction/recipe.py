@@ -204,6 +204,16 @@ class Recipe:
         except RequestError as error:
             raise RequestError(f"{path}: {error}") from None
 
+    def check(self) -> None:
+        """Read or compute the surface, which checks its values, unless its spectrum is in the package or the cache.
+
+        Raises:
+            ValueError: if the profile, or the scan, is wrong.
+        """
+        name = f"{self.digest()}.exr"
+        if not any((folder / name).is_file() for folder in (READY_SPECTRA, cache_folder())):
+            self.height_field()
+
     def build(self, progress: Progress = silent) -> Spectrum:
         """Compute the spectrum; `progress` is called with (steps done, steps in all)."""
         patches = self.height_fields(part(progress, 0, _HEIGHTS_TIME_FRACTION))

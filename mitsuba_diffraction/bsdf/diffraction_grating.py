@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import functools
 import operator
+from inspect import signature
 
 import mitsuba as mi
 
+from ..errors import RequestError
 from ..manual import Parameter, listed
+from ..recipe import Recipe
+from ..surface.gratings import PROFILES
+from .grating import GratingRequest
 from .layers import Layers
 
 PARAMETERS = (
@@ -109,6 +114,35 @@ theory uses the Mueller matrices of the orders. A perfect mirror and Schlick's f
 """
 
 
+def refuse_unknown(props: mi.Properties) -> None:
+    """Check the names of all parameters but nested BSDFs, before anything is computed.
+
+    Raises:
+        RequestError: with the known names, if one is unknown.
+    """
+    known = {name for parameter in PARAMETERS for name in parameter.name.split(", ")}
+    if "profile" in props:
+        if (profile := props["profile"]) not in PROFILES:
+            return  # `surface_from` lists them
+        known |= {"coherence_length", "largest_height_range", "patches", *signature(PROFILES[profile]).parameters}
+    nested = {name for name, value in props.objects() if isinstance(value, mi.BSDF)}
+    if unknown := sorted(set(props.keys()) - known - nested):
+        raise RequestError(f"{', '.join(unknown)}: unknown, wanted one of {', '.join(sorted(known))}")
+
+
+def check(props: mi.Properties) -> None:
+    """Check all parameters without computing a spectrum.
+
+    Raises:
+        RequestError: if a name is unknown or a value wrong.
+        FileNotFoundError: if there is no such file.
+    """
+    refuse_unknown(props)
+    surface = GratingRequest.of(props).surface
+    if isinstance(surface, Recipe):
+        surface.check()
+
+
 def define() -> type:
     """Return the plugin's class for the variant in force: its base class belongs to that variant."""
 
@@ -118,6 +152,7 @@ def define() -> type:
         def __init__(self, props: mi.Properties) -> None:
             # The initialiser of the base class registers the object, which Dr.Jit then calls in all scenes as long as
             # it exists, even if only a traceback refers to it: therefore errors must occur before.
+            refuse_unknown(props)
             self.layers = Layers(props)
             self.spectrum = self.layers.grating.spectrum
             mi.BSDF.__init__(self, props)

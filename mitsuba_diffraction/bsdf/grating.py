@@ -3,21 +3,61 @@
 from __future__ import annotations
 
 import functools
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from ..errors import RequestError
+from ..precomputation import Spectrum
+from ..progress import progress_bar
+from ..recipe import Recipe
 from .geometry import Geometry, Incidence, Interface, rotated
 from .parameters import Media, Scales, check_texture, surface_from
 from .polarisation import reflected, through_layer
 from .tables import BELOW_ONE, larger, limited, opaque, smaller
-from .theory import Scattering, theory_of
+from .theory import Options, Scattering, theory_of
 
 # Of samples, for lobes that the averages of the sampler miss. They are uniform in solid angle: where both directions
 # are grazing, K G grows so fast that samples in proportion to the cosine would have large weights.
 UNIFORM_PROBABILITY = 0.02
+_per_cent = functools.partial(progress_bar, unit="%")
+
+
+@dataclass(frozen=True)
+class GratingRequest:
+    """The parameters of a grating, checked before a spectrum is computed for it.
+
+    Attributes:
+        media: around the grating.
+        scales: of heights and of lengths along the surface.
+        orientation: degrees from the tangent to the pattern's x axis.
+        options: of scalar theory.
+        surface: a spectrum, or the recipe to compute one.
+    """
+
+    media: Media
+    scales: Scales
+    orientation: mi.Texture
+    options: Options
+    surface: Spectrum | Recipe
+
+    @classmethod
+    def of(cls, props: mi.Properties) -> GratingRequest:
+        """Read the parameters of a scene.
+
+        Raises:
+            RequestError: if one is wrong, or they contradict each other.
+        """
+        media, scales = Media.of(props), Scales(props)
+        angle = props.get("orientation", 0.0)
+        if isinstance(angle, float) and not np.isfinite(angle):
+            raise RequestError(f"orientation: got {angle}, wanted degrees or a texture")
+        orientation = props.get_texture("orientation", 0.0)
+        check_texture("orientation", orientation)
+        surface = surface_from(props, media, scales.max_scale)
+        return cls(media, scales, orientation, Options.of(props, media), surface)
 
 
 class Grating:
@@ -32,16 +72,12 @@ class Grating:
         orientation: degrees from the tangent to the pattern's x axis.
     """
 
-    def __init__(self, props: mi.Properties, media: Media) -> None:
-        self.coat = media.coat
-        self.scales = Scales(props)
-        self.spectrum, self.recipe = surface_from(props, media, self.scales.max_scale)
-        self.theory = theory_of(props, self.spectrum, media, self.scales)
-        angle = props.get("orientation", 0.0)
-        if isinstance(angle, float) and not np.isfinite(angle):
-            raise RequestError(f"orientation: got {angle}, wanted degrees or a texture")
-        self.orientation = props.get_texture("orientation", 0.0)
-        check_texture("orientation", self.orientation)
+    def __init__(self, props: mi.Properties, request: GratingRequest) -> None:
+        self.coat, self.scales, self.orientation = request.media.coat, request.scales, request.orientation
+        surface = request.surface
+        self.recipe = surface if isinstance(surface, Recipe) else None
+        self.spectrum = surface.cached(_per_cent) if isinstance(surface, Recipe) else surface
+        self.theory = theory_of(props, self.spectrum, request.media, self.scales, request.options)
         # The grating is black at angles that the spectrum does not cover.
         self.min_cosine = opaque(np.cos(np.deg2rad(self.spectrum.largest_angle)) * (1 - 1e-6))
 

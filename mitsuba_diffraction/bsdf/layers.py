@@ -7,11 +7,9 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ..errors import RequestError
 from .base import base_from
 from .geometry import Interface, rotated
-from .grating import Grating
-from .parameters import Media
+from .grating import Grating, GratingRequest
 from .polarisation import of_plane, reflected
 from .tables import BELOW_ONE, smaller
 
@@ -51,12 +49,10 @@ class Layers:
     """
 
     def __init__(self, props: mi.Properties) -> None:
-        media = Media.of(props)
-        self.coat = media.coat
-        self.grating = Grating(props, media)
+        request = GratingRequest.of(props)
+        self.coat = request.media.coat
         self.base = base_from(props)
-        if self.base is not None and not self.grating.theory.material.transparent:
-            raise RequestError("base: got a BSDF below a conductor or a perfect mirror, which transmit no light")
+        self.grating = Grating(props, request)
         flags = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.Anisotropic | mi.BSDFFlags.FrontSide
         if self.grating.orientation.is_spatially_varying() or any(scale.varies for scale in self.grating.scales):
             flags = flags | mi.BSDFFlags.SpatiallyVarying

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import inspect
 import weakref
 from dataclasses import dataclass, replace
@@ -14,7 +13,6 @@ import numpy as np
 
 from ..errors import RequestError, is_number
 from ..precomputation import Spectrum, load_spectrum
-from ..progress import progress_bar
 from ..recipe import Recipe
 from ..rigorous.spectrum import RigorousSpectrum
 from ..settings import THEORIES, TRANSMISSIONS, VISIBLE, Settings, wavelengths_inside
@@ -22,7 +20,6 @@ from ..surface.gratings import COHERENCE_LENGTHS, PROFILES
 from .coat import SAME_INDEX, Coat, absolute_index, coat_from
 from .fresnel import Conductor, PerfectMirror, reflectance_from
 
-_per_cent = functools.partial(progress_bar, unit="%")
 _PREFIX = "handed over: "
 _OF_SPECTRUM = "representation", "terms", "heights_from", "tolerance"  # for a profile, or to override a recipe
 _handed_over: weakref.WeakValueDictionary[str, Spectrum] = weakref.WeakValueDictionary()
@@ -237,14 +234,11 @@ class Scales:
             )
 
 
-def surface_from(props: mi.Properties, media: Media, scale: float = 1.0) -> tuple[Spectrum, Recipe | None]:
-    """Return the spectrum given by `filename`, `spectrum`, or `profile` with its parameters.
+def surface_from(props: mi.Properties, media: Media, scale: float = 1.0) -> Spectrum | Recipe:
+    """Return the spectrum given by `filename` or `spectrum`, or the recipe given by `filename` or `profile`.
 
-    A spectrum that is built here is built for the wavelengths λ/n in a coat or a dielectric, divided by the maximum
-    `scale`.
-
-    Returns:
-        The spectrum, and its recipe; None for a saved spectrum, which has no heights.
+    The recipe is for the wavelengths λ/n in a coat or a dielectric, divided by the maximum `scale`. Its spectrum is not
+    computed here, so that all other parameters can be checked before.
 
     Raises:
         RequestError: unless exactly one of them is given and valid.
@@ -260,14 +254,14 @@ def surface_from(props: mi.Properties, media: Media, scale: float = 1.0) -> tupl
             f"profile ({', '.join(PROFILES)}) or, from Python, spectrum"
         )
     if given != ["profile"]:
-        if given == ["spectrum"]:
-            spectrum, recipe = _by_handle(props["spectrum"]), None
+        surface = _by_handle(props["spectrum"]) if given == ["spectrum"] else _from_file(props, media, scale)
+        if isinstance(surface, Recipe):
+            found = surface.settings.theory
         else:
-            spectrum, recipe = _from_file(props, media, scale)
-        found = "rigorous" if isinstance(spectrum, RigorousSpectrum) else "scalar"
+            found = "rigorous" if isinstance(surface, RigorousSpectrum) else "scalar"
         if props.get("theory", found) != found:
             raise RequestError(f"theory: got {theory!r} with a spectrum of {found} theory, wanted one built for it")
-        return spectrum, recipe
+        return surface
     name = props["profile"]
     if name not in PROFILES:
         raise RequestError(f"profile: got {name!r}, wanted one of {', '.join(PROFILES)}")
@@ -277,8 +271,7 @@ def surface_from(props: mi.Properties, media: Media, scale: float = 1.0) -> tupl
     settings |= {key: props[key] for key in ("coherence_length", "largest_height_range", *_OF_SPECTRUM) if key in props}
     if theory == "rigorous":
         settings |= {"theory": theory, **settings_from(props, media.coat)}
-    recipe = _inside(props, media, scale, Recipe(surface, Settings(**settings)))
-    return recipe.cached(_per_cent), recipe
+    return _inside(props, media, scale, Recipe(surface, Settings(**settings)))
 
 
 def _inside(props: mi.Properties, media: Media, scale: float, recipe: Recipe) -> Recipe:
@@ -300,8 +293,8 @@ def _inside(props: mi.Properties, media: Media, scale: float, recipe: Recipe) ->
     return replace(recipe, settings=replace(settings, **overrides))
 
 
-def _from_file(props: mi.Properties, media: Media, scale: float) -> tuple[Spectrum, Recipe | None]:
-    """Return the spectrum of a file or of a recipe, and the recipe."""
+def _from_file(props: mi.Properties, media: Media, scale: float) -> Spectrum | Recipe:
+    """Return the spectrum or the recipe of a file."""
     path = Path(str(mi.file_resolver().resolve(str(props["filename"]))))
     given = {name: props[name] for name in _OF_SPECTRUM if name in props}
     suffix = path.suffix.lower()
@@ -311,12 +304,11 @@ def _from_file(props: mi.Properties, media: Media, scale: float) -> tuple[Spectr
         available = sorted(other.name for other in folder.glob("*") if other.suffix.lower() in (".exr", ".toml"))
         raise FileNotFoundError(f"{path}: no such file; {folder} holds {', '.join(available) or 'no spectrum'}")
     if suffix == ".toml":
-        recipe = _inside(props, media, scale, Recipe.load(path, **given))
-        return recipe.cached(_per_cent), recipe
+        return _inside(props, media, scale, Recipe.load(path, **given))
     if suffix == ".exr":
         for name, value in given.items():
             raise RequestError(f"{name}: got {value} with {path}, wanted it when the spectrum is computed")
-        return load_spectrum(path), None
+        return load_spectrum(path)
     raise RequestError(
         f"filename: got {path}, wanted a saved spectrum (.exr) or a recipe (.toml); "
         "a scan is turned into a spectrum by `mitsuba-diffraction precompute`, or named by a recipe"

@@ -123,15 +123,50 @@ class Theory(Protocol):
         """Return the Mueller matrix of the grating as a function of directions and axes, scaled to `value`."""
 
 
-def theory_of(props: mi.Properties, spectrum: Spectrum, media: Media, scales: Scales) -> Theory:
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """The parameters of scalar theory that do not depend on the spectrum.
+
+    Attributes:
+        material: R.
+        shadowing: whether G is a factor.
+        conserve_energy: whether E is.
+    """
+
+    material: Material
+    shadowing: bool
+    conserve_energy: bool
+
+    @classmethod
+    def of(cls, props: mi.Properties, media: Media) -> Options:
+        """Return the options of a scene.
+
+        Raises:
+            RequestError: if one is wrong, or they contradict each other.
+        """
+        material = reflectance_from(props, media.coat)
+        if media.eta is not None and material.model == "schlick":
+            raise RequestError("fresnel: got 'schlick' with a transmission, wanted 'exact'")
+        if "base" in props and not material.transparent:
+            raise RequestError("base: got a BSDF below a conductor or a perfect mirror, which transmit no light")
+        shadowing = props.get("shadowing", SHADOWING[0])
+        if shadowing not in SHADOWING:
+            raise RequestError(f"shadowing: got {shadowing!r}, wanted one of {', '.join(SHADOWING)}")
+        conserve_energy = props.get("conserve_energy", True)
+        if not isinstance(conserve_energy, bool):
+            raise RequestError(f"conserve_energy: got {conserve_energy!r}, wanted true or false")
+        return cls(material, shadowing == "v_cavity", conserve_energy)
+
+
+def theory_of(props: mi.Properties, spectrum: Spectrum, media: Media, scales: Scales, options: Options) -> Theory:
     """Return the theory of a spectrum.
 
     Raises:
-        RequestError: if a parameter is wrong, or does not match the spectrum.
+        RequestError: if a parameter does not match the spectrum.
     """
     if isinstance(spectrum, RigorousSpectrum):
         return RigorousTheory(props, spectrum, media)
-    return ScalarTheory(props, spectrum, media, scales)
+    return ScalarTheory(spectrum, media, scales, options)
 
 
 class ScalarTheory:
@@ -147,19 +182,11 @@ class ScalarTheory:
         interface: the media above and below.
     """
 
-    def __init__(self, props: mi.Properties, spectrum: GratingSpectrum, media: Media, scales: Scales) -> None:
+    def __init__(self, spectrum: GratingSpectrum, media: Media, scales: Scales, options: Options) -> None:
         _warn_of_range(spectrum)
         self.spectrum, self.media, self.scales = spectrum, media, scales
-        self.material = reflectance_from(props, media.coat)
-        if media.eta is not None and self.material.model == "schlick":
-            raise RequestError("fresnel: got 'schlick' with a transmission, wanted 'exact'")
-        shadowing = props.get("shadowing", SHADOWING[0])
-        if shadowing not in SHADOWING:
-            raise RequestError(f"shadowing: got {shadowing!r}, wanted one of {', '.join(SHADOWING)}")
-        self.shadowing = shadowing == "v_cavity"
-        self.conserve_energy = props.get("conserve_energy", True)
-        if not isinstance(self.conserve_energy, bool):
-            raise RequestError(f"conserve_energy: got {self.conserve_energy!r}, wanted true or false")
+        self.material, self.shadowing = options.material, options.shadowing
+        self.conserve_energy = options.conserve_energy
         self.tables = SharedTables.of(spectrum, media.eta)
         self.scattering = self.tables.scattering
         self.update()

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..bsdf.base import is_grating
+from ..bsdf.diffraction_grating import check
 from ..errors import RequestError, root_cause
 from ..llvm import is_supported
 from ..recipe import Recipe
@@ -99,6 +100,7 @@ def load_spectral_scene(
             raise RequestError(f"{name}: got {size}, wanted a positive number of pixels")
     with parsed(path, parameters, materials) as (config, state):
         if materials:
+            _check_materials(materials)
             _warn_of_unused_materials(config, state, materials)
         _replace_films(state, width, height)
         _unwrap_integrators(state)
@@ -332,6 +334,23 @@ def parsed(
         mi.set_file_resolver(resolver)
 
 
+def _check_materials(materials: Materials) -> None:
+    """Raise RequestError if a parameter of a grating is wrong, before a spectrum is computed for any of them."""
+    for name, values in materials.items():
+        try:
+            check(_grating(values))
+        except RequestError as error:
+            raise RequestError(f"material {name}: {error}") from None
+
+
+def _grating(values: Mapping[str, bool | float | str]) -> mi.Properties:
+    """Return the properties of a grating with these parameters."""
+    grating = mi.Properties("diffraction_grating")
+    for key, value in values.items():
+        grating[key] = value
+    return grating
+
+
 def _replace_materials(state: mi.parser.ParserState, materials: Materials) -> None:
     """Replace BSDFs by gratings; see `load_spectral_scene`."""
     bsdfs = {node.props.id(): k for k, node in enumerate(state.nodes) if node.type == mi.ObjectType.BSDF}
@@ -339,9 +358,7 @@ def _replace_materials(state: mi.parser.ParserState, materials: Materials) -> No
         if name not in bsdfs:
             known = ", ".join(sorted(filter(None, bsdfs))) or "none: its BSDFs have no ids"
             raise RequestError(f"material: got the id {name!r}, the ids of BSDFs in the scene are {known}")
-        grating = mi.Properties("diffraction_grating")
-        for key, value in dict(values).items():
-            grating[key] = value
+        grating = _grating(values)
         node = state.nodes[bsdfs[name]]
         if node.props.plugin_name() == "twosided" and grating.get("transmission", "none") == "none":
             both_sides = mi.Properties("twosided")

@@ -116,6 +116,27 @@ def test_an_unknown_id_is_refused_with_the_known_ids(exported):
         load_spectral_scene(exported(), materials={"Disc": MIRROR})
 
 
+@pytest.mark.parametrize(
+    ("values", "text"),
+    [
+        ({"profile": "blazd", "period": 2.0}, r"profile: got 'blazd', wanted one of blazed"),
+        ({"profile": "blazed", "depht": 0.2}, r"depht: unknown, wanted one of .*depth.*period.*shadowing"),
+        ({"profile": "blazed", "depth": -0.2}, r"depth: got -0\.2"),
+        ({"profile": "sinusoidal"}, "period"),
+        ({"profile": "blazed", "material": "aluminium"}, r"material: got 'aluminium', did you mean Al"),
+        ({"profile": "blazed", "shadowing": "smith"}, "shadowing: got 'smith'"),
+        ({"profile": "blazed", "conserve_energy": 1}, "conserve_energy: got 1"),
+        ({"profile": "blazed", "int_ior": "glas"}, "int_ior: got 'glas'"),
+        ({"profile": "blazed", "transmission": "shet"}, "transmission: got 'shet'"),
+        ({"filename": "missing.toml"}, "no such file"),
+    ],
+)
+def test_wrong_parameters_are_refused_before_a_spectrum_is_computed(exported, monkeypatch, values, text):
+    monkeypatch.setattr("mitsuba_diffraction.recipe.Recipe.cached", lambda *_: pytest.fail("a spectrum was computed"))
+    with pytest.raises((ValueError, FileNotFoundError), match=text):
+        load_spectral_scene(exported(), materials={"mat-Floor": MIRROR, "mat-Disc": values})
+
+
 def test_a_material_that_no_shape_has_is_logged(exported, caplog):
     path = exported()
     path.write_text(path.read_text().replace("</scene>", '<bsdf type="diffuse" id="mat-Spare"/></scene>'))
