@@ -16,6 +16,7 @@ prepare = [                      # steps of surface/prepare.py, in this order
     "level_plane",               # or "level_quadratic"
     "align_lines",               # remove offsets between rows
     { despike = 5.0 },           # remove outliers by more than this many standard deviations of the noise
+    { mask_outliers = 2.25 },    # dust and pits become missing pixels; see prepare.mask_outliers
     "fill_missing",              # here, or with fill_missing = true after the last step
     { trim_edges = 0.5 },        # µm off each edge
     { rotate = -3.0 },           # degrees from +x towards +y

@@ -42,6 +42,9 @@ def is_seam_visible(steps: dict[str, tuple[float, float]]) -> bool:
 
 
 _NEIGHBOURHOOD = 5  # side of the neighbourhood of a pixel, pixels
+_SURROUNDINGS_FRACTION = 1 / 40  # of the shorter side of a scan: standard deviation of the weights of the surroundings
+_OUTLIER_PERCENTILE = 99.0
+_OUTLIER_MARGIN = 2  # pixels
 _SIGMA_PER_MAD = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
 _MAX_MISFIT = 0.05  # of a second wave at the seam, in periods
 _MIN_RELATIVE_STRENGTH = 0.1  # of a second wave relative to the strongest; a weaker one is ignored
@@ -153,6 +156,37 @@ def _noise(heights: NDArray[np.float64]) -> float:
         if count > 2:
             differences = np.diff(differences, 2, axis=dimension) / np.sqrt(6)  # 1² + 2² + 1²
     return float(_SIGMA_PER_MAD * np.median(np.abs(differences))) if differences is not heights else 0.0
+
+
+def mask_outliers(height_field: HeightField, factor: float = 2.25) -> HeightField:
+    """Mark dust and pits as missing: regions far above, or far below, their surroundings.
+
+    With r = h − ⟨h⟩, ⟨h⟩ the Gaussian-weighted mean of the surroundings (standard deviation 1/40 of the shorter side of
+    the scan), p_k the percentiles of r, a connected region above p_99 is an outlier if one of its pixels is above p_50
+    + factor (p_99 − p_50); below, likewise with p_1. It is marked with a margin of two pixels. Percentiles, on either
+    side its own, follow the depth and the skewness of the structure.
+
+    Raises:
+        ValueError: if the factor is not at least 1.
+    """
+    _check("mask_outliers", factor)
+    gaps = height_field.gaps
+    whole = harmonic_fill(height_field.heights, height_field.pixel_size)
+    # A profile has no side along its axis of one pixel.
+    sides = [side if n > 1 else np.inf for side, n in zip(height_field.tile_size, gaps.shape[::-1], strict=True)]
+    width = _SURROUNDINGS_FRACTION * min(min(sides), max(height_field.tile_size))
+    relative = whole - ndimage.gaussian_filter(whole, [width / pixel for pixel in height_field.pixel_size[::-1]])
+    relative -= np.median(relative)
+    outliers = np.zeros(gaps.shape, bool)
+    for deviation in (relative, -relative):
+        edge = np.percentile(deviation, _OUTLIER_PERCENTILE)
+        regions, count = ndimage.label(deviation > edge)
+        is_outlier = ndimage.maximum(deviation, regions, np.arange(count + 1)) > factor * edge
+        outliers |= is_outlier[regions] & (regions > 0)
+    outliers = ndimage.binary_dilation(outliers, np.ones((3, 3)), _OUTLIER_MARGIN) & ~gaps
+    masked = np.where(outliers, np.nan, height_field.heights)
+    _check_any("mask_outliers", masked)
+    return _after(height_field, masked, f"mask_outliers: {outliers.sum()} of {outliers.size} pixels")
 
 
 def fill_missing(height_field: HeightField) -> HeightField:
@@ -321,6 +355,7 @@ _STEPS: dict[str, tuple[Callable[..., HeightField], Callable[[object], bool], st
     "level_quadratic": (level_quadratic, *_NO_ARGUMENT),
     "align_lines": (align_lines, *_NO_ARGUMENT),
     "despike": (despike, _is_positive, "a positive number of standard deviations"),
+    "mask_outliers": (mask_outliers, lambda value: is_number(value) and value >= 1, "a number of at least 1"),
     "fill_missing": (fill_missing, *_NO_ARGUMENT),
     "rotate": (rotate, is_number, "a number of degrees"),
     "crop_periods": (crop_periods, ("x", "y", "xy").__contains__, "'x', 'y' or 'xy'"),

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
+from scipy import ndimage
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction.surface import prepare
@@ -49,7 +50,16 @@ def field_of(heights):
     return HeightField(heights, PIXEL, keep_missing=True)
 
 
-ALL = ["level_plane", "level_quadratic", "align_lines", "despike", {"rotate": 180}, {"rotate": 90.0}, "fill_missing"]
+ALL = [
+    "level_plane",
+    "level_quadratic",
+    "align_lines",
+    "despike",
+    "mask_outliers",
+    {"rotate": 180},
+    {"rotate": 90.0},
+    "fill_missing",
+]
 
 # ---------------------------------------------------------------- every step
 
@@ -99,6 +109,7 @@ def test_steps_are_applied_in_order_and_recorded():
         ([{"rotate": "left"}], "rotate: got 'left', wanted a number"),
         ([{"rotate": float("nan")}], "rotate: got nan"),
         ([{"trim_edges": True}], "trim_edges: got True"),
+        ([{"mask_outliers": 0.5}], "mask_outliers: got 0.5, wanted a number of at least 1"),
         ([{"crop_periods": "z"}], "crop_periods: got 'z', wanted 'x', 'y' or 'xy'"),
         ([{"crop_periods": 2.0}], "crop_periods: got 2.0"),
     ],
@@ -257,6 +268,49 @@ def test_a_spike_on_a_level_surface_is_replaced_above_the_threshold():
         assert (prepare.despike(HeightField(noisy, 1.0), threshold).heights != noisy).sum() == spikes
     with pytest.raises(ValueError, match="despike: got 0"):
         prepare.despike(rough((4, 4)), 0)
+
+
+# ---------------------------------------------------------------- dust
+
+
+def dusty(shape=(160, 200)):
+    """Return a wavy grating, and the same with a grain, a grain on the edge, and a pit; and where these are."""
+    x = coordinates(shape)[0]
+    clean = grating(shape, 0.4) + 0.05 * np.sin(x / x.max() * 3) + 0.002 * rough(shape).heights
+    rows, columns = np.mgrid[: shape[0], : shape[1]]
+    where, heights = np.zeros(shape, bool), clean.copy()
+    for row, column, height in ((40, 60, 0.5), (100, 199, 0.4), (120, 90, -0.5)):
+        spot = (rows - row) ** 2 + (columns - column) ** 2 <= 36
+        heights[spot] += height
+        where |= spot
+    return clean, heights, where
+
+
+def test_grains_and_pits_become_missing_and_nothing_a_period_away():
+    clean, heights, where = dusty()
+    after = prepare.mask_outliers(HeightField(heights, PIXEL, "scan"))
+    assert after.gaps[where].all()
+    near = ndimage.binary_dilation(where, np.ones((3, 3)), 8)
+    assert after.gaps.sum() < 3 * where.sum()
+    assert not after.gaps[~near].any()
+    np.testing.assert_array_equal(after.heights[~after.gaps], heights[~after.gaps])
+    assert f"mask_outliers: {after.gaps.sum()} of 32000 pixels" in after.source
+    assert not prepare.mask_outliers(HeightField(clean, PIXEL)).gaps.any()
+
+
+def test_the_mask_ignores_scale_offset_and_missing_pixels():
+    _, heights, _ = dusty()
+    heights[10:14, 150:160] = np.nan
+    one = prepare.mask_outliers(HeightField(heights, PIXEL, keep_missing=True))
+    other = prepare.mask_outliers(HeightField(3 - 0.25 * heights, PIXEL, keep_missing=True))
+    np.testing.assert_array_equal(one.gaps, other.gaps)
+    assert one.gaps[10:14, 150:160].all()
+    assert prepare.mask_outliers(HeightField(heights, PIXEL, keep_missing=True), 50).gaps.sum() == 40
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 60), (60, 1), (2, 3)])
+def test_a_mask_of_a_profile_or_of_few_pixels_is_no_error(shape):
+    prepare.mask_outliers(HeightField(np.zeros(shape), PIXEL))
 
 
 # ---------------------------------------------------------------- rotation
