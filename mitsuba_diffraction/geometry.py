@@ -1,7 +1,7 @@
-"""K, G and the gain of lobes at the horizon: the factors of a pair of directions, for arrays of NumPy and of Dr.Jit.
+"""K and G of a pair of directions or of an order, and the gain of lobes, for arrays of NumPy and of Dr.Jit.
 
-Media of index n_i, where ω_i lies, and n_o, where ω_o lies, both directions away from the surface, k = n ω their wave
-vectors in units of 2π/λ and v = k_i + k_o. Then q = −v_∥/λ, κ = 2π v_z/λ and
+Let n_i and n_o be the indices of the media of ω_i and ω_o, which point away from the surface, k = n ω their wave
+vectors in units of 2π/λ, and v = k_i + k_o. Then q = −v_∥/λ, κ = 2π v_z/λ and
 
     k_i·v = (|v|² + n_i² − n_o²)/2,    k_o·v = (|v|² − n_i² + n_o²)/2,    K = |k_i·v| |k_o·v| / (|k_iz| |k_oz| v_z²)
 
@@ -35,24 +35,24 @@ def k_g(
     min_v_z: Array = 0.0,
     select: Callable[..., Any] = np.where,
 ) -> Array:
-    """Return K G of a pair of directions; shapes broadcast, float32 is preserved.
+    """Return K G at given k_iz, k_oz and |v_∥|; shapes broadcast, float32 is preserved.
 
-    With A_i = |k_i·v|/|k_iz| and A_o = |k_o·v|/|k_oz|, K = A_i A_o/v_z². Reflected light has the shadowing of
-    V-cavities (Torrance and Sparrow 1967), min(1, 2 h_z cos θ_i/|ω_i·h|, 2 h_z cos θ_o/|ω_o·h|) with h = v/|v|;
+    With A_i = |k_i·v|/|k_iz| and A_o = |k_o·v|/|k_oz|, K = A_i A_o/v_z². For reflected light G is the shadowing of
+    V-cavities (Torrance and Sparrow 1967), min(1, 2 h_z cos θ_i/|ω_i·h|, 2 h_z cos θ_o/|ω_o·h|) with h = v/|v|; for
     transmitted light
 
         G = min(1, 2 cos θ_i/|ω_i·h|, 2 cos θ_o/|ω_o·h|)² = min(1, 4 |v|²/max(A_i, A_o)²)
 
-    so that an order vanishes as cos θ towards the horizon, as rigorous orders do: h_z in it would remove light where
-    v_z is small. Where |v|² > |n_i² − n_o²| no facet refracts ω_i into ω_o, and nothing is transmitted.
+    With this G an order vanishes as cos θ towards the horizon, as in rigorous theory; a factor h_z would remove light
+    where v_z is small. Where |v|² > |n_i² − n_o²| no facet refracts ω_i into ω_o, and nothing is transmitted.
 
     Args:
         k_iz, k_oz: |k_iz| and |k_oz|, positive.
         tangent_square: |v_∥|² = |λq|².
         excess: n_i² − n_o².
-        reflects: whether both directions lie on one side.
+        reflects: whether both directions lie on the same side of the surface.
         shadowing: if false, K alone.
-        min_v_z: |v_z| in K is not less, of transmitted light.
+        min_v_z: lower bound of |v_z| in K of transmitted light.
         select: `numpy.where` or `drjit.select`.
     """
     v_z = select(reflects, k_iz + k_oz, abs(k_iz - k_oz))
@@ -113,9 +113,9 @@ def transmitted(
 
     Args:
         cos_i, cos_o: |cos θ_i| and |cos θ_o|, positive.
-        tangent_square: |ω_i,t + η ω_o,t|² = |λq|², λ in the medium of ω_i.
+        tangent_square: |ω_i,∥ + η ω_o,∥|² = |λq|², λ in the medium of ω_i.
         index: η = n_o/n_i.
-        min_v_z: |v_z| in K is not less.
+        min_v_z: lower bound of |v_z| in K.
     """
     square = tangent_square + (cos_i - index * np.asarray(cos_o)) ** 2
     # F depends on the ratio of ω_i·h and ω_o·h alone.

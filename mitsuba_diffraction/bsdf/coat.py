@@ -1,13 +1,13 @@
 """A clear plane layer over the grating: polycarbonate over a disc's metal, lacquer over foil.
 
-A plane layer of index n preserves tangential components, and with them q = −(ω_i + ω_o)_t/λ. Inside,
-sin θ' = sin θ/n and the wavelength is λ/n, hence κ' = 2πn (cos θ'_i + cos θ'_o)/λ and
+A plane layer of index n preserves the tangential components of wave vectors, and with them q = −(ω_i + ω_o)_∥/λ.
+Inside, sin θ' = sin θ/n and the wavelength is λ/n, hence κ' = 2πn (cos θ'_i + cos θ'_o)/λ and
 
     f = T_i T_o R' K' G' E' S(q; κ')/λ²,    T = (1 − F(θ)) e^{−σd/cos θ'}
 
-with F the power reflectance of the front face, R' relative to n, primes for quantities inside, absorption σ and
-thickness d. The front face also reflects F specularly. Light that the grating diffracts beyond the critical angle, or
-that the front face reflects back to the grating, is lost.
+where F is the power reflectance of the front face, R' the reflectance of the material relative to n, σ the absorption
+and d the thickness; primed quantities are those inside. The front face also reflects F specularly. Light that the
+grating diffracts beyond the critical angle, or that the front face reflects back to the grating, is lost.
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ from .geometry import Geometry, Incidence
 from .orders import SlicePower
 from .tables import larger, opaque
 
-RIM = 3  # nodes of zero on each side, as many as a spline covers
+RIM = 3  # nodes of zero around the table, as many as a spline covers
 
 
 class SplineSpectrum:
@@ -45,7 +45,10 @@ class SplineSpectrum:
         incidence: Incidence,
         active: mi.Bool,
     ) -> tuple[mi.Float, mi.Float]:
-        """Evaluate n_o² K G S(q; κ) |cos θ_o| and the density of q, both in µm², as `Scattering.evaluate`."""
+        """Evaluate n_o² K G S(q; κ) |cos θ_o| and the density of q, both in µm², as `Scattering.evaluate`.
+
+        K and G are those of the pair of directions (`Geometry.continuum_factor`), as no order is known.
+        """
         q = geometry.tangent * incidence.frequency
         x, y = q.x * self.per_q_x, q.y * self.per_q_y
         m_x, m_y = mi.Int32(dr.round(x)), mi.Int32(dr.round(y))

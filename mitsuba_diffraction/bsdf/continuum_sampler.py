@@ -1,9 +1,9 @@
-"""Samplers of q with a density that is constant on bins: for smooth spectra and for orders that overlap.
+"""Samplers of q by tables of bins, for smooth spectra and for orders that overlap.
 
-Light incident from s = ω_i,t that is diffracted at the frequency q propagates if |λq + s| ≤ 1: q lies in a disc which
-contains q = 0 and grows about it with 1/λ. The incident directions and wavelengths are divided into bins, too. The
-union of the discs of one of these is that of its maximum of 1/λ and, as discs are larger than bins, of the s on its
-border.
+With s = ω_i,∥, light diffracted at the frequency q propagates if |λq + s| ≤ 1: q lies in a disc that contains q = 0 and
+grows with 1/λ. Incident light is divided into bins, too, of direction and 1/λ. The q that propagate for any light of
+such a bin fill the union of its discs, which is that of the discs at the maximum of 1/λ; as discs are larger than bins,
+those of the s on the border of the bin suffice.
 """
 
 from __future__ import annotations
@@ -70,8 +70,8 @@ _BORDER_MARGIN = 1e-4  # for rounding at run time
 class _Resolution:
     """The numbers of bins of incident light.
 
-    Bins are equal in cos θ_i, so that they are finest at grazing incidence, where the horizon is near the mirror
-    direction; in azimuth; and in 1/λ.
+    Bins are equidistant in cos θ_i, in azimuth and in 1/λ; in θ_i they are therefore finest at grazing incidence, where
+    the mirror direction is near the horizon.
     """
 
     cosines: int
@@ -80,11 +80,11 @@ class _Resolution:
 
 
 COARSE, FINE = _Resolution(8, 32, 4), _Resolution(32, 64, 4)
-MAX_ROWS_OF_FINE = 48  # of blocks; above it the regions of so many bins would take much memory
+MAX_ROWS_OF_FINE = 48  # of blocks in a region; with more, the regions of so many bins would take much memory
 
 
 class IncidenceBins:
-    """Bins of incident light: of cos θ_i, azimuth and 1/λ; and the region of q that propagates for each."""
+    """Bins of cos θ_i, azimuth and 1/λ of incident light, and the region of q that propagates for each."""
 
     def __init__(self, wavelengths: tuple[float, float], rows: int, max_tangent: float = 1.0) -> None:
         """Make the bins.
@@ -101,7 +101,7 @@ class IncidenceBins:
         self.per_frequency = opaque(self.resolution.frequencies / (self._last - self._first))
 
     def bin(self, incidence: Incidence) -> mi.UInt32:
-        """Return the index of the bin of one wavelength from one direction; outside of all bins, the nearest."""
+        """Return the index of the bin of incident light; that of the nearest bin if it lies outside all of them."""
         tangent, bins = incidence.tangent, self.resolution
         cosine, _ = cell_of(incidence.cosine * bins.cosines, bins.cosines)
         azimuth_bin, _ = cell_of((azimuth(tangent.x, tangent.y) + 2) * (bins.azimuths / 4), bins.azimuths)
@@ -164,8 +164,8 @@ class BinSampler:
 
     P_m = Σ_j w_j A_jm / Σ_j w_j M_j is a mixture over κ (`KappaBins`), restricted to a region that contains all q that
     propagate (`IncidenceBins`); M_j is the sum of A_jm over it. A region consists of blocks of bins, an interval of
-    blocks in each row. A bin is drawn by binary searches: of the row of blocks, the block, the bin in it. The density
-    at a given q reads one word for the bin and one packet for M_j.
+    blocks in each row. A bin is drawn by three binary searches: for the row of blocks, for the block, and for the bin
+    in the block. The density at a given q reads one word for the bin and one packet for M_j.
     """
 
     def __init__(
@@ -233,8 +233,8 @@ class BinSampler:
     def sample(self, incidence: Incidence, u: mi.Float, v: mi.Point2f, active: mi.Bool) -> mi.Point2f:
         """Draw q in cycles/µm, for one wavelength.
 
-        `u` chooses the κ bin, the row of blocks and the bin in its block, `v.x` the block and q_x: one number alone has
-        too few bits.
+        `u` chooses the κ bin, the row of blocks and the bin in its block, `v.x` the block and q_x in the bin, `v.y` q_y
+        in the bin: one number alone has too few bits.
         """
         incidence_bin = self.incidence_bins.bin(incidence)
         masses = self.masses(incidence_bin, active)
@@ -267,12 +267,13 @@ class LineSampler:
         p(q) = P_m/Δ · F′(q_y)/(F(b) − F(a)),    |q_x − mΔ| ≤ Δ/2
 
     P_m = Σ_j w_j A_jm / Σ_j w_j M_j is a mixture over κ (`KappaBins`), restricted to the bins that contain propagating
-    q, over which M_j is the sum of A_jm. Perpendicular to the orders, Student's distribution with four degrees of
-    freedom replaces the Gaussian, which is slower to truncate to the interval that propagates at q_x, a ≤ q_y ≤ b:
+    q, over which M_j is the sum of A_jm. In the perpendicular direction q is truncated to the interval that propagates
+    at q_x, a ≤ q_y ≤ b. There Student's t distribution with four degrees of freedom replaces the Gaussian, as its
+    distribution function F is faster to evaluate and to invert:
 
         F(y) = t − t³/3,    t = y/√(τ² + y²),    t = 2 sin(arcsin(3F/2)/3)
 
-    With s = ω_i,t the limits are
+    With s = ω_i,∥ the limits are
 
         |q_x + s_x/λ| ≤ √(1/λ² − s_⊥²),             s_⊥ = max(|s_y/λ| − 4σ_q, 0)
         |q_y + s_y/λ| ≤ √(1/λ² − (q_x + s_x/λ)²),   |q_y| ≤ 4σ_q

@@ -81,7 +81,7 @@ PARAMETERS = (
     ),
 )
 
-MANUAL = f"""A diffraction grating, given by the spectrum of its phase.
+MANUAL = f"""A diffraction grating, given by the power spectrum of e^{{iκh}}, h the height of its surface.
 
 Parameters (XML or dictionary):
 {listed(PARAMETERS)}
@@ -92,24 +92,26 @@ rotate it without reflecting it; the back of a `twosided` shows its mirror image
 first edge of each triangle and is discontinuous: such a mesh needs UVs. Where dp_du vanishes Mitsuba picks an axis.
 
 The BRDF is R · K · G · S(q; κ)/λ² · E: R the power reflectance at the half vector, K and G as in `geometry.py`, S as in
-`orders.py` (orders) or `continuum.py` (a lattice), with q = −(ω_i + ω_o)/λ along the pattern's axes
-and κ = 2π (cos θ_i + cos θ_o)/λ. E, as in `energy.py`, bounds the albedo by one; it is one where the albedo is
-below one without it. Without shadowing K diverges as 1/cos θ near the horizon, and there is no E.
+`orders.py` (orders) or `continuum.py` (a lattice), with q = −(ω_i + ω_o)_∥/λ along the pattern's axes
+and κ = 2π (cos θ_i + cos θ_o)/λ. Orders have K and G of their own, and a gain Γ that compensates the part of a lobe
+below the horizon; a continuum has those of the pair of directions. E, as in `energy.py`, bounds the albedo by about
+one; it is one where the albedo without it is below one. Without shadowing K diverges as 1/cos θ near the horizon, and
+there is no E.
 
-For rigorous theory the BRDF is Σ_m η_m N(q − m/T; σ_q² I)/λ², as in `rigorous_orders.py`: η_m includes R, K, G and
+For rigorous theory the BRDF is Σ_m η_m Γ N(q − m/T; σ_q² I)/λ², as in `rigorous_orders.py`: η_m includes R, K, G and
 E. With a transmission the sum has the factor n_o², n_o the index of the medium of ω_o. The efficiencies of a sheet
-include all of its light: the reflection by its flat face is a lobe of order 0, where scalar theory has a mirror, and
+include all of its light: the reflection by its flat face is a lobe of order 0, which is specular in scalar theory, and
 multiple reflections inside contribute to the orders.
 
 With a transmission (`geometry.py`), light is incident from above or below: q and κ have the indices of both media,
-transmitted light has 1 − R instead of R, and K and G are those of `geometry.transmitted`. From below, the flat face
-of a sheet is a mirror.
+transmitted light has 1 − R instead of R, and G is another one (`geometry.k_g`). From below, the flat face of a sheet
+reflects specularly.
 
-Under a coat (`coat.py`) all this holds inside of it, where wavelengths are shorter and directions steeper; the front
-face of the coat is a mirror. A saved spectrum must cover the shorter wavelengths; one built from a recipe or a profile
-does.
+Under a coat (`coat.py`) all this holds inside it, where wavelengths are shorter and directions steeper; the front face
+of the coat reflects specularly. A saved spectrum must cover the shorter wavelengths; one built from a recipe or a
+profile does.
 
-In polarised variants scalar theory splits s and p light as a plane perpendicular to the half vector does; rigorous
+In polarised variants, scalar theory splits s and p light like a plane perpendicular to the half vector; rigorous
 theory uses the Mueller matrices of the orders. A perfect mirror and Schlick's formula depolarise.
 """
 

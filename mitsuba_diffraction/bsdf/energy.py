@@ -1,7 +1,7 @@
 """E(ω_i, ω_o, λ) at run time, the factor that bounds the albedo by about one.
 
-E = min(e(ω_i, λ), e(ω_o, λ)), e as in `energy/table.py`; an interface has separate e above and below, and for reflected
-and transmitted light.
+E = min(e(ω_i, λ), e(ω_o, λ)), e as in `energy/table.py`. An interface has four e: for light from above and from below,
+each for reflected and for transmitted light.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ class Coordinates:
 class Energy:
     """e(ω, λ) from a table, linear between the corners of a grid cell.
 
-    The four corners of a cell are packed as bytes into a word, as reads cost more than arithmetic: one read for a
-    direction and a wavelength, twice as many for each linear interpolation between wavelengths or ratios of scales.
+    The four corners of a grid cell are packed as bytes into one word, as reads cost more than arithmetic. A direction
+    and a wavelength need one read; interpolation between wavelengths and between ratios of scales each double that.
     """
 
     def __init__(self, table: EnergyTable) -> None:

@@ -6,7 +6,10 @@ A coat and the flat face of a sheet are plane layers: they keep the tangential c
 normal one, so that k next to the relief follows from k outside. κ has a sign: as S(q; −κ) = S(−q; κ), the tables for
 κ ≥ 0 are read at −q where κ < 0.
 
-Where v_z → 0, which occurs in transmission, K diverges and S(q; κ) falls as κ². For |κ| < κ₁ v_z² in K is replaced by
+K and G are those of each order where orders are evaluated one by one (`Geometry.order_squares_and_gain`), and those of
+the pair of directions for continua (`Geometry.continuum_factor`).
+
+Where v_z → 0, which occurs in transmission, K diverges and S(q; κ) falls as κ². For |κ| < κ₁, v_z² in K is replaced by
 that of κ₁, and S by κ₁²/κ² S (`orders.small_kappa`).
 """
 
@@ -61,8 +64,8 @@ class WaveVector:
         return mi.Vector3f(*self.tangent, self.z) * self.per_inner_index
 
 
-# Of samples of reflected and of transmitted light: where the fractions are tabulated; where they are those of a plane;
-# for rigorous theory, as a fine grating differs much from a plane.
+# Of reflected and of transmitted samples: if the transmitted fraction is tabulated, if it is that of a plane, and in
+# rigorous theory, where it is that of a plane although fine gratings differ much from one.
 MIN_TABULATED_PROBABILITY, MIN_PLANE_PROBABILITY, MIN_RIGOROUS_PROBABILITY = 0.05, 0.1, 0.2
 
 
@@ -73,12 +76,13 @@ class Interface:
         coat_index: n of the medium next to the relief above, relative to the outside; one without a coat.
         eta: index below relative to that above; None where no light is transmitted.
         transmits: whether there is a medium below.
-        is_sheet: it is a film with a flat lower face, with the upper medium below it.
-        kappas: a quarter of the first interval of κ of the table, where its error is as small as that of the linear
-            extrapolation, and the minimum κ of the undiffracted order for unscaled heights; rad/µm. None in reflection
-            and for rigorous theory, whose tables do not depend on the sign of κ and include the flat face of a sheet.
-        transmitted_fraction: of the power, for a direction along the pattern's axes, where an `OrderSampler` draws
-            orders; None for rigorous theory and where orders overlap, which use the fraction of a plane.
+        is_sheet: whether the lower medium is a film with a flat lower face, with the upper medium below it.
+        kappas: the two bounds whose minimum is κ₁, in rad/µm for unscaled heights (`furnace.small_kappas`). None in
+            reflection and for rigorous theory, whose tables do not depend on the sign of κ and include the flat face of
+            a sheet.
+        transmitted_fraction: returns the transmitted fraction of power for a direction along the pattern's axes, where
+            an `OrderSampler` draws orders; None for rigorous theory and where orders overlap, which use that of a
+            plane.
     """
 
     def __init__(
@@ -119,7 +123,7 @@ class Interface:
         return self.is_sheet and self.kappas is not None
 
     def is_incident(self, cos: mi.Float) -> mi.Bool:
-        """Return whether light from a direction is scattered, from its cosine."""
+        """Return whether light that is incident from a direction with this cosine is scattered."""
         return cos != 0 if self.transmits else cos > 0
 
     def wave_vector(self, omega: mi.Vector3f) -> WaveVector:
@@ -143,7 +147,10 @@ class Interface:
         return self._wave_vector((k_i.sign > 0) == reflects, -k_i.tangent, k_i.square)
 
     def transmission_probability(self, omega: mi.Vector3f) -> mi.Float:
-        """Return the probability of a transmitted sample, about the fraction of power; ω along the pattern's axes."""
+        """Return the probability that a sample is transmitted, about the transmitted fraction of power.
+
+        `omega` is along the pattern's axes.
+        """
         if self.transmitted_fraction is not None:
             return limited(self.transmitted_fraction(omega), MIN_TABULATED_PROBABILITY, 1 - MIN_TABULATED_PROBABILITY)
         # In a sheet no transmitted light is totally reflected.
@@ -253,12 +260,13 @@ class Geometry:
         return dr.abs(v_z) * dr.two_pi * incidence.frequency * self.height_scale
 
     def continuum_factor(self, incidence: Incidence, per_width: mi.Float) -> mi.Float:
-        """Return n_o² K G |cos θ_o|, times the gain, where orders overlap, so that no single one is known.
+        """Return n_o² ((1 − b) K G + b Γ) |cos θ_o| of a continuum, for which no order is known.
 
-        At grazing incidence the mirror order has nearly all of the power, and K diverges within its lobe. For
-        cos θ ≤ 0.2 and |q| ≤ 4 σ_q, S is assumed to be the lobe of the mirror order, with K G = 1 and its gain; for
-        cos θ ≥ 0.4 or |q| ≥ 5 σ_q, K and G are those of the pair, without a gain, as the power that lobes lose below
-        the horizon is about that gained from evanescent orders.
+        At grazing incidence the mirror order has nearly all of the power, and K diverges within its lobe. The fraction
+        b of S is attributed to this order, with K G = 1 and its gain Γ. It is one for cos θ_i, cos θ_o ≤ 0.2 and
+        |q| ≤ 4 σ_q, zero where one of the cosines is above 0.4 or |q| ≥ 5 σ_q, and zero for transmitted light. The rest
+        has K and G of the pair of directions and no gain, as the power that lobes lose below the horizon is about that
+        gained from evanescent orders.
         """
         square_i, square_o = self.incident.square, self.outgoing.square
         square = dr.squared_norm(self.tangent)
@@ -271,16 +279,18 @@ class Geometry:
     def order_squares_and_gain(
         self, change: mi.Vector2f, per_width: mi.Float
     ) -> tuple[tuple[mi.Float, mi.Float], mi.Float]:
-        """Return k_z² of an order in both media, outside, and the gain Γ of its lobe, which contains the pair.
+        """Return k_z² of an order in both media, outside, for its K and G, and the gain Γ of its lobe.
 
-        The order diffracts ω_i into a direction near ω_o, and ω_o into one near ω_i. Each k_z² is the mean of that of
-        the pair and that of the order, which agree at the centre of the lobe. K of the pair would diverge within the
-        lobe at grazing incidence; here K G of the mirror order is one.
+        The lobe contains the pair of directions. The order diffracts ω_i into a direction near ω_o, and ω_o into one
+        near ω_i. Each k_z² is the mean of that of the pair and that of the order, which agree at the centre of the
+        lobe. K of the pair would diverge within the lobe at grazing incidence; with these k_z², K G of the mirror order
+        is one.
 
         The gain compensates the part of the lobe below the horizon, and is zero where the order does not propagate.
         With σ the width of the lobe in direction cosines, x = cos² θ/2σ is the distance from the horizon in standard
-        deviations. The gain is g(x_i) g(x_o) (g: `geometry.horizon_gain`), x_i the minimum over ω_i and the order of
-        ω_i, x_o likewise: it is reciprocal, and an order has its full power from its Rayleigh anomaly on.
+        deviations. Γ = g(x_i) g(x_o) (g: `geometry.horizon_gain`), x_i the minimum of x of ω_i and of the direction
+        into which the order diffracts ω_i, x_o likewise. The gain is reciprocal, and every order that propagates has
+        its full power.
 
         Args:
             change: λq of the order.
@@ -299,7 +309,7 @@ class Geometry:
     def k_g(
         self, square_i: mi.Float, square_o: mi.Float, tangent_square: mi.Float, incidence: Incidence | None = None
     ) -> mi.Float:
-        """Return K G from k_z² of both directions outside, and |v_∥|²; `incidence` is needed for transmitted light."""
+        """Return K G from |v_∥|² and k_z² of both directions, outside; `incidence` is needed for transmitted light."""
         # At least 1e-6, so that K is finite where the heights are zero.
         min_v_z = 0 if incidence is None else larger(self.min_kappa * incidence.per_kappa, 1e-6)
         k_iz, k_oz = self.incident.normal(square_i), self.outgoing.normal(square_o)
@@ -307,7 +317,7 @@ class Geometry:
 
 
 def cos_square(k: WaveVector, change: mi.Vector2f) -> mi.Float:
-    """Return k_z² outside of the order at λq = `change` of incident light k, in the same medium.
+    """Return k_z², outside, of the order at λq = `change` of incident light k, in the medium of k.
 
     It is negative where the order does not propagate. At grazing incidence n² − |k_∥ + λq|² would have large rounding
     errors.
@@ -320,7 +330,7 @@ class Incidence:
     """Incident light of one wavelength and direction, scattered into one of the media, for samplers.
 
     κ of reflected light is positive above and negative below; that of transmitted light is assumed negative, as it is
-    except for steeply diffracted light. Where it is negative and orders overlap, −q is drawn.
+    except for steeply diffracted light. Where κ is negative and orders overlap, −q is drawn.
 
     Attributes:
         tangent: k_i,∥, or its opposite where −q is drawn.
@@ -388,7 +398,7 @@ class Incidence:
 
         Args:
             k_i: of the incident light.
-            k_o: any in the medium into which it is scattered.
+            k_o: any wave vector in the medium into which light is scattered.
             interface: the media.
             height_scale: factor of the heights.
             kappa_sign: the sign of κ of a pair that is evaluated; one where a direction is drawn.

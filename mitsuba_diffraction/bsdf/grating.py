@@ -19,8 +19,8 @@ from .polarisation import reflected, through_layer
 from .tables import BELOW_ONE, larger, limited, opaque, smaller
 from .theory import Options, Scattering, theory_of
 
-# Of samples, for lobes that the averages of the sampler miss. They are uniform in solid angle: where both directions
-# are grazing, K G grows so fast that samples in proportion to the cosine would have large weights.
+# Of defensive samples, for lobes that the averages of the sampler miss. They are uniform in solid angle: where both
+# directions are grazing, K G grows so fast that samples in proportion to the cosine would have large weights.
 UNIFORM_PROBABILITY = 0.02
 _per_cent = functools.partial(progress_bar, unit="%")
 
@@ -110,7 +110,7 @@ class Grating:
     ) -> tuple[mi.UnpolarizedSpectrum, mi.Float]:
         """Evaluate f cos θ_o and the density of `sample`.
 
-        Under a coat, without the transmittances of its front face.
+        Under a coat, the transmittances of its front face are not included.
 
         Args:
             si: the point, with ω_i.
@@ -257,9 +257,10 @@ class Grating:
         return value
 
     def _covered(self, si: mi.SurfaceInteraction3f) -> tuple[list[mi.Bool], mi.SurfaceInteraction3f]:
-        """Return which of the wavelengths are covered, and the point with covered ones only.
+        """Return which of the wavelengths the spectrum and the material cover, and the point with covered ones only.
 
-        At the others the grating is black, and the index of a metal may be NaN: the shortest covered one replaces them.
+        At wavelengths that are not covered the grating is black, and the index of a metal may be NaN: they are replaced
+        by the shortest covered wavelength.
         """
         limits = np.array(self.spectrum.wavelengths) * self.theory.covered_index
         shortest, longest = np.clip(limits, *self.theory.material.wavelengths)

@@ -1,10 +1,10 @@
 """Common parts of the samplers: a mixture over a few bins of κ, and inversion of cumulative sums.
 
-The optimal density of q is proportional to S(q; κ), but κ = k (cos θ_i + cos θ_o) is known only when q is. For all
-outgoing directions k cos θ_i ≤ κ ≤ k (1 + cos θ_i). With the density 2 cos θ_o of cos θ_o, that of a diffuse surface,
-the bin κ_j ≤ κ ≤ κ_{j+1} has the weight
+The optimal density of q is proportional to S(q; κ), but κ = 2π (cos θ_i + cos θ_o)/λ is known only once q is. For all
+outgoing directions cos θ_i ≤ κλ/2π ≤ 1 + cos θ_i. If cos θ_o has the density 2 cos θ_o, that of a diffuse surface, the
+bin κ_j ≤ κ ≤ κ_{j+1} has the weight
 
-    w_j = e_{j+1}² − e_j²,    e_j = clip(κ_j/k − cos θ_i, 0, 1),    Σ_j w_j = 1
+    w_j = e_{j+1}² − e_j²,    e_j = clip(κ_j λ/2π − cos θ_i, 0, 1),    Σ_j w_j = 1
 
 A few wide bins suffice: where S varies fast with κ, the mixture must cover the range of S, not follow it.
 """
@@ -29,7 +29,8 @@ KAPPA_BINS = 4  # the components of a packet
 class KappaBins:
     """Bins of 0 ≤ κ ≤ `max_kappa` (rad/µm); the last one includes larger κ.
 
-    The bins are equal; with `typical_max_kappa`, below which nearly all light has its κ, three equal ones end there.
+    The bins are equally wide. With `typical_max_kappa`, below which κ of nearly all light lies, three equally wide ones
+    end there.
     """
 
     def __init__(self, max_kappa: float, typical_max_kappa: float | None = None) -> None:
@@ -49,7 +50,7 @@ class KappaBins:
 def mean_powers(spectrum: GratingSpectrum, kappa_bins: KappaBins, uniform_fraction: float = 0.0) -> NDArray[np.float64]:
     """Return A_jm, (KAPPA_BINS, rows, columns): the powers averaged over each bin of κ and normalised to the sum one.
 
-    `uniform_fraction` of the sum is divided equally among the orders, for those that are strong at few κ only.
+    `uniform_fraction` of the sum is divided equally among the orders, so that those are drawn that are strong at few κ.
     """
     means = np.stack([_mean_power(spectrum, *ends) for ends in itertools.pairwise(kappa_bins.ends)])
     return (1 - uniform_fraction) * means + uniform_fraction / means[0].size
@@ -130,7 +131,7 @@ class CumulativeTable:
     def search(
         self, line: mi.UInt32, kappa_bin: mi.UInt32, low: mi.Float, high: mi.Float, u: mi.Float, active: mi.Bool
     ) -> tuple[mi.Int32, mi.Float]:
-        """Return the index i with F(i) ≤ low + u (high − low) < F(i + 1), and the position between them, as `search`.
+        """Return the index i with F(i) ≤ low + u (high − low) < F(i + 1), and the relative position between the two.
 
         Args:
             line: index of the line.

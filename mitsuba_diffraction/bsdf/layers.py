@@ -1,4 +1,4 @@
-"""The layers of a surface: the face of a coat, the grating, and its base; a sample is drawn from one of them."""
+"""The layers of a surface: the face of a coat, the grating, and its base. A sample is drawn from one of them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .grating import Grating, GratingRequest
 from .polarisation import of_plane, reflected
 from .tables import BELOW_ONE, smaller
 
-MIN_LAYER_PROBABILITY = 0.1  # of samples of the grating and of its base, whose powers are only estimated
+MIN_LAYER_PROBABILITY = 0.1  # of sampling the grating, and its base, as their powers are only estimated
 
 
 @dataclass(frozen=True)

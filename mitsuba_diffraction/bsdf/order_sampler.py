@@ -2,10 +2,10 @@
 
 In each bin the probability of an order,
 
-    P_m ∝ √⟨η_m²⟩,
+    P_m ∝ √⟨p_m²⟩,
 
-minimises the variance of a sample; the powers η_m are those of `energy/furnace.py` at points of the bin. Directions are
-mapped to the square of `energy/table.py`.
+minimises the variance of a sample. p_m is the power of the order in `energy/furnace.py`, and ⟨·⟩ the mean over points
+of the bin. Directions are mapped to the square of `energy/table.py`.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from .tables import NumberTable, PacketTable, larger, opaque
 
 PROBABILITY_UNITS = 2**24  # to the probability one; float32 represents integers exactly up to it
 UNIFORM_FRACTION = 0.05  # of the probability in a bin, divided equally among its orders
-# About, of the table for one range of heights and one pair of incident and outgoing side, divided by the root of the
-# number of ranges; larger tables do not fit the cache. Interfaces have more, since orders vary faster with the
-# direction in the denser medium.
+# Approximate numbers of entries of a table; larger ones do not fit into the cache. There is a table for each pair of
+# incident and outgoing medium, and for each range of height scales; with several ranges, the number is divided by the
+# root of theirs. Interfaces have more entries, since orders vary faster with the direction in the denser medium.
 MAX_ENTRIES, MAX_INTERFACE_ENTRIES = 1e5, 2.5e5
-# Radians, of the change of the phase of the deepest point at normal reflection from above: within a bin, of line
-# gratings, which have few orders, and of others; and between the points of a bin.
+# Radians, by which the phase of the deepest point in normal reflection from above may change within a bin (of line
+# gratings, which have few orders; of other gratings), and between the points of a bin at which powers are evaluated.
 MAX_LINE_PHASE, MAX_PHASE, MAX_POINT_PHASE = 2.0, 4.0, 2.5
 MIN_SLICES, MAX_SLICES = 4, 10  # bins of 1/λ
 MIN_SIDE_BINS, MAX_SIDE_BINS = 4, 96  # along a side of the square of directions
@@ -43,11 +43,12 @@ MAX_INDEX_CHANGE = 0.01  # of η, relative to η − 1, up to which a table is r
 
 
 class OrderSampler:
-    """P_m in bins of (scale of heights, incident side, outgoing side, 1/λ, row and column of ω_i).
+    """P_m in bins of (scale of heights, medium of ω_i, medium of ω_o, 1/λ, row and column of ω_i).
 
     Attributes:
-        cumulative: cumulative sums of P over the rectangle of orders that propagate in a bin, in units of 2⁻²⁴.
-        bins: for each bin the start in `cumulative`, first column and row among all orders, and columns + 2¹⁶ rows.
+        cumulative: cumulative sums of P_m over the rectangle of orders that propagate in a bin, in units of 2⁻²⁴.
+        bins: for each bin the start in `cumulative`, the first column and row of its rectangle among all orders, and
+            the number of columns + 2¹⁶ times that of rows.
         counts: numbers of bins of 1/λ and along a side of the square; opaque, as they depend on the surface.
         fractions: T e_T/(R e_R + T e_T) in finer bins of directions, from above and from below.
     """
@@ -68,7 +69,7 @@ class OrderSampler:
             eta: index below relative to that above; None without transmission.
             is_sheet: whether there is a flat lower face, with the upper medium below it.
             coat_index: of a layer over the relief, relative to the outside.
-            height_scales: factors of the heights, ascending; each interval between two has its bins.
+            height_scales: factors of the heights, ascending; each interval between two of them has its own bins.
             min_lateral_scale: minimum factor of the lengths along the surface, by which heights are divided.
         """
         grid = spectrum.grid
@@ -142,7 +143,7 @@ class OrderSampler:
     def _squared_powers(
         self, furnaces: Sequence[Furnace], above: bool, reflects: bool, slice_: float
     ) -> NDArray[np.floating]:
-        """Return η_m² at the nodes of directions, averaged over scales of heights: (rows, columns, orders, orders)."""
+        """Return p_m² at the nodes of directions, averaged over scales of heights: (rows, columns, orders, orders)."""
         (inside, outside), outgoing_below = self._indices(above), above != reflects
         omega, wavelengths = self._nodes(slice_)
         result = np.zeros((len(omega), *(2 * self.max_order[::-1] + 1)), np.float32)

@@ -273,17 +273,19 @@ def _hermite(
     return low + t * (low_slope + t * (square + t * cube)), low_slope + t * (2 * square + t * 3 * cube)
 
 
-# cycles/µm, of a line grating whose orders are drawn: the horizon truncates wider lobes, of which q is drawn.
+# cycles/µm: for line gratings with wider lobes, which the horizon truncates, a `LineSampler` draws q instead of orders.
 MAX_DRAWN_LOBE_WIDTH = 0.03
 
 
 class OrderSpectrum:
     """S(q; κ) = Σ_m η_m(κ) N(q − m/T; σ_q² I), and the density from which q is drawn.
 
-    N is truncated as in `OrderGrid.lobes`. At most one resolved order contributes at q; of a tile as large as the
-    coherence length, 4 × 4 orders do. The density is Σ_m P_m N(q − m/T), with the P_m of an `OrderSampler`, which
-    depends on the media and scales of a scene; where orders overlap, that of `BinSampler`; for a line grating whose
-    orders overlap or are wide, that of `LineSampler`.
+    N is truncated as in `OrderGrid.lobes`. If orders are resolved, at most one of them contributes at q; for a tile as
+    large as the coherence length, 4 × 4 orders do.
+
+    For resolved orders the density is Σ_m P_m N(q − m/T), with P_m of an `OrderSampler`, which depends on the media and
+    scales of a scene. For other line gratings, whose lobes overlap or are wide, it is that of `LineSampler`, for other
+    tiles that of `BinSampler`.
 
     Lobes of resolved orders may be scaled.
     """
@@ -324,7 +326,7 @@ class OrderSpectrum:
         return min(scales, default=np.inf) if self.resolved else None
 
     def meets(self, q_x: mi.Float, q_y: mi.Float, scale: mi.Float | float) -> mi.Bool:
-        """Return whether q (cycles/µm) lies in the lobe of an order; true where they overlap. `scale` is of lobes."""
+        """Return whether q (cycles/µm) lies in the lobe, scaled by `scale`, of an order; true where lobes overlap."""
         if not self.resolved:
             return mi.Bool(True)
         along_x, along_y = self.axes
@@ -338,8 +340,9 @@ class OrderSpectrum:
     ) -> tuple[mi.Float, mi.Float]:
         """Evaluate n_o² K G S(q; κ) |cos θ_o| and the density of q, both in µm², for one wavelength.
 
-        Where orders are known, K and G are those of each order, with the gain of its lobe
-        (`Geometry.order_squares_and_gain`).
+        For resolved orders, and for all orders of line gratings, K and G are those of each order, with the gain of its
+        lobe (`Geometry.order_squares_and_gain`). For other tiles they are those of the pair of directions
+        (`Geometry.continuum_factor`).
 
         Args:
             geometry: of the pair of directions.
@@ -427,7 +430,7 @@ class _Axis:
         return mi.Int32(-self.max_order) if self.reads_all else mi.Int32(dr.ceil(q * self.size - 0.5 * self.count))
 
     def contains(self, m: mi.Int32, q: mi.Float, scale: mi.Float | float) -> mi.Bool:
-        """Return whether the order m exists and q lies in its lobe; `scale` is of lobes."""
+        """Return whether the order m exists and q lies in its lobe, scaled by `scale`."""
         offset = dr.fma(-self.pitch, mi.Float(m), q)
         return (dr.abs(m) <= self.max_order) & (dr.abs(offset) <= self.half_width * scale)
 
@@ -451,5 +454,5 @@ class _Axis:
         return lobes
 
     def quantile(self, m: mi.Int32, u: mi.Float, scale: mi.Float | float) -> mi.Float:
-        """Return the quantile `u` of the lobe of order m, q in cycles/µm; `scale` is of the lobe."""
+        """Return the quantile `u` of the lobe of order m, scaled by `scale`: q in cycles/µm."""
         return dr.fma(self.pitch, mi.Float(m), scale * truncated_gaussian(u, self.inside, self.spread))

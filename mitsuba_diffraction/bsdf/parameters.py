@@ -173,7 +173,7 @@ class Scales:
 
     @property
     def max_scale(self) -> float:
-        """The factor by which the minimum wavelength of the spectrum must be smaller than without scales."""
+        """The maximum scale, at least one: the spectrum must begin at a wavelength shorter by this factor."""
         return max(1.0, *(float(scale.values[-1]) for scale in self))
 
     def at(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
@@ -211,7 +211,7 @@ class Scales:
             RequestError: with the wavelengths for which to build the spectrum.
         """
         shortest = VISIBLE[0] / index
-        # The grating is black at wavelengths that are not covered; at the others κ and q are smaller.
+        # A spectrum may begin at a longer wavelength: at those that it does not cover, the grating is black.
         covered = max(shortest / wavelengths[0], 1.0)
         for scale in self:
             if not scale.varies:

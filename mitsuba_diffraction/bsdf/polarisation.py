@@ -20,7 +20,7 @@ def reflected(split: Split, wi: mi.Vector3f, wo: mi.Vector3f, mode: mi.Transport
     Args:
         split: of the grating.
         wi, wo: directions away from the surface, in the shading frame.
-        mode: of the transport, on which depends from which of the two light is incident.
+        mode: of the transport; it determines from which of the two directions light is incident.
     """
     source, exit_ = (wi, wo) if mode == mi.TransportMode.Importance else (wo, wi)
     return split(source, exit_, mi.mueller.stokes_basis(-source), mi.mueller.stokes_basis(exit_))

@@ -70,11 +70,11 @@ class _Position:
 
 
 class RigorousOrders:
-    """Σ_m η_m N(q − m/T; σ_q² I), and the density Σ_m P_m N(q − m/T; σ_q² I) from which q is drawn.
+    """Σ_m η_m Γ N(q − m/T; σ_q² I), and the density Σ_m P_m N(q − m/T; σ_q² I) from which q is drawn.
 
-    η_m of the pair (ω_i, ω_o), in the coordinates of `Axes`, is symmetric under exchange. N is truncated along each
-    axis at `cutoff_sigmas` standard deviations and normalised. P_m is proportional to η_m of light from ω_i, averaged
-    over bins of
+    η_m of the pair (ω_i, ω_o), in the coordinates of `Axes`, is symmetric under exchange. Γ is the gain of the lobe of
+    each order. N is truncated along each axis at `cutoff_sigmas` standard deviations and normalised. P_m is
+    proportional to η_m of light from ω_i, averaged over bins of
 
         p = g + α,    r = g − α,    α = −ω_i,x ν,    g = ν √(1 − ω_i,y²),
 
@@ -121,7 +121,7 @@ class RigorousOrders:
         return mi.Int32(dr.ceil((q_x - self.half_width) * self.period))
 
     def _near(self, pair: _Pair, active: mi.Bool) -> Iterator[tuple[mi.Int32, mi.Float, mi.Bool]]:
-        """Yield the orders whose lobes may contain q: m, |q − m/T|², and whether they do along x."""
+        """Yield m, |q − m/T|², and whether the lobe contains q_x, of the orders whose lobes may contain q."""
         first = self._first(pair.q_x)
         for step in range(self.count):
             m = first + step
@@ -130,9 +130,9 @@ class RigorousOrders:
             yield m, dr.square(offset) + dr.square(pair.q_y), in_lobe
 
     def evaluate(self, geometry: Geometry, incidence: Incidence, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
-        """Return n_o² cos θ_o Σ_m η_m N and the density of q, both in µm², for one wavelength.
+        """Return n_o² |cos θ_o| Σ_m η_m Γ N and the density of q, both in µm², for one wavelength.
 
-        The lobe of each order has the gain of `Geometry.order_squares_and_gain`.
+        Γ is the gain of `Geometry.order_squares_and_gain`.
 
         Args:
             geometry: of the pair of directions, along the pattern's axes.
@@ -211,7 +211,7 @@ class RigorousOrders:
         across = pair.k_y / (self.period * frequency)
         scale = dr.rcp(dr.select(bright, rows[0].x, mi.Float(1)))
         matrix = [[rows[i][j] * scale * (across if ODD[i, j] else 1) for j in range(4)] for i in range(4)]
-        # Between nodes light could become more than polarised: then all but M_00 is less.
+        # Interpolated matrices may have a degree of polarisation above one: then all elements but M_00 are reduced.
         polarised = [sum(dr.square(m) for m in line[1:]) for line in (matrix[0], [row[0] for row in matrix])]
         limit = dr.rsqrt(larger(larger(*polarised), 1))
         return [
@@ -274,7 +274,7 @@ class RigorousOrders:
         whole = dr.round(k_x)
         n, a = mi.Int32(whole), dr.abs(k_x - whole)
         is_reversed = k_x < whole
-        # Of the incident and of the outgoing direction.
+        # The orders of the incident and of the outgoing direction.
         orders = dr.select(is_reversed, m - n, n), dr.select(is_reversed, -n, n - m)
         cell, low, high = _grid_cell(pair.square, a)
         inner, inside = mi.UInt32(0), pair.z

@@ -23,7 +23,7 @@ from .rigorous_orders import RigorousOrders
 
 MAX_PHASE_STEP = 0.5  # radians at the deepest point, between nodes of the ratio of scales in a table of E
 MAX_RATIOS = 16  # number of these nodes
-SAMPLER_RATIOS = 7  # of scales that vary: the number of values between which `OrderSampler` has its bins
+SAMPLER_RATIOS = 7  # number of ratios of varying scales; `OrderSampler` has bins for each interval between two
 
 _making = threading.Lock()
 _shared: weakref.WeakValueDictionary[tuple[str, str, float | None], SharedTables] = weakref.WeakValueDictionary()
@@ -50,7 +50,7 @@ class SharedTables:
 
     @classmethod
     def of(cls, spectrum: Spectrum, eta: float | None = None) -> SharedTables:
-        """Return the tables of an equal spectrum if a BSDF holds them, else new ones.
+        """Return the tables that a BSDF with an equal spectrum holds, or else new ones.
 
         `eta` is the relative index of a transmitting grating.
 
@@ -99,8 +99,8 @@ class SharedTables:
 
 
 def transmission_bounds(eta: float) -> tuple[float, float]:
-    """Return κ below which nearly all transmitted light lies, and the maximum of |k_i,∥|/n_o.
+    """Return a bound of κ (rad/µm) for nearly all transmitted light, and the maximum of |k_i,∥|/n_o.
 
-    Undiffracted light along the normal has κ = 2π |η − 1|/λ.
+    The bound is 1.5 times κ = 2π |η − 1|/λ of undiffracted light along the normal, at the shortest visible λ.
     """
     return 3 * np.pi * abs(eta - 1) / (VISIBLE[0] * 1e-3), max(eta, 1 / eta)

@@ -51,12 +51,13 @@ class Scattering(Protocol):
     resolved: bool
 
     def meets(self, q_x: mi.Float, q_y: mi.Float, scale: mi.Float) -> mi.Bool:
-        """Return whether q (cycles/µm) lies in the lobe of an order; true where they overlap. `scale` is of lobes."""
+        """Return whether q (cycles/µm) lies in the lobe, scaled by `scale`, of an order; true where lobes overlap."""
 
     def evaluate(self, geometry: Geometry, incidence: Incidence, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
-        """Return n_o² K G S |cos θ_o|, or n_o² Σ_m η_m N |cos θ_o|, and the density of q, both in µm².
+        """Return the power and the density of q, both in µm², for one wavelength of a pair of directions.
 
-        For one wavelength of a pair of directions; where orders are resolved, q lies in the lobe of one.
+        The power is n_o² K G S |cos θ_o|, with the gain of lobes, or n_o² Σ_m η_m Γ N |cos θ_o| in rigorous theory.
+        Where orders are resolved, q lies in the lobe of one.
         """
 
     def sample(self, incidence: Incidence, u: mi.Float, v: mi.Point2f, active: mi.Bool) -> tuple[mi.Point2f, mi.Bool]:
@@ -71,7 +72,8 @@ class Theory(Protocol):
         material: R of a plane.
         interface: the media above and below.
         shadowing: whether G is a factor.
-        covered_index: index by which wavelengths outside are divided to compare them with those of the spectrum.
+        covered_index: index by which wavelengths outside are divided before they are compared with those of the
+            spectrum.
     """
 
     @property
@@ -93,7 +95,7 @@ class Theory(Protocol):
         """Show the parameters of the theory and of its material."""
 
     def parameters_changed(self, keys: list[str]) -> None:
-        """Recompute what depends on the parameters `keys`; on all of them if none is named."""
+        """Recompute all that depends on the parameters `keys`, or on any parameter if there are none."""
 
     def coordinates(self, geometry: Geometry) -> tuple[Coordinates, Coordinates] | None:
         """Return the coordinates of both directions in the table of E, for `evaluate` at all wavelengths."""
@@ -234,7 +236,7 @@ class ScalarTheory:
         return Interface(1.0, self.material.eta, is_sheet, kappas, fraction)
 
     def parameters_changed(self, keys: list[str]) -> None:
-        """Recompute what depends on the parameters `keys`; on all of them if none is named."""
+        """Recompute all that depends on the parameters `keys`, or on any parameter if there are none."""
         changed = [scale for scale in self.scales if not keys or scale.name in keys]
         for scale in changed:
             scale.read()
@@ -308,10 +310,10 @@ class ScalarTheory:
 
 
 class RigorousTheory:
-    """f cos θ_o = Σ_m η_m N(q − m/T; σ_q² I)/λ² cos θ_o: the efficiencies η_m include R, K, G and E.
+    """f cos θ_o = n_o² Σ_m η_m Γ N(q − m/T; σ_q² I)/λ² cos θ_o: the efficiencies η_m include R, K, G and E.
 
     Attributes:
-        scattering: Σ_m η_m N n_o² cos θ_o and its sampler.
+        scattering: n_o² Σ_m η_m Γ N cos θ_o and its sampler.
         material: R = 1 beside the efficiencies.
         interface: the media above and below.
     """
@@ -343,7 +345,7 @@ class RigorousTheory:
     def evaluate(
         self, geometry: Geometry, incidence: Incidence, pair: tuple[Coordinates, Coordinates] | None, active: mi.Bool
     ) -> tuple[mi.Float, mi.Float]:
-        """Return n_o² Σ_m η_m N |cos θ_o| and the density of q."""
+        """Return n_o² Σ_m η_m Γ N |cos θ_o| and the density of q."""
         return self.scattering.evaluate(geometry, incidence, active)
 
     def reflectance(self, si: mi.SurfaceInteraction3f, geometry: Geometry, active: mi.Bool) -> mi.UnpolarizedSpectrum:

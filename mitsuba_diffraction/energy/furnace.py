@@ -2,19 +2,19 @@
 
 With R = 1 and E = 1 the BSDF reflects
 
-    a(ω_i, λ) = ∫ K G S(q; κ) Γ dq    over the q whose ω_o is above the surface (du dv = cos θ_o dω_o = λ² dq)
+    a(ω_i, λ) = ∫ K G Γ S(q; κ) dq    over the q whose ω_o is above the surface (du dv = cos θ_o dω_o = λ² dq)
 
 with the gain Γ of lobes at the horizon. a is summed over components of S, each evaluated once:
 
-- An order of a grating, evaluated by itself. Γ keeps its power wherever its centre propagates, so that it contributes
-  K G η(κ). The cosine of a lobe that the horizon truncates is the mean over the lobe,
+- An order that is evaluated by itself. With Γ it keeps its power wherever its centre propagates, so that it contributes
+  K G η_m(κ). Where the horizon truncates its lobe, cosines are replaced by their mean over the lobe,
 
       cos θ → √(2λσ_q) m(x),    m(x) = ∫₀^∞ g(x) g(y) φ(x − y) √((x + y)/2) dy,    x = cos² θ/(2λσ_q)
 
   with the `horizon_gain` g; m(x) → √x away from the horizon.
-- Where orders overlap, and for a sample, a bin of a lattice over the frequency plane in which S is accumulated. The
-  part of its radial extent that is above the horizon determines its weight and its cosine. Near the mirror direction at
-  grazing incidence (1 − b) K G + b Γ replaces K G, as in `bsdf/geometry.py`.
+- Where orders overlap, and for a sample, a bin of the frequency plane, in which S is accumulated. The part of its
+  radial extent that is above the horizon determines its weight and its cosine. Near the mirror direction at grazing
+  incidence (1 − b) K G + b Γ replaces K G, as in `Geometry.continuum_factor` of `bsdf/geometry.py`.
 
 For an interface between media, the reflected and the transmitted fraction of light from one side are
 
@@ -41,7 +41,7 @@ from ..spectrum.power_spectrum import PowerSpectrum
 Real = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-KAPPA_STEP = 0.1  # spacing of the nodes in κ: the phase of the deepest point, radians; powers are linear between nodes
+KAPPA_STEP = 0.1  # radians of the phase of the deepest point between nodes in κ; powers are linear between nodes
 MAX_KAPPAS = 1000  # nodes in κ of an interface, eight of which lie below κ₁
 MAX_BIN_WIDTH = 0.12  # direction cosines at the shortest wavelength
 MIN_BINS = 2000
@@ -134,14 +134,14 @@ class Furnace:
     def terms(self, directions: Real, length: Real, branch: int) -> tuple[Indices, Indices, Real]:
         """Compute the terms of `albedo` for one branch of light: index of direction, of component, and value.
 
-        Component j diffracts light from ω to −ω_t − λ q_j, or to −ω_t + λ q_j in branch −1, in units of n_i.
+        Component j diffracts light from ω to k_o,∥ = −ω_∥ − λ q_j, or −ω_∥ + λ q_j in branch −1, in units of n_i.
         """
         s, cos_i, index = directions[:, :2], np.abs(directions[:, 2]), (branch and self.index) or 1.0
         q, radius = self.q * (branch or 1), np.zeros(len(self.q)) if self.by_order else np.sqrt(3) * self.widths
         middle, mean = s.mean(0), (length.min() + length.max()) / 2
         cutoff = index + np.hypot(*(s - middle).T).max() + (length.max() - mean) * np.hypot(*q.T)
         near = np.flatnonzero(np.hypot(*(middle + mean * q).T) < cutoff + length.max() * radius)
-        # cos² θ_o = 1 − |ω_i,t + λq|²/η²
+        # cos² θ_o = 1 − |ω_∥ + λq|²/η²
         square = np.repeat(1 - (1 - cos_i[:, None] ** 2) / index**2, len(near), axis=1)
         for k in np.flatnonzero(q.any(0)):
             u = np.multiply.outer(length, q[near, k])
@@ -208,7 +208,7 @@ class Furnace:
         return value if self.index is None else value * fresnel(np.sqrt(square) / 2, self.index)
 
     def _kappa(self, cos_i: Real, cos_o: Real, length: Real, branch: int) -> Real:
-        """Return κ in rad/µm between two directions; zero where transmitted light has the other sign of v_z."""
+        """Return κ in rad/µm of two directions; zero if v_z of transmitted light lacks the sign of the branch."""
         v_z = branch * (cos_i - (self.index or 1.0) * cos_o) if branch else cos_i + cos_o
         return 2 * np.pi / length * np.maximum(v_z, 0)
 
@@ -235,24 +235,24 @@ class Furnace:
 
 
 def min_kappa(spectrum: PowerSpectrum, index: float, height_scale: float = 1.0) -> float:
-    """Return κ₁ in rad/µm for unscaled heights, below which c_m/κ² of transmitted light is linear in κ."""
+    """Return κ₁ in rad/µm, below which c_m/κ² of transmitted light is extrapolated linearly."""
     first, undiffracted = small_kappas(spectrum, index)
     return min(first, undiffracted * height_scale)
 
 
 def small_kappas(spectrum: PowerSpectrum, index: float) -> tuple[float, float]:
-    """Return the two bounds of which κ₁ is the smaller, in rad/µm.
+    """Return the two bounds whose minimum is κ₁, in rad/µm.
 
-    The first is a quarter of the first interval of the table, where its error matters as little as that of the linear
-    extrapolation. The second, to be multiplied by the scale of the heights, is less than κ of the undiffracted order at
-    all wavelengths; those of the spectrum are in the denser medium.
+    The first is a quarter of the first interval of the table, where its error is as small as that of the linear
+    extrapolation. The second, to be multiplied by the scale of the heights, is 0.8 of the minimum κ of undiffracted
+    light at normal incidence. Wavelengths of the spectrum are those in the denser medium.
     """
     max_wavelength = spectrum.wavelengths[1] * 1e-3 * max(index, 1)
     return spectrum.table.first_interval / 4, 1.6 * np.pi * abs(index - 1) / max_wavelength
 
 
 def small_kappa(kappa: Real, first: float, power: NDArray, at_first: NDArray, at_second: NDArray) -> Real:
-    """Return c_m(κ) = `power` above κ₁ = `first`; below, κ₁²/κ² c_m(κ), c_m/κ² being linear through κ₁ and 2κ₁."""
+    """Return c_m(κ) = `power` above κ₁ = `first`; below, κ₁²/κ² c_m(κ), with c_m/κ² linear through κ₁ and 2κ₁."""
     x = kappa / max(first, 1e-30)
     return np.where(kappa < first, (2 - x) * at_first + 0.25 * (x - 1) * at_second, power)
 

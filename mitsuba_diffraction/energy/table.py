@@ -6,17 +6,18 @@ multiplied by
     E = min(e(ω_i, λ), e(ω_o, λ)),    e = 1/max(1, a)
 
 which is reciprocal, and one where a ≤ 1 for both directions. The table holds e at nodes and is linear between them.
-E is a safeguard of the model: it keeps the albedo of a perfect mirror below one to within about a per cent.
+E is a safeguard of the model: for reliefs up to 1 µm deep, the albedo of a perfect mirror exceeds one by about a per
+cent at most.
 
 For a line grating of period T, with c = √(1 − ω_y²) and
 
     u = (c − ω_x) T/λ,    v = (c + ω_x) T/λ
 
-the order m > 0 propagates if m < u, and the order m < 0 if −m < v: e jumps where u or v is a whole number, and is
-continuous between. So each unit square of (u, v) is divided into grid cells separately, finest near its lower edges,
-where an order has just emerged; at u = 0 and v = 0 ω itself is at the horizon. With f the fractional part of u, nodes
-are equidistant in √f, which is proportional to cos θ_o of that order. a depends on u and v alone, except where lobes
-meet the horizon: in units of c, their width is proportional to 1/c. The table has one slice.
+the order m > 0 propagates if m < u, and the order m < 0 if −m < v. e jumps where u or v is a whole number, and is
+continuous between. Each unit square of (u, v) is therefore divided into grid cells separately. They are finest near its
+lower edges, where an order is just above the horizon; at u = 0 and v = 0, ω itself is at the horizon. With f the
+fractional part of u, nodes are equidistant in √f, which is proportional to cos θ_o of that order. a depends on u and v
+alone, except where lobes meet the horizon: in units of c, their width is proportional to 1/c. The table has one slice.
 
 For surfaces with orders in two dimensions, for samples and for interfaces the hemisphere is mapped to a square, with
 the normal at its centre and the horizon at its edge,
@@ -51,12 +52,12 @@ from ..spectrum.power_spectrum import PowerSpectrum
 from .furnace import Furnace, Real
 
 MAX_E = 1.05
-"""Largest stored 1/a; e is one where the interpolated value is larger, so that its kink lies at a = 1."""
+"""Maximum stored 1/a; e is one where the interpolated value exceeds one, so that its kink lies at a = 1."""
 MAX_LINE_NODES = 1.2e5  # nodes of the table of a line grating, about
 MAX_NODES = 100000  # nodes of any other table
 MAX_NODE_COMPONENT_PAIRS = 3e7  # evaluations for a table with one ratio
 MIN_SLICES, MAX_SLICES = 8, 16  # nodes of 1/λ
-SLICE_PHASE = 4  # radians of the phase of the deepest point, for each of which there is one slice more than the minimum
+SLICE_PHASE = 4  # radians, by which the phase of the deepest point changes per slice added to the minimum number
 MIN_FRACTION = 1e-7  # distance of nodes from whole u and v
 MIN_T = 0.01  # t of nodes at the horizon
 
@@ -68,10 +69,10 @@ class Layout:
     Attributes:
         period: T in µm of a line grating; 0 for any other surface.
         squares: number of unit squares of (u, v) along u and along v; 1 for the square of all directions.
-        first: number of grid cells from u or v = 0 to 1, where ω is near the horizon; or along a side of the square.
+        first: number of grid cells from u or v = 0 to 1, where ω is near the horizon; else along a side of the square.
         cells: number of grid cells along a side of each other unit square.
         slices: 1, or the number of nodes in 1/λ.
-        frequencies: (smallest, largest) 1/λ in 1/µm.
+        frequencies: (minimum, maximum) of 1/λ in 1/µm.
         turned: whether the grating is periodic along y, so that x and y are exchanged.
     """
 
@@ -165,7 +166,7 @@ class Layout:
 
 @dataclass(frozen=True, eq=False)
 class EnergyTable:
-    """The bound e at nodes, linear between them.
+    """The factor e at nodes, linear between them.
 
     Attributes:
         layout: the nodes of directions and wavelengths.
@@ -198,7 +199,7 @@ class EnergyTable:
             spectrum: S(q; κ); for an interface, of wavelengths in the denser medium.
             ratios: the nodes of h/s, equidistant.
             index: n below relative to n above, if light is transmitted.
-            min_lateral_scale: the smallest s.
+            min_lateral_scale: the minimum of s.
         """
         sides = [Furnace.of(spectrum, max(ratios), index, side) for side in ((1,) if index is None else (1, -1))]
         layout = Layout.of(sides[0], min_lateral_scale)
@@ -218,8 +219,8 @@ class EnergyTable:
             e[k, :, used] = np.concatenate(bounds).T
         e = e.reshape(*e.shape[:2], *layout.shape)
         if _phase(sides[0], layout.frequencies) > (MAX_SLICES - MIN_SLICES) * SLICE_PHASE:
-            # Of a relief so deep e has no smooth course from node to node: each gets the smallest of its neighbours,
-            # rounded down.
+            # For so deep a relief e varies faster than the nodes resolve: each node gets the minimum over its
+            # neighbours, rounded down.
             e = minimum_filter(e, (1, 1, 3, 3, 3)) - 0.5 * MAX_E / 255
         values = np.rint(np.clip(e, 0, MAX_E) * (255 / MAX_E)).astype(np.uint8)
         return cls(layout, values, tuple(ratios))
@@ -265,24 +266,24 @@ class EnergyTable:
 
 
 def _phase(furnace: Furnace, frequencies: tuple[float, float]) -> float:
-    """Return by how much the phase of the deepest point differs between two 1/λ, in the denser medium, in radians."""
+    """Return the difference of the phases of the deepest point at two 1/λ, in the denser medium, in radians."""
     height = furnace.spectrum.height_range * furnace.height_scale * max(furnace.index or 1, 1)
     return 4 * np.pi * height * (frequencies[1] - frequencies[0])
 
 
 def frequencies_of(spectrum: PowerSpectrum, index: float | None) -> tuple[float, float]:
-    """Return (smallest, largest) 1/λ in 1/µm of a table; `index` is η of `Furnace`."""
+    """Return (minimum, maximum) of 1/λ in 1/µm for a table; `index` is η of `Furnace`."""
     # The wavelengths of the spectrum are in the denser medium.
     shortest, longest = (w * 1e-3 * max(index or 1, 1) for w in spectrum.wavelengths)
     return 1 / longest, 1 / shortest
 
 
 def bounds_of(albedo: Real, index: float | None) -> Real:
-    """Return e from the albedo that the furnace finds.
+    """Return e from the albedo of the furnace.
 
-    Reflected light alone has e = 1/max(1, a). For an interface transmitted light has priority over all reflected light
-    except F₀, the reflectance of a plane at normal incidence, since scalar theory transmits light that steep facets
-    reflect totally:
+    For reflected light alone e = 1/max(1, a). For an interface, transmitted light has priority over all reflected light
+    except F₀, the reflectance of a plane at normal incidence, since scalar theory transmits even light that steep
+    facets reflect totally:
 
         e_T = min(1, (1 − min(R, F₀))/T),    e_R = min(1, (1 − e_T T)/R),    e_R R + e_T T = min(1, R + T)
 
