@@ -143,7 +143,7 @@ class Interface:
         return WaveVector(tangent, square, self._outer_index(above), inner, per_inner, excess, sign)
 
     def scattered(self, k_i: WaveVector, reflects: mi.Bool) -> WaveVector:
-        """Return k of the undiffracted light, in the medium into which light of `k_i` is scattered."""
+        """Return k in the medium into which light of `k_i` is scattered: k_∥ of undiffracted light, k_z² of `k_i`."""
         return self._wave_vector((k_i.sign > 0) == reflects, -k_i.tangent, k_i.square)
 
     def transmission_probability(self, omega: mi.Vector3f) -> mi.Float:
