@@ -137,8 +137,12 @@ def load_spectrum(path: str | os.PathLike[str], recipe: str | None = None) -> Sp
         FileNotFoundError: if there is no such file.
         ValueError: if it is not a spectrum, is damaged, of another version, or was not built from that recipe.
     """
-    is_rigorous = False
-    if os.path.isfile(path):
-        with open(path, "rb") as stream:
-            is_rigorous = RIGOROUS_FORMAT.encode() in stream.read(_MAX_HEADER_BYTES)
-    return (RigorousSpectrum if is_rigorous else GratingSpectrum).load(path, recipe)
+    return (RigorousSpectrum if is_rigorous(path) else GratingSpectrum).load(path, recipe)
+
+
+def is_rigorous(path: str | os.PathLike[str]) -> bool:
+    """Return whether a file exists and its header is that of a rigorous spectrum."""
+    if not os.path.isfile(path):
+        return False
+    with open(path, "rb") as stream:
+        return RIGOROUS_FORMAT.encode() in stream.read(_MAX_HEADER_BYTES)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import re
+
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
-from ..errors import RequestError
+from ..errors import RequestError, is_number
 
 
 def nested_plugin(kind: str, **parameters: object) -> mi.Object:
@@ -60,7 +63,8 @@ def base_from(props: mi.Properties) -> Base | None:
     """Return the nested BSDF of the parameter `base`, or None.
 
     Raises:
-        RequestError: if it is not a BSDF that reflects and does not transmit, or has another name.
+        RequestError: if it is not a BSDF that reflects and does not transmit, a reflectance or a colour, or has another
+            name.
     """
     others = [name for name, value in props.objects() if name != "base" and isinstance(value, mi.BSDF)]
     if others:
@@ -70,9 +74,18 @@ def base_from(props: mi.Properties) -> Base | None:
     if "base" not in props:
         return None
     bsdf = props["base"]
-    if not isinstance(bsdf, mi.BSDF):
-        raise RequestError(f"base: got {bsdf!r}, wanted a BSDF")
-    return Base(bsdf)
+    return Base(bsdf if isinstance(bsdf, mi.BSDF) else _diffuse(bsdf))
+
+
+def _diffuse(value: object) -> mi.BSDF:
+    """Return a diffuse BSDF of a reflectance, or of a colour as of HTML, "#a0522d"."""
+    if is_number(value) and 0 <= value <= 1:
+        return nested_plugin("diffuse", reflectance=float(value))
+    if isinstance(value, str) and re.fullmatch("#[0-9a-fA-F]{6}", value):
+        pixel = mi.Bitmap(np.array([[list(bytes.fromhex(value[1:]))]], np.uint8))
+        linear = np.ravel(pixel.convert(component_format=mi.Struct.Type.Float32, srgb_gamma=False))
+        return nested_plugin("diffuse", reflectance=mi.ScalarColor3f(*map(float, linear)))
+    raise RequestError(f"base: got {value!r}, wanted a BSDF, a reflectance from 0 to 1 or a colour such as #a0522d")
 
 
 class Base:

@@ -12,6 +12,7 @@ from ..errors import RequestError
 from ..manual import Parameter, listed
 from ..recipe import Recipe
 from ..surface.gratings import PROFILES
+from .base import base_from
 from .grating import GratingRequest
 from .layers import Layers
 
@@ -74,8 +75,9 @@ PARAMETERS = (
     ),
     Parameter(
         "base",
-        "BSDF",
-        "what lies under a dielectric surface (pigment): any BSDF that only reflects. Its value is multiplied by "
+        "BSDF, float or string",
+        "what lies under a dielectric surface (pigment): any BSDF that only reflects; a number or a colour such as "
+        "#a0522d is that of a diffuse one. Its value is multiplied by "
         "(1 − R_i)(1 − R_o), R at the angles of ω_i and ω_o to the surface",
         "none",
     ),
@@ -140,6 +142,7 @@ def check(props: mi.Properties) -> None:
         FileNotFoundError: if there is no such file.
     """
     refuse_unknown(props)
+    base_from(props)
     surface = GratingRequest.of(props).surface
     if isinstance(surface, Recipe):
         surface.check()

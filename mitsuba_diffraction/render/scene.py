@@ -20,6 +20,7 @@ from ..bsdf.base import is_grating
 from ..bsdf.diffraction_grating import check
 from ..errors import RequestError, root_cause
 from ..llvm import is_supported
+from ..precomputation import is_rigorous
 from ..recipe import Recipe
 from ..settings import VISIBLE
 
@@ -39,6 +40,8 @@ _DRAWS_PER_LIGHT = 2**14  # of four wavelengths, to estimate the spectrum of the
 Materials = Mapping[str, Mapping[str, bool | float | str]]
 """Id of a BSDF → parameters of the grating that replaces it."""
 
+# Of BSDFs; `principled` has `spec_trans`.
+_TRANSMITTING = {"dielectric", "roughdielectric", "thindielectric", "principledthin", "mask", "null"}
 _RAYS_OF_SENSOR = 4096  # to sample the visible surfaces and their lights
 _MAX_LOBE_VALUE = 1e4  # of a BSDF with narrow lobes, 1/sr
 _MAX_NOISE_FACTOR = 1e4  # of the luminance of a pixel over that of the brightest light
@@ -83,8 +86,9 @@ def load_spectral_scene(
             the aspect ratio is preserved.
         height: likewise.
         parameters: values for the scene's `$name` parameters (`-Dname=value` of Mitsuba's command line).
-        materials: id of a BSDF → parameters of the `diffraction_grating` that replaces it. In a `twosided` the nested
-            BSDF is replaced, unless the grating transmits light.
+        materials: id of a BSDF → parameters of the `diffraction_grating` that replaces it. Below a dielectric of scalar
+            theory the BSDF remains as `base`, unless that is given; "none" stands for none. A `twosided` remains around
+            a grating that does not transmit light.
         motion: of the first sensor: an affine map of world space, 16 numbers in row-major order, applied after its
             `to_world`.
 
@@ -347,8 +351,25 @@ def _grating(values: Mapping[str, bool | float | str]) -> mi.Properties:
     """Return the properties of a grating with these parameters."""
     grating = mi.Properties("diffraction_grating")
     for key, value in values.items():
-        grating[key] = value
+        if (key, value) != ("base", "none"):
+            grating[key] = value
     return grating
+
+
+def _has_base(values: Mapping[str, bool | float | str]) -> bool:
+    """Return whether a BSDF can lie below a grating, and none is given: below a dielectric, in scalar theory."""
+    if {"material", "base"} & values.keys() or values.get("transmission", "none") != "none":
+        return False
+    path = _resolved(values.get("filename", ""))
+    if path.suffix.lower() == ".toml" and path.is_file():
+        return Recipe.load(path).settings.theory == "scalar"
+    return values.get("theory") != "rigorous" and not is_rigorous(path)
+
+
+def _transmits(state: mi.parser.ParserState, props: mi.Properties) -> bool:
+    """Return whether a BSDF of the scene, or one nested in it, transmits light."""
+    is_glass = props.plugin_name() in _TRANSMITTING or mi.Properties(props).get("spec_trans", 0.0) != 0
+    return is_glass or any(_transmits(state, state.nodes[k].props) for k in _children(state, props, mi.ObjectType.BSDF))
 
 
 def _replace_materials(state: mi.parser.ParserState, materials: Materials) -> None:
@@ -358,14 +379,24 @@ def _replace_materials(state: mi.parser.ParserState, materials: Materials) -> No
         if name not in bsdfs:
             known = ", ".join(sorted(filter(None, bsdfs))) or "none: its BSDFs have no ids"
             raise RequestError(f"material: got the id {name!r}, the ids of BSDFs in the scene are {known}")
-        grating = _grating(values)
-        node = state.nodes[bsdfs[name]]
-        if node.props.plugin_name() == "twosided" and grating.get("transmission", "none") == "none":
+        grating, index = _grating(values), bsdfs[name]
+        # A copy, as adding nodes invalidates references to them.
+        replaced = mi.Properties(state.nodes[index].props)
+        if _has_base(values):
+            if _transmits(state, replaced):
+                raise RequestError(
+                    f"material {name}: got a dielectric in the place of a BSDF that transmits light, wanted "
+                    "transmission=sheet or interface, a metal (material=Al), or base=none"
+                )
+            below = mi.Properties(replaced)
+            below.set_id("")
+            grating["base"] = _add(state, mi.ObjectType.BSDF, below)
+        if replaced.plugin_name() == "twosided" and grating.get("transmission", "none") == "none":
             both_sides = mi.Properties("twosided")
             both_sides["bsdf"] = _add(state, mi.ObjectType.BSDF, grating)
             grating = both_sides
         grating.set_id(name)
-        state.nodes[bsdfs[name]].props = grating
+        state.nodes[index].props = grating
 
 
 def files_of_scene(
@@ -440,11 +471,8 @@ def _replace_films(state: mi.parser.ParserState, width: int | None, height: int 
 def _children(state: mi.parser.ParserState, props: mi.Properties, kind: mi.ObjectType | None = None) -> dict[int, str]:
     """Return index in the parser's list → name of the children of a node; only those of `kind`, if it is given."""
     # Of a copy: reading marks a property as used, and Mitsuba reports unused ones as errors.
-    references = [
-        (value.index(), name)
-        for name, value in mi.Properties(props).items()
-        if isinstance(value, mi.Properties.ResolvedReference)
-    ]
+    copy, kind_of_reference = mi.Properties(props), mi.Properties.Type.ResolvedReference
+    references = [(copy[name].index(), name) for name in copy.keys() if copy.type(name) == kind_of_reference]  # noqa: SIM118
     return {index: name for index, name in references if kind in (None, state.nodes[index].type)}
 
 

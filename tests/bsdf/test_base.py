@@ -1,5 +1,6 @@
 """The base under the grating: values, samples and components with any BSDF that reflects."""
 
+import colour
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -155,6 +156,24 @@ def test_a_transmissive_base_is_refused(base):
 def test_a_base_that_is_no_bsdf_is_refused():
     with pytest.raises((RuntimeError, ValueError), match="base"):
         over(uniform(0.5))
+
+
+@pytest.mark.parametrize("base", [0.25, "#a0522d", "#FFFFFF"])
+def test_a_number_or_a_colour_is_a_diffuse_base(base):
+    """Decoded by colour-science."""
+    reflectance = base
+    if isinstance(base, str):
+        encoded = [int(base[i : i + 2], 16) / 255 for i in (1, 3, 5)]
+        reflectance = {"type": "rgb", "value": colour.cctf_decoding(encoded, function="sRGB").tolist()}
+    wo = random_directions(np.random.default_rng(5), 50)
+    wanted = evaluate(over({"type": "diffuse", "reflectance": reflectance}), direction(20), wo)[0]
+    np.testing.assert_allclose(evaluate(over(base), direction(20), wo)[0], wanted, rtol=1e-3)
+
+
+@pytest.mark.parametrize("base", [1.5, -0.1, "#a05", "sienna", True])
+def test_a_base_of_no_reflectance_is_refused(base):
+    with pytest.raises((RuntimeError, ValueError), match=r"base: got .*, wanted a BSDF, a reflectance from 0 to 1"):
+        over(base)
 
 
 @pytest.mark.slow

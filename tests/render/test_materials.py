@@ -7,10 +7,11 @@ from types import SimpleNamespace
 import mitsuba as mi
 import numpy as np
 import pytest
+from bsdf_support import made_up
 
 from mitsuba_diffraction.cli.arguments import materials_of
 from mitsuba_diffraction.render import render
-from mitsuba_diffraction.render.scene import has_uvs, load_spectral_scene, scene_digest, warn_of_gratings
+from mitsuba_diffraction.render.scene import has_uvs, load_spectral_scene, parsed, scene_digest, warn_of_gratings
 
 MIRROR = {"profile": "blazed", "period": 2.0, "depth": 0.2, "material": "none", "conserve_energy": False}
 PLAIN = "".join(
@@ -29,6 +30,7 @@ BLEND = (
     '<bsdf type="blendbsdf"><float name="weight" value="0.5"/><bsdf type="plastic"/>'
     '<bsdf type="diffuse" id="b"/></bsdf>'
 )
+MASK = '<bsdf type="twosided"><bsdf type="mask"><float name="opacity" value="0.5"/><bsdf type="diffuse"/></bsdf></bsdf>'
 # As the add-on for Blender writes it.
 EXPORTED = """<scene version="2.1.0">
     <default name="spp" value="4"/>
@@ -87,6 +89,56 @@ def test_a_replaced_material_renders_as_if_the_scene_had_the_grating(exported):
     assert np.abs(found - before).max() > 0.1
     assert not found[0, 0].any()  # hide_emitters
     assert not before[0, 0].any()
+
+
+def test_the_replaced_bsdf_remains_below_a_dielectric(exported):
+    dielectric = {key: value for key, value in MIRROR.items() if key != "material"}
+    below = PLAIN.replace(
+        '<string name="material" value="none"/>', f'<bsdf type="twosided" name="base">{PRINCIPLED}</bsdf>'
+    )
+    wanted = render(exported(f'<bsdf type="diffraction_grating" name="bsdf">{below}</bsdf>'), spp=2).radiance
+    found = render(path := exported(), spp=2, materials={"mat-Disc": dielectric}).radiance
+    np.testing.assert_array_equal(found, wanted)
+    bare = render(path, spp=2, materials={"mat-Disc": {**dielectric, "base": "none"}}).radiance
+    assert found.mean() > 2 * bare.mean()
+
+
+@pytest.mark.parametrize(
+    ("values", "kept"),
+    [
+        ({"int_ior": 1.4}, True),
+        ({"transmission": "none"}, True),
+        ({"filename": "scalar.toml"}, True),
+        ({"material": "Al"}, False),
+        ({"base": "none"}, False),
+        ({"transmission": "sheet"}, False),
+        ({"theory": "rigorous"}, False),
+        ({"filename": "rigorous.toml"}, False),
+        ({"filename": "rigorous.exr"}, False),
+    ],
+)
+def test_a_base_remains_where_light_reaches_it(exported, tmp_path, values, kept):
+    path = exported()
+    for theory in ("scalar", "rigorous"):
+        text = f'[surface]\nprofile = "blazed"\n[spectrum]\ntheory = "{theory}"\nint_ior = 1.5\n'
+        (tmp_path / f"{theory}.toml").write_text(text if theory == "rigorous" else text.replace("int_ior = 1.5\n", ""))
+    made_up().save(tmp_path / "rigorous.exr")
+    with parsed(path, None, {"mat-Disc": {"profile": "blazed", **values}}) as (_, state):
+        (grating,) = [node.props for node in state.nodes if node.props.plugin_name() == "diffraction_grating"]
+        assert ("base" in grating) == kept
+
+
+@pytest.mark.parametrize(
+    "glass", ['<bsdf type="thindielectric"/>', PRINCIPLED.replace("roughness", "spec_trans"), MASK]
+)
+def test_a_dielectric_in_the_place_of_glass_is_refused(exported, glass):
+    path = exported()
+    path.write_text(path.read_text().replace("</scene>", glass.replace("<bsdf ", '<bsdf id="glass" ', 1) + "</scene>"))
+    with pytest.raises(ValueError, match=r"material glass: got a dielectric .* wanted transmission=sheet or interface"):
+        load_spectral_scene(path, materials={"glass": {"profile": "blazed"}})
+    for values in ({"transmission": "sheet"}, {"material": "Al"}, {"base": "none"}):
+        with parsed(path, None, {"glass": {"profile": "blazed", **values}}):
+            pass
 
 
 @pytest.mark.parametrize(
