@@ -123,15 +123,18 @@ def test_noise_is_estimated_from_two_halves():
 @pytest.mark.parametrize("kind", VARIANTS)
 def test_each_shader_names_the_quirks_that_change_it(kind):
     mi.set_variant("llvm_ad_spectral")
-    surface = md.HeightField(np.random.default_rng(1).normal(0, 0.05, (4, 6)), 0.3)
-    more = {} if kind == "gem" else {"terms": 5, "coherence_length": 2.0}
+    surface = md.HeightField(np.random.default_rng(1).normal(0, 0.05, (14, 16)), 0.3)
+    # PQ has no window and therefore no taper; two tiles along each axis.
+    extent = {"extent": "sample"} if kind in ("flss", "nmm") else {}
+    more = {} if kind == "gem" else {"terms": 5, "coherence_length": 2.0 if extent else 8.0, **extent}
 
     def colours(quirks):
         shader = VARIANTS[kind](surface, quirks, **more)
         light = np.linspace(0.5, 1.5, 401)
         weights = shader.weights(0.1, light)
         wo = [
-            mi.Vector3f(x, y, float(np.sqrt(1 - x * x - y * y))) for x, y in ((-0.61, 0.33), (0.42, -0.27), (0.1, 0.7))
+            mi.Vector3f(x, y, float(np.sqrt(1 - x * x - y * y)))
+            for x, y in ((-0.61, 0.33), (0.42, -0.27), (0.1, 0.7), (-0.28, -0.17))
         ]
         return np.array([shader.rgb(mi.Vector3f(0.3, 0.2, float(np.sqrt(0.87))), w, weights) for w in wo]).ravel()
 
@@ -353,7 +356,7 @@ def test_the_same_seed_gives_the_same_numbers(llvm, folder):
     ("arguments", "of", "words"),
     [
         ("gone.xml", {}, "gone.xml"),
-        ("scene.xml --shader flsss", {}, "shader: got 'flsss', wanted one of flss, nmm, pq, gem"),
+        ("scene.xml --shader flsss", {}, "shader: got 'flsss', wanted one of flss, nmm, pq, nmm_pq, gem"),
         ("scene.xml -o nowhere/out", {}, "the folder nowhere is not there"),
         ("scene.xml --json nowhere/out.json", {}, "the folder nowhere is not there"),
         ("scene.xml --spp 0", {}, "--spp"),

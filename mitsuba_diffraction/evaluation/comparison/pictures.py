@@ -26,6 +26,7 @@ from ..realtime_shader.evaluate import VARIANTS
 from ..realtime_shader.flss import FLSS
 from ..realtime_shader.lights import lights_of
 from ..realtime_shader.quirks import Quirks
+from ..realtime_shader.surfaces import sum_along
 from ..realtime_shader.tristimulus import EMISSION, primary_spectra
 
 
@@ -57,15 +58,16 @@ def same_light(scene: mi.Scene) -> mi.SamplingIntegrator:
     lights = lights_of(scene)
 
     def radiance(scene: mi.Scene, ray: mi.RayDifferential3f, active: mi.Bool) -> tuple[mi.Spectrum, mi.Bool]:
-        si = scene.ray_intersect(ray, active)
-        active = active & si.is_valid()
-        bsdf = si.bsdf(ray)
-        result = mi.Spectrum(0)
-        for light in lights:
-            ds, _, irradiance = light.sample(si, active)
-            lit = active & (scene.ray_test(si.spawn_ray_to(ds.p), active) ^ True)
-            value = bsdf.eval(mi.BSDFContext(), si, si.to_local(ds.d), lit)
-            result += dr.select(lit, value * irradiance, 0)
+        def at_hit(si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active: mi.Bool) -> tuple[mi.Spectrum]:
+            result = mi.Spectrum(0)
+            for light in lights:
+                ds, _, irradiance = light.sample(si, active)
+                lit = active & ~scene.ray_test(si.spawn_ray_to(ds.p), active)
+                value = bsdf.eval(mi.BSDFContext(), si, si.to_local(ds.d), lit)
+                result += dr.select(lit, value * irradiance, 0)
+            return (result,)
+
+        (result,), active = sum_along(scene, ray, active, at_hit)
         return result, active
 
     return _integrator(radiance)
@@ -160,12 +162,13 @@ class Pictures:
         self._shader = mi.load_dict({"type": "diffraction_shader", "variant": shader})
         # Refuses a scene that the shader cannot show.
         prepared = self._shader.prepare(self.scene)
-        if not prepared.surfaces:
+        if not prepared.shaded:
             raise RequestError(f"{scene_path}: no shape has a diffraction_grating, there is nothing to compare")
-        self.shaders: list[Shader] = [shader for _, shader, _ in prepared.surfaces]
-        self.spectra = [surface.layers.grating.spectrum for surface, _, _ in prepared.surfaces]
-        self.has_base = any(surface.layers.base is not None for surface, _, _ in prepared.surfaces)
-        self.has_coat = any(surface.layers.coat is not None for surface, _, _ in prepared.surfaces)
+        self.shaders: list[Shader] = [shaded.shader for shaded in prepared.shaded]
+        layers = [shaded.layers for shaded in prepared.shaded]
+        self.spectra = [one.grating.spectrum for one in layers]
+        self.has_base = any(one.base is not None for one in layers)
+        self.has_coat = any(one.coat is not None for one in layers)
         self.film_size = tuple(int(size) for size in self.scene.sensors()[0].film().size())
         self.surface = _shows_surfaces(self.scene)
         if not self.surface.any():
@@ -175,7 +178,9 @@ class Pictures:
     def quirks(self) -> tuple[str, ...]:
         """Names of the `Quirks` that affect this scene with this shader, and "no_shadows"."""
         of_integrator = ("power_gamma", *(("constant_blend",) if self.has_base else ()))
-        own = (*self.shaders[0].own_quirks, *of_integrator)
+        own = {*self.shaders[0].own_quirks, *of_integrator}
+        if not any(getattr(shader, "extent", "tile") == "sample" for shader in self.shaders):
+            own -= {"periodic_scan"}
         return (*(name for name in Quirks.names() if name in own), NO_SHADOWS)
 
     @property

@@ -18,7 +18,8 @@ from ...geometry import k_g
 from ...settings import SUN_COHERENCE_LENGTH, lobe_width
 from ...surface.heightfield import HeightField
 from .quirks import Quirks
-from .taylor_textures import PUBLISHED_TERMS, TaylorTextures, taylor_transforms
+from .taper import tapered
+from .taylor_textures import MAX_KAPPA, TaylorTextures, taylor_transforms, terms_for
 from .tristimulus import (
     MAX_WAVELENGTH,
     MIN_WAVELENGTH,
@@ -31,6 +32,7 @@ from .tristimulus import (
 )
 
 PUBLISHED_R0 = 0.04  # an index of 1.5, close to that of snake skin
+SERIES_ERROR = 1e-4  # of the amplitudes, if the number of Taylor terms is not given
 
 
 def schlick_falloff(cos_half: mi.Float) -> mi.Float:
@@ -191,6 +193,7 @@ class TextureShader(Shader):
         *("d65_light", "relative", "d65_twice", "cie_rgb_matrix"),
     )
     origin_at_centre: ClassVar[bool] = False
+    published_terms: ClassVar[int]
 
     def __init__(
         self,
@@ -198,7 +201,9 @@ class TextureShader(Shader):
         quirks: Quirks,
         *,
         coherence_length: float = SUN_COHERENCE_LENGTH,
-        terms: int = PUBLISHED_TERMS,
+        extent: str = "tile",
+        terms: int | None = None,
+        max_height_scale: float = 1.0,
         shadowing: bool = True,
     ) -> None:
         """Compute the textures.
@@ -207,7 +212,9 @@ class TextureShader(Shader):
             height_field: the tile.
             quirks: the quirks of the published shader to keep.
             coherence_length: L_c in µm.
-            terms: number of Taylor terms.
+            extent: "tile", or "sample" for a piece of an irregular surface.
+            terms: number of Taylor terms; default: as published, or as many as an error of 1e-4 requires.
+            max_height_scale: of `rgb`, for the number of terms.
             shadowing: include G.
 
         Raises:
@@ -215,9 +222,9 @@ class TextureShader(Shader):
         """
         super().__init__(height_field, quirks, shadowing)
         lobe_width(coherence_length)  # raises unless it is a valid length
-        self.coherence_length = coherence_length
-        self._height_field, self._terms = height_field, terms
-        self._textures: dict[bool, TaylorTextures] = {}
+        self.coherence_length, self.extent = coherence_length, extent
+        self._height_field, self._terms, self._max_height_scale = height_field, terms, max_height_scale
+        self._textures: dict[tuple[bool, bool], TaylorTextures] = {}
         self._bind()
 
     def with_quirks(self, quirks: Quirks) -> TextureShader:
@@ -227,18 +234,43 @@ class TextureShader(Shader):
 
     def _bind(self) -> None:
         """Set up everything that depends on the quirks."""
+        taper, lengths = None, (self.coherence_length, self.coherence_length)
+        if self.tapers:
+            taper, lengths = tapered(self._height_field, self.coherence_length)
+        self.sigmas = tuple(self.sigma * self.coherence_length / length for length in lengths)
         from_zero = self.quirks.heights_from_zero
-        if from_zero not in self._textures:
+        if (from_zero, self.tapers) not in self._textures:
             texels, height = taylor_transforms(
                 self._height_field,
-                self._terms,
+                self.terms,
                 heights_from_zero=from_zero,
                 origin_at_centre=self.origin_at_centre,
+                taper=taper,
+                margin=self.margin,
             )
-            self._textures[from_zero] = TaylorTextures(texels, height)
-        self.textures = self._textures[from_zero]
+            self._textures[from_zero, self.tapers] = TaylorTextures(texels, height)
+        self.textures = self._textures[from_zero, self.tapers]
         matrix = rgb_matrix(cie_rgb_matrix=self.quirks.cie_rgb_matrix, d65_twice=self.quirks.d65_twice)
         self.matrix = [[opaque(float(entry)) for entry in row] for row in matrix]
+
+    @property
+    def tapers(self) -> bool:
+        """Whether the heights are tapered (`taper.py`)."""
+        return False
+
+    @property
+    def margin(self) -> int:
+        """Texels that are read beyond the highest frequency that light reaches."""
+        raise NotImplementedError
+
+    @property
+    def terms(self) -> int:
+        """The number of Taylor terms."""
+        if self._terms is not None:
+            return self._terms
+        if self.quirks.heights_from_zero:
+            return self.published_terms
+        return terms_for(MAX_KAPPA * self._height_field.half_range * self._max_height_scale, SERIES_ERROR)
 
     @property
     def sigma(self) -> float:

@@ -14,10 +14,11 @@ from .base import Shader
 from .flss import FLSS
 from .gem import GEM
 from .nmm import NMM
+from .nmm_pq import NMMPQ
 from .pq import PQ
 from .quirks import Quirks
 
-VARIANTS = {"flss": FLSS, "nmm": NMM, "pq": PQ, "gem": GEM}
+VARIANTS = {"flss": FLSS, "nmm": NMM, "pq": PQ, "nmm_pq": NMMPQ, "gem": GEM}
 
 
 def shader_for(height_field: HeightField, variant: str, quirks: Quirks, **settings: object) -> Shader:
@@ -48,7 +49,7 @@ def colour(
         height_field: the tile.
         wi: ω_i, (..., 3) in the frame of the tile.
         wo: ω_o, likewise; shapes broadcast.
-        variant: "flss", "nmm", "pq" or "gem".
+        variant: one of `VARIANTS`.
         quirks: default: as published.
         settings: further arguments of the shader class.
 
@@ -80,7 +81,8 @@ def relative_radiance(
         wi: ω_i, (..., 3) in the frame of the tile.
         wo: ω_o, likewise.
         wavelengths: (...) in nm; all three broadcast.
-        variant: "flss" or "pq"; "nmm" is evaluated as at one of its own wavelengths, which equals "flss".
+        variant: "flss" or "pq"; "nmm" and "nmm_pq" are evaluated as at one of their own wavelengths, which equals
+            "flss" and "pq".
         quirks: default: as published.
         settings: further arguments of the shader class.
 

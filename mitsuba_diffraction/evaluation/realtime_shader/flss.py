@@ -8,9 +8,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...errors import RequestError
+from ...surface.heightfield import HeightField
 from .base import Gain, TextureShader
+from .quirks import Quirks
 
-RADIUS = 1  # of the neighbourhood of 3 × 3 texels
+WINDOWS = ("texel", "4sigma")
 
 
 class FLSS(TextureShader):
@@ -21,21 +24,57 @@ class FLSS(TextureShader):
 
         P = Σ_m φ(m/T − q) F_m(κ),     φ(x) = e^{−|x|²/2σ_f²},     σ_f = 1/(2πσ_s),     σ_s = L_c/4.
 
-    The neighbourhood truncates at most about e^{−(3/2)²/(σ_f T)²} of a line: 0.4 % for T = L_c, and a negligible part
-    for much smaller tiles. For T > L_c orders overlap, and the complex sum represents a single point x₀ rather than the
-    average.
+    As published, the neighbourhood is one texel on each side. It truncates at most about e^{−(3/2)²/(σ_f T)²} of a
+    line: 0.4 % for T = L_c, and a negligible part for much smaller tiles. For T > L_c orders overlap, and the complex
+    sum represents a single point x₀ rather than the average. Corrected, it spans 4σ_f and truncates less than e^{−4}.
+
+    Attributes:
+        sigmas: σ along x and y, in cycles/µm: σ_f, or, of a tapered scan, the smaller ones of `taper.py`.
     """
 
-    own_quirks = (*TextureShader.own_quirks, "window_pi", "complex_window_sum")
+    own_quirks = (*TextureShader.own_quirks, "window_pi", "complex_window_sum", "one_texel", "periodic_scan")
+    published_terms = 37
+
+    def __init__(
+        self, height_field: HeightField, quirks: Quirks, *, window: str | None = None, **settings: object
+    ) -> None:
+        """Set up the shader with the arguments of `TextureShader` and `window`.
+
+        Args:
+            window: "texel" or "4sigma", instead of what the quirk `one_texel` says.
+        """
+        if window not in (None, *WINDOWS):
+            raise RequestError(f"window: got {window!r}, wanted one of {', '.join(WINDOWS)}")
+        self._window = window
+        super().__init__(height_field, quirks, **settings)
+
+    @property
+    def tapers(self) -> bool:
+        return self.extent == "sample" and not self.quirks.periodic_scan
+
+    @property
+    def radius(self) -> tuple[int, int]:
+        """Texels on each side of the neighbourhood, along x and y."""
+        if self._window == "texel" or (self._window is None and self.quirks.one_texel):
+            return 1, 1
+        return tuple(
+            max(1, int(np.ceil(2 * sigma * size - 0.5)))
+            for sigma, size in zip(self.sigmas, self.tile_size, strict=True)
+        )
+
+    @property
+    def margin(self) -> int:
+        return max(self.radius) + 1
 
     @property
     def texels_per_term(self) -> int:
-        return (2 * RADIUS + 1) ** 2
+        return int(np.prod([2 * radius + 1 for radius in self.radius]))
 
     @property
     def truncated_fraction(self) -> float:
-        """e^{−(3/2)²/(σ_f T)²} with the longer side T: bound of the truncated fraction of the power of a line."""
-        return float(np.exp(-((1.5 / (self.sigma * max(self.tile_size))) ** 2)))
+        """The larger of e^{−(r + ½)²/(σ T)²} along x and y: bound of the truncated fraction of the power of a line."""
+        axes = zip(self.radius, self.sigmas, self.tile_size, strict=True)
+        return max(float(np.exp(-(((radius + 0.5) / (sigma * size)) ** 2))) for radius, sigma, size in axes)
 
     def power(self, gain: Gain, wavelength: mi.Float, height_scale: mi.Float, active: mi.Bool) -> mi.Float:
         x, y = self.position(gain, wavelength)
@@ -49,12 +88,15 @@ class FLSS(TextureShader):
         self, x: mi.Float, y: mi.Float, stretch_x: mi.Float = 1.0, stretch_y: mi.Float = 1.0
     ) -> Callable[[mi.Int32, mi.Int32], mi.Float]:
         """Return φ of the texels m, with distances along x and y scaled by the given factors."""
-        height = float(np.pi) if self.quirks.window_pi else 1.0
-        scale = 1 / (float(np.sqrt(2)) * self.sigma)
+        # The height of a narrower window keeps the power of a flat mirror.
+        height = (float(np.pi) if self.quirks.window_pi else 1.0) * self.sigma / float(np.sqrt(np.prod(self.sigmas)))
+        scale_x, scale_y = (
+            1 / (float(np.sqrt(2)) * sigma * size) for sigma, size in zip(self.sigmas, self.tile_size, strict=True)
+        )
 
         def phi(m_x: mi.Int32, m_y: mi.Int32) -> mi.Float:
-            d_x = (mi.Float(m_x) - x) * (scale / self.tile_size[0]) * stretch_x
-            d_y = (mi.Float(m_y) - y) * (scale / self.tile_size[1]) * stretch_y
+            d_x = (mi.Float(m_x) - x) * scale_x * stretch_x
+            d_y = (mi.Float(m_y) - y) * scale_y * stretch_y
             return height * dr.exp(-dr.square(d_x) - dr.square(d_y))
 
         return phi
@@ -68,13 +110,14 @@ class FLSS(TextureShader):
         height_scale: mi.Float,
         window: Callable[[mi.Int32, mi.Int32], mi.Float],
         active: mi.Bool,
-        radius: int = RADIUS,
+        radius: tuple[int, int] | None = None,
     ) -> mi.Float:
         """Return |Σ φ F|² or Σ φ² |F|² around the position (x, y)."""
         anchor = dr.floor if self.quirks.floor_anchor else dr.round
         # Clamping keeps the conversion in range; far outside the texture nothing is read.
-        first = tuple(mi.Int32(dr.clip(anchor(c), -1e6, 1e6)) - radius for c in (x, y))
+        radius = self.radius if radius is None else radius
+        first = tuple(mi.Int32(dr.clip(anchor(c), -1e6, 1e6)) - r for c, r in zip((x, y), radius, strict=True))
         kappa = -dr.two_pi * gain.w / wavelength * height_scale
-        size = (2 * radius + 1, 2 * radius + 1)
+        size = (2 * radius[0] + 1, 2 * radius[1] + 1)
         complex_sum, powers = self.textures.over(first, size, kappa, window, active)
         return complex_sum if self.quirks.complex_window_sum else powers

@@ -12,23 +12,25 @@ from numpy.typing import NDArray
 from ...bsdf.layers import Layers
 from ...errors import RequestError
 from ...manual import Parameter, listed
-from .base import Shader, SpectralWeights
+from .base import Shader
 from .evaluate import VARIANTS
 from .lights import Light, lights_of, spectrum_of
 from .picture import Emission, decode, encode
+from .pq import PQ
 from .quirks import Quirks
-from .surfaces import Surface, along_pattern, heights_of, surfaces_of, transmitted
+from .surfaces import Shaded, gratings_of, in_place, recipe_of, sum_along
 
 PARAMETERS = (
-    Parameter("variant", "string", "flss, nmm, pq or gem", "flss"),
+    Parameter("variant", "string", "flss, nmm, pq, nmm_pq or gem", "flss"),
     Parameter("as_published", "boolean", "with all peculiarities of the published shader, or with none", "true"),
     Parameter(
         "fresnel_squared, window_pi, …",
         "boolean",
         "one peculiarity on or off, overriding as_published; `Quirks` lists them",
     ),
-    Parameter("terms", "integer", "Taylor terms; not for gem", "37"),
-    Parameter("interpolation", "string", "sinc or linear; for pq only", "sinc"),
+    Parameter("terms", "integer", "Taylor terms; default: as published, or, corrected, as many as needed; not for gem"),
+    Parameter("window", "string", "texel or 4sigma, instead of what one_texel says; for flss and nmm only"),
+    Parameter("interpolation", "string", "sinc or linear; for pq and nmm_pq only", "sinc"),
     Parameter("spacing", "float", "the period d in µm, by default that of the strongest wave along x; for gem only"),
     Parameter("roughness", "float", "of the highlight, 1/µm; for gem only", "5"),
     Parameter("shadows", "boolean", "test whether a surface blocks the light", "false"),
@@ -40,9 +42,10 @@ MANUAL = f"""Real-time shader of structural colour, for the scenes that a path t
 Parameters (XML or dictionary):
 {listed(PARAMETERS)}
 
-Gratings (`diffraction_grating`, also inside `twosided`) are shaded from their heights, which must come from a recipe or
-a profile. Rigorous theory is refused, and coats are ignored. All other BSDFs are evaluated unchanged. Only direct light
-of directional and point lights is shaded; other lights, the background and interreflection are omitted.
+Gratings (`diffraction_grating`, also inside `twosided`, normal and bump maps, masks and blends) are shaded from their
+heights, which must come from a recipe or a profile; of several patches, the first. Rigorous theory and lateral scales
+are refused, and coats are ignored. All other BSDFs are evaluated unchanged. Only direct light of directional and point
+lights is shaded; other lights, the background and interreflection are omitted.
 
 The shader computes RGB. It is converted to a spectrum of that colour (`Emission`), which any film can record; a
 colour outside the gamut of sRGB has negative radiance at some wavelengths. Corrected, FLSS and NMM are in the scene's
@@ -53,10 +56,19 @@ BRDF.
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """Lights of a scene and, for each surface, its shader with one table per light."""
+    """Lights and gratings of a scene.
+
+    Attributes:
+        lights: that are supported.
+        gratings: the BSDFs of the gratings.
+        outer: the BSDFs of shapes that are gratings, or in which gratings are nested.
+        shaded: what takes the place of the layers of each grating.
+    """
 
     lights: list[Light]
-    surfaces: list[tuple[Surface, Shader, list[SpectralWeights]]]
+    gratings: list[mi.BSDF]
+    outer: list[mi.BSDF]
+    shaded: list[Shaded]
 
 
 def define() -> type:
@@ -93,12 +105,14 @@ def define() -> type:
             Raises:
                 ValueError: if the shader does not support them.
             """
-            lights = lights_of(scene)
-            surfaces = []
-            for surface in surfaces_of(scene):
-                shader, r_0 = self.shader_of(surface.layers), _normal_reflectance(surface.layers)
-                surfaces.append((surface, shader, [shader.weights(r_0, light.spectrum) for light in lights]))
-            self.prepared = Prepared(lights, surfaces)
+            lights, (gratings, outer) = lights_of(scene), gratings_of(scene)
+            base_weight = self.diffuse_weight if self.quirks.constant_blend else None
+            shaded = []
+            for layers in (bsdf.layers for bsdf in gratings):
+                shader, r_0 = self.shader_of(layers), _normal_reflectance(layers)
+                weights = [shader.weights(r_0, light.spectrum) for light in lights]
+                shaded.append(Shaded(layers, shader, weights, base_weight))
+            self.prepared = Prepared(lights, gratings, outer, shaded)
             return self.prepared
 
         def shader_of(self, layers: Layers) -> Shader:
@@ -106,11 +120,13 @@ def define() -> type:
             for known, shader in self._shaders:
                 if known is layers:
                     return shader
-            height_field, coherence_length = heights_of(layers)
+            recipe = recipe_of(layers)
             settings = dict(self.settings, shadowing=layers.grating.theory.shadowing)
             if self.variant != "gem":
-                settings["coherence_length"] = coherence_length
-            shader = VARIANTS[self.variant](height_field, self.quirks, **settings)
+                settings["coherence_length"] = float(recipe.settings.coherence_length)
+                settings["extent"] = recipe.settings.extent
+                settings["max_height_scale"] = float(layers.grating.scales.height.values[-1])
+            shader = VARIANTS[self.variant](recipe.height_field(), self.quirks, **settings)
             self._shaders.append((layers, shader))
             return shader
 
@@ -139,45 +155,34 @@ def define() -> type:
                 ray; and whether a surface was hit.
             """
             prepared = self.prepared or self.prepare(scene)
-            si = scene.ray_intersect(ray, active)
-            active = active & si.is_valid()
-            bsdf = si.bsdf(ray)
-            masks = [active & surface.contains(bsdf, si.wi) for surface, _, _ in prepared.surfaces]
-            on_other = active
-            for surface, _, _ in prepared.surfaces:
-                on_other = on_other & (surface.is_of(bsdf) ^ True)
-            rgb, radiance = mi.Color3f(0), mi.UnpolarizedSpectrum(0)
-            for index, light in enumerate(prepared.lights):
-                ds, falloff, irradiance = light.sample(si, active)
-                lit = mi.Bool(True)
-                if self.shadows:
-                    lit = scene.ray_test(si.spawn_ray_to(ds.p), active) ^ True
-                direction = si.to_local(ds.d)
-                value = mi.unpolarized_spectrum(bsdf.eval(mi.BSDFContext(), si, direction, on_other & lit))
-                radiance += dr.select(on_other & lit, value * irradiance, 0)
-                for (surface, shader, weights), mask in zip(prepared.surfaces, masks, strict=True):
-                    lit_mask = mask & lit
-                    layers = surface.layers
-                    local_si = mi.SurfaceInteraction3f(si)
-                    local_si.wi = mi.Vector3f(si.wi.x, si.wi.y, surface.side * si.wi.z)
-                    wi = mi.Vector3f(direction.x, direction.y, surface.side * direction.z)
-                    colour = shader.rgb(
-                        along_pattern(layers, local_si, wi, lit_mask),
-                        along_pattern(layers, local_si, local_si.wi, lit_mask),
-                        weights[index],
-                        lit_mask,
-                        layers.grating.scales.height.value,
-                    )
-                    grating_weight = mi.Float(1)
-                    if layers.base is not None:
-                        below = mi.unpolarized_spectrum(layers.base.bsdf.eval(mi.BSDFContext(), local_si, wi, lit_mask))
-                        if self.quirks.constant_blend:
-                            grating_weight = mi.Float(1 - self.diffuse_weight)
-                            below *= self.diffuse_weight
-                        else:
-                            below *= transmitted(layers, local_si, mi.Frame3f.cos_theta(wi), lit_mask)
-                        radiance += dr.select(lit_mask, below * irradiance, 0)
-                    rgb += dr.select(lit_mask, grating_weight * falloff * colour, 0)
+
+            def at_hit(
+                si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active: mi.Bool
+            ) -> tuple[mi.Color3f, mi.UnpolarizedSpectrum]:
+                rgb, radiance = mi.Color3f(0), mi.UnpolarizedSpectrum(0)
+                of_grating = mi.Bool(False)
+                for outer in prepared.outer:
+                    of_grating |= bsdf == mi.BSDFPtr(outer)
+                for index, light in enumerate(prepared.lights):
+                    ds, falloff, irradiance = light.sample(si, active)
+                    lit = mi.Bool(active)
+                    if self.shadows:
+                        lit &= ~scene.ray_test(si.spawn_ray_to(ds.p), active)
+                    direction = si.to_local(ds.d)
+
+                    def value(light: int | None, active: mi.Bool, at=si, wo=direction) -> mi.UnpolarizedSpectrum:
+                        for shaded in prepared.shaded:
+                            shaded.light = light
+                        return mi.unpolarized_spectrum(bsdf.eval(mi.BSDFContext(), at, wo, active))
+
+                    others, both = value(None, lit), value(index, lit & of_grating)
+                    radiance += dr.select(lit, others * irradiance, 0)
+                    colour = mi.Color3f(*((both - others)[channel] for channel in range(3)))
+                    rgb += dr.select(lit & of_grating, falloff * colour, 0)
+                return rgb, radiance
+
+            with in_place(prepared.gratings, prepared.shaded):
+                (rgb, radiance), active = sum_along(scene, ray, active, at_hit)
             if self.quirks.power_gamma:
                 rgb = decode(encode(rgb, True))
             return dr.select(active, rgb, 0), radiance, active
@@ -201,7 +206,9 @@ def _boolean(props: mi.Properties, name: str, default: bool) -> bool:
 
 def _settings(variant: str) -> tuple[str, ...]:
     """Return the parameters specific to a variant of the shader."""
-    return {"pq": ("terms", "interpolation"), "gem": ("spacing", "roughness")}.get(variant, ("terms",))
+    if variant == "gem":
+        return "spacing", "roughness"
+    return "terms", "interpolation" if issubclass(VARIANTS[variant], PQ) else "window"
 
 
 def _normal_reflectance(layers: Layers) -> NDArray[np.float64]:

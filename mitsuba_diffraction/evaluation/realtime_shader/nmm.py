@@ -8,8 +8,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .base import Gain, SpectralWeights, trapezoid
-from .flss import FLSS, RADIUS
+from .base import Gain, SpectralWeights, TextureShader, trapezoid
+from .flss import FLSS
 from .tristimulus import MAX_WAVELENGTH, MIN_WAVELENGTH, WAVELENGTH_COUNT, WAVELENGTH_STEP
 
 _MAX_DISTANCE = 4.0  # from the centre of a line, in σ_f: its power is e^{−4²} = 1e-7 of the maximum there
@@ -27,29 +27,28 @@ class NMM(FLSS):
     When corrected, each wavelength represents the area of its line. Along λ the power of the window is a Gaussian in
     s = 1/λ about the point s* closest to the order, at the distance p:
 
-        ∫ φ² dλ = e^{−p²/σ_f²} √π σ_f λ_n²/|(u, v)|,
+        ∫ φ² dλ = e^{−p²/σ_f²} √π σ_f λ_n²/|(u, v)|
 
-    where λ_n²/|u| = d · dλ/dn is the Jacobian that the thesis omits, which makes violet too strong.
+    where λ_n²/|u| = d · dλ/dn is the Jacobian that the thesis omits, which makes violet too strong. With different σ
+    along x and y, frequencies are in units of σ.
     """
 
     own_quirks = (*FLSS.own_quirks, "no_jacobian")
+    published_terms = 31
 
     @property
     def texel_reads(self) -> int:
         """Maximum number of texels read for one shading point, at |u| = 2."""
-        max_path = 2e3 * max(self.tile_size)  # nm
-        max_orders = np.floor(max_path / MIN_WAVELENGTH) - np.ceil(max_path / MAX_WAVELENGTH) + 1
-        return round(self.textures.terms * (WAVELENGTH_COUNT + max_orders * self.texels_per_term))
+        return round(self.textures.terms * (WAVELENGTH_COUNT + max_orders(self.tile_size) * self.texels_per_term))
 
     def integral(self, gain: Gain, weights: SpectralWeights, height_scale: mi.Float) -> mi.Color3f:
-        slope = dr.sqrt(dr.square(gain.u) + dr.square(gain.v))
-        near = slope * (1e3 / MAX_WAVELENGTH) < _MAX_DISTANCE * self.sigma
+        # In units of σ, in which the window is round.
+        u, v = gain.u / self.sigmas[0], gain.v / self.sigmas[1]
+        slope = dr.sqrt(dr.square(u) + dr.square(v))
+        near = slope * (1e3 / MAX_WAVELENGTH) < _MAX_DISTANCE
         zero = trapezoid(self, self._order_zero, gain, weights, height_scale, gain.active & near)
 
-        along_x = dr.abs(gain.u) * self.tile_size[0] >= dr.abs(gain.v) * self.tile_size[1]
-        path = dr.select(along_x, dr.abs(gain.u) * self.tile_size[0], dr.abs(gain.v) * self.tile_size[1]) * 1e3  # nm
-        first = dr.maximum(mi.Int32(dr.ceil(path / MAX_WAVELENGTH)), 1)
-        last = mi.Int32(dr.floor(path / MIN_WAVELENGTH))
+        along_x, path = main_axis(gain, self.tile_size)
 
         def weighted_power(n: mi.Int32) -> tuple[mi.Float, mi.Float]:
             """Return λ_n in nm, and |P|² times the width in nm that λ_n represents."""
@@ -60,12 +59,12 @@ class NMM(FLSS):
             else:
                 # p is the distance perpendicular to (u, v). Other orders of the main axis have their own wavelengths
                 # and must not be counted twice.
-                window = self._line_window(x, y, along_x, dr.abs(dr.select(along_x, gain.u, gain.v)) / slope)
-                width = float(np.sqrt(np.pi)) * self.sigma * dr.square(wavelength) * 1e-3 / slope
-            power = self.windowed(gain, x, y, wavelength * 1e-3, height_scale, window, gain.active, RADIUS)
+                window = self._line_window(x, y, along_x, dr.abs(dr.select(along_x, u, v)) / slope)
+                width = float(np.sqrt(np.pi)) * dr.square(wavelength) * 1e-3 / slope
+            power = self.windowed(gain, x, y, wavelength * 1e-3, height_scale, window, gain.active)
             return wavelength, power * width
 
-        return zero + _sum_over_orders(self, first, last, weighted_power, gain, weights)
+        return zero + sum_over_orders(self, path, weighted_power, gain, weights)
 
     def _line_window(
         self, x: mi.Float, y: mi.Float, along_x: mi.Bool, tilt: mi.Float
@@ -83,21 +82,34 @@ class NMM(FLSS):
         """Return φ² |F_0|²."""
         x, y = self.position(gain, wavelength)
         zero = mi.Float(0)
-        return self.windowed(gain, zero, zero, wavelength, height_scale, self.window(x, y), active, radius=0)
+        return self.windowed(gain, zero, zero, wavelength, height_scale, self.window(x, y), active, radius=(0, 0))
+
+
+def max_orders(tile_size: tuple[float, float]) -> int:
+    """Return the number of λ_n between 380 and 780 nm at |u| = 2."""
+    path = 2e3 * max(tile_size)  # nm
+    return int(np.floor(path / MIN_WAVELENGTH) - np.ceil(path / MAX_WAVELENGTH) + 1)
+
+
+def main_axis(gain: Gain, tile_size: tuple[float, float]) -> tuple[mi.Bool, mi.Float]:
+    """Return whether |u| T_x ≥ |v| T_y, and the larger of both, d |u| in nm."""
+    paths = dr.abs(gain.u) * tile_size[0], dr.abs(gain.v) * tile_size[1]
+    along_x = paths[0] >= paths[1]
+    return along_x, dr.select(along_x, *paths) * 1e3
 
 
 @dr.syntax
-def _sum_over_orders(
-    shader: NMM,
-    first: mi.Int32,
-    last: mi.Int32,
+def sum_over_orders(
+    shader: TextureShader,
+    path: mi.Float,
     weighted_power: Callable[[mi.Int32], tuple[mi.Float, mi.Float]],
     gain: Gain,
     weights: SpectralWeights,
 ) -> mi.Color3f:
-    """Return Σ_n F/F₀ weighted_power(n) S (x̄, ȳ, z̄)(λ_n)."""
+    """Return Σ_n F/F₀ weighted_power(n) S (x̄, ȳ, z̄)(λ_n), λ_n = path/n in nm, over the visible wavelengths."""
     result = mi.Color3f(0)
-    n = mi.Int32(first)
+    n = dr.maximum(mi.Int32(dr.ceil(path / MAX_WAVELENGTH)), 1)
+    last = mi.Int32(dr.floor(path / MIN_WAVELENGTH))
     while gain.active & (n <= last):
         wavelength, power = weighted_power(n)
         weight, r_0 = weights(wavelength, gain.active)

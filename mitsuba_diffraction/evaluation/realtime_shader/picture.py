@@ -12,10 +12,10 @@ from .tristimulus import EMISSION, primary_spectra
 
 
 def encode(rgb: mi.Color3f, power_gamma: bool) -> mi.Color3f:
-    """Encode linear RGB for a display: a power of 1/2.2, or the transfer function of sRGB (IEC 61966-2-1)."""
+    """Encode linear RGB for a display: a power of 1/2.5, or the transfer function of sRGB (IEC 61966-2-1)."""
     rgb = dr.maximum(rgb, 0)
     if power_gamma:
-        return dr.power(rgb, 1 / 2.2)
+        return dr.power(rgb, 1 / 2.5)
     return dr.select(rgb <= 0.0031308, 12.92 * rgb, 1.055 * dr.power(rgb, 1 / 2.4) - 0.055)
 
 

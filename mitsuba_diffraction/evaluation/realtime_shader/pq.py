@@ -83,6 +83,7 @@ class PQ(TextureShader):
 
     own_quirks = (*TextureShader.own_quirks, "wrong_product")
     origin_at_centre = True
+    published_terms = 39
 
     def __init__(
         self,
@@ -101,6 +102,7 @@ class PQ(TextureShader):
             interpolation: "sinc" or "linear".
             radius: of the sinc kernel, in texels on each side.
         """
+        self.radius = check_integer("radius", radius, 1)
         super().__init__(height_field, quirks, **settings)
         if interpolation not in INTERPOLATIONS:
             raise RequestError(f"interpolation: got {interpolation!r}, wanted one of {', '.join(INTERPOLATIONS)}")
@@ -110,7 +112,10 @@ class PQ(TextureShader):
         if len(self.tiles) != 2:
             raise RequestError(f"tiles: got {tiles!r}, wanted two whole numbers ≥ 1, along x and y")
         self.interpolation = interpolation
-        self.radius = check_integer("radius", radius, 1)
+
+    @property
+    def margin(self) -> int:
+        return self.radius + 1
 
     @property
     def peak(self) -> float:
@@ -123,7 +128,7 @@ class PQ(TextureShader):
 
     def power(self, gain: Gain, wavelength: mi.Float, height_scale: mi.Float, active: mi.Bool) -> mi.Float:
         x, y = gain.u * self.tile_size[0] / wavelength, gain.v * self.tile_size[1] / wavelength
-        columns, rows = self.textures.columns, self.textures.rows
+        rows, columns = self._height_field.shape
         active = active & (dr.abs(x) <= columns / 2) & (dr.abs(y) <= rows / 2)
         if self.interpolation == "linear":
             first, size = [dr.floor(c) for c in (x, y)], (2, 2)
@@ -137,7 +142,7 @@ class PQ(TextureShader):
 
     def _kernel(self, x: mi.Float, y: mi.Float) -> Callable[[mi.Int32, mi.Int32], mi.Float]:
         """Return the weight of texel m at the position (x, y)."""
-        counts = self.textures.columns, self.textures.rows
+        counts = self._height_field.shape[::-1]
 
         def linear(m_x: mi.Int32, m_y: mi.Int32) -> mi.Float:
             return dr.maximum(1 - dr.abs(mi.Float(m_x) - x), 0) * dr.maximum(1 - dr.abs(mi.Float(m_y) - y), 0)

@@ -1,74 +1,56 @@
-"""The gratings of a scene and their height fields."""
+"""The gratings of a scene, and the shader in their place."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
+import drjit as dr
 import mitsuba as mi
 
 from ...bsdf.base import contains_grating, is_grating, nested
 from ...bsdf.geometry import rotated
 from ...bsdf.layers import Layers
 from ...errors import RequestError
+from ...recipe import Recipe
 from ...rigorous.spectrum import RigorousSpectrum
-from ...surface.heightfield import HeightField
+from .base import Shader, SpectralWeights
+
+_MAX_MASKS = 16  # that a ray passes
 
 
-@dataclass(frozen=True, eq=False)
-class Surface:
-    """One side of a grating in a scene.
-
-    Attributes:
-        bsdf: the BSDF of the shape, the grating or a `twosided` around it.
-        layers: of the `diffraction_grating`; the shader ignores a coat.
-        side: 1 for the front face, −1 for the back face.
-    """
-
-    bsdf: mi.BSDF
-    layers: Layers
-    side: int
-
-    def is_of(self, bsdf: mi.BSDF) -> mi.Bool:
-        """Return whether a point has the BSDF of this surface."""
-        return bsdf == mi.BSDFPtr(self.bsdf)
-
-    def contains(self, bsdf: mi.BSDF, wo: mi.Vector3f) -> mi.Bool:
-        """Return whether a point with this BSDF, seen from ω_o, lies on this side of this surface."""
-        return self.is_of(bsdf) & (self.side * wo.z > 0)
-
-
-def surfaces_of(scene: mi.Scene) -> list[Surface]:
-    """Return all gratings of a scene.
+def gratings_of(scene: mi.Scene) -> tuple[list[mi.BSDF], list[mi.BSDF]]:
+    """Return all gratings of a scene, and the BSDFs of its shapes which they are or are nested in.
 
     Raises:
-        ValueError: if a grating is nested in a BSDF other than `twosided`, or is of rigorous theory.
+        ValueError: if a grating is of rigorous theory or has a lateral scale.
     """
-    found: list[Surface] = []
-    seen: list[mi.BSDF] = []
+    gratings: list[mi.BSDF] = []
+    outer: list[mi.BSDF] = []
     for shape in scene.shapes():
         bsdf = shape.bsdf()
-        if bsdf is None or any(bsdf is other for other in seen):
+        if bsdf is None or any(bsdf is other for other in outer) or not contains_grating(bsdf):
             continue
-        seen.append(bsdf)
-        if is_grating(bsdf):
-            found.append(Surface(bsdf, bsdf.layers, 1))
-            continue
-        parts = nested(bsdf)
-        if bsdf.class_name() == "TwoSidedBRDF":
-            sides = ((parts[0], 1), (parts[-1], -1))
-            found += [Surface(bsdf, part.layers, side) for part, side in sides if is_grating(part)]
-        elif any(map(contains_grating, parts)):
-            raise RequestError(
-                f"diffraction_shader: a diffraction_grating is nested in {bsdf.class_name()}, wanted on a shape or "
-                "in twosided"
-            )
-    if any(isinstance(surface.layers.grating.spectrum, RigorousSpectrum) for surface in found):
-        raise RequestError("diffraction_shader: got a grating with theory=rigorous, wanted one of scalar theory")
-    return found
+        outer.append(bsdf)
+        inside = [bsdf]
+        while inside:
+            part = inside.pop()
+            if not is_grating(part):
+                inside += nested(part)
+            elif all(part is not other for other in gratings):
+                gratings.append(part)
+    for bsdf in gratings:
+        grating = bsdf.layers.grating
+        if isinstance(grating.spectrum, RigorousSpectrum):
+            raise RequestError("diffraction_shader: got a grating with theory=rigorous, wanted one of scalar theory")
+        if grating.scales.lateral is not None:
+            raise RequestError("diffraction_shader: got a grating with a lateral_scale, wanted one without")
+    return gratings, outer
 
 
-def heights_of(layers: Layers) -> tuple[HeightField, float]:
-    """Return the height field and its coherence length in µm.
+def recipe_of(layers: Layers) -> Recipe:
+    """Return the recipe of a grating, which has its heights.
 
     Raises:
         ValueError: for a saved spectrum, which does not contain heights.
@@ -79,17 +61,112 @@ def heights_of(layers: Layers) -> tuple[HeightField, float]:
             "diffraction_shader: it needs heights, which a saved spectrum does not contain; give the grating a "
             "recipe (filename=….toml) or a profile"
         )
-    return recipe.height_field(), float(recipe.settings.coherence_length)
+    return recipe
 
 
-def along_pattern(layers: Layers, si: mi.SurfaceInteraction3f, omega: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:
-    """Return a direction, given in the shading frame, in the frame of the pattern."""
-    return rotated(omega, *layers.grating.frame(si, active))
+@dataclass(eq=False)
+class Shaded:
+    """The layers of a grating for the shader.
+
+    While the shader renders, it takes the place of the layers in their BSDF, so that Mitsuba's own BSDFs around it
+    apply: `twosided`, normal and bump maps, masks, blends.
+
+    Attributes:
+        layers: of the `diffraction_grating`; the shader ignores a coat.
+        shader: of its heights.
+        weights: one table for each light.
+        base_weight: constant weight of the base; None for the transmittance of the surface.
+        light: index of a light: its linear sRGB is added to the first three wavelengths of the base's value; None for
+            the base alone.
+    """
+
+    layers: Layers
+    shader: Shader
+    weights: list[SpectralWeights]
+    base_weight: float | None
+    light: int | None = None
+
+    def evaluate(
+        self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool
+    ) -> tuple[mi.Spectrum, mi.Float]:
+        """Evaluate as `Layers.evaluate`, without density; ω_i is the direction to the viewer, ω_o to the light."""
+        value, weight = mi.UnpolarizedSpectrum(0), mi.Float(1)
+        grating, base = self.layers.grating, self.layers.base
+        active = active & (mi.Frame3f.cos_theta(si.wi) > 0) & (mi.Frame3f.cos_theta(wo) > 0)
+        if base is not None:
+            value = mi.unpolarized_spectrum(base.bsdf.eval(mi.BSDFContext(), si, wo, active))
+            if self.base_weight is None:
+                for omega in (si.wi, wo):
+                    value *= grating.transmittance(si, mi.Frame3f.cos_theta(omega), active)
+            else:
+                value, weight = self.base_weight * value, mi.Float(1 - self.base_weight)
+        if self.light is not None:
+            frame = grating.frame(si, active)
+            rgb = self.shader.rgb(
+                rotated(wo, *frame),
+                rotated(si.wi, *frame),
+                self.weights[self.light],
+                active,
+                grating.scales.height.at(si, active),
+            )
+            for channel in range(3):
+                value[channel] += weight * rgb[channel]
+        return mi.depolarizer(dr.select(active, value, 0)), mi.Float(0)
 
 
-def transmitted(
-    layers: Layers, si: mi.SurfaceInteraction3f, cos_o: mi.Float, active: mi.Bool
-) -> mi.UnpolarizedSpectrum:
-    """Return (1 − R_i)(1 − R_o), the transmittance of the surface to the base and out again."""
-    transmittance = layers.grating.transmittance
-    return transmittance(si, mi.Frame3f.cos_theta(si.wi), active) * transmittance(si, cos_o, active)
+@contextmanager
+def in_place(gratings: list[mi.BSDF], shaded: list[Shaded]) -> Iterator[None]:
+    """Put the shader in the place of the layers of gratings, within a `with` block."""
+    try:
+        for bsdf, layers in zip(gratings, shaded, strict=True):
+            bsdf.layers = layers
+        yield
+    finally:
+        for bsdf, layers in zip(gratings, shaded, strict=True):
+            bsdf.layers = layers.layers
+
+
+def sum_along(
+    scene: mi.Scene,
+    ray: mi.RayDifferential3f,
+    active: mi.Bool,
+    at_hit: Callable[[mi.SurfaceInteraction3f, mi.BSDFPtr, mi.Bool], tuple],
+) -> tuple[tuple, mi.Bool]:
+    """Sum what a ray shows: the first surface that it hits, and through masks those behind.
+
+    Args:
+        scene: the scene.
+        ray: from the camera.
+        active: mask.
+        at_hit: returns arrays for a surface.
+
+    Returns:
+        The sums, and whether a surface was hit.
+    """
+    masked = any(
+        shape.bsdf() is not None and mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Null) for shape in scene.shapes()
+    )
+    si = scene.ray_intersect(ray, active)
+    hit = active & si.is_valid()
+    bsdf = si.bsdf(ray)
+    sums = at_hit(si, bsdf, hit)
+    if not masked:
+        return sums, hit
+
+    def behind(si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active: mi.Bool) -> mi.Float:
+        # Masks and blends with them are grey.
+        return dr.select(active, mi.unpolarized_spectrum(bsdf.eval_null_transmission(si, active))[0], 0)
+
+    def step(ray: mi.Ray3f, throughput: mi.Float, count: mi.UInt32, *sums: object) -> tuple[object, ...]:
+        si = scene.ray_intersect(ray, throughput > 0)
+        hit = (throughput > 0) & si.is_valid()
+        bsdf = si.bsdf()
+        sums = (total + throughput * value for total, value in zip(sums, at_hit(si, bsdf, hit), strict=True))
+        return si.spawn_ray(ray.d), throughput * behind(si, bsdf, hit), count + 1, *sums
+
+    state = dr.while_loop(
+        (si.spawn_ray(ray.d), behind(si, bsdf, hit), mi.UInt32(0), *sums),
+        lambda ray, throughput, count, *sums: (throughput > 0) & (count < _MAX_MASKS),
+        step,
+    )
+    return state[3:], hit

@@ -9,27 +9,59 @@ import mitsuba as mi
 import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
+from scipy.special import gammaln
 
 from ...bsdf.tables import PacketTable, opaque
 from ...errors import RequestError
 from ...surface.heightfield import HeightField
+from .tristimulus import MIN_WAVELENGTH
 
-PUBLISHED_TERMS = 37  # 81 wavelengths × 37 terms × 9 texels are the 27,000 reads of the published shader
+MAX_KAPPA = 4e3 * np.pi / MIN_WAVELENGTH  # rad/µm, at normal incidence
+MAX_FREQUENCY = 2e3 / MIN_WAVELENGTH  # cycles/µm, at grazing incidence
+
+
+def terms_for(x: float, error: float) -> int:
+    """Return the smallest N with x^N/N! ≤ `error`: Lagrange's remainder of e^{ix}, whose derivatives have modulus 1."""
+    terms, remainder = 0, 1.0
+    while remainder > error:
+        terms += 1
+        remainder *= x / terms
+    return max(terms, 1)
+
+
+def series_error(x: float, terms: int) -> float:
+    """Estimate the error of N Taylor terms of e^{ix} in float32: remainder, and rounding of the largest term.
+
+    The largest term is about e^x/√(2πx) (Stirling), while the sum has modulus one: in float32 a series from x = 14 on
+    loses more than a per cent, whatever the number of terms.
+    """
+    remainder = np.exp(terms * np.log(x) - gammaln(terms + 1)) if x > 0 else 0.0
+    largest = np.exp(x) / np.sqrt(2 * np.pi * max(x, 1 / (2 * np.pi)))
+    return float(remainder + np.finfo(np.float32).eps / 2 * largest)
 
 
 def taylor_transforms(
-    height_field: HeightField, terms: int, *, heights_from_zero: bool, origin_at_centre: bool
+    height_field: HeightField,
+    terms: int,
+    *,
+    heights_from_zero: bool,
+    origin_at_centre: bool,
+    taper: NDArray[np.float64] | None = None,
+    margin: int = 1,
 ) -> tuple[NDArray[np.complex64], float]:
-    """Compute F{tⁿ}(m) with t = h/H, n < N; |t| ≤ 1 bounds them by one.
+    """Compute F{w tⁿ}(m) with t = h/H, n < N; |t| ≤ 1 bounds them by one.
 
     Args:
         height_field: the tile, h.
         terms: N.
         heights_from_zero: measure heights from the lowest point (H is the full range) instead of the centre.
         origin_at_centre: x = 0 at the centre of the tile instead of the first pixel, which affects the phase.
+        taper: w, (N_y, N_x); default: one.
+        margin: texels beyond the highest frequency that light reaches.
 
     Returns:
-        The texels, (N_y, N_x, N), with frequency zero at (N_y // 2, N_x // 2) (eq. 4.3); and H in µm.
+        The texels of the frequencies that light reaches, (n_y, n_x, N), with frequency zero at (n_y // 2, n_x // 2)
+        (eq. 4.3); and H in µm.
 
     Raises:
         ValueError: if there are no terms.
@@ -39,14 +71,21 @@ def taylor_transforms(
     heights = height_field.heights - height_field.heights.min() if heights_from_zero else height_field.centred
     height = height_field.height_range if heights_from_zero else height_field.half_range
     t = heights / (height or 1.0)
-    powers = t[None] ** np.arange(terms)[:, None, None]
-    spectrum = scipy.fft.fftshift(scipy.fft.fft2(powers, norm="forward"), axes=(1, 2))
-    if origin_at_centre:
-        for axis, count in zip((1, 2), height_field.shape, strict=True):
-            order = np.arange(count) - count // 2
-            phase = np.exp(1j * np.pi * order * (count - 1) / count)
-            spectrum = spectrum * np.expand_dims(phase, [a for a in (0, 1, 2) if a != axis])
-    return np.ascontiguousarray(np.moveaxis(spectrum, 0, -1), np.complex64), float(height)
+    kept, phases = [], []
+    for count, size in zip(height_field.shape, height_field.tile_size[::-1], strict=True):
+        middle, reached = count // 2, int(np.ceil(MAX_FREQUENCY * size)) + margin
+        first = max(middle - reached, 0)
+        kept.append(slice(first, 2 * middle - first + 1 if first else count))
+        order = np.arange(count)[kept[-1]] - middle
+        phases.append(np.exp(1j * np.pi * order * (count - 1) / count))
+    phase = np.outer(*phases) if origin_at_centre else 1.0
+    power = np.ones(t.shape) if taper is None else taper
+    texels = []
+    for _ in range(terms):
+        transform = scipy.fft.fftshift(scipy.fft.fft2(power, norm="forward"))[tuple(kept)]
+        texels.append((transform * phase).astype(np.complex64))
+        power = power * t
+    return np.stack(texels, axis=-1), float(height)
 
 
 class TaylorTextures:
@@ -61,11 +100,13 @@ class TaylorTextures:
     Attributes:
         columns, rows: the numbers of texels along x and y.
         terms: N.
+        error: of the series at the largest κ (`series_error`).
     """
 
     def __init__(self, texels: NDArray[np.complex64], height: float) -> None:
         """Store the result of `taylor_transforms`."""
         self.rows, self.columns, self.terms = texels.shape
+        self.error = series_error(MAX_KAPPA * height, self.terms)
         self.height = opaque(height)
         self.table = PacketTable(np.stack([texels.real, texels.imag], axis=-1), width=2)
 
