@@ -1,7 +1,9 @@
 """Evaluation as in chapter 5 of the thesis of 2014: grating equation, analytic orders, direct sums."""
 
 import csv
+import dataclasses
 import functools
+from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
@@ -23,11 +25,13 @@ from mitsuba_diffraction.evaluation.validation.viewing_angle import (
     peak_angles,
     reflectance_map,
     relative_reflectance,
+    ridges,
     viewing_angles,
     wavelengths,
 )
 from mitsuba_diffraction.settings import Settings
 
+ROOT = Path(__file__).parents[2]
 BLAZE = SURFACES["blaze"]
 COARSE = wavelengths(40.0)
 SKINS = {"elaphe": (1, 1.144), "xenopeltis": (0, 1.552)}
@@ -119,6 +123,58 @@ def test_the_fit_reveals_periods_that_vary_with_the_wavelength():
     fraction = half.mean()
     assert fit.mean == pytest.approx(2450 + 50 * fraction, abs=0.01)
     assert fit.variance == pytest.approx(2500 * fraction * (1 - fraction), rel=1e-3)
+
+
+def two_gratings():
+    """A map of two gratings, the ridge of one half as high as that of the other."""
+    first, second = gaussian_lobes(2.5, step=0.1), gaussian_lobes(1.9, step=0.1)
+    both = first.reflectance + 0.5 * second.reflectance
+    return ReflectanceMap(BLAZE, "flss", 75.0, first.wavelengths, first.angles, both)
+
+
+def test_ridges_are_found_with_their_heights():
+    first, second = ridges(two_gratings())
+    assert (first.period, first.height) == (pytest.approx(2500, rel=1e-3), 1)
+    assert (second.period, second.height) == (pytest.approx(1900, rel=1e-3), pytest.approx(0.5, rel=0.02))
+    assert [ridge.period for ridge in ridges(gaussian_lobes(2.2))] == [pytest.approx(2200, rel=1e-3)]
+
+
+def test_a_peak_outside_the_range_of_angles_gives_way_to_the_next_ridge():
+    found = two_gratings()
+    angles, other = (grating_equation(d, 75.0, found.wavelengths) for d in (2.5, 1.9))
+    np.testing.assert_allclose(peak_angles(found, (angles[0] - 1, 90.0)), angles, atol=1e-2)
+    # At the shortest wavelengths the first ridge is outside.
+    peaks = peak_angles(found, ((angles[2] + angles[3]) / 2, 90.0))
+    np.testing.assert_allclose(peaks, np.where(np.arange(angles.size) < 3, other, angles), atol=1e-2)
+    assert np.isnan(peak_angles(gaussian_lobes(2.5, width=0.001), (85.0, 89.0))).all()
+
+
+def test_the_published_fit_of_pq_is_that_of_a_ridge_that_leaves_the_range_of_angles():
+    # Tile of 65 µm: orders 63 and 55. Final text, table 5.1; its "variance" is a standard deviation.
+    surface, nanometres = SURFACES["elaphe_scan"], wavelengths()
+    inside = grating_equation(65 / 63, 75.0, nanometres) <= surface.angles[1]
+    periods = np.where(inside, 65e3 / 63, 65e3 / 55)
+    mean, deviation = surface.final["pq"]
+    assert periods.mean() == pytest.approx(mean, abs=2)
+    assert periods.std() == pytest.approx(deviation, abs=2)
+
+
+def test_three_orders_of_the_scan_of_elaphe_are_equally_strong():
+    # Without this package: the orders of the tile along x, at the phase of order 57 at 580 nm and 75°.
+    with Image.open(ROOT / "precompute" / "measured" / "elaphe_afm_65um.png") as picture:
+        heights = np.asarray(picture.convert("L"), float)[::4] / 255 * 0.4347
+    out = np.sqrt(1 - (0.58 * 57 / 65 - np.sin(np.deg2rad(75))) ** 2)
+    field = np.exp(2j * np.pi / 0.58 * (np.cos(np.deg2rad(75)) + out) * heights).mean(axis=0)
+    powers = np.abs(np.fft.fft(field))[-1:-80:-1] ** 2  # orders of light from +x: 1, 2, …
+    strongest = 1 + np.argsort(powers[49:70])[::-1][:3] + 49
+    assert sorted(strongest) == [55, 57, 63]
+    assert powers[strongest - 1].max() < 1.3 * powers[strongest - 1].min()
+
+
+@pytest.mark.parametrize(("azimuth", "expected"), [(None, (-0.5, 0)), (0.0, (0.5, 0)), (90.0, (0, 0.5))])
+def test_the_azimuth_of_a_surface_is_that_of_the_light(azimuth, expected):
+    surface = dataclasses.replace(BLAZE, azimuth=azimuth)
+    np.testing.assert_allclose(surface.direction([30.0])[0], (*expected, np.sqrt(0.75)), atol=1e-9)
 
 
 def test_the_peaks_lie_on_the_grating_equation():
@@ -258,7 +314,8 @@ def test_figures_and_the_table_are_written(llvm, tmp_path):
         *(f"{name}, {how}" for name in ("FLSS", "NMM", "PQ") for how in ("as published", "corrected")),
     ]
     for row in rows:
-        assert float(row[head.index("period / nm")]) == pytest.approx(2500, rel=1e-3)
+        for column in ("all angles: period ± deviation / nm", "published angles"):
+            assert float(row[head.index(column)].split(" ± ")[0]) == pytest.approx(2500, rel=1e-3)
     table = (folder / "periods.md").read_text(encoding="utf-8").splitlines()
     assert len(table) == 2 + len(rows)
     assert f"| {' | '.join(rows[0])} |" == table[2]
@@ -280,6 +337,10 @@ def test_figures_and_the_table_are_written(llvm, tmp_path):
         (lambda: brdf_map(BLAZE, projection="fisheye"), "projection: got 'fisheye'"),
         (lambda: brdf_map(BLAZE, incidence=(95.0, 0.0)), r"incidence: got \(95\.0, 0\.0\)"),
         (lambda: relative_reflectance(BLAZE.spectrum, [0, 0, 1], [[0, 1]], [500.0]), "wi, wo, wavelengths: got shapes"),
+        (
+            lambda: ridges(ReflectanceMap(BLAZE, "nmm", 75.0, COARSE[:1], np.zeros((1, 3)), np.ones((1, 3)))),
+            "found: got a map of nmm, wanted one with all viewing angles",
+        ),
         (lambda: PublishedSurface("x", BLAZE.recipe, 2, 1.0, (0, 0)), "axis: got 2"),
         (lambda: PublishedSurface("x", BLAZE.recipe, 0, 0.0, (0, 0)), r"period: got 0\.0"),
     ],

@@ -125,7 +125,7 @@ def brdf_map(
 
 def _linear_rgb(surface: PublishedSurface, method: str, wi: Array, wo: Array, quirks: Quirks | None) -> Array:
     if method != MODEL:
-        settings = {} if method == "gem" else {"coherence_length": surface.coherence_length}
+        settings = {} if method == "gem" else {"coherence_length": surface.shader_coherence_length}
         return colour(surface.height_field, wi, wo, variant=method, quirks=quirks, **settings)
     nanometres = wavelengths()
     values = relative_reflectance(surface.spectrum, wi, wo, nanometres)

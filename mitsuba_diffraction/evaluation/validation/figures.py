@@ -26,6 +26,7 @@ from .viewing_angle import (
     grating_equation,
     peak_angles,
     reflectance_map,
+    ridges,
     wavelengths,
 )
 
@@ -76,8 +77,7 @@ def plot_reflectance(maps: Sequence[ReflectanceMap]) -> Figure:
     for panel, found in zip(axes, maps, strict=True):
         image = _draw_map(panel, found)
         fit = fit_period(found)
-        variance = f"{fit.variance:.2g}" if fit.variance >= 1e-3 else "< 0.001"
-        panel.set_title(f"{TITLES[found.method]}\nperiod {fit.mean:.1f} nm, variance {variance} nm²", fontsize=10)
+        panel.set_title(f"{TITLES[found.method]}\nperiod {fit.mean:.1f} ± {fit.deviation:.2g} nm", fontsize=10)
         panel.set_xlabel("wavelength λ / nm")
     surface, incidence = maps[0].surface, maps[0].incidence
     axes[0].set_ylabel("viewing angle θ$_r$ / °")
@@ -105,6 +105,9 @@ def _draw_map(panel: Axes, found: ReflectanceMap) -> ScalarMappable:
     else:
         image = panel.pcolormesh(found.wavelengths, found.angles, shown.T, shading="nearest", **style)
     panel.plot(found.wavelengths, peak_angles(found), color=_PEAK, linewidth=2.5, label="peak")
+    for angle in found.surface.angles:
+        if abs(angle) < 90:
+            panel.axhline(angle, color="white", linewidth=0.7)
     period = found.surface.period
     equation = grating_equation(period, found.incidence, found.wavelengths)
     panel.plot(
@@ -173,10 +176,10 @@ def _mark_orders(panel: Axes, found: BRDFMap) -> None:
 PERIOD_COLUMNS = (
     "surface",
     "method",
-    "period / nm",
-    "variance / nm²",
-    "thesis: period / nm",
-    "thesis: variance / nm²",
+    "all angles: period ± deviation / nm",
+    "published angles",
+    "thesis, final text",
+    "ridges: period / nm (relative height)",
 )
 
 
@@ -201,8 +204,14 @@ def period_rows(surface: PublishedSurface, maps: Iterable[ReflectanceMap], step:
             )
             fits = {", as published": found, ", corrected": corrected}
         for manner, one in fits.items():
-            fit, published = fit_period(one), surface.published
-            numbers = f"{fit.mean:.2f}", f"{fit.variance:.3f}", f"{published[0]:.2f}", f"{published[1]:.2f}"
+            everywhere, there = fit_period(one), fit_period(one, surface.angles)
+            final = surface.final.get(found.method) if manner != ", corrected" else None
+            bright = [] if one.discrete else ridges(one)[:4]
+            numbers = [
+                *(f"{fit.mean:.2f} ± {fit.deviation:.2f}" for fit in (everywhere, there)),
+                "{:.2f}, {:.2f}".format(*final) if final else "–",
+                ", ".join(f"{ridge.period:.0f} ({ridge.height:.2f})" for ridge in bright) or "–",
+            ]
             rows.append([surface.name, name + manner, *numbers])
     return rows
 
@@ -267,7 +276,7 @@ def save_figures(
         ]
         save(plot_brdf_maps(brdf_maps), f"brdf_{name}.png")
     tables = [folder / "periods.md", folder / "periods.csv"]
-    save_markdown(markdown(PERIOD_COLUMNS, rows, texts=2), tables[0])
+    save_markdown(markdown(PERIOD_COLUMNS, rows, texts=6), tables[0])
     with whole_file(tables[1]) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
         csv.writer(file).writerows([PERIOD_COLUMNS, *rows])
         file.write(f"# {MARK}\n")

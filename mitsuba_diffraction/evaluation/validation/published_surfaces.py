@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ...cli.examples import source
 from ...errors import RequestError
 from ...grating_spectrum import GratingSpectrum
 from ...recipe import Recipe
-from ...settings import Settings
+from ...settings import SUN_COHERENCE_LENGTH, Settings
 from ...surface.heightfield import HeightField
 
 
@@ -19,15 +21,19 @@ from ...surface.heightfield import HeightField
 class PublishedSurface:
     """A grating, and the published numbers about it.
 
-    Light and viewer are in the plane of the normal and the diffracting axis. Angles are positive towards −x (−y): the
-    blaze direction is positive, and the grating equation d (sin θ_i + sin θ_r) = nλ has n > 0.
+    Light and viewer are in the plane of the normal and the diffracting axis. Angles are positive towards the light,
+    which the grating equation d (sin θ_i + sin θ_r) = nλ has for n > 0.
 
     Attributes:
         name: for titles.
         recipe: of the heights and the spectrum.
-        axis: the diffracting axis, 0 for x and 1 for y.
+        axis: the diffracting axis, 0 for x and 1 for y; of the two, that which is nearer to the azimuth.
         period: d of the grating equation, µm, as published.
-        published: (mean in nm, variance in nm²) of the period that the thesis fits (table 5.1).
+        published: (mean in nm, variance in nm²) of the period that the draft of the thesis fits (table 5.1).
+        azimuth: of the light, degrees from x towards y; by default along −x or −y, the direction of a blaze.
+        final: by method, (mean, standard deviation) in nm of table 5.1 of the final text, which calls the latter
+            variance; where it has the surface and the method.
+        angles: range of the viewing angles of the published maps (final text, figures 5.8 to 5.10), degrees.
     """
 
     name: str
@@ -35,6 +41,9 @@ class PublishedSurface:
     axis: int
     period: float
     published: tuple[float, float]
+    azimuth: float | None = None
+    final: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    angles: tuple[float, float] = (-90.0, 90.0)
 
     def __post_init__(self) -> None:
         if self.axis not in (0, 1):
@@ -57,17 +66,23 @@ class PublishedSurface:
         """L_c in µm."""
         return float(self.recipe.settings.coherence_length)
 
+    @property
+    def shader_coherence_length(self) -> float:
+        """L_c of the shader in µm, which repeats a scan as a tile: that of sunlight, as published."""
+        return SUN_COHERENCE_LENGTH if self.recipe.settings.extent == "sample" else self.coherence_length
+
     def direction(self, angle: ArrayLike) -> NDArray[np.float64]:
-        """Return unit vectors (..., 3) at angles (...) in degrees from the normal, in the plane of the surface."""
+        """Return unit vectors (..., 3) at angles (...) in degrees from the normal, positive on the light's side."""
         angle = np.deg2rad(np.asarray(angle, np.float64))
-        result = np.zeros((*angle.shape, 3))
-        result[..., self.axis], result[..., 2] = -np.sin(angle), np.cos(angle)
-        return result
+        azimuth = np.deg2rad((180.0, 270.0)[self.axis] if self.azimuth is None else self.azimuth)
+        # Rounded, so that a plane along an axis has no other component.
+        x, y = np.round((np.cos(azimuth), np.sin(azimuth)), 12)
+        return np.stack([x * np.sin(angle), y * np.sin(angle), np.cos(angle)], axis=-1)
 
     def with_coherence_length(self, coherence_length: float) -> PublishedSurface:
         """Return the same surface with another coherence length, µm."""
-        recipe = replace(self.recipe, settings=replace(self.recipe.settings, coherence_length=coherence_length))
-        return PublishedSurface(self.name, recipe, self.axis, self.period, self.published)
+        settings = replace(self.recipe.settings, coherence_length=coherence_length)
+        return replace(self, recipe=replace(self.recipe, settings=settings))
 
 
 def _skin(profile: str, depth: float) -> Recipe:
@@ -77,11 +92,45 @@ def _skin(profile: str, depth: float) -> Recipe:
     )
 
 
+def _scan(file: str, height_range: float) -> Recipe:
+    """Return a scan of 65 µm as the author of the thesis used it, dust included (precompute/measured/README.md)."""
+    surface = {"scan": file, "pixel_size": 65 / 1332, "height_range": height_range}
+    # Nearly half of the scan, the largest coherence length that it supports.
+    settings = Settings(extent="sample", coherence_length=32.0, tolerance=0.01)
+    return Recipe(surface, settings, source() / "precompute" / "measured")
+
+
 SURFACES = {
     "blaze": PublishedSurface(
-        "Blaze", Recipe({"profile": "blazed", "period": 2.5, "depth": 0.246}), 0, 2.5, (2500.34, 0.16)
+        "Blaze",
+        Recipe({"profile": "blazed", "period": 2.5, "depth": 0.246}),
+        0,
+        2.5,
+        (2500.34, 0.16),
+        final={"flss": (2499.997, 0.377), "nmm": (2499.997, 0.377), "pq": (2502.428, 0.390)},
+        angles=(-55.0, -40.0),
     ),
     "elaphe": PublishedSurface("Elaphe (synthetic)", _skin("elaphe", 0.375), 1, 1.144, (1144.28, 0.15)),
     "xenopeltis": PublishedSurface("Xenopeltis (synthetic)", _skin("xenopeltis", 0.443), 0, 1.552, (1552.27, 0.45)),
+    "elaphe_scan": PublishedSurface(
+        "Elaphe (scan)",
+        _scan("elaphe_afm_65um.png", 0.4347),
+        0,
+        1.144,
+        (1144.28, 0.15),
+        azimuth=0.0,
+        final={"flss": (1144.262, 0.401), "nmm": (1144.179, 0.677), "pq": (1052.308, 49.678)},
+        angles=(-40.0, -15.0),
+    ),
+    "xenopeltis_scan": PublishedSurface(
+        "Xenopeltis (scan)",
+        _scan("xenopeltis_afm_65um.png", 0.4435),
+        1,
+        1.552,
+        (1552.27, 0.45),
+        final={"flss": (1552.27, 0.45)},
+        angles=(-50.0, -25.0),
+    ),
 }
-"""Name → surface. The skins are synthetic stand-ins; those of the thesis were measured."""
+"""Name → surface. The synthetic skins have the periods that the thesis fits to its scans. The thesis does not state the
+azimuth of the light; on the scan of Elaphe it is the side of x on which FLSS has the published period."""

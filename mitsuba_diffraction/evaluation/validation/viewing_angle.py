@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.signal import find_peaks
 
 from ... import testing
 from ...errors import RequestError
@@ -170,7 +171,7 @@ def reflectance_map(
             np.broadcast_to(nanometres[:, None], everywhere.shape),
             variant=method,
             quirks=quirks,
-            coherence_length=surface.coherence_length,
+            coherence_length=surface.shader_coherence_length,
         )
         values = np.where(np.isnan(everywhere), np.nan, values)
     return ReflectanceMap(surface, method, float(incidence), nanometres, angles, np.asarray(values, np.float64))
@@ -186,8 +187,12 @@ def _order_angles(surface: PublishedSurface, incidence: float, nanometres: Array
     return np.rad2deg(np.arcsin(np.where(np.abs(sines) < 1, sines, np.nan)))
 
 
-def peak_angles(found: ReflectanceMap) -> Array:
+def peak_angles(found: ReflectanceMap, between: tuple[float, float] = (-90.0, 90.0)) -> Array:
     """Return θ_r of the maximum reflectance outside the specular peak, for each wavelength.
+
+    Args:
+        found: the map.
+        between: range of the viewing angles in which the maximum is searched, degrees.
 
     Outside means nearer to order one than to order zero of the published period: d (sin θ_i + sin θ_r) > λ/2. The
     position of the peak between the samples is the vertex of a parabola in the direction cosine through the logarithms
@@ -196,18 +201,21 @@ def peak_angles(found: ReflectanceMap) -> Array:
     Returns:
         (n,) degrees; NaN where the reflectance is zero.
     """
+    angles = np.broadcast_to(found.angles, found.reflectance.shape)
     outside = np.nan_to_num(np.where(found.order > 0.5, found.reflectance, 0))
-    cosine = np.sin(np.deg2rad(np.broadcast_to(found.angles, outside.shape)))
+    within = np.where((angles >= between[0]) & (angles <= between[1]), outside, 0)
+    cosine = np.sin(np.deg2rad(angles))
     rows = np.arange(len(outside))
-    peak = outside.argmax(axis=1)
+    peak = within.argmax(axis=1)
     position = cosine[rows, peak]
     if not found.discrete:
         inner = np.clip(peak, 1, outside.shape[1] - 2)
         samples = inner[:, None] + (-1, 0, 1)
         x, y = (np.take_along_axis(array, samples, axis=1) for array in (cosine, outside))
-        usable = (inner == peak) & (y.min(axis=1) > 0)
+        # At an end of the range the maximum need not be a peak.
+        usable = (inner == peak) & (y.min(axis=1) > 0) & (y[:, 1] >= y[:, ::2].max(axis=1))
         position = np.where(usable, _vertex(x, np.log(np.where(y > 0, y, 1))), position)
-    return np.where(outside[rows, peak] > 0, np.rad2deg(np.arcsin(position)), np.nan)
+    return np.where(within[rows, peak] > 0, np.rad2deg(np.arcsin(position)), np.nan)
 
 
 def _vertex(x: Array, y: Array) -> Array:
@@ -244,14 +252,23 @@ class PeriodFit:
     mean: float
     variance: float
 
+    @property
+    def deviation(self) -> float:
+        """Standard deviation over the wavelengths, nm."""
+        return float(np.sqrt(self.variance))
 
-def fit_period(found: ReflectanceMap) -> PeriodFit:
+
+def fit_period(found: ReflectanceMap, between: tuple[float, float] = (-90.0, 90.0)) -> PeriodFit:
     """Return mean and variance over the wavelengths of d = λ/(sin θ_i + sin θ_r) at the peaks (table 5.1).
+
+    Args:
+        found: the map.
+        between: range of the viewing angles, as in `peak_angles`.
 
     Raises:
         ValueError: if the reflectance outside the specular peak is zero at some wavelength.
     """
-    angles = peak_angles(found)
+    angles = peak_angles(found, between)
     if np.isnan(angles).any():
         dark = found.wavelengths[np.isnan(angles)]
         raise RequestError(f"reflectance: got none outside of the specular peak at {dark[0]:g} nm, wanted a peak")
@@ -259,21 +276,77 @@ def fit_period(found: ReflectanceMap) -> PeriodFit:
     return PeriodFit(float(periods.mean()), float(periods.var()))
 
 
-def published_period(name: str) -> Record:
-    """Fit the period of the thesis (table 5.1) to the peaks of this model, as the thesis did for the shader's."""
+@dataclass(frozen=True)
+class Ridge:
+    """A period whose order is bright at all wavelengths.
+
+    Attributes:
+        period: nm.
+        height: mean over the wavelengths of the reflectance there, relative to that of the brightest ridge.
+    """
+
+    period: float
+    height: float
+
+
+def ridges(found: ReflectanceMap, least: float = 0.3) -> list[Ridge]:
+    """Return the ridges of a map from the period d/2 to 2d, the brightest first.
+
+    A map is resampled over 1/d = (sin θ_i + sin θ_r)/λ, divided by its maximum at each wavelength, and averaged over
+    the wavelengths. Not for methods with directions of their own.
+
+    Args:
+        found: the map.
+        least: height of a ridge, and its prominence, relative to the brightest.
+    """
+    if found.discrete:
+        raise RequestError(f"found: got a map of {found.method}, wanted one with all viewing angles")
+    frequency = np.linspace(0.5, 2.0, 6001) / (1e3 * found.surface.period)
+    sines = np.sin(np.deg2rad(found.incidence)) + np.sin(np.deg2rad(found.angles))
+    rows = np.stack(
+        [
+            np.interp(frequency, sines / nanometres, row)
+            for nanometres, row in zip(found.wavelengths, found.reflectance, strict=True)
+        ]
+    )
+    mean = (rows / rows.max(axis=1, keepdims=True)).mean(axis=0)
+    mean /= mean.max()
+    (peaks, _) = find_peaks(mean, height=least, prominence=least / 3)
+    return [Ridge(float(1 / frequency[i]), float(mean[i])) for i in peaks[np.argsort(mean[peaks])[::-1]]]
+
+
+def profile_period(name: str) -> Record:
+    """Fit the period of a profile, of a synthetic skin the one that it is made with, to the peaks of this model."""
     surface = SURFACES[name]
     found = fit_period(reflectance_map(surface, wavelengths=wavelengths(20.0))).mean
     # Peaks are read on a grid of 0.1°, which moves a period of 2.5 µm by 7 nm at one wavelength, by 1.6 nm in the mean.
-    return Record(found, surface.published[0], 2.0, note=f"nm; {surface.name}, light at 75°")
+    return Record(found, 1e3 * surface.period, 2.0, note=f"nm; {surface.name}, light at 75°")
 
 
-CHECKS = tuple(
+def scan_period(name: str) -> Record:
+    """Fit the period to the peaks of FLSS as published on a scan, as the thesis did."""
+    surface = SURFACES[name]
+    fit = fit_period(reflectance_map(surface, "flss", wavelengths=wavelengths(20.0)), surface.angles)
+    mean, _ = surface.final["flss"]
+    return Record(fit.mean, mean, 1.0, note=f"nm, ±{fit.deviation:.2f} over the wavelengths; light at 75°")
+
+
+CHECKS = (
+    *(
+        Check(
+            "analytic",
+            f"period from peaks: {SURFACES[name].name}",
+            functools.partial(profile_period, name),
+            "period of the profile, by the grating equation",
+            slow=name != "blaze",
+        )
+        for name in ("blaze", "elaphe", "xenopeltis")
+    ),
     Check(
         "literature",
-        f"period of {'the blaze' if name == 'blaze' else name.capitalize()}",
-        functools.partial(published_period, name),
-        "thesis, table 5.1",
-        slow=name != "blaze",
-    )
-    for name in SURFACES
+        "period from peaks: FLSS as published, Elaphe (scan)",
+        functools.partial(scan_period, "elaphe_scan"),
+        "final text of the thesis, table 5.1",
+        slow=True,
+    ),
 )
