@@ -47,11 +47,17 @@ PARAMETERS = (
         "material", "string", 'a conductor instead, as in Mitsuba\'s `conductor`; "none" is the perfect mirror, R = 1'
     ),
     Parameter("fresnel", "string", "exact, or Schlick's approximation schlick", "exact"),
-    Parameter("orientation", "float or texture", "degrees from the tangent dp_du to the pattern's x axis", "0"),
-    Parameter("height_scale", "float or texture", "scales the heights", "1"),
+    Parameter(
+        "orientation",
+        "float, texture or string",
+        "degrees from the tangent dp_du to the pattern's x axis; or radial, x points away from the centre (0.5, 0.5) "
+        "of UV space, or tangential, around it; or the file of a picture, of integers from 0° (black) to 360° (white)",
+        "0",
+    ),
+    Parameter("height_scale", "float, texture or string", "scales the heights; a string is the file of a picture", "1"),
     Parameter(
         "lateral_scale",
-        "float or texture",
+        "float, texture or string",
         "scales the lengths along the surface, but not the widths of lobes; for orders that do not overlap",
         "1",
     ),

@@ -13,8 +13,9 @@ from ..errors import RequestError
 from ..precomputation import Spectrum
 from ..progress import progress_bar
 from ..recipe import Recipe
+from .base import nested_plugin
 from .geometry import Geometry, Incidence, Interface, rotated
-from .parameters import Media, Scales, check_texture, surface_from
+from .parameters import Media, Scales, check_texture, numbers_from, surface_from
 from .polarisation import reflected, through_layer
 from .tables import BELOW_ONE, larger, limited, opaque, smaller
 from .theory import Options, Scattering, theory_of
@@ -22,6 +23,7 @@ from .theory import Options, Scattering, theory_of
 # Of defensive samples, for lobes that the averages of the sampler miss. They are uniform in solid angle: where both
 # directions are grazing, K G grows so fast that samples in proportion to the cosine would have large weights.
 UNIFORM_PROBABILITY = 0.02
+_FROM_RADIUS = {"radial": 0.0, "tangential": 90.0}  # degrees
 _per_cent = functools.partial(progress_bar, unit="%")
 
 
@@ -32,7 +34,8 @@ class GratingRequest:
     Attributes:
         media: around the grating.
         scales: of heights and of lengths along the surface.
-        orientation: degrees from the tangent to the pattern's x axis.
+        orientation: degrees from the tangent, or from the radius, to the pattern's x axis.
+        from_radius: whether they are from the radius.
         options: of scalar theory.
         surface: a spectrum, or the recipe to compute one.
     """
@@ -40,6 +43,7 @@ class GratingRequest:
     media: Media
     scales: Scales
     orientation: mi.Texture
+    from_radius: bool
     options: Options
     surface: Spectrum | Recipe
 
@@ -54,10 +58,16 @@ class GratingRequest:
         angle = props.get("orientation", 0.0)
         if isinstance(angle, float) and not np.isfinite(angle):
             raise RequestError(f"orientation: got {angle}, wanted degrees or a texture")
-        orientation = props.get_texture("orientation", 0.0)
+        from_radius = angle in tuple(_FROM_RADIUS)
+        if from_radius:
+            orientation = nested_plugin("uniform", value=_FROM_RADIUS[angle])
+        elif isinstance(angle, str):
+            orientation = numbers_from("orientation", angle, 360.0, "radial, tangential, ")
+        else:
+            orientation = props.get_texture("orientation", 0.0)
         check_texture("orientation", orientation)
         surface = surface_from(props, media, scales.max_scale)
-        return cls(media, scales, orientation, Options.of(props, media), surface)
+        return cls(media, scales, orientation, from_radius, Options.of(props, media), surface)
 
 
 class Grating:
@@ -70,10 +80,12 @@ class Grating:
         coat: over the grating, or None.
         scales: of heights and of lengths along the surface; one for rigorous theory.
         orientation: degrees from the tangent to the pattern's x axis.
+        from_radius: whether they are from the radius, away from the centre of UV space, instead.
     """
 
     def __init__(self, props: mi.Properties, request: GratingRequest) -> None:
-        self.coat, self.scales, self.orientation = request.media.coat, request.scales, request.orientation
+        self.coat, self.scales = request.media.coat, request.scales
+        self.orientation, self.from_radius = request.orientation, request.from_radius
         surface = request.surface
         self.recipe = surface if isinstance(surface, Recipe) else None
         self.spectrum = surface.cached(_per_cent) if isinstance(surface, Recipe) else surface
@@ -97,7 +109,17 @@ class Grating:
 
     def frame(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
         """Return sine and cosine of the angle from the tangent to the pattern's x axis."""
-        return dr.sincos(dr.deg2rad(self.orientation.eval_1(si, active)))
+        sin, cos = dr.sincos(dr.deg2rad(self.orientation.eval_1(si, active)))
+        if not self.from_radius:
+            return sin, cos
+        # The image of the radius in UV space, whatever the scale, shear or reflection of the UVs.
+        u, v = si.uv - 0.5
+        radius = si.to_local(u * si.dp_du + v * si.dp_dv)
+        square = dr.square(radius.x) + dr.square(radius.y)
+        has_direction = square > 0
+        scale = dr.rsqrt(dr.select(has_direction, square, 1))
+        x, y = dr.select(has_direction, radius.x * scale, 1), radius.y * scale
+        return sin * x + cos * y, cos * x - sin * y
 
     @dr.syntax
     def evaluate(

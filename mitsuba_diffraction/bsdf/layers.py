@@ -54,7 +54,8 @@ class Layers:
         self.base = base_from(props)
         self.grating = Grating(props, request)
         flags = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.Anisotropic | mi.BSDFFlags.FrontSide
-        if self.grating.orientation.is_spatially_varying() or any(scale.varies for scale in self.grating.scales):
+        varies = self.grating.orientation.is_spatially_varying() or any(scale.varies for scale in self.grating.scales)
+        if varies or self.grating.from_radius:
             flags = flags | mi.BSDFFlags.SpatiallyVarying
         self.components = [+flags, *(self.base.components if self.base is not None else [])]
         face = self.coat and mi.BSDFFlags.FrontSide

@@ -17,6 +17,7 @@ from ..recipe import Recipe
 from ..rigorous.spectrum import RigorousSpectrum
 from ..settings import THEORIES, TRANSMISSIONS, VISIBLE, Settings, wavelengths_inside
 from ..surface.gratings import COHERENCE_LENGTHS, PROFILES
+from .base import nested_plugin
 from .coat import SAME_INDEX, Coat, absolute_index, coat_from
 from .fresnel import Conductor, PerfectMirror, reflectance_from
 
@@ -84,7 +85,7 @@ class Scale:
 
     Attributes:
         name: of the parameter.
-        value: a number, or a texture of numbers.
+        value: a number, or a texture of numbers, which may be given by the name of its file.
         values: the distinct values of a texture, ascending; interpolated ones lie between them.
     """
 
@@ -95,6 +96,8 @@ class Scale:
             RequestError: if it is neither a number nor a texture whose values are known.
         """
         self.name, value = name, props.get(name, 1.0)
+        if isinstance(value, str):
+            value = numbers_from(name, value)
         if not is_number(value) and not isinstance(value, mi.Texture):
             raise RequestError(f"{name}: got {value!r}, wanted a number or a texture")
         self.value = value if isinstance(value, mi.Texture) else mi.Float(value)
@@ -137,6 +140,27 @@ class Scale:
     def __str__(self) -> str:
         low, high = self.values[[0, -1]]
         return f"{low:.6g} to {high:.6g}" if self.varies else str(self.value)
+
+
+def numbers_from(name: str, file: str, white: float = 1.0, others: str = "") -> mi.Texture:
+    """Return a texture of the numbers in a picture, without gamma; of integers, the maximum is `white`.
+
+    `others` are the texts that the parameter may have instead, for the message.
+
+    Raises:
+        RequestError: if there is no such file, or it is not a picture.
+    """
+    path = str(mi.file_resolver().resolve(file))
+    try:
+        bitmap = mi.Bitmap(path)
+    except RuntimeError:
+        raise RequestError(f"{name}: got {file!r}, wanted {others}a number or the file of a picture") from None
+    bitmap.set_srgb_gamma(False)
+    numbers = np.array(bitmap.convert(mi.Bitmap.PixelFormat.Y, mi.Struct.Type.Float32, srgb_gamma=False))
+    if bitmap.component_format() in (mi.Struct.Type.UInt8, mi.Struct.Type.UInt16):
+        numbers *= white
+    (texture,) = nested_plugin("bitmap", bitmap=mi.Bitmap(numbers), raw=True).expand()
+    return texture
 
 
 def check_texture(name: str, texture: mi.Texture) -> None:

@@ -283,7 +283,7 @@ def scene_digest(
         for node in state.nodes:
             content.update(f"{node.props.plugin_name()}\n".encode())
             for name, value in node.props.items():
-                named = _resolved(value) if name == "filename" else None
+                named = _resolved(value) if isinstance(value, str) else None
                 if named is None or not named.is_file():
                     content.update(f"{name}={_exact_text(value)}\n".encode())
                 elif named.suffix.lower() == ".toml":

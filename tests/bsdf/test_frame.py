@@ -218,3 +218,41 @@ def test_period_is_that_of_the_pattern():
     on = world(si, bsdf, orders(np.array([0, 0, 1.0]), *np.eye(3)))[0]
     off = world(si, bsdf, orders(np.array([0, 0, 1.0]), *(1.2 * np.eye(3)[:2]), np.eye(3)[2]))[0]
     assert on > 1e3 * off
+
+
+@pytest.mark.parametrize("word", ["radial", "tangential"])
+@pytest.mark.parametrize(
+    "linear", [np.eye(2), [[0, -1], [1, 0]], [[-0.3, 0], [0, 0.3]], [[0.5, 0.4], [0, 0.7]]], ids=str
+)
+def test_a_radial_pattern_points_away_from_the_centre_of_uv_space(word, linear):
+    """On a square of turned, mirrored or sheared UVs."""
+    centre, point = np.array([0.4, 0.55]), np.array([0.65, 0.3])
+    x = np.append(point - centre, 0) / np.linalg.norm(point - centre)
+    y = np.cross((0, 0, 1), x)
+    if word == "tangential":
+        x, y = y, -x
+    check(mesh((SQUARE - centre) @ np.transpose(linear) + 0.5), (*point, 2), DOWN, (0, 0, 1), x, y, word)
+
+
+def test_the_centre_of_a_radial_pattern_is_finite():
+    bsdf = mi.load_dict(corner(orientation="radial"))
+    si = hit(mesh(SQUARE), (0.5, 0.5, 2), DOWN, bsdf)
+    assert np.isfinite(world(si, bsdf, [(0.1, 0.2, 0.97)])).all()
+
+
+@pytest.mark.parametrize(("suffix", "value"), [("png", 51), ("exr", 72.0)])
+def test_an_orientation_is_read_from_a_picture(suffix, value, tmp_path):
+    """White is 360° in a PNG: 51/255 of it are 72°."""
+    cos, sin = np.cos(np.deg2rad(72)), np.sin(np.deg2rad(72))
+    path = tmp_path / f"turn.{suffix}"
+    mi.Bitmap(np.full((4, 4), value, np.uint8 if suffix == "png" else np.float32)).write(str(path))
+    check(mesh(SQUARE), (0.4, 0.2, 2), DOWN, (0, 0, 1), (cos, sin, 0), (-sin, cos, 0), str(path))
+
+
+def test_the_file_of_an_orientation_is_checked(tmp_path):
+    (tmp_path / "text.png").write_text("text")
+    for name in ("missing.png", "radiall", str(tmp_path / "text.png")):
+        with pytest.raises(
+            (RuntimeError, ValueError), match=r"orientation: got .*, wanted radial, tangential, a number"
+        ):
+            mi.load_dict(corner(orientation=name))

@@ -205,7 +205,7 @@ def test_recipes_and_profiles_are_built_for_the_scales(llvm):
         ({"height_scale": [[-0.5, 0.5]]}, "height_scale: got -0.5, wanted 0 to 1"),
         ({"lateral_scale": [[0.0, 0.5]]}, "lateral_scale: got 0, wanted more than 0"),
         ({"lateral_scale": [[np.nan, 0.5]]}, "lateral_scale: got values that are not finite"),
-        ({"lateral_scale": "a"}, "lateral_scale: got 'a', wanted a number or a texture"),
+        ({"lateral_scale": "a"}, "lateral_scale: got 'a', wanted a number or the file of a picture"),
         ({"lateral_scale": {"type": "mesh_attribute", "name": "vertex_s"}}, "MeshAttribute, whose range is not known"),
         ({"coherence_length": 5.0, "lateral_scale": 0.5}, "lateral_scale: got .*0.5.*, wanted 1: only of orders"),
         (
