@@ -13,6 +13,7 @@ import typer
 
 from ..errors import RequestError
 from ..files import refuse_other_than_utf8
+from ..progress import say
 from ..recipe import Recipe
 from ..settings import SUN_COHERENCE_LENGTH, Settings
 from ..surface.prepare import STEP_NAMES, step_of
@@ -30,11 +31,17 @@ def scene_parameters(define: Sequence[str] | None) -> dict[str, str]:
         refuse_other_than_utf8(item)
         if name in parameters:
             raise RequestError(f"-D {name}: got it twice, wanted one value")
-        # File names on the command line are relative to the current folder. A bare word or number is not a file name,
-        # even if a file of that name exists.
-        is_file = os.path.isfile(value) and (os.path.dirname(value) or Path(value).suffix[1:2].isalpha())
-        parameters[name] = str(Path(value).resolve()) if is_file else value
+        parameters[name] = _absolute(value)
     return parameters
+
+
+def _absolute(value: str) -> str:
+    """Return a file name on the command line, relative to the current folder, as an absolute one; other text as it is.
+
+    A bare word or number is not a file name, even if a file of that name exists.
+    """
+    is_file = os.path.isfile(value) and (os.path.dirname(value) or Path(value).suffix[1:2].isalpha())
+    return str(Path(value).resolve()) if is_file else value
 
 
 Define = Annotated[list[str] | None, typer.Option("-D", metavar="NAME=VALUE", help="set a parameter of the scene")]
@@ -64,7 +71,7 @@ def _converted(text: str) -> Value:
     for kind in (int, float):
         with suppress(ValueError):
             return kind(text)
-    return {"true": True, "false": False}.get(text, text)
+    return {"true": True, "false": False}.get(text, _absolute(text))
 
 
 def materials_of(texts: Sequence[str] | None) -> dict[str, dict[str, Value]]:
@@ -80,9 +87,18 @@ def materials_of(texts: Sequence[str] | None) -> dict[str, dict[str, Value]]:
         is_file = Path(source).suffix.lower() in (".toml", ".exr")
         if is_file and not os.path.isfile(source):
             raise FileNotFoundError(f"{source}: no such file")
+        if _is_film(source) and values.keys().isdisjoint(("transmission", "material", "coat_ior", "base")):
+            values["transmission"] = "sheet"
+            say("note", f"material {name}: {source} transmits light (transmission=sheet); transmission=none does not")
         # Absolute, as file names in a scene are relative to the folder of the scene.
         materials[name] = {**({"filename": os.path.abspath(source)} if is_file else {"profile": source}), **values}
     return materials
+
+
+def _is_film(source: str) -> bool:
+    """Return whether a profile, or that of a recipe, is a transparent film."""
+    profile = Recipe.load(source).surface.get("profile", "") if source.lower().endswith(".toml") else source
+    return profile == "film" or profile.startswith("transmission_")
 
 
 PixelSize = Annotated[float | None, typer.Option(help="pixel size of the scan, µm")]

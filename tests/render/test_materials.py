@@ -11,7 +11,14 @@ from bsdf_support import made_up
 
 from mitsuba_diffraction.cli.arguments import materials_of
 from mitsuba_diffraction.render import render
-from mitsuba_diffraction.render.scene import has_uvs, load_spectral_scene, parsed, scene_digest, warn_of_gratings
+from mitsuba_diffraction.render.scene import (
+    files_of_scene,
+    has_uvs,
+    load_spectral_scene,
+    parsed,
+    scene_digest,
+    warn_of_gratings,
+)
 
 MIRROR = {"profile": "blazed", "period": 2.0, "depth": 0.2, "material": "none", "conserve_energy": False}
 PLAIN = "".join(
@@ -244,12 +251,15 @@ def test_the_command_replaces_several_materials(exported, command, monkeypatch, 
 
 def test_materials_are_read_from_the_command_line(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    Path("a.toml").touch()
+    Path("a.toml").write_text('[surface]\nprofile = "blazed"\n')
+    Path("turn.png").touch()
+    Path("Al").touch()
     found = materials_of(["mat-A=a.toml,int_ior=1.5", "B=blazed,period=2,material=Al,conserve_energy=false"])
     assert found == {
         "mat-A": {"filename": str(tmp_path / "a.toml"), "int_ior": 1.5},
         "B": {"profile": "blazed", "period": 2, "material": "Al", "conserve_energy": False},
     }
+    assert materials_of(["A=foil,orientation=turn.png"])["A"]["orientation"] == str(tmp_path / "turn.png")
     for texts, message in (
         (["mat-A"], "got 'mat-A', wanted ID="),
         (["mat-A="], "got 'mat-A=', wanted ID="),
@@ -259,3 +269,38 @@ def test_materials_are_read_from_the_command_line(tmp_path, monkeypatch):
     ):
         with pytest.raises((ValueError, FileNotFoundError), match=message):
             materials_of(texts)
+
+
+@pytest.mark.parametrize(
+    ("text", "transmission"),
+    [
+        ("film", "sheet"),
+        ("transmission_300,theory=rigorous", "sheet"),
+        ("film.toml", "sheet"),
+        ("film,transmission=interface", "interface"),
+        ("film,transmission=none", "none"),
+        ("film,material=Al", None),
+        ("film,base=0.5", None),
+        ("foil", None),
+    ],
+)
+def test_films_transmit_unless_told_otherwise(text, transmission, tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    Path("film.toml").write_text('[surface]\nprofile = "film"\n')
+    assert materials_of([f"pane={text}"])["pane"].get("transmission") == transmission
+    noted = "material pane: " in capfd.readouterr().err
+    assert noted == (transmission == "sheet")
+
+
+def test_the_file_of_a_texture_belongs_to_the_scene(exported, tmp_path):
+    """It is never written over, and a change of it makes another scene."""
+    picture, path = tmp_path / "depth.png", exported()
+    materials = {"mat-Disc": {**MIRROR, "height_scale": str(picture)}}
+    digests = set()
+    for value in (50, 100):
+        mi.Bitmap(np.full((4, 4), value, np.uint8)).write(str(picture))
+        digests.add(scene_digest(path, materials=materials))
+    assert len(digests) == 2
+    assert picture in files_of_scene(path, materials=materials)
+    (shape,) = [s for s in load_spectral_scene(path, materials=materials).shapes() if "DiffractionG" in str(s.bsdf())]
+    assert "height_scale = 0.392157 to 0.392157" in str(shape.bsdf())
