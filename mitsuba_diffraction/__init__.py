@@ -21,6 +21,7 @@ if TYPE_CHECKING:  # type checkers do not see what is imported on first use
     from .surface import gratings
     from .surface.heightfield import HeightField
     from .surface.readers import read_height_field
+    from .viewer import view
 
 _HOME = {
     "GratingSpectrum": "grating_spectrum",
@@ -32,6 +33,7 @@ _HOME = {
     "read_height_field": "surface.readers",
     "reference": "reference",
     "rigorous": "rigorous",
+    "view": "viewer",
 }
 
 __all__ = [
@@ -44,6 +46,7 @@ __all__ = [
     "read_height_field",
     "reference",
     "rigorous",
+    "view",
 ]
 
 

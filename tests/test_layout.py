@@ -31,6 +31,7 @@ LEVELS = {
     "bsdf": "bsdf",
     "render": "integrator render testing",
     "inspection": "inspection",
+    "viewer": "viewer",
     "registration": "plugin registration",
     "cli": "cli __main__",
     "evaluation": "evaluation",
@@ -108,6 +109,13 @@ def test_nothing_depends_on_what_judges_the_product():
             assert not any(found.startswith(judges) for found in imports(module)), module
 
 
+def test_only_the_command_depends_on_the_viewer():
+    viewer = "mitsuba_diffraction.viewer"
+    for module in MODULES:
+        if module != "mitsuba_diffraction" and not module.startswith((viewer, "mitsuba_diffraction.cli")):
+            assert not any(found.startswith(viewer) for found in imports(module)), module
+
+
 def test_what_is_offline_does_not_import_mitsuba(tmp_path):
     program = f"""
 import sys
@@ -117,6 +125,7 @@ assert not loaded, loaded
 field = md.gratings.blazed(period=1.0, depth=0.02, samples=32)
 md.precompute(field, coherence_length=2).save({str(tmp_path / "blazed.exr")!r})
 md.reference.power_spectrum(field, [0.4, 0.0], 20.0)
+md.view("blazed", depth=0.02, samples=32, coherence_length=2.0)
 np = sys.modules["numpy"]
 np.save({str(tmp_path / "scan.npy")!r}, np.random.default_rng(0).random((40, 40)))
 from mitsuba_diffraction.cli import main

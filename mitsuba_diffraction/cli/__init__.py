@@ -26,6 +26,7 @@ from .examples import examples
 from .inspect import inspect
 from .precompute import precompute
 from .render import Stopped, render
+from .view import view
 
 # Click's, or that of the copy of Click which newer versions of Typer carry.
 _UsageError = typer.BadParameter.__base__
@@ -48,7 +49,7 @@ _EVALUATION_COMMANDS = ("compare", "convergence", "validate", "benchmark")
 _evaluation = (
     getattr(importlib.import_module(f"..evaluation.commands.{n}", __name__), n) for n in _EVALUATION_COMMANDS
 )
-for _command in (inspect, precompute, render, efficiency, examples, *_evaluation):
+for _command in (inspect, precompute, render, view, efficiency, examples, *_evaluation):
     app.command(cls=_Command)(_command)
 
 

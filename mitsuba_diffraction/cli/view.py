@@ -1,0 +1,84 @@
+"""`mitsuba-diffraction view`: a page in which a surface is shaded live in the browser."""
+
+from __future__ import annotations
+
+import functools
+import webbrowser
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ..files import whole_file
+from ..outputs import check_outputs
+from ..progress import progress_bar, tell
+from ..surface.gratings import PROFILES
+from ..viewer.page import page
+from ..viewer.surface import Surface
+from .arguments import (
+    Channel,
+    CoherenceLength,
+    Extent,
+    FillMissing,
+    HeightRange,
+    Overwrite,
+    PixelSize,
+    Prepare,
+    Unit,
+    check_suffix,
+    options_of_scan,
+    recipe_of,
+    settings_of,
+    surface_of,
+)
+
+_NOT_SCANS = (".toml", ".exr")
+
+
+def view(
+    context: typer.Context,
+    source: Annotated[
+        str,
+        typer.Argument(
+            metavar="SURFACE[,name=value…]",
+            help="a recipe (.toml), a saved spectrum (.exr), a profile, or a scan; name=value: material, int_ior, "
+            "orientation, height_scale, and the parameters of a profile",
+        ),
+    ],
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="the page (.html); in the current folder by default")
+    ] = None,
+    open_page: Annotated[bool, typer.Option("--open/--no-open", help="open the page in the browser")] = True,
+    pixel_size: PixelSize = None,
+    height_range: HeightRange = None,
+    fill_missing: FillMissing = False,
+    channel: Channel = None,
+    unit: Unit = None,
+    prepare: Prepare = None,
+    extent: Extent = None,
+    coherence_length: CoherenceLength = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Write a page that shows a surface live in the browser, without network (WebGL2)."""
+    name, parameters = surface_of(source)
+    path, progress = Path(name), functools.partial(progress_bar, unit="%")
+    target = output or Path(path.stem or "view").with_suffix(".html")
+    check_suffix("-o", target, ".html")
+    of_scan, settings = options_of_scan(context), settings_of(context)
+    is_scan = path.suffix.lower() not in _NOT_SCANS and name not in PROFILES and (path.suffix or path.exists())
+    recipe = None
+    if is_scan or of_scan or settings:
+        # A scan is rarely cut to a whole number of periods.
+        recipe = recipe_of(path, of_scan, {"extent": "sample", **settings} if is_scan else settings)
+    reads = [path] if path.exists() else []
+    check_outputs([*reads, *(recipe.files if recipe else [])], [("-o", target)], overwrite=overwrite)
+    if recipe is None:
+        surface = Surface.named(name, parameters, progress)
+    else:
+        surface = Surface.of_recipe(recipe, path.stem, {"filename": str(path.resolve())}, parameters, progress)
+    text = page(surface)
+    with whole_file(target) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    tell(f"{target}: {surface.spectrum.source}, {len(text.encode()) / 1e6:.2g} MB")
+    if open_page:
+        webbrowser.open(target.resolve().as_uri())

@@ -1,0 +1,129 @@
+// The panel, the mouse, touch and the keyboard.
+
+const $ = (id) => document.getElementById(id);
+
+const NUMBERS = {
+  lightWidth: (x) => `${x}°`,
+  lightLength: (x) => (x === 0 ? "disc" : `${x}°`),
+  sky: (x) => `${Math.round(100 * x)} %`,
+  exposure: (x) => `${x > 0 ? "+" : ""}${x} EV`,
+  orientation: (x) => `${x}°`,
+  heightScale: (x) => `× ${x.toFixed(2)}`,
+  coherenceLength: (x) => `${x.toPrecision(3)} µm`,
+  index: (x) => x.toFixed(2),
+};
+
+class Controls {
+  constructor(state, changed, actions) {
+    Object.assign(this, { state, changed, actions });
+    for (const name of Object.keys(NUMBERS)) {
+      $(name).addEventListener("input", () => this.set({ [name]: this.valueOf(name) }));
+    }
+    for (const name of ["shape", "material", "pigment"]) {
+      $(name).addEventListener("input", () => this.set({ [name]: $(name).value }));
+    }
+    $("hasBase").addEventListener("input", () => this.set({ hasBase: $("hasBase").checked }));
+    for (const button of document.querySelectorAll("[name=drag]")) {
+      button.addEventListener("input", () => this.set({ drag: button.value }));
+    }
+    for (const [name, action] of Object.entries(actions)) $(name).addEventListener("click", action);
+    this.followPointers($("canvas"));
+    $("canvas").addEventListener("keydown", (event) => this.key(event));
+    this.show();
+  }
+
+  // The coherence length is on a logarithmic scale.
+  valueOf(name) {
+    const value = Number($(name).value);
+    return name === "coherenceLength" ? Math.exp(value) : value;
+  }
+
+  set(changes) {
+    Object.assign(this.state, changes);
+    this.show();
+    this.changed();
+  }
+
+  show() {
+    const { state } = this;
+    for (const [name, text] of Object.entries(NUMBERS)) {
+      $(name).value = name === "coherenceLength" ? Math.log(state[name]) : state[name];
+      $(`${name}-shown`).textContent = text(state[name]);
+    }
+    for (const name of ["shape", "material", "pigment"]) $(name).value = state[name];
+    $("hasBase").checked = state.hasBase;
+    for (const button of document.querySelectorAll("[name=drag]")) button.checked = button.value === state.drag;
+    const dielectric = state.material === "dielectric";
+    for (const name of ["index", "hasBase", "pigment"]) $(name).disabled = !dielectric;
+    $("pigment").disabled = !(dielectric && state.hasBase);
+  }
+
+  orbit(dx, dy) {
+    const elevation = this.state.elevation + dy;
+    this.set({
+      azimuth: this.state.azimuth - dx,
+      elevation: Math.min(Math.max(elevation, -FURTHEST_ELEVATION), FURTHEST_ELEVATION),
+    });
+  }
+
+  moveLight(dx, dy) {
+    const elevation = this.state.lightElevation - dy;
+    this.set({
+      lightAzimuth: this.state.lightAzimuth + dx,
+      lightElevation: Math.min(Math.max(elevation, -FURTHEST_ELEVATION), FURTHEST_ELEVATION),
+    });
+  }
+
+  zoom(factor) {
+    this.set({ distance: Math.min(Math.max(this.state.distance * factor, 2), 20) });
+  }
+
+  followPointers(canvas) {
+    const pointers = new Map();
+    canvas.addEventListener("pointerdown", (event) => {
+      canvas.setPointerCapture(event.pointerId);
+      pointers.set(event.pointerId, event);
+      this.moved = 0;
+    });
+    canvas.addEventListener("pointermove", (event) => {
+      const before = pointers.get(event.pointerId);
+      if (!before) return;
+      const [dx, dy] = [event.clientX - before.clientX, event.clientY - before.clientY];
+      this.moved += Math.abs(dx) + Math.abs(dy);
+      if (pointers.size === 2) {
+        const [other] = [...pointers.values()].filter((pointer) => pointer.pointerId !== event.pointerId);
+        const span = (pointer) => Math.hypot(pointer.clientX - other.clientX, pointer.clientY - other.clientY);
+        this.zoom(span(before) / Math.max(span(event), 1));
+      } else {
+        const light = (this.state.drag === "light") !== (event.shiftKey || event.buttons === 2);
+        if (light) this.moveLight(0.4 * dx, 0.4 * dy);
+        else this.orbit(0.4 * dx, 0.4 * dy);
+      }
+      pointers.set(event.pointerId, event);
+    });
+    for (const kind of ["pointerup", "pointercancel"]) {
+      canvas.addEventListener(kind, (event) => pointers.delete(event.pointerId));
+    }
+    canvas.addEventListener("contextmenu", (event) => event.preventDefault());
+    canvas.addEventListener("wheel", (event) => {
+      event.preventDefault();
+      this.zoom(Math.exp(0.001 * event.deltaY));
+    }, { passive: false });
+    this.pointers = pointers;
+  }
+
+  get dragging() {
+    return this.pointers.size > 0;
+  }
+
+  key(event) {
+    const arrows = { ArrowLeft: [-3, 0], ArrowRight: [3, 0], ArrowUp: [0, -3], ArrowDown: [0, 3] };
+    if (event.key in arrows) {
+      if (event.shiftKey) this.moveLight(...arrows[event.key]);
+      else this.orbit(...arrows[event.key]);
+    } else if (event.key === "+" || event.key === "=") this.zoom(0.9);
+    else if (event.key === "-") this.zoom(1 / 0.9);
+    else return;
+    event.preventDefault();
+  }
+}

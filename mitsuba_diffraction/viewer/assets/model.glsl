@@ -1,0 +1,190 @@
+// f = R K G S(q; kappa)/lambda^2 + (1 - R_i)(1 - R_o) base/pi, in 1/sr: bsdf/orders.py, bsdf/continuum.py,
+// bsdf/geometry.py and geometry.py of the package, for reflected light without a coat. E is one.
+// Directions are unit vectors along the pattern's axes, z the normal, both away from the surface. Lengths are in um.
+
+uniform highp sampler2DArray uTable;  // a_p of c = sum_p a_p t^p: columns m_x, rows m_y, layers intervals of kappa
+uniform float uUnit;                  // factor of the table
+uniform bool uCubic;                  // whether there is an a_3
+uniform float uIntervalsPerKappa;
+uniform int uKind;                    // one of the four below
+uniform ivec2 uMaxOrder;
+uniform vec2 uPerPitch;               // T of orders; 1/spacing of splines
+uniform ivec2 uCount;                 // of the lobes that contribute at one q
+uniform bvec2 uReadsAll;              // whether all orders contribute
+uniform vec2 uHalfWidth;              // of a lobe
+uniform vec2 uPeak;                   // of a lobe along one axis
+uniform float uSigma;                 // sigma_q
+uniform vec2 uLimit;                  // |q| at which splines end
+uniform float uHeightScale;
+uniform float uMinCosine;
+uniform bool uShadowing;
+
+uniform int uMaterial;                // 0 dielectric, 1 conductor, 2 perfect mirror
+uniform float uEta;
+uniform highp sampler2D uIndex;       // n + ik at each nm from 360
+uniform vec3 uPigment;                // coefficients of the reflectance of the base
+uniform bool uHasBase;
+
+const int RESOLVED = 0, LINES = 1, WINDOW = 2, SPLINES = 3;
+const float PI = 3.14159265358979;
+const float SHORTEST = 360.0, LONGEST = 830.0;
+
+float horizonGain(float x) {
+  float t = max(1.0 - 0.25 * x, 0.0);
+  float p = 3.5662365;
+  p = p * t - 9.23048089;
+  p = p * t + 10.57318562;
+  p = p * t - 5.03522703;
+  p = p * t + 0.81494507;
+  p = p * t - 0.04034151;
+  return 1.0 + t * t * p;
+}
+
+// K G from cos^2 of both directions and |lambda q|^2.
+float kG(vec2 squares, float tangentSquare) {
+  vec2 k = sqrt(max(squares, 1e-12));
+  float vz = k.x + k.y;
+  vec2 a = (tangentSquare + vz * vz) / (2.0 * k);
+  float perVz = 1.0 / vz;
+  float factor = a.x * perVz * (a.y * perVz);
+  return uShadowing ? min(factor, 2.0 * min(a.x, a.y) * perVz) : factor;
+}
+
+// cos^2 of both directions of an order at lambda q = change, and in z the gain of its lobe.
+vec3 squaresAndGain(vec3 wi, vec3 wo, vec2 change, float perWidth) {
+  float squareI = wi.z * wi.z, squareO = wo.z * wo.z;
+  float orderO = squareI - dot(change, 2.0 * wi.xy + change);
+  float orderI = squareO - dot(change, 2.0 * wo.xy + change);
+  float gain = 0.0;
+  if (min(orderI, orderO) > 0.0) {
+    gain = horizonGain(0.5 * perWidth * min(squareI, orderO)) * horizonGain(0.5 * perWidth * min(squareO, orderI));
+  }
+  return vec3(0.5 * (squareI + orderI), 0.5 * (squareO + orderO), gain);
+}
+
+float orderFactor(vec3 wi, vec3 wo, vec2 tangent, float perWidth) {
+  vec3 found = squaresAndGain(wi, wo, tangent, perWidth);
+  return found.z > 0.0 ? kG(found.xy, dot(tangent, tangent)) * found.z : 0.0;
+}
+
+float continuumFactor(vec3 wi, vec3 wo, vec2 tangent, float perWidth) {
+  vec2 squares = vec2(wi.z * wi.z, wo.z * wo.z);
+  float square = dot(tangent, tangent);
+  float mirror = clamp((25.0 - square * perWidth * perWidth) / 9.0, 0.0, 1.0);
+  mirror *= clamp(2.0 - 5.0 * sqrt(max(max(squares.x, squares.y), 1e-12)), 0.0, 1.0);
+  float gain = mirror > 0.0 ? squaresAndGain(wi, wo, vec2(0.0), perWidth).z : 0.0;
+  return mix(kG(squares, square), gain, mirror);
+}
+
+vec4 node(ivec2 m, int interval) {
+  if (any(greaterThan(abs(m), uMaxOrder))) return vec4(0.0);
+  return texelFetch(uTable, ivec3(m + uMaxOrder, interval), 0);
+}
+
+vec2 lobe(vec2 m, vec2 q) {
+  vec2 offset = q - m / uPerPitch;
+  vec2 value = uPeak * exp(-0.5 * offset * offset / (uSigma * uSigma));
+  return mix(value, vec2(0.0), greaterThan(abs(offset), uHalfWidth));
+}
+
+// K G S in um^2, lambda in um.
+float scatter(vec3 wi, vec3 wo, float lambda) {
+  vec2 tangent = -(wi.xy + wo.xy);
+  float frequency = 1.0 / lambda;
+  vec2 q = tangent * frequency;
+  vec2 at = q * uPerPitch;
+  float perWidth = frequency / uSigma;
+
+  float x = (wi.z + wo.z) * 2.0 * PI * frequency * uHeightScale * uIntervalsPerKappa;
+  int interval = min(int(x), textureSize(uTable, 0).z - 1);
+  float t = 2.0 * (x - float(interval)) - 1.0;
+  vec4 powers = vec4(1.0, t, t * t, uCubic ? t * t * t : 0.0) * uUnit;
+
+  float result = 0.0;
+  if (uKind == SPLINES) {
+    if (any(greaterThan(abs(q), uLimit))) return 0.0;
+    ivec2 nearest = ivec2(round(at));
+    vec2 d = at - vec2(nearest);
+    vec2 before = 0.5 * (0.5 - d) * (0.5 - d), here = 0.75 - d * d, after = 0.5 * (0.5 + d) * (0.5 + d);
+    vec3 weightsX = vec3(before.x, here.x, after.x), weightsY = vec3(before.y, here.y, after.y);
+    vec4 sum = vec4(0.0);
+    for (int j = 0; j < 3; j++) {
+      for (int i = 0; i < 3; i++) sum += weightsX[i] * weightsY[j] * node(nearest + ivec2(i - 1, j - 1), interval);
+    }
+    result = dot(sum, powers) * uPerPitch.x * uPerPitch.y * continuumFactor(wi, wo, tangent, perWidth);
+    return max(result, 0.0);
+  }
+  ivec2 first = ivec2(ceil(at - 0.5 * vec2(uCount)));
+  if (uReadsAll.x) first.x = -uMaxOrder.x;
+  if (uReadsAll.y) first.y = -uMaxOrder.y;
+  if (uKind == RESOLVED) {
+    if (any(greaterThan(abs(first), uMaxOrder))) return 0.0;
+    vec2 lobes = lobe(vec2(first), q);
+    if (lobes.x * lobes.y == 0.0) return 0.0;
+    float factor = orderFactor(wi, wo, vec2(first) / uPerPitch * lambda, perWidth);
+    return max(lobes.x * lobes.y * factor * dot(node(first, interval), powers), 0.0);
+  }
+  vec4 sum = vec4(0.0);
+  for (int j = 0; j < uCount.y; j++) {
+    for (int i = 0; i < uCount.x; i++) {
+      ivec2 m = first + ivec2(i, j);
+      vec2 lobes = lobe(vec2(m), q);
+      float weight = lobes.x * lobes.y;
+      if (weight == 0.0) continue;
+      if (uKind == LINES) weight *= orderFactor(wi, wo, vec2(m) / uPerPitch * lambda, perWidth);
+      sum += weight * node(m, interval);
+    }
+  }
+  result = max(dot(sum, powers), 0.0);
+  return uKind == LINES ? result : result * continuumFactor(wi, wo, tangent, perWidth);
+}
+
+float dielectric(float cosine) {
+  float inside = sqrt(max(1.0 - (1.0 - cosine * cosine) / (uEta * uEta), 0.0));
+  float s = (cosine - uEta * inside) / max(cosine + uEta * inside, 1e-12);
+  float p = (uEta * cosine - inside) / max(uEta * cosine + inside, 1e-12);
+  return 0.5 * (s * s + p * p);
+}
+
+float conductor(float cosine, vec2 index) {
+  float c2 = cosine * cosine, s2 = 1.0 - c2;
+  float n2 = index.x * index.x, k2 = index.y * index.y;
+  float difference = n2 - k2 - s2;
+  float both = sqrt(max(difference * difference + 4.0 * n2 * k2, 0.0));
+  float a = sqrt(max(0.5 * (both + difference), 0.0));
+  float s = (both + c2 - 2.0 * a * cosine) / (both + c2 + 2.0 * a * cosine);
+  float p = s * (c2 * both + s2 * s2 - 2.0 * a * cosine * s2) / (c2 * both + s2 * s2 + 2.0 * a * cosine * s2);
+  return 0.5 * (s + p);
+}
+
+// R of a plane; lambda in nm.
+float reflectance(float cosine, float nanometres) {
+  if (uMaterial == 2) return 1.0;
+  if (uMaterial == 0) return dielectric(cosine);
+  float at = clamp(nanometres - SHORTEST, 0.0, LONGEST - SHORTEST);
+  int below = int(min(floor(at), LONGEST - SHORTEST - 1.0));
+  vec2 low = texelFetch(uIndex, ivec2(below, 0), 0).xy, high = texelFetch(uIndex, ivec2(below + 1, 0), 0).xy;
+  return conductor(cosine, mix(low, high, at - float(below)));
+}
+
+float pigment(float nanometres) {
+  float x = (uPigment.x * nanometres + uPigment.y) * nanometres + uPigment.z;
+  return 0.5 + 0.5 * x * inversesqrt(1.0 + x * x);
+}
+
+float brdf(vec3 wi, vec3 wo, float nanometres) {
+  if (wi.z <= 0.0 || wo.z <= 0.0) return 0.0;
+  float result = 0.0;
+  if (min(wi.z, wo.z) >= uMinCosine) {
+    float lambda = 1e-3 * nanometres;
+    float power = scatter(wi, wo, lambda);
+    if (power > 0.0) {
+      vec3 v = wi + wo;
+      result = power * reflectance(min(0.5 * length(v), 1.0), nanometres) / (lambda * lambda);
+    }
+  }
+  if (uHasBase && uMaterial == 0) {
+    result += (1.0 - dielectric(wi.z)) * (1.0 - dielectric(wo.z)) * pigment(nanometres) / PI;
+  }
+  return result;
+}

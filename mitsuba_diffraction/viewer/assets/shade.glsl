@@ -1,0 +1,50 @@
+// Adds a frame to the mean of those before: XYZ, and the coverage of the pixel.
+uniform highp sampler2D uPosition;  // w: whether there is a surface
+uniform highp sampler2D uNormal;
+uniform highp sampler2D uTangent;
+uniform highp sampler2D uBefore;
+uniform float uWeight;              // of this frame
+uniform vec3 uEye;
+uniform vec3 uLight;                // to the light
+uniform vec2 uLightSize;            // half its width and half its length at distance one
+uniform bool uLightIsDisc;
+uniform vec2 uRandom;               // of this frame
+uniform float uSin;                 // of the angle from the tangent to the pattern's x axis
+uniform float uCos;
+out vec4 oMean;
+
+float hash(uvec2 at) {
+  uint h = at.x * 1664525u + at.y * 1013904223u;
+  h ^= h >> 16; h *= 2246822519u; h ^= h >> 13; h *= 3266489917u; h ^= h >> 16;
+  return float(h) / 4294967296.0;
+}
+
+// omega_i of the n-th point of the light, a disc or a strip along the meridian; w is the solid angle of the elements
+// there relative to the middle.
+vec4 lightAt(int n) {
+  if (uLightSize.x <= 0.0 && uLightSize.y <= 0.0) return vec4(uLight * frame, 1.0);
+  vec2 u = fract(random + float(n) * vec2(0.7548776662, 0.5698402910));
+  vec2 place = 2.0 * u - 1.0;
+  if (uLightIsDisc) place = sqrt(u.x) * vec2(cos(6.28318531 * u.y), sin(6.28318531 * u.y));
+  vec3 s = normalize(cross(vec3(0.0, 0.0, 1.0), uLight));
+  vec3 d = normalize(uLight + uLightSize.x * place.x * s + uLightSize.y * place.y * cross(uLight, s));
+  float cosine = dot(d, uLight);
+  return vec4(d * frame, cosine * cosine * cosine);
+}
+
+void main() {
+  ivec2 at = ivec2(gl_FragCoord.xy);
+  vec4 position = texelFetch(uPosition, at, 0);
+  vec4 value = vec4(0.0);
+  if (position.w > 0.0) {
+    vec3 n = normalize(texelFetch(uNormal, at, 0).xyz);
+    vec3 tangent = texelFetch(uTangent, at, 0).xyz;
+    vec3 s = normalize(tangent - n * dot(n, tangent));
+    vec3 t = cross(n, s);
+    frame = mat3(uCos * s + uSin * t, uCos * t - uSin * s, n);
+    random = uRandom + vec2(hash(uvec2(at)), hash(uvec2(at) + 7919u));
+    value = vec4(radiance(normalize(uEye - position.xyz) * frame), 1.0);
+  }
+  vec4 before = texelFetch(uBefore, at, 0);
+  oMean = uWeight >= 1.0 ? value : mix(before, value, uWeight);
+}

@@ -1,0 +1,63 @@
+// The meshes of shapes; sphere, plate and disc are found by formula (analytic.glsl).
+
+const ANALYTIC = { sphere: 0, plate: 1, disc: 2 };
+
+class Mesh {
+  // A sheet of points (rows, columns), closed along its rows; the tangent follows the columns.
+  constructor(gl, points, rows, columns) {
+    const at = (j, i) => points.subarray(3 * (j * columns + i), 3 * (j * columns + i) + 3);
+    const vertices = new Float32Array(9 * rows * columns);
+    for (let j = 0; j < rows; j++) {
+      for (let i = 0; i < columns; i++) {
+        const along = sum(at(j, Math.min(i + 1, columns - 1)), scaled(at(j, Math.max(i - 1, 0)), -1));
+        const [before, after] = [j === 0 ? rows - 2 : j - 1, j === rows - 1 ? 1 : j + 1];
+        const around = sum(at(after, i), scaled(at(before, i), -1));
+        const normal = cross(along, around);
+        const length = Math.hypot(...normal) || 1;
+        vertices.set([...at(j, i), ...scaled(normal, 1 / length), ...unit(along)], 9 * (j * columns + i));
+      }
+    }
+    const indices = new Uint32Array(6 * (rows - 1) * (columns - 1));
+    let k = 0;
+    for (let j = 0; j < rows - 1; j++) {
+      for (let i = 0; i < columns - 1; i++) {
+        const corner = j * columns + i;
+        indices.set([corner, corner + 1, corner + columns + 1, corner, corner + columns + 1, corner + columns], k);
+        k += 6;
+      }
+    }
+    this.gl = gl;
+    this.count = indices.length;
+    this.array = gl.createVertexArray();
+    gl.bindVertexArray(this.array);
+    gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
+    gl.bufferData(gl.ARRAY_BUFFER, vertices, gl.STATIC_DRAW);
+    for (let place = 0; place < 3; place++) {
+      gl.enableVertexAttribArray(place);
+      gl.vertexAttribPointer(place, 3, gl.FLOAT, false, 36, 12 * place);
+    }
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, indices, gl.STATIC_DRAW);
+    gl.bindVertexArray(null);
+  }
+
+  draw() {
+    const { gl } = this;
+    gl.bindVertexArray(this.array);
+    gl.drawElements(gl.TRIANGLES, this.count, gl.UNSIGNED_INT, 0);
+    gl.bindVertexArray(null);
+  }
+}
+
+// The coiled snake, moved and scaled to about the size of the sphere.
+async function coilOf(gl, coil) {
+  const { values, shape } = await decoded(coil.positions);
+  const [rows, columns] = shape;
+  const points = new Float32Array(values.length);
+  const middle = coil.origin.map((o, k) => o + (coil.step[k] * 65535) / 2);
+  const scale = 2.5 / (65535 * Math.max(coil.step[0], coil.step[1]));
+  for (let i = 0; i < values.length; i++) {
+    points[i] = scale * (coil.origin[i % 3] + coil.step[i % 3] * values[i] - middle[i % 3]);
+  }
+  return { mesh: new Mesh(gl, points, rows, columns), middle, scale };
+}

@@ -1,0 +1,110 @@
+// The spectrum S(q; kappa) and the material as uniforms of model.glsl.
+
+const KINDS = { resolved: 0, lines: 1, window: 2, splines: 3 };
+const MAX_DRAWN_LOBE_WIDTH = 0.03;  // cycles/um, of a line grating, as in bsdf/orders.py
+const MAX_LOBES = 8;                // along one axis
+
+// Error function (Abramowitz and Stegun 1964, 7.1.26), to 1.5e-7.
+function erf(x) {
+  const t = 1 / (1 + 0.3275911 * Math.abs(x));
+  const p = ((((1.061405429 * t - 1.453152027) * t + 1.421413741) * t - 0.284496736) * t + 0.254829592) * t;
+  return Math.sign(x) * (1 - p * Math.exp(-x * x));
+}
+
+function lobeWidth(coherenceLength) {
+  return 1 / (2 * Math.SQRT2 * Math.PI * (coherenceLength / 4));
+}
+
+// The truncation of lobes along both axes, as OrderGrid.lobes.
+function lobesOf(spectrum, sigma) {
+  return spectrum.tile_size.map((size, axis) => {
+    const maxOrder = spectrum.max_order[axis];
+    let count = Math.max(1, Math.ceil(2 * spectrum.cutoff_sigmas * sigma * size * (1 - 1e-9)));
+    let halfWidth = count > 1 ? count / (2 * size) : spectrum.cutoff_sigmas * sigma;
+    const readsAll = count > 2 * maxOrder + 1;
+    if (readsAll) [count, halfWidth] = [2 * maxOrder + 1, Infinity];
+    const inside = readsAll ? 1 : erf(halfWidth / (Math.SQRT2 * sigma));
+    return { count, halfWidth: Math.min(halfWidth, 1e30), readsAll, peak: 1 / (Math.sqrt(2 * Math.PI) * sigma * inside) };
+  });
+}
+
+// The coherence lengths that the table covers: (shortest, longest) in um.
+function coherenceLengths(spectrum) {
+  const own = spectrum.coherence_length;
+  if (spectrum.kind === "splines") return [own, own];
+  // A mean over random patches has a comb of orders, which shorter coherence lengths blur.
+  const longest = spectrum.patches > 1 ? own : Math.max(own, 130);
+  let shortest = own;
+  const few = (length) =>
+    lobesOf(spectrum, lobeWidth(length)).every((lobe, axis) => lobe.readsAll || lobe.count <= MAX_LOBES ||
+      2 * spectrum.max_order[axis] + 1 <= MAX_LOBES);
+  while (shortest > 2 && few(shortest / 1.1)) shortest /= 1.1;
+  return [shortest, longest];
+}
+
+class Spectrum {
+  constructor(gl, spectrum, table, materials) {
+    Object.assign(this, { gl, spectrum, materials });
+    const [layers, rows, columns, terms] = table.shape;
+    this.texture = numbers3D(gl, table.values, columns, rows, layers, terms);
+    this.bytes = table.values.byteLength;
+    Object.assign(this, { layers, terms });
+    this.noIndex = numbers2D(gl, new Float32Array(2), 1, 1, 2);
+  }
+
+  kindOf(lobes, sigma) {
+    if (this.spectrum.kind === "splines") return KINDS.splines;
+    const isLine = this.spectrum.max_order.includes(0);
+    const single = lobes.every((lobe) => lobe.count === 1);
+    if (single && !(isLine && sigma > MAX_DRAWN_LOBE_WIDTH)) return KINDS.resolved;
+    return isLine ? KINDS.lines : KINDS.window;
+  }
+
+  uniforms(state) {
+    const { spectrum } = this;
+    const splines = spectrum.kind === "splines";
+    const sigma = lobeWidth(splines ? spectrum.coherence_length : state.coherenceLength);
+    const lobes = splines ? null : lobesOf(spectrum, sigma);
+    const both = (of) => (splines ? [0, 0] : lobes.map(of));
+    const metal = this.materials[state.material];
+    return {
+      uTable: this.texture,
+      uUnit: spectrum.unit,
+      uCubic: Number(this.terms === 4),
+      uIntervalsPerKappa: this.layers / spectrum.max_kappa,
+      uKind: this.kindOf(lobes, sigma),
+      uMaxOrder: spectrum.max_order,
+      uPerPitch: splines ? spectrum.spacing.map((d) => 1 / d) : spectrum.tile_size,
+      uCount: both((lobe) => lobe.count),
+      uReadsAll: both((lobe) => Number(lobe.readsAll)),
+      uHalfWidth: both((lobe) => lobe.halfWidth),
+      uPeak: both((lobe) => lobe.peak),
+      uSigma: sigma,
+      uLimit: splines ? spectrum.limit : [0, 0],
+      uHeightScale: state.heightScale,
+      uMinCosine: Math.cos((spectrum.largest_angle * Math.PI) / 180) * (1 - 1e-6),
+      uShadowing: 1,
+      uMaterial: state.material === "dielectric" ? 0 : metal ? 1 : 2,
+      uEta: state.index,
+      uIndex: metal || this.noIndex,
+      uHasBase: Number(state.hasBase),
+      uPigment: state.hasBase ? pigmentOf(state.pigment) : [0, 0, 0],
+      uEntered: entered(state.index),
+    };
+  }
+}
+
+function fresnel(cosine, eta) {
+  const inside = Math.sqrt(Math.max(1 - (1 - cosine * cosine) / (eta * eta), 0));
+  const s = (cosine - eta * inside) / (cosine + eta * inside);
+  const p = (eta * cosine - inside) / (eta * cosine + inside);
+  return 0.5 * (s * s + p * p);
+}
+
+// The fraction of diffuse light that a plane lets in.
+function entered(eta) {
+  const count = 64;
+  let sum = 0;
+  for (let i = 0; i < count; i++) sum += 1 - fresnel(Math.sqrt((i + 0.5) / count), eta);
+  return sum / count;
+}

@@ -1,0 +1,131 @@
+"""The page: HTML, styles, JavaScript and GLSL from `assets`, and the data of a surface, in one text."""
+
+from __future__ import annotations
+
+import html
+import json
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import RequestError
+from ..outputs import MARK
+from ..rigorous.materials import conductor
+from ..settings import VISIBLE
+from ..spectrum.grids import OrderGrid
+from ..spectrum.tables import HALF_SCALE
+from .arrays import encoded
+from .coil import coil
+from .surface import Surface
+
+MAX_BYTES = 5_000_000  # of a page
+
+METALS = ("Al", "Ag", "Au", "Cr", "Cu", "W")
+"""The conductors among which a page chooses, besides that of the surface."""
+
+_ASSETS = Path(__file__).parent / "assets"
+_STYLES = ("page.css",)
+_SCRIPTS = (
+    *("data.js", "gl.js", "colour.js", "spectrum.js", "shapes.js", "view.js", "renderer.js"),
+    *("controls.js", "main.js"),
+)
+
+
+def page(surface: Surface) -> str:
+    """Return the page of a surface as HTML.
+
+    Raises:
+        RequestError: if it would be larger than `MAX_BYTES`, or the material is unknown.
+    """
+    text = (_ASSETS / "page.html").read_text(encoding="utf-8")
+    shaders = {path.stem: path.read_text(encoding="utf-8") for path in sorted(_ASSETS.glob("*.glsl"))}
+    parts = {
+        "title": html.escape(surface.name),
+        "mark": MARK,
+        "styles": "\n".join((_ASSETS / name).read_text(encoding="utf-8") for name in _STYLES),
+        "scripts": "\n".join((_ASSETS / name).read_text(encoding="utf-8") for name in _SCRIPTS),
+        "shaders": _json(shaders),
+        "data": _json(_data(surface)),
+    }
+    for name, part in parts.items():
+        text = text.replace("{{" + name + "}}", part)
+    if (size := len(text.encode())) > MAX_BYTES:
+        raise RequestError(
+            f"{surface.name}: got a page of {size / 1e6:.3g} MB, wanted at most {MAX_BYTES / 1e6:g}; a larger "
+            "tolerance or a shorter coherence length makes its table smaller"
+        )
+    return text
+
+
+def _json(content: object) -> str:
+    """Return JSON that may stand inside of a script element."""
+    return json.dumps(content, ensure_ascii=False, separators=(",", ":")).replace("</", "<\\/")
+
+
+def _data(surface: Surface) -> dict[str, Any]:
+    return {
+        "name": surface.name,
+        "source": surface.spectrum.source,
+        "version": metadata.version("mitsuba_diffraction"),
+        "grating": dict(surface.grating),
+        "material": vars(surface.material) | {"max_height_scale": surface.max_height_scale},
+        "spectrum": _spectrum(surface),
+        "metals": _metals(surface.material.material),
+        "light": encoded(_light()),
+        "coil": coil(),
+    }
+
+
+def _spectrum(surface: Surface) -> dict[str, Any]:
+    """Return the grid and the table: (K, rows, columns, terms) in half precision where that is exact."""
+    spectrum, grid, table = surface.spectrum, surface.spectrum.grid, surface.spectrum.table
+    values = np.moveaxis(table.values, 1, -1)
+    unit = 1.0
+    if table.words_per_node < 4:
+        unit = 1 / HALF_SCALE
+        values = (values * np.float32(HALF_SCALE)).astype(np.float16)
+    of_grid = (
+        {"kind": "orders", "tile_size": grid.tile_size}
+        if isinstance(grid, OrderGrid)
+        else {"kind": "splines", "spacing": grid.spacing, "limit": [min(limit, 1e30) for limit in grid.limit]}
+    )
+    return of_grid | {
+        "max_order": grid.max_order,
+        "max_kappa": table.max_kappa,
+        "unit": unit,
+        "table": encoded(values),
+        "coherence_length": spectrum.coherence_length,
+        "cutoff_sigmas": spectrum.cutoff_sigmas,
+        "largest_angle": spectrum.largest_angle,
+        "wavelengths": spectrum.wavelengths,
+        "patches": spectrum.patches,
+        "extent": spectrum.extent,
+        "error": spectrum.error,
+        "warning": spectrum.warning,
+    }
+
+
+def _nanometres() -> NDArray[np.float64]:
+    return np.arange(VISIBLE[0], VISIBLE[1] + 1)
+
+
+def _light() -> NDArray[np.float32]:
+    """Return x̄, ȳ, z̄ and the light, D65 with Y = 1, at each nm: (471, 4)."""
+    table = np.loadtxt(_ASSETS / "observer.csv", delimiter=",")
+    matching, light = table[:, 1:4] / table[:, 2].sum(), table[:, 4]
+    return np.column_stack([matching, light / (light @ matching[:, 1])]).astype(np.float32)
+
+
+def _metals(chosen: str) -> dict[str, Any]:
+    """Return n + ik of the conductors at each nm, (471, 2), as `Conductor` of the BSDF has them."""
+    folder = Path(str(metadata.distribution("mitsuba").locate_file("mitsuba/data/ior")))
+    names = [*METALS, *([chosen] if chosen not in (*METALS, "", "none") else [])]
+    found = {}
+    for name in names:
+        wavelengths, n, k = conductor(name, folder)
+        index = [np.interp(_nanometres() * 1e-3, wavelengths, part) for part in (n, k)]
+        found[name] = encoded(np.stack(index, -1).astype(np.float32))
+    return found

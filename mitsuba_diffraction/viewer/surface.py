@@ -1,0 +1,186 @@
+"""What a page shows: a spectrum, the heights behind it, the material, and the same grating in a scene."""
+
+from __future__ import annotations
+
+import inspect
+import os
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+from ..errors import RequestError, is_number
+from ..grating_spectrum import GratingSpectrum
+from ..precomputation import Spectrum, load_spectrum
+from ..progress import Progress, no_progress
+from ..recipe import Recipe
+from ..settings import Settings
+from ..spectrum.tables import SliceTable
+from ..surface.gratings import COHERENCE_LENGTHS, PROFILES
+
+# WebGL2 guarantees array textures with sides of 2048 texels and 256 layers.
+MAX_SIDE, MAX_LAYERS = 2048, 256
+
+_NOT_SHOWN = {
+    "transmission": "reflected light only",
+    "coat_ior": "a grating without a coat",
+    "ext_ior": "a grating in air",
+    "lateral_scale": "a grating of one period",
+}
+"""Parameters of a scene that the page does not have, and what it shows instead."""
+
+
+@dataclass(frozen=True)
+class Material:
+    """What the grating is made of, as in a scene.
+
+    Attributes:
+        int_ior: index of refraction of a dielectric.
+        material: or a conductor by Mitsuba's name, or "none", the perfect mirror.
+        orientation: degrees from the tangent to the pattern's x axis.
+        height_scale: factor of the heights.
+    """
+
+    int_ior: float = 1.5
+    material: str = ""
+    orientation: float = 0.0
+    height_scale: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name in ("int_ior", "orientation", "height_scale"):
+            if not is_number(value := getattr(self, name)):
+                raise RequestError(f"{name}: got {value!r}, wanted a number")
+        if not 1 < self.int_ior <= 10:
+            raise RequestError(f"int_ior: got {self.int_ior!r}, wanted an index above 1, at most 10")
+        if not self.height_scale >= 0:
+            raise RequestError(f"height_scale: got {self.height_scale!r}, wanted a number ≥ 0")
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """A surface and its material.
+
+    Attributes:
+        name: its title.
+        spectrum: S(q; κ) as slices.
+        recipe: of the heights; None for a saved spectrum.
+        grating: the surface as parameters of `diffraction_grating`.
+        material: its material.
+    """
+
+    name: str
+    spectrum: GratingSpectrum
+    recipe: Recipe | None
+    grating: Mapping[str, str | int | float]
+    material: Material
+
+    def __post_init__(self) -> None:
+        spectrum: Spectrum = self.spectrum
+        if not isinstance(spectrum, GratingSpectrum):
+            raise RequestError(f"{self.name}: got theory=rigorous, wanted a surface of scalar theory")
+        if not isinstance(spectrum.table, SliceTable):
+            got = spectrum.representation
+            raise RequestError(f"{self.name}: got representation {got!r}, wanted 'slices'")
+        rows, columns = spectrum.grid.shape
+        if max(rows, columns) > MAX_SIDE or spectrum.table.intervals > MAX_LAYERS:
+            raise RequestError(
+                f"{self.name}: got a table of {columns} × {rows} nodes and {spectrum.table.intervals} intervals of κ, "
+                f"wanted at most {MAX_SIDE} × {MAX_SIDE} and {MAX_LAYERS}, the textures of WebGL2"
+            )
+        if self.material.height_scale > (max_scale := self.max_height_scale) * (1 + 1e-6):
+            raise RequestError(
+                f"height_scale: got {self.material.height_scale:g}, wanted at most {max_scale:.4g}: the spectrum was "
+                f"built for wavelengths from {spectrum.wavelengths[0]:g} nm"
+            )
+
+    @property
+    def max_height_scale(self) -> float:
+        """The largest factor of the heights that the table covers for visible light."""
+        return max(1.0, SHORTEST / self.spectrum.wavelengths[0])
+
+    @classmethod
+    def of_recipe(
+        cls,
+        recipe: Recipe,
+        name: str,
+        grating: Mapping[str, Any],
+        parameters: Mapping[str, Any],
+        progress: Callable[[str], AbstractContextManager[Progress]] = no_progress,
+    ) -> Surface:
+        """Return the surface of a recipe, whose spectrum is computed unless it is cached.
+
+        Args:
+            recipe: the surface.
+            name: its title.
+            grating: it as parameters of `diffraction_grating`.
+            parameters: of the material; others are refused.
+            progress: of the computation.
+        """
+        material = material_from(parameters)
+        if recipe.settings.theory == "rigorous":  # before its table is computed
+            raise RequestError(f"{name}: got theory=rigorous, wanted a surface of scalar theory")
+        spectrum = recipe.cached(progress)
+        assert isinstance(spectrum, GratingSpectrum)
+        return cls(name, spectrum, recipe, grating, material)
+
+    @classmethod
+    def named(
+        cls,
+        source: str | os.PathLike[str],
+        parameters: Mapping[str, Any],
+        progress: Callable[[str], AbstractContextManager[Progress]] = no_progress,
+    ) -> Surface:
+        """Return the surface of a recipe (.toml), a saved spectrum (.exr) or a profile.
+
+        Args:
+            source: the file, or the name of the profile.
+            parameters: of the material, and of the profile and its spectrum.
+            progress: of the computation.
+
+        Raises:
+            FileNotFoundError: if there is no such file.
+            RequestError: if a parameter is wrong, or the page does not show such a surface.
+        """
+        path, values = Path(source), dict(parameters)
+        if path.suffix.lower() == ".exr":
+            material = material_from(values)
+            return cls(path.stem, load_spectrum(path), None, {"filename": str(path.resolve())}, material)  # type: ignore[arg-type]
+        if path.suffix.lower() == ".toml":
+            recipe = Recipe.load(path)
+            return cls.of_recipe(recipe, path.stem, {"filename": str(path.resolve())}, values, progress=progress)
+        name = os.fspath(source)
+        if name not in PROFILES:
+            raise RequestError(
+                f"surface: got {name!r}, wanted a recipe (.toml), a saved spectrum (.exr), a scan with its scale, or a "
+                f"profile ({', '.join(PROFILES)})"
+            )
+        known = (*inspect.signature(PROFILES[name]).parameters, "patches")
+        grating = {key: values.pop(key) for key in known if key in values}
+        of_spectrum = ("coherence_length", "tolerance", "theory", "largest_height_range")
+        given = {key: values.pop(key) for key in of_spectrum if key in values}
+        settings = {"coherence_length": COHERENCE_LENGTHS[name]} if name in COHERENCE_LENGTHS else {}
+        if given.get("theory") == "rigorous":
+            raise RequestError("theory: got rigorous, wanted scalar")
+        recipe = Recipe({"profile": name, **grating}, Settings(**{**settings, **given}))
+        return cls.of_recipe(recipe, name, {"profile": name, **grating, **given}, values, progress=progress)
+
+
+SHORTEST = 360.0  # nm, of the wavelengths of a page
+
+
+def material_from(parameters: Mapping[str, Any]) -> Material:
+    """Return the material from the parameters of a scene.
+
+    Raises:
+        RequestError: if one is wrong, or not shown in a page.
+    """
+    known = {field.name for field in fields(Material)}
+    for name, value in parameters.items():
+        if name in _NOT_SHOWN:
+            raise RequestError(f"{name}: got {value!r}, and the page shows {_NOT_SHOWN[name]}")
+        if name not in known:
+            raise RequestError(f"{name}: got {value!r}, wanted a parameter among {', '.join(sorted(known))}")
+    if "material" in parameters and "int_ior" in parameters:
+        raise RequestError("material: a conductor or a perfect mirror takes no int_ior; give one or the other")
+    return replace(Material(), **parameters)

@@ -1,0 +1,132 @@
+"""The page in a real browser: values against the BSDF, interaction, and what leaves the page."""
+
+import shutil
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsuba_diffraction import testing
+from mitsuba_diffraction.viewer import page as pages
+from mitsuba_diffraction.viewer.surface import Surface
+
+sync_api = pytest.importorskip("playwright.sync_api", reason="the package playwright is not installed")
+
+RECIPES = Path(__file__).parents[2] / "precompute"
+CHROMIUM = shutil.which("chromium")
+OPTIONS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
+
+
+@pytest.fixture(scope="module")
+def browser():
+    """Chromium with its software renderer."""
+    if CHROMIUM is None:
+        pytest.skip("chromium is not installed (apt-get install chromium)")
+    with sync_api.sync_playwright() as playwright:
+        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=OPTIONS)
+        yield chromium
+        chromium.close()
+
+
+@pytest.fixture
+def opened(browser, tmp_path):
+    """opened(surface): its page, ready; the messages and requests of the page are collected in `messages`."""
+    tabs = []
+
+    def of(surface, **size):
+        path = tmp_path / f"{len(tabs)}.html"
+        path.write_text(pages.page(surface), encoding="utf-8")
+        tab = browser.new_page(viewport={"width": 420, "height": 400, **size})
+        tab.messages = []
+        tab.on("console", lambda message: tab.messages.append(message.text))
+        tab.on("pageerror", lambda error: tab.messages.append(str(error)))
+        tab.on("request", lambda request: tab.messages.append(request.url[:80]))
+        tab.goto(path.as_uri())
+        tab.evaluate("viewer.ready")
+        tabs.append(tab)
+        return tab
+
+    yield of
+    for tab in tabs:
+        tab.close()
+
+
+def pairs_of(spectrum, count=10_000, seed=1):
+    """ω_i, ω_o and λ: for half of the pairs q lies near a strong order or node, for the others it is random."""
+    random = np.random.default_rng(seed)
+    wi = testing.direction(np.rad2deg(np.arccos(random.random(count))), 360 * random.random(count))
+    wavelength = random.uniform(380, 780, count)
+    powers = np.abs(spectrum.powers(20.0)).ravel()
+    node = random.choice(powers.size, count, p=powers / powers.sum())
+    x, y = spectrum.grid.frequencies()
+    centre = np.stack([x[node % len(x)], y[node // len(x)]], -1)
+    q = centre + random.normal(0, spectrum.lobe_width, (count, 2))
+    wo = testing.towards(wi, q, wavelength)
+    anywhere = testing.direction(np.rad2deg(np.arccos(random.random(count))), 360 * random.random(count))
+    wo = np.where((np.isnan(wo[:, 2]) | (random.random(count) < 0.2))[:, None], anywhere, wo)
+    return np.concatenate([wi, wo, wavelength[:, None]], -1).astype(np.float32)
+
+
+@pytest.mark.parametrize(
+    ("source", "parameters", "changes"),
+    [
+        ("blaze.toml", {}, {}),
+        ("blaze.toml", {"material": "Au", "height_scale": 0.7}, {}),
+        ("foil_crossed.toml", {"material": "none"}, {}),
+        ("elaphe_afm.toml", {"int_ior": 1.5}, {"hasBase": True, "pigment": "#7c3f95"}),
+        pytest.param("elaphe.toml", {"int_ior": 1.7}, {}, marks=pytest.mark.slow),
+        pytest.param("xenopeltis.toml", {}, {}, marks=pytest.mark.slow),
+    ],
+)
+def test_values_are_those_of_the_bsdf(source, parameters, changes, opened, llvm):
+    """10,000 pairs of directions and wavelengths, to 1e-3 of the largest value."""
+    surface = Surface.named(RECIPES / source, parameters)
+    pairs = pairs_of(surface.spectrum)
+    tab = opened(surface)
+    tab.evaluate("(changes) => viewer.set(changes)", {"maxFrames": 1, **changes})
+    values = np.array(tab.evaluate("(pairs) => viewer.evaluate(pairs)", pairs.ravel().tolist()))
+    base = {}
+    if changes:
+        pigment = [int(changes["pigment"][i : i + 2], 16) / 255 for i in (1, 3, 5)]
+        linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in pigment]
+        base = {"base": {"type": "diffuse", "reflectance": {"type": "rgb", "value": linear}}}
+    bsdf = mi.load_dict(
+        {"type": "diffraction_grating", **surface.grating, **parameters, **base, "conserve_energy": False}
+    )
+    wanted = testing.evaluate(bsdf, pairs[:, :3], pairs[:, 3:6], pairs[:, 6:])[:, 0]
+    assert (wanted > 1e-3 * wanted.max()).mean() > 0.1
+    np.testing.assert_allclose(values, wanted, rtol=0, atol=1e-3 * wanted.max())
+
+
+def test_a_drag_changes_the_picture_and_nothing_leaves_the_page(opened):
+    tab = opened(Surface.named("blazed", {"depth": 0.1, "samples": 64, "coherence_length": 3.0}))
+    tab.evaluate("viewer.set({ maxFrames: 1, lightWidth: 0, lightLength: 0 })")
+    before = tab.evaluate("viewer.state")
+    box = tab.locator("#canvas").bounding_box()
+    pictures = [tab.screenshot()]
+    for modifier, name in ((None, "lightAzimuth"), ("Shift", "azimuth")):
+        if modifier:
+            tab.keyboard.down(modifier)
+        tab.mouse.move(box["x"] + 100, box["y"] + 80)
+        tab.mouse.down()
+        tab.mouse.move(box["x"] + 160, box["y"] + 90, steps=2)
+        tab.mouse.up()
+        after = tab.evaluate("viewer.state")
+        assert after[name] != before[name]
+        tab.wait_for_timeout(300)
+        pictures.append(tab.screenshot())
+    tab.keyboard.up("Shift")
+    assert len(set(pictures)) == 3
+    assert tab.messages == [tab.url[:80]]
+
+
+def test_a_browser_without_webgl2_is_told_in_one_line(browser, tmp_path):
+    path = tmp_path / "page.html"
+    path.write_text(pages.page(Surface.named("blazed", {"depth": 0.1, "samples": 64})), encoding="utf-8")
+    tab = browser.new_page()
+    tab.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
+    tab.goto(path.as_uri())
+    tab.evaluate("viewer.ready")
+    assert tab.locator("main").inner_text().strip() == "This page needs WebGL2, which this browser does not offer."
+    tab.close()

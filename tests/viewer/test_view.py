@@ -1,0 +1,108 @@
+"""The command `view` and `md.view`: what they write, what they refuse."""
+
+import dataclasses
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mitsuba_diffraction as md
+from mitsuba_diffraction.color import daylight, matching_functions
+from mitsuba_diffraction.spectrum.tables import SliceTable
+from mitsuba_diffraction.viewer import page as pages
+from mitsuba_diffraction.viewer.surface import MAX_LAYERS, Surface
+
+RECIPES = Path(__file__).parents[2] / "precompute"
+SMALL = "blazed,depth=0.02,samples=32,coherence_length=2"
+
+
+def test_a_page_is_written_and_opened_on_request(command, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    opened = []
+    monkeypatch.setattr("webbrowser.open", opened.append)
+    assert command(f"view {SMALL}")[0] == 0
+    assert opened == [(tmp_path / "blazed.html").as_uri()]
+    assert command(f"view {SMALL},material=Al --no-open")[0] == 0  # replaces its own file
+    assert len(opened) == 1
+    (tmp_path / "mine.html").write_text("my own page")
+    code, _, error = command(f"view {SMALL} --no-open -o mine.html")
+    assert (code, error.endswith("--overwrite replaces it\n")) == (2, True)
+
+
+def test_all_kinds_of_surfaces_are_shown(command, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(RECIPES / "measured", "measured", ignore=shutil.ignore_patterns("*65um*"))
+    shutil.copy(RECIPES / "elaphe_afm.toml", ".")
+    md.precompute(md.gratings.blazed(1.0, 0.02, samples=32), coherence_length=2).save("saved.exr")
+    scan = "measured/elaphe_afm_100x100.png --pixel-size 0.0586 --height-range 0.375 --coherence-length 1"
+    for source, name in ((scan, "elaphe_afm_100x100"), ("elaphe_afm.toml", "elaphe_afm"), ("saved.exr", "saved")):
+        code, out, _ = command(f"view {source} --no-open")
+        assert code == 0
+        assert out.startswith(f"{name}.html: ")
+
+
+def test_a_page_holds_everything_and_is_small():
+    for name in ("blaze", "elaphe", "xenopeltis"):
+        text = pages.page(Surface.named(RECIPES / f"{name}.toml", {}))
+        assert len(text.encode()) < pages.MAX_BYTES
+        assert not re.search(r"(src|href)\s*=\s*[\"'](?!data:)|https?://(?!www\.w3\.org)|@import|\{\{", text)
+
+
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        ("blazed,theory=rigorous", "theory: got rigorous, wanted scalar"),
+        ("blazed,transmission=sheet", "transmission: got 'sheet', and the page shows reflected light only"),
+        ("blazed,coat_ior=1.5", "coat_ior: got 1.5, and the page shows a grating without a coat"),
+        ("blazed,colour=red", "colour: got 'red', wanted a parameter among height_scale, int_ior, material"),
+        ("blazed,material=Alu", "material: got 'Alu', did you mean Al"),
+        ("blazed,material=Al,int_ior=1.5", "material: a conductor or a perfect mirror takes no int_ior"),
+        ("blazed,height_scale=2", "height_scale: got 2, wanted at most 1: the spectrum was built for wavelengths"),
+        ("blazed,int_ior=0.5", "int_ior: got 0.5, wanted an index above 1"),
+        ("blaze", "surface: got 'blaze', wanted a recipe (.toml), a saved spectrum (.exr), a scan with its scale, or"),
+        ("gone.toml", "gone.toml: no such file"),
+        ("rigorous.toml", "rigorous: got theory=rigorous, wanted a surface of scalar theory"),
+    ],
+)
+def test_wrong_requests_are_one_line(source, message, command, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    recipe = '[surface]\nprofile = "blazed"\n[spectrum]\ntheory = "rigorous"\nmaterial = "Al"\n'
+    (tmp_path / "rigorous.toml").write_text(recipe)
+    code, out, error = command(f"view {source} --no-open")
+    assert (code, out, len(error.splitlines())) == (2, "", 1)
+    assert message in error
+    assert not list(tmp_path.glob("*.html"))
+
+
+def test_tables_too_large_for_a_texture_are_refused():
+    spectrum = md.precompute(md.gratings.blazed(1.0, 0.02, samples=32), coherence_length=2)
+    table = np.zeros((MAX_LAYERS + 1, 3, *spectrum.grid.shape), np.float32)
+    spectrum = dataclasses.replace(spectrum, table=SliceTable(spectrum.max_kappa, table))
+    with pytest.raises(ValueError, match=f"intervals of κ, wanted at most 2048 × 2048 and {MAX_LAYERS}"):
+        md.view(spectrum)
+
+
+def test_a_large_page_is_refused(monkeypatch):
+    monkeypatch.setattr(pages, "MAX_BYTES", 100_000)
+    with pytest.raises(ValueError, match=r"got a page of .* MB, wanted at most 0.1; a larger tolerance"):
+        md.view("blazed", depth=0.02, samples=32, coherence_length=2.0)
+
+
+def test_a_notebook_shows_the_page_in_a_frame():
+    shown = md.view(md.Recipe({"profile": "blazed", "depth": 0.02, "samples": 32}), height=300)._repr_html_()
+    assert shown.startswith('<iframe srcdoc="&lt;!doctype html&gt;')
+    assert "height:300px" in shown
+    with pytest.raises(ValueError, match="surface: got int, wanted a file, a profile, a Recipe or a GratingSpectrum"):
+        md.view(3)
+
+
+def test_the_light_and_the_observer_are_those_of_colour_science():
+    table = pages._light()
+    wavelengths = np.arange(360.0, 831.0)
+    matching = matching_functions(wavelengths)
+    wanted = matching / matching[:, 1].sum()
+    np.testing.assert_allclose(table[:, :3], wanted, rtol=1e-5, atol=1e-9)
+    light = daylight(wavelengths)
+    np.testing.assert_allclose(table[:, 3], light / (light @ wanted[:, 1]), rtol=1e-5)
