@@ -17,6 +17,7 @@ from ..settings import SUN_COHERENCE_LENGTH, VISIBLE, Settings, lobe_width
 from ..spectrum.sample import effective_coherence_length, standard_error
 from ..surface.heightfield import HeightField
 from ..surface.periods import Period, find_periods, hann
+from ..surface.prepare import white_noise
 from .colours import CHANGE, MAX_COLOUR_COHERENCE_LENGTH, Change, changes, same_period
 
 Array = NDArray[np.float64]
@@ -157,7 +158,7 @@ def inspect(
         standard_error=scatter,
         scalar_error=scalar,
         changes=changes(piece, spectrum, main[0], extent=extent, measured=measured, build=build) if main else (),
-        concerns=concerns(height_field, numbers, used, measured=measured, scalar=scalar),
+        concerns=concerns(height_field, numbers, used, extent=extent, measured=measured, scalar=scalar),
         piece=piece,
         spectrum=spectrum,
     )
@@ -261,6 +262,8 @@ _BLUE, _GREEN = 0.45, 0.55  # µm
 _MAX_FRACTION_AT_LIMIT = 0.02  # of the power above four fifths of the Nyquist limit
 _MAX_STEP_SCATTER = 1e-3  # fraction of light scattered by the steps of the heights
 _MAX_DEFLECTION = 1.0  # degrees
+_MIN_WAVELENGTHS = 5  # of green light, across a scan
+_MAX_NOISE = 0.5  # of Sq: a quarter of the variance
 _MAX_SLOPE = 45.0  # degrees, above which light is reflected twice
 
 
@@ -269,6 +272,7 @@ def concerns(
     numbers: Statistics,
     coherence_length: float,
     *,
+    extent: str,
     measured: bool,
     scalar: ScalarError,
 ) -> tuple[str, ...]:
@@ -289,6 +293,20 @@ def concerns(
         found.append(f"{warning[0].upper()}{warning[1:]}.")
     if not measured:
         return tuple(found)
+    width = min(height_field.tile_size)
+    if extent == "sample" and width < _MIN_WAVELENGTHS * _GREEN:
+        lobe = np.degrees(_GREEN * lobe_width(coherence_length))
+        found.append(
+            f"The scan is {width:.3g} µm wide, {width / _GREEN:.2g} wavelengths of green light: an order is "
+            f"±{lobe:.2g}° wide, and colours run into each other. Scan 20 µm or more, or, for whole periods of a "
+            "grating, use --extent tile."
+        )
+    noise = white_noise(height_field.heights)
+    if noise > _MAX_NOISE * numbers.Sq:
+        found.append(
+            f"Noise of {noise * 1e3:.2g} nm is {noise / numbers.Sq:.0%} of the roughness Sq: periods and colours may "
+            "be those of the noise. Scan more slowly, or a rougher part of the surface."
+        )
     # A slope s deflects all light by 2s and shifts q by 2s/λ. Less than a lobe is invisible, a degree always too much.
     shift = 2 * np.tan(np.deg2rad(numbers.tilt)) / _GREEN
     if shift > lobe_width(coherence_length) or 2 * numbers.tilt > _MAX_DEFLECTION:

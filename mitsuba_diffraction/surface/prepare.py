@@ -138,7 +138,7 @@ def despike(height_field: HeightField, threshold: float = 5.0) -> HeightField:
     padded = np.pad(whole, _NEIGHBOURHOOD // 2, mode="reflect", reflect_type="odd")
     ranks = _NEIGHBOURHOOD, -_NEIGHBOURHOOD - 1
     low, high = (ndimage.rank_filter(padded, rank, _NEIGHBOURHOOD)[inside, inside] for rank in ranks)
-    sigma = _noise(whole)
+    sigma = white_noise(whole)
     excess = np.maximum(whole - high, low - whole)
     spikes = ~gaps & (excess > threshold * sigma) & (excess > 2 * (high - low))
     cleaned = height_field.heights
@@ -149,7 +149,7 @@ def despike(height_field: HeightField, threshold: float = 5.0) -> HeightField:
     return _after(height_field, cleaned, f"despike: {description}")
 
 
-def _noise(heights: NDArray[np.float64]) -> float:
+def white_noise(heights: NDArray[np.float64]) -> float:
     """Estimate the standard deviation of white noise on a smooth surface, µm."""
     differences = heights
     for dimension, count in enumerate(heights.shape):

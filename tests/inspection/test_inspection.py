@@ -256,9 +256,9 @@ def test_the_period_of_a_tile_is_exact(grating):
 
 
 def about(field, measured=True):
-    return concerns(
-        field, statistics(field), 4.0, measured=measured, scalar=scalar_error(field, "sample" if measured else "tile")
-    )
+    extent = "sample" if measured else "tile"
+    scalar = scalar_error(field, extent)
+    return concerns(field, statistics(field), 4.0, extent=extent, measured=measured, scalar=scalar)
 
 
 @pytest.mark.parametrize(
@@ -288,6 +288,22 @@ def test_a_grating_too_fine_for_scalar_theory_is_a_concern():
     (said,) = about(md.gratings.sinusoidal(0.8, 0.3), measured=False)
     assert said.startswith("Scalar theory: errs by ")
     assert said.endswith("; theory=rigorous has it right.")
+
+
+@pytest.mark.parametrize(("width", "warns"), [(0.33, True), (2.5, True), (3.0, False)])
+def test_a_scan_of_a_few_wavelengths_is_a_concern(width, warns):
+    """An order is as wide as the scan allows."""
+    said = about(md.HeightField(0.05 * np.sin(np.arange(128) * 0.2) * np.ones((128, 1)), width / 128))
+    assert [text for text in said if "wavelengths of green light" in text] == ([said[0]] if warns else [])
+
+
+@pytest.mark.parametrize(("depth", "warns"), [(0.0, True), (2.0, True), (10.0, False)])
+def test_heights_hardly_above_their_noise_are_a_concern(depth, warns):
+    x = np.arange(256) * 0.02
+    noise = np.random.default_rng(3).normal(size=(256, 256))
+    said = about(md.HeightField(1e-3 * (depth / 2 * np.sin(2 * np.pi * x) + noise), 0.02))
+    assert any("of the roughness Sq" in text for text in said) == warns
+    assert not warns or any("Noise of 1 nm" in text for text in said)
 
 
 def test_a_good_scan_has_no_concerns():

@@ -162,6 +162,29 @@ def test_an_unknown_extension_is_refused_with_the_known_ones(tmp_path, refuse, n
     refuse(name, r"wanted one of \.npy, \.npz, \.png, \.tif, \.tiff")
 
 
+@pytest.mark.parametrize("name", ["scan.npy", "scan.png", "scan.tif", "scan.gsf", "scan.gwy", "scan.asc", "grid.asc"])
+def test_content_decides_where_the_extension_is_unknown(tmp_path, name):
+    path = tmp_path / name
+    if name == "scan.npy":
+        np.save(path, HEIGHTS)
+    elif name in ("scan.png", "scan.tif"):
+        Image.fromarray(GREY).save(path)
+    elif name == "scan.gwy":
+        write_gwy(path, {0: ("Height", gwy_field())})
+    elif name == "scan.gsf":
+        write_gsf(path)
+    elif name == "scan.asc":
+        path.write_text("# Channel: Height\n# Width: 3 um\n# Height: 4 um\n# Value units: nm\n1 2 3\n4 5 6\n")
+    else:
+        path.write_text("ncols 2\nnrows 2\nxllcorner 0\nyllcorner 0\ncellsize 1\n1 2\n3 4\n")
+    more = {"height_range": 1.0} if name in ("scan.png", "scan.tif") else {}
+    more |= {"unit": "um"} if name == "grid.asc" else {"pixel_size": 0.1}
+    wanted = read_height_field(path, **more)
+    found = read_height_field(path.rename(tmp_path / "scan.dat"), **more)
+    np.testing.assert_array_equal(found.heights, wanted.heights)
+    assert found.pixel_size == wanted.pixel_size
+
+
 @pytest.mark.parametrize("pixel_size", [None, 0.0, -1.0, np.nan, "wide", (1.0, 2.0, 3.0)])
 def test_the_pixel_size_must_be_known_and_positive(tmp_path, refuse, pixel_size):
     np.save(tmp_path / "scan.npy", HEIGHTS)

@@ -33,6 +33,18 @@ _WITHOUT_UNIT = {
 
 # Extension → reader of single-channel formats with a unit.
 _WITH_UNIT = {".gsf": gwyddion.read_simple_field, ".xyz": text.read_points, ".asc": text.read_table}
+# First bytes of a file → the extension by which it is read if its own is unknown.
+_MAGIC = {
+    b"GWYP": ".gwy",
+    b"Gwyddion Simple Field": ".gsf",
+    b"\\*File list": ".spm",
+    b"\x93NUMPY": ".npy",
+    b"\x89PNG": ".png",
+    b"II*\0": ".tif",
+    b"MM\0*": ".tif",
+    b"# Channel:": ".asc",
+    b"ncols ": ".asc",
+}
 _EXTENSIONS = (*_WITHOUT_UNIT, ".gwy", *_WITH_UNIT)
 
 
@@ -60,7 +72,7 @@ def read_height_field(
     | .spm, .000, .nid, .ibw, .sdf, .x3p, … | instrument formats, with the extra `instruments` | |
 
     Args:
-        path: the file; its extension determines the format.
+        path: the file; its extension determines the format, and its content if that is unknown.
         pixel_size: µm, one number or (x, y). Overrides that of the file; required if the file has none.
         height_range: height of the full range of the integer type (black to white), µm; heights start at zero.
             For integers only.
@@ -110,6 +122,8 @@ def read_height_field(
 
 def _read(path: Path, channel: str | int | None, unit: str | tuple[str, str] | None) -> Scan:
     extension = path.suffix.lower()
+    if extension not in _EXTENSIONS and instruments.format_of(extension) is None and path.is_file():
+        extension = _extension_of_content(path)
     instrument = instruments.format_of(extension) is not None
     if extension not in _EXTENSIONS and not instrument:
         raise RequestError(
@@ -123,12 +137,19 @@ def _read(path: Path, channel: str | int | None, unit: str | tuple[str, str] | N
     if unit is not None and extension in _WITHOUT_UNIT:
         raise RequestError(f"unit: got {unit!r} for {extension}, whose lengths are µm")
     if instrument:
-        return instruments.read(path, unit, channel)
+        return instruments.read(path, unit, channel, extension)
     if extension == ".gwy":
         return gwyddion.read(path, unit, channel)
     if extension in _WITH_UNIT:
         return _WITH_UNIT[extension](path, unit)
     return _WITHOUT_UNIT[extension](path)
+
+
+def _extension_of_content(path: Path) -> str:
+    """Return the extension for which a file is read whose own one is unknown; that one if the content is unknown."""
+    with open(path, "rb") as stream:
+        start = stream.read(max(map(len, _MAGIC)))
+    return next((extension for magic, extension in _MAGIC.items() if start.startswith(magic)), path.suffix)
 
 
 def _as_micrometres(numbers: NDArray, height_range: float | None) -> NDArray[np.float64]:

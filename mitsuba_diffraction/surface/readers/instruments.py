@@ -35,8 +35,8 @@ def format_of(extension: str) -> str | None:
     return "di" if re.fullmatch(r"\.\d{3}", extension) else FORMATS.get(extension)
 
 
-def read(path: Path, unit: str | tuple[str, str] | None, channel: str | int | None) -> Scan:
-    """Read one channel of an instrument file; the top row of its image is row 0."""
+def read(path: Path, unit: str | tuple[str, str] | None, channel: str | int | None, extension: str) -> Scan:
+    """Read one channel of an instrument file of that extension; the top row of its image is row 0."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of the library, on optional dependencies and metadata
         try:
@@ -45,7 +45,7 @@ def read(path: Path, unit: str | tuple[str, str] | None, channel: str | int | No
             raise RequestError(f"an instrument's own format: wanted SurfaceTopography, {EXTRA} ({error})") from None
         _refuse_bomb(path)
         try:
-            reader = lookup_reader_by_format[format_of(path.suffix.lower())](str(path))
+            reader = lookup_reader_by_format[format_of(extension)](str(path))
             found = list(reader.channels)
         # Readers of binary files raise arbitrary exceptions for damaged files.
         except Exception as error:
