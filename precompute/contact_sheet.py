@@ -22,7 +22,9 @@ from mitsuba_diffraction.render.spectral_image import save_preview
 HERE = Path(__file__).parent
 DISCS = {"compact_disc", "dvd"}
 PANES = {"film", "transmission_300", "transmission_600"}
-SKINS = {"elaphe", "elaphe_afm", "xenopeltis", "xenopeltis_afm", "morpho_ridges"}
+SKINS = {f"{name}{kind}" for name in ("elaphe", "xenopeltis") for kind in ("", "_afm", "_synthetic")} | {
+    "morpho_ridges"
+}
 METAL = '<string name="material" value="Al"/>'
 SKIN = """<float name="int_ior" value="1.5"/>
     <bsdf type="diffuse" name="base"><rgb name="reflectance" value="0.02, 0.014, 0.01"/></bsdf>"""
