@@ -126,7 +126,8 @@ def test_each_shader_names_the_quirks_that_change_it(kind):
     surface = md.HeightField(np.random.default_rng(1).normal(0, 0.05, (14, 16)), 0.3)
     # PQ has no window and therefore no taper; two tiles along each axis.
     extent = {"extent": "sample"} if kind in ("flss", "nmm") else {}
-    more = {} if kind == "gem" else {"terms": 5, "coherence_length": 2.0 if extent else 8.0, **extent}
+    lengths = {"coherence_length": 4.0, "corrected_coherence_length": 2.0 if extent else 8.0}
+    more = {} if kind == "gem" else {"terms": 5, **lengths, **extent}
 
     def colours(quirks):
         shader = VARIANTS[kind](surface, quirks, **more)

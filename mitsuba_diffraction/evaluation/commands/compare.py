@@ -23,7 +23,13 @@ def compare(
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="prefix of the output files, or a folder")
     ] = None,
-    shader: Annotated[str, typer.Option(help="flss, nmm, pq or gem")] = "flss",
+    shader: Annotated[
+        list[str] | None,
+        typer.Option(help="flss (default), nmm, pq, nmm_pq or gem; several are compared, with the quirks of the first"),
+    ] = None,
+    terms: Annotated[int | None, typer.Option(min=1, help="Taylor terms of the shader")] = None,
+    window: Annotated[str | None, typer.Option(help="texel or 4sigma; of flss and nmm")] = None,
+    interpolation: Annotated[str | None, typer.Option(help="sinc or linear; of pq and nmm_pq")] = None,
     spp: Annotated[int, typer.Option(min=1, help="samples per pixel of the path tracer")] = 64,
     shading_points: Annotated[int, typer.Option(min=1, help="shading points per pixel of the shader")] = 4,
     width: Annotated[int | None, typer.Option(min=1, help="pixels; default: that of the scene")] = None,
@@ -44,6 +50,7 @@ def compare(
     from ..comparison import summary
 
     parameters = scene_parameters(define)
+    shader, *others = shader or ["flss"]
     reads = files_of_scene(scene, parameters)
     prefix = output
     if output is None or output.is_dir():
@@ -60,6 +67,10 @@ def compare(
     found = run(
         scene,
         shader,
+        others=others,
+        terms=terms,
+        window=window,
+        interpolation=interpolation,
         width=width,
         height=height,
         spp=spp,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 
 from ...errors import RequestError
 from ...progress import Progress, no_progress
+from ..realtime_shader.evaluate import VARIANTS
+from ..realtime_shader.integrator import settings_of
 from .difference import Difference, difference, noise, white_luminance
 from .pictures import Picture, Pictures
 from .quirk_shares import QuirkShares, quirk_shares
@@ -30,25 +32,34 @@ class Comparison:
 
     Attributes:
         scene: file name.
-        shader: "flss", "nmm", "pq" or "gem".
+        shader: one of `VARIANTS`.
+        others: further shaders.
+        settings: of the shaders: terms, window, interpolation; those that are not the default.
         variant: Mitsuba's.
         seed: of the random numbers.
         pictures: by name: "path_traced", "same_light" (the project's model under the lights that the shader supports),
-            "published" and "corrected" (the shader with and without its quirks).
+            "published" and "corrected" (the shader with and without its quirks), and for each of `others`, such as nmm,
+            "nmm_published" and "nmm_corrected".
         surface: (height, width) bool, the pixels that are compared: those covered by surfaces.
         white: the luminance that is shown as white.
         to_path_traced: difference of each other picture from the path-traced one.
         to_same_light: difference of the shader's pictures from "same_light".
         noise: the mean CIEDE2000 due to noise in the traced pictures; None for one sample per pixel.
-        shader_reads: maximum number of texels (two numbers each) that one shading point of the shader reads.
+        shader_reads: maximum number of texels (two numbers each) that one shading point of the shader reads, by name of
+            its picture.
         model_reads: packets (four numbers each) that one BRDF value of the project's model reads for a ray.
-        truncated_fraction: maximum fraction of a line's power outside the shader's 3 × 3 texels; None if not used.
+        truncated_fraction: maximum fraction of a line's power outside the shader's neighbourhood; None if not used.
+        series_error: of the Taylor series, corrected; None if not used.
+        samples: whether a surface is a scan, a piece of an irregular surface.
+        patches: maximum number of patches over which this model averages; the shader has the first.
         coated: whether a grating has a coat, which the shader does not show.
         shares: fractions of the difference due to each quirk; None if not requested.
     """
 
     scene: str
     shader: str
+    others: tuple[str, ...]
+    settings: Mapping[str, object]
     variant: str
     seed: int
     pictures: Mapping[str, Picture]
@@ -57,9 +68,12 @@ class Comparison:
     to_path_traced: Mapping[str, Difference]
     to_same_light: Mapping[str, Difference]
     noise: Mapping[str, float | None]
-    shader_reads: int
+    shader_reads: Mapping[str, int]
     model_reads: int
     truncated_fraction: float | None
+    series_error: float | None
+    samples: bool
+    patches: int
     coated: bool
     shares: QuirkShares | None
 
@@ -68,6 +82,10 @@ def compare(
     scene_path: str | os.PathLike[str],
     shader: str = "flss",
     *,
+    others: Sequence[str] = (),
+    terms: int | None = None,
+    window: str | None = None,
+    interpolation: str | None = None,
     width: int | None = None,
     height: int | None = None,
     spp: int = 64,
@@ -82,7 +100,11 @@ def compare(
 
     Args:
         scene_path: an XML scene whose integrator is a path tracer, with a directional or point light.
-        shader: "flss", "nmm", "pq" or "gem".
+        shader: one of `VARIANTS`; the effect of its quirks is measured.
+        others: further ones.
+        terms: number of Taylor terms; default: as published, or, corrected, as many as needed.
+        window: "texel" or "4sigma" (flss, nmm); default: as published "texel", corrected "4sigma".
+        interpolation: "sinc" or "linear" (pq, nmm_pq).
         width: in pixels; default: that of the film.
         height: likewise.
         spp: samples per pixel of the path tracer.
@@ -101,27 +123,44 @@ def compare(
     for name, count in (("spp", spp), ("shading_points", shading_points), ("shares_side", shares_side)):
         if count < 1:
             raise RequestError(f"{name}: got {count}, wanted a positive number")
-    of = Pictures(scene_path, shader, width=width, height=height, seed=seed, parameters=parameters)
-    pictures = {}
+    settings = {"terms": terms, "window": window, "interpolation": interpolation}
+    settings = {name: value for name, value in settings.items() if value is not None}
+    for name in settings:
+        if not any(name in settings_of(kind) for kind in (shader, *others) if kind in VARIANTS):
+            raise RequestError(f"{name}: got {settings[name]!r}, which {', '.join((shader, *others))} cannot use")
+    request = {"seed": seed, "parameters": parameters, "settings": settings}
+    of = Pictures(scene_path, shader, width=width, height=height, **request)
+    for other in others:
+        of.use(other)  # refuses unknown names
+    of.use(shader)
+    pictures, reads = {}, {}
     with progress("path tracer") as bar:
         pictures["path_traced"] = of.path_traced(spp, bar)
     with progress("the same light") as bar:
         pictures["same_light"] = of.same_light(spp, bar)
-    for name, quirks in (("published", of.quirks), ("corrected", ())):
-        with progress(f"{shader}, {name}") as bar:
-            pictures[name] = of.shaded(quirks, shading_points, spp, bar)
+    for kind in (shader, *others):
+        of.use(kind)
+        for name, quirks in (("published", of.quirks), ("corrected", ())):
+            key = name if kind == shader else f"{kind}_{name}"
+            with progress(f"{kind}, {name}") as bar:
+                pictures[key] = of.shaded(quirks, shading_points, spp, bar)
+            reads[key] = of.shader_reads
+        if kind == shader:
+            truncated_fraction, series_error = of.truncated_fraction, of.series_error
     reference, same_light = pictures["path_traced"].xyz, pictures["same_light"].xyz
     white = white_luminance(reference, of.surface)
     of_quirks = None
     if shares:
         scale = min(1.0, shares_side / max(of.surface.shape))
         columns, rows = (max(1, round(size * scale)) for size in of.film_size)
-        small = Pictures(scene_path, shader, width=columns, height=rows, seed=seed, parameters=parameters)
+        small = Pictures(scene_path, shader, width=columns, height=rows, **request)
         with progress("quirks") as bar:
             of_quirks = quirk_shares(small, QUIRKS_SAMPLES, QUIRKS_SHADING_POINTS, bar)
     return Comparison(
         scene=Path(scene_path).name,
         shader=shader,
+        others=tuple(others),
+        settings=settings,
         variant=mi.variant(),
         seed=seed,
         pictures=pictures,
@@ -129,15 +168,17 @@ def compare(
         white=white,
         to_path_traced={
             name: difference(reference, pictures[name].xyz, of.surface, white)
-            for name in ("same_light", "published", "corrected")
+            for name in pictures
+            if name != "path_traced"
         },
-        to_same_light={
-            name: difference(same_light, pictures[name].xyz, of.surface, white) for name in ("published", "corrected")
-        },
+        to_same_light={name: difference(same_light, pictures[name].xyz, of.surface, white) for name in reads},
         noise={name: noise(picture.halves, of.surface, white) for name, picture in pictures.items()},
-        shader_reads=of.shader_reads,
+        shader_reads=reads,
         model_reads=of.model_reads,
-        truncated_fraction=of.truncated_fraction,
+        truncated_fraction=truncated_fraction,
+        series_error=series_error,
+        samples=of.has_samples,
+        patches=of.patches,
         coated=of.has_coat,
         shares=of_quirks,
     )

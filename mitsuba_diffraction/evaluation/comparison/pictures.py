@@ -21,9 +21,10 @@ from ...render import SpectralImage
 from ...render.film import check_memory, collect, equal_ranges, pass_seed, rotated, trace_pass
 from ...render.passes import Accumulation, ratio, split
 from ...render.scene import channel_wavelengths, load_spectral_scene, parsed
-from ..realtime_shader.base import Shader
+from ..realtime_shader.base import Shader, TextureShader
 from ..realtime_shader.evaluate import VARIANTS
 from ..realtime_shader.flss import FLSS
+from ..realtime_shader.integrator import settings_of
 from ..realtime_shader.lights import lights_of
 from ..realtime_shader.quirks import Quirks
 from ..realtime_shader.surfaces import sum_along
@@ -122,6 +123,8 @@ class Pictures:
         shaders: of the gratings.
         spectra: of the gratings.
         has_base: whether something lies below a grating.
+        has_samples: whether a grating is a scan, a piece of an irregular surface.
+        patches: maximum number of patches over which the spectrum of a grating is averaged.
         has_coat: whether a layer lies above a grating.
     """
 
@@ -134,16 +137,18 @@ class Pictures:
         height: int | None = None,
         seed: int = 0,
         parameters: Mapping[str, str] | None = None,
+        settings: Mapping[str, object] | None = None,
     ) -> None:
         """Load the scene; see `load_spectral_scene`.
 
         Args:
             scene_path: an XML scene whose integrator is a path tracer.
-            shader: "flss", "nmm", "pq" or "gem".
+            shader: one of `VARIANTS`.
             width: in pixels; default: that of the film.
             height: likewise.
             seed: of the random numbers, not negative.
             parameters: values for the scene's `$name` parameters.
+            settings: further parameters of the `diffraction_shader`: terms, window, interpolation.
 
         Raises:
             FileNotFoundError: if there is no such scene.
@@ -151,6 +156,7 @@ class Pictures:
         """
         if shader not in VARIANTS:
             raise RequestError(f"shader: got {shader!r}, wanted one of {', '.join(VARIANTS)}")
+        self._settings = {name: value for name, value in (settings or {}).items() if value is not None}
         if seed < 0:
             raise RequestError(f"seed: got {seed}, wanted an integer that is not negative")
         _check_lights(Path(scene_path), parameters)
@@ -159,27 +165,38 @@ class Pictures:
             raise RequestError(f"{scene_path}: its integrator is the shader itself, wanted a path tracer (type='path')")
         self.seed = seed
         self._others: dict[tuple[bool, bool, int], Picture] = {}
-        self._shader = mi.load_dict({"type": "diffraction_shader", "variant": shader})
-        # Refuses a scene that the shader cannot show.
-        prepared = self._shader.prepare(self.scene)
-        if not prepared.shaded:
-            raise RequestError(f"{scene_path}: no shape has a diffraction_grating, there is nothing to compare")
-        self.shaders: list[Shader] = [shaded.shader for shaded in prepared.shaded]
-        layers = [shaded.layers for shaded in prepared.shaded]
-        self.spectra = [one.grating.spectrum for one in layers]
-        self.has_base = any(one.base is not None for one in layers)
-        self.has_coat = any(one.coat is not None for one in layers)
+        self.use(shader)
         self.film_size = tuple(int(size) for size in self.scene.sensors()[0].film().size())
         self.surface = _shows_surfaces(self.scene)
         if not self.surface.any():
             raise RequestError(f"{scene_path}: no pixel shows a surface, there is nothing to compare")
+
+    def use(self, shader: str) -> None:
+        """Choose the shader, one of `VARIANTS`, of the next pictures."""
+        if shader not in VARIANTS:
+            raise RequestError(f"shader: got {shader!r}, wanted one of {', '.join(VARIANTS)}")
+        own = {name: value for name, value in self._settings.items() if name in settings_of(shader)}
+        self._shader = mi.load_dict({"type": "diffraction_shader", "variant": shader, **own})
+        # Refuses a scene that the shader cannot show.
+        prepared = self._shader.prepare(self.scene)
+        if not prepared.shaded:
+            raise RequestError("no shape has a diffraction_grating, there is nothing to compare")
+        self.shaders: list[Shader] = [shaded.shader for shaded in prepared.shaded]
+        layers = [shaded.layers for shaded in prepared.shaded]
+        self.spectra = [one.grating.spectrum for one in layers]
+        self.has_base = any(one.base is not None for one in layers)
+        recipes = [one.grating.recipe for one in layers]
+        self.has_samples = any(recipe.settings.extent == "sample" for recipe in recipes)
+        self.patches = max(recipe.patches for recipe in recipes)
+        self.has_coat = any(one.coat is not None for one in layers)
 
     @property
     def quirks(self) -> tuple[str, ...]:
         """Names of the `Quirks` that affect this scene with this shader, and "no_shadows"."""
         of_integrator = ("power_gamma", *(("constant_blend",) if self.has_base else ()))
         own = {*self.shaders[0].own_quirks, *of_integrator}
-        if not any(getattr(shader, "extent", "tile") == "sample" for shader in self.shaders):
+        textures = [shader for shader in self.shaders if isinstance(shader, TextureShader)]
+        if all(shader.extent == "tile" for shader in textures):
             own -= {"periodic_scan"}
         return (*(name for name in Quirks.names() if name in own), NO_SHADOWS)
 
@@ -196,9 +213,15 @@ class Pictures:
 
     @property
     def truncated_fraction(self) -> float | None:
-        """Maximum fraction of a line's power outside the shader's 3 × 3 texels; None for other shaders."""
+        """Maximum fraction of a line's power outside the shader's neighbourhood; None for other shaders."""
         fractions = [shader.truncated_fraction for shader in self.shaders if isinstance(shader, FLSS)]
         return max(fractions, default=None)
+
+    @property
+    def series_error(self) -> float | None:
+        """Maximum error of the shader's Taylor series (`series_error`); None for gem."""
+        errors = [shader.textures.error for shader in self.shaders if isinstance(shader, TextureShader)]
+        return max(errors, default=None)
 
     def path_traced(self, samples: int, progress: Progress = silent) -> Picture:
         """Render by the scene's own integrator."""

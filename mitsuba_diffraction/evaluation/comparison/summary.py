@@ -26,13 +26,12 @@ if TYPE_CHECKING:
 
 def titles(comparison: Comparison) -> dict[str, str]:
     """Return the titles of the pictures."""
-    shader = comparison.shader.upper()
-    return {
-        "path_traced": "path tracer, this model",
-        "same_light": "this model, the shader's light",
-        "published": f"{shader} as published",
-        "corrected": f"{shader} corrected",
-    }
+    result = {"path_traced": "path tracer, this model", "same_light": "this model, the shader's light"}
+    for kind in (comparison.shader, *comparison.others):
+        prefix = "" if kind == comparison.shader else f"{kind}_"
+        shader = kind.upper().replace("_", " with ")
+        result |= {f"{prefix}published": f"{shader} as published", f"{prefix}corrected": f"{shader} corrected"}
+    return result
 
 
 _TO_REFERENCE = {
@@ -51,7 +50,7 @@ def picture_table(comparison: Comparison) -> Table:
     for name, title in titles(comparison).items():
         found, same = comparison.to_path_traced.get(name), comparison.to_same_light.get(name)
         picture = comparison.pictures[name]
-        reads = comparison.model_reads if name in ("path_traced", "same_light") else comparison.shader_reads
+        reads = comparison.shader_reads.get(name, comparison.model_reads)
         differences = ["1", "", "", "", ""] if found is None else report.cells(_TO_REFERENCE, found)
         same_light = "" if same is None else f"{same.mean:.2f}"
         rows.append([title, *differences, same_light, str(reads), str(picture.samples), f"{picture.seconds:.1f}"])
@@ -97,10 +96,18 @@ def notes(comparison: Comparison) -> list[str]:
         lines.append("coat: the shader shows coated gratings without their coat; it does not converge to this model")
     elif comparison.truncated_fraction is not None:
         lines.append(
-            "limit: corrected, the shader converges to this model in the same light; its 3 × 3 texels omit at "
-            f"most {100 * comparison.truncated_fraction:.2g} % of a line, and less the longer "
-            "the coherence length is relative to the tile"
+            "limit: corrected, the shader converges to this model in the same light; its neighbourhood omits at most "
+            f"{100 * comparison.truncated_fraction:.2g} % of a line"
         )
+    if comparison.samples:
+        lines.append(
+            "scan: as published it is one period of a tiling; corrected, one transform of the tapered scan, within "
+            "about 5 % of this model's average over windows"
+        )
+    if comparison.patches > 1:
+        lines.append(f"patches: this model is the mean over {comparison.patches} of them, the shader has the first")
+    if comparison.series_error is not None and comparison.series_error > 0.01:
+        lines.append(f"terms: the Taylor series of the corrected shader has an error of {comparison.series_error:.1g}")
     if (shares := comparison.shares) is not None:
         lines.append(
             f"quirks: pictures of {shares.size[0]} × {shares.size[1]} pixels, {shares.samples} samples, "
@@ -135,6 +142,8 @@ def as_dict(comparison: Comparison) -> dict[str, object]:
     return {
         "scene": comparison.scene,
         "shader": comparison.shader,
+        "other shaders": comparison.others,
+        "settings": comparison.settings,
         "variant": comparison.variant,
         "seed": comparison.seed,
         "width": comparison.surface.shape[1],
@@ -150,6 +159,7 @@ def as_dict(comparison: Comparison) -> dict[str, object]:
         "texel reads of the shader": comparison.shader_reads,
         "packet reads of this model": comparison.model_reads,
         "left out by the neighbourhood": comparison.truncated_fraction,
+        "error of the series": comparison.series_error,
         "shares": shares
         and {
             "size": shares.size,
@@ -174,31 +184,33 @@ def shown(comparison: Comparison, name: str) -> NDArray[np.uint8]:
 
 
 def figure(comparison: Comparison) -> Figure:
-    """Plot the pictures side by side, below them CIEDE2000 to the path tracer's, and the effects of the quirks."""
+    """Plot the pictures, four to a row, below them CIEDE2000 to the path tracer's, and the effects of the quirks."""
     from matplotlib.figure import Figure
 
     aspect = comparison.surface.shape[0] / comparison.surface.shape[1]
-    result = Figure(figsize=(12, 4.9 * aspect + 1), layout="constrained")
-    axes = result.subplots(2, 4)
     names = titles(comparison)
+    rows = -(-len(names) // 4)
+    result = Figure(figsize=(12, rows * (5.3 * aspect + 0.8)), layout="constrained")
+    axes = result.subplots(2 * rows, 4)
     limit = max(2.0, float(np.ceil(comparison.to_path_traced["published"].percentile_95)))
-    for column, (name, title) in enumerate(names.items()):
-        axes[0, column].imshow(shown(comparison, name), interpolation="nearest")
-        axes[0, column].set_title(title, fontsize="medium")
-        axes[0, column].set_axis_off()
+    for panel in axes.ravel():
+        panel.set_axis_off()
+    for index, (name, title) in enumerate(names.items()):
+        row, column = divmod(index, 4)
+        axes[2 * row, column].imshow(shown(comparison, name), interpolation="nearest")
+        axes[2 * row, column].set_title(title, fontsize="medium")
         if (found := comparison.to_path_traced.get(name)) is not None:
-            panel = axes[1, column]
+            panel = axes[2 * row + 1, column]
+            panel.set_axis_on()
             image = panel.imshow(found.delta_e, cmap="inferno", vmin=0, vmax=limit, interpolation="nearest")
             panel.set_facecolor("0.88")
             panel.set(xticks=[], yticks=[])
             panel.set_title(f"mean {found.mean:.1f}, 95 % {found.percentile_95:.1f}", fontsize="medium")
-            for spine in panel.spines.values():
-                spine.set_visible(False)
+            panel.spines[:].set_visible(False)
     bar = result.colorbar(image, ax=axes[1, 3], extend="max", pad=0.03)
-    bar.set_label("CIEDE2000 to the path tracer")
-    if comparison.shares is None:
-        axes[1, 0].set_axis_off()
-    else:
+    bar.set_label("CIEDE2000 to the path tracer", fontsize="small")
+    if comparison.shares is not None:
+        axes[1, 0].set_axis_on()
         _bars(axes[1, 0], comparison.shares.path_traced)
         axes[1, 0].set_box_aspect(aspect)
     return result

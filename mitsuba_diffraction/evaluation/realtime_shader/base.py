@@ -189,7 +189,7 @@ class TextureShader(Shader):
     """
 
     own_quirks = (
-        *("fresnel_squared", "fixed_index", "floor_anchor", "heights_from_zero"),
+        *("fresnel_squared", "fixed_index", "floor_anchor", "heights_from_zero", "fixed_coherence"),
         *("d65_light", "relative", "d65_twice", "cie_rgb_matrix"),
     )
     origin_at_centre: ClassVar[bool] = False
@@ -201,6 +201,7 @@ class TextureShader(Shader):
         quirks: Quirks,
         *,
         coherence_length: float = SUN_COHERENCE_LENGTH,
+        corrected_coherence_length: float | None = None,
         extent: str = "tile",
         terms: int | None = None,
         max_height_scale: float = 1.0,
@@ -212,6 +213,7 @@ class TextureShader(Shader):
             height_field: the tile.
             quirks: the quirks of the published shader to keep.
             coherence_length: L_c in µm.
+            corrected_coherence_length: instead, without the quirk `fixed_coherence`.
             extent: "tile", or "sample" for a piece of an irregular surface.
             terms: number of Taylor terms; default: as published, or as many as an error of 1e-4 requires.
             max_height_scale: of `rgb`, for the number of terms.
@@ -222,9 +224,10 @@ class TextureShader(Shader):
         """
         super().__init__(height_field, quirks, shadowing)
         lobe_width(coherence_length)  # raises unless it is a valid length
-        self.coherence_length, self.extent = coherence_length, extent
+        self._coherence_lengths = coherence_length, corrected_coherence_length or coherence_length
+        self.extent = extent
         self._height_field, self._terms, self._max_height_scale = height_field, terms, max_height_scale
-        self._textures: dict[tuple[bool, bool], TaylorTextures] = {}
+        self._textures: dict[tuple[bool, tuple[float, float] | None], TaylorTextures] = {}
         self._bind()
 
     def with_quirks(self, quirks: Quirks) -> TextureShader:
@@ -238,20 +241,25 @@ class TextureShader(Shader):
         if self.tapers:
             taper, lengths = tapered(self._height_field, self.coherence_length)
         self.sigmas = tuple(self.sigma * self.coherence_length / length for length in lengths)
-        from_zero = self.quirks.heights_from_zero
-        if (from_zero, self.tapers) not in self._textures:
+        kind = self.quirks.heights_from_zero, lengths if self.tapers else None
+        if kind not in self._textures:
             texels, height = taylor_transforms(
                 self._height_field,
                 self.terms,
-                heights_from_zero=from_zero,
+                heights_from_zero=self.quirks.heights_from_zero,
                 origin_at_centre=self.origin_at_centre,
                 taper=taper,
                 margin=self.margin,
             )
-            self._textures[from_zero, self.tapers] = TaylorTextures(texels, height)
-        self.textures = self._textures[from_zero, self.tapers]
+            self._textures[kind] = TaylorTextures(texels, height)
+        self.textures = self._textures[kind]
         matrix = rgb_matrix(cie_rgb_matrix=self.quirks.cie_rgb_matrix, d65_twice=self.quirks.d65_twice)
         self.matrix = [[opaque(float(entry)) for entry in row] for row in matrix]
+
+    @property
+    def coherence_length(self) -> float:
+        """L_c in µm."""
+        return self._coherence_lengths[0 if self.quirks.fixed_coherence else 1]
 
     @property
     def tapers(self) -> bool:

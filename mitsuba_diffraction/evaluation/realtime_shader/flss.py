@@ -57,14 +57,17 @@ class FLSS(TextureShader):
         """Texels on each side of the neighbourhood, along x and y."""
         if self._window == "texel" or (self._window is None and self.quirks.one_texel):
             return 1, 1
-        return tuple(
-            max(1, int(np.ceil(2 * sigma * size - 0.5)))
-            for sigma, size in zip(self.sigmas, self.tile_size, strict=True)
-        )
+        return self._spanning
+
+    @property
+    def _spanning(self) -> tuple[int, int]:
+        """Texels on each side that span 4σ, at least one."""
+        axes = zip(self.sigmas, self.tile_size, strict=True)
+        return tuple(max(1, int(np.ceil(2 * sigma * size - 0.5))) for sigma, size in axes)
 
     @property
     def margin(self) -> int:
-        return max(self.radius) + 1
+        return max(self._spanning) + 1
 
     @property
     def texels_per_term(self) -> int:

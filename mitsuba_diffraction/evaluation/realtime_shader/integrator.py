@@ -84,7 +84,7 @@ def define() -> type:
                 raise RequestError(f"variant: got {self.variant!r}, wanted one of {', '.join(VARIANTS)}")
             quirks = Quirks.as_published() if _boolean(props, "as_published", True) else Quirks.corrected()
             self.quirks = replace(quirks, **{name: props[name] for name in Quirks.names() if name in props})
-            self.settings = {name: props[name] for name in _settings(self.variant) if name in props}
+            self.settings = {name: props[name] for name in settings_of(self.variant) if name in props}
             self.shadows = _boolean(props, "shadows", False)
             self.diffuse_weight = props.get("diffuse_weight", 0.5)
             if not (isinstance(self.diffuse_weight, int | float) and 0 <= self.diffuse_weight <= 1):
@@ -123,7 +123,7 @@ def define() -> type:
             recipe = recipe_of(layers)
             settings = dict(self.settings, shadowing=layers.grating.theory.shadowing)
             if self.variant != "gem":
-                settings["coherence_length"] = float(recipe.settings.coherence_length)
+                settings["corrected_coherence_length"] = float(recipe.settings.coherence_length)
                 settings["extent"] = recipe.settings.extent
                 settings["max_height_scale"] = float(layers.grating.scales.height.values[-1])
             shader = VARIANTS[self.variant](recipe.height_field(), self.quirks, **settings)
@@ -204,7 +204,7 @@ def _boolean(props: mi.Properties, name: str, default: bool) -> bool:
     return value
 
 
-def _settings(variant: str) -> tuple[str, ...]:
+def settings_of(variant: str) -> tuple[str, ...]:
     """Return the parameters specific to a variant of the shader."""
     if variant == "gem":
         return "spacing", "roughness"

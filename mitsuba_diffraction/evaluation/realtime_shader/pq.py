@@ -106,12 +106,15 @@ class PQ(TextureShader):
         super().__init__(height_field, quirks, **settings)
         if interpolation not in INTERPOLATIONS:
             raise RequestError(f"interpolation: got {interpolation!r}, wanted one of {', '.join(INTERPOLATIONS)}")
-        if tiles is None:
-            tiles = tuple(max(1, round(self.coherence_length / size)) for size in self.tile_size)
-        self.tiles = tuple(check_integer("tiles", count, 1) for count in tiles)
-        if len(self.tiles) != 2:
+        if tiles is not None and len(tiles) != 2:
             raise RequestError(f"tiles: got {tiles!r}, wanted two whole numbers ≥ 1, along x and y")
+        self._tiles = tiles and tuple(check_integer("tiles", count, 1) for count in tiles)
         self.interpolation = interpolation
+
+    @property
+    def tiles(self) -> tuple[int, int]:
+        """(P, Q)."""
+        return self._tiles or tuple(max(1, round(self.coherence_length / size)) for size in self.tile_size)
 
     @property
     def margin(self) -> int:

@@ -20,6 +20,7 @@ class Quirks:
             span 4σ_f (section 4.3.2).
         floor_anchor: the neighbourhood is centred at ⌊·⌋ of the texel position (algorithm 4.3, lines 12 and 13);
             corrected: at the nearest texel.
+        fixed_coherence: the window is that of a coherence length of 65 µm; corrected: that of the recipe.
         periodic_scan: a scan, a piece of an irregular surface, is one period of a tiling with seams; corrected: it is
             tapered by the mean of the windows with which this model averages over the scan (`taper.py`).
         heights_from_zero: heights are measured from the lowest point (algorithm 4.1), with the published number of
@@ -43,6 +44,7 @@ class Quirks:
     complex_window_sum: bool
     one_texel: bool
     floor_anchor: bool
+    fixed_coherence: bool
     periodic_scan: bool
     heights_from_zero: bool
     no_jacobian: bool
