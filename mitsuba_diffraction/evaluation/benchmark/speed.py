@@ -84,14 +84,16 @@ def blank(spectrum: GratingSpectrum) -> mi.UInt32:
     return words
 
 
-def seconds(work: Mapping[Name, Callable[[], None]], repetitions: int) -> dict[Name, float]:
+def seconds(
+    work: Mapping[Name, Callable[[], object]], repetitions: int, clock: Callable[[], float] = time.perf_counter
+) -> dict[Name, float]:
     """Return seconds per call: medians of interleaved repetitions, so that all calls see the same machine load."""
     times: dict[Name, list[float]] = {name: [] for name in work}
     for repetition in range(-1, repetitions):  # the first compiles
         for name, call in work.items():
-            start = time.perf_counter()
+            start = clock()
             call()
             dr.sync_thread()
             if repetition >= 0:
-                times[name].append(time.perf_counter() - start)
+                times[name].append(clock() - start)
     return {name: statistics.median(values) for name, values in times.items()}

@@ -7,6 +7,7 @@ import dataclasses
 import functools
 import itertools
 import math
+import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 
 from ...files import whole_file
 from ...grating_spectrum import GratingSpectrum
-from ...outputs import METADATA
+from ...outputs import png_text
 from ...progress import Progress, silent, table
 from ...reference import order_powers
 from ...settings import ORIGINS, SERIES, VISIBLE
@@ -27,7 +28,7 @@ from ...spectrum.grids import OrderGrid
 from ...spectrum.tables import AmplitudeTable, series_function, series_weights
 from ..realtime_shader.taylor_textures import PUBLISHED_TERMS
 from ..report import cells
-from ..validation.figures import figure
+from ..validation.figures import figure, png
 from .accuracy import Exact
 from .cases import Case
 from .shader_speed import shader_difference, shaders_of, shading
@@ -53,6 +54,8 @@ THESIS_BOUNDS = {20: 2.995e-4, 25: 8.815e-8, 30: 1.005e-11}
 """Exponent N of the last term → bound, as printed after eq. 3.26."""
 
 TOLERANCE = 1e-3  # of slices
+_MIN_TIMED_PIXELS = 1 << 19  # of the FFTs that are timed together
+_FFT = "FFT for each κ (reference)"
 
 
 @dataclass(frozen=True)
@@ -169,7 +172,7 @@ def bounds() -> list[Bound]:
 
 @dataclass(frozen=True)
 class Method:
-    """Cost and accuracy of a way to evaluate a tile, one CPU core.
+    """Cost and accuracy of a way to evaluate a tile, on one core.
 
     Attributes:
         surface: name of the case.
@@ -178,7 +181,7 @@ class Method:
         transforms: FFTs of the tile behind the table; None if each evaluation takes its own.
         words: of 32 bits read for one evaluation: of four wavelengths; of a shader, of one shading point.
         megabytes: of the table or the textures.
-        error: ∫|ΔS| dq in float32, if S is what it computes.
+        error: ∫|ΔS| dq in float32, if S is what it computes; None for the reference.
         delta_e: (mean, maximum) CIEDE2000 of twelve patches of colour.
         time_ratio: of one evaluation, to that of slices in the same run.
     """
@@ -228,11 +231,17 @@ def methods(
     }
     rays.wo = bsdfs["slices", None].sample(mi.BSDFContext(), rays.si, rays.sample1, rays.sample2)[0].wo
     dr.eval(rays.wo)
-    work: dict[tuple, Callable[[], object]] = {("fft",): lambda: order_powers(case.height_field, 0.7 * MAX_KAPPA)}
+    # Several FFTs of a small tile, as one takes too little time.
+    kappas = np.linspace(0.3, 1, max(1, _MIN_TIMED_PIXELS // case.height_field.heights.size)) * MAX_KAPPA
+    work: dict[tuple, Callable[[], object]] = {
+        ("fft",): lambda: [order_powers(case.height_field, kappa) for kappa in kappas]
+    }
     work |= {name: functools.partial(rays.evaluate, bsdf) for name, bsdf in bsdfs.items()}
     work |= {name: shading(points, shader) for name, shader in shaders.items()}
+    # Processor time does not depend on other processes; that of a GPU is not counted.
+    clock = time.process_time if mi.variant().startswith("llvm") else time.perf_counter
     with _one_core():
-        taken = seconds(work, repetitions)
+        taken = seconds(work, repetitions, clock)
     unit = taken["slices", None] / count
     found = {(e.representation, n): e.error(n) for e in series for n in e.terms}
     result = [
@@ -249,7 +258,9 @@ def methods(
         )
         for (name, terms), spectrum in spectra.items()
     ]
-    result.append(Method(case.name, "FFT for each κ", None, None, None, 0.0, 0.0, (0.0, 0.0), 4 * taken["fft",] / unit))
+    result.append(
+        Method(case.name, _FFT, None, None, None, 0.0, None, (0.0, 0.0), 4 * taken["fft",] / len(kappas) / unit)
+    )
     for (variant, published), shader in shaders.items():
         result.append(
             Method(
@@ -265,6 +276,11 @@ def methods(
             )
         )
     return result
+
+
+def affordable_transforms(fft: Method, evaluations: int) -> float:
+    """Return the number of FFTs, one for each κ, that take as long as so many evaluations of slices."""
+    return 4 * evaluations / fft.time_ratio
 
 
 def _spectra(case: Case, series: Sequence[SeriesErrors]) -> dict[tuple[str, int | None], GratingSpectrum]:
@@ -388,9 +404,9 @@ _SHOWN_ERRORS = 1e-15, 1e3
 
 def save_plot(found: Found, path: str | os.PathLike[str]) -> None:
     """Plot the errors of each tile against the number of terms, and the bounds, as a PNG."""
-    drawn = plot(found)
+    content = png(plot(found), pnginfo=png_text())
     with whole_file(path) as temporary:
-        drawn.savefig(temporary, format="png", dpi=110, metadata=METADATA)
+        temporary.write_bytes(content)
 
 
 def plot(found: Found) -> Figure:
@@ -412,15 +428,18 @@ def plot(found: Found) -> Figure:
         _plot_bounds(column[0], curves)
         column[0].set_title(surface, fontsize=10)
         for panel in column:
-            panel.axvline(PUBLISHED_TERMS, color="0.8", linewidth=0.8, zorder=0)
+            panel.axvline(
+                PUBLISHED_TERMS, color="0.7", linewidth=0.8, zorder=0, label=f"{PUBLISHED_TERMS} terms, published"
+            )
             panel.set_ylim(*_SHOWN_ERRORS)
             panel.grid(alpha=0.25)
+        column[1].set_xlabel("number of terms N")
     axes[0, 0].set_ylabel("∫|ΔS| dq")
     axes[1, 0].set_ylabel("max |Δη|/η of strong orders")
-    axes[1, len(surfaces) // 2].set_xlabel(f"number of terms N (grey line: {PUBLISHED_TERMS}, as published)")
     drawn.legend(
-        *axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False, fontsize=9
-    )
+        *axes[0, 0].get_legend_handles_labels(),
+        loc="outside lower center", ncols=max(1, len(surfaces) - 1), frameon=False, fontsize=9,
+    )  # fmt: skip
     return drawn
 
 
