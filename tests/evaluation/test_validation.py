@@ -446,8 +446,14 @@ def test_figures_are_drawn(command, tmp_path, monkeypatch):
     monkeypatch.setattr(
         "mitsuba_diffraction.evaluation.validation.figures.save_figures", lambda folder, progress: called.append(folder)
     )
-    assert command("validate", "--figures", str(tmp_path / "figures"))[0] == 0
-    assert called == [tmp_path / "figures"]
+    monkeypatch.setattr(
+        "mitsuba_diffraction.evaluation.validation.published_figures.save_published",
+        lambda folder, progress: called.append(folder) or [["Elaphe", "FLSS as published", "0.996", "0.986"]],
+    )
+    code, said, _ = command("validate", "--figures", str(tmp_path / "figures"))
+    assert code == 0
+    assert "0.986" in said
+    assert called == 2 * [tmp_path / "figures"]
 
 
 def test_results_are_plain_json(tmp_path):

@@ -23,7 +23,7 @@ from ...cli.arguments import (
     settings_of,
 )
 from ...errors import RequestError
-from ...progress import progress_bar, show, tell
+from ...progress import progress_bar, show, table, tell
 
 if TYPE_CHECKING:
     from ...recipe import Recipe
@@ -69,9 +69,10 @@ def validate(
     writes = [(option, path) for option, path in (("--json", json), ("--markdown", markdown)) if path is not None]
     if figures is not None:
         from ..validation.figures import figure_names, save_figures
+        from ..validation.published_figures import COLUMNS, FILES, save_published
 
         figures.mkdir(parents=True, exist_ok=True)
-        writes += [("--figures", figures / name) for name in figure_names()]
+        writes += [("--figures", figures / name) for name in (*figure_names(), *FILES)]
     outputs.check_outputs(reads, writes, overwrite=overwrite)
     mi.set_variant(chosen)
     these = checks() if recipe is None else _of_surface(recipe)
@@ -94,6 +95,9 @@ def validate(
     if figures is not None:
         with progress_bar("figures") as progress:
             save_figures(figures, progress=progress)
+        with progress_bar("published maps") as progress:
+            found = save_published(figures, progress=progress)
+        show(table(COLUMNS, found, texts=2), width=80)
     if missed:
         raise RuntimeError(f"{len(missed)} of {promised} checks missed: {'; '.join(missed)}")
 

@@ -14,6 +14,7 @@ from . import (
     conservation,
     coupled_waves,
     measured_gratings,
+    published_maps,
     rough_surface,
     transmission_grating,
     viewing_angle,
@@ -24,7 +25,7 @@ from .record import GROUPS, Check, Record
 def checks() -> tuple[Check, ...]:
     """Return the checks of `mitsuba-diffraction validate`, group by group."""
     gratings = (measured_gratings, transmission_grating)
-    modules = (analytic, bumps, viewing_angle, *gratings, rough_surface, conservation, coupled_waves)
+    modules = (analytic, bumps, viewing_angle, published_maps, *gratings, rough_surface, conservation, coupled_waves)
     unsorted = [check for module in modules for check in module.CHECKS]
     return tuple(sorted(unsorted, key=lambda check: GROUPS.index(check.group)))
 

@@ -1,0 +1,289 @@
+"""Maps of the BRDF that the author of the thesis of 2014 published, and the same maps by this project.
+
+Each is a picture of the outgoing hemisphere, light along the normal: (x, y) = (sin θ_o cos φ_o, sin θ_o sin φ_o). They
+were made by FLSS from an AFM scan of 65 µm, which is available, so that the emulation can be compared pixel by pixel.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from PIL import Image
+from scipy.optimize import minimize_scalar
+
+from ...cli.examples import source
+from ...errors import RequestError
+from ...grating_spectrum import GratingSpectrum
+from ...recipe import Recipe
+from ...settings import Settings
+from ...surface.heightfield import HeightField
+from ...testing import array, vectors
+from ..realtime_shader.evaluate import shader_for
+from ..realtime_shader.quirks import Quirks
+from ..realtime_shader.tristimulus import WAVELENGTH_STEP, d65_weights, rgb_matrix
+from .record import Check, Record
+from .viewing_angle import MODEL, relative_reflectance, wavelengths
+
+Array = NDArray[np.float64]
+
+PUBLISHED, CORRECTED = "flss as published", "flss corrected"
+METHODS = (PUBLISHED, CORRECTED, MODEL)
+
+SIDE, RADIUS = 800, 380
+"""Pixels of a published picture, and of the radius of the disc, sin θ_o = 1."""
+ENCODINGS = ("sRGB", "gamma 2.5")
+"""Transfer functions: that of the published pictures, as their dark colours show, and that of the shader."""
+_MIRROR = 0.1  # sin θ_o; the pictures are saturated nearer to the mirror direction
+_LIGHT = (0.0, 0.0, 1.0)
+_COHERENCE_LENGTH = 65.0
+# Relative radiance and the pictures' conversion of colours, so that maps differ by the light alone. Unlike the shader,
+# the pictures are not multiplied by the white point of D65.
+_QUIRKS = {
+    PUBLISHED: replace(Quirks.as_published(), d65_twice=False),
+    CORRECTED: replace(Quirks.corrected(), relative=True, cie_rgb_matrix=True),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class PublishedMap:
+    """A published picture and the surface that it shows.
+
+    Attributes:
+        name: for titles.
+        picture: file in `precompute/measured/published`.
+        surface: of the recipe; the heights of a scan are relative to `precompute/measured`.
+        covered: (first row, end, first column, end) of rectangles where the picture shows something else.
+    """
+
+    name: str
+    picture: str
+    surface: dict[str, Any]
+    covered: tuple[tuple[int, int, int, int], ...] = ()
+
+    def path(self) -> Path:
+        """Return the path of the picture.
+
+        Raises:
+            RuntimeError: if the package was installed without its examples.
+        """
+        return _measured() / "published" / self.picture
+
+    @property
+    def height(self) -> float:
+        """Of a scan, µm from black to white, which it need not contain."""
+        return float(self.surface["height_range"])
+
+    @functools.cached_property
+    def recipe(self) -> Recipe:
+        """Heights, as the tile that the thesis takes them for, and the parameters of a spectrum of it."""
+        surface = dict(self.surface)
+        if "scan" in surface:
+            surface["scan"] = str(_measured() / str(surface["scan"]))
+        return Recipe(surface, Settings(coherence_length=_COHERENCE_LENGTH, wavelengths=(380, 780), tolerance=0.01))
+
+    @functools.cached_property
+    def height_field(self) -> HeightField:
+        """The heights."""
+        return self.recipe.height_field()
+
+    @functools.cached_property
+    def spectrum(self) -> GratingSpectrum:
+        """S(q; κ), from the cache of recipes or built."""
+        return self.recipe.cached()
+
+
+def _measured() -> Path:
+    return source() / "precompute" / "measured"
+
+
+def _scan(name: str, height_range: float) -> dict[str, Any]:
+    return {"scan": f"{name}_afm_65um.png", "pixel_size": 65 / 1332, "height_range": height_range}
+
+
+PUBLISHED_MAPS = {
+    "blaze": PublishedMap(
+        "Blaze",
+        "flss_blazed.png",
+        {"profile": "blazed", "period": 2.5, "depth": 0.2462},
+        # An enlarged part, and the red frame around that part.
+        (
+            (450, 750, 480, 780),
+            *((350, 353, 250, 350), (447, 450, 250, 350), (350, 450, 250, 253), (350, 450, 347, 350)),
+        ),
+    ),
+    "elaphe": PublishedMap("Elaphe", "flss_elaphe.png", _scan("elaphe", 0.4347)),
+    "xenopeltis": PublishedMap("Xenopeltis", "flss_xeno.png", _scan("xenopeltis", 0.4435)),
+}
+"""Name → published map."""
+_MIN_CORRELATION = {"blaze": 0.98, "elaphe": 0.98, "xenopeltis": 0.92}
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """Every n-th pixel of a published picture along rows and columns.
+
+    Attributes:
+        rows, columns: (n,) of the pixels, in the picture.
+        wo: (n, 3) ω_o. Rows of the picture ↔ y, without a flip.
+        colours: (n, 3) gamma-encoded colours of the author's map, from 0 to 1.
+        compared: (n,) whether the pixel is outside of the mirror direction and not covered.
+    """
+
+    rows: NDArray[np.int64]
+    columns: NDArray[np.int64]
+    wo: Array
+    colours: Array
+    compared: NDArray[np.bool_]
+
+    def picture(self, values: Array) -> Array:
+        """Return values (n, 3) as a picture of the disc, (side, side, 3); white outside."""
+        step = int(np.gcd.reduce(np.diff(np.unique(self.rows))))
+        side = SIDE // step
+        result = np.ones((side, side, 3))
+        result[self.rows // step, self.columns // step] = values
+        return result
+
+
+def grid(published: PublishedMap, step: int = 1) -> Grid:
+    """Read a published map at every `step`-th pixel.
+
+    Raises:
+        ValueError: if the step does not divide the side of the picture.
+    """
+    if step < 1 or SIDE % step:
+        raise RequestError(f"step: got {step!r}, wanted a divisor of {SIDE}")
+    with Image.open(published.path()) as file:
+        picture = np.asarray(file.convert("RGB")) / 255
+    chosen = np.arange(step // 2, SIDE, step)
+    rows, columns = (index.ravel() for index in np.meshgrid(chosen, chosen, indexing="ij"))
+    x, y = ((index + 0.5 - SIDE / 2) / RADIUS for index in (columns, rows))
+    inside = np.hypot(x, y) < 0.999  # the outermost pixels are blended with white
+    rows, columns, x, y = (values[inside] for values in (rows, columns, x, y))
+    radius = np.hypot(x, y)
+    compared = radius > _MIRROR
+    for top, bottom, left, right in published.covered:
+        compared &= ~((rows >= top) & (rows < bottom) & (columns >= left) & (columns < right))
+    wo = np.stack([x, y, np.sqrt(1 - radius**2)], axis=-1)
+    return Grid(rows, columns, wo, picture[rows, columns], compared)
+
+
+def linear_rgb(published: PublishedMap, method: str, wo: ArrayLike) -> Array:
+    """Evaluate a method for light along the normal.
+
+    All methods give the relative radiance under D65, converted to CIE RGB like the published pictures, so that they
+    differ by the light alone.
+
+    Args:
+        published: the map.
+        method: one of `METHODS`.
+        wo: ω_o, (n, 3).
+
+    Returns:
+        Linear RGB, (n, 3).
+
+    Raises:
+        ValueError: if the method is unknown, or Mitsuba has no vectorised spectral variant set.
+    """
+    if method not in METHODS:
+        raise RequestError(f"method: got {method!r}, wanted one of {', '.join(METHODS)}")
+    if method == MODEL:
+        xyz = relative_reflectance(published.spectrum, _LIGHT, wo, wavelengths()) @ (
+            WAVELENGTH_STEP * d65_weights()[:: int(WAVELENGTH_STEP)]
+        )
+        return xyz @ rgb_matrix(cie_rgb_matrix=True, d65_twice=False).T
+    return shader_rgb(published.height_field, wo, [1.0], _QUIRKS[method])[0]
+
+
+def shader_rgb(height_field: HeightField, wo: ArrayLike, height_scales: ArrayLike, quirks: Quirks) -> Array:
+    """Evaluate FLSS for light along the normal, with the heights scaled by each of (m,) factors: (m, n, 3)."""
+    shader = shader_for(height_field, "flss", quirks, coherence_length=_COHERENCE_LENGTH)
+    wo = np.asarray(wo, np.float32)
+    wi = vectors(np.broadcast_to(np.float32(_LIGHT), wo.shape))
+    weights = shader.weights()
+    scaled = [
+        array(shader.rgb(wi, vectors(wo), weights, height_scale=mi.Float(scale))).T
+        for scale in np.asarray(height_scales, np.float64)
+    ]
+    return np.stack(scaled).astype(np.float64)
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Agreement of a map with the author's.
+
+    Attributes:
+        correlation: of the encoded colours, over pixels and channels.
+        brightness: the factor of linear RGB with which the mean square of the difference is smallest.
+    """
+
+    correlation: float
+    brightness: float
+
+
+def encoded(linear: Array, brightness: float = 1.0, encoding: str = "sRGB") -> Array:
+    """Return linear RGB times the brightness, clipped and encoded by one of `ENCODINGS`, from 0 to 1."""
+    if encoding not in ENCODINGS:
+        raise RequestError(f"encoding: got {encoding!r}, wanted one of {', '.join(ENCODINGS)}")
+    clipped = np.clip(linear * brightness, 0, 1)
+    if encoding == "gamma 2.5":
+        return clipped ** (1 / 2.5)
+    # IEC 61966-2-1
+    return np.where(clipped <= 0.0031308, 12.92 * clipped, 1.055 * clipped ** (1 / 2.4) - 0.055)
+
+
+def agreement(pixels: Grid, linear: Array, encoding: str = "sRGB") -> Agreement:
+    """Compare a map with the author's outside of the mirror direction, with one brightness for all pixels.
+
+    Args:
+        pixels: of the author's map.
+        linear: (n, 3) linear RGB.
+        encoding: one of `ENCODINGS`.
+    """
+    theirs, ours = pixels.colours[pixels.compared], linear[pixels.compared]
+
+    def loss(log_brightness: float) -> float:
+        return float(np.mean((encoded(ours, np.exp(log_brightness), encoding) - theirs) ** 2))
+
+    starts = np.arange(-4.0, 10.0, 0.5) - np.log(np.percentile(ours, 99.9))
+    best = starts[np.argmin([loss(start) for start in starts])]
+    found = minimize_scalar(loss, bounds=(best - 0.5, best + 0.5), method="bounded", options={"xatol": 1e-3})
+    brightness = float(np.exp(found.x))
+    correlation = np.corrcoef(theirs.ravel(), encoded(ours, brightness, encoding).ravel())[0, 1]
+    return Agreement(float(correlation), brightness)
+
+
+def correlation_against_height(published: PublishedMap, method: str, heights: ArrayLike, step: int = 16) -> Array:
+    """Correlate FLSS with the author's map for each height range of the surface.
+
+    Args:
+        published: the map.
+        method: `PUBLISHED` or `CORRECTED`.
+        heights: (n,) height ranges in µm.
+        step: between pixels.
+
+    Returns:
+        (n,).
+    """
+    pixels = grid(published, step)
+    scales = np.asarray(heights, np.float64) / published.height
+    maps = shader_rgb(published.height_field, pixels.wo, scales, _QUIRKS[method])
+    return np.array([agreement(pixels, linear).correlation for linear in maps])
+
+
+def published_map(name: str, step: int = 8) -> Record:
+    """Correlate FLSS as published with the author's map."""
+    pixels = grid(PUBLISHED_MAPS[name], step)
+    found = agreement(pixels, linear_rgb(PUBLISHED_MAPS[name], PUBLISHED, pixels.wo))
+    return Record(found.correlation, 1.0, 1 - _MIN_CORRELATION[name], note=f"correlation at every {step}th pixel")
+
+
+CHECKS = tuple(
+    Check("literature", f"published map of {found.name}", functools.partial(published_map, name), "thesis", slow=True)
+    for name, found in PUBLISHED_MAPS.items()
+)

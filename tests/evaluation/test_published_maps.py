@@ -1,0 +1,144 @@
+"""The maps that the author of the thesis of 2014 published, against those of this project."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from mitsuba_diffraction.evaluation.realtime_shader.quirks import Quirks
+from mitsuba_diffraction.evaluation.validation.published_figures import COLUMNS, FILES, row, save_published
+from mitsuba_diffraction.evaluation.validation.published_maps import (
+    CORRECTED,
+    ENCODINGS,
+    METHODS,
+    PUBLISHED,
+    PUBLISHED_MAPS,
+    agreement,
+    correlation_against_height,
+    encoded,
+    grid,
+    linear_rgb,
+    shader_rgb,
+)
+from mitsuba_diffraction.evaluation.validation.viewing_angle import MODEL
+from mitsuba_diffraction.surface.heightfield import HeightField
+
+BLAZE, ELAPHE = PUBLISHED_MAPS["blaze"], PUBLISHED_MAPS["elaphe"]
+
+
+def halved(height_field):
+    """The means of 2 × 2 pixels, with which the shader's textures are four times as fast."""
+    rows, columns = (side // 2 for side in height_field.shape)
+    means = height_field.heights.reshape(rows, 2, columns, 2).mean(axis=(1, 3))
+    return HeightField(means, tuple(2 * size for size in height_field.pixel_size))
+
+
+def test_the_emulated_shader_gives_the_published_map_of_the_blaze(llvm):
+    pixels = grid(BLAZE, 8)
+    linear = linear_rgb(BLAZE, PUBLISHED, pixels.wo)
+    found = agreement(pixels, linear)
+    assert found.correlation >= 0.98
+    # The mirror image blazes to the other side.
+    mirrored = linear_rgb(BLAZE, PUBLISHED, pixels.wo * (-1, 1, 1))
+    assert agreement(pixels, mirrored).correlation < 0.9
+
+
+def test_the_emulated_shader_gives_the_published_map_of_elaphe_from_half_the_pixels(llvm):
+    pixels = grid(ELAPHE, 20)
+    heights = halved(ELAPHE.height_field)
+    as_published, doubled = (
+        agreement(pixels, linear).correlation
+        for linear in shader_rgb(heights, pixels.wo, [1, 2], Quirks.as_published())
+    )
+    assert as_published >= 0.99
+    assert doubled < 0.6  # the series of 37 terms diverges
+    averaged = shader_rgb(heights, pixels.wo, [1], replace(Quirks.as_published(), complex_window_sum=False))[0]
+    assert agreement(pixels, averaged).correlation < as_published - 0.01
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "lowest"), [("blaze", 0.98), ("elaphe", 0.98), ("xenopeltis", 0.92)])
+def test_the_emulated_shader_gives_the_published_maps_pixel_by_pixel(llvm, name, lowest):
+    published = PUBLISHED_MAPS[name]
+    pixels = grid(published)
+    assert pixels.wo.shape[0] > 440_000
+    linear = linear_rgb(published, PUBLISHED, pixels.wo)
+    for encoding in ENCODINGS:
+        assert agreement(pixels, linear, encoding).correlation >= lowest
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["elaphe", "xenopeltis"])
+def test_model_and_corrected_shader_are_alike_and_less_like_the_published_map(llvm, name):
+    found = row(name, 16)
+    correlations = {method: one.correlation for method, one in found.agreements().items()}
+    assert correlations[MODEL] == pytest.approx(correlations[CORRECTED], abs=0.01)
+    assert correlations[MODEL] < correlations[PUBLISHED]
+
+
+@pytest.mark.slow
+def test_the_height_of_elaphe_is_that_with_the_best_correlation(llvm):
+    heights = np.array([0.3, 0.375, 0.4347, 0.5, 0.6])
+    found = correlation_against_height(ELAPHE, PUBLISHED, heights, step=16)
+    assert heights[found.argmax()] == 0.4347
+
+
+def test_agreement_recovers_the_brightness():
+    pixels = grid(ELAPHE, 16)
+    linear = 3 * pixels.colours**2.2 / 300
+    exact = replace(pixels, colours=encoded(linear, 300.0))
+    found = agreement(exact, linear)
+    assert found.correlation == pytest.approx(1)
+    assert found.brightness == pytest.approx(300, rel=0.05)
+
+
+def test_covered_parts_of_a_picture_are_not_compared():
+    pixels = grid(BLAZE)
+    enlarged = (pixels.rows > 452) & (pixels.rows < 748) & (pixels.columns > 482) & (pixels.columns < 777)
+    assert pixels.colours[enlarged].max() == 1
+    assert not pixels.compared[enlarged].any()
+    frame = (pixels.colours == (1, 0, 0)).all(axis=1) & (np.abs(pixels.rows - 399.5) > 20)
+    assert frame.sum() > 500
+    assert not pixels.compared[frame].any()
+    radius = np.hypot(*pixels.wo[:, :2].T)
+    assert radius[pixels.compared].min() > 0.1
+
+
+def test_a_picture_of_a_grid_is_the_published_one():
+    pixels = grid(ELAPHE, 2)
+    shown = pixels.picture(pixels.colours)
+    with Image.open(ELAPHE.path()) as file:
+        published = np.asarray(file.convert("RGB"))[1::2, 1::2] / 255
+    inside = (shown != 1).any(axis=2)
+    np.testing.assert_array_equal(shown[inside], published[inside])
+    assert inside.mean() == pytest.approx(np.pi / 4 * 0.95**2, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: grid(BLAZE, 3), "step: got 3, wanted a divisor of 800"),
+        (lambda: linear_rgb(BLAZE, "pq", [[0, 0, 1]]), "method: got 'pq'"),
+        (lambda: encoded(np.zeros(3), encoding="linear"), "encoding: got 'linear', wanted one of sRGB, gamma 2.5"),
+    ],
+)
+def test_wrong_arguments_are_refused(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+def test_figures_and_table_are_written(llvm, tmp_path, monkeypatch):
+    from mitsuba_diffraction.evaluation.validation import published_figures
+
+    monkeypatch.setattr(published_figures, "row", lambda name, step: row("blaze", 8, METHODS[:1]))
+    monkeypatch.setattr(
+        published_figures, "correlation_against_height", lambda published, method, heights: 0.5 + 0 * heights
+    )
+    steps = []
+    table = save_published(tmp_path, step=16, progress=lambda *step: steps.append(step))
+    assert [len(line) for line in table] == [len(COLUMNS)] * 3
+    assert float(table[0][2]) >= 0.98
+    assert steps[-1] == (5, 5)
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(FILES)
+    assert f"| {table[0][2]} |" in (tmp_path / "published_maps.md").read_text()
