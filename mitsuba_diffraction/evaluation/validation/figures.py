@@ -69,15 +69,16 @@ def png(drawn: Figure, dpi: float = 110, pnginfo: PngInfo | None = None) -> byte
 def plot_reflectance(maps: Sequence[ReflectanceMap]) -> Figure:
     """Plot reflectance over wavelength and viewing angle, with the peak curve and the grating equation on top.
 
-    One panel for each map; all maps are of one surface and one θ_i. Each panel has a logarithmic scale of three decades
-    below its maximum reflectance outside the specular peak.
+    One panel for each map; all maps are of one surface and one θ_i. The panels show all viewing angles, or those near
+    the range of the published map. Each panel has a logarithmic scale of three decades below its maximum reflectance
+    outside the specular peak.
     """
     drawn = figure(3.1 * len(maps) + 0.9, 4.4)
     axes = drawn.subplots(1, len(maps), sharex=True, sharey=True, squeeze=False)[0]
     for panel, found in zip(axes, maps, strict=True):
         image = _draw_map(panel, found)
         fit = fit_period(found)
-        panel.set_title(f"{TITLES[found.method]}\nperiod {fit.mean:.1f} ± {fit.deviation:.2g} nm", fontsize=10)
+        panel.set_title(f"{TITLES[found.method]}\nperiod {fit.mean:.1f} ± {fit.deviation:.2f} nm", fontsize=10)
         panel.set_xlabel("wavelength λ / nm")
     surface, incidence = maps[0].surface, maps[0].incidence
     axes[0].set_ylabel("viewing angle θ$_r$ / °")
@@ -85,7 +86,7 @@ def plot_reflectance(maps: Sequence[ReflectanceMap]) -> Figure:
     bar.set_label("reflectance / maximum\noutside the mirror direction")
     drawn.suptitle(f"{surface.name}: light at θ$_i$ = {incidence:g}°, mirror direction at θ$_r$ = {-incidence:g}°")
     handles, labels = axes[0].get_legend_handles_labels()
-    drawn.legend(handles, labels, loc="outside lower center", ncols=2, frameon=False)
+    drawn.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False)
     return drawn
 
 
@@ -105,9 +106,6 @@ def _draw_map(panel: Axes, found: ReflectanceMap) -> ScalarMappable:
     else:
         image = panel.pcolormesh(found.wavelengths, found.angles, shown.T, shading="nearest", **style)
     panel.plot(found.wavelengths, peak_angles(found), color=_PEAK, linewidth=2.5, label="peak")
-    for angle in found.surface.angles:
-        if abs(angle) < 90:
-            panel.axhline(angle, color="white", linewidth=0.7)
     period = found.surface.period
     equation = grating_equation(period, found.incidence, found.wavelengths)
     panel.plot(
@@ -115,8 +113,14 @@ def _draw_map(panel: Axes, found: ReflectanceMap) -> ScalarMappable:
         label=f"grating equation, d = {1e3 * period:g} nm",
     )  # fmt: skip
     panel.set_xlim(found.wavelengths[[0, -1]])
-    panel.set_ylim(-90, 90)
-    panel.set_yticks(range(-90, 91, 30))
+    low, high = found.surface.angles
+    if high - low < 180:
+        for angle in (low, high):
+            panel.axhline(angle, color="white", linewidth=0.8)
+        panel.axhline(np.nan, color="0.7", linewidth=0.8, label="range of the published map")
+    panel.set_ylim(max(-90, low - 12), min(90, high + 12))
+    if high - low == 180:
+        panel.set_yticks(range(-90, 91, 30))
     return image
 
 
