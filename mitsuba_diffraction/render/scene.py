@@ -88,7 +88,7 @@ def load_spectral_scene(
         parameters: values for the scene's `$name` parameters (`-Dname=value` of Mitsuba's command line).
         materials: id of a BSDF → parameters of the `diffraction_grating` that replaces it. Below a dielectric of scalar
             theory the BSDF remains as `base`, unless that is given; "none" stands for none. A `twosided` remains around
-            a grating that does not transmit light.
+            a grating that does not transmit light. `path` becomes `diffraction_path`.
         motion: of the first sensor: an affine map of world space, 16 numbers in row-major order, applied after its
             `to_world`.
 
@@ -108,6 +108,8 @@ def load_spectral_scene(
             _warn_of_unused_materials(config, state, materials)
         _replace_films(state, width, height)
         _unwrap_integrators(state)
+        if materials:
+            _trace_cast_light(state)
         if motion is not None:
             _move_first_sensor(state, motion)
         mi.parser.transform_all(config, state)
@@ -441,6 +443,15 @@ def _unwrap_integrators(state: mi.parser.ParserState) -> None:
         is_wrapper = node.type == mi.ObjectType.Integrator and node.props.plugin_name() in ("aov", "moment")
         if is_wrapper and (inner := list(_children(state, node.props, mi.ObjectType.Integrator))):
             node.props = mi.Properties(state.nodes[inner[0]].props)
+
+
+def _trace_cast_light(state: mi.parser.ParserState) -> None:
+    """Replace `path` by `diffraction_path` where that supports the scene: the same picture, without fireflies."""
+    unsupported = any("sample_border" in node.props for node in state.nodes)
+    for node in state.nodes:
+        hides = mi.Properties(node.props).get("hide_emitters", False)
+        if node.props.plugin_name() == "path" and not (hides or unsupported):
+            node.props.set_plugin_name("diffraction_path")
 
 
 def _move_first_sensor(state: mi.parser.ParserState, motion: tuple[float, ...]) -> None:

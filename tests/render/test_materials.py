@@ -149,6 +149,28 @@ def test_a_dielectric_in_the_place_of_glass_is_refused(exported, glass):
 
 
 @pytest.mark.parametrize(
+    ("parameter", "border", "wanted"),
+    [
+        ("", "", "DiffractionPath"),
+        ('<boolean name="hide_emitters" value="false"/>', "", "DiffractionPath"),
+        ('<boolean name="hide_emitters" value="true"/>', "", "PathIntegrator"),
+        ("", '<boolean name="sample_border" value="true"/>', "PathIntegrator"),
+    ],
+)
+def test_light_cast_by_gratings_is_traced_where_it_can_be(exported, parameter, border, wanted):
+    path, film = exported(), '<film type="hdrfilm">'
+    text = path.read_text().replace('<boolean name="hide_emitters" value="true"/>', parameter)
+    path.write_text(text.replace(film, film + border))
+
+    def integrator(**materials):
+        found = load_spectral_scene(path, **materials).integrator()
+        return f"{type(found).__name__} {found}"
+
+    assert "PathIntegrator" in integrator()
+    assert wanted in integrator(materials={"mat-Disc": MIRROR})
+
+
+@pytest.mark.parametrize(
     ("disc", "name", "kept"),
     [
         (PRINCIPLED, "mat-Disc", "TwoSided["),
