@@ -127,7 +127,7 @@ def test_each_shader_names_the_quirks_that_change_it(kind):
     # PQ has no window and therefore no taper; two tiles along each axis.
     extent = {"extent": "sample"} if kind in ("flss", "nmm") else {}
     lengths = {"coherence_length": 4.0, "corrected_coherence_length": 2.0 if extent else 8.0}
-    more = {} if kind == "gem" else {"terms": 5, **lengths, **extent}
+    more = {} if kind == "gem" else {"terms": 5, "exact_fresnel": True, **lengths, **extent}
 
     def colours(quirks):
         shader = VARIANTS[kind](surface, quirks, **more)

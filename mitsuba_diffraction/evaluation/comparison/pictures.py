@@ -246,7 +246,8 @@ class Pictures:
         """
         self._shader.set_quirks(Quirks(**{name: name in quirks for name in Quirks.names()}))
         self._shader.shadows = NO_SHADOWS not in quirks
-        self._shader.prepare(self.scene)
+        prepared = self._shader.prepare(self.scene)
+        self.shaders = [shaded.shader for shaded in prepared.shaded]
         known = ("constant_blend" in quirks, self._shader.shadows, others)
         if known not in self._others:
             self._others[known] = self._traced(without_gratings(self._shader), others, silent, halves=False)

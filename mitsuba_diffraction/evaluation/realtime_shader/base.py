@@ -58,6 +58,7 @@ class Gain:
     (Torrance and Sparrow 1967).
 
     Attributes:
+        cos_half: ω_o·h.
         falloff: `schlick_falloff`.
         factor: K G cos θ_i; zero below the horizon.
         active: both directions are in the upper hemisphere.
@@ -68,7 +69,8 @@ class Gain:
         cos_i, cos_o = larger(wi.z, 1e-7), larger(wo.z, 1e-7)
         self.u, self.v, self.w = -wi - wo
         square = dr.square(self.u) + dr.square(self.v)
-        self.falloff = schlick_falloff(0.5 * dr.sqrt(square + dr.square(self.w)))
+        self.cos_half = 0.5 * dr.sqrt(square + dr.square(self.w))
+        self.falloff = schlick_falloff(self.cos_half)
         self.factor = dr.select(
             self.active, k_g(cos_i, cos_o, square, shadowing=shadowing, select=dr.select) * cos_i, 0
         )
@@ -189,7 +191,7 @@ class TextureShader(Shader):
     """
 
     own_quirks = (
-        *("fresnel_squared", "fixed_index", "floor_anchor", "heights_from_zero", "fixed_coherence"),
+        *("fresnel_squared", "schlick", "fixed_index", "floor_anchor", "heights_from_zero", "fixed_coherence"),
         *("d65_light", "relative", "d65_twice", "cie_rgb_matrix"),
     )
     origin_at_centre: ClassVar[bool] = False
@@ -205,6 +207,7 @@ class TextureShader(Shader):
         extent: str = "tile",
         terms: int | None = None,
         max_height_scale: float = 1.0,
+        exact_fresnel: bool = False,
         shadowing: bool = True,
     ) -> None:
         """Compute the textures.
@@ -217,6 +220,7 @@ class TextureShader(Shader):
             extent: "tile", or "sample" for a piece of an irregular surface.
             terms: number of Taylor terms; default: as published, or as many as an error of 1e-4 requires.
             max_height_scale: of `rgb`, for the number of terms.
+            exact_fresnel: the material is a dielectric whose reflectance is exact without the quirk `schlick`.
             shadowing: include G.
 
         Raises:
@@ -225,7 +229,7 @@ class TextureShader(Shader):
         super().__init__(height_field, quirks, shadowing)
         lobe_width(coherence_length)  # raises unless it is a valid length
         self._coherence_lengths = coherence_length, corrected_coherence_length or coherence_length
-        self.extent = extent
+        self.extent, self.exact_fresnel = extent, exact_fresnel
         self._height_field, self._terms, self._max_height_scale = height_field, terms, max_height_scale
         self._textures: dict[tuple[bool, tuple[float, float] | None], TaylorTextures] = {}
         self._bind()
@@ -301,7 +305,11 @@ class TextureShader(Shader):
 
     def fresnel(self, r_0: mi.Float, gain: Gain) -> mi.Float:
         """Return F/F₀ or its square."""
-        return fresnel_ratio(r_0, gain.falloff, self.quirks.fresnel_squared)
+        if self.quirks.schlick or not self.exact_fresnel:
+            return fresnel_ratio(r_0, gain.falloff, self.quirks.fresnel_squared)
+        root = dr.sqrt(r_0)
+        ratio = mi.fresnel(gain.cos_half, (1 + root) / (1 - root))[0] / r_0
+        return dr.square(ratio) if self.quirks.fresnel_squared else ratio
 
     def integral(self, gain: Gain, weights: SpectralWeights, height_scale: mi.Float) -> mi.Color3f:
         """Integrate F/F₀ |P|² S (x̄, ȳ, z̄) over λ by the trapezoidal rule."""

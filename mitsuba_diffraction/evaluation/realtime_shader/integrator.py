@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ...bsdf.fresnel import Dielectric
 from ...bsdf.layers import Layers
 from ...errors import RequestError
 from ...manual import Parameter, listed
@@ -49,8 +50,7 @@ lights is shaded; other lights, the background and interreflection are omitted.
 
 The shader computes RGB. It is converted to a spectrum of that colour (`Emission`), which any film can record; a
 colour outside the gamut of sRGB has negative radiance at some wavelengths. Corrected, FLSS and NMM are in the scene's
-units and show the direct light of a path tracer with fresnel="schlick", without a coat and without the factor E of the
-BRDF.
+units and show the direct light of a path tracer without a coat and without the factor E of the BRDF.
 """
 
 
@@ -124,6 +124,8 @@ def define() -> type:
             settings = dict(self.settings, shadowing=layers.grating.theory.shadowing)
             if self.variant != "gem":
                 settings["corrected_coherence_length"] = float(recipe.settings.coherence_length)
+                material = layers.grating.theory.material
+                settings["exact_fresnel"] = isinstance(material, Dielectric) and material.model == "exact"
                 settings["extent"] = recipe.settings.extent
                 settings["max_height_scale"] = float(layers.grating.scales.height.values[-1])
             shader = VARIANTS[self.variant](recipe.height_field(), self.quirks, **settings)

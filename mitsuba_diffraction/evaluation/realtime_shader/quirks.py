@@ -13,6 +13,8 @@ class Quirks:
 
     Attributes:
         fresnel_squared: F² with Schlick's F, which is already a power reflectance (eq. 3.4, 3.10); corrected: F.
+        schlick: Schlick's approximation (eq. B.1), at 60° a fifth too low for an index of 1.5; corrected: the Fresnel
+            reflectance of a dielectric. Schlick's also of a conductor.
         fixed_index: F is that of an index of 1.5 for any material; corrected: R at normal incidence of the material.
         window_pi: the Gaussian window has the height π (eq. 3.30); corrected: 1, which gives one for a flat mirror.
         complex_window_sum: |Σ φ F|² without the spatial average ⟨·⟩; corrected: Σ φ² |F|².
@@ -39,6 +41,7 @@ class Quirks:
     """
 
     fresnel_squared: bool
+    schlick: bool
     fixed_index: bool
     window_pi: bool
     complex_window_sum: bool
