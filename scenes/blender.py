@@ -1,0 +1,101 @@
+"""A scene of Blender, exported by Mitsuba-Blender: `python scenes/blender.py ADDON exported.xml`, for docs/blender.md.
+
+ADDON is a checkout of the add-on; `pip install bpy==4.5.15 mitsuba==3.5.0` in an environment of Python 3.11. A ring, a
+monkey, a pane, foil and a floor, unwrapped by Blender; an area light, a sun and a dim world. Lengths are metres.
+"""
+
+from __future__ import annotations
+
+import importlib
+import math
+import sys
+from pathlib import Path
+
+import bpy
+import mitsuba
+
+SEGMENTS = 128  # of the ring
+
+
+def material(name: str, colour: tuple[float, float, float], roughness: float, **inputs: float) -> None:
+    """Give the active object a Principled BSDF, with other inputs by their names."""
+    made = bpy.data.materials.new(name)
+    made.use_nodes = True
+    sockets = made.node_tree.nodes["Principled BSDF"].inputs
+    sockets["Base Color"].default_value = (*colour, 1)
+    sockets["Roughness"].default_value = roughness
+    for key, value in inputs.items():
+        sockets[key.replace("_", " ")].default_value = value
+    bpy.context.object.data.materials.append(made)
+
+
+def ring(inner: float, outer: float) -> None:
+    """Add a flat ring as the active object, and unwrap it."""
+    angles = [2 * math.pi * k / SEGMENTS for k in range(SEGMENTS)]
+    points = [(r * math.cos(angle), r * math.sin(angle), 0) for angle in angles for r in (inner, outer)]
+    faces = [(k, k + 1, (k + 3) % len(points), (k + 2) % len(points)) for k in range(0, len(points), 2)]
+    mesh = bpy.data.meshes.new("Disc")
+    mesh.from_pydata(points, [], faces)
+    made = bpy.data.objects.new("Disc", mesh)
+    bpy.context.collection.objects.link(made)
+    bpy.context.view_layer.objects.active = made
+    bpy.ops.object.mode_set(mode="EDIT")
+    bpy.ops.mesh.select_all(action="SELECT")
+    bpy.ops.uv.unwrap()
+    bpy.ops.object.mode_set(mode="OBJECT")
+
+
+def degrees(*angles: float) -> tuple[float, ...]:
+    """Return Euler angles in radians."""
+    return tuple(math.radians(angle) for angle in angles)
+
+
+def objects() -> None:
+    """Add all objects with their materials."""
+    ring(0.15, 0.6)
+    bpy.context.object.location, bpy.context.object.rotation_euler = (-1.15, 0, 0.56), degrees(65, 0, 25)
+    material("Disc", (0.8, 0.8, 0.8), 0.5)
+    bpy.ops.mesh.primitive_monkey_add(size=1.2, location=(0.35, 0.3, 0.62), rotation=degrees(-15, 0, 15))
+    bpy.ops.object.modifier_add(type="SUBSURF")
+    bpy.context.object.modifiers[-1].levels = 2
+    bpy.ops.object.shade_smooth()
+    material("Skin", (0.35, 0.08, 0.02), 0.5)
+    bpy.ops.mesh.primitive_plane_add(size=1.1, location=(1.35, 0, 0.58), rotation=degrees(80, 0, -25))
+    material("Glass", (1, 1, 1), 0.0, Transmission_Weight=1.0)
+    bpy.ops.mesh.primitive_plane_add(size=0.8, location=(-0.2, -0.95, 0.02), rotation=degrees(6, 0, 10))
+    material("Foil", (0.8, 0.8, 0.8), 0.2, Metallic=1.0)
+    bpy.ops.mesh.primitive_plane_add(size=12)
+    material("Floor", (0.35, 0.33, 0.3), 0.6)
+
+
+def lights() -> None:
+    """Add the lights and the world."""
+    bpy.ops.object.light_add(type="AREA", location=(-1.5, -3, 4), rotation=degrees(38, 0, -25))
+    lamp = bpy.context.object.data
+    lamp.shape, lamp.size, lamp.energy = "DISK", 0.3, 500
+    bpy.ops.object.light_add(type="SUN", rotation=degrees(50, 0, 150))
+    bpy.context.object.data.energy = 1.5
+    world = bpy.context.scene.world = bpy.data.worlds.new("Sky")
+    world.use_nodes = True
+    world.node_tree.nodes["Background"].inputs["Color"].default_value = (0.03, 0.036, 0.048, 1)
+
+
+def main(addon: str, output: str) -> None:
+    """Make the scene and export it."""
+    mitsuba.set_variant("scalar_rgb")
+    sys.path.insert(0, addon)
+    importlib.import_module("mitsuba-blender.io").register()
+    for old in list(bpy.data.objects):
+        bpy.data.objects.remove(old)
+    objects()
+    lights()
+    bpy.ops.object.camera_add(location=(0, -4.6, 2.1), rotation=degrees(70, 0, 0))
+    scene = bpy.context.scene
+    scene.camera, bpy.context.object.data.lens = bpy.context.object, 38
+    scene.render.resolution_x, scene.render.resolution_y = 480, 270
+    scene.cycles.max_bounces, scene.cycles.samples = 4, 64
+    bpy.ops.export_scene.mitsuba(filepath=str(Path(output).resolve()))
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
