@@ -350,7 +350,7 @@ class Grating:
             f"coherence_length = {self.spectrum.coherence_length:g} um",
             f"representation = {self.spectrum.representation}, {self.spectrum.megabytes:.3g} MB",
             *([] if self.coat is None else [f"coat = {self.coat}"]),
-            f"orientation = {self.orientation}",
+            f"orientation = {self.orientation}{' from the radius' if self.from_radius else ''}",
             str(self.theory),
         ]
         return "\n".join(lines)

@@ -236,6 +236,7 @@ def test_a_radial_pattern_points_away_from_the_centre_of_uv_space(word, linear):
 
 def test_the_centre_of_a_radial_pattern_is_finite():
     bsdf = mi.load_dict(corner(orientation="radial"))
+    assert " from the radius," in str(bsdf)
     si = hit(mesh(SQUARE), (0.5, 0.5, 2), DOWN, bsdf)
     assert np.isfinite(world(si, bsdf, [(0.1, 0.2, 0.97)])).all()
 
