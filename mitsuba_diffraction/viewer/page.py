@@ -22,6 +22,7 @@ from .coil import coil
 from .surface import Surface
 
 MAX_BYTES = 5_000_000  # of a page
+MAX_HEIGHTS_SIDE = 512  # pixels of the heights for the shader of 2014
 
 METALS = ("Al", "Ag", "Au", "Cr", "Cu", "W")
 """The conductors among which a page chooses, besides that of the surface."""
@@ -29,13 +30,17 @@ METALS = ("Al", "Ag", "Au", "Cr", "Cu", "W")
 _ASSETS = Path(__file__).parent / "assets"
 _STYLES = ("page.css",)
 _SCRIPTS = (
-    *("data.js", "gl.js", "colour.js", "spectrum.js", "shapes.js", "view.js", "renderer.js"),
-    *("controls.js", "main.js"),
+    *("data.js", "gl.js", "colour.js", "spectrum.js", "shapes.js", "view.js", "shader_2014.js"),
+    *("renderer.js", "pick.js", "command.js", "controls.js", "main.js"),
 )
 
 
-def page(surface: Surface) -> str:
+def page(surface: Surface, picture: NDArray[np.float16] | None = None) -> str:
     """Return the page of a surface as HTML.
+
+    Args:
+        surface: what is shown.
+        picture: linear sRGB for comparison, (height, width, 3), the lowest row first.
 
     Raises:
         RequestError: if it would be larger than `MAX_BYTES`, or the material is unknown.
@@ -48,7 +53,7 @@ def page(surface: Surface) -> str:
         "styles": "\n".join((_ASSETS / name).read_text(encoding="utf-8") for name in _STYLES),
         "scripts": "\n".join((_ASSETS / name).read_text(encoding="utf-8") for name in _SCRIPTS),
         "shaders": _json(shaders),
-        "data": _json(_data(surface)),
+        "data": _json(_data(surface, picture)),
     }
     for name, part in parts.items():
         text = text.replace("{{" + name + "}}", part)
@@ -65,7 +70,7 @@ def _json(content: object) -> str:
     return json.dumps(content, ensure_ascii=False, separators=(",", ":")).replace("</", "<\\/")
 
 
-def _data(surface: Surface) -> dict[str, Any]:
+def _data(surface: Surface, picture: NDArray[np.float16] | None) -> dict[str, Any]:
     return {
         "name": surface.name,
         "source": surface.spectrum.source,
@@ -76,6 +81,8 @@ def _data(surface: Surface) -> dict[str, Any]:
         "metals": _metals(surface.material.material),
         "light": encoded(_light()),
         "coil": coil(),
+        "heights": _heights(surface),
+        "picture": None if picture is None else encoded(picture),
     }
 
 
@@ -105,6 +112,25 @@ def _spectrum(surface: Surface) -> dict[str, Any]:
         "extent": spectrum.extent,
         "error": spectrum.error,
         "warning": spectrum.warning,
+    }
+
+
+def _heights(surface: Surface) -> dict[str, Any] | None:
+    """Return the heights for the shader of 2014, as whole numbers from the lowest; None for a saved spectrum."""
+    if surface.recipe is None:
+        return None
+    field = surface.recipe.height_field()
+    # The middle, at most.
+    first = [max(0, (n - MAX_HEIGHTS_SIDE) // 2) for n in field.shape]
+    piece = field.heights[tuple(slice(i, i + MAX_HEIGHTS_SIDE) for i in first)]
+    height_range = float(np.ptp(piece))
+    numbers = np.rint((piece - piece.min()) * (65535 / (height_range or 1.0))).astype(np.uint16)
+    return {
+        "values": encoded(numbers),
+        "shape": piece.shape,
+        "range": height_range,
+        "pixel_size": field.pixel_size,
+        "is_piece": piece.shape != field.shape,
     }
 
 

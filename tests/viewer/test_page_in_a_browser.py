@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from mitsuba_diffraction import testing
+from mitsuba_diffraction.evaluation.realtime_shader.evaluate import shader_for
+from mitsuba_diffraction.evaluation.realtime_shader.quirks import Quirks
 from mitsuba_diffraction.viewer import page as pages
 from mitsuba_diffraction.viewer.surface import Surface
 
@@ -97,6 +99,29 @@ def test_values_are_those_of_the_bsdf(source, parameters, changes, opened, llvm)
     wanted = testing.evaluate(bsdf, pairs[:, :3], pairs[:, 3:6], pairs[:, 6:])[:, 0]
     assert (wanted > 1e-3 * wanted.max()).mean() > 0.1
     np.testing.assert_allclose(values, wanted, rtol=0, atol=1e-3 * wanted.max())
+
+
+@pytest.mark.parametrize("published", [True, False], ids=["published", "corrected"])
+@pytest.mark.parametrize("source", ["blaze.toml", pytest.param("elaphe_afm.toml", marks=pytest.mark.slow)])
+def test_colours_are_those_of_the_shader_of_2014(source, published, opened, llvm):
+    """All four variants in linear RGB, to 1e-3 of the largest value; gamma and blend are not part of it."""
+    surface = Surface.named(RECIPES / source, {})
+    pairs = pairs_of(surface.spectrum, 1000)
+    tab = opened(surface)
+    tab.evaluate("viewer.set({ maxFrames: 1 })")
+    quirks = Quirks.as_published() if published else Quirks.corrected()
+    field, light = surface.recipe.height_field(), pages._light()[20:421, 3]
+    for variant in ("flss", "nmm", "pq", "gem"):
+        # Fewer terms, whose differences in the order of summation do not grow.
+        length = {} if variant == "gem" else {"coherence_length": surface.spectrum.coherence_length, "terms": 25}
+        shader = shader_for(field, variant, quirks, **length)
+        wi, wo = testing.vectors(pairs[:, :3]), testing.vectors(pairs[:, 3:6])
+        wanted = testing.array(shader.rgb(wi, wo, shader.weights(light=light)), np.float64).T
+        tab.evaluate(f"viewer.set({{ right: '{variant}', terms: 25, quirks: {str(vars(quirks)).lower()} }})")
+        found = np.array(tab.evaluate("(pairs) => viewer.evaluateShader(pairs)", pairs.ravel().tolist()))
+        found = found.reshape(-1, 4)[:, :3]
+        assert (np.abs(wanted).max(axis=1) > 1e-3 * wanted.max()).mean() > 0.05, variant
+        np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-3 * np.abs(wanted).max(), err_msg=variant)
 
 
 def test_a_drag_changes_the_picture_and_nothing_leaves_the_page(opened):

@@ -1,6 +1,8 @@
 // The panel, the mouse, touch and the keyboard.
 
 const $ = (id) => document.getElementById(id);
+const CHOICES = ["shape", "material", "pigment", "right", "window"];
+const SWITCHES = ["hasBase", "difference"];
 
 const NUMBERS = {
   lightWidth: (x) => `${x}°`,
@@ -11,6 +13,7 @@ const NUMBERS = {
   heightScale: (x) => `× ${x.toFixed(2)}`,
   coherenceLength: (x) => `${x.toPrecision(3)} µm`,
   index: (x) => x.toFixed(2),
+  terms: (x) => String(x),
 };
 
 class Controls {
@@ -19,10 +22,19 @@ class Controls {
     for (const name of Object.keys(NUMBERS)) {
       $(name).addEventListener("input", () => this.set({ [name]: this.valueOf(name) }));
     }
-    for (const name of ["shape", "material", "pigment"]) {
-      $(name).addEventListener("input", () => this.set({ [name]: $(name).value }));
+    for (const name of CHOICES) $(name).addEventListener("input", () => this.set({ [name]: $(name).value }));
+    for (const name of SWITCHES) $(name).addEventListener("input", () => this.set({ [name]: $(name).checked }));
+    for (const [name, on] of [["published", true], ["corrected", false]]) {
+      $(name).addEventListener("click", () => this.set({ quirks: allQuirks(on) }));
     }
-    $("hasBase").addEventListener("input", () => this.set({ hasBase: $("hasBase").checked }));
+    for (const [name, [text]] of Object.entries(QUIRKS)) {
+      const box = Object.assign(document.createElement("input"), { type: "checkbox", id: `quirk-${name}` });
+      const label = document.createElement("label");
+      label.append(box, ` ${text}`);
+      $("quirks").append(label);
+      box.addEventListener("input", () => this.set({ quirks: { ...this.state.quirks, [name]: box.checked } }));
+    }
+    this.followDivider($("divider"));
     for (const button of document.querySelectorAll("[name=drag]")) {
       button.addEventListener("input", () => this.set({ drag: button.value }));
     }
@@ -50,8 +62,24 @@ class Controls {
       $(name).value = name === "coherenceLength" ? Math.log(state[name]) : state[name];
       $(`${name}-shown`).textContent = text(state[name]);
     }
-    for (const name of ["shape", "material", "pigment"]) $(name).value = state[name];
-    $("hasBase").checked = state.hasBase;
+    for (const name of CHOICES) $(name).value = state[name];
+    for (const name of SWITCHES) $(name).checked = state[name];
+    const compares = state.right !== "none";
+    const isShader = state.right in VARIANTS;
+    $("difference").disabled = !compares;
+    $("of-shader").hidden = !isShader;
+    $("terms").disabled = state.right === "gem";
+    $("window").disabled = !["flss", "nmm"].includes(state.right);
+    for (const [name, [, variants]] of Object.entries(QUIRKS)) {
+      $(`quirk-${name}`).checked = state.quirks[name];
+      $(`quirk-${name}`).parentElement.hidden = !variants.includes(state.right);
+    }
+    const split = compares && !state.difference;
+    for (const name of ["divider", "left-name", "right-name"]) $(name).hidden = !split;
+    $("legend").hidden = !(compares && state.difference);
+    $("right-name").textContent = isShader ? `${state.right.toUpperCase()}, 2014` : "reference";
+    $("divider").style.left = `${100 * state.divider}%`;
+    $("divider").setAttribute("aria-valuenow", Math.round(100 * state.divider));
     for (const button of document.querySelectorAll("[name=drag]")) button.checked = button.value === state.drag;
     const dielectric = state.material === "dielectric";
     for (const name of ["index", "hasBase", "pigment"]) $(name).disabled = !dielectric;
@@ -78,6 +106,20 @@ class Controls {
     this.set({ distance: Math.min(Math.max(this.state.distance * factor, 2), 20) });
   }
 
+  followDivider(divider) {
+    const move = (x) => this.set({ divider: Math.min(Math.max(x, 0), 1) });
+    divider.addEventListener("pointerdown", (event) => divider.setPointerCapture(event.pointerId));
+    divider.addEventListener("pointermove", (event) => {
+      if (!divider.hasPointerCapture(event.pointerId)) return;
+      const box = divider.parentElement.getBoundingClientRect();
+      move((event.clientX - box.left) / box.width);
+    });
+    divider.addEventListener("keydown", (event) => {
+      if (event.key === "ArrowLeft") move(this.state.divider - 0.02);
+      if (event.key === "ArrowRight") move(this.state.divider + 0.02);
+    });
+  }
+
   followPointers(canvas) {
     const pointers = new Map();
     canvas.addEventListener("pointerdown", (event) => {
@@ -102,7 +144,11 @@ class Controls {
       pointers.set(event.pointerId, event);
     });
     for (const kind of ["pointerup", "pointercancel"]) {
-      canvas.addEventListener(kind, (event) => pointers.delete(event.pointerId));
+      canvas.addEventListener(kind, (event) => {
+        pointers.delete(event.pointerId);
+        const ratio = canvas.width / canvas.clientWidth;
+        if (kind === "pointerup" && this.moved < 4) this.pick(event.offsetX * ratio, event.offsetY * ratio);
+      });
     }
     canvas.addEventListener("contextmenu", (event) => event.preventDefault());
     canvas.addEventListener("wheel", (event) => {

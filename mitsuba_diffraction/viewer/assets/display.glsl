@@ -2,7 +2,14 @@
 uniform highp sampler2D uMean;
 uniform float uExposure;
 uniform vec3 uBackground;  // encoded
-uniform float uScale;      // of the drawn part of the mean
+uniform highp sampler2D uOther;  // the other side: a mean, or linear sRGB of a picture
+uniform bool uOtherIsPicture;
+uniform vec4 uOtherScale;  // scale and offset of its pixels
+uniform float uOtherExposure;
+uniform bool uPowerGamma;  // of the other side
+uniform float uDivider;    // pixels from the left
+uniform bool uDifference;
+uniform float uScale;           // of the drawn part of the mean
 out vec4 oColour;
 
 vec3 toLinear(vec3 xyz) {
@@ -31,9 +38,75 @@ vec3 encode(vec3 rgb) {
   return mix(1.055 * pow(rgb, vec3(1.0 / 2.4)) - 0.055, 12.92 * rgb, lessThanEqual(rgb, vec3(0.0031308)));
 }
 
+// Linear sRGB that the screen emits.
+vec3 shown(vec3 rgb, float exposure) {
+  return clamp(rollOff(exposure * intoGamut(rgb, dot(vec3(0.2126, 0.7152, 0.0722), rgb))), 0.0, 1.0);
+}
+
+vec3 ofMean(vec4 mean) {
+  return mean.a > 0.0 ? toLinear(mean.xyz / mean.a) : vec3(0.0);
+}
+
+vec3 toLab(vec3 rgb) {
+  vec3 xyz = vec3(dot(vec3(0.4124, 0.3576, 0.1805), rgb), dot(vec3(0.2126, 0.7152, 0.0722), rgb),
+                  dot(vec3(0.0193, 0.1192, 0.9505), rgb)) / vec3(0.9505, 1.0, 1.089);
+  vec3 f = mix(pow(max(xyz, 1e-9), vec3(1.0 / 3.0)), 7.787037 * xyz + 16.0 / 116.0, lessThan(xyz, vec3(0.008856)));
+  return vec3(116.0 * f.y - 16.0, 500.0 * (f.x - f.y), 200.0 * (f.y - f.z));
+}
+
+// CIEDE2000 (CIE 142).
+float deltaE(vec3 a, vec3 b) {
+  const float PI = 3.14159265, SEVENTH = 6103515625.0;
+  float mean7 = pow(0.5 * (length(a.yz) + length(b.yz)), 7.0);
+  float g = 1.5 - 0.5 * sqrt(mean7 / (mean7 + SEVENTH));
+  vec2 p = vec2(a.y * g, a.z), q = vec2(b.y * g, b.z);
+  float c1 = length(p), c2 = length(q);
+  float h1 = c1 > 0.0 ? atan(p.y, p.x) : 0.0, h2 = c2 > 0.0 ? atan(q.y, q.x) : 0.0;
+  if (h1 < 0.0) h1 += 2.0 * PI;
+  if (h2 < 0.0) h2 += 2.0 * PI;
+  float dh = c1 * c2 > 0.0 ? h2 - h1 : 0.0;
+  if (dh > PI) dh -= 2.0 * PI;
+  if (dh < -PI) dh += 2.0 * PI;
+  float dL = b.x - a.x, dC = c2 - c1, dH = 2.0 * sqrt(c1 * c2) * sin(0.5 * dh);
+  float L = 0.5 * (a.x + b.x), C = 0.5 * (c1 + c2), h = h1 + h2;
+  if (c1 * c2 > 0.0) {
+    if (abs(h1 - h2) > PI) h += h < 2.0 * PI ? 2.0 * PI : -2.0 * PI;
+    h *= 0.5;
+  }
+  float T = 1.0 - 0.17 * cos(h - PI / 6.0) + 0.24 * cos(2.0 * h) + 0.32 * cos(3.0 * h + PI / 30.0) -
+            0.2 * cos(4.0 * h - 63.0 * PI / 180.0);
+  float turn = (h * 180.0 / PI - 275.0) / 25.0, C7 = pow(C, 7.0), L50 = (L - 50.0) * (L - 50.0);
+  float RT = -2.0 * sqrt(C7 / (C7 + SEVENTH)) * sin(PI / 3.0 * exp(-turn * turn));
+  vec3 d = vec3(dL / (1.0 + 0.015 * L50 / sqrt(20.0 + L50)), dC / (1.0 + 0.045 * C), dH / (1.0 + 0.015 * C * T));
+  return sqrt(max(dot(d, d) + RT * d.y * d.z, 0.0));
+}
+
+// Black, purple, orange, pale yellow, for 0 to 1.
+vec3 heat(float x) {
+  vec3 c = mix(vec3(0.0, 0.0, 0.02), vec3(0.45, 0.11, 0.5), clamp(3.0 * x, 0.0, 1.0));
+  c = mix(c, vec3(0.97, 0.45, 0.36), clamp(3.0 * x - 1.0, 0.0, 1.0));
+  return mix(c, vec3(0.99, 0.99, 0.75), clamp(3.0 * x - 2.0, 0.0, 1.0));
+}
+
+const float MAX_DELTA_E = 30.0;
+
 void main() {
   vec4 mean = texelFetch(uMean, ivec2(gl_FragCoord.xy * uScale), 0);
-  vec3 xyz = mean.a > 0.0 ? mean.xyz / mean.a : vec3(0.0);
-  vec3 rgb = intoGamut(toLinear(xyz), dot(vec3(0.2126, 0.7152, 0.0722), toLinear(xyz)));
-  oColour = vec4(mix(uBackground, encode(rollOff(uExposure * rgb)), mean.a), 1.0);
+  vec3 ours = shown(ofMean(mean), uExposure);
+  vec4 found = vec4(0.0);
+  ivec2 at = ivec2(gl_FragCoord.xy * uOtherScale.xy + uOtherScale.zw);
+  if (all(greaterThanEqual(at, ivec2(0))) && all(lessThan(at, textureSize(uOther, 0)))) found = texelFetch(uOther, at, 0);
+  vec3 theirs = uPowerGamma && !uOtherIsPicture
+    ? pow(clamp(uOtherExposure * max(ofMean(found), 0.0), 0.0, 1.0), vec3(1.0 / 2.2))
+    : encode(shown(uOtherIsPicture ? found.rgb : ofMean(found), uOtherExposure));
+  float cover = uOtherIsPicture ? 1.0 : found.a;
+  vec3 colour = mix(uBackground, encode(ours), mean.a);
+  if (uDifference) {
+    vec3 linear = mix(pow((theirs + 0.055) / 1.055, vec3(2.4)), theirs / 12.92, lessThanEqual(theirs, vec3(0.04045)));
+    colour = mix(uBackground, heat(deltaE(toLab(ours), toLab(linear)) / MAX_DELTA_E), min(mean.a, cover));
+  } else if (gl_FragCoord.x > uDivider) {
+    colour = mix(uBackground, theirs, cover);
+  }
+  if (abs(gl_FragCoord.x - uDivider) < 1.0 && !uDifference) colour = vec3(0.5);
+  oColour = vec4(colour, 1.0);
 }

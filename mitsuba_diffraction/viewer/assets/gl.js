@@ -50,6 +50,7 @@ class Program {
         case gl.FLOAT: gl.uniform1f(place, value); break;
         case gl.FLOAT_VEC2: gl.uniform2fv(place, value); break;
         case gl.FLOAT_VEC3: gl.uniform3fv(place, value); break;
+        case gl.FLOAT_VEC4: gl.uniform4fv(place, value); break;
         case gl.FLOAT_MAT3: gl.uniformMatrix3fv(place, false, value); break;
         case gl.FLOAT_MAT4: gl.uniformMatrix4fv(place, false, value); break;
         case gl.INT: case gl.BOOL: gl.uniform1i(place, value); break;

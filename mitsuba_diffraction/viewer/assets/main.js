@@ -2,6 +2,7 @@
 
 const MAX_FRAMES = 128;
 const EXPOSED_FRAMES = [1, 4, 16];  // after which the exposure is found, from less and less noise
+const BUDGET_MILLISECONDS = 80;  // of drawing between two turns of the page
 const BUSY_MILLISECONDS = 60;  // of a frame while dragging, above which fewer pixels are drawn
 
 function initialState(data) {
@@ -18,6 +19,8 @@ function initialState(data) {
     index: material.int_ior,
     hasBase: false, pigment: "#40301c",
     wavelengths: 48,
+    right: "none", divider: 0.5, difference: false,
+    quirks: allQuirks(true), terms: 37, window: "texel",
     drag: "light",
     maxFrames: MAX_FRAMES,
   };
@@ -32,6 +35,8 @@ function prepareControls(data) {
   const [shortest, longest] = coherenceLengths(spectrum);
   Object.assign($("coherenceLength"), { min: Math.log(shortest), max: Math.log(longest), step: "any" });
   $("coherenceLength").disabled = shortest === longest;
+  if (!data.heights) for (const name of Object.keys(VARIANTS)) $("right").querySelector(`[value=${name}]`).remove();
+  if (!data.picture) $("right").querySelector("[value=picture]").remove();
   $("source").textContent = data.source;
   if (spectrum.warning) {
     $("warning").textContent = spectrum.warning;
@@ -44,21 +49,31 @@ async function start() {
   window.SHADERS = JSON.parse($("shaders").textContent);
   const canvas = $("canvas");
   const gl = contextOf(canvas);
-  const light = (await decoded(data.light)).values;
-  matching = light;
+  matching = (await decoded(data.light)).values;
   const metals = {};
   for (const [name, content] of Object.entries(data.metals)) {
     metals[name] = numbers2D(gl, (await decoded(content)).values, 471, 1, 2);
   }
-  const coil = data.coil && (await coilOf(gl, data.coil));
-  const renderer = new Renderer(gl, data, { table: await decoded(data.spectrum.table), metals, light, coil });
-  renderer.normal = 1;
+  const tables = {
+    table: await decoded(data.spectrum.table),
+    metals,
+    light: matching,
+    coil: data.coil && (await coilOf(gl, data.coil)),
+    picture: data.picture && (await pictureOf(gl, data.picture)),
+  };
+  const renderer = new Renderer(gl, data, tables);
+  const shader2014 = data.heights && new Shader2014(gl, data.heights, (await decoded(data.heights.values)).values, renderer.spectrum);
   const state = initialState(data);
   let dirty = true;
-  let exposed = false;
+  let exposed = { model: false, shader: false };
+  let variant = "none";
   prepareControls(data);
   const controls = new Controls(state, () => { dirty = true; }, {
-    auto: () => { exposed = false; dirty = true; },
+    auto: () => {
+      exposed = { model: false, shader: false };
+      dirty = true;
+    },
+    copy: () => copyCommand(data, state, tables.coil),
   });
 
   const background = () => {
@@ -74,43 +89,103 @@ async function start() {
     renderer.resize(width, height);
   }
 
-  function draw() {
-    if (dirty) {
-      renderer.restart();
-      dirty = false;
+  // Makes what the chosen shader needs; true when it can draw.
+  let preparing = false;
+  let fromLowest = null;
+  function prepared() {
+    const wanted = state.right in VARIANTS ? state.right : "none";
+    if (wanted !== "none" && state.quirks.heights_from_zero !== fromLowest) {
+      if (!preparing) {
+        preparing = true;
+        const lowest = state.quirks.heights_from_zero;
+        const progress = (x) => { $("progress").textContent = x < 1 ? `transforms of the heights: ${Math.round(100 * x)} %` : ""; };
+        shader2014.prepare(lowest, progress).then(() => {
+          [preparing, fromLowest, dirty] = [false, lowest, true];
+        });
+      }
+      if (variant !== wanted) renderer.setShader(null, null);
+      variant = "none";
+      return;
     }
-    renderer.drawFrame(state, () => [0, 1]);
-    if (!exposed && EXPOSED_FRAMES.includes(renderer.frame)) {
-      renderer.normal = renderer.autoExposure();
-      exposed = renderer.frame === EXPOSED_FRAMES.at(-1);
+    if (wanted === variant) return;
+    renderer.setShader(shader2014, wanted === "none" ? null : wanted);
+    [variant, exposed.shader, dirty] = [wanted, false, true];
+  }
+
+  // The columns that a side needs.
+  function region(side) {
+    if (state.right === "none" || state.difference) return [0, 1];
+    if (!exposed[side === renderer.model ? "model" : "shader"] && side.frame === 0) return [0, 1];
+    return side === renderer.model ? [0, state.divider] : [state.divider, 1];
+  }
+
+  function expose(side, name) {
+    if (exposed[name] || side.row > 0 || !EXPOSED_FRAMES.includes(side.frame)) return;
+    const found = renderer.autoExposure(side);
+    if (name === "model") renderer.normal = found;
+    else renderer.otherNormal = found;
+    // What was drawn for the exposure alone is drawn again in the columns of the side.
+    exposed[name] = name === "shader" || side.frame === EXPOSED_FRAMES.at(-1);
+  }
+
+  function draw() {
+    const busy = renderer.sides.filter((side) => side.frame < state.maxFrames);
+    for (const side of busy) {
+      renderer.draw(side, state, region(side), BUDGET_MILLISECONDS / busy.length);
+      expose(side, side === renderer.model ? "model" : "shader");
     }
     renderer.drawScreen(state, background());
-    $("time").textContent = `${renderer.model.milliseconds.toFixed(1)} ms`;
-    $("frames").textContent = `${renderer.frame} of ${state.maxFrames}`;
+    show(renderer, state);
   }
 
   function tick() {
     fit();
-    const slow = renderer.model.milliseconds > BUSY_MILLISECONDS;
+    prepared();
+    const slow = renderer.sides.some((side) => side.milliseconds > BUSY_MILLISECONDS || side.row > 0);
     if (controls.dragging && dirty && slow) renderer.scale = Math.max(renderer.scale / 2, 0.25);
     else if (!controls.dragging && renderer.scale < 1) {
       renderer.scale = 1;
       dirty = true;
     }
-    if (dirty || renderer.frame < state.maxFrames) draw();
+    if (dirty) {
+      renderer.restart();
+      dirty = false;
+      draw();
+    } else if (renderer.sides.some((side) => side.frame < state.maxFrames)) draw();
     requestAnimationFrame(tick);
   }
 
   fit();
   draw();
   requestAnimationFrame(tick);
-  new MutationObserver(() => { dirty = true; }).observe(document.documentElement, { attributes: true });
-  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { dirty = true; });
+  const redraw = () => renderer.drawScreen(state, background());
+  new ResizeObserver(() => { dirty = true; }).observe(canvas);
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
+  const picker = new Picker(renderer, state);
+  controls.pick = (x, y) => picker.pick(x, y);
   Object.assign(window.viewer, {
-    state, renderer, data,
+    state, renderer, data, picker,
     set: (changes) => controls.set(changes),
     evaluate: (pairs) => Array.from(renderer.evaluatePairs(state, Float32Array.from(pairs))),
+    evaluateShader: async (pairs) => {
+      await shader2014.prepare(state.quirks.heights_from_zero, () => {});
+      return Array.from(renderer.evaluateShader(shader2014, state, Float32Array.from(pairs)));
+    },
+    command: () => commandOf(data, state, tables.coil),
   });
+}
+
+function show(renderer, state) {
+  const of = (side) => (Number.isNaN(side.milliseconds) ? "…" : `${side.milliseconds.toPrecision(3)} ms`);
+  const texts = [`This model: ${of(renderer.model)} a frame; ${renderer.model.frame} of ${state.maxFrames} frames averaged.`];
+  if (renderer.shader) texts.push(`Shader of 2014: ${of(renderer.shader)} a frame; ${renderer.shader.frame} averaged.`);
+  $("times").textContent = texts.join(" ");
+}
+
+async function pictureOf(gl, picture) {
+  const { values, shape } = await decoded(picture);
+  const [height, width] = shape;
+  return { width, height, texture: numbers2D(gl, values, width, height, 3) };
 }
 
 window.viewer = {};

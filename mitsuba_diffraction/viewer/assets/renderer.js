@@ -4,7 +4,8 @@ const GOLDEN = 0.6180339887498949;
 const R2 = [0.7548776662466927, 0.5698402909980532];  // steps of a two-dimensional sequence (Roberts 2018)
 const fraction = (x) => x - Math.floor(x);
 
-// One of the two shaders: its program, its uniforms, and the mean of its frames.
+// One of the two shaders: its program, its uniforms, and the mean of its frames. A frame is drawn in bands of rows, so
+// that a slow shader blocks neither the page nor the device.
 class Side {
   constructor(gl, text, uniforms) {
     this.gl = gl;
@@ -12,16 +13,36 @@ class Side {
     this.uniforms = uniforms;
     this.means = [];
     this.milliseconds = NaN;
+    this.band = 16;
   }
 
   resize(width, height) {
     for (const target of this.means) target.dispose();
     this.means = [new Target(this.gl, width, height), new Target(this.gl, width, height)];
+    this.restart();
   }
 
-  get mean() {
-    return this.means[0];
+  restart() {
+    Object.assign(this, { frame: 0, row: 0, spent: 0 });
+    this.means[1].bind();
+    this.gl.clearBufferfv(this.gl.COLOR, 0, [0, 0, 0, 0]);
   }
+
+  // The mean that is shown: of all whole frames, or the first one as far as it is drawn.
+  get mean() {
+    return this.means[this.frame === 0 ? 1 : 0];
+  }
+
+  dispose() {
+    for (const target of this.means) target.dispose();
+    this.gl.deleteProgram(this.program.program);
+  }
+}
+
+// Scale and offset from pixels of the screen to those of a picture that fills the shorter side.
+function pictureScale(picture, width, height) {
+  const scale = Math.min(picture.width, picture.height) / Math.min(width, height);
+  return [scale, scale, 0.5 * (picture.width - scale * width), 0.5 * (picture.height - scale * height)];
 }
 
 class Renderer {
@@ -36,12 +57,24 @@ class Renderer {
     this.model = new Side(gl, SHADERS.model + SHADERS.radiance_model, (state) => this.modelUniforms(state));
     this.coil = tables.coil;
     this.empty = gl.createVertexArray();
-    this.frame = 0;
+    this.shader = null;
+    this.picture = tables.picture;
+    this.normal = this.otherNormal = 1;
     this.scale = 1;
   }
 
   get sides() {
-    return [this.model];
+    return this.shader ? [this.model, this.shader] : [this.model];
+  }
+
+  // Puts the shader of 2014 on the other side; null for none.
+  setShader(shader2014, variant) {
+    if (this.shader) this.shader.dispose();
+    this.shader = null;
+    if (variant === null) return;
+    const text = `#define VARIANT ${VARIANTS[variant]}\n${SHADERS.model}${SHADERS.shader_2014}`;
+    this.shader = new Side(this.gl, text, (state) => ({ ...shader2014.uniforms(state), uMatching: this.matching }));
+    this.shader.resize(this.width, this.height);
   }
 
   modelUniforms(state) {
@@ -59,11 +92,10 @@ class Renderer {
     if (this.geometry) this.geometry.dispose();
     this.geometry = new Target(this.gl, width, height, 3, true);
     for (const side of this.sides) side.resize(width, height);
-    this.restart();
   }
 
   restart() {
-    this.frame = 0;
+    for (const side of this.sides) side.restart();
   }
 
   // The size that is drawn: smaller while a slow device is busy.
@@ -104,54 +136,75 @@ class Renderer {
     gl.disable(gl.DEPTH_TEST);
   }
 
-  // Adds a frame to the mean of each side; `regions` has the columns that each needs, (first, end) from 0 to 1.
-  drawFrame(state, regions) {
-    const { gl, frame } = this;
+  // Continues the frame of a side for about `budget` ms, in the columns from first to end (0 to 1).
+  draw(side, state, [first, end], budget) {
+    const { gl } = this;
     const [width, height] = this.drawn;
     const camera = cameraOf(state, width, height);
+    const { frame } = side;
     const jitter = frame === 0 ? [0, 0] : R2.map((step) => fraction(0.5 + frame * step) - 0.5);
     this.drawGeometry(state, camera, jitter);
     const turn = radians(state.orientation);
     const [uPosition, uNormal, uTangent] = this.geometry.textures;
+    const [before, after] = side.means;
+    const [left, right] = [Math.floor(first * width), Math.ceil(end * width)];
+    after.bind(width, height);
+    side.program.use({
+      ...side.uniforms(state),
+      uPosition, uNormal, uTangent,
+      uBefore: before.textures[0],
+      uWeight: 1 / (frame + 1),
+      uEye: camera.eye,
+      uLight: lightOf(state),
+      ...lightSizeOf(state),
+      uRandom: R2.map((step) => fraction(0.5 + frame * step)),
+      uOffset: fraction(0.5 + frame * GOLDEN),
+      uSin: Math.sin(turn),
+      uCos: Math.cos(turn),
+    });
     gl.enable(gl.SCISSOR_TEST);
-    for (const side of this.sides) {
-      const [first, end] = regions(side).map((x) => Math.round(x * width));
-      if (first >= end) continue;
-      const start = performance.now();
-      const [before, after] = side.means;
+    const start = performance.now();
+    let now = start;
+    while (side.row < height && now - start < budget) {
+      const rows = Math.min(side.band, height - side.row);
+      gl.scissor(left, side.row, Math.max(right - left, 1), rows);
       after.bind(width, height);
-      gl.scissor(first, 0, end - first, height);
-      side.program.use({
-        ...side.uniforms(state),
-        uPosition, uNormal, uTangent,
-        uBefore: before.textures[0],
-        uWeight: 1 / (frame + 1),
-        uEye: camera.eye,
-        uLight: lightOf(state),
-        ...lightSizeOf(state),
-        uRandom: R2.map((step) => fraction(0.5 + frame * step)),
-        uOffset: fraction(0.5 + frame * GOLDEN),
-        uSin: Math.sin(turn),
-        uCos: Math.cos(turn),
-      });
       this.quad();
-      side.means = [after, before];
-      after.read(first, 0, 1, 1);  // waits until it is drawn
-      side.milliseconds = performance.now() - start;
+      after.read(left, side.row, 1, 1);  // waits until it is drawn
+      side.row += rows;
+      const spent = performance.now() - now;
+      now += spent;
+      side.spent += spent;
+      side.band = Math.min(Math.max(Math.round((side.band * budget) / (3 * Math.max(spent, 0.5))), 4), 4 * side.band);
     }
     gl.disable(gl.SCISSOR_TEST);
-    this.frame += 1;
+    if (side.row >= height) {
+      side.means = [after, before];
+      side.milliseconds = side.spent;
+      Object.assign(side, { frame: frame + 1, row: 0, spent: 0 });
+    }
   }
 
   drawScreen(state, background) {
     const { gl } = this;
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.viewport(0, 0, gl.drawingBufferWidth, gl.drawingBufferHeight);
+    const { width, height, picture } = this;
+    const isPicture = state.right === "picture";
+    const other = isPicture ? picture.texture : (this.shader || this.model).mean.textures[0];
+    const exposure = 2 ** state.exposure;
     this.screen.use({
       uMean: this.model.mean.textures[0],
-      uExposure: 2 ** state.exposure * this.normal,
-      uBackground: background,
+      uOther: other,
       uScale: this.scale,
+      uOtherScale: isPicture ? pictureScale(picture, width, height) : [this.scale, this.scale, 0, 0],
+      uOtherIsPicture: Number(isPicture),
+      uExposure: exposure * this.normal,
+      uOtherExposure: exposure * (isPicture ? this.normal : this.otherNormal),
+      uPowerGamma: Number(Boolean(this.shader) && state.quirks.power_gamma),
+      uDivider: state.right === "none" ? 1e6 : state.divider * gl.drawingBufferWidth,
+      uDifference: Number(state.difference && state.right !== "none"),
+      uBackground: background,
     });
     this.quad();
   }
@@ -163,8 +216,8 @@ class Renderer {
   }
 
   // The exposure that shows the picture well: color.auto_exposure of the package.
-  autoExposure() {
-    const { values } = this.readMean();
+  autoExposure(side = this.model) {
+    const { values } = this.readMean(side);
     const peaks = [];
     for (let i = 0; i < values.length; i += 4) {
       if (values[i + 3] > 0) {
@@ -181,8 +234,20 @@ class Renderer {
 
   // f cos theta_o of pairs, (n, 7): omega_i, omega_o along the pattern's axes, lambda in nm.
   evaluatePairs(state, pairs) {
+    this.pairs ??= new Program(this.gl, SHADERS.quad_vertex, SHADERS.model, SHADERS.pairs);
+    const values = this.evaluate(this.pairs, this.spectrum.uniforms(state), pairs);
+    return Float32Array.from({ length: pairs.length / 7 }, (_, i) => values[4 * i]);
+  }
+
+  // Linear RGB of the shader of 2014 for pairs, as above: (n, 4).
+  evaluateShader(shader2014, state, pairs) {
+    const text = `#define VARIANT ${VARIANTS[state.right]}\n${SHADERS.model}${SHADERS.shader_2014}`;
+    const program = new Program(this.gl, SHADERS.quad_vertex, text, SHADERS.pairs_2014);
+    return this.evaluate(program, { ...shader2014.uniforms(state), uMatching: this.matching }, pairs);
+  }
+
+  evaluate(program, uniforms, pairs) {
     const { gl } = this;
-    this.pairs ??= new Program(gl, SHADERS.quad_vertex, SHADERS.model, SHADERS.pairs);
     const count = pairs.length / 7;
     const width = Math.min(count, 1024);
     const height = Math.ceil(count / width);
@@ -193,14 +258,14 @@ class Renderer {
     }
     const target = new Target(gl, width, height);
     target.bind();
-    this.pairs.use({
-      ...this.spectrum.uniforms(state),
+    program.use({
+      ...uniforms,
       uIncident: numbers2D(gl, incident, width, height, 4),
       uOutgoing: numbers2D(gl, outgoing, width, height, 4),
     });
     this.quad();
     const values = target.read(0, 0, width, height);
     target.dispose();
-    return Float32Array.from({ length: count }, (_, i) => values[4 * i]);
+    return values;
   }
 }

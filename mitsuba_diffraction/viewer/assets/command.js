@@ -1,0 +1,70 @@
+// The scene and the command that path-trace the view.
+
+function element(name, value) {
+  const kind = typeof value === "boolean" ? "boolean" : typeof value === "string" ? "string" : "float";
+  const text = String(value).replace(/&/g, "&amp;").replace(/"/g, "&quot;").replace(/</g, "&lt;");
+  return `<${kind} name="${name}" value="${text}"/>`;
+}
+
+const list = (v) => v.map((x) => Number(x.toFixed(5))).join(", ");
+
+function sceneOf(data, state, coil) {
+  const grating = { ...data.grating };
+  const own = data.spectrum.coherence_length;
+  const differs = Math.abs(state.coherenceLength / own - 1) > 1e-3;
+  if (grating.profile && differs) grating.coherence_length = Number(state.coherenceLength.toPrecision(4));
+  const material = state.material === "dielectric" ? { int_ior: state.index } : { material: state.material };
+  const parameters = { ...grating, ...material, orientation: state.orientation, height_scale: state.heightScale, conserve_energy: false };
+  const lines = Object.entries(parameters).map(([name, value]) =>
+    name === "patches" || name === "seed" || name === "samples" ? element(name, value).replace(/float/, "integer") : element(name, value));
+  if (state.hasBase && state.material === "dielectric") {
+    lines.push(`<bsdf type="diffuse" name="base"><rgb name="reflectance" value="${list(linearOf(state.pigment))}"/></bsdf>`);
+  }
+  const note = differs && !grating.profile
+    ? `  <!-- The view has a coherence length of ${state.coherenceLength.toPrecision(4)} um, the file ${own.toPrecision(4)}. -->\n` : "";
+  const camera = cameraOf(state, 1, 1);
+  const light = lightOf(state);
+  const { uLightIsDisc, uLightSize } = lightSizeOf(state);
+  const far = 1000;
+  const area = (uLightIsDisc ? Math.PI : 4) * uLightSize[0] * uLightSize[1];
+  const emitter = area === 0
+    ? `<emitter type="directional"><vector name="direction" value="${list(scaled(light, -1))}"/><spectrum name="irradiance" type="d65"/></emitter>`
+    : `<shape type="${uLightIsDisc ? "disk" : "rectangle"}">
+    <transform name="to_world"><scale x="${far * uLightSize[0]}" y="${far * uLightSize[1]}"/><lookat origin="${list(scaled(light, far))}" target="0, 0, 0" up="0, 0, 1"/></transform>
+    <emitter type="area"><spectrum name="radiance" type="d65"><float name="scale" value="${1 / area}"/></spectrum></emitter>
+  </shape>`;
+  const sky = state.sky > 0
+    ? `\n  <emitter type="constant"><spectrum name="radiance" type="d65"><float name="scale" value="${state.sky / Math.PI}"/></spectrum></emitter>` : "";
+  const shape = { sphere: ["sphere", ""], plate: ["rectangle", ""], disc: ["disk", ""] }[state.shape] || ["ply",
+    `<string name="filename" value="scenes/coil/snake.ply"/>
+    <transform name="to_world"><translate value="${list(scaled(coil.middle, -1))}"/><scale value="${coil.scale.toFixed(6)}"/></transform>
+    `];
+  const { width, height } = $("canvas");
+  return `<scene version="3.0.0">
+${note}  <integrator type="path"><integer name="max_depth" value="2"/></integrator>
+  <sensor type="perspective">
+    <float name="fov" value="${FIELD_OF_VIEW}"/><string name="fov_axis" value="smaller"/>
+    <transform name="to_world"><lookat origin="${list(camera.eye)}" target="0, 0, 0" up="0, 0, 1"/></transform>
+    <film type="hdrfilm"><integer name="width" value="${width}"/><integer name="height" value="${height}"/><rfilter type="box"/></film>
+  </sensor>
+  <shape type="${shape[0]}">
+    ${shape[1]}<bsdf type="diffraction_grating">
+      ${lines.join("\n      ")}
+    </bsdf>
+  </shape>
+  ${emitter}${sky}
+</scene>`;
+}
+
+function commandOf(data, state, coil) {
+  const examples = state.shape in ANALYTIC ? "" : "mitsuba-diffraction examples\n";
+  return `${data.command ? `${data.command}\n` : ""}${examples}cat > view.xml <<'END'\n${sceneOf(data, state, coil)}\nEND\nmitsuba-diffraction render view.xml --spp 64\n`;
+}
+
+function copyCommand(data, state, coil) {
+  const text = commandOf(data, state, coil);
+  $("command").value = text;
+  $("command").hidden = false;
+  $("command").select();
+  navigator.clipboard?.writeText(text).catch(() => {});
+}

@@ -1,0 +1,182 @@
+// The shader of 2014: its textures, and its uniforms.
+
+const VARIANTS = { flss: 0, nmm: 1, pq: 2, gem: 3 };
+const MAX_TERMS = 45;
+
+const QUIRKS = {
+  fresnel_squared: ["Fresnel squared", ["flss", "nmm", "pq"]],
+  fixed_index: ["index 1.5 for every material", ["flss", "nmm", "pq"]],
+  window_pi: ["window times π", ["flss", "nmm"]],
+  complex_window_sum: ["complex sum over the window", ["flss", "nmm"]],
+  floor_anchor: ["window about floor(q T)", ["flss", "nmm", "pq"]],
+  heights_from_zero: ["heights from the lowest point", ["flss", "nmm", "pq"]],
+  no_jacobian: ["no dλ/dn", ["nmm"]],
+  wrong_product: ["wrong imaginary part", ["pq"]],
+  relative: ["relative radiance (no 1/λ²)", ["flss", "nmm", "pq"]],
+  d65_twice: ["D65 twice", ["flss", "nmm", "pq"]],
+  cie_rgb_matrix: ["CIE RGB shown as sRGB", ["flss", "nmm", "pq"]],
+  power_gamma: ["gamma 2.2", ["flss", "nmm", "pq", "gem"]],
+  constant_blend: ["constant blend with the pigment", ["flss", "nmm", "pq", "gem"]],
+  infrared_rainbow: ["rainbow of 0.5 to 1 µm", ["gem"]],
+};
+const allQuirks = (on) => Object.fromEntries(Object.keys(QUIRKS).map((name) => [name, on]));
+
+const RGB_TO_XYZ = [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]];
+const CIE_RGB = [[0.41847, -0.15866, -0.082835], [-0.091169, 0.25243, 0.015708], [0.0009209, -0.0025498, 0.1786]];
+const columns = (matrix) => [0, 1, 2].flatMap((i) => matrix.map((row) => row[i]));
+
+// X, Y, Z of the light by the trapezoidal rule at 5 nm from 380 to 780.
+function whiteOfShader() {
+  const white = [0, 0, 0];
+  for (let nm = 380; nm <= 780; nm += 5) {
+    const weight = (nm === 380 || nm === 780 ? 2.5 : 5) * matching[4 * (nm - 360) + 3];
+    for (let k = 0; k < 3; k++) white[k] += weight * matching[4 * (nm - 360) + k];
+  }
+  return white;
+}
+
+// Discrete Fourier transform of complex numbers, e^(-2 pi i m x/N), for any N (Cooley and Tukey 1965).
+function fourier(re, im) {
+  const count = re.length;
+  if (count === 1) return [re, im];
+  let factor = 2;
+  while (count % factor && factor * factor <= count) factor += 1;
+  if (count % factor) factor = count;
+  const rest = count / factor;
+  const parts = [];
+  for (let r = 0; r < factor; r++) {
+    const take = (from) => Float64Array.from({ length: rest }, (_, i) => from[i * factor + r]);
+    parts.push(rest === 1 ? [take(re), take(im)] : fourier(take(re), take(im)));
+  }
+  const [outRe, outIm] = [new Float64Array(count), new Float64Array(count)];
+  const [cosines, sines] = circle(count);
+  for (let m = 0; m < count; m++) {
+    let [a, b] = [0, 0];
+    for (let r = 0; r < factor; r++) {
+      const k = (m * r) % count;
+      const [x, y] = [parts[r][0][m % rest], parts[r][1][m % rest]];
+      a += cosines[k] * x + sines[k] * y;
+      b += cosines[k] * y - sines[k] * x;
+    }
+    outRe[m] = a;
+    outIm[m] = b;
+  }
+  return [outRe, outIm];
+}
+
+const circles = new Map();
+function circle(count) {
+  if (!circles.has(count)) {
+    const of = (f) => Float64Array.from({ length: count }, (_, k) => f((2 * Math.PI * k) / count));
+    circles.set(count, [of(Math.cos), of(Math.sin)]);
+  }
+  return circles.get(count);
+}
+
+class Shader2014 {
+  constructor(gl, heights, values, model) {
+    Object.assign(this, { gl, heights, model });
+    [this.rows, this.columns] = heights.shape;
+    this.tile = [this.columns * heights.pixel_size[0], this.rows * heights.pixel_size[1]];
+    this.values = Float64Array.from(values, (v) => (v / 65535) * heights.range);  // from the lowest point
+    // Of the orders that light reaches, and those around them.
+    this.order = [this.columns, this.rows].map((n, k) => Math.min(Math.floor(n / 2), Math.ceil((2 * this.tile[k]) / 0.38) + 2));
+    this.textures = new Map();
+    this.spacing = NaN;
+  }
+
+  get bytes() {
+    return 8 * MAX_TERMS * (2 * this.order[0] + 1) * (2 * this.order[1] + 1);
+  }
+
+  // Makes the textures of t^n, t = h/H, with heights from the lowest point or from the middle.
+  async prepare(fromLowest, progress) {
+    if (this.textures.has(fromLowest)) return;
+    const { gl, rows, columns, order } = this;
+    const range = this.heights.range;
+    const height = fromLowest ? range : range / 2;
+    const t = this.values.map((v) => (range === 0 ? 0 : (fromLowest ? v : v - range / 2) / height));
+    const [width, depth] = order.map((m) => 2 * m + 1);
+    const made = texture(gl, gl.TEXTURE_2D_ARRAY);
+    gl.texStorage3D(gl.TEXTURE_2D_ARRAY, 1, gl.RG32F, width, depth, MAX_TERMS);
+    const powers = new Float64Array(t.length).fill(1);
+    const none = new Float64Array(columns);
+    for (let n = 0; n < MAX_TERMS; n++) {
+      const lines = Array.from({ length: rows }, (_, j) => fourier(powers.subarray(j * columns, (j + 1) * columns), none));
+      const layer = new Float32Array(2 * width * depth);
+      for (let i = 0; i < width; i++) {
+        const m = i - order[0];
+        // The Nyquist order of an even number of pixels is negative.
+        if (2 * m === columns) continue;
+        const at = ((m % columns) + columns) % columns;
+        const [re, im] = fourier(Float64Array.from(lines, (line) => line[0][at]), Float64Array.from(lines, (line) => line[1][at]));
+        for (let j = 0; j < depth; j++) {
+          const l = j - order[1];
+          if (2 * l === rows && rows > 1) continue;
+          const from = ((l % rows) + rows) % rows;
+          layer[2 * (j * width + i)] = re[from] / (rows * columns);
+          layer[2 * (j * width + i) + 1] = im[from] / (rows * columns);
+        }
+      }
+      if (n === 1) this.spacing = this.strongestPeriod(layer, width, depth);
+      gl.bindTexture(gl.TEXTURE_2D_ARRAY, made.texture);
+      gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, 0, n, width, depth, 1, gl.RG, gl.FLOAT, layer);
+      for (let i = 0; i < t.length; i++) powers[i] *= t[i];
+      if (t.length > 20000) {
+        progress(n / MAX_TERMS);
+        await new Promise((done) => setTimeout(done));
+      }
+    }
+    progress(1);
+    this.textures.set(fromLowest, { texels: made, height });
+  }
+
+  strongestPeriod(layer, width, depth) {
+    const [M] = this.order;
+    let [best, strongest] = [0, 0];
+    for (let m = 1; m <= M; m++) {
+      let power = 0;
+      for (let j = 0; j < depth; j++) {
+        const k = 2 * (j * width + M + m);
+        power += layer[k] ** 2 + layer[k + 1] ** 2;
+      }
+      if (power > strongest * (1 + 1e-6)) [best, strongest] = [m, power];
+    }
+    return this.tile[0] / (best || 1);
+  }
+
+  uniforms(state) {
+    const { quirks } = state;
+    const { texels, height } = this.textures.get(quirks.heights_from_zero);
+    const sigma = Math.SQRT2 * lobeWidth(state.coherenceLength);
+    const white = whiteOfShader();
+    const matrix = quirks.cie_rgb_matrix ? CIE_RGB : XYZ_TO_RGB;
+    const scale = quirks.d65_twice ? white.map((w) => w / white[1]) : [1, 1, 1];
+    const radius = (size) => (state.window === "texel" ? 1 : Math.min(Math.max(Math.ceil(4 * sigma * size), 1), 16));
+    return {
+      ...this.model.uniforms(state),
+      uTexels: texels,
+      uTexelOrder: this.order,
+      uPixels: [this.columns, this.rows],
+      uTile: this.tile,
+      uHeight: height,
+      uTerms: state.terms,
+      uWindowSigma: sigma,
+      uRadius: this.tile.map(radius),
+      uTiles: this.tile.map((size) => Math.max(1, Math.round(state.coherenceLength / size))),
+      uSpacing: this.spacing,
+      uToRGB: columns(matrix.map((row) => row.map((value, k) => value * scale[k]))),
+      uFromRGB: columns(RGB_TO_XYZ),
+      uFresnelSquared: Number(quirks.fresnel_squared),
+      uFixedIndex: Number(quirks.fixed_index),
+      uWindowPi: Number(quirks.window_pi),
+      uComplexSum: Number(quirks.complex_window_sum),
+      uFloor: Number(quirks.floor_anchor),
+      uNoJacobian: Number(quirks.no_jacobian),
+      uWrongProduct: Number(quirks.wrong_product),
+      uRelative: Number(quirks.relative),
+      uConstantBlend: Number(quirks.constant_blend),
+      uInfrared: Number(quirks.infrared_rainbow),
+    };
+  }
+}
