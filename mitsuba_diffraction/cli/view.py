@@ -13,7 +13,7 @@ from ..files import whole_file
 from ..outputs import check_outputs
 from ..progress import progress_bar, tell
 from ..surface.gratings import PROFILES
-from ..viewer.page import page
+from ..viewer.page import page, reference_picture
 from ..viewer.surface import Surface
 from .arguments import (
     Channel,
@@ -48,6 +48,9 @@ def view(
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="the page (.html); in the current folder by default")
     ] = None,
+    reference: Annotated[
+        Path | None, typer.Option(help="a spectral picture (.exr) of `render`, for comparison in the page")
+    ] = None,
     open_page: Annotated[bool, typer.Option("--open/--no-open", help="open the page in the browser")] = True,
     pixel_size: PixelSize = None,
     height_range: HeightRange = None,
@@ -70,13 +73,14 @@ def view(
     if is_scan or of_scan or settings:
         # A scan is rarely cut to a whole number of periods.
         recipe = recipe_of(path, of_scan, {"extent": "sample", **settings} if is_scan else settings)
-    reads = [path] if path.exists() else []
+    reads = [file for file in (path, reference) if file is not None and file.exists()]
     check_outputs([*reads, *(recipe.files if recipe else [])], [("-o", target)], overwrite=overwrite)
+    picture = None if reference is None else reference_picture(reference)
     if recipe is None:
         surface = Surface.named(name, parameters, progress)
     else:
         surface = Surface.of_recipe(recipe, path.stem, {"filename": str(path.resolve())}, parameters, progress)
-    text = page(surface)
+    text = page(surface, picture)
     with whole_file(target) as temporary:
         temporary.write_text(text, encoding="utf-8")
     tell(f"{target}: {surface.spectrum.source}, {len(text.encode()) / 1e6:.2g} MB")

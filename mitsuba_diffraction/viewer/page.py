@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import json
+import os
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -63,6 +64,17 @@ def page(surface: Surface, picture: NDArray[np.float16] | None = None) -> str:
             "tolerance or a shorter coherence length makes its table smaller"
         )
     return text
+
+
+def reference_picture(path: str | os.PathLike[str]) -> NDArray[np.float16]:
+    """Return a spectral picture as linear sRGB in half precision, (height, width, 3), the lowest row first."""
+    from ..color import spectrum_to_linear_sRGB
+    from ..render.spectral_image import SpectralImage
+
+    image = SpectralImage.load(path)
+    rgb = spectrum_to_linear_sRGB(image.radiance, image.wavelengths)[::-1]
+    largest = np.finfo(np.float16).max
+    return np.clip(rgb, -largest, largest).astype(np.float16)
 
 
 def _json(content: object) -> str:

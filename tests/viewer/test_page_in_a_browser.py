@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from mitsuba_diffraction import testing
+from mitsuba_diffraction.color import delta_E, spectrum_to_XYZ
 from mitsuba_diffraction.evaluation.realtime_shader.evaluate import shader_for
 from mitsuba_diffraction.evaluation.realtime_shader.quirks import Quirks
+from mitsuba_diffraction.render import render
 from mitsuba_diffraction.viewer import page as pages
 from mitsuba_diffraction.viewer.surface import Surface
 
@@ -33,13 +35,13 @@ def browser():
 
 @pytest.fixture
 def opened(browser, tmp_path):
-    """opened(surface): its page, ready; the messages and requests of the page are collected in `messages`."""
+    """opened(surface, picture): its page, ready; the messages and requests of the page are collected in `messages`."""
     tabs = []
 
-    def of(surface, **size):
+    def of(surface, picture=None):
         path = tmp_path / f"{len(tabs)}.html"
-        path.write_text(pages.page(surface), encoding="utf-8")
-        tab = browser.new_page(viewport={"width": 420, "height": 400, **size})
+        path.write_text(pages.page(surface, picture), encoding="utf-8")
+        tab = browser.new_page(viewport={"width": 420, "height": 400})
         tab.messages = []
         tab.on("console", lambda message: tab.messages.append(message.text))
         tab.on("pageerror", lambda error: tab.messages.append(str(error)))
@@ -143,6 +145,71 @@ def test_a_drag_changes_the_picture_and_nothing_leaves_the_page(opened):
         pictures.append(tab.screenshot())
     tab.keyboard.up("Shift")
     assert len(set(pictures)) == 3
+    assert tab.messages == [tab.url[:80]]
+
+
+def test_a_pixel_has_the_orders_of_the_grating_equation(opened):
+    tab = opened(Surface.named("blazed", {"period": 2.5, "depth": 0.25, "material": "none"}))
+    # The light is 24 degrees from the axis of the camera, in the plane across the grooves.
+    tab.evaluate(
+        "viewer.set({ maxFrames: 1, shape: 'plate', azimuth: -90, elevation: 89, lightAzimuth: 0, lightElevation: 66, "
+        "lightWidth: 0, lightLength: 0, sky: 0 })"
+    )
+    # Orders are seen by eyes whose q_y is nearly zero; a column of the picture has some.
+    picked = tab.evaluate(
+        "(() => { const { width, height } = document.getElementById('canvas');"
+        " for (let y = 0; y < height; y += 2) { const found = viewer.picker.pick(0.55 * width, y);"
+        " if (found && found.orders.length) return found; } })()"
+    )
+    u = -(picked["wi"][0] + picked["wo"][0])
+    orders = {tuple(found["order"]): found["nanometres"] for found in picked["orders"]}
+    wanted = {(m, 0): 1e3 * u * 2.5 / m for m in range(-14, 15) if m and 380 <= 1e3 * u * 2.5 / m <= 740}
+    assert orders.keys() == wanted.keys()
+    for order, wavelength in wanted.items():
+        assert orders[order] == pytest.approx(wavelength, rel=1e-2)
+    peak = max(picked["values"], key=lambda pair: pair[1])[0]
+    assert min(abs(peak - wavelength) for wavelength in orders.values()) <= 4
+    assert "Orders, by the grating equation" in tab.locator("#picked-text").inner_text()
+
+
+@pytest.mark.slow
+def test_the_copied_scene_renders_the_same_picture(opened, tmp_path, llvm):
+    """A sphere under parallel light: the mean of CIEDE2000 over its pixels, at the exposure of the page."""
+    surface = Surface.named(RECIPES / "elaphe_afm.toml", {})
+    tab = opened(surface)
+    size = {"width": 64, "height": 64}
+    tab.evaluate(
+        "(size) => { const canvas = document.getElementById('canvas');"
+        " Object.assign(canvas.style, { width: `${size.width}px`, height: `${size.height}px`, inset: 'auto' });"
+        " viewer.set({ maxFrames: 32, lightWidth: 0, lightLength: 0, sky: 0 }); }",
+        size,
+    )
+    tab.wait_for_timeout(500)
+    while tab.evaluate("viewer.renderer.width !== 64 || viewer.renderer.model.frame < 32"):
+        tab.wait_for_timeout(200)
+    scene = tab.evaluate("viewer.command()").partition("<<'END'\n")[2].partition("END")[0]
+    (tmp_path / "view.xml").write_text(scene)
+    image = render(tmp_path / "view.xml", spp=256)
+    wanted = spectrum_to_XYZ(image.radiance, image.wavelengths)
+    found = np.array(tab.evaluate("Array.from(viewer.renderer.readMean().values)")).reshape(64, 64, 4)[::-1]
+    inside = found[..., 3] == 1
+    exposure = tab.evaluate("viewer.renderer.normal")
+    difference = delta_E(*(np.clip(exposure * XYZ[inside], 0, 1) for XYZ in (found[..., :3], wanted)))
+    assert inside.sum() > 800
+    assert difference.mean() <= 1
+    assert delta_E(np.zeros(3), np.clip(exposure * wanted[inside], 0, 1)).mean() > 3
+
+
+def test_a_reference_picture_is_compared(opened):
+    surface = Surface.named("blazed", {"depth": 0.1, "samples": 64, "coherence_length": 3.0})
+    grey = np.full((40, 40, 3), 0.5, np.float16)
+    tab = opened(surface, grey)
+    tab.evaluate("viewer.set({ maxFrames: 1, right: 'picture', exposure: 0 })")
+    tab.wait_for_timeout(300)
+    shown = tab.locator("#right-name").inner_text()
+    tab.evaluate("viewer.set({ difference: true })")
+    assert shown == "reference"
+    assert tab.locator("#legend").is_visible()
     assert tab.messages == [tab.url[:80]]
 
 

@@ -121,9 +121,8 @@ async function start() {
 
   function expose(side, name) {
     if (exposed[name] || side.row > 0 || !EXPOSED_FRAMES.includes(side.frame)) return;
-    const found = renderer.autoExposure(side);
-    if (name === "model") renderer.normal = found;
-    else renderer.otherNormal = found;
+    if (name === "model") renderer.normal = renderer.exposureOf(state);
+    else renderer.otherNormal = renderer.autoExposure(side);
     // What was drawn for the exposure alone is drawn again in the columns of the side.
     exposed[name] = name === "shader" || side.frame === EXPOSED_FRAMES.at(-1);
   }
@@ -177,7 +176,7 @@ async function start() {
 
 function show(renderer, state) {
   const of = (side) => (Number.isNaN(side.milliseconds) ? "…" : `${side.milliseconds.toPrecision(3)} ms`);
-  const texts = [`This model: ${of(renderer.model)} a frame; ${renderer.model.frame} of ${state.maxFrames} frames averaged.`];
+  const texts = [`This model: ${of(renderer.model)} a frame; ${renderer.model.frame} of ${state.maxFrames} frames.`];
   if (renderer.shader) texts.push(`Shader of 2014: ${of(renderer.shader)} a frame; ${renderer.shader.frame} averaged.`);
   $("times").textContent = texts.join(" ");
 }

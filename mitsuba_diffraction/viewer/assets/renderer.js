@@ -232,6 +232,11 @@ class Renderer {
     return 1 / at(peaks.filter((peak) => peak > floor), 0.97);
   }
 
+  // The same for the model; where the light is not seen, its sky stays dim.
+  exposureOf(state) {
+    return Math.min(this.autoExposure(), state.sky > 0 ? (0.15 * Math.PI) / state.sky : Infinity);
+  }
+
   // f cos theta_o of pairs, (n, 7): omega_i, omega_o along the pattern's axes, lambda in nm.
   evaluatePairs(state, pairs) {
     this.pairs ??= new Program(this.gl, SHADERS.quad_vertex, SHADERS.model, SHADERS.pairs);
