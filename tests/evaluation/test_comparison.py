@@ -335,6 +335,24 @@ def test_a_coat_is_noted(llvm, folder):
     assert not Pictures("bare.xml", width=4).has_coat
 
 
+def test_several_shaders_are_compared_with_their_options(llvm, folder):
+    write(Path("scene.xml"))
+    found = compare(
+        "scene.xml", "gem", others=("flss",), terms=6, window="texel", width=4, spp=2, shading_points=2, shares=False
+    )
+    assert [*found.pictures] == [
+        *("path_traced", "same_light", "published", "corrected", "flss_published", "flss_corrected"),
+    ]
+    assert found.shader_reads == {
+        "published": 0, "corrected": 0, "flss_published": 81 * 6 * 9, "flss_corrected": 81 * 6 * 9
+    }  # fmt: skip
+    assert {*found.to_path_traced} == {*found.pictures} - {"path_traced"}
+    assert found.noise["flss_corrected"] > 0
+    assert {*summary.titles(found).values()} >= {"GEM as published", "FLSS corrected"}
+    summary.save_figure(found, "figure.png", dpi=40)
+    assert summary.as_dict(found)["settings"] == {"terms": 6, "window": "texel"}
+
+
 @pytest.mark.slow
 def test_the_same_seed_gives_the_same_numbers(llvm, folder):
     write(Path("scene.xml"), rfilter="gaussian")
@@ -358,6 +376,8 @@ def test_the_same_seed_gives_the_same_numbers(llvm, folder):
     [
         ("gone.xml", {}, "gone.xml"),
         ("scene.xml --shader flsss", {}, "shader: got 'flsss', wanted one of flss, nmm, pq, nmm_pq, gem"),
+        ("scene.xml --interpolation linear", {}, "interpolation: got 'linear', which flss cannot use"),
+        ("scene.xml --window wide", {}, "window: got 'wide', wanted one of texel, 4sigma"),
         ("scene.xml -o nowhere/out", {}, "the folder nowhere is not there"),
         ("scene.xml --json nowhere/out.json", {}, "the folder nowhere is not there"),
         ("scene.xml --spp 0", {}, "--spp"),

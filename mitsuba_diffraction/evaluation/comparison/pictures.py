@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ...color import spectrum_to_XYZ
 from ...errors import RequestError
-from ...progress import Progress, silent
+from ...progress import Progress, part, silent
 from ...render import SpectralImage
 from ...render.film import check_memory, collect, equal_ranges, pass_seed, rotated, trace_pass
 from ...render.passes import Accumulation, ratio, split
@@ -99,7 +99,7 @@ class Picture:
         samples: per pixel.
         seconds: of rendering, without loading the scene and compiling kernels.
         halves: XYZ (2, height, width, 3) of two independent pictures with half of the samples each; None for a
-            picture with negligible noise.
+            picture with an odd number of samples.
         xyz: (height, width, 3), CIE XYZ as `color` scales it.
     """
 
@@ -252,9 +252,17 @@ class Pictures:
         if known not in self._others:
             self._others[known] = self._traced(without_gratings(self._shader), others, silent, halves=False)
         rest = self._others[known]
-        rgb, seconds = self._colours(samples, progress)
-        radiance = rest.image.radiance + rgb @ _channel_spectra().T
-        return Picture(SpectralImage(rest.image.wavelengths, radiance), samples, seconds + rest.seconds)
+        # Two independent halves tell the noise.
+        counts = (samples,) if samples % 2 else (samples // 2, samples // 2)
+        parts = [
+            self._colours(count, index, part(progress, index / len(counts), (index + 1) / len(counts)))
+            for index, count in enumerate(counts)
+        ]
+        radiance = [rest.image.radiance + rgb @ _channel_spectra().T for rgb, _ in parts]
+        wavelengths = rest.image.wavelengths
+        halves = np.array([spectrum_to_XYZ(half, wavelengths) for half in radiance]) if len(parts) > 1 else None
+        seconds = rest.seconds + sum(seconds for _, seconds in parts)
+        return Picture(SpectralImage(wavelengths, np.mean(radiance, axis=0)), samples, seconds, halves)
 
     def _traced(self, integrator: mi.Integrator, samples: int, progress: Progress, halves: bool = True) -> Picture:
         rows, columns = self.surface.shape
@@ -275,17 +283,17 @@ class Pictures:
         in_halves = ratio(pair[..., :3], pair[..., 3:]) if halves and len(passes) > 1 else None
         return Picture(image, sums.samples, seconds, in_halves)
 
-    def _colours(self, samples: int, progress: Progress) -> tuple[NDArray[np.float64], float]:
-        """Return linear sRGB of the gratings, (height, width, 3), and seconds."""
+    def _colours(self, samples: int, half: int, progress: Progress) -> tuple[NDArray[np.float64], float]:
+        """Return linear sRGB of the gratings, (height, width, 3), and seconds; `half` selects the random numbers."""
         rows, columns = self.surface.shape
         per_dispatch = max(1, _MAX_POINTS_PER_DISPATCH // samples)
         firsts = range(0, rows * columns, per_dispatch)
         # Compiles the kernels. With two pixels, as Dr.Jit compiles other kernels for a single sample.
-        self._averaged([self._shade(0, 2, samples)] * -(-rows * columns // 2))
+        self._averaged([self._shade(0, 2, samples, half)] * -(-rows * columns // 2))
         begin = time.perf_counter()
         points = []
         for index, first in enumerate(firsts):
-            points.append(self._shade(first, min(per_dispatch, rows * columns - first), samples))
+            points.append(self._shade(first, min(per_dispatch, rows * columns - first), samples, half))
             progress(index + 1, len(firsts))
         return self._averaged(points), time.perf_counter() - begin
 
@@ -300,14 +308,14 @@ class Pictures:
         values = np.array(sums, np.float64).reshape(rows, columns, 4)
         return ratio(values[..., :3], values[..., 3:])
 
-    def _shade(self, first: int, count: int, samples: int) -> NDArray[np.float32]:
+    def _shade(self, first: int, count: int, samples: int, half: int) -> NDArray[np.float32]:
         """Shade points of `count` pixels, from `first` on: (5, n), position in the picture and linear sRGB."""
         sensor = self.scene.sensors()[0]
         columns, rows = (int(size) for size in sensor.film().crop_size())
         sampler = mi.load_dict({"type": "multijitter", "sample_count": samples})
         samples = sampler.sample_count()  # rounded up to a product of two similar numbers
         sampler.set_samples_per_wavefront(samples)
-        seed = pass_seed(self.seed, first)
+        seed = pass_seed(self.seed, 2 * first + half)
         sampler.seed(seed, count * samples)
         pixel = dr.opaque(mi.UInt32, first) + dr.arange(mi.UInt32, count * samples) // samples
         sampler = rotated(sampler, seed, pixel)

@@ -89,8 +89,10 @@ def notes(comparison: Comparison) -> list[str]:
     ]
     noise = comparison.noise["path_traced"], comparison.noise["same_light"]
     if None not in noise:
+        of_shader = comparison.noise["corrected"]
         lines.append(
             f"noise: a mean ΔE00 of {noise[0]:.2f} in the path-traced picture, {noise[1]:.2f} in the same light's"
+            + ("" if of_shader is None else f", {of_shader:.2f} in the corrected shader's")
         )
     if comparison.coated:
         lines.append("coat: the shader shows coated gratings without their coat; it does not converge to this model")
