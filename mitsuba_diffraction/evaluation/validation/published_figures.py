@@ -21,6 +21,7 @@ from .published_maps import (
     METHODS,
     PUBLISHED,
     PUBLISHED_MAPS,
+    TRUNCATED,
     Agreement,
     Grid,
     agreement,
@@ -39,6 +40,7 @@ Array = NDArray[np.float64]
 FILES = ("published_maps.png", "published_maps.md", "published_heights.png")
 COLUMNS = ("map", "method", *(f"correlation, {encoding}" for encoding in ENCODINGS))
 _TITLES = {PUBLISHED: "FLSS as published", CORRECTED: "FLSS corrected", MODEL: "this model"}
+_SERIES = {PUBLISHED: "series converged", TRUNCATED: "37 terms from the lowest point"}
 _HEIGHTS = np.arange(0.30, 0.92, 0.05)  # µm
 
 
@@ -101,7 +103,7 @@ def plot_heights(curves: Mapping[str, Mapping[str, Array]]) -> Figure:
     for panel, (name, of_methods) in zip(axes, curves.items(), strict=True):
         published = PUBLISHED_MAPS[name]
         for method, values in of_methods.items():
-            panel.plot(_HEIGHTS, values, marker="o", markersize=4, label=_TITLES[method])
+            panel.plot(_HEIGHTS, values, marker="o", markersize=4, label=_SERIES[method])
         label = f"{published.height:.4f} µm"
         panel.axvline(published.height, color="0.4", linestyle="--", linewidth=1, label=label)
         panel.set_title(published.name, fontsize=11)
@@ -139,7 +141,7 @@ def save_published(
     for name in skins:
         curves[name] = {
             method: correlation_against_height(PUBLISHED_MAPS[name], method, _HEIGHTS)
-            for method in (PUBLISHED, CORRECTED)
+            for method in (PUBLISHED, TRUNCATED)
         }
         progress(len(rows) + len(curves), total)
     for name, drawn in (("published_maps.png", plot_maps(rows)), ("published_heights.png", plot_heights(curves))):

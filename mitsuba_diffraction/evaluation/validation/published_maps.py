@@ -2,6 +2,9 @@
 
 Each is a picture of the outgoing hemisphere, light along the normal: (x, y) = (sin θ_o cos φ_o, sin θ_o sin φ_o). They
 were made by FLSS from an AFM scan of 65 µm, which is available, so that the emulation can be compared pixel by pixel.
+
+The series of FLSS is summed about the centre of the heights until it has converged: the map of Xenopeltis agrees with
+its height of 0.8187 µm, for which the 37 terms from the lowest point of the published shader (`TRUNCATED`) diverge.
 """
 
 from __future__ import annotations
@@ -32,7 +35,7 @@ from .viewing_angle import MODEL, relative_reflectance, wavelengths
 
 Array = NDArray[np.float64]
 
-PUBLISHED, CORRECTED = "flss as published", "flss corrected"
+PUBLISHED, CORRECTED, TRUNCATED = "flss as published", "flss corrected", "flss truncated"
 METHODS = (PUBLISHED, CORRECTED, MODEL)
 
 SIDE, RADIUS = 800, 380
@@ -42,10 +45,13 @@ ENCODINGS = ("sRGB", "gamma 2.5")
 _MIRROR = 0.1  # sin θ_o; the pictures are saturated nearer to the mirror direction
 _LIGHT = (0.0, 0.0, 1.0)
 _COHERENCE_LENGTH = 65.0
+_TERMS = {PUBLISHED: 50, TRUNCATED: 37}
+"""Of the series; the error of 50 about the centre is 1e-7 for 0.9 µm at 380 nm. Corrected, as many as needed."""
 # Relative radiance and the pictures' conversion of colours, so that maps differ by the light alone. Unlike the shader,
 # the pictures are not multiplied by the white point of D65.
 _QUIRKS = {
-    PUBLISHED: replace(Quirks.as_published(), d65_twice=False),
+    PUBLISHED: replace(Quirks.as_published(), d65_twice=False, heights_from_zero=False),
+    TRUNCATED: replace(Quirks.as_published(), d65_twice=False),
     CORRECTED: replace(Quirks.corrected(), relative=True, cie_rgb_matrix=True),
 }
 
@@ -82,10 +88,8 @@ class PublishedMap:
     @functools.cached_property
     def recipe(self) -> Recipe:
         """Heights, as the tile that the thesis takes them for, and the parameters of a spectrum of it."""
-        surface = dict(self.surface)
-        if "scan" in surface:
-            surface["scan"] = str(_measured() / str(surface["scan"]))
-        return Recipe(surface, Settings(coherence_length=_COHERENCE_LENGTH, wavelengths=(380, 780), tolerance=0.01))
+        settings = Settings(coherence_length=_COHERENCE_LENGTH, wavelengths=(380, 780), tolerance=0.01)
+        return Recipe(self.surface, settings, _measured())
 
     @functools.cached_property
     def height_field(self) -> HeightField:
@@ -118,10 +122,10 @@ PUBLISHED_MAPS = {
         ),
     ),
     "elaphe": PublishedMap("Elaphe", "flss_elaphe.png", _scan("elaphe", 0.4347)),
-    "xenopeltis": PublishedMap("Xenopeltis", "flss_xeno.png", _scan("xenopeltis", 0.4435)),
+    "xenopeltis": PublishedMap("Xenopeltis", "flss_xeno.png", _scan("xenopeltis", 0.8187)),
 }
 """Name → published map."""
-_MIN_CORRELATION = {"blaze": 0.98, "elaphe": 0.98, "xenopeltis": 0.92}
+_MIN_CORRELATION = {"blaze": 0.98, "elaphe": 0.98, "xenopeltis": 0.98}
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,7 +185,7 @@ def linear_rgb(published: PublishedMap, method: str, wo: ArrayLike) -> Array:
 
     Args:
         published: the map.
-        method: one of `METHODS`.
+        method: one of `METHODS`, or `TRUNCATED`.
         wo: ω_o, (n, 3).
 
     Returns:
@@ -190,19 +194,20 @@ def linear_rgb(published: PublishedMap, method: str, wo: ArrayLike) -> Array:
     Raises:
         ValueError: if the method is unknown, or Mitsuba has no vectorised spectral variant set.
     """
-    if method not in METHODS:
-        raise RequestError(f"method: got {method!r}, wanted one of {', '.join(METHODS)}")
+    if method != MODEL and method not in _QUIRKS:
+        raise RequestError(f"method: got {method!r}, wanted one of {', '.join((*_QUIRKS, MODEL))}")
     if method == MODEL:
         xyz = relative_reflectance(published.spectrum, _LIGHT, wo, wavelengths()) @ (
             WAVELENGTH_STEP * d65_weights()[:: int(WAVELENGTH_STEP)]
         )
         return xyz @ rgb_matrix(cie_rgb_matrix=True, d65_twice=False).T
-    return shader_rgb(published.height_field, wo, [1.0], _QUIRKS[method])[0]
+    return shader_rgb(published.height_field, method, wo, [1.0])[0]
 
 
-def shader_rgb(height_field: HeightField, wo: ArrayLike, height_scales: ArrayLike, quirks: Quirks) -> Array:
-    """Evaluate FLSS for light along the normal, with the heights scaled by each of (m,) factors: (m, n, 3)."""
-    shader = shader_for(height_field, "flss", quirks, coherence_length=_COHERENCE_LENGTH)
+def shader_rgb(height_field: HeightField, method: str, wo: ArrayLike, height_scales: ArrayLike) -> Array:
+    """Evaluate FLSS, with the heights scaled by each of (m,) factors: (m, n, 3); other arguments as `linear_rgb`."""
+    terms = {"terms": _TERMS[method]} if method in _TERMS else {}
+    shader = shader_for(height_field, "flss", _QUIRKS[method], coherence_length=_COHERENCE_LENGTH, **terms)
     wo = np.asarray(wo, np.float32)
     wi = vectors(np.broadcast_to(np.float32(_LIGHT), wo.shape))
     weights = shader.weights()
@@ -263,7 +268,7 @@ def correlation_against_height(published: PublishedMap, method: str, heights: Ar
 
     Args:
         published: the map.
-        method: `PUBLISHED` or `CORRECTED`.
+        method: `PUBLISHED` or `TRUNCATED`.
         heights: (n,) height ranges in µm.
         step: between pixels.
 
@@ -272,7 +277,7 @@ def correlation_against_height(published: PublishedMap, method: str, heights: Ar
     """
     pixels = grid(published, step)
     scales = np.asarray(heights, np.float64) / published.height
-    maps = shader_rgb(published.height_field, pixels.wo, scales, _QUIRKS[method])
+    maps = shader_rgb(published.height_field, method, pixels.wo, scales)
     return np.array([agreement(pixels, linear).correlation for linear in maps])
 
 
