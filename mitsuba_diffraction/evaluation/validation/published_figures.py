@@ -98,20 +98,19 @@ def table(rows: Iterable[Row]) -> list[list[str]]:
 
 def plot_heights(curves: Mapping[str, Mapping[str, Array]]) -> Figure:
     """Plot correlation against height range, a panel for each surface: name → method → (n,) at the heights."""
-    drawn = figure(4.2 * len(curves), 3.2)
+    drawn = figure(4.2 * len(curves), 3.6)
     axes = drawn.subplots(1, len(curves), sharey=True, squeeze=False)[0]
     for panel, (name, of_methods) in zip(axes, curves.items(), strict=True):
         published = PUBLISHED_MAPS[name]
         for method, values in of_methods.items():
             panel.plot(_HEIGHTS, values, marker="o", markersize=4, label=_SERIES[method])
-        label = f"{published.height:.4f} µm"
-        panel.axvline(published.height, color="0.4", linestyle="--", linewidth=1, label=label)
+        panel.axvline(published.height, color="0.4", linestyle="--", linewidth=1, label="height in the maps")
         panel.set_title(published.name, fontsize=11)
         panel.set_xlabel("height, black to white / µm")
         panel.set_ylim(0, 1.02)
         panel.grid(alpha=0.3)
-        panel.legend(fontsize=9, loc="lower left")
     axes[0].set_ylabel("correlation with the published map")
+    drawn.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
     return drawn
 
 
