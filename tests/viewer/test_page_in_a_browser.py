@@ -115,8 +115,8 @@ def test_colours_are_those_of_the_shader_of_2014(source, published, opened, llvm
     field, light = surface.recipe.height_field(), pages._light()[20:421, 3]
     for variant in ("flss", "nmm", "pq", "gem"):
         # Fewer terms, whose differences in the order of summation do not grow.
-        length = {} if variant == "gem" else {"coherence_length": surface.spectrum.coherence_length, "terms": 25}
-        shader = shader_for(field, variant, quirks, **length)
+        settings = {"corrected_coherence_length": surface.spectrum.coherence_length, "exact_fresnel": True, "terms": 25}
+        shader = shader_for(field, variant, quirks, **({} if variant == "gem" else settings))
         wi, wo = testing.vectors(pairs[:, :3]), testing.vectors(pairs[:, 3:6])
         wanted = testing.array(shader.rgb(wi, wo, shader.weights(light=light)), np.float64).T
         tab.evaluate(f"viewer.set({{ right: '{variant}', terms: 25, quirks: {str(vars(quirks)).lower()} }})")

@@ -1,7 +1,7 @@
 // The panel, the mouse, touch and the keyboard.
 
 const $ = (id) => document.getElementById(id);
-const CHOICES = ["shape", "material", "pigment", "right", "window"];
+const CHOICES = ["shape", "material", "pigment", "right"];
 const SWITCHES = ["hasBase", "difference"];
 
 const NUMBERS = {
@@ -25,7 +25,10 @@ class Controls {
     for (const name of CHOICES) $(name).addEventListener("input", () => this.set({ [name]: $(name).value }));
     for (const name of SWITCHES) $(name).addEventListener("input", () => this.set({ [name]: $(name).checked }));
     for (const [name, on] of [["published", true], ["corrected", false]]) {
-      $(name).addEventListener("click", () => this.set({ quirks: allQuirks(on) }));
+      $(name).addEventListener("click", () => {
+        const terms = on ? PUBLISHED_TERMS[this.state.right] : this.state.terms;
+        this.set({ quirks: allQuirks(on), terms });
+      });
     }
     for (const [name, [text]] of Object.entries(QUIRKS)) {
       const box = Object.assign(document.createElement("input"), { type: "checkbox", id: `quirk-${name}` });
@@ -69,7 +72,6 @@ class Controls {
     $("difference").disabled = !compares;
     $("of-shader").hidden = !isShader;
     $("terms").disabled = state.right === "gem";
-    $("window").disabled = !["flss", "nmm"].includes(state.right);
     for (const [name, [, variants]] of Object.entries(QUIRKS)) {
       $(`quirk-${name}`).checked = state.quirks[name];
       $(`quirk-${name}`).parentElement.hidden = !variants.includes(state.right);

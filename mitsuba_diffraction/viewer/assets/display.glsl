@@ -97,7 +97,7 @@ void main() {
   ivec2 at = ivec2(gl_FragCoord.xy * uOtherScale.xy + uOtherScale.zw);
   if (all(greaterThanEqual(at, ivec2(0))) && all(lessThan(at, textureSize(uOther, 0)))) found = texelFetch(uOther, at, 0);
   vec3 theirs = uPowerGamma && !uOtherIsPicture
-    ? pow(clamp(uOtherExposure * max(ofMean(found), 0.0), 0.0, 1.0), vec3(1.0 / 2.2))
+    ? pow(clamp(uOtherExposure * max(ofMean(found), 0.0), 0.0, 1.0), vec3(1.0 / 2.5))
     : encode(shown(uOtherIsPicture ? found.rgb : ofMean(found), uOtherExposure));
   float cover = uOtherIsPicture ? 1.0 : found.a;
   vec3 colour = mix(uBackground, encode(ours), mean.a);

@@ -20,7 +20,7 @@ function initialState(data) {
     hasBase: false, pigment: "#40301c",
     wavelengths: 48,
     right: "none", divider: 0.5, difference: false,
-    quirks: allQuirks(true), terms: 37, window: "texel",
+    quirks: allQuirks(true), terms: 37,
     drag: "light",
     maxFrames: MAX_FRAMES,
   };

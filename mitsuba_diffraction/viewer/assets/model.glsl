@@ -139,11 +139,15 @@ float scatter(vec3 wi, vec3 wo, float lambda) {
   return uKind == LINES ? result : result * continuumFactor(wi, wo, tangent, perWidth);
 }
 
-float dielectric(float cosine) {
-  float inside = sqrt(max(1.0 - (1.0 - cosine * cosine) / (uEta * uEta), 0.0));
-  float s = (cosine - uEta * inside) / max(cosine + uEta * inside, 1e-12);
-  float p = (uEta * cosine - inside) / max(uEta * cosine + inside, 1e-12);
+float dielectricOf(float cosine, float eta) {
+  float inside = sqrt(max(1.0 - (1.0 - cosine * cosine) / (eta * eta), 0.0));
+  float s = (cosine - eta * inside) / max(cosine + eta * inside, 1e-12);
+  float p = (eta * cosine - inside) / max(eta * cosine + inside, 1e-12);
   return 0.5 * (s * s + p * p);
+}
+
+float dielectric(float cosine) {
+  return dielectricOf(cosine, uEta);
 }
 
 float conductor(float cosine, vec2 index) {

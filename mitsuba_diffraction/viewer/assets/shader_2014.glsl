@@ -15,7 +15,7 @@ uniform float uSpacing;                // of GEM, um
 uniform highp sampler2D uMatching;     // x, y, z and the light at each nm from 360
 uniform mat3 uToRGB;                   // from XYZ
 uniform mat3 uFromRGB;                 // linear sRGB to XYZ
-uniform bool uFresnelSquared, uFixedIndex, uWindowPi, uComplexSum, uFloor, uNoJacobian, uWrongProduct, uRelative;
+uniform bool uFresnelSquared, uSchlick, uFixedIndex, uWindowPi, uComplexSum, uFloor, uNoJacobian, uWrongProduct, uRelative;
 uniform bool uConstantBlend, uInfrared;
 
 const float FIRST = 380.0, LAST = 780.0, STEP = 5.0;  // nm
@@ -27,7 +27,7 @@ vec4 lightAt(int n);
 
 struct Pair {
   vec3 uvw;
-  float falloff;
+  float cosHalf;
   float factor;
   float slope;
 };
@@ -44,8 +44,14 @@ vec4 weightsAt(float nanometres, float peak) {
   return vec4(xyz, r);
 }
 
-float fresnelRatio(float r, float falloff) {
-  float ratio = (r + (1.0 - r) * falloff) / r;
+float fresnelRatio(float r, float cosHalf) {
+  float ratio;
+  if (uSchlick || uMaterial != 0) {
+    float x = 1.0 - cosHalf;
+    ratio = (r + (1.0 - r) * x * x * x * x * x) / r;
+  } else {
+    ratio = dielectricOf(cosHalf, (1.0 + sqrt(r)) / (1.0 - sqrt(r))) / r;
+  }
   return uFresnelSquared ? ratio * ratio : ratio;
 }
 
@@ -162,7 +168,7 @@ vec3 overWavelengths(Pair pair, float peak) {
   for (int j = 0; j < COUNT; j++) {
     float nanometres = FIRST + STEP * float(j);
     vec4 weights = weightsAt(nanometres, peak);
-    float width = (j == 0 || j == COUNT - 1 ? 0.5 * STEP : STEP) * fresnelRatio(weights.w, pair.falloff);
+    float width = (j == 0 || j == COUNT - 1 ? 0.5 * STEP : STEP) * fresnelRatio(weights.w, pair.cosHalf);
 #if VARIANT == 1
     // Order zero alone.
     float lambda = 1e-3 * nanometres, x = -6.28318531 * pair.uvw.z / lambda * uHeightScale * uHeight;
@@ -196,7 +202,7 @@ vec3 overOrders(Pair pair, float peak) {
       width = 1.77245385 * uWindowSigma * nanometres * nanometres * 1e-3 / pair.slope;
     }
     vec4 weights = weightsAt(nanometres, peak);
-    result += power * width * fresnelRatio(weights.w, pair.falloff) * weights.xyz;
+    result += power * width * fresnelRatio(weights.w, pair.cosHalf) * weights.xyz;
   }
   return result;
 }
@@ -222,9 +228,9 @@ vec3 shaderRGB(vec3 wi, vec3 wo) {
 #else
   Pair pair;
   pair.uvw = -wi - wo;
-  float square = dot(pair.uvw.xy, pair.uvw.xy), cosines = max(wi.z, 1e-7), x = 1.0 - 0.5 * length(pair.uvw);
+  float square = dot(pair.uvw.xy, pair.uvw.xy), cosines = max(wi.z, 1e-7);
   pair.slope = sqrt(square);
-  pair.falloff = x * x * x * x * x;
+  pair.cosHalf = 0.5 * length(pair.uvw);
   pair.factor = kG(vec2(cosines * cosines, wo.z * wo.z), square) * cosines;
 #if VARIANT == 2
   float peak = uTile.x * uTile.y * float(uTiles.x * uTiles.y);

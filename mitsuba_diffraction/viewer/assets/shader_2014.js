@@ -5,9 +5,12 @@ const MAX_TERMS = 45;
 
 const QUIRKS = {
   fresnel_squared: ["Fresnel squared", ["flss", "nmm", "pq"]],
+  schlick: ["Schlick's Fresnel", ["flss", "nmm", "pq"]],
   fixed_index: ["index 1.5 for every material", ["flss", "nmm", "pq"]],
   window_pi: ["window times π", ["flss", "nmm"]],
   complex_window_sum: ["complex sum over the window", ["flss", "nmm"]],
+  one_texel: ["window of one texel", ["flss", "nmm"]],
+  fixed_coherence: ["coherence length of 65 µm", ["flss", "nmm", "pq"]],
   floor_anchor: ["window about floor(q T)", ["flss", "nmm", "pq"]],
   heights_from_zero: ["heights from the lowest point", ["flss", "nmm", "pq"]],
   no_jacobian: ["no dλ/dn", ["nmm"]],
@@ -15,10 +18,11 @@ const QUIRKS = {
   relative: ["relative radiance (no 1/λ²)", ["flss", "nmm", "pq"]],
   d65_twice: ["D65 twice", ["flss", "nmm", "pq"]],
   cie_rgb_matrix: ["CIE RGB shown as sRGB", ["flss", "nmm", "pq"]],
-  power_gamma: ["gamma 2.2", ["flss", "nmm", "pq", "gem"]],
+  power_gamma: ["gamma 2.5", ["flss", "nmm", "pq", "gem"]],
   constant_blend: ["constant blend with the pigment", ["flss", "nmm", "pq", "gem"]],
   infrared_rainbow: ["rainbow of 0.5 to 1 µm", ["gem"]],
 };
+const PUBLISHED_TERMS = { flss: 37, nmm: 31, pq: 39, gem: 37 };
 const allQuirks = (on) => Object.fromEntries(Object.keys(QUIRKS).map((name) => [name, on]));
 
 const RGB_TO_XYZ = [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]];
@@ -80,7 +84,7 @@ class Shader2014 {
     this.tile = [this.columns * heights.pixel_size[0], this.rows * heights.pixel_size[1]];
     this.values = Float64Array.from(values, (v) => (v / 65535) * heights.range);  // from the lowest point
     // Of the orders that light reaches, and those around them.
-    this.order = [this.columns, this.rows].map((n, k) => Math.min(Math.floor(n / 2), Math.ceil((2 * this.tile[k]) / 0.38) + 2));
+    this.order = [this.columns, this.rows].map((n, k) => Math.min(Math.floor(n / 2), Math.ceil((2 * this.tile[k]) / 0.38) + 8));
     this.textures = new Map();
     this.spacing = NaN;
   }
@@ -148,11 +152,12 @@ class Shader2014 {
   uniforms(state) {
     const { quirks } = state;
     const { texels, height } = this.textures.get(quirks.heights_from_zero);
-    const sigma = Math.SQRT2 * lobeWidth(state.coherenceLength);
+    const length = quirks.fixed_coherence ? 65 : state.coherenceLength;
+    const sigma = Math.SQRT2 * lobeWidth(length);
     const white = whiteOfShader();
     const matrix = quirks.cie_rgb_matrix ? CIE_RGB : XYZ_TO_RGB;
     const scale = quirks.d65_twice ? white.map((w) => w / white[1]) : [1, 1, 1];
-    const radius = (size) => (state.window === "texel" ? 1 : Math.min(Math.max(Math.ceil(4 * sigma * size), 1), 16));
+    const radius = (size) => (quirks.one_texel ? 1 : Math.min(Math.max(Math.ceil(2 * sigma * size - 0.5), 1), 16));
     return {
       ...this.model.uniforms(state),
       uTexels: texels,
@@ -163,11 +168,12 @@ class Shader2014 {
       uTerms: state.terms,
       uWindowSigma: sigma,
       uRadius: this.tile.map(radius),
-      uTiles: this.tile.map((size) => Math.max(1, Math.round(state.coherenceLength / size))),
+      uTiles: this.tile.map((size) => Math.max(1, Math.round(length / size))),
       uSpacing: this.spacing,
       uToRGB: columns(matrix.map((row) => row.map((value, k) => value * scale[k]))),
       uFromRGB: columns(RGB_TO_XYZ),
       uFresnelSquared: Number(quirks.fresnel_squared),
+      uSchlick: Number(quirks.schlick),
       uFixedIndex: Number(quirks.fixed_index),
       uWindowPi: Number(quirks.window_pi),
       uComplexSum: Number(quirks.complex_window_sum),

@@ -55,7 +55,7 @@ async function coilOf(gl, coil) {
   const [rows, columns] = shape;
   const points = new Float32Array(values.length);
   const middle = coil.origin.map((o, k) => o + (coil.step[k] * 65535) / 2);
-  const scale = 2.5 / (65535 * Math.max(coil.step[0], coil.step[1]));
+  const scale = 2.2 / (65535 * Math.max(coil.step[0], coil.step[1]));
   for (let i = 0; i < values.length; i++) {
     points[i] = scale * (coil.origin[i % 3] + coil.step[i % 3] * values[i] - middle[i % 3]);
   }
