@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import shlex
 import webbrowser
 from pathlib import Path
 from typing import Annotated
@@ -11,7 +12,7 @@ import typer
 
 from ..files import whole_file
 from ..outputs import check_outputs
-from ..progress import progress_bar, tell
+from ..progress import NAME, progress_bar, tell
 from ..surface.gratings import PROFILES
 from ..viewer.page import page, reference_picture
 from ..viewer.surface import Surface
@@ -79,10 +80,36 @@ def view(
     if recipe is None:
         surface = Surface.named(name, parameters, progress)
     else:
-        surface = Surface.of_recipe(recipe, path.stem, {"filename": str(path.resolve())}, parameters, progress)
+        spectrum = f"{path.stem}.exr"
+        options = _given(context) + (["--extent", "sample"] if is_scan and extent is None else [])
+        command = shlex.join([NAME, "precompute", str(path.resolve()), *options, "-o", spectrum])
+        surface = Surface.of_recipe(recipe, path.stem, {"filename": spectrum}, parameters, progress, command)
     text = page(surface, picture)
     with whole_file(target) as temporary:
         temporary.write_text(text, encoding="utf-8")
     tell(f"{target}: {surface.spectrum.source}, {len(text.encode()) / 1e6:.2g} MB")
     if open_page:
         webbrowser.open(target.resolve().as_uri())
+
+
+def _given(context: typer.Context) -> list[str]:
+    """Return the given options of the scan and its spectrum as words."""
+    words = []
+    for name in (
+        "pixel_size",
+        "height_range",
+        "fill_missing",
+        "channel",
+        "unit",
+        "prepare",
+        "extent",
+        "coherence_length",
+    ):
+        value, option = context.params[name], f"--{name.replace('_', '-')}"
+        if value is True:
+            words.append(option)
+        elif value is not None and value is not False:
+            words += [
+                word for item in (value if isinstance(value, list | tuple) else [value]) for word in (option, str(item))
+            ]
+    return words

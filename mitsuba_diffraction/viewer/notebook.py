@@ -46,10 +46,14 @@ def view(surface: str | os.PathLike[str] | Recipe | GratingSpectrum, height: int
 
 def _surface(surface: object, parameters: Mapping[str, Any]) -> Surface:
     if isinstance(surface, GratingSpectrum):
-        return Surface("surface", surface, None, {}, material_from(parameters))
+        file = {"filename": "surface.exr"}
+        return Surface(
+            "surface", surface, None, file, material_from(parameters), '# in Python: spectrum.save("surface.exr")'
+        )
     if isinstance(surface, Recipe):
         name = str(surface.surface.get("profile") or surface.surface.get("scan"))
-        return Surface.of_recipe(surface, name, {}, parameters)
+        command = '# in Python: recipe.build().save("surface.exr")'
+        return Surface.of_recipe(surface, name, {"filename": "surface.exr"}, parameters, command=command)
     if isinstance(surface, str | os.PathLike):
         return Surface.named(surface, parameters)
     raise RequestError(

@@ -25,6 +25,9 @@ from .surface import Surface
 MAX_BYTES = 5_000_000  # of a page
 MAX_HEIGHTS_SIDE = 512  # pixels of the heights for the shader of 2014
 
+SHORTEST_SHOWN = 380.0  # nm, of the wavelengths that a page shows
+NODES_AT_ONCE = 8  # the most along one axis that contribute at one q, as MAX_LOBES of spectrum.js
+
 METALS = ("Al", "Ag", "Au", "Cr", "Cu", "W")
 """The conductors among which a page chooses, besides that of the surface."""
 
@@ -88,6 +91,7 @@ def _data(surface: Surface, picture: NDArray[np.float16] | None) -> dict[str, An
         "source": surface.spectrum.source,
         "version": metadata.version("mitsuba_diffraction"),
         "grating": dict(surface.grating),
+        "command": surface.command,
         "material": vars(surface.material) | {"max_height_scale": surface.max_height_scale},
         "spectrum": _spectrum(surface),
         "metals": _metals(surface.material.material),
@@ -99,9 +103,13 @@ def _data(surface: Surface, picture: NDArray[np.float16] | None) -> dict[str, An
 
 
 def _spectrum(surface: Surface) -> dict[str, Any]:
-    """Return the grid and the table: (K, rows, columns, terms) in half precision where that is exact."""
+    """Return the grid and the table: (K, terms, rows, columns) in half precision where that is exact."""
     spectrum, grid, table = surface.spectrum, surface.spectrum.grid, surface.spectrum.table
-    values = np.moveaxis(table.values, 1, -1)
+    # Nodes that no visible light reaches are zero, and take no space.
+    pitch = [1 / t for t in grid.tile_size] if isinstance(grid, OrderGrid) else grid.spacing
+    x, y = (np.maximum(np.abs(q) - NODES_AT_ONCE / 2 * d, 0) for q, d in zip(grid.frequencies(), pitch, strict=True))
+    reached = np.hypot(x, y[:, None]) <= 2e3 / SHORTEST_SHOWN
+    values = table.values * reached
     unit = 1.0
     if table.words_per_node < 4:
         unit = 1 / HALF_SCALE

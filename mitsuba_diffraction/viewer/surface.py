@@ -67,6 +67,7 @@ class Surface:
         recipe: of the heights; None for a saved spectrum.
         grating: the surface as parameters of `diffraction_grating`.
         material: its material.
+        command: that makes the file of `grating`, if it is not there yet.
     """
 
     name: str
@@ -74,6 +75,7 @@ class Surface:
     recipe: Recipe | None
     grating: Mapping[str, str | int | float]
     material: Material
+    command: str = ""
 
     def __post_init__(self) -> None:
         spectrum: Spectrum = self.spectrum
@@ -107,6 +109,7 @@ class Surface:
         grating: Mapping[str, Any],
         parameters: Mapping[str, Any],
         progress: Callable[[str], AbstractContextManager[Progress]] = no_progress,
+        command: str = "",
     ) -> Surface:
         """Return the surface of a recipe, whose spectrum is computed unless it is cached.
 
@@ -116,13 +119,14 @@ class Surface:
             grating: it as parameters of `diffraction_grating`.
             parameters: of the material; others are refused.
             progress: of the computation.
+            command: as the attribute.
         """
         material = material_from(parameters)
         if recipe.settings.theory == "rigorous":  # before its table is computed
             raise RequestError(f"{name}: got theory=rigorous, wanted a surface of scalar theory")
         spectrum = recipe.cached(progress)
         assert isinstance(spectrum, GratingSpectrum)
-        return cls(name, spectrum, recipe, grating, material)
+        return cls(name, spectrum, recipe, grating, material, command)
 
     @classmethod
     def named(

@@ -1,6 +1,7 @@
 """The command `view` and `md.view`: what they write, what they refuse."""
 
 import dataclasses
+import json
 import re
 import shutil
 from pathlib import Path
@@ -41,6 +42,11 @@ def test_all_kinds_of_surfaces_are_shown(command, tmp_path, monkeypatch):
         code, out, _ = command(f"view {source} --no-open")
         assert code == 0
         assert out.startswith(f"{name}.html: ")
+    page = Path("elaphe_afm_100x100.html").read_text(encoding="utf-8")
+    data = json.loads(re.search(r'<script id="data".*?>(.*?)</script>', page)[1])
+    assert data["grating"] == {"filename": "elaphe_afm_100x100.exr"}
+    assert command(data["command"].partition(" ")[2])[0] == 0
+    assert Path("elaphe_afm_100x100.exr").is_file()
 
 
 def test_a_page_holds_everything_and_is_small():

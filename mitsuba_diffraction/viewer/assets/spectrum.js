@@ -42,11 +42,22 @@ function coherenceLengths(spectrum) {
   return [shortest, longest];
 }
 
+// (layers, terms, nodes) as (layers, nodes, terms).
+function interleaved(values, terms, nodes) {
+  const result = new values.constructor(values.length);
+  for (let start = 0; start < values.length; start += terms * nodes) {
+    for (let p = 0; p < terms; p++) {
+      for (let i = 0; i < nodes; i++) result[start + i * terms + p] = values[start + p * nodes + i];
+    }
+  }
+  return result;
+}
+
 class Spectrum {
   constructor(gl, spectrum, table, materials) {
     Object.assign(this, { gl, spectrum, materials });
-    const [layers, rows, columns, terms] = table.shape;
-    this.texture = numbers3D(gl, table.values, columns, rows, layers, terms);
+    const [layers, terms, rows, columns] = table.shape;
+    this.texture = numbers3D(gl, interleaved(table.values, terms, rows * columns), columns, rows, layers, terms);
     this.bytes = table.values.byteLength;
     Object.assign(this, { layers, terms });
     this.noIndex = numbers2D(gl, new Float32Array(2), 1, 1, 2);
