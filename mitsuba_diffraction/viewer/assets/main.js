@@ -128,7 +128,9 @@ async function start() {
   }
 
   function draw() {
-    const busy = renderer.sides.filter((side) => side.frame < state.maxFrames);
+    // The first frame of this model does not wait for a slow shader.
+    const sides = renderer.model.frame === 0 ? [renderer.model] : renderer.sides;
+    const busy = sides.filter((side) => side.frame < state.maxFrames);
     for (const side of busy) {
       renderer.draw(side, state, region(side), BUDGET_MILLISECONDS / busy.length);
       expose(side, side === renderer.model ? "model" : "shader");

@@ -175,7 +175,7 @@ class Renderer {
       const spent = performance.now() - now;
       now += spent;
       side.spent += spent;
-      side.band = Math.min(Math.max(Math.round((side.band * budget) / (3 * Math.max(spent, 0.5))), 4), 4 * side.band);
+      side.band = Math.min(Math.max(Math.round((side.band * budget) / (3 * Math.max(spent, 0.5))), 1), 4 * side.band);
     }
     gl.disable(gl.SCISSOR_TEST);
     if (side.row >= height) {
