@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import gc
 import re
 from collections.abc import Callable
 from itertools import pairwise
@@ -152,6 +153,8 @@ def test_a_frozen_evaluation_follows_the_parameters(name):
     def frozen(bsdf: mi.BSDF, si: mi.SurfaceInteraction3f, wo: mi.Vector3f) -> tuple:
         return bsdf.eval_pdf(mi.BSDFContext(), si, wo)
 
+    # Once, Dr.Jit aborted as garbage of earlier tests was collected while it recorded.
+    gc.collect()
     values = []
     for key, value in (("height_scale", 1.0), ("height_scale", 0.8), ("orientation.value", 90.0)):
         parameters[key] = value
