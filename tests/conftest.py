@@ -1,6 +1,7 @@
 """What all tests share: a cache of their own, the measured scans, and the command."""
 
 import functools
+import gc
 import math
 import os
 import shlex
@@ -58,6 +59,15 @@ def pytest_collection_modifyitems(items):
         if not (takes_long or item.get_closest_marker("slow") or item.function in tests):
             tests.add(item.function)
             item.add_marker(pytest.mark.quick)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def garbage_between_modules():
+    """Collect garbage between modules only: Dr.Jit aborted once as plugins were collected while it traced."""
+    gc.collect()
+    gc.disable()
+    yield
+    gc.enable()
 
 
 @pytest.fixture(scope="session", autouse=True)

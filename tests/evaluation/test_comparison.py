@@ -338,7 +338,7 @@ def test_a_coat_is_noted(llvm, folder):
 def test_several_shaders_are_compared_with_their_options(llvm, folder):
     write(Path("scene.xml"))
     found = compare(
-        "scene.xml", "gem", others=("flss",), terms=6, window="texel", width=4, spp=2, shading_points=2, shares=False
+        "scene.xml", "gem", others=("flss",), terms=6, window="texel", width=16, spp=2, shading_points=2, shares=False
     )
     assert [*found.pictures] == [
         *("path_traced", "same_light", "published", "corrected", "flss_published", "flss_corrected"),

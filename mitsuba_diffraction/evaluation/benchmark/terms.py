@@ -26,7 +26,7 @@ from ...reference import order_powers
 from ...settings import ORIGINS, SERIES, VISIBLE
 from ...spectrum.grids import OrderGrid
 from ...spectrum.tables import AmplitudeTable, series_function, series_weights
-from ..realtime_shader.taylor_textures import PUBLISHED_TERMS
+from ..realtime_shader.flss import FLSS
 from ..report import cells
 from ..validation.figures import figure, png
 from .accuracy import Exact
@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from rich.table import Table
 
+PUBLISHED_TERMS = FLSS.published_terms
 TERMS = tuple(range(5, 46))
 SHOWN_TERMS = (20, 25, 30, 37)
 """Of tables; the published FLSS sums 37."""
