@@ -54,7 +54,7 @@ from .progress import Progress, no_progress, part, silent
 from .rigorous import build as rigorous
 from .scalar_theory import scalar_error
 from .settings import Settings
-from .surface.gratings import PATCHES, PROFILES
+from .surface.gratings import COHERENCE_LENGTHS, PATCHES, PROFILES
 from .surface.heightfield import HeightField
 from .surface.prepare import apply_steps, check_steps
 from .surface.readers import read_height_field
@@ -66,6 +66,8 @@ else:
 
 _SCAN_KEYS = frozenset({"scan", "pixel_size", "height_range", "fill_missing", "channel", "unit", "prepare"})
 _SPECTRUM_KEYS = frozenset(f.name for f in fields(Settings))
+REQUESTED = "representation", "terms", "heights_from", "tolerance"  # of a spectrum; they may override a recipe's
+_OF_PROFILE = "coherence_length", "largest_height_range", *REQUESTED
 # Incremented when the same input gives a different result, to invalidate the cache.
 _BUILD_VERSION = 8
 # Spectra in the package (precompute/ready_spectra.py), named as in the cache.
@@ -79,6 +81,11 @@ _in_use: weakref.WeakValueDictionary[str, Spectrum] = weakref.WeakValueDictionar
 
 class CacheWarning(UserWarning):
     """Spectra cannot be cached and are recomputed each time."""
+
+
+def parameters_of_profile(name: str) -> tuple[str, ...]:
+    """Return the names of the parameters of a profile and of its spectrum, as in a scene."""
+    return (*inspect.signature(PROFILES[name]).parameters, "patches", *_OF_PROFILE)
 
 
 @dataclass(frozen=True)
@@ -119,6 +126,25 @@ class Recipe:
                 raise RequestError(f"scan: got {self.surface['scan']!r}, wanted a file name")
             check_steps(plain.pop("prepare", []))
         _refuse_other_values(plain)
+
+    @classmethod
+    def of_profile(cls, name: str, parameters: Mapping[str, Any], **settings: Any) -> Recipe:
+        """Return the recipe of a profile, from parameters as of a scene (`parameters_of_profile`); it ignores others.
+
+        Args:
+            name: of the profile.
+            parameters: of the profile and its spectrum.
+            settings: further ones of the spectrum.
+
+        Raises:
+            ValueError: if a value is wrong, or there is no such profile.
+        """
+        if name not in PROFILES:
+            raise RequestError(f"profile: got {name!r}, wanted one of {', '.join(PROFILES)}")
+        given = {key: parameters[key] for key in parameters_of_profile(name) if key in parameters}
+        default = {"coherence_length": COHERENCE_LENGTHS[name]} if name in COHERENCE_LENGTHS else {}
+        of_spectrum = {key: given.pop(key) for key in _OF_PROFILE if key in given}
+        return cls({"profile": name, **given}, Settings(**{**default, **of_spectrum, **settings}))
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], **settings: Any) -> Recipe:

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import functools
 import operator
-from inspect import signature
 
 import mitsuba as mi
 
 from ..errors import RequestError
 from ..manual import Parameter, listed
-from ..recipe import Recipe
+from ..recipe import Recipe, parameters_of_profile
 from ..surface.gratings import PROFILES
 from .base import base_from
 from .grating import GratingRequest
@@ -134,7 +133,7 @@ def refuse_unknown(props: mi.Properties) -> None:
     if "profile" in props:
         if (profile := props["profile"]) not in PROFILES:
             return  # `surface_from` lists them
-        known |= {"coherence_length", "largest_height_range", "patches", *signature(PROFILES[profile]).parameters}
+        known.update(parameters_of_profile(profile))
     nested = {name for name, value in props.objects() if isinstance(value, mi.BSDF)}
     if unknown := sorted(set(props.keys()) - known - nested):
         raise RequestError(f"{', '.join(unknown)}: unknown, wanted one of {', '.join(sorted(known))}")

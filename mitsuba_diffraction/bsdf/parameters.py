@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import weakref
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,16 +12,15 @@ import numpy as np
 
 from ..errors import RequestError, is_number
 from ..precomputation import Spectrum, load_spectrum
-from ..recipe import Recipe
+from ..recipe import REQUESTED, Recipe
 from ..rigorous.spectrum import RigorousSpectrum
-from ..settings import THEORIES, TRANSMISSIONS, VISIBLE, Settings, wavelengths_inside
-from ..surface.gratings import COHERENCE_LENGTHS, PROFILES
+from ..settings import THEORIES, TRANSMISSIONS, VISIBLE, wavelengths_inside
+from ..surface.gratings import PROFILES
 from .base import nested_plugin
 from .coat import SAME_INDEX, Coat, absolute_index, coat_from
 from .fresnel import Conductor, PerfectMirror, reflectance_from
 
 _PREFIX = "handed over: "
-_OF_SPECTRUM = "representation", "terms", "heights_from", "tolerance"  # for a profile, or to override a recipe
 _handed_over: weakref.WeakValueDictionary[str, Spectrum] = weakref.WeakValueDictionary()
 _SCALAR_ONLY = {
     "height_scale": "build the spectrum of the other depth",
@@ -286,16 +284,8 @@ def surface_from(props: mi.Properties, media: Media, scale: float = 1.0) -> Spec
         if props.get("theory", found) != found:
             raise RequestError(f"theory: got {theory!r} with a spectrum of {found} theory, wanted one built for it")
         return surface
-    name = props["profile"]
-    if name not in PROFILES:
-        raise RequestError(f"profile: got {name!r}, wanted one of {', '.join(PROFILES)}")
-    known = inspect.signature(PROFILES[name]).parameters
-    surface = {"profile": name, **{key: props[key] for key in (*known, "patches") if key in props}}
-    settings = {"coherence_length": COHERENCE_LENGTHS[name]} if name in COHERENCE_LENGTHS else {}
-    settings |= {key: props[key] for key in ("coherence_length", "largest_height_range", *_OF_SPECTRUM) if key in props}
-    if theory == "rigorous":
-        settings |= {"theory": theory, **settings_from(props, media.coat)}
-    return _inside(props, media, scale, Recipe(surface, Settings(**settings)))
+    settings = {"theory": theory, **settings_from(props, media.coat)} if theory == "rigorous" else {}
+    return _inside(props, media, scale, Recipe.of_profile(props["profile"], props, **settings))
 
 
 def _inside(props: mi.Properties, media: Media, scale: float, recipe: Recipe) -> Recipe:
@@ -320,7 +310,7 @@ def _inside(props: mi.Properties, media: Media, scale: float, recipe: Recipe) ->
 def _from_file(props: mi.Properties, media: Media, scale: float) -> Spectrum | Recipe:
     """Return the spectrum or the recipe of a file."""
     path = Path(str(mi.file_resolver().resolve(str(props["filename"]))))
-    given = {name: props[name] for name in _OF_SPECTRUM if name in props}
+    given = {name: props[name] for name in REQUESTED if name in props}
     suffix = path.suffix.lower()
     if suffix in (".toml", ".exr") and not path.is_file():
         # An unresolved path is relative; the resolver begins with the folder of the scene.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import os
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
@@ -14,10 +13,9 @@ from ..errors import RequestError, is_number
 from ..grating_spectrum import GratingSpectrum
 from ..precomputation import Spectrum, load_spectrum
 from ..progress import Progress, no_progress
-from ..recipe import Recipe
-from ..settings import Settings
+from ..recipe import Recipe, parameters_of_profile
 from ..spectrum.tables import SliceTable
-from ..surface.gratings import COHERENCE_LENGTHS, PROFILES
+from ..surface.gratings import PROFILES
 
 # WebGL2 guarantees array textures with sides of 2048 texels and 256 layers.
 MAX_SIDE, MAX_LAYERS = 2048, 256
@@ -110,6 +108,7 @@ class Surface:
         parameters: Mapping[str, Any],
         progress: Callable[[str], AbstractContextManager[Progress]] = no_progress,
         command: str = "",
+        known: tuple[str, ...] = (),
     ) -> Surface:
         """Return the surface of a recipe, whose spectrum is computed unless it is cached.
 
@@ -120,8 +119,9 @@ class Surface:
             parameters: of the material; others are refused.
             progress: of the computation.
             command: as the attribute.
+            known: names of the other parameters, for the message.
         """
-        material = material_from(parameters)
+        material = material_from(parameters, known)
         if recipe.settings.theory == "rigorous":  # before its table is computed
             raise RequestError(f"{name}: got theory=rigorous, wanted a surface of scalar theory")
         spectrum = recipe.cached(progress)
@@ -159,22 +159,19 @@ class Surface:
                 f"surface: got {name!r}, wanted a recipe (.toml), a saved spectrum (.exr), a scan with its scale, or a "
                 f"profile ({', '.join(PROFILES)})"
             )
-        known = (*inspect.signature(PROFILES[name]).parameters, "patches")
+        known = parameters_of_profile(name)
+        if (theory := values.pop("theory", "scalar")) != "scalar":
+            raise RequestError(f"theory: got {theory}, wanted scalar")
         grating = {key: values.pop(key) for key in known if key in values}
-        of_spectrum = ("coherence_length", "tolerance", "theory", "largest_height_range")
-        given = {key: values.pop(key) for key in of_spectrum if key in values}
-        settings = {"coherence_length": COHERENCE_LENGTHS[name]} if name in COHERENCE_LENGTHS else {}
-        if given.get("theory") == "rigorous":
-            raise RequestError("theory: got rigorous, wanted scalar")
-        recipe = Recipe({"profile": name, **grating}, Settings(**{**settings, **given}))
-        return cls.of_recipe(recipe, name, {"profile": name, **grating, **given}, values, progress=progress)
+        recipe = Recipe.of_profile(name, grating)
+        return cls.of_recipe(recipe, name, {"profile": name, **grating}, values, progress=progress, known=known)
 
 
 SHORTEST = 360.0  # nm, of the wavelengths of a page
 
 
-def material_from(parameters: Mapping[str, Any]) -> Material:
-    """Return the material from the parameters of a scene.
+def material_from(parameters: Mapping[str, Any], others: tuple[str, ...] = ()) -> Material:
+    """Return the material from the parameters of a scene; `others` are names for the message.
 
     Raises:
         RequestError: if one is wrong, or not shown in a page.
@@ -184,7 +181,8 @@ def material_from(parameters: Mapping[str, Any]) -> Material:
         if name in _NOT_SHOWN:
             raise RequestError(f"{name}: got {value!r}, and the page shows {_NOT_SHOWN[name]}")
         if name not in known:
-            raise RequestError(f"{name}: got {value!r}, wanted a parameter among {', '.join(sorted(known))}")
+            wanted = ", ".join((*sorted(known), *sorted(others)))
+            raise RequestError(f"{name}: got {value!r}, wanted a parameter among {wanted}")
     if "material" in parameters and "int_ior" in parameters:
         raise RequestError("material: a conductor or a perfect mirror takes no int_ior; give one or the other")
     return replace(Material(), **parameters)
