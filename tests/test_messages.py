@@ -110,7 +110,7 @@ def test_xml_is_refused_in_one_line_too(tmp_path, llvm):
 
 
 def test_a_bug_keeps_its_traceback(monkeypatch, llvm):
-    monkeypatch.setattr("mitsuba_diffraction.bsdf.parameters.Recipe", None)
+    monkeypatch.setattr("mitsuba_diffraction.bsdf.parameters.Recipe.of_profile", None)
     with pytest.raises(RuntimeError, match=r"Traceback(.|\n)*TypeError: 'NoneType' object is not callable"):
         mi.load_dict({"type": "diffraction_grating", "profile": "blazed", "period": 2.5, "depth": 0.25})
 
