@@ -81,23 +81,19 @@ def albedos(bsdf, omega, wavelengths, samples, seed=0):
     return weights.mean(1), weights.std(1) / np.sqrt(samples)
 
 
-@pytest.mark.filterwarnings("ignore::UserWarning")
-@pytest.mark.parametrize(
-    "seed", [pytest.param(seed, marks=() if seed in (0, 8, 26) else pytest.mark.slow) for seed in range(100)]
-)
-def test_no_albedo_of_a_random_surface_is_above_one(seed):
-    """At most 1.05, and of 16 directions one above 1.01.
+@functools.cache
+def lower_bounds(seed):
+    """Albedos of a random surface of R = 1 in 16 random directions, less three standard errors, and its height range.
 
-    Of surfaces deeper than 1 µm phases change by tens of radians within a grid cell of the table, between whose nodes
-    the albedo oscillates: there one direction in four may be above 1.02.
+    None if its request is refused.
     """
     heights, request = random_surface(seed)
     kind = list(KINDS)[seed // 3 % 4]
     shortest = 360.0 if kind == "mirror" else 240.0
     try:
         of = md.precompute(heights, tolerance=1e-2, wavelengths=(shortest, 830.0), **request)
-    except ValueError as refusal:
-        pytest.skip(str(refusal))
+    except ValueError:
+        return None
     bsdf = plugin(of, **KINDS[kind])
     omega, wavelengths = random_directions(np.random.default_rng(seed), 16)
     if kind in ("interface", "sheet"):
@@ -107,20 +103,45 @@ def test_no_albedo_of_a_random_surface_is_above_one(seed):
     again = np.flatnonzero(mean > 1.0)
     if len(again):
         mean[again], error[again] = albedos(bsdf, omega[again], wavelengths[again], 1 << 16, 1)
-    lower_bound = mean - 3 * error
-    if of.height_range > 1:
-        assert (lower_bound > 1.02).mean() <= 0.25
-    else:
-        assert lower_bound.max() <= 1.05
-        assert (lower_bound > 1.01).sum() <= 1
+    return mean - 3 * error, of.height_range
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+@pytest.mark.parametrize("seed", [0, 8, 26])
+def test_no_albedo_of_a_random_surface_is_above_one(seed):
+    found, height_range = lower_bounds(seed)
+    assert height_range <= 1
+    assert found.max() <= 1.01
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_albedos_of_random_surfaces_are_at_most_one():
+    """At most 1.05, and above 1.01 in at most one of 100 directions.
+
+    Of surfaces deeper than 1 µm phases change by tens of radians within a grid cell of the table, between whose nodes
+    the albedo oscillates: there one direction in four may be above 1.02. The other large values are those of rough
+    pieces of a few µm, whose bins the furnace does not resolve at grazing incidence.
+    """
+    surfaces = {seed: found for seed in range(100) if (found := lower_bounds(seed))}
+    assert len(surfaces) > 80
+    for seed, (found, height_range) in surfaces.items():
+        if height_range > 1:
+            assert (found > 1.02).mean() <= 0.25, seed
+    shallow = np.concatenate([found for found, height_range in surfaces.values() if height_range <= 1])
+    assert shallow.max() <= 1.05
+    assert (shallow > 1.01).mean() <= 0.01
 
 
 @pytest.mark.few(1)
 @pytest.mark.parametrize("name", ["deep blazed", "crossed", "xenopeltis"])
 def test_no_albedo_of_a_named_surface_is_above_one(name):
+    """At most 1.02, and above 1.01 in at most one of 24 directions."""
     omega, wavelengths = random_directions(np.random.default_rng(5), 24)
     mean, error = albedos(plugin(spectrum(name)), omega, wavelengths, 1 << 14)
-    assert (mean - 3 * error).max() <= 1.01
+    lower_bound = mean - 3 * error
+    assert lower_bound.max() <= 1.02
+    assert (lower_bound > 1.01).sum() <= 1
 
 
 @pytest.mark.parametrize("height_scale", [0.3, 0.7])
@@ -254,14 +275,19 @@ def test_instances_of_one_surface_share_their_tables(tmp_path):
     of = spectrum("blazed")
     of.save(tmp_path / "s.exr")
     one, other = (mi.load_dict({"type": "diffraction_grating", "filename": str(tmp_path / "s.exr")}) for _ in range(2))
-    assert one.layers.grating.scattering is other.layers.grating.scattering is plugin(of).layers.grating.scattering
-    assert one.layers.grating.theory.energy is other.layers.grating.theory.energy
+    theories = [bsdf.layers.grating.theory for bsdf in (one, other, plugin(of))]
+    for held in (
+        lambda theory: theory.tables,
+        lambda theory: theory.energy,
+        lambda theory: theory.scattering.order_sampler,
+    ):
+        assert len({id(held(theory)) for theory in theories}) == 1
     profile = {"type": "diffraction_grating", "profile": "blazed", "period": 2.5, "depth": 0.123}
     many = mi.load_dict({"type": "scene", **{f"s{i}": {"type": "sphere", "bsdf": {**profile}} for i in range(20)}})
     bsdfs = [shape.bsdf() for shape in many.shapes()]
-    assert len({id(bsdf.layers.grating.scattering) for bsdf in bsdfs}) == 1
+    assert len({id(bsdf.layers.grating.theory.tables) for bsdf in bsdfs}) == 1
     # Nothing is kept once no BSDF uses it.
-    last = weakref.ref(bsdfs[0].layers.grating.scattering)
+    last = weakref.ref(bsdfs[0].layers.grating.theory.tables)
     del many, bsdfs
     gc.collect()
     gc.collect()
