@@ -60,7 +60,8 @@ NUMBERS = {
     "height of a blaze": ("height_scale", 0.8, 0.01, {}),
     "height of skin": ("height_scale", 0.8, 0.01, {"name": "elaphe"}),
     "lateral": ("lateral_scale", 0.9, 1e-3, {"name": "sinusoidal", "coherence_length": 20.0, "lateral_scale": 0.9}),
-    "orientation": ("orientation.value", 2.0, 0.1, {}),
+    # Within a grid cell of E, whose derivative jumps at its edges.
+    "orientation": ("orientation.value", 2.0, 0.02, {}),
     "orientation of skin": ("orientation.value", 25.0, 0.3, {"name": "elaphe"}),
     "index": ("eta", 1.5, 0.02, {"int_ior": 1.5}),
     "index by Schlick": ("eta", 1.5, 0.02, {"int_ior": 1.5, "fresnel": "schlick"}),

@@ -510,7 +510,7 @@ def test_benchmark_plots_png_only(command):
 def test_benchmark_refuses_a_tolerance_before_it_measures(command):
     code, out, err = command("benchmark --tolerance -1")
     assert (code, out) == (2, "")
-    assert "tolerance: got -1.0, wanted a share" in err
+    assert "tolerance: got -1.0, wanted a fraction" in err
 
 
 def test_an_interrupt_inside_a_plugin_is_not_blamed_on_the_scene(command):

@@ -552,6 +552,7 @@ def test_the_notebook_runs_and_prints_what_it_shows(monkeypatch, capsys, whole):
     plt = pytest.importorskip("matplotlib.pyplot")
     plt.switch_backend("agg")
     monkeypatch.setattr(plt, "show", lambda: plt.close("all"))
+    monkeypatch.chdir(ROOT / "notebooks")
     notebook = json.loads((ROOT / "notebooks" / "01_from_scan_to_picture.ipynb").read_text(encoding="utf-8"))
     cells = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
     names = {}
@@ -564,7 +565,7 @@ def test_the_notebook_runs_and_prints_what_it_shows(monkeypatch, capsys, whole):
         shown = "".join("".join(o["text"]) for o in cell["outputs"] if o["output_type"] == "stream")
         said = capsys.readouterr().out
         assert said == shown if whole else bool(said) == bool(shown)
-    assert sum("image/png" in output.get("data", {}) for cell in cells for output in cell["outputs"]) == 2
+    assert sum("image/png" in output.get("data", {}) for cell in cells for output in cell["outputs"]) == 3
     # Colours, not greys.
     assert np.ptp(names["picture"], axis=2).max() > 0.1 * names["picture"].max()
 

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 MAP_COHERENCE = {"blaze": 6.5}
 """µm, of the BRDF maps: in sunlight the orders of the blaze would be thinner than a pixel."""
 
-TITLES = {MODEL: "this model", "flss": "FLSS", "nmm": "NMM", "pq": "PQ", "gem": "GEM"}
+TITLES = {MODEL: "this model", "flss": "FLSS", "nmm": "NMM", "pq": "PQ", "nmm_pq": "NMM and PQ", "gem": "GEM"}
 _PEAK = "#d62728"
 _MIN_SHOWN = 1e-3  # of the maximum reflectance outside the specular peak
 
