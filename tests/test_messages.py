@@ -55,7 +55,14 @@ def test_messages_name_what_is_available(body, parameters, words, tmp_path, llvm
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("compare scenes/xenopeltis_sphere.xml", "shader knows no other; choose -D light=bulb or -D light=parallel"),
+        (
+            "compare scenes/xenopeltis_sphere.xml -D light=strip_along_x",
+            "shader knows no other; choose -D light=bulb or -D light=parallel",
+        ),
+        (
+            "compare precompute/measured/scan.npz",
+            "SCENE: got precompute/measured/scan.npz, wanted a file name that ends in .xml or .toml",
+        ),
         ("convergence scenes/blaze.xml -o out.png", "shader knows no other; choose -D light=bulb or -D light=parallel"),
         (
             "render scenes/rainbow.xml",

@@ -15,7 +15,7 @@ import mitsuba_diffraction as md
 from mitsuba_diffraction.color import delta_E, spectrum_to_XYZ
 from mitsuba_diffraction.evaluation.comparison import compare, summary
 from mitsuba_diffraction.evaluation.comparison.difference import difference, noise, white_luminance
-from mitsuba_diffraction.evaluation.comparison.pictures import NO_SHADOWS, Pictures
+from mitsuba_diffraction.evaluation.comparison.pictures import NO_SHADOWS, Pictures, supported_lights
 from mitsuba_diffraction.evaluation.comparison.quirk_shares import quirk_shares
 from mitsuba_diffraction.evaluation.realtime_shader.evaluate import VARIANTS
 from mitsuba_diffraction.evaluation.realtime_shader.quirks import Quirks
@@ -369,6 +369,22 @@ def test_the_same_seed_gives_the_same_numbers(llvm, folder):
     summary.save_figure(found[0], "figure.png", dpi=40)
     with Image.open("figure.png") as picture:
         assert picture.width > 400
+
+
+def test_lights_that_the_shader_supports_are_found():
+    scene = Path(__file__).parents[2] / "scenes" / "xenopeltis_sphere.xml"
+    assert supported_lights(scene) == ("bulb", "parallel")
+    assert supported_lights(scene, {"light": "bulb"}) is None
+
+
+@pytest.mark.slow
+def test_a_recipe_is_compared_on_the_objects_of_a_scene(command, llvm, folder):
+    recipe = '[surface]\nprofile = "blazed"\nperiod = 2.5\ndepth = 0.2\n[spectrum]\ncoherence_length = 3\n'
+    Path("skin.toml").write_text(recipe)
+    code, _, err = command("compare skin.toml --shader gem --spp 2 --width 12 --no-shares")
+    assert code == 0, err
+    assert "note: the shader does not know the lights of scan.xml: light=parallel, of bulb, parallel" in err
+    assert names() == {"skin.toml", "skin-gem.png", *(f"skin-gem-{p}.exr" for p in ("path", "published", "corrected"))}
 
 
 @pytest.mark.few(2)

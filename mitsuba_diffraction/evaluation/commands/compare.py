@@ -9,17 +9,21 @@ from typing import Annotated
 
 import typer
 
-from ...cli.arguments import Define, Overwrite, Variant, scene_parameters
+from ...cli.arguments import Define, Overwrite, Variant, check_suffix, scene_parameters
+from ...cli.examples import source as examples_folder
 from ...files import whole_file
 from ...outputs import check_outputs, free_name
-from ...progress import progress_bar, show, tell
+from ...progress import progress_bar, say, show, tell
+from ...recipe import Recipe
 
 _PICTURES = {"-path.exr": "path_traced", "-published.exr": "published", "-corrected.exr": "corrected"}
 """Suffix → picture."""
 
 
 def compare(
-    scene: Annotated[Path, typer.Argument(metavar="SCENE.xml")],
+    scene: Annotated[
+        Path, typer.Argument(metavar="SCENE.xml|RECIPE.toml", help="a scene, or a recipe on the objects of scan.xml")
+    ],
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="prefix of the output files, or a folder")
     ] = None,
@@ -48,15 +52,24 @@ def compare(
     from ...render.scene import files_of_scene
     from ..comparison import compare as run
     from ..comparison import summary
+    from ..comparison.pictures import supported_lights
 
-    parameters = scene_parameters(define)
+    check_suffix("SCENE", scene, ".xml", ".toml")
+    parameters, name = scene_parameters(define), scene.stem
     shader, *others = shader or ["flss"]
+    if scene.suffix.lower() == ".toml":
+        Recipe.load(scene)  # reports what is wrong with it
+        parameters = {"spectrum": str(scene.resolve()), **parameters}
+        scene = examples_folder() / "scenes" / "scan.xml"
+    if "light" not in parameters and (lights := supported_lights(scene, parameters)):
+        parameters["light"] = lights[-1]
+        say("note", f"the shader does not know the lights of {scene.name}: light={lights[-1]}, of {', '.join(lights)}")
     reads = files_of_scene(scene, parameters)
     prefix = output
     if output is None or output.is_dir():
         folder = output or Path()
         prefix = folder / free_name(
-            f"{scene.stem}-{shader}", lambda stem: [folder / f"{stem}{end}" for end in (*_PICTURES, ".png")], reads
+            f"{name}-{shader}", lambda stem: [folder / f"{stem}{end}" for end in (*_PICTURES, ".png")], reads
         )
     images = {f"{prefix}{end}": picture for end, picture in _PICTURES.items()}
     written = [("-o", Path(target)) for target in (*images, f"{prefix}.png")]

@@ -328,23 +328,34 @@ class Pictures:
         return np.concatenate([np.array(position), np.array(rgb)])
 
 
-def _check_lights(scene: Path, parameters: Mapping[str, str] | None) -> None:
-    """Raise RequestError if the shader supports no light of a scene, before any spectrum is computed."""
+def supported_lights(
+    scene: str | os.PathLike[str], parameters: Mapping[str, str] | None = None
+) -> tuple[str, ...] | None:
+    """Return the values of a scene's parameter `light` that the shader supports; None if its lights are supported."""
+    scene = Path(scene)
     with parsed(scene, parameters) as (_, state):
         emitters = {node.props.plugin_name() for node in state.nodes if node.type == mi.ObjectType.Emitter}
     if emitters & {"directional", "point"}:
-        return
-    text, advice = scene.read_text(encoding="utf-8", errors="replace"), ""
-    if "lights/$light.xml" in text:
-        lights = {path.stem: path.read_text("utf-8") for path in sorted((scene.parent / "lights").glob("*.xml"))}
-        known = [
-            f"-D light={name}"
-            for name, light in lights.items()
-            if re.search(r'<emitter type="(directional|point)"', light)
-            and ("<integrator" in light) != ("<integrator" in text)
-        ]
-        advice = f"; choose {' or '.join(known)}" if known else ""
-    raise RequestError(f"{scene}: the scene has no directional or point light, and the shader knows no other{advice}")
+        return None
+    text = scene.read_text(encoding="utf-8", errors="replace")
+    if "lights/$light.xml" not in text:
+        return ()
+    lights = {path.stem: path.read_text("utf-8") for path in sorted((scene.parent / "lights").glob("*.xml"))}
+    return tuple(
+        name
+        for name, light in lights.items()
+        if re.search(r'<emitter type="(directional|point)"', light)
+        and ("<integrator" in light) != ("<integrator" in text)
+    )
+
+
+def _check_lights(scene: Path, parameters: Mapping[str, str] | None) -> None:
+    """Raise RequestError if the shader supports no light of a scene, before any spectrum is computed."""
+    if (lights := supported_lights(scene, parameters)) is not None:
+        advice = f"; choose {' or '.join(f'-D light={name}' for name in lights)}" if lights else ""
+        raise RequestError(
+            f"{scene}: the scene has no directional or point light, and the shader knows no other{advice}"
+        )
 
 
 def _channel_spectra() -> NDArray[np.float64]:
