@@ -16,6 +16,7 @@ if TYPE_CHECKING:  # type checkers do not see what is imported on first use
     from . import reference, rigorous
     from .efficiency import efficiencies
     from .grating_spectrum import GratingSpectrum
+    from .peaks import peak_efficiencies
     from .precomputation import precompute
     from .recipe import Recipe
     from .surface import gratings
@@ -29,6 +30,7 @@ _HOME = {
     "Recipe": "recipe",
     "efficiencies": "efficiency",
     "gratings": "surface.gratings",
+    "peak_efficiencies": "peaks",
     "precompute": "precomputation",
     "read_height_field": "surface.readers",
     "reference": "reference",
@@ -42,6 +44,7 @@ __all__ = [
     "Recipe",
     "efficiencies",
     "gratings",
+    "peak_efficiencies",
     "precompute",
     "read_height_field",
     "reference",

@@ -177,3 +177,11 @@ def on_screen(rgb: NDArray[np.floating]) -> NDArray[np.uint8]:
 
     shown = colour.cctf_encoding(roll_off(rgb), function="sRGB")
     return np.round(255 * np.clip(shown, 0.0, 1.0)).astype(np.uint8)
+
+
+def hex_code(rgb: NDArray[np.floating]) -> str:
+    """Return the sRGB code, "#ffc08a", of non-negative linear sRGB (3,), its brightest component scaled to one."""
+    import colour
+
+    shown = colour.cctf_encoding(rgb / max(rgb.max(), 1e-300), function="sRGB")
+    return "#" + bytes(np.round(255 * shown).astype(np.uint8)).hex()

@@ -41,14 +41,15 @@ class OrderEfficiencies:
     Attributes:
         values: (order, angle, wavelength, polarisation), s- before p-polarised incident light; 0 where an order does
             not propagate.
-        orders: m, (n,), ascending; of a tile that varies along x and y (m_x, m_y), (n, 2).
+        orders: m, (n,), ascending; of a tile that varies along x and y (m_x, m_y), (n, 2); names of peaks
+            (`PeakEfficiencies`).
         angles: of incidence, degrees, (a,).
         wavelengths: nm, in vacuum, (w,).
         source: description of the surface, material and theory.
     """
 
     values: Array
-    orders: NDArray[np.int64]
+    orders: NDArray[np.int64] | NDArray[np.str_]
     angles: Array
     wavelengths: Array
     source: str
@@ -57,7 +58,7 @@ class OrderEfficiencies:
     def axes(self) -> dict[str, list]:
         """Return the names of the axes of `values` and the coordinates along them."""
         return {
-            "order": [int(m) if np.ndim(m) == 0 else tuple(map(int, m)) for m in self.orders],
+            "order": [tuple(m) if isinstance(m, list) else m for m in self.orders.tolist()],
             "angle": self.angles.tolist(),
             "wavelength": self.wavelengths.tolist(),
             "polarisation": list(POLARISATIONS),
@@ -68,7 +69,7 @@ class OrderEfficiencies:
         """Return the mean of both polarisations, (order, angle, wavelength)."""
         return self.values.mean(axis=-1)
 
-    def order(self, *m: int) -> Array:
+    def order(self, *m: int | str) -> Array:
         """Return the efficiencies of one order, (angle, wavelength, polarisation).
 
         Raises:
@@ -175,7 +176,7 @@ class OrderEfficiencies:
 _WAVELENGTH, _ANGLE = "wavelength (nm)", "angle of incidence (°)"
 
 
-def _name(order: int | tuple[int, int]) -> str:
+def _name(order: int | str | tuple[int, int]) -> str:
     return f"{order:+d}" if isinstance(order, int) and order else str(order).replace(" ", "")
 
 
@@ -223,8 +224,8 @@ def efficiencies(
     """
     if not isinstance(height_field, HeightField):
         raise RequestError(f"height_field: got {type(height_field).__name__}, wanted a HeightField")
-    angles = _numbers("angles", angles, "degrees above −90 and below 90", -90.0, 90.0)
-    wavelengths = _numbers("wavelengths", wavelengths, "nm from 10 to 100000 (100 µm)", 9.999, 100_000.001)
+    angles = numbers("angles", angles, "degrees above −90 and below 90", -90.0, 90.0)
+    wavelengths = numbers("wavelengths", wavelengths, "nm from 10 to 100000 (100 µm)", 9.999, 100_000.001)
     if theory not in THEORIES:
         raise RequestError(f"theory: got {theory!r}, wanted one of {', '.join(THEORIES)}")
     if not is_number(azimuth) or not np.isfinite(azimuth):
@@ -242,26 +243,50 @@ def efficiencies(
     solve = (_scalar if theory == "scalar" else _rigorous)(height_field, azimuth, shortest, transmission)
     found: dict[tuple[int, ...], Array] = {}
     for step, (a, w) in enumerate(np.ndindex(len(angles), len(wavelengths)), 1):
-        wavelength, index = float(wavelengths[w]) * 1e-3, complex("inf")
-        if theory == "rigorous" or material != "none" or int_ior is not None:
-            index = refractive_index(wavelength, int_ior=int_ior, material=material, known=True)
+        wavelength = float(wavelengths[w]) * 1e-3
+        index = index_at(wavelength, material, int_ior, theory)
         for m, *pair in zip(*solve(float(angles[a]), wavelength, index), strict=True):
             of_order = found.setdefault(tuple(np.atleast_1d(m).tolist()), np.zeros((len(angles), len(wavelengths), 2)))
             of_order[a, w] = pair
         progress(step, len(angles) * len(wavelengths))
     orders = sorted(found)
-    what = material if material is not None else f"n = {int_ior:g}"
-    plane = f", plane of incidence at {azimuth:g}°" if azimuth else ""
-    transmitted = {"none": "", "interface": ", transmitted orders inside", "sheet": ", transmitted by a sheet"}[
-        transmission
-    ]
     return OrderEfficiencies(
         np.stack([found[m] for m in orders]),
         np.array(orders)[:, 0] if profile else np.array(orders),
         angles,
         wavelengths,
-        f"{height_field.source}; {what}, {theory} theory{transmitted}{plane}",
+        description(height_field.source, material, int_ior, azimuth, theory, transmission),
     )
+
+
+def description(
+    source: str,
+    material: str | None,
+    int_ior: complex | None,
+    azimuth: float,
+    theory: str = "scalar",
+    transmission: str = "none",
+) -> str:
+    """Return the description of a surface, material and theory, from arguments of `efficiencies`."""
+    what = material if material is not None else f"n = {int_ior:g}"
+    plane = f", plane of incidence at {azimuth:g}°" if azimuth else ""
+    transmitted = {"none": "", "interface": ", transmitted orders inside", "sheet": ", transmitted by a sheet"}[
+        transmission
+    ]
+    return f"{source}; {what}, {theory} theory{transmitted}{plane}"
+
+
+def incident_direction(angle: float, azimuth: float) -> Array:
+    """Return ω_i, (3,), from the angle of incidence and the azimuth of its plane in degrees."""
+    theta, phi = np.deg2rad((angle, azimuth))
+    return np.array([-np.sin(theta) * np.cos(phi), -np.sin(theta) * np.sin(phi), np.cos(theta)])
+
+
+def index_at(wavelength: float, material: str | None, int_ior: complex | None, theory: str = "scalar") -> complex:
+    """Return n + ik at a wavelength in µm; in scalar theory infinite for material "none", the perfect mirror."""
+    if (theory, material, int_ior) == ("scalar", "none", None):
+        return complex("inf")
+    return refractive_index(wavelength, int_ior=int_ior, material=material, known=True)
 
 
 _Found = tuple[NDArray[np.int64], Array, Array]
@@ -294,21 +319,20 @@ def _scalar(height_field: HeightField, azimuth: float, shortest: float, transmis
 
 def _rigorous(height_field: HeightField, azimuth: float, shortest: float, transmission: str) -> _Solve:
     def solve(angle: float, wavelength: float, index: complex) -> _Found:
-        theta, phi = np.deg2rad((angle, azimuth))
-        direction = -np.sin(theta) * np.cos(phi), -np.sin(theta) * np.sin(phi), np.cos(theta)
+        direction = incident_direction(angle, azimuth)
         found = rigorous.efficiencies(height_field, direction, wavelength, int_ior=index)
         if transmission == "none":
             return found.orders, found.s, found.p
         if transmission == "interface":
             return found.transmitted_orders, *(np.abs(found.transmitted_amplitudes) ** 2).sum(axis=1).T
         k_0 = height_field.tile_size[0] / wavelength
-        orders, powers = sheet_orders(curve_of(height_field), np.array(direction), k_0, index.real, found.harmonics)
+        orders, powers = sheet_orders(curve_of(height_field), direction, k_0, index.real, found.harmonics)
         return orders, *powers.T
 
     return solve
 
 
-def _numbers(name: str, values: ArrayLike, wanted: str, low: float, high: float) -> Array:
+def numbers(name: str, values: ArrayLike, wanted: str, low: float, high: float) -> Array:
     """Return one number or several, all above `low` and below `high`, as (n,)."""
     try:
         array = np.atleast_1d(np.asarray(values, np.float64))

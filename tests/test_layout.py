@@ -26,7 +26,7 @@ LEVELS = {
     "spectrum": "spectrum",
     "energy": "energy",
     "rigorous": "rigorous",
-    "theory": "efficiency reference scalar_theory",
+    "theory": "efficiency peaks reference scalar_theory",
     "precompute": "grating_spectrum precomputation recipe",
     "bsdf": "bsdf",
     "render": "integrator render testing",

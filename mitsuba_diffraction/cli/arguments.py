@@ -9,15 +9,19 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import typer
+from numpy.typing import NDArray
 
 from ..errors import RequestError
 from ..files import refuse_other_than_utf8
 from ..progress import say
 from ..recipe import Recipe
 from ..settings import SUN_COHERENCE_LENGTH, Settings
+from ..surface.gratings import PROFILES
 from ..surface.prepare import STEP_NAMES, step_of
 
+_MAX_VALUES = 10_000  # of a range first:last:step
 Value = bool | int | float | str
 
 
@@ -65,6 +69,40 @@ def surface_of(text: str) -> tuple[str, dict[str, Value]]:
             raise RequestError(f"{text}: got {name + equals + value!r}, wanted name=value, each name once")
         values[name] = _converted(value)
     return source, values
+
+
+def is_scan(source: str) -> bool:
+    """Return whether a source is a scan, not a recipe (.toml), a saved spectrum (.exr) or a profile."""
+    path = Path(source)
+    is_file = bool(path.suffix) or path.exists()
+    return is_file and source not in PROFILES and path.suffix.lower() not in (".toml", ".exr")
+
+
+def numbers(option: str, text: str) -> NDArray[np.float64]:
+    """Return the numbers in "30", "0,30,60" or "0:60:5" (60 included), (n,).
+
+    Raises:
+        ValueError: if the text has another form, or more than 10,000 numbers.
+
+    """
+    try:
+        if ":" not in text:
+            return np.array([float(part) for part in text.split(",")])
+        first, last, step = (float(part) for part in text.split(":"))
+        count = (last - first) / step
+        if not 0 <= count < _MAX_VALUES:
+            raise ValueError
+        return first + step * np.arange(int(count + 1e-9) + 1)
+    except (ValueError, ZeroDivisionError):
+        raise RequestError(f"{option}: got {text!r}, wanted a number, numbers as 0,30,60, or first:last:step") from None
+
+
+def angles_of(option: str, text: str) -> NDArray[np.float64]:
+    """Return angles from the normal in degrees, (n,), given as `numbers`."""
+    found = numbers(option, text)
+    if (wrong := found[~(np.abs(found) < 90)]).size:
+        raise RequestError(f"{option}: got {wrong[0]:g}, wanted degrees above −90 and below 90")
+    return found
 
 
 def _converted(text: str) -> Value:

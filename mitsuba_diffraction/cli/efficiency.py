@@ -1,28 +1,52 @@
-"""`mitsuba-diffraction efficiency`: the efficiencies of the orders of a grating, over angles and wavelengths."""
+"""`mitsuba-diffraction efficiency`: the light in the orders of a grating or the peaks of an irregular surface."""
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
-import numpy as np
 import typer
-from numpy.typing import NDArray
 
-from ..efficiency import efficiencies
+from ..efficiency import OrderEfficiencies, efficiencies
 from ..errors import RequestError
+from ..grating_spectrum import GratingSpectrum
 from ..outputs import check_outputs
+from ..peaks import check_request, peak_efficiencies
+from ..precomputation import load_spectrum
 from ..progress import progress_bar, tell
 from ..recipe import Recipe
-from ..surface.gratings import PROFILES
-from .arguments import Overwrite, check_suffix, surface_of
-
-_MAX_VALUES = 10_000  # of a range first:last:step
+from ..settings import Settings
+from .arguments import (
+    Channel,
+    CoherenceLength,
+    Extent,
+    FillMissing,
+    HeightRange,
+    Overwrite,
+    PixelSize,
+    Prepare,
+    Unit,
+    Value,
+    angles_of,
+    check_suffix,
+    is_scan,
+    numbers,
+    options_of_scan,
+    recipe_of,
+    settings_of,
+    surface_of,
+)
 
 
 def efficiency(
+    context: typer.Context,
     source: Annotated[
-        str, typer.Argument(metavar="RECIPE|PROFILE[,name=value…]", help="a recipe (.toml), or a profile")
+        str,
+        typer.Argument(
+            metavar="SURFACE[,name=value…]",
+            help="a recipe (.toml), a profile, a scan, or a saved spectrum (.exr) of an irregular surface",
+        ),
     ],
     angle: Annotated[
         str, typer.Option(help="of incidence, degrees: a number, several (0,30), or first:last:step")
@@ -42,23 +66,30 @@ def efficiency(
     azimuth: Annotated[
         float, typer.Option(help="of the plane of incidence, degrees from x; 90: along the grooves")
     ] = 0,
+    pixel_size: PixelSize = None,
+    height_range: HeightRange = None,
+    fill_missing: FillMissing = False,
+    channel: Channel = None,
+    unit: Unit = None,
+    prepare: Prepare = None,
+    extent: Extent = None,
+    coherence_length: CoherenceLength = None,
     csv: Annotated[Path | None, typer.Option(help="save all numbers (.csv)")] = None,
     plot: Annotated[Path | None, typer.Option(help="save a plot (.png, .pdf, .svg)")] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Compute the efficiencies of the orders of a grating."""
-    angles, wavelengths = _numbers("--angle", angle), _numbers("--wavelength", wavelength)
+    """Compute how much light goes into each order of a grating, or each spectral peak of an irregular surface."""
+    angles, wavelengths = angles_of("--angle", angle), numbers("--wavelength", wavelength)
     name, values = surface_of(source)
-    if Path(name).suffix.lower() == ".toml":
-        recipe = Recipe.load(name)
-        recipe = Recipe({**recipe.surface, **values}, recipe.settings, recipe.folder)
-    elif name not in PROFILES and (Path(name).suffix or Path(name).exists()):
-        raise RequestError(f"{name}: got a file, wanted a recipe (.toml) or the name of a profile, such as blazed")
-    else:
-        recipe = Recipe({"profile": name, **values})
-    settings = recipe.settings
-    if settings.extent != "tile":
-        raise RequestError(f"{name}: got a sample of an irregular surface, wanted a grating that repeats")
+    of_scan, given = options_of_scan(context), settings_of(context)
+    of_spectrum = {key: given[key] for key in ("extent", "coherence_length") if key in given}
+    recipe = None
+    if Path(name).suffix.lower() != ".exr":
+        recipe = _recipe(name, values, of_scan, of_spectrum)
+    elif options := ", ".join([*values, *of_scan, *of_spectrum]):
+        raise RequestError(f"{name}: got {options} with a saved spectrum, wanted the recipe or the scan itself")
+    settings = Settings() if recipe is None else recipe.settings
+    theory, transmission = theory or settings.theory, transmission or settings.transmission
     if material is None and int_ior is None:
         material, int_ior = settings.material, settings.int_ior
     if csv is not None:
@@ -66,42 +97,49 @@ def efficiency(
     if plot is not None:
         check_suffix("--plot", plot, ".png", ".pdf", ".svg")
     writes = [(option, path) for option, path in (("--csv", csv), ("--plot", plot)) if path is not None]
-    check_outputs([Path(name), *recipe.files], writes, overwrite=overwrite)
-    with progress_bar(f"efficiencies of {name}") as progress:
-        found = efficiencies(
-            recipe.height_field(),
-            angles,
-            wavelengths,
-            theory=theory or settings.theory,
-            material=material,
-            int_ior=int_ior,
-            transmission=transmission or settings.transmission,
-            azimuth=azimuth,
-            progress=progress,
+    check_outputs([Path(name), *(recipe.files if recipe else [])], writes, overwrite=overwrite)
+    irregular = recipe is None or settings.extent == "sample" or recipe.patches > 1
+    if irregular and (theory, transmission) != ("scalar", "none"):
+        raise RequestError(
+            f"{name}: got theory {theory}, transmission {transmission} of an irregular surface, wanted scalar, none"
         )
+    material_of = {"material": material, "int_ior": int_ior, "azimuth": azimuth}
+    found: OrderEfficiencies
+    if irregular:
+        check_request(settings.wavelengths, angles, wavelengths, material, int_ior)  # before a spectrum is computed
+        cached = load_spectrum(name) if recipe is None else recipe.cached(partial(progress_bar, unit="%"))
+        if not isinstance(cached, GratingSpectrum):
+            raise RequestError(f"{name}: got a spectrum of rigorous theory, wanted its recipe")
+        with progress_bar(f"peaks of {name}") as progress:
+            found = peak_efficiencies(cached, angles, wavelengths, **material_of, progress=progress)
+    else:
+        with progress_bar(f"efficiencies of {name}") as progress:
+            found = efficiencies(
+                recipe.height_field(),
+                angles,
+                wavelengths,
+                theory=theory,
+                transmission=transmission,
+                **material_of,
+                progress=progress,
+            )
     tell(str(found))
     if csv is not None:
         found.save_csv(csv)
         tell(f"{csv}: all numbers")
     if plot is not None:
         found.plot(plot)
-        tell(f"{plot}: a plot of the strongest orders")
+        tell(f"{plot}: a plot of the strongest {'peaks' if irregular else 'orders'}")
 
 
-def _numbers(option: str, text: str) -> NDArray[np.float64]:
-    """Return the numbers in "30", "0,30,60" or "0:60:5" (60 included), (n,).
-
-    Raises:
-        ValueError: if the text has another form, or more than 10,000 numbers.
-
-    """
-    try:
-        if ":" not in text:
-            return np.array([float(part) for part in text.split(",")])
-        first, last, step = (float(part) for part in text.split(":"))
-        count = (last - first) / step
-        if not 0 <= count < _MAX_VALUES:
-            raise ValueError
-        return first + step * np.arange(int(count + 1e-9) + 1)
-    except (ValueError, ZeroDivisionError):
-        raise RequestError(f"{option}: got {text!r}, wanted a number, numbers as 0,30,60, or first:last:step") from None
+def _recipe(name: str, values: dict[str, Value], of_scan: dict[str, Any], of_spectrum: dict[str, Any]) -> Recipe:
+    """Return the recipe of a scan, of a profile, or in a file."""
+    if is_scan(name):
+        # A scan is rarely cut to a whole number of periods.
+        return recipe_of(Path(name), of_scan, {"extent": "sample", **of_spectrum})
+    if Path(name).suffix.lower() == ".toml":
+        recipe = recipe_of(Path(name), of_scan, of_spectrum)
+        return Recipe({**recipe.surface, **values}, recipe.settings, recipe.folder)
+    if of_scan:
+        raise RequestError(f"{name}: got {', '.join(of_scan)} with a profile, wanted them with a scan")
+    return Recipe.of_profile(name, values, **of_spectrum)

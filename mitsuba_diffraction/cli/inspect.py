@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -14,9 +15,8 @@ from rich.text import Text
 from ..errors import RequestError
 from ..inspection import Inspection, save_picture
 from ..inspection import inspect as look
-from ..inspection.colours import GREEN
-from ..inspection.picture import with_uncertainty
-from ..outputs import check_outputs, free_name, save_json
+from ..inspection.colours import GREEN, Colour, colours_at
+from ..outputs import check_outputs, free_name, plain, save_json
 from ..progress import progress_bar, show, table, tell
 from ..settings import SUN_COHERENCE_LENGTH, lobe_width
 from .arguments import (
@@ -29,6 +29,7 @@ from .arguments import (
     PixelSize,
     Prepare,
     Unit,
+    angles_of,
     check_suffix,
     options_of_scan,
     recipe_of,
@@ -52,10 +53,20 @@ def inspect(
     prepare: Prepare = None,
     extent: Extent = None,
     coherence_length: CoherenceLength = None,
+    angle: Annotated[
+        str, typer.Option(help="of incidence, degrees, for --view: a number, several (0,30), or first:last:step")
+    ] = "0",
+    view: Annotated[
+        str | None,
+        typer.Option(help="print the colours at these angles, degrees, positive on the side opposite to the light"),
+    ] = None,
     json: Annotated[Path | None, typer.Option(help="save the numbers (.json)")] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Report and plot the statistics, periods and predicted colours of a surface, and their reliability."""
+    angles, views = angles_of("--angle", angle), np.zeros(0) if view is None else angles_of("--view", view)
+    if view is None and angle != "0":
+        raise RequestError(f"--angle: got {angle} without --view, wanted the angles of the viewer, too")
     settings = settings_of(context)
     if source.suffix.lower() != ".toml":
         settings.setdefault("extent", "sample")
@@ -76,11 +87,15 @@ def inspect(
             measured="scan" in recipe.surface,
             progress=progress,
         )
+    colours = colours_at(inspection.spectrum, inspection.direction, angles, views)
     save_picture(inspection, picture, title=source.stem if source.suffix == ".toml" else source.name)
     if json is not None:
-        save_json(inspection.as_json(), json)
-    show(_table(inspection), *([_changes_table(inspection)] if inspection.changes else []), width=130)
-    if inspection.changes:
+        save_json({**inspection.as_json(), **({"colours": plain(colours)} if colours else {})}, json)
+    tables = [_table(inspection)]
+    tables += [_changes_table(inspection)] if inspection.changes else []
+    tables += [_colours_table(colours)] if colours else []
+    show(*tables, width=130)
+    if len(tables) > 1:
         tell("")
     for concern in inspection.concerns:
         tell(f"! {concern}")
@@ -122,10 +137,8 @@ def _surface_lines(inspection: Inspection) -> list[tuple[str, str]]:
 def _diffraction_lines(inspection: Inspection) -> list[tuple[str, str]]:
     lines = []
     for number, period in enumerate(inspection.periods):
-        direction = f"{with_uncertainty(period.direction, period.direction_uncertainty)}° from x"
         name = "period" if number == 0 else "another period"
-        length = f"{with_uncertainty(period.period, period.period_uncertainty)} µm along {direction}"
-        lines.append((name, f"{length}; {period.strength:.1%} of the variance"))
+        lines.append((name, f"{period}; {period.strength:.1%} of the variance"))
     if not inspection.periods:
         hint = " (for a single period of a grating: --extent tile)" if inspection.extent == "sample" else ""
         lines.append(("period", f"none stands out{hint}"))
@@ -168,6 +181,12 @@ def _changes_table(inspection: Inspection) -> Table:
                 f"ΔE00 {change.colour[order]:.1f}",
             ]
         rows.append(row)
+    return table(columns, rows)
+
+
+def _colours_table(colours: Sequence[Colour]) -> Table:
+    columns = ["incidence", "view", "X", "Y", "Z", "sRGB"]
+    rows = [[f"{c.angle:g}°", f"{c.view:g}°", *(f"{value:.4g}" for value in c.XYZ), c.sRGB] for c in colours]
     return table(columns, rows)
 
 

@@ -13,7 +13,6 @@ import typer
 from ..files import whole_file
 from ..outputs import check_outputs
 from ..progress import NAME, progress_bar, tell
-from ..surface.gratings import PROFILES
 from ..viewer.page import page, reference_picture
 from ..viewer.surface import Surface
 from .arguments import (
@@ -27,13 +26,12 @@ from .arguments import (
     Prepare,
     Unit,
     check_suffix,
+    is_scan,
     options_of_scan,
     recipe_of,
     settings_of,
     surface_of,
 )
-
-_NOT_SCANS = (".toml", ".exr")
 
 
 def view(
@@ -69,11 +67,10 @@ def view(
     target = output or Path(path.stem or "view").with_suffix(".html")
     check_suffix("-o", target, ".html")
     of_scan, settings = options_of_scan(context), settings_of(context)
-    is_scan = path.suffix.lower() not in _NOT_SCANS and name not in PROFILES and (path.suffix or path.exists())
-    recipe = None
-    if is_scan or of_scan or settings:
+    recipe, of_a_scan = None, is_scan(name)
+    if of_a_scan or of_scan or settings:
         # A scan is rarely cut to a whole number of periods.
-        recipe = recipe_of(path, of_scan, {"extent": "sample", **settings} if is_scan else settings)
+        recipe = recipe_of(path, of_scan, {"extent": "sample", **settings} if of_a_scan else settings)
     reads = [file for file in (path, reference) if file is not None and file.exists()]
     check_outputs([*reads, *(recipe.files if recipe else [])], [("-o", target)], overwrite=overwrite)
     picture = None if reference is None else reference_picture(reference)
@@ -81,7 +78,7 @@ def view(
         surface = Surface.named(name, parameters, progress)
     else:
         spectrum = f"{path.stem}.exr"
-        options = _given(context) + (["--extent", "sample"] if is_scan and extent is None else [])
+        options = _given(context) + (["--extent", "sample"] if of_a_scan and extent is None else [])
         command = shlex.join([NAME, "precompute", str(path.resolve()), *options, "-o", spectrum])
         surface = Surface.of_recipe(recipe, path.stem, {"filename": spectrum}, parameters, progress, command)
     text = page(surface, picture)

@@ -13,13 +13,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import grey_dilation, grey_erosion
 
-from ..color import daylight, delta_E, spectrum_to_XYZ
+from ..color import XYZ_to_linear_sRGB, daylight, delta_E, hex_code, into_gamut, spectrum_to_XYZ
 from ..errors import RequestError
 from ..geometry import k_g
 from ..grating_spectrum import GratingSpectrum
@@ -71,6 +72,34 @@ def radiance(
     density = lateral_scale**2 * spectrum.evaluate(vector, height_scale * kappa)
     factor = k_g(cos_i, cos_o, (q * wavelengths) ** 2)
     return illumination() * factor * density / wavelengths**2 * cos_i
+
+
+@dataclass(frozen=True)
+class Colour:
+    """The colour of a surface in one direction.
+
+    Attributes:
+        angle: of incidence, degrees.
+        view: angle of the viewer, degrees.
+        XYZ: (3,), of R = 1; Y = 1 for a white sheet in the place of the surface.
+        sRGB: "#ffc08a": its brightest component is 255; colours outside the gamut are desaturated.
+    """
+
+    angle: float
+    view: float
+    XYZ: tuple[float, float, float]
+    sRGB: str
+
+
+def colours_at(spectrum: GratingSpectrum, direction: float, angles: ArrayLike, views: ArrayLike) -> tuple[Colour, ...]:
+    """Predict the colours for each pair of angles of incidence (a,) and view (b,), degrees above −90 and below 90."""
+    found = []
+    for angle, view in product(np.ravel(angles).tolist(), np.ravel(views).tolist()):
+        # A white sheet has the radiance D65 cos θ_i/π.
+        factor = np.pi / np.cos(np.deg2rad(angle))
+        XYZ = np.maximum(factor * spectrum_to_XYZ(radiance(spectrum, direction, angle, view), WAVELENGTHS), 0)
+        found.append(Colour(angle, view, tuple(XYZ.tolist()), hex_code(into_gamut(XYZ_to_linear_sRGB(XYZ)))))
+    return tuple(found)
 
 
 def order_angle(order: int, period: float, wavelength: float) -> float | None:

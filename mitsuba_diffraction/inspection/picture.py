@@ -15,7 +15,7 @@ from ..errors import RequestError
 from ..files import whole_file
 from ..outputs import METADATA
 from ..surface.heightfield import HeightField
-from ..surface.periods import hann, repeated
+from ..surface.periods import hann, repeated, with_uncertainty
 from .colours import WAVELENGTHS, radiance
 from .report import Inspection, reference_plane
 
@@ -230,15 +230,6 @@ def _facts(axes: Axes, inspection: Inspection) -> None:
         "red is deflected most, blue least."
     )
     axes.text(0.0, 0.0, text, fontsize=10.5, color="0.3", va="bottom", linespacing=1.4, transform=axes.transAxes)
-
-
-def with_uncertainty(value: float, uncertainty: float) -> str:
-    """Format as 1.144 ± 0.012: the uncertainty to two digits, the value to the same number of decimals."""
-    if not (np.isfinite(uncertainty) and uncertainty > 0):
-        return f"{value:.4g}"
-    decimals = int(np.clip(1 - np.floor(np.log10(uncertainty)), 0, 6))
-    # Adding zero removes the sign of −0.
-    return f"{round(value, decimals) + 0.0:.{decimals}f} ± {uncertainty:.{decimals}f}".replace("-", "−")
 
 
 def _colours(rows: list[Axes], inspection: Inspection) -> None:

@@ -68,6 +68,11 @@ class Period:
         phi = np.deg2rad(self.direction)
         return np.array([np.cos(phi), np.sin(phi)]) / self.period
 
+    def __str__(self) -> str:
+        """Return "1.144 ± 0.012 µm along −89.7 ± 0.2° from x"."""
+        direction = with_uncertainty(self.direction, self.direction_uncertainty)
+        return f"{with_uncertainty(self.period, self.period_uncertainty)} µm along {direction}° from x"
+
     @classmethod
     def of(cls, q: Array, covariance: Array, strength: float) -> Period:
         """Make a period from a frequency (2,) in cycles/µm and its covariance (2, 2)."""
@@ -82,6 +87,15 @@ class Period:
             direction_uncertainty=float(np.degrees(np.sqrt(across @ covariance @ across) / length)),
             strength=strength,
         )
+
+
+def with_uncertainty(value: float, uncertainty: float) -> str:
+    """Format as 1.144 ± 0.012: the uncertainty to two digits, the value to the same number of decimals."""
+    if not (np.isfinite(uncertainty) and uncertainty > 0):
+        return f"{value:.4g}"
+    decimals = int(np.clip(1 - np.floor(np.log10(uncertainty)), 0, 6))
+    # Adding zero removes the sign of −0.
+    return f"{round(value, decimals) + 0.0:.{decimals}f} ± {uncertainty:.{decimals}f}".replace("-", "−")
 
 
 def find_periods(height_field: HeightField, count: int = 2, *, extent: str = "sample") -> tuple[Period, ...]:

@@ -4,6 +4,7 @@ import json
 import re
 from pathlib import Path
 
+import colour
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -18,6 +19,7 @@ from mitsuba_diffraction.inspection import inspect, save_picture
 from mitsuba_diffraction.inspection.colours import (
     WAVELENGTHS,
     broadened,
+    colours_at,
     illumination,
     order_angle,
     order_fraction,
@@ -379,6 +381,23 @@ def test_an_uncertainty_has_two_digits(value, uncertainty, text):
 # ---------------------------------------------------------------- the command
 
 
+def test_colours_in_numbers_agree_with_colour_science():
+    spectrum = sinusoid(coherence_length=2.5)
+    (found,) = colours_at(spectrum, 0.0, 20.0, [30.0])
+    assert (found.angle, found.view) == (20, 30)
+    # The reflectance factor: of a white sheet it is one.
+    factor = radiance(spectrum, 0.0, 20.0, 30.0) / illumination() * np.pi / np.cos(np.deg2rad(20))
+    observer, daylight = colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"], colour.SDS_ILLUMINANTS["D65"]
+    light = np.interp(observer.wavelengths, daylight.wavelengths, daylight.values)
+    XYZ = np.interp(observer.wavelengths, WAVELENGTHS, factor) * light @ observer.values
+    XYZ /= light @ observer.values[:, 1]
+    np.testing.assert_allclose(found.XYZ, XYZ, rtol=5e-3)
+    rgb = colour.XYZ_to_RGB(XYZ, "sRGB")
+    assert rgb.min() > 0
+    wanted = np.round(255 * colour.cctf_encoding(rgb / rgb.max()))
+    np.testing.assert_allclose([int(found.sRGB[i : i + 2], 16) for i in (1, 3, 5)], wanted, atol=1)
+
+
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -480,8 +499,11 @@ def test_the_slide_of_one_row_shows_whole_periods():
 
 @pytest.mark.slow
 def test_inspect_takes_a_recipe(folder, command):
-    code, out, err = command("inspect foil.toml -o slide.pdf")
+    code, out, err = command("inspect foil.toml -o slide.pdf --angle 0 --view=-20,30 --json n.json")
     assert (code, err) == (0, "")
+    first, second = json.loads(Path("n.json").read_text())["colours"]
+    assert (first["view"], second["view"]) == (-20, 30)
+    assert re.search(rf"^0° +30° +{second['XYZ'][0]:.4g} .*{second['sRGB']}$", out, re.MULTILINE)
     assert "periodic tile" in out
     assert "another period" in out
     assert Path("slide.pdf").read_bytes().startswith(b"%PDF")
@@ -499,6 +521,9 @@ def test_inspect_takes_a_recipe(folder, command):
         ("inspect waves.npy --pixel-size 0.08 --json nowhere/n.json", "--json: got nowhere/n.json"),
         ("inspect foil.toml --pixel-size 0.1", "go with a scan"),
         ("inspect grey.png --pixel-size 0.1 -o ./grey.png", "which is read"),
+        ("inspect foil.toml --angle 30", "--angle: got 30 without --view"),
+        ("inspect foil.toml --view 30:", "--view: got '30:', wanted a number"),
+        ("inspect foil.toml --view 10,95", "--view: got 95, wanted degrees above −90 and below 90"),
     ],
 )
 def test_a_mistake_is_one_line_and_exit_code_2(folder, command, arguments, words):
