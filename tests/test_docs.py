@@ -12,6 +12,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 import pytest
+import yaml
 from markdown.extensions.toc import slugify
 from mkdocs.commands.build import build
 from mkdocs.config import load_config
@@ -205,6 +206,41 @@ def test_the_page_on_python_names_the_public_interface():
         parameters = inspect.signature(named_by(summary[0])).parameters
         for argument in summary[1].split(", "):
             assert argument.split("=")[0] == "…" or argument.split("=")[0] in parameters, summary
+
+
+def test_the_reference_has_all_public_names():
+    page = (ROOT / "docs" / "reference.md").read_text()
+    named = re.findall(r"^::: (mitsuba_diffraction\.[\w.]+)$", page, re.MULTILINE)
+    objects = [named_by(name) for name in named]
+    for name in md.__all__:
+        found = getattr(md, name)
+        inside = [
+            object for object in objects if getattr(object, "__module__", "").startswith(f"{md.__name__}.{name}.")
+        ]
+        assert inside or any(found is object for object in objects), name
+
+
+def test_ruff_of_pre_commit_is_that_of_ci():
+    hooks = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text())["repos"][0]["hooks"]
+    assert [hook["entry"].split()[:2] for hook in hooks] == [["ruff", "check"], ["ruff", "format"]]
+    rule = re.search(r'"(ruff[^"]*)"', (ROOT / "pyproject.toml").read_text())[1]
+    assert all(hook["additional_dependencies"] == [rule] for hook in hooks)
+
+
+def test_the_workflow_runs_ci_on_the_oldest_and_newest_python():
+    (job,) = yaml.safe_load((ROOT / ".github" / "workflows" / "ci.yml").read_text())["jobs"].values()
+    oldest, excluded = re.search(
+        r'requires-python = ">=3\.(\d+),<3\.(\d+)"', (ROOT / "pyproject.toml").read_text()
+    ).groups()
+    assert job["strategy"]["matrix"]["python"] == [f"3.{oldest}", f"3.{int(excluded) - 1}"]
+    assert job["steps"][-1]["run"] == ".ci/run"
+
+
+def test_the_manual_is_built_strictly_on_read_the_docs():
+    assert load_config(str(ROOT / "mkdocs.yml")).strict
+    settings = yaml.safe_load((ROOT / ".readthedocs.yaml").read_text())
+    assert settings["mkdocs"] == {"configuration": "mkdocs.yml", "fail_on_warning": True}
+    assert settings["python"]["install"] == [{"method": "pip", "path": ".", "extra_requirements": ["docs"]}]
 
 
 def test_the_files_that_the_readme_names_exist():
