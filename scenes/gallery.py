@@ -3,7 +3,7 @@
     python scenes/gallery.py                 # every picture
     python scenes/gallery.py foil_sun        # some
     python scenes/gallery.py --write         # new references, after an intended change
-    python scenes/gallery.py --compress      # reduce the pictures in docs/gallery to less than 500 kB each
+    python scenes/gallery.py --compress      # previews in docs/gallery become JPEG files of less than 500 kB
 
 The commands are those of docs/gallery.md: first the scripts that generate the models, if they are missing, then each
 `mitsuba-diffraction render … -o docs/gallery/NAME.exr`, at 160 × 90 pixels and 8 samples per pixel.
@@ -30,11 +30,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import colour
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
-from scipy import cluster, stats
+from scipy import stats
 
 from mitsuba_diffraction.cli import app
 from mitsuba_diffraction.color import into_gamut, spectrum_to_linear_sRGB
@@ -46,7 +45,7 @@ REFERENCES = Path(__file__).with_name("gallery.npz")
 SIZE, SAMPLES, SQUARES = (160, 90), 8, (10, 30)
 SEEDS = 12  # of the references
 SIGNIFICANCE = 1e-3
-MAX_FILE_SIZE = 500_000  # bytes
+MAX_FILE_SIZE, QUALITIES = 500_000, (95, 92, 90, 87, 85, 80)  # bytes; of JPEG
 
 Array = NDArray[np.float64]
 
@@ -177,41 +176,30 @@ def save(references: Mapping[str, Reference], path: Path) -> None:
         np.savez_compressed(temporary, **arrays)
 
 
-def compress(path: Path) -> int:
-    """Reduce a picture of 500 kB or more to a palette; return the number of colours, 0 for a smaller file.
+def compress(path: Path) -> tuple[Path, int]:
+    """Replace a preview (.png) by a JPEG file in true colour; return its name and quality.
+
+    The quality is the highest of `QUALITIES` for which the file is smaller than 500 kB. Chroma has the full resolution,
+    as spectra have fine lines of different colour and equal luminance.
 
     Raises:
-        ValueError: if 32 colours are too many.
+        ValueError: if the file has a palette, whose dots would be kept, or is too large at the lowest quality.
     """
-    if path.stat().st_size < MAX_FILE_SIZE:
-        return 0
     with Image.open(path) as picture:
-        picture = picture.convert("RGB")
-    for colours in (256, 192, 128, 96, 64, 48, 32):
-        stream = io.BytesIO()
-        reduced = picture.quantize(palette=palette(picture, colours), dither=Image.Dither.FLOYDSTEINBERG)
-        reduced.save(stream, "PNG", optimize=True)
-        if stream.tell() < MAX_FILE_SIZE:
-            with whole_file(path) as temporary:
-                temporary.write_bytes(stream.getvalue())
-            return colours
-    raise ValueError(f"{path}: got more than {MAX_FILE_SIZE // 1000} kB with 32 colours, wanted less noise")
-
-
-def palette(picture: Image.Image, colours: int) -> Image.Image:
-    """Return a palette for a picture by k-means in Oklab.
-
-    The weight of a colour is the number of its pixels to the power 0.4: gratings show rare colours in few pixels.
-    """
-    found, counts = np.unique(np.asarray(picture).reshape(-1, 3) // 4, axis=0, return_counts=True)
-    weights = counts**0.4
-    drawn = found[np.random.default_rng(0).choice(len(found), 50_000, p=weights / weights.sum())]
-    points = colour.XYZ_to_Oklab(colour.sRGB_to_XYZ((4 * drawn + 2) / 255))
-    centres, _ = cluster.vq.kmeans2(points, colours, minit="++", rng=0)
-    rgb = np.clip(colour.XYZ_to_sRGB(colour.Oklab_to_XYZ(centres)), 0, 1)
-    result = Image.new("P", (1, 1))
-    result.putpalette(np.round(255 * rgb).astype(np.uint8).ravel().tolist())
-    return result
+        if picture.mode != "RGB":
+            raise ValueError(f"{path.name}: got mode {picture.mode}, wanted true colour: render it anew")
+        for quality in QUALITIES:
+            stream = io.BytesIO()
+            picture.save(stream, "JPEG", quality=quality, subsampling="4:4:4", optimize=True, progressive=True)
+            if stream.tell() < MAX_FILE_SIZE:
+                break
+        else:
+            raise ValueError(f"{path.name}: got {stream.tell() // 1000} kB at quality {quality}, wanted less noise")
+    target = path.with_suffix(".jpg")
+    with whole_file(target) as temporary:
+        temporary.write_bytes(stream.getvalue())
+    path.unlink()
+    return target, quality
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -223,8 +211,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     if options.compress:
         for path in sorted((ROOT / "docs" / "gallery").glob("*.png")):
-            colours = compress(path)
-            print(f"{path.name}: {path.stat().st_size // 1000} kB, {f'{colours} colours' if colours else 'as it was'}")
+            try:
+                target, quality = compress(path)
+                print(f"{target.name}: {target.stat().st_size // 1000} kB, quality {quality}")
+            except ValueError as error:
+                print(error)
         return 0
     models, renderings = commands([ROOT / "docs" / "gallery.md"])
     if unknown := set(options.names) - set(renderings):

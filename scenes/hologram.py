@@ -23,7 +23,9 @@ from scipy.special import j1, jnp_zeros
 
 from mitsuba_diffraction.color import spectrum_to_linear_sRGB
 
-PICTURE = Path(__file__).parents[1] / "docs" / "gallery" / "snake_xenopeltis_sun.png"
+_GALLERY = Path(__file__).parents[1] / "docs" / "gallery"
+# A preview (.png), or what gallery.py makes of it.
+PICTURE = next(_GALLERY.glob("snake_xenopeltis_sun.[jp]*g"), _GALLERY / "snake_xenopeltis_sun.jpg")
 PERIOD, DEPTH = 1.5, 0.25  # µm, as in hologram.xml
 WIDTH = 16.0  # cm, of the hologram; its height is that of the picture
 WAVELENGTHS = np.array([0.620, 0.535, 0.460])  # µm, of the stripes

@@ -244,7 +244,9 @@ def test_the_manual_is_built_strictly_on_read_the_docs():
 
 
 def test_the_files_that_the_readme_names_exist():
-    named = re.findall(r"(?:scenes|docs|precompute|notebooks)/[\w./]+\.(?:xml|png|toml|ipynb|md)", PAGES[0].read_text())
+    named = re.findall(
+        r"(?:scenes|docs|precompute|notebooks)/[\w./]+\.(?:xml|png|jpg|toml|ipynb|md)", PAGES[0].read_text()
+    )
     assert len(named) >= 5
     for name in named:
         assert (ROOT / name).is_file(), name
