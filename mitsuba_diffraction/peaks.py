@@ -74,7 +74,9 @@ def peak_efficiencies(
         spectrum: of a sample, or of a tile whose orders overlap.
         angles: of incidence, degrees, one or (a,), above −90 and below 90.
         wavelengths: nm, one or (w,), for which the spectrum was built.
-        material, int_ior, azimuth: as of `efficiencies`.
+        material: as of `efficiencies`.
+        int_ior: likewise.
+        azimuth: likewise.
         progress: called with (steps done, steps in all).
 
     Raises:

@@ -380,7 +380,8 @@ class RigorousSpectrum:
 
         Args:
             m: orders, broadcast against the others.
-            c, g: as above.
+            c: as above.
+            g: as above.
             wavelength: µm, in the medium of side 0.
             sides: of ω_i and of ω_o, 0 above and 1 below.
             mueller: whether to return M_ij, (…, 4, 4), for k_y ≥ 0.
