@@ -118,7 +118,9 @@ def test_the_command_answers_for_scan_recipe_and_spectrum(command, scan, sinusoi
         ("scan.npy --pixel-size 1 --wavelength 300", "wavelengths: got 300, wanted nm from 360 to 830"),
         ("scan.npy --pixel-size 1 --material Alu", "material: got 'Alu'"),
         ("scan.npy --pixel-size 1 --angle 90", "--angle: got 90, wanted degrees above −90 and below 90"),
-        ("blazed --pixel-size 1", "blazed: got pixel_size with a profile, wanted them with a scan"),
+        ("scan.npy,depth=1 --pixel-size 1", "scan.npy: got depth, wanted the options of a scan"),
+        ("blazed --pixel-size 1", "blazed: got pixel_size, wanted some of period, depth, "),
+        ("blazed,dept=1", "blazed: got dept, wanted some of period, depth, "),
     ],
 )
 def test_wrong_commands_are_refused(command, scan, line, message):

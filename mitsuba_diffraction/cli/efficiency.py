@@ -15,7 +15,7 @@ from ..outputs import check_outputs
 from ..peaks import check_request, peak_efficiencies
 from ..precomputation import load_spectrum
 from ..progress import progress_bar, tell
-from ..recipe import Recipe
+from ..recipe import Recipe, parameters_of_profile
 from ..settings import Settings
 from .arguments import (
     Channel,
@@ -134,12 +134,16 @@ def efficiency(
 
 def _recipe(name: str, values: dict[str, Value], of_scan: dict[str, Any], of_spectrum: dict[str, Any]) -> Recipe:
     """Return the recipe of a scan, of a profile, or in a file."""
-    if is_scan(name):
-        # A scan is rarely cut to a whole number of periods.
-        return recipe_of(Path(name), of_scan, {"extent": "sample", **of_spectrum})
     if Path(name).suffix.lower() == ".toml":
         recipe = recipe_of(Path(name), of_scan, of_spectrum)
         return Recipe({**recipe.surface, **values}, recipe.settings, recipe.folder)
-    if of_scan:
-        raise RequestError(f"{name}: got {', '.join(of_scan)} with a profile, wanted them with a scan")
-    return Recipe.of_profile(name, values, **of_spectrum)
+    if is_scan(name):
+        recipe = recipe_of(Path(name), of_scan, {"extent": "sample", **of_spectrum})  # rarely cut to whole periods
+        unknown, wanted = list(values), "the options of a scan, such as --pixel-size"
+    else:
+        recipe = Recipe.of_profile(name, values, **of_spectrum)
+        known = parameters_of_profile(name)
+        unknown, wanted = [*of_scan, *(key for key in values if key not in known)], f"some of {', '.join(known)}"
+    if unknown:
+        raise RequestError(f"{name}: got {', '.join(unknown)}, wanted {wanted}")
+    return recipe
