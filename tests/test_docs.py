@@ -64,7 +64,10 @@ def folder(tmp_path, monkeypatch):
 def same(printed, shown):
     """Whether two outputs have the same words, and numbers that agree to a thousandth."""
     (words, values), (others, wanted) = (
-        (NUMBER.sub("#", re.sub(r"\[\s+", "[", " ".join(text.split()))), [float(n) for n in NUMBER.findall(text)])
+        (
+            NUMBER.sub("#", re.sub(r"\[\s+", "[", " ".join(text.split()))),
+            [float(n.replace("−", "-")) for n in NUMBER.findall(text)],
+        )
         for text in (printed, shown)
     )
     assert words == others
