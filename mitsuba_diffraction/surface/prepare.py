@@ -181,8 +181,9 @@ def mask_outliers(height_field: HeightField, factor: float = 2.25) -> HeightFiel
     for deviation in (relative, -relative):
         edge = np.percentile(deviation, _OUTLIER_PERCENTILE)
         regions, count = ndimage.label(deviation > edge)
-        is_outlier = ndimage.maximum(deviation, regions, np.arange(count + 1)) > factor * edge
-        outliers |= is_outlier[regions] & (regions > 0)
+        is_outlier = np.zeros(count + 1, bool)
+        is_outlier[regions[deviation > factor * edge]] = True
+        outliers |= is_outlier[regions]
     outliers = ndimage.binary_dilation(outliers, np.ones((3, 3)), _OUTLIER_MARGIN) & ~gaps
     masked = np.where(outliers, np.nan, height_field.heights)
     _check_any("mask_outliers", masked)
