@@ -15,9 +15,11 @@ from numpy.typing import NDArray
 from ..errors import RequestError
 from ..outputs import MARK
 from ..rigorous.materials import conductor
-from ..settings import VISIBLE
+from ..settings import SUN_COHERENCE_LENGTH, VISIBLE
 from ..spectrum.grids import OrderGrid
+from ..spectrum.sample import UNIFORM, effective_coherence_length, window_axes
 from ..spectrum.tables import HALF_SCALE
+from ..surface.heightfield import HeightField
 from .arrays import encoded
 from .coil import coil
 from .surface import Surface
@@ -145,13 +147,30 @@ def _heights(surface: Surface) -> dict[str, Any] | None:
     piece = field.heights[tuple(slice(i, i + MAX_HEIGHTS_SIDE) for i in first)]
     height_range = float(np.ptp(piece))
     numbers = np.rint((piece - piece.min()) * (65535 / (height_range or 1.0))).astype(np.uint16)
+    lengths = {"own": surface.spectrum.coherence_length, "sun": SUN_COHERENCE_LENGTH}
+    is_sample = surface.recipe.settings.extent == "sample"
     return {
         "values": encoded(numbers),
         "shape": piece.shape,
         "range": height_range,
         "pixel_size": field.pixel_size,
-        "is_piece": piece.shape != field.shape,
+        "windows": {
+            name: _windows(HeightField(piece, field.pixel_size), length) for name, length in lengths.items() if is_sample
+        },
     }
+
+
+def _windows(sample: HeightField, coherence_length: float) -> dict[str, Any]:
+    """Return the coherence length that a sample supports, and Σ_p a²(x − x_p) of its windows along x and y."""
+    length = effective_coherence_length(sample, coherence_length)
+    squares = []
+    for axis, count in zip(window_axes(sample, length), sample.shape[::-1], strict=True):
+        window, starts = axis or UNIFORM
+        sums = np.zeros(count)
+        for start in starts:
+            sums[start : start + len(window)] += window**2
+        squares.append(encoded(sums.astype(np.float32)))
+    return {"length": length, "squares": squares}
 
 
 def _nanometres() -> NDArray[np.float64]:

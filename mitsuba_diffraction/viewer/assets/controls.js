@@ -79,7 +79,7 @@ class Controls {
     const split = compares && !state.difference;
     for (const name of ["divider", "left-name", "right-name"]) $(name).hidden = !split;
     $("legend").hidden = !(compares && state.difference);
-    $("right-name").textContent = isShader ? `${state.right.toUpperCase()}, 2014` : "reference";
+    $("right-name").textContent = isShader ? `${state.right.toUpperCase().replace("_", " with ")}, 2014` : "reference";
     $("divider").style.left = `${100 * state.divider}%`;
     $("divider").setAttribute("aria-valuenow", Math.round(100 * state.divider));
     for (const button of document.querySelectorAll("[name=drag]")) button.checked = button.value === state.drag;

@@ -62,7 +62,8 @@ async function start() {
     picture: data.picture && (await pictureOf(gl, data.picture)),
   };
   const renderer = new Renderer(gl, data, tables);
-  const shader2014 = data.heights && new Shader2014(gl, data.heights, (await decoded(data.heights.values)).values, renderer.spectrum);
+  const shader2014 = data.heights && new Shader2014(
+    gl, data.heights, (await decoded(data.heights.values)).values, await tapersOf(data.heights), renderer.spectrum);
   const state = initialState(data);
   let dirty = true;
   let exposed = { model: false, shader: false };
@@ -91,16 +92,16 @@ async function start() {
 
   // Makes what the chosen shader needs; true when it can draw.
   let preparing = false;
-  let fromLowest = null;
+  let textures = null;
   function prepared() {
     const wanted = state.right in VARIANTS ? state.right : "none";
-    if (wanted !== "none" && state.quirks.heights_from_zero !== fromLowest) {
+    if (wanted !== "none" && shader2014.kindOf(state) !== textures) {
       if (!preparing) {
         preparing = true;
-        const lowest = state.quirks.heights_from_zero;
+        const kind = shader2014.kindOf(state);
         const progress = (x) => { $("progress").textContent = x < 1 ? `transforms of the heights: ${Math.round(100 * x)} %` : ""; };
-        shader2014.prepare(lowest, progress).then(() => {
-          [preparing, fromLowest, dirty] = [false, lowest, true];
+        shader2014.prepare(state, progress).then(() => {
+          [preparing, textures, dirty] = [false, kind, true];
         });
       }
       if (variant !== wanted) renderer.setShader(null, null);
@@ -169,7 +170,7 @@ async function start() {
     set: (changes) => controls.set(changes),
     evaluate: (pairs) => Array.from(renderer.evaluatePairs(state, Float32Array.from(pairs))),
     evaluateShader: async (pairs) => {
-      await shader2014.prepare(state.quirks.heights_from_zero, () => {});
+      await shader2014.prepare(state, () => {});
       return Array.from(renderer.evaluateShader(shader2014, state, Float32Array.from(pairs)));
     },
     command: () => commandOf(data, state, tables.coil),

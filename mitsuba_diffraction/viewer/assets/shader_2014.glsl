@@ -1,6 +1,8 @@
 // The shader of 2014 (evaluation/realtime_shader of the package): colour of a tile by Taylor textures, wavelength by
-// wavelength. VARIANT is one of the four; a quirk is a departure of the published code that can be switched off.
-const int FLSS = 0, NMM = 1, PQ = 2, GEM = 3;
+// wavelength. VARIANT is that of VARIANTS in shader_2014.js; a quirk is a departure of the published code that can be
+// switched off.
+#define OF_ORDERS (VARIANT == 1 || VARIANT == 4)
+#define OF_TILES (VARIANT == 2 || VARIANT == 4)
 
 uniform highp sampler2DArray uTexels;  // F{t^n}(m), t = h/H: columns m_x, rows m_y, layers n
 uniform ivec2 uTexelOrder;             // largest |m| of the texture
@@ -9,6 +11,7 @@ uniform vec2 uTile;                    // um
 uniform float uHeight;                 // H in um
 uniform int uTerms;
 uniform float uWindowSigma;            // sigma_f in cycles/um
+uniform vec2 uWindowSigmas;            // along both axes, less for a tapered scan
 uniform ivec2 uRadius;                 // texels of the window on each side
 uniform ivec2 uTiles;                  // of PQ
 uniform float uSpacing;                // of GEM, um
@@ -29,7 +32,6 @@ struct Pair {
   vec3 uvw;
   float cosHalf;
   float factor;
-  float slope;
 };
 
 // X, Y, Z per nm, and R at normal incidence.
@@ -69,8 +71,9 @@ vec2 amplitude(ivec2 m, float x) {
 }
 
 float phi(ivec2 m, vec2 at, vec2 stretch) {
-  vec2 d = (vec2(m) - at) / (1.41421356 * uWindowSigma * uTile) * stretch;
-  return (uWindowPi ? 3.14159265 : 1.0) * exp(-dot(d, d));
+  vec2 d = (vec2(m) - at) / (1.41421356 * uWindowSigmas * uTile) * stretch;
+  float height = uWindowSigma * inversesqrt(uWindowSigmas.x * uWindowSigmas.y);
+  return (uWindowPi ? 3.14159265 : 1.0) * height * exp(-dot(d, d));
 }
 
 // |sum phi F|^2 or sum phi^2 |F|^2 about `at`, in texels; with an axis, only of the `order` along it.
@@ -91,7 +94,7 @@ float windowed(vec2 at, vec2 middle, float x, ivec2 radius, vec2 stretch, int ax
   return uComplexSum ? dot(total, total) : powers;
 }
 
-#if VARIANT == 2
+#if OF_TILES
 // sin(pi x); that of GLSL is precise in absolute terms only, and not always then.
 float sinPi(float x) {
   float k = roundEven(x), r = x - k, s = r * r;
@@ -137,11 +140,42 @@ float kernel(float t, int count) {
 }
 #endif
 
+#if VARIANT == 4
+// The integral of sinc^2(N t) sinc^2(M (rho t + delta)) over t, for N tiles and M across.
+float lineArea(float tiles, float across, float rho, float delta) {
+  bool wide = across * rho <= tiles;
+  float ratio = wide ? across * rho / tiles : tiles / max(across * rho, 1e-6);
+  float turns = abs(delta * (wide ? across : tiles / max(rho, 1e-6))), c = 6.28318531 * turns;
+  float first = 0.5 - c * c / 24.0, second = c * c / 30.0 - 1.0 / 3.0;
+  if (c >= 0.1) {
+    float halfSine = sinPi(turns), below = 2.0 * halfSine * halfSine;
+    first = below / (c * c);
+    second = (1.0 - below - sinPi(2.0 * turns) / c) / (c * c);
+  }
+  return max(2.0 * ((1.0 + ratio) * first + 2.0 * ratio * second), 0.0) / (wide ? tiles : across * rho);
+}
+
+// sum_m |F_nm|^2 I_m over the three orders m about `at` across the axis.
+float linePower(vec2 at, float x, int axis) {
+  int across = 1 - axis;
+  float order = roundEven(at[axis]), rho = abs(at[across] / order);
+  ivec2 m = ivec2(clamp(roundEven(at), -1e6, 1e6));
+  float total = 0.0;
+  m[across] -= 1;
+  for (int k = 0; k < 3; k++) {
+    vec2 f = amplitude(m, x);
+    total += dot(f, f) * lineArea(float(uTiles[axis]), float(uTiles[across]), rho, at[across] - float(m[across]));
+    m[across] += 1;
+  }
+  return total;
+}
+#endif
+
 // |P(q; kappa)|^2, one for a flat mirror at q = 0.
 float powerAt(Pair pair, float lambda) {
   vec2 at = pair.uvw.xy * uTile / lambda;
   float x = -6.28318531 * pair.uvw.z / lambda * uHeightScale * uHeight;
-#if VARIANT == 2
+#if OF_TILES
   if (any(greaterThan(abs(at), 0.5 * vec2(uPixels)))) return 0.0;
   ivec2 first = ivec2(uFloor ? floor(at) : roundEven(at)) - 1;
   vec2 total = vec2(0.0);
@@ -169,7 +203,10 @@ vec3 overWavelengths(Pair pair, float peak) {
     float nanometres = FIRST + STEP * float(j);
     vec4 weights = weightsAt(nanometres, peak);
     float width = (j == 0 || j == COUNT - 1 ? 0.5 * STEP : STEP) * fresnelRatio(weights.w, pair.cosHalf);
-#if VARIANT == 1
+#if VARIANT == 4
+    // Order zero of the axis along which the others are.
+    width *= max(abs(pair.uvw.x) * uTile.x, abs(pair.uvw.y) * uTile.y) < 0.5e-3 * nanometres ? powerAt(pair, 1e-3 * nanometres) : 0.0;
+#elif VARIANT == 1
     // Order zero alone.
     float lambda = 1e-3 * nanometres, x = -6.28318531 * pair.uvw.z / lambda * uHeightScale * uHeight;
     width *= windowed(pair.uvw.xy * uTile / lambda, vec2(0.0), x, ivec2(0), vec2(1.0), -1, 0);
@@ -181,12 +218,12 @@ vec3 overWavelengths(Pair pair, float peak) {
   return result;
 }
 
-#if VARIANT == 1
+#if OF_ORDERS
 // Only the wavelengths of the orders, lambda = d u/n.
 vec3 overOrders(Pair pair, float peak) {
-  vec2 paths = abs(pair.uvw.xy) * uTile;
+  vec2 paths = abs(pair.uvw.xy) * uTile, inSigmas = pair.uvw.xy / uWindowSigmas;
   int axis = paths.x >= paths.y ? 0 : 1;
-  float path = 1e3 * paths[axis], along = abs(pair.uvw[axis]);
+  float path = 1e3 * paths[axis];
   int first = max(int(ceil(path / LAST)), 1), last = int(floor(path / FIRST));
   vec3 result = vec3(0.0);
   for (int n = first; n <= last; n++) {
@@ -194,12 +231,18 @@ vec3 overOrders(Pair pair, float peak) {
     vec2 at = pair.uvw.xy * uTile / lambda;
     float x = -6.28318531 * pair.uvw.z / lambda * uHeightScale * uHeight, width = STEP, power;
     if (uNoJacobian) {
-      power = windowed(at, at, x, uRadius, vec2(1.0), -1, 0);
+      power = powerAt(pair, lambda);
     } else {
-      float tilt = along / pair.slope;
+#if VARIANT == 4
+      power = linePower(at, x, axis);
+      width = nanometres * nanometres / path;
+#else
+      // In units of sigma, in which the window is round.
+      float slope = length(inSigmas), tilt = abs(inSigmas[axis]) / slope;
       vec2 stretch = axis == 0 ? vec2(0.0, tilt) : vec2(tilt, 0.0);
       power = windowed(at, at, x, uRadius, stretch, axis, int(roundEven(at[axis])));
-      width = 1.77245385 * uWindowSigma * nanometres * nanometres * 1e-3 / pair.slope;
+      width = 1.77245385 * nanometres * nanometres * 1e-3 / slope;
+#endif
     }
     vec4 weights = weightsAt(nanometres, peak);
     result += power * width * fresnelRatio(weights.w, pair.cosHalf) * weights.xyz;
@@ -229,17 +272,18 @@ vec3 shaderRGB(vec3 wi, vec3 wo) {
   Pair pair;
   pair.uvw = -wi - wo;
   float square = dot(pair.uvw.xy, pair.uvw.xy), cosines = max(wi.z, 1e-7);
-  pair.slope = sqrt(square);
   pair.cosHalf = 0.5 * length(pair.uvw);
   pair.factor = kG(vec2(cosines * cosines, wo.z * wo.z), square) * cosines;
-#if VARIANT == 2
+#if OF_TILES
   float peak = uTile.x * uTile.y * float(uTiles.x * uTiles.y);
 #else
   float peak = 1.0 / (3.14159265 * uWindowSigma * uWindowSigma);
 #endif
 #if VARIANT == 1
   vec3 xyz = overOrders(pair, peak);
-  if (pair.slope * 1e3 / LAST < 4.0 * uWindowSigma) xyz += overWavelengths(pair, peak);
+  if (length(pair.uvw.xy / uWindowSigmas) * 1e3 / LAST < 4.0) xyz += overWavelengths(pair, peak);
+#elif VARIANT == 4
+  vec3 xyz = overOrders(pair, peak) + overWavelengths(pair, peak);
 #else
   vec3 xyz = overWavelengths(pair, peak);
 #endif

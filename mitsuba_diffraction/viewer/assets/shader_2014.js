@@ -1,28 +1,34 @@
 // The shader of 2014: its textures, and its uniforms.
 
-const VARIANTS = { flss: 0, nmm: 1, pq: 2, gem: 3 };
+const VARIANTS = { flss: 0, nmm: 1, pq: 2, gem: 3, nmm_pq: 4 };
 const MAX_TERMS = 45;
 
+const WINDOWS = ["flss", "nmm"];
+const TILES = ["pq", "nmm_pq"];
+const SERIES = [...WINDOWS, ...TILES];
+
+// Their names, and the variants that have them.
 const QUIRKS = {
-  fresnel_squared: ["Fresnel squared", ["flss", "nmm", "pq"]],
-  schlick: ["Schlick's Fresnel", ["flss", "nmm", "pq"]],
-  fixed_index: ["index 1.5 for every material", ["flss", "nmm", "pq"]],
-  window_pi: ["window times π", ["flss", "nmm"]],
-  complex_window_sum: ["complex sum over the window", ["flss", "nmm"]],
-  one_texel: ["window of one texel", ["flss", "nmm"]],
-  fixed_coherence: ["coherence length of 65 µm", ["flss", "nmm", "pq"]],
-  floor_anchor: ["window about floor(q T)", ["flss", "nmm", "pq"]],
-  heights_from_zero: ["heights from the lowest point", ["flss", "nmm", "pq"]],
-  no_jacobian: ["no dλ/dn", ["nmm"]],
-  wrong_product: ["wrong imaginary part", ["pq"]],
-  relative: ["relative radiance (no 1/λ²)", ["flss", "nmm", "pq"]],
-  d65_twice: ["D65 twice", ["flss", "nmm", "pq"]],
-  cie_rgb_matrix: ["CIE RGB shown as sRGB", ["flss", "nmm", "pq"]],
-  power_gamma: ["gamma 2.5", ["flss", "nmm", "pq", "gem"]],
-  constant_blend: ["constant blend with the pigment", ["flss", "nmm", "pq", "gem"]],
+  fresnel_squared: ["Fresnel squared", SERIES],
+  schlick: ["Schlick's Fresnel", SERIES],
+  fixed_index: ["index 1.5 for every material", SERIES],
+  window_pi: ["window times π", WINDOWS],
+  complex_window_sum: ["complex sum over the window", WINDOWS],
+  one_texel: ["window of one texel", WINDOWS],
+  fixed_coherence: ["coherence length of 65 µm", SERIES],
+  periodic_scan: ["scan as one period", WINDOWS],
+  floor_anchor: ["window about floor(q T)", SERIES],
+  heights_from_zero: ["heights from the lowest point", SERIES],
+  no_jacobian: ["no dλ/dn", ["nmm", "nmm_pq"]],
+  wrong_product: ["wrong imaginary part", TILES],
+  relative: ["relative radiance (no 1/λ²)", SERIES],
+  d65_twice: ["D65 twice", SERIES],
+  cie_rgb_matrix: ["CIE RGB shown as sRGB", SERIES],
+  power_gamma: ["gamma 2.5", [...SERIES, "gem"]],
+  constant_blend: ["constant blend with the pigment", [...SERIES, "gem"]],
   infrared_rainbow: ["rainbow of 0.5 to 1 µm", ["gem"]],
 };
-const PUBLISHED_TERMS = { flss: 37, nmm: 31, pq: 39, gem: 37 };
+const PUBLISHED_TERMS = { flss: 37, nmm: 31, pq: 39, nmm_pq: 39, gem: 37 };
 const allQuirks = (on) => Object.fromEntries(Object.keys(QUIRKS).map((name) => [name, on]));
 
 const RGB_TO_XYZ = [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]];
@@ -77,9 +83,32 @@ function circle(count) {
   return circles.get(count);
 }
 
+// The taper along one axis, and the coherence length 4 sigma of the window in return (taper.py of the package), from the
+// sum of the squared windows at the pixels.
+function taperOf(squares, pixel, length) {
+  const count = squares.length;
+  const total = squares.reduce((a, b) => a + b);
+  const variance = squares.reduce((a, square, i) => a + square * ((i - (count - 1) / 2) * pixel) ** 2, 0) / total;
+  const inverse = Math.max(16 / length ** 2 - 1 / (2 * variance), 1 / (count * pixel) ** 2);
+  return { values: Float64Array.from(squares, (square) => Math.sqrt((square * count) / total)), length: 4 / Math.sqrt(inverse) };
+}
+
+async function tapersOf(heights) {
+  const found = {};
+  for (const [name, { length, squares }] of Object.entries(heights.windows)) {
+    const axis = async (content, k) => {
+      const { values } = await decoded(content);
+      // An axis of one pixel.
+      return values.length === 1 ? { values, length } : taperOf(values, heights.pixel_size[k], length);
+    };
+    found[name] = await Promise.all(squares.map(axis));
+  }
+  return found;
+}
+
 class Shader2014 {
-  constructor(gl, heights, values, model) {
-    Object.assign(this, { gl, heights, model });
+  constructor(gl, heights, values, tapers, model) {
+    Object.assign(this, { gl, heights, tapers, model });
     [this.rows, this.columns] = heights.shape;
     this.tile = [this.columns * heights.pixel_size[0], this.rows * heights.pixel_size[1]];
     this.values = Float64Array.from(values, (v) => (v / 65535) * heights.range);  // from the lowest point
@@ -93,17 +122,33 @@ class Shader2014 {
     return 8 * MAX_TERMS * (2 * this.order[0] + 1) * (2 * this.order[1] + 1);
   }
 
-  // Makes the textures of t^n, t = h/H, with heights from the lowest point or from the middle.
-  async prepare(fromLowest, progress) {
-    if (this.textures.has(fromLowest)) return;
+  // The taper of the heights: of the coherence length of the spectrum or of 65 um, or none.
+  taperOf({ quirks, right }) {
+    if (quirks.periodic_scan || !WINDOWS.includes(right)) return "none";
+    const name = quirks.fixed_coherence ? "sun" : "own";
+    return name in this.tapers ? name : "none";
+  }
+
+  // Which textures a state needs.
+  kindOf(state) {
+    return `${state.quirks.heights_from_zero ? "lowest" : "middle"} ${this.taperOf(state)}`;
+  }
+
+  // Makes the textures of w t^n, t = h/H, with heights from the lowest point or from the middle, and a taper w.
+  async prepare(state, progress) {
+    const kind = this.kindOf(state);
+    if (this.textures.has(kind)) return;
     const { gl, rows, columns, order } = this;
+    const fromLowest = state.quirks.heights_from_zero;
+    const taper = this.tapers[this.taperOf(state)];
     const range = this.heights.range;
     const height = fromLowest ? range : range / 2;
     const t = this.values.map((v) => (range === 0 ? 0 : (fromLowest ? v : v - range / 2) / height));
     const [width, depth] = order.map((m) => 2 * m + 1);
     const made = texture(gl, gl.TEXTURE_2D_ARRAY);
     gl.texStorage3D(gl.TEXTURE_2D_ARRAY, 1, gl.RG32F, width, depth, MAX_TERMS);
-    const powers = new Float64Array(t.length).fill(1);
+    const taperAt = (i) => taper[0].values[i % columns] * taper[1].values[Math.floor(i / columns)];
+    const powers = Float64Array.from(t, (_, i) => (taper ? taperAt(i) : 1));
     const none = new Float64Array(columns);
     for (let n = 0; n < MAX_TERMS; n++) {
       const lines = Array.from({ length: rows }, (_, j) => fourier(powers.subarray(j * columns, (j + 1) * columns), none));
@@ -122,7 +167,7 @@ class Shader2014 {
           layer[2 * (j * width + i) + 1] = im[from] / (rows * columns);
         }
       }
-      if (n === 1) this.spacing = this.strongestPeriod(layer, width, depth);
+      if (n === 1 && !taper) this.spacing = this.strongestPeriod(layer, width, depth);
       gl.bindTexture(gl.TEXTURE_2D_ARRAY, made.texture);
       gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, 0, n, width, depth, 1, gl.RG, gl.FLOAT, layer);
       for (let i = 0; i < t.length; i++) powers[i] *= t[i];
@@ -132,7 +177,7 @@ class Shader2014 {
       }
     }
     progress(1);
-    this.textures.set(fromLowest, { texels: made, height });
+    this.textures.set(kind, { texels: made, height });
   }
 
   strongestPeriod(layer, width, depth) {
@@ -151,13 +196,15 @@ class Shader2014 {
 
   uniforms(state) {
     const { quirks } = state;
-    const { texels, height } = this.textures.get(quirks.heights_from_zero);
+    const { texels, height } = this.textures.get(this.kindOf(state));
     const length = quirks.fixed_coherence ? 65 : state.coherenceLength;
     const sigma = Math.SQRT2 * lobeWidth(length);
+    const taper = this.tapers[this.taperOf(state)];
+    const sigmas = [0, 1].map((axis) => (taper ? (sigma * length) / taper[axis].length : sigma));
     const white = whiteOfShader();
     const matrix = quirks.cie_rgb_matrix ? CIE_RGB : XYZ_TO_RGB;
     const scale = quirks.d65_twice ? white.map((w) => w / white[1]) : [1, 1, 1];
-    const radius = (size) => (quirks.one_texel ? 1 : Math.min(Math.max(Math.ceil(2 * sigma * size - 0.5), 1), 16));
+    const radius = (size, k) => (quirks.one_texel ? 1 : Math.min(Math.max(Math.ceil(2 * sigmas[k] * size - 0.5), 1), 16));
     return {
       ...this.model.uniforms(state),
       uTexels: texels,
@@ -167,6 +214,7 @@ class Shader2014 {
       uHeight: height,
       uTerms: state.terms,
       uWindowSigma: sigma,
+      uWindowSigmas: sigmas,
       uRadius: this.tile.map(radius),
       uTiles: this.tile.map((size) => Math.max(1, Math.round(length / size))),
       uSpacing: this.spacing,
