@@ -13,6 +13,7 @@ from ..errors import RequestError
 from ..precomputation import Spectrum
 from ..progress import progress_bar
 from ..recipe import Recipe
+from ..settings import FROM_RADIUS
 from .base import nested_plugin
 from .geometry import Geometry, Incidence, Interface, rotated
 from .parameters import Media, Scales, check_texture, numbers_from, surface_from
@@ -23,7 +24,6 @@ from .theory import Options, Scattering, theory_of
 # Of defensive samples, for lobes that the averages of the sampler miss. They are uniform in solid angle: where both
 # directions are grazing, K G grows so fast that samples in proportion to the cosine would have large weights.
 UNIFORM_PROBABILITY = 0.02
-_FROM_RADIUS = {"radial": 0.0, "tangential": 90.0}  # degrees
 _per_cent = functools.partial(progress_bar, unit="%")
 
 
@@ -58,9 +58,9 @@ class GratingRequest:
         angle = props.get("orientation", 0.0)
         if isinstance(angle, float) and not np.isfinite(angle):
             raise RequestError(f"orientation: got {angle}, wanted degrees or a texture")
-        from_radius = angle in tuple(_FROM_RADIUS)
+        from_radius = angle in tuple(FROM_RADIUS)
         if from_radius:
-            orientation = nested_plugin("uniform", value=_FROM_RADIUS[angle])
+            orientation = nested_plugin("uniform", value=FROM_RADIUS[angle])
         elif isinstance(angle, str):
             orientation = numbers_from("orientation", angle, 360.0, "radial, tangential, ")
         else:

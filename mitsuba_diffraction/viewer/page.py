@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..errors import RequestError
 from ..outputs import MARK
 from ..rigorous.materials import conductor
-from ..settings import SUN_COHERENCE_LENGTH, VISIBLE
+from ..settings import FROM_RADIUS, SUN_COHERENCE_LENGTH, VISIBLE
 from ..spectrum.grids import OrderGrid
 from ..spectrum.sample import UNIFORM, effective_coherence_length, window_axes
 from ..spectrum.tables import HALF_SCALE
@@ -94,13 +94,22 @@ def _data(surface: Surface, picture: NDArray[np.float16] | None) -> dict[str, An
         "version": metadata.version("mitsuba_diffraction"),
         "grating": dict(surface.grating),
         "command": surface.command,
-        "material": vars(surface.material) | {"max_height_scale": surface.max_height_scale},
+        "material": _material(surface),
         "spectrum": _spectrum(surface),
         "metals": _metals(surface.material.material),
         "light": encoded(_light()),
         "coil": coil(),
         "heights": _heights(surface),
         "picture": None if picture is None else encoded(picture),
+    }
+
+
+def _material(surface: Surface) -> dict[str, Any]:
+    orientation = surface.material.orientation
+    return vars(surface.material) | {
+        "orientation": FROM_RADIUS.get(orientation, orientation) if isinstance(orientation, str) else orientation,
+        "from_radius": orientation in FROM_RADIUS,
+        "max_height_scale": surface.max_height_scale,
     }
 
 
@@ -155,7 +164,9 @@ def _heights(surface: Surface) -> dict[str, Any] | None:
         "range": height_range,
         "pixel_size": field.pixel_size,
         "windows": {
-            name: _windows(HeightField(piece, field.pixel_size), length) for name, length in lengths.items() if is_sample
+            name: _windows(HeightField(piece, field.pixel_size), length)
+            for name, length in lengths.items()
+            if is_sample
         },
     }
 

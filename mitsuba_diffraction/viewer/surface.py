@@ -14,6 +14,7 @@ from ..grating_spectrum import GratingSpectrum
 from ..precomputation import Spectrum, load_spectrum
 from ..progress import Progress, no_progress
 from ..recipe import Recipe, parameters_of_profile
+from ..settings import FROM_RADIUS
 from ..spectrum.tables import SliceTable
 from ..surface.gratings import PROFILES
 
@@ -36,19 +37,21 @@ class Material:
     Attributes:
         int_ior: index of refraction of a dielectric.
         material: or a conductor by Mitsuba's name, or "none", the perfect mirror.
-        orientation: degrees from the tangent to the pattern's x axis.
+        orientation: degrees from the tangent to the pattern's x axis; or radial or tangential.
         height_scale: factor of the heights.
     """
 
     int_ior: float = 1.5
     material: str = ""
-    orientation: float = 0.0
+    orientation: float | str = 0.0
     height_scale: float = 1.0
 
     def __post_init__(self) -> None:
-        for name in ("int_ior", "orientation", "height_scale"):
+        for name in ("int_ior", "height_scale"):
             if not is_number(value := getattr(self, name)):
                 raise RequestError(f"{name}: got {value!r}, wanted a number")
+        if self.orientation not in tuple(FROM_RADIUS) and not is_number(self.orientation):
+            raise RequestError(f"orientation: got {self.orientation!r}, wanted degrees, radial or tangential")
         if not 1 < self.int_ior <= 10:
             raise RequestError(f"int_ior: got {self.int_ior!r}, wanted an index above 1, at most 10")
         if not self.height_scale >= 0:

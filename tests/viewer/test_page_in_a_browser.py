@@ -1,5 +1,6 @@
 """The page in a real browser: values against the BSDF, interaction, and what leaves the page."""
 
+import re
 import shutil
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 
 from mitsuba_diffraction import testing
+from mitsuba_diffraction.bsdf.geometry import rotated
 from mitsuba_diffraction.color import delta_E, spectrum_to_XYZ
 from mitsuba_diffraction.evaluation.realtime_shader.evaluate import VARIANTS, shader_for
 from mitsuba_diffraction.evaluation.realtime_shader.quirks import Quirks
@@ -173,6 +175,34 @@ def test_a_pixel_has_the_orders_of_the_grating_equation(opened):
     peak = max(picked["values"], key=lambda pair: pair[1])[0]
     assert min(abs(peak - wavelength) for wavelength in orders.values()) <= 4
     assert "Orders, by the grating equation" in tab.locator("#picked-text").inner_text()
+
+
+@pytest.mark.parametrize("orientation", [30, "radial", pytest.param("tangential", marks=pytest.mark.slow)])
+def test_the_axes_of_the_pattern_are_those_of_the_plugin(orientation, opened, llvm):
+    """ω_i along the pattern's axes at pixels of a sphere, a plate and a disc, as the scene of the view has it."""
+    parameters = {"depth": 0.1, "samples": 64, "coherence_length": 3.0}
+    tab = opened(Surface.named("blazed", {**parameters, "orientation": orientation}))
+    grating = {"type": "diffraction_grating", "profile": "blazed", **parameters, "orientation": orientation}
+    for name, kind in (("sphere", "sphere"), ("plate", "rectangle"), ("disc", "disk")):
+        tab.evaluate("(shape) => viewer.set({ shape, maxFrames: 1, azimuth: -60, elevation: 50 })", name)
+        scene = tab.evaluate("viewer.command()").partition("<<'END'\n")[2].partition("END")[0]
+        assert f'name="orientation" value="{orientation}"' in scene
+        width, height = tab.evaluate("[viewer.renderer.width, viewer.renderer.height]")
+        light = testing.direction(90 - 51.7, -50.7)
+        sensor = mi.load_string(
+            re.search("<sensor.*?</sensor>", scene, re.DOTALL)[0].replace("<sensor", '<sensor version="3.0.0"', 1)
+        )
+        shape = mi.load_dict({"type": kind, "bsdf": grating})
+        scene = mi.load_dict({"type": "scene", "shape": shape})
+        for x, y in ((0.5, 0.5), (0.42, 0.47), (0.55, 0.53), (0.51, 0.4)):
+            x, y = int(x * width), int(y * height)
+            at = mi.Point2f((x + 0.5) / width, (y + 0.5) / height)
+            ray, _ = sensor.sample_ray(0.0, 0.5, at, mi.Point2f(0.5))
+            si = scene.ray_intersect(ray)
+            frame = shape.bsdf().layers.grating.frame(si, mi.Bool(True))
+            wanted = np.array(rotated(si.to_local(mi.Vector3f(light)), *frame)).ravel()
+            found = tab.evaluate("([x, y]) => viewer.picker.directionsAt(x, y)", [x, y])
+            np.testing.assert_allclose(found["wi"], wanted, atol=2e-3, err_msg=f"{name} {x} {y}")
 
 
 @pytest.mark.slow

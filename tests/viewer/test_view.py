@@ -79,6 +79,7 @@ def test_a_page_holds_everything_is_small_and_ready_within_three_seconds(recipe)
         ("blazed,material=Alu", "material: got 'Alu', did you mean Al"),
         ("blazed,material=Al,int_ior=1.5", "material: a conductor or a perfect mirror takes no int_ior"),
         ("blazed,height_scale=2", "height_scale: got 2, wanted at most 1: the spectrum was built for wavelengths"),
+        ("blazed,orientation=round", "orientation: got 'round', wanted degrees, radial or tangential"),
         ("blazed,int_ior=0.5", "int_ior: got 0.5, wanted an index above 1"),
         ("blaze", "surface: got 'blaze', wanted a recipe (.toml), a saved spectrum (.exr), a scan with its scale, or"),
         ("gone.toml", "gone.toml: no such file"),

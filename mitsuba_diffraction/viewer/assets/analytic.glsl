@@ -5,9 +5,24 @@ uniform mat3 uCamera;   // columns: right, up, back
 uniform vec2 uTangentOfView;
 uniform vec2 uJitter;
 uniform vec2 uSize;
+uniform bool uFromRadius;  // whether the tangent points away from the centre of UV space
 layout(location = 0) out vec4 oPosition;
 layout(location = 1) out vec4 oNormal;
 layout(location = 2) out vec4 oTangent;
+
+const float PI = 3.14159265;
+
+// The image of the radius in UV space; U and V are the derivatives of the position.
+vec4 tangentOf(vec2 uv, vec3 U, vec3 V) {
+  vec3 tangent = uFromRadius ? (uv.x - 0.5) * U + (uv.y - 0.5) * V : U;
+  float size = length(tangent);
+  return vec4(size > 0.0 ? tangent / size : vec3(1.0, 0.0, 0.0), 0.0);
+}
+
+float angleOf(vec2 p) {
+  float angle = dot(p, p) > 0.0 ? atan(p.y, p.x) : 0.0;
+  return (angle < 0.0 ? angle + 2.0 * PI : angle) / (2.0 * PI);
+}
 
 void main() {
   vec2 ndc = 2.0 * (gl_FragCoord.xy + uJitter) / uSize - 1.0;
@@ -22,7 +37,9 @@ void main() {
     oPosition = vec4(p, 1.0);
     oNormal = vec4(p, 0.0);
     float r = length(p.xy);
-    oTangent = vec4(r > 0.0 ? vec3(-p.y, p.x, 0.0) / r : vec3(1.0, 0.0, 0.0), 0.0);
+    vec2 outward = r > 0.0 ? p.xy / r : vec2(1.0, 0.0);
+    vec2 uv = vec2(angleOf(p.xy), acos(clamp(p.z, -1.0, 1.0)) / PI);
+    oTangent = tangentOf(uv, 2.0 * PI * vec3(-p.y, p.x, 0.0), PI * vec3(p.z * outward, -r));
     return;
   }
   float t = -uEye.z / ray.z;
@@ -32,5 +49,10 @@ void main() {
   if (!inside) return;
   oPosition = vec4(p, 1.0);
   oNormal = vec4(0.0, 0.0, 1.0, 0.0);
-  oTangent = vec4(uShape == 1 ? vec3(1.0, 0.0, 0.0) : vec3(p.xy / max(length(p.xy), 1e-6), 0.0), 0.0);
+  if (uShape == 1) {
+    oTangent = tangentOf(0.5 * p.xy + 0.5, vec3(2.0, 0.0, 0.0), vec3(0.0, 2.0, 0.0));
+  } else {
+    float r = length(p.xy);
+    oTangent = tangentOf(vec2(r, angleOf(p.xy)), vec3(p.xy / max(r, 1e-6), 0.0), 2.0 * PI * vec3(-p.y, p.x, 0.0));
+  }
 }

@@ -14,7 +14,8 @@ function sceneOf(data, state, coil) {
   const differs = Math.abs(state.coherenceLength / own - 1) > 1e-3;
   if (grating.profile && differs) grating.coherence_length = Number(state.coherenceLength.toPrecision(4));
   const material = state.material === "dielectric" ? { int_ior: state.index } : { material: state.material };
-  const parameters = { ...grating, ...material, orientation: state.orientation, height_scale: state.heightScale, conserve_energy: false };
+  const orientation = state.fromRadius ? (state.orientation === 0 ? "radial" : "tangential") : state.orientation;
+  const parameters = { ...grating, ...material, orientation, height_scale: state.heightScale, conserve_energy: false };
   const lines = Object.entries(parameters).map(([name, value]) =>
     name === "patches" || name === "seed" || name === "samples" ? element(name, value).replace(/float/, "integer") : element(name, value));
   if (state.hasBase && state.material === "dielectric") {

@@ -8,11 +8,12 @@ const BUSY_MILLISECONDS = 60;  // of a frame while dragging, above which fewer p
 function initialState(data) {
   const { material, spectrum } = data;
   return {
-    shape: "sphere",
+    shape: material.from_radius ? "plate" : "sphere",
     azimuth: -90, elevation: 20, distance: 5,
     lightAzimuth: -50.7, lightElevation: 51.7, lightWidth: 3, lightLength: spectrum.max_order.includes(0) ? 30 : 0,
     sky: 0.02, exposure: 0,
     orientation: material.orientation,
+    fromRadius: material.from_radius,
     heightScale: material.height_scale,
     coherenceLength: spectrum.coherence_length,
     material: material.material === "" ? "dielectric" : material.material,
@@ -30,7 +31,9 @@ function prepareControls(data) {
   const { spectrum } = data;
   const options = [["dielectric", "dielectric"], ["none", "perfect mirror"], ...Object.keys(data.metals).map((m) => [m, m])];
   for (const [value, text] of options) $("material").add(new Option(text, value));
-  if (!data.coil) $("shape").querySelector("[value=coil]").remove();
+  // The vertices of the coil have no texture coordinates.
+  if (!data.coil || data.material.from_radius) $("shape").querySelector("[value=coil]").remove();
+  $("orientation").disabled = data.material.from_radius;
   $("heightScale").max = data.material.max_height_scale;
   const [shortest, longest] = coherenceLengths(spectrum);
   Object.assign($("coherenceLength"), { min: Math.log(shortest), max: Math.log(longest), step: "any" });

@@ -122,6 +122,7 @@ class Renderer {
         uTangentOfView: camera.tangents,
         uJitter: jitter,
         uSize: [width, height],
+        uFromRadius: Number(state.fromRadius),
       });
       this.quad();
       return;
