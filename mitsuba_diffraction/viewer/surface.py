@@ -19,7 +19,7 @@ from ..spectrum.tables import SliceTable
 from ..surface.gratings import PROFILES
 
 # WebGL2 guarantees array textures with sides of 2048 texels and 256 layers.
-MAX_SIDE, MAX_LAYERS = 2048, 256
+MAX_SIDE, MAX_LAYERS = 2048 - 6, 256  # with the margin of spectrum.js
 
 _NOT_SHOWN = {
     "transmission": "reflected light only",

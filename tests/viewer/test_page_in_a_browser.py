@@ -105,6 +105,39 @@ def test_values_are_those_of_the_bsdf(source, parameters, changes, opened, llvm)
     np.testing.assert_allclose(values, wanted, rtol=0, atol=1e-3 * wanted.max())
 
 
+@pytest.mark.parametrize(
+    ("source", "changes"),
+    [
+        ("blaze.toml", {}),
+        pytest.param("blaze.toml", {"coherenceLength": 9, "material": "Au"}, marks=pytest.mark.slow),
+        pytest.param("foil_crossed.toml", {"hasBase": True}, marks=pytest.mark.slow),
+        pytest.param("foil_crossed.toml", {"coherenceLength": 7, "material": "none"}, marks=pytest.mark.slow),
+        ("elaphe_afm.toml", {"material": "Cu"}),
+    ],
+)
+def test_colours_are_integrals_over_the_wavelength(source, changes, opened):
+    """The estimate that is drawn against f cos θ_i of the BSDF at each half nm, to 1e-3 of the largest value."""
+    surface = Surface.named(RECIPES / source, {})
+    tab = opened(surface)
+    parallel = {"maxFrames": 1, "sky": 0, "lightWidth": 0, "lightLength": 0}
+    tab.evaluate("(changes) => viewer.set(changes)", {**parallel, **changes})
+    pairs = pairs_of(surface.spectrum, 200)
+    frames = 512 if surface.spectrum.grid.max_order[0] < 20 else 32
+    found = np.reshape(
+        tab.evaluate("([p, n]) => viewer.evaluateColours(p, n)", [pairs.ravel().tolist(), frames]), (-1, 4)
+    )
+    wavelengths = np.arange(380.0, 740.1, 0.5)
+    dense = np.repeat(pairs[None], len(wavelengths), axis=0)
+    dense[..., 6] = wavelengths[:, None]
+    values = np.reshape(tab.evaluate("(pairs) => viewer.evaluate(pairs)", dense.ravel().tolist()), dense.shape[:2])
+    table = pages._light().astype(np.float64)
+    weights = [np.interp(wavelengths, np.arange(360, 831), table[:, k] * table[:, 3]) for k in range(3)]
+    wanted = np.trapezoid(values[..., None] * np.transpose(weights)[:, None], wavelengths, axis=0)
+    wanted *= (pairs[:, 2] / pairs[:, 5])[:, None]
+    assert (wanted.max(axis=1) > 1e-3 * wanted.max()).mean() > 0.1
+    np.testing.assert_allclose(found[:, :3], wanted, rtol=0, atol=1e-3 * wanted.max())
+
+
 @pytest.mark.parametrize("published", [True, False], ids=["published", "corrected"])
 @pytest.mark.parametrize("source", ["blaze.toml", pytest.param("elaphe_afm.toml", marks=pytest.mark.slow)])
 def test_colours_are_those_of_the_shader_of_2014(source, published, opened, llvm):

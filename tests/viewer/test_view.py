@@ -100,7 +100,7 @@ def test_tables_too_large_for_a_texture_are_refused():
     spectrum = md.precompute(md.gratings.blazed(1.0, 0.02, samples=32), coherence_length=2)
     table = np.zeros((MAX_LAYERS + 1, 3, *spectrum.grid.shape), np.float32)
     spectrum = dataclasses.replace(spectrum, table=SliceTable(spectrum.max_kappa, table))
-    with pytest.raises(ValueError, match=f"intervals of κ, wanted at most 2048 × 2048 and {MAX_LAYERS}"):
+    with pytest.raises(ValueError, match=f"intervals of κ, wanted at most 2042 × 2042 and {MAX_LAYERS}"):
         md.view(spectrum)
 
 

@@ -34,7 +34,7 @@ class Program {
     const count = gl.getProgramParameter(this.program, gl.ACTIVE_UNIFORMS);
     for (let i = 0; i < count; i++) {
       const info = gl.getActiveUniform(this.program, i);
-      this.uniforms.set(info.name, { type: info.type, place: gl.getUniformLocation(this.program, info.name) });
+      this.uniforms.set(info.name.replace("[0]", ""), { type: info.type, place: gl.getUniformLocation(this.program, info.name) });
     }
   }
 

@@ -19,7 +19,6 @@ function initialState(data) {
     material: material.material === "" ? "dielectric" : material.material,
     index: material.int_ior,
     hasBase: false, pigment: "#40301c",
-    wavelengths: 48,
     right: "none", divider: 0.5, difference: false,
     quirks: allQuirks(true), terms: 37,
     drag: "light",
@@ -55,7 +54,8 @@ async function start() {
   matching = (await decoded(data.light)).values;
   const metals = {};
   for (const [name, content] of Object.entries(data.metals)) {
-    metals[name] = numbers2D(gl, (await decoded(content)).values, 471, 1, 2);
+    const { values } = await decoded(content);
+    metals[name] = { values, texture: numbers2D(gl, values, 471, 1, 2) };
   }
   const tables = {
     table: await decoded(data.spectrum.table),
@@ -172,6 +172,7 @@ async function start() {
     state, renderer, data, picker,
     set: (changes) => controls.set(changes),
     evaluate: (pairs) => Array.from(renderer.evaluatePairs(state, Float32Array.from(pairs))),
+    evaluateColours: (pairs, frames) => Array.from(renderer.evaluateColours(state, Float32Array.from(pairs), frames)),
     evaluateShader: async (pairs) => {
       await shader2014.prepare(state, () => {});
       return Array.from(renderer.evaluateShader(shader2014, state, Float32Array.from(pairs)));

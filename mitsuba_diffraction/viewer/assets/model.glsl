@@ -1,12 +1,12 @@
 // f = R K G S(q; kappa)/lambda^2 + (1 - R_i)(1 - R_o) base/pi, in 1/sr: bsdf/orders.py, bsdf/continuum.py,
 // bsdf/geometry.py and geometry.py of the package, for reflected light without a coat. E is one.
+// KIND, MATERIAL, CUBIC and HAS_BASE are constants of the program (spectrum.js), since some renderers execute both
+// branches of a condition.
 // Directions are unit vectors along the pattern's axes, z the normal, both away from the surface. Lengths are in um.
 
 uniform highp sampler2DArray uTable;  // a_p of c = sum_p a_p t^p: columns m_x, rows m_y, layers intervals of kappa
 uniform float uUnit;                  // factor of the table
-uniform bool uCubic;                  // whether there is an a_3
 uniform float uIntervalsPerKappa;
-uniform int uKind;                    // one of the four below
 uniform ivec2 uMaxOrder;
 uniform vec2 uPerPitch;               // T of orders; 1/spacing of splines
 uniform ivec2 uCount;                 // of the lobes that contribute at one q
@@ -19,13 +19,13 @@ uniform float uHeightScale;
 uniform float uMinCosine;
 uniform bool uShadowing;
 
-uniform int uMaterial;                // 0 dielectric, 1 conductor, 2 perfect mirror
 uniform float uEta;
 uniform highp sampler2D uIndex;       // n + ik at each nm from 360
 uniform vec3 uPigment;                // coefficients of the reflectance of the base
-uniform bool uHasBase;
 
+const int DIELECTRIC = 0, CONDUCTOR = 1, MIRROR = 2;
 const int RESOLVED = 0, LINES = 1, WINDOW = 2, SPLINES = 3;
+const int MARGIN = 3;  // of the table, in nodes
 const float PI = 3.14159265358979;
 const float SHORTEST = 360.0, LONGEST = 830.0;
 
@@ -71,14 +71,14 @@ float continuumFactor(vec3 wi, vec3 wo, vec2 tangent, float perWidth) {
   vec2 squares = vec2(wi.z * wi.z, wo.z * wo.z);
   float square = dot(tangent, tangent);
   float mirror = clamp((25.0 - square * perWidth * perWidth) / 9.0, 0.0, 1.0);
-  mirror *= clamp(2.0 - 5.0 * sqrt(max(max(squares.x, squares.y), 1e-12)), 0.0, 1.0);
+  mirror *= clamp(2.0 - 5.0 * sqrt(max(max(squares.x, squares.y), 1e-12)), 0.0, 1.0);  // zero unless both are grazing
   float gain = mirror > 0.0 ? squaresAndGain(wi, wo, vec2(0.0), perWidth).z : 0.0;
   return mix(kG(squares, square), gain, mirror);
 }
 
+// The table has a margin of zeros.
 vec4 node(ivec2 m, int interval) {
-  if (any(greaterThan(abs(m), uMaxOrder))) return vec4(0.0);
-  return texelFetch(uTable, ivec3(m + uMaxOrder, interval), 0);
+  return texelFetch(uTable, ivec3(clamp(m, -uMaxOrder - 1, uMaxOrder + 1) + uMaxOrder + MARGIN, interval), 0);
 }
 
 vec2 lobe(vec2 m, vec2 q) {
@@ -87,56 +87,82 @@ vec2 lobe(vec2 m, vec2 q) {
   return mix(value, vec2(0.0), greaterThan(abs(offset), uHalfWidth));
 }
 
-// K G S in um^2, lambda in um.
-float scatter(vec3 wi, vec3 wo, float lambda) {
-  vec2 tangent = -(wi.xy + wo.xy);
-  float frequency = 1.0 / lambda;
-  vec2 q = tangent * frequency;
-  vec2 at = q * uPerPitch;
-  float perWidth = frequency / uSigma;
+// K G of a continuum where neither direction is grazing.
+float steepFactor(vec3 wi, vec3 wo, vec2 tangent) {
+  return kG(vec2(wi.z * wi.z, wo.z * wo.z), dot(tangent, tangent));
+}
 
-  float x = (wi.z + wo.z) * 2.0 * PI * frequency * uHeightScale * uIntervalsPerKappa;
-  int interval = min(int(x), textureSize(uTable, 0).z - 1);
+// kappa in intervals of the table.
+float intervalsOf(vec3 wi, vec3 wo, float frequency) {
+  return (wi.z + wo.z) * 2.0 * PI * frequency * uHeightScale * uIntervalsPerKappa;
+}
+
+// The interval, and the powers of t in it.
+vec4 powersAt(float x, out int interval) {
+  interval = min(int(x), textureSize(uTable, 0).z - 1);
   float t = 2.0 * (x - float(interval)) - 1.0;
-  vec4 powers = vec4(1.0, t, t * t, uCubic ? t * t * t : 0.0) * uUnit;
+  return vec4(1.0, t, t * t, CUBIC ? t * t * t : 0.0) * uUnit;
+}
 
-  float result = 0.0;
-  if (uKind == SPLINES) {
-    if (any(greaterThan(abs(q), uLimit))) return 0.0;
-    ivec2 nearest = ivec2(round(at));
-    vec2 d = at - vec2(nearest);
-    vec2 before = 0.5 * (0.5 - d) * (0.5 - d), here = 0.75 - d * d, after = 0.5 * (0.5 + d) * (0.5 + d);
-    vec3 weightsX = vec3(before.x, here.x, after.x), weightsY = vec3(before.y, here.y, after.y);
-    vec4 sum = vec4(0.0);
-    for (int j = 0; j < 3; j++) {
-      for (int i = 0; i < 3; i++) sum += weightsX[i] * weightsY[j] * node(nearest + ivec2(i - 1, j - 1), interval);
-    }
-    result = dot(sum, powers) * uPerPitch.x * uPerPitch.y * continuumFactor(wi, wo, tangent, perWidth);
-    return max(result, 0.0);
-  }
+float power(ivec2 m, float x) {
+  int interval;
+  vec4 powers = powersAt(x, interval);
+  return dot(node(m, interval), powers);
+}
+
+// S of splines.
+float splines(vec2 q, float x) {
+  int interval;
+  vec4 powers = powersAt(x, interval);
+  vec2 at = q * uPerPitch, nearest = round(at), d = at - nearest;
+  ivec3 m = ivec3(clamp(ivec2(nearest), -uMaxOrder - 2, uMaxOrder + 2) + uMaxOrder + MARGIN, interval);
+  vec2 before = 0.5 * (0.5 - d) * (0.5 - d), here = 0.75 - d * d, after = 0.5 * (0.5 + d) * (0.5 + d);
+  const ivec3 X = ivec3(1, 0, 0), Y = ivec3(0, 1, 0);
+  vec4 low = before.x * texelFetch(uTable, m - X - Y, 0) + here.x * texelFetch(uTable, m - Y, 0) + after.x * texelFetch(uTable, m + X - Y, 0);
+  vec4 middle = before.x * texelFetch(uTable, m - X, 0) + here.x * texelFetch(uTable, m, 0) + after.x * texelFetch(uTable, m + X, 0);
+  vec4 high = before.x * texelFetch(uTable, m - X + Y, 0) + here.x * texelFetch(uTable, m + Y, 0) + after.x * texelFetch(uTable, m + X + Y, 0);
+  float result = max(dot(before.y * low + here.y * middle + after.y * high, powers) * uPerPitch.x * uPerPitch.y, 0.0);
+  return all(lessThanEqual(abs(q), uLimit)) ? result : 0.0;
+}
+
+// S of orders whose lobes overlap; of lines, K G S.
+float overlapping(vec3 wi, vec3 wo, vec2 q, float x, float lambda) {
+  vec2 at = q * uPerPitch;
   ivec2 first = ivec2(ceil(at - 0.5 * vec2(uCount)));
   if (uReadsAll.x) first.x = -uMaxOrder.x;
   if (uReadsAll.y) first.y = -uMaxOrder.y;
-  if (uKind == RESOLVED) {
-    if (any(greaterThan(abs(first), uMaxOrder))) return 0.0;
-    vec2 lobes = lobe(vec2(first), q);
-    if (lobes.x * lobes.y == 0.0) return 0.0;
-    float factor = orderFactor(wi, wo, vec2(first) / uPerPitch * lambda, perWidth);
-    return max(lobes.x * lobes.y * factor * dot(node(first, interval), powers), 0.0);
-  }
-  vec4 sum = vec4(0.0);
+  int interval;
+  vec4 powers = powersAt(x, interval), sum = vec4(0.0);
   for (int j = 0; j < uCount.y; j++) {
     for (int i = 0; i < uCount.x; i++) {
       ivec2 m = first + ivec2(i, j);
       vec2 lobes = lobe(vec2(m), q);
       float weight = lobes.x * lobes.y;
       if (weight == 0.0) continue;
-      if (uKind == LINES) weight *= orderFactor(wi, wo, vec2(m) / uPerPitch * lambda, perWidth);
+      if (KIND == LINES) weight *= orderFactor(wi, wo, vec2(m) / uPerPitch * lambda, 1.0 / (lambda * uSigma));
       sum += weight * node(m, interval);
     }
   }
-  result = max(dot(sum, powers), 0.0);
-  return uKind == LINES ? result : result * continuumFactor(wi, wo, tangent, perWidth);
+  return max(dot(sum, powers), 0.0);
+}
+
+// K G S of one order.
+float resolved(vec3 wi, vec3 wo, ivec2 m, vec2 q, float x, float lambda) {
+  if (any(greaterThan(abs(m), uMaxOrder))) return 0.0;
+  vec2 lobes = lobe(vec2(m), q);
+  if (lobes.x * lobes.y == 0.0) return 0.0;
+  float factor = orderFactor(wi, wo, vec2(m) / uPerPitch * lambda, 1.0 / (lambda * uSigma));
+  return factor == 0.0 ? 0.0 : max(lobes.x * lobes.y * factor * power(m, x), 0.0);
+}
+
+// K G S in um^2, lambda in um.
+float scatter(vec3 wi, vec3 wo, float lambda) {
+  vec2 tangent = -(wi.xy + wo.xy), q = tangent / lambda;
+  float x = intervalsOf(wi, wo, 1.0 / lambda);
+  if (KIND == RESOLVED) return resolved(wi, wo, ivec2(ceil(q * uPerPitch - 0.5)), q, x, lambda);
+  if (KIND == LINES) return overlapping(wi, wo, q, x, lambda);
+  float density = KIND == SPLINES ? splines(q, x) : overlapping(wi, wo, q, x, lambda);
+  return density == 0.0 ? 0.0 : density * continuumFactor(wi, wo, tangent, 1.0 / (lambda * uSigma));
 }
 
 float dielectricOf(float cosine, float eta) {
@@ -161,14 +187,18 @@ float conductor(float cosine, vec2 index) {
   return 0.5 * (s + p);
 }
 
-// R of a plane; lambda in nm.
-float reflectance(float cosine, float nanometres) {
-  if (uMaterial == 2) return 1.0;
-  if (uMaterial == 0) return dielectric(cosine);
+// n + ik of a conductor.
+vec2 indexAt(float nanometres) {
   float at = clamp(nanometres - SHORTEST, 0.0, LONGEST - SHORTEST);
   int below = int(min(floor(at), LONGEST - SHORTEST - 1.0));
   vec2 low = texelFetch(uIndex, ivec2(below, 0), 0).xy, high = texelFetch(uIndex, ivec2(below + 1, 0), 0).xy;
-  return conductor(cosine, mix(low, high, at - float(below)));
+  return mix(low, high, at - float(below));
+}
+
+// R of a plane; lambda in nm.
+float reflectance(float cosine, float nanometres) {
+  if (MATERIAL == MIRROR) return 1.0;
+  return MATERIAL == DIELECTRIC ? dielectric(cosine) : conductor(cosine, indexAt(nanometres));
 }
 
 float pigment(float nanometres) {
@@ -187,7 +217,7 @@ float brdf(vec3 wi, vec3 wo, float nanometres) {
       result = power * reflectance(min(0.5 * length(v), 1.0), nanometres) / (lambda * lambda);
     }
   }
-  if (uHasBase && uMaterial == 0) {
+  if (HAS_BASE) {
     result += (1.0 - dielectric(wi.z)) * (1.0 - dielectric(wo.z)) * pigment(nanometres) / PI;
   }
   return result;

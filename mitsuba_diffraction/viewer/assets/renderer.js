@@ -2,18 +2,29 @@
 
 const GOLDEN = 0.6180339887498949;
 const R2 = [0.7548776662466927, 0.5698402909980532];  // steps of a two-dimensional sequence (Roberts 2018)
+const R4 = [0.8566748838545029, 0.733891856627126, 0.6287067210378087, 0.5385972572236101];  // of a four-dimensional one
+const POINTS = 4;  // of the light in a frame of resolved orders, as in radiance_model.glsl
+// Where the sequences of a frame begin, so that its points follow those of the frame before.
+const randomOf = (frame) => R4.map((step) => fraction(0.5 + POINTS * frame * step));
 const fraction = (x) => x - Math.floor(x);
 
 // One of the two shaders: its program, its uniforms, and the mean of its frames. A frame is drawn in bands of rows, so
 // that a slow shader blocks neither the page nor the device.
 class Side {
-  constructor(gl, text, uniforms) {
-    this.gl = gl;
-    this.program = new Program(gl, SHADERS.quad_vertex, text, SHADERS.shade);
-    this.uniforms = uniforms;
+  constructor(gl, text, constants, uniforms) {
+    Object.assign(this, { gl, text, constants, uniforms });
+    this.programs = new Map();
     this.means = [];
     this.milliseconds = NaN;
     this.band = 16;
+  }
+
+  programOf(state) {
+    const constants = this.constants(state);
+    if (!this.programs.has(constants)) {
+      this.programs.set(constants, new Program(this.gl, SHADERS.quad_vertex, constants, this.text, SHADERS.shade));
+    }
+    return this.programs.get(constants);
   }
 
   resize(width, height) {
@@ -35,7 +46,7 @@ class Side {
 
   dispose() {
     for (const target of this.means) target.dispose();
-    this.gl.deleteProgram(this.program.program);
+    for (const { program } of this.programs.values()) this.gl.deleteProgram(program);
   }
 }
 
@@ -54,7 +65,10 @@ class Renderer {
     this.analytic = new Program(gl, SHADERS.quad_vertex, SHADERS.analytic);
     this.mesh = new Program(gl, SHADERS.mesh_vertex, SHADERS.mesh);
     this.screen = new Program(gl, SHADERS.quad_vertex, SHADERS.display);
-    this.model = new Side(gl, SHADERS.model + SHADERS.radiance_model, (state) => this.modelUniforms(state));
+    const constants = (state) => this.constants(state);
+    this.model = new Side(gl, SHADERS.model + SHADERS.radiance_model, constants, (state, frame) => this.modelUniforms(state, frame));
+    this.programs = new Map();
+    this.skyColour = new Target(gl, 257, 1);
     this.coil = tables.coil;
     this.empty = gl.createVertexArray();
     this.shader = null;
@@ -73,17 +87,39 @@ class Renderer {
     this.shader = null;
     if (variant === null) return;
     const text = `#define VARIANT ${VARIANTS[variant]}\n${SHADERS.model}${SHADERS.shader_2014}`;
-    this.shader = new Side(this.gl, text, (state) => ({ ...shader2014.uniforms(state), uMatching: this.matching }));
+    this.shader = new Side(this.gl, text, (state) => this.constants(state), (state) => ({ ...shader2014.uniforms(state), uMatching: this.matching }));
     this.shader.resize(this.width, this.height);
   }
 
-  modelUniforms(state) {
+  // The constants of all shaders: of the model, and whether the light is parallel, a disc or a strip.
+  constants(state) {
+    const { uLightIsDisc, uLightSize } = lightSizeOf(state);
+    const light = Math.max(...uLightSize) === 0 ? 0 : uLightIsDisc ? 1 : 2;
+    return `${this.spectrum.constants(state)}const int LIGHT = ${light};\n`;
+  }
+
+  // A program of model.glsl and other text, which are kept.
+  programOf(state, ...text) {
+    const whole = [this.constants(state), SHADERS.model, ...text].join("\n");
+    if (!this.programs.has(whole)) this.programs.set(whole, new Program(this.gl, SHADERS.quad_vertex, whole));
+    return this.programs.get(whole);
+  }
+
+  modelUniforms(state, frame) {
     return {
       ...this.spectrum.uniforms(state),
+      ...wavelengthsOf(state, this.spectrum.materials[state.material], fraction(0.5 + frame * GOLDEN)),
       uMatching: this.matching,
-      uWavelengths: state.wavelengths,
+      uSkyColour: this.skyColour.textures[0],
       uSky: state.sky / Math.PI,
     };
+  }
+
+  drawSky(state) {
+    const { width } = this.skyColour;
+    this.skyColour.bind();
+    this.programOf(state, SHADERS.sky).use({ ...this.spectrum.uniforms(state), uMatching: this.matching, uLastTexel: width - 1 });
+    this.quad();
   }
 
   resize(width, height) {
@@ -145,21 +181,21 @@ class Renderer {
     const { frame } = side;
     const jitter = frame === 0 ? [0, 0] : R2.map((step) => fraction(0.5 + frame * step) - 0.5);
     this.drawGeometry(state, camera, jitter);
+    if (side === this.model && frame === 0 && side.row === 0) this.drawSky(state);
     const turn = radians(state.orientation);
     const [uPosition, uNormal, uTangent] = this.geometry.textures;
     const [before, after] = side.means;
     const [left, right] = [Math.floor(first * width), Math.ceil(end * width)];
     after.bind(width, height);
-    side.program.use({
-      ...side.uniforms(state),
+    side.programOf(state).use({
+      ...side.uniforms(state, frame),
       uPosition, uNormal, uTangent,
       uBefore: before.textures[0],
       uWeight: 1 / (frame + 1),
       uEye: camera.eye,
       uLight: lightOf(state),
-      ...lightSizeOf(state),
-      uRandom: R2.map((step) => fraction(0.5 + frame * step)),
-      uOffset: fraction(0.5 + frame * GOLDEN),
+      uLightSize: lightSizeOf(state).uLightSize,
+      uRandom: randomOf(frame),
       uSin: Math.sin(turn),
       uCos: Math.cos(turn),
     });
@@ -240,15 +276,25 @@ class Renderer {
 
   // f cos theta_o of pairs, (n, 7): omega_i, omega_o along the pattern's axes, lambda in nm.
   evaluatePairs(state, pairs) {
-    this.pairs ??= new Program(this.gl, SHADERS.quad_vertex, SHADERS.model, SHADERS.pairs);
-    const values = this.evaluate(this.pairs, this.spectrum.uniforms(state), pairs);
+    const values = this.evaluate(this.programOf(state, SHADERS.pairs), this.spectrum.uniforms(state), pairs);
     return Float32Array.from({ length: pairs.length / 7 }, (_, i) => values[4 * i]);
+  }
+
+  // XYZ under parallel light for pairs, as above without lambda in use, the mean of some frames: (n, 4).
+  evaluateColours(state, pairs, frames) {
+    this.drawSky(state);
+    const program = this.programOf(state, SHADERS.radiance_model, SHADERS.pairs_model);
+    const mean = new Float64Array((4 * pairs.length) / 7);
+    for (let frame = 0; frame < frames; frame++) {
+      const values = this.evaluate(program, { ...this.modelUniforms(state, frame), uRandom: randomOf(frame) }, pairs);
+      for (let i = 0; i < mean.length; i++) mean[i] += values[i] / frames;
+    }
+    return mean;
   }
 
   // Linear RGB of the shader of 2014 for pairs, as above: (n, 4).
   evaluateShader(shader2014, state, pairs) {
-    const text = `#define VARIANT ${VARIANTS[state.right]}\n${SHADERS.model}${SHADERS.shader_2014}`;
-    const program = new Program(this.gl, SHADERS.quad_vertex, text, SHADERS.pairs_2014);
+    const program = this.programOf(state, `#define VARIANT ${VARIANTS[state.right]}`, SHADERS.shader_2014, SHADERS.pairs_2014);
     return this.evaluate(program, { ...shader2014.uniforms(state), uMatching: this.matching }, pairs);
   }
 

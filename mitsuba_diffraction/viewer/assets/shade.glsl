@@ -6,9 +6,8 @@ uniform highp sampler2D uBefore;
 uniform float uWeight;              // of this frame
 uniform vec3 uEye;
 uniform vec3 uLight;                // to the light
-uniform vec2 uLightSize;            // half its width and half its length at distance one
-uniform bool uLightIsDisc;
-uniform vec2 uRandom;               // of this frame
+uniform vec2 uLightSize;            // of LIGHT, parallel (0), a disc (1) or a strip (2): half its width and half its length at distance one
+uniform vec4 uRandom;               // of this frame
 uniform float uSin;                 // of the angle from the tangent to the pattern's x axis
 uniform float uCos;
 out vec4 oMean;
@@ -19,17 +18,21 @@ float hash(uvec2 at) {
   return float(h) / 4294967296.0;
 }
 
-// omega_i of the n-th point of the light, a disc or a strip along the meridian; w is the solid angle of the elements
-// there relative to the middle.
+// omega_i of a point of the light, -1 to 1 along its axes; w is the solid angle of the elements there relative to the
+// middle.
+vec4 lightTo(vec2 place) {
+  vec3 d = lightAxes * vec3(place, 1.0);
+  float cosine = inversesqrt(dot(d, d));
+  return vec4(d * cosine, cosine * cosine * cosine);
+}
+
+// The n-th point of the light, a disc or a strip along the meridian.
 vec4 lightAt(int n) {
-  if (uLightSize.x <= 0.0 && uLightSize.y <= 0.0) return vec4(uLight * frame, 1.0);
-  vec2 u = fract(random + float(n) * vec2(0.7548776662, 0.5698402910));
+  if (LIGHT == 0) return vec4(lightAxes[2], 1.0);
+  vec2 u = fract(random.xy + float(n) * vec2(0.8566748838545, 0.7338918566271));
   vec2 place = 2.0 * u - 1.0;
-  if (uLightIsDisc) place = sqrt(u.x) * vec2(cos(6.28318531 * u.y), sin(6.28318531 * u.y));
-  vec3 s = normalize(cross(vec3(0.0, 0.0, 1.0), uLight));
-  vec3 d = normalize(uLight + uLightSize.x * place.x * s + uLightSize.y * place.y * cross(uLight, s));
-  float cosine = dot(d, uLight);
-  return vec4(d * frame, cosine * cosine * cosine);
+  if (LIGHT == 1) place = sqrt(u.x) * vec2(cos(6.28318531 * u.y), sin(6.28318531 * u.y));
+  return lightTo(place);
 }
 
 void main() {
@@ -42,7 +45,9 @@ void main() {
     vec3 s = normalize(tangent - n * dot(n, tangent));
     vec3 t = cross(n, s);
     frame = mat3(uCos * s + uSin * t, uCos * t - uSin * s, n);
-    random = uRandom + vec2(hash(uvec2(at)), hash(uvec2(at) + 7919u));
+    vec3 width = normalize(cross(vec3(0.0, 0.0, 1.0), uLight));
+    lightAxes = mat3(uLightSize.x * (width * frame), uLightSize.y * (cross(uLight, width) * frame), uLight * frame);
+    random = uRandom + vec4(hash(uvec2(at)), hash(uvec2(at) + 7919u), hash(uvec2(at) + 104729u), hash(uvec2(at) + 15485863u));
     value = vec4(radiance(normalize(uEye - position.xyz) * frame), 1.0);
   }
   vec4 before = texelFetch(uBefore, at, 0);

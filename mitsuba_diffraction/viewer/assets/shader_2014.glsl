@@ -24,8 +24,9 @@ uniform bool uConstantBlend, uInfrared;
 const float FIRST = 380.0, LAST = 780.0, STEP = 5.0;  // nm
 const int COUNT = 81;
 
-mat3 frame;   // columns: the pattern's axes and the normal
-vec2 random;  // of this pixel and frame
+mat3 frame;      // columns: the pattern's axes and the normal
+mat3 lightAxes;  // along them: half the width, half the length, and the direction of the light
+vec4 random;     // of this pixel and frame
 vec4 lightAt(int n);
 
 struct Pair {
@@ -48,7 +49,7 @@ vec4 weightsAt(float nanometres, float peak) {
 
 float fresnelRatio(float r, float cosHalf) {
   float ratio;
-  if (uSchlick || uMaterial != 0) {
+  if (uSchlick || MATERIAL != DIELECTRIC) {
     float x = 1.0 - cosHalf;
     ratio = (r + (1.0 - r) * x * x * x * x * x) / r;
   } else {
@@ -296,7 +297,7 @@ vec3 radiance(vec3 wo) {
   vec4 light = lightAt(0);
   vec3 rgb = light.w * shaderRGB(light.xyz, wo);
   vec3 below = vec3(0.0);
-  if (uHasBase && uMaterial == 0 && light.z > 0.0 && wo.z > 0.0) {
+  if (HAS_BASE && light.z > 0.0 && wo.z > 0.0) {
     for (int j = 0; j < COUNT; j++) {
       float nanometres = FIRST + STEP * float(j);
       vec4 weights = texelFetch(uMatching, ivec2(int(nanometres - SHORTEST), 0), 0);

@@ -42,12 +42,19 @@ function coherenceLengths(spectrum) {
   return [shortest, longest];
 }
 
-// (layers, terms, nodes) as (layers, nodes, terms).
-function interleaved(values, terms, nodes) {
-  const result = new values.constructor(values.length);
-  for (let start = 0; start < values.length; start += terms * nodes) {
+const MARGIN = 3;  // nodes that are zero around the table, as in model.glsl
+
+// (layers, terms, rows, columns) as (layers, rows, columns, terms), with the margin.
+function interleaved(values, [layers, terms, rows, columns]) {
+  const [height, width] = [rows + 2 * MARGIN, columns + 2 * MARGIN];
+  const result = new values.constructor(layers * height * width * terms);
+  let from = 0;
+  for (let layer = 0; layer < layers; layer++) {
     for (let p = 0; p < terms; p++) {
-      for (let i = 0; i < nodes; i++) result[start + i * terms + p] = values[start + p * nodes + i];
+      for (let j = 0; j < rows; j++) {
+        const start = ((layer * height + j + MARGIN) * width + MARGIN) * terms + p;
+        for (let i = 0; i < columns; i++) result[start + i * terms] = values[from++];
+      }
     }
   }
   return result;
@@ -57,8 +64,9 @@ class Spectrum {
   constructor(gl, spectrum, table, materials) {
     Object.assign(this, { gl, spectrum, materials });
     const [layers, terms, rows, columns] = table.shape;
-    this.texture = numbers3D(gl, interleaved(table.values, terms, rows * columns), columns, rows, layers, terms);
-    this.bytes = table.values.byteLength;
+    const padded = interleaved(table.values, table.shape);
+    this.texture = numbers3D(gl, padded, columns + 2 * MARGIN, rows + 2 * MARGIN, layers, terms);
+    this.bytes = padded.byteLength;
     Object.assign(this, { layers, terms });
     this.noIndex = numbers2D(gl, new Float32Array(2), 1, 1, 2);
   }
@@ -71,6 +79,18 @@ class Spectrum {
     return isLine ? KINDS.lines : KINDS.window;
   }
 
+  // The constants of model.glsl.
+  constants(state) {
+    const metal = state.material in this.materials;
+    const dielectric = state.material === "dielectric";
+    const splines = this.spectrum.kind === "splines";
+    const sigma = lobeWidth(splines ? this.spectrum.coherence_length : state.coherenceLength);
+    return `const int KIND = ${this.kindOf(splines ? null : lobesOf(this.spectrum, sigma), sigma)};
+const int MATERIAL = ${dielectric ? 0 : metal ? 1 : 2};
+const bool CUBIC = ${this.terms === 4}, HAS_BASE = ${state.hasBase && dielectric};
+`;
+  }
+
   uniforms(state) {
     const { spectrum } = this;
     const splines = spectrum.kind === "splines";
@@ -81,9 +101,7 @@ class Spectrum {
     return {
       uTable: this.texture,
       uUnit: spectrum.unit,
-      uCubic: Number(this.terms === 4),
       uIntervalsPerKappa: this.layers / spectrum.max_kappa,
-      uKind: this.kindOf(lobes, sigma),
       uMaxOrder: spectrum.max_order,
       uPerPitch: splines ? spectrum.spacing.map((d) => 1 / d) : spectrum.tile_size,
       uCount: both((lobe) => lobe.count),
@@ -95,14 +113,39 @@ class Spectrum {
       uHeightScale: state.heightScale,
       uMinCosine: Math.cos((spectrum.largest_angle * Math.PI) / 180) * (1 - 1e-6),
       uShadowing: 1,
-      uMaterial: state.material === "dielectric" ? 0 : metal ? 1 : 2,
       uEta: state.index,
-      uIndex: metal || this.noIndex,
-      uHasBase: Number(state.hasBase),
+      uIndex: metal ? metal.texture : this.noIndex,
       uPigment: state.hasBase ? pigmentOf(state.pigment) : [0, 0, 0],
       uEntered: entered(state.index),
     };
   }
+}
+
+const WAVELENGTHS = 48;  // of a frame, as in radiance_model.glsl
+const [FIRST, LAST] = [380, 740];  // nm
+
+// A table of `components` numbers at each nm from 360.
+function at(table, components, nm, k) {
+  const below = Math.floor(nm - 360);
+  const low = table[components * below + k];
+  return low + (nm - 360 - below) * (table[components * (below + 1) + k] - low);
+}
+
+// The wavelengths of a frame, shifted by `offset` (0 to 1), as uniforms of radiance_model.glsl.
+function wavelengthsOf(state, metal, offset) {
+  const step = (LAST - FIRST) / WAVELENGTHS;
+  const [spectrum, indices, pigment] = [[], [], [0, 0, 0]];
+  const [a, b, c] = state.hasBase ? pigmentOf(state.pigment) : [0, 0, 0];
+  for (let j = 0; j < WAVELENGTHS; j++) {
+    const nm = FIRST + step * (j + offset);
+    const weight = step * at(matching, 4, nm, 3);
+    const xyz = [0, 1, 2].map((k) => weight * at(matching, 4, nm, k));
+    const x = (a * nm + b) * nm + c;
+    xyz.forEach((value, k) => { pigment[k] += value * (0.5 + (0.5 * x) / Math.sqrt(1 + x * x)); });
+    spectrum.push(...xyz, nm);
+    indices.push(...(metal ? [at(metal.values, 2, nm, 0), at(metal.values, 2, nm, 1)] : [1, 0]));
+  }
+  return { uSpectrum: spectrum, uIndices: indices, uPigmentColour: pigment };
 }
 
 function fresnel(cosine, eta) {
