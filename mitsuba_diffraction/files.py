@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import mmap
 import os
 import re
 import secrets
@@ -166,6 +165,7 @@ def refuse_special(path: str | os.PathLike[str]) -> None:
 
 _BEFORE_DIGEST = "SHA-256 of this file with zeros for it: "
 _ZEROS = 64 * "0"
+_BYTES_PER_BLOCK = 2**24
 UNSEALED = _BEFORE_DIGEST + _ZEROS
 """Placeholder for the digest; see `seal`."""
 
@@ -192,15 +192,20 @@ def is_intact(path: str | os.PathLike[str]) -> bool | None:
 
 def _digest(stream: BinaryIO) -> tuple[int, bytes] | None:
     """Return the offset of the digest in a file and its expected value; None if there is no placeholder for one."""
-    if not os.fstat(stream.fileno()).st_size:
-        return None
-    with mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as content:
-        found = content.find(_BEFORE_DIGEST.encode())
-        if found < 0:
+    # By blocks, as a mapping of the file would count as memory of the process.
+    mark, read, end_of_read = _BEFORE_DIGEST.encode(), b"", 0
+    while (found := read.find(mark)) < 0:
+        if not (block := stream.read(_BYTES_PER_BLOCK)):
             return None
-        offset = found + len(_BEFORE_DIGEST)
-        with memoryview(content) as view, view[:offset] as before, view[offset + len(_ZEROS) :] as after:
-            digest = hashlib.sha256(before)
-            digest.update(_ZEROS.encode())
-            digest.update(after)
-        return offset, digest.hexdigest().encode()
+        read = read[-len(mark) :] + block
+        end_of_read += len(block)
+    offset = end_of_read - len(read) + found + len(mark)
+    stream.seek(0)
+    digest = hashlib.sha256()
+    while block := stream.read(min(_BYTES_PER_BLOCK, offset - stream.tell())):
+        digest.update(block)
+    digest.update(_ZEROS.encode())
+    stream.seek(offset + len(_ZEROS))
+    while block := stream.read(_BYTES_PER_BLOCK):
+        digest.update(block)
+    return offset, digest.hexdigest().encode()

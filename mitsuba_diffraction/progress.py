@@ -70,9 +70,9 @@ def table(columns: Iterable[str], rows: Iterable[Sequence[str]], texts: int = 1)
     return shown
 
 
-def _count(done: int, total: int, unit: str) -> str:
+def _count(done: float, total: int, unit: str) -> str:
     """Format the part done."""
-    return f"{done} %" if unit == "%" else f"{done} of {total} {unit}".rstrip()
+    return f"{done} %" if unit == "%" else f"{done:.10g} of {total} {unit}".rstrip()
 
 
 def log_lines(

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import logging
 import time
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from ..errors import RequestError
-from ..files import discard
 from ..outputs import check_outputs, free_name
 from ..progress import progress_bar, tell
 from .arguments import Define, Overwrite, Variant, check_suffix, materials_of, scene_parameters
@@ -170,8 +170,8 @@ def _picture(
     label: str,
     exposure: float | None,
     complete: str | None,
-) -> float:
-    """Render, save and report one picture; return the exposure of its preview.
+) -> float | None:
+    """Render, save and report one picture; return the exposure of its preview, if it is known.
 
     Args:
         where: parameters, materials, size and motion, for `load_spectral_scene`.
@@ -179,20 +179,24 @@ def _picture(
         exposure: of the preview; None: `auto_exposure`.
         complete: number of completed pictures, as text to report if Ctrl-C interrupts this one.
     """
-    from ..render.denoise import guides
-    from ..render.passes import Interrupted, checkpoint_path
+    from ..render.denoise import check_requirements, denoised_picture
+    from ..render.passes import Finished, Interrupted, checkpoint_path, discard_checkpoints
     from ..render.passes import render as trace
     from ..render.scene import load_spectral_scene
-    from ..render.spectral_image import SpectralImage, save_preview
+    from ..render.spectral_image import exposure_of_preview, save_preview, stored_digest
 
     start = time.perf_counter()
     checkpoint, preview = checkpoint_path(path), path.with_suffix(".png")
-    earlier = SpectralImage.load(path) if resume and path.is_file() and not checkpoint.exists() else None
-    guide = guides(load_spectral_scene(scene, **where)) if denoise else None
+    earlier = stored_digest(path) if resume and path.is_file() and not checkpoint.exists() else None
+    if denoise:
+        check_requirements()
     interrupted = False
     try:
         with progress_bar(label, "spp", "loading and compiling") as progress:
             image = trace(scene, **where, **request, checkpoint=checkpoint, finished=earlier, progress=progress)
+    except Finished:
+        tell(f"{path}: complete, nothing to do")
+        return exposure if exposure is not None else exposure_of_preview(preview)
     except Interrupted as error:
         image, interrupted = error.image, True
     except KeyboardInterrupt:
@@ -202,16 +206,16 @@ def _picture(
             raise
         raise Stopped(f"{complete}; the same command with --resume continues") from None
     try:
-        if image is not earlier:
-            image.save(path, half=half)
-        exposure = save_preview(image, preview, exposure, guide)
+        image.save(path, half=half)
+        clean = partial(denoised_picture, load_spectral_scene(scene, **where)) if denoise else None
+        exposure = save_preview(image, preview, exposure, clean)
     except (OSError, RuntimeError) as error:
         kept = f"; {checkpoint} is kept, and --resume continues from it" if checkpoint.exists() else ""
         raise RuntimeError(f"{path} or its preview cannot be written ({error}){kept}") from error
     if interrupted:
         spp = image.attributes["spp"]
         raise Stopped(f"{path} holds {spp} samples per pixel; the same command with --resume continues")
-    discard(checkpoint)
+    discard_checkpoints(checkpoint)
     tell(
         f"{path}: {_summary(image, request['until_error'])}, "
         f"{time.perf_counter() - start:.1f} s, {path.stat().st_size / 1e6:.3g} MB\n"
@@ -222,7 +226,7 @@ def _picture(
 
 def _summary(image: SpectralImage, until_error: float | None) -> str:
     """Return size, samples and noise of a picture."""
-    rows, columns, channels = image.radiance.shape
+    rows, columns, channels = image.shape
     text = f"{columns} × {rows} pixels, {channels} wavelengths, {image.attributes['spp']} samples per pixel"
     if "error" in image.attributes:
         text += f", relative error of luminance at most {image.attributes['error']:.2g} in 90 % of the pixels"

@@ -1,8 +1,8 @@
 """Rendering on an existing Dask cluster (the extra `cluster`).
 
-Each pass is a task. A worker loads the scene once per rendering and traces one pass at a time with all of its threads.
-Results are added in the order of the passes, so that the sum is identical, bit for bit, to that of a single machine. At
-most two passes per initial worker are in flight. Dask reassigns the passes of a lost worker.
+Each band of a pass is a task. A worker loads the scene once per rendering and traces one task at a time with all of its
+threads. Results are added in the order of the passes, so that the sum is identical, bit for bit, to that of a single
+machine. At most two tasks per initial worker are in flight. Dask reassigns those of a lost worker.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RequestError
-from .film import pass_seed, trace_pass
-from .passes import Job, Tracer, versions
+from .film import LightOfBands
+from .passes import Job, Tracer, trace_band, versions
 from .scene import scene_digest
 
 # Held while a pass is traced: it uses all threads of Dr.Jit, and two at a time would only need more memory.
@@ -64,8 +64,9 @@ def trace_on(address: str) -> Tracer:
             try:
                 client.wait_for_workers(1, timeout=CONNECT_TIMEOUT)
                 max_waiting = MAX_PASSES_PER_WORKER * len(client.nthreads())
-                for index in range(first, len(job.samples)):
-                    while len(waiting) < max_waiting and index + len(waiting) < len(job.samples):
+                total = len(job.samples) * len(job.bands)
+                for index in range(first, total):
+                    while len(waiting) < max_waiting and index + len(waiting) < total:
                         task = client.submit(_trace_on_worker, job, index + len(waiting), pure=False)
                         waiting.append(task)
                     traced = waiting[0].result()
@@ -108,7 +109,7 @@ async def _check_scheduler(address: str) -> None:
 
 
 def _trace_on_worker(job: Job, index: int) -> NDArray[np.float32]:
-    """Trace one pass on a worker."""
+    """Trace a band of a pass on a worker."""
     import distributed
 
     if versions() != job.versions:
@@ -118,7 +119,7 @@ def _trace_on_worker(job: Job, index: int) -> NDArray[np.float32]:
         threads = distributed.get_worker().state.nthreads
         if dr.thread_count() != threads:
             dr.set_thread_count(threads)
-        return trace_pass(scene_of(job), job.samples[index], pass_seed(job.seed, index))
+        return trace_band(job, scene_of(job), index, light_of(job))
 
 
 @lru_cache(maxsize=1)
@@ -132,3 +133,9 @@ def scene_of(job: Job) -> mi.Scene:
     if content != job.content:
         raise RuntimeError(f"{job.scene}: on a worker, the scene or a file that it references is different")
     return scene
+
+
+@lru_cache(maxsize=1)
+def light_of(job: Job) -> LightOfBands:
+    """Return the light of the passes of a job, kept while a worker traces bands of the same pass."""
+    return LightOfBands(job.bands)

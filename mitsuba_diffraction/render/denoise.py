@@ -19,12 +19,15 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from ..errors import RequestError
-from .film import check_memory
+from .film import Rows
+from .spectral_image import split_rows
 
 _SAMPLES_OF_GUIDES = 16  # per pixel
 _ALBEDO_WAVELENGTHS = (610.0, 550.0, 465.0)  # nm: red, green, blue
 _STEPS_PER_PIXEL = 100  # of the numerical autocorrelation
 _MIN_RESPONSE = 0.1  # lower bound of √R, for filters that remove a frequency
+_BAND_PIXELS = 2**20  # take 0.6 GB
+_BLENDED_ROWS = 64  # of two bands
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,16 +68,27 @@ def check_requirements() -> None:
         raise RequestError("--denoise: pyoidn is not installed; pip install 'mitsuba_diffraction[denoise]'") from None
 
 
-def guides(scene: mi.Scene) -> Guides:
-    """Render the guides of a scene; errors as of `check_requirements`."""
+def guides(scene: mi.Scene, band: Rows | None = None) -> Guides:
+    """Render the guides of a scene, or of a band of its rows; errors as of `check_requirements`."""
     check_requirements()
-    check_memory(scene, 1)  # of the picture; the guides need a fifth of it
+    sensor = scene.sensors()[0]
+    columns, rows = (int(size) for size in sensor.film().crop_size())
+    first, end = band or (0, rows)
+    blocks = split_rows(end - first, columns)
+    parts = [_guides(scene, first + block.start, min(end, first + block.stop)) for block in blocks]
+    response = np.multiply.outer(*(_response(sensor.film().rfilter(), size) for size in (end - first, columns)))
+    return Guides(*(np.concatenate(part) for part in zip(*parts, strict=True)), response[..., None])
+
+
+def _guides(scene: mi.Scene, first: int, end: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return albedo and normals of rows."""
     sensor = scene.sensors()[0]
     columns, rows = (int(size) for size in sensor.film().crop_size())
     sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(0, rows * columns * _SAMPLES_OF_GUIDES)
-    pixel = dr.arange(mi.UInt32, rows * columns * _SAMPLES_OF_GUIDES) // _SAMPLES_OF_GUIDES
-    position = (mi.Point2f(pixel % columns, pixel // columns) + sampler.next_2d()) / mi.Point2f(columns, rows)
+    sampler.seed(first, (end - first) * columns * _SAMPLES_OF_GUIDES)
+    pixel = dr.arange(mi.UInt32, (end - first) * columns * _SAMPLES_OF_GUIDES) // _SAMPLES_OF_GUIDES
+    corner = mi.Point2f(pixel % columns, pixel // columns + dr.opaque(mi.UInt32, first))
+    position = (corner + sampler.next_2d()) / mi.Point2f(columns, rows)
     ray, _ = sensor.sample_ray(0.0, sampler.next_1d(), position, sampler.next_2d())
     ray.wavelengths = type(ray.wavelengths)(*_ALBEDO_WAVELENGTHS, _ALBEDO_WAVELENGTHS[1])
     hit = scene.ray_intersect(ray)
@@ -82,14 +96,13 @@ def guides(scene: mi.Scene) -> Guides:
     diffuse = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Diffuse)
     albedo = mi.unpolarized_spectrum(bsdf.eval_diffuse_reflectance(hit, diffuse))
     albedo = dr.select(diffuse, dr.clip(albedo, 0, 1), 1)
+    normal = dr.select(hit.is_valid(), hit.sh_frame.n, 0)
 
     def mean(*channels: mi.Float) -> NDArray[np.float32]:
-        values = [np.array(x).reshape(rows, columns, _SAMPLES_OF_GUIDES).mean(-1) for x in channels]
+        values = [np.array(x).reshape(end - first, columns, _SAMPLES_OF_GUIDES).mean(-1) for x in channels]
         return np.stack(values, -1).astype(np.float32)
 
-    normal = dr.select(hit.is_valid(), hit.sh_frame.n, 0)
-    response = np.multiply.outer(*(_response(sensor.film().rfilter(), size) for size in (rows, columns)))
-    return Guides(mean(*(albedo[i] for i in range(3))), mean(normal.x, normal.y, normal.z), response[..., None])
+    return mean(*(albedo[i] for i in range(3))), mean(normal.x, normal.y, normal.z)
 
 
 def _response(kernel: mi.ReconstructionFilter, size: int) -> NDArray[np.float64]:
@@ -117,3 +130,21 @@ def denoised(XYZ: NDArray[np.floating], guide: Guides) -> NDArray[np.float64]:
     noisy = np.ascontiguousarray(uncorrelated, np.float32)
     result = pyoidn.denoise(noisy, albedo=albedo, normal=guide.normals, hdr=True)
     return fft.idctn(fft.dctn(result.astype(np.float64), axes=(0, 1)) * guide.response, axes=(0, 1)) * white
+
+
+def denoised_picture(scene: mi.Scene, XYZ: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Denoise a picture of a scene, (rows, columns, 3); a large one in bands that overlap and are blended."""
+    rows, columns, _ = XYZ.shape
+    dr.flush_malloc_cache()
+    count = 1
+    if rows * columns > _BAND_PIXELS:
+        count = -(-rows // max(_BLENDED_ROWS, _BAND_PIXELS // columns - _BLENDED_ROWS))
+    result, total = np.zeros_like(XYZ), np.zeros((rows, 1, 1), XYZ.dtype)
+    for index in range(count):
+        first = max(0, rows * index // count - _BLENDED_ROWS // 2)
+        end = min(rows, rows * (index + 1) // count + _BLENDED_ROWS // 2)
+        from_edge = np.minimum(np.arange(1, end - first + 1), np.arange(end - first, 0, -1))
+        weight = np.minimum(from_edge, _BLENDED_ROWS)[:, None, None].astype(XYZ.dtype)
+        result[first:end] += weight * denoised(XYZ[first:end], guides(scene, (first, end)))
+        total[first:end] += weight
+    return result / total

@@ -12,8 +12,11 @@ to all 93 for each sample and each pixel under the filter.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterable
+import tempfile
+from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -21,8 +24,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RequestError, root_cause
-from ..integrator.paths import Splats
+from ..integrator.paths import LightPaths
 from .scene import channel_wavelengths, channel_weights
+
+Rows = tuple[int, int]
+"""The first row of a band of a picture, and the row after its last."""
+
+# A band of this many pixels takes 1.3 GB.
+BAND_PIXELS = 2**19
+_SPOOLED_BYTES = 2**22  # in memory for each band
 
 # Index of a pixel (row by row), mask → index of its first sample and one past its last; they are contiguous.
 SampleRange = Callable[["mi.UInt32", "mi.Bool"], tuple["mi.UInt32", "mi.UInt32"]]
@@ -33,7 +43,25 @@ def pass_seed(seed: int, index: int) -> int:
     return int(np.random.SeedSequence((seed, index)).generate_state(1)[0])
 
 
-def trace_pass(scene: mi.Scene, spp: int, seed: int, integrator: mi.Integrator | None = None) -> NDArray[np.float32]:
+def bands_of(scene: mi.Scene) -> tuple[Rows, ...]:
+    """Return the bands of rows in which the picture of the first sensor is traced, to bound memory.
+
+    Mitsuba's film takes whole pictures only.
+    """
+    columns, rows = (int(size) for size in scene.sensors()[0].film().crop_size())
+    whole = needs_mitsubas_film(scene.integrator())
+    count = 1 if whole else min(rows, -(-rows * columns // BAND_PIXELS))
+    return tuple(pairwise(rows * index // count for index in range(count + 1)))
+
+
+def trace_pass(
+    scene: mi.Scene,
+    spp: int,
+    seed: int,
+    integrator: mi.Integrator | None = None,
+    rows: Rows | None = None,
+    light: LightOfBands | None = None,
+) -> NDArray[np.float32]:
     """Trace the first sensor once and return the sums that determine radiance.
 
     With the filter f, the position p_s of sample s on the film, its radiance L_s(λ) at four wavelengths λ_sj (divided
@@ -53,17 +81,22 @@ def trace_pass(scene: mi.Scene, spp: int, seed: int, integrator: mi.Integrator |
         spp: samples per pixel; the scene's sampler may draw more (`samples_drawn`).
         seed: 32 bits.
         integrator: replaces that of the scene.
+        rows: those to be traced; default: all. Samples outside them, but under the filter of one of their pixels,
+            count. Bands have independent random numbers, except for the paths from the light, which are common to all.
+        light: of all bands; required with `rows`.
 
     Returns:
-        (height, width, n + 1) float32.
+        (height, width, n + 1) float32, of the rows.
 
     Raises:
         RuntimeError: if tracing failed, with the cause on one line.
     """
     integrator = scene.integrator() if integrator is None else integrator
     try:
-        trace = trace_with_mitsubas_film if needs_mitsubas_film(integrator) else _trace
-        return trace(scene, integrator, spp, seed)
+        if needs_mitsubas_film(integrator):
+            return trace_with_mitsubas_film(scene, integrator, spp, seed)
+        rows = rows or (0, int(scene.sensors()[0].film().crop_size()[1]))
+        return _trace(scene, integrator, spp, seed, rows, light or LightOfBands((rows,)))
     except Exception as error:
         raise RuntimeError(f"rendering failed: {root_cause(error)}") from error
 
@@ -73,24 +106,26 @@ def needs_mitsubas_film(integrator: mi.Integrator) -> bool:
     return not isinstance(integrator, mi.SamplingIntegrator) or isinstance(integrator, mi.CppADIntegrator)
 
 
-def check_memory(scene: mi.Scene, spp: int) -> None:
+def check_memory(scene: mi.Scene, spp: int, bands: tuple[Rows, ...] | None = None) -> None:
     """Check that a picture fits into the available memory, where the system reports it (Linux).
 
-    The peak memory is 24 n + 68 bytes per pixel of n channels (sums in float64, the result of a pass and copies of it,
-    and the picture in float32) and 40 bytes per sample of a pass (position on the film, channels and values of four
-    wavelengths). With Mitsuba's film it was measured as 14 n and 24 n.
+    The peak memory is 24 n + 68 bytes per pixel of n channels of a band (sums in float64, the result of a pass and
+    copies of it, and the picture in float32), 40 bytes per sample of a pass of it (position on the film, channels and
+    values of four wavelengths), and 8 bytes per pixel of the film. With Mitsuba's film, 14 n and 24 n were measured.
 
     Args:
         scene: from `load_spectral_scene`.
         spp: samples per pixel of the largest pass.
+        bands: in which it is traced; default: whole.
 
     Raises:
         ValueError: if more memory is needed than available.
     """
     columns, rows = (int(size) for size in scene.sensors()[0].film().crop_size())
+    largest = rows if bands is None else max(end - first for first, end in bands)
     n = channel_wavelengths().size
     pixel_bytes, sample_bytes = (14 * n, 24 * n) if needs_mitsubas_film(scene.integrator()) else (24 * n + 68, 40)
-    needed = rows * columns * (pixel_bytes + sample_bytes * spp)
+    needed = columns * (largest * (pixel_bytes + sample_bytes * spp) + 8 * rows)
     dr.flush_malloc_cache()
     if (available := _available_memory()) is not None and needed > available:
         raise RequestError(
@@ -175,16 +210,57 @@ def trace_with_mitsubas_film(scene: mi.Scene, integrator: mi.Integrator, spp: in
     return np.concatenate([picture * count, np.full((*picture.shape[:2], 1), count)], axis=-1)
 
 
-def _trace(scene: mi.Scene, integrator: mi.SamplingIntegrator, spp: int, seed: int) -> NDArray[np.float32]:
+class LightOfBands:
+    """Contributions of the paths from the light of one pass, by band, in temporary files if they are many.
+
+    Each is a row of float32, in the order of tracing: position on the film (x, y), wavelengths, values.
+    """
+
+    def __init__(self, bands: tuple[Rows, ...]) -> None:
+        self.bands = bands
+        self._traced: tuple[int, int] | None = None
+        self._columns = 0
+        self._files: list[Any] = []
+
+    def of(self, rows: Rows, light: LightPaths, spp: int, seed: int, margin: int) -> NDArray[np.float32]:
+        """Return the contributions to some rows of a pass, and to `margin` rows above and below."""
+        if self._traced != (spp, seed):
+            self.__del__()
+            self._files = [tempfile.SpooledTemporaryFile(_SPOOLED_BYTES) for _ in self.bands]  # noqa: SIM115
+            for splats in light.splats(seed, light.count(spp)):
+                traced = np.stack([np.array(x) for x in (*splats.position, *splats.wavelengths, *splats.value)], axis=1)
+                self._columns = traced.shape[1]
+                for (first, end), file in zip(self.bands, self._files, strict=True):
+                    row = traced[:, 1]
+                    # Points on the lower edge of the film count as of its last row.
+                    below = np.inf if end == self.bands[-1][1] else end + margin
+                    file.write(traced[(row >= first - margin) & (row < below)].tobytes())
+            self._traced = spp, seed
+        file = self._files[self.bands.index(rows)]
+        file.seek(0)
+        return np.frombuffer(file.read(), np.float32).reshape(-1, self._columns or 1)
+
+    def __del__(self) -> None:
+        for file in self._files:
+            file.close()
+
+
+def _trace(
+    scene: mi.Scene, integrator: mi.SamplingIntegrator, spp: int, seed: int, rows: Rows, light_of_bands: LightOfBands
+) -> NDArray[np.float32]:
     sensor = scene.sensors()[0]
     film = sensor.film()
-    columns, rows = (int(size) for size in film.crop_size())
-    rfilter = film.rfilter()
+    columns, film_rows = (int(size) for size in film.crop_size())
+    (first, end), rfilter = rows, film.rfilter()
     border = rfilter.border_size() if film.sample_border() else 0
+    # Rows above and below that are traced as well.
+    radius = _radius(rfilter)
+    margins = border, min(first + border, radius), min(film_rows + border - end, radius)
     light = None
     if hasattr(integrator, "parts"):
         integrator, light = integrator.parts(scene, sensor)
-    traced_columns, traced_rows = columns + 2 * border, rows + 2 * border
+    traced_columns, traced_rows = columns + 2 * border, end - first + sum(margins[1:])
+    light_seed, seed = seed, pass_seed(seed, first) if first else seed
 
     sampler = sensor.sampler().clone()
     sampler.set_sample_count(spp)
@@ -198,24 +274,25 @@ def _trace(scene: mi.Scene, integrator: mi.SamplingIntegrator, spp: int, seed: i
     pixel = dr.arange(mi.UInt32, size) // count
     sampler = rotated(sampler, seed, pixel)
     row = pixel // stride
-    corner = mi.Vector2f(mi.Vector2i(pixel - row * stride, row)) - border
+    corner = mi.Vector2f(mi.Vector2i(pixel - row * stride, row) - mi.Vector2i(border, dr.opaque(mi.Int32, margins[1])))
     position = corner + sampler.next_2d()
     aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
     time = mi.Float(sensor.shutter_open())
     if sensor.shutter_open_time() > 0:
         time += sampler.next_1d() * sensor.shutter_open_time()
-    ray, weight = sensor.sample_ray_differential(
-        time, sampler.next_1d(), position / mi.ScalarVector2f(columns, rows), aperture
-    )
+    on_film = mi.Point2f(position.x, position.y + dr.opaque(mi.Float, first)) / mi.ScalarVector2f(columns, film_rows)
+    ray, weight = sensor.sample_ray_differential(time, sampler.next_1d(), on_film, aperture)
     ray.scale_differential(spp**-0.5)
     traced, _, _ = integrator.sample(scene, sampler, ray, sensor.get_medium())
     channels = channel_wavelengths().size
     channel, value = _on_channels(film, ray.wavelengths, weight * traced)
     dr.eval(position, channel, value)
-    sums = np.array(collect(rfilter, position, channel, value, (rows, columns), border, equal_ranges(count), channels))
-    sums = sums.reshape(rows, columns, -1)
+    shape = end - first, columns
+    sums = np.array(collect(rfilter, position, channel, value, shape, margins, equal_ranges(count), channels))
+    sums = sums.reshape(*shape, -1)
     if light is not None:
-        _add_light(sums, film, light.splats(seed, light.count(spp)), spp)
+        splats = light_of_bands.of(rows, light, spp, light_seed, radius)
+        _add_light(sums, film, splats - np.float32([0, first, *[0] * (splats.shape[1] - 2)]), spp, margins)
     return sums
 
 
@@ -231,31 +308,32 @@ def _on_channels(film: mi.Film, wavelengths: mi.Spectrum, value: mi.Spectrum) ->
     return list((wavelengths - float(centres[0])) / step), list(radiance / (len(radiance) * step))
 
 
-def _add_light(sums: NDArray[np.float32], film: mi.Film, splat_batches: Iterable[Splats], spp: int) -> None:
+def _add_light(
+    sums: NDArray[np.float32], film: mi.Film, splats: NDArray[np.float32], spp: int, margins: tuple[int, int, int]
+) -> None:
     """Add the contributions of paths from the light, without adding to the sums of filter weights.
 
-    They are sorted by pixel, and those of a pixel by the order of tracing.
+    They are sorted by pixel, and those of a pixel by the order of tracing. Their positions are relative to the first
+    row of the sums.
     """
-    rows, columns, channels = sums.shape
-    parts = []
-    for splats in splat_batches:
-        channel, value = _on_channels(film, splats.wavelengths, splats.value * dr.opaque(mi.Float, spp))
-        dr.eval(channel, value)
-        parts.append([np.array(column) for column in (*splats.position, *channel, *value)])
-    if not parts:
+    if not len(splats):
         return
-    x, y, *rest = (np.concatenate(column) for column in zip(*parts, strict=True))
-    pixel = np.clip(y.astype(np.int64), 0, rows - 1) * columns + np.clip(x.astype(np.int64), 0, columns - 1)
-    order = np.argsort(pixel, kind="stable")
-    x, y, *rest = (mi.Float(column[order]) for column in (x, y, *rest))
-    starts = mi.UInt32(np.concatenate([[0], np.bincount(pixel, minlength=rows * columns).cumsum()]))
+    rows, columns, channels = sums.shape
+    _, above, below = margins
+    row = np.clip(np.floor(splats[:, 1]).astype(np.int64) + above, 0, rows + above + below - 1)
+    pixel = row * columns + np.clip(splats[:, 0].astype(np.int64), 0, columns - 1)
+    ordered = splats[np.argsort(pixel, kind="stable")].T
+    x, y, *rest = (mi.Float(np.ascontiguousarray(column)) for column in ordered)
+    counts = np.bincount(pixel, minlength=(rows + above + below) * columns)
+    starts = mi.UInt32(np.concatenate([[0], counts.cumsum()]))
+    half = len(rest) // 2
+    channel, value = _on_channels(film, mi.Spectrum(rest[:half]), mi.Spectrum(rest[half:]) * dr.opaque(mi.Float, spp))
 
     def range_of_pixel(index: mi.UInt32, active: mi.Bool) -> tuple[mi.UInt32, mi.UInt32]:
         return dr.gather(mi.UInt32, starts, index, active), dr.gather(mi.UInt32, starts, index + 1, active)
 
-    half = len(rest) // 2
-    position, channel, value = mi.Point2f(x, y), rest[:half], rest[half:]
-    added = collect(film.rfilter(), position, channel, value, (rows, columns), 0, range_of_pixel, channels - 1)
+    position, shape = mi.Point2f(x, y), (rows, columns)
+    added = collect(film.rfilter(), position, channel, value, shape, margins, range_of_pixel, channels - 1)
     sums[..., :-1] += np.array(added).reshape(sums.shape)[..., :-1]
 
 
@@ -264,16 +342,22 @@ def equal_ranges(count: mi.UInt32) -> SampleRange:
     return lambda pixel, active: (pixel * count, pixel * count + count)
 
 
+def _radius(rfilter: mi.ReconstructionFilter) -> int:
+    """Return how many pixels away from its own a sample can contribute."""
+    return int(np.ceil(rfilter.radius() - 0.5))
+
+
 @dr.syntax
-def collect(rfilter, position, channel, value, size, border, samples, channels):
+def collect(rfilter, position, channel, value, size, margins, samples, channels):
     """Gather the samples under the filter of each pixel, row by row, in one lane per pixel.
 
     `channel` and `value` are lists; the value at a fractional channel is divided linearly between the two nearest
     channels. The result has `channels` sums and then the sum of filter weights of each pixel. There are also samples in
-    the `border`.
+    the `margins`: pixels at each side, rows above and rows below.
     """
     rows, columns = size
-    kernel_radius = int(np.ceil(rfilter.radius() - 0.5))
+    sides, above, below = margins
+    kernel_radius = _radius(rfilter)
     box = rfilter.is_box_filter()
     width = 2 * kernel_radius + 1
     pixel = dr.arange(mi.UInt32, rows * columns)
@@ -282,16 +366,16 @@ def collect(rfilter, position, channel, value, size, border, samples, channels):
     x = mi.Int32(pixel) - y * mi.Int32(across)
     base = pixel * (channels + 1)
     sums = dr.zeros(mi.Float, rows * columns * (channels + 1))
-    stride = mi.Int32(across) + 2 * border
-    last_x, last_y = mi.Int32(across) + border, dr.opaque(mi.Int32, rows + border)
+    stride = mi.Int32(across) + 2 * sides
+    last_x, first_y, last_y = mi.Int32(across) + sides, dr.opaque(mi.Int32, -above), dr.opaque(mi.Int32, rows + below)
 
     weight = dr.zeros(mi.Float, rows * columns)
     tap = mi.UInt32(0)
     while tap < width * width:
         source_y = y + mi.Int32(tap // width) - kernel_radius
         source_x = x + mi.Int32(tap % width) - kernel_radius
-        inside = (source_x >= -border) & (source_y >= -border) & (source_x < last_x) & (source_y < last_y)
-        index, end = samples(mi.UInt32((source_y + border) * stride + source_x + border), inside)
+        inside = (source_x >= -sides) & (source_y >= first_y) & (source_x < last_x) & (source_y < last_y)
+        index, end = samples(mi.UInt32((source_y - first_y) * stride + source_x + sides), inside)
         while index < end:
             filter_weight = mi.Float(1)
             if dr.hint(not box, mode="scalar"):

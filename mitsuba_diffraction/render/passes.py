@@ -2,24 +2,31 @@
 
 A checkpoint is an uncompressed `.npz` file (noise does not compress) with the fields of `Accumulation` and the `digest`
 of the request (`passes.Job`). The comment of the archive is the SHA-256 of the file (`files.seal`). It takes 8 bytes
-per pixel and channel, 710 MB for 1280 × 720 pixels, and twice as much while it is being replaced.
+per pixel and channel, and twice as much while it is being replaced.
+
+To bound memory, a large picture is traced in bands of rows (`film.bands_of`): in each pass, band after band is added to
+its sums. One band is in memory, the others are in checkpoints of their own.
 """
 
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 import logging
 import math
 import os
+import shutil
 import signal
+import tempfile
 import threading
 import time
+import weakref
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager, nullcontext
 from dataclasses import asdict, dataclass, fields
+from functools import cached_property
 from importlib import metadata
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile, ZipFile
@@ -30,8 +37,18 @@ from numpy.typing import NDArray
 
 from ..color import spectrum_to_XYZ
 from ..errors import RequestError
-from ..files import UNSEALED, exclusive, is_intact, seal, whole_file
-from .film import check_memory, is_independent, needs_mitsubas_film, pass_seed, samples_drawn, trace_pass
+from ..files import UNSEALED, discard, exclusive, is_intact, seal, whole_file
+from .film import (
+    LightOfBands,
+    Rows,
+    bands_of,
+    check_memory,
+    is_independent,
+    needs_mitsubas_film,
+    pass_seed,
+    samples_drawn,
+    trace_pass,
+)
 from .scene import (
     Materials,
     channel_wavelengths,
@@ -40,7 +57,7 @@ from .scene import (
     scene_digest,
     warn_of_gratings,
 )
-from .spectral_image import SpectralImage
+from .spectral_image import SpectralImage, split_rows
 
 _log = logging.getLogger(__name__)
 
@@ -84,31 +101,37 @@ class Accumulation:
         self.passes += 1
         self.samples += samples
 
-    def radiance(self) -> NDArray[np.float32]:
+    def radiance(self, rows: slice = slice(None)) -> NDArray[np.float32]:
         """Return the radiance, (height, width, n) float32, W m⁻² sr⁻¹ nm⁻¹."""
         # Row by row, to avoid a second copy of the sums of a large picture.
-        return np.stack([ratio(row[:, :-1], row[:, -1:]).astype(np.float32) for row in self.sums])
+        return np.stack([ratio(row[:, :-1], row[:, -1:]).astype(np.float32) for row in self.sums[rows]])
 
-    def error(self) -> float:
-        """Return the 90th percentile of the relative standard error of luminance over all non-black pixels.
+    def relative_errors(self) -> NDArray[np.float32]:
+        """Return the relative standard error of luminance, (height, width); NaN if black or before two passes.
 
         With σ² the variance of the luminance of a sample, y_p has the variance σ²/n_p. An unbiased estimate of σ² is
 
             s² = (Σ_p n_p y_p² − (Σ_p n_p y_p)²/N) / (P − 1),
 
-        and the relative error of a pixel is (s/√N) / (Σ_p n_p y_p/N). The mean square over all pixels is not used:
-        where a lamp is seen via two gratings it is dominated by fireflies, and does not decrease for hours. With few
-        passes the percentile is biased upwards by the variance of s².
-
-        Returns:
-            The error; NaN before two passes, or for a black picture.
+        and the relative error of a pixel is (s/√N) / (Σ_p n_p y_p/N).
         """
-        lit = self.luminance > 0
-        if self.passes < 2 or not lit.any():
-            return float("nan")
-        luminance, squares = self.luminance[lit], self.squares[lit]
-        variance = np.maximum(squares - luminance**2 / self.samples, 0) / (self.passes - 1)
-        return float(np.percentile(np.sqrt(variance * self.samples) / luminance, 90))
+        errors = np.full(self.luminance.shape, np.nan, np.float32)
+        if self.passes >= 2:
+            lit = self.luminance > 0
+            luminance, squares = self.luminance[lit], self.squares[lit]
+            variance = np.maximum(squares - luminance**2 / self.samples, 0) / (self.passes - 1)
+            errors[lit] = np.sqrt(variance * self.samples) / luminance
+        return errors
+
+
+def error_of_picture(errors: NDArray[np.float32]) -> float:
+    """Return the 90th percentile of `Accumulation.relative_errors` over all non-black pixels; NaN if there are none.
+
+    The mean square over all pixels is not used: where a lamp is seen via two gratings it is dominated by fireflies, and
+    does not decrease for hours. With few passes the percentile is biased upwards by the variance of s².
+    """
+    errors = errors[~np.isnan(errors)]
+    return float(np.percentile(errors, 90)) if errors.size else math.nan
 
 
 def ratio(sums: NDArray, weights: NDArray) -> NDArray:
@@ -119,6 +142,19 @@ def ratio(sums: NDArray, weights: NDArray) -> NDArray:
 def checkpoint_path(picture: Path) -> Path:
     """Return the path of the checkpoint of a picture, next to it."""
     return picture.with_name(f"{picture.name}.checkpoint")
+
+
+def checkpoint_of_band(checkpoint: str | os.PathLike[str], index: int) -> str:
+    """Return the path of the checkpoint of a band; that of the first has no number."""
+    return f"{os.fspath(checkpoint)}.{index}" if index else os.fspath(checkpoint)
+
+
+def discard_checkpoints(checkpoint: str | os.PathLike[str]) -> None:
+    """Remove the checkpoints of all bands of a picture."""
+    numbers = itertools.count(1)
+    others = itertools.takewhile(os.path.exists, (checkpoint_of_band(checkpoint, number) for number in numbers))
+    for path in (*others, checkpoint):
+        discard(path)
 
 
 def save_checkpoint(path: str | os.PathLike[str], digest: str, sums: Accumulation) -> None:
@@ -156,6 +192,98 @@ def load_checkpoint(path: str | os.PathLike[str], digest: str) -> Accumulation |
     )
 
 
+class BandedSums:
+    """The sums of a picture in bands of rows: those of one band in memory, all others in checkpoints.
+
+    Attributes:
+        bands: rows of each band.
+        done: number of additions so far: in each pass, one per band from top to bottom.
+        errors: (height, width) float32, `Accumulation.relative_errors`.
+        luminance: (height, width) float32, mean luminance.
+    """
+
+    def __init__(
+        self, bands: tuple[Rows, ...], columns: int, digest: str, checkpoint: str | os.PathLike[str] | None
+    ) -> None:
+        """Read existing checkpoints; errors as of `load_checkpoint`. Without `checkpoint`, they are temporary files."""
+        self.bands, self._columns, self._digest = bands, columns, digest
+        if checkpoint is None and len(bands) > 1:
+            checkpoint = Path(tempfile.mkdtemp(), "sums")
+            weakref.finalize(self, shutil.rmtree, checkpoint.parent, ignore_errors=True)
+        self._paths = [None] if checkpoint is None else [checkpoint_of_band(checkpoint, k) for k in range(len(bands))]
+        self.errors, self.luminance = np.full((2, bands[-1][1], columns), np.nan, np.float32)
+        self._index, self._saved = -1, 0
+        passes = [self._describe(index).passes for index in range(len(bands))]
+        self.done = sum(passes)
+        if passes != [-(-(self.done - index) // len(bands)) for index in range(len(bands))]:
+            raise RequestError(f"{checkpoint}: a checkpoint of another band is missing; remove them to start over")
+
+    def band(self, index: int) -> Accumulation:
+        """Return the sums of a band, after saving those that were in memory."""
+        if index != self._index:
+            self.release()
+            (first, end), path = self.bands[index], self._paths[index]
+            stored = None if path is None else load_checkpoint(path, self._digest)
+            self._sums = Accumulation.empty(end - first, self._columns) if stored is None else stored
+            self._index, self._saved = index, self._sums.samples
+        return self._sums
+
+    def add(self, traced: NDArray[np.float32], samples: int) -> None:
+        """Add the next result of `trace_pass`."""
+        index = self.done % len(self.bands)
+        self.band(index).add(traced, samples)
+        self._describe(index)
+        self.done += 1
+
+    def release(self) -> None:
+        """Free the memory of the sums, after saving them."""
+        self.save()
+        self._index, self._sums = -1, Accumulation.empty(0, 0)
+
+    def save(self) -> None:
+        """Write the checkpoint of the sums in memory, if there is anything new in them."""
+        if self._index < 0 or (path := self._paths[self._index]) is None or self._saved == self._sums.samples:
+            return
+        try:
+            save_checkpoint(path, self._digest, self._sums)
+        except OSError as error:
+            kept = f"the last one, of {self._saved} samples per pixel, is kept" if self._saved else "there is none yet"
+            raise OSError(f"{os.fspath(path)}: cannot be written ({error.strerror or error}); {kept}") from error
+        self._saved = self._sums.samples
+
+    def _describe(self, index: int) -> Accumulation:
+        """Update errors and luminance of a band, and return its sums."""
+        sums, rows = self.band(index), slice(*self.bands[index])
+        self.errors[rows] = sums.relative_errors()
+        self.luminance[rows] = sums.luminance / max(sums.samples, 1)
+        return sums
+
+
+class BandedImage(SpectralImage):
+    """A picture of which one band is in memory at a time, as long as `radiance` is not read as a whole."""
+
+    def __init__(self, sums: BandedSums, attributes: Mapping[str, str | int | float]) -> None:
+        object.__setattr__(self, "wavelengths", channel_wavelengths())
+        object.__setattr__(self, "attributes", dict(attributes))
+        object.__setattr__(self, "_sums", sums)
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        return (*self._sums.luminance.shape, self.wavelengths.size)
+
+    def blocks(self) -> Iterator[NDArray[np.float32]]:
+        for index in range(len(self._sums.bands)):
+            sums = self._sums.band(index)
+            for rows in split_rows(*sums.luminance.shape):
+                yield sums.radiance(rows)
+            del sums
+        self._sums.release()
+
+    @cached_property
+    def radiance(self) -> NDArray[np.float32]:
+        return np.concatenate(list(self.blocks()))
+
+
 # Two million samples take some seconds on two cores, so that progress and interrupts are responsive. Passes of large
 # pictures have up to eight samples per pixel, as adding a pass to the sum takes one core as long as tracing a third of
 # a sample per pixel.
@@ -178,6 +306,7 @@ class Job:
         variant: Mitsuba variant.
         seed: random seed.
         samples: samples per pixel of each pass.
+        bands: `film.bands_of` the scene.
         until_error: see `render`.
         content: digest of the scene and the files it references (`scene_digest`).
         versions: of the packages involved.
@@ -188,6 +317,7 @@ class Job:
     variant: str
     seed: int
     samples: tuple[int, ...]
+    bands: tuple[Rows, ...]
     until_error: float | None
     content: str
     versions: tuple[str, ...]
@@ -205,8 +335,12 @@ class Job:
         return load_spectral_scene(self.scene, **self.where)
 
 
-# Yields the passes `first`, `first` + 1, … of a job in order; see `trace_locally`.
+# Yields the results of `trace_band` for `first`, `first` + 1, … in order; see `trace_locally`.
 Tracer = Callable[[Job, "mi.Scene", int], Iterator[NDArray[np.float32]]]
+
+
+class Finished(Exception):
+    """A picture of an earlier run satisfies the request."""
 
 
 class Interrupted(KeyboardInterrupt):
@@ -221,10 +355,17 @@ class Interrupted(KeyboardInterrupt):
         self.image = image
 
 
+def trace_band(job: Job, scene: mi.Scene, index: int, light: LightOfBands) -> NDArray[np.float32]:
+    """Trace number `index` of the bands of all passes, see `BandedSums.done` and `trace_pass`."""
+    number, band = divmod(index, len(job.bands))
+    return trace_pass(scene, job.samples[number], pass_seed(job.seed, number), None, job.bands[band], light)
+
+
 def trace_locally(job: Job, scene: mi.Scene, first: int) -> Iterator[NDArray[np.float32]]:
-    """Trace the passes of a job from `first` on in this process; see `trace_pass`."""
-    for index in range(first, len(job.samples)):
-        yield trace_pass(scene, job.samples[index], pass_seed(job.seed, index))
+    """Trace the bands of the passes of a job from `first` on in this process; see `trace_band`."""
+    light = LightOfBands(job.bands)
+    for index in range(first, len(job.samples) * len(job.bands)):
+        yield trace_band(job, scene, index, light)
 
 
 def versions() -> tuple[str, ...]:
@@ -245,9 +386,9 @@ def render(
     until_error: float | None = None,
     checkpoint: str | os.PathLike[str] | None = None,
     seconds: float = 60.0,
-    finished: SpectralImage | None = None,
+    finished: str | None = None,
     tracer: Tracer = trace_locally,
-    progress: Callable[[int, int, float], None] = lambda done, total, error: None,
+    progress: Callable[[float, int, float], None] = lambda done, total, error: None,
 ) -> SpectralImage:
     """Render the first sensor of a scene spectrally, with its own integrator, in the current variant.
 
@@ -267,16 +408,17 @@ def render(
         until_error: stop when the relative error of the picture (`Accumulation.error`) is at most this; spp is then the
             maximum.
         checkpoint: file in which the sums are saved periodically. If it exists, rendering resumes from it. The caller
-            removes it after saving the picture.
+            removes it after saving the picture (`discard_checkpoints`). Large pictures have several.
         seconds: interval between checkpoints, or twenty times the time that writing one takes, if that is longer.
-        finished: a picture of an earlier run, returned without rendering if it satisfies this request.
+        finished: the attribute `digest` of a picture of an earlier run.
         tracer: traces the passes; default: this process, see also `cluster.trace_on`.
         progress: called at the start and after each pass with the samples per pixel done, in total (with `until_error`,
             extrapolated from the current error), and the current error (NaN before four passes).
 
     Returns:
         The picture; radiance per nm at `channel_wavelengths()`. Its attributes are the scene, the variant, the samples
-        per pixel, the seed, the error (from four passes on) and the digest of the request.
+        per pixel, the seed, the error (from four passes on) and the digest of the request. A large one is read from its
+        checkpoints when it is saved (`BandedImage`).
 
     Raises:
         FileNotFoundError: if there is no such scene.
@@ -284,24 +426,23 @@ def render(
             available, or the checkpoint is of another rendering, or one that another process writes.
         RuntimeError: if rendering failed, with the cause on one line.
         OSError: if a checkpoint cannot be written; the previous one is kept.
+        Finished: without rendering, if the picture with the digest `finished` satisfies this request.
         Interrupted: at the end of the current pass on the first Ctrl-C, with the picture so far, after a checkpoint.
         KeyboardInterrupt: immediately on the second Ctrl-C, or if no pass has been completed.
     """
     where = {"width": width, "height": height, "motion": motion}
     where |= {"parameters": parameters or {}, "materials": materials or {}}
     job, scene = _job(scene_path, where, spp, seed, until_error)
-    if finished is not None and finished.attributes.get("digest") == job.digest():
-        return finished
+    if finished == job.digest():
+        raise Finished
 
     with nullcontext() if checkpoint is None else exclusive(checkpoint):
-        sums = None if checkpoint is None else load_checkpoint(checkpoint, job.digest())
-        if sums is None:
-            columns, rows = (int(size) for size in scene.sensors()[0].film().crop_size())
-            sums = Accumulation.empty(rows, columns)
+        columns = int(scene.sensors()[0].film().crop_size()[0])
+        sums = BandedSums(job.bands, columns, job.digest(), checkpoint)
         complete = _trace(job, scene, sums, checkpoint, seconds, tracer, progress)
-    if not sums.passes:
+    if sums.done < len(job.bands):
         raise KeyboardInterrupt
-    _warn_of_implausible_pixels(sums, max_plausible_luminance(scene))
+    _warn_of_implausible_pixels(sums.luminance, max_plausible_luminance(scene))
     image = _image(sums, job, Path(scene_path).name, complete=complete)
     if not complete:
         raise Interrupted(image)
@@ -311,24 +452,23 @@ def render(
 def _trace(
     job: Job,
     scene: mi.Scene,
-    sums: Accumulation,
+    sums: BandedSums,
     checkpoint: str | os.PathLike[str] | None,
     seconds: float,
     tracer: Tracer,
-    progress: Callable[[int, int, float], None],
+    progress: Callable[[float, int, float], None],
 ) -> bool:
     """Add passes to the sums until the picture is complete or Ctrl-C was pressed; return whether it is complete."""
-    saved, complete = sums.samples, _is_complete(sums, job, progress)
+    complete = _is_complete(sums, job, progress)
     last_checkpoint, interval = time.monotonic(), seconds
-    with _deferred_interrupt() as interrupted, closing(tracer(job, scene, sums.passes)) as traced:
+    with _deferred_interrupt() as interrupted, closing(tracer(job, scene, sums.done)) as traced:
         while not (complete or interrupted()):
-            sums.add(next(traced), job.samples[sums.passes])
+            sums.add(next(traced), job.samples[sums.done // len(job.bands)])
             complete = _is_complete(sums, job, progress)
             due = interrupted() or time.monotonic() - last_checkpoint >= interval
             if checkpoint is not None and due and not complete:
                 last_checkpoint = time.monotonic()
-                _save(checkpoint, job, sums, saved)
-                saved = sums.samples
+                sums.save()
                 interval = max(seconds, MIN_CHECKPOINT_INTERVAL * (time.monotonic() - last_checkpoint))
     return complete
 
@@ -352,7 +492,7 @@ def _job(
             sampler.class_name(),
         )
     samples = split(scene, spp, 1 if until_error is None else _MIN_PASSES_UNTIL_ERROR)
-    check_memory(scene, max(samples))
+    check_memory(scene, max(samples), bands_of(scene))
     warn_of_gratings(scene)
     job = Job(
         scene=str(Path(scene_path).resolve()),
@@ -360,6 +500,7 @@ def _job(
         variant=mi.variant(),
         seed=seed,
         samples=samples,
+        bands=bands_of(scene),
         until_error=until_error,
         content=scene_digest(scene_path, where["parameters"], where["materials"]),
         versions=versions(),
@@ -367,19 +508,22 @@ def _job(
     return job, scene
 
 
-def _image(sums: Accumulation, job: Job, scene: str, complete: bool) -> SpectralImage:
+def _image(sums: BandedSums, job: Job, scene: str, complete: bool) -> SpectralImage:
     """Return the picture so far; only a complete one has the digest of the request."""
-    attributes = {"scene": scene, "variant": job.variant, "spp": sums.samples, "seed": str(job.seed)}
-    if sums.passes >= _MIN_PASSES_FOR_ERROR:
-        attributes["error"] = sums.error()
+    passes = sums.done // len(job.bands)
+    attributes = {"scene": scene, "variant": job.variant, "spp": sum(job.samples[:passes]), "seed": str(job.seed)}
+    if passes >= _MIN_PASSES_FOR_ERROR:
+        attributes["error"] = error_of_picture(sums.errors)
     if complete:
         attributes["digest"] = job.digest()
-    return SpectralImage(channel_wavelengths(), sums.radiance(), attributes)
+    if len(job.bands) > 1:
+        return BandedImage(sums, attributes)
+    return SpectralImage(channel_wavelengths(), sums.band(0).radiance(), attributes)
 
 
-def _warn_of_implausible_pixels(sums: Accumulation, limit: float) -> None:
+def _warn_of_implausible_pixels(luminance: NDArray[np.float32], limit: float) -> None:
     """Log a warning that names a pixel whose luminance is not finite, or else the brightest one above the limit."""
-    luminance = np.abs(sums.luminance) / sums.samples
+    luminance = np.abs(luminance)
     if count := np.count_nonzero(~(luminance <= limit) | np.isinf(luminance)):
         row, column = np.unravel_index(np.argmax(luminance), luminance.shape)  # NaN counts as the maximum
         value = luminance[row, column]
@@ -400,26 +544,22 @@ def split(scene: mi.Scene, spp: int, min_passes: int = 1) -> tuple[int, ...]:
         raise RequestError(f"spp: got {spp}, wanted at most {_MAX_PASSES * spp // passes:.2g} for so large a picture")
     passes = min(max(passes, min_passes), spp)
     ends = [spp * index // passes for index in range(passes + 1)]
-    return tuple(samples_drawn(scene, end - start) for start, end in pairwise(ends))
+    return tuple(samples_drawn(scene, end - start) for start, end in itertools.pairwise(ends))
 
 
-def _is_complete(sums: Accumulation, job: Job, progress: Callable[[int, int, float], None]) -> bool:
+def _is_complete(sums: BandedSums, job: Job, progress: Callable[[float, int, float], None]) -> bool:
     """Report progress and return whether the picture is complete."""
-    error = sums.error() if sums.passes >= _MIN_PASSES_FOR_ERROR else math.nan
+    passes, bands = divmod(sums.done, len(job.bands))
+    error = error_of_picture(sums.errors) if passes >= _MIN_PASSES_FOR_ERROR else math.nan
+    done = sum(job.samples[:passes])
+    if bands:
+        done += round(job.samples[passes] * bands / len(job.bands), 2)
     expected = total = sum(job.samples)
     if job.until_error is not None and not math.isnan(error):
         # The error falls with the square root of the number of samples.
-        expected = min(total, max(sums.samples, round(sums.samples * (error / job.until_error) ** 2)))
-    progress(sums.samples, expected, error)
-    return sums.passes == len(job.samples) or (job.until_error is not None and error <= job.until_error)
-
-
-def _save(checkpoint: str | os.PathLike[str], job: Job, sums: Accumulation, saved: int) -> None:
-    try:
-        save_checkpoint(checkpoint, job.digest(), sums)
-    except OSError as error:
-        kept = f"the last one, of {saved} samples per pixel, is kept" if saved else "there is none yet"
-        raise OSError(f"{os.fspath(checkpoint)}: cannot be written ({error.strerror or error}); {kept}") from error
+        expected = min(total, max(done, round(done * (error / job.until_error) ** 2)))
+    progress(done, expected, error)
+    return not bands and (passes == len(job.samples) or (job.until_error is not None and error <= job.until_error))
 
 
 @contextmanager

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,9 +25,6 @@ from ..files import whole_file
 from ..outputs import MARK, png_text
 from ..spectrum.exr import one_line, silence
 
-if TYPE_CHECKING:
-    from .denoise import Guides
-
 _LAYOUT_VERSION = "1.0"
 # Radiance is per nm, the unit in the channel names: the authors of the layout and pbrt-v4 omit the nm⁻¹, and
 # colour-science integrates the channels over wavelength.
@@ -41,6 +38,15 @@ _RESERVED = frozenset(
         *("spectralLayoutVersion", "emissiveUnits", "writtenBy"),
     )
 )
+
+
+_PIXELS_PER_BLOCK = 2**17
+
+
+def split_rows(rows: int, columns: int) -> list[slice]:
+    """Return the blocks of rows in which large pictures are converted, to bound memory."""
+    step = max(1, _PIXELS_PER_BLOCK // columns)
+    return [slice(first, first + step) for first in range(0, rows, step)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +90,16 @@ class SpectralImage:
         object.__setattr__(self, "radiance", radiance)
         object.__setattr__(self, "attributes", dict(self.attributes))
 
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(height, width, n)."""
+        return self.radiance.shape
+
+    def blocks(self) -> Iterator[NDArray[np.float32]]:
+        """Yield the radiance from top to bottom, in blocks of rows."""
+        for rows in split_rows(*self.shape[:2]):
+            yield self.radiance[rows]
+
     def save(self, path: str | os.PathLike[str], *, half: bool = False) -> None:
         """Write an OpenEXR file (ZIP) in the spectral layout of Fichet, Pacanowski and Wilkie 2021.
 
@@ -98,27 +114,28 @@ class SpectralImage:
             FileNotFoundError: if the folder does not exist.
             ValueError: if a radiance exceeds the range of float16.
         """
+        import Imath
         import OpenEXR
 
-        kind = np.float16 if half else np.float32
-        rgb = spectrum_to_linear_sRGB(self.radiance, self.wavelengths).astype(np.float32)
-        max_value = max(float(np.abs(self.radiance).max()), float(np.abs(rgb).max()))
-        if half and max_value > float(np.finfo(np.float16).max):
-            raise RequestError(f"half: got radiances up to {max_value:.4g}, wanted at most 65504; float32 holds them")
-        channels = {name: np.ascontiguousarray(rgb[..., i], kind) for i, name in enumerate("RGB")}
-        for i, wavelength in enumerate(self.wavelengths):
-            number = f"{wavelength:.6f}".replace(".", ",")
-            channels[f"S0.{number}nm"] = np.ascontiguousarray(self.radiance[..., i], kind)
-        header = {
-            **self.attributes,
-            "compression": OpenEXR.ZIP_COMPRESSION,
-            "type": OpenEXR.scanlineimage,
-            "spectralLayoutVersion": _LAYOUT_VERSION,
-            "emissiveUnits": _UNITS,
-            "writtenBy": MARK,
-        }
-        with whole_file(path) as temporary:
-            OpenEXR.File(header, channels).write(str(temporary))
+        kind, limit = (np.float16, float(np.finfo(np.float16).max)) if half else (np.float32, np.inf)
+        pixel = Imath.Channel(Imath.PixelType(Imath.PixelType.HALF if half else Imath.PixelType.FLOAT))
+        numbers = [f"{wavelength:.6f}".replace(".", ",") for wavelength in self.wavelengths]
+        names = ["R", "G", "B", *(f"S0.{number}nm" for number in numbers)]
+        texts = {"spectralLayoutVersion": _LAYOUT_VERSION, "emissiveUnits": _UNITS, "writtenBy": MARK}
+        attributes = {**self.attributes, **texts}
+        header = OpenEXR.Header(self.shape[1], self.shape[0])
+        header |= {name: value.encode() if isinstance(value, str) else value for name, value in attributes.items()}
+        header["channels"] = dict.fromkeys(names, pixel)
+        # The only writer of OpenEXR that takes a file in blocks of rows.
+        with whole_file(path) as temporary, closing(OpenEXR.OutputFile(str(temporary), header)) as file:
+            for block in self.blocks():
+                rgb = spectrum_to_linear_sRGB(block, self.wavelengths).astype(np.float32)
+                if (value := max(float(np.abs(block).max()), float(np.abs(rgb).max()))) > limit:
+                    raise RequestError(
+                        f"half: got radiances up to {value:.4g}, wanted at most {limit:.0f}; float32 holds them"
+                    )
+                planes = np.concatenate([rgb, block], axis=-1, dtype=kind)
+                file.writePixels({name: planes[..., i].tobytes() for i, name in enumerate(names)}, len(block))
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> SpectralImage:
@@ -159,8 +176,29 @@ class SpectralImage:
         return cls(np.array([wavelength for wavelength, _ in found]), radiance, attributes)
 
 
+def stored_digest(path: str | os.PathLike[str]) -> str | None:
+    """Return the attribute `digest` of a picture that `SpectralImage.save` wrote, None if it has none or is damaged."""
+    import OpenEXR
+
+    with suppress(RuntimeError, ValueError), silence():
+        return OpenEXR.File(os.fspath(path), header_only=True).header().get("digest")
+    return None
+
+
+def exposure_of_preview(path: str | os.PathLike[str]) -> float | None:
+    """Return the exposure of a preview that `save_preview` wrote as PNG, None if it does not hold one."""
+    from PIL import Image
+
+    with suppress(OSError, KeyError, ValueError), Image.open(path) as picture:
+        return float(picture.info["exposure"])
+    return None
+
+
 def save_preview(
-    image: SpectralImage, path: str | os.PathLike[str], exposure: float | None = None, guides: Guides | None = None
+    image: SpectralImage,
+    path: str | os.PathLike[str],
+    exposure: float | None = None,
+    denoise: Callable[[NDArray[np.float32]], NDArray[np.float32]] | None = None,
 ) -> float:
     """Write an 8-bit sRGB preview of a spectral image, in the format given by the suffix of `path`.
 
@@ -168,21 +206,24 @@ def save_preview(
 
     Args:
         exposure: the factor for linear sRGB; by default `auto_exposure`. It is returned.
-        guides: of the same pixels (`denoise.guides`), to denoise the preview.
+        denoise: applied to XYZ, (height, width, 3), such as `denoise.denoised_picture` of the scene.
 
     Raises:
         ValueError: if Pillow does not support the suffix.
     """
     from PIL import Image
 
-    XYZ = spectrum_to_XYZ(image.radiance, image.wavelengths)
-    if guides is not None:
-        from .denoise import denoised
-
-        XYZ = denoised(XYZ, guides)
-    rgb = into_gamut(XYZ_to_linear_sRGB(XYZ))
+    picture = np.concatenate([spectrum_to_XYZ(block, image.wavelengths).astype(np.float32) for block in image.blocks()])
+    if denoise is not None:
+        picture = denoise(picture)
+    blocks = split_rows(*picture.shape[:2])
+    for rows in blocks:
+        picture[rows] = into_gamut(XYZ_to_linear_sRGB(picture[rows]))
     if exposure is None:
-        exposure = auto_exposure(rgb)
+        exposure = auto_exposure(picture)
+    shown = np.concatenate([on_screen(picture[rows] * exposure) for rows in blocks])
+    text = png_text()
+    text.add_text("exposure", repr(exposure))
     with whole_file(path) as temporary:
-        Image.fromarray(on_screen(rgb * exposure)).save(temporary, pnginfo=png_text())
+        Image.fromarray(shown).save(temporary, pnginfo=text)
     return exposure

@@ -92,7 +92,7 @@ def test_a_cluster_gives_the_bits_of_one_machine(scene, two_processes, command):
 def test_results_that_arrive_out_of_order_are_added_in_order(threads_of_this_process, monkeypatch):
     ended = []
 
-    def invented(scene, spp, seed):
+    def invented(scene, spp, seed, *others):
         """Numbers whose sum depends on the order, after a while that is different for each pass."""
         rng = np.random.default_rng(seed)
         time.sleep(rng.uniform(0, 0.1))
@@ -103,7 +103,6 @@ def test_results_that_arrive_out_of_order_are_added_in_order(threads_of_this_pro
     local = render("scene.xml", spp=16)
     in_order = ended.copy()
     ended.clear()
-    monkeypatch.setattr(cluster, "trace_pass", invented)
     monkeypatch.setattr(cluster, "pass_lock", contextlib.nullcontext())
     remote = render("scene.xml", spp=16, tracer=trace_on(threads_of_this_process))
     assert sorted(ended) == sorted(in_order)
@@ -114,10 +113,10 @@ def test_results_that_arrive_out_of_order_are_added_in_order(threads_of_this_pro
 def test_failures_of_a_worker_are_one_line(threads_of_this_process, monkeypatch, command):
     line = f"render scene.xml --spp 9 --variant llvm_ad_spectral --dask {threads_of_this_process}"
 
-    def fail(scene, spp, seed):
+    def fail(*arguments):
         raise RuntimeError("rendering failed: no luck")
 
-    monkeypatch.setattr(cluster, "trace_pass", fail)
+    monkeypatch.setattr(passes, "trace_pass", fail)
     code, out, err = command(line)
     assert (code, out) == (1, "")
     assert err.splitlines()[-1] == "mitsuba-diffraction: error: rendering failed: no luck"

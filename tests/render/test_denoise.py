@@ -11,7 +11,8 @@ from PIL import Image
 
 import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a variant is set)
 from mitsuba_diffraction.color import XYZ_to_linear_sRGB, into_gamut, matching_functions
-from mitsuba_diffraction.render.denoise import Guides, denoised, guides, is_requested
+from mitsuba_diffraction.render import denoise
+from mitsuba_diffraction.render.denoise import Guides, denoised, denoised_picture, guides, is_requested
 
 SCENE = """<scene version="3.0.0"><integrator type="direct"/>
 <sensor type="perspective"><transform name="to_world"><lookat origin="0,-4,2" target="0,0,0.5" up="0,0,1"/></transform>
@@ -169,3 +170,34 @@ def test_the_documentation_names_the_scenes_that_request_denoising():
     assert requesting == {
         f"{name}.xml" for name in ("glasses", "window", "rainbow", "compact_disc", "hologram", "blaze")
     }
+
+
+def test_a_picture_denoised_in_bands_is_that_denoised_as_a_whole(llvm, tmp_path, monkeypatch):
+    """Noise about a grey that rises from 1 to 4, through a tent, on a wall that fills the picture."""
+    film = {"type": "hdrfilm", "width": 64, "height": 160, "rfilter": {"type": "box"}}
+    wall = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, 3]).scale(9)}
+    scene = mi.load_dict({"type": "scene", "sensor": {"type": "perspective", "film": film}, "wall": wall})
+    rng = np.random.default_rng(2)
+    wanted = np.linspace(1, 4, 160)[:, None, None] * np.ones((160, 64, 3))
+    noisy = (wanted * rng.exponential(size=(8, 160, 64, 3)).mean(0)).astype(np.float32)
+    whole = denoised_picture(scene, noisy)
+    np.testing.assert_allclose(whole, denoised(noisy, guides(scene)), rtol=1e-5)
+    monkeypatch.setattr(denoise, "_BAND_PIXELS", 86 * 64)
+    monkeypatch.setattr(denoise, "_BLENDED_ROWS", 32)
+    banded = denoised_picture(scene, noisy)
+    assert (noisy / wanted).std() > 0.3
+    assert (banded / wanted).std() < 0.05
+    # No seams: where bands meet, rows differ from their neighbours as little as in the whole picture.
+    steps = [np.abs(np.diff((picture / wanted).mean((1, 2))))[30:130].max() for picture in (banded, whole)]
+    assert steps[0] < 2 * steps[1]
+
+
+def test_guides_of_bands_are_those_of_the_whole_picture(llvm):
+    film = {"type": "hdrfilm", "width": 32, "height": 24, "rfilter": {"type": "box"}}
+    ball = {"type": "sphere", "center": [0, 0, 4], "bsdf": {"type": "diffuse"}}
+    scene = mi.load_dict({"type": "scene", "sensor": {"type": "perspective", "film": film}, "ball": ball})
+    whole, bands = guides(scene), [guides(scene, rows) for rows in ((0, 9), (9, 24))]
+    for name in ("albedo", "normals"):
+        banded = np.concatenate([getattr(band, name) for band in bands])
+        np.testing.assert_allclose(banded, getattr(whole, name), atol=0.5)
+        np.testing.assert_allclose(banded.mean((1, 2)), getattr(whole, name).mean((1, 2)), atol=0.02)

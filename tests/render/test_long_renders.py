@@ -17,7 +17,13 @@ import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a va
 from mitsuba_diffraction.color import spectrum_to_XYZ
 from mitsuba_diffraction.files import exclusive
 from mitsuba_diffraction.render import SpectralImage, passes, render
-from mitsuba_diffraction.render.passes import Accumulation, Interrupted, load_checkpoint, save_checkpoint
+from mitsuba_diffraction.render.passes import (
+    Accumulation,
+    Interrupted,
+    error_of_picture,
+    load_checkpoint,
+    save_checkpoint,
+)
 from mitsuba_diffraction.render.scene import channel_wavelengths, load_spectral_scene, scene_digest
 from mitsuba_diffraction.render.turntable import orbit
 
@@ -88,7 +94,7 @@ def test_error_is_the_scatter_of_whole_pictures():
     scatter = rng.uniform(0.2, 2.0, (40, 50))
     scatter[3:5] = 50.0  # some pixels never converge, and do not decide
     sums = Accumulation.empty(40, 50)
-    assert np.isnan(sums.error())
+    assert np.isnan(error_of_picture(sums.relative_errors()))
     for number in range(400):
         samples = 2 + number % 3
         luminance = 3 * (1 + scatter * rng.normal(size=scatter.shape) / np.sqrt(samples))
@@ -98,7 +104,7 @@ def test_error_is_the_scatter_of_whole_pictures():
         sums.add((traced * samples).astype(np.float32), samples)
     assert (sums.passes, sums.samples) == (400, 1199)
     expected = np.percentile((scatter[1:] / np.sqrt(1199)), 90)
-    assert sums.error() == pytest.approx(expected, rel=0.05)
+    assert error_of_picture(sums.relative_errors()) == pytest.approx(expected, rel=0.05)
 
 
 @pytest.mark.slow

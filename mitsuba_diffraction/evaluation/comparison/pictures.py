@@ -304,7 +304,7 @@ class Pictures:
         channels = [dr.opaque(mi.Float, channel, shape=len(x)) for channel in range(3)]
         rfilter = self.scene.sensors()[0].film().rfilter()
         count = dr.opaque(mi.UInt32, len(x) // (rows * columns))
-        sums = collect(rfilter, mi.Point2f(x, y), channels, rgb, (rows, columns), 0, equal_ranges(count), 3)
+        sums = collect(rfilter, mi.Point2f(x, y), channels, rgb, (rows, columns), (0, 0, 0), equal_ranges(count), 3)
         values = np.array(sums, np.float64).reshape(rows, columns, 4)
         return ratio(values[..., :3], values[..., 3:])
 

@@ -1,0 +1,177 @@
+"""Large pictures, which are traced in bands of rows to bound memory."""
+
+import resource
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a variant is set)
+from mitsuba_diffraction.color import spectrum_to_XYZ
+from mitsuba_diffraction.render import SpectralImage, film, passes, render
+from mitsuba_diffraction.render.film import LightOfBands, bands_of, trace_pass
+from mitsuba_diffraction.render.passes import BandedImage, Interrupted, trace_locally
+from mitsuba_diffraction.render.scene import channel_wavelengths, load_spectral_scene
+
+# A grating in the sun in front of a wall, and of a crop window of 12 × 10 pixels.
+SCENE = """<scene version="3.0.0">
+    <integrator type="INTEGRATOR"><integer name="max_depth" value="3"/></integrator>
+    <sensor type="perspective"><float name="fov" value="60"/>
+        <transform name="to_world"><lookat origin="0,-3.5,2.5" target="0,.5,.5" up="0,0,1"/></transform>
+        <film type="hdrfilm"><integer name="width" value="16"/><integer name="height" value="12"/>
+            <integer name="crop_offset_x" value="3"/><integer name="crop_width" value="12"/>
+            <integer name="crop_offset_y" value="2"/><integer name="crop_height" value="10"/>
+            <rfilter type="gaussian"/></film>
+        <sampler type="SAMPLER"/>
+    </sensor>
+    <shape type="rectangle"><transform name="to_world"><scale value="4"/></transform></shape>
+    <shape type="rectangle"><transform name="to_world"><rotate x="1" angle="90"/><scale value="4"/>
+        <translate y="1.5"/></transform></shape>
+    <shape type="rectangle"><transform name="to_world"><translate z=".1"/></transform>
+        <bsdf type="diffraction_grating"><string name="profile" value="blazed"/><float name="period" value="2.5"/>
+            <float name="depth" value="0.25"/><float name="coherence_length" value="6"/>
+            <string name="material" value="none"/></bsdf></shape>
+    <emitter type="directional"><vector name="direction" x="0" y=".6" z="-.8"/></emitter>
+</scene>"""
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch, llvm):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def write_scene(integrator="path", sampler="independent"):
+    Path("scene.xml").write_text(SCENE.replace("INTEGRATOR", integrator).replace("SAMPLER", sampler))
+    return "scene.xml"
+
+
+@pytest.fixture
+def three_bands(monkeypatch):
+    monkeypatch.setattr(film, "BAND_PIXELS", 40)
+
+
+def test_bands_cover_the_film(monkeypatch):
+    built = load_spectral_scene(write_scene())
+    assert bands_of(built) == ((0, 10),)
+    for pixels, count in ((119, 2), (40, 3), (12, 10), (1, 10)):
+        monkeypatch.setattr(film, "BAND_PIXELS", pixels)
+        bands = bands_of(built)
+        assert len(bands) == count
+        assert [row for first, end in bands for row in range(first, end)] == list(range(10))
+    # Mitsuba's own film takes whole pictures only.
+    assert bands_of(load_spectral_scene(write_scene("prb"))) == ((0, 10),)
+
+
+@pytest.mark.parametrize(("integrator", "sampler"), [("path", "multijitter"), ("diffraction_path", "independent")])
+def test_a_picture_in_bands_has_the_expectation_of_one_in_a_single_piece(integrator, sampler, three_bands):
+    built = load_spectral_scene(write_scene(integrator, sampler))
+    bands = bands_of(built)
+    light = LightOfBands(bands)
+
+    def rows(sums):
+        """Return luminance and mean filter weight per sample of each row."""
+        luminance = spectrum_to_XYZ(sums[..., :-1], channel_wavelengths())[..., 1]
+        return np.stack([luminance.mean(1), sums[..., -1].mean(1)]) / 64
+
+    whole = np.array([rows(trace_pass(built, 64, seed)) for seed in range(10)])
+    parts = [[trace_pass(built, 64, 100 + seed, None, band, light) for band in bands] for seed in range(10)]
+    banded = np.array([rows(np.concatenate(part)) for part in parts])
+    error = np.sqrt((whole.var(0, ddof=1) + banded.var(0, ddof=1)) / 10)
+    assert (error < 0.1 * whole.mean(0)).all()
+    np.testing.assert_array_less(np.abs(banded.mean(0) - whole.mean(0)), 4 * error)
+
+
+def test_light_of_bands_is_that_of_the_whole_bit_for_bit(three_bands):
+    built = load_spectral_scene(write_scene("diffraction_path"))
+    integrator, bands = built.integrator(), bands_of(built)
+
+    class LightAlone(mi.SamplingIntegrator):
+        def parts(self, scene, sensor):
+            return self, integrator.parts(scene, sensor)[1]
+
+        def sample(self, scene, sampler, ray, medium=None, active=True):
+            return mi.Spectrum(dr.select(dr.squared_norm(ray.d) < 2, 0.0, 1.0)), active, []
+
+    alone, light = LightAlone(mi.Properties()), LightOfBands(bands)
+    for seed in (1, 2):
+        whole = trace_pass(built, 64, seed, alone)[..., :-1]
+        assert (whole.sum((1, 2)) > 0).sum() > 5
+        banded = np.concatenate([trace_pass(built, 64, seed, alone, band, light) for band in bands])
+        np.testing.assert_array_equal(banded[..., :-1], whole)
+
+
+def stop_after(count):
+    """A tracer that presses Ctrl-C while it traces the last of `count` bands."""
+
+    def trace(job, scene, first):
+        for number, traced in enumerate(trace_locally(job, scene, first), 1):
+            if number == count:
+                signal.raise_signal(signal.SIGINT)
+            yield traced
+
+    return trace
+
+
+def test_bands_are_interrupted_resumed_and_saved(three_bands, small_passes):
+    small_passes(11)  # one sample per pixel
+    write_scene("diffraction_path")
+    whole = render("scene.xml", spp=6)
+    assert isinstance(whole, BandedImage)
+    assert whole.shape == whole.radiance.shape == (10, 12, channel_wavelengths().size)
+    calls = []
+    request = {"spp": 6, "checkpoint": "c", "progress": lambda *call: calls.append(call[:2])}
+    with pytest.raises(KeyboardInterrupt) as caught:  # in the second band, before there is a whole picture
+        render("scene.xml", tracer=stop_after(2), **request)
+    assert not isinstance(caught.value, Interrupted)
+    with pytest.raises(Interrupted) as caught:
+        render("scene.xml", tracer=stop_after(8), **request)
+    assert caught.value.image.attributes["spp"] == 3
+    assert calls == [
+        (0, 6),
+        (0.33, 6),
+        (0.67, 6),
+        (0.67, 6),
+        *((x, 6) for x in (1, 1.33, 1.67, 2, 2.33, 2.67, 3, 3.33)),
+    ]
+    np.testing.assert_allclose(caught.value.image.radiance.mean(), whole.radiance.mean(), rtol=0.5)
+    resumed = render("scene.xml", **request)
+    assert resumed.attributes == whole.attributes
+    assert resumed.attributes["error"] > 0
+    resumed.save("a.exr")
+    np.testing.assert_array_equal(SpectralImage.load("a.exr").radiance, whole.radiance)
+
+    assert {path.name for path in Path().iterdir()} == {"scene.xml", "a.exr", "c", "c.1", "c.2"}
+    Path("c.1").unlink()
+    with pytest.raises(ValueError, match="c: a checkpoint of another band is missing"):
+        render("scene.xml", **request)
+    resumed.save("c.1")
+    with pytest.raises(ValueError, match=r"c\.1: not a checkpoint"):
+        render("scene.xml", **request)
+    passes.discard_checkpoints("c")
+    assert {path.name for path in Path().iterdir()} == {"scene.xml", "a.exr"}
+
+
+def test_the_error_of_bands_is_that_of_the_whole_picture(three_bands, small_passes, monkeypatch):
+    small_passes(11)
+    banded = render(write_scene(), spp=64, until_error=0.2)
+    monkeypatch.setattr(film, "BAND_PIXELS", 1000)
+    whole = render("scene.xml", spp=64, until_error=0.2)
+    assert not isinstance(whole, BandedImage)
+    assert banded.attributes["error"] <= 0.2
+    assert banded.attributes["spp"] < 64
+    assert banded.attributes["spp"] == pytest.approx(whole.attributes["spp"], rel=0.4)
+
+
+@pytest.mark.slow
+def test_large_pictures_need_at_most_two_gigabytes():
+    write_scene("diffraction_path")
+    words = ("render", "scene.xml", "--width", "2560", "--spp", "1", "-o", "out.exr")
+    subprocess.run([sys.executable, "-m", "mitsuba_diffraction", *words], check=True)
+    assert SpectralImage.load("out.exr").shape[:2] == (1600, 1920)
+    assert 1024 * resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss < 2e9
