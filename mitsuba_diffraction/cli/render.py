@@ -54,6 +54,13 @@ def render(
     half: Annotated[
         bool, typer.Option("--half", help="write float16: half the size, radiance rounded by up to 0.05 %")
     ] = False,
+    rgb: Annotated[
+        bool, typer.Option("--rgb", help="write R, G, B alone, as float16: 6 bytes per pixel at most")
+    ] = False,
+    channels: Annotated[
+        int | None,
+        typer.Option(min=2, metavar="N", help="write at most N wavelengths (46, 30, 22, …), each over a wider range"),
+    ] = None,
     denoise: Annotated[
         bool | None,
         typer.Option(
@@ -80,6 +87,8 @@ def render(
 
     if output is not None:
         check_suffix("-o", output, ".exr")
+    if rgb and channels is not None:
+        raise RequestError("--rgb writes no wavelengths: wanted --rgb or --channels N")
     if (frames is not None) != orbit:
         raise RequestError("--frames N and --orbit go together")
     where: dict[str, Any] = {"parameters": scene_parameters(define), "materials": materials_of(material)}
@@ -100,7 +109,8 @@ def render(
     where |= {"width": width, "height": height}
     request = {"spp": spp, "seed": seed, "until_error": until_error, "seconds": checkpoint, "tracer": tracer}
     pictures = _pictures(target, frames)
-    _render(scene, pictures, motions, where, request, resume=resume, half=half, denoise=denoise)
+    stored = {"half": half, "rgb": rgb, "channels": channels}
+    _render(scene, pictures, motions, where, request, resume=resume, stored=stored, denoise=denoise)
     if frames is not None:
         animation = target.with_suffix(".webp")
         save_animation([path.with_suffix(".png") for path in pictures], animation)
@@ -113,7 +123,7 @@ def _render(
     motions: list[tuple[float, ...]] | list[None],
     where: dict[str, Any],
     request: dict[str, Any],
-    **options: bool,
+    **options: Any,
 ) -> None:
     """Render a picture for each motion of the camera, all with the exposure of the first."""
     exposure = None
@@ -165,7 +175,7 @@ def _picture(
     request: dict[str, Any],
     *,
     resume: bool,
-    half: bool,
+    stored: dict[str, Any],
     denoise: bool,
     label: str,
     exposure: float | None,
@@ -176,6 +186,7 @@ def _picture(
     Args:
         where: parameters, materials, size and motion, for `load_spectral_scene`.
         request: the other arguments of `passes.render`.
+        stored: arguments of `SpectralImage.save`.
         exposure: of the preview; None: `auto_exposure`.
         complete: number of completed pictures, as text to report if Ctrl-C interrupts this one.
     """
@@ -206,7 +217,7 @@ def _picture(
             raise
         raise Stopped(f"{complete}; the same command with --resume continues") from None
     try:
-        image.save(path, half=half)
+        image.save(path, **stored)
         clean = partial(denoised_picture, load_spectral_scene(scene, **where)) if denoise else None
         exposure = save_preview(image, preview, exposure, clean)
     except (OSError, RuntimeError) as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping
@@ -47,6 +48,13 @@ def split_rows(rows: int, columns: int) -> list[slice]:
     """Return the blocks of rows in which large pictures are converted, to bound memory."""
     step = max(1, _PIXELS_PER_BLOCK // columns)
     return [slice(first, first + step) for first in range(0, rows, step)]
+
+
+def _wider_hats(count: int, channels: int) -> NDArray[np.float32]:
+    """Return the weights, (count, m), of `count` hats in m ≤ channels hats of unit area and k times the width."""
+    k = next(k for k in itertools.count(1) if (count + 1) // k - 1 <= channels)
+    centres = np.arange(k - 1, count - k + 1, k)
+    return (np.maximum(0, 1 - np.abs(np.arange(count)[:, None] - centres) / k) / k).astype(np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +108,9 @@ class SpectralImage:
         for rows in split_rows(*self.shape[:2]):
             yield self.radiance[rows]
 
-    def save(self, path: str | os.PathLike[str], *, half: bool = False) -> None:
+    def save(
+        self, path: str | os.PathLike[str], *, half: bool = False, rgb: bool = False, channels: int | None = None
+    ) -> None:
         """Write an OpenEXR file (ZIP) in the spectral layout of Fichet, Pacanowski and Wilkie 2021.
 
         Channels `S0.405,000000nm` hold the radiance; R, G and B are linear sRGB (scaled as in `color`) for ordinary
@@ -109,32 +119,45 @@ class SpectralImage:
         Args:
             half: write float16 instead of float32, in about half the size or less. Radiance from 6.1e-5 to 65504 is
                 then rounded by at most 2⁻¹¹ (0.05 %), smaller radiance by at most 3e-8.
+            rgb: write R, G and B alone, as float16, at most ±65504. Such a file cannot be loaded as a spectral image.
+            channels: maximum number of wavelengths. Neighbouring ones are added with the weights that make their hats
+                one of k times the width, for the smallest such k: 93, 46, 30, 22, … wavelengths, 5, 10, 15, 20, … nm
+                apart.
 
         Raises:
             FileNotFoundError: if the folder does not exist.
-            ValueError: if a radiance exceeds the range of float16.
+            ValueError: if a radiance exceeds the range of float16, or channels is below 2 or given with rgb.
         """
         import Imath
         import OpenEXR
 
+        if channels is not None and (rgb or channels < 2):
+            raise RequestError(f"channels: got {channels}{' with rgb' if rgb else ''}, wanted two or more wavelengths")
+        half |= rgb
         kind, limit = (np.float16, float(np.finfo(np.float16).max)) if half else (np.float32, np.inf)
         pixel = Imath.Channel(Imath.PixelType(Imath.PixelType.HALF if half else Imath.PixelType.FLOAT))
-        numbers = [f"{wavelength:.6f}".replace(".", ",") for wavelength in self.wavelengths]
+        hats = None if channels is None else _wider_hats(self.wavelengths.size, channels)
+        wavelengths = self.wavelengths[:0] if rgb else self.wavelengths if hats is None else self.wavelengths @ hats
+        numbers = [f"{wavelength:.6f}".replace(".", ",") for wavelength in wavelengths]
         names = ["R", "G", "B", *(f"S0.{number}nm" for number in numbers)]
-        texts = {"spectralLayoutVersion": _LAYOUT_VERSION, "emissiveUnits": _UNITS, "writtenBy": MARK}
-        attributes = {**self.attributes, **texts}
+        layout = {} if rgb else {"spectralLayoutVersion": _LAYOUT_VERSION, "emissiveUnits": _UNITS}
+        attributes = {**self.attributes, **layout, "writtenBy": MARK}
         header = OpenEXR.Header(self.shape[1], self.shape[0])
         header |= {name: value.encode() if isinstance(value, str) else value for name, value in attributes.items()}
         header["channels"] = dict.fromkeys(names, pixel)
         # The only writer of OpenEXR that takes a file in blocks of rows.
         with whole_file(path) as temporary, closing(OpenEXR.OutputFile(str(temporary), header)) as file:
             for block in self.blocks():
-                rgb = spectrum_to_linear_sRGB(block, self.wavelengths).astype(np.float32)
-                if (value := max(float(np.abs(block).max()), float(np.abs(rgb).max()))) > limit:
+                planes = spectrum_to_linear_sRGB(block, self.wavelengths).astype(np.float32)
+                if rgb:
+                    planes = np.clip(planes, -limit, limit)
+                else:
+                    planes = np.concatenate([planes, block if hats is None else block @ hats], axis=-1)
+                if (value := float(np.abs(planes).max())) > limit:
                     raise RequestError(
                         f"half: got radiances up to {value:.4g}, wanted at most {limit:.0f}; float32 holds them"
                     )
-                planes = np.concatenate([rgb, block], axis=-1, dtype=kind)
+                planes = planes.astype(kind)
                 file.writePixels({name: planes[..., i].tobytes() for i, name in enumerate(names)}, len(block))
 
     @classmethod

@@ -454,6 +454,15 @@ def test_render_takes_the_samples_of_the_scene_and_writes_half_precision(command
     half = SpectralImage.load("out.exr").radiance
     np.testing.assert_allclose(half, whole.radiance, rtol=2.0**-11, atol=3e-8)
     assert (half != whole.radiance).any()
+    code, _, err = command(f"{line} --channels 50 --overwrite")
+    assert code == 0, err
+    assert SpectralImage.load("out.exr").wavelengths.size == 46
+    code, _, err = command(f"{line} --rgb")
+    assert code == 0, err
+    assert set(OpenEXR.File("out.exr", separate_channels=True).channels()) == {"R", "G", "B"}
+    code, _, err = command(f"{line} --rgb --channels 50")
+    assert code == 2
+    assert "--rgb writes no wavelengths" in err
 
 
 def test_render_writes_a_spectral_picture_and_a_preview(command):

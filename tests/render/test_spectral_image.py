@@ -173,3 +173,42 @@ def test_half_precision_refuses_values_out_of_range(tmp_path):
     with pytest.raises(ValueError, match=r"half: got radiances up to .*float32"):
         image.save(tmp_path / "a.exr", half=True)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_rgb_alone_is_that_of_the_spectral_file_in_half_precision(image, tmp_path):
+    image.save(tmp_path / "spectral.exr", half=True)
+    image.save(tmp_path / "rgb.exr", rgb=True)
+    spectral, rgb = (
+        OpenEXR.File(str(tmp_path / f"{name}.exr"), separate_channels=True) for name in ("spectral", "rgb")
+    )
+    assert set(rgb.channels()) == {"R", "G", "B"}
+    for name, channel in rgb.channels().items():
+        assert channel.pixels.dtype == np.float16
+        np.testing.assert_array_equal(channel.pixels, spectral.channels()[name].pixels)
+    assert rgb.header()["spp"] == 16
+    with pytest.raises(ValueError, match="spectralLayoutVersion is None"):
+        SpectralImage.load(tmp_path / "rgb.exr")
+    # A lamp that is brighter than a half float is no failure after hours of rendering.
+    bright = SpectralImage(GRID, np.full((1, 1, GRID.size), 1e6))
+    bright.save(tmp_path / "rgb.exr", rgb=True)
+    assert OpenEXR.File(str(tmp_path / "rgb.exr"), separate_channels=True).channels()["G"].pixels == 65504
+
+
+@pytest.mark.parametrize(("channels", "count", "spacing"), [(92, 46, 10), (46, 46, 10), (16, 14, 30), (2, 2, 120)])
+def test_fewer_channels_are_wider_hats(channels, count, spacing, tmp_path):
+    # Spectra of one and of a ramp remain, and a line at 505.7 nm is seen by hats of the new width.
+    line = np.maximum(0, 1 - np.abs(505.7 - GRID) / 5) / 5
+    SpectralImage(GRID, np.stack([GRID**0, GRID / 100, line])[None]).save(tmp_path / "a.exr", channels=channels)
+    loaded = SpectralImage.load(tmp_path / "a.exr")
+    grid = loaded.wavelengths
+    assert grid.size == count
+    np.testing.assert_allclose(np.diff(grid), spacing)
+    expected = np.maximum(0, 1 - np.abs(505.7 - grid) / spacing) / spacing
+    np.testing.assert_allclose(loaded.radiance[0], [grid**0, grid / 100, expected], rtol=1e-5, atol=1e-8)
+
+
+@pytest.mark.parametrize("wrong", [{"channels": 1}, {"channels": 0}, {"channels": 46, "rgb": True}])
+def test_wrong_channels_are_refused(image, tmp_path, wrong):
+    with pytest.raises(ValueError, match="channels: got"):
+        image.save(tmp_path / "a.exr", **wrong)
+    assert list(tmp_path.iterdir()) == []
