@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 from functools import partial
 from pathlib import Path
@@ -12,13 +13,16 @@ import typer
 
 from ..errors import RequestError
 from ..outputs import check_outputs, free_name
-from ..progress import progress_bar, tell
+from ..progress import progress_bar, say, tell
 from .arguments import Define, Overwrite, Variant, check_suffix, materials_of, scene_parameters
 
 if TYPE_CHECKING:
+    from ..render.passes import Estimate
     from ..render.spectral_image import SpectralImage
 
 _log = logging.getLogger(__name__)
+_MIN_ANNOUNCED_SECONDS = 60
+_HOUR = 3600
 
 
 class Stopped(Exception):
@@ -61,6 +65,10 @@ def render(
         int | None,
         typer.Option(min=2, metavar="N", help="write at most N wavelengths (46, 30, 22, …), each over a wider range"),
     ] = None,
+    exposure: Annotated[
+        float | None,
+        typer.Option(min=-99, max=99, metavar="STOPS", help="of the preview: radiance times 2^STOPS; default: chosen"),
+    ] = None,
     denoise: Annotated[
         bool | None,
         typer.Option(
@@ -81,7 +89,7 @@ def render(
     from ..llvm import choose_variant
     from ..render.cluster import trace_on
     from ..render.passes import checkpoint_path, trace_locally
-    from ..render.scene import files_of_scene, named_sample_count
+    from ..render.scene import channel_wavelengths, files_of_scene, named_sample_count
     from ..render.turntable import orbit as motions_of_orbit
     from ..render.turntable import save_animation
 
@@ -103,14 +111,19 @@ def render(
     mi.set_variant(choose_variant(variant))
     if denoise is None:
         denoise = _requests_denoising(scene)
-    spp = spp or named_sample_count(scene, where["parameters"]) or 64
+    named = None if spp else named_sample_count(scene, where["parameters"])
+    spp = spp or named or 64
     tracer = trace_locally if dask is None else trace_on(dask)
     motions = [None] if frames is None else motions_of_orbit(scene, frames, **where)
     where |= {"width": width, "height": height}
     request = {"spp": spp, "seed": seed, "until_error": until_error, "seconds": checkpoint, "tracer": tracer}
+    bytes_per_pixel = 6 if rgb else (2 if half else 4) * (3 + (channels or channel_wavelengths().size))
+    if until_error is None:  # else nobody knows the time
+        request["announce"] = partial(_announce, scene.name, bytes_per_pixel, named)
     pictures = _pictures(target, frames)
     stored = {"half": half, "rgb": rgb, "channels": channels}
-    _render(scene, pictures, motions, where, request, resume=resume, stored=stored, denoise=denoise)
+    factor = None if exposure is None else 2**exposure
+    _render(scene, pictures, motions, where, request, factor, resume=resume, stored=stored, denoise=denoise)
     if frames is not None:
         animation = target.with_suffix(".webp")
         save_animation([path.with_suffix(".png") for path in pictures], animation)
@@ -123,10 +136,10 @@ def _render(
     motions: list[tuple[float, ...]] | list[None],
     where: dict[str, Any],
     request: dict[str, Any],
+    exposure: float | None,
     **options: Any,
 ) -> None:
-    """Render a picture for each motion of the camera, all with the exposure of the first."""
-    exposure = None
+    """Render a picture for each motion of the camera, all with the same exposure, by default that of the first."""
     for number, (path, motion) in enumerate(zip(pictures, motions, strict=True)):
         exposure = _picture(
             scene,
@@ -137,6 +150,26 @@ def _render(
             exposure=exposure,
             complete=f"{number} of {len(pictures)} pictures are complete" if number else None,
             **options,
+        )
+
+
+def _announce(label: str, bytes_per_pixel: int, named: int | None, estimate: Estimate) -> None:
+    """Print what a rendering of more than a minute needs; `named` is the sample count, if it is that of the scene."""
+    if estimate.seconds < _MIN_ANNOUNCED_SECONDS:
+        return
+    size = bytes_per_pixel * estimate.columns * estimate.rows
+    disk = f", {estimate.disk / 1e9:.2g} GB of disk meanwhile" if estimate.disk else ""
+    say(
+        label,
+        f"{estimate.columns} × {estimate.rows} pixels, {estimate.spp} samples per pixel: about "
+        f"{estimate.seconds / 60:.0f} min, {estimate.memory / 1e9:.2g} GB of memory{disk}, a picture of at most "
+        f"{size / 1e6:.2g} MB",
+    )
+    if named is not None and estimate.seconds > _HOUR:
+        _log.warning(
+            "the scene's own %d samples per pixel take about %.1f hours; --spp sets fewer, --until-error stops earlier",
+            named,
+            estimate.seconds / _HOUR,
         )
 
 
@@ -230,7 +263,7 @@ def _picture(
     tell(
         f"{path}: {_summary(image, request['until_error'])}, "
         f"{time.perf_counter() - start:.1f} s, {path.stat().st_size / 1e6:.3g} MB\n"
-        f"{preview}: preview, radiance times {exposure:.4g} (exposure)"
+        f"{preview}: preview, radiance times {exposure:.4g} (--exposure {math.log2(exposure):.2f})"
     )
     return exposure
 

@@ -106,8 +106,8 @@ def needs_mitsubas_film(integrator: mi.Integrator) -> bool:
     return not isinstance(integrator, mi.SamplingIntegrator) or isinstance(integrator, mi.CppADIntegrator)
 
 
-def check_memory(scene: mi.Scene, spp: int, bands: tuple[Rows, ...] | None = None) -> None:
-    """Check that a picture fits into the available memory, where the system reports it (Linux).
+def check_memory(scene: mi.Scene, spp: int, bands: tuple[Rows, ...] | None = None) -> int:
+    """Check that a picture fits into the available memory, where the system reports it (Linux); return what it needs.
 
     The peak memory is 24 n + 68 bytes per pixel of n channels of a band (sums in float64, the result of a pass and
     copies of it, and the picture in float32), 40 bytes per sample of a pass of it (position on the film, channels and
@@ -132,6 +132,7 @@ def check_memory(scene: mi.Scene, spp: int, bands: tuple[Rows, ...] | None = Non
             f"film: got {columns} × {rows} pixels, which take {needed / 1e9:.3g} GB of memory, wanted at most the "
             f"{available / 1e9:.3g} GB that are available"
         )
+    return needed
 
 
 def _available_memory() -> int | None:

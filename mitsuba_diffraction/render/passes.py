@@ -339,6 +339,26 @@ class Job:
 Tracer = Callable[[Job, "mi.Scene", int], Iterator[NDArray[np.float32]]]
 
 
+@dataclass(frozen=True)
+class Estimate:
+    """What a rendering needs.
+
+    Attributes:
+        columns, rows: pixels.
+        spp: samples per pixel; the maximum with `until_error`.
+        memory: bytes, in addition to the scene.
+        disk: bytes of the checkpoints of several bands, else zero.
+        seconds: to the end.
+    """
+
+    columns: int
+    rows: int
+    spp: int
+    memory: int
+    disk: int
+    seconds: float
+
+
 class Finished(Exception):
     """A picture of an earlier run satisfies the request."""
 
@@ -389,6 +409,7 @@ def render(
     finished: str | None = None,
     tracer: Tracer = trace_locally,
     progress: Callable[[float, int, float], None] = lambda done, total, error: None,
+    announce: Callable[[Estimate], None] = lambda estimate: None,
 ) -> SpectralImage:
     """Render the first sensor of a scene spectrally, with its own integrator, in the current variant.
 
@@ -414,6 +435,7 @@ def render(
         tracer: traces the passes; default: this process, see also `cluster.trace_on`.
         progress: called at the start and after each pass with the samples per pixel done, in total (with `until_error`,
             extrapolated from the current error), and the current error (NaN before four passes).
+        announce: called once, after two passes (of the bands of a large picture: the first compiles).
 
     Returns:
         The picture; radiance per nm at `channel_wavelengths()`. Its attributes are the scene, the variant, the samples
@@ -422,8 +444,9 @@ def render(
 
     Raises:
         FileNotFoundError: if there is no such scene.
-        ValueError: as `load_spectral_scene`, or if a number is out of range, the picture needs more memory than is
-            available, or the checkpoint is of another rendering, or one that another process writes.
+        ValueError: as `load_spectral_scene`, or if a number is out of range, the picture needs more memory or its bands
+            more of the disk than is available, or the checkpoint is of another rendering, or one that another process
+            writes.
         RuntimeError: if rendering failed, with the cause on one line.
         OSError: if a checkpoint cannot be written; the previous one is kept.
         Finished: without rendering, if the picture with the digest `finished` satisfies this request.
@@ -436,10 +459,21 @@ def render(
     if finished == job.digest():
         raise Finished
 
+    columns, rows = (int(size) for size in scene.sensors()[0].film().crop_size())
+    memory = check_memory(scene, max(job.samples), job.bands)
+    disk = _check_disk(job.bands, columns, checkpoint)
     with nullcontext() if checkpoint is None else exclusive(checkpoint):
-        columns = int(scene.sensors()[0].film().crop_size()[0])
         sums = BandedSums(job.bands, columns, job.digest(), checkpoint)
-        complete = _trace(job, scene, sums, checkpoint, seconds, tracer, progress)
+        complete = _trace(
+            job,
+            scene,
+            sums,
+            checkpoint,
+            seconds,
+            tracer,
+            progress,
+            lambda remaining: announce(Estimate(columns, rows, sum(job.samples), memory, disk, remaining)),
+        )
     if sums.done < len(job.bands):
         raise KeyboardInterrupt
     _warn_of_implausible_pixels(sums.luminance, max_plausible_luminance(scene))
@@ -457,13 +491,18 @@ def _trace(
     seconds: float,
     tracer: Tracer,
     progress: Callable[[float, int, float], None],
+    announce: Callable[[float], None],
 ) -> bool:
     """Add passes to the sums until the picture is complete or Ctrl-C was pressed; return whether it is complete."""
+    first, total, started = sums.done, len(job.samples) * len(job.bands), 0.0
     complete = _is_complete(sums, job, progress)
     last_checkpoint, interval = time.monotonic(), seconds
     with _deferred_interrupt() as interrupted, closing(tracer(job, scene, sums.done)) as traced:
         while not (complete or interrupted()):
             sums.add(next(traced), job.samples[sums.done // len(job.bands)])
+            if sums.done == first + 2:
+                announce((time.perf_counter() - started) * (total - sums.done))
+            started = time.perf_counter()
             complete = _is_complete(sums, job, progress)
             due = interrupted() or time.monotonic() - last_checkpoint >= interval
             if checkpoint is not None and due and not complete:
@@ -492,7 +531,6 @@ def _job(
             sampler.class_name(),
         )
     samples = split(scene, spp, 1 if until_error is None else _MIN_PASSES_UNTIL_ERROR)
-    check_memory(scene, max(samples), bands_of(scene))
     warn_of_gratings(scene)
     job = Job(
         scene=str(Path(scene_path).resolve()),
@@ -506,6 +544,23 @@ def _job(
         versions=versions(),
     )
     return job, scene
+
+
+def _check_disk(bands: tuple[Rows, ...], columns: int, checkpoint: str | os.PathLike[str] | None) -> int:
+    """Check that the checkpoints of a picture in several bands fit on the disk; return their bytes, while written."""
+    if len(bands) == 1:
+        return 0
+    paths = [] if checkpoint is None else [Path(checkpoint_of_band(checkpoint, band)) for band in range(len(bands))]
+    folder = paths[0].absolute().parent if paths else Path(tempfile.gettempdir())
+    rows = [end - first for first, end in bands]
+    needed = 8 * columns * (channel_wavelengths().size + 3) * (sum(rows) + max(rows))
+    available = shutil.disk_usage(folder).free + sum(path.stat().st_size for path in paths if path.is_file())
+    if needed > available:
+        raise RequestError(
+            f"{folder}: got {columns} × {bands[-1][1]} pixels, whose checkpoints take {needed / 1e9:.3g} GB of the "
+            f"disk, wanted at most the {available / 1e9:.3g} GB that are free"
+        )
+    return needed
 
 
 def _image(sums: BandedSums, job: Job, scene: str, complete: bool) -> SpectralImage:

@@ -1,5 +1,6 @@
 """Large pictures, which are traced in bands of rows to bound memory."""
 
+import itertools
 import resource
 import signal
 import subprocess
@@ -68,7 +69,10 @@ def test_bands_cover_the_film(monkeypatch):
     assert bands_of(load_spectral_scene(write_scene("prb"))) == ((0, 10),)
 
 
-@pytest.mark.parametrize(("integrator", "sampler"), [("path", "multijitter"), ("diffraction_path", "independent")])
+@pytest.mark.parametrize(
+    ("integrator", "sampler"),
+    [("path", "multijitter"), pytest.param("diffraction_path", "independent", marks=pytest.mark.slow)],
+)
 def test_a_picture_in_bands_has_the_expectation_of_one_in_a_single_piece(integrator, sampler, three_bands):
     built = load_spectral_scene(write_scene(integrator, sampler))
     bands = bands_of(built)
@@ -77,12 +81,12 @@ def test_a_picture_in_bands_has_the_expectation_of_one_in_a_single_piece(integra
     def rows(sums):
         """Return luminance and mean filter weight per sample of each row."""
         luminance = spectrum_to_XYZ(sums[..., :-1], channel_wavelengths())[..., 1]
-        return np.stack([luminance.mean(1), sums[..., -1].mean(1)]) / 64
+        return np.stack([luminance.mean(1), sums[..., -1].mean(1)]) / 36
 
-    whole = np.array([rows(trace_pass(built, 64, seed)) for seed in range(10)])
-    parts = [[trace_pass(built, 64, 100 + seed, None, band, light) for band in bands] for seed in range(10)]
+    whole = np.array([rows(trace_pass(built, 36, seed)) for seed in range(8)])
+    parts = [[trace_pass(built, 36, 100 + seed, None, band, light) for band in bands] for seed in range(8)]
     banded = np.array([rows(np.concatenate(part)) for part in parts])
-    error = np.sqrt((whole.var(0, ddof=1) + banded.var(0, ddof=1)) / 10)
+    error = np.sqrt((whole.var(0, ddof=1) + banded.var(0, ddof=1)) / 8)
     assert (error < 0.1 * whole.mean(0)).all()
     np.testing.assert_array_less(np.abs(banded.mean(0) - whole.mean(0)), 4 * error)
 
@@ -166,6 +170,28 @@ def test_the_error_of_bands_is_that_of_the_whole_picture(three_bands, small_pass
     assert banded.attributes["error"] <= 0.2
     assert banded.attributes["spp"] < 64
     assert banded.attributes["spp"] == pytest.approx(whole.attributes["spp"], rel=0.4)
+
+
+def test_checkpoints_that_do_not_fit_on_the_disk_are_refused(three_bands, monkeypatch):
+    monkeypatch.setattr(passes, "trace_pass", None)
+    usage = passes.shutil.disk_usage(".")
+    monkeypatch.setattr(passes.shutil, "disk_usage", lambda folder: usage._replace(free=10**5))
+    words = r"12 × 10 pixels, whose checkpoints take 0\.000129 GB of the disk, wanted at most the 0\.0001 GB"
+    with pytest.raises(ValueError, match=words):
+        render(write_scene(), spp=4, checkpoint="c")
+
+
+def test_what_a_rendering_needs_is_announced_after_two_bands(three_bands, small_passes, monkeypatch):
+    small_passes(11)
+    clock = itertools.count(0, 10)  # each look at the clock is ten seconds after the one before
+    monkeypatch.setattr(passes.time, "perf_counter", lambda: next(clock))
+    estimates = []
+    render(write_scene(), spp=6, announce=estimates.append)
+    (estimate,) = estimates
+    assert (estimate.columns, estimate.rows, estimate.spp) == (12, 10, 6)
+    assert estimate.memory == 12 * (4 * (24 * 93 + 68 + 40) + 80)
+    assert estimate.disk == 12 * 14 * (93 + 3) * 8  # one of four rows is written anew while the old one is there
+    assert estimate.seconds == 160  # for 16 more
 
 
 @pytest.mark.slow

@@ -1,5 +1,6 @@
 """Long renderings: stopping by noise, kills, Ctrl-C, full disks, and the turntable."""
 
+import importlib
 import itertools
 import os
 import resource
@@ -386,6 +387,26 @@ def test_the_command_stops_at_an_error_and_reports_if_it_is_not_reached(command)
     assert (code, err) == (0, "")
     assert "8 samples per pixel, relative error of luminance at most 0." in out
     assert "(above 0.001: increase --spp)" in out
+
+
+def test_the_command_announces_long_renderings_and_takes_an_exposure(command, monkeypatch):
+    module = importlib.import_module("mitsuba_diffraction.cli.render")
+    sampler = '<sampler type="independent"><integer name="sample_count" value="3"/></sampler></sensor>'
+    Path("scene.xml").write_text(SCENE.replace("RFILTER", "box").replace("</sensor>", sampler))
+    code, out, err = command(f"{RENDER} -o out.exr --exposure -1.5")
+    assert (code, err) == (0, "")
+    assert "out.png: preview, radiance times 0.3536 (--exposure -1.50)" in out
+    monkeypatch.setattr(module, "_MIN_ANNOUNCED_SECONDS", 0)
+    code, out, err = command(f"{RENDER} -o out.exr --half --spp 4")
+    assert code == 0
+    assert "16 × 16 pixels, 4 samples per pixel: about 0 min, 0.0006 GB of memory, a picture of at most 0.049 MB" in err
+    assert len(err.splitlines()) == 1
+    chosen = float(out.split("--exposure ")[1].split(")")[0])
+    assert 2**chosen == pytest.approx(float(out.split("radiance times ")[1].split()[0]), rel=0.01)
+    monkeypatch.setattr(module, "_HOUR", 1e-9)
+    code, out, err = command(f"{RENDER} -o out.exr --overwrite")
+    assert code == 0
+    assert "the scene's own 3 samples per pixel take about" in err
 
 
 def test_an_interrupt_before_the_first_pass_writes_nothing(command, monkeypatch):
