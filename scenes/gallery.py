@@ -190,7 +190,7 @@ def compress(path: Path) -> tuple[Path, int]:
             raise ValueError(f"{path.name}: got mode {picture.mode}, wanted true colour: render it anew")
         for quality in QUALITIES:
             stream = io.BytesIO()
-            picture.save(stream, "JPEG", quality=quality, subsampling="4:4:4", optimize=True, progressive=True)
+            picture.save(stream, "JPEG", quality=quality, subsampling="4:4:4")
             if stream.tell() < MAX_FILE_SIZE:
                 break
         else:

@@ -58,17 +58,20 @@ shapes = st.tuples(st.integers(40, 70), st.integers(40, 70))
 # Rounding as a second wave, and a direction of 90° and a little.
 @example(shape=(45, 40), period=0.5, direction=90.0, phase=0.0, tilt=0.0, bow=0.0)
 @example(shape=(43, 40), period=1.0, direction=90.0, phase=0.0, tilt=0.0, bow=0.0)
+# Found in windows of half the size, as the power between two bins is not significant in one window.
+@example(shape=(40, 68), period=0.625, direction=0.0, phase=2.0, tilt=0.0, bow=0.0)
 def test_a_sinusoid_on_a_bowed_plane_is_exact(shape, period, direction, phase, tilt, bow):
     assume(resolved(shape, period, direction))
     x, y = coordinates(shape)
     heights = 0.1 * wave(shape, period, direction, phase) + tilt * x - 2 * y + bow * x * y + bow * y**2
     (found,) = find_periods(HeightField(heights, PIXEL))
-    # The peak of −q is six bins away or more, where a Hann window has some thousandths of its amplitude.
+    # The peak of −q is six bins away or more, where a Hann window has some thousandths of its amplitude: 0.03 bins, of
+    # windows of half the size.
     angle = np.radians(direction)
     error = found.q - np.copysign(1, np.cos(np.radians(found.direction) - angle)) / period * np.array(
         [np.cos(angle), np.sin(angle)]
     )
-    assert np.abs(error * np.array(shape[::-1]) * PIXEL).max() < 0.03  # bins
+    assert np.abs(error * np.array(shape[::-1]) * PIXEL).max() < 0.06  # bins
     assert -90 < found.direction <= 90
     # Over a broken number n of waves, the mean square of a cosine is 1/2 within 1/(2πn); n > 3 here.
     assert found.strength == pytest.approx(1, abs=1 / (6 * np.pi))

@@ -124,7 +124,7 @@ SURFACES = {
     ),
     "xenopeltis_scan": PublishedSurface(
         "Xenopeltis (scan)",
-        _scan("xenopeltis_afm_65um.png", 0.8187),
+        _scan("xenopeltis_afm_65um.png", 0.4435),
         1,
         1.552,
         (1552.27, 0.45),
