@@ -58,6 +58,13 @@ def opened(browser, tmp_path):
         tab.close()
 
 
+def wait_for_frames(tab):
+    """Wait until all frames of the present state are drawn; a change is seen in the next animation frame."""
+    tab.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+    while tab.evaluate("viewer.renderer.sides.some((side) => side.frame < viewer.state.maxFrames)"):
+        tab.wait_for_timeout(50)
+
+
 def pairs_of(spectrum, count=10_000, seed=1):
     """ω_i, ω_o and λ: for half of the pairs q lies near a strong order or node, for the others it is random."""
     random = np.random.default_rng(seed)
@@ -167,6 +174,7 @@ def test_colours_are_those_of_the_shader_of_2014(source, published, opened, llvm
 def test_a_drag_changes_the_picture_and_nothing_leaves_the_page(opened):
     tab = opened(Surface.named("blazed", {"depth": 0.1, "samples": 64, "coherence_length": 3.0}))
     tab.evaluate("viewer.set({ maxFrames: 1, lightWidth: 0, lightLength: 0 })")
+    wait_for_frames(tab)
     before = tab.evaluate("viewer.state")
     box = tab.locator("#canvas").bounding_box()
     pictures = [tab.screenshot()]
@@ -179,7 +187,7 @@ def test_a_drag_changes_the_picture_and_nothing_leaves_the_page(opened):
         tab.mouse.up()
         after = tab.evaluate("viewer.state")
         assert after[name] != before[name]
-        tab.wait_for_timeout(300)
+        wait_for_frames(tab)
         pictures.append(tab.screenshot())
     tab.keyboard.up("Shift")
     assert len(set(pictures)) == 3
@@ -250,9 +258,9 @@ def test_the_copied_scene_renders_the_same_picture(opened, tmp_path, llvm):
         " viewer.set({ maxFrames: 32, lightWidth: 0, lightLength: 0, sky: 0 }); }",
         size,
     )
-    tab.wait_for_timeout(500)
-    while tab.evaluate("viewer.renderer.width !== 64 || viewer.renderer.model.frame < 32"):
-        tab.wait_for_timeout(200)
+    while tab.evaluate("viewer.renderer.width !== 64"):
+        tab.wait_for_timeout(50)
+    wait_for_frames(tab)
     scene = tab.evaluate("viewer.command()").partition("<<'END'\n")[2].partition("END")[0]
     (tmp_path / "view.xml").write_text(scene)
     image = render(tmp_path / "view.xml", spp=256)
@@ -271,7 +279,7 @@ def test_a_reference_picture_is_compared(opened):
     grey = np.full((40, 40, 3), 0.5, np.float16)
     tab = opened(surface, grey)
     tab.evaluate("viewer.set({ maxFrames: 1, right: 'picture', exposure: 0 })")
-    tab.wait_for_timeout(300)
+    wait_for_frames(tab)
     shown = tab.locator("#right-name").inner_text()
     tab.evaluate("viewer.set({ difference: true })")
     assert shown == "reference"
