@@ -63,6 +63,10 @@ def test_messages_name_what_is_available(body, parameters, words, tmp_path, llvm
             "compare precompute/measured/scan.npz",
             "SCENE: got precompute/measured/scan.npz, wanted a file name that ends in .xml or .toml",
         ),
+        (
+            "compare scenes/blaze.xml -D light=bulb --shader flss --shader stam",
+            "shader: got 'stam', wanted one of flss, nmm, pq, nmm_pq, gem",
+        ),
         ("convergence scenes/blaze.xml -o out.png", "shader knows no other; choose -D light=bulb or -D light=parallel"),
         (
             "render scenes/rainbow.xml",

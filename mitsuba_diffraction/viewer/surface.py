@@ -14,6 +14,7 @@ from ..grating_spectrum import GratingSpectrum
 from ..precomputation import Spectrum, load_spectrum
 from ..progress import Progress, no_progress
 from ..recipe import Recipe, parameters_of_profile
+from ..rigorous.materials import refractive_index
 from ..settings import FROM_RADIUS
 from ..spectrum.tables import SliceTable
 from ..surface.gratings import PROFILES
@@ -56,6 +57,8 @@ class Material:
             raise RequestError(f"int_ior: got {self.int_ior!r}, wanted an index above 1, at most 10")
         if not self.height_scale >= 0:
             raise RequestError(f"height_scale: got {self.height_scale!r}, wanted a number ≥ 0")
+        if self.material not in ("", "none"):
+            refractive_index(0.55, material=self.material)  # refuses unknown names
 
 
 @dataclass(frozen=True, eq=False)

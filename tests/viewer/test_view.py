@@ -96,6 +96,13 @@ def test_wrong_requests_are_one_line(source, message, command, tmp_path, monkeyp
     assert not list(tmp_path.glob("*.html"))
 
 
+def test_an_unknown_material_is_refused_before_a_spectrum_is_computed(command, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(Recipe, "cached", lambda *args: pytest.fail("a spectrum was computed"))
+    code, _, error = command("view compact_disc,material=aluminium --no-open")
+    assert (code, error.partition("error: ")[2]) == (2, "material: got 'aluminium', did you mean Al\n")
+
+
 def test_tables_too_large_for_a_texture_are_refused():
     spectrum = md.precompute(md.gratings.blazed(1.0, 0.02, samples=32), coherence_length=2)
     table = np.zeros((MAX_LAYERS + 1, 3, *spectrum.grid.shape), np.float32)

@@ -123,15 +123,18 @@ def compare(
     for name, count in (("spp", spp), ("shading_points", shading_points), ("shares_side", shares_side)):
         if count < 1:
             raise RequestError(f"{name}: got {count}, wanted a positive number")
+    for kind in (shader, *others):  # before a spectrum is computed
+        if kind not in VARIANTS:
+            raise RequestError(f"shader: got {kind!r}, wanted one of {', '.join(VARIANTS)}")
     settings = {"terms": terms, "window": window, "interpolation": interpolation}
     settings = {name: value for name, value in settings.items() if value is not None}
     for name in settings:
-        if not any(name in settings_of(kind) for kind in (shader, *others) if kind in VARIANTS):
+        if not any(name in settings_of(kind) for kind in (shader, *others)):
             raise RequestError(f"{name}: got {settings[name]!r}, which {', '.join((shader, *others))} cannot use")
     request = {"seed": seed, "parameters": parameters, "settings": settings}
     of = Pictures(scene_path, shader, width=width, height=height, **request)
     for other in others:
-        of.use(other)  # refuses unknown names
+        of.use(other)  # refuses a scene that it cannot show
     of.use(shader)
     pictures, reads = {}, {}
     with progress("path tracer") as bar:
