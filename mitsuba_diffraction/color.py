@@ -12,6 +12,8 @@ small rendering.
 
 from __future__ import annotations
 
+import os
+from collections.abc import Callable
 from functools import lru_cache
 
 import numpy as np
@@ -171,12 +173,59 @@ def auto_exposure(rgb: NDArray[np.floating]) -> float:
     return float(1 / np.percentile(lit, 97))
 
 
-def on_screen(rgb: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """Encode exposed, non-negative linear sRGB for a display: `roll_off`, transfer function of sRGB, 8 bits."""
+View = Callable[[NDArray[np.floating]], NDArray[np.floating]]
+"""Exposed linear sRGB, (..., 3) → values for a display, 0 to 1."""
+
+
+def neutral_view(rgb: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Encode exposed, non-negative linear sRGB for a display: `roll_off`, transfer function of sRGB."""
     import colour
 
-    shown = colour.cctf_encoding(roll_off(rgb), function="sRGB")
-    return np.round(255 * np.clip(shown, 0.0, 1.0)).astype(np.uint8)
+    return colour.cctf_encoding(roll_off(rgb), function="sRGB")
+
+
+def ocio_view(name: str) -> View:
+    """Return a view of OpenColorIO for its default display, such as the filmic curve of ACES.
+
+    The configuration is that of $OCIO, or else the one built into OpenColorIO (ACES for computer graphics). Colours
+    enter as XYZ relative to D65, by the role `cie_xyz_d65_interchange`.
+
+    Args:
+        name: of the view, or the beginning of it, in upper or lower case.
+
+    Raises:
+        ValueError: if OpenColorIO is not installed, the configuration cannot be used, or it has no such view.
+    """
+    import colour
+
+    try:
+        import PyOpenColorIO as ocio
+    except ModuleNotFoundError:
+        raise RequestError("--view: opencolorio is not installed; pip install 'mitsuba_diffraction[ocio]'") from None
+    source = os.environ.get("OCIO") or "ocio://default"
+    try:
+        config = ocio.Config.CreateFromFile(source)
+        display = config.getDefaultDisplay()
+        views = list(config.getViews(display))
+        view = min((view for view in views if view.casefold().startswith(name.casefold())), key=len, default=None)
+        if view is None:
+            raise RequestError(f"--view: got {name!r}, the views of {source} are {', '.join(views)}")
+        transform = config.getProcessor("cie_xyz_d65_interchange", display, view, ocio.TRANSFORM_DIR_FORWARD)
+    except (ocio.Exception, ocio.ExceptionMissingFile) as error:
+        raise RequestError(f"--view: {source} cannot be used by OpenColorIO ({' '.join(str(error).split())})") from None
+    processor, to_XYZ = transform.getDefaultCPUProcessor(), colour.RGB_COLOURSPACES["sRGB"].matrix_RGB_to_XYZ
+
+    def shown(rgb: NDArray[np.floating]) -> NDArray[np.floating]:
+        values = np.ascontiguousarray(rgb @ to_XYZ.T, np.float32)
+        processor.applyRGB(values)
+        return values
+
+    return shown
+
+
+def on_screen(rgb: NDArray[np.floating], view: View = neutral_view) -> NDArray[np.uint8]:
+    """Encode exposed, non-negative linear sRGB for a display, 8 bits."""
+    return np.round(255 * np.clip(view(rgb), 0.0, 1.0)).astype(np.uint8)
 
 
 def hex_code(rgb: NDArray[np.floating]) -> str:

@@ -17,6 +17,7 @@ from ..progress import progress_bar, say, tell
 from .arguments import Define, Overwrite, Variant, check_suffix, materials_of, scene_parameters
 
 if TYPE_CHECKING:
+    from ..color import View
     from ..render.passes import Estimate
     from ..render.spectral_image import SpectralImage
 
@@ -69,6 +70,13 @@ def render(
         float | None,
         typer.Option(min=-99, max=99, metavar="STOPS", help="of the preview: radiance times 2^STOPS; default: chosen"),
     ] = None,
+    view: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="filmic preview by a view of OpenColorIO, such as ACES or, with Blender's $OCIO, AgX (extra: ocio)",
+        ),
+    ] = None,
     denoise: Annotated[
         bool | None,
         typer.Option(
@@ -86,6 +94,7 @@ def render(
     """Path-trace a scene into a spectral picture (.exr) with a preview (.png)."""
     import mitsuba as mi
 
+    from ..color import neutral_view, ocio_view
     from ..llvm import choose_variant
     from ..render.cluster import trace_on
     from ..render.passes import checkpoint_path, trace_locally
@@ -97,6 +106,7 @@ def render(
         check_suffix("-o", output, ".exr")
     if rgb and channels is not None:
         raise RequestError("--rgb writes no wavelengths: wanted --rgb or --channels N")
+    shown = neutral_view if view is None else ocio_view(view)
     if (frames is not None) != orbit:
         raise RequestError("--frames N and --orbit go together")
     where: dict[str, Any] = {"parameters": scene_parameters(define), "materials": materials_of(material)}
@@ -123,7 +133,8 @@ def render(
     pictures = _pictures(target, frames)
     stored = {"half": half, "rgb": rgb, "channels": channels}
     factor = None if exposure is None else 2**exposure
-    _render(scene, pictures, motions, where, request, factor, resume=resume, stored=stored, denoise=denoise)
+    options = {"resume": resume, "stored": stored, "denoise": denoise, "view": shown}
+    _render(scene, pictures, motions, where, request, factor, **options)
     if frames is not None:
         animation = target.with_suffix(".webp")
         save_animation([path.with_suffix(".png") for path in pictures], animation)
@@ -210,6 +221,7 @@ def _picture(
     resume: bool,
     stored: dict[str, Any],
     denoise: bool,
+    view: View,
     label: str,
     exposure: float | None,
     complete: str | None,
@@ -220,6 +232,7 @@ def _picture(
         where: parameters, materials, size and motion, for `load_spectral_scene`.
         request: the other arguments of `passes.render`.
         stored: arguments of `SpectralImage.save`.
+        view: of the preview.
         exposure: of the preview; None: `auto_exposure`.
         complete: number of completed pictures, as text to report if Ctrl-C interrupts this one.
     """
@@ -252,7 +265,7 @@ def _picture(
     try:
         image.save(path, **stored)
         clean = partial(denoised_picture, load_spectral_scene(scene, **where)) if denoise else None
-        exposure = save_preview(image, preview, exposure, clean)
+        exposure = save_preview(image, preview, exposure, clean, view)
     except (OSError, RuntimeError) as error:
         kept = f"; {checkpoint} is kept, and --resume continues from it" if checkpoint.exists() else ""
         raise RuntimeError(f"{path} or its preview cannot be written ({error}){kept}") from error

@@ -14,9 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..color import (
+    View,
     XYZ_to_linear_sRGB,
     auto_exposure,
     into_gamut,
+    neutral_view,
     on_screen,
     spectrum_to_linear_sRGB,
     spectrum_to_XYZ,
@@ -222,14 +224,16 @@ def save_preview(
     path: str | os.PathLike[str],
     exposure: float | None = None,
     denoise: Callable[[NDArray[np.float32]], NDArray[np.float32]] | None = None,
+    view: View = neutral_view,
 ) -> float:
     """Write an 8-bit sRGB preview of a spectral image, in the format given by the suffix of `path`.
 
-    Spectra → XYZ → linear sRGB → `into_gamut` → × exposure → `roll_off` → sRGB's transfer function.
+    Spectra → XYZ → linear sRGB → `into_gamut` → × exposure → view.
 
     Args:
         exposure: the factor for linear sRGB; by default `auto_exposure`. It is returned.
         denoise: applied to XYZ, (height, width, 3), such as `denoise.denoised_picture` of the scene.
+        view: tone curve and encoding, such as `color.ocio_view`.
 
     Raises:
         ValueError: if Pillow does not support the suffix.
@@ -244,7 +248,7 @@ def save_preview(
         picture[rows] = into_gamut(XYZ_to_linear_sRGB(picture[rows]))
     if exposure is None:
         exposure = auto_exposure(picture)
-    shown = np.concatenate([on_screen(picture[rows] * exposure) for rows in blocks])
+    shown = np.concatenate([on_screen(picture[rows] * exposure, view) for rows in blocks])
     text = png_text()
     text.add_text("exposure", repr(exposure))
     with whole_file(path) as temporary:

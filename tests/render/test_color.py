@@ -1,9 +1,19 @@
+import sys
+
 import colour
 import numpy as np
 import pytest
 from PIL import Image
 
-from mitsuba_diffraction.color import auto_exposure, into_gamut, roll_off, spectrum_to_linear_sRGB, spectrum_to_XYZ
+from mitsuba_diffraction.color import (
+    auto_exposure,
+    into_gamut,
+    ocio_view,
+    on_screen,
+    roll_off,
+    spectrum_to_linear_sRGB,
+    spectrum_to_XYZ,
+)
 from mitsuba_diffraction.render.spectral_image import SpectralImage, save_preview
 
 GRID = np.arange(365.0, 830.0, 5.0)
@@ -127,3 +137,55 @@ def test_preview_of_unknown_format_writes_nothing(tmp_path):
     with pytest.raises(ValueError, match=r"\.nonsense"):
         save_preview(SpectralImage(GRID, np.ones((2, 2, GRID.size))), tmp_path / "a.nonsense")
     assert list(tmp_path.iterdir()) == []
+
+
+ACES = "ocio://cg-config-v2.1.0_aces-v1.3_ocio-v2.3"  # in each version of OpenColorIO since 2.3
+EXPOSED = np.array([[0.0, 0, 0], [0.18, 0.18, 0.18], [1, 1, 1], [8, 8, 8], [0.9, 0.05, 0.02], [0.02, 0.1, 3]])
+
+
+def test_a_view_is_that_of_OpenImageIO(monkeypatch):
+    oiio = pytest.importorskip("OpenImageIO")
+    monkeypatch.setenv("OCIO", ACES)
+    picture = oiio.ImageBuf(EXPOSED[None].astype(np.float32))
+    shown = oiio.ImageBufAlgo.ociodisplay(
+        picture, "sRGB - Display", "ACES 1.0 - SDR Video", "lin_rec709_srgb", colorconfig=ACES
+    )
+    assert not shown.has_error, shown.geterror()
+    wanted = np.clip(255 * shown.get_pixels()[0], 0, 255)
+    np.testing.assert_allclose(on_screen(EXPOSED, ocio_view("aces")), wanted, atol=1)
+    # The output transform of ACES shows a grey of 18 % as one of 10 %, within the toe of its curve.
+    grey = colour.cctf_decoding(on_screen(EXPOSED[1], ocio_view("aces")) / 255, function="sRGB")
+    np.testing.assert_allclose(grey, 0.1, atol=0.01)
+
+
+def test_views_are_those_of_the_configuration(monkeypatch, tmp_path):
+    monkeypatch.delenv("OCIO", raising=False)
+    with pytest.raises(ValueError, match=r"--view: got 'AgX', the views of ocio://default are ACES .*, Raw"):
+        ocio_view("AgX")
+    monkeypatch.setenv("OCIO", str(tmp_path / "gone.ocio"))
+    with pytest.raises(ValueError, match=r"gone.ocio cannot be used by OpenColorIO \("):
+        ocio_view("AgX")
+    # The name of a view may be the beginning of another's.
+    text = """ocio_profile_version: 2
+roles: {default: XYZ, scene_linear: XYZ, cie_xyz_d65_interchange: XYZ}
+displays:
+  mine:
+    - !<View> {name: Curve Log, colorspace: log}
+    - !<View> {name: Curve, colorspace: half}
+colorspaces:
+  - !<ColorSpace> {name: XYZ}
+  - !<ColorSpace> {name: log, from_scene_reference: !<LogTransform> {base: 2}}
+  - !<ColorSpace>
+    name: half
+    from_scene_reference: !<MatrixTransform> {matrix: [.5, 0, 0, 0, 0, .5, 0, 0, 0, 0, .5, 0, 0, 0, 0, 1]}
+"""
+    (tmp_path / "mine.ocio").write_text(text)
+    monkeypatch.setenv("OCIO", str(tmp_path / "mine.ocio"))
+    to_XYZ = colour.RGB_COLOURSPACES["sRGB"].matrix_RGB_to_XYZ
+    np.testing.assert_allclose(ocio_view("CURVE")(EXPOSED), EXPOSED @ to_XYZ.T / 2, rtol=1e-5, atol=1e-6)
+
+
+def test_without_OpenColorIO_a_view_is_refused_in_one_line(monkeypatch):
+    monkeypatch.setitem(sys.modules, "PyOpenColorIO", None)
+    with pytest.raises(ValueError, match=r"pip install 'mitsuba_diffraction\[ocio\]'"):
+        ocio_view("ACES")
