@@ -98,7 +98,7 @@ def render(
     from ..llvm import choose_variant
     from ..render.cluster import trace_on
     from ..render.passes import checkpoint_path, trace_locally
-    from ..render.scene import channel_wavelengths, files_of_scene, named_sample_count
+    from ..render.scene import channel_wavelengths, files_of_scene, has_alpha, named_sample_count
     from ..render.turntable import orbit as motions_of_orbit
     from ..render.turntable import save_animation
 
@@ -127,7 +127,8 @@ def render(
     motions = [None] if frames is None else motions_of_orbit(scene, frames, **where)
     where |= {"width": width, "height": height}
     request = {"spp": spp, "seed": seed, "until_error": until_error, "seconds": checkpoint, "tracer": tracer}
-    bytes_per_pixel = 6 if rgb else (2 if half else 4) * (3 + (channels or channel_wavelengths().size))
+    planes = 3 + has_alpha(scene, where["parameters"]) + (0 if rgb else channels or channel_wavelengths().size)
+    bytes_per_pixel = (2 if half or rgb else 4) * planes
     if until_error is None:  # else nobody knows the time
         request["announce"] = partial(_announce, scene.name, bytes_per_pixel, named)
     pictures = _pictures(target, frames)

@@ -118,12 +118,13 @@ def define_eye_paths() -> type:
         ) -> tuple[mi.Spectrum, mi.Bool, list[mi.Float]]:
             ctx = mi.BSDFContext()
             si = scene.ray_intersect(ray, active)
-            valid = si.is_valid() & active
+            # Alpha is that of `path`: null interactions are transparent, an environment is not.
+            valid = mi.Bool(scene.environment() is not None)
             result = si.emitter(scene).eval(si, active)
             ray = mi.Ray3f(ray)
             throughput, eta = mi.Spectrum(1.0), mi.Float(1.0)
             depth = mi.UInt32(1)
-            active = valid & (depth < self.max_depth)
+            active &= si.is_valid() & (depth < self.max_depth)
             # Whether an earlier vertex is not on a grating; whether the first vertex is on one or scatters specularly.
             has_other_vertex, from_eye_only = mi.Bool(False), mi.Bool(False)
             while active:
@@ -148,6 +149,7 @@ def define_eye_paths() -> type:
                 throughput *= weight
                 eta *= bs.eta
                 delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+                valid |= active & (mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null) ^ True)
                 from_eye_only |= (depth == 1) & (delta | on_grating)
                 has_other_vertex |= on_grating ^ True
                 active &= dr.any(throughput != 0)

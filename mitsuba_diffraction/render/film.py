@@ -61,6 +61,7 @@ def trace_pass(
     integrator: mi.Integrator | None = None,
     rows: Rows | None = None,
     light: LightOfBands | None = None,
+    alpha: bool = False,
 ) -> NDArray[np.float32]:
     """Trace the first sensor once and return the sums that determine radiance.
 
@@ -84,9 +85,11 @@ def trace_pass(
         rows: those to be traced; default: all. Samples outside them, but under the filter of one of their pixels,
             count. Bands have independent random numbers, except for the paths from the light, which are common to all.
         light: of all bands; required with `rows`.
+        alpha: also return Σ_s f(c − p_s) v_s, with v_s one if the integrator finds the sample valid, else zero; not
+            with Mitsuba's film.
 
     Returns:
-        (height, width, n + 1) float32, of the rows.
+        (height, width, n + 1) float32, of the rows; with alpha, (height, width, n + 2): it is the last but one.
 
     Raises:
         RuntimeError: if tracing failed, with the cause on one line.
@@ -96,7 +99,7 @@ def trace_pass(
         if needs_mitsubas_film(integrator):
             return trace_with_mitsubas_film(scene, integrator, spp, seed)
         rows = rows or (0, int(scene.sensors()[0].film().crop_size()[1]))
-        return _trace(scene, integrator, spp, seed, rows, light or LightOfBands((rows,)))
+        return _trace(scene, integrator, spp, seed, rows, light or LightOfBands((rows,)), alpha)
     except Exception as error:
         raise RuntimeError(f"rendering failed: {root_cause(error)}") from error
 
@@ -247,7 +250,13 @@ class LightOfBands:
 
 
 def _trace(
-    scene: mi.Scene, integrator: mi.SamplingIntegrator, spp: int, seed: int, rows: Rows, light_of_bands: LightOfBands
+    scene: mi.Scene,
+    integrator: mi.SamplingIntegrator,
+    spp: int,
+    seed: int,
+    rows: Rows,
+    light_of_bands: LightOfBands,
+    alpha: bool,
 ) -> NDArray[np.float32]:
     sensor = scene.sensors()[0]
     film = sensor.film()
@@ -284,16 +293,20 @@ def _trace(
     on_film = mi.Point2f(position.x, position.y + dr.opaque(mi.Float, first)) / mi.ScalarVector2f(columns, film_rows)
     ray, weight = sensor.sample_ray_differential(time, sampler.next_1d(), on_film, aperture)
     ray.scale_differential(spp**-0.5)
-    traced, _, _ = integrator.sample(scene, sampler, ray, sensor.get_medium())
+    traced, valid, _ = integrator.sample(scene, sampler, ray, sensor.get_medium())
     channels = channel_wavelengths().size
     channel, value = _on_channels(film, ray.wavelengths, weight * traced)
-    dr.eval(position, channel, value)
+    covered = [dr.select(valid, mi.Float(1), 0)] if alpha else []
+    dr.eval(position, channel, value, covered)
     shape = end - first, columns
-    sums = np.array(collect(rfilter, position, channel, value, shape, margins, equal_ranges(count), channels))
-    sums = sums.reshape(*shape, -1)
+    collected = functools.partial(collect, rfilter, position, size=shape, margins=margins, samples=equal_ranges(count))
+    sums = np.array(collected(channel, value, channels=channels)).reshape(*shape, -1)
     if light is not None:
         splats = light_of_bands.of(rows, light, spp, light_seed, radius)
         _add_light(sums, film, splats - np.float32([0, first, *[0] * (splats.shape[1] - 2)]), spp, margins)
+    if alpha:
+        coverage = np.array(collected([dr.zeros(mi.Float, size)], covered, channels=1)).reshape(*shape, 2)
+        sums = np.concatenate([sums[..., :-1], coverage], axis=-1)
     return sums
 
 

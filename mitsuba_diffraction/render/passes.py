@@ -52,6 +52,7 @@ from .film import (
 from .scene import (
     Materials,
     channel_wavelengths,
+    has_alpha,
     load_spectral_scene,
     max_plausible_luminance,
     scene_digest,
@@ -70,7 +71,8 @@ class Accumulation:
     in the order of their indices.
 
     Attributes:
-        sums: (height, width, n + 1) float64, Σ_p of the results of `trace_pass`, at `channel_wavelengths()`.
+        sums: (height, width, n + 1) float64, or n + 2 with alpha: Σ_p of the results of `trace_pass`, at
+            `channel_wavelengths()`.
         luminance: (height, width) float64, Σ_p n_p y_p.
         squares: (height, width) float64, Σ_p n_p y_p².
         passes: P.
@@ -84,16 +86,17 @@ class Accumulation:
     samples: int = 0
 
     @classmethod
-    def empty(cls, rows: int, columns: int) -> Accumulation:
+    def empty(cls, rows: int, columns: int, alpha: bool = False) -> Accumulation:
         """Return the sums of zero passes."""
-        return cls(np.zeros((rows, columns, channel_wavelengths().size + 1)), *np.zeros((2, rows, columns)))
+        channels = channel_wavelengths().size + (2 if alpha else 1)
+        return cls(np.zeros((rows, columns, channels)), *np.zeros((2, rows, columns)))
 
     def add(self, traced: NDArray[np.float32], samples: int) -> None:
         """Add the result of `trace_pass` with that many samples per pixel."""
         # einsum adds in a fixed order; a matrix product may be multithreaded.
         wavelengths = channel_wavelengths()
         weights = spectrum_to_XYZ(np.eye(wavelengths.size), wavelengths)[:, 1].astype(np.float32)
-        luminance = np.einsum("yxi,i->yx", traced[..., :-1], weights).astype(np.float64)
+        luminance = np.einsum("yxi,i->yx", traced[..., : weights.size], weights).astype(np.float64)
         luminance = ratio(luminance, traced[..., -1])
         self.sums += traced
         self.luminance += samples * luminance
@@ -104,7 +107,12 @@ class Accumulation:
     def radiance(self, rows: slice = slice(None)) -> NDArray[np.float32]:
         """Return the radiance, (height, width, n) float32, W m⁻² sr⁻¹ nm⁻¹."""
         # Row by row, to avoid a second copy of the sums of a large picture.
-        return np.stack([ratio(row[:, :-1], row[:, -1:]).astype(np.float32) for row in self.sums[rows]])
+        n = channel_wavelengths().size
+        return np.stack([ratio(row[:, :n], row[:, -1:]).astype(np.float32) for row in self.sums[rows]])
+
+    def alpha(self) -> NDArray[np.float32]:
+        """Return the fraction of valid samples, (height, width), 0 to 1; only of sums with alpha."""
+        return np.clip(ratio(self.sums[..., -2], self.sums[..., -1]), 0, 1).astype(np.float32)
 
     def relative_errors(self) -> NDArray[np.float32]:
         """Return the relative standard error of luminance, (height, width); NaN if black or before two passes.
@@ -200,10 +208,16 @@ class BandedSums:
         done: number of additions so far: in each pass, one per band from top to bottom.
         errors: (height, width) float32, `Accumulation.relative_errors`.
         luminance: (height, width) float32, mean luminance.
+        alpha: (height, width) float32, or None.
     """
 
     def __init__(
-        self, bands: tuple[Rows, ...], columns: int, digest: str, checkpoint: str | os.PathLike[str] | None
+        self,
+        bands: tuple[Rows, ...],
+        columns: int,
+        digest: str,
+        checkpoint: str | os.PathLike[str] | None,
+        alpha: bool = False,
     ) -> None:
         """Read existing checkpoints; errors as of `load_checkpoint`. Without `checkpoint`, they are temporary files."""
         self.bands, self._columns, self._digest = bands, columns, digest
@@ -212,6 +226,7 @@ class BandedSums:
             weakref.finalize(self, shutil.rmtree, checkpoint.parent, ignore_errors=True)
         self._paths = [None] if checkpoint is None else [checkpoint_of_band(checkpoint, k) for k in range(len(bands))]
         self.errors, self.luminance = np.full((2, bands[-1][1], columns), np.nan, np.float32)
+        self.alpha = np.zeros((bands[-1][1], columns), np.float32) if alpha else None
         self._index, self._saved = -1, 0
         passes = [self._describe(index).passes for index in range(len(bands))]
         self.done = sum(passes)
@@ -224,7 +239,9 @@ class BandedSums:
             self.release()
             (first, end), path = self.bands[index], self._paths[index]
             stored = None if path is None else load_checkpoint(path, self._digest)
-            self._sums = Accumulation.empty(end - first, self._columns) if stored is None else stored
+            if stored is None:
+                stored = Accumulation.empty(end - first, self._columns, self.alpha is not None)
+            self._sums = stored
             self._index, self._saved = index, self._sums.samples
         return self._sums
 
@@ -256,6 +273,8 @@ class BandedSums:
         sums, rows = self.band(index), slice(*self.bands[index])
         self.errors[rows] = sums.relative_errors()
         self.luminance[rows] = sums.luminance / max(sums.samples, 1)
+        if self.alpha is not None:
+            self.alpha[rows] = sums.alpha()
         return sums
 
 
@@ -265,6 +284,7 @@ class BandedImage(SpectralImage):
     def __init__(self, sums: BandedSums, attributes: Mapping[str, str | int | float]) -> None:
         object.__setattr__(self, "wavelengths", channel_wavelengths())
         object.__setattr__(self, "attributes", dict(attributes))
+        object.__setattr__(self, "alpha", sums.alpha)
         object.__setattr__(self, "_sums", sums)
 
     @property
@@ -308,6 +328,7 @@ class Job:
         samples: samples per pixel of each pass.
         bands: `film.bands_of` the scene.
         until_error: see `render`.
+        alpha: whether alpha is recorded.
         content: digest of the scene and the files it references (`scene_digest`).
         versions: of the packages involved.
     """
@@ -319,6 +340,7 @@ class Job:
     samples: tuple[int, ...]
     bands: tuple[Rows, ...]
     until_error: float | None
+    alpha: bool
     content: str
     versions: tuple[str, ...]
 
@@ -378,7 +400,7 @@ class Interrupted(KeyboardInterrupt):
 def trace_band(job: Job, scene: mi.Scene, index: int, light: LightOfBands) -> NDArray[np.float32]:
     """Trace number `index` of the bands of all passes, see `BandedSums.done` and `trace_pass`."""
     number, band = divmod(index, len(job.bands))
-    return trace_pass(scene, job.samples[number], pass_seed(job.seed, number), None, job.bands[band], light)
+    return trace_pass(scene, job.samples[number], pass_seed(job.seed, number), None, job.bands[band], light, job.alpha)
 
 
 def trace_locally(job: Job, scene: mi.Scene, first: int) -> Iterator[NDArray[np.float32]]:
@@ -463,7 +485,7 @@ def render(
     memory = check_memory(scene, max(job.samples), job.bands)
     disk = _check_disk(job.bands, columns, checkpoint)
     with nullcontext() if checkpoint is None else exclusive(checkpoint):
-        sums = BandedSums(job.bands, columns, job.digest(), checkpoint)
+        sums = BandedSums(job.bands, columns, job.digest(), checkpoint, job.alpha)
         complete = _trace(
             job,
             scene,
@@ -523,8 +545,8 @@ def _job(
     if until_error is not None and not 0 < until_error < 1:
         raise RequestError(f"until_error: got {until_error}, wanted a relative error between 0 and 1, such as 0.01")
     scene = load_spectral_scene(scene_path, **where)
-    sampler = scene.sensors()[0].sampler()
-    if needs_mitsubas_film(scene.integrator()) and not is_independent(sampler):
+    sampler, whole = scene.sensors()[0].sampler(), needs_mitsubas_film(scene.integrator())
+    if whole and not is_independent(sampler):
         _log.warning(
             "sampler: got %s, wanted independent: with this integrator or in this variant its samples are not uniform, "
             "and colours may be wrong by some per cent",
@@ -540,6 +562,7 @@ def _job(
         samples=samples,
         bands=bands_of(scene),
         until_error=until_error,
+        alpha=has_alpha(scene_path, where["parameters"]) and not whole,
         content=scene_digest(scene_path, where["parameters"], where["materials"]),
         versions=versions(),
     )
@@ -573,7 +596,7 @@ def _image(sums: BandedSums, job: Job, scene: str, complete: bool) -> SpectralIm
         attributes["digest"] = job.digest()
     if len(job.bands) > 1:
         return BandedImage(sums, attributes)
-    return SpectralImage(channel_wavelengths(), sums.band(0).radiance(), attributes)
+    return SpectralImage(channel_wavelengths(), sums.band(0).radiance(), attributes, sums.alpha)
 
 
 def _warn_of_implausible_pixels(luminance: NDArray[np.float32], limit: float) -> None:

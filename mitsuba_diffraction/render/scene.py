@@ -46,6 +46,7 @@ _RAYS_OF_SENSOR = 4096  # to sample the visible surfaces and their lights
 _MAX_LOBE_VALUE = 1e4  # of a BSDF with narrow lobes, 1/sr
 _MAX_NOISE_FACTOR = 1e4  # of the luminance of a pixel over that of the brightest light
 _MAX_PIXELS = 2**25  # above 7680 × 4320; see also `film.check_memory`
+_FORMATS_WITH_ALPHA = {"luminance_alpha", "rgba", "xyza"}
 _DEFAULT_SIZE = (768, 576)  # width and height of Mitsuba's films
 
 
@@ -271,6 +272,15 @@ def named_sample_count(path: str | os.PathLike[str], parameters: Mapping[str, st
                     raise RequestError(f"sample_count: got {count}, wanted a positive number of samples")
                 return int(count)
     return None
+
+
+def has_alpha(path: str | os.PathLike[str], parameters: Mapping[str, str] | None = None) -> bool:
+    """Return whether the film of a scene's first sensor has a `pixel_format` with alpha; errors as of `parsed`."""
+    with parsed(path, parameters) as (_, state):
+        sensor = next((node for node in state.nodes if node.type == mi.ObjectType.Sensor), None)
+        films = _children(state, sensor.props, mi.ObjectType.Film) if sensor else ()
+        formats = [mi.Properties(state.nodes[film].props).get("pixel_format", "rgb") for film in films]
+    return any(str(name).lower() in _FORMATS_WITH_ALPHA for name in formats)
 
 
 def scene_digest(

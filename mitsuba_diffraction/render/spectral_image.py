@@ -67,6 +67,7 @@ class SpectralImage:
         wavelengths: (n,) float64, nm, ascending.
         radiance: (height, width, n) float32, W m⁻² sr⁻¹ nm⁻¹; row 0 is the top.
         attributes: metadata by name: text, integers (32 bits in the file) or floats (float32 in the file).
+        alpha: (height, width) float32, 0 to 1, or None; radiance is multiplied by it, as is usual in OpenEXR.
 
     Raises:
         ValueError: if the shapes disagree, the wavelengths do not ascend, or an attribute has another type or a
@@ -76,6 +77,7 @@ class SpectralImage:
     wavelengths: NDArray[np.float64]
     radiance: NDArray[np.float32]
     attributes: Mapping[str, str | int | float] = field(default_factory=dict)
+    alpha: NDArray[np.float32] | None = None
 
     def __post_init__(self) -> None:
         wavelengths = np.array(self.wavelengths, dtype=np.float64)
@@ -86,6 +88,10 @@ class SpectralImage:
             raise RequestError(
                 f"radiance: got shape {radiance.shape}, wanted (height, width, {wavelengths.size}), none of them zero"
             )
+        if self.alpha is not None:
+            object.__setattr__(self, "alpha", np.array(self.alpha, dtype=np.float32))
+            if np.shape(self.alpha) != radiance.shape[:2]:
+                raise RequestError(f"alpha: got shape {np.shape(self.alpha)}, wanted {radiance.shape[:2]}")
         for name, value in self.attributes.items():
             if isinstance(value, int) and not -(2**31) <= value < 2**31:
                 # OpenEXR would truncate it silently.
@@ -116,12 +122,13 @@ class SpectralImage:
         """Write an OpenEXR file (ZIP) in the spectral layout of Fichet, Pacanowski and Wilkie 2021.
 
         Channels `S0.405,000000nm` hold the radiance; R, G and B are linear sRGB (scaled as in `color`) for ordinary
-        viewers.
+        viewers, and A is alpha, if there is any.
 
         Args:
             half: write float16 instead of float32, in about half the size or less. Radiance from 6.1e-5 to 65504 is
                 then rounded by at most 2⁻¹¹ (0.05 %), smaller radiance by at most 3e-8.
-            rgb: write R, G and B alone, as float16, at most ±65504. Such a file cannot be loaded as a spectral image.
+            rgb: write R, G and B (and A) alone, as float16, at most ±65504. Such a file cannot be loaded as a spectral
+                image.
             channels: maximum number of wavelengths. Neighbouring ones are added with the weights that make their hats
                 one of k times the width, for the smallest such k: 93, 46, 30, 22, … wavelengths, 5, 10, 15, 20, … nm
                 apart.
@@ -141,7 +148,7 @@ class SpectralImage:
         hats = None if channels is None else _wider_hats(self.wavelengths.size, channels)
         wavelengths = self.wavelengths[:0] if rgb else self.wavelengths if hats is None else self.wavelengths @ hats
         numbers = [f"{wavelength:.6f}".replace(".", ",") for wavelength in wavelengths]
-        names = ["R", "G", "B", *(f"S0.{number}nm" for number in numbers)]
+        names = ["R", "G", "B", *(f"S0.{number}nm" for number in numbers), *(["A"] if self.alpha is not None else [])]
         layout = {} if rgb else {"spectralLayoutVersion": _LAYOUT_VERSION, "emissiveUnits": _UNITS}
         attributes = {**self.attributes, **layout, "writtenBy": MARK}
         header = OpenEXR.Header(self.shape[1], self.shape[0])
@@ -149,12 +156,16 @@ class SpectralImage:
         header["channels"] = dict.fromkeys(names, pixel)
         # The only writer of OpenEXR that takes a file in blocks of rows.
         with whole_file(path) as temporary, closing(OpenEXR.OutputFile(str(temporary), header)) as file:
+            row = 0
             for block in self.blocks():
                 planes = spectrum_to_linear_sRGB(block, self.wavelengths).astype(np.float32)
                 if rgb:
                     planes = np.clip(planes, -limit, limit)
                 else:
                     planes = np.concatenate([planes, block if hats is None else block @ hats], axis=-1)
+                if self.alpha is not None:
+                    planes = np.concatenate([planes, self.alpha[row : row + len(block), :, None]], axis=-1)
+                row += len(block)
                 if (value := float(np.abs(planes).max())) > limit:
                     raise RequestError(
                         f"half: got radiances up to {value:.4g}, wanted at most {limit:.0f}; float32 holds them"
@@ -198,7 +209,8 @@ class SpectralImage:
             for name, value in header.items()
             if name not in _RESERVED and isinstance(value, str | int | float)
         }
-        return cls(np.array([wavelength for wavelength, _ in found]), radiance, attributes)
+        alpha = channels["A"].pixels.astype(np.float32) if "A" in channels else None
+        return cls(np.array([wavelength for wavelength, _ in found]), radiance, attributes, alpha)
 
 
 def stored_digest(path: str | os.PathLike[str]) -> str | None:
@@ -244,11 +256,15 @@ def save_preview(
     if denoise is not None:
         picture = denoise(picture)
     blocks = split_rows(*picture.shape[:2])
+    if image.alpha is not None:  # PNG has colours that are not multiplied by alpha
+        picture /= np.where(image.alpha > 0, image.alpha, 1)[..., None]
     for rows in blocks:
         picture[rows] = into_gamut(XYZ_to_linear_sRGB(picture[rows]))
     if exposure is None:
         exposure = auto_exposure(picture)
     shown = np.concatenate([on_screen(picture[rows] * exposure, view) for rows in blocks])
+    if image.alpha is not None:
+        shown = np.dstack([shown, np.round(255 * image.alpha).astype(np.uint8)])
     text = png_text()
     text.add_text("exposure", repr(exposure))
     with whole_file(path) as temporary:

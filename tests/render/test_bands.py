@@ -52,6 +52,25 @@ def write_scene(integrator="path", sampler="independent"):
     return "scene.xml"
 
 
+# A sphere, a grating and a half transparent rectangle, in front of nothing or of an environment.
+SCENE_WITH_ALPHA = """<scene version="3.0.0">
+    <integrator type="INTEGRATOR"><boolean name="hide_emitters" value="HIDDEN"/></integrator>
+    <sensor type="perspective"><float name="fov" value="50"/>
+        <transform name="to_world"><lookat origin="0,-4,1.5" target="0,0,0" up="0,0,1"/></transform>
+        <film type="hdrfilm"><string name="pixel_format" value="rgba"/><rfilter type="gaussian"/>
+            <integer name="width" value="16"/><integer name="height" value="12"/></film>
+    </sensor>
+    <shape type="sphere"><float name="radius" value=".5"/><point name="center" x="-.9" y="0" z="0"/></shape>
+    <shape type="rectangle"><transform name="to_world"><scale value=".5"/><translate x=".1"/></transform>
+        <bsdf type="diffraction_grating"><string name="profile" value="blazed"/><float name="period" value="2.5"/>
+            <float name="depth" value="0.25"/><float name="coherence_length" value="6"/>
+            <string name="material" value="none"/></bsdf></shape>
+    <shape type="rectangle"><transform name="to_world"><scale value=".5"/><translate x="1.2"/></transform>
+        <bsdf type="mask"><float name="opacity" value=".5"/><bsdf type="diffuse"/></bsdf></shape>
+    LIGHT
+</scene>"""
+
+
 @pytest.fixture
 def three_bands(monkeypatch):
     monkeypatch.setattr(film, "BAND_PIXELS", 40)
@@ -108,6 +127,30 @@ def test_light_of_bands_is_that_of_the_whole_bit_for_bit(three_bands):
         assert (whole.sum((1, 2)) > 0).sum() > 5
         banded = np.concatenate([trace_pass(built, 64, seed, alone, band, light) for band in bands])
         np.testing.assert_array_equal(banded[..., :-1], whole)
+
+
+@pytest.mark.parametrize(
+    ("integrator", "light", "hidden"),
+    [
+        ("diffraction_path", "directional", False),
+        ("path", "constant", True),
+        pytest.param("diffraction_path", "constant", False, marks=pytest.mark.slow),
+        pytest.param("path", "directional", False, marks=pytest.mark.slow),
+    ],
+)
+def test_alpha_is_that_of_mitsubas_own_film(integrator, light, hidden, three_bands):
+    emitter = {"constant": "", "directional": '<vector name="direction" x="0" y=".6" z="-.8"/>'}[light]
+    text = SCENE_WITH_ALPHA.replace("LIGHT", f'<emitter type="{light}">{emitter}</emitter>')
+    text = text.replace("HIDDEN", str(hidden).lower())
+    Path("scene.xml").write_text(text.replace("INTEGRATOR", integrator))
+    Path("wanted.xml").write_text(text.replace("INTEGRATOR", "path"))
+    alpha = render("scene.xml", spp=1024).alpha
+    wanted = np.array(mi.render(mi.load_file("wanted.xml"), spp=1024, seed=1))[..., 3]
+    np.testing.assert_allclose(alpha, wanted, atol=0.08)  # five standard errors of the half transparent rectangle
+    np.testing.assert_allclose(alpha.mean(), wanted.mean(), atol=0.004)
+    assert alpha.min() == (1 if light == "constant" and not hidden else 0)
+    assert alpha.max() > 0.99
+    assert render(write_scene(), spp=1).alpha is None
 
 
 def stop_after(count):

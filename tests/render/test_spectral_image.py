@@ -4,10 +4,12 @@ import stat
 import numpy as np
 import OpenEXR
 import pytest
+from PIL import Image
 
 from mitsuba_diffraction.color import spectrum_to_linear_sRGB
 from mitsuba_diffraction.files import whole_file
-from mitsuba_diffraction.render.spectral_image import SpectralImage
+from mitsuba_diffraction.render import spectral_image
+from mitsuba_diffraction.render.spectral_image import SpectralImage, save_preview
 
 GRID = np.arange(365.0, 830.0, 5.0)
 
@@ -46,6 +48,28 @@ def test_the_file_has_the_spectral_layout(image, tmp_path):
     rgb = spectrum_to_linear_sRGB(image.radiance, GRID)
     for index, name in enumerate("RGB"):
         np.testing.assert_allclose(channels[name].pixels, rgb[..., index], rtol=1e-5, atol=1e-6)
+
+
+def test_alpha_is_a_channel_of_the_file_and_of_the_preview(tmp_path, monkeypatch):
+    monkeypatch.setattr(spectral_image, "_PIXELS_PER_BLOCK", 8)  # two rows
+    alpha = np.linspace(0, 1, 5 * 4).reshape(5, 4)
+    image = SpectralImage(GRID, alpha[..., None] * np.linspace(1, 2, GRID.size), alpha=alpha)
+    image.save(tmp_path / "a.exr")
+    image.save(tmp_path / "rgb.exr", rgb=True)
+    np.testing.assert_array_equal(SpectralImage.load(tmp_path / "a.exr").alpha, alpha.astype(np.float32))
+    channels = OpenEXR.File(str(tmp_path / "rgb.exr"), separate_channels=True).channels()
+    assert sorted(channels) == ["A", "B", "G", "R"]
+    np.testing.assert_array_equal(channels["A"].pixels, alpha.astype(np.float16))
+    # The colours of PNG are not multiplied by alpha.
+    save_preview(image, tmp_path / "a.png")
+    with Image.open(tmp_path / "a.png") as preview:
+        assert preview.mode == "RGBA"
+        pixels = np.array(preview)
+    np.testing.assert_array_equal(pixels[..., 3], np.round(255 * alpha))
+    np.testing.assert_array_equal(pixels[alpha > 0][:, :3], np.broadcast_to(pixels[-1, -1, :3], (19, 3)))
+    assert pixels[-1, -1, :3].max() > 200
+    with pytest.raises(ValueError, match=r"alpha: got shape \(5,\), wanted \(5, 4\)"):
+        SpectralImage(GRID, image.radiance, alpha=alpha[:, 0])
 
 
 def test_colour_science_reads_the_file(image, tmp_path):
