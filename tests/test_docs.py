@@ -37,7 +37,7 @@ SHOWN = {"text", "bash"}
 BY_OTHER_MEANS = (
     *("python3 -m venv", "python -m pytest", "pip install", "jupyter ", "mkdocs "),
     *("mitsuba-diffraction benchmark", "mitsuba-diffraction convergence", "mitsuba-diffraction validate"),
-    *("python precompute/rigorous_reference.py", "python scenes/"),
+    *("python precompute/rigorous_reference.py", "python scenes/", "python docs/"),
 )
 """Commands that CI runs, and the tests of notebooks, the manual, the benchmark, the validation and the gallery."""
 NUMBER = re.compile(r"(?<![\w.])[-−]?\d+(?:\.\d*)?(?:e[-+]?\d+)?")
@@ -287,3 +287,5 @@ def test_the_manual_is_built_without_warnings(tmp_path, caplog):
     for page in PAGES[1:]:
         place = "" if page.stem == "index" else page.stem
         assert (tmp_path / "site" / place / "index.html").is_file()
+    for name in ("blaze", "elaphe", "xenopeltis"):
+        assert "<canvas" in (tmp_path / "site" / "live" / f"{name}.html").read_text(encoding="utf-8")

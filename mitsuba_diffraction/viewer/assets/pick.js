@@ -11,7 +11,8 @@ class Picker {
     const { gl, geometry } = renderer;
     const [width, height] = renderer.drawn;
     const camera = cameraOf(state, width, height);
-    renderer.drawGeometry(state, camera, [0, 0]);
+    renderer.geometryFrame = -1;  // The state may have changed since the last frame.
+    renderer.drawGeometry(state, camera, 0);
     const at = [Math.floor(x * renderer.scale), height - 1 - Math.floor(y * renderer.scale)];
     gl.bindFramebuffer(gl.FRAMEBUFFER, geometry.framebuffer);
     const [position, normal, tangent] = geometry.textures.map((_, i) => {

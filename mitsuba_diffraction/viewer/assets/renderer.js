@@ -127,10 +127,12 @@ class Renderer {
     Object.assign(this, { width, height });
     if (this.geometry) this.geometry.dispose();
     this.geometry = new Target(this.gl, width, height, 3, true);
+    this.geometryFrame = -1;
     for (const side of this.sides) side.resize(width, height);
   }
 
   restart() {
+    this.geometryFrame = -1;
     for (const side of this.sides) side.restart();
   }
 
@@ -145,9 +147,13 @@ class Renderer {
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
-  drawGeometry(state, camera, jitter) {
+  // Positions and normals of a frame, where they are not there already.
+  drawGeometry(state, camera, frame) {
+    if (frame === this.geometryFrame) return;
+    this.geometryFrame = frame;
     const { gl } = this;
     const [width, height] = this.drawn;
+    const jitter = frame === 0 ? [0, 0] : R2.map((step) => fraction(0.5 + frame * step) - 0.5);
     this.geometry.bind(width, height);
     if (state.shape in ANALYTIC) {
       gl.disable(gl.DEPTH_TEST);
@@ -179,8 +185,7 @@ class Renderer {
     const [width, height] = this.drawn;
     const camera = cameraOf(state, width, height);
     const { frame } = side;
-    const jitter = frame === 0 ? [0, 0] : R2.map((step) => fraction(0.5 + frame * step) - 0.5);
-    this.drawGeometry(state, camera, jitter);
+    this.drawGeometry(state, camera, frame);
     if (side === this.model && frame === 0 && side.row === 0) this.drawSky(state);
     const turn = radians(state.orientation);
     const [uPosition, uNormal, uTangent] = this.geometry.textures;
@@ -200,6 +205,7 @@ class Renderer {
       uCos: Math.cos(turn),
     });
     gl.enable(gl.SCISSOR_TEST);
+    after.read(0, 0, 1, 1);  // The time of what was drawn before is not that of the rows.
     const start = performance.now();
     let now = start;
     while (side.row < height && now - start < budget) {
