@@ -35,6 +35,7 @@ def draw(tab: Page, changes: dict[str, Any], frames: int) -> None:
     """Change the state of the page, and wait until that many frames are drawn."""
     tab.evaluate("(changes) => viewer.set(changes)", {**changes, "maxFrames": frames})
     tab.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
-    # The page forbids eval, and with it wait_for_function.
-    while tab.evaluate("viewer.renderer.sides.some((side) => side.frame < viewer.state.maxFrames)"):
+    sides = 1 if tab.evaluate("viewer.state.right") == "none" else 2
+    # The page forbids eval, and with it wait_for_function. The second side waits for its transforms.
+    while tab.evaluate("viewer.renderer.sides.filter((side) => side.frame >= viewer.state.maxFrames).length") < sides:
         tab.wait_for_timeout(200)
