@@ -63,7 +63,7 @@ def pytest_collection_modifyitems(items):
 
 @pytest.fixture(scope="module", autouse=True)
 def garbage_between_modules():
-    """Collect garbage between modules only: Dr.Jit aborted once as plugins were collected while it traced."""
+    """Collect garbage between modules only: Dr.Jit aborts where a scene is collected while `dr.freeze` records."""
     gc.collect()
     gc.disable()
     yield

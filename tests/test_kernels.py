@@ -153,7 +153,7 @@ def test_a_frozen_evaluation_follows_the_parameters(name):
     def frozen(bsdf: mi.BSDF, si: mi.SurfaceInteraction3f, wo: mi.Vector3f) -> tuple:
         return bsdf.eval_pdf(mi.BSDFContext(), si, wo)
 
-    # Once, Dr.Jit aborted as garbage of earlier tests was collected while it recorded.
+    # Dr.Jit aborts where garbage of earlier tests is collected while it records.
     gc.collect()
     values = []
     for key, value in (("height_scale", 1.0), ("height_scale", 0.8), ("orientation.value", 90.0)):
