@@ -129,7 +129,7 @@ def test_colours_are_integrals_over_the_wavelength(source, changes, opened):
     parallel = {"maxFrames": 1, "sky": 0, "lightWidth": 0, "lightLength": 0}
     tab.evaluate("(changes) => viewer.set(changes)", {**parallel, **changes})
     pairs = pairs_of(surface.spectrum, 200)
-    frames = 512 if surface.spectrum.grid.max_order[0] < 20 else 32
+    frames = 1024 if surface.spectrum.grid.max_order[0] < 20 else 32
     found = np.reshape(
         tab.evaluate("([p, n]) => viewer.evaluateColours(p, n)", [pairs.ravel().tolist(), frames]), (-1, 4)
     )

@@ -8,7 +8,7 @@ uniform highp sampler2D uSkyColour; // XYZ of a surface under a sky of radiance 
 uniform float uSky;                 // radiance of the sky relative to the irradiance of the light
 
 const float FIRST = 380.0, LAST = 740.0;  // nm
-const int POINTS = KIND == RESOLVED ? 4 : 16, EACH = 3;
+const int POINTS = KIND != RESOLVED ? 16 : LIGHT == 0 ? 1 : 4, EACH = 3;
 
 mat3 frame;      // columns: the pattern's axes and the normal
 mat3 lightAxes;  // along them: half the width, half the length, and the direction of the light
