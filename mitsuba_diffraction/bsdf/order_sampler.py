@@ -88,6 +88,7 @@ class OrderSampler:
         side_bins = np.sqrt(entries / (np.sqrt(len(ranges)) * self.slices * orders.prod()))
         self.side_bins = int(np.clip(side_bins, MIN_SIDE_BINS, MAX_SIDE_BINS))
         self.layout = Layout(0.0, 1, self.side_bins, 1, self.slices + 1, (first, last))
+        borders = self._borders()
         sums, bins, fractions, start = [], [], [], 0
         for scales, above in itertools.product(ranges, sides):
             furnaces = [Furnace.of(spectrum, scale, eta, 1 if above else -1) for scale in scales]
@@ -100,7 +101,7 @@ class OrderSampler:
                 powers_of_sides.append(np.sqrt(np.mean(squares, axis=0)).sum((-1, -2)).ravel())
                 for slice_ in range(self.slices):
                     within = sum(squares[slice_ * steps : (slice_ + 1) * steps + 1])
-                    corner, size = self._order_ranges(above, reflects, slice_)
+                    corner, size = self._order_ranges(above, reflects, slice_, *borders)
                     of_bins, starts = _packed_cumulative(_root_corner_sum(within), corner, size)
                     sums.append(of_bins)
                     bins.append(np.stack([start + starts, *corner.T, size[:, 0] + (size[:, 1] << 16)], -1))
@@ -163,24 +164,31 @@ class OrderSampler:
             result += powers**2 / len(furnaces)
         return result.reshape(self.side_bins + 1, self.side_bins + 1, *result.shape[1:])
 
-    def _order_ranges(self, above: bool, reflects: bool, slice_: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def _borders(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the minima and the maxima of ω_∥ outside in the bins of directions, (bins, 2)."""
+        along = np.linspace(0, 1, 5)
+        points = np.stack(np.meshgrid([0], along, along, indexing="ij"), -1).reshape(-1, 3)
+        corners = np.indices((1, self.side_bins, self.side_bins)).reshape(3, -1).T
+        omega, _ = self.layout.directions((corners[:, None] + points).reshape(-1, 3))
+        omega = omega[:, :2].reshape(len(corners), -1, 2)
+        return omega.min(1), omega.max(1)
+
+    def _order_ranges(
+        self, above: bool, reflects: bool, slice_: int, low: NDArray[np.float64], high: NDArray[np.float64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return first column and row of the propagating orders of each bin of a slice, and their numbers: (bins, 2).
 
-        They follow from the borders of the bins by |m/T + k_i,∥/λ| ≤ n_o/λ.
+        They follow from `_borders` by |m/T + k_i,∥/λ| ≤ n_o/λ.
         """
-        along = np.linspace(0, 1, 5)
-        border = np.stack(np.meshgrid([0, 1], along, along, indexing="ij"), -1).reshape(-1, 3)
-        corner = np.indices((1, self.side_bins, self.side_bins)).reshape(3, -1).T
-        corner[:, 0] = slice_
-        omega, wavelengths = self.layout.directions(
-            np.repeat(corner, len(border), 0) + np.tile(border, (len(corner), 1))
-        )
+        _, wavelengths = self.layout.directions(np.array([[slice_, 0, 0], [slice_ + 1, 0, 0]], np.float64))
         per_wavelength = self.tile / wavelengths[:, None]
-        middle = -self._indices(above)[1] * omega[:, :2] * per_wavelength
         # With a margin for curved borders and for an index that changes by `MAX_INDEX_CHANGE`.
         half = self._indices(above == reflects)[1] * per_wavelength + 1e-3
         half += (1e-3 + 2 * MAX_INDEX_CHANGE * max(self.eta, 1)) * per_wavelength.max()
-        first, last = (x.reshape(len(corner), -1, 2) for x in (middle - half, middle + half))
+        first, last = (
+            -self._indices(above)[1] * omega[:, None] * per_wavelength + sign * half
+            for omega, sign in ((high, -1), (low, 1))
+        )
         first = np.clip(np.ceil(first.min(1)), -self.max_order, self.max_order).astype(np.int64)
         last = np.clip(np.floor(last.max(1)), -self.max_order, self.max_order).astype(np.int64)
         return first + self.max_order, last - first + 1

@@ -162,7 +162,7 @@ class Furnace:
             i, j, sigma = np.tile(i, LOBE_POINTS), np.tile(j, LOBE_POINTS), np.tile(sigma, LOBE_POINTS)
         cos_i, length = cos_i[i], length[i]
         mean_cos_i = mean_cosine(cos_i**2, sigma)
-        value = weight * self._factor(mean_cos_i, cos_o, length, length**2 * (q[j] ** 2).sum(-1), branch)
+        value = weight * self._factor(mean_cos_i, cos_o, length, length**2 * (q**2).sum(-1)[j], branch)
         # κ of reflected light is that of the pair of directions, κ of transmitted light that of the order.
         kappa = self._kappa(mean_cos_i if branch else cos_i, cos_o if branch else cos_exit, length, branch)
         return i, j, value * self._power(j, kappa, branch)
@@ -183,7 +183,7 @@ class Furnace:
             cos_o, r, weight = _above_horizon(rho[chosen], sigma[chosen], count)
             length_, cos_ = length[i_], cos_i[i_]
             # |λq|² along the line from the centre of the hemisphere
-            tangent, square = length_**2 * (self.q[j_] ** 2).sum(-1), 1 - cos_**2
+            tangent, square = length_**2 * (self.q**2).sum(-1)[j_], 1 - cos_**2
             rho_ = np.tile(rho[chosen], count)
             tangent = square + index**2 * r**2 - r / np.maximum(rho_, 1e-12) * (index**2 * rho_**2 + square - tangent)
             tangent = np.maximum(tangent, 0) + (index * np.tile(sigma[chosen], count)) ** 2
@@ -260,8 +260,10 @@ def small_kappa(kappa: Real, first: float, power: NDArray, at_first: NDArray, at
 def mean_cosine(square: ArrayLike, sigma: ArrayLike) -> Real:
     """Return √(2σ) m(x) for cos² θ = 2σx at the centre of a lobe of width σ in direction cosines."""
     scale = np.sqrt(2 * np.asarray(sigma, np.float64))
-    root = np.sqrt(square) / scale
-    return scale * np.where(root < 4, np.interp(root, *_mean_roots()), root)
+    root = np.asarray(np.sqrt(square) / scale)
+    near = root < 4
+    root[near] = np.interp(root[near], *_mean_roots())
+    return scale * root
 
 
 @cache

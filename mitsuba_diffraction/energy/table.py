@@ -203,12 +203,16 @@ class EnergyTable:
         """
         sides = [Furnace.of(spectrum, max(ratios), index, side) for side in ((1,) if index is None else (1, -1))]
         layout = Layout.of(sides[0], min_lateral_scale)
-        nodes = layout.nodes()
+        nodes, grid = layout.nodes(), spectrum.grid
+        used, step = np.ones(len(nodes), bool), 0
         if layout.lines:
             # u + v = 2cT/λ
             used = np.floor(nodes[:, 1:]).sum(-1) < 2 * layout.period * layout.frequencies[1]
-        else:
-            used = np.ones(len(nodes), bool)
+        elif isinstance(grid, OrderGrid) and 1 in grid.shape:
+            # Symmetric along the grooves, as rows and columns are exchanged, in reverse where the grooves are along x.
+            _, row, column = nodes.T
+            step = 1 if grid.shape[0] == 1 else -1
+            used = row <= column if step == 1 else row + column <= layout.side
         omega, wavelengths = layout.directions(nodes[used], float(np.mean(layout.frequencies)))
         e = np.ones((len(ratios), 1 if index is None else 4, len(nodes)))
         for k, ratio in enumerate(ratios):
@@ -218,6 +222,8 @@ class EnergyTable:
             ]
             e[k, :, used] = np.concatenate(bounds).T
         e = e.reshape(*e.shape[:2], *layout.shape)
+        if step:
+            e = np.where(used.reshape(layout.shape), e, e[..., ::step, ::step].swapaxes(-1, -2))
         if _phase(sides[0], layout.frequencies) > (MAX_SLICES - MIN_SLICES) * SLICE_PHASE:
             # For so deep a relief e varies faster than the nodes resolve: each node gets the minimum over its
             # neighbours, rounded down.
