@@ -17,6 +17,7 @@ from hypothesis import settings
 
 import mitsuba_diffraction as md  # before Dr.Jit, so that it has an LLVM that works
 from mitsuba_diffraction import cli, progress
+from mitsuba_diffraction.bsdf import shared
 from mitsuba_diffraction.progress import log_lines
 
 from bsdf_support import use  # isort: skip
@@ -68,6 +69,14 @@ def garbage_between_modules():
     gc.disable()
     yield
     gc.enable()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def tables_of_a_module():
+    """Share the tables of equal spectra among the tests of a module, which build a new BSDF each."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(shared, "_shared", {})
+        yield
 
 
 @pytest.fixture(scope="session", autouse=True)
