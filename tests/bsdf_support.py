@@ -108,7 +108,18 @@ def draw(bsdf, wi, count, ctx=None, seed=1, uv=(0.0, 0.0), wavelengths=WAVELENGT
     return bs, weights.T
 
 
-def check_chi_square(bsdf, wi, wavelengths=WAVELENGTHS, ctx=None, cases=1, side=1):
+def six_samples(bsdf, two_directions, wavelengths=WAVELENGTHS):
+    """Weights, values, directions, η and densities of three samples for each of two ω_i, (13, 6)."""
+    u = np.tile([(0.05, 0.3, 0.8), (0.4, 0.2, 0.9), (0.6, 0.7, 0.1)], 2)
+    si = interaction(np.repeat(two_directions, 3, axis=0), wavelengths, 6)
+    bs, weight = bsdf.sample(mi.BSDFContext(), si, floats(u[0]), mi.Point2f(*map(floats, u[1:])))
+    value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, bs.wo)
+    parts = mi.unpolarized_spectrum(weight), mi.unpolarized_spectrum(value), bs.wo, bs.eta, pdf
+    dr.eval(parts)  # in one kernel
+    return np.vstack([np.array(part) + np.zeros(6) for part in parts])
+
+
+def check_chi_square(bsdf, wi, wavelengths=WAVELENGTHS, ctx=None, cases=1, side=1, ires=64):
     """Mitsuba's chi² test of what is drawn, without mirrors, against the density; `cases` share the level of 0.01.
 
     All is drawn above the surface, or below with `side` −1.
@@ -131,7 +142,7 @@ def check_chi_square(bsdf, wi, wavelengths=WAVELENGTHS, ctx=None, cases=1, side=
 
     domain = mi.chi2.PlanarDomain()
     # The density of cells has steps, which the test integrates well only on a fine grid.
-    test = mi.chi2.ChiSquareTest(domain, sample, density, sample_dim=3, sample_count=400_000, res=41, ires=64)
+    test = mi.chi2.ChiSquareTest(domain, sample, density, sample_dim=3, sample_count=400_000, res=41, ires=ires)
     assert test.run(significance_level=0.01, test_count=cases, quiet=True), test.messages
 
 
