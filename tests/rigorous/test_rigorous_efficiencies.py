@@ -256,7 +256,7 @@ def ridged(period, depth, samples=512):
         (gratings.sinusoidal(4.21678, 1.17292, samples=256), (-0.17501, 0.178126, 0.968319), 0.593122, 3.44014),
         (gratings.sinusoidal(2.0, 2.3, samples=512), CONICAL, 0.55, 3.5),
         (ridged(3.58, 0.83), CONICAL, 0.637, 3.424),
-        (gratings.blazed(6.0, 2.57), CONICAL, 0.55, 3.36),
+        pytest.param(gratings.blazed(6.0, 2.57), CONICAL, 0.55, 3.36, marks=pytest.mark.slow),
     ],
     ids=["sinusoid", "deep sinusoid", "ridges", "blaze"],
 )

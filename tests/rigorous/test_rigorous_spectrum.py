@@ -20,9 +20,19 @@ SURFACE = gratings.blazed(0.3, 0.05, samples=64)
 REQUEST = Settings(theory="rigorous", int_ior=1.5, wavelengths=(400.0, 500.0), tolerance=0.2, coherence_length=40.0)
 
 
+def coarse(steps, request):
+    """Build a table of few steps, its error measured by few checks."""
+    with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for name in ("_SOLVED_STEPS", "_SOLVED_STEPS_TRANSMISSION"):
+            patch.setattr(build, name, (steps,))
+        patch.setattr(build, "_CHECK_COUNT", 40)
+        return build_spectrum(SURFACE, request)
+
+
 @pytest.fixture(scope="module")
-def spectrum(cache_folder):
-    return build_spectrum(SURFACE, REQUEST)
+def spectrum():
+    return coarse((8, 10, 8), REQUEST)
 
 
 def hemisphere(count, seed):
@@ -104,12 +114,8 @@ def test_a_spectrum_is_unchanged_by_saving_and_loading(spectrum, tmp_path):
 
 @pytest.fixture(scope="module", params=["interface", "sheet"])
 def glass(request):
-    """A coarse table with transmission and Mueller matrices."""
-    with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        patch.setattr("mitsuba_diffraction.rigorous.build._SOLVED_STEPS_TRANSMISSION", ((6, 10, 6),))
-        patch.setattr("mitsuba_diffraction.rigorous.build._CHECK_COUNT", 40)
-        return build_spectrum(SURFACE, replace(REQUEST, polarised=True, transmission=request.param))
+    """A table with transmission and Mueller matrices."""
+    return coarse((6, 10, 6), replace(REQUEST, polarised=True, transmission=request.param))
 
 
 def test_a_table_with_transmission_is_unchanged_by_saving_and_loading(glass, tmp_path):
@@ -281,8 +287,10 @@ def test_progress_in_per_cent_never_decreases(monkeypatch):
     assert done[-1] == 100
 
 
-def test_a_build_succeeds_without_a_usable_checkpoint(tmp_path):
+def test_a_build_succeeds_without_a_usable_checkpoint(tmp_path, monkeypatch):
     """The folder cannot be written to, or the checkpoint is damaged."""
+    monkeypatch.setattr(build, "_SOLVED_STEPS", ((6, 8, 6),))
+    monkeypatch.setattr(build, "_CHECK_COUNT", 10)
     small = gratings.sinusoidal(0.15, 0.03, samples=32)
     wanted = build_spectrum(small, REQUEST, checkpoints=tmp_path / "good").values
     (tmp_path / "file").write_text("")
