@@ -250,7 +250,7 @@ def test_samples_follow_a_textured_base():
     assert max(shares) > 2 * min(shares)
 
 
-@pytest.mark.few(12)
+@pytest.mark.few(6)
 @pytest.mark.parametrize("theta", [0, 70, 89, *(pytest.param(x, marks=pytest.mark.slow) for x in (30, 45, 80, 85))])
 @pytest.mark.parametrize("base", [{"type": "diffuse", "reflectance": uniform(1.0)}, {"type": "conductor"}])
 @pytest.mark.parametrize("name", ["blazed", "deep blazed", "elaphe"])

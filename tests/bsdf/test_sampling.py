@@ -156,14 +156,14 @@ def test_mean_weight_is_the_albedo(llvm, name, theta):
     bsdf, wi, count = plugin(blurred(name), conserve_energy=False), direction(theta, 40), 1 << 18
     _, weight = sampled(bsdf, wi, WAVELENGTHS, count)
     # The integral by another sampling: uniform in the plane of direction cosines, dω = du dv / cos θ_o.
-    u = np.stack([(np.arange(2048) + 0.5) / 2048] * 2)
+    u = np.stack([(np.arange(1024) + 0.5) / 1024] * 2)
     x, y = (2 * axis.ravel() - 1 for axis in np.meshgrid(*u))
     z = np.sqrt(np.maximum(1 - x**2 - y**2, 0))
     inside = z > 0
     x, y, z = x[inside], y[inside], z[inside]
     wo = vectors(np.stack([x, y, z], axis=-1))
     value = array(bsdf.eval(mi.BSDFContext(), interaction(wi, WAVELENGTHS, len(x)), wo), np.float64)
-    albedo = (value / z).sum(axis=1) * (2 / 2048) ** 2
+    albedo = (value / z).sum(axis=1) * (2 / 1024) ** 2
     error = weight.std(axis=1) / np.sqrt(count)
     np.testing.assert_array_less(np.abs(weight.mean(axis=1) - albedo), 4 * error + 2e-3 * albedo)
 
@@ -374,7 +374,7 @@ def test_no_wavelength_is_sampled_outside_of_its_lobe(llvm, theta):
     bsdf = plugin(spectrum, conserve_energy=False)
     wi, wavelengths = direction(theta, 20), (400.0, 410.0, 420.0, 800.0)
     _, weight = draw(bsdf, wi, 1 << 18, wavelengths=wavelengths)
-    wanted = albedo(bsdf, wi, side=2048, wavelengths=wavelengths)
+    wanted = albedo(bsdf, wi, side=1024, wavelengths=wavelengths)
     error = weight.std(1) / np.sqrt(weight.shape[1])
     np.testing.assert_array_less(np.abs(weight.mean(1) - wanted), 4 * error + 2e-3 * wanted)
 

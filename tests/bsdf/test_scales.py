@@ -160,6 +160,8 @@ def test_derivatives_by_texels_are_those_of_differences(llvm, name, step, parame
     scales = {"lateral_scale": 0.9, name: bitmap(start)}
     settings = {"conserve_energy": False, **scales, **parameters}
     bsdf = plugin(for_scales(SURFACES["sinusoidal"](), 1.5, coherence_length=20), **settings)
+    # Values of separate orders do not depend on the sampler.
+    bsdf.layers.grating.theory.update = lambda: None
     scene, key = mi.traverse(bsdf), f"{name}.data"
     wo = near_orders(0.9, np.repeat(np.array(LINE)[3:-3], 3, axis=0))
     wo = wo[: len(wo) - 500]
@@ -189,7 +191,7 @@ def test_derivatives_by_texels_are_those_of_differences(llvm, name, step, parame
 
 
 def test_recipes_and_profiles_are_built_for_the_scales(llvm):
-    parameters = {"type": "diffraction_grating", "profile": "blazed", "period": PERIOD, "depth": 0.2}
+    parameters = {"type": "diffraction_grating", "profile": "blazed", "period": 1.0, "depth": 0.1}
     bsdf = mi.load_dict(parameters | {"lateral_scale": steps([[0.5, 1.5]]), "height_scale": 1.2})
     assert bsdf.spectrum.wavelengths == pytest.approx((240, 830))
     assert bsdf.layers.components[0] & +mi.BSDFFlags.SpatiallyVarying
@@ -299,7 +301,7 @@ def test_e_of_few_scales_is_that_of_separate_gratings(llvm, name):
         assert found > wanted - 0.01
 
 
-@pytest.mark.few(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("parameters", [{"material": "none"}, PASSES], ids=["reflected", "passing"])
 def test_e_of_very_different_heights_is_that_of_each(llvm, parameters):
     """For deep and shallow reliefs, from both sides of an interface."""
