@@ -141,7 +141,18 @@ def test_gratings_by_formula_have_their_periods(name, strength, rows):
 
 @pytest.mark.parametrize(
     ("name", "periods"),
-    [("compact_disc", [1.6]), ("dvd", [0.74]), ("foil", [1.0, 1.0]), ("film", [1.8868, 1.8868]), ("ruled", [1.6667])],
+    [
+        ("film", [1.8868, 1.8868]),
+        *(
+            pytest.param(name, periods, marks=pytest.mark.slow)
+            for name, periods in (
+                ("compact_disc", [1.6]),
+                ("dvd", [0.74]),
+                ("foil", [1.0, 1.0]),
+                ("ruled", [1.6667]),
+            )
+        ),
+    ],
 )
 def test_built_in_profiles_have_their_periods(name, periods):
     found = find_periods(md.gratings.PROFILES[name](), extent="tile")
@@ -359,6 +370,7 @@ def test_crops_confirm_the_uncertainty_of_the_fingers(panel):
             assert abs(one.period - other.period) < 2.5 * np.hypot(one.period_uncertainty, other.period_uncertainty)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("name", "height_range", "periods", "direction"),
     # The highest peaks of the plain periodogram of Elaphe; rows and fingers of Xenopeltis, by eye and periodogram.
