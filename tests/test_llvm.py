@@ -50,7 +50,7 @@ def run(*lines: str, library: str | None = None, python_path: Path | None = None
     return process
 
 
-@pytest.mark.few(1)
+@pytest.mark.slow
 @needs_wheel
 @pytest.mark.parametrize("major", [14, 15])
 def test_the_wheel_replaces_an_old_llvm(major: int) -> None:

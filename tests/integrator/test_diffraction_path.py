@@ -194,7 +194,7 @@ def assert_agree(built, depth, spp, **parameters):
     np.testing.assert_array_less(np.abs(found - wanted), 4 * np.hypot(its_error, error))
     # Without the paths from the light the check would fail.
     eye, light = integrators[1].parts(built, built.sensors()[0])
-    left, _ = region_means(built, eye, spp)
+    left, _ = region_means(built, eye, spp, pictures=4)
     assert light is not None
     assert ((wanted - left) / its_error).max() > 6
 
@@ -202,7 +202,7 @@ def assert_agree(built, depth, spp, **parameters):
 @pytest.mark.parametrize(
     ("build", "depth", "spp"),
     [
-        (sun_alone, 3, 1024),
+        pytest.param(sun_alone, 3, 1024, marks=pytest.mark.slow),
         pytest.param(partial(window, "interface"), 3, 1024, marks=pytest.mark.slow, id="enters"),
         pytest.param(partial(window, "interface", -1), 3, 1024, marks=pytest.mark.slow, id="leaves"),
         pytest.param(partial(window, "sheet"), 3, 1024, marks=pytest.mark.slow, id="relief first"),

@@ -164,9 +164,10 @@ def stop_after(count):
     return trace
 
 
-def test_bands_are_interrupted_resumed_and_saved(three_bands, small_passes):
+@pytest.mark.parametrize("integrator", ["path", pytest.param("diffraction_path", marks=pytest.mark.slow)])
+def test_bands_are_interrupted_resumed_and_saved(integrator, three_bands, small_passes):
     small_passes(11)  # one sample per pixel
-    write_scene("diffraction_path")
+    write_scene(integrator)
     whole = render("scene.xml", spp=6)
     assert isinstance(whole, BandedImage)
     assert whole.shape == whole.radiance.shape == (10, 12, channel_wavelengths().size)

@@ -57,8 +57,9 @@ def threads_of_this_process():
 
 
 @pytest.fixture
-def two_processes():
-    with start(n_workers=2, processes=True) as local:
+def processes(request):
+    """A cluster of as many workers, each of which is a process of its own."""
+    with start(n_workers=request.param, processes=True) as local:
         yield local
 
 
@@ -70,9 +71,10 @@ def with_light_from_gratings(scene):
 
 @pytest.mark.few(1)
 @pytest.mark.parametrize("scene", [SCENE, with_light_from_gratings(SCENE)], ids=["path", "diffraction_path"])
-def test_a_cluster_gives_the_bits_of_one_machine(scene, two_processes, command):
+@pytest.mark.parametrize("processes", [1, 2], indirect=True)
+def test_a_cluster_gives_the_bits_of_one_machine(scene, processes, command):
     Path("scene.xml").write_text(scene)
-    line = f"render scene.xml -o out.exr --spp 9 --variant llvm_ad_spectral --dask {two_processes.scheduler_address}"
+    line = f"render scene.xml -o out.exr --spp 9 --variant llvm_ad_spectral --dask {processes.scheduler_address}"
     code, _, err = command(line)
     assert (code, err) == (0, "")
     here = render("scene.xml", spp=9)
@@ -84,7 +86,7 @@ def test_a_cluster_gives_the_bits_of_one_machine(scene, two_processes, command):
             signal.raise_signal(signal.SIGINT)
 
     with pytest.raises(Interrupted):
-        render("scene.xml", spp=9, checkpoint="c", tracer=trace_on(two_processes.scheduler_address), progress=ctrl_c)
+        render("scene.xml", spp=9, checkpoint="c", tracer=trace_on(processes.scheduler_address), progress=ctrl_c)
     resumed = render("scene.xml", spp=9, checkpoint="c")
     np.testing.assert_array_equal(resumed.radiance, here.radiance)
 
@@ -207,9 +209,10 @@ def test_a_killed_scheduler_is_one_line():
 
 
 @pytest.mark.slow
-def test_the_passes_of_a_lost_worker_are_traced_again(two_processes):
+@pytest.mark.parametrize("processes", [2], indirect=True)
+def test_the_passes_of_a_lost_worker_are_traced_again(processes):
     here = render("scene.xml", spp=60)
-    with distributed.Client(two_processes.scheduler_address, set_as_default=False) as client:
+    with distributed.Client(processes.scheduler_address, set_as_default=False) as client:
         pids = list(client.run(os.getpid).values())
     assert len(set(pids)) == 2
     calls = []
@@ -219,6 +222,6 @@ def test_the_passes_of_a_lost_worker_are_traced_again(two_processes):
         if done == 7:
             os.kill(pids[0], signal.SIGKILL)
 
-    there = render("scene.xml", spp=60, tracer=trace_on(two_processes.scheduler_address), progress=kill)
+    there = render("scene.xml", spp=60, tracer=trace_on(processes.scheduler_address), progress=kill)
     assert calls == list(range(61))
     np.testing.assert_array_equal(there.radiance, here.radiance)
