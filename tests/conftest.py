@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hypothesis import settings
+from threadpoolctl import threadpool_limits
 
 import mitsuba_diffraction as md  # before Dr.Jit, so that it has an LLVM that works
 from mitsuba_diffraction import cli, progress
@@ -76,6 +77,14 @@ def tables_of_a_module():
     """Share the tables of equal spectra among the tests of a module, which build a new BSDF each."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(shared, "_shared", {})
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_thread_of_blas():
+    """Compute with one thread in BLAS, here and in what tests start: waiting threads spin, on cores of other tests."""
+    with threadpool_limits(1, user_api="blas"), pytest.MonkeyPatch.context() as patch:
+        patch.setenv("OPENBLAS_NUM_THREADS", "1")
         yield
 
 

@@ -287,6 +287,7 @@ def test_progress_in_per_cent_never_decreases(monkeypatch):
     assert done[-1] == 100
 
 
+@pytest.mark.filterwarnings("ignore:rigorous table")  # of few steps
 def test_a_build_succeeds_without_a_usable_checkpoint(tmp_path, monkeypatch):
     """The folder cannot be written to, or the checkpoint is damaged."""
     monkeypatch.setattr(build, "_SOLVED_STEPS", ((6, 8, 6),))
