@@ -80,8 +80,9 @@ def register() -> None:
 
 def properties(scale: float) -> list[str]:
     """Return the properties of the scan for one height scale, as they are printed."""
-    field = Recipe.load(HERE / "xenopeltis.toml").height_field()
-    heights = structure(field.heights, field.pixel_size[0]) * scale / SCALES[0]
+    recipe = Recipe.load(HERE / "xenopeltis.toml")
+    field = recipe.height_field()
+    heights = structure(field.heights, field.pixel_size[0]) * scale / recipe.surface["height_range"]
     low, high = np.percentile(heights, [1, 99])
     slope = np.hypot(*np.gradient(heights, *field.pixel_size))
     mirror = [abs(np.exp(4j * np.pi / wavelength * heights).mean()) ** 2 for wavelength in (0.45, 0.55, 0.65)]
