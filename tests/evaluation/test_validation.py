@@ -450,10 +450,11 @@ def test_figures_are_drawn(command, tmp_path, monkeypatch):
         "mitsuba_diffraction.evaluation.validation.published_figures.save_published",
         lambda folder, progress: called.append(folder) or [["Elaphe", "FLSS as published", "0.996", "0.986"]],
     )
+    monkeypatch.setattr("mitsuba_diffraction.evaluation.validation.fourier_figures.save_fourier", called.append)
     code, said, _ = command("validate", "--figures", str(tmp_path / "figures"))
     assert code == 0
     assert "0.986" in said
-    assert called == 2 * [tmp_path / "figures"]
+    assert called == 3 * [tmp_path / "figures"]
 
 
 def test_results_are_plain_json(tmp_path):

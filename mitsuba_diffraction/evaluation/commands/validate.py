@@ -68,11 +68,12 @@ def validate(
     reads = [] if surface is None else [surface, *recipe.files]
     writes = [(option, path) for option, path in (("--json", json), ("--markdown", markdown)) if path is not None]
     if figures is not None:
+        from ..validation import fourier_figures
         from ..validation.figures import figure_names, save_figures
         from ..validation.published_figures import COLUMNS, FILES, save_published
 
         figures.mkdir(parents=True, exist_ok=True)
-        writes += [("--figures", figures / name) for name in (*figure_names(), *FILES)]
+        writes += [("--figures", figures / name) for name in (*figure_names(), *FILES, *fourier_figures.FILES)]
     outputs.check_outputs(reads, writes, overwrite=overwrite)
     mi.set_variant(chosen)
     these = checks() if recipe is None else _of_surface(recipe)
@@ -95,6 +96,7 @@ def validate(
     if figures is not None:
         with progress_bar("figures") as progress:
             save_figures(figures, progress=progress)
+        fourier_figures.save_fourier(figures)
         with progress_bar("published maps") as progress:
             found = save_published(figures, progress=progress)
         show(table(COLUMNS, found, texts=2), width=80)

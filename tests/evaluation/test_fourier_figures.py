@@ -1,0 +1,67 @@
+"""Interpolation and Fourier images against closed forms; their figures."""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import mitsuba_diffraction as md
+from mitsuba_diffraction.evaluation.realtime_shader.taylor_textures import taylor_transforms
+from mitsuba_diffraction.evaluation.validation import fourier_figures
+from mitsuba_diffraction.evaluation.validation.fourier_figures import (
+    extrema,
+    interpolated,
+    linear,
+    tile_kernel,
+    tile_transform,
+)
+
+
+@pytest.mark.parametrize("count", [40, 41])
+def test_the_kernel_of_a_tile_interpolates_its_transform_exactly(count):
+    heights = np.random.default_rng(count).random(count)
+    orders, x = np.arange(-(count // 2), count - count // 2), np.linspace(-7, 7, 101)
+    texels, exact = tile_transform(heights, 9.0, orders), tile_transform(heights, 9.0, x)
+    np.testing.assert_allclose(interpolated(texels, orders[0], x, tile_kernel(count)), exact, atol=1e-12)
+    for rough in (
+        interpolated(texels, orders[0], x, linear),
+        interpolated(texels, orders[0], x, tile_kernel(count), radius=1),
+    ):
+        np.testing.assert_allclose(rough[::50], exact[::50], atol=1e-12)  # at orders
+        assert np.abs(rough - exact).max() > 0.02
+
+
+def test_the_transform_of_a_blaze_is_the_analytic_one():
+    # h = Hx/T: A(x) = sinc(x − κH/2π), up to a phase.
+    x, height, count = np.linspace(-3, 3, 61), 0.246, 2000
+    heights = height * (np.arange(count) + 0.5) / count
+    found = np.abs(tile_transform(heights, 20.0, x))
+    np.testing.assert_allclose(found, np.abs(np.sinc(x - 20.0 * height / (2 * np.pi))), atol=1e-5)
+
+
+def test_linear_interpolation_is_numpys():
+    samples, x = np.random.default_rng(0).random(12), np.linspace(3, 14, 50)
+    np.testing.assert_allclose(interpolated(samples, 3, x, linear), np.interp(x, np.arange(3, 15), samples), rtol=1e-12)
+
+
+def test_the_extrema_of_a_blaze_are_the_analytic_ones():
+    height = 0.3
+    texels, found = taylor_transforms(
+        md.gratings.blazed(2.5, height), 6, heights_from_zero=True, origin_at_centre=False, margin=0
+    )
+    values = extrema(texels, found)
+    # The mean of hⁿ, in order 0, is the largest.
+    n = np.arange(6)
+    np.testing.assert_allclose(values["max Re"], height**n / (n + 1), rtol=0.02)
+    # F{h} of a ramp in order 1.
+    assert values["max Im"][1] == pytest.approx(height / (2 * np.pi), rel=0.02)
+
+
+def test_the_figures_are_written(llvm, tmp_path, monkeypatch):
+    monkeypatch.setattr(fourier_figures, "_SURFACES", ("blaze", "blaze"))
+    monkeypatch.setattr(fourier_figures.plot_fourier_images, "__defaults__", (9,))
+    fourier_figures.save_fourier(tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(fourier_figures.FILES)
+    for path in tmp_path.iterdir():
+        with Image.open(path) as picture:
+            picture.load()
+            assert min(picture.size) > 300
