@@ -14,7 +14,7 @@ from PIL import Image
 import mitsuba_diffraction as md
 from mitsuba_diffraction.color import delta_E, spectrum_to_XYZ
 from mitsuba_diffraction.evaluation.comparison import compare, summary
-from mitsuba_diffraction.evaluation.comparison.difference import difference, noise, white_luminance
+from mitsuba_diffraction.evaluation.comparison.difference import difference, noise, time_of_error, white_luminance
 from mitsuba_diffraction.evaluation.comparison.pictures import NO_SHADOWS, Pictures, supported_lights
 from mitsuba_diffraction.evaluation.comparison.quirk_shares import quirk_shares
 from mitsuba_diffraction.evaluation.realtime_shader.evaluate import VARIANTS
@@ -106,6 +106,14 @@ def test_a_difference_has_the_known_numbers():
 def test_a_black_picture_has_no_exposure():
     with pytest.raises(ValueError, match="wanted positive"):
         difference(np.ones((2, 2, 3)), np.zeros((2, 2, 3)), np.ones((2, 2), bool), 1.0)
+
+
+def test_the_time_of_an_error_is_interpolated_in_logarithms():
+    seconds, errors = (1.0, 4.0, 16.0), (8.0, 4.0, 2.0)
+    assert time_of_error(4 / 2**0.5, seconds, errors) == pytest.approx(8)
+    assert time_of_error(9.0, seconds, errors) == 1
+    assert np.isnan(time_of_error(1.0, seconds, errors))
+    assert np.isnan(time_of_error(1.0, (), ()))
 
 
 def test_noise_is_estimated_from_two_halves():
@@ -313,6 +321,10 @@ def test_compare_writes_pictures_numbers_and_a_figure(command, llvm, folder):
         assert {*numbers["shares"][reference]["quirks"]["power_gamma"]} == {"drop", "rise", "share"}
     for name in ("constant_blend", "infrared_rainbow", "power_gamma", NO_SHADOWS):
         assert name in out
+    few = numbers["path tracer with few samples"]
+    assert [one["samples"] for one in few] == [1, 4]
+    assert few[0]["mean"] > few[1]["mean"]
+    assert "seconds of path tracer: " in out
     assert re.search(r"\n\s*\n\s*path tracer +same light", out)  # a line between the tables
     # The pictures are those of the numbers.
     path, published = (md.render.SpectralImage.load(f"scene-gem-{name}.exr") for name in ("path", "published"))
@@ -349,6 +361,9 @@ def test_several_shaders_are_compared_with_their_options(llvm, folder):
     }  # fmt: skip
     assert {*found.to_path_traced} == {*found.pictures} - {"path_traced"}
     assert found.noise["flss_corrected"] > 0
+    [(count, seconds, _)] = found.few_samples
+    assert count == 1
+    assert seconds > 0
     assert {*summary.titles(found).values()} >= {"GEM as published", "FLSS corrected"}
     summary.save_figure(found, "figure.png", dpi=40)
     assert summary.as_dict(found)["settings"] == {"terms": 6, "window": "texel"}

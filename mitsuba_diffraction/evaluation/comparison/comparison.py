@@ -16,7 +16,7 @@ from ...errors import RequestError
 from ...progress import Progress, no_progress
 from ..realtime_shader.evaluate import VARIANTS
 from ..realtime_shader.integrator import settings_of
-from .difference import Difference, difference, noise, white_luminance
+from .difference import Difference, difference, noise, time_of_error, white_luminance
 from .pictures import Picture, Pictures
 from .quirk_shares import QuirkShares, quirk_shares
 
@@ -24,6 +24,9 @@ from .quirk_shares import QuirkShares, quirk_shares
 QUIRKS_MAX_SIDE = 96
 QUIRKS_SAMPLES = 256
 QUIRKS_SHADING_POINTS = 9
+
+FEW_SAMPLES = (1, 4, 16, 64)
+"""Per pixel of the pictures by which the path tracer's time for an error is measured."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +47,7 @@ class Comparison:
         white: the luminance that is shown as white.
         to_path_traced: difference of each other picture from the path-traced one.
         to_same_light: difference of the shader's pictures from "same_light".
+        few_samples: (samples, seconds, mean CIEDE2000 to "path_traced") of path-traced pictures of another seed.
         noise: the mean CIEDE2000 due to noise in the traced pictures; None for one sample per pixel.
         shader_reads: maximum number of texels (two numbers each) that one shading point of the shader reads, by name of
             its picture.
@@ -67,6 +71,7 @@ class Comparison:
     white: float
     to_path_traced: Mapping[str, Difference]
     to_same_light: Mapping[str, Difference]
+    few_samples: tuple[tuple[int, float, float], ...]
     noise: Mapping[str, float | None]
     shader_reads: Mapping[str, int]
     model_reads: int
@@ -76,6 +81,11 @@ class Comparison:
     patches: int
     coated: bool
     shares: QuirkShares | None
+
+    def time_of_error(self, name: str) -> float:
+        """Return the seconds after which the path tracer has the mean CIEDE2000 of a picture; NaN if not measured."""
+        _, seconds, errors = zip(*self.few_samples, strict=True) if self.few_samples else ((), (), ())
+        return time_of_error(self.to_path_traced[name].mean, seconds, errors)
 
 
 def compare(
@@ -139,6 +149,11 @@ def compare(
     pictures, reads = {}, {}
     with progress("path tracer") as bar:
         pictures["path_traced"] = of.path_traced(spp, bar)
+    reference, few_samples = pictures["path_traced"].xyz, []
+    white = white_luminance(reference, of.surface)
+    for count in (count for count in FEW_SAMPLES if count < spp):
+        few = of.path_traced(count, seed=seed + 1)
+        few_samples.append((count, few.seconds, difference(reference, few.xyz, of.surface, white).mean))
     with progress("the same light") as bar:
         pictures["same_light"] = of.same_light(spp, bar)
     for kind in (shader, *others):
@@ -150,9 +165,7 @@ def compare(
             reads[key] = of.shader_reads
         if kind == shader:
             truncated_fraction, series_error = of.truncated_fraction, of.series_error
-    reference, same_light = pictures["path_traced"].xyz, pictures["same_light"].xyz
-    white = white_luminance(reference, of.surface)
-    of_quirks = None
+    same_light, of_quirks = pictures["same_light"].xyz, None
     if shares:
         scale = min(1.0, shares_side / max(of.surface.shape))
         columns, rows = (max(1, round(size * scale)) for size in of.film_size)
@@ -175,6 +188,7 @@ def compare(
             if name != "path_traced"
         },
         to_same_light={name: difference(same_light, pictures[name].xyz, of.surface, white) for name in reads},
+        few_samples=tuple(few_samples),
         noise={name: noise(picture.halves, of.surface, white) for name, picture in pictures.items()},
         shader_reads=reads,
         model_reads=of.model_reads,

@@ -20,7 +20,7 @@ from ...outputs import METADATA
 from ...progress import Progress, no_progress
 from ...settings import MIN_TOLERANCE
 from ..report import cells
-from .difference import as_shown, difference, noise, white_luminance
+from .difference import as_shown, difference, noise, time_of_error, white_luminance
 from .pictures import Picture, Pictures
 
 TOLERANCES = (1e-1, 1e-2, 1e-3)
@@ -94,17 +94,12 @@ class Convergence:
             already better, NaN if none is.
         """
         bias = min(getattr(point, error) for point in self.curves()[name])
-        times = []
-        for curve in self.curves().values():
-            if not curve[0].traced:
-                continue
-            seconds, errors = (np.log([getattr(point, key) for point in curve]) for key in ("seconds", error))
-            below = np.flatnonzero(errors < np.log(bias))
-            if len(below):
-                last = below[0]
-                span = slice(max(last - 1, 0), last + 1)
-                times.append(np.exp(np.interp(-np.log(bias), -errors[span], seconds[span])))
-        return float(min(times, default=np.nan))
+        times = [
+            time_of_error(bias, *([getattr(point, key) for point in curve] for key in ("seconds", error)))
+            for curve in self.curves().values()
+            if curve[0].traced
+        ]
+        return min((time for time in times if np.isfinite(time)), default=np.nan)
 
 
 def check_tolerances(tolerances: Sequence[float]) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ...color import XYZ_to_linear_sRGB, auto_exposure, delta_E, into_gamut
 from ...errors import RequestError
@@ -74,6 +74,25 @@ def difference(
     delta_e[where] = delta_E(first, second)
     error = np.abs(second[:, 1] - first[:, 1]).sum() / first[:, 1].sum()
     return Difference(exposure, delta_e, float(error))
+
+
+def time_of_error(error: float, seconds: ArrayLike, errors: ArrayLike) -> float:
+    """Return the time after which the error of a picture falls below a given one, interpolated in logarithms.
+
+    Args:
+        error: positive.
+        seconds: (n,) ascending, of pictures.
+        errors: (n,) of these.
+
+    Returns:
+        The first time if that error is below already, NaN if none is.
+    """
+    seconds, errors = np.log(seconds), np.log(errors)
+    below = np.flatnonzero(errors < np.log(error))
+    if not len(below):
+        return float("nan")
+    span = slice(max(below[0] - 1, 0), below[0] + 1)
+    return float(np.exp(np.interp(-np.log(error), -errors[span], seconds[span])))
 
 
 def noise(halves: NDArray[np.float64] | None, where: NDArray[np.bool_], white: float) -> float | None:

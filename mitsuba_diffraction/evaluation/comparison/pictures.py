@@ -223,9 +223,9 @@ class Pictures:
         errors = [shader.textures.error for shader in self.shaders if isinstance(shader, TextureShader)]
         return max(errors, default=None)
 
-    def path_traced(self, samples: int, progress: Progress = silent) -> Picture:
-        """Render by the scene's own integrator."""
-        return self._traced(self.scene.integrator(), samples, progress)
+    def path_traced(self, samples: int, progress: Progress = silent, seed: int | None = None) -> Picture:
+        """Render by the scene's own integrator; with another seed if one is given."""
+        return self._traced(self.scene.integrator(), samples, progress, seed=seed)
 
     def same_light(self, samples: int, progress: Progress = silent) -> Picture:
         """Render the scene's BSDFs under the lights that the shader supports; see `same_light` of this module."""
@@ -264,16 +264,24 @@ class Pictures:
         seconds = rest.seconds + sum(seconds for _, seconds in parts)
         return Picture(SpectralImage(wavelengths, np.mean(radiance, axis=0)), samples, seconds, halves)
 
-    def _traced(self, integrator: mi.Integrator, samples: int, progress: Progress, halves: bool = True) -> Picture:
+    def _traced(
+        self,
+        integrator: mi.Integrator,
+        samples: int,
+        progress: Progress,
+        halves: bool = True,
+        seed: int | None = None,
+    ) -> Picture:
+        seed = self.seed if seed is None else seed
         rows, columns = self.surface.shape
         passes = split(self.scene, samples, 2 if halves else 1)
         check_memory(self.scene, max(passes))
-        trace_pass(self.scene, 1, self.seed, integrator)  # compiles the kernels
+        trace_pass(self.scene, 1, seed, integrator)  # compiles the kernels
         sums = Accumulation.empty(rows, columns)
         pair = np.zeros((2, rows, columns, 4))  # sums of XYZ and of the filter, of every other pass
         begin = time.perf_counter()
         for index, some in enumerate(passes):
-            traced = trace_pass(self.scene, some, pass_seed(self.seed, index), integrator)
+            traced = trace_pass(self.scene, some, pass_seed(seed, index), integrator)
             sums.add(traced, some)
             pair[index % 2, ..., :3] += spectrum_to_XYZ(traced[..., :-1], channel_wavelengths())
             pair[index % 2, ..., 3] += traced[..., -1]

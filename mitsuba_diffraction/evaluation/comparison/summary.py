@@ -45,7 +45,14 @@ _TO_REFERENCE = {
 
 def picture_table(comparison: Comparison) -> Table:
     """Return a table of the pictures and their differences, for a terminal."""
-    columns = (*_TO_REFERENCE, "ΔE00 mean to\nsame light", "reads per\npoint", "samples\nper pixel", "seconds")
+    columns = (
+        *_TO_REFERENCE,
+        "ΔE00 mean to\nsame light",
+        "reads per\npoint",
+        "samples\nper pixel",
+        "seconds",
+        "seconds of\npath tracer",
+    )
     rows = []
     for name, title in titles(comparison).items():
         found, same = comparison.to_path_traced.get(name), comparison.to_same_light.get(name)
@@ -53,7 +60,13 @@ def picture_table(comparison: Comparison) -> Table:
         reads = comparison.shader_reads.get(name, comparison.model_reads)
         differences = ["1", "", "", "", ""] if found is None else report.cells(_TO_REFERENCE, found)
         same_light = "" if same is None else f"{same.mean:.2f}"
-        rows.append([title, *differences, same_light, str(reads), str(picture.samples), f"{picture.seconds:.1f}"])
+        time = float("nan") if found is None else comparison.time_of_error(name)
+        rows.append(
+            [
+                *(title, *differences, same_light, str(reads), str(picture.samples), f"{picture.seconds:.1f}"),
+                "" if np.isnan(time) else f"{time:.2g}",
+            ]
+        )
     return table(("picture", *columns), rows)
 
 
@@ -87,6 +100,11 @@ def notes(comparison: Comparison) -> list[str]:
         "the shader's light: direct light of directional and point lights; here with the shadows that surfaces cast",
         "reads: texels of two numbers (shader), or packets of four for the wavelengths of a ray (this model)",
     ]
+    if comparison.few_samples:
+        lines.append(
+            "seconds of path tracer: after which its own picture has the same mean ΔE00, by pictures of "
+            f"{', '.join(str(count) for count, *_ in comparison.few_samples)} samples per pixel"
+        )
     noise = comparison.noise["path_traced"], comparison.noise["same_light"]
     if None not in noise:
         of_shader = comparison.noise["corrected"]
@@ -158,6 +176,9 @@ def as_dict(comparison: Comparison) -> dict[str, object]:
         },
         "to path tracer": {name: _difference(found) for name, found in comparison.to_path_traced.items()},
         "to same light": {name: _difference(found) for name, found in comparison.to_same_light.items()},
+        "path tracer with few samples": [
+            dict(zip(("samples", "seconds", "mean"), one, strict=True)) for one in comparison.few_samples
+        ],
         "texel reads of the shader": comparison.shader_reads,
         "packet reads of this model": comparison.model_reads,
         "left out by the neighbourhood": comparison.truncated_fraction,
