@@ -3,7 +3,7 @@
 const GOLDEN = 0.6180339887498949;
 const R2 = [0.7548776662466927, 0.5698402909980532];  // steps of a two-dimensional sequence (Roberts 2018)
 const R4 = [0.8566748838545029, 0.733891856627126, 0.6287067210378087, 0.5385972572236101];  // of a four-dimensional one
-const POINTS = 4;  // of the light in a frame of resolved orders, as in radiance_model.glsl
+const POINTS = 4;  // of the light in a frame of resolved orders, at most
 // Where the sequences of a frame begin, so that its points follow those of the frame before.
 const randomOf = (frame) => R4.map((step) => fraction(0.5 + POINTS * frame * step));
 const fraction = (x) => x - Math.floor(x);
