@@ -46,7 +46,7 @@ class Comparison:
         surface: (height, width) bool, the pixels that are compared: those covered by surfaces.
         white: the luminance that is shown as white.
         to_path_traced: difference of each other picture from the path-traced one.
-        to_same_light: difference of the shader's pictures from "same_light".
+        to_same_light: difference of the shader's pictures from "same_light", at the same points.
         few_samples: (samples, seconds, mean CIEDE2000 to "path_traced") of path-traced pictures of another seed.
         noise: the mean CIEDE2000 due to noise in the traced pictures; None for one sample per pixel.
         shader_reads: maximum number of texels (two numbers each) that one shading point of the shader reads, by name of
@@ -155,7 +155,7 @@ def compare(
         few = of.path_traced(count, seed=seed + 1)
         few_samples.append((count, few.seconds, difference(reference, few.xyz, of.surface, white).mean))
     with progress("the same light") as bar:
-        pictures["same_light"] = of.same_light(spp, bar)
+        pictures["same_light"] = of.same_light(shading_points, spp, bar)
     for kind in (shader, *others):
         of.use(kind)
         for name, quirks in (("published", of.quirks), ("corrected", ())):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -21,6 +21,7 @@ from ...render import SpectralImage
 from ...render.film import check_memory, collect, equal_ranges, pass_seed, rotated, trace_pass
 from ...render.passes import Accumulation, ratio, split
 from ...render.scene import channel_wavelengths, load_spectral_scene, parsed
+from ..realtime_shader import tristimulus
 from ..realtime_shader.base import Shader, TextureShader
 from ..realtime_shader.evaluate import VARIANTS
 from ..realtime_shader.flss import FLSS
@@ -88,6 +89,9 @@ NO_SHADOWS = "no_shadows"
 
 # Some seconds of work on two cores, so that progress is shown.
 _MAX_POINTS_PER_DISPATCH = 2**16
+
+Colour = Callable[["mi.RayDifferential3f"], "mi.Color3f"]
+"""Ray → linear sRGB of the gratings that it meets."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,9 +231,27 @@ class Pictures:
         """Render by the scene's own integrator; with another seed if one is given."""
         return self._traced(self.scene.integrator(), samples, progress, seed=seed)
 
-    def same_light(self, samples: int, progress: Progress = silent) -> Picture:
-        """Render the scene's BSDFs under the lights that the shader supports; see `same_light` of this module."""
-        return self._traced(same_light(self.scene), samples, progress)
+    def same_light(self, samples: int, others: int, progress: Progress = silent) -> Picture:
+        """Render the scene's BSDFs under the lights that the shader supports; see `same_light` of this module.
+
+        Gratings are evaluated at the points of `shaded`, each at all wavelengths of the shader, and the light of other
+        BSDFs is the same picture: noise cancels in the difference from the corrected shader. Arguments as of `shaded`.
+        """
+        self._choose(())
+        model, rest = same_light(self.scene), without_gratings(self._shader)
+
+        def colour(ray: mi.RayDifferential3f) -> mi.Color3f:
+            rgb = mi.Color3f(0)
+            for ray.wavelengths, weights in _wavelengths_of_the_shader():
+                whole, other = (
+                    mi.unpolarized_spectrum(integrator.sample(self.scene, None, ray)[0]) for integrator in (model, rest)
+                )
+                for channel in range(3):
+                    rgb[channel] += dr.dot(weights[channel], whole - other)
+                dr.eval(rgb)
+            return rgb
+
+        return self._at_points(colour, samples, others, progress)
 
     def shaded(self, quirks: Collection[str], samples: int, others: int, progress: Progress = silent) -> Picture:
         """Render what the shader's integrator converges to, with far fewer samples.
@@ -244,18 +266,25 @@ class Pictures:
             others: samples per pixel of all BSDFs other than gratings.
             progress: called with (done, total).
         """
+        self._choose(quirks)
+        return self._at_points(lambda ray: self._shader.shade(self.scene, ray)[0], samples, others, progress)
+
+    def _choose(self, quirks: Collection[str]) -> None:
         self._shader.set_quirks(Quirks(**{name: name in quirks for name in Quirks.names()}))
         self._shader.shadows = NO_SHADOWS not in quirks
         prepared = self._shader.prepare(self.scene)
         self.shaders = [shaded.shader for shaded in prepared.shaded]
-        known = ("constant_blend" in quirks, self._shader.shadows, others)
+
+    def _at_points(self, colour: Colour, samples: int, others: int, progress: Progress) -> Picture:
+        """Add the colours of gratings at points of the pixels to the light of all other BSDFs."""
+        known = (self._shader.quirks.constant_blend, self._shader.shadows, others)
         if known not in self._others:
             self._others[known] = self._traced(without_gratings(self._shader), others, silent, halves=False)
         rest = self._others[known]
         # Two independent halves tell the noise.
         counts = (samples,) if samples % 2 else (samples // 2, samples // 2)
         parts = [
-            self._colours(count, index, part(progress, index / len(counts), (index + 1) / len(counts)))
+            self._colours(colour, count, index, part(progress, index / len(counts), (index + 1) / len(counts)))
             for index, count in enumerate(counts)
         ]
         radiance = [rest.image.radiance + rgb @ _channel_spectra().T for rgb, _ in parts]
@@ -291,17 +320,19 @@ class Pictures:
         in_halves = ratio(pair[..., :3], pair[..., 3:]) if halves and len(passes) > 1 else None
         return Picture(image, sums.samples, seconds, in_halves)
 
-    def _colours(self, samples: int, half: int, progress: Progress) -> tuple[NDArray[np.float64], float]:
+    def _colours(
+        self, colour: Colour, samples: int, half: int, progress: Progress
+    ) -> tuple[NDArray[np.float64], float]:
         """Return linear sRGB of the gratings, (height, width, 3), and seconds; `half` selects the random numbers."""
         rows, columns = self.surface.shape
         per_dispatch = max(1, _MAX_POINTS_PER_DISPATCH // samples)
         firsts = range(0, rows * columns, per_dispatch)
         # Compiles the kernels. With two pixels, as Dr.Jit compiles other kernels for a single sample.
-        self._averaged([self._shade(0, 2, samples, half)] * -(-rows * columns // 2))
+        self._averaged([self._shade(colour, 0, 2, samples, half)] * -(-rows * columns // 2))
         begin = time.perf_counter()
         points = []
         for index, first in enumerate(firsts):
-            points.append(self._shade(first, min(per_dispatch, rows * columns - first), samples, half))
+            points.append(self._shade(colour, first, min(per_dispatch, rows * columns - first), samples, half))
             progress(index + 1, len(firsts))
         return self._averaged(points), time.perf_counter() - begin
 
@@ -316,7 +347,7 @@ class Pictures:
         values = np.array(sums, np.float64).reshape(rows, columns, 4)
         return ratio(values[..., :3], values[..., 3:])
 
-    def _shade(self, first: int, count: int, samples: int, half: int) -> NDArray[np.float32]:
+    def _shade(self, colour: Colour, first: int, count: int, samples: int, half: int) -> NDArray[np.float32]:
         """Shade points of `count` pixels, from `first` on: (5, n), position in the picture and linear sRGB."""
         sensor = self.scene.sensors()[0]
         columns, rows = (int(size) for size in sensor.film().crop_size())
@@ -328,10 +359,10 @@ class Pictures:
         pixel = dr.opaque(mi.UInt32, first) + dr.arange(mi.UInt32, count * samples) // samples
         sampler = rotated(sampler, seed, pixel)
         position = mi.Point2f(mi.Float(pixel % columns), mi.Float(pixel // columns)) + sampler.next_2d()
-        # The shader needs no wavelengths: 0.5 is a dummy.
+        # Colours are of all wavelengths: 0.5 is a dummy.
         size = mi.Vector2f(columns, rows)
         ray, _ = sensor.sample_ray(sampler.next_1d(), 0.5, position / size, sampler.next_2d())
-        rgb, _, _ = self._shader.shade(self.scene, mi.RayDifferential3f(ray))
+        rgb = colour(mi.RayDifferential3f(ray))
         dr.eval(position, rgb)
         return np.concatenate([np.array(position), np.array(rgb)])
 
@@ -375,6 +406,21 @@ def _channel_spectra() -> NDArray[np.float64]:
     averages = (b[:-2] + 4 * b[1:-1] + b[2:]) / 6
     assert np.array_equal(EMISSION[1:-1], channel_wavelengths())
     return averages
+
+
+def _wavelengths_of_the_shader() -> Iterator[tuple[mi.UnpolarizedSpectrum, list[mi.UnpolarizedSpectrum]]]:
+    """Return the shader's wavelengths, as many at a time as a ray has, and their weights in linear sRGB."""
+    step = int(tristimulus.WAVELENGTH_STEP)
+    to_xyz = step * tristimulus.light_weights(np.ones_like(tristimulus.wavelengths()))
+    to_rgb = to_xyz @ tristimulus.rgb_matrix(cie_rgb_matrix=False, d65_twice=False).T
+    columns = np.column_stack([tristimulus.wavelengths(), to_rgb])[::step]
+    count = len(mi.UnpolarizedSpectrum(0))
+    # The last ones are repeated without weight.
+    fill = np.repeat(columns[-1:] * [1, 0, 0, 0], -len(columns) % count, axis=0)
+    for some in np.split(np.concatenate([columns, fill]), -(-len(columns) // count)):
+        spectra = [mi.UnpolarizedSpectrum(*column) for column in some.T.tolist()]
+        dr.make_opaque(spectra)  # so that all share a kernel
+        yield spectra[0], spectra[1:]
 
 
 def _shows_surfaces(scene: mi.Scene) -> NDArray[np.bool_]:

@@ -76,7 +76,7 @@ def quirk_shares(pictures: Pictures, samples: int, shading_points: int, progress
     done, total = 2, 2 * len(names) + 4
     references = [pictures.path_traced(samples)]
     progress(1, total)
-    references.append(pictures.same_light(samples))
+    references.append(pictures.same_light(shading_points, samples))
     progress(2, total)
     white = white_luminance(references[0].xyz, pictures.surface)
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 def titles(comparison: Comparison) -> dict[str, str]:
     """Return the titles of the pictures."""
-    result = {"path_traced": "path tracer, this model", "same_light": "this model, the shader's light"}
+    result = {"path_traced": "path tracer, this model", "same_light": "this model, same light"}
     for kind in (comparison.shader, *comparison.others):
         prefix = "" if kind == comparison.shader else f"{kind}_"
         shader = kind.upper().replace("_", " with ")
@@ -47,11 +47,11 @@ def picture_table(comparison: Comparison) -> Table:
     """Return a table of the pictures and their differences, for a terminal."""
     columns = (
         *_TO_REFERENCE,
-        "ΔE00 mean to\nsame light",
+        "ΔE00 to\nsame light",
         "reads per\npoint",
         "samples\nper pixel",
         "seconds",
-        "seconds of\npath tracer",
+        "of path\ntracer",
     )
     rows = []
     for name, title in titles(comparison).items():
@@ -97,12 +97,13 @@ def notes(comparison: Comparison) -> list[str]:
     lines = [
         f"compared: the {100 * comparison.surface.mean():.0f} % of {columns} × {rows} pixels that show only surfaces; "
         f"Y = {comparison.white:.4g} is white; one exposure factor gives a picture the mean luminance of its reference",
-        "the shader's light: direct light of directional and point lights; here with the shadows that surfaces cast",
+        "same light: the shader's, of directional and point lights; here with the shadows that surfaces cast",
+        "ΔE00 to same light: the mean, of pictures of the same points, so that noise cancels",
         "reads: texels of two numbers (shader), or packets of four for the wavelengths of a ray (this model)",
     ]
     if comparison.few_samples:
         lines.append(
-            "seconds of path tracer: after which its own picture has the same mean ΔE00, by pictures of "
+            "seconds of path tracer: those after which its own picture has the same mean ΔE00, by pictures of "
             f"{', '.join(str(count) for count, *_ in comparison.few_samples)} samples per pixel"
         )
     noise = comparison.noise["path_traced"], comparison.noise["same_light"]
