@@ -61,10 +61,11 @@ def picture_table(comparison: Comparison) -> Table:
         differences = ["1", "", "", "", ""] if found is None else report.cells(_TO_REFERENCE, found)
         same_light = "" if same is None else f"{same.mean:.2f}"
         time = float("nan") if found is None else comparison.time_of_error(name)
+        least = "< " if comparison.few_samples and time == comparison.few_samples[0][1] else ""
         rows.append(
             [
                 *(title, *differences, same_light, str(reads), str(picture.samples), f"{picture.seconds:.1f}"),
-                "" if np.isnan(time) else f"{time:.2g}",
+                "" if np.isnan(time) else f"{least}{time:.2g}",
             ]
         )
     return table(("picture", *columns), rows)
@@ -80,8 +81,8 @@ def quirk_table(comparison: Comparison) -> Table:
         for against in (shares.path_traced, shares.same_light):
             one = against.quirks[name]
             # Adding zero removes the sign of −0.
-            row += [f"{round(value, 2) + 0.0:+.2f}" for value in (one.drop, one.rise)]
-            row.append(f"{one.share:.0%}")
+            drop, rise, share = (round(value, 2) + 0.0 for value in (one.drop, one.rise, one.share))
+            row += [f"{drop:+.2f}", f"{rise:+.2f}", f"{share:.0%}"]
         rows.append(row)
     return table(columns, rows)
 
