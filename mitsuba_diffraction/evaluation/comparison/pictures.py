@@ -242,7 +242,8 @@ class Pictures:
 
         def colour(ray: mi.RayDifferential3f) -> mi.Color3f:
             rgb = mi.Color3f(0)
-            for ray.wavelengths, weights in _wavelengths_of_the_shader():
+            for wavelengths, weights in _wavelengths_of_the_shader():
+                ray.wavelengths = wavelengths
                 whole, other = (
                     mi.unpolarized_spectrum(integrator.sample(self.scene, None, ray)[0]) for integrator in (model, rest)
                 )
