@@ -140,7 +140,7 @@ def state_of(value: object) -> list:
     return [value] if dr.is_array_v(value) or isinstance(value, mi.Object) else []
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", ["interface", "two axes", "tile", "sample"])
 def test_a_frozen_evaluation_follows_the_parameters(name):
     """The kernels that `dr.freeze` records have tables and numbers of the plugin among their inputs."""

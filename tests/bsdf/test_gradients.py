@@ -69,7 +69,7 @@ NUMBERS = {
 }
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(3)
 @pytest.mark.parametrize("mode", ["forward", "backward"])
 @pytest.mark.parametrize("case", sorted(NUMBERS))
 def test_the_derivative_by_a_number_is_that_of_differences(case, mode):

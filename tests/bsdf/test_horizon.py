@@ -36,7 +36,7 @@ def test_weights_at_grazing_incidence_are_at_most_twenty(theta, phi):
     assert ((weight**2).mean(1) < 3 * weight.mean(1) ** 2).all()
 
 
-@pytest.mark.few(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("theta", [88, 25, 60, 85])
 def test_rigorous_grating_has_the_albedo_of_the_solver(theta):
     profile, wi = md.gratings.sinusoidal(0.3, 0.1), direction(theta, 0)

@@ -116,6 +116,7 @@ def test_orders_have_the_powers_of_the_closed_form(kind, profile, depth, theta, 
         assert np.abs(np.subtract(found, wanted)).sum() < 0.005 * max(1, np.sum(wanted))
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("profile", ["sinusoidal", "blazed"])
 def test_transmission_is_reciprocal(kind, profile):
@@ -147,7 +148,7 @@ def test_transmission_is_reciprocal(kind, profile):
     np.testing.assert_allclose(radiance, there * abs(wo[:, 2]) * n_i**2, rtol=1e-5, atol=1e-5 * radiance.max())
 
 
-@pytest.mark.few(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("side", [1, -1])
 @pytest.mark.parametrize("component", [0, 1])

@@ -352,6 +352,7 @@ def test_compare_writes_pictures_numbers_and_a_figure(command, llvm, folder):
         assert np.ptp(np.asarray(picture.convert("L"))) > 100
 
 
+@pytest.mark.slow
 def test_a_coat_is_noted(llvm, folder):
     write(Path("scene.xml"), base=BASE + '<float name="coat_ior" value="1.5"/>')
     found = compare("scene.xml", "flss", width=4, spp=1, shading_points=1, shares=False)
@@ -363,6 +364,7 @@ def test_a_coat_is_noted(llvm, folder):
     assert not Pictures("bare.xml", width=4).has_coat
 
 
+@pytest.mark.slow
 def test_several_shaders_are_compared_with_their_options(llvm, folder):
     write(Path("scene.xml"))
     found = compare(

@@ -56,6 +56,7 @@ def test_the_extrema_of_a_blaze_are_the_analytic_ones():
     assert values["max Im"][1] == pytest.approx(height / (2 * np.pi), rel=0.02)
 
 
+@pytest.mark.slow
 def test_the_figures_are_written(llvm, tmp_path, monkeypatch):
     monkeypatch.setattr(fourier_figures, "_SURFACES", ("blaze", "blaze"))
     monkeypatch.setattr(fourier_figures.plot_fourier_images, "__defaults__", (9,))

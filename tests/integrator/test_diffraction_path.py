@@ -212,7 +212,7 @@ def assert_agree(built, depth, spp, **parameters):
         pytest.param(sun_and_sky, 4, 1024, marks=pytest.mark.slow),
         pytest.param(lamp_and_spot, 5, 2048, marks=pytest.mark.slow),
         pytest.param(blend_under_a_point, -1, 1024, marks=pytest.mark.slow),
-        (lamp_that_is_a_grating, 3, 512),
+        pytest.param(lamp_that_is_a_grating, 3, 512, marks=pytest.mark.slow),
         pytest.param(instance_beside_a_grating, 4, 1024, marks=pytest.mark.slow),
     ],
 )
@@ -404,6 +404,7 @@ def test_gradients_are_finite_differences(llvm, mode):
     np.testing.assert_allclose(np.array(found).item(), np.array(finite).item(), rtol=0.03)
 
 
+@pytest.mark.slow
 def test_both_halves_draw_the_lines_of_a_lamp(llvm, tmp_path, monkeypatch):
     path = tmp_path / "scene.xml"
     line = '<spectrum name="irradiance" value="545:0, 546:1, 547:0"/></emitter>'

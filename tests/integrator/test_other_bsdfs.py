@@ -87,6 +87,7 @@ def test_every_bsdf_of_mitsuba_converges_to_the_limit_of_path(name, llvm):
     assert_agree(above(BSDFS[name](), 1.5), 12, 1024)
 
 
+@pytest.mark.slow
 def test_a_tinted_bsdf_is_no_noisier_than_with_path(llvm):
     """Its color is a quotient by the mean over the four wavelengths, which are not replaced there."""
     tinted = {"type": "principled", "base_color": rgb(0.8, 0.05, 0.02), "specular": 0.5, "spec_tint": 1.0}

@@ -112,7 +112,7 @@ def test_a_spectrum_is_unchanged_by_saving_and_loading(spectrum, tmp_path):
         assert getattr(loaded, name) == getattr(spectrum, name)
 
 
-@pytest.fixture(scope="module", params=["interface", "sheet"])
+@pytest.fixture(scope="module", params=["interface", pytest.param("sheet", marks=pytest.mark.slow)])
 def glass(request):
     """A table with transmission and Mueller matrices."""
     return coarse((6, 10, 6), replace(REQUEST, polarised=True, transmission=request.param))

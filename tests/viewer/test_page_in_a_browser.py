@@ -84,9 +84,9 @@ def pairs_of(spectrum, count=10_000, seed=1):
 @pytest.mark.parametrize(
     ("source", "parameters", "changes"),
     [
-        ("blaze.toml", {}, {}),
+        pytest.param("blaze.toml", {}, {}, marks=pytest.mark.slow),
         ("blaze.toml", {"material": "Au", "height_scale": 0.7}, {}),
-        ("foil_crossed.toml", {"material": "none"}, {}),
+        pytest.param("foil_crossed.toml", {"material": "none"}, {}, marks=pytest.mark.slow),
         ("elaphe_afm.toml", {"int_ior": 1.5}, {"hasBase": True, "pigment": "#7c3f95"}),
         pytest.param("elaphe.toml", {"int_ior": 1.7}, {}, marks=pytest.mark.slow),
         pytest.param("xenopeltis.toml", {}, {}, marks=pytest.mark.slow),
@@ -115,7 +115,7 @@ def test_values_are_those_of_the_bsdf(source, parameters, changes, opened, llvm)
 @pytest.mark.parametrize(
     ("source", "changes"),
     [
-        ("blaze.toml", {}),
+        pytest.param("blaze.toml", {}, marks=pytest.mark.slow),
         pytest.param("blaze.toml", {"coherenceLength": 9, "material": "Au"}, marks=pytest.mark.slow),
         pytest.param("foil_crossed.toml", {"hasBase": True}, marks=pytest.mark.slow),
         pytest.param("foil_crossed.toml", {"coherenceLength": 7, "material": "none"}, marks=pytest.mark.slow),
@@ -146,7 +146,9 @@ def test_colours_are_integrals_over_the_wavelength(source, changes, opened):
     np.testing.assert_allclose(found[:, :3], wanted, rtol=0, atol=1e-3 * wanted.max())
 
 
-@pytest.mark.parametrize("published", [True, False], ids=["published", "corrected"])
+@pytest.mark.parametrize(
+    "published", [pytest.param(True, marks=pytest.mark.slow, id="published"), pytest.param(False, id="corrected")]
+)
 @pytest.mark.parametrize("source", ["blaze.toml", pytest.param("elaphe_afm.toml", marks=pytest.mark.slow)])
 def test_colours_are_those_of_the_shader_of_2014(source, published, opened, llvm):
     """All variants in linear RGB, to 1e-3 of the largest value; gamma and blend are not part of it."""
@@ -219,7 +221,10 @@ def test_a_pixel_has_the_orders_of_the_grating_equation(opened):
     assert "Orders, by the grating equation" in tab.locator("#picked-text").inner_text()
 
 
-@pytest.mark.parametrize("orientation", [30, "radial", pytest.param("tangential", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "orientation",
+    [pytest.param(30, marks=pytest.mark.slow), "radial", pytest.param("tangential", marks=pytest.mark.slow)],
+)
 def test_the_axes_of_the_pattern_are_those_of_the_plugin(orientation, opened, llvm):
     """ω_i along the pattern's axes at pixels of a sphere, a plate and a disc, as the scene of the view has it."""
     parameters = {"depth": 0.1, "samples": 64, "coherence_length": 3.0}
