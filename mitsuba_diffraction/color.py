@@ -196,8 +196,6 @@ def ocio_view(name: str) -> View:
     Raises:
         ValueError: if OpenColorIO is not installed, the configuration cannot be used, or it has no such view.
     """
-    import colour
-
     try:
         import PyOpenColorIO as ocio
     except ModuleNotFoundError:
@@ -213,6 +211,8 @@ def ocio_view(name: str) -> View:
         transform = config.getProcessor("cie_xyz_d65_interchange", display, view, ocio.TRANSFORM_DIR_FORWARD)
     except (ocio.Exception, ocio.ExceptionMissingFile) as error:
         raise RequestError(f"--view: {source} cannot be used by OpenColorIO ({' '.join(str(error).split())})") from None
+    import colour
+
     processor, to_XYZ = transform.getDefaultCPUProcessor(), colour.RGB_COLOURSPACES["sRGB"].matrix_RGB_to_XYZ
 
     def shown(rgb: NDArray[np.floating]) -> NDArray[np.floating]:

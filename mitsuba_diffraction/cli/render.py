@@ -92,16 +92,9 @@ def render(
     overwrite: Overwrite = False,
 ) -> None:
     """Path-trace a scene into a spectral picture (.exr) with a preview (.png)."""
-    import mitsuba as mi
-
     from ..color import neutral_view, ocio_view
-    from ..llvm import choose_variant
-    from ..render.cluster import trace_on
-    from ..render.passes import checkpoint_path, trace_locally
-    from ..render.scene import channel_wavelengths, files_of_scene, has_alpha, named_sample_count
-    from ..render.turntable import orbit as motions_of_orbit
-    from ..render.turntable import save_animation
 
+    # Before Mitsuba, which takes more than a second to start.
     if output is not None:
         check_suffix("-o", output, ".exr")
     if rgb and channels is not None:
@@ -109,6 +102,16 @@ def render(
     shown = neutral_view if view is None else ocio_view(view)
     if (frames is not None) != orbit:
         raise RequestError("--frames N and --orbit go together")
+
+    import mitsuba as mi
+
+    from ..llvm import choose_variant
+    from ..render.cluster import trace_on
+    from ..render.passes import checkpoint_path, trace_locally
+    from ..render.scene import channel_wavelengths, files_of_scene, has_alpha, named_sample_count
+    from ..render.turntable import orbit as motions_of_orbit
+    from ..render.turntable import save_animation
+
     where: dict[str, Any] = {"parameters": scene_parameters(define), "materials": materials_of(material)}
     reads = files_of_scene(scene, **where)
     target = output or Path(free_name(scene.stem, lambda stem: _outputs(Path(f"{stem}.exr"), frames), reads) + ".exr")

@@ -46,6 +46,10 @@ def compare(
     overwrite: Overwrite = False,
 ) -> None:
     """Compare renderings of a scene by the path tracer and the real-time shader."""
+    check_suffix("SCENE", scene, ".xml", ".toml")
+    if scene.suffix.lower() == ".toml":
+        Recipe.load(scene)  # reports what is wrong with it, before Mitsuba starts
+
     import mitsuba as mi
 
     from ...llvm import choose_variant
@@ -54,11 +58,9 @@ def compare(
     from ..comparison import summary
     from ..comparison.pictures import supported_lights
 
-    check_suffix("SCENE", scene, ".xml", ".toml")
     parameters, name = scene_parameters(define), scene.stem
     shader, *others = shader or ["flss"]
     if scene.suffix.lower() == ".toml":
-        Recipe.load(scene)  # reports what is wrong with it
         parameters = {"spectrum": str(scene.resolve()), **parameters}
         scene = examples_folder() / "scenes" / "scan.xml"
     if "light" not in parameters and (lights := supported_lights(scene, parameters)):
