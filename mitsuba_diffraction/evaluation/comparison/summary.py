@@ -107,13 +107,14 @@ def notes(comparison: Comparison) -> list[str]:
             "seconds of path tracer: those after which its own picture has the same mean ΔE00, by pictures of "
             f"{', '.join(str(count) for count, *_ in comparison.few_samples)} samples per pixel"
         )
-    noise = comparison.noise["path_traced"], comparison.noise["same_light"]
-    if None not in noise:
-        of_shader = comparison.noise["corrected"]
-        lines.append(
-            f"noise: a mean ΔE00 of {noise[0]:.2f} in the path-traced picture, {noise[1]:.2f} in the same light's"
-            + ("" if of_shader is None else f", {of_shader:.2f} in the corrected shader's")
-        )
+    whose = {
+        "path_traced": "in the path-traced picture",
+        "same_light": "in the same light's",
+        "corrected": "in the corrected shader's",
+    }
+    known = [f"{noise:.2f} {words}" for name, words in whose.items() if (noise := comparison.noise[name]) is not None]
+    if known:
+        lines.append(f"noise: a mean ΔE00 of {', '.join(known)}")
     if comparison.coated:
         lines.append("coat: the shader shows coated gratings without their coat; it does not converge to this model")
     elif comparison.truncated_fraction is not None:
