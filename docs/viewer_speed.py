@@ -14,6 +14,7 @@ from live_browser import draw, opened
 from live_pages import SURFACES
 
 SIZE, FRAMES = 512, 2  # the first one is compiled
+CONTROLS = 330  # pixels beside the picture
 VARIANTS = ("flss", "nmm", "pq", "nmm_pq", "gem")
 
 
@@ -24,7 +25,7 @@ def main() -> None:
     print("| surface | this model, ms |", " | ".join(name.upper().replace("_", " ") for name in VARIANTS), "| MB |")
     print("|---|---|" + "---|" * (len(VARIANTS) + 1), flush=True)
     for surface in options.surfaces:
-        with opened(surface, viewport={"width": SIZE + 330, "height": SIZE}) as tab:
+        with opened(surface, viewport={"width": SIZE + CONTROLS, "height": SIZE}) as tab:
             state = {"shape": "sphere", "lightWidth": 0, "lightLength": 0, "sky": 0, "difference": True}
             model, ratios = [], []
             for variant in VARIANTS:

@@ -239,10 +239,11 @@ class Pictures:
         """
         self._choose(())
         model, rest = same_light(self.scene), without_gratings(self._shader)
+        wavelengths_and_weights = list(_wavelengths_of_the_shader())
 
         def colour(ray: mi.RayDifferential3f) -> mi.Color3f:
             rgb = mi.Color3f(0)
-            for wavelengths, weights in _wavelengths_of_the_shader():
+            for wavelengths, weights in wavelengths_and_weights:
                 ray.wavelengths = wavelengths
                 whole, other = (
                     mi.unpolarized_spectrum(integrator.sample(self.scene, None, ray)[0]) for integrator in (model, rest)

@@ -61,11 +61,11 @@ def picture_table(comparison: Comparison) -> Table:
         differences = ["1", "", "", "", ""] if found is None else report.cells(_TO_REFERENCE, found)
         same_light = "" if same is None else f"{same.mean:.2f}"
         time = float("nan") if found is None else comparison.time_of_error(name)
-        least = "< " if comparison.few_samples and time == comparison.few_samples[0][1] else ""
+        bound = "< " if comparison.few_samples and time == comparison.few_samples[0][1] else ""
         rows.append(
             [
                 *(title, *differences, same_light, str(reads), str(picture.samples), f"{picture.seconds:.1f}"),
-                "" if np.isnan(time) else f"{least}{time:.2g}",
+                "" if np.isnan(time) else f"{bound}{time:.2g}",
             ]
         )
     return table(("picture", *columns), rows)
