@@ -36,17 +36,15 @@ _TAKES_LONG = {"mi", "Furnace", "NotebookClient", "subprocess"}
 
 
 def pytest_configure(config):
-    """Draw fewer examples where slow tests are left out, and keep the order below."""
+    """Draw fewer examples where slow tests are left out."""
     settings.load_profile("tests" if "not slow" in config.option.markexpr else "slow")
-    config.option.loadscopereorder = False  # of pytest-xdist, which begins with the files of most tests
 
 
 @pytest.hookimpl(tryfirst=True)  # before -m selects
 def pytest_collection_modifyitems(items):
     """Mark cases of tests as `slow` or `quick`.
 
-    Files that take long come first, so that two processes end together. Of a test marked `few(n)`, n of the cases that
-    are not slow stay so, evenly spaced; the others are slow.
+    Of a test marked `few(n)`, n of the cases that are not slow stay so, evenly spaced; the others are slow.
     """
     cases = defaultdict(list)
     for item in items:
@@ -63,7 +61,6 @@ def pytest_collection_modifyitems(items):
         if not (takes_long or item.get_closest_marker("slow") or item.function in tests):
             tests.add(item.function)
             item.add_marker(pytest.mark.quick)
-    items.sort(key=lambda item: not _TAKES_LONG & vars(item.module).keys())
 
 
 @pytest.fixture(scope="module", autouse=True)
