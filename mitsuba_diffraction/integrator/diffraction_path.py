@@ -40,11 +40,14 @@ are traced from the light unless the vertex next to E is specular (perfect refle
     L X G X E, L M G X E        from the eye: light scattered by another surface before the grating
 
 Light that a grating scatters to the eye is traced from the eye, as the narrow lobes of a grating seldom include the
-direction to a pinhole. A point on a grating is drawn by area, and a light is drawn from that point; one of four such
-pairs is chosen with a probability proportional to the radiance it receives, shadows included. The path is continued by
-`sample` of the BSDFs, with the correction for shading normals and for BSDFs that are not reciprocal; each X is
-connected to the sensor. There is one path from the light for two samples of the film. As in `path`, a light without
-extent is not seen in a mirror: it is omitted where the grating next to it scatters by a delta component.
+direction to a pinhole. In L G X G E and L G X M E, half of the directions from an opaque X are those to points drawn on
+gratings, weighted by the balance heuristic.
+
+From the light, a point on a grating is drawn by area, and a light is drawn from that point; one of four such pairs is
+chosen with a probability proportional to the radiance it receives, shadows included. The path is continued by `sample`
+of the BSDFs, with the correction for shading normals and for BSDFs that are not reciprocal; each X is connected to the
+sensor. There is one path from the light for two samples of the film. As in `path`, a light without extent is not seen
+in a mirror: it is omitted where the grating next to it scatters by a delta component.
 
 Without a grating, with max_depth below 3, in polarised variants, and for sensors that points cannot be connected to
 (all but `perspective` and `thinlens`), this is `path`. Instances and curves count as X. It can be nested in `aov`.

@@ -39,6 +39,7 @@ class Gratings:
         if not self.shapes:
             return
         self._choice = mi.DiscreteDistribution([area for _, area in areas])
+        self._area = dr.opaque(mi.Float, sum(area for _, area in areas))
         ids = [dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0] for shape in self.shapes]
         kinds = [2 if _is_grating_only(shape.bsdf()) else 1 for shape in self.shapes]
         self._size = dr.opaque(mi.UInt32, max(ids) + 1)
@@ -67,6 +68,10 @@ class Gratings:
         point.pdf *= probability
         return point
 
+    def pdf_direction(self, si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> mi.Float:
+        """Return the density of `sample` per unit solid angle, of a point that a ray hits."""
+        return ratio(dr.square(si.t), self._area * dr.abs(dr.dot(si.n, ray.d)))
+
 
 def implements(method: Callable[..., object], *arguments: object) -> bool:
     """Return whether a plugin implements a method; Mitsuba reports this only when the method is called."""
@@ -92,6 +97,10 @@ def _is_grating_only(bsdf: mi.BSDF) -> bool:
     if is_grating(bsdf):
         return not components
     return bsdf.class_name() == "TwoSidedBRDF" and all(map(_is_grating_only, components))
+
+
+_GRATING_PROBABILITY = 0.5  # of a direction to a point on a grating
+_VISIBILITY_TOLERANCE = 1e-3  # relative, of the distance to that point
 
 
 def define_eye_paths() -> type:
@@ -132,6 +141,9 @@ def define_eye_paths() -> type:
                 on_grating, grating_only = self.gratings.classify(si, active)
                 si_bsdf = with_surviving_wavelengths(si, throughput, grating_only)
                 from_light = on_grating & has_other_vertex & (from_eye_only ^ True)
+                # In L G X G E, few directions from X that the BSDF samples lead to the first G.
+                to_gratings = active & from_eye_only & (on_grating ^ True) & _is_smooth_reflector(bsdf)
+                bsdf_probability = dr.select(to_gratings, 1 - _GRATING_PROBABILITY, 1)
 
                 # Emitter sampling
                 samples_emitter = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
@@ -141,25 +153,39 @@ def define_eye_paths() -> type:
                 samples_emitter &= ds.pdf != 0
                 wo = si.to_local(ds.d)
                 value, pdf = bsdf.eval_pdf(ctx, si_bsdf, wo, samples_emitter)
-                mis_weight = dr.select(ds.delta, 1, _power_heuristic(ds.pdf, pdf))
+                mis_weight = dr.select(ds.delta, 1, _power_heuristic(ds.pdf, bsdf_probability * pdf))
                 result += dr.select(samples_emitter, throughput * value * emitted * mis_weight, 0)
 
-                # BSDF sampling; the next ray may hit an emitter.
-                bs, weight = bsdf.sample(ctx, si_bsdf, sampler.next_1d(active), sampler.next_2d(active), active)
-                throughput *= weight
-                eta *= bs.eta
+                # BSDF sampling, or the direction to a point on a grating; the next ray may hit an emitter.
+                guided = to_gratings & (sampler.next_1d(active) < _GRATING_PROBABILITY)
+                ps = self.gratings.sample(ray.time, sampler.next_1d(active), sampler.next_2d(active))
+                distance = dr.norm(ps.p - si.p)
+                direction = (ps.p - si.p) / distance
+                value, pdf = bsdf.eval_pdf(ctx, si_bsdf, si.to_local(direction), guided)
+                unguided = active & (guided ^ True)
+                bs, weight = bsdf.sample(ctx, si_bsdf, sampler.next_1d(active), sampler.next_2d(active), unguided)
                 delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+                eta *= dr.select(guided, 1, bs.eta)
                 valid |= active & (mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null) ^ True)
                 from_eye_only |= (depth == 1) & (delta | on_grating)
                 has_other_vertex |= on_grating ^ True
-                active &= dr.any(throughput != 0)
-                ray = si.spawn_ray(si.to_world(bs.wo))
+                ray = si.spawn_ray(dr.select(guided, direction, si.to_world(bs.wo)))
                 next_si = scene.ray_intersect(ray, active)
                 ds = mi.DirectionSample3f(scene, next_si, si)
-                pdf = scene.pdf_emitter_direction(si, ds, active)
+                pdf_emitter = scene.pdf_emitter_direction(si, ds, active)
+                # Emitters are left to emitter sampling, of which the weights ignore points on gratings.
+                on_target, _ = self.gratings.classify(next_si, to_gratings & next_si.is_valid())
+                on_target &= pdf_emitter == 0
+                grating_pdf = dr.select(on_target, self.gratings.pdf_direction(next_si, ray), 0)
+                hidden = guided & ~(on_target & (dr.abs(next_si.t - distance) < _VISIBILITY_TOLERANCE * distance))
+                bsdf_pdf = bsdf_probability * dr.select(guided, pdf, bs.pdf)
+                value = dr.select(guided, value, weight * bs.pdf)
+                mixed = dr.select(hidden, 0, value * ratio(1, bsdf_pdf + _GRATING_PROBABILITY * grating_pdf))
+                throughput *= dr.select(to_gratings & (delta ^ True), mixed, weight / bsdf_probability)
+                active &= dr.any(throughput != 0)
                 # Emitters that are never sampled are not found by paths from the light.
-                counts = active & ((from_light & (pdf > 0)) ^ True)
-                mis_weight = _power_heuristic(bs.pdf, dr.select(delta, 0, pdf))
+                counts = active & ((from_light & (pdf_emitter > 0)) ^ True)
+                mis_weight = _power_heuristic(bsdf_pdf, dr.select(delta, 0, pdf_emitter))
                 result += dr.select(counts, throughput * ds.emitter.eval(next_si, counts) * mis_weight, 0)
 
                 si = next_si
@@ -190,6 +216,12 @@ def with_surviving_wavelengths(
     replaced = mi.SurfaceInteraction3f(si)
     replaced.wavelengths = dr.select(active & (throughput <= 0), strongest, si.wavelengths)
     return replaced
+
+
+def _is_smooth_reflector(bsdf: mi.BSDF) -> mi.Bool:
+    """Return whether a BSDF scatters into all directions of one side, without transmission, which would change η."""
+    transmits = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Transmission | mi.BSDFFlags.Null)
+    return mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth) & (transmits ^ True)
 
 
 def _power_heuristic(a: mi.Float, b: mi.Float) -> mi.Float:

@@ -274,19 +274,38 @@ def test_light_paths_are_traced_only_if_a_surface_reflects_them(reflectance, tra
     assert (light is not None) == traces
 
 
-def test_a_grating_seen_in_another_is_less_noisy_than_with_path(llvm):
+def two_gratings():
+    """A ball of which a floor shows the image; both are gratings."""
     narrow = blaze(26.0, material="Al")
     ball = {"type": "sphere", "center": [0, 0, 0.8], "radius": 0.8, "bsdf": narrow}
-    built = scene(floor=plate(narrow, 4, 0), wall=ball, sky=SKY)
-    noise, means, errors = [], [], []
+    return scene(floor=plate(narrow, 4, 0), wall=ball, sky=SKY)
+
+
+def image_of_a_wall(bsdf, coherence_length=1.5):
+    """A plate that lights a wall, which is seen in the plate alone."""
+    wall = {"type": "rectangle", "to_world": at(0, 1.5, 0).rotate([1, 0, 0], 90).scale(4), "bsdf": bsdf}
+    camera = {"to_world": mi.ScalarTransform4f().look_at([0, -3.5, 2.5], [0, 0, 0.1], [0, 0, 1]), "fov": 6}
+    return scene(camera, plate=plate(blaze(coherence_length, material="Al"), 0.5), wall=wall, sun=SUN)
+
+
+@pytest.mark.parametrize(
+    ("build", "depth", "spp", "ratio"),
+    [
+        pytest.param(two_gratings, 6, 32, 1.4),
+        pytest.param(partial(image_of_a_wall, {"type": "plastic"}), 4, 256, 2, id="plastic wall"),
+        pytest.param(partial(image_of_a_wall, diffuse(0.8), 26.0), 4, 256, 4, id="wall", marks=pytest.mark.slow),
+    ],
+)
+def test_light_of_two_gratings_is_less_noisy_than_with_path(build, depth, spp, ratio, llvm):
+    built, noise, means, errors = build(), [], [], []
     for name in ("path", "diffraction_path"):
-        integrator = mi.load_dict({"type": name, "max_depth": 6})
-        pictures = np.array([mi.render(built, integrator=integrator, spp=32, seed=k) for k in range(12)])
+        integrator = mi.load_dict({"type": name, "max_depth": depth})
+        pictures = np.array([mi.render(built, integrator=integrator, spp=spp, seed=k) for k in range(12)])
         noise.append(pictures.var(0, ddof=1).mean())
         means.append(pictures.mean())
         errors.append(pictures.mean((1, 2, 3)).std(ddof=1) / np.sqrt(len(pictures)))
     assert abs(means[0] - means[1]) < 4 * np.hypot(*errors)
-    assert noise[0] > 1.4 * noise[1], noise
+    assert noise[0] > ratio * noise[1], noise
 
 
 @pytest.mark.few(1)
