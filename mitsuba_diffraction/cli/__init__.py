@@ -63,7 +63,7 @@ def _print_version(requested: bool) -> None:
 def _commands(
     context: typer.Context,
     version: Annotated[bool, typer.Option("--version", callback=_print_version, is_eager=True)] = False,
-    debug: Annotated[bool, typer.Option("--debug", help="show where an error was raised")] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="print the traceback of an error")] = False,
 ) -> None:
     """Diffraction gratings for Mitsuba 3."""
     context.obj["debug"] = debug

@@ -49,7 +49,7 @@ def _absolute(value: str) -> str:
 
 
 Define = Annotated[list[str] | None, typer.Option("-D", metavar="NAME=VALUE", help="set a parameter of the scene")]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="replace foreign files, too, but never inputs")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="replace files of other programs, too, but never inputs")]
 Variant = Annotated[str | None, typer.Option(help="Mitsuba variant; default: the fastest spectral one")]
 
 
@@ -140,16 +140,16 @@ def _is_film(source: str) -> bool:
 
 
 PixelSize = Annotated[float | None, typer.Option(help="pixel size of the scan, µm")]
-HeightRange = Annotated[float | None, typer.Option(help="heights from black to white, µm")]
+HeightRange = Annotated[float | None, typer.Option(help="height difference of black and white, µm")]
 FillMissing = Annotated[bool, typer.Option("--fill-missing", help="interpolate missing pixels of the scan")]
 Channel = Annotated[str | None, typer.Option(help="channel of the scan, by name or number")]
 Unit = Annotated[
     list[str] | None,
-    typer.Option(help="unit of a scan without one; given twice: lateral, then of the heights"),
+    typer.Option(help="unit, for a scan without one; given twice: of lengths, then of heights"),
 ]
 Prepare = Annotated[
     list[str] | None,
-    typer.Option(help=f"apply a step to the scan, in the order given: {', '.join(STEP_NAMES)}; NAME=ARGUMENT"),
+    typer.Option(help=f"apply a step, NAME or NAME=ARGUMENT, to the scan, in the given order: {', '.join(STEP_NAMES)}"),
 ]
 Extent = Annotated[
     str | None,

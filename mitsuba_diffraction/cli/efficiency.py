@@ -49,7 +49,7 @@ def efficiency(
         ),
     ],
     angle: Annotated[
-        str, typer.Option(help="of incidence, degrees: a number, several (0,30), or first:last:step")
+        str, typer.Option(help="angle of incidence, degrees: a number, several (0,30), or first:last:step")
     ] = "0",
     wavelength: Annotated[str, typer.Option(help="nm: a number, several, or first:last:step")] = "400:700:50",
     theory: Annotated[
@@ -58,13 +58,13 @@ def efficiency(
     material: Annotated[
         str | None, typer.Option(help="a conductor, as Mitsuba names it; default: that of the recipe, or n = 1.5")
     ] = None,
-    int_ior: Annotated[float | None, typer.Option(help="or the index of a dielectric")] = None,
+    int_ior: Annotated[float | None, typer.Option(help="the index of a dielectric instead")] = None,
     transmission: Annotated[
         str | None,
-        typer.Option(help="none, interface or sheet: the transmitted orders; default: that of the recipe, or none"),
+        typer.Option(help="none, or transmitted orders, too: interface or sheet; default: that of the recipe, or none"),
     ] = None,
     azimuth: Annotated[
-        float, typer.Option(help="of the plane of incidence, degrees from x; 90: along the grooves")
+        float, typer.Option(help="azimuth of the plane of incidence, degrees from x; 90: along the grooves")
     ] = 0,
     pixel_size: PixelSize = None,
     height_range: HeightRange = None,

@@ -21,7 +21,7 @@ def examples(
     folder: Annotated[Path, typer.Argument(metavar="[DIR]", help="target folder; created if missing")] = Path(),
     overwrite: Overwrite = False,
 ) -> None:
-    """Copy the scenes, recipes and measured skins that the package brings."""
+    """Copy the scenes, recipes and measured skins that the package contains."""
     root = source()
     contents = {folder / path: (root / path).read_bytes() for path in _files(root)}
     new = {

@@ -42,19 +42,19 @@ def inspect(
     source: Annotated[Path, typer.Argument(metavar="SCAN|RECIPE", help="a scan, or a recipe (.toml)")],
     output: Annotated[
         Path | None,
-        typer.Option("-o", "--output", help="figure (.png, .pdf, .svg); default: NAME_inspect.png here"),
+        typer.Option("-o", "--output", help="figure (.png, .pdf, .svg); default: ./NAME_inspect.png"),
     ] = None,
     pixel_size: PixelSize = None,
     height_range: HeightRange = None,
     fill_missing: FillMissing = False,
     channel: Channel = None,
     unit: Unit = None,
-    plane: Annotated[bool, typer.Option("--plane", help="level the scan first: --prepare level_plane")] = False,
+    plane: Annotated[bool, typer.Option("--plane", help="level the scan first, as --prepare level_plane does")] = False,
     prepare: Prepare = None,
     extent: Extent = None,
     coherence_length: CoherenceLength = None,
     angle: Annotated[
-        str, typer.Option(help="of incidence, degrees, for --view: a number, several (0,30), or first:last:step")
+        str, typer.Option(help="angle of incidence for --view, degrees: a number, several (0,30), or first:last:step")
     ] = "0",
     view: Annotated[
         str | None,
@@ -63,7 +63,7 @@ def inspect(
     json: Annotated[Path | None, typer.Option(help="save the numbers (.json)")] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Report and plot the statistics, periods and predicted colours of a surface, and their reliability."""
+    """Report and plot the statistics, periods and predicted colours of a surface, and how reliable they are."""
     angles, views = angles_of("--angle", angle), np.zeros(0) if view is None else angles_of("--view", view)
     if view is None and angle != "0":
         raise RequestError(f"--angle: got {angle} without --view, wanted the angles of the viewer, too")

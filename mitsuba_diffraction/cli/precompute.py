@@ -36,9 +36,7 @@ from .arguments import (
 def precompute(
     context: typer.Context,
     sources: Annotated[list[Path], typer.Argument(metavar="RECIPE|SCAN...", help="recipes (.toml), or scans")],
-    output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="spectrum file (.exr); in the current folder by default")
-    ] = None,
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="spectrum file; default: ./NAME.exr")] = None,
     pixel_size: PixelSize = None,
     height_range: HeightRange = None,
     fill_missing: FillMissing = False,
@@ -49,24 +47,24 @@ def precompute(
     tolerance: Annotated[
         float | None,
         typer.Option(
-            help="largest error, a fraction of the power; default: 0.001, of samples up to 0.01, rigorous 0.01"
+            help="maximum error, a fraction of the power; default: 0.001, up to 0.01 for samples, 0.01 if rigorous"
         ),
     ] = None,
-    terms: Annotated[int | None, typer.Option(help="of taylor or chebyshev; default: as the tolerance needs")] = None,
+    terms: Annotated[int | None, typer.Option(help="terms of taylor or chebyshev; default: as many as needed")] = None,
     heights_from: Annotated[
-        str | None, typer.Option(help=f"of taylor or chebyshev: {', '.join(ORIGINS)}; default: mean")
+        str | None, typer.Option(help=f"level of h = 0 in taylor or chebyshev: {', '.join(ORIGINS)}; default: mean")
     ] = None,
     theory: Annotated[
         str | None,
-        typer.Option(help=f"{', '.join(THEORIES)} (for profiles of one row); default: scalar"),
+        typer.Option(help=f"{', '.join(THEORIES)} (for line gratings); default: scalar"),
     ] = None,
-    material: Annotated[str | None, typer.Option(help="of rigorous theory: a conductor, as Mitsuba names it")] = None,
-    int_ior: Annotated[float | None, typer.Option(help="of rigorous theory: the index of a dielectric")] = None,
-    ext_ior: Annotated[float | None, typer.Option(help="of rigorous theory: the index of a coat; default: 1")] = None,
-    polarised: Annotated[bool, typer.Option("--polarised", help="of rigorous theory: with Mueller matrices")] = False,
+    material: Annotated[str | None, typer.Option(help="for rigorous theory: a conductor, as Mitsuba names it")] = None,
+    int_ior: Annotated[float | None, typer.Option(help="for rigorous theory: the index of a dielectric")] = None,
+    ext_ior: Annotated[float | None, typer.Option(help="for rigorous theory: the index of a coat; default: 1")] = None,
+    polarised: Annotated[bool, typer.Option("--polarised", help="for rigorous theory: with Mueller matrices")] = False,
     extent: Extent = None,
     largest_angle: Annotated[
-        float | None, typer.Option(help="largest angle of incidence or exit in the scene, degrees; default: 90")
+        float | None, typer.Option(help="maximum angle of incidence or exit in the scene, degrees; default: 90")
     ] = None,
     coherence_length: CoherenceLength = None,
     largest_height_range: Annotated[float | None, typer.Option(help="refuse deeper surfaces, µm; default: 20")] = None,

@@ -32,7 +32,9 @@ class Stopped(Exception):
 
 def render(
     scene: Annotated[Path, typer.Argument(metavar="SCENE.xml")],
-    output: Annotated[Path | None, typer.Option("-o", "--output", help="spectral picture (.exr)")] = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="spectral picture; default: ./SCENE.exr")
+    ] = None,
     spp: Annotated[
         int | None,
         typer.Option(
@@ -42,13 +44,13 @@ def render(
     width: Annotated[int | None, typer.Option(min=1, help="pixels; default: that of the scene")] = None,
     height: Annotated[int | None, typer.Option(min=1, help="pixels; default: that of the scene")] = None,
     variant: Variant = None,
-    seed: Annotated[int, typer.Option(min=0)] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="seed of the random numbers")] = 0,
     define: Define = None,
     material: Annotated[
         list[str] | None,
         typer.Option(
             metavar="ID=RECIPE|PROFILE[,name=value…]",
-            help="replace the BSDF with that id by a grating; name=value: its parameters",
+            help="replace the BSDF of this id by a grating; name=value: parameters of the grating",
         ),
     ] = None,
     until_error: Annotated[
@@ -60,21 +62,21 @@ def render(
         bool, typer.Option("--half", help="write float16: half the size, radiance rounded by up to 0.05 %")
     ] = False,
     rgb: Annotated[
-        bool, typer.Option("--rgb", help="write R, G, B alone, as float16: 6 bytes per pixel at most")
+        bool, typer.Option("--rgb", help="write only R, G, B, as float16: at most 6 bytes per pixel")
     ] = False,
     channels: Annotated[
         int | None,
-        typer.Option(min=2, metavar="N", help="write at most N wavelengths (46, 30, 22, …), each over a wider range"),
+        typer.Option(min=2, metavar="N", help="write at most N wavelengths (46, 30, 22, …), each over a wider band"),
     ] = None,
     exposure: Annotated[
         float | None,
-        typer.Option(min=-99, max=99, metavar="STOPS", help="of the preview: radiance times 2^STOPS; default: chosen"),
+        typer.Option(min=-99, max=99, metavar="STOPS", help="multiply the preview by 2^STOPS; default: automatic"),
     ] = None,
     view: Annotated[
         str | None,
         typer.Option(
             metavar="NAME",
-            help="filmic preview by a view of OpenColorIO, such as ACES or, with Blender's $OCIO, AgX (extra: ocio)",
+            help="preview by a filmic view of OpenColorIO, such as ACES or, with Blender's $OCIO, AgX (extra: ocio)",
         ),
     ] = None,
     denoise: Annotated[
@@ -87,8 +89,8 @@ def render(
         str | None, typer.Option(metavar="ADDRESS", help="distribute the passes over a Dask cluster (tcp://HOST:PORT)")
     ] = None,
     # 3600 frames are a tenth of a degree apart, and last five minutes.
-    frames: Annotated[int | None, typer.Option(min=2, max=3600, metavar="N", help="frames of an orbit")] = None,
-    orbit: Annotated[bool, typer.Option("--orbit", help="orbit the scene once")] = False,
+    frames: Annotated[int | None, typer.Option(min=2, max=3600, metavar="N", help="frames of --orbit")] = None,
+    orbit: Annotated[bool, typer.Option("--orbit", help="render pictures of one orbit around the scene")] = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Path-trace a scene into a spectral picture (.exr) with a preview (.png)."""

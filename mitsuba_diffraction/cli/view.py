@@ -44,9 +44,7 @@ def view(
             "orientation, height_scale, and the parameters of a profile",
         ),
     ],
-    output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="the page (.html); in the current folder by default")
-    ] = None,
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="the page; default: ./NAME.html")] = None,
     reference: Annotated[
         Path | None, typer.Option(help="a spectral picture (.exr) of `render`, for comparison in the page")
     ] = None,
@@ -61,7 +59,7 @@ def view(
     coherence_length: CoherenceLength = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Write a page that shows a surface live in the browser, without network (WebGL2)."""
+    """Write a page that shades a surface live in the browser (WebGL2), without network."""
     name, parameters = surface_of(source)
     path, progress = Path(name), functools.partial(progress_bar, unit="%")
     target = output or Path(path.stem or "view").with_suffix(".html")

@@ -21,9 +21,9 @@ MANUAL = f"""Path tracer that also samples the light that gratings cast onto oth
 Parameters (XML or dictionary):
 {listed(PARAMETERS)}
 
-The picture converges to that of `path` with the same parameters. A path tracer hits a small or distant light via a
-grating only by chance, so that the light that gratings cast onto a wall appears as fireflies. Those paths are traced
-from the light here, and all others from the eye.
+The picture converges to that of `path` with the same parameters. A path tracer finds a small or distant light via a
+grating only by chance, so that the light that gratings cast onto a wall appears as fireflies. Here those paths are
+traced from the light, and all others from the eye.
 
 With L a light, G a vertex on a surface whose BSDF is or contains a `diffraction_grating` (whichever component of it
 reflects or transmits the light: both sides of `twosided` and of a film, all of a blend, the base), X a vertex on any
@@ -31,7 +31,8 @@ other surface, and E the eye, the paths
 
     L G⁺ X E    and    L G⁺ X (G | X)* X E
 
-are traced from the light unless the vertex next to E is specular (perfect reflection or refraction). Thus
+(⁺: one or more, *: any number) are traced from the light unless the vertex next to E is specular (perfect reflection or
+refraction). Thus
 
     L G E, L G G E              from the eye: gratings alone, a lamp seen through a film
     L G X E, L G G X E          from the light: what they cast onto a wall, a film in a window onto the floor
@@ -39,19 +40,20 @@ are traced from the light unless the vertex next to E is specular (perfect refle
     L G X G E, L G X M E        from the eye: that wall seen in a grating or a mirror
     L X G X E, L M G X E        from the eye: light scattered by another surface before the grating
 
-Light that a grating scatters to the eye is traced from the eye, as the narrow lobes of a grating seldom include the
-direction to a pinhole. In L G X G E and L G X M E, half of the directions from an opaque X are those to points drawn on
-gratings, weighted by the balance heuristic.
+Light that a grating scatters to the eye is traced from the eye, as its narrow lobes seldom include the direction to a
+pinhole. In L G X G E and L G X M E, half of the directions from an opaque X are drawn to points on gratings, with the
+balance heuristic.
 
-From the light, a point on a grating is drawn by area, and a light is drawn from that point; one of four such pairs is
-chosen with a probability proportional to the radiance it receives, shadows included. The path is continued by `sample`
-of the BSDFs, with the correction for shading normals and for BSDFs that are not reciprocal; each X is connected to the
-sensor. There is one path from the light for two samples of the film. As in `path`, a light without extent is not seen
-in a mirror: it is omitted where the grating next to it scatters by a delta component.
+A path from the light starts at a point on a grating, drawn by area, and a light drawn for that point. One of four such
+pairs is chosen with a probability proportional to the radiance that it receives, shadows included. The path is
+continued by `sample` of the BSDFs, with the correction for shading normals and for BSDFs that are not reciprocal; each
+X is connected to the sensor. There is one path from the light for two samples of the film. As in `path`, a light
+without extent is not seen in a mirror: it is omitted where the grating next to it scatters by a delta component.
 
-Without a grating, with max_depth below 3, in polarised variants, and for sensors that points cannot be connected to
-(all but `perspective` and `thinlens`), this is `path`. Instances and curves count as X. It can be nested in `aov`.
-Gradients are those of `path` (forward) and `prb` (backward), and single rays (`sample`) those of `path`.
+Without a grating, with max_depth of 0 to 2, in polarised variants, and for sensors other than `perspective` and
+`thinlens`, this is `path`. Instances and curves count as X. hide_emitters, and films with sample_border, are refused.
+It can be nested in `aov`. Gradients are those of `path` (forward) and `prb` (backward), and single rays (`sample`)
+those of `path`.
 """
 
 

@@ -15,7 +15,7 @@ from ...surface.readers import read_height_field
 
 
 def benchmark(
-    scan: Annotated[Path | None, typer.Argument(metavar="[SCAN]", help="a scan to include")] = None,
+    scan: Annotated[Path | None, typer.Argument(metavar="[SCAN]", help="also measure this scan")] = None,
     pixel_size: PixelSize = None,
     height_range: HeightRange = None,
     surface: Annotated[list[str] | None, typer.Option(help="only these of the built-in surfaces")] = None,

@@ -25,13 +25,13 @@ def compare(
         Path, typer.Argument(metavar="SCENE.xml|RECIPE.toml", help="a scene, or a recipe on the objects of scan.xml")
     ],
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="prefix of the output files, or a folder")
+        Path | None, typer.Option("-o", "--output", help="prefix of the output files, or their folder")
     ] = None,
     shader: Annotated[
         list[str] | None,
-        typer.Option(help="flss (default), nmm, pq, nmm_pq or gem; several are compared, with the quirks of the first"),
+        typer.Option(help="flss (default), nmm, pq, nmm_pq or gem; may be repeated; quirks are those of the first"),
     ] = None,
-    terms: Annotated[int | None, typer.Option(min=1, help="Taylor terms of the shader")] = None,
+    terms: Annotated[int | None, typer.Option(min=1, help="number of Taylor terms of the shader")] = None,
     window: Annotated[str | None, typer.Option(help="texel or 4sigma; of flss and nmm")] = None,
     interpolation: Annotated[str | None, typer.Option(help="sinc or linear; of pq and nmm_pq")] = None,
     spp: Annotated[int, typer.Option(min=1, help="samples per pixel of the path tracer")] = 64,
@@ -40,7 +40,7 @@ def compare(
     height: Annotated[int | None, typer.Option(min=1, help="pixels; default: that of the scene")] = None,
     shares: Annotated[bool, typer.Option(help="measure the cost of each quirk of the shader")] = True,
     variant: Variant = None,
-    seed: Annotated[int, typer.Option(min=0)] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="seed of the random numbers")] = 0,
     json: Annotated[Path | None, typer.Option(help="save the numbers (.json)")] = None,
     define: Define = None,
     overwrite: Overwrite = False,

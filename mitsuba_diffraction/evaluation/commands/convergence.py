@@ -25,7 +25,7 @@ def convergence(
     define: Define = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Measure the error of a picture against time, by the path tracer and by the real-time shaders.
+    """Measure the error of a picture against time, for the path tracer and the real-time shaders.
 
     The scene needs a parameter `tolerance` of its gratings.
     """

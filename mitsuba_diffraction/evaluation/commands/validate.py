@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 def validate(
     context: typer.Context,
     surface: Annotated[
-        Path | None, typer.Argument(metavar="[SURFACE]", help="check this recipe (.toml) or scan instead")
+        Path | None, typer.Argument(metavar="[SURFACE]", help="check only this recipe (.toml) or scan")
     ] = None,
     pixel_size: PixelSize = None,
     height_range: HeightRange = None,
@@ -50,7 +50,7 @@ def validate(
     figures: Annotated[Path | None, typer.Option(metavar="DIR", help="save the figures of the evaluation here")] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Validate against closed forms and rigorous results, or validate one surface. Fails if a bound is exceeded."""
+    """Check the BSDF against closed forms and rigorous results, or check one surface; fail if a bound is exceeded."""
     import mitsuba as mi
 
     from ...llvm import choose_variant

@@ -23,18 +23,18 @@ from .surfaces import Shaded, gratings_of, in_place, recipe_of, sum_along
 
 PARAMETERS = (
     Parameter("variant", "string", "flss, nmm, pq, nmm_pq or gem", "flss"),
-    Parameter("as_published", "boolean", "with all peculiarities of the published shader, or with none", "true"),
+    Parameter("as_published", "boolean", "with all quirks of the published shader, or with none", "true"),
     Parameter(
         "fresnel_squared, window_pi, …",
         "boolean",
-        "one peculiarity on or off, overriding as_published; `Quirks` lists them",
+        "overrides as_published for one quirk; `Quirks` lists them",
     ),
-    Parameter("terms", "integer", "Taylor terms; default: as published, or, corrected, as many as needed; not for gem"),
-    Parameter("window", "string", "texel or 4sigma, instead of what one_texel says; for flss and nmm only"),
+    Parameter("terms", "integer", "Taylor terms; default: as published; corrected, as many as needed; not for gem"),
+    Parameter("window", "string", "texel or 4sigma; overrides one_texel; for flss and nmm only"),
     Parameter("interpolation", "string", "sinc or linear; for pq and nmm_pq only", "sinc"),
-    Parameter("spacing", "float", "the period d in µm, by default that of the strongest wave along x; for gem only"),
-    Parameter("roughness", "float", "of the highlight, 1/µm; for gem only", "5"),
-    Parameter("shadows", "boolean", "test whether a surface blocks the light", "false"),
+    Parameter("spacing", "float", "period, µm; default: that of the strongest Fourier component along x; for gem only"),
+    Parameter("roughness", "float", "width of the highlight, 1/µm; for gem only", "5"),
+    Parameter("shadows", "boolean", "cast shadow rays", "false"),
     Parameter("diffuse_weight", "float", "weight of a BSDF below the grating; the thesis gives no number", "0.5"),
 )
 
@@ -44,9 +44,9 @@ Parameters (XML or dictionary):
 {listed(PARAMETERS)}
 
 Gratings (`diffraction_grating`, also inside `twosided`, normal and bump maps, masks and blends) are shaded from their
-heights, which must come from a recipe or a profile; of several patches, the first. Rigorous theory and lateral scales
-are refused, and coats are ignored. All other BSDFs are evaluated unchanged. Only direct light of directional and point
-lights is shaded; other lights, the background and interreflection are omitted.
+heights, which must be given by a recipe or a profile; of several patches, the first is used. Rigorous theory and
+lateral scales are refused, and coats are ignored. All other BSDFs are evaluated unchanged. Only direct light of
+directional and point lights is shaded; other lights, the background and interreflection are omitted.
 
 The shader computes RGB. It is converted to a spectrum of that colour (`Emission`), which any film can record; a
 colour outside the gamut of sRGB has negative radiance at some wavelengths. Corrected, FLSS and NMM are in the scene's
