@@ -3,71 +3,23 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..errors import RequestError
-from ..precomputation import Spectrum
 from ..progress import progress_bar
 from ..recipe import Recipe
-from ..settings import FROM_RADIUS
-from .base import nested_plugin
 from .geometry import Geometry, Incidence, Interface, rotated
-from .parameters import Media, Scales, check_texture, numbers_from, surface_from
+from .parameters import GratingRequest
 from .polarisation import reflected, through_layer
 from .tables import BELOW_ONE, larger, limited, opaque, smaller
-from .theory import Options, Scattering, theory_of
+from .theory import Scattering, theory_of
 
 # Of defensive samples, for lobes that the averages of the sampler miss. They are uniform in solid angle: where both
 # directions are grazing, K G grows so fast that samples in proportion to the cosine would have large weights.
 UNIFORM_PROBABILITY = 0.02
 _per_cent = functools.partial(progress_bar, unit="%")
-
-
-@dataclass(frozen=True)
-class GratingRequest:
-    """The parameters of a grating, checked before a spectrum is computed for it.
-
-    Attributes:
-        media: around the grating.
-        scales: of heights and of lengths along the surface.
-        orientation: degrees from the tangent, or from the radius, to the pattern's x axis.
-        from_radius: whether they are from the radius.
-        options: of scalar theory.
-        surface: a spectrum, or the recipe to compute one.
-    """
-
-    media: Media
-    scales: Scales
-    orientation: mi.Texture
-    from_radius: bool
-    options: Options
-    surface: Spectrum | Recipe
-
-    @classmethod
-    def of(cls, props: mi.Properties) -> GratingRequest:
-        """Read the parameters of a scene.
-
-        Raises:
-            RequestError: if one is wrong, or they contradict each other.
-        """
-        media, scales = Media.of(props), Scales(props)
-        angle = props.get("orientation", 0.0)
-        if isinstance(angle, float) and not np.isfinite(angle):
-            raise RequestError(f"orientation: got {angle}, wanted degrees or a texture")
-        from_radius = angle in tuple(FROM_RADIUS)
-        if from_radius:
-            orientation = nested_plugin("uniform", value=FROM_RADIUS[angle])
-        elif isinstance(angle, str):
-            orientation = numbers_from("orientation", angle, 360.0, "radial, tangential, ")
-        else:
-            orientation = props.get_texture("orientation", 0.0)
-        check_texture("orientation", orientation)
-        surface = surface_from(props, media, scales.max_scale)
-        return cls(media, scales, orientation, from_radius, Options.of(props, media), surface)
 
 
 class Grating:
@@ -89,7 +41,7 @@ class Grating:
         surface = request.surface
         self.recipe = surface if isinstance(surface, Recipe) else None
         self.spectrum = surface.cached(_per_cent) if isinstance(surface, Recipe) else surface
-        self.theory = theory_of(props, self.spectrum, request.media, self.scales, request.options)
+        self.theory = theory_of(props, self.spectrum, request)
         # The grating is black at angles that the spectrum does not cover.
         self.min_cosine = opaque(np.cos(np.deg2rad(self.spectrum.largest_angle)) * (1 - 1e-6))
 
