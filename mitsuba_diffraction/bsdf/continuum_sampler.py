@@ -19,7 +19,7 @@ from scipy.special import ndtr
 from ..grating_spectrum import GratingSpectrum
 from ..spectrum.grids import OrderGrid, spline_integral
 from .geometry import Incidence, cell_of
-from .inversion import KAPPA_BINS, CumulativeTable, KappaBins, choose, cumulative_sums, mean_powers, search
+from .inversion import KAPPA_BINS, KappaBins, choose, cumulative_sums, mean_powers, search
 from .tables import NumberTable, PacketTable, ProbabilityTable, larger, limited, opaque
 
 MAX_BIN_SPACING = 0.06  # cycles/µm, to resolve the horizon
@@ -205,8 +205,6 @@ class BinSampler:
         blocks = blocks.swapaxes(1, 2).reshape(*blocks.shape[:3:2], -1, KAPPA_BINS)
         self.blocks_y, self.blocks_x, self.in_block, _ = blocks.shape
         cumulative_x = cumulative_sums(blocks.sum(axis=2))
-        self.cumulative_in_block = CumulativeTable(cumulative_sums(blocks)) if self.in_block > 1 else None
-        self.cumulative_x = CumulativeTable(cumulative_x)
 
         self.incidence_bins = IncidenceBins(spectrum.wavelengths, self.blocks_y, max_tangent)
         row_edges = (np.arange(self.blocks_y + 1) * self.block_height - max_index[1] - 0.5) * spacing[1]
@@ -217,7 +215,10 @@ class BinSampler:
         row = np.arange(self.blocks_y)
         # In float32, as `sample` computes them.
         cumulative_y = cumulative_sums(np.float64(cumulative_x[row, end]) - cumulative_x[row, first])
-        self.cumulative_y = CumulativeTable(cumulative_y)
+        # Sums of one bin of κ lie next to each other.
+        self.cumulative_y, self.cumulative_x, self.cumulative_in_block = (
+            NumberTable(sums.swapaxes(-1, -2)) for sums in (cumulative_y, cumulative_x, cumulative_sums(blocks))
+        )
         self.masses = PacketTable(cumulative_y[:, -1])
         self.ends = NumberTable((first | end << 16).astype(np.uint32))
 
@@ -240,17 +241,20 @@ class BinSampler:
         masses = self.masses(incidence_bin, active)
         kappa_bin, u = choose(self.kappa_bins.weights(incidence) * masses, u)
 
-        zero, mass = mi.Float(0.0), self.masses.component(incidence_bin, kappa_bin, active)
-        row, u = self.cumulative_y.search(incidence_bin, kappa_bin, zero, mass, u, active)
-        line, index_in_block = mi.UInt32(row), mi.Int32(0)
-        ends = self.ends(incidence_bin * self.blocks_y + line)
+        def bin_of(
+            sums: NumberTable, line: mi.UInt32, count: int, ends: tuple[mi.Int32, mi.Int32], u: mi.Float
+        ) -> tuple[mi.Int32, mi.Float]:
+            start = (line * KAPPA_BINS + kappa_bin) * (count + 1)
+            return search(lambda i: sums(start + mi.UInt32(i), active), *ends, count, u)
+
+        zero = mi.Int32(0)
+        row, u = bin_of(self.cumulative_y, incidence_bin, self.blocks_y, (zero, mi.Int32(self.blocks_y)), u)
+        line = mi.UInt32(row)
+        ends = self.ends(incidence_bin * self.blocks_y + line, active)
         ends = mi.Int32(ends & 0xFFFF), mi.Int32(ends >> 16)
-        low, high = (self.cumulative_x.cumulative(line, kappa_bin, end, active) for end in ends)
-        column, x = self.cumulative_x.search(line, kappa_bin, low, high, v.x, active)
-        if self.cumulative_in_block is not None:
-            block = mi.UInt32(row * self.blocks_x + column)
-            mass = self.cumulative_in_block.cumulative(block, kappa_bin, mi.Int32(self.in_block), active)
-            index_in_block, _ = self.cumulative_in_block.search(block, kappa_bin, zero, mass, u, active)
+        column, x = bin_of(self.cumulative_x, line, self.blocks_x, ends, v.x)
+        block, ends = mi.UInt32(row * self.blocks_x + column), (zero, mi.Int32(self.in_block))
+        index_in_block, _ = bin_of(self.cumulative_in_block, block, self.in_block, ends, u)
         m_x = mi.Float(column * self.block_width + index_in_block % self.block_width - self.max_index_x)
         m_y = mi.Float(row * self.block_height + index_in_block // self.block_width - self.max_index_y)
         return mi.Point2f((m_x + x - 0.5) * self.spacing_x, (m_y + v.y - 0.5) * self.spacing_y)
