@@ -14,7 +14,7 @@ from .geometry import Geometry, Incidence, Interface, rotated
 from .parameters import GratingRequest
 from .polarisation import reflected, through_layer
 from .tables import BELOW_ONE, larger, limited, opaque, smaller
-from .theory import Scattering, theory_of
+from .theory import theory_of
 
 # Of defensive samples, for lobes that the averages of the sampler miss. They are uniform in solid angle: where both
 # directions are grazing, K G grows so fast that samples in proportion to the cosine would have large weights.
@@ -44,11 +44,6 @@ class Grating:
         self.theory = theory_of(props, self.spectrum, request)
         # The grating is black at angles that the spectrum does not cover.
         self.min_cosine = opaque(np.cos(np.deg2rad(self.spectrum.largest_angle)) * (1 - 1e-6))
-
-    @property
-    def scattering(self) -> Scattering:
-        """K G S cos θ_o and its sampler."""
-        return self.theory.scattering
 
     @property
     def interface(self) -> Interface:
@@ -107,10 +102,10 @@ class Grating:
         pending = mi.UInt32(0)
         for channel, in_lobe in enumerate(covered):
             frequency = lateral_scale * dr.rcp(self._wavelength(si, channel))
-            in_lobe &= self.scattering.meets(u * frequency, v * frequency, lateral_scale)
+            in_lobe &= self.theory.scattering.meets(u * frequency, v * frequency, lateral_scale)
             pending |= dr.select(active & in_lobe, mi.UInt32(1 << channel), 0)
         # Most directions lie outside of all lobes at all wavelengths; unless drawn, they skip the branch.
-        needed = pending != 0 if self.scattering.resolved and not wo_is_sample else True
+        needed = pending != 0 if self.theory.scattering.resolved and not wo_is_sample else True
         # Arguments without derivatives are bound here: Dr.Jit passes all other state through the branch.
         diffracted = functools.partial(self._diffracted, si, pending, active)
         if needed:
@@ -288,7 +283,7 @@ class Grating:
         k_o = interface.scattered(k_i, reflects)
         incidence = Incidence.of(k_i, k_o, interface, height_scale)
         incidence = incidence.at(dr.detach(wavelength / lateral_scale), dr.detach(lateral_scale))
-        q, propagates = self.scattering.sample(incidence, rest, v, active & ~uniform)
+        q, propagates = self.theory.scattering.sample(incidence, rest, v, active & ~uniform)
         tangent = k_o.tangent - incidence.wavelength * incidence.q_sign * q
         wo = rotated(mi.Vector3f(*tangent, 0), -sin, cos) / k_o.index
         wo.z = dr.select(propagates, dr.safe_sqrt(1 - dr.square(wo.x) - dr.square(wo.y)), 0)

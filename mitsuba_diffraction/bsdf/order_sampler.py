@@ -217,10 +217,8 @@ class OrderSampler:
         order = start + mi.UInt32(row * columns + column)
         return (self.cumulative(order + 1, active) - self.cumulative(order, active)) * (1 / PROBABILITY_UNITS)
 
-    def sample(
-        self, incidence: Incidence, u: mi.Float, v: mi.Point2f, active: mi.Bool
-    ) -> tuple[mi.Int32, mi.Int32, mi.Point2f]:
-        """Draw an order for one wavelength from `u`; return it and `v`, which is unused."""
+    def sample(self, incidence: Incidence, u: mi.Float, active: mi.Bool) -> tuple[mi.Int32, mi.Int32]:
+        """Draw an order for one wavelength."""
         start, first_x, first_y, columns, rows = self._bin(incidence, active)
 
         def cumulative(index: mi.Int32) -> mi.Float:
@@ -229,7 +227,7 @@ class OrderSampler:
         index, _ = search(cumulative, mi.Int32(0), columns * rows, int(np.prod(2 * self.max_order + 1)), u)
         # In masked lanes the number of columns is zero.
         row = mi.Int32((mi.Float(index) + 0.5) / larger(mi.Float(columns), 1))
-        return first_x + index - row * columns, first_y + row, v
+        return first_x + index - row * columns, first_y + row
 
     def transmitted_fraction(self, omega: mi.Vector3f) -> mi.Float:
         """Return the transmitted fraction of power, ω along the pattern's axes."""

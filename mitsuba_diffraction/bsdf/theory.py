@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import logging
 from typing import Protocol, cast
 
@@ -30,15 +31,12 @@ from .shared import SharedTables
 from .tables import opaque
 
 _log = logging.getLogger(__name__)
-_warned: set[str] = set()  # warnings that were logged, each once
 
 
-def _warn_of_range(spectrum: GratingSpectrum) -> None:
-    """Log a warning, once for each surface, if scalar theory is inaccurate for it."""
-    message = f"diffraction_grating, {spectrum.source}: {spectrum.warning}"
-    if spectrum.warning and message not in _warned:
-        _warned.add(message)
-        _log.warning("%s", message)
+@functools.cache
+def _warn_of_range(source: str, warning: str) -> None:
+    """Log a warning, once for each surface."""
+    _log.warning("diffraction_grating, %s: %s", source, warning)
 
 
 class Scattering(Protocol):
@@ -138,7 +136,8 @@ class ScalarTheory(Theory):
     """
 
     def __init__(self, spectrum: GratingSpectrum, request: GratingRequest) -> None:
-        _warn_of_range(spectrum)
+        if spectrum.warning:
+            _warn_of_range(spectrum.source, spectrum.warning)
         self.spectrum, self.media, self.scales = spectrum, request.media, request.scales
         self.material, self.shadowing = request.material, request.shadowing
         self.conserve_energy = request.conserve_energy
