@@ -19,7 +19,16 @@ from scipy.special import ndtr
 from ..grating_spectrum import GratingSpectrum
 from ..spectrum.grids import OrderGrid, spline_integral
 from .geometry import Incidence, cell_of
-from .inversion import KAPPA_BINS, KappaBins, choose, cumulative_sums, mean_powers, search
+from .inversion import (
+    KAPPA_BINS,
+    KappaBins,
+    choose,
+    cumulative_sums,
+    direction_bin,
+    direction_borders,
+    mean_powers,
+    search,
+)
 from .tables import NumberTable, PacketTable, ProbabilityTable, larger, limited, opaque
 
 MAX_BIN_SPACING = 0.06  # cycles/µm, to resolve the horizon
@@ -62,29 +71,18 @@ class BinAxis:
         return cls(spacing, max_index, np.diff(below, axis=0))
 
 
+COARSE, FINE = 16, 45  # bins along a side of the square of directions
+FREQUENCY_BINS = 4
+MAX_ROWS_OF_FINE = 48  # of blocks in a region; with more, the regions of so many bins would take much memory
 _MAX_BORDER_STEP = 0.02  # between the points that represent the border of a bin of s
 _BORDER_MARGIN = 1e-4  # for rounding at run time
 
 
-@dataclass(frozen=True)
-class _Resolution:
-    """The numbers of bins of incident light.
-
-    Bins are equidistant in cos θ_i, in azimuth and in 1/λ; in θ_i they are therefore finest at grazing incidence, where
-    the mirror direction is near the horizon.
-    """
-
-    cosines: int
-    azimuths: int
-    frequencies: int
-
-
-COARSE, FINE = _Resolution(8, 32, 4), _Resolution(32, 64, 4)
-MAX_ROWS_OF_FINE = 48  # of blocks in a region; with more, the regions of so many bins would take much memory
-
-
 class IncidenceBins:
-    """Bins of cos θ_i, azimuth and 1/λ of incident light, and the region of q that propagates for each."""
+    """Bins of direction and 1/λ of incident light, and the region of q that propagates for each.
+
+    Directions are mapped to the square of `energy/table.py`.
+    """
 
     def __init__(self, wavelengths: tuple[float, float], rows: int, max_tangent: float = 1.0) -> None:
         """Make the bins.
@@ -95,18 +93,16 @@ class IncidenceBins:
             max_tangent: the maximum of |k_i,∥|/n_o.
         """
         self._max_tangent = max_tangent
-        self.resolution = FINE if rows <= MAX_ROWS_OF_FINE else COARSE
+        self.side = FINE if rows <= MAX_ROWS_OF_FINE else COARSE
         self._first, self._last = 1e3 / wavelengths[1], 1e3 / wavelengths[0]
         self.first = opaque(self._first)
-        self.per_frequency = opaque(self.resolution.frequencies / (self._last - self._first))
+        self.per_frequency = opaque(FREQUENCY_BINS / (self._last - self._first))
 
     def bin(self, incidence: Incidence) -> mi.UInt32:
         """Return the index of the bin of incident light; that of the nearest bin if it lies outside all of them."""
-        tangent, bins = incidence.tangent, self.resolution
-        cosine, _ = cell_of(incidence.cosine * bins.cosines, bins.cosines)
-        azimuth_bin, _ = cell_of((azimuth(tangent.x, tangent.y) + 2) * (bins.azimuths / 4), bins.azimuths)
-        frequency, _ = cell_of((incidence.radius - self.first) * self.per_frequency, bins.frequencies)
-        return (frequency * bins.cosines + cosine) * bins.azimuths + azimuth_bin
+        column, row = direction_bin(mi.Vector3f(*incidence.tangent, incidence.cosine), self.side)
+        frequency, _ = cell_of((incidence.radius - self.first) * self.per_frequency, FREQUENCY_BINS)
+        return (frequency * self.side + row) * self.side + column
 
     def columns(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the interval of q_x that propagates for some q_y of a row, low ≤ q_y ≤ high (rows,), all in cycles/µm.
@@ -114,45 +110,20 @@ class IncidenceBins:
         Returns:
             (bins, rows, 2), the minimum and maximum of q_x; where nothing propagates, the minimum is larger.
         """
-        bins = self.resolution
-        frequency = np.linspace(self._first, self._last, bins.frequencies + 1)[1:, None]
+        frequency = np.linspace(self._first, self._last, FREQUENCY_BINS + 1)[1:, None]
         frequency, low, high = (np.asarray(x, np.float32) for x in (frequency, low, high))
-        result = np.empty((bins.frequencies, bins.cosines, bins.azimuths, len(low), 2))
+        result = np.empty((FREQUENCY_BINS, self.side**2, len(low), 2))
         # The discs of points on the border are enlarged to cover those of points up to half a step away.
         square = (1 + _MAX_BORDER_STEP / 2 + _BORDER_MARGIN) ** 2
-        for cosine, azimuth in np.ndindex(bins.cosines, bins.azimuths):
-            s_x, s_y = (self._max_tangent * s[:, None, None].astype(np.float32) for s in _border(bins, cosine, azimuth))
+        # Near the normal a side of a bin is about 2√2 · 2/`side` long, elsewhere shorter.
+        borders = self._max_tangent * direction_borders(self.side, int(np.ceil(5.7 / self.side / _MAX_BORDER_STEP)))
+        for bin_, border in enumerate(borders.astype(np.float32)):
+            s_x, s_y = border.T[:, :, None, None]
             y = np.clip(0, low / frequency + s_y, high / frequency + s_y)
             half = np.where(y**2 < square, np.sqrt(np.maximum(square - y**2, 0)), -np.inf)
-            result[:, cosine, azimuth, :, 0] = frequency * (-s_x - half).min(axis=0)
-            result[:, cosine, azimuth, :, 1] = frequency * (half - s_x).max(axis=0)
+            result[:, bin_, :, 0] = frequency * (-s_x - half).min(axis=0)
+            result[:, bin_, :, 1] = frequency * (half - s_x).max(axis=0)
         return result.reshape(-1, len(low), 2)
-
-
-def azimuth(x: mi.Float, y: mi.Float) -> mi.Float:
-    """Return the position on the square |x| + |y| = 1, from −2 to 2: a measure of azimuth without an arc tangent."""
-    along = x / larger(dr.abs(x) + dr.abs(y), 1e-12)
-    return dr.select(y >= 0, 1 - along, along - 1)
-
-
-def angle_of_azimuth(position: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the angle in radians from its `azimuth`."""
-    along = 1 - np.abs(position)
-    return np.arctan2(np.sign(position) * (1 - np.abs(along)), along)
-
-
-def _border(bins: _Resolution, cosine: int, azimuth: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return s_x and s_y (n,) of points on the border of a bin, at most `_MAX_BORDER_STEP` apart."""
-    radius = np.sqrt(1 - (np.array([cosine + 1, cosine]) / bins.cosines) ** 2)
-    # An arc is at most twice as long as its part of the square.
-    ends = (azimuth + np.linspace(0, 1, int(np.ceil(8 / bins.azimuths / _MAX_BORDER_STEP)) + 1)) / (
-        bins.azimuths / 4
-    ) - 2
-    angle = angle_of_azimuth(ends)
-    sides = np.linspace(*radius, int(np.ceil((radius[1] - radius[0]) / _MAX_BORDER_STEP)) + 1)
-    r = np.concatenate([np.repeat(radius, len(angle)), sides, sides])
-    a = np.concatenate([angle, angle, np.repeat(angle[[0, -1]], len(sides))])
-    return r * np.cos(a), r * np.sin(a)
 
 
 MAX_BIN_WIDTH = 2.0  # in σ_q

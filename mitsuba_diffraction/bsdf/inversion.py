@@ -1,4 +1,4 @@
-"""Common parts of the samplers: a mixture over a few bins of κ, and inversion of cumulative sums.
+"""Common parts of the samplers: a mixture over a few bins of κ, bins of directions, inversion of cumulative sums.
 
 The optimal density of q is proportional to S(q; κ), but κ = 2π (cos θ_i + cos θ_o)/λ is known only once q is. For all
 outgoing directions cos θ_i ≤ κλ/2π ≤ 1 + cos θ_i. If cos θ_o has the density 2 cos θ_o, that of a diffuse surface, the
@@ -19,8 +19,9 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..energy.table import Layout
 from ..grating_spectrum import GratingSpectrum
-from .geometry import Incidence
+from .geometry import Incidence, cell_of, on_square
 from .tables import BELOW_ONE, larger, limited, opaque
 
 KAPPA_BINS = 4  # the components of a packet
@@ -81,6 +82,20 @@ def choose(weights: mi.Vector4f, u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
         start, end = dr.select(past, ends[bin_ - 1], start), dr.select(past, ends[bin_], end)
     # In a masked lane all weights are zero.
     return chosen, limited((x - start) / larger(end - start, 1e-30), 0, BELOW_ONE)
+
+
+def direction_bin(omega: mi.Vector3f, side: mi.Float | int) -> list[mi.UInt32]:
+    """Return the column and row of ω in bins on the square of `energy/table.py`, `side` along each side."""
+    return [cell_of(side * coordinate, side)[0] for coordinate in on_square(omega)]
+
+
+def direction_borders(side: int, steps: int) -> NDArray[np.float64]:
+    """Return ω_∥ of points on the borders of these bins, each of its sides divided in `steps`: (bins, points, 2)."""
+    along = np.linspace(0, 1, steps + 1)
+    points = [point for t in along for point in ((0, 0, t), (0, 1, t), (0, t, 0), (0, t, 1))]
+    corners = np.indices((1, side, side)).reshape(3, -1).T
+    omega, _ = Layout(0.0, 1, side, 1, 2, (1.0, 2.0)).directions((corners[:, None] + points).reshape(-1, 3))
+    return omega[:, :2].reshape(len(corners), -1, 2)
 
 
 def search(
