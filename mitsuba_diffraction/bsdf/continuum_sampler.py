@@ -55,10 +55,8 @@ class BinAxis:
         grid, sigma = spectrum.grid, spectrum.lobe_width
         nodes = grid.frequencies()[axis]
         if isinstance(grid, OrderGrid):
-            node_spacing, half_width = (
-                1 / grid.tile_size[axis],
-                min(spectrum.lobes[axis].half_width, LOBE_CUTOFF * sigma),
-            )
+            node_spacing = 1 / grid.tile_size[axis]
+            half_width = min(spectrum.lobes[axis].half_width, LOBE_CUTOFF * sigma)
         else:
             node_spacing, half_width = grid.spacing[axis], 1.5 * grid.spacing[axis]
         spacing = node_spacing / np.ceil(node_spacing / min(max_width * sigma, MAX_BIN_SPACING))
@@ -156,12 +154,8 @@ class BinSampler:
             int(np.clip(round(BLOCK_WIDTH / s), 1, count))
             for s, count in zip(spacing, probabilities.shape[1::-1], strict=True)
         )
-        pad = (
-            (0, -probabilities.shape[0] % self.block_height),
-            (0, -probabilities.shape[1] % self.block_width),
-            (0, 0),
-        )
-        self.probabilities = ProbabilityTable(np.pad(probabilities, pad))
+        pad_y, pad_x = -probabilities.shape[0] % self.block_height, -probabilities.shape[1] % self.block_width
+        self.probabilities = ProbabilityTable(np.pad(probabilities, ((0, pad_y), (0, pad_x), (0, 0))))
         probabilities = np.float64(self.probabilities.values)
         self.rows, self.columns = probabilities.shape[:2]
         self.max_index_x, self.max_index_y = max_index
@@ -257,22 +251,15 @@ class LineSampler:
     def __init__(self, spectrum: GratingSpectrum, typical_max_kappa: float | None = None) -> None:
         self.along_x = spectrum.grid.shape[0] == 1
         axis = BinAxis.of(spectrum, 0 if self.along_x else 1, MAX_LINE_BIN_WIDTH)
-        self.kappa_bins, self.max_index, self.count = (
-            KappaBins(spectrum.max_kappa, typical_max_kappa),
-            axis.max_index,
-            len(axis.integrals),
-        )
-        probabilities = (
-            axis.integrals @ mean_powers(spectrum, self.kappa_bins, UNIFORM_LINE_FRACTION).reshape(KAPPA_BINS, -1).T
-        )
-        self.probabilities = ProbabilityTable(np.maximum(probabilities, 0))
+        self.kappa_bins = KappaBins(spectrum.max_kappa, typical_max_kappa)
+        self.max_index, self.count = axis.max_index, len(axis.integrals)
+        powers = mean_powers(spectrum, self.kappa_bins, UNIFORM_LINE_FRACTION).reshape(KAPPA_BINS, -1)
+        self.probabilities = ProbabilityTable(np.maximum(axis.integrals @ powers.T, 0))
         # Cumulative sums of A_j.
         self.cumulative = PacketTable(cumulative_sums(np.float64(self.probabilities.values)))
         self.spacing, self.per_q = opaque(axis.spacing), opaque(1 / axis.spacing)
-        self.half_width, self.limit = (
-            opaque(LOBE_CUTOFF * spectrum.lobe_width),
-            _cumulative(LOBE_CUTOFF / STUDENT_SCALE),
-        )
+        self.half_width = opaque(LOBE_CUTOFF * spectrum.lobe_width)
+        self.limit = _cumulative(LOBE_CUTOFF / STUDENT_SCALE)
         per_scale = 1 / (STUDENT_SCALE * spectrum.lobe_width)
         self.per_scale, self.per_area = opaque(per_scale), opaque(per_scale / axis.spacing)
 
