@@ -251,10 +251,18 @@ def _packed_cumulative(
         for n, begin, count in zip(p.shape[:0:-1], first.T, size.T, strict=True)
     )
     inside = (of_y[:, :, None] & of_x[:, None]).reshape(len(p), -1)
-    p = p.reshape(len(p), -1).astype(np.float64)
-    p = (1 - UNIFORM_FRACTION) * p / np.maximum(
-        p.sum(1, keepdims=True), 1e-30
-    ) + UNIFORM_FRACTION * inside / inside.sum(1, keepdims=True)
-    sums = np.rint(PROBABILITY_UNITS * p.cumsum(1) / p.sum(1, keepdims=True))
+    sums = cumulative_units(p.reshape(len(p), -1).astype(np.float64), inside)
     count = size.prod(1) + 1
-    return np.insert(sums, 0, 0, 1)[np.insert(inside, 0, True, 1)], count.cumsum() - count
+    return sums[np.insert(inside, 0, True, 1)], count.cumsum() - count
+
+
+def cumulative_units(p: NDArray[np.float64], possible: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Return cumulative sums of P_m in units of 2⁻²⁴, of which float32 has exact differences, beginning with zero.
+
+    P_m is proportional to `p`, but for `UNIFORM_FRACTION`, which is divided equally among the `possible` orders:
+    (..., orders) → (..., orders + 1).
+    """
+    p = (1 - UNIFORM_FRACTION) * p / np.maximum(p.sum(axis=-1, keepdims=True), 1e-30)
+    p += UNIFORM_FRACTION * possible / possible.sum(axis=-1, keepdims=True)
+    sums = np.rint(PROBABILITY_UNITS * p.cumsum(axis=-1) / p.sum(axis=-1, keepdims=True))
+    return np.insert(sums, 0, 0, axis=-1)
