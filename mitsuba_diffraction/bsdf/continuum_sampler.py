@@ -19,7 +19,16 @@ from scipy.special import ndtr
 from ..grating_spectrum import GratingSpectrum
 from ..spectrum.grids import OrderGrid, spline_integral
 from .geometry import Incidence, cell_of
-from .inversion import KAPPA_BINS, CumulativeTable, KappaBins, choose, cumulative_sums, mean_powers, search
+from .inversion import (
+    KAPPA_BINS,
+    KappaBins,
+    choose,
+    cumulative_sums,
+    direction_bin,
+    direction_borders,
+    mean_powers,
+    search,
+)
 from .tables import NumberTable, PacketTable, ProbabilityTable, larger, limited, opaque
 
 MAX_BIN_SPACING = 0.06  # cycles/µm, to resolve the horizon
@@ -46,10 +55,8 @@ class BinAxis:
         grid, sigma = spectrum.grid, spectrum.lobe_width
         nodes = grid.frequencies()[axis]
         if isinstance(grid, OrderGrid):
-            node_spacing, half_width = (
-                1 / grid.tile_size[axis],
-                min(spectrum.lobes[axis].half_width, LOBE_CUTOFF * sigma),
-            )
+            node_spacing = 1 / grid.tile_size[axis]
+            half_width = min(spectrum.lobes[axis].half_width, LOBE_CUTOFF * sigma)
         else:
             node_spacing, half_width = grid.spacing[axis], 1.5 * grid.spacing[axis]
         spacing = node_spacing / np.ceil(node_spacing / min(max_width * sigma, MAX_BIN_SPACING))
@@ -62,29 +69,18 @@ class BinAxis:
         return cls(spacing, max_index, np.diff(below, axis=0))
 
 
+COARSE, FINE = 16, 45  # bins along a side of the square of directions
+FREQUENCY_BINS = 4
+MAX_ROWS_OF_FINE = 48  # of blocks in a region; with more, the regions of so many bins would take much memory
 _MAX_BORDER_STEP = 0.02  # between the points that represent the border of a bin of s
 _BORDER_MARGIN = 1e-4  # for rounding at run time
 
 
-@dataclass(frozen=True)
-class _Resolution:
-    """The numbers of bins of incident light.
-
-    Bins are equidistant in cos θ_i, in azimuth and in 1/λ; in θ_i they are therefore finest at grazing incidence, where
-    the mirror direction is near the horizon.
-    """
-
-    cosines: int
-    azimuths: int
-    frequencies: int
-
-
-COARSE, FINE = _Resolution(8, 32, 4), _Resolution(32, 64, 4)
-MAX_ROWS_OF_FINE = 48  # of blocks in a region; with more, the regions of so many bins would take much memory
-
-
 class IncidenceBins:
-    """Bins of cos θ_i, azimuth and 1/λ of incident light, and the region of q that propagates for each."""
+    """Bins of direction and 1/λ of incident light, and the region of q that propagates for each.
+
+    Directions are mapped to the square of `energy/table.py`.
+    """
 
     def __init__(self, wavelengths: tuple[float, float], rows: int, max_tangent: float = 1.0) -> None:
         """Make the bins.
@@ -95,18 +91,16 @@ class IncidenceBins:
             max_tangent: the maximum of |k_i,∥|/n_o.
         """
         self._max_tangent = max_tangent
-        self.resolution = FINE if rows <= MAX_ROWS_OF_FINE else COARSE
+        self.side = FINE if rows <= MAX_ROWS_OF_FINE else COARSE
         self._first, self._last = 1e3 / wavelengths[1], 1e3 / wavelengths[0]
         self.first = opaque(self._first)
-        self.per_frequency = opaque(self.resolution.frequencies / (self._last - self._first))
+        self.per_frequency = opaque(FREQUENCY_BINS / (self._last - self._first))
 
     def bin(self, incidence: Incidence) -> mi.UInt32:
         """Return the index of the bin of incident light; that of the nearest bin if it lies outside all of them."""
-        tangent, bins = incidence.tangent, self.resolution
-        cosine, _ = cell_of(incidence.cosine * bins.cosines, bins.cosines)
-        azimuth_bin, _ = cell_of((azimuth(tangent.x, tangent.y) + 2) * (bins.azimuths / 4), bins.azimuths)
-        frequency, _ = cell_of((incidence.radius - self.first) * self.per_frequency, bins.frequencies)
-        return (frequency * bins.cosines + cosine) * bins.azimuths + azimuth_bin
+        column, row = direction_bin(mi.Vector3f(*incidence.tangent, incidence.cosine), self.side)
+        frequency, _ = cell_of((incidence.radius - self.first) * self.per_frequency, FREQUENCY_BINS)
+        return (frequency * self.side + row) * self.side + column
 
     def columns(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the interval of q_x that propagates for some q_y of a row, low ≤ q_y ≤ high (rows,), all in cycles/µm.
@@ -114,45 +108,20 @@ class IncidenceBins:
         Returns:
             (bins, rows, 2), the minimum and maximum of q_x; where nothing propagates, the minimum is larger.
         """
-        bins = self.resolution
-        frequency = np.linspace(self._first, self._last, bins.frequencies + 1)[1:, None]
+        frequency = np.linspace(self._first, self._last, FREQUENCY_BINS + 1)[1:, None]
         frequency, low, high = (np.asarray(x, np.float32) for x in (frequency, low, high))
-        result = np.empty((bins.frequencies, bins.cosines, bins.azimuths, len(low), 2))
+        result = np.empty((FREQUENCY_BINS, self.side**2, len(low), 2))
         # The discs of points on the border are enlarged to cover those of points up to half a step away.
         square = (1 + _MAX_BORDER_STEP / 2 + _BORDER_MARGIN) ** 2
-        for cosine, azimuth in np.ndindex(bins.cosines, bins.azimuths):
-            s_x, s_y = (self._max_tangent * s[:, None, None].astype(np.float32) for s in _border(bins, cosine, azimuth))
+        # Near the normal a side of a bin is about 2√2 · 2/`side` long, elsewhere shorter.
+        borders = self._max_tangent * direction_borders(self.side, int(np.ceil(5.7 / self.side / _MAX_BORDER_STEP)))
+        for bin_, border in enumerate(borders.astype(np.float32)):
+            s_x, s_y = border.T[:, :, None, None]
             y = np.clip(0, low / frequency + s_y, high / frequency + s_y)
             half = np.where(y**2 < square, np.sqrt(np.maximum(square - y**2, 0)), -np.inf)
-            result[:, cosine, azimuth, :, 0] = frequency * (-s_x - half).min(axis=0)
-            result[:, cosine, azimuth, :, 1] = frequency * (half - s_x).max(axis=0)
+            result[:, bin_, :, 0] = frequency * (-s_x - half).min(axis=0)
+            result[:, bin_, :, 1] = frequency * (half - s_x).max(axis=0)
         return result.reshape(-1, len(low), 2)
-
-
-def azimuth(x: mi.Float, y: mi.Float) -> mi.Float:
-    """Return the position on the square |x| + |y| = 1, from −2 to 2: a measure of azimuth without an arc tangent."""
-    along = x / larger(dr.abs(x) + dr.abs(y), 1e-12)
-    return dr.select(y >= 0, 1 - along, along - 1)
-
-
-def angle_of_azimuth(position: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the angle in radians from its `azimuth`."""
-    along = 1 - np.abs(position)
-    return np.arctan2(np.sign(position) * (1 - np.abs(along)), along)
-
-
-def _border(bins: _Resolution, cosine: int, azimuth: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return s_x and s_y (n,) of points on the border of a bin, at most `_MAX_BORDER_STEP` apart."""
-    radius = np.sqrt(1 - (np.array([cosine + 1, cosine]) / bins.cosines) ** 2)
-    # An arc is at most twice as long as its part of the square.
-    ends = (azimuth + np.linspace(0, 1, int(np.ceil(8 / bins.azimuths / _MAX_BORDER_STEP)) + 1)) / (
-        bins.azimuths / 4
-    ) - 2
-    angle = angle_of_azimuth(ends)
-    sides = np.linspace(*radius, int(np.ceil((radius[1] - radius[0]) / _MAX_BORDER_STEP)) + 1)
-    r = np.concatenate([np.repeat(radius, len(angle)), sides, sides])
-    a = np.concatenate([angle, angle, np.repeat(angle[[0, -1]], len(sides))])
-    return r * np.cos(a), r * np.sin(a)
 
 
 MAX_BIN_WIDTH = 2.0  # in σ_q
@@ -185,12 +154,8 @@ class BinSampler:
             int(np.clip(round(BLOCK_WIDTH / s), 1, count))
             for s, count in zip(spacing, probabilities.shape[1::-1], strict=True)
         )
-        pad = (
-            (0, -probabilities.shape[0] % self.block_height),
-            (0, -probabilities.shape[1] % self.block_width),
-            (0, 0),
-        )
-        self.probabilities = ProbabilityTable(np.pad(probabilities, pad))
+        pad_y, pad_x = -probabilities.shape[0] % self.block_height, -probabilities.shape[1] % self.block_width
+        self.probabilities = ProbabilityTable(np.pad(probabilities, ((0, pad_y), (0, pad_x), (0, 0))))
         probabilities = np.float64(self.probabilities.values)
         self.rows, self.columns = probabilities.shape[:2]
         self.max_index_x, self.max_index_y = max_index
@@ -205,8 +170,6 @@ class BinSampler:
         blocks = blocks.swapaxes(1, 2).reshape(*blocks.shape[:3:2], -1, KAPPA_BINS)
         self.blocks_y, self.blocks_x, self.in_block, _ = blocks.shape
         cumulative_x = cumulative_sums(blocks.sum(axis=2))
-        self.cumulative_in_block = CumulativeTable(cumulative_sums(blocks)) if self.in_block > 1 else None
-        self.cumulative_x = CumulativeTable(cumulative_x)
 
         self.incidence_bins = IncidenceBins(spectrum.wavelengths, self.blocks_y, max_tangent)
         row_edges = (np.arange(self.blocks_y + 1) * self.block_height - max_index[1] - 0.5) * spacing[1]
@@ -217,7 +180,10 @@ class BinSampler:
         row = np.arange(self.blocks_y)
         # In float32, as `sample` computes them.
         cumulative_y = cumulative_sums(np.float64(cumulative_x[row, end]) - cumulative_x[row, first])
-        self.cumulative_y = CumulativeTable(cumulative_y)
+        # Sums of one bin of κ lie next to each other.
+        self.cumulative_y, self.cumulative_x, self.cumulative_in_block = (
+            NumberTable(sums.swapaxes(-1, -2)) for sums in (cumulative_y, cumulative_x, cumulative_sums(blocks))
+        )
         self.masses = PacketTable(cumulative_y[:, -1])
         self.ends = NumberTable((first | end << 16).astype(np.uint32))
 
@@ -240,17 +206,20 @@ class BinSampler:
         masses = self.masses(incidence_bin, active)
         kappa_bin, u = choose(self.kappa_bins.weights(incidence) * masses, u)
 
-        zero, mass = mi.Float(0.0), self.masses.component(incidence_bin, kappa_bin, active)
-        row, u = self.cumulative_y.search(incidence_bin, kappa_bin, zero, mass, u, active)
-        line, index_in_block = mi.UInt32(row), mi.Int32(0)
-        ends = self.ends(incidence_bin * self.blocks_y + line)
+        def bin_of(
+            sums: NumberTable, line: mi.UInt32, count: int, ends: tuple[mi.Int32, mi.Int32], u: mi.Float
+        ) -> tuple[mi.Int32, mi.Float]:
+            start = (line * KAPPA_BINS + kappa_bin) * (count + 1)
+            return search(lambda i: sums(start + mi.UInt32(i), active), *ends, count, u)
+
+        zero = mi.Int32(0)
+        row, u = bin_of(self.cumulative_y, incidence_bin, self.blocks_y, (zero, mi.Int32(self.blocks_y)), u)
+        line = mi.UInt32(row)
+        ends = self.ends(incidence_bin * self.blocks_y + line, active)
         ends = mi.Int32(ends & 0xFFFF), mi.Int32(ends >> 16)
-        low, high = (self.cumulative_x.cumulative(line, kappa_bin, end, active) for end in ends)
-        column, x = self.cumulative_x.search(line, kappa_bin, low, high, v.x, active)
-        if self.cumulative_in_block is not None:
-            block = mi.UInt32(row * self.blocks_x + column)
-            mass = self.cumulative_in_block.cumulative(block, kappa_bin, mi.Int32(self.in_block), active)
-            index_in_block, _ = self.cumulative_in_block.search(block, kappa_bin, zero, mass, u, active)
+        column, x = bin_of(self.cumulative_x, line, self.blocks_x, ends, v.x)
+        block, ends = mi.UInt32(row * self.blocks_x + column), (zero, mi.Int32(self.in_block))
+        index_in_block, _ = bin_of(self.cumulative_in_block, block, self.in_block, ends, u)
         m_x = mi.Float(column * self.block_width + index_in_block % self.block_width - self.max_index_x)
         m_y = mi.Float(row * self.block_height + index_in_block // self.block_width - self.max_index_y)
         return mi.Point2f((m_x + x - 0.5) * self.spacing_x, (m_y + v.y - 0.5) * self.spacing_y)
@@ -282,22 +251,15 @@ class LineSampler:
     def __init__(self, spectrum: GratingSpectrum, typical_max_kappa: float | None = None) -> None:
         self.along_x = spectrum.grid.shape[0] == 1
         axis = BinAxis.of(spectrum, 0 if self.along_x else 1, MAX_LINE_BIN_WIDTH)
-        self.kappa_bins, self.max_index, self.count = (
-            KappaBins(spectrum.max_kappa, typical_max_kappa),
-            axis.max_index,
-            len(axis.integrals),
-        )
-        probabilities = (
-            axis.integrals @ mean_powers(spectrum, self.kappa_bins, UNIFORM_LINE_FRACTION).reshape(KAPPA_BINS, -1).T
-        )
-        self.probabilities = ProbabilityTable(np.maximum(probabilities, 0))
+        self.kappa_bins = KappaBins(spectrum.max_kappa, typical_max_kappa)
+        self.max_index, self.count = axis.max_index, len(axis.integrals)
+        powers = mean_powers(spectrum, self.kappa_bins, UNIFORM_LINE_FRACTION).reshape(KAPPA_BINS, -1)
+        self.probabilities = ProbabilityTable(np.maximum(axis.integrals @ powers.T, 0))
         # Cumulative sums of A_j.
         self.cumulative = PacketTable(cumulative_sums(np.float64(self.probabilities.values)))
         self.spacing, self.per_q = opaque(axis.spacing), opaque(1 / axis.spacing)
-        self.half_width, self.limit = (
-            opaque(LOBE_CUTOFF * spectrum.lobe_width),
-            _cumulative(LOBE_CUTOFF / STUDENT_SCALE),
-        )
+        self.half_width = opaque(LOBE_CUTOFF * spectrum.lobe_width)
+        self.limit = _cumulative(LOBE_CUTOFF / STUDENT_SCALE)
         per_scale = 1 / (STUDENT_SCALE * spectrum.lobe_width)
         self.per_scale, self.per_area = opaque(per_scale), opaque(per_scale / axis.spacing)
 

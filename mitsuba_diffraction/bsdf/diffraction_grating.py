@@ -12,8 +12,8 @@ from ..manual import Parameter, listed
 from ..recipe import Recipe, parameters_of_profile
 from ..surface.gratings import PROFILES
 from .base import base_from
-from .grating import GratingRequest
 from .layers import Layers
+from .parameters import GratingRequest
 
 PARAMETERS = (
     Parameter("filename", "string", "a saved spectrum (.exr) or a recipe (.toml)"),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -19,8 +18,8 @@ from .coat import Coat, absolute_index
 MODELS = ("exact", "schlick")
 
 
-class Material(Protocol):
-    """The reflectance of a material.
+class Material:
+    """The reflectance of a material; by default it has no index and no parameters.
 
     Attributes:
         transparent: whether transmitted light is not absorbed.
@@ -29,20 +28,18 @@ class Material(Protocol):
         eta: relative index of refraction; of a metal its real part, as a texture.
     """
 
-    transparent: bool
-    wavelengths: tuple[float, float]
-
-    @property
-    def model(self) -> str: ...
-
-    @property
-    def eta(self) -> mi.Float | mi.Texture | None: ...
+    transparent: bool = False
+    wavelengths: tuple[float, float] = (0.0, np.inf)
+    model: str = "exact"
+    eta: mi.Float | mi.Texture | None = None
 
     def __call__(self, si: mi.SurfaceInteraction3f, cos_half: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
         """Return R at the cosine ω_i·h."""
+        raise NotImplementedError
 
     def index(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> list[mi.Complex2f] | None:
-        """Return n + ik of each wavelength; None if the model has no polarisation."""
+        """Return n + ik of each wavelength; None if the model, as Schlick's formula, has no polarisation."""
+        return None
 
     def update(self) -> None:
         """Recompute what depends on the parameters."""
@@ -77,10 +74,8 @@ def reflectance_from(props: mi.Properties, coat: Coat | None) -> Material:
     return Conductor(material, model, outside)
 
 
-class PerfectMirror:
+class PerfectMirror(Material):
     """R = 1."""
-
-    transparent, wavelengths, model, eta = False, (0.0, np.inf), "exact", None
 
     def __init__(self, name: str = "none (R = 1)") -> None:
         self.name = name
@@ -88,23 +83,14 @@ class PerfectMirror:
     def __call__(self, si: mi.SurfaceInteraction3f, cos_half: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
         return mi.UnpolarizedSpectrum(1.0)
 
-    def index(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> None:
-        """Return None: a perfect mirror has no index."""
-
-    def update(self) -> None:
-        pass
-
-    def traverse(self, callback: mi.TraversalCallback) -> None:
-        pass
-
     def __repr__(self) -> str:
         return self.name
 
 
-class Dielectric:
+class Dielectric(Material):
     """A dielectric of relative index η without absorption or dispersion, as Mitsuba's `dielectric`."""
 
-    transparent, wavelengths = True, (0.0, np.inf)
+    transparent = True
 
     def __init__(self, int_ior: float | str, ext_ior: float | str, model: str) -> None:
         self.eta = mi.Float(absolute_index("int_ior", int_ior) / absolute_index("ext_ior", ext_ior))
@@ -121,7 +107,6 @@ class Dielectric:
         return mi.UnpolarizedSpectrum(_schlick(dr.square((self.eta - 1) / (self.eta + 1)), cos_half))
 
     def index(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> list[mi.Complex2f] | None:
-        """Return n + ik of each wavelength; None with Schlick's formula, which has no polarisation."""
         return None if self.model == "schlick" else [mi.Complex2f(self.eta, 0)] * len(mi.UnpolarizedSpectrum(0.0))
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
@@ -131,10 +116,10 @@ class Dielectric:
         return f"dielectric, eta = {self.eta}, {self.model}"
 
 
-class Conductor:
+class Conductor(Material):
     """A metal of index η + ik, named as in Mitsuba's `conductor`; under a coat, relative to the index of the coat."""
 
-    transparent, wavelengths = False, VISIBLE
+    wavelengths = VISIBLE
 
     def __init__(self, material: str, model: str, outside: float) -> None:
         data = Path(str(mi.file_resolver().resolve("data/ior/Al.eta.spd"))).parent
@@ -155,24 +140,17 @@ class Conductor:
         return nested_plugin("regular", wavelength_min=VISIBLE[0], wavelength_max=VISIBLE[1], values=text)
 
     def __call__(self, si: mi.SurfaceInteraction3f, cos_half: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
-        eta, k = self.eta.eval(si, active), self.k.eval(si, active)
         if self.model == "exact":
-            result = mi.UnpolarizedSpectrum(0.0)
-            for channel in range(len(result)):
-                result[channel] = mi.fresnel_conductor(cos_half, mi.Complex2f(eta[channel], k[channel]))
-            return result
+            return mi.UnpolarizedSpectrum([mi.fresnel_conductor(cos_half, n) for n in self.index(si, active)])
+        eta, k = self.eta.eval(si, active), self.k.eval(si, active)
         normal = (dr.square(eta - 1) + dr.square(k)) / (dr.square(eta + 1) + dr.square(k))
         return _schlick(normal, cos_half)
 
     def index(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> list[mi.Complex2f] | None:
-        """Return n + ik of each wavelength; None with Schlick's formula, which has no polarisation."""
         if self.model == "schlick":
             return None
         eta, k = self.eta.eval(si, active), self.k.eval(si, active)
-        return [mi.Complex2f(eta[channel], k[channel]) for channel in range(len(eta))]
-
-    def update(self) -> None:
-        pass
+        return [mi.Complex2f(*of_channel) for of_channel in zip(eta, k, strict=True)]
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         callback.put("eta", self.eta, mi.ParamFlags.Differentiable)

@@ -3,71 +3,23 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..errors import RequestError
-from ..precomputation import Spectrum
 from ..progress import progress_bar
 from ..recipe import Recipe
-from ..settings import FROM_RADIUS
-from .base import nested_plugin
 from .geometry import Geometry, Incidence, Interface, rotated
-from .parameters import Media, Scales, check_texture, numbers_from, surface_from
+from .parameters import GratingRequest
 from .polarisation import reflected, through_layer
 from .tables import BELOW_ONE, larger, limited, opaque, smaller
-from .theory import Options, Scattering, theory_of
+from .theory import theory_of
 
 # Of defensive samples, for lobes that the averages of the sampler miss. They are uniform in solid angle: where both
 # directions are grazing, K G grows so fast that samples in proportion to the cosine would have large weights.
 UNIFORM_PROBABILITY = 0.02
 _per_cent = functools.partial(progress_bar, unit="%")
-
-
-@dataclass(frozen=True)
-class GratingRequest:
-    """The parameters of a grating, checked before a spectrum is computed for it.
-
-    Attributes:
-        media: around the grating.
-        scales: of heights and of lengths along the surface.
-        orientation: degrees from the tangent, or from the radius, to the pattern's x axis.
-        from_radius: whether they are from the radius.
-        options: of scalar theory.
-        surface: a spectrum, or the recipe to compute one.
-    """
-
-    media: Media
-    scales: Scales
-    orientation: mi.Texture
-    from_radius: bool
-    options: Options
-    surface: Spectrum | Recipe
-
-    @classmethod
-    def of(cls, props: mi.Properties) -> GratingRequest:
-        """Read the parameters of a scene.
-
-        Raises:
-            RequestError: if one is wrong, or they contradict each other.
-        """
-        media, scales = Media.of(props), Scales(props)
-        angle = props.get("orientation", 0.0)
-        if isinstance(angle, float) and not np.isfinite(angle):
-            raise RequestError(f"orientation: got {angle}, wanted degrees or a texture")
-        from_radius = angle in tuple(FROM_RADIUS)
-        if from_radius:
-            orientation = nested_plugin("uniform", value=FROM_RADIUS[angle])
-        elif isinstance(angle, str):
-            orientation = numbers_from("orientation", angle, 360.0, "radial, tangential, ")
-        else:
-            orientation = props.get_texture("orientation", 0.0)
-        check_texture("orientation", orientation)
-        surface = surface_from(props, media, scales.max_scale)
-        return cls(media, scales, orientation, from_radius, Options.of(props, media), surface)
 
 
 class Grating:
@@ -89,14 +41,9 @@ class Grating:
         surface = request.surface
         self.recipe = surface if isinstance(surface, Recipe) else None
         self.spectrum = surface.cached(_per_cent) if isinstance(surface, Recipe) else surface
-        self.theory = theory_of(props, self.spectrum, request.media, self.scales, request.options)
+        self.theory = theory_of(props, self.spectrum, request)
         # The grating is black at angles that the spectrum does not cover.
         self.min_cosine = opaque(np.cos(np.deg2rad(self.spectrum.largest_angle)) * (1 - 1e-6))
-
-    @property
-    def scattering(self) -> Scattering:
-        """K G S cos θ_o and its sampler."""
-        return self.theory.scattering
 
     @property
     def interface(self) -> Interface:
@@ -155,10 +102,10 @@ class Grating:
         pending = mi.UInt32(0)
         for channel, in_lobe in enumerate(covered):
             frequency = lateral_scale * dr.rcp(self._wavelength(si, channel))
-            in_lobe &= self.scattering.meets(u * frequency, v * frequency, lateral_scale)
+            in_lobe &= self.theory.scattering.meets(u * frequency, v * frequency, lateral_scale)
             pending |= dr.select(active & in_lobe, mi.UInt32(1 << channel), 0)
         # Most directions lie outside of all lobes at all wavelengths; unless drawn, they skip the branch.
-        needed = pending != 0 if self.scattering.resolved and not wo_is_sample else True
+        needed = pending != 0 if self.theory.scattering.resolved and not wo_is_sample else True
         # Arguments without derivatives are bound here: Dr.Jit passes all other state through the branch.
         diffracted = functools.partial(self._diffracted, si, pending, active)
         if needed:
@@ -336,7 +283,7 @@ class Grating:
         k_o = interface.scattered(k_i, reflects)
         incidence = Incidence.of(k_i, k_o, interface, height_scale)
         incidence = incidence.at(dr.detach(wavelength / lateral_scale), dr.detach(lateral_scale))
-        q, propagates = self.scattering.sample(incidence, rest, v, active & ~uniform)
+        q, propagates = self.theory.scattering.sample(incidence, rest, v, active & ~uniform)
         tangent = k_o.tangent - incidence.wavelength * incidence.q_sign * q
         wo = rotated(mi.Vector3f(*tangent, 0), -sin, cos) / k_o.index
         wo.z = dr.select(propagates, dr.safe_sqrt(1 - dr.square(wo.x) - dr.square(wo.y)), 0)

@@ -1,4 +1,4 @@
-"""Common parts of the samplers: a mixture over a few bins of κ, and inversion of cumulative sums.
+"""Common parts of the samplers: a mixture over a few bins of κ, bins of directions, inversion of cumulative sums.
 
 The optimal density of q is proportional to S(q; κ), but κ = 2π (cos θ_i + cos θ_o)/λ is known only once q is. For all
 outgoing directions cos θ_i ≤ κλ/2π ≤ 1 + cos θ_i. If cos θ_o has the density 2 cos θ_o, that of a diffuse surface, the
@@ -19,9 +19,10 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..energy.table import Layout
 from ..grating_spectrum import GratingSpectrum
-from .geometry import Incidence
-from .tables import BELOW_ONE, NumberTable, larger, limited, opaque
+from .geometry import Incidence, cell_of, on_square
+from .tables import BELOW_ONE, larger, limited, opaque
 
 KAPPA_BINS = 4  # the components of a packet
 
@@ -83,6 +84,20 @@ def choose(weights: mi.Vector4f, u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
     return chosen, limited((x - start) / larger(end - start, 1e-30), 0, BELOW_ONE)
 
 
+def direction_bin(omega: mi.Vector3f, side: mi.Float | int) -> list[mi.UInt32]:
+    """Return the column and row of ω in bins on the square of `energy/table.py`, `side` along each side."""
+    return [cell_of(side * coordinate, side)[0] for coordinate in on_square(omega)]
+
+
+def direction_borders(side: int, steps: int) -> NDArray[np.float64]:
+    """Return ω_∥ of points on the borders of these bins, each of its sides divided in `steps`: (bins, points, 2)."""
+    along = np.linspace(0, 1, steps + 1)
+    points = [point for t in along for point in ((0, 0, t), (0, 1, t), (0, t, 0), (0, t, 1))]
+    corners = np.indices((1, side, side)).reshape(3, -1).T
+    omega, _ = Layout(0.0, 1, side, 1, 2, (1.0, 2.0)).directions((corners[:, None] + points).reshape(-1, 3))
+    return omega[:, :2].reshape(len(corners), -1, 2)
+
+
 def search(
     cumulative: Callable[[mi.Int32], mi.Float], first: mi.Int32, end: mi.Int32, count: int, u: mi.Float
 ) -> tuple[mi.Int32, mi.Float]:
@@ -97,66 +112,17 @@ def search(
     Returns:
         i, and the position of the number between F(i) and F(i + 1), in [0, 1).
     """
-    low, high = cumulative(first), cumulative(end)
-    target = _interpolated(low, high, u)
-    index, low, high = _locate(cumulative, first, end, count, target, low, high)
-    return index, _relative_position(target, low, high)
-
-
-class CumulativeTable:
-    """Cumulative sums F of lines of n numbers, for each bin of κ.
-
-    A search has two steps: in every sixteenth sum, then in those between. Each step reads sixteen floats, which are one
-    cache line: cache misses dominate the cost.
-    """
-
-    GROUP = 16
-
-    def __init__(self, sums: NDArray[np.float32]) -> None:
-        """Arrange F, (..., n + 1, κ bins)."""
-        lines = sums.swapaxes(-1, -2)
-        self.count = lines.shape[-1] - 1
-        self.groups = 1
-        if self.count > self.GROUP:
-            lines = _in_groups(lines, self.GROUP)
-            self.groups = lines.shape[-1] // self.GROUP
-            coarse = _in_groups(lines[..., :: self.GROUP], self.GROUP)
-            self.coarse_stride, self.coarse = coarse.shape[-1], NumberTable(coarse)
-        self.stride, self.fine = lines.shape[-1], NumberTable(lines)
-
-    def cumulative(self, line: mi.UInt32, kappa_bin: mi.UInt32, i: mi.Int32, active: mi.Bool) -> mi.Float:
-        """Return F(i), 0 ≤ i ≤ n."""
-        return self.fine((line * KAPPA_BINS + kappa_bin) * self.stride + mi.UInt32(i), active)
-
-    def search(
-        self, line: mi.UInt32, kappa_bin: mi.UInt32, low: mi.Float, high: mi.Float, u: mi.Float, active: mi.Bool
-    ) -> tuple[mi.Int32, mi.Float]:
-        """Return the index i with F(i) ≤ low + u (high − low) < F(i + 1), and the relative position between the two.
-
-        Args:
-            line: index of the line.
-            kappa_bin: index of the bin of κ.
-            low, high: two values of F in this line.
-            u: in [0, 1).
-            active: mask.
-        """
-        line = line * KAPPA_BINS + kappa_bin
-
-        def fine(i: mi.Int32) -> mi.Float:
-            return self.fine(line * self.stride + mi.UInt32(i), active)
-
-        def coarse(i: mi.Int32) -> mi.Float:
-            return self.coarse(line * self.coarse_stride + mi.UInt32(i), active)
-
-        target = _interpolated(low, high, u)
-        first, low = mi.Int32(0), mi.Float(0.0)
-        if self.groups > 1:
-            group, low, high = _locate(coarse, first, mi.Int32(self.groups - 1), self.groups, target, low, high)
-            first = self.GROUP * group
-        size = min(self.GROUP, self.count)
-        index, low, high = _locate(fine, first, first + size, size, target, low, high)
-        # In a masked lane all sums are zero.
-        return dr.minimum(index, self.count - 1), _relative_position(target, low, high)
+    index, low, high = first, cumulative(first), cumulative(end)
+    target = dr.fma(u, high - low, low)
+    # Rounding may give `high`.
+    target = dr.select(target < high, target, low)
+    for bit in reversed(range((count - 1).bit_length())):
+        trial = dr.minimum(index + (1 << bit), end)
+        value = cumulative(trial)
+        is_past = value <= target
+        index = dr.select(is_past, trial, index)
+        low, high = dr.select(is_past, value, low), dr.select(is_past, high, value)
+    return index, limited((target - low) / larger(high - low, 1e-30), 0, BELOW_ONE)
 
 
 def truncated_gaussian(u: mi.Float, inside: mi.Float, spread: mi.Float) -> mi.Float:
@@ -175,44 +141,3 @@ def cumulative_sums(weights: NDArray[np.float64]) -> NDArray[np.float32]:
     result = np.zeros((*weights.shape[:-2], weights.shape[-2] + 1, weights.shape[-1]), np.float32)
     result[..., 1:, :] = weights.cumsum(axis=-2)
     return result
-
-
-def _in_groups(lines: NDArray[np.float32], group: int) -> NDArray[np.float32]:
-    """Pad lines to whole groups with their last number: (..., n) → (..., padded n)."""
-    pad = [(0, 0)] * (lines.ndim - 1) + [(0, -lines.shape[-1] % group)]
-    return np.pad(lines, pad, mode="edge")
-
-
-def _interpolated(low: mi.Float, high: mi.Float, u: mi.Float) -> mi.Float:
-    """Return low + u (high − low), less than high."""
-    target = dr.fma(u, high - low, low)
-    # Rounding may give `high`.
-    return dr.select(target < high, target, low)
-
-
-def _locate(
-    cumulative: Callable[[mi.Int32], mi.Float],
-    first: mi.Int32,
-    end: mi.Int32,
-    count: int,
-    target: mi.Float,
-    low: mi.Float,
-    high: mi.Float,
-) -> tuple[mi.Int32, mi.Float, mi.Float]:
-    """Return the index i with F(i) ≤ `target` < F(i + 1), F(i), F(i + 1).
-
-    `low` is F(first); `high` is F(i + 1) where the search does not evaluate it.
-    """
-    index = first
-    for bit in reversed(range((count - 1).bit_length())):
-        trial = dr.minimum(index + (1 << bit), end)
-        value = cumulative(trial)
-        is_past = value <= target
-        index = dr.select(is_past, trial, index)
-        low, high = dr.select(is_past, value, low), dr.select(is_past, high, value)
-    return index, low, high
-
-
-def _relative_position(target: mi.Float, low: mi.Float, high: mi.Float) -> mi.Float:
-    """Return the position of `target` between `low` and `high`, in [0, 1)."""
-    return limited((target - low) / larger(high - low, 1e-30), 0, BELOW_ONE)

@@ -9,7 +9,8 @@ import mitsuba as mi
 
 from .base import base_from
 from .geometry import Interface, rotated
-from .grating import Grating, GratingRequest
+from .grating import Grating
+from .parameters import GratingRequest
 from .polarisation import of_plane, reflected
 from .tables import BELOW_ONE, smaller
 

@@ -23,8 +23,8 @@ from ..energy.furnace import Furnace
 from ..energy.table import Layout, bounds_of, frequencies_of
 from ..geometry import fresnel
 from ..grating_spectrum import GratingSpectrum
-from .geometry import Incidence, cell_of, on_square
-from .inversion import search
+from .geometry import Incidence, cell_of
+from .inversion import direction_bin, direction_borders, search
 from .tables import NumberTable, PacketTable, larger, opaque
 
 PROBABILITY_UNITS = 2**24  # to the probability one; float32 represents integers exactly up to it
@@ -88,7 +88,8 @@ class OrderSampler:
         side_bins = np.sqrt(entries / (np.sqrt(len(ranges)) * self.slices * orders.prod()))
         self.side_bins = int(np.clip(side_bins, MIN_SIDE_BINS, MAX_SIDE_BINS))
         self.layout = Layout(0.0, 1, self.side_bins, 1, self.slices + 1, (first, last))
-        borders = self._borders()
+        borders = direction_borders(self.side_bins, 4)
+        low, high = borders.min(1), borders.max(1)
         sums, bins, fractions, start = [], [], [], 0
         for scales, above in itertools.product(ranges, sides):
             furnaces = [Furnace.of(spectrum, scale, eta, 1 if above else -1) for scale in scales]
@@ -101,7 +102,7 @@ class OrderSampler:
                 powers_of_sides.append(np.sqrt(np.mean(squares, axis=0)).sum((-1, -2)).ravel())
                 for slice_ in range(self.slices):
                     within = sum(squares[slice_ * steps : (slice_ + 1) * steps + 1])
-                    corner, size = self._order_ranges(above, reflects, slice_, *borders)
+                    corner, size = self._order_ranges(above, reflects, slice_, low, high)
                     of_bins, starts = _packed_cumulative(_root_corner_sum(within), corner, size)
                     sums.append(of_bins)
                     bins.append(np.stack([start + starts, *corner.T, size[:, 0] + (size[:, 1] << 16)], -1))
@@ -164,21 +165,12 @@ class OrderSampler:
             result += powers**2 / len(furnaces)
         return result.reshape(self.side_bins + 1, self.side_bins + 1, *result.shape[1:])
 
-    def _borders(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the minima and the maxima of ω_∥ outside in the bins of directions, (bins, 2)."""
-        along = np.linspace(0, 1, 5)
-        points = np.stack(np.meshgrid([0], along, along, indexing="ij"), -1).reshape(-1, 3)
-        corners = np.indices((1, self.side_bins, self.side_bins)).reshape(3, -1).T
-        omega, _ = self.layout.directions((corners[:, None] + points).reshape(-1, 3))
-        omega = omega[:, :2].reshape(len(corners), -1, 2)
-        return omega.min(1), omega.max(1)
-
     def _order_ranges(
         self, above: bool, reflects: bool, slice_: int, low: NDArray[np.float64], high: NDArray[np.float64]
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return first column and row of the propagating orders of each bin of a slice, and their numbers: (bins, 2).
 
-        They follow from `_borders` by |m/T + k_i,∥/λ| ≤ n_o/λ.
+        They follow from the minima and maxima of ω_∥ outside in the bins, (bins, 2), by |m/T + k_i,∥/λ| ≤ n_o/λ.
         """
         _, wavelengths = self.layout.directions(np.array([[slice_, 0, 0], [slice_ + 1, 0, 0]], np.float64))
         per_wavelength = self.tile / wavelengths[:, None]
@@ -198,7 +190,7 @@ class OrderSampler:
         max_x, max_y = map(int, self.max_order)
         slices, side_bins = self.counts
         tangent = incidence.tangent / incidence.index
-        column, row = _direction_bin(mi.Vector3f(*tangent, dr.safe_sqrt(1 - dr.squared_norm(tangent))), side_bins)
+        column, row = direction_bin(mi.Vector3f(*tangent, dr.safe_sqrt(1 - dr.squared_norm(tangent))), side_bins)
         slice_, _ = cell_of((incidence.frequency - self.first) * self.per_slice, slices)
         table, tables = mi.UInt32(0), 4 if self.transmits else 1
         if self.transmits:
@@ -217,10 +209,8 @@ class OrderSampler:
         order = start + mi.UInt32(row * columns + column)
         return (self.cumulative(order + 1, active) - self.cumulative(order, active)) * (1 / PROBABILITY_UNITS)
 
-    def sample(
-        self, incidence: Incidence, u: mi.Float, v: mi.Point2f, active: mi.Bool
-    ) -> tuple[mi.Int32, mi.Int32, mi.Point2f]:
-        """Draw an order for one wavelength from `u`; return it and `v`, which is unused."""
+    def sample(self, incidence: Incidence, u: mi.Float, active: mi.Bool) -> tuple[mi.Int32, mi.Int32]:
+        """Draw an order for one wavelength."""
         start, first_x, first_y, columns, rows = self._bin(incidence, active)
 
         def cumulative(index: mi.Int32) -> mi.Float:
@@ -229,19 +219,14 @@ class OrderSampler:
         index, _ = search(cumulative, mi.Int32(0), columns * rows, int(np.prod(2 * self.max_order + 1)), u)
         # In masked lanes the number of columns is zero.
         row = mi.Int32((mi.Float(index) + 0.5) / larger(mi.Float(columns), 1))
-        return first_x + index - row * columns, first_y + row, v
+        return first_x + index - row * columns, first_y + row
 
     def transmitted_fraction(self, omega: mi.Vector3f) -> mi.Float:
         """Return the transmitted fraction of power, ω along the pattern's axes."""
-        column, row = _direction_bin(omega, FRACTION_SIDE_BINS)
+        column, row = direction_bin(omega, FRACTION_SIDE_BINS)
         return self.fractions(
             (dr.select(omega.z > 0, mi.UInt32(0), FRACTION_SIDE_BINS) + row) * FRACTION_SIDE_BINS + column
         )
-
-
-def _direction_bin(omega: mi.Vector3f, side_bins: mi.Float | int) -> list[mi.UInt32]:
-    """Return the column and row of the bin of ω on the square."""
-    return [cell_of(side_bins * coordinate, side_bins)[0] for coordinate in on_square(omega)]
 
 
 def _root_corner_sum(at_nodes: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -266,10 +251,18 @@ def _packed_cumulative(
         for n, begin, count in zip(p.shape[:0:-1], first.T, size.T, strict=True)
     )
     inside = (of_y[:, :, None] & of_x[:, None]).reshape(len(p), -1)
-    p = p.reshape(len(p), -1).astype(np.float64)
-    p = (1 - UNIFORM_FRACTION) * p / np.maximum(
-        p.sum(1, keepdims=True), 1e-30
-    ) + UNIFORM_FRACTION * inside / inside.sum(1, keepdims=True)
-    sums = np.rint(PROBABILITY_UNITS * p.cumsum(1) / p.sum(1, keepdims=True))
+    sums = cumulative_units(p.reshape(len(p), -1).astype(np.float64), inside)
     count = size.prod(1) + 1
-    return np.insert(sums, 0, 0, 1)[np.insert(inside, 0, True, 1)], count.cumsum() - count
+    return sums[np.insert(inside, 0, True, 1)], count.cumsum() - count
+
+
+def cumulative_units(p: NDArray[np.float64], possible: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Return cumulative sums of P_m in units of 2⁻²⁴, of which float32 has exact differences, beginning with zero.
+
+    P_m is proportional to `p`, but for `UNIFORM_FRACTION`, which is divided equally among the `possible` orders:
+    (..., orders) → (..., orders + 1).
+    """
+    p = (1 - UNIFORM_FRACTION) * p / np.maximum(p.sum(axis=-1, keepdims=True), 1e-30)
+    p += UNIFORM_FRACTION * possible / possible.sum(axis=-1, keepdims=True)
+    sums = np.rint(PROBABILITY_UNITS * p.cumsum(axis=-1) / p.sum(axis=-1, keepdims=True))
+    return np.insert(sums, 0, 0, axis=-1)

@@ -399,7 +399,7 @@ class OrderSpectrum:
         """Draw q in cycles/µm, for one wavelength; return it and whether its order propagates."""
         if self.q_sampler is not None:
             return self.q_sampler.sample(incidence, u, v, active), active
-        m_x, m_y, v = self.order_sampler.sample(incidence, u, v, active)
+        m_x, m_y = self.order_sampler.sample(incidence, u, active)
         tangent = self._tangent(m_x, m_y, incidence.wavelength)
         scale = incidence.lobe_scale
         q = mi.Point2f(self.axes[0].quantile(m_x, v.x, scale), self.axes[1].quantile(m_y, v.y, scale))

@@ -11,14 +11,15 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import RequestError, is_number
+from ..geometry import SHADOWING
 from ..precomputation import Spectrum, load_spectrum
 from ..recipe import REQUESTED, Recipe
 from ..rigorous.spectrum import RigorousSpectrum
-from ..settings import THEORIES, TRANSMISSIONS, VISIBLE, wavelengths_inside
+from ..settings import FROM_RADIUS, THEORIES, TRANSMISSIONS, VISIBLE, wavelengths_inside
 from ..surface.gratings import PROFILES
 from .base import nested_plugin
 from .coat import SAME_INDEX, Coat, absolute_index, coat_from
-from .fresnel import Conductor, PerfectMirror, reflectance_from
+from .fresnel import Conductor, Material, PerfectMirror, reflectance_from
 
 _PREFIX = "handed over: "
 _handed_over: weakref.WeakValueDictionary[str, Spectrum] = weakref.WeakValueDictionary()
@@ -433,3 +434,61 @@ def check_parameters(props: mi.Properties, spectrum: RigorousSpectrum, coat: Coa
                 "leave it out, or build the spectrum for this material"
             )
     return PerfectMirror(f"{spectrum.material_name}, in the efficiencies")
+
+
+@dataclass(frozen=True)
+class GratingRequest:
+    """The parameters of a grating, checked before a spectrum is computed for it.
+
+    Attributes:
+        media: around the grating.
+        scales: of heights and of lengths along the surface.
+        orientation: degrees from the tangent, or from the radius, to the pattern's x axis.
+        from_radius: whether they are from the radius.
+        material: R of scalar theory.
+        shadowing: whether G is a factor in scalar theory.
+        conserve_energy: whether E is.
+        surface: a spectrum, or the recipe to compute one.
+    """
+
+    media: Media
+    scales: Scales
+    orientation: mi.Texture
+    from_radius: bool
+    material: Material
+    shadowing: bool
+    conserve_energy: bool
+    surface: Spectrum | Recipe
+
+    @classmethod
+    def of(cls, props: mi.Properties) -> GratingRequest:
+        """Read the parameters of a scene.
+
+        Raises:
+            RequestError: if one is wrong, or they contradict each other.
+        """
+        media, scales = Media.of(props), Scales(props)
+        angle = props.get("orientation", 0.0)
+        if isinstance(angle, float) and not np.isfinite(angle):
+            raise RequestError(f"orientation: got {angle}, wanted degrees or a texture")
+        from_radius = angle in tuple(FROM_RADIUS)
+        if from_radius:
+            orientation = nested_plugin("uniform", value=FROM_RADIUS[angle])
+        elif isinstance(angle, str):
+            orientation = numbers_from("orientation", angle, 360.0, "radial, tangential, ")
+        else:
+            orientation = props.get_texture("orientation", 0.0)
+        check_texture("orientation", orientation)
+        surface = surface_from(props, media, scales.max_scale)
+        material = reflectance_from(props, media.coat)
+        if media.eta is not None and material.model == "schlick":
+            raise RequestError("fresnel: got 'schlick' with a transmission, wanted 'exact'")
+        if "base" in props and not material.transparent:
+            raise RequestError("base: got a BSDF below a conductor or a perfect mirror, which transmit no light")
+        shadowing = props.get("shadowing", SHADOWING[0])
+        if shadowing not in SHADOWING:
+            raise RequestError(f"shadowing: got {shadowing!r}, wanted one of {', '.join(SHADOWING)}")
+        conserve_energy = props.get("conserve_energy", True)
+        if not isinstance(conserve_energy, bool):
+            raise RequestError(f"conserve_energy: got {conserve_energy!r}, wanted true or false")
+        return cls(media, scales, orientation, from_radius, material, shadowing == "v_cavity", conserve_energy, surface)

@@ -75,21 +75,8 @@ def of_plane(value: mi.UnpolarizedSpectrum, index: list[mi.Complex2f]) -> Split:
 
     def split(source: mi.Vector3f, exit_: mi.Vector3f, source_axis: mi.Vector3f, exit_axis: mi.Vector3f) -> mi.Spectrum:
         half = dr.normalize(source + exit_)
-        cos_half = dr.dot(source, half)
-        planes = [mi.mueller.specular_reflection(cos_half, eta) for eta in index]
-        # For equal indices all entries and `value` are zero.
-        intensities = [dr.select(plane[0, 0] > 0, plane[0, 0], 1) for plane in planes]
-        entries = [
-            [[plane[i, j] / intensity for j in range(4)] for i in range(4)]
-            for plane, intensity in zip(planes, intensities, strict=True)
-        ]
-        matrix = _matrix(value, entries)
-        # The s axes are perpendicular to the plane of reflection; for retroreflection, to h.
-        axes = [dr.cross(half, -source), dr.cross(half, exit_)]
-        is_retroreflected = dr.squared_norm(axes[0]) < 1e-12
-        across = mi.coordinate_system(half)[0]
-        axes = [dr.select(is_retroreflected, across, dr.normalize(axis)) for axis in axes]
-        return mi.mueller.rotate_mueller_basis(matrix, -source, axes[0], source_axis, exit_, axes[1], exit_axis)
+        planes = [mi.mueller.specular_reflection(dr.dot(source, half), eta) for eta in index]
+        return _of_facet(value, planes, half, source, exit_, source_axis, exit_axis)
 
     return split
 
@@ -110,21 +97,37 @@ def of_interface(value: mi.UnpolarizedSpectrum, eta: mi.Float) -> Split:
         other = dr.select(reflects, dr.select(source.z > 0, eta, dr.rcp(eta)), n_o / n_i)
         reflection = mi.mueller.specular_reflection(cos_half, mi.Complex2f(other, 0))
         transmission = mi.mueller.specular_transmission(cos_half, other)
-        intensity = dr.select(reflects, reflection[0, 0], transmission[0, 0])
-        per_intensity = dr.rcp(dr.select(intensity > 0, intensity, 1))
-        entries = [
-            [dr.select(reflects, reflection[i, j], transmission[i, j]) * per_intensity for j in range(4)]
-            for i in range(4)
-        ]
-        matrix = _matrix(value, [entries] * len(value))
-        across = mi.coordinate_system(half)[0]
-        axes = [dr.cross(half, -source), dr.cross(half, exit_)]
-        axes[1] *= dr.select(reflects | (dr.dot(axes[0], axes[1]) > 0), mi.Float(1), -1)
-        is_retroreflected = dr.squared_norm(axes[0]) < 1e-12
-        axes = [dr.select(is_retroreflected, across, dr.normalize(axis)) for axis in axes]
-        return mi.mueller.rotate_mueller_basis(matrix, -source, axes[0], source_axis, exit_, axes[1], exit_axis)
+        plane = dr.select(reflects, reflection, transmission)
+        return _of_facet(value, [plane] * len(value), half, source, exit_, source_axis, exit_axis)
 
     return split
+
+
+def _of_facet(
+    value: mi.UnpolarizedSpectrum,
+    planes: list[mi.Spectrum],
+    half: mi.Vector3f,
+    source: mi.Vector3f,
+    exit_: mi.Vector3f,
+    source_axis: mi.Vector3f,
+    exit_axis: mi.Vector3f,
+) -> mi.Spectrum:
+    """Return the matrix of a plane perpendicular to `half`, from that of each channel between s axes."""
+    # For equal indices all entries and `value` are zero.
+    intensities = [dr.select(plane[0, 0] > 0, plane[0, 0], 1) for plane in planes]
+    matrix = _matrix(
+        value,
+        [
+            [[plane[i, j] / intensity for j in range(4)] for i in range(4)]
+            for plane, intensity in zip(planes, intensities, strict=True)
+        ],
+    )
+    # The s axes are perpendicular to the plane of reflection; for retroreflection, to h.
+    axes = [dr.cross(half, -source), dr.cross(half, exit_)]
+    is_retroreflected = dr.squared_norm(axes[0]) < 1e-12
+    across = mi.coordinate_system(half)[0]
+    axes = [dr.select(is_retroreflected, across, dr.normalize(axis)) for axis in axes]
+    return mi.mueller.rotate_mueller_basis(matrix, -source, axes[0], source_axis, exit_, axes[1], exit_axis)
 
 
 def of_orders(

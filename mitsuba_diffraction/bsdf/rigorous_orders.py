@@ -16,7 +16,7 @@ from ..rigorous.efficiencies import ODD, REVERSED
 from ..rigorous.spectrum import RigorousSpectrum
 from .geometry import Geometry, Incidence, cell_of
 from .inversion import search, truncated_gaussian
-from .order_sampler import PROBABILITY_UNITS, UNIFORM_FRACTION
+from .order_sampler import PROBABILITY_UNITS, cumulative_units
 from .tables import NumberTable, PacketTable, larger, limited, opaque, smaller
 
 BINS_PER_UNIT = 8  # of the sampler, along p and r
@@ -97,13 +97,9 @@ class RigorousOrders:
         self.starts = NumberTable(axes.starts.astype(np.uint32))
         self.excess, self.top = opaque(axes.excess), opaque(axes.excess_limit)
         self.bins_per_unit = TRANSMISSION_BINS_PER_UNIT if self.transmits else BINS_PER_UNIT
-        units = _probability_units(*_bin_efficiencies(spectrum, self.bins_per_unit))
-        self.wavelength_bins, self.bins_across = units.shape[-4], units.shape[-2]
-        cumulative = np.zeros((*units.shape[:-1], units.shape[-1] + 1))
-        cumulative[..., 1:] = units.cumsum(axis=-1)
-        self.orders = PacketTable(
-            np.stack([cumulative, np.append(units, 0 * units[..., :1], axis=-1)], axis=-1), width=2
-        )
+        sums = cumulative_units(*_bin_efficiencies(spectrum, self.bins_per_unit))
+        self.wavelength_bins, self.bins_across = sums.shape[-4], sums.shape[-2]
+        self.orders = PacketTable(np.stack([sums, np.diff(sums, append=sums[..., -1:])], axis=-1), width=2)
         sigma, cutoff = spectrum.lobe_width, spectrum.cutoff_sigmas
         inside = math.erf(cutoff / math.sqrt(2))  # the fraction of the Gaussian inside of the cutoff, along one axis
         self.spread, self.inside = opaque(np.sqrt(2) * sigma), opaque(inside)
@@ -423,18 +419,5 @@ def _bin_efficiencies(spectrum: RigorousSpectrum, bins_per_unit: int) -> tuple[N
             found += eta, eta > 0
         # The mean over the points at which the order propagates, as the horizon may cross a bin.
         efficiencies[way, z[index], p[index], r[index], order] = found[0] / np.maximum(found[1], 1)
+    possible[..., max_order] = True  # order 0 always propagates
     return efficiencies, possible
-
-
-def _probability_units(efficiencies: NDArray[np.float64], possible: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Return P_m of each bin in units of 2⁻²⁴, of which float32 has exact sums.
-
-    `UNIFORM_FRACTION` is divided equally among the `possible` orders.
-    """
-    mirror = efficiencies.shape[-1] // 2
-    possible[..., mirror] = True  # order 0 always propagates
-    p = efficiencies / np.maximum(efficiencies.sum(axis=-1, keepdims=True), 1e-30)
-    p = (1 - UNIFORM_FRACTION) * p + UNIFORM_FRACTION * possible / possible.sum(axis=-1, keepdims=True)
-    units = np.floor(p * PROBABILITY_UNITS).astype(np.int64)
-    units[..., mirror] += PROBABILITY_UNITS - units.sum(axis=-1)
-    return units

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import logging
 from typing import Protocol, cast
 
@@ -19,26 +20,23 @@ from ..rigorous.spectrum import RigorousSpectrum
 from ..settings import VISIBLE
 from .coat import SAME_INDEX
 from .energy import Coordinates, Energy
-from .fresnel import Material, reflectance_from
+from .fresnel import Material
 from .geometry import Geometry, Incidence, Interface, rotated
 from .order_sampler import MAX_INDEX_CHANGE
 from .orders import OrderSpectrum
-from .parameters import Media, Scales, check_parameters, check_transmission
+from .parameters import GratingRequest, Media, check_parameters, check_transmission
 from .polarisation import Split, of_interface, of_orders, of_plane, unpolarised
 from .rigorous_orders import RigorousOrders
 from .shared import SharedTables
 from .tables import opaque
 
 _log = logging.getLogger(__name__)
-_warned: set[str] = set()  # warnings that were logged, each once
 
 
-def _warn_of_range(spectrum: GratingSpectrum) -> None:
-    """Log a warning, once for each surface, if scalar theory is inaccurate for it."""
-    message = f"diffraction_grating, {spectrum.source}: {spectrum.warning}"
-    if spectrum.warning and message not in _warned:
-        _warned.add(message)
-        _log.warning("%s", message)
+@functools.cache
+def _warn_of_range(source: str, warning: str) -> None:
+    """Log a warning, once for each surface."""
+    _log.warning("diffraction_grating, %s: %s", source, warning)
 
 
 class Scattering(Protocol):
@@ -65,7 +63,7 @@ class Scattering(Protocol):
 
 
 class Theory(Protocol):
-    """A theory of diffraction.
+    """A theory of diffraction, the base class of both.
 
     Attributes:
         scattering: the powers, and their sampler.
@@ -76,20 +74,11 @@ class Theory(Protocol):
             spectrum.
     """
 
-    @property
-    def scattering(self) -> Scattering: ...
-
-    @property
-    def material(self) -> Material: ...
-
-    @property
-    def interface(self) -> Interface: ...
-
-    @property
-    def shadowing(self) -> bool: ...
-
-    @property
-    def covered_index(self) -> float: ...
+    scattering: Scattering
+    material: Material
+    interface: Interface
+    shadowing: bool
+    covered_index: float
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         """Show the parameters of the theory and of its material."""
@@ -98,7 +87,8 @@ class Theory(Protocol):
         """Recompute all that depends on the parameters `keys`, or on any parameter if there are none."""
 
     def coordinates(self, geometry: Geometry) -> tuple[Coordinates, Coordinates] | None:
-        """Return the coordinates of both directions in the table of E, for `evaluate` at all wavelengths."""
+        """Return the coordinates of both directions in the table of E, for `evaluate` at all wavelengths; else None."""
+        return None
 
     def evaluate(
         self, geometry: Geometry, incidence: Incidence, pair: tuple[Coordinates, Coordinates] | None, active: mi.Bool
@@ -125,71 +115,33 @@ class Theory(Protocol):
         """Return the Mueller matrix of the grating as a function of directions and axes, scaled to `value`."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Options:
-    """The parameters of scalar theory that do not depend on the spectrum.
-
-    Attributes:
-        material: R.
-        shadowing: whether G is a factor.
-        conserve_energy: whether E is.
-    """
-
-    material: Material
-    shadowing: bool
-    conserve_energy: bool
-
-    @classmethod
-    def of(cls, props: mi.Properties, media: Media) -> Options:
-        """Return the options of a scene.
-
-        Raises:
-            RequestError: if one is wrong, or they contradict each other.
-        """
-        material = reflectance_from(props, media.coat)
-        if media.eta is not None and material.model == "schlick":
-            raise RequestError("fresnel: got 'schlick' with a transmission, wanted 'exact'")
-        if "base" in props and not material.transparent:
-            raise RequestError("base: got a BSDF below a conductor or a perfect mirror, which transmit no light")
-        shadowing = props.get("shadowing", SHADOWING[0])
-        if shadowing not in SHADOWING:
-            raise RequestError(f"shadowing: got {shadowing!r}, wanted one of {', '.join(SHADOWING)}")
-        conserve_energy = props.get("conserve_energy", True)
-        if not isinstance(conserve_energy, bool):
-            raise RequestError(f"conserve_energy: got {conserve_energy!r}, wanted true or false")
-        return cls(material, shadowing == "v_cavity", conserve_energy)
-
-
-def theory_of(props: mi.Properties, spectrum: Spectrum, media: Media, scales: Scales, options: Options) -> Theory:
+def theory_of(props: mi.Properties, spectrum: Spectrum, request: GratingRequest) -> Theory:
     """Return the theory of a spectrum.
 
     Raises:
         RequestError: if a parameter does not match the spectrum.
     """
     if isinstance(spectrum, RigorousSpectrum):
-        return RigorousTheory(props, spectrum, media)
-    return ScalarTheory(spectrum, media, scales, options)
+        return RigorousTheory(props, spectrum, request.media)
+    return ScalarTheory(spectrum, request)
 
 
-class ScalarTheory:
+class ScalarTheory(Theory):
     """f cos θ_o = R · K · G · S(q; κ)/λ² · E cos θ_o.
 
     Attributes:
-        scattering: K G S cos θ_o and its sampler.
-        material: R.
         media: around the grating; its index is the one for which the tables were made.
         scales: of heights and of lengths along the surface.
-        shadowing: whether G is a factor.
         energy: E, or None where it is one.
-        interface: the media above and below.
     """
 
-    def __init__(self, spectrum: GratingSpectrum, media: Media, scales: Scales, options: Options) -> None:
-        _warn_of_range(spectrum)
-        self.spectrum, self.media, self.scales = spectrum, media, scales
-        self.material, self.shadowing = options.material, options.shadowing
-        self.conserve_energy = options.conserve_energy
-        self.tables = SharedTables.of(spectrum, media.eta)
+    def __init__(self, spectrum: GratingSpectrum, request: GratingRequest) -> None:
+        if spectrum.warning:
+            _warn_of_range(spectrum.source, spectrum.warning)
+        self.spectrum, self.media, self.scales = spectrum, request.media, request.scales
+        self.material, self.shadowing = request.material, request.shadowing
+        self.conserve_energy = request.conserve_energy
+        self.tables = SharedTables.of(spectrum, self.media.eta)
         self.scattering = self.tables.scattering
         self.update()
 
@@ -216,11 +168,7 @@ class ScalarTheory:
         if self.conserve_energy and self.shadowing:
             self.energy = self.tables.energy(scales)
         self.interface = self._interface()
-
-    @property
-    def covered_index(self) -> float:
-        """The maximum index next to the relief, for which the tables are made."""
-        return self.media.index
+        self.covered_index = self.media.index
 
     def _interface(self) -> Interface:
         """Return the media above and below, and set the sampler of orders for the current scales and index."""
@@ -236,7 +184,6 @@ class ScalarTheory:
         return Interface(1.0, self.material.eta, is_sheet, kappas, fraction)
 
     def parameters_changed(self, keys: list[str]) -> None:
-        """Recompute all that depends on the parameters `keys`, or on any parameter if there are none."""
         changed = [scale for scale in self.scales if not keys or scale.name in keys]
         for scale in changed:
             scale.read()
@@ -265,7 +212,6 @@ class ScalarTheory:
         self.material.traverse(callback)
 
     def coordinates(self, geometry: Geometry) -> tuple[Coordinates, Coordinates] | None:
-        """Return the coordinates of both directions in the table of E; None where E is one."""
         if self.energy is None:
             return None
         incident, outgoing = geometry.incident.inner(), geometry.outgoing.inner()
@@ -274,7 +220,6 @@ class ScalarTheory:
     def evaluate(
         self, geometry: Geometry, incidence: Incidence, pair: tuple[Coordinates, Coordinates] | None, active: mi.Bool
     ) -> tuple[mi.Float, mi.Float]:
-        """Return K G S E n_o² |cos θ_o| and the density of q."""
         power, density = self.scattering.evaluate(geometry, incidence, active)
         if pair is not None and self.energy is not None:
             frequency = incidence.frequency * geometry.coat_index
@@ -282,7 +227,6 @@ class ScalarTheory:
         return power, density
 
     def reflectance(self, si: mi.SurfaceInteraction3f, geometry: Geometry, active: mi.Bool) -> mi.UnpolarizedSpectrum:
-        """Return R at the half vector, or 1 − R."""
         reflected = self.material(si, geometry.cos_half(), active)
         return dr.select(geometry.reflects, reflected, 1 - reflected)
 
@@ -293,7 +237,6 @@ class ScalarTheory:
         frame: tuple[mi.Float, mi.Float],
         active: mi.Bool,
     ) -> Split:
-        """Return the Mueller matrix of the grating as a function of directions and axes, scaled to `value`."""
         index = self.material.index(si, active)
         if index is None:
             return unpolarised(value)
@@ -309,15 +252,10 @@ class ScalarTheory:
         return "\n".join(f"{name} = {value}" for name, value in lines.items())
 
 
-class RigorousTheory:
-    """f cos θ_o = n_o² Σ_m η_m Γ N(q − m/T; σ_q² I)/λ² cos θ_o: the efficiencies η_m include R, K, G and E.
+class RigorousTheory(Theory):
+    """f cos θ_o = n_o² Σ_m η_m Γ N(q − m/T; σ_q² I)/λ² cos θ_o: the efficiencies η_m include R, K, G and E."""
 
-    Attributes:
-        scattering: n_o² Σ_m η_m Γ N cos θ_o and its sampler.
-        material: R = 1 beside the efficiencies.
-        interface: the media above and below.
-    """
-
+    scattering: RigorousOrders
     shadowing = True  # has no effect: it is part of the efficiencies
 
     def __init__(self, props: mi.Properties, spectrum: RigorousSpectrum, media: Media) -> None:
@@ -339,17 +277,12 @@ class RigorousTheory:
     def traverse(self, callback: mi.TraversalCallback) -> None:
         """Show no parameters."""
 
-    def coordinates(self, geometry: Geometry) -> None:
-        """Return None: there is no table of E."""
-
     def evaluate(
         self, geometry: Geometry, incidence: Incidence, pair: tuple[Coordinates, Coordinates] | None, active: mi.Bool
     ) -> tuple[mi.Float, mi.Float]:
-        """Return n_o² Σ_m η_m Γ N |cos θ_o| and the density of q."""
         return self.scattering.evaluate(geometry, incidence, active)
 
     def reflectance(self, si: mi.SurfaceInteraction3f, geometry: Geometry, active: mi.Bool) -> mi.UnpolarizedSpectrum:
-        """Return one."""
         return mi.UnpolarizedSpectrum(1.0)
 
     def split(
@@ -359,7 +292,6 @@ class RigorousTheory:
         frame: tuple[mi.Float, mi.Float],
         active: mi.Bool,
     ) -> Split:
-        """Return the Mueller matrix of the grating as a function of directions and axes, scaled to `value`."""
         sin, cos = frame
         relative = 1e3 if self.media.coat is None else 1e3 * self.media.coat.relative
 

@@ -218,7 +218,7 @@ def test_reflected_and_transmitted_orders_are_drawn_with_their_probabilities(pro
     assert share.sum() == pytest.approx(1, abs=1e-6)
     count = 1 << 18
     u = mi.Float(np.random.default_rng(2).random(count).astype(np.float32))
-    drawn_x, drawn_y, _ = table.sample(incidence, u, mi.Point2f(0.5), mi.Bool(True))
+    drawn_x, drawn_y = table.sample(incidence, u, mi.Bool(True))
     rows, columns = spectrum.grid.shape
     drawn = (np.array(drawn_y) + rows // 2) * columns + np.array(drawn_x) + columns // 2
     often = share * count > 5
