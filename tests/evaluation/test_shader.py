@@ -7,15 +7,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from scipy.special import diric
 
 import mitsuba_diffraction as md
-from mitsuba_diffraction.evaluation.finite_tiles import finite_tiles_spectrum, tile_factor
 from mitsuba_diffraction.evaluation.realtime_shader import tristimulus
 from mitsuba_diffraction.evaluation.realtime_shader.evaluate import VARIANTS, colour, relative_radiance, shader_for
 from mitsuba_diffraction.evaluation.realtime_shader.nmm_pq import line_area
 from mitsuba_diffraction.evaluation.realtime_shader.picture import Emission, decode, encode
-from mitsuba_diffraction.evaluation.realtime_shader.pq import tile_factor as tile_factor_drjit
-from mitsuba_diffraction.evaluation.realtime_shader.pq import tiling_power
+from mitsuba_diffraction.evaluation.realtime_shader.pq import tile_factor, tiling_power
 from mitsuba_diffraction.evaluation.realtime_shader.quirks import Quirks
 from mitsuba_diffraction.evaluation.realtime_shader.taylor_textures import series_error, taylor_transforms
 from mitsuba_diffraction.render.scene import root_cause
@@ -276,13 +275,25 @@ def test_without_the_jacobian_nmm_is_purple():
 # --- PQ ---------------------------------------------------------------------------------------------------------------
 
 
-def test_tile_factor_is_that_of_the_reference():
+def test_tile_factor_is_the_kernel_of_dirichlet():
     x = np.concatenate([np.linspace(-40, 40, 4001), np.arange(-9, 10), np.arange(1, 200) / 26, 3 + 1e-6 * np.arange(9)])
     x = x.astype(np.float32)
     for count in (1, 2, 7, 26):
-        np.testing.assert_allclose(
-            np.array(tile_factor_drjit(mi.Float(x), count)), tile_factor(x, count), rtol=2e-5, atol=2e-5
-        )
+        expected = count * diric(2 * np.pi * x.astype(np.float64), count)
+        np.testing.assert_allclose(np.array(tile_factor(mi.Float(x), count)), expected, rtol=2e-5, atol=2e-5)
+
+
+def spectrum_of_tiles(surface, q, kappa, tiles):
+    """S/area of P × Q tiles without a window, by direct sums over all of their pixels, zero beyond Nyquist."""
+    (rows, columns), pixel = surface.shape, surface.pixel_size
+    x, y = np.arange(tiles[0] * columns) * pixel[0], np.arange(tiles[1] * rows) * pixel[1]
+    heights = np.tile(surface.heights, tiles[::-1])
+    sums = [
+        np.exp(-2j * np.pi * q_y * y) @ np.exp(1j * k * heights) @ np.exp(-2j * np.pi * q_x * x)
+        for (q_x, q_y), k in zip(q, kappa, strict=True)
+    ]
+    inside = (np.abs(q) <= 0.5 / np.array(pixel)).all(axis=1)
+    return np.where(inside, np.abs(np.array(sums) / heights.size) ** 2, 0)
 
 
 @pytest.mark.few(2)
@@ -296,8 +307,7 @@ def test_pq_of_n_tiles_is_the_transform_of_their_surface(surface, tiles):
     wo[:, 2] = np.sqrt(1 - wo[:, 0] ** 2 - wo[:, 1] ** 2)
     nanometres = np.full(150, 600.0)
     q = -(wi + wo)[:, :2] / 0.6
-    area = np.prod(surface.tile_size) * np.prod(tiles)
-    s = finite_tiles_spectrum(surface, q, kappa_of(wi, wo, nanometres), tiles=tiles) / area
+    s = spectrum_of_tiles(surface, q, kappa_of(wi, wo, nanometres), tiles)
     radius = max(surface.shape)
     settings = dict(variant="pq", quirks=CORRECTED, tiles=tiles, radius=radius)
     rho = relative_radiance(surface, wi, wo, nanometres, **settings)

@@ -16,11 +16,14 @@ _AT_INTEGER = 2.0**-13.5  # a quarter of √ε in float32
 
 
 def tile_factor(x: mi.Float, count: int) -> mi.Float:
-    """Compute D(x; N) = sin(πNx)/sin(πx), as derived in `finite_tiles.tile_factor`.
+    """Compute D(x; N) = sin(πNx)/sin(πx), the sum of N unit phasors x periods apart, about their centre.
 
-    With k the integer nearest to x and r = x − k,
+    N tiles of period T multiply the transform of one tile by D(qT; N), up to a phase. The quotient is 0/0 at integers;
+    with k the integer nearest to x and r = x − k, exact in floating point,
 
         D(x; N) = (−1)^{k(N−1)} sin(πNr)/sin(πr) → (−1)^{k(N−1)} N   as r → 0.
+
+    In double precision it is N `scipy.special.diric(2πx, N)`.
     """
     k = dr.round(x)
     r = x - k
