@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from numbers import Integral
 from typing import ClassVar
 
 import drjit as dr
@@ -13,7 +12,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...bsdf.tables import PacketTable, larger, opaque
-from ...errors import RequestError
 from ...geometry import k_g
 from ...settings import SUN_COHERENCE_LENGTH, lobe_width
 from ...surface.heightfield import HeightField
@@ -131,9 +129,13 @@ class Shader:
 
     Attributes:
         own_quirks: names of the quirks that affect this shader.
+        peak: S(0) of a flat surface, µm², the normalisation of the relative radiance.
+        texel_reads: maximum number of texels read for one shading point.
     """
 
     own_quirks: ClassVar[tuple[str, ...]]
+    peak: float
+    texel_reads: int
 
     def __init__(self, height_field: HeightField, quirks: Quirks, shadowing: bool = True) -> None:
         self.tile_size = height_field.tile_size
@@ -149,16 +151,6 @@ class Shader:
     def weights(self, r_0: ArrayLike = PUBLISHED_R0, light: ArrayLike | None = None) -> SpectralWeights:
         """Return the `SpectralWeights` of a material and a light."""
         return SpectralWeights(self.quirks, self.peak, r_0=r_0, light=light)
-
-    @property
-    def peak(self) -> float:
-        """S(0) of a flat surface, µm², the normalisation of the relative radiance."""
-        raise NotImplementedError
-
-    @property
-    def texel_reads(self) -> int:
-        """Maximum number of texels read for one shading point."""
-        raise NotImplementedError
 
     def rgb(
         self,
@@ -188,6 +180,13 @@ class TextureShader(Shader):
         ρ(λ) = F/F₀ · K G cos θ_i · |P(q; κ)|²,     q = (u, v)/λ,     κ = −2πw/λ,
 
     with |P|² = 1 for a flat mirror, and the colour is ∫ ρ(λ) S(λ) (x̄, ȳ, z̄) dλ.
+
+    Attributes:
+        origin_at_centre: whether x = 0 is the centre of the tile (`taylor_transforms`).
+        published_terms: number of Taylor terms of the published shader.
+        tapers: whether the heights are tapered (`taper.py`).
+        margin: texels that are read beyond the highest frequency that light reaches.
+        texels_per_term: texels read per Taylor term and wavelength.
     """
 
     own_quirks = (
@@ -196,6 +195,9 @@ class TextureShader(Shader):
     )
     origin_at_centre: ClassVar[bool] = False
     published_terms: ClassVar[int]
+    tapers = False
+    margin: int
+    texels_per_term: int
 
     def __init__(
         self,
@@ -266,16 +268,6 @@ class TextureShader(Shader):
         return self._coherence_lengths[0 if self.quirks.fixed_coherence else 1]
 
     @property
-    def tapers(self) -> bool:
-        """Whether the heights are tapered (`taper.py`)."""
-        return False
-
-    @property
-    def margin(self) -> int:
-        """Texels that are read beyond the highest frequency that light reaches."""
-        raise NotImplementedError
-
-    @property
     def terms(self) -> int:
         """The number of Taylor terms."""
         if self._terms is not None:
@@ -292,6 +284,10 @@ class TextureShader(Shader):
     @property
     def peak(self) -> float:
         return 1 / (float(np.pi) * self.sigma**2)
+
+    def position(self, gain: Gain, wavelength: mi.Float) -> tuple[mi.Float, mi.Float]:
+        """Return q T = (u T_x, v T_y)/λ, in texels relative to frequency zero, at a wavelength in µm."""
+        return gain.u * self.tile_size[0] / wavelength, gain.v * self.tile_size[1] / wavelength
 
     def power(self, gain: Gain, wavelength: mi.Float, height_scale: mi.Float, active: mi.Bool) -> mi.Float:
         """Evaluate |P(q; κ)|² at a wavelength in µm; it is one for a flat mirror at q = 0."""
@@ -328,11 +324,6 @@ class TextureShader(Shader):
         return mi.Color3f(*(sum(row[i] * xyz[i] for i in range(3)) for row in self.matrix))
 
     @property
-    def texels_per_term(self) -> int:
-        """Texels read per Taylor term and wavelength."""
-        raise NotImplementedError
-
-    @property
     def texel_reads(self) -> int:
         return WAVELENGTH_COUNT * self.textures.terms * self.texels_per_term
 
@@ -357,10 +348,3 @@ def trapezoid(
         result += weight * (width * power(gain, wavelength * 1e-3, height_scale, active))
         index += 1
     return result
-
-
-def check_integer(name: str, value: int, minimum: int) -> int:
-    """Return `value` as an int; raise RequestError unless it is a whole number ≥ `minimum`."""
-    if isinstance(value, bool) or not isinstance(value, Integral) or value < minimum:
-        raise RequestError(f"{name}: got {value!r}, wanted a whole number ≥ {minimum}")
-    return int(value)

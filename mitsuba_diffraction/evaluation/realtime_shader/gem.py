@@ -34,6 +34,8 @@ class GEM(Shader):
     """
 
     own_quirks = ("infrared_rainbow",)
+    peak = 1.0  # unused: the shader computes colours, not a relative radiance
+    texel_reads = 0
 
     def __init__(
         self,
@@ -50,15 +52,6 @@ class GEM(Shader):
         self.roughness = roughness
         if not all(isinstance(number, Real) and number > 0 for number in (self.spacing, self.roughness)):
             raise RequestError(f"spacing, roughness: got {spacing!r}, {roughness!r}, wanted positive numbers")
-
-    @property
-    def peak(self) -> float:
-        """Unused: the shader computes colours, not a relative radiance."""
-        return 1.0
-
-    @property
-    def texel_reads(self) -> int:
-        return 0
 
     def rgb(
         self,

@@ -16,7 +16,7 @@ from ...manual import Parameter, listed
 from .base import Shader
 from .evaluate import VARIANTS
 from .lights import Light, lights_of, spectrum_of
-from .picture import Emission, decode, encode
+from .picture import Emission, with_power_gamma
 from .pq import PQ
 from .quirks import Quirks
 from .surfaces import Shaded, gratings_of, in_place, recipe_of, sum_along
@@ -186,7 +186,7 @@ def define() -> type:
             with in_place(prepared.gratings, prepared.shaded):
                 (rgb, radiance), active = sum_along(scene, ray, active, at_hit)
             if self.quirks.power_gamma:
-                rgb = decode(encode(rgb, True))
+                rgb = with_power_gamma(rgb)
             return dr.select(active, rgb, 0), radiance, active
 
         def to_string(self) -> str:

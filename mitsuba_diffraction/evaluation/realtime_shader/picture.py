@@ -1,4 +1,4 @@
-"""Display encoding of the linear RGB of the shader, and spectra that represent the displayed colour."""
+"""The linear RGB of the shader on a display, and spectra that represent the displayed colour."""
 
 from __future__ import annotations
 
@@ -11,16 +11,9 @@ from .base import interpolated
 from .tristimulus import EMISSION, primary_spectra
 
 
-def encode(rgb: mi.Color3f, power_gamma: bool) -> mi.Color3f:
-    """Encode linear RGB for a display: a power of 1/2.5, or the transfer function of sRGB (IEC 61966-2-1)."""
-    rgb = dr.maximum(rgb, 0)
-    if power_gamma:
-        return dr.power(rgb, 1 / 2.5)
-    return dr.select(rgb <= 0.0031308, 12.92 * rgb, 1.055 * dr.power(rgb, 1 / 2.4) - 0.055)
-
-
-def decode(encoded: mi.Color3f) -> mi.Color3f:
-    """Return the linear sRGB that an sRGB display emits for these values."""
+def with_power_gamma(rgb: mi.Color3f) -> mi.Color3f:
+    """Return the linear sRGB that an sRGB display (IEC 61966-2-1) emits for linear RGB encoded by a power of 1/2.5."""
+    encoded = dr.power(dr.maximum(rgb, 0), 1 / 2.5)
     return dr.select(encoded <= 0.04045, encoded / 12.92, dr.power((encoded + 0.055) / 1.055, 2.4))
 
 
