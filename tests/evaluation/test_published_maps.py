@@ -45,7 +45,7 @@ def test_the_emulated_shader_gives_the_published_map_of_the_blaze(llvm):
 
 def test_the_emulated_shader_gives_the_published_map_of_elaphe_from_half_the_pixels(llvm):
     pixels = grid(ELAPHE, 20)
-    heights = halved(ELAPHE.height_field)
+    heights = halved(ELAPHE.recipe.height_field())
     as_published, doubled = (agreement(pixels, found) for found in shader_rgb(heights, TRUNCATED, pixels.wo, [1, 2]))
     assert as_published.correlation >= 0.99
     assert doubled.correlation < 0.6  # the series of 37 terms diverges

@@ -370,8 +370,6 @@ def test_figures_and_the_table_are_written(llvm, tmp_path):
             lambda: ridges(ReflectanceMap(BLAZE, "nmm", 75.0, COARSE[:1], np.zeros((1, 3)), np.ones((1, 3)))),
             "found: got a map of nmm, wanted one with all viewing angles",
         ),
-        (lambda: PublishedSurface("x", BLAZE.recipe, 2, 1.0, (0, 0)), "axis: got 2"),
-        (lambda: PublishedSurface("x", BLAZE.recipe, 0, 0.0, (0, 0)), r"period: got 0\.0"),
     ],
 )
 def test_wrong_arguments_are_refused(llvm, call, message):

@@ -12,7 +12,6 @@ from __future__ import annotations
 import functools
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -20,9 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 from scipy.optimize import minimize_scalar
 
-from ...cli.examples import source
 from ...errors import RequestError
-from ...grating_spectrum import GratingSpectrum
 from ...recipe import Recipe
 from ...settings import Settings
 from ...surface.heightfield import HeightField
@@ -30,6 +27,7 @@ from ...testing import array, vectors
 from ..realtime_shader.evaluate import shader_for
 from ..realtime_shader.quirks import Quirks
 from ..realtime_shader.tristimulus import WAVELENGTH_STEP, d65_weights, rgb_matrix
+from .published_surfaces import MEASURED, scan
 from .record import Check, Record
 from .viewing_angle import MODEL, relative_reflectance, wavelengths
 
@@ -45,6 +43,7 @@ ENCODINGS = ("sRGB", "gamma 2.5")
 _MIRROR = 0.1  # sin θ_o; the pictures are saturated nearer to the mirror direction
 _LIGHT = (0.0, 0.0, 1.0)
 _COHERENCE_LENGTH = 65.0
+_SETTINGS = Settings(coherence_length=_COHERENCE_LENGTH, wavelengths=(380, 780), tolerance=0.01)
 _TERMS = {PUBLISHED: 50, TRUNCATED: 37}
 """Of the series; the error of 50 about the centre is 1e-7 for 0.9 µm at 380 nm. Corrected, as many as needed."""
 # Relative radiance and the pictures' conversion of colours, so that maps differ by the light alone. Unlike the shader,
@@ -63,13 +62,13 @@ class PublishedMap:
     Attributes:
         name: for titles.
         picture: file in `precompute/measured/published`.
-        surface: of the recipe; the heights of a scan are relative to `precompute/measured`.
+        recipe: of the heights, as the tile that the thesis takes them for, and of a spectrum of it.
         covered: (first row, end, first column, end) of rectangles where the picture shows something else.
     """
 
     name: str
     picture: str
-    surface: dict[str, Any]
+    recipe: Recipe
     covered: tuple[tuple[int, int, int, int], ...] = ()
 
     def path(self) -> Path:
@@ -78,54 +77,30 @@ class PublishedMap:
         Raises:
             RuntimeError: if the package was installed without its examples.
         """
-        return _measured() / "published" / self.picture
+        return MEASURED / "published" / self.picture
 
     @property
     def height(self) -> float:
         """Of a scan, µm from black to white, which it need not contain."""
-        return float(self.surface["height_range"])
-
-    @functools.cached_property
-    def recipe(self) -> Recipe:
-        """Heights, as the tile that the thesis takes them for, and the parameters of a spectrum of it."""
-        settings = Settings(coherence_length=_COHERENCE_LENGTH, wavelengths=(380, 780), tolerance=0.01)
-        return Recipe(self.surface, settings, _measured())
-
-    @functools.cached_property
-    def height_field(self) -> HeightField:
-        """The heights."""
-        return self.recipe.height_field()
-
-    @functools.cached_property
-    def spectrum(self) -> GratingSpectrum:
-        """S(q; κ), from the cache of recipes or built."""
-        return self.recipe.cached()
-
-
-def _measured() -> Path:
-    return source() / "precompute" / "measured"
-
-
-def _scan(name: str, height_range: float) -> dict[str, Any]:
-    return {"scan": f"{name}_afm_65um.png", "pixel_size": 65 / 1332, "height_range": height_range}
+        return float(self.recipe.surface["height_range"])
 
 
 PUBLISHED_MAPS = {
     "blaze": PublishedMap(
         "Blaze",
         "flss_blazed.png",
-        {"profile": "blazed", "period": 2.5, "depth": 0.2462},
+        Recipe({"profile": "blazed", "period": 2.5, "depth": 0.2462}, _SETTINGS),
         # An enlarged part, and the red frame around that part.
         (
             (450, 750, 480, 780),
             *((350, 353, 250, 350), (447, 450, 250, 350), (350, 450, 250, 253), (350, 450, 347, 350)),
         ),
     ),
-    "elaphe": PublishedMap("Elaphe", "flss_elaphe.png", _scan("elaphe", 0.4347)),
-    "xenopeltis": PublishedMap("Xenopeltis", "flss_xeno.png", _scan("xenopeltis", 0.8187)),
+    "elaphe": PublishedMap("Elaphe", "flss_elaphe.png", scan("elaphe", 0.4347, _SETTINGS)),
+    "xenopeltis": PublishedMap("Xenopeltis", "flss_xeno.png", scan("xenopeltis", 0.8187, _SETTINGS)),
 }
 """Name → published map."""
-_MIN_CORRELATION = {"blaze": 0.98, "elaphe": 0.98, "xenopeltis": 0.98}
+_MIN_CORRELATION = 0.98
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,11 +172,11 @@ def linear_rgb(published: PublishedMap, method: str, wo: ArrayLike) -> Array:
     if method != MODEL and method not in _QUIRKS:
         raise RequestError(f"method: got {method!r}, wanted one of {', '.join((*_QUIRKS, MODEL))}")
     if method == MODEL:
-        xyz = relative_reflectance(published.spectrum, _LIGHT, wo, wavelengths()) @ (
+        xyz = relative_reflectance(published.recipe.cached(), _LIGHT, wo, wavelengths()) @ (
             WAVELENGTH_STEP * d65_weights()[:: int(WAVELENGTH_STEP)]
         )
         return xyz @ rgb_matrix(cie_rgb_matrix=True, d65_twice=False).T
-    return shader_rgb(published.height_field, method, wo, [1.0])[0]
+    return shader_rgb(published.recipe.height_field(), method, wo, [1.0])[0]
 
 
 def shader_rgb(height_field: HeightField, method: str, wo: ArrayLike, height_scales: ArrayLike) -> Array:
@@ -233,13 +208,14 @@ class Agreement:
 
 def encoded(linear: Array, brightness: float = 1.0, encoding: str = "sRGB") -> Array:
     """Return linear RGB times the brightness, clipped and encoded by one of `ENCODINGS`, from 0 to 1."""
+    import colour
+
     if encoding not in ENCODINGS:
         raise RequestError(f"encoding: got {encoding!r}, wanted one of {', '.join(ENCODINGS)}")
     clipped = np.clip(linear * brightness, 0, 1)
     if encoding == "gamma 2.5":
         return clipped ** (1 / 2.5)
-    # IEC 61966-2-1
-    return np.where(clipped <= 0.0031308, 12.92 * clipped, 1.055 * clipped ** (1 / 2.4) - 0.055)
+    return colour.cctf_encoding(clipped, function="sRGB")
 
 
 def agreement(pixels: Grid, linear: Array, encoding: str = "sRGB") -> Agreement:
@@ -277,7 +253,7 @@ def correlation_against_height(published: PublishedMap, method: str, heights: Ar
     """
     pixels = grid(published, step)
     scales = np.asarray(heights, np.float64) / published.height
-    maps = shader_rgb(published.height_field, method, pixels.wo, scales)
+    maps = shader_rgb(published.recipe.height_field(), method, pixels.wo, scales)
     return np.array([agreement(pixels, linear).correlation for linear in maps])
 
 
@@ -285,7 +261,7 @@ def published_map(name: str, step: int = 8) -> Record:
     """Correlate FLSS as published with the author's map."""
     pixels = grid(PUBLISHED_MAPS[name], step)
     found = agreement(pixels, linear_rgb(PUBLISHED_MAPS[name], PUBLISHED, pixels.wo))
-    return Record(found.correlation, 1.0, 1 - _MIN_CORRELATION[name], note=f"correlation at every {step}th pixel")
+    return Record(found.correlation, 1.0, 1 - _MIN_CORRELATION, note=f"correlation at every {step}th pixel")
 
 
 CHECKS = tuple(
