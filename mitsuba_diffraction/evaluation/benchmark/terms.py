@@ -18,9 +18,7 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-from ...files import whole_file
 from ...grating_spectrum import GratingSpectrum
-from ...outputs import png_text
 from ...progress import Progress, silent, table
 from ...reference import order_powers
 from ...settings import ORIGINS, SERIES, VISIBLE
@@ -28,7 +26,7 @@ from ...spectrum.grids import OrderGrid
 from ...spectrum.tables import AmplitudeTable, series_function, series_weights
 from ..realtime_shader.flss import FLSS
 from ..report import cells
-from ..validation.figures import figure, png
+from ..validation.figures import figure, save_png
 from .accuracy import Exact
 from .cases import Case
 from .shader_speed import shader_difference, shaders_of, shading
@@ -405,9 +403,7 @@ _SHOWN_ERRORS = 1e-15, 1e3
 
 def save_plot(found: Found, path: str | os.PathLike[str]) -> None:
     """Plot the errors of each tile against the number of terms, and the bounds, as a PNG."""
-    content = png(plot(found), pnginfo=png_text())
-    with whole_file(path) as temporary:
-        temporary.write_bytes(content)
+    save_png(plot(found), path)
 
 
 def plot(found: Found) -> Figure:

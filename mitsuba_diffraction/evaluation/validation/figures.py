@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import io
 import os
 from collections.abc import Callable, Iterable, Sequence
@@ -13,7 +12,7 @@ import numpy as np
 
 from ...errors import RequestError
 from ...files import whole_file
-from ...outputs import MARK, png_text
+from ...outputs import png_text
 from ..realtime_shader.quirks import Quirks
 from ..report import markdown, save_markdown
 from .brdf_map import MAP_METHODS, PROJECTIONS, BRDFMap, brdf_map
@@ -34,7 +33,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.cm import ScalarMappable
     from matplotlib.figure import Figure
-    from PIL.PngImagePlugin import PngInfo
 
 MAP_COHERENCE = {"blaze": 6.5}
 """µm, of the BRDF maps: in sunlight the orders of the blaze would be thinner than a pixel."""
@@ -51,8 +49,8 @@ def figure(width: float, height: float) -> Figure:
     return Figure(figsize=(width, height), layout="constrained")
 
 
-def png(drawn: Figure, dpi: float = 110, pnginfo: PngInfo | None = None) -> bytes:
-    """Encode a figure as a PNG of a palette of 256 colours, half the size of a PNG of all colours."""
+def png(drawn: Figure, dpi: float = 110) -> bytes:
+    """Encode a figure as a PNG of a palette of 256 colours, half the size of a PNG of all colours; with the mark."""
     from PIL import Image
 
     whole, reduced = io.BytesIO(), io.BytesIO()
@@ -62,8 +60,14 @@ def png(drawn: Figure, dpi: float = 110, pnginfo: PngInfo | None = None) -> byte
         palette = picture.quantize(256, kmeans=2)
         # Pillow mixes colours only for a palette that it is given.
         mixed = picture.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG)
-        mixed.save(reduced, format="png", optimize=True, pnginfo=pnginfo)
+        mixed.save(reduced, format="png", optimize=True, pnginfo=png_text())
     return reduced.getvalue()
+
+
+def save_png(drawn: Figure, path: str | os.PathLike[str]) -> None:
+    """Write a figure as such a PNG, atomically."""
+    with whole_file(path) as temporary:
+        temporary.write_bytes(png(drawn))
 
 
 def plot_reflectance(maps: Sequence[ReflectanceMap]) -> Figure:
@@ -224,7 +228,7 @@ def figure_names(surfaces: Iterable[str] = tuple(SURFACES)) -> list[str]:
     """Return the names of the files that `save_figures` writes."""
     return [
         *(f"{kind}_{name}.png" for name in surfaces for kind in ("viewing_angle", "brdf")),
-        *("periods.md", "periods.csv"),
+        "periods.md",
     ]
 
 
@@ -239,7 +243,7 @@ def save_figures(
     """Evaluate and plot as in chapter 5 of the thesis of 2014, under the current variant of Mitsuba.
 
     Written atomically: for every surface `viewing_angle_NAME.png` and `brdf_NAME.png`; and the fitted
-    periods, `periods.md` and `periods.csv`.
+    periods, `periods.md`.
 
     Args:
         folder: of the files; created if missing.
@@ -263,8 +267,7 @@ def save_figures(
     rows: list[list[str]] = []
 
     def save(drawn: Figure, name: str) -> None:
-        with whole_file(folder / name) as temporary:
-            temporary.write_bytes(png(drawn, pnginfo=png_text()))
+        save_png(drawn, folder / name)
         files.append(folder / name)
         progress(len(files), 2 * len(surfaces))
 
@@ -279,9 +282,5 @@ def save_figures(
             for projection in PROJECTIONS
         ]
         save(plot_brdf_maps(brdf_maps), f"brdf_{name}.png")
-    tables = [folder / "periods.md", folder / "periods.csv"]
-    save_markdown(markdown(PERIOD_COLUMNS, rows, texts=6), tables[0])
-    with whole_file(tables[1]) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
-        csv.writer(file).writerows([PERIOD_COLUMNS, *rows])
-        file.write(f"# {MARK}\n")
-    return [*files, *tables]
+    save_markdown(markdown(PERIOD_COLUMNS, rows, texts=6), folder / "periods.md")
+    return [*files, folder / "periods.md"]

@@ -11,12 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import diric, gammaln
 
-from ...files import whole_file
-from ...outputs import png_text
 from ...surface.heightfield import HeightField
 from ..realtime_shader.flss import FLSS
 from ..realtime_shader.taylor_textures import MAX_KAPPA, taylor_transforms
-from .figures import figure, png
+from .figures import figure, save_png
 from .published_surfaces import SURFACES
 
 if TYPE_CHECKING:
@@ -197,5 +195,4 @@ def plot_fourier_images(terms: int = FLSS.published_terms) -> Figure:
 def save_fourier(folder: str | os.PathLike[str]) -> None:
     """Write `FILES` into a folder, which exists."""
     for name, drawn in zip(FILES, (plot_interpolation(), plot_fourier_images()), strict=True):
-        with whole_file(Path(folder) / name) as temporary:
-            temporary.write_bytes(png(drawn, pnginfo=png_text()))
+        save_png(drawn, Path(folder) / name)
