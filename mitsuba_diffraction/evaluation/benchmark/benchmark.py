@@ -12,7 +12,6 @@ import mitsuba as mi
 import numpy as np
 from rich.table import Table
 
-from ... import outputs
 from ...files import whole_file
 from ...grating_spectrum import GratingSpectrum
 from ...outputs import METADATA
@@ -160,16 +159,6 @@ def tables(results: Sequence[Result], shaders: Sequence[ShaderSpeed], sampled: S
         table(shader_speed.COLUMNS, (report.cells(shader_speed.COLUMNS, row) for row in shaders), texts=2),
         table(sampling.COLUMNS, (report.cells(sampling.COLUMNS, row) for row in sampled)),
     ]
-
-
-def save_json(
-    results: Sequence[Result],
-    shaders: Sequence[ShaderSpeed],
-    sampled: Sequence[Sampling],
-    path: str | os.PathLike[str],
-) -> None:
-    """Write all results atomically."""
-    outputs.save_json({"speed and error": results, "real-time shader": shaders, "sampling": sampled}, path)
 
 
 def save_plot(results: Sequence[Result], path: str | os.PathLike[str]) -> None:

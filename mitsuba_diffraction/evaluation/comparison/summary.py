@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.table import Table
 
-from ... import outputs
 from ...color import XYZ_to_linear_sRGB, into_gamut, on_screen
 from ...files import whole_file
 from ...outputs import METADATA
@@ -160,7 +159,7 @@ def _difference(found: Difference) -> dict[str, float]:
 
 
 def as_dict(comparison: Comparison) -> dict[str, object]:
-    """Return all numbers, for `report.save_json`."""
+    """Return all numbers, for `outputs.save_json`."""
     shares = comparison.shares
     return {
         "scene": comparison.scene,
@@ -195,11 +194,6 @@ def as_dict(comparison: Comparison) -> dict[str, object]:
             "of same light": shares.same_light,
         },
     }
-
-
-def save_json(comparison: Comparison, path: str | os.PathLike[str]) -> None:
-    """Write `as_dict` atomically."""
-    outputs.save_json(as_dict(comparison), path)
 
 
 def shown(comparison: Comparison, name: str) -> NDArray[np.uint8]:
