@@ -13,7 +13,6 @@ import mitsuba_diffraction as md
 from mitsuba_diffraction.evaluation.realtime_shader import tristimulus
 from mitsuba_diffraction.evaluation.realtime_shader.evaluate import VARIANTS, colour, relative_radiance, shader_for
 from mitsuba_diffraction.evaluation.realtime_shader.nmm_pq import line_area
-from mitsuba_diffraction.evaluation.realtime_shader.picture import Emission, with_power_gamma
 from mitsuba_diffraction.evaluation.realtime_shader.pq import tile_factor, tiling_power
 from mitsuba_diffraction.evaluation.realtime_shader.quirks import Quirks
 from mitsuba_diffraction.evaluation.realtime_shader.taylor_textures import series_error, taylor_transforms
@@ -501,7 +500,7 @@ def test_an_srgb_display_shows_what_is_encoded_by_a_power():
     import colour as science
 
     values = np.linspace(0, 1, 50)
-    found = with_power_gamma(mi.Color3f(mi.Float(values.astype(np.float32))))
+    found = tristimulus.with_power_gamma(mi.Color3f(mi.Float(values.astype(np.float32))))
     expected = science.cctf_decoding(values ** (1 / 2.5), function="sRGB")
     np.testing.assert_allclose(np.array(found)[0], expected, atol=1e-5)
 
@@ -533,7 +532,7 @@ def test_spectra_of_the_primaries_have_their_colours():
     assert spectra.min() > -1e-6
     np.testing.assert_allclose(spectrum_to_linear_sRGB(spectra.T, tristimulus.EMISSION), np.eye(3), atol=6e-3)
     wavelengths = mi.UnpolarizedSpectrum(360, 452.5, 700, 830)
-    light = np.array(Emission()(mi.Color3f(0.5, 1, 2), wavelengths, mi.Bool(True))).ravel()
+    light = np.array(tristimulus.Emission()(mi.Color3f(0.5, 1, 2), wavelengths, mi.Bool(True))).ravel()
     expected = [np.interp(w, tristimulus.EMISSION, spectra @ [0.5, 1, 2]) for w in (360, 452.5, 700, 830)]
     np.testing.assert_allclose(light, expected, rtol=1e-4, atol=1e-6)
 

@@ -286,20 +286,18 @@ def test_nmm_sees_only_the_orders_of_the_tile(llvm, incidence):
 def test_positions_of_orders_are_maxima_of_the_map(llvm, projection):
     found = brdf_map(BLAZE.with_coherence_length(6.5), projection=projection, side=120, incidence=(30.0, 20.0))
     for nanometres, channel in ((450.0, 2), (650.0, 0)):
-        x, y = found.positions_of_orders(np.float64(nanometres), np.int64(1))
+        x, y = found.position_of_order(nanometres, 1)
         column, row = np.abs(found.x - x).argmin(), np.abs(found.y - y).argmin()
         colour = found.rgb[row, column]
         assert colour.argmax() == channel
         # It is dark beside the order; an evanescent order has no position.
         assert found.rgb[(row + 30) % 120, column].max() < 1e-2 * colour.max()
-    assert np.isnan(found.positions_of_orders(np.float64(650.0), np.int64(9))).all()
+    assert np.isnan(found.position_of_order(650.0, 9)).all()
 
 
 def test_orders_do_not_move_in_the_plane_of_u_and_v(llvm):
     positions = [
-        brdf_map(BLAZE, "gem", projection="uv", side=8, incidence=(theta, 10.0)).positions_of_orders(
-            550.0, np.int64(-1)
-        )
+        brdf_map(BLAZE, "gem", projection="uv", side=8, incidence=(theta, 10.0)).position_of_order(550.0, -1)
         for theta in (0.0, 20.0, 40.0)
     ]
     np.testing.assert_allclose(positions, [(-0.55 / 2.5, 0)] * 3, atol=1e-12)

@@ -13,12 +13,12 @@ from ...testing import vectors
 from ..realtime_shader.base import Shader
 from ..realtime_shader.evaluate import shader_for
 from ..realtime_shader.quirks import Quirks
+from ..realtime_shader.tristimulus import PUBLISHED_R0
 from ..validation.lobes import k_g_between
 from .accuracy import Exact, patch_difference, patch_directions
 from .cases import Case
 from .speed import Rays, seconds
 
-_R_0 = 0.04  # skin
 _SHADERS = (("flss", True), ("flss", False), ("nmm", True), ("pq", True))
 
 COLUMNS = {
@@ -97,7 +97,7 @@ def shaders_of(case: Case) -> dict[tuple[str, bool], Shader]:
 
 def shading(rays: Rays, shader: Shader) -> Callable[[], None]:
     """Return a function that evaluates a shader for all rays."""
-    weights = shader.weights(_R_0)
+    weights = shader.weights()
     return lambda: dr.eval(shader.rgb(rays.si.wi, rays.wo, weights))
 
 
@@ -107,7 +107,7 @@ def shader_difference(shader: Shader, exact: Exact) -> tuple[float, float]:
 
     wi, wo = patch_directions()
     cos_half = np.sqrt((1 + (wi * wo).sum(axis=-1)) / 2)
-    wanted = exact.xyz * ((_R_0 + (1 - _R_0) * (1 - cos_half) ** 5) * k_g_between(wi, wo))[:, None]
-    rgb = np.array(shader.rgb(vectors(wi), vectors(wo), shader.weights(_R_0)), np.float64).T
+    wanted = exact.xyz * ((PUBLISHED_R0 + (1 - PUBLISHED_R0) * (1 - cos_half) ** 5) * k_g_between(wi, wo))[:, None]
+    rgb = np.array(shader.rgb(vectors(wi), vectors(wo), shader.weights()), np.float64).T
     xyz = rgb @ colour.RGB_COLOURSPACES["sRGB"].matrix_RGB_to_XYZ.T
     return patch_difference(wanted, xyz * (wanted[:, 1].sum() / xyz[:, 1].sum()))

@@ -1,4 +1,4 @@
-"""Base classes of the variants of the shader, the gain (eq. 3.10) and the contribution of each wavelength to XYZ."""
+"""Base classes of the variants of the shader, and the gain (eq. 3.10)."""
 
 from __future__ import annotations
 
@@ -11,25 +11,15 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...bsdf.tables import PacketTable, larger, opaque
+from ...bsdf.tables import larger, opaque
 from ...geometry import k_g
 from ...settings import SUN_COHERENCE_LENGTH, lobe_width
 from ...surface.heightfield import HeightField
 from .quirks import Quirks
 from .taper import tapered
 from .taylor_textures import MAX_KAPPA, TaylorTextures, taylor_transforms, terms_for
-from .tristimulus import (
-    MAX_WAVELENGTH,
-    MIN_WAVELENGTH,
-    WAVELENGTH_COUNT,
-    WAVELENGTH_STEP,
-    d65_weights,
-    light_weights,
-    rgb_matrix,
-    wavelengths,
-)
+from .tristimulus import MIN_WAVELENGTH, PUBLISHED_R0, WAVELENGTH_COUNT, WAVELENGTH_STEP, SpectralWeights, rgb_matrix
 
-PUBLISHED_R0 = 0.04  # an index of 1.5, close to that of snake skin
 SERIES_ERROR = 1e-4  # of the amplitudes, if the number of Taylor terms is not given
 
 
@@ -74,53 +64,6 @@ class Gain:
         )
 
 
-class SpectralWeights:
-    """Table of (X, Y, Z, R₀) with one entry per nm, read with linear interpolation (algorithm 4.3, line 5)."""
-
-    def __init__(
-        self,
-        quirks: Quirks,
-        peak: float,
-        *,
-        r_0: ArrayLike = PUBLISHED_R0,
-        light: ArrayLike | None = None,
-    ) -> None:
-        """Build the table.
-
-        For the irradiance E(λ) per nm and the relative radiance ρ(λ), the colour is ∫ ρ E (x̄, ȳ, z̄) dλ / ∫ȳ dλ.
-        Absolute radiance has the additional factor R₀ S(0)/λ², where S(0) is the density of a flat surface at q = 0.
-
-        Args:
-            quirks: `fixed_index`, `d65_light` and `relative` apply.
-            peak: S(0) of a flat surface, µm².
-            r_0: power reflectance at normal incidence, one number or (401,) at `tristimulus.wavelengths`.
-            light: spectrum of the light, (401,); default: D65 with Y = 1.
-        """
-        weights = d65_weights() if light is None else light_weights(light)
-        self.luminance = 1.0 if light is None else float(np.trapezoid(weights[:, 1]))
-        if quirks.d65_light:
-            weights = d65_weights() * self.luminance
-        r_0 = PUBLISHED_R0 if quirks.fixed_index else r_0
-        r_0 = np.broadcast_to(np.asarray(r_0, np.float64), wavelengths().shape)
-        if not quirks.relative:
-            weights = weights * (r_0 * peak / (wavelengths() * 1e-3) ** 2)[:, None]
-        self.table = PacketTable(np.concatenate([weights, r_0[:, None]], axis=1))
-
-    def __call__(self, wavelength: mi.Float, active: mi.Bool) -> tuple[mi.Color3f, mi.Float]:
-        """Return (X, Y, Z) per nm, and R₀, at a wavelength in nm; zero outside 380 to 780 nm."""
-        active = active & (wavelength >= MIN_WAVELENGTH - 1e-3) & (wavelength <= MAX_WAVELENGTH + 1e-3)
-        value = interpolated(self.table, wavelength - MIN_WAVELENGTH, int(MAX_WAVELENGTH - MIN_WAVELENGTH), active)
-        return mi.Color3f(value.x, value.y, value.z), value.w
-
-
-def interpolated(table: PacketTable, position: mi.Float, last: int, active: mi.Bool) -> mi.Vector4f:
-    """Return a table's packets 0 … `last`, interpolated linearly at `position` (clamped), and zero if not `active`."""
-    position = dr.clip(position, 0, last)
-    index = mi.UInt32(dr.minimum(position, last - 1))
-    below, above = table(index, active), table(index + 1, active)
-    return below + (position - mi.Float(index)) * (above - below)
-
-
 class Shader:
     """Base class of the shaders of a tile: directions → linear RGB.
 
@@ -150,7 +93,7 @@ class Shader:
 
     def weights(self, r_0: ArrayLike = PUBLISHED_R0, light: ArrayLike | None = None) -> SpectralWeights:
         """Return the `SpectralWeights` of a material and a light."""
-        return SpectralWeights(self.quirks, self.peak, r_0=r_0, light=light)
+        return SpectralWeights(self.quirks, self.peak, r_0, light)
 
     def rgb(
         self,

@@ -16,10 +16,10 @@ from ...manual import Parameter, listed
 from .base import Shader
 from .evaluate import VARIANTS
 from .lights import Light, lights_of, spectrum_of
-from .picture import Emission, with_power_gamma
 from .pq import PQ
 from .quirks import Quirks
 from .surfaces import Shaded, gratings_of, in_place, recipe_of, sum_along
+from .tristimulus import Emission, with_power_gamma
 
 PARAMETERS = (
     Parameter("variant", "string", "flss, nmm, pq, nmm_pq or gem", "flss"),

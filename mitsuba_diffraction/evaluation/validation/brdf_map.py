@@ -51,26 +51,18 @@ class BRDFMap:
         """sRGB (side, side, 3) from 0 to 1; 0.5 grey outside."""
         return np.where(np.isnan(self.rgb), 0.5, on_screen(into_gamut(self.rgb) * self.exposure) / 255)
 
-    def positions_of_orders(self, nanometres: Array, orders: Array) -> tuple[Array, Array]:
-        """Return the positions of orders in the map, by the grating equation with the published period.
+    def position_of_order(self, nanometres: float, order: int) -> Array:
+        """Return (x, y) of an order n in the map by the grating equation with the published period; NaN if evanescent.
 
         The direction cosines of light and viewer along the diffracting axis add up to −nλ/d, across it to zero.
-
-        Args:
-            nanometres: (...) wavelengths.
-            orders: (...) n; the two broadcast.
-
-        Returns:
-            x and y, (...) each; NaN where the order is evanescent.
         """
-        path = np.asarray(orders) * np.asarray(nanometres) * 1e-3 / self.surface.period
-        sums = np.zeros((*path.shape, 2))
-        sums[..., self.surface.axis] = path
+        sums = np.zeros(2)
+        sums[self.surface.axis] = order * nanometres * 1e-3 / self.surface.period
         out = -sums - direction(*self.incidence)[:2]
-        radius = np.hypot(out[..., 0], out[..., 1])
-        position = sums if self.projection == "uv" else _in_degrees(out, radius)
-        position = np.where((radius < 1)[..., None], position, np.nan)
-        return position[..., 0], position[..., 1]
+        sine = np.hypot(*out)
+        if sine >= 1:
+            return np.full(2, np.nan)
+        return sums if self.projection == "uv" else out * (np.rad2deg(np.arcsin(sine)) / max(sine, 1e-12))
 
 
 def brdf_map(
@@ -130,9 +122,3 @@ def _linear_rgb(surface: PublishedSurface, method: str, wi: Array, wo: Array, qu
     nanometres = wavelengths()
     values = relative_reflectance(surface.spectrum, wi, wo, nanometres)
     return spectrum_to_linear_sRGB(values * daylight(nanometres), nanometres)
-
-
-def _in_degrees(cosines: Array, radius: Array) -> Array:
-    """Convert direction cosines (..., 2) of length `radius` to (θ cos φ, θ sin φ) in degrees."""
-    theta = np.rad2deg(np.arcsin(np.minimum(radius, 1)))
-    return cosines * np.divide(theta, radius, out=np.full_like(radius, np.rad2deg(1)), where=radius > 0)[..., None]

@@ -172,7 +172,7 @@ def _mark_orders(panel: Axes, found: BRDFMap) -> None:
     size = found.x[-1] - found.x[0]
     for order in (-2, -1, 1, 2):
         for nanometres, tint in ((450.0, "#6677ff"), (550.0, "#33cc33"), (650.0, "#ff4433")):
-            position = np.array(found.positions_of_orders(np.float64(nanometres), np.int64(order)))
+            position = found.position_of_order(nanometres, order)
             ends = np.stack([position, position])
             ends[:, across] += np.array([0.08, 0.12]) * size
             panel.plot(*ends.T, color=tint, linewidth=1)

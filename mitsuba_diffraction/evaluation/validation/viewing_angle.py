@@ -104,13 +104,6 @@ class ReflectanceMap:
     angles: Array
     reflectance: Array
 
-    def __post_init__(self) -> None:
-        shape = (self.wavelengths.size, self.angles.shape[-1])
-        if self.reflectance.shape != shape or self.angles.shape not in (shape, shape[1:]):
-            raise RequestError(
-                f"reflectance, angles: got shapes {self.reflectance.shape} and {self.angles.shape}, wanted {shape}"
-            )
-
     @property
     def order(self) -> Array:
         """n = d (sin θ_i + sin θ_r)/λ with the published d, (n, m)."""
