@@ -11,7 +11,6 @@ from ...color import auto_exposure, daylight, into_gamut, on_screen, spectrum_to
 from ...errors import RequestError
 from ...testing import direction
 from ..realtime_shader.evaluate import VARIANTS, colour
-from ..realtime_shader.quirks import Quirks
 from .published_surfaces import PublishedSurface
 from .viewing_angle import MODEL, relative_reflectance, wavelengths
 
@@ -72,12 +71,11 @@ def brdf_map(
     projection: str = "hemisphere",
     incidence: tuple[float, float] = (30.0, 0.0),
     side: int = 240,
-    quirks: Quirks | None = None,
 ) -> BRDFMap:
     """Evaluate a surface over the outgoing hemisphere under D65.
 
-    The model's relative reflectance, at every 5 nm, becomes XYZ and sRGB; the shader's variants give their own linear
-    RGB. Each map has its own exposure by `color.auto_exposure`, and stores it.
+    The model's relative reflectance, at every 5 nm, becomes XYZ and sRGB; the shader's variants, as published, give
+    their own linear RGB. Each map has its own exposure by `color.auto_exposure`, and stores it.
 
     Args:
         surface: the surface.
@@ -85,7 +83,6 @@ def brdf_map(
         projection: one of `PROJECTIONS`.
         incidence: (θ_i, φ_i) in degrees, φ_i from the x axis.
         side: pixels along x and along y.
-        quirks: of the shader; as published if none are given.
 
     Raises:
         ValueError: if an argument is wrong, or Mitsuba has no vectorised spectral variant set.
@@ -110,15 +107,15 @@ def brdf_map(
         above = z > 0
         wo = np.concatenate([out, np.sqrt(np.maximum(z, 0))[..., None]], axis=-1)
     rgb = np.full((side, side, 3), np.nan)
-    rgb[above] = _linear_rgb(surface, method, wi, wo[above], quirks)
+    rgb[above] = _linear_rgb(surface, method, wi, wo[above])
     shown = into_gamut(rgb[above])
     return BRDFMap(surface, method, projection, incidence, x, y, rgb, auto_exposure(shown))
 
 
-def _linear_rgb(surface: PublishedSurface, method: str, wi: Array, wo: Array, quirks: Quirks | None) -> Array:
+def _linear_rgb(surface: PublishedSurface, method: str, wi: Array, wo: Array) -> Array:
     if method != MODEL:
         settings = {} if method == "gem" else {"coherence_length": surface.shader_coherence_length}
-        return colour(surface.height_field, wi, wo, variant=method, quirks=quirks, **settings)
+        return colour(surface.height_field, wi, wo, variant=method, **settings)
     nanometres = wavelengths()
     values = relative_reflectance(surface.spectrum, wi, wo, nanometres)
     return spectrum_to_linear_sRGB(values * daylight(nanometres), nanometres)

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from matplotlib.cm import ScalarMappable
     from matplotlib.figure import Figure
 
+FILES = (*(f"{kind}_{name}.png" for name in SURFACES for kind in ("viewing_angle", "brdf")), "periods.md")
 MAP_COHERENCE = {"blaze": 6.5}
 """µm, of the BRDF maps: in sunlight the orders of the blaze would be thinner than a pixel."""
 
@@ -222,14 +223,6 @@ def period_rows(surface: PublishedSurface, maps: Iterable[ReflectanceMap], step:
             ]
             rows.append([surface.name, name + manner, *numbers])
     return rows
-
-
-def figure_names(surfaces: Iterable[str] = tuple(SURFACES)) -> list[str]:
-    """Return the names of the files that `save_figures` writes."""
-    return [
-        *(f"{kind}_{name}.png" for name in surfaces for kind in ("viewing_angle", "brdf")),
-        "periods.md",
-    ]
 
 
 def save_figures(

@@ -22,7 +22,6 @@ from .published_maps import (
     PUBLISHED,
     PUBLISHED_MAPS,
     TRUNCATED,
-    Agreement,
     Grid,
     agreement,
     correlation_against_height,
@@ -58,10 +57,6 @@ class Row:
     pixels: Grid
     maps: Mapping[str, Array]
 
-    def agreements(self) -> dict[str, Agreement]:
-        """Return the agreement of each method with the author's map."""
-        return {method: agreement(self.pixels, linear) for method, linear in self.maps.items()}
-
 
 def row(name: str, step: int = 2, methods: Iterable[str] = METHODS) -> Row:
     """Evaluate the maps of one of `PUBLISHED_MAPS` at every `step`-th pixel."""
@@ -77,9 +72,9 @@ def plot_maps(rows: Iterable[Row]) -> Figure:
     axes = drawn.subplots(len(rows), 1 + len(rows[0].maps), squeeze=False)
     for one, panels in zip(rows, axes, strict=True):
         pictures = {f"{one.name}, published": one.pixels.colours}
-        for method, found in one.agreements().items():
-            title = f"{_TITLES[method]}: {found.correlation:.3f}"
-            pictures[title] = encoded(one.maps[method], found.brightness)
+        for method, linear in one.maps.items():
+            found = agreement(one.pixels, linear)
+            pictures[f"{_TITLES[method]}: {found.correlation:.3f}"] = encoded(linear, found.brightness)
         for (title, colours), panel in zip(pictures.items(), panels, strict=True):
             panel.imshow(one.pixels.picture(colours), interpolation="nearest")
             panel.set_title(title, fontsize=11)

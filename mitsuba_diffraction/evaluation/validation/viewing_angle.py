@@ -34,7 +34,7 @@ METHODS = (MODEL, "flss", "nmm", "pq")
 
 INCIDENCE = 75.0
 """θ_i of the thesis, degrees."""
-
+_MIN_RIDGE = 0.3  # height relative to the brightest ridge; its prominence is at least a third of that
 
 _INDEX = 1.5  # of skin; the only one of the published shader
 _R_0 = ((_INDEX - 1) / (_INDEX + 1)) ** 2
@@ -282,15 +282,11 @@ class Ridge:
     height: float
 
 
-def ridges(found: ReflectanceMap, least: float = 0.3) -> list[Ridge]:
+def ridges(found: ReflectanceMap) -> list[Ridge]:
     """Return the ridges of a map from the period d/2 to 2d, the brightest first.
 
     A map is resampled over 1/d = (sin θ_i + sin θ_r)/λ, divided by its maximum at each wavelength, and averaged over
     the wavelengths. Not for methods with directions of their own.
-
-    Args:
-        found: the map.
-        least: height of a ridge, and its prominence, relative to the brightest.
     """
     if found.discrete:
         raise RequestError(f"found: got a map of {found.method}, wanted one with all viewing angles")
@@ -304,7 +300,7 @@ def ridges(found: ReflectanceMap, least: float = 0.3) -> list[Ridge]:
     )
     mean = (rows / rows.max(axis=1, keepdims=True)).mean(axis=0)
     mean /= mean.max()
-    (peaks, _) = find_peaks(mean, height=least, prominence=least / 3)
+    (peaks, _) = find_peaks(mean, height=_MIN_RIDGE, prominence=_MIN_RIDGE / 3)
     return [Ridge(float(1 / frequency[i]), float(mean[i])) for i in peaks[np.argsort(mean[peaks])[::-1]]]
 
 
