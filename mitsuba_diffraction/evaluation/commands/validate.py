@@ -74,10 +74,7 @@ def validate(
         writes += [("--figures", figures / name) for name in names]
     outputs.check_outputs(reads, writes, overwrite=overwrite)
     mi.set_variant(chosen)
-    if recipe is None:
-        these = checks()
-    else:
-        these = surface_checks(recipe.height_field(), recipe.cached(progress_bar))
+    these = checks() if recipe is None else surface_checks(recipe.height_field(), recipe.cached(progress_bar))
     results = []
     with progress_bar("validation") as progress:
         for check in these:
