@@ -119,19 +119,6 @@ def test_a_picture_of_a_grid_is_the_published_one():
     assert inside.mean() == pytest.approx(np.pi / 4 * 0.95**2, abs=0.02)
 
 
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda: grid(BLAZE, 3), "step: got 3, wanted a divisor of 800"),
-        (lambda: linear_rgb(BLAZE, "pq", [[0, 0, 1]]), "method: got 'pq'"),
-        (lambda: encoded(np.zeros(3), encoding="linear"), "encoding: got 'linear', wanted one of sRGB, gamma 2.5"),
-    ],
-)
-def test_wrong_arguments_are_refused(call, message):
-    with pytest.raises(ValueError, match=message):
-        call()
-
-
 def test_figures_and_table_are_written(llvm, tmp_path, monkeypatch):
     from mitsuba_diffraction.evaluation.validation import published_figures
 

@@ -19,7 +19,6 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 from scipy.optimize import minimize_scalar
 
-from ...errors import RequestError
 from ...recipe import Recipe
 from ...settings import Settings
 from ...surface.heightfield import HeightField
@@ -72,11 +71,7 @@ class PublishedMap:
     covered: tuple[tuple[int, int, int, int], ...] = ()
 
     def path(self) -> Path:
-        """Return the path of the picture.
-
-        Raises:
-            RuntimeError: if the package was installed without its examples.
-        """
+        """Return the path of the picture."""
         return MEASURED / "published" / self.picture
 
     @property
@@ -130,13 +125,7 @@ class Grid:
 
 
 def grid(published: PublishedMap, step: int = 1) -> Grid:
-    """Read a published map at every `step`-th pixel.
-
-    Raises:
-        ValueError: if the step does not divide the side of the picture.
-    """
-    if step < 1 or SIDE % step:
-        raise RequestError(f"step: got {step!r}, wanted a divisor of {SIDE}")
+    """Read a published map at every `step`-th pixel; the step divides the side of the picture."""
     with Image.open(published.path()) as file:
         picture = np.asarray(file.convert("RGB")) / 255
     chosen = np.arange(step // 2, SIDE, step)
@@ -165,12 +154,7 @@ def linear_rgb(published: PublishedMap, method: str, wo: ArrayLike) -> Array:
 
     Returns:
         Linear RGB, (n, 3).
-
-    Raises:
-        ValueError: if the method is unknown, or Mitsuba has no vectorised spectral variant set.
     """
-    if method != MODEL and method not in _QUIRKS:
-        raise RequestError(f"method: got {method!r}, wanted one of {', '.join((*_QUIRKS, MODEL))}")
     if method == MODEL:
         xyz = relative_reflectance(published.recipe.cached(), _LIGHT, wo, wavelengths()) @ (
             WAVELENGTH_STEP * d65_weights()[:: int(WAVELENGTH_STEP)]
@@ -210,8 +194,6 @@ def encoded(linear: Array, brightness: float = 1.0, encoding: str = "sRGB") -> A
     """Return linear RGB times the brightness, clipped and encoded by one of `ENCODINGS`, from 0 to 1."""
     import colour
 
-    if encoding not in ENCODINGS:
-        raise RequestError(f"encoding: got {encoding!r}, wanted one of {', '.join(ENCODINGS)}")
     clipped = np.clip(linear * brightness, 0, 1)
     if encoding == "gamma 2.5":
         return clipped ** (1 / 2.5)
