@@ -23,18 +23,6 @@ from .tristimulus import MIN_WAVELENGTH, PUBLISHED_R0, WAVELENGTH_COUNT, WAVELEN
 SERIES_ERROR = 1e-4  # of the amplitudes, if the number of Taylor terms is not given
 
 
-def schlick_falloff(cos_half: mi.Float) -> mi.Float:
-    """Return (1 − ω_o·h)⁵ (Schlick 1994; eq. B.1): F = R₀ + (1 − R₀)(1 − ω_o·h)⁵."""
-    x = 1 - cos_half
-    return dr.square(dr.square(x)) * x
-
-
-def fresnel_ratio(r_0: mi.Float, falloff: mi.Float, squared: bool) -> mi.Float:
-    """Return F(ω_o·h)/F(1), or its square."""
-    ratio = (r_0 + (1 - r_0) * falloff) / r_0
-    return dr.square(ratio) if squared else ratio
-
-
 class Gain:
     """C(ω_i, ω_o) without F and with shadowing: the factors independent of wavelength.
 
@@ -47,7 +35,7 @@ class Gain:
 
     Attributes:
         cos_half: ω_o·h.
-        falloff: `schlick_falloff`.
+        falloff: (1 − ω_o·h)⁵ of Schlick's approximation (1994; eq. B.1), F = R₀ + (1 − R₀)(1 − ω_o·h)⁵.
         factor: K G cos θ_i; zero below the horizon.
         active: both directions are in the upper hemisphere.
     """
@@ -58,7 +46,8 @@ class Gain:
         self.u, self.v, self.w = -wi - wo
         square = dr.square(self.u) + dr.square(self.v)
         self.cos_half = 0.5 * dr.sqrt(square + dr.square(self.w))
-        self.falloff = schlick_falloff(self.cos_half)
+        x = 1 - self.cos_half
+        self.falloff = dr.square(dr.square(x)) * x
         self.factor = dr.select(
             self.active, k_g(cos_i, cos_o, square, shadowing=shadowing, select=dr.select) * cos_i, 0
         )
@@ -243,11 +232,12 @@ class TextureShader(Shader):
         return gain.factor * self.fresnel(mi.Float(PUBLISHED_R0), gain) * power
 
     def fresnel(self, r_0: mi.Float, gain: Gain) -> mi.Float:
-        """Return F/F₀ or its square."""
+        """Return F(ω_o·h)/F(1) or its square."""
         if self.quirks.schlick or not self.exact_fresnel:
-            return fresnel_ratio(r_0, gain.falloff, self.quirks.fresnel_squared)
-        root = dr.sqrt(r_0)
-        ratio = mi.fresnel(gain.cos_half, (1 + root) / (1 - root))[0] / r_0
+            ratio = (r_0 + (1 - r_0) * gain.falloff) / r_0
+        else:
+            root = dr.sqrt(r_0)
+            ratio = mi.fresnel(gain.cos_half, (1 + root) / (1 - root))[0] / r_0
         return dr.square(ratio) if self.quirks.fresnel_squared else ratio
 
     def integral(self, gain: Gain, weights: SpectralWeights, height_scale: mi.Float) -> mi.Color3f:
