@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import os
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import mitsuba as mi
@@ -15,7 +15,7 @@ from rich.table import Table
 from ...files import whole_file
 from ...grating_spectrum import GratingSpectrum
 from ...outputs import METADATA
-from ...progress import table
+from ...progress import Progress, silent, table
 from ...settings import VISIBLE, Settings
 from .. import report
 from . import sampling, shader_speed
@@ -89,7 +89,7 @@ def run(
     count: int = 1 << 19,
     shading_points: int = 1 << 14,
     repetitions: int = 5,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = silent,
 ) -> tuple[list[Result], list[ShaderSpeed]]:
     """Measure under the current variant.
 

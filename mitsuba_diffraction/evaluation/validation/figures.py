@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import io
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...errors import RequestError
 from ...files import whole_file
 from ...outputs import png_text
+from ...progress import Progress, silent
 from ..realtime_shader.quirks import Quirks
 from ..report import markdown, save_markdown
 from .brdf_map import MAP_METHODS, PROJECTIONS, BRDFMap, brdf_map
@@ -228,11 +228,11 @@ def period_rows(surface: PublishedSurface, maps: Iterable[ReflectanceMap], step:
 def save_figures(
     folder: str | os.PathLike[str],
     *,
-    surfaces: Iterable[str] = tuple(SURFACES),
+    surfaces: Sequence[str] = tuple(SURFACES),
     step: float = 5.0,
     side: int = 200,
-    progress: Callable[[int, int], None] = lambda done, total: None,
-) -> list[Path]:
+    progress: Progress = silent,
+) -> None:
     """Evaluate and plot as in chapter 5 of the thesis of 2014, under the current variant of Mitsuba.
 
     Written atomically: for every surface `viewing_angle_NAME.png` and `brdf_NAME.png`; and the fitted
@@ -243,37 +243,25 @@ def save_figures(
         surfaces: names among `published_surfaces.SURFACES`.
         step: between wavelengths, nm.
         side: pixels of a BRDF map.
-        progress: called with (steps done, steps in total).
-
-    Returns:
-        The files.
+        progress: called with (figures done, figures in total).
 
     Raises:
-        ValueError: on an unknown surface, or where Mitsuba has no vectorised spectral variant set.
+        ValueError: if Mitsuba has no vectorised spectral variant set.
     """
-    surfaces = list(surfaces)
-    if unknown := [name for name in surfaces if name not in SURFACES]:
-        raise RequestError(f"surfaces: got {', '.join(map(repr, unknown))}, wanted among {', '.join(SURFACES)}")
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    files: list[Path] = []
     rows: list[list[str]] = []
-
-    def save(drawn: Figure, name: str) -> None:
-        save_png(drawn, folder / name)
-        files.append(folder / name)
-        progress(len(files), 2 * len(surfaces))
-
-    for name in surfaces:
+    for number, name in enumerate(surfaces):
         surface = SURFACES[name]
         maps = [reflectance_map(surface, method, wavelengths=wavelengths(step)) for method in METHODS]
         rows += period_rows(surface, maps, step)
-        save(plot_reflectance(maps), f"viewing_angle_{name}.png")
+        save_png(plot_reflectance(maps), folder / f"viewing_angle_{name}.png")
+        progress(2 * number + 1, 2 * len(surfaces))
         mapped = surface.with_coherence_length(MAP_COHERENCE[name]) if name in MAP_COHERENCE else surface
         brdf_maps = [
             [brdf_map(mapped, method, projection=projection, side=side) for method in MAP_METHODS]
             for projection in PROJECTIONS
         ]
-        save(plot_brdf_maps(brdf_maps), f"brdf_{name}.png")
+        save_png(plot_brdf_maps(brdf_maps), folder / f"brdf_{name}.png")
+        progress(2 * number + 2, 2 * len(surfaces))
     save_markdown(markdown(PERIOD_COLUMNS, rows, texts=6), folder / "periods.md")
-    return [*files, folder / "periods.md"]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ...files import whole_file
 from ...outputs import METADATA
+from ...progress import Progress, silent
 from ..report import markdown, save_markdown
 from .figures import figure
 from .published_maps import (
@@ -113,7 +114,7 @@ def save_published(
     folder: str | os.PathLike[str],
     *,
     step: int = 2,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = silent,
 ) -> list[list[str]]:
     """Write `FILES` into a folder: the maps, their correlations, and these against the heights of the skins.
 
