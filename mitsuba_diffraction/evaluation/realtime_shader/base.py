@@ -54,7 +54,7 @@ class Gain:
 
 
 class Shader:
-    """Base class of the shaders of a tile: directions → linear RGB.
+    """Base class of the shaders of a tile. Subclasses have a method `rgb`, as that of `TextureShader`.
 
     Directions are unit vectors in the frame of the tile, z being the normal, and point away from the surface: ω_i to
     the light, ω_o to the viewer. An instance is bound to the Mitsuba variant in which it was made.
@@ -83,25 +83,6 @@ class Shader:
     def weights(self, r_0: ArrayLike = PUBLISHED_R0, light: ArrayLike | None = None) -> SpectralWeights:
         """Return the `SpectralWeights` of a material and a light."""
         return SpectralWeights(self.quirks, self.peak, r_0, light)
-
-    def rgb(
-        self,
-        wi: mi.Vector3f,
-        wo: mi.Vector3f,
-        weights: SpectralWeights,
-        active: mi.Bool = True,
-        height_scale: mi.Float = 1.0,
-    ) -> mi.Color3f:
-        """Return linear RGB, before gamma.
-
-        Args:
-            wi: ω_i.
-            wo: ω_o.
-            weights: from `weights`.
-            active: mask.
-            height_scale: scales the heights.
-        """
-        raise NotImplementedError
 
 
 class TextureShader(Shader):
@@ -252,6 +233,15 @@ class TextureShader(Shader):
         active: mi.Bool = True,
         height_scale: mi.Float = 1.0,
     ) -> mi.Color3f:
+        """Return linear RGB, before gamma.
+
+        Args:
+            wi: ω_i.
+            wo: ω_o.
+            weights: from `weights`.
+            active: mask.
+            height_scale: scales the heights.
+        """
         gain = Gain(wi, wo, self.shadowing, mi.Bool(active))
         xyz = gain.factor * self.integral(gain, weights, mi.Float(height_scale))
         return mi.Color3f(*(sum(row[i] * xyz[i] for i in range(3)) for row in self.matrix))

@@ -61,6 +61,7 @@ class GEM(Shader):
         active: mi.Bool = True,
         height_scale: mi.Float = 1.0,
     ) -> mi.Color3f:
+        """Return linear RGB, before gamma; arguments as of `TextureShader.rgb`, heights have no effect."""
         active = mi.Bool(active) & (wi.z > 0) & (wo.z > 0)
         path = dr.abs(wi.x + wo.x) * self.spacing
         highlight = dr.exp(-dr.square(self.roughness * path / dr.maximum(wi.z + wo.z, 1e-6)))
