@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mitsuba_diffraction.evaluation.validation.published_figures import COLUMNS, FILES, row, save_published
+from mitsuba_diffraction.evaluation.validation import published_maps
 from mitsuba_diffraction.evaluation.validation.published_maps import (
+    COLUMNS,
     CORRECTED,
+    FILES,
     METHODS,
     PUBLISHED,
     PUBLISHED_MAPS,
@@ -18,6 +20,8 @@ from mitsuba_diffraction.evaluation.validation.published_maps import (
     encoded,
     grid,
     linear_rgb,
+    row,
+    save_published,
     shader_rgb,
 )
 from mitsuba_diffraction.evaluation.validation.viewing_angle import MODEL
@@ -120,11 +124,9 @@ def test_a_picture_of_a_grid_is_the_published_one():
 
 
 def test_figures_and_table_are_written(llvm, tmp_path, monkeypatch):
-    from mitsuba_diffraction.evaluation.validation import published_figures
-
-    monkeypatch.setattr(published_figures, "row", lambda name, step: row("blaze", 8, METHODS[:1]))
+    monkeypatch.setattr(published_maps, "row", lambda name, step: row("blaze", 8, METHODS[:1]))
     monkeypatch.setattr(
-        published_figures, "correlation_against_height", lambda published, method, heights: 0.5 + 0 * heights
+        published_maps, "correlation_against_height", lambda published, method, heights: 0.5 + 0 * heights
     )
     steps = []
     table = save_published(tmp_path, step=16, progress=lambda *step: steps.append(step))

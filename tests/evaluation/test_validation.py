@@ -438,7 +438,7 @@ def test_figures_are_drawn(command, tmp_path, monkeypatch):
         "mitsuba_diffraction.evaluation.validation.figures.save_figures", lambda folder, progress: called.append(folder)
     )
     monkeypatch.setattr(
-        "mitsuba_diffraction.evaluation.validation.published_figures.save_published",
+        "mitsuba_diffraction.evaluation.validation.published_maps.save_published",
         lambda folder, progress: called.append(folder) or [["Elaphe", "FLSS as published", "0.996", "0.986"]],
     )
     monkeypatch.setattr("mitsuba_diffraction.evaluation.validation.fourier_figures.save_fourier", called.append)

@@ -65,12 +65,12 @@ def validate(
     reads = [] if surface is None else [surface, *recipe.files]
     writes = [(option, path) for option, path in (("--json", json), ("--markdown", markdown)) if path is not None]
     if figures is not None:
-        from ..validation import fourier_figures, published_figures
+        from ..validation import fourier_figures, published_maps
         from ..validation.figures import FILES, save_figures
-        from ..validation.published_figures import COLUMNS, save_published
+        from ..validation.published_maps import COLUMNS, save_published
 
         figures.mkdir(parents=True, exist_ok=True)
-        names = (*FILES, *published_figures.FILES, *fourier_figures.FILES)
+        names = (*FILES, *published_maps.FILES, *fourier_figures.FILES)
         writes += [("--figures", figures / name) for name in names]
     outputs.check_outputs(reads, writes, overwrite=overwrite)
     mi.set_variant(chosen)
