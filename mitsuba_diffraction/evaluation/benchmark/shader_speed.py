@@ -19,7 +19,7 @@ from .accuracy import Exact, patch_difference, patch_directions
 from .cases import Case
 from .speed import Rays, seconds
 
-_SHADERS = (("flss", True), ("flss", False), ("nmm", True), ("pq", True))
+_SHADERS = (("flss", "as published"), ("flss", "corrected"), ("nmm", "as published"), ("pq", "as published"))
 
 COLUMNS = {
     "surface": "{.surface}",
@@ -37,24 +37,17 @@ class ShaderSpeed:
 
     Attributes:
         surface: name of the case.
-        variant: "flss", "nmm" or "pq".
-        as_published: with all published quirks, or with none.
+        shader: variant, "as published" with all quirks or "corrected" with none.
         texel_reads: maximum number for one shading point.
         evaluate_ratio: shading points per second, to eval_pdf of roughconductor (Al) in the same run.
         delta_e: (mean, maximum) CIEDE2000 of the twelve patches against the exact model, after one factor of exposure.
     """
 
     surface: str
-    variant: str
-    as_published: bool
+    shader: str
     texel_reads: int
     evaluate_ratio: float
     delta_e: tuple[float, float]
-
-    @property
-    def shader(self) -> str:
-        """The variant as reports name it."""
-        return self.variant + (", as published" if self.as_published else ", corrected")
 
 
 def shader_speeds(case: Case, exact: Exact, *, count: int = 1 << 14, repetitions: int = 3) -> list[ShaderSpeed]:
@@ -75,23 +68,20 @@ def shader_speeds(case: Case, exact: Exact, *, count: int = 1 << 14, repetitions
     return [
         ShaderSpeed(
             surface=case.name,
-            variant=variant,
-            as_published=published,
+            shader=name,
             texel_reads=shader.texel_reads,
-            evaluate_ratio=taken["rough"] / taken[variant, published],
+            evaluate_ratio=taken["rough"] / taken[name],
             delta_e=shader_difference(shader, exact),
         )
-        for (variant, published), shader in shaders.items()
+        for name, shader in shaders.items()
     ]
 
 
-def shaders_of(case: Case) -> dict[tuple[str, bool], Shader]:
-    """Return shaders of a tile by variant and whether they are as published."""
+def shaders_of(case: Case) -> dict[str, Shader]:
+    """Return shaders of a tile by name."""
+    manners = {"as published": Quirks.as_published(), "corrected": Quirks.corrected()}
     return {
-        (variant, published): shader_for(
-            case.height_field, variant, Quirks.as_published() if published else Quirks.corrected()
-        )
-        for variant, published in _SHADERS
+        f"{variant}, {manner}": shader_for(case.height_field, variant, manners[manner]) for variant, manner in _SHADERS
     }
 
 

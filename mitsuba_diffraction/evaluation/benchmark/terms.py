@@ -8,7 +8,7 @@ import functools
 import itertools
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -230,8 +230,8 @@ def methods(
     dr.eval(rays.wo)
     # Several FFTs of a small tile, as one takes too little time.
     kappas = np.linspace(0.3, 1, max(1, _MIN_TIMED_PIXELS // case.height_field.heights.size)) * MAX_KAPPA
-    work: dict[tuple, Callable[[], object]] = {
-        ("fft",): lambda: [order_powers(case.height_field, kappa) for kappa in kappas]
+    work: dict[Hashable, Callable[[], object]] = {
+        _FFT: lambda: [order_powers(case.height_field, kappa) for kappa in kappas]
     }
     work |= {name: functools.partial(rays.evaluate, bsdf) for name, bsdf in bsdfs.items()}
     work |= {name: shading(points, shader) for name, shader in shaders.items()}
@@ -256,20 +256,20 @@ def methods(
         for (name, terms), spectrum in spectra.items()
     ]
     result.append(
-        Method(case.name, _FFT, None, None, None, 0.0, None, (0.0, 0.0), 4 * taken["fft",] / len(kappas) / unit)
+        Method(case.name, _FFT, None, None, None, 0.0, None, (0.0, 0.0), 4 * taken[_FFT] / len(kappas) / unit)
     )
-    for (variant, published), shader in shaders.items():
+    for name, shader in shaders.items():
         result.append(
             Method(
                 case.name,
-                f"{variant}, {'as published' if published else 'corrected'}",
+                name,
                 shader.textures.terms,
                 shader.textures.terms,
                 2 * shader.texel_reads,
                 8e-6 * shader.textures.rows * shader.textures.columns * shader.textures.terms,
                 None,
                 shader_difference(shader, exact),
-                taken[variant, published] / shading_points / unit,
+                taken[name] / shading_points / unit,
             )
         )
     return result
