@@ -177,11 +177,11 @@ class Pictures:
         own = {name: value for name, value in self._settings.items() if name in settings_of(shader)}
         self._shader = mi.load_dict({"type": "diffraction_shader", "variant": shader, **own})
         # Refuses a scene that the shader cannot show.
-        prepared = self._shader.prepare(self.scene)
-        if not prepared.shaded:
+        self._shader.prepare(self.scene)
+        if not self._shader.shaded:
             raise RequestError("no shape has a diffraction_grating, there is nothing to compare")
-        self.shaders: list[Shader] = [shaded.shader for shaded in prepared.shaded]
-        layers = [shaded.layers for shaded in prepared.shaded]
+        self.shaders: list[Shader] = [shaded.shader for shaded in self._shader.shaded]
+        layers = [shaded.layers for shaded in self._shader.shaded]
         self.spectra = [one.grating.spectrum for one in layers]
         self.has_base = any(one.base is not None for one in layers)
         recipes = [one.grating.recipe for one in layers]
@@ -269,8 +269,8 @@ class Pictures:
     def _choose(self, quirks: Collection[str]) -> None:
         self._shader.set_quirks(Quirks(**{name: name in quirks for name in Quirks.names()}))
         self._shader.shadows = NO_SHADOWS not in quirks
-        prepared = self._shader.prepare(self.scene)
-        self.shaders = [shaded.shader for shaded in prepared.shaded]
+        self._shader.prepare(self.scene)
+        self.shaders = [shaded.shader for shaded in self._shader.shaded]
 
     def _at_points(self, colour: Colour, samples: int, others: int, progress: Progress) -> Picture:
         """Add the colours of gratings at points of the pixels to the light of all other BSDFs."""
