@@ -14,7 +14,7 @@ import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import mitsuba as mi
 import numpy as np
@@ -188,17 +188,13 @@ def shader_rgb(height_field: HeightField, method: str, wo: ArrayLike, height_sca
     return np.stack(scaled).astype(np.float64)
 
 
-@dataclass(frozen=True)
-class Agreement:
-    """Agreement of a map with the author's.
-
-    Attributes:
-        correlation: of the encoded colours, over pixels and channels.
-        brightness: the factor of linear RGB with which the mean square of the difference is smallest.
-    """
+class Agreement(NamedTuple):
+    """Agreement of a map with the author's."""
 
     correlation: float
+    """Of the encoded colours, over pixels and channels."""
     brightness: float
+    """The factor of linear RGB with which the mean square of the difference is smallest."""
 
 
 def encoded(linear: Array, brightness: float = 1.0, encoding: str = "sRGB") -> Array:

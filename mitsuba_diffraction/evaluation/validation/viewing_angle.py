@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import mitsuba as mi
 import numpy as np
@@ -233,14 +234,8 @@ def grating_equation(period: float, incidence: float, wavelengths: ArrayLike, or
     return np.rad2deg(np.arcsin(np.where(np.abs(sines) < 1, sines, np.nan)))
 
 
-@dataclass(frozen=True)
-class PeriodFit:
-    """The period fitted to the peaks of a map.
-
-    Attributes:
-        mean: over the wavelengths, nm.
-        variance: over the wavelengths, nm².
-    """
+class PeriodFit(NamedTuple):
+    """The period fitted to the peaks of a map: its mean (nm) and variance (nm²) over the wavelengths."""
 
     mean: float
     variance: float
@@ -269,14 +264,8 @@ def fit_period(found: ReflectanceMap, between: tuple[float, float] = (-90.0, 90.
     return PeriodFit(float(periods.mean()), float(periods.var()))
 
 
-@dataclass(frozen=True)
-class Ridge:
-    """A period whose order is bright at all wavelengths.
-
-    Attributes:
-        period: nm.
-        height: mean over the wavelengths of the reflectance there, relative to that of the brightest ridge.
-    """
+class Ridge(NamedTuple):
+    """A period (nm) whose order is bright at all wavelengths; its mean reflectance relative to the brightest ridge."""
 
     period: float
     height: float
