@@ -350,9 +350,9 @@ def test_figures_and_the_table_are_written(llvm, tmp_path):
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: reflectance_map(BLAZE, "gem"), "method: got 'gem', wanted one of model, flss, nmm, pq"),
+        (lambda: reflectance_map(BLAZE, "gem"), "variant: gem has no spectrum, only RGB"),
         (lambda: reflectance_map(BLAZE, incidence=90.0), r"incidence: got 90\.0, wanted degrees"),
-        (lambda: brdf_map(BLAZE, "none"), "method: got 'none'"),
+        (lambda: brdf_map(BLAZE, "none"), "variant: got 'none', wanted one of flss, nmm, pq, nmm_pq, gem"),
         (lambda: brdf_map(BLAZE, projection="fisheye"), "projection: got 'fisheye'"),
         (lambda: brdf_map(BLAZE, incidence=(95.0, 0.0)), r"incidence: got \(95\.0, 0\.0\)"),
         (lambda: relative_reflectance(BLAZE.spectrum, [0, 0, 1], [[0, 1]], [500.0]), "wi, wo, wavelengths: got shapes"),

@@ -87,8 +87,6 @@ def brdf_map(
     Raises:
         ValueError: if an argument is wrong, or Mitsuba has no vectorised spectral variant set.
     """
-    if method not in MAP_METHODS:
-        raise RequestError(f"method: got {method!r}, wanted one of {', '.join(MAP_METHODS)}")
     if projection not in PROJECTIONS:
         raise RequestError(f"projection: got {projection!r}, wanted one of {', '.join(PROJECTIONS)}")
     wi = direction(*incidence)

@@ -144,8 +144,6 @@ def reflectance_map(
     Raises:
         ValueError: if an argument is wrong, or Mitsuba has no vectorised spectral variant set.
     """
-    if method not in METHODS:
-        raise RequestError(f"method: got {method!r}, wanted one of {', '.join(METHODS)}")
     if not 0 <= incidence < 90:
         raise RequestError(f"incidence: got {incidence!r}, wanted degrees from the normal, 0 or more, below 90")
     nanometres = np.arange(380.0, 782.5, 5.0) if wavelengths is None else np.asarray(wavelengths, np.float64)
