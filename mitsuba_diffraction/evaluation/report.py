@@ -37,11 +37,8 @@ def record_cells(record: Record) -> list[str]:
     """Format a record as the texts of `RECORD_COLUMNS`."""
     numbers = [f"{value:.4g}" for value in (record.expected, record.measured)]
     small = ["—" if value is None else f"{float(f'{value:.2g}'):.4g}" for value in (record.error, record.bound)]
-    return [record.name, *numbers, *small, _verdict(record)]
-
-
-def _verdict(record: Record) -> str:
-    return "shown" if record.bound is None else "ok" if record.ok else "MISSED"
+    verdict = "shown" if record.bound is None else "ok" if record.ok else "MISSED"
+    return [record.name, *numbers, *small, verdict]
 
 
 def record_table(records: Sequence[Record]) -> Table:

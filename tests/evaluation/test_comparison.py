@@ -327,25 +327,25 @@ def test_compare_writes_pictures_numbers_and_a_figure(command, llvm, folder):
     files = {"scene-gem-path.exr", "scene-gem-published.exr", "scene-gem-corrected.exr", "scene-gem.png"}
     assert names() == {"scene.xml", "numbers.json", *files}
     numbers = json.loads(Path("numbers.json").read_text(encoding="utf-8"))
-    found = numbers["to path tracer"]["published"]
+    found = numbers["to_path_traced"]["published"]
     assert f"{found['mean']:.2f}" in out
-    assert f"{found['exposure factor']:.3g}" in out
-    assert 0 < found["mean"] <= found["95 %"] <= found["max"]
+    assert f"{found['exposure']:.3g}" in out
+    assert 0 < found["mean"] <= found["percentile_95"] <= found["max"]
     assert numbers["shares"]["size"] == [12, 9]
-    for reference in ("of path tracer", "of same light"):
+    for reference in ("path_traced", "same_light"):
         assert {*numbers["shares"][reference]["quirks"]["power_gamma"]} == {"drop", "rise", "share"}
     for name in ("constant_blend", "infrared_rainbow", "power_gamma", NO_SHADOWS):
         assert name in out
-    few = numbers["path tracer with few samples"]
-    assert [one["samples"] for one in few] == [1, 4]
-    assert few[0]["mean"] > few[1]["mean"]
+    few = numbers["few_samples"]
+    assert [samples for samples, _, _ in few] == [1, 4]
+    assert few[0][2] > few[1][2]
     assert "seconds of path tracer: " in out
     assert re.search(r"\n\s*\n\s*path tracer +same light", out)  # a line between the tables
     # The pictures are those of the numbers.
     path, published = (md.render.SpectralImage.load(f"scene-gem-{name}.exr") for name in ("path", "published"))
     xyz = [spectrum_to_XYZ(image.radiance, image.wavelengths) for image in (path, published)]
     surface = Pictures("scene.xml", "gem", width=12).surface
-    again = difference(*xyz, surface, numbers["luminance of white"])
+    again = difference(*xyz, surface, numbers["white"])
     assert again.mean == pytest.approx(found["mean"], rel=1e-3)
     with Image.open("scene-gem.png") as picture:
         assert picture.width > 1000
@@ -395,7 +395,7 @@ def test_the_same_seed_gives_the_same_numbers(llvm, folder):
     numbers = [summary.as_dict(one) for one in found]
     assert numbers[0]["shares"] is None
     for one in numbers:
-        del one["pictures"], one["path tracer with few samples"]  # seconds
+        del one["pictures"], one["few_samples"]  # seconds
     assert numbers[0] == numbers[1]
     # There is a figure without the shares, too.
     summary.save_figure(found[0], "figure.png", dpi=40)

@@ -12,7 +12,7 @@ import mitsuba_diffraction as md
 from mitsuba_diffraction import outputs, rigorous, scalar_theory
 from mitsuba_diffraction.evaluation import report
 from mitsuba_diffraction.evaluation.benchmark.accuracy import against_reference
-from mitsuba_diffraction.evaluation.validation import analytic, conservation, coupled_waves, measured_gratings
+from mitsuba_diffraction.evaluation.validation import analytic, conservation, coupled_waves
 from mitsuba_diffraction.evaluation.validation.checks import checks, scalar_range, surface_checks
 from mitsuba_diffraction.evaluation.validation.record import Check, Record
 
@@ -56,15 +56,6 @@ def test_a_record_is_within_its_bound_or_not():
     record = Record.at_max_error([1.0, 2.0], [1.2, 2.5], [0.1, 1.0])
     assert (record.measured, record.bound, record.ok) == (1.2, 0.1, False)
     assert Record.at_max_error([10.0, 1.0], [12.0, 1.3], 1.0, relative=True).error == pytest.approx(0.3)
-
-
-@pytest.mark.slow
-def test_measured_gratings_are_plotted_with_both_theories():
-    panels = measured_gratings.plot(step=250).axes
-    assert [panel.get_title().split(":")[0] for panel in panels] == ["R150", "R400", "B600", "R831"]
-    for panel in panels:
-        labels = panel.get_legend_handles_labels()[1]
-        assert [label.split()[0] for label in labels] == ["rigorous", "scalar", "measured"]
 
 
 @pytest.mark.slow
@@ -447,7 +438,7 @@ def test_figures_are_drawn(command, tmp_path, monkeypatch):
         "mitsuba_diffraction.evaluation.validation.figures.save_figures", lambda folder, progress: called.append(folder)
     )
     monkeypatch.setattr(
-        "mitsuba_diffraction.evaluation.validation.published_figures.save_published",
+        "mitsuba_diffraction.evaluation.validation.published_maps.save_published",
         lambda folder, progress: called.append(folder) or [["Elaphe", "FLSS as published", "0.996", "0.986"]],
     )
     monkeypatch.setattr("mitsuba_diffraction.evaluation.validation.fourier_figures.save_fourier", called.append)

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from scipy.special import erfc, jv
 
 from mitsuba_diffraction import HeightField, gratings
-from mitsuba_diffraction.evaluation.finite_tiles import finite_tiles_spectrum
 from mitsuba_diffraction.reference import amplitudes, order_powers, power_spectrum
 from mitsuba_diffraction.settings import lobe_width
 from mitsuba_diffraction.spectrum.sample import window_axes
@@ -414,7 +413,6 @@ def test_the_spectrum_is_zero_outside_the_nyquist_limit():
     assert (power_spectrum(field, limit * [[1, 1], [-1, 1], [0.999, -1]], 15.0, extent="sample") > 0).all()
     outside = limit * [[1.001, 0], [0, -1.001], [-2, 0.1], [3, 3]]
     np.testing.assert_array_equal(power_spectrum(field, outside, 15.0, extent="sample"), 0)
-    np.testing.assert_array_equal(finite_tiles_spectrum(field, outside, 15.0, tiles=(2, 3)), 0)
 
 
 def test_rounding_does_not_exclude_the_nyquist_limit():
@@ -422,7 +420,6 @@ def test_rounding_does_not_exclude_the_nyquist_limit():
     assert limit < -1 / 0.6  # by one unit in the last place
     field = HeightField(np.random.default_rng(9).random((26, 26)), 0.3)
     assert power_spectrum(field, [limit, 0.0], 15.0, extent="sample") > 0
-    assert finite_tiles_spectrum(field, [limit, 0.0], 15.0, tiles=(1, 1)) > 0
 
 
 @pytest.mark.parametrize("max_count", [1, 100, 2**20])
@@ -442,66 +439,6 @@ def test_an_empty_q_gives_an_empty_result(extent):
     assert power_spectrum(field, np.zeros((0, 2)), 1.0, extent=extent).shape == (0,)
 
 
-# ---------------------------------------------------------------- a finite number of tiles
-
-tilings = pytest.mark.parametrize(
-    ("shape", "pixel", "tiles"),
-    [
-        ((6, 8), (0.1, 0.1), (3, 2)),
-        ((7, 5), (0.1, 0.25), (4, 3)),
-        ((1, 9), (0.1, 0.7), (5, 4)),
-        ((8, 1), (0.3, 0.1), (2, 5)),
-        ((4, 4), (0.2, 0.1), (1, 1)),
-        ((1, 1), (0.2, 0.1), (3, 2)),
-    ],
-)
-
-
-@tilings
-def test_finite_tiles_are_the_transform_of_all_of_them(shape, pixel, tiles):
-    field = HeightField(np.random.default_rng(12).random(shape) * 0.4, pixel)
-    surface = np.tile(field.heights, tiles[::-1])
-    phase = np.exp(1j * 19.0 * surface)
-    scale = np.prod(pixel) / surface.size
-    # The frequencies of its own FFT, with all the whole q_j T_j, where D is 0/0.
-    frequencies = [np.fft.fftfreq(n, d) for n, d in zip(surface.shape, pixel[::-1], strict=True)]
-    q_y, q_x = np.meshgrid(*frequencies, indexing="ij")
-    wanted = np.abs(np.fft.fft2(phase)) ** 2 * scale
-    got = finite_tiles_spectrum(field, np.stack([q_x, q_y], axis=-1), 19.0, tiles=tiles)
-    np.testing.assert_allclose(got, wanted, atol=1e-12 * wanted.max())
-    # And q between the orders, far from them and next to them.
-    rng = np.random.default_rng(13)
-    m = rng.integers(0, np.maximum(shape[::-1], 2) // 2, (20, 2)) / field.tile_size
-    q = np.concatenate([rng.uniform(-0.5, 0.5, (40, 2)) / pixel, m + 1e-9, m + 1e-5])
-    wanted = np.abs(transform(phase, pixel, q)) ** 2 * scale
-    got = finite_tiles_spectrum(field, q, np.full(80, 19.0), tiles=tiles)
-    np.testing.assert_allclose(got, wanted, rtol=1e-9, atol=1e-11 * wanted.max())
-
-
-@tilings
-def test_the_spectrum_of_finite_tiles_integrates_to_one(shape, pixel, tiles):
-    field = HeightField(np.random.default_rng(14).random(shape), pixel)
-    q, area = nyquist_grid(field, 48)  # more than twice the pixels along any axis
-    for kappa in (0.0, 6.0, 34.9):
-        total = finite_tiles_spectrum(field, q, kappa, tiles=tiles).sum() * area
-        assert total == pytest.approx(1, abs=1e-12)
-
-
-def test_finite_tiles_have_the_powers_of_the_orders():
-    # ∫ D² around one order is N; between orders A changes little over a peak of many tiles.
-    field = gratings.sinusoidal(period=2.5, depth=0.2, samples=64)
-    m = np.arange(-6, 7)
-    q = np.stack([m / 2.5, 0 * m], axis=-1)
-    got = finite_tiles_spectrum(field, q, 18.0, tiles=(7, 3))
-    np.testing.assert_allclose(got, jv(m, 1.8) ** 2 * (7 * 2.5) * (3 * field.tile_size[1]), rtol=1e-9, atol=1e-12)
-
-
-@pytest.mark.parametrize("tiles", [3, (1,), (1, 2, 3), (0, 1), (1, -1), (1.0, 2), (True, 1), "23", None])
-def test_wrong_numbers_of_tiles_are_refused(tiles):
-    with pytest.raises(ValueError, match=r"tiles: got .*, wanted two whole numbers ≥ 1"):
-        finite_tiles_spectrum(HeightField([[0.0]], 1.0), [0.0, 0.0], 1.0, tiles=tiles)
-
-
 # ---------------------------------------------------------------- wrong requests
 
 
@@ -511,7 +448,6 @@ def test_kappa_must_be_finite(kappa):
     for evaluate in (
         lambda: power_spectrum(field, q, [1.0, kappa]),
         lambda: power_spectrum(field, q, [1.0, kappa], extent="sample"),
-        lambda: finite_tiles_spectrum(field, q, [1.0, kappa], tiles=(1, 1)),
     ):
         with pytest.raises(ValueError, match="kappa: got numbers that are not finite"):
             evaluate()

@@ -5,18 +5,17 @@ from __future__ import annotations
 import functools
 import os
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import mitsuba as mi
 import numpy as np
 from rich.table import Table
 
-from ... import outputs
 from ...files import whole_file
 from ...grating_spectrum import GratingSpectrum
 from ...outputs import METADATA
-from ...progress import table
+from ...progress import Progress, silent, table
 from ...settings import VISIBLE, Settings
 from .. import report
 from . import sampling, shader_speed
@@ -90,7 +89,7 @@ def run(
     count: int = 1 << 19,
     shading_points: int = 1 << 14,
     repetitions: int = 5,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = silent,
 ) -> tuple[list[Result], list[ShaderSpeed]]:
     """Measure under the current variant.
 
@@ -160,16 +159,6 @@ def tables(results: Sequence[Result], shaders: Sequence[ShaderSpeed], sampled: S
         table(shader_speed.COLUMNS, (report.cells(shader_speed.COLUMNS, row) for row in shaders), texts=2),
         table(sampling.COLUMNS, (report.cells(sampling.COLUMNS, row) for row in sampled)),
     ]
-
-
-def save_json(
-    results: Sequence[Result],
-    shaders: Sequence[ShaderSpeed],
-    sampled: Sequence[Sampling],
-    path: str | os.PathLike[str],
-) -> None:
-    """Write all results atomically."""
-    outputs.save_json({"speed and error": results, "real-time shader": shaders, "sampling": sampled}, path)
 
 
 def save_plot(results: Sequence[Result], path: str | os.PathLike[str]) -> None:

@@ -5,14 +5,13 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass
 
-from ...cli.examples import source
 from ...grating_spectrum import GratingSpectrum
 from ...precomputation import precompute
-from ...settings import SUN_COHERENCE_LENGTH
+from ...settings import SUN_COHERENCE_LENGTH, Settings
 from ...spectrum.sample import effective_coherence_length
 from ...surface import gratings
 from ...surface.heightfield import HeightField
-from ...surface.readers import read_height_field
+from ..validation.published_surfaces import scan
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,9 +83,8 @@ def tiles() -> list[Case]:
         for depth in (0.15, 0.375, 0.6)
     ]
     for name, height_range in MEASURED.items():
-        file = source() / "precompute" / "measured" / f"{name}_afm_65um.png"
-        scan = read_height_field(file, pixel_size=65 / 1332, height_range=height_range)
-        field = HeightField(scan.heights[_CROP, _CROP], scan.pixel_size, source=f"centre of {scan.source}")
+        whole = scan(name, height_range, Settings()).height_field()
+        field = HeightField(whole.heights[_CROP, _CROP], whole.pixel_size, source=f"centre of {whole.source}")
         cases.append(Case(f"measured {name.capitalize()}", field, "tile", SUN_COHERENCE_LENGTH))
     return cases
 

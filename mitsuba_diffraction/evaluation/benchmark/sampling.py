@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import drjit as dr
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ... import testing
+from ...progress import Progress, silent
 from ...settings import VISIBLE
 from .cases import Case
 from .speed import seconds
@@ -56,7 +57,7 @@ def measure(
     size: int = 128,
     spp: int = 64,
     repetitions: int = 3,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = silent,
 ) -> list[Sampling]:
     """Measure under the current variant.
 

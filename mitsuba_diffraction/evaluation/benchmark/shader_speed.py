@@ -13,13 +13,13 @@ from ...testing import vectors
 from ..realtime_shader.base import Shader
 from ..realtime_shader.evaluate import shader_for
 from ..realtime_shader.quirks import Quirks
+from ..realtime_shader.tristimulus import PUBLISHED_R0
 from ..validation.lobes import k_g_between
 from .accuracy import Exact, patch_difference, patch_directions
 from .cases import Case
 from .speed import Rays, seconds
 
-_R_0 = 0.04  # skin
-_SHADERS = (("flss", True), ("flss", False), ("nmm", True), ("pq", True))
+_SHADERS = (("flss", "as published"), ("flss", "corrected"), ("nmm", "as published"), ("pq", "as published"))
 
 COLUMNS = {
     "surface": "{.surface}",
@@ -37,24 +37,17 @@ class ShaderSpeed:
 
     Attributes:
         surface: name of the case.
-        variant: "flss", "nmm" or "pq".
-        as_published: with all published quirks, or with none.
+        shader: variant, "as published" with all quirks or "corrected" with none.
         texel_reads: maximum number for one shading point.
         evaluate_ratio: shading points per second, to eval_pdf of roughconductor (Al) in the same run.
         delta_e: (mean, maximum) CIEDE2000 of the twelve patches against the exact model, after one factor of exposure.
     """
 
     surface: str
-    variant: str
-    as_published: bool
+    shader: str
     texel_reads: int
     evaluate_ratio: float
     delta_e: tuple[float, float]
-
-    @property
-    def shader(self) -> str:
-        """The variant as reports name it."""
-        return self.variant + (", as published" if self.as_published else ", corrected")
 
 
 def shader_speeds(case: Case, exact: Exact, *, count: int = 1 << 14, repetitions: int = 3) -> list[ShaderSpeed]:
@@ -75,29 +68,26 @@ def shader_speeds(case: Case, exact: Exact, *, count: int = 1 << 14, repetitions
     return [
         ShaderSpeed(
             surface=case.name,
-            variant=variant,
-            as_published=published,
+            shader=name,
             texel_reads=shader.texel_reads,
-            evaluate_ratio=taken["rough"] / taken[variant, published],
+            evaluate_ratio=taken["rough"] / taken[name],
             delta_e=shader_difference(shader, exact),
         )
-        for (variant, published), shader in shaders.items()
+        for name, shader in shaders.items()
     ]
 
 
-def shaders_of(case: Case) -> dict[tuple[str, bool], Shader]:
-    """Return shaders of a tile by variant and whether they are as published."""
+def shaders_of(case: Case) -> dict[str, Shader]:
+    """Return shaders of a tile by name."""
+    manners = {"as published": Quirks.as_published(), "corrected": Quirks.corrected()}
     return {
-        (variant, published): shader_for(
-            case.height_field, variant, Quirks.as_published() if published else Quirks.corrected()
-        )
-        for variant, published in _SHADERS
+        f"{variant}, {manner}": shader_for(case.height_field, variant, manners[manner]) for variant, manner in _SHADERS
     }
 
 
 def shading(rays: Rays, shader: Shader) -> Callable[[], None]:
     """Return a function that evaluates a shader for all rays."""
-    weights = shader.weights(_R_0)
+    weights = shader.weights()
     return lambda: dr.eval(shader.rgb(rays.si.wi, rays.wo, weights))
 
 
@@ -107,7 +97,7 @@ def shader_difference(shader: Shader, exact: Exact) -> tuple[float, float]:
 
     wi, wo = patch_directions()
     cos_half = np.sqrt((1 + (wi * wo).sum(axis=-1)) / 2)
-    wanted = exact.xyz * ((_R_0 + (1 - _R_0) * (1 - cos_half) ** 5) * k_g_between(wi, wo))[:, None]
-    rgb = np.array(shader.rgb(vectors(wi), vectors(wo), shader.weights(_R_0)), np.float64).T
+    wanted = exact.xyz * ((PUBLISHED_R0 + (1 - PUBLISHED_R0) * (1 - cos_half) ** 5) * k_g_between(wi, wo))[:, None]
+    rgb = np.array(shader.rgb(vectors(wi), vectors(wo), shader.weights()), np.float64).T
     xyz = rgb @ colour.RGB_COLOURSPACES["sRGB"].matrix_RGB_to_XYZ.T
     return patch_difference(wanted, xyz * (wanted[:, 1].sum() / xyz[:, 1].sum()))

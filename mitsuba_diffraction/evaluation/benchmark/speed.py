@@ -21,8 +21,8 @@ Name = TypeVar("Name", bound=Hashable)
 class Rays:
     """Random pairs of directions, each with four random wavelengths, and random numbers for sampling."""
 
-    def __init__(self, count: int, seed: int = 0) -> None:
-        random = np.random.default_rng(seed)
+    def __init__(self, count: int) -> None:
+        random = np.random.default_rng(0)
         self.count = count
         wi, wo = (_directions(random, count) for _ in range(2))
         self.si, self.wo = interaction(wi, random.uniform(*VISIBLE, (4, count)).T), vectors(wo)

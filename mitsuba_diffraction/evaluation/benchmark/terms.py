@@ -8,7 +8,7 @@ import functools
 import itertools
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -18,9 +18,7 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-from ...files import whole_file
 from ...grating_spectrum import GratingSpectrum
-from ...outputs import png_text
 from ...progress import Progress, silent, table
 from ...reference import order_powers
 from ...settings import ORIGINS, SERIES, VISIBLE
@@ -28,15 +26,13 @@ from ...spectrum.grids import OrderGrid
 from ...spectrum.tables import AmplitudeTable, series_function, series_weights
 from ..realtime_shader.flss import FLSS
 from ..report import cells
-from ..validation.figures import figure, png
+from ..validation.figures import figure
 from .accuracy import Exact
 from .cases import Case
 from .shader_speed import shader_difference, shaders_of, shading
 from .speed import Rays, seconds
 
 if TYPE_CHECKING:
-    import os
-
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from rich.table import Table
@@ -234,8 +230,8 @@ def methods(
     dr.eval(rays.wo)
     # Several FFTs of a small tile, as one takes too little time.
     kappas = np.linspace(0.3, 1, max(1, _MIN_TIMED_PIXELS // case.height_field.heights.size)) * MAX_KAPPA
-    work: dict[tuple, Callable[[], object]] = {
-        ("fft",): lambda: [order_powers(case.height_field, kappa) for kappa in kappas]
+    work: dict[Hashable, Callable[[], object]] = {
+        _FFT: lambda: [order_powers(case.height_field, kappa) for kappa in kappas]
     }
     work |= {name: functools.partial(rays.evaluate, bsdf) for name, bsdf in bsdfs.items()}
     work |= {name: shading(points, shader) for name, shader in shaders.items()}
@@ -260,20 +256,20 @@ def methods(
         for (name, terms), spectrum in spectra.items()
     ]
     result.append(
-        Method(case.name, _FFT, None, None, None, 0.0, None, (0.0, 0.0), 4 * taken["fft",] / len(kappas) / unit)
+        Method(case.name, _FFT, None, None, None, 0.0, None, (0.0, 0.0), 4 * taken[_FFT] / len(kappas) / unit)
     )
-    for (variant, published), shader in shaders.items():
+    for name, shader in shaders.items():
         result.append(
             Method(
                 case.name,
-                f"{variant}, {'as published' if published else 'corrected'}",
+                name,
                 shader.textures.terms,
                 shader.textures.terms,
                 2 * shader.texel_reads,
                 8e-6 * shader.textures.rows * shader.textures.columns * shader.textures.terms,
                 None,
                 shader_difference(shader, exact),
-                taken[variant, published] / shading_points / unit,
+                taken[name] / shading_points / unit,
             )
         )
     return result
@@ -331,23 +327,18 @@ def run(cases: Sequence[Case], timed: Sequence[str], progress: Progress = silent
     Args:
         cases: the tiles.
         timed: names of those whose methods are timed.
-        progress: called with (steps done, steps in total).
+        progress: called with (tiles done, tiles in total).
         settings: further arguments of `methods`.
     """
     errors: list[SeriesErrors] = []
     measured: list[Method] = []
-    steps, total = itertools.count(1), 8 * len(cases) + 8 * len(timed)
-    progress(0, total)
-    for case in cases:
-        for found in series_errors(case):
-            errors.append(found)
-            progress(next(steps), total)
-    for case in cases:
+    for done, case in enumerate(cases):
+        progress(done, len(cases))
+        own = list(series_errors(case))
+        errors += own
         if case.name in timed:
-            measured += methods(case, [e for e in errors if e.surface == case.name], **settings)
-            for _ in range(8):
-                done = next(steps)
-            progress(done, total)
+            measured += methods(case, own, **settings)
+    progress(len(cases), len(cases))
     return Found(errors, bounds(), measured)
 
 
@@ -359,8 +350,6 @@ BOUND_COLUMNS = {
     "error": "{.found:.2g}",
 }
 
-METHOD_COLUMNS = ("surface", "method", "FFTs", "words read", "MB", "∫|ΔS| dq", "ΔE00 mean, max", "time")
-
 
 def tables(found: Found) -> list[Table]:
     """Return the tables for a terminal."""
@@ -370,6 +359,7 @@ def tables(found: Found) -> list[Table]:
 
 def method_table(found: Found) -> tuple[list[str], list[list[str]]]:
     """Return columns and rows of cost and accuracy, a row for each method."""
+    columns = ["surface", "method", "FFTs", "words read", "MB", "∫|ΔS| dq", "ΔE00 mean, max", "time"]
     formats = {"transforms": "{}", "words": "{}", "megabytes": "{:.3g}", "error": "{:.0e}"}
     rows = []
     for method in found.methods:
@@ -377,7 +367,7 @@ def method_table(found: Found) -> tuple[list[str], list[list[str]]]:
         numbers = ["—" if value is None else text.format(value) for value, text in values]
         colours = "{:.3f}, {:.3f}".format(*method.delta_e)
         rows.append([method.surface, method.label, *numbers, colours, f"{method.time_ratio:.3g}"])
-    return list(METHOD_COLUMNS), rows
+    return columns, rows
 
 
 def error_table(found: Found) -> tuple[list[str], list[list[str]]]:
@@ -403,15 +393,8 @@ _WIDTHS = {"float32": 1.7, "float64": 0.8}
 _SHOWN_ERRORS = 1e-15, 1e3
 
 
-def save_plot(found: Found, path: str | os.PathLike[str]) -> None:
-    """Plot the errors of each tile against the number of terms, and the bounds, as a PNG."""
-    content = png(plot(found), pnginfo=png_text())
-    with whole_file(path) as temporary:
-        temporary.write_bytes(content)
-
-
 def plot(found: Found) -> Figure:
-    """Plot ∫|ΔS| dq above and max |Δη|/η below, one column for each tile."""
+    """Plot errors and bounds against the number of terms: ∫|ΔS| dq above, max |Δη|/η below, a column for each tile."""
     surfaces = list(dict.fromkeys(e.surface for e in found.errors))
     drawn = figure(2.6 * len(surfaces) + 0.6, 6.6)
     axes = drawn.subplots(2, len(surfaces), sharex=True, sharey="row", squeeze=False)

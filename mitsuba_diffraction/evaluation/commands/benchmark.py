@@ -37,7 +37,7 @@ def benchmark(
     from ...llvm import choose_variant
     from ...surface.gratings import ruled
     from .. import report
-    from ..benchmark.benchmark import TOLERANCES, run, save_json, save_plot, tables
+    from ..benchmark.benchmark import TOLERANCES, run, save_plot, tables
     from ..benchmark.cases import bundled_cases, scan_case
     from ..benchmark.sampling import measure
     from ..validation.theories import COLUMNS, compare_theories
@@ -76,7 +76,8 @@ def benchmark(
         sampling = measure(cases, max(tolerance or TOLERANCES), progress=progress)
     show(*tables(results, shaders, sampling), width=140)
     if json is not None:
-        save_json(results, shaders, sampling, json)
+        found = {"speed and error": results, "real-time shader": shaders, "sampling": sampling}
+        outputs.save_json(found, json)
     if plot is not None:
         save_plot(results, plot)
 
@@ -84,6 +85,7 @@ def benchmark(
 def _measure_terms(json: Path | None, plot: Path | None) -> None:
     from ..benchmark import terms
     from ..benchmark.cases import TIMED_TILES, tiles
+    from ..validation.figures import save_png
 
     with progress_bar("number of terms") as progress:
         found = terms.run(tiles(), TIMED_TILES, progress=progress)
@@ -91,4 +93,4 @@ def _measure_terms(json: Path | None, plot: Path | None) -> None:
     if json is not None:
         outputs.save_json(found, json)
     if plot is not None:
-        terms.save_plot(found, plot)
+        save_png(terms.plot(found), plot)

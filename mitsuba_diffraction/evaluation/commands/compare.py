@@ -12,7 +12,7 @@ import typer
 from ...cli.arguments import Define, Overwrite, Variant, check_suffix, scene_parameters
 from ...cli.examples import source as examples_folder
 from ...files import whole_file
-from ...outputs import check_outputs, free_name
+from ...outputs import check_outputs, free_name, save_json
 from ...progress import progress_bar, say, show, tell
 from ...recipe import Recipe
 
@@ -100,7 +100,7 @@ def compare(
             found.pictures[picture].image.save(files.enter_context(whole_file(target)))
         summary.save_figure(found, files.enter_context(whole_file(f"{prefix}.png")))
         if json is not None:
-            summary.save_json(found, files.enter_context(whole_file(json)))
+            save_json(summary.as_dict(found), files.enter_context(whole_file(json)))
     of_quirks = () if found.shares is None else (summary.quirk_table(found),)
     show(summary.picture_table(found), *of_quirks, width=120)
     tell("\n" + "\n".join(summary.notes(found)))

@@ -34,6 +34,7 @@ def convergence(
     from ...llvm import choose_variant
     from ...render.scene import files_of_scene
     from ..comparison import convergence as study
+    from ..report import cells
 
     parameters, tolerances = scene_parameters(define), sorted(tolerance or study.TOLERANCES, reverse=True)
     check_suffix("-o", plot, ".png")
@@ -54,7 +55,7 @@ def convergence(
     study.save_plot(found, plot)
     if json is not None:
         outputs.save_json(found, json)
-    show(table(study.COLUMNS, study.rows(found)), width=100)
+    show(table(study.COLUMNS, (cells(study.COLUMNS, point) for point in found.points)), width=100)
     for name, curve in found.curves().items():
         if not curve[0].traced:
             times = [found.overtaken(name, error) for error in ("delta_e", "relative_mse")]

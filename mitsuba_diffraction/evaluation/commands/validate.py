@@ -27,7 +27,6 @@ from ...progress import progress_bar, show, table, tell
 
 if TYPE_CHECKING:
     from ...recipe import Recipe
-    from ..validation.record import Check
 
 
 def validate(
@@ -55,28 +54,27 @@ def validate(
 
     from ...llvm import choose_variant
     from .. import report
-    from ..validation.checks import checks
+    from ..validation.checks import checks, surface_checks
 
     of_scan, settings = options_of_scan(context), settings_of(context)
     if surface is None and (of_scan or settings):
         names = ", ".join(f"--{name.replace('_', '-')}" for name in {**of_scan, **settings})
         raise RequestError(f"{names}: got no surface; they go with a scan, --extent with a recipe, too")
     chosen = choose_variant(variant)
-    if chosen.startswith("scalar"):
-        raise RequestError(f"--variant: got {chosen}, wanted llvm_… or cuda_…: the checks take millions of directions")
     recipe = None if surface is None else _recipe(surface, of_scan, settings)
     reads = [] if surface is None else [surface, *recipe.files]
     writes = [(option, path) for option, path in (("--json", json), ("--markdown", markdown)) if path is not None]
     if figures is not None:
-        from ..validation import fourier_figures
-        from ..validation.figures import figure_names, save_figures
-        from ..validation.published_figures import COLUMNS, FILES, save_published
+        from ..validation import fourier_figures, published_maps
+        from ..validation.figures import FILES, save_figures
+        from ..validation.published_maps import COLUMNS, save_published
 
         figures.mkdir(parents=True, exist_ok=True)
-        writes += [("--figures", figures / name) for name in (*figure_names(), *FILES, *fourier_figures.FILES)]
+        names = (*FILES, *published_maps.FILES, *fourier_figures.FILES)
+        writes += [("--figures", figures / name) for name in names]
     outputs.check_outputs(reads, writes, overwrite=overwrite)
     mi.set_variant(chosen)
-    these = checks() if recipe is None else _of_surface(recipe)
+    these = checks() if recipe is None else surface_checks(recipe.height_field(), recipe.cached(progress_bar))
     results = []
     with progress_bar("validation") as progress:
         for check in these:
@@ -113,9 +111,3 @@ def _recipe(path: Path, of_scan: dict[str, object], settings: dict[str, object])
     if recipe.settings.theory == "rigorous":
         raise RequestError(f"{path}: got theory = 'rigorous', wanted scalar; precompute prints the measured errors")
     return recipe
-
-
-def _of_surface(recipe: Recipe) -> tuple[Check, ...]:
-    from ..validation.checks import surface_checks
-
-    return surface_checks(recipe.height_field(), recipe.cached(progress_bar))

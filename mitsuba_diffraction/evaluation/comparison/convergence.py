@@ -19,15 +19,12 @@ from ...files import whole_file
 from ...outputs import METADATA
 from ...progress import Progress, no_progress
 from ...settings import MIN_TOLERANCE
-from ..report import cells
 from .difference import as_shown, difference, noise, time_of_error, white_luminance
 from .pictures import Picture, Pictures
 
 TOLERANCES = (1e-1, 1e-2, 1e-3)
 SAMPLES = (1, 4, 16, 64, 256)
-REFERENCE_SAMPLES = 2048
 SHADERS = ("flss", "nmm", "pq")
-SHADING_POINTS = (1, 4, 16)
 SAMPLES_OF_OTHERS_PER_POINT = 4  # samples of all BSDFs other than gratings, per shading point
 
 COLUMNS = {
@@ -116,9 +113,9 @@ def convergence(
     *,
     tolerances: Sequence[float] = TOLERANCES,
     samples: Sequence[int] = SAMPLES,
-    reference_samples: int = REFERENCE_SAMPLES,
+    reference_samples: int = 2048,
     shaders: Sequence[str] = SHADERS,
-    shading_points: Sequence[int] = SHADING_POINTS,
+    shading_points: Sequence[int] = (1, 4, 16),
     width: int | None = None,
     parameters: Mapping[str, str] | None = None,
     progress: Callable[[str], AbstractContextManager[Progress]] = no_progress,
@@ -179,11 +176,6 @@ def convergence(
     )
     rows, columns = of.surface.shape
     return Convergence(scene, (columns, rows), noise(reference.halves, of.surface, white), tuple(points))
-
-
-def rows(found: Convergence) -> list[list[str]]:
-    """Return the points as rows of `COLUMNS`."""
-    return [cells(COLUMNS, point) for point in found.points]
 
 
 def save_plot(found: Convergence, path: str | os.PathLike[str]) -> None:

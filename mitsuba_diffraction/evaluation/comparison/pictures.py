@@ -23,7 +23,6 @@ from ...render.passes import Accumulation, ratio, split
 from ...render.scene import channel_wavelengths, load_spectral_scene, parsed
 from ..realtime_shader import tristimulus
 from ..realtime_shader.base import Shader, TextureShader
-from ..realtime_shader.evaluate import VARIANTS
 from ..realtime_shader.flss import FLSS
 from ..realtime_shader.integrator import settings_of
 from ..realtime_shader.lights import lights_of
@@ -158,9 +157,7 @@ class Pictures:
             FileNotFoundError: if there is no such scene.
             ValueError: if the request is wrong, or the shader cannot show the scene.
         """
-        if shader not in VARIANTS:
-            raise RequestError(f"shader: got {shader!r}, wanted one of {', '.join(VARIANTS)}")
-        self._settings = {name: value for name, value in (settings or {}).items() if value is not None}
+        self._settings = settings or {}
         if seed < 0:
             raise RequestError(f"seed: got {seed}, wanted an integer that is not negative")
         _check_lights(Path(scene_path), parameters)
@@ -177,16 +174,14 @@ class Pictures:
 
     def use(self, shader: str) -> None:
         """Choose the shader, one of `VARIANTS`, of the next pictures."""
-        if shader not in VARIANTS:
-            raise RequestError(f"shader: got {shader!r}, wanted one of {', '.join(VARIANTS)}")
         own = {name: value for name, value in self._settings.items() if name in settings_of(shader)}
         self._shader = mi.load_dict({"type": "diffraction_shader", "variant": shader, **own})
         # Refuses a scene that the shader cannot show.
-        prepared = self._shader.prepare(self.scene)
-        if not prepared.shaded:
+        self._shader.prepare(self.scene)
+        if not self._shader.shaded:
             raise RequestError("no shape has a diffraction_grating, there is nothing to compare")
-        self.shaders: list[Shader] = [shaded.shader for shaded in prepared.shaded]
-        layers = [shaded.layers for shaded in prepared.shaded]
+        self.shaders: list[Shader] = [shaded.shader for shaded in self._shader.shaded]
+        layers = [shaded.layers for shaded in self._shader.shaded]
         self.spectra = [one.grating.spectrum for one in layers]
         self.has_base = any(one.base is not None for one in layers)
         recipes = [one.grating.recipe for one in layers]
@@ -274,8 +269,8 @@ class Pictures:
     def _choose(self, quirks: Collection[str]) -> None:
         self._shader.set_quirks(Quirks(**{name: name in quirks for name in Quirks.names()}))
         self._shader.shadows = NO_SHADOWS not in quirks
-        prepared = self._shader.prepare(self.scene)
-        self.shaders = [shaded.shader for shaded in prepared.shaded]
+        self._shader.prepare(self.scene)
+        self.shaders = [shaded.shader for shaded in self._shader.shaded]
 
     def _at_points(self, colour: Colour, samples: int, others: int, progress: Progress) -> Picture:
         """Add the colours of gratings at points of the pixels to the light of all other BSDFs."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from typing import TYPE_CHECKING
 
@@ -9,14 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.table import Table
 
-from ... import outputs
 from ...color import XYZ_to_linear_sRGB, into_gamut, on_screen
 from ...files import whole_file
 from ...outputs import METADATA
 from ...progress import table
 from .. import report
 from .comparison import Comparison
-from .difference import Difference
 from .quirk_shares import AgainstReference
 
 if TYPE_CHECKING:
@@ -149,57 +148,23 @@ def notes(comparison: Comparison) -> list[str]:
     return lines
 
 
-def _difference(found: Difference) -> dict[str, float]:
-    return {
-        "exposure factor": found.exposure,
-        "mean": found.mean,
-        "95 %": found.percentile_95,
-        "max": found.max,
-        "luminance error": found.luminance_error,
-    }
+_NUMBERS = ("exposure", "mean", "percentile_95", "max", "luminance_error")
+"""Of `Difference`."""
 
 
 def as_dict(comparison: Comparison) -> dict[str, object]:
-    """Return all numbers, for `report.save_json`."""
-    shares = comparison.shares
-    return {
-        "scene": comparison.scene,
-        "shader": comparison.shader,
-        "other shaders": comparison.others,
-        "settings": comparison.settings,
-        "variant": comparison.variant,
-        "seed": comparison.seed,
-        "width": comparison.surface.shape[1],
-        "height": comparison.surface.shape[0],
-        "share of pixels compared": float(comparison.surface.mean()),
-        "luminance of white": comparison.white,
-        "pictures": {
-            name: {"samples": picture.samples, "seconds": picture.seconds, "noise": comparison.noise[name]}
-            for name, picture in comparison.pictures.items()
-        },
-        "to path tracer": {name: _difference(found) for name, found in comparison.to_path_traced.items()},
-        "to same light": {name: _difference(found) for name, found in comparison.to_same_light.items()},
-        "path tracer with few samples": [
-            dict(zip(("samples", "seconds", "mean"), one, strict=True)) for one in comparison.few_samples
-        ],
-        "texel reads of the shader": comparison.shader_reads,
-        "packet reads of this model": comparison.model_reads,
-        "left out by the neighbourhood": comparison.truncated_fraction,
-        "error of the series": comparison.series_error,
-        "shares": shares
-        and {
-            "size": shares.size,
-            "samples": shares.samples,
-            "shading points": shares.shading_points,
-            "of path tracer": shares.path_traced,
-            "of same light": shares.same_light,
-        },
+    """Return all numbers by the names of the attributes, for `outputs.save_json`."""
+    found = {field.name: getattr(comparison, field.name) for field in dataclasses.fields(comparison)}
+    surface = found.pop("surface")
+    found |= {"size": surface.shape[::-1], "compared": float(surface.mean())}
+    found["pictures"] = {
+        name: {"samples": picture.samples, "seconds": picture.seconds} for name, picture in comparison.pictures.items()
     }
-
-
-def save_json(comparison: Comparison, path: str | os.PathLike[str]) -> None:
-    """Write `as_dict` atomically."""
-    outputs.save_json(as_dict(comparison), path)
+    for reference in ("to_path_traced", "to_same_light"):
+        found[reference] = {
+            name: {number: getattr(one, number) for number in _NUMBERS} for name, one in found[reference].items()
+        }
+    return found
 
 
 def shown(comparison: Comparison, name: str) -> NDArray[np.uint8]:

@@ -1,10 +1,9 @@
-"""Base classes of the variants of the shader, the gain (eq. 3.10) and the contribution of each wavelength to XYZ."""
+"""Base classes of the variants of the shader, and the gain (eq. 3.10)."""
 
 from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from numbers import Integral
 from typing import ClassVar
 
 import drjit as dr
@@ -12,39 +11,16 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...bsdf.tables import PacketTable, larger, opaque
-from ...errors import RequestError
+from ...bsdf.tables import larger, opaque
 from ...geometry import k_g
 from ...settings import SUN_COHERENCE_LENGTH, lobe_width
 from ...surface.heightfield import HeightField
 from .quirks import Quirks
 from .taper import tapered
 from .taylor_textures import MAX_KAPPA, TaylorTextures, taylor_transforms, terms_for
-from .tristimulus import (
-    MAX_WAVELENGTH,
-    MIN_WAVELENGTH,
-    WAVELENGTH_COUNT,
-    WAVELENGTH_STEP,
-    d65_weights,
-    light_weights,
-    rgb_matrix,
-    wavelengths,
-)
+from .tristimulus import MIN_WAVELENGTH, PUBLISHED_R0, WAVELENGTH_COUNT, WAVELENGTH_STEP, SpectralWeights, rgb_matrix
 
-PUBLISHED_R0 = 0.04  # an index of 1.5, close to that of snake skin
 SERIES_ERROR = 1e-4  # of the amplitudes, if the number of Taylor terms is not given
-
-
-def schlick_falloff(cos_half: mi.Float) -> mi.Float:
-    """Return (1 − ω_o·h)⁵ (Schlick 1994; eq. B.1): F = R₀ + (1 − R₀)(1 − ω_o·h)⁵."""
-    x = 1 - cos_half
-    return dr.square(dr.square(x)) * x
-
-
-def fresnel_ratio(r_0: mi.Float, falloff: mi.Float, squared: bool) -> mi.Float:
-    """Return F(ω_o·h)/F(1), or its square."""
-    ratio = (r_0 + (1 - r_0) * falloff) / r_0
-    return dr.square(ratio) if squared else ratio
 
 
 class Gain:
@@ -59,7 +35,7 @@ class Gain:
 
     Attributes:
         cos_half: ω_o·h.
-        falloff: `schlick_falloff`.
+        falloff: (1 − ω_o·h)⁵ of Schlick's approximation (1994; eq. B.1), F = R₀ + (1 − R₀)(1 − ω_o·h)⁵.
         factor: K G cos θ_i; zero below the horizon.
         active: both directions are in the upper hemisphere.
     """
@@ -70,70 +46,28 @@ class Gain:
         self.u, self.v, self.w = -wi - wo
         square = dr.square(self.u) + dr.square(self.v)
         self.cos_half = 0.5 * dr.sqrt(square + dr.square(self.w))
-        self.falloff = schlick_falloff(self.cos_half)
+        x = 1 - self.cos_half
+        self.falloff = dr.square(dr.square(x)) * x
         self.factor = dr.select(
             self.active, k_g(cos_i, cos_o, square, shadowing=shadowing, select=dr.select) * cos_i, 0
         )
 
 
-class SpectralWeights:
-    """Table of (X, Y, Z, R₀) with one entry per nm, read with linear interpolation (algorithm 4.3, line 5)."""
-
-    def __init__(
-        self,
-        quirks: Quirks,
-        peak: float,
-        *,
-        r_0: ArrayLike = PUBLISHED_R0,
-        light: ArrayLike | None = None,
-    ) -> None:
-        """Build the table.
-
-        For the irradiance E(λ) per nm and the relative radiance ρ(λ), the colour is ∫ ρ E (x̄, ȳ, z̄) dλ / ∫ȳ dλ.
-        Absolute radiance has the additional factor R₀ S(0)/λ², where S(0) is the density of a flat surface at q = 0.
-
-        Args:
-            quirks: `fixed_index`, `d65_light` and `relative` apply.
-            peak: S(0) of a flat surface, µm².
-            r_0: power reflectance at normal incidence, one number or (401,) at `tristimulus.wavelengths`.
-            light: spectrum of the light, (401,); default: D65 with Y = 1.
-        """
-        weights = d65_weights() if light is None else light_weights(light)
-        self.luminance = 1.0 if light is None else float(np.trapezoid(weights[:, 1]))
-        if quirks.d65_light:
-            weights = d65_weights() * self.luminance
-        r_0 = PUBLISHED_R0 if quirks.fixed_index else r_0
-        r_0 = np.broadcast_to(np.asarray(r_0, np.float64), wavelengths().shape)
-        if not quirks.relative:
-            weights = weights * (r_0 * peak / (wavelengths() * 1e-3) ** 2)[:, None]
-        self.table = PacketTable(np.concatenate([weights, r_0[:, None]], axis=1))
-
-    def __call__(self, wavelength: mi.Float, active: mi.Bool) -> tuple[mi.Color3f, mi.Float]:
-        """Return (X, Y, Z) per nm, and R₀, at a wavelength in nm; zero outside 380 to 780 nm."""
-        active = active & (wavelength >= MIN_WAVELENGTH - 1e-3) & (wavelength <= MAX_WAVELENGTH + 1e-3)
-        value = interpolated(self.table, wavelength - MIN_WAVELENGTH, int(MAX_WAVELENGTH - MIN_WAVELENGTH), active)
-        return mi.Color3f(value.x, value.y, value.z), value.w
-
-
-def interpolated(table: PacketTable, position: mi.Float, last: int, active: mi.Bool) -> mi.Vector4f:
-    """Return a table's packets 0 … `last`, interpolated linearly at `position` (clamped), and zero if not `active`."""
-    position = dr.clip(position, 0, last)
-    index = mi.UInt32(dr.minimum(position, last - 1))
-    below, above = table(index, active), table(index + 1, active)
-    return below + (position - mi.Float(index)) * (above - below)
-
-
 class Shader:
-    """Base class of the shaders of a tile: directions → linear RGB.
+    """Base class of the shaders of a tile. Subclasses have a method `rgb`, as that of `TextureShader`.
 
     Directions are unit vectors in the frame of the tile, z being the normal, and point away from the surface: ω_i to
     the light, ω_o to the viewer. An instance is bound to the Mitsuba variant in which it was made.
 
     Attributes:
         own_quirks: names of the quirks that affect this shader.
+        peak: S(0) of a flat surface, µm², the normalisation of the relative radiance.
+        texel_reads: maximum number of texels read for one shading point.
     """
 
     own_quirks: ClassVar[tuple[str, ...]]
+    peak: float
+    texel_reads: int
 
     def __init__(self, height_field: HeightField, quirks: Quirks, shadowing: bool = True) -> None:
         self.tile_size = height_field.tile_size
@@ -148,36 +82,7 @@ class Shader:
 
     def weights(self, r_0: ArrayLike = PUBLISHED_R0, light: ArrayLike | None = None) -> SpectralWeights:
         """Return the `SpectralWeights` of a material and a light."""
-        return SpectralWeights(self.quirks, self.peak, r_0=r_0, light=light)
-
-    @property
-    def peak(self) -> float:
-        """S(0) of a flat surface, µm², the normalisation of the relative radiance."""
-        raise NotImplementedError
-
-    @property
-    def texel_reads(self) -> int:
-        """Maximum number of texels read for one shading point."""
-        raise NotImplementedError
-
-    def rgb(
-        self,
-        wi: mi.Vector3f,
-        wo: mi.Vector3f,
-        weights: SpectralWeights,
-        active: mi.Bool = True,
-        height_scale: mi.Float = 1.0,
-    ) -> mi.Color3f:
-        """Return linear RGB, before gamma.
-
-        Args:
-            wi: ω_i.
-            wo: ω_o.
-            weights: from `weights`.
-            active: mask.
-            height_scale: scales the heights.
-        """
-        raise NotImplementedError
+        return SpectralWeights(self.quirks, self.peak, r_0, light)
 
 
 class TextureShader(Shader):
@@ -188,6 +93,13 @@ class TextureShader(Shader):
         ρ(λ) = F/F₀ · K G cos θ_i · |P(q; κ)|²,     q = (u, v)/λ,     κ = −2πw/λ,
 
     with |P|² = 1 for a flat mirror, and the colour is ∫ ρ(λ) S(λ) (x̄, ȳ, z̄) dλ.
+
+    Attributes:
+        origin_at_centre: whether x = 0 is the centre of the tile (`taylor_transforms`).
+        published_terms: number of Taylor terms of the published shader.
+        tapers: whether the heights are tapered (`taper.py`).
+        margin: texels that are read beyond the highest frequency that light reaches.
+        texels_per_term: texels read per Taylor term and wavelength.
     """
 
     own_quirks = (
@@ -196,6 +108,9 @@ class TextureShader(Shader):
     )
     origin_at_centre: ClassVar[bool] = False
     published_terms: ClassVar[int]
+    tapers = False
+    margin: int
+    texels_per_term: int
 
     def __init__(
         self,
@@ -266,16 +181,6 @@ class TextureShader(Shader):
         return self._coherence_lengths[0 if self.quirks.fixed_coherence else 1]
 
     @property
-    def tapers(self) -> bool:
-        """Whether the heights are tapered (`taper.py`)."""
-        return False
-
-    @property
-    def margin(self) -> int:
-        """Texels that are read beyond the highest frequency that light reaches."""
-        raise NotImplementedError
-
-    @property
     def terms(self) -> int:
         """The number of Taylor terms."""
         if self._terms is not None:
@@ -293,6 +198,10 @@ class TextureShader(Shader):
     def peak(self) -> float:
         return 1 / (float(np.pi) * self.sigma**2)
 
+    def position(self, gain: Gain, wavelength: mi.Float) -> tuple[mi.Float, mi.Float]:
+        """Return q T = (u T_x, v T_y)/λ, in texels relative to frequency zero, at a wavelength in µm."""
+        return gain.u * self.tile_size[0] / wavelength, gain.v * self.tile_size[1] / wavelength
+
     def power(self, gain: Gain, wavelength: mi.Float, height_scale: mi.Float, active: mi.Bool) -> mi.Float:
         """Evaluate |P(q; κ)|² at a wavelength in µm; it is one for a flat mirror at q = 0."""
         raise NotImplementedError
@@ -304,11 +213,12 @@ class TextureShader(Shader):
         return gain.factor * self.fresnel(mi.Float(PUBLISHED_R0), gain) * power
 
     def fresnel(self, r_0: mi.Float, gain: Gain) -> mi.Float:
-        """Return F/F₀ or its square."""
+        """Return F(ω_o·h)/F(1) or its square."""
         if self.quirks.schlick or not self.exact_fresnel:
-            return fresnel_ratio(r_0, gain.falloff, self.quirks.fresnel_squared)
-        root = dr.sqrt(r_0)
-        ratio = mi.fresnel(gain.cos_half, (1 + root) / (1 - root))[0] / r_0
+            ratio = (r_0 + (1 - r_0) * gain.falloff) / r_0
+        else:
+            root = dr.sqrt(r_0)
+            ratio = mi.fresnel(gain.cos_half, (1 + root) / (1 - root))[0] / r_0
         return dr.square(ratio) if self.quirks.fresnel_squared else ratio
 
     def integral(self, gain: Gain, weights: SpectralWeights, height_scale: mi.Float) -> mi.Color3f:
@@ -323,14 +233,18 @@ class TextureShader(Shader):
         active: mi.Bool = True,
         height_scale: mi.Float = 1.0,
     ) -> mi.Color3f:
+        """Return linear RGB, before gamma.
+
+        Args:
+            wi: ω_i.
+            wo: ω_o.
+            weights: from `weights`.
+            active: mask.
+            height_scale: scales the heights.
+        """
         gain = Gain(wi, wo, self.shadowing, mi.Bool(active))
         xyz = gain.factor * self.integral(gain, weights, mi.Float(height_scale))
         return mi.Color3f(*(sum(row[i] * xyz[i] for i in range(3)) for row in self.matrix))
-
-    @property
-    def texels_per_term(self) -> int:
-        """Texels read per Taylor term and wavelength."""
-        raise NotImplementedError
 
     @property
     def texel_reads(self) -> int:
@@ -357,10 +271,3 @@ def trapezoid(
         result += weight * (width * power(gain, wavelength * 1e-3, height_scale, active))
         index += 1
     return result
-
-
-def check_integer(name: str, value: int, minimum: int) -> int:
-    """Return `value` as an int; raise RequestError unless it is a whole number ≥ `minimum`."""
-    if isinstance(value, bool) or not isinstance(value, Integral) or value < minimum:
-        raise RequestError(f"{name}: got {value!r}, wanted a whole number ≥ {minimum}")
-    return int(value)

@@ -83,10 +83,6 @@ class FLSS(TextureShader):
         x, y = self.position(gain, wavelength)
         return self.windowed(gain, x, y, wavelength, height_scale, self.window(x, y), active)
 
-    def position(self, gain: Gain, wavelength: mi.Float) -> tuple[mi.Float, mi.Float]:
-        """Return c, in texels relative to frequency zero."""
-        return gain.u * self.tile_size[0] / wavelength, gain.v * self.tile_size[1] / wavelength
-
     def window(
         self, x: mi.Float, y: mi.Float, stretch_x: mi.Float = 1.0, stretch_y: mi.Float = 1.0
     ) -> Callable[[mi.Int32, mi.Int32], mi.Float]:

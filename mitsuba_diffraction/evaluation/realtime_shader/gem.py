@@ -34,6 +34,8 @@ class GEM(Shader):
     """
 
     own_quirks = ("infrared_rainbow",)
+    peak = 1.0  # unused: the shader computes colours, not a relative radiance
+    texel_reads = 0
 
     def __init__(
         self,
@@ -51,15 +53,6 @@ class GEM(Shader):
         if not all(isinstance(number, Real) and number > 0 for number in (self.spacing, self.roughness)):
             raise RequestError(f"spacing, roughness: got {spacing!r}, {roughness!r}, wanted positive numbers")
 
-    @property
-    def peak(self) -> float:
-        """Unused: the shader computes colours, not a relative radiance."""
-        return 1.0
-
-    @property
-    def texel_reads(self) -> int:
-        return 0
-
     def rgb(
         self,
         wi: mi.Vector3f,
@@ -68,6 +61,7 @@ class GEM(Shader):
         active: mi.Bool = True,
         height_scale: mi.Float = 1.0,
     ) -> mi.Color3f:
+        """Return linear RGB, before gamma; arguments as of `TextureShader.rgb`, heights have no effect."""
         active = mi.Bool(active) & (wi.z > 0) & (wo.z > 0)
         path = dr.abs(wi.x + wo.x) * self.spacing
         highlight = dr.exp(-dr.square(self.roughness * path / dr.maximum(wi.z + wo.z, 1e-6)))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -16,10 +16,10 @@ from ...manual import Parameter, listed
 from .base import Shader
 from .evaluate import VARIANTS
 from .lights import Light, lights_of, spectrum_of
-from .picture import Emission, decode, encode
 from .pq import PQ
 from .quirks import Quirks
 from .surfaces import Shaded, gratings_of, in_place, recipe_of, sum_along
+from .tristimulus import Emission, with_power_gamma
 
 PARAMETERS = (
     Parameter("variant", "string", "flss, nmm, pq, nmm_pq or gem", "flss"),
@@ -54,23 +54,6 @@ units and show the direct light of a path tracer without a coat and without the 
 """
 
 
-@dataclass(frozen=True, eq=False)
-class Prepared:
-    """Lights and gratings of a scene.
-
-    Attributes:
-        lights: that are supported.
-        gratings: the BSDFs of the gratings.
-        outer: the BSDFs of shapes that are gratings, or in which gratings are nested.
-        shaded: what takes the place of the layers of each grating.
-    """
-
-    lights: list[Light]
-    gratings: list[mi.BSDF]
-    outer: list[mi.BSDF]
-    shaded: list[Shaded]
-
-
 def define() -> type:
     """Define the plugin class for the current variant, as its base class depends on the variant."""
 
@@ -92,28 +75,31 @@ def define() -> type:
             self.emission = Emission()
             mi.SamplingIntegrator.__init__(self, props)
             self._shaders: list[tuple[Layers, Shader]] = []
-            self.prepared: Prepared | None = None
+            # Of the scene, by `prepare`: the lights that are supported; the BSDFs of the gratings; those of the shapes
+            # that are gratings or in which gratings are nested; and what takes the place of the layers of each grating.
+            self.lights: list[Light] = []
+            self.gratings: list[mi.BSDF] = []
+            self.outer: list[mi.BSDF] = []
+            self.shaded: list[Shaded] = []
 
         def set_quirks(self, quirks: Quirks) -> None:
             """Set the quirks for the next `prepare`; existing textures are kept."""
             self.quirks = quirks
             self._shaders = [(grating, shader.with_quirks(quirks)) for grating, shader in self._shaders]
 
-        def prepare(self, scene: mi.Scene) -> Prepared:
+        def prepare(self, scene: mi.Scene) -> None:
             """Read the lights and the gratings of a scene.
 
             Raises:
                 ValueError: if the shader does not support them.
             """
-            lights, (gratings, outer) = lights_of(scene), gratings_of(scene)
+            self.lights, (self.gratings, self.outer) = lights_of(scene), gratings_of(scene)
             base_weight = self.diffuse_weight if self.quirks.constant_blend else None
-            shaded = []
-            for layers in (bsdf.layers for bsdf in gratings):
+            self.shaded = []
+            for layers in (bsdf.layers for bsdf in self.gratings):
                 shader, r_0 = self.shader_of(layers), _normal_reflectance(layers)
-                weights = [shader.weights(r_0, light.spectrum) for light in lights]
-                shaded.append(Shaded(layers, shader, weights, base_weight))
-            self.prepared = Prepared(lights, gratings, outer, shaded)
-            return self.prepared
+                weights = [shader.weights(r_0, light.spectrum) for light in self.lights]
+                self.shaded.append(Shaded(layers, shader, weights, base_weight))
 
         def shader_of(self, layers: Layers) -> Shader:
             """Return the shader of a grating; its textures are computed once."""
@@ -156,16 +142,17 @@ def define() -> type:
                 Linear sRGB of gratings from the shader; radiance of all other BSDFs, per nm at the wavelengths of the
                 ray; and whether a surface was hit.
             """
-            prepared = self.prepared or self.prepare(scene)
+            if not self.lights:
+                self.prepare(scene)
 
             def at_hit(
                 si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active: mi.Bool
             ) -> tuple[mi.Color3f, mi.UnpolarizedSpectrum]:
                 rgb, radiance = mi.Color3f(0), mi.UnpolarizedSpectrum(0)
                 of_grating = mi.Bool(False)
-                for outer in prepared.outer:
+                for outer in self.outer:
                     of_grating |= bsdf == mi.BSDFPtr(outer)
-                for index, light in enumerate(prepared.lights):
+                for index, light in enumerate(self.lights):
                     ds, falloff, irradiance = light.sample(si, active)
                     lit = mi.Bool(active)
                     if self.shadows:
@@ -173,7 +160,7 @@ def define() -> type:
                     direction = si.to_local(ds.d)
 
                     def value(light: int | None, active: mi.Bool, at=si, wo=direction) -> mi.UnpolarizedSpectrum:
-                        for shaded in prepared.shaded:
+                        for shaded in self.shaded:
                             shaded.light = light
                         return mi.unpolarized_spectrum(bsdf.eval(mi.BSDFContext(), at, wo, active))
 
@@ -183,10 +170,10 @@ def define() -> type:
                     rgb += dr.select(lit & of_grating, falloff * colour, 0)
                 return rgb, radiance
 
-            with in_place(prepared.gratings, prepared.shaded):
+            with in_place(self.gratings, self.shaded):
                 (rgb, radiance), active = sum_along(scene, ray, active, at_hit)
             if self.quirks.power_gamma:
-                rgb = decode(encode(rgb, True))
+                rgb = with_power_gamma(rgb)
             return dr.select(active, rgb, 0), radiance, active
 
         def to_string(self) -> str:

@@ -58,7 +58,7 @@ class NMMPQ(PQ):
 
     def _line(self, gain: Gain, wavelength: mi.Float, along_x: mi.Bool, height_scale: mi.Float) -> mi.Float:
         """Return Σ_m |F_nm|² I_m over the three orders m about y, at a wavelength λ_n in µm."""
-        x, y = gain.u * self.tile_size[0] / wavelength, gain.v * self.tile_size[1] / wavelength
+        x, y = self.position(gain, wavelength)
         tiles = dr.select(along_x, mi.Float(self.tiles[0]), mi.Float(self.tiles[1]))
         across = dr.select(along_x, mi.Float(self.tiles[1]), mi.Float(self.tiles[0]))
         main, other = dr.round(dr.select(along_x, x, y)), dr.select(along_x, y, x)

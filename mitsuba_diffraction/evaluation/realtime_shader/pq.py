@@ -9,18 +9,21 @@ import mitsuba as mi
 
 from ...errors import RequestError
 from ...surface.heightfield import HeightField
-from .base import Gain, TextureShader, check_integer
+from .base import Gain, TextureShader
 from .quirks import Quirks
 
 _AT_INTEGER = 2.0**-13.5  # a quarter of √ε in float32
 
 
 def tile_factor(x: mi.Float, count: int) -> mi.Float:
-    """Compute D(x; N) = sin(πNx)/sin(πx), as derived in `finite_tiles.tile_factor`.
+    """Compute D(x; N) = sin(πNx)/sin(πx), the sum of N unit phasors x periods apart, about their centre.
 
-    With k the integer nearest to x and r = x − k,
+    N tiles of period T multiply the transform of one tile by D(qT; N), up to a phase. The quotient is 0/0 at integers;
+    with k the integer nearest to x and r = x − k, exact in floating point,
 
         D(x; N) = (−1)^{k(N−1)} sin(πNr)/sin(πr) → (−1)^{k(N−1)} N   as r → 0.
+
+    In double precision it is N `scipy.special.diric(2πx, N)`.
     """
     k = dr.round(x)
     r = x - k
@@ -102,14 +105,10 @@ class PQ(TextureShader):
             interpolation: "sinc" or "linear".
             radius: of the sinc kernel, in texels on each side.
         """
-        self.radius = check_integer("radius", radius, 1)
-        super().__init__(height_field, quirks, **settings)
         if interpolation not in INTERPOLATIONS:
             raise RequestError(f"interpolation: got {interpolation!r}, wanted one of {', '.join(INTERPOLATIONS)}")
-        if tiles is not None and len(tiles) != 2:
-            raise RequestError(f"tiles: got {tiles!r}, wanted two whole numbers ≥ 1, along x and y")
-        self._tiles = tiles and tuple(check_integer("tiles", count, 1) for count in tiles)
-        self.interpolation = interpolation
+        self.radius, self._tiles, self.interpolation = radius, tiles, interpolation
+        super().__init__(height_field, quirks, **settings)
 
     @property
     def tiles(self) -> tuple[int, int]:
@@ -130,7 +129,7 @@ class PQ(TextureShader):
         return (2 if self.interpolation == "linear" else 2 * self.radius + 1) ** 2
 
     def power(self, gain: Gain, wavelength: mi.Float, height_scale: mi.Float, active: mi.Bool) -> mi.Float:
-        x, y = gain.u * self.tile_size[0] / wavelength, gain.v * self.tile_size[1] / wavelength
+        x, y = self.position(gain, wavelength)
         rows, columns = self._height_field.shape
         active = active & (dr.abs(x) <= columns / 2) & (dr.abs(y) <= rows / 2)
         if self.interpolation == "linear":

@@ -110,13 +110,27 @@ class TaylorTextures:
         self.height = opaque(height)
         self.table = PacketTable(np.stack([texels.real, texels.imag], axis=-1), width=2)
 
+    @dr.syntax
     def amplitude(self, m_x: mi.Int32, m_y: mi.Int32, kappa: mi.Float, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
         """Return real and imaginary part of F_m(κ); zero where the order lies outside the texture."""
         column, row = m_x + self.columns // 2, m_y + self.rows // 2
         inside = active & (column >= 0) & (column < self.columns) & (row >= 0) & (row < self.rows)
         first = mi.UInt32(dr.select(inside, (row * self.columns + column) * self.terms, 0))
-        return _taylor_series(self.table, first, kappa * self.height, self.terms, inside)
+        x = kappa * self.height
+        re, im = mi.Float(0), mi.Float(0)
+        # (ix)ⁿ/n!
+        c_re, c_im = mi.Float(1), mi.Float(0)
+        n = mi.UInt32(0)
+        while n < self.terms:
+            term = self.table(first + n, inside)
+            re += c_re * term.x - c_im * term.y
+            im += c_re * term.y + c_im * term.x
+            n += 1
+            step = x / mi.Float(n)
+            c_re, c_im = -step * c_im, step * c_re
+        return re, im
 
+    @dr.syntax
     def over(
         self,
         first: tuple[mi.Int32, mi.Int32],
@@ -134,48 +148,17 @@ class TaylorTextures:
             weight: φ of the orders (m_x, m_y).
             active: mask.
         """
-        return _rectangle(self, mi.Int32(first[0]), mi.Int32(first[1]), size[0], size[1], kappa, weight, active)
-
-
-@dr.syntax
-def _taylor_series(
-    table: PacketTable, first: mi.UInt32, x: mi.Float, terms: int, active: mi.Bool
-) -> tuple[mi.Float, mi.Float]:
-    """Return Σ_n (ix)ⁿ/n! B_n."""
-    re, im = mi.Float(0), mi.Float(0)
-    # (ix)ⁿ/n!
-    c_re, c_im = mi.Float(1), mi.Float(0)
-    n = mi.UInt32(0)
-    while n < terms:
-        term = table(first + n, active)
-        re += c_re * term.x - c_im * term.y
-        im += c_re * term.y + c_im * term.x
-        n += 1
-        step = x / mi.Float(n)
-        c_re, c_im = -step * c_im, step * c_re
-    return re, im
-
-
-@dr.syntax
-def _rectangle(
-    textures: TaylorTextures,
-    first_x: mi.Int32,
-    first_y: mi.Int32,
-    columns: int,
-    rows: int,
-    kappa: mi.Float,
-    weight: Callable[[mi.Int32, mi.Int32], mi.Float],
-    active: mi.Bool,
-) -> tuple[mi.Float, mi.Float]:
-    re, im, powers = mi.Float(0), mi.Float(0), mi.Float(0)
-    index = mi.Int32(0)
-    while index < columns * rows:
-        m_x = first_x + index % columns
-        m_y = first_y + index // columns
-        part_re, part_im = textures.amplitude(m_x, m_y, kappa, active)
-        phi = weight(m_x, m_y)
-        re += phi * part_re
-        im += phi * part_im
-        powers += dr.square(phi) * (dr.square(part_re) + dr.square(part_im))
-        index += 1
-    return dr.square(re) + dr.square(im), powers
+        first_x, first_y = mi.Int32(first[0]), mi.Int32(first[1])
+        columns, rows = size
+        re, im, powers = mi.Float(0), mi.Float(0), mi.Float(0)
+        index = mi.Int32(0)
+        while index < columns * rows:
+            m_x = first_x + index % columns
+            m_y = first_y + index // columns
+            part_re, part_im = self.amplitude(m_x, m_y, kappa, active)
+            phi = weight(m_x, m_y)
+            re += phi * part_re
+            im += phi * part_im
+            powers += dr.square(phi) * (dr.square(part_re) + dr.square(part_im))
+            index += 1
+        return dr.square(re) + dr.square(im), powers

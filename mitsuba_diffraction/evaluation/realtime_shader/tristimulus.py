@@ -1,18 +1,23 @@
-"""Colour in the shader: spectral weights for XYZ, conversion to RGB, and spectra of RGB colours."""
+"""Colour in the shader: the contribution of each wavelength to XYZ, conversion to RGB, and spectra of RGB colours."""
 
 from __future__ import annotations
 
 from functools import lru_cache
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import lsq_linear
 
+from ...bsdf.tables import PacketTable
 from ...color import daylight, matching_functions
 from ...settings import VISIBLE
+from .quirks import Quirks
 
 MIN_WAVELENGTH, MAX_WAVELENGTH, WAVELENGTH_STEP = 380.0, 780.0, 5.0  # nm
 WAVELENGTH_COUNT = 81  # from the shortest to the longest, in such steps
+PUBLISHED_R0 = 0.04  # an index of 1.5, close to that of snake skin
 
 CIE_RGB = np.array([[0.41847, -0.15866, -0.082835], [-0.091169, 0.25243, 0.015708], [0.00092090, -0.0025498, 0.17860]])
 """XYZ → CIE RGB of 1931 (Smith and Guild 1931), eq. 4.9 of the thesis. Rows sum to 0.177."""
@@ -54,6 +59,46 @@ def rgb_matrix(*, cie_rgb_matrix: bool, d65_twice: bool) -> NDArray[np.float64]:
     return matrix * d65_white() if d65_twice else np.array(matrix)
 
 
+class SpectralWeights:
+    """Table of (X, Y, Z, R₀) with one entry per nm, read with linear interpolation (algorithm 4.3, line 5)."""
+
+    def __init__(self, quirks: Quirks, peak: float, r_0: ArrayLike, light: ArrayLike | None) -> None:
+        """Build the table.
+
+        For the irradiance E(λ) per nm and the relative radiance ρ(λ), the colour is ∫ ρ E (x̄, ȳ, z̄) dλ / ∫ȳ dλ.
+        Absolute radiance has the additional factor R₀ S(0)/λ², where S(0) is the density of a flat surface at q = 0.
+
+        Args:
+            quirks: `fixed_index`, `d65_light` and `relative` apply.
+            peak: S(0) of a flat surface, µm².
+            r_0: power reflectance at normal incidence, one number or (401,) at `tristimulus.wavelengths`.
+            light: spectrum of the light, (401,); None for D65 with Y = 1.
+        """
+        weights = d65_weights() if light is None else light_weights(light)
+        self.luminance = 1.0 if light is None else float(np.trapezoid(weights[:, 1]))
+        if quirks.d65_light:
+            weights = d65_weights() * self.luminance
+        r_0 = PUBLISHED_R0 if quirks.fixed_index else r_0
+        r_0 = np.broadcast_to(np.asarray(r_0, np.float64), wavelengths().shape)
+        if not quirks.relative:
+            weights = weights * (r_0 * peak / (wavelengths() * 1e-3) ** 2)[:, None]
+        self.table = PacketTable(np.concatenate([weights, r_0[:, None]], axis=1))
+
+    def __call__(self, wavelength: mi.Float, active: mi.Bool) -> tuple[mi.Color3f, mi.Float]:
+        """Return (X, Y, Z) per nm, and R₀, at a wavelength in nm; zero outside 380 to 780 nm."""
+        active = active & (wavelength >= MIN_WAVELENGTH - 1e-3) & (wavelength <= MAX_WAVELENGTH + 1e-3)
+        value = interpolated(self.table, wavelength - MIN_WAVELENGTH, int(MAX_WAVELENGTH - MIN_WAVELENGTH), active)
+        return mi.Color3f(value.x, value.y, value.z), value.w
+
+
+def interpolated(table: PacketTable, position: mi.Float, last: int, active: mi.Bool) -> mi.Vector4f:
+    """Return a table's packets 0 … `last`, interpolated linearly at `position` (clamped), and zero if not `active`."""
+    position = dr.clip(position, 0, last)
+    index = mi.UInt32(dr.minimum(position, last - 1))
+    below, above = table(index, active), table(index + 1, active)
+    return below + (position - mi.Float(index)) * (above - below)
+
+
 EMISSION = np.arange(VISIBLE[0], VISIBLE[1] + 0.5, 5.0)
 """The nodes of `primary_spectra`, nm."""
 
@@ -79,3 +124,26 @@ def primary_spectra() -> NDArray[np.float64]:
     result = result @ np.linalg.solve(to_xyz @ result, primaries)
     result.setflags(write=False)
     return result
+
+
+class Emission:
+    """A spectrum of given linear sRGB: Σ_c RGB_c b_c(λ), with b_c from `tristimulus.primary_spectra`."""
+
+    def __init__(self) -> None:
+        spectra = primary_spectra()
+        self.table = PacketTable(np.concatenate([spectra, np.zeros((len(spectra), 1))], axis=1))
+
+    def __call__(self, rgb: mi.Color3f, wavelengths: mi.UnpolarizedSpectrum, active: mi.Bool) -> mi.UnpolarizedSpectrum:
+        """Evaluate the spectrum, per nm, at the wavelengths of a ray, in nm."""
+        result = mi.UnpolarizedSpectrum(0)
+        first, spacing = float(EMISSION[0]), float(EMISSION[1] - EMISSION[0])
+        for channel in range(len(result)):
+            b = interpolated(self.table, (wavelengths[channel] - first) / spacing, EMISSION.size - 1, active)
+            result[channel] = rgb.x * b.x + rgb.y * b.y + rgb.z * b.z
+        return result
+
+
+def with_power_gamma(rgb: mi.Color3f) -> mi.Color3f:
+    """Return the linear sRGB that an sRGB display (IEC 61966-2-1) emits for linear RGB encoded by a power of 1/2.5."""
+    encoded = dr.power(dr.maximum(rgb, 0), 1 / 2.5)
+    return dr.select(encoded <= 0.04045, encoded / 12.92, dr.power((encoded + 0.055) / 1.055, 2.4))

@@ -11,7 +11,6 @@ from ...color import auto_exposure, daylight, into_gamut, on_screen, spectrum_to
 from ...errors import RequestError
 from ...testing import direction
 from ..realtime_shader.evaluate import VARIANTS, colour
-from ..realtime_shader.quirks import Quirks
 from .published_surfaces import PublishedSurface
 from .viewing_angle import MODEL, relative_reflectance, wavelengths
 
@@ -51,26 +50,18 @@ class BRDFMap:
         """sRGB (side, side, 3) from 0 to 1; 0.5 grey outside."""
         return np.where(np.isnan(self.rgb), 0.5, on_screen(into_gamut(self.rgb) * self.exposure) / 255)
 
-    def positions_of_orders(self, nanometres: Array, orders: Array) -> tuple[Array, Array]:
-        """Return the positions of orders in the map, by the grating equation with the published period.
+    def position_of_order(self, nanometres: float, order: int) -> Array:
+        """Return (x, y) of an order n in the map by the grating equation with the published period; NaN if evanescent.
 
         The direction cosines of light and viewer along the diffracting axis add up to −nλ/d, across it to zero.
-
-        Args:
-            nanometres: (...) wavelengths.
-            orders: (...) n; the two broadcast.
-
-        Returns:
-            x and y, (...) each; NaN where the order is evanescent.
         """
-        path = np.asarray(orders) * np.asarray(nanometres) * 1e-3 / self.surface.period
-        sums = np.zeros((*path.shape, 2))
-        sums[..., self.surface.axis] = path
+        sums = np.zeros(2)
+        sums[self.surface.axis] = order * nanometres * 1e-3 / self.surface.period
         out = -sums - direction(*self.incidence)[:2]
-        radius = np.hypot(out[..., 0], out[..., 1])
-        position = sums if self.projection == "uv" else _in_degrees(out, radius)
-        position = np.where((radius < 1)[..., None], position, np.nan)
-        return position[..., 0], position[..., 1]
+        sine = np.hypot(*out)
+        if sine >= 1:
+            return np.full(2, np.nan)
+        return sums if self.projection == "uv" else out * (np.rad2deg(np.arcsin(sine)) / max(sine, 1e-12))
 
 
 def brdf_map(
@@ -80,12 +71,11 @@ def brdf_map(
     projection: str = "hemisphere",
     incidence: tuple[float, float] = (30.0, 0.0),
     side: int = 240,
-    quirks: Quirks | None = None,
 ) -> BRDFMap:
     """Evaluate a surface over the outgoing hemisphere under D65.
 
-    The model's relative reflectance, at every 5 nm, becomes XYZ and sRGB; the shader's variants give their own linear
-    RGB. Each map has its own exposure by `color.auto_exposure`, and stores it.
+    The model's relative reflectance, at every 5 nm, becomes XYZ and sRGB; the shader's variants, as published, give
+    their own linear RGB. Each map has its own exposure by `color.auto_exposure`, and stores it.
 
     Args:
         surface: the surface.
@@ -93,13 +83,10 @@ def brdf_map(
         projection: one of `PROJECTIONS`.
         incidence: (θ_i, φ_i) in degrees, φ_i from the x axis.
         side: pixels along x and along y.
-        quirks: of the shader; as published if none are given.
 
     Raises:
         ValueError: if an argument is wrong, or Mitsuba has no vectorised spectral variant set.
     """
-    if method not in MAP_METHODS:
-        raise RequestError(f"method: got {method!r}, wanted one of {', '.join(MAP_METHODS)}")
     if projection not in PROJECTIONS:
         raise RequestError(f"projection: got {projection!r}, wanted one of {', '.join(PROJECTIONS)}")
     wi = direction(*incidence)
@@ -118,21 +105,15 @@ def brdf_map(
         above = z > 0
         wo = np.concatenate([out, np.sqrt(np.maximum(z, 0))[..., None]], axis=-1)
     rgb = np.full((side, side, 3), np.nan)
-    rgb[above] = _linear_rgb(surface, method, wi, wo[above], quirks)
+    rgb[above] = _linear_rgb(surface, method, wi, wo[above])
     shown = into_gamut(rgb[above])
     return BRDFMap(surface, method, projection, incidence, x, y, rgb, auto_exposure(shown))
 
 
-def _linear_rgb(surface: PublishedSurface, method: str, wi: Array, wo: Array, quirks: Quirks | None) -> Array:
+def _linear_rgb(surface: PublishedSurface, method: str, wi: Array, wo: Array) -> Array:
     if method != MODEL:
         settings = {} if method == "gem" else {"coherence_length": surface.shader_coherence_length}
-        return colour(surface.height_field, wi, wo, variant=method, quirks=quirks, **settings)
+        return colour(surface.height_field, wi, wo, variant=method, **settings)
     nanometres = wavelengths()
     values = relative_reflectance(surface.spectrum, wi, wo, nanometres)
     return spectrum_to_linear_sRGB(values * daylight(nanometres), nanometres)
-
-
-def _in_degrees(cosines: Array, radius: Array) -> Array:
-    """Convert direction cosines (..., 2) of length `radius` to (θ cos φ, θ sin φ) in degrees."""
-    theta = np.rad2deg(np.arcsin(np.minimum(radius, 1)))
-    return cosines * np.divide(theta, radius, out=np.full_like(radius, np.rad2deg(1)), where=radius > 0)[..., None]

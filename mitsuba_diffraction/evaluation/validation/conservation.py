@@ -83,22 +83,22 @@ def excess(bsdf: mi.BSDF) -> Record:
     return Record(np.maximum(max_albedo - 1, 0), 0.0, 1e-3 + MAX_DEVIATIONS * error, note=note)
 
 
-_SURFACES: dict[str, Callable[[], HeightField]] = {
-    "sinusoid": functools.cache(lambda: gratings.sinusoidal(2.5, 0.3)),
-    "blaze": functools.cache(lambda: gratings.blazed(2.5, 0.25)),
-    "crossed": functools.cache(lambda: gratings.crossed(2.0, 0.1, samples=32)),
+_SURFACES = {
+    "sinusoid": gratings.sinusoidal(2.5, 0.3),
+    "blaze": gratings.blazed(2.5, 0.25),
+    "crossed": gratings.crossed(2.0, 0.1, samples=32),
 }
 
 
-def _of(make: Callable[[], HeightField], measure: Callable[[GratingSpectrum], Record]) -> Callable[[], Record]:
-    return lambda: measure(spectrum_of(make(), tolerance=1e-3))
+def _measured(measure: Callable[[GratingSpectrum], Record], surface: HeightField) -> Record:
+    return measure(spectrum_of(surface, tolerance=1e-3))
 
 
 CHECKS = tuple(
-    check
-    for name, make in _SURFACES.items()
-    for check in (
-        Check("energy", f"{name}: reciprocity", _of(make, reciprocity), "f(ω_i, ω_o) = f(ω_o, ω_i)", slow=True),
-        Check("energy", f"{name}: albedo of a perfect mirror", _of(make, energy), "at most one", slow=True),
+    Check("energy", f"{name}: {what}", functools.partial(_measured, measure, surface), source, slow=True)
+    for name, surface in _SURFACES.items()
+    for what, measure, source in (
+        ("reciprocity", reciprocity, "f(ω_i, ω_o) = f(ω_o, ω_i)"),
+        ("albedo of a perfect mirror", energy, "at most one"),
     )
 )

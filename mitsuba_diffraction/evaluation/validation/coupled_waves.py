@@ -141,35 +141,25 @@ def cases() -> tuple[RigorousResult, ...]:
     )
 
 
-def _at_max_difference(
-    those: list[RigorousResult],
-    found: Callable[[RigorousResult], Array],
-    rigorous: Callable[[RigorousResult], Array],
-    bound: float | None,
-) -> Record:
-    """Return the record of the case with the maximum difference; its note quotes the strongest order."""
-    differences = [difference(found(case), rigorous(case)) for case in those]
-    case = those[index := int(np.argmax(differences))]
-    strongest = int(np.argmax(rigorous(case)))
+def _compare(profile: str, choose: Callable[[RigorousResult], bool], metal: bool = False, te: bool = False) -> Record:
+    """Return the record of the chosen case with the maximum difference; its note quotes the strongest order.
+
+    Compares the BSDF for unpolarised light, or scalar theory for `te`. For metals no bound is claimed: see
+    docs/validation.md.
+    """
+    those = [c for c in cases() if c.profile == profile and (c.material != "dielectric") == metal and choose(c)]
+    pairs = [(case.scalar().s, case.te) if te else (case.found(), case.unpolarised) for case in those]
+    differences = [difference(*pair) for pair in pairs]
+    index = int(np.argmax(differences))
+    found, rigorous = pairs[index]
+    strongest = int(np.argmax(rigorous))
     note = (
-        f"Σ|Δη|/Σ η, maximum of {len(those)}: {case}; order {case.orders[strongest]} has {found(case)[strongest]:.4g}, "
-        f"rigorous {rigorous(case)[strongest]:.4g}; converged to {max(c.change for c in those):.1e}"
+        f"Σ|Δη|/Σ η, maximum of {len(those)}: {those[index]}; order {those[index].orders[strongest]} has "
+        f"{found[strongest]:.4g}, rigorous {rigorous[strongest]:.4g}; "
+        f"converged to {max(case.change for case in those):.1e}"
     )
+    bound = BOUNDS[profile] if not metal and all(case.in_range for case in those) else None
     return Record(differences[index], 0.0, bound, note=note)
-
-
-def _dielectric(profile: str, choose: Callable[[RigorousResult], bool]) -> Record:
-    those = [case for case in cases() if case.profile == profile and case.material == "dielectric" and choose(case)]
-    bound = BOUNDS[profile] if all(case.in_range for case in those) else None
-    return _at_max_difference(those, RigorousResult.found, lambda case: case.unpolarised, bound)
-
-
-def _metal(profile: str, te: bool) -> Record:
-    """Compare metals, for which no bound is claimed: see docs/validation.md."""
-    those = [c for c in cases() if c.profile == profile and c.material != "dielectric" and c.angle <= MAX_ANGLE]
-    if te:
-        return _at_max_difference(those, lambda case: case.scalar().s, lambda case: case.te, None)
-    return _at_max_difference(those, RigorousResult.found, lambda case: case.unpolarised, None)
 
 
 def formula(those: Iterable[RigorousResult]) -> Record:
@@ -230,26 +220,19 @@ def _of_profile(profile: str) -> tuple[Check, ...]:
     angle_range = f"≤ {MAX_ANGLE:g}°"
     period_range = f", period ≥ {MIN_PERIOD:g} λ" if profile == "sinusoidal" else ""
 
-    def dielectric(choose: Callable[[RigorousResult], bool]) -> Callable[[], Record]:
-        return functools.partial(_dielectric, profile, choose)
+    def check(name: str, choose: Callable[[RigorousResult], bool], slow: bool = True, **of: bool) -> Check:
+        return _check(f"{profile}, {name}", functools.partial(_compare, profile, choose, **of), slow)
+
+    def near_normal(case: RigorousResult) -> bool:
+        return case.angle <= MAX_ANGLE
 
     return (
-        _check(
-            f"{profile}, n = 1.5, depth ≤ λ/2{period_range}, {angle_range}",
-            dielectric(lambda case: case.in_range),
-            slow=True,
-        ),
-        _check(
-            f"{profile}, n = 1.5, {angle_range}, outside that range",
-            dielectric(lambda case: not case.in_range and case.angle <= MAX_ANGLE),
-            slow=True,
-        ),
-        *(
-            _check(f"{profile}, n = 1.5, {angle:g}°", dielectric(lambda case, a=angle: case.angle == a), slow=True)
-            for angle in (40.0, 60.0)
-        ),
-        _check(f"{profile}, Al, {angle_range}, s", functools.partial(_metal, profile, True)),
-        _check(f"{profile}, Al, {angle_range}, unpolarised", functools.partial(_metal, profile, False), slow=True),
+        check(f"n = 1.5, depth ≤ λ/2{period_range}, {angle_range}", lambda case: case.in_range),
+        check(f"n = 1.5, {angle_range}, outside that range", lambda case: not case.in_range and near_normal(case)),
+        check("n = 1.5, 40°", lambda case: case.angle == 40),
+        check("n = 1.5, 60°", lambda case: case.angle == 60),
+        check(f"Al, {angle_range}, s", near_normal, slow=False, metal=True, te=True),
+        check(f"Al, {angle_range}, unpolarised", near_normal, metal=True),
     )
 
 

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import csv
 import io
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...errors import RequestError
 from ...files import whole_file
-from ...outputs import MARK, png_text
+from ...outputs import png_text
+from ...progress import Progress, silent
 from ..realtime_shader.quirks import Quirks
 from ..report import markdown, save_markdown
 from .brdf_map import MAP_METHODS, PROJECTIONS, BRDFMap, brdf_map
@@ -34,8 +33,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.cm import ScalarMappable
     from matplotlib.figure import Figure
-    from PIL.PngImagePlugin import PngInfo
 
+FILES = (*(f"{kind}_{name}.png" for name in SURFACES for kind in ("viewing_angle", "brdf")), "periods.md")
 MAP_COHERENCE = {"blaze": 6.5}
 """µm, of the BRDF maps: in sunlight the orders of the blaze would be thinner than a pixel."""
 
@@ -51,8 +50,8 @@ def figure(width: float, height: float) -> Figure:
     return Figure(figsize=(width, height), layout="constrained")
 
 
-def png(drawn: Figure, dpi: float = 110, pnginfo: PngInfo | None = None) -> bytes:
-    """Encode a figure as a PNG of a palette of 256 colours, half the size of a PNG of all colours."""
+def png(drawn: Figure, dpi: float = 110) -> bytes:
+    """Encode a figure as a PNG of a palette of 256 colours, half the size of a PNG of all colours; with the mark."""
     from PIL import Image
 
     whole, reduced = io.BytesIO(), io.BytesIO()
@@ -62,8 +61,14 @@ def png(drawn: Figure, dpi: float = 110, pnginfo: PngInfo | None = None) -> byte
         palette = picture.quantize(256, kmeans=2)
         # Pillow mixes colours only for a palette that it is given.
         mixed = picture.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG)
-        mixed.save(reduced, format="png", optimize=True, pnginfo=pnginfo)
+        mixed.save(reduced, format="png", optimize=True, pnginfo=png_text())
     return reduced.getvalue()
+
+
+def save_png(drawn: Figure, path: str | os.PathLike[str]) -> None:
+    """Write a figure as such a PNG, atomically."""
+    with whole_file(path) as temporary:
+        temporary.write_bytes(png(drawn))
 
 
 def plot_reflectance(maps: Sequence[ReflectanceMap]) -> Figure:
@@ -168,7 +173,7 @@ def _mark_orders(panel: Axes, found: BRDFMap) -> None:
     size = found.x[-1] - found.x[0]
     for order in (-2, -1, 1, 2):
         for nanometres, tint in ((450.0, "#6677ff"), (550.0, "#33cc33"), (650.0, "#ff4433")):
-            position = np.array(found.positions_of_orders(np.float64(nanometres), np.int64(order)))
+            position = found.position_of_order(nanometres, order)
             ends = np.stack([position, position])
             ends[:, across] += np.array([0.08, 0.12]) * size
             panel.plot(*ends.T, color=tint, linewidth=1)
@@ -220,68 +225,43 @@ def period_rows(surface: PublishedSurface, maps: Iterable[ReflectanceMap], step:
     return rows
 
 
-def figure_names(surfaces: Iterable[str] = tuple(SURFACES)) -> list[str]:
-    """Return the names of the files that `save_figures` writes."""
-    return [
-        *(f"{kind}_{name}.png" for name in surfaces for kind in ("viewing_angle", "brdf")),
-        *("periods.md", "periods.csv"),
-    ]
-
-
 def save_figures(
     folder: str | os.PathLike[str],
     *,
-    surfaces: Iterable[str] = tuple(SURFACES),
+    surfaces: Sequence[str] = tuple(SURFACES),
     step: float = 5.0,
     side: int = 200,
-    progress: Callable[[int, int], None] = lambda done, total: None,
-) -> list[Path]:
+    progress: Progress = silent,
+) -> None:
     """Evaluate and plot as in chapter 5 of the thesis of 2014, under the current variant of Mitsuba.
 
     Written atomically: for every surface `viewing_angle_NAME.png` and `brdf_NAME.png`; and the fitted
-    periods, `periods.md` and `periods.csv`.
+    periods, `periods.md`.
 
     Args:
         folder: of the files; created if missing.
         surfaces: names among `published_surfaces.SURFACES`.
         step: between wavelengths, nm.
         side: pixels of a BRDF map.
-        progress: called with (steps done, steps in total).
-
-    Returns:
-        The files.
+        progress: called with (figures done, figures in total).
 
     Raises:
-        ValueError: on an unknown surface, or where Mitsuba has no vectorised spectral variant set.
+        ValueError: if Mitsuba has no vectorised spectral variant set.
     """
-    surfaces = list(surfaces)
-    if unknown := [name for name in surfaces if name not in SURFACES]:
-        raise RequestError(f"surfaces: got {', '.join(map(repr, unknown))}, wanted among {', '.join(SURFACES)}")
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    files: list[Path] = []
     rows: list[list[str]] = []
-
-    def save(drawn: Figure, name: str) -> None:
-        with whole_file(folder / name) as temporary:
-            temporary.write_bytes(png(drawn, pnginfo=png_text()))
-        files.append(folder / name)
-        progress(len(files), 2 * len(surfaces))
-
-    for name in surfaces:
+    for number, name in enumerate(surfaces):
         surface = SURFACES[name]
         maps = [reflectance_map(surface, method, wavelengths=wavelengths(step)) for method in METHODS]
         rows += period_rows(surface, maps, step)
-        save(plot_reflectance(maps), f"viewing_angle_{name}.png")
+        save_png(plot_reflectance(maps), folder / f"viewing_angle_{name}.png")
+        progress(2 * number + 1, 2 * len(surfaces))
         mapped = surface.with_coherence_length(MAP_COHERENCE[name]) if name in MAP_COHERENCE else surface
         brdf_maps = [
             [brdf_map(mapped, method, projection=projection, side=side) for method in MAP_METHODS]
             for projection in PROJECTIONS
         ]
-        save(plot_brdf_maps(brdf_maps), f"brdf_{name}.png")
-    tables = [folder / "periods.md", folder / "periods.csv"]
-    save_markdown(markdown(PERIOD_COLUMNS, rows, texts=6), tables[0])
-    with whole_file(tables[1]) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
-        csv.writer(file).writerows([PERIOD_COLUMNS, *rows])
-        file.write(f"# {MARK}\n")
-    return [*files, *tables]
+        save_png(plot_brdf_maps(brdf_maps), folder / f"brdf_{name}.png")
+        progress(2 * number + 2, 2 * len(surfaces))
+    save_markdown(markdown(PERIOD_COLUMNS, rows, texts=6), folder / "periods.md")

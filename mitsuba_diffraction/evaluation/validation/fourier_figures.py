@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import gammaln
+from scipy.special import diric, gammaln
 
-from ...files import whole_file
-from ...outputs import png_text
 from ...surface.heightfield import HeightField
-from ..finite_tiles import tile_factor
 from ..realtime_shader.flss import FLSS
 from ..realtime_shader.taylor_textures import MAX_KAPPA, taylor_transforms
-from .figures import figure, png
+from .figures import figure, save_png
 from .published_surfaces import SURFACES
 
 if TYPE_CHECKING:
@@ -25,7 +22,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
-Kernel = Callable[[Array], Array]
 
 FILES = ("interpolation.png", "fourier_images.png")
 _SURFACES = ("blaze", "elaphe_scan")
@@ -34,32 +30,24 @@ _WAVELENGTH = 0.55  # µm, of the transforms at normal incidence
 _MAX_FREQUENCY = 3.0  # cycles/µm
 
 
-def linear(t: Array) -> Array:
-    """Return the weight of a sample at a distance of t samples, for linear interpolation."""
-    return np.maximum(1 - np.abs(t), 0)
+def interpolated(
+    texels: ArrayLike, orders: ArrayLike, x: ArrayLike, radius: int | None = None
+) -> NDArray[np.complex128]:
+    """Return Σ_m D((x − m)/N; N)/N texels[m]: exact if summed over all N orders of a tile of N pixels.
 
-
-def tile_kernel(count: int) -> Kernel:
-    """Return D(t/N; N)/N, the kernel of a tile of N pixels: exact if summed over all of its texels."""
-    return lambda t: tile_factor(t / count, count) / count
-
-
-def interpolated(samples: ArrayLike, first: int, x: ArrayLike, kernel: Kernel, radius: int | None = None) -> NDArray:
-    """Return Σ_m kernel(x − m) samples[m − first].
+    D(t/N; N)/N = sin(πt)/(N sin(πt/N)), the kernel of PQ.
 
     Args:
-        samples: (n,) at the integers from `first` on.
-        first: of these.
+        texels: (N,) of the orders.
+        orders: (N,) m.
         x: (k,) positions.
-        kernel: weights.
-        radius: sum over as many samples on each side of the nearest one; default: over all.
+        radius: sum over as many texels on each side of the nearest one; default: over all.
     """
-    m = first + np.arange(len(samples))
-    x = np.asarray(x, np.float64)[:, None]
-    weights = kernel(x - m)
+    texels, orders, x = np.asarray(texels), np.asarray(orders), np.asarray(x, np.float64)[:, None]
+    weights = diric(2 * np.pi * (x - orders) / texels.size, texels.size)
     if radius is not None:
-        weights = np.where(np.abs(np.rint(x) - m) <= radius, weights, 0)
-    return weights @ np.asarray(samples)
+        weights = np.where(np.abs(np.rint(x) - orders) <= radius, weights, 0)
+    return weights @ texels
 
 
 def tile_transform(heights: ArrayLike, kappa: float, x: ArrayLike) -> NDArray[np.complex128]:
@@ -102,8 +90,10 @@ def plot_interpolation() -> Figure:
         return np.cos(2 * np.pi * np.outer(t, frequency) + phase) @ amplitude
 
     t, samples = np.linspace(42, 58, 801), np.arange(100.0)
-    kernels: dict[str, Kernel] = {"sinc": np.sinc, "linear": linear}
-    values = {name: interpolated(signal(samples), 0, t, kernel) for name, kernel in kernels.items()}
+    values = {
+        "sinc": np.sinc(t[:, None] - samples) @ signal(samples),
+        "linear": np.interp(t, samples, signal(samples)),
+    }
     _draw(
         panels[0], t, signal(t), {name: (found, _rms(found - signal(t), signal(t))) for name, found in values.items()}
     )
@@ -119,9 +109,9 @@ def plot_interpolation() -> Figure:
         orders, x = np.arange(-(count // 2), count - count // 2), np.linspace(low, high, 701)
         texels, exact = tile_transform(heights, kappa, orders), tile_transform(heights, kappa, x)
         found = {
-            "sinc, 3 texels": interpolated(texels, orders[0], x, tile_kernel(count), radius=1),
-            "linear": interpolated(texels, orders[0], x, linear),
-            "sinc, all texels": interpolated(texels, orders[0], x, tile_kernel(count)),
+            "sinc, 3 texels": interpolated(texels, orders, x, radius=1),
+            "linear": np.interp(x, orders, texels),
+            "sinc, all texels": interpolated(texels, orders, x),
         }
         _draw(
             panel, x, np.abs(exact), {key: (np.abs(value), _rms(value - exact, exact)) for key, value in found.items()}
@@ -205,5 +195,4 @@ def plot_fourier_images(terms: int = FLSS.published_terms) -> Figure:
 def save_fourier(folder: str | os.PathLike[str]) -> None:
     """Write `FILES` into a folder, which exists."""
     for name, drawn in zip(FILES, (plot_interpolation(), plot_fourier_images()), strict=True):
-        with whole_file(Path(folder) / name) as temporary:
-            temporary.write_bytes(png(drawn, pnginfo=png_text()))
+        save_png(drawn, Path(folder) / name)

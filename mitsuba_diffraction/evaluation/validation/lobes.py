@@ -93,12 +93,12 @@ def lobe_powers(bsdf: mi.BSDF, spectrum: GratingSpectrum, wi: Array, q: ArrayLik
     return brdf(bsdf, wi, towards(wi, points, wavelength), wavelength) @ area * wavelength**2
 
 
-def orders_above(spectrum: GratingSpectrum, wi: Array, wavelength: float, max_angle: float = 80.0) -> Array:
-    """Return the orders m (n, 2) of a tile at up to `max_angle` degrees from the normal."""
+def orders_above(spectrum: GratingSpectrum, wi: Array, wavelength: float) -> Array:
+    """Return the orders m (n, 2) of a tile at up to 80° from the normal."""
     m_x, m_y = np.meshgrid(*spectrum.grid.axes())
     m = np.stack([m_x.ravel(), m_y.ravel()], axis=-1)
     cosines = -wavelength * m / spectrum.grid.tile_size - wi[:2]
-    return m[np.hypot(*cosines.T) < np.sin(np.deg2rad(max_angle))]
+    return m[np.hypot(*cosines.T) < np.sin(np.deg2rad(80))]
 
 
 def order_powers(

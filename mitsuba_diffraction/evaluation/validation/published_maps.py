@@ -10,9 +10,11 @@ its height of 0.8187 µm, for which the 37 terms from the lowest point of the pu
 from __future__ import annotations
 
 import functools
+import os
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, NamedTuple
 
 import mitsuba as mi
 import numpy as np
@@ -20,9 +22,9 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 from scipy.optimize import minimize_scalar
 
-from ...cli.examples import source
-from ...errors import RequestError
-from ...grating_spectrum import GratingSpectrum
+from ...files import whole_file
+from ...outputs import METADATA
+from ...progress import Progress, silent
 from ...recipe import Recipe
 from ...settings import Settings
 from ...surface.heightfield import HeightField
@@ -30,8 +32,14 @@ from ...testing import array, vectors
 from ..realtime_shader.evaluate import shader_for
 from ..realtime_shader.quirks import Quirks
 from ..realtime_shader.tristimulus import WAVELENGTH_STEP, d65_weights, rgb_matrix
+from ..report import markdown, save_markdown
+from .figures import figure
+from .published_surfaces import MEASURED, scan
 from .record import Check, Record
 from .viewing_angle import MODEL, relative_reflectance, wavelengths
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
 
@@ -45,6 +53,7 @@ ENCODINGS = ("sRGB", "gamma 2.5")
 _MIRROR = 0.1  # sin θ_o; the pictures are saturated nearer to the mirror direction
 _LIGHT = (0.0, 0.0, 1.0)
 _COHERENCE_LENGTH = 65.0
+_SETTINGS = Settings(coherence_length=_COHERENCE_LENGTH, wavelengths=(380, 780), tolerance=0.01)
 _TERMS = {PUBLISHED: 50, TRUNCATED: 37}
 """Of the series; the error of 50 about the centre is 1e-7 for 0.9 µm at 380 nm. Corrected, as many as needed."""
 # Relative radiance and the pictures' conversion of colours, so that maps differ by the light alone. Unlike the shader,
@@ -63,69 +72,41 @@ class PublishedMap:
     Attributes:
         name: for titles.
         picture: file in `precompute/measured/published`.
-        surface: of the recipe; the heights of a scan are relative to `precompute/measured`.
+        recipe: of the heights, as the tile that the thesis takes them for, and of a spectrum of it.
         covered: (first row, end, first column, end) of rectangles where the picture shows something else.
     """
 
     name: str
     picture: str
-    surface: dict[str, Any]
+    recipe: Recipe
     covered: tuple[tuple[int, int, int, int], ...] = ()
 
     def path(self) -> Path:
-        """Return the path of the picture.
-
-        Raises:
-            RuntimeError: if the package was installed without its examples.
-        """
-        return _measured() / "published" / self.picture
+        """Return the path of the picture."""
+        return MEASURED / "published" / self.picture
 
     @property
     def height(self) -> float:
         """Of a scan, µm from black to white, which it need not contain."""
-        return float(self.surface["height_range"])
-
-    @functools.cached_property
-    def recipe(self) -> Recipe:
-        """Heights, as the tile that the thesis takes them for, and the parameters of a spectrum of it."""
-        settings = Settings(coherence_length=_COHERENCE_LENGTH, wavelengths=(380, 780), tolerance=0.01)
-        return Recipe(self.surface, settings, _measured())
-
-    @functools.cached_property
-    def height_field(self) -> HeightField:
-        """The heights."""
-        return self.recipe.height_field()
-
-    @functools.cached_property
-    def spectrum(self) -> GratingSpectrum:
-        """S(q; κ), from the cache of recipes or built."""
-        return self.recipe.cached()
-
-
-def _measured() -> Path:
-    return source() / "precompute" / "measured"
-
-
-def _scan(name: str, height_range: float) -> dict[str, Any]:
-    return {"scan": f"{name}_afm_65um.png", "pixel_size": 65 / 1332, "height_range": height_range}
+        return float(self.recipe.surface["height_range"])
 
 
 PUBLISHED_MAPS = {
     "blaze": PublishedMap(
         "Blaze",
         "flss_blazed.png",
-        {"profile": "blazed", "period": 2.5, "depth": 0.2462},
+        Recipe({"profile": "blazed", "period": 2.5, "depth": 0.2462}, _SETTINGS),
         # An enlarged part, and the red frame around that part.
         (
             (450, 750, 480, 780),
             *((350, 353, 250, 350), (447, 450, 250, 350), (350, 450, 250, 253), (350, 450, 347, 350)),
         ),
     ),
-    "elaphe": PublishedMap("Elaphe", "flss_elaphe.png", _scan("elaphe", 0.4347)),
-    "xenopeltis": PublishedMap("Xenopeltis", "flss_xeno.png", _scan("xenopeltis", 0.8187)),
+    "elaphe": PublishedMap("Elaphe", "flss_elaphe.png", scan("elaphe", 0.4347, _SETTINGS)),
+    "xenopeltis": PublishedMap("Xenopeltis", "flss_xeno.png", scan("xenopeltis", 0.8187, _SETTINGS)),
 }
 """Name → published map."""
-_MIN_CORRELATION = {"blaze": 0.98, "elaphe": 0.98, "xenopeltis": 0.98}
+_MIN_CORRELATION = 0.98
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,13 +136,7 @@ class Grid:
 
 
 def grid(published: PublishedMap, step: int = 1) -> Grid:
-    """Read a published map at every `step`-th pixel.
-
-    Raises:
-        ValueError: if the step does not divide the side of the picture.
-    """
-    if step < 1 or SIDE % step:
-        raise RequestError(f"step: got {step!r}, wanted a divisor of {SIDE}")
+    """Read a published map at every `step`-th pixel; the step divides the side of the picture."""
     with Image.open(published.path()) as file:
         picture = np.asarray(file.convert("RGB")) / 255
     chosen = np.arange(step // 2, SIDE, step)
@@ -190,18 +165,13 @@ def linear_rgb(published: PublishedMap, method: str, wo: ArrayLike) -> Array:
 
     Returns:
         Linear RGB, (n, 3).
-
-    Raises:
-        ValueError: if the method is unknown, or Mitsuba has no vectorised spectral variant set.
     """
-    if method != MODEL and method not in _QUIRKS:
-        raise RequestError(f"method: got {method!r}, wanted one of {', '.join((*_QUIRKS, MODEL))}")
     if method == MODEL:
-        xyz = relative_reflectance(published.spectrum, _LIGHT, wo, wavelengths()) @ (
+        xyz = relative_reflectance(published.recipe.cached(), _LIGHT, wo, wavelengths()) @ (
             WAVELENGTH_STEP * d65_weights()[:: int(WAVELENGTH_STEP)]
         )
         return xyz @ rgb_matrix(cie_rgb_matrix=True, d65_twice=False).T
-    return shader_rgb(published.height_field, method, wo, [1.0])[0]
+    return shader_rgb(published.recipe.height_field(), method, wo, [1.0])[0]
 
 
 def shader_rgb(height_field: HeightField, method: str, wo: ArrayLike, height_scales: ArrayLike) -> Array:
@@ -218,28 +188,23 @@ def shader_rgb(height_field: HeightField, method: str, wo: ArrayLike, height_sca
     return np.stack(scaled).astype(np.float64)
 
 
-@dataclass(frozen=True)
-class Agreement:
-    """Agreement of a map with the author's.
-
-    Attributes:
-        correlation: of the encoded colours, over pixels and channels.
-        brightness: the factor of linear RGB with which the mean square of the difference is smallest.
-    """
+class Agreement(NamedTuple):
+    """Agreement of a map with the author's."""
 
     correlation: float
+    """Of the encoded colours, over pixels and channels."""
     brightness: float
+    """The factor of linear RGB with which the mean square of the difference is smallest."""
 
 
 def encoded(linear: Array, brightness: float = 1.0, encoding: str = "sRGB") -> Array:
     """Return linear RGB times the brightness, clipped and encoded by one of `ENCODINGS`, from 0 to 1."""
-    if encoding not in ENCODINGS:
-        raise RequestError(f"encoding: got {encoding!r}, wanted one of {', '.join(ENCODINGS)}")
+    import colour
+
     clipped = np.clip(linear * brightness, 0, 1)
     if encoding == "gamma 2.5":
         return clipped ** (1 / 2.5)
-    # IEC 61966-2-1
-    return np.where(clipped <= 0.0031308, 12.92 * clipped, 1.055 * clipped ** (1 / 2.4) - 0.055)
+    return colour.cctf_encoding(clipped, function="sRGB")
 
 
 def agreement(pixels: Grid, linear: Array, encoding: str = "sRGB") -> Agreement:
@@ -263,29 +228,141 @@ def agreement(pixels: Grid, linear: Array, encoding: str = "sRGB") -> Agreement:
     return Agreement(float(correlation), brightness)
 
 
-def correlation_against_height(published: PublishedMap, method: str, heights: ArrayLike, step: int = 16) -> Array:
-    """Correlate FLSS with the author's map for each height range of the surface.
+def correlation_against_height(published: PublishedMap, method: str, heights: ArrayLike) -> Array:
+    """Correlate FLSS with every 16th pixel of the author's map for each height range of the surface.
 
     Args:
         published: the map.
         method: `PUBLISHED` or `TRUNCATED`.
         heights: (n,) height ranges in µm.
-        step: between pixels.
 
     Returns:
         (n,).
     """
-    pixels = grid(published, step)
+    pixels = grid(published, 16)
     scales = np.asarray(heights, np.float64) / published.height
-    maps = shader_rgb(published.height_field, method, pixels.wo, scales)
+    maps = shader_rgb(published.recipe.height_field(), method, pixels.wo, scales)
     return np.array([agreement(pixels, linear).correlation for linear in maps])
 
 
-def published_map(name: str, step: int = 8) -> Record:
+def published_map(name: str) -> Record:
     """Correlate FLSS as published with the author's map."""
-    pixels = grid(PUBLISHED_MAPS[name], step)
+    pixels = grid(PUBLISHED_MAPS[name], 8)
     found = agreement(pixels, linear_rgb(PUBLISHED_MAPS[name], PUBLISHED, pixels.wo))
-    return Record(found.correlation, 1.0, 1 - _MIN_CORRELATION[name], note=f"correlation at every {step}th pixel")
+    return Record(found.correlation, 1.0, 1 - _MIN_CORRELATION, note="correlation at every 8th pixel")
+
+
+# ---------------------------------------------------------------- figures and the table
+
+FILES = ("published_maps.png", "published_maps.md", "published_heights.png")
+COLUMNS = ("map", "method", *(f"correlation, {encoding}" for encoding in ENCODINGS))
+_TITLES = {PUBLISHED: "FLSS as published", CORRECTED: "FLSS corrected", MODEL: "this model"}
+_SERIES = {PUBLISHED: "series converged", TRUNCATED: "37 terms from the lowest point"}
+_HEIGHTS = np.arange(0.30, 0.92, 0.05)  # µm
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """A published map and those of this project.
+
+    Attributes:
+        name: of the surface.
+        pixels: of the author's map.
+        maps: method → (n, 3) linear RGB.
+    """
+
+    name: str
+    pixels: Grid
+    maps: Mapping[str, Array]
+
+
+def row(name: str, step: int = 2, methods: Iterable[str] = METHODS) -> Row:
+    """Evaluate the maps of one of `PUBLISHED_MAPS` at every `step`-th pixel."""
+    published = PUBLISHED_MAPS[name]
+    pixels = grid(published, step)
+    return Row(published.name, pixels, {method: linear_rgb(published, method, pixels.wo) for method in methods})
+
+
+def plot_maps(rows: Iterable[Row]) -> Figure:
+    """Plot the author's maps on the left and those of this project beside them, each titled with its correlation."""
+    rows = list(rows)
+    drawn = figure(3.1 * (1 + len(rows[0].maps)), 3.3 * len(rows))
+    axes = drawn.subplots(len(rows), 1 + len(rows[0].maps), squeeze=False)
+    for one, panels in zip(rows, axes, strict=True):
+        pictures = {f"{one.name}, published": one.pixels.colours}
+        for method, linear in one.maps.items():
+            found = agreement(one.pixels, linear)
+            pictures[f"{_TITLES[method]}: {found.correlation:.3f}"] = encoded(linear, found.brightness)
+        for (title, colours), panel in zip(pictures.items(), panels, strict=True):
+            panel.imshow(one.pixels.picture(colours), interpolation="nearest")
+            panel.set_title(title, fontsize=11)
+            panel.set_axis_off()
+    return drawn
+
+
+def table(rows: Iterable[Row]) -> list[list[str]]:
+    """Return the correlations as rows of `COLUMNS`."""
+    return [
+        [one.name, _TITLES[method], *(f"{agreement(one.pixels, linear, kind).correlation:.3f}" for kind in ENCODINGS)]
+        for one in rows
+        for method, linear in one.maps.items()
+    ]
+
+
+def plot_heights(curves: Mapping[str, Mapping[str, Array]]) -> Figure:
+    """Plot correlation against height range, a panel for each surface: name → method → (n,) at the heights."""
+    drawn = figure(4.2 * len(curves), 3.6)
+    axes = drawn.subplots(1, len(curves), sharey=True, squeeze=False)[0]
+    for panel, (name, of_methods) in zip(axes, curves.items(), strict=True):
+        published = PUBLISHED_MAPS[name]
+        for method, values in of_methods.items():
+            panel.plot(_HEIGHTS, values, marker="o", markersize=4, label=_SERIES[method])
+        panel.axvline(published.height, color="0.4", linestyle="--", linewidth=1, label="height in the maps")
+        panel.set_title(published.name, fontsize=11)
+        panel.set_xlabel("height, black to white / µm")
+        panel.set_ylim(0, 1.02)
+        panel.grid(alpha=0.3)
+    axes[0].set_ylabel("correlation with the published map")
+    drawn.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
+    return drawn
+
+
+def save_published(
+    folder: str | os.PathLike[str],
+    *,
+    step: int = 2,
+    progress: Progress = silent,
+) -> list[list[str]]:
+    """Write `FILES` into a folder: the maps, their correlations, and these against the heights of the skins.
+
+    Args:
+        folder: of the files; it exists.
+        step: between pixels of the published pictures.
+        progress: called with (steps done, steps in total).
+
+    Returns:
+        Rows of `COLUMNS`.
+    """
+    folder, skins = Path(folder), ("elaphe", "xenopeltis")
+    total = len(PUBLISHED_MAPS) + len(skins)
+    rows = []
+    for name in PUBLISHED_MAPS:
+        rows.append(row(name, step))
+        progress(len(rows), total)
+    curves: dict[str, dict[str, Array]] = {}
+    for name in skins:
+        curves[name] = {
+            method: correlation_against_height(PUBLISHED_MAPS[name], method, _HEIGHTS)
+            for method in (PUBLISHED, TRUNCATED)
+        }
+        progress(len(rows) + len(curves), total)
+    for name, drawn in (("published_maps.png", plot_maps(rows)), ("published_heights.png", plot_heights(curves))):
+        with whole_file(folder / name) as temporary:
+            # Of all colours: a palette is too coarse for dark maps.
+            drawn.savefig(temporary, format="png", dpi=100, metadata=METADATA)
+    found = table(rows)
+    save_markdown(markdown(COLUMNS, found, texts=2), folder / "published_maps.md")
+    return found
 
 
 CHECKS = tuple(

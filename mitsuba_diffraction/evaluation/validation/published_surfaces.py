@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ...cli.examples import source
-from ...errors import RequestError
 from ...grating_spectrum import GratingSpectrum
 from ...recipe import Recipe
 from ...settings import SUN_COHERENCE_LENGTH, Settings
@@ -44,12 +43,6 @@ class PublishedSurface:
     azimuth: float | None = None
     final: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     angles: tuple[float, float] = (-90.0, 90.0)
-
-    def __post_init__(self) -> None:
-        if self.axis not in (0, 1):
-            raise RequestError(f"axis: got {self.axis!r}, wanted 0 for x or 1 for y")
-        if not self.period > 0:
-            raise RequestError(f"period: got {self.period!r}, wanted a positive number in µm")
 
     @cached_property
     def height_field(self) -> HeightField:
@@ -92,12 +85,22 @@ def _skin(profile: str, depth: float) -> Recipe:
     )
 
 
-def _scan(file: str, height_range: float) -> Recipe:
-    """Return a scan of 65 µm as the author of the thesis used it, dust included (precompute/measured/README.md)."""
-    surface = {"scan": file, "pixel_size": 65 / 1332, "height_range": height_range}
-    # Nearly half of the scan, the largest coherence length that it supports.
-    settings = Settings(extent="sample", coherence_length=32.0, tolerance=0.01)
-    return Recipe(surface, settings, source() / "precompute" / "measured")
+MEASURED = source() / "precompute" / "measured"
+
+# Nearly half of the scan, the largest coherence length that it supports.
+_AS_SAMPLE = Settings(extent="sample", coherence_length=32.0, tolerance=0.01)
+
+
+def scan(name: str, height_range: float, settings: Settings) -> Recipe:
+    """Return a scan of 65 µm as the author of the thesis used it, dust included (precompute/measured/README.md).
+
+    Args:
+        name: "elaphe" or "xenopeltis".
+        height_range: from black to white, µm.
+        settings: of its spectrum.
+    """
+    surface = {"scan": f"{name}_afm_65um.png", "pixel_size": 65 / 1332, "height_range": height_range}
+    return Recipe(surface, settings, MEASURED)
 
 
 SURFACES = {
@@ -114,7 +117,7 @@ SURFACES = {
     "xenopeltis": PublishedSurface("Xenopeltis (synthetic)", _skin("xenopeltis", 0.443), 0, 1.552, (1552.27, 0.45)),
     "elaphe_scan": PublishedSurface(
         "Elaphe (scan)",
-        _scan("elaphe_afm_65um.png", 0.4347),
+        scan("elaphe", 0.4347, _AS_SAMPLE),
         0,
         1.144,
         (1144.28, 0.15),
@@ -124,7 +127,7 @@ SURFACES = {
     ),
     "xenopeltis_scan": PublishedSurface(
         "Xenopeltis (scan)",
-        _scan("xenopeltis_afm_65um.png", 0.4435),
+        scan("xenopeltis", 0.4435, _AS_SAMPLE),
         1,
         1.552,
         (1552.27, 0.45),

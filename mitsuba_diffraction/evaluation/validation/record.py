@@ -46,17 +46,16 @@ class Record:
         cls,
         expected: ArrayLike,
         measured: ArrayLike,
-        bound: ArrayLike | None,
+        bound: ArrayLike,
         note: str = "",
         *,
         relative: bool = False,
     ) -> Record:
         """Return the record of the pair with the maximum error relative to its bound; NaN counts as the maximum."""
-        limits = 1.0 if bound is None else bound
-        expected, measured, limits = (np.ravel(x) for x in np.broadcast_arrays(expected, measured, limits))
-        error = np.abs(measured - expected) / (np.abs(expected) if relative else 1) / limits
+        expected, measured, bound = (np.ravel(x) for x in np.broadcast_arrays(expected, measured, bound))
+        error = np.abs(measured - expected) / (np.abs(expected) if relative else 1) / bound
         index = int(np.argmax(np.where(np.isnan(error), np.inf, error)))
-        return cls(measured[index], expected[index], None if bound is None else limits[index], relative, note)
+        return cls(measured[index], expected[index], bound[index], relative, note)
 
     @property
     def error(self) -> float:

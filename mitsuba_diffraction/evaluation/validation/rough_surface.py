@@ -42,12 +42,12 @@ COHERENCE_LENGTH = 20.0  # µm
 MAX_DEVIATIONS = 3.0  # standard deviations allowed
 
 
-def random_profile(rms: float, correlation: float, seed: int = 0) -> HeightField:
+def random_profile(rms: float, correlation: float) -> HeightField:
     """Draw one row of Gaussian heights, correlated as σ² e^{−τ²/ℓ²}; lengths in µm."""
     count = round(PROFILE_LENGTH / PIXEL)
     q = np.fft.rfftfreq(count, PIXEL)
     amplitude = np.sqrt(rms**2 * correlation * np.sqrt(np.pi) / PIXEL) * np.exp(-((np.pi * q * correlation) ** 2) / 2)
-    noise = np.fft.rfft(np.random.default_rng(seed).standard_normal(count))
+    noise = np.fft.rfft(np.random.default_rng(0).standard_normal(count))
     heights = np.fft.irfft(noise * amplitude, count)
     return HeightField(
         heights[None, :], PIXEL, f"random profile, rms {rms:g} µm, correlation length {correlation:g} µm"

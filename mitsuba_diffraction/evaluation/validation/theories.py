@@ -28,6 +28,7 @@ COLUMNS = {
     "in the\nlobes": "{.lobe_ratio:.2f}",
     "sample\nratio": "{.sample_ratio:.2f}",
 }
+_METAL = "Al"
 _SAMPLE_COUNT = 60  # directions and wavelengths at which the solver is evaluated
 
 
@@ -58,30 +59,28 @@ class TheoryCost:
 
 def compare_theories(
     height_field: HeightField,
-    material: str = "Al",
     *,
     tolerance: float = 1e-2,
     count: int = 1 << 19,
     repetitions: int = 5,
     progress: Progress = silent,
 ) -> list[TheoryCost]:
-    """Compare scalar, then rigorous theory of a surface of one row, under the current variant of Mitsuba.
+    """Compare scalar, then rigorous theory of a surface of one row in aluminium, under the current variant of Mitsuba.
 
     Args:
         height_field: the surface.
-        material: a conductor by Mitsuba's name.
         tolerance: of the rigorous table; minutes of work.
         count: rays at once.
         repetitions: of each timing, interleaved.
         progress: of the table, called with (steps done, steps in total).
     """
     spectra, built = {}, {}
-    for theory, settings in (("scalar", {}), ("rigorous", {"material": material, "tolerance": tolerance})):
+    for theory, settings in (("scalar", {}), ("rigorous", {"material": _METAL, "tolerance": tolerance})):
         start = time.process_time()
         spectra[theory] = precompute(height_field, theory=theory, progress=progress, **settings)
         built[theory] = time.process_time() - start
-    errors = _errors(height_field, material, spectra["rigorous"])
-    taken = _seconds(spectra, material, count, repetitions)
+    errors = _errors(height_field, spectra["rigorous"])
+    taken = _seconds(spectra, count, repetitions)
     return [
         TheoryCost(
             theory,
@@ -95,7 +94,7 @@ def compare_theories(
     ]
 
 
-def _errors(height_field: HeightField, material: str, table: RigorousSpectrum) -> dict[str, list[float]]:
+def _errors(height_field: HeightField, table: RigorousSpectrum) -> dict[str, list[float]]:
     """Return the errors of both theories at the same directions and wavelengths."""
     errors: dict[str, list[float]] = {"scalar": [], "rigorous": []}
     period, powers = height_field.tile_size[0], profile_powers(height_field)
@@ -103,7 +102,7 @@ def _errors(height_field: HeightField, material: str, table: RigorousSpectrum) -
         angle, wavelength = np.arccos(cosine), 0.4 + 0.3 * u
         sine = np.sin(angle)
         omega = -sine * np.cos(2 * np.pi * azimuth), -sine * np.sin(2 * np.pi * azimuth), cosine
-        index = refractive_index(wavelength, material=material)
+        index = refractive_index(wavelength, material=_METAL)
         exact = efficiencies(height_field, omega, wavelength, int_ior=index, tolerance=2e-3)
         scalar = scalar_orders(powers, period, wavelength, np.rad2deg(angle), index, 360 * azimuth)
         errors["scalar"].append(difference(scalar.unpolarised, exact.unpolarised))
@@ -111,10 +110,10 @@ def _errors(height_field: HeightField, material: str, table: RigorousSpectrum) -
     return errors
 
 
-def _seconds(spectra: dict[str, Spectrum], material: str, count: int, repetitions: int) -> dict[tuple[str, str], float]:
-    bsdfs = {"rough": mi.load_dict({"type": "roughconductor", "material": "Al"})}
+def _seconds(spectra: dict[str, Spectrum], count: int, repetitions: int) -> dict[tuple[str, str], float]:
+    bsdfs = {"rough": mi.load_dict({"type": "roughconductor", "material": _METAL})}
     for theory, spectrum in spectra.items():
-        bsdfs[theory] = mi.load_dict({"type": "diffraction_grating", "spectrum": spectrum, "material": material})
+        bsdfs[theory] = mi.load_dict({"type": "diffraction_grating", "spectrum": spectrum, "material": _METAL})
     rays, lobes = Rays(count), Rays(count)
     drawn = bsdfs["rigorous"].sample(mi.BSDFContext(), rays.si, rays.sample1, rays.sample2)[0]
     lobes.si, lobes.wo = rays.si, drawn.wo

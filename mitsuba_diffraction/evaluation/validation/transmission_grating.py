@@ -8,20 +8,17 @@ ratio of the second order to the first needs no factor; it is compared with esti
 from __future__ import annotations
 
 import functools
-import json
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize_scalar
 
 from ...rigorous.efficiencies import efficiencies
-from ...scalar_theory import fresnel, profile_powers
-from ...surface.gratings import blazed
+from ...scalar_theory import fresnel, profile_powers, transmitted_orders
+from ...surface.gratings import blazed, right_angled
 from ...surface.heightfield import HeightField
+from .measured_gratings import STYLES, THEORIES, best_factor, measured, rms_difference, stored_angles
 from .record import Check, Record
-from .ruled_fit import DATA, FITS, right_angled
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -30,15 +27,11 @@ Real = NDArray[np.float64]
 
 PERIOD = 1000 / 300
 GROOVES = ("right-angled", "vertical wall")
-THEORIES = ("scalar", "rigorous")
 MAX_RMS_DIFFERENCE = 0.02
 """Of rigorous theory."""
 
 # λ in µm → second order over first, from spectra of stars.
 RATIOS = {0.45: 0.27, 0.5: 0.10, 0.55: 0.03}
-
-_COLOURS = {"rigorous": "#d95f02", "scalar": "#7570b3"}
-_ORDERS = np.array([1, 2])
 
 
 def b270(wavelength: float) -> float:
@@ -55,80 +48,32 @@ def groove(shape: str, angle: float) -> HeightField:
 
 
 def transmitted(surface: HeightField, wavelength: float, rigorous: bool) -> Real:
-    """Compute η of the blazed orders 1 and 2, unpolarised light at normal incidence through the plane face.
-
-    Scalar theory: K_t (1 − F) η_m(κ), with v = n ω_i + ω_o, κ = 2π v_z/λ and F at the direction of v (docs/theory.md).
-    """
+    """Compute η of the blazed orders 1 and 2, unpolarised light at normal incidence through the plane face."""
     index = b270(wavelength)
-    face = 1 - fresnel(1.0, index)[0]
     if rigorous:
         # Fifteen harmonics more change the efficiencies by less than 1e-3.
         harmonics = int(2 * index * PERIOD / wavelength) + 15
-        found = efficiencies(surface, (0, 0, -1), wavelength, int_ior=index, tolerance=0.02, harmonics=harmonics)
-        powers = (np.abs(found.transmitted_amplitudes) ** 2).sum(axis=(1, 2)) / 2
-        return face * np.array([powers[found.transmitted_orders == -m][0] for m in _ORDERS])
-    sine = _ORDERS * wavelength / PERIOD
-    cosine = np.sqrt(1 - sine**2)
-    v = np.stack([sine, cosine - index])
-    length = np.linalg.norm(v, axis=0)
-    inside, outside = np.abs(v[1]) / length, np.abs(v[0] * sine + v[1] * cosine) / length
-    factor = inside * outside * length**2 / (cosine * v[1] ** 2)
-    transmittance = 1 - np.mean(fresnel(outside, index), axis=0)
-    return face * factor * transmittance * profile_powers(surface)(-_ORDERS, 2 * np.pi * v[1] / wavelength)
-
-
-@functools.cache
-def measured() -> tuple[Real, Real]:
-    """Return wavelengths in µm and η₁, (n,) each."""
-    nanometres, found, _ = np.loadtxt(DATA / "T300.csv", delimiter=",", skiprows=2, unpack=True)
-    return nanometres * 1e-3, found
+        exact = efficiencies(surface, (0, 0, -1), wavelength, int_ior=index, tolerance=0.02, harmonics=harmonics)
+        orders, powers = exact.transmitted_orders, exact.transmitted_unpolarised
+    else:
+        scalar = transmitted_orders(profile_powers(surface), PERIOD, wavelength, 0.0, index, from_below=True)
+        orders, powers = scalar.m, scalar.unpolarised
+    face = 1 - fresnel(1.0, index)[0]
+    return face * np.array([powers[orders == -m][0] for m in (1, 2)])
 
 
 @functools.cache
 def curve(shape: str, angle: float, rigorous: bool, step: int = 1) -> Real:
     """Return η₁ at every `step`th measured wavelength."""
     surface = groove(shape, angle)
-    return np.array([transmitted(surface, wavelength, rigorous)[0] for wavelength in measured()[0][::step]])
-
-
-@dataclass(frozen=True)
-class Fit:
-    """Grooves and a factor, fitted to the measured efficiencies.
-
-    Attributes:
-        angle: of the facets, degrees.
-        factor: by which the efficiencies are scaled.
-        rms: root of the mean square difference.
-    """
-
-    angle: float
-    factor: float
-    rms: float
+    return np.array([transmitted(surface, wavelength, rigorous)[0] for wavelength in measured("T300")[0][::step]])
 
 
 def scaled(found: Real, step: int = 1) -> tuple[float, float]:
     """Return the factor that best fits efficiencies to the measured ones, and the remaining rms difference."""
-    wanted = measured()[1][::step]
-    factor = float(found @ wanted / (found @ found))
-    return factor, float(np.sqrt(((factor * found - wanted) ** 2).mean()))
-
-
-def fit(shape: str, rigorous: bool, step: int = 3) -> Fit:
-    """Fit the groove angle and the factor in the mean square, to every `step`th wavelength."""
-    best = minimize_scalar(
-        lambda angle: scaled(curve(shape, round(float(angle), 3), rigorous, step), step)[1],
-        bounds=(14.0, 22.0),
-        method="bounded",
-        options={"xatol": 0.05},
-    )
-    angle = round(float(best.x), 2)
-    return Fit(angle, *scaled(curve(shape, angle, rigorous, step), step))
-
-
-@functools.cache
-def stored_angles() -> dict[str, dict[str, float]]:
-    """Return shape of the grooves → theory → angle in degrees that `fit` found, by `precompute/ruled_fits.py`."""
-    return json.loads(FITS.read_text(encoding="utf-8"))["groove angles"]
+    wanted = measured("T300")[1][::step]
+    factor = best_factor(found, wanted)
+    return factor, rms_difference(factor * found, wanted)
 
 
 def difference(shape: str, theory: str) -> Record:
@@ -136,7 +81,7 @@ def difference(shape: str, theory: str) -> Record:
     angle = stored_angles()[shape][theory]
     found = curve(shape, angle, theory == "rigorous")
     factor, rms = scaled(found)
-    raw = float(np.sqrt(((found - measured()[1]) ** 2).mean()))
+    raw = rms_difference(found, measured("T300")[1])
     note = f"rms over {len(found)} wavelengths, facets of {angle:.2f}°, all scaled by {factor:.3f}; {raw:.3f} unscaled"
     return Record(rms, 0.0, MAX_RMS_DIFFERENCE if theory == "rigorous" else None, note=note)
 
@@ -159,19 +104,14 @@ def plot() -> Figure:
 
     figure = Figure(figsize=(9.5, 3.8), layout="constrained")
     panels = figure.subplots(1, 2, sharey=True)
-    wavelengths, wanted = measured()
+    wavelengths, wanted = measured("T300")
     for panel, shape in zip(panels, GROOVES, strict=True):
-        for theory, colour in _COLOURS.items():
+        for theory, style in STYLES.items():
             angle = stored_angles()[shape][theory]
             found = curve(shape, angle, theory == "rigorous")
             factor, rms = scaled(found)
-            panel.plot(
-                1e3 * wavelengths,
-                factor * found,
-                color=colour,
-                linestyle="-" if theory == "rigorous" else "--",
-                label=f"{theory} theory, {angle:.1f}°, × {factor:.2f}: rms {rms:.3f}",
-            )
+            label = f"{theory} theory, {angle:.1f}°, × {factor:.2f}: rms {rms:.3f}"
+            panel.plot(1e3 * wavelengths, factor * found, label=label, **style)
         panel.plot(1e3 * wavelengths, wanted, "o", color="black", markersize=3.5, label="measured")
         panel.set_title(f"300 lines/mm in glass, {shape}", fontsize=10)
         panel.legend(frameon=False, fontsize=8, loc="lower left")

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import mitsuba as mi
 import numpy as np
@@ -34,7 +35,7 @@ METHODS = (MODEL, "flss", "nmm", "pq")
 
 INCIDENCE = 75.0
 """θ_i of the thesis, degrees."""
-
+_MIN_RIDGE = 0.3  # height relative to the brightest ridge; its prominence is at least a third of that
 
 _INDEX = 1.5  # of skin; the only one of the published shader
 _R_0 = ((_INDEX - 1) / (_INDEX + 1)) ** 2
@@ -104,13 +105,6 @@ class ReflectanceMap:
     angles: Array
     reflectance: Array
 
-    def __post_init__(self) -> None:
-        shape = (self.wavelengths.size, self.angles.shape[-1])
-        if self.reflectance.shape != shape or self.angles.shape not in (shape, shape[1:]):
-            raise RequestError(
-                f"reflectance, angles: got shapes {self.reflectance.shape} and {self.angles.shape}, wanted {shape}"
-            )
-
     @property
     def order(self) -> Array:
         """n = d (sin θ_i + sin θ_r)/λ with the published d, (n, m)."""
@@ -150,8 +144,6 @@ def reflectance_map(
     Raises:
         ValueError: if an argument is wrong, or Mitsuba has no vectorised spectral variant set.
     """
-    if method not in METHODS:
-        raise RequestError(f"method: got {method!r}, wanted one of {', '.join(METHODS)}")
     if not 0 <= incidence < 90:
         raise RequestError(f"incidence: got {incidence!r}, wanted degrees from the normal, 0 or more, below 90")
     nanometres = np.arange(380.0, 782.5, 5.0) if wavelengths is None else np.asarray(wavelengths, np.float64)
@@ -240,14 +232,8 @@ def grating_equation(period: float, incidence: float, wavelengths: ArrayLike, or
     return np.rad2deg(np.arcsin(np.where(np.abs(sines) < 1, sines, np.nan)))
 
 
-@dataclass(frozen=True)
-class PeriodFit:
-    """The period fitted to the peaks of a map.
-
-    Attributes:
-        mean: over the wavelengths, nm.
-        variance: over the wavelengths, nm².
-    """
+class PeriodFit(NamedTuple):
+    """The period fitted to the peaks of a map: its mean (nm) and variance (nm²) over the wavelengths."""
 
     mean: float
     variance: float
@@ -276,28 +262,18 @@ def fit_period(found: ReflectanceMap, between: tuple[float, float] = (-90.0, 90.
     return PeriodFit(float(periods.mean()), float(periods.var()))
 
 
-@dataclass(frozen=True)
-class Ridge:
-    """A period whose order is bright at all wavelengths.
-
-    Attributes:
-        period: nm.
-        height: mean over the wavelengths of the reflectance there, relative to that of the brightest ridge.
-    """
+class Ridge(NamedTuple):
+    """A period (nm) whose order is bright at all wavelengths; its mean reflectance relative to the brightest ridge."""
 
     period: float
     height: float
 
 
-def ridges(found: ReflectanceMap, least: float = 0.3) -> list[Ridge]:
+def ridges(found: ReflectanceMap) -> list[Ridge]:
     """Return the ridges of a map from the period d/2 to 2d, the brightest first.
 
     A map is resampled over 1/d = (sin θ_i + sin θ_r)/λ, divided by its maximum at each wavelength, and averaged over
     the wavelengths. Not for methods with directions of their own.
-
-    Args:
-        found: the map.
-        least: height of a ridge, and its prominence, relative to the brightest.
     """
     if found.discrete:
         raise RequestError(f"found: got a map of {found.method}, wanted one with all viewing angles")
@@ -311,7 +287,7 @@ def ridges(found: ReflectanceMap, least: float = 0.3) -> list[Ridge]:
     )
     mean = (rows / rows.max(axis=1, keepdims=True)).mean(axis=0)
     mean /= mean.max()
-    (peaks, _) = find_peaks(mean, height=least, prominence=least / 3)
+    (peaks, _) = find_peaks(mean, height=_MIN_RIDGE, prominence=_MIN_RIDGE / 3)
     return [Ridge(float(1 / frequency[i]), float(mean[i])) for i in peaks[np.argsort(mean[peaks])[::-1]]]
 
 
