@@ -19,7 +19,7 @@ from .progress import Progress, silent
 from .rigorous import refractive_index
 from .rigorous.coordinate_transformation import curve_of, is_profile
 from .rigorous.efficiencies import sheet_orders
-from .scalar_theory import profile_powers, scalar_orders, tile_powers, transmitted_orders
+from .scalar_theory import incident_direction, profile_powers, scalar_orders, tile_powers, transmitted_orders
 from .settings import THEORIES, TRANSMISSIONS
 from .surface.heightfield import HeightField
 
@@ -274,12 +274,6 @@ def description(
         transmission
     ]
     return f"{source}; {what}, {theory} theory{transmitted}{plane}"
-
-
-def incident_direction(angle: float, azimuth: float) -> Array:
-    """Return ω_i, (3,), from the angle of incidence and the azimuth of its plane in degrees."""
-    theta, phi = np.deg2rad((angle, azimuth))
-    return np.array([-np.sin(theta) * np.cos(phi), -np.sin(theta) * np.sin(phi), np.cos(theta)])
 
 
 def index_at(wavelength: float, material: str | None, int_ior: complex | None, theory: str = "scalar") -> complex:

@@ -70,6 +70,7 @@ class GratingSpectrum(PowerSpectrum):
         Raises:
             OSError: if the file cannot be written.
         """
+        grid, table = self.grid, self.table
         header: dict[str, Any] = {
             "representation": self.representation,
             "extent": self.extent,
@@ -78,16 +79,21 @@ class GratingSpectrum(PowerSpectrum):
             "largestAngle": doubles(self.largest_angle),
             "tolerance": doubles(self.tolerance),
             "pixelSize": doubles(*self.pixel_size),
-            **_grid_header(self.grid),
+            **(
+                {"tileSize": doubles(*grid.tile_size)}
+                if isinstance(grid, OrderGrid)
+                else {"spacing": doubles(*grid.spacing), "limit": doubles(*grid.limit)}
+            ),
             **{key: doubles(getattr(self, name)) for name, key in _NUMBERS.items()},
             **{key: getattr(self, name) for name, key in _OTHERS.items()},
             **({} if self.standard_error is None else {"standardError": doubles(self.standard_error)}),
-            **_series_header(self),
             "units": "lengths in micrometres, wavelengths in nanometres",
             **({"warning": self.warning} if self.warning else {}),
+            "energy": json.dumps(self.energy_table().as_plain()),
         }
-        header["energy"] = json.dumps(self.energy_table().as_plain())
-        channels = _channels(self.table)
+        if isinstance(table, AmplitudeTable):
+            header |= {"heightScale": doubles(table.height), "heightsFrom": self.settings.heights_from}
+        channels = _channels(table)
         header["channelCount"] = len(channels)
         write(path, FORMAT, FORMAT_VERSION, header, channels, recipe)
 
@@ -115,6 +121,9 @@ class GratingSpectrum(PowerSpectrum):
                 raise RequestError(
                     f"got {len(pixels)} channels ({unknown}), wanted {header['channelCount']} of known names"
                 )
+            series: dict[str, Any] = {}
+            if isinstance(table, AmplitudeTable):
+                series = {"terms": header["channelCount"] // 2, "heights_from": header["heightsFrom"]}
             settings = Settings(
                 header["extent"],
                 _single(header["coherenceLength"]),
@@ -122,7 +131,7 @@ class GratingSpectrum(PowerSpectrum):
                 _single(header["largestAngle"]),
                 header["representation"],
                 _single(header["tolerance"]),
-                **_series_settings(header),
+                **series,
             )
             entries: dict[str, Any] = {name: header[key] for name, key in _OTHERS.items()}
             entries |= {name: _single(header[key]) for name, key in _NUMBERS.items()}
@@ -142,12 +151,6 @@ class GratingSpectrum(PowerSpectrum):
             raise RequestError(f"{path}: a damaged spectrum ({one_line(error)})") from None
 
 
-def _grid_header(grid: OrderGrid | SplineGrid) -> dict[str, np.ndarray]:
-    if isinstance(grid, OrderGrid):
-        return {"tileSize": doubles(*grid.tile_size)}
-    return {"spacing": doubles(*grid.spacing), "limit": doubles(*grid.limit)}
-
-
 def _grid(header: dict, shape: tuple[int, int]) -> OrderGrid | SplineGrid:
     max_order = ((shape[1] - 1) // 2, (shape[0] - 1) // 2)
     if "tileSize" in header:
@@ -156,18 +159,6 @@ def _grid(header: dict, shape: tuple[int, int]) -> OrderGrid | SplineGrid:
 
 
 _FUNCTIONS = {"taylor": "F{{u^{:03d}}}", "chebyshev": "F{{T_{:03d}}}"}
-
-
-def _series_header(spectrum: GratingSpectrum) -> dict[str, Any]:
-    if isinstance(spectrum.table, SliceTable):
-        return {}
-    return {"heightScale": doubles(spectrum.table.height), "heightsFrom": spectrum.settings.heights_from}
-
-
-def _series_settings(header: dict) -> dict[str, Any]:
-    if header["representation"] == SliceTable.representation:
-        return {}
-    return {"terms": header["channelCount"] // 2, "heights_from": header["heightsFrom"]}
 
 
 def _channels(table: SliceTable | AmplitudeTable) -> dict[str, np.ndarray]:

@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import gaussian_filter
 
-from .efficiency import OrderEfficiencies, description, incident_direction, index_at, numbers
+from .efficiency import OrderEfficiencies, description, index_at, numbers
 from .errors import RequestError
 from .geometry import k_g
 from .progress import Progress, silent
-from .scalar_theory import fresnel
+from .scalar_theory import fresnel, incident_direction
 from .spectrum.grids import OrderGrid
 from .spectrum.power_spectrum import PowerSpectrum
 from .surface.periods import Period

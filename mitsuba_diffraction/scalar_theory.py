@@ -57,6 +57,12 @@ def fresnel(cosine: ArrayLike, index: complex) -> tuple[Array, Array]:
     return np.abs(s) ** 2, np.abs(p) ** 2
 
 
+def incident_direction(angle: float, azimuth: float) -> Array:
+    """Return ω_i, (3,), from the angle of incidence and the azimuth of its plane in degrees."""
+    theta, phi = np.deg2rad((angle, azimuth))
+    return np.array([-np.sin(theta) * np.cos(phi), -np.sin(theta) * np.sin(phi), np.cos(theta)])
+
+
 def equivalent_depth(rms_height: float) -> float:
     """Return the peak-to-valley depth of the sinusoid of equal r.m.s. height, 2√2 times that (any unit)."""
     return 2 * np.sqrt(2) * rms_height
@@ -149,8 +155,7 @@ def scalar_orders(
         azimuth: of the plane of incidence, degrees; 0: perpendicular to the grooves, 90: parallel (conical).
     """
     pitch = wavelength / np.atleast_1d(period)
-    azimuth, angle = np.deg2rad((azimuth, angle))
-    tangential_i = -np.sin(angle) * np.array([np.cos(azimuth), np.sin(azimuth)])
+    tangential_i = incident_direction(angle, azimuth)[:2]
     m, tangential_o, factor, cos_half = _mirror_orders(powers, pitch, wavelength, tangential_i)
     albedo = [_mirror_orders(powers, pitch, wavelength, tangential)[2].sum() for tangential in tangential_o]
     reflected = factor / np.maximum(1, np.maximum(factor.sum(), albedo))
@@ -175,8 +180,7 @@ def transmitted_orders(
     light from above, they include the transmittance 1 − F of the flat face.
     """
     n_i, n_o, side = (index, 1.0, -1) if from_below else (1.0, index, 1)
-    azimuth, angle = np.deg2rad((azimuth, angle))
-    tangential_i = -np.sin(angle) * np.array([np.cos(azimuth), np.sin(azimuth)])
+    tangential_i = incident_direction(angle, azimuth)[:2]
     m, steps = _lattice(wavelength / np.atleast_1d(period), n_i + n_o)
     square = n_o**2 - ((tangential_i + steps) ** 2).sum(axis=-1)
     m, tangent, k_oz = m[square > 0], (steps[square > 0] ** 2).sum(axis=-1), np.sqrt(square[square > 0])
