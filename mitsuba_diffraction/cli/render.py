@@ -97,7 +97,8 @@ def render(
     from ..color import neutral_view, ocio_view
 
     # Before Mitsuba, which takes more than a second to start.
-    check_suffix("-o", output, ".exr")
+    if output is not None:
+        check_suffix("-o", output, ".exr")
     if rgb and channels is not None:
         raise RequestError("--rgb writes no wavelengths: wanted --rgb or --channels N")
     shown = neutral_view if view is None else ocio_view(view)
@@ -135,28 +136,38 @@ def render(
     bytes_per_pixel = (2 if half or rgb else 4) * planes
     if until_error is None:  # else nobody knows the time
         request["announce"] = partial(_announce, scene.name, bytes_per_pixel, named)
-    picture = partial(
-        _picture,
-        scene,
-        request=request,
-        resume=resume,
-        stored={"half": half, "rgb": rgb, "channels": channels},
-        denoise=denoise,
-        view=shown,
-    )
-    pictures, factor = _pictures(target, frames), None if exposure is None else 2**exposure
-    for number, (path, motion) in enumerate(zip(pictures, motions, strict=True)):
-        factor = picture(  # all with the exposure of the first
-            path,
-            {**where, "motion": motion},
-            label=scene.name if len(pictures) == 1 else f"{scene.name} {number + 1}/{len(pictures)}",
-            exposure=factor,
-            complete=f"{number} of {len(pictures)} pictures are complete" if number else None,
-        )
+    pictures = _pictures(target, frames)
+    stored = {"half": half, "rgb": rgb, "channels": channels}
+    factor = None if exposure is None else 2**exposure
+    options = {"resume": resume, "stored": stored, "denoise": denoise, "view": shown}
+    _render(scene, pictures, motions, where, request, factor, **options)
     if frames is not None:
         animation = target.with_suffix(".webp")
         save_animation([path.with_suffix(".png") for path in pictures], animation)
         tell(f"{animation}: animated preview, {frames} frames")
+
+
+def _render(
+    scene: Path,
+    pictures: list[Path],
+    motions: list[tuple[float, ...]] | list[None],
+    where: dict[str, Any],
+    request: dict[str, Any],
+    exposure: float | None,
+    **options: Any,
+) -> None:
+    """Render a picture for each motion of the camera, all with the same exposure, by default that of the first."""
+    for number, (path, motion) in enumerate(zip(pictures, motions, strict=True)):
+        exposure = _picture(
+            scene,
+            path,
+            {**where, "motion": motion},
+            request,
+            label=scene.name if len(pictures) == 1 else f"{scene.name} {number + 1}/{len(pictures)}",
+            exposure=exposure,
+            complete=f"{number} of {len(pictures)} pictures are complete" if number else None,
+            **options,
+        )
 
 
 def _announce(label: str, bytes_per_pixel: int, named: int | None, estimate: Estimate) -> None:
@@ -211,8 +222,8 @@ def _picture(
     scene: Path,
     path: Path,
     where: dict[str, Any],
-    *,
     request: dict[str, Any],
+    *,
     resume: bool,
     stored: dict[str, Any],
     denoise: bool,
