@@ -39,7 +39,6 @@ class Gratings:
         if not self.shapes:
             return
         self._choice = mi.DiscreteDistribution([area for _, area in areas])
-        self._area = dr.opaque(mi.Float, sum(area for _, area in areas))
         ids = [dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0] for shape in self.shapes]
         kinds = [2 if _is_grating_only(shape.bsdf()) else 1 for shape in self.shapes]
         self._size = dr.opaque(mi.UInt32, max(ids) + 1)
@@ -70,7 +69,7 @@ class Gratings:
 
     def pdf_direction(self, si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> mi.Float:
         """Return the density of `sample` per unit solid angle, of a point that a ray hits."""
-        return ratio(dr.square(si.t), self._area * dr.abs(dr.dot(si.n, ray.d)))
+        return ratio(dr.square(si.t), self._choice.sum() * dr.abs(dr.dot(si.n, ray.d)))
 
 
 def implements(method: Callable[..., object], *arguments: object) -> bool:
@@ -159,9 +158,9 @@ def define_eye_paths() -> type:
                 # BSDF sampling, or the direction to a point on a grating; the next ray may hit an emitter.
                 guided = to_gratings & (sampler.next_1d(active) < _GRATING_PROBABILITY)
                 ps = self.gratings.sample(ray.time, sampler.next_1d(active), sampler.next_2d(active))
-                distance = dr.norm(ps.p - si.p)
-                direction = (ps.p - si.p) / distance
-                value, pdf = bsdf.eval_pdf(ctx, si_bsdf, si.to_local(direction), guided)
+                to_point = si.spawn_ray_to(ps.p)
+                distance = dr.norm(ps.p - to_point.o)
+                value, pdf = bsdf.eval_pdf(ctx, si_bsdf, si.to_local(to_point.d), guided)
                 unguided = active & (guided ^ True)
                 bs, weight = bsdf.sample(ctx, si_bsdf, sampler.next_1d(active), sampler.next_2d(active), unguided)
                 delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
@@ -169,7 +168,7 @@ def define_eye_paths() -> type:
                 valid |= active & (mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null) ^ True)
                 from_eye_only |= (depth == 1) & (delta | on_grating)
                 has_other_vertex |= on_grating ^ True
-                ray = si.spawn_ray(dr.select(guided, direction, si.to_world(bs.wo)))
+                ray = si.spawn_ray(dr.select(guided, to_point.d, si.to_world(bs.wo)))
                 next_si = scene.ray_intersect(ray, active)
                 ds = mi.DirectionSample3f(scene, next_si, si)
                 pdf_emitter = scene.pdf_emitter_direction(si, ds, active)

@@ -281,11 +281,12 @@ def two_gratings():
     return scene(floor=plate(narrow, 4, 0), wall=ball, sky=SKY)
 
 
-def image_of_a_wall(bsdf, coherence_length=1.5):
+def image_of_a_wall(bsdf, coherence_length=1.5, x=0, tilt=90):
     """A plate that lights a wall, which is seen in the plate alone."""
-    wall = {"type": "rectangle", "to_world": at(0, 1.5, 0).rotate([1, 0, 0], 90).scale(4), "bsdf": bsdf}
-    camera = {"to_world": mi.ScalarTransform4f().look_at([0, -3.5, 2.5], [0, 0, 0.1], [0, 0, 1]), "fov": 6}
-    return scene(camera, plate=plate(blaze(coherence_length, material="Al"), 0.5), wall=wall, sun=SUN)
+    wall = {"type": "rectangle", "to_world": at(x, 1.5, 0).rotate([1, 0, 0], tilt).scale(4), "bsdf": bsdf}
+    camera = {"to_world": mi.ScalarTransform4f().look_at([x, -3.5, 2.5], [x, 0, 0.1], [0, 0, 1]), "fov": 6}
+    lit = {"type": "rectangle", "to_world": at(x, 0, 0.1).scale(0.5), "bsdf": blaze(coherence_length, material="Al")}
+    return scene(camera, plate=lit, wall=wall, sun=SUN)
 
 
 @pytest.mark.parametrize(
@@ -293,6 +294,8 @@ def image_of_a_wall(bsdf, coherence_length=1.5):
     [
         pytest.param(two_gratings, 6, 32, 1.4),
         pytest.param(partial(image_of_a_wall, {"type": "plastic"}), 4, 256, 2, id="plastic wall"),
+        # Mitsuba offsets the origins of rays by 1e-4 of the coordinates.
+        pytest.param(partial(image_of_a_wall, diffuse(0.8), x=100, tilt=60), 4, 256, 1, id="far from the origin"),
         pytest.param(partial(image_of_a_wall, diffuse(0.8), 26.0), 4, 256, 4, id="wall", marks=pytest.mark.slow),
     ],
 )
