@@ -93,6 +93,10 @@ class Settings:
         ):
             if (value := getattr(self, name)) not in known:
                 raise RequestError(f"{name}: got {value!r}, wanted one of {', '.join(known)}")
+        for name in ("coherence_length", "largest_angle", "tolerance", "largest_height_range", "ext_ior"):
+            value = getattr(self, name)
+            if not (is_number(value) or (name == "tolerance" and value is None)):
+                raise RequestError(f"{name}: got {value!r}, wanted a number")
         lobe_width(self.coherence_length)
         try:
             shortest, longest = (float(w) for w in self.wavelengths)
@@ -104,17 +108,22 @@ class Settings:
                 f"{MIN_WAVELENGTH:g} nm"
             )
         object.__setattr__(self, "wavelengths", (shortest, longest))
+        if not 0 < self.largest_angle <= 90:
+            raise RequestError(
+                f"largest_angle: got {self.largest_angle!r}, wanted degrees from the normal, above 0, at most 90"
+            )
         self._check_series()
         minimum = MIN_TOLERANCE if self.theory == "scalar" else MIN_RIGOROUS_TOLERANCE
-        for name, is_valid, wanted in (
-            ("largest_angle", lambda x: 0 < x <= 90, "degrees from the normal, above 0, at most 90"),
-            ("tolerance", lambda x: minimum <= x < 1, f"a fraction of the reflected power from {minimum:g} to 1"),
-            ("largest_height_range", lambda x: x > 0, "a positive number of µm"),
-            ("ext_ior", lambda x: 1 <= x <= 10, "the index of the medium above, from 1 to 10"),
-        ):
-            value = getattr(self, name)
-            if not (is_number(value) and is_valid(value)) and (name, value) != ("tolerance", None):
-                raise RequestError(f"{name}: got {value!r}, wanted {wanted}")
+        if self.tolerance is not None and not minimum <= self.tolerance < 1:
+            raise RequestError(
+                f"tolerance: got {self.tolerance!r}, wanted a fraction of the reflected power from {minimum:g} to 1"
+            )
+        if not self.largest_height_range > 0:
+            raise RequestError(
+                f"largest_height_range: got {self.largest_height_range!r}, wanted a positive number of µm"
+            )
+        if not 1 <= self.ext_ior <= 10:
+            raise RequestError(f"ext_ior: got {self.ext_ior!r}, wanted the index of the medium above, from 1 to 10")
         if not isinstance(self.polarised, bool):
             raise RequestError(f"polarised: got {self.polarised!r}, wanted True or False")
         if self.theory == "rigorous" and (self.extent, self.largest_angle, self.representation) != ("tile", 90, "auto"):
@@ -189,7 +198,7 @@ def lobe_width(coherence_length: float) -> float:
     Raises:
         ValueError: if the coherence length is not 1 nm to 1 m.
     """
-    if not (is_number(coherence_length) and MIN_COHERENCE_LENGTH <= coherence_length <= MAX_COHERENCE_LENGTH):
+    if not MIN_COHERENCE_LENGTH <= coherence_length <= MAX_COHERENCE_LENGTH:
         raise RequestError(
             f"coherence_length: got {coherence_length!r}, wanted a positive number of µm, "
             f"{MIN_COHERENCE_LENGTH:g} to {MAX_COHERENCE_LENGTH:g}"
