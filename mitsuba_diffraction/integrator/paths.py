@@ -218,7 +218,7 @@ def with_surviving_wavelengths(
 
 
 def _is_smooth_reflector(bsdf: mi.BSDF) -> mi.Bool:
-    """Return whether a BSDF scatters into all directions of one side, without transmission, which would change η."""
+    """Return whether a BSDF has a value for all reflected directions, and no transmission, which would change η."""
     transmits = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Transmission | mi.BSDFFlags.Null)
     return mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth) & (transmits ^ True)
 
