@@ -14,7 +14,7 @@ import numpy as np
 
 from ..energy.table import MAX_E, EnergyTable
 from .geometry import cell_of, on_square
-from .tables import NumberTable, larger, limited, opaque, smaller
+from .tables import NumberTable, integer_part, larger, limited, opaque, smaller
 
 
 @dataclass
@@ -88,7 +88,7 @@ class Energy:
         self, at: Coordinates, frequency: mi.Float, transmitted: mi.Bool | bool = False, ratio: mi.Float | float = 1.0
     ) -> mi.Float:
         """Return e of one direction, for transmitted or reflected light; other arguments as of `factor`."""
-        side, slices, weights = mi.UInt32(self.side), mi.UInt32(self.last_slice) + 1, []
+        side, slices, weights = integer_part(self.side), integer_part(self.last_slice) + 1, []
         index, tables = mi.UInt32(0), 4 if self.two_sided else 1
         if self.two_sided:
             index += dr.select(at.below, mi.UInt32(2), 0) + dr.select(transmitted, mi.UInt32(1), 0)
@@ -124,4 +124,4 @@ class Energy:
         cells = dr.select(inner, self.cells, self.first_cells)
         cell, x = cell_of(dr.sqrt(limited(u - square, 0, 1)) * cells, cells)
         start = dr.select(inner, dr.fma(square - 1, self.cells, self.first_cells), 0)
-        return cell + mi.UInt32(start), x
+        return cell + integer_part(start), x

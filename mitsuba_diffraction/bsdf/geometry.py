@@ -23,7 +23,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .. import geometry
-from .tables import larger, limited, smaller
+from .tables import integer_part, larger, limited, smaller
 
 
 # Not frozen: Dr.Jit rebuilds what enters a branch field by field.
@@ -469,5 +469,5 @@ def on_square(omega: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
 def cell_of(x: mi.Float, count: mi.Float | int) -> tuple[mi.UInt32, mi.Float]:
     """Return the grid cell of x, 0 ≤ x ≤ count, and the coordinate in it; outside, the nearest."""
     x = limited(x, 0, count)
-    cell = dr.minimum(mi.UInt32(x), mi.UInt32(count) - 1)
-    return cell, x - mi.Float(cell)
+    cell = dr.minimum(integer_part(x), integer_part(count) - 1)
+    return cell, x - mi.Float(mi.Int32(cell))

@@ -25,7 +25,7 @@ from ..geometry import fresnel
 from ..grating_spectrum import GratingSpectrum
 from .geometry import Incidence, cell_of
 from .inversion import direction_bin, direction_borders, search
-from .tables import NumberTable, PacketTable, larger, opaque
+from .tables import NumberTable, PacketTable, integer_part, larger, opaque
 
 PROBABILITY_UNITS = 2**24  # to the probability one; float32 represents integers exactly up to it
 UNIFORM_FRACTION = 0.05  # of the probability in a bin, divided equally among its orders
@@ -197,7 +197,8 @@ class OrderSampler:
             table = dr.select(incidence.above, mi.UInt32(0), 2) + dr.select(incidence.reflects, mi.UInt32(0), 1)
         if self.edges:
             table += sum(dr.select(incidence.height_scale > edge, mi.UInt32(tables), 0) for edge in self.edges)
-        index = ((table * mi.UInt32(slices) + slice_) * mi.UInt32(side_bins) + row) * mi.UInt32(side_bins) + column
+        side = integer_part(side_bins)
+        index = ((table * integer_part(slices) + slice_) * side + row) * side + column
         start, x, y, size = self.bins(index, active)
         return start, mi.Int32(x) - max_x, mi.Int32(y) - max_y, mi.Int32(size & 0xFFFF), mi.Int32(size >> 16)
 

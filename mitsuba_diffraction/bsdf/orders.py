@@ -21,6 +21,7 @@ from .tables import (
     HalfTable,
     PacketTable,
     SharedExponentTable,
+    integer_part,
     larger,
     opaque,
 )
@@ -161,8 +162,8 @@ class SlicePower(_NodeTable):
         `small` as of `small_kappa`; κ₁ is at most half of the first interval.
         """
         x = kappa * self.per_kappa
-        interval = dr.minimum(mi.UInt32(x), self.intervals - 1)
-        factors = self._factors(2 * (x - mi.Float(interval)) - 1)
+        interval = dr.minimum(integer_part(x), self.intervals - 1)
+        factors = self._factors(2 * (x - mi.Float(mi.Int32(interval))) - 1)
         first, second = (self._factors(2 * n * small[0] * self.per_kappa - 1) for n in (1, 2))
         factors = small_kappa(kappa, small, factors, first, second)
         return interval * self.nodes, factors
@@ -230,8 +231,8 @@ class AmplitudePower(_NodeTable):
         at = dr.detach(x)
         if self.factors is not None:
             coordinate = at * self.per_x
-            step = dr.minimum(mi.UInt32(coordinate), self.steps - 1)
-            coordinate -= mi.Float(step)
+            step = dr.minimum(integer_part(coordinate), self.steps - 1)
+            coordinate -= mi.Float(mi.Int32(step))
 
         def body(
             pair: mi.UInt32, sign: mi.Float, term: mi.Float, before: mi.Float, *sums: mi.Float

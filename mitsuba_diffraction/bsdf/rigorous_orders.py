@@ -17,7 +17,7 @@ from ..rigorous.spectrum import RigorousSpectrum
 from .geometry import Geometry, Incidence, cell_of
 from .inversion import search, truncated_gaussian
 from .order_sampler import PROBABILITY_UNITS, cumulative_units
-from .tables import NumberTable, PacketTable, larger, limited, opaque, smaller
+from .tables import NumberTable, PacketTable, integer_part, larger, limited, opaque, smaller
 
 BINS_PER_UNIT = 8  # of the sampler, along p and r
 TRANSMISSION_BINS_PER_UNIT = 4  # likewise, where light is transmitted
@@ -260,7 +260,7 @@ class RigorousOrders:
         _, x_steps, z_steps = self.axes.steps
         packet = self.table(((position.row * self.axes.steps[0] + i) * x_steps + j) * z_steps + k, position.active)
         # Along Z between the lower and the upper half of each word, then along X and F.
-        along_z = [dr.lerp(mi.Float(word & 0xFFFF), mi.Float(word >> 16), w) for word in packet]
+        along_z = [dr.lerp(mi.Float(mi.Int32(word & 0xFFFF)), mi.Float(mi.Int32(word >> 16)), w) for word in packet]
         found = dr.lerp(dr.lerp(along_z[0], along_z[1], h), dr.lerp(along_z[2], along_z[3], h), f)
         return dr.select(position.active, found * (1 / MAX_STORED), 0)
 
@@ -350,7 +350,7 @@ def _grid_cell(square: mi.Float, a: mi.Float) -> tuple[mi.UInt32, mi.Float, mi.F
     within = (part >= a) & (part < 1 - a)
     middle = whole + dr.select(far, mi.Float(1), dr.select(within, mi.Float(0.5), mi.Float(0)))
     half = dr.select(within, 0.5 - a, a)
-    return mi.UInt32(2 * middle), dr.square(middle - half), dr.square(middle + half)
+    return integer_part(2 * middle), dr.square(middle - half), dr.square(middle + half)
 
 
 def _packets(values: NDArray[np.float32]) -> NDArray[np.uint32]:

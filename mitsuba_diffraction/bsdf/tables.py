@@ -1,4 +1,4 @@
-"""Tables that Dr.Jit gathers from, and minimum and maximum in few instructions.
+"""Tables that Dr.Jit gathers from, and minimum, maximum and integer part in few instructions.
 
 `dr.maximum` and `dr.minimum` follow IEEE 754 for NaN and signed zeros, which takes LLVM several instructions; a
 comparison and a selection take one each. Here a comparison with NaN is false.
@@ -26,6 +26,14 @@ def smaller(a: mi.Float, b: mi.Float) -> mi.Float:
 def limited(x: mi.Float, low: float, high: float) -> mi.Float:
     """Return `x`, clipped to the interval from `low` to `high`."""
     return smaller(larger(x, low), high)
+
+
+def integer_part(x: mi.Float) -> mi.UInt32:
+    """Return the integer part of x, 0 ≤ x < 2³¹.
+
+    A conversion to int32 is one instruction, one to uint32 takes LLVM several without AVX-512.
+    """
+    return mi.UInt32(mi.Int32(x))
 
 
 def opaque(value: float) -> mi.Float:
@@ -159,4 +167,4 @@ class ProbabilityTable:
         """Return the packets at `index`; zero where not `active`."""
         word = dr.gather(mi.UInt32, self.words, index, active)
         exponent = dr.reinterpret_array(mi.Float, (word & 255) << 23)
-        return exponent * mi.Vector4f(*(mi.Float((word >> shift) & 63) for shift in (26, 20, 14, 8)))
+        return exponent * mi.Vector4f(*(mi.Float(mi.Int32((word >> shift) & 63)) for shift in (26, 20, 14, 8)))
