@@ -18,7 +18,7 @@ PERIOD = 2.5
 
 
 def corner_blaze():
-    """Blazed along x and along y: its light goes to −x −y, so that a mirrored or turned pattern is told apart."""
+    """Blazed along x and along y: its light goes to −x −y, so that a mirrored or rotated pattern differs."""
     ramp = md.gratings.blazed(PERIOD, 0.2, samples=48)
     along_x = ramp.heights[0]
     return md.HeightField(along_x[None, :] + along_x[:, None], PERIOD / 48)

@@ -241,9 +241,9 @@ def test_the_command_takes_theory_and_material_of_a_recipe(command):
     code, said, error = command("efficiency", f"{recipe},depth=0", "--wavelength", "600", "--int-ior", "1.5")
     assert (code, error) == (0, "")
     head, row = (line.split() for line in said.splitlines()[-2:])
-    passed = recipe.with_name("transmission_600.toml")
-    _, of_recipe, _ = command("efficiency", str(passed), "--wavelength", "600")
+    transmitting = recipe.with_name("transmission_600.toml")
+    _, of_recipe, _ = command("efficiency", str(transmitting), "--wavelength", "600")
     assert "rigorous theory, transmitted by a sheet" in of_recipe
-    _, inside, _ = command("efficiency", str(passed), "--wavelength", "600", "--transmission", "interface")
+    _, inside, _ = command("efficiency", str(transmitting), "--wavelength", "600", "--transmission", "interface")
     assert "rigorous theory, transmitted orders inside" in inside
     assert row[head.index("0") + 1] == row[-1] == "4.000"  # the unit of the wavelength is a word, too

@@ -1,4 +1,4 @@
-"""The scenes that come with the package render, and their models are what they say."""
+"""The scenes that come with the package render, and their models are as described."""
 
 import os
 import re
@@ -139,21 +139,21 @@ def hit(small_scenes, name, origins, directions):
 # ---------------------------------------------------------------- the hologram
 
 
-def test_stripes_of_the_hologram_send_their_colours_from_the_lamp_to_the_eye():
+def test_stripes_of_the_hologram_diffract_their_colours_from_the_lamp_to_the_eye():
     """By the grating equation; as bright as they should be by J_1²."""
     light, eye = np.array(hologram.LIGHT), np.array(hologram.EYE)
     brightness = np.random.default_rng(0).random((4, 6, 3))
     lateral, heights, turn = (x.ravel() for x in hologram.gratings(brightness, light, eye))
     pixel = hologram.WIDTH / 18
     y, x = np.mgrid[:4, :18]
-    places = np.stack([(x + 0.5) * pixel - 8, (1.5 - y) * 3 * pixel, 0 * x], -1).reshape(-1, 3)
-    to_light, to_eye = (hologram.directions(places, there) for there in (light, eye))
+    points = np.stack([(x + 0.5) * pixel - 8, (1.5 - y) * 3 * pixel, 0 * x], -1).reshape(-1, 3)
+    to_light, to_eye = (hologram.directions(points, there) for there in (light, eye))
     turn, wavelength = np.deg2rad(turn), np.tile(hologram.WAVELENGTHS, 24)
-    sent = (wavelength / (lateral * hologram.PERIOD))[:, None] * np.stack([np.cos(turn), np.sin(turn)], -1)
-    np.testing.assert_allclose(-to_light[:, :2] - sent, to_eye[:, :2], atol=1e-12)
+    diffracted = (wavelength / (lateral * hologram.PERIOD))[:, None] * np.stack([np.cos(turn), np.sin(turn)], -1)
+    np.testing.assert_allclose(-to_light[:, :2] - diffracted, to_eye[:, :2], atol=1e-12)
     kappa = 2 * np.pi * (to_light[:, 2] + to_eye[:, 2]) / wavelength
-    share = j1(kappa * heights * hologram.DEPTH / 2) ** 2
-    np.testing.assert_allclose(share / 0.3386, brightness.ravel(), atol=2e-3)
+    fraction = j1(kappa * heights * hologram.DEPTH / 2) ** 2
+    np.testing.assert_allclose(fraction / 0.3386, brightness.ravel(), atol=2e-3)
 
 
 # ---------------------------------------------------------------- the snake

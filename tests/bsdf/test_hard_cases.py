@@ -158,14 +158,14 @@ def seen(spectrum, wi, wo, wavelengths):
 
 def factor_of_order(wi, wo, tangent, width):
     """Return K G Γ(x_i) Γ(x_o) of an order at λq (n, 4, 2), lobe width λσ_q; zero where it does not propagate."""
-    come = [omega[:, None, 2] ** 2 for omega in (wi, wo)]
-    sent = [1 - ((omega[:, None, :2] + tangent) ** 2).sum(-1) for omega in (wi, wo)]
-    x = [np.minimum(s, c) / (2 * width) for s, c in zip(sent, come, strict=True)]
-    c_i, c_o = (np.sqrt(np.maximum(c + s, 1e-12) / 2) for c, s in zip(come, sent[::-1], strict=True))
+    squares = [omega[:, None, 2] ** 2 for omega in (wi, wo)]
+    of_order = [1 - ((omega[:, None, :2] + tangent) ** 2).sum(-1) for omega in (wi, wo)]
+    x = [np.minimum(s, c) / (2 * width) for s, c in zip(of_order, squares, strict=True)]
+    c_i, c_o = (np.sqrt(np.maximum(c + s, 1e-12) / 2) for c, s in zip(squares, of_order[::-1], strict=True))
     w = c_i + c_o
     d = ((tangent**2).sum(-1) + w**2) / 2
     k_g = d**2 / (c_i * c_o * w**2) * np.minimum(1, 2 * w * np.minimum(c_i, c_o) / d)
-    return np.where(np.minimum(*sent) > 0, k_g * horizon_gain(x[0]) * horizon_gain(x[1]), 0)
+    return np.where(np.minimum(*of_order) > 0, k_g * horizon_gain(x[0]) * horizon_gain(x[1]), 0)
 
 
 def expected(field, power_spectrum, wi, wo, wavelengths, sigma, line):
@@ -232,7 +232,7 @@ def test_hard_surfaces_are_rendered_right(name):
     line = isinstance(spectrum.grid, OrderGrid) and 1 in field.heights.shape
     assert np.isfinite(got).all()
     assert (exact > 1e-3 * exact.max()).sum() >= 30
-    # What the table says, to the digits of single precision in q; and the truth, to the tolerance of a whole lobe.
+    # The table, to single precision in q; and the exact S, to the tolerance of a whole lobe.
     sigma = spectrum.lobe_width
     peak = 1 / (2 * np.pi * sigma**2)
     digits = 1e-4 + 2e-6 / sigma

@@ -112,5 +112,5 @@ def test_the_reverse_direction_has_the_transposed_matrix(polarised, parameters):
     # No light leaves more than wholly polarised, whatever the light that comes.
     stokes = np.random.default_rng(6).normal(size=(3, 50))
     stokes = np.concatenate([np.ones((1, 50)), stokes / np.linalg.norm(stokes, axis=0)])
-    sent = np.einsum("ij...,jk->i...k", there, stokes)
-    assert (np.linalg.norm(sent[1:], axis=0) <= sent[0] + 1e-5 * there[0, 0].max()).all()
+    diffracted = np.einsum("ij...,jk->i...k", there, stokes)
+    assert (np.linalg.norm(diffracted[1:], axis=0) <= diffracted[0] + 1e-5 * there[0, 0].max()).all()

@@ -68,8 +68,8 @@ def expected(spectrum, wi, wo, wavelength):
         lobe = np.exp(-square / (2 * sigma**2)) / (2 * np.pi * sigma**2 * -np.expm1(-(spectrum.cutoff_sigmas**2) / 2))
         lobe = np.where(square <= (spectrum.cutoff_sigmas * sigma) ** 2, lobe, 0)
         shift = [wavelength * m / axes.period, 0]
-        sent = [1 - ((omega[:, :2] + shift) ** 2).sum(1) for omega in (wi, wo)]
-        for s, omega in zip(sent, (wi, wo), strict=True):
+        of_order = [1 - ((omega[:, :2] + shift) ** 2).sum(1) for omega in (wi, wo)]
+        for s, omega in zip(of_order, (wi, wo), strict=True):
             lobe *= np.where(s > 0, horizon_gain(np.minimum(s, omega[:, 2] ** 2) / (2 * wavelength * sigma)), 0)
         f += np.maximum(spectrum.evaluate(m, c, g, wavelength), 0) * lobe
     return f / wavelength**2

@@ -368,7 +368,7 @@ def test_orders_are_drawn_with_their_probabilities(llvm, name, theta, phi):
 
 @pytest.mark.parametrize("theta", [0, 40])
 def test_no_wavelength_is_sampled_outside_of_its_lobe(llvm, theta):
-    # Regression: lobes were drawn whole and evaluated truncated. What a short wavelength drew beyond its lobe of the
+    # Regression: lobes were drawn whole and evaluated truncated. What a short wavelength drew outside its lobe of the
     # mirror order counted for longer ones: 800 nm reflected 5.8 % too much.
     spectrum = md.precompute(md.gratings.sinusoidal(2.5, 0.02), coherence_length=16.0, tolerance=0.1)
     assert OrderSpectrum(spectrum).q_sampler is None

@@ -28,7 +28,7 @@ from bsdf_support import (
 import mitsuba_diffraction as md
 
 WI = direction(30, 20)
-PASSES = {"int_ior": 1.5, "transmission": "interface"}
+TRANSMITS = {"int_ior": 1.5, "transmission": "interface"}
 
 
 def corner():
@@ -70,7 +70,7 @@ SQUARE = [(m, n) for m in range(-4, 5) for n in range(-4, 5)]
         (SURFACES["blazed"], LINE, {}),
         (corner, SQUARE, {}),
         (SURFACES["blazed"], LINE, {"coat_ior": 1.5}),
-        (SURFACES["blazed"], LINE, PASSES),
+        (SURFACES["blazed"], LINE, TRANSMITS),
         (SURFACES["blazed"], LINE, {"int_ior": 1.5, "transmission": "sheet"}),
     ],
     ids=["line", "crossed", "coat", "interface", "sheet"],
@@ -94,7 +94,7 @@ def test_constant_scales_equal_a_grating_built_with_them(llvm, surface, orders, 
 @pytest.mark.few(2)
 @pytest.mark.parametrize("lateral", [1.4, 0.6])
 @pytest.mark.parametrize(
-    ("surface", "parameters"), [(SURFACES["blazed"], {}), (corner, {}), (SURFACES["blazed"], PASSES)]
+    ("surface", "parameters"), [(SURFACES["blazed"], {}), (corner, {}), (SURFACES["blazed"], TRANSMITS)]
 )
 def test_samples_of_scaled_gratings_are_unbiased(llvm, surface, parameters, lateral):
     bsdf = plugin(
@@ -153,7 +153,9 @@ def difference(function, at, step):
     return (8 * (f[2] - f[1]) - (f[3] - f[0])) / (12 * step)
 
 
-@pytest.mark.parametrize("parameters", [{}, pytest.param(PASSES, marks=pytest.mark.slow)], ids=["mirror", "interface"])
+@pytest.mark.parametrize(
+    "parameters", [{}, pytest.param(TRANSMITS, marks=pytest.mark.slow)], ids=["mirror", "interface"]
+)
 @pytest.mark.parametrize(("name", "step"), [("height_scale", 0.01), ("lateral_scale", 1e-3)])
 def test_derivatives_by_texels_are_those_of_differences(llvm, name, step, parameters):
     start = np.random.default_rng(3).uniform(0.85, 0.95, (2, 3, 1)).astype(np.float32)
@@ -302,7 +304,7 @@ def test_e_of_few_scales_is_that_of_separate_gratings(llvm, name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("parameters", [{"material": "none"}, PASSES], ids=["reflected", "passing"])
+@pytest.mark.parametrize("parameters", [{"material": "none"}, TRANSMITS], ids=["reflected", "transmitted"])
 def test_e_of_very_different_heights_is_that_of_each(llvm, parameters):
     """For deep and shallow reliefs, from both sides of an interface."""
     index, heights, count = parameters.get("int_ior", 1.0), (0.1, 1.0), 200

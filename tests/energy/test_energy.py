@@ -63,7 +63,7 @@ def random_surface(seed):
 
 
 def random_directions(rng, count, max_angle=89.9):
-    """Directions, half of them beyond 70°, and λ in nm."""
+    """Directions, half of them at more than 70°, and λ in nm."""
     theta = np.deg2rad(rng.uniform(np.where(rng.random(count) < 0.5, 0, min(70, max_angle)), max_angle))
     phi = rng.uniform(0, 2 * np.pi, count)
     omega = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1)

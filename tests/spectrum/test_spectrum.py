@@ -332,7 +332,7 @@ def test_the_spectrum_is_zero_far_from_the_orders(blaze):
 @pytest.mark.few(3)
 @pytest.mark.parametrize("coherence_length", [0.3, 1.0, 2.0, 5.0, 9.0])
 def test_lobes_wider_than_the_grid_of_orders_keep_all_orders(coherence_length):
-    # Regression: where lobes reached beyond the last order, the count of neighbours began outside of the grid and
+    # Regression: where lobes extended past the last order, the count of neighbours began outside of the grid and
     # missed the orders on the other side; a grating of one row, whose only order along y is zero, gave S = 0.
     field = md.gratings.blazed(period=2.5, depth=0.25, samples=64)
     spectrum = md.precompute(field, coherence_length=coherence_length)

@@ -29,7 +29,7 @@ def efficiencies(heights, kappa):
 @pytest.fixture(scope="module", params=sorted(SKINS))
 def skin(request):
     make, axis, period, depth = SKINS[request.param]
-    # Twenty periods, so that the mean period is exactly the one asked for.
+    # Twenty periods, so that the mean period is exactly the requested one.
     return make(20 * period), axis, period, depth
 
 

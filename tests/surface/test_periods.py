@@ -91,7 +91,7 @@ def test_the_error_of_a_sinusoid_in_noise_is_below_the_stated_uncertainty(noise)
         found = find_periods(HeightField(heights, PIXEL))[0]
         errors.append((found.period - period) / found.period_uncertainty)
         errors.append(turned(found.direction, direction) / found.direction_uncertainty)
-        # A wave in noise cannot be told better than the bound allows, nor is it told much worse than a bin.
+        # The period of a wave in noise is not known better than the bound, nor much less well than a bin.
         assert found.period_uncertainty < period**2 / min(shape[1] * PIXEL[0], shape[0] * PIXEL[1])
     # A quarter, half as long and wide, has four times the standard error of the whole.
     assert len(errors) > 40
@@ -197,7 +197,7 @@ def test_a_grating_on_a_part_of_the_patch_is_found():
 @pytest.mark.few(1)
 @pytest.mark.parametrize(("name", "directions"), [("elaphe", (90, 0)), ("xenopeltis", (0, 90))])
 def test_the_rows_of_a_synthetic_skin_are_a_period(name, directions):
-    # Its fingers wander, and the uncertainty says so.
+    # Its fingers wander, which the uncertainty shows.
     skin = md.gratings.PROFILES[name](size=32.0, depth=0.375, seed=1)
     skin = HeightField(skin.heights[::2, ::2], 2 * skin.pixel_size[0])
     period = {"elaphe": 32 / 28, "xenopeltis": 32 / 21}[name]

@@ -1,4 +1,4 @@
-"""Steps of preparation: what each takes away, what it leaves, and what it says of itself."""
+"""Steps of preparation: what each takes away, what it leaves, and what it reports."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Files to height fields: round trips of every format of the core, and every misuse told in one line."""
+"""Files to height fields: round trips of every format of the core, and one line for every misuse."""
 
 import struct
 import time

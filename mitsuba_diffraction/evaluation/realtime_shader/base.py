@@ -98,7 +98,7 @@ class TextureShader(Shader):
         origin_at_centre: whether x = 0 is the centre of the tile (`taylor_transforms`).
         published_terms: number of Taylor terms of the published shader.
         tapers: whether the heights are tapered (`taper.py`).
-        margin: texels that are read beyond the highest frequency that light reaches.
+        margin: texels read outside the frequencies that light reaches.
         texels_per_term: texels read per Taylor term and wavelength.
     """
 

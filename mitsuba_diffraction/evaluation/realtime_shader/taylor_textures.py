@@ -57,7 +57,7 @@ def taylor_transforms(
         heights_from_zero: measure heights from the lowest point (H is the full range) instead of the centre.
         origin_at_centre: x = 0 at the centre of the tile instead of the first pixel, which affects the phase.
         taper: w, (N_y, N_x); default: one.
-        margin: texels beyond the highest frequency that light reaches.
+        margin: texels outside the frequencies that light reaches.
 
     Returns:
         The texels of the frequencies that light reaches, (n_y, n_x, N), with frequency zero at (n_y // 2, n_x // 2)
