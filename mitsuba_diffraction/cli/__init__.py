@@ -6,14 +6,17 @@ Exit codes: 0 done; 1 the work failed; 2 the request was wrong; 130 interrupted.
 
 from __future__ import annotations
 
+import _thread
 import importlib
 import io
 import logging
 import signal
 import sys
+import threading
 import traceback
 import warnings
 from importlib import metadata
+from types import FrameType
 from typing import Annotated
 
 import typer
@@ -70,15 +73,21 @@ def _commands(
 
 
 class _CtrlC:
-    """Handler of SIGINT that raises KeyboardInterrupt and records it.
+    """Handler of SIGINT that raises KeyboardInterrupt and records it; during an import, after its end.
 
-    The record is needed as Mitsuba converts exceptions raised in a plugin into errors of the scene.
+    The record is needed as Mitsuba converts exceptions raised in a plugin into errors of the scene. While an extension
+    module is being imported, as Mitsuba, an exception is converted or aborts the process.
     """
 
     pressed = False
 
-    def __call__(self, number: int, frame: object) -> None:
+    def __call__(self, number: int, frame: FrameType | None) -> None:
         self.pressed = True
+        while frame is not None:
+            if frame.f_code.co_filename.startswith("<frozen importlib"):
+                threading.Timer(0.05, _thread.interrupt_main).start()
+                return
+            frame = frame.f_back
         raise KeyboardInterrupt
 
 

@@ -1,6 +1,7 @@
 """The commands as a person meets them: one line for a mistake, a file for a success, nothing for an interrupt."""
 
 import contextlib
+import importlib
 import os
 import re
 import signal
@@ -16,6 +17,7 @@ import OpenEXR
 import pytest
 
 import mitsuba_diffraction as md
+from mitsuba_diffraction.cli import _CtrlC
 from mitsuba_diffraction.cli.arguments import scene_parameters
 from mitsuba_diffraction.errors import RequestError
 from mitsuba_diffraction.progress import log_lines
@@ -560,6 +562,25 @@ def test_an_interrupt_swallowed_by_the_loader_ends_the_rendering(command, monkey
     assert code == 130
     assert err.strip() == "mitsuba-diffraction: interrupted: nothing was written"
     assert not Path("scene.exr").exists()
+
+
+def test_an_interrupt_during_an_import_waits_for_its_end(monkeypatch):
+    # Regression: while Mitsuba was imported, which creates enumerations in Python, Ctrl-C aborted the process.
+    Path("interrupted.py").write_text("import signal\nsignal.raise_signal(signal.SIGINT)\ncomplete = True\n")
+    monkeypatch.syspath_prepend(".")
+
+    def work():
+        importlib.import_module("interrupted")
+        for _ in range(1000):
+            time.sleep(0.01)
+
+    before = signal.signal(signal.SIGINT, _CtrlC())
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            work()
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert sys.modules.pop("interrupted").complete
 
 
 @pytest.mark.slow
