@@ -459,7 +459,7 @@ def test_a_mistake_is_one_line_and_exit_code_2(command, llvm, folder, arguments,
     assert names() == before
 
 
-@pytest.mark.few(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError("disk full")])
 def test_a_failed_comparison_leaves_no_files(command, monkeypatch, llvm, folder, error):
     write(Path("scene.xml"))

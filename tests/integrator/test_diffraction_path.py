@@ -295,7 +295,14 @@ def image_of_a_wall(bsdf, coherence_length=1.5, x=0, tilt=90):
         pytest.param(two_gratings, 6, 32, 1.4),
         pytest.param(partial(image_of_a_wall, {"type": "plastic"}), 4, 256, 2, id="plastic wall"),
         # Mitsuba offsets the origins of rays by 1e-4 of the coordinates.
-        pytest.param(partial(image_of_a_wall, diffuse(0.8), x=100, tilt=60), 4, 256, 1, id="far from the origin"),
+        pytest.param(
+            partial(image_of_a_wall, diffuse(0.8), x=100, tilt=60),
+            4,
+            256,
+            1,
+            id="far from the origin",
+            marks=pytest.mark.slow,
+        ),
         pytest.param(partial(image_of_a_wall, diffuse(0.8), 26.0), 4, 256, 4, id="wall", marks=pytest.mark.slow),
     ],
 )

@@ -132,7 +132,7 @@ def test_light_of_bands_is_that_of_the_whole_bit_for_bit(three_bands):
     ("integrator", "light", "hidden"),
     [
         ("diffraction_path", "directional", False),
-        ("path", "constant", True),
+        pytest.param("path", "constant", True, marks=pytest.mark.slow),
         pytest.param("diffraction_path", "constant", False, marks=pytest.mark.slow),
         pytest.param("path", "directional", False, marks=pytest.mark.slow),
     ],

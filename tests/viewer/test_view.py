@@ -34,6 +34,7 @@ def test_a_page_is_written_and_opened_on_request(command, tmp_path, monkeypatch)
     assert (code, error.endswith("--overwrite replaces it\n")) == (2, True)
 
 
+@pytest.mark.slow
 def test_all_kinds_of_surfaces_are_shown(command, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     shutil.copytree(RECIPES / "measured", "measured", ignore=shutil.ignore_patterns("*65um*"))
