@@ -31,7 +31,7 @@ def limited(x: mi.Float, low: float, high: float) -> mi.Float:
 def integer_part(x: mi.Float) -> mi.UInt32:
     """Return the integer part of x, 0 ≤ x < 2³¹.
 
-    A conversion to int32 is one instruction, one to uint32 takes LLVM several without AVX-512.
+    Conversions between float32 and int32 are one instruction, those of uint32 take LLVM several without AVX-512.
     """
     return mi.UInt32(mi.Int32(x))
 

@@ -80,12 +80,16 @@ class _CtrlC:
     """
 
     pressed = False
+    _again: threading.Timer | None = None
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
         self.pressed = True
+        if self._again is not None:  # Ctrl-C was pressed twice
+            self._again.cancel()
         while frame is not None:
             if frame.f_code.co_filename.startswith("<frozen importlib"):
-                threading.Timer(0.05, _thread.interrupt_main).start()
+                self._again = threading.Timer(0.05, _thread.interrupt_main)
+                self._again.start()
                 return
             frame = frame.f_back
         raise KeyboardInterrupt

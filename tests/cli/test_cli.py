@@ -566,7 +566,8 @@ def test_an_interrupt_swallowed_by_the_loader_ends_the_rendering(command, monkey
 
 def test_an_interrupt_during_an_import_waits_for_its_end(monkeypatch):
     # Regression: while Mitsuba was imported, which creates enumerations in Python, Ctrl-C aborted the process.
-    Path("interrupted.py").write_text("import signal\nsignal.raise_signal(signal.SIGINT)\ncomplete = True\n")
+    press = "signal.raise_signal(signal.SIGINT)"
+    Path("interrupted.py").write_text(f"import signal, time\n{press}; time.sleep(0.03); {press}\ncomplete = True\n")
     monkeypatch.syspath_prepend(".")
 
     def work():
@@ -578,6 +579,7 @@ def test_an_interrupt_during_an_import_waits_for_its_end(monkeypatch):
     try:
         with pytest.raises(KeyboardInterrupt):
             work()
+        time.sleep(0.2)  # once, although it was pressed twice
     finally:
         signal.signal(signal.SIGINT, before)
     assert sys.modules.pop("interrupted").complete
