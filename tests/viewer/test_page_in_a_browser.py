@@ -59,7 +59,7 @@ def opened(browser, tmp_path):
         tab.close()
 
 
-def array(tab, function, *arguments):
+def call(tab, function, *arguments):
     """Call a function of the page; numbers travel as JSON, six times faster than as values of Playwright."""
     called = f"async (text) => JSON.stringify(await ({function})(...JSON.parse(text)))"
     return np.array(json.loads(tab.evaluate(called, json.dumps(arguments))))
@@ -105,7 +105,7 @@ def test_values_are_those_of_the_bsdf(source, parameters, changes, opened, llvm)
     pairs = pairs_of(surface.spectrum)
     tab = opened(surface)
     tab.evaluate("(changes) => viewer.set(changes)", {"maxFrames": 1, **changes})
-    values = array(tab, "viewer.evaluate", pairs.ravel().tolist())
+    values = call(tab, "viewer.evaluate", pairs.ravel().tolist())
     base = {}
     if changes:
         pigment = [int(changes["pigment"][i : i + 2], 16) / 255 for i in (1, 3, 5)]
@@ -137,11 +137,11 @@ def test_colours_are_integrals_over_the_wavelength(source, changes, opened):
     tab.evaluate("(changes) => viewer.set(changes)", {**parallel, **changes})
     pairs = pairs_of(surface.spectrum, 200)
     frames = 1024 if surface.spectrum.grid.max_order[0] < 20 else 32
-    found = array(tab, "viewer.evaluateColours", pairs.ravel().tolist(), frames).reshape(-1, 4)
+    found = call(tab, "viewer.evaluateColours", pairs.ravel().tolist(), frames).reshape(-1, 4)
     wavelengths = np.arange(380.0, 740.1, 0.5)
     # Arranged in the browser, as a list of all pairs at all wavelengths takes long to get there.
     of_all = "(p, of) => viewer.evaluate(of.flatMap((w) => p.map((x, k) => (k % 7 === 6 ? w : x))))"
-    values = array(tab, of_all, pairs.ravel().tolist(), wavelengths.tolist()).reshape(len(wavelengths), len(pairs))
+    values = call(tab, of_all, pairs.ravel().tolist(), wavelengths.tolist()).reshape(len(wavelengths), len(pairs))
     table = pages._light().astype(np.float64)
     weights = [np.interp(wavelengths, np.arange(360, 831), table[:, k] * table[:, 3]) for k in range(3)]
     wanted = np.trapezoid(values[..., None] * np.transpose(weights)[:, None], wavelengths, axis=0)
@@ -172,7 +172,7 @@ def test_colours_are_those_of_the_shader_of_2014(source, published, opened, llvm
         wi, wo = testing.vectors(pairs[:, :3]), testing.vectors(pairs[:, 3:6])
         wanted = testing.array(shader.rgb(wi, wo, shader.weights(light=light)), np.float64).T
         tab.evaluate(f"viewer.set({{ right: '{variant}', terms: 25, quirks: {str(vars(quirks)).lower()} }})")
-        found = array(tab, "viewer.evaluateShader", pairs.ravel().tolist()).reshape(-1, 4)[:, :3]
+        found = call(tab, "viewer.evaluateShader", pairs.ravel().tolist()).reshape(-1, 4)[:, :3]
         assert (np.abs(wanted).max(axis=1) > 1e-3 * wanted.max()).mean() > 0.05, variant
         np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-3 * np.abs(wanted).max(), err_msg=variant)
 
