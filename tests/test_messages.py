@@ -24,6 +24,7 @@ BLAZED = '<string name="profile" value="blazed"/><float name="period" value="2.5
         ("", {"light": "moon"}, "lights holds lamp, sun"),
         ("", {}, 'the scene has no integrator, wanted one, such as <integrator type="path"/>'),
         ("", {"lamp": "moon"}, "the scene's parameters are light"),
+        ('<bsdf type="difraction_grating"/>', {}, '"difraction_grating" not found!; did you mean diffraction_grating'),
         (GRATING % '<string name="filename" value="gone.exr"/>', {}, r"gone.exr: no such file; .* holds skin.exr"),
         (
             GRATING % (BLAZED + '<string name="material" value="Alu"/>'),
@@ -71,6 +72,11 @@ def test_messages_name_what_is_available(body, parameters, words, tmp_path, llvm
         (
             "render scenes/rainbow.xml",
             "models/disc_metal.ply: no such file; it is made by: python scenes/disc.py && python scenes/ground.py",
+        ),
+        (
+            "render scenes/lights",
+            "wanted a scene (.xml); this folder holds bulb.xml, desk_lamp.xml, lamp.xml, lamps.xml, "
+            "parallel.xml, strip_along_x.xml, strip_along_y.xml, sun.xml",
         ),
         ("render scenes/foil.xml", "no such file; it is made by: python scenes/foil.py && python scenes/ground.py"),
     ],

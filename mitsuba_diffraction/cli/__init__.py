@@ -46,7 +46,7 @@ class _Command(TyperCommand):
         return super().parse_args(context, arguments)
 
 
-app = typer.Typer(add_completion=False, no_args_is_help=False, help="Diffraction gratings for Mitsuba 3.")
+app = typer.Typer()
 # Imported by name, as no module of the product may depend on `evaluation`.
 _EVALUATION_COMMANDS = ("compare", "convergence", "validate", "benchmark")
 _evaluation = (
@@ -62,14 +62,19 @@ def _print_version(requested: bool) -> None:
         raise typer.Exit
 
 
-@app.callback()
+@app.callback(invoke_without_command=True)
 def _commands(
     context: typer.Context,
     version: Annotated[bool, typer.Option("--version", callback=_print_version, is_eager=True)] = False,
     debug: Annotated[bool, typer.Option("--debug", help="print the traceback of an error")] = False,
 ) -> None:
-    """Diffraction gratings for Mitsuba 3."""
+    """Diffraction gratings for Mitsuba 3.
+
+    A first picture: mitsuba-diffraction examples && mitsuba-diffraction render scenes/xenopeltis.xml
+    """
     context.obj["debug"] = debug
+    if context.invoked_subcommand is None:
+        tell(context.get_help())
 
 
 class _CtrlC:

@@ -280,19 +280,24 @@ def _picture(
         raise Stopped(f"{path} holds {spp} samples per pixel; the same command with --resume continues")
     discard_checkpoints(checkpoint)
     tell(
-        f"{path}: {_summary(image, request['until_error'])}, "
+        f"{path}: {_summary(image, request['until_error'], stored)}, "
         f"{time.perf_counter() - start:.1f} s, {path.stat().st_size / 1e6:.3g} MB\n"
-        f"{preview}: preview, radiance times {exposure:.4g} (--exposure {math.log2(exposure):.2f})"
+        f"{preview}: preview, exposed by {(stops := math.log2(exposure)):+.2f} stops (--exposure {stops:.2f})"
     )
     return exposure
 
 
-def _summary(image: SpectralImage, until_error: float | None) -> str:
-    """Return size, samples and noise of a picture."""
-    rows, columns, channels = image.shape
-    text = f"{columns} × {rows} pixels, {channels} wavelengths, {image.attributes['spp']} samples per pixel"
+def _summary(image: SpectralImage, until_error: float | None, stored: dict[str, Any]) -> str:
+    """Return size, channels as `stored`, samples and noise of a picture."""
+    from ..render.spectral_image import wider_hats
+
+    rows, columns, wavelengths = image.shape
+    if stored["channels"] is not None:
+        wavelengths = wider_hats(wavelengths, stored["channels"]).shape[1]
+    channels = "RGB" if stored["rgb"] else f"{wavelengths} wavelengths"
+    text = f"{columns} × {rows} pixels, {channels}, {image.attributes['spp']} samples per pixel"
     if "error" in image.attributes:
-        text += f", relative error of luminance at most {image.attributes['error']:.2g} in 90 % of the pixels"
+        text += f", noise at most {100 * image.attributes['error']:.2g} % of the luminance in nine of ten pixels"
         if until_error is not None and image.attributes["error"] > until_error:
-            text += f" (above {until_error:g}: increase --spp)"
+            text += f" (above {100 * until_error:g} %: increase --spp)"
     return f"{text}, {image.attributes['variant']}"

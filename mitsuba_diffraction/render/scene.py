@@ -8,6 +8,7 @@ import os
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from difflib import get_close_matches
 from pathlib import Path
 
 import drjit as dr
@@ -40,6 +41,7 @@ _DRAWS_PER_LIGHT = 2**14  # of four wavelengths, to estimate the spectrum of the
 Materials = Mapping[str, Mapping[str, bool | float | str]]
 """Id of a BSDF → parameters of the grating that replaces it."""
 
+_PLUGINS = ("diffraction_grating", "diffraction_path", "diffraction_shader")
 # Of BSDFs; `principled` has `spec_trans`.
 _TRANSMITTING = {"dielectric", "roughdielectric", "thindielectric", "principledthin", "mask", "null"}
 _RAYS_OF_SENSOR = 4096  # to sample the visible surfaces and their lights
@@ -329,9 +331,12 @@ def parsed(
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if parsing or the block fails, with the cause in one line.
+        ValueError: if it is a folder, or parsing or the block fails, with the cause in one line.
     """
     path = Path(path)
+    if path.is_dir():
+        scenes = ", ".join(sorted(file.name for file in path.glob("*.xml"))) or "none"
+        raise RequestError(f"{path}: got a folder, wanted a scene (.xml); this folder holds {scenes}")
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
     resolver = mi.file_resolver()
@@ -553,13 +558,16 @@ def _spectral_film(
 
 
 def _alternatives(scene: Path, error: str) -> str:
-    """Return the alternatives to a missing include or an unknown parameter, as the end of a message."""
+    """Return the alternatives to a missing include, plugin or parameter, as the end of a message."""
     if (missing := re.search(r'included file "(.+?)" not found', error)) is not None:
         folder = scene.resolve().parent / Path(missing[1]).parent
         available = sorted(path.stem for path in folder.glob("*.xml"))
         return f"; {Path(missing[1]).parent} holds {', '.join(available) or 'none'}"
     if (missing := re.search(r"undefined parameter: \$(\w+)", error)) is not None:
         return f"; set it by -D {missing[1]}=…"
+    if (missing := re.search(r'Plugin "(\w+)" not found', error)) is not None:
+        similar = get_close_matches(missing[1], _PLUGINS, n=1)
+        return f"; did you mean {similar[0]}?" if similar else ""
     if "unused parameters" in error:
         text = scene.read_text(encoding="utf-8", errors="replace")
         known = sorted({*re.findall(r"\$(\w+)", text), *re.findall(r'<default\s+name="(\w+)"', text)})

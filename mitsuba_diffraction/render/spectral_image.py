@@ -52,7 +52,7 @@ def split_rows(rows: int, columns: int) -> list[slice]:
     return [slice(first, first + step) for first in range(0, rows, step)]
 
 
-def _wider_hats(count: int, channels: int) -> NDArray[np.float32]:
+def wider_hats(count: int, channels: int) -> NDArray[np.float32]:
     """Return the weights, (count, m), of `count` hats in m ≤ channels hats of unit area and k times the width."""
     k = next(k for k in itertools.count(1) if (count + 1) // k - 1 <= channels)
     centres = np.arange(k - 1, count - k + 1, k)
@@ -145,7 +145,7 @@ class SpectralImage:
         half |= rgb
         kind, limit = (np.float16, float(np.finfo(np.float16).max)) if half else (np.float32, np.inf)
         pixel = Imath.Channel(Imath.PixelType(Imath.PixelType.HALF if half else Imath.PixelType.FLOAT))
-        hats = None if channels is None else _wider_hats(self.wavelengths.size, channels)
+        hats = None if channels is None else wider_hats(self.wavelengths.size, channels)
         wavelengths = self.wavelengths[:0] if rgb else self.wavelengths if hats is None else self.wavelengths @ hats
         numbers = [f"{wavelength:.6f}".replace(".", ",") for wavelength in wavelengths]
         names = ["R", "G", "B", *(f"S0.{number}nm" for number in numbers), *(["A"] if self.alpha is not None else [])]

@@ -58,7 +58,6 @@ def files():
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ("", "command"),
         ("frobnicate", "frobnicate"),
         ("precompute", "Missing argument"),
         ("precompute gone.toml", "gone.toml"),
@@ -422,10 +421,19 @@ def test_debug_shows_where_a_request_is_refused(command):
 
 
 def test_help_exits_with_zero(command):
-    code, out, _ = command("--help")
-    assert code == 0
-    assert "precompute" in out
-    assert "render" in out
+    for line in ("", "--help"):
+        code, out, err = command(line)
+        assert (code, err) == (0, "")
+        assert "mitsuba-diffraction examples && mitsuba-diffraction render" in out
+        assert "precompute" in out
+
+
+def test_shells_complete_commands(command, monkeypatch):
+    monkeypatch.setenv("_MITSUBA_DIFFRACTION_COMPLETE", "complete_bash")
+    monkeypatch.setenv("COMP_WORDS", "mitsuba-diffraction prec")
+    monkeypatch.setenv("COMP_CWORD", "1")
+    code, out, _ = command("")
+    assert (code, out.split()) == (0, ["precompute"])
 
 
 @pytest.mark.parametrize("count", [0, -4])
