@@ -88,8 +88,10 @@ FIGURES = (
             --wavelength 400:700:10 --plot {out}/efficiencies.png""",
     ),
     Figure(("inspect.png",), "mitsuba-diffraction inspect precompute/elaphe.toml -o {out}/inspect.png"),
-    notebook("measured_gratings.png", "05_can_i_trust_the_picture", "cell-15", 3),
-    notebook("measured_transmission.png", "05_can_i_trust_the_picture", "transmission-measured", 3),
+    Figure(
+        ("measured_gratings.png", "measured_transmission.png"),
+        "python docs/measured_figures.py {out}/measured_gratings.png {out}/measured_transmission.png",
+    ),
     notebook("patch_length.png", "02_brdf_and_grating_equation", "cell-16", 6),
     picture_error("blaze", "bulb"),
     picture_error("blaze", "parallel"),
@@ -106,13 +108,12 @@ FIGURES = (
     ),
     notebook("slits.png", "02_brdf_and_grating_equation", "cell-14", 6),
     Figure(("terms.png",), "mitsuba-diffraction benchmark --terms --plot {out}/terms.png", 10),
+    Figure(("fourier_images.png", "interpolation.png"), "python docs/thesis/fourier_figures.py {out}"),
+    Figure(("published_heights.png", "published_maps.png"), "python docs/thesis/published_maps.py {out}", 8),
     Figure(
-        (
-            *("brdf_xenopeltis.png", "fourier_images.png", "interpolation.png", "published_heights.png"),
-            *("published_maps.png", "viewing_angle_elaphe_scan.png", "viewing_angle_xenopeltis_scan.png"),
-        ),
-        "mitsuba-diffraction validate --figures {out}",
-        20,
+        ("brdf_xenopeltis.png", "viewing_angle_elaphe_scan.png", "viewing_angle_xenopeltis_scan.png"),
+        "python docs/thesis/evaluation.py {out} xenopeltis elaphe_scan xenopeltis_scan",
+        10,
     ),
     Figure(("viewer.png",), "python docs/viewer_picture.py {out}/viewer.png", needs="Chromium (docs/live_browser.py)"),
 )

@@ -264,7 +264,8 @@ def test_what_the_page_on_the_thesis_names_exists(command):
     for name in named:
         assert (ROOT / name).is_file() or (PACKAGE / name).is_file(), name
     for name, member in re.findall(r"`([\w/]+\.py)` \(`(\w+)`\)", text):
-        assert re.search(rf"^ *(?:def|class) {member}\b", (PACKAGE / name).read_text(), re.MULTILINE), (name, member)
+        path = PACKAGE / name if (PACKAGE / name).is_file() else ROOT / name
+        assert re.search(rf"^ *(?:def|class) {member}\b", path.read_text(), re.MULTILINE), (name, member)
     for page, anchor in re.findall(r"\]\(([\w./]*)#?([\w-]*)\)", text):
         headings = re.findall(r"^#+ (.*)$", (ROOT / "docs" / (page or "thesis.md")).read_text(), re.MULTILINE)
         assert not anchor or anchor in {slugify(heading.replace("`", ""), "-") for heading in headings}, (page, anchor)

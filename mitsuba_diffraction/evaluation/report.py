@@ -10,7 +10,7 @@ from rich.text import Text
 
 from ..files import whole_file
 from ..outputs import MARK
-from .validation.record import Record
+from .record import Record
 
 RECORD_COLUMNS = ("check", "expected", "found", "difference", "bound", "")
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from rich.console import Console
+from theories import COLUMNS, compare_theories
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction import gratings
@@ -15,7 +16,6 @@ from mitsuba_diffraction.evaluation.benchmark import benchmark
 from mitsuba_diffraction.evaluation.benchmark.accuracy import Exact
 from mitsuba_diffraction.evaluation.benchmark.cases import Case, bundled_cases, scan_case
 from mitsuba_diffraction.evaluation.benchmark.sampling import measure
-from mitsuba_diffraction.evaluation.validation.theories import COLUMNS, compare_theories
 from mitsuba_diffraction.settings import VISIBLE
 from mitsuba_diffraction.spectrum.tables import SliceTable
 

@@ -1,13 +1,13 @@
 """Interpolation and Fourier images against closed forms; their figures."""
 
+import fourier_figures
 import numpy as np
 import pytest
+from fourier_figures import extrema, interpolated, tile_transform
 from PIL import Image
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction.evaluation.realtime_shader.taylor_textures import taylor_transforms
-from mitsuba_diffraction.evaluation.validation import fourier_figures
-from mitsuba_diffraction.evaluation.validation.fourier_figures import extrema, interpolated, tile_transform
 
 
 @pytest.mark.parametrize("count", [40, 41])

@@ -3,6 +3,7 @@
 import importlib
 from pathlib import Path
 
+import measured_figures
 import numpy as np
 import pytest
 
@@ -47,7 +48,7 @@ def test_the_stored_angles_fit_best(theory):
 
 @pytest.mark.slow
 def test_measured_gratings_are_plotted_with_both_theories(llvm):
-    figure = measured_gratings.plot(step=300)
+    figure = measured_figures.plot_ruled(step=300)
     assert len(figure.axes) == 4
     labels = figure.axes[3].get_legend_handles_labels()[1]
     assert labels == [

@@ -3,11 +3,10 @@
 from dataclasses import replace
 
 import numpy as np
+import published_maps
 import pytest
 from PIL import Image
-
-from mitsuba_diffraction.evaluation.validation import published_maps
-from mitsuba_diffraction.evaluation.validation.published_maps import (
+from published_maps import (
     COLUMNS,
     CORRECTED,
     FILES,
@@ -24,7 +23,8 @@ from mitsuba_diffraction.evaluation.validation.published_maps import (
     save_published,
     shader_rgb,
 )
-from mitsuba_diffraction.evaluation.validation.viewing_angle import MODEL
+from viewing_angle import MODEL
+
 from mitsuba_diffraction.surface.heightfield import HeightField
 
 BLAZE, ELAPHE = PUBLISHED_MAPS["blaze"], PUBLISHED_MAPS["elaphe"]
@@ -37,6 +37,7 @@ def halved(height_field):
     return HeightField(means, tuple(2 * size for size in height_field.pixel_size))
 
 
+@pytest.mark.slow
 def test_the_emulated_shader_gives_the_published_map_of_the_blaze(llvm):
     pixels = grid(BLAZE, 8)
     linear = linear_rgb(BLAZE, PUBLISHED, pixels.wo)
@@ -123,6 +124,7 @@ def test_a_picture_of_a_grid_is_the_published_one():
     assert inside.mean() == pytest.approx(np.pi / 4 * 0.95**2, abs=0.02)
 
 
+@pytest.mark.slow
 def test_figures_and_table_are_written(llvm, tmp_path, monkeypatch):
     monkeypatch.setattr(published_maps, "row", lambda name, step: row("blaze", 8, METHODS[:1]))
     monkeypatch.setattr(

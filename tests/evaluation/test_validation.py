@@ -12,9 +12,9 @@ import mitsuba_diffraction as md
 from mitsuba_diffraction import outputs, rigorous, scalar_theory
 from mitsuba_diffraction.evaluation import report
 from mitsuba_diffraction.evaluation.benchmark.accuracy import against_reference
+from mitsuba_diffraction.evaluation.record import Check, Record
 from mitsuba_diffraction.evaluation.validation import analytic, conservation, coupled_waves
 from mitsuba_diffraction.evaluation.validation.checks import checks, scalar_range, surface_checks
-from mitsuba_diffraction.evaluation.validation.record import Check, Record
 
 PRECOMPUTE = Path(__file__).parents[2] / "precompute"
 CHECKS = checks()
@@ -400,11 +400,10 @@ def test_wrong_requests_are_refused(command, tmp_path):
         code, _, error = command("validate", option, str(tmp_path / "nowhere" / "results"))
         assert (code, error.count("\n"), error.count("nowhere is not there")) == (2, 1, 1)
     (tmp_path / "ruled.toml").write_text('[surface]\nprofile = "blazed"\n[spectrum]\ntheory = "rigorous"\n')
-    code, _, error = command("validate", str(tmp_path / "ruled.toml"), "--figures", str(tmp_path / "figures"))
+    code, _, error = command("validate", str(tmp_path / "ruled.toml"))
     assert (code, error.count("\n")) == (2, 1)
     assert "ruled.toml: got theory = 'rigorous', wanted scalar" in error
-    code, _, error = command("validate", "--variant", "scalar_spectral", "--figures", str(tmp_path / "figures"))
-    assert not (tmp_path / "figures").exists()
+    code, _, error = command("validate", "--variant", "scalar_spectral")
     assert (code, error.count("\n")) == (2, 1)
     assert "is scalar; use one of" in error
 
@@ -429,23 +428,6 @@ def test_a_scan_is_validated_with_the_options_that_other_commands_take(command, 
     code, _, error = command("validate", str(tmp_path / "scan.npy"), "--pixel-size", "0.2")
     assert code == 2
     assert "--fill-missing" in error
-
-
-def test_figures_are_drawn(command, tmp_path, monkeypatch):
-    called = []
-    monkeypatch.setattr("mitsuba_diffraction.evaluation.validation.checks.checks", lambda: ())
-    monkeypatch.setattr(
-        "mitsuba_diffraction.evaluation.validation.figures.save_figures", lambda folder, progress: called.append(folder)
-    )
-    monkeypatch.setattr(
-        "mitsuba_diffraction.evaluation.validation.published_maps.save_published",
-        lambda folder, progress: called.append(folder) or [["Elaphe", "FLSS as published", "0.996", "0.986"]],
-    )
-    monkeypatch.setattr("mitsuba_diffraction.evaluation.validation.fourier_figures.save_fourier", called.append)
-    code, said, _ = command("validate", "--figures", str(tmp_path / "figures"))
-    assert code == 0
-    assert "0.986" in said
-    assert called == 3 * [tmp_path / "figures"]
 
 
 def test_results_are_plain_json(tmp_path):

@@ -7,16 +7,13 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 import pytest
+from brdf_map import MAP_METHODS, PROJECTIONS, brdf_map
+from evaluation import save_figures
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
-
-import mitsuba_diffraction as md
-from mitsuba_diffraction.evaluation.realtime_shader.quirks import Quirks
-from mitsuba_diffraction.evaluation.validation.brdf_map import MAP_METHODS, PROJECTIONS, brdf_map
-from mitsuba_diffraction.evaluation.validation.figures import save_figures
-from mitsuba_diffraction.evaluation.validation.published_surfaces import SURFACES, PublishedSurface
-from mitsuba_diffraction.evaluation.validation.viewing_angle import (
+from published_surfaces import SURFACES, PublishedSurface
+from viewing_angle import (
     METHODS,
     ReflectanceMap,
     fit_period,
@@ -28,6 +25,9 @@ from mitsuba_diffraction.evaluation.validation.viewing_angle import (
     viewing_angles,
     wavelengths,
 )
+
+import mitsuba_diffraction as md
+from mitsuba_diffraction.evaluation.realtime_shader.quirks import Quirks
 from mitsuba_diffraction.settings import Settings
 
 ROOT = Path(__file__).parents[2]
@@ -242,6 +242,13 @@ def test_the_peak_on_xenopeltis_toggles_where_a_ridge_enters_the_published_range
     np.testing.assert_allclose(within[found.wavelengths <= 580], 1557, atol=2)
     np.testing.assert_allclose(within[found.wavelengths >= 620], 3065, atol=10)
     np.testing.assert_allclose(periods((-90, 90)), 3065, atol=15)
+
+
+@pytest.mark.slow
+def test_the_published_shader_has_the_published_period_on_the_scan_of_elaphe(llvm):
+    surface = SURFACES["elaphe_scan"]
+    fit = fit_period(reflectance_map(surface, "flss", wavelengths=wavelengths(20.0)), surface.angles)
+    assert fit.mean == pytest.approx(surface.final["flss"][0], abs=1.0)
 
 
 @pytest.mark.slow

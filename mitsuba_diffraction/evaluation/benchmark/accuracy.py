@@ -14,7 +14,7 @@ from ...reference import power_spectrum
 from ...spectrum.grids import OrderGrid
 from ...surface.heightfield import HeightField
 from ...testing import direction
-from ..validation.record import Record
+from ..record import Record
 from .cases import Case
 
 Array = NDArray[np.float64]

@@ -5,13 +5,14 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass
 
+from ...cli.examples import source
 from ...grating_spectrum import GratingSpectrum
 from ...precomputation import precompute
+from ...recipe import Recipe
 from ...settings import SUN_COHERENCE_LENGTH, Settings
 from ...spectrum.sample import effective_coherence_length
 from ...surface import gratings
 from ...surface.heightfield import HeightField
-from ..validation.published_surfaces import scan
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,12 +65,25 @@ def bundled_cases() -> list[Case]:
     ]
 
 
+_MEASURED_FOLDER = source() / "precompute" / "measured"
 MEASURED = {"elaphe": 0.4347, "xenopeltis": 0.8187}
 """µm from black to white, of the scans of 65 µm in precompute/measured, as of the published maps."""
 _CROP = slice(333, 999)  # of 1332 rows and columns: the central 32.5 µm
 
 TIMED_TILES = ("synthetic, 0.375 µm", "measured Elaphe", "measured Xenopeltis")
 """Of `tiles`."""
+
+
+def scan(name: str, height_range: float, settings: Settings) -> Recipe:
+    """Return a scan of 65 µm as the author of the thesis used it, dust included (precompute/measured/README.md).
+
+    Args:
+        name: "elaphe" or "xenopeltis".
+        height_range: from black to white, µm.
+        settings: of its spectrum.
+    """
+    surface = {"scan": f"{name}_afm_65um.png", "pixel_size": 65 / 1332, "height_range": height_range}
+    return Recipe(surface, settings, _MEASURED_FOLDER)
 
 
 def tiles() -> list[Case]:

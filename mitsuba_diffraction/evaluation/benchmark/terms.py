@@ -24,9 +24,9 @@ from ...reference import order_powers
 from ...settings import ORIGINS, SERIES, VISIBLE
 from ...spectrum.grids import OrderGrid
 from ...spectrum.tables import AmplitudeTable, series_function, series_weights
+from ..plots import figure
 from ..realtime_shader.flss import FLSS
 from ..report import cells
-from ..validation.figures import figure
 from .accuracy import Exact
 from .cases import Case
 from .shader_speed import shader_difference, shaders_of, shading

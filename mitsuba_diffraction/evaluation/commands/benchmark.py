@@ -10,7 +10,7 @@ import typer
 from ... import outputs
 from ...cli.arguments import HeightRange, Overwrite, PixelSize, Variant, check_suffix
 from ...errors import RequestError
-from ...progress import progress_bar, show, table
+from ...progress import progress_bar, show
 from ...surface.readers import read_height_field
 
 
@@ -21,9 +21,6 @@ def benchmark(
     surface: Annotated[list[str] | None, typer.Option(help="only these of the built-in surfaces")] = None,
     tolerance: Annotated[list[float] | None, typer.Option(help="only these tolerances")] = None,
     variant: Variant = None,
-    rigorous: Annotated[
-        bool, typer.Option("--rigorous", help="compare the theories on 1200 lines/mm in aluminium instead; minutes")
-    ] = False,
     terms: Annotated[
         bool, typer.Option("--terms", help="measure the amplitude series by number of terms instead; minutes")
     ] = False,
@@ -35,22 +32,16 @@ def benchmark(
     import mitsuba as mi
 
     from ...llvm import choose_variant
-    from ...surface.gratings import ruled
-    from .. import report
     from ..benchmark.benchmark import TOLERANCES, run, save_plot, tables
     from ..benchmark.cases import bundled_cases, scan_case
     from ..benchmark.sampling import measure
-    from ..validation.theories import COLUMNS, compare_theories
 
     if plot is not None:
         check_suffix("--plot", plot, ".png")
     writes = [(option, path) for option, path in (("--json", json), ("--plot", plot)) if path is not None]
     outputs.check_outputs([] if scan is None else [scan], writes, overwrite=overwrite)
-    for option, given, own in (("--rigorous", rigorous, "one grating"), ("--terms", terms, "tiles")):
-        if given and (scan is not None or surface or tolerance or (rigorous and (terms or plot is not None))):
-            raise RequestError(
-                f"{option}: got other surfaces, tolerances, a plot or a study, too; it has {own} of its own"
-            )
+    if terms and (scan is not None or surface or tolerance):
+        raise RequestError("--terms: got other surfaces or tolerances, too; it has tiles of its own")
     cases = bundled_cases()
     names = [case.name for case in cases]
     if unknown := set(surface or []) - set(names):
@@ -61,13 +52,6 @@ def benchmark(
     mi.set_variant(choose_variant(variant))
     if terms:
         _measure_terms(json, plot)
-        return
-    if rigorous:
-        with progress_bar("rigorous efficiencies") as progress:
-            costs = compare_theories(ruled(1200), progress=progress)
-        show(table(COLUMNS, (report.cells(COLUMNS, cost) for cost in costs)), width=140)
-        if json is not None:
-            outputs.save_json({"theories": costs}, json)
         return
     with progress_bar("speed and error") as progress:
         results, shaders = run(cases, tolerances=tolerance or TOLERANCES, progress=progress)
@@ -85,7 +69,7 @@ def benchmark(
 def _measure_terms(json: Path | None, plot: Path | None) -> None:
     from ..benchmark import terms
     from ..benchmark.cases import TIMED_TILES, tiles
-    from ..validation.figures import save_png
+    from ..plots import save_png
 
     with progress_bar("number of terms") as progress:
         found = terms.run(tiles(), TIMED_TILES, progress=progress)

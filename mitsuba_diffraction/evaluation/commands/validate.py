@@ -23,7 +23,7 @@ from ...cli.arguments import (
     settings_of,
 )
 from ...errors import RequestError
-from ...progress import progress_bar, show, table, tell
+from ...progress import progress_bar, show, tell
 
 if TYPE_CHECKING:
     from ...recipe import Recipe
@@ -46,7 +46,6 @@ def validate(
     variant: Variant = None,
     json: Annotated[Path | None, typer.Option(help="save the results (.json)")] = None,
     markdown: Annotated[Path | None, typer.Option(help="save a table with notes and sources (.md)")] = None,
-    figures: Annotated[Path | None, typer.Option(metavar="DIR", help="save the figures of the evaluation here")] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Check the BSDF against closed forms and rigorous results, or check one surface; fail if a bound is exceeded."""
@@ -64,14 +63,6 @@ def validate(
     recipe = None if surface is None else _recipe(surface, of_scan, settings)
     reads = [] if surface is None else [surface, *recipe.files]
     writes = [(option, path) for option, path in (("--json", json), ("--markdown", markdown)) if path is not None]
-    if figures is not None:
-        from ..validation import fourier_figures, published_maps
-        from ..validation.figures import FILES, save_figures
-        from ..validation.published_maps import COLUMNS, save_published
-
-        figures.mkdir(parents=True, exist_ok=True)
-        names = (*FILES, *published_maps.FILES, *fourier_figures.FILES)
-        writes += [("--figures", figures / name) for name in names]
     outputs.check_outputs(reads, writes, overwrite=overwrite)
     mi.set_variant(chosen)
     these = checks() if recipe is None else surface_checks(recipe.height_field(), recipe.cached(progress_bar))
@@ -91,13 +82,6 @@ def validate(
         outputs.save_json({"checks": report.record_dicts(results)}, json)
     if markdown is not None:
         report.save_markdown(report.record_markdown(results), markdown)
-    if figures is not None:
-        with progress_bar("figures") as progress:
-            save_figures(figures, progress=progress)
-        fourier_figures.save_fourier(figures)
-        with progress_bar("published maps") as progress:
-            found = save_published(figures, progress=progress)
-        show(table(COLUMNS, found, texts=2), width=80)
     if missed:
         raise RuntimeError(f"{len(missed)} of {promised} checks missed: {'; '.join(missed)}")
 

@@ -15,9 +15,9 @@ from ...settings import lobe_width
 from ...surface import gratings
 from ...surface.heightfield import HeightField
 from ...testing import direction
+from ..record import Check, Record
 from .conservation import parseval
 from .lobes import brdf, density, grating, k_g_between, order_powers, orders_above, spectrum_of, towards
-from .record import Check, Record
 
 Array = NDArray[np.float64]
 

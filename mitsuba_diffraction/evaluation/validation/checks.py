@@ -8,24 +8,20 @@ from ...grating_spectrum import GratingSpectrum
 from ...scalar_theory import scalar_error
 from ...surface.heightfield import HeightField
 from ..benchmark.accuracy import against_reference
+from ..record import GROUPS, Check, Record
 from . import (
     analytic,
-    bumps,
     conservation,
     coupled_waves,
     measured_gratings,
-    published_maps,
     rough_surface,
     transmission_grating,
-    viewing_angle,
 )
-from .record import GROUPS, Check, Record
 
 
 def checks() -> tuple[Check, ...]:
     """Return the checks of `mitsuba-diffraction validate`, group by group."""
-    gratings = (measured_gratings, transmission_grating)
-    modules = (analytic, bumps, viewing_angle, published_maps, *gratings, rough_surface, conservation, coupled_waves)
+    modules = (analytic, measured_gratings, transmission_grating, rough_surface, conservation, coupled_waves)
     unsorted = [check for module in modules for check in module.CHECKS]
     return tuple(sorted(unsorted, key=lambda check: GROUPS.index(check.group)))
 

@@ -13,8 +13,8 @@ from ... import testing
 from ...grating_spectrum import GratingSpectrum
 from ...surface import gratings
 from ...surface.heightfield import HeightField
+from ..record import Check, Record
 from .lobes import brdf, grating, spectrum_of
-from .record import Check, Record
 
 Array = NDArray[np.float64]
 

@@ -33,8 +33,8 @@ from ...scalar_theory import (
 from ...surface import gratings
 from ...surface.heightfield import HeightField
 from ...testing import direction
+from ..record import Check, Record
 from .lobes import grating, lobe_powers, spectrum_of
-from .record import Check, Record
 
 Array = NDArray[np.float64]
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import functools
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,10 +16,7 @@ from numpy.typing import NDArray
 from ...rigorous.efficiencies import efficiencies
 from ...scalar_theory import profile_powers, scalar_orders
 from ...surface.gratings import right_angled
-from .record import Check, Record
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from ..record import Check, Record
 
 Real = NDArray[np.float64]
 
@@ -28,8 +24,6 @@ DATA = Path(__file__).parents[2] / "data" / "gratings"
 FITS = DATA / "fits.json"
 LINES_PER_MM = {"R150": 150.0, "R400": 400.0, "B600": 600.0, "R831": 831.0}
 THEORIES = ("scalar", "rigorous")
-STYLES = {"rigorous": {"color": "#d95f02", "linestyle": "-"}, "scalar": {"color": "#7570b3", "linestyle": "--"}}
-"""Of curves, by theory."""
 
 MAX_RMS_DIFFERENCE = 0.05
 """Of rigorous theory; R150 exceeds it: see docs/validation.md."""
@@ -117,36 +111,6 @@ def difference(name: str, theory: str) -> Record:
         f"{rms_difference(scale * found, wanted):.3f} if all are scaled by {scale:.3f}"
     )
     return Record(rms_difference(found, wanted), 0.0, bound, note=note)
-
-
-def plot(step: float = 4.0) -> Figure:
-    """Plot the measured efficiencies of each grating and the curves of both theories; a point every `step` nm."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(9.5, 6.6), layout="constrained")
-    panels = figure.subplots(2, 2, sharex=True, sharey=True).ravel()
-    for panel, name in zip(panels, LINES_PER_MM, strict=True):
-        wavelengths, wanted = measured(name)
-        fine = np.arange(wavelengths[0], wavelengths[-1], 1e-3 * step)
-        for theory, style in STYLES.items():
-            angle, rms = stored_angles()[name][theory], difference(name, theory).measured
-            label = f"{theory} theory, facets of {angle:.1f}°: rms {rms:.3f}"
-            panel.plot(1e3 * fine, littrow(name, angle, fine, theory == "rigorous"), label=label, **style)
-        panel.plot(1e3 * wavelengths, wanted, "o", color="black", markersize=3.5, label="measured")
-        for top, bottom in ((2, 3), (2, 5)):
-            anomaly = 1e6 / LINES_PER_MM[name] * top / bottom
-            if 1e3 * wavelengths[0] < anomaly < 1e3 * wavelengths[-1]:
-                panel.axvline(anomaly, color="0.75", linewidth=1, zorder=0)
-                panel.text(anomaly, 0.985, f" λ/d = {top}/{bottom}", color="0.4", fontsize=8, va="top")
-        panel.set_title(f"{name}: {LINES_PER_MM[name]:g} lines/mm", fontsize=10)
-        panel.legend(frameon=False, fontsize=8, loc="lower right")
-        panel.set_ylim(0, 1)
-        panel.grid(alpha=0.2)
-    for panel in panels[2:]:
-        panel.set_xlabel("wavelength / nm")
-    for panel in panels[::2]:
-        panel.set_ylabel("efficiency of order 1, Littrow")
-    return figure
 
 
 CHECKS = tuple(

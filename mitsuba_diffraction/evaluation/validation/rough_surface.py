@@ -28,8 +28,8 @@ from ...grating_spectrum import GratingSpectrum
 from ...settings import lobe_width
 from ...surface.heightfield import HeightField
 from ...testing import direction
+from ..record import Check, Record
 from .lobes import brdf, density, grating, spectrum_of, towards
-from .record import Check, Record
 
 Array = NDArray[np.float64]
 

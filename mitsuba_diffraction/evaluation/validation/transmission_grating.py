@@ -8,7 +8,6 @@ ratio of the second order to the first needs no factor; it is compared with esti
 from __future__ import annotations
 
 import functools
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +16,8 @@ from ...rigorous.efficiencies import efficiencies
 from ...scalar_theory import fresnel, profile_powers, transmitted_orders
 from ...surface.gratings import blazed, right_angled
 from ...surface.heightfield import HeightField
-from .measured_gratings import STYLES, THEORIES, best_factor, measured, rms_difference, stored_angles
-from .record import Check, Record
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from ..record import Check, Record
+from .measured_gratings import THEORIES, best_factor, measured, rms_difference, stored_angles
 
 Real = NDArray[np.float64]
 
@@ -96,30 +92,6 @@ def ratios(shape: str, theory: str) -> Record:
     values = ", ".join(f"{value:.3f}" for value in found)
     at = ", ".join(f"{1e3 * wavelength:g}" for wavelength in RATIOS)
     return Record(found[0], next(iter(RATIOS.values())), None, note=f"{values} at {at} nm")
-
-
-def plot() -> Figure:
-    """Return the measured efficiencies, and the curves of both theories and both shapes, each with its factor."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(9.5, 3.8), layout="constrained")
-    panels = figure.subplots(1, 2, sharey=True)
-    wavelengths, wanted = measured("T300")
-    for panel, shape in zip(panels, GROOVES, strict=True):
-        for theory, style in STYLES.items():
-            angle = stored_angles()[shape][theory]
-            found = curve(shape, angle, theory == "rigorous")
-            factor, rms = scaled(found)
-            label = f"{theory} theory, {angle:.1f}°, × {factor:.2f}: rms {rms:.3f}"
-            panel.plot(1e3 * wavelengths, factor * found, label=label, **style)
-        panel.plot(1e3 * wavelengths, wanted, "o", color="black", markersize=3.5, label="measured")
-        panel.set_title(f"300 lines/mm in glass, {shape}", fontsize=10)
-        panel.legend(frameon=False, fontsize=8, loc="lower left")
-        panel.set_ylim(0, 0.8)
-        panel.set_xlabel("wavelength / nm")
-        panel.grid(alpha=0.2)
-    panels[0].set_ylabel("transmitted efficiency of order 1")
-    return figure
 
 
 CHECKS = tuple(

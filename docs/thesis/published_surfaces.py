@@ -9,11 +9,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ...cli.examples import source
-from ...grating_spectrum import GratingSpectrum
-from ...recipe import Recipe
-from ...settings import SUN_COHERENCE_LENGTH, Settings
-from ...surface.heightfield import HeightField
+from mitsuba_diffraction.evaluation.benchmark.cases import scan
+from mitsuba_diffraction.grating_spectrum import GratingSpectrum
+from mitsuba_diffraction.recipe import Recipe
+from mitsuba_diffraction.settings import SUN_COHERENCE_LENGTH, Settings
+from mitsuba_diffraction.surface.heightfield import HeightField
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,22 +85,8 @@ def _skin(profile: str, depth: float) -> Recipe:
     )
 
 
-MEASURED = source() / "precompute" / "measured"
-
 # Nearly half of the scan, the largest coherence length that it supports.
 _AS_SAMPLE = Settings(extent="sample", coherence_length=32.0, tolerance=0.01)
-
-
-def scan(name: str, height_range: float, settings: Settings) -> Recipe:
-    """Return a scan of 65 µm as the author of the thesis used it, dust included (precompute/measured/README.md).
-
-    Args:
-        name: "elaphe" or "xenopeltis".
-        height_range: from black to white, µm.
-        settings: of its spectrum.
-    """
-    surface = {"scan": f"{name}_afm_65um.png", "pixel_size": 65 / 1332, "height_range": height_range}
-    return Recipe(surface, settings, MEASURED)
 
 
 SURFACES = {

@@ -9,23 +9,21 @@ by the grating equation of the first order,
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from published_surfaces import PublishedSurface
 from scipy.signal import find_peaks
 
-from ... import testing
-from ...errors import RequestError
-from ...grating_spectrum import GratingSpectrum
-from ...llvm import is_supported
-from ..realtime_shader.evaluate import relative_radiance
-from ..realtime_shader.quirks import Quirks
-from .published_surfaces import SURFACES, PublishedSurface
-from .record import Check, Record
+from mitsuba_diffraction import testing
+from mitsuba_diffraction.errors import RequestError
+from mitsuba_diffraction.evaluation.realtime_shader.evaluate import relative_radiance
+from mitsuba_diffraction.evaluation.realtime_shader.quirks import Quirks
+from mitsuba_diffraction.grating_spectrum import GratingSpectrum
+from mitsuba_diffraction.llvm import is_supported
 
 Array = NDArray[np.float64]
 
@@ -289,40 +287,3 @@ def ridges(found: ReflectanceMap) -> list[Ridge]:
     mean /= mean.max()
     (peaks, _) = find_peaks(mean, height=_MIN_RIDGE, prominence=_MIN_RIDGE / 3)
     return [Ridge(float(1 / frequency[i]), float(mean[i])) for i in peaks[np.argsort(mean[peaks])[::-1]]]
-
-
-def profile_period(name: str) -> Record:
-    """Fit the period of a profile, of a synthetic skin the one that it is made with, to the peaks of this model."""
-    surface = SURFACES[name]
-    found = fit_period(reflectance_map(surface, wavelengths=wavelengths(20.0))).mean
-    # Peaks are read on a grid of 0.1°, which moves a period of 2.5 µm by 7 nm at one wavelength, by 1.6 nm in the mean.
-    return Record(found, 1e3 * surface.period, 2.0, note=f"nm; {surface.name}, light at 75°")
-
-
-def scan_period(name: str) -> Record:
-    """Fit the period to the peaks of FLSS as published on a scan, as the thesis did."""
-    surface = SURFACES[name]
-    fit = fit_period(reflectance_map(surface, "flss", wavelengths=wavelengths(20.0)), surface.angles)
-    mean, _ = surface.final["flss"]
-    return Record(fit.mean, mean, 1.0, note=f"nm, ±{fit.deviation:.2f} over the wavelengths; light at 75°")
-
-
-CHECKS = (
-    *(
-        Check(
-            "analytic",
-            f"period from peaks: {SURFACES[name].name}",
-            functools.partial(profile_period, name),
-            "period of the profile, by the grating equation",
-            slow=name != "blaze",
-        )
-        for name in ("blaze", "elaphe", "xenopeltis")
-    ),
-    Check(
-        "literature",
-        "period from peaks: FLSS as published, Elaphe (scan)",
-        functools.partial(scan_period, "elaphe_scan"),
-        "final text of the thesis, table 5.1",
-        slow=True,
-    ),
-)

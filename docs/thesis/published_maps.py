@@ -1,5 +1,7 @@
 """Maps of the BRDF that the author of the thesis of 2014 published, and the same maps by this project.
 
+    python docs/thesis/published_maps.py FOLDER
+
 Each is a picture of the outgoing hemisphere, light along the normal: (x, y) = (sin θ_o cos φ_o, sin θ_o sin φ_o). They
 were made by FLSS from an AFM scan of 65 µm, which is available, so that the emulation can be compared pixel by pixel.
 
@@ -9,7 +11,7 @@ its height of 0.8187 µm, for which the 37 terms from the lowest point of the pu
 
 from __future__ import annotations
 
-import functools
+import argparse
 import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
@@ -21,28 +23,30 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 from scipy.optimize import minimize_scalar
+from viewing_angle import MODEL, relative_reflectance, wavelengths
 
-from ...files import whole_file
-from ...outputs import METADATA
-from ...progress import Progress, silent
-from ...recipe import Recipe
-from ...settings import Settings
-from ...surface.heightfield import HeightField
-from ...testing import array, vectors
-from ..realtime_shader.evaluate import shader_for
-from ..realtime_shader.quirks import Quirks
-from ..realtime_shader.tristimulus import WAVELENGTH_STEP, d65_weights, rgb_matrix
-from ..report import markdown, save_markdown
-from .figures import figure
-from .published_surfaces import MEASURED, scan
-from .record import Check, Record
-from .viewing_angle import MODEL, relative_reflectance, wavelengths
+from mitsuba_diffraction.evaluation.benchmark.cases import scan
+from mitsuba_diffraction.evaluation.plots import figure
+from mitsuba_diffraction.evaluation.realtime_shader.evaluate import shader_for
+from mitsuba_diffraction.evaluation.realtime_shader.quirks import Quirks
+from mitsuba_diffraction.evaluation.realtime_shader.tristimulus import WAVELENGTH_STEP, d65_weights, rgb_matrix
+from mitsuba_diffraction.evaluation.report import markdown, save_markdown
+from mitsuba_diffraction.files import whole_file
+from mitsuba_diffraction.llvm import choose_variant
+from mitsuba_diffraction.outputs import METADATA
+from mitsuba_diffraction.progress import Progress, progress_bar, show, silent
+from mitsuba_diffraction.progress import table as progress_table
+from mitsuba_diffraction.recipe import Recipe
+from mitsuba_diffraction.settings import Settings
+from mitsuba_diffraction.surface.heightfield import HeightField
+from mitsuba_diffraction.testing import array, vectors
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
 
+_FOLDER = Path(__file__).parents[2] / "precompute" / "measured" / "published"
 PUBLISHED, CORRECTED, TRUNCATED = "flss as published", "flss corrected", "flss truncated"
 METHODS = (PUBLISHED, CORRECTED, MODEL)
 
@@ -83,7 +87,7 @@ class PublishedMap:
 
     def path(self) -> Path:
         """Return the path of the picture."""
-        return MEASURED / "published" / self.picture
+        return _FOLDER / self.picture
 
     @property
     def height(self) -> float:
@@ -106,7 +110,6 @@ PUBLISHED_MAPS = {
     "xenopeltis": PublishedMap("Xenopeltis", "flss_xeno.png", scan("xenopeltis", 0.8187, _SETTINGS)),
 }
 """Name → published map."""
-_MIN_CORRELATION = 0.98
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,13 +248,6 @@ def correlation_against_height(published: PublishedMap, method: str, heights: Ar
     return np.array([agreement(pixels, linear).correlation for linear in maps])
 
 
-def published_map(name: str) -> Record:
-    """Correlate FLSS as published with the author's map."""
-    pixels = grid(PUBLISHED_MAPS[name], 8)
-    found = agreement(pixels, linear_rgb(PUBLISHED_MAPS[name], PUBLISHED, pixels.wo))
-    return Record(found.correlation, 1.0, 1 - _MIN_CORRELATION, note="correlation at every 8th pixel")
-
-
 # ---------------------------------------------------------------- figures and the table
 
 FILES = ("published_maps.png", "published_maps.md", "published_heights.png")
@@ -365,7 +361,16 @@ def save_published(
     return found
 
 
-CHECKS = tuple(
-    Check("literature", f"published map of {found.name}", functools.partial(published_map, name), "thesis", slow=True)
-    for name, found in PUBLISHED_MAPS.items()
-)
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, help="of the figures and the table; created if missing")
+    folder = parser.parse_args().folder
+    folder.mkdir(parents=True, exist_ok=True)
+    mi.set_variant(choose_variant(None))
+    with progress_bar("published maps") as progress:
+        found = save_published(folder, progress=progress)
+    show(progress_table(COLUMNS, found, texts=2), width=80)
+
+
+if __name__ == "__main__":
+    main()

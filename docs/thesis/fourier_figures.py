@@ -1,7 +1,11 @@
-"""Figures 3.1 and 4.1 of the draft of the thesis of 2014: interpolated transforms, and those of powers of heights."""
+"""Figures 3.1 and 4.1 of the draft of the thesis of 2014: interpolated transforms, and those of powers of heights.
+
+python docs/thesis/fourier_figures.py FOLDER
+"""
 
 from __future__ import annotations
 
+import argparse
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,13 +13,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from published_surfaces import SURFACES
 from scipy.special import diric, gammaln
 
-from ...surface.heightfield import HeightField
-from ..realtime_shader.flss import FLSS
-from ..realtime_shader.taylor_textures import MAX_KAPPA, taylor_transforms
-from .figures import figure, save_png
-from .published_surfaces import SURFACES
+from mitsuba_diffraction.evaluation.plots import figure, save_png
+from mitsuba_diffraction.evaluation.realtime_shader.flss import FLSS
+from mitsuba_diffraction.evaluation.realtime_shader.taylor_textures import MAX_KAPPA, taylor_transforms
+from mitsuba_diffraction.surface.heightfield import HeightField
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -196,3 +200,15 @@ def save_fourier(folder: str | os.PathLike[str]) -> None:
     """Write `FILES` into a folder, which exists."""
     for name, drawn in zip(FILES, (plot_interpolation(), plot_fourier_images()), strict=True):
         save_png(drawn, Path(folder) / name)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, help="of the figures; created if missing")
+    folder = parser.parse_args().folder
+    folder.mkdir(parents=True, exist_ok=True)
+    save_fourier(folder)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,23 +1,23 @@
-"""The evaluation of the thesis of 2014 (chapter 5) for the real-time shader and for this model: figures and a table."""
+"""The evaluation of the thesis of 2014 (chapter 5) for the real-time shader and for this model: figures and a table.
+
+    python docs/thesis/evaluation.py FOLDER [SURFACE …]
+
+`docs/evaluation.md` discusses them.
+"""
 
 from __future__ import annotations
 
-import io
+import argparse
 import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import mitsuba as mi
 import numpy as np
-
-from ...files import whole_file
-from ...outputs import png_text
-from ...progress import Progress, silent
-from ..realtime_shader.quirks import Quirks
-from ..report import markdown, save_markdown
-from .brdf_map import MAP_METHODS, PROJECTIONS, BRDFMap, brdf_map
-from .published_surfaces import SURFACES, PublishedSurface
-from .viewing_angle import (
+from brdf_map import MAP_METHODS, PROJECTIONS, BRDFMap, brdf_map
+from published_surfaces import SURFACES, PublishedSurface
+from viewing_angle import (
     METHODS,
     MODEL,
     ReflectanceMap,
@@ -28,6 +28,12 @@ from .viewing_angle import (
     ridges,
     wavelengths,
 )
+
+from mitsuba_diffraction.evaluation.plots import figure, save_png
+from mitsuba_diffraction.evaluation.realtime_shader.quirks import Quirks
+from mitsuba_diffraction.evaluation.report import markdown, save_markdown
+from mitsuba_diffraction.llvm import choose_variant
+from mitsuba_diffraction.progress import Progress, progress_bar, silent
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -41,34 +47,6 @@ MAP_COHERENCE = {"blaze": 6.5}
 TITLES = {MODEL: "this model", "flss": "FLSS", "nmm": "NMM", "pq": "PQ", "nmm_pq": "NMM and PQ", "gem": "GEM"}
 _PEAK = "#d62728"
 _MIN_SHOWN = 1e-3  # of the maximum reflectance outside the specular peak
-
-
-def figure(width: float, height: float) -> Figure:
-    """Return an empty figure, size in inches, that is not shown in a window."""
-    from matplotlib.figure import Figure
-
-    return Figure(figsize=(width, height), layout="constrained")
-
-
-def png(drawn: Figure, dpi: float = 110) -> bytes:
-    """Encode a figure as a PNG of a palette of 256 colours, half the size of a PNG of all colours; with the mark."""
-    from PIL import Image
-
-    whole, reduced = io.BytesIO(), io.BytesIO()
-    drawn.savefig(whole, format="png", dpi=dpi)
-    with Image.open(whole) as picture:
-        picture = picture.convert("RGB")
-        palette = picture.quantize(256, kmeans=2)
-        # Pillow mixes colours only for a palette that it is given.
-        mixed = picture.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG)
-        mixed.save(reduced, format="png", optimize=True, pnginfo=png_text())
-    return reduced.getvalue()
-
-
-def save_png(drawn: Figure, path: str | os.PathLike[str]) -> None:
-    """Write a figure as such a PNG, atomically."""
-    with whole_file(path) as temporary:
-        temporary.write_bytes(png(drawn))
 
 
 def plot_reflectance(maps: Sequence[ReflectanceMap]) -> Figure:
@@ -265,3 +243,19 @@ def save_figures(
         save_png(plot_brdf_maps(brdf_maps), folder / f"brdf_{name}.png")
         progress(2 * number + 2, 2 * len(surfaces))
     save_markdown(markdown(PERIOD_COLUMNS, rows, texts=6), folder / "periods.md")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, help="of the figures and the table; created if missing")
+    parser.add_argument(
+        "surfaces", nargs="*", metavar="SURFACE", default=list(SURFACES), help=f"of {', '.join(SURFACES)}"
+    )
+    options = parser.parse_args()
+    mi.set_variant(choose_variant(None))
+    with progress_bar("figures") as progress:
+        save_figures(options.folder, surfaces=options.surfaces, progress=progress)
+
+
+if __name__ == "__main__":
+    main()

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from published_surfaces import PublishedSurface
+from viewing_angle import MODEL, relative_reflectance, wavelengths
 
-from ...color import auto_exposure, daylight, into_gamut, on_screen, spectrum_to_linear_sRGB
-from ...errors import RequestError
-from ...testing import direction
-from ..realtime_shader.evaluate import VARIANTS, colour
-from .published_surfaces import PublishedSurface
-from .viewing_angle import MODEL, relative_reflectance, wavelengths
+from mitsuba_diffraction.color import auto_exposure, daylight, into_gamut, on_screen, spectrum_to_linear_sRGB
+from mitsuba_diffraction.errors import RequestError
+from mitsuba_diffraction.evaluation.realtime_shader.evaluate import VARIANTS, colour
+from mitsuba_diffraction.testing import direction
 
 Array = NDArray[np.float64]
 

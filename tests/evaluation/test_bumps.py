@@ -16,20 +16,19 @@ p is the fraction of pits in the drawn data. On pixels of size Δ, integrals are
 sinc(aq)/sinc(Δq).
 """
 
-from __future__ import annotations
-
 import functools
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
-from ...grating_spectrum import GratingSpectrum
-from ...settings import lobe_width
-from ...surface.heightfield import HeightField
-from ...testing import direction
-from .analytic import compare_orders
-from .lobes import density, grating, spectrum_of, towards
-from .record import Check, Record
+from mitsuba_diffraction.evaluation.record import Record
+from mitsuba_diffraction.evaluation.validation.analytic import compare_orders
+from mitsuba_diffraction.evaluation.validation.lobes import density, grating, spectrum_of, towards
+from mitsuba_diffraction.grating_spectrum import GratingSpectrum
+from mitsuba_diffraction.settings import lobe_width
+from mitsuba_diffraction.surface.heightfield import HeightField
+from mitsuba_diffraction.testing import direction
 
 Array = NDArray[np.float64]
 
@@ -63,7 +62,7 @@ def random() -> HeightField:
     return HeightField(heights, COARSE_PIXEL, "random pits on tracks")
 
 
-def _regular() -> Record:
+def regular_orders() -> Record:
     def closed_form(m: Array, kappa: Array) -> Array:
         x, y = m[:, 0] * PIT_WIDTH / TRACK_PITCH, m[:, 1] * PIT_LENGTH / PIT_SPACING
         pit = PIT_WIDTH * PIT_LENGTH * np.sinc(x) * np.sinc(y) * np.exp(-1j * np.pi * (x + y))
@@ -105,7 +104,7 @@ def _effective_area() -> float:
     return (TRACK_COUNT * TRACK_PITCH - margin) * (PITS_PER_TRACK * PIT_LENGTH - margin)
 
 
-def _tracks(m: int) -> Record:
+def tracks(m: int) -> Record:
     """Compare the power of an order of the tracks, within 5 σ_q of q = (m/t, 0), without the incoherent part."""
     wavelength, sigma = 0.5, lobe_width(COHERENCE_LENGTH)
     axis = np.linspace(-5, 5, 41) * sigma
@@ -126,7 +125,7 @@ def _tracks(m: int) -> Record:
     return Record(found, expected, bound, note="fraction of the reflected power")
 
 
-def _between_tracks() -> Record:
+def between_tracks() -> Record:
     """Compare the incoherent part in a band between the orders of the tracks, 0.2 to 0.5 by −0.7 to 0.7 cycles/µm."""
     wavelength = 0.5
     x, y = np.linspace(0.2, 0.5, 31), np.linspace(-0.7, 0.7, 141)
@@ -139,9 +138,16 @@ def _between_tracks() -> Record:
     return Record(found, expected, bound, note="fraction of the reflected power")
 
 
-CHECKS = (
-    Check("analytic", "equal bumps on a lattice", _regular, "Stam 1999: transform of one bump, sampled by the lattice"),
-    Check("statistical", "compact disc, random pits: mirror order", lambda: _tracks(0), "Stam 1999", slow=True),
-    Check("statistical", "compact disc, random pits: first order", lambda: _tracks(1), "Stam 1999", slow=True),
-    Check("statistical", "compact disc, random pits: between orders", _between_tracks, "Stam 1999", slow=True),
-)
+def test_equal_bumps_on_a_lattice_have_the_orders_of_one_bump(llvm):
+    assert regular_orders().ok
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("order", [0, 1])
+def test_random_pits_have_the_orders_of_their_tracks(llvm, order):
+    assert tracks(order).ok
+
+
+@pytest.mark.slow
+def test_random_pits_scatter_between_the_orders(llvm):
+    assert between_tracks().ok
