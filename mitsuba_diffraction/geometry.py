@@ -11,6 +11,7 @@ for reflection (n_i = n_o; Stam 1999) and for transmission alike (cf. Walter et 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -68,6 +69,51 @@ def k_g(
         transmitted = select(square_ratio < 1, k * square_ratio, k)
         result = select(reflects, select(k < in_v_cavity, k, in_v_cavity), transmitted)
     return select(reflects | (square < abs(excess)), result, 0)
+
+
+@dataclass(frozen=True, eq=False)
+class Diffracted:
+    """The directions ω_o into which light of one ω_i is diffracted, (n,), in NumPy.
+
+    Attributes:
+        kept: mask of the frequencies q that propagate.
+        tangent: k_o,∥, (n, 2).
+        k_oz: |k_oz|.
+        v_z: k_iz + k_oz, signed for light from above.
+        k_g: K G.
+        cos_half: |ω_i·h|.
+    """
+
+    kept: NDArray[np.bool_]
+    tangent: NDArray[np.float64]
+    k_oz: NDArray[np.float64]
+    v_z: NDArray[np.float64]
+    k_g: NDArray[np.float64]
+    cos_half: NDArray[np.float64]
+
+
+def diffracted(
+    tangent: NDArray[np.float64], steps: NDArray[np.float64], n_i: float = 1.0, n_o: float | None = None
+) -> Diffracted:
+    """Return the directions into which light is reflected, or transmitted into a medium of index n_o.
+
+    Args:
+        tangent: k_i,∥, (2,); nothing propagates if it is evanescent.
+        steps: λq, (..., 2).
+        n_i: index of the medium of ω_i.
+        n_o: of that of transmitted light; None for reflected light.
+    """
+    reflects, n_o = n_o is None, n_i if n_o is None else n_o
+    square_i, excess = n_i**2 - tangent @ tangent, n_i**2 - n_o**2
+    tangent_o = -steps - tangent
+    square_o = n_o**2 - (tangent_o**2).sum(axis=-1)
+    kept = (square_o > 0) & (square_i > 0)
+    k_iz, k_oz, change = np.sqrt(max(square_i, 0.0)), np.sqrt(square_o[kept]), (steps[kept] ** 2).sum(axis=-1)
+    v_z = k_iz + k_oz if reflects else k_iz - k_oz
+    square = change + v_z**2
+    cos_half = np.abs(square + excess) / (2 * n_i * np.sqrt(np.maximum(square, 1e-18)))
+    factor = k_g(k_iz, k_oz, change, excess, reflects, min_v_z=1e-6 * n_i)
+    return Diffracted(kept, tangent_o[kept], k_oz, v_z, factor, np.minimum(cos_half, 1))
 
 
 def horizon_gain(x: Array, select: Callable[..., Any] = np.where) -> Array:

@@ -18,7 +18,7 @@ from scipy.ndimage import gaussian_filter
 
 from .efficiency import OrderEfficiencies, description, index_at, numbers
 from .errors import RequestError
-from .geometry import k_g
+from .geometry import diffracted
 from .progress import Progress, silent
 from .scalar_theory import fresnel, incident_direction
 from .spectrum.grids import OrderGrid
@@ -135,14 +135,9 @@ def _reflected(spectrum: PowerSpectrum, direction: Array, wavelength: float) -> 
     """
     q = np.stack(np.meshgrid(*spectrum.grid.frequencies()), -1)
     power, cos_half = np.zeros(q.shape[:2]), np.ones(q.shape[:2])
-    square_i, square_o = direction @ direction, ((direction + wavelength * q) ** 2).sum(axis=-1)
-    if square_i < 1:
-        kept = row, column = np.nonzero(square_o < 1)
-        cos_i, cos_o = np.sqrt(1 - square_i), np.sqrt(1 - square_o[kept])
-        tangent = (wavelength * q[kept]) ** 2 @ np.ones(2)
-        kappa = 2 * np.pi * (cos_i + cos_o) / wavelength
-        power[kept] = k_g(cos_i, cos_o, tangent) * spectrum.table.powers_at(row, column, kappa)
-        cos_half[kept] = np.sqrt(tangent + (cos_i + cos_o) ** 2) / 2
+    found = diffracted(direction, wavelength * q)
+    densities = spectrum.table.powers_at(*np.nonzero(found.kept), 2 * np.pi * found.v_z / wavelength)
+    power[found.kept], cos_half[found.kept] = found.k_g * densities, found.cos_half
     return power, cos_half
 
 

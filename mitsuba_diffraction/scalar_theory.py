@@ -20,7 +20,7 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.special import jv
 
 from .errors import RequestError
-from .geometry import k_g, transmitted
+from .geometry import Diffracted, diffracted
 from .reference import amplitudes
 from .rigorous.coordinate_transformation import curve_of, is_profile
 from .rigorous.efficiencies import converge
@@ -154,13 +154,18 @@ def scalar_orders(
         index: n + ik of the material; ∞ of a perfect mirror.
         azimuth: of the plane of incidence, degrees; 0: perpendicular to the grooves, 90: parallel (conical).
     """
-    pitch = wavelength / np.atleast_1d(period)
-    tangential_i = incident_direction(angle, azimuth)[:2]
-    m, tangential_o, factor, cos_half = _mirror_orders(powers, pitch, wavelength, tangential_i)
-    albedo = [_mirror_orders(powers, pitch, wavelength, tangential)[2].sum() for tangential in tangential_o]
-    reflected = factor / np.maximum(1, np.maximum(factor.sum(), albedo))
-    s, p = (1.0, 1.0) if np.isinf(index) else fresnel(cos_half, index)
-    return Orders(m, s * reflected, p * reflected)
+    m, steps = _lattice(wavelength / np.atleast_1d(period), 2.0)
+
+    def mirrored(tangent: Array) -> tuple[Diffracted, Array]:
+        """Return the orders of light with this tangential part of ω_i, and K G η_m: what R = 1 reflects."""
+        found = diffracted(tangent, steps)
+        return found, found.k_g * powers(m[found.kept], 2 * np.pi * found.v_z / wavelength)
+
+    found, power = mirrored(incident_direction(angle, azimuth)[:2])
+    albedo = [mirrored(tangent)[1].sum() for tangent in found.tangent]
+    power = power / np.maximum(1, np.maximum(power.sum(), albedo))
+    s, p = (1.0, 1.0) if np.isinf(index) else fresnel(found.cos_half, index)
+    return Orders(m[found.kept], s * power, p * power)
 
 
 def transmitted_orders(
@@ -180,26 +185,19 @@ def transmitted_orders(
     light from above, they include the transmittance 1 − F of the flat face.
     """
     n_i, n_o, side = (index, 1.0, -1) if from_below else (1.0, index, 1)
-    tangential_i = incident_direction(angle, azimuth)[:2]
     m, steps = _lattice(wavelength / np.atleast_1d(period), n_i + n_o)
-    square = n_o**2 - ((tangential_i + steps) ** 2).sum(axis=-1)
-    m, tangent, k_oz = m[square > 0], (steps[square > 0] ** 2).sum(axis=-1), np.sqrt(square[square > 0])
-    k_iz = np.sqrt(n_i**2 - tangential_i @ tangential_i)
+    found = diffracted(incident_direction(angle, azimuth)[:2], steps, n_i, n_o)
     # S(q; −κ) = S(−q; κ)
-    kappa, sign = 2 * np.pi * np.abs(k_iz - k_oz) / wavelength, np.where(side * (k_iz - k_oz) < 0, -1, 1)
-    cosines, relative = (k_iz / n_i, k_oz / n_o), n_o / n_i
-    power = transmitted(*cosines, tangent / n_i**2, relative) * powers((m.T * sign).T, kappa)
-    power = power / max(1.0, power.sum())
+    kappa, sign = 2 * np.pi * np.abs(found.v_z) / wavelength, np.where(side * found.v_z < 0, -1, 1)
+    m = m[found.kept]
+    power = found.k_g * powers((m.T * sign).T, kappa)
+    s, p = (power * (1 - reflected) for reflected in fresnel(found.cos_half, n_o / n_i))
+    s, p = (polarised / max(1.0, (s + p).sum() / 2) for polarised in (s, p))
     if sheet:
-        cos_out = np.sqrt(np.maximum(1 - n_o**2 + k_oz**2, 0))
-        power = power * (1 - np.mean(fresnel(cos_out, index), axis=0))
-    # |ω_i·h|
-    half = tangent / n_i**2 + (cosines[0] - relative * cosines[1]) ** 2
-    half = np.minimum(np.abs(half + 1 - relative**2) / (2 * np.sqrt(np.maximum(half, 1e-18))), 1)
-    s, p = (1 - reflected for reflected in fresnel(half, relative))
-    mean = np.maximum((s + p) / 2, 1e-12)
-    kept = cos_out > 0 if sheet else slice(None)
-    return Orders(m[kept], (power * s / mean)[kept], (power * p / mean)[kept])
+        cos_out = np.sqrt(np.maximum(1 - n_o**2 + found.k_oz**2, 0))
+        through = 1 - np.mean(fresnel(cos_out, index), axis=0)
+        m, s, p = ((values.T * factor).T[cos_out > 0] for values, factor in ((m, 1), (s, through), (p, through)))
+    return Orders(m, s, p)
 
 
 def _lattice(pitch: Array, cutoff: float) -> tuple[NDArray[np.int64], Array]:
@@ -210,31 +208,6 @@ def _lattice(pitch: Array, cutoff: float) -> tuple[NDArray[np.int64], Array]:
     steps = np.zeros((len(m), 2))
     steps[:, : len(pitch)] = m * pitch
     return m if len(pitch) == 2 else m[:, 0], steps
-
-
-def _mirror_orders(
-    powers: OrderPowers, pitch: Array, wavelength: float, tangential_i: Array
-) -> tuple[NDArray[np.int64], Array, Array, Array]:
-    """Return the orders reflected by a perfect mirror, R = 1.
-
-    Args:
-        powers: of the profile or tile.
-        pitch: λ/T, (1,) of a profile, (2,) of a tile.
-        wavelength: µm.
-        tangential_i: the tangential part of ω_i, (2,).
-
-    Returns:
-        For propagating orders: m, (n,) or (n, 2), the tangential part of ω_o, (n, 2), K G η_m and ω_i·h, (n,).
-    """
-    m, steps = _lattice(pitch, 2.0)
-    tangential_o = -steps - tangential_i
-    square_o = (tangential_o**2).sum(axis=-1)
-    m, steps, tangential_o, square_o = (values[square_o < 1] for values in (m, steps, tangential_o, square_o))
-    cos_i, cos_o = np.sqrt(1 - (tangential_i**2).sum()), np.sqrt(1 - square_o)
-    w = cos_i + cos_o
-    square = (steps**2).sum(axis=-1)
-    half = np.sqrt(square + w**2) / 2
-    return m, tangential_o, k_g(cos_i, cos_o, square) * powers(m, 2 * np.pi * w / wavelength), half
 
 
 def difference(scalar: ArrayLike, rigorous: ArrayLike) -> float:

@@ -69,6 +69,7 @@ class Theory(Protocol):
         scattering: the powers, and their sampler.
         material: R of a plane.
         interface: the media above and below.
+        media: those around the grating.
         shadowing: whether G is a factor.
         covered_index: index by which wavelengths outside are divided before they are compared with those of the
             spectrum.
@@ -77,6 +78,7 @@ class Theory(Protocol):
     scattering: Scattering
     material: Material
     interface: Interface
+    media: Media
     shadowing: bool
     covered_index: float
 
@@ -130,7 +132,7 @@ class ScalarTheory(Theory):
     """f cos θ_o = R · K · G · S(q; κ)/λ² · E cos θ_o.
 
     Attributes:
-        media: around the grating; its index is the one for which the tables were made.
+        media: its index is the one for which the tables were made.
         scales: of heights and of lengths along the surface.
         energy: E, or None where it is one.
     """

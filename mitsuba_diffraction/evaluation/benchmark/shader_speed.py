@@ -9,12 +9,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...geometry import k_g
 from ...testing import vectors
 from ..realtime_shader.base import Shader
 from ..realtime_shader.evaluate import shader_for
 from ..realtime_shader.quirks import Quirks
 from ..realtime_shader.tristimulus import PUBLISHED_R0
-from ..validation.lobes import k_g_between
 from .accuracy import Exact, patch_difference, patch_directions
 from .cases import Case
 from .speed import Rays, seconds
@@ -97,7 +97,8 @@ def shader_difference(shader: Shader, exact: Exact) -> tuple[float, float]:
 
     wi, wo = patch_directions()
     cos_half = np.sqrt((1 + (wi * wo).sum(axis=-1)) / 2)
-    wanted = exact.xyz * ((PUBLISHED_R0 + (1 - PUBLISHED_R0) * (1 - cos_half) ** 5) * k_g_between(wi, wo))[:, None]
+    factor = k_g(wi[:, 2], wo[:, 2], ((wi + wo)[:, :2] ** 2).sum(axis=-1))
+    wanted = exact.xyz * ((PUBLISHED_R0 + (1 - PUBLISHED_R0) * (1 - cos_half) ** 5) * factor)[:, None]
     rgb = np.array(shader.rgb(vectors(wi), vectors(wo), shader.weights()), np.float64).T
     xyz = rgb @ colour.RGB_COLOURSPACES["sRGB"].matrix_RGB_to_XYZ.T
     return patch_difference(wanted, xyz * (wanted[:, 1].sum() / xyz[:, 1].sum()))
