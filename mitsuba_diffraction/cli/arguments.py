@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
+import inspect
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import fields
 from pathlib import Path
@@ -141,28 +143,47 @@ def _is_film(source: str) -> bool:
 
 PixelSize = Annotated[float | None, typer.Option(help="pixel size of the scan, µm")]
 HeightRange = Annotated[float | None, typer.Option(help="height difference of black and white, µm")]
-FillMissing = Annotated[bool, typer.Option("--fill-missing", help="interpolate missing pixels of the scan")]
-Channel = Annotated[str | None, typer.Option(help="channel of the scan, by name or number")]
-Unit = Annotated[
-    list[str] | None,
-    typer.Option(help="unit, for a scan without one; given twice: of lengths, then of heights"),
-]
-Prepare = Annotated[
-    list[str] | None,
-    typer.Option(help=f"apply a step, NAME or NAME=ARGUMENT, to the scan, in the given order: {', '.join(STEP_NAMES)}"),
-]
-Extent = Annotated[
-    str | None,
-    typer.Option(help="tile (periodic) or sample (of an irregular surface); default: that of the recipe"),
-]
-CoherenceLength = Annotated[
-    float | None, typer.Option(help=f"µm; default: that of the recipe, or of sunlight, {SUN_COHERENCE_LENGTH:g}")
-]
+_STEPS = f"apply a step, NAME or NAME=ARGUMENT, to the scan, in the given order: {', '.join(STEP_NAMES)}"
+_COHERENCE_LENGTH = f"µm; default: that of the recipe, or of sunlight, {SUN_COHERENCE_LENGTH:g}"
+SCAN_OPTIONS: dict[str, Any] = {
+    "pixel_size": PixelSize,
+    "height_range": HeightRange,
+    "fill_missing": Annotated[bool, typer.Option("--fill-missing", help="interpolate missing pixels of the scan")],
+    "channel": Annotated[str | None, typer.Option(help="channel of the scan, by name or number")],
+    "unit": Annotated[
+        list[str] | None, typer.Option(help="unit, for a scan without one; given twice: of lengths, then of heights")
+    ],
+    "prepare": Annotated[list[str] | None, typer.Option(help=_STEPS)],
+    "extent": Annotated[
+        str | None,
+        typer.Option(help="tile (periodic) or sample (of an irregular surface); default: that of the recipe"),
+    ],
+    "coherence_length": Annotated[float | None, typer.Option(help=_COHERENCE_LENGTH)],
+}
+
+
+def takes_scan(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command the options of a scan, which `options_of_scan` and `settings_of` read from the context."""
+    own = list(inspect.signature(command, eval_str=True).parameters.values())
+    keyword = inspect.Parameter.POSITIONAL_OR_KEYWORD
+    added = [
+        inspect.Parameter(name, keyword, default=False if name == "fill_missing" else None, annotation=annotation)
+        for name, annotation in SCAN_OPTIONS.items()
+    ]
+
+    @functools.wraps(command)
+    def run(**given: Any) -> None:
+        command(**{parameter.name: given[parameter.name] for parameter in own})
+
+    parameters = [*own[:-1], *added, own[-1]]  # the last is --overwrite
+    run.__dict__["__signature__"] = inspect.Signature(parameters)
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    return run
 
 
 def options_of_scan(context: typer.Context) -> dict[str, object]:
     """Return the given options of a scan, under their names in recipes."""
-    given = _given(context, ("pixel_size", "height_range", "fill_missing", "channel", "unit", "prepare"))
+    given = _given(context, [name for name in SCAN_OPTIONS if name not in ("extent", "coherence_length")])
     if len(unit := given.get("unit", ())) == 1:
         given["unit"] = unit[0]
     steps = [*["level_plane"] * context.params.get("plane", False), *given.get("prepare", [])]

@@ -18,15 +18,7 @@ from ..progress import progress_bar, tell
 from ..recipe import Recipe, parameters_of_profile
 from ..settings import Settings
 from .arguments import (
-    Channel,
-    CoherenceLength,
-    Extent,
-    FillMissing,
-    HeightRange,
     Overwrite,
-    PixelSize,
-    Prepare,
-    Unit,
     Value,
     angles_of,
     check_suffix,
@@ -36,9 +28,11 @@ from .arguments import (
     recipe_of,
     settings_of,
     surface_of,
+    takes_scan,
 )
 
 
+@takes_scan
 def efficiency(
     context: typer.Context,
     source: Annotated[
@@ -66,14 +60,6 @@ def efficiency(
     azimuth: Annotated[
         float, typer.Option(help="azimuth of the plane of incidence, degrees from x; 90: along the grooves")
     ] = 0,
-    pixel_size: PixelSize = None,
-    height_range: HeightRange = None,
-    fill_missing: FillMissing = False,
-    channel: Channel = None,
-    unit: Unit = None,
-    prepare: Prepare = None,
-    extent: Extent = None,
-    coherence_length: CoherenceLength = None,
     csv: Annotated[Path | None, typer.Option(help="save all numbers (.csv)")] = None,
     plot: Annotated[Path | None, typer.Option(help="save a plot (.png, .pdf, .svg)")] = None,
     overwrite: Overwrite = False,

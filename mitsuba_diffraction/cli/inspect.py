@@ -20,23 +20,17 @@ from ..outputs import check_outputs, free_name, plain, save_json
 from ..progress import progress_bar, show, table, tell
 from ..settings import SUN_COHERENCE_LENGTH, lobe_width
 from .arguments import (
-    Channel,
-    CoherenceLength,
-    Extent,
-    FillMissing,
-    HeightRange,
     Overwrite,
-    PixelSize,
-    Prepare,
-    Unit,
     angles_of,
     check_suffix,
     options_of_scan,
     recipe_of,
     settings_of,
+    takes_scan,
 )
 
 
+@takes_scan
 def inspect(
     context: typer.Context,
     source: Annotated[Path, typer.Argument(metavar="SCAN|RECIPE", help="a scan, or a recipe (.toml)")],
@@ -44,15 +38,7 @@ def inspect(
         Path | None,
         typer.Option("-o", "--output", help="figure (.png, .pdf, .svg); default: ./NAME_inspect.png"),
     ] = None,
-    pixel_size: PixelSize = None,
-    height_range: HeightRange = None,
-    fill_missing: FillMissing = False,
-    channel: Channel = None,
-    unit: Unit = None,
     plane: Annotated[bool, typer.Option("--plane", help="level the scan first, as --prepare level_plane does")] = False,
-    prepare: Prepare = None,
-    extent: Extent = None,
-    coherence_length: CoherenceLength = None,
     angle: Annotated[
         str, typer.Option(help="angle of incidence for --view, degrees: a number, several (0,30), or first:last:step")
     ] = "0",

@@ -17,32 +17,20 @@ from ..rigorous.spectrum import RigorousSpectrum
 from ..settings import ORIGINS, REPRESENTATIONS, SUN_COHERENCE_LENGTH, THEORIES
 from ..surface.prepare import is_seam_visible, seam_steps
 from .arguments import (
-    Channel,
-    CoherenceLength,
-    Extent,
-    FillMissing,
-    HeightRange,
     Overwrite,
-    PixelSize,
-    Prepare,
-    Unit,
     check_suffix,
     options_of_scan,
     recipe_of,
     settings_of,
+    takes_scan,
 )
 
 
+@takes_scan
 def precompute(
     context: typer.Context,
     sources: Annotated[list[Path], typer.Argument(metavar="RECIPE|SCAN...", help="recipes (.toml), or scans")],
     output: Annotated[Path | None, typer.Option("-o", "--output", help="spectrum file; default: ./NAME.exr")] = None,
-    pixel_size: PixelSize = None,
-    height_range: HeightRange = None,
-    fill_missing: FillMissing = False,
-    channel: Channel = None,
-    unit: Unit = None,
-    prepare: Prepare = None,
     representation: Annotated[str | None, typer.Option(help=f"{', '.join(REPRESENTATIONS)}; default: auto")] = None,
     tolerance: Annotated[
         float | None,
@@ -62,11 +50,9 @@ def precompute(
     int_ior: Annotated[float | None, typer.Option(help="for rigorous theory: the index of a dielectric")] = None,
     ext_ior: Annotated[float | None, typer.Option(help="for rigorous theory: the index of a coat; default: 1")] = None,
     polarised: Annotated[bool, typer.Option("--polarised", help="for rigorous theory: with Mueller matrices")] = False,
-    extent: Extent = None,
     largest_angle: Annotated[
         float | None, typer.Option(help="maximum angle of incidence or exit in the scene, degrees; default: 90")
     ] = None,
-    coherence_length: CoherenceLength = None,
     largest_height_range: Annotated[float | None, typer.Option(help="refuse deeper surfaces, µm; default: 20")] = None,
     overwrite: Overwrite = False,
 ) -> None:
@@ -76,17 +62,19 @@ def precompute(
     targets = [output or Path(source.name or "spectrum").with_suffix(".exr") for source in sources]
     for target in targets:
         check_suffix("-o", target, ".exr")
-    max_pixel_size = SUN_COHERENCE_LENGTH if coherence_length is None else coherence_length
+    pixel_size, settings = context.params["pixel_size"], settings_of(context)
+    max_pixel_size = settings.get("coherence_length", SUN_COHERENCE_LENGTH)
     if pixel_size is not None and pixel_size > max_pixel_size:
         raise RequestError(
             f"--pixel-size: got {pixel_size:g} µm, wanted at most the coherence length, {max_pixel_size:g} µm: with "
             "larger pixels there is a single height within the coherence length, and no diffraction"
         )
-    recipes = [recipe_of(source, options_of_scan(context), settings_of(context)) for source in sources]
+    recipes = [recipe_of(source, options_of_scan(context), settings) for source in sources]
     reads = [*sources, *(file for recipe in recipes for file in recipe.files)]
     writes = [("-o" if output else f"spectrum of {s}", t) for s, t in zip(sources, targets, strict=True)]
     check_outputs(reads, writes, overwrite=overwrite)
-    seams = [_seam(source, recipe) if extent is None else "" for source, recipe in zip(sources, recipes, strict=True)]
+    is_sure = "extent" in settings
+    seams = ["" if is_sure else _seam(source, recipe) for source, recipe in zip(sources, recipes, strict=True)]
     for source, recipe, target, seam in zip(sources, recipes, targets, seams, strict=True):
         with progress_bar(f"spectrum of {source.name}", "%") as progress:
             spectrum = recipe.build(progress)

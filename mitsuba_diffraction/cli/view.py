@@ -16,24 +16,19 @@ from ..progress import NAME, progress_bar, tell
 from ..viewer.page import page, reference_picture
 from ..viewer.surface import Surface
 from .arguments import (
-    Channel,
-    CoherenceLength,
-    Extent,
-    FillMissing,
-    HeightRange,
+    SCAN_OPTIONS,
     Overwrite,
-    PixelSize,
-    Prepare,
-    Unit,
     check_suffix,
     is_scan,
     options_of_scan,
     recipe_of,
     settings_of,
     surface_of,
+    takes_scan,
 )
 
 
+@takes_scan
 def view(
     context: typer.Context,
     source: Annotated[
@@ -49,14 +44,6 @@ def view(
         Path | None, typer.Option(help="a spectral picture (.exr) of `render`, for comparison in the page")
     ] = None,
     open_page: Annotated[bool, typer.Option("--open/--no-open", help="open the page in the browser")] = True,
-    pixel_size: PixelSize = None,
-    height_range: HeightRange = None,
-    fill_missing: FillMissing = False,
-    channel: Channel = None,
-    unit: Unit = None,
-    prepare: Prepare = None,
-    extent: Extent = None,
-    coherence_length: CoherenceLength = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Write a page that shades a surface live in the browser (WebGL2), without network."""
@@ -76,7 +63,7 @@ def view(
         surface = Surface.named(name, parameters, progress)
     else:
         spectrum = f"{path.stem}.exr"
-        options = _given(context) + (["--extent", "sample"] if of_a_scan and extent is None else [])
+        options = _given(context) + (["--extent", "sample"] if of_a_scan and "extent" not in settings else [])
         command = shlex.join([NAME, "precompute", str(path.resolve()), *options, "-o", spectrum])
         surface = Surface.of_recipe(recipe, path.stem, {"filename": spectrum}, parameters, progress, command)
     text = page(surface, picture)
@@ -90,16 +77,7 @@ def view(
 def _given(context: typer.Context) -> list[str]:
     """Return the given options of the scan and its spectrum as words."""
     words = []
-    for name in (
-        "pixel_size",
-        "height_range",
-        "fill_missing",
-        "channel",
-        "unit",
-        "prepare",
-        "extent",
-        "coherence_length",
-    ):
+    for name in SCAN_OPTIONS:
         value, option = context.params[name], f"--{name.replace('_', '-')}"
         if value is True:
             words.append(option)

@@ -10,17 +10,12 @@ import typer
 
 from ... import outputs
 from ...cli.arguments import (
-    Channel,
-    FillMissing,
-    HeightRange,
     Overwrite,
-    PixelSize,
-    Prepare,
-    Unit,
     Variant,
     options_of_scan,
     recipe_of,
     settings_of,
+    takes_scan,
 )
 from ...errors import RequestError
 from ...progress import progress_bar, show, tell
@@ -29,19 +24,11 @@ if TYPE_CHECKING:
     from ...recipe import Recipe
 
 
+@takes_scan
 def validate(
     context: typer.Context,
     surface: Annotated[
         Path | None, typer.Argument(metavar="[SURFACE]", help="check only this recipe (.toml) or scan")
-    ] = None,
-    pixel_size: PixelSize = None,
-    height_range: HeightRange = None,
-    fill_missing: FillMissing = False,
-    channel: Channel = None,
-    unit: Unit = None,
-    prepare: Prepare = None,
-    extent: Annotated[
-        str | None, typer.Option(help="tile or sample; default: that of the recipe, sample for a scan")
     ] = None,
     variant: Variant = None,
     json: Annotated[Path | None, typer.Option(help="save the results (.json)")] = None,
@@ -58,7 +45,9 @@ def validate(
     of_scan, settings = options_of_scan(context), settings_of(context)
     if surface is None and (of_scan or settings):
         names = ", ".join(f"--{name.replace('_', '-')}" for name in {**of_scan, **settings})
-        raise RequestError(f"{names}: got no surface; they go with a scan, --extent with a recipe, too")
+        raise RequestError(
+            f"{names}: got no surface; they go with a scan, --extent and --coherence-length with a recipe, too"
+        )
     chosen = choose_variant(variant)
     recipe = None if surface is None else _recipe(surface, of_scan, settings)
     reads = [] if surface is None else [surface, *recipe.files]
