@@ -47,6 +47,14 @@ PARAMETERS = (
     ),
     Parameter("fresnel", "string", "exact, or Schlick's approximation schlick", "exact"),
     Parameter(
+        "thin_film_thickness",
+        "float, texture or string",
+        "thickness of a film on the relief, µm along the normal, at most 2; a string is the file of a picture, whose "
+        "integers are from 0 (black) to 1 µm (white). Scalar theory only",
+        "0",
+    ),
+    Parameter("thin_film_ior", "float or string", "index of the film, as int_ior, or a name as of material", "none"),
+    Parameter(
         "orientation",
         "float, texture or string",
         "degrees from the tangent dp_du to the pattern's x axis; radial: x points away from the centre (0.5, 0.5) of "
@@ -113,6 +121,9 @@ reflections inside.
 With transmission (`geometry.py`), light is incident from above or below: q and κ contain the indices of both media,
 transmitted light has 1 − R instead of R, and its G is a different one (`geometry.k_g`). From below, the flat face of a
 sheet reflects specularly.
+
+A thin film on the relief (`thin_film.py`) changes R, and T, which is 1 − R without it. The phase e^{{iκh}} is the same
+at both of its faces.
 
 Under a coat (`coat.py`) all this holds for the wavelengths and directions inside it; its front face reflects
 specularly. A saved spectrum must cover the shorter wavelengths inside; one built from a recipe or a profile does.

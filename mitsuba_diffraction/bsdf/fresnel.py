@@ -19,27 +19,49 @@ MODELS = ("exact", "schlick")
 
 
 class Material:
-    """The reflectance of a material; by default it has no index and no parameters.
+    """The reflectance of a material, from `__call__` or `powers`; by default it has no index and no parameters.
 
     Attributes:
         transparent: whether transmitted light is not absorbed.
         wavelengths: range in which the reflectance is known, nm.
         model: one of `MODELS`.
         eta: relative index of refraction; of a metal its real part, as a texture.
+        outside: absolute index of the medium above, to which indices are relative.
+        varies: whether the material varies over the surface.
     """
 
     transparent: bool = False
     wavelengths: tuple[float, float] = (0.0, np.inf)
     model: str = "exact"
     eta: mi.Float | mi.Texture | None = None
+    outside: float = 1.0
+    varies: bool = False
 
     def __call__(self, si: mi.SurfaceInteraction3f, cos_half: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
-        """Return R at the cosine ω_i·h."""
+        """Return R at the cosine ω_i·h, negative for light from below."""
+        return self.powers(si, cos_half, active)[0]
+
+    def powers(
+        self, si: mi.SurfaceInteraction3f, cos_half: mi.Float, active: mi.Bool
+    ) -> tuple[mi.UnpolarizedSpectrum, mi.UnpolarizedSpectrum]:
+        """Return R, and T of a transparent material, at the cosine ω_i·h."""
+        reflected = self(si, cos_half, active)
+        return reflected, 1 - reflected
+
+    def index(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> list[mi.Complex2f]:
+        """Return n + ik of each wavelength."""
         raise NotImplementedError
 
-    def index(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> list[mi.Complex2f] | None:
-        """Return n + ik of each wavelength; None if the model, as Schlick's formula, has no polarisation."""
-        return None
+    def planes(
+        self, si: mi.SurfaceInteraction3f, cos_half: mi.Float, reflects: mi.Bool, active: mi.Bool
+    ) -> list[mi.Matrix4f]:
+        """Return the Mueller matrices of a plane between its s axes at each wavelength, up to a factor.
+
+        A material without polarisation, such as Schlick's formula, depolarises.
+        """
+        depolariser = mi.Matrix4f(0)
+        depolariser[0, 0] = mi.Float(1.0)
+        return [depolariser] * len(si.wavelengths)
 
     def update(self) -> None:
         """Recompute what depends on the parameters."""
@@ -93,7 +115,8 @@ class Dielectric(Material):
     transparent = True
 
     def __init__(self, int_ior: float | str, ext_ior: float | str, model: str) -> None:
-        self.eta = mi.Float(absolute_index("int_ior", int_ior) / absolute_index("ext_ior", ext_ior))
+        self.outside = absolute_index("ext_ior", ext_ior)
+        self.eta = mi.Float(absolute_index("int_ior", int_ior) / self.outside)
         self.model = model
         self.update()
 
@@ -106,8 +129,17 @@ class Dielectric(Material):
             return mi.UnpolarizedSpectrum(mi.fresnel(cos_half, self.eta)[0])
         return mi.UnpolarizedSpectrum(_schlick(dr.square((self.eta - 1) / (self.eta + 1)), cos_half))
 
-    def index(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> list[mi.Complex2f] | None:
-        return None if self.model == "schlick" else [mi.Complex2f(self.eta, 0)] * len(mi.UnpolarizedSpectrum(0.0))
+    def index(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> list[mi.Complex2f]:
+        return [mi.Complex2f(self.eta, 0)] * len(si.wavelengths)
+
+    def planes(
+        self, si: mi.SurfaceInteraction3f, cos_half: mi.Float, reflects: mi.Bool, active: mi.Bool
+    ) -> list[mi.Matrix4f]:
+        if self.model == "schlick":
+            return super().planes(si, cos_half, reflects, active)
+        cos, eta = dr.abs(cos_half), dr.select(cos_half > 0, self.eta, dr.rcp(self.eta))
+        reflection = mi.mueller.specular_reflection(cos, mi.Complex2f(eta, 0))
+        return [dr.select(reflects, reflection, mi.mueller.specular_transmission(cos, eta))] * len(si.wavelengths)
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         callback.put("eta", self.eta, mi.ParamFlags.Differentiable)
@@ -128,8 +160,7 @@ class Conductor(Material):
         except RequestError as error:
             raise RequestError(f"{error}; none is the perfect mirror, R = 1") from None
         self.eta, self.k = (self._spectrum(wavelengths, values / outside) for values in index)
-        self.material = material
-        self.model = model
+        self.material, self.model, self.outside = material, model, outside
 
     @staticmethod
     def _spectrum(wavelengths: NDArray[np.float64], values: NDArray[np.float64]) -> mi.Texture:
@@ -146,11 +177,16 @@ class Conductor(Material):
         normal = (dr.square(eta - 1) + dr.square(k)) / (dr.square(eta + 1) + dr.square(k))
         return _schlick(normal, cos_half)
 
-    def index(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> list[mi.Complex2f] | None:
-        if self.model == "schlick":
-            return None
+    def index(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> list[mi.Complex2f]:
         eta, k = self.eta.eval(si, active), self.k.eval(si, active)
         return [mi.Complex2f(*of_channel) for of_channel in zip(eta, k, strict=True)]
+
+    def planes(
+        self, si: mi.SurfaceInteraction3f, cos_half: mi.Float, reflects: mi.Bool, active: mi.Bool
+    ) -> list[mi.Matrix4f]:
+        if self.model == "schlick":
+            return super().planes(si, cos_half, reflects, active)
+        return [mi.mueller.specular_reflection(cos_half, n) for n in self.index(si, active)]
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         callback.put("eta", self.eta, mi.ParamFlags.Differentiable)

@@ -240,16 +240,21 @@ class Grating:
         return covered, replaced
 
     def transmittance(self, si: mi.SurfaceInteraction3f, cos: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
-        """Return 1 − R, times T of the coat, at the cosine of an angle outside."""
-        transmitted = 1 - self.reflectance(si, cos, active)
+        """Return T of a plane, times that of the coat, at the cosine of an angle outside."""
+        transmitted = self._powers(si, cos, active)[1]
         if self.coat is None:
             return transmitted
         return self.coat.transmittance(cos, self.coat.cos_inside(cos)) * transmitted
 
     def reflectance(self, si: mi.SurfaceInteraction3f, cos: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
         """Return R of a plane below the coat, at the cosine of an angle outside."""
+        return self._powers(si, cos, active)[0]
+
+    def _powers(
+        self, si: mi.SurfaceInteraction3f, cos: mi.Float, active: mi.Bool
+    ) -> tuple[mi.UnpolarizedSpectrum, mi.UnpolarizedSpectrum]:
         _, si = self._covered(si)
-        return self.theory.material(si, cos if self.coat is None else self.coat.cos_inside(cos), active)
+        return self.theory.material.powers(si, cos if self.coat is None else self.coat.cos_inside(cos), active)
 
     def sample(
         self,

@@ -11,7 +11,7 @@ from .base import base_from
 from .geometry import Interface, rotated
 from .grating import Grating
 from .parameters import GratingRequest
-from .polarisation import of_plane, reflected
+from .polarisation import of_facets, reflected
 from .tables import BELOW_ONE, smaller
 
 MIN_LAYER_PROBABILITY = 0.1  # of sampling the grating, and its base, as their powers are only estimated
@@ -55,7 +55,8 @@ class Layers:
         self.base = base_from(props)
         self.grating = Grating(props, request)
         flags = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.Anisotropic | mi.BSDFFlags.FrontSide
-        varies = self.grating.orientation.is_spatially_varying() or any(scale.varies for scale in self.grating.scales)
+        varying = [*self.grating.scales, self.grating.theory.material]
+        varies = self.grating.orientation.is_spatially_varying() or any(part.varies for part in varying)
         if varies or self.grating.from_radius:
             flags = flags | mi.BSDFFlags.SpatiallyVarying
         self.components = [+flags, *(self.base.components if self.base is not None else [])]
@@ -195,7 +196,11 @@ class Layers:
         if not mi.is_polarized:
             return value
         eta = self.interface.eta if self.coat is None else self.coat.eta
-        split = of_plane(value, [mi.Complex2f(eta, 0)] * len(value))
+
+        def planes(cos_half: mi.Float, reflects: mi.Bool) -> list[mi.Matrix4f]:
+            return [mi.mueller.specular_reflection(dr.abs(cos_half), mi.Complex2f(eta, 0))] * len(value)
+
+        split = of_facets(value, planes, eta)
         return reflected(split, si.wi, mi.reflect(si.wi), ctx.mode)
 
     def _sample_below(

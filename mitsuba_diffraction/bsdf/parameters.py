@@ -20,6 +20,7 @@ from ..surface.gratings import PROFILES
 from .base import nested_plugin
 from .coat import SAME_INDEX, Coat, absolute_index, coat_from
 from .fresnel import Conductor, Material, PerfectMirror, reflectance_from
+from .thin_film import with_film
 from .varying import VaryingNumber, check_texture, numbers_from
 
 _PREFIX = "handed over: "
@@ -30,6 +31,8 @@ _SCALAR_ONLY = {
     "base": "transmitted light is not computed; leave it out",
     "shadowing": "it is part of the efficiencies; leave it out",
     "fresnel": "it is part of the efficiencies; leave it out",
+    "thin_film_thickness": "its tables are of bare surfaces; leave it out",
+    "thin_film_ior": "its tables are of bare surfaces; leave it out",
 }
 
 
@@ -381,7 +384,7 @@ class GratingRequest:
             orientation = props.get_texture("orientation", 0.0)
         check_texture("orientation", orientation)
         surface = surface_from(props, media, scales.max_scale)
-        material = reflectance_from(props, media.coat)
+        material = with_film(props, reflectance_from(props, media.coat))
         if media.eta is not None and material.model == "schlick":
             raise RequestError("fresnel: got 'schlick' with a transmission, wanted 'exact'")
         if "base" in props and not material.transparent:

@@ -60,52 +60,32 @@ def through_layer(
     )
 
 
-def unpolarised(value: mi.UnpolarizedSpectrum) -> Split:
-    """Return the matrix of a depolarising grating."""
-    return lambda *_: mi.depolarizer(value)
-
-
-def of_plane(value: mi.UnpolarizedSpectrum, index: list[mi.Complex2f]) -> Split:
-    """Return the matrix of a plane perpendicular to h, scaled to `value` for unpolarised light.
+def of_facets(
+    value: mi.UnpolarizedSpectrum, planes: Callable[[mi.Float, mi.Bool], list[mi.Matrix4f]], eta: mi.Float
+) -> Split:
+    """Return the matrix of a plane perpendicular to h, the normal of the facet that reflects or refracts a pair.
 
     Args:
-        value: R K G E S/λ² cos θ_o, R the mean of R_s and R_p at the half vector.
-        index: n + ik of every wavelength, relative to the medium above.
-    """
-
-    def split(source: mi.Vector3f, exit_: mi.Vector3f, source_axis: mi.Vector3f, exit_axis: mi.Vector3f) -> mi.Spectrum:
-        half = dr.normalize(source + exit_)
-        planes = [mi.mueller.specular_reflection(dr.dot(source, half), eta) for eta in index]
-        return _of_facet(value, planes, half, source, exit_, source_axis, exit_axis)
-
-    return split
-
-
-def of_interface(value: mi.UnpolarizedSpectrum, eta: mi.Float) -> Split:
-    """Return the matrix of a plane perpendicular to h, the normal of the facet that refracts or reflects the pair.
-
-    Args:
-        value: as of `of_plane`, or that of transmitted light.
+        value: R K G E S/λ² cos θ_o of unpolarised light, R the mean of R_s and R_p at the half vector, or that of
+            transmitted light.
+        planes: returns the matrices between s axes at each wavelength, up to a factor, from the cosine of the direction
+            of incidence and h, negative from below, and from whether light is reflected.
         eta: index below relative to that above.
     """
 
     def split(source: mi.Vector3f, exit_: mi.Vector3f, source_axis: mi.Vector3f, exit_axis: mi.Vector3f) -> mi.Spectrum:
         n_i, n_o = (dr.select(omega.z > 0, 1, eta) for omega in (source, exit_))
-        reflects = (source.z > 0) == (exit_.z > 0)
         half = dr.normalize(n_i * source + n_o * exit_)
         cos_half = dr.abs(dr.dot(source, half))
-        other = dr.select(reflects, dr.select(source.z > 0, eta, dr.rcp(eta)), n_o / n_i)
-        reflection = mi.mueller.specular_reflection(cos_half, mi.Complex2f(other, 0))
-        transmission = mi.mueller.specular_transmission(cos_half, other)
-        plane = dr.select(reflects, reflection, transmission)
-        return _of_facet(value, [plane] * len(value), half, source, exit_, source_axis, exit_axis)
+        found = planes(dr.select(source.z > 0, cos_half, -cos_half), (source.z > 0) == (exit_.z > 0))
+        return _of_facet(value, found, half, source, exit_, source_axis, exit_axis)
 
     return split
 
 
 def _of_facet(
     value: mi.UnpolarizedSpectrum,
-    planes: list[mi.Spectrum],
+    planes: list[mi.Matrix4f],
     half: mi.Vector3f,
     source: mi.Vector3f,
     exit_: mi.Vector3f,

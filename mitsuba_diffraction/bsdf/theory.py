@@ -25,7 +25,7 @@ from .geometry import Geometry, Incidence, Interface, rotated
 from .order_sampler import MAX_INDEX_CHANGE
 from .orders import OrderSpectrum
 from .parameters import GratingRequest, Media, check_parameters, check_transmission
-from .polarisation import Split, of_interface, of_orders, of_plane, unpolarised
+from .polarisation import Split, of_facets, of_orders
 from .rigorous_orders import RigorousOrders
 from .shared import SharedTables
 from .tables import opaque
@@ -105,7 +105,7 @@ class Theory(Protocol):
         """
 
     def reflectance(self, si: mi.SurfaceInteraction3f, geometry: Geometry, active: mi.Bool) -> mi.UnpolarizedSpectrum:
-        """Return R at the half vector, or 1 − R of transmitted light; one where it is part of the efficiencies."""
+        """Return R at the half vector, or T of transmitted light; one where it is part of the efficiencies."""
 
     def split(
         self,
@@ -229,8 +229,7 @@ class ScalarTheory(Theory):
         return power, density
 
     def reflectance(self, si: mi.SurfaceInteraction3f, geometry: Geometry, active: mi.Bool) -> mi.UnpolarizedSpectrum:
-        reflected = self.material(si, geometry.cos_half(), active)
-        return dr.select(geometry.reflects, reflected, 1 - reflected)
+        return dr.select(geometry.reflects, *self.material.powers(si, geometry.cos_half(), active))
 
     def split(
         self,
@@ -239,10 +238,10 @@ class ScalarTheory(Theory):
         frame: tuple[mi.Float, mi.Float],
         active: mi.Bool,
     ) -> Split:
-        index = self.material.index(si, active)
-        if index is None:
-            return unpolarised(value)
-        return of_plane(value, index) if self.media.eta is None else of_interface(value, self.material.eta)
+        def planes(cos_half: mi.Float, reflects: mi.Bool) -> list[mi.Matrix4f]:
+            return self.material.planes(si, cos_half, reflects, active)
+
+        return of_facets(value, planes, self.interface.eta)
 
     def __str__(self) -> str:
         lines = {

@@ -66,6 +66,11 @@ NUMBERS = {
     "index": ("eta", 1.5, 0.02, {"int_ior": 1.5}),
     "index by Schlick": ("eta", 1.5, 0.02, {"int_ior": 1.5, "fresnel": "schlick"}),
     "index over a base": ("eta", 1.5, 0.02, {"int_ior": 1.5, "base": {"type": "diffuse"}}),
+    "film": ("thin_film_thickness", 0.1, 2e-3, {"int_ior": 1.5, "thin_film_ior": 2.35, "thin_film_thickness": 0.1}),
+    "film on metal": (
+        "thin_film_thickness",
+        *(0.2, 2e-3, {"material": "Au", "thin_film_ior": "Cu2O", "thin_film_thickness": 0.2}),
+    ),
 }
 
 
@@ -107,6 +112,20 @@ def test_the_derivative_by_the_index_of_a_metal_is_that_of_differences(key, fres
     assert abs(wanted) > 1e-3
     np.testing.assert_allclose(found[140], wanted, rtol=0.01)
     np.testing.assert_allclose(found.sum(), found[140], rtol=1e-4)
+
+
+def test_the_derivative_by_a_texture_of_thicknesses_is_that_of_differences():
+    start = np.float32([[0.08, 0.1], [0.12, 0.14]])[..., None]
+    total = Total("thin_film_thickness.data", int_ior=1.5, thin_film_ior=2.35, thin_film_thickness=bitmap(start))
+    x = mi.TensorXf(start)
+    dr.enable_grad(x)
+    dr.backward(total(x))
+    found = np.array(dr.grad(x))
+    step = np.zeros_like(start)
+    step[0, 1] = 1
+    wanted = difference(lambda t: total.number(mi.TensorXf(start + np.float32(t) * step)), 0.0, 2e-3)
+    assert abs(wanted) > 1e-3
+    np.testing.assert_allclose(found[0, 1, 0], wanted, rtol=0.01)
 
 
 def test_the_derivative_by_a_texture_of_orientations_is_that_of_differences():
