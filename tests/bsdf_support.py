@@ -2,6 +2,7 @@
 
 import functools
 import itertools
+import warnings
 
 import drjit as dr
 import mitsuba as mi
@@ -10,7 +11,9 @@ import pytest
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction import testing
+from mitsuba_diffraction.rigorous.build import build_spectrum
 from mitsuba_diffraction.rigorous.spectrum import Axes, RigorousSpectrum
+from mitsuba_diffraction.settings import Settings
 
 array, direction, floats, vectors = testing.array, testing.direction, testing.floats, testing.vectors
 WAVELENGTHS = (400.0, 500.0, 600.0, 700.0)
@@ -50,6 +53,25 @@ def made_up(coherence_length=65.0):
             eta = 1 + np.sin(0.6 * (come + a) + 1) ** 2 + np.sin(1 - 0.6 * (leave + a)) ** 2
             values[start + row] = np.multiply.outer(eta, wavelengths)[:, None] / (80 + 5 * (come - leave))
     return RigorousSpectrum(axes, values, None, "Al", 0j, coherence_length, 0.01, 0, 0, 0, 1, "made up", "")
+
+
+@functools.cache
+def coarse_glass(transmission):
+    """A coarse table of light reflected and transmitted by fine grooves in glass, with Mueller matrices."""
+    settings = Settings(
+        theory="rigorous",
+        int_ior=1.5,
+        wavelengths=(400.0, 500.0),
+        tolerance=0.2,
+        coherence_length=40.0,
+        polarised=True,
+        transmission=transmission,
+    )
+    with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        patch.setattr("mitsuba_diffraction.rigorous.build._SOLVED_STEPS_TRANSMISSION", ((3, 4, 3),))
+        patch.setattr("mitsuba_diffraction.rigorous.build._CHECK_COUNT", 40)
+        return build_spectrum(md.gratings.blazed(0.3, 0.05, samples=64), settings)
 
 
 def use(variant):

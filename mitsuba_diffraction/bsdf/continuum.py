@@ -23,9 +23,7 @@ class SplineSpectrum:
 
     resolved = False
 
-    def __init__(
-        self, spectrum: GratingSpectrum, typical_max_kappa: float | None = None, max_tangent: float = 1.0
-    ) -> None:
+    def __init__(self, spectrum: GratingSpectrum, typical_max_kappa: float | None = None) -> None:
         grid = spectrum.grid
         self.power = SlicePower(spectrum.table, (RIM, RIM))
         self.max_node_x, self.max_node_y = grid.max_order
@@ -33,7 +31,7 @@ class SplineSpectrum:
         self.per_area = opaque(1 / (grid.spacing[0] * grid.spacing[1]))
         self.limit_x, self.limit_y = (opaque(limit) for limit in grid.limit)
         self.per_width = opaque(1 / spectrum.lobe_width)
-        self.q_sampler = BinSampler(spectrum, typical_max_kappa, max_tangent)
+        self.q_sampler = BinSampler(spectrum, typical_max_kappa)
 
     def meets(self, q_x: mi.Float, q_y: mi.Float, scale: mi.Float | float) -> mi.Bool:
         """Return true: a continuum has no gaps."""

@@ -342,7 +342,6 @@ class Incidence:
         reflects: whether reflected light is considered, else transmitted light.
         index: n_i outside.
         radius: n_o/λ outside; the q that propagate fill the disc of this radius around −k_i,∥/λ.
-        cosine: √(1 − |k_i,∥|²/(n_o R)²), R the maximum of |k_i,∥|/n_o.
         q_sign: 1 or −1, the factor from the q at which the table is read to the q that is drawn.
         square: n_o² − |k_i,∥|².
         height_scale: factor of the heights.
@@ -362,7 +361,6 @@ class Incidence:
     reflects: mi.Bool
     index: mi.Float
     radius: mi.Float
-    cosine: mi.Float
     q_sign: mi.Float
     square: mi.Float
     height_scale: mi.Float
@@ -406,10 +404,6 @@ class Incidence:
         reflects = k_i.sign == k_o.sign
         assumed_sign = dr.select(reflects & (k_i.sign > 0), mi.Float(1), -1) if interface.mirrors_q else mi.Float(1.0)
         square = dr.square(k_o.index) - dr.square(k_i.index) + k_i.square
-        max_ratio = mi.Float(1.0)
-        if interface.transmits and not interface.is_sheet:
-            max_ratio = larger(interface.eta, interface.per_eta)
-        across = dr.squared_norm(k_i.tangent) / dr.square(k_o.index * max_ratio)
         snell = k_o.normal(larger(square, 0))
         undiffracted, steep = (dr.abs(k_i.z + k_o.sign * z) for z in (snell, 0.7 * snell))
         near_undiffracted = smaller(undiffracted, steep), dr.rcp(larger(dr.abs(undiffracted - steep), 1e-4))
@@ -424,7 +418,6 @@ class Incidence:
             reflects,
             k_i.index,
             k_o.index,
-            dr.safe_sqrt(1 - across),
             assumed_sign * kappa_sign,
             square,
             mi.Float(height_scale),

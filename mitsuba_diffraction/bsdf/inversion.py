@@ -48,13 +48,9 @@ class KappaBins:
         return mi.Vector4f(*(fractions[bin_ + 1] - fractions[bin_] for bin_ in range(KAPPA_BINS)))
 
 
-def mean_powers(spectrum: GratingSpectrum, kappa_bins: KappaBins, uniform_fraction: float = 0.0) -> NDArray[np.float64]:
-    """Return A_jm, (KAPPA_BINS, rows, columns): the powers averaged over each bin of κ and normalised to the sum one.
-
-    `uniform_fraction` of the sum is divided equally among the orders, so that those are drawn that are strong at few κ.
-    """
-    means = np.stack([_mean_power(spectrum, *ends) for ends in itertools.pairwise(kappa_bins.ends)])
-    return (1 - uniform_fraction) * means + uniform_fraction / means[0].size
+def mean_powers(spectrum: GratingSpectrum, kappa_bins: KappaBins) -> NDArray[np.float64]:
+    """Return the powers averaged over each bin of κ and normalised to the sum one: (KAPPA_BINS, rows, columns)."""
+    return np.stack([_mean_power(spectrum, *ends) for ends in itertools.pairwise(kappa_bins.ends)])
 
 
 def _mean_power(spectrum: GratingSpectrum, first: float, end: float) -> NDArray[np.float64]:

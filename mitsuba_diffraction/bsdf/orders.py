@@ -13,7 +13,7 @@ import scipy.special
 from ..grating_spectrum import GratingSpectrum
 from ..spectrum.grids import LobeAxis
 from ..spectrum.tables import HALF_SCALE, AmplitudeTable, SliceTable, shared_exponents
-from .continuum_sampler import BinSampler, LineSampler
+from .continuum_sampler import BinSampler
 from .geometry import Geometry, Incidence
 from .inversion import truncated_gaussian
 from .order_sampler import OrderSampler
@@ -274,7 +274,7 @@ def _hermite(
     return low + t * (low_slope + t * (square + t * cube)), low_slope + t * (2 * square + t * 3 * cube)
 
 
-# cycles/µm: for line gratings with wider lobes, which the horizon truncates, a `LineSampler` draws q instead of orders.
+# cycles/µm: for line gratings with wider lobes, which the horizon truncates, q is drawn instead of an order.
 MAX_DRAWN_LOBE_WIDTH = 0.03
 
 
@@ -285,15 +285,12 @@ class OrderSpectrum:
     large as the coherence length, 4 × 4 orders do.
 
     For resolved orders the density is Σ_m P_m N(q − m/T), with P_m of an `OrderSampler`, which depends on the media and
-    scales of a scene. For other line gratings, whose lobes overlap or are wide, it is that of `LineSampler`, for other
-    tiles that of `BinSampler`.
+    scales of a scene. For overlapping orders, and for line gratings with wide lobes, it is that of `BinSampler`.
 
     Lobes of resolved orders may be scaled.
     """
 
-    def __init__(
-        self, spectrum: GratingSpectrum, typical_max_kappa: float | None = None, max_tangent: float = 1.0
-    ) -> None:
+    def __init__(self, spectrum: GratingSpectrum, typical_max_kappa: float | None = None) -> None:
         grid, sigma = spectrum.grid, spectrum.lobe_width
         self.axes = tuple(
             _Axis(lobe, size, max_order, sigma)
@@ -303,13 +300,7 @@ class OrderSpectrum:
         self.resolved = all(axis.count == 1 for axis in self.axes) and not (is_line and sigma > MAX_DRAWN_LOBE_WIDTH)
         power = AmplitudePower if isinstance(spectrum.table, AmplitudeTable) else SlicePower
         self.power = power(spectrum.table, tuple(axis.rim for axis in self.axes), windows=not self.resolved)
-        self.q_sampler = None
-        if not self.resolved:
-            self.q_sampler = (
-                LineSampler(spectrum, typical_max_kappa)
-                if is_line
-                else BinSampler(spectrum, typical_max_kappa, max_tangent)
-            )
+        self.q_sampler = None if self.resolved else BinSampler(spectrum, typical_max_kappa)
         self.order_sampler: OrderSampler | None = None
         self.is_line = is_line
         self.per_width = opaque(1 / sigma)

@@ -42,7 +42,7 @@ class SharedTables:
             self.scattering = RigorousOrders(spectrum)
         else:
             represented = OrderSpectrum if isinstance(spectrum.grid, OrderGrid) else SplineSpectrum
-            self.scattering = represented(spectrum, *([] if eta is None else transmission_bounds(eta)))
+            self.scattering = represented(spectrum, *([] if eta is None else [typical_max_kappa(eta)]))
         self._spectrum, self._eta = spectrum, eta
         self._energy: tuple[tuple, Energy | None] | None = None
         self._orders: tuple[tuple, OrderSampler] | None = None
@@ -98,9 +98,9 @@ class SharedTables:
             return self._energy[1]
 
 
-def transmission_bounds(eta: float) -> tuple[float, float]:
-    """Return a bound of κ (rad/µm) for nearly all transmitted light, and the maximum of |k_i,∥|/n_o.
+def typical_max_kappa(eta: float) -> float:
+    """Return a bound of κ (rad/µm) for nearly all transmitted light.
 
-    The bound is 1.5 times κ = 2π |η − 1|/λ of undiffracted light along the normal, at the shortest visible λ.
+    It is 1.5 times κ = 2π |η − 1|/λ of undiffracted light along the normal, at the shortest visible λ.
     """
-    return 3 * np.pi * abs(eta - 1) / (VISIBLE[0] * 1e-3), max(eta, 1 / eta)
+    return 3 * np.pi * abs(eta - 1) / (VISIBLE[0] * 1e-3)

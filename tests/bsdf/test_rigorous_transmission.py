@@ -1,19 +1,24 @@
 """Transmission by rigorous theory: the BSDF against its tables in float64."""
 
-import warnings
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from bsdf_support import check_chi_square, direction, floats, interaction, random_directions, six_samples, use, vectors
+from bsdf_support import (
+    check_chi_square,
+    coarse_glass,
+    direction,
+    floats,
+    interaction,
+    random_directions,
+    six_samples,
+    use,
+    vectors,
+)
 from scipy.special import erf
 
 import mitsuba_diffraction as md
-from mitsuba_diffraction import gratings
-from mitsuba_diffraction.rigorous.build import build_spectrum
 from mitsuba_diffraction.rigorous.spectrum import Axes, RigorousSpectrum
-from mitsuba_diffraction.settings import Settings
 
 PERIOD, ETA, WAVELENGTH = 0.3, 1.5, 0.45
 WAVELENGTHS = (405.0, 440.0, 470.0, 498.0)
@@ -23,20 +28,7 @@ IMPORTANCE = mi.TransportMode.Importance
 @pytest.fixture(scope="module", params=["interface", "sheet"])
 def glass(request):
     """Return a coarse table of reflected and transmitted light, with Mueller matrices."""
-    settings = Settings(
-        theory="rigorous",
-        int_ior=ETA,
-        wavelengths=(400.0, 500.0),
-        tolerance=0.2,
-        coherence_length=40.0,
-        polarised=True,
-        transmission=request.param,
-    )
-    with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        patch.setattr("mitsuba_diffraction.rigorous.build._SOLVED_STEPS_TRANSMISSION", ((3, 4, 3),))
-        patch.setattr("mitsuba_diffraction.rigorous.build._CHECK_COUNT", 40)
-        return build_spectrum(gratings.blazed(PERIOD, 0.05, samples=64), settings)
+    return coarse_glass(request.param)
 
 
 @pytest.fixture(autouse=True)
