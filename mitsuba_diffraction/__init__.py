@@ -16,6 +16,7 @@ if TYPE_CHECKING:  # type checkers do not see what is imported on first use
     from . import reference, rigorous
     from .efficiency import efficiencies
     from .grating_spectrum import GratingSpectrum
+    from .inverse_design import design
     from .peaks import peak_efficiencies
     from .precomputation import precompute
     from .recipe import Recipe
@@ -28,6 +29,7 @@ _HOME = {
     "GratingSpectrum": "grating_spectrum",
     "HeightField": "surface.heightfield",
     "Recipe": "recipe",
+    "design": "inverse_design",
     "efficiencies": "efficiency",
     "gratings": "surface.gratings",
     "peak_efficiencies": "peaks",
@@ -42,6 +44,7 @@ __all__ = [
     "GratingSpectrum",
     "HeightField",
     "Recipe",
+    "design",
     "efficiencies",
     "gratings",
     "peak_efficiencies",

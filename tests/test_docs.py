@@ -23,10 +23,11 @@ from mitsuba_diffraction.evaluation.realtime_shader.quirks import Quirks
 ROOT = Path(__file__).parents[1]
 PACKAGE = Path(md.__file__).parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-SLOW = {"compare", "long_renders", "own_grating", "own_scan", "plugin", "reading_exr", "tolerance"}
+SLOW = {"compare", "design", "long_renders", "own_grating", "own_scan", "plugin", "reading_exr", "tolerance"}
 """Pages whose code takes long."""
 BLOCK = re.compile(r"^(?P<indent> *)```(?P<language>\w+)\n(?P<body>.*?)^ *```$", re.DOTALL | re.MULTILINE)
 REDUCED = {
+    "design": {"--texels": "8", "--iterations": "1"},
     "render": {"--width": "16", "--spp": "1"},
     "precompute": {"--tolerance": "0.05"},
     "compare": {"--width": "16", "--spp": "1", "--no-shares": None},

@@ -24,6 +24,7 @@ from typer.core import TyperCommand
 
 from ..errors import Bug, RequestError, is_bug
 from ..progress import NAME, say, tell
+from .design import design
 from .efficiency import efficiency
 from .examples import examples
 from .inspect import inspect
@@ -52,7 +53,7 @@ _EVALUATION_COMMANDS = ("compare", "convergence", "validate", "benchmark")
 _evaluation = (
     getattr(importlib.import_module(f"..evaluation.commands.{n}", __name__), n) for n in _EVALUATION_COMMANDS
 )
-for _command in (inspect, precompute, render, view, efficiency, examples, *_evaluation):
+for _command in (inspect, design, precompute, render, view, efficiency, examples, *_evaluation):
     app.command(cls=_Command)(_command)
 
 

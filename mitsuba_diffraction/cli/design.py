@@ -1,0 +1,127 @@
+"""`mitsuba-diffraction design`: from a picture to the relief that casts it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from numpy.typing import NDArray
+from PIL import Image
+
+from ..errors import RequestError
+from ..files import refuse_special
+from ..inverse_design import Design
+from ..inverse_design import design as search
+from ..inverse_design.output import SUFFIXES, save
+from ..outputs import check_outputs, free_name
+from ..progress import progress_bar, say, show, table, tell
+from .arguments import Overwrite, check_suffix, numbers
+from .render import Stopped
+
+
+def design(
+    target: Annotated[Path, typer.Argument(metavar="TARGET.png", help="the picture to cast, grey or RGB, opaque")],
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="relief (.gsf, .tif); default: ./TARGET_relief.gsf")
+    ] = None,
+    texel: Annotated[float, typer.Option(help="side of a texel, µm")] = 0.8,
+    texels: Annotated[int, typer.Option(help="texels along the period of the relief")] = 32,
+    height_range: Annotated[float, typer.Option(help="largest difference of heights, µm")] = 0.8,
+    angle: Annotated[
+        float, typer.Option(help="degrees from the mirror direction to the middle of an edge of the picture")
+    ] = 17.5,
+    wavelength: Annotated[
+        str | None, typer.Option(help="nm: one of a laser, several (450,550) or first:last:step; default: white light")
+    ] = None,
+    int_ior: Annotated[
+        float | None, typer.Option(help="index of a sheet that transmits the light; default: the relief reflects")
+    ] = None,
+    levels: Annotated[int | None, typer.Option(help="number of equidistant heights; default: continuous")] = None,
+    tool_blur: Annotated[float, typer.Option(help="standard deviation of the tool's blur, µm")] = 0.13,
+    iterations: Annotated[int, typer.Option(help="of the last search")] = 400,
+    seed: Annotated[int, typer.Option(help="of the random reliefs from which the search starts")] = 0,
+    overwrite: Overwrite = False,
+) -> None:
+    """Compute the relief that casts a picture in white light, or in that of a laser."""
+    default = free_name(f"{target.stem}_relief", lambda stem: [Path(stem + suffix) for suffix in SUFFIXES], [target])
+    path = output or Path(f"{default}.gsf")
+    check_suffix("-o", path, ".gsf", ".tif")
+    picture = read_target(target)
+    check_outputs([target], [("-o", path.with_suffix(suffix)) for suffix in SUFFIXES], overwrite=overwrite)
+    if picture.shape[0] != picture.shape[1]:
+        say("note", f"{target} has {picture.shape[1]} × {picture.shape[0]} pixels, and is cast as a square")
+    wavelengths = None if wavelength is None else numbers("--wavelength", wavelength)
+    with progress_bar(f"design of {target.name}", "iterations") as progress:
+        found = search(
+            picture,
+            texel,
+            texels,
+            height_range,
+            angle,
+            wavelengths,
+            int_ior,
+            levels,
+            tool_blur=tool_blur,
+            iterations=iterations,
+            seed=seed,
+            progress=progress,
+        )
+    paths = save(found, path)
+    _report(found)
+    relief, tiff, recipe, figure = paths
+    field = found.height_field
+    tell(
+        f"{relief}: one period, {field.tile_size[0]:.4g} × {field.tile_size[1]:.4g} µm\n{tiff}: the same, pixels of "
+        f"{field.pixel_size[0] * 1e3:.4g} nm, {height_range:g} µm from black to white; its top row is at the lowest "
+        f"y\n{recipe}: its recipe, for scenes\n{figure}: target, prediction and relief"
+    )
+    if found.warning:
+        tell(f"! {found.warning}")
+    if found.interrupted:
+        raise Stopped(f"{relief} holds the best relief so far")
+
+
+def read_target(path: Path) -> NDArray[np.float64]:
+    """Return linear radiance from 0 to 1, (rows, columns) or (rows, columns, 3), of a picture in sRGB.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is not an opaque picture.
+    """
+    refuse_special(path)
+    try:
+        with Image.open(path) as image:
+            has_alpha = image.mode.endswith("A") and image.getextrema()[-1] != (255, 255)
+            if has_alpha or "transparency" in image.info:
+                raise RequestError(f"{path}: got a picture with alpha, wanted an opaque one")
+            if image.mode.startswith("I"):
+                encoded = np.asarray(image, np.float64) / 65535
+            else:
+                encoded = np.asarray(image.convert("L" if image.mode in ("1", "L", "LA") else "RGB"), np.float64) / 255
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        if isinstance(error, RequestError) or getattr(error, "errno", None):
+            raise
+        raise RequestError(f"{path}: not a picture that can be read ({error})") from None
+    if encoded.ndim == 3 and (encoded == encoded[..., :1]).all():
+        encoded = encoded[..., 0]
+    # IEC 61966-2-1.
+    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+
+
+def _report(found: Design) -> None:
+    columns = ["wavelength", "in the target", "correlation", "unevenness", "mirror direction", *found.changed]
+    rows = [
+        [f"{wavelength:.0f} nm", f"{one[0]:.1%}", f"{one[1]:.3f}", f"{one[2]:.2f}", *(f"{x:.1%}" for x in one[3:])]
+        for wavelength, *one in zip(
+            found.wavelengths,
+            found.efficiency,
+            found.correlation,
+            found.unevenness,
+            found.mirror,
+            *found.changed.values(),
+            strict=True,
+        )
+    ]
+    show(table(columns, rows), width=130)

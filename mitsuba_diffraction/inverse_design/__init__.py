@@ -1,0 +1,6 @@
+"""From a picture to the relief that casts it: `design` (build.py) minimises the loss of far_field.py."""
+
+from .build import design
+from .result import Design
+
+__all__ = ["Design", "design"]

@@ -1,0 +1,244 @@
+"""`design`: the request and its checks, and the search for the relief."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from numbers import Integral
+
+import numpy as np
+import scipy.fft
+import scipy.ndimage
+import scipy.optimize
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import RequestError
+from ..progress import Progress, silent
+from ..rigorous.efficiencies import one_thread
+from ..settings import MIN_WAVELENGTH
+from .far_field import Array, FarField, bounds, lobes_in_bins, nearest_levels
+from .plate import Plate
+from .result import Design
+
+_WHITE = 1e3 / np.linspace(1e3 / 430, 1e3 / 670, 8)  # nm, equidistant in 1/λ
+_CHANNELS = (620.0, 540.0, 460.0)  # nm, of the red, green and blue of a target; linear between them
+_PER_TEXEL = 4  # pixels along a texel in the search
+_BINS_PER_ORDER = 1.5
+_STARTS, _FIRST_ITERATIONS = 6, 75
+_FIXED_FRACTIONS = (0.4, 0.7, 0.9, 1.0)  # of the texels, that are set to levels one round after the other
+_CORRECTIONS, _TOLERANCE = 20, 1e-8  # of L-BFGS-B: stored steps, and the decrease of L at which it ends
+
+
+@one_thread()
+def design(
+    target: ArrayLike,
+    texel: float = 0.8,
+    texels: int = 32,
+    height_range: float = 0.8,
+    angle: float = 17.5,
+    wavelengths: float | Sequence[float] | None = None,
+    int_ior: float | None = None,
+    levels: int | None = None,
+    *,
+    tool_blur: float = 0.13,
+    iterations: int = 400,
+    seed: int = 0,
+    progress: Progress = silent,
+) -> Design:
+    """Compute a relief that casts a picture, for light along its normal.
+
+    The relief is periodic, a square of `texels` × `texels` of constant height, blurred by the tool. Its heights
+    minimise the squared difference between the light in each direction and the wanted fraction (`FarField`), by
+    L-BFGS-B (Byrd et al. 1995) from the best of several random reliefs. The coherence length is half the period, so
+    that the orders merge into a picture.
+
+    Args:
+        target: the wanted radiance, (rows, columns), or (rows, columns, 3) for red, green and blue; ≥ 0, linear, rows
+            from the top. As seen on a screen: its right is +x of ω_o, its top +y, and the middles of its edges are at
+            direction cosines of ±sin(angle). All light of a wavelength is wanted in the target; that of a wavelength
+            between 620, 540 and 460 nm is the linear interpolation of red, green and blue.
+        texel: side of a texel, µm.
+        texels: along the period.
+        height_range: largest difference of heights, µm.
+        angle: from the mirror direction to the middle of an edge of the picture, degrees.
+        wavelengths: nm, one number for a laser; by default white light, 430–670 nm.
+        int_ior: index of a sheet that transmits the light, which falls on its relief; by default the relief reflects.
+        levels: number of equidistant heights; by default they are continuous.
+        tool_blur: standard deviation of the Gaussian by which the tool blurs heights, µm; 0 for none.
+        iterations: of the last search.
+        seed: of the random reliefs.
+        progress: called with (iterations done, iterations in all).
+
+    Returns:
+        The relief and its predicted far field. After a KeyboardInterrupt it is the best so far (`Design.interrupted`).
+
+    Raises:
+        ValueError: if an argument is out of range, or no relief of these texels can cast the target.
+    """
+    plate = Plate(
+        texel=texel,
+        texels=texels,
+        height_range=height_range,
+        angle=angle,
+        wavelengths=_wavelengths(wavelengths),
+        int_ior=int_ior,
+        levels=levels,
+        tool_blur=tool_blur,
+    )
+    for name, value, minimum in (("iterations", iterations, 1), ("seed", seed, 0)):
+        if not isinstance(value, Integral) or value < minimum:
+            raise RequestError(f"{name}: got {value!r}, wanted a whole number of at least {minimum}")
+    wanted = wanted_fractions(target, plate)
+    search = _Search(plate, wanted, iterations, progress)
+    interrupted = False
+    try:
+        search(seed)
+    except KeyboardInterrupt:
+        interrupted = True
+    heights = search.heights
+    if plate.levels is not None:  # interrupted, some may not be set yet
+        heights = nearest_levels(heights, plate.height_range, plate.levels)
+    return Design.of(heights, plate, wanted, interrupted)
+
+
+def _wavelengths(given: float | Sequence[float] | None) -> Array:
+    """Return the wavelengths in nm as an array."""
+    try:
+        found = _WHITE if given is None else np.atleast_1d(np.asarray(given, np.float64))
+    except (TypeError, ValueError):
+        found = np.zeros(0)
+    if found.ndim != 1 or not found.size or not ((found >= MIN_WAVELENGTH) & (found < np.inf)).all():
+        raise RequestError(f"wavelengths: got {given!r}, wanted one or several in nm, from {MIN_WAVELENGTH:g} nm on")
+    return found
+
+
+def wanted_fractions(target: ArrayLike, plate: Plate) -> Array:
+    """Return t, the wanted fraction of the light in each bin, (w, bins, bins), rows ↔ +y.
+
+    Raises:
+        ValueError: if the target is not a picture, is black at a wavelength, or lies in the mirror direction.
+    """
+    try:
+        picture = np.asarray(target, np.float64)
+    except (TypeError, ValueError):
+        raise RequestError(f"target: got {type(target).__name__}, wanted an array of numbers") from None
+    if picture.ndim == 3 and picture.shape[2] in (2, 4):
+        raise RequestError(f"target: got shape {picture.shape}, with alpha; wanted an opaque picture, grey or RGB")
+    if picture.size == 0 or not (picture.ndim == 2 or (picture.ndim == 3 and picture.shape[2] == 3)):
+        raise RequestError(f"target: got shape {picture.shape}, wanted (rows, columns) or (rows, columns, 3)")
+    if not (np.isfinite(picture).all() and picture.min() >= 0):
+        raise RequestError(
+            f"target: got {np.count_nonzero(~(picture >= 0) | np.isinf(picture))} values that are negative or not "
+            "finite, wanted linear radiance ≥ 0"
+        )
+    channels = picture[..., None] if picture.ndim == 2 else picture
+    count = math.ceil(_BINS_PER_ORDER * plate.orders_across)
+    rows, columns = (_overlaps(size, count) for size in channels.shape[:2])
+    binned = np.einsum("ir,rcs,jc->sij", rows, channels[::-1], columns)
+    if len(binned) == 3:
+        weights = np.stack([np.interp(plate.wavelengths, _CHANNELS[::-1], one) for one in np.eye(3)[:, ::-1]])
+        binned = np.einsum("sw,sij->wij", weights, binned)
+    else:
+        binned = np.repeat(binned, len(plate.wavelengths), axis=0)
+    near = np.hypot(*np.meshgrid(*2 * [(plate.edges(count)[1:] + plate.edges(count)[:-1]) / 2])) < plate.pitch
+    for wavelength, one in zip(plate.wavelengths, binned, strict=True):
+        if one.sum() == 0:
+            raise RequestError(f"target: got black at {wavelength:g} nm, wanted light somewhere")
+        if one[~near].sum() == 0:
+            raise RequestError(
+                f"target: at {wavelength:g} nm it is the mirror direction only (within {plate.pitch:.2g} of it), into "
+                "which a flat plate sends all light; wanted light elsewhere, too"
+            )
+    return binned / binned.sum(axis=(1, 2), keepdims=True)
+
+
+def _overlaps(pixels: int, bins: int) -> Array:
+    """Return the fraction of each pixel in each bin of the same length in all, (bins, pixels)."""
+    edges = np.linspace(0, pixels, bins + 1)
+    below = np.clip(edges[:, None] - np.arange(pixels), 0, 1)
+    return np.diff(below, axis=0)
+
+
+def far_field_of(plate: Plate, wanted: Array, coherence_length: float) -> FarField:
+    """Return the map from heights to light in the bins of `wanted`, (w, bins, bins), at a coherence length in µm."""
+    pixels, edges = plate.texels * _PER_TEXEL, plate.edges(wanted.shape[1])
+    orders = scipy.fft.fftfreq(pixels, 1 / pixels)
+    lobes = [lobes_in_bins(edges, orders, plate.period, w * 1e-3, coherence_length) for w in plate.wavelengths]
+    return FarField(plate.spread(_PER_TEXEL), plate.kappa, np.array(lobes), wanted)
+
+
+class _Search:
+    """The search for the heights of the texels; an exception, such as KeyboardInterrupt, loses nothing."""
+
+    def __init__(self, plate: Plate, wanted: Array, iterations: int, progress: Progress) -> None:
+        self._plate, self._wanted, self._iterations = plate, wanted, iterations
+        self._progress, self._done, self._total = progress, 0, _STARTS * 2 * _FIRST_ITERATIONS + iterations
+        # Loss and heights of the best relief of each start.
+        self._found: list[tuple[float, Array]] = []
+
+    @property
+    def heights(self) -> Array:
+        """Those of the smallest loss so far, (texels, texels) µm."""
+        flat = np.zeros(2 * (self._plate.texels,))
+        return min(self._found, key=lambda pair: pair[0], default=(0.0, flat))[1]
+
+    def __call__(self, seed: int) -> None:
+        """Search from random reliefs, first with lobes of twice the width, then from the best of them to the end."""
+        wide, own = (
+            far_field_of(self._plate, self._wanted, scale * self._plate.coherence_length) for scale in (0.5, 1.0)
+        )
+        random = np.random.default_rng(seed)
+        for _ in range(_STARTS):
+            heights = self._minimised(wide, self._random_relief(random), _FIRST_ITERATIONS)
+            self._minimised(own, heights, _FIRST_ITERATIONS)
+        if self._plate.levels is None:
+            self._minimised(own, self.heights, self._iterations)
+            return
+        heights, fixed = self.heights, None
+        for fraction in _FIXED_FRACTIONS:
+            heights = self._minimised(own, heights, self._iterations // len(_FIXED_FRACTIONS), fixed)
+            nearest = nearest_levels(heights, self._plate.height_range, self._plate.levels)
+            distance = np.abs(nearest - heights)
+            fixed = distance <= np.quantile(distance, fraction)
+            heights = np.where(fixed, nearest, heights)
+            self._found = [(own.loss(heights)[0], heights)]
+
+    def _random_relief(self, random: np.random.Generator) -> Array:
+        """Return smooth random heights, steep enough for light to reach the edges of the picture."""
+        plate = self._plate
+        # A facet of slope s directs light to the direction cosine s times the phase per height, κλ/2π.
+        phase = float(np.abs(plate.kappa * plate.wavelengths).mean()) * 1e-3 / (2 * np.pi)
+        length = plate.height_range * phase / (2 * np.sin(np.deg2rad(plate.angle)))
+        noise = random.standard_normal(2 * (plate.texels,))
+        smooth = scipy.ndimage.gaussian_filter(noise, min(length / plate.texel, plate.texels / 6), mode="wrap")
+        return plate.height_range * (smooth - smooth.min()) / max(np.ptp(smooth), 1e-30)
+
+    def _minimised(
+        self, far_field: FarField, heights: Array, iterations: int, fixed: NDArray[np.bool_] | None = None
+    ) -> Array:
+        """Return the heights of the smallest loss that L-BFGS-B finds from the given ones."""
+        self._found.append((math.inf, heights))
+
+        def loss(flat: Array) -> tuple[float, Array]:
+            value, gradient = far_field.loss(flat.reshape(heights.shape))
+            if value < self._found[-1][0]:
+                self._found[-1] = value, flat.reshape(heights.shape).copy()
+            return value, gradient.ravel()
+
+        begin = self._done
+
+        def report(_: object) -> None:
+            self._done += 1
+            self._progress(self._done, self._total)
+
+        scipy.optimize.minimize(
+            loss,
+            heights.ravel(),
+            jac=True,
+            method="L-BFGS-B",
+            bounds=bounds(heights, self._plate.height_range, fixed),
+            callback=report,
+            options={"maxiter": iterations, "maxcor": _CORRECTIONS, "ftol": _TOLERANCE, "gtol": 0.0},
+        )
+        self._done = begin + iterations
+        return self._found[-1][1]

@@ -1,0 +1,104 @@
+"""The far field of a relief of square texels, its distance from the wanted one, and the gradient of that.
+
+z = U h Uᵀ                                   heights of the pixels, from those of the texels, h (`blurred_texels`)
+η_m = |F_m|²,  F = fft2(e^{iκz})/N           power of each order, for light along the normal
+P = A_y η A_xᵀ                               power in each bin of direction cosines
+L = Σ (P − t)²/Σ t²                          t the wanted fraction of the light, Σ over bins and wavelengths
+
+∂L/∂P = 2 (P − t)/Σ t²,    g = A_yᵀ ∂L/∂P A_x
+∂L/∂z = 2 Re[conj(iκ e^{iκz}) · ifft2(g F)],    ∂L/∂h = Uᵀ ∂L/∂z U
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.fft
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import Bounds
+from scipy.special import ndtr
+
+from ..settings import lobe_width
+
+Array = NDArray[np.float64]
+
+
+def blurred_texels(texels: int, per_texel: int, blur: float) -> Array:
+    """Return U, (texels · per_texel, texels): squares convolved with a Gaussian, at the pixels of one period.
+
+    Args:
+        texels: along one period.
+        per_texel: pixels along a texel.
+        blur: standard deviation of the Gaussian in texels; 0 for none.
+    """
+    offset = (np.arange(texels * per_texel)[:, None] + 0.5) / per_texel - (np.arange(texels) + 0.5)
+    offset = (offset + texels / 2) % texels - texels / 2
+    width = max(blur, 1e-9)
+    return sum(
+        ndtr((offset + period + 0.5) / width) - ndtr((offset + period - 0.5) / width) for period in (-texels, 0, texels)
+    )
+
+
+def lobes_in_bins(edges: Array, orders: ArrayLike, period: float, wavelength: float, coherence_length: float) -> Array:
+    """Return A, (bins, orders): the integrals of the lobes of orders over bins along one axis.
+
+    With light along the normal, the lobe of the order m is a Gaussian about ω_o = −λ m/T of standard deviation λ σ_q.
+
+    Args:
+        edges: of the bins, ascending direction cosines, (bins + 1,).
+        orders: m, (orders,).
+        period: T, µm.
+        wavelength: λ, µm.
+        coherence_length: µm.
+    """
+    offset = edges[:, None] + wavelength * np.asarray(orders) / period
+    return np.diff(ndtr(offset / (wavelength * lobe_width(coherence_length))), axis=0)
+
+
+@dataclass(frozen=True, eq=False)
+class FarField:
+    """The map from heights of texels to the light in the bins of a picture, and what is wanted of it.
+
+    Attributes:
+        texels: U, (pixels, texels).
+        kappa: κ of each wavelength, (w,) rad/µm.
+        lobes: A of each wavelength, (w, bins, pixels), orders as in `scipy.fft.fftfreq`, the same along x and y.
+        wanted: t, (w, bins, bins), rows ↔ +y; sums to one for each wavelength.
+    """
+
+    texels: Array
+    kappa: Array
+    lobes: Array
+    wanted: Array
+
+    def relief(self, heights: Array) -> Array:
+        """Return z, (pixels, pixels) µm, of the heights h of the texels, rows ↔ +y."""
+        return self.texels @ heights @ self.texels.T
+
+    def loss(self, heights: Array) -> tuple[float, Array]:
+        """Return L and ∂L/∂h, (texels, texels) 1/µm, at the heights h of the texels in µm."""
+        z, total, gradient = self.relief(heights), 0.0, 0.0
+        scale = 1 / (self.wanted**2).sum()
+        for kappa, lobes, wanted in zip(self.kappa, self.lobes, self.wanted, strict=True):
+            wave = np.exp(1j * kappa * z)
+            amplitudes = scipy.fft.fft2(wave, norm="forward")
+            difference = lobes @ (amplitudes.real**2 + amplitudes.imag**2) @ lobes.T - wanted
+            total += scale * (difference**2).sum()
+            g = lobes.T @ (2 * scale * difference) @ lobes
+            gradient = gradient + 2 * kappa * (np.conj(1j * wave) * scipy.fft.ifft2(g * amplitudes)).real
+        return float(total), self.texels.T @ gradient @ self.texels
+
+
+def nearest_levels(heights: Array, height_range: float, levels: int) -> Array:
+    """Return the nearest of the levels k · height_range/(levels − 1), k = 0 … levels − 1."""
+    step = height_range / (levels - 1)
+    return np.clip(np.rint(heights / step), 0, levels - 1) * step
+
+
+def bounds(heights: Array, height_range: float, fixed: NDArray[np.bool_] | None = None) -> Bounds:
+    """Return 0 ≤ h ≤ height_range, and h as it is where `fixed`."""
+    low, high = np.zeros(heights.shape), np.full(heights.shape, height_range)
+    if fixed is not None:
+        low[fixed] = high[fixed] = heights[fixed]
+    return Bounds(low.ravel(), high.ravel())

@@ -1,0 +1,112 @@
+"""The files of a design: the relief as .gsf and 16-bit TIFF, its recipe, and a picture of what it casts."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from PIL import Image
+from scipy.interpolate import interp1d
+
+from ..color import daylight, into_gamut, on_screen, spectrum_to_linear_sRGB
+from ..files import whole_file
+from ..outputs import MARK, METADATA
+from ..settings import VISIBLE
+from ..surface.heightfield import HeightField
+from .far_field import Array
+from .result import Design
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+SUFFIXES = (".gsf", ".tif", ".toml", ".png")
+_IMAGE_DESCRIPTION = 270  # tag of TIFF
+_COLOUR_WAVELENGTHS = 41
+_PLOTTED_WAVELENGTHS = np.arange(400.0, 701.0, 10.0)  # nm
+
+
+def save(design: Design, path: str | os.PathLike[str]) -> tuple[Path, ...]:
+    """Write the files of a design, which have the name of `path` and the `SUFFIXES`; return their paths.
+
+    Row 0 of the relief is at the lowest y, as in all files that the package reads. White (65535) of the TIFF is
+    `height_range` of the design; its description says so.
+
+    Raises:
+        FileNotFoundError: if the folder does not exist.
+    """
+    paths = tuple(Path(path).with_suffix(suffix) for suffix in SUFFIXES)
+    field, plate = design.height_field, design.plate
+    with whole_file(paths[0]) as temporary:
+        temporary.write_bytes(_simple_field(field))
+    with whole_file(paths[1]) as temporary:
+        counts = np.rint(field.heights / plate.height_range * 65535).astype(np.uint16)
+        scale = (
+            f"{MARK}: {field.source}. Pixel size {field.pixel_size[0]:.6g} µm; height {plate.height_range:g} µm from "
+            "black (0) to white (65535); the top row is at the lowest y"
+        )
+        Image.fromarray(counts).save(temporary, "TIFF", tiffinfo={_IMAGE_DESCRIPTION: scale.replace("µ", "u")})
+    with whole_file(paths[2]) as temporary:
+        temporary.write_text(
+            f'# {MARK}: {field.source}\n[surface]\nscan = "{paths[0].name}"\n\n[spectrum]\nextent = "tile"\n'
+            f"coherence_length = {plate.coherence_length:.6g}\n",
+            encoding="utf-8",
+        )
+    save_picture(design, paths[3])
+    return paths
+
+
+def _simple_field(field: HeightField) -> bytes:
+    """Return the contents of a Gwyddion Simple Field."""
+    rows, columns = field.shape
+    width, height = (f"{1e-6 * length:.9g}" for length in field.tile_size)
+    header = (
+        f"Gwyddion Simple Field 1.0\nXRes = {columns}\nYRes = {rows}\nXReal = {width}\nYReal = {height}\n"
+        f"XYUnits = m\nZUnits = m\nTitle = {field.source}\nComment = {MARK}\n"
+    ).encode()
+    padding = b"\0" * (4 - len(header) % 4)
+    return header + padding + (1e-6 * field.heights).astype("<f4").tobytes()
+
+
+def save_picture(design: Design, path: str | os.PathLike[str]) -> None:
+    """Write target, predicted picture, relief and efficiency over wavelength as one PNG."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(15, 4), dpi=120, layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(1, 4, width_ratios=(1, 1, 1.15, 1.1))
+    edge = float(design.plate.edges(1)[1])
+    exposure = 1 / np.quantile(_linear_sRGB(design, design.wanted).max(axis=-1), 0.995)
+    for axes, name, light in ((panels[0], "target", design.wanted), (panels[1], "predicted", design.predicted)):
+        shown = on_screen(exposure * _linear_sRGB(design, light))
+        axes.imshow(shown, extent=(-edge, edge, -edge, edge), origin="lower")
+        axes.set(title=name, xlabel="$x$ of $\\omega_o$", ylabel="$y$ of $\\omega_o$")
+    field = design.height_field
+    image = panels[2].imshow(field.heights, extent=(0, field.tile_size[0], 0, field.tile_size[1]), origin="lower")
+    figure.colorbar(image, ax=panels[2], label="µm")
+    panels[2].set(title="relief, one period", xlabel="x, µm", ylabel="y, µm")
+    _plot_efficiency(panels[3], design)
+    with whole_file(path) as temporary:
+        figure.savefig(temporary, metadata=METADATA)
+
+
+def _linear_sRGB(design: Design, light: Array) -> Array:
+    """Return linear sRGB, (bins, bins, 3), of light in the bins, (w, bins, bins), under daylight; grey for a laser."""
+    own = design.wavelengths
+    if len(own) == 1:
+        return np.repeat(light[0][..., None], 3, axis=-1)
+    shown = np.linspace(own.min(), own.max(), _COLOUR_WAVELENGTHS)
+    spectra = interp1d(own, light, axis=0)(shown) * daylight(shown)[:, None, None]
+    white = spectrum_to_linear_sRGB(daylight(shown), shown)
+    return into_gamut(spectrum_to_linear_sRGB(np.moveaxis(spectra, 0, -1), shown) / white)
+
+
+def _plot_efficiency(axes: Axes, design: Design) -> None:
+    own, plotted = design.wavelengths, _PLOTTED_WAVELENGTHS
+    if not (own.min() >= VISIBLE[0] and own.max() <= VISIBLE[1]):
+        plotted = own.mean() * np.linspace(0.8, 1.2, 31)
+    axes.plot(plotted, 100 * design.efficiencies(plotted), color="black")
+    axes.plot(own, 100 * design.efficiency, "o", color="black", ms=4)
+    axes.set(title="light in the target", xlabel="wavelength, nm", ylabel="% of the light", ylim=(0, 100))

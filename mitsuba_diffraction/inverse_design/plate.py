@@ -1,0 +1,105 @@
+"""The plate that is designed: its texels, its light, and the directions of the picture."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from numbers import Integral
+
+import numpy as np
+
+from ..errors import RequestError, is_number
+from .far_field import Array, blurred_texels
+
+_MAX_TEXELS = 256
+
+
+@dataclass(frozen=True, eq=False)
+class Plate:
+    """A periodic relief of square texels, and its light; the arguments of `design`.
+
+    Raises:
+        ValueError: if one is out of range, or the texels cannot direct light to the edges of the picture.
+    """
+
+    texel: float
+    texels: int
+    height_range: float
+    angle: float
+    wavelengths: Array
+    int_ior: float | None
+    levels: int | None
+    tool_blur: float
+
+    def __post_init__(self) -> None:
+        for name, zero in (("texel", False), ("height_range", False), ("tool_blur", True)):
+            value = getattr(self, name)
+            if not is_number(value) or value < 0 or (value == 0 and not zero):
+                raise RequestError(f"{name}: got {value!r}, wanted a {'' if zero else 'positive '}number of µm")
+        whole = isinstance(self.texels, Integral) and not isinstance(self.texels, bool)
+        if not (whole and 4 <= self.texels <= _MAX_TEXELS):
+            raise RequestError(f"texels: got {self.texels!r}, wanted a whole number from 4 to {_MAX_TEXELS}")
+        if not (is_number(self.angle) and 0 < self.angle < 45):
+            raise RequestError(
+                f"angle: got {self.angle!r}, wanted degrees above 0 and below 45, where the corners of the picture are "
+                "at the horizon"
+            )
+        if self.int_ior is not None and not (is_number(self.int_ior) and 1 < self.int_ior <= 10):
+            raise RequestError(f"int_ior: got {self.int_ior!r}, wanted an index above 1, or none for a mirror")
+        if self.levels is not None and not (isinstance(self.levels, Integral) and self.levels >= 2):
+            raise RequestError(f"levels: got {self.levels!r}, wanted a whole number of at least 2")
+        longest = float(self.wavelengths.max()) * 1e-3
+        sine = math.sin(math.radians(self.angle))
+        if self.texel <= longest / 2:
+            raise RequestError(
+                f"texel: got {self.texel:g} µm, wanted more than half the wavelength, {longest / 2:.3g} µm: the first "
+                "order of texels that alternate would be evanescent"
+            )
+        if self.texel >= longest / sine:
+            raise RequestError(
+                f"texel: got {self.texel:g} µm with an angle of {self.angle:g}°, wanted less than {longest / sine:.3g} "
+                "µm (λ/sin angle): a flat texel sends no light further out"
+            )
+        if self.period * sine < 2 * longest:
+            raise RequestError(
+                f"texels: got {self.texels} of {self.texel:g} µm, wanted a period of at least {2 * longest / sine:.3g} "
+                f"µm (2 λ/sin angle): orders are {longest / self.period:.2g} apart, the picture ends at {sine:.2g}"
+            )
+
+    @property
+    def period(self) -> float:
+        """T in µm."""
+        return self.texel * self.texels
+
+    @property
+    def coherence_length(self) -> float:
+        """Half the period, in µm: the lobe of an order has a standard deviation of 0.9/T, so that orders merge."""
+        return self.period / 2
+
+    @property
+    def pitch(self) -> float:
+        """The largest distance of adjacent orders, λ/T, in direction cosines."""
+        return float(self.wavelengths.max()) * 1e-3 / self.period
+
+    @property
+    def orders_across(self) -> float:
+        """Orders of the shortest wavelength along an edge of the picture."""
+        return 2 * math.sin(math.radians(self.angle)) * self.period / (float(self.wavelengths.min()) * 1e-3)
+
+    @property
+    def kappa(self) -> Array:
+        """κ in rad/µm of each wavelength, (w,), halfway between the middle of the picture and its edge.
+
+        2π (1 + cos θ)/λ; of a sheet whose relief the light meets first, 2π (1 − √(n² − sin² θ))/λ, which is negative.
+        """
+        sine = math.sin(math.radians(self.angle)) / 2
+        path = 1 + math.sqrt(1 - sine**2) if self.int_ior is None else 1 - math.sqrt(self.int_ior**2 - sine**2)
+        return 2 * np.pi * path / (self.wavelengths * 1e-3)
+
+    def edges(self, bins: int) -> Array:
+        """Return the edges of bins of equal width across the picture, in direction cosines, (bins + 1,)."""
+        return np.linspace(-1, 1, bins + 1) * math.sin(math.radians(self.angle))
+
+    def spread(self, per_texel: int, blur_scale: float = 1.0) -> Array:
+        """Return U of `blurred_texels` for this plate, with a blur of the tool that is larger by a factor."""
+        return blurred_texels(self.texels, per_texel, blur_scale * self.tool_blur / self.texel)

@@ -1,0 +1,136 @@
+"""The result of a design: the relief, its predicted far field, and what errors of its making cost."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..geometry import diffracted
+from ..scalar_theory import scalar_error, tile_powers, transmitted_orders
+from ..surface.heightfield import HeightField
+from .far_field import Array, lobes_in_bins
+from .plate import Plate
+
+_PIXEL = 0.09  # µm, at most: resolves all frequencies that visible light reaches; in a sheet divided by its index
+_BRIGHT = 0.1  # of the maximum of a target: what is brighter is in the target
+# Of its making: factors of the heights and of the tool's blur.
+_ERRORS = {"depth −5 %": (0.95, 1.0), "depth +5 %": (1.05, 1.0), "blur −20 %": (1.0, 0.8), "blur +20 %": (1.0, 1.2)}
+
+
+@dataclass(frozen=True, eq=False)
+class Design:
+    """A relief and the light that it sends into the bins of the picture, as fractions of all light that leaves it.
+
+    Attributes:
+        height_field: one period; rows ↔ +y, as in all height fields.
+        plate: the request.
+        wanted, predicted: fraction of the light in each bin, (w, bins, bins), rows ↔ +y; `wanted` sums to one.
+        mirror: fraction in order 0, the mirror direction, (w,).
+        changed: efficiency after an error of making, (w,), by its name: "depth +5 %", "blur −20 %", …
+        interrupted: whether the search was interrupted.
+    """
+
+    height_field: HeightField
+    plate: Plate = field(repr=False)
+    wanted: Array = field(repr=False)
+    predicted: Array = field(repr=False)
+    mirror: Array
+    changed: Mapping[str, Array]
+    interrupted: bool = False
+
+    @classmethod
+    def of(cls, heights: Array, plate: Plate, wanted: Array, interrupted: bool = False) -> Design:
+        """Predict the far field of texels of the given heights, (texels, texels) µm."""
+        field = _relief(heights, plate)
+        predicted, mirror = _far_field(field, plate, plate.wavelengths, wanted.shape[1])
+        changed = {
+            name: _efficiency(_far_field(_relief(*scaled), plate, plate.wavelengths, wanted.shape[1])[0], wanted)
+            for name, (depth, blur) in _ERRORS.items()
+            for scaled in [(depth * heights, plate, blur)]
+        }
+        return cls(field, plate, wanted, predicted, mirror, changed, interrupted)
+
+    @property
+    def wavelengths(self) -> Array:
+        """In nm, (w,)."""
+        return self.plate.wavelengths
+
+    @property
+    def inside(self) -> NDArray[np.bool_]:
+        """The bins of the target: those brighter than a tenth of its maximum, (w, bins, bins)."""
+        return _inside(self.wanted)
+
+    @property
+    def efficiency(self) -> Array:
+        """The fraction of the light in the target, (w,)."""
+        return _efficiency(self.predicted, self.wanted)
+
+    @property
+    def correlation(self) -> Array:
+        """Pearson's correlation of wanted and predicted light over the bins, (w,)."""
+        pairs = zip(self.wanted, self.predicted, strict=True)
+        return np.array([np.corrcoef(t.ravel(), p.ravel())[0, 1] for t, p in pairs])
+
+    @property
+    def unevenness(self) -> Array:
+        """The standard deviation of predicted by wanted light over the target, relative to its mean, (w,)."""
+        ratios = [p[i] / t[i] for p, t, i in zip(self.predicted, self.wanted, self.inside, strict=True)]
+        return np.array([ratio.std() / ratio.mean() for ratio in ratios])
+
+    @property
+    def warning(self) -> str:
+        """A sentence if the relief is outside the range of scalar theory, otherwise ""."""
+        return scalar_error(self.height_field).warning
+
+    def efficiencies(self, wavelengths: Array) -> Array:
+        """Return the fraction of the light in the target at other wavelengths in nm, (n,).
+
+        The target is that of the nearest wavelength of the design.
+        """
+        nearest = np.abs(np.subtract.outer(wavelengths, self.wavelengths)).argmin(axis=1)
+        predicted = _far_field(self.height_field, self.plate, wavelengths, self.wanted.shape[1])[0]
+        return _efficiency(predicted, self.wanted[nearest])
+
+
+def _relief(heights: Array, plate: Plate, blur_scale: float = 1.0) -> HeightField:
+    """Return one period of the relief, in pixels of at most `_PIXEL`."""
+    per_texel = max(4, math.ceil(plate.texel / _PIXEL * (plate.int_ior or 1.0)))
+    spread = plate.spread(per_texel, blur_scale)
+    source = f"design of {plate.texels} × {plate.texels} texels of {plate.texel:g} µm"
+    return HeightField(spread @ heights @ spread.T, plate.texel / per_texel, source)
+
+
+def _far_field(relief: HeightField, plate: Plate, wavelengths: Array, bins: int) -> tuple[Array, Array]:
+    """Return the fractions of the light in the bins, (w, bins, bins), and in order 0, (w,).
+
+    The orders are those of the BSDF, each at its own κ, with K G or, of a sheet, K_t G_t (1 − F).
+    """
+    powers = tile_powers(relief, float(wavelengths.min()) * 1e-3)
+    edges, predicted, mirror = plate.edges(bins), [], []
+    for wavelength in wavelengths * 1e-3:
+        if plate.int_ior is None:
+            axis = np.arange(-int(plate.period / wavelength), int(plate.period / wavelength) + 1)
+            m = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+            found = diffracted(np.zeros(2), m * wavelength / plate.period)
+            m = m[found.kept]
+            power = found.k_g * powers(m, 2 * np.pi * found.v_z / wavelength)
+        else:
+            orders = transmitted_orders(powers, 2 * (plate.period,), wavelength, 0.0, plate.int_ior, sheet=True)
+            m, power = orders.m, orders.unpolarised
+        power = power / power.sum()
+        along_x, along_y = (lobes_in_bins(edges, one, plate.period, wavelength, plate.coherence_length) for one in m.T)
+        predicted.append((along_y * power) @ along_x.T)
+        mirror.append(power[(m == 0).all(axis=-1)].sum())
+    return np.array(predicted), np.array(mirror)
+
+
+def _inside(wanted: Array) -> NDArray[np.bool_]:
+    return wanted > _BRIGHT * wanted.max(axis=(1, 2), keepdims=True)
+
+
+def _efficiency(predicted: Array, wanted: Array) -> Array:
+    return np.where(_inside(wanted), predicted, 0).sum(axis=(1, 2))

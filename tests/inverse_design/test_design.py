@@ -1,0 +1,188 @@
+"""Designs: what the BSDF and the precomputed spectrum say of them, and requests that are refused."""
+
+import numpy as np
+import pytest
+
+import mitsuba_diffraction as md
+from mitsuba_diffraction.inverse_design import Design
+from mitsuba_diffraction.inverse_design.far_field import nearest_levels
+
+SMALL = {"texel": 1.0, "texels": 16, "iterations": 30}
+
+
+def lopsided(size=24):
+    """A heart with its left half wider, and a bar at its right: neither mirror image nor rotation is the same."""
+    y, x = np.mgrid[size : -size : size * 1j, -size : size : size * 1j] / size
+    a, b = (x + 0.25) / np.where(x < -0.25, 0.65, 0.5), (y - 0.05) / 0.65
+    return (((a**2 + b**2 - 1) ** 3 < a**2 * b**3) | ((x > 0.55) & (x < 0.8) & (y > -0.3))).astype(float)
+
+
+@pytest.fixture(scope="module")
+def laser():
+    return md.design(lopsided(), wavelengths=532, **SMALL)
+
+
+def spectrum_of(relief, design):
+    # Inside a sheet of index 1.5 wavelengths are shorter.
+    range_ = (240 if design.plate.int_ior else 520, 560)
+    return md.precompute(relief, coherence_length=design.plate.coherence_length, wavelengths=range_, tolerance=5e-3)
+
+
+def powers(design, value, count=2):
+    """The fractions of ∫ value du dv in the bins of the picture; value(x, y), (n, 2) → (n,)."""
+    edge, bins = float(design.plate.edges(1)[1]), design.wanted.shape[1]
+    step = 2 * edge / (bins * count)
+    outside = int(np.ceil((1 - edge) / step))
+    u = (np.arange(-outside, bins * count + outside) + 0.5) * step - edge
+    y, x = np.meshgrid(u, u, indexing="ij")
+    disc = np.hypot(x, y) < 0.999
+    density = np.zeros(x.shape)
+    density[disc] = value(x[disc], y[disc])
+    inner = slice(outside, outside + bins * count)
+    total = density.sum()
+    return density[inner, inner].reshape(bins, count, bins, count).sum(axis=(1, 3)) / total
+
+
+def test_a_design_for_a_laser_sends_most_light_into_the_target(laser):
+    assert laser.efficiency[0] > 0.65
+    assert laser.correlation[0] > 0.9
+    assert laser.mirror[0] < 0.02
+    flat = lopsided().mean()
+    assert laser.efficiency[0] > 1.5 * flat
+
+
+def test_the_prediction_is_that_of_precompute(laser):
+    spectrum = spectrum_of(laser.height_field, laser)
+
+    def density(x, y):
+        z = np.sqrt(1 - x**2 - y**2)
+        # K G = 1/cos θ_o near the normal, here for all directions: hardly any light is further out.
+        return spectrum.evaluate(-np.stack([x, y], -1) / 0.532, 2 * np.pi * (1 + z) / 0.532) / z
+
+    found = powers(laser, density)
+    assert found[laser.inside[0]].sum() == pytest.approx(laser.efficiency[0], rel=0.02)
+    assert np.abs(found - laser.predicted[0]).sum() < 0.03
+
+
+@pytest.mark.parametrize("request_", [{"wavelengths": 532}, {"wavelengths": 532, "int_ior": 1.5, "height_range": 1.6}])
+def test_the_bsdf_sends_light_where_the_design_says(request_, llvm):
+    import mitsuba as mi
+
+    from mitsuba_diffraction import testing
+
+    design = md.design(lopsided(), **{**SMALL, **request_})
+    sheet = {"int_ior": 1.5, "transmission": "sheet"} if design.plate.int_ior else {"material": "none"}
+    spectrum = spectrum_of(design.height_field, design)
+    bsdf = mi.load_dict({"type": "diffraction_grating", "spectrum": spectrum, **sheet})
+
+    def density(x, y):
+        z = np.sqrt(1 - x**2 - y**2)
+        wo = np.stack([x, y, -z if design.plate.int_ior else z], -1)
+        return testing.evaluate(bsdf, [0, 0, 1], wo, [532.0])[:, 0] / z
+
+    found = powers(design, density)
+    assert found[design.inside[0]].sum() == pytest.approx(design.efficiency[0], rel=0.02)
+    # Rows of the target from the top, those of the bins from the lowest y.
+    correlations = {
+        name: np.corrcoef(image.ravel(), design.wanted[0].ravel())[0, 1]
+        for name, image in {"": found, "x": found[:, ::-1], "y": found[::-1], "turned": found[::-1, ::-1]}.items()
+    }
+    assert correlations.pop("") > 0.9
+    assert max(correlations.values()) < 0.6
+
+
+def test_a_design_depends_on_its_seed_alone(laser):
+    again = md.design(lopsided(), wavelengths=532, **SMALL)
+    other = md.design(lopsided(), wavelengths=532, seed=1, **SMALL)
+    assert np.array_equal(again.height_field.heights, laser.height_field.heights)
+    assert not np.array_equal(other.height_field.heights, laser.height_field.heights)
+
+
+def test_a_search_among_levels_beats_rounding(laser):
+    stepped = md.design(lopsided(), wavelengths=532, levels=8, tool_blur=0, **SMALL)
+    assert len(np.unique(stepped.height_field.heights.round(9))) <= 8
+    # The blur of the tool does not reach the middle of a texel.
+    per_texel = len(laser.height_field.heights) // 16
+    heights = laser.height_field.heights[per_texel // 2 :: per_texel, per_texel // 2 :: per_texel]
+    rounded = Design.of(nearest_levels(heights, 0.8, 8), stepped.plate, stepped.wanted)
+    assert stepped.efficiency[0] > 1.1 * rounded.efficiency[0]
+
+
+def test_an_interrupted_design_is_the_best_so_far(laser):
+    def stop(done, total):
+        assert total == 930
+        if done == 100:
+            raise KeyboardInterrupt
+
+    found = md.design(lopsided(), wavelengths=532, progress=stop, **SMALL)
+    assert found.interrupted
+    assert not laser.interrupted
+    assert 0.5 < found.efficiency[0] < laser.efficiency[0]
+
+
+def test_errors_of_making_are_those_of_another_relief(laser):
+    deeper = md.HeightField(1.05 * laser.height_field.heights, laser.height_field.pixel_size)
+    spectrum = spectrum_of(deeper, laser)
+
+    def density(x, y):
+        z = np.sqrt(1 - x**2 - y**2)
+        return spectrum.evaluate(-np.stack([x, y], -1) / 0.532, 2 * np.pi * (1 + z) / 0.532) / z
+
+    found = powers(laser, density)[laser.inside[0]].sum()
+    assert laser.changed["depth +5 %"][0] == pytest.approx(found, rel=0.02)
+    assert abs(found - laser.efficiency[0]) > 0.005
+
+
+def test_white_light_is_directed_at_all_wavelengths():
+    found = md.design(lopsided(), texel=1.0, texels=16, iterations=100)
+    between = found.efficiencies(np.array([440.0, 500.0, 560.0, 620.0]))
+    assert found.efficiency.min() > 0.5
+    assert between.min() > 0.95 * found.efficiency.min()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [0.36, 0.55, 0.75])
+def test_the_default_plate_casts_compact_pictures(size):
+    """In white light 70 % of the light is inside, with a correlation of 0.9."""
+    y, x = np.mgrid[1:-1:48j, -1:1:48j]
+    target = (np.hypot(x, y) < size) if size < 0.5 else (np.abs(x) + np.abs(y - 0.1) < size * 1.25)
+    assert 0.1 < target.mean() < 0.5
+    found = md.design(target)
+    assert found.efficiency.min() > 0.7
+    assert found.correlation.min() > 0.9
+
+
+CENTRE = np.zeros((65, 65))
+CENTRE[31:34, 31:34] = 1
+
+
+@pytest.mark.parametrize(
+    ("target", "options", "message"),
+    [
+        (np.zeros((8, 8)), {}, "target: got black at 430 nm, wanted light somewhere"),
+        (np.zeros((0, 8)), {}, r"target: got shape \(0, 8\), wanted"),
+        (np.ones(8), {}, r"target: got shape \(8,\), wanted \(rows, columns\)"),
+        (np.full((8, 8), np.nan), {}, "target: got 64 values that are negative or not finite"),
+        (-np.eye(8), {}, "target: got 8 values that are negative"),
+        (np.ones((8, 8, 4)), {}, r"target: got shape \(8, 8, 4\), with alpha"),
+        ("heart.png", {}, "target: got str, wanted an array of numbers"),
+        (np.eye(8)[..., None] * [0, 0, 1], {}, "target: got black at 540"),
+        (CENTRE, {}, "target: at 430 nm it is the mirror direction only"),
+        (np.eye(8), {"texel": 0.3}, "texel: got 0.3 µm, wanted more than half the wavelength, 0.335 µm"),
+        (np.eye(8), {"texel": 3}, "texel: got 3 µm with an angle of 17.5°, wanted less than 2.23 µm"),
+        (np.eye(8), {"texels": 5}, "texels: got 5 of 0.8 µm, wanted a period of at least 4.46 µm"),
+        (np.eye(8), {"texels": 32.5}, "texels: got 32.5, wanted a whole number"),
+        (np.eye(8), {"height_range": 0}, "height_range: got 0, wanted a positive number of µm"),
+        (np.eye(8), {"tool_blur": -1}, "tool_blur: got -1, wanted a number of µm"),
+        (np.eye(8), {"angle": 50}, "angle: got 50, wanted degrees above 0 and below 45"),
+        (np.eye(8), {"wavelengths": 0.532}, "wavelengths: got 0.532, wanted one or several in nm"),
+        (np.eye(8), {"wavelengths": []}, r"wavelengths: got \[\], wanted one or several"),
+        (np.eye(8), {"int_ior": 1}, "int_ior: got 1, wanted an index above 1"),
+        (np.eye(8), {"levels": 1}, "levels: got 1, wanted a whole number of at least 2"),
+        (np.eye(8), {"iterations": 0}, "iterations: got 0, wanted a whole number of at least 1"),
+        (np.eye(8), {"seed": -1}, "seed: got -1, wanted a whole number of at least 0"),
+    ],
+)
+def test_mistakes_are_refused(target, options, message):
+    with pytest.raises(ValueError, match=message):
+        md.design(target, **options)

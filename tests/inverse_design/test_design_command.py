@@ -1,0 +1,99 @@
+"""The command `design`: its files, what it says, and mistakes in one line."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import mitsuba_diffraction as md
+from mitsuba_diffraction import cli
+from mitsuba_diffraction.cli.design import read_target
+from mitsuba_diffraction.outputs import check_outputs
+from mitsuba_diffraction.recipe import Recipe
+
+OPTIONS = "--texel 1 --texels 12 --wavelength 532 --iterations 10"
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    picture = np.zeros((24, 24), np.uint8)
+    picture[2:10, 12:22], picture[10:18, 12:15] = 255, 188  # 188 is half of the light of 255
+    Image.fromarray(picture).save("flag.png")
+    Image.fromarray(np.zeros_like(picture)).save("black.png")
+    Image.fromarray(np.dstack([picture] * 4)).save("alpha.png")
+    Path("text.png").write_text("no picture")
+    Path("cut.png").write_bytes(Path("flag.png").read_bytes()[:60])
+
+
+def test_a_design_is_written_as_relief_recipe_and_picture(command):
+    code, said, error = command(f"design flag.png {OPTIONS} --seed 3 -o plate.gsf")
+    assert (code, error) == (0, "")
+    assert "532 nm" in said
+    assert {path.name for path in Path().glob("plate.*")} == {"plate.gsf", "plate.tif", "plate.toml", "plate.png"}
+    options = {"texel": 1.0, "texels": 12, "wavelengths": 532, "iterations": 10, "seed": 3}
+    expected = md.design(read_target(Path("flag.png")), **options).height_field
+    field = md.read_height_field("plate.gsf")
+    assert field.pixel_size == pytest.approx(expected.pixel_size, rel=1e-6)
+    assert field.heights == pytest.approx(expected.heights, abs=1e-6)
+    counted = md.read_height_field("plate.tif", pixel_size=expected.pixel_size, height_range=0.8)
+    assert counted.heights == pytest.approx(expected.heights, abs=0.8 / 65535)
+    with Image.open("plate.tif") as tiff:
+        assert "Pixel size 0.0833333 um; height 0.8 um from black (0) to white (65535)" in tiff.tag_v2[270]
+    recipe = Recipe.load("plate.toml")
+    assert np.array_equal(recipe.height_field().heights, field.heights)
+    assert recipe.settings.coherence_length == 6
+    # Files of the package may be replaced.
+    check_outputs([], [("-o", path) for path in Path().glob("plate.*")])
+
+
+def test_a_target_is_a_picture_as_seen_on_a_screen():
+    found = read_target(Path("flag.png"))
+    assert found[5, 15] == 1
+    assert found[15, 13] == pytest.approx(0.503, abs=1e-3)
+    with Image.open("flag.png") as picture:
+        picture.convert("RGBA").save("opaque.png")
+    assert np.array_equal(read_target(Path("opaque.png")), found)
+
+
+def test_an_interrupted_command_writes_the_best_so_far(command, monkeypatch):
+    class Bar:
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            pass
+
+        def __call__(self, done, total):
+            if done == 40:
+                raise KeyboardInterrupt
+
+    monkeypatch.setitem(cli.design.__globals__, "progress_bar", lambda *_: Bar())
+    code, _, error = command(f"design flag.png {OPTIONS}")
+    assert code == 130
+    assert "flag_relief.gsf holds the best relief so far" in error
+    assert np.ptp(md.read_height_field("flag_relief.gsf").heights) > 0.1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("black.png", "target: got black at 430 nm, wanted light somewhere"),
+        ("alpha.png", "alpha.png: got a picture with alpha, wanted an opaque one"),
+        ("text.png", "text.png: not a picture that can be read"),
+        ("cut.png", "cut.png: not a picture that can be read"),
+        ("gone.png", "gone.png: no such file"),
+        ("flag.png -o plate.exr", "-o: got plate.exr, wanted a file name that ends in .gsf or .tif"),
+        ("flag.png -o flag.gsf", "-o: got flag.png, which is read"),
+        ("flag.png --wavelength red", "--wavelength: got 'red', wanted a number"),
+        ("flag.png --texel 0.2", "texel: got 0.2 µm, wanted more than half the wavelength"),
+        ("flag.png --levels 1", "levels: got 1, wanted a whole number of at least 2"),
+    ],
+)
+def test_mistakes_are_refused_in_one_line(command, arguments, message):
+    before = set(Path().iterdir())
+    code, said, error = command(f"design {arguments}")
+    assert (code, said, error.count("\n")) == (2, "", 1)
+    assert message in error
+    assert set(Path().iterdir()) == before

@@ -1,0 +1,99 @@
+"""The loss of a design, its gradient and its parts, against quadrature and differences."""
+
+import itertools
+
+import numpy as np
+import pytest
+import scipy.integrate
+import scipy.ndimage
+
+from mitsuba_diffraction.inverse_design.build import far_field_of, wanted_fractions
+from mitsuba_diffraction.inverse_design.far_field import blurred_texels, lobes_in_bins, nearest_levels
+from mitsuba_diffraction.inverse_design.plate import Plate
+from mitsuba_diffraction.reference import order_powers
+from mitsuba_diffraction.settings import lobe_width
+from mitsuba_diffraction.surface.heightfield import HeightField
+
+
+def plate(**changed):
+    request = {"texel": 1.0, "texels": 10, "height_range": 0.8, "angle": 16.0, "wavelengths": np.array([450.0, 600.0])}
+    return Plate(**{**request, "int_ior": None, "levels": None, "tool_blur": 0.2, **changed})
+
+
+@pytest.mark.parametrize("int_ior", [None, 1.5])
+def test_the_gradient_is_that_of_the_loss(int_ior):
+    one, random = plate(int_ior=int_ior), np.random.default_rng(3)
+    far_field = far_field_of(one, wanted_fractions(random.random((9, 7, 3)), one), one.coherence_length)
+    heights, direction = random.uniform(0, 0.8, (10, 10)), random.standard_normal((10, 10))
+    step = 1e-5
+    difference = far_field.loss(heights + step * direction)[0] - far_field.loss(heights - step * direction)[0]
+    gradient = far_field.loss(heights)[1]
+    assert (gradient * direction).sum() == pytest.approx(difference / (2 * step), rel=1e-7)
+
+
+def test_the_loss_compares_the_lobes_of_the_orders_with_the_target():
+    one, heights = plate(), np.random.default_rng(1).uniform(0, 0.8, (10, 10))
+    wanted = wanted_fractions(np.eye(8), one)
+    far_field = far_field_of(one, wanted, one.coherence_length)
+    relief = far_field.relief(heights)
+    field, total = HeightField(relief, one.period / len(relief)), 0.0
+    for wavelength, kappa, t in zip([0.45, 0.6], one.kappa, wanted, strict=True):
+        m = np.fft.fftfreq(len(relief), 1 / len(relief))
+        # Midpoint rule within the bins, for every order.
+        edges, fine = one.edges(len(t)), 40
+        u = (np.arange(len(t) * fine) + 0.5) / (len(t) * fine) * (edges[-1] - edges[0]) + edges[0]
+        sigma = wavelength * lobe_width(one.coherence_length)
+        lobes = np.exp(-((u[:, None] + wavelength * m / one.period) ** 2) / (2 * sigma**2))
+        lobes *= (u[1] - u[0]) / (np.sqrt(2 * np.pi) * sigma)
+        lobes = lobes.reshape(len(t), fine, -1).sum(1)
+        total += ((lobes @ order_powers(field, kappa) @ lobes.T - t) ** 2).sum()
+    assert far_field.loss(heights)[0] == pytest.approx(total / (wanted**2).sum(), rel=1e-4)
+
+
+def test_lobes_are_integrals_of_gaussians():
+    edges = np.array([-0.3, -0.1, 0.05])
+    found = lobes_in_bins(edges, [2], 12.0, 0.5, 6.0)[:, 0]
+    sigma = 0.5 * lobe_width(6.0)
+
+    def lobe(u):
+        return np.exp(-((u + 0.5 * 2 / 12) ** 2) / (2 * sigma**2)) / (np.sqrt(2 * np.pi) * sigma)
+
+    expected = [scipy.integrate.quad(lobe, *pair)[0] for pair in itertools.pairwise(edges)]
+    assert found == pytest.approx(expected, rel=1e-9)
+
+
+def test_texels_are_blurred_as_by_a_gaussian_filter():
+    per_texel = 400
+    squares = np.repeat(np.eye(5), per_texel, axis=0)
+    expected = scipy.ndimage.gaussian_filter1d(squares, 0.3 * per_texel, axis=0, mode="wrap", truncate=8)
+    assert blurred_texels(5, per_texel, 0.3) == pytest.approx(expected, abs=1e-5)
+    assert np.array_equal(blurred_texels(5, 4, 0), np.repeat(np.eye(5), 4, axis=0))
+
+
+def test_levels_are_equidistant():
+    found = nearest_levels(np.linspace(0, 0.7, 200), 0.7, 8)
+    assert np.unique(found) == pytest.approx(np.arange(8) / 10)
+    assert np.abs(found - np.linspace(0, 0.7, 200)).max() <= 0.05 + 1e-12
+
+
+def test_targets_have_their_top_at_positive_y_and_their_right_at_positive_x():
+    picture = np.zeros((30, 20))
+    picture[:10, 15:] = 1  # upper right: a third of the height, a quarter of the width
+    wanted = wanted_fractions(picture, plate())[0]
+    y, x = np.meshgrid(*2 * [(np.arange(len(wanted)) + 0.5) / len(wanted) * 2 - 1], indexing="ij")
+    assert wanted.sum() == pytest.approx(1)
+    assert (wanted * x).sum() == pytest.approx(0.75, abs=0.01)
+    assert (wanted * y).sum() == pytest.approx(2 / 3, abs=0.01)
+
+
+def test_colours_of_a_target_belong_to_wavelengths():
+    picture = np.zeros((8, 8, 3))
+    picture[:, :4, 0] = 1  # red on the left
+    picture[:, 4:, 2] = 1  # blue on the right
+    picture[:4, :, 1] = 1  # green above
+    blue, turquoise, green, red = wanted_fractions(picture, plate(wavelengths=np.array([430.0, 500, 540, 650])))
+    half = len(blue) // 2
+    assert blue[:, :half].sum() == pytest.approx(0, abs=1e-12)
+    assert red[:, half + 1 :].sum() == pytest.approx(0, abs=1e-12)
+    assert green[:half].sum() == pytest.approx(0, abs=1e-12)
+    assert turquoise == pytest.approx((blue + green) / 2)
