@@ -22,6 +22,7 @@ import numpy as np
 
 from .energy.table import EnergyTable
 from .errors import RequestError
+from .progress import stage
 from .settings import REPRESENTATIONS, Settings
 from .spectrum.exr import doubles, one_line, read, write
 from .spectrum.grids import OrderGrid, SplineGrid
@@ -62,7 +63,8 @@ class GratingSpectrum(PowerSpectrum):
 
     @cached_property
     def _energy(self) -> EnergyTable:
-        return EnergyTable.of(self) if self.energy is None else self.energy
+        with stage("bound of the albedo"):
+            return EnergyTable.of(self) if self.energy is None else self.energy
 
     def save(self, path: str | os.PathLike[str], recipe: str = "") -> None:
         """Write the spectrum as an OpenEXR file, atomically; `recipe` is the digest of its `Recipe`.

@@ -21,7 +21,11 @@ out = Console(highlight=False, soft_wrap=True)
 err = Console(stderr=True, highlight=False, soft_wrap=True)
 
 _MIN_REPORTED_SECONDS = 2.0  # of work before a log or a notebook shows progress
+_MIN_REPORTED_DURATION = 10.0  # s, of a command
 _lock = threading.Lock()
+_stages: list[str] = []  # nested blocks of code, the innermost last
+_durations: dict[str, float] = {}  # s, by the name of a stage
+_since = 0.0  # time at which the innermost stage began or went on
 _bars: list[Bars] = []  # the display common to all bars, as rich shows one at a time
 
 
@@ -38,6 +42,48 @@ def no_progress(label: str) -> Iterator[Progress]:
 def part(whole: Progress, begin: float, end: float) -> Progress:
     """Return a function that reports progress of a part of the whole, from `begin` to `end` in per cent."""
     return lambda done, total: whole(round(100 * (begin + (end - begin) * done / total)), 100)
+
+
+def _switch(change: Callable[[], None]) -> None:
+    """Count the time since the last call for the innermost stage; then `change` the stages."""
+    global _since
+    with _lock:
+        now = time.monotonic()
+        if _stages:
+            _durations[_stages[-1]] = _durations.get(_stages[-1], 0.0) + now - _since
+        _since = now
+        change()
+
+
+@contextmanager
+def stage(name: str) -> Iterator[None]:
+    """Name what a block of code does, for `durations` and the bars.
+
+    The time of an inner stage does not count for the outer one. Stages of several threads count as nested.
+    """
+    _switch(lambda: _stages.append(name))
+    try:
+        yield
+    finally:
+        _switch(lambda: _stages.remove(name))
+
+
+@contextmanager
+def durations() -> Iterator[None]:
+    """Print at the end of a command that took more than ten seconds how long its stages took."""
+    _durations.clear()
+    start = time.monotonic()
+    yield
+    if (total := time.monotonic() - start) > _MIN_REPORTED_DURATION:
+        parts = {**_durations, "other": total - sum(_durations.values())}
+        text = ", ".join(f"{name} {seconds:.1f}" for name, seconds in parts.items() if seconds >= 0.05)
+        tell(f"took {total:.1f} s: {text}")
+
+
+def _after(unit: str, depth: int) -> str:
+    """Return the unit and the stage, if one began inside the `depth` stages around a bar."""
+    doing = _stages[depth:]
+    return ", ".join([*([unit] if unit else []), *doing[-1:]])
 
 
 def say(kind: str, message: object) -> None:
@@ -72,21 +118,21 @@ def table(columns: Iterable[str], rows: Iterable[Sequence[str]], texts: int = 1)
 
 def _count(done: float, total: int, unit: str) -> str:
     """Format the part done."""
-    return f"{done} %" if unit == "%" else f"{done:.10g} of {total} {unit}".rstrip()
+    return f"{done} {unit}" if unit.startswith("%") else f"{done:.10g} of {total} {unit}".rstrip()
 
 
 def log_lines(
     label: str, unit: str = "", seconds: float = 30.0, first: float = _MIN_REPORTED_SECONDS
 ) -> Callable[..., None]:
     """Report progress without a terminal: a line on stderr after `first` seconds, then every `seconds`."""
-    start = time.monotonic()
+    start, depth = time.monotonic(), len(_stages)
     due = start + first
 
     def show(done: int, total: int, error: float = math.nan) -> None:
         nonlocal due
         if (now := time.monotonic()) >= due:
             due = now + seconds
-            say(label, f"{_count(done, total, unit)}, {now - start:.0f} s")
+            say(label, f"{_count(done, total, _after(unit, depth))}, {now - start:.0f} s")
 
     return show
 
@@ -123,11 +169,12 @@ def progress_bar(label: str, unit: str = "", begin: str = "") -> Iterator[Callab
             _bars.append(Bars(*columns, console=err, transient=True, speed_estimate_period=600))
             _bars[0].start()
         bars = _bars[0]
+    depth = len(_stages)
     task = bars.add_task(label, total=None, after=begin or unit)
 
     def show(done: int, total: int, error: float = math.nan) -> None:
-        after = unit if math.isnan(error) else f"{unit}, error {error:.2g}"
-        bars.update(task, completed=done, total=total, after=after if done else begin or unit)
+        after = _after(unit, depth) + ("" if math.isnan(error) else f", error {error:.2g}")
+        bars.update(task, completed=done, total=total, after=after if done else begin or after)
 
     try:
         yield show
@@ -144,12 +191,12 @@ def _notebook_line(label: str, unit: str) -> Iterator[Callable[..., None]]:
     """Display a line in the cell's output that shows progress and, at the end, the time."""
     from IPython.display import display
 
-    start, handle = time.monotonic(), None
+    start, depth, handle = time.monotonic(), len(_stages), None
 
     def show(done: int, total: int, error: float = math.nan) -> None:
         nonlocal handle
         seconds = time.monotonic() - start
-        line = {"text/plain": f"{label}: {_count(done, total, unit)}, {seconds:.0f} s"}
+        line = {"text/plain": f"{label}: {_count(done, total, _after(unit, depth))}, {seconds:.0f} s"}
         if handle is not None:
             handle.update(line, raw=True)
         elif seconds >= _MIN_REPORTED_SECONDS:

@@ -50,7 +50,7 @@ from .errors import RequestError
 from .files import cache_folder, refuse_special
 from .grating_spectrum import FORMAT_VERSION, GratingSpectrum
 from .precomputation import Spectrum, build_spectrum, load_spectrum
-from .progress import Progress, no_progress, part, silent
+from .progress import Progress, no_progress, part, silent, stage
 from .rigorous import build as rigorous
 from .scalar_theory import scalar_error
 from .settings import Settings
@@ -69,7 +69,7 @@ _SPECTRUM_KEYS = frozenset(f.name for f in fields(Settings))
 REQUESTED = "representation", "terms", "heights_from", "tolerance"  # of a spectrum; they may override a recipe's
 _OF_PROFILE = "coherence_length", "largest_height_range", *REQUESTED
 # Incremented when the same input gives a different result, to invalidate the cache.
-_BUILD_VERSION = 8
+_BUILD_VERSION = 9
 # Spectra in the package (precompute/ready_spectra.py), named as in the cache.
 READY_SPECTRA = Path(__file__).parent / "data" / "spectra"
 _HEIGHTS_TIME_FRACTION = 0.3  # of the build, spent on the heights of several patches, roughly
@@ -199,7 +199,8 @@ class Recipe:
 
     def height_field(self) -> HeightField:
         """Return the surface, read or computed at the first call; of several patches, the first."""
-        return self._height_field
+        with stage("heights"):
+            return self._height_field
 
     @cached_property
     def _height_field(self) -> HeightField:

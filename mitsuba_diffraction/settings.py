@@ -47,8 +47,8 @@ class Settings:
         representation: "slices" (also chosen by "auto"): powers; or a series of the amplitudes of one tile, "taylor"
             (Stam 1999) or "chebyshev" (Dhillon and Ghosh 2016).
         tolerance: bound of max over κ of ∫|S_approx(q; κ) − S_exact(q; κ)| dq, a fraction of the reflected power; by
-            default 1e-3, and for a sample a tenth of its `standard_error`, limited to 1e-3 … 1e-2. In rigorous theory,
-            the bound of `RigorousSpectrum.error`, by default 1e-2.
+            default 1e-2, and 1e-3 for one tile whose orders do not overlap. In rigorous theory, the bound of
+            `RigorousSpectrum.error`, by default 1e-2.
         largest_height_range: in µm; deeper surfaces are refused, since their heights may be in nm. Time and memory grow
             with the height range.
         terms: N of a series, whatever its error; by default the number that the tolerance requires.

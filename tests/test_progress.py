@@ -24,7 +24,7 @@ def test_a_log_reports_in_one_line_that_a_spectrum_is_computed(llvm, capfd, monk
         mi.load_dict({"type": "diffraction_grating", "profile": "lamellar", "period": 3.1, "depth": 0.1})
     out, err = capfd.readouterr()
     assert out == ""
-    assert re.fullmatch(r"mitsuba-diffraction: spectrum of lamellar: \d+ %, 0 s\n", err)
+    assert re.fullmatch(r"mitsuba-diffraction: spectrum of lamellar: \d+ %, powers, 0 s\n", err)
 
 
 def test_progress_begins_with_the_heights_and_never_decreases():
@@ -63,3 +63,18 @@ with progress.progress_bar("spectrum of elaphe") as show:
     NotebookClient(notebook, timeout=120).execute()
     (output,) = notebook.cells[0].outputs
     assert output["data"]["text/plain"] == "spectrum of elaphe: 0 s"
+
+
+def test_long_commands_print_how_long_their_stages_took(capsys, monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    for inner in (2.0, 7.6):
+        with progress.durations():
+            now[0] += 1
+            with progress.stage("powers"):
+                now[0] += 1
+                with progress.stage("heights"):
+                    now[0] += inner
+                now[0] += 0.5
+    # The first took less than ten seconds. Inner stages do not count for outer ones.
+    assert capsys.readouterr().out == "took 10.1 s: powers 1.5, heights 7.6, other 1.0\n"

@@ -86,39 +86,30 @@ class PacketTable(NumberTable):
 
 
 def aligned(values: np.ndarray) -> np.ndarray:
-    """Return flat float32 or uint32 at an address that is a multiple of 64 bytes.
+    """Return flat numbers at an address that is a multiple of 64 bytes.
 
     Dr.Jit uses the memory of NumPy arrays without copying, and gathers whole packets only from aligned memory: without
     alignment kernels would be slower, and differ from one allocation to the next.
     """
-    memory = np.empty(4 * values.size + 64, np.uint8)
+    memory = np.empty(values.nbytes + 64, np.uint8)
     start = -memory.ctypes.data % 64
-    result = memory[start : start + 4 * values.size].view(values.dtype)
+    result = memory[start : start + values.nbytes].view(values.dtype)
     result[:] = values
     return result
 
 
 class HalfTable:
-    """A flat table of packets of four numbers in half precision, two in a word of 32 bits.
+    """A flat table of packets of four numbers in half precision; one packet is one read of 8 bytes."""
 
-    A packet is read by two gathers of a word, as gathers of whole packets were measured to be slower. The bits of a
-    half, shifted to their positions in a float32, are its value times `1/unit`; the caller multiplies sums by `unit`.
-    """
-
-    unit = 2.0**112  # the exponent biases are 15 and 127
+    unit = 1.0
 
     def __init__(self, packets: np.ndarray) -> None:
         """Flatten packets of four numbers, the last axis, in half precision."""
-        self.words = mi.UInt32(aligned(np.ascontiguousarray(packets, np.float16).view(np.uint32).ravel()))
+        self.values = mi.Float16(aligned(np.ascontiguousarray(packets, np.float16).ravel()))
 
     def add(self, packet: mi.Vector4f, weight: mi.Float, index: mi.UInt32, active: mi.Bool) -> mi.Vector4f:
         """Return `packet` plus `weight` times the packet at `index`."""
-        numbers = []
-        for half in (0, 1):
-            word = dr.gather(mi.UInt32, self.words, 2 * index + half, active)
-            numbers.append(dr.reinterpret_array(mi.Float, ((word & 0x7FFF) << 13) | ((word & 0x8000) << 16)))
-            numbers.append(dr.reinterpret_array(mi.Float, ((word & 0x7FFF0000) >> 3) | (word & 0x80000000)))
-        return dr.fma(weight, mi.Vector4f(numbers), packet)
+        return dr.fma(weight, mi.Vector4f(dr.gather(mi.Array4f16, self.values, index, active)), packet)
 
 
 class SharedExponentTable:

@@ -11,7 +11,7 @@ from ..errors import RequestError
 from ..grating_spectrum import GratingSpectrum
 from ..outputs import check_outputs
 from ..precomputation import Spectrum
-from ..progress import progress_bar, tell
+from ..progress import durations, progress_bar, stage, tell
 from ..recipe import Recipe
 from ..rigorous.spectrum import RigorousSpectrum
 from ..settings import ORIGINS, REPRESENTATIONS, SUN_COHERENCE_LENGTH, THEORIES
@@ -35,7 +35,7 @@ def precompute(
     tolerance: Annotated[
         float | None,
         typer.Option(
-            help="maximum error, a fraction of the power; default: 0.001, up to 0.01 for samples, 0.01 if rigorous"
+            help="maximum error, a fraction of the power; default: 0.01, and 0.001 for a tile of separate orders"
         ),
     ] = None,
     terms: Annotated[int | None, typer.Option(help="terms of taylor or chebyshev; default: as many as needed")] = None,
@@ -74,17 +74,24 @@ def precompute(
     writes = [("-o" if output else f"spectrum of {s}", t) for s, t in zip(sources, targets, strict=True)]
     check_outputs(reads, writes, overwrite=overwrite)
     is_sure = "extent" in settings
-    seams = ["" if is_sure else _seam(source, recipe) for source, recipe in zip(sources, recipes, strict=True)]
-    for source, recipe, target, seam in zip(sources, recipes, targets, seams, strict=True):
-        with progress_bar(f"spectrum of {source.name}", "%") as progress:
-            spectrum = recipe.build(progress)
+    with durations():
+        seams = ["" if is_sure else _seam(source, recipe) for source, recipe in zip(sources, recipes, strict=True)]
+        for source, recipe, target, seam in zip(sources, recipes, targets, seams, strict=True):
+            _precompute(source, recipe, target, seam)
+
+
+def _precompute(source: Path, recipe: Recipe, target: Path, seam: str) -> None:
+    """Compute, save and report one spectrum."""
+    with progress_bar(f"spectrum of {source.name}", "%") as progress:
+        spectrum = recipe.build(progress)
+        with stage("writing"):
             spectrum.save(target)
-        tell(
-            f"{target}: {spectrum.source}; {spectrum.extent}, {spectrum.grid}; coherence length "
-            f"{spectrum.coherence_length:.4g} µm; {_table_summary(spectrum)}{seam}"
-        )
-        if isinstance(spectrum, GratingSpectrum) and spectrum.warning:
-            tell(f"! {spectrum.warning}")
+    tell(
+        f"{target}: {spectrum.source}; {spectrum.extent}, {spectrum.grid}; coherence length "
+        f"{spectrum.coherence_length:.4g} µm; {_table_summary(spectrum)}{seam}"
+    )
+    if isinstance(spectrum, GratingSpectrum) and spectrum.warning:
+        tell(f"! {spectrum.warning}")
 
 
 def _table_summary(spectrum: Spectrum) -> str:

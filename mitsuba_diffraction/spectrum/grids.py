@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 
 from ..errors import RequestError
 
+# Lattices, in units of the spacing, that together are one of half the spacing between the nodes.
+SHIFTS = ((-0.25, -0.25), (-0.25, 0.25), (0.25, -0.25), (0.25, 0.25))
+
 
 class _Rectangle:
     """The nodes m = (m_x, m_y), |m_x| ≤ M_x, |m_y| ≤ M_y."""
@@ -192,7 +195,7 @@ class SplineGrid(_Rectangle):
         kept: OrderGrid | SplineGrid,
         coefficients: NDArray[np.float32],
         exact: NDArray[np.float64],
-        shift: NDArray[np.float64],
+        shift: tuple[float, float],
         max_q: tuple[float, float],
     ) -> float:
         """Compute ∫|S_approx − S_exact| dq up to `max_q`, by the rectangle rule on the lattice shifted by `shift` Δ.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -15,53 +16,32 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import RequestError
 
 
-def position(kappa: ArrayLike, max_kappa: float) -> NDArray[np.float64]:
-    """Return t = 2κ/κ_max − 1."""
-    return 2 * np.asarray(kappa, np.float64) / max_kappa - 1
-
-
 def chebyshev_nodes(count: int) -> NDArray[np.float64]:
     """Return the zeros of T_J in t, ascending: (J,)."""
     return -np.cos(np.pi * (np.arange(count) + 0.5) / count)
 
 
-def chebyshev_polynomials(t: ArrayLike, count: int) -> NDArray[np.float64]:
-    """Evaluate T_n(t), n < `count`, for t (...): (..., count)."""
-    t = np.asarray(t, np.float64)
-    return np.polynomial.chebyshev.chebvander(t, count - 1).reshape(*t.shape, count)
+def derivative_bound(heights: NDArray[np.float64], weights: ArrayLike, n: int) -> float:
+    """Return an upper bound of ∫|∂ⁿS/∂κⁿ| dq, µmⁿ, of S = |F{a e^{iκh}}|²; `weights` a² of sum one, heights in µm.
 
+    The mean height h̄ is a phase without effect. ∂ⁿS = Σ_k (n over k) F{(ih)^k u} F*{(ih)^{n−k} u}, u = a e^{iκ(h−h̄)};
+    by Cauchy–Schwarz and Parseval the integral is at most
 
-def chebyshev_transform(count: int) -> NDArray[np.float64]:
-    """Return the matrix, (J, J), from values at `chebyshev_nodes` to Chebyshev coefficients of their interpolant."""
-    values = chebyshev_polynomials(chebyshev_nodes(count), count)
-    norm = np.full(count, 2.0)
-    norm[0] = 1.0
-    return norm[:, None] * values.T / count
-
-
-def nodes_for(x: float, tolerance: float) -> int:
-    """Return the number of Chebyshev nodes that resolves e^{ixt} on −1 ≤ t ≤ 1 to `tolerance`.
-
-    Jacobi–Anger: the coefficient of T_n is 2 iⁿ J_n(x), and |J_n(x)| ≤ (x/2)ⁿ/n!.
+        Σ_k (n over k) √(M_2k M_2n−2k),     M_j = Σ a² (h − h̄)^j.
     """
-    if x == 0:
-        return 1
-    # In logarithms, as the bound grows to e^{x/2} before it falls, which overflows for x > 1400.
-    count, bound = 1, np.log(4 / tolerance)
-    while bound > 0 or count < x / 2:
-        bound += np.log(x) - np.log(2 * count)
-        count += 1
-    return count
+    square = (heights - np.sum(weights * heights)) ** 2
+    moments = [float(np.sum(weights * square**k)) for k in range(n + 1)]
+    return sum(math.comb(n, k) * math.sqrt(moments[k] * moments[n - k]) for k in range(n + 1))
 
 
 @dataclass(frozen=True, eq=False)
 class SliceTable:
     """c_m as a polynomial on each of K equal intervals of 0 ≤ κ ≤ κ_max, through its values at Chebyshev points.
 
-    c_m(κ) = Σ_jl F*… e^{iκ(h_j − h_l)} is band-limited: its fastest oscillation in κ has the angular frequency R, the
-    height range. On an interval Δκ the error of a cubic through Chebyshev points is at most (RΔκ)⁴/3072 of the
-    amplitude, that of a parabola (RΔκ)³/192, so that intervals of about 1.3 and 0.6 rad keep 1e-3. Deep surfaces need
-    more intervals but lose no digits.
+    On an interval Δκ the error ∫|ΔS| dq of a cubic through Chebyshev points is at most Δκ⁴/3072 times the maximum of
+    ∫|∂⁴S/∂κ⁴| dq, that of a parabola Δκ³/192 times that of the third derivative. `derivative_bound` bounds them by the
+    moments of the heights, so that the number of intervals that a tolerance needs is known beforehand
+    (`intervals_for`). Deep surfaces need more intervals but lose no digits.
 
     Attributes:
         max_kappa: κ_max in rad/µm.
@@ -91,13 +71,21 @@ class SliceTable:
         terms: int,
         max_kappa: float,
         powers: Callable[[float], NDArray[np.float64]],
-        rounded: Callable[[NDArray[np.float32]], NDArray[np.float32]],
         progress: Callable[[int, int], None],
+        rounded: Callable[[NDArray[np.float32]], NDArray[np.float32]] | None = None,
+        kept: Callable[[], tuple[slice, slice]] = lambda: (slice(None), slice(None)),
     ) -> SliceTable:
         """Build from c_m = powers(κ), one κ after the other, so that memory holds little more than the result.
 
-        `rounded` rounds values (K, terms, ...) to a number format (`packed`, `halved`); an interval with values too
-        large for the format is not rounded.
+        Args:
+            intervals: K.
+            terms: the number of coefficients a_p.
+            max_kappa: κ_max in rad/µm.
+            powers: returns c_m, (rows, columns), for κ in rad/µm.
+            progress: called with the number of κ done, and of all.
+            rounded: rounds values (K, terms, ...) to a number format (`packed`, `halved`); an interval with values too
+                large for the format is not rounded.
+            kept: returns, when all powers are known, the nodes that are kept.
         """
         values, nodes, polynomial = None, chebyshev_nodes(terms), to_polynomial(terms)
         for interval, node in np.ndindex(intervals, terms):
@@ -106,9 +94,11 @@ class SliceTable:
                 values = np.zeros((intervals, terms, *power.shape), np.float32)
             for coefficient, factor in zip(values[interval], polynomial[:, node], strict=True):
                 coefficient += factor * power
-            if node == terms - 1 and np.isfinite(stored := rounded(values[interval, None])).all():
-                values[interval] = stored[0]
             progress(interval * terms + node + 1, intervals * terms)
+        values = np.ascontiguousarray(values[(slice(None), slice(None), *kept())])
+        for one in values[:, None] if rounded else ():
+            if np.isfinite(stored := rounded(one)).all():
+                one[:] = stored
         return cls(max_kappa, values)
 
     @property
@@ -125,6 +115,15 @@ class SliceTable:
     def shape(self) -> tuple[int, int]:
         """(rows, columns) of the grid."""
         return self.values.shape[2:]
+
+    def extrema(self) -> NDArray[np.float64]:
+        """Return the κ in rad/µm at which the error of interpolation is largest, (K `terms` + 1,), ascending.
+
+        These are the ends of the intervals and, between them, the extrema of the Chebyshev polynomial T_`terms`.
+        """
+        inside = (1 - np.cos(np.pi * np.arange(self.terms) / self.terms)) / 2
+        kappas = (np.arange(self.intervals)[:, None] + inside).ravel() / self.intervals
+        return self.max_kappa * np.append(kappas, 1.0)
 
     def content(self) -> list[NDArray]:
         """Return all that distinguishes the table, as C-contiguous arrays."""
@@ -268,14 +267,13 @@ def series_weights(representation: str, terms: int, x: ArrayLike) -> NDArray[np.
     return size * np.array([1, 1j, -1, -1j])[n % 4]
 
 
-HALF_SCALE = 2.0**14  # factor of numbers in half precision, which then range from 4e-9 to just under 4
+HALF_SCALE = 2.0**14  # factor of numbers in half precision, which then are multiples of 4e-12 up to just under 4
 
 
 def halved(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Round `values` to half precision after scaling; subnormal numbers become zero, too large ones infinite."""
+    """Round `values` to half precision after scaling; too large ones become infinite."""
     with np.errstate(over="ignore"):
         half = (values * np.float32(HALF_SCALE)).astype(np.float16)
-    half[np.abs(half) < np.finfo(np.float16).smallest_normal] = 0
     return half.astype(np.float32) / np.float32(HALF_SCALE)
 
 
@@ -298,6 +296,15 @@ def shared_exponents(values: NDArray[np.float32]) -> tuple[NDArray[np.float32], 
     too_large = exponents >= MIN_EXPONENT + EXPONENT_COUNT
     mantissas[np.broadcast_to(too_large[:, None], mantissas.shape)] = np.inf
     return mantissas, exponents
+
+
+def intervals_for(derivative: float, terms: int, max_kappa: float, allowed: float) -> int:
+    """Return the number of intervals that bounds ∫|ΔS| dq by `allowed`; `derivative` bounds ∫|∂ⁿS/∂κⁿ| dq, n `terms`.
+
+    A polynomial through n Chebyshev points errs by at most max|f⁽ⁿ⁾| Δκⁿ/(2²ⁿ⁻¹ n!).
+    """
+    error = derivative * max_kappa**terms / (2 ** (2 * terms - 1) * math.factorial(terms))
+    return max(1, math.ceil((error / allowed) ** (1 / terms)))
 
 
 def to_polynomial(terms: int) -> NDArray[np.float64]:

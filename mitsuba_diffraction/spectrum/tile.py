@@ -10,36 +10,38 @@ import scipy.fft
 import scipy.linalg
 from numpy.typing import NDArray
 
-from ..progress import Progress
 from ..surface.heightfield import HeightField
-from .grids import OrderGrid, SplineGrid, inner, spline
-from .tables import chebyshev_nodes, chebyshev_polynomials, chebyshev_transform, nodes_for, position
-
-# Fractions of the largest κ at which the interpolation in κ is compared with direct sums.
-_CHECKED_FRACTIONS = (0.137, 0.618, 0.983)
+from .grids import SHIFTS, OrderGrid, SplineGrid, inner, spline
+from .tables import derivative_bound
 
 
 class TilePowers:
-    """η_m(κ) on an order grid, from one transform of the tile.
+    """η_m(κ) on an order grid, from the transform of a tile, or its mean over several, as a pixel covers many.
 
     Attributes:
         grid: the orders whose lobes overlap the frequencies that light reaches.
-        own_error: an upper bound of Σ_m |Δη_m| of these powers.
+        transforms: the number of Fourier transforms for one κ.
     """
 
-    own_error: float = 0.0
-
-    def __init__(self, height_field: HeightField, max_frequency: float, lobe_radius: float) -> None:
-        """Take the tile, the largest |q| that light reaches and the radius of a lobe, both in cycles/µm."""
-        self._height_field = height_field
-        pixels = height_field.shape[::-1]
-        self.grid = OrderGrid.reachable(height_field.tile_size, pixels, max_frequency + lobe_radius)
-        self._reachable = OrderGrid.reachable(height_field.tile_size, pixels, max_frequency)
+    def __init__(self, height_fields: Sequence[HeightField], max_frequency: float, lobe_radius: float) -> None:
+        """Take tiles of one size, the largest |q| that light reaches and the radius of a lobe, both in cycles/µm."""
+        self._heights = [field.centred for field in height_fields]
+        self.transforms = len(height_fields)
+        tile_size, pixels = height_fields[0].tile_size, height_fields[0].shape[::-1]
+        self.grid = OrderGrid.reachable(tile_size, pixels, max_frequency + lobe_radius)
+        self._reachable = OrderGrid.reachable(tile_size, pixels, max_frequency)
 
     def __call__(self, kappa: float) -> NDArray[np.float64]:
         """Compute η_m(κ), (rows, columns); κ in rad/µm."""
-        transform = scipy.fft.fft2(np.exp(1j * kappa * self._height_field.centred), norm="forward", overwrite_x=True)
-        return self.grid.take(transform.real**2 + transform.imag**2)
+        total = np.zeros(self._heights[0].shape)
+        for heights in self._heights:
+            transform = scipy.fft.fft2(np.exp(1j * kappa * heights), norm="forward", overwrite_x=True)
+            total += transform.real**2 + transform.imag**2
+        return self.grid.take(total / self.transforms)
+
+    def derivative_bound(self, n: int) -> float:
+        """Return an upper bound of Σ_m |∂ⁿη_m/∂κⁿ|, µmⁿ."""
+        return float(np.mean([derivative_bound(heights, 1 / heights.size, n) for heights in self._heights]))
 
     def reached(self, powers: NDArray[np.float64]) -> float:
         """Return the fraction of the power in orders that light reaches, from η_m of the grid."""
@@ -55,65 +57,7 @@ class TilePowers:
         """
         exact = self(kappa)
         inside = exact[inner(self.grid, kept)]
-        return float(exact.sum() - inside.sum() + np.abs(np.maximum(powers, 0) - inside).sum()) + self.own_error
-
-
-class MeanPowers(TilePowers):
-    """The mean of η_m(κ) over P periodic patches, which estimates that over the many patches that a pixel covers.
-
-    Powers are band-limited in κ by the height range, so that their values at Chebyshev nodes determine them everywhere
-    (Jacobi–Anger); transforming every patch for every κ would take ten times as long. The transforms at the nodes are
-    in single precision. The error of that and of the interpolation is measured against direct sums in double precision
-    and added to the error of a table.
-    """
-
-    def __init__(
-        self,
-        height_fields: Sequence[HeightField],
-        max_frequency: float,
-        lobe_radius: float,
-        max_kappa: float,
-        tolerance: float,
-        progress: Progress,
-    ) -> None:
-        """Take patches of one size, frequency and radius as in `TilePowers`, the largest κ in rad/µm and the tolerance.
-
-        `progress` is called with the number of finished patches and the total.
-        """
-        super().__init__(height_fields[0], max_frequency, lobe_radius)
-        self._max_kappa = max_kappa
-        height_range = max(field.height_range for field in height_fields)
-        self._nodes = nodes_for(max_kappa * height_range / 2, 0.01 * tolerance)
-        total = np.zeros((self._nodes, *self.grid.shape))
-        direct = np.zeros((len(_CHECKED_FRACTIONS), *self.grid.shape))
-        for number, field in enumerate(height_fields, 1):
-            heights = field.centred.astype(np.float32)
-            for j, kappa in enumerate((1 + chebyshev_nodes(self._nodes)) / 2 * max_kappa):
-                total[j] += self.grid.take(_powers_float32(heights, kappa))
-            one = TilePowers(field, max_frequency, lobe_radius)
-            for j, fraction in enumerate(_CHECKED_FRACTIONS):
-                direct[j] += one(fraction * max_kappa)
-            progress(number, len(height_fields))
-        flat = total.reshape(self._nodes, -1) / len(height_fields)
-        self._coefficients = chebyshev_transform(self._nodes) @ flat
-        self.own_error = max(
-            float(np.abs(self(fraction * max_kappa) - powers / len(height_fields)).sum())
-            for fraction, powers in zip(_CHECKED_FRACTIONS, direct, strict=True)
-        )
-
-    def __call__(self, kappa: float) -> NDArray[np.float64]:
-        """Compute the mean of η_m(κ), (rows, columns); κ in rad/µm."""
-        values = chebyshev_polynomials(position(np.array([kappa]), self._max_kappa), self._nodes)
-        return (values @ self._coefficients).reshape(self.grid.shape)
-
-
-def _powers_float32(heights: NDArray[np.float32], kappa: float) -> NDArray[np.float32]:
-    """Compute η_m(κ) of all orders in single precision, (N_y, N_x), as in `scipy.fft.fftfreq`."""
-    phase = np.float32(kappa) * heights
-    wave = np.empty(heights.shape, np.complex64)
-    wave.real, wave.imag = np.cos(phase), np.sin(phase)
-    transform = scipy.fft.fft2(wave, norm="forward", overwrite_x=True)
-    return transform.real**2 + transform.imag**2
+        return float(exact.sum() - inside.sum() + np.abs(np.maximum(powers, 0) - inside).sum())
 
 
 class TileSplines:
@@ -124,6 +68,7 @@ class TileSplines:
 
     Attributes:
         grid: all nodes whose splines overlap the frequencies that light reaches.
+        transforms: the number of Fourier transforms for one κ.
     """
 
     # Additional nodes outside the grid, so that power outside is not projected on its outermost nodes.
@@ -132,12 +77,12 @@ class TileSplines:
     def __init__(self, powers: TilePowers, lobe_width: float, spacing: float, max_frequency: float) -> None:
         """Take η_m(κ), σ_q, and the largest spacing and frequency of the nodes, all in cycles/µm."""
         self._powers, self._sigma, self._spacing = powers, lobe_width, spacing
+        self.transforms = powers.transforms
         self._orders = powers.grid.frequencies()
         # S is negligible further than six σ_q from the last order.
         self._max_q = tuple(min(max_frequency, q[-1] + 6 * lobe_width) for q in self._orders)
         max_order = tuple(int(np.rint(end / spacing)) + 1 for end in self._max_q)
         self.grid = SplineGrid((spacing, spacing), max_order, (np.inf, np.inf))
-        self._random = np.random.default_rng(0)
 
     @cached_property
     def _projection(self) -> list[NDArray[np.float64]]:
@@ -166,16 +111,21 @@ class TileSplines:
         along_x, along_y = self._projection
         return along_y @ self._powers(kappa) @ along_x.T
 
+    def derivative_bound(self, n: int) -> float:
+        """Return an upper bound of ∫|∂ⁿS/∂κⁿ| dq, µmⁿ: a lobe does not change that of its order."""
+        return self._powers.derivative_bound(n)
+
     def reached(self, powers: NDArray[np.float64]) -> float:
         """Return the fraction of the power at frequencies that light reaches, from c_m of the grid."""
         return self.grid.within(powers, self._max_q)
 
     def error(self, kept: OrderGrid | SplineGrid, powers: NDArray[np.float32], kappa: float) -> float:
         """Return ∫|S_approx − S_exact| dq over the frequencies that light reaches; arguments of `TilePowers.error`."""
-        shift = self._random.uniform(-0.5, 0.5, 2)
-        along_x, along_y = (
-            self._lobes(np.arange(-max_order, max_order + 1) + s, orders)
-            for max_order, s, orders in zip(self.grid.max_order, shift, self._orders, strict=True)
-        )
-        exact = along_y @ self._powers(kappa) @ along_x.T
-        return self.grid.error(kept, powers, exact, shift, self._max_q) + self._powers.own_error
+        of_orders, errors = self._powers(kappa), []
+        for shift in SHIFTS:
+            along_x, along_y = (
+                self._lobes(np.arange(-max_order, max_order + 1) + s, orders)
+                for max_order, s, orders in zip(self.grid.max_order, shift, self._orders, strict=True)
+            )
+            errors.append(self.grid.error(kept, powers, along_y @ of_orders @ along_x.T, shift, self._max_q))
+        return float(np.mean(errors))

@@ -19,10 +19,6 @@ def ignore(done, total):
     pass
 
 
-def as_it_is(values):
-    return values
-
-
 # ---------------------------------------------------------------- orders
 
 
@@ -184,7 +180,7 @@ def powers_of(field):
 
 
 def build(field):
-    return SliceTable.build(40, 4, LARGEST_KAPPA, powers_of(field), as_it_is, ignore)
+    return SliceTable.build(40, 4, LARGEST_KAPPA, powers_of(field), ignore)
 
 
 def test_tables_hold_each_order_at_its_node():
@@ -219,7 +215,7 @@ def test_slices_interpolate_polynomials_of_their_degree_exactly(terms):
     def powers(kappa):
         return np.array([[(kappa / LARGEST_KAPPA) ** (terms - 1), 0.5]])
 
-    table = SliceTable.build(3, terms, LARGEST_KAPPA, powers, as_it_is, ignore)
+    table = SliceTable.build(3, terms, LARGEST_KAPPA, powers, ignore)
     assert (table.terms, table.intervals, table.shape) == (terms, 3, (1, 2))
     for kappa in LARGEST_KAPPA * np.array([0.0, 0.1, 1 / 3, 0.5, 0.9, 1.0]):
         np.testing.assert_allclose(table.powers(kappa), powers(kappa), atol=1e-6)
@@ -235,7 +231,7 @@ def test_rounding_errs_by_at_most_half_a_unit(seed, decades):
     # Half a unit; with 255 or less in it, a unit is at most 1/127 of the largest, but no less than 2⁻³⁶.
     assert (error <= np.maximum(peak / 254, 2.0**-37)).all()
     error = np.abs(halved(values) - values)
-    assert (error <= np.maximum(np.abs(values) * 2.0**-11, 2.0**-28)).all()
+    assert (error <= np.maximum(np.abs(values) * 2.0**-11, 2.0**-39)).all()
     for rounded in (packed, halved):
         np.testing.assert_array_equal(rounded(rounded(values)), rounded(values))
     # No finite error for numbers that are too large: such a table is not taken.
@@ -248,7 +244,7 @@ def test_slices_are_rounded_except_intervals_with_too_large_values(terms, rounde
     def powers(kappa):
         return np.array([[0.1 if kappa < LARGEST_KAPPA / 2 else 10.1]])
 
-    table = SliceTable.build(2, terms, LARGEST_KAPPA, powers, rounded, ignore)
+    table = SliceTable.build(2, terms, LARGEST_KAPPA, powers, ignore, rounded)
     np.testing.assert_array_equal(table.values[:1], rounded(table.values[:1]))
     assert table.powers(0.0) != np.float32(0.1)
     assert table.powers(0.0) == pytest.approx(0.1, rel=4e-3)
@@ -335,7 +331,7 @@ def test_lobes_wider_than_the_grid_of_orders_keep_all_orders(coherence_length):
     # Regression: where lobes extended past the last order, the count of neighbours began outside of the grid and
     # missed the orders on the other side; a grating of one row, whose only order along y is zero, gave S = 0.
     field = md.gratings.blazed(period=2.5, depth=0.25, samples=64)
-    spectrum = md.precompute(field, coherence_length=coherence_length)
+    spectrum = md.precompute(field, coherence_length=coherence_length, tolerance=1e-3)
     sigma = 1 / (2 * np.sqrt(2) * np.pi * coherence_length / 4)
     q = np.stack(np.meshgrid(np.linspace(-4, 4, 9), [-0.7 * sigma, 0, 0.3 * sigma], indexing="ij"), axis=-1)
     m = np.arange(-32, 32)
