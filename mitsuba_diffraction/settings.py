@@ -51,7 +51,7 @@ class Settings:
             `RigorousSpectrum.error`, by default 1e-2.
         largest_height_range: in µm; deeper surfaces are refused, since their heights may be in nm. Time and memory grow
             with the height range.
-        terms: N of a series, whatever its error; by default the number that the tolerance requires.
+        terms: N of a series, whatever its error; None, in files "auto", is the number that the tolerance requires.
         heights_from: the level of h = 0 in a series: "mean" or "lowest".
         theory: "scalar", or "rigorous": Maxwell's equations, for a tile of one row and one material only.
         int_ior: in rigorous theory, index of refraction of a dielectric, or n + ik.
@@ -149,6 +149,8 @@ class Settings:
 
     def _check_series(self) -> None:
         """Raise RequestError if parameters of a series are invalid, or given without a series."""
+        if self.terms == "auto":
+            object.__setattr__(self, "terms", None)
         if self.representation not in SERIES:
             for name, value, default in (("terms", self.terms, None), ("heights_from", self.heights_from, "mean")):
                 if value != default:

@@ -1,4 +1,4 @@
-"""Render every recipe of this folder into one picture: python precompute/contact_sheet.py docs/ready_surfaces.png
+"""Render every surface of this folder into one picture: python precompute/contact_sheet.py docs/ready_surfaces.png
 
 Discs (compact_disc, dvd) are shown as discs, films and transmission gratings as a pane in front of a small
 lamp, all others on a sphere and a plate. The light is a sun at the left, a narrow lamp, and a dim sky.
@@ -81,7 +81,8 @@ def main() -> None:
     import mitsuba as mi  # after the package, which chooses LLVM
 
     mi.set_variant(choose_variant(None))
-    recipes = sorted(HERE.glob("*.toml"))
+    # Tiles are skins that stand there already.
+    recipes = sorted(path for path in HERE.glob("*.toml") if not path.stem.endswith("_tile"))
     columns = 6
     rows = math.ceil(len(recipes) / columns)
     inch = arguments.size / 96

@@ -16,6 +16,7 @@ from mitsuba_diffraction.settings import Settings
 from mitsuba_diffraction.surface.readers import read_height_field
 
 SLOW = {"compact_disc", "dvd", "elaphe_synthetic", "morpho_ridges", "xenopeltis_synthetic", "xenopeltis_afm"}
+SLOW |= {"elaphe_tile", "xenopeltis_tile"}
 READY = {"elaphe", "xenopeltis"}
 """They take minutes; tests/test_ready_spectra.py builds them."""
 RECIPES = sorted((Path(__file__).parents[1] / "precompute").glob("*.toml"))

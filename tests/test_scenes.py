@@ -5,6 +5,7 @@ import re
 import shutil
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import drjit as dr
@@ -45,6 +46,25 @@ def llvm():
 @pytest.mark.parametrize("name", ["blaze", "elaphe", "screen", "xenopeltis", "xenopeltis_sphere"])
 def test_scene_renders(llvm, name):
     check(render(SCENES / f"{name}.xml", spp=4, width=16, height=16), 16, 16)
+
+
+@pytest.mark.slow
+def test_a_snake_by_taylor_terms_is_that_of_slices_with_both_integrators(llvm):
+    """Means over quarters of the picture, of slices and 20 terms, by `path` and `diffraction_path`."""
+    means = []
+    for parameters in ({}, {"representation": "taylor", "terms": "20"}):
+        parameters = {"skin": "xenopeltis_tile", "depth": "3", **parameters}
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "taylor: 20 terms", UserWarning)
+            built = load_spectral_scene(SCENES / "xenopeltis.xml", width=48, parameters=parameters)
+        for name in ("path", "diffraction_path"):
+            integrator = mi.load_dict({"type": name, "max_depth": 3})
+            pictures = [mi.render(built, integrator=integrator, spp=64, seed=seed) for seed in range(6)]
+            quarters = [np.array(one).sum(-1).reshape(2, 16, 2, 24).mean((1, 3)) for one in pictures]
+            means.append((np.mean(quarters, 0), np.std(quarters, 0, ddof=1) / 6**0.5))
+    (reference, error), *others = means
+    for mean, its_error in others:
+        np.testing.assert_array_less(np.abs(mean - reference), 4 * np.hypot(error, its_error) + 3e-3 * reference)
 
 
 @pytest.mark.slow

@@ -32,7 +32,9 @@ PARAMETERS = (
         "how the powers of orders are stored: slices (default) or, for one tile, a series of the amplitudes, taylor or "
         "chebyshev",
     ),
-    Parameter("terms", "integer", "number of terms of a series; by default as many as the tolerance needs"),
+    Parameter(
+        "terms", "integer or string", "number of terms of a series; auto: as many as the tolerance needs", "auto"
+    ),
     Parameter("heights_from", "string", "for a series, the level of h = 0: mean (default) or lowest"),
     Parameter(
         "theory",

@@ -183,18 +183,20 @@ class AmplitudePower(_NodeTable):
         """Arrange a table; `rim` and `windows` as of `_NodeTable`."""
         super().__init__(table.shape, rim, windows)
         count = len(table.terms)
-        self.pairs = -(-count // 2)
-        terms = np.zeros((2 * self.pairs, 2, *table.shape), np.float32)
+        pairs = -(-count // 2)
+        # Series of all lengths have the same kernel.
+        self.pairs = dr.opaque(mi.UInt32, pairs)
+        terms = np.zeros((2 * pairs, 2, *table.shape), np.float32)
         terms[:count, 0], terms[:count, 1] = table.terms.real, table.terms.imag
-        packets = self._arranged(terms.reshape(self.pairs, 4, *table.shape))
+        packets = self._arranged(terms.reshape(pairs, 4, *table.shape))
         self.table = PacketTable(np.moveaxis(packets, 1, -1))
         self.height, self.factors = opaque(table.height), None
         if table.representation == "chebyshev":
-            max_x, n = table.max_kappa * table.height, np.arange(2 * self.pairs)
+            max_x, n = table.max_kappa * table.height, np.arange(2 * pairs)
             self.steps = 1 + int(max_x / _MAX_BESSEL_STEP)
             x = np.linspace(0, max_x, self.steps + 1)[:, None]
             self.per_x = opaque(self.steps / max(max_x, 1e-30))
-            values = [function(n, x).reshape(-1, self.pairs, 2) for function in (scipy.special.jv, scipy.special.jvp)]
+            values = [function(n, x).reshape(-1, pairs, 2) for function in (scipy.special.jv, scipy.special.jvp)]
             packets = np.concatenate([values[0], values[1] * max_x / self.steps], axis=-1)
             packets[:, 1:] *= 2
             packets[:, 0, 1::2] *= 2

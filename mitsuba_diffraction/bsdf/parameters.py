@@ -190,7 +190,15 @@ def surface_from(props: mi.Properties, media: Media, scale: float = 1.0) -> Spec
             raise RequestError(f"theory: got {theory!r} with a spectrum of {found} theory, wanted one built for it")
         return surface
     settings = {"theory": theory, **settings_from(props, media.coat)} if theory == "rigorous" else {}
-    return _inside(props, media, scale, Recipe.of_profile(props["profile"], props, **settings))
+    return _inside(props, media, scale, Recipe.of_profile(props["profile"], props, **_requested(props), **settings))
+
+
+def _requested(props: mi.Properties) -> dict[str, str | float]:
+    """Return the parameters of the spectrum that a scene requests; `terms` is a text where it may be "auto"."""
+    given = {name: props[name] for name in REQUESTED if name in props}
+    if isinstance(terms := given.get("terms"), str) and terms.isdecimal():
+        given["terms"] = int(terms)
+    return given
 
 
 def _inside(props: mi.Properties, media: Media, scale: float, recipe: Recipe) -> Recipe:
@@ -215,7 +223,7 @@ def _inside(props: mi.Properties, media: Media, scale: float, recipe: Recipe) ->
 def _from_file(props: mi.Properties, media: Media, scale: float) -> Spectrum | Recipe:
     """Return the spectrum or the recipe of a file."""
     path = Path(str(mi.file_resolver().resolve(str(props["filename"]))))
-    given = {name: props[name] for name in REQUESTED if name in props}
+    given = _requested(props)
     suffix = path.suffix.lower()
     if suffix in (".toml", ".exr") and not path.is_file():
         # An unresolved path is relative; the resolver begins with the folder of the scene.

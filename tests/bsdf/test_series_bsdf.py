@@ -1,5 +1,6 @@
 """Amplitude series in the BSDF: values against direct sums, samples, derivatives, scenes."""
 
+import dataclasses
 import functools
 
 import drjit as dr
@@ -116,9 +117,35 @@ def test_scenes_and_recipes_take_a_series(tmp_path):
     assert mi.load_dict({**scene, "representation": "slices"}).spectrum.representation == "slices"
 
 
+@EACH
+def test_series_of_all_lengths_share_a_kernel(kind):
+    whole, wi = spectrum("crossed", kind, 3.0), direction(20, 40)
+    wo = towards(wi, np.random.default_rng(3).uniform(-0.5, 0.5, (60, 2)), 500)
+    launched = set()
+    for count in (2, 3, 5, len(whole.table.terms)):
+        table = dataclasses.replace(whole.table, terms=whole.table.terms[:count])
+        shorter = raw_plugin(dataclasses.replace(whole, table=table))
+        dr.kernel_history_clear()
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            evaluate(shorter, wi, wo, [500.0] * 4)
+            history = dr.kernel_history((dr.KernelType.JIT,))
+        launched.add(max(history, key=lambda kernel: len(kernel["ir"].getvalue()))["hash"])
+    assert len(launched) == 1
+
+
+def test_a_scene_gives_terms_as_text(tmp_path):
+    scene = {**BLAZE, "representation": "taylor"}
+    assert len(mi.load_dict({**scene, "terms": "30"}).spectrum.table.terms) == 30
+    needed = mi.load_dict(scene).spectrum.settings.terms
+    assert mi.load_dict({**scene, "terms": "auto"}).spectrum.settings.terms == needed < 20
+    assert mi.load_dict({**BLAZE, "terms": "auto"}).spectrum.representation == "slices"
+
+
 @pytest.mark.parametrize(
     ("parameters", "text"),
     [
+        ({"representation": "taylor", "terms": "0"}, "terms: got 0, wanted a whole number from 1 to 999"),
+        ({"representation": "taylor", "terms": "many"}, "terms: got 'many', wanted a whole number"),
         ({"representation": "svd"}, "representation: got 'svd'"),
         ({"terms": 20}, "terms: got 20 with representation 'auto'"),
         ({"representation": "taylor", "terms": 0}, "terms: got 0"),

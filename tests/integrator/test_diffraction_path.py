@@ -58,6 +58,11 @@ def sun_alone():
     return scene(plate=plate(blaze(material="Al"), height=0.4), sun=SUN)
 
 
+def taylor_terms():
+    bsdf = {"type": "diffraction_grating", "profile": "blazed", "coherence_length": 1.5, "conserve_energy": False}
+    return scene(plate=plate({**bsdf, "material": "Al", "representation": "taylor", "terms": 20}, height=0.4), sun=SUN)
+
+
 def sun_and_sky():
     """A grating with pigment on both sides of a plate."""
     pigment = blaze(int_ior=1.8, base=diffuse(0.4))
@@ -209,6 +214,7 @@ def assert_agree(built, depth, spp, **parameters):
         pytest.param(partial(window, "sheet", -1), 3, 1024, id="flat face first"),
         pytest.param(films_between_lamps, 5, 2048, marks=pytest.mark.slow, id="films"),
         pytest.param(partial(films_between_lamps, "interface"), 5, 2048, marks=pytest.mark.slow, id="glass"),
+        pytest.param(taylor_terms, 3, 1024),
         pytest.param(sun_and_sky, 4, 1024, marks=pytest.mark.slow),
         pytest.param(lamp_and_spot, 5, 2048, marks=pytest.mark.slow),
         pytest.param(blend_under_a_point, -1, 1024, marks=pytest.mark.slow),

@@ -4,21 +4,34 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from ... import outputs
-from ...cli.arguments import Define, Overwrite, Variant, check_suffix, scene_parameters
+from ...cli.arguments import Define, Overwrite, Variant, check_suffix, numbers, scene_parameters
+from ...errors import RequestError
 from ...progress import progress_bar, show, table, tell
+from ...settings import ORIGINS
+from ..report import cells
+
+if TYPE_CHECKING:
+    from ..comparison.series import SeriesStudy
 
 
 def convergence(
     scene: Annotated[Path, typer.Argument(metavar="SCENE.xml")],
     plot: Annotated[Path, typer.Option("-o", "--output", help="plot of error against time (.png)")],
     tolerance: Annotated[list[float] | None, typer.Option(help="of the spectra; default: 0.1, 0.01 and 0.001")] = None,
-    spp: Annotated[list[int] | None, typer.Option(min=1, help="samples per pixel; default: 1, 4, … 256")] = None,
-    reference_spp: Annotated[int, typer.Option(min=2, help="samples per pixel of the reference")] = 2048,
+    terms: Annotated[
+        str | None, typer.Option(help="compare numbers of terms of a series, 4,6,8, with slices instead")
+    ] = None,
+    spp: Annotated[
+        list[int] | None, typer.Option(min=1, help="samples per pixel; default: 1, 4, … 256; with --terms: 16")
+    ] = None,
+    reference_spp: Annotated[
+        int | None, typer.Option(min=2, help="samples per pixel of the reference; default: 2048")
+    ] = None,
     width: Annotated[int, typer.Option(min=1, help="pixels")] = 128,
     variant: Variant = None,
     json: Annotated[Path | None, typer.Option(help="save the numbers (.json)")] = None,
@@ -27,27 +40,47 @@ def convergence(
 ) -> None:
     """Measure the error of a picture against time, for the path tracer and the real-time shaders.
 
-    The scene needs a parameter `tolerance` of its gratings.
+    The scene needs a parameter `tolerance` of its gratings; with --terms, `representation`, `terms` and `heights_from`.
     """
     import mitsuba as mi
 
     from ...llvm import choose_variant
     from ...render.scene import files_of_scene
     from ..comparison import convergence as study
-    from ..report import cells
+    from ..comparison import series
 
-    parameters, tolerances = scene_parameters(define), sorted(tolerance or study.TOLERANCES, reverse=True)
+    parameters = scene_parameters(define)
+    if terms is None:
+        tolerances = sorted(tolerance or study.TOLERANCES, reverse=True)
+        study.check_tolerances(tolerances)
+        own = {"tolerance": f"{tolerances[0]:g}"}
+    elif tolerance or reference_spp or len(spp or []) > 1:
+        raise RequestError("--terms: got --tolerance, --reference-spp or several --spp, too; wanted at most one --spp")
+    else:
+        counts = numbers("--terms", terms)
+        own = {"representation": "auto", "terms": "auto", "heights_from": ORIGINS[0]}
     check_suffix("-o", plot, ".png")
     written = [("-o", plot), *([("--json", json)] if json is not None else [])]
-    study.check_tolerances(tolerances)
-    reads = files_of_scene(scene, {**parameters, "tolerance": f"{tolerances[0]:g}"})
-    outputs.check_outputs(reads, written, overwrite=overwrite)
+    outputs.check_outputs(files_of_scene(scene, {**parameters, **own}), written, overwrite=overwrite)
     mi.set_variant(choose_variant(variant))
+    if terms is not None:
+        origin = parameters.get("heights_from")
+        found_series = series.study(
+            scene,
+            terms=counts,
+            origins=ORIGINS if origin is None else (origin,),
+            samples=spp[0] if spp else series.SAMPLES,
+            width=width,
+            parameters=parameters,
+            progress=progress_bar,
+        )
+        _report_series(found_series, plot, json)
+        return
     found = study.convergence(
         scene,
         tolerances=tolerances,
         samples=sorted(spp or study.SAMPLES),
-        reference_samples=reference_spp,
+        reference_samples=reference_spp or 2048,
         width=width,
         parameters=parameters,
         progress=progress_bar,
@@ -62,3 +95,13 @@ def convergence(
             when = ["not overtaken" if math.isnan(time) else f"overtaken after {time:.2g} s" for time in times]
             tell(f"{name}: {when[0]} (ΔE00), {when[1]} (relative MSE)")
     tell(f"the reference owes ΔE00 {found.noise:.2f} to noise")
+
+
+def _report_series(found: SeriesStudy, plot: Path, json: Path | None) -> None:
+    from ..comparison import series
+    from ..plots import save_png
+
+    save_png(series.plot(found), plot)
+    if json is not None:
+        outputs.save_json({"scene": found.scene, "samples": found.samples, "rows": found.rows}, json)
+    show(table(series.COLUMNS, (cells(series.COLUMNS, row) for row in found.rows), texts=2), width=120)
