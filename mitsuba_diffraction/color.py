@@ -39,6 +39,8 @@ def matching_functions(wavelengths: ArrayLike) -> NDArray[np.float64]:
 @lru_cache(maxsize=8)
 def _xyz_matrix(wavelengths: tuple[float, ...]) -> NDArray[np.float64]:
     """Return the matrix m of `spectrum_to_XYZ`, (n, 3)."""
+    import colour
+
     centres = np.asarray(wavelengths)
     steps = np.diff(centres)
     if centres.size < 2 or steps[0] < 1 or np.ptp(steps) > 1e-3 * steps[0]:
@@ -47,6 +49,9 @@ def _xyz_matrix(wavelengths: tuple[float, ...]) -> NDArray[np.float64]:
             f"wavelengths: got {centres.size}{ends}, wanted two or more, ascending in equal steps of at least 1 nm"
         )
     step = float(np.mean(steps))
+    if centres[0] - step >= VISIBLE[1] or centres[-1] + step <= VISIBLE[0]:
+        white = colour.xy_to_XYZ(colour.CCS_ILLUMINANTS[_OBSERVER]["D65"])
+        return np.tile(white / centres.size, (centres.size, 1))
     spacing = 0.25
     fine = np.arange(VISIBLE[0], VISIBLE[1] + spacing / 2, spacing)
     matching = matching_functions(fine)
@@ -63,6 +68,7 @@ def spectrum_to_XYZ(radiance: ArrayLike, wavelengths: ArrayLike) -> NDArray[np.f
     X = ∫ L(λ) x̄(λ) dλ. If x̄ = Σ_i m_i t_i, then X = Σ_i m_i L_i for any spectrum, smooth or a single line; m is
     therefore the least-squares fit of the matching function by the hats. At a spacing of 5 nm the largest residuals of
     x̄, ȳ and z̄ are 0.002, 0.002 and 0.01. (With m_i = x̄(λ_i) Δλ, the error for narrow lines is ten times larger.)
+    Light that is invisible at all wavelengths is shown as grey of its mean radiance.
 
     Args:
         radiance: (..., n), W m⁻² sr⁻¹ nm⁻¹.

@@ -13,7 +13,7 @@ from __future__ import annotations
 import json
 import os
 import threading
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -65,6 +65,16 @@ class GratingSpectrum(PowerSpectrum):
     def _energy(self) -> EnergyTable:
         with stage("bound of the albedo"):
             return EnergyTable.of(self) if self.energy is None else self.energy
+
+    def up_to(self, longest: float) -> GratingSpectrum:
+        """Return the spectrum for wavelengths up to `longest`, nm; the table, for κ from zero, holds for all of them.
+
+        Only E and the samplers depend on the longest wavelength.
+        """
+        if longest <= self.wavelengths[1] * (1 + 1e-6):
+            return self
+        settings = replace(self.settings, wavelengths=(self.wavelengths[0], longest))
+        return replace(self, settings=settings, energy=None)
 
     def save(self, path: str | os.PathLike[str], recipe: str = "") -> None:
         """Write the spectrum as an OpenEXR file, atomically; `recipe` is the digest of its `Recipe`.

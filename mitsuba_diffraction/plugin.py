@@ -14,8 +14,9 @@ import drjit as dr
 import mitsuba as mi
 
 from . import llvm
+from .bsdf.light import cover_light
 from .bsdf.parameters import hand_over
-from .errors import Bug, root_cause
+from .errors import Bug, RequestError, root_cause
 from .llvm import is_supported
 
 # Name, registration function of Mitsuba, and the module whose `define` makes the class for the current variant.
@@ -47,12 +48,20 @@ def _refuse(reason: str, props: mi.Properties) -> mi.Object:
 
 
 def _with_short_errors(load: Callable[..., mi.Object]) -> Callable[..., mi.Object]:
-    """Return a loader that accepts a GratingSpectrum in a dict, and reports errors of the plugins in one line."""
+    """Return a loader that accepts a GratingSpectrum in a dict, and reports errors of the plugins in one line.
+
+    The gratings of a scene are made to cover its light.
+    """
 
     @functools.wraps(load)
     def loader(scene: dict | str, *args: object, **kwargs: object) -> mi.Object:
         try:
-            return load(hand_over(scene), *args, **kwargs)
+            loaded = load(hand_over(scene), *args, **kwargs)
+            if isinstance(loaded, mi.Scene):
+                cover_light(loaded)
+            return loaded
+        except RequestError as error:
+            line = str(error)
         except RuntimeError as error:
             if not any(f'plugin of type "{name}"' in str(error) for name, *_ in PLUGINS):
                 raise

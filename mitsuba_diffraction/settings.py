@@ -175,20 +175,21 @@ class Settings:
         return {f.name: value for f in fields(self) if (value := getattr(self, f.name)) != f.default}
 
 
-def wavelengths_inside(index: float, scale: float = 1.0) -> tuple[float, float]:
-    """Return (shortest, longest) wavelengths of visible light in a medium, in nm: λ/n, the shortest divided by s.
+def wavelengths_inside(index: float, scale: float = 1.0, outside: tuple[float, float] = VISIBLE) -> tuple[float, float]:
+    """Return (shortest, longest) wavelengths of light in a medium, in nm: λ/n, the shortest divided by s.
 
     Args:
         index: n, the largest absolute index of the media beside the surface.
         scale: s, the largest factor of heights or lengths, which is equivalent to wavelengths that are shorter by s.
+        outside: (shortest, longest) wavelengths in air.
 
     Raises:
         ValueError: if the shortest wavelength is below `MIN_WAVELENGTH`.
     """
-    shortest, max_scale = VISIBLE[0] / (index * scale), VISIBLE[0] / (index * MIN_WAVELENGTH)
+    shortest, max_scale = outside[0] / (index * scale), outside[0] / (index * MIN_WAVELENGTH)
     if scale > max_scale:
         raise RequestError(f"height_scale, lateral_scale: got up to {scale:g}, wanted at most {max_scale:.3g}")
-    return shortest, VISIBLE[1] / index
+    return shortest, outside[1] / index
 
 
 def lobe_width(coherence_length: float) -> float:

@@ -181,6 +181,14 @@ def define() -> type:
             self.m_components = self.layers.components
             self.m_flags = functools.reduce(operator.or_, self.m_components)
 
+        def cover(self, wavelengths: tuple[float, float]) -> None:
+            """Take the wavelengths of the light in a scene, see `Grating.cover`."""
+            try:
+                self.layers.grating.cover(wavelengths)
+            except RequestError as error:
+                raise RequestError(f"{self.id() or 'diffraction_grating'}: {error}") from None
+            self.spectrum = self.layers.grating.spectrum
+
         def traverse(self, callback: mi.TraversalCallback) -> None:
             self.layers.traverse(callback)
 

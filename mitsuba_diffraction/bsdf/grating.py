@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..errors import RequestError
 from ..progress import progress_bar
 from ..recipe import Recipe
 from .geometry import Geometry, Incidence, Interface, rotated
@@ -42,6 +43,8 @@ class Grating:
         self.recipe = surface if isinstance(surface, Recipe) else None
         self.spectrum = surface.cached(_per_cent) if isinstance(surface, Recipe) else surface
         self.theory = theory_of(props, self.spectrum, request)
+        # Mitsuba's own object does not outlive the construction of the plugin.
+        self._props, self._request = mi.Properties(props), request
         # The grating is black at angles that the spectrum does not cover.
         self.min_cosine = opaque(np.cos(np.deg2rad(self.spectrum.largest_angle)) * (1 - 1e-6))
 
@@ -49,6 +52,41 @@ class Grating:
     def interface(self) -> Interface:
         """The media above and below, for the current parameters."""
         return self.theory.interface
+
+    def lacks(self, wavelengths: tuple[float, float]) -> list[tuple[float, float]]:
+        """Return the parts of a range of wavelengths, nm, at which the grating would be black."""
+        (first, last), (shortest, longest) = wavelengths, self._range()
+        parts = (first, min(last, shortest)), (max(first, longest), last)
+        return [(low, high) for low, high in parts if high - low > 1e-6 * high]
+
+    def cover(self, wavelengths: tuple[float, float]) -> None:
+        """Take the wavelengths of the light in a scene, (shortest, longest) in air, nm.
+
+        A spectrum from a recipe or a profile is computed anew where it ends before.
+
+        Raises:
+            RequestError: if the material or a saved spectrum does not cover them.
+        """
+        (first, last), (shortest, longest) = wavelengths, self.theory.material.wavelengths
+        if first < shortest * (1 - 1e-6) or last > longest * (1 + 1e-6):
+            raise RequestError(
+                f"material: got light of {first:g} to {last:g} nm, and a table of {shortest:g} to {longest:g} nm "
+                f"({self.theory.material}); wanted light inside its range, int_ior, or material=none (R = 1)"
+            )
+        try:
+            self.theory.cover(wavelengths)
+        except RequestError:
+            recipe = self._request.widened(wavelengths)
+            if recipe is None:
+                raise
+            self.recipe, self.spectrum = recipe, recipe.cached(_per_cent)
+            self.theory = theory_of(self._props, self.spectrum, self._request)
+            self.theory.cover(wavelengths)
+
+    def _range(self) -> tuple[float, float]:
+        """Return the shortest and the longest wavelength that both spectrum and material cover, nm."""
+        shortest, longest = np.clip(self.theory.wavelengths, *self.theory.material.wavelengths)
+        return float(shortest), float(longest)
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         callback.put("orientation", self.orientation, mi.ParamFlags.Differentiable)
@@ -231,8 +269,7 @@ class Grating:
         At wavelengths that are not covered the grating is black, and the index of a metal may be NaN: they are replaced
         by the shortest covered wavelength.
         """
-        limits = np.array(self.spectrum.wavelengths) * self.theory.covered_index
-        shortest, longest = np.clip(limits, *self.theory.material.wavelengths)
+        shortest, longest = self._range()
         replaced = mi.SurfaceInteraction3f(si)
         covered = [(w >= shortest * (1 - 1e-6)) & (w <= longest * (1 + 1e-6)) for w in si.wavelengths]
         for channel, is_covered in enumerate(covered):

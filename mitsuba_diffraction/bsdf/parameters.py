@@ -126,19 +126,18 @@ class Scales:
         max_lateral = 1.0 if self.lateral is None else self.lateral.values[-1]
         return float(low / max_lateral), float(high / self.min_lateral)
 
-    def check(self, wavelengths: tuple[float, float], index: float, max_resolved: float | None) -> None:
+    def check(self, wavelengths: tuple[float, float], shortest: float, max_resolved: float | None) -> None:
         """Check the values against the range of a spectrum.
 
         Args:
             wavelengths: shortest and longest of the spectrum, nm.
-            index: the maximum index next to the relief.
+            shortest: of the light next to the relief, nm.
             max_resolved: the maximum lateral scale for which orders do not overlap; None if they overlap.
 
         Raises:
             RequestError: with the wavelengths for which to build the spectrum.
         """
-        shortest = VISIBLE[0] / index
-        # A spectrum may begin at a longer wavelength: at those that it does not cover, the grating is black.
+        # A spectrum may begin at a longer wavelength, as long as the lights of the scene do, too.
         covered = max(shortest / wavelengths[0], 1.0)
         for scale in self:
             if not scale.varies:
@@ -207,17 +206,22 @@ def _inside(props: mi.Properties, media: Media, scale: float, recipe: Recipe) ->
     Parameters that do not match the recipe are refused here, before a table is computed.
     """
     settings, overrides = recipe.settings, {}
-    wavelengths = wavelengths_inside(media.index, scale)
     if settings.theory == "rigorous":
         refuse_scalar_only(props)
         if settings.transmission != "none":
             check_transmission(settings.transmission, media)
         overrides = settings_of_medium(media)
-    # Rigorous tables of a bare surface are for the wavelengths above it.
-    shorter = media.index * scale > 1 and (settings.theory == "scalar" or media.coat is not None)
-    if shorter and settings.wavelengths == VISIBLE:
-        overrides["wavelengths"] = wavelengths
+    if settings.wavelengths == VISIBLE:
+        overrides["wavelengths"] = _next_to_relief(settings.theory, media, scale, VISIBLE)
     return replace(recipe, settings=replace(settings, **overrides))
+
+
+def _next_to_relief(theory: str, media: Media, scale: float, wavelengths: tuple[float, float]) -> tuple[float, float]:
+    """Return the wavelengths (shortest, longest) for which to build a spectrum, from those in air, nm."""
+    # Rigorous tables of a bare surface are for the wavelengths above it.
+    if theory == "rigorous" and media.coat is None:
+        return wavelengths
+    return wavelengths_inside(media.index, scale, wavelengths)
 
 
 def _from_file(props: mi.Properties, media: Media, scale: float) -> Spectrum | Recipe:
@@ -371,6 +375,16 @@ class GratingRequest:
     shadowing: bool
     conserve_energy: bool
     surface: Spectrum | Recipe
+
+    def widened(self, wavelengths: tuple[float, float]) -> Recipe | None:
+        """Return the recipe for light of these wavelengths in air, nm; None for one that sets its own, or a file."""
+        if not isinstance(self.surface, Recipe):
+            return None
+        settings, scale = self.surface.settings, self.scales.max_scale
+        of_visible, of_scene = (_next_to_relief(settings.theory, self.media, scale, w) for w in (VISIBLE, wavelengths))
+        if settings.wavelengths != of_visible:
+            return None
+        return replace(self.surface, settings=replace(settings, wavelengths=of_scene))
 
     @classmethod
     def of(cls, props: mi.Properties) -> GratingRequest:

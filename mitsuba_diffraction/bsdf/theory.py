@@ -71,8 +71,7 @@ class Theory(Protocol):
         interface: the media above and below.
         media: those around the grating.
         shadowing: whether G is a factor.
-        covered_index: index by which wavelengths outside are divided before they are compared with those of the
-            spectrum.
+        wavelengths: (shortest, longest) of the table, in air, nm.
     """
 
     scattering: Scattering
@@ -80,7 +79,14 @@ class Theory(Protocol):
     interface: Interface
     media: Media
     shadowing: bool
-    covered_index: float
+    wavelengths: tuple[float, float]
+
+    def cover(self, wavelengths: tuple[float, float]) -> None:
+        """Take the wavelengths of the light in a scene, (shortest, longest) in air, nm.
+
+        Raises:
+            RequestError: if the tables do not cover them.
+        """
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         """Show the parameters of the theory and of its material."""
@@ -143,34 +149,48 @@ class ScalarTheory(Theory):
         self.spectrum, self.media, self.scales = spectrum, request.media, request.scales
         self.material, self.shadowing = request.material, request.shadowing
         self.conserve_energy = request.conserve_energy
-        self.tables = SharedTables.of(spectrum, self.media.eta)
-        self.scattering = self.tables.scattering
+        self.light: tuple[float, float] | None = None
         self.update()
+
+    def cover(self, wavelengths: tuple[float, float]) -> None:
+        self.light, before = wavelengths, self.light
+        try:
+            self.update()
+        except RequestError:
+            self.light = before
+            raise
 
     def update(self) -> None:
         """Check the parameters that can change, and recompute what depends on them.
 
         Raises:
-            RequestError: if the spectrum does not cover the scales, or the wavelengths inside a coat.
+            RequestError: if the spectrum does not cover the scales, or the wavelengths of the light.
         """
-        shortest = VISIBLE[0] / self.media.index
-        max_scale = shortest / self.spectrum.wavelengths[0]
-        if self.media.index > 1 and max_scale < 1 - 1e-6:
+        index, (first, last) = self.media.index, self.light or VISIBLE
+        shortest = first / index
+        # Without a scene nobody knows whether there is light at the wavelengths before the first of the spectrum.
+        if (index > 1 or self.light) and shortest < self.spectrum.wavelengths[0] * (1 - 1e-6):
             name, medium = "int_ior", "the material"
             if self.media.eta is None:
                 name, medium = ("ext_ior", "it") if self.media.coat is None else ("coat_ior", "the coat")
+            got, why = f"{name}: got {index:g}", f"; inside {medium} they are shorter"
+            if index == 1:
+                got, why = f"wavelengths: got light from {first:g} nm", ""
             raise RequestError(
-                f"{name}: got {self.media.index:g}, and a spectrum for wavelengths from "
-                f"{self.spectrum.wavelengths[0]:g} nm; inside {medium} they are shorter: build it from "
+                f"{got}, and a spectrum for wavelengths from {self.spectrum.wavelengths[0]:g} nm{why}: build it from "
                 f"{shortest:.4g} nm"
             )
-        scales = self.scales
-        scales.check(self.spectrum.wavelengths, self.media.index, getattr(self.scattering, "max_scale", None))
+        # The longest wavelength grows as the index falls.
+        self.spectrum = self.spectrum.up_to(last / index)
+        self.tables = SharedTables.of(self.spectrum, self.media.eta)
+        self.scattering, scales = self.tables.scattering, self.scales
+        scales.check(self.spectrum.wavelengths, shortest, getattr(self.scattering, "max_scale", None))
         self.energy: Energy | None = None
         if self.conserve_energy and self.shadowing:
             self.energy = self.tables.energy(scales)
         self.interface = self._interface()
-        self.covered_index = self.media.index
+        shortest, longest = self.spectrum.wavelengths
+        self.wavelengths = shortest * index, longest * index
 
     def _interface(self) -> Interface:
         """Return the media above and below, and set the sampler of orders for the current scales and index."""
@@ -201,8 +221,6 @@ class ScalarTheory(Theory):
             other_index = abs(eta - before) > MAX_INDEX_CHANGE * abs(before - 1)
             if other_index:
                 self.media = dataclasses.replace(self.media, eta=eta)
-                self.tables = SharedTables.of(self.spectrum, eta)
-                self.scattering = self.tables.scattering
         if changed or other_index:
             self.update()
         else:
@@ -270,7 +288,17 @@ class RigorousTheory(Theory):
             self.interface = Interface(1.0 if coat is None else coat.eta)
         else:
             self.interface = Interface(eta=opaque(spectrum.int_ior.real), is_sheet=media.transmission == "sheet")
-        self.covered_index = 1 if coat is None else media.index
+        index = 1.0 if coat is None else media.index
+        shortest, longest = spectrum.wavelengths
+        self.wavelengths = shortest * index, longest * index
+
+    def cover(self, wavelengths: tuple[float, float]) -> None:
+        (first, last), (shortest, longest) = wavelengths, self.wavelengths
+        if first < shortest * (1 - 1e-6) or last > longest * (1 + 1e-6):
+            raise RequestError(
+                f"wavelengths: got light of {first:g} to {last:g} nm and a rigorous spectrum of {shortest:g} to "
+                f"{longest:g} nm: build it for wavelengths=({first:g}, {last:g})"
+            )
 
     def parameters_changed(self, keys: list[str]) -> None:
         """Do nothing: a table of efficiencies has no parameters."""

@@ -110,7 +110,7 @@ def render(
     from ..llvm import choose_variant
     from ..render.cluster import trace_on
     from ..render.passes import checkpoint_path, trace_locally
-    from ..render.scene import channel_wavelengths, files_of_scene, has_alpha, named_sample_count
+    from ..render.scene import files_of_scene, has_alpha, named_sample_count
     from ..render.turntable import orbit as motions_of_orbit
     from ..render.turntable import save_animation
 
@@ -132,10 +132,10 @@ def render(
     motions = [None] if frames is None else motions_of_orbit(scene, frames, **where)
     where |= {"width": width, "height": height}
     request = {"spp": spp, "seed": seed, "until_error": until_error, "seconds": checkpoint, "tracer": tracer}
-    planes = 3 + has_alpha(scene, where["parameters"]) + (0 if rgb else channels or channel_wavelengths().size)
-    bytes_per_pixel = (2 if half or rgb else 4) * planes
     if until_error is None:  # else nobody knows the time
-        request["announce"] = partial(_announce, scene.name, bytes_per_pixel, named)
+        planes = 3 + has_alpha(scene, where["parameters"])
+        written = 0 if rgb else channels
+        request["announce"] = partial(_announce, scene.name, 2 if half or rgb else 4, planes, written, named)
     pictures = _pictures(target, frames)
     stored = {"half": half, "rgb": rgb, "channels": channels}
     factor = None if exposure is None else 2**exposure
@@ -170,11 +170,19 @@ def _render(
         )
 
 
-def _announce(label: str, bytes_per_pixel: int, named: int | None, estimate: Estimate) -> None:
-    """Print what a rendering of more than a minute needs; `named` is the sample count, if it is that of the scene."""
+def _announce(
+    label: str, bytes_per_number: int, planes: int, wavelengths: int | None, named: int | None, estimate: Estimate
+) -> None:
+    """Print what a rendering of more than a minute needs.
+
+    Args:
+        planes: of the picture, in addition to those of its `wavelengths` (None: all).
+        named: the sample count, if it is that of the scene.
+    """
     if estimate.seconds < _MIN_ANNOUNCED_SECONDS:
         return
-    size = bytes_per_pixel * estimate.columns * estimate.rows
+    planes += estimate.channels if wavelengths is None else wavelengths
+    size = bytes_per_number * planes * estimate.columns * estimate.rows
     disk = f", {estimate.disk / 1e9:.2g} GB of disk meanwhile" if estimate.disk else ""
     say(
         label,

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from ..errors import RequestError, root_cause
 from ..integrator.paths import LightPaths
-from .scene import channel_wavelengths, channel_weights
+from .scene import channel_wavelengths, channel_weights, recorded_range, wavelengths_of
 
 Rows = tuple[int, int]
 """The first row of a band of a picture, and the row after its last."""
@@ -126,7 +126,7 @@ def check_memory(scene: mi.Scene, spp: int, bands: tuple[Rows, ...] | None = Non
     """
     columns, rows = (int(size) for size in scene.sensors()[0].film().crop_size())
     largest = rows if bands is None else max(end - first for first, end in bands)
-    n = channel_wavelengths().size
+    n = channel_wavelengths(recorded_range(scene)).size
     pixel_bytes, sample_bytes = (14 * n, 24 * n) if needs_mitsubas_film(scene.integrator()) else (24 * n + 68, 40)
     needed = columns * (largest * (pixel_bytes + sample_bytes * spp) + 8 * rows)
     dr.flush_malloc_cache()
@@ -209,7 +209,7 @@ def _fraction(number: mi.Float) -> mi.Float:
 
 def trace_with_mitsubas_film(scene: mi.Scene, integrator: mi.Integrator, spp: int, seed: int) -> NDArray[np.float32]:
     recorded = np.array(mi.render(scene, integrator=integrator, spp=spp, seed=seed))
-    picture = recorded / channel_weights().astype(np.float32)
+    picture = recorded / channel_weights(recorded_range(scene)).astype(np.float32)
     count = np.float32(samples_drawn(scene, spp))
     return np.concatenate([picture * count, np.full((*picture.shape[:2], 1), count)], axis=-1)
 
@@ -294,7 +294,7 @@ def _trace(
     ray, weight = sensor.sample_ray_differential(time, sampler.next_1d(), on_film, aperture)
     ray.scale_differential(spp**-0.5)
     traced, valid, _ = integrator.sample(scene, sampler, ray, sensor.get_medium())
-    channels = channel_wavelengths().size
+    channels = channel_wavelengths(recorded_range(scene)).size
     channel, value = _on_channels(film, ray.wavelengths, weight * traced)
     covered = [dr.select(valid, mi.Float(1), 0)] if alpha else []
     dr.eval(position, channel, value, covered)
@@ -317,7 +317,7 @@ def _on_channels(film: mi.Film, wavelengths: mi.Spectrum, value: mi.Spectrum) ->
     si.wavelengths = wavelengths
     response = film.sensor_response_function().eval(si)
     radiance = mi.unpolarized_spectrum(value) * dr.select(response > 0, dr.rcp(response), 0)
-    centres = channel_wavelengths()
+    centres = channel_wavelengths(wavelengths_of(film))
     step = float(centres[1] - centres[0])
     return list((wavelengths - float(centres[0])) / step), list(radiance / (len(radiance) * step))
 

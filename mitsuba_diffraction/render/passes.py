@@ -38,6 +38,7 @@ from numpy.typing import NDArray
 from ..color import spectrum_to_XYZ
 from ..errors import RequestError
 from ..files import UNSEALED, discard, exclusive, is_intact, seal, whole_file
+from ..settings import VISIBLE
 from .film import (
     LightOfBands,
     Rows,
@@ -51,10 +52,12 @@ from .film import (
 )
 from .scene import (
     Materials,
+    SpectralRange,
     channel_wavelengths,
     has_alpha,
     load_spectral_scene,
     max_plausible_luminance,
+    recorded_range,
     scene_digest,
     warn_of_gratings,
 )
@@ -67,16 +70,17 @@ _log = logging.getLogger(__name__)
 class Accumulation:
     """Sums over passes p = 1 … P of n_p samples per pixel each.
 
-    y_p is the luminance Y of a pixel in pass p alone. Floating-point sums depend on their order: passes must be added
-    in the order of their indices.
+    y_p is the luminance Y of a pixel in pass p alone, of invisible light its mean radiance. Floating-point sums depend
+    on their order: passes must be added in the order of their indices.
 
     Attributes:
         sums: (height, width, n + 1) float64, or n + 2 with alpha: Σ_p of the results of `trace_pass`, at
-            `channel_wavelengths()`.
+            `channel_wavelengths(spectral_range)`.
         luminance: (height, width) float64, Σ_p n_p y_p.
         squares: (height, width) float64, Σ_p n_p y_p².
         passes: P.
         samples: N = Σ_p n_p.
+        spectral_range: (shortest, longest) wavelength, nm.
     """
 
     sums: NDArray[np.float64]
@@ -84,17 +88,20 @@ class Accumulation:
     squares: NDArray[np.float64]
     passes: int = 0
     samples: int = 0
+    spectral_range: SpectralRange = VISIBLE
 
     @classmethod
-    def empty(cls, rows: int, columns: int, alpha: bool = False) -> Accumulation:
+    def empty(
+        cls, rows: int, columns: int, alpha: bool = False, spectral_range: SpectralRange = VISIBLE
+    ) -> Accumulation:
         """Return the sums of zero passes."""
-        channels = channel_wavelengths().size + (2 if alpha else 1)
-        return cls(np.zeros((rows, columns, channels)), *np.zeros((2, rows, columns)))
+        channels = channel_wavelengths(spectral_range).size + (2 if alpha else 1)
+        return cls(np.zeros((rows, columns, channels)), *np.zeros((2, rows, columns)), spectral_range=spectral_range)
 
     def add(self, traced: NDArray[np.float32], samples: int) -> None:
         """Add the result of `trace_pass` with that many samples per pixel."""
         # einsum adds in a fixed order; a matrix product may be multithreaded.
-        wavelengths = channel_wavelengths()
+        wavelengths = channel_wavelengths(self.spectral_range)
         weights = spectrum_to_XYZ(np.eye(wavelengths.size), wavelengths)[:, 1].astype(np.float32)
         luminance = np.einsum("yxi,i->yx", traced[..., : weights.size], weights).astype(np.float64)
         luminance = ratio(luminance, traced[..., -1])
@@ -107,7 +114,7 @@ class Accumulation:
     def radiance(self, rows: slice = slice(None)) -> NDArray[np.float32]:
         """Return the radiance, (height, width, n) float32, W m⁻² sr⁻¹ nm⁻¹."""
         # Row by row, to avoid a second copy of the sums of a large picture.
-        n = channel_wavelengths().size
+        n = channel_wavelengths(self.spectral_range).size
         return np.stack([ratio(row[:, :n], row[:, -1:]).astype(np.float32) for row in self.sums[rows]])
 
     def alpha(self) -> NDArray[np.float32]:
@@ -218,9 +225,10 @@ class BandedSums:
         digest: str,
         checkpoint: str | os.PathLike[str] | None,
         alpha: bool = False,
+        spectral_range: SpectralRange = VISIBLE,
     ) -> None:
         """Read existing checkpoints; errors as of `load_checkpoint`. Without `checkpoint`, they are temporary files."""
-        self.bands, self._columns, self._digest = bands, columns, digest
+        self.bands, self._columns, self._digest, self.spectral_range = bands, columns, digest, spectral_range
         if checkpoint is None and len(bands) > 1:
             checkpoint = Path(tempfile.mkdtemp(), "sums")
             weakref.finalize(self, shutil.rmtree, checkpoint.parent, ignore_errors=True)
@@ -240,7 +248,7 @@ class BandedSums:
             (first, end), path = self.bands[index], self._paths[index]
             stored = None if path is None else load_checkpoint(path, self._digest)
             if stored is None:
-                stored = Accumulation.empty(end - first, self._columns, self.alpha is not None)
+                stored = Accumulation.empty(end - first, self._columns, self.alpha is not None, self.spectral_range)
             self._sums = stored
             self._index, self._saved = index, self._sums.samples
         return self._sums
@@ -282,7 +290,7 @@ class BandedImage(SpectralImage):
     """A picture of which one band is in memory at a time, as long as `radiance` is not read as a whole."""
 
     def __init__(self, sums: BandedSums, attributes: Mapping[str, str | int | float]) -> None:
-        object.__setattr__(self, "wavelengths", channel_wavelengths())
+        object.__setattr__(self, "wavelengths", channel_wavelengths(sums.spectral_range))
         object.__setattr__(self, "attributes", dict(attributes))
         object.__setattr__(self, "alpha", sums.alpha)
         object.__setattr__(self, "_sums", sums)
@@ -329,6 +337,7 @@ class Job:
         bands: `film.bands_of` the scene.
         until_error: see `render`.
         alpha: whether alpha is recorded.
+        spectral_range: (shortest, longest) wavelength that is recorded, nm.
         content: digest of the scene and the files it references (`scene_digest`).
         versions: of the packages involved.
     """
@@ -341,6 +350,7 @@ class Job:
     bands: tuple[Rows, ...]
     until_error: float | None
     alpha: bool
+    spectral_range: SpectralRange
     content: str
     versions: tuple[str, ...]
 
@@ -367,6 +377,7 @@ class Estimate:
 
     Attributes:
         columns, rows: pixels.
+        channels: wavelengths.
         spp: samples per pixel; the maximum with `until_error`.
         memory: bytes, in addition to the scene.
         disk: bytes of the checkpoints of several bands, else zero.
@@ -375,6 +386,7 @@ class Estimate:
 
     columns: int
     rows: int
+    channels: int
     spp: int
     memory: int
     disk: int
@@ -460,9 +472,9 @@ def render(
         announce: called once, after two passes (of the bands of a large picture: the first compiles).
 
     Returns:
-        The picture; radiance per nm at `channel_wavelengths()`. Its attributes are the scene, the variant, the samples
-        per pixel, the seed, the error (from four passes on) and the digest of the request. A large one is read from its
-        checkpoints when it is saved (`BandedImage`).
+        The picture; radiance per nm at `channel_wavelengths` of the film's range. Its attributes are the scene, the
+        variant, the samples per pixel, the seed, the error (from four passes on) and the digest of the request. A large
+        one is read from its checkpoints when it is saved (`BandedImage`).
 
     Raises:
         FileNotFoundError: if there is no such scene.
@@ -483,9 +495,10 @@ def render(
 
     columns, rows = (int(size) for size in scene.sensors()[0].film().crop_size())
     memory = check_memory(scene, max(job.samples), job.bands)
-    disk = _check_disk(job.bands, columns, checkpoint)
+    disk = _check_disk(job, columns, checkpoint)
+    channels = channel_wavelengths(job.spectral_range).size
     with nullcontext() if checkpoint is None else exclusive(checkpoint):
-        sums = BandedSums(job.bands, columns, job.digest(), checkpoint, job.alpha)
+        sums = BandedSums(job.bands, columns, job.digest(), checkpoint, job.alpha, job.spectral_range)
         complete = _trace(
             job,
             scene,
@@ -494,7 +507,7 @@ def render(
             seconds,
             tracer,
             progress,
-            lambda remaining: announce(Estimate(columns, rows, sum(job.samples), memory, disk, remaining)),
+            lambda remaining: announce(Estimate(columns, rows, channels, sum(job.samples), memory, disk, remaining)),
         )
     if sums.done < len(job.bands):
         raise KeyboardInterrupt
@@ -563,20 +576,22 @@ def _job(
         bands=bands_of(scene),
         until_error=until_error,
         alpha=has_alpha(scene_path, where["parameters"]) and not whole,
+        spectral_range=recorded_range(scene),
         content=scene_digest(scene_path, where["parameters"], where["materials"]),
         versions=versions(),
     )
     return job, scene
 
 
-def _check_disk(bands: tuple[Rows, ...], columns: int, checkpoint: str | os.PathLike[str] | None) -> int:
+def _check_disk(job: Job, columns: int, checkpoint: str | os.PathLike[str] | None) -> int:
     """Check that the checkpoints of a picture in several bands fit on the disk; return their bytes, while written."""
+    bands = job.bands
     if len(bands) == 1:
         return 0
     paths = [] if checkpoint is None else [Path(checkpoint_of_band(checkpoint, band)) for band in range(len(bands))]
     folder = paths[0].absolute().parent if paths else Path(tempfile.gettempdir())
     rows = [end - first for first, end in bands]
-    needed = 8 * columns * (channel_wavelengths().size + 3) * (sum(rows) + max(rows))
+    needed = 8 * columns * (channel_wavelengths(job.spectral_range).size + 3) * (sum(rows) + max(rows))
     available = shutil.disk_usage(folder).free + sum(path.stat().st_size for path in paths if path.is_file())
     if needed > available:
         raise RequestError(
@@ -596,7 +611,7 @@ def _image(sums: BandedSums, job: Job, scene: str, complete: bool) -> SpectralIm
         attributes["digest"] = job.digest()
     if len(job.bands) > 1:
         return BandedImage(sums, attributes)
-    return SpectralImage(channel_wavelengths(), sums.band(0).radiance(), attributes, sums.alpha)
+    return SpectralImage(channel_wavelengths(job.spectral_range), sums.band(0).radiance(), attributes, sums.alpha)
 
 
 def _warn_of_implausible_pixels(luminance: NDArray[np.float32], limit: float) -> None:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from ..bsdf.base import is_grating
 from ..bsdf.diffraction_grating import check
+from ..bsdf.light import cover_light, wavelengths_of
 from ..errors import RequestError, root_cause
 from ..llvm import is_supported
 from ..precomputation import is_rigorous
@@ -27,15 +28,14 @@ from ..settings import VISIBLE
 
 _log = logging.getLogger(__name__)
 
-# Spacing of the channels, nm.
+# Spacing of the channels, nm, at most.
 #
 # With 5 nm, colours differ from the exact ones by ΔE₂₀₀₀ ≤ 0.05 for lines 5 nm wide and by at most 0.6 for laser lines
 # (10 nm: 1.3 and 3.2; 23.5 nm: 90), and the orders of a grating, 5–20 nm wide at a coherence length of 65 µm, are
 # resolved. The spacing affects memory but not time, as `film` adds a sample to at most eight channels.
 _CHANNEL_STEP = 5.0
 
-# Grid spacing of the density from which wavelengths are drawn, nm: less than the width of a lamp's lines.
-_DENSITY_STEP = 0.25
+_STEPS_PER_CHANNEL = 20  # of the density from which wavelengths are drawn; a step is narrower than a lamp's lines
 _DRAWS_PER_LIGHT = 2**14  # of four wavelengths, to estimate the spectrum of the light
 
 Materials = Mapping[str, Mapping[str, bool | float | str]]
@@ -52,12 +52,17 @@ _FORMATS_WITH_ALPHA = {"luminance_alpha", "rgba", "xyza"}
 _DEFAULT_SIZE = (768, 576)  # width and height of Mitsuba's films
 
 
-def channel_wavelengths() -> NDArray[np.float64]:
-    """Return the centres of the film's channels, (n,), nm; the hat functions lie inside Mitsuba's spectral range."""
-    return np.arange(VISIBLE[0] + _CHANNEL_STEP, VISIBLE[1] - _CHANNEL_STEP / 2, _CHANNEL_STEP)
+SpectralRange = tuple[float, float]
+"""(shortest, longest) wavelength that a film records, nm."""
 
 
-def channel_weights() -> NDArray[np.float64]:
+def channel_wavelengths(spectral_range: SpectralRange = VISIBLE) -> NDArray[np.float64]:
+    """Return the centres of the film's channels, (n,), nm, equidistant; the hat functions lie inside the range."""
+    count = max(2, round((spectral_range[1] - spectral_range[0]) / _CHANNEL_STEP) - 1)
+    return np.linspace(*spectral_range, count + 2)[1:-1]
+
+
+def channel_weights(spectral_range: SpectralRange = VISIBLE) -> NDArray[np.float64]:
     """Return the area of the response of each channel, (n,); the recorded value divided by it is radiance.
 
     Mitsuba samples wavelengths in proportion to the sum of the responses of the film. With hats of unit area, half of
@@ -66,7 +71,13 @@ def channel_weights() -> NDArray[np.float64]:
     quarter, as much as 1.8 times the samples would. The lower bound of one quarter limits the noise of a channel to
     twice that of the best one.
     """
-    return np.maximum(np.cosh(0.0072 * (channel_wavelengths() - 538)) ** -2, 0.25)
+    return np.maximum(np.cosh(0.0072 * (channel_wavelengths(spectral_range) - 538)) ** -2, 0.25)
+
+
+def recorded_range(scene: mi.Scene) -> SpectralRange:
+    """Return the range of the first sensor of a scene from `load_spectral_scene`."""
+    shortest, longest = wavelengths_of(scene.sensors()[0].film())
+    return round(shortest, 6), round(longest, 6)
 
 
 def load_spectral_scene(
@@ -81,8 +92,9 @@ def load_spectral_scene(
     """Load an XML scene in the current variant and replace its film by a spectral one.
 
     The film becomes a `specfilm` of float32 whose channels are hat functions at `channel_wavelengths()` with areas of
-    `channel_weights()`: divided by these, a channel is spectral radiance per nm, averaged over the hat. Size, crop and
-    reconstruction filter are those of the scene. File names in the scene are relative to its folder.
+    `channel_weights()`: divided by these, a channel is spectral radiance per nm, averaged over the hat. They cover
+    visible light, or the bands of a `specfilm` that reach beyond. Size, crop and reconstruction filter are those of the
+    scene. File names in the scene are relative to its folder.
 
     Args:
         width: of the full film in pixels; the crop window is scaled with it. If only one of width and height is given,
@@ -119,6 +131,8 @@ def load_spectral_scene(
         # Serially: on several threads, Mitsuba 3.9.1 crashed once in a loop of loads and renderings.
         config.parallel = False
         scene = mi.parser.instantiate(config, state)
+        if isinstance(scene, mi.Scene):
+            cover_light(scene)
     if not isinstance(scene, mi.Scene):
         raise RequestError(f"{path}: the file holds a {type(scene).__name__}, wanted a scene")
     if scene.integrator() is None:
@@ -231,15 +245,15 @@ def _draw_wavelengths_of_lights(scene: mi.Scene) -> None:
     its light arrives at a pixel. The film divides by p, and p > 0 where r > 0: the expectation of each channel is
     unchanged.
     """
-    emissions = [_emission(emitter) for emitter in scene.emitters()]
     for sensor in scene.sensors():
         # The sensor draws wavelengths from this object of the film.
         distribution = mi.traverse(sensor.film().sensor_response_function())
         response = np.array(distribution["values"], np.float64)
         response /= response.sum()
+        grid = np.linspace(*wavelengths_of(sensor.film()), response.size)
         lines = np.zeros_like(response)
-        for emission in emissions:
-            recorded = response * emission
+        for emitter in scene.emitters():
+            recorded = response * _emission(emitter, grid)
             lines = np.maximum(lines, recorded / (recorded.sum() or 1) - 4 * response)
         if lines.any():
             density = response + lines / (3 * max(1, lines.sum()))
@@ -249,8 +263,8 @@ def _draw_wavelengths_of_lights(scene: mi.Scene) -> None:
             distribution.update()
 
 
-def _emission(emitter: mi.Emitter) -> NDArray[np.float64]:
-    """Return the spectrum of a light on the grid of the density, (n,), up to a factor.
+def _emission(emitter: mi.Emitter, grid: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the spectrum of a light on a grid of equidistant wavelengths in nm, (n,), up to a factor.
 
     It is a histogram of wavelengths sampled by the light itself, so that narrow lines are not missed. A light whose
     spectrum varies over positions or directions is sampled at a single one.
@@ -260,7 +274,7 @@ def _emission(emitter: mi.Emitter) -> NDArray[np.float64]:
     numbers = (np.arange(_DRAWS_PER_LIGHT, dtype=np.float32) + 0.5) / _DRAWS_PER_LIGHT
     wavelengths, weights = emitter.sample_wavelengths(si, mi.Float(numbers))
     wavelengths, weights = (x.ravel() for x in np.broadcast_arrays(wavelengths, mi.unpolarized_spectrum(weights)))
-    edges = np.arange(VISIBLE[0] - _DENSITY_STEP / 2, VISIBLE[1] + _DENSITY_STEP, _DENSITY_STEP)
+    edges = np.append(grid, 2 * grid[-1] - grid[-2]) - (grid[1] - grid[0]) / 2
     return np.histogram(wavelengths, edges, weights=weights)[0]
 
 
@@ -547,14 +561,35 @@ def _spectral_film(
         film["sample_border"] = old["sample_border"]
     for index, name in _children(state, old, mi.ObjectType.ReconstructionFilter).items():
         film[name] = mi.Properties.ResolvedReference(index)
-    triangle = 1 - np.abs(np.linspace(-1, 1, round(2 * _CHANNEL_STEP / _DENSITY_STEP) + 1))
-    for number, (centre, weight) in enumerate(zip(channel_wavelengths(), channel_weights(), strict=True)):
+    spectral_range = _spectral_range(state, old)
+    centres = channel_wavelengths(spectral_range)
+    step = float(centres[1] - centres[0])
+    triangle = 1 - np.abs(np.linspace(-1, 1, 2 * _STEPS_PER_CHANNEL + 1))
+    for number, (centre, weight) in enumerate(zip(centres, channel_weights(spectral_range), strict=True)):
         hat = mi.Properties("regular")
-        hat["wavelength_min"], hat["wavelength_max"] = float(centre - _CHANNEL_STEP), float(centre + _CHANNEL_STEP)
-        hat["values"] = ", ".join(f"{weight / _CHANNEL_STEP * value:.17g}" for value in triangle)
+        hat["wavelength_min"], hat["wavelength_max"] = float(centre - step), float(centre + step)
+        hat["values"] = ", ".join(f"{weight / step * value:.17g}" for value in triangle)
         # Channels are numbered, as the parser refuses names with a dot; films order channels by name.
         film[f"channel_{number:03d}"] = _add(state, mi.ObjectType.Texture, hat)
     return film
+
+
+def _spectral_range(state: mi.parser.ParserState, film: mi.Properties) -> SpectralRange:
+    """Return the wavelengths from the shortest to the longest of a film's bands if some are not visible, else these."""
+    if film.plugin_name() != "specfilm":
+        return VISIBLE
+    textures = [mi.Properties(state.nodes[index].props) for index in _children(state, film, mi.ObjectType.Texture)]
+    ranges = [mi.PluginManager.instance().create_object(texture).wavelength_range() for texture in textures]
+    tables = [film[name].wavelengths for name in film.keys() if film.type(name) == mi.Properties.Type.Spectrum]  # noqa: SIM118
+    ranges += [(min(table), max(table)) for table in tables if len(table)]
+    if not ranges:
+        return VISIBLE
+    first, last = float(min(low for low, _ in ranges)), float(max(high for _, high in ranges))
+    if VISIBLE[0] <= first and last <= VISIBLE[1]:
+        return VISIBLE
+    # Of a narrow line, at least two channels.
+    middle, half = (first + last) / 2, max((last - first) / 2, 1.5 * _CHANNEL_STEP)
+    return middle - half, middle + half
 
 
 def _alternatives(scene: Path, error: str) -> str:

@@ -17,6 +17,7 @@ from mitsuba_diffraction.errors import Bug, RequestError
 from mitsuba_diffraction.render import film, passes, render
 from mitsuba_diffraction.render.film import trace_pass
 from mitsuba_diffraction.render.scene import channel_wavelengths, channel_weights, load_spectral_scene
+from mitsuba_diffraction.render.spectral_image import save_preview
 
 GRID = channel_wavelengths()
 SCENES = Path(__file__).parents[2] / "scenes"
@@ -54,6 +55,23 @@ def test_constant_radiance_of_one_per_nm_is_one_in_every_channel(variant, spp, t
     means = image.radiance.mean((0, 1))
     np.testing.assert_allclose(means, 1, atol=tolerance)
     np.testing.assert_allclose(means.mean(), 1, atol=tolerance / 6)
+
+
+@pytest.mark.parametrize(
+    ("first", "last", "channels"), [(850, 950, range(855, 950, 5)), (1063, 1065, (1061.5, 1066.5))]
+)
+def test_a_film_of_infrared_light_keeps_its_range(first, last, channels, llvm, tmp_path):
+    # Regression: it was replaced by one of visible light, and the picture was black.
+    band = f"""<film type="specfilm"><integer name="width" value="$width"/><integer name="height" value="8"/>
+        {spectrum("band", first, last, "1, 1")}</film>"""
+    light = f'<emitter type="constant">{spectrum("radiance", 800, 1100, "1, 1")}</emitter>'
+    image = render(write_scene(tmp_path, light, film=band), spp=64)
+    np.testing.assert_allclose(image.wavelengths, channels)
+    np.testing.assert_allclose(image.radiance.mean((0, 1)), 1, atol=0.1)
+    save_preview(image, tmp_path / "preview.png", exposure=0.25)
+    shown = np.array(Image.open(tmp_path / "preview.png"))
+    assert (np.ptp(shown, axis=2) <= 1).all()
+    assert shown.mean() == pytest.approx(137, abs=20)  # a quarter, in sRGB
 
 
 @pytest.mark.slow

@@ -228,6 +228,6 @@ def test_a_missing_extra_is_named(tmp_path, monkeypatch):
 
 
 def test_formats_that_may_hold_more_than_heights_are_not_passed_on():
-    # MATLAB, HDF5, netCDF, pickles: no instrument's own, and readers of great power.
-    for extension in (".mat", ".h5", ".hdf5", ".nc", ".pkl", ".npy", ".npz", ".txt", ".zip", ".hgt", ".datx"):
+    # MATLAB, HDF5, netCDF, pickles: no instrument's own, and readers of great power; .datx is Zygo's HDF5.
+    for extension in (".mat", ".h5", ".hdf5", ".nc", ".pkl", ".npy", ".npz", ".txt", ".zip", ".hgt"):
         assert instruments.format_of(extension) is None

@@ -3,6 +3,7 @@
 import struct
 import time
 import zlib
+from contextlib import nullcontext
 
 import gwyfile
 import numpy as np
@@ -406,7 +407,9 @@ def test_gwy_provides_its_scale_and_the_top_row_is_the_first(tmp_path):
 @pytest.mark.parametrize(("unit", "scale"), [("m", 1.0), ("um", 1e-6), ("µm", 1e-6), ("nm", 1e-9), ("Å", 1e-10)])
 def test_gwy_units_are_converted(tmp_path, unit, scale):
     write_gwy(tmp_path / "scan.gwy", {3: ("Z", gwy_field(z=unit))})
-    np.testing.assert_allclose(read_height_field(tmp_path / "scan.gwy").heights, HEIGHTS * scale, rtol=1e-12)
+    with nullcontext() if scale * np.ptp(HEIGHTS) > 2e-4 else pytest.warns(UserWarning, match="is their unit right"):
+        field = read_height_field(tmp_path / "scan.gwy")
+    np.testing.assert_allclose(field.heights, HEIGHTS * scale, rtol=1e-12)
 
 
 def test_the_channel_is_that_of_the_heights_or_the_named_one(tmp_path, refuse):
@@ -438,8 +441,35 @@ def test_a_missing_unit_is_refused(tmp_path, refuse):
     assert field.pixel_size == pytest.approx((1.0, 2.0))
     for wrong in ("V", ("m",), ("m", "m", "m"), 3):
         refuse("scan.gwy", "unit: ", unit=wrong)
-    np.save(tmp_path / "scan.npy", HEIGHTS)
-    refuse("scan.npy", "unit: got 'nm' for .npy", unit="nm")
+    np.save(tmp_path / "scan.npy", HEIGHTS * 1e3)
+    np.testing.assert_allclose(read_height_field(tmp_path / "scan.npy", 0.1, unit="nm").heights, HEIGHTS, rtol=1e-12)
+    np.save(tmp_path / "scan.npy", np.uint8(HEIGHTS * 10))
+    refuse("scan.npy", r"unit: got 'nm' for integers in \.npy, wanted height_range", unit="nm", height_range=1.0)
+
+
+@pytest.mark.parametrize(
+    ("pixel", "scale", "fault"),
+    [
+        (1e-5, 1.0, r"pixel_size: got 1e-05 × 1e-05 µm, a field of .*, wanted pixels of 0\.0001 to 100 µm"),
+        (250e3, 1.0, "pixel_size: got 2.5e[+]05"),
+        (0.1, 1e-6, r"got heights of a range of 3e-07 µm, wanted 0\.0002 to 20 µm: is their unit right\? unit \("),
+        (0.1, 1e6, "got heights of a range of 3e[+]05 µm"),
+    ],
+)
+def test_a_scan_of_an_impossible_scale_is_named(tmp_path, refuse, pixel, scale, fault):
+    # Regression: a picture in metres was a mirror, and pixels of a quarter of a metre were taken.
+    heights = np.float32(HEIGHTS / np.ptp(HEIGHTS) * 0.3 * scale)
+    Image.fromarray(heights).save(tmp_path / "scan.tif")
+    np.save(tmp_path / "scan.npy", heights)
+    for name in ("scan.tif", "scan.npy"):
+        if fault.startswith("pixel_size"):
+            refuse(name, fault, pixel_size=pixel)
+        else:
+            with pytest.warns(UserWarning, match=f"{name}: {fault}"):
+                read_height_field(tmp_path / name, pixel)
+    if scale < 1:
+        field = read_height_field(tmp_path / "scan.tif", pixel, unit=("um", "m"))
+        assert field.height_range == pytest.approx(0.3, rel=1e-5)
 
 
 DOUBLES = struct.pack("<I", 6) + np.zeros(6).tobytes()

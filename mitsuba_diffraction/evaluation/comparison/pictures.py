@@ -20,7 +20,8 @@ from ...progress import Progress, part, silent
 from ...render import SpectralImage
 from ...render.film import check_memory, collect, equal_ranges, pass_seed, rotated, trace_pass
 from ...render.passes import Accumulation, ratio, split
-from ...render.scene import channel_wavelengths, load_spectral_scene, parsed
+from ...render.scene import channel_wavelengths, load_spectral_scene, parsed, recorded_range
+from ...settings import VISIBLE
 from ..realtime_shader import tristimulus
 from ..realtime_shader.base import Shader, TextureShader
 from ..realtime_shader.flss import FLSS
@@ -164,6 +165,8 @@ class Pictures:
         self.scene = load_spectral_scene(scene_path, width=width, height=height, parameters=parameters)
         if hasattr(self.scene.integrator(), "quirks"):
             raise RequestError(f"{scene_path}: its integrator is the shader itself, wanted a path tracer (type='path')")
+        if (found := recorded_range(self.scene)) != VISIBLE:
+            raise RequestError(f"{scene_path}: got a film of {found[0]:g} to {found[1]:g} nm, wanted visible light")
         self.seed = seed
         self._others: dict[tuple[bool, bool, int], Picture] = {}
         self.use(shader)

@@ -8,6 +8,8 @@ explicit y (.xyz, ESRI grids) keep theirs.
 from __future__ import annotations
 
 import os
+import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +17,10 @@ from numpy.typing import NDArray
 
 from ...errors import RequestError, is_number
 from ...files import refuse_special
+from ...settings import Settings
 from ..heightfield import HeightField
 from . import gwyddion, instruments, pictures, text
-from .scan import Scan
+from .scan import Scan, micrometres, pair
 
 __all__ = ["read_height_field"]
 
@@ -42,10 +45,18 @@ _MAGIC = {
     b"\x89PNG": ".png",
     b"II*\0": ".tif",
     b"MM\0*": ".tif",
-    b"# Channel:": ".asc",
     b"ncols ": ".asc",
+    b"DIGITAL SURF": ".sur",
+    b"DSCOMPRESSED": ".sur",
+    b"Binary TrueMap": ".tmd",
+    b"PK\3\4": ".x3p",
 }
 _EXTENSIONS = (*_WITHOUT_UNIT, ".gwy", *_WITH_UNIT)
+_HEADER_BYTES = 4096  # of a text
+
+# What a scan that diffracts light can be, µm; outside, a unit is wrong.
+_MIN_HEIGHT_RANGE, _MAX_HEIGHT_RANGE = 2e-4, Settings.largest_height_range
+_MIN_PIXEL, _MAX_PIXEL, _MAX_FIELD = 1e-4, 100.0, 5e4
 
 
 def read_height_field(
@@ -62,13 +73,15 @@ def read_height_field(
 
     | format | contents | required arguments |
     |---|---|---|
-    | .npy | floats are µm; integers run over the full range of their type | pixel_size; integers: height_range |
+    | .npy | floats are µm, or `unit`; integers run over the full range of their type | pixel_size; integers: \
+        height_range |
     | .npz | array `heights`, as .npy, and optionally `pixel_size` in µm, one number or (x, y) | as .npy |
     | .png, .tif, .tiff | 8 or 16 bit grey; colour if grey and opaque but for annotation | pixel_size, height_range |
-    | .tif, .tiff | 32 bit float, µm | pixel_size |
+    | .tif, .tiff | 32 bit float, µm, or `unit` | pixel_size |
+    | .tif, .tiff | Park Systems, with the extra `instruments` | |
     | .gwy, .gsf | Gwyddion, Gwyddion Simple Field | unit, if the file has none |
     | .xyz | points x y z on a regular grid | unit |
-    | .asc | table of heights exported by Gwyddion, or ESRI grid | unit and pixel_size, if it has none |
+    | .asc, .txt | table of heights exported by Gwyddion, or ESRI grid | unit and pixel_size, if it has none |
     | .spm, .000, .nid, .ibw, .sdf, .x3p, … | instrument formats, with the extra `instruments` | |
 
     Args:
@@ -81,6 +94,7 @@ def read_height_field(
         channel: of a file with several (.gwy and instrument formats), by name or number. None selects the one that
             holds lengths, or the first of those named height or topography; `source` reports which.
         unit: of lengths, e.g. "nm", for a file without one; ("um", "nm") if lateral lengths and heights differ.
+            `pixel_size` is in µm in any case.
         keep_missing: keep missing pixels as NaN, for the steps of `prepare`.
 
     Returns:
@@ -88,7 +102,11 @@ def read_height_field(
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if the file or the arguments are invalid; one line that names the file.
+        ValueError: if the file or the arguments are invalid, or the pixels or the field are too small or too large for
+            a scan; one line that names the file.
+
+    Warns:
+        UserWarning: if the heights are too small or too large for a scan.
     """
     path = Path(path)
     refuse_special(path)
@@ -113,17 +131,48 @@ def read_height_field(
         if pixel_size is None:
             raise RequestError("pixel_size: the file has none, wanted one number or (x, y) in µm")
         source = f"{path.name}, {scan.channel}" if scan.channel else path.name
-        return HeightField(heights, pixel_size, source, fill_missing=fill_missing, keep_missing=keep_missing)
+        field = HeightField(heights, pixel_size, source, fill_missing=fill_missing, keep_missing=keep_missing)
+        _check_scale(field, levelled=not keep_missing)
     # Pillow raises OSError for a damaged image, the system for unreadable paths (a folder, permissions);
     # UnicodeDecodeError comes from a damaged text.
     except (RequestError, UnicodeDecodeError, OSError, MemoryError) as error:
         raise RequestError(" ".join(f"{path}: {str(error)[:_MAX_QUOTE]}".split())) from error
+    return field
+
+
+def _check_scale(field: HeightField, levelled: bool) -> None:
+    """Check that a scan can have its pixels, its size and its heights; one still to be levelled may be tilted.
+
+    Raises:
+        RequestError: if pixels or size cannot be right.
+
+    Warns:
+        UserWarning: if the heights cannot.
+    """
+    (x, y), size = field.pixel_size, max(field.tile_size)
+    if not (min(x, y) >= _MIN_PIXEL and max(x, y) <= _MAX_PIXEL and size <= _MAX_FIELD):
+        raise RequestError(
+            f"pixel_size: got {x:.4g} × {y:.4g} µm, a field of {size:.4g} µm, wanted pixels of {_MIN_PIXEL:g} to "
+            f"{_MAX_PIXEL:g} µm and at most {_MAX_FIELD:g} µm: is their unit right? pixel_size (--pixel-size), in µm, "
+            "sets them"
+        )
+    height_range = float(np.nanmax(field.heights) - np.nanmin(field.heights))
+    if 0 < height_range < _MIN_HEIGHT_RANGE or (levelled and height_range > _MAX_HEIGHT_RANGE):
+        warnings.warn(
+            f"{field.source}: got heights of a range of {height_range:.3g} µm, wanted {_MIN_HEIGHT_RANGE:g} to "
+            f"{_MAX_HEIGHT_RANGE:g} µm: is their unit right? unit (--unit um --unit m: lateral lengths in µm, heights "
+            "in m) sets it for a file without one",
+            stacklevel=3,
+        )
 
 
 def _read(path: Path, channel: str | int | None, unit: str | tuple[str, str] | None) -> Scan:
     extension = path.suffix.lower()
-    if extension not in _EXTENSIONS and instruments.format_of(extension) is None and path.is_file():
+    known = extension in _EXTENSIONS or instruments.format_of(extension) is not None
+    if (not known or extension == ".dat") and path.is_file():  # many programs name their files .dat
         extension = _extension_of_content(path)
+    if extension in (".tif", ".tiff") and pictures.is_park(path):
+        extension = instruments.PARK
     instrument = instruments.format_of(extension) is not None
     if extension not in _EXTENSIONS and not instrument:
         raise RequestError(
@@ -134,21 +183,33 @@ def _read(path: Path, channel: str | int | None, unit: str | tuple[str, str] | N
         raise RequestError("the file is empty")
     if channel is not None and not (instrument or extension == ".gwy"):
         raise RequestError(f"channel: got {channel!r} for {extension}, which holds one only")
-    if unit is not None and extension in _WITHOUT_UNIT:
-        raise RequestError(f"unit: got {unit!r} for {extension}, whose lengths are µm")
     if instrument:
         return instruments.read(path, unit, channel, extension)
     if extension == ".gwy":
         return gwyddion.read(path, unit, channel)
     if extension in _WITH_UNIT:
         return _WITH_UNIT[extension](path, unit)
-    return _WITHOUT_UNIT[extension](path)
+    read = _WITHOUT_UNIT[extension](path)
+    return read if unit is None else _in_unit(read, unit, extension)
+
+
+def _in_unit(read: Scan, unit: str | tuple[str, str], extension: str) -> Scan:
+    """Return a scan of a format without units whose lengths are in `unit`."""
+    if read.numbers.dtype.kind != "f":
+        raise RequestError(f"unit: got {unit!r} for integers in {extension}, wanted height_range, in µm")
+    along, high = (micrometres(name, "unit") for name in pair(unit))
+    size = read.pixel_size
+    if size is not None:
+        size = (along * size[0], along * size[1]) if isinstance(size, tuple) else along * size
+    return replace(read, numbers=read.numbers * high, pixel_size=size)
 
 
 def _extension_of_content(path: Path) -> str:
     """Return the extension for which a file is read whose own one is unknown; that one if the content is unknown."""
     with open(path, "rb") as stream:
-        start = stream.read(max(map(len, _MAGIC)))
+        start = stream.read(_HEADER_BYTES)
+    if text.is_gwyddion_export(start):
+        return ".asc"
     return next((extension for magic, extension in _MAGIC.items() if start.startswith(magic)), path.suffix)
 
 

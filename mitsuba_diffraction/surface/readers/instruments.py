@@ -13,20 +13,29 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import RequestError
-from . import scan
+from . import mended, scan
 from .scan import MAX_BYTES, Channel, Scan, choose
 
 EXTRA = "pip install 'mitsuba_diffraction[instruments]'"
 
 # Formats that SurfaceTopography names by their extension, and others.
-_NAMED_ALIKE = "al3d bcr ezd frt ibw jpk lext mdt mi mnt nms opd opdx os3d plu plux sdf sur tmd x3p zon"
-_NAMED_OTHERWISE = {".bcrf": "bcr", ".nid": "ezd", ".spm": "di", ".vk4": "vk", ".vk6": "vk", ".vk7": "vk"}
-FORMATS = {f".{name}": name for name in _NAMED_ALIKE.split()} | _NAMED_OTHERWISE
+_NAMED_ALIKE = (
+    "al3d bcr datx ezd frt ibw jpk lext mdt mi mnt nms oir opd opdx os3d plu plux poir qep sdf sur tmd x3p zmg zon"
+)
+_NAMED_OTHERWISE = (
+    {".bcrf": "bcr", ".dat": "metropro", ".nid": "ezd", ".spm": "di"}
+    | dict.fromkeys((".vk4", ".vk6", ".vk7"), "vk")
+    | dict.fromkeys((".cur", ".stp", ".tom", ".top"), "wsxm")
+)
+PARK = ".tiff of Park Systems"
+"""In the place of an extension: a TIFF whose picture is a preview, and whose heights are in tags of their own."""
+FORMATS = {f".{name}": name for name in _NAMED_ALIKE.split()} | _NAMED_OTHERWISE | {PARK: "ps"}
 """Extension → SurfaceTopography's name of the format, in addition to Nanoscope's numbers (.000, .001, …)."""
 
 NAMES = (
-    "Nanoscope .spm .000, Nanosurf .nid .ezd, Igor .ibw, JPK .jpk, NT-MDT .mdt, ISO 25178-71 .sdf, X3P .x3p, "
-    "Digital Surf .sur, Wyko .opd, Keyence .vk4, Sensofar .plu and others"
+    "Nanoscope .spm .000, Nanosurf .nid .ezd, Park .tiff, Igor .ibw, JPK .jpk, NT-MDT .mdt, WSxM .stp .top, "
+    "ISO 25178-71 .sdf, X3P .x3p, Digital Surf .sur, Zygo .dat .datx, Wyko .opd, Keyence .vk4, Sensofar .plu .plux, "
+    "NanoFocus .nms, TrueMap .tmd and others"
 )
 
 
@@ -44,12 +53,15 @@ def read(path: Path, unit: str | tuple[str, str] | None, channel: str | int | No
         except ImportError as error:
             raise RequestError(f"an instrument's own format: wanted SurfaceTopography, {EXTRA} ({error})") from None
         _refuse_bomb(path)
+        name = format_of(extension)
+        library = lookup_reader_by_format[name]
+        contents = mended.rewritten(path, name)
         try:
-            reader = lookup_reader_by_format[format_of(extension)](str(path))
+            reader = library(contents)
             found = list(reader.channels)
-        # Readers of binary files raise arbitrary exceptions for damaged files.
+        # Readers of binary files raise arbitrary exceptions.
         except Exception as error:
-            raise RequestError(f"not a file of this instrument, or a damaged one ({_message(error)})") from None
+            raise RequestError(f"{_unread(library)} ({_message(error)})") from None
         chosen = choose(
             [Channel(c.index, c.name or "untitled", c.dim == 2 and c.data_kind.value == "height") for c in found],
             channel,
@@ -64,7 +76,10 @@ def read(path: Path, unit: str | tuple[str, str] | None, channel: str | int | No
             heights = np.ma.asarray(topography.heights(), np.float64).T
             size = topography.physical_sizes
         except Exception as error:
-            raise RequestError(f"a damaged file ({_message(error)})") from None
+            raise RequestError(f"{_unread(library)} ({_message(error)})") from None
+        if name == "nms":
+            heights, factor = mended.nms(path, heights)
+            along *= factor
     rows, columns = heights.shape
     pixel_size = (size[0] * along / columns, size[1] * along / rows) if size is not None else None
     return Scan(heights * high, pixel_size, chosen.name)
@@ -80,6 +95,14 @@ def _refuse_bomb(path: Path) -> None:
             raise RequestError(f"a damaged archive ({error})") from None
         if unpacked > MAX_BYTES:
             raise RequestError(f"an archive of {unpacked} bytes, wanted at most {MAX_BYTES}")
+
+
+def _unread(library: type) -> str:
+    """Return what a file is called that the library does not read; whether it is damaged, nobody knows."""
+    return (
+        f"not read as a file of {library.name()}: it is another one, incomplete, or of a kind that SurfaceTopography "
+        "does not know; if the instrument's program opens it, export it as .gsf, .gwy or .sdf"
+    )
 
 
 def _message(error: Exception) -> str:

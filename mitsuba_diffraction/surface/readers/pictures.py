@@ -6,6 +6,7 @@ import tokenize
 import warnings
 import zipfile
 import zlib
+from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
 
@@ -63,6 +64,16 @@ def _load_array(file: BinaryIO) -> NDArray:
 
 
 MAX_ANNOTATION_FRACTION = 0.25  # of pixels that are coloured, such as a scale bar; a colour map has more
+
+
+_PARK_TAG = 50434  # of a TIFF: heights of Park Systems
+
+
+def is_park(path: Path) -> bool:
+    """Return whether a TIFF holds heights in the tags of Park Systems, beside a picture of them."""
+    with suppress(*DAMAGED, ValueError, OSError), Image.open(path, formats=("TIFF",)) as picture:
+        return _PARK_TAG in picture.tag_v2
+    return False
 
 
 def read(path: Path) -> Scan:

@@ -6,7 +6,7 @@ missing pixel. Lines that begin with # are comments. Row 0 has the smallest y.
 .asc: a table of heights, starting with the top row of the image, with one of these headers:
 
     # Channel: Height                 exported by Gwyddion; lines in any order, others are ignored
-    # Width: 5.000 µm
+    # Width: 5.000 µm                 or these four in this order, in any language: Kanal, Breite, Höhe, …
     # Height: 5.000 µm
     # Value units: m
 
@@ -36,8 +36,10 @@ from .scan import MAX_BYTES, Scan
 
 _MAX_GRID_DEVIATION = 0.1  # of a coordinate, in pixels, owing to rounding in text
 _MIN_POINT_FRACTION = 0.25  # of grid positions that have a point
-_GWYDDION = re.compile(r"#\s*(Channel|Width|Height|Value units):(.*)")
-_LENGTH = re.compile(r"([-+.\deE]*)(.*)")
+_GWYDDION = "Channel", "Width", "Height", "Value units"
+_HEADER_LINE = re.compile(r"#\s*([^:\uff1a#]+?)\s*[:\uff1a](.*)")
+_LENGTH = re.compile(r"([-+.,\deE]*)(.*)")
+_DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+(?:[eE][-+]?\d+)?")
 _ESRI = ("ncols", "nrows", "xllcorner", "yllcorner", "xllcenter", "yllcenter", "cellsize", "nodata_value")
 
 
@@ -66,8 +68,7 @@ def read_table(path: Path, unit: str | tuple[str, str] | None) -> Scan:
     text = _text(path)
     if text.lstrip()[:5].lower() == "ncols":
         return _esri(text, unit)
-    matches = (_GWYDDION.match(line) for line in text.splitlines())
-    header = {match[1]: match[2].strip() for match in matches if match and match[2].strip()}
+    header = _gwyddion_header(text)
     heights = _table(text)
     rows, columns = heights.shape
     if not header and columns == 3 and _may_be_points(heights):
@@ -78,6 +79,31 @@ def read_table(path: Path, unit: str | tuple[str, str] | None) -> Scan:
     if "Width" in header and "Height" in header:
         pixel_size = (_length(header["Width"], along) / columns, _length(header["Height"], along) / rows)
     return Scan(heights * scale, pixel_size, header.get("Channel", ""))
+
+
+def _gwyddion_header(text: str) -> dict[str, str]:
+    """Return what the comments of Gwyddion's export say, by the English names of `_GWYDDION`."""
+    lines = [(match[1], match[2].strip()) for line in text.splitlines() if (match := _HEADER_LINE.match(line))]
+    if found := {name: value for name, value in lines if name in _GWYDDION and value}:
+        return found
+    # In other languages their order tells: two lengths between a name and a unit.
+    for four in zip(lines, lines[1:], lines[2:], lines[3:], strict=False):
+        values = [value for _, value in four]
+        if _has_unit(values[1]) and _has_unit(values[2]) and not _has_unit(values[0]):
+            return {name: value for name, value in zip(_GWYDDION, values, strict=True) if value}
+    return {}
+
+
+def is_gwyddion_export(start: bytes) -> bool:
+    """Return whether a file begins as a text that Gwyddion exported, in any language."""
+    # The end of `start` may be in the middle of a character.
+    return "Width" in _gwyddion_header(start.decode("utf-8", errors="ignore"))
+
+
+def _has_unit(value: str) -> bool:
+    """Return whether a text is a number and a unit of length."""
+    match = _LENGTH.match(value)
+    return match is not None and bool(match[1]) and scan.is_length(match[2])
 
 
 def _esri(text: str, unit: str | tuple[str, str] | None) -> Scan:
@@ -121,6 +147,9 @@ def _table(text: str) -> NDArray[np.float64]:
     first = next((line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")), "")
     if not first:
         raise RequestError("the file holds no numbers")
+    numbers = first.replace(";", " ").split()
+    if len(numbers) > 1 and all(map(_DECIMAL_COMMA.fullmatch, numbers)):
+        text, first = text.replace(",", "."), first.replace(",", ".")
     delimiter = next((mark for mark in (";", ",") if mark in first), None)
     try:
         with warnings.catch_warnings():
@@ -166,7 +195,7 @@ def _length(text: str, unit: str) -> float:
     """Parse a length in its own unit, or else in the given one; in µm."""
     number, own = _LENGTH.match(text).groups()
     try:
-        value = float(number)
+        value = float(number.replace(",", "."))
     except ValueError:
         raise RequestError(f"the header: got the length {text[:60]!r}, wanted a number and a unit") from None
     return value * scan.micrometres(own.strip() or unit, "the header")

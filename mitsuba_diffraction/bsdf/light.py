@@ -1,0 +1,83 @@
+"""The wavelengths of the light in a scene, which the tables of its gratings must cover."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..errors import RequestError
+from ..llvm import is_supported
+from ..settings import VISIBLE
+from .base import is_grating, nested
+
+STEP = 0.25  # nm, less than the width of a lamp's lines
+
+
+def wavelengths_of(film: mi.Film) -> tuple[float, float]:
+    """Return (shortest, longest) wavelength that a film records, nm; a film without a response records visible light.
+
+    Raises:
+        RequestError: if its response has no end.
+    """
+    response = film.sensor_response_function()
+    if response is None:
+        return VISIBLE
+    shortest, longest = (float(w) for w in response.wavelength_range())
+    if not 0 < shortest < longest < np.inf:
+        raise RequestError(f"film: got bands of {shortest:g} to {longest:g} nm, wanted a range of wavelengths")
+    return shortest, longest
+
+
+def cover_light(scene: mi.Scene) -> None:
+    """Make the gratings of a scene cover the wavelengths at which its lights emit and its films record.
+
+    Raises:
+        RequestError: if the tables of one cannot; it names the range, and how to widen it.
+    """
+    if not is_supported(mi.variant()):
+        return
+    gratings = {id(bsdf): bsdf for shape in scene.shapes() for bsdf in _gratings_in(shape.bsdf())}
+    if not gratings or not scene.sensors():
+        return
+    ranges = [wavelengths_of(sensor.film()) for sensor in scene.sensors()]
+    first, last = min(low for low, _ in ranges), max(high for _, high in ranges)
+    for bsdf in gratings.values():
+        shortest, longest = first, last
+        for low, high in bsdf.layers.grating.lacks((first, last)):
+            if not any(_emits(emitter, low, high) for emitter in scene.emitters()):
+                shortest, longest = (high, longest) if low == first else (shortest, low)
+        if shortest < longest:
+            bsdf.cover((shortest, longest))
+
+
+def _gratings_in(bsdf: mi.BSDF | None) -> list[mi.BSDF]:
+    """Return a BSDF, if it is a grating, and those nested in it."""
+    if bsdf is None:
+        return []
+    return [bsdf] * is_grating(bsdf) + [grating for inner in nested(bsdf) for grating in _gratings_in(inner)]
+
+
+def _emits(emitter: mi.Emitter, low: float, high: float) -> bool:
+    """Return whether a light may emit between two wavelengths, nm; of one without a spectrum, whether they are visible.
+
+    Samples of wavelengths do not answer this, as Mitsuba draws those of some spectra from a part of their range.
+    """
+
+    class Spectra(mi.TraversalCallback):
+        def __init__(self) -> None:
+            mi.TraversalCallback.__init__(self)
+            self.found: list[mi.Texture] = []
+
+        def put(self, name: str, value: object, *rest: object) -> None:
+            if isinstance(value, mi.Texture):
+                self.found.append(value)
+
+    spectra = Spectra()
+    emitter.traverse(spectra)
+    if not spectra.found or any(spectrum.is_spatially_varying() for spectrum in spectra.found):
+        return low < VISIBLE[1] and high > VISIBLE[0]
+    wavelengths = np.arange(low + STEP / 2, high, STEP)
+    si = dr.zeros(mi.SurfaceInteraction3f, wavelengths.size)
+    si.wavelengths = type(si.wavelengths)(mi.Float(wavelengths.astype(np.float32)))
+    return any(bool(dr.any(spectrum.eval(si) > 0, axis=None)) for spectrum in spectra.found)

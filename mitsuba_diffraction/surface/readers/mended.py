@@ -1,0 +1,131 @@
+"""Valid files that SurfaceTopography refuses or misreads, rewritten in the form that it reads; and what it misreads.
+
+- .tmd: the comment has any length; the library reads 24 bytes.
+- .x3p (ISO 25178-72): a folder that was zipped, heights as text in main.xml, empty offsets, dates that are none, and
+  dashes in the revision are common; the library takes none of them.
+- .sur: since 2010 the data may be compressed by zlib (DSCOMPRESSED).
+- .nms: lengths are in nm instead of mm, heights are linear between two integers of the header, and pixels without
+  intensity were not measured.
+"""
+
+from __future__ import annotations
+
+import io
+import posixpath
+import struct
+import zipfile
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...errors import RequestError
+from .scan import MAX_BYTES
+
+_TMD_COMMENT = 24  # bytes, of the only comment that the library reads
+_SUR_HEADER, _SUR_SIZES = 512, struct.Struct("<2h")  # lengths of comment and private data, at `_SUR_AT`
+_SUR_AT = 334
+_NMS_HEADER = 3468
+
+
+def rewritten(path: Path, name: str) -> str | io.BytesIO:
+    """Return the path, or the contents, of a file of the format `name` for the library.
+
+    Raises:
+        RequestError: if the file is not of this format.
+    """
+    if name not in _REWRITE:
+        return str(path)
+    if path.stat().st_size > MAX_BYTES:
+        raise RequestError(f"got {path.stat().st_size} bytes, wanted at most {MAX_BYTES}")
+    return io.BytesIO(_REWRITE[name](path.read_bytes()))
+
+
+def _tmd(data: bytes) -> bytes:
+    magic, _, rest = data.partition(b"\0")
+    comment, end, numbers = rest.partition(b"\0")
+    if not (magic.startswith(b"Binary TrueMap Data File") and end):
+        raise RequestError("not a TrueMap file, which begins with 'Binary TrueMap Data File' and a comment")
+    return magic + b"\0" + comment[: _TMD_COMMENT - 1].ljust(_TMD_COMMENT, b"\0") + numbers
+
+
+def _sur(data: bytes) -> bytes:
+    if not data.startswith(b"DSCOMPRESSED") or len(data) < _SUR_HEADER + 4:
+        return data
+    start = _SUR_HEADER + sum(_SUR_SIZES.unpack_from(data, _SUR_AT))
+    try:
+        (count,) = struct.unpack_from("<I", data, start)
+        sizes = struct.unpack_from(f"<{2 * count}I", data, start + 4)
+        begin, streams = start + 4 + 8 * count, []
+        if sum(sizes[::2]) > MAX_BYTES:
+            raise RequestError(f"got {sum(sizes[::2])} bytes of heights, wanted at most {MAX_BYTES}")
+        for raw, packed in zip(sizes[::2], sizes[1::2], strict=True):
+            streams.append(zlib.decompressobj().decompress(data[begin : begin + packed], raw))
+            begin += packed
+    except (struct.error, zlib.error) as error:
+        raise RequestError(f"a compressed Digital Surf file whose heights cannot be decompressed ({error})") from None
+    return b"DIGITAL SURF" + data[12:start] + b"".join(streams)
+
+
+def _x3p(data: bytes) -> bytes:
+    try:
+        archive = zipfile.ZipFile(io.BytesIO(data))
+        names = archive.namelist()
+        mains = [name for name in names if posixpath.basename(name).lower() == "main.xml"]
+        if not mains:
+            raise RequestError("not an X3P file, which is an archive that contains main.xml")
+        main = min(mains, key=len)
+        root = ElementTree.fromstring(archive.read(main))
+    except (zipfile.BadZipFile, ElementTree.ParseError, NotImplementedError, zlib.error) as error:
+        raise RequestError(f"not an X3P file, which is an archive that contains main.xml ({error})") from None
+    for element in root.iter():
+        element.tag = element.tag.rpartition("}")[2]
+    if (record := root.find("Record2")) is not None:  # date and instrument
+        root.remove(record)
+    if (revision := root.find("Record1/Revision")) is not None:
+        revision.text = "ISO5436 - 2000"
+    for axis in root.findall("Record1/Axes/*"):
+        for empty in [child for child in axis if not (child.text or "").strip() and not len(child)]:
+            axis.remove(empty)
+    members = {}
+    record, kind = root.find("Record3"), root.find("Record1/Axes/CZ/DataType")
+    if record is not None and (listed := record.find("DataList")) is not None and kind is not None:
+        texts = [(datum.text or "").rpartition(";")[2].strip() for datum in listed.iter("Datum")]
+        try:
+            heights = np.array([float(text) if text else np.nan for text in texts], "<f8")
+        except ValueError as error:
+            raise RequestError(f"an X3P file whose heights are text, but no numbers ({error})") from None
+        record.remove(listed)
+        kind.text, members["data.bin"] = "D", heights.tobytes()
+        ElementTree.SubElement(ElementTree.SubElement(record, "DataLink"), "PointDataLink").text = "data.bin"
+    # The names of members are relative to main.xml.
+    inside = {name.replace("\\", "/").removeprefix(posixpath.dirname(main)).strip("/"): name for name in names}
+    for link in root.findall("Record3/DataLink/*"):
+        name = (link.text or "").strip().replace("\\", "/").removeprefix("./").strip("/")
+        if name in inside:
+            link.text, members[name] = name, archive.read(inside[name])
+    whole = io.BytesIO()
+    with zipfile.ZipFile(whole, "w") as written:
+        for name, content in {"main.xml": ElementTree.tostring(root), **members}.items():
+            written.writestr(name, content)
+    return whole.getvalue()
+
+
+_REWRITE: dict[str, Callable[[bytes], bytes]] = {"tmd": _tmd, "sur": _sur, "x3p": _x3p}
+
+
+def nms(path: Path, heights: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """Return the heights of a NanoFocus file, masked where not measured, and the factor of the library's lengths."""
+    data = path.read_bytes()
+    first, last = struct.unpack_from("<2i", data, 8)
+    low, high = struct.unpack_from("<2d", data, 16)
+    numbers = (heights - low) * ((2**16 - 2) / ((high - low) or 1.0))
+    if last > first:
+        heights = low + (np.rint(numbers) - first) * ((high - low) / (last - first))
+    intensity = np.frombuffer(data, np.uint8, offset=_NMS_HEADER + 2 * heights.size)[: heights.size]
+    if intensity.size == heights.size and intensity.any():
+        heights = np.ma.masked_array(heights, intensity.reshape(heights.shape) == 0)
+    return heights, 1e-6

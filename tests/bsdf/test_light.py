@@ -1,0 +1,96 @@
+"""Light that a scene has and a table lacks: the grating covers it, or the scene is refused; it is never black."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from bsdf_support import albedo, direction, plugin
+
+import mitsuba_diffraction as md
+
+WAVELENGTHS = (450.0, 530.0, 600.0, 700.0)
+PROFILE = {"type": "diffraction_grating", "profile": "sinusoidal", "period": 2.5, "depth": 0.25}
+GRATING = {**PROFILE, "coherence_length": 4.0}
+WHITE = {"type": "uniform", "value": 1.0}
+
+
+def spectrum(*wavelengths):
+    return md.precompute(md.gratings.sinusoidal(2.5, 0.25), wavelengths=wavelengths, coherence_length=4.0)
+
+
+def scene(bsdf, film=None, light=WHITE):
+    """Return a scene of one grating under a sky; film: (shortest, longest) wavelength of its band."""
+    camera = {"type": "hdrfilm", "width": 2, "height": 2}
+    if film:
+        band = {"type": "regular", "wavelength_min": film[0], "wavelength_max": film[1], "values": "1, 1"}
+        camera |= {"type": "specfilm", "band": band}
+    view = mi.ScalarTransform4f().look_at([0, 0, 3], [0, 0, 0], [0, 1, 0])
+    return {
+        "type": "scene",
+        "integrator": {"type": "path"},
+        "sensor": {"type": "orthographic", "to_world": view, "film": camera},
+        "light": {"type": "constant", "radiance": light},
+        "grating": {"type": "rectangle", "bsdf": bsdf},
+    }
+
+
+def mean(bsdf, film):
+    """Return the mean of the radiance per nm that a film records of a BSDF under a white sky."""
+    return np.array(mi.render(mi.load_dict(scene(bsdf, film)), spp=1024)).mean() / (film[1] - film[0])
+
+
+@pytest.mark.parametrize("coat", [{}, {"coat_ior": 1.3}])
+def test_a_spectrum_for_shorter_wavelengths_holds_for_longer_ones(llvm, coat):
+    # Regression: a spectrum built for a coat of 1.55 and used with a thinner one, or none, was black above 535 nm.
+    short, exact = (spectrum(360 / n, 830 / n) for n in (1.55, 1.3 if coat else 1.0))
+    found, wanted = (
+        albedo(plugin(s, material="Al", **coat), direction(20, 40), wavelengths=WAVELENGTHS) for s in (short, exact)
+    )
+    np.testing.assert_allclose(found, wanted, rtol=0.01)
+
+
+def test_a_lower_index_is_not_black(llvm):
+    # Regression: lowered from 2.4 to 1.5, nothing was transmitted above 530 nm.
+    lowered, wanted = (mi.load_dict({**GRATING, "transmission": "interface", "int_ior": n}) for n in (2.4, 1.5))
+    parameters = mi.traverse(lowered)
+    parameters["eta"] = 1.5
+    parameters.update()
+    values = (albedo(bsdf, direction(20, 40), wavelengths=WAVELENGTHS) for bsdf in (lowered, wanted))
+    np.testing.assert_allclose(*values, rtol=0.02)
+
+
+def test_a_film_of_infrared_or_ultraviolet_light_is_not_black(llvm):
+    # Regression: near infrared light was black, without a word.
+    flat = {**GRATING, "depth": 0.05, "material": "none"}
+    for film in ((850, 950), (320, 330)):
+        assert mean(flat, film) == pytest.approx(1, abs=0.02)
+    metal, mirror = (mean({**bsdf, "material": "Al"}, (840, 880)) for bsdf in (flat, {"type": "conductor"}))
+    assert metal == pytest.approx(mirror, abs=0.02)
+
+
+def test_light_that_a_table_lacks_is_refused_with_its_range(llvm):
+    saved, visible = ({"type": "diffraction_grating", "spectrum": spectrum(*w)} for w in ((500, 600), (360, 830)))
+    metal = {**GRATING, "material": "Al"}
+    for bsdf, film, message in (
+        (saved, None, r"light from 360 nm, .* from 500 nm: build it from 36"),
+        (visible, (300, 400), r"light from 300 nm, .* from 360 nm: build it from 300"),
+        (metal, (850, 950), r"material: got light of 850 to 950 nm, and a table of 299 to 885 nm \(conductor, Al"),
+        ({"type": "twosided", "bsdf": metal}, (850, 950), "material: got light of 850 to 950 nm"),
+    ):
+        with pytest.raises(RuntimeError, match=message) as found:
+            mi.load_dict(scene(bsdf, film))
+        assert "\n" not in str(found.value)
+
+
+def test_a_rigorous_spectrum_is_refused_outside_its_wavelengths(llvm):
+    settings = {"theory": "rigorous", "int_ior": 1.5, "tolerance": 0.2, "coherence_length": 40.0}
+    of = md.precompute(md.gratings.sinusoidal(1.0, 0.1), wavelengths=(500, 600), **settings)
+    bsdf = {"type": "diffraction_grating", "spectrum": of}
+    with pytest.raises(RuntimeError, match=r"light of 360 to 830 nm and a rigorous spectrum of 500 to 600 nm: build"):
+        mi.load_dict(scene(bsdf))
+    mi.load_dict(scene(bsdf, (510, 590)))
+
+
+def test_wavelengths_without_light_need_no_table(llvm):
+    line = {"type": "regular", "wavelength_min": 530.0, "wavelength_max": 534.0, "values": "1, 1"}
+    grating = {"type": "diffraction_grating", "spectrum": spectrum(500, 600)}
+    mi.load_dict(scene(grating, light=line))

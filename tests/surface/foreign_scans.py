@@ -1,0 +1,189 @@
+"""Small synthetic scans in the layouts of instruments' files, of the same relief: 16 rows of 24 pixels.
+
+A peak near the upper left corner (row 2, column 3) tells the orientation.
+"""
+
+import hashlib
+import io
+import struct
+import zipfile
+import zlib
+
+import numpy as np
+
+ROWS, COLUMNS = 16, 24
+DX, DY = 0.25, 0.40  # µm
+PEAK = (2, 3)
+
+
+def relief():
+    """Heights in µm; row 0 is the top row of the picture."""
+    row, column = np.mgrid[0:ROWS, 0:COLUMNS]
+    heights = 0.100 + 0.004 * row + 0.010 * column
+    heights[PEAK] = 0.900
+    return heights
+
+
+def nms(missing=(), first=0, last=65535):
+    """NanoFocus µsurf: header of 3468 bytes, spacing in nm, uint16 heights, then one byte of intensity per pixel."""
+    low, high = 0.05, 1.05
+    header = bytearray(3468)
+    struct.pack_into("<2i", header, 0, 2, 1)  # 16 bit numbers, an area
+    struct.pack_into("<2i", header, 8, first, last)  # the integers that stand for low and high
+    struct.pack_into("<2d", header, 16, low, high)  # µm
+    header[32:41] = b"OM_MS_2.0"
+    header[1076:1092] = b"2020-01-01T00:00"
+    struct.pack_into("<2I2d", header, 1368, COLUMNS, ROWS, DX * 1000, DY * 1000)
+    struct.pack_into("<i", header, 1416, 1)  # there is an intensity
+    numbers = np.rint((relief() - low) / (high - low) * (last - first) + first).astype("<u2")
+    intensity = np.full((ROWS, COLUMNS), 128, "u1")
+    for at in missing:
+        intensity[at] = 0
+    return bytes(header) + numbers.tobytes() + intensity.tobytes()
+
+
+def tmd(comment):
+    """TrueMap and GelSight: lengths and heights in mm; the comment ends with a zero byte and may have any length."""
+    head = b"Binary TrueMap Data File v2.0\r\n\0" + comment + b"\0"
+    sizes = struct.pack("<2I4f", COLUMNS, ROWS, COLUMNS * DX / 1000, ROWS * DY / 1000, 0.0, 0.0)
+    return head + sizes + (relief() / 1000).astype("<f4").tobytes()
+
+
+def sur(missing=(), streams=1):
+    """Digital Surf, compressed: header of 512 bytes, a directory of streams, one zlib stream of int32."""
+    step = 1e-4  # µm
+    numbers = np.rint(relief() / step).astype("<i4")
+    lowest, highest = int(numbers.min()), int(numbers.max())
+    for at in missing:
+        numbers[at] = lowest - 2
+    parts = [part.tobytes() for part in np.array_split(numbers.ravel(), streams)]
+    packed = [zlib.compress(part) for part in parts]
+    sizes = [len(one) for pair in zip(parts, packed, strict=True) for one in pair]
+    data = struct.pack(f"<{1 + len(sizes)}I", streams, *sizes) + b"".join(packed)
+
+    def text(word, length=16):
+        return word.encode("latin-1").ljust(length)
+
+    header = b"DSCOMPRESSED" + struct.pack("<4h", 0, 1, 1, 2) + text("", 30) + text("", 30)
+    header += struct.pack("<5h", 0, 0, 0, int(bool(missing)), 0) + struct.pack("<f4x", 0.0)
+    header += struct.pack("<h5i", 32, lowest, highest, COLUMNS, ROWS, ROWS * COLUMNS)
+    header += struct.pack("<3f", DX, DY, step)
+    header += text("X") + text("Y") + text("Z") + 6 * text("\xb5m")
+    header += struct.pack("<3f3h12x7hf", 1, 1, 1, 0, 0, 0, 0, 0, 0, 1, 1, 2020, 0, 0.0)
+    header += (
+        struct.pack("<I6x2h128x", len(data), 0, 0) + struct.pack("<5f", 0, 0, 0, 0, 0) + text("", 13) + text("", 13)
+    )
+    assert len(header) == 512
+    return header + data
+
+
+REVISION = "ISO5436 - 2000"
+
+
+def x3p(as_text=True, revision=REVISION, folder="", missing=(), date="", offset="0.0"):
+    """X3P (ISO 25178-72): a zip of main.xml and, unless the heights stand in it as text, a file of doubles. Metres."""
+    heights = relief() * 1e-6
+    for at in missing:
+        heights[at] = np.nan
+    binary = heights.astype("<f8").tobytes()
+    if as_text:
+        data = "".join("<Datum/>" if np.isnan(h) else f"<Datum>{h:.12E}</Datum>" for h in heights.ravel())
+        data = f"<DataList>{data}</DataList>"
+    else:
+        digest = hashlib.md5(binary).hexdigest()
+        data = (
+            "<DataLink><PointDataLink>bindata/data.bin</PointDataLink>"
+            f"<MD5ChecksumPointData>{digest}</MD5ChecksumPointData></DataLink>"
+        )
+
+    def axis(name, kind, step):
+        content = f"<AxisType>{kind}</AxisType><DataType>D</DataType><Increment>{step:E}</Increment>"
+        return f"<{name}>{content}<Offset>{offset}</Offset></{name}>"
+
+    axes = axis("CX", "I", DX * 1e-6) + axis("CY", "I", DY * 1e-6) + axis("CZ", "A", 1.0)
+    size = f"<MatrixDimension><SizeX>{COLUMNS}</SizeX><SizeY>{ROWS}</SizeY><SizeZ>1</SizeZ></MatrixDimension>"
+    main = (
+        '<?xml version="1.0" encoding="UTF-8"?>\n<p:ISO5436_2 xmlns:p="http://www.opengps.eu/2008/ISO5436_2">'
+        f"<Record1><Revision>{revision}</Revision><FeatureType>SUR</FeatureType><Axes>{axes}</Axes></Record1>"
+        f"<Record2><Date>{date}</Date></Record2><Record3>{size}{data}</Record3>"
+        "<Record4><ChecksumFile>md5checksum.hex</ChecksumFile></Record4></p:ISO5436_2>\n"
+    ).encode()
+    members = {"main.xml": main, "md5checksum.hex": hashlib.md5(main).hexdigest().encode() + b" *main.xml\n"}
+    if not as_text:
+        members["bindata/data.bin"] = binary
+    whole = io.BytesIO()
+    with zipfile.ZipFile(whole, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in members.items():
+            archive.writestr(zipfile.ZipInfo(folder + name, (2020, 1, 1, 0, 0, 0)), content)
+    return whole.getvalue()
+
+
+def tiff(strip, tags):
+    """A little-endian TIFF of one page and one strip of pixels; tags: number → (type, count, bytes)."""
+    tags = {273: (4, 1, struct.pack("<I", 8)), 279: (4, 1, struct.pack("<I", len(strip)))} | tags
+    body, entries = strip + b"\0" * (len(strip) % 2), b""
+    for number in sorted(tags):
+        kind, count, value = tags[number]
+        entries += struct.pack("<2HI", number, kind, count)
+        if len(value) > 4:
+            entries += struct.pack("<I", 8 + len(body))
+            body += value + b"\0" * (len(value) % 2)
+        else:
+            entries += value.ljust(4, b"\0")
+    directory = struct.pack("<H", len(tags)) + entries + struct.pack("<I", 0)
+    return b"II*\0" + struct.pack("<I", 8 + len(body)) + body + directory
+
+
+def park(floats=False):
+    """Park Systems: a TIFF whose picture is a preview in false colours; the data are in private tags.
+
+    Height = gain · (factor · number + offset), in the unit of the header; the first line stored is the lowest of the
+    picture. The numbers are int16 in version 1 of the header, which this is.
+    """
+    gain, factor, offset = 5e-4, 1.0, 20.0  # µm, 1, 1
+    numbers = (relief()[::-1] / gain - offset) / factor
+    numbers = numbers.astype("<f4") if floats else np.rint(numbers).astype("<i2")
+
+    def wide(word, length):
+        return word.encode("utf-16-le").ljust(2 * length, b"\0")
+
+    header = (
+        struct.pack("<I", 0) + wide("Z Height", 32) + wide("Contact", 8) + struct.pack("<d4I", 0.0, 0, 0, COLUMNS, ROWS)
+    )
+    header += struct.pack("<dId3I", 0.0, 0, 0.0, 1, 0, 0) + struct.pack(
+        "<6d", COLUMNS * DX, ROWS * DY, 0.0, 0.0, 1.0, 0.0
+    )
+    header += wide("um", 8) + struct.pack("<2d", 0.0, 0.0) + struct.pack("<3d", gain, factor, offset) + wide("um", 8)
+    header += struct.pack("<3i3I", 0, 0, 0, 0, 0, 0)
+    if floats:  # version 2 of the header
+        header += (
+            struct.pack("<2d", 1.0, 1.0) + 3 * wide("", 8) + struct.pack("<3I2d", 2, 0, 0, 0.0, 0.0) + wide("", 16)
+        )
+    low, high = relief().min(), relief().max()
+    preview = np.rint((relief() - low) / (high - low) * 255).astype("u1")
+    ramp = np.arange(256, dtype="<u2") * 257
+    return tiff(
+        preview.tobytes(),
+        {
+            256: (3, 1, struct.pack("<H", COLUMNS)),
+            257: (3, 1, struct.pack("<H", ROWS)),
+            258: (3, 1, struct.pack("<H", 8)),  # bits
+            259: (3, 1, struct.pack("<H", 1)),  # not compressed
+            262: (3, 1, struct.pack("<H", 3)),  # palette
+            277: (3, 1, struct.pack("<H", 1)),
+            278: (3, 1, struct.pack("<H", ROWS)),
+            320: (3, 768, np.concatenate([ramp, ramp // 2, ramp // 4]).astype("<u2").tobytes()),
+            50432: (4, 1, struct.pack("<I", 0x0E031301)),
+            50433: (4, 1, struct.pack("<I", 0x01000002 if floats else 0x01000001)),
+            50434: (1, numbers.nbytes, numbers.tobytes()),
+            50435: (1, len(header), header),
+        },
+    )
+
+
+def gwyddion_text(labels=("Channel:", "Width:", "Height:", "Value units:"), comma=False):
+    """The text export of Gwyddion; its header and its decimal mark are those of the language of the program."""
+    values = "Topographie", f"{COLUMNS * DX:.3f} µm", f"{ROWS * DY:.3f} µm", "m"
+    text = "".join(f"# {label} {value}\n" for label, value in zip(labels, values, strict=True))
+    text += "".join("\t".join(f"{h * 1e-6:.6e}" for h in row) + "\n" for row in relief())
+    return text.replace(".", ",") if comma else text
