@@ -22,6 +22,7 @@ from ..errors import RequestError, is_number
 from .base import nested_plugin
 from .tables import opaque
 
+MIN_INDEX, MAX_INDEX = 0.01, 100.0
 SAME_INDEX = 1e-3  # indices of refraction that differ by less, as those of air and vacuum, are taken as equal
 _log = logging.getLogger(__name__)
 
@@ -57,8 +58,13 @@ def absolute_index(name: str, index: float | str) -> float:
     Raises:
         RequestError: if it is neither.
     """
-    if not isinstance(index, str) and not (is_number(index) and 0 < index < np.inf):
-        raise RequestError(f"{name}: got {index!r}, wanted a positive index of refraction, or a name such as 'bk7'")
+    if not isinstance(index, str):
+        if not (is_number(index) and MIN_INDEX <= index <= MAX_INDEX):
+            raise RequestError(
+                f"{name}: got {index!r}, wanted a positive index of refraction, or a name such as 'bk7' "
+                f"({MIN_INDEX:g} to {MAX_INDEX:g})"
+            )
+        index = float(index)
     try:
         interface = nested_plugin("dielectric", int_ior=index, ext_ior=1.0)
     except RuntimeError as error:

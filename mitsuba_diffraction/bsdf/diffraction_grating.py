@@ -151,6 +151,26 @@ def refuse_unknown(props: mi.Properties) -> None:
         raise RequestError(f"{', '.join(unknown)}: unknown, wanted one of {', '.join(sorted(known))}")
 
 
+def refuse_other_types(props: mi.Properties) -> None:
+    """Check that no parameter is a colour, a vector or a spectrum, nor an object where it must be a number or a text.
+
+    Raises:
+        RequestError: if one is.
+    """
+    types = {name: parameter.type for parameter in PARAMETERS for name in parameter.name.split(", ")}
+    kinds, objects = mi.Properties.Type, dict(props.objects())
+    for name in props.keys():  # noqa: SIM118
+        kind, wanted, value = props.type(name), types.get(name, "float or string"), objects.get(name)
+        is_base = isinstance(value, mi.BSDF) and ("BSDF" in wanted or name not in types)  # `base_from` names others
+        is_texture = isinstance(value, mi.Texture) and "texture" in wanted
+        # Vectors are refused as other numbers are.
+        is_index = kind == kinds.Vector and wanted == "float or string"
+        is_plain = kind in (kinds.Bool, kinds.Integer, kinds.Float, kinds.String)
+        if not (is_plain or is_base or is_texture or is_index):
+            got = kind.name.lower() if value is None else type(value).__name__
+            raise RequestError(f"{name}: got a {got}, wanted {wanted}")
+
+
 def check(props: mi.Properties) -> None:
     """Check all parameters without computing a spectrum.
 
@@ -159,6 +179,7 @@ def check(props: mi.Properties) -> None:
         FileNotFoundError: if there is no such file.
     """
     refuse_unknown(props)
+    refuse_other_types(props)
     base_from(props)
     surface = GratingRequest.of(props).surface
     if isinstance(surface, Recipe):
@@ -175,6 +196,7 @@ def define() -> type:
             # The initialiser of the base class registers the object, which Dr.Jit then calls in all scenes as long as
             # it exists, even if only a traceback refers to it: therefore errors must occur before.
             refuse_unknown(props)
+            refuse_other_types(props)
             self.layers = Layers(props)
             self.spectrum = self.layers.grating.spectrum
             mi.BSDF.__init__(self, props)
@@ -193,7 +215,7 @@ def define() -> type:
             self.layers.traverse(callback)
 
         def parameters_changed(self, keys: list[str] = ()) -> None:
-            self.layers.grating.theory.parameters_changed(keys)
+            self.layers.grating.parameters_changed(keys)
 
         def eval_pdf(
             self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True

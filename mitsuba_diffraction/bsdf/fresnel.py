@@ -13,7 +13,7 @@ from ..errors import RequestError
 from ..rigorous.materials import conductor
 from ..settings import VISIBLE
 from .base import nested_plugin
-from .coat import Coat, absolute_index
+from .coat import MAX_INDEX, MIN_INDEX, Coat, absolute_index
 
 MODELS = ("exact", "schlick")
 
@@ -121,8 +121,17 @@ class Dielectric(Material):
         self.update()
 
     def update(self) -> None:
-        """Make the index an opaque array: Dr.Jit would compile a literal into its kernels."""
+        """Check the index and make it an opaque array: Dr.Jit would compile a literal into its kernels.
+
+        Raises:
+            RequestError: if it is none.
+        """
         dr.make_opaque(self.eta)
+        values = np.array(dr.detach(self.eta))
+        if not ((values >= MIN_INDEX) & (values <= MAX_INDEX)).all():
+            raise RequestError(
+                f"eta: got {np.ravel(values)[0]:g}, wanted a positive relative index, {MIN_INDEX:g} to {MAX_INDEX:g}"
+            )
 
     def __call__(self, si: mi.SurfaceInteraction3f, cos_half: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
         if self.model == "exact":

@@ -16,6 +16,7 @@ from .parameters import GratingRequest
 from .polarisation import reflected, through_layer
 from .tables import BELOW_ONE, larger, limited, opaque, smaller
 from .theory import theory_of
+from .varying import check_texture
 
 # Of defensive samples, for lobes that the averages of the sampler miss. They are uniform in solid angle: where both
 # directions are grazing, K G grows so fast that samples in proportion to the cosine would have large weights.
@@ -87,6 +88,12 @@ class Grating:
         """Return the shortest and the longest wavelength that both spectrum and material cover, nm."""
         shortest, longest = np.clip(self.theory.wavelengths, *self.theory.material.wavelengths)
         return float(shortest), float(longest)
+
+    def parameters_changed(self, keys: list[str]) -> None:
+        """Check the parameters `keys`, or all if there are none, and recompute what depends on them."""
+        if not keys or "orientation" in keys:
+            check_texture("orientation", self.orientation)
+        self.theory.parameters_changed(keys)
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         callback.put("orientation", self.orientation, mi.ParamFlags.Differentiable)

@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..errors import RequestError
+from ..errors import RequestError, is_number
 from ..geometry import SHADOWING
 from ..precomputation import Spectrum, load_spectrum
 from ..recipe import REQUESTED, Recipe
@@ -24,6 +24,8 @@ from .thin_film import with_film
 from .varying import VaryingNumber, check_texture, numbers_from
 
 _PREFIX = "handed over: "
+_MAX_DEGREES = 1e6
+_MIN_LATERAL_SCALE = 0.01  # below, a period is shorter than any wavelength
 _handed_over: weakref.WeakValueDictionary[str, Spectrum] = weakref.WeakValueDictionary()
 _SCALAR_ONLY = {
     "height_scale": "build the spectrum of the other depth",
@@ -143,13 +145,13 @@ class Scales:
             if not scale.varies:
                 dr.make_opaque(scale.value)
             low, high = scale.values[[0, -1]]
-            if low < 0 or high > covered * (1 + 1e-6) or (low == 0 and scale is self.lateral):
-                bad = low if low <= 0 else high
+            minimum = 0.0 if scale is self.height else _MIN_LATERAL_SCALE
+            if low < minimum or high > covered * (1 + 1e-6):
+                bad = low if low < minimum else high
                 raise RequestError(
-                    f"{scale.name}: got {bad:.6g}, wanted {'0' if scale is self.height else 'more than 0 and up'} to "
-                    f"{covered:.4g}: the spectrum was built for wavelengths from {wavelengths[0]:g} nm; for larger "
-                    f"scales build it from {shortest:.4g} nm divided by the scale"
-                    + (f", here {shortest / high:.4g} nm" if high > covered else "")
+                    f"{scale.name}: got {bad:.6g}, wanted {minimum:g} to {covered:.4g}: the spectrum was built for "
+                    f"wavelengths from {wavelengths[0]:g} nm; for larger scales build it from {shortest:.4g} nm "
+                    "divided by the scale" + (f", here {shortest / high:.4g} nm" if high > covered else "")
                 )
         if self.lateral is not None and (max_resolved is None or self.lateral.values[-1] > max_resolved):
             raise RequestError(
@@ -395,8 +397,8 @@ class GratingRequest:
         """
         media, scales = Media.of(props), Scales(props)
         angle = props.get("orientation", 0.0)
-        if isinstance(angle, float) and not np.isfinite(angle):
-            raise RequestError(f"orientation: got {angle}, wanted degrees or a texture")
+        if isinstance(angle, float | int) and not (is_number(angle) and abs(angle) <= _MAX_DEGREES):
+            raise RequestError(f"orientation: got {angle}, wanted degrees, up to {_MAX_DEGREES:g}, or a texture")
         from_radius = angle in tuple(FROM_RADIUS)
         if from_radius:
             orientation = nested_plugin("uniform", value=FROM_RADIUS[angle])

@@ -94,16 +94,19 @@ def numbers_from(name: str, file: str, white: float = 1.0, others: str = "") -> 
 
 
 def check_texture(name: str, texture: mi.Texture) -> None:
-    """Check the values of a bitmap in the place of a number.
+    """Check the values of a texture in the place of a number.
 
     Raises:
-        RequestError: if some are not finite, or the bitmap has colours.
+        RequestError: if some are not finite, or those of a bitmap are colours.
     """
     parameters = mi.traverse(texture)
+    for key in parameters.keys():  # noqa: SIM118
+        if key.split(".")[-1] in ("to_uv", "range"):
+            continue
+        if not np.isfinite(np.array(dr.detach(parameters[key]), np.float64)).all():
+            raise RequestError(f"{name}: got values that are not finite, wanted numbers")
     if "data" not in parameters:
         return
-    if not np.isfinite(np.array(dr.detach(parameters["data"]))).all():
-        raise RequestError(f"{name}: got values that are not finite, wanted numbers")
     try:
         texture.eval_1(dr.zeros(mi.SurfaceInteraction3f))
     except RuntimeError:
