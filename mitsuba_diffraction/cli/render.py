@@ -13,7 +13,7 @@ import typer
 
 from ..errors import RequestError
 from ..outputs import check_outputs, free_name
-from ..progress import progress_bar, say, tell
+from ..progress import durations, progress_bar, say, stage, tell
 from .arguments import Define, Overwrite, Variant, check_suffix, materials_of, scene_parameters
 
 if TYPE_CHECKING:
@@ -58,8 +58,8 @@ def render(
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="resume an interrupted run of the same command")] = False,
     checkpoint: Annotated[float, typer.Option(min=0, metavar="SECONDS", help="interval between checkpoints")] = 60,
-    half: Annotated[
-        bool, typer.Option("--half", help="write float16: half the size, radiance rounded by up to 0.05 %")
+    single: Annotated[
+        bool, typer.Option("--float", help="write float32; default: float16, unless it rounds by more than 0.05 %")
     ] = False,
     rgb: Annotated[
         bool, typer.Option("--rgb", help="write only R, G, B, as float16: at most 6 bytes per pixel")
@@ -135,16 +135,17 @@ def render(
     if until_error is None:  # else nobody knows the time
         planes = 3 + has_alpha(scene, where["parameters"])
         written = 0 if rgb else channels
-        request["announce"] = partial(_announce, scene.name, 2 if half or rgb else 4, planes, written, named)
+        request["announce"] = partial(_announce, scene.name, 4 if single and not rgb else 2, planes, written, named)
     pictures = _pictures(target, frames)
-    stored = {"half": half, "rgb": rgb, "channels": channels}
+    stored = {"half": False if single else None, "rgb": rgb, "channels": channels}
     factor = None if exposure is None else 2**exposure
     options = {"resume": resume, "stored": stored, "denoise": denoise, "view": shown}
-    _render(scene, pictures, motions, where, request, factor, **options)
-    if frames is not None:
-        animation = target.with_suffix(".webp")
-        save_animation([path.with_suffix(".png") for path in pictures], animation)
-        tell(f"{animation}: animated preview, {frames} frames")
+    with durations():
+        _render(scene, pictures, motions, where, request, factor, **options)
+        if frames is not None:
+            animation = target.with_suffix(".webp")
+            save_animation([path.with_suffix(".png") for path in pictures], animation)
+            tell(f"{animation}: animated preview, {frames} frames")
 
 
 def _render(
@@ -187,8 +188,8 @@ def _announce(
     say(
         label,
         f"{estimate.columns} × {estimate.rows} pixels, {estimate.spp} samples per pixel: about "
-        f"{estimate.seconds / 60:.0f} min, {estimate.memory / 1e9:.2g} GB of memory{disk}, a picture of at most "
-        f"{size / 1e6:.2g} MB",
+        f"{estimate.seconds / 60:.0f} min, {estimate.memory / 1e9:.2g} GB of memory{disk}, a picture of "
+        f"{size / 1e6:.2g} MB before compression",
     )
     if named is not None and estimate.seconds > _HOUR:
         _log.warning(
@@ -277,9 +278,11 @@ def _picture(
             raise
         raise Stopped(f"{complete}; the same command with --resume continues") from None
     try:
-        image.save(path, **stored)
-        clean = partial(denoised_picture, load_spectral_scene(scene, **where)) if denoise else None
-        exposure = save_preview(image, preview, exposure, clean, view)
+        with stage("writing"):
+            image.save(path, **stored)
+        with stage("preview"):
+            clean = partial(denoised_picture, load_spectral_scene(scene, **where)) if denoise else None
+            exposure = save_preview(image, preview, exposure, clean, view)
     except (OSError, RuntimeError) as error:
         kept = f"; {checkpoint} is kept, and --resume continues from it" if checkpoint.exists() else ""
         raise RuntimeError(f"{path} or its preview cannot be written ({error}){kept}") from error

@@ -38,6 +38,7 @@ from numpy.typing import NDArray
 from ..color import spectrum_to_XYZ
 from ..errors import RequestError
 from ..files import UNSEALED, discard, exclusive, is_intact, seal, whole_file
+from ..progress import stage
 from ..settings import VISIBLE
 from .film import (
     LightOfBands,
@@ -534,7 +535,8 @@ def _trace(
     last_checkpoint, interval = time.monotonic(), seconds
     with _deferred_interrupt() as interrupted, closing(tracer(job, scene, sums.done)) as traced:
         while not (complete or interrupted()):
-            sums.add(next(traced), job.samples[sums.done // len(job.bands)])
+            with stage("kernels and first pass" if sums.done == first else "rendering"):
+                sums.add(next(traced), job.samples[sums.done // len(job.bands)])
             if sums.done == first + 2:
                 announce((time.perf_counter() - started) * (total - sums.done))
             started = time.perf_counter()
@@ -557,7 +559,8 @@ def _job(
         raise RequestError(f"seed: got {seed}, wanted an integer that is not negative")
     if until_error is not None and not 0 < until_error < 1:
         raise RequestError(f"until_error: got {until_error}, wanted a relative error between 0 and 1, such as 0.01")
-    scene = load_spectral_scene(scene_path, **where)
+    with stage("reading"):
+        scene = load_spectral_scene(scene_path, **where)
     sampler, whole = scene.sensors()[0].sampler(), needs_mitsubas_film(scene.integrator())
     if whole and not is_independent(sampler):
         _log.warning(
@@ -566,7 +569,8 @@ def _job(
             sampler.class_name(),
         )
     samples = split(scene, spp, 1 if until_error is None else _MIN_PASSES_UNTIL_ERROR)
-    warn_of_gratings(scene)
+    with stage("checks"):
+        warn_of_gratings(scene)
     job = Job(
         scene=str(Path(scene_path).resolve()),
         where=where,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping
@@ -116,17 +117,34 @@ class SpectralImage:
         for rows in split_rows(*self.shape[:2]):
             yield self.radiance[rows]
 
+    def _fits_half(self) -> bool:
+        """Return whether float16 rounds the picture by no more than 0.05 %, of radiance or of the mean radiance."""
+        total, largest = 0.0, 0.0
+        for block in self.blocks():
+            rgb = spectrum_to_linear_sRGB(block, self.wavelengths)
+            # NaN is more than any limit.
+            largest = np.maximum(largest, np.maximum(np.abs(block).max(), np.abs(rgb).max()))
+            total += float(block.sum(dtype=np.float64))
+        half = np.finfo(np.float16)
+        return bool(largest <= half.max and total / math.prod(self.shape) >= half.smallest_normal)
+
     def save(
-        self, path: str | os.PathLike[str], *, half: bool = False, rgb: bool = False, channels: int | None = None
+        self,
+        path: str | os.PathLike[str],
+        *,
+        half: bool | None = False,
+        rgb: bool = False,
+        channels: int | None = None,
     ) -> None:
-        """Write an OpenEXR file (ZIP) in the spectral layout of Fichet, Pacanowski and Wilkie 2021.
+        """Write an OpenEXR file in the spectral layout of Fichet, Pacanowski and Wilkie 2021.
 
         Channels `S0.405,000000nm` hold the radiance; R, G and B are linear sRGB (scaled as in `color`) for ordinary
         viewers, and A is alpha, if there is any.
 
         Args:
-            half: write float16 instead of float32, in about half the size or less. Radiance from 6.1e-5 to 65504 is
-                then rounded by at most 2⁻¹¹ (0.05 %), smaller radiance by at most 3e-8.
+            half: write float16 instead of float32, in less than half the size. Radiance from 6.1e-5 to 65504 is then
+                rounded by at most 2⁻¹¹ (0.05 %), smaller radiance by at most 3e-8. None: if none exceeds 65504 and the
+                mean is at least 6.1e-5.
             rgb: write R, G and B (and A) alone, as float16, at most ±65504. Such a file cannot be loaded as a spectral
                 image.
             channels: maximum number of wavelengths. Neighbouring ones are added with the weights that make their hats
@@ -142,7 +160,7 @@ class SpectralImage:
 
         if channels is not None and (rgb or channels < 2):
             raise RequestError(f"channels: got {channels}{' with rgb' if rgb else ''}, wanted two or more wavelengths")
-        half |= rgb
+        half = rgb or (self._fits_half() if half is None else half)
         kind, limit = (np.float16, float(np.finfo(np.float16).max)) if half else (np.float32, np.inf)
         pixel = Imath.Channel(Imath.PixelType(Imath.PixelType.HALF if half else Imath.PixelType.FLOAT))
         hats = None if channels is None else wider_hats(self.wavelengths.size, channels)
@@ -154,6 +172,8 @@ class SpectralImage:
         header = OpenEXR.Header(self.shape[1], self.shape[0])
         header |= {name: value.encode() if isinstance(value, str) else value for name, value in attributes.items()}
         header["channels"] = dict.fromkeys(names, pixel)
+        # Wavelets compress noise better than ZIP.
+        header["compression"] = Imath.Compression(Imath.Compression.PIZ_COMPRESSION)
         # The only writer of OpenEXR that takes a file in blocks of rows.
         with whole_file(path) as temporary, closing(OpenEXR.OutputFile(str(temporary), header)) as file:
             row = 0

@@ -199,6 +199,17 @@ def test_half_precision_refuses_values_out_of_range(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(("factor", "kind"), [(1.0, np.float16), (1e-6, np.float32), (1e6, np.float32)])
+def test_half_precision_is_chosen_where_it_rounds_by_less_than_noise(image, factor, kind, tmp_path):
+    radiance = np.abs(image.radiance)
+    scaled = SpectralImage(image.wavelengths, radiance * (factor / radiance.mean()), image.attributes)
+    scaled.save(tmp_path / "a.exr", half=None)
+    file = OpenEXR.File(str(tmp_path / "a.exr"), separate_channels=True)
+    assert {channel.pixels.dtype for channel in file.channels().values()} == {np.dtype(kind)}
+    error = np.abs(SpectralImage.load(tmp_path / "a.exr").radiance - scaled.radiance)
+    assert (error <= 2.0**-11 * np.maximum(scaled.radiance, scaled.radiance.mean())).all()
+
+
 def test_rgb_alone_is_that_of_the_spectral_file_in_half_precision(image, tmp_path):
     image.save(tmp_path / "spectral.exr", half=True)
     image.save(tmp_path / "rgb.exr", rgb=True)
