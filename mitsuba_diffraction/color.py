@@ -33,7 +33,7 @@ def matching_functions(wavelengths: ArrayLike) -> NDArray[np.float64]:
     import colour
 
     cmfs = colour.MSDS_CMFS[_OBSERVER]
-    return np.stack([np.interp(wavelengths, cmfs.wavelengths, column) for column in cmfs.values.T], axis=1)
+    return np.stack([np.interp(np.asarray(wavelengths), cmfs.wavelengths, column) for column in cmfs.values.T], axis=1)
 
 
 @lru_cache(maxsize=8)
@@ -120,7 +120,7 @@ def daylight(wavelengths: ArrayLike) -> NDArray[np.float64]:
     import colour
 
     table = colour.SDS_ILLUMINANTS["D65"]
-    return np.interp(wavelengths, table.wavelengths, table.values) / 100
+    return np.interp(np.asarray(wavelengths), table.wavelengths, table.values) / 100
 
 
 def into_gamut(rgb: NDArray[np.floating]) -> NDArray[np.float64]:

@@ -6,6 +6,7 @@ import builtins
 import re
 import sys
 from numbers import Real
+from typing import Any
 
 # Mitsuba reports an exception of a Python plugin as text: the location of the plugin in the scene, indented lines of
 # the traceback, then the class of the exception and its message.
@@ -31,7 +32,10 @@ def is_bug(kind: type[BaseException]) -> bool:
 
 def is_number(value: object) -> bool:
     """Return whether a parameter is a number that a float can hold: True, False, infinity and NaN are none."""
-    return isinstance(value, Real) and not isinstance(value, bool) and bool(abs(value) <= sys.float_info.max)
+    if not isinstance(value, Real) or isinstance(value, bool):
+        return False
+    size: Any = abs(value)  # numbers of any kind can be compared
+    return bool(size <= sys.float_info.max)
 
 
 def root_cause(error: BaseException) -> str:
@@ -48,7 +52,8 @@ def root_cause(error: BaseException) -> str:
         error = error.__cause__
     if isinstance(error, KeyboardInterrupt):
         raise error
-    kind, text = type(error), re.sub(r"\[\w+\.(cpp|h):\d+\] ?", "", str(error))
+    kind: Any = type(error)
+    text = re.sub(r"\[\w+\.(cpp|h):\d+\] ?", "", str(error))
     if (match := _OF_PLUGIN.search(text)) is not None:
         kind = {"RequestError": RequestError}.get(match["kind"]) or getattr(builtins, match["kind"], Exception)
         location = f"{match['plugin']} at {match['location']}: " if match["plugin"] else ""

@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 import hashlib
+import importlib.util
 import os
 import re
 import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import platformdirs
 
 from .errors import RequestError
 
-try:
-    import fcntl
-except ImportError:  # Windows, where temporary files in use cannot be recognised
-    fcntl = None
+# Not on Windows, where temporary files in use cannot be recognised.
+fcntl: Any = importlib.import_module("fcntl") if importlib.util.find_spec("fcntl") else None
 
 _being_written: set[str] = set()  # temporary paths
 

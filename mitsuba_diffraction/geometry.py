@@ -104,7 +104,7 @@ def diffracted(
         n_o: of that of transmitted light; None for reflected light.
     """
     reflects, n_o = n_o is None, n_i if n_o is None else n_o
-    square_i, excess = n_i**2 - tangent @ tangent, n_i**2 - n_o**2
+    square_i, excess = float(n_i**2 - tangent @ tangent), n_i**2 - n_o**2
     tangent_o = -steps - tangent
     square_o = n_o**2 - (tangent_o**2).sum(axis=-1)
     kept = (square_o > 0) & (square_i > 0)
@@ -145,7 +145,7 @@ def fresnel(cosine: ArrayLike, index: float) -> NDArray[np.float64]:
     return _fresnel(cosine, within, index)
 
 
-def _fresnel(cos_i: ArrayLike, cos_o: ArrayLike, index: float) -> NDArray[np.float64]:
+def _fresnel(cos_i: Array, cos_o: Array, index: float) -> NDArray[np.float64]:
     """Return F from the cosines on both sides."""
     s = (cos_i - index * cos_o) / np.maximum(cos_i + index * cos_o, 1e-12)
     p = (index * cos_i - cos_o) / np.maximum(index * cos_i + cos_o, 1e-12)
@@ -153,7 +153,7 @@ def _fresnel(cos_i: ArrayLike, cos_o: ArrayLike, index: float) -> NDArray[np.flo
 
 
 def transmitted(
-    cos_i: ArrayLike, cos_o: ArrayLike, tangent_square: ArrayLike, index: float, min_v_z: ArrayLike = 0.0
+    cos_i: Array, cos_o: Array, tangent_square: Array, index: float, min_v_z: ArrayLike = 0.0
 ) -> NDArray[np.float64]:
     """Return K G (1 − F) of transmitted light; shapes broadcast, lengths in units of n_i.
 

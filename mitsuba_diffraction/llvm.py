@@ -65,7 +65,7 @@ def _load(path: str | Path) -> ctypes.CDLL | None:
 def _library_version(path: str | Path) -> tuple[int, ...]:
     """Return the version of the libLLVM at ``path``, () if it does not load or is older than LLVM 16."""
     library = _load(path)
-    if not hasattr(library, "LLVMGetVersion"):
+    if library is None or not hasattr(library, "LLVMGetVersion"):
         return ()
     numbers = [ctypes.c_uint() for _ in range(3)]
     library.LLVMGetVersion(*map(ctypes.byref, numbers))

@@ -15,7 +15,7 @@ import math
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from .errors import RequestError
 from .files import refuse_other_than_utf8, refuse_unwritable, whole_file
@@ -85,7 +85,7 @@ def save_json(content: object, path: str | os.PathLike[str]) -> None:
         temporary.write_text(json.dumps(marked, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
-def plain(value: object) -> object:
+def plain(value: Any) -> Any:
     """Convert to JSON types: dataclasses become dictionaries, tuples lists, and floats that are not finite None."""
     if dataclasses.is_dataclass(value):
         value = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}

@@ -136,7 +136,8 @@ def _reflected(spectrum: PowerSpectrum, direction: Array, wavelength: float) -> 
     q = np.stack(np.meshgrid(*spectrum.grid.frequencies()), -1)
     power, cos_half = np.zeros(q.shape[:2]), np.ones(q.shape[:2])
     found = diffracted(direction, wavelength * q)
-    densities = spectrum.table.powers_at(*np.nonzero(found.kept), 2 * np.pi * found.v_z / wavelength)
+    row, column = np.nonzero(found.kept)
+    densities = spectrum.table.powers_at(row, column, 2 * np.pi * found.v_z / wavelength)
     power[found.kept], cos_half[found.kept] = found.k_g * densities, found.cos_half
     return power, cos_half
 

@@ -149,8 +149,8 @@ def progress_bar(label: str, unit: str = "", begin: str = "") -> Iterator[Callab
         begin: message until something can be counted.
     """
     if err.is_jupyter:
-        with _notebook_line(label, unit) as show:
-            yield show
+        with _notebook_line(label, unit) as shown:
+            yield shown
         return
     if not err.is_terminal:
         yield log_lines(label, unit)

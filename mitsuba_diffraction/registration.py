@@ -11,6 +11,7 @@ import sys
 from collections.abc import Sequence
 from importlib.machinery import ModuleSpec
 from types import ModuleType
+from typing import Any
 
 
 def register() -> None:
@@ -60,7 +61,8 @@ class _MitsubaFinder(importlib.abc.MetaPathFinder):
             self._searching = False
         if spec is None or spec.loader is None:
             return None
-        execute = spec.loader.exec_module
+        loader: Any = spec.loader
+        execute = loader.exec_module
 
         def execute_and_register(module: ModuleType) -> None:
             execute(module)
@@ -68,5 +70,5 @@ class _MitsubaFinder(importlib.abc.MetaPathFinder):
                 sys.meta_path.remove(self)
             _watch(sys.modules["mitsuba"])
 
-        spec.loader.exec_module = execute_and_register
+        loader.exec_module = execute_and_register
         return spec

@@ -12,6 +12,7 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -97,12 +98,14 @@ def tile_powers(height_field: HeightField, shortest: float) -> OrderPowers:
     degree = int(np.ceil(max_kappa * height_field.half_range / 2)) + 25
     grid = OrderGrid.reachable(height_field.tile_size, height_field.shape[::-1], 2 / shortest)
     m_x, m_y = (axis.ravel() for axis in np.meshgrid(*grid.axes()))
-    coefficients = chebyshev.chebinterpolate(
-        lambda x: [amplitudes(height_field, kappa)[m_y, m_x] for kappa in max_kappa / 2 * (x + 1)], degree
-    )
+
+    def of_nodes(x: Array) -> Any:
+        return np.stack([amplitudes(height_field, kappa)[m_y, m_x] for kappa in max_kappa / 2 * (x + 1)])
+
+    coefficients: Any = chebyshev.chebinterpolate(of_nodes, degree)
 
     def powers(m: NDArray[np.int64], kappa: Array) -> Array:
-        inside = (np.abs(m) <= grid.max_order).all(axis=-1)
+        inside = np.asarray((np.abs(m) <= grid.max_order).all(axis=-1))
         columns, rows = np.moveaxis(np.where(inside[..., None], m + grid.max_order, 0), -1, 0)
         waves = chebyshev.chebvander(2 * kappa / max_kappa - 1, degree)
         amplitude = (waves * np.moveaxis(coefficients[:, rows * grid.shape[1] + columns], 0, -1)).sum(axis=-1)
@@ -345,8 +348,8 @@ def scalar_error(height_field: HeightField, extent: str = "tile") -> ScalarError
             solved = _solved_error(height_field) if depth > 0 else (0.0, 0.0)
     if np.isfinite(solved[0]):
         return ScalarError(*solved, False, remedy)
-    estimated = (_estimated_error(lengths, power, depth, name) for name in ("dielectric", "transmitted"))
-    return ScalarError(*estimated, True, remedy)
+    reflected, transmitted = (_estimated_error(lengths, power, depth, name) for name in ("dielectric", "transmitted"))
+    return ScalarError(reflected, transmitted, True, remedy)
 
 
 def _solved_error(profile: HeightField) -> tuple[float, float]:

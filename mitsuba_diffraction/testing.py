@@ -25,7 +25,7 @@ def towards(wi: Array, q: ArrayLike, wavelength: ArrayLike) -> Array:
 
     All three broadcast; z is NaN where the frequency is evanescent.
     """
-    across = -1e-3 * np.asarray(wavelength, np.float64)[..., None] * q - wi[..., :2]
+    across = -1e-3 * np.asarray(wavelength, np.float64)[..., None] * np.asarray(q) - wi[..., :2]
     with np.errstate(invalid="ignore"):
         return np.concatenate([across, np.sqrt(1 - (across**2).sum(axis=-1, keepdims=True))], axis=-1)
 
@@ -148,12 +148,13 @@ def sample(
     Returns:
         ω_o (n, 3); the weights f cos θ_o/pdf, (n, c); and Mitsuba's sample.
     """
-    u = np.random.default_rng(seed).random((3, len(wi))).astype(np.float32)
+    count = len(np.asarray(wi))
+    u = np.random.default_rng(seed).random((3, count)).astype(np.float32)
     found, weight = bsdf.sample(
         context or mi.BSDFContext(), interaction(wi, wavelengths, uv), floats(u[0]), mi.Point2f(*map(floats, u[1:]))
     )
     dr.eval(found, weight)  # in one kernel
-    return array(found.wo, np.float64).T, _spectrum(weight, len(wi)), found
+    return array(found.wo, np.float64).T, _spectrum(weight, count), found
 
 
 def _components(kind: type, values: ArrayLike) -> object:

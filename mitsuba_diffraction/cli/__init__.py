@@ -17,7 +17,7 @@ import traceback
 import warnings
 from importlib import metadata
 from types import FrameType
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperCommand
@@ -33,13 +33,13 @@ from .render import Stopped, render
 from .view import view
 
 # Click's, or that of the copy of Click which newer versions of Typer carry.
-_UsageError = typer.BadParameter.__base__
+_UsageError: Any = typer.BadParameter.__base__
 
 
 class _Command(TyperCommand):
     """Command that refuses an option given twice, unless the option takes a list of values."""
 
-    def parse_args(self, context: typer.Context, arguments: list[str]) -> list[str]:
+    def parse_args(self, context: Any, arguments: list[str]) -> list[str]:
         _, _, order = self.make_parser(context).parse_args(list(arguments))
         for parameter in order:
             if order.count(parameter) > 1 and not parameter.multiple and parameter.param_type_name == "option":
@@ -147,8 +147,10 @@ def _report(error: BaseException, debug: bool = False) -> int:
     while error.__cause__ is not None and "(see above)" in str(error):  # Dr.Jit's message does not name the cause
         error = error.__cause__
     if isinstance(error, RequestError | FileNotFoundError | IsADirectoryError | NotADirectoryError):
-        from_system = isinstance(error, OSError) and error.filename and error.strerror
-        say("error", f"{error.filename}: {error.strerror.lower()}" if from_system else error)
+        if isinstance(error, OSError) and error.filename and error.strerror:
+            say("error", f"{error.filename}: {error.strerror.lower()}")
+        else:
+            say("error", error)
         return 2
     if is_bug(type(error)):
         text = error if isinstance(error, Bug) else f"{type(error).__name__}: {error}"

@@ -94,7 +94,7 @@ def numbers(option: str, text: str) -> NDArray[np.float64]:
         count = (last - first) / step
         if not 0 <= count < _MAX_VALUES:
             raise ValueError
-        return first + step * np.arange(int(count + 1e-9) + 1)
+        return first + step * np.arange(int(count + 1e-9) + 1, dtype=np.float64)
     except (ValueError, ZeroDivisionError):
         raise RequestError(f"{option}: got {text!r}, wanted a number, numbers as 0,30,60, or first:last:step") from None
 

@@ -52,7 +52,7 @@ def design(
     check_outputs([target], [("-o", path.with_suffix(suffix)) for suffix in SUFFIXES], overwrite=overwrite)
     if picture.shape[0] != picture.shape[1]:
         say("note", f"{target} has {picture.shape[1]} × {picture.shape[0]} pixels, and is cast as a square")
-    wavelengths = None if wavelength is None else numbers("--wavelength", wavelength)
+    wavelengths = None if wavelength is None else numbers("--wavelength", wavelength).tolist()
     with progress_bar(f"design of {target.name}", "iterations") as progress:
         found = search(
             picture,

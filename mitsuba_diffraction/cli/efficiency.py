@@ -68,7 +68,7 @@ def efficiency(
     angles, wavelengths = angles_of("--angle", angle), numbers("--wavelength", wavelength)
     name, values = surface_of(source)
     of_scan, given = options_of_scan(context), settings_of(context)
-    of_spectrum = {key: given[key] for key in ("extent", "coherence_length") if key in given}
+    of_spectrum: dict[str, Any] = {key: given[key] for key in ("extent", "coherence_length") if key in given}
     recipe = None
     if Path(name).suffix.lower() != ".exr":
         recipe = _recipe(name, values, of_scan, of_spectrum)
@@ -76,8 +76,9 @@ def efficiency(
         raise RequestError(f"{name}: got {options} with a saved spectrum, wanted the recipe or the scan itself")
     settings = Settings() if recipe is None else recipe.settings
     theory, transmission = theory or settings.theory, transmission or settings.transmission
+    index: complex | None = int_ior
     if material is None and int_ior is None:
-        material, int_ior = settings.material, settings.int_ior
+        material, index = settings.material, settings.int_ior
     if csv is not None:
         check_suffix("--csv", csv, ".csv")
     if plot is not None:
@@ -89,10 +90,10 @@ def efficiency(
         raise RequestError(
             f"{name}: got theory {theory}, transmission {transmission} of an irregular surface, wanted scalar, none"
         )
-    material_of = {"material": material, "int_ior": int_ior, "azimuth": azimuth}
+    material_of: dict[str, Any] = {"material": material, "int_ior": index, "azimuth": azimuth}
     found: OrderEfficiencies
-    if irregular:
-        check_request(settings.wavelengths, angles, wavelengths, material, int_ior)  # before a spectrum is computed
+    if recipe is None or irregular:
+        check_request(settings.wavelengths, angles, wavelengths, material, index)  # before a spectrum is computed
         cached = load_spectrum(name) if recipe is None else recipe.cached(partial(progress_bar, unit="%"))
         if not isinstance(cached, GratingSpectrum):
             raise RequestError(f"{name}: got a spectrum of rigorous theory, wanted its recipe")

@@ -144,8 +144,8 @@ def _diffraction_lines(inspection: Inspection) -> list[tuple[str, str]]:
     lines.append(("scalar theory", str(inspection.scalar_error)))
     if inspection.piece is not inspection.height_field:
         x, y = inspection.piece.tile_size
-        length = inspection.spectrum.coherence_length
-        lines.append(("colours", f"of the middle {x:.3g} × {y:.3g} µm, at a coherence length of {length:.3g} µm"))
+        length = f"{inspection.spectrum.coherence_length:.3g} µm"
+        lines.append(("colours", f"of the middle {x:.3g} × {y:.3g} µm, at a coherence length of {length}"))
     return lines
 
 

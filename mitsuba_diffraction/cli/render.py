@@ -131,7 +131,8 @@ def render(
     tracer = trace_locally if dask is None else trace_on(dask)
     motions = [None] if frames is None else motions_of_orbit(scene, frames, **where)
     where |= {"width": width, "height": height}
-    request = {"spp": spp, "seed": seed, "until_error": until_error, "seconds": checkpoint, "tracer": tracer}
+    request: dict[str, Any] = {"spp": spp, "seed": seed, "until_error": until_error}
+    request |= {"seconds": checkpoint, "tracer": tracer}
     if until_error is None:  # else nobody knows the time
         planes = 3 + has_alpha(scene, where["parameters"])
         written = 0 if rgb else channels
@@ -308,7 +309,8 @@ def _summary(image: SpectralImage, until_error: float | None, stored: dict[str, 
     channels = "RGB" if stored["rgb"] else f"{wavelengths} wavelengths"
     text = f"{columns} × {rows} pixels, {channels}, {image.attributes['spp']} samples per pixel"
     if "error" in image.attributes:
-        text += f", noise at most {100 * image.attributes['error']:.2g} % of the luminance in nine of ten pixels"
-        if until_error is not None and image.attributes["error"] > until_error:
+        error = float(image.attributes["error"])
+        text += f", noise at most {100 * error:.2g} % of the luminance in nine of ten pixels"
+        if until_error is not None and error > until_error:
             text += f" (above {100 * until_error:g} %: increase --spp)"
     return f"{text}, {image.attributes['variant']}"

@@ -241,7 +241,9 @@ def _fraction(view: _View, main: Period, order: int) -> float:
 
 def _XYZ(view: _View, main: Period, order: int, period: float) -> Array:
     """Return non-negative XYZ at normal incidence in the direction to which `period` diffracts 550 nm."""
-    spectra = radiance(view.spectrum, main.direction, 0.0, order_angle(order, period, GREEN), **view.scale)
+    angle = order_angle(order, period, GREEN)
+    assert angle is not None  # evanescent orders were left out
+    spectra = radiance(view.spectrum, main.direction, 0.0, angle, **view.scale)
     return np.maximum(spectrum_to_XYZ(spectra, WAVELENGTHS), 0)
 
 

@@ -195,7 +195,7 @@ def _strongest(q_x: Array, q_y: Array, power: Array) -> tuple[Array, Array, Arra
         starts = np.unique(np.linspace(0, len(q), min(len(q), _MAX_BINS), endpoint=False).astype(int))
         bins.append(np.add.reduceat(q, starts) / np.diff([*starts, len(q)]))
         power = np.maximum.reduceat(power, starts, axis=1 - axis)
-    return *bins, power
+    return bins[0], bins[1], power
 
 
 def _facts(axes: Axes, inspection: Inspection) -> None:

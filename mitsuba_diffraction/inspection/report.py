@@ -132,6 +132,7 @@ def inspect(
                 tolerance=_TOLERANCE,
                 progress=part(progress, *next(spectra)),
             )
+        assert isinstance(spectrum, GratingSpectrum)  # of scalar theory, the default
         return spectrum
 
     numbers = statistics(height_field, extent=extent)

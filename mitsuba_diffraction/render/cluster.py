@@ -11,7 +11,7 @@ import asyncio
 import logging
 import threading
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from concurrent import futures
 from contextlib import contextmanager, suppress
 from functools import lru_cache
@@ -52,7 +52,7 @@ def trace_on(address: str) -> Tracer:
             "a Dask cluster needs the package distributed: pip install 'mitsuba_diffraction[cluster]'"
         ) from None
 
-    def trace(job: Job, scene: mi.Scene, first: int) -> Iterator[NDArray[np.float32]]:
+    def trace(job: Job, scene: mi.Scene, first: int) -> Generator[NDArray[np.float32], None, None]:
         try:
             distributed.comm.parse_address(address, strict=True)
             asyncio.run(_check_scheduler(address))

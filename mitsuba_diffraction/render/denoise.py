@@ -77,7 +77,8 @@ def guides(scene: mi.Scene, band: Rows | None = None) -> Guides:
     blocks = split_rows(end - first, columns)
     parts = [_guides(scene, first + block.start, min(end, first + block.stop)) for block in blocks]
     response = np.multiply.outer(*(_response(sensor.film().rfilter(), size) for size in (end - first, columns)))
-    return Guides(*(np.concatenate(part) for part in zip(*parts, strict=True)), response[..., None])
+    albedo, normals = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return Guides(albedo, normals, response[..., None])
 
 
 def _guides(scene: mi.Scene, first: int, end: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

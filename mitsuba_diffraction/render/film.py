@@ -303,7 +303,8 @@ def _trace(
     sums = np.array(collected(channel, value, channels=channels)).reshape(*shape, -1)
     if light is not None:
         splats = light_of_bands.of(rows, light, spp, light_seed, radius)
-        _add_light(sums, film, splats - np.float32([0, first, *[0] * (splats.shape[1] - 2)]), spp, margins)
+        origin = np.array([0, first, *[0] * (splats.shape[1] - 2)], np.float32)
+        _add_light(sums, film, splats - origin, spp, margins)
     if alpha:
         coverage = np.array(collected([dr.zeros(mi.Float, size)], covered, channels=1)).reshape(*shape, 2)
         sums = np.concatenate([sums[..., :-1], coverage], axis=-1)
@@ -362,7 +363,16 @@ def _radius(rfilter: mi.ReconstructionFilter) -> int:
 
 
 @dr.syntax
-def collect(rfilter, position, channel, value, size, margins, samples, channels):
+def collect(
+    rfilter: mi.ReconstructionFilter,
+    position: mi.Point2f,
+    channel: list[mi.Float],
+    value: list[mi.Float],
+    size: tuple[int, int],
+    margins: tuple[int, int, int],
+    samples: SampleRange,
+    channels: int,
+) -> mi.Float:
     """Gather the samples under the filter of each pixel, row by row, in one lane per pixel.
 
     `channel` and `value` are lists; the value at a fractional channel is divided linearly between the two nearest

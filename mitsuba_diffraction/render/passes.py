@@ -22,7 +22,7 @@ import tempfile
 import threading
 import time
 import weakref
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import closing, contextmanager, nullcontext
 from dataclasses import asdict, dataclass, fields
 from functools import cached_property
@@ -97,7 +97,8 @@ class Accumulation:
     ) -> Accumulation:
         """Return the sums of zero passes."""
         channels = channel_wavelengths(spectral_range).size + (2 if alpha else 1)
-        return cls(np.zeros((rows, columns, channels)), *np.zeros((2, rows, columns)), spectral_range=spectral_range)
+        luminance, squares = np.zeros((2, rows, columns))
+        return cls(np.zeros((rows, columns, channels)), luminance, squares, spectral_range=spectral_range)
 
     def add(self, traced: NDArray[np.float32], samples: int) -> None:
         """Add the result of `trace_pass` with that many samples per pixel."""
@@ -290,6 +291,8 @@ class BandedSums:
 class BandedImage(SpectralImage):
     """A picture of which one band is in memory at a time, as long as `radiance` is not read as a whole."""
 
+    _sums: BandedSums
+
     def __init__(self, sums: BandedSums, attributes: Mapping[str, str | int | float]) -> None:
         object.__setattr__(self, "wavelengths", channel_wavelengths(sums.spectral_range))
         object.__setattr__(self, "attributes", dict(attributes))
@@ -369,7 +372,7 @@ class Job:
 
 
 # Yields the results of `trace_band` for `first`, `first` + 1, … in order; see `trace_locally`.
-Tracer = Callable[[Job, "mi.Scene", int], Iterator[NDArray[np.float32]]]
+Tracer = Callable[[Job, "mi.Scene", int], Generator[NDArray[np.float32], None, None]]
 
 
 @dataclass(frozen=True)
@@ -416,7 +419,7 @@ def trace_band(job: Job, scene: mi.Scene, index: int, light: LightOfBands) -> ND
     return trace_pass(scene, job.samples[number], pass_seed(job.seed, number), None, job.bands[band], light, job.alpha)
 
 
-def trace_locally(job: Job, scene: mi.Scene, first: int) -> Iterator[NDArray[np.float32]]:
+def trace_locally(job: Job, scene: mi.Scene, first: int) -> Generator[NDArray[np.float32], None, None]:
     """Trace the bands of the passes of a job from `first` on in this process; see `trace_band`."""
     light = LightOfBands(job.bands)
     for index in range(first, len(job.samples) * len(job.bands)):
@@ -443,7 +446,7 @@ def render(
     seconds: float = 60.0,
     finished: str | None = None,
     tracer: Tracer = trace_locally,
-    progress: Callable[[float, int, float], None] = lambda done, total, error: None,
+    progress: Callable[[float, float, float], None] = lambda done, total, error: None,
     announce: Callable[[Estimate], None] = lambda estimate: None,
 ) -> SpectralImage:
     """Render the first sensor of a scene spectrally, with its own integrator, in the current variant.
@@ -488,7 +491,7 @@ def render(
         Interrupted: at the end of the current pass on the first Ctrl-C, with the picture so far, after a checkpoint.
         KeyboardInterrupt: immediately on the second Ctrl-C, or if no pass has been completed.
     """
-    where = {"width": width, "height": height, "motion": motion}
+    where: dict[str, Any] = {"width": width, "height": height, "motion": motion}
     where |= {"parameters": parameters or {}, "materials": materials or {}}
     job, scene = _job(scene_path, where, spp, seed, until_error)
     if finished == job.digest():
@@ -526,7 +529,7 @@ def _trace(
     checkpoint: str | os.PathLike[str] | None,
     seconds: float,
     tracer: Tracer,
-    progress: Callable[[float, int, float], None],
+    progress: Callable[[float, float, float], None],
     announce: Callable[[float], None],
 ) -> bool:
     """Add passes to the sums until the picture is complete or Ctrl-C was pressed; return whether it is complete."""
@@ -608,7 +611,12 @@ def _check_disk(job: Job, columns: int, checkpoint: str | os.PathLike[str] | Non
 def _image(sums: BandedSums, job: Job, scene: str, complete: bool) -> SpectralImage:
     """Return the picture so far; only a complete one has the digest of the request."""
     passes = sums.done // len(job.bands)
-    attributes = {"scene": scene, "variant": job.variant, "spp": sum(job.samples[:passes]), "seed": str(job.seed)}
+    attributes: dict[str, str | int | float] = {
+        "scene": scene,
+        "variant": job.variant,
+        "spp": sum(job.samples[:passes]),
+        "seed": str(job.seed),
+    }
     if passes >= _MIN_PASSES_FOR_ERROR:
         attributes["error"] = error_of_picture(sums.errors)
     if complete:
@@ -644,14 +652,15 @@ def split(scene: mi.Scene, spp: int, min_passes: int = 1) -> tuple[int, ...]:
     return tuple(samples_drawn(scene, end - start) for start, end in itertools.pairwise(ends))
 
 
-def _is_complete(sums: BandedSums, job: Job, progress: Callable[[float, int, float], None]) -> bool:
+def _is_complete(sums: BandedSums, job: Job, progress: Callable[[float, float, float], None]) -> bool:
     """Report progress and return whether the picture is complete."""
     passes, bands = divmod(sums.done, len(job.bands))
     error = error_of_picture(sums.errors) if passes >= _MIN_PASSES_FOR_ERROR else math.nan
-    done = sum(job.samples[:passes])
+    done: float = sum(job.samples[:passes])
     if bands:
         done += round(job.samples[passes] * bands / len(job.bands), 2)
-    expected = total = sum(job.samples)
+    total: float = sum(job.samples)
+    expected = total
     if job.until_error is not None and not math.isnan(error):
         # The error falls with the square root of the number of samples.
         expected = min(total, max(done, round(done * (error / job.until_error) ** 2)))

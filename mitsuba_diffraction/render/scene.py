@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from difflib import get_close_matches
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -328,7 +329,7 @@ def _resolved(name: object) -> Path:
     return Path(str(mi.file_resolver().resolve(str(name))))
 
 
-def _exact_text(value: object) -> str:
+def _exact_text(value: Any) -> str:
     """Format a property as text without loss; Mitsuba's own abbreviates spectra and rounds."""
     if dr.is_array_v(value):
         return str(list(value))

@@ -9,7 +9,7 @@ import itertools
 import os
 import time
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from ..errors import RequestError
 from ..files import whole_file
-from ..progress import Progress, silent
+from ..progress import Progress, part, silent
 from ..settings import Settings
 from ..surface.heightfield import HeightField
 from .coordinate_transformation import ABOVE, BELOW, Curve, Grating, HalfSpace, Scattered, curve_of, half_space, scatter
@@ -41,7 +41,7 @@ from .spectrum import MAX_PERIOD_IN_WAVELENGTHS, Axes, RigorousSpectrum, fractio
 
 Real = NDArray[np.float64]
 # n of the incident and of the outgoing orders, and their matrices, (outgoing orders, incident orders, 4, 4).
-_Orders = tuple[NDArray[np.int64], NDArray[np.int64], Real]
+_Orders = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[Any]]
 # α, g, λ, whether an order is near its Rayleigh anomaly, and (side of incidence, side of exit) → m and M_ij, (n, 4, 4).
 _Check = tuple[float, float, float, bool, dict[tuple[int, int], tuple[NDArray[np.int64], Real]]]
 
@@ -112,9 +112,7 @@ def build_spectrum(
             # Half as many steps again more than halve the error: an error of two tolerances predicts the last table.
             begin, done = done, 95 if error <= 2 * tolerance or solved == steps[-1] else done + 20
             build = _Build(surface, solved, settings.polarised)
-            values, mueller = build.table(
-                lambda row, rows, a=begin, b=done: progress(a + (b - a) * row // rows, 100), checkpoints
-            )
+            values, mueller = build.table(part(progress, begin / 100, done / 100), checkpoints)
             spectrum = RigorousSpectrum(
                 axes=build.axes,
                 values=values,
@@ -247,6 +245,7 @@ class _Surface:
             entry η. Where k_y is imaginary, the elements that are odd in k_y are imaginary, too.
         """
         orders = solved.orders
+        found: Mapping[tuple[int, int], NDArray[Any]]
         if self.transmission == "sheet":
             orders = orders[ABOVE], orders[ABOVE]
             found = through_sheet(solved, self.index(self.wavelengths[0]).real)
@@ -280,9 +279,9 @@ class _Surface:
         return checks
 
 
-def _errors(spectrum: RigorousSpectrum, checks: list[_Check]) -> dict[str, float]:
+def _errors(spectrum: RigorousSpectrum, checks: list[_Check]) -> dict[str, Any]:
     """Return `error`, `max_error`, `max_error_near` and `polarisation_error` of a table."""
-    error, polarisation_error = [], []
+    errors, polarisation_error = [], []
     for alpha, g, wavelength, _, orders in checks:
         total, difference, matrix_difference = 0.0, 0.0, 0.0
         for sides, (m, matrices) in orders.items():
@@ -293,9 +292,9 @@ def _errors(spectrum: RigorousSpectrum, checks: list[_Check]) -> dict[str, float
             if spectrum.mueller is not None:
                 difference_ij = spectrum.evaluate(*arguments, mueller=True) - matrices
                 matrix_difference += np.abs(difference_ij).max(axis=(1, 2)).sum()
-        error.append(difference / total)
+        errors.append(difference / total)
         polarisation_error.append(matrix_difference / total)
-    error, near = np.array(error), np.array([check[3] for check in checks])
+    error, near = np.array(errors), np.array([check[3] for check in checks])
     return {
         "error": float(error.mean()),
         "max_error": float(error[~near].max(initial=0)),
@@ -371,7 +370,7 @@ class _Build:
     def _planes(self, job: int) -> NDArray[np.float32]:
         """Return the result of `_job` where Z is the wavelength."""
         a, (above, _) = self.jobs[job]
-        axes, surface, planes = self.axes, self.surface, []
+        axes, surface, planes = self.axes, self.surface, list[Any]()
         squares = [_square_in(above, a, t_x, 0.0) for t_x in self.fractions[1]]
         for square, previous in zip(squares, [None, *squares], strict=False):
             if square == previous:
@@ -434,7 +433,7 @@ class _Build:
 
 def _square_in(interval: int, a: float, t: float, min_square: float) -> float:
     """Return γ² at the fraction t of an interval; the same for all t if the interval is a point."""
-    low, high = (float(x) for x in interval_bounds(interval, a, min_square))
+    low, high = (float(x) for x in interval_bounds(interval, np.asarray(a), min_square))
     square = low + (high - low) * (t if high - low > 1e-6 else 0.5)
     # A field that neither propagates nor decays has no admittance.
     return square if abs(square) > _MIN_SQUARE else _MIN_SQUARE if interval else -_MIN_SQUARE
@@ -500,7 +499,8 @@ class _Checkpoint:
             if self.path:
                 self.path.parent.mkdir(parents=True, exist_ok=True)
                 with whole_file(self.path) as temporary, open(temporary, "wb") as file:
-                    np.savez(file, **{str(row): values for row, values in self.done.items()})
+                    arrays: dict[str, Any] = {str(row): values for row, values in self.done.items()}
+                    np.savez(file, **arrays)
         self._written = time.monotonic()
 
     def remove(self) -> None:

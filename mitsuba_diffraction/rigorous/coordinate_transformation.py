@@ -87,7 +87,8 @@ class Curve:
     @property
     def middle(self) -> tuple[Real, Real]:
         """x and z half way between the points, (n,) each."""
-        return tuple((c[1:] + c[:-1]) / 2 for c in (self.x, self.z))
+        x, z = ((c[1:] + c[:-1]) / 2 for c in (self.x, self.z))
+        return x, z
 
 
 def is_profile(height_field: HeightField) -> bool:
@@ -165,7 +166,7 @@ class Grating:
         self.s = np.linalg.inv(left @ self.m + self.j)
         self.sm = self.s @ left
 
-    def _coefficients(self, values: Complex) -> Complex:
+    def _coefficients(self, values: Real | Complex) -> Complex:
         """Return ∫₀¹ f e^{−2πi n t} dt of values (…, samples) between the points of the curve, n as in `fft`."""
         shift = np.exp(-1j * np.pi * np.fft.fftfreq(len(self.t)))
         return np.fft.fft(values) * shift / len(self.t)
@@ -174,7 +175,9 @@ class Grating:
         n, c = 2 * self.harmonics + 1, self._coefficients(values)
         return toeplitz(c[:n], c[-np.arange(n)])
 
-    def bounded(self, alpha: Real, gamma2: complex, upwards: bool, count: int) -> tuple[Complex, Complex]:
+    def bounded(
+        self, alpha: NDArray[np.floating], gamma2: complex, upwards: bool, count: int
+    ) -> tuple[Complex, Complex]:
         """Return ψ and −iG along the curve, (n, count) each, of a basis of the fields that decay fastest up or down.
 
         Args:
@@ -286,7 +289,7 @@ class Scattered:
 
     orders: tuple[NDArray[np.int64], NDArray[np.int64]]
     amplitudes: tuple[tuple[Complex, Complex], tuple[Complex, Complex]]
-    alpha: tuple[Real, Real]
+    alpha: tuple[NDArray[np.floating], NDArray[np.floating]]
     k_y: complex
     k_0: float
 
@@ -304,7 +307,7 @@ class Scattered:
         return powers * _PARITY[:, None] if np.imag(self.k_y) else powers
 
 
-def scatter(alpha: Real, above: HalfSpace, below: HalfSpace, k_y: complex, index: complex) -> Scattered:
+def scatter(alpha: NDArray[np.floating], above: HalfSpace, below: HalfSpace, k_y: complex, index: complex) -> Scattered:
     """Solve for the amplitudes of all orders, with air above and a medium of index n + ik below.
 
     Args:
@@ -345,4 +348,5 @@ def scatter(alpha: Real, above: HalfSpace, below: HalfSpace, k_y: complex, index
         blocks.append(tuple(of_side))
     orders = above.orders, below.orders
     middle = len(alpha) // 2
-    return Scattered(orders, tuple(blocks), tuple(alpha[n + middle] for n in orders), k_y, k_0)
+    alphas = alpha[above.orders + middle], alpha[below.orders + middle]
+    return Scattered(orders, (blocks[0], blocks[1]), alphas, k_y, k_0)

@@ -368,7 +368,9 @@ def through_sheet(solved: Scattered, index: float) -> dict[tuple[int, int], Comp
     return {sides: _as_blocks(matrix) for sides, matrix in found.items()}
 
 
-def _plane(solved: Scattered, alpha: Real, k: float, other: float, upwards: bool) -> tuple[Complex, Complex]:
+def _plane(
+    solved: Scattered, alpha: NDArray[np.floating], k: float, other: float, upwards: bool
+) -> tuple[Complex, Complex]:
     """Return the Mueller matrices of refraction and of reflection at a plane, (n, 4, 4) each.
 
     Args:

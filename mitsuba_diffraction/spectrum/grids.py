@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy.ndimage
@@ -74,8 +75,8 @@ class OrderGrid(_Rectangle):
 
         No orders exceed the Nyquist order N/2 of the `pixels`, (N_x, N_y).
         """
-        max_order = tuple(min(int(np.floor(t * max_frequency)), n // 2) for t, n in zip(tile_size, pixels, strict=True))
-        return cls(tile_size, max_order)
+        x, y = (min(int(np.floor(t * max_frequency)), n // 2) for t, n in zip(tile_size, pixels, strict=True))
+        return cls(tile_size, (x, y))
 
     def __str__(self) -> str:
         x, y = self.tile_size
@@ -83,7 +84,8 @@ class OrderGrid(_Rectangle):
 
     def frequencies(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return q_x of the columns and q_y of the rows, cycles/µm."""
-        return tuple(m / size for m, size in zip(self.axes(), self.tile_size, strict=True))
+        x, y = (m / size for m, size in zip(self.axes(), self.tile_size, strict=True))
+        return x, y
 
     def take(self, powers: NDArray, half: float = 0.5) -> NDArray:
         """Select the kept orders, in the order of `axes`, from the powers of all, (N_y, N_x), as of `scipy.fft.fft2`.
@@ -132,7 +134,8 @@ class OrderGrid(_Rectangle):
                 count, half_width = 2 * max_order + 1, np.inf
             inside = float(scipy.special.erf(half_width / (np.sqrt(2) * lobe_width)))
             result.append(LobeAxis(count, half_width, inside))
-        return tuple(result)
+        x, y = result
+        return x, y
 
 
 @dataclass(frozen=True)
@@ -165,7 +168,8 @@ class SplineGrid(_Rectangle):
 
     def frequencies(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return q_x of the columns and q_y of the rows, cycles/µm."""
-        return tuple(m * d for m, d in zip(self.axes(), self.spacing, strict=True))
+        x, y = (np.float64(d) * m for m, d in zip(self.axes(), self.spacing, strict=True))
+        return x, y
 
     def around(
         self, q: NDArray[np.float64]
@@ -185,7 +189,7 @@ class SplineGrid(_Rectangle):
 
     def within(self, coefficients: NDArray[np.float64], max_q: tuple[float, float]) -> float:
         """Compute ∫ Σ c B B/(Δ_x Δ_y) over |q_x| and |q_y| up to `max_q` (cycles/µm)."""
-        inside = []
+        inside: list[NDArray[np.float64]] = []
         for m, spacing, end in zip(self.axes(), self.spacing, max_q, strict=True):
             inside.append(spline_integral(end / spacing - m) - spline_integral(-end / spacing - m))
         return float(inside[1] @ coefficients @ inside[0])
@@ -225,17 +229,18 @@ def spline(x: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(x <= 0.5, 0.75 - x**2, 0.5 * np.maximum(1.5 - x, 0) ** 2)
 
 
-def spline_weights(t: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def spline_weights(t: Any) -> tuple[Any, Any, Any]:
     """Return B(t + 1), B(t), B(t − 1) for |t| ≤ ½: the weights of the nodes before, at and after the nearest."""
     return 0.5 * (0.5 - t) ** 2, 0.75 - t**2, 0.5 * (0.5 + t) ** 2
 
 
-def spline_integral(x: NDArray[np.float64]) -> NDArray[np.float64]:
+def spline_integral(x: NDArray[np.floating]) -> NDArray[np.float64]:
     """Return ∫B from −∞ to x."""
     x = np.clip(x, -1.5, 1.5)
-    return sum(c * np.maximum(x + 1.5 - k, 0) ** 3 for k, c in enumerate((1, -3, 3, -1))) / 6
+    return np.sum([c * np.maximum(x + 1.5 - k, 0) ** 3 for k, c in enumerate((1, -3, 3, -1))], axis=0) / 6
 
 
 def inner(grid: OrderGrid | SplineGrid, kept: OrderGrid | SplineGrid) -> tuple[slice, slice]:
     """Return slices of the nodes of `kept` among those of the larger `grid`."""
-    return tuple(slice(m - n, m + n + 1) for m, n in zip(grid.max_order[::-1], kept.max_order[::-1], strict=True))
+    rows, columns = (slice(m - n, m + n + 1) for m, n in zip(grid.max_order[::-1], kept.max_order[::-1], strict=True))
+    return rows, columns

@@ -67,10 +67,11 @@ def window_axes(height_field: HeightField, coherence_length: float) -> tuple[Win
     a(x) = exp(−x²/2σ_s²) with σ_s = L_c/4, about the centre of its support, 6σ_s rounded up to whole pixels. The
     positions are evenly spaced from edge to edge of the scan, at most σ_s apart, rounded to whole pixels.
     """
-    return tuple(
+    along_x, along_y = (
         _axis(count, pixel, coherence_length / 4) if count > 1 else None
         for count, pixel in zip(height_field.shape[::-1], height_field.pixel_size, strict=True)
     )
+    return along_x, along_y
 
 
 def mean_periodogram(

@@ -29,6 +29,7 @@ def derivative_bound(heights: NDArray[np.float64], weights: ArrayLike, n: int) -
 
         Σ_k (n over k) √(M_2k M_2n−2k),     M_j = Σ a² (h − h̄)^j.
     """
+    weights = np.asarray(weights)
     square = (heights - np.sum(weights * heights)) ** 2
     moments = [float(np.sum(weights * square**k)) for k in range(n + 1)]
     return sum(math.comb(n, k) * math.sqrt(moments[k] * moments[n - k]) for k in range(n + 1))
@@ -87,17 +88,18 @@ class SliceTable:
                 large for the format is not rounded.
             kept: returns, when all powers are known, the nodes that are kept.
         """
-        values, nodes, polynomial = None, chebyshev_nodes(terms), to_polynomial(terms)
+        values = np.empty((), np.float32)  # until the shape is known
+        nodes, polynomial = chebyshev_nodes(terms), to_polynomial(terms)
         for interval, node in np.ndindex(intervals, terms):
             power = powers((interval + (1 + nodes[node]) / 2) / intervals * max_kappa)
-            if values is None:
+            if not values.ndim:
                 values = np.zeros((intervals, terms, *power.shape), np.float32)
             for coefficient, factor in zip(values[interval], polynomial[:, node], strict=True):
                 coefficient += factor * power
             progress(interval * terms + node + 1, intervals * terms)
         values = np.ascontiguousarray(values[(slice(None), slice(None), *kept())])
-        for one in values[:, None] if rounded else ():
-            if np.isfinite(stored := rounded(one)).all():
+        for one in values[:, None]:
+            if rounded is not None and np.isfinite(stored := rounded(one)).all():
                 one[:] = stored
         return cls(max_kappa, values)
 
@@ -154,7 +156,7 @@ class SliceTable:
     ) -> NDArray[np.float32]:
         """Evaluate c_m(κ) at one node and one κ each; all arguments and the result of one shape (...)."""
         interval, t = locate(kappa, self.max_kappa, self.intervals)
-        result = np.float32(0)
+        result = np.zeros((), np.float32)
         for power in reversed(range(self.terms)):
             result = result * t + self.values[interval, power, row, column]
         return result
@@ -309,7 +311,7 @@ def intervals_for(derivative: float, terms: int, max_kappa: float, allowed: floa
 
 def to_polynomial(terms: int) -> NDArray[np.float64]:
     """Return the matrix whose row p gives the coefficient of t^p from the values at as many Chebyshev points."""
-    return np.linalg.inv(np.vander(chebyshev_nodes(terms), increasing=True))
+    return np.linalg.inv(np.vander(chebyshev_nodes(terms), increasing=True)).astype(np.float64)
 
 
 def locate(kappa: ArrayLike, max_kappa: float, intervals: int) -> tuple[NDArray[np.int64], NDArray[np.float32]]:

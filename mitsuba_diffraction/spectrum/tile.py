@@ -81,8 +81,8 @@ class TileSplines:
         self._orders = powers.grid.frequencies()
         # S is negligible further than six σ_q from the last order.
         self._max_q = tuple(min(max_frequency, q[-1] + 6 * lobe_width) for q in self._orders)
-        max_order = tuple(int(np.rint(end / spacing)) + 1 for end in self._max_q)
-        self.grid = SplineGrid((spacing, spacing), max_order, (np.inf, np.inf))
+        x, y = (int(np.rint(end / spacing)) + 1 for end in self._max_q)
+        self.grid = SplineGrid((spacing, spacing), (x, y), (np.inf, np.inf))
 
     @cached_property
     def _projection(self) -> list[NDArray[np.float64]]:
@@ -101,7 +101,7 @@ class TileSplines:
         gram = np.repeat(np.array([[1], [26], [66]]) / 120, len(nodes), axis=1)
         return scipy.linalg.solveh_banded(gram, moments)[self._MARGIN : -self._MARGIN]
 
-    def _lobes(self, positions: NDArray[np.float64], orders: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _lobes(self, positions: NDArray[np.floating], orders: NDArray[np.float64]) -> NDArray[np.float64]:
         """Compute Δ N(q − m/T; σ_q²) at q = Δ · `positions`, (positions, orders)."""
         offset = (positions[:, None] * self._spacing - orders) / self._sigma
         return self._spacing / (np.sqrt(2 * np.pi) * self._sigma) * np.exp(-(offset**2) / 2)

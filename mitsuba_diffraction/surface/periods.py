@@ -248,7 +248,8 @@ class _Periodogram:
         """Return the waves across the parts of the longest period with this peak as third or second harmonic."""
         waves = self._waves[:, at[0], at[1]]
         near = [other for other in self._candidates if self._power[other] > _MIN_FUNDAMENTAL * self._power[at]]
-        others = self._waves[(slice(None), *zip(*near, strict=True))].T
+        rows, columns = np.transpose(near)
+        others = self._waves[:, rows, columns].T
         others = others * np.sign(others @ waves + 0.5)[:, None]
         for order in (3, 2):
             miss = np.abs(others - waves / order).max(axis=1)

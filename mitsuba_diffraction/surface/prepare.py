@@ -7,6 +7,7 @@ Each step takes a height field and returns a new one, whose `source` records the
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -232,7 +233,8 @@ def rotate(height_field: HeightField, degrees: float) -> HeightField:
     if quarters == np.rint(quarters):
         quarter_turns = int(np.rint(quarters)) % 4
         # rot90 rotates from +x (columns) towards −y (rows), but rows run along +y here.
-        size = height_field.pixel_size[:: -1 if quarter_turns % 2 else 1]
+        d_x, d_y = height_field.pixel_size
+        size = (d_y, d_x) if quarter_turns % 2 else (d_x, d_y)
         return _after(height_field, np.rot90(height_field.heights, -quarter_turns), f"rotate: {degrees:g}°", size)
     rows, columns = height_field.shape
     d_x, d_y = height_field.pixel_size
@@ -346,17 +348,17 @@ def _component(wave: Period, axis: str) -> tuple[float, float]:
 # ---------------------------------------------------------------- recipes
 
 
-def _is_positive(value: object) -> bool:
+def _is_positive(value: Any) -> bool:
     return is_number(value) and value > 0
 
 
 _NO_ARGUMENT = (lambda argument: False), "no argument"
-_STEPS: dict[str, tuple[Callable[..., HeightField], Callable[[object], bool], str]] = {
+_STEPS: dict[str, tuple[Callable[..., HeightField], Callable[[Any], bool], str]] = {
     "level_plane": (level_plane, *_NO_ARGUMENT),
     "level_quadratic": (level_quadratic, *_NO_ARGUMENT),
     "align_lines": (align_lines, *_NO_ARGUMENT),
     "despike": (despike, _is_positive, "a positive number of standard deviations"),
-    "mask_outliers": (mask_outliers, lambda value: is_number(value) and value >= 1, "a number of at least 1"),
+    "mask_outliers": (mask_outliers, lambda value: _is_positive(value) and value >= 1, "a number of at least 1"),
     "fill_missing": (fill_missing, *_NO_ARGUMENT),
     "rotate": (rotate, is_number, "a number of degrees"),
     "crop_periods": (crop_periods, ("x", "y", "xy").__contains__, "'x', 'y' or 'xy'"),

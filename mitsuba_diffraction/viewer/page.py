@@ -18,7 +18,7 @@ from ..rigorous.materials import conductor
 from ..settings import FROM_RADIUS, SUN_COHERENCE_LENGTH, VISIBLE
 from ..spectrum.grids import OrderGrid
 from ..spectrum.sample import UNIFORM, effective_coherence_length, window_axes
-from ..spectrum.tables import HALF_SCALE
+from ..spectrum.tables import HALF_SCALE, SliceTable
 from ..surface.heightfield import HeightField
 from .arrays import encoded
 from .coil import coil
@@ -116,6 +116,7 @@ def _material(surface: Surface) -> dict[str, Any]:
 def _spectrum(surface: Surface) -> dict[str, Any]:
     """Return the grid and the table: (K, terms, rows, columns) in half precision where that is exact."""
     spectrum, grid, table = surface.spectrum, surface.spectrum.grid, surface.spectrum.table
+    assert isinstance(table, SliceTable)  # see `Surface`
     # Nodes that no visible light reaches are zero, and take no space.
     pitch = [1 / t for t in grid.tile_size] if isinstance(grid, OrderGrid) else grid.spacing
     x, y = (np.maximum(np.abs(q) - NODES_AT_ONCE / 2 * d, 0) for q, d in zip(grid.frequencies(), pitch, strict=True))

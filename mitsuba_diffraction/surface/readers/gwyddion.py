@@ -14,6 +14,7 @@ import re
 import struct
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,10 +39,10 @@ def read(path: Path, unit: str | tuple[str, str] | None, channel: str | int | No
     data = path.read_bytes()
     if data[:4] != b"GWYP":
         raise RequestError("not a Gwyddion file, which begins with 'GWYP'")
-    name, inside = _Bytes(data, 4, len(data)).object()
+    name, inside = _Bytes(data, 4, len(data)).content()
     if name != "GwyContainer":
         raise RequestError(f"got a {name!r}, wanted a GwyContainer")
-    fields: dict[int, dict[str, object]] = {}
+    fields: dict[int, dict[str, Any]] = {}
     titles: dict[int, str] = {}
     for name, value in inside.components():
         if (match := _FIELD.fullmatch(name)) and isinstance(value, tuple) and value[0] == "GwyDataField":
@@ -59,7 +60,7 @@ def read(path: Path, unit: str | tuple[str, str] | None, channel: str | int | No
     return Scan(heights * high, (size[0] * along / columns, size[1] * along / rows), chosen.name)
 
 
-def _heights(field: dict[str, object]) -> tuple[NDArray[np.float64], tuple[float, float]]:
+def _heights(field: dict[str, Any]) -> tuple[NDArray[np.float64], tuple[float, float]]:
     """Return the array of a data field, and its width and height, in the units of the file."""
     columns, rows, values = field.get("xres"), field.get("yres"), field.get("data")
     if not (isinstance(columns, int) and isinstance(rows, int) and columns > 0 and rows > 0):
@@ -89,35 +90,35 @@ class _Bytes:
     def __init__(self, data: bytes, offset: int, end: int) -> None:
         self._data, self._offset, self._end = data, offset, end
 
-    def object(self) -> tuple[str, _Bytes]:
+    def content(self) -> tuple[str, _Bytes]:
         """Read the name and the content of an object here, and move past it."""
         name = self._text(_MAX_NAME_LENGTH)
-        size = self._number("<I")
+        size = int(self._number("<I"))
         start = self._skip(size)
         return name, _Bytes(self._data, start, start + size)
 
-    def components(self) -> Iterator[tuple[str, object]]:
+    def components(self) -> Iterator[tuple[str, Any]]:
         """Yield name and value of each component: (name, content) of an object, an array of doubles, or None."""
         while self._offset < self._end:
             yield self._text(_MAX_NAME_LENGTH), self._value()
 
-    def _value(self) -> object:
-        kind = chr(self._number("<B"))
+    def _value(self) -> Any:
+        kind = chr(int(self._number("<B")))
         if kind == "o":
-            return self.object()
+            return self.content()
         if kind == "s":
             return self._text()
         if kind in _NUMBERS:
             return self._number(_NUMBERS[kind])
         if kind not in "SOCIQD":
             raise RequestError(f"a component of the unknown type {kind!r}")
-        count = self._number("<I")
+        count = int(self._number("<I"))
         if kind in _ARRAYS:
             start = self._skip(count * _ARRAYS[kind])
             return np.frombuffer(self._data, "<f8", count, start) if kind == "D" else None
         # Each text or object takes at least a byte, so that this ends where the bytes do.
         for _ in range(count):
-            self._text() if kind == "S" else self.object()
+            self._text() if kind == "S" else self.content()
         return None
 
     def _skip(self, count: int) -> int:

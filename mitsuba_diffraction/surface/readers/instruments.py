@@ -9,8 +9,10 @@ import re
 import warnings
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...errors import RequestError
 from . import mended, scan
@@ -53,7 +55,7 @@ def read(path: Path, unit: str | tuple[str, str] | None, channel: str | int | No
         except ImportError as error:
             raise RequestError(f"an instrument's own format: wanted SurfaceTopography, {EXTRA} ({error})") from None
         _refuse_bomb(path)
-        name = format_of(extension)
+        name = format_of(extension) or ""
         library = lookup_reader_by_format[name]
         contents = mended.rewritten(path, name)
         try:
@@ -73,7 +75,7 @@ def read(path: Path, unit: str | tuple[str, str] | None, channel: str | int | No
         along, high = (scan.scale(own, one, "its lengths") for one in given)
         try:
             topography = source.topography() if own else source.topography(unit=given[0])
-            heights = np.ma.asarray(topography.heights(), np.float64).T
+            heights: NDArray[np.float64] = np.ma.asarray(topography.heights(), np.float64).T
             size = topography.physical_sizes
         except Exception as error:
             raise RequestError(f"{_unread(library)} ({_message(error)})") from None
@@ -97,7 +99,7 @@ def _refuse_bomb(path: Path) -> None:
             raise RequestError(f"an archive of {unpacked} bytes, wanted at most {MAX_BYTES}")
 
 
-def _unread(library: type) -> str:
+def _unread(library: Any) -> str:
     """Return what a file is called that the library does not read; whether it is damaged, nobody knows."""
     return (
         f"not read as a file of {library.name()}: it is another one, incomplete, or of a kind that SurfaceTopography "

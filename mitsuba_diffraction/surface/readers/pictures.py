@@ -8,7 +8,7 @@ import zipfile
 import zlib
 from contextlib import suppress
 from pathlib import Path
-from typing import BinaryIO
+from typing import IO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,7 +53,7 @@ def read_npz(path: Path) -> Scan:
     return Scan(heights, values if len(values) == 2 else values[0])
 
 
-def _load_array(file: BinaryIO) -> NDArray:
+def _load_array(file: IO[bytes]) -> NDArray:
     """Read an array in NumPy's format; pickles are refused."""
     try:
         with warnings.catch_warnings():

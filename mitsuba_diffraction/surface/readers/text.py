@@ -193,7 +193,7 @@ def _may_be_points(table: NDArray[np.float64]) -> bool:
 
 def _length(text: str, unit: str) -> float:
     """Parse a length in its own unit, or else in the given one; in µm."""
-    number, own = _LENGTH.match(text).groups()
+    number, own = _LENGTH.findall(text)[0]
     try:
         value = float(number.replace(",", "."))
     except ValueError:
